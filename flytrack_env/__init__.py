@@ -1,0 +1,26 @@
+"""FlyTrack: a drone-racing environment in JAX. Importing it registers its ids with gymnax."""
+
+from flytrack_env.dynamics import ModelParameters, nominal_parameters
+from flytrack_env.env import EnvParams, EnvState, FlyTrack
+from flytrack_env.model_file import ModelFileError, load_model, save_model
+from flytrack_env.registration import make, register_all
+from flytrack_env.tracks import Track, TrackError, available_tracks, load_track
+
+register_all()
+
+__all__ = [
+    "EnvParams",
+    "EnvState",
+    "FlyTrack",
+    "ModelFileError",
+    "ModelParameters",
+    "Track",
+    "TrackError",
+    "available_tracks",
+    "load_model",
+    "load_track",
+    "make",
+    "nominal_parameters",
+    "register_all",
+    "save_model",
+]

@@ -1,0 +1,115 @@
+"""The simulator's physics: lag, body rates, thrust, rigid-body translation, battery.
+
+The equations are the handout's. ``advance`` states them once, for one drone of scalar
+leaves; ``step`` is the same function on the packed (21,) vector.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from flytrack_env.quaternion import Quaternion, Scalar, Vec3
+from flytrack_env.state import Action, Drone, pack, unpack, unpack_action
+
+SECONDS_PER_MINUTE = 60.0
+
+
+class ModelParameters(NamedTuple):
+    """Parameters of the minimal model; the first five fields alone construct it.
+
+    tau: (4,) s, time constants of the first-order lag of roll, pitch, yaw, thrust.
+    thrust_coeffs: (6,) N, of 1, u, u^2, u^3, V, u V.
+    max_rate: (3,) deg/s, body rate at full stick.
+    m: kg. g: m/s^2. battery_drain_v_per_min: V/min.
+    """
+
+    tau: jax.Array
+    thrust_coeffs: jax.Array
+    max_rate: jax.Array
+    m: Scalar
+    g: Scalar
+    battery_drain_v_per_min: Scalar = 1.0
+
+
+def nominal_parameters() -> ModelParameters:
+    """Return a generic 1 kg racing quadcopter, before anything was identified.
+
+    Assumption: 40 ms lags; no thrust at u = -1, growing with (u + 1), (u + 1)^2 and V (u + 1) to
+    a thrust-to-weight ratio of 3.5 at 24 V and 3.1 at 22 V.
+    """
+    return ModelParameters(
+        tau=np.array([0.04, 0.04, 0.04, 0.04], np.float32),
+        thrust_coeffs=np.array([-9.36, -6.36, 3.0, 0.0, 0.98, 0.98], np.float32),
+        max_rate=np.array([618.0, 618.0, 120.0], np.float32),
+        m=1.0,
+        g=9.80665,
+    )
+
+
+def collective_thrust(thrust_action: Scalar, battery_v: Scalar, coeffs: jax.Array) -> Scalar:
+    """Return the thrust in N along body z for a lagged thrust action and a battery voltage.
+
+    ``coeffs`` has shape (6,); handout, task 1, equation 3.
+    """
+    u, volt = thrust_action, battery_v
+    polynomial = coeffs[0] + u * (coeffs[1] + u * (coeffs[2] + u * coeffs[3]))
+    return polynomial + volt * (coeffs[4] + u * coeffs[5])
+
+
+def lag(applied: Action, command: Action, dt: Scalar, tau: jax.Array) -> Action:
+    """Return the applied action after ``dt`` seconds of first-order lag towards a held command.
+
+    ``tau`` has shape (4,), s. Exact for a command held over the step; handout, equation 1.
+    """
+    blend = 1.0 - jnp.exp(-dt / jnp.asarray(tau))
+    return Action(
+        *(old + blend[i] * (new - old) for i, (old, new) in enumerate(zip(applied, command)))
+    )
+
+
+def body_rates(applied: Action, max_rate: jax.Array) -> Vec3:
+    """Return body rates in rad/s of an applied action; ``max_rate`` has shape (3,), deg/s."""
+    full_stick = jnp.deg2rad(jnp.asarray(max_rate))
+    return Vec3(
+        applied.roll * full_stick[0], applied.pitch * full_stick[1], applied.yaw * full_stick[2]
+    )
+
+
+def integrate_attitude(quat: Quaternion, rates_b: Vec3, dt: Scalar) -> Quaternion:
+    """Return the attitude after ``dt``: normalize(q + dt/2 q (x) [0, rates]); handout, equation 2."""
+    turn = quat.multiply(Quaternion(0.0, *rates_b))
+    half_dt = 0.5 * dt
+    return Quaternion(*(q + half_dt * dq for q, dq in zip(quat, turn))).normalize()
+
+
+def advance(drone: Drone, command: Action, dt: Scalar, params: ModelParameters) -> Drone:
+    """Return the drone ``dt`` seconds later under a held command.
+
+    The acceleration uses the attitude *before* the step and the thrust of the lagged action
+    *after* it (handout, equations 1 to 4). Commands are not clipped here.
+    """
+    applied = lag(drone.applied, command, dt, params.tau)
+    rates_b = body_rates(applied, params.max_rate)
+    thrust = collective_thrust(applied.thrust, drone.battery_v, params.thrust_coeffs)
+    thrust_axis_w = drone.quat.axes()[2]
+    acc_w = thrust_axis_w.scale(thrust / params.m) - Vec3(0.0, 0.0, params.g)
+    return Drone(
+        pos_w=drone.pos_w + drone.vel_w.scale(dt) + acc_w.scale(0.5 * dt * dt),
+        vel_w=drone.vel_w + acc_w.scale(dt),
+        acc_w=acc_w,
+        quat=integrate_attitude(drone.quat, rates_b, dt),
+        rates_b=rates_b,
+        applied=applied,
+        battery_v=drone.battery_v - params.battery_drain_v_per_min / SECONDS_PER_MINUTE * dt,
+    )
+
+
+def step(x: jax.Array, u: jax.Array, dt: Scalar, params: ModelParameters) -> jax.Array:
+    """Return the handout's next state: (21,), (4,), s -> (21,); differentiable in everything.
+
+    Raises:
+        ValueError: if ``x`` or ``u`` has another shape.
+    """
+    return pack(advance(unpack(x), unpack_action(u), dt, params))

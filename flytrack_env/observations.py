@@ -1,0 +1,69 @@
+"""The observation: what the policy sees, in the current gate's flight frame, scaled to about 1.
+
+The flight frame of a gate is x along the direction of flight, y left, z the gate's up
+(``flytrack_env.tracks``). ``OBSERVATION`` is the table, index by index; a value is the quantity
+divided by its scale, clipped to the range.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from flytrack_env.fusion import compute_once
+from flytrack_env.quaternion import Scalar
+from flytrack_env.state import BATTERY_EMPTY_V, BATTERY_FULL_V, Drone
+from flytrack_env.tracks import GateFrame
+
+
+class Entry(NamedTuple):
+    """Rows of the observation that belong together: value = quantity / scale, within +-limit."""
+
+    name: str
+    size: int
+    frame: str
+    unit: str
+    scale: float
+    limit: float
+
+
+BATTERY_MIDDLE_V = 0.5 * (BATTERY_FULL_V + BATTERY_EMPTY_V)
+
+OBSERVATION = (
+    Entry("position relative to the gate's centre", 3, "gate", "m", 10.0, 10.0),
+    Entry("velocity", 3, "gate", "m/s", 10.0, 10.0),
+    Entry("rotation matrix body to gate, row by row", 9, "gate", "1", 1.0, 1.0),
+    Entry("angular velocity", 3, "body", "rad/s", 10.0, 10.0),
+    Entry("previous applied action: roll, pitch, yaw, thrust", 4, "body", "1", 1.0, 1.0),
+    Entry("battery voltage above 23 V", 1, "-", "V", 1.0, 1.0),
+    Entry("next gate's centre relative to the gate's centre", 3, "gate", "m", 10.0, 10.0),
+    Entry("next gate's direction of flight", 3, "gate", "1", 1.0, 1.0),
+)
+OBSERVATION_SIZE = sum(entry.size for entry in OBSERVATION)
+OBSERVATION_LIMIT = np.concatenate(
+    [np.full(entry.size, entry.limit, np.float32) for entry in OBSERVATION]
+)
+
+
+def observe_race(drone: Drone, gate: GateFrame, next_gate: GateFrame) -> jax.Array:
+    """Return the observation of a drone before ``gate``, shape (OBSERVATION_SIZE,), float32."""
+    left = compute_once(gate.left())
+    frame = (gate.forward, left, gate.up)
+    body_axes = drone.quat.axes()
+    quantities: list[tuple[Scalar, ...]] = [
+        tuple(axis.dot(drone.pos_w - gate.centre) for axis in frame),
+        tuple(axis.dot(drone.vel_w) for axis in frame),
+        tuple(axis.dot(body_axis) for axis in frame for body_axis in body_axes),
+        drone.rates_b,
+        drone.applied,
+        (drone.battery_v - BATTERY_MIDDLE_V,),
+        tuple(axis.dot(next_gate.centre - gate.centre) for axis in frame),
+        tuple(axis.dot(next_gate.forward) for axis in frame),
+    ]
+    values = [
+        jnp.clip(value * (1.0 / entry.scale), -entry.limit, entry.limit)
+        for entry, group in zip(OBSERVATION, quantities, strict=True)
+        for value in group
+    ]
+    return jnp.stack(values)

@@ -1,0 +1,63 @@
+"""Cheap named random draws for resets.
+
+Sampling a reset happens in every step of every environment (auto-reset selects it where an
+episode ended), so it must cost a few integer operations a draw. One word is drawn from the JAX key;
+every named draw hashes that word with the name. Not for cryptography, and not for drawing more
+than a few dozen numbers per word.
+"""
+
+import zlib
+
+import jax
+import jax.numpy as jnp
+
+from flytrack_env.quaternion import Scalar
+
+UNIFORM_BITS = 24  # the mantissa of a float32
+GOLDEN_RATIO_32 = 0x9E3779B9
+
+
+def mix(word: jax.Array) -> jax.Array:
+    """Return a well-mixed uint32 of a uint32: an invertible two-multiply integer hash.
+
+    Source: C. Wellons, "Prospecting for hash functions" (2018), the constants of ``lowbias32``.
+    """
+    word = (word ^ (word >> 16)) * jnp.uint32(0x7FEB352D)
+    word = (word ^ (word >> 15)) * jnp.uint32(0x846CA68B)
+    return word ^ (word >> 16)
+
+
+def seed_of(key: jax.Array) -> jax.Array:
+    """Return one random word, uint32 scalar, of a JAX key (typed, or the legacy array of words).
+
+    The words of a key are hashed directly: keys come from a generator already, and its rounds would
+    cost as much as the rest of the step.
+    """
+    is_typed = jnp.issubdtype(key.dtype, jax.dtypes.prng_key)
+    words = jax.random.key_data(key) if is_typed else key
+    seed = jnp.uint32(GOLDEN_RATIO_32)
+    for i in range(words.shape[-1]):
+        seed = mix(seed ^ words[i])
+    return seed
+
+
+def seeds_of(key: jax.Array, count: int) -> jax.Array:
+    """Return ``count`` random words, uint32, of a single JAX key: one per environment of a batch."""
+    return mix(seed_of(key) + jnp.arange(count, dtype=jnp.uint32) * jnp.uint32(GOLDEN_RATIO_32))
+
+
+class Draws:
+    """Named uniform draws that all derive from one random word, a uint32 scalar."""
+
+    def __init__(self, seed: jax.Array):
+        self.seed = seed
+
+    def uniform(self, name: str, low: Scalar, high: Scalar) -> jax.Array:
+        """Return a float32 in [low, high); the same name gives the same number."""
+        word = mix(self.seed ^ jnp.uint32(zlib.crc32(name.encode())))
+        unit = (word >> (32 - UNIFORM_BITS)).astype(jnp.float32) * (2.0**-UNIFORM_BITS)
+        return low + (high - low) * unit
+
+    def index(self, name: str, count: int) -> jax.Array:
+        """Return an int32 in [0, count)."""
+        return jnp.minimum(self.uniform(name, 0.0, count).astype(jnp.int32), count - 1)

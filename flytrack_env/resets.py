@@ -1,0 +1,133 @@
+"""Where episodes start: at the start pose with noise, or anywhere along the course."""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from flytrack_env.dynamics import ModelParameters, body_rates
+from flytrack_env.fusion import compute_once
+from flytrack_env.quaternion import Quaternion, Scalar, Vec3
+from flytrack_env.randomness import Draws
+from flytrack_env.state import BATTERY_FULL_V, Action, Drone
+from flytrack_env.tracks import Course
+
+# The last part of a segment is left out: from there the gate could not be reached any more.
+LAST_SEGMENT_FRACTION = 0.8
+
+
+class ResetParams(NamedTuple):
+    """Distribution of starts; every draw is uniform.
+
+    course_fraction: share of the starts that lie along the course; the others are at the start pose.
+    start_*: half ranges around the start pose; the height is only raised, by 0 to start_height_noise.
+    course_offset: half range of the offset from the straight line between two gates, per axis, m.
+    course_speed: speed from 0 to this along that line, m/s, with a sideways part of 20 %.
+    course_tilt_deg: tilt from 0 to this towards any side; the yaw is any.
+    course_stick: half range of the applied rate actions; applied thrust from course_thrust_low/high.
+    *_battery_low_v: battery from this to full.
+    """
+
+    course_fraction: Scalar = 0.8
+    start_position_noise: Scalar = 0.3
+    start_height_noise: Scalar = 0.3
+    start_yaw_noise_deg: Scalar = 15.0
+    start_tilt_noise_deg: Scalar = 5.0
+    start_battery_low_v: Scalar = 23.5
+    course_offset: Scalar = 1.0
+    course_speed: Scalar = 18.0
+    course_tilt_deg: Scalar = 45.0
+    course_stick: Scalar = 0.3
+    course_thrust_low: Scalar = -0.8
+    course_thrust_high: Scalar = 0.2
+    course_battery_low_v: Scalar = 22.2
+
+
+SIDEWAYS_FRACTION = 0.2
+STILL_THRUST = -1.0
+
+
+def sample_start(
+    seed: jax.Array, course: Course, params: ResetParams, model: ModelParameters
+) -> tuple[Drone, jax.Array]:
+    """Return a start (float32 leaves) and the index of the gate to fly first, int32.
+
+    ``seed`` is a uint32 scalar, see ``flytrack_env.randomness``. At the start pose the drone is at
+    rest with its rotors still; on the course it flies from one gate towards the next.
+    """
+    draws = Draws(compute_once(seed))
+    is_on_course = compute_once(draws.uniform("kind", 0.0, 1.0) < params.course_fraction)
+
+    def choose(on_course: Scalar, at_pose: Scalar) -> jax.Array:
+        return jnp.where(is_on_course, on_course, at_pose)
+
+    gate_index = jnp.where(is_on_course, draws.index("gate", course.num_gates), 0)
+    stick = choose(params.course_stick, 0.0)
+    applied = Action(
+        draws.uniform("roll", -stick, stick),
+        draws.uniform("pitch", -stick, stick),
+        draws.uniform("yaw_stick", -stick, stick),
+        draws.uniform(
+            "thrust",
+            choose(params.course_thrust_low, STILL_THRUST),
+            choose(params.course_thrust_high, STILL_THRUST),
+        ),
+    )
+    battery_low_v = choose(params.course_battery_low_v, params.start_battery_low_v)
+    pos_w, vel_w = _position_and_velocity(draws, choose, gate_index, course, params)
+    drone = Drone(
+        pos_w=pos_w,
+        vel_w=vel_w,
+        acc_w=Vec3(0.0, 0.0, 0.0),
+        quat=_attitude(draws, choose, course, params),
+        rates_b=body_rates(applied, model.max_rate),
+        applied=applied,
+        battery_v=draws.uniform("battery", battery_low_v, BATTERY_FULL_V),
+    )
+    return jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32), drone), gate_index
+
+
+Choose = Callable[[Scalar, Scalar], jax.Array]
+
+
+def _position_and_velocity(
+    draws: Draws, choose: Choose, gate_index: jax.Array, course: Course, params: ResetParams
+) -> tuple[Vec3, Vec3]:
+    """Return where the drone starts and how fast, in the world."""
+    before = jnp.where(gate_index == 0, course.num_gates - 1, gate_index - 1)
+    origin = course.gate(before).centre
+    segment = course.gate(gate_index).centre - origin
+    along = compute_once(segment.scale(1.0 / segment.norm()))
+    on_course = origin + segment.scale(draws.uniform("along", 0.0, LAST_SEGMENT_FRACTION))
+    noise = choose(params.course_offset, params.start_position_noise)
+    offset = Vec3(
+        draws.uniform("offset_x", -noise, noise),
+        draws.uniform("offset_y", -noise, noise),
+        draws.uniform(
+            "offset_z",
+            choose(-params.course_offset, 0.0),
+            choose(params.course_offset, params.start_height_noise),
+        ),
+    )
+    speed = draws.uniform("speed", 0.0, choose(params.course_speed, 0.0))
+    sideways = speed * draws.uniform("sideways", -SIDEWAYS_FRACTION, SIDEWAYS_FRACTION)
+    aside = Vec3(-along.y, along.x, 0.0)
+    anchor = Vec3(*map(choose, on_course, course.start_pos_w))
+    return anchor + offset, along.scale(speed) + aside.scale(sideways)
+
+
+def _attitude(draws: Draws, choose: Choose, course: Course, params: ResetParams) -> Quaternion:
+    """Return the attitude: any yaw on the course, about the start pose's otherwise."""
+    yaw_range = choose(jnp.pi, jnp.deg2rad(params.start_yaw_noise_deg))
+    tilt_deg = choose(params.course_tilt_deg, params.start_tilt_noise_deg)
+    yaw, tilt, tilt_heading = compute_once(
+        (
+            draws.uniform("yaw", -yaw_range, yaw_range),
+            draws.uniform("tilt", 0.0, jnp.deg2rad(tilt_deg)),
+            draws.uniform("tilt_heading", -jnp.pi, jnp.pi),
+        )
+    )
+    level = Quaternion(1.0, 0.0, 0.0, 0.0)
+    base = Quaternion(*map(choose, level, course.start_quat))
+    return base.multiply(compute_once(Quaternion.from_yaw_tilt(yaw, tilt, tilt_heading)))

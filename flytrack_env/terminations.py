@@ -1,0 +1,71 @@
+"""Why an episode terminates. The time limit is not here: that is truncation."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from flytrack_env.quaternion import Vec3
+from flytrack_env.state import BATTERY_EMPTY_V, Drone
+from flytrack_env.tracks import Course
+
+
+class Causes(NamedTuple):
+    """Causes of termination, each a bool; several can hold at once.
+
+    crash: the drone touched a gate's frame, or was given an action that is not a number.
+    ground: below the floor of the bounds. out_of_bounds: beyond any other side.
+    missed_gate: crossed the gate's plane outside its frame. battery_empty: below 22 V.
+    """
+
+    crash: jax.Array
+    ground: jax.Array
+    out_of_bounds: jax.Array
+    missed_gate: jax.Array
+    battery_empty: jax.Array
+
+    def any(self) -> jax.Array:
+        """Return whether the episode terminates."""
+        return (
+            self.crash
+            | self.ground
+            | self.out_of_bounds
+            | self.missed_gate
+            | self.battery_empty
+        )
+
+
+def is_below_ground(pos_w: Vec3, course: Course) -> jax.Array:
+    """Return whether a position is below the floor of the bounds."""
+    return pos_w.z < course.bounds_low.z
+
+
+def is_out_of_bounds(pos_w: Vec3, course: Course) -> jax.Array:
+    """Return whether a position is beyond the walls or the ceiling, or is not a number."""
+    low, high = course.bounds_low, course.bounds_high
+    is_inside = (
+        (pos_w.x >= low.x)
+        & (pos_w.x <= high.x)
+        & (pos_w.y >= low.y)
+        & (pos_w.y <= high.y)
+        & (pos_w.z <= high.z)
+    )
+    return ~is_inside
+
+
+def is_battery_empty(drone: Drone) -> jax.Array:
+    """Return whether the battery is below its valid range."""
+    return drone.battery_v < BATTERY_EMPTY_V
+
+
+def find_causes(
+    drone: Drone, course: Course, is_crash: jax.Array, is_missed: jax.Array
+) -> Causes:
+    """Return the causes of termination after a step."""
+    return Causes(
+        crash=jnp.asarray(is_crash),
+        ground=is_below_ground(drone.pos_w, course),
+        out_of_bounds=is_out_of_bounds(drone.pos_w, course),
+        missed_gate=jnp.asarray(is_missed),
+        battery_empty=is_battery_empty(drone),
+    )

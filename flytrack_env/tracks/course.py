@@ -1,0 +1,150 @@
+"""A track as arrays for ``jit``, and the geometry of flying through a gate.
+
+Every gate has a *flight frame*: x along the direction of flight (normal to the gate), z along
+the gate's local z, y to the left. Observations and crossings are expressed in it, so that "in front
+of the gate" means x < 0 whichever side of its local y axis the gate is flown from.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from flytrack_env.fusion import compute_once
+from flytrack_env.quaternion import Quaternion, Scalar, Vec3
+from flytrack_env.tracks.track import Track
+
+
+class GateFrame(NamedTuple):
+    """Flight frame of one gate: centre and axes in the world, half edges in m.
+
+    The leaves are scalars, or arrays of shape (num_gates,) for the gates of a course.
+    """
+
+    centre: Vec3
+    forward: Vec3
+    up: Vec3
+    half_opening: Scalar
+    half_frame: Scalar
+
+    def left(self) -> Vec3:
+        """Return the frame's y axis."""
+        return self.up.cross(self.forward)
+
+    def to_frame(self, vector_w: Vec3) -> Vec3:
+        """Return a world-frame vector's components in the flight frame."""
+        return Vec3(self.forward.dot(vector_w), self.left().dot(vector_w), self.up.dot(vector_w))
+
+
+class Course(NamedTuple):
+    """What the environment needs of a track; a pytree of arrays, so that courses can be batched."""
+
+    gates: GateFrame
+    start_pos_w: Vec3
+    start_quat: Quaternion
+    bounds_low: Vec3
+    bounds_high: Vec3
+
+    @property
+    def num_gates(self) -> int:
+        """Number of gates of one lap (static)."""
+        return int(np.shape(self.gates.half_opening)[0])
+
+    def gate(self, index: jax.Array) -> GateFrame:
+        """Return the gate of an index in [0, num_gates), as scalars.
+
+        A tree of selects on the bits of the index: on a CPU under ``vmap`` this vectorises,
+        which a gather does not.
+        """
+        bits = [(index & (1 << bit)) != 0 for bit in range((self.num_gates - 1).bit_length())]
+
+        def select(table: jax.Array) -> jax.Array:
+            level = [table[i] for i in range(self.num_gates)]
+            for bit in bits:
+                pairs = [level[i : i + 2] for i in range(0, len(level), 2)]
+                level = [jnp.where(bit, pair[-1], pair[0]) for pair in pairs]
+            return level[0]
+
+        return compute_once(jax.tree.map(select, self.gates))
+
+    def next_index(self, index: jax.Array) -> jax.Array:
+        """Return the index of the gate after this one, laps repeating."""
+        return jnp.where(index + 1 >= self.num_gates, 0, index + 1)
+
+
+class Crossing(NamedTuple):
+    """How a straight segment meets a gate's plane in the direction of flight.
+
+    is_pass, is_frame, is_miss: through the opening, on the frame, outside it; at most one is true.
+    fraction: where on the segment, in [0, 1]; 1 where the plane is not crossed.
+    offset: distance of the crossing from the centre over the free half opening, along the worse
+    of the gate's two axes: 0 at the centre, 1 at the edge.
+    """
+
+    is_pass: jax.Array
+    is_frame: jax.Array
+    is_miss: jax.Array
+    fraction: jax.Array
+    offset: jax.Array
+
+
+def cross_gate(gate: GateFrame, start_w: Vec3, end_w: Vec3, radius: Scalar) -> Crossing:
+    """Return how a drone of that radius (m) flying a straight segment (world, m) meets a gate.
+
+    The point of crossing is interpolated, so the answer does not depend on how a path is cut into
+    segments. A point exactly on the plane counts as beyond it: the segment that ends there crosses,
+    the one that starts there does not. Backwards through the opening is no event; the frame is solid
+    from both sides.
+    """
+    start = gate.to_frame(start_w - gate.centre)
+    end = gate.to_frame(end_w - gate.centre)
+    is_forward = (start.x < 0.0) & (end.x >= 0.0)
+    is_backward = (start.x >= 0.0) & (end.x < 0.0)
+    is_crossing = is_forward | is_backward
+    # The denominator is non-zero wherever the plane is crossed; elsewhere it is not used.
+    travel = jnp.where(is_crossing, end.x - start.x, 1.0)
+    fraction = jnp.where(is_crossing, -start.x / travel, 1.0)
+    across = jnp.abs(start.y + fraction * (end.y - start.y))
+    along = jnp.abs(start.z + fraction * (end.z - start.z))
+    distance = jnp.maximum(across, along)
+    free = gate.half_opening - radius
+    is_within_opening = distance <= free
+    is_within_frame = distance <= gate.half_frame + radius
+    return compute_once(Crossing(
+        is_pass=is_forward & is_within_opening,
+        is_frame=is_crossing & ~is_within_opening & is_within_frame,
+        is_miss=is_forward & ~is_within_frame,
+        fraction=fraction,
+        offset=distance / free,
+    ))
+
+
+def build_course(track: Track) -> Course:
+    """Return a track as arrays, float32: the gates' flight frames, start pose and bounds."""
+
+    def column(rows: list[tuple[float, ...]], index: int) -> np.ndarray:
+        return np.array([row[index] for row in rows], np.float32)
+
+    def vectors(rows: list[tuple[float, ...]]) -> Vec3:
+        return Vec3(*(column(rows, index) for index in range(3)))
+
+    forward, up = [], []
+    for gate in track.gates:
+        w, x, y, z = gate.quaternion
+        local_y = (2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x))
+        forward.append(tuple(gate.direction * component for component in local_y))
+        up.append((2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)))
+    return Course(
+        gates=GateFrame(
+            centre=vectors([gate.position for gate in track.gates]),
+            forward=vectors(forward),
+            up=vectors(up),
+            half_opening=column([(0.5 * gate.opening,) for gate in track.gates], 0),
+            half_frame=column([(0.5 * gate.frame,) for gate in track.gates], 0),
+        ),
+        start_pos_w=Vec3(*map(np.float32, track.start_position)),
+        start_quat=Quaternion(*map(np.float32, track.start_quaternion)),
+        bounds_low=Vec3(*map(np.float32, track.bounds_low)),
+        bounds_high=Vec3(*map(np.float32, track.bounds_high)),
+    )

@@ -1,0 +1,36 @@
+"""A 5-value step for clients written before gymnax 1.0 (PureJaxRL, rejax, JaxMARL's adapter)."""
+
+from functools import partial
+from typing import Any
+
+import jax
+
+
+class LegacyStep:
+    """Wrap an environment so that ``step`` returns obs, state, reward, done, info.
+
+    ``done`` is terminated or truncated; both stay in ``info``, as does ``final_observation``.
+    Survives ``copy.deepcopy`` and ``pickle``.
+    """
+
+    def __init__(self, env: Any):
+        self._env = env
+
+    def __getattr__(self, name: str) -> Any:
+        # Copying and unpickling look attributes up before __init__ has set any.
+        if name == "_env" or (name.startswith("__") and name.endswith("__")):
+            raise AttributeError(name)
+        return getattr(self._env, name)
+
+    @partial(jax.jit, static_argnames=("self",))
+    def reset(self, key: jax.Array, params: Any = None) -> tuple[Any, Any]:
+        """Return observation and state."""
+        return self._env.reset(key, params)
+
+    @partial(jax.jit, static_argnames=("self",))
+    def step(
+        self, key: jax.Array, state: Any, action: Any, params: Any = None
+    ) -> tuple[Any, Any, jax.Array, jax.Array, dict[str, Any]]:
+        """Return observation, state, reward, done and info."""
+        obs, state, reward, terminated, truncated, info = self._env.step(key, state, action, params)
+        return obs, state, reward, terminated | truncated, info
