@@ -1,0 +1,1 @@
+"""Training code that uses FlyTrack through its public names only."""

@@ -8,6 +8,8 @@ from flytrack_env.tracks import Track, TrackError, available_tracks, load_track
 
 register_all()
 
+__version__ = "0.1.0"
+
 __all__ = [
     "EnvParams",
     "EnvState",

@@ -2,14 +2,13 @@
 
 import json
 import math
-import os
-import tempfile
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from flytrack_env.dynamics import ModelParameters
+from flytrack_env.files import write_atomically
 
 MODEL_FILE_VERSION = 1
 SIZES = {
@@ -99,17 +98,3 @@ def save_model(path: str | Path, model: ModelParameters, provenance: dict[str, A
         "provenance": provenance,
     }
     write_atomically(path, (json.dumps(document, indent=2) + "\n").encode())
-
-
-def write_atomically(path: str | Path, content: bytes) -> None:
-    """Write a file under a temporary name and rename it: readers see the old one or the whole new one."""
-    path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-    try:
-        with os.fdopen(handle, "wb") as file:
-            file.write(content)
-        os.replace(temporary, path)
-    except BaseException:
-        os.unlink(temporary)
-        raise

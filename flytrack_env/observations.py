@@ -31,13 +31,13 @@ class Entry(NamedTuple):
 BATTERY_MIDDLE_V = 0.5 * (BATTERY_FULL_V + BATTERY_EMPTY_V)
 
 OBSERVATION = (
-    Entry("position relative to the gate's centre", 3, "gate", "m", 10.0, 10.0),
-    Entry("velocity", 3, "gate", "m/s", 10.0, 10.0),
+    Entry("position relative to the gate's centre", 3, "gate", "m", 3.0, 30.0),
+    Entry("velocity", 3, "gate", "m/s", 5.0, 12.0),
     Entry("rotation matrix body to gate, row by row", 9, "gate", "1", 1.0, 1.0),
-    Entry("angular velocity", 3, "body", "rad/s", 10.0, 10.0),
+    Entry("angular velocity", 3, "body", "rad/s", 5.0, 3.0),
     Entry("previous applied action: roll, pitch, yaw, thrust", 4, "body", "1", 1.0, 1.0),
     Entry("battery voltage above 23 V", 1, "-", "V", 1.0, 1.0),
-    Entry("next gate's centre relative to the gate's centre", 3, "gate", "m", 10.0, 10.0),
+    Entry("next gate's centre relative to the gate's centre", 3, "gate", "m", 5.0, 20.0),
     Entry("next gate's direction of flight", 3, "gate", "1", 1.0, 1.0),
 )
 OBSERVATION_SIZE = sum(entry.size for entry in OBSERVATION)

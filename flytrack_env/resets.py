@@ -24,7 +24,8 @@ class ResetParams(NamedTuple):
     start_*: half ranges around the start pose; the height is only raised, by 0 to start_height_noise.
     course_offset: half range of the offset from the straight line between two gates, per axis, m.
     course_speed: speed from 0 to this along that line, m/s, with a sideways part of 20 %.
-    course_tilt_deg: tilt from 0 to this towards any side; the yaw is any.
+    course_yaw_deg: half range of the yaw about the direction of that line.
+    course_tilt_deg: tilt from 0 to this towards any side.
     course_stick: half range of the applied rate actions; applied thrust from course_thrust_low/high.
     *_battery_low_v: battery from this to full.
     """
@@ -35,9 +36,10 @@ class ResetParams(NamedTuple):
     start_yaw_noise_deg: Scalar = 15.0
     start_tilt_noise_deg: Scalar = 5.0
     start_battery_low_v: Scalar = 23.5
-    course_offset: Scalar = 1.0
-    course_speed: Scalar = 18.0
-    course_tilt_deg: Scalar = 45.0
+    course_offset: Scalar = 0.5
+    course_speed: Scalar = 14.0
+    course_yaw_deg: Scalar = 60.0
+    course_tilt_deg: Scalar = 30.0
     course_stick: Scalar = 0.3
     course_thrust_low: Scalar = -0.8
     course_thrust_high: Scalar = 0.2
@@ -45,6 +47,7 @@ class ResetParams(NamedTuple):
 
 
 SIDEWAYS_FRACTION = 0.2
+VERTICAL_BELOW = 1e-3
 STILL_THRUST = -1.0
 
 
@@ -75,12 +78,15 @@ def sample_start(
         ),
     )
     battery_low_v = choose(params.course_battery_low_v, params.start_battery_low_v)
-    pos_w, vel_w = _position_and_velocity(draws, choose, gate_index, course, params)
+    origin, along, length = _segment(gate_index, course)
+    anchor = origin + along.scale(length * draws.uniform("along", 0.0, LAST_SEGMENT_FRACTION))
+    anchor = Vec3(*map(choose, anchor, course.start_pos_w))
+    heading = Quaternion(*map(choose, _facing(along), course.start_quat))
     drone = Drone(
-        pos_w=pos_w,
-        vel_w=vel_w,
+        pos_w=anchor + _offset(draws, choose, params),
+        vel_w=_velocity(draws, choose, along, params),
         acc_w=Vec3(0.0, 0.0, 0.0),
-        quat=_attitude(draws, choose, course, params),
+        quat=heading.multiply(_turn(draws, choose, params)),
         rates_b=body_rates(applied, model.max_rate),
         applied=applied,
         battery_v=draws.uniform("battery", battery_low_v, BATTERY_FULL_V),
@@ -91,43 +97,53 @@ def sample_start(
 Choose = Callable[[Scalar, Scalar], jax.Array]
 
 
-def _position_and_velocity(
-    draws: Draws, choose: Choose, gate_index: jax.Array, course: Course, params: ResetParams
-) -> tuple[Vec3, Vec3]:
-    """Return where the drone starts and how fast, in the world."""
+def _segment(gate_index: jax.Array, course: Course) -> tuple[Vec3, Vec3, Scalar]:
+    """Return origin, direction and length of the straight line from the gate before to a gate."""
     before = jnp.where(gate_index == 0, course.num_gates - 1, gate_index - 1)
     origin = course.gate(before).centre
     segment = course.gate(gate_index).centre - origin
-    along = compute_once(segment.scale(1.0 / segment.norm()))
-    on_course = origin + segment.scale(draws.uniform("along", 0.0, LAST_SEGMENT_FRACTION))
+    length = segment.norm()
+    return compute_once((origin, segment.scale(1.0 / length), length))
+
+
+def _facing(direction: Vec3) -> Quaternion:
+    """Return the level attitude that faces along a direction, the world's x if it is vertical."""
+    horizontal = Vec3(direction.x, direction.y, 0.0).norm()
+    is_vertical = horizontal < VERTICAL_BELOW
+    cosine = jnp.where(is_vertical, 1.0, direction.x / jnp.where(is_vertical, 1.0, horizontal))
+    # Half-angle formulas; rounding can put the cosine just beyond 1.
+    w = jnp.sqrt(jnp.maximum(0.5 * (1.0 + cosine), 0.0))
+    z = jnp.sqrt(jnp.maximum(0.5 * (1.0 - cosine), 0.0))
+    return compute_once(Quaternion(w, 0.0, 0.0, jnp.where(direction.y < 0.0, -z, z)))
+
+
+def _offset(draws: Draws, choose: Choose, params: ResetParams) -> Vec3:
+    """Return the offset from the line or the start pose, m."""
     noise = choose(params.course_offset, params.start_position_noise)
-    offset = Vec3(
+    highest = choose(params.course_offset, params.start_height_noise)
+    return Vec3(
         draws.uniform("offset_x", -noise, noise),
         draws.uniform("offset_y", -noise, noise),
-        draws.uniform(
-            "offset_z",
-            choose(-params.course_offset, 0.0),
-            choose(params.course_offset, params.start_height_noise),
-        ),
+        draws.uniform("offset_z", choose(-params.course_offset, 0.0), highest),
     )
+
+
+def _velocity(draws: Draws, choose: Choose, along: Vec3, params: ResetParams) -> Vec3:
+    """Return the velocity: along the line with a part to its side, m/s; 0 at the start pose."""
     speed = draws.uniform("speed", 0.0, choose(params.course_speed, 0.0))
     sideways = speed * draws.uniform("sideways", -SIDEWAYS_FRACTION, SIDEWAYS_FRACTION)
-    aside = Vec3(-along.y, along.x, 0.0)
-    anchor = Vec3(*map(choose, on_course, course.start_pos_w))
-    return anchor + offset, along.scale(speed) + aside.scale(sideways)
+    return along.scale(speed) + Vec3(-along.y, along.x, 0.0).scale(sideways)
 
 
-def _attitude(draws: Draws, choose: Choose, course: Course, params: ResetParams) -> Quaternion:
-    """Return the attitude: any yaw on the course, about the start pose's otherwise."""
-    yaw_range = choose(jnp.pi, jnp.deg2rad(params.start_yaw_noise_deg))
-    tilt_deg = choose(params.course_tilt_deg, params.start_tilt_noise_deg)
-    yaw, tilt, tilt_heading = compute_once(
+def _turn(draws: Draws, choose: Choose, params: ResetParams) -> Quaternion:
+    """Return the yaw and tilt away from level flight straight ahead."""
+    yaw = jnp.deg2rad(choose(params.course_yaw_deg, params.start_yaw_noise_deg))
+    tilt = jnp.deg2rad(choose(params.course_tilt_deg, params.start_tilt_noise_deg))
+    angles = compute_once(
         (
-            draws.uniform("yaw", -yaw_range, yaw_range),
-            draws.uniform("tilt", 0.0, jnp.deg2rad(tilt_deg)),
+            draws.uniform("yaw", -yaw, yaw),
+            draws.uniform("tilt", 0.0, tilt),
             draws.uniform("tilt_heading", -jnp.pi, jnp.pi),
         )
     )
-    level = Quaternion(1.0, 0.0, 0.0, 0.0)
-    base = Quaternion(*map(choose, level, course.start_quat))
-    return base.multiply(compute_once(Quaternion.from_yaw_tilt(yaw, tilt, tilt_heading)))
+    return compute_once(Quaternion.from_yaw_tilt(*angles))

@@ -30,7 +30,7 @@ class RewardWeights(NamedTuple):
     """Weight of each term; the names are those of the functions in ``TERMS``."""
 
     progress: Scalar = 0.2
-    gate_pass: Scalar = 0.2
+    gate_pass: Scalar = 0.5
     off_centre: Scalar = -0.2
     termination: Scalar = -1.0
     body_rates: Scalar = -4e-5

@@ -1,0 +1,1 @@
+"""The plant that FlyTrack ships as a black box; see README.md."""

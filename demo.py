@@ -1,0 +1,107 @@
+"""The main job on the shipped black box: collect, identify, train from scratch, fly (``make demo``)."""
+
+import argparse
+import json
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import eval_agent
+from baselines.purejaxrl_ppo import Config
+from baselines.purejaxrl_ppo.density import draw_position_density
+from baselines.purejaxrl_ppo.evaluate import fly_many, score
+from baselines.purejaxrl_ppo.train_ppo import train_policy
+from flytrack_env import blackbox, load_track, save_model
+from flytrack_env.files import write_atomically
+from flytrack_env.rollout import load_rollout
+from flytrack_env.viz_rerun import visualize_state_action_sequence
+from flytrack_sysid import Validation, collect, fit, validate
+
+NUM_LAPS = 3
+NUM_STEPS = 2500
+NUM_EPISODES = 256
+
+
+def identify(black_box: Path, out: Path, seed: int) -> Validation:
+    """Fly the excitation on the black box, fit the minimal model, write it; return its errors."""
+    training, held_out = collect(blackbox.load(black_box), seed).split()
+    identified = fit(training)
+    validation = validate(identified.model, held_out)
+    provenance = {
+        "black_box": black_box.name,
+        "seed": seed,
+        "held_out": "every fourth manoeuvre of each kind",
+        "fit_rms": dict(zip(("roll", "pitch", "yaw", "thrust_n"), identified.rms, strict=True)),
+        "held_out_errors": validation.as_json(),
+    }
+    save_model(out / "model.json", identified.model, provenance)
+    return validation
+
+
+def main() -> None:
+    """Run the job, print lap times, write ``runs/demo``."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--black-box", type=Path, default=eval_agent.SHIPPED_BLACK_BOX)
+    parser.add_argument("--out", type=Path, default=Path("runs/demo"))
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--total-timesteps", type=float, default=Config.total_timesteps)
+    arguments = parser.parse_args()
+    started = time.perf_counter()
+    out, seed = arguments.out, arguments.seed
+    out.mkdir(parents=True, exist_ok=True)
+
+    print(f"1/4 collect and identify: {arguments.black_box}")
+    validation = identify(arguments.black_box, out, seed)
+    for name, mse in validation.mse.items():
+        print(f"    one-step MSE on held-out data, {name}: {mse:.3g}")
+    print("    open, not explained by the minimal model, specific force by speed:")
+    for low, high, rms in validation.open_force_by_speed:
+        print(f"      {low:4.0f} to {high:2.0f} m/s: {rms:.2f} m/s^2")
+
+    print("2/4 train PPO from scratch on the identified model")
+    config = Config(total_timesteps=int(arguments.total_timesteps))
+    checkpoint, _ = train_policy(out, config, seed, model=out / "model.json")
+
+    print("3/4 fly the checkpoint on the black box")
+    flight = eval_agent.fly_on_black_box(checkpoint, arguments.black_box, NUM_STEPS, seed)
+    eval_agent.save_flown(out / "rollout.npy", flight)
+    print(eval_agent.describe(flight, blackbox.DT))
+    env = eval_agent.black_box_env(checkpoint, arguments.black_box)
+    flights = fly_many(
+        env, checkpoint.network, checkpoint.params, seed, NUM_EPISODES, NUM_STEPS, NUM_LAPS
+    )
+    result = score(flights, NUM_LAPS)
+
+    print("4/4 draw")
+    states, actions = load_rollout(out / "rollout.npy")
+    track = load_track(checkpoint.track)
+    draw_position_density(out / "position_density.png", flights.positions(), track)
+    visualize_state_action_sequence(
+        list(zip(states, actions, strict=True)), track.rows(), str(out / "rollout.rrd")
+    )
+    summary: dict[str, Any] = {
+        "seed": seed,
+        "black_box": arguments.black_box.name,
+        "validation": validation.as_json(),
+        "training_steps": checkpoint.meta["steps"],
+        "training_seconds": checkpoint.meta["seconds"],
+        "rollout": {
+            "lap_times_s": np.round(eval_agent.lap_times(flight), 3).tolist(),
+            "gates_passed": int(np.max(flight.gates_passed)),
+            "ended": eval_agent.reason_ended(flight),
+        },
+        "noisy_starts": {"episodes": NUM_EPISODES, "laps": NUM_LAPS, **result._asdict()},
+        "seconds": round(time.perf_counter() - started, 1),
+    }
+    write_atomically(out / "summary.json", (json.dumps(summary, indent=2) + "\n").encode())
+    print(
+        f"{result.success:.1%} of {NUM_EPISODES} noisy starts finish {NUM_LAPS} laps on the black "
+        f"box; first lap {result.first_lap_s:.2f} s, flying lap {result.flying_lap_s:.2f} s"
+    )
+    print(f"written: {out}/ in {summary['seconds']} s")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,310 @@
+"""The simulator against the handout's equations, written a second time in NumPy."""
+
+import inspect
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax.flatten_util import ravel_pytree
+
+from flytrack_env.dynamics import ModelParameters, collective_thrust, nominal_parameters, step
+
+START = np.array([0, 0, 0, 0, 0, 0, 0, 0, 0, 1, 0, 0, 0, 0, 0, 0, 0, 0, 0, -1, 24], float)
+DTS = (0.0005, 0.002, 0.01, 0.05)
+NUM_CASES = 64
+
+
+def double_parameters(**fields: Any) -> ModelParameters:
+    """Return the nominal parameters in double precision, uneven, with some fields replaced."""
+    uneven = ModelParameters(
+        tau=np.array([0.03, 0.05, 0.08, 0.02]),
+        thrust_coeffs=np.array([-9.0, -6.0, 3.1, 0.4, 0.9, 1.1]),
+        max_rate=np.array([600.0, 500.0, 130.0]),
+        m=1.2,
+        g=9.81,
+        battery_drain_v_per_min=1.3,
+    )
+    return uneven._replace(**fields)
+
+
+def handout_step(x: np.ndarray, u: np.ndarray, dt: float, params: ModelParameters) -> np.ndarray:
+    """Return the next state (21,) by the four equations of the handout's task 1, in float64."""
+    position, velocity, q, u_prev, volt = x[0:3], x[3:6], x[9:13], x[16:20], x[20]
+    u_eff = u_prev + (1.0 - np.exp(-dt / params.tau)) * (u - u_prev)
+    omega = np.radians(params.max_rate * u_eff[0:3])
+    left = np.array(
+        [
+            [q[0], -q[1], -q[2], -q[3]],
+            [q[1], q[0], -q[3], q[2]],
+            [q[2], q[3], q[0], -q[1]],
+            [q[3], -q[2], q[1], q[0]],
+        ]
+    )
+    q_next = q + 0.5 * dt * left @ np.concatenate([[0.0], omega])
+    q_next /= np.linalg.norm(q_next)
+    t = u_eff[3]
+    thrust = np.dot(params.thrust_coeffs, [1.0, t, t**2, t**3, volt, t * volt])
+    vector = q[1:]
+    up = np.array([0.0, 0.0, 1.0])
+    axis = up + 2.0 * np.cross(vector, np.cross(vector, up) + q[0] * up)  # Rodrigues, not a matrix
+    acceleration = axis * thrust / params.m - np.array([0.0, 0.0, params.g])
+    v_next = velocity + acceleration * dt
+    p_next = position + velocity * dt + 0.5 * acceleration * dt**2
+    drained = volt - params.battery_drain_v_per_min / 60.0 * dt
+    return np.concatenate([p_next, v_next, acceleration, q_next, omega, u_eff, [drained]])
+
+
+def random_cases(count: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    """Return random states (N, 21) with unit quaternions and actions (N, 4)."""
+    rng = np.random.default_rng(seed)
+    x = rng.normal(scale=5.0, size=(count, 21))
+    x[:, 9:13] = rng.normal(size=(count, 4))
+    x[:, 9:13] /= np.linalg.norm(x[:, 9:13], axis=1, keepdims=True)
+    x[:, 16:20] = rng.uniform(-1.0, 1.0, (count, 4))
+    x[:, 20] = rng.uniform(22.0, 24.0, count)
+    return x, rng.uniform(-1.0, 1.0, (count, 4))
+
+
+step_all = jax.jit(jax.vmap(step, in_axes=(0, 0, None, None)))
+
+
+@jax.jit
+def fly(x: jax.Array, actions: jax.Array, dt: float, params: ModelParameters) -> jax.Array:
+    """Return the states after each of T held actions (T, 4)."""
+
+    def one(x: jax.Array, u: jax.Array) -> tuple[jax.Array, jax.Array]:
+        x = step(x, u, dt, params)
+        return x, x
+
+    return jax.lax.scan(one, x, actions)[1]
+
+
+def test_signature_is_the_handouts() -> None:
+    assert list(inspect.signature(step).parameters) == ["x", "u", "dt", "params"]
+    assert ModelParameters._fields[:5] == ("tau", "thrust_coeffs", "max_rate", "m", "g")
+    assert issubclass(ModelParameters, tuple)
+    # Whatever is behind the five fields has a default.
+    assert set(ModelParameters._fields[5:]) == set(ModelParameters._field_defaults)
+
+
+def test_five_fields_alone_construct_the_model_and_fly() -> None:
+    five = ModelParameters(
+        jnp.full(4, 0.04), jnp.zeros(6).at[0].set(9.80665), jnp.array([618.0, 618.0, 120.0]), 1.0, 9.80665
+    )
+    after = step(jnp.asarray(START, jnp.float32), jnp.zeros(4), 0.01, five)
+    assert after.shape == (21,) and after.dtype == jnp.float32
+    assert float(after[20]) == pytest.approx(24.0 - 0.01 / 60.0, abs=2e-6)
+
+
+def test_nominal_drone_has_no_thrust_at_minus_one_and_the_stated_maximum() -> None:
+    model = nominal_parameters()
+    weight = model.m * model.g
+    for volt, ratio in ((24.0, 3.5), (22.0, 3.1)):
+        assert collective_thrust(-1.0, volt, model.thrust_coeffs) == pytest.approx(0.0, abs=1e-4)
+        full = collective_thrust(1.0, volt, model.thrust_coeffs) / weight
+        assert full == pytest.approx(ratio, abs=0.1)
+    np.testing.assert_array_equal(model.max_rate, [618.0, 618.0, 120.0])
+    assert (model.m, model.g) == (1.0, 9.80665)
+
+
+@pytest.mark.parametrize("dt", DTS)
+def test_agrees_with_the_handouts_equations(dt: float) -> None:
+    params = double_parameters()
+    x, u = random_cases(NUM_CASES)
+    expected = np.stack([handout_step(*case, dt, params) for case in zip(x, u, strict=True)])
+    with jax.enable_x64(True):
+        np.testing.assert_allclose(step_all(x, u, dt, params), expected, rtol=1e-12, atol=1e-12)
+    single = step_all(jnp.asarray(x), jnp.asarray(u), dt, params)
+    assert single.dtype == jnp.float32
+    np.testing.assert_allclose(single, expected, rtol=2e-5, atol=2e-5)
+
+
+def test_vmap_equals_a_loop() -> None:
+    x, u = (jnp.asarray(array) for array in random_cases(8))
+    params = nominal_parameters()
+    loop = jnp.stack([step(x[i], u[i], 0.01, params) for i in range(8)])
+    np.testing.assert_allclose(step_all(x, u, 0.01, params), loop, rtol=1e-6, atol=1e-6)
+
+
+def test_one_compilation_serves_every_dt_and_model() -> None:
+    traces = 0
+
+    @jax.jit
+    def counted(x: jax.Array, u: jax.Array, dt: float, params: ModelParameters) -> jax.Array:
+        nonlocal traces
+        traces += 1
+        return step(x, u, dt, params)
+
+    for dt in DTS:
+        for mass in (0.5, 1.0):
+            model = nominal_parameters()._replace(m=mass)
+            after = counted(START.astype(np.float32), np.zeros(4, np.float32), dt, model)
+            assert float(after[20]) == pytest.approx(24.0 - dt / 60.0, abs=2e-6)
+    assert traces == 1
+
+
+def test_free_fall() -> None:
+    params = double_parameters(thrust_coeffs=np.zeros(6))
+    with jax.enable_x64(True):
+        x = fly(random_cases(1)[0][0], np.zeros((100, 4)), 0.01, params)
+    np.testing.assert_allclose(x[:, 6:9], np.tile([0.0, 0.0, -params.g], (100, 1)), atol=1e-12)
+    fallen = x[-1] - x[0]
+    np.testing.assert_allclose(fallen[3:6], [0.0, 0.0, -params.g * 0.99], atol=1e-12)
+
+
+@pytest.mark.parametrize("volt", [22.0, 23.0, 24.0])
+def test_hover_keeps_the_velocity(volt: float) -> None:
+    model = nominal_parameters()._replace(battery_drain_v_per_min=0.0)
+    c = model.thrust_coeffs.astype(float)
+    roots = np.roots([c[3], c[2], c[1] + c[5] * volt, c[0] + c[4] * volt - model.m * model.g])
+    hover = next(float(r.real) for r in roots if abs(r.imag) < 1e-9 and -1.0 < r.real < 1.0)
+    start = START.copy()
+    start[3:6], start[19], start[20] = (1.0, -2.0, 0.5), hover, volt
+    x = fly(start.astype(np.float32), np.tile([0.0, 0.0, 0.0, hover], (200, 1)), 0.01, model)
+    np.testing.assert_allclose(x[:, 6:9], 0.0, atol=5e-6)
+    np.testing.assert_allclose(x[-1, 3:6], [1.0, -2.0, 0.5], atol=2e-5)
+
+
+def test_quaternion_stays_unit_over_ten_thousand_random_steps() -> None:
+    actions = np.random.default_rng(3).uniform(-1.0, 1.0, (10_000, 4)).astype(np.float32)
+    x = fly(START.astype(np.float32), actions, 0.01, nominal_parameters())
+    np.testing.assert_allclose(np.linalg.norm(x[:, 9:13], axis=1), 1.0, atol=1e-6)
+    assert np.isfinite(x).all()
+
+
+def test_zero_rate_command_keeps_the_attitude() -> None:
+    start = random_cases(1, seed=4)[0][0]
+    start[16:20] = (0.0, 0.0, 0.0, 0.3)
+    x = fly(start.astype(np.float32), np.tile([0, 0, 0, 1.0], (1000, 1)), 0.01, nominal_parameters())
+    np.testing.assert_allclose(x[-1, 9:13], start[9:13], atol=1e-6)
+    np.testing.assert_array_equal(x[:, 13:16], 0.0)
+
+
+def attitude_error(start_stick: float, num_steps: int) -> float:
+    """Return the angle error in rad after 0.4 s at full roll stick, in ``num_steps`` steps."""
+    params = double_parameters()
+    start = START.copy()
+    start[16] = start_stick
+    x = fly(start, np.tile([1.0, 0.0, 0.0, -1.0], (num_steps, 1)), 0.4 / num_steps, params)[-1]
+    tau, full = params.tau[0], np.radians(params.max_rate[0])
+    exact = full * (0.4 - (1.0 - start_stick) * tau * (1.0 - np.exp(-0.4 / tau)))
+    angle = 2.0 * np.arctan2(x[10], x[9])
+    return abs((angle - exact + np.pi) % (2.0 * np.pi) - np.pi)
+
+
+def velocity_error(start_thrust: float, num_steps: int) -> float:
+    """Return the error of the climb rate in m/s after 0.4 s of full thrust (thrust linear in u)."""
+    params = double_parameters(thrust_coeffs=np.array([9.0, 9.0, 0.0, 0.0, 0.0, 0.0]))
+    start = START.copy()
+    start[19] = start_thrust
+    x = fly(start, np.tile([0.0, 0.0, 0.0, 1.0], (num_steps, 1)), 0.4 / num_steps, params)[-1]
+    tau = params.tau[3]
+    mean_thrust = 0.4 - (1.0 - start_thrust) * tau * (1.0 - np.exp(-0.4 / tau))
+    return abs(float(x[5]) - ((9.0 * 0.4 + 9.0 * mean_thrust) / params.m - params.g * 0.4))
+
+
+@pytest.mark.parametrize(
+    ("error", "applied", "ratio"),
+    [
+        pytest.param(attitude_error, 0.0, 2.0, id="attitude, changing rates: first order"),
+        pytest.param(attitude_error, 1.0, 4.0, id="attitude, constant rates: second order"),
+        pytest.param(velocity_error, -1.0, 2.0, id="velocity, changing thrust: first order"),
+    ],
+)
+def test_halving_the_time_step_divides_the_error(error: Any, applied: float, ratio: float) -> None:
+    with jax.enable_x64(True):
+        errors = [error(applied, num_steps) for num_steps in (200, 400, 800)]
+    for coarse, fine in zip(errors, errors[1:], strict=False):
+        assert coarse / fine == pytest.approx(ratio, rel=0.05)
+
+
+@pytest.mark.parametrize("num_steps", [1, 2, 7, 50])
+def test_translation_is_exact_for_a_constant_acceleration(num_steps: int) -> None:
+    params = double_parameters(thrust_coeffs=np.array([15.0, 0, 0, 0, 0, 0]))
+    start = START.copy()
+    start[0:6] = (1.0, 2.0, 3.0, -4.0, 5.0, 6.0)
+    half = np.deg2rad(40.0) / 2.0
+    start[9:13] = (np.cos(half), 0.0, np.sin(half), 0.0)
+    with jax.enable_x64(True):
+        x = fly(start, np.zeros((num_steps, 4)), 0.5 / num_steps, params)[-1]
+    tilt = np.array([np.sin(2 * half), 0.0, np.cos(2 * half)])
+    acceleration = tilt * 15.0 / params.m - np.array([0.0, 0.0, params.g])
+    velocity = start[3:6] + 0.5 * acceleration
+    np.testing.assert_allclose(x[3:6], velocity, atol=1e-10)
+    position = start[0:3] + 0.5 * start[3:6] + 0.125 * acceleration
+    np.testing.assert_allclose(x[0:3], position, atol=1e-10)
+
+
+@pytest.mark.parametrize("dt", [1e-4, 0.01, 0.3, 10.0])
+def test_lag_of_two_half_steps_is_that_of_one(dt: float) -> None:
+    params = double_parameters()
+    x, u = (array[0] for array in random_cases(1))
+    with jax.enable_x64(True):
+        whole = fly(x, u[None], dt, params)[-1]
+        halves = fly(x, np.stack([u, u]), dt / 2, params)[-1]
+    np.testing.assert_allclose(halves[16:20], whole[16:20], atol=1e-14)
+    assert not np.allclose(whole[16:20], x[16:20], atol=1e-6)
+
+
+@pytest.mark.parametrize(("is_double", "tolerance"), [(True, 1e-9), (False, 0.01)])
+def test_battery_loses_one_volt_per_minute(is_double: bool, tolerance: float) -> None:
+    with jax.enable_x64(is_double):
+        start = jnp.asarray(START, float if is_double else jnp.float32)
+        x = fly(start, jnp.zeros((6000, 4), start.dtype), 0.01, nominal_parameters())
+    assert float(x[-1, 20]) == pytest.approx(23.0, abs=tolerance)
+
+
+def numeric_jacobian(function: Any, vector: np.ndarray, width: float = 1e-6) -> np.ndarray:
+    """Return the central-difference Jacobian (M, N) of a function of a vector (N,)."""
+    shifts = width * np.eye(vector.size)
+    return np.stack([(function(vector + s) - function(vector - s)) / (2 * width) for s in shifts], -1)
+
+
+@pytest.mark.parametrize("differentiate", [jax.jacfwd, jax.jacrev])
+def test_gradients_equal_finite_differences(differentiate: Any) -> None:
+    with jax.enable_x64(True):
+        flat, unravel = ravel_pytree(double_parameters())
+
+        @jax.jit
+        def packed(vector: jax.Array) -> jax.Array:
+            x, u, rest = jnp.split(vector, [21, 25])
+            return step(x, u, rest[0], unravel(rest[1:]))
+
+        jacobian = jax.jit(differentiate(packed))
+        for x, u in zip(*random_cases(3, seed=5), strict=True):
+            vector = np.concatenate([x, u, [0.02], flat])
+            numeric = numeric_jacobian(packed, vector)
+            np.testing.assert_allclose(jacobian(vector), numeric, rtol=1e-5, atol=1e-5)
+    # Everything matters: no column but those of the old acceleration and rates is zero.
+    unused = {*range(6, 9), *range(13, 16)}
+    assert set(np.flatnonzero(~np.abs(numeric).any(axis=0)).tolist()) == unused
+
+
+def test_gradients_are_finite_at_the_handouts_start() -> None:
+    arguments = (START.astype(np.float32), np.zeros(4, np.float32), 0.01, nominal_parameters())
+    jacobians = jax.jit(jax.jacrev(step, argnums=(0, 1, 2, 3)))(*arguments)
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(jacobians))
+
+
+@pytest.mark.parametrize(
+    ("x_shape", "u_shape", "name"),
+    [
+        ((20,), (4,), "x"),
+        ((22,), (4,), "x"),
+        ((1, 21), (4,), "x"),
+        ((), (4,), "x"),
+        ((21,), (3,), "action"),
+        ((21,), (5,), "action"),
+        ((21,), (4, 1), "action"),
+        ((21,), (), "action"),
+    ],
+)
+@pytest.mark.parametrize("is_jitted", [False, True])
+def test_wrong_shapes_are_refused(
+    x_shape: tuple[int, ...], u_shape: tuple[int, ...], name: str, is_jitted: bool
+) -> None:
+    function = jax.jit(step) if is_jitted else step
+    with pytest.raises(ValueError, match=rf"^{name}: found shape .* expected"):
+        function(np.zeros(x_shape), np.zeros(u_shape), 0.01, nominal_parameters())

@@ -1,0 +1,590 @@
+"""The environment as a gymnax client sees it: episodes, flags, observations, laps, gradients."""
+
+import copy
+import pickle
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from flytrack_env.env import EnvParams, EnvState, FlyTrack
+from flytrack_env.model_file import ModelFileError
+from flytrack_env.observations import OBSERVATION, OBSERVATION_SIZE
+from flytrack_env.state import Action, pack
+from flytrack_env.tracks import TrackError, load_track
+from flytrack_env.wrappers import LegacyStep
+
+CAUSES = ("crash", "ground", "out_of_bounds", "missed_gate", "battery_empty")
+INFO_KEYS = {
+    *CAUSES,
+    "gates_passed",
+    "laps",
+    "lap_completed",
+    "lap_time_s",
+    "gate_distance_m",
+    "terminated",
+    "truncated",
+    "final_observation",
+}
+SPEED = 20.0
+YAW_180 = (0.0, 0.0, 0.0, 1.0)
+
+
+def stack(trees: list[Any]) -> Any:
+    """Return a batch of equal trees."""
+    return jax.tree.map(lambda *leaves: jnp.stack([jnp.asarray(x) for x in leaves]), *trees)
+
+
+def assert_close(a: Any, b: Any, tolerance: float = 1e-5) -> None:
+    """Compare two trees leaf by leaf."""
+    assert jax.tree.structure(a) == jax.tree.structure(b)
+    for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True):
+        np.testing.assert_allclose(x, y, rtol=tolerance, atol=tolerance)
+
+
+@pytest.fixture(scope="module")
+def step_all(env: FlyTrack) -> Callable[..., Any]:
+    """``env.step`` for a batch."""
+    return jax.jit(jax.vmap(env.step, in_axes=(0, 0, 0, None)))
+
+
+@pytest.fixture(scope="module")
+def step_env_all(env: FlyTrack) -> Callable[..., Any]:
+    """``env.step_env`` for a batch."""
+    return jax.jit(jax.vmap(env.step_env, in_axes=(None, 0, 0, None)))
+
+
+@pytest.fixture(scope="module")
+def flight(env: FlyTrack, params: EnvParams, reset_many: Any, rollout: Any) -> Any:
+    """States and outputs of 256 random flights of 120 steps, extreme sticks among them."""
+    rng = np.random.default_rng(0)
+    actions = rng.uniform(-1.0, 1.0, (120, 256, 4)).astype(np.float32)
+    actions[:, :64] = np.sign(actions[0, :64])
+    actions[:, 64:96] = np.sign(actions[:, 64:96]) * np.float32(np.inf)
+    actions[:, 96:112] *= 1e30
+    _, states = reset_many(jax.random.split(jax.random.key(1), 256), params)
+    return rollout(env, jax.random.key(2), states, jnp.asarray(actions), params)
+
+
+# --- The protocol -------------------------------------------------------------------------------
+
+
+def test_step_returns_six_values_of_the_stated_types(
+    env: FlyTrack, params: EnvParams, reset_many: Any, step_all: Any
+) -> None:
+    keys = jax.random.split(jax.random.key(0), 3)
+    observation, states = reset_many(keys, params)
+    assert observation.shape == (3, OBSERVATION_SIZE) and observation.dtype == jnp.float32
+    outputs = step_all(keys, states, jnp.zeros((3, 4)), params)
+    assert len(outputs) == 6
+    observation, next_states, reward, terminated, truncated, info = outputs
+    assert observation.shape == (3, OBSERVATION_SIZE) and observation.dtype == jnp.float32
+    assert reward.shape == (3,) and reward.dtype == jnp.float32
+    assert terminated.dtype == truncated.dtype == jnp.bool_
+    assert set(info) == INFO_KEYS
+    assert info["final_observation"].shape == observation.shape
+    for before, after in zip(jax.tree.leaves(states), jax.tree.leaves(next_states), strict=True):
+        assert (before.shape, before.dtype) == (after.shape, after.dtype)
+
+
+def test_default_parameters_are_used_when_none_are_given(env: FlyTrack, params: EnvParams) -> None:
+    key = jax.random.key(3)
+    observation, state = env.reset(key)
+    assert_close((observation, state), env.reset(key, params), 0.0)
+    assert_close(env.step(key, state, jnp.zeros(4)), env.step(key, state, jnp.zeros(4), params))
+
+
+def test_spaces_are_finite_and_contain_every_observation(
+    env: FlyTrack, params: EnvParams, flight: Any
+) -> None:
+    space, actions = env.observation_space(params), env.action_space(params)
+    assert space.shape == (OBSERVATION_SIZE,) and actions.shape == (4,)
+    assert np.isfinite(space.low).all() and np.isfinite(space.high).all()
+    assert env.num_actions == 4
+    assert actions.contains(actions.sample(jax.random.key(0)))
+    observation, *_, info = flight[1]
+    for array in (observation, info["final_observation"]):
+        assert np.isfinite(array).all()
+        assert jax.jit(jax.vmap(space.contains))(array.reshape(-1, OBSERVATION_SIZE)).all()
+
+
+def test_flight_ends_in_many_ways_and_stays_finite(flight: Any) -> None:
+    _, (_, states, reward, terminated, _, info) = flight
+    assert int(terminated.sum()) > 50
+    assert sum(bool(info[cause].any()) for cause in CAUSES) >= 3
+    assert int(info["gates_passed"].max()) >= 1
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves((states, reward)))
+
+
+def test_auto_reset_leaves_nothing_behind_in_a_flight(flight: Any) -> None:
+    _, (observation, states, _, terminated, truncated, info) = flight
+    done = np.asarray(terminated | truncated)
+    race = states.race
+    for leaf in (states.time, race.gates_passed, race.laps, race.lap_start_s, race.lap_time_s):
+        assert not np.asarray(leaf)[done].any()
+    np.testing.assert_array_equal(
+        np.asarray(observation)[~done], np.asarray(info["final_observation"])[~done]
+    )
+    assert (np.asarray(observation)[done] != np.asarray(info["final_observation"])[done]).any(1).all()
+
+
+def test_info_belongs_to_the_step_not_to_the_reset(
+    env: FlyTrack, params: EnvParams, flight: Any
+) -> None:
+    before, (_, states, _, terminated, truncated, info) = flight
+    done = np.asarray(terminated | truncated)
+    causes = np.stack([np.asarray(info[cause]) for cause in CAUSES])
+    np.testing.assert_array_equal(causes.any(axis=0), terminated)
+    np.testing.assert_array_equal(info["terminated"], terminated)
+    np.testing.assert_array_equal(info["truncated"], truncated)
+    # An ended episode still shows its own count.
+    assert (np.asarray(info["gates_passed"]) >= np.asarray(before.race.gates_passed)).all()
+    assert (np.asarray(info["gates_passed"])[done] > 0).any()
+    centre = np.stack([np.asarray(x)[~done] for x in states.race.gate.centre])
+    position = np.stack([np.asarray(x)[~done] for x in states.plant.pos_w])
+    distance = np.linalg.norm(position - centre, axis=0)
+    np.testing.assert_allclose(np.asarray(info["gate_distance_m"])[~done], distance, atol=1e-4)
+
+
+def test_same_inputs_give_the_same_outputs(
+    env: FlyTrack, params: EnvParams, reset_many: Any, step_all: Any
+) -> None:
+    keys = jax.random.split(jax.random.key(4), 3)
+    first, again = reset_many(keys, params), reset_many(keys, params)
+    assert_close(first, again, 0.0)
+    actions = jnp.full((3, 4), 0.3)
+    assert_close(step_all(keys, first[1], actions, params), step_all(keys, again[1], actions, params), 0.0)
+
+
+def test_without_jit_the_step_is_the_same(env: FlyTrack, params: EnvParams) -> None:
+    key, action = jax.random.key(5), jnp.array([0.2, -0.4, 0.6, 0.1])
+    state = env.reset(key, params)[1]
+    jitted = env.step(key, state, action, params)
+    with jax.disable_jit():
+        assert_close(env.step(key, state, action, params), jitted, 1e-5)
+
+
+def test_parameters_can_differ_between_environments(
+    env: FlyTrack, params: EnvParams, reset_many: Any
+) -> None:
+    _, states = reset_many(jax.random.split(jax.random.key(6), 3), params)
+    masses = jnp.array([0.5, 1.0, 2.0])
+    batched = params.replace(model=params.model._replace(m=masses))
+    axes = jax.tree.map(lambda _: None, params).replace(
+        model=jax.tree.map(lambda _: None, params.model)._replace(m=0)
+    )
+    same = jax.tree.map(lambda leaf: jnp.stack([leaf[0]] * 3), states)
+    step = jax.jit(jax.vmap(env.step_env, in_axes=(None, 0, None, axes)))
+    after = step(None, same, jnp.zeros(4), batched)[1].plant
+    weightless = np.stack([np.asarray(after.acc_w.x), np.asarray(after.acc_w.y)])
+    np.testing.assert_allclose(weightless * np.asarray(masses), weightless[:, 1:2].repeat(3, 1), rtol=1e-4)
+
+
+# --- Ends of episodes ---------------------------------------------------------------------------
+
+# Position, velocity, extra fields of the drone, steps already flown, action; causes; truncated.
+IN_FRONT = (12.55, 2.0, 1.35)
+FAST = (-10.0, 0.0, 0.0)
+ZERO = (0.0, 0.0, 0.0, 0.0)
+NAN = float("nan")
+ENDS = {
+    "flies on": ((15.0, 2.0, 1.35), FAST, {}, 100, ZERO, set(), False),
+    "passes": (IN_FRONT, FAST, {}, 100, ZERO, set(), False),
+    "frame": ((12.55, 3.0, 1.35), FAST, {}, 100, ZERO, {"crash"}, False),
+    "frame above": ((12.55, 2.0, 2.4), FAST, {}, 100, ZERO, {"crash"}, False),
+    "missed": ((12.55, 4.0, 1.35), FAST, {}, 100, ZERO, {"missed_gate"}, False),
+    "ground": ((15.0, 2.0, 0.01), (0.0, 0.0, -5.0), {}, 100, ZERO, {"ground"}, False),
+    "wall +x": ((25.49, 2.0, 1.0), (5.0, 0.0, 0.0), {}, 100, ZERO, {"out_of_bounds"}, False),
+    "wall -x": ((-2.49, 9.0, 1.0), (-5.0, 0.0, 0.0), {}, 100, ZERO, {"out_of_bounds"}, False),
+    "wall +y": ((15.0, 34.99, 1.0), (0.0, 5.0, 0.0), {}, 100, ZERO, {"out_of_bounds"}, False),
+    "wall -y": ((15.0, -2.99, 1.0), (0.0, -5.0, 0.0), {}, 100, ZERO, {"out_of_bounds"}, False),
+    "ceiling": ((15.0, 2.0, 6.34), (0.0, 0.0, 5.0), {}, 100, ZERO, {"out_of_bounds"}, False),
+    "corner": ((25.49, 2.0, 0.01), (9.0, 0, -9.0), {}, 100, ZERO, {"ground", "out_of_bounds"}, False),
+    "battery": ((15.0, 2.0, 1.35), FAST, {"battery_v": 22.0001}, 9, ZERO, {"battery_empty"}, False),
+    "low battery": ((15.0, 2.0, 1.35), FAST, {"battery_v": 22.01}, 9, ZERO, set(), False),
+    "nan roll": ((15.0, 2.0, 1.35), FAST, {}, 100, (NAN, 0.0, 0.0, 0.0), {"crash"}, False),
+    "nan thrust": ((15.0, 2.0, 1.35), FAST, {}, 100, (0.0, 0.0, 0.0, NAN), {"crash"}, False),
+    "time limit": ((15.0, 2.0, 1.35), FAST, {}, 999, ZERO, set(), True),
+    "one before": ((15.0, 2.0, 1.35), FAST, {}, 998, ZERO, set(), False),
+    "frame at time limit": ((12.55, 3.0, 1.35), FAST, {}, 999, ZERO, {"crash"}, True),
+    "pass at time limit": (IN_FRONT, FAST, {}, 999, ZERO, set(), True),
+}
+
+
+@pytest.fixture(scope="module")
+def ends(env: FlyTrack, params: EnvParams, make_drone: Any, step_all: Any) -> tuple[Any, ...]:
+    """One step of every row of ``ENDS`` from a race that has gone on for a while."""
+    states, actions = [], []
+    for position, velocity, fields, time, action, _, _ in ENDS.values():
+        fields = {name: jnp.float32(value) for name, value in fields.items()}
+        state = env.begin(make_drone(position, velocity, **fields), 0, params)
+        race = state.race._replace(
+            gates_passed=jnp.int32(8),
+            laps=jnp.int32(1),
+            lap_start_s=jnp.float32(0.7),
+            lap_time_s=jnp.float32(0.7),
+        )
+        states.append(state._replace(race=race, time=jnp.int32(time)))
+        actions.append(action)
+    states, actions = stack(states), jnp.array(actions, jnp.float32)
+    keys = jax.random.split(jax.random.key(7), len(ENDS))
+    return keys, states, actions, step_all(keys, states, actions, params)
+
+
+@pytest.mark.parametrize("name", ENDS)
+def test_every_end_has_its_own_cause_and_flags(name: str, ends: tuple[Any, ...]) -> None:
+    row = list(ENDS).index(name)
+    *_, causes, is_truncated = ENDS[name]
+    _, _, _, terminated, truncated, info = ends[3]
+    assert {cause for cause in CAUSES if bool(info[cause][row])} == causes
+    assert bool(terminated[row]) is bool(causes)
+    assert bool(truncated[row]) is is_truncated
+
+
+def test_ended_episodes_begin_as_reset_does(
+    params: EnvParams, reset_many: Any, ends: tuple[Any, ...]
+) -> None:
+    keys, _, _, (observation, states, _, terminated, truncated, info) = ends
+    done = np.asarray(terminated | truncated)
+    assert (np.asarray(states.race.laps)[~done] == 1).all()
+    fresh_observation, fresh = reset_many(keys, params)
+    for leaf, expected in zip(jax.tree.leaves(states), jax.tree.leaves(fresh), strict=True):
+        np.testing.assert_allclose(np.asarray(leaf)[done], np.asarray(expected)[done], atol=1e-5)
+    np.testing.assert_allclose(
+        np.asarray(observation)[done], np.asarray(fresh_observation)[done], atol=1e-5
+    )
+    for leaf in (states.time, states.race.gates_passed, states.race.laps):
+        assert not np.asarray(leaf)[done].any()
+    for leaf in (states.race.lap_start_s, states.race.lap_time_s):
+        assert not np.asarray(leaf)[done].any()
+
+
+def test_final_observation_is_the_one_before_the_reset(
+    env: FlyTrack, params: EnvParams, step_env_all: Any, ends: tuple[Any, ...]
+) -> None:
+    _, states, actions, (observation, _, reward, terminated, truncated, info) = ends
+    before_reset, _, rewards, flags, _ = step_env_all(None, states, actions, params)
+    assert np.isfinite(info["final_observation"]).all() and np.isfinite(reward).all()
+    np.testing.assert_allclose(info["final_observation"], before_reset, atol=1e-6)
+    np.testing.assert_allclose(reward, rewards, atol=1e-6)
+    np.testing.assert_array_equal(terminated, flags)
+    done = np.asarray(terminated | truncated)
+    differs = (np.asarray(observation) != np.asarray(info["final_observation"])).any(axis=1)
+    np.testing.assert_array_equal(differs, done)
+
+
+def test_batch_step_ends_the_same_episodes_and_resets_them_apart(
+    env: FlyTrack, params: EnvParams, ends: tuple[Any, ...]
+) -> None:
+    _, states, actions, single = ends
+    batch = env.step_batch(jax.random.key(8), states, actions, params)
+    assert_close(batch[2:], single[2:], 2e-5)
+    done = np.asarray(batch[3] | batch[4])
+    observation, state = batch[:2]
+    assert_close(
+        jax.tree.map(lambda leaf: leaf[~done], (observation, state)),
+        jax.tree.map(lambda leaf: leaf[~done], single[:2]),
+        2e-5,
+    )
+    race = state.race
+    for leaf in (state.time, race.gates_passed, race.laps, race.lap_start_s, race.lap_time_s):
+        assert not np.asarray(leaf)[done].any()
+    starts = np.stack([np.asarray(leaf)[done] for leaf in state.plant.pos_w], -1)
+    assert len(np.unique(starts, axis=0)) == done.sum()
+    other = env.step_batch(jax.random.key(9), states, actions, params)[1]
+    assert (np.asarray(other.plant.pos_w.x) != np.asarray(state.plant.pos_w.x))[done].all()
+    expected = jax.jit(jax.vmap(env.observe, in_axes=(None, 0, None, None)))(
+        None, state, None, params
+    )
+    np.testing.assert_allclose(observation, expected, atol=1e-6)
+
+
+def test_batch_step_equals_vmap_of_step_env_where_nothing_ends(
+    env: FlyTrack, params: EnvParams, step_env_all: Any, ends: tuple[Any, ...]
+) -> None:
+    _, states, actions, (_, _, _, terminated, truncated, _) = ends
+    going = ~np.asarray(terminated | truncated)
+    rows = np.resize(np.flatnonzero(going), len(going))
+    states, actions = jax.tree.map(lambda leaf: leaf[rows], (states, actions))
+    batch = env.step_batch(jax.random.key(10), states, actions, params)
+    observation, state, reward, flags, info = step_env_all(None, states, actions, params)
+    assert not (batch[3] | batch[4]).any()
+    assert_close(batch[:4], (observation, state, reward, flags))
+    assert_close({name: batch[5][name] for name in info}, info)
+
+
+# --- Actions ------------------------------------------------------------------------------------
+
+
+def test_actions_beyond_the_range_are_clipped(
+    params: EnvParams, reset_many: Any, step_all: Any
+) -> None:
+    keys = jax.random.split(jax.random.key(11), 1)
+    _, state = reset_many(keys, params)
+    corners = np.array([[1, -1, 1, 1], [-1, 1, -1, -1]], np.float32)
+    pairs = [(c, c * f) for c in corners for f in (1.001, 7.0, 1e30, np.float32(np.inf))]
+    for corner, beyond in pairs:
+        expected = step_all(keys, state, jnp.asarray(corner)[None], params)
+        assert_close(step_all(keys, state, jnp.asarray(beyond)[None], params), expected, 0.0)
+
+
+def test_integer_actions_are_as_good_as_real_ones(
+    env: FlyTrack, params: EnvParams, make_drone: Any
+) -> None:
+    state = env.begin(make_drone((15.0, 2.0, 1.35)), 0, params)
+    key = jax.random.key(0)
+    real = env.step(key, state, jnp.array([1.0, 0.0, -1.0, 1.0]), params)
+    assert_close(env.step(key, state, jnp.array([1, 0, -1, 1]), params), real, 1e-6)
+
+
+@pytest.mark.parametrize("shape", [(), (3,), (5,), (4, 1), (1, 4)])
+def test_actions_of_another_shape_are_refused(
+    shape: tuple[int, ...], env: FlyTrack, params: EnvParams, make_drone: Any
+) -> None:
+    state = env.begin(make_drone((15.0, 2.0, 1.35)), 0, params)
+    with pytest.raises(ValueError, match=r"action: found shape .*expected \(4,\)"):
+        env.step(jax.random.key(0), state, jnp.zeros(shape), params)
+    with pytest.raises(ValueError, match=r"action: found shape .*expected \(4,\)"):
+        env.step_env(None, state, jnp.zeros(shape), params)
+
+
+@pytest.mark.parametrize("shape", [(2, 3), (3, 4), (4,)])
+def test_batches_of_actions_of_another_shape_are_refused(
+    shape: tuple[int, ...], env: FlyTrack, params: EnvParams, make_drone: Any
+) -> None:
+    states = stack([env.begin(make_drone((15.0, 2.0, 1.35)), 0, params)] * 2)
+    with pytest.raises(ValueError):
+        env.step_batch(jax.random.key(0), states, jnp.zeros(shape), params)
+
+
+# --- Construction -------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("arguments", "error", "message"),
+    [
+        ({"track": "monza"}, TrackError, "track: found 'monza', expected one of .*flytrack"),
+        ({"track": Path("no/such.toml")}, TrackError, "no/such.toml: cannot be read"),
+        ({"model": "no/such.json"}, ModelFileError, "no/such.json: cannot be read"),
+        ({"missed_gate": "ignore"}, ValueError, "missed_gate: found 'ignore', expected one of"),
+        ({"missed_gate": True}, ValueError, "missed_gate: found True, expected one of"),
+    ],
+)
+def test_wrong_arguments_say_what_was_expected(
+    arguments: dict[str, Any], error: type[Exception], message: str
+) -> None:
+    with pytest.raises(error, match=message):
+        FlyTrack(**arguments)
+
+
+def test_model_of_an_environment_comes_from_its_argument(params: EnvParams) -> None:
+    model = params.model._replace(m=1.7)
+    assert FlyTrack(model=model).default_params.model.m == 1.7
+
+
+# --- Observation --------------------------------------------------------------------------------
+
+
+def expected_observation(x: np.ndarray, gate_index: int) -> np.ndarray:
+    """Return the observation of a state (21,) before a gate, from the track's data, in NumPy."""
+    track = load_track("flytrack")
+    gates = [track.gates[(gate_index + i) % len(track.gates)] for i in (0, 1)]
+    axes = [Rotation.from_quat(g.quaternion, scalar_first=True).as_matrix() for g in gates]
+    forward, next_forward = (g.direction * a[:, 1] for g, a in zip(gates, axes, strict=True))
+    to_gate = np.stack([forward, np.cross(axes[0][:, 2], forward), axes[0][:, 2]])
+    body = Rotation.from_quat(x[9:13], scalar_first=True).as_matrix()
+    centre, next_centre = (np.array(g.position) for g in gates)
+    return np.concatenate(
+        [
+            to_gate @ (x[0:3] - centre) / 10.0,
+            to_gate @ x[3:6] / 10.0,
+            (to_gate @ body).ravel(),
+            x[13:16] / 10.0,
+            x[16:20],
+            [x[20] - 23.0],
+            to_gate @ (next_centre - centre) / 10.0,
+            to_gate @ next_forward,
+        ]
+    )
+
+
+def test_observation_index_by_index(env: FlyTrack, params: EnvParams, flight: Any) -> None:
+    assert [entry.size for entry in OBSERVATION] == [3, 3, 9, 3, 4, 1, 3, 3]
+    states, outputs = flight
+    observed = np.concatenate([outputs[0][:-1, ::5].reshape(-1, OBSERVATION_SIZE)])
+    seen = jax.tree.map(lambda leaf: leaf[1:, ::5].ravel(), states)
+    x = np.asarray(jax.vmap(pack)(seen.plant), float)
+    gate_indices = np.asarray(seen.race.gate_index)
+    assert set(gate_indices) == set(range(8))
+    rows = range(0, len(x), 7)
+    expected = np.stack([expected_observation(x[i], gate_indices[i]) for i in rows])
+    np.testing.assert_allclose(observed[rows], expected, atol=2e-5)
+
+
+def test_observation_is_clipped_to_its_range(
+    env: FlyTrack, params: EnvParams, make_drone: Any
+) -> None:
+    drone = make_drone(
+        (1e6, -1e6, 0.0), (1e5, 0.0, 0.0), applied=Action(2.0, -2.0, 0.0, 0.0), battery_v=30.0
+    )
+    observation = env.observe(None, env.begin(drone, 0, params), None, params)
+    assert env.observation_space(params).contains(observation)
+    np.testing.assert_allclose(observation[[0, 1, 3, 18, 19, 22]], [-10, 10, -10, 1, -1, 1])
+
+
+# --- Laps, with a plant on rails ----------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def rails(make_railway: Any) -> tuple[FlyTrack, Any]:
+    """The shipped course with a plant on rails straight through every gate, and the rails."""
+    corners = []
+    for gate in load_track("flytrack").gates:
+        axes = Rotation.from_quat(gate.quaternion, scalar_first=True).as_matrix()
+        forward = gate.direction * axes[:, 1]
+        corners += [gate.position - forward, gate.position + forward]
+    railway = make_railway(np.array(corners), SPEED)
+    return FlyTrack(plant=railway, missed_gate="fly_on"), railway
+
+
+NUM_LAPS = 5
+FIRST_GATES = (0, 3, 7)
+
+
+@pytest.fixture(scope="module")
+def laps(rails: tuple[FlyTrack, Any], rollout: Any, make_drone: Any) -> Any:
+    """Outputs of a little over five laps from before each of the first gates."""
+    env, railway = rails
+    params = env.default_params.replace(max_steps_in_episode=100_000)
+    states = stack(
+        [env.begin(make_drone(railway.corners[2 * gate]), gate, params) for gate in FIRST_GATES]
+    )
+    num_steps = int((NUM_LAPS + 0.1) * railway.arcs[-1] / SPEED / 0.01)
+    actions = jnp.zeros((num_steps, len(FIRST_GATES), 4))
+    return rollout(env, jax.random.key(0), states, actions, params)[1]
+
+
+def test_laps_are_counted_from_wherever_the_episode_began(laps: Any) -> None:
+    _, states, _, terminated, truncated, info = laps
+    assert not (terminated | truncated).any()
+    np.testing.assert_array_equal(info["laps"][-1], NUM_LAPS)
+    np.testing.assert_array_equal(info["lap_completed"].sum(axis=0), NUM_LAPS)
+    gates = np.asarray(info["gates_passed"])
+    np.testing.assert_array_equal(gates // 8, info["laps"])
+    assert (np.diff(gates, axis=0) >= 0).all() and (np.diff(gates, axis=0) <= 1).all()
+    np.testing.assert_array_equal(
+        states.race.gate_index, (gates + np.array(FIRST_GATES)) % 8
+    )
+
+
+def test_lap_times_are_interpolated_at_the_crossing(
+    laps: Any, rails: tuple[FlyTrack, Any]
+) -> None:
+    info, (_, railway) = laps[5], rails
+    length = railway.arcs[-1]
+    done = np.asarray(info["lap_completed"])
+    times = np.asarray(info["lap_time_s"])
+    for column, gate in enumerate(FIRST_GATES):
+        lap_times = times[done[:, column], column]
+        # The first lap ends a metre behind the corner before the last of the eight gates.
+        first = (railway.arcs[2 * gate - 2] - railway.arcs[2 * gate]) % length + 1.0
+        np.testing.assert_allclose(lap_times[0], first / SPEED, atol=1e-3)
+        np.testing.assert_allclose(lap_times[1:], length / SPEED, atol=1e-3)
+        assert not times[: np.argmax(done[:, column]), column].any()
+
+
+def test_steps_with_two_seeds_of_the_same_rails_agree(
+    rails: tuple[FlyTrack, Any], make_drone: Any
+) -> None:
+    env, railway = rails
+    state = env.begin(make_drone(railway.corners[0]), 0, env.default_params)
+    outputs = [env.step(jax.random.key(i), state, jnp.zeros(4)) for i in range(2)]
+    assert_close(outputs[0], outputs[1], 0.0)
+
+
+# --- Gradients ----------------------------------------------------------------------------------
+
+
+def differentiable(env: FlyTrack, state: EnvState, params: EnvParams) -> Callable[..., Any]:
+    """Return a smooth scalar of observation and next state, as a function of action and speed."""
+
+    @jax.jit
+    def scalar(action: jax.Array, speed: jax.Array) -> jax.Array:
+        plant = state.plant._replace(vel_w=state.plant.vel_w._replace(y=speed))
+        observation, after, *_ = env.step_env(None, state._replace(plant=plant), action, params)
+        return jnp.sum(observation**2) + sum(leaf**2 for leaf in jax.tree.leaves(after.plant))
+
+    return scalar
+
+
+def test_transition_gradients_are_detached_unless_asked_for(
+    env: FlyTrack, params: EnvParams, make_drone: Any
+) -> None:
+    attached = env.with_transition_gradients()
+    assert env.supports_transition_gradients and not env.transition_gradients_enabled
+    action, speed = np.array([0.2, -0.3, 0.4, 0.1]), np.array(1.5)
+    with jax.enable_x64(True):
+        state = env.begin(make_drone((15.0, 2.5, 1.0), (-5.0, 1.0, 0.5)), 0, params)
+        state = jax.tree.map(
+            lambda leaf: leaf.astype(float) if leaf.dtype == jnp.float32 else leaf, state
+        )
+        detached = jax.grad(differentiable(env, state, params), argnums=(0, 1))(action, speed)
+        scalar = differentiable(attached, state, params)
+        gradient = jax.grad(scalar, argnums=(0, 1))(action, speed)
+        shifts = 1e-6 * np.eye(4)
+        numeric = [(scalar(action + s, speed) - scalar(action - s, speed)) / 2e-6 for s in shifts]
+        slope = (scalar(action, speed + 1e-6) - scalar(action, speed - 1e-6)) / 2e-6
+    assert not np.asarray(detached[0]).any() and not np.asarray(detached[1]).any()
+    np.testing.assert_allclose(gradient[0], numeric, rtol=1e-4, atol=1e-5)
+    np.testing.assert_allclose(gradient[1], slope, rtol=1e-4, atol=1e-5)
+    assert np.abs(numeric).min() > 1e-6
+
+
+def test_gradients_of_a_flight_and_its_rewards_are_finite(
+    env: FlyTrack, params: EnvParams, make_drone: Any
+) -> None:
+    attached = env.with_transition_gradients()
+    state = env.begin(make_drone((18.6, 2.0, 1.0), quat=YAW_180), 0, params)
+
+    @jax.jit
+    @jax.grad
+    def gradient(actions: jax.Array) -> jax.Array:
+        def one(state: EnvState, action: jax.Array) -> tuple[EnvState, jax.Array]:
+            _, state, reward, *_ = attached.step_env(None, state, action, params)
+            return state, reward
+
+        return jax.lax.scan(one, state, actions)[1].sum()
+
+    value = np.asarray(gradient(jnp.full((50, 4), 0.1)))
+    assert np.isfinite(value).all()
+    assert (np.abs(value[0]) > 0.0).all()
+
+
+# --- Wrapper for clients of five values ---------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "clone", [copy.copy, copy.deepcopy, lambda wrapped: pickle.loads(pickle.dumps(wrapped))]
+)
+def test_legacy_step_survives_copies(clone: Any, env: FlyTrack) -> None:
+    wrapped = clone(LegacyStep(env))
+    assert wrapped.name == "FlyTrack-v0" and wrapped.num_actions == 4
+    with pytest.raises(AttributeError):
+        wrapped.no_such_attribute  # noqa: B018
+    observation, state = jax.eval_shape(wrapped.reset, jax.random.key(0))
+    assert observation.shape == (OBSERVATION_SIZE,)
+
+
+def test_legacy_step_returns_five_values(
+    env: FlyTrack, params: EnvParams, ends: tuple[Any, ...]
+) -> None:
+    keys, states, actions, (observation, after, reward, terminated, truncated, info) = ends
+    wrapped = LegacyStep(env)
+    outputs = jax.jit(jax.vmap(wrapped.step, in_axes=(0, 0, 0, None)))(keys, states, actions, params)
+    assert len(outputs) == 5
+    assert_close(outputs, (observation, after, reward, terminated | truncated, info), 1e-5)

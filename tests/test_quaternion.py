@@ -1,0 +1,106 @@
+"""Vectors and quaternions against SciPy's rotations."""
+
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from flytrack_env.quaternion import Quaternion, Vec3, half_angle
+
+NUM_CASES = 500
+
+
+@pytest.fixture(scope="module")
+def quats() -> np.ndarray:
+    """Random unit quaternions (N, 4), w first, with the half turns and the identity among them."""
+    quats = np.random.default_rng(0).normal(size=(NUM_CASES, 4))
+    quats[:4] = np.eye(4)
+    return quats / np.linalg.norm(quats, axis=1, keepdims=True)
+
+
+def rotations(quats: np.ndarray) -> Rotation:
+    """Return SciPy's rotations of quaternions (N, 4), w first."""
+    return Rotation.from_quat(quats, scalar_first=True)
+
+
+def columns(array: np.ndarray) -> tuple[jax.Array, ...]:
+    """Return the columns of an array (N, K) as K arrays (N,)."""
+    return tuple(jnp.asarray(array[:, i]) for i in range(array.shape[1]))
+
+
+def test_axes_are_the_columns_of_the_rotation_matrix(quats: np.ndarray) -> None:
+    axes = np.stack([np.stack(axis, -1) for axis in Quaternion(*columns(quats)).axes()], axis=-1)
+    np.testing.assert_allclose(axes, rotations(quats).as_matrix(), atol=1e-6)
+
+
+def test_axes_are_right_handed_and_orthonormal(quats: np.ndarray) -> None:
+    axis_x, axis_y, axis_z = Quaternion(*columns(quats)).axes()
+    for axis in (axis_x, axis_y, axis_z):
+        np.testing.assert_allclose(axis.norm(), 1.0, atol=2e-6)
+    np.testing.assert_allclose(axis_x.dot(axis_y), 0.0, atol=1e-6)
+    np.testing.assert_allclose(np.stack(axis_x.cross(axis_y)), np.stack(axis_z), atol=2e-6)
+
+
+def test_rotate_agrees_with_scipy(quats: np.ndarray) -> None:
+    vectors = np.random.default_rng(1).normal(size=(NUM_CASES, 3))
+    rotated = np.stack(Quaternion(*columns(quats)).rotate(Vec3(*columns(vectors))), -1)
+    np.testing.assert_allclose(rotated, rotations(quats).apply(vectors), atol=5e-6)
+
+
+def test_multiply_is_the_composition_of_rotations(quats: np.ndarray) -> None:
+    others = np.roll(quats, 7, axis=0)
+    product = np.stack(Quaternion(*columns(quats)).multiply(Quaternion(*columns(others))), -1)
+    expected = (rotations(quats) * rotations(others)).as_quat(scalar_first=True)
+    sign = np.sign(np.sum(product * expected, axis=1, keepdims=True))
+    np.testing.assert_allclose(product, sign * expected, atol=1e-6)
+
+
+@pytest.mark.parametrize("factor", [1e-3, 0.5, 1.0, 300.0])
+def test_normalize_gives_the_same_direction_at_unit_norm(quats: np.ndarray, factor: float) -> None:
+    unit = np.stack(Quaternion(*columns(factor * quats)).normalize(), -1)
+    np.testing.assert_allclose(unit, quats, atol=1e-6)
+
+
+def test_half_angle_is_within_a_millionth() -> None:
+    angle = np.linspace(-np.pi, np.pi, 100_001)
+    cosine, sine = half_angle(jnp.asarray(angle))
+    np.testing.assert_allclose(cosine, np.cos(angle / 2), atol=1e-6)
+    np.testing.assert_allclose(sine, np.sin(angle / 2), atol=1e-6)
+
+
+def test_from_yaw_tilt_leans_the_thrust_axis_towards_the_heading() -> None:
+    rng = np.random.default_rng(2)
+    yaw, heading = rng.uniform(-np.pi, np.pi, (2, NUM_CASES))
+    tilt = rng.uniform(0.0, np.pi, NUM_CASES)
+    lean = np.stack([-np.sin(heading), np.cos(heading), np.zeros(NUM_CASES)], -1) * tilt[:, None]
+    expected = Rotation.from_euler("z", yaw[:, None]) * Rotation.from_rotvec(lean)
+    result = Quaternion.from_yaw_tilt(*map(jnp.asarray, (yaw, tilt, heading)))
+    matrix = np.stack([np.stack(axis, -1) for axis in result.axes()], axis=-1)
+    np.testing.assert_allclose(matrix, expected.as_matrix(), atol=1e-5)
+
+
+def test_vectors_add_subtract_scale() -> None:
+    a, b = Vec3(1.0, 2.0, 3.0), Vec3(-4.0, 0.5, 2.0)
+    assert a + b == Vec3(-3.0, 2.5, 5.0)
+    assert a - b == Vec3(5.0, 1.5, 1.0)
+    assert a.scale(2.0) == Vec3(2.0, 4.0, 6.0)
+    assert a.dot(b) == 3.0
+    assert tuple(a.cross(b)) == tuple(np.cross(a, b))
+
+
+@pytest.mark.parametrize(
+    ("vector", "norm", "gradient"),
+    [((0.0, 0.0, 0.0), 0.0, (0.0, 0.0, 0.0)), ((3.0, 0.0, -4.0), 5.0, (0.6, 0.0, -0.8))],
+)
+@pytest.mark.parametrize("differentiate", [jax.grad, jax.jacfwd])
+def test_norm_has_a_gradient_everywhere(
+    vector: tuple[float, ...],
+    norm: float,
+    gradient: tuple[float, ...],
+    differentiate: Callable[..., Callable[[Vec3], Vec3]],
+) -> None:
+    assert float(Vec3(*vector).norm()) == pytest.approx(norm)
+    np.testing.assert_allclose(np.stack(differentiate(Vec3.norm)(Vec3(*vector))), gradient)

@@ -1,0 +1,52 @@
+"""Registration with gymnax: ids, overrides, and importing the package more than once."""
+
+import importlib
+
+import gymnax
+import jax
+import pytest
+from gymnax.registration import registered_envs
+
+import flytrack_env
+from flytrack_env.registration import ENVIRONMENTS, make, register_all
+
+
+@pytest.mark.parametrize("env_id", sorted(ENVIRONMENTS))
+def test_every_id_is_made_twice_and_after_another_import(env_id: str) -> None:
+    first, first_params = gymnax.make(env_id)
+    importlib.reload(flytrack_env)
+    register_all()
+    second, second_params = gymnax.make(env_id)
+    assert first is not second
+    assert list(registered_envs).count(env_id) == 1
+    assert type(first) is type(second)
+    assert jax.tree.structure(first_params) == jax.tree.structure(second_params)
+
+
+@pytest.mark.parametrize("env_id", sorted(ENVIRONMENTS))
+def test_every_id_resets_and_steps(env_id: str) -> None:
+    env, params = gymnax.make(env_id)
+    key = jax.random.key(0)
+    observation, state = jax.eval_shape(env.reset, key, params)
+    action = jax.eval_shape(env.action_space(params).sample, key)
+    outputs = jax.eval_shape(env.step, key, state, action, params)
+    assert len(outputs) == 6
+    assert outputs[0].shape == observation.shape == env.observation_space(params).shape
+    assert jax.tree.structure(outputs[1]) == jax.tree.structure(state)
+
+
+def test_flytrack_is_registered_under_its_name() -> None:
+    assert "FlyTrack-v0" in ENVIRONMENTS
+    assert gymnax.make("FlyTrack-v0")[0].name == "FlyTrack-v0"
+
+
+def test_overrides_reach_the_environment() -> None:
+    assert make("FlyTrack-v0", missed_gate="fly_on").missed_gate == "fly_on"
+    assert gymnax.make("FlyTrack-v0", missed_gate="fly_on")[0].missed_gate == "fly_on"
+    with pytest.raises(ValueError, match="missed_gate"):
+        gymnax.make("FlyTrack-v0", missed_gate="sometimes")
+
+
+def test_unknown_ids_are_refused() -> None:
+    with pytest.raises(ValueError, match=r"env_id: found 'FlyTrack-v9', expected one of .*FlyTrack-v0"):
+        make("FlyTrack-v9")
