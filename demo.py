@@ -92,7 +92,12 @@ def main() -> None:
             "gates_passed": int(np.max(flight.gates_passed)),
             "ended": eval_agent.reason_ended(flight),
         },
-        "noisy_starts": {"episodes": NUM_EPISODES, "laps": NUM_LAPS, **result._asdict()},
+        "noisy_starts": {
+            "episodes": NUM_EPISODES,
+            "laps": NUM_LAPS,
+            # JSON has no NaN: a time that there was none of is null.
+            **{name: None if np.isnan(v) else v for name, v in result._asdict().items()},
+        },
         "seconds": round(time.perf_counter() - started, 1),
     }
     write_atomically(out / "summary.json", (json.dumps(summary, indent=2) + "\n").encode())

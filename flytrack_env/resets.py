@@ -13,7 +13,7 @@ from flytrack_env.randomness import Draws
 from flytrack_env.state import BATTERY_FULL_V, Action, Drone
 from flytrack_env.tracks import Course
 
-# The last part of a segment is left out: from there the gate could not be reached any more.
+# The last part of the way is left out: from there the gate could not be reached any more.
 LAST_SEGMENT_FRACTION = 0.8
 
 
@@ -22,9 +22,9 @@ class ResetParams(NamedTuple):
 
     course_fraction: share of the starts that lie along the course; the others are at the start pose.
     start_*: half ranges around the start pose; the height is only raised, by 0 to start_height_noise.
-    course_offset: half range of the offset from the straight line between two gates, per axis, m.
-    course_speed: speed from 0 to this along that line, m/s, with a sideways part of 20 %.
-    course_yaw_deg: half range of the yaw about the direction of that line.
+    course_offset: half range of the offset from the curve between two gates, per axis, m.
+    course_speed: speed from 0 to this along that curve, m/s, with a sideways part of 20 %.
+    course_yaw_deg: half range of the yaw about the direction of that curve.
     course_tilt_deg: tilt from 0 to this towards any side.
     course_stick: half range of the applied rate actions; applied thrust from course_thrust_low/high.
     *_battery_low_v: battery from this to full.
@@ -48,6 +48,7 @@ class ResetParams(NamedTuple):
 
 SIDEWAYS_FRACTION = 0.2
 VERTICAL_BELOW = 1e-3
+SHORTEST_TANGENT = 1e-3
 STILL_THRUST = -1.0
 
 
@@ -78,9 +79,8 @@ def sample_start(
         ),
     )
     battery_low_v = choose(params.course_battery_low_v, params.start_battery_low_v)
-    origin, along, length = _segment(gate_index, course)
-    anchor = origin + along.scale(length * draws.uniform("along", 0.0, LAST_SEGMENT_FRACTION))
-    anchor = Vec3(*map(choose, anchor, course.start_pos_w))
+    on_curve, along = _point_on_course(draws, gate_index, course)
+    anchor = Vec3(*map(choose, on_curve, course.start_pos_w))
     heading = Quaternion(*map(choose, _facing(along), course.start_quat))
     drone = Drone(
         pos_w=anchor + _offset(draws, choose, params),
@@ -97,13 +97,33 @@ def sample_start(
 Choose = Callable[[Scalar, Scalar], jax.Array]
 
 
-def _segment(gate_index: jax.Array, course: Course) -> tuple[Vec3, Vec3, Scalar]:
-    """Return origin, direction and length of the straight line from the gate before to a gate."""
-    before = jnp.where(gate_index == 0, course.num_gates - 1, gate_index - 1)
-    origin = course.gate(before).centre
-    segment = course.gate(gate_index).centre - origin
-    length = segment.norm()
-    return compute_once((origin, segment.scale(1.0 / length), length))
+def _point_on_course(
+    draws: Draws, gate_index: jax.Array, course: Course
+) -> tuple[Vec3, Vec3]:
+    """Return a point on the way from the gate before to a gate, and the unit direction of flight there.
+
+    The way is a cubic Hermite curve that leaves and meets the gates along their directions of flight,
+    with tangents as long as the gates are apart: about what a racing drone flies.
+    """
+    before = course.gate(jnp.where(gate_index == 0, course.num_gates - 1, gate_index - 1))
+    gate = course.gate(gate_index)
+    chord = gate.centre - before.centre
+    length = chord.norm()
+    leave, meet = before.forward.scale(length), gate.forward.scale(length)
+    s = draws.uniform("along", 0.0, LAST_SEGMENT_FRACTION)
+    point = (
+        before.centre
+        + leave.scale(s * (1.0 - s) * (1.0 - s))
+        + chord.scale(s * s * (3.0 - 2.0 * s))
+        + meet.scale(s * s * (s - 1.0))
+    )
+    tangent = (
+        leave.scale((1.0 - s) * (1.0 - 3.0 * s))
+        + chord.scale(6.0 * s * (1.0 - s))
+        + meet.scale(s * (3.0 * s - 2.0))
+    )
+    point, tangent = compute_once((point, tangent))
+    return point, compute_once(tangent.scale(1.0 / jnp.maximum(tangent.norm(), SHORTEST_TANGENT)))
 
 
 def _facing(direction: Vec3) -> Quaternion:
@@ -118,7 +138,7 @@ def _facing(direction: Vec3) -> Quaternion:
 
 
 def _offset(draws: Draws, choose: Choose, params: ResetParams) -> Vec3:
-    """Return the offset from the line or the start pose, m."""
+    """Return the offset from the curve or the start pose, m."""
     noise = choose(params.course_offset, params.start_position_noise)
     highest = choose(params.course_offset, params.start_height_noise)
     return Vec3(
@@ -129,7 +149,7 @@ def _offset(draws: Draws, choose: Choose, params: ResetParams) -> Vec3:
 
 
 def _velocity(draws: Draws, choose: Choose, along: Vec3, params: ResetParams) -> Vec3:
-    """Return the velocity: along the line with a part to its side, m/s; 0 at the start pose."""
+    """Return the velocity: along the curve with a part to its side, m/s; 0 at the start pose."""
     speed = draws.uniform("speed", 0.0, choose(params.course_speed, 0.0))
     sideways = speed * draws.uniform("sideways", -SIDEWAYS_FRACTION, SIDEWAYS_FRACTION)
     return along.scale(speed) + Vec3(-along.y, along.x, 0.0).scale(sideways)

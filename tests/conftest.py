@@ -11,7 +11,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-
 from flytrack_env.dynamics import ModelParameters
 from flytrack_env.env import EnvParams, EnvState, FlyTrack
 from flytrack_env.quaternion import Quaternion, Scalar, Vec3
@@ -93,9 +92,7 @@ def drone_at(
 
 def track_of_row(distances: list[float]) -> Track:
     """Return a track of gates in a row along +x at these x, flown towards +x."""
-    gates = tuple(
-        Gate(i, (x, 0.0, 2.0), FACING_X, 1.0, 1.5, 2.7) for i, x in enumerate(distances)
-    )
+    gates = tuple(Gate(i, (x, 0.0, 2.0), FACING_X, 1.0, 1.5, 2.7) for i, x in enumerate(distances))
     low, high = (min(distances) - 100.0, -50.0, 0.0), (max(distances) + 100.0, 50.0, 50.0)
     return Track("row", gates, (min(distances) - 5.0, 0.0, 2.0), (1.0, 0.0, 0.0, 0.0), low, high)
 
@@ -132,7 +129,7 @@ def params(env: FlyTrack) -> EnvParams:
 
 @pytest.fixture(scope="session")
 def rollout() -> Callable[..., Any]:
-    """A function that flies a batch: (env, keys, states, actions (T, N, 4), params) -> stacked steps.
+    """A function that flies a batch: (env, keys, states, actions (T, N, 4), params) -> steps.
 
     Compiled once per environment; the state before each step and all outputs of ``step`` come back.
     """

@@ -1,6 +1,7 @@
 """The simulator against the handout's equations, written a second time in NumPy."""
 
 import inspect
+from itertools import pairwise
 from typing import Any
 
 import jax
@@ -91,7 +92,11 @@ def test_signature_is_the_handouts() -> None:
 
 def test_five_fields_alone_construct_the_model_and_fly() -> None:
     five = ModelParameters(
-        jnp.full(4, 0.04), jnp.zeros(6).at[0].set(9.80665), jnp.array([618.0, 618.0, 120.0]), 1.0, 9.80665
+        jnp.full(4, 0.04),
+        jnp.zeros(6).at[0].set(9.80665),
+        jnp.array([618.0, 618.0, 120.0]),
+        1.0,
+        9.80665,
     )
     after = step(jnp.asarray(START, jnp.float32), jnp.zeros(4), 0.01, five)
     assert after.shape == (21,) and after.dtype == jnp.float32
@@ -177,7 +182,9 @@ def test_quaternion_stays_unit_over_ten_thousand_random_steps() -> None:
 def test_zero_rate_command_keeps_the_attitude() -> None:
     start = random_cases(1, seed=4)[0][0]
     start[16:20] = (0.0, 0.0, 0.0, 0.3)
-    x = fly(start.astype(np.float32), np.tile([0, 0, 0, 1.0], (1000, 1)), 0.01, nominal_parameters())
+    x = fly(
+        start.astype(np.float32), np.tile([0, 0, 0, 1.0], (1000, 1)), 0.01, nominal_parameters()
+    )
     np.testing.assert_allclose(x[-1, 9:13], start[9:13], atol=1e-6)
     np.testing.assert_array_equal(x[:, 13:16], 0.0)
 
@@ -216,7 +223,7 @@ def velocity_error(start_thrust: float, num_steps: int) -> float:
 def test_halving_the_time_step_divides_the_error(error: Any, applied: float, ratio: float) -> None:
     with jax.enable_x64(True):
         errors = [error(applied, num_steps) for num_steps in (200, 400, 800)]
-    for coarse, fine in zip(errors, errors[1:], strict=False):
+    for coarse, fine in pairwise(errors):
         assert coarse / fine == pytest.approx(ratio, rel=0.05)
 
 
@@ -259,7 +266,9 @@ def test_battery_loses_one_volt_per_minute(is_double: bool, tolerance: float) ->
 def numeric_jacobian(function: Any, vector: np.ndarray, width: float = 1e-6) -> np.ndarray:
     """Return the central-difference Jacobian (M, N) of a function of a vector (N,)."""
     shifts = width * np.eye(vector.size)
-    return np.stack([(function(vector + s) - function(vector - s)) / (2 * width) for s in shifts], -1)
+    return np.stack(
+        [(function(vector + s) - function(vector - s)) / (2 * width) for s in shifts], -1
+    )
 
 
 @pytest.mark.parametrize("differentiate", [jax.jacfwd, jax.jacrev])

@@ -78,25 +78,35 @@ GATES = {
     "along x": gate_at((0.0, 0.0, 0.0), Rotation.from_euler("z", -90, degrees=True)),
     "against its y": gate_at((12.5, 2.0, 1.35), Rotation.from_euler("z", 270, degrees=True), -1.0),
     "oblique": gate_at((-3.0, 7.0, 2.0), Rotation.from_euler("z", 37, degrees=True)),
-    "tilted": gate_at((1.0, 2.0, 3.0), Rotation.from_euler("zyx", [75, 20, -35], degrees=True), -1.0),
+    "tilted": gate_at(
+        (1.0, 2.0, 3.0), Rotation.from_euler("zyx", [75, 20, -35], degrees=True), -1.0
+    ),
     "lying": gate_at((0.0, 0.0, 5.0), Rotation.from_euler("x", 90, degrees=True)),
 }
 
 
 def ring(distance: float) -> list[tuple[float, float]]:
-    """Return points at that distance (the larger of the two axes) from the centre: sides and corners."""
+    """Return points at that distance, the larger of the two axes, from the centre."""
     d, some = distance, 0.4 * distance
     return [(d, some), (-d, some), (some, d), (-some, -d), (d, d), (-d, d), (-d, -d), (d, 0.0)]
 
 
 CROSSINGS = [
     *[((-0.1, 0.1, y, z), "pass") for y, z in [(0.0, 0.0), *ring(FREE - 1e-3)]],
-    *[((-0.1, 0.1, y, z), "frame") for d in (FREE + 1e-3, 0.75, 1.35, SOLID - 1e-3) for y, z in ring(d)],
+    *[
+        ((-0.1, 0.1, y, z), "frame")
+        for d in (FREE + 1e-3, 0.75, 1.35, SOLID - 1e-3)
+        for y, z in ring(d)
+    ],
     *[((-0.1, 0.1, y, z), "miss") for d in (SOLID + 1e-3, 3.0, 40.0) for y, z in ring(d)],
     *[((0.1, -0.1, y, z), "none") for y, z in [(0.0, 0.0), *ring(FREE - 1e-3)]],
     *[((0.1, -0.1, y, z), "frame") for d in (FREE + 1e-3, SOLID - 1e-3) for y, z in ring(d)],
     *[((0.1, -0.1, y, z), "none") for y, z in ring(SOLID + 1e-3)],
-    *[((a, b, y, z), "none") for a, b in ((-2.0, -0.1), (0.1, 2.0), (-0.1, -2.0)) for y, z in ring(0.3)],
+    *[
+        ((a, b, y, z), "none")
+        for a, b in ((-2.0, -0.1), (0.1, 2.0), (-0.1, -2.0))
+        for y, z in ring(0.3)
+    ],
     ((-50.0, 30.0, 0.0, 0.0), "pass"),  # fast
     ((-0.3, -0.3, 0.0, 0.0), "none"),  # parallel to the plane, before it
     ((0.3, 0.3, 0.0, 0.0), "none"),
@@ -264,7 +274,13 @@ def test_two_gates_in_one_step_both_count(
     [(1.0, 0.0, True, False), (2.0, 0.0, False, True), (0.4, 60.0, True, False)],
 )
 def test_the_second_gate_of_a_step_can_be_touched_too(
-    y: float, vy: float, crash: bool, missed: bool, coasting_envs: Envs, row_track: Row, make_drone: Any
+    y: float,
+    vy: float,
+    crash: bool,
+    missed: bool,
+    coasting_envs: Envs,
+    row_track: Row,
+    make_drone: Any,
 ) -> None:
     env = coasting_envs(row_track([0.0, 0.4]), "terminate")
     _, causes, events = transition_of(env, make_drone((-0.2, y, 2.0), (100.0, vy, 0.0)))
@@ -292,7 +308,7 @@ def test_after_flying_on_the_same_gate_can_be_flown(
     env = coasting_envs(row_track(list(ROW)), "fly_on")
     params = env.default_params.replace(dt=1.0)
     step = jax.jit(env.transition)
-    # Past the gate, back around it, back through it, and through it in its direction: (x, y), passed.
+    # Past the gate, back around it, through it, and back through it: (x, y), gates passed.
     legs = [((3.0, 2.0), 0), ((1.0, 3.0), 0), ((1.0, 0.0), 0), ((3.0, 0.0), 1), ((1.0, 0.0), 1)]
     state = env.begin(make_drone((1.0, 2.0, 2.0)), 0, params)
     for (x, y), passed in legs:
@@ -318,7 +334,9 @@ def test_flying_backwards_counts_nothing(
     assert int(state.race.gate_index) == gate_index
 
 
-def test_the_frame_is_solid_from_behind(coasting_envs: Envs, row_track: Row, make_drone: Any) -> None:
+def test_the_frame_is_solid_from_behind(
+    coasting_envs: Envs, row_track: Row, make_drone: Any
+) -> None:
     env = coasting_envs(row_track(list(ROW)), "fly_on")
     _, causes, _ = transition_of(env, make_drone((2.05, 1.0, 2.0), (-10.0, 0.0, 0.0)))
     assert bool(causes.crash)

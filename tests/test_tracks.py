@@ -130,16 +130,27 @@ REFUSALS = {
     "empty name": ('name = "small"', 'name = ""', "name", "non-empty string"),
     "number as name": ('name = "small"', "name = 3", "name", "non-empty string"),
     "missing start": (
-        VALID[VALID.index("[start]") : VALID.index("[bounds]")], "", "start", "missing"
+        VALID[VALID.index("[start]") : VALID.index("[bounds]")],
+        "",
+        "start",
+        "missing",
     ),
     "missing start position": ("position = [-4.0, 0.0, 1.0]\n", "", "position", "missing"),
-    "missing gate field": ("direction = \"+y\"\n", "", "direction", "missing"),
+    "missing gate field": ('direction = "+y"\n', "", "direction", "missing"),
     "missing last gate's field": ("frame = 2\n", "", "frame", "missing"),
     "unknown top field": ('name = "small"', 'name = "small"\nlaps = 3', "laps", "unknown"),
-    "unknown start field": ("[1.0, 0.0, 0.0, 0.0]", "[1.0, 0.0, 0.0, 0.0]\nyaw = 0", "yaw", "unknown"),
+    "unknown start field": (
+        "[1.0, 0.0, 0.0, 0.0]",
+        "[1.0, 0.0, 0.0, 0.0]\nyaw = 0",
+        "yaw",
+        "unknown",
+    ),
     "unknown gate field": ("opening = 1\n", "opening = 1\ncolour = 2\n", "colour", "unknown"),
     "start is no table": (
-        VALID[VALID.index("[start]") : VALID.index("[bounds]")], "start = 1\n", "start", "table"
+        VALID[VALID.index("[start]") : VALID.index("[bounds]")],
+        "start = 1\n",
+        "start",
+        "table",
     ),
     "string as number": ("[10.0, 1.0, 1.6]", '["a", 1.0, 1.6]', "position", "expected a number"),
     "bool as number": ("[10.0, 1.0, 1.6]", "[true, 1.0, 1.6]", "position", "expected a number"),
@@ -147,7 +158,10 @@ REFUSALS = {
     "list as number": ("frame = 2\n", "frame = [2]\n", "frame", "expected a number"),
     "two coordinates": ("[10.0, 1.0, 1.6]", "[10.0, 1.0]", "position", "expected 3 numbers"),
     "five quaternion parts": (
-        "[0.0, 0.0, 0.0, 1.0]", "[0.0, 0.0, 0.0, 0.0, 1.0]", "quaternion", "expected 4 numbers"
+        "[0.0, 0.0, 0.0, 1.0]",
+        "[0.0, 0.0, 0.0, 0.0, 1.0]",
+        "quaternion",
+        "expected 4 numbers",
     ),
     "nan position": ("[10.0, 1.0, 1.6]", "[nan, 1.0, 1.6]", "position", "finite"),
     "infinite bounds": ("[15.0, 5.0, 5.0]", "[inf, 5.0, 5.0]", "high", "finite"),

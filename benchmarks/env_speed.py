@@ -1,0 +1,242 @@
+"""Environment steps per second of process CPU time on one core, next to a toy and to l2f.
+
+``python -m benchmarks.env_speed [--repeats 7] [--out results]`` prints a table and writes
+``results.md`` and ``results.json``. Keys and actions are drawn before the clock starts; every
+output of a step is kept, so that nothing can be left out of it. The contestants take turns,
+because machines drift: compare ratios of one run, not rates of two.
+"""
+
+import argparse
+import json
+import os
+import platform
+import statistics
+import time
+from collections.abc import Callable
+from importlib import import_module
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any, NamedTuple
+
+NUM_ACTIONS_L2F = 16  # drawn in advance and flown in turn
+L2F_TIME_LIMIT = 500  # steps
+MINIMUM_REPEATS = 5
+PACKAGES = ("jax", "jaxlib", "gymnax", "l2f", "numpy")
+
+PENDULUM = "gymnax Pendulum-v1, vmap, 1,024"
+L2F_SMALL, L2F_LARGE = "l2f full step, 1,024", "l2f full step, 4,096"
+PLAIN, BATCH = "FlyTrack vmap(step), 1,024", "FlyTrack step_batch, 4,096"
+
+
+class Target(NamedTuple):
+    """A ratio that is wanted: at least ``goal``, hopefully ``stretch``."""
+
+    ours: str
+    peer: str
+    goal: float
+    stretch: float
+
+
+TARGETS = (Target(PLAIN, L2F_SMALL, 3.0, 5.0), Target(BATCH, L2F_LARGE, 8.0, 12.0))
+
+
+class Contestant(NamedTuple):
+    """Something that makes ``num_steps`` environment steps each time it is run."""
+
+    name: str
+    num_steps: int
+    run: Callable[[], None]
+
+
+def pin_to_one_core() -> str:
+    """Keep this process, and the libraries it loads later, on one core; return what was done."""
+    os.environ["OMP_NUM_THREADS"] = "1"
+    os.environ.setdefault("JAX_PLATFORMS", "cpu")
+    if not hasattr(os, "sched_setaffinity"):
+        return "not pinned: this system has no sched_setaffinity"
+    core = max(os.sched_getaffinity(0))
+    os.sched_setaffinity(0, {core})
+    return f"pinned to core {core}"
+
+
+def jax_contestant(
+    name: str, env_id: str, num_envs: int, length: int, is_batch: bool
+) -> Contestant:
+    """Return a scan of ``length`` steps of a gymnax environment, all outputs in the carry."""
+    import gymnax
+    import jax
+
+    import_module("flytrack_env")  # registers the id
+    env, params = gymnax.make(env_id)
+    step = env.step_batch if is_batch else jax.vmap(env.step, in_axes=(0, 0, 0, None))
+    reset = jax.jit(jax.vmap(env.reset, in_axes=(0, None)))
+    keys = jax.random.split(jax.random.key(0), (length,) if is_batch else (length, num_envs))
+    shape = (length, num_envs, *env.action_space(params).shape)
+    actions = jax.random.uniform(jax.random.key(1), shape, minval=-1.0)
+    _, state = reset(jax.random.split(jax.random.key(2), num_envs), params)
+
+    @jax.jit
+    def fly(state: Any, keys: jax.Array, actions: jax.Array, params: Any) -> Any:
+        def one(carry: Any, inputs: tuple[jax.Array, jax.Array]) -> tuple[Any, None]:
+            key, action = inputs
+            return step(key, carry[1], action, params), None
+
+        first = step(keys[0], state, actions[0], params)
+        return jax.lax.scan(one, first, (keys, actions))[0]
+
+    def run() -> None:
+        nonlocal state
+        outputs = jax.block_until_ready(fly(state, keys, actions, params))
+        state = outputs[1]
+
+    return Contestant(name, (length + 1) * num_envs, run)
+
+
+def l2f_contestant(name: str, num_envs: int, length: int) -> Contestant:
+    """Return ``length`` full steps of l2f: dynamics, reward, termination, reset, observation."""
+    import l2f
+    import numpy as np
+
+    vector = l2f.vector_selector[num_envs]
+    device, rng, env = l2f.Device(), vector.VectorRng(), vector.VectorEnvironment()
+    parameters, state, next_state = (
+        vector.VectorParameters(),
+        vector.VectorState(),
+        vector.VectorState(),
+    )
+    vector.initialize_rng(device, rng, 0)
+    vector.initialize_environment(device, env)
+    vector.sample_initial_parameters(device, env, parameters, rng)
+    vector.sample_initial_state(device, env, parameters, state, rng)
+    shape = (NUM_ACTIONS_L2F, num_envs, 4)
+    actions = np.random.default_rng(0).uniform(-1.0, 1.0, shape).astype(np.float32)
+    observation = np.empty((num_envs, env.OBSERVATION_DIM), np.float32)
+    reward, terminated = np.empty(num_envs, np.float32), np.empty(num_envs, bool)
+    age = np.zeros(num_envs, int)
+
+    def run() -> None:
+        nonlocal state, next_state, age
+        world = (device, env, parameters)
+        for i in range(length):
+            action = actions[i % NUM_ACTIONS_L2F]
+            vector.step(*world, state, action, next_state, rng)
+            vector.reward(*world, state, action, next_state, reward, rng)
+            vector.terminated(*world, next_state, terminated, rng)
+            done = terminated | (age >= L2F_TIME_LIMIT)
+            age = (age + 1) * (1 - done)
+            vector.sample_initial_state_if_truncated(*world, next_state, done, rng)
+            vector.observe(*world, next_state, observation, rng)
+            state, next_state = next_state, state
+
+    return Contestant(name, length * num_envs, run)
+
+
+def contestants() -> list[Contestant]:
+    """Return everything that is measured; l2f only where it is installed."""
+    found = [
+        jax_contestant(PENDULUM, "Pendulum-v1", 1024, 200, is_batch=False),
+        jax_contestant(PLAIN, "FlyTrack-v0", 1024, 200, is_batch=False),
+        jax_contestant(BATCH, "FlyTrack-v0", 4096, 200, is_batch=True),
+    ]
+    try:
+        found += [l2f_contestant(L2F_SMALL, 1024, 200), l2f_contestant(L2F_LARGE, 4096, 50)]
+    except ImportError as error:
+        print(f"l2f is skipped, and the ratios with it: {error}. Install it: pip install l2f")
+    return found
+
+
+def measure(entries: list[Contestant], repeats: int, warm_up: int = 3) -> dict[str, list[float]]:
+    """Return the rates of each contestant, million steps per CPU second, all taking turns."""
+    for entry in entries:
+        for _ in range(warm_up):
+            entry.run()
+    rates: dict[str, list[float]] = {entry.name: [] for entry in entries}
+    for _ in range(repeats):
+        for entry in entries:
+            start = time.process_time()
+            entry.run()
+            rates[entry.name].append(entry.num_steps / (time.process_time() - start) / 1e6)
+    return rates
+
+
+def cpu_name() -> str:
+    """Return the processor's name as the system gives it."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+    except OSError:
+        return platform.processor() or platform.machine()
+    names = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
+    return names[0] if names else platform.machine()
+
+
+def versions() -> dict[str, str]:
+    """Return the versions of what was measured."""
+    found = {"python": platform.python_version()}
+    for package in PACKAGES:
+        try:
+            found[package] = version(package)
+        except PackageNotFoundError:
+            found[package] = "not installed"
+    return found
+
+
+def ratios(rates: dict[str, list[float]]) -> list[dict[str, Any]]:
+    """Return the measured ratio of each target whose contestants all ran.
+
+    The median over the rounds of the ratio within a round: drift of the machine cancels.
+    """
+    rows = []
+    for target in TARGETS:
+        if target.ours in rates and target.peer in rates:
+            pairs = zip(rates[target.ours], rates[target.peer], strict=True)
+            rows.append({**target._asdict(), "ratio": statistics.median(a / b for a, b in pairs)})
+    return rows
+
+
+def as_markdown(result: dict[str, Any]) -> str:
+    """Return the result as two tables and a line about the machine."""
+    lines = [
+        "| environment | million steps per CPU second, median | lowest to highest |",
+        "|---|---|---|",
+    ]
+    for name, rates in result["rates"].items():
+        spread = f"{min(rates):.2f} to {max(rates):.2f}"
+        lines.append(f"| {name} | {statistics.median(rates):.2f} | {spread} |")
+    lines += ["", "| ratio | measured | target | stretch |", "|---|---|---|---|"]
+    for row in result["ratios"]:
+        numbers = f"{row['ratio']:.1f} | {row['goal']:g} | {row['stretch']:g}"
+        lines.append(f"| {row['ours']} to {row['peer']} | {numbers} |")
+    packages = ", ".join(f"{name} {number}" for name, number in result["versions"].items())
+    lines += ["", f"{result['cpu']}, {result['core']}, {result['repeats']} rounds; {packages}."]
+    return "\n".join(lines) + "\n"
+
+
+def main() -> None:
+    """Measure, print and write."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--repeats", type=int, default=7, help="rounds, at least 5")
+    parser.add_argument("--out", type=Path, help="path of the results without its suffix")
+    arguments = parser.parse_args()
+    if arguments.repeats < MINIMUM_REPEATS:
+        parser.error(f"--repeats: found {arguments.repeats}, expected at least {MINIMUM_REPEATS}")
+    core = pin_to_one_core()
+    rates = measure(contestants(), arguments.repeats)
+    result = {
+        "rates": rates,
+        "ratios": ratios(rates),
+        "cpu": cpu_name(),
+        "core": core,
+        "repeats": arguments.repeats,
+        "versions": versions(),
+    }
+    table = as_markdown(result)
+    print(table, end="")
+    if arguments.out:
+        arguments.out.parent.mkdir(parents=True, exist_ok=True)
+        arguments.out.with_suffix(".md").write_text(table, encoding="utf-8")
+        text = json.dumps(result, indent=2) + "\n"
+        arguments.out.with_suffix(".json").write_text(text, encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,77 @@
+"""From black box to race, once per training seed: ``python -m benchmarks.learning``.
+
+Identifies the black box once, then for every seed trains PPO from scratch on the identified model and flies
+256 noisy starts over 3 laps on the black box itself. Writes a table of all seeds.
+"""
+
+import argparse
+import platform
+import time
+from pathlib import Path
+
+import jax
+
+import eval_agent
+from baselines.purejaxrl_ppo import Config
+from baselines.purejaxrl_ppo.evaluate import fly_many, score
+from baselines.purejaxrl_ppo.train_ppo import train_policy
+from demo import NUM_EPISODES, NUM_LAPS, NUM_STEPS, identify
+from flytrack_env.files import write_atomically
+
+TARGET_SUCCESS = 0.95
+HEADER = (
+    "| seed | success on the black box | gates of 24 | first lap (s) | flying lap (s) | "
+    "training CPU (s) | training wall (s) |\n|---|---|---|---|---|---|---|\n"
+)
+
+
+def measure_seed(seed: int, black_box: Path, out: Path, config: Config) -> tuple[float, str]:
+    """Return the success of one training seed, and its row of the table."""
+    started = time.process_time()
+    checkpoint, _ = train_policy(out / f"seed{seed}", config, seed, model=out / "model.json")
+    cpu_seconds = time.process_time() - started
+    env = eval_agent.black_box_env(checkpoint, black_box)
+    flights = fly_many(
+        env, checkpoint.network, checkpoint.params, seed, NUM_EPISODES, NUM_STEPS, NUM_LAPS
+    )
+    result = score(flights, NUM_LAPS)
+    row = (
+        f"| {seed} | {result.success:.1%} | {result.gates:.2f} | {result.first_lap_s:.3f} | "
+        f"{result.flying_lap_s:.3f} | {cpu_seconds:.0f} | {checkpoint.meta['seconds']:.0f} |\n"
+    )
+    return result.success, row
+
+
+def main() -> None:
+    """Measure every seed, print and write the table; exit 1 if a seed misses the target."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--seeds", type=int, default=5)
+    parser.add_argument("--black-box", type=Path, default=eval_agent.SHIPPED_BLACK_BOX)
+    parser.add_argument("--out", type=Path, default=Path("runs/learning"))
+    parser.add_argument("--total-timesteps", type=float, default=Config.total_timesteps)
+    parser.add_argument("--table", type=Path, default=Path("docs/results/learning.md"))
+    arguments = parser.parse_args()
+    config = Config(total_timesteps=int(arguments.total_timesteps))
+    identify(arguments.black_box, arguments.out, seed=0)
+    successes, rows = [], []
+    for seed in range(arguments.seeds):
+        success, row = measure_seed(seed, arguments.black_box, arguments.out, config)
+        successes.append(success)
+        rows.append(row)
+        print(row, end="", flush=True)
+    reached = sum(success >= TARGET_SUCCESS for success in successes)
+    text = (
+        "# Learning: from black box to race\n\n"
+        f"`python -m benchmarks.learning --seeds {arguments.seeds} "
+        f"--total-timesteps {config.total_timesteps:g}` on {platform.machine()}, "
+        f"{jax.device_count()} {jax.default_backend()} device, jax {jax.__version__}. CPU seconds "
+        f"include compilation. {NUM_EPISODES} noisy starts, {NUM_LAPS} laps; training seeds with at least "
+        f"{TARGET_SUCCESS:.0%}: **{reached} of {len(successes)}**.\n\n" + HEADER + "".join(rows)
+    )
+    write_atomically(arguments.table, text.encode())
+    if reached < len(successes):
+        raise SystemExit(1)
+
+
+if __name__ == "__main__":
+    main()

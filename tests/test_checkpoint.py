@@ -1,0 +1,81 @@
+"""Checkpoints come back as they were written, or are refused with the reason."""
+
+import dataclasses
+
+import flax.serialization
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from baselines.purejaxrl_ppo import CheckpointError, Config, load_checkpoint, make_network
+from baselines.purejaxrl_ppo.checkpoint import save_checkpoint
+from flytrack_env import FlyTrack
+from flytrack_env.observations import OBSERVATION_SIZE
+
+CONFIG = Config(hidden_sizes=(8,))
+DESCRIPTION = {"env_id": "FlyTrack-v0", "track": "flytrack", "observation_size": OBSERVATION_SIZE}
+
+
+@pytest.fixture
+def params():
+    return make_network(CONFIG).init(jax.random.key(0), jnp.zeros((1, OBSERVATION_SIZE)))
+
+
+@pytest.fixture
+def path(tmp_path, params):
+    save_checkpoint(tmp_path / "a.msgpack", params, CONFIG, DESCRIPTION)
+    return tmp_path / "a.msgpack"
+
+
+def test_round_trip(path, params):
+    checkpoint = load_checkpoint(path)
+    jax.tree.map(np.testing.assert_array_equal, checkpoint.params, params)
+    assert checkpoint.config == CONFIG
+    assert (checkpoint.env_id, checkpoint.track) == ("FlyTrack-v0", "flytrack")
+    checkpoint.check_fits(FlyTrack())
+
+
+def test_other_observation_size_is_refused(tmp_path):
+    params = make_network(CONFIG).init(jax.random.key(0), jnp.zeros((1, 5)))
+    save_checkpoint(tmp_path / "b.msgpack", params, CONFIG, {**DESCRIPTION, "observation_size": 5})
+    with pytest.raises(CheckpointError, match=f"size 5 .*{OBSERVATION_SIZE}"):
+        load_checkpoint(tmp_path / "b.msgpack").check_fits(FlyTrack())
+
+
+def test_parameters_of_another_network_are_refused(tmp_path, params):
+    wider = dataclasses.replace(CONFIG, hidden_sizes=(9,))
+    save_checkpoint(tmp_path / "c.msgpack", params, wider, DESCRIPTION)
+    with pytest.raises(CheckpointError, match="shape"):
+        load_checkpoint(tmp_path / "c.msgpack")
+
+
+def test_values_that_are_not_finite_are_refused(tmp_path, params):
+    broken = jax.tree.map(lambda leaf: leaf * np.nan, params)
+    save_checkpoint(tmp_path / "d.msgpack", broken, CONFIG, DESCRIPTION)
+    with pytest.raises(CheckpointError, match="not finite"):
+        load_checkpoint(tmp_path / "d.msgpack")
+
+
+@pytest.mark.parametrize("kept", [0, 1, 100, 0.5, 0.99])
+def test_truncated_file_is_refused(path, kept):
+    content = path.read_bytes()
+    length = kept if isinstance(kept, int) else int(kept * len(content))
+    path.write_bytes(content[:length])
+    with pytest.raises(CheckpointError, match="a.msgpack"):
+        load_checkpoint(path)
+
+
+@pytest.mark.parametrize(
+    "content", [{}, {"meta": "{}"}, {"meta": "not json"}, {"meta": '{"format": "other"}'}, [1, 2]]
+)
+def test_another_format_is_refused(tmp_path, content):
+    path = tmp_path / "e.msgpack"
+    path.write_bytes(flax.serialization.msgpack_serialize(content))
+    with pytest.raises(CheckpointError, match="e.msgpack"):
+        load_checkpoint(path)
+
+
+def test_missing_file_is_refused(tmp_path):
+    with pytest.raises(CheckpointError, match="missing.msgpack: cannot be read"):
+        load_checkpoint(tmp_path / "missing.msgpack")

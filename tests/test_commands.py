@@ -1,0 +1,115 @@
+"""The commands a user types: training, evaluating, the demo; and what they refuse."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import demo
+import eval_agent
+from baselines.purejaxrl_ppo import Config
+from baselines.purejaxrl_ppo.density import draw_position_density
+from baselines.purejaxrl_ppo.train_ppo import train_policy
+from flytrack_env import load_model, load_track
+from flytrack_env.rollout import load_rollout
+
+ROOT = Path(__file__).parent.parent
+
+
+@pytest.fixture(scope="module")
+def checkpoint_path(tmp_path_factory):
+    out = tmp_path_factory.mktemp("train")
+    config = Config(total_timesteps=4096, num_envs=64, num_steps=32, hidden_sizes=(16,))
+    train_policy(out, config, seed=0)
+    return out / "final.msgpack"
+
+
+def run(*arguments: str) -> subprocess.CompletedProcess:
+    return subprocess.run(
+        [sys.executable, *arguments], cwd=ROOT, capture_output=True, text=True, timeout=300
+    )
+
+
+def test_eval_agent_writes_the_rollout(checkpoint_path, tmp_path):
+    out = tmp_path / "rollout.npy"
+    done = run(
+        "eval_agent.py", "--checkpoint", str(checkpoint_path), "--steps", "50", "--out", str(out)
+    )
+    assert done.returncode == 0, done.stderr
+    assert "gates: 0" in done.stdout and "ended:" in done.stdout
+    states, actions = load_rollout(out)
+    assert np.load(out).shape == (len(states), 25) and 1 <= len(states) <= 50
+    # Row after row is the black box: the applied action lags behind the command.
+    assert np.abs(actions).max() <= 1.0
+    np.testing.assert_allclose(states[0, :2], [18.6, 2.0], atol=0.31)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--checkpoint", "missing.msgpack", "--steps", "5"], "missing.msgpack"),
+        (["--checkpoint", "CHECKPOINT", "--steps", "0"], "--steps"),
+        (["--checkpoint", "CHECKPOINT", "--steps", "5", "--black-box", "no.bin"], "no.bin"),
+    ],
+)
+def test_eval_agent_refuses(checkpoint_path, tmp_path, arguments, message):
+    arguments = [str(checkpoint_path) if a == "CHECKPOINT" else a for a in arguments]
+    out = tmp_path / "rollout.npy"
+    done = run("eval_agent.py", *arguments, "--out", str(out))
+    assert done.returncode == 2 and message in done.stderr and "Traceback" not in done.stderr
+    assert not out.exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--track", "nowhere"], "nowhere"),
+        (["--model", "missing.json"], "missing.json"),
+        (["--total-timesteps", "10"], "total_timesteps"),
+        (["--env-id", "FlyTrack-v9"], "FlyTrack-v9"),
+    ],
+)
+def test_training_refuses_before_any_work(tmp_path, arguments, message):
+    out = tmp_path / "out"
+    done = run("-m", "baselines.purejaxrl_ppo.train_ppo", *arguments, "--out", str(out))
+    assert done.returncode == 2 and message in done.stderr and "Traceback" not in done.stderr
+    assert not out.exists()
+
+
+def test_demo_writes_everything(tmp_path, monkeypatch, capsys):
+    pytest.importorskip("rerun")
+    out = tmp_path / "demo"
+    monkeypatch.setattr(demo, "NUM_STEPS", 100)
+    monkeypatch.setattr(demo, "NUM_EPISODES", 4)
+    monkeypatch.setattr(
+        sys, "argv", ["demo.py", "--out", str(out), "--total-timesteps", str(Config().batch_size)]
+    )
+    demo.main()
+    names = {"final.msgpack", "model.json", "position_density.png", "rollout.npy", "rollout.rrd"}
+    assert {path.name for path in out.iterdir()} == names | {"summary.json"}
+    summary = json.loads((out / "summary.json").read_text())
+    assert summary["noisy_starts"]["episodes"] == 4
+    assert set(summary["validation"]["one_step_mse"]) == {
+        "position",
+        "velocity",
+        "quaternion",
+        "rates",
+    }
+    assert load_model(out / "model.json").tau.shape == (4,)
+    assert "noisy starts finish 3 laps" in capsys.readouterr().out
+
+
+def test_density_counts_positions_in_bins(tmp_path):
+    positions = np.tile([[10.0, 10.0, 1.0]], (50, 1))
+    draw_position_density(tmp_path / "density.png", positions, load_track("flytrack"))
+    assert (tmp_path / "density.png").read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"
+
+
+def test_lap_times_and_reason_of_a_flight(checkpoint_path):
+    checkpoint = eval_agent.load_checkpoint(checkpoint_path)
+    flight = eval_agent.fly_on_black_box(checkpoint, eval_agent.SHIPPED_BLACK_BOX, 20, seed=1)
+    assert eval_agent.reason_ended(flight) == "all steps flown"
+    assert eval_agent.lap_times(flight).size == 0

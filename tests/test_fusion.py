@@ -1,0 +1,125 @@
+"""``compute_once`` is the identity, whatever is done to it."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from flytrack_env.fusion import compute_once
+
+LEAVES = {
+    "float": np.array([1.5, -0.0, np.inf, -np.inf, np.nan], np.float32),
+    "all nan": np.full(3, np.nan, np.float32),
+    "scalar": np.float32(2.5),
+    "half": np.array([0.5, 2.0], np.float16),
+    "int": np.array([-3, 0, 2**31 - 1, -(2**31)], np.int32),
+    "unsigned": np.array([0, 1, 2**32 - 1], np.uint32),
+    "bool": np.array([True, False]),
+    "matrix": np.arange(6, dtype=np.float32).reshape(2, 3),
+}
+TRANSFORMS = {
+    "eager": lambda f: f,
+    "jit": jax.jit,
+    "vmap": lambda f: lambda x: jax.vmap(f)(jnp.stack([x, x]))[1],
+    "jit of vmap": lambda f: lambda x: jax.jit(jax.vmap(f))(jnp.stack([x, x]))[1],
+    "vmap along the last axis": lambda f: (
+        lambda x: jax.vmap(f, -1, -1)(jnp.stack([x, x], -1))[..., 1]
+    ),
+    "scan": lambda f: lambda x: jax.lax.scan(lambda c, _: (f(c), None), x, None, length=3)[0],
+    "cond": lambda f: lambda x: jax.lax.cond(jnp.asarray(True), f, lambda y: y, x),
+    "remat": jax.checkpoint,
+}
+
+
+@pytest.mark.parametrize("leaf", LEAVES)
+@pytest.mark.parametrize("transform", TRANSFORMS)
+def test_identity(leaf: str, transform: str) -> None:
+    value = jnp.asarray(LEAVES[leaf])
+    result = TRANSFORMS[transform](compute_once)(value)
+    assert (result.dtype, result.shape) == (value.dtype, value.shape)
+    np.testing.assert_array_equal(result, value)
+    if np.issubdtype(value.dtype, np.floating):
+        np.testing.assert_array_equal(np.signbit(result), np.signbit(value))
+
+
+@pytest.mark.parametrize("first", LEAVES)
+def test_trees_keep_structure_order_and_types(first: str) -> None:
+    tree = {"a": (LEAVES[first], [LEAVES["int"]]), "b": LEAVES["bool"], "c": None}
+    for function in (compute_once, jax.jit(compute_once)):
+        result = function(tree)
+        assert jax.tree.structure(result) == jax.tree.structure(tree)
+        for a, b in zip(jax.tree.leaves(result), jax.tree.leaves(tree), strict=True):
+            assert a.dtype == b.dtype
+            np.testing.assert_array_equal(a, b)
+
+
+def test_vmap_over_some_leaves_only() -> None:
+    pair = jax.jit(jax.vmap(lambda x, y: compute_once((x, y)), in_axes=(0, None)))
+    x, y = pair(jnp.arange(3.0), jnp.float32(5.0))
+    np.testing.assert_array_equal(x, [0.0, 1.0, 2.0])
+    np.testing.assert_array_equal(y, [5.0, 5.0, 5.0])
+
+
+def plain(x: jax.Array, n: jax.Array) -> jax.Array:
+    """Return a function of a real and an integer."""
+    return jnp.sin(x) * x**2 + n * x
+
+
+def fenced(x: jax.Array, n: jax.Array) -> jax.Array:
+    """Return the same with boundaries inside."""
+    x, n, _ = compute_once((x, n, x > 0))
+    return compute_once(jnp.sin(x)) * x**2 + n * compute_once(x)
+
+
+@pytest.mark.parametrize("order", [1, 2])
+@pytest.mark.parametrize("differentiate", [jax.grad, jax.jacfwd, jax.jacrev])
+@pytest.mark.parametrize("is_jitted", [False, True])
+def test_derivatives_pass_through(order: int, differentiate: Any, is_jitted: bool) -> None:
+    functions = []
+    for function in (plain, fenced):
+        for _ in range(order):
+            function = differentiate(function)
+        functions.append(jax.jit(function) if is_jitted else function)
+    expected, result = (function(jnp.float32(0.7), jnp.int32(3)) for function in functions)
+    np.testing.assert_allclose(result, expected, rtol=1e-6)
+
+
+def test_jvp_and_vjp_pass_tangents_through() -> None:
+    x = jnp.array([1.0, 2.0])
+    tangent = jnp.array([0.3, -0.5])
+    for wrap in (lambda f: f, jax.jit):
+        value, pushed = jax.jvp(wrap(compute_once), (x,), (tangent,))
+        np.testing.assert_array_equal(value, x)
+        np.testing.assert_array_equal(pushed, tangent)
+        value, pull = jax.vjp(wrap(compute_once), x)
+        np.testing.assert_array_equal(pull(tangent)[0], tangent)
+
+
+def test_gradients_of_a_batch() -> None:
+    x = jnp.linspace(-1.0, 1.0, 5)
+    n = jnp.arange(5)
+    expected = jax.vmap(jax.grad(plain))(x, n)
+    np.testing.assert_allclose(jax.jit(jax.vmap(jax.grad(fenced)))(x, n), expected, rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    "tree",
+    [
+        pytest.param((), id="nothing"),
+        pytest.param({"a": None}, id="no leaves"),
+        pytest.param((np.zeros((0, 3), np.float32),), id="empty leaf"),
+        pytest.param((np.zeros((0,), np.float32), np.ones(2, np.float32)), id="empty leaf first"),
+    ],
+)
+def test_empty_trees_and_leaves(tree: Any) -> None:
+    result = jax.jit(compute_once)(tree)
+    assert jax.tree.structure(result) == jax.tree.structure(tree)
+
+
+def test_random_keys_pass_through() -> None:
+    key = jax.random.key(3)
+    for tree in ((key,), (jnp.float32(1.0), key)):
+        result = jax.jit(compute_once)(tree)
+        assert jax.random.key_data(result[-1]).tolist() == jax.random.key_data(key).tolist()

@@ -1,0 +1,202 @@
+"""Model files: written, read, and refused in words."""
+
+import json
+import os
+import re
+from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from flytrack_env.dynamics import ModelParameters, nominal_parameters
+from flytrack_env.env import FlyTrack
+from flytrack_env.model_file import ModelFileError, load_model, save_model
+
+MINIMAL = """{
+  "tau": [0.03, 0.04, 0.05, 0.06],
+  "thrust_coeffs": [1, 2, 3, 4, 5, 6],
+  "max_rate": [618.0, 618.0, 120.0],
+  "m": 1,
+  "g": 9.80665,
+  "battery_drain_v_per_min": 1.0
+}
+"""
+FIELDS = json.loads(MINIMAL)
+
+
+def assert_same_model(a: ModelParameters, b: ModelParameters) -> None:
+    """Compare two models field by field."""
+    for name in ModelParameters._fields:
+        np.testing.assert_array_equal(getattr(a, name), getattr(b, name), err_msg=name)
+
+
+@pytest.mark.parametrize(
+    "model",
+    [
+        nominal_parameters(),
+        nominal_parameters()._replace(m=0.1, g=1.62, battery_drain_v_per_min=0.0),
+        nominal_parameters()._replace(thrust_coeffs=np.float32([0.1, -0.2, 1 / 3, 1e-7, 1e5, 0])),
+    ],
+)
+def test_round_trip(model: ModelParameters, tmp_path: Path) -> None:
+    path = tmp_path / "model.json"
+    provenance = {"source": "a test", "seed": 3, "files": ["a.npy"]}
+    save_model(path, model, provenance)
+    assert_same_model(load_model(path), model)
+    assert_same_model(load_model(str(path)), model)
+    document = json.loads(path.read_text(encoding="utf-8"))
+    assert document["provenance"] == provenance
+    assert set(document["units"]) == set(document["parameters"]) == set(ModelParameters._fields)
+
+
+def test_minimal_file_by_hand(tmp_path: Path) -> None:
+    path = tmp_path / "model.json"
+    path.write_text(MINIMAL, encoding="utf-8")
+    model = load_model(path)
+    expected = {name: np.float32(value) for name, value in FIELDS.items()}
+    for name, value in expected.items():
+        np.testing.assert_allclose(getattr(model, name), value)
+    assert_same_model(FlyTrack(model=path).default_params.model, model)
+    nested = tmp_path / "nested.json"
+    nested.write_text(json.dumps({"version": 1, "parameters": FIELDS}), encoding="utf-8")
+    assert_same_model(load_model(nested), model)
+
+
+def without(name: str) -> dict[str, Any]:
+    """Return the fields of the minimal file but one."""
+    return {field: value for field, value in FIELDS.items() if field != name}
+
+
+BAD_TEXTS = {
+    "empty": ("", "not a JSON file"),
+    "no json": ("tau = 3", "not a JSON file"),
+    "cut short": (MINIMAL[:-4], "not a JSON file"),
+    "deep": ("[" * 100_000, "not a JSON file"),
+    "list": ("[1, 2]", "found a list, expected an object"),
+    "number": ("3", "found a int, expected an object"),
+    "newer": (json.dumps({"version": 2, "parameters": FIELDS}), "version: found 2, expected 1"),
+    "version as text": (json.dumps({**FIELDS, "version": "1"}), "version: found '1', expected 1"),
+    "parameters as list": (json.dumps({"parameters": [1]}), r"parameters: found \[1\], expected"),
+    "parameters as null": (json.dumps({"parameters": None}), "parameters: found None, expected"),
+    "unknown field": (json.dumps({**FIELDS, "mass": 1}), "mass: unknown; expected tau, "),
+    "huge integer": (MINIMAL.replace('"m": 1,', f'"m": 1{400 * "0"},'), "m: found 1"),
+    "too many digits": (MINIMAL.replace('"m": 1,', f'"m": 1{5000 * "0"},'), "m"),
+    "beyond float32": (MINIMAL.replace("[0.03", "[1e39"), "tau: found "),
+}
+
+
+@pytest.mark.parametrize("case", BAD_TEXTS)
+def test_bad_files_are_refused(case: str, tmp_path: Path) -> None:
+    text, reason = BAD_TEXTS[case]
+    path = tmp_path / "model.json"
+    path.write_text(text, encoding="utf-8")
+    with pytest.raises(ModelFileError, match=rf"^{re.escape(str(path))}: {reason}"):
+        load_model(path)
+
+
+@pytest.mark.parametrize("name", ModelParameters._fields)
+def test_missing_fields_are_named(name: str, tmp_path: Path) -> None:
+    path = tmp_path / "model.json"
+    path.write_text(json.dumps(without(name)), encoding="utf-8")
+    with pytest.raises(ModelFileError, match=rf"^{re.escape(str(path))}: {name}: missing"):
+        load_model(path)
+
+
+VECTORS = [(name, len(value)) for name, value in FIELDS.items() if isinstance(value, list)]
+BAD_VALUES = [
+    *[
+        (name, [1.0] * n, f"{size} finite numbers")
+        for name, size in VECTORS
+        for n in (0, size - 1, size + 1)
+    ],
+    *[(name, bad, f"{size} finite numbers") for name, size in VECTORS for bad in (1.0, "x", None)],
+    *[
+        (name, [*[1.0] * (size - 1), bad], "finite")
+        for name, size in VECTORS
+        for bad in ("1", True, None, [1.0], float("nan"), float("inf"))
+    ],
+    *[
+        (name, bad, "a finite number")
+        for name in ("m", "g", "battery_drain_v_per_min")
+        for bad in ([1.0], "1", True, None, float("nan"), float("-inf"), {})
+    ],
+    *[("m", bad, "> 0") for bad in (0, -1.0)],
+    *[("tau", [0.04, 0.04, bad, 0.04], "> 0") for bad in (0.0, -0.01)],
+    ("max_rate", [618.0, -618.0, 120.0], "> 0"),
+]
+
+
+@pytest.mark.parametrize(("name", "value", "reason"), BAD_VALUES)
+def test_bad_values_are_refused(name: str, value: Any, reason: str, tmp_path: Path) -> None:
+    path = tmp_path / "model.json"
+    path.write_text(json.dumps({**FIELDS, name: value}), encoding="utf-8")
+    with pytest.raises(
+        ModelFileError, match=rf"^{re.escape(str(path))}: {name}: found .*, expected .*{reason}"
+    ):
+        load_model(path)
+
+
+def test_files_that_cannot_be_read(tmp_path: Path) -> None:
+    binary = tmp_path / "binary.json"
+    binary.write_bytes(b"\xff\xfe\x00")
+    for path in (tmp_path / "none.json", tmp_path, binary):
+        with pytest.raises(ModelFileError, match=rf"^{re.escape(str(path))}: cannot be read: "):
+            load_model(path)
+
+
+@contextmanager
+def full_disk() -> Iterator[None]:
+    """Let every write to a file fail after a few bytes, as on a full disk."""
+    resource = pytest.importorskip("resource")
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (10, limits[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+
+
+@contextmanager
+def failing_rename() -> Iterator[None]:
+    """Let ``os.replace`` fail."""
+
+    def fail(*arguments: Any, **keywords: Any) -> None:
+        raise OSError("not permitted")
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(os, "replace", fail)
+        yield
+
+
+@pytest.mark.parametrize(
+    ("trouble", "provenance"),
+    [(full_disk, {}), (failing_rename, {}), (nullcontext, {"not JSON": object()})],
+)
+def test_a_failed_write_leaves_the_old_file(
+    trouble: Any, provenance: dict[str, Any], tmp_path: Path
+) -> None:
+    path = tmp_path / "model.json"
+    save_model(path, nominal_parameters(), {})
+    old = path.read_bytes()
+    with pytest.raises((OSError, TypeError)), trouble():
+        save_model(path, nominal_parameters()._replace(m=9.0), provenance)
+    assert path.read_bytes() == old
+    assert [entry.name for entry in tmp_path.iterdir()] == ["model.json"]
+
+
+def test_missing_folders_are_made_and_old_files_replaced(tmp_path: Path) -> None:
+    path = tmp_path / "a" / "b" / "model.json"
+    for mass in (1.5, 2.5):
+        save_model(path, nominal_parameters()._replace(m=mass), {})
+        assert load_model(path).m == mass
+
+
+def test_written_files_have_the_usual_permissions(tmp_path: Path) -> None:
+    usual = tmp_path / "usual.json"
+    usual.write_text("{}", encoding="utf-8")
+    path = tmp_path / "model.json"
+    save_model(path, nominal_parameters(), {})
+    assert path.stat().st_mode == usual.stat().st_mode

@@ -1,0 +1,138 @@
+"""Every reward term by hand, and their weighted sum."""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from flytrack_env import rewards
+from flytrack_env.env import EnvParams, FlyTrack
+from flytrack_env.quaternion import Vec3
+from flytrack_env.rewards import TERMS, RewardWeights, Transition, total_reward
+from flytrack_env.state import Action
+
+MakeTransition = Callable[..., Transition]
+
+
+@pytest.fixture
+def make_transition(make_drone: Any) -> MakeTransition:
+    """A function that returns a still transition 5 m before a gate, with some parts replaced."""
+
+    def make(before: Any = None, after: Any = None, **fields: Any) -> Transition:
+        still = {
+            "gate_centre_w": Vec3(*map(jnp.float32, (1.0, 2.0, 3.0))),
+            "num_passed": jnp.int32(0),
+            "offset": jnp.float32(0.5),
+            "is_terminated": jnp.asarray(False),
+        }
+        drones = [
+            make_drone(**{"position": (-4.0, 2.0, 3.0), **(d or {})}) for d in (before, after)
+        ]
+        return Transition(*drones, **{**still, **fields})
+
+    return make
+
+
+PASSED = {"num_passed": jnp.int32(1)}
+CASES = [
+    ("progress", {}, 0.0),
+    ("progress", {"after": {"position": (-3.0, 2.0, 3.0)}}, 1.0),
+    ("progress", {"after": {"position": (-5.0, 2.0, 3.0)}}, -1.0),
+    ("progress", {"after": {"position": (1.0, 6.0, 6.0)}}, 0.0),
+    ("progress", {"after": {"position": (1.0, 2.0, 3.0)}}, 5.0),
+    ("gate_pass", {}, 0.0),
+    ("gate_pass", PASSED, 1.0),
+    ("gate_pass", {"num_passed": jnp.int32(2)}, 2.0),
+    ("off_centre", {}, 0.0),
+    ("off_centre", PASSED, 0.25),
+    ("off_centre", {**PASSED, "offset": jnp.float32(1.0)}, 1.0),
+    ("off_centre", {**PASSED, "offset": jnp.float32(0.0)}, 0.0),
+    ("termination", {}, 0.0),
+    ("termination", {"is_terminated": jnp.asarray(True)}, 1.0),
+    ("body_rates", {}, 0.0),
+    ("body_rates", {"after": {"rates_b": Vec3(1.0, -2.0, 3.0)}}, 14.0),
+    ("body_rates", {"before": {"rates_b": Vec3(1.0, -2.0, 3.0)}}, 0.0),
+    ("action_change", {}, 0.0),
+    ("action_change", {"after": {"applied": Action(0.1, -0.2, 0.3, -0.4)}}, 0.3),
+    ("action_change", {"before": {"applied": Action(1.0, 1.0, 1.0, 1.0)}}, 4.0),
+]
+
+
+@pytest.mark.parametrize(("name", "parts", "expected"), CASES)
+def test_term(
+    name: str, parts: dict[str, Any], expected: float, make_transition: MakeTransition
+) -> None:
+    value = getattr(rewards, name)(make_transition(**parts))
+    assert float(value) == pytest.approx(expected, abs=1e-5)
+
+
+def test_every_weight_is_named_after_a_term_and_every_term_is_tested() -> None:
+    names = [term.__name__ for term in TERMS]
+    assert len(set(names)) == len(names)
+    assert set(RewardWeights._fields) == set(names) == {case[0] for case in CASES}
+    assert set(RewardWeights._field_defaults) == set(names)
+
+
+def test_total_is_the_weighted_sum(make_transition: MakeTransition) -> None:
+    transition = make_transition(
+        after={
+            "position": (-3.0, 2.5, 3.0),
+            "rates_b": Vec3(1.0, 0.5, 0.2),
+            "applied": Action(0.1, 0.2, 0.3, 0.4),
+        },
+        num_passed=jnp.int32(1),
+        is_terminated=jnp.asarray(True),
+    )
+    values = {term.__name__: float(term(transition)) for term in TERMS}
+    assert all(values.values()), "a zero term would not test its weight"
+    for name, value in values.items():
+        only = RewardWeights(**{field: float(field == name) for field in RewardWeights._fields})
+        assert float(total_reward(transition, only)) == pytest.approx(value, rel=1e-6)
+    weights = RewardWeights(*np.linspace(-1.0, 2.0, len(TERMS)).tolist())
+    expected = sum(getattr(weights, name) * value for name, value in values.items())
+    assert float(total_reward(transition, weights)) == pytest.approx(expected, rel=1e-5)
+
+
+def test_default_weights_have_the_right_signs() -> None:
+    weights = RewardWeights()
+    assert weights.progress > 0.0 and weights.gate_pass > 0.0
+    for name in ("off_centre", "termination", "body_rates", "action_change"):
+        assert getattr(weights, name) < 0.0
+
+
+def test_gradient_is_finite_at_the_gates_centre(make_transition: MakeTransition) -> None:
+    at_centre = {"position": (1.0, 2.0, 3.0)}
+
+    def reward(x: jax.Array) -> jax.Array:
+        transition = make_transition(before=at_centre, after=at_centre)
+        after = transition.after._replace(pos_w=transition.after.pos_w._replace(x=x))
+        return total_reward(transition._replace(after=after), RewardWeights())
+
+    assert np.isfinite(jax.grad(reward)(jnp.float32(1.0)))
+
+
+@pytest.mark.parametrize(
+    ("y", "expected"),
+    [
+        (0.0, {"progress": True, "gate_pass": 1, "off_centre": 0.0, "termination": 0}),
+        (0.3, {"progress": True, "gate_pass": 1, "off_centre": 0.25, "termination": 0}),
+        (1.0, {"gate_pass": 0, "off_centre": 0.0, "termination": 1}),
+        (2.0, {"gate_pass": 0, "off_centre": 0.0, "termination": 1}),
+    ],
+)
+def test_environment_hands_its_transition_to_the_terms(
+    y: float, expected: dict[str, Any], coasting_envs: Any, row_track: Any, make_drone: Any
+) -> None:
+    env: FlyTrack = coasting_envs(row_track([0.0, 10.0]), "terminate")
+    transition = jax.jit(env.transition)
+    for name, value in expected.items():
+        only = RewardWeights(**{field: float(field == name) for field in RewardWeights._fields})
+        params: EnvParams = env.default_params.replace(reward=only)
+        state = env.begin(make_drone((-0.9, y, 2.0), (100.0, 0.0, 0.0)), 0, params)
+        reward = float(transition(state, jnp.zeros(4), params)[1])
+        if name == "progress":  # towards the gate that was flown to, 0.9 m before and 0.1 m behind
+            value = np.hypot(0.9, y) - np.hypot(0.1, y)
+        assert reward == pytest.approx(value, abs=1e-4)
