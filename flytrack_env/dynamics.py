@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from flytrack_env.fusion import compute_once
 from flytrack_env.quaternion import Quaternion, Scalar, Vec3
 from flytrack_env.state import Action, Drone, pack, unpack, unpack_action
 
@@ -90,11 +91,11 @@ def advance(drone: Drone, command: Action, dt: Scalar, params: ModelParameters) 
     The acceleration uses the attitude *before* the step and the thrust of the lagged action
     *after* it (handout, equations 1 to 4). Commands are not clipped here.
     """
-    applied = lag(drone.applied, command, dt, params.tau)
+    applied = compute_once(lag(drone.applied, command, dt, params.tau))
     rates_b = body_rates(applied, params.max_rate)
     thrust = collective_thrust(applied.thrust, drone.battery_v, params.thrust_coeffs)
     thrust_axis_w = drone.quat.axes()[2]
-    acc_w = thrust_axis_w.scale(thrust / params.m) - Vec3(0.0, 0.0, params.g)
+    acc_w = compute_once(thrust_axis_w.scale(thrust / params.m) - Vec3(0.0, 0.0, params.g))
     return Drone(
         pos_w=drone.pos_w + drone.vel_w.scale(dt) + acc_w.scale(0.5 * dt * dt),
         vel_w=drone.vel_w + acc_w.scale(dt),

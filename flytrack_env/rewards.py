@@ -5,7 +5,6 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from flytrack_env.fusion import compute_once
 from flytrack_env.quaternion import Scalar, Vec3
 from flytrack_env.state import Drone
 
@@ -74,6 +73,4 @@ TERMS = (progress, gate_pass, off_centre, termination, body_rates, action_change
 
 def total_reward(transition: Transition, weights: RewardWeights) -> jax.Array:
     """Return the weighted sum of all terms."""
-    terms = compute_once([term(transition) for term in TERMS])
-    names = [term.__name__ for term in TERMS]
-    return sum(getattr(weights, name) * value for name, value in zip(names, terms, strict=True))
+    return sum(getattr(weights, term.__name__) * term(transition) for term in TERMS)
