@@ -11,6 +11,7 @@ import zlib
 import jax
 import jax.numpy as jnp
 
+from flytrack_env.fusion import compute_once
 from flytrack_env.quaternion import Scalar
 
 UNIFORM_BITS = 24  # the mantissa of a float32
@@ -36,8 +37,9 @@ def seed_of(key: jax.Array) -> jax.Array:
     is_typed = jnp.issubdtype(key.dtype, jax.dtypes.prng_key)
     words = jax.random.key_data(key) if is_typed else key
     seed = jnp.uint32(GOLDEN_RATIO_32)
-    for i in range(words.shape[-1]):
-        seed = mix(seed ^ words[i])
+    # The fence: a batch of keys is strided, and what reads strided memory is not vectorised.
+    for word in compute_once([words[i] for i in range(words.shape[-1])]):
+        seed = mix(seed ^ word)
     return seed
 
 

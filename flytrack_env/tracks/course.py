@@ -99,25 +99,26 @@ def cross_gate(gate: GateFrame, start_w: Vec3, end_w: Vec3, radius: Scalar) -> C
     """
     start = gate.to_frame(start_w - gate.centre)
     end = gate.to_frame(end_w - gate.centre)
-    is_forward = (start.x < 0.0) & (end.x >= 0.0)
-    is_backward = (start.x >= 0.0) & (end.x < 0.0)
+    start_x, end_x = compute_once((start.x, end.x))
+    is_forward = (start_x < 0.0) & (end_x >= 0.0)
+    is_backward = (start_x >= 0.0) & (end_x < 0.0)
     is_crossing = is_forward | is_backward
     # The denominator is non-zero wherever the plane is crossed; elsewhere it is not used.
-    travel = jnp.where(is_crossing, end.x - start.x, 1.0)
-    fraction = jnp.where(is_crossing, -start.x / travel, 1.0)
+    travel = jnp.where(is_crossing, end_x - start_x, 1.0)
+    fraction = compute_once(jnp.where(is_crossing, -start_x / travel, 1.0))
     across = jnp.abs(start.y + fraction * (end.y - start.y))
     along = jnp.abs(start.z + fraction * (end.z - start.z))
-    distance = jnp.maximum(across, along)
+    distance = compute_once(jnp.maximum(across, along))
     free = gate.half_opening - radius
     is_within_opening = distance <= free
     is_within_frame = distance <= gate.half_frame + radius
-    return compute_once(Crossing(
+    return Crossing(
         is_pass=is_forward & is_within_opening,
         is_frame=is_crossing & ~is_within_opening & is_within_frame,
         is_miss=is_forward & ~is_within_frame,
         fraction=fraction,
         offset=distance / free,
-    ))
+    )
 
 
 def build_course(track: Track) -> Course:
