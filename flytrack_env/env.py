@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 from gymnax.environments import environment, spaces
 
+from flytrack_env.auto_reset import reset_ended
 from flytrack_env.dynamics import ModelParameters, nominal_parameters
 from flytrack_env.fusion import compute_once
 from flytrack_env.model_file import load_model
@@ -252,6 +253,16 @@ class FlyTrack(environment.Environment[EnvState, EnvParams]):
         }
         return observation, next_state, reward, terminated, truncated, info
 
+    def _sample_starts(
+        self, places: jax.Array, inputs: tuple[jax.Array, EnvParams]
+    ) -> tuple[jax.Array, EnvState]:
+        """Return observations and states of episodes that begin in some environments of a batch."""
+        key, params = inputs
+        begin_all = jax.vmap(self._begin_from, in_axes=(0, None))
+        states = begin_all(seeds_of(key, places), params)
+        observe_all = jax.vmap(self.observe, in_axes=(None, 0, None, None))
+        return observe_all(None, states, None, params), states
+
     @partial(jax.jit, static_argnames=("self",))
     def step_batch(
         self, key: jax.Array, states: EnvState, actions: jax.Array, params: EnvParams
@@ -268,15 +279,8 @@ class FlyTrack(environment.Environment[EnvState, EnvParams]):
         truncated = self.is_truncated(next_states, params)
         done = terminated | truncated
 
-        def reset_ended() -> tuple[jax.Array, EnvState]:
-            seeds = seeds_of(key, done.shape[0])
-            fresh = jax.vmap(self._begin_from, in_axes=(0, None))(seeds, params)
-            states = compute_once(jax.tree.map(partial(jnp.where, done), fresh, next_states))
-            observe_all = jax.vmap(self.observe, in_axes=(None, 0, None, None))
-            return observe_all(None, states, None, params), states
-
-        observations, next_states = jax.lax.cond(
-            done.any(), reset_ended, lambda: (final_observations, next_states)
+        observations, next_states = reset_ended(
+            self._sample_starts, done, (final_observations, next_states), (key, params)
         )
         info = {
             **info,
