@@ -69,9 +69,7 @@ def main() -> None:
     eval_agent.save_flown(out / "rollout.npy", flight)
     print(eval_agent.describe(flight, blackbox.DT))
     env = eval_agent.black_box_env(checkpoint, arguments.black_box)
-    flights = fly_many(
-        env, checkpoint.network, checkpoint.params, seed, NUM_EPISODES, NUM_STEPS, NUM_LAPS
-    )
+    flights = fly_many(env, checkpoint.network, checkpoint.params, seed, NUM_EPISODES, NUM_STEPS, NUM_LAPS)
     result = score(flights, NUM_LAPS)
 
     print("4/4 draw")

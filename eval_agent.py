@@ -25,9 +25,7 @@ def black_box_env(checkpoint: Checkpoint, black_box: Path) -> FlyTrack:
     Raises:
         BlackBoxError, CheckpointError, TrackError: a file that cannot be used.
     """
-    env = flytrack_env.make(
-        checkpoint.env_id, track=checkpoint.track, plant=blackbox.load(black_box)
-    )
+    env = flytrack_env.make(checkpoint.env_id, track=checkpoint.track, plant=blackbox.load(black_box))
     checkpoint.check_fits(env)
     return env
 
@@ -84,9 +82,7 @@ def main() -> None:
         parser.error(f"--steps: found {arguments.steps}, expected at least 1")
     try:
         checkpoint = load_checkpoint(arguments.checkpoint)
-        flight = fly_on_black_box(
-            checkpoint, arguments.black_box, arguments.steps, arguments.seed
-        )
+        flight = fly_on_black_box(checkpoint, arguments.black_box, arguments.steps, arguments.seed)
         save_flown(arguments.out, flight)
     except (ValueError, OSError) as error:
         parser.error(str(error))

@@ -59,9 +59,7 @@ def pin_to_one_core() -> str:
     return f"pinned to core {core}"
 
 
-def jax_contestant(
-    name: str, env_id: str, num_envs: int, length: int, is_batch: bool
-) -> Contestant:
+def jax_contestant(name: str, env_id: str, num_envs: int, length: int, is_batch: bool) -> Contestant:
     """Return a scan of ``length`` steps of a gymnax environment, all outputs in the carry."""
     import gymnax
     import jax

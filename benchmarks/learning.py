@@ -31,9 +31,7 @@ def measure_seed(seed: int, black_box: Path, out: Path, config: Config) -> tuple
     checkpoint, _ = train_policy(out / f"seed{seed}", config, seed, model=out / "model.json")
     cpu_seconds = time.process_time() - started
     env = eval_agent.black_box_env(checkpoint, black_box)
-    flights = fly_many(
-        env, checkpoint.network, checkpoint.params, seed, NUM_EPISODES, NUM_STEPS, NUM_LAPS
-    )
+    flights = fly_many(env, checkpoint.network, checkpoint.params, seed, NUM_EPISODES, NUM_STEPS, NUM_LAPS)
     result = score(flights, NUM_LAPS)
     row = (
         f"| {seed} | {result.success:.1%} | {result.gates:.2f} | {result.first_lap_s:.3f} | "

@@ -105,8 +105,7 @@ def _check_closed(path: Path, exported: export.Exported, module: str) -> None:
     callbacks = [target for target in targets if "callback" in target]
     if effects or callbacks:
         raise BlackBoxError(
-            f"{path}: found {', '.join(effects + callbacks)}, expected a pure function without "
-            "callbacks"
+            f"{path}: found {', '.join(effects + callbacks)}, expected a pure function without callbacks"
         )
 
 

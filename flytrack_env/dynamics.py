@@ -65,24 +65,21 @@ def lag(applied: Action, command: Action, dt: Scalar, tau: jax.Array) -> Action:
     ``tau`` has shape (4,), s. Exact for a command held over the step; handout, equation 1.
     """
     blend = 1.0 - jnp.exp(-dt / jnp.asarray(tau))
-    return Action(
-        *(old + blend[i] * (new - old) for i, (old, new) in enumerate(zip(applied, command)))
-    )
+    pairs = zip(applied, command, blend, strict=True)
+    return Action(*(old + fraction * (new - old) for old, new, fraction in pairs))
 
 
 def body_rates(applied: Action, max_rate: jax.Array) -> Vec3:
     """Return body rates in rad/s of an applied action; ``max_rate`` has shape (3,), deg/s."""
     full_stick = jnp.deg2rad(jnp.asarray(max_rate))
-    return Vec3(
-        applied.roll * full_stick[0], applied.pitch * full_stick[1], applied.yaw * full_stick[2]
-    )
+    return Vec3(applied.roll * full_stick[0], applied.pitch * full_stick[1], applied.yaw * full_stick[2])
 
 
 def integrate_attitude(quat: Quaternion, rates_b: Vec3, dt: Scalar) -> Quaternion:
     """Return the attitude after ``dt``: normalize(q + dt/2 q (x) [0, rates]); handout, equation 2."""
     turn = quat.multiply(Quaternion(0.0, *rates_b))
     half_dt = 0.5 * dt
-    return Quaternion(*(q + half_dt * dq for q, dq in zip(quat, turn))).normalize()
+    return Quaternion(*(q + half_dt * dq for q, dq in zip(quat, turn, strict=True))).normalize()
 
 
 def advance(drone: Drone, command: Action, dt: Scalar, params: ModelParameters) -> Drone:

@@ -89,9 +89,7 @@ class FlyTrack(environment.Environment[EnvState, EnvParams]):
     ):
         super().__init__()
         if missed_gate not in MISSED_GATE_CHOICES:
-            raise ValueError(
-                f"missed_gate: found {missed_gate!r}, expected one of {MISSED_GATE_CHOICES}"
-            )
+            raise ValueError(f"missed_gate: found {missed_gate!r}, expected one of {MISSED_GATE_CHOICES}")
         self.track: Track = load_track(track)
         self.plant: Plant = Simulator() if plant is None else plant
         self.missed_gate = missed_gate
@@ -134,9 +132,7 @@ class FlyTrack(environment.Environment[EnvState, EnvParams]):
         """Return the drone of an environment state."""
         return self.plant.drone(state.plant)
 
-    def observe(
-        self, key: jax.Array | None, state: EnvState, action: Any, params: EnvParams
-    ) -> jax.Array:
+    def observe(self, key: jax.Array | None, state: EnvState, action: Any, params: EnvParams) -> jax.Array:
         """Return the observation of a state, (OBSERVATION_SIZE,) float32; key and action are unused."""
         del key, action
         return observe_race(self.drone(state), state.race.gate, state.race.next_gate)
@@ -151,9 +147,7 @@ class FlyTrack(environment.Environment[EnvState, EnvParams]):
         """Return the next state, the reward, the causes of termination and the race's events."""
         command, is_nan = clean_command(action)
         before = self.drone(state)
-        plant_state = compute_once(
-            self.plant.step(state.plant, command, params.dt, params.model)
-        )
+        plant_state = compute_once(self.plant.step(state.plant, command, params.dt, params.model))
         after = self.plant.drone(plant_state)
         start_time_s = state.time * params.dt
         race, events = advance_race(
@@ -166,9 +160,7 @@ class FlyTrack(environment.Environment[EnvState, EnvParams]):
             params.drone_radius,
         )
         is_missed = events.is_miss & (self.missed_gate == "terminate")
-        causes = compute_once(
-            find_causes(after, params.course, events.is_frame | is_nan, is_missed)
-        )
+        causes = compute_once(find_causes(after, params.course, events.is_frame | is_nan, is_missed))
         is_terminated = compute_once(causes.any())
         reward = total_reward(
             Transition(
@@ -235,9 +227,7 @@ class FlyTrack(environment.Environment[EnvState, EnvParams]):
         """
         if params is None:
             params = self.default_params
-        final_observation, next_state, reward, terminated, info = self.step_env(
-            None, state, action, params
-        )
+        final_observation, next_state, reward, terminated, info = self.step_env(None, state, action, params)
         truncated = self.is_truncated(next_state, params)
         done = terminated | truncated
         fresh_state = self._begin_from(seed_of(key), params)
@@ -273,9 +263,7 @@ class FlyTrack(environment.Environment[EnvState, EnvParams]):
         ``vmap(step)`` up to the random draws: starts are sampled only in steps where an episode ended.
         """
         step_all = jax.vmap(self.step_env, in_axes=(None, 0, 0, None))
-        final_observations, next_states, rewards, terminated, info = step_all(
-            None, states, actions, params
-        )
+        final_observations, next_states, rewards, terminated, info = step_all(None, states, actions, params)
         truncated = self.is_truncated(next_states, params)
         done = terminated | truncated
 

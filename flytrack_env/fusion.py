@@ -26,7 +26,18 @@ def compute_once(tree: Tree) -> Tree:
     CPU only.
     """
     leaves, structure = jax.tree.flatten(tree)
-    return jax.tree.unflatten(structure, _compute_once_p.bind(*map(jnp.asarray, leaves)))
+    leaves = [jnp.asarray(leaf) for leaf in leaves]
+    places = [i for i, leaf in enumerate(leaves) if leaf.size and _is_number(leaf)]
+    if places:
+        fenced = _compute_once_p.bind(*(leaves[i] for i in places))
+        for i, leaf in zip(places, fenced, strict=True):
+            leaves[i] = leaf
+    return jax.tree.unflatten(structure, leaves)
+
+
+def _is_number(leaf: jax.Array) -> bool:
+    """Return whether a leaf can be negated: not a typed random key."""
+    return not jnp.issubdtype(leaf.dtype, jax.dtypes.extended)
 
 
 def _fence(*leaves: jax.Array) -> tuple[jax.Array, ...]:
@@ -53,6 +64,4 @@ _compute_once_p.def_abstract_eval(lambda *avals: list(avals))
 batching.primitive_batchers[_compute_once_p] = _batch
 ad.primitive_jvps[_compute_once_p] = _jvp
 mlir.register_lowering(_compute_once_p, lambda ctx, *leaves: list(leaves))
-mlir.register_lowering(
-    _compute_once_p, mlir.lower_fun(_fence, multiple_results=True), platform="cpu"
-)
+mlir.register_lowering(_compute_once_p, mlir.lower_fun(_fence, multiple_results=True), platform="cpu")

@@ -1,7 +1,7 @@
 """Model files: the parameters of a drone as JSON, by hand or from an identification."""
 
 import json
-import math
+import reprlib
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +27,7 @@ UNITS = {
     "g": "m/s^2",
     "battery_drain_v_per_min": "V/min",
 }
+LARGEST = float(np.finfo(np.float32).max)
 MUST_BE_POSITIVE = ("tau", "max_rate", "m")
 
 
@@ -39,11 +40,12 @@ def _read_field(path: Path, name: str, value: Any) -> Any:
     values = value if isinstance(value, list) else [value]
     is_right_shape = isinstance(value, list) == (size > 0) and len(values) == max(size, 1)
     are_numbers = all(
-        isinstance(v, (int, float)) and not isinstance(v, bool) and math.isfinite(v) for v in values
+        isinstance(v, (int, float)) and not isinstance(v, bool) and -LARGEST < v < LARGEST for v in values
     )
     if not is_right_shape or not are_numbers:
         expected = f"{size} finite numbers" if size else "a finite number"
-        raise ModelFileError(f"{path}: {name}: found {value!r}, expected {expected}")
+        found = reprlib.repr(value)
+        raise ModelFileError(f"{path}: {name}: found {found}, expected {expected} (float32)")
     if name in MUST_BE_POSITIVE and min(values) <= 0.0:
         raise ModelFileError(f"{path}: {name}: found {value!r}, expected > 0")
     return np.array(value, np.float32) if size else float(value)
@@ -63,7 +65,7 @@ def load_model(path: str | Path) -> ModelParameters:
         data = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError) as error:
         raise ModelFileError(f"{path}: cannot be read: {error}") from error
-    except (json.JSONDecodeError, RecursionError) as error:
+    except (ValueError, RecursionError) as error:  # ValueError also for endless digits
         raise ModelFileError(f"{path}: not a JSON file: {error}") from error
     if not isinstance(data, dict):
         raise ModelFileError(f"{path}: found a {type(data).__name__}, expected an object")
@@ -87,10 +89,7 @@ def save_model(path: str | Path, model: ModelParameters, provenance: dict[str, A
     Written to a temporary name beside the target and renamed, so that no half-written file is left.
     """
     path = Path(path)
-    parameters = {
-        name: np.asarray(getattr(model, name), float).tolist()
-        for name in SIZES
-    }
+    parameters = {name: np.asarray(getattr(model, name), float).tolist() for name in SIZES}
     document = {
         "version": MODEL_FILE_VERSION,
         "parameters": parameters,

@@ -41,9 +41,7 @@ OBSERVATION = (
     Entry("next gate's direction of flight", 3, "gate", "1", 1.0, 1.0),
 )
 OBSERVATION_SIZE = sum(entry.size for entry in OBSERVATION)
-OBSERVATION_LIMIT = np.concatenate(
-    [np.full(entry.size, entry.limit, np.float32) for entry in OBSERVATION]
-)
+OBSERVATION_LIMIT = np.concatenate([np.full(entry.size, entry.limit, np.float32) for entry in OBSERVATION])
 
 
 def observe_race(drone: Drone, gate: GateFrame, next_gate: GateFrame) -> jax.Array:

@@ -6,7 +6,7 @@ the compiler can vectorise. Packed vectors exist at the interfaces only
 (``flytrack_env.state``).
 """
 
-from typing import NamedTuple, Union
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -14,7 +14,7 @@ import numpy as np
 
 from flytrack_env.fusion import compute_once
 
-Scalar = Union[jax.Array, np.ndarray, float]
+Scalar = jax.Array | np.ndarray | float
 
 
 class Vec3(NamedTuple):

@@ -55,9 +55,7 @@ def start_race(gate_index: jax.Array, course: Course) -> Race:
     )
 
 
-def _count_pass(
-    race: Race, is_pass: jax.Array, time_s: Scalar, course: Course
-) -> tuple[Race, jax.Array]:
+def _count_pass(race: Race, is_pass: jax.Array, time_s: Scalar, course: Course) -> tuple[Race, jax.Array]:
     """Return the race after a possible pass at a time, its gate frames not yet moved on; and whether
     the pass completed a lap."""
     gates_passed = race.gates_passed + is_pass

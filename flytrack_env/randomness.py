@@ -55,7 +55,7 @@ class Draws:
         self.seed = seed
 
     def uniform(self, name: str, low: Scalar, high: Scalar) -> jax.Array:
-        """Return a float32 in [low, high); the same name gives the same number."""
+        """Return a float32 in [low, high]; the same name gives the same number."""
         word = mix(self.seed ^ jnp.uint32(zlib.crc32(name.encode())))
         unit = (word >> (32 - UNIFORM_BITS)).astype(jnp.float32) * (2.0**-UNIFORM_BITS)
         return low + (high - low) * unit

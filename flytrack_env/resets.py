@@ -97,9 +97,7 @@ def sample_start(
 Choose = Callable[[Scalar, Scalar], jax.Array]
 
 
-def _point_on_course(
-    draws: Draws, gate_index: jax.Array, course: Course
-) -> tuple[Vec3, Vec3]:
+def _point_on_course(draws: Draws, gate_index: jax.Array, course: Course) -> tuple[Vec3, Vec3]:
     """Return a point on the way from the gate before to a gate, and the unit direction of flight there.
 
     The way is a cubic Hermite curve that leaves and meets the gates along their directions of flight,

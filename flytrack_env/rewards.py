@@ -29,8 +29,8 @@ class RewardWeights(NamedTuple):
     """Weight of each term; the names are those of the functions in ``TERMS``."""
 
     progress: Scalar = 0.2
-    gate_pass: Scalar = 0.5
-    off_centre: Scalar = -0.2
+    gate_pass: Scalar = 1.0
+    off_centre: Scalar = -1.0
     termination: Scalar = -1.0
     body_rates: Scalar = -4e-5
     action_change: Scalar = -1e-2

@@ -40,9 +40,7 @@ def save_rollout(path: str | Path, states: ArrayLike, actions: ArrayLike) -> Non
     for name, array, size in (("states", states, STATE_SIZE), ("actions", actions, ACTION_SIZE)):
         if array.shape != (steps, size) or steps == 0 or array.dtype.kind not in "fiu":
             found = f"{array.dtype} of shape {array.shape}"
-            raise RolloutError(
-                f"{path}: {name}: found {found}, expected (T, {size}) numbers, T >= 1"
-            )
+            raise RolloutError(f"{path}: {name}: found {found}, expected (T, {size}) numbers, T >= 1")
     content = io.BytesIO()
     np.save(content, _as_rows(path, np.concatenate([states, actions], axis=1)), allow_pickle=False)
     write_atomically(path, content.getvalue())

@@ -26,13 +26,7 @@ class Causes(NamedTuple):
 
     def any(self) -> jax.Array:
         """Return whether the episode terminates."""
-        return (
-            self.crash
-            | self.ground
-            | self.out_of_bounds
-            | self.missed_gate
-            | self.battery_empty
-        )
+        return self.crash | self.ground | self.out_of_bounds | self.missed_gate | self.battery_empty
 
 
 def is_below_ground(pos_w: Vec3, course: Course) -> jax.Array:
@@ -58,9 +52,7 @@ def is_battery_empty(drone: Drone) -> jax.Array:
     return drone.battery_v < BATTERY_EMPTY_V
 
 
-def find_causes(
-    drone: Drone, course: Course, is_crash: jax.Array, is_missed: jax.Array
-) -> Causes:
+def find_causes(drone: Drone, course: Course, is_crash: jax.Array, is_missed: jax.Array) -> Causes:
     """Return the causes of termination after a step."""
     return Causes(
         crash=jnp.asarray(is_crash),

@@ -56,9 +56,7 @@ FRONT_LEFT, FRONT_RIGHT = (0.15, 0.09, 0.0), (0.15, -0.09, 0.0)
 BACK_LEFT, BACK_RIGHT = (-0.15, 0.14, 0.0), (-0.15, -0.14, 0.0)
 MOTORS_B = np.array([FRONT_LEFT, FRONT_RIGHT, BACK_LEFT, BACK_RIGHT])
 ARMS_B = np.array([[FRONT_LEFT, BACK_RIGHT], [FRONT_RIGHT, BACK_LEFT]])
-CAMERA_RAY_B = CAMERA_RAY_M * np.array(
-    [math.cos(CAMERA_PITCH_RAD), 0.0, math.sin(CAMERA_PITCH_RAD)]
-)
+CAMERA_RAY_B = CAMERA_RAY_M * np.array([math.cos(CAMERA_PITCH_RAD), 0.0, math.sin(CAMERA_PITCH_RAD)])
 
 GATE_COLOUR = (255, 140, 0)
 DRONE_COLOUR = (230, 230, 230)
@@ -123,9 +121,7 @@ def _write_recording(
         raise
 
 
-def _record(
-    path: Path, app_id: str, states: np.ndarray, actions: np.ndarray, gates: np.ndarray
-) -> None:
+def _record(path: Path, app_id: str, states: np.ndarray, actions: np.ndarray, gates: np.ndarray) -> None:
     """Write the recording through a stream of its own, closed when this returns."""
     recording = rr.RecordingStream(app_id)
     if not rr.is_enabled(recording):
@@ -259,9 +255,7 @@ def _check_poses(name: str, rows: np.ndarray, position: slice, quaternion: slice
     if not is_unit.all():
         row = int(np.argmin(is_unit))
         expected = f"1 within {UNIT_NORM_TOLERANCE:g}"
-        raise ValueError(
-            f"{name}[{row}]: found quaternion norm {norms[row]:.6g}, expected {expected}"
-        )
+        raise ValueError(f"{name}[{row}]: found quaternion norm {norms[row]:.6g}, expected {expected}")
     rows[:, quaternion] /= norms[:, None]
 
 

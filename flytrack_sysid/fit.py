@@ -47,7 +47,7 @@ def specific_force_z(data: Excitation, gravity: float) -> np.ndarray:
 
     World acceleration plus gravity, projected on body z with the attitude before the step.
     """
-    acc_w = data.next_states[..., ACCELERATION].astype(float) + [0.0, 0.0, gravity]
+    acc_w = data.next_states[..., ACCELERATION].astype(float) + np.array([0.0, 0.0, gravity])
     w_first = data.states[..., QUATERNION].reshape(-1, 4)
     axis_w = Rotation.from_quat(w_first, scalar_first=True).apply([0.0, 0.0, 1.0])
     return (acc_w.reshape(-1, 3) * axis_w).sum(axis=1).reshape(acc_w.shape[:-1])
@@ -108,7 +108,5 @@ def fit(data: Excitation, start: ModelParameters | None = None) -> Fit:
     tau, left = _minimise_over_tau(lambda tau: solve_map(tau)[1])
     taus.append(tau)
     rms.append(float(np.sqrt(np.mean(left**2))))
-    model = given._replace(
-        tau=np.array(taus, np.float32), thrust_coeffs=solve_map(tau)[0].astype(np.float32)
-    )
+    model = given._replace(tau=np.array(taus, np.float32), thrust_coeffs=solve_map(tau)[0].astype(np.float32))
     return Fit(model, tuple(rms))  # type: ignore[arg-type]

@@ -1,5 +1,6 @@
 """One-step errors on held-out data, and what the minimal structure leaves open."""
 
+from itertools import pairwise
 from typing import Any, NamedTuple
 
 import jax
@@ -42,9 +43,7 @@ def validate(model: ModelParameters, data: Excitation) -> Validation:
     """Return the errors of a model on data that it was not fitted to."""
     flat = [array.reshape(-1, array.shape[-1]) for array in data[:3]]
     states, actions, measured = flat
-    predicted = np.asarray(
-        jax.jit(jax.vmap(step, in_axes=(0, 0, None, None)))(states, actions, DT, model)
-    )
+    predicted = np.asarray(jax.jit(jax.vmap(step, in_axes=(0, 0, None, None)))(states, actions, DT, model))
     error = measured.astype(float) - predicted
     mse = {name: float(np.mean(error[:, where] ** 2)) for name, where in CHANNELS.items()}
 
@@ -52,7 +51,7 @@ def validate(model: ModelParameters, data: Excitation) -> Validation:
     force_b = attitude.inv().apply(error[:, ACCELERATION])
     speed = np.linalg.norm(states[:, VELOCITY], axis=1)
     by_speed = []
-    for low, high in zip(SPEED_EDGES[:-1], SPEED_EDGES[1:], strict=True):
+    for low, high in pairwise(SPEED_EDGES):
         is_in = (speed >= low) & (speed < high)
         if is_in.any():
             rms = np.sqrt(np.mean(np.sum(force_b[is_in] ** 2, axis=1)))

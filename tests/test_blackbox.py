@@ -190,9 +190,7 @@ def test_attitude_battery_and_clipping(fly):
         # 60 s * 100 Hz steps per volt, within float32 near 24 V.
         assert (x[BATTERY] - after[BATTERY]) * 6000.0 == pytest.approx(1.0, rel=0.02)
         np.testing.assert_array_equal(after, fly(x, np.clip(u, -1.0, 1.0)))
-    np.testing.assert_array_equal(
-        fly(states[0], [9.0, -9.0, 9.0, -9.0]), fly(states[0], [1, -1, 1, -1])
-    )
+    np.testing.assert_array_equal(fly(states[0], [9.0, -9.0, 9.0, -9.0]), fly(states[0], [1, -1, 1, -1]))
 
 
 def test_lags_and_full_stick_rates(fly):
@@ -216,8 +214,7 @@ def test_rebuilt_artifact_is_the_committed_one(tmp_path, capsys):
     rebuilt = load(tmp_path / "deep" / "acro_step.bin")
     states, actions = random_inputs(512)
     outputs = [
-        np.asarray(jax.jit(jax.vmap(box.step_vector))(states, actions))
-        for box in (load(SHIPPED), rebuilt)
+        np.asarray(jax.jit(jax.vmap(box.step_vector))(states, actions)) for box in (load(SHIPPED), rebuilt)
     ]
     assert np.isfinite(outputs[0]).all()
     np.testing.assert_array_equal(outputs[0], outputs[1])
@@ -358,9 +355,7 @@ def test_truncated(tmp_path):
     lengths = [1, 3, 4, 8, 20, 64, *range(100, len(content) - 12, 97), len(content) - 13]
     for length in lengths:
         path.write_bytes(content[:length])
-        with pytest.raises(
-            BlackBoxError, match=f"found {length} bytes that cannot be deserialised"
-        ):
+        with pytest.raises(BlackBoxError, match=f"found {length} bytes that cannot be deserialised"):
             load(path)
 
 
@@ -403,9 +398,7 @@ def test_wrong_platform(tmp_path):
 
 def test_not_finite(tmp_path):
     path = write_artifact(tmp_path / "nan.bin", lambda x, u: x.at[8].set(x[8] / x[0]))
-    with pytest.raises(
-        BlackBoxError, match=r"nan\.bin: components \[8\] .*expected finite numbers"
-    ):
+    with pytest.raises(BlackBoxError, match=r"nan\.bin: components \[8\] .*expected finite numbers"):
         load(path)
 
 

@@ -62,7 +62,7 @@ def test_truncated_file_is_refused(path, kept):
     content = path.read_bytes()
     length = kept if isinstance(kept, int) else int(kept * len(content))
     path.write_bytes(content[:length])
-    with pytest.raises(CheckpointError, match="a.msgpack"):
+    with pytest.raises(CheckpointError, match=r"a\.msgpack"):
         load_checkpoint(path)
 
 
@@ -72,10 +72,10 @@ def test_truncated_file_is_refused(path, kept):
 def test_another_format_is_refused(tmp_path, content):
     path = tmp_path / "e.msgpack"
     path.write_bytes(flax.serialization.msgpack_serialize(content))
-    with pytest.raises(CheckpointError, match="e.msgpack"):
+    with pytest.raises(CheckpointError, match=r"e\.msgpack"):
         load_checkpoint(path)
 
 
 def test_missing_file_is_refused(tmp_path):
-    with pytest.raises(CheckpointError, match="missing.msgpack: cannot be read"):
+    with pytest.raises(CheckpointError, match=r"missing\.msgpack: cannot be read"):
         load_checkpoint(tmp_path / "missing.msgpack")

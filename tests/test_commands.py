@@ -28,16 +28,12 @@ def checkpoint_path(tmp_path_factory):
 
 
 def run(*arguments: str) -> subprocess.CompletedProcess:
-    return subprocess.run(
-        [sys.executable, *arguments], cwd=ROOT, capture_output=True, text=True, timeout=300
-    )
+    return subprocess.run([sys.executable, *arguments], cwd=ROOT, capture_output=True, text=True, timeout=300)
 
 
 def test_eval_agent_writes_the_rollout(checkpoint_path, tmp_path):
     out = tmp_path / "rollout.npy"
-    done = run(
-        "eval_agent.py", "--checkpoint", str(checkpoint_path), "--steps", "50", "--out", str(out)
-    )
+    done = run("eval_agent.py", "--checkpoint", str(checkpoint_path), "--steps", "50", "--out", str(out))
     assert done.returncode == 0, done.stderr
     assert "gates: 0" in done.stdout and "ended:" in done.stdout
     states, actions = load_rollout(out)

@@ -182,9 +182,7 @@ def test_quaternion_stays_unit_over_ten_thousand_random_steps() -> None:
 def test_zero_rate_command_keeps_the_attitude() -> None:
     start = random_cases(1, seed=4)[0][0]
     start[16:20] = (0.0, 0.0, 0.0, 0.3)
-    x = fly(
-        start.astype(np.float32), np.tile([0, 0, 0, 1.0], (1000, 1)), 0.01, nominal_parameters()
-    )
+    x = fly(start.astype(np.float32), np.tile([0, 0, 0, 1.0], (1000, 1)), 0.01, nominal_parameters())
     np.testing.assert_allclose(x[-1, 9:13], start[9:13], atol=1e-6)
     np.testing.assert_array_equal(x[:, 13:16], 0.0)
 
@@ -266,9 +264,7 @@ def test_battery_loses_one_volt_per_minute(is_double: bool, tolerance: float) ->
 def numeric_jacobian(function: Any, vector: np.ndarray, width: float = 1e-6) -> np.ndarray:
     """Return the central-difference Jacobian (M, N) of a function of a vector (N,)."""
     shifts = width * np.eye(vector.size)
-    return np.stack(
-        [(function(vector + s) - function(vector - s)) / (2 * width) for s in shifts], -1
-    )
+    return np.stack([(function(vector + s) - function(vector - s)) / (2 * width) for s in shifts], -1)
 
 
 @pytest.mark.parametrize("differentiate", [jax.jacfwd, jax.jacrev])

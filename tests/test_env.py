@@ -130,14 +130,10 @@ def test_auto_reset_leaves_nothing_behind_in_a_flight(flight: Any) -> None:
     np.testing.assert_array_equal(
         np.asarray(observation)[~done], np.asarray(info["final_observation"])[~done]
     )
-    assert (
-        (np.asarray(observation)[done] != np.asarray(info["final_observation"])[done]).any(1).all()
-    )
+    assert (np.asarray(observation)[done] != np.asarray(info["final_observation"])[done]).any(1).all()
 
 
-def test_info_belongs_to_the_step_not_to_the_reset(
-    env: FlyTrack, params: EnvParams, flight: Any
-) -> None:
+def test_info_belongs_to_the_step_not_to_the_reset(env: FlyTrack, params: EnvParams, flight: Any) -> None:
     before, (_, states, _, terminated, truncated, info) = flight
     done = np.asarray(terminated | truncated)
     causes = np.stack([np.asarray(info[cause]) for cause in CAUSES])
@@ -160,9 +156,7 @@ def test_same_inputs_give_the_same_outputs(
     first, again = reset_many(keys, params), reset_many(keys, params)
     assert_close(first, again, 0.0)
     actions = jnp.full((3, 4), 0.3)
-    assert_close(
-        step_all(keys, first[1], actions, params), step_all(keys, again[1], actions, params), 0.0
-    )
+    assert_close(step_all(keys, first[1], actions, params), step_all(keys, again[1], actions, params), 0.0)
 
 
 def test_without_jit_the_step_is_the_same(env: FlyTrack, params: EnvParams) -> None:
@@ -186,9 +180,7 @@ def test_parameters_can_differ_between_environments(
     step = jax.jit(jax.vmap(env.step_env, in_axes=(None, 0, None, axes)))
     after = step(None, same, jnp.zeros(4), batched)[1].plant
     weightless = np.stack([np.asarray(after.acc_w.x), np.asarray(after.acc_w.y)])
-    np.testing.assert_allclose(
-        weightless * np.asarray(masses), weightless[:, 1:2].repeat(3, 1), rtol=1e-4
-    )
+    np.testing.assert_allclose(weightless * np.asarray(masses), weightless[:, 1:2].repeat(3, 1), rtol=1e-4)
 
 
 # --- Ends of episodes ---------------------------------------------------------------------------
@@ -269,9 +261,7 @@ def test_ended_episodes_begin_as_reset_does(
     fresh_observation, fresh = reset_many(keys, params)
     for leaf, expected in zip(jax.tree.leaves(states), jax.tree.leaves(fresh), strict=True):
         np.testing.assert_allclose(np.asarray(leaf)[done], np.asarray(expected)[done], atol=1e-5)
-    np.testing.assert_allclose(
-        np.asarray(observation)[done], np.asarray(fresh_observation)[done], atol=1e-5
-    )
+    np.testing.assert_allclose(np.asarray(observation)[done], np.asarray(fresh_observation)[done], atol=1e-5)
     for leaf in (states.time, states.race.gates_passed, states.race.laps):
         assert not np.asarray(leaf)[done].any()
     for leaf in (states.race.lap_start_s, states.race.lap_time_s):
@@ -312,9 +302,7 @@ def test_batch_step_ends_the_same_episodes_and_resets_them_apart(
     assert len(np.unique(starts, axis=0)) == done.sum()
     other = env.step_batch(jax.random.key(9), states, actions, params)[1]
     assert (np.asarray(other.plant.pos_w.x) != np.asarray(state.plant.pos_w.x))[done].all()
-    expected = jax.jit(jax.vmap(env.observe, in_axes=(None, 0, None, None)))(
-        None, state, None, params
-    )
+    expected = jax.jit(jax.vmap(env.observe, in_axes=(None, 0, None, None)))(None, state, None, params)
     np.testing.assert_allclose(observation, expected, atol=1e-6)
 
 
@@ -335,9 +323,7 @@ def test_batch_step_equals_vmap_of_step_env_where_nothing_ends(
 # --- Actions ------------------------------------------------------------------------------------
 
 
-def test_actions_beyond_the_range_are_clipped(
-    params: EnvParams, reset_many: Any, step_all: Any
-) -> None:
+def test_actions_beyond_the_range_are_clipped(params: EnvParams, reset_many: Any, step_all: Any) -> None:
     keys = jax.random.split(jax.random.key(11), 1)
     _, state = reset_many(keys, params)
     corners = np.array([[1, -1, 1, 1], [-1, 1, -1, -1]], np.float32)
@@ -347,9 +333,7 @@ def test_actions_beyond_the_range_are_clipped(
         assert_close(step_all(keys, state, jnp.asarray(beyond)[None], params), expected, 0.0)
 
 
-def test_integer_actions_are_as_good_as_real_ones(
-    env: FlyTrack, params: EnvParams, make_drone: Any
-) -> None:
+def test_integer_actions_are_as_good_as_real_ones(env: FlyTrack, params: EnvParams, make_drone: Any) -> None:
     state = env.begin(make_drone((15.0, 2.0, 1.35)), 0, params)
     key = jax.random.key(0)
     real = env.step(key, state, jnp.array([1.0, 0.0, -1.0, 1.0]), params)
@@ -440,12 +424,8 @@ def test_observation_index_by_index(env: FlyTrack, params: EnvParams, flight: An
     np.testing.assert_allclose(observed[np.array(rows)], expected, atol=2e-5)
 
 
-def test_observation_is_clipped_to_its_range(
-    env: FlyTrack, params: EnvParams, make_drone: Any
-) -> None:
-    drone = make_drone(
-        (1e6, -1e6, 0.0), (1e5, 0.0, 0.0), applied=Action(2.0, -2.0, 0.0, 0.0), battery_v=30.0
-    )
+def test_observation_is_clipped_to_its_range(env: FlyTrack, params: EnvParams, make_drone: Any) -> None:
+    drone = make_drone((1e6, -1e6, 0.0), (1e5, 0.0, 0.0), applied=Action(2.0, -2.0, 0.0, 0.0), battery_v=30.0)
     observation = env.observe(None, env.begin(drone, 0, params), None, params)
     assert env.observation_space(params).contains(observation)
     limits = np.asarray(env.observation_space(params).high)
@@ -477,9 +457,7 @@ def laps(rails: tuple[FlyTrack, Any], rollout: Any, make_drone: Any) -> Any:
     """Outputs of a little over five laps from before each of the first gates."""
     env, railway = rails
     params = env.default_params.replace(max_steps_in_episode=100_000)
-    states = stack(
-        [env.begin(make_drone(railway.corners[2 * gate]), gate, params) for gate in FIRST_GATES]
-    )
+    states = stack([env.begin(make_drone(railway.corners[2 * gate]), gate, params) for gate in FIRST_GATES])
     num_steps = int((NUM_LAPS + 0.1) * railway.arcs[-1] / SPEED / 0.01)
     actions = jnp.zeros((num_steps, len(FIRST_GATES), 4))
     return rollout(env, jax.random.key(0), states, actions, params)[1]
@@ -511,9 +489,7 @@ def test_lap_times_are_interpolated_at_the_crossing(laps: Any, rails: tuple[FlyT
         assert not times[: np.argmax(done[:, column]), column].any()
 
 
-def test_steps_with_two_seeds_of_the_same_rails_agree(
-    rails: tuple[FlyTrack, Any], make_drone: Any
-) -> None:
+def test_steps_with_two_seeds_of_the_same_rails_agree(rails: tuple[FlyTrack, Any], make_drone: Any) -> None:
     env, railway = rails
     state = env.begin(make_drone(railway.corners[0]), 0, env.default_params)
     outputs = [env.step(jax.random.key(i), state, jnp.zeros(4)) for i in range(2)]
@@ -543,9 +519,7 @@ def test_transition_gradients_are_detached_unless_asked_for(
     action, speed = np.array([0.2, -0.3, 0.4, 0.1]), np.array(1.5)
     with jax.enable_x64(True):
         state = env.begin(make_drone((15.0, 2.5, 1.0), (-5.0, 1.0, 0.5)), 0, params)
-        state = jax.tree.map(
-            lambda leaf: leaf.astype(float) if leaf.dtype == jnp.float32 else leaf, state
-        )
+        state = jax.tree.map(lambda leaf: leaf.astype(float) if leaf.dtype == jnp.float32 else leaf, state)
         detached = jax.grad(differentiable(env, state, params), argnums=(0, 1))(action, speed)
         scalar = differentiable(attached, state, params)
         gradient = jax.grad(scalar, argnums=(0, 1))(action, speed)
@@ -593,13 +567,9 @@ def test_legacy_step_survives_copies(clone: Any, env: FlyTrack) -> None:
     assert observation.shape == (OBSERVATION_SIZE,)
 
 
-def test_legacy_step_returns_five_values(
-    env: FlyTrack, params: EnvParams, ends: tuple[Any, ...]
-) -> None:
+def test_legacy_step_returns_five_values(env: FlyTrack, params: EnvParams, ends: tuple[Any, ...]) -> None:
     keys, states, actions, (observation, after, reward, terminated, truncated, info) = ends
     wrapped = LegacyStep(env)
-    outputs = jax.jit(jax.vmap(wrapped.step, in_axes=(0, 0, 0, None)))(
-        keys, states, actions, params
-    )
+    outputs = jax.jit(jax.vmap(wrapped.step, in_axes=(0, 0, 0, None)))(keys, states, actions, params)
     assert len(outputs) == 5
     assert_close(outputs, (observation, after, reward, terminated | truncated, info), 1e-5)

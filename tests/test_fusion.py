@@ -24,9 +24,7 @@ TRANSFORMS = {
     "jit": jax.jit,
     "vmap": lambda f: lambda x: jax.vmap(f)(jnp.stack([x, x]))[1],
     "jit of vmap": lambda f: lambda x: jax.jit(jax.vmap(f))(jnp.stack([x, x]))[1],
-    "vmap along the last axis": lambda f: (
-        lambda x: jax.vmap(f, -1, -1)(jnp.stack([x, x], -1))[..., 1]
-    ),
+    "vmap along the last axis": lambda f: lambda x: jax.vmap(f, -1, -1)(jnp.stack([x, x], -1))[..., 1],
     "scan": lambda f: lambda x: jax.lax.scan(lambda c, _: (f(c), None), x, None, length=3)[0],
     "cond": lambda f: lambda x: jax.lax.cond(jnp.asarray(True), f, lambda y: y, x),
     "remat": jax.checkpoint,

@@ -29,9 +29,7 @@ def course_of(*gates: Gate) -> Course:
     return build_course(Track("test", gates, (0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), *bounds))
 
 
-def gate_at(
-    centre: tuple[float, ...], rotation: Rotation, direction: float = 1.0, gate_id: int = 0
-) -> Gate:
+def gate_at(centre: tuple[float, ...], rotation: Rotation, direction: float = 1.0, gate_id: int = 0) -> Gate:
     """Return a gate of the usual size."""
     quat = tuple(rotation.as_quat(scalar_first=True).tolist())
     return Gate(gate_id, centre, quat, direction, 1.5, 2.7)
@@ -78,9 +76,7 @@ GATES = {
     "along x": gate_at((0.0, 0.0, 0.0), Rotation.from_euler("z", -90, degrees=True)),
     "against its y": gate_at((12.5, 2.0, 1.35), Rotation.from_euler("z", 270, degrees=True), -1.0),
     "oblique": gate_at((-3.0, 7.0, 2.0), Rotation.from_euler("z", 37, degrees=True)),
-    "tilted": gate_at(
-        (1.0, 2.0, 3.0), Rotation.from_euler("zyx", [75, 20, -35], degrees=True), -1.0
-    ),
+    "tilted": gate_at((1.0, 2.0, 3.0), Rotation.from_euler("zyx", [75, 20, -35], degrees=True), -1.0),
     "lying": gate_at((0.0, 0.0, 5.0), Rotation.from_euler("x", 90, degrees=True)),
 }
 
@@ -93,20 +89,12 @@ def ring(distance: float) -> list[tuple[float, float]]:
 
 CROSSINGS = [
     *[((-0.1, 0.1, y, z), "pass") for y, z in [(0.0, 0.0), *ring(FREE - 1e-3)]],
-    *[
-        ((-0.1, 0.1, y, z), "frame")
-        for d in (FREE + 1e-3, 0.75, 1.35, SOLID - 1e-3)
-        for y, z in ring(d)
-    ],
+    *[((-0.1, 0.1, y, z), "frame") for d in (FREE + 1e-3, 0.75, 1.35, SOLID - 1e-3) for y, z in ring(d)],
     *[((-0.1, 0.1, y, z), "miss") for d in (SOLID + 1e-3, 3.0, 40.0) for y, z in ring(d)],
     *[((0.1, -0.1, y, z), "none") for y, z in [(0.0, 0.0), *ring(FREE - 1e-3)]],
     *[((0.1, -0.1, y, z), "frame") for d in (FREE + 1e-3, SOLID - 1e-3) for y, z in ring(d)],
     *[((0.1, -0.1, y, z), "none") for y, z in ring(SOLID + 1e-3)],
-    *[
-        ((a, b, y, z), "none")
-        for a, b in ((-2.0, -0.1), (0.1, 2.0), (-0.1, -2.0))
-        for y, z in ring(0.3)
-    ],
+    *[((a, b, y, z), "none") for a, b in ((-2.0, -0.1), (0.1, 2.0), (-0.1, -2.0)) for y, z in ring(0.3)],
     ((-50.0, 30.0, 0.0, 0.0), "pass"),  # fast
     ((-0.3, -0.3, 0.0, 0.0), "none"),  # parallel to the plane, before it
     ((0.3, 0.3, 0.0, 0.0), "none"),
@@ -234,9 +222,7 @@ def test_coasting_through_the_gates_does_not_depend_on_the_time_step(
     assert (third >= crossing - 1e-4).all() and (third <= crossing + dt + 1e-4).all()
 
 
-def transition_of(
-    env: FlyTrack, drone: Any, dt: float = 0.01, gate_index: int = 0
-) -> tuple[Any, Any, Any]:
+def transition_of(env: FlyTrack, drone: Any, dt: float = 0.01, gate_index: int = 0) -> tuple[Any, Any, Any]:
     """Return the state, causes and events after one coasting step."""
     params = env.default_params.replace(dt=dt)
     state = env.begin(drone, gate_index, params)
@@ -244,9 +230,7 @@ def transition_of(
     return state, causes, events
 
 
-def test_two_gates_in_one_step_both_count(
-    coasting_envs: Envs, row_track: Row, make_drone: Any
-) -> None:
+def test_two_gates_in_one_step_both_count(coasting_envs: Envs, row_track: Row, make_drone: Any) -> None:
     env = coasting_envs(row_track([0.0, 0.4]), "terminate")
     params = env.default_params
     step = jax.jit(jax.vmap(env.transition, in_axes=(0, None, None)))
@@ -288,9 +272,7 @@ def test_the_second_gate_of_a_step_can_be_touched_too(
     assert int(events.num_passed) == (1 if vy else 0)
 
 
-def test_missed_gate_terminates_or_flies_on(
-    coasting_envs: Envs, row_track: Row, make_drone: Any
-) -> None:
+def test_missed_gate_terminates_or_flies_on(coasting_envs: Envs, row_track: Row, make_drone: Any) -> None:
     drone = make_drone((-0.05, 2.0, 2.0), (10.0, 0.0, 0.0))
     for setting, is_ended in (("terminate", True), ("fly_on", False)):
         env = coasting_envs(row_track(list(ROW)), setting)
@@ -334,9 +316,7 @@ def test_flying_backwards_counts_nothing(
     assert int(state.race.gate_index) == gate_index
 
 
-def test_the_frame_is_solid_from_behind(
-    coasting_envs: Envs, row_track: Row, make_drone: Any
-) -> None:
+def test_the_frame_is_solid_from_behind(coasting_envs: Envs, row_track: Row, make_drone: Any) -> None:
     env = coasting_envs(row_track(list(ROW)), "fly_on")
     _, causes, _ = transition_of(env, make_drone((2.05, 1.0, 2.0), (-10.0, 0.0, 0.0)))
     assert bool(causes.crash)

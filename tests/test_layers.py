@@ -18,7 +18,7 @@ PACKAGE = "flytrack_env"
 
 # Low to high. A module imports only from rows above its own here; a package counts as one module.
 LAYERS = (
-    {"files", "fusion"},
+    {"files", "fusion", "auto_reset"},
     {"quaternion"},
     {"state"},
     {"tracks", "randomness"},
@@ -118,9 +118,7 @@ def tree_classes() -> list[type]:
             is_class = isinstance(value, type) and not isinstance(value, types.GenericAlias)
             if is_class and value.__module__.startswith(PACKAGE):
                 is_record = hasattr(value, "_fields") or dataclasses.is_dataclass(value)
-                if is_record and not jax.tree_util.treedef_is_leaf(
-                    jax.tree.structure(filled(value))
-                ):
+                if is_record and not jax.tree_util.treedef_is_leaf(jax.tree.structure(filled(value))):
                     found[f"{value.__module__}.{value.__qualname__}"] = value
     return list(found.values())
 

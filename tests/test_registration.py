@@ -48,7 +48,5 @@ def test_overrides_reach_the_environment() -> None:
 
 
 def test_unknown_ids_are_refused() -> None:
-    with pytest.raises(
-        ValueError, match=r"env_id: found 'FlyTrack-v9', expected one of .*FlyTrack-v0"
-    ):
+    with pytest.raises(ValueError, match=r"env_id: found 'FlyTrack-v9', expected one of .*FlyTrack-v0"):
         make("FlyTrack-v9")

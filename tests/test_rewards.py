@@ -28,9 +28,7 @@ def make_transition(make_drone: Any) -> MakeTransition:
             "offset": jnp.float32(0.5),
             "is_terminated": jnp.asarray(False),
         }
-        drones = [
-            make_drone(**{"position": (-4.0, 2.0, 3.0), **(d or {})}) for d in (before, after)
-        ]
+        drones = [make_drone(**{"position": (-4.0, 2.0, 3.0), **(d or {})}) for d in (before, after)]
         return Transition(*drones, **{**still, **fields})
 
     return make
@@ -62,9 +60,7 @@ CASES = [
 
 
 @pytest.mark.parametrize(("name", "parts", "expected"), CASES)
-def test_term(
-    name: str, parts: dict[str, Any], expected: float, make_transition: MakeTransition
-) -> None:
+def test_term(name: str, parts: dict[str, Any], expected: float, make_transition: MakeTransition) -> None:
     value = getattr(rewards, name)(make_transition(**parts))
     assert float(value) == pytest.approx(expected, abs=1e-5)
 

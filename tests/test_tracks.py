@@ -224,9 +224,7 @@ def test_refusals_name_file_line_field_and_reason(case: str, tmp_path: Path) -> 
         (VALID + "frame = 3\n", "frame|overwrite"),
     ],
 )
-def test_bad_toml_names_the_file_and_what_the_parser_says(
-    text: str, reason: str, tmp_path: Path
-) -> None:
+def test_bad_toml_names_the_file_and_what_the_parser_says(text: str, reason: str, tmp_path: Path) -> None:
     path = tmp_path / "bad.toml"
     path.write_text(text, encoding="utf-8")
     with pytest.raises(TrackError, match=rf"{re.escape(str(path))}: not a TOML file: .*({reason})"):

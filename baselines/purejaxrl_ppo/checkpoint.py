@@ -51,9 +51,7 @@ class Checkpoint(NamedTuple):
             )
 
 
-def save_checkpoint(
-    path: str | Path, params: Any, config: Config, description: dict[str, Any]
-) -> None:
+def save_checkpoint(path: str | Path, params: Any, config: Config, description: dict[str, Any]) -> None:
     """Write a checkpoint atomically.
 
     description: JSON values; needs env_id, track and observation_size, may hold anything else.
@@ -114,8 +112,6 @@ def _check_shapes(path: Path, expected: Any, params: Any) -> None:
     for (where, leaf), wanted in zip(found_leaves, jax.tree.leaves(expected), strict=True):
         name = jax.tree_util.keystr(where)
         if np.shape(leaf) != wanted.shape:
-            raise CheckpointError(
-                f"{path}: {name}: found shape {np.shape(leaf)}, expected {wanted.shape}"
-            )
+            raise CheckpointError(f"{path}: {name}: found shape {np.shape(leaf)}, expected {wanted.shape}")
         if not np.isfinite(leaf).all():
             raise CheckpointError(f"{path}: {name}: found values that are not finite")

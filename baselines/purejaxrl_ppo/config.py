@@ -7,7 +7,7 @@ from dataclasses import dataclass
 class Config:
     """Hyperparameters of PPO; the defaults are the recipe for FlyTrack-v0 (docs/training.md)."""
 
-    total_timesteps: int = 10_000_000
+    total_timesteps: int = 8_000_000
     """Environment steps over all environments; rounded down to whole updates."""
     num_envs: int = 1024
     """Environments stepped side by side."""

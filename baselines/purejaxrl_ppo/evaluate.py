@@ -50,9 +50,7 @@ class Score(NamedTuple):
 
 def start_pose_params(params: EnvParams, num_steps: int) -> EnvParams:
     """Return parameters whose episodes begin at the noisy start pose and may last that many steps."""
-    return params.replace(
-        reset=params.reset._replace(course_fraction=0.0), max_steps_in_episode=num_steps
-    )
+    return params.replace(reset=params.reset._replace(course_fraction=0.0), max_steps_in_episode=num_steps)
 
 
 @partial(jax.jit, static_argnames=("env", "network", "num_steps"))
@@ -71,9 +69,7 @@ def fly_episode(
         observation, state, is_flying = carry
         mean = network.apply(policy_params, observation, method="policy").mode()
         action = jnp.clip(mean, -1.0, 1.0)
-        next_observation, next_state, _, terminated, info = env.step_env(
-            None, state, action, params
-        )
+        next_observation, next_state, _, terminated, info = env.step_env(None, state, action, params)
         flown = Flight(
             states=pack(env.drone(state)),
             actions=action,

@@ -57,9 +57,7 @@ def batched_step(env: Any) -> Callable:
     return step
 
 
-def generalized_advantages(
-    batch: Batch, last_value: jax.Array, gamma: float, gae_lambda: float
-) -> jax.Array:
+def generalized_advantages(batch: Batch, last_value: jax.Array, gamma: float, gae_lambda: float) -> jax.Array:
     """Return GAE advantages, (num_steps, num_envs); arXiv 1506.02438, equation 16.
 
     The reward of a truncated step already holds the bootstrapped value of its final observation.
@@ -129,9 +127,7 @@ def make_train_state(key: jax.Array, observation_size: int, config: Config) -> T
         config.learning_rate * config.final_learning_rate_fraction,
         config.num_updates * config.update_epochs * config.num_minibatches,
     )
-    optimizer = optax.chain(
-        optax.clip_by_global_norm(config.max_grad_norm), optax.adam(schedule, eps=1e-5)
-    )
+    optimizer = optax.chain(optax.clip_by_global_norm(config.max_grad_norm), optax.adam(schedule, eps=1e-5))
     params = network.init(key, jnp.zeros((1, observation_size)))
     return TrainState.create(apply_fn=network.apply, params=params, tx=optimizer)
 
@@ -166,9 +162,7 @@ def make_train(
         # Few steps see a truncation, so that its value is rarely worth computing.
         final_value = jax.lax.cond(
             truncated.any(),
-            lambda: network.apply(
-                runner.train_state.params, info["final_observation"], method="value"
-            ),
+            lambda: network.apply(runner.train_state.params, info["final_observation"], method="value"),
             lambda: jnp.zeros_like(value),
         )
         bootstrapped = reward + config.gamma * final_value * (truncated & ~terminated)
@@ -201,9 +195,7 @@ def make_train(
 
     def update(runner: Runner, _: None) -> tuple[Runner, dict[str, jax.Array]]:
         runner, (batch, log) = jax.lax.scan(collect_step, runner, None, config.num_steps)
-        last_value = network.apply(
-            runner.train_state.params, runner.observation, method="value"
-        )
+        last_value = network.apply(runner.train_state.params, runner.observation, method="value")
         advantage = generalized_advantages(batch, last_value, config.gamma, config.gae_lambda)
         target = advantage + batch.value
         data = jax.tree.map(

@@ -45,9 +45,7 @@ def train_policy(
     out.mkdir(parents=True, exist_ok=True)
     num_steps = config.num_updates * config.batch_size
     with tqdm(total=num_steps, unit="step", unit_scale=True, desc="train") as bar:
-        train = jax.jit(
-            make_train(env, env.default_params, config, report=progress_report(bar, config))
-        )
+        train = jax.jit(make_train(env, env.default_params, config, report=progress_report(bar, config)))
         started = time.perf_counter()
         runner, metrics = jax.block_until_ready(train(jax.random.key(seed)))
         seconds = time.perf_counter() - started

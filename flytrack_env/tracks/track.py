@@ -16,6 +16,7 @@ import numpy as np
 TRACK_FOLDER = Path(__file__).parent
 DIRECTIONS = {"+y": 1.0, "-y": -1.0}
 UNIT_NORM_TOLERANCE = 1e-3
+LARGEST = 1e6  # m: beyond that, float32 positions are coarser than a drone
 
 
 class TrackError(ValueError):
@@ -128,8 +129,9 @@ class _Reader:
         for number in value:
             if isinstance(number, bool) or not isinstance(number, (int, float)):
                 raise self.fail(header, index, field, f"found {number!r}, expected a number")
-            if not math.isfinite(number):
-                raise self.fail(header, index, field, f"found {number}, expected a finite number")
+            if not -LARGEST < number < LARGEST:  # false for NaN too
+                reason = f"found {str(number)[:20]}, expected a finite number within +-{LARGEST:g}"
+                raise self.fail(header, index, field, reason)
         return tuple(float(number) for number in value)
 
     def quaternion(self, data: dict[str, Any], header: str, index: int) -> tuple[Any, ...]:
@@ -182,11 +184,11 @@ class _Reader:
                 raise self.fail("[[gates]]", index, "id", f"{gate_id} is used twice")
         low = self.numbers(data["bounds"], "[bounds]", 0, "low", 3)
         high = self.numbers(data["bounds"], "[bounds]", 0, "high", 3)
-        if not all(a < b for a, b in zip(low, high)):
+        if not all(a < b for a, b in zip(low, high, strict=True)):
             raise self.fail("[bounds]", 0, "high", f"found {high}, expected more than low, {low}")
 
         def is_inside(position: tuple[float, ...]) -> bool:
-            return all(a < p < b for a, p, b in zip(low, position, high))
+            return all(a < p < b for a, p, b in zip(low, position, high, strict=True))
 
         for index, gate in enumerate(gates):
             if not is_inside(gate.position):
