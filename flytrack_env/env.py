@@ -16,7 +16,7 @@ from flytrack_env.model_file import load_model
 from flytrack_env.observations import OBSERVATION_LIMIT, OBSERVATION_SIZE, observe_race
 from flytrack_env.plants import Plant, Simulator
 from flytrack_env.quaternion import Scalar
-from flytrack_env.race import Race, RaceEvents, advance_race, start_race
+from flytrack_env.race import Race, RaceEvents, advance_race, look_up_gates, start_race
 from flytrack_env.randomness import seed_of, seeds_of
 from flytrack_env.resets import ResetParams, sample_start
 from flytrack_env.rewards import RewardWeights, Transition, total_reward
@@ -234,6 +234,8 @@ class FlyTrack(environment.Environment[EnvState, EnvParams]):
         next_state = compute_once(
             jax.tree.map(partial(jnp.where, compute_once(done)), fresh_state, next_state)
         )
+        # Gates are looked up after the choice, by its index: a fifth faster than to choose frames.
+        next_state = next_state._replace(race=look_up_gates(next_state.race, params.course))
         observation = self.observe(None, next_state, None, params)
         info = {
             **info,

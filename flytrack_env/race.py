@@ -55,7 +55,15 @@ def start_race(gate_index: jax.Array, course: Course) -> Race:
     )
 
 
-def _count_pass(race: Race, is_pass: jax.Array, time_s: Scalar, course: Course) -> tuple[Race, jax.Array]:
+def look_up_gates(race: Race, course: Course) -> Race:
+    """Return the race with the flight frames that belong to its gate index."""
+    following = course.next_index(race.gate_index)
+    return race._replace(gate=course.gate(race.gate_index), next_gate=course.gate(following))
+
+
+def _count_pass(
+    race: Race, is_pass: jax.Array, time_s: Scalar, course: Course
+) -> tuple[Race, jax.Array]:
     """Return the race after a possible pass at a time, its gate frames not yet moved on; and whether
     the pass completed a lap."""
     gates_passed = race.gates_passed + is_pass
@@ -101,6 +109,4 @@ def advance_race(
         is_miss=first.is_miss | (first.is_pass & second.is_miss),
         offset=jnp.where(is_second, jnp.maximum(first.offset, second.offset), first.offset),
     )
-    gate = course.gate(after.gate_index)
-    next_gate = course.gate(course.next_index(after.gate_index))
-    return compute_once((after._replace(gate=gate, next_gate=next_gate), events))
+    return compute_once((look_up_gates(after, course), events))
