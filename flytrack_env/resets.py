@@ -37,12 +37,12 @@ class ResetParams(NamedTuple):
     start_tilt_noise_deg: Scalar = 5.0
     start_battery_low_v: Scalar = 23.5
     course_offset: Scalar = 0.5
-    course_speed: Scalar = 14.0
-    course_yaw_deg: Scalar = 60.0
-    course_tilt_deg: Scalar = 30.0
+    course_speed: Scalar = 16.0
+    course_yaw_deg: Scalar = 90.0
+    course_tilt_deg: Scalar = 60.0
     course_stick: Scalar = 0.3
-    course_thrust_low: Scalar = -0.8
-    course_thrust_high: Scalar = 0.2
+    course_thrust_low: Scalar = -1.0
+    course_thrust_high: Scalar = 0.8
     course_battery_low_v: Scalar = 22.2
 
 

@@ -13,6 +13,9 @@ class Config:
     """Environments stepped side by side."""
     num_steps: int = 64
     """Steps of every environment per update."""
+    episode_steps: int = 250
+    """Time limit of training episodes. Long ones spend most experience on the one line that the policy
+    flies already, and a policy that knows nothing beside it fails on another plant."""
     update_epochs: int = 4
     """Passes over the collected batch per update."""
     num_minibatches: int = 8

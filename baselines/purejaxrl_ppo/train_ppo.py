@@ -45,7 +45,8 @@ def train_policy(
     out.mkdir(parents=True, exist_ok=True)
     num_steps = config.num_updates * config.batch_size
     with tqdm(total=num_steps, unit="step", unit_scale=True, desc="train") as bar:
-        train = jax.jit(make_train(env, env.default_params, config, report=progress_report(bar, config)))
+        params = env.default_params.replace(max_steps_in_episode=config.episode_steps)
+        train = jax.jit(make_train(env, params, config, report=progress_report(bar, config)))
         started = time.perf_counter()
         runner, metrics = jax.block_until_ready(train(jax.random.key(seed)))
         seconds = time.perf_counter() - started
