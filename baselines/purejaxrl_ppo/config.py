@@ -7,13 +7,13 @@ from dataclasses import dataclass
 class Config:
     """Hyperparameters of PPO; the defaults are the recipe for FlyTrack-v0 (docs/training.md)."""
 
-    total_timesteps: int = 8_000_000
+    total_timesteps: int = 12_000_000
     """Environment steps over all environments; rounded down to whole updates."""
     num_envs: int = 1024
     """Environments stepped side by side."""
     num_steps: int = 64
     """Steps of every environment per update."""
-    episode_steps: int = 250
+    episode_steps: int = 200
     """Time limit of training episodes. Long ones spend most experience on the one line that the policy
     flies already, and a policy that knows nothing beside it fails on another plant."""
     update_epochs: int = 4
