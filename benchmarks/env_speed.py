@@ -194,6 +194,10 @@ def ratios(rates: dict[str, list[float]]) -> list[dict[str, Any]]:
 def as_markdown(result: dict[str, Any]) -> str:
     """Return the result as two tables and a line about the machine."""
     lines = [
+        "# Environment speed",
+        "",
+        f"`python -m benchmarks.env_speed --repeats {result['repeats']}`; what limits it: docs/speed.md.",
+        "",
         "| environment | million steps per CPU second, median | lowest to highest |",
         "|---|---|---|",
     ]
@@ -230,10 +234,12 @@ def main() -> None:
     table = as_markdown(result)
     print(table, end="")
     if arguments.out:
-        arguments.out.parent.mkdir(parents=True, exist_ok=True)
-        arguments.out.with_suffix(".md").write_text(table, encoding="utf-8")
+        # Not at the top: it imports jax, whose threads must be born on the pinned core.
+        from flytrack_env.files import write_atomically
+
+        write_atomically(arguments.out.with_suffix(".md"), table.encode())
         text = json.dumps(result, indent=2) + "\n"
-        arguments.out.with_suffix(".json").write_text(text, encoding="utf-8")
+        write_atomically(arguments.out.with_suffix(".json"), text.encode())
 
 
 if __name__ == "__main__":

@@ -23,7 +23,8 @@ class ModelParameters(NamedTuple):
     tau: (4,) s, time constants of the first-order lag of roll, pitch, yaw, thrust.
     thrust_coeffs: (6,) N, of 1, u, u^2, u^3, V, u V.
     max_rate: (3,) deg/s, body rate at full stick.
-    m: kg. g: m/s^2. battery_drain_v_per_min: V/min.
+    m: kg. g: m/s^2. battery_drain_v_per_min: V/min. linear_drag: (3,) 1/s, deceleration per speed along
+    body x, y, z; at 0 it does nothing and the model is the handout's.
     """
 
     tau: jax.Array
@@ -32,6 +33,7 @@ class ModelParameters(NamedTuple):
     m: Scalar
     g: Scalar
     battery_drain_v_per_min: Scalar = 1.0
+    linear_drag: jax.Array | tuple[float, float, float] = (0.0, 0.0, 0.0)
 
 
 def nominal_parameters() -> ModelParameters:
@@ -82,6 +84,16 @@ def integrate_attitude(quat: Quaternion, rates_b: Vec3, dt: Scalar) -> Quaternio
     return Quaternion(*(q + half_dt * dq for q, dq in zip(quat, turn, strict=True))).normalize()
 
 
+def drag_acceleration(vel_w: Vec3, axes: tuple[Vec3, Vec3, Vec3], linear_drag: jax.Array) -> Vec3:
+    """Return the acceleration by drag, world, m/s^2: -R diag(d) R^T v.
+
+    axes: the body's axes in the world. linear_drag: (3,) 1/s. Source: M. Faessler et al., "Differential
+    flatness of quadrotor dynamics subject to rotor drag", 2018, equation 2.
+    """
+    slowed = [axis.scale(-linear_drag[i] * axis.dot(vel_w)) for i, axis in enumerate(axes)]
+    return slowed[0] + slowed[1] + slowed[2]
+
+
 def advance(drone: Drone, command: Action, dt: Scalar, params: ModelParameters) -> Drone:
     """Return the drone ``dt`` seconds later under a held command.
 
@@ -91,8 +103,9 @@ def advance(drone: Drone, command: Action, dt: Scalar, params: ModelParameters) 
     applied = compute_once(lag(drone.applied, command, dt, params.tau))
     rates_b = body_rates(applied, params.max_rate)
     thrust = collective_thrust(applied.thrust, drone.battery_v, params.thrust_coeffs)
-    thrust_axis_w = drone.quat.axes()[2]
-    acc_w = compute_once(thrust_axis_w.scale(thrust / params.m) - Vec3(0.0, 0.0, params.g))
+    axes = compute_once(drone.quat.axes())
+    drag_w = drag_acceleration(drone.vel_w, axes, params.linear_drag)
+    acc_w = compute_once(axes[2].scale(thrust / params.m) - Vec3(0.0, 0.0, params.g) + drag_w)
     return Drone(
         pos_w=drone.pos_w + drone.vel_w.scale(dt) + acc_w.scale(0.5 * dt * dt),
         vel_w=drone.vel_w + acc_w.scale(dt),

@@ -18,7 +18,9 @@ SIZES = {
     "m": 0,
     "g": 0,
     "battery_drain_v_per_min": 0,
+    "linear_drag": 3,
 }
+MAY_BE_ABSENT = ("linear_drag",)
 UNITS = {
     "tau": "s",
     "thrust_coeffs": "N, N, N, N, N/V, N/V",
@@ -26,6 +28,7 @@ UNITS = {
     "m": "kg",
     "g": "m/s^2",
     "battery_drain_v_per_min": "V/min",
+    "linear_drag": "1/s",
 }
 LARGEST = float(np.finfo(np.float32).max)
 MUST_BE_POSITIVE = ("tau", "max_rate", "m")
@@ -54,8 +57,9 @@ def _read_field(path: Path, name: str, value: Any) -> Any:
 def load_model(path: str | Path) -> ModelParameters:
     """Return the parameters in a model file.
 
-    The file is a JSON object with ``tau``, ``thrust_coeffs``, ``max_rate``, ``m``, ``g`` and
-    ``battery_drain_v_per_min``, at the top or under ``parameters``; units as in ``ModelParameters``.
+    The file is a JSON object with ``tau``, ``thrust_coeffs``, ``max_rate``, ``m``, ``g``,
+    ``battery_drain_v_per_min`` and perhaps ``linear_drag``, at the top or under ``parameters``; units as
+    in ``ModelParameters``.
 
     Raises:
         ModelFileError: missing file, not JSON, a newer version, a field missing, unknown or out of range.
@@ -76,11 +80,13 @@ def load_model(path: str | Path) -> ModelParameters:
     if not isinstance(values, dict):
         raise ModelFileError(f"{path}: parameters: found {values!r}, expected an object")
     for name in SIZES:
-        if name not in values:
+        if name not in values and name not in MAY_BE_ABSENT:
             raise ModelFileError(f"{path}: {name}: missing")
     for name in set(values) - set(SIZES) - {"version"}:
         raise ModelFileError(f"{path}: {name}: unknown; expected {', '.join(SIZES)}")
-    return ModelParameters(**{name: _read_field(path, name, values[name]) for name in SIZES})
+    return ModelParameters(
+        **{name: _read_field(path, name, values[name]) for name in SIZES if name in values}
+    )
 
 
 def save_model(path: str | Path, model: ModelParameters, provenance: dict[str, Any]) -> None:

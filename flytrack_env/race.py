@@ -61,9 +61,7 @@ def look_up_gates(race: Race, course: Course) -> Race:
     return race._replace(gate=course.gate(race.gate_index), next_gate=course.gate(following))
 
 
-def _count_pass(
-    race: Race, is_pass: jax.Array, time_s: Scalar, course: Course
-) -> tuple[Race, jax.Array]:
+def _count_pass(race: Race, is_pass: jax.Array, time_s: Scalar, course: Course) -> tuple[Race, jax.Array]:
     """Return the race after a possible pass at a time, its gate frames not yet moved on; and whether
     the pass completed a lap."""
     gates_passed = race.gates_passed + is_pass

@@ -1,5 +1,6 @@
 """Fitting the minimal model: four lags and six thrust coefficients, in float64."""
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -7,7 +8,7 @@ from scipy import optimize, signal
 from scipy.spatial.transform import Rotation
 
 from flytrack_env.dynamics import ModelParameters, nominal_parameters
-from flytrack_env.state import ACCELERATION, APPLIED_ACTION, BATTERY, QUATERNION, RATES
+from flytrack_env.state import ACCELERATION, APPLIED_ACTION, BATTERY, QUATERNION, RATES, VELOCITY
 from flytrack_sysid.collect import DT, Excitation
 
 TAU_BOUNDS = (1e-3, 0.5)
@@ -42,18 +43,22 @@ def thrust_terms(action: np.ndarray, battery_v: np.ndarray) -> np.ndarray:
     return np.stack(terms, axis=-1)
 
 
-def specific_force_z(data: Excitation, gravity: float) -> np.ndarray:
-    """Return the specific force along the thrust axis, m/s^2, of every step.
+def specific_force_b(data: Excitation, gravity: float) -> np.ndarray:
+    """Return the specific force of every step, body frame, (num_manoeuvres, num_steps, 3) m/s^2.
 
-    World acceleration plus gravity, projected on body z with the attitude before the step.
+    World acceleration plus gravity, rotated with the attitude before the step.
     """
     acc_w = data.next_states[..., ACCELERATION].astype(float) + np.array([0.0, 0.0, gravity])
-    w_first = data.states[..., QUATERNION].reshape(-1, 4)
-    axis_w = Rotation.from_quat(w_first, scalar_first=True).apply([0.0, 0.0, 1.0])
-    return (acc_w.reshape(-1, 3) * axis_w).sum(axis=1).reshape(acc_w.shape[:-1])
+    return to_body(data, acc_w)
 
 
-def _minimise_over_tau(residual: "np.ufunc") -> tuple[float, np.ndarray]:
+def to_body(data: Excitation, vectors_w: np.ndarray) -> np.ndarray:
+    """Return world-frame vectors, one per step, in the body frame before the step."""
+    attitude = Rotation.from_quat(data.states[..., QUATERNION].reshape(-1, 4), scalar_first=True)
+    return attitude.inv().apply(vectors_w.reshape(-1, 3)).reshape(vectors_w.shape)
+
+
+def _minimise_over_tau(residual: Callable[[float], np.ndarray]) -> tuple[float, np.ndarray]:
     """Return the time constant with the least squared residual, and that residual."""
     result = optimize.least_squares(
         lambda log_tau: residual(np.exp(log_tau[0])).ravel(),
@@ -68,11 +73,11 @@ def _minimise_over_tau(residual: "np.ufunc") -> tuple[float, np.ndarray]:
     return tau, residual(tau)
 
 
-def fit(data: Excitation, start: ModelParameters | None = None) -> Fit:
+def fit(data: Excitation, start: ModelParameters | None = None, with_drag: bool = False) -> Fit:
     """Identify lags and thrust map; mass, gravity, maximum rates and drain are taken as given.
 
-    The rates are compared with the lag driven by the commands, from the first state of each manoeuvre
-    on; the thrust map is solved linearly inside the search for its lag.
+    with_drag: identify linear drag too, which the handout's minimal structure lacks; else it stays as
+    in ``start``, 0 by default.
 
     Raises:
         FitError: an axis that the commands never moved, or a search that did not converge.
@@ -81,32 +86,60 @@ def fit(data: Excitation, start: ModelParameters | None = None) -> Fit:
     for axis, name in enumerate(AXES):
         if np.ptp(data.actions[..., axis]) < 1e-3:
             raise FitError(f"{name}: the commands never change; this lag cannot be identified")
-    applied_start = data.states[:, 0, APPLIED_ACTION].astype(float)
-    commands = data.actions.astype(float)
-    rates_b = data.next_states[..., RATES].astype(float)
-    full_stick = np.deg2rad(np.asarray(given.max_rate, float))
-    taus, rms = [], []
-    for axis in range(3):
+    rate_fits = [_fit_rate(data, axis, float(given.max_rate[axis])) for axis in range(3)]
+    force_b = specific_force_b(data, given.g)
+    vel_b = to_body(data, data.states[..., VELOCITY].astype(float))
+    linear_drag = np.asarray(given.linear_drag, float)
+    if with_drag:
+        lateral = [-np.sum(force_b[..., i] * vel_b[..., i]) / np.sum(vel_b[..., i] ** 2) for i in (0, 1)]
+        linear_drag = np.array([*lateral, 0.0])
+    thrust = given.m * (force_b[..., 2] + linear_drag[2] * vel_b[..., 2])
+    drag_terms = -given.m * vel_b[..., 2:] if with_drag else vel_b[..., :0]
+    tau, coefficients, rms = _fit_thrust(data, thrust, drag_terms)
+    if with_drag:
+        linear_drag[2] = coefficients[-1]
+    model = given._replace(
+        tau=np.array([*(tau for tau, _ in rate_fits), tau], np.float32),
+        thrust_coeffs=coefficients[:6].astype(np.float32),
+        linear_drag=linear_drag.astype(np.float32),
+    )
+    return Fit(model, (rate_fits[0][1], rate_fits[1][1], rate_fits[2][1], rms))
 
-        def rate_residual(tau: float, axis: int = axis) -> np.ndarray:
-            applied = lagged(commands[..., axis], applied_start[:, axis], tau)
-            return rates_b[..., axis] - full_stick[axis] * applied
 
-        tau, left = _minimise_over_tau(rate_residual)
-        taus.append(tau)
-        rms.append(float(np.sqrt(np.mean(left**2))))
+def _fit_rate(data: Excitation, axis: int, max_rate_deg: float) -> tuple[float, float]:
+    """Return the lag of one rate axis, s, and the rms of what is left, rad/s.
 
-    thrust = given.m * specific_force_z(data, given.g)
+    The measured rate is compared with the lag driven by the commands (which are exact), from the first
+    state of each manoeuvre on.
+    """
+    start = data.states[:, 0, APPLIED_ACTION][:, axis].astype(float)
+    commands = data.actions[..., axis].astype(float)
+    measured = data.next_states[..., RATES][..., axis].astype(float)
+
+    def residual(tau: float) -> np.ndarray:
+        return measured - np.deg2rad(max_rate_deg) * lagged(commands, start, tau)
+
+    tau, left = _minimise_over_tau(residual)
+    return tau, float(np.sqrt(np.mean(left**2)))
+
+
+def _fit_thrust(
+    data: Excitation, thrust: np.ndarray, extra_terms: np.ndarray
+) -> tuple[float, np.ndarray, float]:
+    """Return the lag of thrust, s, its coefficients and those of the extra terms, and the rms left, N.
+
+    thrust: (num_manoeuvres, num_steps), N. The coefficients are solved linearly inside the search.
+    """
+    start = data.states[:, 0, APPLIED_ACTION][:, 3].astype(float)
+    commands = data.actions[..., 3].astype(float)
     battery_v = data.states[..., BATTERY].astype(float)
 
-    def solve_map(tau: float) -> tuple[np.ndarray, np.ndarray]:
-        applied = lagged(commands[..., 3], applied_start[:, 3], tau)
-        regressors = thrust_terms(applied, battery_v).reshape(-1, 6)
+    def solve(tau: float) -> tuple[np.ndarray, np.ndarray]:
+        terms = thrust_terms(lagged(commands, start, tau), battery_v)
+        regressors = np.concatenate([terms, extra_terms], axis=-1)
+        regressors = regressors.reshape(-1, regressors.shape[-1])
         coefficients = np.linalg.lstsq(regressors, thrust.ravel(), rcond=None)[0]
         return coefficients, thrust.ravel() - regressors @ coefficients
 
-    tau, left = _minimise_over_tau(lambda tau: solve_map(tau)[1])
-    taus.append(tau)
-    rms.append(float(np.sqrt(np.mean(left**2))))
-    model = given._replace(tau=np.array(taus, np.float32), thrust_coeffs=solve_map(tau)[0].astype(np.float32))
-    return Fit(model, tuple(rms))  # type: ignore[arg-type]
+    tau, left = _minimise_over_tau(lambda tau: solve(tau)[1])
+    return tau, solve(tau)[0], float(np.sqrt(np.mean(left**2)))

@@ -88,7 +88,7 @@ def test_demo_writes_everything(tmp_path, monkeypatch, capsys):
     assert {path.name for path in out.iterdir()} == names | {"summary.json"}
     summary = json.loads((out / "summary.json").read_text())
     assert summary["noisy_starts"]["episodes"] == 4
-    assert set(summary["validation"]["one_step_mse"]) == {
+    assert set(summary["validation"]["minimal"]["one_step_mse"]) == {
         "position",
         "velocity",
         "quaternion",

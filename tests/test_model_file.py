@@ -97,7 +97,13 @@ def test_bad_files_are_refused(case: str, tmp_path: Path) -> None:
         load_model(path)
 
 
-@pytest.mark.parametrize("name", ModelParameters._fields)
+def test_drag_may_be_absent_and_is_then_none(tmp_path: Path) -> None:
+    path = tmp_path / "model.json"
+    path.write_text(json.dumps(without("linear_drag")), encoding="utf-8")
+    np.testing.assert_array_equal(load_model(path).linear_drag, 0.0)
+
+
+@pytest.mark.parametrize("name", sorted(set(ModelParameters._fields) - {"linear_drag"}))
 def test_missing_fields_are_named(name: str, tmp_path: Path) -> None:
     path = tmp_path / "model.json"
     path.write_text(json.dumps(without(name)), encoding="utf-8")

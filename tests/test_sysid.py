@@ -8,7 +8,7 @@ from flytrack_env.dynamics import advance, collective_thrust, nominal_parameters
 from flytrack_env.plants import Simulator
 from flytrack_env.state import BATTERY_EMPTY_V, BATTERY_FULL_V
 from flytrack_sysid import Excitation, FitError, collect, fit, validate
-from flytrack_sysid.fit import lagged, specific_force_z, thrust_terms
+from flytrack_sysid.fit import lagged, specific_force_b, thrust_terms
 
 TRUTH = nominal_parameters()._replace(
     tau=np.array([0.021, 0.034, 0.057, 0.045], np.float32),
@@ -68,7 +68,9 @@ def test_split_holds_out_every_kind_and_shares_nothing(data):
 
 def test_identifies_minimal_plant_to_rounding(data):
     training, held_out = data.split()
+    np.testing.assert_allclose(fit(training, with_drag=True).model.linear_drag, 0.0, atol=1e-5)
     identified = fit(training)
+    assert not np.any(identified.model.linear_drag)
     np.testing.assert_allclose(identified.model.tau, TRUTH.tau, rtol=1e-4)
     action, battery_v = np.meshgrid(np.linspace(-1, 1, 21), np.linspace(22, 24, 9))
     found = collective_thrust(action, battery_v, identified.model.thrust_coeffs)
@@ -87,6 +89,10 @@ def test_drag_stays_open_and_grows_with_speed():
     # The unexplained force is about what was hidden: 0.2 1/s times the speed.
     low, high, rms = validation.open_force_by_speed[-1]
     assert 0.2 * low * 0.5 < rms < 0.2 * high
+    extended = fit(training, with_drag=True).model
+    np.testing.assert_allclose(extended.linear_drag, 0.2, rtol=1e-3)
+    np.testing.assert_allclose(extended.tau, TRUTH.tau, rtol=1e-3)
+    assert max(validate(extended, held_out).open_force) < 1e-2
 
 
 def test_lag_filter_equals_recursion():
@@ -112,8 +118,8 @@ def test_specific_force_of_hover_and_tilt(data):
     states[0, :, 9:13] = quaternions
     thrust_w = Rotation.from_quat(quaternions, scalar_first=True).apply([0, 0, 9.80665])
     after[0, :, 6:9] = thrust_w - [0, 0, 9.80665]
-    force = specific_force_z(Excitation(states, np.zeros((1, 2, 4)), after, ("leg",)), 9.80665)
-    np.testing.assert_allclose(force, 9.80665, rtol=1e-12)
+    force = specific_force_b(Excitation(states, np.zeros((1, 2, 4)), after, ("leg",)), 9.80665)
+    np.testing.assert_allclose(force[0], [[0.0, 0.0, 9.80665]] * 2, atol=1e-12)
 
 
 def test_axis_that_never_moves_is_refused(data):
