@@ -42,6 +42,7 @@ def train_policy(
     """
     env = flytrack_env.make(env_id, **env_arguments)
     config.check()
+    env.default_params.check()
     out.mkdir(parents=True, exist_ok=True)
     num_steps = config.num_updates * config.batch_size
     with tqdm(total=num_steps, unit="step", unit_scale=True, desc="train") as bar:
