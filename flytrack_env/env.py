@@ -4,10 +4,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import chex
 import jax
 import jax.numpy as jnp
-import numpy as np
 from gymnax.environments import environment, spaces
 
 from flytrack_env.auto_reset import reset_ended
@@ -15,15 +13,15 @@ from flytrack_env.dynamics import ModelParameters, nominal_parameters
 from flytrack_env.fusion import compute_once
 from flytrack_env.model_file import load_model
 from flytrack_env.observations import OBSERVATION_LIMIT, OBSERVATION_SIZE, observe_race
+from flytrack_env.params import EnvParams
 from flytrack_env.plants import Plant, Simulator
-from flytrack_env.quaternion import Scalar
 from flytrack_env.race import Race, RaceEvents, advance_race, look_up_gates, start_race
 from flytrack_env.randomness import seed_of, seeds_of
 from flytrack_env.resets import ResetParams, sample_start
 from flytrack_env.rewards import RewardWeights, Transition, total_reward
-from flytrack_env.state import ACTION_SIZE, BATTERY_EMPTY_V, BATTERY_FULL_V, Action, Drone, unpack_action
+from flytrack_env.state import ACTION_SIZE, Action, Drone, unpack_action
 from flytrack_env.terminations import Causes, find_causes
-from flytrack_env.tracks import Course, Track, build_course, load_track
+from flytrack_env.tracks import Track, build_course, load_track
 
 MISSED_GATE_CHOICES = ("terminate", "fly_on")
 
@@ -34,42 +32,6 @@ class EnvState(NamedTuple):
     plant: Any
     race: Race
     time: jax.Array
-
-
-@chex.dataclass(frozen=True, mappable_dataclass=False)
-class EnvParams:
-    """Everything that may be fitted, randomised or tuned: a pytree without static fields.
-
-    dt: s. drone_radius: m. max_steps_in_episode: the time limit, steps.
-    """
-
-    model: ModelParameters
-    course: Course
-    reset: ResetParams
-    reward: RewardWeights
-    dt: Scalar = 0.01
-    drone_radius: Scalar = 0.15
-    max_steps_in_episode: Scalar = 1000
-
-    def check(self) -> None:
-        """Raise ValueError, naming the field, for values that no episode can be flown with.
-
-        For concrete values, before work begins: under ``jit`` nothing can be refused any more.
-        """
-        for name in ("start_battery_low_v", "course_battery_low_v"):
-            value = getattr(self.reset, name)
-            if not np.all((np.asarray(value) >= BATTERY_EMPTY_V) & (np.asarray(value) <= BATTERY_FULL_V)):
-                raise ValueError(
-                    f"reset.{name}: found {value}, expected {BATTERY_EMPTY_V:g} to {BATTERY_FULL_V:g} V"
-                )
-        for name in ("dt", "drone_radius", "max_steps_in_episode"):
-            value = getattr(self, name)
-            if not np.all(np.asarray(value) > 0):
-                raise ValueError(f"{name}: found {value}, expected > 0")
-        if not np.all(np.asarray(self.course.gates.half_opening) > self.drone_radius):
-            raise ValueError(
-                f"drone_radius: found {self.drone_radius}, expected less than half of every gate's opening"
-            )
 
 
 def clean_command(action: jax.Array) -> tuple[Action, jax.Array]:

@@ -26,6 +26,7 @@ LAYERS = (
     {"dynamics"},
     {"plants"},
     {"race", "resets", "observations", "rewards", "terminations", "model_file"},
+    {"params"},
     {"env"},
     {"wrappers", "blackbox", "rollout"},
     {"registration", "viz_rerun"},
