@@ -32,7 +32,7 @@ class Validation(NamedTuple):
         return {
             "one_step_mse": self.mse,
             "open": {
-                "what": "specific force that the minimal model does not explain",
+                "what": "specific force that the model does not explain",
                 "rms_body_xyz_m_per_s2": list(self.open_force),
                 "rms_by_speed_m_per_s": [list(row) for row in self.open_force_by_speed],
             },
