@@ -17,14 +17,17 @@ from baselines.purejaxrl_ppo.ppo import make_train
 
 
 def progress_report(bar: tqdm, config: Config) -> Callable[[dict[str, Any]], None]:
-    """Return a callback that moves the bar on by one update and shows how the policy flies."""
+    """Return a callback that moves the bar on by one update and shows how the policy flies.
+
+    unharmed: share of the episodes that the time limit ended, not a crash or a miss.
+    """
 
     def report(metrics: dict[str, Any]) -> None:
         bar.update(config.batch_size)
-        laps = float(metrics.get("episode_lap_time_s", np.nan))
         bar.set_postfix_str(
             f"return {float(metrics['episode_return']):6.1f}, "
-            f"gates {float(metrics['episode_gates_passed']):5.1f}, lap {laps:4.2f} s"
+            f"gates {float(metrics['episode_gates_passed']):4.1f}, "
+            f"unharmed {float(metrics['episode_truncated']):4.0%}"
         )
 
     return report
