@@ -65,7 +65,17 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--total-timesteps", type=float, default=Config.total_timesteps)
     arguments = parser.parse_args()
+    try:
+        run(arguments)
+    except (ValueError, OverflowError, OSError) as error:
+        parser.error(str(error))
+
+
+def run(arguments: argparse.Namespace) -> None:
+    """Do the job; raises ValueError or OSError for what cannot be used, settings before any work."""
     started = time.perf_counter()
+    config = Config(total_timesteps=int(arguments.total_timesteps))
+    config.check()
     out, seed = arguments.out, arguments.seed
     out.mkdir(parents=True, exist_ok=True)
 
@@ -74,7 +84,6 @@ def main() -> None:
     describe_identification(validations)
 
     print("2/4 train PPO from scratch on the identified model")
-    config = Config(total_timesteps=int(arguments.total_timesteps))
     checkpoint, _ = train_policy(out, config, seed, model=out / "model.json")
 
     print("3/4 fly the checkpoint on the black box")

@@ -18,6 +18,8 @@ from flytrack_env.rollout import save_rollout
 
 SHIPPED_BLACK_BOX = Path(__file__).parent / "blackbox" / "acro_step.bin"
 
+MAX_SEED = 2**31
+
 
 def black_box_env(checkpoint: Checkpoint, black_box: Path) -> FlyTrack:
     """Return the checkpoint's environment with the black box in place of the simulator.
@@ -25,8 +27,14 @@ def black_box_env(checkpoint: Checkpoint, black_box: Path) -> FlyTrack:
     Raises:
         BlackBoxError, CheckpointError, TrackError: a file that cannot be used.
     """
-    env = flytrack_env.make(checkpoint.env_id, track=checkpoint.track, plant=blackbox.load(black_box))
+    env = flytrack_env.make(
+        checkpoint.env_id,
+        track=checkpoint.track,
+        plant=blackbox.load(black_box),
+        missed_gate=checkpoint.meta["missed_gate"],
+    )
     checkpoint.check_fits(env)
+    env.default_params.check()
     return env
 
 
@@ -80,13 +88,17 @@ def main() -> None:
     arguments = parser.parse_args()
     if arguments.steps < 1:
         parser.error(f"--steps: found {arguments.steps}, expected at least 1")
+    if not 0 <= arguments.seed < MAX_SEED:
+        parser.error(f"--seed: found {arguments.seed}, expected 0 to {MAX_SEED - 1}")
+    if arguments.out.is_dir():
+        parser.error(f"--out: {arguments.out} is a folder, expected the path of a file")
     try:
         checkpoint = load_checkpoint(arguments.checkpoint)
         flight = fly_on_black_box(checkpoint, arguments.black_box, arguments.steps, arguments.seed)
+        print(describe(flight, dt=blackbox.DT))
         save_flown(arguments.out, flight)
     except (ValueError, OSError) as error:
         parser.error(str(error))
-    print(describe(flight, dt=blackbox.DT))
     print(f"rollout: {arguments.out}")
 
 

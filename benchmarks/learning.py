@@ -50,6 +50,7 @@ def main() -> None:
     parser.add_argument("--table", type=Path, default=Path("docs/results/learning.md"))
     arguments = parser.parse_args()
     config = Config(total_timesteps=int(arguments.total_timesteps))
+    config.check()
     identify(arguments.black_box, arguments.out, seed=0)
     successes, rows = [], []
     for seed in range(arguments.seeds):

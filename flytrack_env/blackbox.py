@@ -162,8 +162,10 @@ class BlackBox:
     the default device is another, run inside ``with jax.default_device(jax.devices("cpu")[0])``;
     JAX raises a ValueError otherwise.
 
-    path: the artifact's file. state_size: components of the artifact's own state, 21 or 18.
+    path: the artifact's file. state_size: components of the artifact's own state, 21 or 18. dt: s, baked in.
     """
+
+    dt = DT
 
     def __init__(self, path: Path, exported: export.Exported, max_rate: tuple[float, ...]):
         self.path = path

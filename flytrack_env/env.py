@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from gymnax.environments import environment, spaces
 
 from flytrack_env.auto_reset import reset_ended
@@ -181,6 +182,24 @@ class FlyTrack(environment.Environment[EnvState, EnvParams]):
         }
         return observation, next_state, reward, causes.any(), info
 
+    def reset(self, key: jax.Array, params: EnvParams | None = None) -> tuple[jax.Array, EnvState]:
+        """Return observation and state of an episode that begins.
+
+        Raises:
+            ValueError: parameters that no episode can be flown with, or a step of time that the plant does
+                not have, where their values are known (not while tracing).
+        """
+        if params is None:
+            params = self.default_params
+        if not any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(params)):
+            params.check()
+            plant_dt = getattr(self.plant, "dt", params.dt)
+            if not np.allclose(params.dt, plant_dt, rtol=1e-5):
+                raise ValueError(
+                    f"dt: found {params.dt} s, expected {plant_dt} s, which the plant has baked in"
+                )
+        return super().reset(key, params)
+
     def _begin_from(self, seed: jax.Array, params: EnvParams) -> EnvState:
         """Return the state of an episode that begins, from one random word."""
         start = sample_start(seed, params.course, params.reset, params.model)
@@ -242,7 +261,7 @@ class FlyTrack(environment.Environment[EnvState, EnvParams]):
     def step_batch(
         self, key: jax.Array, states: EnvState, actions: jax.Array, params: EnvParams
     ) -> tuple[jax.Array, EnvState, jax.Array, jax.Array, jax.Array, dict[str, Any]]:
-        """``step`` for a whole batch with one key, several times faster than ``vmap(step)``.
+        """``step`` for a whole batch with one key, faster than ``vmap(step)``.
 
         states: leaves (num_envs,). actions: (num_envs, 4). params: one for all. Same results as
         ``vmap(step)`` up to the random draws: starts are sampled only in steps where an episode ended.

@@ -13,7 +13,10 @@ from flytrack_env.state import Action, Drone
 
 
 class Plant(Protocol):
-    """Pure functions for one drone; all of them work under ``jit``, ``vmap`` and ``scan``."""
+    """Pure functions for one drone; all of them work under ``jit``, ``vmap`` and ``scan``.
+
+    A plant that cannot be asked for any other step of time says so with an attribute ``dt``, s.
+    """
 
     def reset(self, drone: Drone) -> Any:
         """Return the plant's state with the drone in that state and nothing remembered."""

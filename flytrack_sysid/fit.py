@@ -12,6 +12,7 @@ from flytrack_env.state import ACCELERATION, APPLIED_ACTION, BATTERY, QUATERNION
 from flytrack_sysid.collect import DT, Excitation
 
 TAU_BOUNDS = (1e-3, 0.5)
+SLOWEST = 0.1  # m/s, rms along each body axis
 AXES = ("roll", "pitch", "yaw", "thrust")
 
 
@@ -86,11 +87,15 @@ def fit(data: Excitation, start: ModelParameters | None = None, with_drag: bool 
     for axis, name in enumerate(AXES):
         if np.ptp(data.actions[..., axis]) < 1e-3:
             raise FitError(f"{name}: the commands never change; this lag cannot be identified")
+    if not all(np.isfinite(array).all() for array in data[:3]):
+        raise FitError("data: found values that are not finite")
     rate_fits = [_fit_rate(data, axis, float(given.max_rate[axis])) for axis in range(3)]
     force_b = specific_force_b(data, given.g)
     vel_b = to_body(data, data.states[..., VELOCITY].astype(float))
     linear_drag = np.asarray(given.linear_drag, float)
     if with_drag:
+        if np.any(np.mean(vel_b**2, axis=(0, 1)) < SLOWEST**2):
+            raise FitError("velocity: the drone hardly moves along some axis; drag cannot be identified")
         lateral = [-np.sum(force_b[..., i] * vel_b[..., i]) / np.sum(vel_b[..., i] ** 2) for i in (0, 1)]
         linear_drag = np.array([*lateral, 0.0])
     thrust = given.m * (force_b[..., 2] + linear_drag[2] * vel_b[..., 2])

@@ -14,7 +14,12 @@ from flytrack_env import FlyTrack
 from flytrack_env.observations import OBSERVATION_SIZE
 
 CONFIG = Config(hidden_sizes=(8,))
-DESCRIPTION = {"env_id": "FlyTrack-v0", "track": "flytrack", "observation_size": OBSERVATION_SIZE}
+DESCRIPTION = {
+    "env_id": "FlyTrack-v0",
+    "track": "flytrack",
+    "missed_gate": "terminate",
+    "observation_size": OBSERVATION_SIZE,
+}
 
 
 @pytest.fixture
@@ -79,3 +84,19 @@ def test_another_format_is_refused(tmp_path, content):
 def test_missing_file_is_refused(tmp_path):
     with pytest.raises(CheckpointError, match=r"missing\.msgpack: cannot be read"):
         load_checkpoint(tmp_path / "missing.msgpack")
+
+
+@pytest.mark.parametrize(
+    ("name", "value"), [("env_id", 5), ("track", 5), ("missed_gate", None), ("config", [1, 2])]
+)
+def test_damaged_description_is_refused(tmp_path, params, name, value):
+    save_checkpoint(tmp_path / "f.msgpack", params, CONFIG, {**DESCRIPTION, name: value})
+    with pytest.raises(CheckpointError, match=r"f\.msgpack"):
+        load_checkpoint(tmp_path / "f.msgpack")
+
+
+def test_parameters_that_are_no_tree_are_refused(tmp_path, path):
+    content = flax.serialization.msgpack_restore(path.read_bytes())
+    path.write_bytes(flax.serialization.msgpack_serialize({**content, "params": 5}))
+    with pytest.raises(CheckpointError, match=r"a\.msgpack"):
+        load_checkpoint(path)

@@ -66,6 +66,8 @@ def test_eval_agent_refuses(checkpoint_path, tmp_path, arguments, message):
         (["--model", "missing.json"], "missing.json"),
         (["--total-timesteps", "10"], "total_timesteps"),
         (["--env-id", "FlyTrack-v9"], "FlyTrack-v9"),
+        (["--total-timesteps", "inf"], "infinity"),
+        (["--seed", "99999999999999"], "--seed"),
     ],
 )
 def test_training_refuses_before_any_work(tmp_path, arguments, message):
@@ -96,6 +98,16 @@ def test_demo_writes_everything(tmp_path, monkeypatch, capsys):
     }
     assert load_model(out / "model.json").tau.shape == (4,)
     assert "noisy starts finish 3 laps" in capsys.readouterr().out
+
+
+def test_demo_refuses_before_any_work(tmp_path, monkeypatch, capsys):
+    out = tmp_path / "demo"
+    for arguments in (["--total-timesteps", "10"], ["--black-box", "nope.bin"]):
+        monkeypatch.setattr(sys, "argv", ["demo.py", "--out", str(out), *arguments])
+        with pytest.raises(SystemExit):
+            demo.main()
+        assert arguments[1] in capsys.readouterr().err
+    assert not any(out.glob("*"))
 
 
 def test_density_counts_positions_in_bins(tmp_path):

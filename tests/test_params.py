@@ -1,8 +1,10 @@
 """Parameters that no episode can be flown with are refused by name."""
 
+import jax
 import pytest
 
 from flytrack_env import FlyTrack
+from flytrack_env.plants import Simulator
 
 PARAMS = FlyTrack().default_params
 
@@ -30,3 +32,19 @@ def test_values_that_must_be_positive(name, value):
 def test_drone_wider_than_an_opening():
     with pytest.raises(ValueError, match=r"drone_radius: found 0\.75"):
         PARAMS.replace(drone_radius=0.75).check()
+
+
+def test_reset_refuses_a_battery_outside_its_range():
+    params = PARAMS.replace(reset=PARAMS.reset._replace(start_battery_low_v=40.0))
+    with pytest.raises(ValueError, match=r"reset\.start_battery_low_v: found 40"):
+        FlyTrack().reset(jax.random.key(0), params)
+
+
+def test_reset_refuses_another_step_than_the_plant_has():
+    class OneStep(Simulator):
+        dt = 0.02
+
+    env = FlyTrack(plant=OneStep())
+    with pytest.raises(ValueError, match=r"dt: found 0\.01 s, expected 0\.02 s"):
+        env.reset(jax.random.key(0), PARAMS)
+    env.reset(jax.random.key(0), PARAMS.replace(dt=0.02))

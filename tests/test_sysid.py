@@ -127,3 +127,17 @@ def test_axis_that_never_moves_is_refused(data):
     actions[..., 1] = 0.0
     with pytest.raises(FitError, match="pitch"):
         fit(data._replace(actions=actions))
+
+
+def test_drag_without_motion_is_refused(data):
+    states = data.states.copy()
+    states[..., 3:6] = 0.0
+    with pytest.raises(FitError, match="hardly moves"):
+        fit(data._replace(states=states), with_drag=True)
+
+
+def test_data_that_are_not_finite_are_refused(data):
+    states = data.states.copy()
+    states[0, 0, 0] = np.nan
+    with pytest.raises(FitError, match="not finite"):
+        fit(data._replace(states=states))

@@ -54,7 +54,7 @@ class Checkpoint(NamedTuple):
 def save_checkpoint(path: str | Path, params: Any, config: Config, description: dict[str, Any]) -> None:
     """Write a checkpoint atomically.
 
-    description: JSON values; needs env_id, track and observation_size, may hold anything else.
+    description: JSON values; needs env_id, track, missed_gate and observation_size, may hold anything else.
     """
     meta = {
         "format": FORMAT,
@@ -83,7 +83,7 @@ def load_checkpoint(path: str | Path) -> Checkpoint:
     try:
         meta = json.loads(content["meta"])
         found_format = meta["format"]
-    except (KeyError, TypeError, json.JSONDecodeError) as error:
+    except (KeyError, IndexError, TypeError, AttributeError, json.JSONDecodeError) as error:
         raise CheckpointError(f"{path}: not a checkpoint: no description in it") from error
     if found_format != FORMAT:
         raise CheckpointError(f"{path}: format: found {found_format!r}, expected {FORMAT!r}")
@@ -94,10 +94,13 @@ def load_checkpoint(path: str | Path) -> Checkpoint:
         expected = jax.eval_shape(network.init, jax.random.key(0), jnp.zeros((1, size)))
         params = flax.serialization.from_state_dict(expected, content["params"])
         _check_shapes(path, expected, params)
+        for name in ("env_id", "track", "missed_gate"):
+            if not isinstance(meta[name], str):
+                raise CheckpointError(f"{path}: {name}: found {meta[name]!r}, expected a string")
         return Checkpoint(params, config, meta["env_id"], meta["track"], size, meta)
     except CheckpointError:
         raise
-    except (KeyError, TypeError, ValueError) as error:
+    except (KeyError, IndexError, TypeError, AttributeError, ValueError) as error:
         raise CheckpointError(f"{path}: damaged description or parameters: {error}") from error
 
 

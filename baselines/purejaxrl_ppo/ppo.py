@@ -5,7 +5,7 @@ updates. What differs from PureJaxRL, and why:
 
 - Truncation is bootstrapped: the value of the final observation is added to the last reward of an
   episode that the time limit cut off, because the race would have gone on.
-- Environments are stepped as a batch where they offer ``step_batch`` (several times faster).
+- Environments are stepped as a batch where they offer ``step_batch`` (faster).
 - Minibatches come from an affine permutation, i -> a i + b mod n, because a sort of 65,536 keys per epoch
   costs as much as the environments.
 - The standard deviation has a floor (``networks.py``), so that exploration cannot die out early.

@@ -15,6 +15,8 @@ from baselines.purejaxrl_ppo.checkpoint import Checkpoint, load_checkpoint, save
 from baselines.purejaxrl_ppo.config import Config
 from baselines.purejaxrl_ppo.ppo import make_train
 
+MAX_SEED = 2**31
+
 
 def progress_report(bar: tqdm, config: Config) -> Callable[[dict[str, Any]], None]:
     """Return a callback that moves the bar on by one update and shows how the policy flies.
@@ -31,6 +33,11 @@ def progress_report(bar: tqdm, config: Config) -> Callable[[dict[str, Any]], Non
         )
 
     return report
+
+
+def track_reference(track: str | Path) -> str:
+    """Return what finds a track from any folder: its name, or the absolute path of its file."""
+    return str(Path(track).resolve()) if str(track).endswith(".toml") else str(track)
 
 
 def train_policy(
@@ -59,7 +66,8 @@ def train_policy(
     path = out / "final.msgpack"
     description = {
         "env_id": env_id,
-        "track": str(env_arguments.get("track", env.track.name)),
+        "track": track_reference(env_arguments.get("track", env.track.name)),
+        "missed_gate": env.missed_gate,
         "observation_size": int(env.observation_space().shape[0]),
         "seed": seed,
         "steps": num_steps,
@@ -83,8 +91,10 @@ def main() -> None:
     parser.add_argument("--total-timesteps", type=float, default=Config.total_timesteps)
     parser.add_argument("--out", type=Path, default=Path("runs/train"))
     arguments = parser.parse_args()
-    config = Config(total_timesteps=int(arguments.total_timesteps))
+    if not 0 <= arguments.seed < MAX_SEED:
+        parser.error(f"--seed: found {arguments.seed}, expected 0 to {MAX_SEED - 1}")
     try:
+        config = Config(total_timesteps=int(arguments.total_timesteps))
         checkpoint, _ = train_policy(
             arguments.out,
             config,
@@ -93,7 +103,7 @@ def main() -> None:
             track=arguments.track,
             model=arguments.model,
         )
-    except ValueError as error:
+    except (ValueError, OverflowError, OSError) as error:
         parser.error(str(error))
     print(f"{checkpoint.meta['steps']} steps in {checkpoint.meta['seconds']} s")
     print(f"checkpoint: {arguments.out / 'final.msgpack'}")

@@ -81,7 +81,7 @@ def load_track(name_or_path: str | Path) -> Track:
         raise TrackError(f"{path}: cannot be read: {error}") from error
     try:
         data = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
+    except (ValueError, RecursionError) as error:  # TOMLDecodeError, endless digits, endless nesting
         raise TrackError(f"{path}: not a TOML file: {error}") from error
     return _Reader(path, text).track(data)
 
@@ -130,7 +130,8 @@ class _Reader:
             if isinstance(number, bool) or not isinstance(number, (int, float)):
                 raise self.fail(header, index, field, f"found {number!r}, expected a number")
             if not -LARGEST < number < LARGEST:  # false for NaN too
-                reason = f"found {str(number)[:20]}, expected a finite number within +-{LARGEST:g}"
+                found = number if isinstance(number, float) else f"an integer of {number.bit_length()} bits"
+                reason = f"found {found}, expected a finite number within +-{LARGEST:g}"
                 raise self.fail(header, index, field, reason)
         return tuple(float(number) for number in value)
 
