@@ -51,7 +51,7 @@ class FlyTrack(environment.Environment[EnvState, EnvParams]):
     """Race an acro-mode quadcopter through the gates of a track at 100 Hz.
 
     Args:
-        track: name of a shipped track, or the path of a track file.
+        track: name of a shipped track, the path of a track file, or a ``Track``.
         model: parameters of the simulated drone, or the path of a model file; nominal if None.
         plant: what moves the drone; the simulator if None. Black boxes: ``flytrack_env.blackbox``.
         missed_gate: "terminate" the episode when a gate's plane is crossed outside its frame, or
@@ -66,7 +66,7 @@ class FlyTrack(environment.Environment[EnvState, EnvParams]):
 
     def __init__(
         self,
-        track: str | Path = "flytrack",
+        track: str | Path | Track = "flytrack",
         model: ModelParameters | str | Path | None = None,
         plant: Plant | None = None,
         missed_gate: str = "terminate",
@@ -74,7 +74,7 @@ class FlyTrack(environment.Environment[EnvState, EnvParams]):
         super().__init__()
         if missed_gate not in MISSED_GATE_CHOICES:
             raise ValueError(f"missed_gate: found {missed_gate!r}, expected one of {MISSED_GATE_CHOICES}")
-        self.track: Track = load_track(track)
+        self.track: Track = track if isinstance(track, Track) else load_track(track)
         self.plant: Plant = Simulator() if plant is None else plant
         self.missed_gate = missed_gate
         if model is None:
@@ -115,6 +115,10 @@ class FlyTrack(environment.Environment[EnvState, EnvParams]):
     def drone(self, state: EnvState) -> Drone:
         """Return the drone of an environment state."""
         return self.plant.drone(state.plant)
+
+    def race(self, state: EnvState) -> Race:
+        """Return where the drone stands in the race."""
+        return state.race
 
     def observe(self, key: jax.Array | None, state: EnvState, action: Any, params: EnvParams) -> jax.Array:
         """Return the observation of a state, (OBSERVATION_SIZE,) float32; key and action are unused."""

@@ -28,14 +28,14 @@ LAYERS = (
     {"race", "resets", "observations", "rewards", "terminations", "model_file"},
     {"params"},
     {"env"},
-    {"wrappers", "blackbox", "rollout"},
+    {"wrappers", "blackbox", "rollout", "rendering"},
     {"registration", "viz_rerun"},
     {"gymnasium_adapter"},
     {"__init__"},
 )
 RANKS = {name: rank for rank, layer in enumerate(LAYERS) for name in layer}
 CONSUMERS = ("flytrack_sysid", "baselines", "benchmarks", "blackbox", "eval_agent", "demo")
-ONLY_IN = {"gymnasium": "gymnasium_adapter", "rerun": "viz_rerun"}
+ONLY_IN = {"gymnasium": "gymnasium_adapter", "PIL": "rendering", "pygame": "rendering", "rerun": "viz_rerun"}
 
 
 def files_of(name: str) -> list[Path]:
