@@ -1,5 +1,8 @@
 """The parameters of an environment."""
 
+from dataclasses import field
+from typing import Any
+
 import chex
 import numpy as np
 
@@ -15,7 +18,8 @@ from flytrack_env.tracks import Course
 class EnvParams:
     """Everything that may be fitted, randomised or tuned: a pytree without static fields.
 
-    dt: s. drone_radius: m. max_steps_in_episode: the time limit, steps.
+    dt: s. drone_radius: m. max_steps_in_episode: the time limit, steps. wrappers: the parameters of each
+    wrapper around the environment, by its name; a wrapper's class says what they are.
     """
 
     model: ModelParameters
@@ -25,6 +29,7 @@ class EnvParams:
     dt: Scalar = 0.01
     drone_radius: Scalar = 0.15
     max_steps_in_episode: Scalar = 1000
+    wrappers: dict[str, Any] = field(default_factory=dict)
 
     def check(self) -> None:
         """Raise ValueError, naming the field, for values that no episode can be flown with.

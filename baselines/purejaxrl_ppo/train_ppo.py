@@ -14,6 +14,7 @@ import flytrack_env
 from baselines.purejaxrl_ppo.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
 from baselines.purejaxrl_ppo.config import Config
 from baselines.purejaxrl_ppo.ppo import make_train
+from flytrack_env.model_file import model_as_json
 
 MAX_SEED = 2**31
 
@@ -72,10 +73,7 @@ def train_policy(
         "seed": seed,
         "steps": num_steps,
         "seconds": round(seconds, 1),
-        "model": {
-            name: np.asarray(value, float).tolist()
-            for name, value in env.default_params.model._asdict().items()
-        },
+        "model": model_as_json(env.default_params.model),
     }
     save_checkpoint(path, runner.train_state.params, config, description)
     return load_checkpoint(path), metrics
