@@ -98,7 +98,11 @@ def draw_view(axes: Axes, track: Track, view: list[int]) -> LineCollection:
     draw_gates(axes, track, view)
     start = np.array(track.start_position)[view]
     axes.plot(*start, "o", color=START_COLOUR, markersize=7, zorder=5)
-    axes.text(start[0] + 0.4 * label, start[1] - 0.4 * label, "start", color=START_COLOUR, va="top")
+    # Where the way is farthest; from the side, below the ground.
+    corners = [(1.5, -0.9), (-1.5, -0.9), (1.5, 0.9), (-1.5, 0.9)][: 2 if view == SIDE_VIEW else 4]
+    places = [start + label * np.array(corner) for corner in corners]
+    place = max(places, key=lambda place: np.linalg.norm(points[:, view] - place, axis=1).min())
+    axes.text(*place, "start", color=START_COLOUR, ha="center", va="center")
     return lines
 
 
