@@ -442,6 +442,20 @@ def test_documented_table_is_that_of_the_files() -> None:
         ]
 
 
+def test_measured_tracks_are_the_shipped_ones_and_those_with_a_picture() -> None:
+    lines = (DOCS / "results" / "tracks.md").read_text(encoding="utf-8").splitlines()
+    cells = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines if line.startswith("|")]
+    measured = {row[0]: row[1:3] for row in cells[2:]}
+    expected = {
+        re.sub(r"random_(\d+)", r"random_track(\1)", name): [
+            str(len(track.gates)),
+            f"{way_length(build_course(track)):.1f}",
+        ]
+        for name, track in drawn_tracks().items()
+    }
+    assert measured == expected, "measure again: python -m benchmarks.tracks"
+
+
 def test_documented_limits_are_the_checks() -> None:
     text = (DOCS / "tracks.md").read_text(encoding="utf-8")
     table = text[text.index("| demand |") :]
