@@ -89,6 +89,10 @@ class FlyTrack(EpisodicEnvironment):
         """Return where the drone stands in the race."""
         return state.race
 
+    def model(self, state: EnvState, params: EnvParams) -> ModelParameters:
+        """Return the model of the parameters."""
+        return params.model
+
     def observe_drone(self, drone: Drone, state: EnvState, params: EnvParams) -> list[jax.Array]:
         """Return the observation before the gate to be flown, float32 scalars."""
         return observe_race(drone, state.race.gate, state.race.next_gate)

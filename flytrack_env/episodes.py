@@ -14,6 +14,7 @@ import numpy as np
 from gymnax.environments import environment, spaces
 
 from flytrack_env.auto_reset import reset_ended
+from flytrack_env.dynamics import ModelParameters
 from flytrack_env.fusion import compute_once
 from flytrack_env.observations import Entry
 from flytrack_env.params import EnvParams
@@ -68,6 +69,10 @@ class EpisodicEnvironment(environment.Environment[Any, EnvParams]):
 
     def race(self, state: Any) -> Race:
         """Return where the drone stands in the race."""
+        raise NotImplementedError
+
+    def model(self, state: Any, params: EnvParams) -> ModelParameters:
+        """Return the model that a state's episode is flown with."""
         raise NotImplementedError
 
     def sample_start(self, seed: jax.Array, params: EnvParams) -> tuple[Drone, jax.Array]:

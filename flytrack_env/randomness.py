@@ -75,8 +75,8 @@ class Draws:
     def normal(self, name: str) -> jax.Array:
         """Return a float32, standard normal but for a distribution function off by up to 0.001; within 4.5.
 
-        The sum of a word's four bytes, stretched by an odd polynomial: a seventh of the cost of the
-        inverse distribution function, which was dearer than the whole step.
+        The sum of a word's four bytes, stretched by an odd polynomial: noise is drawn in every step, twice,
+        and the inverse distribution function would be dearer than the rest of the observation.
         """
         word = self.word(name)
         pairs = (word & EVEN_BYTES) + ((word >> 8) & EVEN_BYTES)

@@ -137,6 +137,9 @@ def test_randomising_what_is_baked_in_is_refused() -> None:
 
 def test_layers() -> None:
     env = wrapped(*ALL)
+    _, state = env.reset(jax.random.key(0))
+    assert len(env.model(state, env.default_params).effects) == 4
+    assert FlyTrack().model(None, FlyTrack().default_params).effects == ()
     assert [type(layer) for layer in layers_of(env)] == [*reversed(ALL), FlyTrack]
     assert env.track.name == "flytrack" and env.missed_gate == "terminate"
 

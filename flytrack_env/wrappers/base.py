@@ -11,6 +11,7 @@ from typing import Any, ClassVar
 
 import jax
 
+from flytrack_env.dynamics import ModelParameters
 from flytrack_env.episodes import EpisodicEnvironment
 from flytrack_env.observations import Entry
 from flytrack_env.params import EnvParams
@@ -99,6 +100,10 @@ class Wrapper(EpisodicEnvironment):
     def race(self, state: Any) -> Race:
         """Return where the drone stands in the race."""
         return self.env.race(state.inner)
+
+    def model(self, state: Any, params: EnvParams) -> ModelParameters:
+        """Return the model that a state's episode is flown with."""
+        return self.env.model(state.inner, params)
 
     def sample_start(self, seed: jax.Array, params: EnvParams) -> tuple[Drone, jax.Array]:
         """Return a drone that begins an episode, and the gate to fly first."""

@@ -79,7 +79,7 @@ class DomainRandomization(Wrapper):
     """Fly every episode with a model drawn around the given one.
 
     The ranges are ``params.wrappers["domain_randomization"]``, a ``RandomizationParams``. The policy is not
-    told what was drawn. ``model(state, params)`` is for people and tests.
+    told what was drawn; ``env.model(state, params)`` tells people.
 
     Raises:
         WrapperError: as ``Wrapper``, or a plant that has its parameters baked in.
@@ -112,7 +112,7 @@ class DomainRandomization(Wrapper):
 
     def model(self, state: RandomizedState, params: EnvParams) -> ModelParameters:
         """Return the model that a state's episode is flown with."""
-        return self._drawn(state.word, params).model
+        return self.env.model(state.inner, self._drawn(state.word, params))
 
     def _drawn(self, word: jax.Array, params: EnvParams) -> EnvParams:
         ranges = self.own_params(params)
