@@ -41,8 +41,8 @@ ENVIRONMENTS: dict[str, Variant] = {
 def make(env_id: str, **overrides: Any) -> EpisodicEnvironment:
     """Return the environment of an id; ``overrides`` are arguments of ``FlyTrack``.
 
-    With a plant that has its parameters baked in (a black box), ids that randomise the model fly that plant as
-    it is, with the same observation: what was trained on the id can be flown on the plant.
+    With a plant that has its parameters baked in (a black box), ids that randomise the model fly that plant
+    as it is, with the same observation: what was trained on the id can be flown on the plant.
 
     Raises:
         ValueError: unknown id.
