@@ -2,6 +2,7 @@
 
 from flytrack_env.dynamics import ModelParameters, nominal_parameters
 from flytrack_env.env import EnvParams, EnvState, FlyTrack
+from flytrack_env.gymnasium_adapter import register_with_gymnasium
 from flytrack_env.model_file import ModelFileError, load_model, save_model
 from flytrack_env.registration import make, register_all
 from flytrack_env.tracks import (
@@ -15,6 +16,7 @@ from flytrack_env.tracks import (
 )
 
 register_all()
+register_with_gymnasium()
 
 __version__ = "0.1.0"
 
