@@ -165,7 +165,7 @@ def test_parameters_of_another_environment_are_refused(wrapper: Any) -> None:
     with pytest.raises(ValueError, match=rf"params\.wrappers: found \[\], expected '{env.key}' among them"):
         env.step(jax.random.key(0), state, jnp.zeros(4), others)
     unknown = others.replace(wrappers={env.key: env.own_defaults(), "nois": NoiseParams()})
-    with pytest.raises(ValueError, match=r"params\.wrappers: found \[.*'nois'\], expected"):
+    with pytest.raises(ValueError, match=r"params\.wrappers: found \[.*'nois'.*\], expected"):
         env.reset(jax.random.key(0), unknown)
 
 
@@ -442,7 +442,7 @@ def sampled_models(num: int = 2000, ranges: RandomizationParams | None = None) -
 def test_everything_that_has_a_range_fills_it_and_independently() -> None:
     models, params = sampled_models()
     ranges = params.wrappers["domain_randomization"]
-    columns = [(models.m, 0.8, 1.2)] + [(tau, 0.7 * 0.04, 1.3 * 0.04) for tau in models.tau]
+    columns = [(models.m, 0.8, 1.2)] + [(tau, 0.7 * 0.04, 1.3 * 0.04) for tau in models.tau.T]
     for found, low, high in zip(models.effects, ranges.low, ranges.high, strict=True):
         for name, lowest in low._asdict().items():
             value = np.asarray(getattr(found, name))
@@ -450,7 +450,7 @@ def test_everything_that_has_a_range_fills_it_and_independently() -> None:
                 assert (value == 0.0).all()
             elif lowest < getattr(high, name):
                 columns.append((value, lowest, getattr(high, name)))
-    assert len(columns) == 1 + 4 + 1 + 1 + 3 + 3
+    assert len(columns) == 1 + 4 + 1 + 1 + 2 + 3
     units = []
     for values, low, high in columns:
         unit = (np.asarray(values, float) - low) / (high - low)
