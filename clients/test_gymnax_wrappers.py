@@ -1,0 +1,99 @@
+"""gymnax's own wrappers on every id."""
+
+from typing import Any
+
+import gymnax
+import jax
+import numpy as np
+import pytest
+from gymnax.wrappers import FlattenObservationWrapper, GymnaxToGymWrapper, LogWrapper
+
+from flytrack_env.registration import ENVIRONMENTS
+
+NUM_ENVS, NUM_STEPS = 32, 300
+
+every_id = pytest.mark.parametrize("env_id", sorted(ENVIRONMENTS))
+
+
+def fly_at_random(env: Any, params: Any) -> tuple[Any, Any]:
+    """Return observations at the reset (N, ...), and all outputs of ``step``, leaves (T, N, ...).
+
+    Keys and actions do not depend on the wrapper, so that two flights can be compared.
+    """
+    reset_key, steps_key = jax.random.split(jax.random.key(0))
+    observations, states = jax.vmap(env.reset, (0, None))(jax.random.split(reset_key, NUM_ENVS), params)
+
+    def step(states: Any, key: jax.Array) -> tuple[Any, Any]:
+        keys = jax.random.split(key, NUM_ENVS)
+        actions = jax.vmap(env.action_space(params).sample)(keys)
+        outputs = jax.vmap(env.step, (0, 0, 0, None))(keys, states, actions, params)
+        return outputs[1], outputs
+
+    return observations, jax.lax.scan(step, states, jax.random.split(steps_key, NUM_STEPS))[1]
+
+
+@every_id
+def test_log_wrapper_logs_the_returns_and_lengths_of_episodes(env_id: str) -> None:
+    env, params = gymnax.make(env_id)
+    _, outputs = jax.jit(lambda: fly_at_random(LogWrapper(env), params))()
+    _, _, rewards, terminated, truncated, info = jax.tree.map(np.asarray, outputs)
+    assert (info["returned_episode"] == (terminated | truncated)).all()
+    assert info["returned_episode"].sum() > NUM_ENVS
+    for one in range(NUM_ENVS):
+        ends = np.flatnonzero(info["returned_episode"][:, one])
+        lengths = np.diff(ends, prepend=-1)
+        returns = [episode.sum() for episode in np.split(rewards[:, one], ends + 1)[: len(ends)]]
+        assert (info["returned_episode_lengths"][ends, one] == lengths).all()
+        np.testing.assert_allclose(info["returned_episode_returns"][ends, one], returns, atol=1e-4)
+
+
+@every_id
+def test_flatten_observation_wrapper_gives_the_same_numbers_as_a_vector(env_id: str) -> None:
+    env, params = gymnax.make(env_id)
+    flat = FlattenObservationWrapper(env)
+    expected, actual = jax.jit(lambda: (fly_at_random(env, params), fly_at_random(flat, params)))()
+    size = int(np.prod(env.observation_space(params).shape))
+    assert flat.observation_space(params).shape == (size,)
+    assert actual[0].shape == (NUM_ENVS, size) and actual[1][0].shape == (NUM_STEPS, NUM_ENVS, size)
+    reshaped = jax.tree.map(lambda leaf, like: leaf.reshape(like.shape), actual, expected)
+    jax.tree.map(np.testing.assert_array_equal, reshaped, expected)
+
+
+@every_id
+def test_log_wrapper_goes_over_flatten_observation_wrapper(env_id: str) -> None:
+    env, params = gymnax.make(env_id)
+    both = LogWrapper(FlattenObservationWrapper(env))
+    expected = jax.eval_shape(lambda: fly_at_random(FlattenObservationWrapper(env), params))
+    observations, outputs = jax.eval_shape(lambda: fly_at_random(both, params))
+    assert observations == expected[0]
+    assert outputs[1].env_state == expected[1][1]
+    assert (outputs[0], *outputs[2:5]) == (expected[1][0], *expected[1][2:5])
+    assert outputs[5].items() >= expected[1][5].items()
+    assert outputs[5].keys() - expected[1][5].keys() >= {
+        "returned_episode_returns",
+        "returned_episode_lengths",
+    }
+
+
+@every_id
+def test_gymnax_to_gym_wrapper_flies_what_the_environment_flies(env_id: str) -> None:
+    env, params = gymnax.make(env_id)
+    wrapped = GymnaxToGymWrapper(env, params, seed=0)
+    observation, _ = wrapped.reset(seed=5)
+    key, reset_key = jax.random.split(jax.random.key(5))
+    expected, state = env.reset(reset_key, params)
+    num_ended = 0
+    wrapped.action_space.seed(0)
+    for _ in range(NUM_STEPS):
+        np.testing.assert_allclose(observation, expected, atol=1e-5)
+        assert wrapped.observation_space.contains(np.asarray(observation))
+        action = wrapped.action_space.sample()
+        observation, reward, terminated, truncated, info = wrapped.step(action)
+        key, step_key = jax.random.split(key)
+        outputs = env.step(step_key, state, action, params)
+        expected, state = outputs[0], outputs[1]
+        np.testing.assert_allclose(reward, outputs[2], atol=1e-5)
+        assert (bool(terminated), bool(truncated)) == (bool(outputs[3]), bool(outputs[4]))
+        assert set(info) == set(outputs[5])
+        num_ended += bool(terminated | truncated)
+    assert num_ended > 0
