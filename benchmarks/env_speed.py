@@ -26,6 +26,16 @@ PACKAGES = ("jax", "jaxlib", "gymnax", "l2f", "numpy")
 PENDULUM = "gymnax Pendulum-v1, vmap, 1,024"
 L2F_SMALL, L2F_LARGE = "l2f full step, 1,024", "l2f full step, 4,096"
 PLAIN, BATCH = "FlyTrack vmap(step), 1,024", "FlyTrack step_batch, 4,096"
+VARIANTS = {
+    f"{env_id} vmap(step), 1,024": env_id
+    for env_id in (
+        "FlyTrackNoisy-v0",
+        "FlyTrackActionHistory-v0",
+        "FlyTrackRandomized-v0",
+        "FlyTrackRobust-v0",
+    )
+}
+MOST_COSTLY = 1.5  # a variant's step over the plain one's
 
 
 class Target(NamedTuple):
@@ -135,6 +145,7 @@ def contestants() -> list[Contestant]:
         jax_contestant(PENDULUM, "Pendulum-v1", 1024, 200, is_batch=False),
         jax_contestant(PLAIN, "FlyTrack-v0", 1024, 200, is_batch=False),
         jax_contestant(BATCH, "FlyTrack-v0", 4096, 200, is_batch=True),
+        *(jax_contestant(name, env_id, 1024, 200, is_batch=False) for name, env_id in VARIANTS.items()),
     ]
     try:
         found += [l2f_contestant(L2F_SMALL, 1024, 200), l2f_contestant(L2F_LARGE, 4096, 50)]
@@ -191,6 +202,16 @@ def ratios(rates: dict[str, list[float]]) -> list[dict[str, Any]]:
     return rows
 
 
+def costs(rates: dict[str, list[float]]) -> dict[str, float]:
+    """Return what a step of each variant costs over a plain one: the median of the rounds' ratios."""
+    return {
+        name: statistics.median(
+            plain / variant for plain, variant in zip(rates[PLAIN], rates[name], strict=True)
+        )
+        for name in VARIANTS
+    }
+
+
 def as_markdown(result: dict[str, Any]) -> str:
     """Return the result as two tables and a line about the machine."""
     lines = [
@@ -208,6 +229,9 @@ def as_markdown(result: dict[str, Any]) -> str:
     for row in result["ratios"]:
         numbers = f"{row['ratio']:.1f} | {row['goal']:g} | {row['stretch']:g}"
         lines.append(f"| {row['ours']} to {row['peer']} | {numbers} |")
+    lines += ["", "| variant | cost over the plain step | at most |", "|---|---|---|"]
+    for name, cost in result["costs"].items():
+        lines.append(f"| {name} | {cost:.2f} | {MOST_COSTLY:g} |")
     packages = ", ".join(f"{name} {number}" for name, number in result["versions"].items())
     lines += ["", f"{result['cpu']}, {result['core']}, {result['repeats']} rounds; {packages}."]
     return "\n".join(lines) + "\n"
@@ -226,6 +250,7 @@ def main() -> None:
     result = {
         "rates": rates,
         "ratios": ratios(rates),
+        "costs": costs(rates),
         "cpu": cpu_name(),
         "core": core,
         "repeats": arguments.repeats,

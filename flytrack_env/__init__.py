@@ -2,11 +2,21 @@
 
 from flytrack_env.dynamics import ModelParameters, nominal_parameters
 from flytrack_env.env import EnvParams, EnvState, FlyTrack
+from flytrack_env.gymnasium_adapter import register_with_gymnasium
 from flytrack_env.model_file import ModelFileError, load_model, save_model
 from flytrack_env.registration import make, register_all
-from flytrack_env.tracks import Track, TrackError, available_tracks, load_track
+from flytrack_env.tracks import (
+    Track,
+    TrackError,
+    available_tracks,
+    find_problems,
+    load_track,
+    random_track,
+    save_track,
+)
 
 register_all()
+register_with_gymnasium()
 
 __version__ = "0.1.0"
 
@@ -19,10 +29,13 @@ __all__ = [
     "Track",
     "TrackError",
     "available_tracks",
+    "find_problems",
     "load_model",
     "load_track",
     "make",
     "nominal_parameters",
+    "random_track",
     "register_all",
     "save_model",
+    "save_track",
 ]

@@ -188,8 +188,9 @@ class BlackBox:
         rate_actions = after[RATES] / self._full_stick_rad_s
         return jnp.concatenate([after[:16], rate_actions, after[16:]])
 
-    def reset(self, drone: Drone) -> Drone:
-        """Return the drone with its leaves as float32, as a step returns them."""
+    def reset(self, drone: Drone, model: ModelParameters) -> Drone:
+        """Return the drone with its leaves as float32, as a step returns them; ``model`` is not used."""
+        del model
         return jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32), drone)
 
     def step(self, state: Drone, command: Action, dt: Scalar, model: ModelParameters) -> Drone:

@@ -1,18 +1,21 @@
 """The simulator's physics: lag, body rates, thrust, rigid-body translation, battery.
 
-The equations are the handout's. ``advance`` states them once, for one drone of scalar
-leaves; ``step`` is the same function on the packed (21,) vector.
+The equations are the handout's; effects that a model has beyond them are folded in between
+(``flytrack_env.effects``). ``advance`` states them once, for one drone of scalar leaves; ``step`` is the
+same function on the packed (21,) vector.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from flytrack_env import effects
+from flytrack_env.effects import Flight
 from flytrack_env.fusion import compute_once
 from flytrack_env.quaternion import Quaternion, Scalar, Vec3
-from flytrack_env.state import Action, Drone, pack, unpack, unpack_action
+from flytrack_env.state import ACTION_SIZE, Action, Drone, pack, unpack, unpack_action
 
 SECONDS_PER_MINUTE = 60.0
 
@@ -23,8 +26,8 @@ class ModelParameters(NamedTuple):
     tau: (4,) s, time constants of the first-order lag of roll, pitch, yaw, thrust.
     thrust_coeffs: (6,) N, of 1, u, u^2, u^3, V, u V.
     max_rate: (3,) deg/s, body rate at full stick.
-    m: kg. g: m/s^2. battery_drain_v_per_min: V/min. linear_drag: (3,) 1/s, deceleration per speed along
-    body x, y, z; at 0 it does nothing and the model is the handout's.
+    m: kg. g: m/s^2. battery_drain_v_per_min: V/min. effects: parameters of the effects that the model
+    has, in the order of ``flytrack_env.effects.EFFECTS``; without any, the model is the handout's.
     """
 
     tau: jax.Array
@@ -33,7 +36,24 @@ class ModelParameters(NamedTuple):
     m: Scalar
     g: Scalar
     battery_drain_v_per_min: Scalar = 1.0
-    linear_drag: jax.Array | tuple[float, float, float] = (0.0, 0.0, 0.0)
+    effects: tuple[Any, ...] = ()
+
+    def with_effects(self, *parameters: Any) -> "ModelParameters":
+        """Return the model with effects added, or replaced where it has them.
+
+        Raises:
+            TypeError: something that is not the parameters of an effect.
+        """
+        return self._replace(effects=effects.merge(self.effects, *parameters))
+
+    def effect(self, name: str) -> Any:
+        """Return the parameters of an effect; neutral ones where the model does not have it.
+
+        Raises:
+            KeyError: no effect of that name.
+        """
+        neutral = effects.BY_NAME[name].parameters()
+        return next((found for found in self.effects if type(found) is type(neutral)), neutral)
 
 
 def nominal_parameters() -> ModelParameters:
@@ -66,7 +86,8 @@ def lag(applied: Action, command: Action, dt: Scalar, tau: jax.Array) -> Action:
 
     ``tau`` has shape (4,), s. Exact for a command held over the step; handout, equation 1.
     """
-    blend = 1.0 - jnp.exp(-dt / jnp.asarray(tau))
+    # One by one: batched models have time constants that are no array of four.
+    blend = [1.0 - jnp.exp(-dt / tau[i]) for i in range(ACTION_SIZE)]
     pairs = zip(applied, command, blend, strict=True)
     return Action(*(old + fraction * (new - old) for old, new, fraction in pairs))
 
@@ -84,29 +105,39 @@ def integrate_attitude(quat: Quaternion, rates_b: Vec3, dt: Scalar) -> Quaternio
     return Quaternion(*(q + half_dt * dq for q, dq in zip(quat, turn, strict=True))).normalize()
 
 
-def drag_acceleration(vel_w: Vec3, axes: tuple[Vec3, Vec3, Vec3], linear_drag: jax.Array) -> Vec3:
-    """Return the acceleration by drag, world, m/s^2: -R diag(d) R^T v.
+def _acceleration(flight: Flight, params: ModelParameters, memories: tuple[Any, ...]) -> Vec3:
+    """Return the acceleration, world, m/s^2: thrust, gravity, and the forces of effects."""
+    axes = flight.body_axes_w
+    acc_w = axes[2].scale(flight.thrust_acc) - Vec3(0.0, 0.0, params.g)
+    if not effects.acts(params.effects, "force"):
+        return acc_w
+    still = Vec3(0.0, 0.0, 0.0)
+    flight = flight._replace(air_w=compute_once(effects.fold("air", params.effects, memories, still, flight)))
+    force_b = compute_once(effects.fold("force", params.effects, memories, still, flight))
+    return acc_w + (axes[0].scale(force_b.x) + axes[1].scale(force_b.y) + axes[2].scale(force_b.z))
 
-    axes: the body's axes in the world. linear_drag: (3,) 1/s. Source: M. Faessler et al., "Differential
-    flatness of quadrotor dynamics subject to rotor drag", 2018, equation 2.
-    """
-    slowed = [axis.scale(-linear_drag[i] * axis.dot(vel_w)) for i, axis in enumerate(axes)]
-    return slowed[0] + slowed[1] + slowed[2]
 
-
-def advance(drone: Drone, command: Action, dt: Scalar, params: ModelParameters) -> Drone:
-    """Return the drone ``dt`` seconds later under a held command.
+def advance(
+    drone: Drone, memories: tuple[Any, ...], command: Action, dt: Scalar, params: ModelParameters
+) -> tuple[Drone, tuple[Any, ...]]:
+    """Return the drone ``dt`` seconds later under a held command, and what its effects remember then.
 
     The acceleration uses the attitude *before* the step and the thrust of the lagged action
-    *after* it (handout, equations 1 to 4). Commands are not clipped here.
+    *after* it (handout, equations 1 to 4). Commands are not clipped here. memories: as from
+    ``effects.start_memories``.
     """
-    applied = compute_once(lag(drone.applied, command, dt, params.tau))
-    rates_b = body_rates(applied, params.max_rate)
-    thrust = collective_thrust(applied.thrust, drone.battery_v, params.thrust_coeffs)
-    axes = compute_once(drone.quat.axes())
-    drag_w = drag_acceleration(drone.vel_w, axes, params.linear_drag)
-    acc_w = compute_once(axes[2].scale(thrust / params.m) - Vec3(0.0, 0.0, params.g) + drag_w)
-    return Drone(
+    flight = Flight(drone=drone, command=command, dt=dt)
+
+    def fold(stage: str, value: Any) -> Any:
+        return effects.fold(stage, params.effects, memories, value, flight)
+
+    applied = compute_once(lag(drone.applied, fold("command", command), dt, params.tau))
+    flight = flight._replace(applied=applied, body_axes_w=compute_once(drone.quat.axes()))
+    rates_b = fold("rates", body_rates(applied, params.max_rate))
+    thrust = fold("thrust", collective_thrust(applied.thrust, drone.battery_v, params.thrust_coeffs))
+    flight = flight._replace(thrust_acc=compute_once(thrust / params.m))
+    acc_w = compute_once(_acceleration(flight, params, memories))
+    after = Drone(
         pos_w=drone.pos_w + drone.vel_w.scale(dt) + acc_w.scale(0.5 * dt * dt),
         vel_w=drone.vel_w + acc_w.scale(dt),
         acc_w=acc_w,
@@ -115,12 +146,18 @@ def advance(drone: Drone, command: Action, dt: Scalar, params: ModelParameters) 
         applied=applied,
         battery_v=drone.battery_v - params.battery_drain_v_per_min / SECONDS_PER_MINUTE * dt,
     )
+    return compute_once(after), effects.remember(params.effects, memories, flight)
 
 
 def step(x: jax.Array, u: jax.Array, dt: Scalar, params: ModelParameters) -> jax.Array:
     """Return the handout's next state: (21,), (4,), s -> (21,); differentiable in everything.
 
     Raises:
-        ValueError: if ``x`` or ``u`` has another shape.
+        ValueError: if ``x`` or ``u`` has another shape, or the model has an effect with a memory, which
+            the vector has no place for; ``flytrack_env.plants.Simulator`` flies that.
     """
-    return pack(advance(unpack(x), unpack_action(u), dt, params))
+    drone = unpack(x)
+    memories = effects.start_memories(params.effects, drone)
+    if any(memory is not None for memory in memories):
+        raise ValueError("params.effects: found one with a memory, expected none; use plants.Simulator")
+    return pack(advance(drone, memories, unpack_action(u), dt, params)[0])

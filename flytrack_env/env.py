@@ -1,26 +1,23 @@
 """FlyTrack: the drone-racing environment, native to gymnax 1.0."""
 
-from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from gymnax.environments import environment, spaces
 
-from flytrack_env.auto_reset import reset_ended
 from flytrack_env.dynamics import ModelParameters, nominal_parameters
+from flytrack_env.episodes import EpisodicEnvironment, without_nan
 from flytrack_env.fusion import compute_once
 from flytrack_env.model_file import load_model
-from flytrack_env.observations import OBSERVATION_LIMIT, OBSERVATION_SIZE, observe_race
+from flytrack_env.observations import OBSERVATION, Entry, observe_race
 from flytrack_env.params import EnvParams
 from flytrack_env.plants import Plant, Simulator
 from flytrack_env.race import Race, RaceEvents, advance_race, look_up_gates, start_race
-from flytrack_env.randomness import seed_of, seeds_of
 from flytrack_env.resets import ResetParams, sample_start
 from flytrack_env.rewards import RewardWeights, Transition, total_reward
-from flytrack_env.state import ACTION_SIZE, Action, Drone, unpack_action
+from flytrack_env.state import Action, Drone
 from flytrack_env.terminations import Causes, find_causes
 from flytrack_env.tracks import Track, build_course, load_track
 
@@ -35,19 +32,7 @@ class EnvState(NamedTuple):
     time: jax.Array
 
 
-def clean_command(action: jax.Array) -> tuple[Action, jax.Array]:
-    """Return the command of an action (4,), clipped to [-1, 1], and whether it was not a number.
-
-    Infinite values clip; a NaN becomes 0, so that it cannot poison the state, and ends the episode.
-    """
-    command = unpack_action(jnp.asarray(action))
-    # The fence: a batch of actions is strided, and what reads strided memory is not vectorised.
-    clipped = compute_once([jnp.clip(value, -1.0, 1.0) for value in command])
-    cleaned = (jnp.where(jnp.isnan(value), 0.0, value) for value in clipped)
-    return Action(*cleaned), jnp.isnan(sum(clipped))
-
-
-class FlyTrack(environment.Environment[EnvState, EnvParams]):
+class FlyTrack(EpisodicEnvironment):
     """Race an acro-mode quadcopter through the gates of a track at 100 Hz.
 
     Args:
@@ -61,8 +46,6 @@ class FlyTrack(environment.Environment[EnvState, EnvParams]):
         TrackError, ModelFileError: a track or model that cannot be read.
         ValueError: another value of ``missed_gate``.
     """
-
-    _supports_transition_gradients = True
 
     def __init__(
         self,
@@ -89,28 +72,14 @@ class FlyTrack(environment.Environment[EnvState, EnvParams]):
         )
 
     @property
-    def name(self) -> str:
-        """Environment name."""
-        return "FlyTrack-v0"
-
-    @property
     def default_params(self) -> EnvParams:
         """Parameters with the track and model that the environment was made with."""
         return self._default_params
 
     @property
-    def num_actions(self) -> int:
-        """Number of components of an action."""
-        return ACTION_SIZE
-
-    def action_space(self, params: EnvParams | None = None) -> spaces.Box:
-        """Roll-rate, pitch-rate, yaw-rate and thrust command, each in [-1, 1]."""
-        return spaces.Box(-1.0, 1.0, (ACTION_SIZE,), jnp.float32)
-
-    def observation_space(self, params: EnvParams | None = None) -> spaces.Box:
-        """The table ``flytrack_env.observations.OBSERVATION`` as a box."""
-        limit = jnp.asarray(OBSERVATION_LIMIT)
-        return spaces.Box(-limit, limit, (OBSERVATION_SIZE,), jnp.float32)
+    def observation_table(self) -> tuple[Entry, ...]:
+        """The table ``flytrack_env.observations.OBSERVATION``."""
+        return OBSERVATION
 
     def drone(self, state: EnvState) -> Drone:
         """Return the drone of an environment state."""
@@ -120,22 +89,26 @@ class FlyTrack(environment.Environment[EnvState, EnvParams]):
         """Return where the drone stands in the race."""
         return state.race
 
-    def observe(self, key: jax.Array | None, state: EnvState, action: Any, params: EnvParams) -> jax.Array:
-        """Return the observation of a state, (OBSERVATION_SIZE,) float32; key and action are unused."""
-        del key, action
-        return observe_race(self.drone(state), state.race.gate, state.race.next_gate)
+    def model(self, state: EnvState, params: EnvParams) -> ModelParameters:
+        """Return the model of the parameters."""
+        return params.model
+
+    def observe_drone(self, drone: Drone, state: EnvState, params: EnvParams) -> list[jax.Array]:
+        """Return the observation before the gate to be flown, float32 scalars."""
+        return observe_race(drone, state.race.gate, state.race.next_gate)
 
     def is_truncated(self, state: EnvState, params: EnvParams) -> jax.Array:
         """Return whether the time limit is reached."""
         return state.time >= params.max_steps_in_episode
 
     def transition(
-        self, state: EnvState, action: jax.Array, params: EnvParams
+        self, state: EnvState, command: Action, params: EnvParams
     ) -> tuple[EnvState, jax.Array, Causes, RaceEvents]:
         """Return the next state, the reward, the causes of termination and the race's events."""
-        command, is_nan = clean_command(action)
+        is_nan = jnp.isnan(sum(command))
+        command = without_nan(command)
         before = self.drone(state)
-        plant_state = compute_once(self.plant.step(state.plant, command, params.dt, params.model))
+        plant_state = self.plant.step(state.plant, command, params.dt, params.model)
         after = self.plant.drone(plant_state)
         start_time_s = state.time * params.dt
         race, events = advance_race(
@@ -163,18 +136,15 @@ class FlyTrack(environment.Environment[EnvState, EnvParams]):
         )
         return EnvState(plant=plant_state, race=race, time=state.time + 1), reward, causes, events
 
-    def step_env(
-        self, key: jax.Array | None, state: EnvState, action: jax.Array, params: EnvParams
-    ) -> tuple[jax.Array, EnvState, jax.Array, jax.Array, dict[str, Any]]:
-        """Return observation, state, reward, terminated and info of one step, without auto-reset.
+    def advance(
+        self, state: EnvState, command: Action, params: EnvParams
+    ) -> tuple[EnvState, jax.Array, jax.Array, dict[str, Any]]:
+        """Return the next state, the reward, whether the episode terminates, and info.
 
         info: each cause of termination, ``gates_passed``, ``laps``, ``lap_completed``, ``lap_time_s``
         (last complete lap, interpolated at the crossing; 0 if none), ``gate_distance_m``.
         """
-        del key
-        next_state, reward, causes, events = self.transition(state, action, params)
-        observation = self.observe(None, next_state, action, params)
-        observation, next_state = self._apply_transition_gradient_policy(observation, next_state)
+        next_state, reward, causes, events = self.transition(state, command, params)
         race = next_state.race
         info = {
             **causes._asdict(),
@@ -184,104 +154,25 @@ class FlyTrack(environment.Environment[EnvState, EnvParams]):
             "lap_time_s": race.lap_time_s,
             "gate_distance_m": (self.drone(next_state).pos_w - race.gate.centre).norm(),
         }
-        return observation, next_state, reward, causes.any(), info
+        return next_state, reward, causes.any(), info
 
-    def reset(self, key: jax.Array, params: EnvParams | None = None) -> tuple[jax.Array, EnvState]:
-        """Return observation and state of an episode that begins.
+    def sample_start(self, seed: jax.Array, params: EnvParams) -> tuple[Drone, jax.Array]:
+        """Return a drone at the start pose or on the course, and the gate to fly first."""
+        return sample_start(seed, params.course, params.reset, params.model)
 
-        Raises:
-            ValueError: parameters that no episode can be flown with, or a step of time that the plant does
-                not have, where their values are known (not while tracing).
-        """
-        if params is None:
-            params = self.default_params
-        if not any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(params)):
-            params.check()
-            plant_dt = getattr(self.plant, "dt", params.dt)
-            if not np.allclose(params.dt, plant_dt, rtol=1e-5):
-                raise ValueError(
-                    f"dt: found {params.dt} s, expected {plant_dt} s, which the plant has baked in"
-                )
-        return super().reset(key, params)
-
-    def _begin_from(self, seed: jax.Array, params: EnvParams) -> EnvState:
-        """Return the state of an episode that begins, from one random word."""
-        start = sample_start(seed, params.course, params.reset, params.model)
-        return self.begin(*start, params)
-
-    def begin(self, drone: Drone, gate_index: Any, params: EnvParams) -> EnvState:
-        """Return the state of an episode that begins with a given drone and gate to fly first."""
+    def begin(self, drone: Drone, gate_index: Any, params: EnvParams, seed: Any = 0) -> EnvState:
+        """Return the state of an episode that begins; the seed is unused, nothing else is drawn."""
+        del seed
         race = start_race(jnp.asarray(gate_index, jnp.int32), params.course)
-        return EnvState(plant=self.plant.reset(drone), race=race, time=jnp.int32(0))
+        return EnvState(plant=self.plant.reset(drone, params.model), race=race, time=jnp.int32(0))
 
-    def reset_env(self, key: jax.Array, params: EnvParams) -> tuple[jax.Array, EnvState]:
-        """Return observation and state of an episode that begins."""
-        state = self._begin_from(seed_of(key), params)
-        return self.observe(None, state, None, params), state
+    def settle(self, state: EnvState, params: EnvParams) -> EnvState:
+        """Return the state with the gates' frames that belong to its gate index."""
+        return state._replace(race=look_up_gates(state.race, params.course))
 
-    @partial(jax.jit, static_argnames=("self",))
-    def step(
-        self,
-        key: jax.Array,
-        state: EnvState,
-        action: jax.Array,
-        params: EnvParams | None = None,
-    ) -> tuple[jax.Array, EnvState, jax.Array, jax.Array, jax.Array, dict[str, Any]]:
-        """Return observation, state, reward, terminated, truncated and info, with auto-reset.
-
-        gymnax's protocol, except that the whole key serves the reset: the step itself draws nothing.
-        """
-        if params is None:
-            params = self.default_params
-        final_observation, next_state, reward, terminated, info = self.step_env(None, state, action, params)
-        truncated = self.is_truncated(next_state, params)
-        done = terminated | truncated
-        fresh_state = self._begin_from(seed_of(key), params)
-        next_state = compute_once(
-            jax.tree.map(partial(jnp.where, compute_once(done)), fresh_state, next_state)
-        )
-        # Gates are looked up after the choice, by its index: a fifth faster than to choose frames.
-        next_state = next_state._replace(race=look_up_gates(next_state.race, params.course))
-        observation = self.observe(None, next_state, None, params)
-        info = {
-            **info,
-            "terminated": terminated,
-            "truncated": truncated,
-            "final_observation": final_observation,
-        }
-        return observation, next_state, reward, terminated, truncated, info
-
-    def _sample_starts(
-        self, places: jax.Array, inputs: tuple[jax.Array, EnvParams]
-    ) -> tuple[jax.Array, EnvState]:
-        """Return observations and states of episodes that begin in some environments of a batch."""
-        key, params = inputs
-        begin_all = jax.vmap(self._begin_from, in_axes=(0, None))
-        states = begin_all(seeds_of(key, places), params)
-        observe_all = jax.vmap(self.observe, in_axes=(None, 0, None, None))
-        return observe_all(None, states, None, params), states
-
-    @partial(jax.jit, static_argnames=("self",))
-    def step_batch(
-        self, key: jax.Array, states: EnvState, actions: jax.Array, params: EnvParams
-    ) -> tuple[jax.Array, EnvState, jax.Array, jax.Array, jax.Array, dict[str, Any]]:
-        """``step`` for a whole batch with one key, faster than ``vmap(step)``.
-
-        states: leaves (num_envs,). actions: (num_envs, 4). params: one for all. Same results as
-        ``vmap(step)`` up to the random draws: starts are sampled only in steps where an episode ended.
-        """
-        step_all = jax.vmap(self.step_env, in_axes=(None, 0, 0, None))
-        final_observations, next_states, rewards, terminated, info = step_all(None, states, actions, params)
-        truncated = self.is_truncated(next_states, params)
-        done = terminated | truncated
-
-        observations, next_states = reset_ended(
-            self._sample_starts, done, (final_observations, next_states), (key, params)
-        )
-        info = {
-            **info,
-            "terminated": terminated,
-            "truncated": truncated,
-            "final_observation": final_observations,
-        }
-        return observations, next_states, rewards, terminated, truncated, info
+    def check_params(self, params: EnvParams) -> None:
+        """Raise ValueError for what cannot be flown, or a step of time that the plant does not have."""
+        params.check()
+        plant_dt = getattr(self.plant, "dt", params.dt)
+        if not np.allclose(params.dt, plant_dt, rtol=1e-5):
+            raise ValueError(f"dt: found {params.dt} s, expected {plant_dt} s, which the plant has baked in")

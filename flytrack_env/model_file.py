@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from flytrack_env import effects
 from flytrack_env.dynamics import ModelParameters
 from flytrack_env.files import write_atomically
 
@@ -18,9 +19,7 @@ SIZES = {
     "m": 0,
     "g": 0,
     "battery_drain_v_per_min": 0,
-    "linear_drag": 3,
 }
-MAY_BE_ABSENT = ("linear_drag",)
 UNITS = {
     "tau": "s",
     "thrust_coeffs": "N, N, N, N, N/V, N/V",
@@ -28,7 +27,6 @@ UNITS = {
     "m": "kg",
     "g": "m/s^2",
     "battery_drain_v_per_min": "V/min",
-    "linear_drag": "1/s",
 }
 LARGEST = float(np.finfo(np.float32).max)
 MUST_BE_POSITIVE = ("tau", "max_rate", "m")
@@ -54,17 +52,28 @@ def _read_field(path: Path, name: str, value: Any) -> Any:
     return np.array(value, np.float32) if size else float(value)
 
 
-def load_model(path: str | Path) -> ModelParameters:
-    """Return the parameters in a model file.
+def _read_effect(path: Path, name: str, values: Any) -> Any:
+    """Return the parameters of one effect; those that are not in the file are neutral."""
+    effect = effects.BY_NAME.get(name)
+    if effect is None:
+        raise ModelFileError(f"{path}: effects: {name}: unknown; expected of {', '.join(effects.BY_NAME)}")
+    if not isinstance(values, dict):
+        raise ModelFileError(f"{path}: effects: {name}: found {reprlib.repr(values)}, expected an object")
+    for field, value in values.items():
+        bounds = effect.ranges.get(field)
+        if bounds is None:
+            expected = ", ".join(effect.ranges)
+            raise ModelFileError(f"{path}: effects: {name}: {field}: unknown; expected of {expected}")
+        is_number = isinstance(value, (int, float)) and not isinstance(value, bool)
+        if not is_number or not bounds.low <= value <= bounds.high:
+            expected = f"{bounds.low:g} to {bounds.high:g} {bounds.unit}"
+            found = reprlib.repr(value)
+            raise ModelFileError(f"{path}: effects: {name}: {field}: found {found}, expected {expected}")
+    return effect.parameters(**{field: float(value) for field, value in values.items()})
 
-    The file is a JSON object with ``tau``, ``thrust_coeffs``, ``max_rate``, ``m``, ``g``,
-    ``battery_drain_v_per_min`` and perhaps ``linear_drag``, at the top or under ``parameters``; units as
-    in ``ModelParameters``.
 
-    Raises:
-        ModelFileError: missing file, not JSON, a newer version, a field missing, unknown or out of range.
-    """
-    path = Path(path)
+def _read_json(path: Path) -> dict[str, Any]:
+    """Return the object in a JSON file."""
     try:
         data = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError) as error:
@@ -73,20 +82,54 @@ def load_model(path: str | Path) -> ModelParameters:
         raise ModelFileError(f"{path}: not a JSON file: {error}") from error
     if not isinstance(data, dict):
         raise ModelFileError(f"{path}: found a {type(data).__name__}, expected an object")
+    return data
+
+
+def load_model(path: str | Path) -> ModelParameters:
+    """Return the parameters in a model file.
+
+    The file is a JSON object with ``tau``, ``thrust_coeffs``, ``max_rate``, ``m``, ``g`` and
+    ``battery_drain_v_per_min`` at the top or under ``parameters``, units as in ``ModelParameters``; and
+    perhaps ``effects``, an object of effects' names (``flytrack_env.effects``) with their parameters.
+
+    Raises:
+        ModelFileError: missing file, not JSON, a newer version, a field missing, unknown or out of range.
+    """
+    path = Path(path)
+    data = _read_json(path)
     version = data.get("version", MODEL_FILE_VERSION)
     if version != MODEL_FILE_VERSION:
         raise ModelFileError(f"{path}: version: found {version!r}, expected {MODEL_FILE_VERSION}")
     values = data.get("parameters", data)
     if not isinstance(values, dict):
-        raise ModelFileError(f"{path}: parameters: found {values!r}, expected an object")
+        raise ModelFileError(f"{path}: parameters: found {reprlib.repr(values)}, expected an object")
     for name in SIZES:
-        if name not in values and name not in MAY_BE_ABSENT:
+        if name not in values:
             raise ModelFileError(f"{path}: {name}: missing")
-    for name in set(values) - set(SIZES) - {"version"}:
-        raise ModelFileError(f"{path}: {name}: unknown; expected {', '.join(SIZES)}")
-    return ModelParameters(
-        **{name: _read_field(path, name, values[name]) for name in SIZES if name in values}
-    )
+    for name in set(values) - set(SIZES) - {"version", "effects"}:
+        raise ModelFileError(f"{path}: {name}: unknown; expected {', '.join(SIZES)}, effects")
+    found = data.get("effects", values.get("effects", {}))
+    if not isinstance(found, dict):
+        raise ModelFileError(f"{path}: effects: found {reprlib.repr(found)}, expected an object")
+    base = ModelParameters(**{name: _read_field(path, name, values[name]) for name in SIZES})
+    return base.with_effects(*(_read_effect(path, name, found[name]) for name in found))
+
+
+def model_as_json(model: ModelParameters) -> dict[str, Any]:
+    """Return a model as JSON values: ``parameters``, ``effects``, and the ``units`` of both."""
+    by_name = {effects.effect_of(parameters).name: parameters for parameters in model.effects}
+    effect_units = {
+        name: {field: bounds.unit for field, bounds in effects.BY_NAME[name].ranges.items()}
+        for name in by_name
+    }
+    return {
+        "parameters": {name: np.asarray(getattr(model, name), float).tolist() for name in SIZES},
+        "effects": {
+            name: {field: float(value) for field, value in parameters._asdict().items()}
+            for name, parameters in by_name.items()
+        },
+        "units": {**UNITS, **effect_units},
+    }
 
 
 def save_model(path: str | Path, model: ModelParameters, provenance: dict[str, Any]) -> None:
@@ -94,12 +137,5 @@ def save_model(path: str | Path, model: ModelParameters, provenance: dict[str, A
 
     Written to a temporary name beside the target and renamed, so that no half-written file is left.
     """
-    path = Path(path)
-    parameters = {name: np.asarray(getattr(model, name), float).tolist() for name in SIZES}
-    document = {
-        "version": MODEL_FILE_VERSION,
-        "parameters": parameters,
-        "units": UNITS,
-        "provenance": provenance,
-    }
-    write_atomically(path, (json.dumps(document, indent=2) + "\n").encode())
+    document = {"version": MODEL_FILE_VERSION, **model_as_json(model), "provenance": provenance}
+    write_atomically(Path(path), (json.dumps(document, indent=2) + "\n").encode())

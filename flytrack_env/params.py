@@ -1,9 +1,13 @@
 """The parameters of an environment."""
 
+from dataclasses import field
+from typing import Any
+
 import chex
 import numpy as np
 
 from flytrack_env.dynamics import ModelParameters
+from flytrack_env.effects import effect_of
 from flytrack_env.quaternion import Scalar
 from flytrack_env.resets import ResetParams
 from flytrack_env.rewards import RewardWeights
@@ -15,7 +19,8 @@ from flytrack_env.tracks import Course
 class EnvParams:
     """Everything that may be fitted, randomised or tuned: a pytree without static fields.
 
-    dt: s. drone_radius: m. max_steps_in_episode: the time limit, steps.
+    dt: s. drone_radius: m. max_steps_in_episode: the time limit, steps. wrappers: the parameters of each
+    wrapper around the environment, by its name; a wrapper's class says what they are.
     """
 
     model: ModelParameters
@@ -25,6 +30,7 @@ class EnvParams:
     dt: Scalar = 0.01
     drone_radius: Scalar = 0.15
     max_steps_in_episode: Scalar = 1000
+    wrappers: dict[str, Any] = field(default_factory=dict)
 
     def check(self) -> None:
         """Raise ValueError, naming the field, for values that no episode can be flown with.
@@ -37,6 +43,15 @@ class EnvParams:
                 raise ValueError(
                     f"reset.{name}: found {value}, expected {BATTERY_EMPTY_V:g} to {BATTERY_FULL_V:g} V"
                 )
+        for parameters in self.model.effects:
+            effect = effect_of(parameters)
+            for name, bounds in effect.ranges.items():
+                value = np.asarray(getattr(parameters, name))
+                if not np.all((value >= bounds.low) & (value <= bounds.high)):
+                    expected = f"{bounds.low:g} to {bounds.high:g} {bounds.unit}"
+                    raise ValueError(
+                        f"model.effects: {effect.name}.{name}: found {value}, expected {expected}"
+                    )
         for name in ("dt", "drone_radius", "max_steps_in_episode"):
             value = getattr(self, name)
             if not np.all(np.asarray(value) > 0):

@@ -5,9 +5,10 @@ A plant's state is a pytree of its own, because a plant may remember more than t
 delay buffer, a gust); whoever holds a state asks for the drone in it.
 """
 
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 from flytrack_env.dynamics import ModelParameters, advance
+from flytrack_env.effects import start_memories
 from flytrack_env.quaternion import Scalar
 from flytrack_env.state import Action, Drone
 
@@ -15,10 +16,11 @@ from flytrack_env.state import Action, Drone
 class Plant(Protocol):
     """Pure functions for one drone; all of them work under ``jit``, ``vmap`` and ``scan``.
 
-    A plant that cannot be asked for any other step of time says so with an attribute ``dt``, s.
+    A plant with everything baked in says so with an attribute ``dt``, its only step of time, s: it does
+    not look at ``model`` either.
     """
 
-    def reset(self, drone: Drone) -> Any:
+    def reset(self, drone: Drone, model: ModelParameters) -> Any:
         """Return the plant's state with the drone in that state and nothing remembered."""
 
     def step(self, state: Any, command: Action, dt: Scalar, model: ModelParameters) -> Any:
@@ -28,17 +30,26 @@ class Plant(Protocol):
         """Return the drone of a plant's state."""
 
 
+class SimulatorState(NamedTuple):
+    """The drone, and what each effect of the model remembers."""
+
+    drone: Drone
+    memories: tuple[Any, ...]
+
+
 class Simulator:
-    """The differentiable model (``flytrack_env.dynamics``); its state is the drone itself."""
+    """The differentiable model: ``flytrack_env.dynamics`` with the model's effects."""
 
-    def reset(self, drone: Drone) -> Drone:
+    def reset(self, drone: Drone, model: ModelParameters) -> SimulatorState:
+        """Return the drone with fresh memories."""
+        return SimulatorState(drone, start_memories(model.effects, drone))
+
+    def step(
+        self, state: SimulatorState, command: Action, dt: Scalar, model: ModelParameters
+    ) -> SimulatorState:
+        """Return the model's next state."""
+        return SimulatorState(*advance(*state, command, dt, model))
+
+    def drone(self, state: SimulatorState) -> Drone:
         """Return the drone."""
-        return drone
-
-    def step(self, state: Drone, command: Action, dt: Scalar, model: ModelParameters) -> Drone:
-        """Return the model's next drone."""
-        return advance(state, command, dt, model)
-
-    def drone(self, state: Drone) -> Drone:
-        """Return the drone."""
-        return state
+        return state.drone

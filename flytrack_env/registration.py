@@ -1,28 +1,62 @@
 """The table of environment ids, and their registration with gymnax."""
 
+from collections.abc import Callable, Mapping
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import gymnax
 from gymnax.registration import registered_envs
 
 from flytrack_env.env import FlyTrack
+from flytrack_env.episodes import EpisodicEnvironment
+from flytrack_env.wrappers import ActionHistory, DomainRandomization, ObservationNoise
 
-# An id is a set of base arguments; variants with wrappers are rows of the same table.
-ENVIRONMENTS: dict[str, dict[str, Any]] = {
-    "FlyTrack-v0": {},
+
+class Variant(NamedTuple):
+    """One id: what it is, the base arguments of ``FlyTrack``, and the wrappers, innermost first."""
+
+    summary: str
+    arguments: Mapping[str, Any] = {}
+    wrappers: tuple[Callable[[EpisodicEnvironment], EpisodicEnvironment], ...] = ()
+
+
+HISTORY = partial(ActionHistory, length=3)
+
+ENVIRONMENTS: dict[str, Variant] = {
+    "FlyTrack-v0": Variant("The race with perfect sensors and one known drone."),
+    "FlyTrackNoisy-v0": Variant("The race seen through noisy sensors.", wrappers=(ObservationNoise,)),
+    "FlyTrackActionHistory-v0": Variant(
+        "The race with the last three commands in the observation.", wrappers=(HISTORY,)
+    ),
+    "FlyTrackRandomized-v0": Variant(
+        "The race with another drone, and other air, in every episode.", wrappers=(DomainRandomization,)
+    ),
+    "FlyTrackRobust-v0": Variant(
+        "All of it: another drone in every episode, noisy sensors, the last three commands.",
+        wrappers=(DomainRandomization, ObservationNoise, HISTORY),
+    ),
 }
 
 
-def make(env_id: str, **overrides: Any) -> FlyTrack:
+def make(env_id: str, **overrides: Any) -> EpisodicEnvironment:
     """Return the environment of an id; ``overrides`` are arguments of ``FlyTrack``.
+
+    With a plant that has its parameters baked in (a black box), ids that randomise the model fly that plant
+    as it is, with the same observation: what was trained on the id can be flown on the plant.
 
     Raises:
         ValueError: unknown id.
     """
     if env_id not in ENVIRONMENTS:
         raise ValueError(f"env_id: found {env_id!r}, expected one of {', '.join(ENVIRONMENTS)}")
-    return FlyTrack(**{**ENVIRONMENTS[env_id], **overrides})
+    variant = ENVIRONMENTS[env_id]
+    env: EpisodicEnvironment = FlyTrack(**{**variant.arguments, **overrides})
+    for wrapper in variant.wrappers:
+        if wrapper is DomainRandomization and hasattr(env.plant, "dt"):
+            continue
+        env = wrapper(env)
+    env.env_id = env_id
+    return env
 
 
 def register_all() -> None:

@@ -11,7 +11,7 @@ from flytrack_env.fusion import compute_once
 from flytrack_env.quaternion import Quaternion, Scalar, Vec3
 from flytrack_env.randomness import Draws
 from flytrack_env.state import BATTERY_FULL_V, Action, Drone
-from flytrack_env.tracks import Course
+from flytrack_env.tracks import Course, hermite_curve
 
 # The last part of the way is left out: from there the gate could not be reached any more.
 LAST_SEGMENT_FRACTION = 0.8
@@ -109,17 +109,7 @@ def _point_on_course(draws: Draws, gate_index: jax.Array, course: Course) -> tup
     length = chord.norm()
     leave, meet = before.forward.scale(length), gate.forward.scale(length)
     s = draws.uniform("along", 0.0, LAST_SEGMENT_FRACTION)
-    point = (
-        before.centre
-        + leave.scale(s * (1.0 - s) * (1.0 - s))
-        + chord.scale(s * s * (3.0 - 2.0 * s))
-        + meet.scale(s * s * (s - 1.0))
-    )
-    tangent = (
-        leave.scale((1.0 - s) * (1.0 - 3.0 * s))
-        + chord.scale(6.0 * s * (1.0 - s))
-        + meet.scale(s * (3.0 * s - 2.0))
-    )
+    point, tangent = hermite_curve(before.centre, leave, gate.centre, meet, s)
     point, tangent = compute_once((point, tangent))
     return point, compute_once(tangent.scale(1.0 / jnp.maximum(tangent.norm(), SHORTEST_TANGENT)))
 

@@ -138,7 +138,7 @@ def collect(plant: Plant, seed: int = 0) -> Excitation:
             next_state = plant.step(state, unpack_action(action), DT, model)
             return next_state, (pack(plant.drone(state)), pack(plant.drone(next_state)))
 
-        return jax.lax.scan(step, plant.reset(unpack(start)), command)[1]
+        return jax.lax.scan(step, plant.reset(unpack(start), model), command)[1]
 
     commands = commands.astype(np.float32)
     states, next_states = jax.jit(jax.vmap(fly))(jnp.asarray(starts, jnp.float32), commands)

@@ -8,6 +8,7 @@ from scipy import optimize, signal
 from scipy.spatial.transform import Rotation
 
 from flytrack_env.dynamics import ModelParameters, nominal_parameters
+from flytrack_env.effects import LinearDrag
 from flytrack_env.state import ACCELERATION, APPLIED_ACTION, BATTERY, QUATERNION, RATES, VELOCITY
 from flytrack_sysid.collect import DT, Excitation
 
@@ -92,7 +93,7 @@ def fit(data: Excitation, start: ModelParameters | None = None, with_drag: bool 
     rate_fits = [_fit_rate(data, axis, float(given.max_rate[axis])) for axis in range(3)]
     force_b = specific_force_b(data, given.g)
     vel_b = to_body(data, data.states[..., VELOCITY].astype(float))
-    linear_drag = np.asarray(given.linear_drag, float)
+    linear_drag = np.array(given.effect("linear_drag"), float)
     if with_drag:
         if np.any(np.mean(vel_b**2, axis=(0, 1)) < SLOWEST**2):
             raise FitError("velocity: the drone hardly moves along some axis; drag cannot be identified")
@@ -106,8 +107,9 @@ def fit(data: Excitation, start: ModelParameters | None = None, with_drag: bool 
     model = given._replace(
         tau=np.array([*(tau for tau, _ in rate_fits), tau], np.float32),
         thrust_coeffs=coefficients[:6].astype(np.float32),
-        linear_drag=linear_drag.astype(np.float32),
     )
+    if with_drag:
+        model = model.with_effects(LinearDrag(*map(float, linear_drag)))
     return Fit(model, (rate_fits[0][1], rate_fits[1][1], rate_fits[2][1], rms))
 
 

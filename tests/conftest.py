@@ -23,7 +23,7 @@ FACING_X = (0.5**0.5, 0.0, 0.0, -(0.5**0.5))  # yaw -90 degrees: the gate's loca
 class Coasting:
     """A plant that flies straight on at constant velocity, whatever the command."""
 
-    def reset(self, drone: Drone) -> Drone:
+    def reset(self, drone: Drone, model: ModelParameters) -> Drone:
         """Return the drone."""
         return drone
 
@@ -56,7 +56,7 @@ class Railway:
         legs = np.linalg.norm(np.roll(self.corners, -1, axis=0) - self.corners, axis=1)
         return np.concatenate([[0.0], np.cumsum(legs)])
 
-    def reset(self, drone: Drone) -> OnRails:
+    def reset(self, drone: Drone, model: ModelParameters) -> OnRails:
         """Return the state at the corner nearest to the drone."""
         pos_w = jnp.stack([jnp.asarray(value) for value in drone.pos_w])
         nearest = jnp.argmin(jnp.linalg.norm(jnp.asarray(self.corners) - pos_w, axis=1))

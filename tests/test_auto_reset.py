@@ -48,13 +48,13 @@ def test_gradient_flows_through_what_did_not_end():
 class Remembering(Simulator):
     """A plant whose state has an array beside the drone: the last three commanded thrusts."""
 
-    def reset(self, drone):
+    def reset(self, drone, model):
         return drone, jnp.zeros(3)
 
     def step(self, state, command, dt, model):
         drone, memory = state
         memory = jnp.append(memory[1:], command.thrust)
-        return advance(drone, command, dt, model), memory
+        return advance(drone, (), command, dt, model)[0], memory
 
     def drone(self, state):
         return state[0]

@@ -19,7 +19,7 @@ import flytrack_env
 from blackbox import acro_step_runtime, plant
 from blackbox.build import build, main
 from blackbox.plant import PlantParameters
-from flytrack_env import blackbox
+from flytrack_env import blackbox, nominal_parameters
 from flytrack_env.blackbox import BlackBox, BlackBoxError, load
 from flytrack_env.dynamics import ModelParameters
 from flytrack_env.dynamics import step as model_step
@@ -450,7 +450,7 @@ def test_many_drones_fly_in_one_loop(shipped):
 def test_plant_protocol(shipped, fly):
     x, u = (rows[0] for rows in random_inputs(1))
     command = unpack_action(jnp.asarray(u))
-    state = shipped.reset(unpack(jnp.asarray(x)))
+    state = shipped.reset(unpack(jnp.asarray(x)), nominal_parameters())
     after = shipped.drone(shipped.step(state, command, blackbox.DT, None))
     np.testing.assert_allclose(jnp.stack(jax.tree.leaves(after)), fly(x, u), rtol=1e-6, atol=1e-6)
     with pytest.raises(ValueError, match=r"dt: found 0\.02 s, expected 0\.01 s"):
@@ -511,6 +511,6 @@ def test_environment_flies_the_black_box(shipped, fly):
 
 
 def test_command_leaves_may_be_python_numbers(shipped):
-    state = shipped.reset(unpack(blackbox.start_vector()))
+    state = shipped.reset(unpack(blackbox.start_vector()), nominal_parameters())
     after = shipped.step(state, Action(0, 0, 0, -1), 0.01, None)
     assert after.pos_w.z.dtype == jnp.float32

@@ -144,7 +144,7 @@ def test_info_belongs_to_the_step_not_to_the_reset(env: FlyTrack, params: EnvPar
     assert (np.asarray(info["gates_passed"]) >= np.asarray(before.race.gates_passed)).all()
     assert (np.asarray(info["gates_passed"])[done] > 0).any()
     centre = np.stack([np.asarray(x)[~done] for x in states.race.gate.centre])
-    position = np.stack([np.asarray(x)[~done] for x in states.plant.pos_w])
+    position = np.stack([np.asarray(x)[~done] for x in env.drone(states).pos_w])
     distance = np.linalg.norm(position - centre, axis=0)
     np.testing.assert_allclose(np.asarray(info["gate_distance_m"])[~done], distance, atol=1e-4)
 
@@ -178,7 +178,7 @@ def test_parameters_can_differ_between_environments(
     )
     same = jax.tree.map(lambda leaf: jnp.stack([leaf[0]] * 3), states)
     step = jax.jit(jax.vmap(env.step_env, in_axes=(None, 0, None, axes)))
-    after = step(None, same, jnp.zeros(4), batched)[1].plant
+    after = env.drone(step(None, same, jnp.zeros(4), batched)[1])
     weightless = np.stack([np.asarray(after.acc_w.x), np.asarray(after.acc_w.y)])
     np.testing.assert_allclose(weightless * np.asarray(masses), weightless[:, 1:2].repeat(3, 1), rtol=1e-4)
 
@@ -298,10 +298,10 @@ def test_batch_step_ends_the_same_episodes_and_resets_them_apart(
     race = state.race
     for leaf in (state.time, race.gates_passed, race.laps, race.lap_start_s, race.lap_time_s):
         assert not np.asarray(leaf)[done].any()
-    starts = np.stack([np.asarray(leaf)[done] for leaf in state.plant.pos_w], -1)
+    starts = np.stack([np.asarray(leaf)[done] for leaf in env.drone(state).pos_w], -1)
     assert len(np.unique(starts, axis=0)) == done.sum()
     other = env.step_batch(jax.random.key(9), states, actions, params)[1]
-    assert (np.asarray(other.plant.pos_w.x) != np.asarray(state.plant.pos_w.x))[done].all()
+    assert (np.asarray(env.drone(other).pos_w.x) != np.asarray(env.drone(state).pos_w.x))[done].all()
     expected = jax.jit(jax.vmap(env.observe, in_axes=(None, 0, None, None)))(None, state, None, params)
     np.testing.assert_allclose(observation, expected, atol=1e-6)
 
@@ -504,7 +504,8 @@ def differentiable(env: FlyTrack, state: EnvState, params: EnvParams) -> Callabl
 
     @jax.jit
     def scalar(action: jax.Array, speed: jax.Array) -> jax.Array:
-        plant = state.plant._replace(vel_w=state.plant.vel_w._replace(y=speed))
+        drone = env.drone(state)
+        plant = state.plant._replace(drone=drone._replace(vel_w=drone.vel_w._replace(y=speed)))
         observation, after, *_ = env.step_env(None, state._replace(plant=plant), action, params)
         return jnp.sum(observation**2) + sum(leaf**2 for leaf in jax.tree.leaves(after.plant))
 

@@ -294,7 +294,7 @@ def test_after_flying_on_the_same_gate_can_be_flown(
     legs = [((3.0, 2.0), 0), ((1.0, 3.0), 0), ((1.0, 0.0), 0), ((3.0, 0.0), 1), ((1.0, 0.0), 1)]
     state = env.begin(make_drone((1.0, 2.0, 2.0)), 0, params)
     for (x, y), passed in legs:
-        pos_w = state.plant.pos_w
+        pos_w = env.drone(state).pos_w
         velocity = pos_w._replace(x=x - pos_w.x, y=y - pos_w.y, z=jnp.float32(0.0))
         state = state._replace(plant=state.plant._replace(vel_w=velocity))
         state, _, causes, _ = step(state, jnp.zeros(4), params)

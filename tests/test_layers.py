@@ -27,6 +27,7 @@ LAYERS = (
     {"plants"},
     {"race", "resets", "observations", "rewards", "terminations", "model_file"},
     {"params"},
+    {"episodes"},
     {"env"},
     {"wrappers", "blackbox", "rollout", "rendering"},
     {"registration", "viz_rerun"},

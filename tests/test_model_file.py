@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from flytrack_env.dynamics import ModelParameters, nominal_parameters
+from flytrack_env.effects import CommandDelay, LinearDrag, QuadraticDrag
 from flytrack_env.env import FlyTrack
 from flytrack_env.model_file import ModelFileError, load_model, save_model
 
@@ -29,8 +30,10 @@ FIELDS = json.loads(MINIMAL)
 
 def assert_same_model(a: ModelParameters, b: ModelParameters) -> None:
     """Compare two models field by field."""
-    for name in ModelParameters._fields:
+    for name in FIELDS:
         np.testing.assert_array_equal(getattr(a, name), getattr(b, name), err_msg=name)
+    assert [type(parameters) for parameters in a.effects] == [type(parameters) for parameters in b.effects]
+    np.testing.assert_array_equal(np.concatenate([(), *a.effects]), np.concatenate([(), *b.effects]))
 
 
 @pytest.mark.parametrize(
@@ -38,6 +41,7 @@ def assert_same_model(a: ModelParameters, b: ModelParameters) -> None:
     [
         nominal_parameters(),
         nominal_parameters()._replace(m=0.1, g=1.62, battery_drain_v_per_min=0.0),
+        nominal_parameters().with_effects(CommandDelay(0.013), LinearDrag(0.1, 0.2, -0.05)),
         nominal_parameters()._replace(thrust_coeffs=np.float32([0.1, -0.2, 1 / 3, 1e-7, 1e5, 0])),
     ],
 )
@@ -49,7 +53,8 @@ def test_round_trip(model: ModelParameters, tmp_path: Path) -> None:
     assert_same_model(load_model(str(path)), model)
     document = json.loads(path.read_text(encoding="utf-8"))
     assert document["provenance"] == provenance
-    assert set(document["units"]) == set(document["parameters"]) == set(ModelParameters._fields)
+    assert set(document["parameters"]) | {"effects"} == set(ModelParameters._fields)
+    assert set(document["units"]) == set(document["parameters"]) | set(document["effects"])
 
 
 def test_minimal_file_by_hand(tmp_path: Path) -> None:
@@ -84,6 +89,31 @@ BAD_TEXTS = {
     "unknown field": (json.dumps({**FIELDS, "mass": 1}), "mass: unknown; expected tau, "),
     "huge integer": (MINIMAL.replace('"m": 1,', f'"m": 1{400 * "0"},'), "m: found 1"),
     "too many digits": (MINIMAL.replace('"m": 1,', f'"m": 1{5000 * "0"},'), "not a JSON file"),
+    "effects as list": (json.dumps({**FIELDS, "effects": [1]}), r"effects: found \[1\], expected an object"),
+    "unknown effect": (
+        json.dumps({**FIELDS, "effects": {"drag": {}}}),
+        "effects: drag: unknown; expected of comm",
+    ),
+    "effect as number": (
+        json.dumps({**FIELDS, "effects": {"wind": 3}}),
+        "effects: wind: found 3, expected an obj",
+    ),
+    "unknown parameter": (
+        json.dumps({**FIELDS, "effects": {"wind": {"speed": 3}}}),
+        "effects: wind: speed: unknown; expected of v_x, ",
+    ),
+    "parameter as text": (
+        json.dumps({**FIELDS, "effects": {"wind": {"v_x": "3"}}}),
+        "effects: wind: v_x: found '3', expected -20 to 20 m/s",
+    ),
+    "parameter out of range": (
+        json.dumps({**FIELDS, "effects": {"command_delay": {"delay_s": 0.05}}}),
+        "effects: command_delay: delay_s: found 0.05, expected 0 to 0.04 s",
+    ),
+    "parameter not a number": (
+        json.dumps({**FIELDS, "effects": {"wind": {"v_x": float("nan")}}}),
+        "effects: wind: v_x: found nan, expected -20 to 20 m/s",
+    ),
     "beyond float32": (MINIMAL.replace("[0.03", "[1e39"), "tau: found "),
 }
 
@@ -97,13 +127,18 @@ def test_bad_files_are_refused(case: str, tmp_path: Path) -> None:
         load_model(path)
 
 
-def test_drag_may_be_absent_and_is_then_none(tmp_path: Path) -> None:
+def test_effects_by_hand_beside_or_among_the_parameters(tmp_path: Path) -> None:
     path = tmp_path / "model.json"
-    path.write_text(json.dumps(without("linear_drag")), encoding="utf-8")
-    np.testing.assert_array_equal(load_model(path).linear_drag, 0.0)
+    some = {"quadratic_drag": {"k_x": 0.1}, "command_delay": {"delay_s": 0.02}}
+    for document in ({**FIELDS, "effects": some}, {"parameters": FIELDS, "effects": some}):
+        path.write_text(json.dumps(document), encoding="utf-8")
+        # In the order of the list of effects, whatever the file's; neutral where the file says nothing.
+        assert load_model(path).effects == (CommandDelay(0.02), QuadraticDrag(0.1, 0.0, 0.0))
+    path.write_text(MINIMAL, encoding="utf-8")
+    assert load_model(path).effects == ()
 
 
-@pytest.mark.parametrize("name", sorted(set(ModelParameters._fields) - {"linear_drag"}))
+@pytest.mark.parametrize("name", sorted(FIELDS))
 def test_missing_fields_are_named(name: str, tmp_path: Path) -> None:
     path = tmp_path / "model.json"
     path.write_text(json.dumps(without(name)), encoding="utf-8")

@@ -4,6 +4,7 @@ import jax
 import pytest
 
 from flytrack_env import FlyTrack
+from flytrack_env.effects import CommandDelay
 from flytrack_env.plants import Simulator
 
 PARAMS = FlyTrack().default_params
@@ -48,3 +49,13 @@ def test_reset_refuses_another_step_than_the_plant_has():
     with pytest.raises(ValueError, match=r"dt: found 0\.01 s, expected 0\.02 s"):
         env.reset(jax.random.key(0), PARAMS)
     env.reset(jax.random.key(0), PARAMS.replace(dt=0.02))
+
+
+@pytest.mark.parametrize("delay_s", [-0.01, 0.05, float("nan")])
+def test_effects_outside_their_range(delay_s):
+    model = PARAMS.model.with_effects(CommandDelay(delay_s))
+    with pytest.raises(
+        ValueError, match=r"model\.effects: command_delay\.delay_s: found .*, expected 0 to 0"
+    ):
+        PARAMS.replace(model=model).check()
+    PARAMS.replace(model=PARAMS.model.with_effects(CommandDelay(0.02))).check()

@@ -1,6 +1,7 @@
 """Registration with gymnax: ids, overrides, and importing the package more than once."""
 
 import importlib
+from typing import Any
 
 import gymnax
 import jax
@@ -9,6 +10,7 @@ from gymnax.registration import registered_envs
 
 import flytrack_env
 from flytrack_env.registration import ENVIRONMENTS, make, register_all
+from flytrack_env.wrappers import DomainRandomization, layers_of
 
 
 @pytest.mark.parametrize("env_id", sorted(ENVIRONMENTS))
@@ -45,6 +47,17 @@ def test_overrides_reach_the_environment() -> None:
     assert gymnax.make("FlyTrack-v0", missed_gate="fly_on")[0].missed_gate == "fly_on"
     with pytest.raises(ValueError, match="missed_gate"):
         gymnax.make("FlyTrack-v0", missed_gate="sometimes")
+
+
+@pytest.mark.parametrize("env_id", sorted(ENVIRONMENTS))
+def test_every_id_takes_a_plant_with_its_parameters_baked_in(env_id: str, coasting: Any) -> None:
+    class Baked(type(coasting)):
+        dt = 0.01
+
+    env = make(env_id, plant=Baked())
+    assert env.name == env_id
+    assert env.observation_space().shape == make(env_id).observation_space().shape
+    assert not any(isinstance(layer, DomainRandomization) for layer in layers_of(env))
 
 
 def test_unknown_ids_are_refused() -> None:

@@ -30,7 +30,7 @@ def sample(params: EnvParams, reset_many: Any) -> Sample:
         keys = jax.random.split(jax.random.key(0), NUM_STARTS)
         _, state = reset_many(keys, params.replace(reset=ResetParams(**fields)))
         assert not np.asarray(state.time).any()
-        return np.asarray(jax.vmap(pack)(state.plant), float), np.asarray(state.race.gate_index)
+        return np.asarray(jax.vmap(pack)(state.plant.drone), float), np.asarray(state.race.gate_index)
 
     return draw
 
@@ -229,7 +229,7 @@ def test_starts_of_other_tracks_are_on_them(coasting_envs: Any, row_track: Any, 
     keys = jax.random.split(jax.random.key(1), 256)
     _, state = jax.jit(jax.vmap(env.reset, in_axes=(0, None)))(keys, env.default_params)
     assert set(np.asarray(state.race.gate_index)) == {0, 1, 2}
-    assert (np.abs(np.asarray(state.plant.pos_w.y)) <= 1.0 + 1e-5).all()
+    assert (np.abs(np.asarray(env.drone(state).pos_w.y)) <= 1.0 + 1e-5).all()
 
 
 # --- Randomness ---------------------------------------------------------------------------------

@@ -5,7 +5,6 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from flytrack_env.dynamics import advance, collective_thrust, nominal_parameters
-from flytrack_env.plants import Simulator
 from flytrack_env.state import BATTERY_EMPTY_V, BATTERY_FULL_V
 from flytrack_sysid import Excitation, FitError, collect, fit, validate
 from flytrack_sysid.fit import lagged, specific_force_b, thrust_terms
@@ -16,18 +15,24 @@ TRUTH = nominal_parameters()._replace(
 )
 
 
-class Truth(Simulator):
+class Truth:
     """A plant of the minimal structure with parameters that the tools are not told."""
 
+    def reset(self, drone, model):
+        return drone
+
     def step(self, state, command, dt, model):
-        return advance(state, command, dt, TRUTH)
+        return advance(state, (), command, dt, TRUTH)[0]
+
+    def drone(self, state):
+        return state
 
 
 class Dragging(Truth):
     """The same with linear drag in the world frame, 0.2 1/s."""
 
     def step(self, state, command, dt, model):
-        after = advance(state, command, dt, TRUTH)
+        after = advance(state, (), command, dt, TRUTH)[0]
         drag_w = state.vel_w.scale(-0.2)
         return after._replace(
             acc_w=after.acc_w + drag_w,
@@ -68,9 +73,9 @@ def test_split_holds_out_every_kind_and_shares_nothing(data):
 
 def test_identifies_minimal_plant_to_rounding(data):
     training, held_out = data.split()
-    np.testing.assert_allclose(fit(training, with_drag=True).model.linear_drag, 0.0, atol=1e-5)
+    np.testing.assert_allclose(fit(training, with_drag=True).model.effect("linear_drag"), 0.0, atol=1e-5)
     identified = fit(training)
-    assert not np.any(identified.model.linear_drag)
+    assert identified.model.effects == ()
     np.testing.assert_allclose(identified.model.tau, TRUTH.tau, rtol=1e-4)
     action, battery_v = np.meshgrid(np.linspace(-1, 1, 21), np.linspace(22, 24, 9))
     found = collective_thrust(action, battery_v, identified.model.thrust_coeffs)
@@ -90,7 +95,7 @@ def test_drag_stays_open_and_grows_with_speed():
     low, high, rms = validation.open_force_by_speed[-1]
     assert 0.2 * low * 0.5 < rms < 0.2 * high
     extended = fit(training, with_drag=True).model
-    np.testing.assert_allclose(extended.linear_drag, 0.2, rtol=1e-3)
+    np.testing.assert_allclose(extended.effect("linear_drag"), 0.2, rtol=1e-3)
     np.testing.assert_allclose(extended.tau, TRUTH.tau, rtol=1e-3)
     assert max(validate(extended, held_out).open_force) < 1e-2
 

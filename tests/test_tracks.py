@@ -1,16 +1,35 @@
-"""The shipped course against the handout's table, and everything the loader refuses."""
+"""The shipped courses, the FlyTrack one against the handout's table, and everything the loader refuses."""
 
 import math
 import re
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
+import gymnax
+import jax
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from PIL import Image
 
-from flytrack_env.tracks import Gate, Track, TrackError, available_tracks, build_course, load_track
+from docs.draw_tracks import digest, draw_track, drawn_tracks
+from flytrack_env.tracks import (
+    DEMANDS,
+    Gate,
+    Limits,
+    Track,
+    TrackError,
+    available_tracks,
+    build_course,
+    load_track,
+    save_track,
+    way_length,
+)
+
+DOCS = Path(__file__).parent.parent / "docs"
 
 HANDOUT_ROWS = np.array(
     [
@@ -77,8 +96,9 @@ def test_shipped_directions() -> None:
     assert directions == {i: -1.0 if i in MINUS_Y_IDS else 1.0 for i in directions}
 
 
-def test_directions_lead_to_the_next_gate() -> None:
-    gates = load_track("flytrack").gates
+@pytest.mark.parametrize("name", ["flytrack", "figure_eight", "speedway"])
+def test_directions_lead_to_the_next_gate(name: str) -> None:
+    gates = load_track(name).gates
     for i, gate in enumerate(gates):
         psi = 2.0 * math.atan2(gate.quaternion[3], gate.quaternion[0])
         forward = gate.direction * np.array([-math.sin(psi), math.cos(psi)])
@@ -111,6 +131,62 @@ def test_course_has_the_flight_frames_of_the_track() -> None:
     np.testing.assert_allclose(np.stack(course.gates.centre).T, HANDOUT_ROWS[:, 1:4], rtol=1e-6)
     left = np.stack([-forward[1], forward[0], forward[2]])
     np.testing.assert_allclose(np.stack(course.gates.left()), left, atol=1e-5)
+
+
+def test_shipped_tracks_are_the_promised_ones_under_their_own_names() -> None:
+    assert available_tracks() == ("figure_eight", "flytrack", "speedway", "split_s")
+    assert all(load_track(name).name == name for name in available_tracks())
+
+
+def test_figure_eight_crosses_itself_and_turns_both_ways() -> None:
+    centres = load_track("figure_eight").rows()[:, 1:4]
+    legs = np.roll(centres, -1, axis=0) - centres
+    before, after = np.roll(legs, 1, axis=0), legs
+    turns = before[:, 0] * after[:, 1] - before[:, 1] * after[:, 0]
+    assert (turns > 0.0).any() and (turns < 0.0).any()
+    # Two legs lead through the middle: one from gate 3 to 4, the other one 2.5 m below, from gate 7 to 0.
+    for start, end, height in ((3, 4, 4.0), (7, 0, 1.5)):
+        np.testing.assert_allclose(0.5 * (centres[start] + centres[end]), [0.0, 0.0, height], atol=1e-9)
+
+
+def test_split_s_dives_through_the_gate_below_the_one_before() -> None:
+    track = load_track("split_s")
+    upper, lower = track.gates[2:4]
+    assert upper.position[:2] == lower.position[:2]
+    assert upper.position[2] - lower.position[2] == 6.0
+    gates = build_course(track).gates
+    ahead = np.stack(gates.forward, axis=-1)
+    np.testing.assert_allclose(ahead[2], [1.0, 0.0, 0.0], atol=1e-5)
+    np.testing.assert_allclose(ahead[3], -ahead[2], atol=1e-5)
+
+
+def test_speedway_is_large() -> None:
+    track, usual = load_track("speedway"), load_track("flytrack")
+    assert way_length(build_course(track)) > 3.0 * way_length(build_course(usual))
+    assert all(gate.opening == 2.5 and gate.frame == 4.5 for gate in track.gates)
+
+
+@pytest.mark.parametrize("name", available_tracks())
+def test_starts_face_the_first_gate(name: str) -> None:
+    track = load_track(name)
+    w, _, _, z = track.start_quaternion
+    way = np.subtract(track.gates[0].position, track.start_position)
+    off_deg = math.degrees(2.0 * math.atan2(z, w) - math.atan2(way[1], way[0]))
+    assert abs((off_deg + 180.0) % 360.0 - 180.0) < 1.0
+
+
+@pytest.mark.parametrize("name", available_tracks())
+def test_gymnax_makes_every_track_by_name_and_by_path(name: str, tmp_path: Path) -> None:
+    path = tmp_path / "my own.toml"
+    save_track(path, load_track(name))
+    for reference in (name, path, str(path)):
+        env, params = gymnax.make("FlyTrack-v0", track=reference)
+        assert env.track == load_track(name)
+        assert params.course.num_gates == len(env.track.gates)
+        key = jax.random.key(0)
+        observation, state = jax.eval_shape(env.reset, key, params)
+        action = jax.ShapeDtypeStruct((env.num_actions,), np.float32)
+        assert jax.eval_shape(env.step, key, state, action, params)[0].shape == observation.shape
 
 
 def test_valid_file_is_read(tmp_path: Path) -> None:
@@ -287,3 +363,137 @@ def test_valid_tracks_round_trip(
         assert getattr(read, name) == getattr(track, name)
     for a, b in zip(read.gates, track.gates, strict=True):
         assert (a.direction, a.opening, a.frame) == (b.direction, b.opening, b.frame)
+
+
+@settings(max_examples=100, deadline=None)
+@given(track=tracks(), name=st.text(min_size=1))
+def test_saved_tracks_are_read_back_equal(
+    track: Track, name: str, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    path = tmp_path_factory.getbasetemp() / "saved.toml"
+    try:
+        name.encode()
+    except UnicodeEncodeError:
+        name = "any"
+    track = replace(track, name=name)
+    save_track(path, track)
+    assert load_track(path) == track
+
+
+@pytest.mark.parametrize("name", available_tracks())
+def test_shipped_tracks_are_saved_and_read_back_equal(name: str, tmp_path: Path) -> None:
+    save_track(tmp_path / "copy.toml", load_track(name))
+    assert load_track(tmp_path / "copy.toml") == load_track(name)
+
+
+def first_gate_with(**fields: Any) -> Track:
+    """Return the FlyTrack course with other fields of its first gate."""
+    track = load_track("flytrack")
+    return replace(track, gates=(replace(track.gates[0], **fields), *track.gates[1:]))
+
+
+UNSAVEABLE = {
+    "nan": (
+        lambda: first_gate_with(position=(math.nan, 2.0, 1.35)),
+        "position: found nan, expected a finite",
+    ),
+    "long quaternion": (lambda: first_gate_with(quaternion=(1.0, 0.0, 0.0, 1.0)), "quaternion: found norm"),
+    "rounded quaternion": (
+        lambda: first_gate_with(quaternion=(0.7071, 0.0, 0.0, 0.7071)),
+        "gates: would not be read back",
+    ),
+    "list": (lambda: replace(load_track("flytrack"), bounds_low=[-2.5, -3.0, 0.0]), "bounds_low: would not"),
+    "direction": (lambda: first_gate_with(direction=0.5), "cannot be written: KeyError"),
+    "surrogate": (lambda: replace(load_track("flytrack"), name="\ud800"), "cannot be written: Unicode"),
+    "no name": (lambda: replace(load_track("flytrack"), name=""), "name: found '', expected a non-empty"),
+    "no track": (lambda: "flytrack", "cannot be written: AttributeError"),
+}
+
+
+@pytest.mark.parametrize("case", UNSAVEABLE)
+def test_what_would_not_come_back_is_not_saved(case: str, tmp_path: Path) -> None:
+    build, reason = UNSAVEABLE[case]
+    path = tmp_path / "saved.toml"
+    with pytest.raises(TrackError, match=rf"{re.escape(str(path))}.*{re.escape(reason)}"):
+        save_track(path, build())
+    assert not list(tmp_path.iterdir())
+
+
+def test_tracks_are_saved_under_a_name_that_can_be_loaded(tmp_path: Path) -> None:
+    with pytest.raises(TrackError, match=r"path: found '.*track.json', expected one that ends in .toml"):
+        save_track(tmp_path / "track.json", load_track("flytrack"))
+
+
+# --- Documentation ------------------------------------------------------------------------------
+
+
+def test_documented_table_is_that_of_the_files() -> None:
+    text = (DOCS / "tracks.md").read_text(encoding="utf-8")
+    rows = {cells[0].strip("` "): [cell.strip() for cell in cells[1:5]] for cells in table_rows(text)}
+    assert set(rows) == set(available_tracks())
+    for name, cells in rows.items():
+        track = load_track(name)
+        heights = [gate.position[2] for gate in track.gates]
+        assert cells == [
+            str(len(track.gates)),
+            f"{track.gates[0].opening:g}",
+            f"{way_length(build_course(track)):.1f}",
+            f"{min(heights):g} to {max(heights):g}",
+        ]
+
+
+def test_measured_tracks_are_the_shipped_ones_and_those_with_a_picture() -> None:
+    lines = (DOCS / "results" / "tracks.md").read_text(encoding="utf-8").splitlines()
+    cells = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines if line.startswith("|")]
+    measured = {row[0]: row[1:3] for row in cells[2:]}
+    expected = {
+        re.sub(r"random_(\d+)", r"random_track(\1)", name): [
+            str(len(track.gates)),
+            f"{way_length(build_course(track)):.1f}",
+        ]
+        for name, track in drawn_tracks().items()
+    }
+    assert measured == expected, "measure again: python -m benchmarks.tracks"
+
+
+def test_documented_limits_are_the_checks() -> None:
+    text = (DOCS / "tracks.md").read_text(encoding="utf-8")
+    table = text[text.index("| demand |") :]
+    rows = dict(re.findall(r"^\| ([a-z ]+) \| (.*) \|$", table, re.MULTILINE)[1:])
+    limits = Limits()
+    numbers = {
+        "opening": [f"{limits.min_opening:g} m"],
+        "spacing": [f"{limits.min_spacing:g} to {limits.max_spacing:g} m"],
+        "turn": [f"{limits.max_turn_deg:g} deg"],
+        "own gate": [],
+        "path": [f"{limits.clearance:g} m"],
+        "frames": [f"{limits.clearance:g} m"],
+        "bounds": [f"{limits.clearance:g} m"],
+        "ground": [],
+        "start": [
+            f"{limits.min_start_distance:g} to {limits.max_spacing:g} m",
+            f"{limits.max_start_turn_deg:g} deg",
+        ],
+    }
+    assert tuple(rows) == tuple(numbers) == DEMANDS
+    assert all(number in rows[demand] for demand in DEMANDS for number in numbers[demand])
+
+
+def table_rows(text: str) -> list[list[str]]:
+    """Return the cells of every row of the table of tracks: the rows that begin with a name in code."""
+    return [line.strip("|").split("|") for line in text.splitlines() if line.startswith("| `")]
+
+
+@pytest.mark.parametrize("name", drawn_tracks())
+def test_every_track_has_a_picture_of_itself_in_the_docs(name: str) -> None:
+    with Image.open(DOCS / "tracks" / f"{name}.png") as image:
+        assert image.text["Track"] == digest(drawn_tracks()[name]), "draw again: python -m docs.draw_tracks"
+        assert min(image.size) > 500
+    assert f"](tracks/{name}.png)" in (DOCS / "tracks.md").read_text(encoding="utf-8")
+
+
+def test_pictures_exist_of_shipped_tracks_and_can_be_drawn_of_any(tmp_path: Path) -> None:
+    assert set(available_tracks()) < set(drawn_tracks())
+    draw_track(tmp_path / "split_s.png", load_track("split_s"))
+    with Image.open(tmp_path / "split_s.png") as drawn, Image.open(DOCS / "tracks/split_s.png") as shipped:
+        assert drawn.size == shipped.size

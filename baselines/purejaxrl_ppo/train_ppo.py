@@ -14,6 +14,7 @@ import flytrack_env
 from baselines.purejaxrl_ppo.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
 from baselines.purejaxrl_ppo.config import Config
 from baselines.purejaxrl_ppo.ppo import make_train
+from flytrack_env.model_file import model_as_json
 
 MAX_SEED = 2**31
 
@@ -36,7 +37,13 @@ def progress_report(bar: tqdm, config: Config) -> Callable[[dict[str, Any]], Non
 
 
 def track_reference(track: str | Path) -> str:
-    """Return what finds a track from any folder: its name, or the absolute path of its file."""
+    """Return what finds a track from any folder: its name, or the absolute path of its file.
+
+    Raises:
+        ValueError: a ``Track``, which no checkpoint could name; save it to a file first.
+    """
+    if not isinstance(track, (str, Path)):
+        raise ValueError(f"track: found a {type(track).__name__}, expected a name or the path of a file")
     return str(Path(track).resolve()) if str(track).endswith(".toml") else str(track)
 
 
@@ -50,6 +57,7 @@ def train_policy(
     Raises:
         ValueError: settings, id, track or model that cannot be used, before any training.
     """
+    track = track_reference(env_arguments.get("track", "flytrack"))
     env = flytrack_env.make(env_id, **env_arguments)
     config.check()
     env.default_params.check()
@@ -66,16 +74,13 @@ def train_policy(
     path = out / "final.msgpack"
     description = {
         "env_id": env_id,
-        "track": track_reference(env_arguments.get("track", env.track.name)),
+        "track": track,
         "missed_gate": env.missed_gate,
         "observation_size": int(env.observation_space().shape[0]),
         "seed": seed,
         "steps": num_steps,
         "seconds": round(seconds, 1),
-        "model": {
-            name: np.asarray(value, float).tolist()
-            for name, value in env.default_params.model._asdict().items()
-        },
+        "model": model_as_json(env.default_params.model),
     }
     save_checkpoint(path, runner.train_state.params, config, description)
     return load_checkpoint(path), metrics

@@ -15,6 +15,8 @@ from flytrack_env.fusion import compute_once
 from flytrack_env.quaternion import Quaternion, Scalar, Vec3
 from flytrack_env.tracks.track import Track
 
+LENGTH_SAMPLES = 1000
+
 
 class GateFrame(NamedTuple):
     """Flight frame of one gate: centre and axes in the world, half edges in m.
@@ -149,3 +151,46 @@ def build_course(track: Track) -> Course:
         bounds_low=Vec3(*map(np.float32, track.bounds_low)),
         bounds_high=Vec3(*map(np.float32, track.bounds_high)),
     )
+
+
+def hermite_curve(start: Vec3, leave: Vec3, end: Vec3, meet: Vec3, s: Scalar) -> tuple[Vec3, Vec3]:
+    """Return point and tangent, m, at ``s`` in [0, 1] of the cubic curve from ``start`` to ``end``.
+
+    It leaves with the tangent ``leave`` and meets the end with the tangent ``meet``, m. Cubic Hermite
+    interpolation; numpy arrays stay numpy arrays.
+    """
+    chord = end - start
+    point = (
+        start
+        + leave.scale(s * (1.0 - s) * (1.0 - s))
+        + chord.scale(s * s * (3.0 - 2.0 * s))
+        + meet.scale(s * s * (s - 1.0))
+    )
+    tangent = (
+        leave.scale((1.0 - s) * (1.0 - 3.0 * s))
+        + chord.scale(6.0 * s * (1.0 - s))
+        + meet.scale(s * (3.0 * s - 2.0))
+    )
+    return point, tangent
+
+
+def sample_way(course: Course, num_samples: int) -> np.ndarray:
+    """Return points of the way round a course, (num_gates, num_samples, 3), world, m, float64.
+
+    Row n leads from gate n to the gate after it, both ends included, on the curve along which episodes
+    start in flight (``flytrack_env.resets``): it leaves and meets the gates along their directions of
+    flight, with tangents as long as the gates are apart.
+    """
+    before = jax.tree.map(lambda leaf: np.asarray(leaf, float)[:, None], course.gates)
+    gate = jax.tree.map(lambda leaf: np.roll(leaf, -1, axis=0), before)
+    chord = gate.centre - before.centre
+    length = np.sqrt(chord.dot(chord))
+    leave, meet = before.forward.scale(length), gate.forward.scale(length)
+    s = np.linspace(0.0, 1.0, num_samples)
+    return np.stack(hermite_curve(before.centre, leave, gate.centre, meet, s)[0], axis=-1)
+
+
+def way_length(course: Course) -> float:
+    """Return the length of the way of ``sample_way`` round a course, m, within a millimetre per gate."""
+    way = sample_way(course, LENGTH_SAMPLES)
+    return float(np.linalg.norm(np.diff(way, axis=1), axis=-1).sum())

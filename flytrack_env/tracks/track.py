@@ -4,26 +4,30 @@ A track file has a ``name``, a ``[start]`` (position, quaternion), ``[bounds]`` 
 ``[[gates]]`` table per gate, in flying order; ``flytrack.toml`` beside this file is the example.
 """
 
+import dataclasses
+import json
 import math
 import re
 import tomllib
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from flytrack_env.files import write_atomically
+
 TRACK_FOLDER = Path(__file__).parent
 DIRECTIONS = {"+y": 1.0, "-y": -1.0}
 UNIT_NORM_TOLERANCE = 1e-3
+ROUNDING = 1e-12  # of a norm: a quaternion that is this close to a unit was not rounded for a file
 LARGEST = 1e6  # m: beyond that, float32 positions are coarser than a drone
 
 
 class TrackError(ValueError):
-    """A track file that cannot be flown; the message names file, line, field and reason."""
+    """A track that cannot be flown; the message names file, line, field and reason."""
 
 
-@dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True)
 class Gate:
     """One square gate; position in m, quaternion (w, x, y, z) gate to world, edges in m.
 
@@ -39,7 +43,7 @@ class Gate:
     frame: float
 
 
-@dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True)
 class Track:
     """A course: gates in flying order (laps repeat), start pose and bounds; SI units, world frame."""
 
@@ -79,6 +83,68 @@ def load_track(name_or_path: str | Path) -> Track:
         text = path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
         raise TrackError(f"{path}: cannot be read: {error}") from error
+    return _parse(path, text)
+
+
+def save_track(path: str | Path, track: Track) -> None:
+    """Write a track as a ``.toml`` file from which ``load_track`` returns an equal track.
+
+    Raises:
+        TrackError: a path without ``.toml``, or a track that would not come back as it is: values that no
+            track file may have, quaternions that are not units.
+        OSError: what the system says.
+    """
+    path = Path(path)
+    if path.suffix != ".toml":
+        raise TrackError(f"path: found {str(path)!r}, expected one that ends in .toml")
+    try:
+        text = _write(track)
+        content = text.encode()
+    except (AttributeError, KeyError, TypeError, UnicodeEncodeError) as error:
+        raise TrackError(f"{path}: the track cannot be written: {error!r}") from error
+    read = _parse(path, text)
+    names = [field.name for field in dataclasses.fields(Track)]
+    changed = [name for name in names if getattr(read, name) != getattr(track, name)]
+    if changed:
+        raise TrackError(
+            f"{path}: {', '.join(changed)}: would not be read back as written, expected tuples of floats "
+            "and unit quaternions"
+        )
+    write_atomically(path, content)
+
+
+def _write(track: Track) -> str:
+    """Return the text of a track file."""
+    signs = {sign: name for name, sign in DIRECTIONS.items()}
+    # JSON strings are TOML's basic strings, but for the one control character that JSON lets stand.
+    name = json.dumps(track.name, ensure_ascii=False).replace("\x7f", "\\u007f")
+    lines = [
+        f"name = {name}",
+        "",
+        "[start]",
+        f"position = {list(track.start_position)}",
+        f"quaternion = {list(track.start_quaternion)}",
+        "",
+        "[bounds]",
+        f"low = {list(track.bounds_low)}",
+        f"high = {list(track.bounds_high)}",
+    ]
+    for gate in track.gates:
+        lines += [
+            "",
+            "[[gates]]",
+            f"id = {gate.id}",
+            f"position = {list(gate.position)}",
+            f"quaternion = {list(gate.quaternion)}",
+            f'direction = "{signs[gate.direction]}"',
+            f"opening = {gate.opening}",
+            f"frame = {gate.frame}",
+        ]
+    return "\n".join(lines) + "\n"
+
+
+def _parse(path: Path, text: str) -> Track:
+    """Return the checked track of a file's text; raises TrackError."""
     try:
         data = tomllib.loads(text)
     except (ValueError, RecursionError) as error:  # TOMLDecodeError, endless digits, endless nesting
@@ -136,12 +202,12 @@ class _Reader:
         return tuple(float(number) for number in value)
 
     def quaternion(self, data: dict[str, Any], header: str, index: int) -> tuple[Any, ...]:
-        """Return a unit quaternion, renormalised from its rounded digits."""
+        """Return a unit quaternion, renormalised if its digits were rounded."""
         value = self.numbers(data, header, index, "quaternion", 4)
         norm = math.sqrt(sum(q * q for q in value))
         if abs(norm - 1.0) > UNIT_NORM_TOLERANCE:
             raise self.fail(header, index, "quaternion", f"found norm {norm:.6g}, expected 1")
-        return tuple(q / norm for q in value)
+        return value if abs(norm - 1.0) <= ROUNDING else tuple(q / norm for q in value)
 
     def gate(self, data: dict[str, Any], index: int) -> Gate:
         """Return one checked gate."""

@@ -1,0 +1,101 @@
+"""Effects beyond the minimal model: the one explicit, ordered list, and how a model uses it.
+
+The simulator folds them, the fit and the diagnosis free their parameters, domain randomisation draws
+them, the documentation lists them. A new effect is a file here and a line in ``EFFECTS``.
+"""
+
+from typing import Any
+
+from flytrack_env.effects.base import STAGES, Effect, Flight, Range
+from flytrack_env.effects.command_delay import COMMAND_DELAY, CommandDelay
+from flytrack_env.effects.linear_drag import LINEAR_DRAG, LinearDrag
+from flytrack_env.effects.quadratic_drag import QUADRATIC_DRAG, QuadraticDrag
+from flytrack_env.effects.rate_scale import RATE_SCALE, RateScale
+from flytrack_env.effects.rotor_drag import ROTOR_DRAG, RotorDrag
+from flytrack_env.effects.thrust_scale import THRUST_SCALE, ThrustScale
+from flytrack_env.effects.wind import WIND, Wind
+from flytrack_env.state import Drone
+
+# The order in which effects of one stage are folded, and that of a model's effects.
+EFFECTS: tuple[Effect, ...] = (
+    COMMAND_DELAY,
+    RATE_SCALE,
+    THRUST_SCALE,
+    WIND,
+    LINEAR_DRAG,
+    QUADRATIC_DRAG,
+    ROTOR_DRAG,
+)
+BY_NAME = {effect.name: effect for effect in EFFECTS}
+_BY_CLASS = {effect.parameters: effect for effect in EFFECTS}
+
+
+def effect_of(parameters: Any) -> Effect:
+    """Return the effect that parameters belong to.
+
+    Raises:
+        TypeError: not the parameters of an effect.
+    """
+    effect = _BY_CLASS.get(type(parameters))
+    if effect is None:
+        names = ", ".join(effect.parameters.__name__ for effect in EFFECTS)
+        raise TypeError(f"effect: found {type(parameters).__name__}, expected one of {names}")
+    return effect
+
+
+def merge(present: tuple[Any, ...], *added: Any) -> tuple[Any, ...]:
+    """Return parameters of effects in the order of ``EFFECTS``; what is added replaces its like."""
+    by_name = {effect_of(parameters).name: parameters for parameters in (*present, *added)}
+    return tuple(by_name[effect.name] for effect in EFFECTS if effect.name in by_name)
+
+
+def start_memories(effects: tuple[Any, ...], drone: Drone) -> tuple[Any, ...]:
+    """Return what the effects of a model remember when an episode begins; None for most."""
+    starts = ((effect_of(parameters).start, parameters) for parameters in effects)
+    return tuple(start(parameters, drone) if start else None for start, parameters in starts)
+
+
+def acts(effects: tuple[Any, ...], stage: str) -> bool:
+    """Return whether any effect of a model acts at a stage (static)."""
+    return any(stage in effect_of(parameters).stages for parameters in effects)
+
+
+def fold(stage: str, effects: tuple[Any, ...], memories: tuple[Any, ...], value: Any, flight: Flight) -> Any:
+    """Return a stage's value after all effects of a model that act there, in order."""
+    for parameters, memory in zip(effects, memories, strict=True):
+        hook = getattr(effect_of(parameters), stage)
+        if hook is not None:
+            value = hook(parameters, memory, value, flight)
+    return value
+
+
+def remember(effects: tuple[Any, ...], memories: tuple[Any, ...], flight: Flight) -> tuple[Any, ...]:
+    """Return what the effects of a model remember after a step."""
+    updates = ((effect_of(parameters).remember, parameters) for parameters in effects)
+    pairs = zip(updates, memories, strict=True)
+    return tuple(
+        update(parameters, memory, flight) if update else memory for (update, parameters), memory in pairs
+    )
+
+
+__all__ = [
+    "BY_NAME",
+    "EFFECTS",
+    "STAGES",
+    "CommandDelay",
+    "Effect",
+    "Flight",
+    "LinearDrag",
+    "QuadraticDrag",
+    "Range",
+    "RateScale",
+    "RotorDrag",
+    "ThrustScale",
+    "Wind",
+    "acts",
+    "effect_of",
+    "fold",
+    "merge",
+    "remember",
+    "start_memories",
+]

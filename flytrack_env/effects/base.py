@@ -1,0 +1,100 @@
+"""What an effect is: something that the minimal model leaves out, in one file.
+
+A file of this folder has a ``NamedTuple`` of parameters (numbers in SI units unless its range says
+otherwise, each with its **neutral** value as default) and one ``Effect`` that says how they act. A model
+carries the parameters of the effects that it has; the simulator folds them, in the order of
+``flytrack_env.effects.EFFECTS``, at the stages of a step:
+
+=========  =====================  =====================================================  ============
+stage      value                  what it is                                             acts on
+=========  =====================  =====================================================  ============
+command    ``Action``             the command that the rate loop and motors get          command
+rates      ``Vec3``, rad/s        body rates of the lagged action                        actuator
+thrust     scalar, N              collective thrust along body z                         actuator
+air        ``Vec3``, m/s, world   velocity of the air                                    force
+force      ``Vec3``, m/s^2, body  specific force beside thrust; starts at 0              force
+=========  =====================  =====================================================  ============
+
+A hook takes the effect's parameters, its memory, the value so far and the ``Flight``, and returns the
+value. At neutral parameters it returns the value bit for bit, so that neutral equals absent.
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+from flytrack_env.quaternion import Scalar, Vec3
+from flytrack_env.state import Action, Drone
+
+# The stages in the order in which a step passes them, and where an effect that hooks in there acts.
+STAGES = {"command": "command", "rates": "actuator", "thrust": "actuator", "air": "force", "force": "force"}
+
+
+class Flight(NamedTuple):
+    """What an effect may look at; what later stages find out is None before them.
+
+    drone: before the step. command: as given, before any effect. dt: s.
+    applied: the lagged action after the step. body_axes_w: the body's x, y, z axes before the step.
+    thrust_acc: collective thrust over mass, after the stage thrust, m/s^2. air_w: m/s.
+    """
+
+    drone: Drone
+    command: Action
+    dt: Scalar
+    applied: Action | None = None
+    body_axes_w: tuple[Vec3, Vec3, Vec3] | None = None
+    thrust_acc: Scalar | None = None
+    air_w: Vec3 | None = None
+
+    def airspeed_b(self) -> Vec3:
+        """Return the velocity through the air, body frame, m/s; from the stage force on."""
+        airspeed_w = self.drone.vel_w - self.air_w
+        return Vec3(*(axis.dot(airspeed_w) for axis in self.body_axes_w))
+
+
+class Range(NamedTuple):
+    """Where a parameter may lie, and its unit: a bound for files, fits and randomisation.
+
+    Both signs where the equation has them, so that a log that says the opposite of physics can say so.
+    """
+
+    low: float
+    high: float
+    unit: str
+
+
+Hook = Callable[[Any, Any, Any, Flight], Any]
+
+
+@dataclass(frozen=True)
+class Effect:
+    """One effect; at least one hook is given.
+
+    name: as in model files. parameters: the NamedTuple class; its defaults are neutral. ranges: of each
+    parameter. equation, source: for people. command, rates, thrust, air, force: hooks at these stages.
+    start: (parameters, drone) -> memory of an episode that begins; no memory if None.
+    remember: (parameters, memory, flight) -> memory after a step.
+    """
+
+    name: str
+    parameters: Any
+    ranges: Mapping[str, Range]
+    equation: str
+    source: str
+    command: Hook | None = None
+    rates: Hook | None = None
+    thrust: Hook | None = None
+    air: Hook | None = None
+    force: Hook | None = None
+    start: Callable[[Any, Drone], Any] | None = None
+    remember: Callable[[Any, Any, Flight], Any] | None = None
+
+    @property
+    def stages(self) -> tuple[str, ...]:
+        """The stages at which the effect acts."""
+        return tuple(stage for stage in STAGES if getattr(self, stage) is not None)
+
+    @property
+    def acts_on(self) -> tuple[str, ...]:
+        """Where the effect acts: command, actuator or force."""
+        return tuple(dict.fromkeys(STAGES[stage] for stage in self.stages))

@@ -1,0 +1,67 @@
+"""A pure delay of all commands: radio, flight controller, motor driver."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from flytrack_env.effects.base import Effect, Flight, Range
+from flytrack_env.quaternion import Scalar
+from flytrack_env.state import Action, Drone
+
+# Commands remembered: at 100 Hz, delays up to 0.04 s. Longer ones are flown as that.
+BUFFER_STEPS = 4
+
+
+class CommandDelay(NamedTuple):
+    """Delay, s; need not be whole steps."""
+
+    delay_s: Scalar = 0.0
+
+
+class PastCommands(NamedTuple):
+    """The commands before the present one, the latest first."""
+
+    commands: tuple[Action, ...]
+
+
+def start(delay: CommandDelay, drone: Drone) -> PastCommands:
+    """Return the memory of an episode that begins: the applied action, as if commanded for long."""
+    return PastCommands((drone.applied,) * BUFFER_STEPS)
+
+
+def delayed(delay: CommandDelay, past: PastCommands, command: Action, flight: Flight) -> Action:
+    """Return the command that acts: the mean of what arrives during the step.
+
+    A command held over its step and delayed by n + f steps acts as 1 - f parts of the n-th before the
+    present one and f parts of the one before that. Exact for whole steps; differentiable, at 0 from above.
+    """
+    steps = jnp.minimum(delay.delay_s / flight.dt, float(BUFFER_STEPS))
+    whole = jnp.floor(steps)
+    part = steps - whole
+
+    def weight(age: int) -> jax.Array:
+        return jnp.where(whole == age, 1.0 - part, jnp.where(whole == age - 1, part, 0.0))
+
+    weights = [weight(age) for age in range(BUFFER_STEPS + 1)]
+    by_channel = zip(*(command, *past.commands), strict=True)
+    return Action(
+        *(sum(w * value for w, value in zip(weights, values, strict=True)) for values in by_channel)
+    )
+
+
+def remember(delay: CommandDelay, past: PastCommands, flight: Flight) -> PastCommands:
+    """Return the memory after a step."""
+    return PastCommands((flight.command, *past.commands[:-1]))
+
+
+COMMAND_DELAY = Effect(
+    name="command_delay",
+    parameters=CommandDelay,
+    ranges={"delay_s": Range(0.0, 0.04, "s")},
+    equation="u(t) = u(t - delay), averaged over the step",
+    source="assumption: the same for all four commands, constant within a flight",
+    command=delayed,
+    start=start,
+    remember=remember,
+)

@@ -1,0 +1,28 @@
+"""Other maximum body rates than the model's: a wrong setting of the flight controller."""
+
+from typing import NamedTuple
+
+from flytrack_env.effects.base import Effect, Flight, Range
+from flytrack_env.quaternion import Scalar, Vec3
+
+
+class RateScale(NamedTuple):
+    """Factor on the body rates about x, y, z, 1."""
+
+    roll: Scalar = 1.0
+    pitch: Scalar = 1.0
+    yaw: Scalar = 1.0
+
+
+def _rates(scale: RateScale, memory: None, rates_b: Vec3, flight: Flight) -> Vec3:
+    return Vec3(scale.roll * rates_b.x, scale.pitch * rates_b.y, scale.yaw * rates_b.z)
+
+
+RATE_SCALE = Effect(
+    name="rate_scale",
+    parameters=RateScale,
+    ranges={axis: Range(0.5, 1.5, "1") for axis in RateScale._fields},
+    equation="omega *= diag(roll, pitch, yaw)",
+    source="assumption: the stick's curve stays linear",
+    rates=_rates,
+)

@@ -1,0 +1,28 @@
+"""Drag in the rotors' plane, in proportion to thrust: blades that flap lean the thrust backwards."""
+
+from typing import NamedTuple
+
+from flytrack_env.effects.base import Effect, Flight, Range
+from flytrack_env.quaternion import Scalar, Vec3
+
+
+class RotorDrag(NamedTuple):
+    """Share of the thrust that leans back per airspeed in the rotors' plane, s/m."""
+
+    h: Scalar = 0.0
+
+
+def _force(drag: RotorDrag, memory: None, force_b: Vec3, flight: Flight) -> Vec3:
+    airspeed_b = flight.airspeed_b()
+    lean = drag.h * flight.thrust_acc
+    return Vec3(force_b.x - lean * airspeed_b.x, force_b.y - lean * airspeed_b.y, force_b.z)
+
+
+ROTOR_DRAG = Effect(
+    name="rotor_drag",
+    parameters=RotorDrag,
+    ranges={"h": Range(-0.2, 0.2, "s/m")},
+    equation="f_b -= h (T/m) P R^T (v - v_air), P the projection onto body x, y",
+    source='R. Mahony, V. Kumar, P. Corke, "Multirotor aerial vehicles", 2012, eq. 12: blade flapping',
+    force=_force,
+)

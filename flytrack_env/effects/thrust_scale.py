@@ -1,0 +1,26 @@
+"""All thrust scaled: a payload, worn propellers, warm motors; no log tells these from mass."""
+
+from typing import NamedTuple
+
+from flytrack_env.effects.base import Effect, Flight, Range
+from flytrack_env.quaternion import Scalar
+
+
+class ThrustScale(NamedTuple):
+    """Factor on the collective thrust, 1."""
+
+    factor: Scalar = 1.0
+
+
+def _thrust(scale: ThrustScale, memory: None, thrust_n: Scalar, flight: Flight) -> Scalar:
+    return scale.factor * thrust_n
+
+
+THRUST_SCALE = Effect(
+    name="thrust_scale",
+    parameters=ThrustScale,
+    ranges={"factor": Range(0.5, 1.5, "1")},
+    equation="T *= factor",
+    source="assumption: the shape of the thrust curve stays",
+    thrust=_thrust,
+)

@@ -1,0 +1,44 @@
+"""Steady wind: moving air where the model has drag, and a constant push that needs no drag.
+
+A log in which no drag was identified shows the push only; one with drag shows the velocity. The
+parameters are apart because their units are.
+"""
+
+from typing import NamedTuple
+
+from flytrack_env.effects.base import Effect, Flight, Range
+from flytrack_env.quaternion import Scalar, Vec3
+
+
+class Wind(NamedTuple):
+    """Velocity of the air, v_*, m/s, and constant specific force, a_*, m/s^2; world frame."""
+
+    v_x: Scalar = 0.0
+    v_y: Scalar = 0.0
+    v_z: Scalar = 0.0
+    a_x: Scalar = 0.0
+    a_y: Scalar = 0.0
+    a_z: Scalar = 0.0
+
+
+def _air(wind: Wind, memory: None, air_w: Vec3, flight: Flight) -> Vec3:
+    return air_w + Vec3(wind.v_x, wind.v_y, wind.v_z)
+
+
+def _force(wind: Wind, memory: None, force_b: Vec3, flight: Flight) -> Vec3:
+    push_w = Vec3(wind.a_x, wind.a_y, wind.a_z)
+    return force_b + Vec3(*(axis.dot(push_w) for axis in flight.body_axes_w))
+
+
+WIND = Effect(
+    name="wind",
+    parameters=Wind,
+    ranges={
+        **{name: Range(-20.0, 20.0, "m/s") for name in ("v_x", "v_y", "v_z")},
+        **{name: Range(-5.0, 5.0, "m/s^2") for name in ("a_x", "a_y", "a_z")},
+    },
+    equation="v_air += v; f_b += R^T a",
+    source="assumption: uniform and steady within a flight",
+    air=_air,
+    force=_force,
+)

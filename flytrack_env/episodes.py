@@ -1,0 +1,215 @@
+"""Episodes: how an environment's hooks become gymnax's ``reset`` and ``step``, with auto-reset outermost.
+
+An environment, or a wrapper around one, says how an episode begins, goes on and looks
+(``EpisodicEnvironment``'s hooks). ``reset``, ``step`` and ``step_batch`` are made of these here, once.
+They are called on the outermost object only, so that whatever a wrapper keeps is fresh in every episode.
+"""
+
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from gymnax.environments import environment, spaces
+
+from flytrack_env.auto_reset import reset_ended
+from flytrack_env.dynamics import ModelParameters
+from flytrack_env.fusion import compute_once
+from flytrack_env.observations import Entry
+from flytrack_env.params import EnvParams
+from flytrack_env.plants import Plant
+from flytrack_env.race import Race
+from flytrack_env.randomness import seed_of, seeds_of
+from flytrack_env.state import ACTION_SIZE, Action, Drone, unpack_action
+from flytrack_env.tracks import Track
+
+Step = tuple[jax.Array, Any, jax.Array, jax.Array, jax.Array, dict[str, Any]]
+
+
+def clip_action(action: jax.Array) -> Action:
+    """Return the command of an action (4,), clipped to [-1, 1]; infinite values clip, NaN stays."""
+    command = unpack_action(jnp.asarray(action))
+    # The fence: a batch of actions is strided, and what reads strided memory is not vectorised.
+    return compute_once(Action(*(jnp.clip(value, -1.0, 1.0) for value in command)))
+
+
+def without_nan(command: Action) -> Action:
+    """Return the command with 0 for what is not a number, so that it cannot poison a state."""
+    return Action(*(jnp.where(jnp.isnan(value), 0.0, value) for value in command))
+
+
+class EpisodicEnvironment(environment.Environment[Any, EnvParams]):
+    """An environment for gymnax, made of hooks for one drone; a state is any pytree.
+
+    track: what is flown. plant: what flies. missed_gate: "terminate" or "fly_on". env_id: as registered.
+    """
+
+    _supports_transition_gradients = True
+    track: Track
+    plant: Plant
+    missed_gate: str
+    env_id = "FlyTrack-v0"
+
+    # The hooks.
+
+    @property
+    def default_params(self) -> EnvParams:
+        """Parameters that the environment was made with."""
+        raise NotImplementedError
+
+    @property
+    def observation_table(self) -> tuple[Entry, ...]:
+        """What an observation holds, row by row."""
+        raise NotImplementedError
+
+    def drone(self, state: Any) -> Drone:
+        """Return the drone of a state, as it is."""
+        raise NotImplementedError
+
+    def race(self, state: Any) -> Race:
+        """Return where the drone stands in the race."""
+        raise NotImplementedError
+
+    def model(self, state: Any, params: EnvParams) -> ModelParameters:
+        """Return the model that a state's episode is flown with."""
+        raise NotImplementedError
+
+    def sample_start(self, seed: jax.Array, params: EnvParams) -> tuple[Drone, jax.Array]:
+        """Return a drone that begins an episode, and the gate to fly first, of a uint32 word."""
+        raise NotImplementedError
+
+    def begin(self, drone: Drone, gate_index: Any, params: EnvParams, seed: Any = 0) -> Any:
+        """Return the state of an episode that begins with a given drone and gate to fly first.
+
+        seed: uint32 word that decides whatever else an episode draws (noise, a model).
+        """
+        raise NotImplementedError
+
+    def advance(
+        self, state: Any, command: Action, params: EnvParams
+    ) -> tuple[Any, jax.Array, jax.Array, dict[str, Any]]:
+        """Return the next state, the reward, whether the episode terminates, and info; no auto-reset.
+
+        command: within [-1, 1]; one that is not a number ends the episode and may not get into the state.
+        """
+        raise NotImplementedError
+
+    def observe_drone(self, drone: Drone, state: Any, params: EnvParams) -> list[jax.Array]:
+        """Return the observation of a state whose sensors report ``drone``, value by value."""
+        raise NotImplementedError
+
+    def settle(self, state: Any, params: EnvParams) -> Any:
+        """Return a state that auto-reset has chosen with everything that follows from the rest of it."""
+        raise NotImplementedError
+
+    def check_params(self, params: EnvParams) -> None:
+        """Raise ValueError, naming the field, for concrete values that cannot be flown."""
+        raise NotImplementedError
+
+    # What follows from them.
+
+    @property
+    def name(self) -> str:
+        """The registered id."""
+        return self.env_id
+
+    @property
+    def num_actions(self) -> int:
+        """Number of components of an action."""
+        return ACTION_SIZE
+
+    def action_space(self, params: EnvParams | None = None) -> spaces.Box:
+        """Roll-rate, pitch-rate, yaw-rate and thrust command, each in [-1, 1]."""
+        return spaces.Box(-1.0, 1.0, (ACTION_SIZE,), jnp.float32)
+
+    def observation_space(self, params: EnvParams | None = None) -> spaces.Box:
+        """The observation's table as a box."""
+        limits = [np.full(entry.size, entry.limit, np.float32) for entry in self.observation_table]
+        limit = jnp.asarray(np.concatenate(limits))
+        return spaces.Box(-limit, limit, limit.shape, jnp.float32)
+
+    def observe(self, key: jax.Array | None, state: Any, action: Any, params: EnvParams) -> jax.Array:
+        """Return the observation of a state, (size,) float32; key and action are unused."""
+        del key, action
+        return jnp.stack(self.observe_drone(self.drone(state), state, params))
+
+    def step_env(
+        self, key: jax.Array | None, state: Any, action: jax.Array, params: EnvParams
+    ) -> tuple[jax.Array, Any, jax.Array, jax.Array, dict[str, Any]]:
+        """Return observation, state, reward, terminated and info of one step, without auto-reset."""
+        del key
+        next_state, reward, terminated, info = self.advance(state, clip_action(action), params)
+        observation = self.observe(None, next_state, action, params)
+        observation, next_state = self._apply_transition_gradient_policy(observation, next_state)
+        return observation, next_state, reward, terminated, info
+
+    def reset(self, key: jax.Array, params: EnvParams | None = None) -> tuple[jax.Array, Any]:
+        """Return observation and state of an episode that begins.
+
+        Raises:
+            ValueError: parameters that no episode can be flown with, where their values are known (not
+                while tracing).
+        """
+        if params is None:
+            params = self.default_params
+        if not any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(params)):
+            self.check_params(params)
+        return super().reset(key, params)
+
+    def reset_env(self, key: jax.Array, params: EnvParams) -> tuple[jax.Array, Any]:
+        """Return observation and state of an episode that begins."""
+        state = self._begin_from(seed_of(key), params)
+        return self.observe(None, state, None, params), state
+
+    def _begin_from(self, seed: jax.Array, params: EnvParams) -> Any:
+        """Return the state of an episode that begins, from one random word."""
+        return self.begin(*self.sample_start(seed, params), params, seed)
+
+    @partial(jax.jit, static_argnames=("self",))
+    def step(self, key: jax.Array, state: Any, action: jax.Array, params: EnvParams | None = None) -> Step:
+        """Return observation, state, reward, terminated, truncated and info, with auto-reset.
+
+        gymnax's protocol, except that the whole key serves the reset: what a step draws, it draws from
+        the word that the episode began with.
+        """
+        if params is None:
+            params = self.default_params
+        final_observation, next_state, reward, terminated, info = self.step_env(None, state, action, params)
+        truncated = self.is_truncated(next_state, params)
+        done = terminated | truncated
+        fresh_state = self._begin_from(seed_of(key), params)
+        next_state = compute_once(
+            jax.tree.map(partial(jnp.where, compute_once(done)), fresh_state, next_state)
+        )
+        # What follows from the choice (gate frames) is derived after it: a fifth faster than choosing it.
+        next_state = self.settle(next_state, params)
+        observation = self.observe(None, next_state, None, params)
+        info = {**info, "terminated": terminated, "truncated": truncated}
+        info["final_observation"] = final_observation
+        return observation, next_state, reward, terminated, truncated, info
+
+    def _sample_starts(self, places: jax.Array, inputs: tuple[jax.Array, EnvParams]) -> tuple[jax.Array, Any]:
+        """Return observations and states of episodes that begin in some environments of a batch."""
+        key, params = inputs
+        begin_all = jax.vmap(self._begin_from, in_axes=(0, None))
+        states = begin_all(seeds_of(key, places), params)
+        observe_all = jax.vmap(self.observe, in_axes=(None, 0, None, None))
+        return observe_all(None, states, None, params), states
+
+    @partial(jax.jit, static_argnames=("self",))
+    def step_batch(self, key: jax.Array, states: Any, actions: jax.Array, params: EnvParams) -> Step:
+        """``step`` for a whole batch with one key, faster than ``vmap(step)``.
+
+        states: leaves (num_envs,). actions: (num_envs, 4). params: one for all. Same results as
+        ``vmap(step)`` up to the random draws: starts are sampled only in steps where an episode ended.
+        """
+        step_all = jax.vmap(self.step_env, in_axes=(None, 0, 0, None))
+        final_observations, next_states, rewards, terminated, info = step_all(None, states, actions, params)
+        truncated = jax.vmap(self.is_truncated, in_axes=(0, None))(next_states, params)
+        observations, next_states = reset_ended(
+            self._sample_starts, terminated | truncated, (final_observations, next_states), (key, params)
+        )
+        info = {**info, "terminated": terminated, "truncated": truncated}
+        info["final_observation"] = final_observations
+        return observations, next_states, rewards, terminated, truncated, info

@@ -1,0 +1,136 @@
+"""The options of ``reset``: where an episode starts, and the track (docs/gymnasium.md)."""
+
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from flytrack_env.state import (
+    APPLIED_ACTION,
+    BATTERY,
+    BATTERY_EMPTY_V,
+    BATTERY_FULL_V,
+    POSITION,
+    QUATERNION,
+    STATE_SIZE,
+    VELOCITY,
+)
+from flytrack_env.tracks import Course, Track
+
+TRACK, BATTERY_V = "track", "battery_v"
+POSE_NAMES = ("position", "quaternion", "yaw_deg", "velocity", "gate_index")
+NAMES = (*POSE_NAMES, BATTERY_V, TRACK)
+UNIT_NORM_TOLERANCE = 1e-3
+LARGEST = float(np.finfo(np.float32).max)
+STILL_ROTORS = (0.0, 0.0, 0.0, -1.0)
+
+
+class Start(NamedTuple):
+    """Where an episode starts; all of it None: as drawn.
+
+    drone: (21,), laid out as in ``flytrack_env.state``, and gate_index: instead of a drawn start.
+    battery_v: instead of the start's own.
+    """
+
+    drone: np.ndarray | None
+    gate_index: int
+    battery_v: float | None
+
+
+def check_names(options: Mapping[str, Any] | None) -> dict[str, Any]:
+    """Return the options as a dict; none is an empty one.
+
+    Raises:
+        ValueError: not a mapping, an unknown name, or a quaternion together with a yaw.
+    """
+    if options is None:
+        return {}
+    if not isinstance(options, Mapping):
+        raise ValueError(f"options: found {type(options).__name__}, expected a dict")
+    for name in options:
+        if name not in NAMES:
+            raise ValueError(f"options: found {name!r}, expected one of {', '.join(NAMES)}")
+    if "quaternion" in options and "yaw_deg" in options:
+        raise ValueError("options: found quaternion and yaw_deg, expected one of them")
+    if not isinstance(options.get(TRACK, ""), (str, Path, Track)):
+        found = type(options[TRACK]).__name__
+        raise ValueError(f"options[{TRACK!r}]: found {found}, expected a name, a path or a Track")
+    return dict(options)
+
+
+def read_start(options: Mapping[str, Any], course: Course) -> Start:
+    """Return the start that checked options ask for on a course.
+
+    Raises:
+        ValueError: a value that no episode can start with; it names option, found and expected.
+    """
+    battery_v = None
+    if BATTERY_V in options:
+        battery_v = _number(options, BATTERY_V)
+        if not BATTERY_EMPTY_V < battery_v <= BATTERY_FULL_V:
+            expected = f"above {BATTERY_EMPTY_V:g} and up to {BATTERY_FULL_V:g} V"
+            raise _error(BATTERY_V, options, expected)
+    if not any(name in options for name in POSE_NAMES):
+        return Start(None, 0, battery_v)
+    drone = np.zeros(STATE_SIZE, np.float32)
+    drone[POSITION] = _position(options, course)
+    drone[QUATERNION] = _quaternion(options, course)
+    if "velocity" in options:
+        drone[VELOCITY] = _numbers(options, "velocity", 3)
+    drone[APPLIED_ACTION] = STILL_ROTORS
+    drone[BATTERY] = BATTERY_FULL_V
+    return Start(drone, _gate_index(options, course.num_gates), battery_v)
+
+
+def _position(options: Mapping[str, Any], course: Course) -> np.ndarray:
+    if "position" not in options:
+        return np.array(course.start_pos_w)
+    position = _numbers(options, "position", 3)
+    low, high = np.array(course.bounds_low), np.array(course.bounds_high)
+    if not ((position >= low) & (position <= high)).all():
+        raise _error("position", options, f"within the bounds, {low.tolist()} to {high.tolist()} m")
+    return position
+
+
+def _quaternion(options: Mapping[str, Any], course: Course) -> np.ndarray:
+    if "yaw_deg" in options:
+        half = 0.5 * math.radians(_number(options, "yaw_deg"))
+        return np.array([math.cos(half), 0.0, 0.0, math.sin(half)])
+    if "quaternion" not in options:
+        return np.array(course.start_quat)
+    quaternion = _numbers(options, "quaternion", 4)
+    norm = np.linalg.norm(quaternion)
+    if abs(norm - 1.0) > UNIT_NORM_TOLERANCE:
+        raise _error("quaternion", options, f"norm 1 within {UNIT_NORM_TOLERANCE:g}")
+    return quaternion / norm
+
+
+def _gate_index(options: Mapping[str, Any], num_gates: int) -> int:
+    index = options.get("gate_index", 0)
+    is_integer = isinstance(index, (int, np.integer)) and not isinstance(index, bool)
+    if not is_integer or not 0 <= index < num_gates:
+        raise _error("gate_index", options, f"an integer from 0 to {num_gates - 1}")
+    return int(index)
+
+
+def _number(options: Mapping[str, Any], name: str) -> float:
+    return float(_numbers(options, name, 0))
+
+
+def _numbers(options: Mapping[str, Any], name: str, size: int) -> np.ndarray:
+    """Return a number (size 0), or that many, finite as float32; float64."""
+    expected = f"{size} finite numbers" if size else "a finite number"
+    try:
+        values = np.asarray(options[name])
+    except ValueError as error:  # ragged lists
+        raise _error(name, options, expected) from error
+    is_right_shape = values.shape == ((size,) if size else ())
+    if not is_right_shape or values.dtype.kind not in "fiu" or not (abs(values) < LARGEST).all():
+        raise _error(name, options, expected)
+    return values.astype(float)
+
+
+def _error(name: str, options: Mapping[str, Any], expected: str) -> ValueError:
+    return ValueError(f"options[{name!r}]: found {options[name]!r}, expected {expected}")

@@ -1,0 +1,252 @@
+"""An environment with parameters, as compiled functions that take and give few arrays."""
+
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from flytrack_env.env import EnvParams
+from flytrack_env.gymnasium_adapter.columns import Columns
+from flytrack_env.gymnasium_adapter.layout import Layout, Packed
+from flytrack_env.gymnasium_adapter.options import Start
+from flytrack_env.registration import make
+from flytrack_env.rendering import scene_row
+from flytrack_env.rendering.scene import GATE_INDEX
+from flytrack_env.state import BATTERY, STATE_SIZE, unpack
+from flytrack_env.tracks import Track, build_course, load_track
+
+KEY_WORDS = 2  # uint32 words of a random key
+NOT_INFO = ("terminated", "truncated", "final_observation")  # of step_batch's info; returned apart
+
+
+def draw_key(generator: np.random.Generator, shape: tuple[int, ...] = ()) -> np.ndarray:
+    """Return the words of a random key, (*shape, KEY_WORDS), uint32."""
+    return generator.integers(0, 2**32, (*shape, KEY_WORDS), np.uint32)
+
+
+def _key(words: jax.Array) -> jax.Array:
+    return jax.random.wrap_key_data(words, impl="threefry2x32")
+
+
+def _grouped(reward: jax.Array, terminated: jax.Array, truncated: jax.Array, info: dict[str, Any]) -> Any:
+    """Return what a vector environment gives of one environment's step, as ``SyncVectorEnv`` groups it.
+
+    Reward, flags, the infos of an episode that goes on, the final infos of one that ended, and the masks
+    of the latter. A mask says where the value of its name, less the underscore, is given; elsewhere it is 0.
+    """
+    done = terminated | truncated
+
+    def masked(mask: jax.Array) -> dict[str, jax.Array]:
+        values = {name: jnp.where(mask, value, jnp.zeros_like(value)) for name, value in info.items()}
+        return values | {f"_{name}": mask for name in info}
+
+    final_masks = {"_final_obs": done, "_final_info": done}
+    return reward, terminated, truncated, masked(~done), masked(done), final_masks
+
+
+class Programs:
+    """Compiled functions of an environment for parameters of one structure.
+
+    state: of an episode, arrays or shapes. A packed episode is the key's words, the number of steps
+    flown, and the environment's state.
+    """
+
+    def __init__(self, env: Any, params: EnvParams, state: Any):
+        self.env = env
+        self.params_layout = Layout.of(params)
+        words = jax.ShapeDtypeStruct((KEY_WORDS,), jnp.uint32)
+        count = jax.ShapeDtypeStruct((), jnp.uint32)
+        self.state_layout = Layout.of(state)
+        self.episode_layout = Layout.of((words, count, state))
+        action = jax.ShapeDtypeStruct(env.action_space(params).shape, jnp.float32)
+        outcome = jax.eval_shape(partial(self._outcome, params=params), words, state, action)[2]
+        self.columns = Columns(outcome)
+        self.batch_columns = Columns(jax.eval_shape(_grouped, *outcome))
+
+    def _outcome(
+        self, words: jax.Array, state: Any, action: jax.Array, params: EnvParams
+    ) -> tuple[jax.Array, Any, tuple[Any, ...]]:
+        """Return observation, state, and (reward, terminated, truncated, info) of a step."""
+        observation, state, reward, terminated, info = self.env.step_env(_key(words), state, action, params)
+        return observation, state, (reward, terminated, self.env.is_truncated(state, params), info)
+
+    def _scene(self, state: Any) -> jax.Array:
+        return scene_row(self.env.drone(state), self.env.race(state))
+
+    def _begun(self, words: jax.Array, state: Any, observation: jax.Array) -> tuple[Any, ...]:
+        episode = self.episode_layout.pack((words, jnp.uint32(0), state))
+        return episode, observation, self._scene(state)
+
+    @partial(jax.jit, static_argnums=0)
+    def pack_params(self, params: EnvParams) -> Packed:
+        """Return the parameters as the other functions take them."""
+        return self.params_layout.pack(params)
+
+    @partial(jax.jit, static_argnums=0)
+    def reset(self, words: jax.Array, params: Packed) -> tuple[Any, ...]:
+        """Return packed episode, observation and scene of an episode that begins as drawn."""
+        observation, state = self.env.reset(_key(words), self.params_layout.unpack(params))
+        return self._begun(words, state, observation)
+
+    @partial(jax.jit, static_argnums=0)
+    def begin(self, words: jax.Array, drone: jax.Array, gate_index: Any, params: Packed) -> tuple[Any, ...]:
+        """Return the same of an episode that begins with a drone (21,) and a gate to fly first."""
+        unpacked = self.params_layout.unpack(params)
+        state = self.env.begin(unpack(drone), gate_index, unpacked)
+        return self._begun(words, state, self.env.observe(_key(words), state, None, unpacked))
+
+    @partial(jax.jit, static_argnums=0)
+    def step(self, episode: Packed, action: jax.Array, params: Packed) -> tuple[Any, ...]:
+        """Return packed episode, observation, scene, and the blocks of ``columns``."""
+        words, count, state = self.episode_layout.unpack(episode)
+        step_words = jax.random.key_data(jax.random.fold_in(_key(words), count))
+        observation, state, outcome = self._outcome(
+            step_words, state, action, self.params_layout.unpack(params)
+        )
+        episode = self.episode_layout.pack((words, count + 1, state))
+        return episode, observation, self._scene(state), self.columns.gather(outcome)
+
+    @partial(jax.jit, static_argnums=0)
+    def reset_batch(self, words: jax.Array, params: Packed) -> tuple[Any, ...]:
+        """Return packed states, observations and scenes of a batch; words: (num_envs, KEY_WORDS)."""
+        return self._unpack_episodes(*jax.vmap(self.reset, in_axes=(0, None))(words, params))
+
+    @partial(jax.jit, static_argnums=0)
+    def begin_batch(
+        self, words: jax.Array, drones: jax.Array, gate_indices: jax.Array, params: Packed
+    ) -> tuple[Any, ...]:
+        """Return the same of episodes that begin with drones (num_envs, 21) and gates (num_envs,)."""
+        begin_all = jax.vmap(self.begin, in_axes=(0, 0, 0, None))
+        return self._unpack_episodes(*begin_all(words, drones, gate_indices, params))
+
+    def _unpack_episodes(self, episodes: Packed, observations: Any, scenes: Any) -> tuple[Any, ...]:
+        """Return the packed states of packed episodes; a batch shares one key, which is no part of them."""
+        _, _, states = jax.vmap(self.episode_layout.unpack)(episodes)
+        return self.state_layout.pack_batch(states), observations, scenes
+
+    @partial(jax.jit, static_argnums=(0, 6))
+    def step_batch(
+        self,
+        states: Packed,
+        words: jax.Array,
+        count: Any,
+        actions: jax.Array,
+        params: Packed,
+        has_scenes: bool,
+    ) -> tuple[Any, ...]:
+        """Return packed states, observations, final observations, scenes, and ``batch_columns``' blocks.
+
+        The auto-resetting step of a batch; words: of one key for all, which step ``count`` makes its own.
+        scenes: (num_envs, SCENE_SIZE) after the auto-reset if they are asked for, else None.
+        """
+        key = jax.random.fold_in(_key(words), count)
+        observations, new_states, rewards, terminated, truncated, info = self.env.step_batch(
+            key, self.state_layout.unpack_batch(states), actions, self.params_layout.unpack(params)
+        )
+        final_observations = info["final_observation"]
+        kept = {name: value for name, value in info.items() if name not in NOT_INFO}
+        blocks = self.batch_columns.gather(jax.vmap(_grouped)(rewards, terminated, truncated, kept))
+        scenes = jax.vmap(self._scene)(new_states) if has_scenes else None
+        packed = self.state_layout.pack_batch(new_states)
+        return packed, observations, final_observations, scenes, blocks
+
+
+class Simulation:
+    """An environment of an id with its parameters. Never changes; copies share what is compiled.
+
+    env_id, overrides: what ``flytrack_env.make`` takes. params: replace the defaults if not None.
+
+    Raises:
+        ValueError: what ``flytrack_env.make`` and ``EnvParams.check`` refuse, and leaves of another shape.
+        TypeError: params of another type.
+    """
+
+    def __init__(self, env_id: str, params: EnvParams | None, overrides: dict[str, Any]):
+        self.env_id, self.overrides = env_id, overrides
+        self.env, programs = _shared(env_id, overrides)
+        self.params = self.env.default_params if params is None else params
+        _check_shapes(self.params, self.env.default_params)
+        # With parameters that are not traced, reset checks their values.
+        _, state = jax.eval_shape(lambda key: self.env.reset(key, self.params), jax.random.key(0))
+        layout = Layout.of(self.params)
+        if layout not in programs:
+            programs[layout] = Programs(self.env, self.params, state)
+        self.programs = programs[layout]
+        self.packed_params = self.programs.pack_params(self.params)
+
+    def with_track(self, track: str | Path | Track) -> "Simulation":
+        """Return the same on another track.
+
+        Raises:
+            TrackError: a track that cannot be read.
+        """
+        course = build_course(track if isinstance(track, Track) else load_track(track))
+        return Simulation(self.env_id, self.params.replace(course=course), self.overrides)
+
+    def begin(self, words: np.ndarray, start: Start) -> tuple[Packed, jax.Array, jax.Array]:
+        """Return packed episode, observation and scene of an episode that begins.
+
+        words: of a key, (KEY_WORDS,); or (num_envs, KEY_WORDS) for packed states, observations and scenes
+        of a batch.
+        """
+        programs, params, batch = self.programs, self.packed_params, words.shape[:-1]
+        if start.drone is None:
+            begun = (programs.reset_batch if batch else programs.reset)(words, params)
+            if start.battery_v is None:
+                return begun
+            scenes = np.array(begun[2])
+            drones, gate_indices = scenes[..., :STATE_SIZE], scenes[..., GATE_INDEX].astype(np.int32)
+        else:
+            drones = np.tile(start.drone, (*batch, 1)) if batch else start.drone.copy()
+            gate_indices = np.full(batch, start.gate_index, np.int32)
+        if start.battery_v is not None:
+            drones[..., BATTERY] = start.battery_v
+        return (programs.begin_batch if batch else programs.begin)(words, drones, gate_indices, params)
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> "Simulation":
+        return self
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return Simulation, (self.env_id, self.params, self.overrides)
+
+
+def _check_shapes(params: EnvParams, default: EnvParams) -> None:
+    """Refuse what is no EnvParams, or has leaves of a batch; a course may have any number of gates."""
+    if not isinstance(params, EnvParams):
+        raise TypeError(f"params: found {type(params).__name__}, expected EnvParams")
+    found = jax.tree_util.tree_leaves_with_path(params.replace(course=default.course))
+    for (path, leaf), expected in zip(found, jax.tree.leaves(default), strict=True):
+        if np.shape(leaf) != np.shape(expected):
+            name = f"params{jax.tree_util.keystr(path)}"
+            raise ValueError(f"{name}: found shape {np.shape(leaf)}, expected {np.shape(expected)}")
+
+
+# Environments by what they were made with: the second one of a kind needs no compilation.
+_SHARED: dict[Any, tuple[Any, dict[Layout, Programs]]] = {}
+MOST_SHARED = 16
+
+
+def _identity(value: Any) -> Any:
+    """Return something hashable that changes where an argument, or the file it names, does."""
+    if isinstance(value, (str, Path)) and Path(value).is_file():
+        status = Path(value).stat()
+        return str(Path(value).resolve()), status.st_mtime_ns, status.st_size
+    return value
+
+
+def _shared(env_id: str, overrides: dict[str, Any]) -> tuple[Any, dict[Layout, Programs]]:
+    """Return an environment and its programs by their parameters' layout."""
+    try:
+        key = (env_id, frozenset((name, _identity(value)) for name, value in overrides.items()))
+        hash(key)
+    except TypeError:  # an argument of arrays, say
+        return make(env_id, **overrides), {}
+    if key not in _SHARED:
+        made = make(env_id, **overrides), {}
+        if len(_SHARED) == MOST_SHARED:
+            del _SHARED[next(iter(_SHARED))]
+        _SHARED[key] = made
+    return _SHARED[key]

@@ -1,0 +1,45 @@
+"""Pictures of a flight, without a display: a top view of the course beside a chase view.
+
+Needs the extra ``flytrack[render]``; importing this package does not. ``scene_row`` says, inside a
+compiled step, what a picture shows; ``FlightLog`` collects such rows; ``make_renderer`` draws them.
+"""
+
+from typing import TYPE_CHECKING
+
+from flytrack_env.rendering.scene import SCENE_SIZE, FlightLog, scene_row
+from flytrack_env.tracks import Course
+
+if TYPE_CHECKING:
+    from flytrack_env.rendering.renderer import Renderer
+    from flytrack_env.rendering.window import Window
+
+__all__ = ["SCENE_SIZE", "FlightLog", "make_renderer", "open_window", "scene_row"]
+
+INSTALL = "pip install 'flytrack[render]'"
+
+
+def make_renderer(course: Course) -> "Renderer":
+    """Return what draws flights on a course.
+
+    Raises:
+        ImportError: Pillow is not installed; the message says how to install it.
+    """
+    try:
+        from flytrack_env.rendering.renderer import Renderer
+    except ImportError as error:
+        raise ImportError(f"pictures need Pillow, which cannot be imported: {INSTALL}") from error
+    return Renderer(course)
+
+
+def open_window(step_s: float) -> "Window":
+    """Return a window that shows pictures of a flight as it would go by, a step every ``step_s`` s.
+
+    Raises:
+        ImportError: pygame is not installed; the message says how to install it.
+    """
+    from flytrack_env.rendering.window import Window
+
+    try:
+        return Window(step_s)
+    except ImportError as error:
+        raise ImportError(f"windows need pygame, which cannot be imported: {INSTALL}") from error

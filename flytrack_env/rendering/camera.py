@@ -1,0 +1,66 @@
+"""A pinhole camera: where points, lines and polygons of the world are on the picture."""
+
+import numpy as np
+
+from flytrack_env.rendering.geometry import UP_W, unit
+
+NEAREST_M = 0.15  # what is nearer to the camera is cut away
+
+
+class Camera:
+    """A camera that stays upright.
+
+    eye_w, forward_w: (3,), world, m; forward of length 1. centre_px: (2,), pixels. focal_px: pixels.
+    """
+
+    def __init__(self, eye_w: np.ndarray, forward_w: np.ndarray, centre_px: np.ndarray, focal_px: float):
+        right = unit(np.cross(forward_w, UP_W), np.array([0.0, -1.0, 0.0]))
+        self.eye_w, self.forward_w = eye_w, forward_w
+        self.centre_px, self.focal_px = centre_px, focal_px
+        self.axes = np.stack([right, np.cross(forward_w, right), forward_w])
+
+    def look(self, points_w: np.ndarray) -> np.ndarray:
+        """Return points (..., 3), world, in the camera's frame: right, down, away; m."""
+        return (points_w - self.eye_w) @ self.axes.T
+
+    def pixels(self, points_c: np.ndarray) -> np.ndarray:
+        """Return where points (..., 3) of the camera's frame, all before it, are, (..., 2)."""
+        return self.centre_px + self.focal_px * points_c[..., :2] / points_c[..., 2:]
+
+    def horizon_px(self) -> float:
+        """Return the height of the horizon on the picture, pixels from its top."""
+        level = max(float(np.hypot(self.forward_w[0], self.forward_w[1])), 1e-3)
+        return float(self.centre_px[1] + self.focal_px * self.forward_w[2] / level)
+
+    def segments(self, segments_w: np.ndarray) -> tuple[list[list[float]], list[int]]:
+        """Return the visible parts of segments (n, 2, 3) as x, y, x, y in pixels, and their indices."""
+        points = self.look(segments_w)
+        indices = np.flatnonzero((points[..., 2] > NEAREST_M).any(axis=1))
+        points = points[indices]
+        for end in (0, 1):
+            is_cut = points[:, end, 2] < NEAREST_M
+            hidden, seen = points[is_cut, end], points[is_cut, 1 - end]
+            share = (NEAREST_M - hidden[:, 2:]) / (seen[:, 2:] - hidden[:, 2:])
+            points[is_cut, end] = hidden + share * (seen - hidden)
+        return self.pixels(points).reshape(-1, 4).tolist(), indices.tolist()
+
+    def polygon(self, points_c: np.ndarray) -> list[float]:
+        """Return the visible part of a polygon (n, 3), camera's frame, as x, y, x, y, ... in pixels.
+
+        Empty where nothing of it is before the camera.
+        """
+        if points_c[:, 2].min() < NEAREST_M:
+            points_c = _cut(points_c)
+        return self.pixels(points_c).ravel().tolist()
+
+
+def _cut(points_c: np.ndarray) -> np.ndarray:
+    """Return the part of a polygon (n, 3) before the nearest plane, (m, 3)."""
+    kept = []
+    for start, end in zip(points_c, np.roll(points_c, -1, axis=0), strict=True):
+        is_seen = start[2] >= NEAREST_M
+        if is_seen:
+            kept.append(start)
+        if is_seen != (end[2] >= NEAREST_M):
+            kept.append(start + (NEAREST_M - start[2]) / (end[2] - start[2]) * (end - start))
+    return np.array(kept).reshape(-1, 3)

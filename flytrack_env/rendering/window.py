@@ -1,0 +1,80 @@
+"""A window that shows a flight at the speed at which it would go by."""
+
+import logging
+import os
+import time
+from collections.abc import Callable
+from types import ModuleType
+
+import numpy as np
+
+LOGGER = logging.getLogger(__name__)
+
+PICTURES_PER_S = 30.0
+LATE_S = 0.1  # further behind than this, time is not made up for
+DRIVER = "SDL_VIDEODRIVER"
+INVISIBLE = "offscreen"  # what SDL takes by itself where there is no display
+
+
+def _load_pygame() -> ModuleType:
+    os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
+    import pygame
+
+    return pygame
+
+
+class Window:
+    """Shows pictures through pygame; without a display nothing is seen, and a log message says so.
+
+    step_s: time between two steps, s.
+
+    Raises:
+        ImportError: pygame is not installed.
+    """
+
+    def __init__(self, step_s: float):
+        self.pygame = _load_pygame()
+        self.step_s = step_s
+        self.step_due_s = self.picture_due_s = time.monotonic()
+        self._open_display()
+
+    def _open_display(self) -> None:
+        try:
+            self.pygame.display.init()
+            if DRIVER in os.environ or self.pygame.display.get_driver() != INVISIBLE:
+                return
+        except self.pygame.error:
+            if DRIVER in os.environ:
+                raise
+        LOGGER.warning("no display was found: the window uses SDL's dummy driver and is not to be seen")
+        self.pygame.display.quit()
+        os.environ[DRIVER] = "dummy"
+        try:
+            self.pygame.display.init()
+        finally:
+            del os.environ[DRIVER]
+
+    def show(self, draw: Callable[[], np.ndarray], is_first: bool) -> None:
+        """Wait until the next step is due; draw and show a picture if one is due, too.
+
+        draw: returns a picture (height, width, 3), uint8. is_first: an episode begins, whose picture is
+        always shown and waits for nothing.
+        """
+        now_s = time.monotonic()
+        self.step_due_s += self.step_s
+        if is_first or self.step_due_s < now_s - LATE_S:
+            self.step_due_s = now_s
+        time.sleep(max(self.step_due_s - now_s, 0.0))
+        if not is_first and time.monotonic() < self.picture_due_s:
+            return
+        self.picture_due_s = time.monotonic() + 1.0 / PICTURES_PER_S
+        picture = draw()
+        size = (picture.shape[1], picture.shape[0])
+        surface = self.pygame.display.get_surface() or self.pygame.display.set_mode(size)
+        surface.blit(self.pygame.image.frombuffer(picture.tobytes(), size, "RGB"), (0, 0))
+        self.pygame.display.flip()
+        self.pygame.event.pump()
+
+    def close(self) -> None:
+        """Close the window; more than once is allowed."""
+        self.pygame.display.quit()

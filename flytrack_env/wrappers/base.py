@@ -1,0 +1,143 @@
+"""What a wrapper is: an environment around an environment, inside of auto-reset.
+
+gymnax's own wrappers go around a step that has already reset itself, so that what they keep leaks
+into the next episode. Ours change the hooks of ``flytrack_env.episodes.EpisodicEnvironment`` instead:
+each has one state of its own around the inner state, begun when an episode begins. They compose in any
+order that makes sense; one that does not is refused.
+"""
+
+from collections.abc import Mapping
+from typing import Any, ClassVar
+
+import jax
+
+from flytrack_env.dynamics import ModelParameters
+from flytrack_env.episodes import EpisodicEnvironment
+from flytrack_env.observations import Entry
+from flytrack_env.params import EnvParams
+from flytrack_env.plants import Plant
+from flytrack_env.race import Race
+from flytrack_env.state import Drone
+from flytrack_env.tracks import Track
+
+
+class WrapperError(ValueError):
+    """An order of wrappers that makes no sense; the message says why."""
+
+
+class Wrapper(EpisodicEnvironment):
+    """Delegates every hook; a wrapper overrides those that it changes.
+
+    Its state is a NamedTuple whose field ``inner`` holds the wrapped environment's state. key: the name
+    of its parameters in ``EnvParams.wrappers``. refuses: wrappers that may not be inside, and why.
+
+    Raises:
+        WrapperError: something else than FlyTrack or a wrapper of ours, the same wrapper twice, or one
+            that this wrapper refuses.
+    """
+
+    key: ClassVar[str]
+    refuses: ClassVar[Mapping[str, str]] = {}
+
+    def __init__(self, env: EpisodicEnvironment):
+        super().__init__()
+        name = type(self).__name__
+        if not isinstance(env, EpisodicEnvironment):
+            raise WrapperError(
+                f"{name}: found {type(env).__name__} inside, expected FlyTrack or a wrapper that acts before "
+                "auto-reset; wrappers of another step (LegacyStep, gymnax's) go outermost"
+            )
+        for inside in layers_of(env):
+            if type(inside) is type(self):
+                raise WrapperError(
+                    f"{name}: found another one inside; their parameters share the key {self.key!r}"
+                )
+            reason = self.refuses.get(type(inside).__name__)
+            if reason is not None:
+                raise WrapperError(f"{name} around {type(inside).__name__}: {reason}")
+        self.env = env
+        self.env_id = f"{name}({env.env_id})"
+
+    def own_defaults(self) -> Any:
+        """Return the default parameters of this wrapper, a NamedTuple; None if it has none."""
+        return None
+
+    def own_params(self, params: EnvParams) -> Any:
+        """Return this wrapper's part of the parameters."""
+        return params.wrappers[self.key]
+
+    @property
+    def track(self) -> Track:  # type: ignore[override]
+        """What is flown."""
+        return self.env.track
+
+    @property
+    def plant(self) -> Plant:  # type: ignore[override]
+        """What flies."""
+        return self.env.plant
+
+    @property
+    def missed_gate(self) -> str:  # type: ignore[override]
+        """What a missed gate does."""
+        return self.env.missed_gate
+
+    @property
+    def default_params(self) -> EnvParams:
+        """The inner environment's, with this wrapper's own."""
+        params = self.env.default_params
+        own = self.own_defaults()
+        return params if own is None else params.replace(wrappers={**params.wrappers, self.key: own})
+
+    @property
+    def observation_table(self) -> tuple[Entry, ...]:
+        """The inner environment's."""
+        return self.env.observation_table
+
+    def drone(self, state: Any) -> Drone:
+        """Return the drone of a state, as it is."""
+        return self.env.drone(state.inner)
+
+    def race(self, state: Any) -> Race:
+        """Return where the drone stands in the race."""
+        return self.env.race(state.inner)
+
+    def model(self, state: Any, params: EnvParams) -> ModelParameters:
+        """Return the model that a state's episode is flown with."""
+        return self.env.model(state.inner, params)
+
+    def sample_start(self, seed: jax.Array, params: EnvParams) -> tuple[Drone, jax.Array]:
+        """Return a drone that begins an episode, and the gate to fly first."""
+        return self.env.sample_start(seed, params)
+
+    def observe_drone(self, drone: Drone, state: Any, params: EnvParams) -> list[jax.Array]:
+        """Return the inner environment's observation."""
+        return self.env.observe_drone(drone, state.inner, params)
+
+    def settle(self, state: Any, params: EnvParams) -> Any:
+        """Return the state with the inner one settled."""
+        return state._replace(inner=self.env.settle(state.inner, params))
+
+    def is_truncated(self, state: Any, params: EnvParams) -> jax.Array:
+        """Return whether the time limit is reached."""
+        return self.env.is_truncated(state.inner, params)
+
+    def check_params(self, params: EnvParams) -> None:
+        """Raise ValueError for parameters that cannot be flown, or that lack this wrapper's own."""
+        self.env.check_params(params)
+        own = self.own_defaults()
+        if own is None:
+            return
+        found = params.wrappers.get(self.key)
+        if jax.tree.structure(found) != jax.tree.structure(own):
+            raise ValueError(
+                f"params.wrappers[{self.key!r}]: found {found!r}, expected {type(own).__name__}, "
+                "as in this environment's default_params"
+            )
+
+
+def layers_of(env: EpisodicEnvironment) -> list[EpisodicEnvironment]:
+    """Return an environment and everything inside it, outermost first."""
+    layers = [env]
+    while isinstance(layers[-1], Wrapper):
+        layers.append(layers[-1].env)
+    return layers

@@ -1,0 +1,165 @@
+"""Another drone in every episode: mass, lags and effects drawn from ranges."""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from flytrack_env.dynamics import ModelParameters
+from flytrack_env.effects import CommandDelay, LinearDrag, ThrustScale, Wind, effect_of
+from flytrack_env.episodes import EpisodicEnvironment
+from flytrack_env.params import EnvParams
+from flytrack_env.quaternion import Scalar
+from flytrack_env.randomness import Draws
+from flytrack_env.state import Action, Drone
+from flytrack_env.wrappers.base import Wrapper, WrapperError
+
+
+class RandomizationParams(NamedTuple):
+    """Ranges of uniform draws, once per episode.
+
+    mass_factor_*: of the model's mass. lag_factor_*: of each of its four time constants. low, high:
+    parameters of effects (``flytrack_env.effects``), the same effects in both; a draw replaces what the
+    model has, None leaves it.
+    """
+
+    mass_factor_low: Scalar = 0.8
+    mass_factor_high: Scalar = 1.2
+    lag_factor_low: Scalar = 0.7
+    lag_factor_high: Scalar = 1.3
+    low: tuple[Any, ...] = (
+        CommandDelay(0.0),
+        ThrustScale(0.85),
+        Wind(-3.0, -3.0, -0.5, a_x=None, a_y=None, a_z=None),
+        LinearDrag(0.0, 0.0, 0.0),
+    )
+    high: tuple[Any, ...] = (
+        CommandDelay(0.02),
+        ThrustScale(1.15),
+        Wind(3.0, 3.0, 0.5, a_x=None, a_y=None, a_z=None),
+        LinearDrag(0.5, 0.5, 0.3),
+    )
+
+
+class RandomizedState(NamedTuple):
+    """The inner state, and the word that this episode's model is drawn from."""
+
+    inner: Any
+    word: jax.Array
+
+
+def sample_model(word: jax.Array, model: ModelParameters, ranges: RandomizationParams) -> ModelParameters:
+    """Return the model of an episode, from a uint32 word; the same word gives the same model.
+
+    Drawn again wherever it is needed: cheaper than to carry some twenty numbers through every step.
+    """
+    draws = Draws(word)
+    mass_factor = draws.uniform("mass", ranges.mass_factor_low, ranges.mass_factor_high)
+    lag_factors = [
+        draws.uniform(f"lag_{axis}", ranges.lag_factor_low, ranges.lag_factor_high)
+        for axis in ("roll", "pitch", "yaw", "thrust")
+    ]
+    tau = [model.tau[i] * factor for i, factor in enumerate(lag_factors)]
+    drawn = [_draw(draws, model, low, high) for low, high in zip(ranges.low, ranges.high, strict=True)]
+    return model._replace(m=model.m * mass_factor, tau=tau).with_effects(*drawn)
+
+
+def _draw(draws: Draws, model: ModelParameters, low: Any, high: Any) -> Any:
+    """Return the parameters of one effect, each drawn where it has a range."""
+    name = effect_of(low).name
+    values = {
+        field: draws.uniform(f"{name}.{field}", lowest, getattr(high, field))
+        for field, lowest in low._asdict().items()
+        if lowest is not None
+    }
+    return model.effect(name)._replace(**values)
+
+
+class DomainRandomization(Wrapper):
+    """Fly every episode with a model drawn around the given one.
+
+    The ranges are ``params.wrappers["domain_randomization"]``, a ``RandomizationParams``. The policy is not
+    told what was drawn; ``env.model(state, params)`` tells people.
+
+    Raises:
+        WrapperError: as ``Wrapper``, or a plant that has its parameters baked in.
+    """
+
+    key = "domain_randomization"
+
+    def __init__(self, env: EpisodicEnvironment):
+        super().__init__(env)
+        if hasattr(env.plant, "dt"):
+            raise WrapperError(
+                f"DomainRandomization around {env.plant!r}: its parameters are baked in, none can be drawn"
+            )
+
+    def own_defaults(self) -> RandomizationParams:
+        """Return the default ranges."""
+        return RandomizationParams()
+
+    def check_params(self, params: EnvParams) -> None:
+        """Raise ValueError for ranges that hold no model, and what the inner check refuses.
+
+        The effects of the ranges may be others than the default's, but the same in ``low`` and ``high``.
+        """
+        self.env.check_params(params)
+        ranges = params.wrappers.get(self.key)
+        if not isinstance(ranges, RandomizationParams):
+            expected = "RandomizationParams, as in this environment's default_params"
+            raise ValueError(f"params.wrappers[{self.key!r}]: found {ranges!r}, expected {expected}")
+        _check_ranges(ranges)
+
+    def model(self, state: RandomizedState, params: EnvParams) -> ModelParameters:
+        """Return the model that a state's episode is flown with."""
+        return self.env.model(state.inner, self._drawn(state.word, params))
+
+    def _drawn(self, word: jax.Array, params: EnvParams) -> EnvParams:
+        ranges = self.own_params(params)
+        return params.replace(model=sample_model(word, params.model, ranges))
+
+    def sample_start(self, seed: jax.Array, params: EnvParams) -> tuple[Drone, jax.Array]:
+        """Return a start of the drone that the episode will be flown with."""
+        return self.env.sample_start(seed, self._drawn(self._word(seed), params))
+
+    def _word(self, seed: Any) -> jax.Array:
+        return Draws(seed).word(self.key)
+
+    def begin(self, drone: Drone, gate_index: Any, params: EnvParams, seed: Any = 0) -> RandomizedState:
+        """Return the state of an episode that begins, its model decided by the seed."""
+        word = self._word(seed)
+        return RandomizedState(self.env.begin(drone, gate_index, self._drawn(word, params), seed), word)
+
+    def advance(
+        self, state: RandomizedState, command: Action, params: EnvParams
+    ) -> tuple[RandomizedState, jax.Array, jax.Array, dict[str, Any]]:
+        """Return the outcome of the inner environment with this episode's model."""
+        inner, *outcome = self.env.advance(state.inner, command, self._drawn(state.word, params))
+        return RandomizedState(inner, state.word), *outcome
+
+
+def _check_ranges(ranges: RandomizationParams) -> None:
+    """Raise ValueError for an empty range, one beyond an effect's own, or effects that do not match."""
+    classes = [
+        [effect_of(parameters).parameters for parameters in side] for side in (ranges.low, ranges.high)
+    ]
+    if classes[0] != classes[1]:
+        names = [[parameters.__name__ for parameters in side] for side in classes]
+        raise ValueError(f"high: found effects {names[1]}, expected those of low, {names[0]}")
+    rows = [
+        ("mass_factor", ranges.mass_factor_low, ranges.mass_factor_high, 0.0, jnp.inf),
+        ("lag_factor", ranges.lag_factor_low, ranges.lag_factor_high, 0.0, jnp.inf),
+    ]
+    for low, high in zip(ranges.low, ranges.high, strict=True):
+        effect = effect_of(low)
+        for name, bounds in effect.ranges.items():
+            pair = getattr(low, name), getattr(high, name)
+            if pair != (None, None):
+                rows.append((f"{effect.name}.{name}", *pair, bounds.low, bounds.high))
+    for name, low, high, lowest, highest in rows:
+        is_factor = name.endswith("_factor")
+        is_range = low is not None and high is not None and lowest <= low <= high <= highest
+        if not is_range or (is_factor and low <= 0.0):
+            raise ValueError(
+                f"{name}: found a range from {low} to {high}, expected one within {lowest:g} to {highest:g}"
+            )

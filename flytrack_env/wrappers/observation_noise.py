@@ -1,0 +1,100 @@
+"""Sensor noise: the policy sees a drone that is a little elsewhere."""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from flytrack_env.fusion import compute_once
+from flytrack_env.params import EnvParams
+from flytrack_env.quaternion import Quaternion, Scalar, Vec3
+from flytrack_env.randomness import Draws, next_word
+from flytrack_env.state import Action, Drone
+from flytrack_env.wrappers.base import Wrapper
+
+
+class NoiseParams(NamedTuple):
+    """Standard deviations, per component: of position, velocity, attitude and body rates.
+
+    The defaults are those of a good motion capture or visual-inertial estimate and a filtered gyro.
+    """
+
+    position_m: Scalar = 0.02
+    velocity_m_per_s: Scalar = 0.05
+    attitude_deg: Scalar = 0.5
+    rates_rad_per_s: Scalar = 0.1
+
+
+class NoisyState(NamedTuple):
+    """The inner state, and the word that this step's noise is drawn from."""
+
+    inner: Any
+    word: jax.Array
+
+
+class ObservationNoise(Wrapper):
+    """Add white noise to what the sensors report of position, velocity, attitude and body rates.
+
+    The standard deviations are ``params.wrappers["observation_noise"]``, a ``NoiseParams``. Independent in
+    every step and episode; the observation of a state is always the same, so that ``final_observation`` is
+    what the policy would have seen.
+    """
+
+    key = "observation_noise"
+
+    def own_defaults(self) -> NoiseParams:
+        """Return the default standard deviations."""
+        return NoiseParams()
+
+    def check_params(self, params: EnvParams) -> None:
+        """Raise ValueError for a negative standard deviation, and what the inner check refuses."""
+        super().check_params(params)
+        for name, value in self.own_params(params)._asdict().items():
+            if not jnp.all(jnp.asarray(value) >= 0.0):
+                raise ValueError(f"params.wrappers[{self.key!r}].{name}: found {value}, expected >= 0")
+
+    def begin(self, drone: Drone, gate_index: Any, params: EnvParams, seed: Any = 0) -> NoisyState:
+        """Return the state of an episode that begins, with noise of its own."""
+        inner = self.env.begin(drone, gate_index, params, seed)
+        return NoisyState(inner, Draws(seed).word("observation_noise"))
+
+    def advance(
+        self, state: NoisyState, command: Action, params: EnvParams
+    ) -> tuple[NoisyState, jax.Array, jax.Array, dict[str, Any]]:
+        """Return the outcome of the inner environment, with another draw of noise to come."""
+        inner, *outcome = self.env.advance(state.inner, command, params)
+        return NoisyState(inner, next_word(state.word)), *outcome
+
+    def observe_drone(self, drone: Drone, state: NoisyState, params: EnvParams) -> list[jax.Array]:
+        """Return the inner observation of a drone as noisy sensors report it.
+
+        Attitude is disturbed before the observation is made of it. What is a vector is disturbed after:
+        white noise of equal deviation along all axes is the same in every frame, and this is cheaper.
+        """
+        noise, draws = self.own_params(params), Draws(state.word)
+        turned = compute_once(_turn(drone.quat, draws, noise.attitude_deg))
+        values = self.env.observe_drone(drone._replace(quat=turned), state.inner, params)
+        deviations = {
+            "position": noise.position_m,
+            "velocity": noise.velocity_m_per_s,
+            "rates": noise.rates_rad_per_s,
+        }
+        row = 0
+        for entry in self.observation_table:
+            if entry.key in deviations:
+                deviation = deviations[entry.key] / entry.scale
+                for i in range(row, row + entry.size):
+                    noisy = values[i] + deviation * draws.normal(f"{entry.key}_{i - row}")
+                    values[i] = jnp.clip(noisy, -entry.limit, entry.limit)
+            row += entry.size
+        return values
+
+
+def _turn(quat: Quaternion, draws: Draws, deviation_deg: Scalar) -> Quaternion:
+    """Return an attitude turned by a small random angle about each body axis."""
+    half_angle = 0.5 * jnp.deg2rad(deviation_deg)
+    normals = Vec3(*(draws.normal(f"attitude_{axis}") for axis in "xyz"))
+    half_turn = compute_once(normals.scale(half_angle))
+    # A unit quaternion without a normalisation, so that no noise changes no bit.
+    real_part = jnp.sqrt(jnp.maximum(1.0 - half_turn.dot(half_turn), 0.0))
+    return quat.multiply(Quaternion(real_part, *half_turn))

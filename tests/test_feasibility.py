@@ -1,0 +1,311 @@
+"""The check of a course's geometry: the shipped ones pass, and every way of breaking one is found."""
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import jax
+import numpy as np
+import pytest
+from scipy.interpolate import CubicHermiteSpline
+from scipy.spatial import KDTree
+
+from flytrack_env.dynamics import nominal_parameters
+from flytrack_env.params import EnvParams
+from flytrack_env.quaternion import Vec3
+from flytrack_env.resets import ResetParams, sample_start
+from flytrack_env.tracks import (
+    DEMANDS,
+    Gate,
+    Limits,
+    Track,
+    available_tracks,
+    build_course,
+    find_problems,
+    hermite_curve,
+    load_track,
+    sample_way,
+    way_length,
+)
+
+NUM_GATES, RADIUS, HEIGHT = 6, 10.0, 2.0
+
+
+def yaw_of(heading_deg: float) -> tuple[float, float, float, float]:
+    """Return the attitude of a gate that is flown along a heading with direction +1."""
+    half = math.radians(heading_deg - 90.0) / 2.0
+    return (math.cos(half), 0.0, 0.0, math.sin(half))
+
+
+def ring(radius: float = RADIUS, num_gates: int = NUM_GATES) -> Track:
+    """Return gates on a circle, flown anticlockwise, gate 0 at (radius, 0); starts 5 m before it."""
+    gates = []
+    for i in range(num_gates):
+        angle = 2.0 * math.pi * i / num_gates
+        centre = (radius * math.cos(angle), radius * math.sin(angle), HEIGHT)
+        gates.append(Gate(10 + i, centre, yaw_of(math.degrees(angle) + 90.0), 1.0, 1.5, 2.7))
+    wall = radius + 5.0
+    return Track(
+        "ring", tuple(gates), (radius, -5.0, 0.1), yaw_of(180.0), (-wall, -wall, 0.0), (wall, wall, 7.0)
+    )
+
+
+def change_gate(track: Track, index: int, **fields: Any) -> Track:
+    """Return a track with other fields of one gate."""
+    gates = list(track.gates)
+    gates[index] = replace(gates[index], **fields)
+    return replace(track, gates=tuple(gates))
+
+
+def point_on_way(track: Track, way: int, share: float) -> tuple[float, ...]:
+    """Return a point between two gates."""
+    samples = sample_way(build_course(track), 1001)[way]
+    return tuple(samples[round(1000 * share)].tolist())
+
+
+def test_unbroken_ring_is_feasible() -> None:
+    assert find_problems(ring()) == ()
+
+
+@pytest.mark.parametrize("name", available_tracks())
+def test_shipped_tracks_are_feasible(name: str) -> None:
+    assert find_problems(load_track(name)) == ()
+
+
+def near_gate(track: Track) -> Track:
+    """Gate 11 moves to 3 m behind gate 10."""
+    return change_gate(track, 1, position=(RADIUS, 3.0, HEIGHT))
+
+
+def gate_in_path(track: Track) -> Track:
+    """Gate 13 moves into the way from gate 10 to 11, and stands across it."""
+    return change_gate(track, 3, position=point_on_way(track, 0, 0.505), quaternion=yaw_of(120.0))
+
+
+def touching_gate(track: Track) -> Track:
+    """Gate 13 moves beside gate 10: no path, but their frames are 0.2 m apart."""
+    return change_gate(track, 3, position=(RADIUS + 2.9, 0.0, HEIGHT), quaternion=track.gates[0].quaternion)
+
+
+# What breaks the ring, the demand that it breaks, and what the message says of it.
+BREAKS: dict[str, tuple[Callable[[Track], Track], str, str]] = {
+    "small opening": (
+        lambda track: change_gate(track, 2, opening=0.5),
+        "opening",
+        "gate 12: opening of 0.5 m, expected at least 0.6 m",
+    ),
+    "too near": (near_gate, "spacing", "gates 10 and 11: 3.00 m apart, expected 5 to 40 m"),
+    "too far": (lambda track: ring(41.0), "spacing", "gates 15 and 10: 41.00 m apart, expected 5 to 40 m"),
+    "reversed: to": (
+        lambda track: change_gate(track, 2, direction=-1.0),
+        "turn",
+        "gate 12: 150 deg between its direction of flight and the straight way to gate 13, expected at "
+        "most 100 deg",
+    ),
+    "reversed: from": (
+        lambda track: change_gate(track, 2, direction=-1.0),
+        "turn",
+        "gate 12: 150 deg between its direction of flight and the straight way from gate 11, expected at "
+        "most 100 deg",
+    ),
+    "next gate from behind": (
+        lambda track: change_gate(track, 2, direction=-1.0),
+        "own gate",
+        "gate 12: the way from gate 11 to 12 ",
+    ),
+    "in the path": (
+        gate_in_path,
+        "path",
+        "gate 13: 0.00 m from the way from gate 10 to 11, expected at least 0.65 m",
+    ),
+    "touching": (touching_gate, "frames", "gates 10 and 13: frames 0.20 m apart, expected at least 0.65 m"),
+    "frame outside": (
+        lambda track: replace(track, bounds_high=(10.5, 15.0, 7.0)),
+        "bounds",
+        "gate 10: frame 0.85 m out of bounds (high x), expected inside",
+    ),
+    "frame above": (
+        lambda track: replace(track, bounds_high=(15.0, 15.0, 3.0)),
+        "bounds",
+        "gate 10: frame 0.35 m out of bounds (ceiling), expected inside",
+    ),
+    "path near the floor": (
+        lambda track: replace(track, bounds_low=(-15.0, -15.0, 1.5)),
+        "bounds",
+        "the way from gate 12 to 13: 0.50 m inside the bounds (floor), expected at least 0.65 m",
+    ),
+    "below ground": (
+        lambda track: change_gate(track, 4, position=(*track.gates[4].position[:2], 1.25)),
+        "ground",
+        "gate 14: bottom of the frame 0.10 m below the ground, expected above",
+    ),
+    "start behind": (
+        lambda track: replace(track, start_position=(RADIUS, 5.0, HEIGHT)),
+        "start",
+        "start: 180 deg off the direction of flight of gate 10, expected in front of it, at most 60 deg",
+    ),
+    "start too near": (
+        lambda track: replace(track, start_position=(RADIUS, -2.0, HEIGHT)),
+        "start",
+        "start: 2.00 m from gate 10, expected 3 to 40 m",
+    ),
+    "start too far": (
+        lambda track: replace(track, start_position=(RADIUS, -50.0, HEIGHT), bounds_low=(-15.0, -60.0, 0.0)),
+        "start",
+        "start: 50.00 m from gate 10, expected 3 to 40 m",
+    ),
+    "start behind another gate": (
+        lambda track: change_gate(
+            track, 3, position=(RADIUS + 1.0, -2.5, HEIGHT), quaternion=track.gates[0].quaternion
+        ),
+        "start",
+        "start: gate 13 is 0.00 m from the straight way to gate 10, expected at least 0.65 m",
+    ),
+    "start at the wall": (
+        lambda track: replace(track, bounds_low=(-15.0, -5.2, 0.0)),
+        "start",
+        "start: 0.25 m too near the bounds or beyond them (low y)",
+    ),
+    "start below ground": (
+        lambda track: replace(track, start_position=(RADIUS, -5.0, -0.5)),
+        "start",
+        "start: 0.50 m too near the bounds or beyond them (floor)",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", BREAKS)
+def test_every_break_is_found_and_named(case: str) -> None:
+    breaking, demand, text = BREAKS[case]
+    problems = find_problems(breaking(ring()))
+    assert [p for p in problems if p.demand == demand and p.text.startswith(text)], problems
+
+
+def test_every_demand_has_a_break() -> None:
+    assert {demand for _, demand, _ in BREAKS.values()} == set(DEMANDS)
+
+
+def test_breaks_that_move_nothing_else_are_the_only_problem() -> None:
+    for case in ("small opening", "below ground", "start behind", "start too near", "frame above"):
+        breaking, demand, _ = BREAKS[case]
+        assert {problem.demand for problem in find_problems(breaking(ring()))} == {demand}, case
+
+
+def test_way_through_the_next_gates_frame_from_behind_is_found() -> None:
+    # A hairpin, flown round the wrong side: the way first meets the plane where the frame is.
+    track = change_gate(ring(), 1, position=(RADIUS, 6.0, HEIGHT), direction=-1.0)
+    track = change_gate(track, 1, quaternion=yaw_of(90.0))
+    texts = [p.text for p in find_problems(track, Limits(max_turn_deg=180.0)) if p.demand == "own gate"]
+    assert any("gate 11: the way from gate 10 to 11 meets it" in text for text in texts), texts
+
+
+def side_by_side() -> Track:
+    """Return a ring of which gate 11 stands 8 m beside gate 10, 0.3 m ahead, and is flown the same way.
+
+    Its plane is crossed at once, far to the side.
+    """
+    return change_gate(ring(), 1, position=(RADIUS - 8.0, 0.3, HEIGHT), quaternion=yaw_of(90.0))
+
+
+def test_way_past_the_next_gate_is_a_miss() -> None:
+    texts = [p.text for p in find_problems(side_by_side()) if p.demand == "own gate"]
+    assert any("gate 11: the way from gate 10 to 11 misses it" in text for text in texts), texts
+
+
+# Field, the value that the FlyTrack course just keeps, the one that it breaks, and the demand.
+EDGES = [
+    ("min_spacing", 7.21, 7.22, "spacing"),
+    ("max_spacing", 13.61, 13.60, "spacing"),
+    ("max_turn_deg", 60.2, 60.1, "turn"),
+    ("min_start_distance", 6.22, 6.23, "start"),
+    ("max_start_turn_deg", 11.6, 11.5, "start"),
+    ("start_clearance", 5.0, 5.01, "start"),
+    ("min_opening", 1.5, 1.51, "opening"),
+]
+
+
+@pytest.mark.parametrize(("field", "kept", "broken", "demand"), EDGES)
+def test_limits_bind_where_they_say(field: str, kept: float, broken: float, demand: str) -> None:
+    track = load_track("flytrack")
+    assert find_problems(track, Limits()._replace(**{field: kept})) == ()
+    assert {p.demand for p in find_problems(track, Limits()._replace(**{field: broken}))} == {demand}
+
+
+def test_clearance_is_to_the_floor_and_the_other_gates() -> None:
+    # The way of the ring is 2 m above ground; a frame 1 m away from it is in the path of 1.1 m only.
+    assert find_problems(ring(), Limits(clearance=1.99)) == ()
+    assert {p.demand for p in find_problems(ring(), Limits(clearance=2.01))} == {"bounds"}
+    x, y, _ = point_on_way(ring(), 0, 0.5)
+    track = change_gate(ring(), 3, position=(x, y, HEIGHT + 1.35 + 1.0), quaternion=yaw_of(120.0))
+    for clearance, is_in_path in ((0.95, False), (1.05, True)):
+        demands = {p.demand for p in find_problems(track, Limits(clearance=clearance))}
+        assert ("path" in demands) == is_in_path
+
+
+def test_gate_in_the_path_is_found_however_small_the_clearance() -> None:
+    problems = find_problems(gate_in_path(ring()), Limits(clearance=1e-6))
+    assert any(p.text.startswith("gate 13: 0.00 m from the way from gate 10 to 11") for p in problems)
+
+
+def test_default_clearances_are_what_starts_need() -> None:
+    radius, starts = EnvParams.drone_radius, ResetParams()
+    limits = Limits()
+    assert limits.drone_radius == radius
+    assert limits.clearance == pytest.approx(starts.course_offset + radius)
+    assert limits.start_clearance == pytest.approx(starts.start_position_noise + radius)
+
+
+def test_drone_radius_widens_the_frame() -> None:
+    for radius, word in ((0.15, "misses it"), (50.0, "meets it")):
+        problems = find_problems(side_by_side(), Limits(drone_radius=radius))
+        texts = [p.text for p in problems if p.demand == "own gate" and "from gate 10 to 11" in p.text]
+        assert texts and all(word in text for text in texts)
+
+
+def test_all_problems_are_reported_at_once() -> None:
+    track = change_gate(change_gate(ring(), 2, opening=0.5), 4, opening=0.4)
+    assert [p.text.split(":")[0] for p in find_problems(track)] == ["gate 12", "gate 14"]
+
+
+def test_check_sees_a_tilted_gates_lowest_corner() -> None:
+    # Rolled by 45 degrees about its axis of flight: the corner is a diagonal below the centre.
+    yaw = np.array(ring().gates[0].quaternion)
+    c, s = math.cos(math.pi / 8), math.sin(math.pi / 8)
+    rolled = (yaw[0] * c - 0.0, -yaw[3] * s, yaw[0] * s, yaw[3] * c)
+    problems = find_problems(change_gate(ring(), 0, quaternion=rolled, frame=2.9))
+    depth = 1.45 * math.sqrt(2.0) - HEIGHT
+    assert [p.text for p in problems if p.demand == "ground"] == [
+        f"gate 10: bottom of the frame {depth:.2f} m below the ground, expected above"
+    ]
+
+
+def test_hermite_curve_is_scipys() -> None:
+    rng = np.random.default_rng(0)
+    start, leave, end, meet = rng.normal(size=(4, 3))
+    s = np.linspace(0.0, 1.0, 7)
+    point, tangent = hermite_curve(Vec3(*start), Vec3(*leave), Vec3(*end), Vec3(*meet), s)
+    spline = CubicHermiteSpline([0.0, 1.0], [start, end], [leave, meet])
+    np.testing.assert_allclose(np.stack(point, -1), spline(s), atol=1e-12)
+    np.testing.assert_allclose(np.stack(tangent, -1), spline(s, 1), atol=1e-12)
+
+
+@pytest.mark.parametrize("name", ["flytrack", "split_s"])
+def test_way_is_the_one_on_which_episodes_start(name: str) -> None:
+    course = build_course(load_track(name))
+    params = ResetParams(course_fraction=1.0, course_offset=0.0)
+    seeds = np.arange(500, dtype=np.uint32) * np.uint32(0x9E3779B9)
+    draw = jax.jit(jax.vmap(lambda seed: sample_start(seed, course, params, nominal_parameters())))
+    drones, gate_index = draw(seeds)
+    positions, ways = np.stack(drones.pos_w, -1), (np.asarray(gate_index) - 1) % course.num_gates
+    samples = sample_way(course, 2000)
+    for way in range(course.num_gates):
+        assert (ways == way).any()
+        assert KDTree(samples[way]).query(positions[ways == way])[0].max() < 0.01
+
+
+def test_length_of_the_way_round_a_ring() -> None:
+    # Six arcs of 60 deg, by cubics: Hermite's tangents of the chord's length make them 0.3 % short.
+    length = way_length(build_course(ring()))
+    assert length == pytest.approx(2.0 * math.pi * RADIUS, rel=5e-3)
+    assert way_length(build_course(ring(2.0 * RADIUS))) == pytest.approx(2.0 * length, rel=1e-5)

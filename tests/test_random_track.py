@@ -1,0 +1,227 @@
+"""Random courses: feasible, distinct, a function of the key; and what cannot be drawn is refused."""
+
+import math
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from flytrack_env.env import FlyTrack
+from flytrack_env.quaternion import Vec3
+from flytrack_env.tracks import (
+    DEMANDS,
+    Limits,
+    Track,
+    TrackError,
+    available_tracks,
+    build_course,
+    cross_gate,
+    find_problems,
+    load_track,
+    random_track,
+    sample_way,
+    save_track,
+)
+
+NUM_SEEDS = 100
+NUM_SAMPLES = 100
+DRONE_RADIUS = 0.15
+BEYOND = 3  # samples of the next way: enough to be through the gate at the end of this one
+
+
+@pytest.fixture(scope="module")
+def drawn() -> list[Track]:
+    """Courses of the first seeds."""
+    return [random_track(seed) for seed in range(NUM_SEEDS)]
+
+
+def test_only_feasible_courses_are_drawn(drawn: list[Track]) -> None:
+    for track in drawn:
+        assert find_problems(track) == (), track.name
+
+
+def cross_all(gates: Any, starts: jax.Array, ends: jax.Array) -> Any:
+    """Return how every segment (N, M, 3) of every way meets every gate: leaves (N, M, num_gates)."""
+
+    def meet(start: jax.Array, end: jax.Array) -> Any:
+        return jax.vmap(lambda gate: cross_gate(gate, Vec3(*start), Vec3(*end), DRONE_RADIUS))(gates)
+
+    return jax.vmap(jax.vmap(meet))(starts, ends)
+
+
+CROSS_ALL = jax.jit(cross_all)
+
+
+def count_events(track: Track) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return passes, frames and misses, (way, gate) each, of flying the way by the race's own geometry."""
+    course = build_course(track)
+    way = sample_way(course, NUM_SAMPLES).astype(np.float32)
+    # From just behind a gate to just behind the next one.
+    points = np.concatenate([way[:, 1:], np.roll(way, -1, axis=0)[:, 1:BEYOND]], axis=1)
+    crossing = CROSS_ALL(course.gates, points[:, :-1], points[:, 1:])
+    events = (crossing.is_pass, crossing.is_frame, crossing.is_miss)
+    return tuple(np.asarray(event).sum(axis=1) for event in events)
+
+
+def assert_flies_through(track: Track) -> None:
+    """Check that the way passes its next gate once, misses it never, and touches no gate at all."""
+    passes, frames, misses = count_events(track)
+    next_gate = np.roll(np.eye(len(track.gates), dtype=int), 1, axis=1)
+    np.testing.assert_array_equal(passes, next_gate, err_msg=track.name)
+    assert not frames.any() and not (misses * next_gate).any(), track.name
+
+
+def test_way_passes_every_gate_in_turn_by_the_races_geometry(drawn: list[Track]) -> None:
+    for track in drawn:
+        assert_flies_through(track)
+
+
+@pytest.mark.parametrize("name", available_tracks())
+def test_way_of_shipped_tracks_passes_every_gate_in_turn(name: str) -> None:
+    assert_flies_through(load_track(name))
+
+
+def test_courses_are_distinct(drawn: list[Track]) -> None:
+    assert len({track.gates for track in drawn}) == NUM_SEEDS
+    assert len({track.name for track in drawn}) == NUM_SEEDS
+
+
+def test_course_is_a_function_of_the_key(drawn: list[Track]) -> None:
+    for seed in range(10):
+        same = (
+            random_track(seed),
+            random_track(jax.random.key(seed)),
+            random_track(jax.random.PRNGKey(seed)),
+        )
+        assert all(track == drawn[seed] for track in same)
+    keys = jax.random.split(jax.random.key(0), 3)
+    assert len({random_track(key).gates for key in keys}) == 3
+    assert random_track(np.int64(4)) == drawn[4]
+    assert random_track(2**32 - 1) == random_track(jax.random.key(np.uint32(2**32 - 1)))
+
+
+def test_course_of_a_seed_stays_the_same() -> None:
+    # Whoever publishes a seed publishes a course: a change of the drawing is a change of behaviour.
+    track = random_track(0)
+    assert track.name == "random_0_0"
+    assert [gate.position for gate in track.gates[:2]] == [(9.61, 6.56, 2.42), (24.36, 5.44, 3.64)]
+    assert track.start_position == (7.26, 12.08, 0.1)
+
+
+def turns_of(track: Track) -> np.ndarray:
+    """Return the change of heading from each gate to the gate behind it, (N,), rad in [-pi, pi]."""
+    forward = build_course(track).gates.forward
+    heading = np.arctan2(forward.y, forward.x)
+    return (np.roll(heading, -1) - heading + math.pi) % (2.0 * math.pi) - math.pi
+
+
+def test_courses_vary(drawn: list[Track]) -> None:
+    laps = np.array([round(turns_of(track).sum() / (2.0 * math.pi)) for track in drawn])
+    # Once round to the left or right, and figures of eight, which come out even.
+    assert all((laps == winding).mean() > 0.1 for winding in (-1, 0, 1))
+    signs = [gate.direction for track in drawn for gate in track.gates]
+    assert 0.4 < np.mean(np.array(signs) > 0.0) < 0.6
+    heights = np.array([gate.position[2] for track in drawn for gate in track.gates])
+    assert heights.min() < 1.5 and heights.max() > 3.9
+
+
+def test_both_senses_of_turning_on_most_courses(drawn: list[Track]) -> None:
+    turns = np.array([turns_of(track) for track in drawn])
+    assert ((turns > 0.2).any(axis=1) & (turns < -0.2).any(axis=1)).mean() > 0.5
+
+
+@settings(max_examples=30, deadline=None)
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    num_gates=st.integers(3, 12),
+    size=st.tuples(st.floats(40.0, 60.0), st.floats(40.0, 60.0)),
+    heights=st.tuples(st.floats(1.35, 3.0), st.floats(3.0, 6.0)),
+    spacing=st.floats(5.0, 7.0),
+)
+def test_arguments_are_kept(
+    seed: int, num_gates: int, size: tuple[float, float], heights: tuple[float, float], spacing: float
+) -> None:
+    limits = Limits(min_spacing=spacing)
+    track = random_track(seed, num_gates, size, heights, limits)
+    assert find_problems(track, limits) == ()
+    assert [gate.id for gate in track.gates] == list(range(num_gates))
+    centres = track.rows()[:, 1:4]
+    assert (centres[:, :2] >= 4.99).all() and (centres[:, :2] <= np.array(size) - 4.99).all()
+    assert centres[:, 2].min() >= heights[0] - 0.01 and centres[:, 2].max() <= heights[1] + 0.01
+    assert (track.bounds_low, track.bounds_high[:2]) == ((0.0, 0.0, 0.0), size)
+    apart = np.linalg.norm(centres[:, None, :2] - centres[None, :, :2], axis=-1)
+    assert apart[~np.eye(num_gates, dtype=bool)].min() >= spacing
+    assert_flies_through(track)
+
+
+def test_start_stands_before_the_first_gate_and_faces_it(drawn: list[Track]) -> None:
+    for track in drawn:
+        first = np.array(track.gates[0].position)
+        yaw = 2.0 * math.atan2(track.start_quaternion[3], track.start_quaternion[0])
+        way = (first - track.start_position)[:2]
+        np.testing.assert_allclose(way, 6.0 * np.array([math.cos(yaw), math.sin(yaw)]), atol=0.01)
+        assert track.start_position[2] == 0.1
+
+
+def test_courses_are_saved_and_read_back_equal(drawn: list[Track], tmp_path: Path) -> None:
+    for track in drawn:
+        save_track(tmp_path / "random.toml", track)
+        assert load_track(tmp_path / "random.toml") == track
+
+
+def test_environment_takes_a_random_course(tmp_path: Path) -> None:
+    track = random_track(3)
+    save_track(tmp_path / "mine.toml", track)
+    for given_track in (track, tmp_path / "mine.toml"):
+        env = FlyTrack(track=given_track)
+        assert env.track == track
+        key = jax.random.key(0)
+        observation, state = env.reset(key, env.default_params)
+        assert np.isfinite(observation).all()
+        outputs = jax.eval_shape(env.step, key, state, jnp.zeros(4), env.default_params)
+        assert outputs[0].shape == observation.shape
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"num_gates": 2}, "num_gates: found 2, expected at least 3"),
+        ({"size": (30.0, 10.0)}, r"size: found \(30.0, 10.0\), expected more than 10 m each"),
+        ({"size": (math.nan, 30.0)}, "size: found"),
+        ({"size": (30.0, math.inf)}, "size: found"),
+        ({"heights": (1.0, 3.0)}, r"heights: found \(1.0, 3.0\), expected a range from 1.35 m upwards"),
+        ({"heights": (3.0, 2.0)}, "heights: found"),
+        ({"heights": (2.0, math.inf)}, "heights: found"),
+        ({"key": -1}, "key: found -1, expected 0 to 4294967295"),
+        ({"key": 2**32}, "key: found 4294967296"),
+        ({"key": jnp.zeros((3, 2), jnp.uint32)}, r"key: found uint32 of shape \(3, 2\), expected one key"),
+        ({"key": jnp.zeros(2)}, "key: found float32 of shape"),
+    ],
+)
+def test_bad_arguments_are_refused(arguments: dict[str, Any], message: str) -> None:
+    with pytest.raises(TrackError, match=message):
+        random_track(**{"key": 0, **arguments})
+
+
+def test_batch_of_typed_keys_is_refused() -> None:
+    with pytest.raises(TrackError, match=r"key: found uint32 of shape \(2, 2\), expected one key"):
+        random_track(jax.random.split(jax.random.key(0)))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "demand"),
+    [
+        ({"num_gates": 60}, "spacing"),
+        ({"limits": Limits(max_turn_deg=1.0)}, "turn"),
+        ({"limits": Limits(min_start_distance=20.0)}, "start"),
+    ],
+)
+def test_demands_that_cannot_be_met_are_named(arguments: dict[str, Any], demand: str) -> None:
+    assert demand in DEMANDS
+    with pytest.raises(TrackError, match=rf"in 300 attempts; .* most often: {demand} \(\d+ times\)"):
+        random_track(0, **arguments)

@@ -1,0 +1,335 @@
+"""Pictures of a flight: what they show, that they keep up, and what is said where they cannot."""
+
+import logging
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.wrappers import RecordVideo
+
+from flytrack_env.rendering import FlightLog, make_renderer, open_window
+from flytrack_env.rendering.scene import GATE_INDEX, LAP_START, LAP_TIME, LAPS, SCENE_SIZE
+from flytrack_env.state import BATTERY, POSITION, QUATERNION, VELOCITY
+from flytrack_env.tracks import Course, build_course, load_track
+
+pytest.importorskip("PIL", reason="the extra [render] is not installed")
+
+from flytrack_env.rendering import palette
+from flytrack_env.rendering.camera import NEAREST_M, Camera
+from flytrack_env.rendering.geometry import gates_of
+from flytrack_env.rendering.renderer import BAR_HEIGHT, Renderer
+
+BASE = "FlyTrack-v0"
+WIDTH, HEIGHT = palette.FRAME_SIZE
+SHAPE = (HEIGHT, WIDTH, 3)
+SPLIT = palette.TOP_VIEW_WIDTH
+
+
+@pytest.fixture(scope="module")
+def course() -> Course:
+    """The default course."""
+    return build_course(load_track("flytrack"))
+
+
+@pytest.fixture(scope="module")
+def renderer(course: Course) -> Renderer:
+    """What draws on it."""
+    return make_renderer(course)
+
+
+def row_at(position: Any, gate_index: int = 0, velocity: Any = (-10.0, 0.0, 0.0)) -> np.ndarray:
+    """Return a row of a drone that faces gate 0, level."""
+    row = np.zeros(SCENE_SIZE, np.float32)
+    row[POSITION], row[VELOCITY], row[QUATERNION] = position, velocity, (0.0, 0.0, 0.0, 1.0)
+    row[BATTERY], row[GATE_INDEX] = 23.5, gate_index
+    return row
+
+
+def log_of(rows: list[np.ndarray]) -> FlightLog:
+    """Return a log of rows at 100 Hz."""
+    log = FlightLog(0.01)
+    for row in rows:
+        log.append(row)
+    return log
+
+
+def flight(num_steps: int = 60) -> list[np.ndarray]:
+    """Return rows from the start pose through gate 0, ever faster."""
+    fractions = np.linspace(0.0, 1.0, num_steps)
+    return [
+        row_at((18.6 - 9.0 * share, 2.0, 0.3 + share), int(share > 0.7), (-20.0 * share, 0.0, 0.0))
+        for share in fractions
+    ]
+
+
+def distance_to(picture: np.ndarray, colour: palette.Colour) -> np.ndarray:
+    """Return how far each pixel is from a colour, largest channel."""
+    return abs(picture.astype(int) - np.array(colour)).max(axis=-1)
+
+
+def top_view_pixel(renderer: Renderer, position: Any) -> tuple[int, int]:
+    """Return row and column of a position, world, on the picture."""
+    x, y = renderer.top_view.pixels(np.array(position)) / palette.SUPERSAMPLING
+    return round(float(y)), round(float(x))
+
+
+# --- The picture --------------------------------------------------------------------------------
+
+
+def test_picture_is_a_new_array_of_bytes(renderer: Renderer) -> None:
+    log = log_of(flight())
+    picture = renderer.draw(log)
+    assert picture.shape == SHAPE and picture.dtype == np.uint8 and picture.flags.writeable
+    expected = picture.copy()
+    picture[:] = 0
+    np.testing.assert_array_equal(renderer.draw(log), expected)
+    with pytest.raises(ValueError, match="log: found no rows"):
+        renderer.draw(FlightLog(0.01))
+
+
+def test_a_trail_drawn_bit_by_bit_is_the_trail_drawn_at_once(course: Course, renderer: Renderer) -> None:
+    growing, other = FlightLog(0.01), FlightLog(0.01)
+    for index, row in enumerate(flight(300)):  # longer than the log's first buffer
+        growing.append(row)
+        if index % 20 == 0:
+            other.append(row + np.float32(0.1))
+            bit_by_bit = renderer.draw(growing)
+            renderer.draw(other)  # another flight in between
+    bit_by_bit = renderer.draw(growing)
+    np.testing.assert_array_equal(bit_by_bit, make_renderer(course).draw(log_of(flight(300))))
+
+
+def test_top_view_shows_trail_drone_and_next_gate_where_they_are(renderer: Renderer) -> None:
+    rows = flight()
+    picture = renderer.draw(log_of(rows))
+    # World x is to the right and y upwards on this track.
+    start, gate_1 = top_view_pixel(renderer, (18.6, 2.0)), top_view_pixel(renderer, (6.5, 6.0))
+    drone = top_view_pixel(renderer, rows[-1][POSITION])
+    assert gate_1[0] < start[0] and gate_1[1] < drone[1] < start[1] < SPLIT
+    assert distance_to(picture[drone], palette.DRONE) < 40
+    for share in (0.3, 0.6):
+        row = rows[round(share * (len(rows) - 1))]
+        pixel = top_view_pixel(renderer, row[POSITION])
+        speed = float(np.linalg.norm(row[VELOCITY]))
+        colour = palette.speed_colours(np.array([speed]))[0]
+        assert distance_to(picture[pixel[0] - 1 : pixel[0] + 2, pixel[1]], colour).min() < 40
+    top_view = picture[:, :SPLIT]
+    near = [
+        (distance_to(top_view, palette.NEXT_GATE) < 20)[row - 25 : row + 25, column - 25 : column + 25].sum()
+        for row, column in (top_view_pixel(renderer, (12.5, 2.0)), gate_1)
+    ]
+    assert near[0] == 0 and near[1] > 30
+
+
+def test_every_gate_is_in_the_top_view_with_a_number_beside_it(course: Course, renderer: Renderer) -> None:
+    empty = np.array(renderer.top_view.empty.reduce(palette.SUPERSAMPLING))
+    is_gate = distance_to(empty, palette.GATE) < 30
+    is_text = distance_to(empty, palette.TEXT) < 60
+    for centre in gates_of(course).centres:
+        row, column = top_view_pixel(renderer, centre)
+        around = np.s_[row - 34 : row + 35, column - 34 : column + 35]
+        assert is_gate[around].sum() > 40 and is_text[around].sum() >= 5
+
+
+def test_a_wide_course_is_turned(row_track: Any) -> None:
+    view = make_renderer(build_course(row_track([0.0, 10.0, 20.0]))).top_view
+    origin, forward, left = view.pixels(np.array([(0.0, 0.0), (1.0, 0.0), (0.0, 1.0)]))
+    np.testing.assert_allclose(forward - origin, [0.0, -view.scale], atol=1e-9)  # up
+    np.testing.assert_allclose(left - origin, [-view.scale, 0.0], atol=1e-9)
+
+
+def test_chase_view_shows_the_drone_and_the_gate_ahead(renderer: Renderer) -> None:
+    picture = renderer.draw(log_of(flight()[:30]))
+    chase = picture[BAR_HEIGHT:, SPLIT:]
+    gate = np.argwhere(distance_to(chase, palette.NEXT_GATE) < 40)
+    rotors = np.argwhere(distance_to(chase, palette.FRONT_ROTOR) < 40)
+    assert len(gate) > 1000 and len(rotors) > 20
+    middle = 0.5 * (WIDTH - SPLIT)
+    assert abs(rotors[:, 1].mean() - middle) < 20 and abs(gate[:, 1].mean() - middle) < 20
+    assert gate[:, 0].mean() < rotors[:, 0].mean()
+    farther = renderer.draw(log_of(flight()[:1]))[BAR_HEIGHT:, SPLIT:]
+    assert (distance_to(farther, palette.NEXT_GATE) < 40).sum() < len(gate)
+
+
+def test_text_follows_lap_gate_speed_battery_and_times(renderer: Renderer) -> None:
+    row = row_at((15.0, 2.0, 1.0))
+    bar = np.s_[:BAR_HEIGHT, SPLIT:]
+    base = renderer.draw(log_of([row]))[bar]
+    for column, value in (
+        (LAPS, 2.0),
+        (GATE_INDEX, 5.0),
+        (BATTERY, 22.5),
+        (LAP_START, -3.0),
+        (LAP_TIME, 4.5),
+    ):
+        changed = row.copy()
+        changed[column] = value
+        assert (renderer.draw(log_of([changed]))[bar] != base).any()
+    faster = row_at((15.0, 2.0, 1.0), velocity=(-12.0, 0.0, 0.0))
+    assert (renderer.draw(log_of([faster]))[bar] != base).any()
+    assert (renderer.draw(log_of([row, row]))[bar] != base).any()
+
+
+# --- The camera ---------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def camera() -> Camera:
+    """A camera 2 m above the origin that looks along +x, on a picture of 200 x 100 pixels."""
+    return Camera(np.array([0.0, 0.0, 2.0]), np.array([1.0, 0.0, 0.0]), np.array([100.0, 50.0]), 80.0)
+
+
+def test_camera_puts_points_where_they_are_seen(camera: Camera) -> None:
+    ahead, left, above = (10.0, 0.0, 2.0), (10.0, 1.0, 2.0), (10.0, 0.0, 3.0)
+    pixels = camera.pixels(camera.look(np.array([ahead, left, above])))
+    np.testing.assert_allclose(pixels, [(100.0, 50.0), (92.0, 50.0), (100.0, 42.0)], atol=1e-9)
+    assert camera.horizon_px() == 50.0
+
+
+def test_camera_cuts_what_is_behind_it(camera: Camera) -> None:
+    segments = np.array(
+        [
+            [(10.0, 0.0, 0.0), (20.0, 0.0, 0.0)],
+            [(-5.0, 0.0, 0.0), (10.0, 0.0, 0.0)],
+            [(10.0, 0.0, 0.0), (-5.0, 0.0, 0.0)],
+            [(-5.0, 0.0, 0.0), (-1.0, 0.0, 0.0)],
+        ]
+    )
+    lines, indices = camera.segments(segments)
+    assert indices == [0, 1, 2]
+    nearest = 50.0 + 80.0 * 2.0 / NEAREST_M
+    np.testing.assert_allclose(lines[0], [100.0, 66.0, 100.0, 58.0], atol=1e-9)
+    np.testing.assert_allclose(lines[1], [100.0, nearest, 100.0, 66.0], atol=1e-6)
+    np.testing.assert_allclose(lines[2], [100.0, 66.0, 100.0, nearest], atol=1e-6)
+    floor = np.array([(-5.0, -1.0, 0.0), (-5.0, 1.0, 0.0), (10.0, 1.0, 0.0), (10.0, -1.0, 0.0)])
+    corners = np.array(camera.polygon(camera.look(floor))).reshape(-1, 2)
+    assert len(corners) == 4
+    np.testing.assert_allclose(sorted(corners[:, 1]), [66.0, 66.0, nearest, nearest], atol=1e-6)
+    assert camera.polygon(camera.look(floor - np.array([20.0, 0.0, 0.0]))) == []
+
+
+# --- Through Gymnasium --------------------------------------------------------------------------
+
+
+def test_single_environment_renders_its_own_flight() -> None:
+    env = gymnasium.make(BASE, render_mode="rgb_array").unwrapped
+    with pytest.raises(gymnasium.error.ResetNeeded, match="expected a reset"):
+        env.render()
+    env.reset(seed=0, options={"gate_index": 0})
+    first = env.render()
+    assert first.shape == SHAPE
+    for _ in range(20):
+        env.step(np.array([0.0, 0.1, 0.0, 0.8]))
+    assert (env.render() != first).any()
+    env.reset(options={"gate_index": 0})
+    np.testing.assert_array_equal(env.render(), first)
+
+
+def test_vector_environment_renders_every_flight() -> None:
+    arguments = {"render_mode": "rgb_array", "vectorization_mode": "vector_entry_point"}
+    env = gymnasium.make_vec(BASE, num_envs=3, **arguments)
+    env.reset(options={"gate_index": 0})
+    first = env.render()
+    assert isinstance(first, tuple) and [picture.shape for picture in first] == [SHAPE] * 3
+    np.testing.assert_array_equal(first[0], first[2])
+    actions = np.array([[0.0, 0.1, 0.0, 0.8]] * 3)
+    for index in range(20):
+        actions[1] = np.nan if index == 10 else actions[0]  # its second flight is half as old
+        env.step(actions)
+    flown = env.render()
+    np.testing.assert_array_equal(flown[0], flown[2])
+    assert (flown[0] != first[0]).any() and (flown[1] != flown[0]).any()
+
+
+def test_record_video_writes_every_step(tmp_path: Path) -> None:
+    pytest.importorskip("moviepy", reason="RecordVideo needs it")
+    from imageio_ffmpeg import count_frames_and_secs
+
+    env = RecordVideo(gymnasium.make(BASE, render_mode="rgb_array"), str(tmp_path / "video"))
+    env.reset(seed=0, options={"gate_index": 0})
+    for _ in range(24):
+        env.step(np.array([0.0, 0.0, 0.0, 0.6]))
+    env.close()
+    (path,) = (tmp_path / "video").glob("*.mp4")
+    assert count_frames_and_secs(str(path)) == (25, pytest.approx(0.25, abs=0.02))
+
+
+# --- The window ---------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def dummy_display(monkeypatch: pytest.MonkeyPatch) -> None:
+    """SDL's driver that shows nothing."""
+    pytest.importorskip("pygame", reason="the extra [render] is not installed")
+    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
+
+
+def test_human_mode_keeps_real_time(dummy_display: None, caplog: pytest.LogCaptureFixture) -> None:
+    env = gymnasium.make(BASE, render_mode="human")
+    env.reset(seed=0, options={"gate_index": 0})
+    env.step(np.zeros(4))  # compiles
+    start_s = time.monotonic()
+    for _ in range(30):
+        env.step(np.array([0.0, 0.0, 0.0, 0.6]))
+    assert time.monotonic() - start_s > 0.25
+    assert env.render() is None
+    env.close()
+    env.close()
+    assert caplog.records == []
+
+
+def test_window_draws_only_what_is_seen(dummy_display: None) -> None:
+    window, drawn = open_window(0.005), []
+
+    def draw() -> np.ndarray:
+        drawn.append(time.monotonic())
+        return np.full(SHAPE, 99, np.uint8)
+
+    for index in range(60):
+        window.show(draw, is_first=index == 0)
+    assert 2 <= len(drawn) <= 15 and min(np.diff(drawn)) > 0.03
+    assert window.pygame.display.get_surface().get_at((5, 5))[:3] == (99, 99, 99)
+    window.close()
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="elsewhere there is always a display")
+def test_window_without_a_display_says_so(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    pytest.importorskip("pygame", reason="the extra [render] is not installed")
+    for name in ("DISPLAY", "WAYLAND_DISPLAY", "SDL_VIDEODRIVER"):
+        monkeypatch.delenv(name, raising=False)
+    with caplog.at_level(logging.WARNING):
+        window = open_window(0.01)
+    assert "no display was found" in caplog.text and "dummy" in caplog.text
+    assert window.pygame.display.get_driver() == "dummy"
+    window.close()
+
+
+# --- What is missing ----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("package", "mode"), [("PIL", "rgb_array"), ("pygame", "human")])
+def test_missing_packages_are_named_with_the_remedy(
+    package: str, mode: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in [name for name in sys.modules if name.startswith("flytrack_env.rendering.")]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setitem(sys.modules, package, None)
+    with pytest.raises(ImportError, match=r"pip install 'flytrack\[render\]'"):
+        gymnasium.make(BASE, render_mode=mode)
+
+
+def test_nothing_is_imported_before_it_is_needed() -> None:
+    code = (
+        "import sys, gymnasium, flytrack_env\n"
+        f"gymnasium.make({BASE!r})\n"
+        "print([name for name in sys.modules if name in ('pygame', 'flytrack_env.rendering.renderer')])"
+    )
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert result.stdout.strip() == "[]"
