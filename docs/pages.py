@@ -162,7 +162,8 @@ def arguments_section(env_id: str) -> list[str]:
     entries = re.findall(r"^ {8}(\w+): (.*(?:\n {12}.*)*)", body, re.MULTILINE)
     rows = [(f"`{name}`", re.sub(r"\s+", " ", text).replace("``", "`")) for name, text in entries]
     parameters = inspect.signature(FlyTrack).parameters.values()
-    defaults = ", ".join(f"{parameter.name}={parameter.default!r}" for parameter in parameters)
+    shown = (f"{parameter.name}={parameter.default!r}" for parameter in parameters)
+    defaults = ", ".join(shown).replace("'", '"')
     lines = [
         "## Arguments",
         "",

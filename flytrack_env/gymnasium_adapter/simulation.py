@@ -12,6 +12,7 @@ from flytrack_env.env import EnvParams
 from flytrack_env.gymnasium_adapter.columns import Columns
 from flytrack_env.gymnasium_adapter.layout import Layout, Packed
 from flytrack_env.gymnasium_adapter.options import Start
+from flytrack_env.randomness import seed_of
 from flytrack_env.registration import make
 from flytrack_env.rendering import scene_row
 from flytrack_env.rendering.scene import GATE_INDEX
@@ -95,7 +96,7 @@ class Programs:
     def begin(self, words: jax.Array, drone: jax.Array, gate_index: Any, params: Packed) -> tuple[Any, ...]:
         """Return the same of an episode that begins with a drone (21,) and a gate to fly first."""
         unpacked = self.params_layout.unpack(params)
-        state = self.env.begin(unpack(drone), gate_index, unpacked)
+        state = self.env.begin(unpack(drone), gate_index, unpacked, seed_of(_key(words)))
         return self._begun(words, state, self.env.observe(_key(words), state, None, unpacked))
 
     @partial(jax.jit, static_argnums=0)

@@ -3,7 +3,7 @@
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
+import numpy as np
 
 from flytrack_env.dynamics import ModelParameters
 from flytrack_env.effects import CommandDelay, LinearDrag, ThrustScale, Wind, effect_of
@@ -147,8 +147,8 @@ def _check_ranges(ranges: RandomizationParams) -> None:
         names = [[parameters.__name__ for parameters in side] for side in classes]
         raise ValueError(f"high: found effects {names[1]}, expected those of low, {names[0]}")
     rows = [
-        ("mass_factor", ranges.mass_factor_low, ranges.mass_factor_high, 0.0, jnp.inf),
-        ("lag_factor", ranges.lag_factor_low, ranges.lag_factor_high, 0.0, jnp.inf),
+        ("mass_factor", ranges.mass_factor_low, ranges.mass_factor_high, 0.0, np.inf),
+        ("lag_factor", ranges.lag_factor_low, ranges.lag_factor_high, 0.0, np.inf),
     ]
     for low, high in zip(ranges.low, ranges.high, strict=True):
         effect = effect_of(low)
@@ -157,9 +157,10 @@ def _check_ranges(ranges: RandomizationParams) -> None:
             if pair != (None, None):
                 rows.append((f"{effect.name}.{name}", *pair, bounds.low, bounds.high))
     for name, low, high, lowest, highest in rows:
-        is_factor = name.endswith("_factor")
-        is_range = low is not None and high is not None and lowest <= low <= high <= highest
-        if not is_range or (is_factor and low <= 0.0):
+        # NaN, not 0, for None; not jnp, which would be traced under jit.
+        lows, highs = (np.asarray(np.nan if edge is None else edge) for edge in (low, high))
+        is_range = np.all((lowest <= lows) & (lows <= highs) & (highs <= highest))
+        if not is_range or (name.endswith("_factor") and np.any(lows <= 0.0)):
             raise ValueError(
                 f"{name}: found a range from {low} to {high}, expected one within {lowest:g} to {highest:g}"
             )

@@ -4,6 +4,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from flytrack_env.fusion import compute_once
 from flytrack_env.params import EnvParams
@@ -50,7 +51,7 @@ class ObservationNoise(Wrapper):
         """Raise ValueError for a negative standard deviation, and what the inner check refuses."""
         super().check_params(params)
         for name, value in self.own_params(params)._asdict().items():
-            if not jnp.all(jnp.asarray(value) >= 0.0):
+            if not np.all(np.asarray(value) >= 0.0):  # not jnp: that would be traced under jit
                 raise ValueError(f"params.wrappers[{self.key!r}].{name}: found {value}, expected >= 0")
 
     def begin(self, drone: Drone, gate_index: Any, params: EnvParams, seed: Any = 0) -> NoisyState:
