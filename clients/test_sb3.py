@@ -46,24 +46,23 @@ def test_ppo_learns_from_a_single_environment(env_id: str) -> None:
     after = [parameter.detach().numpy() for parameter in model.policy.parameters()]
     assert all(np.isfinite(values).all() for values in after)
     assert any((old != new).any() for old, new in zip(before, after, strict=True))
-    assert len(model.ep_info_buffer) > 0
+    assert model.num_timesteps == 256
 
 
 @every_id
-def test_many_at_once_say_where_episodes_ended(env_id: str) -> None:
-    envs, plain = make_vec(env_id), make_vec(env_id).env
+def test_many_at_once_say_where_episodes_ended(env_id: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    envs = make_vec(env_id)
+    step, given = envs.env.step, []
+    monkeypatch.setattr(envs.env, "step", lambda actions: given.append(step(actions)) or given[-1])
     envs.seed(3)
-    observations = envs.reset()
-    seeds = range(3, 3 + NUM_ENVS)
-    np.testing.assert_array_equal(observations, plain.reset(seed=list(seeds))[0])
+    start = envs.reset()
     num_terminated, num_truncated = 0, 0
     generator = np.random.default_rng(0)
     for _ in range(150):
         actions = generator.uniform(-1, 1, (NUM_ENVS, 4)).astype(np.float32)
         observations, rewards, done, infos = envs.step(actions)
-        expected = plain.step(actions)
-        np.testing.assert_array_equal(observations, expected[0])
-        np.testing.assert_array_equal(rewards, expected[1])
+        expected = given[-1]
+        assert observations is expected[0] and rewards is expected[1]
         np.testing.assert_array_equal(done, expected[2] | expected[3])
         for index, info in enumerate(infos):
             assert bool(info) == done[index]
@@ -75,6 +74,8 @@ def test_many_at_once_say_where_episodes_ended(env_id: str) -> None:
         num_terminated += expected[2].sum()
         num_truncated += (done & ~expected[2]).sum()
     assert num_terminated > 0 and num_truncated > 0
+    seeds = list(range(3, 3 + NUM_ENVS))
+    np.testing.assert_array_equal(start, envs.env.reset(seed=seeds)[0])
 
 
 def test_a_reset_without_a_seed_draws_on() -> None:
