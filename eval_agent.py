@@ -34,7 +34,7 @@ def black_box_env(checkpoint: Checkpoint, black_box: Path) -> FlyTrack:
         missed_gate=checkpoint.meta["missed_gate"],
     )
     checkpoint.check_fits(env)
-    env.default_params.check()
+    env.check_params(env.default_params)
     return env
 
 

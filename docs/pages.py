@@ -184,8 +184,10 @@ def arguments_section(env_id: str) -> list[str]:
 
 def range_rows(ranges: Any) -> list[tuple[str, str, str]]:
     """Return the rows of a randomisation: what, from, to."""
+    effect_factors = f"{ranges.effect_factor_low:g}", f"{ranges.effect_factor_high:g}"
     rows = [
         ("mass, factor", f"{ranges.mass_factor_low:g}", f"{ranges.mass_factor_high:g}"),
+        ("what the model has of the effects below, factor", *effect_factors),
         ("each of the four lags, factor", f"{ranges.lag_factor_low:g}", f"{ranges.lag_factor_high:g}"),
     ]
     for low, high in zip(ranges.low, ranges.high, strict=True):
@@ -272,7 +274,7 @@ def effects_page() -> str:
         neutral = effect.parameters()
         texts = [
             f"`{effect.equation}`. Acts on: {', '.join(effect.acts_on)} (stage {', '.join(effect.stages)}).",
-            *(["It has a memory: the last commands."] if effect.start else []),
+            *(["It has a memory."] if effect.start else []),
             f"Source: {effect.source}.",
         ]
         rows = [

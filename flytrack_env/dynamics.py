@@ -105,6 +105,13 @@ def integrate_attitude(quat: Quaternion, rates_b: Vec3, dt: Scalar) -> Quaternio
     return Quaternion(*(q + half_dt * dq for q, dq in zip(quat, turn, strict=True))).normalize()
 
 
+def start_rates(drone: Drone, params: ModelParameters) -> Vec3:
+    """Return the body rates, rad/s, of a drone that has flown with its applied action for long."""
+    flight = Flight(drone=drone, command=drone.applied, dt=0.0, applied=drone.applied)
+    memories = effects.start_memories(params.effects, drone)
+    return effects.fold("rates", params.effects, memories, body_rates(drone.applied, params.max_rate), flight)
+
+
 def _acceleration(flight: Flight, params: ModelParameters, memories: tuple[Any, ...]) -> Vec3:
     """Return the acceleration, world, m/s^2: thrust, gravity, and the forces of effects."""
     axes = flight.body_axes_w
@@ -112,7 +119,6 @@ def _acceleration(flight: Flight, params: ModelParameters, memories: tuple[Any, 
     if not effects.acts(params.effects, "force"):
         return acc_w
     still = Vec3(0.0, 0.0, 0.0)
-    flight = flight._replace(air_w=compute_once(effects.fold("air", params.effects, memories, still, flight)))
     force_b = compute_once(effects.fold("force", params.effects, memories, still, flight))
     return acc_w + (axes[0].scale(force_b.x) + axes[1].scale(force_b.y) + axes[2].scale(force_b.z))
 
@@ -128,14 +134,17 @@ def advance(
     """
     flight = Flight(drone=drone, command=command, dt=dt)
 
-    def fold(stage: str, value: Any) -> Any:
+    def fold(stage: str, value: Any) -> Any:  # with what is known of the flight by then
         return effects.fold(stage, params.effects, memories, value, flight)
 
     applied = compute_once(lag(drone.applied, fold("command", command), dt, params.tau))
     flight = flight._replace(applied=applied, body_axes_w=compute_once(drone.quat.axes()))
     rates_b = fold("rates", body_rates(applied, params.max_rate))
+    flight = flight._replace(rates_b=rates_b)
     thrust = fold("thrust", collective_thrust(applied.thrust, drone.battery_v, params.thrust_coeffs))
     flight = flight._replace(thrust_acc=compute_once(thrust / params.m))
+    if effects.acts(params.effects, "force"):
+        flight = flight._replace(air_w=compute_once(fold("air", Vec3(0.0, 0.0, 0.0))))
     acc_w = compute_once(_acceleration(flight, params, memories))
     after = Drone(
         pos_w=drone.pos_w + drone.vel_w.scale(dt) + acc_w.scale(0.5 * dt * dt),

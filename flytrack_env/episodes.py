@@ -148,13 +148,18 @@ class EpisodicEnvironment(environment.Environment[Any, EnvParams]):
         """Return observation and state of an episode that begins.
 
         Raises:
-            ValueError: parameters that no episode can be flown with, where their values are known (not
-                while tracing).
+            ValueError: parameters of another environment's wrappers; or that no episode can be flown with,
+                where their values are known (not while they are traced).
         """
         if params is None:
             params = self.default_params
+        expected = sorted(self.default_params.wrappers)
+        if sorted(params.wrappers) != expected:
+            found = sorted(params.wrappers)
+            raise ValueError(f"params.wrappers: found {found}, expected {expected}, as in default_params")
         if not any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(params)):
-            self.check_params(params)
+            # As NumPy: comparing JAX's arrays would be traced where the reset is.
+            self.check_params(jax.tree.map(np.asarray, params))
         return super().reset(key, params)
 
     def reset_env(self, key: jax.Array, params: EnvParams) -> tuple[jax.Array, Any]:
@@ -201,7 +206,7 @@ class EpisodicEnvironment(environment.Environment[Any, EnvParams]):
     def step_batch(self, key: jax.Array, states: Any, actions: jax.Array, params: EnvParams) -> Step:
         """``step`` for a whole batch with one key, faster than ``vmap(step)``.
 
-        states: leaves (num_envs,). actions: (num_envs, 4). params: one for all. Same results as
+        states: leaves (num_envs,). actions: (num_envs, 4). params: the same for all. Same results as
         ``vmap(step)`` up to the random draws: starts are sampled only in steps where an episode ended.
         """
         step_all = jax.vmap(self.step_env, in_axes=(None, 0, 0, None))

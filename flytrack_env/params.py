@@ -7,7 +7,7 @@ import chex
 import numpy as np
 
 from flytrack_env.dynamics import ModelParameters
-from flytrack_env.effects import effect_of
+from flytrack_env.effects import check_parameters
 from flytrack_env.quaternion import Scalar
 from flytrack_env.resets import ResetParams
 from flytrack_env.rewards import RewardWeights
@@ -44,14 +44,7 @@ class EnvParams:
                     f"reset.{name}: found {value}, expected {BATTERY_EMPTY_V:g} to {BATTERY_FULL_V:g} V"
                 )
         for parameters in self.model.effects:
-            effect = effect_of(parameters)
-            for name, bounds in effect.ranges.items():
-                value = np.asarray(getattr(parameters, name))
-                if not np.all((value >= bounds.low) & (value <= bounds.high)):
-                    expected = f"{bounds.low:g} to {bounds.high:g} {bounds.unit}"
-                    raise ValueError(
-                        f"model.effects: {effect.name}.{name}: found {value}, expected {expected}"
-                    )
+            check_parameters(parameters, self.dt)
         for name in ("dt", "drone_radius", "max_steps_in_episode"):
             value = getattr(self, name)
             if not np.all(np.asarray(value) > 0):

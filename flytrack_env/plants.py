@@ -2,7 +2,7 @@
 
 The environment, the evaluator and the identification tools fly anything with this contract.
 A plant's state is a pytree of its own, because a plant may remember more than the drone shows (a
-delay buffer, a gust); whoever holds a state asks for the drone in it.
+delay buffer, say); whoever holds a state asks for the drone in it.
 """
 
 from typing import Any, NamedTuple, Protocol

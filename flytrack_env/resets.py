@@ -6,7 +6,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from flytrack_env.dynamics import ModelParameters, body_rates
+from flytrack_env.dynamics import ModelParameters, start_rates
 from flytrack_env.fusion import compute_once
 from flytrack_env.quaternion import Quaternion, Scalar, Vec3
 from flytrack_env.randomness import Draws
@@ -87,10 +87,11 @@ def sample_start(
         vel_w=_velocity(draws, choose, along, params),
         acc_w=Vec3(0.0, 0.0, 0.0),
         quat=heading.multiply(_turn(draws, choose, params)),
-        rates_b=body_rates(applied, model.max_rate),
+        rates_b=Vec3(0.0, 0.0, 0.0),
         applied=applied,
         battery_v=draws.uniform("battery", battery_low_v, BATTERY_FULL_V),
     )
+    drone = drone._replace(rates_b=start_rates(drone, model))
     return jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32), drone), gate_index
 
 

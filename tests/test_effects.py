@@ -14,7 +14,6 @@ from flytrack_env import effects
 from flytrack_env.dynamics import ModelParameters, nominal_parameters, step
 from flytrack_env.effects import (
     EFFECTS,
-    STAGES,
     CommandDelay,
     Effect,
     LinearDrag,
@@ -23,8 +22,10 @@ from flytrack_env.effects import (
     RotorDrag,
     ThrustScale,
     Wind,
+    check_parameters,
 )
 from flytrack_env.effects.command_delay import BUFFER_STEPS
+from flytrack_env.env import FlyTrack
 from flytrack_env.plants import Simulator
 from flytrack_env.quaternion import Quaternion, Vec3
 from flytrack_env.state import Action, Drone, pack, unpack_action
@@ -161,10 +162,23 @@ def test_every_file_of_the_folder_is_in_the_list() -> None:
     assert files == {effect.name for effect in EFFECTS}
 
 
-def test_stages_are_those_of_the_contract() -> None:
-    used = {stage for effect in EFFECTS for stage in effect.stages}
-    assert used <= set(STAGES)
-    assert {place for effect in EFFECTS for place in effect.acts_on} <= set(STAGES.values())
+def test_parameters_beyond_what_the_effect_can_do_are_refused() -> None:
+    check_parameters(CommandDelay(0.04), 0.01)
+    for delay_s, dt, expected in (
+        (0.05, 0.01, "0 to 0.04 s"),
+        (0.03, 0.005, "0 to 0.02 s at steps of 0.005 s"),
+    ):
+        with pytest.raises(ValueError, match=f"command_delay.delay_s: found {delay_s}, expected {expected}"):
+            check_parameters(CommandDelay(delay_s), dt)
+
+
+def test_starts_have_the_rates_that_the_model_gives_their_sticks() -> None:
+    env = FlyTrack(model=NOMINAL.with_effects(RateScale(0.5, 0.6, 0.7)))
+    _, state = env.reset(jax.random.key(3))
+    drone = env.drone(state)
+    held = env.drone(env.advance(state, drone.applied, env.default_params)[0])
+    assert np.abs(drone.rates_b).max() > 0.1
+    np.testing.assert_allclose(drone.rates_b, held.rates_b, rtol=1e-5)
 
 
 # --- A model with effects -------------------------------------------------------------------------

@@ -2,7 +2,10 @@
 
 import copy
 import importlib
+import json
 import pickle
+import subprocess
+import sys
 import warnings
 from importlib.util import find_spec
 from pathlib import Path
@@ -26,6 +29,9 @@ from flytrack_env.tracks import load_track
 
 IDS = sorted(ENVIRONMENTS)
 BASE = "FlyTrack-v0"
+# For what takes long to compile: the last row of the table has everything that the others have.
+LAST = list(ENVIRONMENTS)[-1]
+SOME_SLOW_IDS = [pytest.param(env_id, marks=[] if env_id == LAST else pytest.mark.slow) for env_id in IDS]
 CRASH = np.full(4, np.nan, np.float32)  # an action that ends the episode
 # Before, Gymnasium's wrapper left out the first step after an end (Gymnasium, pull request 1624).
 COUNTS_EVERY_STEP = tuple(map(int, gymnasium.__version__.split(".")[:2])) >= (1, 4)
@@ -78,7 +84,7 @@ def test_ids_are_registered_once_and_without_a_second_time_limit(env_id: str) ->
     assert np.isfinite(env.observation_space.low).all() and np.isfinite(env.observation_space.high).all()
 
 
-@pytest.mark.parametrize("env_id", IDS)
+@pytest.mark.parametrize("env_id", SOME_SLOW_IDS)
 def test_vector_environment_of_every_id_resets_in_the_same_step(env_id: str) -> None:
     env = make_vector(env_id)
     assert env.metadata["autoreset_mode"] is AutoresetMode.SAME_STEP
@@ -223,7 +229,24 @@ def test_vector_seeds() -> None:
         env.reset(seed=[1, 2])
 
 
-def test_other_processes_fly_the_same() -> None:
+def test_another_process_flies_the_same_and_imports_no_viewer() -> None:
+    code = f"""
+import json, sys, gymnasium
+env = gymnasium.make("flytrack_env:{BASE}")
+start = env.reset(seed=9)[0].tolist()
+viewers = [name for name in ("pygame", "flytrack_env.rendering.renderer") if name in sys.modules]
+print(json.dumps([start, env.step([0.1] * 4)[0].tolist(), viewers]))
+"""
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    start, after, viewers = json.loads(result.stdout)
+    env = gymnasium.make(BASE)
+    np.testing.assert_array_equal(env.reset(seed=9)[0], np.float32(start))
+    np.testing.assert_array_equal(env.step([0.1] * 4)[0], np.float32(after))
+    assert viewers == []
+
+
+@pytest.mark.slow
+def test_worker_processes_fly_the_same() -> None:
     # Not "fork": JAX has threads, which a forked process lacks.
     workers = AsyncVectorEnv([lambda: gymnasium.make(f"flytrack_env:{BASE}")] * 2, context="spawn")
     try:

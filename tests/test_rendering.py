@@ -1,7 +1,6 @@
 """Pictures of a flight: what they show, that they keep up, and what is said where they cannot."""
 
 import logging
-import subprocess
 import sys
 import time
 from pathlib import Path
@@ -323,13 +322,3 @@ def test_missing_packages_are_named_with_the_remedy(
     monkeypatch.setitem(sys.modules, package, None)
     with pytest.raises(ImportError, match=r"pip install 'flytrack\[render\]'"):
         gymnasium.make(BASE, render_mode=mode)
-
-
-def test_nothing_is_imported_before_it_is_needed() -> None:
-    code = (
-        "import sys, gymnasium, flytrack_env\n"
-        f"gymnasium.make({BASE!r})\n"
-        "print([name for name in sys.modules if name in ('pygame', 'flytrack_env.rendering.renderer')])"
-    )
-    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert result.stdout.strip() == "[]"

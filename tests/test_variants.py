@@ -57,16 +57,22 @@ def test_identical_seeds_fly_identically_in_another_process(env_id: str) -> None
 
 @OVER_IDS
 def test_without_jit_it_flies_the_same(env_id: str) -> None:
-    """Within 1e-5, over the first steps of an episode, one by one from the same states."""
+    """Within 1e-5: a reset, steps each from its own last state, and an end with its reset."""
     env, params = gymnax.make(env_id)
-    _, state = env.reset(jax.random.key(3), params)
-    for action in jax.random.uniform(jax.random.key(4), (3, 4), minval=-1.0):
-        compiled = jax.jit(env.step_env)(None, state, action, params)
-        with jax.disable_jit():
-            plain = env.step_env(None, state, action, params)
-        for a, b in zip(jax.tree.leaves(compiled), jax.tree.leaves(plain), strict=True):
-            np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-5)
-        state = compiled[1]
+    params = params.replace(max_steps_in_episode=3)
+
+    def flight(reset: Any, step: Any) -> list[Any]:
+        results = [reset(jax.random.key(3), params)]
+        for i, action in enumerate(jax.random.uniform(jax.random.key(4), (4, 4), minval=-1.0)):
+            results.append(step(jax.random.key(i), results[-1][1], action, params))
+        return results
+
+    compiled = flight(jax.jit(env.reset), env.step)
+    with jax.disable_jit():
+        plain = flight(env.reset, env.step)
+    assert bool(compiled[3][4]) and not bool(compiled[2][4])  # truncated after three steps
+    for a, b in zip(jax.tree.leaves(compiled), jax.tree.leaves(plain), strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-5)
 
 
 @OVER_IDS
@@ -149,6 +155,6 @@ def test_a_heavier_drone_hovers_at_another_command(make_drone: Any) -> None:
     assert np.ptp(commands) > 0.1
 
 
-def test_names_are_the_ids_and_parts_are_public() -> None:
+def test_names_are_the_ids() -> None:
     for env_id in ENVIRONMENTS:
         assert flytrack_env.make(env_id).name == env_id

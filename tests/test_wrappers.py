@@ -14,6 +14,7 @@ import pytest
 from gymnax.wrappers import LogWrapper
 
 from flytrack_env.effects import CommandDelay as Delay
+from flytrack_env.effects import LinearDrag, QuadraticDrag, ThrustScale, effect_of
 from flytrack_env.env import EnvParams, FlyTrack
 from flytrack_env.observations import OBSERVATION_SIZE
 from flytrack_env.state import Action, pack
@@ -71,8 +72,8 @@ def _fly(env: Any, key: jax.Array, params: EnvParams) -> Any:
 # --- Composition ----------------------------------------------------------------------------------
 
 
-def test_orders_that_make_sense_give_the_same_environment() -> None:
-    """Every permutation either flies, with the same observation size and infos, or is refused."""
+def test_orders_that_make_sense_have_the_same_spaces_and_parameters() -> None:
+    """The others are refused: exactly those with the history of commands inside the delay."""
     refused = []
     for order in permutations(ALL):
         try:
@@ -88,7 +89,6 @@ def test_orders_that_make_sense_give_the_same_environment() -> None:
             "command_delay",
             "observation_noise",
         }
-    # One in two: exactly those with the history inside the delay.
     assert len(refused) == 60
     assert all(order.index(ActionHistory) < order.index(CommandDelay) for order in refused)
 
@@ -97,6 +97,14 @@ def test_orders_that_make_sense_give_the_same_environment() -> None:
     "order",
     [
         (EpisodeStatistics, ObservationNoise, CommandDelay, ActionHistory, DomainRandomization),
+        pytest.param(
+            (CommandDelay, ActionHistory, DomainRandomization, EpisodeStatistics, ObservationNoise),
+            marks=pytest.mark.slow,
+        ),
+        pytest.param(
+            (ObservationNoise, EpisodeStatistics, DomainRandomization, CommandDelay, ActionHistory),
+            marks=pytest.mark.slow,
+        ),
     ],
 )
 def test_the_order_does_not_change_the_flight(order: tuple[Any, ...]) -> None:
@@ -109,7 +117,7 @@ def test_the_order_does_not_change_the_flight(order: tuple[Any, ...]) -> None:
 
 @OVER_WRAPPERS
 def test_twice_is_refused(wrapper: Any) -> None:
-    with pytest.raises(WrapperError, match=f"{wrapper.__name__}: found another one inside"):
+    with pytest.raises(WrapperError, match=f"{wrapper.__name__} around {wrapper.__name__}: both"):
         wrapper(
             ObservationNoise(wrapper(FlyTrack())) if wrapper is not ObservationNoise else wrapped(wrapper)
         )
@@ -150,8 +158,52 @@ def test_parameters_of_another_environment_are_refused(wrapper: Any) -> None:
     if env.own_defaults() is None:
         env.reset(jax.random.key(0), FlyTrack().default_params)
         return
-    with pytest.raises(ValueError, match=rf"params\.wrappers\['{wrapper.key}'\]: found None, expected"):
-        env.reset(jax.random.key(0), FlyTrack().default_params)
+    others = FlyTrack().default_params
+    with pytest.raises(ValueError, match=rf"params\.wrappers: found \[\], expected \['{env.key}'\]"):
+        env.reset(jax.random.key(0), others)
+    _, state = env.reset(jax.random.key(0))
+    with pytest.raises(ValueError, match=rf"params\.wrappers: found \[\], expected '{env.key}' among them"):
+        env.step(jax.random.key(0), state, jnp.zeros(4), others)
+    unknown = others.replace(wrappers={env.key: env.own_defaults(), "nois": NoiseParams()})
+    with pytest.raises(ValueError, match=r"params\.wrappers: found \[.*'nois'\], expected"):
+        env.reset(jax.random.key(0), unknown)
+
+
+def test_histories_of_both_kinds_and_a_delay_around_applied_actions_make_sense() -> None:
+    env = ActionHistory(CommandDelay(ActionHistory(FlyTrack(), kind="applied", length=2)), length=1)
+    assert env.observation_space().shape == (OBSERVATION_SIZE + 3 * 4,)
+    assert len({entry.key for entry in env.observation_table}) == len(env.observation_table)
+
+
+def test_a_subclass_counts_as_what_it_is() -> None:
+    class Louder(ObservationNoise):
+        pass
+
+    class Longer(ActionHistory):
+        pass
+
+    with pytest.raises(WrapperError, match="Louder around ObservationNoise: both"):
+        Louder(ObservationNoise(FlyTrack()))
+    with pytest.raises(WrapperError, match="CommandDelay around Longer: the history would hold"):
+        CommandDelay(Longer(FlyTrack()))
+
+
+@OVER_WRAPPERS
+def test_a_reset_may_be_traced_with_parameters_that_are_not(wrapper: Any) -> None:
+    env, key = wrapped(wrapper), jax.random.key(0)
+    arrays = jax.tree.map(jnp.asarray, env.default_params)
+    jax.eval_shape(env.reset, key)
+    jax.eval_shape(lambda key: env.reset(key, env.default_params), key)
+    jax.eval_shape(lambda key: env.reset(key, arrays), key)
+    jax.eval_shape(LogWrapper(env).reset, key)
+    jax.eval_shape(LegacyStep(env).reset, key)
+
+
+def test_gradients_stay_wanted_through_wrapping() -> None:
+    smooth = ObservationNoise(FlyTrack()).with_transition_gradients()
+    assert ActionHistory(smooth).transition_gradients_enabled
+    legacy = LegacyStep(ObservationNoise(FlyTrack())).with_transition_gradients()
+    assert isinstance(legacy, LegacyStep) and legacy.transition_gradients_enabled
 
 
 # --- Nothing survives an episode ------------------------------------------------------------------
@@ -281,11 +333,21 @@ def test_noise_has_the_stated_deviations_and_is_white() -> None:
 
 def test_noise_stays_inside_the_space_and_off_the_flight() -> None:
     env = wrapped(ObservationNoise)
-    loud = {"wrappers": {"observation_noise": NoiseParams(50.0, 50.0, 90.0, 50.0)}}
+    loud = {"wrappers": {"observation_noise": NoiseParams(50.0, 50.0, 20.0, 50.0)}}
     noisy, plain = fly(env, **loud), fly(wrapped())
     limit = np.asarray(env.observation_space().high)
     assert (np.abs(np.asarray(noisy[2][0])) <= limit).all()
     np.testing.assert_allclose(noisy[2][2], plain[2][2], atol=1e-5)  # rewards are of the true flight
+
+
+@pytest.mark.parametrize(
+    ("field", "value"), [("position_m", -0.1), ("attitude_deg", 21.0), ("rates_rad_per_s", np.nan)]
+)
+def test_bad_deviations_are_refused(field: str, value: float) -> None:
+    env = wrapped(ObservationNoise)
+    bad = {"observation_noise": NoiseParams()._replace(**{field: value})}
+    with pytest.raises(ValueError, match=rf"\.{field}: found {value}, expected 0 to"):
+        env.reset(jax.random.key(0), env.default_params.replace(wrappers=bad))
 
 
 # --- Action history -------------------------------------------------------------------------------
@@ -415,6 +477,25 @@ def test_no_range_is_the_plain_environment() -> None:
     np.testing.assert_allclose(randomised[2][0], fly(wrapped())[2][0], atol=1e-5)
 
 
+def test_what_the_model_itself_has_is_drawn_around_it() -> None:
+    """An identified effect is known: scaled, within its range. What is not among the ranges stays."""
+    env = wrapped(DomainRandomization)
+    known = (Delay(0.036), ThrustScale(0.6), LinearDrag(1.0, -0.5, 0.0), QuadraticDrag(0.1))
+    params = env.default_params.replace(model=FlyTrack().default_params.model.with_effects(*known))
+    keys = jax.random.split(jax.random.key(0), 500)
+    models = jax.jit(jax.vmap(lambda key: env.model(env.reset(key, params)[1], params)))(keys)
+    assert models.tau.shape == (500, 4)
+    by_name = {effect_of(effect).name: jax.tree.map(np.asarray, effect) for effect in models.effects}
+    assert list(by_name) == ["command_delay", "thrust_scale", "wind", "linear_drag", "quadratic_drag"]
+    delay_s = by_name["command_delay"].delay_s
+    assert 0.8 * 0.036 <= delay_s.min() < 0.03 and delay_s.max() == np.float32(0.04)
+    factor, drag = by_name["thrust_scale"].factor, by_name["linear_drag"]
+    assert 1.0 - 0.4 * 1.2 <= factor.min() < 0.54 and 0.66 < factor.max() <= 1.0 - 0.4 * 0.8 + 1e-6
+    assert 0.8 <= drag.d_x.min() < 0.83 and 1.17 < drag.d_x.max() <= 1.2 + 1e-6
+    assert -0.6 - 1e-6 <= drag.d_y.min() < -0.58 and (drag.d_z == 0.0).all()
+    assert (by_name["quadratic_drag"].k_x == np.float32(0.1)).all()
+
+
 BASE = RandomizationParams()
 BAD_RANGES = [
     (BASE._replace(mass_factor_low=1.3), r"mass_factor: found a range from 1\.3 to 1\.2"),
@@ -422,7 +503,7 @@ BAD_RANGES = [
     (BASE._replace(low=BASE.low[1:]), r"high: found effects \['CommandDelay', .* expected those of low"),
     (
         BASE._replace(high=(BASE.high[0]._replace(delay_s=0.1), *BASE.high[1:])),
-        r"command_delay\.delay_s: found a range from 0\.0 to 0\.1, expected one within 0 to 0\.04",
+        r"command_delay\.delay_s: found 0\.1, expected 0 to 0\.04 s",
     ),
     (
         BASE._replace(high=(BASE.high[0]._replace(delay_s=None), *BASE.high[1:])),

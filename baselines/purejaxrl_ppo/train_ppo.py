@@ -60,7 +60,7 @@ def train_policy(
     track = track_reference(env_arguments.get("track", "flytrack"))
     env = flytrack_env.make(env_id, **env_arguments)
     config.check()
-    env.default_params.check()
+    env.check_params(env.default_params)
     out.mkdir(parents=True, exist_ok=True)
     num_steps = config.num_updates * config.batch_size
     with tqdm(total=num_steps, unit="step", unit_scale=True, desc="train") as bar:

@@ -6,6 +6,8 @@ them, the documentation lists them. A new effect is a file here and a line in ``
 
 from typing import Any
 
+import numpy as np
+
 from flytrack_env.effects.base import STAGES, Effect, Flight, Range
 from flytrack_env.effects.command_delay import COMMAND_DELAY, CommandDelay
 from flytrack_env.effects.linear_drag import LINEAR_DRAG, LinearDrag
@@ -26,6 +28,7 @@ EFFECTS: tuple[Effect, ...] = (
     QUADRATIC_DRAG,
     ROTOR_DRAG,
 )
+ROUNDING = 1e-5  # of float32 times
 BY_NAME = {effect.name: effect for effect in EFFECTS}
 _BY_CLASS = {effect.parameters: effect for effect in EFFECTS}
 
@@ -41,6 +44,22 @@ def effect_of(parameters: Any) -> Effect:
         names = ", ".join(effect.parameters.__name__ for effect in EFFECTS)
         raise TypeError(f"effect: found {type(parameters).__name__}, expected one of {names}")
     return effect
+
+
+def check_parameters(parameters: Any, dt: Any) -> None:
+    """Raise ValueError, naming effect and parameter, for concrete values beyond what the effect can do.
+
+    dt: step of time, s.
+    """
+    effect = effect_of(parameters)
+    for name, bounds in effect.ranges.items():
+        value = np.asarray(getattr(parameters, name))
+        longest = effect.most_steps.get(name, np.inf) * np.asarray(dt, float)
+        high = np.minimum(bounds.high, longest * (1.0 + ROUNDING))
+        if not np.all((value >= bounds.low) & (value <= high)):
+            reason = f" at steps of {dt} s" if np.any(longest < bounds.high) else ""
+            expected = f"{bounds.low:g} to {np.min(high):g} {bounds.unit}{reason}"
+            raise ValueError(f"{effect.name}.{name}: found {value}, expected {expected}")
 
 
 def merge(present: tuple[Any, ...], *added: Any) -> tuple[Any, ...]:
@@ -93,6 +112,7 @@ __all__ = [
     "ThrustScale",
     "Wind",
     "acts",
+    "check_parameters",
     "effect_of",
     "fold",
     "merge",

@@ -20,7 +20,7 @@ value. At neutral parameters it returns the value bit for bit, so that neutral e
 """
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 from flytrack_env.quaternion import Scalar, Vec3
@@ -35,7 +35,8 @@ class Flight(NamedTuple):
 
     drone: before the step. command: as given, before any effect. dt: s.
     applied: the lagged action after the step. body_axes_w: the body's x, y, z axes before the step.
-    thrust_acc: collective thrust over mass, after the stage thrust, m/s^2. air_w: m/s.
+    rates_b: after the stage rates, rad/s. thrust_acc: collective thrust over mass, after the stage thrust,
+    m/s^2. air_w: after the stage air, m/s.
     """
 
     drone: Drone
@@ -43,6 +44,7 @@ class Flight(NamedTuple):
     dt: Scalar
     applied: Action | None = None
     body_axes_w: tuple[Vec3, Vec3, Vec3] | None = None
+    rates_b: Vec3 | None = None
     thrust_acc: Scalar | None = None
     air_w: Vec3 | None = None
 
@@ -72,6 +74,7 @@ class Effect:
 
     name: as in model files. parameters: the NamedTuple class; its defaults are neutral. ranges: of each
     parameter. equation, source: for people. command, rates, thrust, air, force: hooks at these stages.
+    most_steps: of parameters that are times, how many steps of time they may last.
     start: (parameters, drone) -> memory of an episode that begins; no memory if None.
     remember: (parameters, memory, flight) -> memory after a step.
     """
@@ -81,6 +84,7 @@ class Effect:
     ranges: Mapping[str, Range]
     equation: str
     source: str
+    most_steps: Mapping[str, int] = field(default_factory=dict)
     command: Hook | None = None
     rates: Hook | None = None
     thrust: Hook | None = None

@@ -9,7 +9,7 @@ from flytrack_env.effects.base import Effect, Flight, Range
 from flytrack_env.quaternion import Scalar
 from flytrack_env.state import Action, Drone
 
-# Commands remembered: at 100 Hz, delays up to 0.04 s. Longer ones are flown as that.
+# Commands remembered: at 100 Hz, delays up to 0.04 s.
 BUFFER_STEPS = 4
 
 
@@ -60,6 +60,7 @@ COMMAND_DELAY = Effect(
     parameters=CommandDelay,
     ranges={"delay_s": Range(0.0, 0.04, "s")},
     equation="u(t) = u(t - delay), averaged over the step",
+    most_steps={"delay_s": BUFFER_STEPS},
     source="assumption: the same for all four commands, constant within a flight",
     command=delayed,
     start=start,

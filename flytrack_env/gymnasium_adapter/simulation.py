@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from flytrack_env.env import EnvParams
+from flytrack_env.episodes import EpisodicEnvironment
 from flytrack_env.gymnasium_adapter.columns import Columns
 from flytrack_env.gymnasium_adapter.layout import Layout, Packed
 from flytrack_env.gymnasium_adapter.options import Start
@@ -51,35 +52,37 @@ def _grouped(reward: jax.Array, terminated: jax.Array, truncated: jax.Array, inf
 class Programs:
     """Compiled functions of an environment for parameters of one structure.
 
-    state: of an episode, arrays or shapes. A packed episode is the key's words, the number of steps
-    flown, and the environment's state.
+    state: of an episode, arrays or shapes. States and parameters go in and out packed.
     """
 
-    def __init__(self, env: Any, params: EnvParams, state: Any):
+    def __init__(self, env: EpisodicEnvironment, params: EnvParams, state: Any):
         self.env = env
-        self.params_layout = Layout.of(params)
-        words = jax.ShapeDtypeStruct((KEY_WORDS,), jnp.uint32)
-        count = jax.ShapeDtypeStruct((), jnp.uint32)
-        self.state_layout = Layout.of(state)
-        self.episode_layout = Layout.of((words, count, state))
+        self.params_layout, self.state_layout = Layout.of(params), Layout.of(state)
         action = jax.ShapeDtypeStruct(env.action_space(params).shape, jnp.float32)
-        outcome = jax.eval_shape(partial(self._outcome, params=params), words, state, action)[2]
+        outcome = jax.eval_shape(partial(self._outcome, params=params), state, action)[2]
         self.columns = Columns(outcome)
         self.batch_columns = Columns(jax.eval_shape(_grouped, *outcome))
 
     def _outcome(
-        self, words: jax.Array, state: Any, action: jax.Array, params: EnvParams
+        self, state: Any, action: jax.Array, params: EnvParams
     ) -> tuple[jax.Array, Any, tuple[Any, ...]]:
         """Return observation, state, and (reward, terminated, truncated, info) of a step."""
-        observation, state, reward, terminated, info = self.env.step_env(_key(words), state, action, params)
+        observation, state, reward, terminated, info = self.env.step_env(None, state, action, params)
         return observation, state, (reward, terminated, self.env.is_truncated(state, params), info)
 
     def _scene(self, state: Any) -> jax.Array:
         return scene_row(self.env.drone(state), self.env.race(state))
 
-    def _begun(self, words: jax.Array, state: Any, observation: jax.Array) -> tuple[Any, ...]:
-        episode = self.episode_layout.pack((words, jnp.uint32(0), state))
-        return episode, observation, self._scene(state)
+    def _reset(self, words: jax.Array, params: Packed) -> tuple[Any, jax.Array, jax.Array]:
+        observation, state = self.env.reset(_key(words), self.params_layout.unpack(params))
+        return state, observation, self._scene(state)
+
+    def _begin(
+        self, words: jax.Array, drone: jax.Array, gate_index: Any, params: Packed
+    ) -> tuple[Any, jax.Array, jax.Array]:
+        unpacked = self.params_layout.unpack(params)
+        state = self.env.begin(unpack(drone), gate_index, unpacked, seed_of(_key(words)))
+        return state, self.env.observe(None, state, None, unpacked), self._scene(state)
 
     @partial(jax.jit, static_argnums=0)
     def pack_params(self, params: EnvParams) -> Packed:
@@ -87,46 +90,42 @@ class Programs:
         return self.params_layout.pack(params)
 
     @partial(jax.jit, static_argnums=0)
-    def reset(self, words: jax.Array, params: Packed) -> tuple[Any, ...]:
-        """Return packed episode, observation and scene of an episode that begins as drawn."""
-        observation, state = self.env.reset(_key(words), self.params_layout.unpack(params))
-        return self._begun(words, state, observation)
+    def reset(self, words: jax.Array, params: Packed) -> tuple[Packed, jax.Array, jax.Array]:
+        """Return state, observation and scene of an episode that begins as drawn from a key's words."""
+        state, *seen = self._reset(words, params)
+        return self.state_layout.pack(state), *seen
 
     @partial(jax.jit, static_argnums=0)
-    def begin(self, words: jax.Array, drone: jax.Array, gate_index: Any, params: Packed) -> tuple[Any, ...]:
+    def begin(
+        self, words: jax.Array, drone: jax.Array, gate_index: Any, params: Packed
+    ) -> tuple[Packed, jax.Array, jax.Array]:
         """Return the same of an episode that begins with a drone (21,) and a gate to fly first."""
-        unpacked = self.params_layout.unpack(params)
-        state = self.env.begin(unpack(drone), gate_index, unpacked, seed_of(_key(words)))
-        return self._begun(words, state, self.env.observe(_key(words), state, None, unpacked))
+        state, *seen = self._begin(words, drone, gate_index, params)
+        return self.state_layout.pack(state), *seen
 
     @partial(jax.jit, static_argnums=0)
-    def step(self, episode: Packed, action: jax.Array, params: Packed) -> tuple[Any, ...]:
-        """Return packed episode, observation, scene, and the blocks of ``columns``."""
-        words, count, state = self.episode_layout.unpack(episode)
-        step_words = jax.random.key_data(jax.random.fold_in(_key(words), count))
-        observation, state, outcome = self._outcome(
-            step_words, state, action, self.params_layout.unpack(params)
+    def step(self, state: Packed, action: jax.Array, params: Packed) -> tuple[Any, ...]:
+        """Return state, observation, scene, and the blocks of ``columns``."""
+        observation, new_state, outcome = self._outcome(
+            self.state_layout.unpack(state), action, self.params_layout.unpack(params)
         )
-        episode = self.episode_layout.pack((words, count + 1, state))
-        return episode, observation, self._scene(state), self.columns.gather(outcome)
+        blocks = self.columns.gather(outcome)
+        return self.state_layout.pack(new_state), observation, self._scene(new_state), blocks
 
     @partial(jax.jit, static_argnums=0)
-    def reset_batch(self, words: jax.Array, params: Packed) -> tuple[Any, ...]:
-        """Return packed states, observations and scenes of a batch; words: (num_envs, KEY_WORDS)."""
-        return self._unpack_episodes(*jax.vmap(self.reset, in_axes=(0, None))(words, params))
+    def reset_batch(self, words: jax.Array, params: Packed) -> tuple[Packed, jax.Array, jax.Array]:
+        """Return states, observations and scenes of a batch; words: (num_envs, KEY_WORDS)."""
+        states, *seen = jax.vmap(self._reset, in_axes=(0, None))(words, params)
+        return self.state_layout.pack_batch(states), *seen
 
     @partial(jax.jit, static_argnums=0)
     def begin_batch(
         self, words: jax.Array, drones: jax.Array, gate_indices: jax.Array, params: Packed
-    ) -> tuple[Any, ...]:
+    ) -> tuple[Packed, jax.Array, jax.Array]:
         """Return the same of episodes that begin with drones (num_envs, 21) and gates (num_envs,)."""
-        begin_all = jax.vmap(self.begin, in_axes=(0, 0, 0, None))
-        return self._unpack_episodes(*begin_all(words, drones, gate_indices, params))
-
-    def _unpack_episodes(self, episodes: Packed, observations: Any, scenes: Any) -> tuple[Any, ...]:
-        """Return the packed states of packed episodes; a batch shares one key, which is no part of them."""
-        _, _, states = jax.vmap(self.episode_layout.unpack)(episodes)
-        return self.state_layout.pack_batch(states), observations, scenes
+        begin_all = jax.vmap(self._begin, in_axes=(0, 0, 0, None))
+        states, *seen = begin_all(words, drones, gate_indices, params)
+        return self.state_layout.pack_batch(states), *seen
 
     @partial(jax.jit, static_argnums=(0, 6))
     def step_batch(
@@ -138,9 +137,9 @@ class Programs:
         params: Packed,
         has_scenes: bool,
     ) -> tuple[Any, ...]:
-        """Return packed states, observations, final observations, scenes, and ``batch_columns``' blocks.
+        """Return states, observations, final observations, scenes, and the blocks of ``batch_columns``.
 
-        The auto-resetting step of a batch; words: of one key for all, which step ``count`` makes its own.
+        The auto-resetting step of a batch. words: of one key for all; count: makes it this step's own.
         scenes: (num_envs, SCENE_SIZE) after the auto-reset if they are asked for, else None.
         """
         key = jax.random.fold_in(_key(words), count)
@@ -161,7 +160,7 @@ class Simulation:
     env_id, overrides: what ``flytrack_env.make`` takes. params: replace the defaults if not None.
 
     Raises:
-        ValueError: what ``flytrack_env.make`` and ``EnvParams.check`` refuse, and leaves of another shape.
+        ValueError: what ``flytrack_env.make`` and ``check_params`` refuse, and leaves of another shape.
         TypeError: params of another type.
     """
 
@@ -170,8 +169,8 @@ class Simulation:
         self.env, programs = _shared(env_id, overrides)
         self.params = self.env.default_params if params is None else params
         _check_shapes(self.params, self.env.default_params)
-        # With parameters that are not traced, reset checks their values.
-        _, state = jax.eval_shape(lambda key: self.env.reset(key, self.params), jax.random.key(0))
+        self.env.check_params(self.params)
+        _, state = jax.eval_shape(self.env.reset, jax.random.key(0), self.params)
         layout = Layout.of(self.params)
         if layout not in programs:
             programs[layout] = Programs(self.env, self.params, state)
@@ -188,10 +187,9 @@ class Simulation:
         return Simulation(self.env_id, self.params.replace(course=course), self.overrides)
 
     def begin(self, words: np.ndarray, start: Start) -> tuple[Packed, jax.Array, jax.Array]:
-        """Return packed episode, observation and scene of an episode that begins.
+        """Return packed state, observation and scene of an episode that begins.
 
-        words: of a key, (KEY_WORDS,); or (num_envs, KEY_WORDS) for packed states, observations and scenes
-        of a batch.
+        words: of a key, (KEY_WORDS,); or (num_envs, KEY_WORDS) for the same of a batch.
         """
         programs, params, batch = self.programs, self.packed_params, words.shape[:-1]
         if start.drone is None:
@@ -218,7 +216,10 @@ def _check_shapes(params: EnvParams, default: EnvParams) -> None:
     """Refuse what is no EnvParams, or has leaves of a batch; a course may have any number of gates."""
     if not isinstance(params, EnvParams):
         raise TypeError(f"params: found {type(params).__name__}, expected EnvParams")
-    found = jax.tree_util.tree_leaves_with_path(params.replace(course=default.course))
+    params = params.replace(course=default.course)
+    if jax.tree.structure(params) != jax.tree.structure(default):
+        return  # other effects, say
+    found = jax.tree_util.tree_leaves_with_path(params)
     for (path, leaf), expected in zip(found, jax.tree.leaves(default), strict=True):
         if np.shape(leaf) != np.shape(expected):
             name = f"params{jax.tree_util.keystr(path)}"
@@ -226,7 +227,7 @@ def _check_shapes(params: EnvParams, default: EnvParams) -> None:
 
 
 # Environments by what they were made with: the second one of a kind needs no compilation.
-_SHARED: dict[Any, tuple[Any, dict[Layout, Programs]]] = {}
+_SHARED: dict[Any, tuple[EpisodicEnvironment, dict[Layout, Programs]]] = {}
 MOST_SHARED = 16
 
 
@@ -238,7 +239,7 @@ def _identity(value: Any) -> Any:
     return value
 
 
-def _shared(env_id: str, overrides: dict[str, Any]) -> tuple[Any, dict[Layout, Programs]]:
+def _shared(env_id: str, overrides: dict[str, Any]) -> tuple[EpisodicEnvironment, dict[Layout, Programs]]:
     """Return an environment and its programs by their parameters' layout."""
     try:
         key = (env_id, frozenset((name, _identity(value)) for name, value in overrides.items()))

@@ -8,10 +8,7 @@ import numpy as np
 from flytrack_env.env import EnvParams
 from flytrack_env.gymnasium_adapter.common import box, check_render_mode, metadata_of
 from flytrack_env.gymnasium_adapter.options import TRACK, check_names, read_start
-from flytrack_env.gymnasium_adapter.simulation import (
-    Simulation,
-    draw_key,
-)
+from flytrack_env.gymnasium_adapter.simulation import Simulation, draw_key
 from flytrack_env.rendering import FlightLog, make_renderer, open_window
 
 RENDER_MODES = ("human", "rgb_array")
@@ -27,7 +24,7 @@ class FlyTrackEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         overrides: further arguments of ``flytrack_env.make``: track, model, plant, missed_gate.
 
     Raises:
-        ValueError: what ``flytrack_env.make`` and ``EnvParams.check`` refuse, or an unknown render mode.
+        ValueError: what ``flytrack_env.make`` and ``check_params`` refuse, or an unknown render mode.
         TypeError: params of another type.
         ImportError: a render mode whose package is not installed.
     """
@@ -48,7 +45,7 @@ class FlyTrackEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         env, params = self._simulation.env, self._simulation.params
         self.observation_space = box(env.observation_space(params))
         self.action_space = box(env.action_space(params))
-        self._episode: Any = None
+        self._state: Any = None
         self._log = FlightLog(float(params.dt))
         self._renderer = None if render_mode is None else make_renderer(params.course)
         self._window = open_window(float(params.dt)) if render_mode == "human" else None
@@ -73,7 +70,7 @@ class FlyTrackEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         if simulation is not self._simulation:
             self._simulation = simulation
             self._renderer = self._renderer and make_renderer(simulation.params.course)
-        self._episode, observation, scene = simulation.begin(draw_key(self.np_random), start)
+        self._state, observation, scene = simulation.begin(draw_key(self.np_random), start)
         self._log = FlightLog(float(simulation.params.dt))
         self._show(scene)
         return np.array(observation), {}
@@ -87,14 +84,14 @@ class FlyTrackEnv(gymnasium.Env[np.ndarray, np.ndarray]):
             gymnasium.error.ResetNeeded: no episode has begun.
             ValueError: an action of another shape.
         """
-        if self._episode is None:
+        if self._state is None:
             raise gymnasium.error.ResetNeeded("step: found no episode, expected a reset before it")
         action = np.asarray(action, np.float32)
         if action.shape != self.action_space.shape:
             raise ValueError(f"action: found shape {action.shape}, expected {self.action_space.shape}")
         programs = self._simulation.programs
-        outputs = programs.step(self._episode, action, self._simulation.packed_params)
-        self._episode, observation, scene, blocks = outputs
+        outputs = programs.step(self._state, action, self._simulation.packed_params)
+        self._state, observation, scene, blocks = outputs
         reward, terminated, truncated, info = programs.columns.plain(blocks)
         self._show(scene)
         return np.array(observation), reward, terminated, truncated, info
@@ -117,7 +114,7 @@ class FlyTrackEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         """
         if self.render_mode != "rgb_array":
             return None
-        if self._episode is None:
+        if self._state is None:
             raise gymnasium.error.ResetNeeded("render: found no episode, expected a reset before it")
         return self._renderer.draw(self._log)
 

@@ -11,10 +11,7 @@ from gymnasium.vector.utils import batch_space
 from flytrack_env.env import EnvParams
 from flytrack_env.gymnasium_adapter.common import box, check_render_mode, metadata_of
 from flytrack_env.gymnasium_adapter.options import TRACK, check_names, read_start
-from flytrack_env.gymnasium_adapter.simulation import (
-    Simulation,
-    draw_key,
-)
+from flytrack_env.gymnasium_adapter.simulation import Simulation, draw_key
 from flytrack_env.rendering import FlightLog, make_renderer
 
 RENDER_MODES = ("rgb_array",)
@@ -35,7 +32,7 @@ class FlyTrackVectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.nd
         overrides: further arguments of ``flytrack_env.make``: track, model, plant, missed_gate.
 
     Raises:
-        ValueError: what ``flytrack_env.make`` and ``EnvParams.check`` refuse, an unknown render mode, or no
+        ValueError: what ``flytrack_env.make`` and ``check_params`` refuse, an unknown render mode, or no
             environments.
         TypeError: params of another type.
         ImportError: a render mode without Pillow.

@@ -31,16 +31,15 @@ class ActionHistory(Wrapper):
         WrapperError: as ``Wrapper``.
     """
 
-    key = "action_history"
-
     def __init__(self, env: EpisodicEnvironment, length: int = 3, kind: str = "commanded"):
-        super().__init__(env)
         if length < 1:
             raise ValueError(f"length: found {length}, expected at least 1")
         if kind not in KINDS:
             raise ValueError(f"kind: found {kind!r}, expected one of {KINDS}")
         self.length = length
         self.kind = kind
+        self.key = f"{kind}_action_history"
+        super().__init__(env)
 
     @property
     def observation_table(self) -> tuple[Entry, ...]:

@@ -6,8 +6,7 @@ each has one state of its own around the inner state, begun when an episode begi
 order that makes sense; one that does not is refused.
 """
 
-from collections.abc import Mapping
-from typing import Any, ClassVar
+from typing import Any
 
 import jax
 
@@ -28,16 +27,15 @@ class WrapperError(ValueError):
 class Wrapper(EpisodicEnvironment):
     """Delegates every hook; a wrapper overrides those that it changes.
 
-    Its state is a NamedTuple whose field ``inner`` holds the wrapped environment's state. key: the name
-    of its parameters in ``EnvParams.wrappers``. refuses: wrappers that may not be inside, and why.
+    Its state is a NamedTuple whose field ``inner`` holds the wrapped environment's state. key: its name,
+    and that of its parameters in ``EnvParams.wrappers``; no two wrappers of an environment share one.
 
     Raises:
         WrapperError: something else than FlyTrack or a wrapper of ours, the same wrapper twice, or one
             that this wrapper refuses.
     """
 
-    key: ClassVar[str]
-    refuses: ClassVar[Mapping[str, str]] = {}
+    key: str
 
     def __init__(self, env: EpisodicEnvironment):
         super().__init__()
@@ -48,22 +46,32 @@ class Wrapper(EpisodicEnvironment):
                 "auto-reset; wrappers of another step (LegacyStep, gymnax's) go outermost"
             )
         for inside in layers_of(env):
-            if type(inside) is type(self):
-                raise WrapperError(
-                    f"{name}: found another one inside; their parameters share the key {self.key!r}"
-                )
-            reason = self.refuses.get(type(inside).__name__)
+            reason = self.refusal(inside)
             if reason is not None:
                 raise WrapperError(f"{name} around {type(inside).__name__}: {reason}")
+        self._transition_gradients_enabled = env.transition_gradients_enabled
         self.env = env
         self.env_id = f"{name}({env.env_id})"
+
+    def refusal(self, inside: EpisodicEnvironment) -> str | None:
+        """Return why this wrapper may not go around what is inside, however deep; None if it may."""
+        if isinstance(inside, Wrapper) and inside.key == self.key:
+            return f"both have the name {self.key!r}, by which their parameters and draws are told apart"
+        return None
 
     def own_defaults(self) -> Any:
         """Return the default parameters of this wrapper, a NamedTuple; None if it has none."""
         return None
 
     def own_params(self, params: EnvParams) -> Any:
-        """Return this wrapper's part of the parameters."""
+        """Return this wrapper's part of the parameters.
+
+        Raises:
+            ValueError: parameters of an environment without this wrapper.
+        """
+        if self.key not in params.wrappers:
+            found = sorted(params.wrappers)
+            raise ValueError(f"params.wrappers: found {found}, expected {self.key!r} among them")
         return params.wrappers[self.key]
 
     @property

@@ -4,13 +4,13 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from flytrack_env.effects import CommandDelay as Delay
-from flytrack_env.effects import Flight, command_delay
+from flytrack_env.effects import Flight, check_parameters, command_delay
 from flytrack_env.episodes import EpisodicEnvironment, without_nan
 from flytrack_env.params import EnvParams
 from flytrack_env.state import Action, Drone
+from flytrack_env.wrappers.action_history import ActionHistory
 from flytrack_env.wrappers.base import Wrapper
 
 
@@ -32,20 +32,17 @@ class CommandDelay(Wrapper):
     """
 
     key = "command_delay"
-    refuses = {  # noqa: RUF012
-        "ActionHistory": "the history would hold the delayed commands; put the history outside the delay"
-    }
 
     def __init__(self, env: EpisodicEnvironment, delay_s: float = 0.02):
         super().__init__(env)
         self._default = Delay(delay_s)
-        self._check(self._default)
+        check_parameters(self._default, float(env.default_params.dt))
 
-    def _check(self, delay: Delay) -> None:
-        bounds = command_delay.COMMAND_DELAY.ranges["delay_s"]
-        delays = np.asarray(delay.delay_s)
-        if not np.all((delays >= bounds.low) & (delays <= bounds.high)):
-            raise ValueError(f"delay_s: found {delay.delay_s}, expected {bounds.low:g} to {bounds.high:g} s")
+    def refusal(self, inside: EpisodicEnvironment) -> str | None:
+        """Return why not: a history of commands inside, or what every wrapper refuses."""
+        if isinstance(inside, ActionHistory) and inside.kind == "commanded":
+            return "the history would hold the delayed commands; put the history outside the delay"
+        return super().refusal(inside)
 
     def own_defaults(self) -> Delay:
         """Return the delay that the wrapper was made with."""
@@ -54,7 +51,7 @@ class CommandDelay(Wrapper):
     def check_params(self, params: EnvParams) -> None:
         """Raise ValueError for a delay outside the effect's range, and what the inner check refuses."""
         super().check_params(params)
-        self._check(self.own_params(params))
+        check_parameters(self.own_params(params), params.dt)
 
     def begin(self, drone: Drone, gate_index: Any, params: EnvParams, seed: Any = 0) -> CommandDelayState:
         """Return the state of an episode that begins, as if its applied action were commanded for long."""

@@ -3,10 +3,11 @@
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from flytrack_env.dynamics import ModelParameters
-from flytrack_env.effects import CommandDelay, LinearDrag, ThrustScale, Wind, effect_of
+from flytrack_env.effects import CommandDelay, LinearDrag, ThrustScale, Wind, check_parameters, effect_of
 from flytrack_env.episodes import EpisodicEnvironment
 from flytrack_env.params import EnvParams
 from flytrack_env.quaternion import Scalar
@@ -18,15 +19,19 @@ from flytrack_env.wrappers.base import Wrapper, WrapperError
 class RandomizationParams(NamedTuple):
     """Ranges of uniform draws, once per episode.
 
-    mass_factor_*: of the model's mass. lag_factor_*: of each of its four time constants. low, high:
-    parameters of effects (``flytrack_env.effects``), the same effects in both; a draw replaces what the
-    model has, None leaves it.
+    mass_factor_*: of the model's mass; forces per mass (drag, a wind's push) stay, so that it acts like
+    1 / thrust_scale. lag_factor_*: of each of its four time constants. low, high: parameters of effects
+    (``flytrack_env.effects``), the same effects in both; None leaves a parameter alone.
+    effect_factor_*: of what the model itself has of these effects. An effect that was identified is known:
+    its departure from neutral is scaled, instead of drawn from low to high.
     """
 
     mass_factor_low: Scalar = 0.8
     mass_factor_high: Scalar = 1.2
     lag_factor_low: Scalar = 0.7
     lag_factor_high: Scalar = 1.3
+    effect_factor_low: Scalar = 0.8
+    effect_factor_high: Scalar = 1.2
     low: tuple[Any, ...] = (
         CommandDelay(0.0),
         ThrustScale(0.85),
@@ -60,19 +65,30 @@ def sample_model(word: jax.Array, model: ModelParameters, ranges: RandomizationP
         for axis in ("roll", "pitch", "yaw", "thrust")
     ]
     tau = [model.tau[i] * factor for i, factor in enumerate(lag_factors)]
-    drawn = [_draw(draws, model, low, high) for low, high in zip(ranges.low, ranges.high, strict=True)]
+    drawn = [
+        _draw(draws, model, low, high, (ranges.effect_factor_low, ranges.effect_factor_high))
+        for low, high in zip(ranges.low, ranges.high, strict=True)
+    ]
     return model._replace(m=model.m * mass_factor, tau=tau).with_effects(*drawn)
 
 
-def _draw(draws: Draws, model: ModelParameters, low: Any, high: Any) -> Any:
-    """Return the parameters of one effect, each drawn where it has a range."""
-    name = effect_of(low).name
-    values = {
-        field: draws.uniform(f"{name}.{field}", lowest, getattr(high, field))
-        for field, lowest in low._asdict().items()
-        if lowest is not None
-    }
-    return model.effect(name)._replace(**values)
+def _draw(draws: Draws, model: ModelParameters, low: Any, high: Any, factors: tuple[Scalar, Scalar]) -> Any:
+    """Return the parameters of one effect: around the model's, or from the range if it has none."""
+    effect, present = effect_of(low), [type(parameters) for parameters in model.effects]
+    known, neutral = model.effect(effect.name), effect.parameters()
+    values = {}
+    for field, lowest in low._asdict().items():
+        if lowest is None:
+            continue
+        name = f"{effect.name}.{field}"
+        if type(low) in present:
+            departure = getattr(known, field) - getattr(neutral, field)
+            value = getattr(neutral, field) + departure * draws.uniform(name, *factors)
+            bounds = effect.ranges[field]
+            values[field] = jnp.clip(value, bounds.low, bounds.high)
+        else:
+            values[field] = draws.uniform(name, lowest, getattr(high, field))
+    return known._replace(**values)
 
 
 class DomainRandomization(Wrapper):
@@ -108,11 +124,12 @@ class DomainRandomization(Wrapper):
         if not isinstance(ranges, RandomizationParams):
             expected = "RandomizationParams, as in this environment's default_params"
             raise ValueError(f"params.wrappers[{self.key!r}]: found {ranges!r}, expected {expected}")
-        _check_ranges(ranges)
+        _check_ranges(ranges, params.dt)
 
     def model(self, state: RandomizedState, params: EnvParams) -> ModelParameters:
         """Return the model that a state's episode is flown with."""
-        return self.env.model(state.inner, self._drawn(state.word, params))
+        model = self.env.model(state.inner, self._drawn(state.word, params))
+        return model._replace(tau=jnp.stack(list(model.tau)))
 
     def _drawn(self, word: jax.Array, params: EnvParams) -> EnvParams:
         ranges = self.own_params(params)
@@ -130,6 +147,14 @@ class DomainRandomization(Wrapper):
         word = self._word(seed)
         return RandomizedState(self.env.begin(drone, gate_index, self._drawn(word, params), seed), word)
 
+    def observe_drone(self, drone: Drone, state: RandomizedState, params: EnvParams) -> list[jax.Array]:
+        """Return the inner environment's observation, with this episode's model."""
+        return self.env.observe_drone(drone, state.inner, self._drawn(state.word, params))
+
+    def settle(self, state: RandomizedState, params: EnvParams) -> RandomizedState:
+        """Return the state with the inner one settled, with this episode's model."""
+        return state._replace(inner=self.env.settle(state.inner, self._drawn(state.word, params)))
+
     def advance(
         self, state: RandomizedState, command: Action, params: EnvParams
     ) -> tuple[RandomizedState, jax.Array, jax.Array, dict[str, Any]]:
@@ -138,7 +163,7 @@ class DomainRandomization(Wrapper):
         return RandomizedState(inner, state.word), *outcome
 
 
-def _check_ranges(ranges: RandomizationParams) -> None:
+def _check_ranges(ranges: RandomizationParams, dt: Any) -> None:
     """Raise ValueError for an empty range, one beyond an effect's own, or effects that do not match."""
     classes = [
         [effect_of(parameters).parameters for parameters in side] for side in (ranges.low, ranges.high)
@@ -149,9 +174,12 @@ def _check_ranges(ranges: RandomizationParams) -> None:
     rows = [
         ("mass_factor", ranges.mass_factor_low, ranges.mass_factor_high, 0.0, np.inf),
         ("lag_factor", ranges.lag_factor_low, ranges.lag_factor_high, 0.0, np.inf),
+        ("effect_factor", ranges.effect_factor_low, ranges.effect_factor_high, 0.0, np.inf),
     ]
     for low, high in zip(ranges.low, ranges.high, strict=True):
         effect = effect_of(low)
+        known = {name: value for name, value in high._asdict().items() if value is not None}
+        check_parameters(effect.parameters()._replace(**known), dt)
         for name, bounds in effect.ranges.items():
             pair = getattr(low, name), getattr(high, name)
             if pair != (None, None):

@@ -22,6 +22,10 @@ class LegacyStep:
             raise AttributeError(name)
         return getattr(self._env, name)
 
+    def with_transition_gradients(self) -> "LegacyStep":
+        """Return the same around an environment that lets gradients through, see gymnax."""
+        return LegacyStep(self._env.with_transition_gradients())
+
     @partial(jax.jit, static_argnames=("self",))
     def reset(self, key: jax.Array, params: Any = None) -> tuple[Any, Any]:
         """Return observation and state."""

@@ -13,6 +13,9 @@ from flytrack_env.randomness import Draws, next_word
 from flytrack_env.state import Action, Drone
 from flytrack_env.wrappers.base import Wrapper
 
+# Beyond that, draws turn by more than the half turn that the construction of a unit quaternion can take.
+LARGEST_ATTITUDE_DEG = 20.0
+
 
 class NoiseParams(NamedTuple):
     """Standard deviations, per component: of position, velocity, attitude and body rates.
@@ -51,8 +54,10 @@ class ObservationNoise(Wrapper):
         """Raise ValueError for a negative standard deviation, and what the inner check refuses."""
         super().check_params(params)
         for name, value in self.own_params(params)._asdict().items():
-            if not np.all(np.asarray(value) >= 0.0):  # not jnp: that would be traced under jit
-                raise ValueError(f"params.wrappers[{self.key!r}].{name}: found {value}, expected >= 0")
+            highest = LARGEST_ATTITUDE_DEG if name == "attitude_deg" else np.inf
+            if not np.all((np.asarray(value) >= 0.0) & (np.asarray(value) <= highest)):
+                expected = f"0 to {highest:g}"
+                raise ValueError(f"params.wrappers[{self.key!r}].{name}: found {value}, expected {expected}")
 
     def begin(self, drone: Drone, gate_index: Any, params: EnvParams, seed: Any = 0) -> NoisyState:
         """Return the state of an episode that begins, with noise of its own."""
