@@ -1,16 +1,20 @@
 # `make setup` builds .venv from the lock file; `make demo` and `make test` build on it.
+# `make test-clients` builds .venv-clients, with RL code of others on top (docs/clients.md).
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.locked
+CLIENTS := .venv-clients
+CLIENTS_STAMP := $(CLIENTS)/.locked
+CHECK_PYTHON = $(PYTHON) -c 'import sys; v = sys.version_info; sys.exit(v < (3, 11) and f"Python 3.11 or newer is needed, found {v.major}.{v.minor}; try PYTHON=python3.11")'
 
-.PHONY: setup demo test lint lock clean
+.PHONY: setup demo test test-clients lint lock clean
 
 setup: $(STAMP)
 
 # --no-deps with hashes: exactly what the lock file names, nothing resolved again.
 $(STAMP): requirements.lock pyproject.toml
-	$(PYTHON) -c 'import sys; v = sys.version_info; sys.exit(v < (3, 11) and f"Python 3.11 or newer is needed, found {v.major}.{v.minor}; try: make setup PYTHON=python3.11")'
+	$(CHECK_PYTHON)
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --disable-pip-version-check --quiet --no-deps --require-hashes -r requirements.lock
 	$(BIN)/python -m pip install --disable-pip-version-check --quiet --no-deps --no-build-isolation --editable .
@@ -21,6 +25,19 @@ demo: setup
 
 test: setup
 	$(BIN)/python -m pytest
+
+# With dependencies: what the clients need beyond the lock file is in their requirements.
+$(CLIENTS_STAMP): requirements.lock clients/requirements.txt pyproject.toml
+	$(CHECK_PYTHON)
+	test -x $(CLIENTS)/bin/python || $(PYTHON) -m venv $(CLIENTS)
+	$(CLIENTS)/bin/python -m pip install --disable-pip-version-check --quiet --no-deps --require-hashes -r requirements.lock
+	$(CLIENTS)/bin/python -m pip install --disable-pip-version-check --quiet -r clients/requirements.txt
+	$(CLIENTS)/bin/python -m pip install --disable-pip-version-check --quiet --no-deps --no-build-isolation --editable .
+	$(CLIENTS)/bin/python -m pip check
+	touch $(CLIENTS_STAMP)
+
+test-clients: $(CLIENTS_STAMP)
+	$(CLIENTS)/bin/python -m pytest clients
 
 lint: setup
 	$(BIN)/ruff check .
@@ -33,4 +50,4 @@ lock:
 		--no-header --extra train --extra sysid --extra viz --extra dev --output-file requirements.lock pyproject.toml
 
 clean:
-	rm -rf $(VENV) build dist *.egg-info
+	rm -rf $(VENV) $(CLIENTS) build dist *.egg-info

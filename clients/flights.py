@@ -1,0 +1,58 @@
+"""Flights of any policy, and how training is judged by them."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+EVALUATION_SEED = 1234  # the same starts before and after training, and for every client
+NUM_FLIGHTS = 256
+
+
+class Outcome(NamedTuple):
+    """What a training run changed: means over the flights of an evaluation before it and one after it.
+
+    Returns are the client's own evaluation; gates are those passed in an episode.
+    """
+
+    return_before: float
+    return_after: float
+    gates_before: float
+    gates_after: float
+
+    @property
+    def return_gain(self) -> float:
+        """How much the mean return rose."""
+        return self.return_after - self.return_before
+
+    @property
+    def gate_gain(self) -> float:
+        """How many gates more an episode passes."""
+        return self.gates_after - self.gates_before
+
+
+def mean_gates(
+    act: Callable[[jax.Array, jax.Array], jax.Array], env: Any, params: Any, num_steps: int
+) -> float:
+    """Return the gates passed in an episode, mean over ``NUM_FLIGHTS`` episodes on the same starts.
+
+    act: observation and key to action. env: with gymnax's 6-value step. num_steps: of the longest episode.
+    """
+
+    def fly(key: jax.Array) -> jax.Array:
+        start_key, steps_key = jax.random.split(key)
+        start = (*env.reset(start_key, params), jnp.int32(0), jnp.bool_(False))
+
+        def step(carry: Any, key: jax.Array) -> Any:
+            observation, state, gates, has_ended = carry
+            act_key, step_key = jax.random.split(key)
+            action = act(observation, act_key)
+            observation, state, _, terminated, truncated, info = env.step(step_key, state, action, params)
+            gates = jnp.where(has_ended, gates, info["gates_passed"])
+            return (observation, state, gates, has_ended | terminated | truncated), None
+
+        return jax.lax.scan(step, start, jax.random.split(steps_key, num_steps))[0][2]
+
+    keys = jax.random.split(jax.random.key(EVALUATION_SEED), NUM_FLIGHTS)
+    return float(jax.jit(jax.vmap(fly))(keys).mean())
