@@ -55,8 +55,8 @@ def check_parameters(parameters: Any, dt: Any) -> None:
     for name, bounds in effect.ranges.items():
         value = np.asarray(getattr(parameters, name))
         longest = effect.most_steps.get(name, np.inf) * np.asarray(dt, float)
-        high = np.minimum(bounds.high, longest * (1.0 + ROUNDING))
-        if not np.all((value >= bounds.low) & (value <= high)):
+        high = np.minimum(bounds.high, longest)
+        if not np.all((value >= bounds.low) & (value <= high * (1.0 + ROUNDING))):
             reason = f" at steps of {dt} s" if np.any(longest < bounds.high) else ""
             expected = f"{bounds.low:g} to {np.min(high):g} {bounds.unit}{reason}"
             raise ValueError(f"{effect.name}.{name}: found {value}, expected {expected}")

@@ -7,6 +7,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from flytrack_env.fusion import compute_once
+
 FLOATS, INTS, BOOLS = range(3)
 HOST_DTYPES = (np.float64, np.int64, np.bool_)  # what Gymnasium makes of Python's own numbers
 DEVICE_DTYPES = (jnp.float32, jnp.int32, jnp.bool_)
@@ -49,7 +51,8 @@ class Columns:
         """
         rows: list[list[jax.Array]] = [[], [], []]
         batch: tuple[int, ...] = ()
-        for leaf, place in zip(jax.tree.leaves(tree), self.places, strict=True):
+        # The fence: a concatenation computes what it joins anew, number by number.
+        for leaf, place in zip(compute_once(jax.tree.leaves(tree)), self.places, strict=True):
             batch = leaf.shape[: leaf.ndim - len(place.shape)]
             flat = leaf.reshape(*batch, -1).T if batch else leaf.reshape(-1)
             rows[place.block].append(flat.astype(DEVICE_DTYPES[place.block]))

@@ -10,6 +10,8 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
+from flytrack_env.fusion import compute_once
+
 Packed = tuple[jax.Array, ...]
 
 
@@ -49,7 +51,8 @@ class Layout(NamedTuple):
 
         The batch is the last axis, so that a scalar per environment stays contiguous.
         """
-        leaves = [leaf.reshape(leaf.shape[0], -1).T for leaf in jax.tree.leaves(trees)]
+        # The fence: a concatenation computes what it joins anew, number by number.
+        leaves = [leaf.reshape(leaf.shape[0], -1).T for leaf in compute_once(jax.tree.leaves(trees))]
         return self._join(leaves)
 
     def unpack_batch(self, packed: Packed) -> Any:

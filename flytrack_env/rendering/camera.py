@@ -49,13 +49,16 @@ class Camera:
 
         Empty where nothing of it is before the camera.
         """
-        if points_c[:, 2].min() < NEAREST_M:
+        depths = points_c[:, 2].tolist()
+        if max(depths) < NEAREST_M:
+            return []
+        if min(depths) < NEAREST_M:
             points_c = _cut(points_c)
         return self.pixels(points_c).ravel().tolist()
 
 
 def _cut(points_c: np.ndarray) -> np.ndarray:
-    """Return the part of a polygon (n, 3) before the nearest plane, (m, 3)."""
+    """Return the part of a polygon (n, 3) that is partly before the nearest plane, (m, 3)."""
     kept = []
     for start, end in zip(points_c, np.roll(points_c, -1, axis=0), strict=True):
         is_seen = start[2] >= NEAREST_M
@@ -63,4 +66,4 @@ def _cut(points_c: np.ndarray) -> np.ndarray:
             kept.append(start)
         if is_seen != (end[2] >= NEAREST_M):
             kept.append(start + (NEAREST_M - start[2]) / (end[2] - start[2]) * (end - start))
-    return np.array(kept).reshape(-1, 3)
+    return np.array(kept)

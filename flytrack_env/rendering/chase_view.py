@@ -43,7 +43,7 @@ class ChaseView:
     def __init__(self, course: Course, gates: Gates, left: int, width: int, height: int):
         self.gates, self.left, self.width, self.height = gates, left, width, height
         self.corners_w = np.concatenate([gates.outer, gates.inner], axis=1)
-        self.tops_w = gates.centres + UP_W * (0.5 * np.ptp(gates.outer[..., 2:], axis=1) + 0.5 * NUMBER_M)
+        self.tops_w = gates.centres + UP_W * (0.5 * np.ptp(gates.outer[..., 2:], axis=1) + 0.7 * NUMBER_M)
         self.focal_px = 0.5 * width / np.tan(0.5 * np.radians(FIELD_OF_VIEW_DEG))
         self.centre_px = np.array([0.5 * width, 0.5 * height])
         self.pixel = palette.SUPERSAMPLING
@@ -130,10 +130,11 @@ class ChaseView:
         self._draw_outline(draw, camera, corners_c, palette.blend(colour, palette.BACKGROUND, 0.6))
         top_c = camera.look(self.tops_w[index])
         if top_c[2] > NUMBER_NEAREST_M:
-            # In steps, because every size is a font of its own.
+            # In steps, so that few sizes are set.
             size = 4 * int(np.clip(NUMBER_M * self.focal_px / top_c[2], 24, 80) // 4)
-            x, y = camera.pixels(top_c).tolist()
-            draw.text((x, y), str(index), colour, palette.font(size), anchor="mm")
+            number = palette.lettering(str(index), size)
+            corner = camera.pixels(top_c) - 0.5 * np.array(number.size)
+            draw.bitmap((round(corner[0]), round(corner[1])), number, colour)
 
     def _draw_outline(
         self, draw: ImageDraw.ImageDraw, camera: Camera, corners_c: np.ndarray, colour: palette.Colour

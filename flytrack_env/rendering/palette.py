@@ -1,9 +1,9 @@
 """Colours and sizes of a picture."""
 
-from functools import cache
+from functools import cache, lru_cache
 
 import numpy as np
-from PIL import ImageFont
+from PIL import Image, ImageDraw, ImageFont
 
 Colour = tuple[int, int, int]
 
@@ -61,3 +61,13 @@ def blend(colour: Colour, other: Colour, share: float) -> Colour:
 def font(size: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
     """Return Pillow's own font in a size, pixels."""
     return ImageFont.load_default(size)
+
+
+@lru_cache(maxsize=1024)
+def lettering(text: str, size: int) -> Image.Image:
+    """Return one line of text as a mask; kept, because text costs more to set than gates to draw."""
+    face = font(size)
+    _, _, right, bottom = face.getbbox(text, anchor="la")
+    mask = Image.new("L", (int(right) + 1, int(bottom) + 1))
+    ImageDraw.Draw(mask).text((0, 0), text, 255, face, anchor="la")
+    return mask

@@ -31,7 +31,6 @@ class Renderer:
         self.top_view = TopView(course, gates, split, height)
         self.chase_view = ChaseView(course, gates, split, width - split, height)
         self.canvas = Image.new("RGB", (width, height))
-        self.font = palette.font(TEXT_SIZE)
 
     def draw(self, log: FlightLog) -> np.ndarray:
         """Return a picture of the log's last row and the way there, (540, 960, 3), uint8.
@@ -62,4 +61,5 @@ class Renderer:
         left = palette.TOP_VIEW_WIDTH
         draw.rectangle([left, 0, palette.FRAME_SIZE[0], BAR_HEIGHT], palette.BACKGROUND)
         for column, text in zip(COLUMNS, texts, strict=True):
-            draw.text((left + column, TEXT_TOP), text, palette.TEXT, self.font)
+            if text:
+                draw.bitmap((left + column, TEXT_TOP), palette.lettering(text, TEXT_SIZE), palette.TEXT)

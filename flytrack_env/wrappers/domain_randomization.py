@@ -35,13 +35,13 @@ class RandomizationParams(NamedTuple):
     low: tuple[Any, ...] = (
         CommandDelay(0.0),
         ThrustScale(0.85),
-        Wind(-3.0, -3.0, -0.5, a_x=None, a_y=None, a_z=None),
+        Wind(-3.0, -3.0, None, a_x=None, a_y=None, a_z=None),
         LinearDrag(0.0, 0.0, 0.0),
     )
     high: tuple[Any, ...] = (
         CommandDelay(0.02),
         ThrustScale(1.15),
-        Wind(3.0, 3.0, 0.5, a_x=None, a_y=None, a_z=None),
+        Wind(3.0, 3.0, None, a_x=None, a_y=None, a_z=None),
         LinearDrag(0.5, 0.5, 0.3),
     )
 
