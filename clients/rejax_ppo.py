@@ -7,7 +7,7 @@ import rejax
 from clients.flights import Outcome, mean_gates
 from flytrack_env.wrappers import LegacyStep
 
-RETURN_MARGIN, GATE_MARGIN = 8.0, 3.0
+RETURN_MARGIN, GATE_MARGIN = 8.0, 4.0
 
 
 def make_ppo(env_id: str = "FlyTrack-v0") -> rejax.PPO:
