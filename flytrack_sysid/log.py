@@ -1,0 +1,120 @@
+"""Flight logs: named columns in SI units, the one form of simulated and measured flight.
+
+================================  =============================================  =======
+column                            quantity                                       unit
+================================  =============================================  =======
+``t``                             time, growing within a segment                 s
+``u_roll u_pitch u_yaw u_thrust`` command, in [-1, 1]                            1
+``segment``                       number of the flight, each in one piece        1
+``p_x p_y p_z``                   position, world                                m
+``v_x v_y v_z``                   velocity, world                                m/s
+``a_x a_y a_z``                   acceleration, world (0 in hover)               m/s^2
+``f_x f_y f_z``                   accelerometer: specific force, body            m/s^2
+``q_w q_x q_y q_z``               orientation, body to world                     1
+``w_x w_y w_z``                   angular velocity, body                         rad/s
+``uprev_roll`` ... ``_thrust``    applied (lagged) action                        1
+``v_bat``                         battery voltage                                V
+================================  =============================================  =======
+
+Row k holds what was measured at t_k and the command held from t_k to t_k+1. As in the handout's state,
+``a`` and ``f`` of row k are those of the step that led to t_k, with the attitude before it. ``t`` and the
+commands are always there; other channels may be absent (never zero instead), but only whole ones. Rows
+need not be evenly spaced; a sample that was lost is a missing row.
+"""
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from flytrack_env.state import (
+    ACCELERATION,
+    APPLIED_ACTION,
+    BATTERY,
+    POSITION,
+    QUATERNION,
+    RATES,
+    VELOCITY,
+)
+
+_XYZ, _STICKS = ("x", "y", "z"), ("roll", "pitch", "yaw", "thrust")
+CHANNELS: dict[str, tuple[str, ...]] = {
+    "u": tuple(f"u_{stick}" for stick in _STICKS),
+    **{name: tuple(f"{name}_{axis}" for axis in _XYZ) for name in ("p", "v", "a", "f")},
+    "q": tuple(f"q_{axis}" for axis in ("w", *_XYZ)),
+    "w": tuple(f"w_{axis}" for axis in _XYZ),
+    "uprev": tuple(f"uprev_{stick}" for stick in _STICKS),
+    "v_bat": ("v_bat",),
+}
+REQUIRED = ("t", *CHANNELS["u"])
+COLUMNS = ("t", "segment", *(column for columns in CHANNELS.values() for column in columns))
+_IN_STATE = {
+    "p": POSITION,
+    "v": VELOCITY,
+    "a": ACCELERATION,
+    "q": QUATERNION,
+    "w": RATES,
+    "uprev": APPLIED_ACTION,
+    "v_bat": slice(BATTERY, BATTERY + 1),
+}
+
+
+class LogError(ValueError):
+    """A flight log that cannot be used; the message names file, row and column, found and expected."""
+
+
+@dataclass(frozen=True)
+class FlightLog:
+    """A flight log in memory; what files hold is checked by ``load_log``, this is not.
+
+    time: (num_rows,) s. channels: of ``CHANNELS``, name -> (num_rows, number of its columns) float64;
+    "u" is always there. segment: (num_rows,) int, equal numbers side by side. source: where it is from,
+    for messages. sha256: of the file, "" if there is none.
+    """
+
+    time: np.ndarray
+    channels: Mapping[str, np.ndarray]
+    segment: np.ndarray
+    source: str = "flight log"
+    sha256: str = ""
+
+    def __len__(self) -> int:
+        return len(self.time)
+
+    def __contains__(self, channel: str) -> bool:
+        return channel in self.channels
+
+    def __getitem__(self, channel: str) -> np.ndarray:
+        return self.channels[channel]
+
+    def select(self, rows: np.ndarray) -> "FlightLog":
+        """Return some of the rows, by mask or slice."""
+        channels = {name: values[rows] for name, values in self.channels.items()}
+        return replace(self, time=self.time[rows], channels=channels, segment=self.segment[rows])
+
+    def without(self, *names: str) -> "FlightLog":
+        """Return the log as if these channels had not been measured."""
+        channels = {name: values for name, values in self.channels.items() if name not in names}
+        return replace(self, channels=channels)
+
+    def is_start(self) -> np.ndarray:
+        """Return where a segment begins, (num_rows,) bool."""
+        return np.concatenate([[True], self.segment[1:] != self.segment[:-1]])[: len(self)]
+
+
+def log_of_states(
+    flights: Iterable[tuple[np.ndarray, np.ndarray]], dt: float, source: str = "flight log"
+) -> FlightLog:
+    """Return the log of flights of the handout's states (T, 21) and actions (T, 4), a segment each.
+
+    The first acceleration of a flight is that of the step before it. dt: s.
+    """
+    flights = [(np.asarray(states, float), np.asarray(actions, float)) for states, actions in flights]
+    states = np.concatenate([states for states, _ in flights])
+    channels = {name: states[:, where] for name, where in _IN_STATE.items()}
+    return FlightLog(
+        time=np.concatenate([np.arange(len(states)) * dt for states, _ in flights]),
+        channels={"u": np.concatenate([actions for _, actions in flights]), **channels},
+        segment=np.repeat(np.arange(len(flights)), [len(states) for states, _ in flights]),
+        source=source,
+    )
