@@ -1,0 +1,187 @@
+"""Least squares over all channels of a log, each weighted by the noise that it turns out to have."""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from scipy import optimize
+
+from flytrack_env.dynamics import ModelParameters
+from flytrack_sysid.log import FlightLog
+from flytrack_sysid.parameters import (
+    TAUS,
+    THRUST_COEFFS,
+    bounds_of,
+    from_vector,
+    names_of,
+    to_vector,
+    with_values,
+)
+from flytrack_sysid.record import make_record
+from flytrack_sysid.residuals import CENTRED, Problem, make_problem, residuals
+
+# Noise that the first round assumes, in the channels' units: that of common sensors.
+FIRST_NOISE = {"w": 0.1, "f": 1.5, "v": 0.05, "p": 0.01, "q": 0.01, "v_bat": 0.02}
+LEAST_NOISE = 1e-12
+ROUNDS = 4
+TOLERANCE = 1e-10
+# How far thrust coefficients may lie from where the search starts, in weights of the drone (per volt for
+# the last two): weak enough to move nothing that the data determine, and it keeps the rest finite.
+PRIOR_WEIGHTS = {**dict.fromkeys(THRUST_COEFFS[:4], 10.0), **dict.fromkeys(THRUST_COEFFS[4:], 1.0)}
+
+
+class FitError(ValueError):
+    """Data that do not determine the model, or that no model of this structure fits."""
+
+
+class Estimate(NamedTuple):
+    """What a fit found, in float64.
+
+    model: with the estimate in it. free: names of what was estimated. covariance: of the free
+    parameters. noise: rms left of each channel, per component. measured: rms of what each channel
+    measured, likewise. count: numbers that were explained.
+    """
+
+    model: ModelParameters
+    free: tuple[str, ...]
+    covariance: np.ndarray
+    noise: dict[str, np.ndarray]
+    measured: dict[str, np.ndarray]
+    count: int
+
+
+@jax.jit
+def _weighted(vector: jax.Array, like: ModelParameters, problem: Problem, weights: dict) -> jax.Array:
+    """Return all residuals times their weights, flat."""
+    found = residuals(from_vector(vector, like), problem)
+    return jnp.concatenate([(found[name] * weights[name]).ravel() for name in sorted(found)])
+
+
+_slopes = jax.jit(jax.jacfwd(_weighted))
+
+
+def _counts(problem: Problem) -> np.ndarray:
+    return np.concatenate([problem.channels[name].counts.ravel() > 0 for name in sorted(problem.channels)])
+
+
+class _Search:
+    """One round: the least squares problem with given weights, in the free parameters' own scale.
+
+    Time constants are sought by their logarithm, so that none becomes negative.
+    """
+
+    def __init__(
+        self, start: ModelParameters, free: tuple[str, ...], problem: Problem, noise: dict[str, np.ndarray]
+    ):
+        self.like, self.free, self.problem = start, free, problem
+        names = names_of(start)
+        self.where = np.array([names.index(name) for name in free])
+        self.is_log = np.array([name in TAUS for name in free])
+        self.vector = to_vector(start)
+        self.weights = {name: 1.0 / sigma for name, sigma in noise.items()}
+        self.counting = _counts(problem)
+        scale = [PRIOR_WEIGHTS.get(name, np.inf) for name in free]
+        self.prior_weight = 1.0 / (np.array(scale) * float(start.m) * float(start.g))
+        self.centre = self.vector[self.where]
+
+    def full(self, sought: np.ndarray) -> np.ndarray:
+        """Return all of the model's numbers."""
+        vector = self.vector.copy()
+        vector[self.where] = np.where(self.is_log, np.exp(np.where(self.is_log, sought, 0.0)), sought)
+        return vector
+
+    def residual(self, sought: np.ndarray) -> np.ndarray:
+        """Return the weighted residuals of rows that count, and the pull of the prior."""
+        vector = self.full(sought)
+        values = np.asarray(_weighted(vector, self.like, self.problem, self.weights))[self.counting]
+        return np.concatenate([values, self.prior_weight * (vector[self.where] - self.centre)])
+
+    def slopes(self, sought: np.ndarray) -> np.ndarray:
+        """Return the derivative of ``residual``."""
+        vector = self.full(sought)
+        slopes = np.asarray(_slopes(vector, self.like, self.problem, self.weights))
+        chain = np.where(self.is_log, vector[self.where], 1.0)
+        of_prior = np.diag(self.prior_weight)
+        return np.concatenate([slopes[np.ix_(self.counting, self.where)], of_prior]) * chain
+
+    def run(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return the numbers found, and their covariance in the scale in which they were sought."""
+        bounds = np.array([bounds_of(name) for name in self.free])
+        bounds[self.is_log] = np.log(bounds[self.is_log])
+        start = np.where(self.is_log, np.log(np.abs(self.centre) + LEAST_NOISE), self.centre)
+        try:
+            result = optimize.least_squares(
+                self.residual,
+                np.clip(start, bounds[:, 0], bounds[:, 1]),
+                self.slopes,
+                bounds=bounds.T,
+                x_scale="jac",
+                xtol=TOLERANCE,
+                ftol=TOLERANCE,
+                gtol=None,
+            )
+        except ValueError as error:  # scipy's word for residuals that are not finite
+            raise FitError(f"the fit diverged: {error}") from error
+        if not result.success or not np.isfinite(result.cost):
+            raise FitError(f"the fit did not converge: {result.message}")
+        return result.x, np.linalg.pinv(result.jac.T @ result.jac, hermitian=True)
+
+
+def _spread(values: np.ndarray, channel_name: str, problem: Problem) -> np.ndarray:
+    """Return the rms of residuals per component, with the means that were taken out counted as fitted."""
+    channel = problem.channels[channel_name]
+    count = channel.counts.sum(axis=0)
+    if channel_name in CENTRED:
+        used = channel.counts.any(axis=1)
+        count = count - len(np.unique(channel.window[used])) * (2 if channel_name == "p" else 1)
+    return np.sqrt(np.sum(values**2, axis=0) / np.maximum(count, 1.0))
+
+
+def channel_noise(model: ModelParameters, problem: Problem) -> dict[str, np.ndarray]:
+    """Return the rms of what a model leaves of each channel, per component."""
+    found = jax.jit(residuals)(model, problem)
+    return {name: _spread(np.asarray(values), name, problem) for name, values in found.items()}
+
+
+def estimate(
+    log: FlightLog,
+    judged: np.ndarray,
+    start: ModelParameters,
+    free: tuple[str, ...],
+    report: Callable[[int, int], None] = lambda done, rounds: None,
+) -> Estimate:
+    """Return the least squares estimate of a model's free parameters from the judged rows of a log.
+
+    Weights and the rows that lost commands spoil follow from the estimate of the round before.
+
+    Raises:
+        FitError: a search that diverged or ended at a bound.
+    """
+    with jax.enable_x64(True):
+        record = make_record(log)
+        model = jax.tree.map(lambda leaf: np.asarray(leaf, float), start)
+        noise: dict[str, np.ndarray] = {}
+        for number in range(ROUNDS):
+            problem = make_problem(log, record, judged, model)
+            widths = {name: channel.counts.shape[1] for name, channel in problem.channels.items()}
+            noise = noise or {name: np.full(width, FIRST_NOISE[name]) for name, width in widths.items()}
+            search = _Search(model, free, problem, noise)
+            sought, covariance = search.run()
+            model = with_values(model, dict(zip(free, search.full(sought)[search.where], strict=True)))
+            noise = {
+                name: np.maximum(left, LEAST_NOISE) for name, left in channel_noise(model, problem).items()
+            }
+            report(number + 1, ROUNDS)
+    chain = np.where(search.is_log, np.exp(np.where(search.is_log, sought, 0.0)), 1.0)
+    still = {
+        name: np.sqrt(
+            np.sum(channel.measured[:, : channel.counts.shape[1]] ** 2 * channel.counts, axis=0)
+            / np.maximum(channel.counts.sum(axis=0), 1.0)
+        )
+        for name, channel in problem.channels.items()
+    }
+    return Estimate(
+        model, free, covariance * np.outer(chain, chain), noise, still, int(search.counting.sum())
+    )

@@ -1,0 +1,116 @@
+"""Names for every number in a model, for fits, for what is held fixed, and for reports."""
+
+from collections.abc import Iterable, Mapping
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from flytrack_env.dynamics import ModelParameters
+from flytrack_env.effects import BY_NAME, effect_of
+
+STICKS = ("roll", "pitch", "yaw", "thrust")
+TAUS = tuple(f"tau_{stick}" for stick in STICKS)
+THRUST_COEFFS = tuple(f"c{power}" for power in range(6))
+MAX_RATES = tuple(f"max_rate_{stick}" for stick in STICKS[:3])
+DRAIN = "battery_drain_v_per_min"
+BASE = (*TAUS, *THRUST_COEFFS, *MAX_RATES, "m", "g", DRAIN)
+UNITS = {
+    **dict.fromkeys(TAUS, "s"),
+    **dict.fromkeys(THRUST_COEFFS[:4], "N"),
+    **dict.fromkeys(THRUST_COEFFS[4:], "N/V"),
+    **dict.fromkeys(MAX_RATES, "deg/s"),
+    **{"m": "kg", "g": "m/s^2", DRAIN: "V/min"},
+}
+
+
+class Bounds(NamedTuple):
+    """Where a fit looks for a parameter."""
+
+    low: float
+    high: float
+
+
+# Wide enough for anything that flies at 100 Hz; an answer at a bound is refused.
+TAU_BOUNDS = Bounds(1e-3, 0.5)
+MAX_RATE_BOUNDS = Bounds(1.0, 5000.0)
+MASS_BOUNDS = Bounds(1e-3, 1e3)
+UNBOUNDED = Bounds(-np.inf, np.inf)
+
+
+def names_of(model: ModelParameters) -> tuple[str, ...]:
+    """Return the names of all numbers in a model: the base, then ``effect.parameter``."""
+    of_effects = ((effect_of(parameters).name, parameters._fields) for parameters in model.effects)
+    return (*BASE, *(f"{effect}.{field}" for effect, fields in of_effects for field in fields))
+
+
+def unit_of(name: str) -> str:
+    """Return the unit of a parameter."""
+    effect, _, field = name.partition(".")
+    return BY_NAME[effect].ranges[field].unit if field else UNITS[name]
+
+
+def bounds_of(name: str) -> Bounds:
+    """Return where a fit looks for a parameter."""
+    effect, _, field = name.partition(".")
+    if field:
+        bounds = BY_NAME[effect].ranges[field]
+        return Bounds(bounds.low, bounds.high)
+    if name in TAUS:
+        return TAU_BOUNDS
+    if name in MAX_RATES:
+        return MAX_RATE_BOUNDS
+    return MASS_BOUNDS if name == "m" else UNBOUNDED
+
+
+def to_vector(model: ModelParameters) -> np.ndarray:
+    """Return all numbers of a model, in the order of ``names_of``, float64."""
+    return np.concatenate([np.ravel(np.asarray(leaf, float)) for leaf in jax.tree.leaves(model)])
+
+
+def from_vector(vector: Any, like: ModelParameters) -> ModelParameters:
+    """Return the model of the same structure with these numbers; differentiable."""
+    leaves, structure = jax.tree.flatten(like)
+    sizes = [np.size(leaf) for leaf in leaves]
+    ends = np.cumsum(sizes)
+    parts = [vector[end - size : end] for size, end in zip(sizes, ends, strict=True)]
+    shapes = [np.shape(leaf) for leaf in leaves]
+    reshaped = [jnp.reshape(part, shape) for part, shape in zip(parts, shapes, strict=True)]
+    return jax.tree.unflatten(structure, reshaped)
+
+
+def as_float32(model: ModelParameters) -> ModelParameters:
+    """Return the model with the environment's precision: float32 arrays and Python floats."""
+
+    def leaf(value: Any) -> Any:
+        return np.asarray(value, np.float32) if np.ndim(value) else float(np.float32(value))
+
+    return jax.tree.map(leaf, model)
+
+
+def with_values(model: ModelParameters, values: Mapping[str, float]) -> ModelParameters:
+    """Return the model with some numbers replaced, by name.
+
+    Raises:
+        KeyError: no number of that name in the model.
+    """
+    vector = to_vector(model)
+    names = names_of(model)
+    for name, value in values.items():
+        if name not in names:
+            raise KeyError(f"{name}: unknown; expected of {', '.join(names)}")
+        vector[names.index(name)] = value
+    leaves = jax.tree.leaves(from_vector(vector, model))
+    return jax.tree.unflatten(jax.tree.structure(model), [np.asarray(leaf) for leaf in leaves])
+
+
+def with_neutral_effects(model: ModelParameters, effects: Iterable[str]) -> ModelParameters:
+    """Return the model with effects added where it lacks them, at their neutral values.
+
+    Raises:
+        KeyError: no effect of that name.
+    """
+    added = [BY_NAME[name].parameters() for name in effects]
+    present = {type(parameters) for parameters in model.effects}
+    return model.with_effects(*(parameters for parameters in added if type(parameters) not in present))

@@ -1,0 +1,184 @@
+"""A log made ready for replay: on even steps, gaps filled with rows that count for nothing.
+
+Commands are what a replay is driven by, so a lost row matters twice: its measurements are missing, and
+so is the command that was given in it. Filled rows get commands in between their neighbours, and how far
+off those may be is carried along (``command_doubt``), so that rows where it matters can be left out.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from scipy.spatial.transform import Rotation, Slerp
+
+from flytrack_sysid.log import FlightLog
+from flytrack_sysid.split import blocks_of
+
+GAP_STEPS = 1.5  # of the usual step: what lasts longer is a gap
+LONGEST_FILLED_S = 0.1  # after a longer gap a new flight begins
+WINDOW_S = 1.25  # over which increments of velocity and attitude are followed
+PADDED_TO = 1024  # rows: logs of about the same length share one compiled program
+BATTERY_UNKNOWN_V = 23.0
+APPLIED_UNKNOWN = 1.0  # standard deviation of an applied action that nothing is known of
+
+
+class Record(NamedTuple):
+    """Rows of a replay, padded; row k is followed by row k + 1 after ``step_s``.
+
+    source_row: (num_rows,) int, the log's row, -1 for filled ones and padding.
+    step_s: (num_rows,) s. command: (num_rows, 4). command_doubt: (num_rows, 4), how far off the command
+    may be (standard deviation). begins: (num_rows,) bool, a flight starts here.
+    is_applied_known: (num_rows,) bool, ``applied`` was measured here. applied: (num_rows, 4).
+    pos_w, vel_w: (num_rows, 3). quat: (num_rows, 4). battery_v: (num_rows,). Where a channel is absent:
+    0, upright, 23 V.
+    piece: (num_rows,) int, numbers of stretches of at most 1.25 s, none across blocks.
+    """
+
+    source_row: np.ndarray
+    step_s: np.ndarray
+    command: np.ndarray
+    command_doubt: np.ndarray
+    begins: np.ndarray
+    is_applied_known: np.ndarray
+    applied: np.ndarray
+    pos_w: np.ndarray
+    vel_w: np.ndarray
+    quat: np.ndarray
+    battery_v: np.ndarray
+    piece: np.ndarray
+
+
+def usual_step(log: FlightLog) -> float:
+    """Return the median time between rows of a segment, s."""
+    steps = np.diff(log.time)[log.segment[1:] == log.segment[:-1]]
+    return float(np.median(steps))
+
+
+def _new_times(log: FlightLog, usual: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return times with gaps filled, the log's row at or before each, and where a flight begins."""
+    steps = np.diff(log.time, append=log.time[-1])
+    ends = np.append(log.segment[1:] != log.segment[:-1], True)
+    is_long = ~ends & (steps > LONGEST_FILLED_S)
+    is_gap = ~ends & ~is_long & (steps > GAP_STEPS * usual)
+    pieces = np.where(is_gap, np.round(steps / usual).astype(int), 1)
+    pieces = np.maximum(pieces, 1)
+    row = np.repeat(np.arange(len(log)), pieces)
+    part = np.arange(len(row)) - np.repeat(np.cumsum(pieces) - pieces, pieces)
+    times = log.time[row] + part * (steps / pieces)[row]
+    begins = (part == 0) & np.append(True, (ends | is_long)[:-1])[row]
+    return times, np.where(part == 0, row, -1 - row), begins
+
+
+def _doubts(log: FlightLog, pieces: np.ndarray) -> np.ndarray:
+    """Return how far a command in the gap after each row may be off, (num_rows, 4).
+
+    A command that changes evenly is off by nothing, one that jumps somewhere in the gap by half the jump.
+    """
+    change = np.diff(log["u"], axis=0, append=log["u"][-1:])
+    before = np.vstack([change[:1], change[:-1]])
+    after = np.vstack([change[1:], change[-1:]])
+    expected = 0.5 * (before + after) * pieces[:, None]
+    return 0.5 * np.abs(change - expected)
+
+
+def _between(times: np.ndarray, log: FlightLog, values: np.ndarray) -> np.ndarray:
+    """Return values at other times, linear in between; times of segments are laid end to end."""
+    return np.stack([np.interp(times, log.time, column) for column in values.T], axis=1)
+
+
+def _quaternions(times: np.ndarray, log: FlightLog) -> np.ndarray:
+    if "q" not in log:
+        return np.tile([1.0, 0.0, 0.0, 0.0], (len(times), 1))
+    rotations = Slerp(log.time, Rotation.from_quat(log["q"], scalar_first=True))
+    return rotations(times).as_quat(scalar_first=True)
+
+
+def _velocity(log: FlightLog) -> np.ndarray:
+    """Return the velocity, or what positions say of it; 0 without either."""
+    if "v" in log:
+        return log["v"]
+    return np.gradient(log["p"], log.time, axis=0) if "p" in log else np.zeros((len(log), 3))
+
+
+def _end_to_end(log: FlightLog, usual: float) -> FlightLog:
+    """Return the log with its segments one after the other in time."""
+    starts = np.flatnonzero(log.is_start())
+    lengths = np.diff(np.append(starts, len(log)))
+    durations = log.time[starts + lengths - 1] - log.time[starts] + usual
+    offset = np.concatenate([[0.0], np.cumsum(durations)[:-1]]) - log.time[starts]
+    return FlightLog(log.time + np.repeat(offset, lengths), log.channels, log.segment, log.source)
+
+
+def make_record(log: FlightLog) -> Record:
+    """Return a log ready for replay."""
+    usual = usual_step(log)
+    blocks = blocks_of(log)
+    log = _end_to_end(log, usual)
+    times, rows, begins = _new_times(log, usual)
+    measured = rows >= 0
+    behind = np.where(measured, rows, -1 - rows)  # the row at or before
+    pieces = np.bincount(behind, minlength=len(log))
+    zeros = np.zeros((len(times), 3))
+    command = np.where(measured[:, None], log["u"][behind], _between(times, log, log["u"]))
+    battery = _between(times, log, log["v_bat"])[:, 0] if "v_bat" in log else BATTERY_UNKNOWN_V + zeros[:, 0]
+    after_gap = np.append(False, ~measured[:-1]) & measured
+    record = Record(
+        source_row=np.where(measured, rows, -1),
+        step_s=np.diff(times, append=times[-1] + usual),
+        command=command,
+        command_doubt=np.where(measured[:, None], 0.0, _doubts(log, pieces)[behind]),
+        begins=begins,
+        is_applied_known=(begins | after_gap) & ("uprev" in log),
+        applied=log["uprev"][behind] if "uprev" in log else command,
+        pos_w=_between(times, log, log["p"]) if "p" in log else zeros,
+        vel_w=_between(times, log, _velocity(log)),
+        quat=_quaternions(times, log),
+        battery_v=battery,
+        piece=_pieces(times, begins, blocks[behind]),
+    )
+    return _padded(record)
+
+
+def _pieces(times: np.ndarray, begins: np.ndarray, blocks: np.ndarray) -> np.ndarray:
+    """Return numbers of stretches: blocks of each flight, cut evenly into stretches of at most 1.25 s."""
+    is_first = begins | np.append(True, np.diff(blocks) != 0)
+    number = np.cumsum(is_first) - 1
+    first = np.flatnonzero(is_first)
+    last = np.append(first[1:], len(times)) - 1
+    duration = times[last] - times[first]
+    pieces = np.maximum(1, np.ceil(duration / WINDOW_S - 1e-6)).astype(int)
+    share = (times - times[first][number]) / np.maximum(duration, 1e-9)[number]
+    piece = np.minimum((share * pieces[number]).astype(int), pieces[number] - 1)
+    return (np.cumsum(pieces) - pieces)[number] + piece
+
+
+def _padded(record: Record) -> Record:
+    """Return the record with rows added that start nothing and count for nothing."""
+    missing = -len(record.source_row) % PADDED_TO
+
+    def pad(values: np.ndarray) -> np.ndarray:
+        return np.concatenate([values, np.repeat(values[-1:], missing, axis=0)])
+
+    padded = Record(*(pad(values) for values in record))
+    source_row, begins = padded.source_row.copy(), padded.begins.copy()
+    if missing:
+        source_row[-missing:], begins[-missing:] = -1, True
+    return padded._replace(source_row=source_row, begins=begins)
+
+
+def applied_doubt(record: Record, tau: np.ndarray) -> np.ndarray:
+    """Return how far the replay's applied action may be off, (num_rows, 4): a standard deviation.
+
+    From commands that were lost and from what was applied when a flight began; both are forgotten with
+    the lags ``tau``, (4,) s.
+    """
+    keep_squared = np.exp(-2.0 * record.step_s[:, None] / tau)
+    enters = (1.0 - np.sqrt(keep_squared)) ** 2 * record.command_doubt**2
+    unknown = np.where(record.is_applied_known, 0.0, APPLIED_UNKNOWN**2)
+    variance, variances = unknown[0] * np.ones(4), np.empty_like(record.command)
+    restarts = record.begins | record.is_applied_known
+    for row in range(len(restarts)):
+        if restarts[row]:
+            variance = unknown[row] * np.ones(4)
+        variances[row] = variance
+        variance = keep_squared[row] * variance + enters[row]
+    return np.sqrt(variances)

@@ -1,0 +1,174 @@
+"""What a log measured minus what the model says, channel by channel.
+
+========  ==============================================================================  =======
+channel   residual                                                                        unit
+========  ==============================================================================  =======
+``w``     body rates, against the lag driven by the commands                              rad/s
+``f``     specific force, body (from ``a`` where the log has no accelerometer)            m/s^2
+``v``     velocity, against the integrated acceleration, centred in windows               m/s
+``p``     position, likewise without offset and slope; only where the log lacks ``v``     m
+``q``     attitude, against the integrated rates, as a world-frame rotation, centred      rad
+``v_bat`` battery voltage, against its drain, centred                                     V
+========  ==============================================================================  =======
+
+Centring takes out what a window began with, which is measured with noise like the rest.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from flytrack_env.dynamics import ModelParameters
+from flytrack_env.quaternion import Quaternion
+from flytrack_sysid.log import FlightLog
+from flytrack_sysid.record import Record, applied_doubt
+from flytrack_sysid.replay import Replay, replay
+
+CENTRED = ("v", "p", "q", "v_bat")
+TURN_CHANNELS, FORCE_CHANNELS = ("w", "q"), ("f", "v", "p")
+# An applied action known worse than this counts for nothing: half a gyro's noise at full stick.
+LARGEST_DOUBT = 0.005
+
+
+class Channel(NamedTuple):
+    """What one channel measured; (num_rows, components) and masks of the same shape.
+
+    window: (num_rows,) int, what is centred together.
+    """
+
+    measured: np.ndarray
+    counts: np.ndarray
+    window: np.ndarray
+
+
+class Problem(NamedTuple):
+    """A record with what was measured in it; counts are 0 where a row is not to be judged."""
+
+    record: Record
+    turns_afresh: np.ndarray
+    channels: dict[str, Channel]
+
+
+def measured_channels(log: FlightLog, record: Record, gravity: float) -> dict[str, np.ndarray]:
+    """Return what a log measured of each residual channel, on the record's rows; 0 in filled ones."""
+    row = record.source_row
+    own = {name: log[name][row] for name in ("w", "q", "v", "v_bat") if name in log}
+    if "f" in log:
+        own["f"] = log["f"][row]
+    elif "a" in log and "q" in log:
+        before = np.roll(record.quat, 1, axis=0)
+        force_w = log["a"][row] + np.array([0.0, 0.0, gravity])
+        own["f"] = Rotation.from_quat(before, scalar_first=True).inv().apply(force_w)
+    if "v" not in log and "p" in log:
+        own["p"] = log["p"][row]
+    if "q" not in log:  # nothing in the world frame can be compared
+        own = {name: values for name, values in own.items() if name not in ("v", "p")}
+    return own
+
+
+def make_problem(log: FlightLog, record: Record, judged: np.ndarray, model: ModelParameters) -> Problem:
+    """Return the problem of explaining the judged rows of a log.
+
+    judged: (rows of the log,) bool. The lags of ``model`` say how long lost commands are remembered.
+    """
+    doubt = applied_doubt(record, np.asarray(model.tau, float))
+    is_certain = doubt < LARGEST_DOUBT
+    exists = (record.source_row >= 0) & judged[record.source_row]
+    is_after = exists & ~record.begins
+    turns, lifts = is_certain[:, :3], is_certain[:, 3]
+    turn_window, turns_afresh = _windows(record, turns.all(axis=1))
+    lift_window, _ = _windows(record, lifts)
+    allowed = {
+        "w": turns & is_after[:, None],
+        "q": (turns.all(axis=1) & exists)[:, None],
+        "f": (lifts & is_after)[:, None],
+        "v": (lifts & exists)[:, None],
+        "p": (lifts & exists)[:, None],
+        "v_bat": exists[:, None],
+    }
+    flight = np.cumsum(record.begins) - 1
+    windows = {"q": turn_window, "v": lift_window, "p": lift_window, "v_bat": flight}
+    channels = {}
+    for name, values in measured_channels(log, record, float(model.g)).items():
+        width = 3 if name == "q" else values.shape[1]
+        counts = np.broadcast_to(allowed[name], (len(values), width)).astype(float)
+        channels[name] = Channel(values, counts, windows.get(name, flight))
+    return Problem(record, turns_afresh, channels)
+
+
+def _windows(record: Record, is_certain: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return windows, new ones also where doubt ends, and where they begin."""
+    is_back = is_certain & ~np.append(True, is_certain[:-1])
+    is_new = np.append(True, np.diff(record.piece) != 0) | record.begins | is_back
+    return np.cumsum(is_new) - 1, is_new
+
+
+def _sums(values: jax.Array, window: jax.Array) -> jax.Array:
+    """Return, at every row, the sum over its window."""
+    return jax.ops.segment_sum(values, window, num_segments=len(window))[window]
+
+
+def _centred(values: jax.Array, counts: jax.Array, window: jax.Array) -> jax.Array:
+    """Return values less their mean over the rows of the window that count."""
+    mean = _sums(values * counts, window) / jnp.maximum(_sums(counts, window), 1.0)
+    return values - mean
+
+
+def _without_slope(values: jax.Array, time: jax.Array, counts: jax.Array, window: jax.Array) -> jax.Array:
+    """Return values less their regression on time, over the rows of the window that count."""
+    values = _centred(values, counts, window)
+    time = _centred(time[:, None], counts, window)
+    spread = _sums(time * time * counts, window)
+    slope = _sums(time * values * counts, window) / jnp.where(spread > 0.0, spread, 1.0)
+    return values - slope * time
+
+
+def _rotation_between(measured: jax.Array, said: jax.Array) -> jax.Array:
+    """Return the world-frame rotation vector from what is said to what was measured, rad."""
+    conjugate = Quaternion(*said.T)._replace(x=-said[:, 1], y=-said[:, 2], z=-said[:, 3])
+    error = jnp.stack(tuple(Quaternion(*measured.T).multiply(conjugate)), axis=-1)
+    error = error * jnp.where(error[:, :1] < 0.0, -1.0, 1.0)
+    vector = error[:, 1:]
+    squared = jnp.sum(vector**2, axis=1, keepdims=True)
+    is_turned = squared > 0.0
+    sine = jnp.sqrt(jnp.where(is_turned, squared, 1.0))
+    # Angle over sine of the half angle; 2 where there is no turn to divide by.
+    factor = jnp.where(is_turned, 2.0 * jnp.arctan2(sine, error[:, :1]) / sine, 2.0)
+    return vector * factor
+
+
+def _raw(name: str, channel: Channel, said: Replay, record: Record) -> jax.Array:
+    """Return measured minus said of one channel, before centring."""
+    step_s = jnp.concatenate([jnp.zeros(1), record.step_s[:-1]])[:, None]  # of the step to the row
+    if name == "w":
+        return channel.measured - said.rates_b
+    if name == "f":
+        return channel.measured - said.force_b
+    if name == "q":
+        return _rotation_between(channel.measured, said.quat)
+    if name == "v_bat":
+        return channel.measured - jnp.cumsum(said.battery_change_v)[:, None]
+    vel_change = jnp.cumsum(said.acc_w * step_s, axis=0)
+    if name == "v":
+        return channel.measured - vel_change
+    moved = (vel_change - said.acc_w * step_s) * step_s + 0.5 * said.acc_w * step_s**2
+    return channel.measured - jnp.cumsum(moved, axis=0)
+
+
+def residuals(model: ModelParameters, problem: Problem) -> dict[str, jax.Array]:
+    """Return the residuals of each channel, (num_rows, components); 0 where a row does not count."""
+    record = jax.tree.map(jnp.asarray, problem.record)
+    said = replay(model, record, problem.turns_afresh)
+    time = jnp.cumsum(record.step_s)
+    found = {}
+    for name, channel in problem.channels.items():
+        values, counts = _raw(name, channel, said, record), jnp.asarray(channel.counts)
+        if name == "p":
+            values = _without_slope(values, time, counts, channel.window)
+        elif name in CENTRED:
+            values = _centred(values, counts, channel.window)
+        found[name] = values * counts
+    return found
