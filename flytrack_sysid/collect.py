@@ -1,145 +1,166 @@
-"""Excitation: short manoeuvres, one axis at a time, flown on a plant from chosen states.
+"""Collecting data: the excitation flown on a plant, as a flight log.
 
-Rate axes: sines, steps, doublets and chirps at several amplitudes, at about hovering thrust. Thrust: sweeps
-over the whole stick at voltages from full to nearly empty. Legs: tilted flight from several speeds and
-headings, where what the minimal model lacks shows.
+A plant is anything with the contract of ``flytrack_env.plants`` or a function ``step(x, u)`` of the
+handout's vectors. Only what comes out of it is used.
+
+Envelope: a flight ends where the drone would become faster than 25 m/s, leave heights between 10 and
+110 m, or leave 22 to 24 V.
 """
 
-from typing import Any, NamedTuple
+from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from scipy import signal
 
 from flytrack_env.dynamics import nominal_parameters
 from flytrack_env.plants import Plant
 from flytrack_env.state import (
-    ACTION_SIZE,
+    ACCELERATION,
     BATTERY,
     BATTERY_EMPTY_V,
     BATTERY_FULL_V,
-    QUATERNION,
+    POSITION,
     STATE_SIZE,
     VELOCITY,
     pack,
     unpack,
     unpack_action,
 )
+from flytrack_sysid.excitation import DT_S, FLIGHT_STEPS, FLIGHTS_PER_KIND, KINDS, script, start_state
+from flytrack_sysid.log import FlightLog, log_of_states
+from flytrack_sysid.sensors import measure
 
-DT = 0.01
-NUM_STEPS = 150
-AMPLITUDES = (0.1, 0.3, 0.6, 1.0)
-LEG_SPEEDS = (3.0, 8.0, 14.0)
-HOVER_THRUST = -0.25
-CRUISE_HEIGHT = 50.0
-RESERVE_V = 0.05
+StepFunction = Callable[[np.ndarray, np.ndarray], Any]
+Fly = Callable[[np.ndarray, np.ndarray], np.ndarray]
+Report = Callable[[int, int], None]
 
-
-class Excitation(NamedTuple):
-    """What was flown; leaves (num_manoeuvres, num_steps, ...), float32, 100 Hz.
-
-    states: (21,) before each step. actions: (4,) commanded. next_states: (21,) after it.
-    kinds: a name per manoeuvre: roll, pitch, yaw, thrust or leg.
-    """
-
-    states: np.ndarray
-    actions: np.ndarray
-    next_states: np.ndarray
-    kinds: tuple[str, ...]
-
-    def select(self, manoeuvres: np.ndarray) -> "Excitation":
-        """Return some of the manoeuvres, by index or mask."""
-        kinds = tuple(np.array(self.kinds)[manoeuvres])
-        arrays = (self.states, self.actions, self.next_states)
-        return Excitation(*(array[manoeuvres] for array in arrays), kinds)
-
-    def split(self) -> tuple["Excitation", "Excitation"]:
-        """Return training data and held-out data: every fourth manoeuvre, of each kind, is held out."""
-        order: dict[str, int] = {}
-        held_out = []
-        for kind in self.kinds:
-            order[kind] = order.get(kind, -1) + 1
-            held_out.append(order[kind] % 4 == 3)
-        mask = np.array(held_out)
-        return self.select(~mask), self.select(mask)
+LARGEST_SPEED = 25.0  # m/s
+HEIGHTS = (10.0, 110.0)  # m
+SECONDS_PER_FLIGHT = FLIGHT_STEPS * DT_S
+FEWEST_MINUTES = FLIGHTS_PER_KIND * len(KINDS) * SECONDS_PER_FLIGHT / 60.0
+SHORTEST_FLIGHT_S = 0.5
+MIDDLE_V = 0.5 * (BATTERY_EMPTY_V + BATTERY_FULL_V)
 
 
-def waveforms(rng: np.random.Generator) -> dict[str, np.ndarray]:
-    """Return one sine, step, doublet and chirp each, (num_steps,), amplitude 1, random phase or timing."""
-    time = np.arange(NUM_STEPS) * DT
-    duration = NUM_STEPS * DT
-    begin = rng.uniform(0.1, 0.3) * duration
-    width = rng.uniform(0.15, 0.3) * duration
-    is_on = (time >= begin) & (time < begin + width)
-    is_reversed = (time >= begin + width) & (time < begin + 2 * width)
-    sign = rng.choice([-1.0, 1.0])
-    return {
-        "sine": np.sin(2 * np.pi * rng.uniform(0.7, 3.0) * time + rng.uniform(0, 2 * np.pi)),
-        "step": sign * is_on,
-        "doublet": sign * (is_on.astype(float) - is_reversed),
-        "chirp": sign * signal.chirp(time, f0=0.5, t1=duration, f1=15.0, phi=-90),
-    }
+class CollectError(ValueError):
+    """A plant that cannot be flown, or a request that cannot be met."""
 
 
-def start_state(rng: np.random.Generator, voltage: float, tilt_deg: float, speed: float) -> Any:
-    """Return a start, (21,): tilted towards a random side, moving along a random direction."""
-    x = np.zeros(STATE_SIZE)
-    x[2] = CRUISE_HEIGHT
-    heading, side = rng.uniform(-np.pi, np.pi, 2)
-    half = 0.5 * np.deg2rad(tilt_deg)
-    x[QUATERNION] = [np.cos(half), np.sin(half) * np.cos(side), np.sin(half) * np.sin(side), 0.0]
-    x[VELOCITY] = [speed * np.cos(heading), speed * np.sin(heading), rng.uniform(-0.2, 0.2) * speed]
-    x[16:20] = [0.0, 0.0, 0.0, HOVER_THRUST]
-    x[BATTERY] = voltage
-    return x
-
-
-def script(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, tuple[str, ...]]:
-    """Return starts (num_manoeuvres, 21), commands (num_manoeuvres, num_steps, 4) and kinds."""
-    starts, commands, kinds = [], [], []
-    drain = nominal_parameters().battery_drain_v_per_min * NUM_STEPS * DT / 60.0
-    lowest = BATTERY_EMPTY_V + drain + RESERVE_V
-
-    def add(kind: str, command: np.ndarray, voltage: float, tilt_deg: float, speed: float) -> None:
-        starts.append(start_state(rng, voltage, tilt_deg, speed))
-        commands.append(np.clip(command, -1.0, 1.0))
-        kinds.append(kind)
-
-    for axis, kind in enumerate(("roll", "pitch", "yaw")):
-        for amplitude in AMPLITUDES:
-            for wave in waveforms(rng).values():
-                command = np.full((NUM_STEPS, ACTION_SIZE), [0.0, 0.0, 0.0, HOVER_THRUST])
-                command[:, axis] = amplitude * wave
-                add(kind, command, rng.uniform(lowest, BATTERY_FULL_V), 0.0, 0.0)
-    for voltage in np.linspace(lowest, BATTERY_FULL_V, 8):
-        for wave in waveforms(rng).values():
-            command = np.zeros((NUM_STEPS, ACTION_SIZE))
-            command[:, 3] = wave
-            add("thrust", command, voltage, rng.uniform(0.0, 20.0), 0.0)
-    for speed in LEG_SPEEDS:
-        for _ in range(8):
-            command = np.zeros((NUM_STEPS, ACTION_SIZE))
-            command[:, 3] = HOVER_THRUST + 0.3 * waveforms(rng)["sine"]
-            add("leg", command, rng.uniform(lowest, BATTERY_FULL_V), rng.uniform(0, 60), speed)
-    return np.array(starts), np.array(commands), tuple(kinds)
-
-
-def collect(plant: Plant, seed: int = 0) -> Excitation:
-    """Fly the excitation script on a plant and return what was measured.
-
-    plant: anything with the contract of ``flytrack_env.plants``; only its outputs are used.
-    """
-    starts, commands, kinds = script(np.random.default_rng(seed))
+def _fly_plant(plant: Plant) -> Fly:
+    """Return a function that flies a plant of ``flytrack_env.plants`` from starts, all at once."""
     model = nominal_parameters()  # part of the contract; a black box does not look at it
 
-    def fly(start: jax.Array, command: jax.Array) -> tuple[jax.Array, jax.Array]:
+    def fly_one(start: jax.Array, command: jax.Array) -> jax.Array:
         def step(state: Any, action: jax.Array) -> tuple:
-            next_state = plant.step(state, unpack_action(action), DT, model)
-            return next_state, (pack(plant.drone(state)), pack(plant.drone(next_state)))
+            return plant.step(state, unpack_action(action), DT_S, model), pack(plant.drone(state))
 
-        return jax.lax.scan(step, plant.reset(unpack(start), model), command)[1]
+        last, states = jax.lax.scan(step, plant.reset(unpack(start), model), command)
+        return jnp.concatenate([states, pack(plant.drone(last))[None]])
 
-    commands = commands.astype(np.float32)
-    states, next_states = jax.jit(jax.vmap(fly))(jnp.asarray(starts, jnp.float32), commands)
-    return Excitation(np.asarray(states), commands, np.asarray(next_states), kinds)
+    fly_all = jax.jit(jax.vmap(fly_one))
+    return lambda starts, commands: np.asarray(fly_all(starts, commands))
+
+
+def _fly_function(step: StepFunction, report: Report) -> Fly:
+    """Return a function that calls ``step(x, u)`` for every step of every flight."""
+
+    def checked(x: np.ndarray, u: np.ndarray) -> np.ndarray:
+        after = np.asarray(step(x, u), np.float32)
+        if after.shape != (STATE_SIZE,):
+            raise CollectError(f"step: found a state of shape {after.shape}, expected ({STATE_SIZE},)")
+        return after
+
+    def fly(starts: np.ndarray, commands: np.ndarray) -> np.ndarray:
+        states = np.empty((*commands.shape[:2], STATE_SIZE), np.float32)
+        states = np.concatenate([starts[:, None].astype(np.float32), states], axis=1)
+        for flight, command in enumerate(commands):
+            for number, u in enumerate(command):
+                states[flight, number + 1] = checked(states[flight, number], u)
+            report(flight + 1, len(commands))
+        return states
+
+    return fly
+
+
+def find_hover(fly: Fly) -> float:
+    """Return the thrust action that holds the weight at 23 V, level and at rest.
+
+    Raises:
+        CollectError: a plant that full thrust does not lift, or that idle thrust does.
+    """
+    actions = np.linspace(-1.0, 1.0, 41)
+    rng = np.random.default_rng(0)
+    starts = np.stack([start_state(rng, MIDDLE_V, action, 0.0, 0.0) for action in actions])
+    commands = np.zeros((len(actions), 1, 4), np.float32)
+    commands[:, 0, 3] = actions
+    climb = fly(starts.astype(np.float32), commands)[:, -1, ACCELERATION][:, 2]
+    if not (climb[0] < 0.0 < climb[-1]):
+        found = f"{climb[0]:.3g} and {climb[-1]:.3g} m/s^2"
+        raise CollectError(
+            f"plant: found vertical accelerations of {found} at thrust -1 and 1, level at {MIDDLE_V:g} V; "
+            "expected it to sink and to climb"
+        )
+    above = int(np.argmax(climb > 0.0))
+    return float(np.interp(0.0, climb[above - 1 : above + 1], actions[above - 1 : above + 1]))
+
+
+def _inside(states: np.ndarray) -> np.ndarray:
+    """Return where states (..., 21) are within the envelope."""
+    height, battery_v = states[..., POSITION][..., 2], states[..., BATTERY]
+    is_slow = np.linalg.norm(states[..., VELOCITY], axis=-1) <= LARGEST_SPEED
+    is_charged = (battery_v >= BATTERY_EMPTY_V) & (battery_v <= BATTERY_FULL_V)
+    return is_slow & is_charged & (height >= HEIGHTS[0]) & (height <= HEIGHTS[1])
+
+
+def collect(
+    plant: Plant | StepFunction,
+    minutes: float = 2.0,
+    seed: int = 0,
+    noise: float = 0.0,
+    report: Report = lambda done, total: None,
+) -> FlightLog:
+    """Fly the excitation on a plant and return the log, a segment per flight of at most 2.5 s.
+
+    plant: a plant, or a function ``(x (21,), u (4,)) -> x (21,)``, 0.01 s a step, called from chosen
+    states. minutes: of flight before the envelope ends any, at least 1. noise: 0 logs the state as it is;
+    1 as common sensors would (``flytrack_sysid.sensors``). report: called with flights done and to do.
+
+    Raises:
+        CollectError: too few minutes, a plant that does not fly or returns what is no state.
+    """
+    if not minutes >= FEWEST_MINUTES:
+        raise CollectError(f"minutes: found {minutes}, expected at least {FEWEST_MINUTES:g}")
+    if not noise >= 0.0:
+        raise CollectError(f"noise: found {noise}, expected 0 or more")
+    rng = np.random.default_rng(seed)
+    is_plant = hasattr(plant, "reset") and hasattr(plant, "drone")
+    fly = _fly_plant(plant) if is_plant else _fly_function(plant, report)
+    hover = find_hover(_fly_plant(plant) if is_plant else _fly_function(plant, lambda done, total: None))
+    flights = script(round(minutes * 60.0 / SECONDS_PER_FLIGHT), hover, rng)
+    starts = np.stack([flight.start for flight in flights]).astype(np.float32)
+    commands = np.stack([flight.command for flight in flights]).astype(np.float32)
+    # One step ahead of the log, so that the first row's acceleration is the plant's, not the start's.
+    commands = np.concatenate([commands[:, :1], commands], axis=1)
+    states = fly(starts, commands)
+    if not np.isfinite(states).all():
+        flight, row, column = np.argwhere(~np.isfinite(states))[0]
+        raise CollectError(
+            f"plant: found {states[flight, row, column]} in component {column}, flight {flight} "
+            f"({flights[flight].kind}), step {row}; expected finite numbers"
+        )
+    log = log_of_states(_cut(states[:, 1:-1], commands[:, 1:]), DT_S, "collected")
+    if noise > 0.0:
+        log = measure(log, noise, nominal_parameters().g, rng)
+    return log
+
+
+def _cut(states: np.ndarray, commands: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Return the part of each flight before it leaves the envelope; none of very short ones."""
+    lengths = np.where(_inside(states).all(axis=1), states.shape[1], np.argmin(_inside(states), axis=1))
+    shortest = SHORTEST_FLIGHT_S / DT_S
+    kept = [(x[:n], u[:n]) for x, u, n in zip(states, commands, lengths, strict=True) if n >= shortest]
+    if not kept:
+        raise CollectError("plant: no flight stayed within the envelope for half a second")
+    return kept

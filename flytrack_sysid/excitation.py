@@ -1,0 +1,154 @@
+"""Excitation: short flights that move one thing at a time, from chosen states.
+
+==========  =====================================================================================
+kind        what is flown, from a state of its own at a voltage of its own
+==========  =====================================================================================
+roll,       chirp then step, or doublet then sine, on this axis alone and about hovering thrust,
+pitch, yaw  at amplitudes from a tenth of the stick to all of it
+thrust      two of sine, step, doublet and chirp over the whole stick, near upright
+free        switching commands on all axes, thrust axis up to 80 degrees from the vertical
+leg         4 to 18 m/s in any direction and heading, tilted, with switching yaw and slow thrust
+==========  =====================================================================================
+
+Four flights of a kind follow each other, so that the last of every four can be held out
+(``flytrack_sysid.split``) and every kind is in both parts.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from scipy import signal
+from scipy.spatial.transform import Rotation
+
+from flytrack_env.state import (
+    ACTION_SIZE,
+    APPLIED_ACTION,
+    BATTERY,
+    BATTERY_EMPTY_V,
+    BATTERY_FULL_V,
+    POSITION,
+    QUATERNION,
+    STATE_SIZE,
+    VELOCITY,
+)
+
+DT_S = 0.01
+SLOT_STEPS = 125
+FLIGHT_STEPS = 2 * SLOT_STEPS
+FLIGHTS_PER_KIND = 4
+KINDS = ("roll", "pitch", "yaw", "thrust", "free", "leg")
+AMPLITUDES = (0.1, 0.3, 0.6, 1.0)
+FREE_AMPLITUDES = (0.3, 0.5, 0.8, 1.0)
+LEG_SPEEDS = (4.0, 9.0, 14.0, 18.0)  # m/s
+HEIGHT = 60.0  # m, at the start of each flight
+THRUST_SWING, LEG_SWING, LEG_STICK = 0.25, 0.3, 0.2
+HOLD_STEPS = (3, 12)  # of switching commands
+# Above empty: what the flight itself takes, at any drain that leaves a flight of a minute.
+RESERVE_V = 0.1
+
+
+class Flight(NamedTuple):
+    """One flight: kind, start (21,) and commands (FLIGHT_STEPS, 4), before anything is clipped."""
+
+    kind: str
+    start: np.ndarray
+    command: np.ndarray
+
+
+def wave(name: str, rng: np.random.Generator) -> np.ndarray:
+    """Return a sine, step, doublet or chirp of amplitude 1, (SLOT_STEPS,), random in phase or timing."""
+    time = np.arange(SLOT_STEPS) * DT_S
+    duration = SLOT_STEPS * DT_S
+    sign = rng.choice([-1.0, 1.0])
+    if name == "sine":
+        return sign * np.sin(2 * np.pi * rng.uniform(0.8, 3.0) * time)
+    if name == "chirp":
+        return sign * signal.chirp(time, f0=0.8, t1=duration, f1=16.0, phi=-90)
+    begin, width = rng.uniform(0.1, 0.3) * duration, rng.uniform(0.15, 0.3) * duration
+    is_on = (time >= begin) & (time < begin + width)
+    is_reversed = (time >= begin + width) & (time < begin + 2 * width)
+    return sign * (is_on - (1.0 * is_reversed if name == "doublet" else 0.0))
+
+
+def switching(rng: np.random.Generator) -> np.ndarray:
+    """Return a command that jumps between -1 and 1 every 30 to 120 ms, (FLIGHT_STEPS,)."""
+    holds = rng.integers(*HOLD_STEPS, size=FLIGHT_STEPS, endpoint=True)
+    signs = rng.choice([-1.0, 1.0]) * (-1.0) ** np.arange(FLIGHT_STEPS)
+    return np.repeat(signs, holds)[:FLIGHT_STEPS]
+
+
+def start_state(
+    rng: np.random.Generator, voltage: float, hover: float, tilt_deg: float, speed: float
+) -> np.ndarray:
+    """Return a start (21,) with the thrust action ``hover``, tilted and moving in random directions."""
+    x = np.zeros(STATE_SIZE)
+    x[POSITION] = [0.0, 0.0, HEIGHT]
+    side, heading, yaw = rng.uniform(-np.pi, np.pi, 3)
+    tilt = Rotation.from_rotvec(np.deg2rad(tilt_deg) * np.array([np.cos(side), np.sin(side), 0.0]))
+    x[QUATERNION] = (tilt * Rotation.from_euler("z", yaw)).as_quat(scalar_first=True, canonical=True)
+    climb = rng.uniform(-0.3, 0.3)
+    x[VELOCITY] = speed * np.array([np.cos(heading), np.sin(heading), climb]) / np.hypot(1.0, climb)
+    x[APPLIED_ACTION] = [0.0, 0.0, 0.0, hover]
+    x[BATTERY] = voltage
+    return x
+
+
+def _axis_command(axis: int, turn: int, number: int, hover: float, rng: np.random.Generator) -> np.ndarray:
+    """Return two waves on one axis; kinds of waves alternate by turn, amplitudes go round by number."""
+    names = ("chirp", "step") if turn % 2 == 0 else ("doublet", "sine")
+    command = np.tile([0.0, 0.0, 0.0, hover], (FLIGHT_STEPS, 1))
+    for slot, name in enumerate(names):
+        # Shifted by slot and turn, so that the held-out flights differ in amplitude.
+        amplitude = AMPLITUDES[(number + slot + turn) % len(AMPLITUDES)]
+        command[slot * SLOT_STEPS : (slot + 1) * SLOT_STEPS, axis] = amplitude * wave(name, rng)
+    return command
+
+
+def _flight(
+    kind: str, turn: int, number: int, voltage: float, hover: float, rng: np.random.Generator
+) -> Flight:
+    """Return one flight of a kind; ``number`` counts within the four of its turn."""
+    if kind in KINDS[:3]:
+        start = start_state(rng, voltage, hover, 0.0, 0.0)
+        return Flight(kind, start, _axis_command(KINDS.index(kind), turn, number, hover, rng))
+    command = np.tile([0.0, 0.0, 0.0, hover], (FLIGHT_STEPS, 1))
+    if kind == "thrust":
+        names = ("sine", "step", "doublet", "chirp")
+        pair = names[number % 4], names[(number + 1 + turn) % 4]
+        command[:, 3] = np.concatenate([wave(name, rng) for name in pair])
+        return Flight(kind, start_state(rng, voltage, hover, rng.uniform(0.0, 20.0), 0.0), command)
+    command[:, 2] = switching(rng)
+    if kind == "free":
+        amplitude = FREE_AMPLITUDES[number]
+        command[:, :2] = amplitude * np.stack([switching(rng), switching(rng)], axis=1)
+        command[:, 3] += THRUST_SWING * switching(rng)
+        return Flight(kind, start_state(rng, voltage, hover, rng.uniform(20.0, 80.0), 0.0), command)
+    time = np.arange(FLIGHT_STEPS) * DT_S
+    slow = [np.sin(2 * np.pi * rng.uniform(0.5, 1.5) * time + rng.uniform(0, 2 * np.pi)) for _ in range(3)]
+    command[:, :2] = LEG_STICK * np.stack(slow[:2], axis=1)
+    command[:, 3] += LEG_SWING * slow[2]
+    return Flight(
+        kind, start_state(rng, voltage, hover, rng.uniform(10.0, 50.0), LEG_SPEEDS[number]), command
+    )
+
+
+def script(num_flights: int, hover: float, rng: np.random.Generator) -> list[Flight]:
+    """Return the flights of an excitation; ``hover`` is the thrust action that holds the weight.
+
+    Voltages of each kind are spread evenly between full and nearly empty, in random order.
+    """
+    turns = -(-num_flights // (FLIGHTS_PER_KIND * len(KINDS)))
+    lowest = BATTERY_EMPTY_V + RESERVE_V
+    voltages = {
+        kind: rng.permutation(np.linspace(lowest, BATTERY_FULL_V, turns * FLIGHTS_PER_KIND)) for kind in KINDS
+    }
+    flights = [
+        _flight(kind, turn, number, voltages[kind][turn * FLIGHTS_PER_KIND + number], hover, rng)
+        for turn in range(turns)
+        for kind in KINDS
+        for number in range(FLIGHTS_PER_KIND)
+    ]
+    return [
+        flight._replace(command=np.clip(flight.command, -1.0, 1.0).reshape(-1, ACTION_SIZE))
+        for flight in flights[:num_flights]
+    ]

@@ -1,0 +1,58 @@
+"""Sensors: what a log shows of a flight when it is measured instead of known."""
+
+from dataclasses import replace
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from flytrack_sysid.log import FlightLog
+
+# Standard deviations at level 1; gyro and accelerometer as on a drone whose motors run.
+GYRO_NOISE = 0.1  # rad/s
+ACCELEROMETER_NOISE = 1.5  # m/s^2
+VELOCITY_NOISE = 0.05  # m/s
+POSITION_NOISE = 0.01  # m
+ATTITUDE_NOISE_DEG = 0.5
+# Steps of the numbers that are logged, at any level: 16 bits over 2000 deg/s and 16 g; mm/s, mm, 10 mV.
+GYRO_STEP = 4000.0 / 2**16 * np.pi / 180.0  # rad/s
+ACCELEROMETER_STEP = 32.0 * 9.80665 / 2**16  # m/s^2
+VELOCITY_STEP, POSITION_STEP, QUATERNION_STEP, BATTERY_STEP = 1e-3, 1e-3, 1e-4, 0.01
+LOST_ROWS = 0.02  # share, at level 1
+
+
+def specific_force_b(log: FlightLog, gravity: float) -> np.ndarray:
+    """Return the specific force of the step to each row in the attitude before it, body, m/s^2.
+
+    (num_rows, 3); in the first row of a segment, where no step is known, in its own attitude. Needs the
+    channels a and q. gravity: m/s^2.
+    """
+    before = np.arange(len(log)) - np.where(log.is_start(), 0, 1)
+    attitude = Rotation.from_quat(log["q"][before], scalar_first=True)
+    return attitude.inv().apply(log["a"] + np.array([0.0, 0.0, gravity]))
+
+
+def measure(log: FlightLog, level: float, gravity: float, rng: np.random.Generator) -> FlightLog:
+    """Return a log as sensors would have written it: noisy, quantised, with rows lost.
+
+    level: 1 for the noise of this module, 0 for none. Known accelerations become an accelerometer's
+    specific force, and the applied action, which nobody measures, is absent.
+    """
+
+    def noisy(values: np.ndarray, noise: float, step: float) -> np.ndarray:
+        return step * np.round((values + level * noise * rng.standard_normal(values.shape)) / step)
+
+    attitude = Rotation.from_quat(log["q"], scalar_first=True)
+    turn = np.deg2rad(level * ATTITUDE_NOISE_DEG) * rng.standard_normal((len(log), 3))
+    quat = (attitude * Rotation.from_rotvec(turn)).as_quat(scalar_first=True)
+    quat = QUATERNION_STEP * np.round(quat / QUATERNION_STEP)
+    channels = {
+        "u": log["u"],
+        "p": noisy(log["p"], POSITION_NOISE, POSITION_STEP),
+        "v": noisy(log["v"], VELOCITY_NOISE, VELOCITY_STEP),
+        "f": noisy(specific_force_b(log, gravity), ACCELEROMETER_NOISE, ACCELEROMETER_STEP),
+        "q": quat / np.linalg.norm(quat, axis=1, keepdims=True),
+        "w": noisy(log["w"], GYRO_NOISE, GYRO_STEP),
+        "v_bat": noisy(log["v_bat"], 0.0, BATTERY_STEP),
+    }
+    is_kept = rng.random(len(log)) >= level * LOST_ROWS
+    return replace(log, channels=channels).select(is_kept)
