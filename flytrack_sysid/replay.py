@@ -18,6 +18,9 @@ from flytrack_env.state import Action, Drone
 from flytrack_sysid.record import Record
 
 
+UNROLL = 1
+
+
 class Replay(NamedTuple):
     """What the model says of the rows, (num_rows, ...); of the first of a flight it says nothing.
 
@@ -59,25 +62,18 @@ def replay(model: ModelParameters, record: Record, turns_afresh: jax.Array) -> R
     arguments are, inside of ``jax.enable_x64(True)``.
     """
 
-    def next_row(carry: tuple, inputs: tuple) -> tuple:
-        applied, rates_b, memories, quat = carry
-        row, is_fresh = inputs
-        applied = _chosen(row.begins | row.is_applied_known, Action(*row.applied), applied)
-        drone = _drone(row, applied, rates_b)
-        memories = _chosen(row.begins, start_memories(model.effects, drone), memories)
-        quat = _chosen(row.begins | is_fresh, drone.quat, quat)
-        after, memories = advance(drone, memories, Action(*row.command), row.step_s, model)
-        force_w = after.acc_w + Vec3(0.0, 0.0, model.g)
-        of_next = (after.rates_b, [axis.dot(force_w) for axis in drone.quat.axes()], after.acc_w)
-        change_v = after.battery_v - drone.battery_v
-        turned = integrate_attitude(quat, after.rates_b, row.step_s)
-        return (after.applied, after.rates_b, memories, turned), (applied, quat, of_next, change_v)
-
     record = jax.tree.map(jnp.asarray, record)
-    first = jax.tree.map(lambda column: column[0], record)
-    drone = _drone(first, Action(*first.applied), Vec3(*jnp.zeros_like(first.vel_w)))
-    start = (drone.applied, drone.rates_b, start_memories(model.effects, drone), drone.quat)
-    _, (applied, quat, of_next, change_v) = jax.lax.scan(next_row, start, (record, turns_afresh))
+    applied, rates_b, memories = _remembered(model, record)
+
+    def said_of_next(row: Record, applied: Action, rates_b: Vec3, memories: tuple) -> tuple:
+        drone = _drone(row, applied, rates_b)
+        after, _ = advance(drone, memories, Action(*row.command), row.step_s, model)
+        force_w = after.acc_w + Vec3(0.0, 0.0, model.g)
+        force_b = Vec3(*(axis.dot(force_w) for axis in drone.quat.axes()))
+        return after.rates_b, force_b, after.acc_w, after.battery_v - drone.battery_v
+
+    of_next = jax.vmap(said_of_next)(record, applied, rates_b, memories)
+    quat = _turned(record, of_next[0], record.begins | turns_afresh)
 
     def stacked(leaves: Any) -> jax.Array:
         return jnp.stack(tuple(leaves), axis=-1)
@@ -85,5 +81,38 @@ def replay(model: ModelParameters, record: Record, turns_afresh: jax.Array) -> R
     def moved_on(values: jax.Array) -> jax.Array:  # said at a row, of the next one
         return jnp.concatenate([jnp.zeros_like(values[:1]), values[:-1]])
 
-    rates_b, force_b, acc_w = (moved_on(stacked(leaves)) for leaves in of_next)
-    return Replay(stacked(applied), rates_b, force_b, acc_w, stacked(quat), moved_on(change_v))
+    rates_b, force_b, acc_w = (moved_on(stacked(leaves)) for leaves in of_next[:3])
+    return Replay(stacked(applied), rates_b, force_b, acc_w, stacked(quat), moved_on(of_next[3]))
+
+
+def _remembered(model: ModelParameters, record: Record) -> tuple[Action, Vec3, tuple]:
+    """Return the applied action, body rates and effects' memories at every row.
+
+    Only these follow from the row before; the rest of a step is done for all rows at once.
+    """
+
+    def next_row(carry: tuple, row: Record) -> tuple:
+        applied, rates_b, memories = carry
+        applied = _chosen(row.begins | row.is_applied_known, Action(*row.applied), applied)
+        drone = _drone(row, applied, rates_b)
+        memories = _chosen(row.begins, start_memories(model.effects, drone), memories)
+        after, later = advance(drone, memories, Action(*row.command), row.step_s, model)
+        return (after.applied, after.rates_b, later), (applied, rates_b, memories)
+
+    first = jax.tree.map(lambda column: column[0], record)
+    drone = _drone(first, Action(*first.applied), Vec3(*jnp.zeros_like(first.vel_w)))
+    start = (drone.applied, drone.rates_b, start_memories(model.effects, drone))
+    return jax.lax.scan(next_row, start, record, unroll=UNROLL)[1]
+
+
+def _turned(record: Record, rates_b: Vec3, is_fresh: jax.Array) -> Quaternion:
+    """Return the attitude that rates lead to at every row, from the measured one where it is fresh."""
+
+    def next_row(quat: Quaternion, inputs: tuple) -> tuple:
+        measured, rates_b, step_s, is_fresh = inputs
+        quat = _chosen(is_fresh, measured, quat)
+        return integrate_attitude(quat, rates_b, step_s), quat
+
+    measured = Quaternion(*record.quat.T)
+    start = jax.tree.map(lambda column: column[0], measured)
+    return jax.lax.scan(next_row, start, (measured, rates_b, record.step_s, is_fresh), unroll=UNROLL)[1]
