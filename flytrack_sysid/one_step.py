@@ -37,14 +37,21 @@ class ChannelError(NamedTuple):
 
     errors: (num_steps, size), unit of the channel; of q with the sign that is nearer to the measured one.
     mse: mean over steps and components. nrmse: None where the measured channel never changes.
-    angle_rms_deg: of q, else None.
+    turn_deg: of q, (num_steps, 3) deg, the turn from modelled to measured attitude, body axes; else None.
     """
 
     errors: np.ndarray
     mse: float
     mse_by_axis: tuple[float, ...]
     nrmse: float | None
-    angle_rms_deg: float | None = None
+    turn_deg: np.ndarray | None = None
+
+    @property
+    def angle_rms_deg(self) -> float | None:
+        """Rms of the angle between measured and modelled attitude, deg; None but for q."""
+        if self.turn_deg is None:
+            return None
+        return float(np.sqrt(np.mean(np.sum(self.turn_deg**2, axis=1))))
 
     def as_json(self, name: str) -> dict[str, Any]:
         """Return the numbers, not the single errors, as JSON values."""
@@ -83,15 +90,14 @@ def predicted_channel(name: str, prediction: Prediction, model: ModelParameters)
 
 def _error_of(name: str, before: np.ndarray, measured: np.ndarray, predicted: np.ndarray) -> ChannelError:
     """Return a channel's errors; all (num_steps, size)."""
-    angle_rms_deg = None
+    turn_deg = None
     if name == "q":
 
         def nearer(quats: np.ndarray) -> np.ndarray:
             return np.where(np.sum(quats * measured, axis=1, keepdims=True) < 0.0, -quats, quats)
 
         before, predicted = nearer(before), nearer(predicted)
-        turn = turn_between(measured, predicted)
-        angle_rms_deg = float(np.rad2deg(np.sqrt(np.mean(np.sum(turn**2, axis=1)))))
+        turn_deg = np.rad2deg(turn_between(predicted, measured))
     errors = measured - predicted
     by_change = NORMALISED_BY[name] == BY_CHANGE
     scale = np.mean((measured - before) ** 2) if by_change else np.mean(np.var(measured, axis=0))
@@ -101,7 +107,7 @@ def _error_of(name: str, before: np.ndarray, measured: np.ndarray, predicted: np
         mse=mse,
         mse_by_axis=tuple(np.mean(errors**2, axis=0).tolist()),
         nrmse=float(np.sqrt(mse / scale)) if scale > 0.0 else None,
-        angle_rms_deg=angle_rms_deg,
+        turn_deg=turn_deg,
     )
 
 
