@@ -88,7 +88,7 @@ def predicted_channel(name: str, prediction: Prediction, model: ModelParameters)
     return columns(of[name])
 
 
-def _error_of(name: str, before: np.ndarray, measured: np.ndarray, predicted: np.ndarray) -> ChannelError:
+def error_of(name: str, before: np.ndarray, measured: np.ndarray, predicted: np.ndarray) -> ChannelError:
     """Return a channel's errors; all (num_steps, size)."""
     turn_deg = None
     if name == "q":
@@ -126,7 +126,7 @@ def one_step_errors(
     if not len(here):
         return OneStep(0, {})
     channels = {
-        name: _error_of(
+        name: error_of(
             name, log[name][here], log[name][here + 1], predicted_channel(name, prediction, model)[here]
         )
         for name in names

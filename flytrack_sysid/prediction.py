@@ -5,6 +5,7 @@ Everything comes out of ``flytrack_env.dynamics.advance``, in float64.
 
 from collections.abc import Iterator
 from functools import partial
+from itertools import pairwise
 from typing import Any, NamedTuple
 
 import jax
@@ -62,10 +63,14 @@ class Prediction(NamedTuple):
 def steps_of(log: FlightLog) -> Steps:
     """Return how the rows of a log follow one another."""
     starts = log.is_start()
-    duration = np.append(np.diff(log.time), 0.0)
+    duration = np.append(np.diff(log.time), 0.0)[: len(log)]
     is_inside = np.append(~starts[1:], False)[: len(log)]
     median = float(np.median(duration[is_inside])) if is_inside.any() else 1.0
-    is_step = is_inside & (duration <= GAP_STEPS * median)
+    is_step = is_inside.copy()
+    bounds = np.append(np.flatnonzero(starts), len(log)).tolist()
+    for start, end in pairwise(bounds):  # segments may have been logged at different rates
+        inside = duration[start : end - 1]
+        is_step[start : end - 1] = inside <= GAP_STEPS * (np.median(inside) if len(inside) else 0.0)
     is_break = np.append(True, ~is_step[:-1])[: len(log)]
     stretch = np.cumsum(is_break) - 1
     return Steps(
