@@ -140,7 +140,7 @@ def draw_rollouts(rollouts: Sequence[Rollout]) -> Figure:
 def draw_thrust(thrust: ThrustError | None) -> Figure:
     """Draw the error of thrust over applied action and voltage, and both curves at three voltages."""
     if thrust is None:
-        return _nothing("Thrust", "not judged: it needs v_bat, and f, a or v")
+        return _nothing("Thrust", "not judged: it needs v_bat, and f, or a or v with q")
     figure, panels = _figure("Thrust", 2, 1, 8.0)
     heat, curves = panels[:, 0]
     limit = float(np.nanmax(np.abs(thrust.mean_n)))

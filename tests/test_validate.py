@@ -279,6 +279,7 @@ def test_segments_of_other_rates_have_no_gaps(log):
 
 def test_judges_only_the_rows_it_is_told(log):
     rows = held_out_rows(log)
+    rows[320:400] = True  # a piece with rows that are not judged on both sides
     damaged = {name: values.copy() for name, values in log.channels.items()}
     for name in ("p", "v", "w", "a"):
         damaged[name][~rows] += 100.0
@@ -289,6 +290,13 @@ def test_judges_only_the_rows_it_is_told(log):
     assert nothing.one_step.channels == {} and nothing.thrust is None and nothing.steps == ()
     with pytest.raises(ValueError, match="rows: found int64"):
         validate(TRUTH, log, np.flatnonzero(rows))
+
+
+@pytest.mark.parametrize("num_rows", [1, 2])
+def test_log_of_hardly_any_rows_is_judged_on_what_it_has(log, num_rows):
+    short = validate(TRUTH, log.select(slice(num_rows)))
+    assert short.one_step.num_steps == num_rows - 1 and short.steps == ()
+    assert [rollout.num_starts for rollout in short.rollouts] == [0, 0, 0, 0]
 
 
 def test_commands_without_steps_are_said(log):
