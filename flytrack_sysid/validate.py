@@ -92,6 +92,27 @@ def _notes_of(model: ModelParameters, log: FlightLog, prediction: Prediction) ->
     return notes
 
 
+def _forces(
+    model: ModelParameters, log: FlightLog, prediction: Prediction, rows: np.ndarray
+) -> tuple[ThrustError | None, OpenForce | None, list[str]]:
+    """Return the error of thrust, the force left open, and notes on what the log cannot tell of them."""
+    thrust = left = None
+    samples = force_samples(model, log, prediction, rows)
+    if samples is None:
+        why = "no judged step has f, a or v that the model can be held to"
+        return None, None, [f"thrust and force left open: {why}"]
+    notes = []
+    if "v_bat" in log:
+        thrust = thrust_error(model, samples, prediction.steps.median)
+    else:
+        notes.append("thrust by voltage: v_bat is not in the log")
+    if samples.source != "v" and "v" in log and "q" in log:
+        left = open_force(log, prediction, samples)
+    else:
+        notes.append("force left open by speed: it needs v, q, and a or f")
+    return thrust, left, notes
+
+
 def validate(model: ModelParameters, log: FlightLog, rows: np.ndarray | None = None) -> Validation:
     """Return the errors of a model on a log, from the measured states under the logged commands.
 
@@ -111,26 +132,11 @@ def validate(model: ModelParameters, log: FlightLog, rows: np.ndarray | None = N
     if not one_step.num_steps:
         notes.append("one step: no judged row is followed by a judged row")
     rollouts = rollout_errors(model, log, prediction, rows)
-    for rollout in rollouts:
-        if not rollout.num_starts:
-            notes.append(
-                f"free flight of {rollout.horizon_s:g} s: no judged stretch without a gap is as long"
-            )
-    samples = force_samples(model, log, prediction, rows)
-    thrust = left = None
-    if samples is None:
-        notes.append(
-            "thrust and force left open: the log has none of f, a or v that the model can be held to"
-        )
-    else:
-        if "v_bat" in log:
-            thrust = thrust_error(model, samples, prediction.steps.median)
-        else:
-            notes.append("thrust by voltage: v_bat is not in the log")
-        if samples.source != "v" and "v" in log and "q" in log:
-            left = open_force(log, prediction, samples)
-        else:
-            notes.append("force left open by speed: it needs v, q, and a or f")
+    too_long = [f"{rollout.horizon_s:g} s" for rollout in rollouts if not rollout.num_starts]
+    if too_long:
+        notes.append(f"free flight of {', '.join(too_long)}: no judged stretch without a gap is as long")
+    thrust, left, force_notes = _forces(model, log, prediction, rows)
+    notes += force_notes
     steps = step_responses(model, log, prediction, rows)
     if not steps:
         notes.append(

@@ -265,7 +265,7 @@ def test_gaps_are_not_crossed(log):
     assert max(nrmse(gappy).values()) < 1e-6
     assert 0 < gappy.rollouts[1].num_starts < 50 and gappy.rollouts[3].num_starts == 0
     assert gappy.rollouts[3].errors == {}
-    assert any("free flight of 2 s" in note for note in gappy.notes)
+    assert any("free flight of 1 s, 2 s" in note for note in gappy.notes)
     assert max(spread.p95 for spread in gappy.rollouts[1].errors.values()) < 1e-5
     recovered = validate(TRUTH, log.without("uprev").select(keep))
     assert 0 < recovered.one_step.num_steps < gappy.one_step.num_steps
