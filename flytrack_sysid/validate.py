@@ -1,63 +1,156 @@
-"""One-step errors on held-out data, and what the minimal structure leaves open."""
+"""How well a model predicts a flight log, and what it leaves open."""
 
-from itertools import pairwise
 from typing import Any, NamedTuple
 
-import jax
 import numpy as np
-from scipy.spatial.transform import Rotation
 
-from flytrack_env.dynamics import ModelParameters, step
-from flytrack_env.state import ACCELERATION, POSITION, QUATERNION, RATES, VELOCITY
-from flytrack_sysid.collect import DT, Excitation
+from flytrack_env.dynamics import ModelParameters
+from flytrack_sysid.forces import OpenForce, force_samples, open_force
+from flytrack_sysid.log import FlightLog
+from flytrack_sysid.one_step import OneStep, one_step_errors
+from flytrack_sysid.open_loop import Rollout, rollout_errors
+from flytrack_sysid.prediction import SETTLING_S, Prediction, inputs_that_lack, predict
+from flytrack_sysid.steps import HELD_AFTER_S, HELD_BEFORE_S, LEAST_JUMP, StepResponse, step_responses
+from flytrack_sysid.thrust import ThrustError, thrust_error
 
-CHANNELS = {"position": POSITION, "velocity": VELOCITY, "quaternion": QUATERNION, "rates": RATES}
-SPEED_EDGES = (0.0, 2.0, 5.0, 10.0, 20.0)
+NAMES = {
+    "p": "position",
+    "v": "velocity",
+    "q": "attitude",
+    "w": "body rates",
+    "a": "acceleration",
+    "f": "specific force",
+}
 
 
 class Validation(NamedTuple):
-    """Errors of the model's one-step prediction from the measured state, on held-out data.
+    """Errors of a model on the judged rows of a log.
 
-    mse: mean squared error per channel (per component: m^2, (m/s)^2, 1, (rad/s)^2).
-    open_force: rms of measured minus modelled specific force, body x, y, z, m/s^2.
-    open_force_by_speed: (speed from, speed to, rms of that force's norm), m/s and m/s^2.
+    notes: what could not be judged and why, and what was assumed; sentences.
+    thrust, open_force: None where the log cannot tell.
     """
 
-    mse: dict[str, float]
-    open_force: tuple[float, float, float]
-    open_force_by_speed: tuple[tuple[float, float, float], ...]
+    num_rows: int
+    num_judged: int
+    one_step: OneStep
+    rollouts: tuple[Rollout, ...]
+    thrust: ThrustError | None
+    open_force: OpenForce | None
+    steps: tuple[StepResponse, ...]
+    notes: tuple[str, ...]
 
     def as_json(self) -> dict[str, Any]:
-        """Return the numbers as JSON values."""
-        return {
-            "one_step_mse": self.mse,
-            "open": {
-                "what": "specific force that the model does not explain",
-                "rms_body_xyz_m_per_s2": list(self.open_force),
-                "rms_by_speed_m_per_s": [list(row) for row in self.open_force_by_speed],
-            },
+        """Return the numbers as JSON values; what could not be judged is absent, and in the notes."""
+        parts = {
+            "thrust": self.thrust and self.thrust.as_json(),
+            "open_force": self.open_force and self.open_force.as_json(),
         }
+        return _finite(
+            {
+                "rows": self.num_rows,
+                "judged_rows": self.num_judged,
+                "one_step": self.one_step.as_json(),
+                "rollouts": [rollout.as_json() for rollout in self.rollouts],
+                **{name: part for name, part in parts.items() if part is not None},
+                "steps": [step.as_json() for step in self.steps],
+                "notes": list(self.notes),
+            }
+        )
 
 
-def validate(model: ModelParameters, data: Excitation) -> Validation:
-    """Return the errors of a model on data that it was not fitted to."""
-    flat = [array.reshape(-1, array.shape[-1]) for array in data[:3]]
-    states, actions, measured = flat
-    predicted = np.asarray(jax.jit(jax.vmap(step, in_axes=(0, 0, None, None)))(states, actions, DT, model))
-    error = measured.astype(float) - predicted
-    mse = {name: float(np.mean(error[:, where] ** 2)) for name, where in CHANNELS.items()}
+def _finite(value: Any) -> Any:
+    """Return JSON values with null for what is not finite: a model that ran away."""
+    if isinstance(value, dict):
+        return {name: _finite(item) for name, item in value.items()}
+    if isinstance(value, list):
+        return [_finite(item) for item in value]
+    return None if isinstance(value, float) and not np.isfinite(value) else value
 
-    attitude = Rotation.from_quat(states[:, QUATERNION], scalar_first=True)
-    force_b = attitude.inv().apply(error[:, ACCELERATION])
-    speed = np.linalg.norm(states[:, VELOCITY], axis=1)
-    by_speed = []
-    for low, high in pairwise(SPEED_EDGES):
-        is_in = (speed >= low) & (speed < high)
-        if is_in.any():
-            rms = np.sqrt(np.mean(np.sum(force_b[is_in] ** 2, axis=1)))
-            by_speed.append((low, high, float(rms)))
+
+def _notes_of(model: ModelParameters, log: FlightLog, prediction: Prediction) -> list[str]:
+    """Return what the log lacks, and what is assumed instead."""
+    notes = []
+    for name, lacking in inputs_that_lack(model, log).items():
+        if name in log and lacking:
+            verb = "is" if len(lacking) == 1 else "are"
+            notes.append(f"{NAMES[name]} ({name}): not judged; {', '.join(lacking)} {verb} not in the log")
+        elif name not in log and name not in ("a", "f"):
+            notes.append(f"{NAMES[name]} ({name}): not in the log")
+    if "a" not in log and "f" not in log:
+        notes.append("acceleration (a) and specific force (f): not in the log")
+    if prediction.applied_from == "lag":
+        notes.append(
+            "applied action (uprev): not in the log; it follows the commands by the model's own lags, as if "
+            "the first command of a segment had been held before"
+        )
+    if not prediction.is_settled.all():
+        count = int(np.sum(~prediction.is_settled))
+        notes.append(
+            f"{count} rows within {SETTLING_S:g} s after a segment's start or a gap begin no judged step or "
+            "flight: what came before is not known there"
+        )
+    return notes
+
+
+def _forces(
+    model: ModelParameters, log: FlightLog, prediction: Prediction, rows: np.ndarray
+) -> tuple[ThrustError | None, OpenForce | None, list[str]]:
+    """Return the error of thrust, the force left open, and notes on what the log cannot tell of them."""
+    thrust = left = None
+    samples = force_samples(model, log, prediction, rows)
+    if samples is None:
+        why = "no judged step has f, a or v that the model can be held to"
+        return None, None, [f"thrust and force left open: {why}"]
+    notes = []
+    if "v_bat" in log:
+        thrust = thrust_error(model, samples, prediction.steps.median)
+    else:
+        notes.append("thrust by voltage: v_bat is not in the log")
+    if samples.source != "v" and "v" in log and "q" in log:
+        left = open_force(log, prediction, samples)
+    else:
+        notes.append("force left open by speed: it needs v, q, and a or f")
+    return thrust, left, notes
+
+
+def validate(model: ModelParameters, log: FlightLog, rows: np.ndarray | None = None) -> Validation:
+    """Return the errors of a model on a log, from the measured states under the logged commands.
+
+    rows: (num_rows,) bool, those that are judged (``split.held_out_rows``); all if None. Rows that are not
+    judged are used only to know the applied action and what effects remember.
+
+    Raises:
+        ValueError: ``rows`` has another shape, or is not of truth values.
+    """
+    rows = np.ones(len(log), bool) if rows is None else np.asarray(rows)
+    if rows.shape != (len(log),) or rows.dtype != bool:
+        found = f"{rows.dtype} of shape {rows.shape}"
+        raise ValueError(f"rows: found {found}, expected bool of shape ({len(log)},)")
+    prediction = predict(model, log)
+    notes = _notes_of(model, log, prediction)
+    one_step = one_step_errors(model, log, prediction, rows)
+    if not one_step.num_steps:
+        notes.append("one step: no judged row is followed by a judged row")
+    rollouts = rollout_errors(model, log, prediction, rows)
+    too_long = [f"{rollout.horizon_s:g} s" for rollout in rollouts if not rollout.num_starts]
+    if too_long:
+        notes.append(f"free flight of {', '.join(too_long)}: no judged stretch without a gap is as long")
+    thrust, left, force_notes = _forces(model, log, prediction, rows)
+    notes += force_notes
+    steps = step_responses(model, log, prediction, rows)
+    if not steps:
+        notes.append(
+            "step responses: no judged command of roll, pitch or yaw jumps by "
+            f"{LEAST_JUMP:g} between {HELD_BEFORE_S:g} s and {HELD_AFTER_S:g} s of constant command, with a "
+            "body rate or attitude measured"
+        )
     return Validation(
-        mse=mse,
-        open_force=tuple(float(rms) for rms in np.sqrt(np.mean(force_b**2, axis=0))),  # type: ignore
-        open_force_by_speed=tuple(by_speed),
+        num_rows=len(log),
+        num_judged=int(rows.sum()),
+        one_step=one_step,
+        rollouts=rollouts,
+        thrust=thrust,
+        open_force=left,
+        steps=steps,
+        notes=tuple(notes),
     )

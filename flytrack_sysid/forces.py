@@ -1,0 +1,170 @@
+"""The specific force that a model does not explain."""
+
+from itertools import pairwise
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from flytrack_env.dynamics import ModelParameters
+from flytrack_sysid.log import FlightLog
+from flytrack_sysid.one_step import predicted_channel
+from flytrack_sysid.prediction import (
+    Prediction,
+    columns,
+    inputs_that_lack,
+    judged_steps,
+    specific_force_w,
+    to_body,
+)
+
+# Long enough for the noise of velocity to average out, short beside a manoeuvre.
+WINDOW_S = 0.1
+SPEED_EDGES = (0.0, 2.0, 5.0, 10.0, 20.0, np.inf)
+
+
+class ForceSamples(NamedTuple):
+    """Specific force of judged steps or windows, body frame, (num_samples, 3) m/s^2.
+
+    source: f, a or v, the channel it was measured with; v knows body z only. Others (num_samples,): applied
+    thrust action after the step, V, rows before the steps.
+    """
+
+    source: str
+    measured_b: np.ndarray
+    modelled_b: np.ndarray
+    action: np.ndarray
+    battery_v: np.ndarray
+    rows: np.ndarray
+
+
+class SpeedBin(NamedTuple):
+    """Force left open at speeds from low to high, m/s (inf: without end); rms of norm and body axes, m/s^2.
+
+    mean_against_velocity: its mean part against the direction of flight: drag that the model lacks.
+    """
+
+    low: float
+    high: float
+    count: int
+    rms: float
+    rms_b: tuple[float, float, float]
+    mean_against_velocity: float
+
+
+class OpenForce(NamedTuple):
+    """Specific force, measured minus modelled, body axes, m/s^2."""
+
+    source: str
+    mean_b: tuple[float, float, float]
+    rms_b: tuple[float, float, float]
+    by_speed: tuple[SpeedBin, ...]
+
+    def as_json(self) -> dict[str, Any]:
+        """Return the numbers as JSON values; a speed without end is null."""
+        bins = [
+            {
+                "speed_from_m_per_s": part.low,
+                "speed_to_m_per_s": part.high if np.isfinite(part.high) else None,
+                "count": part.count,
+                "rms_m_per_s2": part.rms,
+                "rms_body_xyz_m_per_s2": list(part.rms_b),
+                "mean_against_velocity_m_per_s2": part.mean_against_velocity,
+            }
+            for part in self.by_speed
+        ]
+        return {
+            "what": "specific force that the model does not explain",
+            "measured_with": self.source,
+            "mean_body_xyz_m_per_s2": list(self.mean_b),
+            "rms_body_xyz_m_per_s2": list(self.rms_b),
+            "by_speed": bins,
+        }
+
+
+def _from_velocity(
+    model: ModelParameters, log: FlightLog, prediction: Prediction, here: np.ndarray
+) -> ForceSamples:
+    """Return samples along body z of velocity's growth over windows that do not overlap."""
+    length = max(1, round(WINDOW_S / prediction.steps.median))
+    run = np.cumsum(np.append(True, np.diff(here) > 1)) if len(here) else here
+    place = np.arange(len(here)) - np.searchsorted(run, run)
+    is_first = place % length == 0
+    whole = is_first & (np.append(run, np.full(length, -1))[length - 1 :][: len(here)] == run)
+    windows = here[whole][:, None] + np.arange(length)
+    rows = windows[:, length // 2]
+    duration = prediction.steps.duration[windows]
+    weights = duration / duration.sum(axis=1, keepdims=True)
+
+    def mean(values: np.ndarray) -> np.ndarray:
+        return np.einsum("wk,wk...->w...", weights, values[windows])
+
+    acc_w = (log["v"][windows[:, -1] + 1] - log["v"][windows[:, 0]]) / duration.sum(axis=1)[:, None]
+    error_w = acc_w - mean(columns(prediction.after.acc_w))
+    axis_w = mean(columns(prediction.before.quat.axes()[2]))
+    axis_w /= np.linalg.norm(axis_w, axis=1, keepdims=True)
+    modelled = np.zeros((len(rows), 3))
+    modelled[:, 2] = mean(predicted_channel("f", prediction, model)[:, 2])
+    measured = modelled.copy()
+    measured[:, 2] += np.sum(axis_w * error_w, axis=1)
+    action, battery_v = prediction.after.applied.thrust, prediction.before.battery_v
+    return ForceSamples("v", measured, modelled, mean(action), mean(battery_v), rows)
+
+
+def force_samples(
+    model: ModelParameters, log: FlightLog, prediction: Prediction, rows: np.ndarray
+) -> ForceSamples | None:
+    """Return the specific force of judged steps, of f, else a, else v; None if the log allows none."""
+    lacking = inputs_that_lack(model, log)
+    source = next((name for name in ("f", "a", "v") if name in log and not lacking[name]), None)
+    here = judged_steps(rows, prediction)
+    if source is None or not len(here):
+        return None
+    if source == "v":
+        samples = _from_velocity(model, log, prediction, here)
+        return samples if len(samples.rows) else None
+    measured = log[source][here + 1]
+    if source == "a":
+        before = jax.tree.map(lambda leaf: leaf[here], prediction.before)
+        measured = to_body(before, specific_force_w(measured, model))
+    return ForceSamples(
+        source=source,
+        measured_b=measured,
+        modelled_b=predicted_channel("f", prediction, model)[here],
+        action=prediction.after.applied.thrust[here],
+        battery_v=prediction.before.battery_v[here],
+        rows=here,
+    )
+
+
+def open_force(log: FlightLog, prediction: Prediction, samples: ForceSamples) -> OpenForce:
+    """Return the specific force that the model leaves open, in all and by speed over ground, m/s^2.
+
+    The log has v and q, and the samples are of f or a.
+    """
+    error_b = samples.measured_b - samples.modelled_b
+    before = jax.tree.map(lambda leaf: leaf[samples.rows], prediction.before)
+    vel_b = to_body(before, log["v"][samples.rows])
+    speed = np.linalg.norm(vel_b, axis=1)
+    against = -np.sum(error_b * vel_b, axis=1) / np.maximum(speed, np.finfo(float).tiny)
+    bins = []
+    for low, high in pairwise(SPEED_EDGES):
+        is_in = (speed >= low) & (speed < high)
+        if is_in.any():
+            squared = np.mean(error_b[is_in] ** 2, axis=0)
+            bins.append(
+                SpeedBin(
+                    low=low,
+                    high=high,
+                    count=int(is_in.sum()),
+                    rms=float(np.sqrt(squared.sum())),
+                    rms_b=tuple(np.sqrt(squared).tolist()),
+                    mean_against_velocity=float(np.mean(against[is_in])),
+                )
+            )
+    return OpenForce(
+        source=samples.source,
+        mean_b=tuple(np.mean(error_b, axis=0).tolist()),
+        rms_b=tuple(np.sqrt(np.mean(error_b**2, axis=0)).tolist()),
+        by_speed=tuple(bins),
+    )

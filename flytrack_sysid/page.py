@@ -1,0 +1,128 @@
+"""One self-contained HTML page of text, tables and pictures; nothing is loaded from elsewhere."""
+
+import base64
+from collections.abc import Sequence
+from html import escape
+from typing import NamedTuple
+
+_STYLE = """
+:root { --ink: #1b1f24; --soft: #59636e; --line: #d5dae0; --paper: #ffffff; --note: #f4f6f8; }
+@media (prefers-color-scheme: dark) {
+  :root { --ink: #e6e9ec; --soft: #a3adb8; --line: #3a424b; --paper: #14181c; --note: #1e242a; }
+}
+* { box-sizing: border-box; }
+body { margin: 0 auto; max-width: 52rem; padding: 1rem; color: var(--ink); background: var(--paper);
+  font: 1rem/1.5 system-ui, sans-serif; overflow-wrap: break-word; }
+h1 { font-size: 1.6rem; line-height: 1.2; margin: 0.5rem 0; }
+h2 { font-size: 1.2rem; margin: 2rem 0 0.5rem; padding-top: 0.75rem; border-top: 1px solid var(--line); }
+ul { background: var(--note); border-left: 3px solid var(--soft); margin: 1rem 0;
+  padding: 0.5rem 1rem 0.5rem 2rem; }
+.scroll { overflow-x: auto; }
+table { border-collapse: collapse; margin: 0.5rem 0; font-variant-numeric: tabular-nums; }
+caption, figcaption { text-align: left; color: var(--soft); font-size: 0.9rem; padding: 0.25rem 0; }
+th, td { text-align: right; padding: 0.3rem 0.75rem; border-bottom: 1px solid var(--line);
+  white-space: nowrap; }
+th:first-child, td:first-child { text-align: left; padding-left: 0; }
+figure { margin: 1rem 0; }
+img { width: 100%; height: auto; background: #ffffff; border-radius: 4px; }
+@media print {
+  :root { --ink: #000000; --soft: #444444; --line: #bbbbbb; --paper: #ffffff; --note: #ffffff; }
+  body { max-width: none; padding: 0; font-size: 10pt; }
+  figure, tr { break-inside: avoid; }
+  h2 { break-after: avoid; }
+}
+"""
+
+
+class Text(NamedTuple):
+    """A paragraph."""
+
+    text: str
+
+
+class Bullets(NamedTuple):
+    """A list of remarks."""
+
+    items: Sequence[str]
+
+
+class Table(NamedTuple):
+    """A table; every row has as many cells as the header, the first names the row."""
+
+    header: Sequence[str]
+    rows: Sequence[Sequence[str]]
+    caption: str = ""
+
+
+class Picture(NamedTuple):
+    """A PNG picture, and in words what it shows."""
+
+    png: bytes
+    caption: str
+
+
+Part = Text | Bullets | Table | Picture
+
+
+class Section(NamedTuple):
+    """A heading and what stands under it."""
+
+    heading: str
+    parts: Sequence[Part]
+
+
+def _html_of_table(table: Table) -> str:
+    for row in table.rows:
+        if len(row) != len(table.header):
+            raise ValueError(
+                f"table {table.caption!r}: found a row of {len(row)} cells, expected {len(table.header)}"
+            )
+    head = "".join(f'<th scope="col">{escape(cell)}</th>' for cell in table.header)
+    body = "\n".join(
+        "<tr>" + "".join(f"<td>{escape(cell)}</td>" for cell in row) + "</tr>" for row in table.rows
+    )
+    caption = f"<caption>{escape(table.caption)}</caption>" if table.caption else ""
+    return (
+        f'<div class="scroll"><table>{caption}\n<thead><tr>{head}</tr></thead>\n'
+        f"<tbody>\n{body}\n</tbody></table></div>"
+    )
+
+
+def _html_of(part: Part) -> str:
+    if isinstance(part, Text):
+        return f"<p>{escape(part.text)}</p>"
+    if isinstance(part, Bullets):
+        return "<ul>\n" + "\n".join(f"<li>{escape(item)}</li>" for item in part.items) + "\n</ul>"
+    if isinstance(part, Table):
+        return _html_of_table(part)
+    data, caption = base64.b64encode(part.png).decode("ascii"), escape(part.caption)
+    return (
+        f'<figure><img alt="{caption}" src="data:image/png;base64,{data}">'
+        f"<figcaption>{caption}</figcaption></figure>"
+    )
+
+
+def page(title: str, sections: Sequence[Section], introduction: Sequence[Part] = ()) -> str:
+    """Return an HTML document; all text is escaped, so that it may come from files.
+
+    Raises:
+        ValueError: a table's row has another number of cells than its header.
+    """
+    body = [f"<h1>{escape(title)}</h1>", *(_html_of(part) for part in introduction)]
+    for section in sections:
+        parts = "\n".join(_html_of(part) for part in section.parts)
+        body.append(f"<section>\n<h2>{escape(section.heading)}</h2>\n{parts}\n</section>")
+    return "\n".join(
+        [
+            "<!doctype html>",
+            '<html lang="en">',
+            '<head><meta charset="utf-8">',
+            '<meta name="viewport" content="width=device-width, initial-scale=1">',
+            f"<title>{escape(title)}</title>",
+            f"<style>{_STYLE}</style></head>",
+            "<body>",
+            *body,
+            "</body></html>",
+            "",
+        ]
+    )

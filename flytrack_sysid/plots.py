@@ -1,0 +1,204 @@
+"""Figures of a validation; colours of M. Okabe and K. Ito, which colour-blind people can tell apart."""
+
+import io
+from collections.abc import Sequence
+
+import matplotlib
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from flytrack_sysid.forces import OpenForce
+from flytrack_sysid.one_step import UNITS, OneStep
+from flytrack_sysid.open_loop import QUANTITIES, Rollout
+from flytrack_sysid.steps import AXES, StepResponse
+from flytrack_sysid.thrust import ThrustError
+from flytrack_sysid.validate import NAMES, Validation
+
+DPI = 150
+WIDTH_IN, NOTHING_HEIGHT_IN = 7.0, 1.2
+BLUE, ORANGE, GREEN, GREY = "#0072B2", "#D55E00", "#009E73", "#666666"
+BY_AXIS = {"x": BLUE, "y": ORANGE, "z": GREEN}
+STYLES = ("-", "--", ":")
+NUM_BINS = 61
+# What lies beyond is in the histogram's last bins: single rows would else squeeze all others.
+SHOWN_PERCENTILE = 99.5
+
+
+def png_of(figure: Figure) -> bytes:
+    """Return a figure as a PNG file."""
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=DPI, metadata={"Software": None})
+    return buffer.getvalue()
+
+
+def _figure(title: str, rows: int, columns: int, height_in: float) -> tuple[Figure, np.ndarray]:
+    figure = Figure(figsize=(WIDTH_IN, height_in), layout="constrained")
+    figure.suptitle(title, fontsize="large", fontweight="bold")
+    axes = figure.subplots(rows, columns, squeeze=False)
+    for panel in axes.flat:
+        panel.spines[["top", "right"]].set_visible(False)
+        panel.grid(color="0.9", linewidth=0.8)
+        panel.set_axisbelow(True)
+    return figure, axes
+
+
+def _nothing(title: str, why: str) -> Figure:
+    """Return a low figure that says why there is nothing to show."""
+    figure, panels = _figure(title, 1, 1, NOTHING_HEIGHT_IN)
+    _say(panels[0, 0], why)
+    return figure
+
+
+def _say(axes: Axes, why: str) -> None:
+    """Say in a panel why it shows nothing."""
+    axes.set_axis_off()
+    axes.text(0.5, 0.5, why, ha="center", va="center", color=GREY, transform=axes.transAxes, wrap=True)
+
+
+def draw_steps(steps: Sequence[StepResponse]) -> Figure:
+    """Draw measured and modelled answers to the clearest commanded steps, a panel per axis."""
+    title = "Answer to commanded steps"
+    if not steps:
+        return _nothing(title, "no clear commanded step of roll, pitch or yaw is judged")
+    figure, panels = _figure(title, len(AXES), 1, 8.0)
+    for panel, axis in zip(panels[:, 0], AXES, strict=True):
+        own = [step for step in steps if step.axis == axis]
+        if not own:
+            _say(panel, f"{axis}: no clear commanded step")
+            continue
+        for colour, step in zip((BLUE, ORANGE, GREEN), own, strict=False):
+            change = f"{step.command_before:+.2f} to {step.command_after:+.2f}"
+            label = f"stick {change} at {step.time_s:.2f} s"
+            milliseconds = 1e3 * step.since_step
+            panel.plot(milliseconds, np.rad2deg(step.measured), color=colour, label=label)
+            panel.plot(milliseconds, np.rad2deg(step.modelled), "--", color="black", linewidth=1.2)
+        panel.plot([], [], "--", color="black", linewidth=1.2, label="model, flying freely")
+        panel.axvline(0.0, color=GREY, linewidth=0.8)
+        panel.set_ylabel(f"{axis} rate (deg/s)")
+        panel.legend(fontsize="small", frameon=False)
+    panels[-1, 0].set_xlabel("time since the command (ms)")
+    return figure
+
+
+def _draw_histogram(panel: Axes, values: np.ndarray) -> None:
+    """Draw how often errors are how large, a line per axis; (num_steps, 3)."""
+    limit = max(np.percentile(np.abs(values), SHOWN_PERCENTILE), np.finfo(float).tiny)
+    edges = np.linspace(-limit, limit, NUM_BINS + 1)
+    for (axis, colour), column in zip(BY_AXIS.items(), values.T, strict=True):
+        share = np.histogram(np.clip(column, -limit, limit), edges)[0] / len(column)
+        panel.stairs(100.0 * share, edges, color=colour, label=axis)
+    panel.set_yscale("log")  # a drone that mostly does not turn has nearly all its errors in one bin
+
+
+def draw_one_step(one_step: OneStep) -> Figure:
+    """Draw the histogram of one-step errors of each channel, a line per component."""
+    names = ["p", "v", "q", "w", "f" if "f" in one_step.channels else "a"]
+    title = "One-step errors, measured minus modelled"
+    if not one_step.channels:
+        return _nothing(title, "no step is judged")
+    figure, panels = _figure(title, 3, 2, 8.0)
+    panels.flat[-1].set_axis_off()
+    for panel, name in zip(panels.flat, names, strict=False):
+        error = one_step.channels.get(name)
+        if error is None:
+            _say(panel, f"{NAMES[name]}: not in the log, or not judged")
+            continue
+        values, unit = error.errors, UNITS[name].replace("^2", "²")
+        if error.turn_deg is not None:
+            values, unit = error.turn_deg, "deg"
+        _draw_histogram(panel, values)
+        nrmse = "" if error.nrmse is None else f", NRMSE {error.nrmse:.2g}"
+        panel.set_title(f"{NAMES[name]}{nrmse}", fontsize="medium", loc="left")
+        panel.set_xlabel(f"error ({unit})")
+        panel.set_ylabel("steps (%)")
+        panel.ticklabel_format(axis="x", scilimits=(-2, 3))
+        panel.legend(fontsize="small", frameon=False)
+    return figure
+
+
+def draw_rollouts(rollouts: Sequence[Rollout]) -> Figure:
+    """Draw how the errors of free flight grow with its length."""
+    figure, panels = _figure("Drift of the model in free flight", 2, 2, 6.0)
+    for panel, (name, (_, unit)) in zip(panels.flat, QUANTITIES.items(), strict=True):
+        flown = [rollout for rollout in rollouts if name in rollout.errors]
+        if not flown:
+            _say(panel, f"{name}: not in the log,\nor no judged stretch is long enough")
+            continue
+        horizons = [rollout.horizon_s for rollout in flown]
+        errors = [rollout.errors[name] for rollout in flown]
+        panel.plot(horizons, [error.p95 for error in errors], "^--", color=ORANGE, label="95th percentile")
+        panel.plot(horizons, [error.median for error in errors], "o-", color=BLUE, label="median")
+        panel.set_xlabel("length of the flight (s)")
+        panel.set_ylabel(f"{name} ({unit})")
+        panel.set_xlim(left=0.0)
+        panel.set_ylim(bottom=0.0)
+        panel.legend(fontsize="small", frameon=False)
+    return figure
+
+
+def draw_thrust(thrust: ThrustError | None) -> Figure:
+    """Draw the error of thrust over applied action and voltage, and both curves at three voltages."""
+    if thrust is None:
+        return _nothing("Thrust", "not judged: it needs v_bat, and f, or a or v with q")
+    figure, panels = _figure("Thrust", 2, 1, 8.0)
+    heat, curves = panels[:, 0]
+    limit = float(np.nanmax(np.abs(thrust.mean_n)))
+    heat.grid(False)
+    heat.set_facecolor("0.9")
+    image = heat.pcolormesh(
+        thrust.action_edges,
+        thrust.voltage_edges,
+        np.ma.masked_invalid(thrust.mean_n),
+        cmap=matplotlib.colormaps["PuOr_r"],
+        vmin=-max(limit, np.finfo(float).tiny),
+        vmax=max(limit, np.finfo(float).tiny),
+    )
+    figure.colorbar(image, ax=heat, label="measured minus modelled (N)")
+    heat.set_title("mean error; grey: not flown", fontsize="medium", loc="left")
+    heat.set_ylabel("battery (V)")
+    for colour, style, curve in zip((BLUE, ORANGE, GREEN), STYLES, thrust.curves, strict=True):
+        label = f"{curve.voltage_v:.1f} V"
+        curves.plot(curve.modelled_action, curve.modelled_n, style, color=colour, label=f"model, {label}")
+        curves.plot(curve.measured_action, curve.measured_n, "o", color=colour, label=f"measured, {label}")
+    curves.set_xlabel("applied thrust action (stick, after the lag)")
+    curves.set_ylabel("thrust (N)")
+    curves.legend(fontsize="small", frameon=False, ncols=2)
+    return figure
+
+
+def draw_open_force(force: OpenForce | None) -> Figure:
+    """Draw the specific force that the model leaves open by speed."""
+    title = "Force that the model leaves open"
+    if force is None:
+        return _nothing(title, "not judged: it needs v, q, and a or f")
+    figure, panels = _figure(title, 1, 1, 4.5)
+    panel = panels[0, 0]
+    place = np.arange(len(force.by_speed))
+    labels = [
+        f"{part.low:g} to {part.high:g}" if np.isfinite(part.high) else f"over {part.low:g}"
+        for part in force.by_speed
+    ]
+    width = 0.2
+    for index, axis in enumerate("xyz"):
+        heights = [part.rms_b[index] for part in force.by_speed]
+        panel.bar(place + (index - 1) * width, heights, width, color=BY_AXIS[axis], label=f"body {axis}, rms")
+    against = [part.mean_against_velocity for part in force.by_speed]
+    panel.plot(place, against, "D", color="black", label="against the flight's direction, mean")
+    panel.axhline(0.0, color=GREY, linewidth=0.8)
+    panel.set_xticks(place, labels)
+    panel.set_xlabel("speed (m/s)")
+    panel.set_ylabel("measured minus modelled (m/s²)")
+    panel.legend(fontsize="small", frameon=False)
+    return figure
+
+
+def draw_validation(validation: Validation) -> dict[str, Figure]:
+    """Return all figures of a validation by name."""
+    return {
+        "steps": draw_steps(validation.steps),
+        "one_step": draw_one_step(validation.one_step),
+        "rollouts": draw_rollouts(validation.rollouts),
+        "thrust": draw_thrust(validation.thrust),
+        "open_force": draw_open_force(validation.open_force),
+    }

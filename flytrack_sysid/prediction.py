@@ -1,0 +1,252 @@
+"""What a model makes of a flight log: one step from every measured row, and free flight from some.
+
+Everything comes out of ``flytrack_env.dynamics.advance``, in float64.
+"""
+
+from collections.abc import Iterator
+from functools import partial
+from itertools import pairwise
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from flytrack_env.dynamics import ModelParameters, advance
+from flytrack_env.effects import acts, start_memories
+from flytrack_env.quaternion import Quaternion, Vec3
+from flytrack_env.state import ACTION_SIZE, BATTERY_FULL_V, Action, Drone
+from flytrack_sysid.log import FlightLog
+
+# A row that comes later than this after the one before it, in median steps, is behind lost samples: what
+# was commanded between them is not known.
+GAP_STEPS = 1.5
+# From a guessed applied action to the right one: e^-10 of the error is left after lags of 50 ms.
+SETTLING_S = 0.5
+# Free flights at once: bounds the memory that they need, and compiles one size.
+BATCH = 128
+
+
+class Steps(NamedTuple):
+    """How a log's rows follow one another.
+
+    duration: (num_rows,) s, to the next row; the median step where no row follows. median: s.
+    is_step: (num_rows,) bool, a row of the same segment follows without a gap.
+    stretch: (num_rows,) int, number of the stretch without a gap that a row belongs to.
+    since_break: (num_rows,) s, since that stretch began.
+    """
+
+    duration: np.ndarray
+    median: float
+    is_step: np.ndarray
+    stretch: np.ndarray
+    since_break: np.ndarray
+
+
+class Prediction(NamedTuple):
+    """The model's step from every row of a log; leaves of the drones are (num_rows,) float64.
+
+    before: the measured state; zeros (upright, full battery) where the log has no such channel.
+    memories: what the model's effects remember before the step. after: the state at the next row.
+    is_settled: (num_rows,) bool, applied action and memories no longer depend on how they began.
+    applied_from: "log" if it has the applied action, else "lag" of the model.
+    """
+
+    before: Drone
+    memories: tuple[Any, ...]
+    after: Drone
+    steps: Steps
+    is_settled: np.ndarray
+    applied_from: str
+
+
+def steps_of(log: FlightLog) -> Steps:
+    """Return how the rows of a log follow one another."""
+    starts = log.is_start()
+    duration = np.append(np.diff(log.time), 0.0)[: len(log)]
+    is_inside = np.append(~starts[1:], False)[: len(log)]
+    median = float(np.median(duration[is_inside])) if is_inside.any() else 1.0
+    is_step = is_inside.copy()
+    bounds = np.append(np.flatnonzero(starts), len(log)).tolist()
+    for start, end in pairwise(bounds):  # segments may have been logged at different rates
+        inside = duration[start : end - 1]
+        is_step[start : end - 1] = inside <= GAP_STEPS * (np.median(inside) if len(inside) else 0.0)
+    is_break = np.append(True, ~is_step[:-1])[: len(log)]
+    stretch = np.cumsum(is_break) - 1
+    return Steps(
+        duration=np.where(is_inside, duration, median),
+        median=median,
+        is_step=is_step,
+        stretch=stretch,
+        since_break=log.time - log.time[is_break][stretch],
+    )
+
+
+def runs_of(rows: np.ndarray, steps: Steps) -> list[tuple[int, int]]:
+    """Return the runs of judged rows without a gap, as first row and end; rows: (num_rows,) bool."""
+    follows = np.append(False, rows[1:] & rows[:-1] & steps.is_step[:-1])[: len(rows)]
+    starts = np.flatnonzero(rows & ~follows)
+    ends = np.flatnonzero(rows & ~np.append(follows[1:], False)[: len(rows)]) + 1
+    return list(zip(starts.tolist(), ends.tolist(), strict=True))
+
+
+def judged_steps(rows: np.ndarray, prediction: Prediction) -> np.ndarray:
+    """Return the rows whose step to the next is judged, ascending; rows: (num_rows,) bool."""
+    both = rows & np.append(rows[1:], False)[: len(rows)]
+    return np.flatnonzero(both & prediction.steps.is_step & prediction.is_settled)
+
+
+def turn_between(quats: np.ndarray, others: np.ndarray) -> np.ndarray:
+    """Return the rotation vectors, body frame, rad, that turn (..., 4) attitudes into others; (..., 3)."""
+    inverse = Quaternion(quats[..., 0], *(-quats[..., axis] for axis in (1, 2, 3)))
+    turn = columns(inverse.multiply(Quaternion(*np.moveaxis(others, -1, 0))))
+    turn = np.where(turn[..., :1] < 0.0, -turn, turn)
+    sine = np.linalg.norm(turn[..., 1:], axis=-1, keepdims=True)
+    angle = 2.0 * np.arctan2(sine, turn[..., :1])
+    # The limit of angle over sine; a unit quaternion's cosine is 1 there.
+    return turn[..., 1:] * np.divide(angle, sine, out=np.full_like(sine, 2.0), where=sine > 0.0)
+
+
+def inputs_that_lack(model: ModelParameters, log: FlightLog) -> dict[str, tuple[str, ...]]:
+    """Return, for every channel that a model predicts, the channels it needs and the log does not have.
+
+    A model whose thrust does not depend on the voltage needs none; one without forces beside thrust needs
+    no velocity to predict the specific force.
+    """
+    needs_battery = bool(np.any(np.asarray(model.thrust_coeffs)[4:]))
+    force = [*(["v_bat"] if needs_battery else [])]
+    if acts(model.effects, "force"):
+        force += ["v", "q"]
+    needs = {
+        "p": ["p", "v", "q", *force],
+        "v": ["v", "q", *force],
+        "q": ["q"],
+        "w": [],
+        "a": ["q", *force],
+        "f": force,
+    }
+    return {
+        name: tuple(dict.fromkeys(channel for channel in channels if channel not in log))
+        for name, channels in needs.items()
+    }
+
+
+def columns(vector: Any) -> np.ndarray:
+    """Return a vector or quaternion of (num_rows,) leaves as an array, (num_rows, its size)."""
+    return np.stack([np.asarray(leaf) for leaf in vector], axis=-1)
+
+
+def to_body(drone: Drone, vectors_w: np.ndarray) -> np.ndarray:
+    """Return world-frame vectors in the body frames of drones; (num_rows, 3), leaves (num_rows,)."""
+    world = Vec3(*vectors_w.T)
+    return np.stack([axis.dot(world) for axis in drone.quat.axes()], axis=-1)
+
+
+def specific_force_w(acc_w: np.ndarray, model: ModelParameters) -> np.ndarray:
+    """Return the specific force of accelerations, (num_rows, 3) m/s^2, world frame."""
+    return acc_w + np.array([0.0, 0.0, float(model.g)])
+
+
+def in_float64(model: ModelParameters) -> ModelParameters:
+    """Return the same model with leaves of float64."""
+    return jax.tree.map(lambda leaf: np.asarray(leaf, float), model)
+
+
+def _measured(log: FlightLog) -> Drone:
+    """Return the measured states; applied action and missing channels are fillers."""
+    zeros = np.zeros(len(log))
+
+    def channel(name: str, size: int) -> list[np.ndarray]:
+        return list(log[name].T) if name in log else [zeros] * size
+
+    full = np.full(len(log), BATTERY_FULL_V)
+    return Drone(
+        pos_w=Vec3(*channel("p", 3)),
+        vel_w=Vec3(*channel("v", 3)),
+        acc_w=Vec3(zeros, zeros, zeros),
+        quat=Quaternion(*(log["q"].T if "q" in log else [zeros + 1.0, zeros, zeros, zeros])),
+        rates_b=Vec3(*channel("w", 3)),
+        applied=Action(*channel("uprev", ACTION_SIZE)),
+        battery_v=log["v_bat"][:, 0] if "v_bat" in log else full,
+    )
+
+
+@partial(jax.jit, static_argnames="has_applied")
+def _step_from_every_row(
+    rows: tuple[Drone, Action, Any, Any], model: ModelParameters, has_applied: bool
+) -> tuple[Action, tuple[Any, ...], Drone]:
+    """Return applied actions and memories before, and the drones after, the steps of all rows."""
+
+    def one(carry: Any, row: tuple) -> Any:
+        measured, command, duration, is_start = row
+        applied, memories = carry
+        if has_applied:
+            applied = measured.applied
+        else:  # what is commanded first is taken to have been commanded for long
+            applied = jax.tree.map(partial(jnp.where, is_start), command, applied)
+        drone = measured._replace(applied=applied)
+        fresh = start_memories(model.effects, drone)
+        memories = jax.tree.map(partial(jnp.where, is_start), fresh, memories)
+        after, later = advance(drone, memories, command, duration, model)
+        return (after.applied, later), (applied, memories, after)
+
+    first = jax.tree.map(lambda leaf: leaf[0], rows[0])
+    return jax.lax.scan(one, (first.applied, start_memories(model.effects, first)), rows)[1]
+
+
+def predict(model: ModelParameters, log: FlightLog) -> Prediction:
+    """Return the model's step from every row of a log, from the measured state under the logged command.
+
+    The applied action is the log's; without it, it follows the commands from the segment's start on.
+    """
+    steps = steps_of(log)
+    measured, has_applied = _measured(log), "uprev" in log
+    commands = Action(*log["u"].T)
+    with jax.enable_x64(True):
+        rows = (measured, commands, steps.duration, log.is_start())
+        found = _step_from_every_row(rows, in_float64(model), has_applied)
+        applied, memories, after = jax.tree.map(np.asarray, found)
+    is_known = has_applied and not jax.tree.leaves(memories)
+    return Prediction(
+        before=measured._replace(applied=applied),
+        memories=memories,
+        after=after,
+        steps=steps,
+        is_settled=np.full(len(log), is_known) | (steps.since_break >= SETTLING_S),
+        applied_from="log" if has_applied else "lag",
+    )
+
+
+@jax.jit
+def _fly(
+    starts: tuple[Drone, tuple[Any, ...]], commands: Action, durations: jax.Array, model: ModelParameters
+) -> dict[str, Any]:
+    """Return free flights: p, v, q, w after every step; leaves (num_steps, BATCH)."""
+
+    def one(carry: Any, row: tuple) -> Any:
+        drone, memories = jax.vmap(advance, in_axes=(0, 0, 0, 0, None))(*carry, *row, model)
+        seen = {"p": drone.pos_w, "v": drone.vel_w, "q": drone.quat, "w": drone.rates_b}
+        return (drone, memories), seen
+
+    return jax.lax.scan(one, starts, (commands, durations))[1]
+
+
+def free_flights(
+    model: ModelParameters, log: FlightLog, prediction: Prediction, starts: np.ndarray, num_steps: int
+) -> Iterator[tuple[np.ndarray, dict[str, np.ndarray]]]:
+    """Yield flights of the model by itself from measured rows under the logged commands, in batches.
+
+    starts: (num_starts,) rows. Yields their rows (BATCH,) at most, and p, v, q, w at the ``num_steps``
+    rows after each, (num_rows, num_steps, size), units of the log; beyond the log's end the last command
+    is held.
+    """
+    for begin in range(0, len(starts), BATCH):
+        batch = starts[begin : begin + BATCH]
+        filled = np.resize(batch, BATCH)
+        rows = np.minimum(filled + np.arange(num_steps)[:, None], len(log) - 1)
+        with jax.enable_x64(True):
+            first = jax.tree.map(lambda leaf: leaf[filled], (prediction.before, prediction.memories))  # noqa: B023
+            commands = Action(*(column[rows] for column in log["u"].T))
+            flown = _fly(first, commands, prediction.steps.duration[rows], in_float64(model))
+            flown = {name: columns(leaves) for name, leaves in flown.items()}
+        yield batch, {name: values.swapaxes(0, 1)[: len(batch)] for name, values in flown.items()}

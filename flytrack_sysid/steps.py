@@ -1,0 +1,132 @@
+"""The clearest commanded steps of a log, and the model's answer to them."""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from flytrack_env.dynamics import ModelParameters
+from flytrack_sysid.log import FlightLog
+from flytrack_sysid.open_loop import longest_flight
+from flytrack_sysid.prediction import Prediction, Steps, free_flights, runs_of, turn_between
+
+AXES = ("roll", "pitch", "yaw")
+LEAST_JUMP = 0.2
+HELD_BEFORE_S = 0.08
+HELD_AFTER_S = 0.12
+CONSTANT_WITHIN = 1e-3  # of a stick in [-1, 1]: finer than a receiver's steps
+SHOWN_BEFORE_S = 0.1
+SHOWN_AFTER_S = 0.4
+MOST_PER_AXIS = 3
+TIME_ROUNDING_S = 1e-6
+
+
+class StepResponse(NamedTuple):
+    """One commanded step: the measured body rate, and that of the model flying freely from before it.
+
+    time_s, segment: where in the log. command_before, command_after: in [-1, 1]. since_step: (num_rows,) s.
+    command: (num_rows,). measured, modelled: (num_rows,) rad/s. rms: of their difference, rad/s.
+    """
+
+    axis: str
+    segment: int
+    time_s: float
+    command_before: float
+    command_after: float
+    since_step: np.ndarray
+    command: np.ndarray
+    measured: np.ndarray
+    modelled: np.ndarray
+    rms: float
+
+    def as_json(self) -> dict[str, Any]:
+        """Return the numbers as JSON values."""
+        names = {"since_step": "since_step_s", "rms": "rms_rad_per_s"}
+        names |= {"measured": "measured_rad_per_s", "modelled": "modelled_rad_per_s"}
+        return {
+            names.get(name, name): value.tolist() if isinstance(value, np.ndarray) else value
+            for name, value in self._asdict().items()
+        }
+
+
+def measured_rates(log: FlightLog, steps: Steps) -> np.ndarray | None:
+    """Return the body rates, (num_rows, 3) rad/s: w, else those between attitudes; None without either.
+
+    Between attitudes: the rate that led to the row, as in the simulator; NaN behind a gap.
+    """
+    if "w" in log:
+        return log["w"]
+    if "q" not in log:
+        return None
+    rates_b = np.full((len(log), 3), np.nan)
+    turn = turn_between(log["q"][:-1], log["q"][1:]) / steps.duration[:-1, None]
+    rates_b[1:] = np.where(steps.is_step[:-1, None], turn, np.nan)
+    return rates_b
+
+
+def _steps_in(time: np.ndarray, command: np.ndarray) -> np.ndarray:
+    """Return the rows of one run where a command jumps between two constant values; both (num_rows,)."""
+    changes = np.flatnonzero(np.abs(np.diff(command)) > CONSTANT_WITHIN) + 1
+    times = time[np.concatenate([[0], changes])]
+    held_before = np.diff(times)
+    held_after = np.append(times[2:], time[-1])[: len(changes)] - time[changes]
+    is_step = np.abs(command[changes] - command[changes - 1]) >= LEAST_JUMP
+    is_step &= held_before >= HELD_BEFORE_S - TIME_ROUNDING_S
+    is_step &= held_after >= HELD_AFTER_S - TIME_ROUNDING_S
+    return changes[is_step]
+
+
+def _clearest(
+    log: FlightLog, prediction: Prediction, rows: np.ndarray, axis: int
+) -> list[tuple[int, int, int]]:
+    """Return the largest steps of an axis as first row shown, row of the step and end of what is shown."""
+    found = []
+    command = log["u"][:, axis]
+    for start, end in runs_of(rows, prediction.steps):
+        time = log.time[start:end]
+        for step in _steps_in(time, command[start:end]).tolist():
+            at = time[step]
+            first = int(np.searchsorted(time, at - SHOWN_BEFORE_S - TIME_ROUNDING_S))
+            last = int(np.searchsorted(time, at + SHOWN_AFTER_S + TIME_ROUNDING_S))
+            is_whole = time[0] <= at - SHOWN_BEFORE_S + TIME_ROUNDING_S
+            if is_whole and prediction.is_settled[start + first]:
+                found.append((start + first, start + step, start + last))
+    found.sort(key=lambda rows: -abs(command[rows[1]] - command[rows[1] - 1]))
+    return found[:MOST_PER_AXIS]
+
+
+def step_responses(
+    model: ModelParameters, log: FlightLog, prediction: Prediction, rows: np.ndarray
+) -> tuple[StepResponse, ...]:
+    """Return the answers to the largest commanded steps of each rate axis; none if there are none.
+
+    rows: (num_rows,) bool, those judged. A step is a jump by 0.2 at least between commands that are
+    constant for 0.08 s before and 0.12 s after it.
+    """
+    rates_b = measured_rates(log, prediction.steps)
+    if rates_b is None:
+        return ()
+    shown = [(axis, *place) for axis in range(len(AXES)) for place in _clearest(log, prediction, rows, axis)]
+    firsts = np.array([first for _, first, _, _ in shown], int)
+    num_steps = max([longest_flight(prediction), *(end - first - 1 for _, first, _, end in shown)])
+    responses = []
+    for batch, flown in free_flights(model, log, prediction, firsts, num_steps):
+        for index in range(len(batch)):
+            axis, first, step, end = shown[len(responses)]
+            since = slice(first + 1, end)
+            modelled = flown["w"][index, : end - first - 1, axis]
+            measured = rates_b[since, axis]
+            responses.append(
+                StepResponse(
+                    axis=AXES[axis],
+                    segment=int(log.segment[step]),
+                    time_s=float(log.time[step]),
+                    command_before=float(log["u"][step - 1, axis]),
+                    command_after=float(log["u"][step, axis]),
+                    since_step=log.time[since] - log.time[step],
+                    command=log["u"][since, axis],
+                    measured=measured,
+                    modelled=modelled,
+                    rms=float(np.sqrt(np.mean((measured - modelled) ** 2))),
+                )
+            )
+    return tuple(responses)

@@ -1,0 +1,200 @@
+"""A validation as files: numbers, text, figures, and a page with all of them."""
+
+import json
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from flytrack_env.files import write_atomically
+from flytrack_sysid.forces import OpenForce
+from flytrack_sysid.log import FlightLog
+from flytrack_sysid.one_step import NORMALISED_BY, NRMSE_MEANING, UNITS
+from flytrack_sysid.open_loop import QUANTITIES, START_EVERY_S
+from flytrack_sysid.page import Bullets, Picture, Section, Table, Text, page
+from flytrack_sysid.plots import draw_validation, png_of
+from flytrack_sysid.thrust import ThrustError
+from flytrack_sysid.validate import NAMES, Validation
+
+CAPTIONS = {
+    "steps": "Measured body rates (solid) and those of the model (dashed), which flies by itself from 0.1 s "
+    "before the command.",
+    "one_step": "Errors of the step from each measured row to the next; the last bins hold what is beyond.",
+    "rollouts": "Errors of the model flying by itself under the logged commands, over all starts.",
+    "thrust": "Mass times specific force along body z. Above: error by applied action and voltage. Below: "
+    "the model at rest (lines) and means of what was flown (dots) in thirds of the range of voltage.",
+    "open_force": "Specific force, measured minus modelled. Diamonds above 0: drag that the model lacks.",
+}
+
+
+def _number(value: float | None) -> str:
+    if value is None:
+        return "-"
+    return f"{value:.3g}" if np.isfinite(value) else "runs away"
+
+
+def _one_step_table(validation: Validation) -> Table:
+    rows = []
+    for name, error in validation.one_step.channels.items():
+        unit = "1" if UNITS[name] == "1" else f"({UNITS[name]})^2"
+        rows.append([f"{NAMES[name]} ({name})", _number(error.mse), unit, _number(error.nrmse)])
+        if error.angle_rms_deg is not None:
+            rows.append(["attitude, rms angle", _number(error.angle_rms_deg), "deg", ""])
+    caption = f"One step: {validation.one_step.num_steps} steps"
+    return Table(["channel", "MSE", "unit", "NRMSE"], rows, caption)
+
+
+def _rollout_table(validation: Validation) -> Table:
+    rows = []
+    for rollout in validation.rollouts:
+        for name, spread in rollout.errors.items():
+            numbers = [_number(number) for number in spread]
+            quantity = f"{name} ({QUANTITIES[name][1]})"
+            rows.append([f"{rollout.horizon_s:g} s", quantity, *numbers, str(rollout.num_starts)])
+    caption = f"Free flight: a start every {START_EVERY_S:g} s of judged flight"
+    return Table(["after", "error", "median", "rms", "95th pct", "starts"], rows, caption)
+
+
+def _thrust_table(thrust: ThrustError) -> Table:
+    rows = [
+        [f"{low:.2f} to {high:.2f}", *(_number(None if np.isnan(mean) else mean) for mean in means)]
+        for (low, high), means in zip(pairwise(thrust.voltage_edges), thrust.mean_n, strict=True)
+    ]
+    middles = 0.5 * (thrust.action_edges[:-1] + thrust.action_edges[1:])
+    caption = (
+        f"Thrust error, mean in N, by voltage (rows, V) and applied action (columns); rms of all "
+        f"{_number(thrust.total_rms_n)} N, measured with {thrust.source}"
+    )
+    return Table(["V", *(f"{middle:+.1f}" for middle in middles)], rows, caption)
+
+
+def _force_table(force: OpenForce) -> Table:
+    rows = []
+    for part in force.by_speed:
+        speed = f"{part.low:g} to {part.high:g}" if np.isfinite(part.high) else f"over {part.low:g}"
+        numbers = (part.rms, *part.rms_b, part.mean_against_velocity)
+        rows.append([speed, *(_number(number) for number in numbers), str(part.count)])
+    caption = f"Specific force left open, m/s^2, by speed in m/s, measured with {force.source}"
+    return Table(["speed", "rms", "x", "y", "z", "drag-like mean", "steps"], rows, caption)
+
+
+def _steps_table(validation: Validation) -> Table:
+    rows = [
+        [
+            step.axis,
+            f"{step.segment}",
+            f"{step.time_s:.2f}",
+            f"{step.command_before:+.2f} to {step.command_after:+.2f}",
+            _number(float(np.rad2deg(step.rms))),
+        ]
+        for step in validation.steps
+    ]
+    return Table(
+        ["axis", "segment", "time (s)", "command", "rms error (deg/s)"], rows, "Clearest commanded steps"
+    )
+
+
+def _tables(validation: Validation) -> dict[str, Table]:
+    """Return the tables that have any row, by the figure that they belong to."""
+    tables = {
+        "one_step": _one_step_table(validation),
+        "rollouts": _rollout_table(validation),
+        "steps": _steps_table(validation),
+    }
+    if validation.thrust is not None:
+        tables["thrust"] = _thrust_table(validation.thrust)
+    if validation.open_force is not None:
+        tables["open_force"] = _force_table(validation.open_force)
+    return {name: table for name, table in tables.items() if table.rows}
+
+
+def _text_of_table(table: Table) -> str:
+    lines = [list(table.header), *(list(row) for row in table.rows)]
+    widths = [max(len(line[column]) for line in lines) for column in range(len(table.header))]
+    text = [
+        "  ".join(
+            cell.rjust(width) if column else cell.ljust(width)
+            for column, (cell, width) in enumerate(zip(line, widths, strict=True))
+        ).rstrip()
+        for line in lines
+    ]
+    return "\n".join([table.caption, *text])
+
+
+def _head(validation: Validation, model_name: str, log: FlightLog) -> list[str]:
+    return [
+        f"Model {model_name}, on {log.source}: "
+        f"{validation.num_judged} of {validation.num_rows} rows are judged.",
+    ]
+
+
+def _nrmse_meanings(validation: Validation) -> list[str]:
+    """Return what the NRMSE of the judged channels is, a sentence for each kind."""
+    kinds: dict[str, list[str]] = {}
+    for name in validation.one_step.channels:
+        kinds.setdefault(NORMALISED_BY[name], []).append(name)
+    return [f"NRMSE of {', '.join(names)}: {NRMSE_MEANING[kind]}." for kind, names in kinds.items()]
+
+
+def text_of(validation: Validation, model_name: str, log: FlightLog) -> str:
+    """Return a validation as plain text, tables and notes."""
+    tables = _tables(validation)
+    blocks = ["\n".join(_head(validation, model_name, log))]
+    for name, table in tables.items():
+        block = _text_of_table(table)
+        if name == "one_step":
+            block = "\n".join([block, *_nrmse_meanings(validation)])
+        blocks.append(block)
+    if validation.notes:
+        blocks.append("\n".join(["Notes", *(f"- {note}" for note in validation.notes)]))
+    return "\n\n".join(blocks) + "\n"
+
+
+def json_of(validation: Validation, model_name: str, log: FlightLog) -> dict[str, Any]:
+    """Return a validation as JSON values, with what was judged on what."""
+    return {"model": model_name, "log": log.source, "log_sha256": log.sha256, **validation.as_json()}
+
+
+def html_of(validation: Validation, model_name: str, log: FlightLog, pictures: dict[str, bytes]) -> str:
+    """Return a validation as a self-contained page; pictures: PNG files by figure's name."""
+    headings = {
+        "steps": "Step responses",
+        "rollouts": "Free flight",
+        "one_step": "One step",
+        "thrust": "Thrust by command and voltage",
+        "open_force": "Force left open by speed",
+    }
+    tables = _tables(validation)
+    sections = []
+    for name, heading in headings.items():
+        parts: list[Any] = [Picture(pictures[name], CAPTIONS[name])]
+        parts += [tables[name]] if name in tables else []
+        if name == "one_step":
+            parts += [Text(meaning) for meaning in _nrmse_meanings(validation)]
+        sections.append(Section(heading, parts))
+    introduction: list[Any] = [Text(line) for line in _head(validation, model_name, log)]
+    if validation.notes:
+        introduction += [Text("What the log does not tell, and what was assumed:"), Bullets(validation.notes)]
+    return page(f"Validation of {model_name}", sections, introduction)
+
+
+def write_validation(out: str | Path, validation: Validation, model_name: str, log: FlightLog) -> list[Path]:
+    """Write validation.json, .txt and .html and the figures into a folder; return their paths.
+
+    All is computed before the first file is written, each under a temporary name and renamed.
+
+    Raises:
+        OSError: what the system says.
+    """
+    pictures = {name: png_of(figure) for name, figure in draw_validation(validation).items()}
+    document = json.dumps(json_of(validation, model_name, log), indent=1, allow_nan=False) + "\n"
+    files = {
+        "validation.json": document.encode(),
+        "validation.txt": text_of(validation, model_name, log).encode(),
+        "validation.html": html_of(validation, model_name, log, pictures).encode(),
+        **{f"{name}.png": png for name, png in pictures.items()},
+    }
+    for name, content in files.items():
+        write_atomically(Path(out) / name, content)
+    return [Path(out) / name for name in files]

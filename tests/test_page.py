@@ -1,0 +1,87 @@
+"""Pages are whole, self-contained and say what files say without doing what they say."""
+
+import re
+from html.parser import HTMLParser
+
+import pytest
+
+from flytrack_sysid.page import Bullets, Picture, Section, Table, Text, page
+
+PNG = b"\x89PNG\r\n\x1a\n and the rest"
+HOSTILE = '"><script>alert(1)</script><a href="https://example.org/x">'
+VOID = {"meta", "img", "br"}
+
+
+class Reader(HTMLParser):
+    """Reads a page; collects elements, attributes and text, and checks that every element is closed."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.seen: list[str] = []
+        self.attributes: list[tuple[str, str]] = []
+        self.text = ""
+
+    def handle_starttag(self, tag, attrs):
+        self.seen.append(tag)
+        self.attributes += attrs
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+    def handle_data(self, data):
+        self.text += data
+
+
+def read(text: str) -> Reader:
+    """Return what a browser would see of a page."""
+    reader = Reader()
+    reader.feed(text)
+    reader.close()
+    assert reader.open == []
+    return reader
+
+
+def full_page(words: str) -> str:
+    """Return a page with these words in every place that takes any."""
+    parts = [
+        Text(words),
+        Bullets([words]),
+        Table([words, "b"], [[words, "2"]], caption=words),
+        Picture(PNG, words),
+    ]
+    return page(words, [Section(words, parts)], introduction=[Text(words)])
+
+
+def test_hostile_words_are_only_shown():
+    seen = read(full_page(HOSTILE))
+    plain = read(full_page("plain"))
+    assert seen.seen == plain.seen and not {"script", "a"} & set(seen.seen)
+    assert seen.text.count(HOSTILE) == plain.text.count("plain")
+    assert ("alt", HOSTILE) in seen.attributes
+
+
+def test_nothing_is_loaded_from_elsewhere():
+    seen = read(full_page("plain"))
+    targets = [value for name, value in seen.attributes if name in ("src", "href")]
+    assert len(targets) == 1 and targets[0].startswith("data:image/png;base64,")
+    assert not re.search(r"https?://|url\(|@import|<link|<script", full_page("plain"))
+
+
+def test_everything_is_shown_once():
+    text = page(
+        "Title",
+        [Section("One heading", [Text("first paragraph")]), Section("Two headings", [Bullets(["a", "b"])])],
+    )
+    seen = read(text)
+    for words in ("first paragraph", "One heading", "Two headings"):
+        assert seen.text.count(words) == 1
+    assert seen.seen.count("li") == 2 and seen.seen.count("section") == 2
+    assert "width=device-width" in text and "prefers-color-scheme: dark" in text and "@media print" in text
+
+
+def test_row_of_another_length_is_refused():
+    with pytest.raises(ValueError, match=r"table 'sizes': found a row of 1 cells, expected 2"):
+        page("t", [Section("s", [Table(["a", "b"], [["1"]], caption="sizes")])])

@@ -1,0 +1,376 @@
+"""Validation finds no error in the truth, and puts other models' errors where they belong."""
+
+import json
+import re
+from dataclasses import replace
+from html import escape
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from flytrack_env.dynamics import ModelParameters, advance, collective_thrust, nominal_parameters
+from flytrack_env.effects import CommandDelay, LinearDrag, QuadraticDrag, start_memories
+from flytrack_env.state import pack, unpack, unpack_action
+from flytrack_sysid.forces import WINDOW_S
+from flytrack_sysid.log import FlightLog, log_of_states
+from flytrack_sysid.one_step import error_of
+from flytrack_sysid.open_loop import QUANTITIES
+from flytrack_sysid.plots import draw_validation
+from flytrack_sysid.prediction import SETTLING_S, columns, predict, steps_of
+from flytrack_sysid.split import held_out_rows
+from flytrack_sysid.steps import MOST_PER_AXIS
+from flytrack_sysid.validate import Validation, validate
+from flytrack_sysid.validation_report import text_of, write_validation
+
+DT = 0.01
+NUM_ROWS = 300
+HOVER = -0.25
+TRUTH = nominal_parameters()._replace(tau=np.array([0.02, 0.03, 0.06, 0.045], np.float32))
+DRAG = LinearDrag(0.3, 0.3, 0.3)
+DELAY = CommandDelay(0.024)
+
+
+def scripts() -> tuple[np.ndarray, np.ndarray]:
+    """Return starts (5, 21) and commands (5, num_rows, 4): steps of each axis, thrust, fast flight."""
+    time = np.arange(NUM_ROWS) * DT
+    commands = np.zeros((5, NUM_ROWS, 4))
+    commands[..., 3] = HOVER + 0.02 * np.sin(5.0 * time)
+    for axis in range(3):
+        for at, value in ((0.8, 0.4), (1.0, -0.4), (1.2, 0.0), (1.8, 0.1 * (axis + 2)), (2.1, 0.0)):
+            commands[axis, time >= at, axis] = value
+    commands[3, :, 3] = np.sin(7.0 * time)
+    commands[4, :, 0] = 0.1 * np.sin(9.0 * time)
+    starts = np.zeros((5, 21))
+    starts[:, 2], starts[:, 9], starts[:, 19] = 50.0, 1.0, HOVER
+    starts[:, 20] = [23.9, 22.1, 23.0, 23.4, 22.6]
+    starts[4, 3:6], starts[2, 3] = (12.0, 3.0, 0.5), 4.0
+    return starts, commands
+
+
+@jax.jit
+def _fly(start: jax.Array, commands: jax.Array, model: ModelParameters, durations: jax.Array) -> jax.Array:
+    def one(carry, row):
+        (drone, memories), (command, duration) = carry, row
+        return advance(drone, memories, unpack_action(command), duration, model), pack(drone)
+
+    drone = unpack(start)
+    first = (drone, start_memories(model.effects, drone))
+    return jax.lax.scan(one, first, (commands, durations))[1]
+
+
+def fly(truth: ModelParameters) -> FlightLog:
+    """Return the log of the script's flights on a model, in float64."""
+    with jax.enable_x64(True):
+        flights = [
+            (_fly(jnp.asarray(start), jnp.asarray(commands), truth, jnp.full(NUM_ROWS, DT)), commands)
+            for start, commands in zip(*scripts(), strict=True)
+        ]
+        return log_of_states(flights, DT, "test.npz")
+
+
+@pytest.fixture(scope="module")
+def log() -> FlightLog:
+    return fly(TRUTH)
+
+
+@pytest.fixture(scope="module")
+def exact(log) -> Validation:
+    return validate(TRUTH, log)
+
+
+def with_force(log: FlightLog, gravity: float) -> FlightLog:
+    """Return the log with an accelerometer in place of the acceleration."""
+    attitude = Rotation.from_quat(np.concatenate([log["q"][:1], log["q"][:-1]]), scalar_first=True)
+    force_b = attitude.inv().apply(log["a"] + [0.0, 0.0, gravity])
+    return replace(log.without("a"), channels={**log.without("a").channels, "f": force_b})
+
+
+def nrmse(validation: Validation) -> dict[str, float | None]:
+    """Return the NRMSE of every judged channel."""
+    return {name: error.nrmse for name, error in validation.one_step.channels.items()}
+
+
+def test_truth_has_no_error(exact):
+    assert set(exact.one_step.channels) == {"p", "v", "q", "w", "a"}
+    assert max(nrmse(exact).values()) < 1e-6
+    assert exact.one_step.channels["q"].angle_rms_deg < 1e-6
+    assert [rollout.num_starts for rollout in exact.rollouts] == [60, 50, 40, 20]
+    for rollout in exact.rollouts:
+        assert max(spread.p95 for spread in rollout.errors.values()) < 1e-5
+    assert exact.thrust.total_rms_n < 1e-5 and max(exact.open_force.rms_b) < 1e-5
+    assert max(step.rms for step in exact.steps) < 1e-5
+    assert exact.notes == ()
+
+
+def test_the_clearest_steps_are_found(exact):
+    found = {axis: [step for step in exact.steps if step.axis == axis] for axis in ("roll", "pitch", "yaw")}
+    assert all(len(steps) == MOST_PER_AXIS for steps in found.values())
+    for axis, steps in found.items():
+        first = steps[0]
+        assert (first.command_before, first.command_after) == (0.4, -0.4)
+        assert first.time_s == pytest.approx(1.0) and first.segment == ["roll", "pitch", "yaw"].index(axis)
+        assert first.since_step[0] == pytest.approx(-0.09) and first.since_step[-1] == pytest.approx(0.4)
+
+
+def test_wrong_lag_shows_in_rates_and_steps_only_of_its_axis(log):
+    slow = validate(TRUTH._replace(tau=np.array([0.02, 0.06, 0.06, 0.045])), log)
+    by_axis = slow.one_step.channels["w"].mse_by_axis
+    assert by_axis[1] > 1e-3 and max(by_axis[0], by_axis[2]) < 1e-9
+    assert {step.axis for step in slow.steps if step.rms > 0.1} == {"pitch"}
+    assert slow.thrust.total_rms_n < 1e-5
+    assert slow.rollouts[1].errors["attitude"].p95 > 0.5
+
+
+def test_wrong_thrust_shows_in_the_map_by_its_formula(log):
+    coeffs = TRUTH.thrust_coeffs + np.array([0.5, 0.0, 0.0, 0.0, 0.0, 0.1])
+    wrong = validate(TRUTH._replace(thrust_coeffs=coeffs), log)
+    swept = np.flatnonzero(np.all(wrong.thrust.count > 0, axis=1))
+    assert len(swept) == 1 and wrong.thrust.count.sum() == wrong.one_step.num_steps
+    middles = 0.5 * (wrong.thrust.action_edges[1:] + wrong.thrust.action_edges[:-1])
+    expected = -0.5 - 0.1 * 23.4 * middles
+    np.testing.assert_allclose(wrong.thrust.mean_n[swept[0]], expected, atol=0.1)
+    assert wrong.one_step.channels["w"].mse < 1e-9
+    assert np.isnan(wrong.thrust.mean_n).any() and wrong.as_json()["thrust"]["mean_n"][0][0] is None
+
+
+def test_modelled_curve_is_the_simulators(exact):
+    for curve in exact.thrust.curves:
+        expected = collective_thrust(curve.modelled_action, curve.voltage_v, TRUTH.thrust_coeffs)
+        np.testing.assert_allclose(curve.modelled_n, expected, rtol=1e-6, atol=1e-5)
+        assert np.all(
+            np.abs(np.interp(curve.measured_action, curve.modelled_action, expected) - curve.measured_n) < 1.0
+        )
+
+
+def test_drag_shows_in_the_force_by_speed():
+    dragging = fly(TRUTH.with_effects(DRAG))
+    open_force = validate(TRUTH, dragging).open_force
+    drag_like = [part.mean_against_velocity for part in open_force.by_speed]
+    assert drag_like == sorted(drag_like) and open_force.by_speed[-1].low == 10.0
+    for part in open_force.by_speed[1:]:
+        assert 0.3 * part.low < part.mean_against_velocity == pytest.approx(part.rms, rel=0.1)
+    known = validate(TRUTH.with_effects(DRAG), dragging)
+    assert max(known.open_force.rms_b) < 1e-5
+
+
+def test_model_of_nothing_changes_has_nrmse_one(log):
+    """A drone that the log shows moving, judged by a predictor that repeats the last row."""
+    before, after = log["v"][:-1], log["v"][1:]
+    assert error_of("v", before, after, before).nrmse == pytest.approx(1.0)
+    assert error_of("q", log["q"][:-1], log["q"][1:], -log["q"][:-1]).nrmse == pytest.approx(1.0)
+    rates_b = log["w"]
+    mean = np.broadcast_to(rates_b.mean(axis=0), rates_b.shape)
+    assert error_of("w", rates_b, rates_b, mean).nrmse == pytest.approx(1.0)
+    still = np.zeros((9, 3))
+    assert error_of("p", still, still, still).nrmse is None
+
+
+def test_delay_is_flown_with_its_memory():
+    delayed = TRUTH.with_effects(DELAY)
+    log = fly(delayed)
+    for known in (validate(delayed, log), validate(delayed, log.without("uprev"))):
+        assert max(nrmse(known).values()) < 1e-6
+        assert max(step.rms for step in known.steps) < 1e-5
+        assert max(known.rollouts[2].errors[name].p95 for name in QUANTITIES) < 1e-5
+    missing = validate(TRUTH, log)
+    assert min(step.rms for step in missing.steps) > 0.05
+
+
+@pytest.mark.parametrize("source", ["a", "f", "v"])
+def test_thrust_is_measured_with_what_there_is(log, source):
+    measured = {"a": log, "f": with_force(log, TRUTH.g), "v": log.without("a")}[source]
+    same = validate(TRUTH, measured)
+    assert same.thrust.source == source and same.thrust.total_rms_n < 1e-5
+    coeffs = TRUTH.thrust_coeffs - np.array([1.5, 0.0, 0.0, 0.0, 0.0, 0.0])
+    wrong = validate(TRUTH._replace(thrust_coeffs=coeffs), measured)
+    # The drone of this script leans little within a window, so that even velocity tells all of it.
+    assert wrong.thrust.total_mean_n == pytest.approx(1.5, rel=0.02)
+    assert (wrong.open_force is None) == (source == "v")
+    assert set(wrong.one_step.channels) == {"p", "v", "q", "w", source}
+
+
+def test_windows_of_velocity_do_not_overlap(log):
+    samples = validate(TRUTH, log.without("a")).thrust
+    assert samples.count.sum() == 5 * ((NUM_ROWS - 1) * DT // WINDOW_S)
+
+
+@pytest.mark.parametrize(
+    ("missing", "judged", "said"),
+    [
+        (("v",), {"q", "w", "a"}, r"position \(p\): not judged; v is not in the log"),
+        (("w",), {"p", "v", "q", "a"}, r"body rates \(w\): not in the log"),
+        (("a",), {"p", "v", "q", "w"}, r"acceleration \(a\) and specific force \(f\)"),
+        (("v_bat",), {"q", "w"}, r"velocity \(v\): not judged; v_bat is not in the log"),
+        (("q",), {"w"}, r"velocity \(v\): not judged; q is not in the log"),
+        (("q", "w"), set(), "step responses: no judged command"),
+    ],
+)
+def test_what_is_missing_is_said_and_gives_no_number(log, missing, judged, said):
+    validation = validate(TRUTH, log.without(*missing))
+    assert set(validation.one_step.channels) == judged
+    assert any(re.search(said, note) for note in validation.notes), validation.notes
+    numbers = json.loads(json.dumps(validation.as_json(), allow_nan=False))
+    assert set(numbers["one_step"]["channels"]) == judged
+    assert max([0.0, *nrmse(validation).values()]) < 1e-6
+    assert all(error.p95 < 1e-5 for rollout in validation.rollouts for error in rollout.errors.values())
+
+
+def test_drag_is_not_judged_without_the_velocity(log):
+    bare = with_force(log, TRUTH.g).without("v")
+    assert "f" in validate(TRUTH, bare).one_step.channels
+    dragging = validate(TRUTH.with_effects(DRAG), bare)
+    assert "f" not in dragging.one_step.channels and dragging.thrust is None
+
+
+def test_model_without_battery_needs_no_voltage(log):
+    flat = TRUTH._replace(thrust_coeffs=np.array([13.0, 16.0, 3.0, 0.0, 0.0, 0.0]))
+    validation = validate(flat, fly(flat).without("v_bat"))
+    assert max(nrmse(validation).values()) < 1e-6 and "a" in validation.one_step.channels
+
+
+def test_rates_of_steps_come_from_attitude_without_gyroscope(log):
+    validation = validate(TRUTH, log.without("w"))
+    assert len(validation.steps) == 3 * MOST_PER_AXIS
+    # The simulator normalises instead of turning exactly, third order in the angle of a step.
+    assert max(step.rms for step in validation.steps) < 5e-3
+
+
+def test_applied_action_is_recovered_from_commands(log):
+    bare = log.without("uprev")
+    prediction = predict(TRUTH, bare)
+    applied = columns(prediction.before.applied)
+    is_settled = prediction.is_settled
+    np.testing.assert_allclose(applied[is_settled], log["uprev"][is_settled], atol=1e-5)
+    assert prediction.applied_from == "lag" and np.sum(~is_settled) == 5 * round(SETTLING_S / DT)
+    validation = validate(TRUTH, bare)
+    assert validation.one_step.num_steps == 5 * (NUM_ROWS - 1 - round(SETTLING_S / DT))
+    assert max(nrmse(validation).values()) < 1e-6
+    assert any(note.startswith("applied action (uprev)") for note in validation.notes)
+
+
+def test_steps_end_at_gaps_and_segments(log):
+    keep = np.ones(len(log), bool)
+    keep[[100, 420, 421]] = False
+    steps = steps_of(log.select(keep))
+    assert sorted(set(np.flatnonzero(~steps.is_step))) == [99, 298, 418, 596, 896, 1196, 1496]
+    assert steps.duration[99] == pytest.approx(2 * DT) and steps.since_break[100] == 0.0
+
+
+def test_gaps_are_not_crossed(log):
+    keep = np.arange(len(log)) % 97 != 96
+    gappy = validate(TRUTH, log.select(keep))
+    assert max(nrmse(gappy).values()) < 1e-6
+    assert 0 < gappy.rollouts[1].num_starts < 50 and gappy.rollouts[3].num_starts == 0
+    assert gappy.rollouts[3].errors == {}
+    assert any("free flight of 1 s, 2 s" in note for note in gappy.notes)
+    assert max(spread.p95 for spread in gappy.rollouts[1].errors.values()) < 1e-5
+    recovered = validate(TRUTH, log.without("uprev").select(keep))
+    assert 0 < recovered.one_step.num_steps < gappy.one_step.num_steps
+    assert max(nrmse(recovered).values()) < 1e-6
+
+
+def test_segments_of_other_rates_have_no_gaps(log):
+    rows = np.concatenate([np.arange(0, NUM_ROWS, 2), np.arange(NUM_ROWS, len(log))])
+    assert np.sum(~steps_of(log.select(rows)).is_step) == 5
+
+
+def test_judges_only_the_rows_it_is_told(log):
+    rows = held_out_rows(log)
+    rows[320:400] = True  # a piece with rows that are not judged on both sides
+    damaged = {name: values.copy() for name, values in log.channels.items()}
+    for name in ("p", "v", "w", "a"):
+        damaged[name][~rows] += 100.0
+    validation = validate(TRUTH, replace(log, channels=damaged), rows)
+    assert validation.num_judged == rows.sum() < len(log) and validation.one_step.num_steps > 100
+    assert max(nrmse(validation).values()) < 1e-6 and max(validation.open_force.rms_b) < 1e-5
+    nothing = validate(TRUTH, log, np.zeros(len(log), bool))
+    assert nothing.one_step.channels == {} and nothing.thrust is None and nothing.steps == ()
+    with pytest.raises(ValueError, match="rows: found int64"):
+        validate(TRUTH, log, np.flatnonzero(rows))
+
+
+@pytest.mark.parametrize("num_rows", [1, 2])
+def test_log_of_hardly_any_rows_is_judged_on_what_it_has(log, num_rows):
+    short = validate(TRUTH, log.select(slice(num_rows)))
+    assert short.one_step.num_steps == num_rows - 1 and short.steps == ()
+    assert [rollout.num_starts for rollout in short.rollouts] == [0, 0, 0, 0]
+
+
+def test_commands_without_steps_are_said(log):
+    smooth = validate(TRUTH, log.select(log.segment >= 3))
+    assert smooth.steps == () and any(note.startswith("step responses") for note in smooth.notes)
+
+
+def test_uneven_sampling_is_judged_by_its_times():
+    rng = np.random.default_rng(1)
+    start, commands = (values[0] for values in scripts())
+    durations = DT * rng.uniform(0.7, 1.3, NUM_ROWS)
+    with jax.enable_x64(True):
+        states = np.asarray(_fly(jnp.asarray(start), jnp.asarray(commands), TRUTH, jnp.asarray(durations)))
+    even = log_of_states([(states, commands)], DT)
+    time = np.concatenate([[0.0], np.cumsum(durations)[:-1]])
+    validation = validate(TRUTH, replace(even, time=time))
+    assert max(nrmse(validation).values()) < 1e-6
+    assert all(error.p95 < 1e-4 for rollout in validation.rollouts for error in rollout.errors.values())
+
+
+def test_model_that_runs_away_is_still_reported(log):
+    absurd = validate(TRUTH.with_effects(QuadraticDrag(-400.0, -400.0, -400.0)), log)
+    assert not np.isfinite(absurd.rollouts[-1].errors["position"].rms)
+    numbers = json.loads(json.dumps(absurd.as_json(), allow_nan=False))
+    assert numbers["rollouts"][-1]["position_m"]["rms"] is None
+    assert "runs away" in text_of(absurd, "absurd.json", log)
+
+
+FIGURES = {"steps", "one_step", "rollouts", "thrust", "open_force"}
+
+
+def test_report_is_whole_and_harmless(tmp_path, log, exact):
+    hostile = "<img src=x onerror=alert(1)>.npz"
+    named = replace(log, source=hostile)
+    paths = write_validation(tmp_path / "new" / "out", exact, "<b>model</b>.json", named)
+    assert {path.name for path in paths} == {
+        *(f"validation.{suffix}" for suffix in ("json", "txt", "html")),
+        *(f"{name}.png" for name in FIGURES),
+    }
+    assert {path.name for path in (tmp_path / "new" / "out").iterdir()} == {path.name for path in paths}
+    html = (tmp_path / "new" / "out" / "validation.html").read_text(encoding="utf-8")
+    assert "<img src=x" not in html and "<b>" not in html and "&lt;img src=x" in html
+    numbers = json.loads((tmp_path / "new" / "out" / "validation.json").read_text(encoding="utf-8"))
+    assert numbers["log"] == hostile and numbers["model"] == "<b>model</b>.json"
+    velocity = numbers["one_step"]["channels"]["v"]
+    text = (tmp_path / "new" / "out" / "validation.txt").read_text(encoding="utf-8")
+    for shown in (f"{velocity['mse']:.3g}", f"{velocity['nrmse']:.3g}"):
+        assert shown in html and shown in text
+    for name in FIGURES:
+        assert (tmp_path / "new" / "out" / f"{name}.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_report_of_a_poor_log_says_what_is_missing(tmp_path, log):
+    bare = log.without("v", "a", "w", "q")
+    validation = validate(TRUTH, bare)
+    write_validation(tmp_path, validation, "model.json", bare)
+    html = (tmp_path / "validation.html").read_text(encoding="utf-8")
+    assert all(escape(note) in html for note in validation.notes) and len(validation.notes) > 5
+
+
+def test_nothing_is_written_if_a_figure_fails(tmp_path, log, exact, monkeypatch):
+    def fail(validation):
+        raise RuntimeError("no figure")
+
+    monkeypatch.setattr("flytrack_sysid.validation_report.draw_validation", fail)
+    with pytest.raises(RuntimeError, match="no figure"):
+        write_validation(tmp_path / "out", exact, "model.json", log)
+    assert not (tmp_path / "out").exists()
+
+
+def test_empty_panels_say_why(log):
+    nothing = validate(TRUTH, log.without("q", "w", "v", "a"), np.zeros(len(log), bool))
+    figures = draw_validation(nothing)
+    assert set(figures) == FIGURES
+    for figure in figures.values():
+        for panel in figure.axes:
+            assert [text for text in panel.texts if text.get_text()], figure
