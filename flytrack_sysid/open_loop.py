@@ -65,9 +65,11 @@ def _starts_and_ends(
             continue
         wanted = np.arange(time[np.argmax(is_settled)], time[-1], START_EVERY_S)
         begin = np.searchsorted(time, wanted - half_step)
+        begin = begin[prediction.steps.is_measured[first + begin]]
         reached = np.searchsorted(time, time[begin, None] + np.array(HORIZONS_S) - half_step)
+        last = np.minimum(first + reached, len(log) - 1)
         starts.append(first + begin)
-        ends.append(np.where(reached < len(time), first + reached, -1))
+        ends.append(np.where((reached < len(time)) & prediction.steps.is_measured[last], last, -1))
     if not starts:
         return np.zeros(0, int), np.zeros((0, len(HORIZONS_S)), int)
     return np.concatenate(starts), np.concatenate(ends)
@@ -97,7 +99,7 @@ def rollout_errors(
 ) -> tuple[Rollout, ...]:
     """Return the errors of free flights from measured states, a start every 0.25 s of judged runs.
 
-    rows: (num_rows,) bool, those judged; a flight stays in them, and does not cross a gap.
+    rows: (num_rows,) bool, those judged; a flight stays in them, and begins and ends where it was measured.
     """
     lacking = inputs_that_lack(model, log)
     judged = [name for name, (channel, _) in QUANTITIES.items() if channel in log and not lacking[channel]]

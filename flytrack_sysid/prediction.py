@@ -5,7 +5,6 @@ Everything comes out of ``flytrack_env.dynamics.advance``, in float64.
 
 from collections.abc import Iterator
 from functools import partial
-from itertools import pairwise
 from typing import Any, NamedTuple
 
 import jax
@@ -17,30 +16,27 @@ from flytrack_env.effects import acts, start_memories
 from flytrack_env.quaternion import Quaternion, Vec3
 from flytrack_env.state import ACTION_SIZE, BATTERY_FULL_V, Action, Drone
 from flytrack_sysid.log import FlightLog
+from flytrack_sysid.record import LARGEST_DOUBT, Filled, applied_doubt, steps_after, usual_step
 
-# A row that comes later than this after the one before it, in median steps, is behind lost samples: what
-# was commanded between them is not known.
-GAP_STEPS = 1.5
-# From a guessed applied action to the right one: e^-10 of the error is left after lags of 50 ms.
+# For effects that remember: what they remembered when a segment began is not known.
 SETTLING_S = 0.5
 # Free flights at once: bounds the memory that they need, and compiles one size.
 BATCH = 128
 
 
 class Steps(NamedTuple):
-    """How a log's rows follow one another.
+    """How the rows of a log without gaps follow one another.
 
     duration: (num_rows,) s, to the next row; the median step where no row follows. median: s.
-    is_step: (num_rows,) bool, a row of the same segment follows without a gap.
-    stretch: (num_rows,) int, number of the stretch without a gap that a row belongs to.
-    since_break: (num_rows,) s, since that stretch began.
+    is_step: (num_rows,) bool, a row of the same segment follows. is_measured: (num_rows,) bool, the row
+    was logged; False where it fills a gap. since_start: (num_rows,) s, since the segment began.
     """
 
     duration: np.ndarray
     median: float
     is_step: np.ndarray
-    stretch: np.ndarray
-    since_break: np.ndarray
+    is_measured: np.ndarray
+    since_start: np.ndarray
 
 
 class Prediction(NamedTuple):
@@ -60,30 +56,21 @@ class Prediction(NamedTuple):
     applied_from: str
 
 
-def steps_of(log: FlightLog) -> Steps:
-    """Return how the rows of a log follow one another."""
+def steps_of(filled: Filled) -> Steps:
+    """Return how the rows of a log whose gaps are filled follow one another."""
+    log = filled.log
     starts = log.is_start()
-    duration = np.append(np.diff(log.time), 0.0)[: len(log)]
-    is_inside = np.append(~starts[1:], False)[: len(log)]
-    median = float(np.median(duration[is_inside])) if is_inside.any() else 1.0
-    is_step = is_inside.copy()
-    bounds = np.append(np.flatnonzero(starts), len(log)).tolist()
-    for start, end in pairwise(bounds):  # segments may have been logged at different rates
-        inside = duration[start : end - 1]
-        is_step[start : end - 1] = inside <= GAP_STEPS * (np.median(inside) if len(inside) else 0.0)
-    is_break = np.append(True, ~is_step[:-1])[: len(log)]
-    stretch = np.cumsum(is_break) - 1
     return Steps(
-        duration=np.where(is_inside, duration, median),
-        median=median,
-        is_step=is_step,
-        stretch=stretch,
-        since_break=log.time - log.time[is_break][stretch],
+        duration=steps_after(log),
+        median=float(np.median(usual_step(log))),
+        is_step=np.append(~starts[1:], False),
+        is_measured=filled.source_row >= 0,
+        since_start=log.time - log.time[starts][np.cumsum(starts) - 1],
     )
 
 
 def runs_of(rows: np.ndarray, steps: Steps) -> list[tuple[int, int]]:
-    """Return the runs of judged rows without a gap, as first row and end; rows: (num_rows,) bool."""
+    """Return the runs of judged rows, as first row and end; rows: (num_rows,) bool."""
     follows = np.append(False, rows[1:] & rows[:-1] & steps.is_step[:-1])[: len(rows)]
     starts = np.flatnonzero(rows & ~follows)
     ends = np.flatnonzero(rows & ~np.append(follows[1:], False)[: len(rows)]) + 1
@@ -92,8 +79,10 @@ def runs_of(rows: np.ndarray, steps: Steps) -> list[tuple[int, int]]:
 
 def judged_steps(rows: np.ndarray, prediction: Prediction) -> np.ndarray:
     """Return the rows whose step to the next is judged, ascending; rows: (num_rows,) bool."""
-    both = rows & np.append(rows[1:], False)[: len(rows)]
-    return np.flatnonzero(both & prediction.steps.is_step & prediction.is_settled)
+    steps = prediction.steps
+    exists = rows & steps.is_measured
+    both = exists & np.append(exists[1:], False)[: len(rows)]
+    return np.flatnonzero(both & steps.is_step & prediction.is_settled)
 
 
 def turn_between(quats: np.ndarray, others: np.ndarray) -> np.ndarray:
@@ -194,25 +183,36 @@ def _step_from_every_row(
     return jax.lax.scan(one, (first.applied, start_memories(model.effects, first)), rows)[1]
 
 
-def predict(model: ModelParameters, log: FlightLog) -> Prediction:
+def _is_settled(model: ModelParameters, filled: Filled, steps: Steps, has_memory: bool) -> np.ndarray:
+    """Return where applied action and memories no longer depend on what is not known of the past."""
+    begins = filled.log.is_start()
+    if "uprev" in filled.log:
+        is_known = np.ones(len(filled.log), bool)
+    else:
+        tau = np.asarray(model.tau, float)
+        doubt = applied_doubt(steps.duration, filled.command_doubt, begins, np.zeros_like(begins), tau)
+        is_known = (doubt < LARGEST_DOUBT).all(axis=1)
+    return is_known & ((steps.since_start >= SETTLING_S) | (not has_memory))
+
+
+def predict(model: ModelParameters, filled: Filled) -> Prediction:
     """Return the model's step from every row of a log, from the measured state under the logged command.
 
     The applied action is the log's; without it, it follows the commands from the segment's start on.
     """
-    steps = steps_of(log)
+    log, steps = filled.log, steps_of(filled)
     measured, has_applied = _measured(log), "uprev" in log
     commands = Action(*log["u"].T)
     with jax.enable_x64(True):
         rows = (measured, commands, steps.duration, log.is_start())
         found = _step_from_every_row(rows, in_float64(model), has_applied)
         applied, memories, after = jax.tree.map(np.asarray, found)
-    is_known = has_applied and not jax.tree.leaves(memories)
     return Prediction(
         before=measured._replace(applied=applied),
         memories=memories,
         after=after,
         steps=steps,
-        is_settled=np.full(len(log), is_known) | (steps.since_break >= SETTLING_S),
+        is_settled=_is_settled(model, filled, steps, bool(jax.tree.leaves(memories))),
         applied_from="log" if has_applied else "lag",
     )
 

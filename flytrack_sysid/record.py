@@ -5,11 +5,13 @@ so is the command that was given in it. Filled rows get commands in between thei
 off those may be is carried along (``command_doubt``), so that rows where it matters can be left out.
 """
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
+from flytrack_env.state import ACTION_SIZE
 from flytrack_sysid.log import FlightLog
 from flytrack_sysid.split import blocks_of
 
@@ -18,6 +20,10 @@ LONGEST_FILLED_S = 0.1  # after a longer gap a new flight begins
 WINDOW_S = 1.25  # over which increments of velocity and attitude are followed
 PADDED_TO = 1024  # rows: logs of about the same length share one compiled program
 BATTERY_UNKNOWN_V = 23.0
+NOMINAL_STEP_S = 0.01  # of a log without two rows
+UPRIGHT = (1.0, 0.0, 0.0, 0.0)
+# An applied action known worse than this counts for nothing: half a gyro's noise at full stick.
+LARGEST_DOUBT = 0.005
 APPLIED_UNKNOWN = 1.0  # standard deviation of an applied action that nothing is known of
 
 
@@ -47,13 +53,17 @@ class Record(NamedTuple):
     piece: np.ndarray
 
 
-def usual_step(log: FlightLog) -> float:
-    """Return the median time between rows of a segment, s."""
-    steps = np.diff(log.time)[log.segment[1:] == log.segment[:-1]]
-    return float(np.median(steps))
+def usual_step(log: FlightLog) -> np.ndarray:
+    """Return the median time between rows of the segment that each row is in, (num_rows,) s."""
+    starts = np.flatnonzero(log.is_start())
+    steps = [np.diff(times) for times in np.split(log.time, starts[1:])]
+    all_steps = np.concatenate(steps)
+    fallback = float(np.median(all_steps)) if len(all_steps) else NOMINAL_STEP_S
+    medians = [float(np.median(own)) if len(own) else fallback for own in steps]
+    return np.repeat(medians, [len(own) + 1 for own in steps])
 
 
-def _new_times(log: FlightLog, usual: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _new_times(log: FlightLog, usual: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return times with gaps filled, the log's row at or before each, and where a flight begins."""
     steps = np.diff(log.time, append=log.time[-1])
     ends = np.append(log.segment[1:] != log.segment[:-1], True)
@@ -86,8 +96,6 @@ def _between(times: np.ndarray, log: FlightLog, values: np.ndarray) -> np.ndarra
 
 
 def _quaternions(times: np.ndarray, log: FlightLog) -> np.ndarray:
-    if "q" not in log:
-        return np.tile([1.0, 0.0, 0.0, 0.0], (len(times), 1))
     rotations = Slerp(log.time, Rotation.from_quat(log["q"], scalar_first=True))
     return rotations(times).as_quat(scalar_first=True)
 
@@ -99,43 +107,77 @@ def _velocity(log: FlightLog) -> np.ndarray:
     return np.gradient(log["p"], log.time, axis=0) if "p" in log else np.zeros((len(log), 3))
 
 
-def _end_to_end(log: FlightLog, usual: float) -> FlightLog:
+def _end_to_end(log: FlightLog, usual: np.ndarray) -> FlightLog:
     """Return the log with its segments one after the other in time."""
     starts = np.flatnonzero(log.is_start())
     lengths = np.diff(np.append(starts, len(log)))
-    durations = log.time[starts + lengths - 1] - log.time[starts] + usual
+    durations = log.time[starts + lengths - 1] - log.time[starts] + usual[starts]
     offset = np.concatenate([[0.0], np.cumsum(durations)[:-1]]) - log.time[starts]
     return FlightLog(log.time + np.repeat(offset, lengths), log.channels, log.segment, log.source)
 
 
+class Filled(NamedTuple):
+    """A log with rows added in its gaps, in between their neighbours.
+
+    log: segments end where a gap is too long to be filled. source_row: (num_rows,) int, the row of the
+    log as it was; -1 for added ones. behind: (num_rows,) int, that row or the one before the gap.
+    command_doubt: (num_rows, 4), standard deviation of how far a command may be off.
+    """
+
+    log: FlightLog
+    source_row: np.ndarray
+    behind: np.ndarray
+    command_doubt: np.ndarray
+
+
+def fill_gaps(log: FlightLog) -> Filled:
+    """Return a log without gaps."""
+    usual = usual_step(log)
+    in_line = _end_to_end(log, usual)
+    times, rows, begins = _new_times(in_line, usual)
+    measured = rows >= 0
+    behind = np.where(measured, rows, -1 - rows)
+    pieces = np.bincount(behind, minlength=len(log))
+    channels = {
+        name: _quaternions(times, in_line) if name == "q" else _between(times, in_line, values)
+        for name, values in log.channels.items()
+    }
+    for name, values in channels.items():
+        values[measured] = log[name][rows[measured]]
+    filled = replace(
+        log, time=times - (in_line.time - log.time)[behind], channels=channels, segment=np.cumsum(begins) - 1
+    )
+    doubt = np.where(measured[:, None], 0.0, _doubts(log, pieces)[behind])
+    return Filled(filled, np.where(measured, rows, -1), behind, doubt)
+
+
 def make_record(log: FlightLog) -> Record:
     """Return a log ready for replay."""
-    usual = usual_step(log)
-    blocks = blocks_of(log)
-    log = _end_to_end(log, usual)
-    times, rows, begins = _new_times(log, usual)
-    measured = rows >= 0
-    behind = np.where(measured, rows, -1 - rows)  # the row at or before
-    pieces = np.bincount(behind, minlength=len(log))
-    zeros = np.zeros((len(times), 3))
-    command = np.where(measured[:, None], log["u"][behind], _between(times, log, log["u"]))
-    battery = _between(times, log, log["v_bat"])[:, 0] if "v_bat" in log else BATTERY_UNKNOWN_V + zeros[:, 0]
-    after_gap = np.append(False, ~measured[:-1]) & measured
+    filled = fill_gaps(log)
+    full, begins = filled.log, filled.log.is_start()
+    zeros = np.zeros((len(full), 3))
+    after_gap = np.append(False, filled.source_row[:-1] < 0) & (filled.source_row >= 0)
     record = Record(
-        source_row=np.where(measured, rows, -1),
-        step_s=np.diff(times, append=times[-1] + usual),
-        command=command,
-        command_doubt=np.where(measured[:, None], 0.0, _doubts(log, pieces)[behind]),
+        source_row=filled.source_row,
+        step_s=steps_after(full),
+        command=full["u"],
+        command_doubt=filled.command_doubt,
         begins=begins,
         is_applied_known=(begins | after_gap) & ("uprev" in log),
-        applied=log["uprev"][behind] if "uprev" in log else command,
-        pos_w=_between(times, log, log["p"]) if "p" in log else zeros,
-        vel_w=_between(times, log, _velocity(log)),
-        quat=_quaternions(times, log),
-        battery_v=battery,
-        piece=_pieces(times, begins, blocks[behind]),
+        applied=full["uprev"] if "uprev" in log else full["u"],
+        pos_w=full["p"] if "p" in log else zeros,
+        vel_w=_velocity(full),
+        quat=full["q"] if "q" in log else np.tile(UPRIGHT, (len(full), 1)),
+        battery_v=full["v_bat"][:, 0] if "v_bat" in log else zeros[:, 0] + BATTERY_UNKNOWN_V,
+        piece=_pieces(full.time, begins, blocks_of(log)[filled.behind]),
     )
     return _padded(record)
+
+
+def steps_after(log: FlightLog) -> np.ndarray:
+    """Return the time from each row to the next of its segment, (num_rows,) s; the usual one at the end."""
+    steps = np.diff(log.time, append=log.time[-1])
+    return np.where(np.append(log.is_start()[1:], True), usual_step(log), steps)
 
 
 def _pieces(times: np.ndarray, begins: np.ndarray, blocks: np.ndarray) -> np.ndarray:
@@ -165,20 +207,26 @@ def _padded(record: Record) -> Record:
     return padded._replace(source_row=source_row, begins=begins)
 
 
-def applied_doubt(record: Record, tau: np.ndarray) -> np.ndarray:
-    """Return how far the replay's applied action may be off, (num_rows, 4): a standard deviation.
+def applied_doubt(
+    step_s: np.ndarray,
+    command_doubt: np.ndarray,
+    begins: np.ndarray,
+    is_applied_known: np.ndarray,
+    tau: np.ndarray,
+) -> np.ndarray:
+    """Return how far the applied action of a replay may be off, (num_rows, 4): a standard deviation.
 
     From commands that were lost and from what was applied when a flight began; both are forgotten with
-    the lags ``tau``, (4,) s.
+    the lags ``tau``, (4,) s. The other arguments are those of ``Record``.
     """
-    keep_squared = np.exp(-2.0 * record.step_s[:, None] / tau)
-    enters = (1.0 - np.sqrt(keep_squared)) ** 2 * record.command_doubt**2
-    unknown = np.where(record.is_applied_known, 0.0, APPLIED_UNKNOWN**2)
-    variance, variances = unknown[0] * np.ones(4), np.empty_like(record.command)
-    restarts = record.begins | record.is_applied_known
+    keep = np.exp(-step_s[:, None] / tau)
+    enters = (1.0 - keep) ** 2 * command_doubt**2
+    unknown = np.where(is_applied_known, 0.0, APPLIED_UNKNOWN**2)
+    variance, variances = np.full(ACTION_SIZE, unknown[0]), np.empty_like(command_doubt)
+    restarts = begins | is_applied_known
     for row in range(len(restarts)):
         if restarts[row]:
-            variance = unknown[row] * np.ones(4)
+            variance = np.full(ACTION_SIZE, unknown[row])
         variances[row] = variance
-        variance = keep_squared[row] * variance + enters[row]
+        variance = keep[row] ** 2 * variance + enters[row]
     return np.sqrt(variances)

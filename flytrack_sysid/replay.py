@@ -18,9 +18,6 @@ from flytrack_env.state import Action, Drone
 from flytrack_sysid.record import Record
 
 
-UNROLL = 1
-
-
 class Replay(NamedTuple):
     """What the model says of the rows, (num_rows, ...); of the first of a flight it says nothing.
 
@@ -102,7 +99,7 @@ def _remembered(model: ModelParameters, record: Record) -> tuple[Action, Vec3, t
     first = jax.tree.map(lambda column: column[0], record)
     drone = _drone(first, Action(*first.applied), Vec3(*jnp.zeros_like(first.vel_w)))
     start = (drone.applied, drone.rates_b, start_memories(model.effects, drone))
-    return jax.lax.scan(next_row, start, record, unroll=UNROLL)[1]
+    return jax.lax.scan(next_row, start, record)[1]
 
 
 def _turned(record: Record, rates_b: Vec3, is_fresh: jax.Array) -> Quaternion:
@@ -115,4 +112,4 @@ def _turned(record: Record, rates_b: Vec3, is_fresh: jax.Array) -> Quaternion:
 
     measured = Quaternion(*record.quat.T)
     start = jax.tree.map(lambda column: column[0], measured)
-    return jax.lax.scan(next_row, start, (measured, rates_b, record.step_s, is_fresh), unroll=UNROLL)[1]
+    return jax.lax.scan(next_row, start, (measured, rates_b, record.step_s, is_fresh))[1]

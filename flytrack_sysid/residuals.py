@@ -24,13 +24,11 @@ from scipy.spatial.transform import Rotation
 from flytrack_env.dynamics import ModelParameters
 from flytrack_env.quaternion import Quaternion
 from flytrack_sysid.log import FlightLog
-from flytrack_sysid.record import Record, applied_doubt
+from flytrack_sysid.record import LARGEST_DOUBT, Record, applied_doubt
 from flytrack_sysid.replay import Replay, replay
 
 CENTRED = ("v", "p", "q", "v_bat")
 TURN_CHANNELS, FORCE_CHANNELS = ("w", "q"), ("f", "v", "p")
-# An applied action known worse than this counts for nothing: half a gyro's noise at full stick.
-LARGEST_DOUBT = 0.005
 
 
 class Channel(NamedTuple):
@@ -74,7 +72,13 @@ def make_problem(log: FlightLog, record: Record, judged: np.ndarray, model: Mode
 
     judged: (rows of the log,) bool. The lags of ``model`` say how long lost commands are remembered.
     """
-    doubt = applied_doubt(record, np.asarray(model.tau, float))
+    doubt = applied_doubt(
+        record.step_s,
+        record.command_doubt,
+        record.begins,
+        record.is_applied_known,
+        np.asarray(model.tau, float),
+    )
     is_certain = doubt < LARGEST_DOUBT
     exists = (record.source_row >= 0) & judged[record.source_row]
     is_after = exists & ~record.begins

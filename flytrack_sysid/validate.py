@@ -9,7 +9,8 @@ from flytrack_sysid.forces import OpenForce, force_samples, open_force
 from flytrack_sysid.log import FlightLog
 from flytrack_sysid.one_step import OneStep, one_step_errors
 from flytrack_sysid.open_loop import Rollout, rollout_errors
-from flytrack_sysid.prediction import SETTLING_S, Prediction, inputs_that_lack, predict
+from flytrack_sysid.prediction import Prediction, inputs_that_lack, predict
+from flytrack_sysid.record import fill_gaps
 from flytrack_sysid.steps import HELD_AFTER_S, HELD_BEFORE_S, LEAST_JUMP, StepResponse, step_responses
 from flytrack_sysid.thrust import ThrustError, thrust_error
 
@@ -86,8 +87,8 @@ def _notes_of(model: ModelParameters, log: FlightLog, prediction: Prediction) ->
     if not prediction.is_settled.all():
         count = int(np.sum(~prediction.is_settled))
         notes.append(
-            f"{count} rows within {SETTLING_S:g} s after a segment's start or a gap begin no judged step or "
-            "flight: what came before is not known there"
+            f"{count} rows after a segment's start or lost commands begin no judged step or flight: the "
+            "applied action, or what the model's effects remember, is not known there"
         )
     return notes
 
@@ -126,7 +127,10 @@ def validate(model: ModelParameters, log: FlightLog, rows: np.ndarray | None = N
     if rows.shape != (len(log),) or rows.dtype != bool:
         found = f"{rows.dtype} of shape {rows.shape}"
         raise ValueError(f"rows: found {found}, expected bool of shape ({len(log)},)")
-    prediction = predict(model, log)
+    num_rows, num_judged = len(log), int(rows.sum())
+    filled = fill_gaps(log)
+    log, rows = filled.log, rows[filled.behind]
+    prediction = predict(model, filled)
     notes = _notes_of(model, log, prediction)
     one_step = one_step_errors(model, log, prediction, rows)
     if not one_step.num_steps:
@@ -134,7 +138,7 @@ def validate(model: ModelParameters, log: FlightLog, rows: np.ndarray | None = N
     rollouts = rollout_errors(model, log, prediction, rows)
     too_long = [f"{rollout.horizon_s:g} s" for rollout in rollouts if not rollout.num_starts]
     if too_long:
-        notes.append(f"free flight of {', '.join(too_long)}: no judged stretch without a gap is as long")
+        notes.append(f"free flight of {', '.join(too_long)}: no judged stretch is as long")
     thrust, left, force_notes = _forces(model, log, prediction, rows)
     notes += force_notes
     steps = step_responses(model, log, prediction, rows)
@@ -145,8 +149,8 @@ def validate(model: ModelParameters, log: FlightLog, rows: np.ndarray | None = N
             "body rate or attitude measured"
         )
     return Validation(
-        num_rows=len(log),
-        num_judged=int(rows.sum()),
+        num_rows=num_rows,
+        num_judged=num_judged,
         one_step=one_step,
         rollouts=rollouts,
         thrust=thrust,

@@ -19,7 +19,8 @@ from flytrack_sysid.log import FlightLog, log_of_states
 from flytrack_sysid.one_step import error_of
 from flytrack_sysid.open_loop import QUANTITIES
 from flytrack_sysid.plots import draw_validation
-from flytrack_sysid.prediction import SETTLING_S, columns, predict, steps_of
+from flytrack_sysid.prediction import columns, predict, steps_of
+from flytrack_sysid.record import LARGEST_DOUBT, fill_gaps
 from flytrack_sysid.split import held_out_rows
 from flytrack_sysid.steps import MOST_PER_AXIS
 from flytrack_sysid.validate import Validation, validate
@@ -240,41 +241,53 @@ def test_rates_of_steps_come_from_attitude_without_gyroscope(log):
 
 def test_applied_action_is_recovered_from_commands(log):
     bare = log.without("uprev")
-    prediction = predict(TRUTH, bare)
+    prediction = predict(TRUTH, fill_gaps(bare))
     applied = columns(prediction.before.applied)
     is_settled = prediction.is_settled
-    np.testing.assert_allclose(applied[is_settled], log["uprev"][is_settled], atol=1e-5)
-    assert prediction.applied_from == "lag" and np.sum(~is_settled) == 5 * round(SETTLING_S / DT)
+    np.testing.assert_allclose(applied[is_settled], log["uprev"][is_settled], atol=2 * LARGEST_DOUBT)
+    # exp(-t / slowest lag) of what the applied action may have been is left.
+    longest = np.log(1 / LARGEST_DOUBT) * np.max(TRUTH.tau)
+    assert prediction.applied_from == "lag" and np.sum(~is_settled) == 5 * np.ceil(longest / DT)
     validation = validate(TRUTH, bare)
-    assert validation.one_step.num_steps == 5 * (NUM_ROWS - 1 - round(SETTLING_S / DT))
-    assert max(nrmse(validation).values()) < 1e-6
+    assert validation.one_step.num_steps == np.sum(is_settled) - 5
+    assert max(nrmse(validation).values()) < 1e-2
     assert any(note.startswith("applied action (uprev)") for note in validation.notes)
 
 
-def test_steps_end_at_gaps_and_segments(log):
+def test_gaps_are_filled_with_rows_that_are_not_judged(log):
     keep = np.ones(len(log), bool)
     keep[[100, 420, 421]] = False
-    steps = steps_of(log.select(keep))
-    assert sorted(set(np.flatnonzero(~steps.is_step))) == [99, 298, 418, 596, 896, 1196, 1496]
-    assert steps.duration[99] == pytest.approx(2 * DT) and steps.since_break[100] == 0.0
+    filled = fill_gaps(log.select(keep))
+    np.testing.assert_allclose(filled.log.time, log.time, atol=1e-12)
+    assert np.flatnonzero(filled.source_row < 0).tolist() == [100, 420, 421]
+    steps = steps_of(filled)
+    assert np.flatnonzero(~steps.is_step).tolist() == [299, 599, 899, 1199, 1499]
+    np.testing.assert_allclose(filled.log["q"][100], log["q"][100], atol=1e-3)
 
 
-def test_gaps_are_not_crossed(log):
+def test_a_long_gap_ends_a_segment(log):
+    keep = np.ones(len(log), bool)
+    keep[100:115] = False
+    filled = fill_gaps(log.select(keep))
+    assert len(filled.log) == len(log) - 15 and filled.log.segment[99:101].tolist() == [0, 1]
+
+
+def test_flights_go_on_across_gaps(log):
     keep = np.arange(len(log)) % 97 != 96
     gappy = validate(TRUTH, log.select(keep))
     assert max(nrmse(gappy).values()) < 1e-6
-    assert 0 < gappy.rollouts[1].num_starts < 50 and gappy.rollouts[3].num_starts == 0
-    assert gappy.rollouts[3].errors == {}
-    assert any("free flight of 1 s, 2 s" in note for note in gappy.notes)
-    assert max(spread.p95 for spread in gappy.rollouts[1].errors.values()) < 1e-5
+    assert gappy.rollouts[3].num_starts > 0
+    # Only what was commanded in the lost row is guessed.
+    assert gappy.rollouts[1].errors["velocity"].median < 0.01
     recovered = validate(TRUTH, log.without("uprev").select(keep))
     assert 0 < recovered.one_step.num_steps < gappy.one_step.num_steps
-    assert max(nrmse(recovered).values()) < 1e-6
+    assert max(nrmse(recovered).values()) < 2e-2
 
 
 def test_segments_of_other_rates_have_no_gaps(log):
     rows = np.concatenate([np.arange(0, NUM_ROWS, 2), np.arange(NUM_ROWS, len(log))])
-    assert np.sum(~steps_of(log.select(rows)).is_step) == 5
+    filled = fill_gaps(log.select(rows))
+    assert (filled.source_row >= 0).all() and np.sum(~steps_of(filled).is_step) == 5
 
 
 def test_judges_only_the_rows_it_is_told(log):
