@@ -1,6 +1,6 @@
 """Does a log that can be read describe a flight? Units, gravity and signs, stuck columns, too little data.
 
-What one channel says of the motion is compared with what another says, over windows of about 0.1 s so that
+What one channel says of the motion is compared with what another says, over windows of 0.1 to 1 s so that
 noise averages out. A unit is named wrong only where both move alike, by about a known factor; where the
 motion is too small to tell, nothing is said. The signs of frames are not compared, but for the z of ``f``.
 """
@@ -16,11 +16,12 @@ from flytrack_env.dynamics import nominal_parameters
 from flytrack_sysid.log import CHANNELS, FlightLog, LogError
 
 GRAVITY = float(nominal_parameters().g)  # m/s^2
-WINDOW_S = 0.1  # long against the noise of a sample, short against a manoeuvre
+WINDOWS_S = (0.1, 0.3, 1.0)  # long against the noise of a sample; short ones for fast manoeuvres
 FEWEST_WINDOWS = 10
 LEAST_CORRELATION = 0.9  # with less in common, the slope may be that of noise
 TOLERANCE = 0.15  # of a known wrong factor: scale errors of sensors stay well below it
 FEWEST_ROWS = 100
+FEWEST_UPRIGHT_ROWS = 20
 SHORTEST_S = 2.0
 STILL = 1e-6  # in any unit: what changes by less does not change
 LONGEST_STEP_S = 0.5  # no log of a drone is as slow as 2 Hz
@@ -45,7 +46,7 @@ BATTERY_UNITS = {1000.0: "mV", 100.0: "hundredths of V", 10.0: "tenths of V"}
 
 
 class Windows(NamedTuple):
-    """Pieces of a log of about 0.1 s, none across segments or long gaps; (num_windows,) each.
+    """Pieces of a log of about one length, none across segments or long gaps; (num_windows,) each.
 
     starts, ends: first row, and the row after the last step. durations: s.
     """
@@ -58,38 +59,51 @@ class Windows(NamedTuple):
         """Return by how much (num_rows, ...) values grow over each window."""
         return values[self.ends] - values[self.starts]
 
-    def integral_of(self, log: FlightLog, values: np.ndarray) -> np.ndarray:
-        """Return the integral over each window of values (num_rows, n), which change linearly in between."""
+    def mean_of(self, log: FlightLog, values: np.ndarray) -> np.ndarray:
+        """Return the mean over each window of values (num_rows, n), which change linearly in between."""
         steps = np.diff(log.time)[:, None] * 0.5 * (values[1:] + values[:-1])
-        return self.change_of(np.concatenate([np.zeros((1, values.shape[1])), np.cumsum(steps, axis=0)]))
+        integral = np.concatenate([np.zeros((1, values.shape[1])), np.cumsum(steps, axis=0)])
+        return self.change_of(integral) / self.durations[:, None]
 
 
-def windows_of(log: FlightLog) -> Windows:
+def windows_of(log: FlightLog, length_s: float) -> Windows:
     """Return the windows of a log; those that a gap makes twice as long are left out."""
     is_start = log.is_start()
     flight = np.cumsum(is_start) - 1
     since_start = log.time - log.time[is_start][flight]
-    number = np.floor(since_start / WINDOW_S)
+    number = np.floor(since_start / length_s)
     edges = np.flatnonzero(is_start | np.append(True, np.diff(number) > 0))
     starts, ends = edges[:-1], edges[1:]
     durations = log.time[ends] - log.time[starts]
     steps = np.diff(log.time)[~is_start[1:]]
-    longest = 2.0 * max(WINDOW_S, np.median(steps)) if len(steps) else 0.0
+    longest = 2.0 * max(length_s, np.median(steps)) if len(steps) else 0.0
     keep = (flight[starts] == flight[ends]) & (durations <= longest)
     return Windows(starts[keep], ends[keep], durations[keep])
 
 
-def slope_of(found: np.ndarray, expected: np.ndarray) -> float:
-    """Return the factor from what was expected to what was found, nan where they hardly move alike.
+def slope_of(log: FlightLog, change: np.ndarray, rate: np.ndarray, is_centred: bool = False) -> float:
+    """Return the factor from the change of one quantity to the integral of its rate, nan if none is clear.
 
-    found, expected: (num_windows, 3). The ratio of their sizes, which noise in either biases little where
-    they are highly correlated.
+    change, rate: (num_rows, 3). The ratio of their sizes over windows of that length at which they move
+    most alike: noise in either biases it little where they are highly correlated. is_centred: without the
+    mean of each column, which a bias is in.
     """
-    size_found, size_expected = np.linalg.norm(found), np.linalg.norm(expected)
-    if len(found) < FEWEST_WINDOWS or min(size_found, size_expected) < STILL:
-        return np.nan
-    correlation = np.sum(found * expected) / (size_found * size_expected)
-    return float(size_found / size_expected) if correlation >= LEAST_CORRELATION else np.nan
+    best, slope = LEAST_CORRELATION, np.nan
+    for length_s in WINDOWS_S:
+        windows = windows_of(log, length_s)
+        if len(windows.starts) < FEWEST_WINDOWS:
+            continue
+        grown = windows.change_of(change) / windows.durations[:, None]
+        summed = windows.mean_of(log, rate)
+        if is_centred:
+            grown, summed = grown - grown.mean(axis=0), summed - summed.mean(axis=0)
+        size_grown, size_summed = np.linalg.norm(grown), np.linalg.norm(summed)
+        if min(size_grown, size_summed) < STILL:
+            continue
+        correlation = np.sum(grown * summed) / (size_grown * size_summed)
+        if correlation >= best:
+            best, slope = correlation, float(size_summed / size_grown)
+    return slope
 
 
 def is_about(value: float, factor: float) -> bool:
@@ -153,8 +167,7 @@ def _rates(log: FlightLog) -> list[str]:
         attitude = Rotation.from_quat(log["q"], scalar_first=True)
         turns_b = (attitude[:-1].inv() * attitude[1:]).as_rotvec()
         turned = np.concatenate([np.zeros((1, 3)), np.cumsum(turns_b, axis=0)])
-        windows = windows_of(log)
-        slope = slope_of(windows.integral_of(log, log["w"]), windows.change_of(turned))
+        slope = slope_of(log, turned, log["w"])
         problems = _wrong_unit(slope, RATE_UNITS, f"the rates at which {_columns('q')} turn")
     fast = np.percentile(np.linalg.norm(log["w"], axis=1), 99)
     if problems or fast <= FASTEST_RATE:
@@ -166,8 +179,7 @@ def _rates(log: FlightLog) -> list[str]:
 def _position(log: FlightLog) -> list[str]:
     if "p" not in log or "v" not in log:
         return []
-    windows = windows_of(log)
-    slope = slope_of(windows.change_of(log["p"]), windows.integral_of(log, log["v"]))
+    slope = 1.0 / slope_of(log, log["p"], log["v"])
     return _wrong_unit(slope, PLACE_UNITS, f"the way that {_columns('v')} make")
 
 
@@ -175,16 +187,15 @@ def _acceleration(log: FlightLog) -> list[str]:
     """Compare increments less their mean, which a bias or gravity is in; then that mean."""
     if "a" not in log or "v" not in log:
         return []
-    windows = windows_of(log)
-    if len(windows.starts) < FEWEST_WINDOWS:
-        return []
-    found = windows.integral_of(log, log["a"]) / windows.durations[:, None]
-    expected = windows.change_of(log["v"]) / windows.durations[:, None]
-    slope = slope_of(found - found.mean(axis=0), expected - expected.mean(axis=0))
+    slope = slope_of(log, log["v"], log["a"], is_centred=True)
     problems = _wrong_unit(slope, ACCELERATION_UNITS, f"the changes of {_columns('v')} per second")
-    offset = float(np.median(found[:, 2] - expected[:, 2]))
-    if problems or not is_about(offset, GRAVITY) or not (np.isnan(slope) or is_about(slope, 1.0)):
+    windows = windows_of(log, WINDOWS_S[-1])
+    if problems or len(windows.starts) == 0:
         return problems
+    changes = windows.change_of(log["v"]) / windows.durations[:, None]
+    offset = float(np.median((windows.mean_of(log, log["a"]) - changes)[:, 2]))
+    if not is_about(offset, GRAVITY) or not (np.isnan(slope) or is_about(slope, 1.0)):
+        return []
     text = f"found {offset:.3g} m/s^2 more than v_z changes by, expected 0 in hover"
     return [f"a_z: {text}: gravity looks left in, as an accelerometer measures it"]
 
@@ -197,12 +208,14 @@ def _force(log: FlightLog) -> list[str]:
 
 def _force_unit(log: FlightLog) -> list[str]:
     """Compare the size of the specific force with what the velocity says, or with what keeps a drone up."""
-    found = float(np.median(np.linalg.norm(log["f"], axis=1)))
+    windows = windows_of(log, WINDOWS_S[0])
+    if len(windows.starts) < FEWEST_WINDOWS:
+        return []
+    found = float(np.median(np.linalg.norm(windows.mean_of(log, log["f"]), axis=1)))
     if found > LARGEST_FORCE_G:
         return []
     problem = f"{_columns('f')}: found a median size of {found:.3g}"
-    windows = windows_of(log)
-    if "v" in log and len(windows.starts) >= FEWEST_WINDOWS:
+    if "v" in log:
         force_w = windows.change_of(log["v"]) / windows.durations[:, None] + np.array([0.0, 0.0, GRAVITY])
         expected = float(np.median(np.linalg.norm(force_w, axis=1)))
         if not is_about(found * GRAVITY, expected):
@@ -220,7 +233,7 @@ def _force_sign(log: FlightLog) -> list[str]:
     if "q" in log:
         body_z_w = Rotation.from_quat(log["q"], scalar_first=True).apply([0.0, 0.0, 1.0])
         force_z = force_z[body_z_w[:, 2] >= UPRIGHT]
-    if len(force_z) < FEWEST_ROWS or np.median(force_z) > -LEAST_FORCE_DOWN:
+    if len(force_z) < FEWEST_UPRIGHT_ROWS or np.median(force_z) > -LEAST_FORCE_DOWN:
         return []
     found = f"found a median of {np.median(force_z):.3g} m/s^2 where upright"
     return [f"f_z: {found}, expected about {GRAVITY:.3g}: z looks as if it pointed down"]
