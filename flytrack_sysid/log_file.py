@@ -113,12 +113,14 @@ def _ranges(log: FlightLog) -> list[str]:
 def _content(path: Path) -> bytes:
     """Return the bytes of a file that is not too large."""
     try:
-        announced = path.stat().st_size
+        _check_size(str(path), path.stat().st_size)
         with path.open("rb") as file:
-            content = file.read(LARGEST_BYTES + 1) if announced <= LARGEST_BYTES else b""
+            content = file.read(LARGEST_BYTES + 1)  # devices announce nothing and never end
+    except LogError:
+        raise
     except (OSError, ValueError) as error:  # ValueError: a NUL in the name
         raise LogError(f"{path}: cannot be read: {error}") from error
-    _check_size(str(path), max(announced, len(content)))  # devices announce nothing and never end
+    _check_size(str(path), len(content))
     return content
 
 

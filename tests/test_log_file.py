@@ -328,10 +328,19 @@ def test_large_files_are_refused_unread(tmp_path, monkeypatch):
             load_log(tmp_path / name)
 
 
-def test_sparse_file_beyond_the_limit_is_refused(tmp_path):
+def test_sparse_file_beyond_the_limit_is_refused_unopened(tmp_path, monkeypatch):
     with (tmp_path / "flight.csv").open("wb") as file:
         file.truncate(log_file.LARGEST_BYTES + 1)
+    monkeypatch.setattr(Path, "open", lambda *_: pytest.fail("the file was opened"))
     with pytest.raises(LogError, match="found more than 536870912 bytes"):
+        load_log(tmp_path / "flight.csv")
+
+
+@pytest.mark.skipif(not Path("/dev/zero").exists(), reason="needs a device that never ends")
+def test_device_is_read_to_the_limit_only(tmp_path, monkeypatch):
+    (tmp_path / "flight.csv").symlink_to("/dev/zero")
+    monkeypatch.setattr(log_file, "LARGEST_BYTES", 1000)
+    with pytest.raises(LogError, match="found more than 1000 bytes"):
         load_log(tmp_path / "flight.csv")
 
 

@@ -104,6 +104,11 @@ WRONG = {
     "f with z down": (scaled("f", np.array([1.0, -1.0, -1.0])), "f_z", "pointed down"),
     "a in g": (scaled("a", 1 / GRAVITY), columns("a"), "looks like g, not m/s"),
     "a with gravity": (shifted("a", UPWARDS), "a_z", "gravity looks left in"),
+    "a in g, with gravity": (
+        lambda log: scaled("a", 1 / GRAVITY)(shifted("a", UPWARDS)(log)),
+        columns("a"),
+        "looks like g, not m/s",
+    ),
     "p in mm": (scaled("p", 1000.0), columns("p"), "looks like mm, not m$"),
     "p in cm": (scaled("p", 100.0), columns("p"), "looks like cm, not m$"),
     "commands stuck": (
@@ -162,6 +167,23 @@ def test_drone_that_stands_while_commands_move(logs, measured):
     assert len(problems) == 1 and f": {named}: found the same values in every row" in problems[0]
 
 
+def test_drone_that_stands_under_still_commands_is_one_problem(logs):
+    log = logs["clean 0"]
+    still = {name: np.repeat(log[name][:1], len(log), axis=0) for name in ("u", "w", "q")}
+    (problem,) = find_problems(replace(log, channels=still))
+    assert f": {columns('u')}: " in problem
+
+
+@pytest.mark.parametrize("wrong", [None, "w in deg/s", "p in mm", "a in g", "f in g"])
+@pytest.mark.parametrize("name", NAMES)
+def test_long_gaps_hide_nothing_and_raise_nothing(logs, name, wrong):
+    log = logs[name]
+    log = log.select(log.time % 1.0 < 0.55)
+    problems = find_problems(WRONG[wrong][0](log) if wrong else log)
+    assert len(problems) == (wrong is not None)
+    assert all(f": {WRONG[wrong][1]}: " in problem for problem in problems)
+
+
 def test_noise_of_a_drone_that_stands_is_no_motion_to_judge(logs):
     log = logs["noisy 0"]
     rng = np.random.default_rng(5)
@@ -214,6 +236,17 @@ def test_battery_in_other_units(logs, value, guess):
 def test_velocity_in_cm_per_s_is_not_blamed_on_position(logs):
     (problem,) = find_problems(scaled("v", 100.0)(logs["noisy 1"].without("a", "f")))
     assert f": {columns('v')}: " in problem and "looks like cm/s" in problem
+
+
+def test_velocity_in_other_units_is_not_blamed_on_gravity(logs):
+    # A slow sink that in cm/s happens to lie as far from the acceleration as gravity would.
+    log, sink_w = logs["clean 0"], np.array([0.0, 0.0, -GRAVITY / 99])
+    rate = 2 * np.pi * np.array([1.0, 2.0, 3.0])
+    time = log.time[:, None]
+    channels = {"u": log["u"], "a": np.cos(rate * time) + sink_w}
+    for scale in (1.0, 100.0):
+        velocity = scale * (np.sin(rate * time) / rate + sink_w * time)
+        assert find_problems(replace(log, channels={**channels, "v": velocity})) == []
 
 
 def test_scale_errors_and_biases_of_sensors_pass(logs):
