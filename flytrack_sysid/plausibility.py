@@ -25,7 +25,8 @@ FEWEST_UPRIGHT_ROWS = 20
 SHORTEST_S = 2.0
 STILL = 1e-6  # in any unit: what changes by less does not change
 LONGEST_STEP_S = 0.5  # no log of a drone is as slow as 2 Hz
-LONGEST_STEP_MS = 500.0  # the same in ms
+MS_PER_S, US_PER_S = 1e3, 1e6
+FAST_PERCENTILE = 99.0  # of the rates: a lone spike is no unit
 FASTEST_RATE = float(np.deg2rad(4000.0))  # rad/s, the widest range among common gyroscopes
 HIGHEST_BATTERY_V = 100.0  # drones' batteries end at about 60 V
 LIKELY_BATTERY_V = (2.5, 70.0)  # an empty cell; more than a full pack of 14 in row
@@ -131,7 +132,7 @@ def _time(log: FlightLog) -> tuple[FlightLog, list[str]]:
     step = np.median(steps) if len(steps) else 0.0
     if step < LONGEST_STEP_S:
         return log, []
-    unit, per_second = ("ms", 1e3) if step < LONGEST_STEP_MS else ("us", 1e6)
+    unit, per_second = ("ms", MS_PER_S) if step < LONGEST_STEP_S * MS_PER_S else ("us", US_PER_S)
     problem = f"t: found a median step of {step:.4g}, expected less than {LONGEST_STEP_S:g} s"
     return replace(log, time=log.time / per_second), [f"{problem}: this looks like {unit}"]
 
@@ -170,10 +171,12 @@ def _rates(log: FlightLog) -> list[str]:
         turned = np.concatenate([np.zeros((1, 3)), np.cumsum(turns_b, axis=0)])
         slope = slope_of(log, turned, log["w"])
         problems = _wrong_unit(slope, RATE_UNITS, f"the rates over those by {_columns('q')}")
-    fast = np.percentile(np.linalg.norm(log["w"], axis=1), 99)
+    fast = np.percentile(np.linalg.norm(log["w"], axis=1), FAST_PERCENTILE)
     if problems or fast <= FASTEST_RATE:
         return problems
-    found = f"found rates above {fast:.0f} in 1 % of the rows, expected at most {FASTEST_RATE:.0f} rad/s"
+    found = (
+        f"found a {FAST_PERCENTILE:g}th percentile of {fast:.0f}, expected at most {FASTEST_RATE:.0f} rad/s"
+    )
     return [f"{_columns('w')}: {found}, all that gyroscopes measure: this looks like deg/s"]
 
 
