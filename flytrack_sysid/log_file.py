@@ -1,0 +1,240 @@
+"""Files of flight logs: ``.npz`` and ``.csv``, checked when read, and the same bytes for the same log.
+
+Columns are those of ``flytrack_sysid.log``. An ``.npz`` holds one array of numbers per column; a ``.csv`` has
+a header of column names, then one row of numbers, separated by commas, per sample; blank lines are skipped.
+"""
+
+import csv
+import hashlib
+import io
+import zipfile
+from array import array
+from collections.abc import Iterable
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+
+from flytrack_env.files import write_atomically
+from flytrack_sysid.log import CHANNELS, FlightLog, LogError
+from flytrack_sysid.log_table import Table, check_names, log_of_table
+
+LARGEST_BYTES = 512 * 2**20  # unpacked: all columns as float64 at 1 kHz for half an hour fit
+GAP_FACTOR = 1.5  # a step this many medians long lacks a sample; loggers jitter by less
+NPY_HEADERS = {
+    (1, 0): np.lib.format.read_array_header_1_0,
+    (2, 0): np.lib.format.read_array_header_2_0,
+}
+
+
+def load_log(path: str | Path) -> FlightLog:
+    """Return the log in an ``.npz`` or ``.csv`` file; the suffix says which.
+
+    Columns, units and frames: ``flytrack_sysid.log``. Without a column ``segment``, all rows are one.
+    Quaternions come back with norm 1. Nothing is ever unpickled.
+
+    Raises:
+        LogError: a file that cannot be read, or is no log; the message names file, row and column. Rows
+            count from 0, lines of a CSV file from 1.
+    """
+    path = Path(path)
+    read, _ = _format_of(path)
+    content = _content(path)
+    return log_of_table(read(str(path), content), hashlib.sha256(content).hexdigest())
+
+
+def save_log(path: str | Path, log: FlightLog) -> None:
+    """Write a log to an ``.npz`` or ``.csv`` file; the suffix says which.
+
+    Every float64 comes back the same, and the same log gives the same bytes. The column ``segment`` is
+    there only if there is more than one. Written under a temporary name and renamed.
+
+    Raises:
+        LogError: another suffix, or a log that ``load_log`` would refuse.
+        OSError: what the system says.
+    """
+    path = Path(path)
+    _, write = _format_of(path)
+    columns = {"t": np.asarray(log.time, float)}
+    if len(log) and np.any(log.segment != log.segment[0]):
+        columns["segment"] = log.segment
+    for name in CHANNELS:
+        if name in log:
+            columns |= dict(zip(CHANNELS[name], np.asarray(log[name], float).T, strict=True))
+    check_names(str(path), list(columns))
+    log_of_table(Table(str(path), {name: values.astype(float) for name, values in columns.items()}))
+    write_atomically(path, write(columns))
+
+
+def gaps_of(log: FlightLog) -> np.ndarray:
+    """Return the rows after which samples are missing, (num_gaps,) int.
+
+    There the time step is longer than 1.5 times the median step of its segment.
+    """
+    starts = np.flatnonzero(log.is_start())
+    gaps = [np.zeros(0, int)]
+    for start, end in pairwise([*starts, len(log)]):
+        steps = np.diff(log.time[start:end])
+        if len(steps):
+            gaps.append(start + np.flatnonzero(steps > GAP_FACTOR * np.median(steps)))
+    return np.concatenate(gaps)
+
+
+def describe(log: FlightLog) -> str:
+    """Return a few lines on a log: where from, how long, how often, what was measured, what is missing."""
+    inside = ~log.is_start()[1:]
+    steps = np.diff(log.time)
+    absent = [name for name in CHANNELS if name not in log]
+    lines = [
+        f"{log.source}: {len(log)} rows, {log.is_start().sum()} segments, {steps[inside].sum():.2f} s",
+        f"channels: {', '.join(log.channels)}; absent: {', '.join(absent) or 'none'}",
+    ]
+    if inside.any():
+        median, gaps = np.median(steps[inside]), gaps_of(log)
+        lines[1:1] = [f"sample interval: {median:.4g} s (median), {1.0 / median:.4g} Hz", "gaps: none"]
+        if len(gaps):
+            longest = gaps[np.argmax(steps[gaps])]
+            lines[2] = f"gaps: {len(gaps)}, longest {steps[longest]:.4g} s, after row {longest}"
+    return "\n".join([*lines, *_ranges(log)])
+
+
+def _ranges(log: FlightLog) -> list[str]:
+    """Return a line on the speeds, heights and voltages that were measured, if any."""
+    ranges = []
+    if "v" in log:
+        ranges.append(f"speed up to {np.linalg.norm(log['v'], axis=1).max():.3g} m/s")
+    for name, label, unit in (("p", "height", "m"), ("v_bat", "voltage", "V")):
+        if name in log:
+            values = log[name][:, -1]  # p_z, or the only column
+            ranges.append(f"{label} {values.min():.4g} to {values.max():.4g} {unit}")
+    return ["; ".join(ranges)] if ranges else []
+
+
+def _content(path: Path) -> bytes:
+    """Return the bytes of a file that is not too large."""
+    try:
+        _check_size(str(path), path.stat().st_size)
+        with path.open("rb") as file:
+            content = file.read(LARGEST_BYTES + 1)  # devices announce nothing and never end
+    except LogError:
+        raise
+    except (OSError, ValueError) as error:  # ValueError: a NUL in the name
+        raise LogError(f"{path}: cannot be read: {error}") from error
+    _check_size(str(path), len(content))
+    return content
+
+
+def _check_size(source: str, size: int) -> None:
+    if size > LARGEST_BYTES:
+        raise LogError(f"{source}: found more than {LARGEST_BYTES} bytes, expected a log of at most that")
+
+
+def _read_npz(source: str, content: bytes) -> Table:
+    """Return the arrays of an .npz file, once the archive's list of them is that of a log."""
+    try:
+        archive = zipfile.ZipFile(io.BytesIO(content))
+    except Exception as error:  # damaged archives raise anything from struct.error to RuntimeError
+        raise LogError(f"{source}: not an .npz file, or cut off: {error}") from error
+    members = archive.infolist()
+    check_names(source, [member.filename.removesuffix(".npy") for member in members])
+    # zipfile never unpacks more of a member than the archive announces.
+    _check_size(source, sum(member.file_size for member in members))
+    columns = {}
+    for member in members:
+        name = member.filename.removesuffix(".npy")
+        try:
+            columns[name] = _read_array(archive, member)
+        except LogError as error:
+            raise LogError(f"{source}: column {name}: {error}") from error
+        except Exception as error:  # as above, and what numpy says of damaged headers
+            found = f"{type(error).__name__}: {error}"
+            raise LogError(f"{source}: column {name}: damaged, cannot be read: {found}") from error
+    return Table(source, columns)
+
+
+def _read_array(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> np.ndarray:
+    """Return one array of numbers, (num_rows,) float64; a header that promises anything else is refused."""
+    with archive.open(member) as file:
+        shape, _, dtype = NPY_HEADERS[np.lib.format.read_magic(file)](file)
+        if dtype.kind not in "iuf":
+            hint = ": pickles are never read" if dtype.hasobject else ""
+            raise LogError(f"found an array of {dtype}, expected numbers{hint}")
+        if len(shape) != 1:
+            raise LogError(f"found an array of shape {shape}, expected one dimension")
+        data = file.read()
+    if len(data) != shape[0] * dtype.itemsize:
+        raise LogError(f"found {len(data)} bytes, expected {shape[0]} numbers of {dtype.itemsize} bytes")
+    return np.frombuffer(data, dtype).astype(float)
+
+
+def _read_csv(source: str, content: bytes) -> Table:
+    """Return the columns of a CSV file."""
+    text = io.TextIOWrapper(io.BytesIO(content), encoding="utf-8-sig", newline="")
+    rows = csv.reader(text, strict=True)
+    try:
+        header = [name.strip() for name in next(rows, [])]
+        if len(header) == 1 and any(mark in header[0] for mark in ";\t"):
+            raise LogError(f"{source}: line 1: found no comma in {header[0]!r}, expected names with commas")
+        check_names(source, header)
+        values, lines = array("d"), array("q")
+        for cells in rows:
+            if cells:
+                lines.append(rows.line_num)
+                values.extend(_numbers(source, header, cells, len(lines) - 1, rows.line_num))
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise LogError(f"{source}: near line {rows.line_num + 1}: not a CSV file: {error}") from error
+    table = np.frombuffer(values, float) if values else np.zeros(0)
+    columns = dict(zip(header, table.reshape(-1, len(header)).T.copy(), strict=True))
+    return Table(source, columns, np.array(lines))
+
+
+def _numbers(source: str, header: list[str], cells: list[str], row: int, line: int) -> list[float]:
+    """Return the numbers in one row of a CSV file."""
+    place = f"{source}: row {row} (line {line})"
+    if len(cells) != len(header):
+        column = f", column {header[len(cells)]}" if len(cells) < len(header) else ""
+        raise LogError(f"{place}{column}: found {len(cells)} cells, expected {len(header)} as in the header")
+    try:
+        return [_number(cell) for cell in cells]
+    except ValueError:
+        column, cell = next(pair for pair in zip(header, cells, strict=True) if not _is_number(pair[1]))
+    found = repr(cell) if cell.strip() else "an empty cell"
+    raise LogError(f"{place}, column {column}: found {found}, expected a number")
+
+
+def _number(cell: str) -> float:
+    if "_" in cell:  # Python reads 1_000 as a number; nobody else does
+        raise ValueError(cell)
+    return float(cell)
+
+
+def _is_number(cell: str) -> bool:
+    try:
+        _number(cell)
+    except ValueError:
+        return False
+    return True
+
+
+def _write_npz(columns: dict[str, np.ndarray]) -> bytes:
+    """Return an .npz file; numpy dates its members 1980, and stored bytes depend on no zlib."""
+    buffer = io.BytesIO()
+    np.savez(buffer, allow_pickle=False, **columns)
+    return buffer.getvalue()
+
+
+def _write_csv(columns: dict[str, np.ndarray]) -> bytes:
+    """Return a CSV file with the shortest digits that give each float64 back."""
+    rows: Iterable[tuple] = zip(*(values.tolist() for values in columns.values()), strict=True)
+    lines = [",".join(columns), *(",".join(map(repr, row)) for row in rows)]
+    return ("\n".join(lines) + "\n").encode()
+
+
+_FORMATS = {".npz": (_read_npz, _write_npz), ".csv": (_read_csv, _write_csv)}
+
+
+def _format_of(path: Path) -> tuple:
+    """Return the reader and the writer of a file's format."""
+    if path.suffix.lower() not in _FORMATS:
+        raise LogError(f"{path}: found suffix {path.suffix!r}, expected {' or '.join(_FORMATS)}")
+    return _FORMATS[path.suffix.lower()]
