@@ -99,7 +99,9 @@ def load_model(path: str | Path) -> ModelParameters:
     data = _read_json(path)
     version = data.get("version", MODEL_FILE_VERSION)
     if version != MODEL_FILE_VERSION:
-        raise ModelFileError(f"{path}: version: found {version!r}, expected {MODEL_FILE_VERSION}")
+        is_newer = isinstance(version, int) and version > MODEL_FILE_VERSION
+        why = "; written by a newer FlyTrack, update to read it" if is_newer else ""
+        raise ModelFileError(f"{path}: version: found {version!r}, expected {MODEL_FILE_VERSION}{why}")
     values = data.get("parameters", data)
     if not isinstance(values, dict):
         raise ModelFileError(f"{path}: parameters: found {reprlib.repr(values)}, expected an object")
@@ -113,6 +115,19 @@ def load_model(path: str | Path) -> ModelParameters:
         raise ModelFileError(f"{path}: effects: found {reprlib.repr(found)}, expected an object")
     base = ModelParameters(**{name: _read_field(path, name, values[name]) for name in SIZES})
     return base.with_effects(*(_read_effect(path, name, found[name]) for name in found))
+
+
+def load_provenance(path: str | Path) -> dict[str, Any]:
+    """Return what a model file says of how its parameters came about; empty where it says nothing.
+
+    Raises:
+        ModelFileError: missing file, not JSON, or a provenance that is no object.
+    """
+    path = Path(path)
+    provenance = _read_json(path).get("provenance", {})
+    if not isinstance(provenance, dict):
+        raise ModelFileError(f"{path}: provenance: found {reprlib.repr(provenance)}, expected an object")
+    return provenance
 
 
 def model_as_json(model: ModelParameters) -> dict[str, Any]:

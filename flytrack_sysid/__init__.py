@@ -1,1 +1,25 @@
-"""Identification of a plant: fly an excitation on it, fit the minimal model, say what is left."""
+"""Identification of a plant: fly an excitation on it, fit a model, say how good it is and what is left."""
+
+from flytrack_sysid.collect import CollectError, collect
+from flytrack_sysid.estimate import FitError
+from flytrack_sysid.fit import Fit, fit
+from flytrack_sysid.log import FlightLog, LogError, log_of_states
+from flytrack_sysid.log_file import load_log, save_log
+from flytrack_sysid.split import held_out_rows
+from flytrack_sysid.validate import Validation, validate
+
+__all__ = [
+    "CollectError",
+    "Fit",
+    "FitError",
+    "FlightLog",
+    "LogError",
+    "Validation",
+    "collect",
+    "fit",
+    "held_out_rows",
+    "load_log",
+    "log_of_states",
+    "save_log",
+    "validate",
+]

@@ -25,6 +25,7 @@ from flytrack_sysid.residuals import CENTRED, Problem, make_problem, residuals
 # Noise that the first round assumes, in the channels' units: that of common sensors.
 FIRST_NOISE = {"w": 0.1, "f": 1.5, "v": 0.05, "p": 0.01, "q": 0.01, "v_bat": 0.02}
 LEAST_NOISE = 1e-12
+RANK_TOLERANCE = 1e-13  # directions that the data say less of, relatively, count as not determined
 ROUNDS = 4
 TOLERANCE = 1e-10
 # How far thrust coefficients may lie from where the search starts, in weights of the drone (per volt for
@@ -126,7 +127,27 @@ class _Search:
             raise FitError(f"the fit diverged: {error}") from error
         if not result.success or not np.isfinite(result.cost):
             raise FitError(f"the fit did not converge: {result.message}")
-        return result.x, np.linalg.pinv(result.jac.T @ result.jac, hermitian=True)
+        return result.x, self.covariance(result.jac, result.fun)
+
+    def covariance(self, slopes: np.ndarray, left: np.ndarray) -> np.ndarray:
+        """Return the covariance of the sought numbers, widened where residuals of a second go together.
+
+        That of independent residuals of the noise assumed, in which each standard deviation is raised to
+        that of the cluster-robust (sandwich) estimate over pieces of a flight, if that is larger: what
+        the model lacks shows as residuals that agree within a piece.
+        """
+        scale = np.sqrt(np.sum(slopes**2, axis=0))
+        scaled = slopes / np.where(scale > 0.0, scale, 1.0)
+        bread = np.linalg.pinv(scaled.T @ scaled, rcond=RANK_TOLERANCE, hermitian=True)
+        widths = [self.problem.channels[name].counts.shape[1] for name in sorted(self.problem.channels)]
+        pieces = np.concatenate([np.repeat(self.problem.record.piece, width) for width in widths])
+        pieces = pieces[self.counting]
+        pulls = np.zeros((pieces.max() + 1, len(scale)))
+        np.add.at(pulls, pieces, scaled[: len(pieces)] * left[: len(pieces), None])
+        robust = bread @ (pulls.T @ pulls) @ bread
+        widen = np.sqrt(np.maximum(np.diag(robust) / np.maximum(np.diag(bread), LEAST_NOISE), 1.0))
+        wide = bread * np.outer(widen, widen)
+        return wide / np.outer(scale, scale)
 
 
 def _spread(values: np.ndarray, channel_name: str, problem: Problem) -> np.ndarray:

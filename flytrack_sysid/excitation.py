@@ -5,7 +5,7 @@ kind        what is flown, from a state of its own at a voltage of its own
 ==========  =====================================================================================
 roll,       chirp then step, or doublet then sine, on this axis alone and about hovering thrust,
 pitch, yaw  at amplitudes from a tenth of the stick to all of it
-thrust      two of sine, step, doublet and chirp over the whole stick, near upright
+thrust      a sine, step, doublet or chirp over the whole stick, then switching, near upright
 free        switching commands on all axes, thrust axis up to 80 degrees from the vertical
 leg         4 to 18 m/s in any direction and heading, tilted, with switching yaw and slow thrust
 ==========  =====================================================================================
@@ -41,7 +41,7 @@ AMPLITUDES = (0.1, 0.3, 0.6, 1.0)
 FREE_AMPLITUDES = (0.3, 0.5, 0.8, 1.0)
 LEG_SPEEDS = (4.0, 9.0, 14.0, 18.0)  # m/s
 HEIGHT = 60.0  # m, at the start of each flight
-THRUST_SWING, LEG_SWING, LEG_STICK = 0.25, 0.3, 0.2
+LEG_SWING, LEG_STICK = 0.3, 0.2
 HOLD_STEPS = (3, 12)  # of switching commands
 # Above empty: what the flight itself takes, at any drain that leaves a flight of a minute.
 RESERVE_V = 0.1
@@ -70,11 +70,14 @@ def wave(name: str, rng: np.random.Generator) -> np.ndarray:
     return sign * (is_on - (1.0 * is_reversed if name == "doublet" else 0.0))
 
 
-def switching(rng: np.random.Generator) -> np.ndarray:
-    """Return a command that jumps between -1 and 1 every 30 to 120 ms, (FLIGHT_STEPS,)."""
+def switching(rng: np.random.Generator, smallest: float = 1.0) -> np.ndarray:
+    """Return a command that changes sign every 30 to 120 ms, (FLIGHT_STEPS,).
+
+    Its sizes are drawn between ``smallest`` and 1.
+    """
     holds = rng.integers(*HOLD_STEPS, size=FLIGHT_STEPS, endpoint=True)
     signs = rng.choice([-1.0, 1.0]) * (-1.0) ** np.arange(FLIGHT_STEPS)
-    return np.repeat(signs, holds)[:FLIGHT_STEPS]
+    return np.repeat(signs * rng.uniform(smallest, 1.0, FLIGHT_STEPS), holds)[:FLIGHT_STEPS]
 
 
 def start_state(
@@ -113,15 +116,14 @@ def _flight(
         return Flight(kind, start, _axis_command(KINDS.index(kind), turn, number, hover, rng))
     command = np.tile([0.0, 0.0, 0.0, hover], (FLIGHT_STEPS, 1))
     if kind == "thrust":
-        names = ("sine", "step", "doublet", "chirp")
-        pair = names[number % 4], names[(number + 1 + turn) % 4]
-        command[:, 3] = np.concatenate([wave(name, rng) for name in pair])
+        name = ("sine", "step", "doublet", "chirp")[number]
+        command[:, 3] = np.append(wave(name, rng), switching(rng, smallest=0.3)[SLOT_STEPS:])
         return Flight(kind, start_state(rng, voltage, hover, rng.uniform(0.0, 20.0), 0.0), command)
     command[:, 2] = switching(rng)
     if kind == "free":
         amplitude = FREE_AMPLITUDES[number]
         command[:, :2] = amplitude * np.stack([switching(rng), switching(rng)], axis=1)
-        command[:, 3] += THRUST_SWING * switching(rng)
+        command[:, 3] = switching(rng, smallest=0.0)
         return Flight(kind, start_state(rng, voltage, hover, rng.uniform(20.0, 80.0), 0.0), command)
     time = np.arange(FLIGHT_STEPS) * DT_S
     slow = [np.sin(2 * np.pi * rng.uniform(0.5, 1.5) * time + rng.uniform(0, 2 * np.pi)) for _ in range(3)]

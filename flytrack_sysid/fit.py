@@ -1,152 +1,264 @@
-"""Fitting the minimal model: four lags and six thrust coefficients, in float64."""
+"""Identifying a model from a flight log: lags, thrust map, drain, and effects that are asked for."""
 
-from collections.abc import Callable
-from typing import NamedTuple
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import numpy as np
-from scipy import optimize, signal
-from scipy.spatial.transform import Rotation
 
-from flytrack_env.dynamics import ModelParameters, nominal_parameters
-from flytrack_env.effects import LinearDrag
-from flytrack_env.state import ACCELERATION, APPLIED_ACTION, BATTERY, QUATERNION, RATES, VELOCITY
-from flytrack_sysid.collect import DT, Excitation
+from flytrack_env import __version__
+from flytrack_env.dynamics import ModelParameters, collective_thrust, nominal_parameters
+from flytrack_env.state import BATTERY_EMPTY_V, BATTERY_FULL_V
+from flytrack_sysid.estimate import Estimate, FitError, estimate
+from flytrack_sysid.log import CHANNELS, FlightLog
+from flytrack_sysid.parameters import (
+    DRAIN,
+    TAU_BOUNDS,
+    TAUS,
+    THRUST_COEFFS,
+    as_float32,
+    from_vector,
+    names_of,
+    to_vector,
+    unit_of,
+    with_neutral_effects,
+    with_values,
+)
+from flytrack_sysid.plausibility import check_plausible
+from flytrack_sysid.split import HELD_OUT_EVERY, held_out_rows
 
-TAU_BOUNDS = (1e-3, 0.5)
-SLOWEST = 0.1  # m/s, rms along each body axis
-AXES = ("roll", "pitch", "yaw", "thrust")
+TWO_SIDED_95 = 1.959964  # standard deviations of a normal distribution
+NEVER_MOVED = 1e-3  # of a stick's travel from -1 to 1
+AT_BOUND = 1.01
+# What makes a warning: half the width of the 95 % interval, relative to a time constant, to full thrust.
+UNCERTAIN_TAU, UNCERTAIN_THRUST = 0.2, 0.02
+BOX_ACTIONS, BOX_VOLTAGES = 41, 9
 
 
-class FitError(ValueError):
-    """Data that do not determine the model."""
+class Interval(NamedTuple):
+    """An estimate and its 95 % interval."""
+
+    value: float
+    low: float
+    high: float
 
 
-class Fit(NamedTuple):
-    """An identified model; rms: of what the fit left, rad/s for the three rates and N for thrust."""
+class MapDoubt(NamedTuple):
+    """Where the thrust map is known worst: half the 95 % interval, N, and as a share of full thrust."""
+
+    half_width_n: float
+    share: float
+    action: float
+    battery_v: float
+
+
+@dataclass(frozen=True)
+class Fit:
+    """An identified model.
+
+    model: float32, as the environment takes it. estimate: the same in float64, with covariance and what is
+    left of each channel. intervals: by name. map_doubt: None where the thrust map was not fitted.
+    warnings: what the data do not determine; sentences. every: which part was held out
+    (``flytrack_sysid.split``), 0 for none. source, sha256: of the log.
+    """
 
     model: ModelParameters
-    rms: tuple[float, float, float, float]
+    estimate: Estimate
+    intervals: Mapping[str, Interval]
+    map_doubt: MapDoubt | None
+    warnings: tuple[str, ...]
+    every: int
+    source: str
+    sha256: str
+
+    def provenance(self) -> dict[str, Any]:
+        """Return how the parameters came about, as JSON values for the model file."""
+        names = list(self.intervals)
+        deviation = np.sqrt(np.diag(self.estimate.covariance))
+        scale = np.outer(deviation, deviation)
+        return {
+            "tool": f"flytrack_sysid.fit {__version__}",
+            "data": {"file": self.source, "sha256": self.sha256},
+            "split": {
+                "held_out_every": self.every,
+                "rule": "the last of every so many blocks of at most 5 s",
+            },
+            "intervals_95": {
+                name: {**interval._asdict(), "unit": unit_of(name)}
+                for name, interval in self.intervals.items()
+            },
+            "correlation": {
+                "of": names,
+                "matrix": np.round(self.estimate.covariance / np.where(scale > 0.0, scale, 1.0), 4).tolist(),
+            },
+            "thrust_map_worst": None if self.map_doubt is None else self.map_doubt._asdict(),
+            "left_rms": {name: left.tolist() for name, left in self.estimate.noise.items()},
+            "warnings": list(self.warnings),
+        }
+
+    def describe(self) -> str:
+        """Return the result as a table in text."""
+        lines = [f"{'parameter':28} {'estimate':>12} {'95 % interval':>27}  unit"]
+        for name, (value, low, high) in self.intervals.items():
+            lines.append(f"{name:28} {value:12.6g} {low:12.6g} to {high:11.6g}  {unit_of(name)}")
+        if self.map_doubt is not None:
+            worst = self.map_doubt
+            lines.append(
+                f"thrust map: known to {worst.half_width_n:.3g} N ({worst.share:.2%} of full thrust) or "
+                f"better; worst at action {worst.action:.2g}, {worst.battery_v:.3g} V"
+            )
+        lines += [f"warning: {warning}" for warning in self.warnings]
+        return "\n".join(lines)
 
 
-def lagged(commands: np.ndarray, applied_start: np.ndarray, tau: float) -> np.ndarray:
-    """Return the applied actions after each step of a first-order lag.
-
-    commands: (num_manoeuvres, num_steps), held over each step. applied_start: (num_manoeuvres,). tau: s.
-    """
-    keep = np.exp(-DT / tau)
-    start = keep * applied_start[:, None]
-    return signal.lfilter([1.0 - keep], [1.0, -keep], commands, axis=1, zi=start)[0]
-
-
-def thrust_terms(action: np.ndarray, battery_v: np.ndarray) -> np.ndarray:
-    """Return the six regressors 1, u, u^2, u^3, V, u V of the thrust map; (..., 6)."""
-    one = np.ones_like(action)
-    terms = (one, action, action**2, action**3, battery_v, action * battery_v)
-    return np.stack(terms, axis=-1)
+def _free_names(model: ModelParameters, log: FlightLog, fixed: Mapping[str, float]) -> tuple[str, ...]:
+    """Return what is estimated: lags, thrust map, drain and effects, as far as the log has channels."""
+    names = names_of(model)
+    unknown = [name for name in fixed if name not in names]
+    if unknown:
+        raise FitError(f"fixed: {unknown[0]}: unknown; expected of {', '.join(names)}")
+    wanted = [*TAUS, *THRUST_COEFFS, DRAIN, *(name for name in names if "." in name)]
+    if "v_bat" not in log:
+        wanted = [name for name in wanted if name not in (*THRUST_COEFFS[4:], DRAIN)]
+    return tuple(name for name in wanted if name not in fixed)
 
 
-def specific_force_b(data: Excitation, gravity: float) -> np.ndarray:
-    """Return the specific force of every step, body frame, (num_manoeuvres, num_steps, 3) m/s^2.
-
-    World acceleration plus gravity, rotated with the attitude before the step.
-    """
-    acc_w = data.next_states[..., ACCELERATION].astype(float) + np.array([0.0, 0.0, gravity])
-    return to_body(data, acc_w)
-
-
-def to_body(data: Excitation, vectors_w: np.ndarray) -> np.ndarray:
-    """Return world-frame vectors, one per step, in the body frame before the step."""
-    attitude = Rotation.from_quat(data.states[..., QUATERNION].reshape(-1, 4), scalar_first=True)
-    return attitude.inv().apply(vectors_w.reshape(-1, 3)).reshape(vectors_w.shape)
-
-
-def _minimise_over_tau(residual: Callable[[float], np.ndarray]) -> tuple[float, np.ndarray]:
-    """Return the time constant with the least squared residual, and that residual."""
-    result = optimize.least_squares(
-        lambda log_tau: residual(np.exp(log_tau[0])).ravel(),
-        x0=[np.log(0.04)],
-        bounds=np.log(TAU_BOUNDS).reshape(2, 1),
-        xtol=1e-12,
-        ftol=1e-12,
-    )
-    if not result.success or not np.isfinite(result.cost):
-        raise FitError(f"the fit did not converge: {result.message}")
-    tau = float(np.exp(result.x[0]))
-    return tau, residual(tau)
+def _check_data(log: FlightLog, judged: np.ndarray, free: tuple[str, ...]) -> None:
+    """Raise FitError where channels or motion are missing for what is to be estimated."""
+    if not free:
+        raise FitError("fixed: found every parameter, expected one to estimate at least")
+    has_turns = "w" in log or "q" in log
+    if not has_turns and any(name in free for name in TAUS[:3]):
+        raise FitError(f"{log.source}: w and q are absent; the lags of the body rates need one of them")
+    has_forces = "f" in log or ("q" in log and any(name in log for name in ("a", "v", "p")))
+    if not has_forces and any(name in free for name in (TAUS[3], *THRUST_COEFFS)):
+        raise FitError(
+            f"{log.source}: thrust needs f, or q with one of a, v and p; found {', '.join(log.channels)}"
+        )
+    for axis, (column, tau) in enumerate(zip(CHANNELS["u"], TAUS, strict=True)):
+        stick = log["u"][judged, axis]
+        if tau in free and np.ptp(stick) < NEVER_MOVED:
+            raise FitError(
+                f"{log.source}: {column}: stuck at {stick[0]:.4g}; {tau} cannot be identified: move "
+                f"it, or fix {tau}"
+            )
 
 
-def fit(data: Excitation, start: ModelParameters | None = None, with_drag: bool = False) -> Fit:
-    """Identify lags and thrust map; mass, gravity, maximum rates and drain are taken as given.
+def _check_result(result: Estimate, log: FlightLog) -> None:
+    """Raise FitError where the best model is none."""
+    values = dict(zip(names_of(result.model), to_vector(result.model), strict=True))
+    for name in TAUS:
+        if name in result.free and not TAU_BOUNDS.low * AT_BOUND < values[name] < TAU_BOUNDS.high / AT_BOUND:
+            raise FitError(
+                f"{log.source}: {name}: the fit ended at {values[name]:.3g} s, expected {TAU_BOUNDS.low} to "
+                f"{TAU_BOUNDS.high} s; does {CHANNELS['u'][TAUS.index(name)]} drive this drone?"
+            )
+    if "w" in result.noise:
+        for axis, column in enumerate(CHANNELS["w"]):
+            left, measured = result.noise["w"][axis], result.measured["w"][axis]
+            if TAUS[axis] in result.free and left > AT_BOUND * measured:
+                raise FitError(
+                    f"{log.source}: {column}: the model leaves more ({left:.3g} rad/s rms) than was measured "
+                    f"({measured:.3g}); do sign and order of {CHANNELS['u'][axis]} and {column} agree?"
+                )
 
-    with_drag: identify linear drag too, which the handout's minimal structure lacks; else it stays as
-    in ``start``, 0 by default.
+
+def _intervals(result: Estimate) -> dict[str, Interval]:
+    values = dict(zip(names_of(result.model), to_vector(result.model), strict=True))
+    found = {}
+    for name, deviation in zip(result.free, np.sqrt(np.diag(result.covariance)), strict=True):
+        value, half = float(values[name]), float(TWO_SIDED_95 * deviation)
+        if name in TAUS:  # even in the logarithm, so that no time is negative
+            factor = np.exp(min(half / value, np.log(TAU_BOUNDS.high / TAU_BOUNDS.low)))
+            found[name] = Interval(value, float(value / factor), float(value * factor))
+        else:
+            found[name] = Interval(value, value - half, value + half)
+    return found
+
+
+def _map_doubt(result: Estimate, log: FlightLog) -> MapDoubt | None:
+    """Return where the thrust map is known worst, over all actions and 22 to 24 V, or the log's own range."""
+    where = [index for index, name in enumerate(result.free) if name in THRUST_COEFFS]
+    if not where:
+        return None
+    volts = log["v_bat"] if "v_bat" in log else np.array([BATTERY_EMPTY_V, BATTERY_FULL_V])
+    is_usual = volts.min() >= BATTERY_EMPTY_V - 1.0 and volts.max() <= BATTERY_FULL_V + 1.0
+    low, high = (BATTERY_EMPTY_V, BATTERY_FULL_V) if is_usual else (volts.min(), volts.max())
+    action, battery_v = np.meshgrid(np.linspace(-1, 1, BOX_ACTIONS), np.linspace(low, high, BOX_VOLTAGES))
+    units = np.eye(len(THRUST_COEFFS))
+    terms = np.stack([np.asarray(collective_thrust(action, battery_v, unit)) for unit in units], axis=-1)
+    terms = terms[..., [THRUST_COEFFS.index(result.free[index]) for index in where]]
+    covariance = result.covariance[np.ix_(where, where)]
+    half = TWO_SIDED_95 * np.sqrt(np.einsum("...i,ij,...j->...", terms, covariance, terms))
+    full = np.abs(collective_thrust(action, battery_v, np.asarray(result.model.thrust_coeffs))).max()
+    worst = np.unravel_index(np.argmax(half), half.shape)
+    width = float(half[worst])
+    return MapDoubt(width, width / float(full), float(action[worst]), float(battery_v[worst]))
+
+
+def _warnings(fit_intervals: Mapping[str, Interval], doubt: MapDoubt | None, log: FlightLog) -> list[str]:
+    """Return what the data do not determine."""
+    found = []
+    for name, (value, low, high) in fit_intervals.items():
+        if name in TAUS and 0.5 * (high - low) > UNCERTAIN_TAU * value:
+            found.append(f"{name} is not determined by the data: {low:.3g} to {high:.3g} s")
+        elif "." in name and low <= 0.0 <= high:
+            found.append(f"{name} cannot be told from 0: {low:.3g} to {high:.3g} {unit_of(name)}")
+    if doubt is not None and doubt.share > UNCERTAIN_THRUST:
+        thrust = log["u"][:, 3]
+        volts = f" at {log['v_bat'].min():.4g} to {log['v_bat'].max():.4g} V" if "v_bat" in log else ""
+        found.append(
+            f"the thrust map is not determined by the data everywhere: +-{doubt.half_width_n:.3g} N "
+            f"({doubt.share:.0%} of full thrust) at action {doubt.action:.2g}, {doubt.battery_v:.4g} V; the "
+            f"log commands {thrust.min():.2g} to {thrust.max():.2g}{volts}"
+        )
+    if "v_bat" not in log:
+        found.append(
+            "v_bat is absent: how thrust depends on the voltage, and the drain, are taken as they were"
+        )
+    return found
+
+
+def fit(
+    log: FlightLog,
+    start: ModelParameters | None = None,
+    fixed: Mapping[str, float] | None = None,
+    effects: Iterable[str] = (),
+    every: int = HELD_OUT_EVERY,
+    report: Callable[[int, int], None] = lambda done, rounds: None,
+) -> Fit:
+    """Identify lags, thrust map and battery drain from a log; mass, gravity, full-stick rates are given.
+
+    start: where the search starts, and what is taken for granted; nominal if None. fixed: values of
+    parameters that are not estimated, by name (``tau_yaw``, ``c4``, ``max_rate_roll``, ``m``,
+    ``linear_drag.d_x``, ...). effects: names of effects whose parameters are estimated too. every: which
+    rows are held out (``flytrack_sysid.split``), 0 for none. report: called with rounds done and in all.
 
     Raises:
-        FitError: an axis that the commands never moved, or a search that did not converge.
+        LogError: a log that looks wrong (``flytrack_sysid.plausibility``).
+        FitError: channels or motion are missing, an unknown name, a fit that diverged.
     """
-    given = nominal_parameters() if start is None else start
-    for axis, name in enumerate(AXES):
-        if np.ptp(data.actions[..., axis]) < 1e-3:
-            raise FitError(f"{name}: the commands never change; this lag cannot be identified")
-    if not all(np.isfinite(array).all() for array in data[:3]):
-        raise FitError("data: found values that are not finite")
-    rate_fits = [_fit_rate(data, axis, float(given.max_rate[axis])) for axis in range(3)]
-    force_b = specific_force_b(data, given.g)
-    vel_b = to_body(data, data.states[..., VELOCITY].astype(float))
-    linear_drag = np.array(given.effect("linear_drag"), float)
-    if with_drag:
-        if np.any(np.mean(vel_b**2, axis=(0, 1)) < SLOWEST**2):
-            raise FitError("velocity: the drone hardly moves along some axis; drag cannot be identified")
-        lateral = [-np.sum(force_b[..., i] * vel_b[..., i]) / np.sum(vel_b[..., i] ** 2) for i in (0, 1)]
-        linear_drag = np.array([*lateral, 0.0])
-    thrust = given.m * (force_b[..., 2] + linear_drag[2] * vel_b[..., 2])
-    drag_terms = -given.m * vel_b[..., 2:] if with_drag else vel_b[..., :0]
-    tau, coefficients, rms = _fit_thrust(data, thrust, drag_terms)
-    if with_drag:
-        linear_drag[2] = coefficients[-1]
-    model = given._replace(
-        tau=np.array([*(tau for tau, _ in rate_fits), tau], np.float32),
-        thrust_coeffs=coefficients[:6].astype(np.float32),
+    fixed = dict(fixed or {})
+    check_plausible(log)
+    try:
+        model = with_neutral_effects(nominal_parameters() if start is None else start, effects)
+    except KeyError as error:
+        raise FitError(f"effects: {error.args[0]}: no effect of that name") from error
+    free = _free_names(model, log, fixed)
+    model = with_values(model, fixed)
+    judged = ~held_out_rows(log, every)
+    _check_data(log, judged, free)
+    result = estimate(log, judged, model, free, report)
+    _check_result(result, log)
+    intervals = _intervals(result)
+    doubt = _map_doubt(result, log)
+    return Fit(
+        model=as_float32(from_vector(to_vector(result.model), result.model)),
+        estimate=result,
+        intervals=intervals,
+        map_doubt=doubt,
+        warnings=tuple(_warnings(intervals, doubt, log)),
+        every=every,
+        source=log.source,
+        sha256=log.sha256,
     )
-    if with_drag:
-        model = model.with_effects(LinearDrag(*map(float, linear_drag)))
-    return Fit(model, (rate_fits[0][1], rate_fits[1][1], rate_fits[2][1], rms))
-
-
-def _fit_rate(data: Excitation, axis: int, max_rate_deg: float) -> tuple[float, float]:
-    """Return the lag of one rate axis, s, and the rms of what is left, rad/s.
-
-    The measured rate is compared with the lag driven by the commands (which are exact), from the first
-    state of each manoeuvre on.
-    """
-    start = data.states[:, 0, APPLIED_ACTION][:, axis].astype(float)
-    commands = data.actions[..., axis].astype(float)
-    measured = data.next_states[..., RATES][..., axis].astype(float)
-
-    def residual(tau: float) -> np.ndarray:
-        return measured - np.deg2rad(max_rate_deg) * lagged(commands, start, tau)
-
-    tau, left = _minimise_over_tau(residual)
-    return tau, float(np.sqrt(np.mean(left**2)))
-
-
-def _fit_thrust(
-    data: Excitation, thrust: np.ndarray, extra_terms: np.ndarray
-) -> tuple[float, np.ndarray, float]:
-    """Return the lag of thrust, s, its coefficients and those of the extra terms, and the rms left, N.
-
-    thrust: (num_manoeuvres, num_steps), N. The coefficients are solved linearly inside the search.
-    """
-    start = data.states[:, 0, APPLIED_ACTION][:, 3].astype(float)
-    commands = data.actions[..., 3].astype(float)
-    battery_v = data.states[..., BATTERY].astype(float)
-
-    def solve(tau: float) -> tuple[np.ndarray, np.ndarray]:
-        terms = thrust_terms(lagged(commands, start, tau), battery_v)
-        regressors = np.concatenate([terms, extra_terms], axis=-1)
-        regressors = regressors.reshape(-1, regressors.shape[-1])
-        coefficients = np.linalg.lstsq(regressors, thrust.ravel(), rcond=None)[0]
-        return coefficients, thrust.ravel() - regressors @ coefficients
-
-    tau, left = _minimise_over_tau(lambda tau: solve(tau)[1])
-    return tau, solve(tau)[0], float(np.sqrt(np.mean(left**2)))

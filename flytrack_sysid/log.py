@@ -48,6 +48,8 @@ CHANNELS: dict[str, tuple[str, ...]] = {
 }
 REQUIRED = ("t", *CHANNELS["u"])
 COLUMNS = ("t", "segment", *(column for columns in CHANNELS.values() for column in columns))
+GAP_STEPS = 1.5  # of the usual step: what lasts longer lacks a sample; loggers jitter by less
+NOMINAL_STEP_S = 0.01  # of a log without two rows
 _IN_STATE = {
     "p": POSITION,
     "v": VELOCITY,
@@ -100,6 +102,16 @@ class FlightLog:
     def is_start(self) -> np.ndarray:
         """Return where a segment begins, (num_rows,) bool."""
         return np.concatenate([[True], self.segment[1:] != self.segment[:-1]])[: len(self)]
+
+
+def usual_step(log: FlightLog) -> np.ndarray:
+    """Return the median time between rows of the segment that each row is in, (num_rows,) s."""
+    starts = np.flatnonzero(log.is_start())
+    steps = [np.diff(times) for times in np.split(log.time, starts[1:])]
+    all_steps = np.concatenate(steps)
+    fallback = float(np.median(all_steps)) if len(all_steps) else NOMINAL_STEP_S
+    medians = [float(np.median(own)) if len(own) else fallback for own in steps]
+    return np.repeat(medians, [len(own) + 1 for own in steps])
 
 
 def log_of_states(

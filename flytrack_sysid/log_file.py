@@ -10,17 +10,15 @@ import io
 import zipfile
 from array import array
 from collections.abc import Iterable
-from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 
 from flytrack_env.files import write_atomically
-from flytrack_sysid.log import CHANNELS, FlightLog, LogError
+from flytrack_sysid.log import CHANNELS, GAP_STEPS, FlightLog, LogError, usual_step
 from flytrack_sysid.log_table import Table, check_names, log_of_table
 
 LARGEST_BYTES = 512 * 2**20  # unpacked: all columns as float64 at 1 kHz for half an hour fit
-GAP_FACTOR = 1.5  # a step this many medians long lacks a sample; loggers jitter by less
 NPY_HEADERS = {
     (1, 0): np.lib.format.read_array_header_1_0,
     (2, 0): np.lib.format.read_array_header_2_0,
@@ -71,13 +69,8 @@ def gaps_of(log: FlightLog) -> np.ndarray:
 
     There the time step is longer than 1.5 times the median step of its segment.
     """
-    starts = np.flatnonzero(log.is_start())
-    gaps = [np.zeros(0, int)]
-    for start, end in pairwise([*starts, len(log)]):
-        steps = np.diff(log.time[start:end])
-        if len(steps):
-            gaps.append(start + np.flatnonzero(steps > GAP_FACTOR * np.median(steps)))
-    return np.concatenate(gaps)
+    is_inside = log.segment[1:] == log.segment[:-1]
+    return np.flatnonzero(is_inside & (np.diff(log.time) > GAP_STEPS * usual_step(log)[:-1]))
 
 
 def describe(log: FlightLog) -> str:

@@ -15,8 +15,8 @@ from flytrack_env.dynamics import ModelParameters, advance
 from flytrack_env.effects import acts, start_memories
 from flytrack_env.quaternion import Quaternion, Vec3
 from flytrack_env.state import ACTION_SIZE, BATTERY_FULL_V, Action, Drone
-from flytrack_sysid.log import FlightLog
-from flytrack_sysid.record import LARGEST_DOUBT, Filled, applied_doubt, steps_after, usual_step
+from flytrack_sysid.log import FlightLog, usual_step
+from flytrack_sysid.record import LARGEST_DOUBT, Filled, applied_doubt, steps_after
 
 # For effects that remember: what they remembered when a segment began is not known.
 SETTLING_S = 0.5

@@ -12,15 +12,13 @@ import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
 from flytrack_env.state import ACTION_SIZE
-from flytrack_sysid.log import FlightLog
+from flytrack_sysid.log import GAP_STEPS, FlightLog, usual_step
 from flytrack_sysid.split import blocks_of
 
-GAP_STEPS = 1.5  # of the usual step: what lasts longer is a gap
 LONGEST_FILLED_S = 0.1  # after a longer gap a new flight begins
 WINDOW_S = 1.25  # over which increments of velocity and attitude are followed
 PADDED_TO = 1024  # rows: logs of about the same length share one compiled program
 BATTERY_UNKNOWN_V = 23.0
-NOMINAL_STEP_S = 0.01  # of a log without two rows
 UPRIGHT = (1.0, 0.0, 0.0, 0.0)
 # An applied action known worse than this counts for nothing: half a gyro's noise at full stick.
 LARGEST_DOUBT = 0.005
@@ -51,16 +49,6 @@ class Record(NamedTuple):
     quat: np.ndarray
     battery_v: np.ndarray
     piece: np.ndarray
-
-
-def usual_step(log: FlightLog) -> np.ndarray:
-    """Return the median time between rows of the segment that each row is in, (num_rows,) s."""
-    starts = np.flatnonzero(log.is_start())
-    steps = [np.diff(times) for times in np.split(log.time, starts[1:])]
-    all_steps = np.concatenate(steps)
-    fallback = float(np.median(all_steps)) if len(all_steps) else NOMINAL_STEP_S
-    medians = [float(np.median(own)) if len(own) else fallback for own in steps]
-    return np.repeat(medians, [len(own) + 1 for own in steps])
 
 
 def _new_times(log: FlightLog, usual: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -96,6 +84,8 @@ def _between(times: np.ndarray, log: FlightLog, values: np.ndarray) -> np.ndarra
 
 
 def _quaternions(times: np.ndarray, log: FlightLog) -> np.ndarray:
+    if len(log) == 1:
+        return log["q"].copy()
     rotations = Slerp(log.time, Rotation.from_quat(log["q"], scalar_first=True))
     return rotations(times).as_quat(scalar_first=True)
 
