@@ -25,7 +25,7 @@ from flytrack_sysid.residuals import CENTRED, Problem, make_problem, residuals
 # Noise that the first round assumes, in the channels' units: that of common sensors.
 FIRST_NOISE = {"w": 0.1, "f": 1.5, "v": 0.05, "p": 0.01, "q": 0.01, "v_bat": 0.02}
 LEAST_NOISE = 1e-12
-RANK_TOLERANCE = 1e-13  # directions that the data say less of, relatively, count as not determined
+LEAST_INFORMATION = 1e-13  # about a direction, against what is known best: rounding hides less
 ROUNDS = 4
 TOLERANCE = 1e-10
 # How far thrust coefficients may lie from where the search starts, in weights of the drone (per volt for
@@ -136,9 +136,13 @@ class _Search:
         that of the cluster-robust (sandwich) estimate over pieces of a flight, if that is larger: what
         the model lacks shows as residuals that agree within a piece.
         """
-        scale = np.sqrt(np.sum(slopes**2, axis=0))
-        scaled = slopes / np.where(scale > 0.0, scale, 1.0)
-        bread = np.linalg.pinv(scaled.T @ scaled, rcond=RANK_TOLERANCE, hermitian=True)
+        size = np.sqrt(np.sum(slopes**2, axis=0))
+        scale = np.where(size > 0.0, size, 1.0)
+        scaled = slopes / scale
+        information, directions = np.linalg.eigh(scaled.T @ scaled)
+        # A floor and no pseudo-inverse, so that what the data say nothing of is very uncertain.
+        information = np.maximum(information, LEAST_INFORMATION * information[-1])
+        bread = directions / information @ directions.T
         widths = [self.problem.channels[name].counts.shape[1] for name in sorted(self.problem.channels)]
         pieces = np.concatenate([np.repeat(self.problem.record.piece, width) for width in widths])
         pieces = pieces[self.counting]
