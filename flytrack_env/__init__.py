@@ -3,7 +3,7 @@
 from flytrack_env.dynamics import ModelParameters, nominal_parameters
 from flytrack_env.env import EnvParams, EnvState, FlyTrack
 from flytrack_env.gymnasium_adapter import register_with_gymnasium
-from flytrack_env.model_file import ModelFileError, load_model, save_model
+from flytrack_env.model_file import ModelFileError, load_model, load_provenance, save_model
 from flytrack_env.registration import make, register_all
 from flytrack_env.tracks import (
     Track,
@@ -31,6 +31,7 @@ __all__ = [
     "available_tracks",
     "find_problems",
     "load_model",
+    "load_provenance",
     "load_track",
     "make",
     "nominal_parameters",

@@ -67,7 +67,10 @@ def _fly_function(step: StepFunction, report: Report) -> Fly:
     """Return a function that calls ``step(x, u)`` for every step of every flight."""
 
     def checked(x: np.ndarray, u: np.ndarray) -> np.ndarray:
-        after = np.asarray(step(x, u), np.float32)
+        try:
+            after = np.asarray(step(x, u), np.float32)
+        except Exception as error:  # whatever a user's function raises
+            raise CollectError(f"step: {type(error).__name__}: {error}") from error
         if after.shape != (STATE_SIZE,):
             raise CollectError(f"step: found a state of shape {after.shape}, expected ({STATE_SIZE},)")
         return after

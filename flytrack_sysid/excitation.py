@@ -21,7 +21,6 @@ from scipy import signal
 from scipy.spatial.transform import Rotation
 
 from flytrack_env.state import (
-    ACTION_SIZE,
     APPLIED_ACTION,
     BATTERY,
     BATTERY_EMPTY_V,
@@ -134,23 +133,26 @@ def _flight(
     )
 
 
-def script(num_flights: int, hover: float, rng: np.random.Generator) -> list[Flight]:
-    """Return the flights of an excitation; ``hover`` is the thrust action that holds the weight.
+def _voltages(kind: str, turns: int, rng: np.random.Generator) -> np.ndarray:
+    """Return the voltages of a kind's flights, (turns, 4), evenly spread between nearly empty and full.
 
-    Voltages of each kind are spread evenly between full and nearly empty, in random order.
+    In random order, but for the last of every four, which may be held out: each turn's lies in a range of
+    its own, and that of each kind elsewhere in it.
     """
+    levels = np.linspace(BATTERY_EMPTY_V + RESERVE_V, BATTERY_FULL_V, turns * FLIGHTS_PER_KIND)
+    last = np.arange(turns) * FLIGHTS_PER_KIND + KINDS.index(kind) % FLIGHTS_PER_KIND
+    others = rng.permutation(np.delete(levels, last)).reshape(turns, FLIGHTS_PER_KIND - 1)
+    return np.column_stack([others, rng.permutation(levels[last])])
+
+
+def script(num_flights: int, hover: float, rng: np.random.Generator) -> list[Flight]:
+    """Return the flights of an excitation; ``hover`` is the thrust action that holds the weight."""
     turns = -(-num_flights // (FLIGHTS_PER_KIND * len(KINDS)))
-    lowest = BATTERY_EMPTY_V + RESERVE_V
-    voltages = {
-        kind: rng.permutation(np.linspace(lowest, BATTERY_FULL_V, turns * FLIGHTS_PER_KIND)) for kind in KINDS
-    }
+    voltages = {kind: _voltages(kind, turns, rng) for kind in KINDS}
     flights = [
-        _flight(kind, turn, number, voltages[kind][turn * FLIGHTS_PER_KIND + number], hover, rng)
+        _flight(kind, turn, number, voltages[kind][turn, number], hover, rng)
         for turn in range(turns)
         for kind in KINDS
         for number in range(FLIGHTS_PER_KIND)
     ]
-    return [
-        flight._replace(command=np.clip(flight.command, -1.0, 1.0).reshape(-1, ACTION_SIZE))
-        for flight in flights[:num_flights]
-    ]
+    return [flight._replace(command=np.clip(flight.command, -1.0, 1.0)) for flight in flights[:num_flights]]

@@ -64,6 +64,11 @@ def save_log(path: str | Path, log: FlightLog) -> None:
     write_atomically(path, write(columns))
 
 
+def check_name(path: str | Path) -> None:
+    """Raise LogError for a file that ``save_log`` would refuse by its name, before there is a log."""
+    _format_of(Path(path))
+
+
 def gaps_of(log: FlightLog) -> np.ndarray:
     """Return the rows after which samples are missing, (num_gaps,) int.
 
@@ -92,15 +97,22 @@ def describe(log: FlightLog) -> str:
 
 
 def _ranges(log: FlightLog) -> list[str]:
-    """Return a line on the speeds, heights and voltages that were measured, if any."""
+    """Return lines on what was covered: commands, and speeds, heights, tilts, voltages where measured."""
+    commands = [
+        f"{column} {values.min():.3g} to {values.max():.3g}"
+        for column, values in zip(CHANNELS["u"], log["u"].T, strict=True)
+    ]
     ranges = []
     if "v" in log:
         ranges.append(f"speed up to {np.linalg.norm(log['v'], axis=1).max():.3g} m/s")
+    if "q" in log:
+        upright = 1.0 - 2.0 * (log["q"][:, 1] ** 2 + log["q"][:, 2] ** 2)  # cosine of the tilt
+        ranges.append(f"tilt up to {np.rad2deg(np.arccos(np.clip(upright.min(), -1.0, 1.0))):.0f} deg")
     for name, label, unit in (("p", "height", "m"), ("v_bat", "voltage", "V")):
         if name in log:
             values = log[name][:, -1]  # p_z, or the only column
             ranges.append(f"{label} {values.min():.4g} to {values.max():.4g} {unit}")
-    return ["; ".join(ranges)] if ranges else []
+    return [f"commands: {'; '.join(commands)}", *(["; ".join(ranges)] if ranges else [])]
 
 
 def _content(path: Path) -> bytes:

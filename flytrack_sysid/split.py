@@ -30,7 +30,13 @@ def blocks_of(log: FlightLog) -> np.ndarray:
 
 
 def held_out_rows(log: FlightLog, every: int = HELD_OUT_EVERY) -> np.ndarray:
-    """Return which rows are held out, (num_rows,) bool: the last of every ``every`` blocks; none if 0."""
+    """Return which rows are held out, (num_rows,) bool: the last of every ``every`` blocks; none if 0.
+
+    Raises:
+        ValueError: ``every`` is 1, which leaves nothing, or negative.
+    """
+    if every == 1 or every < 0:
+        raise ValueError(f"every: found {every}, expected 0, 2, 3, ...")
     if every == 0:
         return np.zeros(len(log), bool)
     return blocks_of(log) % every == every - 1

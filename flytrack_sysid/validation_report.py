@@ -37,7 +37,7 @@ def _number(value: float | None) -> str:
 def _one_step_table(validation: Validation) -> Table:
     rows = []
     for name, error in validation.one_step.channels.items():
-        unit = "1" if UNITS[name] == "1" else f"({UNITS[name]})^2"
+        unit = {"1": "1", "m": "m^2"}.get(UNITS[name], f"({UNITS[name]})^2")
         rows.append([f"{NAMES[name]} ({name})", _number(error.mse), unit, _number(error.nrmse)])
         if error.angle_rms_deg is not None:
             rows.append(["attitude, rms angle", _number(error.angle_rms_deg), "deg", ""])

@@ -1,0 +1,181 @@
+"""The command ``flytrack-sysid``: collect, fit, validate; each a thin skin over a function of the package."""
+
+import argparse
+import importlib
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from tqdm import tqdm
+
+from flytrack_env import blackbox, load_model, load_provenance, save_model
+from flytrack_env.model_file import ModelFileError
+from flytrack_sysid.collect import CollectError, collect
+from flytrack_sysid.fit import fit
+from flytrack_sysid.log import FlightLog
+from flytrack_sysid.log_file import check_name, describe, load_log, save_log
+from flytrack_sysid.split import HELD_OUT_EVERY, held_out_rows
+from flytrack_sysid.validate import validate
+from flytrack_sysid.validation_report import text_of, write_validation
+
+
+def load_plant(where: str) -> Any:
+    """Return the plant in an artifact, or the object that ``module:name`` names.
+
+    Importing a module runs it, as importing does; the working directory is searched first.
+
+    Raises:
+        BlackBoxError: an artifact that cannot be used.
+        CollectError: a module or name that cannot be imported.
+    """
+    module, colon, name = where.partition(":")
+    if not colon or Path(where).exists():
+        return blackbox.load(where)
+    sys.path.insert(0, str(Path.cwd()))
+    try:
+        found: Any = importlib.import_module(module)
+        for part in name.split("."):
+            found = getattr(found, part)
+    except (ImportError, AttributeError, ValueError) as error:
+        raise CollectError(f"--black-box {where}: cannot be imported: {error}") from error
+    finally:
+        sys.path.pop(0)
+    is_plant = hasattr(found, "reset") and hasattr(found, "drone")
+    if not is_plant and not callable(found):
+        raise CollectError(
+            f"--black-box {where}: found {type(found).__name__}, expected step(x, u) or a plant"
+        )
+    return found
+
+
+class _Bar:
+    """A progress bar to be called with what is done and what there is to do."""
+
+    def __init__(self, unit: str):
+        self.bar = tqdm(unit=f" {unit}", leave=False, disable=None)
+
+    def __call__(self, done: int, total: int) -> None:
+        self.bar.total = total
+        self.bar.update(done - self.bar.n)
+        if done == total:
+            self.bar.close()
+
+
+def run_collect(arguments: argparse.Namespace) -> None:
+    """Fly the excitation and write the log."""
+    check_name(arguments.out)
+    plant = load_plant(arguments.black_box)
+    log = collect(plant, arguments.minutes, arguments.seed, arguments.noise, _Bar("flights"))
+    save_log(arguments.out, log)
+    print(describe(load_log(arguments.out)))
+
+
+def fixed_values(pairs: Sequence[str]) -> dict[str, float]:
+    """Return NAME=VALUE pairs as a dictionary.
+
+    Raises:
+        ValueError: no name, or no number.
+    """
+    values = {}
+    for pair in pairs:
+        name, _, text = pair.partition("=")
+        try:
+            values[name.strip()] = float(text)
+        except ValueError as error:
+            raise ValueError(
+                f"--fix {pair}: expected NAME=VALUE with a number, as in tau_yaw=0.05"
+            ) from error
+    return values
+
+
+def run_fit(arguments: argparse.Namespace) -> None:
+    """Identify a model and write it."""
+    fixed = fixed_values(arguments.fix)
+    start = None if arguments.start is None else load_model(arguments.start)
+    log = load_log(arguments.log)
+    found = fit(log, start, fixed, arguments.effect, arguments.hold_out_every, _Bar("rounds"))
+    provenance = found.provenance()
+    provenance["started_from"] = "nominal parameters" if start is None else Path(arguments.start).name
+    provenance["fixed"] = fixed
+    save_model(arguments.out, found.model, provenance)
+    print(found.describe())
+    print(f"written: {arguments.out}")
+
+
+def judged_rows(model_path: str | Path, log: FlightLog) -> tuple[Any, str]:
+    """Return the rows of a log that a model was not fitted to, (num_rows,) bool, and a sentence on them.
+
+    All rows of a log that the fit did not see, as its file's hash tells.
+
+    Raises:
+        ModelFileError: a model file whose split cannot be read.
+    """
+    provenance = load_provenance(model_path)
+    data, split = provenance.get("data"), provenance.get("split")
+    if not isinstance(data, dict) or data.get("sha256") != log.sha256:
+        names = Path(log.source).name, Path(model_path).name
+        return None, f"all rows are judged: {names[0]} is not what {names[1]} was fitted to"
+    every = split.get("held_out_every") if isinstance(split, dict) else None
+    if not isinstance(every, int) or isinstance(every, bool) or every < 0 or every == 1:
+        raise ModelFileError(f"{model_path}: split: held_out_every: found {every!r}, expected 0, 2, 3, ...")
+    if every == 0:
+        raise ModelFileError(f"{model_path}: fitted to all of {log.source}; validate it on another log")
+    return held_out_rows(log, every), f"held-out part: the last of every {every} blocks"
+
+
+def run_validate(arguments: argparse.Namespace) -> None:
+    """Judge a model on what it was not fitted to, and write the report."""
+    model = load_model(arguments.model)
+    log = load_log(arguments.log)
+    rows, which = judged_rows(arguments.model, log)
+    found = validate(model, log, rows)
+    written = write_validation(arguments.out, found, Path(arguments.model).name, log)
+    print(which)
+    print(text_of(found, Path(arguments.model).name, log))
+    print(f"written: {', '.join(str(path) for path in written)}")
+
+
+def make_parser() -> argparse.ArgumentParser:
+    """Return the parser of the command."""
+    parser = argparse.ArgumentParser(prog="flytrack-sysid", description=__doc__)
+    commands = parser.add_subparsers(required=True, metavar="COMMAND")
+
+    one = commands.add_parser("collect", help="fly an excitation on a plant and write a flight log")
+    one.add_argument("--black-box", required=True, help="an acro_step.bin, or module:step with step(x, u)")
+    one.add_argument("--out", type=Path, required=True, help="the log, .npz or .csv")
+    one.add_argument("--minutes", type=float, default=2.0, help="default: %(default)s")
+    one.add_argument("--seed", type=int, default=0)
+    one.add_argument("--noise", type=float, default=0.0, help="0: the state itself; 1: common sensors")
+    one.set_defaults(run=run_collect)
+
+    one = commands.add_parser("fit", help="identify a model from a flight log")
+    one.add_argument("log", type=Path)
+    one.add_argument("--out", type=Path, required=True, help="the model, .json")
+    one.add_argument("--fix", action="append", default=[], metavar="NAME=VALUE", help="hold a parameter")
+    one.add_argument("--from", dest="start", metavar="MODEL", help="start from this model's values")
+    one.add_argument("--effect", action="append", default=[], metavar="NAME", help="identify it too")
+    every = one.add_argument("--hold-out-every", type=int, default=HELD_OUT_EVERY, metavar="N")
+    every.help = "hold out the last of every N blocks, none if 0; default: %(default)s"
+    one.set_defaults(run=run_fit)
+
+    one = commands.add_parser("validate", help="judge a model on held-out flight")
+    one.add_argument("model", type=Path)
+    one.add_argument("log", type=Path)
+    one.add_argument("--out", type=Path, required=True, help="a folder for the report")
+    one.set_defaults(run=run_validate)
+    return parser
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run a command; what cannot be used is said in one line, with exit status 2."""
+    parser = make_parser()
+    parsed = parser.parse_args(arguments)
+    try:
+        parsed.run(parsed)
+    except (ValueError, OSError) as error:
+        parser.exit(2, f"flytrack-sysid: error: {error}\n")
+
+
+if __name__ == "__main__":
+    main()
