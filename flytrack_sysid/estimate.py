@@ -26,8 +26,8 @@ from flytrack_sysid.residuals import CENTRED, Problem, make_problem, residuals
 FIRST_NOISE = {"w": 0.1, "f": 1.5, "v": 0.05, "p": 0.01, "q": 0.01, "v_bat": 0.02}
 LEAST_NOISE = 1e-12
 LEAST_INFORMATION = 1e-13  # about a direction, against what is known best: rounding hides less
-ROUNDS = 4
-TOLERANCE = 1e-10
+# Relative to cost and step, of each round: only the last is to be exact.
+TOLERANCES = (1e-4, 1e-4, 1e-10)
 # How far thrust coefficients may lie from where the search starts, in weights of the drone (per volt for
 # the last two): weak enough to move nothing that the data determine, and it keeps the rest finite.
 PRIOR_WEIGHTS = {**dict.fromkeys(THRUST_COEFFS[:4], 10.0), **dict.fromkeys(THRUST_COEFFS[4:], 1.0)}
@@ -54,9 +54,16 @@ class Estimate(NamedTuple):
 
 
 @jax.jit
-def _weighted(vector: jax.Array, like: ModelParameters, problem: Problem, weights: dict) -> jax.Array:
-    """Return all residuals times their weights, flat."""
-    found = residuals(from_vector(vector, like), problem)
+def _weighted(
+    values: jax.Array,
+    where: jax.Array,
+    vector: jax.Array,
+    like: ModelParameters,
+    problem: Problem,
+    weights: dict,
+) -> jax.Array:
+    """Return all residuals times their weights, flat, with ``values`` in these places of the vector."""
+    found = residuals(from_vector(vector.at[where].set(values), like), problem)
     return jnp.concatenate([(found[name] * weights[name]).ravel() for name in sorted(found)])
 
 
@@ -76,38 +83,35 @@ class _Search:
     def __init__(
         self, start: ModelParameters, free: tuple[str, ...], problem: Problem, noise: dict[str, np.ndarray]
     ):
-        self.like, self.free, self.problem = start, free, problem
+        self.free, self.problem = free, problem
         names = names_of(start)
-        self.where = np.array([names.index(name) for name in free])
+        where = np.array([names.index(name) for name in free])
+        vector = to_vector(start)
+        self.given = where, vector, start, problem, {name: 1.0 / sigma for name, sigma in noise.items()}
+        self.centre = vector[where]
         self.is_log = np.array([name in TAUS for name in free])
-        self.vector = to_vector(start)
-        self.weights = {name: 1.0 / sigma for name, sigma in noise.items()}
         self.counting = _counts(problem)
         scale = [PRIOR_WEIGHTS.get(name, np.inf) for name in free]
         self.prior_weight = 1.0 / (np.array(scale) * float(start.m) * float(start.g))
-        self.centre = self.vector[self.where]
 
-    def full(self, sought: np.ndarray) -> np.ndarray:
-        """Return all of the model's numbers."""
-        vector = self.vector.copy()
-        vector[self.where] = np.where(self.is_log, np.exp(np.where(self.is_log, sought, 0.0)), sought)
-        return vector
+    def values(self, sought: np.ndarray) -> np.ndarray:
+        """Return the free parameters in their own units."""
+        return np.where(self.is_log, np.exp(np.where(self.is_log, sought, 0.0)), sought)
 
     def residual(self, sought: np.ndarray) -> np.ndarray:
         """Return the weighted residuals of rows that count, and the pull of the prior."""
-        vector = self.full(sought)
-        values = np.asarray(_weighted(vector, self.like, self.problem, self.weights))[self.counting]
-        return np.concatenate([values, self.prior_weight * (vector[self.where] - self.centre)])
+        values = self.values(sought)
+        weighted = np.asarray(_weighted(values, *self.given))[self.counting]
+        return np.concatenate([weighted, self.prior_weight * (values - self.centre)])
 
     def slopes(self, sought: np.ndarray) -> np.ndarray:
         """Return the derivative of ``residual``."""
-        vector = self.full(sought)
-        slopes = np.asarray(_slopes(vector, self.like, self.problem, self.weights))
-        chain = np.where(self.is_log, vector[self.where], 1.0)
-        of_prior = np.diag(self.prior_weight)
-        return np.concatenate([slopes[np.ix_(self.counting, self.where)], of_prior]) * chain
+        values = self.values(sought)
+        slopes = np.asarray(_slopes(values, *self.given))[self.counting]
+        chain = np.where(self.is_log, values, 1.0)
+        return np.concatenate([slopes, np.diag(self.prior_weight)]) * chain
 
-    def run(self) -> tuple[np.ndarray, np.ndarray]:
+    def run(self, tolerance: float) -> tuple[np.ndarray, np.ndarray]:
         """Return the numbers found, and their covariance in the scale in which they were sought."""
         bounds = np.array([bounds_of(name) for name in self.free])
         bounds[self.is_log] = np.log(bounds[self.is_log])
@@ -119,8 +123,8 @@ class _Search:
                 self.slopes,
                 bounds=bounds.T,
                 x_scale="jac",
-                xtol=TOLERANCE,
-                ftol=TOLERANCE,
+                xtol=tolerance,
+                ftol=tolerance,
                 gtol=None,
             )
         except ValueError as error:  # scipy's word for residuals that are not finite
@@ -188,17 +192,17 @@ def estimate(
         record = make_record(log)
         model = jax.tree.map(lambda leaf: np.asarray(leaf, float), start)
         noise: dict[str, np.ndarray] = {}
-        for number in range(ROUNDS):
+        for number, tolerance in enumerate(TOLERANCES):
             problem = make_problem(log, record, judged, model)
             widths = {name: channel.counts.shape[1] for name, channel in problem.channels.items()}
             noise = noise or {name: np.full(width, FIRST_NOISE[name]) for name, width in widths.items()}
             search = _Search(model, free, problem, noise)
-            sought, covariance = search.run()
-            model = with_values(model, dict(zip(free, search.full(sought)[search.where], strict=True)))
+            sought, covariance = search.run(tolerance)
+            model = with_values(model, dict(zip(free, search.values(sought), strict=True)))
             noise = {
                 name: np.maximum(left, LEAST_NOISE) for name, left in channel_noise(model, problem).items()
             }
-            report(number + 1, ROUNDS)
+            report(number + 1, len(TOLERANCES))
     chain = np.where(search.is_log, np.exp(np.where(search.is_log, sought, 0.0)), 1.0)
     still = {
         name: np.sqrt(

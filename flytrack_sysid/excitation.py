@@ -37,6 +37,9 @@ FLIGHT_STEPS = 2 * SLOT_STEPS
 FLIGHTS_PER_KIND = 4
 KINDS = ("roll", "pitch", "yaw", "thrust", "free", "leg")
 AMPLITUDES = (0.1, 0.3, 0.6, 1.0)
+# Where each wave begins to go round the amplitudes: the last of four, which may be held out, has a step
+# that shows, and no full stick, which tells the fit most.
+FIRST_AMPLITUDE = {"chirp": 2, "step": 3, "doublet": 3, "sine": 2}
 FREE_AMPLITUDES = (0.3, 0.5, 0.8, 1.0)
 LEG_SPEEDS = (4.0, 9.0, 14.0, 18.0)  # m/s
 HEIGHT = 60.0  # m, at the start of each flight
@@ -100,8 +103,7 @@ def _axis_command(axis: int, turn: int, number: int, hover: float, rng: np.rando
     names = ("chirp", "step") if turn % 2 == 0 else ("doublet", "sine")
     command = np.tile([0.0, 0.0, 0.0, hover], (FLIGHT_STEPS, 1))
     for slot, name in enumerate(names):
-        # Shifted by slot and turn, so that the held-out flights differ in amplitude.
-        amplitude = AMPLITUDES[(number + slot + turn) % len(AMPLITUDES)]
+        amplitude = AMPLITUDES[(number + FIRST_AMPLITUDE[name]) % len(AMPLITUDES)]
         command[slot * SLOT_STEPS : (slot + 1) * SLOT_STEPS, axis] = amplitude * wave(name, rng)
     return command
 

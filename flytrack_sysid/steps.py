@@ -12,7 +12,7 @@ from flytrack_sysid.prediction import Prediction, Steps, free_flights, runs_of, 
 AXES = ("roll", "pitch", "yaw")
 LEAST_JUMP = 0.2
 HELD_BEFORE_S = 0.08
-HELD_AFTER_S = 0.12
+HELD_AFTER_S = 0.15
 CONSTANT_WITHIN = 1e-3  # of a stick in [-1, 1]: finer than a receiver's steps
 SHOWN_BEFORE_S = 0.1
 SHOWN_AFTER_S = 0.4
