@@ -17,7 +17,8 @@ from flytrack_env import blackbox, load_track, save_model
 from flytrack_env.files import write_atomically
 from flytrack_env.rollout import load_rollout
 from flytrack_env.viz_rerun import visualize_state_action_sequence
-from flytrack_sysid import Validation, collect, fit, validate
+from flytrack_sysid import Validation, collect, fit, held_out_rows, load_log, save_log, validate
+from flytrack_sysid.validate import NAMES
 
 NUM_LAPS = 3
 NUM_STEPS = 2500
@@ -25,36 +26,33 @@ NUM_EPISODES = 256
 
 
 def identify(black_box: Path, out: Path, seed: int) -> dict[str, Validation]:
-    """Fly the excitation on the black box, fit, write the model to train on; return its errors.
+    """Fly the excitation on the black box, fit, write log and model to train on; return held-out errors.
 
     The minimal model shows what is open; linear drag, which those who flew the original report, is then
     added, and what it leaves is open still.
     """
-    training, held_out = collect(blackbox.load(black_box), seed).split()
-    minimal = validate(fit(training).model, held_out)
-    identified = fit(training, with_drag=True)
-    validations = {"minimal": minimal, "with_drag": validate(identified.model, held_out)}
-    provenance = {
-        "black_box": black_box.name,
-        "seed": seed,
-        "held_out": "every fourth manoeuvre of each kind",
-        "fit_rms": dict(zip(("roll", "pitch", "yaw", "thrust_n"), identified.rms, strict=True)),
-        "held_out_errors": {name: errors.as_json() for name, errors in validations.items()},
-    }
-    save_model(out / "model.json", identified.model, provenance)
-    return validations
+    save_log(out / "flight_log.npz", collect(blackbox.load(black_box), seed=seed))
+    log = load_log(out / "flight_log.npz")
+    fits = {"minimal": fit(log), "with_drag": fit(log, effects=("linear_drag",))}
+    save_model(out / "model.json", fits["with_drag"].model, fits["with_drag"].provenance())
+    rows = held_out_rows(log)
+    return {name: validate(found.model, log, rows) for name, found in fits.items()}
 
 
 def describe_identification(validations: dict[str, Validation]) -> None:
     """Print one-step errors on held-out data, and the force that each model leaves open."""
     minimal, extended = validations["minimal"], validations["with_drag"]
     print("    one-step MSE on held-out data          minimal   with linear drag")
-    for name, mse in minimal.mse.items():
-        print(f"      {name:36} {mse:9.3g} {extended.mse[name]:9.3g}")
+    for name, error in minimal.one_step.channels.items():
+        print(f"      {NAMES[name]:36} {error.mse:9.3g} {extended.one_step.channels[name].mse:9.3g}")
+    if minimal.open_force is None or extended.open_force is None:
+        return
     print("    open, not explained: specific force, rms in m/s^2, by speed")
-    rows = zip(minimal.open_force_by_speed, extended.open_force_by_speed, strict=True)
-    for (low, high, before), (*_, after) in rows:
-        print(f"      {low:2.0f} to {high:2.0f} m/s {before:34.3f} {after:9.3f}")
+    for before, after in zip(minimal.open_force.by_speed, extended.open_force.by_speed, strict=True):
+        speeds = (
+            f"{before.low:g} to {before.high:g} m/s" if before.high < np.inf else f"over {before.low:g} m/s"
+        )
+        print(f"      {speeds:36} {before.rms:9.3f} {after.rms:9.3f}")
 
 
 def main() -> None:

@@ -3,7 +3,7 @@
 A plant is anything with the contract of ``flytrack_env.plants`` or a function ``step(x, u)`` of the
 handout's vectors. Only what comes out of it is used.
 
-Envelope: a flight ends where the drone would become faster than 25 m/s, leave heights between 10 and
+Envelope: a flight ends where the drone would become faster than 20 m/s, leave heights between 10 and
 110 m, or leave 22 to 24 V.
 """
 
@@ -36,7 +36,7 @@ StepFunction = Callable[[np.ndarray, np.ndarray], Any]
 Fly = Callable[[np.ndarray, np.ndarray], np.ndarray]
 Report = Callable[[int, int], None]
 
-LARGEST_SPEED = 25.0  # m/s
+LARGEST_SPEED = 20.0  # m/s
 HEIGHTS = (10.0, 110.0)  # m
 SECONDS_PER_FLIGHT = FLIGHT_STEPS * DT_S
 FEWEST_MINUTES = FLIGHTS_PER_KIND * len(KINDS) * SECONDS_PER_FLIGHT / 60.0

@@ -7,7 +7,7 @@ roll,       chirp then step, or doublet then sine, on this axis alone and about 
 pitch, yaw  at amplitudes from a tenth of the stick to all of it
 thrust      a sine, step, doublet or chirp over the whole stick, then switching, near upright
 free        switching commands on all axes, thrust axis up to 80 degrees from the vertical
-leg         4 to 18 m/s in any direction and heading, tilted, with switching yaw and slow thrust
+leg         3 to 15 m/s in any direction and heading, tilted, with switching yaw and slow thrust
 ==========  =====================================================================================
 
 Four flights of a kind follow each other, so that the last of every four can be held out
@@ -41,7 +41,7 @@ AMPLITUDES = (0.1, 0.3, 0.6, 1.0)
 # that shows, and no full stick, which tells the fit most.
 FIRST_AMPLITUDE = {"chirp": 2, "step": 3, "doublet": 3, "sine": 2}
 FREE_AMPLITUDES = (0.3, 0.5, 0.8, 1.0)
-LEG_SPEEDS = (4.0, 9.0, 14.0, 18.0)  # m/s
+LEG_SPEEDS = (3.0, 7.0, 11.0, 15.0)  # m/s
 HEIGHT = 60.0  # m, at the start of each flight
 LEG_SWING, LEG_STICK = 0.3, 0.2
 HOLD_STEPS = (3, 12)  # of switching commands

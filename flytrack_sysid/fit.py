@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -78,7 +79,7 @@ class Fit:
         scale = np.outer(deviation, deviation)
         return {
             "tool": f"flytrack_sysid.fit {__version__}",
-            "data": {"file": self.source, "sha256": self.sha256},
+            "data": {"file": Path(self.source).name, "sha256": self.sha256},
             "split": {
                 "held_out_every": self.every,
                 "rule": "the last of every so many blocks of at most 5 s",
