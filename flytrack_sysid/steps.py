@@ -100,7 +100,7 @@ def step_responses(
     """Return the answers to the largest commanded steps of each rate axis; none if there are none.
 
     rows: (num_rows,) bool, those judged. A step is a jump by 0.2 at least between commands that are
-    constant for 0.08 s before and 0.12 s after it.
+    constant for 0.08 s before and 0.15 s after it.
     """
     rates_b = measured_rates(log, prediction.steps)
     if rates_b is None:
@@ -120,8 +120,8 @@ def step_responses(
                     axis=AXES[axis],
                     segment=int(log.segment[step]),
                     time_s=float(log.time[step]),
-                    command_before=float(log["u"][step - 1, axis]),
-                    command_after=float(log["u"][step, axis]),
+                    command_before=float(log["u"][step - 1, axis]) + 0.0,  # no -0
+                    command_after=float(log["u"][step, axis]) + 0.0,
                     since_step=log.time[since] - log.time[step],
                     command=log["u"][since, axis],
                     measured=measured,

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 DOCS = Path(__file__).parent.parent / "docs"
-PAGES = ("environment.md", "wrappers.md", "effects.md", "gymnasium.md")
+PAGES = ("environment.md", "wrappers.md", "effects.md", "gymnasium.md", "identification.md")
 
 
 def examples(page: str) -> str:
@@ -22,8 +22,10 @@ def examples(page: str) -> str:
 
 
 @pytest.mark.parametrize("page", PAGES)
-def test_examples_run(page: str) -> None:
+def test_examples_run(page: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     code = examples(page)
+    (tmp_path / "blackbox").symlink_to(DOCS.parent / "blackbox")
+    monkeypatch.chdir(tmp_path)  # pages may write files
     assert re.search(r"\S", code), f"{page}: no example"
     exec(compile("import gymnax\n" + code, page, "exec"), {})
 
