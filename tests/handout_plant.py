@@ -1,9 +1,11 @@
-"""The handout's equations once more, in NumPy and float64, as a truth that shares nothing with the simulator."""
+"""The handout's equations once more, in NumPy and float64: a truth that shares nothing with the simulator."""
 
 from dataclasses import dataclass, replace
 
 import numpy as np
 
+from flytrack_env.dynamics import ModelParameters
+from flytrack_sysid.excitation import script
 from flytrack_sysid.log import FlightLog, log_of_states
 
 GRAVITY = 9.80665
@@ -23,6 +25,13 @@ class HandoutPlant:
     drain: float = 1.0
     drag_b: tuple[float, ...] = (0.0, 0.0, 0.0)
     dt: float = 0.01
+
+    def model(self, **changes: object) -> ModelParameters:
+        """Return what a fit without effects should find, with some fields replaced."""
+        found = ModelParameters(
+            np.array(self.tau), np.array(self.coeffs), np.array(self.max_rate), 1.0, GRAVITY, self.drain
+        )
+        return found._replace(**changes)
 
     def __call__(self, x: np.ndarray, u: np.ndarray, dt: float | None = None) -> np.ndarray:
         """Return the state ``dt`` later, (..., 21)."""
@@ -76,3 +85,19 @@ def fly(plant: HandoutPlant, starts: np.ndarray, commands: np.ndarray, steps_s: 
     flights = np.stack(states, axis=1)
     log = log_of_states(zip(flights, commands, strict=True), plant.dt, "handout.npz")
     return replace(log, time=np.tile(np.cumsum(steps_s) - steps_s, len(starts)))
+
+
+def excited(
+    plant: HandoutPlant, flights: int = 24, skip: int = 1, repeat: int = 1, jitter: float = 0.0
+) -> FlightLog:
+    """Return the log of the excitation on a plant, float64, without noise.
+
+    skip, repeat: of commands, for steps of 0.01 s times skip over repeat. jitter: of steps, relative.
+    """
+    rng = np.random.default_rng(5)
+    planned = script(flights, HOVER, rng)
+    starts = np.stack([flight.start for flight in planned])
+    commands = np.stack([flight.command for flight in planned])[:, ::skip].repeat(repeat, axis=1)
+    step_s = 0.01 * skip / repeat
+    steps_s = step_s * (1.0 + rng.uniform(-jitter, jitter, commands.shape[1]))
+    return fly(replace(plant, dt=step_s), starts, commands, steps_s)
