@@ -170,16 +170,16 @@ def _acting_search(
     free: tuple[str, ...],
     problem: Problem,
     noise: dict[str, np.ndarray],
-    is_last: bool,
+    may_be_idle: bool,
 ) -> _Search:
     """Return a search without parameters that nothing depends on, which would lead it astray.
 
-    Wind, say, acts only once there is some drag; nothing may be without influence in the last round.
+    Wind, say, acts only once there is some drag; what is still without influence after the first round is refused.
     """
     search = _Search(model, free, problem, noise)
     acting = search.acting()
     idle = [name for name in free if name not in acting]
-    if is_last and idle:
+    if idle and not may_be_idle:
         raise FitError(f"{', '.join(idle)}: nothing that the log measured depends on it; expected it fixed")
     return _Search(model, acting, problem, noise) if idle else search
 
@@ -223,7 +223,7 @@ def estimate(
             problem = make_problem(log, record, judged, model)
             widths = {name: channel.counts.shape[1] for name, channel in problem.channels.items()}
             noise = noise or {name: np.full(width, FIRST_NOISE[name]) for name, width in widths.items()}
-            search = _acting_search(model, free, problem, noise, number + 1 == len(TOLERANCES))
+            search = _acting_search(model, free, problem, noise, may_be_idle=number == 0)
             sought, covariance = search.run(tolerance)
             model = with_values(model, dict(zip(search.free, search.values(sought), strict=True)))
             noise = {
