@@ -174,7 +174,7 @@ def _acting_search(
 ) -> _Search:
     """Return a search without parameters that nothing depends on, which would lead it astray.
 
-    Wind, say, acts only once there is some drag; what is still without influence after the first round is refused.
+    Wind, say, acts only once there is some drag; what is idle after the first round too is refused.
     """
     search = _Search(model, free, problem, noise)
     acting = search.acting()

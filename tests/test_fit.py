@@ -212,7 +212,6 @@ REFUSED = {
     "no time constant": (lambda log: log, {"fixed": {"tau_yaw": 0.0}}, "tau_yaw: found 0.0, expected 0.001"),
     "no mass": (lambda log: log, {"fixed": {"m": 0.0}}, "fixed: m: found 0.0, expected 0.001 to 1000 kg"),
     "no number": (lambda log: log, {"fixed": {"c1": np.nan}}, "fixed: c1: found nan"),
-    "nothing to see": (lambda log: log, {"effects": ("wind",)}, "wind.v_x, wind.v_y, wind.v_z: nothing that"),
 }
 
 
@@ -229,6 +228,13 @@ def test_effect_beyond_what_is_looked_for_is_refused():
         FitError, match=r"linear_drag\.d_x: the fit ended at 3 1/s, expected it within -3 to 3"
     ):
         fit(log, effects=("linear_drag",))
+
+
+@pytest.mark.slow
+def test_effect_that_nothing_depends_on_is_refused(noisy):
+    """Wind without drag; the search for it ended after minutes only."""
+    with pytest.raises(FitError, match=r"wind\.v_x, wind\.v_y, wind\.v_z: nothing that the log measured"):
+        fit(noisy, effects=("wind",))
 
 
 def test_implausible_log_and_split_that_leaves_nothing_are_refused(noisy):
