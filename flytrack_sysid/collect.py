@@ -133,7 +133,7 @@ def collect(
     Raises:
         CollectError: too few minutes, a plant that does not fly or returns what is no state.
     """
-    if not minutes >= FEWEST_MINUTES:
+    if not FEWEST_MINUTES <= minutes < np.inf:
         raise CollectError(f"minutes: found {minutes}, expected at least {FEWEST_MINUTES:g}")
     if not noise >= 0.0:
         raise CollectError(f"noise: found {noise}, expected 0 or more")

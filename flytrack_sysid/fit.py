@@ -18,8 +18,10 @@ from flytrack_sysid.parameters import (
     TAUS,
     THRUST_COEFFS,
     as_float32,
+    bounds_of,
     from_vector,
     names_of,
+    neutral_value,
     to_vector,
     unit_of,
     with_neutral_effects,
@@ -31,6 +33,7 @@ from flytrack_sysid.split import HELD_OUT_EVERY, held_out_rows
 TWO_SIDED_95 = 1.959964  # standard deviations of a normal distribution
 NEVER_MOVED = 1e-3  # of a stick's travel from -1 to 1
 AT_BOUND = 1.01
+AT_END = 1e-3  # of the range of an effect's parameter
 # What makes a warning: half the width of the 95 % interval, relative to a time constant, to full thrust.
 UNCERTAIN_TAU, UNCERTAIN_THRUST = 0.2, 0.02
 BOX_ACTIONS, BOX_VOLTAGES = 41, 9
@@ -118,6 +121,10 @@ def _free_names(model: ModelParameters, log: FlightLog, fixed: Mapping[str, floa
     unknown = [name for name in fixed if name not in names]
     if unknown:
         raise FitError(f"fixed: {unknown[0]}: unknown; expected of {', '.join(names)}")
+    for name, value in fixed.items():
+        low, high = bounds_of(name)
+        if not (np.isfinite(value) and low <= value <= high):
+            raise FitError(f"fixed: {name}: found {value}, expected {low:g} to {high:g} {unit_of(name)}")
     wanted = [*TAUS, *THRUST_COEFFS, DRAIN, *(name for name in names if "." in name)]
     if "v_bat" not in log:
         wanted = [name for name in wanted if name not in (*THRUST_COEFFS[4:], DRAIN)]
@@ -153,6 +160,14 @@ def _check_result(result: Estimate, log: FlightLog) -> None:
             raise FitError(
                 f"{log.source}: {name}: the fit ended at {values[name]:.3g} s, expected {TAU_BOUNDS.low} to "
                 f"{TAU_BOUNDS.high} s; does {CHANNELS['u'][TAUS.index(name)]} drive this drone?"
+            )
+    for name in (name for name in result.free if "." in name):
+        low, high = bounds_of(name)
+        ends = [end for end in (low, high) if end != neutral_value(name)]
+        if np.isclose(values[name], ends, rtol=0.0, atol=AT_END * (high - low)).any():
+            raise FitError(
+                f"{log.source}: {name}: the fit ended at {values[name]:.3g} {unit_of(name)}, expected it "
+                f"within {low:g} to {high:g}"
             )
     if "w" in result.noise:
         for axis, column in enumerate(CHANNELS["w"]):
@@ -203,8 +218,8 @@ def _warnings(fit_intervals: Mapping[str, Interval], doubt: MapDoubt | None, log
     for name, (value, low, high) in fit_intervals.items():
         if name in TAUS and 0.5 * (high - low) > UNCERTAIN_TAU * value:
             found.append(f"{name} is not determined by the data: {low:.3g} to {high:.3g} s")
-        elif "." in name and low <= 0.0 <= high:
-            found.append(f"{name} cannot be told from 0: {low:.3g} to {high:.3g} {unit_of(name)}")
+        elif "." in name and low <= (neutral := neutral_value(name)) <= high:
+            found.append(f"{name} cannot be told from {neutral:g}: {low:.3g} to {high:.3g} {unit_of(name)}")
     if doubt is not None and doubt.share > UNCERTAIN_THRUST:
         thrust = log["u"][:, 3]
         volts = f" at {log['v_bat'].min():.4g} to {log['v_bat'].max():.4g} V" if "v_bat" in log else ""

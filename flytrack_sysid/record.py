@@ -72,9 +72,12 @@ def _doubts(log: FlightLog, pieces: np.ndarray) -> np.ndarray:
     A command that changes evenly is off by nothing, one that jumps somewhere in the gap by half the jump.
     """
     change = np.diff(log["u"], axis=0, append=log["u"][-1:])
-    before = np.vstack([change[:1], change[:-1]])
-    after = np.vstack([change[1:], change[-1:]])
-    expected = 0.5 * (before + after) * pieces[:, None]
+    # To the next row of the same flight, per step; the last row of a flight has none.
+    has_next = ~np.append(log.is_start()[1:], True)[:, None]
+    slope = np.where(has_next, change / pieces[:, None], 0.0)
+    sides = np.roll(has_next, 1, axis=0).astype(int) + np.roll(has_next, -1, axis=0)
+    mean = (np.roll(slope, 1, axis=0) + np.roll(slope, -1, axis=0)) / np.maximum(sides, 1)
+    expected = mean * pieces[:, None]
     return 0.5 * np.abs(change - expected)
 
 
@@ -94,7 +97,12 @@ def _velocity(log: FlightLog) -> np.ndarray:
     """Return the velocity, or what positions say of it; 0 without either."""
     if "v" in log:
         return log["v"]
-    return np.gradient(log["p"], log.time, axis=0) if "p" in log else np.zeros((len(log), 3))
+    velocity = np.zeros((len(log), 3))
+    starts = np.flatnonzero(log.is_start())
+    for start, end in zip(starts, np.append(starts[1:], len(log)), strict=True):
+        if "p" in log and end - start > 1:
+            velocity[start:end] = np.gradient(log["p"][start:end], log.time[start:end], axis=0)
+    return velocity
 
 
 def _end_to_end(log: FlightLog, usual: np.ndarray) -> FlightLog:
