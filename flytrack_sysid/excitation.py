@@ -136,12 +136,15 @@ def _flight(
 
 
 def _voltages(kind: str, turns: int, rng: np.random.Generator) -> np.ndarray:
-    """Return the voltages of a kind's flights, (turns, 4), evenly spread between nearly empty and full.
+    """Return the voltages of a kind's flights, (turns, 4), between nearly empty and full.
 
-    In random order, but for the last of every four, which may be held out: each turn's lies in a range of
-    its own, and that of each kind elsewhere in it.
+    Closer together towards both ends, which tell most of how thrust depends on the voltage. In random
+    order, but for the last of every four, which may be held out: each turn's lies in a range of its own,
+    and that of each kind elsewhere in it.
     """
-    levels = np.linspace(BATTERY_EMPTY_V + RESERVE_V, BATTERY_FULL_V, turns * FLIGHTS_PER_KIND)
+    lowest, count = BATTERY_EMPTY_V + RESERVE_V, turns * FLIGHTS_PER_KIND
+    share = 0.5 - 0.5 * np.cos(np.pi * np.arange(count) / (count - 1))
+    levels = lowest + share * (BATTERY_FULL_V - lowest)
     last = np.arange(turns) * FLIGHTS_PER_KIND + KINDS.index(kind) % FLIGHTS_PER_KIND
     others = rng.permutation(np.delete(levels, last)).reshape(turns, FLIGHTS_PER_KIND - 1)
     return np.column_stack([others, rng.permutation(levels[last])])

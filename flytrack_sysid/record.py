@@ -16,7 +16,7 @@ from flytrack_sysid.log import GAP_STEPS, FlightLog, usual_step
 from flytrack_sysid.split import blocks_of
 
 LONGEST_FILLED_S = 0.1  # after a longer gap a new flight begins
-WINDOW_S = 1.25  # over which increments of velocity and attitude are followed
+WINDOW_S = 2.5  # over which increments of velocity and attitude are followed
 PADDED_TO = 1024  # rows: logs of about the same length share one compiled program
 BATTERY_UNKNOWN_V = 23.0
 UPRIGHT = (1.0, 0.0, 0.0, 0.0)
@@ -34,7 +34,7 @@ class Record(NamedTuple):
     is_applied_known: (num_rows,) bool, ``applied`` was measured here. applied: (num_rows, 4).
     pos_w, vel_w: (num_rows, 3). quat: (num_rows, 4). battery_v: (num_rows,). Where a channel is absent:
     0, upright, 23 V.
-    piece: (num_rows,) int, numbers of stretches of at most 1.25 s, none across blocks.
+    piece: (num_rows,) int, numbers of stretches of at most 2.5 s, none across blocks.
     """
 
     source_row: np.ndarray
@@ -179,7 +179,7 @@ def steps_after(log: FlightLog) -> np.ndarray:
 
 
 def _pieces(times: np.ndarray, begins: np.ndarray, blocks: np.ndarray) -> np.ndarray:
-    """Return numbers of stretches: blocks of each flight, cut evenly into stretches of at most 1.25 s."""
+    """Return numbers of stretches: blocks of each flight, cut evenly into stretches of at most 2.5 s."""
     is_first = begins | np.append(True, np.diff(blocks) != 0)
     number = np.cumsum(is_first) - 1
     first = np.flatnonzero(is_first)

@@ -8,7 +8,7 @@ from handout_plant import HandoutPlant, excited
 from scipy.spatial.transform import Rotation
 
 from flytrack_sysid.log import FlightLog
-from flytrack_sysid.record import PADDED_TO, applied_doubt, fill_gaps, make_record
+from flytrack_sysid.record import PADDED_TO, WINDOW_S, applied_doubt, fill_gaps, make_record
 from flytrack_sysid.split import blocks_of
 
 
@@ -85,7 +85,7 @@ def test_windows_are_at_most_so_long_and_within_blocks():
         assert np.all(np.isin(np.diff(piece), [0, 1]))
         for number in np.unique(piece):
             own = piece == number
-            assert len(np.unique(block[own])) == 1 and np.ptp(case.time[own]) <= 1.25
+            assert len(np.unique(block[own])) == 1 and np.ptp(case.time[own]) <= WINDOW_S
             assert own.sum() > 60
 
 

@@ -160,8 +160,8 @@ def test_held_out_measurements_do_not_enter(log, is_one_flight):
 
 
 def test_windows_with_one_or_two_rows_that_count_leave_nothing(log):
-    problem = problem_of(log, np.arange(len(log)) % 125 == 60)
+    problem = problem_of(log, np.arange(len(log)) % 250 == 60)
     found = largest(left(PLANT.model(tau=np.full(4, 0.04)), problem))
     assert max(found["v"], found["q"]) < 1e-12 and found["w"] > 0.01
-    problem = problem_of(log.without("v"), np.isin(np.arange(len(log)) % 125, [60, 61]))
+    problem = problem_of(log.without("v"), np.isin(np.arange(len(log)) % 250, [60, 61]))
     assert largest(left(PLANT.model(tau=np.full(4, 0.04)), problem))["p"] < 1e-9
