@@ -5,7 +5,7 @@ import pytest
 from handout_plant import HOVER, HandoutPlant
 
 from flytrack_sysid.collect import collect
-from flytrack_sysid.excitation import AMPLITUDES, FLIGHT_STEPS, KINDS, script, switching, wave
+from flytrack_sysid.excitation import AMPLITUDES, FLIGHT_STEPS, KINDS, LEG_SPEEDS, script, switching, wave
 from flytrack_sysid.log import FlightLog
 from flytrack_sysid.split import held_out_rows
 
@@ -31,7 +31,7 @@ def test_every_kind_comes_in_fours_with_all_amplitudes_and_voltages():
                 np.testing.assert_allclose(np.sort(turn), AMPLITUDES, rtol=0.02)
     assert np.abs([flight.command for flight in flights]).max() <= 1.0
     speeds = [np.linalg.norm(flight.start[3:6]) for flight in flights if flight.kind == "leg"]
-    np.testing.assert_allclose(speeds, [4.0, 9.0, 14.0, 18.0] * 2)
+    np.testing.assert_allclose(speeds, LEG_SPEEDS * 2)
 
 
 def test_same_seed_same_script_other_seed_another():
