@@ -37,8 +37,9 @@ def load_plant(where: str) -> Any:
         found: Any = importlib.import_module(module)
         for part in name.split("."):
             found = getattr(found, part)
-    except (ImportError, AttributeError, ValueError) as error:
-        raise CollectError(f"--black-box {where}: cannot be imported: {error}") from error
+    except Exception as error:  # whatever a user's module raises
+        said = f"{type(error).__name__}: {error}"
+        raise CollectError(f"--black-box {where}: cannot be imported: {said}") from error
     finally:
         sys.path.pop(0)
     is_plant = hasattr(found, "reset") and hasattr(found, "drone")
@@ -91,6 +92,8 @@ def fixed_values(pairs: Sequence[str]) -> dict[str, float]:
 
 def run_fit(arguments: argparse.Namespace) -> None:
     """Identify a model and write it."""
+    if arguments.out.suffix != ".json":  # before the work, and lest a log is overwritten
+        raise ModelFileError(f"{arguments.out}: found suffix {arguments.out.suffix!r}, expected .json")
     fixed = fixed_values(arguments.fix)
     start = None if arguments.start is None else load_model(arguments.start)
     log = load_log(arguments.log)
