@@ -15,6 +15,7 @@ from flytrack_sysid.collect import CollectError, collect
 from flytrack_sysid.fit import fit
 from flytrack_sysid.log import FlightLog
 from flytrack_sysid.log_file import check_name, describe, load_log, save_log
+from flytrack_sysid.plausibility import check_plausible
 from flytrack_sysid.split import HELD_OUT_EVERY, held_out_rows
 from flytrack_sysid.validate import validate
 from flytrack_sysid.validation_report import text_of, write_validation
@@ -131,6 +132,7 @@ def run_validate(arguments: argparse.Namespace) -> None:
     """Judge a model on what it was not fitted to, and write the report."""
     model = load_model(arguments.model)
     log = load_log(arguments.log)
+    check_plausible(log)
     rows, which = judged_rows(arguments.model, log)
     found = validate(model, log, rows)
     written = write_validation(arguments.out, found, Path(arguments.model).name, log)

@@ -232,6 +232,16 @@ def test_validate_refuses(folder, capsys, tmp_path, change, message):
     assert not (tmp_path / "report").exists()
 
 
+@pytest.mark.parametrize(
+    ("spoil", "message"), [(in_degrees, "deg/s"), (lambda log: log.select(slice(50)), "too short")]
+)
+def test_validate_refuses_what_cannot_be_a_flight(folder, capsys, tmp_path, spoil, message):
+    save_log(tmp_path / "other.npz", spoil(load_log(folder / "data.npz")))
+    out = tmp_path / "report"
+    assert message in refused(capsys, "validate", folder / "model.json", tmp_path / "other.npz", "--out", out)
+    assert not out.exists()
+
+
 def test_the_command_is_installed():
     command = Path(sys.executable).with_name("flytrack-sysid")
     done = subprocess.run([command, "--help"], capture_output=True, text=True, timeout=120)
