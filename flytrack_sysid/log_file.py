@@ -10,6 +10,8 @@ import io
 import zipfile
 from array import array
 from collections.abc import Iterable
+from functools import partial
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +22,7 @@ from flytrack_sysid.log_table import Table, check_names, log_of_table
 
 LARGEST_BYTES = 512 * 2**20  # unpacked: all columns as float64 at 1 kHz for half an hour fit
 UNPACKED = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
+READ_BYTES = 2**20
 NPY_HEADERS = {
     (1, 0): np.lib.format.read_array_header_1_0,
     (2, 0): np.lib.format.read_array_header_2_0,
@@ -121,7 +124,9 @@ def _content(path: Path) -> bytes:
     try:
         _check_size(str(path), path.stat().st_size)
         with path.open("rb") as file:
-            content = file.read(LARGEST_BYTES + 1)  # devices announce nothing and never end
+            # In pieces: devices announce nothing and never end, and a small file needs little memory.
+            pieces = iter(partial(file.read, READ_BYTES), b"")
+            content = b"".join(islice(pieces, LARGEST_BYTES // READ_BYTES + 1))
     except LogError:
         raise
     except (OSError, ValueError) as error:  # ValueError: a NUL in the name

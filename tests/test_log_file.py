@@ -329,6 +329,16 @@ def test_large_files_are_refused_unread(tmp_path, monkeypatch):
             load_log(tmp_path / name)
 
 
+def test_small_file_needs_little_memory(tmp_path):
+    save_log(tmp_path / "flight.npz", make_log())
+    tracemalloc.start()
+    try:
+        load_log(tmp_path / "flight.npz")
+        assert tracemalloc.get_traced_memory()[1] < 16 * 2**20
+    finally:
+        tracemalloc.stop()
+
+
 @pytest.mark.parametrize(
     ("method", "message"),
     [
@@ -337,7 +347,7 @@ def test_large_files_are_refused_unread(tmp_path, monkeypatch):
         (zipfile.ZIP_LZMA, "column t: found compression 14, expected none or deflate"),
     ],
 )
-def test_array_that_unpacks_to_more_than_announced_is_not_unpacked(tmp_path, monkeypatch, method, message):
+def test_array_that_unpacks_to_more_than_announced_is_not_unpacked(tmp_path, method, message):
     header, num_rows, unpacked = io.BytesIO(), 1000, 64 * 2**20
     np.lib.format.write_array_header_1_0(
         header, {"descr": "<f8", "fortran_order": False, "shape": (num_rows,)}
@@ -346,7 +356,6 @@ def test_array_that_unpacks_to_more_than_announced_is_not_unpacked(tmp_path, mon
         for column in REQUIRED:
             archive.writestr(f"{column}.npy", header.getvalue() + bytes(unpacked if column == "t" else 8000))
         archive.getinfo("t.npy").file_size = len(header.getvalue()) + 8 * num_rows
-    monkeypatch.setattr(log_file, "LARGEST_BYTES", 2**20)  # the file is read into as much
     tracemalloc.start()
     try:
         with pytest.raises(LogError, match=message):
