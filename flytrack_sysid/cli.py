@@ -15,6 +15,7 @@ from flytrack_sysid.collect import CollectError, collect
 from flytrack_sysid.fit import fit
 from flytrack_sysid.log import FlightLog
 from flytrack_sysid.log_file import check_name, describe, load_log, save_log
+from flytrack_sysid.plausibility import check_plausible
 from flytrack_sysid.split import HELD_OUT_EVERY, held_out_rows
 from flytrack_sysid.validate import validate
 from flytrack_sysid.validation_report import text_of, write_validation
@@ -37,8 +38,9 @@ def load_plant(where: str) -> Any:
         found: Any = importlib.import_module(module)
         for part in name.split("."):
             found = getattr(found, part)
-    except (ImportError, AttributeError, ValueError) as error:
-        raise CollectError(f"--black-box {where}: cannot be imported: {error}") from error
+    except Exception as error:  # whatever a user's module raises
+        said = f"{type(error).__name__}: {error}"
+        raise CollectError(f"--black-box {where}: cannot be imported: {said}") from error
     finally:
         sys.path.pop(0)
     is_plant = hasattr(found, "reset") and hasattr(found, "drone")
@@ -91,6 +93,8 @@ def fixed_values(pairs: Sequence[str]) -> dict[str, float]:
 
 def run_fit(arguments: argparse.Namespace) -> None:
     """Identify a model and write it."""
+    if arguments.out.suffix != ".json":  # before the work, and lest a log is overwritten
+        raise ModelFileError(f"{arguments.out}: found suffix {arguments.out.suffix!r}, expected .json")
     fixed = fixed_values(arguments.fix)
     start = None if arguments.start is None else load_model(arguments.start)
     log = load_log(arguments.log)
@@ -128,6 +132,7 @@ def run_validate(arguments: argparse.Namespace) -> None:
     """Judge a model on what it was not fitted to, and write the report."""
     model = load_model(arguments.model)
     log = load_log(arguments.log)
+    check_plausible(log)
     rows, which = judged_rows(arguments.model, log)
     found = validate(model, log, rows)
     written = write_validation(arguments.out, found, Path(arguments.model).name, log)

@@ -30,7 +30,7 @@ from flytrack_env.state import (
 )
 from flytrack_sysid.excitation import DT_S, FLIGHT_STEPS, FLIGHTS_PER_KIND, KINDS, script, start_state
 from flytrack_sysid.log import FlightLog, log_of_states
-from flytrack_sysid.sensors import measure
+from flytrack_sysid.sensors import LOST_ROWS, measure
 
 StepFunction = Callable[[np.ndarray, np.ndarray], Any]
 Fly = Callable[[np.ndarray, np.ndarray], np.ndarray]
@@ -68,7 +68,8 @@ def _fly_function(step: StepFunction, report: Report) -> Fly:
 
     def checked(x: np.ndarray, u: np.ndarray) -> np.ndarray:
         try:
-            after = np.asarray(step(x, u), np.float32)
+            # Copies: a function that changes its arguments must not change the log.
+            after = np.asarray(step(x.copy(), u.copy()), np.float32)
         except Exception as error:  # whatever a user's function raises
             raise CollectError(f"step: {type(error).__name__}: {error}") from error
         if after.shape != (STATE_SIZE,):
@@ -131,12 +132,14 @@ def collect(
     1 as common sensors would (``flytrack_sysid.sensors``). report: called with flights done and to do.
 
     Raises:
-        CollectError: too few minutes, a plant that does not fly or returns what is no state.
+        CollectError: minutes, seed or noise out of range, a plant that does not fly or returns no state.
     """
     if not FEWEST_MINUTES <= minutes < np.inf:
         raise CollectError(f"minutes: found {minutes}, expected at least {FEWEST_MINUTES:g}")
-    if not noise >= 0.0:
-        raise CollectError(f"noise: found {noise}, expected 0 or more")
+    if not 0.0 <= noise < 1.0 / LOST_ROWS:
+        raise CollectError(f"noise: found {noise}, expected 0 or more, below {1.0 / LOST_ROWS:g}")
+    if seed < 0:
+        raise CollectError(f"seed: found {seed}, expected 0 or more")
     rng = np.random.default_rng(seed)
     is_plant = hasattr(plant, "reset") and hasattr(plant, "drone")
     fly = _fly_plant(plant) if is_plant else _fly_function(plant, report)

@@ -28,6 +28,7 @@ from flytrack_sysid.parameters import (
     with_values,
 )
 from flytrack_sysid.plausibility import check_plausible
+from flytrack_sysid.record import BATTERY_UNKNOWN_V
 from flytrack_sysid.split import HELD_OUT_EVERY, held_out_rows
 
 TWO_SIDED_95 = 1.959964  # standard deviations of a normal distribution
@@ -230,7 +231,8 @@ def _warnings(fit_intervals: Mapping[str, Interval], doubt: MapDoubt | None, log
         )
     if "v_bat" not in log:
         found.append(
-            "v_bat is absent: how thrust depends on the voltage, and the drain, are taken as they were"
+            "v_bat is absent: how thrust depends on the voltage, and the drain, are taken as they were, and "
+            f"the log as flown at {BATTERY_UNKNOWN_V:g} V"
         )
     return found
 
@@ -264,7 +266,10 @@ def fit(
     model = with_values(model, fixed)
     judged = ~held_out_rows(log, every)
     _check_data(log, judged, free)
-    result = estimate(log, judged, model, free, report)
+    try:
+        result = estimate(log, judged, model, free, report)
+    except FitError as error:
+        raise FitError(f"{log.source}: {error}") from error
     _check_result(result, log)
     intervals = _intervals(result)
     doubt = _map_doubt(result, log)

@@ -97,6 +97,13 @@ WRONG = {
     "w in deg/s": (scaled("w", 180 / np.pi), columns("w"), "looks like deg/s"),
     "t in ms": (time_times(1e3), "t", "median step of 10, .* looks like ms"),
     "t in us": (time_times(1e6), "t", r"median step of 1e\+04, .* looks like us"),
+    "t in ns": (time_times(1e9), "t", r"median step of 1e\+07, .* looks like ns"),
+    "q world to body": (scaled("q", np.array([1.0, -1.0, -1.0, -1.0])), columns("q"), "looks like world to"),
+    "q stuck": (
+        lambda log: shifted("q", [1.0, 0.0, 0.0, 0.0])(scaled("q", 0.0)(log)),
+        columns("q"),
+        "the attitude looks stuck",
+    ),
     "v_bat in mV": (scaled("v_bat", 1000.0), "v_bat", "looks like mV$"),
     "v_bat in hundredths": (scaled("v_bat", 100.0), "v_bat", "looks like hundredths of V$"),
     "v_bat in tenths": (scaled("v_bat", 10.0), "v_bat", "looks like tenths of V$"),
