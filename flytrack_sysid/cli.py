@@ -33,7 +33,7 @@ def load_plant(where: str) -> Any:
     module, colon, name = where.partition(":")
     if not colon or Path(where).exists():
         return blackbox.load(where)
-    sys.path.insert(0, str(Path.cwd()))
+    sys.path.insert(0, str(Path.cwd()))  # and it stays: the module may import later
     try:
         found: Any = importlib.import_module(module)
         for part in name.split("."):
@@ -41,8 +41,6 @@ def load_plant(where: str) -> Any:
     except Exception as error:  # whatever a user's module raises
         said = f"{type(error).__name__}: {error}"
         raise CollectError(f"--black-box {where}: cannot be imported: {said}") from error
-    finally:
-        sys.path.pop(0)
     is_plant = hasattr(found, "reset") and hasattr(found, "drone")
     if not is_plant and not callable(found):
         raise CollectError(
@@ -135,8 +133,8 @@ def run_validate(arguments: argparse.Namespace) -> None:
     check_plausible(log)
     rows, which = judged_rows(arguments.model, log)
     found = validate(model, log, rows)
+    found = found._replace(notes=(which, *found.notes))
     written = write_validation(arguments.out, found, Path(arguments.model).name, log)
-    print(which)
     print(text_of(found, Path(arguments.model).name, log))
     print(f"written: {', '.join(str(path) for path in written)}")
 

@@ -40,7 +40,7 @@ LARGEST_SPEED = 20.0  # m/s
 HEIGHTS = (10.0, 110.0)  # m
 SECONDS_PER_FLIGHT = FLIGHT_STEPS * DT_S
 FEWEST_MINUTES = FLIGHTS_PER_KIND * len(KINDS) * SECONDS_PER_FLIGHT / 60.0
-SHORTEST_FLIGHT_S = 0.5
+FEWEST_ROWS = 2  # of a flight; shorter ones say nothing
 MIDDLE_V = 0.5 * (BATTERY_EMPTY_V + BATTERY_FULL_V)
 
 
@@ -60,7 +60,14 @@ def _fly_plant(plant: Plant) -> Fly:
         return jnp.concatenate([states, pack(plant.drone(last))[None]])
 
     fly_all = jax.jit(jax.vmap(fly_one))
-    return lambda starts, commands: np.asarray(fly_all(starts, commands))
+
+    def fly(starts: np.ndarray, commands: np.ndarray) -> np.ndarray:
+        try:
+            return np.asarray(fly_all(starts, commands))
+        except Exception as error:  # whatever a user's plant raises
+            raise CollectError(f"plant: {type(error).__name__}: {error}") from error
+
+    return fly
 
 
 def _fly_function(step: StepFunction, report: Report) -> Fly:
@@ -165,8 +172,7 @@ def collect(
 def _cut(states: np.ndarray, commands: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
     """Return the part of each flight before it leaves the envelope; none of very short ones."""
     lengths = np.where(_inside(states).all(axis=1), states.shape[1], np.argmin(_inside(states), axis=1))
-    shortest = SHORTEST_FLIGHT_S / DT_S
-    kept = [(x[:n], u[:n]) for x, u, n in zip(states, commands, lengths, strict=True) if n >= shortest]
+    kept = [(x[:n], u[:n]) for x, u, n in zip(states, commands, lengths, strict=True) if n >= FEWEST_ROWS]
     if not kept:
-        raise CollectError("plant: no flight stayed within the envelope for half a second")
+        raise CollectError("plant: no flight stayed within the envelope for more than a step")
     return kept

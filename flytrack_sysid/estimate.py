@@ -141,7 +141,7 @@ class _Search:
         return result.x, self.covariance(result.jac, result.fun)
 
     def covariance(self, slopes: np.ndarray, left: np.ndarray) -> np.ndarray:
-        """Return the covariance of the sought numbers, widened where residuals of a second go together.
+        """Return the covariance of the sought numbers, widened where residuals of a flight go together.
 
         That of independent residuals of the noise assumed, in which each standard deviation is raised to
         that of the cluster-robust (sandwich) estimate over pieces of a flight, if that is larger: what
@@ -159,7 +159,8 @@ class _Search:
         pieces = pieces[self.counting]
         pulls = np.zeros((pieces.max() + 1, len(scale)))
         np.add.at(pulls, pieces, scaled[: len(pieces)] * left[: len(pieces), None])
-        robust = bread @ (pulls.T @ pulls) @ bread
+        count = len(np.unique(pieces))
+        robust = bread @ (pulls.T @ pulls) @ bread * (count / max(count - 1, 1))
         widen = np.sqrt(np.maximum(np.diag(robust) / np.maximum(np.diag(bread), LEAST_NOISE), 1.0))
         wide = bread * np.outer(widen, widen)
         return wide / np.outer(scale, scale)

@@ -86,7 +86,7 @@ def test_without_voltage_its_influence_is_taken_for_granted_and_said_so(exact):
     assert any("v_bat is absent" in warning for warning in found.warnings)
     np.testing.assert_array_equal(found.model.thrust_coeffs[4:], np.float32([0.8, 0.9]))
     # 23 V instead of 22 to 24 V leaves an error of up to c4 + c5 volts in single flights.
-    assert tau_error(found) < 0.05 and map_error(found) < 0.05
+    assert tau_error(found) < 0.1 and map_error(found) < 0.05
 
 
 def test_intervals_hold_the_truth_and_widen_with_fewer_channels(noisy, fitted):
@@ -94,10 +94,9 @@ def test_intervals_hold_the_truth_and_widen_with_fewer_channels(noisy, fitted):
     assert sum(inside) >= len(inside) - 2
     assert tau_error(fitted) < 0.02 and map_error(fitted) < 0.01
     assert fitted.map_doubt.share < 0.01 and map_error(fitted) < 2.0 * fitted.map_doubt.share
-    fewer = fit(noisy.without("v", "f"))
-    wide, narrow = half_widths(fewer), half_widths(fitted)
-    assert all(wide[name] > 1.5 * narrow[name] for name in ("tau_thrust", *THRUST_COEFFS))
-    assert wide["tau_roll"] == pytest.approx(narrow["tau_roll"], rel=0.05)
+    wide, narrow = half_widths(fit(noisy.without("w"))), half_widths(fitted)
+    assert all(wide[name] > 1.2 * narrow[name] for name in TAUS[:3])
+    assert wide["tau_thrust"] == pytest.approx(narrow["tau_thrust"], rel=0.05)
 
 
 @pytest.mark.slow
@@ -256,3 +255,13 @@ def test_result_is_told_in_text_and_json(fitted):
     np.testing.assert_allclose(json_["left_rms"]["w"], 0.1, rtol=0.1)
     np.testing.assert_allclose(json_["left_rms"]["f"], 1.5, rtol=0.1)
     np.testing.assert_allclose(json_["left_rms"]["v"], 0.05, rtol=0.3)
+
+
+def test_a_drone_on_the_ground_is_said_to_be_motionless(noisy):
+    rng = np.random.default_rng(0)
+    still = {
+        name: values[0] + 0.05 * rng.normal(size=values.shape) for name, values in noisy.channels.items()
+    }
+    still["q"] = still["q"] / np.linalg.norm(still["q"], axis=1, keepdims=True)
+    with pytest.raises(FitError, match="w: found no body rate that follows its command"):
+        fit(replace(noisy, channels={**still, "u": noisy["u"]}))
