@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import gymnax
@@ -17,6 +18,7 @@ from flytrack_env.quaternion import Quaternion, Scalar, Vec3
 from flytrack_env.state import Action, Drone
 from flytrack_env.tracks import Gate, Track
 
+MEMORY_MAPS, MOST_MEMORY_MAPS = Path("/proc/self/maps"), 25_000
 FACING_X = (0.5**0.5, 0.0, 0.0, -(0.5**0.5))  # yaw -90 degrees: the gate's local +y is world +x
 
 
@@ -113,6 +115,17 @@ def toml_of(track: Track) -> str:
             f"opening = {gate.opening}\nframe = {gate.frame}",
         ]
     return "\n".join(lines) + "\n"
+
+
+@pytest.fixture(scope="module", autouse=True)
+def few_programs_at_a_time():
+    """Forget compiled programs before the process has more memory maps than the system allows.
+
+    A compiled program takes some maps, Linux allows 65,530 a process, and XLA aborts where it gets none.
+    """
+    yield
+    if MEMORY_MAPS.exists() and MEMORY_MAPS.read_bytes().count(b"\n") > MOST_MEMORY_MAPS:
+        jax.clear_caches()
 
 
 @pytest.fixture(scope="session")
