@@ -87,15 +87,10 @@ def test_demo_writes_everything(tmp_path, monkeypatch, capsys):
     )
     demo.main()
     names = {"final.msgpack", "model.json", "position_density.png", "rollout.npy", "rollout.rrd"}
-    assert {path.name for path in out.iterdir()} == names | {"summary.json"}
+    assert {path.name for path in out.iterdir()} == names | {"flight_log.npz", "summary.json"}
     summary = json.loads((out / "summary.json").read_text())
     assert summary["noisy_starts"]["episodes"] == 4
-    assert set(summary["validation"]["minimal"]["one_step_mse"]) == {
-        "position",
-        "velocity",
-        "quaternion",
-        "rates",
-    }
+    assert set(summary["validation"]["minimal"]["one_step"]["channels"]) == {"p", "v", "q", "w", "a"}
     assert load_model(out / "model.json").tau.shape == (4,)
     assert "noisy starts finish 3 laps" in capsys.readouterr().out
 

@@ -151,8 +151,9 @@ def test_held_out_rows_do_not_influence_the_fit_and_are_used_with_every_0(noisy,
         spoilt[name][out] *= 0.9
     spoilt["q"][out], spoilt["v_bat"][out] = np.roll(spoilt["q"][out], 9, axis=0), 22.5
     again = fit(replace(noisy, channels=spoilt))
+    # Not closer than where the search ends: running sums over held-out rows round differently.
     np.testing.assert_allclose(
-        to_vector(again.estimate.model), to_vector(fitted.estimate.model), rtol=1e-9, atol=1e-9
+        to_vector(again.estimate.model), to_vector(fitted.estimate.model), rtol=1e-6, atol=1e-6
     )
     everything = fit(noisy, every=0)
     assert everything.estimate.count == pytest.approx(fitted.estimate.count * 4 / 3, rel=0.03)
