@@ -27,7 +27,7 @@ FIRST_NOISE = {"w": 0.1, "f": 1.5, "v": 0.05, "p": 0.01, "q": 0.01, "v_bat": 0.0
 LEAST_NOISE = 1e-12
 LEAST_INFORMATION = 1e-13  # about a direction, against what is known best: rounding hides less
 # Relative to cost and step, of each round: only the last is to be exact.
-TOLERANCES = (1e-4, 1e-4, 1e-10)
+TOLERANCES = (1e-4, 1e-4, 1e-14)
 MOST_EVALUATIONS = 200  # about ten times what a search takes that ends
 # How far thrust coefficients may lie from where the search starts, in weights of the drone (per volt for
 # the last two): weak enough to move nothing that the data determine, and it keeps the rest finite.

@@ -16,6 +16,8 @@ from flytrack_sysid.log import GAP_STEPS, FlightLog, usual_step
 from flytrack_sysid.split import blocks_of
 
 LONGEST_FILLED_S = 0.1  # after a longer gap a new flight begins
+# Without voltage thrust is off by another share in each flight, and the velocity runs away with it.
+WINDOW_WITHOUT_VOLTAGE_S = 1.25
 WINDOW_S = 2.5  # over which increments of velocity and attitude are followed
 PADDED_TO = 1024  # rows: logs of about the same length share one compiled program
 BATTERY_UNKNOWN_V = 23.0
@@ -154,6 +156,7 @@ def make_record(log: FlightLog) -> Record:
     filled = fill_gaps(log)
     full, begins = filled.log, filled.log.is_start()
     zeros = np.zeros((len(full), 3))
+    longest_s = WINDOW_S if "v_bat" in log else WINDOW_WITHOUT_VOLTAGE_S
     after_gap = np.append(False, filled.source_row[:-1] < 0) & (filled.source_row >= 0)
     record = Record(
         source_row=filled.source_row,
@@ -167,7 +170,7 @@ def make_record(log: FlightLog) -> Record:
         vel_w=_velocity(full),
         quat=full["q"] if "q" in log else np.tile(UPRIGHT, (len(full), 1)),
         battery_v=full["v_bat"][:, 0] if "v_bat" in log else zeros[:, 0] + BATTERY_UNKNOWN_V,
-        piece=_pieces(full.time, begins, blocks_of(log)[filled.behind]),
+        piece=_pieces(full.time, begins, blocks_of(log)[filled.behind], longest_s),
     )
     return _padded(record)
 
@@ -178,14 +181,14 @@ def steps_after(log: FlightLog) -> np.ndarray:
     return np.where(np.append(log.is_start()[1:], True), usual_step(log), steps)
 
 
-def _pieces(times: np.ndarray, begins: np.ndarray, blocks: np.ndarray) -> np.ndarray:
+def _pieces(times: np.ndarray, begins: np.ndarray, blocks: np.ndarray, longest_s: float) -> np.ndarray:
     """Return numbers of stretches: blocks of each flight, cut evenly into stretches of at most 2.5 s."""
     is_first = begins | np.append(True, np.diff(blocks) != 0)
     number = np.cumsum(is_first) - 1
     first = np.flatnonzero(is_first)
     last = np.append(first[1:], len(times)) - 1
     duration = times[last] - times[first]
-    pieces = np.maximum(1, np.ceil(duration / WINDOW_S - 1e-6)).astype(int)
+    pieces = np.maximum(1, np.ceil(duration / longest_s - 1e-6)).astype(int)
     share = (times - times[first][number]) / np.maximum(duration, 1e-9)[number]
     piece = np.minimum((share * pieces[number]).astype(int), pieces[number] - 1)
     return (np.cumsum(pieces) - pieces)[number] + piece

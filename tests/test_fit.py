@@ -86,7 +86,7 @@ def test_without_voltage_its_influence_is_taken_for_granted_and_said_so(exact):
     assert any("v_bat is absent" in warning for warning in found.warnings)
     np.testing.assert_array_equal(found.model.thrust_coeffs[4:], np.float32([0.8, 0.9]))
     # 23 V instead of 22 to 24 V leaves an error of up to c4 + c5 volts in single flights.
-    assert tau_error(found) < 0.1 and map_error(found) < 0.05
+    assert tau_error(found) < 0.05 and map_error(found) < 0.05
 
 
 def test_intervals_hold_the_truth_and_widen_with_fewer_channels(noisy, fitted):
@@ -151,9 +151,8 @@ def test_held_out_rows_do_not_influence_the_fit_and_are_used_with_every_0(noisy,
         spoilt[name][out] *= 0.9
     spoilt["q"][out], spoilt["v_bat"][out] = np.roll(spoilt["q"][out], 9, axis=0), 22.5
     again = fit(replace(noisy, channels=spoilt))
-    # Not closer than where the search ends: running sums over held-out rows round differently.
     np.testing.assert_allclose(
-        to_vector(again.estimate.model), to_vector(fitted.estimate.model), rtol=1e-6, atol=1e-6
+        to_vector(again.estimate.model), to_vector(fitted.estimate.model), rtol=1e-9, atol=1e-9
     )
     everything = fit(noisy, every=0)
     assert everything.estimate.count == pytest.approx(fitted.estimate.count * 4 / 3, rel=0.03)
