@@ -29,6 +29,8 @@ LEAST_INFORMATION = 1e-13  # about a direction, against what is known best: roun
 # Relative to cost and step, of each round: only the last is to be exact.
 TOLERANCES = (1e-4, 1e-4, 1e-14)
 MOST_EVALUATIONS = 200  # about ten times what a search takes that ends
+LAST_RISE = 1e-10  # of the cost, which rounding may add to such a step
+LAST_STEPS = 3  # from an error of 1e-8, where the cost is flat to rounding, to that of the slopes
 # How far thrust coefficients may lie from where the search starts, in weights of the drone (per volt for
 # the last two): weak enough to move nothing that the data determine, and it keeps the rest finite.
 PRIOR_WEIGHTS = {**dict.fromkeys(THRUST_COEFFS[:4], 10.0), **dict.fromkeys(THRUST_COEFFS[4:], 1.0)}
@@ -138,7 +140,28 @@ class _Search:
             raise FitError(f"the fit diverged: {error}") from error
         if not result.success or not np.isfinite(result.cost):
             raise FitError(f"the fit did not converge: {result.message}")
+        if tolerance == TOLERANCES[-1]:
+            result.x = self.finished(result.x, bounds.T)
         return result.x, self.covariance(result.jac, result.fun)
+
+    def finished(self, sought: np.ndarray, bounds: np.ndarray) -> np.ndarray:
+        """Return where the slope of the cost, and not only its change, is rounding: full Gauss-Newton steps.
+
+        The cost is flat at its least, so that a search which compares costs ends a 1e-8 away from it,
+        in a direction that the order of summation decides: another number of threads, another model.
+        """
+        left = self.residual(sought)
+        for _ in range(LAST_STEPS):
+            slopes = self.slopes(sought)
+            size = np.linalg.norm(slopes, axis=0)
+            size = np.where(size > 0.0, size, 1.0)
+            step = np.linalg.lstsq(slopes / size, -left, rcond=LEAST_INFORMATION)[0] / size
+            moved = np.clip(sought + step, *bounds)
+            then = self.residual(moved)
+            if not then @ then <= (left @ left) * (1.0 + LAST_RISE):
+                break
+            sought, left = moved, then
+        return sought
 
     def covariance(self, slopes: np.ndarray, left: np.ndarray) -> np.ndarray:
         """Return the covariance of the sought numbers, widened where residuals of a flight go together.
