@@ -153,4 +153,4 @@ def save_model(path: str | Path, model: ModelParameters, provenance: dict[str, A
     Written to a temporary name beside the target and renamed, so that no half-written file is left.
     """
     document = {"version": MODEL_FILE_VERSION, **model_as_json(model), "provenance": provenance}
-    write_atomically(Path(path), (json.dumps(document, indent=2) + "\n").encode())
+    write_atomically(Path(path), (json.dumps(document, indent=2, allow_nan=False) + "\n").encode())

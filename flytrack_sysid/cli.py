@@ -15,6 +15,7 @@ from flytrack_sysid.collect import CollectError, collect
 from flytrack_sysid.fit import fit
 from flytrack_sysid.log import FlightLog
 from flytrack_sysid.log_file import check_name, describe, load_log, save_log
+from flytrack_sysid.plausibility import check_plausible
 from flytrack_sysid.split import HELD_OUT_EVERY, held_out_rows
 from flytrack_sysid.validate import validate
 from flytrack_sysid.validation_report import text_of, write_validation
@@ -32,15 +33,14 @@ def load_plant(where: str) -> Any:
     module, colon, name = where.partition(":")
     if not colon or Path(where).exists():
         return blackbox.load(where)
-    sys.path.insert(0, str(Path.cwd()))
+    sys.path.insert(0, str(Path.cwd()))  # and it stays: the module may import later
     try:
         found: Any = importlib.import_module(module)
         for part in name.split("."):
             found = getattr(found, part)
-    except (ImportError, AttributeError, ValueError) as error:
-        raise CollectError(f"--black-box {where}: cannot be imported: {error}") from error
-    finally:
-        sys.path.pop(0)
+    except Exception as error:  # whatever a user's module raises
+        said = f"{type(error).__name__}: {error}"
+        raise CollectError(f"--black-box {where}: cannot be imported: {said}") from error
     is_plant = hasattr(found, "reset") and hasattr(found, "drone")
     if not is_plant and not callable(found):
         raise CollectError(
@@ -91,6 +91,8 @@ def fixed_values(pairs: Sequence[str]) -> dict[str, float]:
 
 def run_fit(arguments: argparse.Namespace) -> None:
     """Identify a model and write it."""
+    if arguments.out.suffix != ".json":  # before the work, and lest a log is overwritten
+        raise ModelFileError(f"{arguments.out}: found suffix {arguments.out.suffix!r}, expected .json")
     fixed = fixed_values(arguments.fix)
     start = None if arguments.start is None else load_model(arguments.start)
     log = load_log(arguments.log)
@@ -128,10 +130,11 @@ def run_validate(arguments: argparse.Namespace) -> None:
     """Judge a model on what it was not fitted to, and write the report."""
     model = load_model(arguments.model)
     log = load_log(arguments.log)
+    check_plausible(log)
     rows, which = judged_rows(arguments.model, log)
     found = validate(model, log, rows)
+    found = found._replace(notes=(which, *found.notes))
     written = write_validation(arguments.out, found, Path(arguments.model).name, log)
-    print(which)
     print(text_of(found, Path(arguments.model).name, log))
     print(f"written: {', '.join(str(path) for path in written)}")
 

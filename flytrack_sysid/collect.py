@@ -30,7 +30,7 @@ from flytrack_env.state import (
 )
 from flytrack_sysid.excitation import DT_S, FLIGHT_STEPS, FLIGHTS_PER_KIND, KINDS, script, start_state
 from flytrack_sysid.log import FlightLog, log_of_states
-from flytrack_sysid.sensors import measure
+from flytrack_sysid.sensors import LOST_ROWS, measure
 
 StepFunction = Callable[[np.ndarray, np.ndarray], Any]
 Fly = Callable[[np.ndarray, np.ndarray], np.ndarray]
@@ -40,7 +40,7 @@ LARGEST_SPEED = 20.0  # m/s
 HEIGHTS = (10.0, 110.0)  # m
 SECONDS_PER_FLIGHT = FLIGHT_STEPS * DT_S
 FEWEST_MINUTES = FLIGHTS_PER_KIND * len(KINDS) * SECONDS_PER_FLIGHT / 60.0
-SHORTEST_FLIGHT_S = 0.5
+FEWEST_ROWS = 2  # of a flight; shorter ones say nothing
 MIDDLE_V = 0.5 * (BATTERY_EMPTY_V + BATTERY_FULL_V)
 
 
@@ -60,7 +60,14 @@ def _fly_plant(plant: Plant) -> Fly:
         return jnp.concatenate([states, pack(plant.drone(last))[None]])
 
     fly_all = jax.jit(jax.vmap(fly_one))
-    return lambda starts, commands: np.asarray(fly_all(starts, commands))
+
+    def fly(starts: np.ndarray, commands: np.ndarray) -> np.ndarray:
+        try:
+            return np.asarray(fly_all(starts, commands))
+        except Exception as error:  # whatever a user's plant raises
+            raise CollectError(f"plant: {type(error).__name__}: {error}") from error
+
+    return fly
 
 
 def _fly_function(step: StepFunction, report: Report) -> Fly:
@@ -68,7 +75,8 @@ def _fly_function(step: StepFunction, report: Report) -> Fly:
 
     def checked(x: np.ndarray, u: np.ndarray) -> np.ndarray:
         try:
-            after = np.asarray(step(x, u), np.float32)
+            # Copies: a function that changes its arguments must not change the log.
+            after = np.asarray(step(x.copy(), u.copy()), np.float32)
         except Exception as error:  # whatever a user's function raises
             raise CollectError(f"step: {type(error).__name__}: {error}") from error
         if after.shape != (STATE_SIZE,):
@@ -131,12 +139,14 @@ def collect(
     1 as common sensors would (``flytrack_sysid.sensors``). report: called with flights done and to do.
 
     Raises:
-        CollectError: too few minutes, a plant that does not fly or returns what is no state.
+        CollectError: minutes, seed or noise out of range, a plant that does not fly or returns no state.
     """
-    if not minutes >= FEWEST_MINUTES:
+    if not FEWEST_MINUTES <= minutes < np.inf:
         raise CollectError(f"minutes: found {minutes}, expected at least {FEWEST_MINUTES:g}")
-    if not noise >= 0.0:
-        raise CollectError(f"noise: found {noise}, expected 0 or more")
+    if not 0.0 <= noise < 1.0 / LOST_ROWS:
+        raise CollectError(f"noise: found {noise}, expected 0 or more, below {1.0 / LOST_ROWS:g}")
+    if seed < 0:
+        raise CollectError(f"seed: found {seed}, expected 0 or more")
     rng = np.random.default_rng(seed)
     is_plant = hasattr(plant, "reset") and hasattr(plant, "drone")
     fly = _fly_plant(plant) if is_plant else _fly_function(plant, report)
@@ -162,8 +172,7 @@ def collect(
 def _cut(states: np.ndarray, commands: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
     """Return the part of each flight before it leaves the envelope; none of very short ones."""
     lengths = np.where(_inside(states).all(axis=1), states.shape[1], np.argmin(_inside(states), axis=1))
-    shortest = SHORTEST_FLIGHT_S / DT_S
-    kept = [(x[:n], u[:n]) for x, u, n in zip(states, commands, lengths, strict=True) if n >= shortest]
+    kept = [(x[:n], u[:n]) for x, u, n in zip(states, commands, lengths, strict=True) if n >= FEWEST_ROWS]
     if not kept:
-        raise CollectError("plant: no flight stayed within the envelope for half a second")
+        raise CollectError("plant: no flight stayed within the envelope for more than a step")
     return kept

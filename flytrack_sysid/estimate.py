@@ -28,6 +28,7 @@ LEAST_NOISE = 1e-12
 LEAST_INFORMATION = 1e-13  # about a direction, against what is known best: rounding hides less
 # Relative to cost and step, of each round: only the last is to be exact.
 TOLERANCES = (1e-4, 1e-4, 1e-10)
+MOST_EVALUATIONS = 200  # about ten times what a search takes that ends
 # How far thrust coefficients may lie from where the search starts, in weights of the drone (per volt for
 # the last two): weak enough to move nothing that the data determine, and it keeps the rest finite.
 PRIOR_WEIGHTS = {**dict.fromkeys(THRUST_COEFFS[:4], 10.0), **dict.fromkeys(THRUST_COEFFS[4:], 1.0)}
@@ -111,6 +112,11 @@ class _Search:
         chain = np.where(self.is_log, values, 1.0)
         return np.concatenate([slopes, np.diag(self.prior_weight)]) * chain
 
+    def acting(self) -> tuple[str, ...]:
+        """Return the free parameters on which anything that counts depends, at the start."""
+        slopes = np.asarray(_slopes(self.centre, *self.given))[self.counting]
+        return tuple(name for name, acts in zip(self.free, slopes.any(axis=0), strict=True) if acts)
+
     def run(self, tolerance: float) -> tuple[np.ndarray, np.ndarray]:
         """Return the numbers found, and their covariance in the scale in which they were sought."""
         bounds = np.array([bounds_of(name) for name in self.free])
@@ -126,6 +132,7 @@ class _Search:
                 xtol=tolerance,
                 ftol=tolerance,
                 gtol=None,
+                max_nfev=MOST_EVALUATIONS,
             )
         except ValueError as error:  # scipy's word for residuals that are not finite
             raise FitError(f"the fit diverged: {error}") from error
@@ -134,7 +141,7 @@ class _Search:
         return result.x, self.covariance(result.jac, result.fun)
 
     def covariance(self, slopes: np.ndarray, left: np.ndarray) -> np.ndarray:
-        """Return the covariance of the sought numbers, widened where residuals of a second go together.
+        """Return the covariance of the sought numbers, widened where residuals of a flight go together.
 
         That of independent residuals of the noise assumed, in which each standard deviation is raised to
         that of the cluster-robust (sandwich) estimate over pieces of a flight, if that is larger: what
@@ -152,10 +159,30 @@ class _Search:
         pieces = pieces[self.counting]
         pulls = np.zeros((pieces.max() + 1, len(scale)))
         np.add.at(pulls, pieces, scaled[: len(pieces)] * left[: len(pieces), None])
-        robust = bread @ (pulls.T @ pulls) @ bread
+        count = len(np.unique(pieces))
+        robust = bread @ (pulls.T @ pulls) @ bread * (count / max(count - 1, 1))
         widen = np.sqrt(np.maximum(np.diag(robust) / np.maximum(np.diag(bread), LEAST_NOISE), 1.0))
         wide = bread * np.outer(widen, widen)
         return wide / np.outer(scale, scale)
+
+
+def _acting_search(
+    model: ModelParameters,
+    free: tuple[str, ...],
+    problem: Problem,
+    noise: dict[str, np.ndarray],
+    may_be_idle: bool,
+) -> _Search:
+    """Return a search without parameters that nothing depends on, which would lead it astray.
+
+    Wind, say, acts only once there is some drag; what is idle after the first round too is refused.
+    """
+    search = _Search(model, free, problem, noise)
+    acting = search.acting()
+    idle = [name for name in free if name not in acting]
+    if idle and not may_be_idle:
+        raise FitError(f"{', '.join(idle)}: nothing that the log measured depends on it; expected it fixed")
+    return _Search(model, acting, problem, noise) if idle else search
 
 
 def _spread(values: np.ndarray, channel_name: str, problem: Problem) -> np.ndarray:
@@ -164,7 +191,8 @@ def _spread(values: np.ndarray, channel_name: str, problem: Problem) -> np.ndarr
     count = channel.counts.sum(axis=0)
     if channel_name in CENTRED:
         used = channel.counts.any(axis=1)
-        count = count - len(np.unique(channel.window[used])) * (2 if channel_name == "p" else 1)
+        sizes = np.unique(channel.window[used], return_counts=True)[1]
+        count = count - np.minimum(sizes, 2 if channel_name == "p" else 1).sum()
     return np.sqrt(np.sum(values**2, axis=0) / np.maximum(count, 1.0))
 
 
@@ -196,9 +224,9 @@ def estimate(
             problem = make_problem(log, record, judged, model)
             widths = {name: channel.counts.shape[1] for name, channel in problem.channels.items()}
             noise = noise or {name: np.full(width, FIRST_NOISE[name]) for name, width in widths.items()}
-            search = _Search(model, free, problem, noise)
+            search = _acting_search(model, free, problem, noise, may_be_idle=number == 0)
             sought, covariance = search.run(tolerance)
-            model = with_values(model, dict(zip(free, search.values(sought), strict=True)))
+            model = with_values(model, dict(zip(search.free, search.values(sought), strict=True)))
             noise = {
                 name: np.maximum(left, LEAST_NOISE) for name, left in channel_noise(model, problem).items()
             }

@@ -5,7 +5,7 @@ kind        what is flown, from a state of its own at a voltage of its own
 ==========  =====================================================================================
 roll,       chirp then step, or doublet then sine, on this axis alone and about hovering thrust,
 pitch, yaw  at amplitudes from a tenth of the stick to all of it
-thrust      a sine, step, doublet or chirp over the whole stick, then switching, near upright
+thrust      a sine, step, doublet or chirp over the whole stick, then slow switching, near upright
 free        switching commands on all axes, thrust axis up to 80 degrees from the vertical
 leg         3 to 15 m/s in any direction and heading, tilted, with switching yaw and slow thrust
 ==========  =====================================================================================
@@ -44,7 +44,8 @@ FREE_AMPLITUDES = (0.3, 0.5, 0.8, 1.0)
 LEG_SPEEDS = (3.0, 7.0, 11.0, 15.0)  # m/s
 HEIGHT = 60.0  # m, at the start of each flight
 LEG_SWING, LEG_STICK = 0.3, 0.2
-HOLD_STEPS = (3, 12)  # of switching commands
+# How long switching commands are held: fast ones tell of lags, slow ones let thrust get to the end.
+FAST_STEPS, SLOW_STEPS = (3, 12), (15, 40)
 # Above empty: what the flight itself takes, at any drain that leaves a flight of a minute.
 RESERVE_V = 0.1
 
@@ -72,12 +73,14 @@ def wave(name: str, rng: np.random.Generator) -> np.ndarray:
     return sign * (is_on - (1.0 * is_reversed if name == "doublet" else 0.0))
 
 
-def switching(rng: np.random.Generator, smallest: float = 1.0) -> np.ndarray:
-    """Return a command that changes sign every 30 to 120 ms, (FLIGHT_STEPS,).
+def switching(
+    rng: np.random.Generator, smallest: float = 1.0, hold_steps: tuple[int, int] = FAST_STEPS
+) -> np.ndarray:
+    """Return a command that changes sign every so many steps, (FLIGHT_STEPS,).
 
-    Its sizes are drawn between ``smallest`` and 1.
+    Its sizes are drawn between ``smallest`` and 1, how long it is held between ``hold_steps``.
     """
-    holds = rng.integers(*HOLD_STEPS, size=FLIGHT_STEPS, endpoint=True)
+    holds = rng.integers(*hold_steps, size=FLIGHT_STEPS, endpoint=True)
     signs = rng.choice([-1.0, 1.0]) * (-1.0) ** np.arange(FLIGHT_STEPS)
     return np.repeat(signs * rng.uniform(smallest, 1.0, FLIGHT_STEPS), holds)[:FLIGHT_STEPS]
 
@@ -118,7 +121,7 @@ def _flight(
     command = np.tile([0.0, 0.0, 0.0, hover], (FLIGHT_STEPS, 1))
     if kind == "thrust":
         name = ("sine", "step", "doublet", "chirp")[number]
-        command[:, 3] = np.append(wave(name, rng), switching(rng, smallest=0.3)[SLOT_STEPS:])
+        command[:, 3] = np.append(wave(name, rng), switching(rng, 0.5, SLOW_STEPS)[SLOT_STEPS:])
         return Flight(kind, start_state(rng, voltage, hover, rng.uniform(0.0, 20.0), 0.0), command)
     command[:, 2] = switching(rng)
     if kind == "free":
@@ -136,12 +139,15 @@ def _flight(
 
 
 def _voltages(kind: str, turns: int, rng: np.random.Generator) -> np.ndarray:
-    """Return the voltages of a kind's flights, (turns, 4), evenly spread between nearly empty and full.
+    """Return the voltages of a kind's flights, (turns, 4), between nearly empty and full.
 
-    In random order, but for the last of every four, which may be held out: each turn's lies in a range of
-    its own, and that of each kind elsewhere in it.
+    Closer together towards both ends, which tell most of how thrust depends on the voltage. In random
+    order, but for the last of every four, which may be held out: each turn's lies in a range of its own,
+    and that of each kind elsewhere in it.
     """
-    levels = np.linspace(BATTERY_EMPTY_V + RESERVE_V, BATTERY_FULL_V, turns * FLIGHTS_PER_KIND)
+    lowest, count = BATTERY_EMPTY_V + RESERVE_V, turns * FLIGHTS_PER_KIND
+    share = 0.5 - 0.5 * np.cos(np.pi * np.arange(count) / (count - 1))
+    levels = lowest + share * (BATTERY_FULL_V - lowest)
     last = np.arange(turns) * FLIGHTS_PER_KIND + KINDS.index(kind) % FLIGHTS_PER_KIND
     others = rng.permutation(np.delete(levels, last)).reshape(turns, FLIGHTS_PER_KIND - 1)
     return np.column_stack([others, rng.permutation(levels[last])])

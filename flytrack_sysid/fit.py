@@ -11,26 +11,28 @@ from flytrack_env import __version__
 from flytrack_env.dynamics import ModelParameters, collective_thrust, nominal_parameters
 from flytrack_env.state import BATTERY_EMPTY_V, BATTERY_FULL_V
 from flytrack_sysid.estimate import Estimate, FitError, estimate
-from flytrack_sysid.log import CHANNELS, FlightLog
+from flytrack_sysid.fit_checks import check_answer, check_data, check_result
+from flytrack_sysid.log import FlightLog
 from flytrack_sysid.parameters import (
     DRAIN,
     TAU_BOUNDS,
     TAUS,
     THRUST_COEFFS,
     as_float32,
+    bounds_of,
     from_vector,
     names_of,
+    neutral_value,
     to_vector,
     unit_of,
     with_neutral_effects,
     with_values,
 )
 from flytrack_sysid.plausibility import check_plausible
+from flytrack_sysid.record import BATTERY_UNKNOWN_V
 from flytrack_sysid.split import HELD_OUT_EVERY, held_out_rows
 
 TWO_SIDED_95 = 1.959964  # standard deviations of a normal distribution
-NEVER_MOVED = 1e-3  # of a stick's travel from -1 to 1
-AT_BOUND = 1.01
 # What makes a warning: half the width of the 95 % interval, relative to a time constant, to full thrust.
 UNCERTAIN_TAU, UNCERTAIN_THRUST = 0.2, 0.02
 BOX_ACTIONS, BOX_VOLTAGES = 41, 9
@@ -60,7 +62,7 @@ class Fit:
     model: float32, as the environment takes it. estimate: the same in float64, with covariance and what is
     left of each channel. intervals: by name. map_doubt: None where the thrust map was not fitted.
     warnings: what the data do not determine; sentences. every: which part was held out
-    (``flytrack_sysid.split``), 0 for none. source, sha256: of the log.
+    (``flytrack_sysid.split``), 0 for none. source, sha256: of the log, the hash of what it holds.
     """
 
     model: ModelParameters
@@ -118,50 +120,14 @@ def _free_names(model: ModelParameters, log: FlightLog, fixed: Mapping[str, floa
     unknown = [name for name in fixed if name not in names]
     if unknown:
         raise FitError(f"fixed: {unknown[0]}: unknown; expected of {', '.join(names)}")
+    for name, value in fixed.items():
+        low, high = bounds_of(name)
+        if not (np.isfinite(value) and low <= value <= high):
+            raise FitError(f"fixed: {name}: found {value}, expected {low:g} to {high:g} {unit_of(name)}")
     wanted = [*TAUS, *THRUST_COEFFS, DRAIN, *(name for name in names if "." in name)]
     if "v_bat" not in log:
         wanted = [name for name in wanted if name not in (*THRUST_COEFFS[4:], DRAIN)]
     return tuple(name for name in wanted if name not in fixed)
-
-
-def _check_data(log: FlightLog, judged: np.ndarray, free: tuple[str, ...]) -> None:
-    """Raise FitError where channels or motion are missing for what is to be estimated."""
-    if not free:
-        raise FitError("fixed: found every parameter, expected one to estimate at least")
-    has_turns = "w" in log or "q" in log
-    if not has_turns and any(name in free for name in TAUS[:3]):
-        raise FitError(f"{log.source}: w and q are absent; the lags of the body rates need one of them")
-    has_forces = "f" in log or ("q" in log and any(name in log for name in ("a", "v", "p")))
-    if not has_forces and any(name in free for name in (TAUS[3], *THRUST_COEFFS)):
-        raise FitError(
-            f"{log.source}: thrust needs f, or q with one of a, v and p; found {', '.join(log.channels)}"
-        )
-    for axis, (column, tau) in enumerate(zip(CHANNELS["u"], TAUS, strict=True)):
-        stick = log["u"][judged, axis]
-        if tau in free and np.ptp(stick) < NEVER_MOVED:
-            raise FitError(
-                f"{log.source}: {column}: stuck at {stick[0]:.4g}; {tau} cannot be identified: move "
-                f"it, or fix {tau}"
-            )
-
-
-def _check_result(result: Estimate, log: FlightLog) -> None:
-    """Raise FitError where the best model is none."""
-    values = dict(zip(names_of(result.model), to_vector(result.model), strict=True))
-    for name in TAUS:
-        if name in result.free and not TAU_BOUNDS.low * AT_BOUND < values[name] < TAU_BOUNDS.high / AT_BOUND:
-            raise FitError(
-                f"{log.source}: {name}: the fit ended at {values[name]:.3g} s, expected {TAU_BOUNDS.low} to "
-                f"{TAU_BOUNDS.high} s; does {CHANNELS['u'][TAUS.index(name)]} drive this drone?"
-            )
-    if "w" in result.noise:
-        for axis, column in enumerate(CHANNELS["w"]):
-            left, measured = result.noise["w"][axis], result.measured["w"][axis]
-            if TAUS[axis] in result.free and left > AT_BOUND * measured:
-                raise FitError(
-                    f"{log.source}: {column}: the model leaves more ({left:.3g} rad/s rms) than was measured "
-                    f"({measured:.3g}); do sign and order of {CHANNELS['u'][axis]} and {column} agree?"
-                )
 
 
 def _intervals(result: Estimate) -> dict[str, Interval]:
@@ -203,8 +169,8 @@ def _warnings(fit_intervals: Mapping[str, Interval], doubt: MapDoubt | None, log
     for name, (value, low, high) in fit_intervals.items():
         if name in TAUS and 0.5 * (high - low) > UNCERTAIN_TAU * value:
             found.append(f"{name} is not determined by the data: {low:.3g} to {high:.3g} s")
-        elif "." in name and low <= 0.0 <= high:
-            found.append(f"{name} cannot be told from 0: {low:.3g} to {high:.3g} {unit_of(name)}")
+        elif "." in name and low <= (neutral := neutral_value(name)) <= high:
+            found.append(f"{name} cannot be told from {neutral:g}: {low:.3g} to {high:.3g} {unit_of(name)}")
     if doubt is not None and doubt.share > UNCERTAIN_THRUST:
         thrust = log["u"][:, 3]
         volts = f" at {log['v_bat'].min():.4g} to {log['v_bat'].max():.4g} V" if "v_bat" in log else ""
@@ -215,7 +181,8 @@ def _warnings(fit_intervals: Mapping[str, Interval], doubt: MapDoubt | None, log
         )
     if "v_bat" not in log:
         found.append(
-            "v_bat is absent: how thrust depends on the voltage, and the drain, are taken as they were"
+            "v_bat is absent: how thrust depends on the voltage, and the drain, are taken as they were, and "
+            f"the log as flown at {BATTERY_UNKNOWN_V:g} V"
         )
     return found
 
@@ -248,9 +215,13 @@ def fit(
     free = _free_names(model, log, fixed)
     model = with_values(model, fixed)
     judged = ~held_out_rows(log, every)
-    _check_data(log, judged, free)
-    result = estimate(log, judged, model, free, report)
-    _check_result(result, log)
+    check_data(log, judged, free)
+    check_answer(log, model)
+    try:
+        result = estimate(log, judged, model, free, report)
+    except FitError as error:
+        raise FitError(f"{log.source}: {error}") from error
+    check_result(result, log)
     intervals = _intervals(result)
     doubt = _map_doubt(result, log)
     return Fit(

@@ -22,8 +22,10 @@ commands are always there; other channels may be absent (never zero instead), bu
 need not be evenly spaced; a sample that was lost is a missing row.
 """
 
+import hashlib
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -71,14 +73,13 @@ class FlightLog:
 
     time: (num_rows,) s. channels: of ``CHANNELS``, name -> (num_rows, number of its columns) float64;
     "u" is always there. segment: (num_rows,) int, equal numbers side by side. source: where it is from,
-    for messages. sha256: of the file, "" if there is none.
+    for messages.
     """
 
     time: np.ndarray
     channels: Mapping[str, np.ndarray]
     segment: np.ndarray
     source: str = "flight log"
-    sha256: str = ""
 
     def __len__(self) -> int:
         return len(self.time)
@@ -88,6 +89,15 @@ class FlightLog:
 
     def __getitem__(self, channel: str) -> np.ndarray:
         return self.channels[channel]
+
+    @cached_property
+    def sha256(self) -> str:
+        """The hash of what the log holds: the same in memory and in any file of it."""
+        digest = hashlib.sha256()
+        segment = np.cumsum(self.is_start())
+        for name, values in (("t", self.time), ("segment", segment), *sorted(self.channels.items())):
+            digest.update(name.encode() + np.ascontiguousarray(values, float).tobytes())
+        return digest.hexdigest()
 
     def select(self, rows: np.ndarray) -> "FlightLog":
         """Return some of the rows, by mask or slice."""

@@ -5,11 +5,12 @@ a header of column names, then one row of numbers, separated by commas, per samp
 """
 
 import csv
-import hashlib
 import io
 import zipfile
 from array import array
 from collections.abc import Iterable
+from functools import partial
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +20,8 @@ from flytrack_sysid.log import CHANNELS, GAP_STEPS, FlightLog, LogError, usual_s
 from flytrack_sysid.log_table import Table, check_names, log_of_table
 
 LARGEST_BYTES = 512 * 2**20  # unpacked: all columns as float64 at 1 kHz for half an hour fit
+UNPACKED = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
+READ_BYTES = 2**20
 NPY_HEADERS = {
     (1, 0): np.lib.format.read_array_header_1_0,
     (2, 0): np.lib.format.read_array_header_2_0,
@@ -38,7 +41,7 @@ def load_log(path: str | Path) -> FlightLog:
     path = Path(path)
     read, _ = _format_of(path)
     content = _content(path)
-    return log_of_table(read(str(path), content), hashlib.sha256(content).hexdigest())
+    return log_of_table(read(str(path), content))
 
 
 def save_log(path: str | Path, log: FlightLog) -> None:
@@ -120,7 +123,9 @@ def _content(path: Path) -> bytes:
     try:
         _check_size(str(path), path.stat().st_size)
         with path.open("rb") as file:
-            content = file.read(LARGEST_BYTES + 1)  # devices announce nothing and never end
+            # In pieces: devices announce nothing and never end, and a small file needs little memory.
+            pieces = iter(partial(file.read, READ_BYTES), b"")
+            content = b"".join(islice(pieces, LARGEST_BYTES // READ_BYTES + 1))
     except LogError:
         raise
     except (OSError, ValueError) as error:  # ValueError: a NUL in the name
@@ -142,7 +147,6 @@ def _read_npz(source: str, content: bytes) -> Table:
         raise LogError(f"{source}: not an .npz file, or cut off: {error}") from error
     members = archive.infolist()
     check_names(source, [member.filename.removesuffix(".npy") for member in members])
-    # zipfile never unpacks more of a member than the archive announces.
     _check_size(source, sum(member.file_size for member in members))
     columns = {}
     for member in members:
@@ -158,7 +162,13 @@ def _read_npz(source: str, content: bytes) -> Table:
 
 
 def _read_array(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> np.ndarray:
-    """Return one array of numbers, (num_rows,) float64; a header that promises anything else is refused."""
+    """Return one array of numbers, (num_rows,) float64; a header that promises anything else is refused.
+
+    Never unpacks much more than the archive announces: zipfile bounds what it unpacks of stored and
+    deflated members if asked for a number of bytes, and of no others.
+    """
+    if member.compress_type not in UNPACKED:
+        raise LogError(f"found compression {member.compress_type}, expected none or deflate, as numpy writes")
     with archive.open(member) as file:
         shape, _, dtype = NPY_HEADERS[np.lib.format.read_magic(file)](file)
         if dtype.kind not in "iuf":
@@ -166,9 +176,10 @@ def _read_array(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> np.ndarray
             raise LogError(f"found an array of {dtype}, expected numbers{hint}")
         if len(shape) != 1:
             raise LogError(f"found an array of shape {shape}, expected one dimension")
-        data = file.read()
-    if len(data) != shape[0] * dtype.itemsize:
-        raise LogError(f"found {len(data)} bytes, expected {shape[0]} numbers of {dtype.itemsize} bytes")
+        size = member.file_size - file.tell()
+        if size != shape[0] * dtype.itemsize:
+            raise LogError(f"found {size} bytes, expected {shape[0]} numbers of {dtype.itemsize} bytes")
+        data = file.read(size)
     return np.frombuffer(data, dtype).astype(float)
 
 

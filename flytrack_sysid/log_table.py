@@ -55,7 +55,7 @@ def check_names(source: str, names: Sequence[str]) -> None:
                 raise LogError(f"{source}: column {column}: missing; found only {', '.join(present)} of it")
 
 
-def log_of_table(table: Table, sha256: str = "") -> FlightLog:
+def log_of_table(table: Table) -> FlightLog:
     """Return the log that a table holds; a table without segments is one.
 
     Quaternions are normalised. The names must have passed ``check_names``.
@@ -77,7 +77,7 @@ def log_of_table(table: Table, sha256: str = "") -> FlightLog:
     channels = {name: table.matrix(columns) for name, columns in present.items()}
     if "q" in channels:
         channels["q"] = _normalised(table, channels["q"])
-    return FlightLog(table.columns["t"], channels, segment, table.source, sha256)
+    return FlightLog(table.columns["t"], channels, segment, table.source)
 
 
 def _check_lengths(table: Table) -> None:

@@ -64,6 +64,12 @@ def bounds_of(name: str) -> Bounds:
     return MASS_BOUNDS if name == "m" else UNBOUNDED
 
 
+def neutral_value(name: str) -> float:
+    """Return the value at which a parameter of an effect, ``effect.parameter``, does nothing."""
+    effect, _, field = name.partition(".")
+    return float(getattr(BY_NAME[effect].parameters(), field))
+
+
 def to_vector(model: ModelParameters) -> np.ndarray:
     """Return all numbers of a model, in the order of ``names_of``, float64."""
     return np.concatenate([np.ravel(np.asarray(leaf, float)) for leaf in jax.tree.leaves(model)])

@@ -2,30 +2,28 @@
 
 What one channel says of the motion is compared with what another says, over windows of 0.1 to 1 s so that
 noise averages out. A unit is named wrong only where both move alike, by about a known factor; where the
-motion is too small to tell, nothing is said. The signs of frames are not compared, but for the z of ``f``.
+motion is too small to tell, nothing is said. Of frames, only the direction of ``q`` and the z of ``f`` are
+compared.
 """
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
-from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from flytrack_env.dynamics import nominal_parameters
 from flytrack_sysid.log import CHANNELS, FlightLog, LogError
+from flytrack_sysid.windows import FEWEST_WINDOWS, STILL, WINDOWS_S, slope_of, windows_of
 
 GRAVITY = float(nominal_parameters().g)  # m/s^2
-WINDOWS_S = (0.1, 0.3, 1.0)  # long against the noise of a sample; short ones for fast manoeuvres
-FEWEST_WINDOWS = 10
-LEAST_CORRELATION = 0.9  # with less in common, the slope may be that of noise
 TOLERANCE = 0.15  # of a known wrong factor: scale errors of sensors stay well below it
 FEWEST_ROWS = 100
 FEWEST_UPRIGHT_ROWS = 20
 SHORTEST_S = 2.0
-STILL = 1e-6  # in any unit: what changes by less does not change
 LONGEST_STEP_S = 0.5  # no log of a drone is as slow as 2 Hz
-MS_PER_S, US_PER_S = 1e3, 1e6
+PER_S = {"ms": 1e3, "us": 1e6, "ns": 1e9}
+LEAST_TURN = 0.3  # rad within a second: more than a gyroscope's bias makes of a drone that stands still
 FAST_PERCENTILE = 99.0  # of the rates: a lone spike is no unit
 FASTEST_RATE = float(np.deg2rad(4000.0))  # rad/s, the widest range among common gyroscopes
 HIGHEST_BATTERY_V = 100.0  # drones' batteries end at about 60 V
@@ -45,67 +43,6 @@ PLACE_UNITS = {
 }
 ACCELERATION_UNITS = {1.0 / GRAVITY: ("a", "g", "m/s^2")}
 BATTERY_UNITS = {1000.0: "mV", 100.0: "hundredths of V", 10.0: "tenths of V"}
-
-
-class Windows(NamedTuple):
-    """Pieces of a log of about one length, none across segments or long gaps; (num_windows,) each.
-
-    starts, ends: first row, and the row after the last step. durations: s.
-    """
-
-    starts: np.ndarray
-    ends: np.ndarray
-    durations: np.ndarray
-
-    def change_of(self, values: np.ndarray) -> np.ndarray:
-        """Return by how much (num_rows, ...) values grow over each window."""
-        return values[self.ends] - values[self.starts]
-
-    def mean_of(self, log: FlightLog, values: np.ndarray) -> np.ndarray:
-        """Return the mean over each window of values (num_rows, n), which change linearly in between."""
-        steps = np.diff(log.time)[:, None] * 0.5 * (values[1:] + values[:-1])
-        integral = np.concatenate([np.zeros((1, values.shape[1])), np.cumsum(steps, axis=0)])
-        return self.change_of(integral) / self.durations[:, None]
-
-
-def windows_of(log: FlightLog, length_s: float) -> Windows:
-    """Return the windows of a log; those that a gap makes twice as long are left out."""
-    is_start = log.is_start()
-    flight = np.cumsum(is_start) - 1
-    since_start = log.time - log.time[is_start][flight]
-    number = np.floor(since_start / length_s)
-    edges = np.flatnonzero(is_start | np.append(True, np.diff(number) > 0))
-    starts, ends = edges[:-1], edges[1:]
-    durations = log.time[ends] - log.time[starts]
-    steps = np.diff(log.time)[~is_start[1:]]
-    longest = 2.0 * max(length_s, np.median(steps)) if len(steps) else 0.0
-    keep = (flight[starts] == flight[ends]) & (durations <= longest)
-    return Windows(starts[keep], ends[keep], durations[keep])
-
-
-def slope_of(log: FlightLog, change: np.ndarray, rate: np.ndarray, is_centred: bool = False) -> float:
-    """Return the factor from the change of one quantity to the integral of its rate, nan if none is clear.
-
-    change, rate: (num_rows, 3). The ratio of their sizes over windows of that length at which they move
-    most alike: noise in either biases it little where they are highly correlated. is_centred: without the
-    mean of each column, which a bias is in.
-    """
-    best, slope = LEAST_CORRELATION, np.nan
-    for length_s in WINDOWS_S:
-        windows = windows_of(log, length_s)
-        if len(windows.starts) < FEWEST_WINDOWS:
-            continue
-        grown = windows.change_of(change) / windows.durations[:, None]
-        summed = windows.mean_of(log, rate)
-        if is_centred:
-            grown, summed = grown - grown.mean(axis=0), summed - summed.mean(axis=0)
-        size_grown, size_summed = np.linalg.norm(grown), np.linalg.norm(summed)
-        if min(size_grown, size_summed) < STILL:
-            continue
-        correlation = np.sum(grown * summed) / (size_grown * size_summed)
-        if correlation >= best:
-            best, slope = correlation, float(size_summed / size_grown)
-    return slope
 
 
 def is_about(value: float, factor: float) -> bool:
@@ -132,7 +69,9 @@ def _time(log: FlightLog) -> tuple[FlightLog, list[str]]:
     step = np.median(steps) if len(steps) else 0.0
     if step < LONGEST_STEP_S:
         return log, []
-    unit, per_second = ("ms", MS_PER_S) if step < LONGEST_STEP_S * MS_PER_S else ("us", US_PER_S)
+    likely = (unit for unit, per_second in PER_S.items() if step < LONGEST_STEP_S * per_second)
+    unit = next(likely, "ns")
+    per_second = PER_S[unit]
     problem = f"t: found a median step of {step:.4g}, expected less than {LONGEST_STEP_S:g} s"
     return replace(log, time=log.time / per_second), [f"{problem}: this looks like {unit}"]
 
@@ -161,15 +100,37 @@ def _motion(log: FlightLog) -> list[str]:
     return [f"{_columns(*measured)}: {found}: the sensors, or whoever logged them, look stuck"]
 
 
+def _turned(attitude: Rotation) -> np.ndarray:
+    """Return the sum of the turns between rows about the body's axes, (num_rows, 3) rad."""
+    turns_b = (attitude[:-1].inv() * attitude[1:]).as_rotvec()
+    return np.concatenate([np.zeros((1, 3)), np.cumsum(turns_b, axis=0)])
+
+
+def _attitude(log: FlightLog) -> list[str]:
+    """Compare the attitude with the rates: does it move with them, and in the right direction?"""
+    if "q" not in log or "w" not in log:
+        return []
+    windows = windows_of(log, WINDOWS_S[-1])
+    turn = np.linalg.norm(windows.mean_of(log, log["w"]), axis=1) * windows.durations
+    if np.ptp(log["q"], axis=0).max() <= STILL:
+        if not len(turn) or turn.max() <= LEAST_TURN:
+            return []
+        found = f"found the same in every row while {_columns('w')} turn by {turn.max():.2g} rad in a second"
+        return [f"{_columns('q')}: {found}: the attitude looks stuck"]
+    attitude = Rotation.from_quat(log["q"], scalar_first=True)
+    slopes = [slope_of(log, _turned(one), log["w"]) for one in (attitude, attitude.inv())]
+    if not np.isnan(slopes[0]) or not is_about(slopes[1], 1.0):
+        return []
+    found = f"found turns that agree with {_columns('w')} only if it is inverted"
+    return [f"{_columns('q')}: {found}: this looks like world to body, not body to world"]
+
+
 def _rates(log: FlightLog) -> list[str]:
     if "w" not in log:
         return []
     problems = []
     if "q" in log:
-        attitude = Rotation.from_quat(log["q"], scalar_first=True)
-        turns_b = (attitude[:-1].inv() * attitude[1:]).as_rotvec()
-        turned = np.concatenate([np.zeros((1, 3)), np.cumsum(turns_b, axis=0)])
-        slope = slope_of(log, turned, log["w"])
+        slope = slope_of(log, _turned(Rotation.from_quat(log["q"], scalar_first=True)), log["w"])
         problems = _wrong_unit(slope, RATE_UNITS, f"the rates over those by {_columns('q')}")
     fast = np.percentile(np.linalg.norm(log["w"], axis=1), FAST_PERCENTILE)
     if problems or fast <= FASTEST_RATE:
@@ -259,6 +220,7 @@ CHECKS: tuple[Callable[[FlightLog], list[str]], ...] = (
     _length,
     _commands,
     _motion,
+    _attitude,
     _rates,
     _position,
     _acceleration,

@@ -14,9 +14,9 @@ import numpy as np
 from flytrack_env.dynamics import ModelParameters, advance
 from flytrack_env.effects import acts, start_memories
 from flytrack_env.quaternion import Quaternion, Vec3
-from flytrack_env.state import ACTION_SIZE, BATTERY_FULL_V, Action, Drone
+from flytrack_env.state import ACTION_SIZE, Action, Drone
 from flytrack_sysid.log import FlightLog, usual_step
-from flytrack_sysid.record import LARGEST_DOUBT, Filled, applied_doubt, steps_after
+from flytrack_sysid.record import BATTERY_UNKNOWN_V, LARGEST_DOUBT, Filled, applied_doubt, steps_after
 
 # For effects that remember: what they remembered when a segment began is not known.
 SETTLING_S = 0.5
@@ -42,7 +42,7 @@ class Steps(NamedTuple):
 class Prediction(NamedTuple):
     """The model's step from every row of a log; leaves of the drones are (num_rows,) float64.
 
-    before: the measured state; zeros (upright, full battery) where the log has no such channel.
+    before: the measured state; zeros (upright, 23 V) where the log has no such channel.
     memories: what the model's effects remember before the step. after: the state at the next row.
     is_settled: (num_rows,) bool, applied action and memories no longer depend on how they began.
     applied_from: "log" if it has the applied action, else "lag" of the model.
@@ -99,13 +99,9 @@ def turn_between(quats: np.ndarray, others: np.ndarray) -> np.ndarray:
 def inputs_that_lack(model: ModelParameters, log: FlightLog) -> dict[str, tuple[str, ...]]:
     """Return, for every channel that a model predicts, the channels it needs and the log does not have.
 
-    A model whose thrust does not depend on the voltage needs none; one without forces beside thrust needs
-    no velocity to predict the specific force.
+    One without forces beside thrust needs no velocity to predict the specific force.
     """
-    needs_battery = bool(np.any(np.asarray(model.thrust_coeffs)[4:]))
-    force = [*(["v_bat"] if needs_battery else [])]
-    if acts(model.effects, "force"):
-        force += ["v", "q"]
+    force = ["v", "q"] if acts(model.effects, "force") else []
     needs = {
         "p": ["p", "v", "q", *force],
         "v": ["v", "q", *force],
@@ -148,7 +144,7 @@ def _measured(log: FlightLog) -> Drone:
     def channel(name: str, size: int) -> list[np.ndarray]:
         return list(log[name].T) if name in log else [zeros] * size
 
-    full = np.full(len(log), BATTERY_FULL_V)
+    assumed_v = np.full(len(log), BATTERY_UNKNOWN_V)
     return Drone(
         pos_w=Vec3(*channel("p", 3)),
         vel_w=Vec3(*channel("v", 3)),
@@ -156,7 +152,7 @@ def _measured(log: FlightLog) -> Drone:
         quat=Quaternion(*(log["q"].T if "q" in log else [zeros + 1.0, zeros, zeros, zeros])),
         rates_b=Vec3(*channel("w", 3)),
         applied=Action(*channel("uprev", ACTION_SIZE)),
-        battery_v=log["v_bat"][:, 0] if "v_bat" in log else full,
+        battery_v=log["v_bat"][:, 0] if "v_bat" in log else assumed_v,
     )
 
 

@@ -16,7 +16,7 @@ from flytrack_sysid.log import GAP_STEPS, FlightLog, usual_step
 from flytrack_sysid.split import blocks_of
 
 LONGEST_FILLED_S = 0.1  # after a longer gap a new flight begins
-WINDOW_S = 1.25  # over which increments of velocity and attitude are followed
+WINDOW_S = 2.5  # over which increments of velocity and attitude are followed
 PADDED_TO = 1024  # rows: logs of about the same length share one compiled program
 BATTERY_UNKNOWN_V = 23.0
 UPRIGHT = (1.0, 0.0, 0.0, 0.0)
@@ -34,7 +34,7 @@ class Record(NamedTuple):
     is_applied_known: (num_rows,) bool, ``applied`` was measured here. applied: (num_rows, 4).
     pos_w, vel_w: (num_rows, 3). quat: (num_rows, 4). battery_v: (num_rows,). Where a channel is absent:
     0, upright, 23 V.
-    piece: (num_rows,) int, numbers of stretches of at most 1.25 s, none across blocks.
+    piece: (num_rows,) int, numbers of stretches of at most 2.5 s, none across blocks.
     """
 
     source_row: np.ndarray
@@ -72,9 +72,12 @@ def _doubts(log: FlightLog, pieces: np.ndarray) -> np.ndarray:
     A command that changes evenly is off by nothing, one that jumps somewhere in the gap by half the jump.
     """
     change = np.diff(log["u"], axis=0, append=log["u"][-1:])
-    before = np.vstack([change[:1], change[:-1]])
-    after = np.vstack([change[1:], change[-1:]])
-    expected = 0.5 * (before + after) * pieces[:, None]
+    # To the next row of the same flight, per step; the last row of a flight has none.
+    has_next = ~np.append(log.is_start()[1:], True)[:, None]
+    slope = np.where(has_next, change / pieces[:, None], 0.0)
+    sides = np.roll(has_next, 1, axis=0).astype(int) + np.roll(has_next, -1, axis=0)
+    mean = (np.roll(slope, 1, axis=0) + np.roll(slope, -1, axis=0)) / np.maximum(sides, 1)
+    expected = mean * pieces[:, None]
     return 0.5 * np.abs(change - expected)
 
 
@@ -94,7 +97,12 @@ def _velocity(log: FlightLog) -> np.ndarray:
     """Return the velocity, or what positions say of it; 0 without either."""
     if "v" in log:
         return log["v"]
-    return np.gradient(log["p"], log.time, axis=0) if "p" in log else np.zeros((len(log), 3))
+    velocity = np.zeros((len(log), 3))
+    starts = np.flatnonzero(log.is_start())
+    for start, end in zip(starts, np.append(starts[1:], len(log)), strict=True):
+        if "p" in log and end - start > 1:
+            velocity[start:end] = np.gradient(log["p"][start:end], log.time[start:end], axis=0)
+    return velocity
 
 
 def _end_to_end(log: FlightLog, usual: np.ndarray) -> FlightLog:
@@ -171,7 +179,7 @@ def steps_after(log: FlightLog) -> np.ndarray:
 
 
 def _pieces(times: np.ndarray, begins: np.ndarray, blocks: np.ndarray) -> np.ndarray:
-    """Return numbers of stretches: blocks of each flight, cut evenly into stretches of at most 1.25 s."""
+    """Return numbers of stretches: blocks of each flight, cut evenly into stretches of at most 2.5 s."""
     is_first = begins | np.append(True, np.diff(blocks) != 0)
     number = np.cumsum(is_first) - 1
     first = np.flatnonzero(is_first)

@@ -51,7 +51,7 @@ class Problem(NamedTuple):
 
 
 def measured_channels(log: FlightLog, record: Record, gravity: float) -> dict[str, np.ndarray]:
-    """Return what a log measured of each residual channel, on the record's rows; 0 in filled ones."""
+    """Return what a log measured of each residual channel, on the record's rows; anything in filled ones."""
     row = record.source_row
     own = {name: log[name][row] for name in ("w", "q", "v", "v_bat") if name in log}
     if "f" in log:
@@ -82,13 +82,15 @@ def make_problem(log: FlightLog, record: Record, judged: np.ndarray, model: Mode
     is_certain = doubt < LARGEST_DOUBT
     exists = (record.source_row >= 0) & judged[record.source_row]
     is_after = exists & ~record.begins
+    behind = np.maximum.accumulate(record.source_row)  # of a filled row, the one before the gap
+    starts_judged = np.append(True, judged[behind][:-1])  # a force is that of a step from measured values
     turns, lifts = is_certain[:, :3], is_certain[:, 3]
     turn_window, turns_afresh = _windows(record, turns.all(axis=1))
     lift_window, _ = _windows(record, lifts)
     allowed = {
         "w": turns & is_after[:, None],
         "q": (turns.all(axis=1) & exists)[:, None],
-        "f": (lifts & is_after)[:, None],
+        "f": (lifts & is_after & starts_judged)[:, None],
         "v": (lifts & exists)[:, None],
         "p": (lifts & exists)[:, None],
         "v_bat": exists[:, None],

@@ -10,7 +10,7 @@ from flytrack_sysid.log import FlightLog
 from flytrack_sysid.one_step import OneStep, one_step_errors
 from flytrack_sysid.open_loop import Rollout, rollout_errors
 from flytrack_sysid.prediction import Prediction, inputs_that_lack, predict
-from flytrack_sysid.record import fill_gaps
+from flytrack_sysid.record import BATTERY_UNKNOWN_V, fill_gaps
 from flytrack_sysid.steps import HELD_AFTER_S, HELD_BEFORE_S, LEAST_JUMP, StepResponse, step_responses
 from flytrack_sysid.thrust import ThrustError, thrust_error
 
@@ -79,6 +79,8 @@ def _notes_of(model: ModelParameters, log: FlightLog, prediction: Prediction) ->
             notes.append(f"{NAMES[name]} ({name}): not in the log")
     if "a" not in log and "f" not in log:
         notes.append("acceleration (a) and specific force (f): not in the log")
+    if "v_bat" not in log and np.any(np.asarray(model.thrust_coeffs)[4:]):
+        notes.append(f"battery (v_bat): not in the log; {BATTERY_UNKNOWN_V:g} V is taken for thrust")
     if prediction.applied_from == "lag":
         notes.append(
             "applied action (uprev): not in the log; it follows the commands by the model's own lags, as if "

@@ -1,9 +1,9 @@
 """Files of flight logs: read back as written, and refused with file, row and column."""
 
-import hashlib
 import io
 import pickle
 import re
+import tracemalloc
 import zipfile
 from collections.abc import Callable
 from dataclasses import replace
@@ -16,7 +16,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from flytrack_sysid import log_file
-from flytrack_sysid.log import CHANNELS, COLUMNS, FlightLog, LogError
+from flytrack_sysid.log import CHANNELS, COLUMNS, REQUIRED, FlightLog, LogError
 from flytrack_sysid.log_file import describe, gaps_of, load_log, save_log
 
 SUFFIXES = (".npz", ".csv")
@@ -71,7 +71,7 @@ def test_round_trip(suffix, tmp_path):
     found = load_log(str(path))
     assert_same_log(found, log)
     assert found.source == str(path)
-    assert found.sha256 == hashlib.sha256(path.read_bytes()).hexdigest()
+    assert found.sha256 == log.sha256 != replace(log, time=log.time + 1.0).sha256
     again = tmp_path / f"again{suffix}"
     save_log(again, found)
     assert again.read_bytes() == path.read_bytes()
@@ -328,6 +328,42 @@ def test_large_files_are_refused_unread(tmp_path, monkeypatch):
             load_log(tmp_path / name)
 
 
+def test_small_file_needs_little_memory(tmp_path):
+    save_log(tmp_path / "flight.npz", make_log())
+    tracemalloc.start()
+    try:
+        load_log(tmp_path / "flight.npz")
+        assert tracemalloc.get_traced_memory()[1] < 16 * 2**20
+    finally:
+        tracemalloc.stop()
+
+
+@pytest.mark.parametrize(
+    ("method", "message"),
+    [
+        (zipfile.ZIP_DEFLATED, "column t: damaged"),
+        (zipfile.ZIP_BZIP2, "column t: found compression 12, expected none or deflate"),
+        (zipfile.ZIP_LZMA, "column t: found compression 14, expected none or deflate"),
+    ],
+)
+def test_array_that_unpacks_to_more_than_announced_is_not_unpacked(tmp_path, method, message):
+    header, num_rows, unpacked = io.BytesIO(), 1000, 64 * 2**20
+    np.lib.format.write_array_header_1_0(
+        header, {"descr": "<f8", "fortran_order": False, "shape": (num_rows,)}
+    )
+    with zipfile.ZipFile(tmp_path / "bomb.npz", "w", method) as archive:
+        for column in REQUIRED:
+            archive.writestr(f"{column}.npy", header.getvalue() + bytes(unpacked if column == "t" else 8000))
+        archive.getinfo("t.npy").file_size = len(header.getvalue()) + 8 * num_rows
+    tracemalloc.start()
+    try:
+        with pytest.raises(LogError, match=message):
+            load_log(tmp_path / "bomb.npz")
+        assert tracemalloc.get_traced_memory()[1] < unpacked / 8
+    finally:
+        tracemalloc.stop()
+
+
 def test_sparse_file_beyond_the_limit_is_refused_unopened(tmp_path, monkeypatch):
     with (tmp_path / "flight.csv").open("wb") as file:
         file.truncate(log_file.LARGEST_BYTES + 1)
@@ -394,16 +430,20 @@ def test_description_says_what_is_in_a_log():
     log["v"][3] = [0.0, -3.0, 4.0]
     log["p"][:, 2] = np.arange(8) - 2
     log["v_bat"][:, 0] = np.linspace(16.5, 14.0, 8)
+    log["u"][:] = np.outer(np.linspace(0.0, 1.0, 8), [0.5, -0.25, 0.0, 1.0])
+    log["u"][0] = [-0.1, 0.1, 0.0, -1.0]
     assert describe(log).splitlines() == [
         "flight.csv: 8 rows, 2 segments, 0.09 s",
         "sample interval: 0.01 s (median), 100 Hz",
         "gaps: 1, longest 0.04 s, after row 5",
         "channels: p, v, v_bat, u; absent: a, f, q, w, uprev",
+        "commands: u_roll -0.1 to 0.5; u_pitch -0.25 to 0.1; u_yaw 0 to 0; u_thrust -1 to 1",
         "speed up to 5 m/s; height -2 to 5 m; voltage 14 to 16.5 V",
     ]
     assert describe(log.without("p", "v", "v_bat").select(slice(1))).splitlines() == [
         "flight.csv: 1 rows, 1 segments, 0.00 s",
         "channels: u; absent: p, v, a, f, q, w, uprev, v_bat",
+        "commands: u_roll -0.1 to -0.1; u_pitch 0.1 to 0.1; u_yaw 0 to 0; u_thrust -1 to -1",
     ]
 
 

@@ -97,6 +97,13 @@ WRONG = {
     "w in deg/s": (scaled("w", 180 / np.pi), columns("w"), "looks like deg/s"),
     "t in ms": (time_times(1e3), "t", "median step of 10, .* looks like ms"),
     "t in us": (time_times(1e6), "t", r"median step of 1e\+04, .* looks like us"),
+    "t in ns": (time_times(1e9), "t", r"median step of 1e\+07, .* looks like ns"),
+    "q world to body": (scaled("q", np.array([1.0, -1.0, -1.0, -1.0])), columns("q"), "looks like world to"),
+    "q stuck": (
+        lambda log: shifted("q", [1.0, 0.0, 0.0, 0.0])(scaled("q", 0.0)(log)),
+        columns("q"),
+        "the attitude looks stuck",
+    ),
     "v_bat in mV": (scaled("v_bat", 1000.0), "v_bat", "looks like mV$"),
     "v_bat in hundredths": (scaled("v_bat", 100.0), "v_bat", "looks like hundredths of V$"),
     "v_bat in tenths": (scaled("v_bat", 10.0), "v_bat", "looks like tenths of V$"),
@@ -269,6 +276,7 @@ class Nominal:
         return state
 
 
-def test_excitation_raises_no_problem():
-    data = collect(Nominal(), seed=1)
-    assert find_problems(with_force(log_of_states(zip(data.states, data.actions, strict=True), DT))) == []
+@pytest.mark.parametrize("noise", [0.0, 1.0, 3.0])
+def test_excitation_raises_no_problem(noise):
+    log = collect(Nominal(), seed=1, noise=noise)
+    assert find_problems(log if "f" in log else with_force(log)) == []

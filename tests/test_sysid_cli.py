@@ -13,7 +13,7 @@ from blackbox.build import build
 from blackbox.plant import PlantParameters
 from flytrack_env import load_model, load_provenance, save_model
 from flytrack_env.dynamics import nominal_parameters
-from flytrack_sysid import load_log, save_log
+from flytrack_sysid import collect, load_log, save_log
 from flytrack_sysid.cli import load_plant, main
 from flytrack_sysid.log import FlightLog
 
@@ -121,6 +121,12 @@ def step(x, u):
 def broken(x, u):
     raise RuntimeError("motors are off")
 
+def in_place(x, u):
+    x[8] = 20.0 * u[3]
+    x[5] += 0.01 * x[8]
+    x[16:20] = u
+    return x
+
 number = 3
 """
 
@@ -140,16 +146,34 @@ def test_module_and_step_are_imported_from_the_working_folder(tmp_path, monkeypa
         ("my_robot:number", [], "found int"),
         ("my_robot:broken", [], "RuntimeError: motors are off"),
         ("my_robot:step", [], "expected it to sink and to climb"),
+        ("unfinished:step", [], "unfinished:step: cannot be imported: SyntaxError"),
+        (".my_robot:step", [], ".my_robot:step: cannot be imported: TypeError"),
         (SHIPPED, ["--minutes", "0.2"], "minutes"),
+        (SHIPPED, ["--minutes", "inf"], "minutes: found inf"),
         (SHIPPED, ["--noise", "-1"], "noise"),
+        (SHIPPED, ["--noise", "inf"], "noise: found inf"),
+        (SHIPPED, ["--noise", "50"], "noise: found 50.0, expected 0 or more, below 50"),
+        (SHIPPED, ["--seed", "-1"], "seed: found -1"),
         (SHIPPED, ["--out", "data.mat"], "data.mat"),
     ],
 )
 def test_collect_refuses(capsys, tmp_path, monkeypatch, plant, options, message):
     (tmp_path / "my_robot.py").write_text(MODULE)
+    (tmp_path / "unfinished.py").write_text("def step(x, u) return x")
     monkeypatch.chdir(tmp_path)
     assert message in refused(capsys, "collect", "--black-box", plant, "--out", "data.npz", *options)
-    assert {path.name for path in tmp_path.iterdir()} <= {"my_robot.py", "__pycache__"}
+    assert {path.name for path in tmp_path.iterdir()} <= {"my_robot.py", "unfinished.py", "__pycache__"}
+
+
+def test_function_that_changes_its_arguments_changes_no_logged_row(tmp_path, monkeypatch):
+    (tmp_path / "my_robot.py").write_text(MODULE)
+    monkeypatch.chdir(tmp_path)
+    log = collect(load_plant("my_robot:in_place"), minutes=1.0)
+    inside = ~log.is_start()[1:]
+    grown = np.diff(log["v"][:, 2])[inside]
+    np.testing.assert_allclose(grown, 0.01 * log["a"][1:, 2][inside], atol=1e-5)
+    # The action applied at a row is the one commanded before it.
+    np.testing.assert_array_equal(log["uprev"][1:][inside], log["u"][:-1][inside])
 
 
 def in_degrees(log: FlightLog) -> FlightLog:
@@ -161,6 +185,13 @@ def stuck(log: FlightLog) -> FlightLog:
     """Return the log with a yaw stick that never moved."""
     commands = log["u"] * np.array([1.0, 1.0, 0.0, 1.0])
     return FlightLog(log.time, {**log.channels, "u": commands}, log.segment)
+
+
+def test_fit_does_not_overwrite_a_log(folder, capsys):
+    before = (folder / "data.npz").read_bytes()
+    said = refused(capsys, "fit", folder / "data.npz", "--out", folder / "data.npz")
+    assert "data.npz: found suffix '.npz', expected .json" in said
+    assert (folder / "data.npz").read_bytes() == before
 
 
 @pytest.mark.parametrize(
@@ -199,6 +230,16 @@ def test_validate_refuses(folder, capsys, tmp_path, change, message):
     path.write_text(json.dumps(document))
     assert message in refused(capsys, "validate", path, folder / "data.npz", "--out", tmp_path / "report")
     assert not (tmp_path / "report").exists()
+
+
+@pytest.mark.parametrize(
+    ("spoil", "message"), [(in_degrees, "deg/s"), (lambda log: log.select(slice(50)), "too short")]
+)
+def test_validate_refuses_what_cannot_be_a_flight(folder, capsys, tmp_path, spoil, message):
+    save_log(tmp_path / "other.npz", spoil(load_log(folder / "data.npz")))
+    out = tmp_path / "report"
+    assert message in refused(capsys, "validate", folder / "model.json", tmp_path / "other.npz", "--out", out)
+    assert not out.exists()
 
 
 def test_the_command_is_installed():

@@ -204,7 +204,6 @@ def test_windows_of_velocity_do_not_overlap(log):
         (("v",), {"q", "w", "a"}, r"position \(p\): not judged; v is not in the log"),
         (("w",), {"p", "v", "q", "a"}, r"body rates \(w\): not in the log"),
         (("a",), {"p", "v", "q", "w"}, r"acceleration \(a\) and specific force \(f\)"),
-        (("v_bat",), {"q", "w"}, r"velocity \(v\): not judged; v_bat is not in the log"),
         (("q",), {"w"}, r"velocity \(v\): not judged; q is not in the log"),
         (("q", "w"), set(), "step responses: no judged command"),
     ],
@@ -230,6 +229,12 @@ def test_model_without_battery_needs_no_voltage(log):
     flat = TRUTH._replace(thrust_coeffs=np.array([13.0, 16.0, 3.0, 0.0, 0.0, 0.0]))
     validation = validate(flat, fly(flat).without("v_bat"))
     assert max(nrmse(validation).values()) < 1e-6 and "a" in validation.one_step.channels
+
+
+def test_without_voltage_a_middle_one_is_taken(log):
+    bare = validate(TRUTH, log.without("v_bat"))
+    assert "battery (v_bat): not in the log; 23 V is taken for thrust" in bare.notes
+    assert 1e-3 < nrmse(bare)["a"] < 0.2 and nrmse(bare)["w"] < 1e-6 and bare.thrust is None
 
 
 def test_rates_of_steps_come_from_attitude_without_gyroscope(log):

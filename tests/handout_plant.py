@@ -1,0 +1,110 @@
+"""The handout's equations once more, in NumPy and float64: a truth that shares nothing with the simulator."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from flytrack_env.dynamics import ModelParameters
+from flytrack_sysid.excitation import script
+from flytrack_sysid.log import FlightLog, log_of_states
+
+GRAVITY = 9.80665
+HOVER = -0.25  # about what holds the weight of ``HandoutPlant``
+
+
+@dataclass(frozen=True)
+class HandoutPlant:
+    """A plant ``step(x, u)`` with parameters that no tool is told; one state or many at once.
+
+    tau: s. coeffs: N. max_rate: deg/s. drain: V/min. drag_b: 1/s, linear drag along the body's axes.
+    """
+
+    tau: tuple[float, ...] = (0.021, 0.034, 0.057, 0.045)
+    coeffs: tuple[float, ...] = (-6.0, -4.0, 3.5, 0.4, 0.8, 0.9)
+    max_rate: tuple[float, ...] = (618.0, 618.0, 120.0)
+    drain: float = 1.0
+    drag_b: tuple[float, ...] = (0.0, 0.0, 0.0)
+    dt: float = 0.01
+
+    def model(self, **changes: object) -> ModelParameters:
+        """Return what a fit without effects should find, with some fields replaced."""
+        found = ModelParameters(
+            np.array(self.tau), np.array(self.coeffs), np.array(self.max_rate), 1.0, GRAVITY, self.drain
+        )
+        return found._replace(**changes)
+
+    def __call__(self, x: np.ndarray, u: np.ndarray, dt: float | None = None) -> np.ndarray:
+        """Return the state ``dt`` later, (..., 21)."""
+        dt = self.dt if dt is None else dt
+        x = np.asarray(x, float)
+        p, v, q, applied, volt = x[..., 0:3], x[..., 3:6], x[..., 9:13], x[..., 16:20], x[..., 20]
+        applied = applied + (1.0 - np.exp(-dt / np.array(self.tau))) * (u - applied)
+        omega = np.radians(np.array(self.max_rate) * applied[..., :3])
+        # q (x) [0, omega] as a matrix product, from the left
+        w, i, j, k = np.moveaxis(q, -1, 0)
+        left = np.array([[-i, -j, -k], [w, -k, j], [k, w, -i], [-j, i, w]])
+        turned = q + 0.5 * dt * np.einsum("ab...,...b->...a", left, omega)
+        s = applied[..., 3]
+        c = self.coeffs
+        thrust = c[0] + c[1] * s + c[2] * s**2 + c[3] * s**3 + c[4] * volt + c[5] * s * volt
+        body_to_world = rotation(q)
+        speed_b = np.einsum("...ji,...j->...i", body_to_world, v)
+        force_b = -np.array(self.drag_b) * speed_b
+        force_b[..., 2] += thrust
+        a = np.einsum("...ij,...j->...i", body_to_world, force_b) - [0.0, 0.0, GRAVITY]
+        return np.concatenate(
+            [
+                p + v * dt + 0.5 * a * dt**2,
+                v + a * dt,
+                a,
+                turned / np.linalg.norm(turned, axis=-1, keepdims=True),
+                omega,
+                applied,
+                (volt - self.drain / 60.0 * dt)[..., None],
+            ],
+            axis=-1,
+        )
+
+
+def rotation(quat: np.ndarray) -> np.ndarray:
+    """Return rotation matrices, body to world, (..., 3, 3)."""
+    w, i, j, k = np.moveaxis(quat, -1, 0)
+    rows = [
+        [1 - 2 * (j * j + k * k), 2 * (i * j - k * w), 2 * (i * k + j * w)],
+        [2 * (i * j + k * w), 1 - 2 * (i * i + k * k), 2 * (j * k - i * w)],
+        [2 * (i * k - j * w), 2 * (j * k + i * w), 1 - 2 * (i * i + j * j)],
+    ]
+    return np.moveaxis(np.array(rows), (0, 1), (-2, -1))
+
+
+def fly(plant: HandoutPlant, starts: np.ndarray, commands: np.ndarray, steps_s: np.ndarray) -> FlightLog:
+    """Return the float64 log of flights from starts (N, 21) under commands (N, T, 4), held for steps (T,)."""
+    states = [np.asarray(starts, float)]
+    for number, step_s in enumerate(steps_s[:-1]):
+        states.append(plant(states[-1], commands[:, number], step_s))
+    flights = np.stack(states, axis=1)
+    log = log_of_states(zip(flights, commands, strict=True), plant.dt, "handout.npz")
+    return replace(log, time=np.tile(np.cumsum(steps_s) - steps_s, len(starts)))
+
+
+def excited(
+    plant: HandoutPlant,
+    flights: int = 24,
+    skip: int = 1,
+    repeat: int = 1,
+    jitter: float = 0.0,
+    thrust: tuple[float, float] = (-1.0, 1.0),
+) -> FlightLog:
+    """Return the log of the excitation on a plant, float64, without noise.
+
+    skip, repeat: of commands, for steps of 0.01 s times skip over repeat. jitter: of steps, relative.
+    thrust: what its command is clipped to.
+    """
+    rng = np.random.default_rng(5)
+    planned = script(flights, HOVER, rng)
+    starts = np.stack([flight.start for flight in planned])
+    commands = np.stack([flight.command for flight in planned])[:, ::skip].repeat(repeat, axis=1)
+    commands[..., 3] = np.clip(commands[..., 3], *thrust)
+    step_s = 0.01 * skip / repeat
+    steps_s = step_s * (1.0 + rng.uniform(-jitter, jitter, commands.shape[1]))
+    return fly(replace(plant, dt=step_s), starts, commands, steps_s)

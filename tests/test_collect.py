@@ -1,0 +1,105 @@
+"""Collecting flies any plant alike, within its envelope, and says which plants do not fly."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from handout_plant import GRAVITY, HandoutPlant
+
+from flytrack_env.dynamics import advance
+from flytrack_sysid import CollectError, collect
+from flytrack_sysid.collect import HEIGHTS, LARGEST_SPEED
+
+
+class Simulated:
+    """The simulator with the handout plant's parameters, as a plant."""
+
+    def reset(self, drone, model):
+        return drone
+
+    def step(self, state, command, dt, model):
+        return advance(state, (), command, dt, HandoutPlant().model())[0]
+
+    def drone(self, state):
+        return state
+
+
+def test_plant_and_function_of_the_same_equations_give_the_same_log():
+    plant = collect(Simulated(), minutes=1.0, seed=2)
+    done = []
+    function = collect(HandoutPlant(), minutes=1.0, seed=2, report=lambda *counts: done.append(counts))
+    assert done == [(number + 1, 24) for number in range(24)]
+    np.testing.assert_array_equal(plant.segment, function.segment)
+    np.testing.assert_array_equal(plant.time, function.time)
+    np.testing.assert_allclose(plant["u"], function["u"], atol=1e-5)
+    for name, tolerance in {"p": 2e-3, "v": 2e-3, "a": 2e-3, "q": 1e-4, "w": 1e-3, "v_bat": 2e-4}.items():
+        np.testing.assert_allclose(plant[name], function[name], atol=tolerance, err_msg=name)
+    assert plant.time.max() <= 2.5 and len(plant) > 0.8 * 6000
+
+
+def test_log_is_what_the_plant_did():
+    """Each row follows from the row before under that row's command, accelerations included."""
+    log = collect(HandoutPlant(), minutes=1.0, seed=2)
+    x = np.concatenate([log[name] for name in ("p", "v", "a", "q", "w", "uprev", "v_bat")], axis=1)
+    after = HandoutPlant()(x[:-1], log["u"][:-1])
+    inside = ~log.is_start()[1:]
+    np.testing.assert_allclose(x[1:][inside], after[inside], atol=2e-5)
+    first = np.flatnonzero(log.is_start())
+    assert np.abs(log["a"][first]).max() > 0.1, "the first row's acceleration is the plant's"
+
+
+def test_noise_is_measured_with_the_same_seed_alike():
+    first, again = (collect(HandoutPlant(), minutes=1.0, seed=2, noise=1.0) for _ in range(2))
+    for name, values in first.channels.items():
+        np.testing.assert_array_equal(values, again[name])
+    assert "f" in first and "a" not in first and len(first) < 6000
+
+
+def test_envelope_cuts_a_plant_of_huge_thrust():
+    strong = replace(HandoutPlant(), coeffs=(-24.0, -16.0, 14.0, 1.6, 3.2, 3.6))
+    log = collect(strong, minutes=1.0)
+    assert np.linalg.norm(log["v"], axis=1).max() <= LARGEST_SPEED
+    assert HEIGHTS[0] <= log["p"][:, 2].min() and log["p"][:, 2].max() <= HEIGHTS[1]
+    assert log["v_bat"].min() >= 22.0
+    lengths = np.unique(log.segment, return_counts=True)[1]
+    assert len(lengths) == 24 and lengths.min() < 250, "some flights are cut, and none is dropped"
+    drained = collect(replace(HandoutPlant(), drain=30.0), minutes=1.0)
+    assert drained["v_bat"].min() >= 22.0 and len(drained) < 5500
+
+
+def broken(**parts):
+    """Return a step function of the handout's plant with something replaced after 0.3 s of flight."""
+
+    def step(x, u):
+        after = HandoutPlant()(x, u)
+        if x[2] != 60.0:
+            after[parts["where"]] = parts["value"]
+        return after
+
+    return step
+
+
+def raises(x, u):
+    raise RuntimeError("no link")
+
+
+@pytest.mark.parametrize(
+    ("step", "arguments", "message"),
+    [
+        (replace(HandoutPlant(), coeffs=(1.0, 1.0, 0, 0, 0, 0)), {}, "sink and to climb"),
+        (replace(HandoutPlant(), coeffs=(2.0 * GRAVITY, 1.0, 0, 0, 0, 0)), {}, "sink and to climb"),
+        (broken(where=20, value=np.nan), {}, "found nan in component 20, flight 0 .roll., step"),
+        (broken(where=7, value=np.inf), {}, "found inf in component 7"),
+        (lambda x, u: HandoutPlant()(x, u)[:20], {}, r"shape \(20,\), expected \(21,\)"),
+        (lambda x, u: x * np.nan, {}, "vertical accelerations of nan and nan"),
+        (raises, {}, "RuntimeError: no link"),
+        (broken(where=2, value=500.0), {}, "no flight stayed within the envelope"),
+        (HandoutPlant(), {"minutes": 0.9}, "minutes: found 0.9, expected at least 1"),
+        (HandoutPlant(), {"minutes": np.nan}, "minutes: found nan"),
+        (HandoutPlant(), {"minutes": np.inf}, "minutes: found inf"),
+        (HandoutPlant(), {"noise": -1.0}, "noise: found -1.0, expected 0 or more"),
+    ],
+)
+def test_what_does_not_fly_is_named(step, arguments, message):
+    with pytest.raises(CollectError, match=message):
+        collect(step, **{"minutes": 1.0, **arguments})

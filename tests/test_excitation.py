@@ -1,0 +1,88 @@
+"""The excitation moves one thing at a time, over all amplitudes and voltages, the same for the same seed."""
+
+import numpy as np
+import pytest
+from handout_plant import HOVER, HandoutPlant
+
+from flytrack_sysid.collect import collect
+from flytrack_sysid.excitation import AMPLITUDES, FLIGHT_STEPS, KINDS, LEG_SPEEDS, script, switching, wave
+from flytrack_sysid.log import FlightLog
+from flytrack_sysid.split import held_out_rows
+
+STICKS = ("roll", "pitch", "yaw", "thrust")
+
+
+def flown(num_flights: int = 48, seed: int = 0) -> list:
+    return script(num_flights, HOVER, np.random.default_rng(seed))
+
+
+def test_every_kind_comes_in_fours_with_all_amplitudes_and_voltages():
+    flights = flown()
+    assert [flight.kind for flight in flights] == [kind for kind in KINDS for _ in range(4)] * 2
+    for kind in KINDS:
+        own = [flight for flight in flights if flight.kind == kind]
+        volts = np.sort([flight.start[20] for flight in own])
+        assert volts[0] < 22.2 and volts[-1] == 24.0 and np.diff(volts).max() < 0.45
+    for axis, kind in enumerate(KINDS[:3]):
+        own = [flight.command for flight in flights if flight.kind == kind]
+        assert all(np.ptp(np.delete(command, axis, axis=1), axis=0).max() == 0.0 for command in own)
+        for half in np.split(np.stack(own), 2, axis=1):
+            for turn in np.split(np.abs(half[..., axis]).max(axis=1), 2):
+                np.testing.assert_allclose(np.sort(turn), AMPLITUDES, rtol=0.02)
+    assert np.abs([flight.command for flight in flights]).max() <= 1.0
+    speeds = [np.linalg.norm(flight.start[3:6]) for flight in flights if flight.kind == "leg"]
+    np.testing.assert_allclose(speeds, LEG_SPEEDS * 2)
+
+
+def test_same_seed_same_script_other_seed_another():
+    first, again, other = flown(), flown(), flown(seed=1)
+    for name in ("start", "command"):
+        np.testing.assert_array_equal([getattr(f, name) for f in first], [getattr(f, name) for f in again])
+        assert not np.array_equal([getattr(f, name) for f in first], [getattr(f, name) for f in other])
+
+
+def test_switching_holds_30_to_120_ms_and_always_changes_sign():
+    for seed in range(20):
+        command = switching(np.random.default_rng(seed), smallest=0.3)
+        changes = np.flatnonzero(np.diff(command))
+        assert len(command) == FLIGHT_STEPS and np.all((np.abs(command) >= 0.3) & (np.abs(command) <= 1.0))
+        assert np.all(command[changes] * command[changes + 1] < 0.0)
+        holds = np.diff(changes)
+        assert holds.min() >= 3 and holds.max() <= 12
+
+
+@pytest.mark.parametrize("name", ["sine", "step", "doublet", "chirp"])
+def test_waves_have_amplitude_one_and_begin_at_rest(name):
+    for seed in range(10):
+        values = wave(name, np.random.default_rng(seed))
+        assert 0.98 <= np.abs(values).max() <= 1.0
+        assert abs(values[0]) < 0.02
+        if name == "doublet":
+            assert {-1.0, 0.0, 1.0} == set(values) and abs(values.sum()) <= 1.0
+        if name == "step":
+            assert len(set(values)) == 2 and np.abs(np.diff(values)).sum() == 2.0
+
+
+@pytest.fixture(scope="module")
+def log() -> FlightLog:
+    return collect(HandoutPlant(), minutes=1.0, seed=1)
+
+
+def test_held_out_part_has_every_kind_and_a_clear_step_of_each_axis(log):
+    out = held_out_rows(log)
+    segments = np.unique(log.segment[out])
+    assert {KINDS[number // 4 % len(KINDS)] for number in segments} == set(KINDS)
+    judged = log.select(out)
+    for axis, stick in enumerate(STICKS[:3]):
+        jumps = np.abs(np.diff(judged["u"][:, axis]))
+        alone = [KINDS[number // 4 % len(KINDS)] == stick for number in judged.segment[1:]]
+        same = judged.segment[1:] == judged.segment[:-1]
+        assert jumps[same & np.array(alone)].max() >= 0.3, stick
+
+
+def test_both_parts_cover_full_to_empty(log):
+    out = held_out_rows(log)
+    for part in (out, ~out):
+        volts = log["v_bat"][part]
+        assert volts.min() < 22.6 and volts.max() > 23.4
+    assert log["v_bat"].min() >= 22.0 and log["v_bat"].min() < 22.2 and log["v_bat"].max() > 23.9

@@ -1,0 +1,167 @@
+"""The truth leaves nothing of any channel, and what is wrong shows where it should and nowhere else."""
+
+from dataclasses import replace
+
+import jax
+import numpy as np
+import pytest
+from handout_plant import GRAVITY, HandoutPlant, excited
+from scipy.spatial.transform import Rotation
+
+from flytrack_env.dynamics import ModelParameters
+from flytrack_env.effects import LinearDrag
+from flytrack_sysid.log import FlightLog
+from flytrack_sysid.record import make_record
+from flytrack_sysid.residuals import Problem, make_problem, residuals
+from flytrack_sysid.sensors import specific_force_b
+from flytrack_sysid.split import held_out_rows
+
+PLANT = HandoutPlant()
+EVERY_CHANNEL = {"w", "q", "f", "v", "v_bat"}
+
+
+@pytest.fixture(scope="module")
+def log() -> FlightLog:
+    return excited(PLANT, flights=24)
+
+
+def problem_of(log: FlightLog, judged: np.ndarray | None = None) -> Problem:
+    judged = np.ones(len(log), bool) if judged is None else judged
+    return make_problem(log, make_record(log), judged, PLANT.model())
+
+
+def left(model: ModelParameters, problem: Problem) -> dict[str, np.ndarray]:
+    """Return residuals of a model in float64."""
+    with jax.enable_x64(True):
+        return {name: np.asarray(values) for name, values in jax.jit(residuals)(model, problem).items()}
+
+
+def largest(found: dict[str, np.ndarray]) -> dict[str, float]:
+    return {name: float(np.abs(values).max()) for name, values in found.items()}
+
+
+@pytest.mark.parametrize(
+    ("absent", "expected"),
+    [
+        ((), EVERY_CHANNEL),
+        (("uprev", "a"), EVERY_CHANNEL - {"f"}),
+        (("v",), EVERY_CHANNEL - {"v"} | {"p"}),
+        (("w", "v_bat", "v", "p"), {"q", "f"}),
+        (("q",), {"w", "v_bat"}),
+    ],
+)
+def test_truth_leaves_nothing_of_any_channel(log, absent, expected):
+    problem = problem_of(log.without(*absent))
+    assert set(problem.channels) == expected
+    model = PLANT.model(battery_drain_v_per_min=1.0)
+    if "v_bat" in absent:  # thrust follows a voltage that is not there
+        del problem.channels["f"]
+    # What was applied before the first row is unknown without uprev: up to LARGEST_DOUBT of it is left.
+    tolerance = 0.06 if "uprev" in absent else 1e-9
+    assert max(largest(left(model, problem)).values()) < tolerance
+    share = [channel.counts.mean() for channel in problem.channels.values()]
+    assert min(share) > (0.8 if "uprev" in absent else 0.97)
+
+
+def test_accelerometer_and_acceleration_are_the_same_channel(log):
+    force = specific_force_b(log, GRAVITY)
+    measured = replace(log, channels={**log.channels, "f": force}).without("a")
+    assert largest(left(PLANT.model(), problem_of(measured)))["f"] < 1e-9
+
+
+@pytest.mark.parametrize(
+    "shape", [{"skip": 2}, {"repeat": 5, "flights": 4}, {"jitter": 0.4}], ids=["50 Hz", "500 Hz", "uneven"]
+)
+def test_truth_leaves_nothing_at_other_steps(shape):
+    problem = problem_of(excited(PLANT, **shape))
+    assert max(largest(left(PLANT.model(), problem)).values()) < 1e-9
+
+
+def changed(index: int, vector: tuple[float, ...], factor: float) -> np.ndarray:
+    return np.where(np.arange(len(vector)) == index, factor * np.array(vector), vector)
+
+
+@pytest.mark.parametrize(
+    ("changes", "shows_in"),
+    [
+        ({"tau": changed(0, PLANT.tau, 1.2)}, {"w": 0.1, "q": 0.01}),
+        ({"tau": changed(2, PLANT.tau, 1.2)}, {"w": 0.05, "q": 0.002}),
+        ({"tau": changed(3, PLANT.tau, 1.2)}, {"f": 0.5, "v": 0.02}),
+        ({"thrust_coeffs": changed(2, PLANT.coeffs, 1.2)}, {"f": 0.5, "v": 0.02}),
+        ({"thrust_coeffs": changed(5, PLANT.coeffs, 1.02)}, {"f": 0.1, "v": 0.02}),
+        ({"max_rate": np.array([618.0, 700.0, 120.0])}, {"w": 0.5, "q": 0.01}),
+        ({"battery_drain_v_per_min": 1.2}, {"v_bat": 0.002}),
+        ({"effects": (LinearDrag(0.1, 0.1, 0.1),)}, {"f": 0.5, "v": 0.02}),
+    ],
+)
+def test_what_is_wrong_shows_in_its_channels_alone(log, changes, shows_in):
+    found = largest(left(PLANT.model(**changes), problem_of(log)))
+    for name, value in found.items():
+        if name in shows_in:
+            assert value > shows_in[name], name
+        else:
+            assert value < 1e-9, name
+
+
+def test_what_windows_begin_with_is_taken_out(log):
+    """A constant offset of v and v_bat, offset and slope of p, a constant turn of q in the world."""
+    problem = problem_of(log)
+    window = problem.channels["v"].window
+    offsets = np.random.default_rng(0).normal(size=(window.max() + 1, 3))
+    turns = Rotation.from_rotvec(0.3 * np.random.default_rng(1).normal(size=(window.max() + 1, 3)))
+    window_q = problem.channels["q"].window
+    attitude = turns[window_q] * Rotation.from_quat(problem.record.quat, scalar_first=True)
+    channels = dict(problem.channels)
+    for name, values in (("v", offsets[window]), ("v_bat", 1.7)):
+        channels[name] = channels[name]._replace(measured=channels[name].measured + values)
+    channels["q"] = channels["q"]._replace(measured=attitude.as_quat(scalar_first=True))
+    assert max(largest(left(PLANT.model(), problem._replace(channels=channels))).values()) < 1e-8
+
+    problem = problem_of(log.without("v"))
+    place = problem.channels["p"]
+    time = np.cumsum(problem.record.step_s)[:, None]
+    moved = place.measured + offsets[place.window] + 3.0 * time * offsets[::-1][place.window]
+    problem = problem._replace(channels={"p": place._replace(measured=moved)})
+    assert largest(left(PLANT.model(), problem))["p"] < 1e-8
+
+
+def test_turning_the_world_about_the_vertical_changes_nothing(log):
+    """Everything measured in the world frame is turned by 70 degrees, with a model that is wrong."""
+    turn = Rotation.from_euler("z", 70.0, degrees=True)
+    quat = turn * Rotation.from_quat(log["q"], scalar_first=True)
+    channels = {name: turn.apply(log[name]) for name in ("p", "v", "a")}
+    turned = replace(log, channels={**log.channels, **channels, "q": quat.as_quat(scalar_first=True)})
+    model = PLANT.model(tau=np.full(4, 0.04), effects=(LinearDrag(0.2, 0.1, 0.3),))
+    before, after = left(model, problem_of(log)), left(model, problem_of(turned))
+    for name in ("w", "f", "v_bat"):
+        np.testing.assert_allclose(after[name], before[name], atol=1e-9)
+    for name in ("v", "q"):
+        np.testing.assert_allclose(after[name], turn.apply(np.array(before[name])), atol=1e-9)
+
+
+@pytest.mark.parametrize("is_one_flight", [False, True])
+def test_held_out_measurements_do_not_enter(log, is_one_flight):
+    """Nor do they where blocks are cut from one flight: no step is judged that began in a held-out row."""
+    if is_one_flight:
+        log = replace(log, time=np.arange(len(log)) * 0.01, segment=np.zeros(len(log), int))
+    judged = ~held_out_rows(log)
+    rng = np.random.default_rng(0)
+    spoilt = {name: values.copy() for name, values in log.channels.items()}
+    for name in ("p", "v", "a", "w", "v_bat"):
+        spoilt[name][~judged] += rng.normal(size=spoilt[name][~judged].shape)
+    spoilt["q"][~judged] = Rotation.random(int((~judged).sum()), rng).as_quat(scalar_first=True)
+    model = PLANT.model(tau=np.full(4, 0.04))
+    before = left(model, problem_of(log, judged))
+    after = left(model, problem_of(replace(log, channels=spoilt), judged))
+    for name, values in before.items():
+        np.testing.assert_allclose(after[name], values, atol=1e-9, err_msg=name)
+        assert np.abs(values[:6000][judged]).max() > 0.0 or name == "v_bat"
+        np.testing.assert_array_equal(values[:6000][~judged], 0.0)
+
+
+def test_windows_with_one_or_two_rows_that_count_leave_nothing(log):
+    problem = problem_of(log, np.arange(len(log)) % 250 == 60)
+    found = largest(left(PLANT.model(tau=np.full(4, 0.04)), problem))
+    assert max(found["v"], found["q"]) < 1e-12 and found["w"] > 0.01
+    problem = problem_of(log.without("v"), np.isin(np.arange(len(log)) % 250, [60, 61]))
+    assert largest(left(PLANT.model(tau=np.full(4, 0.04)), problem))["p"] < 1e-9

@@ -1,0 +1,75 @@
+"""Sensors add the noise that they state, in the steps that they state, and lose rows."""
+
+import numpy as np
+import pytest
+from handout_plant import GRAVITY, HandoutPlant, excited, rotation
+from scipy.spatial.transform import Rotation
+
+from flytrack_sysid import sensors
+from flytrack_sysid.log import FlightLog
+
+
+@pytest.fixture(scope="module")
+def truth() -> FlightLog:
+    return excited(HandoutPlant())
+
+
+def matched(truth: FlightLog, measured: FlightLog) -> np.ndarray:
+    """Return the rows of the truth that were measured."""
+    key = np.round(truth.time * 100).astype(int) + 1000 * truth.segment
+    return np.isin(key, np.round(measured.time * 100).astype(int) + 1000 * measured.segment)
+
+
+def test_noise_is_as_stated(truth):
+    log = sensors.measure(truth, 2.0, GRAVITY, np.random.default_rng(0))
+    kept = matched(truth, log)
+    assert "uprev" not in log and "a" not in log
+    assert len(log) == kept.sum() and 0.03 < 1.0 - kept.mean() < 0.05
+    np.testing.assert_array_equal(log["u"], truth["u"][kept])
+    force = sensors.specific_force_b(truth, GRAVITY)[kept]
+    stated = {
+        "w": (truth["w"][kept], sensors.GYRO_NOISE),
+        "f": (force, sensors.ACCELEROMETER_NOISE),
+        "v": (truth["v"][kept], sensors.VELOCITY_NOISE),
+        "p": (truth["p"][kept], sensors.POSITION_NOISE),
+    }
+    for name, (values, noise) in stated.items():
+        left = log[name] - values
+        np.testing.assert_allclose(left.std(axis=0), 2.0 * noise, rtol=0.05, err_msg=name)
+        assert np.abs(left.mean(axis=0)).max() < 0.1 * noise, name
+    turn = Rotation.from_quat(truth["q"][kept], scalar_first=True).inv() * Rotation.from_quat(
+        log["q"], scalar_first=True
+    )
+    np.testing.assert_allclose(np.rad2deg(turn.as_rotvec()).std(axis=0), 1.0, rtol=0.05)
+    np.testing.assert_allclose(np.linalg.norm(log["q"], axis=1), 1.0, rtol=1e-12)
+
+
+def test_without_noise_only_the_steps_of_numbers_are_left(truth):
+    log = sensors.measure(truth, 0.0, GRAVITY, np.random.default_rng(0))
+    assert len(log) == len(truth)
+    steps = {
+        "w": sensors.GYRO_STEP,
+        "v": sensors.VELOCITY_STEP,
+        "p": sensors.POSITION_STEP,
+        "v_bat": sensors.BATTERY_STEP,
+    }
+    for name, step in steps.items():
+        off = np.abs(log[name] - truth[name])
+        assert 0.4 * step < off.max() <= 0.5001 * step, name
+        np.testing.assert_allclose(log[name] / step, np.round(log[name] / step), atol=1e-6)
+
+
+def test_accelerometer_measures_what_is_not_gravity_in_the_attitude_before(truth):
+    force = sensors.specific_force_b(truth, GRAVITY)
+    before = rotation(truth["q"][:-1])
+    expected = np.einsum("nji,nj->ni", before, truth["a"][1:] + np.array([0.0, 0.0, GRAVITY]))
+    inside = ~truth.is_start()[1:]
+    np.testing.assert_allclose(force[1:][inside], expected[inside], atol=1e-12)
+    # Without drag that is thrust alone.
+    np.testing.assert_allclose(force[1:][inside][:, :2], 0.0, atol=1e-9)
+    hover = FlightLog(
+        np.zeros(1),
+        {"a": np.zeros((1, 3)), "q": np.array([[1.0, 0.0, 0.0, 0.0]]), "u": np.zeros((1, 4))},
+        np.zeros(1, int),
+    )
+    np.testing.assert_allclose(sensors.specific_force_b(hover, GRAVITY), [[0.0, 0.0, GRAVITY]])
