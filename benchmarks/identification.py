@@ -170,7 +170,8 @@ def report(
             "",
             "The interval is asked of four lags and six coefficients of every plant; the aim is "
             f"{COVERAGE_AIM[0]:.0%} to {COVERAGE_AIM[1]:.0%}.",
-            "Clean logs leave rounding only, which intervals of noise do not describe.",
+            "Clean logs leave rounding only, which intervals of noise do not describe. The largest times",
+            "include compiling anew for logs of another length.",
             "",
             "Clean logs, held-out part: the largest one-step error of any plant, over the change in a step "
             "(p, v, q)",
