@@ -81,10 +81,10 @@ def collective_thrust(thrust_action: Scalar, battery_v: Scalar, coeffs: jax.Arra
     return polynomial + volt * (coeffs[4] + u * coeffs[5])
 
 
-def lag(applied: Action, command: Action, dt: Scalar, tau: jax.Array) -> Action:
+def lag(applied: Action, command: Action, dt: Scalar, tau: Any) -> Action:
     """Return the applied action after ``dt`` seconds of first-order lag towards a held command.
 
-    ``tau`` has shape (4,), s. Exact for a command held over the step; handout, equation 1.
+    ``tau``: four time constants, s. Exact for a command held over the step; handout, equation 1.
     """
     # One by one: batched models have time constants that are no array of four.
     blend = [1.0 - jnp.exp(-dt / tau[i]) for i in range(ACTION_SIZE)]
@@ -137,14 +137,15 @@ def advance(
     def fold(stage: str, value: Any) -> Any:  # with what is known of the flight by then
         return effects.fold(stage, params.effects, memories, value, flight)
 
-    applied = compute_once(lag(drone.applied, fold("command", command), dt, params.tau))
+    tau = fold("lag", Action(*(params.tau[i] for i in range(ACTION_SIZE))))
+    applied = compute_once(lag(drone.applied, fold("command", command), dt, tau))
     flight = flight._replace(applied=applied, body_axes_w=compute_once(drone.quat.axes()))
     rates_b = fold("rates", body_rates(applied, params.max_rate))
-    flight = flight._replace(rates_b=rates_b)
+    still = Vec3(0.0, 0.0, 0.0)
+    air_w = compute_once(fold("air", still)) if effects.acts(params.effects, "air") else still
+    flight = flight._replace(rates_b=rates_b, air_w=air_w)
     thrust = fold("thrust", collective_thrust(applied.thrust, drone.battery_v, params.thrust_coeffs))
     flight = flight._replace(thrust_acc=compute_once(thrust / params.m))
-    if effects.acts(params.effects, "force"):
-        flight = flight._replace(air_w=compute_once(fold("air", Vec3(0.0, 0.0, 0.0))))
     acc_w = compute_once(_acceleration(flight, params, memories))
     after = Drone(
         pos_w=drone.pos_w + drone.vel_w.scale(dt) + acc_w.scale(0.5 * dt * dt),
@@ -153,7 +154,7 @@ def advance(
         quat=integrate_attitude(drone.quat, rates_b, dt),
         rates_b=rates_b,
         applied=applied,
-        battery_v=drone.battery_v - params.battery_drain_v_per_min / SECONDS_PER_MINUTE * dt,
+        battery_v=fold("battery", drone.battery_v - params.battery_drain_v_per_min / SECONDS_PER_MINUTE * dt),
     )
     return compute_once(after), effects.remember(params.effects, memories, flight)
 

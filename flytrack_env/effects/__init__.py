@@ -10,23 +10,43 @@ import numpy as np
 
 from flytrack_env.effects.base import STAGES, Effect, Flight, Range
 from flytrack_env.effects.command_delay import COMMAND_DELAY, CommandDelay
+from flytrack_env.effects.ground_effect import GROUND_EFFECT, GroundEffect
 from flytrack_env.effects.linear_drag import LINEAR_DRAG, LinearDrag
 from flytrack_env.effects.quadratic_drag import QUADRATIC_DRAG, QuadraticDrag
+from flytrack_env.effects.rate_expo import RATE_EXPO, RateExpo
+from flytrack_env.effects.rate_saturation import RATE_SATURATION, RateSaturation
 from flytrack_env.effects.rate_scale import RATE_SCALE, RateScale
+from flytrack_env.effects.rate_slew_limit import RATE_SLEW_LIMIT, RateSlewLimit
 from flytrack_env.effects.rotor_drag import ROTOR_DRAG, RotorDrag
+from flytrack_env.effects.second_order_rates import SECOND_ORDER_RATES, SecondOrderRates
+from flytrack_env.effects.thrust_lag_asymmetry import THRUST_LAG_ASYMMETRY, ThrustLagAsymmetry
 from flytrack_env.effects.thrust_scale import THRUST_SCALE, ThrustScale
+from flytrack_env.effects.thrust_tilt import THRUST_TILT, ThrustTilt
+from flytrack_env.effects.translational_lift import TRANSLATIONAL_LIFT, TranslationalLift
+from flytrack_env.effects.voltage_sag import VOLTAGE_SAG, VoltageSag
 from flytrack_env.effects.wind import WIND, Wind
+from flytrack_env.effects.yaw_reaction import YAW_REACTION, YawReaction
 from flytrack_env.state import Drone
 
 # The order in which effects of one stage are folded, and that of a model's effects.
 EFFECTS: tuple[Effect, ...] = (
     COMMAND_DELAY,
+    THRUST_LAG_ASYMMETRY,
+    RATE_EXPO,
     RATE_SCALE,
-    THRUST_SCALE,
+    RATE_SATURATION,
+    YAW_REACTION,
+    SECOND_ORDER_RATES,
+    RATE_SLEW_LIMIT,
     WIND,
+    THRUST_SCALE,
+    TRANSLATIONAL_LIFT,
+    GROUND_EFFECT,
     LINEAR_DRAG,
     QUADRATIC_DRAG,
     ROTOR_DRAG,
+    THRUST_TILT,
+    VOLTAGE_SAG,
 )
 ROUNDING = 1e-5  # of float32 times
 BY_NAME = {effect.name: effect for effect in EFFECTS}
@@ -104,13 +124,23 @@ __all__ = [
     "CommandDelay",
     "Effect",
     "Flight",
+    "GroundEffect",
     "LinearDrag",
     "QuadraticDrag",
     "Range",
+    "RateExpo",
+    "RateSaturation",
     "RateScale",
+    "RateSlewLimit",
     "RotorDrag",
+    "SecondOrderRates",
+    "ThrustLagAsymmetry",
     "ThrustScale",
+    "ThrustTilt",
+    "TranslationalLift",
+    "VoltageSag",
     "Wind",
+    "YawReaction",
     "acts",
     "check_parameters",
     "effect_of",

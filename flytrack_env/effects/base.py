@@ -9,10 +9,12 @@ carries the parameters of the effects that it has; the simulator folds them, in 
 stage      value                  what it is                                             acts on
 =========  =====================  =====================================================  ============
 command    ``Action``             the command that the rate loop and motors get          command
+lag        ``Action``, s          time constants of the first-order lag                  actuator
 rates      ``Vec3``, rad/s        body rates of the lagged action                        actuator
-thrust     scalar, N              collective thrust along body z                         actuator
 air        ``Vec3``, m/s, world   velocity of the air                                    force
+thrust     scalar, N              collective thrust along body z                         actuator
 force      ``Vec3``, m/s^2, body  specific force beside thrust; starts at 0              force
+battery    scalar, V              battery voltage after the step                         battery
 =========  =====================  =====================================================  ============
 
 A hook takes the effect's parameters, its memory, the value so far and the ``Flight``, and returns the
@@ -27,7 +29,15 @@ from flytrack_env.quaternion import Scalar, Vec3
 from flytrack_env.state import Action, Drone
 
 # The stages in the order in which a step passes them, and where an effect that hooks in there acts.
-STAGES = {"command": "command", "rates": "actuator", "thrust": "actuator", "air": "force", "force": "force"}
+STAGES = {
+    "command": "command",
+    "lag": "actuator",
+    "rates": "actuator",
+    "air": "force",
+    "thrust": "actuator",
+    "force": "force",
+    "battery": "battery",
+}
 
 
 class Flight(NamedTuple):
@@ -35,8 +45,8 @@ class Flight(NamedTuple):
 
     drone: before the step. command: as given, before any effect. dt: s.
     applied: the lagged action after the step. body_axes_w: the body's x, y, z axes before the step.
-    rates_b: after the stage rates, rad/s. thrust_acc: collective thrust over mass, after the stage thrust,
-    m/s^2. air_w: after the stage air, m/s.
+    rates_b: after the stage rates, rad/s. air_w: after the stage air, m/s. thrust_acc: collective thrust
+    over mass, after the stage thrust, m/s^2.
     """
 
     drone: Drone
@@ -45,11 +55,11 @@ class Flight(NamedTuple):
     applied: Action | None = None
     body_axes_w: tuple[Vec3, Vec3, Vec3] | None = None
     rates_b: Vec3 | None = None
-    thrust_acc: Scalar | None = None
     air_w: Vec3 | None = None
+    thrust_acc: Scalar | None = None
 
     def airspeed_b(self) -> Vec3:
-        """Return the velocity through the air, body frame, m/s; from the stage force on."""
+        """Return the velocity through the air, body frame, m/s; from the stage thrust on."""
         airspeed_w = self.drone.vel_w - self.air_w
         return Vec3(*(axis.dot(airspeed_w) for axis in self.body_axes_w))
 
@@ -73,8 +83,9 @@ class Effect:
     """One effect; at least one hook is given.
 
     name: as in model files. parameters: the NamedTuple class; its defaults are neutral. ranges: of each
-    parameter. equation, source: for people. command, rates, thrust, air, force: hooks at these stages.
-    most_steps: of parameters that are times, how many steps of time they may last.
+    parameter. equation, source: for people. command, lag, rates, air, thrust, force, battery: hooks at these
+    stages. most_steps: of parameters that are times, how many steps of time they may last.
+    probes: values at which to look for the effect, of parameters whose slope at neutral is 0 or one-sided.
     start: (parameters, drone) -> memory of an episode that begins; no memory if None.
     remember: (parameters, memory, flight) -> memory after a step.
     """
@@ -85,11 +96,14 @@ class Effect:
     equation: str
     source: str
     most_steps: Mapping[str, int] = field(default_factory=dict)
+    probes: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
     command: Hook | None = None
+    lag: Hook | None = None
     rates: Hook | None = None
-    thrust: Hook | None = None
     air: Hook | None = None
+    thrust: Hook | None = None
     force: Hook | None = None
+    battery: Hook | None = None
     start: Callable[[Any, Drone], Any] | None = None
     remember: Callable[[Any, Any, Flight], Any] | None = None
 
@@ -100,5 +114,5 @@ class Effect:
 
     @property
     def acts_on(self) -> tuple[str, ...]:
-        """Where the effect acts: command, actuator or force."""
+        """Where the effect acts: command, actuator, force or battery."""
         return tuple(dict.fromkeys(STAGES[stage] for stage in self.stages))

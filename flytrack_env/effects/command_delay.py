@@ -61,6 +61,7 @@ COMMAND_DELAY = Effect(
     ranges={"delay_s": Range(0.0, 0.04, "s")},
     equation="u(t) = u(t - delay), averaged over the step",
     most_steps={"delay_s": BUFFER_STEPS},
+    probes={"delay_s": (0.005, 0.01, 0.02, 0.03)},
     source="assumption: the same for all four commands, constant within a flight",
     command=delayed,
     start=start,

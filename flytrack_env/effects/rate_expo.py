@@ -1,0 +1,28 @@
+"""A cubic stick curve that the model does not know: gentle about the centre, the same at full stick."""
+
+from typing import NamedTuple
+
+from flytrack_env.effects.base import Effect, Flight, Range
+from flytrack_env.quaternion import Scalar, Vec3
+
+
+class RateExpo(NamedTuple):
+    """Cubic part of the stick curve, 1."""
+
+    expo: Scalar = 0.0
+
+
+def _rates(curve: RateExpo, memory: None, rates_b: Vec3, flight: Flight) -> Vec3:
+    sticks = flight.applied[:3]
+    linear = 1.0 - curve.expo
+    return Vec3(*(r * (linear + curve.expo * (u * u)) for r, u in zip(rates_b, sticks, strict=True)))
+
+
+RATE_EXPO = Effect(
+    name="rate_expo",
+    parameters=RateExpo,
+    ranges={"expo": Range(-0.9, 0.9, "1")},
+    equation="omega = max_rate ((1 - expo) u + expo u^3), per axis, u the lagged stick",
+    source='the "expo" of radio transmitters; assumption: the same on all axes, behind the lag',
+    rates=_rates,
+)

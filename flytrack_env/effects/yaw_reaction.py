@@ -1,0 +1,27 @@
+"""A yaw rate that is kicked when the thrust changes: propellers that spin up turn the frame the other way."""
+
+from typing import NamedTuple
+
+from flytrack_env.effects.base import Effect, Flight, Range
+from flytrack_env.quaternion import Scalar, Vec3
+
+
+class YawReaction(NamedTuple):
+    """Yaw angle by which a change of the applied thrust action by 1 turns the drone, rad."""
+
+    angle: Scalar = 0.0
+
+
+def _rates(reaction: YawReaction, memory: None, rates_b: Vec3, flight: Flight) -> Vec3:
+    change = (flight.applied.thrust - flight.drone.applied.thrust) / flight.dt
+    return rates_b._replace(z=rates_b.z + reaction.angle * change)
+
+
+YAW_REACTION = Effect(
+    name="yaw_reaction",
+    parameters=YawReaction,
+    ranges={"angle": Range(-0.2, 0.2, "rad")},
+    equation="omega_z += angle du/dt, u the applied thrust",
+    source="assumption: unequal spin-up of the two directions of rotation, in proportion to its speed",
+    rates=_rates,
+)
