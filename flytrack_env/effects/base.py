@@ -86,6 +86,7 @@ class Effect:
     parameter. equation, source: for people. command, lag, rates, air, thrust, force, battery: hooks at these
     stages. most_steps: of parameters that are times, how many steps of time they may last.
     probes: values at which to look for the effect, of parameters whose slope at neutral is 0 or one-sided.
+    groups: parameters that are looked for together; all of them if empty.
     start: (parameters, drone) -> memory of an episode that begins; no memory if None.
     remember: (parameters, memory, flight) -> memory after a step.
     """
@@ -104,6 +105,7 @@ class Effect:
     thrust: Hook | None = None
     force: Hook | None = None
     battery: Hook | None = None
+    groups: tuple[tuple[str, ...], ...] = ()
     start: Callable[[Any, Drone], Any] | None = None
     remember: Callable[[Any, Any, Flight], Any] | None = None
 

@@ -39,6 +39,7 @@ WIND = Effect(
     },
     equation="v_air += v; f_b += R^T a",
     source="assumption: uniform and steady within a flight",
+    groups=(("a_x", "a_y", "a_z"), ("v_x", "v_y", "v_z")),
     air=_air,
     force=_force,
 )
