@@ -18,6 +18,7 @@ from flytrack_env.quaternion import Quaternion, Scalar, Vec3
 from flytrack_env.state import ACTION_SIZE, Action, Drone, pack, unpack, unpack_action
 
 SECONDS_PER_MINUTE = 60.0
+HELD_S = 1e6  # s, how long "for long" is: lags, leads and limits of the rates are over, to float32's rounding
 
 
 class ModelParameters(NamedTuple):
@@ -107,20 +108,37 @@ def integrate_attitude(quat: Quaternion, rates_b: Vec3, dt: Scalar) -> Quaternio
 
 def start_rates(drone: Drone, params: ModelParameters) -> Vec3:
     """Return the body rates, rad/s, of a drone that has flown with its applied action for long."""
-    flight = Flight(drone=drone, command=drone.applied, dt=0.0, applied=drone.applied)
+    rates_b = body_rates(drone.applied, params.max_rate)
+    if not effects.acts(params.effects, "rates"):
+        return rates_b
+    applied, axes = drone.applied, drone.quat.axes()
+    flight = Flight(drone=drone, command=applied, dt=HELD_S, applied=applied, body_axes_w=axes)
     memories = effects.start_memories(params.effects, drone)
-    return effects.fold("rates", params.effects, memories, body_rates(drone.applied, params.max_rate), flight)
+    flight = _with_thrust(flight, params, memories)
+    return effects.fold("rates", params.effects, memories, rates_b, flight)
 
 
-def _acceleration(flight: Flight, params: ModelParameters, memories: tuple[Any, ...]) -> Vec3:
-    """Return the acceleration, world, m/s^2: thrust, gravity, and the forces of effects."""
-    axes = flight.body_axes_w
-    acc_w = axes[2].scale(flight.thrust_acc) - Vec3(0.0, 0.0, params.g)
+def _with_thrust(flight: Flight, params: ModelParameters, memories: tuple[Any, ...]) -> Flight:
+    """Return the flight with what the stages air and thrust find out."""
+    air_w = Vec3(0.0, 0.0, 0.0)
+    if effects.acts(params.effects, "air"):
+        air_w = compute_once(effects.fold("air", params.effects, memories, air_w, flight))
+    flight = flight._replace(air_w=air_w)
+    thrust = collective_thrust(flight.applied.thrust, flight.drone.battery_v, params.thrust_coeffs)
+    thrust = effects.fold("thrust", params.effects, memories, thrust, flight)
+    return flight._replace(thrust_acc=compute_once(thrust / params.m))
+
+
+def _forces(flight: Flight, params: ModelParameters, memories: tuple[Any, ...]) -> tuple[Vec3, Vec3]:
+    """Return the acceleration, world, and the specific force, body, m/s^2: thrust and what effects add."""
+    axes, thrust_acc = flight.body_axes_w, flight.thrust_acc
+    acc_w = axes[2].scale(thrust_acc) - Vec3(0.0, 0.0, params.g)
     if not effects.acts(params.effects, "force"):
-        return acc_w
+        return acc_w, Vec3(jnp.zeros_like(thrust_acc), jnp.zeros_like(thrust_acc), thrust_acc)
     still = Vec3(0.0, 0.0, 0.0)
-    force_b = compute_once(effects.fold("force", params.effects, memories, still, flight))
-    return acc_w + (axes[0].scale(force_b.x) + axes[1].scale(force_b.y) + axes[2].scale(force_b.z))
+    beside_b = compute_once(effects.fold("force", params.effects, memories, still, flight))
+    acc_w = acc_w + (axes[0].scale(beside_b.x) + axes[1].scale(beside_b.y) + axes[2].scale(beside_b.z))
+    return acc_w, beside_b._replace(z=beside_b.z + thrust_acc)
 
 
 def advance(
@@ -140,13 +158,11 @@ def advance(
     tau = fold("lag", Action(*(params.tau[i] for i in range(ACTION_SIZE))))
     applied = compute_once(lag(drone.applied, fold("command", command), dt, tau))
     flight = flight._replace(applied=applied, body_axes_w=compute_once(drone.quat.axes()))
+    flight = _with_thrust(flight, params, memories)
     rates_b = fold("rates", body_rates(applied, params.max_rate))
-    still = Vec3(0.0, 0.0, 0.0)
-    air_w = compute_once(fold("air", still)) if effects.acts(params.effects, "air") else still
-    flight = flight._replace(rates_b=rates_b, air_w=air_w)
-    thrust = fold("thrust", collective_thrust(applied.thrust, drone.battery_v, params.thrust_coeffs))
-    flight = flight._replace(thrust_acc=compute_once(thrust / params.m))
-    acc_w = compute_once(_acceleration(flight, params, memories))
+    flight = flight._replace(rates_b=rates_b)
+    acc_w, force_b = _forces(flight, params, memories)
+    acc_w, flight = compute_once(acc_w), flight._replace(force_b=force_b)
     after = Drone(
         pos_w=drone.pos_w + drone.vel_w.scale(dt) + acc_w.scale(0.5 * dt * dt),
         vel_w=drone.vel_w + acc_w.scale(dt),
@@ -157,6 +173,48 @@ def advance(
         battery_v=fold("battery", drone.battery_v - params.battery_drain_v_per_min / SECONDS_PER_MINUTE * dt),
     )
     return compute_once(after), effects.remember(params.effects, memories, flight)
+
+
+class Reading(NamedTuple):
+    """What the sensors say after a step: body rates, rad/s, and specific force, m/s^2, body frame."""
+
+    rates_b: Vec3
+    force_b: Vec3
+
+
+def read_gyro(drone: Drone, memories: tuple[Any, ...], dt: Scalar, params: ModelParameters) -> Vec3:
+    """Return what the gyro says of a drone's body rates, rad/s.
+
+    memories: what effects remember of the flight up to this drone. dt: s, the step between readings.
+    """
+    flight = Flight(drone=drone, command=drone.applied, dt=dt, applied=drone.applied, rates_b=drone.rates_b)
+    return effects.fold("gyro", params.effects, memories, drone.rates_b, flight)
+
+
+def read_sensors(
+    before: Drone, after: Drone, memories: tuple[Any, ...], dt: Scalar, params: ModelParameters
+) -> Reading:
+    """Return what gyro and accelerometer say after a step of ``dt`` seconds.
+
+    The true specific force is that of the step, in the body frame before it, as ``advance`` has it.
+    memories: what effects remember *after* the step.
+    """
+    axes = before.quat.axes()
+    force_w = after.acc_w + Vec3(0.0, 0.0, params.g)
+    force_b = compute_once(Vec3(*(axis.dot(force_w) for axis in axes)))
+    flight = Flight(
+        drone=before,
+        command=after.applied,
+        dt=dt,
+        applied=after.applied,
+        body_axes_w=axes,
+        rates_b=after.rates_b,
+        force_b=force_b,
+    )
+    return Reading(
+        rates_b=read_gyro(after, memories, dt, params),
+        force_b=effects.fold("accelerometer", params.effects, memories, force_b, flight),
+    )
 
 
 def step(x: jax.Array, u: jax.Array, dt: Scalar, params: ModelParameters) -> jax.Array:

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from flytrack_env.dynamics import ModelParameters, nominal_parameters
+from flytrack_env.effects import acts
 from flytrack_env.episodes import EpisodicEnvironment, without_nan
 from flytrack_env.fusion import compute_once
 from flytrack_env.model_file import load_model
@@ -94,7 +95,13 @@ class FlyTrack(EpisodicEnvironment):
         return params.model
 
     def observe_drone(self, drone: Drone, state: EnvState, params: EnvParams) -> list[jax.Array]:
-        """Return the observation before the gate to be flown, float32 scalars."""
+        """Return the observation before the gate to be flown, float32 scalars.
+
+        Body rates are the gyro's reading where the model has effects on it and the plant is the simulator.
+        """
+        if acts(params.model.effects, "gyro") and hasattr(self.plant, "read_gyro"):
+            rates_b = self.plant.read_gyro(state.plant, drone, params.dt, params.model)
+            drone = drone._replace(rates_b=rates_b)
         return observe_race(drone, state.race.gate, state.race.next_gate)
 
     def is_truncated(self, state: EnvState, params: EnvParams) -> jax.Array:

@@ -51,7 +51,8 @@ OBSERVATION_LIMIT = np.concatenate([np.full(entry.size, entry.limit, np.float32)
 def observe_race(drone: Drone, gate: GateFrame, next_gate: GateFrame) -> list[jax.Array]:
     """Return the observation of a drone before ``gate``: OBSERVATION_SIZE scalars, float32.
 
-    Scalars, so that wrappers can add to them and they are stacked once: a concatenation of batches is slow.
+    ``drone`` is as the sensors report it. Scalars, so that wrappers can add to them and they are stacked
+    once: a concatenation of batches is slow.
     """
     left = compute_once(gate.left())
     frame = (gate.forward, left, gate.up)

@@ -7,9 +7,9 @@ delay buffer, say); whoever holds a state asks for the drone in it.
 
 from typing import Any, NamedTuple, Protocol
 
-from flytrack_env.dynamics import ModelParameters, advance
+from flytrack_env.dynamics import ModelParameters, advance, read_gyro
 from flytrack_env.effects import start_memories
-from flytrack_env.quaternion import Scalar
+from flytrack_env.quaternion import Scalar, Vec3
 from flytrack_env.state import Action, Drone
 
 
@@ -17,7 +17,8 @@ class Plant(Protocol):
     """Pure functions for one drone; all of them work under ``jit``, ``vmap`` and ``scan``.
 
     A plant with everything baked in says so with an attribute ``dt``, its only step of time, s: it does
-    not look at ``model`` either.
+    not look at ``model`` either. A plant whose gyro can say something else than the drone's rates has a
+    ``read_gyro`` as the simulator's.
     """
 
     def reset(self, drone: Drone, model: ModelParameters) -> Any:
@@ -53,3 +54,7 @@ class Simulator:
     def drone(self, state: SimulatorState) -> Drone:
         """Return the drone."""
         return state.drone
+
+    def read_gyro(self, state: SimulatorState, drone: Drone, dt: Scalar, model: ModelParameters) -> Vec3:
+        """Return what the gyro says of a drone's body rates, rad/s; what it remembers is the state's."""
+        return read_gyro(drone, state.memories, dt, model)

@@ -11,7 +11,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from flytrack_env import effects
-from flytrack_env.dynamics import ModelParameters, nominal_parameters, step
+from flytrack_env.dynamics import ModelParameters, nominal_parameters, read_sensors, start_rates, step
 from flytrack_env.effects import (
     EFFECTS,
     CommandDelay,
@@ -55,11 +55,12 @@ def moving_drone(rng: np.random.Generator) -> Drone:
 
 @jax.jit
 def fly(drone: Drone, commands: jax.Array, model: ModelParameters) -> jax.Array:
-    """Return the packed states after each command, (num_steps, 21)."""
+    """Return the packed states after each command, gyro and accelerometer behind them, (num_steps, 27)."""
 
     def one(state: Any, action: jax.Array) -> tuple[Any, jax.Array]:
-        state = SIMULATOR.step(state, unpack_action(action), DT, model)
-        return state, pack(SIMULATOR.drone(state))
+        after = SIMULATOR.step(state, unpack_action(action), DT, model)
+        reading = read_sensors(state.drone, after.drone, after.memories, DT, model)
+        return after, jnp.concatenate([pack(after.drone), jnp.stack([*reading.rates_b, *reading.force_b])])
 
     return jax.lax.scan(one, SIMULATOR.reset(drone, model), commands)[1]
 
@@ -113,10 +114,12 @@ def test_probes_show_the_effect(effect: Effect) -> None:
             assert not np.array_equal(fly(drone, full_stick, probed), fly(drone, full_stick, NOMINAL))
 
 
-# Components of the state after one step that an effect at this stage may change.
-FORCE = {*range(0, 9)}
-CHANGES = {"command": set(range(21)) - {20}, "rates": {*range(9, 16)}, "thrust": FORCE, "air": FORCE}
+# Components of the state and of the sensors' readings after one step that an effect at this stage may change.
+GYRO, ACCELEROMETER = {*range(21, 24)}, {*range(24, 27)}
+FORCE = {*range(0, 9)} | ACCELEROMETER
+CHANGES = {"command": set(range(27)) - {20}, "rates": {*range(9, 16)} | GYRO, "thrust": FORCE, "air": FORCE}
 CHANGES |= {"lag": CHANGES["command"], "force": FORCE, "battery": {20}}
+CHANGES |= {"gyro": GYRO, "accelerometer": ACCELEROMETER}
 
 
 @OVER_EFFECTS
@@ -125,6 +128,16 @@ def test_changes_what_it_says_and_nothing_else(effect: Effect) -> None:
     changed = set(np.flatnonzero((with_effect != random_flight([], num_steps=1)).any(axis=0)))
     allowed = set().union(*(CHANGES[stage] for stage in effect.stages))
     assert changed and changed <= allowed
+
+
+SENSOR_EFFECTS = [effect for effect in EFFECTS if effect.acts_on == ("sensor",)]
+
+
+def test_sensor_effects_change_readings_and_never_the_flight() -> None:
+    assert len(SENSOR_EFFECTS) == sum("sensor" in effect.acts_on for effect in EFFECTS) > 0
+    sensing = random_flight([inside_ranges(effect, 0.8) for effect in SENSOR_EFFECTS])
+    np.testing.assert_array_equal(sensing[:, :21], random_flight([])[:, :21])
+    assert (sensing[:, 21:] != random_flight([])[:, 21:]).all(axis=0).all()
 
 
 @OVER_EFFECTS
@@ -192,6 +205,18 @@ def test_starts_have_the_rates_that_the_model_gives_their_sticks() -> None:
     held = env.drone(env.advance(state, drone.applied, env.default_params)[0])
     assert np.abs(drone.rates_b).max() > 0.1
     np.testing.assert_allclose(drone.rates_b, held.rates_b, rtol=1e-5)
+
+
+RATE_EFFECTS = [effect for effect in EFFECTS if effect.rates is not None]
+
+
+@pytest.mark.parametrize("effect", RATE_EFFECTS, ids=lambda effect: effect.name)
+def test_rates_of_a_start_stay_while_its_sticks_are_held(effect: Effect) -> None:
+    drone, model = moving_drone(np.random.default_rng(5)), NOMINAL.with_effects(inside_ranges(effect, 0.5))
+    drone = drone._replace(rates_b=start_rates(drone, model))
+    assert np.abs(drone.rates_b).max() > 0.1 and np.isfinite(drone.rates_b).all()
+    held = fly(drone, jnp.tile(jnp.stack(drone.applied), (3, 1)), model)[:, 13:16]
+    np.testing.assert_allclose(held, np.tile(drone.rates_b, (3, 1)), rtol=2e-3, atol=1e-5)
 
 
 # --- A model with effects -------------------------------------------------------------------------

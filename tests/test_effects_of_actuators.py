@@ -10,6 +10,8 @@ import pytest
 from flytrack_env.dynamics import ModelParameters, nominal_parameters
 from flytrack_env.effects import (
     GroundEffect,
+    MotorImbalance,
+    RateCrossCoupling,
     RateExpo,
     RateSaturation,
     RateSlewLimit,
@@ -137,3 +139,27 @@ def test_yaw_turns_by_an_angle_for_each_change_of_thrust():
     yaw_rate = flown(YawReaction(0.05), held(100, thrust=1.0))[:, 15]
     assert yaw_rate.sum() * DT == pytest.approx(0.05, rel=1e-3)  # u from 0 to 1
     assert np.abs(jnp.asarray(yaw_rate[-10:])).max() < 1e-3
+
+
+def test_roll_and_pitch_rates_leak_into_yaw():
+    rates = flown(RateCrossCoupling(0.1, -0.2), held(20, roll=0.5, pitch=-0.4, yaw=0.3))[:, 13:16]
+    plain = flown((), held(20, roll=0.5, pitch=-0.4, yaw=0.3))[:, 13:16]
+    np.testing.assert_array_equal(rates[:, :2], plain[:, :2])
+    np.testing.assert_allclose(rates[:, 2], plain @ [0.1, -0.2, 1.0], rtol=1e-5)
+
+
+@pytest.mark.parametrize("thrust", [-0.5, 0.0, 0.8])
+def test_roll_and_pitch_creep_with_thrust(thrust):
+    applied = (0.0, 0.0, 0.0, thrust)
+    state = flown(MotorImbalance(0.01, -0.02), held(1, thrust=thrust), applied=applied)[0]
+    thrust_acc = state[8] + 9.80665  # level: all of it is up
+    np.testing.assert_allclose(state[13:16], [0.01 * thrust_acc, -0.02 * thrust_acc, 0.0], rtol=1e-4)
+
+
+def test_a_second_lag_does_not_remember_the_imbalance_twice():
+    """Rates that settle at the bias: it goes into the lag, and comes out of it once."""
+    hover = (0.0, 0.0, 0.0, -0.5)
+    creeping = flown((MotorImbalance(0.01), SecondOrderRates(0.03)), held(60, thrust=-0.5), applied=hover)
+    direct = flown(MotorImbalance(0.01), held(60, thrust=-0.5), applied=hover)
+    assert creeping[0, 13] < 0.5 * direct[0, 13]
+    assert creeping[-1, 13] == pytest.approx(direct[-1, 13], rel=1e-3)

@@ -8,11 +8,19 @@ from typing import Any
 
 import numpy as np
 
+from flytrack_env.effects.accelerometer_bias import ACCELEROMETER_BIAS, AccelerometerBias
+from flytrack_env.effects.accelerometer_scale import ACCELEROMETER_SCALE, AccelerometerScale
 from flytrack_env.effects.base import STAGES, Effect, Flight, Range
 from flytrack_env.effects.command_delay import COMMAND_DELAY, CommandDelay
 from flytrack_env.effects.ground_effect import GROUND_EFFECT, GroundEffect
+from flytrack_env.effects.gyro_bias import GYRO_BIAS, GyroBias
+from flytrack_env.effects.gyro_scale import GYRO_SCALE, GyroScale
+from flytrack_env.effects.imu_latency import IMU_LATENCY, ImuLatency
+from flytrack_env.effects.imu_offset import IMU_OFFSET, ImuOffset
 from flytrack_env.effects.linear_drag import LINEAR_DRAG, LinearDrag
+from flytrack_env.effects.motor_imbalance import MOTOR_IMBALANCE, MotorImbalance
 from flytrack_env.effects.quadratic_drag import QUADRATIC_DRAG, QuadraticDrag
+from flytrack_env.effects.rate_cross_coupling import RATE_CROSS_COUPLING, RateCrossCoupling
 from flytrack_env.effects.rate_expo import RATE_EXPO, RateExpo
 from flytrack_env.effects.rate_saturation import RATE_SATURATION, RateSaturation
 from flytrack_env.effects.rate_scale import RATE_SCALE, RateScale
@@ -28,7 +36,8 @@ from flytrack_env.effects.wind import WIND, Wind
 from flytrack_env.effects.yaw_reaction import YAW_REACTION, YawReaction
 from flytrack_env.state import Drone
 
-# The order in which effects of one stage are folded, and that of a model's effects.
+# The order in which effects of one stage are folded, and that of a model's effects. What adds to the rates
+# comes before the loop that remembers them; the latency comes before all that is wrong with its readings.
 EFFECTS: tuple[Effect, ...] = (
     COMMAND_DELAY,
     THRUST_LAG_ASYMMETRY,
@@ -36,6 +45,8 @@ EFFECTS: tuple[Effect, ...] = (
     RATE_SCALE,
     RATE_SATURATION,
     YAW_REACTION,
+    MOTOR_IMBALANCE,
+    RATE_CROSS_COUPLING,
     SECOND_ORDER_RATES,
     RATE_SLEW_LIMIT,
     WIND,
@@ -47,6 +58,12 @@ EFFECTS: tuple[Effect, ...] = (
     ROTOR_DRAG,
     THRUST_TILT,
     VOLTAGE_SAG,
+    IMU_LATENCY,
+    IMU_OFFSET,
+    ACCELEROMETER_SCALE,
+    ACCELEROMETER_BIAS,
+    GYRO_SCALE,
+    GYRO_BIAS,
 )
 ROUNDING = 1e-5  # of float32 times
 BY_NAME = {effect.name: effect for effect in EFFECTS}
@@ -121,13 +138,21 @@ __all__ = [
     "BY_NAME",
     "EFFECTS",
     "STAGES",
+    "AccelerometerBias",
+    "AccelerometerScale",
     "CommandDelay",
     "Effect",
     "Flight",
     "GroundEffect",
+    "GyroBias",
+    "GyroScale",
+    "ImuLatency",
+    "ImuOffset",
     "LinearDrag",
+    "MotorImbalance",
     "QuadraticDrag",
     "Range",
+    "RateCrossCoupling",
     "RateExpo",
     "RateSaturation",
     "RateScale",

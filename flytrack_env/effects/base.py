@@ -3,19 +3,24 @@
 A file of this folder has a ``NamedTuple`` of parameters (numbers in SI units unless its range says
 otherwise, each with its **neutral** value as default) and one ``Effect`` that says how they act. A model
 carries the parameters of the effects that it has; the simulator folds them, in the order of
-``flytrack_env.effects.EFFECTS``, at the stages of a step:
+``flytrack_env.effects.EFFECTS``, at the stages of a step, and then of reading the sensors:
 
-=========  =====================  =====================================================  ============
-stage      value                  what it is                                             acts on
-=========  =====================  =====================================================  ============
-command    ``Action``             the command that the rate loop and motors get          command
-lag        ``Action``, s          time constants of the first-order lag                  actuator
-rates      ``Vec3``, rad/s        body rates of the lagged action                        actuator
-air        ``Vec3``, m/s, world   velocity of the air                                    force
-thrust     scalar, N              collective thrust along body z                         actuator
-force      ``Vec3``, m/s^2, body  specific force beside thrust; starts at 0              force
-battery    scalar, V              battery voltage after the step                         battery
-=========  =====================  =====================================================  ============
+=============  =====================  =================================================  ============
+stage          value                  what it is                                         acts on
+=============  =====================  =================================================  ============
+command        ``Action``             the command that the rate loop and motors get      command
+lag            ``Action``, s          time constants of the first-order lag              actuator
+air            ``Vec3``, m/s, world   velocity of the air                                force
+thrust         scalar, N              collective thrust along body z                     actuator
+rates          ``Vec3``, rad/s        body rates of the lagged action                    actuator
+force          ``Vec3``, m/s^2, body  specific force beside thrust; starts at 0          force
+battery        scalar, V              battery voltage after the step                     battery
+gyro           ``Vec3``, rad/s        what the gyro says of the body rates               sensor
+accelerometer  ``Vec3``, m/s^2, body  what the accelerometer says of the specific force  sensor
+=============  =====================  =================================================  ============
+
+What the sensors say changes nothing of the flight. They are read after the step, with what effects remember
+then (``flytrack_env.dynamics.read_sensors``); nobody reads them unless asked to.
 
 A hook takes the effect's parameters, its memory, the value so far and the ``Flight``, and returns the
 value. At neutral parameters it returns the value bit for bit, so that neutral equals absent.
@@ -32,11 +37,13 @@ from flytrack_env.state import Action, Drone
 STAGES = {
     "command": "command",
     "lag": "actuator",
-    "rates": "actuator",
     "air": "force",
     "thrust": "actuator",
+    "rates": "actuator",
     "force": "force",
     "battery": "battery",
+    "gyro": "sensor",
+    "accelerometer": "sensor",
 }
 
 
@@ -45,8 +52,12 @@ class Flight(NamedTuple):
 
     drone: before the step. command: as given, before any effect. dt: s.
     applied: the lagged action after the step. body_axes_w: the body's x, y, z axes before the step.
-    rates_b: after the stage rates, rad/s. air_w: after the stage air, m/s. thrust_acc: collective thrust
-    over mass, after the stage thrust, m/s^2.
+    air_w: after the stage air, m/s. thrust_acc: collective thrust over mass, after the stage thrust, m/s^2.
+    rates_b: after the stage rates, rad/s. force_b: specific force of the step, thrust and all else but
+    gravity, in the body frame before it, after the stage force, m/s^2.
+    At the stage accelerometer all of these are true values but air_w and thrust_acc, which are None, and the
+    applied action stands for the command. At the stage gyro only dt, applied and rates_b are those of the
+    step; drone is the one after it.
     """
 
     drone: Drone
@@ -54,9 +65,10 @@ class Flight(NamedTuple):
     dt: Scalar
     applied: Action | None = None
     body_axes_w: tuple[Vec3, Vec3, Vec3] | None = None
-    rates_b: Vec3 | None = None
     air_w: Vec3 | None = None
     thrust_acc: Scalar | None = None
+    rates_b: Vec3 | None = None
+    force_b: Vec3 | None = None
 
     def airspeed_b(self) -> Vec3:
         """Return the velocity through the air, body frame, m/s; from the stage thrust on."""
@@ -83,8 +95,9 @@ class Effect:
     """One effect; at least one hook is given.
 
     name: as in model files. parameters: the NamedTuple class; its defaults are neutral. ranges: of each
-    parameter. equation, source: for people. command, lag, rates, air, thrust, force, battery: hooks at these
-    stages. most_steps: of parameters that are times, how many steps of time they may last.
+    parameter. equation, source: for people. command, lag, air, thrust, rates, force, battery, gyro,
+    accelerometer: hooks at these stages.
+    most_steps: of parameters that are times, how many steps of time they may last.
     probes: values at which to look for the effect, of parameters whose slope at neutral is 0 or one-sided.
     groups: parameters that are looked for together; all of them if empty.
     start: (parameters, drone) -> memory of an episode that begins; no memory if None.
@@ -98,14 +111,16 @@ class Effect:
     source: str
     most_steps: Mapping[str, int] = field(default_factory=dict)
     probes: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
+    groups: tuple[tuple[str, ...], ...] = ()
     command: Hook | None = None
     lag: Hook | None = None
-    rates: Hook | None = None
     air: Hook | None = None
     thrust: Hook | None = None
+    rates: Hook | None = None
     force: Hook | None = None
     battery: Hook | None = None
-    groups: tuple[tuple[str, ...], ...] = ()
+    gyro: Hook | None = None
+    accelerometer: Hook | None = None
     start: Callable[[Any, Drone], Any] | None = None
     remember: Callable[[Any, Any, Flight], Any] | None = None
 
@@ -116,5 +131,5 @@ class Effect:
 
     @property
     def acts_on(self) -> tuple[str, ...]:
-        """Where the effect acts: command, actuator, force or battery."""
+        """Where the effect acts: command, actuator, force, battery or sensor."""
         return tuple(dict.fromkeys(STAGES[stage] for stage in self.stages))

@@ -30,20 +30,28 @@ def start(delay: CommandDelay, drone: Drone) -> PastCommands:
     return PastCommands((drone.applied,) * BUFFER_STEPS)
 
 
-def delayed(delay: CommandDelay, past: PastCommands, command: Action, flight: Flight) -> Action:
-    """Return the command that acts: the mean of what arrives during the step.
+def age_weights(delay_s: Scalar, dt: Scalar) -> list[jax.Array]:
+    """Return the share of the present value, of the one a step before, ... in one that is ``delay_s`` late.
 
-    A command held over its step and delayed by n + f steps acts as 1 - f parts of the n-th before the
-    present one and f parts of the one before that. Exact for whole steps; differentiable, at 0 from above.
+    BUFFER_STEPS + 1 shares that sum to 1. A delay of n + f steps, dt s each, is 1 - f parts of the value n
+    steps before and f parts of the one before that. Differentiable, at 0 from above.
     """
-    steps = jnp.minimum(delay.delay_s / flight.dt, float(BUFFER_STEPS))
+    steps = jnp.minimum(delay_s / dt, float(BUFFER_STEPS))
     whole = jnp.floor(steps)
     part = steps - whole
 
     def weight(age: int) -> jax.Array:
         return jnp.where(whole == age, 1.0 - part, jnp.where(whole == age - 1, part, 0.0))
 
-    weights = [weight(age) for age in range(BUFFER_STEPS + 1)]
+    return [weight(age) for age in range(BUFFER_STEPS + 1)]
+
+
+def delayed(delay: CommandDelay, past: PastCommands, command: Action, flight: Flight) -> Action:
+    """Return the command that acts: the mean of what arrives during the step.
+
+    A command is held over its step, so that ``age_weights`` are the shares of the step that each acts.
+    """
+    weights = age_weights(delay.delay_s, flight.dt)
     by_channel = zip(*(command, *past.commands), strict=True)
     return Action(
         *(sum(w * value for w, value in zip(weights, values, strict=True)) for values in by_channel)

@@ -1,0 +1,28 @@
+"""An accelerometer that shows a force where there is none: its offset at this temperature."""
+
+from typing import NamedTuple
+
+from flytrack_env.effects.base import Effect, Flight, Range
+from flytrack_env.quaternion import Scalar, Vec3
+
+
+class AccelerometerBias(NamedTuple):
+    """What the accelerometer adds along body x, y, z, m/s^2."""
+
+    x: Scalar = 0.0
+    y: Scalar = 0.0
+    z: Scalar = 0.0
+
+
+def _accelerometer(bias: AccelerometerBias, memory: None, force_b: Vec3, flight: Flight) -> Vec3:
+    return force_b + Vec3(*bias)
+
+
+ACCELEROMETER_BIAS = Effect(
+    name="accelerometer_bias",
+    parameters=AccelerometerBias,
+    ranges={axis: Range(-2.0, 2.0, "m/s^2") for axis in AccelerometerBias._fields},
+    equation="f_measured += (x, y, z)",
+    source="assumption: constant within a flight",
+    accelerometer=_accelerometer,
+)

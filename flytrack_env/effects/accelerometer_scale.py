@@ -1,0 +1,28 @@
+"""An accelerometer that shows too much or too little: the sensitivity of each of its axes."""
+
+from typing import NamedTuple
+
+from flytrack_env.effects.base import Effect, Flight, Range
+from flytrack_env.quaternion import Scalar, Vec3
+
+
+class AccelerometerScale(NamedTuple):
+    """Factor on what the accelerometer shows along body x, y, z, 1."""
+
+    x: Scalar = 1.0
+    y: Scalar = 1.0
+    z: Scalar = 1.0
+
+
+def _accelerometer(scale: AccelerometerScale, memory: None, force_b: Vec3, flight: Flight) -> Vec3:
+    return Vec3(scale.x * force_b.x, scale.y * force_b.y, scale.z * force_b.z)
+
+
+ACCELEROMETER_SCALE = Effect(
+    name="accelerometer_scale",
+    parameters=AccelerometerScale,
+    ranges={axis: Range(0.8, 1.2, "1") for axis in AccelerometerScale._fields},
+    equation="f_measured *= diag(x, y, z)",
+    source="assumption: linear up to the largest force, no leak between the axes",
+    accelerometer=_accelerometer,
+)

@@ -1,0 +1,28 @@
+"""A gyro that shows a turn where there is none: its offset since it was last at rest."""
+
+from typing import NamedTuple
+
+from flytrack_env.effects.base import Effect, Flight, Range
+from flytrack_env.quaternion import Scalar, Vec3
+
+
+class GyroBias(NamedTuple):
+    """What the gyro adds about body x, y, z, rad/s."""
+
+    x: Scalar = 0.0
+    y: Scalar = 0.0
+    z: Scalar = 0.0
+
+
+def _gyro(bias: GyroBias, memory: None, rates_b: Vec3, flight: Flight) -> Vec3:
+    return rates_b + Vec3(*bias)
+
+
+GYRO_BIAS = Effect(
+    name="gyro_bias",
+    parameters=GyroBias,
+    ranges={axis: Range(-0.5, 0.5, "rad/s") for axis in GyroBias._fields},
+    equation="omega_measured += (x, y, z)",
+    source="assumption: constant within a flight; the rate loop flies by the true rates",
+    gyro=_gyro,
+)

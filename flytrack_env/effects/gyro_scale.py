@@ -1,0 +1,28 @@
+"""A gyro that shows too fast or too slow a turn: the sensitivity of each of its axes."""
+
+from typing import NamedTuple
+
+from flytrack_env.effects.base import Effect, Flight, Range
+from flytrack_env.quaternion import Scalar, Vec3
+
+
+class GyroScale(NamedTuple):
+    """Factor on what the gyro shows about body x, y, z, 1."""
+
+    x: Scalar = 1.0
+    y: Scalar = 1.0
+    z: Scalar = 1.0
+
+
+def _gyro(scale: GyroScale, memory: None, rates_b: Vec3, flight: Flight) -> Vec3:
+    return Vec3(scale.x * rates_b.x, scale.y * rates_b.y, scale.z * rates_b.z)
+
+
+GYRO_SCALE = Effect(
+    name="gyro_scale",
+    parameters=GyroScale,
+    ranges={axis: Range(0.8, 1.2, "1") for axis in GyroScale._fields},
+    equation="omega_measured *= diag(x, y, z)",
+    source="assumption: linear up to the fastest turn, no leak between the axes",
+    gyro=_gyro,
+)

@@ -1,0 +1,78 @@
+"""Gyro and accelerometer that are late: their filters, the bus, the estimator's queue."""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+
+from flytrack_env.effects.base import Effect, Flight, Range
+from flytrack_env.effects.command_delay import BUFFER_STEPS, age_weights
+from flytrack_env.quaternion import Scalar, Vec3
+from flytrack_env.state import Drone
+
+
+class ImuLatency(NamedTuple):
+    """Delay of both sensors, s; need not be whole steps."""
+
+    latency_s: Scalar = 0.0
+
+
+class PastReadings(NamedTuple):
+    """True body rates, rad/s, and specific forces, m/s^2, body; the present ones first, then the past.
+
+    is_fresh: no step was made yet, and no force is known.
+    """
+
+    rates_b: tuple[Vec3, ...]
+    forces_b: tuple[Vec3, ...]
+    is_fresh: Scalar
+
+
+def start(latency: ImuLatency, drone: Drone) -> PastReadings:
+    """Return the memory of an episode that begins: rates that have been held for long, no forces."""
+    still = Vec3(*(jnp.zeros_like(rate) for rate in drone.rates_b))
+    size = BUFFER_STEPS + 1
+    return PastReadings((drone.rates_b,) * size, (still,) * size, jnp.ones_like(drone.battery_v, bool))
+
+
+def _late(latency: ImuLatency, present: Vec3, readings: tuple[Vec3, ...], flight: Flight) -> Vec3:
+    """Return the mean of the readings between which the delayed time lies, by their nearness."""
+    weights = age_weights(latency.latency_s, flight.dt)
+    by_axis = zip(*(present, *readings[1:]), strict=True)  # the first one remembered is the present one
+    return Vec3(*(sum(w * value for w, value in zip(weights, values, strict=True)) for values in by_axis))
+
+
+def _gyro(latency: ImuLatency, past: PastReadings, rates_b: Vec3, flight: Flight) -> Vec3:
+    return _late(latency, rates_b, past.rates_b, flight)
+
+
+def _accelerometer(latency: ImuLatency, past: PastReadings, force_b: Vec3, flight: Flight) -> Vec3:
+    return _late(latency, force_b, past.forces_b, flight)
+
+
+def remember(latency: ImuLatency, past: PastReadings, flight: Flight) -> PastReadings:
+    """Return the memory after a step; before the first, the force is taken to have been that of the first."""
+
+    def or_first(force_b: Vec3) -> Vec3:
+        pairs = zip(flight.force_b, force_b, strict=True)
+        return Vec3(*(jnp.where(past.is_fresh, first, known) for first, known in pairs))
+
+    return PastReadings(
+        rates_b=(flight.rates_b, *past.rates_b[:-1]),
+        forces_b=(flight.force_b, *(or_first(force_b) for force_b in past.forces_b[:-1])),
+        is_fresh=jnp.zeros_like(past.is_fresh),
+    )
+
+
+IMU_LATENCY = Effect(
+    name="imu_latency",
+    parameters=ImuLatency,
+    ranges={"latency_s": Range(0.0, 0.04, "s")},
+    equation="omega_measured(t) = omega(t - latency), f_measured(t) = f(t - latency), linear between steps",
+    source="assumption: the same for both sensors; what imu_offset adds is not late",
+    most_steps={"latency_s": BUFFER_STEPS},
+    probes={"latency_s": (0.005, 0.01, 0.02, 0.03)},
+    gyro=_gyro,
+    accelerometer=_accelerometer,
+    start=start,
+    remember=remember,
+)

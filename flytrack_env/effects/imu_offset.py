@@ -1,0 +1,33 @@
+"""An accelerometer away from the centre of mass, which turns show a force."""
+
+from typing import NamedTuple
+
+from flytrack_env.effects.base import Effect, Flight, Range
+from flytrack_env.quaternion import Scalar, Vec3
+
+
+class ImuOffset(NamedTuple):
+    """Where the accelerometer is, from the centre of mass along body x, y, z, m."""
+
+    x: Scalar = 0.0
+    y: Scalar = 0.0
+    z: Scalar = 0.0
+
+
+def _accelerometer(offset: ImuOffset, memory: None, force_b: Vec3, flight: Flight) -> Vec3:
+    """Return the reading with the mean rates of the step: there the change of rates is centred."""
+    arm_b, before = Vec3(*offset), flight.drone.rates_b
+    mean_rates_b = (before + flight.rates_b).scale(0.5)
+    angular_acc_b = (flight.rates_b - before).scale(1.0 / flight.dt)
+    centripetal = mean_rates_b.cross(mean_rates_b.cross(arm_b))
+    return force_b + (centripetal + angular_acc_b.cross(arm_b))
+
+
+IMU_OFFSET = Effect(
+    name="imu_offset",
+    parameters=ImuOffset,
+    ranges={axis: Range(-0.2, 0.2, "m") for axis in ImuOffset._fields},
+    equation="f_measured += omega x (omega x r) + domega/dt x r, omega the mean of before and after the step",
+    source="acceleration of a point of a rigid body; assumption: rates change evenly within the step",
+    accelerometer=_accelerometer,
+)
