@@ -1,0 +1,45 @@
+"""Plants with hidden effects, in equations that share nothing with the package: what a diagnosis has to name.
+
+``draw_base``, ``draw_effect``, ``draw_truth``, ``draw_outside``, ``draw_gust`` and ``draw_change`` draw a
+``Truth``; ``fly`` flies it, ``measure`` makes a log as sensors would have written it.
+"""
+
+from benchmarks.hidden.draws import (
+    CHANGES,
+    EFFECTS,
+    NAMES,
+    draw_base,
+    draw_change,
+    draw_effect,
+    draw_gust,
+    draw_truth,
+    with_effects,
+)
+from benchmarks.hidden.flights import CrashError, fly
+from benchmarks.hidden.kinds import FLIGHT_KINDS
+from benchmarks.hidden.noise import NOISE_KINDS, measure
+from benchmarks.hidden.outside import KINDS as OUTSIDE_KINDS
+from benchmarks.hidden.outside_draws import draw_outside
+from benchmarks.hidden.truth import Gust, Outside, Truth
+
+__all__ = [
+    "CHANGES",
+    "EFFECTS",
+    "FLIGHT_KINDS",
+    "NAMES",
+    "NOISE_KINDS",
+    "OUTSIDE_KINDS",
+    "CrashError",
+    "Gust",
+    "Outside",
+    "Truth",
+    "draw_base",
+    "draw_change",
+    "draw_effect",
+    "draw_gust",
+    "draw_outside",
+    "draw_truth",
+    "fly",
+    "measure",
+    "with_effects",
+]

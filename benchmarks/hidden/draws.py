@@ -1,0 +1,231 @@
+"""Random truths: the list of hidden effects, how large they are drawn, and the plants that have them.
+
+A **size** is what an effect is drawn by: log-uniform between what a flight of a minute barely shows under
+the noise of ``benchmarks.hidden.noise`` and what nobody overlooks. ``EFFECTS`` says what a size is of.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from benchmarks.hidden.truth import GRAVITY, Gust, Truth
+
+Values = dict[str, float]
+Rng = np.random.Generator
+
+
+class Drawn(NamedTuple):
+    """How an effect is drawn: smallest and largest size, unit, and its parameters at a size."""
+
+    low: float
+    high: float
+    unit: str
+    make: Callable[[float, Rng], Values]
+
+
+def _sign(rng: Rng) -> float:
+    return float(rng.choice([-1.0, 1.0]))
+
+
+def _signed(name: str) -> Callable[[float, Rng], Values]:
+    return lambda size, rng: {name: size * _sign(rng)}
+
+
+def _positive(name: str) -> Callable[[float, Rng], Values]:
+    return lambda size, rng: {name: size}
+
+
+def _direction(*names: str) -> Callable[[float, Rng], Values]:
+    """Return a maker of a vector of that length in a random direction."""
+
+    def make(size: float, rng: Rng) -> Values:
+        way = rng.standard_normal(len(names))
+        return dict(zip(names, (size * way / np.linalg.norm(way)).tolist(), strict=True))
+
+    return make
+
+
+def _factors(*names: str) -> Callable[[float, Rng], Values]:
+    """Return a maker of factors e^(+-size) on some axes, by half of it or more on the others."""
+
+    def make(size: float, rng: Rng) -> Values:
+        shares = rng.uniform(0.5, 1.0, len(names))
+        shares[rng.integers(len(names))] = 1.0
+        return {name: math.exp(size * share * _sign(rng)) for name, share in zip(names, shares, strict=True)}
+
+    return make
+
+
+def _log_factor(name: str) -> Callable[[float, Rng], Values]:
+    return lambda size, rng: {name: math.exp(size * _sign(rng))}
+
+
+def _drag(prefix: str, upright: tuple[float, float]) -> Callable[[float, Rng], Values]:
+    """Return a maker of coefficients of body x and y near the size, and of z as shares of it."""
+
+    def make(size: float, rng: Rng) -> Values:
+        shares = (1.0, rng.uniform(0.7, 1.4), rng.uniform(*upright))
+        return {f"{prefix}_{axis}": float(size * share) for axis, share in zip("xyz", shares, strict=True)}
+
+    return make
+
+
+def _ground(size: float, rng: Rng) -> Values:
+    return {"gain": size, "height_m": float(rng.uniform(0.2, 0.5))}
+
+
+def _oscillator(size: float, rng: Rng) -> Values:
+    return {"wn": 1.0 / size, "zeta": float(rng.uniform(0.4, 0.9))}
+
+
+# What a size is: see the unit, and the maker. Parameters and signs as in the package where laws agree.
+EFFECTS: dict[str, Drawn] = {
+    "command_delay": Drawn(0.002, 0.03, "s", _positive("delay_s")),
+    "thrust_lag_asymmetry": Drawn(0.1, 1.0, "|ln ratio|", _log_factor("ratio")),
+    "rate_expo": Drawn(0.02, 0.4, "1", _signed("expo")),
+    "rate_scale": Drawn(0.005, 0.15, "|ln factor|", _factors("roll", "pitch", "yaw")),
+    "rate_saturation": Drawn(0.03, 0.35, "share lost at full stick", _positive("lost")),
+    "rate_cross_coupling": Drawn(0.004, 0.08, "1", _direction("from_roll", "from_pitch")),
+    "motor_imbalance": Drawn(0.001, 0.015, "rad/s per m/s^2", _direction("roll", "pitch")),
+    "yaw_reaction": Drawn(0.005, 0.08, "rad", _signed("angle")),
+    "second_order_rates": Drawn(0.004, 0.03, "s, 1 / wn", _oscillator),
+    "rate_slew_limit": Drawn(0.004, 0.03, "s^2/rad", _positive("inverse")),
+    "wind": Drawn(0.08, 1.5, "m/s^2; with drag 6 times that in m/s", _direction("a_x", "a_y", "a_z")),
+    "thrust_scale": Drawn(0.01, 0.2, "|ln factor|", _log_factor("factor")),
+    "translational_lift": Drawn(0.015, 0.3, "share of thrust", _positive("gain")),
+    "ground_effect": Drawn(0.03, 0.3, "share of thrust", _ground),
+    "linear_drag": Drawn(0.03, 0.6, "1/s", _drag("d", (0.2, 1.0))),
+    "quadratic_drag": Drawn(0.003, 0.05, "1/m", _drag("k", (0.5, 2.0))),
+    "rotor_drag": Drawn(0.003, 0.05, "s/m", _positive("h")),
+    "thrust_tilt": Drawn(0.006, 0.12, "rad", _direction("towards_x", "towards_y")),
+    "voltage_sag": Drawn(0.1, 2.0, "V at full thrust", _positive("at_full_v")),
+    "accelerometer_bias": Drawn(0.08, 1.5, "m/s^2", _direction("x", "y", "z")),
+    "accelerometer_scale": Drawn(0.008, 0.12, "|ln factor|", _factors("x", "y", "z")),
+    "gyro_bias": Drawn(0.005, 0.1, "rad/s", _direction("x", "y", "z")),
+    "gyro_scale": Drawn(0.005, 0.1, "|ln factor|", _factors("x", "y", "z")),
+    "imu_offset": Drawn(0.005, 0.06, "m", _direction("x", "y", "z")),
+    "imu_latency": Drawn(0.002, 0.02, "s", _positive("latency_s")),
+}
+NAMES = tuple(EFFECTS)
+DRAGS = ("linear_drag", "quadratic_drag", "rotor_drag")
+AIR_PER_PUSH = 6.0  # m/s of wind per m/s^2 of its size, where there is drag
+# Base parameters: each log-uniform or uniform. Thrust is put together at REFERENCE_V.
+TAU_S = (0.015, 0.07)
+FULL_THRUST_N, IDLE_THRUST_N, REFERENCE_V = (28.0, 45.0), (0.3, 1.0), 23.0
+CURVED, CUBIC = (0.3, 0.75), (-0.03, 0.03)  # shares of the thrust between idle and full
+PER_VOLT, PER_VOLT_STICK = (0.4, 0.9), (0.3, 0.9)  # N/V
+GUST_STD, GUST_S = (0.3, 1.5), (0.3, 3.0)  # m/s^2, s
+GUST_RATE_STD = (0.02, 0.1)  # rad/s
+
+
+def _log_uniform(low: float, high: float, rng: Rng) -> float:
+    return float(math.exp(rng.uniform(math.log(low), math.log(high))))
+
+
+def draw_base(rng: Rng) -> Truth:
+    """Return a plant without effects: lags of 15 to 70 ms, a thrust curve of its own, else the handout's."""
+    tau = tuple(_log_uniform(*TAU_S, rng) for _ in range(4))
+    full, idle = rng.uniform(*FULL_THRUST_N), rng.uniform(*IDLE_THRUST_N)
+    curved, cubic = rng.uniform(*CURVED), rng.uniform(*CUBIC)
+    volt, both = rng.uniform(*PER_VOLT), rng.uniform(*PER_VOLT_STICK)
+    span = full - idle
+    # With s = (1 + u) / 2: idle + span ((1 - curved) s + curved s^2 + cubic (u^3 - u)) at the reference.
+    one = idle + span * ((1.0 - curved) / 2.0 + curved / 4.0)
+    linear = span * ((1.0 - curved) / 2.0 + curved / 2.0 - cubic)
+    coeffs = (
+        one - volt * REFERENCE_V,
+        linear - both * REFERENCE_V,
+        span * curved / 4.0,
+        span * cubic,
+        volt,
+        both,
+    )
+    return Truth(tau, tuple(float(value) for value in coeffs), gravity=GRAVITY)
+
+
+def draw_effect(name: str, rng: Rng, size: float | None = None, has_drag: bool = False) -> Values:
+    """Return parameters of an effect in a random direction, by a size that is drawn if not given.
+
+    has_drag: of the rest of the plant; wind is then moving air, else a steady push.
+
+    Raises:
+        KeyError: if there is no such effect.
+    """
+    drawn = EFFECTS[name]
+    size = _log_uniform(drawn.low, drawn.high, rng) if size is None else size
+    values = drawn.make(size, rng)
+    if name == "wind" and has_drag:
+        return {key.replace("a_", "v_"): AIR_PER_PUSH * value for key, value in values.items()}
+    return values
+
+
+def with_effects(truth: Truth, names: tuple[str, ...], rng: Rng) -> Truth:
+    """Return a plant that has these effects too, drawn in this order."""
+    has_drag = any(name in DRAGS for name in (*names, *truth.effects))
+    effects = {name: draw_effect(name, rng, has_drag=has_drag) for name in names}
+    return replace(truth, effects={**truth.effects, **effects})
+
+
+def draw_truth(rng: Rng, num_effects: int) -> Truth:
+    """Return a plant with so many different effects of the list."""
+    names = rng.choice(NAMES, size=num_effects, replace=False)
+    return with_effects(draw_base(rng), tuple(str(name) for name in names), rng)
+
+
+def draw_gust(rng: Rng) -> Gust:
+    """Return gusts of 0.3 to 1.5 m/s^2 that last for 0.3 to 3 s; half of them turn the drone as well."""
+    rate_std = _log_uniform(*GUST_RATE_STD, rng) if rng.random() < 0.5 else 0.0
+    return Gust(_log_uniform(*GUST_STD, rng), _log_uniform(*GUST_S, rng), rate_std)
+
+
+class Changed(NamedTuple):
+    """How a base parameter is changed: smallest and largest size, and the plant after it."""
+
+    low: float
+    high: float
+    make: Callable[[Truth, float, Rng], Truth]
+
+
+def _scaled(values: tuple[float, ...], size: float, rng: Rng) -> tuple[float, ...]:
+    factors = _factors(*(str(number) for number in range(len(values))))(size, rng)
+    return tuple(value * factor for value, factor in zip(values, factors.values(), strict=True))
+
+
+def _other_curve(truth: Truth, size: float, rng: Rng) -> Truth:
+    """Return a plant of another thrust curve: offset, slope and bend change, by size times half its span."""
+    half_span = 0.5 * (truth.thrust(1.0, REFERENCE_V) - truth.thrust(-1.0, REFERENCE_V))
+    way = rng.standard_normal(3)
+    moved = size * half_span * way / np.linalg.norm(way)
+    pairs = zip(truth.coeffs, (*moved.tolist(), 0.0, 0.0, 0.0), strict=True)
+    return replace(truth, coeffs=tuple(old + change for old, change in pairs))
+
+
+# Sizes are of |ln factor|, of all values of the parameter; of the thrust curve, a share of half its span.
+CHANGES: dict[str, Changed] = {
+    "tau": Changed(0.05, 0.6, lambda truth, size, rng: replace(truth, tau=_scaled(truth.tau, size, rng))),
+    "coeffs": Changed(0.005, 0.08, _other_curve),
+    "max_rate": Changed(
+        0.005, 0.15, lambda truth, size, rng: replace(truth, max_rate=_scaled(truth.max_rate, size, rng))
+    ),
+    "drain": Changed(
+        0.05, 0.6, lambda truth, size, rng: replace(truth, drain=_scaled((truth.drain,), size, rng)[0])
+    ),
+    "mass": Changed(
+        0.01, 0.2, lambda truth, size, rng: replace(truth, mass=_scaled((truth.mass,), size, rng)[0])
+    ),
+}
+
+
+def draw_change(truth: Truth, name: str, rng: Rng, size: float | None = None) -> Truth:
+    """Return a plant of which one base parameter is another: of ``CHANGES``.
+
+    size: as said there; drawn if not given.
+
+    Raises:
+        KeyError: if there is no such change.
+    """
+    change = CHANGES[name]
+    return change.make(truth, _log_uniform(change.low, change.high, rng) if size is None else size, rng)

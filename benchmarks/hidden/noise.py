@@ -1,0 +1,93 @@
+"""Sensors' noise: what a log shows of a flight when it is measured.
+
+All kinds have the same standard deviations, quantise, and lose rows; they differ in how errors are
+distributed ("heavy": Student's t of 3 degrees of freedom) and in whether they last ("coloured": AR(1)).
+"""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+from scipy import signal
+from scipy.spatial.transform import Rotation
+
+from flytrack_sysid.log import FlightLog
+
+GYRO_STD = 0.1  # rad/s
+ACCELEROMETER_STD = 1.5  # m/s^2
+VELOCITY_STD = 0.05  # m/s
+POSITION_STD = 0.01  # m
+ATTITUDE_STD = np.deg2rad(0.5)  # rad, about each body axis
+STD = {
+    "p": POSITION_STD,
+    "v": VELOCITY_STD,
+    "f": ACCELEROMETER_STD,
+    "q": ATTITUDE_STD,
+    "w": GYRO_STD,
+    "v_bat": 0.0,
+}
+# What the last digit of a logged number is: m, m/s, m/s^2, 1, rad/s, V; 16 bits over 32 g and 4000 deg/s.
+DIGIT = {
+    "p": 1e-3,
+    "v": 1e-3,
+    "f": 32.0 * 9.80665 / 2**16,
+    "q": 1e-4,
+    "w": np.deg2rad(4000.0) / 2**16,
+    "v_bat": 1e-2,
+}
+LOST_ROWS = 0.02  # share
+DEGREES_OF_FREEDOM = 3  # the fewest whole ones with a finite standard deviation
+COLOURS = (0.5, 0.95)  # coefficients of AR(1) that are drawn, per column
+
+Draw = Callable[[tuple[int, int], np.random.Generator], np.ndarray]
+
+
+def _white(shape: tuple[int, int], rng: np.random.Generator) -> np.ndarray:
+    return rng.standard_normal(shape)
+
+
+def _heavy(shape: tuple[int, int], rng: np.random.Generator) -> np.ndarray:
+    spread = np.sqrt(DEGREES_OF_FREEDOM / (DEGREES_OF_FREEDOM - 2))
+    return rng.standard_t(DEGREES_OF_FREEDOM, shape) / spread
+
+
+def _coloured(shape: tuple[int, int], rng: np.random.Generator) -> np.ndarray:
+    """Return AR(1) noise that has gone on for ever, each column with a coefficient of its own."""
+    columns = []
+    for fresh in rng.standard_normal(shape).T:
+        keep = rng.uniform(*COLOURS)
+        gain = np.sqrt(1.0 - keep**2)
+        # The filter's memory before the first row makes that of standard deviation 1 too.
+        column, _ = signal.lfilter([gain], [1.0, -keep], fresh, zi=[keep * rng.standard_normal()])
+        columns.append(column)
+    return np.stack(columns, axis=1)
+
+
+NOISES: dict[str, Draw] = {"sensors": _white, "heavy": _heavy, "coloured": _coloured}
+NOISE_KINDS = (*NOISES, "none")
+
+
+def measure(log: FlightLog, noise: str, rng: np.random.Generator) -> FlightLog:
+    """Return a flight as sensors log it: noisy, quantised, with rows lost; without acceleration.
+
+    noise: of ``NOISE_KINDS``; "none" only leaves out the acceleration, which no sensor tells.
+
+    Raises:
+        ValueError: if there is no such noise.
+    """
+    if noise not in NOISE_KINDS:
+        raise ValueError(f"noise: found {noise!r}, expected one of {', '.join(NOISE_KINDS)}")
+    if noise == "none":
+        return log.without("a")
+    channels = {"u": log["u"]}
+    for name, std in STD.items():
+        values, digit = log[name], DIGIT[name]
+        errors = std * NOISES[noise]((len(log), 3 if name == "q" else values.shape[1]), rng)
+        if name == "q":
+            attitude = Rotation.from_quat(values, scalar_first=True) * Rotation.from_rotvec(errors)
+            quat = digit * np.round(attitude.as_quat(scalar_first=True) / digit)
+            channels[name] = quat / np.linalg.norm(quat, axis=1, keepdims=True)
+        else:
+            channels[name] = digit * np.round((values + errors) / digit)
+    is_kept = rng.random(len(log)) >= LOST_ROWS
+    return replace(log, channels=channels).select(is_kept)

@@ -1,0 +1,115 @@
+"""A pilot who has got used to the drone: a cascade from position to sticks, on the true state.
+
+The gains follow the plant's own lags, so that a slow drone is flown gently and no hidden effect makes it
+swing. The pilot knows the thrust curve without effects, and learns steady errors of force in flight.
+"""
+
+import math
+
+from benchmarks.hidden.outside import DT_S
+from benchmarks.hidden.plans import Moment
+from benchmarks.hidden.truth import Truth
+from benchmarks.hidden.vectors import Vector, norm, rotation, to_body, within, wrapped
+
+# Gains as shares of what comes before them, so that no loop chases the one inside it.
+ATTITUDE_PER_LAG, VELOCITY_PER_ATTITUDE, POSITION_PER_VELOCITY, LEARN_PER_VELOCITY = 0.4, 0.3, 0.35, 0.3
+QUICKEST_ATTITUDE, QUICKEST_HEIGHT = 12.0, 5.0  # 1/s
+YAW_GAIN, MOST_YAW_RATE = 2.5, 1.6  # 1/s, rad/s
+MOST_TILTED = math.radians(65.0)  # of the thrust that is asked for
+MOST_UP, MOST_DOWN = 14.0, 6.0  # m/s^2
+MOST_SPEED, MOST_CORRECTION, MOST_LEARNT = 18.0, 4.0, 5.0  # m/s, m/s, m/s^2
+UPRIGHT = 0.3  # cosine of the tilt beyond which a heading means nothing
+TINY = 1e-9
+NEWTON_STEPS = 4  # from the stick before, which is close
+# Manoeuvres on one stick are cut off below a height that leaves room to brake, and above a speed.
+BRAKING, ROOM_M, FASTEST = 5.0, 4.0, 15.0  # m/s^2, m, m/s
+# The flown height looks ahead, and near the ground the climb that it asks for is never less than this.
+LOOK_AHEAD_S, FLOOR_M, FLOOR_GAIN = 0.25, 0.14, 12.0
+
+
+class Pilot:
+    """Gives commands for moments of a plan."""
+
+    def __init__(self, truth: Truth):
+        self._truth = truth
+        self._full_rates = tuple(math.radians(rate) for rate in truth.max_rate)
+        effects = truth.effects
+        delay = effects.get("command_delay", {}).get("delay_s", 0.0) + DT_S
+        loop = effects.get("second_order_rates", {})
+        ringing = 2.0 / loop["wn"] if loop else 0.0
+        slew = 3.0 * effects.get("rate_slew_limit", {}).get("inverse", 0.0)
+        slow_fall = max(1.0, effects.get("thrust_lag_asymmetry", {}).get("ratio", 1.0))
+        turn_lag = max(truth.tau[:3]) + delay + ringing + slew
+        self._attitude = min(QUICKEST_ATTITUDE, ATTITUDE_PER_LAG / turn_lag)
+        self._level = VELOCITY_PER_ATTITUDE * self._attitude
+        self._upright = min(QUICKEST_HEIGHT, ATTITUDE_PER_LAG / (slow_fall * truth.tau[3] + delay))
+        self._learnt_w = (0.0, 0.0, 0.0)
+        self._stick, self._is_cut_off = -0.2, False
+
+    def command(self, plant, moment: Moment) -> tuple[float, float, float, float]:
+        """Return the sticks for the plant's state at a moment of the plan, in [-1, 1]."""
+        has_stick = moment.sticks is not None
+        self._is_cut_off = has_stick and (self._is_cut_off or self._is_unsafe(plant))
+        is_free = not has_stick or self._is_cut_off
+        force_w = self._force(plant, moment, is_free)
+        own = self._sticks(plant, force_w, moment.heading)
+        if not is_free:
+            own = tuple(
+                mine if given is None else given for mine, given in zip(own, moment.sticks, strict=True)
+            )
+        return tuple(max(-1.0, min(1.0, stick)) for stick in own)
+
+    def _is_unsafe(self, plant) -> bool:
+        falling = max(0.0, -plant.vel_w[2])
+        low = plant.pos_w[2] - falling * falling / (2.0 * BRAKING) < ROOM_M
+        return low or norm(plant.vel_w) > FASTEST
+
+    def _force(self, plant, moment: Moment, is_free: bool) -> Vector:
+        """Return the specific force that is wanted, world, m/s^2."""
+        gains = (self._level, self._level, self._upright)
+        away = tuple(
+            POSITION_PER_VELOCITY * gain * (there - here)
+            for gain, there, here in zip(gains, moment.pos_w, plant.pos_w, strict=True)
+        )
+        wanted = tuple(a + b for a, b in zip(within(away, MOST_CORRECTION), moment.vel_w, strict=True))
+        error = tuple(a - b for a, b in zip(within(wanted, MOST_SPEED), plant.vel_w, strict=True))
+        acc = [
+            a + gain * e + k for a, gain, e, k in zip(moment.acc_w, gains, error, self._learnt_w, strict=True)
+        ]
+        if is_free:
+            learn = tuple(
+                known + DT_S * LEARN_PER_VELOCITY * gain * gain * e
+                for known, gain, e in zip(self._learnt_w, gains, within(error, 2.0), strict=True)
+            )
+            self._learnt_w = within(learn, MOST_LEARNT)
+        ahead = plant.pos_w[2] + LOOK_AHEAD_S * plant.vel_w[2]
+        if ahead < FLOOR_M:
+            acc[2] += FLOOR_GAIN * self._upright * (FLOOR_M - ahead)
+        up = self._truth.gravity + max(-MOST_DOWN, min(MOST_UP, acc[2]))
+        side = within((acc[0], acc[1], 0.0), up * math.tan(MOST_TILTED))
+        return (side[0], side[1], up)
+
+    def _sticks(self, plant, force_w: Vector, heading: float) -> tuple[float, float, float, float]:
+        """Return sticks that turn the thrust towards a force, and the nose towards a heading."""
+        rows = rotation(plant.quat)
+        x, y, z = to_body(rows, force_w)
+        across = math.hypot(x, y)
+        angle = self._attitude * math.atan2(across, z) / max(across, TINY)
+        yaw = 0.0
+        if rows[2][2] > UPRIGHT:
+            error = wrapped(heading - math.atan2(rows[1][0], rows[0][0]))
+            yaw = max(-MOST_YAW_RATE, min(MOST_YAW_RATE, YAW_GAIN * error))
+        rates = (-angle * y, angle * x, yaw)
+        sticks = tuple(rate / full for rate, full in zip(rates, self._full_rates, strict=True))
+        return (*sticks, self._thrust_stick(max(z, 0.0) * self._truth.mass, plant.battery_v))
+
+    def _thrust_stick(self, thrust_n: float, battery_v: float) -> float:
+        """Return the stick of a thrust by the curve without effects, by Newton's method."""
+        _, linear, square, cube, _, both = self._truth.coeffs
+        stick = self._stick
+        for _ in range(NEWTON_STEPS):
+            slope = linear + both * battery_v + stick * (2.0 * square + 3.0 * cube * stick)
+            stick += (thrust_n - self._truth.thrust(stick, battery_v)) / max(slope, 1.0)
+            stick = max(-1.0, min(1.0, stick))
+        self._stick = stick
+        return stick

@@ -1,0 +1,73 @@
+"""What a plant with hidden effects is: its parameters, and nothing that computes a flight."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+GRAVITY = 9.80665  # m/s^2
+
+
+@dataclass(frozen=True)
+class Outside:
+    """An effect that no list has, with a shape of its own.
+
+    kind: of ``benchmarks.hidden.outside.KINDS``. depends_on: what it is a function of, tags. channel: what
+    it changes, as in ``outside.SCALES``. amplitude: its largest size, as a multiple of the noise that the
+    sensors of ``benchmarks.hidden.noise`` have in the channel. shape: parameters of the kind.
+    """
+
+    kind: str
+    depends_on: tuple[str, ...]
+    channel: str
+    amplitude: float
+    shape: Mapping[str, float]
+
+
+@dataclass(frozen=True)
+class Gust:
+    """Moving air as a random process of first order, per world axis; the accelerometer feels it.
+
+    std: m/s^2, specific force. time_constant: s. rate_std: rad/s, the same of body rates; 0 for none.
+    """
+
+    std: float
+    time_constant: float
+    rate_std: float = 0.0
+
+
+@dataclass(frozen=True)
+class Truth:
+    """A plant; without effects it is the handout's.
+
+    tau: s. coeffs: N, of 1, u, u^2, u^3, V, u V. max_rate: deg/s. drain: V/min. mass: kg. gravity: m/s^2.
+    effects: name -> parameter -> value, units as in ``benchmarks.hidden.draws``.
+    """
+
+    tau: tuple[float, float, float, float]
+    coeffs: tuple[float, float, float, float, float, float]
+    max_rate: tuple[float, float, float] = (618.0, 618.0, 120.0)
+    drain: float = 1.0
+    mass: float = 1.0
+    gravity: float = GRAVITY
+    effects: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+    outside: Outside | None = None
+    gust: Gust | None = None
+
+    def thrust(self, stick: float, battery_v: float) -> float:
+        """Return the thrust of an applied thrust action at a voltage, N, without effects."""
+        one, linear, square, cube, volt, both = self.coeffs
+        return one + stick * (linear + stick * (square + stick * cube)) + battery_v * (volt + stick * both)
+
+    def text(self) -> str:
+        """Return one line that says what is hidden."""
+        parts = [f"{name}({_values(values)})" for name, values in self.effects.items()]
+        if self.outside is not None:
+            out = self.outside
+            tags = ", ".join(out.depends_on)
+            parts.append(f"outside {out.kind}[{tags}] on {out.channel} x{out.amplitude:.3g}")
+        if self.gust is not None:
+            parts.append(f"gust({self.gust.std:.3g} m/s^2, {self.gust.time_constant:.3g} s)")
+        return " + ".join(parts) or "no effects"
+
+
+def _values(values: Mapping[str, float]) -> str:
+    return ", ".join(f"{name} {value:.3g}" for name, value in values.items())

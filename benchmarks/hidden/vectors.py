@@ -1,0 +1,74 @@
+"""Vectors and quaternions as tuples of floats: for three numbers, faster than arrays by far."""
+
+import math
+
+Vector = tuple[float, float, float]
+Quaternion = tuple[float, float, float, float]
+
+
+def rotation(quat: Quaternion) -> tuple[Vector, Vector, Vector]:
+    """Return the rows of the rotation matrix, body to world; quat: w, x, y, z of norm 1."""
+    w, x, y, z = quat
+    return (
+        (1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)),
+        (2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)),
+        (2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)),
+    )
+
+
+def to_world(rows: tuple[Vector, Vector, Vector], vector_b: Vector) -> Vector:
+    """Return a body vector in the world frame."""
+    x, y, z = vector_b
+    return tuple(row[0] * x + row[1] * y + row[2] * z for row in rows)
+
+
+def to_body(rows: tuple[Vector, Vector, Vector], vector_w: Vector) -> Vector:
+    """Return a world vector in the body frame."""
+    first, second, third = rows
+    x, y, z = vector_w
+    return (
+        first[0] * x + second[0] * y + third[0] * z,
+        first[1] * x + second[1] * y + third[1] * z,
+        first[2] * x + second[2] * y + third[2] * z,
+    )
+
+
+def turned(quat: Quaternion, rates_b: Vector, step_s: float) -> Quaternion:
+    """Return the attitude after a step at body rates, rad/s: the handout's first order, of norm 1."""
+    w, x, y, z = quat
+    half = 0.5 * step_s
+    roll, pitch, yaw = half * rates_b[0], half * rates_b[1], half * rates_b[2]
+    new = (
+        w - x * roll - y * pitch - z * yaw,
+        x + w * roll + y * yaw - z * pitch,
+        y + w * pitch - x * yaw + z * roll,
+        z + w * yaw + x * pitch - y * roll,
+    )
+    norm = math.sqrt(new[0] * new[0] + new[1] * new[1] + new[2] * new[2] + new[3] * new[3])
+    return (new[0] / norm, new[1] / norm, new[2] / norm, new[3] / norm)
+
+
+def plus(first: Vector, second: Vector) -> Vector:
+    """Return the sum of two vectors."""
+    return (first[0] + second[0], first[1] + second[1], first[2] + second[2])
+
+
+def scaled(factor: float, vector: Vector) -> Vector:
+    """Return a vector times a number."""
+    return (factor * vector[0], factor * vector[1], factor * vector[2])
+
+
+def norm(vector: Vector) -> float:
+    """Return the length of a vector."""
+    return math.sqrt(vector[0] * vector[0] + vector[1] * vector[1] + vector[2] * vector[2])
+
+
+def within(vector: Vector, most: float) -> Vector:
+    """Return a vector cut to a length."""
+    length = norm(vector)
+    return vector if length <= most else scaled(most / length, vector)
+
+
+def wrapped(angle_rad: float) -> float:
+    """Return an angle in [-pi, pi]."""
+    return math.remainder(angle_rad, 2.0 * math.pi)
