@@ -1,0 +1,107 @@
+"""A log cut into lanes of equal length, which a replay flies side by side.
+
+What a step needs of the steps before it (applied action, rates, memories) follows from the commands and is
+forgotten within a second. So the log is cut into stretches of five seconds, each led in by the second
+before it, and all stretches are replayed at once: twelve times fewer steps in a row.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from flytrack_sysid.log import FlightLog
+from flytrack_sysid.record import LARGEST_DOUBT, Record, applied_doubt, make_record
+
+LEAD_IN_ROWS = 100
+LANE_ROWS = 500
+LANES_PADDED_TO = 2  # logs of about the same length share one compiled program
+# Axes of a residual: rotation x, y, z, force x, y, z (all world), battery. Channels of an axis: one that is
+# measured directly, and a level, of which that is the rate of change.
+DIRECT, LEVEL = ("w", "f", None), ("q", "v", "v_bat")
+SIZES = (3, 3, 1)
+NUM_AXES = sum(SIZES)
+
+
+class Lanes(NamedTuple):
+    """A log in lanes; (rows, lanes, ...), where row k is followed by row k + 1 after ``step_s``.
+
+    record: as in ``flytrack_sysid.record``. measured: by channel: w rad/s, f m/s^2 (body); others are in the
+    record. counts: (rows, lanes, NUM_AXES, 2) bool, what is to be explained; the lead-in never is.
+    is_joined: (rows, lanes) bool, the row follows the one before it in flight. row: (rows, lanes) int, of
+    the record, -1 where there is none.
+    """
+
+    record: Record
+    measured: dict[str, np.ndarray]
+    counts: np.ndarray
+    is_joined: np.ndarray
+    row: np.ndarray
+
+
+def _index(num_rows: int) -> np.ndarray:
+    """Return the record's row at each place of the lanes, (rows, lanes); -1 where there is none."""
+    lanes = -(-num_rows // LANE_ROWS)
+    lanes += -lanes % LANES_PADDED_TO
+    places = np.arange(-LEAD_IN_ROWS, LANE_ROWS)[:, None] + LANE_ROWS * np.arange(lanes)
+    return np.where((places >= 0) & (places < num_rows), places, -1)
+
+
+def measured_of(log: FlightLog, record: Record, gravity: float) -> dict[str, np.ndarray]:
+    """Return what a log measured of each channel on the record's rows; anything in filled rows."""
+    row = record.source_row
+    found = {name: log[name][row] for name in ("w", "q", "v", "v_bat", "f") if name in log}
+    if "f" not in log and "a" in log and "q" in log:
+        before = np.roll(record.quat, 1, axis=0)
+        force_w = log["a"][row] + np.array([0.0, 0.0, gravity])
+        found["f"] = Rotation.from_quat(before, scalar_first=True).inv().apply(force_w)
+    if "q" not in log:  # nothing in the world frame can be compared
+        found = {name: values for name, values in found.items() if name != "v"}
+    return found
+
+
+def _counting(name: str | None, size: int, allowed: dict, found: dict, index: np.ndarray) -> np.ndarray:
+    """Return where a channel counts, (rows, lanes, size)."""
+    mask = allowed[name][index] if name in found else np.zeros(index.shape, bool)
+    return np.repeat(mask[..., None], size, axis=-1)
+
+
+def make_lanes(log: FlightLog, judged: np.ndarray, tau: np.ndarray, gravity: float) -> Lanes:
+    """Return the lanes of a log; only ``judged`` rows of it, (num_rows,) bool, count.
+
+    tau: (4,) s, lags that say how long lost commands are remembered.
+    """
+    record = make_record(log)
+    doubt = applied_doubt(record.step_s, record.command_doubt, record.begins, record.is_applied_known, tau)
+    is_certain = doubt < LARGEST_DOUBT
+    exists = (record.source_row >= 0) & judged[record.source_row]
+    after = exists & ~record.begins
+    turns, lifts = is_certain[:, :3].all(axis=1), is_certain[:, 3]
+    allowed = {
+        "w": turns & after,
+        "q": turns & exists,
+        "f": lifts & after,
+        "v": lifts & exists,
+        "v_bat": exists,
+    }
+    index = _index(1 + int(np.flatnonzero(record.source_row >= 0)[-1]))
+    is_real = (index >= 0) & (np.arange(len(index)) >= LEAD_IN_ROWS)[:, None]
+    found = measured_of(log, record, gravity)
+    counts = np.stack(
+        [
+            np.concatenate(
+                [
+                    _counting(name, size, allowed, found, index)
+                    for name, size in zip(names, SIZES, strict=True)
+                ],
+                axis=-1,
+            )
+            for names in (DIRECT, LEVEL)
+        ],
+        axis=-1,
+    )
+    counts &= is_real[..., None, None]
+    sensed = {name: found[name][index] for name in ("w", "f") if name in found}
+    record = Record(*(leaf[index] for leaf in record))
+    begins = record.begins | (np.arange(len(index)) == 0)[:, None] | (index < 0)
+    return Lanes(record._replace(begins=begins), sensed, counts, ~begins, index)

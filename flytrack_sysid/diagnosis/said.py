@@ -1,0 +1,108 @@
+"""What a model says of every row of a log's lanes, and what was measured beyond that.
+
+========  ====================================================================================  =======
+channel   residual of a row                                                                     unit
+========  ====================================================================================  =======
+``w``     gyro less the rates that the commands lead to, world frame                            rad/s
+``q``     turn since the row before less the turn of those rates, world frame                   rad
+``f``     accelerometer less the model's specific force, world frame                            m/s^2
+``v``     change of velocity since the row before less the model's, world frame                 m/s
+``v_bat`` change of voltage since the row before less the model's                               V
+========  ====================================================================================  =======
+
+The measured attitude, velocity, position and voltage are fed into the model row by row; only what follows
+from the commands alone (applied action, rates, what effects remember) is carried on by the model.
+"""
+
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from flytrack_env.dynamics import ModelParameters, advance, integrate_attitude, read_sensors
+from flytrack_env.effects import start_memories
+from flytrack_env.quaternion import Quaternion, Vec3
+from flytrack_env.state import Action, Drone
+from flytrack_sysid.diagnosis.lanes import Lanes
+from flytrack_sysid.parameters import from_vector
+from flytrack_sysid.record import Record
+
+
+def _drone(row: Record, applied: Action, rates_b: Vec3) -> Drone:
+    return Drone(
+        pos_w=Vec3(*row.pos_w),
+        vel_w=Vec3(*row.vel_w),
+        acc_w=Vec3(*jnp.zeros_like(row.vel_w)),
+        quat=Quaternion(*row.quat),
+        rates_b=rates_b,
+        applied=applied,
+        battery_v=row.battery_v,
+    )
+
+
+def _chosen(condition: jax.Array, yes: Any, no: Any) -> Any:
+    return jax.tree.map(partial(jnp.where, condition), yes, no)
+
+
+def _carried(model: ModelParameters, lane: Record) -> tuple:
+    """Return applied action, body rates and memories at every row of a lane."""
+
+    def next_row(carry: tuple, row: Record) -> tuple:
+        applied, rates_b, memories = carry
+        applied = _chosen(row.begins | row.is_applied_known, Action(*row.applied), applied)
+        drone = _drone(row, applied, rates_b)
+        memories = _chosen(row.begins, start_memories(model.effects, drone), memories)
+        after, later = advance(drone, memories, Action(*row.command), row.step_s, model)
+        return (after.applied, after.rates_b, later), (applied, rates_b, memories)
+
+    first = jax.tree.map(lambda column: column[0], lane)
+    drone = _drone(first, Action(*first.applied), Vec3(*jnp.zeros_like(first.vel_w)))
+    start = (drone.applied, drone.rates_b, start_memories(model.effects, drone))
+    return jax.lax.scan(next_row, start, lane)[1]
+
+
+def _turn(measured: Quaternion, said: Quaternion) -> Vec3:
+    """Return the small world-frame rotation from what is said to what was measured, rad."""
+    conjugate = Quaternion(said.w, -said.x, -said.y, -said.z)
+    error = measured.multiply(conjugate)
+    double = jnp.where(error.w < 0.0, -2.0, 2.0)
+    return Vec3(double * error.x, double * error.y, double * error.z)
+
+
+def _of_step(
+    model: ModelParameters, row: Record, carried: tuple, next_row: Record, sensed: dict[str, jax.Array]
+) -> jax.Array:
+    """Return the residuals of the row after one step, (NUM_AXES, 2); 0 for channels that are absent."""
+    applied, rates_b, memories = carried
+    drone = _drone(row, applied, rates_b)
+    after, later = advance(drone, memories, Action(*row.command), row.step_s, model)
+    read = read_sensors(drone, after, later, row.step_s, model)
+    axes = drone.quat.axes()
+
+    def to_world(vector_b: Vec3) -> Vec3:
+        return axes[0].scale(vector_b.x) + axes[1].scale(vector_b.y) + axes[2].scale(vector_b.z)
+
+    nothing = Vec3(0.0, 0.0, 0.0)
+    spun = to_world(Vec3(*sensed["w"]) - read.rates_b) if "w" in sensed else nothing
+    turned = _turn(Quaternion(*next_row.quat), integrate_attitude(drone.quat, after.rates_b, row.step_s))
+    pushed = to_world(Vec3(*sensed["f"]) - read.force_b) if "f" in sensed else nothing
+    moved = Vec3(*next_row.vel_w) - drone.vel_w - after.acc_w.scale(row.step_s)
+    drained = next_row.battery_v - after.battery_v
+    return jnp.stack([jnp.stack([*spun, *pushed, 0.0]), jnp.stack([*turned, *moved, drained])], axis=-1)
+
+
+def _of_lane(model: ModelParameters, lane: Record, sensed: dict[str, jax.Array]) -> jax.Array:
+    carried = _carried(model, lane)
+    rows = jax.tree.map(lambda leaf: leaf[:-1], (lane, carried))
+    later = jax.tree.map(lambda leaf: leaf[1:], (lane, sensed))
+    found = jax.vmap(lambda before, after: _of_step(model, *before, *after))(rows, later)
+    # Of the first row of a lane nothing is said.
+    return jnp.concatenate([jnp.zeros_like(found[:1]), found])
+
+
+def unexplained(vector: jax.Array, like: ModelParameters, lanes: Lanes) -> jax.Array:
+    """Return what a model leaves, (rows, lanes, NUM_AXES, 2), and 0 where a flight begins."""
+    model = from_vector(vector, like)
+    of_lane = jax.vmap(lambda lane, sensed: _of_lane(model, lane, sensed), in_axes=1, out_axes=1)
+    return jnp.where(lanes.is_joined[..., None, None], of_lane(lanes.record, lanes.measured), 0.0)

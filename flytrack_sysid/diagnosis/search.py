@@ -1,0 +1,115 @@
+"""Which effects a log shows: one after the other, each refitted together with all that was found before."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from scipy import stats
+
+from flytrack_sysid.diagnosis.candidates import CANDIDATES, Candidate, base_places, opened
+from flytrack_sysid.diagnosis.linear import PROBES, Gain, Outlook
+from flytrack_sysid.diagnosis.problem import Problem
+from flytrack_sysid.diagnosis.refine import refine
+
+CHANCE = 1e-4  # of a name where there is nothing, for each effect
+PER_PARAMETER = 4.0  # of chi2: what one more parameter has to gain to be preferred to fewer
+MOST_EFFECTS = 6
+CLOSE = 0.6  # of the best gain: who comes so near to first order is refitted before one is chosen
+MOST_REFITTED = 4
+
+
+class Found(NamedTuple):
+    """A model: which effects it has (in which way each), its vector, cost, and free places."""
+
+    chosen: tuple[Candidate, ...]
+    vector: np.ndarray
+    cost: float
+    places: tuple[int, ...]
+
+
+def threshold(count: int) -> float:
+    """Return the gain of chi2 from which so many parameters are named."""
+    return float(stats.chi2.isf(CHANCE, count))
+
+
+def places_of(problem: Problem, chosen: Sequence[Candidate]) -> list[int]:
+    """Return what is free with these effects: the base and their parameters."""
+    return base_places(problem) + [place for one in chosen for place in problem.index(one.fields)]
+
+
+def free_places(problem: Problem) -> list[int]:
+    """Return every place that may become free: the base, and all parameters of all effects."""
+    effects = [place for place, name in enumerate(problem.names) if "." in name]
+    return base_places(problem) + effects
+
+
+def fitted(problem: Problem, chosen: Sequence[Candidate], vector: np.ndarray, rounds: int = 6) -> Found:
+    """Return the model with these effects that fits best, from a vector."""
+    places = places_of(problem, chosen)
+    vector, cost = refine(problem, vector, places, rounds)
+    return Found(tuple(chosen), vector, cost, tuple(places))
+
+
+def base_fit(problem: Problem) -> Found:
+    """Return the model without effects that fits best."""
+    return fitted(problem, (), problem.start)
+
+
+class Scored(NamedTuple):
+    """A candidate and what it would gain, to first order."""
+
+    candidate: Candidate
+    gain: Gain
+
+    @property
+    def merit(self) -> float:
+        """The gain over its inflation, less a price per parameter."""
+        return self.gain.robust - PER_PARAMETER * len(self.candidate.fields)
+
+
+def scores(problem: Problem, outlook: Outlook, found: Found) -> list[Scored]:
+    """Return all effects that the model does not have, by merit to first order, one way of each."""
+    given = [outlook.places.index(place) for place in found.places]
+    present = {one.effect for one in found.chosen}
+    best: dict[str, Scored] = {}
+    for candidate in CANDIDATES:
+        if candidate.effect in present:
+            continue
+        gain = outlook.gain(outlook.columns_of(candidate), given)
+        if gain is None or (candidate.probe is not None and gain.step[0] <= 0.0):
+            continue
+        scored = Scored(candidate, gain)
+        if candidate.effect not in best or scored.merit > best[candidate.effect].merit:
+            best[candidate.effect] = scored
+    return sorted(best.values(), key=lambda scored: -scored.merit)
+
+
+def full_outlook(problem: Problem, vector: np.ndarray) -> Outlook:
+    """Return the outlook along everything."""
+    return Outlook(problem, vector, free_places(problem), PROBES)
+
+
+def begun(problem: Problem, outlook: Outlook, found: Found, scored: Scored) -> np.ndarray:
+    """Return the vector from which an effect is fitted in: where first order says, or at its probe."""
+    vector = opened(problem, found.vector, scored.candidate)
+    if scored.candidate.probe is None:
+        vector[problem.index(scored.candidate.fields)] += scored.gain.step
+    return problem.clipped(vector[None])[0]
+
+
+def add_best(problem: Problem, found: Found) -> Found | None:
+    """Return the model with the effect added that explains most; None where none explains enough."""
+    outlook = full_outlook(problem, found.vector)
+    ranked = scores(problem, outlook, found)
+    if not ranked:
+        return None
+    near = [one for one in ranked[:MOST_REFITTED] if one.merit > CLOSE * ranked[0].merit]
+    near = [one for one in near if one.gain.robust > 0.5 * threshold(len(one.candidate.fields))]
+    tried = []
+    for one in near:
+        vector = begun(problem, outlook, found, one)
+        trial = fitted(problem, (*found.chosen, one.candidate), vector, rounds=4)
+        gain = (found.cost - trial.cost) / one.gain.inflation
+        if gain > threshold(len(one.candidate.fields)):
+            tried.append((gain - PER_PARAMETER * len(one.candidate.fields), trial))
+    return max(tried, key=lambda pair: pair[0])[1] if tried else None

@@ -1,0 +1,142 @@
+"""Whether each effect of a model is needed, and what could stand in its place."""
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import numpy as np
+
+from flytrack_sysid.diagnosis.linear import Outlook, solve
+from flytrack_sysid.diagnosis.problem import Problem
+from flytrack_sysid.diagnosis.search import (
+    PER_PARAMETER,
+    Found,
+    Scored,
+    begun,
+    fitted,
+    full_outlook,
+    scores,
+    threshold,
+)
+from flytrack_sysid.parameters import neutral_value
+
+SAME = 10.0  # of chi2: a rival that explains so nearly as much cannot be told apart
+MOST_RIVALS = 3
+NEARLY = 60.0  # of chi2, to first order: rivals that come so near are refitted
+PROBE_SHARE = 0.25  # of the gain: first order says less of what is looked for at probes
+
+
+class Weighed(NamedTuple):
+    """One effect of a model against doing without it and against its rivals.
+
+    gain: of chi2 over the model without it, refitted. inflation: of that gain's variance. rivals: effect ->
+    how much worse the model is with that one instead, of chi2; the better ones are refitted.
+    swaps: models with the rival in the effect's place, refitted.
+    """
+
+    gain: float
+    inflation: float
+    rivals: Mapping[str, float]
+    swaps: Mapping[str, Found]
+
+    @property
+    def robust(self) -> float:
+        """The gain over its inflation."""
+        return self.gain / self.inflation
+
+
+def without(problem: Problem, found: Found, effect: str) -> Found:
+    """Return the model without an effect, refitted."""
+    vector = found.vector.copy()
+    for one in found.chosen:
+        if one.effect == effect:
+            vector[problem.index(one.fields)] = [neutral_value(field) for field in one.fields]
+    chosen = tuple(one for one in found.chosen if one.effect != effect)
+    return fitted(problem, chosen, vector, rounds=6)
+
+
+def weigh(problem: Problem, found: Found, outlook: Outlook, effect: str) -> Weighed:
+    """Return what an effect of a model is worth; outlook: of the model, along all its places."""
+    less = without(problem, found, effect)
+    seen = full_outlook(problem, less.vector)
+    own = next(one for one in found.chosen if one.effect == effect)
+    gain = less.cost - found.cost
+    rivals: dict[str, float] = {}
+    swaps: dict[str, Found] = {}
+    ranked = [one for one in scores(problem, seen, less) if one.candidate.effect != effect]
+    for number, one in enumerate(ranked):
+        rivals[one.candidate.effect] = gain - one.gain.chi2
+        close = max(NEARLY, PROBE_SHARE * gain) if one.candidate.probe is not None else NEARLY
+        if number < MOST_RIVALS and gain - one.gain.chi2 < close:
+            swap = _swapped(problem, less, seen, one)
+            rivals[one.candidate.effect] = swap.cost - found.cost
+            swaps[one.candidate.effect] = swap
+    return Weighed(gain, _inflation(outlook, found, own.fields), rivals, swaps)
+
+
+def _swapped(problem: Problem, less: Found, seen: Outlook, rival: Scored) -> Found:
+    return fitted(problem, (*less.chosen, rival.candidate), begun(problem, seen, less, rival), rounds=5)
+
+
+def _inflation(outlook: Outlook, found: Found, fields: tuple[str, ...]) -> float:
+    columns = [outlook.column(field) for field in fields]
+    given = [outlook.places.index(place) for place in found.places]
+    given = [column for column in given if column not in columns]
+    gain = outlook.gain(columns, given)
+    return 1.0 if gain is None else gain.inflation
+
+
+def settle(problem: Problem, found: Found) -> tuple[Found, dict[str, Weighed]]:
+    """Return the model without effects that it does not need, and with better ones in their place."""
+    while True:
+        outlook = full_outlook(problem, found.vector)
+        weighed = {one.effect: weigh(problem, found, outlook, one.effect) for one in found.chosen}
+        short = {one.effect: weighed[one.effect].robust - threshold(len(one.fields)) for one in found.chosen}
+        if short and min(short.values()) < 0.0:
+            found = without(problem, found, min(short, key=short.get))
+            continue
+        better = _better(found, weighed)
+        if better is None:
+            return found, weighed
+        found = better
+
+
+def price(found: Found) -> float:
+    """Return a model's cost and the price of its parameters."""
+    return found.cost + PER_PARAMETER * sum(len(one.fields) for one in found.chosen)
+
+
+def _better(found: Found, weighed: Mapping[str, Weighed]) -> Found | None:
+    """Return the best model with one effect swapped, if it is better."""
+    swaps = [swap for one in weighed.values() for swap in one.swaps.values()]
+    best = min(swaps, key=price, default=None)
+    return best if best is not None and price(best) < price(found) - 0.5 else None
+
+
+def separations(
+    problem: Problem, outlook: Outlook, found: Found, effect: str
+) -> tuple[float, dict[str, float]]:
+    """Return an effect's lambda, and what is left of it beside each rival, to first order.
+
+    lambda: squared norm of its signature with all else that is free projected out.
+    """
+    own = next(one for one in found.chosen if one.effect == effect)
+    columns = [outlook.column(field) for field in own.fields]
+    size = found.vector[problem.index(own.fields)] - [neutral_value(field) for field in own.fields]
+    given = [outlook.places.index(place) for place in found.places]
+    given = [column for column in given if column not in columns]
+
+    def beside(others: list[int]) -> float:
+        across = outlook.total[np.ix_(others, columns)]
+        own_information = outlook.total[np.ix_(columns, columns)]
+        left = own_information - across.T @ solve(outlook.total[np.ix_(others, others)], across)
+        return float(size @ left @ size)
+
+    present = {one.effect for one in found.chosen}
+    rivals: dict[str, float] = {}
+    from flytrack_sysid.diagnosis.candidates import CANDIDATES
+
+    for candidate in CANDIDATES:
+        if candidate.effect not in present:
+            left = beside(given + outlook.columns_of(candidate))
+            rivals[candidate.effect] = min(left, rivals.get(candidate.effect, np.inf))
+    return beside(given), rivals
