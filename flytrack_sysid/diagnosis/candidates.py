@@ -7,7 +7,7 @@ import numpy as np
 
 from flytrack_env.effects import EFFECTS, Effect
 from flytrack_sysid.diagnosis.problem import Problem
-from flytrack_sysid.parameters import DRAIN, TAUS, THRUST_COEFFS
+from flytrack_sysid.parameters import DRAIN, TAUS, THRUST_COEFFS, neutral_value
 
 BASE_FREE = (*TAUS, *THRUST_COEFFS, DRAIN)
 
@@ -22,6 +22,10 @@ class Candidate(NamedTuple):
     effect: str
     fields: tuple[str, ...]
     probe: tuple[str, float] | None = None
+
+    def neutral(self) -> np.ndarray:
+        """Return the values of its fields that do nothing."""
+        return np.array([neutral_value(field) for field in self.fields])
 
 
 def candidates_of(effect: Effect) -> list[Candidate]:

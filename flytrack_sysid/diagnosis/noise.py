@@ -191,6 +191,15 @@ def first_guess(left: np.ndarray, counts: np.ndarray) -> np.ndarray:
     return found
 
 
+def disturbance_gain(lanes: Lanes, left: np.ndarray, sought: np.ndarray) -> np.ndarray:
+    """Return by axis how much likelier (minus twice the log) residuals are with the disturbance than without."""
+    given = tuple(jnp.asarray(part) for part in (step_to(lanes), lanes.is_joined, lanes.counts, left))
+    still = sought.copy()
+    still[3] = np.log(LEAST_SHARE)
+    tell = jax.jit(lambda values: _misfit(values, *given).total)
+    return np.asarray(tell(still)) - np.asarray(tell(sought))
+
+
 FIRST_DAMPING, MORE, LESS = 1e-2, 10.0, 0.2
 MOST_ROUNDS = 12
 ENOUGH = 0.3  # of minus twice the log likelihood: less than what one parameter is off by

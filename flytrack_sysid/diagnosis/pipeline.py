@@ -10,19 +10,22 @@ from flytrack_sysid.diagnosis.lanes import make_lanes
 from flytrack_sysid.diagnosis.problem import Problem
 from flytrack_sysid.diagnosis.refine import cost_of
 from flytrack_sysid.diagnosis.search import MOST_EFFECTS, Found, add_best, base_fit, full_outlook
-from flytrack_sysid.diagnosis.weigh import Weighed, settle
+from flytrack_sysid.diagnosis.result import Unexplained
+from flytrack_sysid.diagnosis.unexplained import collapsed, look
+from flytrack_sysid.diagnosis.weigh import Weighed, settle, without
 from flytrack_sysid.log import FlightLog
 
 SATURATED_SHARES = np.array([0.0, 1.0, 0.5, 0.25, 0.1])
 
 
 class Settled(NamedTuple):
-    """What a log says: the problem with its noise, the refitted base, the model, and its effects weighed."""
+    """What a log says: the problem with its noise, the refitted base, the model, its effects weighed, and the rest."""
 
     problem: Problem
     base: Found
     found: Found
     weighed: dict[str, Weighed]
+    rest: Unexplained
 
 
 def saturated(problem: Problem, vector: np.ndarray) -> np.ndarray:
@@ -53,4 +56,12 @@ def settled(log: FlightLog, judged: np.ndarray, model: ModelParameters) -> Settl
     full = saturated(problem, found.vector)
     problem.set_noise(noises.fit_noise(lanes, problem.left(full[None])[0], problem.noise))
     found, weighed = settle(problem, found)
-    return Settled(problem, base_fit(problem), found, weighed)
+    base = base_fit(problem)
+    while True:
+        rest, dependences = look(problem, found, base.vector)
+        stand_ins = collapsed(problem, found, dependences) if dependences else []
+        if not stand_ins:
+            return Settled(problem, base, found, weighed, rest)
+        for effect in stand_ins:
+            found = without(problem, found, effect)
+        found, weighed = settle(problem, found)

@@ -92,6 +92,10 @@ class Problem:
             parts.append(np.asarray(_whitened(left, self.gains, self.counts))[: len(part)])
         return np.concatenate(parts)
 
+    def whiten(self, left: np.ndarray) -> np.ndarray:
+        """Return residuals (BATCH, rows, lanes, NUM_AXES, 2) as innovations."""
+        return np.asarray(_whitened(left, self.gains, self.counts))
+
     def clipped(self, vectors: np.ndarray) -> np.ndarray:
         """Return vectors within bounds."""
         return np.clip(vectors, self.low, self.high)
@@ -147,18 +151,19 @@ def robust_square(left: np.ndarray) -> float:
     return float(np.where(size < noises.OUTLIER, size**2, beyond).sum())
 
 
+def blocks_of(values: np.ndarray) -> np.ndarray:
+    """Return (..., rows, lanes, axes, 2) as (blocks, ..., numbers), a second each, without the lead-in."""
+    kept = values[..., LEAD_IN_ROWS:, :, :, :]
+    pieces, lanes = LANE_ROWS // BLOCK_ROWS, kept.shape[-3]
+    split = kept.reshape(*kept.shape[:-4], pieces, BLOCK_ROWS, lanes, -1)
+    return np.moveaxis(split, (-4, -2), (0, 1)).reshape(pieces * lanes, *kept.shape[:-4], -1)
+
+
 def sums_of(left: np.ndarray, slopes: np.ndarray) -> Sums:
     """Return the sums that every linear fit needs; ``left`` as a residual falls along ``-slopes``."""
     root = np.sqrt(robust_weight(left))
 
-    def blocks(values: np.ndarray) -> np.ndarray:  # (..., rows, lanes, axes, 2) -> (blocks, ..., numbers)
-        kept = (values * root)[..., LEAD_IN_ROWS:, :, :, :]
-        pieces, lanes = LANE_ROWS // BLOCK_ROWS, kept.shape[-3]
-        split = kept.reshape(*kept.shape[:-4], pieces, BLOCK_ROWS, lanes, -1)
-        split = np.moveaxis(split, (-4, -2), (0, 1)).reshape(pieces * lanes, *kept.shape[:-4], -1)
-        return split
-
-    of_slopes, of_left = blocks(slopes), blocks(left)
+    of_slopes, of_left = blocks_of(slopes * root), blocks_of(left * root)
     information = of_slopes @ np.swapaxes(of_slopes, 1, 2)
     score = -np.einsum("bpn,bn->bp", of_slopes, of_left)
     return Sums(information, score, robust_square(left), left)

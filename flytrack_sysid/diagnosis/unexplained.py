@@ -1,0 +1,274 @@
+"""What is left that no effect of the list explains: whether it is there, and what it depends on."""
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from scipy import stats
+
+from flytrack_sysid.diagnosis import noise as noises
+from flytrack_sysid.diagnosis.lanes import LEAD_IN_ROWS
+from flytrack_sysid.diagnosis.linear import inflation_of, solve
+from flytrack_sysid.diagnosis.problem import BATCH, Problem, blocks_of, robust_weight
+from flytrack_sysid.diagnosis.regressors import SIDES, Flown, constants, dependences, flown
+from flytrack_sysid.diagnosis.result import Unexplained
+from flytrack_sysid.diagnosis.search import Found, threshold
+
+CHANCE = 1e-6  # of a flag where nothing is left, for each dependence
+MATERIAL = 0.08  # of the sensor's noise, rms: less is left alone
+OF_NAMED = 0.15  # of what the named causes do, rms: laws of the list are not exact
+OF_WANDERING = 0.45  # of the disturbance that is there, rms: a dependence that explains less is a coincidence
+MOST_DEPENDENCES = 3
+PERIODIC_HZ = (0.3, 25.0)
+LINE = 28.0  # power of a line over that of its neighbourhood: e^-28 by chance
+NEIGHBOURS = 40  # frequencies on each side
+STOCHASTIC_GAIN, STOCHASTIC_SHARE = 50.0, 0.15  # of minus twice the log likelihood; of the sensor's noise
+FELT = 0.3  # coupling from which a disturbance is the drone's and not the sensor's
+RIDGE = 1e-6
+KEPT_SHARE = 0.1  # of an effect's lambda, beside what the rest depends on: less, and it stood in for that
+
+
+class Dependence(NamedTuple):
+    """A dependence found on one side: its name, gain over its inflation, and rms over the sensor's noise."""
+
+    name: str
+    side: str
+    gain: float
+    share: float
+    features_w: np.ndarray
+    columns: np.ndarray
+
+
+def _whitened(problem: Problem, features_w: np.ndarray, side: str) -> np.ndarray:
+    """Return what features (count, rows, lanes, 3) would leave, whitened, of a side's axes."""
+    step_s = noises.step_to(problem.lanes)[..., None]
+    found = []
+    for begin in range(0, len(features_w), BATCH):
+        part = features_w[begin : begin + BATCH]
+        left = np.zeros((BATCH, *features_w.shape[1:3], noises.NUM_AXES, 2))
+        left[: len(part), ..., SIDES[side], 0] = part
+        left[: len(part), ..., SIDES[side], 1] = part * step_s
+        left *= problem.lanes.is_joined[..., None, None]
+        found.append(problem.whiten(left)[: len(part), ..., SIDES[side], :])
+    return np.concatenate(found)
+
+
+class _Side:
+    """Sums of one side's axes: what is given (columns of the model), residual, and features as they come."""
+
+    def __init__(self, problem: Problem, side: str, left: np.ndarray, slopes: np.ndarray):
+        axes = SIDES[side]
+        self.left = left[..., axes, :]
+        self.root = np.sqrt(robust_weight(self.left))
+        self.rest = blocks_of(self.left * self.root)
+        given = slopes[..., axes, :]
+        acting = np.abs(given).reshape(len(given), -1).max(axis=1) > 0.0
+        self.given = blocks_of(given[acting] * self.root)
+
+    def gain(self, columns: np.ndarray) -> tuple[float, float, np.ndarray]:
+        """Return chi2 of features besides what is given, its inflation, and their coefficients."""
+        across = np.einsum("bgn,bfn->gf", self.given, columns, optimize=True)
+        inner = np.einsum("bgn,bhn->gh", self.given, self.given, optimize=True)
+        inner += RIDGE * np.diag(np.maximum(np.diag(inner), 1.0))
+        share = solve(inner, across)
+        total = np.einsum("bfn,bhn->fh", columns, columns, optimize=True)
+        own = total - across.T @ share
+        own += RIDGE * np.diag(np.diag(total)) + np.eye(len(own))
+        score_given = np.einsum("bgn,bn->g", self.given, self.rest, optimize=True)
+        score = np.einsum("bfn,bn->f", columns, self.rest, optimize=True) - share.T @ score_given
+        step = solve(own, score)
+        beside = solve(inner, score_given - across @ step)
+        after = self.rest - np.einsum("bfn,f->bn", columns, step) - np.einsum("bgn,g->bn", self.given, beside)
+        blocks = np.einsum("bfn,bn->bf", columns, after) - np.einsum("bgn,bn->bg", self.given, after) @ share
+        return float(score @ step), inflation_of(own, blocks), step
+
+
+    def information_along(self, columns: np.ndarray, step: np.ndarray) -> float:
+        """Return the squared size of columns times a step, with what is given taken out."""
+        signature = np.einsum("bfn,f->bn", columns, step)[:, None]
+        across = np.einsum("bgn,bfn->gf", self.given, signature, optimize=True)
+        inner = np.einsum("bgn,bhn->gh", self.given, self.given, optimize=True)
+        inner += RIDGE * np.diag(np.maximum(np.diag(inner), 1.0))
+        return float(np.sum(signature**2) - (across.T @ solve(inner, across))[0, 0])
+
+
+def _rms(features_w: np.ndarray, step: np.ndarray, counts: np.ndarray) -> float:
+    """Return the rms size of a fitted effect over the rows that count, in its own unit."""
+    signal = np.tensordot(step, features_w, axes=1)[counts]
+    signal = signal - signal.mean(axis=0)
+    return float(np.sqrt(np.mean(np.sum(signal**2, axis=-1))))
+
+
+def _named_size(problem: Problem, found: Found, base: np.ndarray, side: str) -> float:
+    """Return the rms of what named causes change in a side's direct channel."""
+    if not found.chosen:
+        return 0.0
+    left = problem.left(np.stack([found.vector, base]))
+    change = (left[1] - left[0])[..., SIDES[side], 0][problem.lanes.counts.any(axis=(2, 3))]
+    return float(np.sqrt(np.mean(np.sum(change**2, axis=-1))))
+
+
+def _wandering(noise: noises.Noise, axes: slice) -> float:
+    """Return the standard deviation of a disturbance that the drone feels, over all axes of a side."""
+    felt = np.asarray(noise.coupling)[axes] > FELT
+    return float(np.sqrt(np.sum((np.asarray(noise.disturbance)[axes] * felt) ** 2)))
+
+
+def depends_on(
+    problem: Problem, found: Found, base: np.ndarray, extra: Mapping[str, np.ndarray] | None = None
+) -> list[Dependence]:
+    """Return dependences of what a model leaves, the clearest first, on each side at most three."""
+    flight = flown(problem.lanes, found.vector[problem.index(("tau_roll", "tau_pitch", "tau_yaw", "tau_thrust"))])
+    left, slopes = problem.slopes(found.vector, list(found.places), np.zeros((0, len(found.vector))))
+    features = dependences(flight)
+    noise = noises.noise_of(problem.noise)
+    result = []
+    for side, axes in SIDES.items():
+        if not problem.lanes.counts[..., axes, :].any():
+            continue
+        sums = _Side(problem, side, left, slopes)
+        if extra is not None and side in extra:
+            sums.given = np.concatenate([sums.given, blocks_of(_whitened(problem, extra[side], side) * sums.root)], axis=1)
+        own_noise = float(np.sqrt(np.mean(np.asarray(noise.direct[axes]) ** 2)))
+        least = max(
+            MATERIAL * own_noise,
+            OF_NAMED * _named_size(problem, found, base, side),
+            OF_WANDERING * _wandering(noise, axes),
+        )
+        columns = {
+            name: blocks_of(_whitened(problem, one, side) * sums.root) for name, one in features[side].items()
+        }
+        result += _greedy(sums, side, columns, features[side], flight, least, own_noise)
+    return sorted(result, key=lambda one: -one.gain)
+
+
+def _greedy(
+    sums: _Side,
+    side: str,
+    columns: Mapping[str, np.ndarray],
+    features: Mapping[str, np.ndarray],
+    flight: Flown,
+    least: float,
+    own_noise: float,
+) -> list[Dependence]:
+    """Return dependences one after the other, each besides those before."""
+    result: list[Dependence] = []
+    while len(result) < MOST_DEPENDENCES:
+        best: Dependence | None = None
+        for name, one in columns.items():
+            if any(name == earlier.name for earlier in result):
+                continue
+            chi2, inflation, step = sums.gain(one)
+            count, size = one.shape[1], _rms(features[name], step, flight.counts)
+            if chi2 / inflation < stats.chi2.isf(CHANCE, count) or size < least:
+                continue
+            gain = chi2 / inflation - 2.0 * count
+            if best is None or gain > best.gain:
+                best = Dependence(name, side, gain, size / own_noise, features[name], one)
+        if best is None:
+            break
+        result.append(best)
+        sums.given = np.concatenate([sums.given, best.columns], axis=1)
+    return result
+
+
+def lines(problem: Problem, found: Found) -> list[tuple[str, float, float]]:
+    """Return side, frequency in Hz and amplitude over the sensor's noise of what is periodic, body frame."""
+    flight = flown(problem.lanes, np.full(4, 0.03))
+    left = problem.left(found.vector[None])[0]
+    noise = noises.noise_of(problem.noise)
+    result = []
+    for side, axes in SIDES.items():
+        counts = problem.lanes.counts[..., axes, 0].all(axis=-1)
+        if not counts.any():
+            continue
+        body = np.einsum("rlji,rlj->rli", flight.body_to_world, left[..., axes, 0]) * counts[..., None]
+        series = np.swapaxes(body[LEAD_IN_ROWS:], 0, 1).reshape(-1, 3)
+        step_s = float(np.median(noises.step_to(problem.lanes)))
+        power = (np.abs(np.fft.rfft(series, axis=0)) ** 2).max(axis=1)
+        frequency = np.fft.rfftfreq(len(series), step_s)
+        usual = np.array(
+            [np.median(power[max(k - NEIGHBOURS, 1) : k + NEIGHBOURS]) for k in range(len(power))]
+        )
+        inside = (frequency > PERIODIC_HZ[0]) & (frequency < PERIODIC_HZ[1])
+        ratio = np.where(inside, power / np.maximum(usual, 1e-300), 0.0)
+        peak = int(np.argmax(ratio))
+        if ratio[peak] > LINE:
+            size = 2.0 * np.sqrt(power[peak]) / counts.sum()
+            own = float(np.sqrt(np.mean(np.asarray(noise.direct[axes]) ** 2)))
+            result.append((side, float(frequency[peak]), float(size / own)))
+    return result
+
+
+def stochastic(problem: Problem, found: Found) -> dict[str, float]:
+    """Return, by side, the size over the sensor's noise of a disturbance that wanders and is clearly there."""
+    result = {}
+    left = problem.left(found.vector[None])[0]
+    noise = noises.noise_of(problem.noise)
+    felt = np.asarray(noise.coupling) > FELT
+    share = np.asarray(noise.disturbance / noise.direct)
+    gain = noises.disturbance_gain(problem.lanes, left, problem.noise)
+    for side, axes in SIDES.items():
+        here = felt[axes] & (gain[axes] > STOCHASTIC_GAIN)
+        size = float(np.sqrt(np.sum((share[axes] * here) ** 2)))
+        if size > STOCHASTIC_SHARE:
+            result[side] = size
+    return result
+
+
+def look(problem: Problem, found: Found, base: np.ndarray) -> tuple[Unexplained, list[Dependence]]:
+    """Return what a model leaves unexplained, and the dependences that a veto may use."""
+    periodic = lines(problem, found)
+    found_on = depends_on(problem, found, base, _waves(problem, periodic))
+    shares = {f"{side}: periodic at {hz:.3g} Hz": size for side, hz, size in periodic}
+    shares |= {f"{one.side}: {one.name}": one.share for one in found_on}
+    if not shares:
+        shares |= {f"{side}: stochastic": size for side, size in stochastic(problem, found).items()}
+    names = [name.split(": ", 1)[1] for name in shares]
+    return Unexplained(bool(shares), tuple(dict.fromkeys(names)), shares), found_on
+
+
+def collapsed(problem: Problem, found: Found, dependences_found: Sequence[Dependence]) -> list[str]:
+    """Return effects of a model whose gain is gone beside smooth functions of what the rest depends on.
+
+    They stand in for something else. The functions have their constants, which a wind, say, would be.
+    """
+    left, slopes = problem.slopes(found.vector, list(found.places), np.zeros((0, len(found.vector))))
+    flight = flown(problem.lanes, np.full(4, 0.03))
+    result = []
+    for one in found.chosen:
+        own = [found.places.index(place) for place in problem.index(one.fields)]
+        others = [place for place in range(len(found.places)) if place not in own]
+        before = after = 0.0
+        for side, axes in SIDES.items():
+            if not problem.lanes.counts[..., axes, :].any():
+                continue
+            sums = _Side(problem, side, left, slopes[others])
+            acting = slopes[own][..., axes, :]
+            if not np.abs(acting).max() > 0.0:
+                continue
+            columns = blocks_of(acting * sums.root)
+            size = found.vector[list(np.array(found.places)[own])] - one.neutral()
+            before += sums.information_along(columns, size)
+            for dependence in dependences_found:
+                if dependence.side == side:
+                    constant = _whitened(problem, constants(flight, side), side) * sums.root
+                    more = [sums.given, dependence.columns, blocks_of(constant)]
+                    sums.given = np.concatenate(more, axis=1)
+            after += sums.information_along(columns, size)
+        if after < max(KEPT_SHARE * before, threshold(len(one.fields))):
+            result.append(one.effect)
+    return result
+
+
+def _waves(problem: Problem, periodic: Sequence[tuple[str, float, float]]) -> dict[str, np.ndarray]:
+    """Return sine and cosine at the frequencies found, along the body's axes, by side."""
+    flight = flown(problem.lanes, np.full(4, 0.03))
+    body = np.moveaxis(flight.body_to_world, -1, 0)
+    result = {}
+    for side, hz, _ in periodic:
+        phase = 2.0 * np.pi * hz * flight.time_s
+        both = np.stack([np.sin(phase), np.cos(phase)])
+        product = both[:, None, ..., None] * body[None]
+        result[side] = product.reshape(-1, *product.shape[2:])
+    return result
