@@ -16,11 +16,12 @@ from collections.abc import Callable
 
 import numpy as np
 
-from benchmarks.hidden.plans import DT_S, HIGH_M, SLOWER, Moment, Rng, Sketch, cycle, leg
+from benchmarks.hidden.plans import HIGH_M, SLOWER, Moment, Rng, Sketch, cycle, leg
+from benchmarks.hidden.truth import DT_S
 from benchmarks.hidden.vectors import wrapped
 
 HOVER_M, RACE_M, SLOW_M = (1.5, 8.0), (1.5, 5.0), (1.5, 6.0)  # heights
-CORRECTION_M, CORRECTION_S = 0.4, 0.5  # of small moves in a hover
+CORRECTION_M, CORRECTION_S = 0.25, 0.8  # of small moves in a hover
 RACE_SPEEDS, SLOW_SPEEDS = (7.0, 16.0), (0.5, 3.0)  # m/s
 WAYPOINTS_M = 25.0  # their spread, horizontally
 MOST_SIDEWAYS = 13.0  # m/s^2, of a race's turns

@@ -6,9 +6,11 @@ swing. The pilot knows the thrust curve without effects, and learns steady error
 
 import math
 
-from benchmarks.hidden.outside import DT_S
+import numpy as np
+
+from benchmarks.hidden.outside import FirstOrderNoise
 from benchmarks.hidden.plans import Moment
-from benchmarks.hidden.truth import Truth
+from benchmarks.hidden.truth import DT_S, Truth
 from benchmarks.hidden.vectors import Vector, norm, rotation, to_body, within, wrapped
 
 # Gains as shares of what comes before them, so that no loop chases the one inside it.
@@ -20,6 +22,7 @@ MOST_UP, MOST_DOWN = 14.0, 6.0  # m/s^2
 MOST_SPEED, MOST_CORRECTION, MOST_LEARNT = 18.0, 4.0, 5.0  # m/s, m/s, m/s^2
 UPRIGHT = 0.3  # cosine of the tilt beyond which a heading means nothing
 TINY = 1e-9
+TREMBLE, TREMBLE_S = 0.01, 0.1  # of all sticks that the hands hold still, and s
 NEWTON_STEPS = 4  # from the stick before, which is close
 # Manoeuvres on one stick are cut off below a height that leaves room to brake, and above a speed.
 BRAKING, ROOM_M, FASTEST = 5.0, 4.0, 15.0  # m/s^2, m, m/s
@@ -30,7 +33,7 @@ LOOK_AHEAD_S, FLOOR_M, FLOOR_GAIN = 0.25, 0.14, 12.0
 class Pilot:
     """Gives commands for moments of a plan."""
 
-    def __init__(self, truth: Truth):
+    def __init__(self, truth: Truth, rng: np.random.Generator):
         self._truth = truth
         self._full_rates = tuple(math.radians(rate) for rate in truth.max_rate)
         effects = truth.effects
@@ -44,6 +47,7 @@ class Pilot:
         self._level = VELOCITY_PER_ATTITUDE * self._attitude
         self._upright = min(QUICKEST_HEIGHT, ATTITUDE_PER_LAG / (slow_fall * truth.tau[3] + delay))
         self._learnt_w = (0.0, 0.0, 0.0)
+        self._tremble = FirstOrderNoise(TREMBLE_S, rng, len(truth.tau))
         self._stick, self._is_cut_off = -0.2, False
 
     def command(self, plant, moment: Moment) -> tuple[float, float, float, float]:
@@ -52,7 +56,12 @@ class Pilot:
         self._is_cut_off = has_stick and (self._is_cut_off or self._is_unsafe(plant))
         is_free = not has_stick or self._is_cut_off
         force_w = self._force(plant, moment, is_free)
-        own = self._sticks(plant, force_w, moment.heading)
+        own = tuple(
+            stick + TREMBLE * shake
+            for stick, shake in zip(
+                self._sticks(plant, force_w, moment.heading), self._tremble.step(), strict=True
+            )
+        )
         if not is_free:
             own = tuple(
                 mine if given is None else given for mine, given in zip(own, moment.sticks, strict=True)
