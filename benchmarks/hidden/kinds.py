@@ -32,6 +32,7 @@ NEAR_S, CHASE_S = 0.3, (3.0, 6.0)  # to a waypoint that counts as met; how long 
 BEGIN_S, STILL_S = 0.5, (2.0, 4.5)  # of hover before something begins, and between moves
 SLOW_HOLD_S, SLOW_TURNING = (2.0, 4.0), 0.3  # s, rad/s
 START_SPREAD_M = 5.0
+HIGHER_M = 1.5  # per try, of all heights of kinds that are flown low all the time
 
 
 def _scripted(sketch: Sketch, seconds: float) -> None:
@@ -63,7 +64,7 @@ def _slow(sketch: Sketch, seconds: float) -> None:
     while len(sketch) * DT_S < seconds:
         leg(sketch, rng.uniform(*SLOW_SPEEDS), rng.uniform(*SLOW_HOLD_S), rng.normal(0.0, SLOW_TURNING))
         sketch.wait(BEGIN_S)
-        sketch.climb_to(rng.uniform(*SLOW_M))
+        sketch.climb_to(HIGHER_M * sketch.caution + rng.uniform(*SLOW_M))
 
 
 def _race(sketch: Sketch, seconds: float) -> None:
@@ -74,7 +75,8 @@ def _race(sketch: Sketch, seconds: float) -> None:
     while len(sketch) * DT_S < seconds:
         if waypoint is None or left == 0 or math.dist(waypoint[:2], sketch.pos_w[:2]) < speed * NEAR_S:
             place = rng.normal(0.0, WAYPOINTS_M, 2).clip(-2.0 * WAYPOINTS_M, 2.0 * WAYPOINTS_M)
-            waypoint, wanted = (*place.tolist(), rng.uniform(*RACE_M)), slower * rng.uniform(*RACE_SPEEDS)
+            height = HIGHER_M * sketch.caution + rng.uniform(*RACE_M)
+            waypoint, wanted = (*place.tolist(), height), slower * rng.uniform(*RACE_SPEEDS)
             left = steps_of(rng.uniform(*CHASE_S))
         left -= 1
         x, y, z = (there - here for there, here in zip(waypoint, sketch.pos_w, strict=True))
@@ -106,7 +108,10 @@ def plan(kind: str, seconds: float, rng: Rng, caution: int = 0) -> list[Moment]:
     if kind not in FLIGHT_KINDS:
         raise ValueError(f"kind: found {kind!r}, expected one of {', '.join(FLIGHT_KINDS)}")
     heights, draw = FLIGHT_KINDS[kind]
-    start_w = (*rng.uniform(-START_SPREAD_M, START_SPREAD_M, 2).tolist(), float(rng.uniform(*heights)))
+    start_w = (
+        *rng.uniform(-START_SPREAD_M, START_SPREAD_M, 2).tolist(),
+        HIGHER_M * caution + float(rng.uniform(*heights)),
+    )
     sketch = Sketch(rng, start_w, float(rng.uniform(-math.pi, math.pi)), caution)
     draw(sketch, seconds)
     return sketch.moments(seconds)
