@@ -21,6 +21,7 @@ from benchmarks.hidden.noise import NOISE_KINDS, measure
 from benchmarks.hidden.outside import KINDS as OUTSIDE_KINDS
 from benchmarks.hidden.outside_draws import draw_outside
 from benchmarks.hidden.truth import Gust, Outside, Truth
+from benchmarks.hidden.visibility import signal_to_noise
 
 __all__ = [
     "CHANGES",
@@ -41,5 +42,6 @@ __all__ = [
     "draw_truth",
     "fly",
     "measure",
+    "signal_to_noise",
     "with_effects",
 ]

@@ -11,9 +11,9 @@ from collections import deque
 from collections.abc import Callable, Mapping
 from typing import Any
 
+from benchmarks.hidden.truth import DT_S
 from benchmarks.hidden.vectors import Vector
 
-DT_S = 0.01
 Parameters = Mapping[str, float]
 Sticks = tuple[float, float, float, float]
 Hook = Callable[[Any, Any], Any]

@@ -1,7 +1,8 @@
 """Random truths: the list of hidden effects, how large they are drawn, and the plants that have them.
 
 A **size** is what an effect is drawn by: log-uniform between what a flight of a minute barely shows under
-the noise of ``benchmarks.hidden.noise`` and what nobody overlooks. ``EFFECTS`` says what a size is of.
+the noise of ``benchmarks.hidden.noise`` and what nobody overlooks; ``python -m benchmarks.hidden`` says how
+plainly. ``EFFECTS`` says what a size is of.
 """
 
 import math
@@ -15,6 +16,10 @@ from benchmarks.hidden.truth import GRAVITY, Gust, Truth
 
 Values = dict[str, float]
 Rng = np.random.Generator
+
+
+# Of what a size does not say: shares of it on other axes and of drag along y, m, 1.
+OTHER_AXES, SIDEWAYS, GROUND_M, ZETA = (0.5, 1.0), (0.7, 1.4), (0.2, 0.5), (0.4, 0.9)
 
 
 class Drawn(NamedTuple):
@@ -52,7 +57,7 @@ def _factors(*names: str) -> Callable[[float, Rng], Values]:
     """Return a maker of factors e^(+-size) on some axes, by half of it or more on the others."""
 
     def make(size: float, rng: Rng) -> Values:
-        shares = rng.uniform(0.5, 1.0, len(names))
+        shares = rng.uniform(*OTHER_AXES, len(names))
         shares[rng.integers(len(names))] = 1.0
         return {name: math.exp(size * share * _sign(rng)) for name, share in zip(names, shares, strict=True)}
 
@@ -67,47 +72,47 @@ def _drag(prefix: str, upright: tuple[float, float]) -> Callable[[float, Rng], V
     """Return a maker of coefficients of body x and y near the size, and of z as shares of it."""
 
     def make(size: float, rng: Rng) -> Values:
-        shares = (1.0, rng.uniform(0.7, 1.4), rng.uniform(*upright))
+        shares = (1.0, rng.uniform(*SIDEWAYS), rng.uniform(*upright))
         return {f"{prefix}_{axis}": float(size * share) for axis, share in zip("xyz", shares, strict=True)}
 
     return make
 
 
 def _ground(size: float, rng: Rng) -> Values:
-    return {"gain": size, "height_m": float(rng.uniform(0.2, 0.5))}
+    return {"gain": size, "height_m": float(rng.uniform(*GROUND_M))}
 
 
 def _oscillator(size: float, rng: Rng) -> Values:
-    return {"wn": 1.0 / size, "zeta": float(rng.uniform(0.4, 0.9))}
+    return {"wn": 1.0 / size, "zeta": float(rng.uniform(*ZETA))}
 
 
 # What a size is: see the unit, and the maker. Parameters and signs as in the package where laws agree.
 EFFECTS: dict[str, Drawn] = {
-    "command_delay": Drawn(0.002, 0.03, "s", _positive("delay_s")),
-    "thrust_lag_asymmetry": Drawn(0.1, 1.0, "|ln ratio|", _log_factor("ratio")),
-    "rate_expo": Drawn(0.02, 0.4, "1", _signed("expo")),
-    "rate_scale": Drawn(0.005, 0.15, "|ln factor|", _factors("roll", "pitch", "yaw")),
-    "rate_saturation": Drawn(0.03, 0.35, "share lost at full stick", _positive("lost")),
-    "rate_cross_coupling": Drawn(0.004, 0.08, "1", _direction("from_roll", "from_pitch")),
-    "motor_imbalance": Drawn(0.001, 0.015, "rad/s per m/s^2", _direction("roll", "pitch")),
-    "yaw_reaction": Drawn(0.005, 0.08, "rad", _signed("angle")),
-    "second_order_rates": Drawn(0.004, 0.03, "s, 1 / wn", _oscillator),
-    "rate_slew_limit": Drawn(0.004, 0.03, "s^2/rad", _positive("inverse")),
-    "wind": Drawn(0.08, 1.5, "m/s^2; with drag 6 times that in m/s", _direction("a_x", "a_y", "a_z")),
+    "command_delay": Drawn(0.0006, 0.02, "s", _positive("delay_s")),
+    "thrust_lag_asymmetry": Drawn(0.25, 1.2, "|ln ratio|", _log_factor("ratio")),
+    "rate_expo": Drawn(0.006, 0.15, "1", _signed("expo")),
+    "rate_scale": Drawn(0.005, 0.1, "|ln factor|", _factors("roll", "pitch", "yaw")),
+    "rate_saturation": Drawn(0.008, 0.2, "share lost at full stick", _positive("lost")),
+    "rate_cross_coupling": Drawn(0.005, 0.08, "1", _direction("from_roll", "from_pitch")),
+    "motor_imbalance": Drawn(0.0006, 0.01, "rad/s per m/s^2", _direction("roll", "pitch")),
+    "yaw_reaction": Drawn(0.003, 0.05, "rad", _signed("angle")),
+    "second_order_rates": Drawn(0.002, 0.025, "s, 1 / wn", _oscillator),
+    "rate_slew_limit": Drawn(0.0025, 0.03, "s^2/rad", _positive("inverse")),
+    "wind": Drawn(0.12, 1.5, "m/s^2; with drag 6 times that in m/s", _direction("a_x", "a_y", "a_z")),
     "thrust_scale": Drawn(0.01, 0.2, "|ln factor|", _log_factor("factor")),
-    "translational_lift": Drawn(0.015, 0.3, "share of thrust", _positive("gain")),
-    "ground_effect": Drawn(0.03, 0.3, "share of thrust", _ground),
+    "translational_lift": Drawn(0.03, 0.4, "share of thrust", _positive("gain")),
+    "ground_effect": Drawn(0.06, 0.5, "share of thrust", _ground),
     "linear_drag": Drawn(0.03, 0.6, "1/s", _drag("d", (0.2, 1.0))),
     "quadratic_drag": Drawn(0.003, 0.05, "1/m", _drag("k", (0.5, 2.0))),
     "rotor_drag": Drawn(0.003, 0.05, "s/m", _positive("h")),
-    "thrust_tilt": Drawn(0.006, 0.12, "rad", _direction("towards_x", "towards_y")),
-    "voltage_sag": Drawn(0.1, 2.0, "V at full thrust", _positive("at_full_v")),
-    "accelerometer_bias": Drawn(0.08, 1.5, "m/s^2", _direction("x", "y", "z")),
+    "thrust_tilt": Drawn(0.008, 0.12, "rad", _direction("towards_x", "towards_y")),
+    "voltage_sag": Drawn(0.01, 1.0, "V at full thrust", _positive("at_full_v")),
+    "accelerometer_bias": Drawn(0.12, 1.5, "m/s^2", _direction("x", "y", "z")),
     "accelerometer_scale": Drawn(0.008, 0.12, "|ln factor|", _factors("x", "y", "z")),
-    "gyro_bias": Drawn(0.005, 0.1, "rad/s", _direction("x", "y", "z")),
+    "gyro_bias": Drawn(0.006, 0.1, "rad/s", _direction("x", "y", "z")),
     "gyro_scale": Drawn(0.005, 0.1, "|ln factor|", _factors("x", "y", "z")),
     "imu_offset": Drawn(0.005, 0.06, "m", _direction("x", "y", "z")),
-    "imu_latency": Drawn(0.002, 0.02, "s", _positive("latency_s")),
+    "imu_latency": Drawn(0.0006, 0.015, "s", _positive("latency_s")),
 }
 NAMES = tuple(EFFECTS)
 DRAGS = ("linear_drag", "quadratic_drag", "rotor_drag")

@@ -2,13 +2,12 @@
 
 import numpy as np
 
-from benchmarks.hidden.actuators import DT_S
 from benchmarks.hidden.kinds import plan
 from benchmarks.hidden.pilot import Pilot
 from benchmarks.hidden.plans import Moment
 from benchmarks.hidden.plant import Plant, Start
 from benchmarks.hidden.readings import readings
-from benchmarks.hidden.truth import Truth
+from benchmarks.hidden.truth import DT_S, Truth
 from benchmarks.hidden.vectors import Vector
 from flytrack_sysid.log import FlightLog
 
@@ -62,7 +61,7 @@ def _flown(
     # As if drained by the time to settle already, which the log leaves out.
     start = Start(moments[0].pos_w, moments[0].heading, float(rng.uniform(*OPEN_V)), HOVER_STICK)
     plant = Plant(truth, start, rng, seconds + SETTLE_S, _centre(truth, moments))
-    pilot, rows = Pilot(truth), []
+    pilot, rows = Pilot(truth, rng), []
     for moment in [*settling, *moments]:
         sticks = pilot.command(plant, moment)
         rows.append(

@@ -23,10 +23,9 @@ from typing import Any
 import numpy as np
 
 from benchmarks.hidden.noise import ACCELEROMETER_STD, GYRO_STD
-from benchmarks.hidden.truth import Outside, Truth
+from benchmarks.hidden.truth import DT_S, Outside, Truth
 from benchmarks.hidden.vectors import Vector, norm, scaled, to_body
 
-DT_S = 0.01
 DEPENDS_ON = {
     "position": ("position",),
     "time": ("time",),
@@ -42,23 +41,23 @@ KINDS = tuple(DEPENDS_ON)
 SCALES = {"force": ACCELEROMETER_STD, "thrust": ACCELEROMETER_STD, "rate": GYRO_STD}
 SMALLEST, LARGEST = 0.3, 3.0  # amplitudes that are drawn
 HEADING_ORDERS = (2, 3)
-CIRCLE = np.linspace(-np.pi, np.pi, 361)
+CIRCLE = np.linspace(-np.pi, np.pi, 3601)  # rad, headings at which the largest is looked for
 REFERENCE_V = 23.0  # at which the slope of the thrust turns a force into a share of the stick
 TINY_SPEED = 1e-6  # m/s, keeps 0 / 0 away
 
 
 class FirstOrderNoise:
-    """Three independent random processes of standard deviation 1 that forget with a time constant, s."""
+    """Independent random processes of standard deviation 1 that forget with a time constant, s."""
 
-    def __init__(self, time_constant_s: float, rng: np.random.Generator):
+    def __init__(self, time_constant_s: float, rng: np.random.Generator, count: int = 3):
         self._keep = math.exp(-DT_S / time_constant_s)
         self._fresh = math.sqrt(1.0 - self._keep**2)
         self._rng = rng
-        self._now = tuple(rng.standard_normal(3).tolist())
+        self._now = tuple(rng.standard_normal(count).tolist())
 
-    def step(self) -> Vector:
-        """Return the next three values."""
-        fresh = self._rng.standard_normal(3).tolist()
+    def step(self) -> tuple[float, ...]:
+        """Return the next values, 10 ms later."""
+        fresh = self._rng.standard_normal(len(self._now)).tolist()
         pairs = zip(self._now, fresh, strict=True)
         self._now = tuple(self._keep * old + self._fresh * new for old, new in pairs)
         return self._now

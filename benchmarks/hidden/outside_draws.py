@@ -24,6 +24,7 @@ STICK_AXES = 4
 YAW = {"x": 0.0, "y": 0.0, "z": 1.0}
 UP = {"x": 0.0, "y": 0.0, "z": 1.0}
 # Ranges of shapes: units in the names of what is drawn from them.
+MOST_LEAN, WAVE = math.radians(40.0), (0.3, 1.0)  # rad; shares of waves in the heading
 RADIUS_M, MIDDLE_SHARE = (4.0, 12.0), (0.25, 0.75)
 STEP_WIDTH_SHARE, HUMP_WIDTH_SHARE = (0.005, 0.05), (0.05, 0.15)
 SPEED_MS, SPEED_WIDTH_MS = (4.0, 11.0), (0.7, 1.5)
@@ -41,7 +42,7 @@ def _way(rng: Rng, size: int = 3) -> Shape:
 def _position(rng: Rng) -> Drawn:
     # Mostly up or down, as thermals go.
     up = float(rng.choice([-1.0, 1.0]))
-    side, lean = rng.uniform(-math.pi, math.pi), rng.uniform(0.0, math.radians(40.0))
+    side, lean = rng.uniform(-math.pi, math.pi), rng.uniform(0.0, MOST_LEAN)
     way = (math.sin(lean) * math.cos(side), math.sin(lean) * math.sin(side), up * math.cos(lean))
     shape = dict(zip(AXES, way, strict=True))
     return "force", {
@@ -62,7 +63,7 @@ def _time(rng: Rng) -> Drawn:
 
 
 def _heading(rng: Rng) -> Drawn:
-    shape = {f"size_{order}": rng.uniform(0.3, 1.0) for order in HEADING_ORDERS}
+    shape = {f"size_{order}": rng.uniform(*WAVE) for order in HEADING_ORDERS}
     shape |= {f"phase_{order}": rng.uniform(-math.pi, math.pi) for order in HEADING_ORDERS}
     shape["largest"] = float(np.abs(heading_waves(shape, CIRCLE)).max())
     return ("force", {**shape, **_way(rng, 2)}) if rng.random() < 0.5 else ("rate", {**shape, **YAW})

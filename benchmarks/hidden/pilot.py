@@ -6,9 +6,11 @@ swing. The pilot knows the thrust curve without effects, and learns steady error
 
 import math
 
-from benchmarks.hidden.outside import DT_S
+import numpy as np
+
+from benchmarks.hidden.outside import FirstOrderNoise
 from benchmarks.hidden.plans import Moment
-from benchmarks.hidden.truth import Truth
+from benchmarks.hidden.truth import DT_S, Truth
 from benchmarks.hidden.vectors import Vector, norm, rotation, to_body, within, wrapped
 
 # Gains as shares of what comes before them, so that no loop chases the one inside it.
@@ -17,10 +19,14 @@ QUICKEST_ATTITUDE, QUICKEST_HEIGHT = 12.0, 5.0  # 1/s
 YAW_GAIN, MOST_YAW_RATE = 2.5, 1.6  # 1/s, rad/s
 MOST_TILTED = math.radians(65.0)  # of the thrust that is asked for
 MOST_UP, MOST_DOWN = 14.0, 6.0  # m/s^2
+MOST_LESSON = 2.0  # m/s, error of speed beyond which nothing more is learnt
 MOST_SPEED, MOST_CORRECTION, MOST_LEARNT = 18.0, 4.0, 5.0  # m/s, m/s, m/s^2
 UPRIGHT = 0.3  # cosine of the tilt beyond which a heading means nothing
-TINY = 1e-9
+TINY, LEAST_SLOPE, CUBE_POWER = 1e-9, 1.0, 3.0  # m/s^2; N per stick; of the thrust curve's last term
+TREMBLE, TREMBLE_S = 0.01, 0.1  # of all sticks that the hands hold still, and s
+USUAL_TURN = 3.0  # rad/s, change of rates that a slew limit stretches
 NEWTON_STEPS = 4  # from the stick before, which is close
+FIRST_STICK = -0.2  # before there is one
 # Manoeuvres on one stick are cut off below a height that leaves room to brake, and above a speed.
 BRAKING, ROOM_M, FASTEST = 5.0, 4.0, 15.0  # m/s^2, m, m/s
 # The flown height looks ahead, and near the ground the climb that it asks for is never less than this.
@@ -30,21 +36,22 @@ LOOK_AHEAD_S, FLOOR_M, FLOOR_GAIN = 0.25, 0.14, 12.0
 class Pilot:
     """Gives commands for moments of a plan."""
 
-    def __init__(self, truth: Truth):
+    def __init__(self, truth: Truth, rng: np.random.Generator):
         self._truth = truth
         self._full_rates = tuple(math.radians(rate) for rate in truth.max_rate)
         effects = truth.effects
         delay = effects.get("command_delay", {}).get("delay_s", 0.0) + DT_S
         loop = effects.get("second_order_rates", {})
         ringing = 2.0 / loop["wn"] if loop else 0.0
-        slew = 3.0 * effects.get("rate_slew_limit", {}).get("inverse", 0.0)
+        slew = USUAL_TURN * effects.get("rate_slew_limit", {}).get("inverse", 0.0)
         slow_fall = max(1.0, effects.get("thrust_lag_asymmetry", {}).get("ratio", 1.0))
         turn_lag = max(truth.tau[:3]) + delay + ringing + slew
         self._attitude = min(QUICKEST_ATTITUDE, ATTITUDE_PER_LAG / turn_lag)
         self._level = VELOCITY_PER_ATTITUDE * self._attitude
         self._upright = min(QUICKEST_HEIGHT, ATTITUDE_PER_LAG / (slow_fall * truth.tau[3] + delay))
         self._learnt_w = (0.0, 0.0, 0.0)
-        self._stick, self._is_cut_off = -0.2, False
+        self._tremble = FirstOrderNoise(TREMBLE_S, rng, len(truth.tau))
+        self._stick, self._is_cut_off = FIRST_STICK, False
 
     def command(self, plant, moment: Moment) -> tuple[float, float, float, float]:
         """Return the sticks for the plant's state at a moment of the plan, in [-1, 1]."""
@@ -52,7 +59,12 @@ class Pilot:
         self._is_cut_off = has_stick and (self._is_cut_off or self._is_unsafe(plant))
         is_free = not has_stick or self._is_cut_off
         force_w = self._force(plant, moment, is_free)
-        own = self._sticks(plant, force_w, moment.heading)
+        own = tuple(
+            stick + TREMBLE * shake
+            for stick, shake in zip(
+                self._sticks(plant, force_w, moment.heading), self._tremble.step(), strict=True
+            )
+        )
         if not is_free:
             own = tuple(
                 mine if given is None else given for mine, given in zip(own, moment.sticks, strict=True)
@@ -79,7 +91,7 @@ class Pilot:
         if is_free:
             learn = tuple(
                 known + DT_S * LEARN_PER_VELOCITY * gain * gain * e
-                for known, gain, e in zip(self._learnt_w, gains, within(error, 2.0), strict=True)
+                for known, gain, e in zip(self._learnt_w, gains, within(error, MOST_LESSON), strict=True)
             )
             self._learnt_w = within(learn, MOST_LEARNT)
         ahead = plant.pos_w[2] + LOOK_AHEAD_S * plant.vel_w[2]
@@ -108,8 +120,8 @@ class Pilot:
         _, linear, square, cube, _, both = self._truth.coeffs
         stick = self._stick
         for _ in range(NEWTON_STEPS):
-            slope = linear + both * battery_v + stick * (2.0 * square + 3.0 * cube * stick)
-            stick += (thrust_n - self._truth.thrust(stick, battery_v)) / max(slope, 1.0)
+            slope = linear + both * battery_v + stick * (2.0 * square + CUBE_POWER * cube * stick)
+            stick += (thrust_n - self._truth.thrust(stick, battery_v)) / max(slope, LEAST_SLOPE)
             stick = max(-1.0, min(1.0, stick))
         self._stick = stick
         return stick

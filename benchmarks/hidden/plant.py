@@ -5,10 +5,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from benchmarks.hidden.actuators import COMMAND_MAKERS, DT_S, RATE_MAKERS, Sticks
+from benchmarks.hidden.actuators import COMMAND_MAKERS, RATE_MAKERS, Sticks
 from benchmarks.hidden.forces import AIR_VELOCITY, FORCE_MAKERS, THRUST_MAKERS
 from benchmarks.hidden.outside import FirstOrderNoise, command_hook, vector_hook
-from benchmarks.hidden.truth import Truth
+from benchmarks.hidden.truth import DT_S, Truth
 from benchmarks.hidden.vectors import Quaternion, Vector, plus, rotation, scaled, to_body, to_world, turned
 
 SECONDS_PER_MINUTE = 60.0

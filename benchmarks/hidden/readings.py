@@ -2,9 +2,8 @@
 
 import numpy as np
 
-from benchmarks.hidden.truth import Truth
+from benchmarks.hidden.truth import DT_S, Truth
 
-DT_S = 0.01
 XYZ = ("x", "y", "z")
 
 

@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 GRAVITY = 9.80665  # m/s^2
+DT_S = 0.01  # of a step
 
 
 @dataclass(frozen=True)
