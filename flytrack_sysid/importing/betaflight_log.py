@@ -112,6 +112,10 @@ def _channels(table: Table, headers: dict[str, Any], craft: Craft) -> dict[str, 
     # Setpoints are whole numbers: half of one past full stick is rounding.
     is_rounding = np.abs(commands) <= 1.0 + units / 2 / full
     time, g_unit = table.columns["time"], _header(table.source, headers, "acc_1G", 1)[0]
+    if g_unit == 0.0:
+        raise LogError(
+            f"{table.source}: header acc_1G: found 0, expected what the accelerometer shows at 1 g"
+        )
     found = {"t": (time - time[0]) * MICROSECOND}
     parts = [
         ("u", np.where(is_rounding, np.clip(commands, -1.0, 1.0), commands)),
@@ -134,7 +138,7 @@ def _header(
     value = headers.get(name, default)
     values = value if isinstance(value, list) else [value]
     if len(values) != size or not all(isinstance(one, (int, float)) and one >= 0 for one in values):
-        raise LogError(f"{source}: header {name}: found {value!r}, expected {size} numbers")
+        raise LogError(f"{source}: header {name}: found {value!r}, expected {size} numbers of at least 0")
     return [float(one) for one in values]
 
 

@@ -73,19 +73,20 @@ class _Topics:
 
     def __init__(self, path: Path):
         self.path = path
+        pyulog = needed_module("pyulog", "logs", path)
         try:
             with path.open("rb") as file:
                 found = file.read(len(FIRST_BYTES))
+                file.seek(0)
+                ulog = pyulog.ULog(file, TOPICS) if found == FIRST_BYTES else None
         except OSError as error:
             raise LogError(f"{path}: cannot be read: {error}") from error
-        if found != FIRST_BYTES:
-            raise LogError(f"{path}: found {found!r} first, expected {FIRST_BYTES!r}, as every ULog begins")
-        pyulog = needed_module("pyulog", "logs", path)
-        try:
-            ulog = pyulog.ULog(str(path), TOPICS)
         except Exception as error:  # whatever a parser raises on damaged bytes
             said = f"{type(error).__name__}: {error}"
             raise LogError(f"{path}: damaged, cannot be parsed: {said}") from error
+        if ulog is None:
+            raise LogError(f"{path}: found {found!r} first, expected {FIRST_BYTES!r}, as every ULog begins")
+        self.is_damaged = ulog.file_corruption
         self.parameters: dict[str, Any] = ulog.initial_parameters
         self.data = {data.name: data.data for data in ulog.data_list if data.multi_id == 0}
 
@@ -152,7 +153,9 @@ def read_ulog(path: Path, mapping: Mapping) -> Flight:
         channels["v_bat"] = np.interp(base, battery[0], battery[1][:, 0])[:, None]
     landed = topics.find(LANDED)
     is_flying = np.ones(len(base), bool) if landed is None else _is_flying(*landed, base)
-    return _flight(path, craft, base, channels, is_known, is_flying)
+    flight = _flight(path, craft, base, channels, is_known, is_flying)
+    damage = (f"{path}: damaged in places; what could be read is used",) if topics.is_damaged else ()
+    return flight._replace(notes=flight.notes + damage)
 
 
 def _is_flying(times: np.ndarray, landed: np.ndarray, base: np.ndarray) -> np.ndarray:
