@@ -128,6 +128,16 @@ def test_a_missing_file_or_package_is_named(tmp_path, monkeypatch):
         import_log(path, "betaflight")
 
 
+def test_logs_of_different_craft_or_channels_make_no_log(tmp_path):
+    first = write(tmp_path / "a.bbl", log_with())
+    second = write(tmp_path / "b.bbl", log_with(rc_rates="220,100,60"))
+    with pytest.raises(LogError, match=r"b\.bbl: craft: full stick .* 600 deg/s.*a\.bbl.* 500 deg/s"):
+        import_log([first, second], "betaflight")
+    write(second, log_with(names=[name.replace("vbatLatest", "x") for name in NAMES]))
+    with pytest.raises(LogError, match=r"b\.bbl: channels v_bat: not in both this file and .*a\.bbl"):
+        import_log([first, second], "betaflight")
+
+
 @pytest.fixture(scope="module")
 def real():
     """A real acro flight, and every second frame of it as another decoder has it, in raw units."""

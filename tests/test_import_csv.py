@@ -105,7 +105,7 @@ def test_units_and_frames_come_out_ours(folder, truth):
 
 def test_euler_angles_of_aerospace_are_ours(tmp_path):
     """Nose east and 30 degrees up, then rolled right by 20: by hand from the picture."""
-    rows = ["t,r,p,y,a,e,u,h", *(f"{0.01 * k},20,30,90,0,0,0,{k % 2}" for k in range(5))]
+    rows = ["t,r,p,y,a,e,u,h", *(f"{0.01 * row},20,30,90,0,0,0,{row % 2}" for row in range(5))]
     (tmp_path / "a.csv").write_text("\n".join(rows))
     (tmp_path / "map.toml").write_text(
         '[time]\ncolumn = "t"\nunit = "s"\n[command]\ncolumns = ["a", "e", "u", "h"]\n'
@@ -241,6 +241,16 @@ def test_command_writes_log_details_and_model(folder, tmp_path, capsys):
     assert details["sha256"] == load_log(out).sha256
     assert [Path(source).name for source in details["sources"]] == ["flight.csv"]
     assert load_model(model).m == 0.5 and load_model(model).max_rate.tolist() == [700.0, 600.0, 500.0]
+
+
+def test_command_keeps_clocks_if_asked(folder, tmp_path, capsys):
+    late = write_csv(tmp_path / "late.csv", flight(TIME_S, 0.02))
+    arguments = ["import", late, "--format", "csv", "--map", folder / "map.toml", "--out", tmp_path / "a.npz"]
+    for options, verdict, num_rows in (([], "corrected", 1998), (["--keep-clocks"], "left as asked", 2000)):
+        main([str(part) for part in (*arguments, *options)])
+        (line,) = (line for line in capsys.readouterr().out.splitlines() if line.startswith("clock of q"))
+        assert "+20." in line and verdict in line
+        assert abs(len(load_log(tmp_path / "a.npz")) - num_rows) <= 1
 
 
 def test_command_writes_nothing_where_the_model_lacks_a_value(folder, tmp_path, capsys):

@@ -168,6 +168,24 @@ def test_what_is_no_ulog_is_refused(tmp_path, content, message):
         import_log(tmp_path / "a.ulg", "ulog")
 
 
+def test_damage_is_noted_and_the_rest_read(tmp_path, capsys):
+    path = write(tmp_path / "a.ulg", topics())
+    content = path.read_bytes()
+    place = content.rindex(b"battery_status") - 6  # where the subscription to the last topic begins
+    path.write_bytes(content[:place] + bytes(60) + content[place:])
+    found = import_log(path, "ulog")
+    assert found.notes[-1].endswith("a.ulg: damaged in places; what could be read is used")
+    assert len(found.log) == 196
+    assert capsys.readouterr().out == ""  # what pyulog prints is not the command's answer
+
+
+def test_a_file_cut_in_half_is_refused(tmp_path):
+    path = write(tmp_path / "a.ulg", topics())
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+    with pytest.raises(LogError, match=r"a\.ulg: topic vehicle_rates_setpoint .*missing or empty"):
+        import_log(path, "ulog")
+
+
 def test_a_missing_file_or_package_is_named(tmp_path, monkeypatch):
     with pytest.raises(LogError, match=r"no\.ulg: cannot be read"):
         import_log(tmp_path / "no.ulg", "ulog")

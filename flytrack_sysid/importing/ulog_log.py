@@ -4,6 +4,8 @@ Rows are the samples of the body rates; other sensors are interpolated in betwee
 held. Where a topic misses more than three of its usual steps, or the craft has landed, there are no rows.
 """
 
+import contextlib
+import sys
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -75,7 +77,8 @@ class _Topics:
         self.path = path
         pyulog = needed_module("pyulog", "logs", path)
         try:
-            with path.open("rb") as file:
+            # pyulog prints what it finds damaged; that is no part of what a command answers.
+            with path.open("rb") as file, contextlib.redirect_stdout(sys.stderr):
                 found = file.read(len(FIRST_BYTES))
                 file.seek(0)
                 ulog = pyulog.ULog(file, TOPICS) if found == FIRST_BYTES else None
