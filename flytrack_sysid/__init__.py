@@ -3,6 +3,7 @@
 from flytrack_sysid.collect import CollectError, collect
 from flytrack_sysid.estimate import FitError
 from flytrack_sysid.fit import Fit, fit
+from flytrack_sysid.importing import Imported, import_log
 from flytrack_sysid.log import FlightLog, LogError, log_of_states
 from flytrack_sysid.log_file import load_log, save_log
 from flytrack_sysid.split import held_out_rows
@@ -13,11 +14,13 @@ __all__ = [
     "Fit",
     "FitError",
     "FlightLog",
+    "Imported",
     "LogError",
     "Validation",
     "collect",
     "fit",
     "held_out_rows",
+    "import_log",
     "load_log",
     "log_of_states",
     "save_log",

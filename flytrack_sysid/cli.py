@@ -1,4 +1,4 @@
-"""The command ``flytrack-sysid``: collect, fit, validate; each a thin skin over a function of the package."""
+"""The command ``flytrack-sysid``: collect, import, fit, validate; thin skins over the package's functions."""
 
 import argparse
 import importlib
@@ -13,6 +13,7 @@ from flytrack_env import blackbox, load_model, load_provenance, save_model
 from flytrack_env.model_file import ModelFileError
 from flytrack_sysid.collect import CollectError, collect
 from flytrack_sysid.fit import fit
+from flytrack_sysid.importing import FORMATS, import_log
 from flytrack_sysid.log import FlightLog
 from flytrack_sysid.log_file import check_name, describe, load_log, save_log
 from flytrack_sysid.plausibility import check_plausible
@@ -71,6 +72,33 @@ def run_collect(arguments: argparse.Namespace) -> None:
     print(describe(load_log(arguments.out)))
 
 
+def run_import(arguments: argparse.Namespace) -> None:
+    """Read measured flights and write them as a log, with what the log cannot hold beside it."""
+    check_name(arguments.out)
+    if arguments.model_out is not None:
+        check_model_name(arguments.model_out)
+    found = import_log(arguments.files, arguments.format, arguments.map, not arguments.keep_clocks)
+    written = [arguments.out, arguments.out.with_suffix(".import.json")]
+    model = None if arguments.model_out is None else found.nominal_model()  # before anything is written
+    save_log(arguments.out, found.log)
+    found.save_details(written[1])
+    if model is not None:
+        about = {
+            "nominal": "generic quadcopter, scaled to the craft",
+            "imported_from": [Path(source).name for source in found.sources],
+        }
+        save_model(arguments.model_out, model, about)
+        written.append(arguments.model_out)
+    print(found.describe())
+    print(f"written: {', '.join(str(path) for path in written)}")
+
+
+def check_model_name(path: Path) -> None:
+    """Raise ModelFileError for a model's file that is not .json, lest a log is overwritten."""
+    if path.suffix != ".json":
+        raise ModelFileError(f"{path}: found suffix {path.suffix!r}, expected .json")
+
+
 def fixed_values(pairs: Sequence[str]) -> dict[str, float]:
     """Return NAME=VALUE pairs as a dictionary.
 
@@ -91,8 +119,7 @@ def fixed_values(pairs: Sequence[str]) -> dict[str, float]:
 
 def run_fit(arguments: argparse.Namespace) -> None:
     """Identify a model and write it."""
-    if arguments.out.suffix != ".json":  # before the work, and lest a log is overwritten
-        raise ModelFileError(f"{arguments.out}: found suffix {arguments.out.suffix!r}, expected .json")
+    check_model_name(arguments.out)  # before the work
     fixed = fixed_values(arguments.fix)
     start = None if arguments.start is None else load_model(arguments.start)
     log = load_log(arguments.log)
@@ -151,6 +178,15 @@ def make_parser() -> argparse.ArgumentParser:
     one.add_argument("--seed", type=int, default=0)
     one.add_argument("--noise", type=float, default=0.0, help="0: the state itself; 1: common sensors")
     one.set_defaults(run=run_collect)
+
+    one = commands.add_parser("import", help="turn logs of real flights into a flight log")
+    one.add_argument("files", type=Path, nargs="+", metavar="FILE")
+    one.add_argument("--format", required=True, choices=FORMATS)
+    one.add_argument("--map", metavar="MAPPING", help="a mapping file, .toml, or the name of a shipped one")
+    one.add_argument("--out", type=Path, required=True, help="the log, .npz or .csv")
+    one.add_argument("--model-out", type=Path, help="also write the nominal model of this craft, .json")
+    one.add_argument("--keep-clocks", action="store_true", help="report clock offsets, correct none")
+    one.set_defaults(run=run_import)
 
     one = commands.add_parser("fit", help="identify a model from a flight log")
     one.add_argument("log", type=Path)

@@ -1,0 +1,6 @@
+"""Readers of other people's flight logs: CSV by a mapping file, PX4 ULog, Betaflight blackbox."""
+
+from flytrack_sysid.importing.importer import FORMATS, Imported, import_log
+from flytrack_sysid.importing.mapping import load_mapping
+
+__all__ = ["FORMATS", "Imported", "import_log", "load_mapping"]

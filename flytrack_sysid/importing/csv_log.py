@@ -1,0 +1,154 @@
+"""CSV logs of anybody, by a mapping file; gzip-compressed ones too."""
+
+import csv
+import gzip
+import io
+import zlib
+from array import array
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from flytrack_sysid.importing.flight import Flight
+from flytrack_sysid.importing.mapping import Attitude, Columns, Command, Mapping, Vector
+from flytrack_sysid.importing.units import quaternion_from, vector_from
+from flytrack_sysid.log import CHANNELS, LogError
+from flytrack_sysid.log_file import LARGEST_BYTES
+from flytrack_sysid.log_table import LARGEST_NORM_ERROR, Table, log_of_table
+
+
+def read_csv(path: Path, mapping: Mapping) -> Flight:
+    """Return the flight in a CSV file with a header, by a mapping; SI units and our frames.
+
+    Raises:
+        LogError: a mapping without columns; a file that cannot be read; a column that it lacks; a cell that
+            is no number, or a value that no log can have. The message names file, row, line and column.
+    """
+    if mapping.columns is None:
+        raise LogError(f"{path}: {mapping.source} names no columns; a CSV file needs [time] and [command]")
+    columns = mapping.columns
+    table = _read(path, columns, mapping.source)
+    values = {"t": _time(table, columns)}
+    for name, part in (("u", _commands(table, columns.command)), *_measured(table, columns)):
+        values |= dict(zip(CHANNELS[name], part.T, strict=True))
+    return Flight(log_of_table(table._replace(columns=values)), mapping.craft)
+
+
+def _wanted(columns: Columns) -> dict[str, str]:
+    """Return the columns that are read, each with the table of the mapping that wants it."""
+    wanted = {columns.time.column: "time"} if columns.time.column else {}
+    wanted |= dict.fromkeys(columns.command.columns, "command")
+    for channel, vector in columns.vectors.items():
+        wanted |= dict.fromkeys(vector.columns, channel)
+    if columns.attitude:
+        wanted |= dict.fromkeys(columns.attitude.columns, "attitude")
+    if columns.battery:
+        wanted[columns.battery.column] = "battery"
+    return wanted
+
+
+def _text(path: Path) -> io.StringIO:
+    """Return what a file, perhaps compressed, holds; never unpacks more than the largest log."""
+    try:
+        with gzip.open(path, "rb") if path.suffix == ".gz" else path.open("rb") as file:
+            content = file.read(LARGEST_BYTES + 1)
+        if len(content) > LARGEST_BYTES:
+            raise LogError(f"{path}: found more than {LARGEST_BYTES} bytes, expected a log of at most that")
+        return io.StringIO(content.decode("utf-8-sig"), newline="")
+    except (OSError, EOFError, zlib.error, UnicodeDecodeError) as error:
+        raise LogError(f"{path}: cannot be read as text: {error}") from error
+
+
+def _read(path: Path, columns: Columns, mapping: str) -> Table:
+    """Return the columns that the mapping names, as they are in the file."""
+    rows = csv.reader(_text(path), delimiter=columns.delimiter, strict=True)
+    wanted, values, lines = _wanted(columns), array("d"), array("q")
+    try:
+        header = [name.strip() for name in next(rows, [])]
+        for name, table in wanted.items():
+            if header.count(name) != 1:
+                found = f"found {header.count(name)} times among {', '.join(header)}"
+                raise LogError(f"{path}: column {name}: {found}; expected once by {mapping}: {table}")
+        places = [header.index(name) for name in wanted]
+        for cells in rows:
+            if cells:
+                if len(cells) != len(header):
+                    found = f"found {len(cells)} cells, expected {len(header)} as in the header"
+                    raise LogError(f"{path}: row {len(lines)} (line {rows.line_num}): {found}")
+                lines.append(rows.line_num)
+                values.extend(_number(path, lines, header[place], cells[place]) for place in places)
+    except csv.Error as error:
+        raise LogError(f"{path}: near line {rows.line_num + 1}: not a CSV file: {error}") from error
+    if not lines:
+        raise LogError(f"{path}: found no rows, expected at least one")
+    matrix = np.frombuffer(values, float).reshape(-1, len(wanted))
+    return Table(str(path), dict(zip(wanted, matrix.T.copy(), strict=True)), np.array(lines))
+
+
+def _number(path: Path, lines: array, column: str, cell: str) -> float:
+    try:
+        return float(cell)
+    except ValueError:
+        found = repr(cell) if cell.strip() else "an empty cell"
+        place = f"{path}: row {len(lines) - 1} (line {lines[-1]}), column {column}"
+        raise LogError(f"{place}: found {found}, expected a number") from None
+
+
+def _time(table: Table, columns: Columns) -> np.ndarray:
+    """Return time from 0 on, s: large numbers of us would cost digits."""
+    time = columns.time
+    if time.column is None:
+        return np.arange(len(table.lines)) * time.scale
+    values = table.columns[time.column]
+    return (values - values[0]) * time.scale
+
+
+def _commands(table: Table, command: Command) -> np.ndarray:
+    """Return the commands (num_rows, 4) with what means -1 and 1 there."""
+    low, high = np.array(command.low), np.array(command.high)
+    values = table.matrix(command.columns)
+    if command.clip:
+        values = np.clip(values, np.minimum(low, high), np.maximum(low, high))
+    bad = np.argwhere((values < np.minimum(low, high)) | (values > np.maximum(low, high)))
+    if len(bad):
+        row, stick = bad[0]
+        text = (
+            f"found {values[row, stick]:g}, expected {low[stick]:g} to {high[stick]:g} by command.low, high"
+        )
+        raise table.error(row, command.columns[stick], f"{text}; clip = true cuts it")
+    return 2.0 * (values - low) / (high - low) - 1.0
+
+
+def _measured(table: Table, columns: Columns) -> list[tuple[str, np.ndarray]]:
+    """Return the channels that the mapping names, in SI units and our frames."""
+    found = [(name, _vector(table, vector)) for name, vector in columns.vectors.items()]
+    if columns.attitude is not None:
+        found.append(("q", _quaternions(table, columns.attitude)))
+    if columns.battery is not None:
+        found.append(("v_bat", table.matrix([columns.battery.column]) * columns.battery.scale))
+    return found
+
+
+def _vector(table: Table, vector: Vector) -> np.ndarray:
+    return vector_from(table.matrix(vector.columns) * np.array(vector.scales), vector.is_turned)
+
+
+def _quaternions(table: Table, attitude: Attitude) -> np.ndarray:
+    """Return the quaternions (num_rows, 4); Euler angles turn by yaw, then pitch, then roll, moving axes."""
+    values = table.matrix(attitude.columns) * np.array(attitude.scales)
+    bad = np.flatnonzero(~np.isfinite(values).all(axis=1))
+    if len(bad):
+        raise table.error(bad[0], ", ".join(attitude.columns), "found no finite numbers")
+    if attitude.order == "euler":
+        rotation = Rotation.from_euler("ZYX", values[:, ::-1])
+    else:
+        norm = np.linalg.norm(values, axis=1)
+        bad = np.flatnonzero(np.abs(norm - 1.0) > LARGEST_NORM_ERROR)
+        if len(bad):
+            text = f"found a quaternion of norm {norm[bad[0]]:.4g}, expected 1"
+            raise table.error(bad[0], ", ".join(attitude.columns), text)
+        rotation = Rotation.from_quat(values, scalar_first=attitude.order == "wxyz")
+    if attitude.is_inverted:
+        rotation = rotation.inv()
+    return quaternion_from(rotation, attitude.is_body_turned, attitude.is_world_turned)

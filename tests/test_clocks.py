@@ -1,0 +1,70 @@
+"""Offsets between sensors' clocks: found, corrected, and never made of the plant's lag."""
+
+import numpy as np
+import pytest
+from made_flight import TIME_S, flight, noisy
+from real_logs import CRAZYFLIE, shared
+from scipy.spatial.transform import Rotation
+
+from flytrack_sysid import FlightLog, import_log
+from flytrack_sysid.importing import clocks
+
+
+@pytest.fixture(scope="module")
+def truth() -> FlightLog:
+    """A flight of 20 s at 100 Hz, all clocks the same."""
+    return flight(TIME_S)
+
+
+@pytest.mark.parametrize("late_s", [(0.023, -0.012, 0.031), (-0.04, 0.008, -0.015)])
+def test_clock_offsets_between_sensors_are_found_and_corrected(truth, late_s):
+    aligned, found = clocks.align_clocks(noisy(flight(TIME_S, *late_s), seed=1))
+    assert [(one.channel, one.reference) for one in found] == [("q", "w"), ("v", "f"), ("p", "v")]
+    for one, expected in zip(found, late_s, strict=True):
+        assert abs(one.offset_s - expected) < 4.0 * one.sigma_s + 1e-4, one.describe()
+        assert one.sigma_s < 1.5e-3 and one.verdict == "corrected"
+    rows = np.searchsorted(TIME_S, aligned.time - 1e-6)
+    for name, bound in (("q", 0.004), ("v", 0.03), ("p", 0.008)):
+        assert np.sqrt(np.mean((aligned[name] - truth[name][rows]) ** 2)) < bound, name
+
+
+def test_standard_errors_are_honest(truth):
+    found = [one for seed in range(8) for one in clocks.align_clocks(noisy(truth, seed))[1]]
+    scores = np.array([one.offset_s / one.sigma_s for one in found])
+    assert len(scores) == 24 and 0.5 < scores.std() < 1.6 and np.mean(np.abs(scores) > 3.0) < 0.1
+
+
+def test_clocks_that_agree_are_left(truth):
+    aligned, found = clocks.align_clocks(truth)
+    assert all(one.verdict == "not significant, left" and abs(one.offset_s) < 1e-3 for one in found)
+    np.testing.assert_array_equal(aligned["q"], truth["q"])
+
+
+def test_lag_of_the_plant_is_no_clock_offset(truth):
+    later = FlightLog(truth.time, {**truth.channels, "u": np.roll(truth["u"], 20, axis=0)}, truth.segment)
+    found, other = clocks.align_clocks(truth)[1], clocks.align_clocks(later)[1]
+    assert found == other and all(one.verdict == "not significant, left" for one in found)
+
+
+def test_clocks_of_a_drone_at_rest_or_too_short_are_not_compared(truth):
+    rest = FlightLog(truth.time, {**truth.channels, "w": 0.0 * truth["w"] + 0.1}, truth.segment)
+    assert "not compared: correlation" in clocks.align_clocks(rest)[1][0].verdict
+    short = clocks.align_clocks(truth.select(slice(500)))[1]
+    assert [one.verdict for one in short] == ["not compared: less than 10 s without a gap"] * 3
+
+
+def test_crazyflie_attitude_is_late_by_the_same_on_every_axis():
+    """As a clock would have it, and a filter's lag or a wrong unit would not."""
+    files = sorted(shared(CRAZYFLIE).glob("seed0006*.csv.gz"))
+    log = import_log(files, "csv", "crazyflie_phoenix", align=False).log
+    attitude = Rotation.from_quat(log["q"], scalar_first=True)
+    turned = np.cumsum((attitude[:-1].inv() * attitude[1:]).as_rotvec(), axis=0)
+    found = []
+    for axis in np.eye(3):
+        alone = Rotation.from_rotvec(np.concatenate([np.zeros((1, 3)), turned * axis]))
+        channels = {"q": alone.as_quat(scalar_first=True), "w": log["w"] * axis}
+        found += clocks.align_clocks(FlightLog(log.time, channels, log.segment))[1]
+    mean_s = np.mean([one.offset_s for one in found])
+    assert 0.004 < mean_s < 0.008
+    for one in found:
+        assert abs(one.offset_s - mean_s) < 3.0 * one.sigma_s + 5e-4, one.describe()

@@ -1,0 +1,200 @@
+"""Betaflight blackbox logs: units, rates, refusals; and a real one against its decoded frames."""
+
+import gzip
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from real_logs import BETAFLIGHT, BLACKBOX_HEADERS, blackbox, shared
+from scipy.spatial.transform import Rotation
+
+from flytrack_sysid import LogError, import_log
+from flytrack_sysid.importing.betaflight_log import full_stick_rate
+
+pytest.importorskip("orangebox", reason="orangebox is not installed: pip install 'flytrack[logs]'")
+
+GRAVITY = 9.80665
+NAMES = ["loopIteration", "time", *(f"setpoint[{axis}]" for axis in range(4)), "vbatLatest"]
+NAMES += [f"gyroADC[{axis}]" for axis in range(3)] + [f"accSmooth[{axis}]" for axis in range(3)]
+FULL_STICK = (1021.6, 200.0 / 0.3, 500.0)  # of the headers: 5.108 x 200; 200 / (1 - 0.7); 100 / (1 - 0.8)
+
+
+def frames(num_rows: int = 200) -> np.ndarray:
+    """Return frames of a steady turn, the throttle rising."""
+    time = 5_000_000 + 500 * np.arange(num_rows)
+    row = [0, 0, 511, -333, 250, 0, 2410, 100, -50, 25, 1024, -512, 2048]
+    found = np.tile(row, (num_rows, 1))
+    found[:, 0], found[:, 1], found[:, 5] = np.arange(num_rows), time, np.linspace(0, 1000, num_rows)
+    return found
+
+
+def write(path: Path, *logs: bytes) -> Path:
+    """Write logs one after the other, as a flash chip has them."""
+    path.write_bytes(b"".join(logs))
+    return path
+
+
+def log_with(rows: np.ndarray | None = None, names: list[str] = NAMES, **headers: str | None) -> bytes:
+    """Return a log with other headers; None leaves one out."""
+    kept = {name: value for name, value in (BLACKBOX_HEADERS | headers).items() if value is not None}
+    return blackbox(frames() if rows is None else rows, names, kept)
+
+
+def test_units_and_frames_are_ours(tmp_path):
+    found = import_log(write(tmp_path / "a.bbl", log_with()), "betaflight")
+    log = found.log
+    assert found.craft.max_rate_deg_s == pytest.approx(FULL_STICK)
+    np.testing.assert_allclose(log.time, 500e-6 * np.arange(200), atol=1e-12)
+    np.testing.assert_allclose(log["u"][0], [511 / 1021.6, -0.4995, 0.5, -1.0], atol=1e-9)
+    assert log["u"][-1, 3] == 1.0
+    np.testing.assert_allclose(log["w"][0], np.deg2rad([100.0, -50.0, 25.0]))
+    np.testing.assert_allclose(log["f"][0], [0.5 * GRAVITY, -0.25 * GRAVITY, GRAVITY])
+    assert log["v_bat"][0] == pytest.approx(24.1)
+    assert set(log.channels) == {"u", "w", "f", "v_bat"} and "Betaflight 4.5.1" in found.notes[0]
+
+
+def test_fine_rates_and_old_voltages_are_scaled(tmp_path):
+    fine = frames() * np.isin(NAMES, ["setpoint[0]", "setpoint[1]", "setpoint[2]"]) * 9 + frames()
+    fine += frames() * np.char.startswith(NAMES, "gyro") * 9
+    fine[:, NAMES.index("vbatLatest")] = 241
+    plain = import_log(write(tmp_path / "a.bbl", log_with()), "betaflight").log
+    headers = {"blackbox_high_resolution": "1", "vbatcellvoltage": "33,36,43"}
+    log = import_log(write(tmp_path / "b.bbl", log_with(fine, **headers)), "betaflight").log
+    for name in plain.channels:
+        np.testing.assert_allclose(log[name], plain[name], atol=1e-12, err_msg=name)
+
+
+def test_logs_of_one_file_become_segments_and_lost_frames_no_rows(tmp_path):
+    rows = np.delete(frames(), slice(50, 60), axis=0)
+    rows[100, 1] = rows[99, 1]  # a frame with the time of the one before
+    found = import_log(write(tmp_path / "a.bbl", log_with(), log_with(rows)), "betaflight")
+    assert np.bincount(found.log.segment).tolist() == [200, 189]
+    assert [source.rpartition("a.bbl")[2] for source in found.sources] == [", log 1", ", log 2"]
+    assert "log 2: 1 frames left out" in found.notes[2]
+    assert np.diff(found.log.time[200:]).max() == pytest.approx(11 * 500e-6)
+
+
+@pytest.mark.parametrize(
+    ("rates_type", "rc_rate", "super_rate", "expected_deg_s"),
+    [
+        ("BETAFLIGHT", 100, 70, 200 / 0.3),
+        ("BETAFLIGHT", 220, 0, 200 * (2.2 + 14.54 * 0.2)),
+        ("RACEFLIGHT", 37, 80, 370 * 1.8),
+        ("KISS", 100, 70, 200 / 0.3),
+        ("ACTUAL", 7, 67, 670),
+        ("QUICK", 90, 67, 670),
+        ("BETAFLIGHT", 255, 90, 1998),  # the limit
+    ],
+)
+def test_rates_at_full_stick_are_the_firmwares(rates_type, rc_rate, super_rate, expected_deg_s):
+    assert full_stick_rate(rates_type, rc_rate, super_rate, 1998.0) == pytest.approx(expected_deg_s)
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (b"", r"a\.bbl: found b'' first, expected b'H Product:Blackbox'"),
+        (b"time,x\n", r"a\.bbl: found b'time,x\\n' first"),
+        (log_with()[:-200], r"a\.bbl: log 1 of 1: cut off: found no end-of-log event in \d+ bytes"),
+        (log_with() + log_with()[:-200], r"a\.bbl: log 2 of 2: cut off"),
+        (log_with().replace(b"encoding:1", b"encoding:77"), r"a\.bbl: damaged, cannot be decoded"),
+        (log_with(rows=frames(0)), r"a\.bbl: (found no frames|damaged)"),
+        (
+            log_with(**{"Firmware revision": "INAV 7.1"}),
+            r"Firmware revision: found 'INAV 7\.1', expected Beta",
+        ),
+        (log_with(rc_rates=None), r"a\.bbl: header rc_rates: missing, so full stick is unknown"),
+        (log_with(rates="0,70"), r"a\.bbl: header rates: found \[0, 70\], expected 3 numbers"),
+        (log_with(rates_type="9"), r"a\.bbl: header rates_type: found 9, expected below 5"),
+        (log_with(rc_rates="0,0,0"), r"full stick at \(0\.0, 0\.0, 0\.0\) deg/s"),
+        (log_with(acc_1G=None), r"a\.bbl: header acc_1G: found None, expected 1 numbers of at least 0"),
+        (log_with(acc_1G="0"), r"a\.bbl: header acc_1G: found 0, expected"),
+        (log_with(names=[*NAMES[:-1], "x"]), r"a\.bbl: field accSmooth\[2\]: missing; found loopIteration"),
+        (log_with(rc_rates="50,50,50"), r"column u_roll: found 5\.11, expected a command in \[-1, 1\]"),
+    ],
+)
+def test_what_cannot_be_meant_is_refused(tmp_path, content, message):
+    with pytest.raises(LogError, match=message):
+        import_log(write(tmp_path / "a.bbl", content), "betaflight")
+
+
+def test_a_missing_file_or_package_is_named(tmp_path, monkeypatch):
+    with pytest.raises(LogError, match=r"no\.bbl: cannot be read"):
+        import_log(tmp_path / "no.bbl", "betaflight")
+    path = write(tmp_path / "a.bbl", log_with())
+    monkeypatch.setitem(sys.modules, "orangebox", None)
+    with pytest.raises(LogError, match=r"a\.bbl: needs the package orangebox.*flytrack\[logs\]"):
+        import_log(path, "betaflight")
+
+
+def test_logs_of_different_craft_or_channels_make_no_log(tmp_path):
+    first = write(tmp_path / "a.bbl", log_with())
+    second = write(tmp_path / "b.bbl", log_with(rc_rates="220,100,60"))
+    with pytest.raises(LogError, match=r"b\.bbl: craft: full stick .* 600 deg/s.*a\.bbl.* 500 deg/s"):
+        import_log([first, second], "betaflight")
+    write(second, log_with(names=[name.replace("vbatLatest", "x") for name in NAMES]))
+    with pytest.raises(LogError, match=r"b\.bbl: channels v_bat: not in both this file and .*a\.bbl"):
+        import_log([first, second], "betaflight")
+
+
+@pytest.fixture(scope="module")
+def real():
+    """A real acro flight, and every second frame of it as another decoder has it, in raw units."""
+    folder = shared(BETAFLIGHT)
+    with gzip.open(folder / "shortLog_decoded_1kHz.csv.gz", "rt") as file:
+        decoded = np.genfromtxt(file, delimiter=",", names=True, deletechars="")
+    return import_log(folder / "shortLog.BFL", "betaflight"), decoded
+
+
+def test_real_log_holds_what_another_decoder_found(real):
+    log, decoded = real[0].log, real[1]
+    assert real[0].problems == ()
+    every = log.select(slice(0, None, 2))
+    assert len(every) == len(decoded)
+    time_us = decoded["time"] - decoded["time"][0]
+    np.testing.assert_allclose(every.time, 1e-6 * time_us, atol=1e-9)
+    for axis in range(3):
+        np.testing.assert_allclose(np.rad2deg(every["w"][:, axis]), decoded[f"gyroADC[{axis}]"], atol=1e-9)
+        force_g = every["f"][:, axis] / GRAVITY
+        np.testing.assert_allclose(force_g, decoded[f"accSmooth[{axis}]"] / 2048, atol=1e-9)
+    np.testing.assert_allclose(every["v_bat"][:, 0], decoded["vbatLatest"] / 100, atol=1e-9)
+    np.testing.assert_allclose(500.0 * (every["u"][:, 3] + 1.0), decoded["setpoint[3]"], atol=1e-9)
+
+
+def test_real_log_reaches_full_stick_where_its_header_says(real):
+    found, decoded = real
+    assert found.craft.max_rate_deg_s == pytest.approx((1021.6, 1021.6, 772.96))
+    for axis in (0, 1):
+        assert decoded[f"setpoint[{axis}]"].max() == 1022  # 1021.6, in whole numbers
+        assert found.log["u"][:, axis].max() == 1.0
+
+
+def test_real_log_turns_where_it_is_told_to_and_its_frame_is_ours(real):
+    """Signs: rates follow setpoints; left and rear rotors make positive roll and pitch."""
+    log, decoded = real[0].log, real[1]
+    for axis in range(3):
+        assert np.corrcoef(log["u"][:, axis], log["w"][:, axis])[0, 1] > 0.98
+    # Betaflight's motors: rear right, front right, rear left, front left; thrust as speed squared.
+    thrust = np.stack([decoded[f"eRPM[{motor}]"] for motor in range(4)], axis=1) ** 2
+    width = 31
+    for axis, signs in ((0, (-1, -1, 1, 1)), (1, (1, -1, 1, -1))):
+        torque = np.convolve(thrust @ np.array(signs), np.ones(width) / width, "valid")
+        gained = decoded[f"gyroADC[{axis}]"][width - 1 :] - decoded[f"gyroADC[{axis}]"][: 1 - width]
+        assert np.corrcoef(torque, gained)[0, 1] > 0.6
+
+
+@pytest.mark.parametrize(("yaw_sign", "is_upright"), [(1.0, True), (-1.0, False)])
+def test_real_log_is_right_handed(real, yaw_sign, is_upright):
+    """From rest through two flips to hover: integrated rates end upright only if yaw is to the left."""
+    log = real[0].log
+    at_rest = log.time < 1.0
+    force_rest = log["f"][at_rest].mean(axis=0)
+    assert np.linalg.norm(force_rest) == pytest.approx(GRAVITY, rel=0.03) and force_rest[2] > 9.0
+    rates = (log["w"] - log["w"][at_rest].mean(axis=0)) * np.array([1.0, 1.0, yaw_sign])
+    steps = Rotation.from_rotvec(rates[1:] * np.diff(log.time)[:, None])
+    attitude = Rotation.align_vectors([[0.0, 0.0, 1.0]], [force_rest / np.linalg.norm(force_rest)])[0]
+    for step in steps:
+        attitude = attitude * step
+    tilt_deg = np.rad2deg(np.arccos(attitude.apply([0.0, 0.0, 1.0])[2]))
+    assert (tilt_deg < 10.0) if is_upright else (tilt_deg > 30.0)

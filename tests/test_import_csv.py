@@ -1,0 +1,297 @@
+"""CSV logs by a mapping: units, frames, rows, errors; and the flights of a Crazyflie."""
+
+import csv
+import gzip
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from made_flight import GRAVITY, TIME_S, flight
+from real_logs import CRAZYFLIE, shared
+from scipy.spatial.transform import Rotation
+
+from flytrack_env import load_model, nominal_parameters
+from flytrack_sysid import FlightLog, LogError, import_log, load_log
+from flytrack_sysid.cli import main
+from flytrack_sysid.importing.craft import Craft, nominal_model
+
+FLIP = np.array([1.0, -1.0, -1.0])
+HEADER = ["ms", "n", "e", "d", "vn", "ve", "vd", "ax", "ay", "az", "p", "q", "r", "qx", "qy", "qz", "qw"]
+HEADER += ["ail", "ele", "rud", "thr", "mv"]
+MAPPING = """
+[time]
+column = "ms"
+unit = "ms"
+[command]
+columns = ["ail", "ele", "rud", "thr"]
+low = [1000, 2000, 2000, 1000]
+high = [2000, 1000, 1000, 2000]
+[position]
+columns = ["n", "e", "d"]
+unit = "cm"
+frame = "ned"
+[velocity]
+columns = ["vn", "ve", "vd"]
+unit = "m/s"
+frame = "ned"
+[specific_force]
+columns = ["ax", "ay", "az"]
+unit = "g"
+frame = "frd"
+[rates]
+columns = ["p", "q", "r"]
+unit = "deg/s"
+frame = "frd"
+[attitude]
+quaternion = ["qx", "qy", "qz", "qw"]
+order = "xyzw"
+body = "frd"
+world = "ned"
+[battery]
+column = "mv"
+unit = "mV"
+[craft]
+max_rate_deg_s = [700, 600, 500]
+mass_kg = 0.5
+voltage_v = [14.0, 16.8]
+"""
+
+
+@pytest.fixture(scope="module")
+def truth() -> FlightLog:
+    """A flight of 20 s at 100 Hz, all clocks the same."""
+    return flight(TIME_S)
+
+
+def write_csv(path: Path, log: FlightLog) -> Path:
+    """Write a log as others would: NED, FRD, degrees, g, cm, ms, PWM, quaternions x, y, z, w."""
+    ned = Rotation.from_quat(log["q"], scalar_first=True).as_quat(scalar_first=True) * [1.0, 1.0, -1.0, -1.0]
+    sticks = 1500.0 + 500.0 * log["u"] * [1.0, -1.0, -1.0, 1.0]
+    columns = [
+        1e3 * log.time + 5000.0,
+        *(100.0 * log["p"] * FLIP).T,
+        *(log["v"] * FLIP).T,
+        *(log["f"] * FLIP / GRAVITY).T,
+        *np.rad2deg(log["w"] * FLIP).T,
+        *ned[:, [1, 2, 3, 0]].T,
+        *sticks.T,
+        1e3 * log["v_bat"][:, 0],
+    ]
+    with path.open("w", newline="", encoding="utf-8") as file:
+        table = csv.writer(file)
+        table.writerow(HEADER)
+        table.writerows(np.column_stack(columns).tolist())
+    return path
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory, truth) -> Path:
+    """A folder with ``flight.csv`` of the first 3 s and its ``map.toml``."""
+    out = tmp_path_factory.mktemp("csv")
+    write_csv(out / "flight.csv", truth.select(slice(300)))
+    (out / "map.toml").write_text(MAPPING)
+    return out
+
+
+def test_units_and_frames_come_out_ours(folder, truth):
+    found = import_log(folder / "flight.csv", "csv", folder / "map.toml")
+    np.testing.assert_allclose(found.log.time, TIME_S[:300], atol=1e-9)
+    for name, values in truth.select(slice(300)).channels.items():
+        sign = np.sign(np.sum(found.log[name] * values, axis=1, keepdims=True)) if name == "q" else 1.0
+        np.testing.assert_allclose(sign * found.log[name], values, atol=1e-6, err_msg=name)
+    assert found.craft == Craft((700.0, 600.0, 500.0), 0.5, (14.0, 16.8)) and found.problems == ()
+
+
+def test_euler_angles_of_aerospace_are_ours(tmp_path):
+    """Nose east and 30 degrees up, then rolled right by 20: by hand from the picture."""
+    rows = ["t,r,p,y,a,e,u,h", *(f"{0.01 * row},20,30,90,0,0,0,{row % 2}" for row in range(5))]
+    (tmp_path / "a.csv").write_text("\n".join(rows))
+    (tmp_path / "map.toml").write_text(
+        '[time]\ncolumn = "t"\nunit = "s"\n[command]\ncolumns = ["a", "e", "u", "h"]\n'
+        '[attitude]\neuler = ["r", "p", "y"]\nunit = "deg"\nbody = "frd"\nworld = "ned"\n'
+    )
+    log = import_log(tmp_path / "a.csv", "csv", tmp_path / "map.toml").log
+    axes_w = Rotation.from_quat(log["q"][0], scalar_first=True).as_matrix()
+    tilt, roll = np.deg2rad(30.0), np.deg2rad(20.0)
+    np.testing.assert_allclose(axes_w[:, 0], [0.0, -np.cos(tilt), np.sin(tilt)], atol=1e-9)  # nose
+    assert axes_w[2, 1] == pytest.approx(np.sin(roll) * np.cos(tilt))  # left side up
+    assert axes_w[2, 2] == pytest.approx(np.cos(roll) * np.cos(tilt))
+
+
+def test_world_to_body_is_inverted(folder, tmp_path):
+    (tmp_path / "map.toml").write_text(
+        MAPPING.replace('order = "xyzw"', 'order = "xyzw"\ndirection = "world_to_body"')
+    )
+    straight = import_log(folder / "flight.csv", "csv", folder / "map.toml", align=False).log
+    inverted = import_log(folder / "flight.csv", "csv", tmp_path / "map.toml", align=False)
+    turned = [Rotation.from_quat(log["q"], scalar_first=True) for log in (straight, inverted.log)]
+    assert np.max((turned[0] * turned[1]).magnitude()) < 1e-6
+    assert any("world to body" in problem for problem in inverted.problems)
+
+
+def test_rows_are_chosen_and_files_become_segments(folder, tmp_path):
+    for name in ("one.csv", "two.csv"):
+        (tmp_path / name).write_bytes((folder / "flight.csv").read_bytes())
+    (tmp_path / "list.csv").write_text("name,good\none.csv,100\ntwo.csv,60\n")
+    rows = "[rows]\nfirst = 10\nevery = 2\nfrom_s = 0.2\n"
+    manifest = '[rows.manifest]\nfile = "list.csv"\nkey = "name"\ncount = "good"\n'
+    (tmp_path / "map.toml").write_text(MAPPING + rows + manifest)
+    found = import_log([tmp_path / "one.csv", tmp_path / "two.csv"], "csv", tmp_path / "map.toml")
+    np.testing.assert_allclose(found.log.time[:45], 0.01 * np.arange(20, 110, 2))
+    assert found.log.segment.tolist() == [0] * 45 + [1] * 25
+    assert [Path(source).name for source in found.sources] == ["one.csv", "two.csv"]
+    (tmp_path / "list.csv").write_text("name,good\none.csv,100\n")
+    with pytest.raises(LogError, match=r"list\.csv: column name: two\.csv: missing"):
+        import_log([tmp_path / "one.csv", tmp_path / "two.csv"], "csv", tmp_path / "map.toml")
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ('unit = "cm"', 'unit = "ft"', r"map\.toml: position\.unit: found 'ft', expected one of m, cm, mm"),
+        ('column = "ms"', 'column = "us"', r"flight\.csv: column us: found 0 times.*map\.toml: time"),
+        ('"ax", "ay", "az"', '"ax", "ay"', r"specific_force\.columns: .*expected 3 different names"),
+        ('frame = "frd"', 'frame = "ned"', r"specific_force\.frame: found 'ned', expected one of flu, frd"),
+        ('order = "xyzw"\n', "", r"attitude\.order: missing, expected wxyz or xyzw"),
+        ("[time]", "[times]", r"map\.toml: time: missing"),
+        ("[battery]", "[batery]", r"map\.toml: batery: unknown; expected of rows, craft"),
+        (
+            "low = [1000",
+            "low = [1600",
+            r"flight\.csv: row \d+ \(line \d+\), column ail: found 1\d+.*, expected 1600",
+        ),
+        ("high = [2000", "high = [1000", r"command\.high: found .*expected other values than low"),
+        ("mass_kg = 0.5", "mass_kg = -1", r"craft\.mass_kg: found -1, expected a number above 0"),
+        ("[14.0, 16.8]", "[16.8, 14.0]", r"craft\.voltage_v: .*lower one first"),
+        ('unit = "mV"', 'unit = "mV"\nscale = 1.0', r"battery\.scale: found together with unit"),
+        ('unit = "ms"', 'unit = "ms"\nstep_s = 0.1', r"time: expected either column.* or step_s"),
+        ('unit = "deg/s"', 'unit = "deg/s"\nsigns = [1, 2, 1]', r"rates\.signs: .*expected 1 or -1"),
+        ('"qx", "qy", "qz", "qw"', '"n", "e", "d", "qw"', r"row 0 \(line 2\), column n, e, d, qw: .*norm"),
+        (
+            "[craft]",
+            "[rows]\nfirst = 5000\n[craft]",
+            r"map\.toml: rows: none of the 300 rows of .*flight\.csv",
+        ),
+        ("[time]", "[time", r"map\.toml: not a readable TOML file"),
+    ],
+)
+def test_mappings_that_cannot_be_meant_are_refused(folder, tmp_path, old, new, message):
+    assert old in MAPPING
+    (tmp_path / "map.toml").write_text(MAPPING.replace(old, new, 1))
+    with pytest.raises(LogError, match=message):
+        import_log(folder / "flight.csv", "csv", tmp_path / "map.toml")
+
+
+@pytest.mark.parametrize(
+    ("row", "change", "message"),
+    [
+        (4, lambda cells: [*cells[:3], "", *cells[4:]], r"row 3 \(line 5\), column d: found an empty cell"),
+        (4, lambda cells: [*cells[:3], "x", *cells[4:]], r"row 3 \(line 5\), column d: found 'x'"),
+        (4, lambda cells: [*cells[:3], "nan", *cells[4:]], r"row 3 \(line 5\), column p_z: found nan"),
+        (4, lambda cells: cells[:5], r"row 3 \(line 5\): found 5 cells, expected 22"),
+        (4, lambda cells: ["0", *cells[1:]], r"row 3 \(line 5\), column t: found -5\.0.*later time"),
+        (0, lambda cells: ["ms", *cells[:-1]], r"column n: found .*|column ms: found 2 times"),
+    ],
+)
+def test_cells_that_cannot_be_meant_are_refused(folder, tmp_path, row, change, message):
+    lines = (folder / "flight.csv").read_text().splitlines()
+    lines[row] = ",".join(change(lines[row].split(",")))
+    (tmp_path / "bad.csv").write_text("\n".join(lines))
+    with pytest.raises(LogError, match=rf"bad\.csv: ({message})"):
+        import_log(tmp_path / "bad.csv", "csv", folder / "map.toml")
+
+
+def test_files_that_are_missing_cut_off_or_unmapped_are_refused(folder, tmp_path):
+    with pytest.raises(LogError, match=r"no\.csv: cannot be read as text"):
+        import_log(tmp_path / "no.csv", "csv", folder / "map.toml")
+    with pytest.raises(LogError, match=r"no\.toml: no such mapping file.*crazyflie_phoenix"):
+        import_log(folder / "flight.csv", "csv", tmp_path / "no.toml")
+    with pytest.raises(LogError, match=r"flight\.csv: no mapping names no columns"):
+        import_log(folder / "flight.csv", "csv")
+    packed = gzip.compress((folder / "flight.csv").read_bytes())
+    (tmp_path / "cut.csv.gz").write_bytes(packed[: len(packed) // 2])
+    with pytest.raises(LogError, match=r"cut\.csv\.gz: cannot be read as text"):
+        import_log(tmp_path / "cut.csv.gz", "csv", folder / "map.toml")
+    with pytest.raises(LogError, match="format: found 'mat'"):
+        import_log(folder / "flight.csv", "mat")
+
+
+def test_nominal_model_hovers_where_the_nominal_craft_does():
+    nominal = nominal_parameters()
+    craft = nominal_model(Craft((60.0, 50.0, 40.0), 0.03, (3.0, 4.0)), "a log")
+    powers = np.array([1.0, 0.5, 0.25, 0.125])
+    for share in (0.9, 1.0):  # of the highest voltage
+        own, usual = 4.0 * share, 24.0 * share
+        thrust = craft.thrust_coeffs @ np.array([*powers, own, 0.5 * own])
+        expected = nominal.thrust_coeffs @ np.array([*powers, usual, 0.5 * usual])
+        assert thrust / craft.m == pytest.approx(expected / nominal.m, rel=1e-5)
+    assert craft.max_rate.tolist() == [60.0, 50.0, 40.0] and craft.m == 0.03
+    with pytest.raises(LogError, match=r"a log: craft\.mass_kg: not in the log"):
+        nominal_model(Craft((60.0, 50.0, 40.0), None, (3.0, 4.0)), "a log")
+
+
+def test_command_writes_log_details_and_model(folder, tmp_path, capsys):
+    out, model = tmp_path / "log.npz", tmp_path / "model.json"
+    arguments = ["import", folder / "flight.csv", "--format", "csv", "--map", folder / "map.toml"]
+    main([str(part) for part in (*arguments, "--out", out, "--model-out", model)])
+    said = capsys.readouterr().out
+    assert "segment 0:" in said and "full stick 700, 600, 500 deg/s; mass 0.5 kg" in said
+    details = json.loads((tmp_path / "log.import.json").read_text())
+    assert details["sha256"] == load_log(out).sha256
+    assert [Path(source).name for source in details["sources"]] == ["flight.csv"]
+    assert load_model(model).m == 0.5 and load_model(model).max_rate.tolist() == [700.0, 600.0, 500.0]
+
+
+def test_command_keeps_clocks_if_asked(folder, tmp_path, capsys):
+    late = write_csv(tmp_path / "late.csv", flight(TIME_S, 0.02))
+    arguments = ["import", late, "--format", "csv", "--map", folder / "map.toml", "--out", tmp_path / "a.npz"]
+    for options, verdict, num_rows in (([], "corrected", 1998), (["--keep-clocks"], "left as asked", 2000)):
+        main([str(part) for part in (*arguments, *options)])
+        (line,) = (line for line in capsys.readouterr().out.splitlines() if line.startswith("clock of q"))
+        assert "+20." in line and verdict in line
+        assert abs(len(load_log(tmp_path / "a.npz")) - num_rows) <= 1
+
+
+def test_command_writes_nothing_where_the_model_lacks_a_value(folder, tmp_path, capsys):
+    (tmp_path / "map.toml").write_text(MAPPING.replace("mass_kg = 0.5", ""))
+    arguments = ["import", folder / "flight.csv", "--format", "csv", "--map", tmp_path / "map.toml"]
+    with pytest.raises(SystemExit) as stopped:
+        main(
+            [
+                str(part)
+                for part in (*arguments, "--out", tmp_path / "a.npz", "--model-out", tmp_path / "m.json")
+            ]
+        )
+    assert stopped.value.code == 2 and "craft.mass_kg" in capsys.readouterr().err
+    assert {path.name for path in tmp_path.iterdir()} == {"map.toml"}
+
+
+@pytest.fixture(scope="module")
+def crazyflie():
+    """All flights of the Crazyflie, as they are."""
+    files = sorted(shared(CRAZYFLIE).glob("seed*.csv.gz"))
+    return files, import_log(files, "csv", "crazyflie_phoenix", align=False)
+
+
+def test_crazyflie_flights_are_read_whole(crazyflie):
+    files, found = crazyflie
+    with (files[0].parent / "MANIFEST.csv").open() as file:
+        usable = {row["file"]: int(row["usable_rows"]) for row in csv.DictReader(file)}
+    assert [Path(source).name for source in found.sources] == [path.name for path in files]
+    assert np.bincount(found.log.segment).tolist() == [usable[path.name] for path in files]
+    assert found.problems == () and found.craft.mass_kg == 0.03
+    heights = found.log["p"][:, 2]
+    assert heights.min() > 0.5 and heights.max() < 1.5
+
+
+def test_crazyflie_frames_are_ours(crazyflie):
+    """Where it is tilted to, it accelerates to; and it turns where it is told to."""
+    log = crazyflie[1].log
+    up_w = Rotation.from_quat(log["q"], scalar_first=True).apply([0.0, 0.0, 1.0])[5:-5]
+    acc_w = (log["v"][10:] - log["v"][:-10]) / 0.1
+    inside = log.segment[10:] == log.segment[:-10]
+    for axis in (0, 1):
+        assert np.corrcoef(acc_w[inside, axis], up_w[inside, axis])[0, 1] > 0.85
+    for axis in range(3):
+        assert np.corrcoef(log["u"][inside.nonzero()[0], axis], log["w"][5:-5][inside, axis])[0, 1] > 0.35

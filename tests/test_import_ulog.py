@@ -1,0 +1,195 @@
+"""PX4 logs: what a file written by the format's specification holds, in our units and frames."""
+
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from real_logs import UlogWriter
+from scipy.spatial.transform import Rotation
+
+from flytrack_sysid import LogError, import_log
+
+pytest.importorskip("pyulog", reason="pyulog is not installed: pip install 'flytrack[logs]'")
+
+PARAMETERS = {
+    "MC_ACRO_R_MAX": 720.0,
+    "MC_ROLLRATE_MAX": 220.0,
+    "MC_ACRO_P_MAX": 360.0,
+    "MC_ACRO_Y_MAX": 90.0,
+    "MC_YAWRATE_MAX": 180.0,
+}
+STEP_US = 4000
+TIMES_US = 1_000_000 + STEP_US * np.arange(200)
+EAST = (np.sqrt(0.5), 0.0, 0.0, np.sqrt(0.5))  # NED, FRD: nose east
+XYZ = [("float", "x", 0), ("float", "y", 0), ("float", "z", 0)]
+VXYZ = [("float", "vx", 0), ("float", "vy", 0), ("float", "vz", 0)]
+SETPOINT = [("float", "roll", 0), ("float", "pitch", 0), ("float", "yaw", 0)]
+
+
+def constant(values: tuple[float, ...], times: np.ndarray = TIMES_US) -> list[tuple[Any, ...]]:
+    """Return rows of the same values."""
+    return [(int(time), *values) for time in times]
+
+
+def topics() -> dict[str, tuple[list, list]]:
+    """Return the topics of a log of a drone with its nose east, turning, pulling up; fields and rows."""
+    slow = TIMES_US[::5]
+    place = constant((1.0, 2.0, -3.0, 4.0, 5.0, -6.0), slow)
+    half_full = (float(np.deg2rad(360.0)), float(np.deg2rad(90.0)), float(np.deg2rad(-45.0)))
+    return {
+        "vehicle_angular_velocity": ([("float", "xyz", 3)], constant((0.1, 0.2, 0.3))),
+        "vehicle_acceleration": ([("float", "xyz", 3)], constant((0.5, 0.25, -9.75))),
+        "vehicle_attitude": ([("float", "q", 4)], constant(EAST, slow)),
+        "vehicle_local_position": ([*XYZ, *VXYZ], place),
+        "vehicle_rates_setpoint": (
+            [*SETPOINT, ("float", "thrust_body", 3)],
+            constant((*half_full, 0.0, 0.0, -0.75), slow),
+        ),
+        "battery_status": ([("float", "voltage_v", 0)], constant((16.25,), TIMES_US[::100])),
+    }
+
+
+def write(path: Path, tables: dict[str, tuple[list, list]], parameters: Any = None) -> Path:
+    """Write topics to a ULog file."""
+    writer = UlogWriter(PARAMETERS if parameters is None else parameters)
+    for name, (fields, rows) in tables.items():
+        writer.add(name, fields, rows)
+    return writer.write(path)
+
+
+def test_frames_and_units_are_ours(tmp_path):
+    found = import_log(write(tmp_path / "a.ulg", topics()), "ulog")
+    log = found.log
+    first = {name: values[0] for name, values in log.channels.items()}
+    np.testing.assert_allclose(first["w"], [0.1, -0.2, -0.3], atol=1e-6)
+    np.testing.assert_allclose(first["f"], [0.5, -0.25, 9.75], atol=1e-6)
+    np.testing.assert_allclose(first["p"], [1.0, -2.0, 3.0], atol=1e-6)  # north, west, up
+    np.testing.assert_allclose(first["v"], [4.0, -5.0, 6.0], atol=1e-6)
+    np.testing.assert_allclose(first["q"], [np.sqrt(0.5), 0.0, 0.0, -np.sqrt(0.5)], atol=1e-6)
+    nose_w = Rotation.from_quat(first["q"], scalar_first=True).apply([1.0, 0.0, 0.0])
+    np.testing.assert_allclose(nose_w, [0.0, -1.0, 0.0], atol=1e-6)  # east is right of north
+    # Half of full stick; pitch and yaw of FRD change sign.
+    np.testing.assert_allclose(first["u"], [0.5, -0.25, 0.25, 0.5], atol=1e-6)
+    assert first["v_bat"] == pytest.approx([16.25])
+    assert found.craft.max_rate_deg_s == pytest.approx((720.0, 360.0, 180.0))
+    assert log.time[0] == 0.0 and np.diff(log.time) == pytest.approx(1e-6 * STEP_US)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_attitude_is_turned_as_its_vectors_are(tmp_path, seed):
+    ned = Rotation.random(random_state=seed)
+    tables = topics()
+    tables["vehicle_attitude"] = (
+        tables["vehicle_attitude"][0],
+        constant(tuple(ned.as_quat(scalar_first=True))),
+    )
+    log = import_log(write(tmp_path / "a.ulg", tables), "ulog").log
+    flip = np.diag([1.0, -1.0, -1.0])
+    ours = Rotation.from_quat(log["q"][0], scalar_first=True).as_matrix()
+    np.testing.assert_allclose(ours, flip @ ned.as_matrix() @ flip, atol=1e-6)
+
+
+def test_setpoints_are_held_and_sensors_interpolated(tmp_path):
+    tables = topics()
+    fields, _ = tables["vehicle_rates_setpoint"]
+    rolls = np.deg2rad(720.0) * np.linspace(0.0, 1.0, 40)
+    times = TIMES_US[::5] + STEP_US // 2
+    setpoints = [(int(time), roll, 0, 0, 0, 0, -0.5) for time, roll in zip(times, rolls, strict=True)]
+    places = [(int(time), 1e-6 * (time - 1e6), 0, 0, 1, 0, 0) for time in TIMES_US[::5]]
+    tables["vehicle_rates_setpoint"] = (fields, setpoints)
+    tables["vehicle_local_position"] = ([*XYZ, *VXYZ], places)
+    log = import_log(write(tmp_path / "a.ulg", tables), "ulog").log
+    assert log.time[0] == 0.0 and len(log) == 195  # after the first setpoint, before the last position
+    held = np.linspace(0.0, 1.0, 40)[np.arange(195) // 5]
+    np.testing.assert_allclose(log["u"][:, 0], held, atol=1e-6)
+    np.testing.assert_allclose(log["p"][:, 0], 1e-6 * STEP_US * np.arange(1, 196), atol=1e-6)
+
+
+def test_older_topics_serve(tmp_path):
+    tables = topics()
+    rates, force = tables.pop("vehicle_angular_velocity")[1], tables.pop("vehicle_acceleration")[1]
+    both = [(*rate, *acceleration[1:]) for rate, acceleration in zip(rates, force, strict=True)]
+    tables["sensor_combined"] = ([("float", "gyro_rad", 3), ("float", "accelerometer_m_s2", 3)], both)
+    thrust = [(*row[:4], 0.75) for row in tables["vehicle_rates_setpoint"][1]]
+    tables["vehicle_rates_setpoint"] = ([*SETPOINT, ("float", "thrust", 0)], thrust)
+    new = import_log(write(tmp_path / "a.ulg", topics()), "ulog").log
+    old = import_log(write(tmp_path / "b.ulg", tables), "ulog").log
+    for name in ("u", "w", "f", "q"):
+        np.testing.assert_array_equal(old[name], new[name])
+
+
+def test_what_a_topic_misses_and_the_ground_are_no_rows(tmp_path):
+    tables = topics()
+    fields, rows = tables["vehicle_attitude"]
+    tables["vehicle_attitude"] = (fields, [row for row in rows if not 1.2e6 < row[0] < 1.3e6])
+    tables["vehicle_land_detected"] = ([("bool", "landed", 0)], [(0, True), (1_100_000, False)])
+    found = import_log(write(tmp_path / "a.ulg", tables), "ulog")
+    log_s = found.log.time + 1.1  # of the first row in flight
+    assert log_s[-1] == pytest.approx(1e-6 * TIMES_US[-5])  # the last setpoint and attitude
+    assert not np.any((log_s > 1.2001) & (log_s < 1.2999)) and np.sum(log_s < 1.2001) == 26
+    assert "200 samples of the rates used, 175 in flight" in found.notes[0]
+
+
+def test_a_topic_that_is_missing_is_named(tmp_path):
+    for name in ("vehicle_attitude", "vehicle_rates_setpoint", "vehicle_angular_velocity"):
+        tables = topics()
+        del tables[name]
+        with pytest.raises(LogError, match=rf"a\.ulg: topic {name} .*missing or empty; found "):
+            import_log(write(tmp_path / "a.ulg", tables), "ulog")
+
+
+def test_parameters_that_are_missing_are_named_unless_the_mapping_has_them(tmp_path):
+    path = write(tmp_path / "a.ulg", topics(), {"MC_ACRO_R_MAX": 720.0})
+    with pytest.raises(LogError, match=r"a\.ulg: parameter MC_ACRO_P_MAX or MC_PITCHRATE_MAX: missing"):
+        import_log(path, "ulog")
+    mapping = tmp_path / "craft.toml"
+    mapping.write_text("[craft]\nmax_rate_deg_s = [720, 180, 90]\n")
+    np.testing.assert_allclose(
+        import_log(path, "ulog", mapping).log["u"][0], [0.5, -0.5, 0.5, 0.5], atol=1e-6
+    )
+    mapping.write_text("[craft]\nmax_rate_deg_s = [90, 90, 90]\n")
+    with pytest.raises(LogError, match=r"column u_roll: found 4, expected a command in \[-1, 1\]"):
+        import_log(path, "ulog", mapping)
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (b"", r"a\.ulg: found b'' first"),
+        (b"time,x\n0,1\n", r"a\.ulg: found b'time,x.*expected b'ULog"),
+        (b"ULog\x01\x12\x35\x01", r"a\.ulg: (damaged|topic)"),
+    ],
+)
+def test_what_is_no_ulog_is_refused(tmp_path, content, message):
+    (tmp_path / "a.ulg").write_bytes(content)
+    with pytest.raises(LogError, match=message):
+        import_log(tmp_path / "a.ulg", "ulog")
+
+
+def test_damage_is_noted_and_the_rest_read(tmp_path, capsys):
+    path = write(tmp_path / "a.ulg", topics())
+    content = path.read_bytes()
+    place = content.rindex(b"battery_status") - 6  # where the subscription to the last topic begins
+    path.write_bytes(content[:place] + bytes(60) + content[place:])
+    found = import_log(path, "ulog")
+    assert found.notes[-1].endswith("a.ulg: damaged in places; what could be read is used")
+    assert len(found.log) == 196
+    assert capsys.readouterr().out == ""  # what pyulog prints is not the command's answer
+
+
+def test_a_file_cut_in_half_is_refused(tmp_path):
+    path = write(tmp_path / "a.ulg", topics())
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+    with pytest.raises(LogError, match=r"a\.ulg: topic vehicle_rates_setpoint .*missing or empty"):
+        import_log(path, "ulog")
+
+
+def test_a_missing_file_or_package_is_named(tmp_path, monkeypatch):
+    with pytest.raises(LogError, match=r"no\.ulg: cannot be read"):
+        import_log(tmp_path / "no.ulg", "ulog")
+    path = write(tmp_path / "a.ulg", topics())
+    monkeypatch.setitem(sys.modules, "pyulog", None)
+    with pytest.raises(LogError, match=r"a\.ulg: needs the package pyulog.*flytrack\[logs\]"):
+        import_log(path, "ulog")
