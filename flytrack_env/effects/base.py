@@ -99,7 +99,8 @@ class Effect:
     accelerometer: hooks at these stages.
     most_steps: of parameters that are times, how many steps of time they may last.
     probes: values at which to look for the effect, of parameters whose slope at neutral is 0 or one-sided.
-    groups: parameters that are looked for together; all of them if empty.
+    groups: parameters that are looked for together; all of them if empty. shapes: parameters that only shape
+    what others do, and do nothing while those are neutral.
     start: (parameters, drone) -> memory of an episode that begins; no memory if None.
     remember: (parameters, memory, flight) -> memory after a step.
     """
@@ -112,6 +113,7 @@ class Effect:
     most_steps: Mapping[str, int] = field(default_factory=dict)
     probes: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
     groups: tuple[tuple[str, ...], ...] = ()
+    shapes: tuple[str, ...] = ()
     command: Hook | None = None
     lag: Hook | None = None
     air: Hook | None = None

@@ -2,33 +2,38 @@
 
 from typing import NamedTuple
 
+import jax.numpy as jnp
+
 from flytrack_env.effects.base import Effect, Flight, Range
 from flytrack_env.quaternion import Scalar, Vec3
 
 
 class QuadraticDrag(NamedTuple):
-    """Deceleration per airspeed times speed along body x, y, z, 1/m."""
+    """Deceleration per airspeed squared along body x, y, z, 1/m, and how far the axes share the speed, 1."""
 
     k_x: Scalar = 0.0
     k_y: Scalar = 0.0
     k_z: Scalar = 0.0
+    shared: Scalar = 1.0
 
 
 def _force(drag: QuadraticDrag, memory: None, force_b: Vec3, flight: Flight) -> Vec3:
     airspeed_b = flight.airspeed_b()
-    speed = airspeed_b.norm()
-    return force_b - Vec3(
-        drag.k_x * speed * airspeed_b.x,
-        drag.k_y * speed * airspeed_b.y,
-        drag.k_z * speed * airspeed_b.z,
-    )
+    whole = drag.shared * airspeed_b.norm()
+    own = 1.0 - drag.shared
+    coefficients = zip((drag.k_x, drag.k_y, drag.k_z), airspeed_b, strict=True)
+    return force_b - Vec3(*(k * (whole + own * jnp.abs(speed)) * speed for k, speed in coefficients))
 
 
 QUADRATIC_DRAG = Effect(
     name="quadratic_drag",
     parameters=QuadraticDrag,
-    ranges={axis: Range(-0.5, 0.5, "1/m") for axis in QuadraticDrag._fields},
-    equation="f_b -= diag(k) |v - v_air| R^T (v - v_air)",
-    source="the drag equation, f = c_d A rho v^2 / 2m along each axis, k = c_d A rho / 2m",
+    ranges={
+        **{axis: Range(-0.5, 0.5, "1/m") for axis in ("k_x", "k_y", "k_z")},
+        "shared": Range(0.0, 1.0, "1"),
+    },
+    equation="f_i -= k_i (shared |v| + (1 - shared) |v_i|) v_i, v = R^T (v - v_air), per body axis i",
+    source="the drag equation, f = c_d A rho v^2 / 2m: of one body (shared 1), or of each axis by itself (0)",
+    shapes=("shared",),
     force=_force,
 )

@@ -1,4 +1,4 @@
-"""A rate loop with more than one lag: inertia, a filter, or overshoot."""
+"""A rate loop with inertia: body rates that follow with a second order, sluggish or overshooting."""
 
 from typing import NamedTuple
 
@@ -9,54 +9,79 @@ from flytrack_env.quaternion import Scalar, Vec3
 from flytrack_env.state import Drone
 
 SHORTEST_S = 1e-5  # a lag below this is none: nothing at 100 Hz shows it
+CRITICAL = 1e-6  # of the squared damping about 1: the series is exact to rounding
 
 
 class SecondOrderRates(NamedTuple):
-    """A second lag of the body rates, s, and a lead, s: a lead larger than the lag overshoots."""
+    """Lag of a rate that changes evenly, s, and damping: below 1 it overshoots."""
 
     lag_s: Scalar = 0.0
-    lead_s: Scalar = 0.0
+    damping: Scalar = 0.7
 
 
-class Filtered(NamedTuple):
-    """The rates behind the second lag, before the lead, rad/s."""
+class Turning(NamedTuple):
+    """Body rates, rad/s, and their slopes, rad/s^2."""
 
     rates_b: Vec3
+    slopes_b: Vec3
 
 
-def start(loop: SecondOrderRates, drone: Drone) -> Filtered:
+class _Response(NamedTuple):
+    """What remains after a step of an offset from the input and of a slope, in offset and in slope."""
+
+    offset: Scalar
+    offset_of_slope: Scalar
+    slope_of_offset: Scalar
+    slope: Scalar
+
+
+def start(loop: SecondOrderRates, drone: Drone) -> Turning:
     """Return the memory of an episode that begins: a rate that has been held."""
-    return Filtered(drone.rates_b)
+    return Turning(drone.rates_b, Vec3(*(jnp.zeros_like(rate) for rate in drone.rates_b)))
 
 
-def _lagged(loop: SecondOrderRates, memory: Filtered, rates_b: Vec3, flight: Flight) -> Vec3:
+def _response(loop: SecondOrderRates, dt: Scalar) -> _Response:
+    """Return the transition of a held input: the exponential of [[0, 1], [-wn^2, -2 zeta wn]] dt."""
     is_lag = loop.lag_s > SHORTEST_S
-    # Guard inside the where: the slope of exp(-dt / 0) is not a number even where it is not selected.
-    keep = jnp.where(is_lag, jnp.exp(-flight.dt / jnp.where(is_lag, loop.lag_s, 1.0)), 0.0)
-    return Vec3(*(new + keep * (old - new) for new, old in zip(rates_b, memory.rates_b, strict=True)))
+    frequency = 2.0 * loop.damping / jnp.where(is_lag, loop.lag_s, 1.0)
+    decay = loop.damping * frequency
+    spread = frequency * frequency * (loop.damping * loop.damping - 1.0)
+    size = jnp.sqrt(jnp.maximum(jnp.abs(spread), CRITICAL * frequency * frequency))
+    # exp(-decay t) cosh and sinh, apart so that neither overflows; cos and sin where it oscillates.
+    slow, fast = jnp.exp(-(decay - size) * dt), jnp.exp(-(decay + size) * dt)
+    fade = jnp.exp(-decay * dt)
+    even = jnp.where(spread > 0.0, 0.5 * (slow + fast), fade * jnp.cos(size * dt))
+    odd = jnp.where(spread > 0.0, 0.5 * (slow - fast), fade * jnp.sin(size * dt)) / size
+    found = (even + decay * odd, odd, -frequency * frequency * odd, even - decay * odd)
+    return _Response(*(jnp.where(is_lag, value, 0.0) for value in found))
 
 
-def _rates(loop: SecondOrderRates, memory: Filtered, rates_b: Vec3, flight: Flight) -> Vec3:
-    lagged = _lagged(loop, memory, rates_b, flight)
-    gain = loop.lead_s / flight.dt
-    return Vec3(*(new + gain * (new - old) for new, old in zip(lagged, memory.rates_b, strict=True)))
+def _rates(loop: SecondOrderRates, memory: Turning, rates_b: Vec3, flight: Flight) -> Vec3:
+    left = _response(loop, flight.dt)
+    axes = zip(rates_b, memory.rates_b, memory.slopes_b, strict=True)
+    return Vec3(*(new + left.offset * (old - new) + left.offset_of_slope * slope for new, old, slope in axes))
 
 
-def remember(loop: SecondOrderRates, memory: Filtered, flight: Flight) -> Filtered:
-    """Return the memory after a step: what the lag made of the rates, found back from the lead."""
-    gain = loop.lead_s / flight.dt
-    back = 1.0 / (1.0 + gain)
-    pairs = zip(flight.rates_b, memory.rates_b, strict=True)
-    return Filtered(Vec3(*(back * (rate + gain * old) for rate, old in pairs)))
+def remember(loop: SecondOrderRates, memory: Turning, flight: Flight) -> Turning:
+    """Return the memory after a step; the input of the step is found back from the rates it led to."""
+    left = _response(loop, flight.dt)
+
+    def slope_after(rate: Scalar, old: Scalar, slope: Scalar) -> Scalar:
+        held = (rate - left.offset * old - left.offset_of_slope * slope) / (1.0 - left.offset)
+        return left.slope_of_offset * (old - held) + left.slope * slope
+
+    axes = zip(flight.rates_b, memory.rates_b, memory.slopes_b, strict=True)
+    return Turning(flight.rates_b, Vec3(*(slope_after(*axis) for axis in axes)))
 
 
 SECOND_ORDER_RATES = Effect(
     name="second_order_rates",
     parameters=SecondOrderRates,
-    ranges={"lag_s": Range(0.0, 0.1, "s"), "lead_s": Range(0.0, 0.1, "s")},
-    equation="omega = (1 + lead d/dt) y, y the rates behind a further lag lag_s",
-    source="assumption: the same on all axes; a second real pole and a zero",
+    ranges={"lag_s": Range(0.0, 0.1, "s"), "damping": Range(0.2, 3.0, "1")},
+    equation="omega'' / wn^2 + lag_s omega' + omega = omega of the lagged stick, wn = 2 damping / lag_s",
+    source="a second-order servo, exact for an input held over the step; assumption: the same on all axes",
     probes={"lag_s": (0.003, 0.01, 0.03)},
+    shapes=("damping",),
     rates=_rates,
     start=start,
     remember=remember,
