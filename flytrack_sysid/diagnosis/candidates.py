@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from flytrack_env.effects import EFFECTS, Effect
+from flytrack_env.effects import BY_NAME, EFFECTS, Effect
 from flytrack_sysid.diagnosis.problem import Problem
 from flytrack_sysid.parameters import DRAIN, TAUS, THRUST_COEFFS, neutral_value
 
@@ -22,6 +22,12 @@ class Candidate(NamedTuple):
     effect: str
     fields: tuple[str, ...]
     probe: tuple[str, float] | None = None
+
+    @property
+    def price(self) -> int:
+        """Its parameters, without those that only shape what others do."""
+        shapes = [f"{self.effect}.{field}" for field in BY_NAME[self.effect].shapes]
+        return sum(field not in shapes for field in self.fields)
 
     def neutral(self) -> np.ndarray:
         """Return the values of its fields that do nothing."""

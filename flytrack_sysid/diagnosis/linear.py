@@ -17,13 +17,19 @@ class Gain(NamedTuple):
     """What freeing some parameters besides others would gain.
 
     chi2: in minus twice the log likelihood. inflation: of its variance, where residuals of a second hang
-    together. step: of the parameters. information: about them, what others explain taken out.
+    together. step: of the parameters. information: about those that others do not do, what others explain
+    taken out.
     """
 
     chi2: float
     inflation: float
     step: np.ndarray
     information: np.ndarray
+
+    @property
+    def count(self) -> int:
+        """How many parameters the log says something of."""
+        return len(self.information)
 
     @property
     def robust(self) -> float:
@@ -75,22 +81,39 @@ class Outlook:
         return solve(self.total[np.ix_(columns, columns)], self.score[columns])
 
     def gain(self, added: Sequence[int], given: Sequence[int]) -> Gain | None:
-        """Return what freeing ``added`` columns besides ``given`` ones gains; None where those do the same."""
-        added, given = list(added), list(given)
+        """Return what freeing ``added`` columns besides ``given`` ones gains; None where those do the same.
+
+        Columns that those nearly do are left out, and their step is 0.
+        """
+        given, every = list(given), list(added)
+        added = self._own(every, given)
+        if not added:
+            return None
         across = self.total[np.ix_(given, added)]
         inner = self.total[np.ix_(given, given)]
         share = solve(inner, across)
         own = self.total[np.ix_(added, added)] - across.T @ share
-        size = np.diag(self.total)[added]
-        if np.any(np.diag(own) <= np.maximum(LEAST_OWN_SHARE * size, 2.0 * self.prior[added])):
-            return None
         score = self.score[added] - share.T @ self.score[given]
         step = solve(own, score)
         both = np.concatenate([solve(inner, self.score[given]) - share @ step, step])
         columns = given + added
         blocks = self.sums.score[:, columns] - self.sums.information[:, columns][:, :, columns] @ both
         blocks = blocks[:, len(given) :] - blocks[:, : len(given)] @ share
-        return Gain(float(score @ step), inflation_of(own, blocks), step, own)
+        whole = np.zeros(len(every))
+        whole[[every.index(column) for column in added]] = step
+        return Gain(float(score @ step), inflation_of(own, blocks), whole, own)
+
+    def _own(self, columns: list[int], given: list[int]) -> list[int]:
+        """Return the columns that are not what given ones, or those before them, nearly do."""
+        kept: list[int] = []
+        for column in columns:
+            others = given + kept
+            across = self.total[others, column]
+            own = self.total[column, column] - across @ solve(self.total[np.ix_(others, others)], across)
+            least = max(LEAST_OWN_SHARE * self.total[column, column], 2.0 * self.prior[column])
+            if own > least:
+                kept.append(column)
+        return kept
 
 
 def inflation_of(information: np.ndarray, scores: np.ndarray) -> float:

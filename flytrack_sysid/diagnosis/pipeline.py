@@ -9,9 +9,9 @@ from flytrack_sysid.diagnosis import noise as noises
 from flytrack_sysid.diagnosis.lanes import make_lanes
 from flytrack_sysid.diagnosis.problem import Problem
 from flytrack_sysid.diagnosis.refine import cost_of
-from flytrack_sysid.diagnosis.search import MOST_EFFECTS, Found, add_best, base_fit, full_outlook
+from flytrack_sysid.diagnosis.search import MOST_EFFECTS, Found, add_best, base_fit, fitted, full_outlook
 from flytrack_sysid.diagnosis.result import Unexplained
-from flytrack_sysid.diagnosis.unexplained import collapsed, look
+from flytrack_sysid.diagnosis.unexplained import look, stand_ins
 from flytrack_sysid.diagnosis.weigh import Weighed, settle, without
 from flytrack_sysid.log import FlightLog
 
@@ -46,22 +46,22 @@ def settled(log: FlightLog, judged: np.ndarray, model: ModelParameters) -> Settl
     base = base_fit(problem)
     full = saturated(problem, base.vector)
     problem.set_noise(noises.fit_noise(lanes, problem.left(full[None])[0]))
-    problem_base = base_fit(problem)
-    found = problem_base
+    base = found = base_fit(problem)
     while len(found.chosen) < MOST_EFFECTS:
         more = add_best(problem, found)
         if more is None:
             break
         found = more
-    full = saturated(problem, found.vector)
-    problem.set_noise(noises.fit_noise(lanes, problem.left(full[None])[0], problem.noise))
+    if found.chosen:
+        full = saturated(problem, found.vector)
+        problem.set_noise(noises.fit_noise(lanes, problem.left(full[None])[0], problem.noise))
+        found, base = fitted(problem, found.chosen, found.vector), base_fit(problem)
     found, weighed = settle(problem, found)
-    base = base_fit(problem)
     while True:
         rest, dependences = look(problem, found, base.vector)
-        stand_ins = collapsed(problem, found, dependences) if dependences else []
-        if not stand_ins:
+        dropped = stand_ins(problem, found, weighed, rest, dependences) if rest.flagged else []
+        if not dropped:
             return Settled(problem, base, found, weighed, rest)
-        for effect in stand_ins:
+        for effect in dropped:
             found = without(problem, found, effect)
         found, weighed = settle(problem, found)

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from flytrack_sysid.diagnosis.lanes import Lanes
 from flytrack_sysid.diagnosis.noise import step_to
 
-TIME_WAVES, RANK_WAVES, CHANGE_WAVES, HEADING_WAVES, PLACE_WAVES = 8, 6, 4, 4, 3
+TIME_WAVES, RANK_WAVES, CHANGE_WAVES, HEADING_WAVES, PLACE_WAVES = 8, 6, 4, 4, 2
 TINY_SPEED = 0.3  # m/s: slower flight has no direction
 SIDES = {"rate": slice(0, 3), "force": slice(3, 6)}  # axes of a residual
 STICKS = 4
@@ -91,7 +91,6 @@ def dependences(flight: Flown) -> Mapping[str, Mapping[str, np.ndarray]]:
     body = np.moveaxis(flight.body_to_world, -1, 0)  # body axes in the world
     world = np.broadcast_to(np.eye(3)[:, None, None, :], body.shape)
     speed = np.linalg.norm(flight.vel_w, axis=-1)
-    way = flight.vel_w / np.maximum(speed, TINY_SPEED)[..., None]
     heading = np.arctan2(flight.body_to_world[..., 1, 0], flight.body_to_world[..., 0, 0])
     orders = range(1, HEADING_WAVES + 1)
     turns = np.stack([wave(n * heading) for n in orders for wave in (np.sin, np.cos)])
@@ -121,7 +120,7 @@ def dependences(flight: Flown) -> Mapping[str, Mapping[str, np.ndarray]]:
         "position": _along(place, world),
         "time": _along(times, body),
         "heading": _along(turns, body),
-        "airspeed": _along(fast, np.stack([way, body[2]])),
+        "airspeed": _along(fast, np.stack([_way(flight), body[2]])),
         "attitude": _along(tilt, body),
         "command": _along(sticks[3], body[2:]),
     }
@@ -129,7 +128,13 @@ def dependences(flight: Flown) -> Mapping[str, Mapping[str, np.ndarray]]:
 
 
 def constants(flight: Flown, side: str) -> np.ndarray:
-    """Return unit rates along the body's axes, or unit forces along the body's and the world's."""
+    """Return unit rates along the body's axes, or unit forces along the body's, the world's and the way."""
     body = np.moveaxis(flight.body_to_world, -1, 0)
     world = np.broadcast_to(np.eye(3)[:, None, None, :], body.shape)
-    return body if side == "rate" else np.concatenate([body, world])
+    return body if side == "rate" else np.concatenate([body, world, _way(flight)[None]])
+
+
+def _way(flight: Flown) -> np.ndarray:
+    """Return the direction of flight, world, (rows, lanes, 3); shorter than 1 where there is hardly any."""
+    speed = np.linalg.norm(flight.vel_w, axis=-1)
+    return flight.vel_w / np.maximum(speed, TINY_SPEED)[..., None]

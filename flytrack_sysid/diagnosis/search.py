@@ -64,7 +64,7 @@ class Scored(NamedTuple):
     @property
     def merit(self) -> float:
         """The gain over its inflation, less a price per parameter."""
-        return self.gain.robust - PER_PARAMETER * len(self.candidate.fields)
+        return self.gain.robust - PER_PARAMETER * self.gain.count
 
 
 def scores(problem: Problem, outlook: Outlook, found: Found) -> list[Scored]:
@@ -104,12 +104,12 @@ def add_best(problem: Problem, found: Found) -> Found | None:
     if not ranked:
         return None
     near = [one for one in ranked[:MOST_REFITTED] if one.merit > CLOSE * ranked[0].merit]
-    near = [one for one in near if one.gain.robust > 0.5 * threshold(len(one.candidate.fields))]
+    near = [one for one in near if one.gain.robust > 0.7 * threshold(one.gain.count)]
     tried = []
     for one in near:
         vector = begun(problem, outlook, found, one)
         trial = fitted(problem, (*found.chosen, one.candidate), vector, rounds=4)
         gain = (found.cost - trial.cost) / one.gain.inflation
-        if gain > threshold(len(one.candidate.fields)):
-            tried.append((gain - PER_PARAMETER * len(one.candidate.fields), trial))
+        if gain > threshold(one.gain.count):
+            tried.append((gain - PER_PARAMETER * one.gain.count, trial))
     return max(tried, key=lambda pair: pair[0])[1] if tried else None

@@ -13,6 +13,7 @@ from flytrack_sysid.diagnosis.problem import BATCH, Problem, blocks_of, robust_w
 from flytrack_sysid.diagnosis.regressors import SIDES, Flown, constants, dependences, flown
 from flytrack_sysid.diagnosis.result import Unexplained
 from flytrack_sysid.diagnosis.search import Found, threshold
+from flytrack_sysid.diagnosis.weigh import Weighed
 
 CHANCE = 1e-6  # of a flag where nothing is left, for each dependence
 MATERIAL = 0.08  # of the sensor's noise, rms: less is left alone
@@ -25,6 +26,7 @@ NEIGHBOURS = 40  # frequencies on each side
 STOCHASTIC_GAIN, STOCHASTIC_SHARE = 50.0, 0.15  # of minus twice the log likelihood; of the sensor's noise
 FELT = 0.3  # coupling from which a disturbance is the drone's and not the sensor's
 RIDGE = 1e-6
+DISTURBED = 3.0  # times the usual threshold, for names on a side where something unknown acts
 KEPT_SHARE = 0.1  # of an effect's lambda, beside what the rest depends on: less, and it stood in for that
 
 
@@ -82,14 +84,17 @@ class _Side:
         blocks = np.einsum("bfn,bn->bf", columns, after) - np.einsum("bgn,bn->bg", self.given, after) @ share
         return float(score @ step), inflation_of(own, blocks), step
 
-
-    def information_along(self, columns: np.ndarray, step: np.ndarray) -> float:
-        """Return the squared size of columns times a step, with what is given taken out."""
-        signature = np.einsum("bfn,f->bn", columns, step)[:, None]
-        across = np.einsum("bgn,bfn->gf", self.given, signature, optimize=True)
+    def lambda_of(self, columns: np.ndarray, size: np.ndarray) -> float:
+        """Return the squared signature of columns at a size, fitted again beside what is given."""
+        across = np.einsum("bgn,bfn->gf", self.given, columns, optimize=True)
         inner = np.einsum("bgn,bhn->gh", self.given, self.given, optimize=True)
         inner += RIDGE * np.diag(np.maximum(np.diag(inner), 1.0))
-        return float(np.sum(signature**2) - (across.T @ solve(inner, across))[0, 0])
+        share = solve(inner, across)
+        own = np.einsum("bfn,bhn->fh", columns, columns, optimize=True) - across.T @ share
+        score_given = np.einsum("bgn,bn->g", self.given, self.rest, optimize=True)
+        score = np.einsum("bfn,bn->f", columns, self.rest, optimize=True) - share.T @ score_given
+        again = size - solve(own + RIDGE * np.diag(np.diag(own)), score)
+        return float(again @ own @ again)
 
 
 def _rms(features_w: np.ndarray, step: np.ndarray, counts: np.ndarray) -> float:
@@ -118,7 +123,9 @@ def depends_on(
     problem: Problem, found: Found, base: np.ndarray, extra: Mapping[str, np.ndarray] | None = None
 ) -> list[Dependence]:
     """Return dependences of what a model leaves, the clearest first, on each side at most three."""
-    flight = flown(problem.lanes, found.vector[problem.index(("tau_roll", "tau_pitch", "tau_yaw", "tau_thrust"))])
+    flight = flown(
+        problem.lanes, found.vector[problem.index(("tau_roll", "tau_pitch", "tau_yaw", "tau_thrust"))]
+    )
     left, slopes = problem.slopes(found.vector, list(found.places), np.zeros((0, len(found.vector))))
     features = dependences(flight)
     noise = noises.noise_of(problem.noise)
@@ -128,7 +135,9 @@ def depends_on(
             continue
         sums = _Side(problem, side, left, slopes)
         if extra is not None and side in extra:
-            sums.given = np.concatenate([sums.given, blocks_of(_whitened(problem, extra[side], side) * sums.root)], axis=1)
+            sums.given = np.concatenate(
+                [sums.given, blocks_of(_whitened(problem, extra[side], side) * sums.root)], axis=1
+            )
         own_noise = float(np.sqrt(np.mean(np.asarray(noise.direct[axes]) ** 2)))
         least = max(
             MATERIAL * own_noise,
@@ -228,35 +237,43 @@ def look(problem: Problem, found: Found, base: np.ndarray) -> tuple[Unexplained,
     return Unexplained(bool(shares), tuple(dict.fromkeys(names)), shares), found_on
 
 
-def collapsed(problem: Problem, found: Found, dependences_found: Sequence[Dependence]) -> list[str]:
-    """Return effects of a model whose gain is gone beside smooth functions of what the rest depends on.
+def stand_ins(
+    problem: Problem,
+    found: Found,
+    weighed: Mapping[str, Weighed],
+    rest: Unexplained,
+    dependences_found: Sequence[Dependence],
+) -> list[str]:
+    """Return effects of a model that stand in for something that no list has.
 
-    They stand in for something else. The functions have their constants, which a wind, say, would be.
+    Their gain is gone beside smooth functions of what the rest depends on (with the constants of those,
+    which a wind, say, would be), or is small where something unknown disturbs the same side.
     """
     left, slopes = problem.slopes(found.vector, list(found.places), np.zeros((0, len(found.vector))))
     flight = flown(problem.lanes, np.full(4, 0.03))
+    disturbed = {name.split(":")[0] for name in rest.shares}
     result = []
     for one in found.chosen:
         own = [found.places.index(place) for place in problem.index(one.fields)]
         others = [place for place in range(len(found.places)) if place not in own]
-        before = after = 0.0
+        size = found.vector[problem.index(one.fields)] - one.neutral()
+        before, after = dict.fromkeys(SIDES, 0.0), dict.fromkeys(SIDES, 0.0)
         for side, axes in SIDES.items():
-            if not problem.lanes.counts[..., axes, :].any():
+            acting = slopes[own][..., axes, :]
+            if not (problem.lanes.counts[..., axes, :].any() and np.abs(acting).max() > 0.0):
                 continue
             sums = _Side(problem, side, left, slopes[others])
-            acting = slopes[own][..., axes, :]
-            if not np.abs(acting).max() > 0.0:
-                continue
             columns = blocks_of(acting * sums.root)
-            size = found.vector[list(np.array(found.places)[own])] - one.neutral()
-            before += sums.information_along(columns, size)
+            before[side] = sums.lambda_of(columns, size)
             for dependence in dependences_found:
                 if dependence.side == side:
-                    constant = _whitened(problem, constants(flight, side), side) * sums.root
-                    more = [sums.given, dependence.columns, blocks_of(constant)]
-                    sums.given = np.concatenate(more, axis=1)
-            after += sums.information_along(columns, size)
-        if after < max(KEPT_SHARE * before, threshold(len(one.fields))):
+                    constant = blocks_of(_whitened(problem, constants(flight, side), side) * sums.root)
+                    sums.given = np.concatenate([sums.given, dependence.columns, constant], axis=1)
+            after[side] = sums.lambda_of(columns, size)
+        own_side = max(before, key=before.get)
+        least = threshold(weighed[one.effect].count)
+        is_gone = sum(after.values()) < max(KEPT_SHARE * sum(before.values()), least)
+        if is_gone or (own_side in disturbed and weighed[one.effect].robust < DISTURBED * least):
             result.append(one.effect)
     return result
 

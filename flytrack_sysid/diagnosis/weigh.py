@@ -28,13 +28,15 @@ PROBE_SHARE = 0.25  # of the gain: first order says less of what is looked for a
 class Weighed(NamedTuple):
     """One effect of a model against doing without it and against its rivals.
 
-    gain: of chi2 over the model without it, refitted. inflation: of that gain's variance. rivals: effect ->
+    gain: of chi2 over the model without it, refitted. inflation: of that gain's variance. count: of its
+    parameters, those that the log says something of. rivals: effect ->
     how much worse the model is with that one instead, of chi2; the better ones are refitted.
     swaps: models with the rival in the effect's place, refitted.
     """
 
     gain: float
     inflation: float
+    count: int
     rivals: Mapping[str, float]
     swaps: Mapping[str, Found]
 
@@ -70,19 +72,19 @@ def weigh(problem: Problem, found: Found, outlook: Outlook, effect: str) -> Weig
             swap = _swapped(problem, less, seen, one)
             rivals[one.candidate.effect] = swap.cost - found.cost
             swaps[one.candidate.effect] = swap
-    return Weighed(gain, _inflation(outlook, found, own.fields), rivals, swaps)
+    return Weighed(gain, *_inflation(outlook, found, own.fields), rivals, swaps)
 
 
 def _swapped(problem: Problem, less: Found, seen: Outlook, rival: Scored) -> Found:
     return fitted(problem, (*less.chosen, rival.candidate), begun(problem, seen, less, rival), rounds=5)
 
 
-def _inflation(outlook: Outlook, found: Found, fields: tuple[str, ...]) -> float:
+def _inflation(outlook: Outlook, found: Found, fields: tuple[str, ...]) -> tuple[float, int]:
     columns = [outlook.column(field) for field in fields]
     given = [outlook.places.index(place) for place in found.places]
     given = [column for column in given if column not in columns]
     gain = outlook.gain(columns, given)
-    return 1.0 if gain is None else gain.inflation
+    return (1.0, 1) if gain is None else (gain.inflation, gain.count)
 
 
 def settle(problem: Problem, found: Found) -> tuple[Found, dict[str, Weighed]]:
@@ -101,8 +103,8 @@ def settle(problem: Problem, found: Found) -> tuple[Found, dict[str, Weighed]]:
 
 
 def price(found: Found) -> float:
-    """Return a model's cost and the price of its parameters."""
-    return found.cost + PER_PARAMETER * sum(len(one.fields) for one in found.chosen)
+    """Return a model's cost and the price of its effects."""
+    return found.cost + PER_PARAMETER * sum(one.price for one in found.chosen)
 
 
 def _better(found: Found, weighed: Mapping[str, Weighed]) -> Found | None:
