@@ -10,27 +10,30 @@ from flytrack_sysid.diagnosis.bins import BLOCK_S, FEWEST_ROWS, binned, edges_of
 from flytrack_sysid.diagnosis.evidence import After, Against, words_of
 from flytrack_sysid.diagnosis.traces import REGRESSORS, UNITS, Traces
 from flytrack_sysid.diagnosis.whiteness import BANDS, on_slots, response
-from flytrack_sysid.plots import BLUE, GREY, ORANGE
+from flytrack_sysid.plots import BLUE, GREY, ORANGE, say
 
 WIDTH_IN, ROW_IN, LEGEND_IN = 8.0, 2.5, 0.9
 MOST_COLUMNS = 3
 BEFORE_S, AFTER_S = 0.05, 0.3  # shown about a change of a command
+FEWEST_SHOWN = 50  # rows
+NOTHING = "not in the log, or too little of it"
 # Attitude and velocity are noisy in each row: the change over a piece is known as well as that over a step.
 PIECE_S, FEWEST_PIECES = 0.2, 5
 # People think of turns in degrees: unit -> unit shown, and factor.
 SHOWN = {
     "rad/s": ("deg/s", float(np.rad2deg(1.0))),
     "rad/s²": ("deg/s²", float(np.rad2deg(1.0))),
-    "rad²/s²": ("(deg/s)²", float(np.rad2deg(1.0) ** 2)),
 }
 _TURN_AXES = {"x": "roll", "y": "pitch", "z": "yaw"}
 
 
-def panels_of(title: str, rows: int, columns: int, height_in: float) -> tuple[Figure, np.ndarray]:
-    """Return an empty figure of (rows, columns) panels."""
+def panels_of(
+    title: str, rows: int, columns: int, height_in: float, is_one_scale: bool = False
+) -> tuple[Figure, np.ndarray]:
+    """Return an empty figure of (rows, columns) panels; is_one_scale: of y, for the panels of a row."""
     figure = Figure(figsize=(WIDTH_IN, height_in), layout="constrained")
     figure.suptitle(title, fontsize="large", fontweight="bold", x=0.01, ha="left")
-    axes = figure.subplots(rows, columns, squeeze=False)
+    axes = figure.subplots(rows, columns, squeeze=False, sharey="row" if is_one_scale else False)
     for panel in axes.flat:
         panel.spines[["top", "right"]].set_visible(False)
         panel.grid(color="0.92", linewidth=0.8)
@@ -39,9 +42,11 @@ def panels_of(title: str, rows: int, columns: int, height_in: float) -> tuple[Fi
     return figure, axes
 
 
-def legend_below(figure: Figure, panel: Axes, columns: int = 4) -> None:
+def legend_below(figure: Figure, columns: int = 4) -> None:
     """Put one legend for all panels below them, where it hides nothing."""
-    handles, labels = panel.get_legend_handles_labels()
+    handles, labels = max(
+        (panel.get_legend_handles_labels() for panel in figure.axes), key=lambda own: len(own[1])
+    )
     figure.legend(handles, labels, loc="outside lower center", ncols=columns, frameon=False, fontsize="small")
 
 
@@ -54,9 +59,14 @@ def label_of(residual: str) -> str:
     if channel in ("rates", "attitude"):
         source = "" if channel == "rates" else ", by attitude"
         return f"{_TURN_AXES[axis]} rate{source} ({unit})"
-    frame = "world" if "world" in residual else "body"
+    frame = "world " if "world" in residual else ""
     source = "" if channel == "force" else ", by velocity"
-    return f"force, {frame} {axis}{source} ({unit})"
+    return f"force {frame}{axis}{source} ({unit})"
+
+
+def can_show(traces: Traces, residual: str) -> bool:
+    """Return whether enough rows of a residual count to show anything."""
+    return int(traces.column("extended", residual)[1].sum()) >= FEWEST_SHOWN
 
 
 def scaled(residual: str, values: np.ndarray) -> np.ndarray:
@@ -95,10 +105,9 @@ def _draw_against(panel: Axes, traces: Traces, spec: Against, names: tuple[str, 
     if is_change:
         columns = _averaged(columns, traces, counts)
     regressor, left, rest, block = columns
-    fewest = FEWEST_PIECES if is_change else FEWEST_ROWS
-    edges = edges_of(regressor)
+    edges = edges_of(regressor, fewest=FEWEST_PIECES if is_change else FEWEST_ROWS)
     before, explained, after = (
-        binned(regressor, values, block.astype(int), edges, fewest) for values in (left, left - rest, rest)
+        binned(regressor, values, block.astype(int), edges) for values in (left, left - rest, rest)
     )
     _draw_three(panel, before.at, before.means, before.ends95, explained.means, after.means)
     panel.set_xlabel(label, fontsize="small")
@@ -148,12 +157,17 @@ def draw_cause(
     without, extended: of the models in ``traces``, the extended one less the cause, and itself. The curve is
     the difference between what the two say of each row.
     """
+    # Without a sensor, its panel and that of what stands in for it are the same.
+    panels = list(dict.fromkeys(spec._replace(residual=traces.used(spec.residual)) for spec in panels))
     columns = min(len(panels), MOST_COLUMNS) if len(panels) % MOST_COLUMNS != 1 else min(len(panels), 2)
     rows = -(-len(panels) // columns)
     title = words_of(cause)
     height_in = LEGEND_IN + ROW_IN * rows
     figure, axes = panels_of(title[0].upper() + title[1:], rows, columns, height_in)
     for panel, spec in zip(axes.flat, panels, strict=True):
+        if not can_show(traces, spec.residual):
+            say(panel, f"{label_of(spec.residual)}:\n{NOTHING}")
+            continue
         draw = _draw_against if isinstance(spec, Against) else _draw_after
         draw(panel, traces, spec, (without, extended))
         label = label_of(spec.residual)
@@ -161,5 +175,5 @@ def draw_cause(
         panel.set_title(title, fontsize="small", loc="left")
     for panel in axes[:, 0]:
         panel.set_ylabel("measured less said", fontsize="small")
-    legend_below(figure, axes[0, 0], columns=3)
+    legend_below(figure, columns=3)
     return figure

@@ -143,7 +143,7 @@ EVIDENCE: dict[str, Evidence] = {
     "imu_latency": Evidence(
         "gyro and accelerometer are late",
         (*_TURNS[:2], After("attitude_x", "roll"), After("attitude_y", "pitch")),
-        "The gyro lags behind (above); the attitude does not (below). So does the accelerometer.",
+        "The gyro lags behind (above), as the accelerometer does; the attitude does not (below).",
     ),
     "imu_offset": Evidence(
         "the accelerometer is off the centre of mass",

@@ -8,7 +8,9 @@ from matplotlib.figure import Figure
 
 from flytrack_sysid.diagnosis.bins import binned, edges_of
 from flytrack_sysid.diagnosis.conviction import (
+    NOTHING,
     block_of,
+    can_show,
     label_of,
     legend_below,
     panels_of,
@@ -24,7 +26,7 @@ from flytrack_sysid.diagnosis.whiteness import (
     cross_correlation,
     on_slots,
 )
-from flytrack_sysid.plots import BLUE, GREEN, GREY, ORANGE
+from flytrack_sysid.plots import BLUE, GREEN, GREY, ORANGE, say
 
 # The models in the order of a diagnosis: name, words, colour.
 MODELS = {
@@ -48,6 +50,7 @@ FORCES = tuple(f"force_{axis}" for axis in "xyz")
 MOST_TIME_BINS, LEAST_TIME_BIN_S = 200, 0.25
 NUM_REGRESSOR_BINS = 10
 MARKER = 3.5
+ASIDE = 0.012  # of a panel's width: models stand beside each other, so that none hides another
 
 
 def error_style(name: str) -> tuple[str, str]:
@@ -87,7 +90,7 @@ def draw_errors(error: Mapping[str, Errors]) -> Figure:
     _draw_bars(axes[0, 1], free, {key: f"{key.removesuffix('s')} s" for key in keys})
     axes[0, 1].set_title("position error in free flight, rms", fontsize="small", loc="left")
     axes[0, 1].set_ylabel("m")
-    legend_below(figure, axes[0, 0])
+    legend_below(figure)
     return figure
 
 
@@ -104,6 +107,9 @@ def draw_over_time(traces: Traces) -> Figure:
     edges = np.linspace(elapsed[0], elapsed[-1] + traces.step_s, count + 1)
     names = [name for pair in zip(RATES, FORCES, strict=True) for name in pair] + ["battery"]
     for panel, residual in zip(axes.flat, names, strict=False):
+        if not can_show(traces, residual):
+            say(panel, f"{label_of(residual)}:\n{NOTHING}")
+            continue
         for model in _models_in(traces):
             values, counts = traces.column(model, residual)
             values = scaled(residual, values)[counts]
@@ -111,11 +117,11 @@ def draw_over_time(traces: Traces) -> Figure:
             words, colour = MODELS[model]
             panel.plot(found.at, found.means, color=colour, linewidth=0.9, label=words)
         panel.axhline(0.0, color=GREY, linewidth=0.6)
-        panel.set_title(label_of(residual), fontsize="small", loc="left")
+        panel.set_title(label_of(traces.used(residual)), fontsize="small", loc="left")
     axes.flat[-1].set_axis_off()
     for panel in (axes[3, 0], axes[2, 1]):
         panel.set_xlabel("time (s)", fontsize="small")
-    legend_below(figure, axes[0, 0])
+    legend_below(figure)
     return figure
 
 
@@ -126,38 +132,36 @@ def _regressors_of(residual: str) -> list[str]:
     return [own, "speed", "applied_thrust", "height", "heading"]
 
 
+def _draw_bins(panel: Axes, traces: Traces, residual: str, name: str) -> None:
+    """Draw the means of a residual of all models by bins of a regressor."""
+    regressor, label = regressor_of(traces, name)
+    block = block_of(traces)
+    for number, model in enumerate(_models_in(traces)):
+        values, counts = traces.column(model, residual)
+        edges = edges_of(regressor[counts], NUM_REGRESSOR_BINS)
+        found = binned(regressor[counts], scaled(residual, values)[counts], block[counts], edges)
+        words, colour = MODELS[model]
+        aside = (number - 1) * ASIDE * (edges[-1] - edges[0])
+        style = {"fmt": "o-", "color": colour, "markersize": MARKER, "linewidth": 0.9}
+        panel.errorbar(found.at + aside, found.means, found.ends95, label=words, **style)
+    panel.axhline(0.0, color=GREY, linewidth=0.6)
+    panel.set_xlabel(label.replace(" (", "\n("), fontsize="x-small")
+    panel.tick_params(labelsize="x-small")
+
+
 def draw_against(traces: Traces, residuals: Sequence[str], title: str) -> Figure:
     """Draw binned means of residuals, a row each, against speed, thrust, stick, height and heading."""
-    figure, axes = panels_of(title, len(residuals), len(_regressors_of(residuals[0])), 6.2)
-    block = block_of(traces)
+    columns = len(_regressors_of(residuals[0]))
+    figure, axes = panels_of(title, len(residuals), columns, 6.2, is_one_scale=True)
     for line, residual in zip(axes, residuals, strict=True):
+        if not can_show(traces, residual):
+            for panel in line:
+                say(panel, NOTHING)
+            continue
         for panel, name in zip(line, _regressors_of(residual), strict=True):
-            regressor, label = regressor_of(traces, name)
-            for number, model in enumerate(_models_in(traces)):
-                values, counts = traces.column(model, residual)
-                edges = edges_of(regressor[counts], NUM_REGRESSOR_BINS)
-                values = scaled(residual, values)[counts]
-                found = binned(regressor[counts], values, block[counts], edges)
-                words, colour = MODELS[model]
-                aside = (number - 1) * 0.15 * (edges[1] - edges[0])  # so that none hides another
-                panel.errorbar(
-                    found.at + aside,
-                    found.means,
-                    found.ends95,
-                    fmt="o-",
-                    color=colour,
-                    markersize=MARKER,
-                    linewidth=0.9,
-                    label=words,
-                )
-            panel.axhline(0.0, color=GREY, linewidth=0.6)
-            panel.set_xlabel(label.replace(" (", "\n("), fontsize="x-small")
-            panel.tick_params(labelsize="x-small")
-        for panel in line[1:]:
-            panel.sharey(line[0])
-            panel.tick_params(labelleft=False)
-        line[0].set_ylabel(label_of(residual), fontsize="small")
-    legend_below(figure, axes[0, 0])
+            _draw_bins(panel, traces, residual, name)
+        line[0].set_ylabel(label_of(traces.used(residual)), fontsize="small")
+    legend_below(figure)
     return figure
 
 
@@ -176,29 +180,47 @@ def _draw_bands(panel: Axes, found: Correlation) -> None:
         panel.fill_between(1e3 * found.lags_s, -ends, ends, color=shade, linewidth=0.0, label=label, zorder=0)
 
 
+def _grid(traces: Traces, model: str, residual: str) -> np.ndarray:
+    values, counts = traces.column(model, residual)
+    return on_slots(values, traces.slot, counts)
+
+
 def autocorrelations(traces: Traces, residual: str) -> dict[str, Correlation]:
-    """Return the autocorrelation of a residual of each of the three models."""
-    found = {}
-    for model in _models_in(traces):
-        values, counts = traces.column(model, residual)
-        if counts.any():
-            found[model] = autocorrelation(on_slots(values, traces.slot, counts), traces.step_s)
-    return found
+    """Return the autocorrelation of a residual of each of the three models; none if little of it counts."""
+    models = _models_in(traces) if can_show(traces, residual) else []
+    return {model: autocorrelation(_grid(traces, model, residual), traces.step_s) for model in models}
+
+
+def cross_correlations(traces: Traces, residual: str, stick: str) -> dict[str, Correlation]:
+    """Return the cross-correlation of a residual of each of the three models with a command; likewise."""
+    command = traces.regressors[f"command_{stick}"]
+    command = on_slots(command, traces.slot, np.ones(len(command), bool))
+    models = _models_in(traces) if can_show(traces, residual) else []
+    return {
+        model: cross_correlation(command, _grid(traces, model, residual), traces.step_s) for model in models
+    }
+
+
+def _draw_correlations(panel: Axes, found: Mapping[str, Correlation], title: str) -> None:
+    """Draw correlations of models, and the bands of the extended one."""
+    if not found:
+        say(panel, f"{title}:\n{NOTHING}")
+        return
+    for model, one in found.items():
+        _draw_correlation(panel, one, *MODELS[model])
+    _draw_bands(panel, found["extended"])
+    panel.set_title(title, fontsize="small", loc="left")
 
 
 def draw_whiteness(traces: Traces) -> Figure:
     """Draw autocorrelations of residuals, with the bands that white noise stays within."""
     figure, axes = panels_of("Is what is left white? Autocorrelation of residuals", 2, 3, 5.4)
     for panel, residual in zip(axes.flat, (*RATES, *FORCES), strict=True):
-        found = autocorrelations(traces, residual)
-        for model, one in found.items():
-            _draw_correlation(panel, one, *MODELS[model])
-        if found:
-            _draw_bands(panel, found["extended"])
-        panel.set_title(label_of(residual).split(" (")[0], fontsize="small", loc="left")
+        title = label_of(traces.used(residual)).split(" (")[0]
+        _draw_correlations(panel, autocorrelations(traces, residual), title)
     for panel in axes[-1]:
         panel.set_xlabel("lag (ms)", fontsize="small")
-    legend_below(figure, axes[0, 0], columns=5)
+    legend_below(figure, columns=5)
     return figure
 
 
@@ -207,21 +229,10 @@ def draw_independence(traces: Traces) -> Figure:
     figure, axes = panels_of("Is what is left independent of the commands?", 2, 2, 5.4)
     pairs = dict(zip((*RATES, FORCES[2]), ("roll", "pitch", "yaw", "thrust"), strict=True))
     for panel, (residual, stick) in zip(axes.flat, pairs.items(), strict=True):
-        command = traces.regressors[f"command_{stick}"]
-        command = on_slots(command, traces.slot, np.ones(len(command), bool))
-        found = {}
-        for model in _models_in(traces):
-            values, counts = traces.column(model, residual)
-            if counts.any():
-                grid = on_slots(values, traces.slot, counts)
-                found[model] = cross_correlation(command, grid, traces.step_s)
-                _draw_correlation(panel, found[model], *MODELS[model])
-        if found:
-            _draw_bands(panel, found["extended"])
+        title = f"{label_of(traces.used(residual)).split(' (')[0]} with the {stick} command"
+        _draw_correlations(panel, cross_correlations(traces, residual, stick), title)
         panel.axvline(0.0, color=GREY, linewidth=0.8)
-        title = f"{label_of(residual).split(' (')[0]} with the {stick} command"
-        panel.set_title(title, fontsize="small", loc="left")
     for panel in axes[-1]:
         panel.set_xlabel("residual after the command (ms)", fontsize="small")
-    legend_below(figure, axes[0, 0], columns=5)
+    legend_below(figure, columns=5)
     return figure

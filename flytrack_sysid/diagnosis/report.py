@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
+from flytrack_env.dynamics import SECONDS_PER_MINUTE
 from flytrack_env.files import write_atomically
 from flytrack_sysid.diagnosis.conviction import draw_cause
 from flytrack_sysid.diagnosis.evidence import EVIDENCE, in_words, without, words_of
@@ -32,6 +33,10 @@ from flytrack_sysid.plots import png_of
 
 MOST_PICTURED = 6  # causes, those with the largest gain: more pictures nobody reads
 MOST_LISTED = 3  # names in one cell
+DIFFERENCES = (
+    "The log lacks a gyro or an accelerometer; attitude or velocity stand in, by their change from row to "
+    "row. White noise of theirs shows as a correlation of -0.5 at the first lag."
+)
 NO_BREAK = "\u00a0"  # a space at which lines do not break
 HEADLINE_HORIZONS = ("1", "1.0", "1s")  # s of free flight, whose error the first sentence gives
 HOW = (
@@ -41,7 +46,9 @@ HOW = (
     "that was held out, and where no other cause explains as much.",
     "In the plot of a cause, orange dots are what the extended model leaves with this one cause taken out, "
     "nothing else refitted. The line is the difference between both models. Blue rings are what is left.",
-    "Residuals are measured less said. Pictures show the whole log, the table of errors the held-out part.",
+    "Residuals are measured less said by the model. Forces are specific forces along the body's axes, thrust "
+    "along z, where not said to be along the world's; rates are about the body's axes.",
+    "Pictures show the whole log, the table of errors the held-out part.",
 )
 
 
@@ -72,15 +79,15 @@ def _named(causes: tuple[Cause, ...]) -> str:
 
 def _gained(diagnosis: Diagnosis) -> str:
     """Return what the causes do for a second of free flight; nothing where that is not known."""
-    errors = [diagnosis.error[name].position_m for name in ("nominal", "extended") if name in diagnosis.error]
-    for horizon in HEADLINE_HORIZONS:
-        found = [one[horizon] for one in errors if np.isfinite(one.get(horizon, np.nan))]
-        if len(found) == len(("before", "after")):
-            before, after = found
-            return (
-                f" The position after 1 s of free flight is off by {after:.2g} m instead of {before:.2g} m."
-            )
-    return ""
+
+    def error(model: str) -> float:
+        found = diagnosis.error[model].position_m if model in diagnosis.error else {}
+        return next((found[horizon] for horizon in HEADLINE_HORIZONS if horizon in found), np.nan)
+
+    before, after = error("nominal"), error("extended")
+    if not np.isfinite(before + after):
+        return ""
+    return f" The position after 1 s of free flight is off by {after:.2g} m instead of {before:.2g} m."
 
 
 def verdict_of(diagnosis: Diagnosis) -> Verdict:
@@ -215,7 +222,7 @@ def _evidence(diagnosis: Diagnosis, pictures: Mapping[str, bytes]) -> list[Secti
 
 
 def _residual_parts(found: Traces, pictures: Mapping[str, bytes]) -> list[Part]:
-    return [
+    parts: list[Part] = [
         Picture(pictures["over_time"], "Means over short pieces of time. Noise has been averaged out."),
         Picture(
             pictures["rates"],
@@ -233,13 +240,16 @@ def _residual_parts(found: Traces, pictures: Mapping[str, bytes]) -> list[Part]:
             "residual follows the command; commands that change slowly show on both sides.",
         ),
     ]
+    if any(found.used(name) != name for name in (RATES[0], FORCES[0])):
+        parts.append(Text(DIFFERENCES))
+    return parts
 
 
 def html_of(diagnosis: Diagnosis, log: FlightLog) -> str:
     """Return the report of a diagnosis of a log as a self-contained page."""
     found = traces_of(diagnosis, log)
     pictures = {name: png_of(figure) for name, figure in draw_report(diagnosis, found).items()}
-    minutes = found.regressors["elapsed"][-1] / 60.0
+    minutes = found.regressors["elapsed"][-1] / SECONDS_PER_MINUTE
     introduction: list[Part] = [
         verdict_of(diagnosis),
         Text(f"{diagnosis.source}: {len(log)} rows, {minutes:.1f} min. SHA-256 {diagnosis.sha256[:12]}."),

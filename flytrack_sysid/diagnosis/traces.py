@@ -65,22 +65,23 @@ class Traces(NamedTuple):
     step_s: float
     attitude: Rotation
 
-    def channel(self, name: str) -> str:
-        """Return a channel, or what says the same where the log lacks its sensor."""
-        return name if self.counts[name].any() else _INSTEAD.get(name, name)
+    def used(self, name: str) -> str:
+        """Return the column that stands for one: attitude for rates, velocity for force, without a sensor."""
+        channel, _, rest = name.partition("_")
+        if not self.counts[channel].any():
+            channel = _INSTEAD.get(channel, channel)
+        return f"{channel}_{rest}" if rest else channel
 
     def column(self, model: str, name: str) -> tuple[np.ndarray, np.ndarray]:
         """Return one component of a residual and where it counts, both (num_rows,).
 
-        name: ``rates_x``, ``force_world_z``, ``battery``, ...; rates and force from attitude and velocity
-        where the log lacks gyro and accelerometer.
+        name: ``rates_x``, ``force_world_z``, ``battery``, ...; what is ``used`` for it.
         """
-        parts = name.split("_")
-        channel = self.channel(parts[0])
+        channel, *rest = self.used(name).split("_")
         values = self.residuals[model][channel]
-        if "world" in parts:
+        if "world" in rest:
             values = self.attitude.apply(values)
-        return values[:, _AXES.index(parts[-1]) if len(parts) > 1 else 0], self.counts[channel]
+        return values[:, _AXES.index(rest[-1]) if rest else 0], self.counts[channel]
 
 
 # Label and unit of each regressor.
@@ -98,8 +99,14 @@ REGRESSORS: dict[str, tuple[str, str]] = {
         for axis, name in zip(_AXES, _STICKS[:3], strict=True)
     },
     **{f"said_force_{axis}": (f"force of the model, body {axis}", "m/s²") for axis in _AXES},
-    **{f"turning_{axis}": (f"squared rates about the others than {axis}", "rad²/s²") for axis in _AXES},
-    **{f"spin_up_{axis}": (f"demanded angular acceleration, {axis}", "rad/s²") for axis in _AXES},
+    **{
+        f"turning_{axis}": (f"squared rates about {others}", "rad²/s²")
+        for axis, others in zip(_AXES, ("y, z", "x, z", "x, y"), strict=True)
+    },
+    **{
+        f"spin_up_{axis}": (f"{name} demanded", "rad/s²")
+        for axis, name in zip(_AXES, _STICKS[:3], strict=True)
+    },
     **{f"position_{axis}": (f"position {axis}", "m") for axis in "xy"},
     "height": ("height", "m"),
     "heading": ("heading", "deg"),

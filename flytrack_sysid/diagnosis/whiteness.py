@@ -11,7 +11,7 @@ from scipy import linalg, stats
 
 LONGEST_LAG_S = 0.5
 BANDS = {95: float(stats.norm.isf(0.025)), 99: float(stats.norm.isf(0.005))}  # percent -> standard deviations
-HELD = 1e-2  # of the power of a command's changes: what is less than that is not asked for
+HELD = 2e-3  # of the power of a command's changes: what is less than that is not asked for
 FEWEST_PAIRS = 30  # of rows a lag apart
 
 
@@ -143,7 +143,7 @@ def response(change: np.ndarray, grid: np.ndarray, step_s: float, first_s: float
     that follow each other within ``last_s`` are told apart; lightly held at 0, where smooth commands do not
     say. Linear in ``grid``: the responses of two parts of a residual sum up. std: from what is left then.
     """
-    change, grid = np.where(np.isfinite(change), change, np.nan), _centred(grid)
+    grid = _centred(grid)
     lags = _lags(step_s, first_s, last_s)
     means, pairs = _products(change, grid, lags)
     apart = np.arange(len(lags))
@@ -155,10 +155,10 @@ def response(change: np.ndarray, grid: np.ndarray, step_s: float, first_s: float
     noise = _centred(grid - _following(change, values, lags))
     reach = _lags(step_s, -LONGEST_LAG_S, LONGEST_LAG_S)
     of_noise = np.nan_to_num(_products(noise, noise, reach)[0])
-    of_changes = [
-        np.nan_to_num(_products(change, change, reach + shift)[0]) @ of_noise for shift in apart.tolist()
-    ]
-    scatter = inverse @ linalg.toeplitz(of_changes) @ inverse
+    further = np.arange(reach[0], reach[-1] + len(lags))
+    of_changes = np.nan_to_num(_products(change, change, further)[0])
+    both = np.lib.stride_tricks.sliding_window_view(of_changes, len(reach)) @ of_noise
+    scatter = inverse @ linalg.toeplitz(both) @ inverse
     return Response(
         lags * step_s, values, np.sqrt(np.maximum(np.diag(scatter), 0.0) / np.maximum(pairs, 1.0))
     )
