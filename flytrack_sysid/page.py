@@ -23,6 +23,10 @@ caption, figcaption { text-align: left; color: var(--soft); font-size: 0.9rem; p
 th, td { text-align: right; padding: 0.3rem 0.75rem; border-bottom: 1px solid var(--line);
   white-space: nowrap; }
 th:first-child, td:first-child { text-align: left; padding-left: 0; }
+.wrap td, .wrap th { white-space: pre-line; text-align: left; vertical-align: top; }
+.verdict { margin: 1rem 0; padding: 0.75rem 1rem; border-left: 6px solid var(--soft); border-radius: 4px;
+  background: var(--note); font-size: 1.15rem; }
+.good { border-color: #009E73; } .found { border-color: #0072B2; } .open { border-color: #D55E00; }
 figure { margin: 1rem 0; }
 img { width: 100%; height: auto; background: #ffffff; border-radius: 4px; }
 @media print {
@@ -46,12 +50,26 @@ class Bullets(NamedTuple):
     items: Sequence[str]
 
 
+class Verdict(NamedTuple):
+    """What matters at a glance. tone: of ``TONES``, how it is coloured."""
+
+    text: str
+    tone: str
+
+
+TONES = ("good", "found", "open")
+
+
 class Table(NamedTuple):
-    """A table; every row has as many cells as the header, the first names the row."""
+    """A table; every row has as many cells as the header, the first names the row.
+
+    is_text: cells hold words rather than numbers: they may wrap and have several lines.
+    """
 
     header: Sequence[str]
     rows: Sequence[Sequence[str]]
     caption: str = ""
+    is_text: bool = False
 
 
 class Picture(NamedTuple):
@@ -61,7 +79,7 @@ class Picture(NamedTuple):
     caption: str
 
 
-Part = Text | Bullets | Table | Picture
+Part = Text | Verdict | Bullets | Table | Picture
 
 
 class Section(NamedTuple):
@@ -82,8 +100,9 @@ def _html_of_table(table: Table) -> str:
         "<tr>" + "".join(f"<td>{escape(cell)}</td>" for cell in row) + "</tr>" for row in table.rows
     )
     caption = f"<caption>{escape(table.caption)}</caption>" if table.caption else ""
+    kind = ' class="wrap"' if table.is_text else ""
     return (
-        f'<div class="scroll"><table>{caption}\n<thead><tr>{head}</tr></thead>\n'
+        f'<div class="scroll"><table{kind}>{caption}\n<thead><tr>{head}</tr></thead>\n'
         f"<tbody>\n{body}\n</tbody></table></div>"
     )
 
@@ -91,6 +110,10 @@ def _html_of_table(table: Table) -> str:
 def _html_of(part: Part) -> str:
     if isinstance(part, Text):
         return f"<p>{escape(part.text)}</p>"
+    if isinstance(part, Verdict):
+        if part.tone not in TONES:
+            raise ValueError(f"verdict: found tone {part.tone!r}, expected one of {', '.join(TONES)}")
+        return f'<p class="verdict {part.tone}">{escape(part.text)}</p>'
     if isinstance(part, Bullets):
         return "<ul>\n" + "\n".join(f"<li>{escape(item)}</li>" for item in part.items) + "\n</ul>"
     if isinstance(part, Table):
@@ -106,7 +129,7 @@ def page(title: str, sections: Sequence[Section], introduction: Sequence[Part] =
     """Return an HTML document; all text is escaped, so that it may come from files.
 
     Raises:
-        ValueError: a table's row has another number of cells than its header.
+        ValueError: a table's row has another number of cells than its header, or a verdict an unknown tone.
     """
     body = [f"<h1>{escape(title)}</h1>", *(_html_of(part) for part in introduction)]
     for section in sections:

@@ -46,11 +46,11 @@ def _figure(title: str, rows: int, columns: int, height_in: float) -> tuple[Figu
 def _nothing(title: str, why: str) -> Figure:
     """Return a low figure that says why there is nothing to show."""
     figure, panels = _figure(title, 1, 1, NOTHING_HEIGHT_IN)
-    _say(panels[0, 0], why)
+    say(panels[0, 0], why)
     return figure
 
 
-def _say(axes: Axes, why: str) -> None:
+def say(axes: Axes, why: str) -> None:
     """Say in a panel why it shows nothing."""
     axes.set_axis_off()
     axes.text(0.5, 0.5, why, ha="center", va="center", color=GREY, transform=axes.transAxes, wrap=True)
@@ -65,7 +65,7 @@ def draw_steps(steps: Sequence[StepResponse]) -> Figure:
     for panel, axis in zip(panels[:, 0], AXES, strict=True):
         own = [step for step in steps if step.axis == axis]
         if not own:
-            _say(panel, f"{axis}: no clear commanded step")
+            say(panel, f"{axis}: no clear commanded step")
             continue
         for colour, step in zip((BLUE, ORANGE, GREEN), own, strict=False):
             change = f"{step.command_before:+.2f} to {step.command_after:+.2f}"
@@ -102,7 +102,7 @@ def draw_one_step(one_step: OneStep) -> Figure:
     for panel, name in zip(panels.flat, names, strict=False):
         error = one_step.channels.get(name)
         if error is None:
-            _say(panel, f"{NAMES[name]}: not in the log, or not judged")
+            say(panel, f"{NAMES[name]}: not in the log, or not judged")
             continue
         values, unit = error.errors, UNITS[name].replace("^2", "²")
         if error.turn_deg is not None:
@@ -123,7 +123,7 @@ def draw_rollouts(rollouts: Sequence[Rollout]) -> Figure:
     for panel, (name, (_, unit)) in zip(panels.flat, QUANTITIES.items(), strict=True):
         flown = [rollout for rollout in rollouts if name in rollout.errors]
         if not flown:
-            _say(panel, f"{name}: not in the log,\nor no judged stretch is long enough")
+            say(panel, f"{name}: not in the log,\nor no judged stretch is long enough")
             continue
         horizons = [rollout.horizon_s for rollout in flown]
         errors = [rollout.errors[name] for rollout in flown]

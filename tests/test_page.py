@@ -5,7 +5,7 @@ from html.parser import HTMLParser
 
 import pytest
 
-from flytrack_sysid.page import Bullets, Picture, Section, Table, Text, page
+from flytrack_sysid.page import Bullets, Picture, Section, Table, Text, Verdict, page
 
 PNG = b"\x89PNG\r\n\x1a\n and the rest"
 HOSTILE = '"><script>alert(1)</script><a href="https://example.org/x">'
@@ -48,8 +48,10 @@ def full_page(words: str) -> str:
     """Return a page with these words in every place that takes any."""
     parts = [
         Text(words),
+        Verdict(words, "good"),
         Bullets([words]),
         Table([words, "b"], [[words, "2"]], caption=words),
+        Table([words, "b"], [[words, "2"]], caption=words, is_text=True),
         Picture(PNG, words),
     ]
     return page(words, [Section(words, parts)], introduction=[Text(words)])
@@ -85,3 +87,8 @@ def test_everything_is_shown_once():
 def test_row_of_another_length_is_refused():
     with pytest.raises(ValueError, match=r"table 'sizes': found a row of 1 cells, expected 2"):
         page("t", [Section("s", [Table(["a", "b"], [["1"]], caption="sizes")])])
+
+
+def test_unknown_tone_is_refused():
+    with pytest.raises(ValueError, match=r"verdict: found tone 'loud', expected one of good, found, open"):
+        page("t", [Section("s", [Verdict("words", "loud")])])

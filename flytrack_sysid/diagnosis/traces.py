@@ -1,0 +1,264 @@
+"""What models leave of a log, row by row, and what it may be held against: speed, thrust, sticks, place.
+
+============  =====================================================================  =======
+channel       residual of a row, measured less said                                  unit
+============  =====================================================================  =======
+``rates``     gyro, body                                                             rad/s
+``attitude``  mean rate of the turn since the row before, body                       rad/s
+``force``     accelerometer, or known accelerations as specific force, body          m/s^2
+``velocity``  mean acceleration since the row before, body                           m/s^2
+``battery``   voltage, summed up since the flight began                              V
+============  =====================================================================  =======
+
+``attitude`` and ``velocity`` say the same as ``rates`` and ``force``, without gyro and accelerometer: what
+shows in one of a pair only is wrong with a sensor.
+"""
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import jax
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from flytrack_env.dynamics import ModelParameters, lag
+from flytrack_env.effects import EFFECTS
+from flytrack_env.state import Action
+from flytrack_sysid.diagnosis.lanes import LEAD_IN_ROWS, Lanes, make_lanes
+from flytrack_sysid.diagnosis.problem import Problem
+from flytrack_sysid.log import FlightLog
+from flytrack_sysid.parameters import to_vector
+from flytrack_sysid.record import Record
+
+UNITS = {"rates": "rad/s", "attitude": "rad/s", "force": "m/s²", "velocity": "m/s²", "battery": "V"}
+# Of Problem.left, (axes, channel): rotation is axes 0 to 2, force 3 to 5, battery 6; direct 0, level 1.
+_PLACES = {
+    "rates": (slice(0, 3), 0),
+    "attitude": (slice(0, 3), 1),
+    "force": (slice(3, 6), 0),
+    "velocity": (slice(3, 6), 1),
+    "battery": (slice(6, 7), 1),
+}
+_PER_STEP = ("attitude", "velocity", "battery")  # changes since the row before
+_INSTEAD = {"rates": "attitude", "force": "velocity"}
+_STICKS = ("roll", "pitch", "yaw", "thrust")
+_AXES = "xyz"
+BETWEEN_FLIGHTS = 1000  # slots: no lag of a correlation reaches from one flight into the next
+
+
+class Traces(NamedTuple):
+    """Residuals of models and regressors, a value per row of the log.
+
+    residuals: model -> channel -> (num_rows, 3), battery (num_rows, 1); units of the module's table;
+    anything where nothing counts. counts: channel -> (num_rows,) bool, what a fit is made of; all False
+    of a channel that the log lacks.
+    regressors: (num_rows,) each, in the units of ``REGRESSORS``.
+    slot: (num_rows,) int, place of a row among evenly spaced ones; a lost row leaves its slot empty, and
+    flights are far apart. step_s: between slots.
+    attitude: body to world, of the row before: the frame of force and velocity.
+    """
+
+    residuals: Mapping[str, Mapping[str, np.ndarray]]
+    counts: Mapping[str, np.ndarray]
+    regressors: Mapping[str, np.ndarray]
+    slot: np.ndarray
+    step_s: float
+    attitude: Rotation
+
+    def used(self, name: str) -> str:
+        """Return the column that stands for one: attitude for rates, velocity for force, without a sensor."""
+        channel, _, rest = name.partition("_")
+        if not self.counts[channel].any():
+            channel = _INSTEAD.get(channel, channel)
+        return f"{channel}_{rest}" if rest else channel
+
+    def column(self, model: str, name: str) -> tuple[np.ndarray, np.ndarray]:
+        """Return one component of a residual and where it counts, both (num_rows,).
+
+        name: ``rates_x``, ``force_world_z``, ``battery``, ...; what is ``used`` for it.
+        """
+        channel, *rest = self.used(name).split("_")
+        values = self.residuals[model][channel]
+        if "world" in rest:
+            values = self.attitude.apply(values)
+        return values[:, _AXES.index(rest[-1]) if rest else 0], self.counts[channel]
+
+
+# Label and unit of each regressor.
+REGRESSORS: dict[str, tuple[str, str]] = {
+    "time": ("time since the flight began", "s"),
+    "elapsed": ("time, flights one after the other", "s"),
+    **{f"airspeed_{axis}": (f"airspeed along body {axis}", "m/s") for axis in _AXES},
+    "airspeed_xy": ("airspeed in the rotor plane", "m/s"),
+    "speed": ("speed", "m/s"),
+    **{f"command_{stick}": (f"{stick} command", "1") for stick in _STICKS},
+    **{f"applied_{stick}": (f"{stick} action, lagged", "1") for stick in _STICKS},
+    "thrust_change": ("change of the applied thrust action", "1/s"),
+    **{
+        f"said_rates_{axis}": (f"{name} rate of the model", "rad/s")
+        for axis, name in zip(_AXES, _STICKS[:3], strict=True)
+    },
+    **{f"said_force_{axis}": (f"force of the model, body {axis}", "m/s²") for axis in _AXES},
+    **{
+        f"turning_{axis}": (f"squared rates about {others}", "rad²/s²")
+        for axis, others in zip(_AXES, ("y, z", "x, z", "x, y"), strict=True)
+    },
+    **{
+        f"spin_up_{axis}": (f"{name} demanded", "rad/s²")
+        for axis, name in zip(_AXES, _STICKS[:3], strict=True)
+    },
+    **{f"position_{axis}": (f"position {axis}", "m") for axis in "xy"},
+    "height": ("height", "m"),
+    "heading": ("heading", "deg"),
+    "tilt": ("tilt", "deg"),
+}
+
+
+@jax.jit
+def _lagged(record: Record, tau: np.ndarray) -> Action:
+    """Return the applied action at the rows of lanes: the commands behind the lags, (rows, lanes) each."""
+
+    def next_row(applied: Action, row: Record) -> tuple[Action, Action]:
+        restarts = row.begins | row.is_applied_known
+        measured = Action(*row.applied.T)
+        pairs = zip(measured, applied, strict=True)
+        applied = Action(*(jax.numpy.where(restarts, new, old) for new, old in pairs))
+        return lag(applied, Action(*row.command.T), row.step_s, tau), applied
+
+    first = Action(*record.applied[0].T)
+    return jax.lax.scan(next_row, first, record)[1]
+
+
+class _Rows(NamedTuple):
+    """Where the log's rows are in lanes. place: of the record's rows; kept: of these, the log's rows."""
+
+    place: tuple[np.ndarray, np.ndarray]
+    kept: np.ndarray
+
+    def along(self, values: np.ndarray) -> np.ndarray:
+        """Return values (rows, lanes, ...) in the record's order, filled rows included."""
+        return np.asarray(values)[self.place]
+
+
+def _rows_of(lanes: Lanes) -> _Rows:
+    row = np.where((np.arange(len(lanes.row)) >= LEAD_IN_ROWS)[:, None], lanes.row, -1)
+    lane, place = np.nonzero(row.T >= 0)  # lane after lane is the record's order
+    return _Rows((place, lane), np.flatnonzero(lanes.record.source_row[place, lane] >= 0))
+
+
+def _residuals(left: np.ndarray, rows: _Rows, record: Record, before: Rotation) -> dict[str, np.ndarray]:
+    """Return the channels of one model on the log's rows; left: (rows, lanes, NUM_AXES, 2), world."""
+    along = rows.along(left)
+    step_s = np.roll(record.step_s, 1)[:, None]
+    found = {}
+    for name, (axes, number) in _PLACES.items():
+        values = along[:, axes, number]
+        if name == "battery":
+            summed = np.cumsum(values, axis=0)
+            is_first = np.flatnonzero(record.begins)
+            started = is_first[np.cumsum(record.begins) - 1]
+            values = summed - summed[started]
+        elif name in _PER_STEP:
+            values = values / step_s
+        found[name] = values[rows.kept] if name == "battery" else before.inv().apply(values[rows.kept])
+    return found
+
+
+def _counts(lanes: Lanes, rows: _Rows, record: Record) -> dict[str, np.ndarray]:
+    """Return where channels count; changes since a row that was lost do not."""
+    along = rows.along(lanes.counts)
+    after_measured = np.append(False, record.source_row[:-1] >= 0) & ~record.begins
+    return {
+        name: (along[:, axes, number].all(axis=1) & (after_measured if name in _PER_STEP else True))[
+            rows.kept
+        ]
+        for name, (axes, number) in _PLACES.items()
+    }
+
+
+def _regressors(model: ModelParameters, record: Record, applied: np.ndarray) -> dict:
+    """Return the regressors in the record's order; applied: (num_rows, 4)."""
+    attitude = Rotation.from_quat(record.quat, scalar_first=True)
+    wind = model.effect("wind")
+    airspeed = attitude.inv().apply(record.vel_w - np.array([wind.v_x, wind.v_y, wind.v_z], float))
+    change = np.diff(applied, axis=0, append=applied[-1:]) / record.step_s[:, None]
+    change = np.where(np.append(record.begins[1:], True)[:, None], 0.0, change)
+    body_z, body_x = attitude.apply((0.0, 0.0, 1.0)), attitude.apply((1.0, 0.0, 0.0))
+    full_rates = np.deg2rad(np.asarray(model.max_rate, float))
+    found = {
+        "airspeed_xy": np.hypot(airspeed[:, 0], airspeed[:, 1]),
+        "speed": np.linalg.norm(record.vel_w, axis=1),
+        "thrust_change": change[:, 3],
+        "position_x": record.pos_w[:, 0],
+        "position_y": record.pos_w[:, 1],
+        "height": record.pos_w[:, 2],
+        "heading": np.rad2deg(np.arctan2(body_x[:, 1], body_x[:, 0])),
+        "tilt": np.rad2deg(np.arccos(np.clip(body_z[:, 2], -1.0, 1.0))),
+    }
+    for index, axis in enumerate(_AXES):
+        found[f"airspeed_{axis}"] = airspeed[:, index]
+        found[f"spin_up_{axis}"] = change[:, index] * full_rates[index]
+    for index, stick in enumerate(_STICKS):
+        found[f"command_{stick}"] = record.command[:, index]
+    # What is said of a row is said of the step to it, from the row before; the lag acts first in a step.
+    found = {name: np.roll(values, 1) for name, values in found.items()}
+    return found | {f"applied_{stick}": applied[:, index] for index, stick in enumerate(_STICKS)}
+
+
+def _said(
+    residuals: dict, lanes: Lanes, rows: _Rows, record: Record, before: Rotation, gravity: float
+) -> dict[str, np.ndarray]:
+    """Return the rates and the true specific force that a model says: measured less its residual."""
+    step_s = np.roll(record.step_s, 1)[rows.kept, None]
+    if "w" in lanes.measured:
+        rates = rows.along(lanes.measured["w"])[rows.kept] - residuals["rates"]
+    else:
+        after = Rotation.from_quat(record.quat[rows.kept], scalar_first=True)
+        rates = (before.inv() * after).as_rotvec() / step_s - residuals["attitude"]
+    moved = (record.vel_w - np.roll(record.vel_w, 1, axis=0))[rows.kept] / step_s
+    force = before.inv().apply(moved + np.array([0.0, 0.0, gravity])) - residuals["velocity"]
+    squares = rates**2
+    turning = squares.sum(axis=1, keepdims=True) - squares
+    parts = {"said_rates": rates, "said_force": force, "turning": turning}
+    return {
+        f"{name}_{axis}": part[:, index] for name, part in parts.items() for index, axis in enumerate(_AXES)
+    }
+
+
+def traces(log: FlightLog, models: Mapping[str, ModelParameters], like: str) -> Traces:
+    """Return what each of some models leaves of all rows of a log.
+
+    like: name of the model whose lags, rates and wind the regressors are made with; a delay of commands is
+    not among them. Regressors of a row are those of the step to it: what was flown and commanded in the row
+    before, the action after its lag.
+
+    Raises:
+        KeyError: ``like`` is none of the models.
+    """
+    base = models[like]
+    with jax.enable_x64(True):
+        lanes = make_lanes(log, np.ones(len(log), bool), np.asarray(base.tau, float), float(base.g))
+        problem = Problem(lanes, base)
+        every = [
+            model.with_effects(*(model.effect(one.name) for one in EFFECTS)) for model in models.values()
+        ]
+        left = problem.left(np.array([to_vector(model) for model in every]))
+        lagged = _lagged(lanes.record, np.asarray(base.tau, float))
+        applied = np.stack([np.asarray(stick) for stick in lagged], axis=-1)
+    rows = _rows_of(lanes)
+    record = Record(*(rows.along(leaf) for leaf in lanes.record))
+    begins = ~rows.along(lanes.is_joined)
+    record = record._replace(begins=begins)
+    before = Rotation.from_quat(np.roll(record.quat, 1, axis=0)[rows.kept], scalar_first=True)
+    residuals = {name: _residuals(one, rows, record, before) for name, one in zip(models, left, strict=True)}
+    found = _regressors(base, record, rows.along(applied))
+    since = log.time - log.time[log.is_start()][np.cumsum(log.is_start()) - 1]
+    step_s = float(np.median(record.step_s))
+    regressors = {
+        "time": since,
+        "elapsed": step_s * rows.kept,
+        **{name: values[rows.kept] for name, values in found.items()},
+    }
+    regressors |= _said(residuals[like], lanes, rows, record, before, float(base.g))
+    slot = np.arange(len(begins)) + BETWEEN_FLIGHTS * np.cumsum(begins)
+    return Traces(residuals, _counts(lanes, rows, record), regressors, slot[rows.kept], step_s, before)

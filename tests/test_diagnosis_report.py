@@ -1,0 +1,302 @@
+"""The report of a diagnosis: residuals are what they are said to be, and each cause has its plot."""
+
+import re
+from dataclasses import replace
+
+import jax
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from benchmarks.hidden import draw_base, fly, measure
+from flytrack_env.dynamics import ModelParameters
+from flytrack_env.effects import EFFECTS, AccelerometerBias, CommandDelay, LinearDrag
+from flytrack_sysid.diagnosis.conviction import draw_cause
+from flytrack_sysid.diagnosis.evidence import BASE_CAUSES, EVIDENCE, Against, without
+from flytrack_sysid.diagnosis.report import html_of, verdict_of, write_report
+from flytrack_sysid.diagnosis.result import (
+    CAUSES_FOUND,
+    CONSISTENT,
+    UNEXPLAINED,
+    Cause,
+    Diagnosis,
+    Errors,
+    Estimated,
+    NotIdentifiable,
+    Unexplained,
+)
+from flytrack_sysid.diagnosis.traces import BETWEEN_FLIGHTS, REGRESSORS, traces
+from flytrack_sysid.parameters import to_vector, with_values
+
+SECONDS, DT_S = 12.0, 0.01
+SETTLED = 150  # rows until a start is forgotten
+DRAG = LinearDrag(0.3, 0.4, 0.1)
+
+
+def model_of(truth) -> ModelParameters:
+    """Return the model of a hidden plant without its effects."""
+    leaves = (np.array(truth.tau), np.array(truth.coeffs), np.array(truth.max_rate))
+    return ModelParameters(*leaves, truth.mass, truth.gravity, truth.drain)
+
+
+@pytest.fixture(scope="module")
+def flown():
+    """A hidden plant with drag, and the clean log of its flight."""
+    rng = np.random.default_rng(5)
+    truth = replace(draw_base(rng), effects={"linear_drag": DRAG._asdict()})
+    return model_of(truth), measure(fly(truth, "scripted", SECONDS, rng), "none", rng)
+
+
+@pytest.fixture(scope="module")
+def measured(flown):
+    """The same log as sensors would have written it."""
+    rng = np.random.default_rng(6)
+    return measure(flown[1], "sensors", rng)
+
+
+def lagged(log, tau: np.ndarray) -> np.ndarray:
+    """Return the commands of an evenly spaced log behind first-order lags, (num_rows, 4)."""
+    keep = np.exp(-DT_S / tau)
+    found = [log["u"][0]]
+    for command in log["u"][:-1]:
+        found.append(keep * found[-1] + (1.0 - keep) * command)
+    return np.array(found)
+
+
+def test_residuals_are_measured_less_said(flown):
+    base, log = flown
+    wrong = base._replace(tau=1.3 * base.tau, battery_drain_v_per_min=0.5).with_effects(
+        LinearDrag(0.1, 0.2, 0.0)
+    )
+    found = traces(log, {"right": base.with_effects(DRAG), "wrong": wrong}, like="wrong")
+    applied = lagged(log, wrong.tau)
+    quat = Rotation.from_quat(log["q"], scalar_first=True)
+    airspeed_b = quat.inv().apply(log["v"])[:-1]
+    stick, volt, coeffs = applied[1:, 3], log["v_bat"][:-1, 0], wrong.thrust_coeffs
+    thrust = np.polyval(coeffs[3::-1], stick) + volt * (coeffs[4] + stick * coeffs[5])
+    said = np.array([0.0, 0.0, 1.0]) * thrust[:, None] / wrong.m - np.array([0.1, 0.2, 0.0]) * airspeed_b
+    rates = log["w"] - applied[:, :3] * np.deg2rad(wrong.max_rate)
+    later, own = slice(SETTLED, None), found.residuals["wrong"]
+    np.testing.assert_allclose(own["rates"][later], rates[later], atol=1e-5)
+    np.testing.assert_allclose(own["force"][later], (log["f"][1:] - said)[SETTLED - 1 :], atol=1e-4)
+    gravity_w = np.array([0.0, 0.0, wrong.g])
+    moved = quat[:-1].inv().apply(np.diff(log["v"], axis=0) / DT_S + gravity_w) - said
+    np.testing.assert_allclose(own["velocity"][later], moved[SETTLED - 1 :], atol=1e-3)
+    turned = (quat[:-1].inv() * quat[1:]).as_rotvec() / DT_S - applied[1:, :3] * np.deg2rad(wrong.max_rate)
+    np.testing.assert_allclose(
+        own["attitude"][later], turned[SETTLED - 1 :], atol=0.05
+    )  # of steps, not angles
+    drained = log["v_bat"][:, 0] - log["v_bat"][0, 0] + 0.5 / 60.0 * log.time
+    np.testing.assert_allclose(own["battery"][:, 0], drained, atol=1e-6)
+    for name in ("rates", "force", "velocity"):  # what is there is seen, and gone with the right model
+        assert np.abs(own[name][later]).max() > 0.1
+        assert np.abs(found.residuals["right"][name][later]).max() < 1e-3
+
+
+def test_regressors_are_those_of_the_step(flown):
+    base, log = flown
+    found = traces(log, {"right": base.with_effects(DRAG)}, like="right")
+    assert set(found.regressors) == set(REGRESSORS)
+    regressors, later = found.regressors, slice(SETTLED, None)
+    np.testing.assert_allclose(
+        regressors["applied_thrust"][later], lagged(log, base.tau)[later, 3], atol=1e-6
+    )
+    np.testing.assert_allclose(regressors["command_roll"][1:], log["u"][:-1, 0])
+    np.testing.assert_allclose(regressors["speed"][1:], np.linalg.norm(log["v"], axis=1)[:-1])
+    np.testing.assert_allclose(regressors["said_force_z"][later], log["f"][later, 2], atol=1e-3)
+    np.testing.assert_allclose(regressors["said_rates_y"][later], log["w"][later, 1], atol=1e-3)
+    np.testing.assert_allclose(
+        regressors["turning_z"][later], (log["w"][later, :2] ** 2).sum(axis=1), atol=1e-2
+    )
+
+
+def test_lost_rows_leave_their_slots_empty(flown):
+    base, log = flown
+    kept = np.ones(len(log), bool)
+    kept[[400, 401, 700]] = False
+    parts = log.select(kept)
+    parts = replace(parts, segment=(parts.time > 9.0).astype(int))
+    found = traces(parts, {"base": base}, like="base")
+    gaps = np.diff(found.slot)
+    assert gaps[399] == 3 and gaps[697] == 2 and (gaps > BETWEEN_FLIGHTS).sum() == 1
+    assert not found.counts["velocity"][[0, 400, 698]].any() and found.counts["velocity"][401]
+    start = int(np.flatnonzero(gaps > BETWEEN_FLIGHTS)[0]) + 1
+    assert not found.counts["force"][start] and found.residuals["base"]["battery"][start] == 0.0
+    assert found.regressors["time"][start] == 0.0
+
+
+def test_attitude_stands_in_for_a_gyro(flown):
+    base, log = flown
+    found = traces(log.without("w", "f"), {"base": base}, like="base")
+    assert found.used("rates_y") == "attitude_y" and found.used("force_world_x") == "velocity_world_x"
+    assert found.used("battery") == "battery"
+    np.testing.assert_array_equal(
+        found.column("base", "rates_y")[0], found.residuals["base"]["attitude"][:, 1]
+    )
+    with_gyro = traces(log, {"base": base}, like="base")
+    for name in ("said_rates_x", "said_rates_z"):
+        apart = found.regressors[name][SETTLED:] - with_gyro.regressors[name][SETTLED:]
+        assert np.abs(apart).max() < 0.05
+
+
+def shown(model: ModelParameters, cause: str) -> ModelParameters:
+    """Return the model with a cause, far from neutral."""
+    if cause in BASE_CAUSES:
+        size = {
+            name: 1.4 * float(value)
+            for name, value in zip(BASE_CAUSES[cause], old_of(model, cause), strict=True)
+        }
+        return with_values(model, size)
+    effect = next(effect for effect in EFFECTS if effect.name == cause)
+    return model.with_effects(
+        effect.parameters(**{name: 0.9 * one.high for name, one in effect.ranges.items()})
+    )
+
+
+def old_of(model: ModelParameters, cause: str) -> list[float]:
+    """Return the model's numbers of a base cause."""
+    names = {
+        f"tau_{stick}": model.tau[index] for index, stick in enumerate(("roll", "pitch", "yaw", "thrust"))
+    }
+    names |= {f"c{power}": model.thrust_coeffs[power] for power in range(6)}
+    names["battery_drain_v_per_min"] = model.battery_drain_v_per_min
+    return [float(names[name]) for name in BASE_CAUSES[cause]]
+
+
+def test_every_cause_has_a_plot_in_which_it_shows(flown):
+    base, log = flown
+    low = log["p"] - [0.0, 0.0, log["p"][:, 2].min() - 0.1]  # some effects are there near the ground only
+    log = replace(log, channels={**log.channels, "p": low})
+    causes = [*(effect.name for effect in EFFECTS), *BASE_CAUSES]
+    assert set(EVIDENCE) == set(causes)
+    models = {"without": base, **{cause: shown(base, cause) for cause in causes}}
+    found = traces(log, models, like="without")
+    sizes = {"rates": 0.01, "attitude": 0.01, "force": 0.05, "velocity": 0.05, "battery": 0.02}
+    for cause in causes:
+        evidence = EVIDENCE[cause]
+        assert evidence.words and evidence.reading and evidence.panels
+        explained = []
+        for panel in evidence.panels:
+            if isinstance(panel, Against):
+                assert panel.regressor in REGRESSORS
+            (less, counts), (full, _) = (found.column(name, panel.residual) for name in ("without", cause))
+            explained.append(np.abs(full - less)[counts].max() / sizes[panel.residual.split("_")[0]])
+        assert max(explained) > 1.0, cause
+
+
+def test_a_model_without_a_cause(flown):
+    base = flown[0]
+    extended = base._replace(tau=2.0 * base.tau).with_effects(DRAG, CommandDelay(0.01))
+    less = without(extended, base, "linear_drag")
+    assert less.effect("linear_drag") == LinearDrag() and less.effect("command_delay").delay_s == 0.01
+    less = without(extended, base, "tau_pitch")
+    np.testing.assert_allclose(less.tau, base.tau * [2.0, 1.0, 2.0, 2.0])
+    np.testing.assert_array_equal(to_vector(without(less, base, "thrust_curve")), to_vector(less))
+
+
+@pytest.fixture(scope="module")
+def diagnosis(flown, measured):
+    """A diagnosis put together by hand."""
+    base = flown[0]
+    nominal = base._replace(tau=1.3 * base.tau)
+    bias = AccelerometerBias(0.2, 0.0, 0.0)
+    drag = {
+        name: Estimated(value, (0.9 * value, 1.1 * value), "1/s") for name, value in DRAG._asdict().items()
+    }
+    causes = (
+        Cause("linear_drag", (), "force", drag, 900.0, 310.0, 800.0, 500.0, "rotor_drag"),
+        Cause(
+            "tau_roll",
+            ("command_delay",),
+            "rates",
+            {"tau_roll": Estimated(0.03, (0.02, 0.04), "s")},
+            90.0,
+            31.0,
+            80.0,
+            1.0,
+        ),
+        Cause(
+            "accelerometer_bias",
+            (),
+            "force",
+            {"x": Estimated(0.2, (0.1, 0.3), "m/s^2")},
+            50.0,
+            20.0,
+            40.0,
+            30.0,
+        ),
+    )
+    error = {
+        name: Errors(
+            {"w": 0.5 * share, "f": 0.4 * share, "q": float("nan")}, {"0.5": 0.1 * share, "1": 0.5 * share}
+        )
+        for name, share in (("nominal", 1.0), ("refitted_base", 0.8), ("extended", 0.2), ("noise_floor", 0.1))
+    }
+    return Diagnosis(
+        verdict=f"{CAUSES_FOUND}+{UNEXPLAINED}",
+        causes=causes,
+        unexplained=Unexplained(True, ("position",), {"force: position": 0.3}),
+        not_identifiable=(NotIdentifiable("ground_effect", 0.02, "m^2", ("thrust_scale",), "low_passes"),),
+        error=error,
+        nominal=nominal,
+        base=base,
+        extended=base.with_effects(DRAG, bias),
+        noise={"rates": [0.1, 0.1, 0.1]},
+        source="<script>flight</script>",
+        sha256=measured.sha256,
+        seconds=1.0,
+        warnings=("something to know",),
+    )
+
+
+def test_page_says_all_and_loads_nothing(tmp_path, diagnosis, measured):
+    write_report(tmp_path / "report.html", diagnosis, measured)
+    assert [path.name for path in tmp_path.iterdir()] == ["report.html"]
+    text = (tmp_path / "report.html").read_text(encoding="utf-8")
+    for words in (
+        *(cause.effect for cause in diagnosis.causes),
+        *(EVIDENCE[cause.effect].words for cause in diagnosis.causes),
+        "m/s²",
+        "1/s",
+        "0.3\u00a0[0.27,\u00a00.33]\u00a01/s",
+        "low passes",
+        "ground_effect",
+        "something to know",
+        "0.1 m instead of 0.5 m",
+        "&lt;script&gt;flight",
+    ):
+        assert words in text.replace("&#x27;", "'"), words
+    assert not re.search(r"https?://|url\(|@import|<link|<script", text)
+    assert text.count('src="data:image/png;base64,') == text.count("<img") == 6 + len(diagnosis.causes)
+    assert len(text) < 3e6
+
+
+def test_page_of_a_log_of_few_channels(diagnosis, measured):
+    text = html_of(diagnosis, measured.without("w", "f", "v_bat"))
+    assert "attitude or velocity stand in" in text and text.count("<img") == 6 + len(diagnosis.causes)
+
+
+def test_verdicts(diagnosis):
+    assert verdict_of(diagnosis).tone == "open" and "lacks 3 things" in verdict_of(diagnosis).text
+    assert "depends on position" in verdict_of(diagnosis).text
+    alone = replace(diagnosis, verdict=CAUSES_FOUND, causes=diagnosis.causes[:1], unexplained=Unexplained())
+    assert verdict_of(alone).tone == "found" and "one thing: drag" in verdict_of(alone).text
+    nothing = replace(diagnosis, verdict=UNEXPLAINED, causes=())
+    assert verdict_of(nothing).tone == "open" and "no known cause explains it" in verdict_of(nothing).text
+    fine = replace(diagnosis, verdict=CONSISTENT, causes=(), unexplained=Unexplained())
+    assert verdict_of(fine).tone == "good"
+
+
+def test_curve_of_a_cause_goes_through_what_is_left_without_it(flown, measured):
+    base = flown[0]
+    models = {"without": base, "extended": base.with_effects(DRAG)}
+    found = traces(measured, models, like="extended")
+    figure = draw_cause("linear_drag", EVIDENCE["linear_drag"].panels, found, "without", "extended")
+    for panel in figure.axes:
+        lines = {line.get_label(): line for line in panel.lines}
+        curve = lines["what the cause explains"].get_ydata()
+        (dots,) = panel.containers
+        middles, ends = dots.lines[0].get_ydata(), dots.lines[2][0].get_segments()
+        halves = np.array([0.5 * (end[1, 1] - end[0, 1]) for end in ends])
+        assert np.mean(np.abs(middles - curve) < 1.5 * halves) > 0.8
+    assert jax.config.jax_enable_x64 is False
