@@ -362,3 +362,12 @@ def test_longer_delays_act_later() -> None:
     models = [NOMINAL.with_effects(CommandDelay(float(delay))) for delay in delays]
     pitch = [float(fly(drone, commands, model)[-1, 17]) for model in models]
     assert all(later < sooner for sooner, later in pairwise(pitch))
+
+
+@OVER_EFFECTS
+def test_what_is_notable_is_inside_the_range(effect: Effect) -> None:
+    neutral = effect.parameters()
+    assert set(effect.notable) == set(effect.ranges) - set(effect.shapes)
+    for name, size in effect.notable.items():
+        assert size > 0.0
+        assert effect.ranges[name].low <= getattr(neutral, name) + size <= effect.ranges[name].high

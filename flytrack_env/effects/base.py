@@ -95,8 +95,9 @@ class Effect:
     """One effect; at least one hook is given.
 
     name: as in model files. parameters: the NamedTuple class; its defaults are neutral. ranges: of each
-    parameter. equation, source: for people. command, lag, air, thrust, rates, force, battery, gyro,
-    accelerometer: hooks at these stages.
+    parameter. notable: how far from neutral a parameter is worth knowing, a judgement: what is smaller
+    hardly shows in a lap or a reading. equation, source: for people. command, lag, air, thrust, rates,
+    force, battery, gyro, accelerometer: hooks at these stages.
     most_steps: of parameters that are times, how many steps of time they may last.
     probes: values at which to look for the effect, of parameters whose slope at neutral is 0 or one-sided.
     groups: parameters that are looked for together; all of them if empty. shapes: parameters that only shape
@@ -108,6 +109,7 @@ class Effect:
     name: str
     parameters: Any
     ranges: Mapping[str, Range]
+    notable: Mapping[str, float]
     equation: str
     source: str
     most_steps: Mapping[str, int] = field(default_factory=dict)

@@ -67,6 +67,7 @@ COMMAND_DELAY = Effect(
     name="command_delay",
     parameters=CommandDelay,
     ranges={"delay_s": Range(0.0, 0.04, "s")},
+    notable={"delay_s": 0.005},
     equation="u(t) = u(t - delay), averaged over the step",
     most_steps={"delay_s": BUFFER_STEPS},
     probes={"delay_s": (0.005, 0.01, 0.02, 0.03)},

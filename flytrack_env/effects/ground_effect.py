@@ -29,6 +29,7 @@ GROUND_EFFECT = Effect(
     name="ground_effect",
     parameters=GroundEffect,
     ranges={"area": Range(-0.01, 0.01, "m^2")},
+    notable={"area": 0.001},
     equation="T *= 1 + area / (z^2 + 16 area)",
     source="I. C. Cheeseman, W. E. Bennett, ARC R&M 3021, 1955, to first order in area / z^2, levelled off",
     thrust=_thrust,

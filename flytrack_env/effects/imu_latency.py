@@ -67,6 +67,7 @@ IMU_LATENCY = Effect(
     name="imu_latency",
     parameters=ImuLatency,
     ranges={"latency_s": Range(0.0, 0.04, "s")},
+    notable={"latency_s": 0.003},
     equation="omega_measured(t) = omega(t - latency), f_measured(t) = f(t - latency), linear between steps",
     source="assumption: the same for both sensors; what imu_offset adds is not late",
     most_steps={"latency_s": BUFFER_STEPS},

@@ -22,6 +22,7 @@ MOTOR_IMBALANCE = Effect(
     name="motor_imbalance",
     parameters=MotorImbalance,
     ranges={axis: Range(-0.05, 0.05, "(rad/s)/(m/s^2)") for axis in MotorImbalance._fields},
+    notable={"roll": 0.002, "pitch": 0.002},
     equation="omega_x += roll T/m; omega_y += pitch T/m",
     source="assumption: a torque in proportion to thrust, which a rate loop without integral part leaves",
     rates=_rates,

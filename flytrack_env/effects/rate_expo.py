@@ -22,6 +22,7 @@ RATE_EXPO = Effect(
     name="rate_expo",
     parameters=RateExpo,
     ranges={"expo": Range(-0.9, 0.9, "1")},
+    notable={"expo": 0.05},
     equation="omega = max_rate ((1 - expo) u + expo u^3), per axis, u the lagged stick",
     source='the "expo" of radio transmitters; assumption: the same on all axes, behind the lag',
     rates=_rates,

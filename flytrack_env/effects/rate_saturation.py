@@ -11,19 +11,21 @@ CENTRED = 1e-6  # of a stick: nothing saturates there, and nothing is divided by
 
 
 class RateSaturation(NamedTuple):
-    """Share of full stick, at its end, that turns no faster, 1, and how gradually: 0.05 is a corner, 1."""
+    """Share of full stick, at its end, that turns no faster, 1, and how gradually, 0 (a corner) to 1."""
 
     lost: Scalar = 0.0
-    softness: Scalar = 0.05
+    softness: Scalar = 0.0
 
 
 def _rates(limit: RateSaturation, memory: None, rates_b: Vec3, flight: Flight) -> Vec3:
-    power = 1.0 / limit.softness
-    beyond = jnp.power(1.0 - limit.lost, -power) - 1.0  # 0 where nothing is lost
+    reachable = 1.0 - limit.lost
+    bend = 1.0 / (reachable * reachable) - 1.0
 
     def limited(rate: Scalar, stick: Scalar) -> Scalar:
         size = jnp.maximum(jnp.abs(stick), CENTRED)
-        return rate * jnp.power(1.0 + beyond * jnp.power(size, power), -limit.softness)
+        corner = jnp.where(size > reachable, reachable / size, 1.0)
+        gradual = 1.0 / jnp.sqrt(1.0 + bend * size * size)
+        return rate * (corner + limit.softness * (gradual - corner))
 
     return Vec3(*(limited(rate, stick) for rate, stick in zip(rates_b, flight.applied[:3], strict=True)))
 
@@ -31,9 +33,11 @@ def _rates(limit: RateSaturation, memory: None, rates_b: Vec3, flight: Flight) -
 RATE_SATURATION = Effect(
     name="rate_saturation",
     parameters=RateSaturation,
-    ranges={"lost": Range(0.0, 0.8, "1"), "softness": Range(0.05, 0.6, "1")},
-    equation="omega = max_rate u (1 + ((1 - lost)^-n - 1) |u|^n)^(-1/n), n = 1 / softness, u the lagged stick",
-    source="assumption: full stick gives 1 - lost, small sticks all of it; the same on all axes",
+    ranges={"lost": Range(0.0, 0.9, "1"), "softness": Range(0.0, 1.0, "1")},
+    notable={"lost": 0.05},
+    equation="omega = max_rate ((1 - softness) clip(u, -L, L) + softness u / sqrt(1 + (L^-2 - 1) u^2)), "
+    "L = 1 - lost",
+    source="assumption: full stick u gives L, small sticks all of theirs; the same on all axes",
     shapes=("softness",),
     probes={"lost": (0.03, 0.1, 0.3)},
     rates=_rates,

@@ -22,6 +22,7 @@ RATE_SCALE = Effect(
     name="rate_scale",
     parameters=RateScale,
     ranges={axis: Range(0.5, 1.5, "1") for axis in RateScale._fields},
+    notable={"roll": 0.03, "pitch": 0.03, "yaw": 0.03},
     equation="omega *= diag(roll, pitch, yaw)",
     source="assumption: the stick's curve stays linear",
     rates=_rates,

@@ -30,6 +30,7 @@ RATE_SLEW_LIMIT = Effect(
     name="rate_slew_limit",
     parameters=RateSlewLimit,
     ranges={"inverse": Range(0.0, 0.1, "s^2/rad")},
+    notable={"inverse": 0.005},
     equation="|omega - omega before| <= dt / inverse, per axis",
     source="assumption: the same on all axes, at any thrust",
     probes={"inverse": (0.003, 0.01, 0.03)},

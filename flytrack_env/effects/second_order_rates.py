@@ -78,6 +78,7 @@ SECOND_ORDER_RATES = Effect(
     name="second_order_rates",
     parameters=SecondOrderRates,
     ranges={"lag_s": Range(0.0, 0.1, "s"), "damping": Range(0.2, 3.0, "1")},
+    notable={"lag_s": 0.005},
     equation="omega'' / wn^2 + lag_s omega' + omega = omega of the lagged stick, wn = 2 damping / lag_s",
     source="a second-order servo, exact for an input held over the step; assumption: the same on all axes",
     probes={"lag_s": (0.003, 0.01, 0.03)},

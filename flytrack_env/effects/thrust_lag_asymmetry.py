@@ -24,6 +24,7 @@ THRUST_LAG_ASYMMETRY = Effect(
     name="thrust_lag_asymmetry",
     parameters=ThrustLagAsymmetry,
     ranges={"ratio": Range(0.3, 3.0, "1")},
+    notable={"ratio": 0.3},
     equation="tau_thrust *= ratio where the command is below the applied thrust",
     source="assumption: one ratio at any thrust; motors are driven up, and coast down",
     lag=_lag,

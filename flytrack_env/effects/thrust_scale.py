@@ -20,6 +20,7 @@ THRUST_SCALE = Effect(
     name="thrust_scale",
     parameters=ThrustScale,
     ranges={"factor": Range(0.5, 1.5, "1")},
+    notable={"factor": 0.02},
     equation="T *= factor",
     source="assumption: the shape of the thrust curve stays",
     thrust=_thrust,

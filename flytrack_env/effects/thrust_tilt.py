@@ -22,6 +22,7 @@ THRUST_TILT = Effect(
     name="thrust_tilt",
     parameters=ThrustTilt,
     ranges={name: Range(-0.2, 0.2, "rad") for name in ThrustTilt._fields},
+    notable={"towards_x": 0.01, "towards_y": 0.01},
     equation="f_b += (T/m) (towards_x, towards_y, 0)",
     source="assumption: small angles, the same at any thrust",
     force=_force,

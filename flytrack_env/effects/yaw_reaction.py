@@ -21,6 +21,7 @@ YAW_REACTION = Effect(
     name="yaw_reaction",
     parameters=YawReaction,
     ranges={"angle": Range(-0.2, 0.2, "rad")},
+    notable={"angle": 0.02},
     equation="omega_z += angle du/dt, u the applied thrust",
     source="assumption: unequal spin-up of the two directions of rotation, in proportion to its speed",
     rates=_rates,

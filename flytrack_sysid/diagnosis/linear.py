@@ -1,16 +1,18 @@
 """A log seen from one model: what each parameter would change, to first order, and how sure that is."""
 
+import copy
 from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 from scipy import linalg
 
-from flytrack_sysid.diagnosis.candidates import CANDIDATES, Candidate, opened
-from flytrack_sysid.diagnosis.problem import Problem, Sums, sums_of
+from flytrack_sysid.diagnosis.candidates import CANDIDATES, Candidate
+from flytrack_sysid.diagnosis.problem import Problem, Slopes, blocks_of, robust_square, robust_weight
 
 # A direction of which the others leave less than this share is not told apart from them.
 LEAST_OWN_SHARE = 1e-7
+PROBE_PRIOR = 1e-2  # a step to a probe is known to be less than ten times that
 
 
 class Gain(NamedTuple):
@@ -38,28 +40,60 @@ class Gain(NamedTuple):
 
 
 class Outlook:
-    """Sums over blocks of all columns at one vector: every parameter that may be free, and every probe.
+    """A model and, to first order, what every column would change: parameters, and ways to probes.
 
-    vector: the model. places: parameters of the columns. probes: candidates of further columns, whose step
-    is the share of the way to the probe.
+    vector: the model. places: parameters of the first columns. probes: candidates of further ones, whose
+    step is the share of the way to the probe. columns: whitened, by blocks of a second. Slopes may be
+    those at a model nearby (``at``).
     """
 
-    def __init__(
-        self, problem: Problem, vector: np.ndarray, places: Sequence[int], probes: Sequence[Candidate]
-    ):
-        self.problem, self.vector = problem, vector
-        self.places, self.probes = list(places), list(probes)
-        others = np.array([opened(problem, vector, probe) for probe in self.probes]).reshape(-1, len(vector))
-        left, slopes = problem.slopes(vector, self.places, others)
-        self.sums: Sums = sums_of(left, slopes)
-        prior = np.concatenate([prior_information(problem)[self.places], np.full(len(self.probes), 1e-2)])
-        self.prior = prior
-        self.total = self.sums.information.sum(axis=0) + np.diag(prior)
-        pull = prior_information(problem)[self.places] * (vector - problem.start)[self.places]
-        pull = np.concatenate([pull, np.zeros(len(self.probes))])
-        self.score = self.sums.score.sum(axis=0) - pull
-        known = prior_information(problem) * (vector - problem.start) ** 2
-        self.cost = self.sums.square + float(known.sum())
+    def __init__(self, problem: Problem, slopes: Slopes, probes: Sequence[Candidate] = ()):
+        self.problem, self.slopes = problem, slopes
+        self.places, self.probes = list(slopes.places), list(probes)
+        self.prior = np.concatenate(
+            [prior_information(problem)[self.places], np.full(len(self.probes), PROBE_PRIOR)]
+        )
+        self.columns = problem.whiten(slopes.columns)
+        self.vector, self.white = slopes.vector, problem.whiten(slopes.left[None])[0]
+        self._weigh()
+
+    def _weigh(self) -> None:
+        root = np.sqrt(robust_weight(self.white))
+        weighed = blocks_of(self.columns * root)
+        rest = blocks_of(self.white * root)
+        self.by_block = weighed @ np.swapaxes(weighed, 1, 2)
+        self.score_by_block = -np.einsum("bpn,bn->bp", weighed, rest, optimize=True)
+        self.total = self.by_block.sum(axis=0) + np.diag(self.prior)
+        self._rescore()
+
+    def _rescore(self) -> None:
+        pull = np.zeros(len(self.prior))
+        pull[: len(self.places)] = (self.prior[: len(self.places)]) * (
+            self.vector - self.problem.start
+        )[self.places]
+        self.score = self.score_by_block.sum(axis=0) - pull
+        self.cost = cost_of(self.problem, self.vector[None], self.white[None])[0]
+
+    def moved(self, vector: np.ndarray, white: np.ndarray) -> "Outlook":
+        """Return the outlook from a model nearby, with the slopes of this one."""
+        later = copy.copy(self)
+        later.vector, later.white = vector, white
+        root = np.sqrt(robust_weight(white))
+        rest = blocks_of(white * root * root)
+        later.score_by_block = -np.einsum("bpn,bn->bp", blocks_of(self.columns), rest, optimize=True)
+        later._rescore()
+        return later
+
+    def narrowed(self, places: Sequence[int]) -> "Outlook":
+        """Return the outlook along some of the places only."""
+        kept = [self.places.index(place) for place in places]
+        later = copy.copy(self)
+        later.places, later.probes = list(places), []
+        later.prior, later.columns = self.prior[kept], self.columns[kept]
+        later.by_block = self.by_block[:, kept][:, :, kept]
+        later.score_by_block = self.score_by_block[:, kept]
+        later.total, later.score = self.total[np.ix_(kept, kept)], self.score[kept]
+        return later
 
     def column(self, name: str) -> int:
         """Return the column of a parameter."""
@@ -74,6 +108,10 @@ class Outlook:
         if candidate.probe is not None:
             columns.insert(0, len(self.places) + self.probes.index(candidate))
         return columns
+
+    def acting(self, columns: Sequence[int]) -> list[int]:
+        """Return the columns that change anything."""
+        return [column for column in columns if self.total[column, column] > 2.0 * self.prior[column]]
 
     def step(self, columns: Sequence[int]) -> np.ndarray:
         """Return the step along columns that explains most, nothing else moving."""
@@ -97,7 +135,7 @@ class Outlook:
         step = solve(own, score)
         both = np.concatenate([solve(inner, self.score[given]) - share @ step, step])
         columns = given + added
-        blocks = self.sums.score[:, columns] - self.sums.information[:, columns][:, :, columns] @ both
+        blocks = self.score_by_block[:, columns] - self.by_block[:, columns][:, :, columns] @ both
         blocks = blocks[:, len(given) :] - blocks[:, : len(given)] @ share
         whole = np.zeros(len(every))
         whole[[every.index(column) for column in added]] = step
@@ -141,6 +179,12 @@ def prior_information(problem: Problem) -> np.ndarray:
     finite = np.isfinite(problem.high - problem.low)
     width = np.where(finite, problem.high - problem.low, 0.0)
     return 1.0 / np.where(finite, width, 10.0 * problem.scale) ** 2
+
+
+def cost_of(problem: Problem, vectors: np.ndarray, white: np.ndarray) -> np.ndarray:
+    """Return minus twice the log likelihood of models, and what is known beforehand, (count,)."""
+    known = prior_information(problem) * (vectors - problem.start) ** 2
+    return np.array([robust_square(one) for one in white]) + known.sum(axis=1)
 
 
 PROBES = [candidate for candidate in CANDIDATES if candidate.probe is not None]

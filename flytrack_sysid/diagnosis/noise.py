@@ -52,7 +52,6 @@ class Gains(NamedTuple):
 
     keep: jax.Array
     push: jax.Array
-    restart: jax.Array
     direct_d: jax.Array
     direct_e: jax.Array
     direct_size: jax.Array
@@ -61,13 +60,13 @@ class Gains(NamedTuple):
     level_size: jax.Array
 
 
-def make_gains(noise: Noise, step_s: jax.Array, is_joined: jax.Array, counts: jax.Array) -> Gains:
+def make_gains(noise: Noise, step_s: jax.Array, is_known: jax.Array, counts: jax.Array) -> Gains:
     """Return the gains; step_s (rows, lanes) to the row, counts (rows, lanes, NUM_AXES, 2) bool."""
 
     def row(carry: tuple, inputs: tuple) -> tuple:
         var_e, cov, var_d = carry
         dt, joined, counting, keep = inputs
-        dt, joined = dt[:, None], joined[:, None]
+        dt = dt[:, None]
         push = noise.coupling * dt
         stationary = noise.disturbance**2
         later_d = jnp.where(joined, keep**2 * var_d + stationary * (1.0 - keep**2), stationary)
@@ -87,13 +86,12 @@ def make_gains(noise: Noise, step_s: jax.Array, is_joined: jax.Array, counts: ja
         level_d, level_e, level_size = later_cov * inverse, later_e * inverse, size
         carry = later_e - level_e * later_e, later_cov - level_e * later_cov, later_d - level_d * later_cov
         keep, push = jnp.where(joined, keep, 0.0), jnp.where(joined, push, 0.0)
-        restart = jnp.broadcast_to(~joined, keep.shape)
         return carry, Gains(
-            keep, push, restart, direct_d, direct_e, direct_size, level_d, level_e, level_size
+            keep, push, direct_d, direct_e, direct_size, level_d, level_e, level_size
         )
 
     keep = jnp.exp(-step_s[..., None] / noise.tau)
-    by_row = (step_s, is_joined, counts.astype(step_s.dtype), keep)
+    by_row = (step_s, is_known, counts.astype(step_s.dtype), keep)
     nothing = jnp.zeros((step_s.shape[1], NUM_AXES))
     return jax.lax.scan(row, (nothing, nothing, nothing), by_row)[1]
 
@@ -193,11 +191,15 @@ def first_guess(left: np.ndarray, counts: np.ndarray) -> np.ndarray:
 
 def disturbance_gain(lanes: Lanes, left: np.ndarray, sought: np.ndarray) -> np.ndarray:
     """Return by axis how much likelier (minus twice the log) residuals are with the disturbance than without."""
-    given = tuple(jnp.asarray(part) for part in (step_to(lanes), lanes.is_joined, lanes.counts, left))
+    given = tuple(jnp.asarray(part) for part in (step_to(lanes), lanes.is_known, lanes.counts, left))
     still = sought.copy()
     still[3] = np.log(LEAST_SHARE)
-    tell = jax.jit(lambda values: _misfit(values, *given).total)
-    return np.asarray(tell(still)) - np.asarray(tell(sought))
+    return np.asarray(_total(still, *given)) - np.asarray(_total(sought, *given))
+
+
+@jax.jit
+def _total(sought: jax.Array, *given: jax.Array) -> jax.Array:
+    return _misfit(sought, *given).total
 
 
 FIRST_DAMPING, MORE, LESS = 1e-2, 10.0, 0.2
@@ -210,7 +212,7 @@ def fit_noise(lanes: Lanes, left: np.ndarray, start: np.ndarray | None = None) -
 
     Damped scoring (Levenberg, with the expected curvature), every axis by itself.
     """
-    given = tuple(jnp.asarray(part) for part in (step_to(lanes), lanes.is_joined, lanes.counts, left))
+    given = tuple(jnp.asarray(part) for part in (step_to(lanes), lanes.is_known, lanes.counts, left))
     low, high = _bounds()
     best = np.clip(first_guess(left, lanes.counts) if start is None else start, low, high)
     misfit, slopes, curvature = (np.asarray(part) for part in _misfit_and_slopes(best, *given))

@@ -7,15 +7,15 @@ import numpy as np
 from flytrack_env.dynamics import ModelParameters
 from flytrack_sysid.diagnosis import noise as noises
 from flytrack_sysid.diagnosis.lanes import make_lanes
+from flytrack_sysid.diagnosis.linear import Outlook, cost_of
 from flytrack_sysid.diagnosis.problem import Problem
-from flytrack_sysid.diagnosis.refine import cost_of
-from flytrack_sysid.diagnosis.search import MOST_EFFECTS, Found, add_best, base_fit, fitted, full_outlook
 from flytrack_sysid.diagnosis.result import Unexplained
+from flytrack_sysid.diagnosis.search import MOST_EFFECTS, Found, add_best, base_fit, fitted, full_outlook
 from flytrack_sysid.diagnosis.unexplained import look, stand_ins
 from flytrack_sysid.diagnosis.weigh import Weighed, settle, without
 from flytrack_sysid.log import FlightLog
 
-SATURATED_SHARES = np.array([0.0, 1.0, 0.5, 0.25, 0.1])
+SATURATED_SHARES = np.array([0.0, 1.0, 0.5, 0.2])  # of the step to everything at once
 
 
 class Settled(NamedTuple):
@@ -28,14 +28,14 @@ class Settled(NamedTuple):
     rest: Unexplained
 
 
-def saturated(problem: Problem, vector: np.ndarray) -> np.ndarray:
-    """Return the model with every effect at once, one step from a vector, held back by what is known."""
-    outlook = full_outlook(problem, vector)
+def saturated(problem: Problem, outlook: Outlook) -> np.ndarray:
+    """Return what a model leaves with every effect at once, one step away, held back by what is known."""
     places = outlook.places
-    tried = np.repeat(vector[None], len(SATURATED_SHARES), axis=0)
+    tried = np.repeat(outlook.vector[None], len(SATURATED_SHARES), axis=0)
     tried[:, places] += SATURATED_SHARES[:, None] * outlook.step(range(len(places)))
     tried = problem.clipped(tried)
-    return tried[int(np.nanargmin(cost_of(problem, tried)))]
+    left = problem.left(tried)
+    return left[int(np.nanargmin(cost_of(problem, tried, problem.whiten(left))))]
 
 
 def settled(log: FlightLog, judged: np.ndarray, model: ModelParameters) -> Settled:
@@ -44,19 +44,28 @@ def settled(log: FlightLog, judged: np.ndarray, model: ModelParameters) -> Settl
     problem = Problem(lanes, model)
     problem.set_noise(noises.first_guess(problem.left(problem.start[None])[0], lanes.counts))
     base = base_fit(problem)
-    full = saturated(problem, base.vector)
-    problem.set_noise(noises.fit_noise(lanes, problem.left(full[None])[0]))
-    base = found = base_fit(problem)
+    outlook = full_outlook(problem, base.vector)
+    problem.set_noise(noises.fit_noise(lanes, saturated(problem, outlook)))
+    # The slopes are those of nearly the same model, seen through the new noise.
+    outlook = Outlook(problem, outlook.slopes, outlook.probes)
+    base = found = fitted(problem, (), base.vector, outlook)
+    outlook = outlook.moved(found.vector, problem.whiten(problem.left(found.vector[None]))[0])
     while len(found.chosen) < MOST_EFFECTS:
-        more = add_best(problem, found)
+        more = add_best(problem, found, outlook)
         if more is None:
             break
         found = more
+        outlook = full_outlook(problem, found.vector)
     if found.chosen:
-        full = saturated(problem, found.vector)
-        problem.set_noise(noises.fit_noise(lanes, problem.left(full[None])[0], problem.noise))
-        found, base = fitted(problem, found.chosen, found.vector), base_fit(problem)
-    found, weighed = settle(problem, found)
+        problem.set_noise(noises.fit_noise(lanes, saturated(problem, outlook), problem.noise))
+        found, base = fitted(problem, found.chosen, found.vector), fitted(problem, (), base.vector)
+    return _without_stand_ins(problem, base, *settle(problem, found))
+
+
+def _without_stand_ins(
+    problem: Problem, base: Found, found: Found, weighed: dict[str, Weighed]
+) -> Settled:
+    """Return the model without names that something unknown has brought about."""
     while True:
         rest, dependences = look(problem, found, base.vector)
         dropped = stand_ins(problem, found, weighed, rest, dependences) if rest.flagged else []

@@ -1,10 +1,10 @@
 """A log against all that a model could be: residuals, slopes and their sums, over blocks of a second.
 
-One program evaluates 16 models at once, each with every effect of the list; a model without an effect has
+One program evaluates 20 models at once, another four, each with every effect of the list; a model without an effect has
 it at its neutral value. So no set of effects needs a compilation of its own.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
 import jax
@@ -17,7 +17,7 @@ from flytrack_sysid.diagnosis.lanes import LANE_ROWS, LEAD_IN_ROWS, Lanes
 from flytrack_sysid.diagnosis.said import unexplained
 from flytrack_sysid.parameters import TAUS, bounds_of, names_of, to_vector
 
-BATCH = 16
+BATCH, FEW = 20, 4
 BLOCK_ROWS = 100  # a second at 100 Hz: what hangs together at most
 RELATIVE_STEP = 1e-6  # of a parameter's scale, for slopes
 
@@ -36,17 +36,16 @@ def _whitened(left: jax.Array, gains: noises.Gains, counts: jax.Array) -> jax.Ar
 _gains = jax.jit(noises.make_gains)
 
 
-class Sums(NamedTuple):
-    """Products of whitened slopes with each other and with the residual, by block, and its square.
+class Slopes(NamedTuple):
+    """What a model leaves, (rows, lanes, NUM_AXES, 2), and how that changes, (count, ...), before whitening.
 
-    information: (blocks, count, count). score: (blocks, count). square: minus twice the log likelihood,
-    outliers counted by their size. left: whitened residual, (rows, lanes, NUM_AXES, 2).
+    places: of the first columns; ways to other vectors follow.
     """
 
-    information: np.ndarray
-    score: np.ndarray
-    square: float
+    vector: np.ndarray
     left: np.ndarray
+    places: tuple[int, ...]
+    columns: np.ndarray
 
 
 class Problem:
@@ -71,55 +70,48 @@ class Problem:
         """Weigh from now on with this noise, (6, NUM_AXES)."""
         self.noise = sought
         step_s = noises.step_to(self.lanes)
-        self.gains = _gains(noises.noise_of(sought), step_s, self.lanes.is_joined, self.counts)
+        self.gains = _gains(noises.noise_of(sought), step_s, self.lanes.is_known, self.counts)
 
-    def left(self, vectors: np.ndarray) -> jax.Array:
+    def left(self, vectors: np.ndarray) -> np.ndarray:
         """Return what models (count, parameters) leave, (count, rows, lanes, NUM_AXES, 2)."""
-        parts = []
-        for begin in range(0, len(vectors), BATCH):
-            part = vectors[begin : begin + BATCH]
-            filled = np.concatenate([part, np.repeat(part[-1:], BATCH - len(part), axis=0)])
-            parts.append(np.asarray(_left(filled, self.like, self.lanes))[: len(part)])
-        return np.concatenate(parts)
-
-    def whitened(self, vectors: np.ndarray) -> np.ndarray:
-        """Return innovations of models, (count, rows, lanes, NUM_AXES, 2)."""
-        parts = []
-        for begin in range(0, len(vectors), BATCH):
-            part = vectors[begin : begin + BATCH]
-            filled = np.concatenate([part, np.repeat(part[-1:], BATCH - len(part), axis=0)])
-            left = _left(filled, self.like, self.lanes)
-            parts.append(np.asarray(_whitened(left, self.gains, self.counts))[: len(part)])
-        return np.concatenate(parts)
+        return self._in_batches(lambda part: _left(part, self.like, self.lanes), vectors)
 
     def whiten(self, left: np.ndarray) -> np.ndarray:
-        """Return residuals (BATCH, rows, lanes, NUM_AXES, 2) as innovations."""
-        return np.asarray(_whitened(left, self.gains, self.counts))
+        """Return residuals (count, rows, lanes, NUM_AXES, 2) as innovations."""
+        return self._in_batches(lambda part: _whitened(part, self.gains, self.counts), left)
+
+    @staticmethod
+    def _in_batches(tell: Callable[[np.ndarray], jax.Array], values: np.ndarray) -> np.ndarray:
+        """Return what a program of fixed batch says of values, (count, ...)."""
+        size = FEW if len(values) <= FEW else BATCH
+        parts = []
+        for begin in range(0, len(values), size):
+            part = values[begin : begin + size]
+            filled = np.concatenate([part, np.repeat(part[-1:], size - len(part), axis=0)])
+            parts.append(np.asarray(tell(filled))[: len(part)])
+        return np.concatenate(parts)
 
     def clipped(self, vectors: np.ndarray) -> np.ndarray:
         """Return vectors within bounds."""
         return np.clip(vectors, self.low, self.high)
 
-    def squares(self, vectors: np.ndarray) -> np.ndarray:
-        """Return minus twice the log likelihood of models, (count,), without what is constant."""
-        return np.array([robust_square(one) for one in self.whitened(vectors)])
-
     def slopes(
-        self, vector: np.ndarray, places: Sequence[int], others: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Return innovations at a vector, their slopes along places, and the way to other vectors.
+        self, vector: np.ndarray, places: Sequence[int], others: np.ndarray | None = None
+    ) -> "Slopes":
+        """Return what a model leaves, its slopes along places, and the way to other vectors.
 
-        Slopes are (len(places) + len(others), rows, lanes, NUM_AXES, 2). One-sided differences, into the
-        bounds: what an effect does may begin at its neutral value.
+        One-sided differences, into the bounds: what an effect does may begin at its neutral value.
         """
-        step = RELATIVE_STEP * self.scale[list(places)]
-        step = np.where(vector[list(places)] + step > self.high[list(places)], -step, step)
+        places = list(places)
+        step = RELATIVE_STEP * self.scale[places]
+        step = np.where(vector[places] + step > self.high[places], -step, step)
         moved = np.repeat(vector[None], len(places), axis=0)
         moved[np.arange(len(places)), places] += step
-        found = self.whitened(np.concatenate([vector[None], moved, others]))
+        others = np.zeros((0, len(vector))) if others is None else others
+        found = self.left(np.concatenate([vector[None], moved, others]))
         away = found[1:] - found[0]
         away[: len(places)] /= step[:, None, None, None, None]
-        return found[0], away
+        return Slopes(vector, found[0], tuple(places), away)
 
     def index(self, names: Sequence[str]) -> list[int]:
         """Return the places of parameters in the vector."""
@@ -157,13 +149,3 @@ def blocks_of(values: np.ndarray) -> np.ndarray:
     pieces, lanes = LANE_ROWS // BLOCK_ROWS, kept.shape[-3]
     split = kept.reshape(*kept.shape[:-4], pieces, BLOCK_ROWS, lanes, -1)
     return np.moveaxis(split, (-4, -2), (0, 1)).reshape(pieces * lanes, *kept.shape[:-4], -1)
-
-
-def sums_of(left: np.ndarray, slopes: np.ndarray) -> Sums:
-    """Return the sums that every linear fit needs; ``left`` as a residual falls along ``-slopes``."""
-    root = np.sqrt(robust_weight(left))
-
-    of_slopes, of_left = blocks_of(slopes * root), blocks_of(left * root)
-    information = of_slopes @ np.swapaxes(of_slopes, 1, 2)
-    score = -np.einsum("bpn,bn->bp", of_slopes, of_left)
-    return Sums(information, score, robust_square(left), left)

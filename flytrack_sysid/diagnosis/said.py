@@ -20,7 +20,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from flytrack_env.dynamics import ModelParameters, advance, integrate_attitude, read_sensors
+from flytrack_env.dynamics import ModelParameters, Reading, advance, read_sensors
 from flytrack_env.effects import start_memories
 from flytrack_env.quaternion import Quaternion, Vec3
 from flytrack_env.state import Action, Drone
@@ -45,23 +45,6 @@ def _chosen(condition: jax.Array, yes: Any, no: Any) -> Any:
     return jax.tree.map(partial(jnp.where, condition), yes, no)
 
 
-def _carried(model: ModelParameters, lane: Record) -> tuple:
-    """Return applied action, body rates and memories at every row of a lane."""
-
-    def next_row(carry: tuple, row: Record) -> tuple:
-        applied, rates_b, memories = carry
-        applied = _chosen(row.begins | row.is_applied_known, Action(*row.applied), applied)
-        drone = _drone(row, applied, rates_b)
-        memories = _chosen(row.begins, start_memories(model.effects, drone), memories)
-        after, later = advance(drone, memories, Action(*row.command), row.step_s, model)
-        return (after.applied, after.rates_b, later), (applied, rates_b, memories)
-
-    first = jax.tree.map(lambda column: column[0], lane)
-    drone = _drone(first, Action(*first.applied), Vec3(*jnp.zeros_like(first.vel_w)))
-    start = (drone.applied, drone.rates_b, start_memories(model.effects, drone))
-    return jax.lax.scan(next_row, start, lane)[1]
-
-
 def _turn(measured: Quaternion, said: Quaternion) -> Vec3:
     """Return the small world-frame rotation from what is said to what was measured, rad."""
     conjugate = Quaternion(said.w, -said.x, -said.y, -said.z)
@@ -71,13 +54,9 @@ def _turn(measured: Quaternion, said: Quaternion) -> Vec3:
 
 
 def _of_step(
-    model: ModelParameters, row: Record, carried: tuple, next_row: Record, sensed: dict[str, jax.Array]
+    row: Record, next_row: Record, drone: Drone, after: Drone, read: Reading, sensed: dict[str, jax.Array]
 ) -> jax.Array:
     """Return the residuals of the row after one step, (NUM_AXES, 2); 0 for channels that are absent."""
-    applied, rates_b, memories = carried
-    drone = _drone(row, applied, rates_b)
-    after, later = advance(drone, memories, Action(*row.command), row.step_s, model)
-    read = read_sensors(drone, after, later, row.step_s, model)
     axes = drone.quat.axes()
 
     def to_world(vector_b: Vec3) -> Vec3:
@@ -85,7 +64,7 @@ def _of_step(
 
     nothing = Vec3(0.0, 0.0, 0.0)
     spun = to_world(Vec3(*sensed["w"]) - read.rates_b) if "w" in sensed else nothing
-    turned = _turn(Quaternion(*next_row.quat), integrate_attitude(drone.quat, after.rates_b, row.step_s))
+    turned = _turn(Quaternion(*next_row.quat), after.quat)
     pushed = to_world(Vec3(*sensed["f"]) - read.force_b) if "f" in sensed else nothing
     moved = Vec3(*next_row.vel_w) - drone.vel_w - after.acc_w.scale(row.step_s)
     drained = next_row.battery_v - after.battery_v
@@ -93,11 +72,25 @@ def _of_step(
 
 
 def _of_lane(model: ModelParameters, lane: Record, sensed: dict[str, jax.Array]) -> jax.Array:
-    carried = _carried(model, lane)
-    rows = jax.tree.map(lambda leaf: leaf[:-1], (lane, carried))
-    later = jax.tree.map(lambda leaf: leaf[1:], (lane, sensed))
-    found = jax.vmap(lambda before, after: _of_step(model, *before, *after))(rows, later)
-    # Of the first row of a lane nothing is said.
+    """Return the residuals of a lane's rows, step after step; of its first row nothing is said."""
+    rows = jax.tree.map(lambda leaf: leaf[:-1], lane)
+    later, sensed = jax.tree.map(lambda leaf: leaf[1:], (lane, sensed))
+
+    def step(carry: tuple, inputs: tuple) -> tuple:
+        row, next_row, sensed = inputs
+        applied, rates_b, memories = carry
+        applied = _chosen(row.begins | row.is_applied_known, Action(*row.applied), applied)
+        drone = _drone(row, applied, rates_b)
+        memories = _chosen(row.begins, start_memories(model.effects, drone), memories)
+        after, memories = advance(drone, memories, Action(*row.command), row.step_s, model)
+        read = read_sensors(drone, after, memories, row.step_s, model)
+        found = _of_step(row, next_row, drone, after, read, sensed)
+        return (after.applied, after.rates_b, memories), found
+
+    first = jax.tree.map(lambda column: column[0], lane)
+    drone = _drone(first, Action(*first.applied), Vec3(*jnp.zeros_like(first.vel_w)))
+    start = (drone.applied, drone.rates_b, start_memories(model.effects, drone))
+    found = jax.lax.scan(step, start, (rows, later, sensed))[1]
     return jnp.concatenate([jnp.zeros_like(found[:1]), found])
 
 

@@ -16,6 +16,7 @@ PER_PARAMETER = 4.0  # of chi2: what one more parameter has to gain to be prefer
 MOST_EFFECTS = 6
 CLOSE = 0.6  # of the best gain: who comes so near to first order is refitted before one is chosen
 MOST_REFITTED = 4
+PROMISING = 0.7  # of the threshold, to first order
 
 
 class Found(NamedTuple):
@@ -43,10 +44,12 @@ def free_places(problem: Problem) -> list[int]:
     return base_places(problem) + effects
 
 
-def fitted(problem: Problem, chosen: Sequence[Candidate], vector: np.ndarray, rounds: int = 6) -> Found:
+def fitted(
+    problem: Problem, chosen: Sequence[Candidate], vector: np.ndarray, nearby: Outlook | None = None
+) -> Found:
     """Return the model with these effects that fits best, from a vector."""
     places = places_of(problem, chosen)
-    vector, cost = refine(problem, vector, places, rounds)
+    vector, cost = refine(problem, vector, places, nearby)
     return Found(tuple(chosen), vector, cost, tuple(places))
 
 
@@ -86,7 +89,8 @@ def scores(problem: Problem, outlook: Outlook, found: Found) -> list[Scored]:
 
 def full_outlook(problem: Problem, vector: np.ndarray) -> Outlook:
     """Return the outlook along everything."""
-    return Outlook(problem, vector, free_places(problem), PROBES)
+    others = np.array([opened(problem, vector, probe) for probe in PROBES])
+    return Outlook(problem, problem.slopes(vector, free_places(problem), others), PROBES)
 
 
 def begun(problem: Problem, outlook: Outlook, found: Found, scored: Scored) -> np.ndarray:
@@ -97,18 +101,16 @@ def begun(problem: Problem, outlook: Outlook, found: Found, scored: Scored) -> n
     return problem.clipped(vector[None])[0]
 
 
-def add_best(problem: Problem, found: Found) -> Found | None:
+def add_best(problem: Problem, found: Found, outlook: Outlook) -> Found | None:
     """Return the model with the effect added that explains most; None where none explains enough."""
-    outlook = full_outlook(problem, found.vector)
     ranked = scores(problem, outlook, found)
-    if not ranked:
-        return None
     near = [one for one in ranked[:MOST_REFITTED] if one.merit > CLOSE * ranked[0].merit]
-    near = [one for one in near if one.gain.robust > 0.7 * threshold(one.gain.count)]
     tried = []
     for one in near:
-        vector = begun(problem, outlook, found, one)
-        trial = fitted(problem, (*found.chosen, one.candidate), vector, rounds=4)
+        if one.gain.robust < PROMISING * threshold(one.gain.count):
+            continue
+        chosen = (*found.chosen, one.candidate)
+        trial = fitted(problem, chosen, begun(problem, outlook, found, one), outlook)
         gain = (found.cost - trial.cost) / one.gain.inflation
         if gain > threshold(one.gain.count):
             tried.append((gain - PER_PARAMETER * one.gain.count, trial))

@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from scipy import stats
+from scipy import ndimage, stats
 
 from flytrack_sysid.diagnosis import noise as noises
 from flytrack_sysid.diagnosis.lanes import LEAD_IN_ROWS
@@ -47,12 +47,18 @@ def _whitened(problem: Problem, features_w: np.ndarray, side: str) -> np.ndarray
     found = []
     for begin in range(0, len(features_w), BATCH):
         part = features_w[begin : begin + BATCH]
-        left = np.zeros((BATCH, *features_w.shape[1:3], noises.NUM_AXES, 2))
-        left[: len(part), ..., SIDES[side], 0] = part
-        left[: len(part), ..., SIDES[side], 1] = part * step_s
+        left = np.zeros((*part.shape[:3], noises.NUM_AXES, 2))
+        left[..., SIDES[side], 0] = part
+        left[..., SIDES[side], 1] = part * step_s
         left *= problem.lanes.is_joined[..., None, None]
-        found.append(problem.whiten(left)[: len(part), ..., SIDES[side], :])
+        found.append(problem.whiten(left)[..., SIDES[side], :])
     return np.concatenate(found)
+
+
+def _seen(problem: Problem, found: Found) -> tuple[np.ndarray, np.ndarray]:
+    """Return what a model leaves, and its slopes along what is free, whitened."""
+    slopes = problem.slopes(found.vector, found.places)
+    return problem.whiten(slopes.left[None])[0], problem.whiten(slopes.columns)
 
 
 class _Side:
@@ -126,7 +132,7 @@ def depends_on(
     flight = flown(
         problem.lanes, found.vector[problem.index(("tau_roll", "tau_pitch", "tau_yaw", "tau_thrust"))]
     )
-    left, slopes = problem.slopes(found.vector, list(found.places), np.zeros((0, len(found.vector))))
+    left, slopes = _seen(problem, found)
     features = dependences(flight)
     noise = noises.noise_of(problem.noise)
     result = []
@@ -196,9 +202,7 @@ def lines(problem: Problem, found: Found) -> list[tuple[str, float, float]]:
         step_s = float(np.median(noises.step_to(problem.lanes)))
         power = (np.abs(np.fft.rfft(series, axis=0)) ** 2).max(axis=1)
         frequency = np.fft.rfftfreq(len(series), step_s)
-        usual = np.array(
-            [np.median(power[max(k - NEIGHBOURS, 1) : k + NEIGHBOURS]) for k in range(len(power))]
-        )
+        usual = ndimage.median_filter(power, 2 * NEIGHBOURS + 1, mode="nearest")
         inside = (frequency > PERIODIC_HZ[0]) & (frequency < PERIODIC_HZ[1])
         ratio = np.where(inside, power / np.maximum(usual, 1e-300), 0.0)
         peak = int(np.argmax(ratio))
@@ -249,7 +253,7 @@ def stand_ins(
     Their gain is gone beside smooth functions of what the rest depends on (with the constants of those,
     which a wind, say, would be), or is small where something unknown disturbs the same side.
     """
-    left, slopes = problem.slopes(found.vector, list(found.places), np.zeros((0, len(found.vector))))
+    left, slopes = _seen(problem, found)
     flight = flown(problem.lanes, np.full(4, 0.03))
     disturbed = {name.split(":")[0] for name in rest.shares}
     result = []

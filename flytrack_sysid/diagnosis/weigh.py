@@ -5,6 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from flytrack_sysid.diagnosis.candidates import CANDIDATES
 from flytrack_sysid.diagnosis.linear import Outlook, solve
 from flytrack_sysid.diagnosis.problem import Problem
 from flytrack_sysid.diagnosis.search import (
@@ -31,7 +32,7 @@ class Weighed(NamedTuple):
     gain: of chi2 over the model without it, refitted. inflation: of that gain's variance. count: of its
     parameters, those that the log says something of. rivals: effect ->
     how much worse the model is with that one instead, of chi2; the better ones are refitted.
-    swaps: models with the rival in the effect's place, refitted.
+    swaps: models with the rival in the effect's place, refitted. less: the model without the effect.
     """
 
     gain: float
@@ -39,6 +40,7 @@ class Weighed(NamedTuple):
     count: int
     rivals: Mapping[str, float]
     swaps: Mapping[str, Found]
+    less: Found
 
     @property
     def robust(self) -> float:
@@ -53,11 +55,11 @@ def without(problem: Problem, found: Found, effect: str) -> Found:
         if one.effect == effect:
             vector[problem.index(one.fields)] = [neutral_value(field) for field in one.fields]
     chosen = tuple(one for one in found.chosen if one.effect != effect)
-    return fitted(problem, chosen, vector, rounds=6)
+    return fitted(problem, chosen, vector)
 
 
 def weigh(problem: Problem, found: Found, outlook: Outlook, effect: str) -> Weighed:
-    """Return what an effect of a model is worth; outlook: of the model, along all its places."""
+    """Return what an effect of a model is worth; outlook: of the model, along its places."""
     less = without(problem, found, effect)
     seen = full_outlook(problem, less.vector)
     own = next(one for one in found.chosen if one.effect == effect)
@@ -72,11 +74,12 @@ def weigh(problem: Problem, found: Found, outlook: Outlook, effect: str) -> Weig
             swap = _swapped(problem, less, seen, one)
             rivals[one.candidate.effect] = swap.cost - found.cost
             swaps[one.candidate.effect] = swap
-    return Weighed(gain, *_inflation(outlook, found, own.fields), rivals, swaps)
+    return Weighed(gain, *_inflation(outlook, found, own.fields), rivals, swaps, less)
 
 
 def _swapped(problem: Problem, less: Found, seen: Outlook, rival: Scored) -> Found:
-    return fitted(problem, (*less.chosen, rival.candidate), begun(problem, seen, less, rival), rounds=5)
+    chosen = (*less.chosen, rival.candidate)
+    return fitted(problem, chosen, begun(problem, seen, less, rival), seen)
 
 
 def _inflation(outlook: Outlook, found: Found, fields: tuple[str, ...]) -> tuple[float, int]:
@@ -90,7 +93,7 @@ def _inflation(outlook: Outlook, found: Found, fields: tuple[str, ...]) -> tuple
 def settle(problem: Problem, found: Found) -> tuple[Found, dict[str, Weighed]]:
     """Return the model without effects that it does not need, and with better ones in their place."""
     while True:
-        outlook = full_outlook(problem, found.vector)
+        outlook = Outlook(problem, problem.slopes(found.vector, found.places))
         weighed = {one.effect: weigh(problem, found, outlook, one.effect) for one in found.chosen}
         short = {one.effect: weighed[one.effect].robust - threshold(len(one.fields)) for one in found.chosen}
         if short and min(short.values()) < 0.0:
@@ -135,10 +138,8 @@ def separations(
 
     present = {one.effect for one in found.chosen}
     rivals: dict[str, float] = {}
-    from flytrack_sysid.diagnosis.candidates import CANDIDATES
-
     for candidate in CANDIDATES:
         if candidate.effect not in present:
-            left = beside(given + outlook.columns_of(candidate))
+            left = beside(given + outlook.acting(outlook.columns_of(candidate)))
             rivals[candidate.effect] = min(left, rivals.get(candidate.effect, np.inf))
     return beside(given), rivals

@@ -1,0 +1,189 @@
+"""Names for what a settled model has beyond the nominal one: effects, and base parameters that differ."""
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from flytrack_sysid.diagnosis import noise as noises
+from flytrack_sysid.diagnosis.lanes import SIZES
+from flytrack_sysid.diagnosis.linear import Outlook, inflation_of, solve
+from flytrack_sysid.diagnosis.problem import Problem
+from flytrack_sysid.diagnosis.result import Cause, Estimated
+from flytrack_sysid.diagnosis.search import Found, threshold
+from flytrack_sysid.diagnosis.weigh import SAME, Weighed, separations
+from flytrack_sysid.parameters import DRAIN, TAUS, THRUST_COEFFS, unit_of
+
+TWO_SIDED_95 = 1.959964
+# What a base parameter that differs is called.
+BASE_CAUSES = {**{name: (name,) for name in TAUS}, "thrust_curve": THRUST_COEFFS, "battery_drain": (DRAIN,)}
+CHANNELS = (("rates", "attitude"), ("force", "velocity"), (None, "battery"))
+LOOSE = 0.25  # of what was known beforehand: a parameter known no better is not determined by the log
+# Equal but for a name: mass, payload, battery and motors all scale the thrust over the mass.
+SCALE_TWINS = ("thrust_curve",)
+
+
+class Covered:
+    """Information about some free parameters of a model, all others fitted along with them."""
+
+    def __init__(self, outlook: Outlook, found: Found, fields: Sequence[str]):
+        self.columns = [outlook.column(field) for field in fields]
+        given = [outlook.places.index(place) for place in found.places]
+        given = [column for column in given if column not in self.columns]
+        across = outlook.total[np.ix_(given, self.columns)]
+        share = solve(outlook.total[np.ix_(given, given)], across)
+        self.information = outlook.total[np.ix_(self.columns, self.columns)] - across.T @ share
+        blocks = outlook.score_by_block
+        self.inflation = inflation_of(self.information, blocks[:, self.columns] - blocks[:, given] @ share)
+
+    def deviations(self) -> np.ndarray:
+        """Return standard deviations, inflated."""
+        return np.sqrt(np.diag(solve(self.information, np.eye(len(self.information)))) * self.inflation)
+
+
+def estimates(
+    problem: Problem, outlook: Outlook, found: Found, fields: Sequence[str]
+) -> dict[str, Estimated]:
+    """Return values and 95 % intervals of parameters that the log determines, by name without the effect."""
+    deviations = Covered(outlook, found, fields).deviations()
+    result = {}
+    for field, deviation in zip(fields, deviations, strict=True):
+        place = problem.names.index(field)
+        value, half = float(found.vector[place]), TWO_SIDED_95 * float(deviation)
+        width = problem.high[place] - problem.low[place]
+        if "." in field and deviation > LOOSE * width:
+            continue
+        result[field.split(".")[-1]] = Estimated(value, (value - half, value + half), unit_of(field))
+    return result
+
+
+def channel_of(problem: Problem, less: np.ndarray, full: np.ndarray) -> str:
+    """Return the channel in which two models differ most, by what the log says of each."""
+    white = problem.whiten(problem.left(np.stack([less, full])))
+    by_axis = np.square(white[1] - white[0]).sum(axis=(0, 1))
+    edges = np.cumsum([0, *SIZES])
+    power = {
+        CHANNELS[side][channel]: by_axis[edges[side] : edges[side + 1], channel].sum()
+        for side in range(len(SIZES))
+        for channel in range(2)
+        if CHANNELS[side][channel] is not None
+    }
+    return max(power, key=power.get)
+
+
+def held_out_gain(held_out: Problem, less: np.ndarray, full: np.ndarray) -> tuple[float, float]:
+    """Return what a model gains over a lesser one on other rows, and what it would if it were right there."""
+    white = held_out.whiten(held_out.left(np.stack([less, full])))
+    gain = float(np.sum(white[0] ** 2) - np.sum(white[1] ** 2))
+    return gain, float(np.sum((white[0] - white[1]) ** 2))
+
+
+def effect_causes(
+    problem: Problem,
+    held_out: Problem,
+    outlook: Outlook,
+    found: Found,
+    weighed: Mapping[str, Weighed],
+) -> list[Cause]:
+    """Return the effects of a model as causes, those that explain most first."""
+    causes = []
+    for one in found.chosen:
+        weight = weighed[one.effect]
+        lambda_, beside = separations(problem, outlook, found, one.effect)
+        twins = tuple(
+            rival
+            for rival, worse in sorted(weight.rivals.items(), key=lambda pair: pair[1])
+            if worse < SAME and rival in weight.swaps
+        )
+        closest = min(weight.rivals, key=weight.rivals.get, default="")
+        causes.append(
+            Cause(
+                effect=one.effect,
+                equivalent=twins,
+                channel=channel_of(problem, weight.less.vector, found.vector),
+                parameters=estimates(problem, outlook, found, one.fields),
+                chi2_gain=weight.gain,
+                heldout_gain=held_out_gain(held_out, weight.less.vector, found.vector)[0],
+                lambda_=lambda_,
+                lambda_sep=max(min([weight.rivals.get(closest, lambda_), *beside.values()]), 0.0),
+                closest=closest,
+            )
+        )
+    return sorted(causes, key=lambda cause: -cause.chi2_gain)
+
+
+def base_causes(problem: Problem, held_out: Problem, outlook: Outlook, found: Found) -> list[Cause]:
+    """Return base parameters that the log contradicts, as causes."""
+    causes = []
+    for name, fields in BASE_CAUSES.items():
+        acting = [field for field in fields if outlook.acting([outlook.column(field)])]
+        if not acting:
+            continue
+        places = problem.index(acting)
+        covered = Covered(outlook, found, acting)
+        change = found.vector[places] - problem.start[places]
+        gain = float(change @ covered.information @ change)
+        if gain / covered.inflation < threshold(len(acting)):
+            continue
+        nominal = found.vector.copy()
+        nominal[places] = problem.start[places]
+        own = name, estimates(problem, outlook, found, acting)
+        scaled = _as_scale(problem.start[places], found.vector[places], covered)
+        if name == "thrust_curve" and scaled is not None:
+            own = "thrust_scale", {"factor": scaled}
+        causes.append(
+            Cause(
+                effect=own[0],
+                equivalent=SCALE_TWINS if own[0] == "thrust_scale" else (),
+                channel=channel_of(problem, nominal, found.vector),
+                parameters=own[1],
+                chi2_gain=gain,
+                heldout_gain=_refitted_gain(held_out, problem, outlook, found, places, nominal),
+                lambda_=gain,
+                lambda_sep=gain,
+            )
+        )
+    return sorted(causes, key=lambda cause: -cause.chi2_gain)
+
+
+def _refitted_gain(
+    held_out: Problem,
+    problem: Problem,
+    outlook: Outlook,
+    found: Found,
+    places: Sequence[int],
+    nominal: np.ndarray,
+) -> float:
+    """Return the held-out gain over the model with some parameters at nominal and the rest fitted again."""
+    others = [place for place in found.places if place not in set(places)]
+    columns = [outlook.places.index(place) for place in others]
+    own = [outlook.places.index(place) for place in places]
+    change = nominal[list(places)] - found.vector[list(places)]
+    score = outlook.score[columns] - outlook.total[np.ix_(columns, own)] @ change
+    less = nominal.copy()
+    less[others] += solve(outlook.total[np.ix_(columns, columns)], score)
+    return held_out_gain(held_out, problem.clipped(less[None])[0], found.vector)[0]
+
+
+def _as_scale(nominal: np.ndarray, values: np.ndarray, covered: Covered) -> Estimated | None:
+    """Return the factor between two thrust curves, if one explains all that the log says of them."""
+    along = nominal @ covered.information
+    known = float(along @ nominal)
+    factor = float(along @ values) / known
+    rest = values - factor * nominal
+    if rest @ covered.information @ rest / covered.inflation > threshold(len(values) - 1):
+        return None
+    half = TWO_SIDED_95 * np.sqrt(covered.inflation / known)
+    return Estimated(factor, (factor - half, factor + half), "1")
+
+
+def sensor_noise(problem: Problem) -> dict[str, list[float]]:
+    """Return the standard deviations of the sensors as found, by channel and axis (world frame)."""
+    noise = noises.noise_of(problem.noise)
+    edges = np.cumsum([0, *SIZES])
+    found = {}
+    for side, names in enumerate(CHANNELS):
+        for name, values in zip(names, (noise.direct, noise.level), strict=True):
+            if name is not None:
+                own = np.asarray(values)[edges[side] : edges[side + 1]]
+                found[name] = [float(f"{value:.4g}") for value in own]
+    return found
