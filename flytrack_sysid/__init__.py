@@ -1,6 +1,7 @@
 """Identification of a plant: fly an excitation on it, fit a model, say how good it is and what is left."""
 
 from flytrack_sysid.collect import CollectError, collect
+from flytrack_sysid.diagnosis import Diagnosis, DiagnosisError, diagnose
 from flytrack_sysid.estimate import FitError
 from flytrack_sysid.fit import Fit, fit
 from flytrack_sysid.importing import Imported, import_log
@@ -11,6 +12,8 @@ from flytrack_sysid.validate import Validation, validate
 
 __all__ = [
     "CollectError",
+    "Diagnosis",
+    "DiagnosisError",
     "Fit",
     "FitError",
     "FlightLog",
@@ -18,6 +21,7 @@ __all__ = [
     "LogError",
     "Validation",
     "collect",
+    "diagnose",
     "fit",
     "held_out_rows",
     "import_log",

@@ -1,4 +1,4 @@
-"""The command ``flytrack-sysid``: collect, import, fit, validate; thin skins over the package's functions."""
+"""The command ``flytrack-sysid``: collect, import, fit, validate, diagnose; thin skins over the package's functions."""
 
 import argparse
 import importlib
@@ -7,11 +7,14 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from tqdm import tqdm
 
 from flytrack_env import blackbox, load_model, load_provenance, save_model
 from flytrack_env.model_file import ModelFileError
 from flytrack_sysid.collect import CollectError, collect
+from flytrack_sysid.diagnosis import diagnose, joined, write_diagnosis
+from flytrack_sysid.diagnosis import text_of as text_of_diagnosis
 from flytrack_sysid.fit import fit
 from flytrack_sysid.importing import FORMATS, import_log
 from flytrack_sysid.log import FlightLog
@@ -166,6 +169,20 @@ def run_validate(arguments: argparse.Namespace) -> None:
     print(f"written: {', '.join(str(path) for path in written)}")
 
 
+def run_diagnose(arguments: argparse.Namespace) -> None:
+    """Say what a model gets wrong about flights, and write the report and the extended model."""
+    learnt, judged = ([load_log(path) for path in paths] for paths in (arguments.logs, arguments.hold_out))
+    log = joined([*learnt, *judged])
+    check_plausible(log)
+    count = sum(len(one) for one in learnt)
+    held_out = np.arange(len(log)) >= count if judged else None
+    model = None if arguments.model is None else load_model(arguments.model)
+    found = diagnose(log, model, held_out, _Bar("stages"))
+    written = write_diagnosis(arguments.out, found, log)
+    print(text_of_diagnosis(found))
+    print(f"written: {', '.join(str(path) for path in written)}")
+
+
 def make_parser() -> argparse.ArgumentParser:
     """Return the parser of the command."""
     parser = argparse.ArgumentParser(prog="flytrack-sysid", description=__doc__)
@@ -203,6 +220,14 @@ def make_parser() -> argparse.ArgumentParser:
     one.add_argument("log", type=Path)
     one.add_argument("--out", type=Path, required=True, help="a folder for the report")
     one.set_defaults(run=run_validate)
+
+    one = commands.add_parser("diagnose", help="name what a model gets wrong about flights")
+    one.add_argument("logs", type=Path, nargs="+", metavar="LOG")
+    one.add_argument("--model", help="what is held against the logs, .json; default: the nominal model")
+    hold_out = one.add_argument("--hold-out", type=Path, nargs="+", default=[], metavar="LOG")
+    hold_out.help = "logs to judge by and not to learn from; default: the last of every four blocks"
+    one.add_argument("--out", type=Path, required=True, help="a folder for the report")
+    one.set_defaults(run=run_diagnose)
     return parser
 
 

@@ -116,7 +116,7 @@ def test_stick_curves_at_rest(stick):
     applied = (stick, 0.0, 0.0, 0.0)
     expo = flown(RateExpo(0.4), held(1, roll=stick), applied=applied)[0, 13]
     assert expo == pytest.approx(FULL_STICK * (0.6 * stick + 0.4 * stick**3), rel=1e-5)
-    saturated = flown(RateSaturation(0.4), held(1, roll=stick), applied=applied)[0, 13]
+    saturated = flown(RateSaturation(0.4, 0.0), held(1, roll=stick), applied=applied)[0, 13]
     assert saturated == pytest.approx(FULL_STICK * np.clip(stick, -0.6, 0.6), rel=1e-5)
 
 

@@ -14,7 +14,7 @@ class RateSaturation(NamedTuple):
     """Share of full stick, at its end, that turns no faster, 1, and how gradually, 0 (a corner) to 1."""
 
     lost: Scalar = 0.0
-    softness: Scalar = 0.0
+    softness: Scalar = 0.5
 
 
 def _rates(limit: RateSaturation, memory: None, rates_b: Vec3, flight: Flight) -> Vec3:

@@ -27,9 +27,11 @@ def _scales(problem: Problem, vector: np.ndarray) -> np.ndarray:
     """
     still = vector.copy()
     for name in problem.names:
-        if name.startswith("max_rate_") or name == "battery_drain_v_per_min":
-            still[problem.names.index(name)] = 0.0
-        elif name in ("c0", "c1", "c2", "c3", "c4", "c5"):
+        if (
+            name.startswith("max_rate_")
+            or name == "battery_drain_v_per_min"
+            or name in ("c0", "c1", "c2", "c3", "c4", "c5")
+        ):
             still[problem.names.index(name)] = 0.0
     left = problem.left(still[None])[0]
     return _rms(left, problem.counts, is_centred=True)

@@ -39,6 +39,7 @@ class Lanes(NamedTuple):
     is_joined: np.ndarray
     is_known: np.ndarray
     row: np.ndarray
+    quanta: np.ndarray
 
 
 def _index(num_rows: int) -> np.ndarray:
@@ -60,6 +61,18 @@ def measured_of(log: FlightLog, record: Record, gravity: float) -> dict[str, np.
     if "q" not in log:  # nothing in the world frame can be compared
         found = {name: values for name, values in found.items() if name != "v"}
     return found
+
+
+def _quanta(found: dict[str, np.ndarray]) -> np.ndarray:
+    """Return the smallest change of each measured channel, (2, NUM_AXES); 0 for attitude."""
+
+    def smallest(name: str | None) -> float:
+        if name not in found or name == "q":
+            return 0.0
+        steps = np.diff(np.unique(found[name]))
+        return float(steps.min()) if len(steps) else 0.0
+
+    return np.array([np.repeat([smallest(name) for name in names], SIZES) for names in (DIRECT, LEVEL)])
 
 
 def _counting(name: str | None, size: int, allowed: dict, found: dict, index: np.ndarray) -> np.ndarray:
@@ -107,6 +120,8 @@ def make_lanes(log: FlightLog, judged: np.ndarray, tau: np.ndarray, gravity: flo
     record = Record(*(leaf[index] for leaf in record))
     begins = record.begins | (np.arange(len(index)) == 0)[:, None] | (index < 0)
     certain = zip((turns, lifts, np.ones_like(turns)), SIZES, strict=True)
-    known = np.concatenate([np.repeat(one[index][..., None], size, axis=-1) for one, size in certain], axis=-1)
+    known = np.concatenate(
+        [np.repeat(one[index][..., None], size, axis=-1) for one, size in certain], axis=-1
+    )
     known &= ~begins[..., None]
-    return Lanes(record._replace(begins=begins), sensed, counts, ~begins, known, index)
+    return Lanes(record._replace(begins=begins), sensed, counts, ~begins, known, index, _quanta(found))

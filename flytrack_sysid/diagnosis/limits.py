@@ -46,9 +46,8 @@ class Seen:
         fields = [field for field in way.fields if field.split(".")[1] not in shapes]
         if way.probe is not None:  # its column comes first
             fields = [way.probe[0], *(field for field in fields if field != way.probe[0])]
-            others = [field for field in fields[1:]]
             self.columns = [len(outlook.places) + outlook.probes.index(way)]
-            self.columns += [outlook.column(field) for field in others]
+            self.columns += [outlook.column(field) for field in fields[1:]]
         else:
             self.columns = [outlook.column(field) for field in fields]
         self.fields = fields
@@ -67,7 +66,9 @@ class Seen:
         return found
 
 
-def unseen(problem: Problem, outlook: Outlook, found: Found) -> Mapping[str, tuple[float, str, tuple[str, ...]]]:
+def unseen(
+    problem: Problem, outlook: Outlook, found: Found
+) -> Mapping[str, tuple[float, str, tuple[str, ...]]]:
     """Return effects that the log could not have shown: smallest detectable size, unit, what looks alike.
 
     The size is of the parameter that is seen worst, for a lambda of 30; infinite where nothing depends on it.
@@ -80,29 +81,24 @@ def unseen(problem: Problem, outlook: Outlook, found: Found) -> Mapping[str, tup
             continue
         seen = Seen(outlook, given, effect.name)
         lambdas = seen.lambdas()
-        # Wind by its push: without drag, moving air does nothing.
         worst = int(np.argmin(lambdas))
         if lambdas[worst] >= DETECTED:
             continue
         field = seen.fields[worst].split(".")[1]
         smallest = effect.notable[field] * np.sqrt(DETECTED / max(lambdas[worst], 1e-300))
-        alone = seen.lambdas_alone()
-        alike = look_alikes(outlook, given, seen, present) if alone[worst] >= DETECTED else ()
+        alike = look_alikes(outlook, given, seen) if lambdas[worst] > 0.0 else ()
         result[effect.name] = (float(smallest), effect.ranges[field].unit, alike)
     return result
 
 
-def look_alikes(
-    outlook: Outlook, given: list[int], seen: Seen, present: set[str]
-) -> tuple[str, ...]:
+def look_alikes(outlook: Outlook, given: list[int], seen: Seen) -> tuple[str, ...]:
     """Return effects beside which this one hardly shows any more."""
     lambdas = seen.lambdas()
     result = []
     for other in EFFECTS:
         if other.name in (seen.effect, *BASE_ONLY):
             continue
-        columns = [column for column in Seen(outlook, given, other.name).columns]
-        beside = seen.lambdas(columns)
+        beside = seen.lambdas(Seen(outlook, given, other.name).columns)
         if np.any((beside < SEPARATE) & (beside < 0.1 * lambdas)):
             result.append(other.name)
     return tuple(result)

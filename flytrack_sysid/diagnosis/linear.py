@@ -68,9 +68,9 @@ class Outlook:
 
     def _rescore(self) -> None:
         pull = np.zeros(len(self.prior))
-        pull[: len(self.places)] = (self.prior[: len(self.places)]) * (
-            self.vector - self.problem.start
-        )[self.places]
+        pull[: len(self.places)] = (
+            (self.prior[: len(self.places)]) * (self.vector - self.problem.start)[self.places]
+        )
         self.score = self.score_by_block.sum(axis=0) - pull
         self.cost = cost_of(self.problem, self.vector[None], self.white[None])[0]
 

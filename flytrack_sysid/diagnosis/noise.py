@@ -26,6 +26,7 @@ from flytrack_sysid.diagnosis.lanes import NUM_AXES, Lanes
 UNKNOWN_START = 1e8
 # No sensor and no step of float32 is better: direct rad/s, m/s^2; level rad, m/s, V.
 FLOORS = np.array([[1e-4] * 3 + [1e-3] * 3 + [1.0], [1e-5] * 3 + [1e-4] * 3 + [1e-4]])
+UNIFORM = 12.0**-0.5  # standard deviation of rounding, over the last digit
 LEAST_SHARE = 1e-3  # of a disturbance and of a wander, against the noise: below, there is none
 TAU_RANGE_S = (0.02, 5.0)
 OUTLIER = 4.0  # innovations beyond count by their size, not its square
@@ -86,9 +87,7 @@ def make_gains(noise: Noise, step_s: jax.Array, is_known: jax.Array, counts: jax
         level_d, level_e, level_size = later_cov * inverse, later_e * inverse, size
         carry = later_e - level_e * later_e, later_cov - level_e * later_cov, later_d - level_d * later_cov
         keep, push = jnp.where(joined, keep, 0.0), jnp.where(joined, push, 0.0)
-        return carry, Gains(
-            keep, push, direct_d, direct_e, direct_size, level_d, level_e, level_size
-        )
+        return carry, Gains(keep, push, direct_d, direct_e, direct_size, level_d, level_e, level_size)
 
     keep = jnp.exp(-step_s[..., None] / noise.tau)
     by_row = (step_s, is_known, counts.astype(step_s.dtype), keep)
@@ -175,8 +174,14 @@ def _misfit_and_slopes(sought: jax.Array, *given: jax.Array) -> tuple[jax.Array,
     return found.total[0], slopes(found.total), curvature
 
 
-def first_guess(left: np.ndarray, counts: np.ndarray) -> np.ndarray:
+def floors_of(lanes: Lanes) -> np.ndarray:
+    """Return the least noise of each channel, (2, NUM_AXES): that of its last digit, or of float32."""
+    return np.maximum(FLOORS, lanes.quanta * UNIFORM)
+
+
+def first_guess(lanes: Lanes, left: np.ndarray) -> np.ndarray:
     """Return logarithms to start the search from, (6, NUM_AXES), robust against slow residuals."""
+    counts, floors = lanes.counts, floors_of(lanes)
     both = counts[1:] & counts[:-1]
     found = np.zeros((6, NUM_AXES))
     for axis in range(NUM_AXES):
@@ -184,7 +189,7 @@ def first_guess(left: np.ndarray, counts: np.ndarray) -> np.ndarray:
         level = left[1:, :, axis, 1][both[..., axis, 1]]
         for number, change in enumerate((direct, level)):
             spread = np.sqrt(0.5 * np.mean(np.square(change))) if len(change) else 1.0
-            found[number, axis] = np.log(max(spread, FLOORS[number, axis]))
+            found[number, axis] = np.log(max(spread, floors[number, axis]))
     found[2], found[3], found[4], found[5] = np.log(0.1), np.log(0.1), np.log(0.3), 0.0
     return found
 
@@ -213,8 +218,8 @@ def fit_noise(lanes: Lanes, left: np.ndarray, start: np.ndarray | None = None) -
     Damped scoring (Levenberg, with the expected curvature), every axis by itself.
     """
     given = tuple(jnp.asarray(part) for part in (step_to(lanes), lanes.is_known, lanes.counts, left))
-    low, high = _bounds()
-    best = np.clip(first_guess(left, lanes.counts) if start is None else start, low, high)
+    low, high = _bounds(lanes)
+    best = np.clip(first_guess(lanes, left) if start is None else start, low, high)
     misfit, slopes, curvature = (np.asarray(part) for part in _misfit_and_slopes(best, *given))
     damping = np.full(NUM_AXES, FIRST_DAMPING)
     for _ in range(MOST_ROUNDS):
@@ -240,9 +245,11 @@ def fit_noise(lanes: Lanes, left: np.ndarray, start: np.ndarray | None = None) -
     return best
 
 
-def _bounds() -> tuple[np.ndarray, np.ndarray]:
+def _bounds(lanes: Lanes) -> tuple[np.ndarray, np.ndarray]:
     """Return the ends of what is searched, (6, NUM_AXES) each, as logarithms and a logit."""
     ones = np.ones(NUM_AXES)
     low = [np.log(LEAST_SHARE), np.log(LEAST_SHARE), np.log(TAU_RANGE_S[0]), -5.0]
     high = [np.log(1e3)] * 4 + [np.log(TAU_RANGE_S[1]), 5.0]
-    return np.stack([*np.log(FLOORS), *(value * ones for value in low)]), np.stack([v * ones for v in high])
+    return np.stack([*np.log(floors_of(lanes)), *(value * ones for value in low)]), np.stack(
+        [v * ones for v in high]
+    )

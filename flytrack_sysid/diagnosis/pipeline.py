@@ -42,7 +42,7 @@ def settled(log: FlightLog, judged: np.ndarray, model: ModelParameters) -> Settl
     """Return what judged rows of a log say, starting from a model; inside of ``jax.enable_x64(True)``."""
     lanes = make_lanes(log, judged, np.asarray(model.tau, float), float(model.g))
     problem = Problem(lanes, model)
-    problem.set_noise(noises.first_guess(problem.left(problem.start[None])[0], lanes.counts))
+    problem.set_noise(noises.first_guess(lanes, problem.left(problem.start[None])[0]))
     base = base_fit(problem)
     outlook = full_outlook(problem, base.vector)
     problem.set_noise(noises.fit_noise(lanes, saturated(problem, outlook)))
@@ -62,9 +62,7 @@ def settled(log: FlightLog, judged: np.ndarray, model: ModelParameters) -> Settl
     return _without_stand_ins(problem, base, *settle(problem, found))
 
 
-def _without_stand_ins(
-    problem: Problem, base: Found, found: Found, weighed: dict[str, Weighed]
-) -> Settled:
+def _without_stand_ins(problem: Problem, base: Found, found: Found, weighed: dict[str, Weighed]) -> Settled:
     """Return the model without names that something unknown has brought about."""
     while True:
         rest, dependences = look(problem, found, base.vector)

@@ -11,7 +11,7 @@ import jax
 import numpy as np
 
 from flytrack_env.dynamics import ModelParameters
-from flytrack_env.effects import EFFECTS
+from flytrack_env.effects import EFFECTS, effect_of
 from flytrack_sysid.diagnosis import noise as noises
 from flytrack_sysid.diagnosis.lanes import LANE_ROWS, LEAD_IN_ROWS, Lanes
 from flytrack_sysid.diagnosis.said import unexplained
@@ -52,9 +52,9 @@ class Problem:
     """Judged rows of a log, and a noise; all parameters in one vector in the order of ``names``."""
 
     def __init__(self, lanes: Lanes, model: ModelParameters):
-        every = model.with_effects(
-            *(model.effect(effect.name) for effect in EFFECTS)
-        )  # those it has, and neutral ones
+        # Those it has, and neutral ones.
+        every = model.with_effects(*(model.effect(effect.name) for effect in EFFECTS))
+        self.given_effects = tuple(effect_of(one).name for one in model.effects)
         self.like = jax.tree.map(lambda leaf: np.asarray(leaf, float), every)
         self.names = names_of(self.like)
         self.start = to_vector(self.like)
@@ -95,9 +95,7 @@ class Problem:
         """Return vectors within bounds."""
         return np.clip(vectors, self.low, self.high)
 
-    def slopes(
-        self, vector: np.ndarray, places: Sequence[int], others: np.ndarray | None = None
-    ) -> "Slopes":
+    def slopes(self, vector: np.ndarray, places: Sequence[int], others: np.ndarray | None = None) -> "Slopes":
         """Return what a model leaves, its slopes along places, and the way to other vectors.
 
         One-sided differences, into the bounds: what an effect does may begin at its neutral value.
