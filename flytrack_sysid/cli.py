@@ -1,4 +1,4 @@
-"""The command ``flytrack-sysid``: collect, import, fit, validate, diagnose; thin skins over the package's functions."""
+"""The command ``flytrack-sysid``: collect, import, fit, validate, diagnose; thin skins over functions."""
 
 import argparse
 import importlib

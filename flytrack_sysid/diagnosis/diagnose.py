@@ -46,11 +46,10 @@ class DiagnosisError(ValueError):
 
 def check_log(log: FlightLog) -> None:
     """Raise DiagnosisError for a log that says nothing of how the drone turns and moves."""
-    turns = "w" in log or "q" in log
-    if not turns and "v_bat" not in log:
+    if "w" not in log and "q" not in log:
         found = ", ".join(log.channels)
         raise DiagnosisError(
-            f"{log.source}: found channels {found}; expected w (gyro) or q (attitude) at least"
+            f"{log.source}: found channels {found}, expected w (gyro) or q (attitude) at least"
         )
 
 
@@ -178,7 +177,7 @@ def _limits(
     problem: Problem, outlook: Outlook, found: Found, causes: Sequence[Cause]
 ) -> list[NotIdentifiable]:
     """Return what the log could not have shown, and causes it cannot tell from others, with what to fly."""
-    limits = unseen(problem, outlook, found)
+    limits = unseen(outlook, found)
     twins = {
         cause.effect: cause.equivalent
         for cause in causes
@@ -192,7 +191,8 @@ def _limits(
         if name in limits:
             smallest, unit, _ = limits[name]
         else:
-            field, one = next(iter(next(c for c in causes if c.effect == name).parameters.items()))
+            cause = next(cause for cause in causes if cause.effect == name)
+            one = next(iter(cause.parameters.values()))
             smallest, unit = abs(one.value), one.unit
         result.append(NotIdentifiable(name, smallest, unit, tuple(alike), flights[name]))
     return result

@@ -29,8 +29,8 @@ class Lanes(NamedTuple):
     record: as in ``flytrack_sysid.record``. measured: by channel: w rad/s, f m/s^2 (body); others are in the
     record. counts: (rows, lanes, NUM_AXES, 2) bool, what is to be explained; the lead-in never is.
     is_joined: (rows, lanes) bool, the row follows the one before it in flight. is_known: (rows, lanes,
-    NUM_AXES) bool, and what led to it is known: no command was lost that still acts. row: (rows, lanes) int, of
-    the record, -1 where there is none.
+    NUM_AXES) bool, and what led to it is known: no command was lost that still acts. row: (rows, lanes)
+    int, of the record, -1 where there is none. quanta: (2, NUM_AXES), the last digit of what is measured.
     """
 
     record: Record
@@ -119,9 +119,7 @@ def make_lanes(log: FlightLog, judged: np.ndarray, tau: np.ndarray, gravity: flo
     sensed = {name: found[name][index] for name in ("w", "f") if name in found}
     record = Record(*(leaf[index] for leaf in record))
     begins = record.begins | (np.arange(len(index)) == 0)[:, None] | (index < 0)
-    certain = zip((turns, lifts, np.ones_like(turns)), SIZES, strict=True)
-    known = np.concatenate(
-        [np.repeat(one[index][..., None], size, axis=-1) for one, size in certain], axis=-1
-    )
+    certain = np.stack([turns, lifts, np.ones_like(turns)], axis=-1)
+    known = np.repeat(certain[index], SIZES, axis=-1)
     known &= ~begins[..., None]
     return Lanes(record._replace(begins=begins), sensed, counts, ~begins, known, index, _quanta(found))

@@ -66,9 +66,10 @@ class Seen:
         return found
 
 
-def unseen(
-    problem: Problem, outlook: Outlook, found: Found
-) -> Mapping[str, tuple[float, str, tuple[str, ...]]]:
+Limit = tuple[float, str, tuple[str, ...]]
+
+
+def unseen(outlook: Outlook, found: Found) -> Mapping[str, Limit]:
     """Return effects that the log could not have shown: smallest detectable size, unit, what looks alike.
 
     The size is of the parameter that is seen worst, for a lambda of 30; infinite where nothing depends on it.

@@ -155,7 +155,7 @@ class Outlook:
 
 
 def inflation_of(information: np.ndarray, scores: np.ndarray) -> float:
-    """Return how much more scores of blocks, (blocks, count), vary than their information says; at least 1."""
+    """Return how much more scores of blocks, (blocks, count), vary than information says; at least 1."""
     used = np.abs(scores).sum(axis=1) > 0.0
     spread = scores[used].T @ scores[used]
     number = max(int(used.sum()), 2)

@@ -1,8 +1,8 @@
 """What is noise in a residual: white sensors, and a disturbance that wanders.
 
 Each axis (three of rotation, three of force, one of the battery) has two channels: a direct one, ``w`` or
-``f``, and a level, ``q``, ``v`` or ``v_bat``, of which the direct one is the rate of change. Their residual is
-taken as
+``f``, and a level, ``q``, ``v`` or ``v_bat``, of which the direct one is the rate of change. Their residual
+is taken as
 
     d after = exp(-dt / tau) d + white        disturbance: gusts, vibration, what the model lacks
     e after = e + coupling d dt + white       what the disturbance, and the fed-in attitude, sum up to
@@ -135,7 +135,7 @@ DIFFERENCE = 1e-4  # of logarithms, for slopes
 
 
 class _Misfit(NamedTuple):
-    """Minus twice the log likelihood of each axis, outliers counted by their size, and what it consists of."""
+    """Minus twice the log likelihood of each axis, outliers counted by their size, and its parts."""
 
     total: jax.Array
     log_sizes: jax.Array
@@ -195,7 +195,7 @@ def first_guess(lanes: Lanes, left: np.ndarray) -> np.ndarray:
 
 
 def disturbance_gain(lanes: Lanes, left: np.ndarray, sought: np.ndarray) -> np.ndarray:
-    """Return by axis how much likelier (minus twice the log) residuals are with the disturbance than without."""
+    """Return by axis how much likelier, in minus twice the log, residuals are with the disturbance."""
     given = tuple(jnp.asarray(part) for part in (step_to(lanes), lanes.is_known, lanes.counts, left))
     still = sought.copy()
     still[3] = np.log(LEAST_SHARE)
@@ -250,6 +250,5 @@ def _bounds(lanes: Lanes) -> tuple[np.ndarray, np.ndarray]:
     ones = np.ones(NUM_AXES)
     low = [np.log(LEAST_SHARE), np.log(LEAST_SHARE), np.log(TAU_RANGE_S[0]), -5.0]
     high = [np.log(1e3)] * 4 + [np.log(TAU_RANGE_S[1]), 5.0]
-    return np.stack([*np.log(floors_of(lanes)), *(value * ones for value in low)]), np.stack(
-        [v * ones for v in high]
-    )
+    lowest = np.stack([*np.log(floors_of(lanes)), *(value * ones for value in low)])
+    return lowest, np.stack([value * ones for value in high])

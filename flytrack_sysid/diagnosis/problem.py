@@ -1,7 +1,7 @@
 """A log against all that a model could be: residuals, slopes and their sums, over blocks of a second.
 
-One program evaluates 20 models at once, another four, each with every effect of the list; a model without an effect has
-it at its neutral value. So no set of effects needs a compilation of its own.
+One program evaluates 20 models at once, another four, each with every effect of the list; a model without
+an effect has it at its neutral value. So no set of effects needs a compilation of its own.
 """
 
 from collections.abc import Callable, Mapping, Sequence

@@ -1,4 +1,4 @@
-"""What an unknown effect may depend on, as smooth features of the flight, and the forces and rates they make."""
+"""What an unknown effect may depend on, as smooth features of the flight, and their forces and rates."""
 
 from collections.abc import Mapping
 from typing import NamedTuple
@@ -83,9 +83,9 @@ def _along(waves: np.ndarray, vectors_w: np.ndarray) -> np.ndarray:
 
 
 def dependences(flight: Flown) -> Mapping[str, Mapping[str, np.ndarray]]:
-    """Return by side (rate, force) and dependence what an unknown effect might add, (features, rows, lanes, 3).
+    """Return by side (rate, force) and dependence what an unknown effect might add, of unit size.
 
-    World frame; unit size.
+    (features, rows, lanes, 3), world frame.
     """
     counts = flight.counts
     body = np.moveaxis(flight.body_to_world, -1, 0)  # body axes in the world

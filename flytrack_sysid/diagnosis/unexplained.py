@@ -214,7 +214,7 @@ def lines(problem: Problem, found: Found) -> list[tuple[str, float, float]]:
 
 
 def stochastic(problem: Problem, found: Found) -> dict[str, float]:
-    """Return, by side, the size over the sensor's noise of a disturbance that wanders and is clearly there."""
+    """Return, by side, the size over the sensor's noise of a disturbance that is clearly there."""
     result = {}
     left = problem.left(found.vector[None])[0]
     noise = noises.noise_of(problem.noise)

@@ -1,0 +1,188 @@
+"""How well the diagnosis names hidden effects, on plants drawn at run time.
+
+``python -m benchmarks.diagnosis [--plants 200] [--rows clean,one,...] [--seed 0]`` flies every plant for a
+minute (benchmarks.hidden), shows the diagnosis the log and the model without the hidden effects, and grades
+what it says by what the log could show (benchmarks.hidden.oracle). A line a plant goes to
+docs/results/diagnosis.jsonl as it is done; what is there already, of the same code, is not done again.
+``--write`` makes docs/results/diagnosis.md of the lines.
+"""
+
+import argparse
+import hashlib
+import json
+import os
+import platform
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+from tqdm import tqdm
+
+from benchmarks.hidden import (
+    Truth,
+    draw_base,
+    draw_gust,
+    draw_outside,
+    draw_truth,
+    fly,
+    measure,
+    signal_to_noise,
+)
+from benchmarks.hidden.oracle import known, removed
+from flytrack_env.dynamics import ModelParameters
+from flytrack_sysid.diagnosis import Diagnosis, diagnose
+from flytrack_sysid.split import held_out_rows
+
+ROOT = Path(__file__).parent.parent
+LINES = ROOT / "docs" / "results" / "diagnosis.jsonl"
+SECONDS = 60.0
+NAMING = "lanes,said,noise,problem,linear,candidates,refine,search,weigh,pipeline,unexplained,regressors"
+CODE = (
+    *(f"flytrack_sysid/diagnosis/{name}.py" for name in (*NAMING.split(","), "causes")),
+    "flytrack_env/effects/*.py",
+    "flytrack_env/dynamics.py",
+    "benchmarks/hidden/*.py",
+)
+AMPLITUDES = (0.5, 3.0)  # of effects outside the list, times the noise
+Rng = np.random.Generator
+
+
+def _outside(rng: Rng) -> Truth:
+    low, high = np.log(AMPLITUDES)
+    return replace(draw_base(rng), outside=draw_outside(rng, amplitude=float(np.exp(rng.uniform(low, high)))))
+
+
+# Row -> how a truth is drawn, and the sensors' noise.
+ROWS: dict[str, tuple[Callable[[Rng], Truth], str]] = {
+    "clean": (draw_base, "sensors"),
+    "heavy": (draw_base, "heavy"),
+    "coloured": (draw_base, "coloured"),
+    "gusts": (lambda rng: replace(draw_base(rng), gust=draw_gust(rng)), "sensors"),
+    "one": (lambda rng: draw_truth(rng, 1), "sensors"),
+    "two": (lambda rng: draw_truth(rng, 2), "sensors"),
+    "three": (lambda rng: draw_truth(rng, 3), "sensors"),
+    "outside": (_outside, "sensors"),
+}
+
+
+def model_of(truth: Truth) -> ModelParameters:
+    """Return the base of a plant: what its team believes in."""
+    return ModelParameters(
+        tau=np.array(truth.tau, np.float32),
+        thrust_coeffs=np.array(truth.coeffs, np.float32),
+        max_rate=np.array(truth.max_rate, np.float32),
+        m=truth.mass,
+        g=truth.gravity,
+        battery_drain_v_per_min=truth.drain,
+    )
+
+
+def code_hash() -> str:
+    """Return a hash of what names depend on: effects, the search, and the hidden plants."""
+    digest = hashlib.sha256()
+    for path in sorted(path for pattern in CODE for path in ROOT.glob(pattern)):
+        digest.update(path.read_bytes())
+    return digest.hexdigest()[:12]
+
+
+def plant(row: str, number: int, seed: int) -> dict[str, Any]:
+    """Return what one plant's diagnosis said and what it could have."""
+    draw, noise = ROWS[row]
+    rng = np.random.default_rng([seed, number, list(ROWS).index(row)])
+    truth = draw(rng)
+    clean = fly(truth, "scripted", SECONDS, rng)
+    log = measure(clean, noise, rng)
+    model = model_of(truth)
+    started = time.process_time()
+    found = diagnose(log, model)
+    seconds = time.process_time() - started
+    line: dict[str, Any] = {
+        "truth": truth.text(),
+        "effects": list(truth.effects),
+        "verdict": found.verdict,
+        "causes": [_said(cause, truth) for cause in found.causes],
+        "unexplained": {name: round(size, 3) for name, size in found.unexplained.shares.items()},
+        "not_identifiable": [one.effect for one in found.not_identifiable],
+        "cpu_s": round(seconds, 2),
+    }
+    if truth.effects:
+        could = known(clean, log, ~held_out_rows(log), model, truth.effects)
+        line["known"] = {name: [float(f"{v:.4g}") for v in one[:2]] + [one[2]] for name, one in could.items()}
+        line["removed"] = _removed(truth, found, rng)
+    if truth.outside is not None:
+        line["depends_on"] = truth.outside.kind
+        line["amplitude"] = round(truth.outside.amplitude, 3)
+        line["visible"] = round(float(signal_to_noise(truth, clean)), 1)
+    return line
+
+
+def _said(cause: Any, truth: Truth) -> dict[str, Any]:
+    """Return what is named, and which of its intervals cover the truth where the law is the same."""
+    true = truth.effects.get(cause.effect, {})
+    covers = [
+        one.ci95[0] <= true[name] <= one.ci95[1] for name, one in cause.parameters.items() if name in true
+    ]
+    return {
+        "effect": cause.effect,
+        "equivalent": list(cause.equivalent),
+        "gain": float(f"{cause.chi2_gain:.4g}"),
+        "heldout": float(f"{cause.heldout_gain:.4g}"),
+        "covers": [int(value) for value in covers],
+    }
+
+
+def _removed(truth: Truth, found: Diagnosis, rng: Rng) -> list[float]:
+    """Return the share of explainable error that is removed on a new flight, and its size in noise."""
+    new = fly(truth, "scripted", SECONDS, rng)
+    share, size = removed(new, found.nominal, found.base, found.extended)
+    return [round(share, 4), round(size, 4)]
+
+
+def read_lines(code: str | None) -> dict[tuple[str, int, int], dict[str, Any]]:
+    """Return the lines of a code's hash by row, seed and number; of any code if None."""
+    if not LINES.exists():
+        return {}
+    lines = [json.loads(text) for text in LINES.read_text().splitlines()]
+    kept = [line for line in lines if code is None or line["code"] == code]
+    return {(line["row"], line["seed"], line["number"]): line for line in kept}
+
+
+def run(rows: list[str], plants: range, seed: int) -> None:
+    """Diagnose what is not done yet, all rows in turn, and append the lines."""
+    code = code_hash()
+    done = read_lines(code)
+    todo = [(row, number) for number in plants for row in rows if (row, seed, number) not in done]
+    machine = f"{platform.machine()}, {os.cpu_count()} cores, jax {jax.__version__}"
+    for row, number in tqdm(todo, unit=" plants", disable=None):
+        line = {"row": row, "seed": seed, "number": number, "code": code, "machine": machine}
+        try:
+            line |= plant(row, number, seed)
+        except Exception as error:  # a crash is a result too, and the others go on
+            line["error"] = f"{type(error).__name__}: {error}"
+        with LINES.open("a") as file:
+            file.write(json.dumps(line) + "\n")
+
+
+def main() -> None:
+    """Run, or write the page."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--plants", type=int, default=200, help="of each row; default: %(default)s")
+    parser.add_argument("--first", type=int, default=0, help="number of the first plant")
+    parser.add_argument("--rows", default=",".join(ROWS), help="default: all")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--write", action="store_true", help="write the page of the lines that are there")
+    arguments = parser.parse_args()
+    if arguments.write:
+        from benchmarks.diagnosis_page import write_page  # it reads this module's rows
+
+        write_page()
+        return
+    run(arguments.rows.split(","), range(arguments.first, arguments.plants), arguments.seed)
+
+
+if __name__ == "__main__":
+    main()
