@@ -19,7 +19,7 @@ SATURATED_SHARES = np.array([0.0, 1.0, 0.5, 0.2])  # of the step to everything a
 
 
 class Settled(NamedTuple):
-    """What a log says: the problem with its noise, the refitted base, the model, its effects weighed, rest."""
+    """What a log says: problem with noise, refitted base, model, its effects weighed, and the rest."""
 
     problem: Problem
     base: Found
