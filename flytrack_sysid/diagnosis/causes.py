@@ -172,7 +172,7 @@ def _as_scale(nominal: np.ndarray, values: np.ndarray, covered: Covered) -> Esti
     rest = values - factor * nominal
     if rest @ covered.information @ rest / covered.inflation > threshold(len(values) - 1):
         return None
-    half = TWO_SIDED_95 * np.sqrt(covered.inflation / known)
+    half = TWO_SIDED_95 * float(np.sqrt(covered.inflation / known))
     return Estimated(factor, (factor - half, factor + half), "1")
 
 

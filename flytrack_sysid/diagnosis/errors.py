@@ -33,8 +33,21 @@ def _scales(problem: Problem, vector: np.ndarray) -> np.ndarray:
             or name in ("c0", "c1", "c2", "c3", "c4", "c5")
         ):
             still[problem.names.index(name)] = 0.0
-    left = problem.left(still[None])[0]
+    left = _summed_up(problem.left(still[None])[0], problem.counts)
     return _rms(left, problem.counts, is_centred=True)
+
+
+def _summed_up(left: np.ndarray, counts: np.ndarray) -> np.ndarray:
+    """Return residuals with those of the battery summed up, less their mean in each lane.
+
+    A voltage changes by less in a step than its last digit, so that one step says nothing of it.
+    """
+    found = left.copy()
+    counting = counts[..., -1, 1]
+    level = np.cumsum(left[..., -1, 1], axis=0)
+    mean = np.where(counting, level, 0.0).sum(axis=0) / np.maximum(counting.sum(axis=0), 1)
+    found[..., -1, 1] = level - mean
+    return found
 
 
 def _rms(left: np.ndarray, counts: np.ndarray, is_centred: bool = False) -> np.ndarray:
@@ -92,10 +105,11 @@ def errors_of(
     result = {}
     for (name, vector), one in zip(vectors.items(), left, strict=True):
         model = from_vector(vector, held_out.like)
-        one_step = _by_channel(_rms(one, held_out.counts), scales, held_out)
+        one_step = _by_channel(_rms(_summed_up(one, held_out.counts), held_out.counts), scales, held_out)
         result[name] = Errors(one_step, _positions(model, log, rows))
     noise = noises.noise_of(held_out.noise)
     floor = np.stack([noise.direct, np.sqrt(2.0) * noise.level], axis=-1)
+    floor[-1, 1] = noise.level[-1]  # summed up, not a difference of two
     positions = _start_errors(held_out, log, float(held_out.like.g))
     result[NOISE_FLOOR] = Errors(_by_channel(floor, scales, held_out), positions)
     return result
