@@ -42,7 +42,7 @@ LINES = ROOT / "docs" / "results" / "diagnosis.jsonl"
 SECONDS = 60.0
 NAMING = "lanes,said,noise,problem,linear,candidates,refine,search,weigh,pipeline,unexplained,regressors"
 CODE = (
-    *(f"flytrack_sysid/diagnosis/{name}.py" for name in (*NAMING.split(","), "causes")),
+    *(f"flytrack_sysid/diagnosis/{name}.py" for name in (*NAMING.split(","), "causes", "base")),
     "flytrack_env/effects/*.py",
     "flytrack_env/dynamics.py",
     "benchmarks/hidden/*.py",

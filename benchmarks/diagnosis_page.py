@@ -53,8 +53,11 @@ def exact_sets(lines: Iterable[Line]) -> list[bool]:
     """
     found = []
     for line in lines:
-        can = line["known"]
-        if all(one[0] > SHOWN and one[1] > SEPARATE for one in can.values()):
+        could = line["known"]
+        needed = [effect for effect in line["effects"] if effect != "thrust_scale"]
+        if all(
+            effect in could and could[effect][0] > SHOWN and could[effect][1] > SEPARATE for effect in needed
+        ):
             found.append(sorted(named(line)) == sorted(line["effects"]))
     return found
 

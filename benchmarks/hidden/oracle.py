@@ -5,7 +5,7 @@ an effect is then the effect's signature, whatever its law, and minus twice the 
 length. All else is fitted again, each rival in the effect's place too.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import jax
@@ -52,19 +52,24 @@ def clean_problem(clean: FlightLog, log: FlightLog, judged: np.ndarray, model: M
 
 
 def with_all(problem: Problem, effects: Mapping[str, object]) -> Found:
-    """Return the model with all true effects, fitted to the clean log."""
-    found = fitted(problem, (), problem.start)
-    waiting = [name for name in effects if any(one.effect == name for one in CANDIDATES)]
+    """Return the model with all true effects that fits the clean log best, whichever is fitted in first."""
+    base = fitted(problem, (), problem.start)
+    known_ones = [name for name in effects if any(one.effect == name for one in CANDIDATES)]
+    tried = [_one_by_one(problem, base, known_ones, first) for first in known_ones]
+    return min(tried, key=lambda found: found.cost, default=base)
+
+
+def _one_by_one(problem: Problem, found: Found, effects: Sequence[str], first: str) -> Found:
+    waiting = list(effects)
     while waiting:
         outlook = full_outlook(problem, found.vector)
         ranked = [one for one in scores(problem, outlook, found) if one.candidate.effect in waiting]
         if not ranked:
             break
-        best = max(ranked, key=lambda one: one.gain.chi2)
+        best = max(ranked, key=lambda one: (one.candidate.effect == first, one.gain.chi2))
         waiting.remove(best.candidate.effect)
-        found = fitted(
-            problem, (*found.chosen, best.candidate), begun(problem, outlook, found, best), outlook
-        )
+        chosen = (*found.chosen, best.candidate)
+        found = fitted(problem, chosen, begun(problem, outlook, found, best), outlook)
     return found
 
 

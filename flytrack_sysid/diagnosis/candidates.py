@@ -1,6 +1,5 @@
 """What may be wrong: every effect of the list, in each way in which it can be looked for."""
 
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -57,6 +56,6 @@ def opened(problem: Problem, vector: np.ndarray, candidate: Candidate) -> np.nda
     return vector
 
 
-def base_places(problem: Problem, absent: Sequence[str] = ()) -> list[int]:
-    """Return the places of the base parameters that are always free."""
-    return [problem.names.index(name) for name in BASE_FREE if name not in absent]
+def base_places(problem: Problem) -> list[int]:
+    """Return the places of the base parameters that are free."""
+    return [problem.names.index(name) for name in BASE_FREE if name not in problem.held]

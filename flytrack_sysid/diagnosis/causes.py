@@ -5,39 +5,20 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from flytrack_sysid.diagnosis import noise as noises
+from flytrack_sysid.diagnosis.base import BASE_CAUSES, Covered, contradiction
 from flytrack_sysid.diagnosis.lanes import SIZES
-from flytrack_sysid.diagnosis.linear import Outlook, inflation_of, solve
+from flytrack_sysid.diagnosis.linear import Outlook, solve
 from flytrack_sysid.diagnosis.problem import Problem
 from flytrack_sysid.diagnosis.result import Cause, Estimated
 from flytrack_sysid.diagnosis.search import Found, threshold
 from flytrack_sysid.diagnosis.weigh import SAME, Weighed, separations
-from flytrack_sysid.parameters import DRAIN, TAUS, THRUST_COEFFS, unit_of
+from flytrack_sysid.parameters import unit_of
 
 TWO_SIDED_95 = 1.959964
-# What a base parameter that differs is called.
-BASE_CAUSES = {**{name: (name,) for name in TAUS}, "thrust_curve": THRUST_COEFFS, "battery_drain": (DRAIN,)}
 CHANNELS = (("rates", "attitude"), ("force", "velocity"), (None, "battery"))
 LOOSE = 0.25  # of what was known beforehand: a parameter known no better is not determined by the log
 # Equal but for a name: mass, payload, battery and motors all scale the thrust over the mass.
 SCALE_TWINS = ("thrust_curve",)
-
-
-class Covered:
-    """Information about some free parameters of a model, all others fitted along with them."""
-
-    def __init__(self, outlook: Outlook, found: Found, fields: Sequence[str]):
-        self.columns = [outlook.column(field) for field in fields]
-        given = [outlook.places.index(place) for place in found.places]
-        given = [column for column in given if column not in self.columns]
-        across = outlook.total[np.ix_(given, self.columns)]
-        share = solve(outlook.total[np.ix_(given, given)], across)
-        self.information = outlook.total[np.ix_(self.columns, self.columns)] - across.T @ share
-        blocks = outlook.score_by_block
-        self.inflation = inflation_of(self.information, blocks[:, self.columns] - blocks[:, given] @ share)
-
-    def deviations(self) -> np.ndarray:
-        """Return standard deviations, inflated."""
-        return np.sqrt(np.diag(solve(self.information, np.eye(len(self.information)))) * self.inflation)
 
 
 def estimates(
@@ -115,15 +96,11 @@ def base_causes(problem: Problem, held_out: Problem, outlook: Outlook, found: Fo
     """Return base parameters that the log contradicts, as causes."""
     causes = []
     for name, fields in BASE_CAUSES.items():
-        acting = [field for field in fields if outlook.acting([outlook.column(field)])]
-        if not acting:
+        wrong = contradiction(problem, outlook, found, fields)
+        if wrong is None:
             continue
+        acting, covered, gain = wrong
         places = problem.index(acting)
-        covered = Covered(outlook, found, acting)
-        change = found.vector[places] - problem.start[places]
-        gain = float(change @ covered.information @ change)
-        if gain / covered.inflation < threshold(len(acting)):
-            continue
         nominal = found.vector.copy()
         nominal[places] = problem.start[places]
         own = name, estimates(problem, outlook, found, acting)

@@ -6,6 +6,7 @@ import numpy as np
 
 from flytrack_env.dynamics import ModelParameters
 from flytrack_sysid.diagnosis import noise as noises
+from flytrack_sysid.diagnosis.base import simpler
 from flytrack_sysid.diagnosis.lanes import make_lanes
 from flytrack_sysid.diagnosis.linear import Outlook, cost_of
 from flytrack_sysid.diagnosis.problem import Problem
@@ -59,7 +60,10 @@ def settled(log: FlightLog, judged: np.ndarray, model: ModelParameters) -> Settl
     if found.chosen:
         problem.set_noise(noises.fit_noise(lanes, saturated(problem, outlook), problem.noise))
         found, base = fitted(problem, found.chosen, found.vector), fitted(problem, (), base.vector)
-    return _without_stand_ins(problem, base, *settle(problem, found))
+    found, weighed = settle(problem, found)
+    while (other := simpler(problem, found)) is not None:
+        found, weighed = settle(problem, other)
+    return _without_stand_ins(problem, base, found, weighed)
 
 
 def _without_stand_ins(problem: Problem, base: Found, found: Found, weighed: dict[str, Weighed]) -> Settled:

@@ -65,6 +65,7 @@ class Problem:
             [_scale(name, value) for name, value in zip(self.names, self.start, strict=True)]
         )
         self.noise: np.ndarray | None = None
+        self.held: tuple[str, ...] = ()  # base parameters that stay nominal
 
     def set_noise(self, sought: np.ndarray) -> None:
         """Weigh from now on with this noise, (6, NUM_AXES)."""

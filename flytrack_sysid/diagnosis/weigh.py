@@ -95,7 +95,7 @@ def settle(problem: Problem, found: Found) -> tuple[Found, dict[str, Weighed]]:
     while True:
         outlook = Outlook(problem, problem.slopes(found.vector, found.places))
         weighed = {one.effect: weigh(problem, found, outlook, one.effect) for one in found.chosen}
-        short = {one.effect: weighed[one.effect].robust - threshold(len(one.fields)) for one in found.chosen}
+        short = {effect: one.robust - threshold(one.count) for effect, one in weighed.items()}
         if short and min(short.values()) < 0.0:
             found = without(problem, found, min(short, key=short.get))
             continue

@@ -1,0 +1,113 @@
+"""Base parameters that a log contradicts, and effects that explain several of them at once."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from flytrack_sysid.diagnosis.linear import Outlook, inflation_of, solve
+from flytrack_sysid.diagnosis.problem import Problem
+from flytrack_sysid.diagnosis.search import (
+    MOST_REFITTED,
+    PER_PARAMETER,
+    Found,
+    begun,
+    fitted,
+    full_outlook,
+    scores,
+    threshold,
+)
+from flytrack_sysid.parameters import DRAIN, TAUS, THRUST_COEFFS
+
+# What a base parameter that differs is called.
+BASE_CAUSES = {**{name: (name,) for name in TAUS}, "thrust_curve": THRUST_COEFFS, "battery_drain": (DRAIN,)}
+HOPELESS = 0.01  # of the cost, above the limit to first order: not worth a fit
+
+
+class Covered:
+    """Information about some free parameters of a model, all others fitted along with them."""
+
+    def __init__(self, outlook: Outlook, found: Found, fields: Sequence[str]):
+        self.columns = [outlook.column(field) for field in fields]
+        given = [outlook.places.index(place) for place in found.places]
+        given = [column for column in given if column not in self.columns]
+        across = outlook.total[np.ix_(given, self.columns)]
+        share = solve(outlook.total[np.ix_(given, given)], across)
+        self.information = outlook.total[np.ix_(self.columns, self.columns)] - across.T @ share
+        blocks = outlook.score_by_block
+        self.inflation = inflation_of(self.information, blocks[:, self.columns] - blocks[:, given] @ share)
+
+    def deviations(self) -> np.ndarray:
+        """Return standard deviations, inflated."""
+        return np.sqrt(np.diag(solve(self.information, np.eye(len(self.information)))) * self.inflation)
+
+
+class Contradiction(NamedTuple):
+    """Base parameters that differ from the nominal ones: names, information, and chi2 of the difference."""
+
+    fields: list[str]
+    covered: Covered
+    gain: float
+
+
+def contradiction(
+    problem: Problem, outlook: Outlook, found: Found, fields: Sequence[str]
+) -> Contradiction | None:
+    """Return how the log contradicts the nominal values of some base parameters; None where it does not."""
+    acting = [
+        field for field in fields if field not in problem.held and outlook.acting([outlook.column(field)])
+    ]
+    if not acting:
+        return None
+    places = problem.index(acting)
+    covered = Covered(outlook, found, acting)
+    change = found.vector[places] - problem.start[places]
+    gain = float(change @ covered.information @ change)
+    if gain / covered.inflation < threshold(len(acting)):
+        return None
+    return Contradiction(acting, covered, gain)
+
+
+def contradicted(problem: Problem, found: Found) -> list[str]:
+    """Return the base parameters that a log contradicts."""
+    outlook = Outlook(problem, problem.slopes(found.vector, found.places))
+    wrong = [contradiction(problem, outlook, found, fields) for fields in BASE_CAUSES.values()]
+    return [field for one in wrong if one is not None for field in one.fields]
+
+
+def simpler(problem: Problem, found: Found) -> Found | None:
+    """Return a model with one effect more and base parameters as they were, if it explains as much.
+
+    A delay of all commands, say, looks like four longer lags. Those parameters are then held.
+    """
+    wrong = contradicted(problem, found)
+    lags = [field for field in wrong if field in TAUS]
+    for fields in (wrong, lags) if lags not in (wrong, []) else (wrong,):
+        if not fields:
+            continue
+        held = problem.held
+        problem.held = (*held, *fields)
+        trial = _best_instead(problem, found, fields)
+        if trial is not None:
+            return trial
+        problem.held = held
+    return None
+
+
+def _best_instead(problem: Problem, found: Found, fields: Sequence[str]) -> Found | None:
+    """Return the best model with one effect more while some base parameters are held, if it is better."""
+    vector = found.vector.copy()
+    vector[problem.index(fields)] = problem.start[problem.index(fields)]
+    less = fitted(problem, found.chosen, vector)
+    seen = full_outlook(problem, less.vector)
+    limit = found.cost + PER_PARAMETER * len(fields)
+    best = less if less.cost < limit else None
+    for one in scores(problem, seen, less)[:MOST_REFITTED]:
+        if less.cost - one.gain.chi2 > limit + less.cost * HOPELESS and one.candidate.probe is None:
+            continue
+        chosen = (*less.chosen, one.candidate)
+        trial = fitted(problem, chosen, begun(problem, seen, less, one), seen)
+        cost = trial.cost + PER_PARAMETER * one.candidate.price
+        if cost < limit:
+            best, limit = trial, cost
+    return best
