@@ -149,7 +149,9 @@ def _voltages(number: int, hover: float, rng: np.random.Generator) -> tuple[np.n
 
 
 MANOEUVRES = {
-    "headings": Manoeuvre("Hover with the nose to the north, east, south and west, a few seconds each.", _headings),
+    "headings": Manoeuvre(
+        "Hover with the nose to the north, east, south and west, a few seconds each.", _headings
+    ),
     "speeds": Manoeuvre(
         "Fly straight legs at 3, 7, 11 and 15 m/s, nose first and sideways, climbing and sinking.", _speeds
     ),
@@ -168,7 +170,9 @@ MANOEUVRES = {
         "Throw all four sticks from side to side as fast as you can, small and large.", _switching
     ),
     "spins": Manoeuvre("Turn at full stick for two seconds: flips, rolls, yaw, and yaw with a roll.", _spins),
-    "voltages": Manoeuvre("Move thrust up and down about hovering, from a full pack to an empty one.", _voltages),
+    "voltages": Manoeuvre(
+        "Move thrust up and down about hovering, from a full pack to an empty one.", _voltages
+    ),
 }
 
 
