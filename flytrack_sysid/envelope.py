@@ -7,6 +7,8 @@ from flytrack_env.state import BATTERY, BATTERY_EMPTY_V, BATTERY_FULL_V, POSITIO
 LARGEST_SPEED = 20.0  # m/s
 HEIGHTS = (10.0, 110.0)  # m
 SCRIPT_HEIGHTS = (0.1, 110.0)  # m, of a script, which may want flights close to the ground
+MIDDLE_V = 0.5 * (BATTERY_EMPTY_V + BATTERY_FULL_V)
+FEWEST_STEPS = 2  # of a flight; shorter ones say nothing
 
 
 def is_inside(states: np.ndarray, heights: tuple[float, float] = HEIGHTS) -> np.ndarray:

@@ -21,6 +21,7 @@ from flytrack_env.state import (
     STATE_SIZE,
     VELOCITY,
 )
+from flytrack_sysid.envelope import MIDDLE_V
 from flytrack_sysid.excitation import (
     AMPLITUDES,
     DT_S,
@@ -39,7 +40,7 @@ from flytrack_sysid.excitation import (
 
 # All manoeuvres last as long, so that they can be compared. Even: two flights fill a lane of a diagnosis.
 FLIGHTS_PER_MANOEUVRE = 8
-MIDDLE_V = 0.5 * (BATTERY_EMPTY_V + BATTERY_FULL_V)
+SECONDS_PER_MANOEUVRE = FLIGHTS_PER_MANOEUVRE * FLIGHT_STEPS * DT_S
 VOLTAGES = np.linspace(BATTERY_EMPTY_V + RESERVE_V, BATTERY_FULL_V, FLIGHTS_PER_MANOEUVRE)
 SWING_HZ = 1.0  # of a thrust that goes up and down about hovering
 HOVER_SWING = 0.05  # of the stick: nobody holds it still

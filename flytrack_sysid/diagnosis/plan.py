@@ -1,7 +1,7 @@
 """What to fly to settle what a log could not show.
 
-All manoeuvres are flown by the model that was found, seen by the sensors of the log with their noise. What each
-of them would say of every parameter (its Fisher information) is added to what the log says.
+All manoeuvres are flown by the model that was found, and seen by the log's sensors with their noise. What
+each of them would say of every parameter (its Fisher information) is added to what the log says.
 """
 
 import copy
@@ -10,7 +10,6 @@ from functools import partial
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from flytrack_env.dynamics import ModelParameters
