@@ -146,20 +146,24 @@ def collect(
     else:
         check_script(script)
         flown, heights = script, SCRIPT_HEIGHTS
+    log = log_of_states(_cut(*_states(fly, flown), heights), DT_S, "collected")
+    if noise > 0.0:
+        log = measure(log, noise, nominal_parameters().g, rng)
+    return log
+
+
+def _states(fly: Fly, flown: Script) -> tuple[np.ndarray, np.ndarray]:
+    """Return the states (N, T, 21) of a script and the commands (N, T, 4) given in them, float32."""
     starts, commands = flown.starts.astype(np.float32), flown.commands.astype(np.float32)
     # One step ahead of the log, so that the first row's acceleration is the plant's, not the start's.
-    commands = np.concatenate([commands[:, :1], commands], axis=1)
-    states = fly(starts, commands)
+    states = fly(starts, np.concatenate([commands[:, :1], commands], axis=1))
     if not np.isfinite(states).all():
         flight, row, column = np.argwhere(~np.isfinite(states))[0]
         raise CollectError(
             f"plant: found {states[flight, row, column]} in component {column}, flight {flight} "
             f"({flown.kinds[flight]}), step {row}; expected finite numbers"
         )
-    log = log_of_states(_cut(states[:, 1:-1], commands[:, 1:], heights), DT_S, "collected")
-    if noise > 0.0:
-        log = measure(log, noise, nominal_parameters().g, rng)
-    return log
+    return states[:, 1:-1], commands
 
 
 def _cut(
