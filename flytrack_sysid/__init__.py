@@ -7,6 +7,7 @@ from flytrack_sysid.fit import Fit, fit
 from flytrack_sysid.importing import Imported, import_log
 from flytrack_sysid.log import FlightLog, LogError, log_of_states
 from flytrack_sysid.log_file import load_log, save_log
+from flytrack_sysid.script_file import Script, ScriptError, load_script, save_script
 from flytrack_sysid.split import held_out_rows
 from flytrack_sysid.validate import Validation, validate
 
@@ -19,6 +20,8 @@ __all__ = [
     "FlightLog",
     "Imported",
     "LogError",
+    "Script",
+    "ScriptError",
     "Validation",
     "collect",
     "diagnose",
@@ -26,7 +29,9 @@ __all__ = [
     "held_out_rows",
     "import_log",
     "load_log",
+    "load_script",
     "log_of_states",
     "save_log",
+    "save_script",
     "validate",
 ]

@@ -1,4 +1,4 @@
-"""The command ``flytrack-sysid``: collect, import, fit, validate, diagnose; thin skins over functions."""
+"""The command ``flytrack-sysid``: collect, import, fit, validate, diagnose, plan; skins over functions."""
 
 import argparse
 import importlib
@@ -11,15 +11,19 @@ import numpy as np
 from tqdm import tqdm
 
 from flytrack_env import blackbox, load_model, load_provenance, save_model
+from flytrack_env.dynamics import nominal_parameters
 from flytrack_env.model_file import ModelFileError
 from flytrack_sysid.collect import CollectError, collect
 from flytrack_sysid.diagnosis import diagnose, joined, write_diagnosis
 from flytrack_sysid.diagnosis import text_of as text_of_diagnosis
+from flytrack_sysid.diagnosis.next_flight import next_flight
 from flytrack_sysid.fit import fit
 from flytrack_sysid.importing import FORMATS, import_log
 from flytrack_sysid.log import FlightLog
 from flytrack_sysid.log_file import check_name, describe, load_log, save_log
 from flytrack_sysid.plausibility import check_plausible
+from flytrack_sysid.script_file import check_name as check_script_name
+from flytrack_sysid.script_file import load_script, save_script
 from flytrack_sysid.split import HELD_OUT_EVERY, held_out_rows
 from flytrack_sysid.validate import validate
 from flytrack_sysid.validation_report import text_of, write_validation
@@ -67,10 +71,11 @@ class _Bar:
 
 
 def run_collect(arguments: argparse.Namespace) -> None:
-    """Fly the excitation and write the log."""
+    """Fly the excitation, or a script, and write the log."""
     check_name(arguments.out)
+    script = None if arguments.script is None else load_script(arguments.script)
     plant = load_plant(arguments.black_box)
-    log = collect(plant, arguments.minutes, arguments.seed, arguments.noise, _Bar("flights"))
+    log = collect(plant, arguments.minutes, arguments.seed, arguments.noise, _Bar("flights"), script)
     save_log(arguments.out, log)
     print(describe(load_log(arguments.out)))
 
@@ -183,6 +188,16 @@ def run_diagnose(arguments: argparse.Namespace) -> None:
     print(f"written: {', '.join(str(path) for path in written)}")
 
 
+def run_plan(arguments: argparse.Namespace) -> None:
+    """Write the script of what a diagnosis asks to fly, and say why."""
+    check_script_name(arguments.out)
+    model = nominal_parameters() if arguments.model is None else load_model(arguments.model)
+    found = next_flight(arguments.diagnosis, model, arguments.seed)
+    save_script(arguments.out, found.script)
+    print(found.describe())
+    print(f"written: {arguments.out}")
+
+
 def make_parser() -> argparse.ArgumentParser:
     """Return the parser of the command."""
     parser = argparse.ArgumentParser(prog="flytrack-sysid", description=__doc__)
@@ -191,7 +206,9 @@ def make_parser() -> argparse.ArgumentParser:
     one = commands.add_parser("collect", help="fly an excitation on a plant and write a flight log")
     one.add_argument("--black-box", required=True, help="an acro_step.bin, or module:step with step(x, u)")
     one.add_argument("--out", type=Path, required=True, help="the log, .npz or .csv")
-    one.add_argument("--minutes", type=float, default=2.0, help="default: %(default)s")
+    either = one.add_mutually_exclusive_group()
+    either.add_argument("--minutes", type=float, default=2.0, help="of excitation; default: %(default)s")
+    either.add_argument("--script", type=Path, help="fly this instead, .npz, as from plan")
     one.add_argument("--seed", type=int, default=0)
     one.add_argument("--noise", type=float, default=0.0, help="0: the state itself; 1: common sensors")
     one.set_defaults(run=run_collect)
@@ -228,6 +245,13 @@ def make_parser() -> argparse.ArgumentParser:
     hold_out.help = "logs to judge by and not to learn from; default: the last of every four blocks"
     one.add_argument("--out", type=Path, required=True, help="a folder for the report")
     one.set_defaults(run=run_diagnose)
+
+    one = commands.add_parser("plan", help="write a script of flights that settle what a log did not show")
+    one.add_argument("diagnosis", type=Path, help="diagnosis.json")
+    one.add_argument("--out", type=Path, required=True, help="the script, .npz, for collect --script")
+    one.add_argument("--model", type=Path, help="whose hovering thrust to begin with; default: nominal")
+    one.add_argument("--seed", type=int, default=0)
+    one.set_defaults(run=run_plan)
     return parser
 
 

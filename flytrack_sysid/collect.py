@@ -4,7 +4,7 @@ A plant is anything with the contract of ``flytrack_env.plants`` or a function `
 handout's vectors. Only what comes out of it is used.
 
 Envelope: a flight ends where the drone would become faster than 20 m/s, leave heights between 10 and
-110 m, or leave 22 to 24 V.
+110 m, or leave 22 to 24 V. A script may go down to 0.1 m.
 """
 
 from collections.abc import Callable
@@ -18,30 +18,24 @@ from flytrack_env.dynamics import nominal_parameters
 from flytrack_env.plants import Plant
 from flytrack_env.state import (
     ACCELERATION,
-    BATTERY,
-    BATTERY_EMPTY_V,
-    BATTERY_FULL_V,
-    POSITION,
     STATE_SIZE,
-    VELOCITY,
     pack,
     unpack,
     unpack_action,
 )
-from flytrack_sysid.excitation import DT_S, FLIGHT_STEPS, FLIGHTS_PER_KIND, KINDS, script, start_state
+from flytrack_sysid import excitation
+from flytrack_sysid.envelope import FEWEST_STEPS, HEIGHTS, MIDDLE_V, SCRIPT_HEIGHTS, is_inside
+from flytrack_sysid.excitation import DT_S, FLIGHT_STEPS, FLIGHTS_PER_KIND, KINDS, start_state
 from flytrack_sysid.log import FlightLog, log_of_states
+from flytrack_sysid.script_file import Script, check_script, script_of
 from flytrack_sysid.sensors import LOST_ROWS, measure
 
 StepFunction = Callable[[np.ndarray, np.ndarray], Any]
 Fly = Callable[[np.ndarray, np.ndarray], np.ndarray]
 Report = Callable[[int, int], None]
 
-LARGEST_SPEED = 20.0  # m/s
-HEIGHTS = (10.0, 110.0)  # m
 SECONDS_PER_FLIGHT = FLIGHT_STEPS * DT_S
 FEWEST_MINUTES = FLIGHTS_PER_KIND * len(KINDS) * SECONDS_PER_FLIGHT / 60.0
-FEWEST_ROWS = 2  # of a flight; shorter ones say nothing
-MIDDLE_V = 0.5 * (BATTERY_EMPTY_V + BATTERY_FULL_V)
 
 
 class CollectError(ValueError):
@@ -117,29 +111,24 @@ def find_hover(fly: Fly) -> float:
     return float(np.interp(0.0, climb[above - 1 : above + 1], actions[above - 1 : above + 1]))
 
 
-def _inside(states: np.ndarray) -> np.ndarray:
-    """Return where states (..., 21) are within the envelope."""
-    height, battery_v = states[..., POSITION][..., 2], states[..., BATTERY]
-    is_slow = np.linalg.norm(states[..., VELOCITY], axis=-1) <= LARGEST_SPEED
-    is_charged = (battery_v >= BATTERY_EMPTY_V) & (battery_v <= BATTERY_FULL_V)
-    return is_slow & is_charged & (height >= HEIGHTS[0]) & (height <= HEIGHTS[1])
-
-
 def collect(
     plant: Plant | StepFunction,
     minutes: float = 2.0,
     seed: int = 0,
     noise: float = 0.0,
     report: Report = lambda done, total: None,
+    script: Script | None = None,
 ) -> FlightLog:
-    """Fly the excitation on a plant and return the log, a segment per flight of at most 2.5 s.
+    """Fly the excitation, or a script, on a plant and return the log, a segment per flight.
 
     plant: a plant, or a function ``(x (21,), u (4,)) -> x (21,)``, 0.01 s a step, called from chosen
     states. minutes: of flight before the envelope ends any, at least 1. noise: 0 logs the state as it is;
     1 as common sensors would (``flytrack_sysid.sensors``). report: called with flights done and to do.
+    script: flown instead of the excitation, whatever minutes says; the plant's hover is not looked up.
 
     Raises:
         CollectError: minutes, seed or noise out of range, a plant that does not fly or returns no state.
+        ScriptError: a script that cannot be flown.
     """
     if not FEWEST_MINUTES <= minutes < np.inf:
         raise CollectError(f"minutes: found {minutes}, expected at least {FEWEST_MINUTES:g}")
@@ -150,29 +139,40 @@ def collect(
     rng = np.random.default_rng(seed)
     is_plant = hasattr(plant, "reset") and hasattr(plant, "drone")
     fly = _fly_plant(plant) if is_plant else _fly_function(plant, report)
-    hover = find_hover(_fly_plant(plant) if is_plant else _fly_function(plant, lambda done, total: None))
-    flights = script(round(minutes * 60.0 / SECONDS_PER_FLIGHT), hover, rng)
-    starts = np.stack([flight.start for flight in flights]).astype(np.float32)
-    commands = np.stack([flight.command for flight in flights]).astype(np.float32)
-    # One step ahead of the log, so that the first row's acceleration is the plant's, not the start's.
-    commands = np.concatenate([commands[:, :1], commands], axis=1)
-    states = fly(starts, commands)
-    if not np.isfinite(states).all():
-        flight, row, column = np.argwhere(~np.isfinite(states))[0]
-        raise CollectError(
-            f"plant: found {states[flight, row, column]} in component {column}, flight {flight} "
-            f"({flights[flight].kind}), step {row}; expected finite numbers"
-        )
-    log = log_of_states(_cut(states[:, 1:-1], commands[:, 1:]), DT_S, "collected")
+    if script is None:
+        hover = find_hover(_fly_plant(plant) if is_plant else _fly_function(plant, lambda done, total: None))
+        number = round(minutes * 60.0 / SECONDS_PER_FLIGHT)
+        flown, heights = script_of(excitation.script(number, hover, rng)), HEIGHTS
+    else:
+        check_script(script)
+        flown, heights = script, SCRIPT_HEIGHTS
+    log = log_of_states(_cut(*_states(fly, flown), heights), DT_S, "collected")
     if noise > 0.0:
         log = measure(log, noise, nominal_parameters().g, rng)
     return log
 
 
-def _cut(states: np.ndarray, commands: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
+def _states(fly: Fly, flown: Script) -> tuple[np.ndarray, np.ndarray]:
+    """Return the states (N, T, 21) of a script and the commands (N, T, 4) given in them, float32."""
+    starts, commands = flown.starts.astype(np.float32), flown.commands.astype(np.float32)
+    # One step ahead of the log, so that the first row's acceleration is the plant's, not the start's.
+    states = fly(starts, np.concatenate([commands[:, :1], commands], axis=1))
+    if not np.isfinite(states).all():
+        flight, row, column = np.argwhere(~np.isfinite(states))[0]
+        raise CollectError(
+            f"plant: found {states[flight, row, column]} in component {column}, flight {flight} "
+            f"({flown.kinds[flight]}), step {row}; expected finite numbers"
+        )
+    return states[:, 1:-1], commands
+
+
+def _cut(
+    states: np.ndarray, commands: np.ndarray, heights: tuple[float, float]
+) -> list[tuple[np.ndarray, np.ndarray]]:
     """Return the part of each flight before it leaves the envelope; none of very short ones."""
-    lengths = np.where(_inside(states).all(axis=1), states.shape[1], np.argmin(_inside(states), axis=1))
-    kept = [(x[:n], u[:n]) for x, u, n in zip(states, commands, lengths, strict=True) if n >= FEWEST_ROWS]
+    inside = is_inside(states, heights)
+    lengths = np.where(inside.all(axis=1), states.shape[1], np.argmin(inside, axis=1))
+    kept = [(x[:n], u[:n]) for x, u, n in zip(states, commands, lengths, strict=True) if n >= FEWEST_STEPS]
     if not kept:
         raise CollectError("plant: no flight stayed within the envelope for more than a step")
     return kept

@@ -8,7 +8,7 @@ from handout_plant import GRAVITY, HandoutPlant
 
 from flytrack_env.dynamics import advance
 from flytrack_sysid import CollectError, collect
-from flytrack_sysid.collect import HEIGHTS, LARGEST_SPEED
+from flytrack_sysid.envelope import HEIGHTS, LARGEST_SPEED
 
 
 class Simulated:

@@ -1,0 +1,210 @@
+"""Manoeuvres: flights that settle one question each, from chosen states.
+
+Where the excitation (``flytrack_sysid.excitation``) moves everything a little, a manoeuvre does one thing
+often: eight flights of 2.5 s. What each is for, and how to fly it on a real drone, says ``MANOEUVRES``.
+"""
+
+from collections.abc import Callable, Iterable
+from typing import NamedTuple
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from flytrack_env.dynamics import ModelParameters, collective_thrust
+from flytrack_env.state import (
+    APPLIED_ACTION,
+    BATTERY,
+    BATTERY_EMPTY_V,
+    BATTERY_FULL_V,
+    POSITION,
+    QUATERNION,
+    STATE_SIZE,
+    VELOCITY,
+)
+from flytrack_sysid.envelope import MIDDLE_V
+from flytrack_sysid.excitation import (
+    AMPLITUDES,
+    DT_S,
+    FLIGHT_STEPS,
+    FREE_AMPLITUDES,
+    HEIGHT,
+    LEG_SPEEDS,
+    LEG_SWING,
+    RESERVE_V,
+    SLOT_STEPS,
+    SLOW_STEPS,
+    Flight,
+    switching,
+    wave,
+)
+
+# All manoeuvres last as long, so that they can be compared. Even: two flights fill a lane of a diagnosis.
+FLIGHTS_PER_MANOEUVRE = 8
+SECONDS_PER_MANOEUVRE = FLIGHTS_PER_MANOEUVRE * FLIGHT_STEPS * DT_S
+VOLTAGES = np.linspace(BATTERY_EMPTY_V + RESERVE_V, BATTERY_FULL_V, FLIGHTS_PER_MANOEUVRE)
+SWING_HZ = 1.0  # of a thrust that goes up and down about hovering
+HOVER_SWING = 0.05  # of the stick: nobody holds it still
+VOLTAGE_SWING = 0.5
+STEEPNESS = 0.8  # climb of a leg over its speed along the ground, in turns up and down
+LOW_HEIGHTS = (0.2, 0.35, 0.6, 1.0)  # m: a rotor's radius or two, where the ground is felt
+LOW_SPEED = 2.0  # m/s, of every other low pass
+TILTS_DEG = (20.0, 40.0, 60.0, 80.0)
+QUICK_STEPS = (1, 6)  # how long fast switching is held
+# m/s upwards at the start of flips, whose thrust lifts nothing on average: half of what is lost in a flight.
+FLIP_CLIMB = 0.5 * 9.8 * FLIGHT_STEPS * DT_S
+SPIN_STICKS = (
+    *((sign, 0.0, 0.0) for sign in (1.0, -1.0)),
+    *((0.0, sign, 0.0) for sign in (1.0, -1.0)),
+    *((0.0, 0.0, sign) for sign in (1.0, -1.0)),
+    (1.0, 0.0, 1.0),
+    (0.0, 1.0, -1.0),
+)
+ACTIONS = np.linspace(-1.0, 1.0, 41)  # at which a model's thrust is looked up
+
+
+class Manoeuvre(NamedTuple):
+    """A manoeuvre: how to fly it on a real drone, and its flights by number, for a hovering thrust."""
+
+    how: str
+    flight: Callable[[int, float, np.random.Generator], tuple[np.ndarray, np.ndarray]]
+
+
+def _start(
+    hover: float,
+    voltage: float = MIDDLE_V,
+    yaw_deg: float = 0.0,
+    tilt_deg: float = 0.0,
+    vel_w: Iterable[float] = (0.0, 0.0, 0.0),
+    height: float = HEIGHT,
+) -> np.ndarray:
+    """Return a start (21,): yawed, then tilted about body x, with the thrust action ``hover``."""
+    x = np.zeros(STATE_SIZE)
+    x[POSITION], x[VELOCITY] = [0.0, 0.0, height], tuple(vel_w)
+    attitude = Rotation.from_euler("ZX", [yaw_deg, tilt_deg], degrees=True)
+    x[QUATERNION] = attitude.as_quat(scalar_first=True, canonical=True)
+    x[APPLIED_ACTION] = [0.0, 0.0, 0.0, hover]
+    x[BATTERY] = voltage
+    return x
+
+
+def _swing(hover: float, size: float, rng: np.random.Generator) -> np.ndarray:
+    """Return centred sticks and a thrust that goes slowly up and down about hovering, (FLIGHT_STEPS, 4)."""
+    command = np.zeros((FLIGHT_STEPS, 4))
+    time = np.arange(FLIGHT_STEPS) * DT_S
+    command[:, 3] = hover + size * np.sin(2 * np.pi * SWING_HZ * time + rng.uniform(0, 2 * np.pi))
+    return command
+
+
+def _headings(number: int, hover: float, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    return _start(hover, yaw_deg=90.0 * number), _swing(hover, HOVER_SWING, rng)
+
+
+def _speeds(number: int, hover: float, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Return a leg along x or, every other, along y of the body; climbing and sinking by pairs."""
+    speed, yaw_deg = LEG_SPEEDS[number // 2], 90.0 * rng.integers(4)
+    course = np.deg2rad(yaw_deg + 90.0 * (number % 2))
+    climb = STEEPNESS * (-1.0) ** (number // 2)
+    vel_w = speed * np.array([np.cos(course), np.sin(course), climb]) / np.hypot(1.0, climb)
+    return _start(hover, VOLTAGES[number], yaw_deg, vel_w=vel_w), _swing(hover, LEG_SWING, rng)
+
+
+def _low_passes(number: int, hover: float, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    vel_w = (LOW_SPEED * (number % 2), 0.0, 0.0)
+    return _start(hover, vel_w=vel_w, height=LOW_HEIGHTS[number // 2]), _swing(hover, HOVER_SWING, rng)
+
+
+def _thrust(number: int, hover: float, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    command = np.zeros((FLIGHT_STEPS, 4))
+    command[:, 3] = switching(rng, 0.5, SLOW_STEPS) if number % 2 else switching(rng)
+    return _start(hover, VOLTAGES[number]), command
+
+
+def _tilted(number: int, hover: float, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    tilt_deg = TILTS_DEG[number // 2] * (-1.0) ** number
+    return _start(hover, VOLTAGES[number], 90.0 * rng.integers(4), tilt_deg), _swing(hover, LEG_SWING, rng)
+
+
+def _amplitudes(number: int, hover: float, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Return roll, then pitch at one amplitude, or yaw, then all axes."""
+    command, slots = _swing(hover, HOVER_SWING, rng), (slice(SLOT_STEPS), slice(SLOT_STEPS, FLIGHT_STEPS))
+    for slot, axes in zip(slots, ((2,), (0, 1, 2)) if number % 2 else ((0,), (1,)), strict=True):
+        for axis in axes:
+            command[slot, axis] = AMPLITUDES[number // 2] * wave("sine" if len(axes) > 1 else "doublet", rng)
+    return _start(hover, VOLTAGES[number]), command
+
+
+def _switching(number: int, hover: float, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    command = [switching(rng, hold_steps=QUICK_STEPS) for _ in range(4)]
+    return _start(hover, VOLTAGES[number]), FREE_AMPLITUDES[number // 2] * np.stack(command, axis=1)
+
+
+def _spins(number: int, hover: float, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    command = _swing(hover, HOVER_SWING, rng)
+    command[:, :3] = SPIN_STICKS[number]
+    climb = FLIP_CLIMB if np.any(command[0, :2]) else 0.0
+    return _start(hover, VOLTAGES[number], vel_w=(0.0, 0.0, climb)), command
+
+
+def _voltages(number: int, hover: float, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    return _start(hover, VOLTAGES[number]), _swing(hover, VOLTAGE_SWING, rng)
+
+
+MANOEUVRES = {
+    "headings": Manoeuvre(
+        "Hover with the nose to the north, east, south and west, a few seconds each.", _headings
+    ),
+    "speeds": Manoeuvre(
+        "Fly straight legs at 3, 7, 11 and 15 m/s, nose first and sideways, climbing and sinking.", _speeds
+    ),
+    "low_passes": Manoeuvre("Hover and pass slowly between 0.2 and 1 m above flat ground.", _low_passes),
+    "thrust_steps": Manoeuvre(
+        "Level, throw the thrust stick between both ends, in short jabs and held for half a second.", _thrust
+    ),
+    "thrust_tilted": Manoeuvre(
+        "Hold the drone at 20 to 80 degrees to one side and to the other, moving thrust up and down.", _tilted
+    ),
+    "stick_amplitudes": Manoeuvre(
+        "Give roll, pitch and yaw to both sides, at a tenth, a third, two thirds and all of the stick.",
+        _amplitudes,
+    ),
+    "fast_switching": Manoeuvre(
+        "Throw all four sticks from side to side as fast as you can, small and large.", _switching
+    ),
+    "spins": Manoeuvre("Turn at full stick for two seconds: flips, rolls, yaw, and yaw with a roll.", _spins),
+    "voltages": Manoeuvre(
+        "Move thrust up and down about hovering, from a full pack to an empty one.", _voltages
+    ),
+}
+
+
+def hover_action(model: ModelParameters) -> float:
+    """Return the thrust action at which a model's thrust curve holds its weight at 23 V.
+
+    The nearest end of the stick for a model that no thrust holds. Effects are left out: they change it by
+    less than matters to where a flight begins.
+    """
+    thrust_n = np.asarray(collective_thrust(ACTIONS, MIDDLE_V, np.asarray(model.thrust_coeffs, float)))
+    above = thrust_n > float(model.m) * float(model.g)
+    if not above.any() or above.all():
+        return float(ACTIONS[-1] if not above.any() else ACTIONS[0])
+    first = int(np.argmax(above))
+    pair = slice(max(first - 1, 0), first + 1)
+    return float(np.interp(float(model.m) * float(model.g), thrust_n[pair], ACTIONS[pair]))
+
+
+def flights_of(names: Iterable[str], hover: float, seed: int = 0) -> list[Flight]:
+    """Return the flights of manoeuvres, eight of each, in the order of the names.
+
+    hover: the thrust action that holds the weight. The flights of a manoeuvre do not depend on the others.
+
+    Raises:
+        KeyError: no manoeuvre of that name.
+    """
+    flights = []
+    for name in names:
+        manoeuvre = MANOEUVRES[name]
+        rng = np.random.default_rng([seed, list(MANOEUVRES).index(name)])
+        for number in range(FLIGHTS_PER_MANOEUVRE):
+            start, command = manoeuvre.flight(number, hover, rng)
+            flights.append(Flight(name, start, np.clip(command, -1.0, 1.0)))
+    return flights

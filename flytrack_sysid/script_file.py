@@ -1,0 +1,156 @@
+"""Scripts: flights to be flown, and their files.
+
+==========  ==============  ==================================================================
+array       shape           what it is
+==========  ==============  ==================================================================
+kinds       (N,) text       what each flight is, a name of ``flytrack_sysid.manoeuvres``
+starts      (N, 21)         the handout's state at the start of each, within the envelope
+commands    (N, T, 4)       commands in [-1, 1], one per 0.01 s
+==========  ==============  ==================================================================
+"""
+
+import io
+import zipfile
+from collections.abc import Iterable
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from flytrack_env.files import write_atomically
+from flytrack_env.state import ACTION_SIZE, APPLIED_ACTION, QUATERNION, STATE_SIZE
+from flytrack_sysid.envelope import FEWEST_STEPS, LARGEST_SPEED, SCRIPT_HEIGHTS, is_inside
+from flytrack_sysid.excitation import Flight
+from flytrack_sysid.manoeuvres import MANOEUVRES
+
+SUFFIX = ".npz"
+ARRAYS = ("kinds", "starts", "commands")
+LARGEST_BYTES = 64 * 2**20  # unpacked: thousands of flights of 2.5 s
+LARGEST_NORM_ERROR = 1e-3  # of a start's quaternion
+ROUNDING = 1e-6  # of numbers that were float32
+
+
+class ScriptError(ValueError):
+    """A script that cannot be flown, or a diagnosis that none can be made from."""
+
+
+class Script(NamedTuple):
+    """Flights to be flown: kinds (N,), starts (N, 21), commands (N, T, 4); float64."""
+
+    kinds: tuple[str, ...]
+    starts: np.ndarray
+    commands: np.ndarray
+
+
+def script_of(flights: Iterable[Flight]) -> Script:
+    """Return the script of flights of equal length."""
+    kinds, starts, commands = zip(*flights, strict=True)
+    return Script(tuple(kinds), np.stack(starts).astype(float), np.stack(commands).astype(float))
+
+
+def check_name(path: str | Path) -> None:
+    """Raise ScriptError for a file that is not .npz, before there is a script."""
+    if Path(path).suffix.lower() != SUFFIX:
+        raise ScriptError(f"{path}: found suffix {Path(path).suffix!r}, expected {SUFFIX}")
+
+
+def check_script(script: Script, source: str = "script") -> None:
+    """Raise ScriptError unless a script can be flown; the message names source, array and flight."""
+    kinds, starts, commands = script
+    number = len(kinds)
+    if number == 0:
+        raise ScriptError(f"{source}: kinds: found no flight, expected at least one")
+    if starts.shape != (number, STATE_SIZE):
+        raise ScriptError(f"{source}: starts: found shape {starts.shape}, expected ({number}, {STATE_SIZE})")
+    if commands.ndim != 3 or commands.shape[::2] != (number, ACTION_SIZE) or commands.shape[1] < FEWEST_STEPS:
+        expected = f"({number}, {FEWEST_STEPS} or more, {ACTION_SIZE})"
+        raise ScriptError(f"{source}: commands: found shape {commands.shape}, expected {expected}")
+    for name, values in (("starts", starts), ("commands", commands)):
+        bad = np.argwhere(~np.isfinite(values))
+        if len(bad):
+            place = tuple(bad[0].tolist())
+            raise ScriptError(
+                f"{source}: {name}{list(place)}: found {values[place]}, expected a finite number"
+            )
+    unknown = [kind for kind in kinds if kind not in MANOEUVRES]
+    if unknown:
+        raise ScriptError(f"{source}: kinds: found {unknown[0]!r}, expected one of {', '.join(MANOEUVRES)}")
+    _check_ranges(starts, commands, source)
+
+
+def _check_ranges(starts: np.ndarray, commands: np.ndarray, source: str) -> None:
+    for name, sticks in (("starts (applied action)", starts[:, APPLIED_ACTION]), ("commands", commands)):
+        bad = np.argwhere(np.abs(sticks) > 1.0 + ROUNDING)
+        if len(bad):
+            found = sticks[tuple(bad[0])]
+            raise ScriptError(f"{source}: {name}: found {found:g} in flight {bad[0][0]}, expected -1 to 1")
+    norm = np.linalg.norm(starts[:, QUATERNION], axis=1)
+    bad = np.flatnonzero(np.abs(norm - 1.0) > LARGEST_NORM_ERROR)
+    if len(bad):
+        found = f"a quaternion of norm {norm[bad[0]]:.4g}"
+        raise ScriptError(f"{source}: starts: found {found} in flight {bad[0]}, expected 1")
+    bad = np.flatnonzero(~is_inside(starts, SCRIPT_HEIGHTS))
+    if len(bad):
+        expected = (
+            f"at most {LARGEST_SPEED:g} m/s, {SCRIPT_HEIGHTS[0]:g} to {SCRIPT_HEIGHTS[1]:g} m, 22 to 24 V"
+        )
+        raise ScriptError(
+            f"{source}: starts: found flight {bad[0]} outside of the envelope, expected {expected}"
+        )
+
+
+def save_script(path: str | Path, script: Script) -> None:
+    """Write a script to an ``.npz`` file, whole or not at all; the same script gives the same bytes.
+
+    Raises:
+        ScriptError: another suffix, or a script that ``load_script`` would refuse.
+        OSError: what the system says.
+    """
+    check_name(path)
+    check_script(script, str(path))
+    buffer = io.BytesIO()
+    arrays = {"kinds": np.array(script.kinds), "starts": script.starts, "commands": script.commands}
+    np.savez(buffer, allow_pickle=False, **arrays)
+    write_atomically(path, buffer.getvalue())
+
+
+def load_script(path: str | Path) -> Script:
+    """Return the script in an ``.npz`` file. Nothing is ever unpickled.
+
+    Raises:
+        ScriptError: a file that cannot be read, or is no script that can be flown; the message says what.
+    """
+    check_name(path)
+    arrays = _arrays(Path(path))
+    if arrays["kinds"].ndim != 1 or arrays["kinds"].dtype.kind != "U":
+        raise ScriptError(f"{path}: kinds: found {_described(arrays['kinds'])}, expected a row of names")
+    for name in ("starts", "commands"):
+        if arrays[name].dtype.kind not in "iuf":
+            raise ScriptError(f"{path}: {name}: found {_described(arrays[name])}, expected numbers")
+    starts, commands = arrays["starts"].astype(float), arrays["commands"].astype(float)
+    script = Script(tuple(arrays["kinds"].tolist()), starts, commands)
+    check_script(script, str(path))
+    return script
+
+
+def _described(values: np.ndarray) -> str:
+    return f"an array of {values.dtype}, shape {values.shape}"
+
+
+def _arrays(path: Path) -> dict[str, np.ndarray]:
+    """Return the arrays of a file that has just those of a script."""
+    try:
+        with zipfile.ZipFile(path) as archive:
+            size = sum(member.file_size for member in archive.infolist())
+            names = sorted(member.filename.removesuffix(".npy") for member in archive.infolist())
+        if size > LARGEST_BYTES:
+            raise ScriptError(f"{path}: found {size} bytes, expected a script of at most {LARGEST_BYTES}")
+        if names != sorted(ARRAYS):
+            raise ScriptError(f"{path}: found arrays {', '.join(names)}, expected {', '.join(ARRAYS)}")
+        with np.load(path, allow_pickle=False) as archive:
+            return {name: archive[name] for name in ARRAYS}
+    except ScriptError:
+        raise
+    except Exception as error:  # damaged archives raise anything, and numpy refuses pickles by ValueError
+        found = f"{type(error).__name__}: {error}"
+        raise ScriptError(f"{path}: not a script, or damaged; nothing is unpickled: {found}") from error

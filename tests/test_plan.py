@@ -1,0 +1,161 @@
+"""What to fly next: manoeuvres that show what a hovering log could not, once they are flown."""
+
+from collections.abc import Callable, Iterator
+from functools import cache
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+import pytest
+
+from flytrack_env.dynamics import nominal_parameters
+from flytrack_env.effects import BY_NAME
+from flytrack_env.plants import Simulator
+from flytrack_sysid import FlightLog, collect
+from flytrack_sysid.diagnosis.lanes import make_lanes
+from flytrack_sysid.diagnosis.linear import Outlook
+from flytrack_sysid.diagnosis.plan import Question, advise, information_of_manoeuvres
+from flytrack_sysid.diagnosis.problem import Problem
+from flytrack_sysid.diagnosis.search import Found, base_places, full_outlook
+from flytrack_sysid.manoeuvres import MANOEUVRES, flights_of, hover_action
+from flytrack_sysid.script_file import script_of
+
+MODEL = nominal_parameters()
+GYRO, FORCE, ATTITUDE, VELOCITY, VOLTAGE = 0.1, 1.5, 0.009, 0.05, 0.01  # rad/s, m/s^2, rad, m/s, V
+LITTLE, SHORT_S = 0.05, 0.3  # what wanders, over the sensors' noise, and how long it lasts
+WANTED = {
+    "wind": ("thrust_tilt", "accelerometer_bias"),
+    "thrust_tilt": ("wind",),
+    "ground_effect": (),
+    "rate_saturation": (),
+    "rate_expo": ("rate_saturation",),
+    "imu_offset": (),
+    "linear_drag": ("quadratic_drag",),
+    "yaw_reaction": (),
+    "gyro_scale": ("rate_scale",),
+}
+EXPECTED = {
+    "wind": {"headings", "thrust_tilted", "spins"},
+    "thrust_tilt": {"headings"},
+    "ground_effect": {"low_passes"},
+    "rate_saturation": {"stick_amplitudes", "spins"},
+    "rate_expo": {"stick_amplitudes", "fast_switching"},
+    "imu_offset": {"spins", "fast_switching"},
+    "linear_drag": {"speeds"},
+    "yaw_reaction": {"thrust_steps"},
+    "gyro_scale": {"spins", "stick_amplitudes"},
+}
+
+
+class Drone(Simulator):
+    """The simulator, which flies the nominal model whatever it is asked for."""
+
+    def reset(self, drone: Any, model: Any) -> Any:
+        """Return the drone with nothing remembered."""
+        return super().reset(drone, MODEL)
+
+    def step(self, state: Any, command: Any, dt: Any, model: Any) -> Any:
+        """Return the next state of the nominal model."""
+        return super().step(state, command, dt, MODEL)
+
+
+class Logged(NamedTuple):
+    """A log, its problem, the model that is right, and the outlook of it."""
+
+    log: FlightLog
+    problem: Problem
+    found: Found
+    outlook: Outlook
+
+
+def noise_of_sensors() -> np.ndarray:
+    """Return common sensors as a problem has its noise, (6, 7)."""
+    direct, level = [GYRO] * 3 + [FORCE] * 3 + [1.0], [ATTITUDE] * 3 + [VELOCITY] * 3 + [VOLTAGE]
+    rest = np.repeat(np.array([LITTLE, LITTLE, SHORT_S]), 7).reshape(3, 7)
+    return np.concatenate([np.log([direct, level]), np.log(rest), np.zeros((1, 7))])
+
+
+def problem_of(log: FlightLog) -> Problem:
+    problem = Problem(make_lanes(log, np.ones(len(log), bool), np.asarray(MODEL.tau, float), MODEL.g), MODEL)
+    problem.set_noise(noise_of_sensors())
+    return problem
+
+
+def logged(log: FlightLog) -> Logged:
+    problem = problem_of(log)
+    found = Found((), problem.start, 0.0, tuple(base_places(problem)))
+    return Logged(log, problem, found, full_outlook(problem, found.vector))
+
+
+@pytest.fixture(scope="module", autouse=True)
+def in_float64() -> Iterator[None]:
+    """Diagnose in float64; collecting flies float32 anyway."""
+    with jax.enable_x64(True):
+        yield
+
+
+@pytest.fixture(scope="module")
+def hover() -> Logged:
+    """Twenty seconds of hover, the nose in one direction."""
+    first = flights_of(["headings"], hover_action(MODEL))[0]
+    return logged(collect(Drone(), script=script_of([first] * 8)).without("uprev"))
+
+
+@pytest.fixture(scope="module")
+def told() -> Callable[[str], np.ndarray]:
+    """What a manoeuvre tells of everything once it is collected, with other commands than foreseen."""
+    script = script_of(flights_of(MANOEUVRES, hover_action(MODEL), seed=1))
+    log = collect(Drone(), script=script).without("uprev")
+    kinds = np.array(script.kinds)[log.segment]
+
+    @cache
+    def told_by(name: str) -> np.ndarray:
+        return logged(log.select(kinds == name)).outlook.by_block.sum(axis=0)
+
+    return told_by
+
+
+def test_a_hovering_log_cannot_tell_wind_from_tilt(hover):
+    alone, beside = (
+        Question(hover.outlook, hover.found, "thrust_tilt", alike).shares()[0] for alike in ((), ("wind",))
+    )
+    assert alone > 1.0 > 10.0 * beside
+
+
+def test_what_is_advised_shows_once_it_is_flown(hover, told):
+    advice = advise(hover.problem, hover.found, hover.outlook, WANTED)
+    assert set(advice) == set(WANTED)
+    for effect, alike in WANTED.items():
+        question = Question(hover.outlook, hover.found, effect, alike)
+        assert advice[effect] in EXPECTED[effect], effect
+        before, after = question.shares()[0], question.shares(told(advice[effect]))[0]
+        assert before < 1.0 <= after, f"{effect}: {before} before and {after} after {advice[effect]}"
+
+
+def test_what_is_promised_is_what_collecting_brings(hover, told):
+    """Each manoeuvre gets its own lanes: others would promise something else by orders of magnitude."""
+    question = Question(hover.outlook, hover.found, "yaw_reaction")
+    ahead = information_of_manoeuvres(hover.problem, hover.found, hover.outlook, question.columns)
+    assert list(ahead) == list(MANOEUVRES)
+    promised = {name: question.shares(one)[0] for name, one in ahead.items()}
+    for name in ("low_passes", "speeds", "thrust_steps"):
+        assert promised[name] == pytest.approx(question.shares(told(name))[0], rel=0.5), name
+    assert promised["thrust_steps"] > 10.0 * promised["speeds"] > 100.0 * promised["low_passes"]
+
+
+def test_sensors_that_the_log_lacks_tell_nothing_ahead_either(hover):
+    blind = logged(hover.log.without("v_bat"))
+    question = Question(blind.outlook, blind.found, "voltage_sag")
+    ahead = information_of_manoeuvres(blind.problem, blind.found, blind.outlook, question.columns)
+    assert max(question.shares(one)[0] for one in ahead.values()) < 0.01
+
+
+def test_nothing_wanted_nothing_advised(hover):
+    assert advise(hover.problem, hover.found, hover.outlook, {}) == {}
+
+
+def test_there_is_advice_even_where_nothing_would_do(hover):
+    """No flight of a drone without drag tells the scale of an accelerometer sideways."""
+    advice = advise(hover.problem, hover.found, hover.outlook, {"accelerometer_scale": ()})
+    assert advice["accelerometer_scale"] in MANOEUVRES
+    assert BY_NAME["accelerometer_scale"].notable.keys() == {"x", "y", "z"}
