@@ -99,6 +99,7 @@ class Effect:
     hardly shows in a lap or a reading. equation, source: for people. command, lag, air, thrust, rates,
     force, battery, gyro, accelerometer: hooks at these stages.
     most_steps: of parameters that are times, how many steps of time they may last.
+    needs: what a log has to have measured to be asked about it: p position, v velocity, q attitude.
     probes: values at which to look for the effect, of parameters whose slope at neutral is 0 or one-sided.
     groups: parameters that are looked for together; all of them if empty. shapes: parameters that only shape
     what others do, and do nothing while those are neutral.
@@ -113,6 +114,7 @@ class Effect:
     equation: str
     source: str
     most_steps: Mapping[str, int] = field(default_factory=dict)
+    needs: tuple[str, ...] = ()
     probes: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
     groups: tuple[tuple[str, ...], ...] = ()
     shapes: tuple[str, ...] = ()

@@ -30,6 +30,7 @@ GROUND_EFFECT = Effect(
     parameters=GroundEffect,
     ranges={"area": Range(-0.01, 0.01, "m^2")},
     notable={"area": 0.001},
+    needs=("p",),
     equation="T *= 1 + area / (z^2 + 16 area)",
     source="I. C. Cheeseman, W. E. Bennett, ARC R&M 3021, 1955, to first order in area / z^2, levelled off",
     thrust=_thrust,

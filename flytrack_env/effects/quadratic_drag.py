@@ -33,6 +33,7 @@ QUADRATIC_DRAG = Effect(
         "shared": Range(0.0, 1.0, "1"),
     },
     notable={"k_x": 0.005, "k_y": 0.005, "k_z": 0.005},
+    needs=("v", "q"),
     equation="f_i -= k_i (shared |v| + (1 - shared) |v_i|) v_i, v = R^T (v - v_air), per body axis i",
     source="the drag equation, f = c_d A rho v^2 / 2m: of one body (shared 1), or of each axis by itself (0)",
     shapes=("shared",),

@@ -23,6 +23,7 @@ ROTOR_DRAG = Effect(
     parameters=RotorDrag,
     ranges={"h": Range(-0.2, 0.2, "s/m")},
     notable={"h": 0.005},
+    needs=("v", "q"),
     equation="f_b -= h (T/m) P R^T (v - v_air), P the projection onto body x, y",
     source='R. Mahony, V. Kumar, P. Corke, "Multirotor aerial vehicles", 2012, eq. 12: blade flapping',
     force=_force,

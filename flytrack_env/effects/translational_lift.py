@@ -27,6 +27,7 @@ TRANSLATIONAL_LIFT = Effect(
     parameters=TranslationalLift,
     ranges={"gain": Range(-0.5, 0.5, "1")},
     notable={"gain": 0.05},
+    needs=("v", "q"),
     equation="T *= 1 + gain s^2 / (s^2 + (7 m/s)^2), s the airspeed along body x and y",
     source="J. G. Leishman, Principles of Helicopter Aerodynamics, section 2.14, as a saturating curve",
     thrust=_thrust,

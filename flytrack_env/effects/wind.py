@@ -38,6 +38,7 @@ WIND = Effect(
         **{name: Range(-5.0, 5.0, "m/s^2") for name in ("a_x", "a_y", "a_z")},
     },
     notable={"a_x": 0.2, "a_y": 0.2, "a_z": 0.2, "v_x": 1.0, "v_y": 1.0, "v_z": 1.0},
+    needs=("q",),
     equation="v_air += v; f_b += R^T a",
     source="assumption: uniform and steady within a flight",
     groups=(("a_x", "a_y", "a_z"), ("v_x", "v_y", "v_z")),

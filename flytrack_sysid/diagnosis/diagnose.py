@@ -21,6 +21,7 @@ from flytrack_sysid.diagnosis.problem import Problem
 from flytrack_sysid.diagnosis.result import (
     CAUSES_FOUND,
     CONSISTENT,
+    TO_LOG,
     UNEXPLAINED,
     Cause,
     Diagnosis,
@@ -185,7 +186,10 @@ def _limits(
     }
     shown = set(twins) | {one for names in twins.values() for one in names}
     wanted = {name: alike for name, (_, _, alike) in limits.items() if name not in shown} | twins
-    flights = advise(problem, found, outlook, wanted) if wanted else {}
+    flights = {name: TO_LOG + " and ".join(BY_NAME[name].needs) for name in problem.barred}
+    asked = {name: alike for name, alike in wanted.items() if name not in problem.barred}
+    if asked:
+        flights |= advise(problem, found, outlook, asked)
     result = []
     for name, alike in wanted.items():
         if name in limits:

@@ -1,7 +1,5 @@
 """What a log could not have shown, and what it cannot tell apart."""
 
-from collections.abc import Mapping
-
 import numpy as np
 
 from flytrack_env.effects import BY_NAME, EFFECTS
@@ -69,16 +67,20 @@ class Seen:
 Limit = tuple[float, str, tuple[str, ...]]
 
 
-def unseen(outlook: Outlook, found: Found) -> Mapping[str, Limit]:
+def unseen(outlook: Outlook, found: Found) -> dict[str, Limit]:
     """Return effects that the log could not have shown: smallest detectable size, unit, what looks alike.
 
     The size is of the parameter that is seen worst, for a lambda of 30; infinite where nothing depends on it.
     """
     given = [outlook.places.index(place) for place in found.places]
     present = {one.effect for one in found.chosen}
-    result = {}
+    result: dict[str, Limit] = {}
     for effect in EFFECTS:
         if effect.name in present or effect.name in BASE_ONLY:
+            continue
+        if effect.name in outlook.problem.barred:
+            field = next(iter(effect.notable))
+            result[effect.name] = (float("inf"), effect.ranges[field].unit, ())
             continue
         seen = Seen(outlook, given, effect.name)
         lambdas = seen.lambdas()
@@ -97,7 +99,7 @@ def look_alikes(outlook: Outlook, given: list[int], seen: Seen) -> tuple[str, ..
     lambdas = seen.lambdas()
     result = []
     for other in EFFECTS:
-        if other.name in (seen.effect, *BASE_ONLY):
+        if other.name in (seen.effect, *BASE_ONLY, *outlook.problem.barred):
             continue
         beside = seen.lambdas(Seen(outlook, given, other.name).columns)
         if np.any((beside < SEPARATE) & (beside < 0.1 * lambdas)):

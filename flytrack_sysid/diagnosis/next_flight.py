@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from flytrack_env.dynamics import ModelParameters
-from flytrack_sysid.diagnosis.result import SCHEMA
+from flytrack_sysid.diagnosis.result import SCHEMA, TO_LOG
 from flytrack_sysid.manoeuvres import MANOEUVRES, SECONDS_PER_MANOEUVRE, flights_of, hover_action
 from flytrack_sysid.script_file import Script, ScriptError, script_of
 
@@ -39,6 +39,8 @@ def _reasons(path: Path, content: Any) -> dict[str, tuple[str, ...]]:
         place = f"{path}: not_identifiable[{number}]"
         if not isinstance(effect, str):
             raise ScriptError(f"{place}: effect: found {effect!r}, expected a name")
+        if isinstance(fly, str) and fly.startswith(TO_LOG):
+            continue  # a sensor settles it, no flight
         if not isinstance(fly, str) or fly not in MANOEUVRES:
             raise ScriptError(f"{place}: fly: found {fly!r}, expected one of {', '.join(MANOEUVRES)}")
         wanted[fly].append(effect)

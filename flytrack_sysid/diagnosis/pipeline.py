@@ -5,6 +5,7 @@ from typing import NamedTuple
 import numpy as np
 
 from flytrack_env.dynamics import ModelParameters
+from flytrack_env.effects import EFFECTS
 from flytrack_sysid.diagnosis import noise as noises
 from flytrack_sysid.diagnosis.base import simpler
 from flytrack_sysid.diagnosis.lanes import make_lanes
@@ -43,6 +44,7 @@ def settled(log: FlightLog, judged: np.ndarray, model: ModelParameters) -> Settl
     """Return what judged rows of a log say, starting from a model; inside of ``jax.enable_x64(True)``."""
     lanes = make_lanes(log, judged, np.asarray(model.tau, float), float(model.g))
     problem = Problem(lanes, model)
+    problem.barred = tuple(effect.name for effect in EFFECTS if not set(effect.needs) <= set(log.channels))
     problem.set_noise(noises.first_guess(lanes, problem.left(problem.start[None])[0]))
     base = base_fit(problem)
     outlook = full_outlook(problem, base.vector)

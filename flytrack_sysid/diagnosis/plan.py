@@ -86,7 +86,9 @@ def _in_parts(lanes: Lanes, size: int) -> Iterator[Lanes]:
     number = lanes.counts.shape[1]
     for begin in range(0, number, size):
         places = np.arange(begin, begin + size)
-        part = jax.tree.map(partial(np.take, indices=np.minimum(places, number - 1), axis=1), lanes)
+        part = jax.tree.map(
+            partial(np.take, indices=np.minimum(places, number - 1), axis=1), lanes._replace(quanta=None)
+        )._replace(quanta=lanes.quanta)
         yield part._replace(counts=part.counts & (places < number)[:, None, None])
 
 

@@ -65,6 +65,7 @@ class Problem:
             [_scale(name, value) for name, value in zip(self.names, self.start, strict=True)]
         )
         self.noise: np.ndarray | None = None
+        self.barred: tuple[str, ...] = ()  # effects that the log cannot be asked about
         self.held: tuple[str, ...] = ()  # base parameters that stay nominal
 
     def set_noise(self, sought: np.ndarray) -> None:

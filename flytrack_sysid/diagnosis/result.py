@@ -9,6 +9,7 @@ import numpy as np
 from flytrack_env.dynamics import ModelParameters
 
 SCHEMA = 1
+TO_LOG = "log "  # what comes instead of a manoeuvre where a channel is missing
 CONSISTENT, CAUSES_FOUND, UNEXPLAINED = "consistent", "causes_found", "unexplained"
 
 

@@ -76,7 +76,7 @@ def scores(problem: Problem, outlook: Outlook, found: Found) -> list[Scored]:
     present = {one.effect for one in found.chosen}
     best: dict[str, Scored] = {}
     for candidate in CANDIDATES:
-        if candidate.effect in present:
+        if candidate.effect in present or candidate.effect in problem.barred:
             continue
         gain = outlook.gain(outlook.columns_of(candidate), given)
         if gain is None or (candidate.probe is not None and gain.step[0] <= 0.0):
