@@ -24,7 +24,7 @@ demo: setup
 	$(BIN)/python demo.py
 
 test: setup
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest --numprocesses 2 --dist loadfile
 
 # With dependencies: what the clients need beyond the lock file is in their requirements.
 $(CLIENTS_STAMP): requirements.lock clients/requirements.txt pyproject.toml
