@@ -42,7 +42,10 @@ LINES = ROOT / "docs" / "results" / "diagnosis.jsonl"
 SECONDS = 60.0
 NAMING = "lanes,said,noise,problem,linear,candidates,refine,search,weigh,pipeline,unexplained,regressors"
 CODE = (
-    *(f"flytrack_sysid/diagnosis/{name}.py" for name in (*NAMING.split(","), "causes", "base")),
+    *(
+        f"flytrack_sysid/diagnosis/{name}.py"
+        for name in (*NAMING.split(","), "causes", "base", "sides", "stand_ins")
+    ),
     "flytrack_env/effects/*.py",
     "flytrack_env/dynamics.py",
     "benchmarks/hidden/*.py",

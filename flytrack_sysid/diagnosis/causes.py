@@ -92,12 +92,14 @@ def effect_causes(
     return sorted(causes, key=lambda cause: -cause.chi2_gain)
 
 
-def base_causes(problem: Problem, held_out: Problem, outlook: Outlook, found: Found) -> list[Cause]:
-    """Return base parameters that the log contradicts, as causes."""
+def base_causes(
+    problem: Problem, held_out: Problem, outlook: Outlook, found: Found, doubtful: Sequence[str]
+) -> list[Cause]:
+    """Return base parameters that the log contradicts, as causes, without doubtful ones."""
     causes = []
     for name, fields in BASE_CAUSES.items():
         wrong = contradiction(problem, outlook, found, fields)
-        if wrong is None:
+        if wrong is None or name in doubtful:
             continue
         acting, covered, gain = wrong
         places = problem.index(acting)

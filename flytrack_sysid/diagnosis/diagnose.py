@@ -38,7 +38,6 @@ STAGES = ("search", "held-out rows", "what the log cannot show", "errors")
 # A gain on held-out rows is wrong for a true cause where it lies so many standard deviations below what
 # the cause would gain there, and below that share of it.
 HELD_OUT_SIGMAS, HELD_OUT_SHARE = 4.0, 0.3
-NEEDED = ("q",)
 
 
 class DiagnosisError(ValueError):
@@ -119,7 +118,7 @@ def _found(
     outlook = full_outlook(problem, result.found.vector)
     causes = [
         *effect_causes(problem, judge, outlook, result.found, result.weighed),
-        *base_causes(problem, judge, outlook, result.found),
+        *base_causes(problem, judge, outlook, result.found, result.doubtful),
     ]
     limits = _limits(problem, outlook, result.found, causes)
     report(3, len(STAGES))

@@ -7,13 +7,14 @@ import numpy as np
 from flytrack_env.dynamics import ModelParameters
 from flytrack_env.effects import EFFECTS
 from flytrack_sysid.diagnosis import noise as noises
-from flytrack_sysid.diagnosis.base import simpler
+from flytrack_sysid.diagnosis.base import BASE_CAUSES, contradiction, simpler
 from flytrack_sysid.diagnosis.lanes import make_lanes
 from flytrack_sysid.diagnosis.linear import Outlook, cost_of
 from flytrack_sysid.diagnosis.problem import Problem
 from flytrack_sysid.diagnosis.result import Unexplained
 from flytrack_sysid.diagnosis.search import MOST_EFFECTS, Found, add_best, base_fit, fitted, full_outlook
-from flytrack_sysid.diagnosis.unexplained import look, stand_ins
+from flytrack_sysid.diagnosis.stand_ins import Suspect, stand_ins
+from flytrack_sysid.diagnosis.unexplained import look
 from flytrack_sysid.diagnosis.weigh import Weighed, settle, without
 from flytrack_sysid.log import FlightLog
 
@@ -21,13 +22,17 @@ SATURATED_SHARES = np.array([0.0, 1.0, 0.5, 0.2])  # of the step to everything a
 
 
 class Settled(NamedTuple):
-    """What a log says: problem with noise, refitted base, model, its effects weighed, and the rest."""
+    """What a log says: problem with noise, refitted base, model, its effects weighed, and the rest.
+
+    doubtful: names of base parameters that differ only because of something unexplained.
+    """
 
     problem: Problem
     base: Found
     found: Found
     weighed: dict[str, Weighed]
     rest: Unexplained
+    doubtful: tuple[str, ...]
 
 
 def saturated(problem: Problem, outlook: Outlook) -> np.ndarray:
@@ -72,9 +77,40 @@ def _without_stand_ins(problem: Problem, base: Found, found: Found, weighed: dic
     """Return the model without names that something unknown has brought about."""
     while True:
         rest, dependences = look(problem, found, base.vector)
-        dropped = stand_ins(problem, found, weighed, rest, dependences) if rest.flagged else []
+        if not rest.flagged:
+            return Settled(problem, base, found, weighed, rest, ())
+        of_base = _suspects_of_base(problem, found)
+        suspects = [*_suspects(problem, found, weighed), *of_base]
+        doubtful = stand_ins(problem, found, suspects, rest, dependences)
+        dropped = [name for name in doubtful if name in weighed]
         if not dropped:
-            return Settled(problem, base, found, weighed, rest)
+            return Settled(problem, base, found, weighed, rest, tuple(doubtful))
         for effect in dropped:
             found = without(problem, found, effect)
         found, weighed = settle(problem, found)
+
+
+def _suspects(problem: Problem, found: Found, weighed: dict[str, Weighed]) -> list[Suspect]:
+    return [
+        Suspect(
+            one.effect,
+            one.fields,
+            found.vector[problem.index(one.fields)] - one.neutral(),
+            weighed[one.effect].robust,
+            weighed[one.effect].count,
+        )
+        for one in found.chosen
+    ]
+
+
+def _suspects_of_base(problem: Problem, found: Found) -> list[Suspect]:
+    outlook = Outlook(problem, problem.slopes(found.vector, found.places))
+    result = []
+    for name, fields in BASE_CAUSES.items():
+        wrong = contradiction(problem, outlook, found, fields)
+        if wrong is not None:
+            places = problem.index(wrong.fields)
+            size = found.vector[places] - problem.start[places]
+            robust = wrong.gain / wrong.covered.inflation
+            result.append(Suspect(name, tuple(wrong.fields), size, robust, len(places)))
+    return result

@@ -4,7 +4,7 @@ One program evaluates 20 models at once, another four, each with every effect of
 an effect has it at its neutral value. So no set of effects needs a compilation of its own.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import jax
@@ -116,10 +116,6 @@ class Problem:
     def index(self, names: Sequence[str]) -> list[int]:
         """Return the places of parameters in the vector."""
         return [self.names.index(name) for name in names]
-
-    def values(self, vector: np.ndarray) -> Mapping[str, float]:
-        """Return a vector's numbers by name."""
-        return dict(zip(self.names, vector.tolist(), strict=True))
 
 
 def _scale(name: str, value: float) -> float:

@@ -8,12 +8,11 @@ from scipy import ndimage, stats
 
 from flytrack_sysid.diagnosis import noise as noises
 from flytrack_sysid.diagnosis.lanes import LEAD_IN_ROWS
-from flytrack_sysid.diagnosis.linear import inflation_of, solve
-from flytrack_sysid.diagnosis.problem import BATCH, Problem, blocks_of, robust_weight
-from flytrack_sysid.diagnosis.regressors import SIDES, Flown, constants, dependences, flown
+from flytrack_sysid.diagnosis.problem import Problem, blocks_of
+from flytrack_sysid.diagnosis.regressors import SIDES, Flown, dependences
 from flytrack_sysid.diagnosis.result import Unexplained
-from flytrack_sysid.diagnosis.search import Found, threshold
-from flytrack_sysid.diagnosis.weigh import Weighed
+from flytrack_sysid.diagnosis.search import Found
+from flytrack_sysid.diagnosis.sides import Side, flight_of, seen, whitened
 
 CHANCE = 1e-6  # of a flag where nothing is left, for each dependence
 MATERIAL = 0.08  # of the sensor's noise, rms: less is left alone
@@ -25,9 +24,6 @@ LINE = 28.0  # power of a line over that of its neighbourhood: e^-28 by chance
 NEIGHBOURS = 40  # frequencies on each side
 STOCHASTIC_GAIN, STOCHASTIC_SHARE = 50.0, 0.15  # of minus twice the log likelihood; of the sensor's noise
 FELT = 0.3  # coupling from which a disturbance is the drone's and not the sensor's
-RIDGE = 1e-6
-DISTURBED = 3.0  # times the usual threshold, for names on a side where something unknown acts
-KEPT_SHARE = 0.1  # of an effect's lambda, beside what the rest depends on: less, and it stood in for that
 
 
 class Dependence(NamedTuple):
@@ -39,68 +35,6 @@ class Dependence(NamedTuple):
     share: float
     features_w: np.ndarray
     columns: np.ndarray
-
-
-def _whitened(problem: Problem, features_w: np.ndarray, side: str) -> np.ndarray:
-    """Return what features (count, rows, lanes, 3) would leave, whitened, of a side's axes."""
-    step_s = noises.step_to(problem.lanes)[..., None]
-    found = []
-    for begin in range(0, len(features_w), BATCH):
-        part = features_w[begin : begin + BATCH]
-        left = np.zeros((*part.shape[:3], noises.NUM_AXES, 2))
-        left[..., SIDES[side], 0] = part
-        left[..., SIDES[side], 1] = part * step_s
-        left *= problem.lanes.is_joined[..., None, None]
-        found.append(problem.whiten(left)[..., SIDES[side], :])
-    return np.concatenate(found)
-
-
-def _seen(problem: Problem, found: Found) -> tuple[np.ndarray, np.ndarray]:
-    """Return what a model leaves, and its slopes along what is free, whitened."""
-    slopes = problem.slopes(found.vector, found.places)
-    return problem.whiten(slopes.left[None])[0], problem.whiten(slopes.columns)
-
-
-class _Side:
-    """Sums of one side's axes: what is given (columns of the model), residual, and features as they come."""
-
-    def __init__(self, problem: Problem, side: str, left: np.ndarray, slopes: np.ndarray):
-        axes = SIDES[side]
-        self.left = left[..., axes, :]
-        self.root = np.sqrt(robust_weight(self.left))
-        self.rest = blocks_of(self.left * self.root)
-        given = slopes[..., axes, :]
-        acting = np.abs(given).reshape(len(given), -1).max(axis=1) > 0.0
-        self.given = blocks_of(given[acting] * self.root)
-
-    def gain(self, columns: np.ndarray) -> tuple[float, float, np.ndarray]:
-        """Return chi2 of features besides what is given, its inflation, and their coefficients."""
-        across = np.einsum("bgn,bfn->gf", self.given, columns, optimize=True)
-        inner = np.einsum("bgn,bhn->gh", self.given, self.given, optimize=True)
-        inner += RIDGE * np.diag(np.maximum(np.diag(inner), 1.0))
-        share = solve(inner, across)
-        total = np.einsum("bfn,bhn->fh", columns, columns, optimize=True)
-        own = total - across.T @ share
-        own += RIDGE * np.diag(np.diag(total)) + np.eye(len(own))
-        score_given = np.einsum("bgn,bn->g", self.given, self.rest, optimize=True)
-        score = np.einsum("bfn,bn->f", columns, self.rest, optimize=True) - share.T @ score_given
-        step = solve(own, score)
-        beside = solve(inner, score_given - across @ step)
-        after = self.rest - np.einsum("bfn,f->bn", columns, step) - np.einsum("bgn,g->bn", self.given, beside)
-        blocks = np.einsum("bfn,bn->bf", columns, after) - np.einsum("bgn,bn->bg", self.given, after) @ share
-        return float(score @ step), inflation_of(own, blocks), step
-
-    def lambda_of(self, columns: np.ndarray, size: np.ndarray) -> float:
-        """Return the squared signature of columns at a size, fitted again beside what is given."""
-        across = np.einsum("bgn,bfn->gf", self.given, columns, optimize=True)
-        inner = np.einsum("bgn,bhn->gh", self.given, self.given, optimize=True)
-        inner += RIDGE * np.diag(np.maximum(np.diag(inner), 1.0))
-        share = solve(inner, across)
-        own = np.einsum("bfn,bhn->fh", columns, columns, optimize=True) - across.T @ share
-        score_given = np.einsum("bgn,bn->g", self.given, self.rest, optimize=True)
-        score = np.einsum("bfn,bn->f", columns, self.rest, optimize=True) - share.T @ score_given
-        again = size - solve(own + RIDGE * np.diag(np.diag(own)), score)
-        return float(again @ own @ again)
 
 
 def _rms(features_w: np.ndarray, step: np.ndarray, counts: np.ndarray) -> float:
@@ -129,20 +63,18 @@ def depends_on(
     problem: Problem, found: Found, base: np.ndarray, extra: Mapping[str, np.ndarray] | None = None
 ) -> list[Dependence]:
     """Return dependences of what a model leaves, the clearest first, on each side at most three."""
-    flight = flown(
-        problem.lanes, found.vector[problem.index(("tau_roll", "tau_pitch", "tau_yaw", "tau_thrust"))]
-    )
-    left, slopes = _seen(problem, found)
+    flight = flight_of(problem, found)
+    left, slopes = seen(problem, found)
     features = dependences(flight)
     noise = noises.noise_of(problem.noise)
     result = []
     for side, axes in SIDES.items():
         if not problem.lanes.counts[..., axes, :].any():
             continue
-        sums = _Side(problem, side, left, slopes)
+        sums = Side(problem, side, left, slopes)
         if extra is not None and side in extra:
             sums.given = np.concatenate(
-                [sums.given, blocks_of(_whitened(problem, extra[side], side) * sums.root)], axis=1
+                [sums.given, blocks_of(whitened(problem, extra[side], side) * sums.root)], axis=1
             )
         own_noise = float(np.sqrt(np.mean(np.asarray(noise.direct[axes]) ** 2)))
         least = max(
@@ -151,14 +83,14 @@ def depends_on(
             OF_WANDERING * _wandering(noise, axes),
         )
         columns = {
-            name: blocks_of(_whitened(problem, one, side) * sums.root) for name, one in features[side].items()
+            name: blocks_of(whitened(problem, one, side) * sums.root) for name, one in features[side].items()
         }
         result += _greedy(sums, side, columns, features[side], flight, least, own_noise)
     return sorted(result, key=lambda one: -one.gain)
 
 
 def _greedy(
-    sums: _Side,
+    sums: Side,
     side: str,
     columns: Mapping[str, np.ndarray],
     features: Mapping[str, np.ndarray],
@@ -189,7 +121,7 @@ def _greedy(
 
 def lines(problem: Problem, found: Found) -> list[tuple[str, float, float]]:
     """Return side, frequency in Hz and amplitude over the sensor's noise of what is periodic, body frame."""
-    flight = flown(problem.lanes, np.full(4, 0.03))
+    flight = flight_of(problem, found)
     left = problem.left(found.vector[None])[0]
     noise = noises.noise_of(problem.noise)
     result = []
@@ -232,7 +164,7 @@ def stochastic(problem: Problem, found: Found) -> dict[str, float]:
 def look(problem: Problem, found: Found, base: np.ndarray) -> tuple[Unexplained, list[Dependence]]:
     """Return what a model leaves unexplained, and the dependences that a veto may use."""
     periodic = lines(problem, found)
-    found_on = depends_on(problem, found, base, _waves(problem, periodic))
+    found_on = depends_on(problem, found, base, _waves(problem, found, periodic))
     shares = {f"{side}: periodic at {hz:.3g} Hz": size for side, hz, size in periodic}
     shares |= {f"{one.side}: {one.name}": one.share for one in found_on}
     if not shares:
@@ -241,50 +173,11 @@ def look(problem: Problem, found: Found, base: np.ndarray) -> tuple[Unexplained,
     return Unexplained(bool(shares), tuple(dict.fromkeys(names)), shares), found_on
 
 
-def stand_ins(
-    problem: Problem,
-    found: Found,
-    weighed: Mapping[str, Weighed],
-    rest: Unexplained,
-    dependences_found: Sequence[Dependence],
-) -> list[str]:
-    """Return effects of a model that stand in for something that no list has.
-
-    Their gain is gone beside smooth functions of what the rest depends on (with the constants of those,
-    which a wind, say, would be), or is small where something unknown disturbs the same side.
-    """
-    left, slopes = _seen(problem, found)
-    flight = flown(problem.lanes, np.full(4, 0.03))
-    disturbed = {name.split(":")[0] for name in rest.shares}
-    result = []
-    for one in found.chosen:
-        own = [found.places.index(place) for place in problem.index(one.fields)]
-        others = [place for place in range(len(found.places)) if place not in own]
-        size = found.vector[problem.index(one.fields)] - one.neutral()
-        before, after = dict.fromkeys(SIDES, 0.0), dict.fromkeys(SIDES, 0.0)
-        for side, axes in SIDES.items():
-            acting = slopes[own][..., axes, :]
-            if not (problem.lanes.counts[..., axes, :].any() and np.abs(acting).max() > 0.0):
-                continue
-            sums = _Side(problem, side, left, slopes[others])
-            columns = blocks_of(acting * sums.root)
-            before[side] = sums.lambda_of(columns, size)
-            for dependence in dependences_found:
-                if dependence.side == side:
-                    constant = blocks_of(_whitened(problem, constants(flight, side), side) * sums.root)
-                    sums.given = np.concatenate([sums.given, dependence.columns, constant], axis=1)
-            after[side] = sums.lambda_of(columns, size)
-        own_side = max(before, key=before.get)
-        least = threshold(weighed[one.effect].count)
-        is_gone = sum(after.values()) < max(KEPT_SHARE * sum(before.values()), least)
-        if is_gone or (own_side in disturbed and weighed[one.effect].robust < DISTURBED * least):
-            result.append(one.effect)
-    return result
-
-
-def _waves(problem: Problem, periodic: Sequence[tuple[str, float, float]]) -> dict[str, np.ndarray]:
+def _waves(
+    problem: Problem, found: Found, periodic: Sequence[tuple[str, float, float]]
+) -> dict[str, np.ndarray]:
     """Return sine and cosine at the frequencies found, along the body's axes, by side."""
-    flight = flown(problem.lanes, np.full(4, 0.03))
+    flight = flight_of(problem, found)
     body = np.moveaxis(flight.body_to_world, -1, 0)
     result = {}
     for side, hz, _ in periodic:
