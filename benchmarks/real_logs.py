@@ -78,6 +78,11 @@ def betaflight(data: Path) -> Craft:
     return timed(found.log, found.nominal_model(), None)
 
 
+def with_unit(text: str, unit: str) -> str:
+    """Return a number with its unit, if it has one."""
+    return text if unit == "1" else f"{text} {unit}"
+
+
 def number(value: float | None) -> str:
     """Return three digits."""
     return "none" if value is None or not np.isfinite(value) else f"{value:.3g}"
@@ -94,7 +99,7 @@ def causes_table(found: Diagnosis) -> str:
     rows = []
     for cause in found.causes:
         values = "<br>".join(
-            f"{name} {number(one.value)} ({number(one.ci95[0])} to {number(one.ci95[1])}) {one.unit}"
+            f"{name} {with_unit(number(one.value), one.unit)} ({' to '.join(map(number, one.ci95))})"
             for name, one in cause.parameters.items()
         )
         alike = ", ".join(cause.equivalent) or f"no (closest: {cause.closest})" if cause.closest else "no"
@@ -131,7 +136,11 @@ def errors_table(found: Diagnosis) -> str:
 def unseen_table(found: Diagnosis) -> str:
     """Return what the log could not have shown."""
     rows = [
-        [f"`{one.effect}`", f"{number(one.smallest)} {one.unit}", ", ".join(one.confused_with) or "noise"]
+        [
+            f"`{one.effect}`",
+            with_unit(number(one.smallest), one.unit),
+            ", ".join(one.confused_with) or "noise",
+        ]
         for one in found.not_identifiable
     ]
     return table(("effect", "seen for sure from", "looks like"), rows)
@@ -192,7 +201,7 @@ of this repository: they are read from `../shared/data`, or the folder that `FLY
 
 CRAZYFLIE_HEAD = """## Crazyflie 2.1, flown by learned policies
 
-Held out are the flights of policies {judged}: the model is judged on other policies, which command
+Held out are the flights of policies {policies}: the model is judged on other policies, which command
 differently.
 
 ```
@@ -204,17 +213,19 @@ flytrack-sysid import $FLIGHTS/seed000{{{judged}}}_*.csv.gz --format csv \\
 flytrack-sysid diagnose learnt.npz --model crazyflie.json --hold-out judged.npz --out report
 ```"""
 
-CRAZYFLIE_LIMITS = """**How far to trust it.** The nominal model is no model of this drone: lags and the
-shape of its thrust are those of a racing quadcopter, so that base parameters are named is no surprise. The
-policies fly in closed loop: what they command answers to what disturbed the drone a moment before, and
-residuals correlate with commands that come *after* them. A regression and a fit of a model that lacks
-something are both biased by this. Body rates here are rates of Euler angles, and velocity and attitude are
-those of the firmware's estimator, so that a lag of the estimator looks like a lag of the drone
-(`tau_thrust` above all, as no accelerometer was logged). Voltage is read under load: it dips because the
-motors pull, and the thrust map that takes it as a cause can get a wrong sign for its voltage terms;
-`voltage_sag` is the cause to expect. All policies fly the same circle, at about 1 m height and below 2 m/s:
-drag, lift, ground effect and wind hardly show. Mass is a guess within 10 %, and with it all thrust. Motor
-commands were logged but are not read."""
+CRAZYFLIE_LIMITS = """\
+**How far to trust it.** The nominal model is no model of this drone: lags and the shape of its thrust are
+those of a racing quadcopter, so that base parameters are named is no surprise. The policies fly in closed
+loop: what they command answers to what disturbed the drone a moment before, and residuals correlate with
+commands that come *after* them. A regression and a fit of a model that lacks something are both biased by
+this. Body rates here are rates of Euler angles, and velocity and attitude are those of the firmware's
+estimator, so that a lag of the estimator looks like a lag of the drone (`tau_thrust` above all, as no
+accelerometer was logged). Voltage is read under load: it dips because the motors pull, and the thrust map
+that takes it as a cause can get a wrong sign for its voltage terms; `voltage_sag` is the cause to expect.
+The regression answers to sticks after 20 to 30 ms only: a dead time, for which `command_delay` is the name.
+Where one of the two is not in the table, the search has missed it. All policies fly the same circle, at
+about 1 m height and below 2 m/s: drag, lift, ground effect and wind hardly show. Mass is a guess within 10
+%, and with it all thrust. Motor commands were logged but are not read."""
 
 BETAFLIGHT_HEAD = """## Betaflight quadcopter, one acro flight
 
@@ -229,14 +240,14 @@ flytrack-sysid import ../shared/data/{folder}/shortLog.BFL --format betaflight \
 flytrack-sysid diagnose quad.npz --model quad.json --out report
 ```"""
 
-BETAFLIGHT_LIMITS = """**How far to trust it.** Rate setpoints go through a feed-forward controller before
-they are rates: that the rates follow within a few milliseconds says how well it is tuned, and is no
-property of the frame. The flight is short, and the held-out part has no flips in roll: what is gained there
-is a test of pitch and yaw on a few flips. There is no attitude, velocity or position: drag, wind, lift and
-everything that depends on where up is cannot show, and a force in proportion to airspeed in a fast flip can
-pass for an accelerometer that sits off the centre of mass (`imu_offset`). A stochastic rest is to be
-expected, as the accelerometer shakes with the rotors. The mass is a guess, so thrust is known per mass
-only."""
+BETAFLIGHT_LIMITS = """\
+**How far to trust it.** Rate setpoints go through a feed-forward controller before they are rates: that the
+rates follow within a few milliseconds says how well it is tuned, and is no property of the frame. The
+flight is short, and the held-out part has no flips in roll: what is gained there is a test of pitch and yaw
+on a few flips. There is no attitude, velocity or position: drag, wind, lift and everything that depends on
+where up is cannot show, and a force in proportion to airspeed in a fast flip can pass for an accelerometer
+that sits off the centre of mass (`imu_offset`). A stochastic rest is to be expected, as the accelerometer
+shakes with the rotors. The mass is a guess, so thrust is known per mass only."""
 
 
 def page(flown: Craft, acro: Craft) -> str:
@@ -244,7 +255,7 @@ def page(flown: Craft, acro: Craft) -> str:
     learnt, judged = ",".join(LEARNT), ",".join(JUDGED)
     parts = [
         HEAD.format(jax=jax.__version__),
-        CRAZYFLIE_HEAD.format(folder=CRAZYFLIE, learnt=learnt, judged=judged),
+        CRAZYFLIE_HEAD.format(folder=CRAZYFLIE, learnt=learnt, judged=judged, policies=", ".join(JUDGED)),
         section(flown),
         answers_part(flown),
         CRAZYFLIE_LIMITS,
