@@ -6,7 +6,15 @@ from pathlib import Path
 import pytest
 
 DOCS = Path(__file__).parent.parent / "docs"
-PAGES = ("environment.md", "wrappers.md", "effects.md", "gymnasium.md", "identification.md", "real_logs.md")
+PAGES = (
+    "environment.md",
+    "wrappers.md",
+    "effects.md",
+    "gymnasium.md",
+    "identification.md",
+    "real_logs.md",
+    "diagnosis.md",
+)
 
 
 def examples(page: str) -> str:

@@ -1,0 +1,91 @@
+"""The diagnosis of measured flights, and the regression that it is held against."""
+
+import json
+
+import numpy as np
+import pytest
+from real_logs import CRAZYFLIE, shared
+
+from benchmarks.answers import ANSWER_ROWS, answers, velocity_scale
+from benchmarks.real_logs import main
+from flytrack_sysid import FlightLog, diagnose, import_log
+
+DT_S = 0.01
+PARTS = ("seed00053_log2", "seed00067_log1")  # 11 s of two policies
+NEEDS_ACCELEROMETER = {"accelerometer_bias", "accelerometer_scale", "imu_offset"}
+
+
+@pytest.fixture(scope="module")
+def crazyflie():
+    """The diagnosis of two short flights of a Crazyflie, from the nominal model of the importer."""
+    files = [shared(CRAZYFLIE) / f"{name}.csv.gz" for name in PARTS]
+    found = import_log(files, "csv", "crazyflie_phoenix")
+    return diagnose(found.log, found.nominal_model())
+
+
+def test_the_nominal_crazyflie_is_a_sane_start():
+    files = [shared(CRAZYFLIE) / f"{name}.csv.gz" for name in PARTS]
+    found = import_log(files, "csv", "crazyflie_phoenix")
+    model, voltage = found.nominal_model(), found.log["v_bat"].mean()
+    assert np.deg2rad(np.asarray(model.max_rate)) == pytest.approx(np.pi / 3)
+    assert 0.027 <= float(model.m) <= 0.033
+    stick = np.linspace(-1.0, 1.0, 201)
+    c0, c1, c2, c3, c4, c5 = np.asarray(model.thrust_coeffs, float)
+    thrust = c0 + c1 * stick + c2 * stick**2 + c3 * stick**3 + voltage * (c4 + c5 * stick)
+    weight = float(model.m) * float(model.g)
+    assert thrust[0] < 0.2 * weight and 1.5 * weight < thrust[-1] < 6.0 * weight
+
+
+def test_what_the_nominal_crazyflie_certainly_lacks_is_named(crazyflie):
+    assert crazyflie.verdict.startswith("causes_found")
+    causes = {cause.effect: cause for cause in crazyflie.causes}
+    thrust = causes.get("thrust_curve", causes.get("thrust_scale"))
+    assert thrust is not None and thrust.heldout_gain > 0.0  # the nominal one hovers at another stick
+    assert not NEEDS_ACCELEROMETER & set(causes)
+    assert json.loads(json.dumps(crazyflie.as_json(), allow_nan=False))["verdict"] == crazyflie.verdict
+
+
+def test_the_extended_crazyflie_flies_better_where_it_was_not_fitted(crazyflie):
+    nominal, extended = crazyflie.error["nominal"], crazyflie.error["extended"]
+    for channel in ("rates", "velocity"):
+        assert extended.one_step_nrmse[channel] < nominal.one_step_nrmse[channel]
+    for horizon, error in extended.position_m.items():
+        assert error < 0.5 * nominal.position_m[horizon]
+
+
+def test_a_crazyflie_on_its_slow_circle_cannot_show_everything(crazyflie):
+    unseen = {one.effect for one in crazyflie.not_identifiable}
+    assert {"ground_effect", "translational_lift"} <= unseen  # at 1 m, below 2 m/s
+
+
+def made_log(late_rows: int) -> FlightLog:
+    """Return two flights whose rates follow random commands so many rows later."""
+    rng = np.random.default_rng(3)
+    commands = rng.uniform(-1.0, 1.0, (1200, 4))
+    rates = np.roll(commands[:, :3], late_rows, axis=0)
+    segment = np.repeat([0, 1], 600)
+    voltage = 4.0 - 0.5 * ((1.0 + commands[:, 3:]) / 2.0) ** 2
+    channels = {"u": commands, "w": rates, "v": rates, "p": np.cumsum(rates, axis=0) * DT_S, "v_bat": voltage}
+    return FlightLog(np.tile(np.arange(600) * DT_S, 2), channels, segment)
+
+
+def test_answers_are_those_of_the_drone():
+    log = made_log(late_rows=4)
+    steps, errors = answers(log, log.segment == 1)
+    late = (np.arange(ANSWER_ROWS + 1) >= 4).astype(float)
+    for axis in ("roll", "pitch", "yaw"):
+        np.testing.assert_allclose(steps[axis], late, atol=1e-9)
+        assert errors[axis] < 1e-9
+    np.testing.assert_allclose(steps["voltage"], -0.5, atol=1e-9)
+
+
+def test_velocity_that_is_too_small_is_seen():
+    log = made_log(late_rows=0)
+    channels = {**log.channels, "v": 0.5 * log["v"]}
+    found = velocity_scale(FlightLog(log.time, channels, log.segment))
+    assert found == pytest.approx((2.0, 2.0))
+
+
+def test_without_measured_flights_the_page_is_left_alone(tmp_path):
+    with pytest.raises(SystemExit, match="skipped: no measured flights"):
+        main(["--data", str(tmp_path)])
