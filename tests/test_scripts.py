@@ -12,11 +12,11 @@ from handout_plant import HandoutPlant
 from flytrack_env.dynamics import nominal_parameters
 from flytrack_sysid import collect, load_log
 from flytrack_sysid.cli import main
-from flytrack_sysid.diagnosis.lanes import LANE_ROWS
+from flytrack_sysid.diagnosis.lanes import LANE_S
 from flytrack_sysid.diagnosis.next_flight import next_flight
 from flytrack_sysid.diagnosis.plan import LANES_PER_MANOEUVRE
 from flytrack_sysid.envelope import HEIGHTS, SCRIPT_HEIGHTS
-from flytrack_sysid.excitation import FLIGHT_STEPS
+from flytrack_sysid.excitation import DT_S, FLIGHT_STEPS
 from flytrack_sysid.manoeuvres import FLIGHTS_PER_MANOEUVRE, MANOEUVRES, flights_of, hover_action
 from flytrack_sysid.script_file import Script, ScriptError, check_script, load_script, save_script, script_of
 
@@ -33,7 +33,7 @@ def test_every_manoeuvre_can_be_flown_and_says_how():
     check_script(script)
     assert script.kinds == tuple(name for name in MANOEUVRES for _ in range(FLIGHTS_PER_MANOEUVRE))
     assert all(one.how.endswith(".") and len(one.how) > 20 for one in MANOEUVRES.values())
-    assert FLIGHTS_PER_MANOEUVRE * FLIGHT_STEPS == LANES_PER_MANOEUVRE * LANE_ROWS
+    assert FLIGHTS_PER_MANOEUVRE * FLIGHT_STEPS * DT_S == LANES_PER_MANOEUVRE * LANE_S
     flights = script.commands.reshape(-1, FLIGHT_STEPS * 4)
     assert len(np.unique(np.hstack([script.starts, flights]), axis=0)) == len(flights), "no flight twice"
 

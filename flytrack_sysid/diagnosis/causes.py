@@ -16,6 +16,10 @@ from flytrack_sysid.parameters import unit_of
 
 TWO_SIDED_95 = 1.959964
 CHANNELS = (("rates", "attitude"), ("force", "velocity"), (None, "battery"))
+IMMATERIAL = 0.01  # of a lag or a drain
+# A gain on held-out rows is wrong for a true cause where it lies so many standard deviations below what
+# the cause would gain there, and below that share of it.
+HELD_OUT_SIGMAS, HELD_OUT_SHARE = 4.0, 0.3
 LOOSE = 0.25  # of what was known beforehand: a parameter known no better is not determined by the log
 # Equal but for a name: mass, payload, battery and motors all scale the thrust over the mass.
 SCALE_TWINS = ("thrust_curve",)
@@ -26,14 +30,15 @@ def estimates(
 ) -> dict[str, Estimated]:
     """Return values and 95 % intervals of parameters that the log determines, by name without the effect."""
     deviations = Covered(outlook, found, fields).deviations()
-    result = {}
+    result, least = {}, deviations.min()  # of each effect one parameter at least is told
     for field, deviation in zip(fields, deviations, strict=True):
         place = problem.names.index(field)
         value, half = float(found.vector[place]), TWO_SIDED_95 * float(deviation)
         width = problem.high[place] - problem.low[place]
-        if "." in field and deviation > LOOSE * width:
+        if "." in field and deviation > LOOSE * width and deviation > least:
             continue
-        result[field.split(".")[-1]] = Estimated(value, (value - half, value + half), unit_of(field))
+        ends = max(value - half, problem.low[place]), min(value + half, problem.high[place])
+        result[field.split(".")[-1]] = Estimated(value, (float(ends[0]), float(ends[1])), unit_of(field))
     return result
 
 
@@ -75,7 +80,9 @@ def effect_causes(
             for rival, worse in sorted(weight.rivals.items(), key=lambda pair: pair[1])
             if worse < SAME and rival in weight.swaps
         )
-        closest = min(weight.rivals, key=weight.rivals.get, default="")
+        # Refitted where that was worth it, else to first order.
+        rivals = {name: min(weight.rivals.get(name, size), size) for name, size in beside.items()}
+        closest = min(rivals, key=rivals.get, default="")
         causes.append(
             Cause(
                 effect=one.effect,
@@ -85,18 +92,31 @@ def effect_causes(
                 chi2_gain=weight.gain,
                 heldout_gain=held_out_gain(held_out, weight.less.vector, found.vector)[0],
                 lambda_=lambda_,
-                lambda_sep=max(min([weight.rivals.get(closest, lambda_), *beside.values()]), 0.0),
+                lambda_sep=max(rivals.get(closest, lambda_), 0.0),
                 closest=closest,
             )
         )
     return sorted(causes, key=lambda cause: -cause.chi2_gain)
 
 
+def is_contradicted(gain: float, expected: float, inflation: float) -> bool:
+    """Return whether a gain on held-out rows says that what was found is not there.
+
+    expected: what it would be if it were; the spread is that of a chi2 about it.
+    """
+    spread = 2.0 * np.sqrt(max(expected, 1.0) * inflation)
+    return gain < expected - HELD_OUT_SIGMAS * spread and gain < HELD_OUT_SHARE * expected
+
+
 def base_causes(
     problem: Problem, held_out: Problem, outlook: Outlook, found: Found, doubtful: Sequence[str]
-) -> list[Cause]:
-    """Return base parameters that the log contradicts, as causes, without doubtful ones."""
-    causes = []
+) -> tuple[list[Cause], list[str]]:
+    """Return base parameters that the log contradicts, as causes, and names that held-out rows take back.
+
+    doubtful: names that are not given.
+    """
+    causes: list[Cause] = []
+    lost: list[str] = []
     for name, fields in BASE_CAUSES.items():
         wrong = contradiction(problem, outlook, found, fields)
         if wrong is None or name in doubtful:
@@ -105,6 +125,12 @@ def base_causes(
         places = problem.index(acting)
         nominal = found.vector.copy()
         nominal[places] = problem.start[places]
+        if _is_immaterial(name, problem.start[places], found.vector[places]):
+            continue
+        held, expected = _refitted_gain(held_out, problem, outlook, found, places, nominal)
+        if is_contradicted(held, expected, covered.inflation):
+            lost.append(name)
+            continue
         own = name, estimates(problem, outlook, found, acting)
         scaled = _as_scale(problem.start[places], found.vector[places], covered)
         if name == "thrust_curve" and scaled is not None:
@@ -116,12 +142,17 @@ def base_causes(
                 channel=channel_of(problem, nominal, found.vector),
                 parameters=own[1],
                 chi2_gain=gain,
-                heldout_gain=_refitted_gain(held_out, problem, outlook, found, places, nominal),
+                heldout_gain=held,
                 lambda_=gain,
                 lambda_sep=gain,
             )
         )
-    return sorted(causes, key=lambda cause: -cause.chi2_gain)
+    return sorted(causes, key=lambda cause: -cause.chi2_gain), lost
+
+
+def _is_immaterial(name: str, nominal: np.ndarray, values: np.ndarray) -> bool:
+    """Return whether a time constant or drain differs by less than matters; rounding does as much."""
+    return name != "thrust_curve" and bool(np.all(np.abs(values - nominal) < IMMATERIAL * np.abs(nominal)))
 
 
 def _refitted_gain(
@@ -131,8 +162,8 @@ def _refitted_gain(
     found: Found,
     places: Sequence[int],
     nominal: np.ndarray,
-) -> float:
-    """Return the held-out gain over the model with some parameters at nominal and the rest fitted again."""
+) -> tuple[float, float]:
+    """Return ``held_out_gain`` over the model with some parameters at nominal and the rest fitted again."""
     others = [place for place in found.places if place not in set(places)]
     columns = [outlook.places.index(place) for place in others]
     own = [outlook.places.index(place) for place in places]
@@ -140,7 +171,7 @@ def _refitted_gain(
     score = outlook.score[columns] - outlook.total[np.ix_(columns, own)] @ change
     less = nominal.copy()
     less[others] += solve(outlook.total[np.ix_(columns, columns)], score)
-    return held_out_gain(held_out, problem.clipped(less[None])[0], found.vector)[0]
+    return held_out_gain(held_out, problem.clipped(less[None])[0], found.vector)
 
 
 def _as_scale(nominal: np.ndarray, values: np.ndarray, covered: Covered) -> Estimated | None:
@@ -162,7 +193,8 @@ def sensor_noise(problem: Problem) -> dict[str, list[float]]:
     found = {}
     for side, names in enumerate(CHANNELS):
         for name, values in zip(names, (noise.direct, noise.level), strict=True):
-            if name is not None:
-                own = np.asarray(values)[edges[side] : edges[side + 1]]
+            axes = slice(edges[side], edges[side + 1])
+            if name is not None and problem.counts[..., axes, (*names,).index(name)].any():
+                own = np.asarray(values)[axes]
                 found[name] = [float(f"{value:.4g}") for value in own]
     return found

@@ -10,12 +10,18 @@ import numpy as np
 
 from flytrack_env.dynamics import ModelParameters, nominal_parameters
 from flytrack_env.effects import BY_NAME, effect_of
-from flytrack_sysid.diagnosis.causes import base_causes, effect_causes, held_out_gain, sensor_noise
+from flytrack_sysid.diagnosis.causes import (
+    base_causes,
+    effect_causes,
+    held_out_gain,
+    is_contradicted,
+    sensor_noise,
+)
 from flytrack_sysid.diagnosis.errors import errors_of
 from flytrack_sysid.diagnosis.lanes import make_lanes
 from flytrack_sysid.diagnosis.limits import unseen
 from flytrack_sysid.diagnosis.linear import Outlook
-from flytrack_sysid.diagnosis.pipeline import Settled, settled
+from flytrack_sysid.diagnosis.pipeline import Settled, settled, taken_back
 from flytrack_sysid.diagnosis.plan import advise
 from flytrack_sysid.diagnosis.problem import Problem
 from flytrack_sysid.diagnosis.result import (
@@ -29,15 +35,12 @@ from flytrack_sysid.diagnosis.result import (
     Unexplained,
 )
 from flytrack_sysid.diagnosis.search import Found, full_outlook
-from flytrack_sysid.diagnosis.weigh import Weighed, settle, without
+from flytrack_sysid.diagnosis.weigh import Weighed
 from flytrack_sysid.log import FlightLog
 from flytrack_sysid.parameters import as_float32, from_vector
 from flytrack_sysid.split import HELD_OUT_EVERY, held_out_rows
 
 STAGES = ("search", "held-out rows", "what the log cannot show", "errors")
-# A gain on held-out rows is wrong for a true cause where it lies so many standard deviations below what
-# the cause would gain there, and below that share of it.
-HELD_OUT_SIGMAS, HELD_OUT_SHARE = 4.0, 0.3
 
 
 class DiagnosisError(ValueError):
@@ -45,7 +48,9 @@ class DiagnosisError(ValueError):
 
 
 def check_log(log: FlightLog) -> None:
-    """Raise DiagnosisError for a log that says nothing of how the drone turns and moves."""
+    """Raise DiagnosisError for a log without rows, or that says nothing of how the drone turns."""
+    if not len(log):
+        raise DiagnosisError(f"{log.source}: found 0 rows, expected some seconds of flight")
     if "w" not in log and "q" not in log:
         found = ", ".join(log.channels)
         raise DiagnosisError(
@@ -116,10 +121,9 @@ def _found(
     result, lost = _held(result, judge)
     report(2, len(STAGES))
     outlook = full_outlook(problem, result.found.vector)
-    causes = [
-        *effect_causes(problem, judge, outlook, result.found, result.weighed),
-        *base_causes(problem, judge, outlook, result.found, result.doubtful),
-    ]
+    of_base, lost_of_base = base_causes(problem, judge, outlook, result.found, result.doubtful)
+    causes = [*effect_causes(problem, judge, outlook, result.found, result.weighed), *of_base]
+    lost += lost_of_base
     limits = _limits(problem, outlook, result.found, causes)
     report(3, len(STAGES))
     vectors = {"nominal": problem.start, "refitted_base": result.base.vector, "extended": result.found.vector}
@@ -148,22 +152,23 @@ def _found(
 
 def _held(result: Settled, judge: Problem) -> tuple[Settled, list[str]]:
     """Return the result without effects that held-out rows contradict, and their names."""
-    lost = [
-        effect for effect, weight in result.weighed.items() if _is_contradicted(judge, weight, result.found)
-    ]
-    if not lost:
-        return result, []
-    found = result.found
-    for effect in lost:
-        found = without(result.problem, found, effect)
-    found, weighed = settle(result.problem, found)
-    return result._replace(found=found, weighed=weighed), lost
+    lost: list[str] = []
+    while True:
+        now = [
+            effect
+            for effect, weight in result.weighed.items()
+            if _is_contradicted(judge, weight, result.found)
+        ]
+        if not now:
+            return result, lost
+        lost += now
+        found, weighed = taken_back(result.problem, result.found, now)
+        result = result._replace(found=found, weighed=weighed)
 
 
 def _is_contradicted(judge: Problem, weight: Weighed, found: Found) -> bool:
     gain, expected = held_out_gain(judge, weight.less.vector, found.vector)
-    spread = 2.0 * np.sqrt(max(expected, 1.0) * weight.inflation)
-    return gain < expected - HELD_OUT_SIGMAS * spread and gain < HELD_OUT_SHARE * expected
+    return is_contradicted(gain, expected, weight.inflation)
 
 
 def _with_lost(rest: Unexplained, lost: Sequence[str]) -> Unexplained:

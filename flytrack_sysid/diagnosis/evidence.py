@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 from flytrack_env.dynamics import ModelParameters
-from flytrack_env.effects import BY_NAME
+from flytrack_env.effects import BY_NAME, ThrustScale
 from flytrack_sysid.parameters import DRAIN, STICKS, TAUS, THRUST_COEFFS, names_of, to_vector, with_values
 
 # Causes that are no effect: numbers of the base model, by name.
@@ -179,6 +179,8 @@ def without(extended: ModelParameters, nominal: ModelParameters, cause: str) -> 
     Raises:
         KeyError: no cause of that name.
     """
+    if cause == "thrust_scale" and all(type(one) is not ThrustScale for one in extended.effects):
+        cause = "thrust_curve"  # found as one factor between two curves
     if cause not in BASE_CAUSES:
         return extended.with_effects(BY_NAME[cause].parameters())
     before = dict(zip(names_of(nominal), to_vector(nominal).tolist(), strict=True))

@@ -13,8 +13,9 @@ from scipy.spatial.transform import Rotation
 from flytrack_sysid.log import FlightLog
 from flytrack_sysid.record import LARGEST_DOUBT, Record, applied_doubt, make_record
 
-LEAD_IN_ROWS = 100
-LANE_ROWS = 500
+LEAD_IN_S, LANE_S = 1, 5
+PIECES = LEAD_IN_S + LANE_S  # of a second each, the lead-in first
+FEWEST_ROWS_PER_S = 20
 LANES_PADDED_TO = 2  # logs of about the same length share one compiled program
 # Axes of a residual: rotation x, y, z, force x, y, z (all world), battery. Channels of an axis: one that is
 # measured directly, and a level, of which that is the rate of change.
@@ -42,11 +43,22 @@ class Lanes(NamedTuple):
     quanta: np.ndarray
 
 
-def _index(num_rows: int) -> np.ndarray:
+def rows_per_second(record: Record) -> int:
+    """Return how many rows of a record last about a second: a round number, so that programs are shared."""
+    rate = 1.0 / float(np.median(record.step_s[record.source_row >= 0]))
+    return max(FEWEST_ROWS_PER_S, int(float(f"{rate:.2g}")))
+
+
+def lead_in_of(rows: int) -> int:
+    """Return how many of a lane's rows are its lead-in."""
+    return rows * LEAD_IN_S // PIECES
+
+
+def _index(num_rows: int, rate: int) -> np.ndarray:
     """Return the record's row at each place of the lanes, (rows, lanes); -1 where there is none."""
-    lanes = -(-num_rows // LANE_ROWS)
+    lanes = -(-num_rows // (LANE_S * rate))
     lanes += -lanes % LANES_PADDED_TO
-    places = np.arange(-LEAD_IN_ROWS, LANE_ROWS)[:, None] + LANE_ROWS * np.arange(lanes)
+    places = np.arange(-LEAD_IN_S * rate, LANE_S * rate)[:, None] + LANE_S * rate * np.arange(lanes)
     return np.where((places >= 0) & (places < num_rows), places, -1)
 
 
@@ -99,8 +111,8 @@ def make_lanes(log: FlightLog, judged: np.ndarray, tau: np.ndarray, gravity: flo
         "v": lifts & exists,
         "v_bat": exists,
     }
-    index = _index(1 + int(np.flatnonzero(record.source_row >= 0)[-1]))
-    is_real = (index >= 0) & (np.arange(len(index)) >= LEAD_IN_ROWS)[:, None]
+    index = _index(1 + int(np.flatnonzero(record.source_row >= 0)[-1]), rows_per_second(record))
+    is_real = (index >= 0) & (np.arange(len(index)) >= lead_in_of(len(index)))[:, None]
     found = measured_of(log, record, gravity)
     counts = np.stack(
         [

@@ -10,6 +10,7 @@ from flytrack_sysid.diagnosis.search import Found
 
 DETECTED = 30.0  # lambda from which a log shows an effect nearly always
 SEPARATE = 20.0  # lambda beside a rival from which it tells the two apart
+NOTHING = 1e-6  # of that: rounding
 BASE_ONLY = ("thrust_scale",)  # told apart from the free thrust curve by no log: a cause of the base
 
 
@@ -60,6 +61,7 @@ class Seen:
             others = [one for one in given if one != column]
             across = total[others, column]
             own = total[column, column] - across @ solve(total[np.ix_(others, others)], across)
+            own -= self.outlook.prior[column]  # which is no word of the log
             found[number] = max(float(own), 0.0) * self.sizes[number] ** 2
         return found
 
@@ -88,7 +90,8 @@ def unseen(outlook: Outlook, found: Found) -> dict[str, Limit]:
         if lambdas[worst] >= DETECTED:
             continue
         field = seen.fields[worst].split(".")[1]
-        smallest = effect.notable[field] * np.sqrt(DETECTED / max(lambdas[worst], 1e-300))
+        known = lambdas[worst] > DETECTED * NOTHING
+        smallest = effect.notable[field] * np.sqrt(DETECTED / lambdas[worst]) if known else np.inf
         alike = look_alikes(outlook, given, seen) if lambdas[worst] > 0.0 else ()
         result[effect.name] = (float(smallest), effect.ranges[field].unit, alike)
     return result

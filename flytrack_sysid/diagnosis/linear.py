@@ -12,6 +12,7 @@ from flytrack_sysid.diagnosis.problem import Problem, Slopes, blocks_of, robust_
 
 # A direction of which the others leave less than this share is not told apart from them.
 LEAST_OWN_SHARE = 1e-7
+AT_BOUND = 1e-9
 PROBE_PRIOR = 1e-2  # a step to a probe is known to be less than ten times that
 
 
@@ -117,6 +118,22 @@ class Outlook:
         """Return the step along columns that explains most, nothing else moving."""
         columns = list(columns)
         return solve(self.total[np.ix_(columns, columns)], self.score[columns])
+
+    def step_inside(self) -> np.ndarray:
+        """Return the step along all places that explains most within bounds: what is stuck there stays."""
+        problem, places = self.problem, np.array(self.places)
+        low, high, now = problem.low[places], problem.high[places], self.vector[places]
+        room = AT_BOUND * np.maximum(np.abs(now), 1.0)
+        free, step = np.ones(len(places), bool), np.zeros(len(places))
+        while free.any():
+            step[:] = 0.0
+            step[free] = self.step(np.flatnonzero(free))
+            stuck = free & (((now <= low + room) & (step < 0.0)) | ((now >= high - room) & (step > 0.0)))
+            if not stuck.any():
+                break
+            free &= ~stuck
+            step[stuck] = 0.0
+        return step
 
     def gain(self, added: Sequence[int], given: Sequence[int]) -> Gain | None:
         """Return what freeing ``added`` columns besides ``given`` ones gains; None where those do the same.

@@ -1,5 +1,6 @@
 """From a log to a settled model: noise, search, settling."""
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -85,9 +86,15 @@ def _without_stand_ins(problem: Problem, base: Found, found: Found, weighed: dic
         dropped = [name for name in doubtful if name in weighed]
         if not dropped:
             return Settled(problem, base, found, weighed, rest, tuple(doubtful))
-        for effect in dropped:
-            found = without(problem, found, effect)
-        found, weighed = settle(problem, found)
+        found, weighed = taken_back(problem, found, dropped)
+
+
+def taken_back(problem: Problem, found: Found, effects: Sequence[str]) -> tuple[Found, dict[str, Weighed]]:
+    """Return the model without some effects, which are not to come again, settled."""
+    problem.refused = (*problem.refused, *effects)
+    for effect in effects:
+        found = without(problem, found, effect)
+    return settle(problem, found)
 
 
 def _suspects(problem: Problem, found: Found, weighed: dict[str, Weighed]) -> list[Suspect]:

@@ -16,7 +16,7 @@ from flytrack_env.dynamics import ModelParameters
 from flytrack_env.plants import Simulator
 from flytrack_env.state import pack, unpack, unpack_action
 from flytrack_sysid.diagnosis.candidates import opened
-from flytrack_sysid.diagnosis.lanes import LANE_ROWS, Lanes, make_lanes
+from flytrack_sysid.diagnosis.lanes import LANE_S, Lanes, make_lanes
 from flytrack_sysid.diagnosis.limits import DETECTED, SEPARATE, Seen
 from flytrack_sysid.diagnosis.linear import Outlook
 from flytrack_sysid.diagnosis.problem import Problem
@@ -28,7 +28,7 @@ from flytrack_sysid.manoeuvres import FLIGHTS_PER_MANOEUVRE, MANOEUVRES, flights
 from flytrack_sysid.parameters import TAUS, from_vector
 from flytrack_sysid.record import BATTERY_UNKNOWN_V, UPRIGHT
 
-LANES_PER_MANOEUVRE = FLIGHTS_PER_MANOEUVRE * FLIGHT_STEPS // LANE_ROWS
+LANES_PER_MANOEUVRE = int(FLIGHTS_PER_MANOEUVRE * FLIGHT_STEPS * DT_S) // LANE_S
 NOTHING = 1e-2  # of what shows an effect: less is what the log's own prior says
 ABOUT = 0.8  # of the best share: what comes so near is as good, and what is easier to fly comes first
 

@@ -13,12 +13,11 @@ import numpy as np
 from flytrack_env.dynamics import ModelParameters
 from flytrack_env.effects import EFFECTS, effect_of
 from flytrack_sysid.diagnosis import noise as noises
-from flytrack_sysid.diagnosis.lanes import LANE_ROWS, LEAD_IN_ROWS, Lanes
+from flytrack_sysid.diagnosis.lanes import LANE_S, Lanes, lead_in_of
 from flytrack_sysid.diagnosis.said import unexplained
 from flytrack_sysid.parameters import TAUS, bounds_of, names_of, to_vector
 
 BATCH, FEW = 20, 4
-BLOCK_ROWS = 100  # a second at 100 Hz: what hangs together at most
 RELATIVE_STEP = 1e-6  # of a parameter's scale, for slopes
 
 
@@ -66,6 +65,7 @@ class Problem:
         )
         self.noise: np.ndarray | None = None
         self.barred: tuple[str, ...] = ()  # effects that the log cannot be asked about
+        self.refused: tuple[str, ...] = ()  # effects that were taken back, and are not to come again
         self.held: tuple[str, ...] = ()  # base parameters that stay nominal
 
     def set_noise(self, sought: np.ndarray) -> None:
@@ -141,7 +141,10 @@ def robust_square(left: np.ndarray) -> float:
 
 def blocks_of(values: np.ndarray) -> np.ndarray:
     """Return (..., rows, lanes, axes, 2) as (blocks, ..., numbers), a second each, without the lead-in."""
-    kept = values[..., LEAD_IN_ROWS:, :, :, :]
-    pieces, lanes = LANE_ROWS // BLOCK_ROWS, kept.shape[-3]
-    split = kept.reshape(*kept.shape[:-4], pieces, BLOCK_ROWS, lanes, -1)
-    return np.moveaxis(split, (-4, -2), (0, 1)).reshape(pieces * lanes, *kept.shape[:-4], -1)
+    rows, lanes = values.shape[-4:-2]
+    kept = values[..., lead_in_of(rows) :, :, :, :]
+    second = kept.shape[-4] // LANE_S
+    split = kept.reshape(*kept.shape[:-4], LANE_S, second, lanes, kept.shape[-2] * 2)
+    return np.moveaxis(split, (-4, -2), (0, 1)).reshape(
+        LANE_S * lanes, *kept.shape[:-4], second * kept.shape[-2] * 2
+    )

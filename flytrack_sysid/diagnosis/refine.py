@@ -29,7 +29,7 @@ def refine(
     since, is_fresh = outlook.cost, nearby is None
     for _ in range(MOST_ROUNDS):
         tried = np.repeat(outlook.vector[None], len(SHARES), axis=0)
-        tried[:, places] += SHARES[:, None] * outlook.step(range(len(places)))
+        tried[:, places] += SHARES[:, None] * outlook.step_inside()
         tried = problem.clipped(tried)
         white = _white(problem, tried)
         costs = cost_of(problem, tried, white)

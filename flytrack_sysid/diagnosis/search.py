@@ -16,6 +16,7 @@ PER_PARAMETER = 4.0  # of chi2: what one more parameter has to gain to be prefer
 MOST_EFFECTS = 6
 CLOSE = 0.6  # of the best gain: who comes so near to first order is refitted before one is chosen
 MOST_REFITTED = 4
+MOST_TURNS = 3  # of refits that come to nothing before a search ends
 PROMISING = 0.7  # of the threshold, to first order
 
 
@@ -76,7 +77,7 @@ def scores(problem: Problem, outlook: Outlook, found: Found) -> list[Scored]:
     present = {one.effect for one in found.chosen}
     best: dict[str, Scored] = {}
     for candidate in CANDIDATES:
-        if candidate.effect in present or candidate.effect in problem.barred:
+        if candidate.effect in present or candidate.effect in (*problem.barred, *problem.refused):
             continue
         gain = outlook.gain(outlook.columns_of(candidate), given)
         if gain is None or (candidate.probe is not None and gain.step[0] <= 0.0):
@@ -103,15 +104,28 @@ def begun(problem: Problem, outlook: Outlook, found: Found, scored: Scored) -> n
 
 def add_best(problem: Problem, found: Found, outlook: Outlook) -> Found | None:
     """Return the model with the effect added that explains most; None where none explains enough."""
-    ranked = scores(problem, outlook, found)
-    near = [one for one in ranked[:MOST_REFITTED] if one.merit > CLOSE * ranked[0].merit]
-    tried = []
-    for one in near:
-        if one.gain.robust < PROMISING * threshold(one.gain.count):
-            continue
-        chosen = (*found.chosen, one.candidate)
-        trial = fitted(problem, chosen, begun(problem, outlook, found, one), outlook)
-        gain = (found.cost - trial.cost) / one.gain.inflation
-        if gain > threshold(one.gain.count):
-            tried.append((gain - PER_PARAMETER * one.gain.count, trial))
-    return max(tried, key=lambda pair: pair[0])[1] if tried else None
+    ranked = [
+        one
+        for one in scores(problem, outlook, found)
+        if one.gain.robust > PROMISING * threshold(one.gain.count)
+    ]
+    for _ in range(MOST_TURNS):
+        near = [one for one in ranked[:MOST_REFITTED] if one.merit > CLOSE * ranked[0].merit]
+        trials = [_tried(problem, found, outlook, one) for one in near]
+        good = [trial for trial in trials if trial is not None]
+        if good:
+            return max(good, key=lambda pair: pair[0])[1]
+        ranked = ranked[max(len(near), 1) :]
+        if not ranked:
+            break
+    return None
+
+
+def _tried(problem: Problem, found: Found, outlook: Outlook, one: Scored) -> tuple[float, Found] | None:
+    """Return the merit of a model with an effect more, and the model; None if it gains too little."""
+    chosen = (*found.chosen, one.candidate)
+    trial = fitted(problem, chosen, begun(problem, outlook, found, one), outlook)
+    gain = (found.cost - trial.cost) / one.gain.inflation
+    if gain <= threshold(one.gain.count):
+        return None
+    return gain - PER_PARAMETER * one.gain.count, trial

@@ -58,6 +58,8 @@ def stand_ins(
                 more.append(blocks_of(whitened(problem, constants(flight, side), side) * sums.root))
                 sums.given = np.concatenate([sums.given, *more], axis=1)
             after[side] = sums.lambda_of(columns, one.size)
+        if not any(before.values()):
+            continue  # it acts on neither side: the battery
         own_side = max(before, key=before.get)
         least = threshold(one.count)
         is_gone = sum(after.values()) < max(KEPT_SHARE * sum(before.values()), least)

@@ -24,7 +24,7 @@ from scipy.spatial.transform import Rotation
 from flytrack_env.dynamics import ModelParameters, lag
 from flytrack_env.effects import EFFECTS
 from flytrack_env.state import Action
-from flytrack_sysid.diagnosis.lanes import LEAD_IN_ROWS, Lanes, make_lanes
+from flytrack_sysid.diagnosis.lanes import Lanes, lead_in_of, make_lanes
 from flytrack_sysid.diagnosis.problem import Problem
 from flytrack_sysid.log import FlightLog
 from flytrack_sysid.parameters import to_vector
@@ -141,7 +141,7 @@ class _Rows(NamedTuple):
 
 
 def _rows_of(lanes: Lanes) -> _Rows:
-    row = np.where((np.arange(len(lanes.row)) >= LEAD_IN_ROWS)[:, None], lanes.row, -1)
+    row = np.where((np.arange(len(lanes.row)) >= lead_in_of(len(lanes.row)))[:, None], lanes.row, -1)
     lane, place = np.nonzero(row.T >= 0)  # lane after lane is the record's order
     return _Rows((place, lane), np.flatnonzero(lanes.record.source_row[place, lane] >= 0))
 

@@ -7,7 +7,7 @@ import numpy as np
 from scipy import ndimage, stats
 
 from flytrack_sysid.diagnosis import noise as noises
-from flytrack_sysid.diagnosis.lanes import LEAD_IN_ROWS
+from flytrack_sysid.diagnosis.lanes import lead_in_of
 from flytrack_sysid.diagnosis.problem import Problem, blocks_of
 from flytrack_sysid.diagnosis.regressors import SIDES, Flown, dependences
 from flytrack_sysid.diagnosis.result import Unexplained
@@ -130,7 +130,7 @@ def lines(problem: Problem, found: Found) -> list[tuple[str, float, float]]:
         if not counts.any():
             continue
         body = np.einsum("rlji,rlj->rli", flight.body_to_world, left[..., axes, 0]) * counts[..., None]
-        series = np.swapaxes(body[LEAD_IN_ROWS:], 0, 1).reshape(-1, 3)
+        series = np.swapaxes(body[lead_in_of(len(body)) :], 0, 1).reshape(-1, 3)
         step_s = float(np.median(noises.step_to(problem.lanes)))
         power = (np.abs(np.fft.rfft(series, axis=0)) ** 2).max(axis=1)
         frequency = np.fft.rfftfreq(len(series), step_s)

@@ -23,6 +23,7 @@ from flytrack_sysid.parameters import neutral_value
 SAME = 10.0  # of chi2: a rival that explains so nearly as much cannot be told apart
 MOST_RIVALS = 3
 NEARLY = 60.0  # of chi2, to first order: rivals that come so near are refitted
+NEAR_SHARE = 0.15  # of the gain: a large change is not one of first order
 PROBE_SHARE = 0.25  # of the gain: first order says less of what is looked for at probes
 
 
@@ -69,7 +70,8 @@ def weigh(problem: Problem, found: Found, outlook: Outlook, effect: str) -> Weig
     ranked = [one for one in scores(problem, seen, less) if one.candidate.effect != effect]
     for number, one in enumerate(ranked):
         rivals[one.candidate.effect] = gain - one.gain.chi2
-        close = max(NEARLY, PROBE_SHARE * gain) if one.candidate.probe is not None else NEARLY
+        share = PROBE_SHARE if one.candidate.probe is not None else NEAR_SHARE
+        close = max(NEARLY, share * gain)
         if number < MOST_RIVALS and gain - one.gain.chi2 < close:
             swap = _swapped(problem, less, seen, one)
             rivals[one.candidate.effect] = swap.cost - found.cost
