@@ -102,7 +102,7 @@ def _in_training_only(rng: Rng) -> Case:
 
 
 def residuals_of(truth: Truth, log: FlightLog) -> tuple[np.ndarray, np.ndarray]:
-    """Return accelerometer and gyro of a clean log less what the plant says without effects, (num_rows, 3)."""
+    """Return a clean log's accelerometer and gyro less what the plant without effects says, (num_rows, 3)."""
     sticks = np.vstack([log["u"][:1], log["u"][:-1]])
     keep = np.exp(-DT_S / np.array(truth.tau))
     applied = np.stack(
