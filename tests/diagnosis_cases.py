@@ -6,7 +6,7 @@ and the effect itself where no rival comes near (SEPARATE).
 """
 
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -197,10 +197,13 @@ def names_of(found: Mapping[str, Any]) -> set[str]:
     return {cause["effect"] for cause in found["causes"]}
 
 
-def faults(hidden: Mapping[str, Sequence], causes: Sequence[Mapping[str, Any]]) -> list[str]:
+def faults(
+    there: Collection[str], hidden: Mapping[str, Sequence], causes: Sequence[Mapping[str, Any]]
+) -> list[str]:
     """Return what is wrong with causes, a line each.
 
-    hidden: by effect what the log could show: lambda, lambda beside the closest rival, and that rival.
+    there: the plant's hidden effects. hidden: by effect what the log could show: lambda, lambda beside the
+    closest rival, and that rival; without a scale of thrust, which the oracle leaves to the thrust curve.
     """
     classes = {cause["effect"]: {cause["effect"], *cause["equivalent"]} for cause in causes}
     result = []
@@ -212,6 +215,6 @@ def faults(hidden: Mapping[str, Sequence], causes: Sequence[Mapping[str, Any]]) 
             result.append(f"{how} is not named itself")
     rivals = {rival for _, beside, rival in hidden.values() if beside <= SEPARATE}
     for name, alike in classes.items():
-        if not alike & set(hidden) and name not in rivals:
+        if not alike & set(there) and name not in rivals:
             result.append(f"{name} is named and is not there")
     return result
