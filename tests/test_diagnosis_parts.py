@@ -1,0 +1,221 @@
+"""Parts of the diagnosis: its noise filter, its lanes, and what it does with logs that say too little."""
+
+import json
+from dataclasses import replace
+
+import jax
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from benchmarks.diagnosis import model_of
+from benchmarks.hidden import draw_base, fly, measure
+from flytrack_env.dynamics import nominal_parameters
+from flytrack_env.effects import CommandDelay, LinearDrag, SecondOrderRates
+from flytrack_env.plants import Simulator
+from flytrack_sysid import collect
+from flytrack_sysid.diagnosis import DiagnosisError, diagnose, joined
+from flytrack_sysid.diagnosis import noise as noises
+from flytrack_sysid.diagnosis.lanes import LANE_ROWS, LEAD_IN_ROWS, NUM_AXES, make_lanes
+from flytrack_sysid.diagnosis.problem import Problem
+from flytrack_sysid.record import make_record
+from flytrack_sysid.replay import replay
+
+SECONDS, DT_S = 40.0, 0.01
+BATTERY = NUM_AXES - 1  # it has no direct channel
+# Of the sensors, rad/s, m/s^2, rad, m/s, V; and of gusts that shake both sides.
+DIRECT = np.repeat([0.1, 1.5, 1.0], [3, 3, 1])
+LEVEL = np.repeat([0.01, 0.05, 0.01], [3, 3, 1])
+DISTURBANCE = np.repeat([0.1, 1.5, 1e-3], [3, 3, 1])
+WANDER, TAU_S = 0.1 * LEVEL, 0.3
+
+
+@pytest.fixture(scope="module")
+def flown():
+    """A hidden plant without effects, and what its sensors log."""
+    rng = np.random.default_rng(3)
+    truth = draw_base(rng)
+    return truth, measure(fly(truth, "scripted", SECONDS, rng), "sensors", rng)
+
+
+@pytest.fixture(scope="module")
+def lanes(flown):
+    """All rows of that log."""
+    truth, log = flown
+    return make_lanes(log, np.ones(len(log), bool), np.array(truth.tau), truth.gravity)
+
+
+@pytest.fixture(scope="module")
+def disturbed(lanes):
+    """Residuals of white sensors and a disturbance that the drone feels, (rows, lanes, NUM_AXES, 2)."""
+    rng, keep = np.random.default_rng(4), np.exp(-DT_S / TAU_S)
+    count = 1 + int(lanes.row.max())
+    fresh = rng.standard_normal((count, NUM_AXES))
+    acting = [fresh[0]]
+    for row in fresh[1:]:
+        acting.append(keep * acting[-1] + np.sqrt(1.0 - keep**2) * row)
+    acting = DISTURBANCE * np.array(acting)
+    walk = WANDER * np.sqrt(DT_S) * rng.standard_normal((count, NUM_AXES))
+    level = np.cumsum(acting * DT_S + walk, axis=0) + LEVEL * rng.standard_normal((count, NUM_AXES))
+    direct = acting + DIRECT * rng.standard_normal((count, NUM_AXES))
+    series = np.stack([direct, np.diff(level, axis=0, prepend=level[:1])], axis=-1)
+    return series[lanes.row] * lanes.is_joined[..., None, None]
+
+
+def true_noise() -> noises.Noise:
+    """Return the noise that those residuals have."""
+    ones = np.ones(NUM_AXES)
+    return noises.Noise(DIRECT, LEVEL, WANDER, DISTURBANCE, TAU_S * ones, ones)
+
+
+def whitened(lanes, left, noise: noises.Noise) -> np.ndarray:
+    """Return innovations; not a number where nothing counts."""
+    with jax.enable_x64(True):
+        gains = noises.make_gains(noise, noises.step_to(lanes), lanes.is_known, lanes.counts)
+        found = np.array(noises.innovations(gains, left, lanes.counts))
+    found[~lanes.counts] = np.nan
+    return found
+
+
+def correlation(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """Return the mean product over rows and lanes where both are there; 0 where none are."""
+    product = first * second
+    return np.nansum(product, axis=(0, 1)) / np.maximum(np.isfinite(product).sum(axis=(0, 1)), 1)
+
+
+def test_innovations_are_white_and_of_variance_one(lanes, disturbed):
+    found = whitened(lanes, disturbed, true_noise())
+    counting = lanes.counts.any(axis=(0, 1))
+    assert counting.sum() == 2 * NUM_AXES - 1
+    sigmas = 5.0 / np.sqrt(lanes.counts.sum(axis=(0, 1))[counting])
+    assert np.all(np.abs(correlation(found, found)[counting] - 1.0) < np.sqrt(2.0) * sigmas)
+    for lag in (1, 2, 10):
+        assert np.all(np.abs(correlation(found[lag:], found[:-lag])[counting]) < sigmas)
+    assert np.all(np.abs(correlation(found[..., 0], found[..., 1])[:BATTERY]) < sigmas[0])
+
+
+def test_a_filter_without_the_disturbance_leaves_it(lanes, disturbed):
+    still = true_noise()._replace(disturbance=1e-3 * DIRECT)
+    found = whitened(lanes, disturbed, still)[..., :BATTERY, :]
+    assert np.all(correlation(found[1:], found[:-1])[:, 0] > 0.2)
+
+
+def test_the_noise_of_residuals_is_found_again(lanes, disturbed):
+    with jax.enable_x64(True):
+        found = jax.tree.map(np.asarray, noises.noise_of(noises.fit_noise(lanes, disturbed)))
+    moving = slice(0, BATTERY)
+    np.testing.assert_allclose(found.direct[moving], DIRECT[moving], rtol=0.08)
+    np.testing.assert_allclose(found.level, LEVEL, rtol=0.15)
+    np.testing.assert_allclose(found.disturbance[moving], DISTURBANCE[moving], rtol=0.3)
+    np.testing.assert_allclose(np.log(found.tau[moving] / TAU_S), 0.0, atol=np.log(2.0))
+    assert np.all(found.coupling[moving] > 0.6)
+
+
+def test_lanes_hold_every_row_once_behind_what_leads_in(flown, lanes):
+    _, log = flown
+    record = make_record(log)
+    own = lanes.row[LEAD_IN_ROWS:].T.ravel()
+    np.testing.assert_array_equal(own[own >= 0], np.arange(1 + np.flatnonzero(record.source_row >= 0)[-1]))
+    np.testing.assert_array_equal(lanes.row[:LEAD_IN_ROWS, 1:], lanes.row[LANE_ROWS:, :-1])
+    assert not lanes.counts[:LEAD_IN_ROWS].any()
+    measured = np.append(record.source_row, -1)[lanes.row] >= 0
+    assert (
+        not lanes.counts[~measured].any() and lanes.counts[measured & (lanes.row > 0)][:, 0, 1].mean() > 0.4
+    )
+
+
+def test_lanes_say_what_one_long_replay_says(flown, lanes):
+    truth, log = flown
+    model = model_of(truth).with_effects(
+        CommandDelay(0.013), SecondOrderRates(0.01), LinearDrag(0.3, 0.3, 0.1)
+    )
+    with jax.enable_x64(True):
+        problem = Problem(lanes, model)
+        left = problem.left(problem.start[None])[0]
+        like = jax.tree.map(lambda leaf: np.asarray(leaf, float), model)
+        record = make_record(log)
+        said = jax.tree.map(np.asarray, jax.jit(replay)(like, record, np.ones(len(record.step_s), bool)))
+    before = Rotation.from_quat(np.roll(record.quat, 1, axis=0), scalar_first=True)
+    source = record.source_row
+    expected = {
+        (0, 0): before.apply(log["w"][source] - said.rates_b),
+        (3, 0): before.apply(log["f"][source] - said.force_b),
+        (3, 1): np.diff(record.vel_w, axis=0, prepend=record.vel_w[:1])
+        - said.acc_w * np.roll(record.step_s, 1)[:, None],
+    }
+    for (axis, channel), one in expected.items():
+        axes = slice(axis, axis + 3)
+        counts = lanes.counts[..., axes, channel]
+        # In multiples of the noise; what came before the lead-in is forgotten to a millionth of full stick.
+        error = (left[..., axes, channel] - one[lanes.row]) / (DIRECT, LEVEL)[channel][axes]
+        assert counts[LEAD_IN_ROWS].any() and np.abs(error[counts]).max() < 1e-3
+
+
+def test_the_simulator_leaves_nothing_of_its_own_log():
+    log = collect(Simulator(), 1.0, 5)
+    log = log.select(log.segment % 3 != 2)
+    model = nominal_parameters()
+    with jax.enable_x64(True):
+        found = make_lanes(log, np.ones(len(log), bool), np.asarray(model.tau, float), float(model.g))
+        problem = Problem(found, model)
+        left = problem.left(problem.start[None])[0]
+    # The log is in float32: positions of 60 m, speeds of 20 m/s, 24 V.
+    largest = np.where(found.counts, np.abs(left), 0.0).max(axis=(0, 1))
+    assert np.all(largest[:3] < 2e-5) and np.all(largest[3:6, 0] < 1e-3) and np.all(largest[3:6, 1] < 2e-5)
+    assert largest[BATTERY, 1] < 5e-6
+
+
+def test_a_log_without_turns_is_refused(flown):
+    log = replace(flown[1].without("w", "q"), source="flight.csv")
+    with pytest.raises(
+        DiagnosisError, match=r"flight\.csv: found channels .*v_bat.*expected w \(gyro\) or q"
+    ):
+        diagnose(log)
+
+
+@pytest.mark.parametrize("held_out", [np.zeros(3, bool), np.zeros((5, 1), bool), 1, np.zeros(5)])
+def test_held_out_rows_of_another_shape_are_refused(flown, held_out):
+    log = flown[1].select(slice(0, 5))
+    with pytest.raises(DiagnosisError, match=r"held_out: found .* expected bool of \(5,\)"):
+        diagnose(log, held_out=held_out)
+
+
+def assert_refused_or_silent(log, **given) -> None:
+    """Check that a log that says too little is refused, or that nothing is made of it."""
+    try:
+        found = diagnose(log, **given)
+    except DiagnosisError as error:
+        assert "found" in str(error) and "expected" in str(error)
+        return
+    assert found.causes == () and not found.unexplained.flagged
+    json.dumps(found.as_json(), allow_nan=False)
+
+
+def test_a_log_without_rows_is_refused(flown):
+    with pytest.raises(DiagnosisError, match="found 0 rows"):
+        diagnose(flown[1].select(slice(0, 0)))
+
+
+@pytest.mark.slow  # programs of their own have to be compiled
+@pytest.mark.parametrize("rows", [1, 2, 5, 40])
+def test_nothing_is_made_of_a_few_rows(flown, rows):
+    assert_refused_or_silent(flown[1].select(slice(0, rows)), model=model_of(flown[0]))
+
+
+@pytest.mark.slow
+def test_nothing_is_learnt_from_what_is_held_out(flown):
+    log = flown[1]
+    assert_refused_or_silent(log, model=model_of(flown[0]), held_out=np.ones(len(log), bool))
+
+
+def test_logs_are_joined_by_what_they_all_have(flown):
+    first = replace(flown[1].select(slice(0, 30)), source="folder/a.npz")
+    segments = np.repeat([4, 7], 10)
+    second = replace(flown[1].select(slice(30, 50)).without("f"), segment=segments, source="b.npz")
+    both = joined([first, second])
+    assert sorted(both.channels) == sorted(set(first.channels) - {"f"}) and both.source == "a.npz + b.npz"
+    np.testing.assert_array_equal(both.segment, np.repeat([0, 1, 2], [30, 10, 10]))
+    np.testing.assert_array_equal(both["w"], np.concatenate([first["w"], second["w"]]))
+    assert joined([first]) is first
+    with pytest.raises(DiagnosisError, match="logs: found none"):
+        joined([])
