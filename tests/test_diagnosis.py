@@ -165,7 +165,7 @@ def test_a_hover_cannot_tell_wind_from_tilt(found) -> None:
     }
     assert any(both <= alike for alike in classes) or any(both <= alike for alike in unclear)
     flights = [limit for limit in one["not_identifiable"] if limit["effect"] in both]
-    assert flights and all(isinstance(limit["fly"], str) and limit["fly"] for limit in flights)
+    assert "headings" in [limit["fly"] for limit in flights]
 
 
 def test_what_no_list_has_is_flagged_and_not_named(found, cases) -> None:

@@ -16,12 +16,13 @@ from flytrack_env.plants import Simulator
 from flytrack_sysid import collect
 from flytrack_sysid.diagnosis import DiagnosisError, diagnose, joined
 from flytrack_sysid.diagnosis import noise as noises
-from flytrack_sysid.diagnosis.lanes import LANE_ROWS, LEAD_IN_ROWS, NUM_AXES, make_lanes
+from flytrack_sysid.diagnosis.lanes import LANE_S, LEAD_IN_S, NUM_AXES, make_lanes
 from flytrack_sysid.diagnosis.problem import Problem
 from flytrack_sysid.record import make_record
 from flytrack_sysid.replay import replay
 
 SECONDS, DT_S = 40.0, 0.01
+RATE = 100  # rows a second
 BATTERY = NUM_AXES - 1  # it has no direct channel
 # Of the sensors, rad/s, m/s^2, rad, m/s, V; and of gusts that shake both sides.
 DIRECT = np.repeat([0.1, 1.5, 1.0], [3, 3, 1])
@@ -114,10 +115,10 @@ def test_the_noise_of_residuals_is_found_again(lanes, disturbed):
 def test_lanes_hold_every_row_once_behind_what_leads_in(flown, lanes):
     _, log = flown
     record = make_record(log)
-    own = lanes.row[LEAD_IN_ROWS:].T.ravel()
+    own = lanes.row[LEAD_IN_S * RATE :].T.ravel()
     np.testing.assert_array_equal(own[own >= 0], np.arange(1 + np.flatnonzero(record.source_row >= 0)[-1]))
-    np.testing.assert_array_equal(lanes.row[:LEAD_IN_ROWS, 1:], lanes.row[LANE_ROWS:, :-1])
-    assert not lanes.counts[:LEAD_IN_ROWS].any()
+    np.testing.assert_array_equal(lanes.row[: LEAD_IN_S * RATE, 1:], lanes.row[LANE_S * RATE :, :-1])
+    assert not lanes.counts[: LEAD_IN_S * RATE].any()
     measured = np.append(record.source_row, -1)[lanes.row] >= 0
     assert (
         not lanes.counts[~measured].any() and lanes.counts[measured & (lanes.row > 0)][:, 0, 1].mean() > 0.4
@@ -148,7 +149,7 @@ def test_lanes_say_what_one_long_replay_says(flown, lanes):
         counts = lanes.counts[..., axes, channel]
         # In multiples of the noise; what came before the lead-in is forgotten to a millionth of full stick.
         error = (left[..., axes, channel] - one[lanes.row]) / (DIRECT, LEVEL)[channel][axes]
-        assert counts[LEAD_IN_ROWS].any() and np.abs(error[counts]).max() < 1e-3
+        assert counts[LEAD_IN_S * RATE].any() and np.abs(error[counts]).max() < 1e-3
 
 
 def test_the_simulator_leaves_nothing_of_its_own_log():

@@ -4,6 +4,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from flytrack_env.dynamics import collective_thrust
 from flytrack_sysid.diagnosis import noise as noises
 from flytrack_sysid.diagnosis.base import BASE_CAUSES, Covered, contradiction
 from flytrack_sysid.diagnosis.lanes import SIZES
@@ -16,7 +17,9 @@ from flytrack_sysid.parameters import unit_of
 
 TWO_SIDED_95 = 1.959964
 CHANNELS = (("rates", "attitude"), ("force", "velocity"), (None, "battery"))
+BY_CHANCE = 3.0  # times SAME: so much a chi2 that is expected below SAME hardly ever is
 IMMATERIAL = 0.01  # of a lag or a drain
+IMMATERIAL_THRUST = 0.003  # of the weight, rms over what was flown
 # A gain on held-out rows is wrong for a true cause where it lies so many standard deviations below what
 # the cause would gain there, and below that share of it.
 HELD_OUT_SIGMAS, HELD_OUT_SHARE = 4.0, 0.3
@@ -56,6 +59,14 @@ def channel_of(problem: Problem, less: np.ndarray, full: np.ndarray) -> str:
     return max(power, key=power.get)
 
 
+def _is_same(worse: float, left_beside: float) -> bool:
+    """Return whether a log cannot tell a rival apart: it explains as much, or chance alone decides.
+
+    worse: the rival's model, of chi2. left_beside: of lambda, with the rival taken out.
+    """
+    return worse < SAME or (left_beside < SAME and worse < BY_CHANCE * SAME)
+
+
 def held_out_gain(held_out: Problem, less: np.ndarray, full: np.ndarray) -> tuple[float, float]:
     """Return what a model gains over a lesser one on other rows, and what it would if it were right there."""
     white = held_out.whiten(held_out.left(np.stack([less, full])))
@@ -78,7 +89,7 @@ def effect_causes(
         twins = tuple(
             rival
             for rival, worse in sorted(weight.rivals.items(), key=lambda pair: pair[1])
-            if worse < SAME and rival in weight.swaps
+            if rival in weight.swaps and _is_same(worse, beside.get(rival, lambda_))
         )
         # Refitted where that was worth it, else to first order.
         rivals = {name: min(weight.rivals.get(name, size), size) for name, size in beside.items()}
@@ -125,7 +136,7 @@ def base_causes(
         places = problem.index(acting)
         nominal = found.vector.copy()
         nominal[places] = problem.start[places]
-        if _is_immaterial(name, problem.start[places], found.vector[places]):
+        if _is_immaterial(problem, name, found):
             continue
         held, expected = _refitted_gain(held_out, problem, outlook, found, places, nominal)
         if is_contradicted(held, expected, covered.inflation):
@@ -150,9 +161,16 @@ def base_causes(
     return sorted(causes, key=lambda cause: -cause.chi2_gain), lost
 
 
-def _is_immaterial(name: str, nominal: np.ndarray, values: np.ndarray) -> bool:
-    """Return whether a time constant or drain differs by less than matters; rounding does as much."""
-    return name != "thrust_curve" and bool(np.all(np.abs(values - nominal) < IMMATERIAL * np.abs(nominal)))
+def _is_immaterial(problem: Problem, name: str, found: Found) -> bool:
+    """Return whether a lag, drain or thrust curve differs by less than matters; rounding does as much."""
+    places = problem.index(BASE_CAUSES[name])
+    change = found.vector[places] - problem.start[places]
+    if name != "thrust_curve":
+        return bool(np.all(np.abs(change) < IMMATERIAL * np.abs(problem.start[places])))
+    record = problem.lanes.record
+    thrust = np.asarray(collective_thrust(record.command[..., 3], record.battery_v, change))
+    weight = float(problem.like.m) * float(problem.like.g)
+    return float(np.sqrt(np.mean(thrust[problem.counts.any(axis=(2, 3))] ** 2))) < IMMATERIAL_THRUST * weight
 
 
 def _refitted_gain(

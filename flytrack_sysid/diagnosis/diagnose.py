@@ -183,25 +183,21 @@ def _limits(
 ) -> list[NotIdentifiable]:
     """Return what the log could not have shown, and causes it cannot tell from others, with what to fly."""
     limits = unseen(outlook, found)
-    twins = {
-        cause.effect: cause.equivalent
-        for cause in causes
-        if cause.equivalent and cause.effect in BY_NAME and cause.effect != "thrust_scale"
-    }
-    shown = set(twins) | {one for names in twins.values() for one in names}
-    wanted = {name: alike for name, (_, _, alike) in limits.items() if name not in shown} | twins
+    twins: dict[str, tuple[str, ...]] = {}
+    for cause in causes:
+        if cause.effect in BY_NAME and cause.equivalent and cause.effect != "thrust_scale":
+            twins[cause.effect] = cause.equivalent
+            twins |= {name: (cause.effect,) for name in cause.equivalent}
+    wanted = {name: alike for name, (_, _, alike) in limits.items()} | twins
     flights = {name: TO_LOG + " and ".join(BY_NAME[name].needs) for name in problem.barred}
     asked = {name: alike for name, alike in wanted.items() if name not in problem.barred}
     if asked:
         flights |= advise(problem, found, outlook, asked)
     result = []
     for name, alike in wanted.items():
-        if name in limits:
-            smallest, unit, _ = limits[name]
-        else:
-            cause = next(cause for cause in causes if cause.effect == name)
-            one = next(iter(cause.parameters.values()))
-            smallest, unit = abs(one.value), one.unit
+        field = next(iter(BY_NAME[name].notable))
+        # Of a twin of what was found there is no such size: none is its own.
+        smallest, unit = limits[name][:2] if name in limits else (np.inf, BY_NAME[name].ranges[field].unit)
         result.append(NotIdentifiable(name, smallest, unit, tuple(alike), flights[name]))
     return result
 

@@ -31,6 +31,7 @@ from flytrack_sysid.record import BATTERY_UNKNOWN_V, UPRIGHT
 LANES_PER_MANOEUVRE = int(FLIGHTS_PER_MANOEUVRE * FLIGHT_STEPS * DT_S) // LANE_S
 NOTHING = 1e-2  # of what shows an effect: less is what the log's own prior says
 ABOUT = 0.8  # of the best share: what comes so near is as good, and what is easier to fly comes first
+PLENTY = 2.0  # shares: twice what shows an effect
 
 
 @jax.jit
@@ -162,13 +163,13 @@ class Question:
 
 
 def _best(shares: Mapping[str, np.ndarray]) -> str:
-    """Return the manoeuvre with the largest worst share; the easiest of those that are about as good.
+    """Return the easiest manoeuvre whose shares are plenty, or about as large as those of the best.
 
-    Where the worst shows in no manoeuvre, the next one decides.
+    The best has the largest worst share; where the worst shows in no manoeuvre, the next one decides.
     """
     floored = {name: np.where(own < NOTHING, 0.0, own) for name, own in shares.items()}
     best = max(floored.values(), key=lambda own: own.tolist())
-    return next(name for name, own in floored.items() if np.all(own >= ABOUT * best))
+    return next(name for name, own in floored.items() if np.all(own >= np.minimum(ABOUT * best, PLENTY)))
 
 
 def advise(
