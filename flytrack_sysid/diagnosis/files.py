@@ -3,10 +3,12 @@
 import json
 from pathlib import Path
 
+import numpy as np
+
 from flytrack_env import __version__, save_model
 from flytrack_env.files import write_atomically
 from flytrack_sysid.diagnosis.report import write_report
-from flytrack_sysid.diagnosis.result import Diagnosis
+from flytrack_sysid.diagnosis.result import TO_LOG, Diagnosis
 from flytrack_sysid.log import FlightLog
 
 JSON_NAME, MODEL_NAME, REPORT_NAME = "diagnosis.json", "extended_model.json", "report.html"
@@ -49,8 +51,8 @@ def text_of(diagnosis: Diagnosis) -> str:
     if diagnosis.unexplained.flagged:
         lines.append(f"unexplained, depends on: {', '.join(diagnosis.unexplained.depends_on)}")
     for one in diagnosis.not_identifiable:
+        below = f" below {one.smallest:.3g} {one.unit}" if np.isfinite(one.smallest) else ""
         alike = f", looks like {', '.join(one.confused_with)}" if one.confused_with else ""
-        lines.append(
-            f"not shown by this log: {one.effect} below {one.smallest:.3g} {one.unit}{alike}; fly {one.fly}"
-        )
+        to_do = one.fly if one.fly.startswith(TO_LOG) else f"fly {one.fly}"
+        lines.append(f"not shown by this log: {one.effect}{below}{alike}; {to_do}")
     return "\n".join([*lines, *diagnosis.warnings])
