@@ -5,6 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from flytrack_env.dynamics import collective_thrust
 from flytrack_sysid.diagnosis.linear import Outlook, inflation_of, solve
 from flytrack_sysid.diagnosis.problem import Problem
 from flytrack_sysid.diagnosis.search import (
@@ -21,6 +22,8 @@ from flytrack_sysid.parameters import DRAIN, TAUS, THRUST_COEFFS
 
 # What a base parameter that differs is called.
 BASE_CAUSES = {**{name: (name,) for name in TAUS}, "thrust_curve": THRUST_COEFFS, "battery_drain": (DRAIN,)}
+IMMATERIAL = 0.01  # of a lag or a drain
+IMMATERIAL_THRUST = 0.003  # of the weight, rms over what was flown
 HOPELESS = 0.01  # of the cost, above the limit to first order: not worth a fit
 
 
@@ -42,6 +45,18 @@ class Covered:
         return np.sqrt(np.diag(solve(self.information, np.eye(len(self.information)))) * self.inflation)
 
 
+def _is_immaterial(problem: Problem, fields: Sequence[str], found: Found) -> bool:
+    """Return whether a lag, drain or thrust curve differs by less than matters; rounding does as much."""
+    places = problem.index(fields)
+    change = found.vector[places] - problem.start[places]
+    if fields != THRUST_COEFFS:
+        return bool(np.all(np.abs(change) < IMMATERIAL * np.abs(problem.start[places])))
+    record = problem.lanes.record
+    thrust = np.asarray(collective_thrust(record.command[..., 3], record.battery_v, change))
+    weight = float(problem.like.m) * float(problem.like.g)
+    return float(np.sqrt(np.mean(thrust[problem.counts.any(axis=(2, 3))] ** 2))) < IMMATERIAL_THRUST * weight
+
+
 class Contradiction(NamedTuple):
     """Base parameters that differ from the nominal ones: names, information, and chi2 of the difference."""
 
@@ -53,11 +68,11 @@ class Contradiction(NamedTuple):
 def contradiction(
     problem: Problem, outlook: Outlook, found: Found, fields: Sequence[str]
 ) -> Contradiction | None:
-    """Return how the log contradicts the nominal values of some base parameters; None where it does not."""
+    """Return how the log contradicts nominal values of base parameters; None where it does not, or hardly."""
     acting = [
         field for field in fields if field not in problem.held and outlook.acting([outlook.column(field)])
     ]
-    if not acting:
+    if not acting or _is_immaterial(problem, fields, found):
         return None
     places = problem.index(acting)
     covered = Covered(outlook, found, acting)

@@ -4,7 +4,6 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from flytrack_env.dynamics import collective_thrust
 from flytrack_sysid.diagnosis import noise as noises
 from flytrack_sysid.diagnosis.base import BASE_CAUSES, Covered, contradiction
 from flytrack_sysid.diagnosis.lanes import SIZES
@@ -18,8 +17,6 @@ from flytrack_sysid.parameters import unit_of
 TWO_SIDED_95 = 1.959964
 CHANNELS = (("rates", "attitude"), ("force", "velocity"), (None, "battery"))
 BY_CHANCE = 3.0  # times SAME: so much a chi2 that is expected below SAME hardly ever is
-IMMATERIAL = 0.01  # of a lag or a drain
-IMMATERIAL_THRUST = 0.003  # of the weight, rms over what was flown
 # A gain on held-out rows is wrong for a true cause where it lies so many standard deviations below what
 # the cause would gain there, and below that share of it.
 HELD_OUT_SIGMAS, HELD_OUT_SHARE = 4.0, 0.3
@@ -136,8 +133,6 @@ def base_causes(
         places = problem.index(acting)
         nominal = found.vector.copy()
         nominal[places] = problem.start[places]
-        if _is_immaterial(problem, name, found):
-            continue
         held, expected = _refitted_gain(held_out, problem, outlook, found, places, nominal)
         if is_contradicted(held, expected, covered.inflation):
             lost.append(name)
@@ -159,18 +154,6 @@ def base_causes(
             )
         )
     return sorted(causes, key=lambda cause: -cause.chi2_gain), lost
-
-
-def _is_immaterial(problem: Problem, name: str, found: Found) -> bool:
-    """Return whether a lag, drain or thrust curve differs by less than matters; rounding does as much."""
-    places = problem.index(BASE_CAUSES[name])
-    change = found.vector[places] - problem.start[places]
-    if name != "thrust_curve":
-        return bool(np.all(np.abs(change) < IMMATERIAL * np.abs(problem.start[places])))
-    record = problem.lanes.record
-    thrust = np.asarray(collective_thrust(record.command[..., 3], record.battery_v, change))
-    weight = float(problem.like.m) * float(problem.like.g)
-    return float(np.sqrt(np.mean(thrust[problem.counts.any(axis=(2, 3))] ** 2))) < IMMATERIAL_THRUST * weight
 
 
 def _refitted_gain(
