@@ -40,7 +40,7 @@ EXPECTED = {
     "ground_effect": {"low_passes"},
     "rate_saturation": {"stick_amplitudes", "spins"},
     "rate_expo": {"stick_amplitudes", "fast_switching"},
-    "imu_offset": {"spins", "fast_switching", "stick_amplitudes"},
+    "imu_offset": {"spins", "fast_switching"},
     "linear_drag": {"speeds"},
     "yaw_reaction": {"thrust_steps"},
     "gyro_scale": {"spins", "stick_amplitudes"},

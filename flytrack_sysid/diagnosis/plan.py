@@ -31,7 +31,7 @@ from flytrack_sysid.record import BATTERY_UNKNOWN_V, UPRIGHT
 LANES_PER_MANOEUVRE = int(FLIGHTS_PER_MANOEUVRE * FLIGHT_STEPS * DT_S) // LANE_S
 NOTHING = 1e-2  # of what shows an effect: less is what the log's own prior says
 ABOUT = 0.8  # of the best share: what comes so near is as good, and what is easier to fly comes first
-PLENTY = 2.0  # shares: twice what shows an effect
+PLENTY = 30.0  # shares: thirty times what shows an effect
 
 
 @jax.jit
