@@ -14,6 +14,7 @@ Line = dict[str, Any]
 CONTROLS = ("clean", "heavy", "coloured", "gusts")
 SHOWN, SEPARATE, HIDDEN = 30.0, 20.0, 8.0  # lambda
 NOTABLE = 0.2  # of the noise: error that a new flight shows
+OTHER_LAW = ("translational_lift",)  # its gain is another one's: the plants' law ends elsewhere
 VISIBLE = 10.0  # standard deviations of an effect outside the list: it was there, and flown
 
 
@@ -81,6 +82,7 @@ def figures(by_row: dict[str, list[Line]]) -> list[tuple[str, str, str]]:
         for row in ("one", "two", "three")
         for line in by_row[row]
         for cause in line["causes"]
+        if cause["effect"] not in OTHER_LAW
         for value in cause["covers"]
     ]
     outside = [line for line in by_row["outside"] if line["visible"] >= VISIBLE]
