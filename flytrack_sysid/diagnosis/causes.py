@@ -20,6 +20,7 @@ BY_CHANCE = 3.0  # times SAME: so much a chi2 that is expected below SAME hardly
 # A gain on held-out rows is wrong for a true cause where it lies so many standard deviations below what
 # the cause would gain there, and below that share of it.
 HELD_OUT_SIGMAS, HELD_OUT_SHARE = 4.0, 0.3
+OF_LAW = 0.01  # of an effect's gain: no more is its law's remainder
 LOOSE = 0.25  # of what was known beforehand: a parameter known no better is not determined by the log
 # Equal but for a name: mass, payload, battery and motors all scale the thrust over the mass.
 SCALE_TWINS = ("thrust_curve",)
@@ -104,7 +105,13 @@ def effect_causes(
                 closest=closest,
             )
         )
-    return sorted(causes, key=lambda cause: -cause.chi2_gain)
+    kept = [
+        cause
+        for cause in causes
+        # Found in place of a thrust curve.
+        if cause.effect != "thrust_scale" or not _is_remainder(cause.chi2_gain, cause.channel, causes)
+    ]
+    return sorted(kept, key=lambda cause: -cause.chi2_gain)
 
 
 def is_contradicted(gain: float, expected: float, inflation: float) -> bool:
@@ -117,11 +124,17 @@ def is_contradicted(gain: float, expected: float, inflation: float) -> bool:
 
 
 def base_causes(
-    problem: Problem, held_out: Problem, outlook: Outlook, found: Found, doubtful: Sequence[str]
+    problem: Problem,
+    held_out: Problem,
+    outlook: Outlook,
+    found: Found,
+    doubtful: Sequence[str],
+    effects: Sequence[Cause],
 ) -> tuple[list[Cause], list[str]]:
     """Return base parameters that the log contradicts, as causes, and names that held-out rows take back.
 
-    doubtful: names that are not given.
+    doubtful: names that are not given. effects: causes that were found; their laws are not exact, and what
+    gains next to nothing beside one that shows in the same place is its remainder.
     """
     causes: list[Cause] = []
     lost: list[str] = []
@@ -137,6 +150,9 @@ def base_causes(
         if is_contradicted(held, expected, covered.inflation):
             lost.append(name)
             continue
+        channel = channel_of(problem, nominal, found.vector)
+        if _is_remainder(gain, channel, effects):
+            continue
         own = name, estimates(problem, outlook, found, acting)
         scaled = _as_scale(problem.start[places], found.vector[places], covered)
         if name == "thrust_curve" and scaled is not None:
@@ -145,7 +161,7 @@ def base_causes(
             Cause(
                 effect=own[0],
                 equivalent=SCALE_TWINS if own[0] == "thrust_scale" else (),
-                channel=channel_of(problem, nominal, found.vector),
+                channel=channel,
                 parameters=own[1],
                 chi2_gain=gain,
                 heldout_gain=held,
@@ -154,6 +170,12 @@ def base_causes(
             )
         )
     return sorted(causes, key=lambda cause: -cause.chi2_gain), lost
+
+
+def _is_remainder(gain: float, channel: str, others: Sequence[Cause]) -> bool:
+    """Return whether a gain is next to nothing beside that of a cause that shows in the same place."""
+    side = next(names for names in CHANNELS if channel in names)
+    return gain < OF_LAW * max((one.chi2_gain for one in others if one.channel in side), default=0.0)
 
 
 def _refitted_gain(

@@ -121,8 +121,9 @@ def _found(
     result, lost = _held(result, judge)
     report(2, len(STAGES))
     outlook = full_outlook(problem, result.found.vector)
-    of_base, lost_of_base = base_causes(problem, judge, outlook, result.found, result.doubtful)
-    causes = [*effect_causes(problem, judge, outlook, result.found, result.weighed), *of_base]
+    effects = effect_causes(problem, judge, outlook, result.found, result.weighed)
+    of_base, lost_of_base = base_causes(problem, judge, outlook, result.found, result.doubtful, effects)
+    causes = [*effects, *of_base]
     lost += lost_of_base
     limits = _limits(problem, outlook, result.found, causes)
     report(3, len(STAGES))
