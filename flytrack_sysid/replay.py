@@ -35,7 +35,7 @@ class Replay(NamedTuple):
     battery_change_v: jax.Array
 
 
-def _drone(row: Record, applied: Action, rates_b: Vec3) -> Drone:
+def drone_of(row: Record, applied: Action, rates_b: Vec3) -> Drone:
     """Return the drone as measured, with the applied action and rates of the replay."""
     return Drone(
         pos_w=Vec3(*row.pos_w),
@@ -48,7 +48,8 @@ def _drone(row: Record, applied: Action, rates_b: Vec3) -> Drone:
     )
 
 
-def _chosen(condition: jax.Array, yes: Any, no: Any) -> Any:
+def chosen(condition: jax.Array, yes: Any, no: Any) -> Any:
+    """Return one of two trees, leaf by leaf."""
     return jax.tree.map(partial(jnp.where, condition), yes, no)
 
 
@@ -63,7 +64,7 @@ def replay(model: ModelParameters, record: Record, turns_afresh: jax.Array) -> R
     applied, rates_b, memories = _remembered(model, record)
 
     def said_of_next(row: Record, applied: Action, rates_b: Vec3, memories: tuple) -> tuple:
-        drone = _drone(row, applied, rates_b)
+        drone = drone_of(row, applied, rates_b)
         after, _ = advance(drone, memories, Action(*row.command), row.step_s, model)
         force_w = after.acc_w + Vec3(0.0, 0.0, model.g)
         force_b = Vec3(*(axis.dot(force_w) for axis in drone.quat.axes()))
@@ -90,14 +91,14 @@ def _remembered(model: ModelParameters, record: Record) -> tuple[Action, Vec3, t
 
     def next_row(carry: tuple, row: Record) -> tuple:
         applied, rates_b, memories = carry
-        applied = _chosen(row.begins | row.is_applied_known, Action(*row.applied), applied)
-        drone = _drone(row, applied, rates_b)
-        memories = _chosen(row.begins, start_memories(model.effects, drone), memories)
+        applied = chosen(row.begins | row.is_applied_known, Action(*row.applied), applied)
+        drone = drone_of(row, applied, rates_b)
+        memories = chosen(row.begins, start_memories(model.effects, drone), memories)
         after, later = advance(drone, memories, Action(*row.command), row.step_s, model)
         return (after.applied, after.rates_b, later), (applied, rates_b, memories)
 
     first = jax.tree.map(lambda column: column[0], record)
-    drone = _drone(first, Action(*first.applied), Vec3(*jnp.zeros_like(first.vel_w)))
+    drone = drone_of(first, Action(*first.applied), Vec3(*jnp.zeros_like(first.vel_w)))
     start = (drone.applied, drone.rates_b, start_memories(model.effects, drone))
     return jax.lax.scan(next_row, start, record)[1]
 
@@ -107,7 +108,7 @@ def _turned(record: Record, rates_b: Vec3, is_fresh: jax.Array) -> Quaternion:
 
     def next_row(quat: Quaternion, inputs: tuple) -> tuple:
         measured, rates_b, step_s, is_fresh = inputs
-        quat = _chosen(is_fresh, measured, quat)
+        quat = chosen(is_fresh, measured, quat)
         return integrate_attitude(quat, rates_b, step_s), quat
 
     measured = Quaternion(*record.quat.T)

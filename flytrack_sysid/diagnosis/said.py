@@ -14,9 +14,6 @@ The measured attitude, velocity, position and voltage are fed into the model row
 from the commands alone (applied action, rates, what effects remember) is carried on by the model.
 """
 
-from functools import partial
-from typing import Any
-
 import jax
 import jax.numpy as jnp
 
@@ -27,22 +24,7 @@ from flytrack_env.state import Action, Drone
 from flytrack_sysid.diagnosis.lanes import Lanes
 from flytrack_sysid.parameters import from_vector
 from flytrack_sysid.record import Record
-
-
-def _drone(row: Record, applied: Action, rates_b: Vec3) -> Drone:
-    return Drone(
-        pos_w=Vec3(*row.pos_w),
-        vel_w=Vec3(*row.vel_w),
-        acc_w=Vec3(*jnp.zeros_like(row.vel_w)),
-        quat=Quaternion(*row.quat),
-        rates_b=rates_b,
-        applied=applied,
-        battery_v=row.battery_v,
-    )
-
-
-def _chosen(condition: jax.Array, yes: Any, no: Any) -> Any:
-    return jax.tree.map(partial(jnp.where, condition), yes, no)
+from flytrack_sysid.replay import chosen, drone_of
 
 
 def _turn(measured: Quaternion, said: Quaternion) -> Vec3:
@@ -79,16 +61,16 @@ def _of_lane(model: ModelParameters, lane: Record, sensed: dict[str, jax.Array])
     def step(carry: tuple, inputs: tuple) -> tuple:
         row, next_row, sensed = inputs
         applied, rates_b, memories = carry
-        applied = _chosen(row.begins | row.is_applied_known, Action(*row.applied), applied)
-        drone = _drone(row, applied, rates_b)
-        memories = _chosen(row.begins, start_memories(model.effects, drone), memories)
+        applied = chosen(row.begins | row.is_applied_known, Action(*row.applied), applied)
+        drone = drone_of(row, applied, rates_b)
+        memories = chosen(row.begins, start_memories(model.effects, drone), memories)
         after, memories = advance(drone, memories, Action(*row.command), row.step_s, model)
         read = read_sensors(drone, after, memories, row.step_s, model)
         found = _of_step(row, next_row, drone, after, read, sensed)
         return (after.applied, after.rates_b, memories), found
 
     first = jax.tree.map(lambda column: column[0], lane)
-    drone = _drone(first, Action(*first.applied), Vec3(*jnp.zeros_like(first.vel_w)))
+    drone = drone_of(first, Action(*first.applied), Vec3(*jnp.zeros_like(first.vel_w)))
     start = (drone.applied, drone.rates_b, start_memories(model.effects, drone))
     found = jax.lax.scan(step, start, (rows, later, sensed))[1]
     return jnp.concatenate([jnp.zeros_like(found[:1]), found])
