@@ -29,6 +29,10 @@ FLOORS = np.array([[1e-4] * 3 + [1e-3] * 3 + [1.0], [1e-5] * 3 + [1e-4] * 3 + [1
 UNIFORM = 12.0**-0.5  # standard deviation of rounding, over the last digit
 LEAST_SHARE = 1e-3  # of a disturbance and of a wander, against the noise: below, there is none
 TAU_RANGE_S = (0.02, 5.0)
+# The search: damping of its steps, as they fail and as they help; and where it ends.
+FIRST_DAMPING, MORE, LESS = 1e-2, 10.0, 0.2
+MOST_ROUNDS = 12
+ENOUGH = 0.3  # of minus twice the log likelihood: less than what one parameter is off by
 OUTLIER = 4.0  # innovations beyond count by their size, not its square
 
 
@@ -205,11 +209,6 @@ def disturbance_gain(lanes: Lanes, left: np.ndarray, sought: np.ndarray) -> np.n
 @jax.jit
 def _total(sought: jax.Array, *given: jax.Array) -> jax.Array:
     return _misfit(sought, *given).total
-
-
-FIRST_DAMPING, MORE, LESS = 1e-2, 10.0, 0.2
-MOST_ROUNDS = 12
-ENOUGH = 0.3  # of minus twice the log likelihood: less than what one parameter is off by
 
 
 def fit_noise(lanes: Lanes, left: np.ndarray, start: np.ndarray | None = None) -> np.ndarray:

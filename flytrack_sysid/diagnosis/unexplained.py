@@ -33,7 +33,6 @@ class Dependence(NamedTuple):
     side: str
     gain: float
     share: float
-    features_w: np.ndarray
     columns: np.ndarray
 
 
@@ -111,7 +110,7 @@ def _greedy(
                 continue
             gain = chi2 / inflation - 2.0 * count
             if best is None or gain > best.gain:
-                best = Dependence(name, side, gain, size / own_noise, features[name], one)
+                best = Dependence(name, side, gain, size / own_noise, one)
         if best is None:
             break
         result.append(best)
