@@ -82,9 +82,10 @@ def test_ground_effect_is_cheeseman_and_bennetts_from_two_radii_on():
     radius = 0.2
     for height in (2 * radius, 4 * radius, 20 * radius):
         theirs = 1.0 / (1.0 - (radius / (4 * height)) ** 2)
-        found = lift_ratio(GroundEffect((radius / 4) ** 2), height=height)
+        found = lift_ratio(GroundEffect(1 / 16, radius), height=height)
         assert found - 1.0 == pytest.approx(theirs - 1.0, rel=0.25)
-    assert lift_ratio(GroundEffect((radius / 4) ** 2), height=0.0) == pytest.approx(1 + 1 / 16, rel=1e-4)
+    assert lift_ratio(GroundEffect(0.2, radius), height=0.0) == pytest.approx(1.2, rel=1e-4)
+    assert lift_ratio(GroundEffect(0.2, radius), height=radius) == pytest.approx(1.1, rel=1e-4)
 
 
 def test_thrust_tilt_pushes_sideways_in_proportion_to_thrust():

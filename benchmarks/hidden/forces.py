@@ -37,7 +37,7 @@ def _translational_lift(values: Parameters) -> Callable[[Any, float], float]:
 def _ground_effect(values: Parameters) -> Callable[[Any, float], float]:
     """T *= 1 + gain exp(-z / height_m).
 
-    Not the package's law, which is Cheeseman and Bennett's 1 / z^2.
+    Not the package's law, which falls off with 1 / z^2.
     """
     gain, height = values["gain"], values["height_m"]
     return lambda plant, thrust: thrust * (1.0 + gain * math.exp(-max(plant.pos_w[2], 0.0) / height))

@@ -7,31 +7,31 @@ import jax.numpy as jnp
 from flytrack_env.effects.base import Effect, Flight, Range
 from flytrack_env.quaternion import Scalar
 
-# (radius / 4)^2 times this is the radius squared: below one radius the gain levels off.
-RADII = 16.0
-# m^2, keeps 0 / 0 away where there is no effect and no height; far below any rotor's.
-TINY_AREA = 1e-12
-
 
 class GroundEffect(NamedTuple):
-    """Area, m^2: the square of a quarter of the radius of one rotor that stands for all four."""
+    """Share of the thrust gained on the ground, 1, and the height at which half of it is left, m.
 
-    area: Scalar = 0.0
+    Of one rotor the gain is about 1/16 and the height its radius; a whole quadcopter gains more.
+    """
+
+    gain: Scalar = 0.0
+    height_m: Scalar = 0.3
 
 
 def _thrust(ground: GroundEffect, memory: None, thrust_n: Scalar, flight: Flight) -> Scalar:
-    height = jnp.maximum(flight.drone.pos_w.z, 0.0)
-    near = ground.area / (height * height + RADII * jnp.abs(ground.area) + TINY_AREA)
-    return thrust_n * (1.0 + near)
+    heights = jnp.maximum(flight.drone.pos_w.z, 0.0) / ground.height_m
+    return thrust_n * (1.0 + ground.gain / (1.0 + heights * heights))
 
 
 GROUND_EFFECT = Effect(
     name="ground_effect",
     parameters=GroundEffect,
-    ranges={"area": Range(-0.01, 0.01, "m^2")},
-    notable={"area": 0.001},
+    ranges={"gain": Range(-0.5, 0.5, "1"), "height_m": Range(0.05, 2.0, "m")},
+    notable={"gain": 0.05},
     needs=("p",),
-    equation="T *= 1 + area / (z^2 + 16 area)",
-    source="I. C. Cheeseman, W. E. Bennett, ARC R&M 3021, 1955, to first order in area / z^2, levelled off",
+    equation="T *= 1 + gain / (1 + (z / height_m)^2)",
+    source="I. C. Cheeseman, W. E. Bennett, ARC R&M 3021, 1955, to first order in (radius / 4 z)^2 = "
+    "gain (height_m / z)^2, levelled off",
+    shapes=("height_m",),
     thrust=_thrust,
 )
