@@ -17,6 +17,7 @@ from flytrack_sysid.diagnosis.causes import (
     is_contradicted,
     sensor_noise,
 )
+from flytrack_sysid.diagnosis.cautions import cautions
 from flytrack_sysid.diagnosis.errors import errors_of
 from flytrack_sysid.diagnosis.lanes import make_lanes
 from flytrack_sysid.diagnosis.limits import unseen
@@ -144,10 +145,7 @@ def _found(
         source=Path(log.source).name,
         sha256=log.sha256,
         seconds=0.0,
-        warnings=tuple(
-            f"{name} gained nothing on the held-out part: it was there for a time only, or never"
-            for name in lost
-        ),
+        warnings=cautions(problem, result.found, causes, errors, lost),
     )
 
 
