@@ -14,7 +14,7 @@ from flytrack_env.dynamics import nominal_parameters
 from flytrack_env.effects import CommandDelay, LinearDrag, SecondOrderRates
 from flytrack_env.plants import Simulator
 from flytrack_sysid import collect
-from flytrack_sysid.diagnosis import DiagnosisError, diagnose, joined
+from flytrack_sysid.diagnosis import DiagnosisError, diagnose, joined, regressors
 from flytrack_sysid.diagnosis import noise as noises
 from flytrack_sysid.diagnosis.lanes import LANE_S, LEAD_IN_S, NUM_AXES, make_lanes
 from flytrack_sysid.diagnosis.problem import Problem
@@ -125,6 +125,23 @@ def test_lanes_hold_every_row_once_behind_what_leads_in(flown, lanes):
     )
 
 
+def test_lanes_are_only_where_something_is_judged(flown):
+    truth, log = flown
+    judged = (log.time > 7.0) & (log.time < 19.0) | (log.time > 33.0)
+    lanes = make_lanes(log, judged, np.array(truth.tau), truth.gravity)
+    own, lead_in = lanes.row[LEAD_IN_S * RATE :], lanes.row[: LEAD_IN_S * RATE]
+    rows = own[own >= 0]
+    assert len(np.unique(rows)) == len(rows)
+    record = make_record(log)
+    source = record.source_row
+    wanted = np.flatnonzero((source >= 0) & judged[source])
+    assert np.isin(wanted, rows).all()
+    counting = own[lanes.counts[LEAD_IN_S * RATE :].any(axis=(2, 3))]
+    assert np.isin(counting, wanted).all()
+    assert own.shape[1] == 6  # 12 s and 7 s, in stretches of five, and one that fills up
+    assert (np.diff(lead_in[:, :5], axis=0) == 1).all()  # flown for real, also where it is not judged
+
+
 def test_lanes_say_what_one_long_replay_says(flown, lanes):
     truth, log = flown
     model = model_of(truth).with_effects(
@@ -150,6 +167,21 @@ def test_lanes_say_what_one_long_replay_says(flown, lanes):
         # In multiples of the noise; what came before the lead-in is forgotten to a millionth of full stick.
         error = (left[..., axes, channel] - one[lanes.row]) / (DIRECT, LEVEL)[channel][axes]
         assert counts[LEAD_IN_S * RATE].any() and np.abs(error[counts]).max() < 1e-3
+
+
+def test_a_bump_is_about_a_place_on_the_way_and_along_one_axis(flown, lanes):
+    truth, _ = flown
+    flight = regressors.flown(lanes, np.array(truth.tau))
+    found = regressors.bumps(flight)
+    assert found.shape[0] % regressors.BUMP_SIZE == 0
+    for number, feature in enumerate(found):
+        axis = number % regressors.BUMP_SIZE
+        assert np.all(feature[..., np.arange(3) != axis] == 0.0)
+        size = feature[..., axis]
+        peak = np.unravel_index(np.argmax(np.where(flight.counts, size, 0.0)), size.shape)
+        assert size[peak] == pytest.approx(1.0)
+        away = np.linalg.norm(flight.pos_w - flight.pos_w[peak], axis=-1)
+        assert size[away > 4.0 * max(regressors.BUMP_WIDTHS_M)].max(initial=0.0) < 1e-3
 
 
 def test_the_simulator_leaves_nothing_of_its_own_log():

@@ -1,8 +1,8 @@
 """A log cut into lanes of equal length, which a replay flies side by side.
 
 What a step needs of the steps before it (applied action, rates, memories) follows from the commands and is
-forgotten within a second. So the log is cut into stretches of five seconds, each led in by the second
-before it, and all stretches are replayed at once: twelve times fewer steps in a row.
+forgotten within a second. So what is judged of the log is cut into stretches of five seconds, each led in by
+the second before it, and all stretches are replayed at once: many times fewer steps in a row.
 """
 
 from typing import NamedTuple
@@ -54,12 +54,23 @@ def lead_in_of(rows: int) -> int:
     return rows * LEAD_IN_S // PIECES
 
 
-def _index(num_rows: int, rate: int) -> np.ndarray:
-    """Return the record's row at each place of the lanes, (rows, lanes); -1 where there is none."""
-    lanes = -(-num_rows // (LANE_S * rate))
-    lanes += -lanes % LANES_PADDED_TO
-    places = np.arange(-LEAD_IN_S * rate, LANE_S * rate)[:, None] + LANE_S * rate * np.arange(lanes)
-    return np.where((places >= 0) & (places < num_rows), places, -1)
+def _index(exists: np.ndarray, rate: int) -> np.ndarray:
+    """Return the record's row at each place of the lanes, (rows, lanes); -1 where there is none.
+
+    exists: (num_rows,) bool, rows that count; lanes hold all of them. One follows the other, but where
+    nothing counts for longer than a lead-in.
+    """
+    long, lead_in = LANE_S * rate, LEAD_IN_S * rate
+    starts: list[int] = []
+    rows = np.flatnonzero(exists)
+    while len(rows):
+        after = starts[-1] + long if starts else rows[0]
+        starts.append(after if rows[0] - after < lead_in else rows[0])
+        rows = rows[np.searchsorted(rows, starts[-1] + long) :]
+    starts += [len(exists)] * (-len(starts) % LANES_PADDED_TO or LANES_PADDED_TO * (not starts))
+    begin = np.array(starts)
+    places = begin + np.arange(-lead_in, long)[:, None]
+    return np.where((places >= 0) & (places < len(exists)) & (begin < len(exists)), places, -1)
 
 
 def measured_of(log: FlightLog, record: Record, gravity: float) -> dict[str, np.ndarray]:
@@ -111,7 +122,8 @@ def make_lanes(log: FlightLog, judged: np.ndarray, tau: np.ndarray, gravity: flo
         "v": lifts & exists,
         "v_bat": exists,
     }
-    index = _index(1 + int(np.flatnonzero(record.source_row >= 0)[-1]), rows_per_second(record))
+    num_rows = 1 + int(np.flatnonzero(record.source_row >= 0)[-1])
+    index = _index(exists[:num_rows], rows_per_second(record))
     is_real = (index >= 0) & (np.arange(len(index)) >= lead_in_of(len(index)))[:, None]
     found = measured_of(log, record, gravity)
     counts = np.stack(

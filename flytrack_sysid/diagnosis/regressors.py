@@ -14,6 +14,9 @@ TIME_WAVES, RANK_WAVES, CHANGE_WAVES, HEADING_WAVES, PLACE_WAVES = 8, 6, 4, 4, 2
 TINY_SPEED = 0.3  # m/s: slower flight has no direction
 SIDES = {"rate": slice(0, 3), "force": slice(3, 6)}  # axes of a residual
 STICKS = 4
+# Bumps about places on the way: how many places, and widths, m.
+BUMP_PLACES, BUMP_WIDTHS_M = 24, (3.0, 8.0)
+BUMP_SIZE = 3  # features of one bump: a force along each world axis
 
 
 class Flown(NamedTuple):
@@ -74,6 +77,21 @@ def _place_waves(flight: Flown) -> np.ndarray:
     axes = [np.concatenate([np.ones_like(waves[:1]), waves]) for waves in axes]
     orders = np.argwhere(np.indices((PLACE_WAVES + 1,) * 3).sum(axis=0) <= PLACE_WAVES)
     return np.stack([axes[0][i] * axes[1][j] * axes[2][k] for i, j, k in orders if i + j + k > 0])
+
+
+def bumps(flight: Flown) -> np.ndarray:
+    """Return forces along the world's axes that are there about some place on the way only, as a thermal is.
+
+    (bumps * BUMP_SIZE, rows, lanes, 3), world frame; of each bump all axes in a row.
+    """
+    where = flight.pos_w[flight.counts]
+    chosen = np.linspace(0, len(where) - 1, 2 * BUMP_PLACES + 1).astype(int)[1::2]
+    waves = []
+    for place in where[chosen]:
+        squared = np.square(flight.pos_w - place).sum(axis=-1)
+        waves += [np.exp(-0.5 * squared / width**2) for width in BUMP_WIDTHS_M]
+    world = np.broadcast_to(np.eye(BUMP_SIZE)[:, None, None, :], (BUMP_SIZE, *squared.shape, 3))
+    return _along(np.stack(waves), world)
 
 
 def _along(waves: np.ndarray, vectors_w: np.ndarray) -> np.ndarray:

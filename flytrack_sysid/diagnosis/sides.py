@@ -4,7 +4,7 @@ import numpy as np
 
 from flytrack_sysid.diagnosis import noise as noises
 from flytrack_sysid.diagnosis.linear import inflation_of, solve
-from flytrack_sysid.diagnosis.problem import BATCH, Problem, blocks_of, robust_weight
+from flytrack_sysid.diagnosis.problem import Problem, blocks_of, robust_weight
 from flytrack_sysid.diagnosis.regressors import SIDES, Flown, flown
 from flytrack_sysid.diagnosis.search import Found
 from flytrack_sysid.parameters import TAUS
@@ -15,15 +15,8 @@ RIDGE = 1e-6  # of each column's own: features are nearly dependent where little
 def whitened(problem: Problem, features_w: np.ndarray, side: str) -> np.ndarray:
     """Return what features (count, rows, lanes, 3) would leave, whitened, of a side's axes."""
     step_s = noises.step_to(problem.lanes)[..., None]
-    found = []
-    for begin in range(0, len(features_w), BATCH):
-        part = features_w[begin : begin + BATCH]
-        left = np.zeros((*part.shape[:3], noises.NUM_AXES, 2))
-        left[..., SIDES[side], 0] = part
-        left[..., SIDES[side], 1] = part * step_s
-        left *= problem.lanes.is_joined[..., None, None]
-        found.append(problem.whiten(left)[..., SIDES[side], :])
-    return np.concatenate(found)
+    joined = features_w * problem.lanes.is_joined[..., None]
+    return problem.whiten(np.stack([joined, joined * step_s], axis=-1), SIDES[side])
 
 
 def flight_of(problem: Problem, found: Found) -> Flown:
@@ -70,6 +63,14 @@ class Side:
         after = self.rest - np.einsum("bfn,f->bn", columns, step) - np.einsum("bgn,g->bn", self.given, given)
         blocks = np.einsum("bfn,bn->bf", columns, after) - np.einsum("bgn,bn->bg", self.given, after) @ share
         return float(score @ step), inflation_of(own, blocks), step
+
+    def best_group(self, columns: np.ndarray, size: int) -> int:
+        """Return which group of so many features in a row explains most, each for itself."""
+        _, own, score = self._beside(columns)
+        groups = range(len(score) // size)
+        inner = [slice(group * size, (group + 1) * size) for group in groups]
+        chi2 = [score[part] @ solve(own[part, part] + np.eye(size), score[part]) for part in inner]
+        return int(np.argmax(chi2))
 
     def lambda_of(self, columns: np.ndarray, size: np.ndarray) -> float:
         """Return the squared signature of slopes at a size, fitted again beside what is given."""

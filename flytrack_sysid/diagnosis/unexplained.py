@@ -9,7 +9,7 @@ from scipy import ndimage, stats
 from flytrack_sysid.diagnosis import noise as noises
 from flytrack_sysid.diagnosis.lanes import lead_in_of
 from flytrack_sysid.diagnosis.problem import Problem, blocks_of
-from flytrack_sysid.diagnosis.regressors import SIDES, Flown, dependences
+from flytrack_sysid.diagnosis.regressors import BUMP_SIZE, SIDES, Flown, bumps, dependences
 from flytrack_sysid.diagnosis.result import Unexplained
 from flytrack_sysid.diagnosis.search import Found
 from flytrack_sysid.diagnosis.sides import Side, flight_of, seen, whitened
@@ -34,6 +34,18 @@ class Dependence(NamedTuple):
     gain: float
     share: float
     columns: np.ndarray
+
+
+class Feature(NamedTuple):
+    """What an unknown effect may do: smooth functions in the world frame, and whitened by blocks.
+
+    tries: among how many of its kind it was chosen.
+    """
+
+    name: str
+    features_w: np.ndarray
+    columns: np.ndarray
+    tries: int = 1
 
 
 def _rms(features_w: np.ndarray, step: np.ndarray, counts: np.ndarray) -> float:
@@ -81,18 +93,23 @@ def depends_on(
             OF_NAMED * _named_size(problem, found, base, side),
             OF_WANDERING * _wandering(noise, axes),
         )
-        columns = {
-            name: blocks_of(whitened(problem, one, side) * sums.root) for name, one in features[side].items()
-        }
-        result += _greedy(sums, side, columns, features[side], flight, least, own_noise)
+        looked_at = [
+            Feature(name, one, blocks_of(whitened(problem, one, side) * sums.root))
+            for name, one in features[side].items()
+        ]
+        around = bumps(flight) if side == "force" and flight.pos_w.any() else None
+        places = None
+        if around is not None:
+            places = Feature("position", around, blocks_of(whitened(problem, around, side) * sums.root))
+        result += _greedy(sums, side, looked_at, places, flight, least, own_noise)
     return sorted(result, key=lambda one: -one.gain)
 
 
 def _greedy(
     sums: Side,
     side: str,
-    columns: Mapping[str, np.ndarray],
-    features: Mapping[str, np.ndarray],
+    looked_at: Sequence[Feature],
+    places: Feature | None,
     flight: Flown,
     least: float,
     own_noise: float,
@@ -101,21 +118,29 @@ def _greedy(
     result: list[Dependence] = []
     while len(result) < MOST_DEPENDENCES:
         best: Dependence | None = None
-        for name, one in columns.items():
-            if any(name == earlier.name for earlier in result):
+        for one in (*looked_at, *([] if places is None else [_best_bump(sums, places)])):
+            if any(one.name == earlier.name for earlier in result):
                 continue
-            chi2, inflation, step = sums.gain(one)
-            count, size = one.shape[1], _rms(features[name], step, flight.counts)
-            if chi2 / inflation < stats.chi2.isf(CHANCE, count) or size < least:
+            chi2, inflation, step = sums.gain(one.columns)
+            count, size = one.columns.shape[1], _rms(one.features_w, step, flight.counts)
+            if chi2 / inflation < stats.chi2.isf(CHANCE / one.tries, count) or size < least:
                 continue
             gain = chi2 / inflation - 2.0 * count
             if best is None or gain > best.gain:
-                best = Dependence(name, side, gain, size / own_noise, one)
+                best = Dependence(one.name, side, gain, size / own_noise, one.columns)
         if best is None:
             break
         result.append(best)
         sums.given = np.concatenate([sums.given, best.columns], axis=1)
     return result
+
+
+def _best_bump(sums: Side, places: Feature) -> Feature:
+    """Return the bump about a place that explains most."""
+    group = sums.best_group(places.columns, BUMP_SIZE)
+    part = slice(group * BUMP_SIZE, (group + 1) * BUMP_SIZE)
+    tries = places.columns.shape[1] // BUMP_SIZE
+    return Feature(places.name, places.features_w[part], places.columns[:, part], tries)
 
 
 def lines(problem: Problem, found: Found) -> list[tuple[str, float, float]]:
