@@ -36,7 +36,7 @@ DT_S = 0.01
 CERTAIN, SEPARATE = 30.0, 20.0  # lambda of an effect, and beside its closest rival
 SIGNED = {"thrust_tilt": -1.0, "wind": -1.0, "yaw_reaction": -1.0}  # what mirrors each parameter
 SEGMENT_ROWS, HELD_OUT_EVERY = 330, 4  # twelve segments, each short enough to be a block
-OUTSIDE_AMPLITUDE = 1.5
+OUTSIDE_AMPLITUDE = 2.0
 HOVER_WIND = 0.25  # m/s^2; corrections of a few degrees tell a stronger one from a tilt
 Rng = np.random.Generator
 
@@ -144,8 +144,8 @@ def _wind_in_hover(rng: Rng) -> Case:
     return _flown(replace(truth, effects={"wind": wind}), rng, kind="hover")
 
 
-def _outside(rng: Rng) -> Case:
-    kind = str(rng.choice(["periodic", "heading"]))
+def _outside(rng: Rng, kinds: Sequence[str] = ("periodic", "heading")) -> Case:
+    kind = str(rng.choice(kinds))
     return _flown(replace(draw_base(rng), outside=draw_outside(rng, kind, OUTSIDE_AMPLITUDE)), rng)
 
 
@@ -180,10 +180,13 @@ CASES: Mapping[str, Callable[[Rng], Case]] = {
     "one_mirrored": lambda rng: _signed(rng_of("one_signed"), -1.0),
     "one": lambda rng: _drawn(rng, 1),
     "two": lambda rng: _drawn(rng, 2),
+    # Without a slope where there is none of it, and with fits that go astray.
+    "loop": lambda rng: _flown(_with(draw_base(rng), ["second_order_rates"], rng), rng),
     "training_only": _in_training_only,
     "shuffled": _shuffled,
     "wind_in_hover": _wind_in_hover,
     "outside": _outside,
+    "thermal": lambda rng: _outside(rng, ["position"]),
     "tau": lambda rng: _changed("tau", rng),
     "mass": lambda rng: _changed("mass", rng),
     "simulated": _simulated,
@@ -203,7 +206,7 @@ def faults(
     """Return what is wrong with causes, a line each.
 
     there: the plant's hidden effects. hidden: by effect what the log could show: lambda, lambda beside the
-    closest rival, and that rival; without a scale of thrust, which the oracle leaves to the thrust curve.
+    closest rival, and that rival.
     """
     classes = {cause["effect"]: {cause["effect"], *cause["equivalent"]} for cause in causes}
     result = []

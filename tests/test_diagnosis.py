@@ -38,7 +38,7 @@ from tests.diagnosis_cases import (
 
 ROOT = Path(__file__).parent.parent
 BROKEN = ("stuck_gyro", "stuck_commands")
-GRADED = ("one_signed", "one", "two")
+GRADED = ("one_signed", "one", "two", "loop")
 CHANNELS = {"rates", "attitude", "force", "velocity", "battery"}
 WIDENED = 1.5  # of 95 % intervals: a right one misses such a wide one 3 times in a thousand
 TIMEOUT_S = 900.0
@@ -178,6 +178,11 @@ def test_what_no_list_has_is_flagged_and_not_named(found, cases) -> None:
         said_hz = [float(name.split()[2]) for name in dependences if name.startswith("periodic at")]
         resolved_hz = 2.0 / SECONDS
         assert any(abs(hz - outside.shape["frequency_hz"]) < resolved_hz for hz in said_hz), dependences
+
+
+def test_a_force_about_one_place_is_seen_to_depend_on_the_place(found) -> None:
+    one = found["thermal"]
+    assert one["causes"] == [] and one["unexplained"]["depends_on"] == ["position"]
 
 
 def test_other_lags_are_named_and_measured(found, cases) -> None:

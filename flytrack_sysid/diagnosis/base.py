@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+from scipy import stats
 
 from flytrack_env.dynamics import collective_thrust
 from flytrack_sysid.diagnosis.linear import Outlook, inflation_of, solve
@@ -12,11 +13,11 @@ from flytrack_sysid.diagnosis.search import (
     MOST_REFITTED,
     PER_PARAMETER,
     Found,
-    begun,
     fitted,
     full_outlook,
     scores,
     threshold,
+    with_effect,
 )
 from flytrack_sysid.parameters import DRAIN, TAUS, THRUST_COEFFS
 
@@ -38,11 +39,21 @@ class Covered:
         share = solve(outlook.total[np.ix_(given, given)], across)
         self.information = outlook.total[np.ix_(self.columns, self.columns)] - across.T @ share
         blocks = outlook.score_by_block
-        self.inflation = inflation_of(self.information, blocks[:, self.columns] - blocks[:, given] @ share)
+        self.scores = blocks[:, self.columns] - blocks[:, given] @ share
+        self.inflation = inflation_of(self.information, self.scores)
 
-    def deviations(self) -> np.ndarray:
-        """Return standard deviations, inflated."""
-        return np.sqrt(np.diag(solve(self.information, np.eye(len(self.information)))) * self.inflation)
+    def half_widths(self) -> np.ndarray:
+        """Return half of each parameter's 95 % interval.
+
+        Of the deviation that the information says or, where it is larger, that which scores of blocks say
+        of each parameter (a sandwich estimate, with Student's t for so many blocks).
+        """
+        covariance = solve(self.information, np.eye(len(self.information)))
+        used = self.scores[np.abs(self.scores).sum(axis=1) > 0.0]
+        number = max(len(used), 2)
+        spread = used.T @ used * number / (number - 1)
+        variance = np.maximum(np.diag(covariance), np.diag(covariance @ spread @ covariance))
+        return np.sqrt(variance) * stats.t.ppf(0.975, number - 1)
 
 
 def _is_immaterial(problem: Problem, fields: Sequence[str], found: Found) -> bool:
@@ -85,7 +96,7 @@ def contradiction(
 
 def contradicted(problem: Problem, found: Found) -> list[str]:
     """Return the base parameters that a log contradicts."""
-    outlook = Outlook(problem, problem.slopes(found.vector, found.places))
+    outlook = full_outlook(problem, found.vector)
     wrong = [contradiction(problem, outlook, found, fields) for fields in BASE_CAUSES.values()]
     return [field for one in wrong if one is not None for field in one.fields]
 
@@ -120,8 +131,7 @@ def _best_instead(problem: Problem, found: Found, fields: Sequence[str]) -> Foun
     for one in scores(problem, seen, less)[:MOST_REFITTED]:
         if less.cost - one.gain.chi2 > limit + less.cost * HOPELESS and one.candidate.probe is None:
             continue
-        chosen = (*less.chosen, one.candidate)
-        trial = fitted(problem, chosen, begun(problem, seen, less, one), seen)
+        trial = with_effect(problem, seen, less, one)
         cost = trial.cost + PER_PARAMETER * one.candidate.price
         if cost < limit:
             best, limit = trial, cost

@@ -20,13 +20,14 @@ class Gain(NamedTuple):
     """What freeing some parameters besides others would gain.
 
     chi2: in minus twice the log likelihood. inflation: of its variance, where residuals of a second hang
-    together. step: of the parameters. information: about those that others do not do, what others explain
-    taken out.
+    together. step: of the parameters. aside: of the others, along with it. information: about those that
+    others do not do, what others explain taken out.
     """
 
     chi2: float
     inflation: float
     step: np.ndarray
+    aside: np.ndarray
     information: np.ndarray
 
     @property
@@ -49,7 +50,7 @@ class Outlook:
     """
 
     def __init__(self, problem: Problem, slopes: Slopes, probes: Sequence[Candidate] = ()):
-        self.problem, self.slopes = problem, slopes
+        self.problem, self.slopes, self.noise = problem, slopes, problem.noise
         self.places, self.probes = list(slopes.places), list(probes)
         self.prior = np.concatenate(
             [prior_information(problem)[self.places], np.full(len(self.probes), PROBE_PRIOR)]
@@ -84,6 +85,16 @@ class Outlook:
         later.score_by_block = -np.einsum("bpn,bn->bp", blocks_of(self.columns), rest, optimize=True)
         later._rescore()
         return later
+
+    def distance(self, vector: np.ndarray) -> float:
+        """Return by how much, to first order, a model differs from where slopes were taken, as a chi2."""
+        change = vector - self.slopes.vector
+        places = np.array(self.places)
+        elsewhere = np.delete(change, places)
+        if np.any(elsewhere != 0.0):
+            return np.inf
+        count = len(places)
+        return float(change[places] @ self.total[:count, :count] @ change[places])
 
     def narrowed(self, places: Sequence[int]) -> "Outlook":
         """Return the outlook along some of the places only."""
@@ -156,7 +167,7 @@ class Outlook:
         blocks = blocks[:, len(given) :] - blocks[:, : len(given)] @ share
         whole = np.zeros(len(every))
         whole[[every.index(column) for column in added]] = step
-        return Gain(float(score @ step), inflation_of(own, blocks), whole, own)
+        return Gain(float(score @ step), inflation_of(own, blocks), whole, both[: len(given)], own)
 
     def _own(self, columns: list[int], given: list[int]) -> list[int]:
         """Return the columns that are not what given ones, or those before them, nearly do."""

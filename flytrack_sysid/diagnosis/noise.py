@@ -32,7 +32,7 @@ TAU_RANGE_S = (0.02, 5.0)
 # The search: damping of its steps, as they fail and as they help; and where it ends.
 FIRST_DAMPING, MORE, LESS = 1e-2, 10.0, 0.2
 MOST_ROUNDS = 12
-ENOUGH = 0.3  # of minus twice the log likelihood: less than what one parameter is off by
+ENOUGH = 1.0  # of minus twice the log likelihood: what one parameter is off by
 OUTLIER = 4.0  # innovations beyond count by their size, not its square
 
 
@@ -100,7 +100,7 @@ def make_gains(noise: Noise, step_s: jax.Array, is_known: jax.Array, counts: jax
 
 
 def innovations(gains: Gains, increments: jax.Array, counts: jax.Array) -> jax.Array:
-    """Return residuals (rows, lanes, NUM_AXES, 2) as innovations of variance 1; 0 where nothing counts."""
+    """Return residuals (rows, lanes, axes, 2) as innovations of variance 1; 0 where nothing counts."""
 
     def row(carry: tuple, inputs: tuple) -> tuple:
         sum_e, wandered, disturbed = carry
@@ -115,7 +115,7 @@ def innovations(gains: Gains, increments: jax.Array, counts: jax.Array) -> jax.A
         sized = jnp.stack([direct / jnp.sqrt(gain.direct_size), off / jnp.sqrt(gain.level_size)], axis=-1)
         return later, sized
 
-    nothing = jnp.zeros((increments.shape[1], NUM_AXES))
+    nothing = jnp.zeros(increments.shape[1:3])
     by_row = (increments, gains, counts.astype(increments.dtype))
     return jax.lax.scan(row, (nothing, nothing, nothing), by_row)[1]
 
@@ -233,13 +233,13 @@ def fit_noise(lanes: Lanes, left: np.ndarray, start: np.ndarray | None = None) -
         tried = np.clip(best - np.clip(step, -1.0, 1.0), low, high)
         then, then_slopes, then_curvature = (np.asarray(part) for part in _misfit_and_slopes(tried, *given))
         is_better = then < misfit
-        gain = np.where(is_better, misfit - then, 0.0)
         best = np.where(is_better, tried, best)
         slopes = np.where(is_better, then_slopes, slopes)
         curvature = np.where(is_better[:, None, None], then_curvature, curvature)
         damping = np.where(is_better, damping * LESS, damping * MORE)
         misfit = np.where(is_better, then, misfit)
-        if np.all((gain < ENOUGH) & (is_better | (damping > 10.0))):
+        expected = 0.5 * np.sum(pull * step, axis=0)
+        if np.all(expected < ENOUGH):
             break
     return best
 

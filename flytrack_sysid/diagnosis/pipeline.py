@@ -55,10 +55,8 @@ def settled(log: FlightLog, judged: np.ndarray, model: ModelParameters) -> Settl
     base = base_fit(problem)
     outlook = full_outlook(problem, base.vector)
     problem.set_noise(noises.fit_noise(lanes, saturated(problem, outlook)))
-    # The slopes are those of nearly the same model, seen through the new noise.
-    outlook = Outlook(problem, outlook.slopes, outlook.probes)
-    base = found = fitted(problem, (), base.vector, outlook)
-    outlook = outlook.moved(found.vector, problem.whiten(problem.left(found.vector[None]))[0])
+    base = found = fitted(problem, (), base.vector, full_outlook(problem, base.vector))
+    outlook = full_outlook(problem, found.vector)
     while len(found.chosen) < MOST_EFFECTS:
         more = add_best(problem, found, outlook)
         if more is None:
@@ -67,7 +65,8 @@ def settled(log: FlightLog, judged: np.ndarray, model: ModelParameters) -> Settl
         outlook = full_outlook(problem, found.vector)
     if found.chosen:
         problem.set_noise(noises.fit_noise(lanes, saturated(problem, outlook), problem.noise))
-        found, base = fitted(problem, found.chosen, found.vector), fitted(problem, (), base.vector)
+        found = fitted(problem, found.chosen, found.vector, full_outlook(problem, found.vector))
+        base = fitted(problem, (), base.vector)
     found, weighed = settle(problem, found)
     while (other := simpler(problem, found)) is not None:
         found, weighed = settle(problem, other)
@@ -111,7 +110,7 @@ def _suspects(problem: Problem, found: Found, weighed: dict[str, Weighed]) -> li
 
 
 def _suspects_of_base(problem: Problem, found: Found) -> list[Suspect]:
-    outlook = Outlook(problem, problem.slopes(found.vector, found.places))
+    outlook = full_outlook(problem, found.vector)
     result = []
     for name, fields in BASE_CAUSES.items():
         wrong = contradiction(problem, outlook, found, fields)

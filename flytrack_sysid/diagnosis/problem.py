@@ -5,7 +5,7 @@ an effect has it at its neutral value. So no set of effects needs a compilation 
 """
 
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -67,6 +67,7 @@ class Problem:
         self.barred: tuple[str, ...] = ()  # effects that the log cannot be asked about
         self.refused: tuple[str, ...] = ()  # effects that were taken back, and are not to come again
         self.held: tuple[str, ...] = ()  # base parameters that stay nominal
+        self.last_outlook: Any = None  # ``linear.Outlook`` along everything: slopes are dear
 
     def set_noise(self, sought: np.ndarray) -> None:
         """Weigh from now on with this noise, (6, NUM_AXES)."""
@@ -78,9 +79,10 @@ class Problem:
         """Return what models (count, parameters) leave, (count, rows, lanes, NUM_AXES, 2)."""
         return self._in_batches(lambda part: _left(part, self.like, self.lanes), vectors)
 
-    def whiten(self, left: np.ndarray) -> np.ndarray:
-        """Return residuals (count, rows, lanes, NUM_AXES, 2) as innovations."""
-        return self._in_batches(lambda part: _whitened(part, self.gains, self.counts), left)
+    def whiten(self, left: np.ndarray, axes: slice = slice(None)) -> np.ndarray:
+        """Return residuals (count, rows, lanes, NUM_AXES, 2), or of some axes, as innovations."""
+        gains = noises.Gains(*(np.asarray(leaf)[..., axes] for leaf in self.gains))
+        return self._in_batches(lambda part: _whitened(part, gains, self.counts[..., axes, :]), left)
 
     @staticmethod
     def _in_batches(tell: Callable[[np.ndarray], jax.Array], values: np.ndarray) -> np.ndarray:

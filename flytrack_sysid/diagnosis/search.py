@@ -9,7 +9,7 @@ from scipy import stats
 from flytrack_sysid.diagnosis.candidates import CANDIDATES, Candidate, base_places, opened
 from flytrack_sysid.diagnosis.linear import PROBES, Gain, Outlook
 from flytrack_sysid.diagnosis.problem import Problem
-from flytrack_sysid.diagnosis.refine import refine
+from flytrack_sysid.diagnosis.refine import STALE, refine
 
 CHANCE = 1e-4  # of a name where there is nothing, for each effect
 PER_PARAMETER = 4.0  # of chi2: what one more parameter has to gain to be preferred to fewer
@@ -18,6 +18,8 @@ CLOSE = 0.6  # of the best gain: who comes so near to first order is refitted be
 MOST_REFITTED = 4
 MOST_TURNS = 3  # of refits that come to nothing before a search ends
 PROMISING = 0.7  # of the threshold, to first order
+SHARE_OF_WAY = (0.02, 1.5)  # to a probe, at which a fit begins
+KEPT_PROMISE = 0.6  # of a gain to first order: a fit that comes to less may have gone astray
 
 
 class Found(NamedTuple):
@@ -89,16 +91,47 @@ def scores(problem: Problem, outlook: Outlook, found: Found) -> list[Scored]:
 
 
 def full_outlook(problem: Problem, vector: np.ndarray) -> Outlook:
-    """Return the outlook along everything."""
-    others = np.array([opened(problem, vector, probe) for probe in PROBES])
-    return Outlook(problem, problem.slopes(vector, free_places(problem), others), PROBES)
+    """Return the outlook along everything; slopes taken last serve again for a model nearby."""
+    last = problem.last_outlook
+    if last is not None and last.places == free_places(problem) and last.distance(vector) < STALE:
+        if last.noise is not problem.noise:
+            last = Outlook(problem, last.slopes, PROBES)
+        outlook = last.moved(vector, problem.whiten(problem.left(vector[None]))[0])
+    else:
+        others = np.array([opened(problem, vector, probe) for probe in PROBES])
+        outlook = Outlook(problem, problem.slopes(vector, free_places(problem), others), PROBES)
+    problem.last_outlook = outlook
+    return outlook
 
 
-def begun(problem: Problem, outlook: Outlook, found: Found, scored: Scored) -> np.ndarray:
-    """Return the vector from which an effect is fitted in: where first order says, or at its probe."""
-    vector = opened(problem, found.vector, scored.candidate)
-    if scored.candidate.probe is None:
-        vector[problem.index(scored.candidate.fields)] += scored.gain.step
+def with_effect(problem: Problem, outlook: Outlook, found: Found, scored: Scored) -> Found:
+    """Return the model with an effect more, fitted from where first order says.
+
+    An effect that is looked for at a probe also begins at that, if it came to much less than promised.
+    """
+    candidate, gain = scored
+    chosen = (*found.chosen, candidate)
+    if candidate.probe is None:
+        vector = found.vector.copy()
+        vector[problem.index(candidate.fields)] += gain.step
+        return fitted(problem, chosen, problem.clipped(vector[None])[0], outlook)
+    best = fitted(problem, chosen, _on_the_way(problem, found, scored))
+    if found.cost - best.cost < KEPT_PROMISE * gain.chi2:
+        other = fitted(problem, chosen, opened(problem, found.vector, candidate))
+        best = min(best, other, key=lambda one: one.cost)
+    return best
+
+
+def _on_the_way(problem: Problem, found: Found, scored: Scored) -> np.ndarray:
+    """Return the vector at the share of the way to a probe that explains most, all else moved along."""
+    candidate, gain = scored
+    vector = found.vector.copy()
+    vector[list(found.places)] += gain.aside
+    others = [field for field in candidate.fields if field != candidate.probe[0]]
+    vector[problem.index(others)] += gain.step[1:]
+    place = problem.names.index(candidate.probe[0])
+    share = np.clip(gain.step[0], *SHARE_OF_WAY)
+    vector[place] += share * (candidate.probe[1] - vector[place])
     return problem.clipped(vector[None])[0]
 
 
@@ -123,8 +156,7 @@ def add_best(problem: Problem, found: Found, outlook: Outlook) -> Found | None:
 
 def _tried(problem: Problem, found: Found, outlook: Outlook, one: Scored) -> tuple[float, Found] | None:
     """Return the merit of a model with an effect more, and the model; None if it gains too little."""
-    chosen = (*found.chosen, one.candidate)
-    trial = fitted(problem, chosen, begun(problem, outlook, found, one), outlook)
+    trial = with_effect(problem, outlook, found, one)
     gain = (found.cost - trial.cost) / one.gain.inflation
     if gain <= threshold(one.gain.count):
         return None

@@ -11,12 +11,11 @@ from flytrack_sysid.diagnosis.problem import Problem
 from flytrack_sysid.diagnosis.search import (
     PER_PARAMETER,
     Found,
-    Scored,
-    begun,
     fitted,
     full_outlook,
     scores,
     threshold,
+    with_effect,
 )
 from flytrack_sysid.parameters import neutral_value
 
@@ -60,9 +59,10 @@ def without(problem: Problem, found: Found, effect: str) -> Found:
 
 
 def weigh(problem: Problem, found: Found, outlook: Outlook, effect: str) -> Weighed:
-    """Return what an effect of a model is worth; outlook: of the model, along its places."""
+    """Return what an effect of a model is worth; outlook: of the model, along everything."""
     less = without(problem, found, effect)
-    seen = full_outlook(problem, less.vector)
+    # Slopes with the effect serve without it: rivals that come near are refitted.
+    seen = outlook.moved(less.vector, problem.whiten(problem.left(less.vector[None]))[0])
     own = next(one for one in found.chosen if one.effect == effect)
     gain = less.cost - found.cost
     rivals: dict[str, float] = {}
@@ -73,15 +73,10 @@ def weigh(problem: Problem, found: Found, outlook: Outlook, effect: str) -> Weig
         share = PROBE_SHARE if one.candidate.probe is not None else NEAR_SHARE
         close = max(NEARLY, share * gain)
         if number < MOST_RIVALS and gain - one.gain.chi2 < close:
-            swap = _swapped(problem, less, seen, one)
+            swap = with_effect(problem, seen, less, one)
             rivals[one.candidate.effect] = swap.cost - found.cost
             swaps[one.candidate.effect] = swap
     return Weighed(gain, *_inflation(outlook, found, own.fields), rivals, swaps, less)
-
-
-def _swapped(problem: Problem, less: Found, seen: Outlook, rival: Scored) -> Found:
-    chosen = (*less.chosen, rival.candidate)
-    return fitted(problem, chosen, begun(problem, seen, less, rival), seen)
 
 
 def _inflation(outlook: Outlook, found: Found, fields: tuple[str, ...]) -> tuple[float, int]:
@@ -95,7 +90,7 @@ def _inflation(outlook: Outlook, found: Found, fields: tuple[str, ...]) -> tuple
 def settle(problem: Problem, found: Found) -> tuple[Found, dict[str, Weighed]]:
     """Return the model without effects that it does not need, and with better ones in their place."""
     while True:
-        outlook = Outlook(problem, problem.slopes(found.vector, found.places))
+        outlook = full_outlook(problem, found.vector)
         weighed = {one.effect: weigh(problem, found, outlook, one.effect) for one in found.chosen}
         short = {effect: one.robust - threshold(one.count) for effect, one in weighed.items()}
         if short and min(short.values()) < 0.0:
