@@ -124,17 +124,19 @@ def plant(row: str, number: int, seed: int) -> dict[str, Any]:
 
 
 def _said(cause: Any, truth: Truth) -> dict[str, Any]:
-    """Return what is named, and which of its intervals cover the truth where the law is the same."""
+    """Return what is named, and by parameter what is true, what was found and its interval."""
     true = truth.effects.get(cause.effect, {})
-    covers = [
-        one.ci95[0] <= true[name] <= one.ci95[1] for name, one in cause.parameters.items() if name in true
-    ]
+    covers = {
+        name: [float(f"{value:.5g}") for value in (true[name], one.value, *one.ci95)]
+        for name, one in cause.parameters.items()
+        if name in true
+    }
     return {
         "effect": cause.effect,
         "equivalent": list(cause.equivalent),
         "gain": float(f"{cause.chi2_gain:.4g}"),
         "heldout": float(f"{cause.heldout_gain:.4g}"),
-        "covers": [int(value) for value in covers],
+        "intervals": covers,
     }
 
 

@@ -6,20 +6,22 @@ length. All else is fitted again, each rival in the effect's place too.
 """
 
 from collections.abc import Mapping, Sequence
+from itertools import product
 from typing import NamedTuple
 
 import jax
 import numpy as np
 
-from benchmarks.hidden.noise import STD
+from benchmarks.hidden.noise import DIGIT, STD
 from flytrack_env.dynamics import ModelParameters
-from flytrack_sysid.diagnosis.candidates import CANDIDATES
+from flytrack_sysid.diagnosis.candidates import CANDIDATES, Candidate, opened
 from flytrack_sysid.diagnosis.lanes import NUM_AXES, make_lanes
-from flytrack_sysid.diagnosis.noise import floors_of
+from flytrack_sysid.diagnosis.noise import fit_noise
 from flytrack_sysid.diagnosis.problem import Problem
-from flytrack_sysid.diagnosis.search import Found, begun, fitted, full_outlook, scores
-from flytrack_sysid.diagnosis.weigh import weigh
+from flytrack_sysid.diagnosis.search import Found, fitted, full_outlook, scores, with_effect
+from flytrack_sysid.diagnosis.weigh import MOST_RIVALS, weigh
 from flytrack_sysid.log import FlightLog
+from flytrack_sysid.parameters import THRUST_COEFFS
 
 # Attitude noise turns the thrust that is fed in: m/s of velocity in a second, as a random walk.
 WANDER = STD["q"] * 10.0 * np.sqrt(0.01)
@@ -34,43 +36,77 @@ class Known(NamedTuple):
     rival: str
 
 
-def true_noise(problem: Problem) -> np.ndarray:
+def true_noise() -> np.ndarray:
     """Return the noise of ``benchmarks.hidden.noise`` as the diagnosis has it, (6, NUM_AXES)."""
     direct = np.repeat([STD["w"], STD["f"], 1.0], [3, 3, 1])
-    level = np.repeat([STD["q"], STD["v"], floors_of(problem.lanes)[1, -1]], [3, 3, 1])
+    level = np.repeat([STD["q"], STD["v"], DIGIT["v_bat"]], [3, 3, 1])
     wander = np.repeat([1e-3 * STD["q"], WANDER, 1e-3], [3, 3, 1]) / level
     rest = np.repeat([[NO_DISTURBANCE], [ANY_TAU], [COUPLED]], NUM_AXES, axis=1)
     return np.stack([np.log(direct), np.log(level), np.log(wander), *rest])
 
 
 def clean_problem(clean: FlightLog, log: FlightLog, judged: np.ndarray, model: ModelParameters) -> Problem:
-    """Return the problem of the clean rows that a measured log kept, with the sensors' true noise."""
+    """Return the problem of the clean rows that a measured log kept, with the sensors' true noise.
+
+    Of the voltage that is rounding, which lasts while the battery drains by a digit: it is fitted.
+    """
     kept = clean.select(np.isin(np.round(clean.time, 6), np.round(log.time, 6)))
-    problem = Problem(make_lanes(kept, judged, np.asarray(model.tau, float), float(model.g)), model)
-    problem.set_noise(true_noise(problem))
+    tau, gravity = np.asarray(model.tau, float), float(model.g)
+    problem = Problem(make_lanes(kept, judged, tau, gravity), model)
+    measured = Problem(make_lanes(log, judged, tau, gravity), model)
+    errors = measured.left(problem.start[None])[0] - problem.left(problem.start[None])[0]
+    noise = true_noise()
+    noise[:, -1] = fit_noise(measured.lanes, errors, noise)[:, -1]
+    problem.set_noise(noise)
     return problem
 
 
-def with_all(problem: Problem, effects: Mapping[str, object]) -> Found:
-    """Return the model with all true effects that fits the clean log best, whichever is fitted in first."""
-    base = fitted(problem, (), problem.start)
-    known_ones = [name for name in effects if any(one.effect == name for one in CANDIDATES)]
-    tried = [_one_by_one(problem, base, known_ones, first) for first in known_ones]
-    return min(tried, key=lambda found: found.cost, default=base)
+def with_all(problem: Problem, effects: Mapping[str, Mapping[str, float]]) -> Found:
+    """Return the model with all true effects that fits the clean log best, from the true parameters.
+
+    A law with other parameters than the truth's begins in each way in which it is looked for.
+    """
+    ways = []
+    for name, values in effects.items():
+        own = [one for one in CANDIDATES if one.effect == name and name != "thrust_scale"]
+        whole = [one for one in own if len(one.fields) == max(len(other.fields) for other in own)]
+        is_known = any(field.split(".")[1] in values for one in whole for field in one.fields)
+        ways.append(whole[:1] if is_known else whole)
+    tried = [_begun_with(problem, chosen, effects) for chosen in product(*(own for own in ways if own))]
+    return min(tried, key=lambda found: found.cost)
 
 
-def _one_by_one(problem: Problem, found: Found, effects: Sequence[str], first: str) -> Found:
-    waiting = list(effects)
-    while waiting:
-        outlook = full_outlook(problem, found.vector)
-        ranked = [one for one in scores(problem, outlook, found) if one.candidate.effect in waiting]
-        if not ranked:
-            break
-        best = max(ranked, key=lambda one: (one.candidate.effect == first, one.gain.chi2))
-        waiting.remove(best.candidate.effect)
-        chosen = (*found.chosen, best.candidate)
-        found = fitted(problem, chosen, begun(problem, outlook, found, best), outlook)
-    return found
+def _begun_with(
+    problem: Problem, chosen: Sequence[Candidate], effects: Mapping[str, Mapping[str, float]]
+) -> Found:
+    vector = problem.start.copy()
+    for way in chosen:
+        vector = opened(problem, vector, way)
+        for field in way.fields:
+            place = problem.names.index(field)
+            vector[place] = effects[way.effect].get(field.split(".")[1], vector[place])
+    return fitted(problem, chosen, problem.clipped(vector[None])[0])
+
+
+def _scale_known(problem: Problem, found: Found) -> Known:
+    """Return what the log could show of a scale of thrust, which a free thrust curve explains.
+
+    Against the nominal curve, all else fitted, and the best rival beside that.
+    """
+    places = problem.index(THRUST_COEFFS)
+    vector = found.vector.copy()
+    vector[places] = problem.start[places]
+    problem.held = THRUST_COEFFS
+    less = fitted(problem, found.chosen, vector)
+    seen = full_outlook(problem, less.vector)
+    rivals = {}
+    others = [one for one in scores(problem, seen, less) if one.candidate.effect != "thrust_scale"]
+    for one in others[:MOST_RIVALS]:
+        rivals[one.candidate.effect] = with_effect(problem, seen, less, one).cost
+    problem.held = ()
+    rival = min(rivals, key=rivals.get, default="")
+    gain = less.cost - found.cost
+    return Known(gain, max(min(rivals.get(rival, less.cost) - found.cost, gain), 0.0), rival)
 
 
 def known(
@@ -78,7 +114,7 @@ def known(
     log: FlightLog,
     judged: np.ndarray,
     model: ModelParameters,
-    effects: Mapping[str, object],
+    effects: Mapping[str, Mapping[str, float]],
 ) -> dict[str, Known]:
     """Return, by hidden effect, what the judged rows of a log could show of it."""
     with jax.enable_x64(True):
@@ -91,6 +127,8 @@ def known(
             rival = min(weight.rivals, key=weight.rivals.get, default="")
             beside = min(weight.rivals.get(rival, weight.gain), weight.gain)
             result[one.effect] = Known(weight.gain, max(beside, 0.0), rival)
+        if "thrust_scale" in effects:
+            result["thrust_scale"] = _scale_known(problem, found)
     return result
 
 
