@@ -40,12 +40,9 @@ from flytrack_sysid.split import held_out_rows
 ROOT = Path(__file__).parent.parent
 LINES = ROOT / "docs" / "results" / "diagnosis.jsonl"
 SECONDS = 60.0
-NAMING = "lanes,said,noise,problem,linear,candidates,refine,search,weigh,pipeline,unexplained,regressors"
 CODE = (
-    *(
-        f"flytrack_sysid/diagnosis/{name}.py"
-        for name in (*NAMING.split(","), "causes", "base", "sides", "stand_ins")
-    ),
+    "flytrack_sysid/diagnosis/*.py",
+    *(f"flytrack_sysid/{name}.py" for name in ("log", "parameters", "record", "split")),
     "flytrack_env/effects/*.py",
     "flytrack_env/dynamics.py",
     "benchmarks/hidden/*.py",
@@ -85,7 +82,7 @@ def model_of(truth: Truth) -> ModelParameters:
 
 
 def code_hash() -> str:
-    """Return a hash of what names depend on: effects, the search, and the hidden plants."""
+    """Return a hash of what a line depends on: effects, the diagnosis, and the hidden plants."""
     digest = hashlib.sha256()
     for path in sorted(path for pattern in CODE for path in ROOT.glob(pattern)):
         digest.update(path.read_bytes())
@@ -148,11 +145,14 @@ def _removed(truth: Truth, found: Diagnosis, rng: Rng) -> list[float]:
 
 
 def read_lines(code: str | None) -> dict[tuple[str, int, int], dict[str, Any]]:
-    """Return the lines of a code's hash by row, seed and number; of any code if None."""
+    """Return the lines of a code's hash by row, seed and number; of the last line's if None."""
     if not LINES.exists():
         return {}
-    lines = [json.loads(text) for text in LINES.read_text().splitlines()]
-    kept = [line for line in lines if code is None or line["code"] == code]
+    # What a kill has cut off has no end of line.
+    whole = [text for text in LINES.read_text().splitlines(keepends=True) if text.endswith("\n")]
+    lines = [json.loads(text) for text in whole]
+    code = lines[-1]["code"] if code is None and lines else code
+    kept = [line for line in lines if line["code"] == code]
     return {(line["row"], line["seed"], line["number"]): line for line in kept}
 
 

@@ -155,8 +155,10 @@ def advance(
     def fold(stage: str, value: Any) -> Any:  # with what is known of the flight by then
         return effects.fold(stage, params.effects, memories, value, flight)
 
+    acting = fold("command", command)
+    flight = flight._replace(acting=acting)
     tau = fold("lag", Action(*(params.tau[i] for i in range(ACTION_SIZE))))
-    applied = compute_once(lag(drone.applied, fold("command", command), dt, tau))
+    applied = compute_once(lag(drone.applied, acting, dt, tau))
     flight = flight._replace(applied=applied, body_axes_w=compute_once(drone.quat.axes()))
     flight = _with_thrust(flight, params, memories)
     rates_b = fold("rates", body_rates(applied, params.max_rate))

@@ -177,12 +177,14 @@ def run_validate(arguments: argparse.Namespace) -> None:
 def run_diagnose(arguments: argparse.Namespace) -> None:
     """Say what a model gets wrong about flights, and write the report and the extended model."""
     learnt, judged = ([load_log(path) for path in paths] for paths in (arguments.logs, arguments.hold_out))
-    log = joined([*learnt, *judged])
-    check_plausible(log)
+    logs = [*learnt, *judged]
+    for one in logs:
+        check_plausible(one)
+    log = joined(logs)
     count = sum(len(one) for one in learnt)
     held_out = np.arange(len(log)) >= count if judged else None
     model = None if arguments.model is None else load_model(arguments.model)
-    found = diagnose(log, model, held_out, _Bar("stages"))
+    found = diagnose(logs, model, held_out, _Bar("stages"))
     written = write_diagnosis(arguments.out, found, log)
     print(text_of_diagnosis(found))
     print(f"written: {', '.join(str(path) for path in written)}")

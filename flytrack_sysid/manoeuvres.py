@@ -21,7 +21,7 @@ from flytrack_env.state import (
     STATE_SIZE,
     VELOCITY,
 )
-from flytrack_sysid.envelope import MIDDLE_V
+from flytrack_sysid.envelope import MIDDLE_V, VOLTAGES
 from flytrack_sysid.excitation import (
     AMPLITUDES,
     DT_S,
@@ -41,7 +41,7 @@ from flytrack_sysid.excitation import (
 # All manoeuvres last as long, so that they can be compared. Even: two flights fill a lane of a diagnosis.
 FLIGHTS_PER_MANOEUVRE = 8
 SECONDS_PER_MANOEUVRE = FLIGHTS_PER_MANOEUVRE * FLIGHT_STEPS * DT_S
-VOLTAGES = np.linspace(BATTERY_EMPTY_V + RESERVE_V, BATTERY_FULL_V, FLIGHTS_PER_MANOEUVRE)
+STARTS_V = np.linspace(BATTERY_EMPTY_V + RESERVE_V, BATTERY_FULL_V, FLIGHTS_PER_MANOEUVRE)
 SWING_HZ = 1.0  # of a thrust that goes up and down about hovering
 HOVER_SWING = 0.05  # of the stick: nobody holds it still
 VOLTAGE_SWING = 0.5
@@ -105,7 +105,7 @@ def _speeds(number: int, hover: float, rng: np.random.Generator) -> tuple[np.nda
     course = np.deg2rad(yaw_deg + 90.0 * (number % 2))
     climb = STEEPNESS * (-1.0) ** (number // 2)
     vel_w = speed * np.array([np.cos(course), np.sin(course), climb]) / np.hypot(1.0, climb)
-    return _start(hover, VOLTAGES[number], yaw_deg, vel_w=vel_w), _swing(hover, LEG_SWING, rng)
+    return _start(hover, STARTS_V[number], yaw_deg, vel_w=vel_w), _swing(hover, LEG_SWING, rng)
 
 
 def _low_passes(number: int, hover: float, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
@@ -116,12 +116,12 @@ def _low_passes(number: int, hover: float, rng: np.random.Generator) -> tuple[np
 def _thrust(number: int, hover: float, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     command = np.zeros((FLIGHT_STEPS, 4))
     command[:, 3] = switching(rng, 0.5, SLOW_STEPS) if number % 2 else switching(rng)
-    return _start(hover, VOLTAGES[number]), command
+    return _start(hover, STARTS_V[number]), command
 
 
 def _tilted(number: int, hover: float, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     tilt_deg = TILTS_DEG[number // 2] * (-1.0) ** number
-    return _start(hover, VOLTAGES[number], 90.0 * rng.integers(4), tilt_deg), _swing(hover, LEG_SWING, rng)
+    return _start(hover, STARTS_V[number], 90.0 * rng.integers(4), tilt_deg), _swing(hover, LEG_SWING, rng)
 
 
 def _amplitudes(number: int, hover: float, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
@@ -130,23 +130,23 @@ def _amplitudes(number: int, hover: float, rng: np.random.Generator) -> tuple[np
     for slot, axes in zip(slots, ((2,), (0, 1, 2)) if number % 2 else ((0,), (1,)), strict=True):
         for axis in axes:
             command[slot, axis] = AMPLITUDES[number // 2] * wave("sine" if len(axes) > 1 else "doublet", rng)
-    return _start(hover, VOLTAGES[number]), command
+    return _start(hover, STARTS_V[number]), command
 
 
 def _switching(number: int, hover: float, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     command = [switching(rng, hold_steps=QUICK_STEPS) for _ in range(4)]
-    return _start(hover, VOLTAGES[number]), FREE_AMPLITUDES[number // 2] * np.stack(command, axis=1)
+    return _start(hover, STARTS_V[number]), FREE_AMPLITUDES[number // 2] * np.stack(command, axis=1)
 
 
 def _spins(number: int, hover: float, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     command = _swing(hover, HOVER_SWING, rng)
     command[:, :3] = SPIN_STICKS[number]
     climb = FLIP_CLIMB if np.any(command[0, :2]) else 0.0
-    return _start(hover, VOLTAGES[number], vel_w=(0.0, 0.0, climb)), command
+    return _start(hover, STARTS_V[number], vel_w=(0.0, 0.0, climb)), command
 
 
 def _voltages(number: int, hover: float, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    return _start(hover, VOLTAGES[number]), _swing(hover, VOLTAGE_SWING, rng)
+    return _start(hover, STARTS_V[number]), _swing(hover, VOLTAGE_SWING, rng)
 
 
 MANOEUVRES = {
@@ -177,13 +177,14 @@ MANOEUVRES = {
 }
 
 
-def hover_action(model: ModelParameters) -> float:
-    """Return the thrust action at which a model's thrust curve holds its weight at 23 V.
+def hover_action(model: ModelParameters, voltages: tuple[float, float] = VOLTAGES) -> float:
+    """Return the thrust action at which a model's thrust curve holds its weight, half-way between voltages.
 
     The nearest end of the stick for a model that no thrust holds. Effects are left out: they change it by
     less than matters to where a flight begins.
     """
-    thrust_n = np.asarray(collective_thrust(ACTIONS, MIDDLE_V, np.asarray(model.thrust_coeffs, float)))
+    middle_v = 0.5 * sum(voltages)
+    thrust_n = np.asarray(collective_thrust(ACTIONS, middle_v, np.asarray(model.thrust_coeffs, float)))
     above = thrust_n > float(model.m) * float(model.g)
     if not above.any() or above.all():
         return float(ACTIONS[-1] if not above.any() else ACTIONS[0])
@@ -192,10 +193,13 @@ def hover_action(model: ModelParameters) -> float:
     return float(np.interp(float(model.m) * float(model.g), thrust_n[pair], ACTIONS[pair]))
 
 
-def flights_of(names: Iterable[str], hover: float, seed: int = 0) -> list[Flight]:
+def flights_of(
+    names: Iterable[str], hover: float, seed: int = 0, voltages: tuple[float, float] = VOLTAGES
+) -> list[Flight]:
     """Return the flights of manoeuvres, eight of each, in the order of the names.
 
     hover: the thrust action that holds the weight. The flights of a manoeuvre do not depend on the others.
+    voltages: of an empty and a full battery, V.
 
     Raises:
         KeyError: no manoeuvre of that name.
@@ -206,5 +210,6 @@ def flights_of(names: Iterable[str], hover: float, seed: int = 0) -> list[Flight
         rng = np.random.default_rng([seed, list(MANOEUVRES).index(name)])
         for number in range(FLIGHTS_PER_MANOEUVRE):
             start, command = manoeuvre.flight(number, hover, rng)
+            start[BATTERY] = np.interp(start[BATTERY], VOLTAGES, voltages)
             flights.append(Flight(name, start, np.clip(command, -1.0, 1.0)))
     return flights

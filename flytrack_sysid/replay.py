@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from flytrack_env.dynamics import ModelParameters, advance, integrate_attitude
+from flytrack_env.dynamics import ModelParameters, advance, integrate_attitude, start_rates
 from flytrack_env.effects import start_memories
 from flytrack_env.quaternion import Quaternion, Vec3
 from flytrack_env.state import Action, Drone
@@ -93,9 +93,10 @@ def _remembered(model: ModelParameters, record: Record) -> tuple[Action, Vec3, t
         applied, rates_b, memories = carry
         applied = chosen(row.begins | row.is_applied_known, Action(*row.applied), applied)
         drone = drone_of(row, applied, rates_b)
+        drone = drone._replace(rates_b=chosen(row.begins, start_rates(drone, model), rates_b))
         memories = chosen(row.begins, start_memories(model.effects, drone), memories)
         after, later = advance(drone, memories, Action(*row.command), row.step_s, model)
-        return (after.applied, after.rates_b, later), (applied, rates_b, memories)
+        return (after.applied, after.rates_b, later), (applied, drone.rates_b, memories)
 
     first = jax.tree.map(lambda column: column[0], record)
     drone = drone_of(first, Action(*first.applied), Vec3(*jnp.zeros_like(first.vel_w)))

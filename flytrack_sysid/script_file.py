@@ -19,7 +19,7 @@ import numpy as np
 
 from flytrack_env.files import write_atomically
 from flytrack_env.state import ACTION_SIZE, APPLIED_ACTION, QUATERNION, STATE_SIZE
-from flytrack_sysid.envelope import FEWEST_STEPS, LARGEST_SPEED, SCRIPT_HEIGHTS, is_inside
+from flytrack_sysid.envelope import ANY_VOLTAGE, FEWEST_STEPS, LARGEST_SPEED, SCRIPT_HEIGHTS, is_inside
 from flytrack_sysid.excitation import Flight
 from flytrack_sysid.manoeuvres import MANOEUVRES
 
@@ -89,10 +89,10 @@ def _check_ranges(starts: np.ndarray, commands: np.ndarray, source: str) -> None
     if len(bad):
         found = f"a quaternion of norm {norm[bad[0]]:.4g}"
         raise ScriptError(f"{source}: starts: found {found} in flight {bad[0]}, expected 1")
-    bad = np.flatnonzero(~is_inside(starts, SCRIPT_HEIGHTS))
+    bad = np.flatnonzero(~is_inside(starts, SCRIPT_HEIGHTS, ANY_VOLTAGE))
     if len(bad):
         expected = (
-            f"at most {LARGEST_SPEED:g} m/s, {SCRIPT_HEIGHTS[0]:g} to {SCRIPT_HEIGHTS[1]:g} m, 22 to 24 V"
+            f"at most {LARGEST_SPEED:g} m/s, {SCRIPT_HEIGHTS[0]:g} to {SCRIPT_HEIGHTS[1]:g} m, a voltage"
         )
         raise ScriptError(
             f"{source}: starts: found flight {bad[0]} outside of the envelope, expected {expected}"

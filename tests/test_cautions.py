@@ -38,31 +38,31 @@ def with_value(problem: Problem, field: str, value: float) -> tuple[Found, list[
 
 
 def test_a_value_inside_its_range_is_no_caution(problem):
-    assert cautions(problem, *with_value(problem, "rate_scale.yaw", 0.9), AS_GOOD, []) == ()
+    assert cautions(problem, *with_value(problem, "rate_scale.yaw", 0.9), AS_GOOD, [], 0) == ()
 
 
 def test_a_value_at_the_end_of_its_range_is_told(problem):
     low = problem.low[problem.names.index("rate_scale.yaw")]
-    (told,) = cautions(problem, *with_value(problem, "rate_scale.yaw", low), AS_GOOD, [])
+    (told,) = cautions(problem, *with_value(problem, "rate_scale.yaw", low), AS_GOOD, [], 0)
     assert told.startswith(f"rate_scale.yaw = {low:g} is at the end")
 
 
 def test_a_limit_that_is_as_hard_as_can_be_is_no_caution(problem):
-    assert cautions(problem, *with_value(problem, "rate_saturation.softness", 0.0), AS_GOOD, []) == ()
+    assert cautions(problem, *with_value(problem, "rate_saturation.softness", 0.0), AS_GOOD, [], 0) == ()
 
 
 def test_a_base_parameter_has_no_range_to_end_at(problem):
     cause = replace(CAUSE, effect="tau_roll", parameters={"tau_roll": Estimated(0.1, (0.1, 0.1), "s")})
     found = Found((), problem.start, 0.0, ())
-    assert cautions(problem, found, [cause], AS_GOOD, []) == ()
+    assert cautions(problem, found, [cause], AS_GOOD, [], 0) == ()
 
 
 def test_free_flight_that_got_worse_is_told(problem):
     errors = AS_GOOD | {"extended": Errors({}, {"1": 0.78})}
-    (told,) = cautions(problem, Found((), problem.start, 0.0, ()), [], errors, [])
+    (told,) = cautions(problem, Found((), problem.start, 0.0, ()), [], errors, [], 0)
     assert "0.78 m against 0.5 m after 1 s" in told
 
 
 def test_what_was_taken_back_is_told(problem):
-    (told,) = cautions(problem, Found((), problem.start, 0.0, ()), [], AS_GOOD, ["wind"])
+    (told,) = cautions(problem, Found((), problem.start, 0.0, ()), [], AS_GOOD, ["wind"], 0)
     assert told.startswith("wind gained nothing on the held-out part")

@@ -12,12 +12,18 @@ from benchmarks.diagnosis import model_of
 from benchmarks.hidden import draw_base, fly, measure
 from flytrack_env.dynamics import nominal_parameters
 from flytrack_env.effects import CommandDelay, LinearDrag, SecondOrderRates
+from flytrack_env.effects.command_delay import BUFFER_STEPS
 from flytrack_env.plants import Simulator
 from flytrack_sysid import collect
 from flytrack_sysid.diagnosis import DiagnosisError, diagnose, joined, regressors
 from flytrack_sysid.diagnosis import noise as noises
-from flytrack_sysid.diagnosis.lanes import LANE_S, LEAD_IN_S, NUM_AXES, make_lanes
+from flytrack_sysid.diagnosis.candidates import CANDIDATES
+from flytrack_sysid.diagnosis.diagnose import left_out
+from flytrack_sysid.diagnosis.lanes import LANE_S, LEAD_IN_S, NUM_AXES, make_lanes, thinned
+from flytrack_sysid.diagnosis.pipeline import taken_back
 from flytrack_sysid.diagnosis.problem import Problem
+from flytrack_sysid.diagnosis.search import fitted
+from flytrack_sysid.parameters import TAUS
 from flytrack_sysid.record import make_record
 from flytrack_sysid.replay import replay
 
@@ -239,6 +245,56 @@ def test_nothing_is_made_of_a_few_rows(flown, rows):
 def test_nothing_is_learnt_from_what_is_held_out(flown):
     log = flown[1]
     assert_refused_or_silent(log, model=model_of(flown[0]), held_out=np.ones(len(log), bool))
+
+
+def test_what_a_given_model_has_too_much_is_taken_out_again(flown):
+    truth, log = flown
+    model = model_of(truth)._replace(battery_drain_v_per_min=0.0)
+    found = diagnose(log, model.with_effects(LinearDrag(0.2, 0.2, 0.2)))
+    drag, drain = sorted(found.causes, key=lambda cause: cause.effect)[::-1]
+    assert (drag.effect, drain.effect) == ("linear_drag", "battery_drain")
+    for one in drag.parameters.values():
+        assert one.value == pytest.approx(0.0, abs=0.02)
+    assert drag.heldout_gain > 0.0 and drag.lambda_ > 100.0
+    assert drain.parameters["battery_drain_v_per_min"].value == pytest.approx(truth.drain, rel=0.05)
+
+
+def test_what_was_held_for_an_effect_is_free_without_it(flown, lanes):
+    with jax.enable_x64(True):
+        problem = Problem(lanes, model_of(flown[0]))
+        problem.set_noise(noises.first_guess(lanes, problem.left(problem.start[None])[0]))
+        delay = next(one for one in CANDIDATES if one.effect == "command_delay")
+        problem.held, problem.held_for = (*TAUS, "c0"), {"command_delay": TAUS, "wind": ("c0",)}
+        found = fitted(problem, (delay,), problem.start)
+        left, _ = taken_back(problem, found, ["command_delay"])
+    assert problem.held == ("c0",) and "command_delay" in problem.refused
+    assert left.chosen == () and set(problem.index(TAUS)) <= set(left.places)
+
+
+def test_delays_end_where_no_older_row_is_remembered(flown):
+    truth, log = flown
+    quick = replace(log, time=0.1 * log.time)  # 1 kHz
+    lanes = make_lanes(quick, np.ones(len(log), bool), np.array(truth.tau), truth.gravity)
+    problem = Problem(lanes, model_of(truth))
+    place = problem.names.index("command_delay.delay_s")
+    assert problem.high[place] == pytest.approx(BUFFER_STEPS * 0.001, rel=1e-3)
+
+
+def test_of_a_long_log_lanes_are_looked_at_evenly(lanes, monkeypatch):
+    assert thinned(lanes) is lanes
+    monkeypatch.setattr("flytrack_sysid.diagnosis.lanes.MOST_ROWS", 4 * LANE_S * RATE + 10)
+    fewer = thinned(lanes)
+    number = lanes.row.shape[1]
+    np.testing.assert_array_equal(fewer.row, lanes.row[:, np.linspace(0, number - 1, 4).round().astype(int)])
+    assert fewer.counts.shape == (*fewer.row.shape, NUM_AXES, 2) and fewer.quanta is lanes.quanta
+    assert fewer.record.pos_w.shape == (*fewer.row.shape, 3)
+
+
+def test_channels_that_some_logs_lack_are_told(flown):
+    first = replace(flown[1].select(slice(0, 30)), source="folder/a.npz")
+    second = replace(flown[1].select(slice(30, 50)).without("f"), source="b.npz")
+    assert left_out([first, second]) == ["channel f is not used: b.npz has none"]
+    assert left_out([first, first]) == []
 
 
 def test_logs_are_joined_by_what_they_all_have(flown):

@@ -365,6 +365,13 @@ def test_longer_delays_act_later() -> None:
 
 
 @OVER_EFFECTS
+def test_an_effect_of_one_sensor_alone_asks_for_that_sensor(effect: Effect) -> None:
+    for stage, channel in (("gyro", "w"), ("accelerometer", "f"), ("battery", "v_bat")):
+        if effect.stages == (stage,):
+            assert channel in effect.needs
+
+
+@pytest.mark.parametrize("effect", EFFECTS, ids=lambda effect: effect.name)
 def test_what_is_notable_is_inside_the_range(effect: Effect) -> None:
     neutral = effect.parameters()
     assert set(effect.notable) == set(effect.ranges) - set(effect.shapes)

@@ -10,6 +10,7 @@ from scipy import signal
 
 from flytrack_env.dynamics import ModelParameters, nominal_parameters
 from flytrack_env.effects import (
+    CommandDelay,
     GroundEffect,
     MotorImbalance,
     RateCrossCoupling,
@@ -76,6 +77,14 @@ def test_translational_lift_grows_with_airspeed_in_the_rotors_plane(speed, share
     assert lift_ratio(lift, vel_w=(speed, 0.0, 5.0)) == pytest.approx(1.0 + 0.2 * share, rel=1e-5)
     in_wind = (lift, Wind(v_y=-speed))
     assert lift_ratio(in_wind, vel_w=(0.0, 0.0, 0.0)) == pytest.approx(1.0 + 0.2 * share, rel=1e-5)
+
+
+def test_a_late_command_falls_when_it_arrives():
+    delay, late_s = 2, 0.02
+    commands = np.concatenate([held(20, thrust=0.6), held(20, thrust=-0.6)])
+    asymmetry = ThrustLagAsymmetry(2.0)
+    late = flown((CommandDelay(late_s), asymmetry), commands)[:, 19]
+    np.testing.assert_allclose(late[delay:], flown(asymmetry, commands)[:-delay, 19], atol=1e-6)
 
 
 def test_ground_effect_is_cheeseman_and_bennetts_from_two_radii_on():

@@ -188,7 +188,7 @@ def test_mappings_that_cannot_be_meant_are_refused(folder, tmp_path, old, new, m
     [
         (4, lambda cells: [*cells[:3], "", *cells[4:]], r"row 3 \(line 5\), column d: found an empty cell"),
         (4, lambda cells: [*cells[:3], "x", *cells[4:]], r"row 3 \(line 5\), column d: found 'x'"),
-        (4, lambda cells: [*cells[:3], "nan", *cells[4:]], r"row 3 \(line 5\), column p_z: found nan"),
+        (4, lambda cells: [*cells[:3], "nan", *cells[4:]], r"row 3 \(line 5\), column d: found nan"),
         (4, lambda cells: cells[:5], r"row 3 \(line 5\): found 5 cells, expected 22"),
         (4, lambda cells: ["0", *cells[1:]], r"row 3 \(line 5\), column t: found -5\.0.*later time"),
         (0, lambda cells: ["ms", *cells[:-1]], r"column n: found .*|column ms: found 2 times"),

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from handout_plant import HandoutPlant
 
-from flytrack_env.dynamics import nominal_parameters
+from flytrack_env.dynamics import collective_thrust, nominal_parameters
+from flytrack_env.state import APPLIED_ACTION, BATTERY
 from flytrack_sysid import collect, load_log
 from flytrack_sysid.cli import main
 from flytrack_sysid.diagnosis.lanes import LANE_S
@@ -55,6 +56,30 @@ def test_hover_of_a_model():
     )
 
 
+def test_flights_of_a_small_craft_are_at_its_voltages(tmp_path):
+    voltages, model = (3.2, 4.1), nominal_parameters()
+    small = model._replace(thrust_coeffs=np.array([0.0, 4.0, 0.0, 0.0, 2.7, 0.0]))  # of the volts alone
+    hover = hover_action(small, voltages)
+    thrust_n = float(collective_thrust(hover, 0.5 * sum(voltages), small.thrust_coeffs))
+    assert thrust_n == pytest.approx(float(small.m) * float(small.g), rel=1e-3)
+    assert hover_action(small) != pytest.approx(hover, abs=0.1)
+    path = tmp_path / "diagnosis.json"
+    path.write_text(json.dumps(asked(("wind", "voltages")) | {"data": {"voltages": voltages}}))
+    script = next_flight(path, small).script
+    assert script.starts[:, BATTERY].max() == pytest.approx(4.1) and script.starts[:, BATTERY].min() > 3.2
+    np.testing.assert_allclose(script.starts[:, APPLIED_ACTION][:, 3], hover)
+    save_script(tmp_path / "flight.npz", script)
+    assert load_script(tmp_path / "flight.npz").kinds == script.kinds
+
+
+@pytest.mark.parametrize("voltages", [[3.0], [4.0, 3.0], ["a", "b"], [0.0, 4.0], "3 V"])
+def test_voltages_that_cannot_be_are_refused(tmp_path, voltages):
+    path = tmp_path / "diagnosis.json"
+    path.write_text(json.dumps(asked(("wind", "voltages")) | {"data": {"voltages": voltages}}))
+    with pytest.raises(ScriptError, match=r"diagnosis.json: data: voltages: found .* expected the lowest"):
+        next_flight(path, nominal_parameters())
+
+
 def test_scripts_go_lower_than_the_excitation():
     log = collect(HandoutPlant(), script=made("low_passes", "speeds"))
     assert SCRIPT_HEIGHTS[0] <= log["p"][:, 2].min() < 0.3 < HEIGHTS[0]
@@ -94,7 +119,7 @@ BAD = {
     "applied action.: found -2 in flight 0": changed("starts", (0, 19), -2.0),
     "quaternion of norm 2 in flight 4": changed("starts", (4, 9), np.sqrt(4.0)),
     "found flight 1 outside of the envelope": changed("starts", (1, 2), 0.01),
-    "found flight 0 outside of the envelope": changed("starts", (0, 20), 16.0),
+    "found flight 0 outside of the envelope": changed("starts", (0, 20), -1.0),
     r"starts: found shape \(8, 20\), expected \(8, 21\)": {"starts": made("headings").starts[:, :20]},
     r"commands: found shape \(7, 250, 4\), expected \(8, 2 or more, 4\)": {
         "commands": made("headings").commands[:7]

@@ -57,7 +57,7 @@ def _rate_scale(values: Parameters) -> Hook:
 def _rate_saturation(values: Parameters) -> Hook:
     """omega = limit tanh(omega / limit), per axis; at full stick, ``lost`` of it is missing.
 
-    Not the package's law, which is a hard limit.
+    Not the package's law, which mixes a hard limit and a gradual one of another shape.
     """
     low, high = 0.0, 1.0
     # In x = 1 / (limit as a share of full stick): tanh(x) / x falls from 1.
@@ -113,7 +113,7 @@ def _second_order_rates(values: Parameters) -> Hook:
 
     wn: rad/s. zeta: other than 1.
 
-    Not the package's law, which is a second real pole and a zero.
+    The package has the same law with other parameters: lag_s is 2 zeta / wn, damping is zeta.
     """
     natural, damping = values["wn"], values["zeta"]
     decay, root = natural * damping, natural * cmath.sqrt(damping * damping - 1.0)

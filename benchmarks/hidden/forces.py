@@ -56,7 +56,7 @@ def _linear_drag(values: Parameters) -> Callable[[Any], Vector]:
 def _quadratic_drag(values: Parameters) -> Callable[[Any], Vector]:
     """f_i -= k_i |v_i| v_i, each axis for itself.
 
-    Not the package's law, in which the whole speed multiplies each axis.
+    The package's law with ``shared`` at 0; by default there the whole speed multiplies each axis.
     """
 
     def act(plant: Any) -> Vector:

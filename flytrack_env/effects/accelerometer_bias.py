@@ -23,6 +23,7 @@ ACCELEROMETER_BIAS = Effect(
     parameters=AccelerometerBias,
     ranges={axis: Range(-2.0, 2.0, "m/s^2") for axis in AccelerometerBias._fields},
     notable={"x": 0.3, "y": 0.3, "z": 0.3},
+    needs=("f",),
     equation="f_measured += (x, y, z)",
     source="assumption: constant within a flight",
     accelerometer=_accelerometer,

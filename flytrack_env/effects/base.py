@@ -50,7 +50,8 @@ STAGES = {
 class Flight(NamedTuple):
     """What an effect may look at; what later stages find out is None before them.
 
-    drone: before the step. command: as given, before any effect. dt: s.
+    drone: before the step. command: as given, before any effect. dt: s. acting: the command after the stage
+    command.
     applied: the lagged action after the step. body_axes_w: the body's x, y, z axes before the step.
     air_w: after the stage air, m/s. thrust_acc: collective thrust over mass, after the stage thrust, m/s^2.
     rates_b: after the stage rates, rad/s. force_b: specific force of the step, thrust and all else but
@@ -63,6 +64,7 @@ class Flight(NamedTuple):
     drone: Drone
     command: Action
     dt: Scalar
+    acting: Action | None = None
     applied: Action | None = None
     body_axes_w: tuple[Vec3, Vec3, Vec3] | None = None
     air_w: Vec3 | None = None
@@ -99,7 +101,8 @@ class Effect:
     hardly shows in a lap or a reading. equation, source: for people. command, lag, air, thrust, rates,
     force, battery, gyro, accelerometer: hooks at these stages.
     most_steps: of parameters that are times, how many steps of time they may last.
-    needs: what a log has to have measured to be asked about it: p position, v velocity, q attitude.
+    needs: channels that a log has to have to be asked about it: p position, v velocity, q attitude, w gyro,
+    f accelerometer, v_bat voltage.
     probes: values at which to look for the effect, of parameters whose slope at neutral is 0 or one-sided.
     groups: parameters that are looked for together; all of them if empty. shapes: parameters that only shape
     what others do, and do nothing while those are neutral.

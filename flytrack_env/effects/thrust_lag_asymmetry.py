@@ -16,7 +16,7 @@ class ThrustLagAsymmetry(NamedTuple):
 
 
 def _lag(asymmetry: ThrustLagAsymmetry, memory: None, tau: Action, flight: Flight) -> Action:
-    is_falling = flight.command.thrust < flight.drone.applied.thrust
+    is_falling = flight.acting.thrust < flight.drone.applied.thrust
     return tau._replace(thrust=jnp.where(is_falling, asymmetry.ratio * tau.thrust, tau.thrust))
 
 

@@ -7,6 +7,7 @@ import numpy as np
 from scipy import stats
 
 from flytrack_env.dynamics import collective_thrust
+from flytrack_sysid.diagnosis.candidates import BASE_CAUSES
 from flytrack_sysid.diagnosis.linear import Outlook, inflation_of, solve
 from flytrack_sysid.diagnosis.problem import Problem
 from flytrack_sysid.diagnosis.search import (
@@ -19,10 +20,8 @@ from flytrack_sysid.diagnosis.search import (
     threshold,
     with_effect,
 )
-from flytrack_sysid.parameters import DRAIN, TAUS, THRUST_COEFFS
+from flytrack_sysid.parameters import TAUS, THRUST_COEFFS
 
-# What a base parameter that differs is called.
-BASE_CAUSES = {**{name: (name,) for name in TAUS}, "thrust_curve": THRUST_COEFFS, "battery_drain": (DRAIN,)}
 IMMATERIAL = 0.01  # of a lag or a drain
 IMMATERIAL_THRUST = 0.003  # of the weight, rms over what was flown
 HOPELESS = 0.01  # of the cost, above the limit to first order: not worth a fit
@@ -115,6 +114,8 @@ def simpler(problem: Problem, found: Found) -> Found | None:
         problem.held = (*held, *fields)
         trial = _best_instead(problem, found, fields)
         if trial is not None:
+            for effect in {one.effect for one in trial.chosen} - {one.effect for one in found.chosen}:
+                problem.held_for[effect] = tuple(fields)
             return trial
         problem.held = held
     return None

@@ -6,8 +6,10 @@ import numpy as np
 
 from flytrack_env.effects import BY_NAME, EFFECTS, Effect
 from flytrack_sysid.diagnosis.problem import Problem
-from flytrack_sysid.parameters import DRAIN, TAUS, THRUST_COEFFS, neutral_value
+from flytrack_sysid.parameters import DRAIN, TAUS, THRUST_COEFFS
 
+# What a base parameter that differs is called.
+BASE_CAUSES = {**{name: (name,) for name in TAUS}, "thrust_curve": THRUST_COEFFS, "battery_drain": (DRAIN,)}
 BASE_FREE = (*TAUS, *THRUST_COEFFS, DRAIN)
 
 
@@ -27,10 +29,6 @@ class Candidate(NamedTuple):
         """Its parameters, without those that only shape what others do."""
         shapes = [f"{self.effect}.{field}" for field in BY_NAME[self.effect].shapes]
         return sum(field not in shapes for field in self.fields)
-
-    def neutral(self) -> np.ndarray:
-        """Return the values of its fields that do nothing."""
-        return np.array([neutral_value(field) for field in self.fields])
 
 
 def candidates_of(effect: Effect) -> list[Candidate]:

@@ -5,7 +5,8 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from flytrack_sysid.diagnosis import noise as noises
-from flytrack_sysid.diagnosis.base import BASE_CAUSES, Covered, contradiction
+from flytrack_sysid.diagnosis.base import Covered, contradiction
+from flytrack_sysid.diagnosis.candidates import BASE_CAUSES
 from flytrack_sysid.diagnosis.lanes import SIZES
 from flytrack_sysid.diagnosis.linear import Outlook, solve
 from flytrack_sysid.diagnosis.problem import Problem
@@ -156,9 +157,9 @@ def base_causes(
         if _is_remainder(gain, channel, effects):
             continue
         own = name, estimates(problem, outlook, found, acting)
-        scaled = _as_scale(problem.start[places], found.vector[places], covered)
-        if name == "thrust_curve" and scaled is not None:
-            own = "thrust_scale", {"factor": scaled}
+        if name == "thrust_curve":
+            scaled = _as_scale(problem.start[places], found.vector[places], covered)
+            own = own if scaled is None else ("thrust_scale", {"factor": scaled})
         causes.append(
             Cause(
                 effect=own[0],
@@ -203,6 +204,8 @@ def _as_scale(nominal: np.ndarray, values: np.ndarray, covered: Covered) -> Esti
     """Return the factor between two thrust curves, if one explains all that the log says of them."""
     along = nominal @ covered.information
     known = float(along @ nominal)
+    if known <= 0.0:
+        return None  # a curve of zeros
     factor = float(along @ values) / known
     rest = values - factor * nominal
     if rest @ covered.information @ rest / covered.inflation > threshold(len(values) - 1):

@@ -19,10 +19,10 @@ from flytrack_sysid.diagnosis.causes import (
 )
 from flytrack_sysid.diagnosis.cautions import cautions
 from flytrack_sysid.diagnosis.errors import errors_of
-from flytrack_sysid.diagnosis.lanes import make_lanes
+from flytrack_sysid.diagnosis.lanes import make_lanes, thinned, voltages_of
 from flytrack_sysid.diagnosis.limits import unseen
 from flytrack_sysid.diagnosis.linear import Outlook
-from flytrack_sysid.diagnosis.pipeline import Settled, settled, taken_back
+from flytrack_sysid.diagnosis.pipeline import Settled, reviewed, settled, taken_back
 from flytrack_sysid.diagnosis.plan import advise
 from flytrack_sysid.diagnosis.problem import Problem
 from flytrack_sysid.diagnosis.result import (
@@ -97,6 +97,7 @@ def diagnose(
         DiagnosisError: a log that says nothing of how the drone turns; ``held_out`` of another shape.
     """
     started = time.monotonic()
+    unused = [] if isinstance(log, FlightLog) else left_out(log)
     log = log if isinstance(log, FlightLog) else joined(log)
     check_log(log)
     out = held_out_rows(log, HELD_OUT_EVERY) if held_out is None else np.asarray(held_out)
@@ -107,7 +108,16 @@ def diagnose(
     model = nominal_parameters() if model is None else model
     with jax.enable_x64(True):
         found = _found(log, out, model, report)
-    return replace(found, seconds=time.monotonic() - started)
+    return replace(found, seconds=time.monotonic() - started, warnings=(*unused, *found.warnings))
+
+
+def left_out(logs: Sequence[FlightLog]) -> list[str]:
+    """Return a warning for each channel that some logs have and others lack."""
+    every = sorted({name for log in logs for name in log.channels})
+    lacking = {name: [Path(log.source).name for log in logs if name not in log.channels] for name in every}
+    return [
+        f"channel {name} is not used: {', '.join(files)} has none" for name, files in lacking.items() if files
+    ]
 
 
 def _found(
@@ -117,7 +127,7 @@ def _found(
     result = settled(log, ~out, model)
     report(1, len(STAGES))
     problem = result.problem
-    judge = Problem(make_lanes(log, out, np.asarray(model.tau, float), float(model.g)), model)
+    judge = Problem(thinned(make_lanes(log, out, np.asarray(model.tau, float), float(model.g))), model)
     judge.set_noise(problem.noise)
     result, lost = _held(result, judge)
     report(2, len(STAGES))
@@ -142,10 +152,11 @@ def _found(
         base=_model(problem, result.base),
         extended=_model(problem, result.found),
         noise=sensor_noise(problem),
+        voltages=voltages_of(problem.lanes),
         source=Path(log.source).name,
         sha256=log.sha256,
         seconds=0.0,
-        warnings=cautions(problem, result.found, causes, errors, lost),
+        warnings=cautions(problem, result.found, causes, errors, lost, learnt=int((~out).sum())),
     )
 
 
@@ -161,8 +172,7 @@ def _held(result: Settled, judge: Problem) -> tuple[Settled, list[str]]:
         if not now:
             return result, lost
         lost += now
-        found, weighed = taken_back(result.problem, result.found, now)
-        result = result._replace(found=found, weighed=weighed)
+        result = reviewed(result.problem, result.base, *taken_back(result.problem, result.found, now))
 
 
 def _is_contradicted(judge: Problem, weight: Weighed, found: Found) -> bool:

@@ -4,15 +4,9 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 from flytrack_env.dynamics import ModelParameters
-from flytrack_env.effects import BY_NAME, ThrustScale
-from flytrack_sysid.parameters import DRAIN, STICKS, TAUS, THRUST_COEFFS, names_of, to_vector, with_values
-
-# Causes that are no effect: numbers of the base model, by name.
-BASE_CAUSES: dict[str, tuple[str, ...]] = {
-    **{tau: (tau,) for tau in TAUS},
-    "thrust_curve": THRUST_COEFFS,
-    "battery_drain": (DRAIN,),
-}
+from flytrack_env.effects import ThrustScale
+from flytrack_sysid.diagnosis.candidates import BASE_CAUSES
+from flytrack_sysid.parameters import STICKS, names_of, to_vector, with_values
 
 
 class Against(NamedTuple):
@@ -174,7 +168,7 @@ EVIDENCE: dict[str, Evidence] = {
 
 
 def without(extended: ModelParameters, nominal: ModelParameters, cause: str) -> ModelParameters:
-    """Return a model less one cause: the effect neutral, or base parameters as in the nominal model.
+    """Return a model less one cause: effect or base parameters as in the nominal model.
 
     Raises:
         KeyError: no cause of that name.
@@ -182,7 +176,7 @@ def without(extended: ModelParameters, nominal: ModelParameters, cause: str) -> 
     if cause == "thrust_scale" and all(type(one) is not ThrustScale for one in extended.effects):
         cause = "thrust_curve"  # found as one factor between two curves
     if cause not in BASE_CAUSES:
-        return extended.with_effects(BY_NAME[cause].parameters())
+        return extended.with_effects(nominal.effect(cause))
     before = dict(zip(names_of(nominal), to_vector(nominal).tolist(), strict=True))
     return with_values(extended, {name: before[name] for name in BASE_CAUSES[cause]})
 

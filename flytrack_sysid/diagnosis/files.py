@@ -54,5 +54,7 @@ def text_of(diagnosis: Diagnosis) -> str:
         below = f" below {one.smallest:.3g} {one.unit}" if np.isfinite(one.smallest) else ""
         alike = f", looks like {', '.join(one.confused_with)}" if one.confused_with else ""
         to_do = one.fly if one.fly.startswith(TO_LOG) else f"fly {one.fly}"
-        lines.append(f"not shown by this log: {one.effect}{below}{alike}; {to_do}")
+        is_named = any(one.effect == cause.effect for cause in diagnosis.causes)
+        what = "not told apart by this log" if is_named else "not shown by this log"
+        lines.append(f"{what}: {one.effect}{below}{alike}; {to_do}")
     return "\n".join([*lines, *diagnosis.warnings])

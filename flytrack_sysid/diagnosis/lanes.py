@@ -7,6 +7,7 @@ the second before it, and all stretches are replayed at once: many times fewer s
 
 from typing import NamedTuple
 
+import jax
 import numpy as np
 from scipy.spatial.transform import Rotation
 
@@ -16,6 +17,7 @@ from flytrack_sysid.record import LARGEST_DOUBT, Record, applied_doubt, make_rec
 LEAD_IN_S, LANE_S = 1, 5
 PIECES = LEAD_IN_S + LANE_S  # of a second each, the lead-in first
 FEWEST_ROWS_PER_S = 20
+MOST_ROWS = 30_000  # that are replayed, lead-ins apart: all slopes of them are held at once, some 50 kB a row
 LANES_PADDED_TO = 2  # logs of about the same length share one compiled program
 # Axes of a residual: rotation x, y, z, force x, y, z (all world), battery. Channels of an axis: one that is
 # measured directly, and a level, of which that is the rate of change.
@@ -147,3 +149,20 @@ def make_lanes(log: FlightLog, judged: np.ndarray, tau: np.ndarray, gravity: flo
     known = np.repeat(certain[index], SIZES, axis=-1)
     known &= ~begins[..., None]
     return Lanes(record._replace(begins=begins), sensed, counts, ~begins, known, index, _quanta(found))
+
+
+def voltages_of(lanes: Lanes) -> tuple[float, float] | None:
+    """Return the lowest and the highest voltage that was measured, V; None without any."""
+    measured = lanes.record.battery_v[lanes.counts[..., -1, 1]]
+    return (float(measured.min()), float(measured.max())) if len(measured) else None
+
+
+def thinned(lanes: Lanes) -> Lanes:
+    """Return lanes evenly spread, of MOST_ROWS at most, in place of those of a long log."""
+    rows, count = lanes.row.shape
+    most = max(MOST_ROWS // (rows - lead_in_of(rows)) // LANES_PADDED_TO, 1) * LANES_PADDED_TO
+    if count <= most:
+        return lanes
+    kept = np.linspace(0, count - 1, most).round().astype(int)
+    by_lane = jax.tree.map(lambda leaf: leaf[:, kept], lanes._replace(quanta=None))
+    return by_lane._replace(quanta=lanes.quanta)

@@ -5,8 +5,11 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from flytrack_env.dynamics import ModelParameters
 from flytrack_sysid.diagnosis.result import SCHEMA, TO_LOG
+from flytrack_sysid.envelope import VOLTAGES
 from flytrack_sysid.manoeuvres import MANOEUVRES, SECONDS_PER_MANOEUVRE, flights_of, hover_action
 from flytrack_sysid.script_file import Script, ScriptError, script_of
 
@@ -47,6 +50,18 @@ def _reasons(path: Path, content: Any) -> dict[str, tuple[str, ...]]:
     return {name: tuple(effects) for name, effects in wanted.items() if effects}
 
 
+def _voltages(path: Path, content: dict[str, Any]) -> tuple[float, float]:
+    """Return the voltages that a diagnosis has seen; those of the handout's drone where it saw none."""
+    data = content.get("data")
+    found = data.get("voltages") if isinstance(data, dict) else None
+    if found is None:
+        return VOLTAGES
+    numbers = found if isinstance(found, list) and all(isinstance(one, int | float) for one in found) else []
+    if len(numbers) != 2 or not 0.0 < numbers[0] <= numbers[1] < np.inf:
+        raise ScriptError(f"{path}: data: voltages: found {found!r}, expected the lowest and the highest, V")
+    return float(numbers[0]), float(numbers[1])
+
+
 def next_flight(path: str | Path, model: ModelParameters, seed: int = 0) -> NextFlight:
     """Return the flights that a ``diagnosis.json`` asks for, for a drone that hovers as a model does.
 
@@ -61,4 +76,6 @@ def next_flight(path: str | Path, model: ModelParameters, seed: int = 0) -> Next
     reasons = _reasons(path, content)
     if not reasons:
         raise ScriptError(f"{path}: not_identifiable: found nothing that another flight would settle")
-    return NextFlight(script_of(flights_of(reasons, hover_action(model), seed)), reasons)
+    voltages = _voltages(path, content)
+    hover = hover_action(model, voltages)
+    return NextFlight(script_of(flights_of(reasons, hover, seed, voltages)), reasons)

@@ -87,7 +87,7 @@ def draw_errors(error: Mapping[str, Errors]) -> Figure:
     axes[0, 0].tick_params(axis="x", rotation=20)
     free = {name: one.position_m for name, one in error.items()}
     keys = keys_of(list(free.values()))
-    _draw_bars(axes[0, 1], free, {key: f"{key.removesuffix('s')} s" for key in keys})
+    _draw_bars(axes[0, 1], free, {key: f"{key} s" for key in keys})
     axes[0, 1].set_title("position error in free flight, rms", fontsize="small", loc="left")
     axes[0, 1].set_ylabel("m")
     legend_below(figure)
@@ -129,7 +129,7 @@ def _regressors_of(residual: str) -> list[str]:
     """Return what a residual is drawn against: its own stick first."""
     stick = {"rates_x": "roll", "rates_y": "pitch", "rates_z": "yaw"}.get(residual)
     own = f"airspeed_{residual[-1]}" if stick is None else f"applied_{stick}"
-    return [own, "speed", "applied_thrust", "height", "heading"]
+    return [own, "speed", "applied_thrust", "position_x", "position_y", "height", "heading"]
 
 
 def _draw_bins(panel: Axes, traces: Traces, residual: str, name: str) -> None:
@@ -150,7 +150,7 @@ def _draw_bins(panel: Axes, traces: Traces, residual: str, name: str) -> None:
 
 
 def draw_against(traces: Traces, residuals: Sequence[str], title: str) -> Figure:
-    """Draw binned means of residuals, a row each, against speed, thrust, stick, height and heading."""
+    """Draw binned means of residuals, a row each, against speed, thrust, stick, place and heading."""
     columns = len(_regressors_of(residuals[0]))
     figure, axes = panels_of(title, len(residuals), columns, 6.2, is_one_scale=True)
     for line, residual in zip(axes, residuals, strict=True):

@@ -8,8 +8,9 @@ import numpy as np
 from flytrack_env.dynamics import ModelParameters
 from flytrack_env.effects import EFFECTS
 from flytrack_sysid.diagnosis import noise as noises
-from flytrack_sysid.diagnosis.base import BASE_CAUSES, contradiction, simpler
-from flytrack_sysid.diagnosis.lanes import make_lanes
+from flytrack_sysid.diagnosis.base import contradiction, simpler
+from flytrack_sysid.diagnosis.candidates import BASE_CAUSES
+from flytrack_sysid.diagnosis.lanes import make_lanes, thinned
 from flytrack_sysid.diagnosis.linear import Outlook, cost_of
 from flytrack_sysid.diagnosis.problem import Problem
 from flytrack_sysid.diagnosis.result import Unexplained
@@ -48,9 +49,10 @@ def saturated(problem: Problem, outlook: Outlook) -> np.ndarray:
 
 def settled(log: FlightLog, judged: np.ndarray, model: ModelParameters) -> Settled:
     """Return what judged rows of a log say, starting from a model; inside of ``jax.enable_x64(True)``."""
-    lanes = make_lanes(log, judged, np.asarray(model.tau, float), float(model.g))
+    lanes = thinned(make_lanes(log, judged, np.asarray(model.tau, float), float(model.g)))
     problem = Problem(lanes, model)
-    problem.barred = tuple(effect.name for effect in EFFECTS if not set(effect.needs) <= set(log.channels))
+    there = {*log.channels, *lanes.measured}
+    problem.barred = tuple(effect.name for effect in EFFECTS if not set(effect.needs) <= there)
     problem.set_noise(noises.first_guess(lanes, problem.left(problem.start[None])[0]))
     base = base_fit(problem)
     outlook = full_outlook(problem, base.vector)
@@ -70,11 +72,11 @@ def settled(log: FlightLog, judged: np.ndarray, model: ModelParameters) -> Settl
     found, weighed = settle(problem, found)
     while (other := simpler(problem, found)) is not None:
         found, weighed = settle(problem, other)
-    return _without_stand_ins(problem, base, found, weighed)
+    return reviewed(problem, base, found, weighed)
 
 
-def _without_stand_ins(problem: Problem, base: Found, found: Found, weighed: dict[str, Weighed]) -> Settled:
-    """Return the model without names that something unknown has brought about."""
+def reviewed(problem: Problem, base: Found, found: Found, weighed: dict[str, Weighed]) -> Settled:
+    """Return the model without names that something unknown has brought about, and what is left."""
     while True:
         rest, dependences = look(problem, found, base.vector)
         if not rest.flagged:
@@ -91,6 +93,8 @@ def _without_stand_ins(problem: Problem, base: Found, found: Found, weighed: dic
 def taken_back(problem: Problem, found: Found, effects: Sequence[str]) -> tuple[Found, dict[str, Weighed]]:
     """Return the model without some effects, which are not to come again, settled."""
     problem.refused = (*problem.refused, *effects)
+    freed = {field for effect in effects for field in problem.held_for.pop(effect, ())}
+    problem.held = tuple(field for field in problem.held if field not in freed)
     for effect in effects:
         found = without(problem, found, effect)
     return settle(problem, found)
@@ -101,7 +105,7 @@ def _suspects(problem: Problem, found: Found, weighed: dict[str, Weighed]) -> li
         Suspect(
             one.effect,
             one.fields,
-            found.vector[problem.index(one.fields)] - one.neutral(),
+            (found.vector - problem.start)[problem.index(one.fields)],
             weighed[one.effect].robust,
             weighed[one.effect].count,
         )

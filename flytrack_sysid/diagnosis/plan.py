@@ -16,12 +16,12 @@ from flytrack_env.dynamics import ModelParameters
 from flytrack_env.plants import Simulator
 from flytrack_env.state import pack, unpack, unpack_action
 from flytrack_sysid.diagnosis.candidates import opened
-from flytrack_sysid.diagnosis.lanes import LANE_S, Lanes, make_lanes
+from flytrack_sysid.diagnosis.lanes import LANE_S, Lanes, make_lanes, voltages_of
 from flytrack_sysid.diagnosis.limits import DETECTED, SEPARATE, Seen
 from flytrack_sysid.diagnosis.linear import Outlook
 from flytrack_sysid.diagnosis.problem import Problem
 from flytrack_sysid.diagnosis.search import Found
-from flytrack_sysid.envelope import SCRIPT_HEIGHTS, is_inside
+from flytrack_sysid.envelope import ANY_VOLTAGE, SCRIPT_HEIGHTS, VOLTAGES, is_inside
 from flytrack_sysid.excitation import DT_S, FLIGHT_STEPS
 from flytrack_sysid.log import FlightLog, log_of_states
 from flytrack_sysid.manoeuvres import FLIGHTS_PER_MANOEUVRE, MANOEUVRES, flights_of, hover_action
@@ -50,7 +50,7 @@ def _flown(vector: jax.Array, like: ModelParameters, starts: jax.Array, commands
 
 def _until_outside(states: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return flights that stand still once they leave the envelope, and where they are within it."""
-    inside = np.logical_and.accumulate(is_inside(states, SCRIPT_HEIGHTS), axis=1)
+    inside = np.logical_and.accumulate(is_inside(states, SCRIPT_HEIGHTS, ANY_VOLTAGE), axis=1)
     last = np.maximum.accumulate(np.where(inside, np.arange(states.shape[1]), 0), axis=1)
     return np.take_along_axis(states, last[..., None], axis=1), inside
 
@@ -73,7 +73,8 @@ def _absent(lanes: Lanes) -> list[str]:
 def _seen_flights(problem: Problem, vector: np.ndarray) -> tuple[FlightLog, np.ndarray]:
     """Return all manoeuvres flown by a model, seen by the sensors of a problem's log, and rows that count."""
     model = problem.like._replace(thrust_coeffs=vector[problem.index([f"c{power}" for power in range(6)])])
-    flights = flights_of(MANOEUVRES, hover_action(model))
+    voltages = voltages_of(problem.lanes) or VOLTAGES
+    flights = flights_of(MANOEUVRES, hover_action(model, voltages), voltages=voltages)
     starts, commands = (
         np.stack(part) for part in zip(*((one.start, one.command) for one in flights), strict=True)
     )

@@ -11,7 +11,7 @@ import jax
 import numpy as np
 
 from flytrack_env.dynamics import ModelParameters
-from flytrack_env.effects import EFFECTS, effect_of
+from flytrack_env.effects import BY_NAME, EFFECTS, effect_of
 from flytrack_sysid.diagnosis import noise as noises
 from flytrack_sysid.diagnosis.lanes import LANE_S, Lanes, lead_in_of
 from flytrack_sysid.diagnosis.said import unexplained
@@ -60,6 +60,7 @@ class Problem:
         self.lanes = lanes
         self.counts = lanes.counts
         self.low, self.high = np.array([bounds_of(name) for name in self.names]).T
+        self.high = np.minimum(self.high, _longest(self.names, lanes))
         self.scale = np.array(
             [_scale(name, value) for name, value in zip(self.names, self.start, strict=True)]
         )
@@ -67,6 +68,7 @@ class Problem:
         self.barred: tuple[str, ...] = ()  # effects that the log cannot be asked about
         self.refused: tuple[str, ...] = ()  # effects that were taken back, and are not to come again
         self.held: tuple[str, ...] = ()  # base parameters that stay nominal
+        self.held_for: dict[str, tuple[str, ...]] = {}  # those, by the effect that made them needless
         self.last_outlook: Any = None  # ``linear.Outlook`` along everything: slopes are dear
 
     def set_noise(self, sought: np.ndarray) -> None:
@@ -118,6 +120,18 @@ class Problem:
     def index(self, names: Sequence[str]) -> list[int]:
         """Return the places of parameters in the vector."""
         return [self.names.index(name) for name in names]
+
+
+def _longest(names: Sequence[str], lanes: Lanes) -> np.ndarray:
+    """Return the longest value of parameters that are times: so many steps of the log as are remembered."""
+    step_s = float(np.median(lanes.record.step_s))
+    fields = [name.partition(".") for name in names]
+    return np.array(
+        [
+            BY_NAME[effect].most_steps.get(field, np.inf) * step_s if field else np.inf
+            for effect, _, field in fields
+        ]
+    )
 
 
 def _scale(name: str, value: float) -> float:

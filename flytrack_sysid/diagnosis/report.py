@@ -38,12 +38,12 @@ DIFFERENCES = (
     "row. White noise of theirs shows as a correlation of -0.5 at the first lag."
 )
 NO_BREAK = "\u00a0"  # a space at which lines do not break
-HEADLINE_HORIZONS = ("1", "1.0", "1s")  # s of free flight, whose error the first sentence gives
+HEADLINE_HORIZON = "1"  # s of free flight, whose error the first sentence gives
 HOW = (
     "Every step of the log is predicted from the row before it. What follows from the commands alone is "
     "carried on by the model; attitude, velocity, position and voltage are taken from the log.",
-    "A cause is named where it explains more than chance, both on the part that was fitted and on the part "
-    "that was held out, and where no other cause explains as much.",
+    "A cause is named where it explains more than chance on the fitted part, where the held-out part does "
+    "not contradict it, and where no other cause explains more.",
     "In the plot of a cause, orange dots are what the extended model leaves with this one cause taken out, "
     "nothing else refitted. The line is the difference between both models. Blue rings are what is left.",
     "Residuals are measured less said by the model. Forces are specific forces along the body's axes, thrust "
@@ -69,7 +69,9 @@ def _parameter(name: str, found: Estimated) -> str:
 def _confused(cause: Cause) -> str:
     if cause.equivalent:
         return f"this log cannot tell it from: {in_words(cause.equivalent[:MOST_LISTED])}"
-    return f"told apart; closest is: {words_of(cause.closest)}" if cause.closest else "told apart"
+    if cause.closest:
+        return f"told apart; closest is: {words_of(cause.closest)}"
+    return "not put against others"
 
 
 def _named(causes: tuple[Cause, ...]) -> str:
@@ -82,7 +84,7 @@ def _gained(diagnosis: Diagnosis) -> str:
 
     def error(model: str) -> float:
         found = diagnosis.error[model].position_m if model in diagnosis.error else {}
-        return next((found[horizon] for horizon in HEADLINE_HORIZONS if horizon in found), np.nan)
+        return found.get(HEADLINE_HORIZON, np.nan)
 
     before, after = error("nominal"), error("extended")
     if not np.isfinite(before + after):
@@ -132,7 +134,7 @@ def _errors_table(diagnosis: Diagnosis) -> Table:
     ]
     rows += [
         [
-            f"position after {key.removesuffix('s')} s",
+            f"position after {key} s",
             "m",
             *(_number(one.position_m.get(key)) for one in error.values()),
         ]

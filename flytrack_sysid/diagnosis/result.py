@@ -31,8 +31,7 @@ class Cause:
     attitude, force, velocity or battery: where it shows most. parameters: by name. chi2_gain: what it gains
     on the part that was fitted, heldout_gain: on the part held out, of minus twice the log likelihood.
     lambda_: squared size of its signature over the noise, all else that is free taken out. lambda_sep: the
-    same with the closest rival taken out too. before, after: rms of the channel's residual without and
-    with it.
+    same with the closest rival taken out too, and closest which that is; base parameters have none.
     """
 
     effect: str
@@ -64,7 +63,7 @@ class NotIdentifiable:
     """An effect that this log could not have shown, or not apart from others.
 
     smallest: of its parameter that is seen worst, what the log would show for sure. confused_with: what
-    looks alike in this log. fly: what to fly to settle it, a kind of ``flytrack_sysid.diagnosis.plan``.
+    looks alike in this log. fly: what to fly to settle it, one of ``flytrack_sysid.manoeuvres``.
     """
 
     effect: str
@@ -91,7 +90,8 @@ class Diagnosis:
 
     verdict: consistent, causes_found, unexplained, or "causes_found+unexplained". error: by model: nominal,
     refitted_base, extended, noise_floor. nominal, base, extended: the models. source, sha256: of the log.
-    noise: by channel and axis, standard deviations of the sensors as found.
+    noise: by channel and axis, standard deviations of the sensors as found. voltages: the lowest and the
+    highest of the battery that were learnt from, V; None where it was not measured.
     """
 
     verdict: str
@@ -106,6 +106,7 @@ class Diagnosis:
     source: str
     sha256: str
     seconds: float
+    voltages: tuple[float, float] | None = None
     warnings: tuple[str, ...] = ()
 
     def as_json(self) -> dict[str, Any]:
@@ -138,7 +139,7 @@ class Diagnosis:
                 for name, one in self.error.items()
             },
             "noise": self.noise,
-            "data": {"file": self.source, "sha256": self.sha256},
+            "data": {"file": self.source, "sha256": self.sha256, "voltages": self.voltages},
             "warnings": list(self.warnings),
         }
 

@@ -17,7 +17,7 @@ from the commands alone (applied action, rates, what effects remember) is carrie
 import jax
 import jax.numpy as jnp
 
-from flytrack_env.dynamics import ModelParameters, Reading, advance, read_sensors
+from flytrack_env.dynamics import ModelParameters, Reading, advance, body_rates, read_sensors
 from flytrack_env.effects import start_memories
 from flytrack_env.quaternion import Quaternion, Vec3
 from flytrack_env.state import Action, Drone
@@ -53,16 +53,22 @@ def _of_step(
     return jnp.stack([jnp.stack([*spun, *pushed, 0.0]), jnp.stack([*turned, *moved, drained])], axis=-1)
 
 
+def _first_rates(drone: Drone, sensed: dict[str, jax.Array], model: ModelParameters) -> Vec3:
+    """Return the rates with which a flight begins: what the gyro says, else what the sticks ask for."""
+    return Vec3(*sensed["w"]) if "w" in sensed else body_rates(drone.applied, model.max_rate)
+
+
 def _of_lane(model: ModelParameters, lane: Record, sensed: dict[str, jax.Array]) -> jax.Array:
     """Return the residuals of a lane's rows, step after step; of its first row nothing is said."""
-    rows = jax.tree.map(lambda leaf: leaf[:-1], lane)
+    rows, sensed_before = jax.tree.map(lambda leaf: leaf[:-1], (lane, sensed))
     later, sensed = jax.tree.map(lambda leaf: leaf[1:], (lane, sensed))
 
     def step(carry: tuple, inputs: tuple) -> tuple:
-        row, next_row, sensed = inputs
+        row, next_row, sensed_before, sensed = inputs
         applied, rates_b, memories = carry
         applied = chosen(row.begins | row.is_applied_known, Action(*row.applied), applied)
         drone = drone_of(row, applied, rates_b)
+        drone = drone._replace(rates_b=chosen(row.begins, _first_rates(drone, sensed_before, model), rates_b))
         memories = chosen(row.begins, start_memories(model.effects, drone), memories)
         after, memories = advance(drone, memories, Action(*row.command), row.step_s, model)
         read = read_sensors(drone, after, memories, row.step_s, model)
@@ -72,7 +78,7 @@ def _of_lane(model: ModelParameters, lane: Record, sensed: dict[str, jax.Array])
     first = jax.tree.map(lambda column: column[0], lane)
     drone = drone_of(first, Action(*first.applied), Vec3(*jnp.zeros_like(first.vel_w)))
     start = (drone.applied, drone.rates_b, start_memories(model.effects, drone))
-    found = jax.lax.scan(step, start, (rows, later, sensed))[1]
+    found = jax.lax.scan(step, start, (rows, later, sensed_before, sensed))[1]
     return jnp.concatenate([jnp.zeros_like(found[:1]), found])
 
 

@@ -98,7 +98,7 @@ def full_outlook(problem: Problem, vector: np.ndarray) -> Outlook:
             last = Outlook(problem, last.slopes, PROBES)
         outlook = last.moved(vector, problem.whiten(problem.left(vector[None]))[0])
     else:
-        others = np.array([opened(problem, vector, probe) for probe in PROBES])
+        others = problem.clipped(np.array([opened(problem, vector, probe) for probe in PROBES]))
         outlook = Outlook(problem, problem.slopes(vector, free_places(problem), others), PROBES)
     problem.last_outlook = outlook
     return outlook
@@ -117,7 +117,7 @@ def with_effect(problem: Problem, outlook: Outlook, found: Found, scored: Scored
         return fitted(problem, chosen, problem.clipped(vector[None])[0], outlook)
     best = fitted(problem, chosen, _on_the_way(problem, found, scored))
     if found.cost - best.cost < KEPT_PROMISE * gain.chi2:
-        other = fitted(problem, chosen, opened(problem, found.vector, candidate))
+        other = fitted(problem, chosen, problem.clipped(opened(problem, found.vector, candidate)[None])[0])
         best = min(best, other, key=lambda one: one.cost)
     return best
 

@@ -17,7 +17,6 @@ from flytrack_sysid.diagnosis.search import (
     threshold,
     with_effect,
 )
-from flytrack_sysid.parameters import neutral_value
 
 SAME = 10.0  # of chi2: a rival that explains so nearly as much cannot be told apart
 MOST_RIVALS = 3
@@ -53,7 +52,8 @@ def without(problem: Problem, found: Found, effect: str) -> Found:
     vector = found.vector.copy()
     for one in found.chosen:
         if one.effect == effect:
-            vector[problem.index(one.fields)] = [neutral_value(field) for field in one.fields]
+            places = problem.index(one.fields)
+            vector[places] = problem.start[places]  # neutral, or as the given model has it
     chosen = tuple(one for one in found.chosen if one.effect != effect)
     return fitted(problem, chosen, vector)
 
@@ -123,7 +123,8 @@ def separations(
     """
     own = next(one for one in found.chosen if one.effect == effect)
     columns = [outlook.column(field) for field in own.fields]
-    size = found.vector[problem.index(own.fields)] - [neutral_value(field) for field in own.fields]
+    places = problem.index(own.fields)
+    size = found.vector[places] - problem.start[places]
     given = [outlook.places.index(place) for place in found.places]
     given = [column for column in given if column not in columns]
 

@@ -3,6 +3,7 @@
 import csv
 import gzip
 import io
+import math
 import zlib
 from array import array
 from pathlib import Path
@@ -87,12 +88,15 @@ def _read(path: Path, columns: Columns, mapping: str) -> Table:
 
 
 def _number(path: Path, lines: array, column: str, cell: str) -> float:
+    place = f"{path}: row {len(lines) - 1} (line {lines[-1]}), column {column}"
     try:
-        return float(cell)
+        value = float(cell)
     except ValueError:
         found = repr(cell) if cell.strip() else "an empty cell"
-        place = f"{path}: row {len(lines) - 1} (line {lines[-1]}), column {column}"
         raise LogError(f"{place}: found {found}, expected a number") from None
+    if not math.isfinite(value):
+        raise LogError(f"{place}: found {cell.strip()}, expected a finite number")
+    return value
 
 
 def _time(table: Table, columns: Columns) -> np.ndarray:
