@@ -175,10 +175,12 @@ def _broken(rng: Rng, channel: str, value: float) -> Case:
 CASES: Mapping[str, Callable[[Rng], Case]] = {
     "clean": lambda rng: _flown(draw_base(rng), rng),
     "heavy": lambda rng: _flown(draw_base(rng), rng, "heavy"),
+    "coloured": lambda rng: _flown(draw_base(rng), rng, "coloured"),
     "gusts": lambda rng: _flown(replace(draw_base(rng), gust=draw_gust(rng)), rng),
     "one_signed": _signed,
     "one_mirrored": lambda rng: _signed(rng_of("one_signed"), -1.0),
     "one": lambda rng: _drawn(rng, 1),
+    "raced": lambda rng: _flown(_with(draw_base(rng), rng.choice(NAMES, 1), rng), rng, kind="race"),
     "two": lambda rng: _drawn(rng, 2),
     # Without a slope where there is none of it, and with fits that go astray.
     "loop": lambda rng: _flown(_with(draw_base(rng), ["second_order_rates"], rng), rng),

@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy import stats
 
 from benchmarks.diagnosis import model_of, plant
 from benchmarks.hidden.oracle import known
@@ -38,7 +39,7 @@ from tests.diagnosis_cases import (
 
 ROOT = Path(__file__).parent.parent
 BROKEN = ("stuck_gyro", "stuck_commands")
-GRADED = ("one_signed", "one", "two", "loop")
+GRADED = ("one_signed", "one", "raced", "two", "loop")
 CHANNELS = {"rates", "attitude", "force", "velocity", "battery"}
 WIDENED = 1.5  # of 95 % intervals: a right one misses such a wide one 3 times in a thousand
 TIMEOUT_S = 900.0
@@ -106,6 +107,10 @@ def test_every_sound_log_is_diagnosed(found: dict[str, Found]) -> None:
 def test_a_plant_as_believed_is_consistent(name: str, found: dict[str, Found]) -> None:
     assert found[name]["causes"] == [] and found[name]["verdict"] == "consistent"
     assert not found[name]["unexplained"]["flagged"] and found[name]["warnings"] == []
+
+
+def test_noise_that_lasts_has_no_name(found: dict[str, Found]) -> None:
+    assert found["coloured"]["causes"] == []
 
 
 def test_gusts_are_chance_and_have_no_name(found: dict[str, Found]) -> None:
@@ -251,9 +256,23 @@ def test_the_extended_model_can_be_flown(folder, found, cases) -> None:
     assert np.isfinite(observation).all() and np.isfinite(reward)
 
 
-# Of the benchmark's plants: row, and the largest share with a fault.
-STATISTICS = {"clean": 0.05, "heavy": 0.1, "gusts": 0.1, "one": 0.1, "two": 0.2, "three": 0.3}
-PLANTS = 40
+# Of the benchmark's plants: row, and the share with a fault that is aimed at.
+STATISTICS = {
+    "clean": 0.01,
+    "heavy": 0.01,
+    "coloured": 0.01,
+    "gusts": 0.01,
+    "one": 0.02,
+    "two": 0.05,
+    "three": 0.1,
+}
+OUTSIDE, PLANTS = 0.05, 40
+BY_CHANCE = 1e-3  # that more have one, where the aim is met
+
+
+def most(share: float) -> int:
+    """Return how many of the plants may have a fault."""
+    return int(stats.binom.isf(BY_CHANCE, PLANTS, share))
 
 
 @pytest.mark.slow
@@ -262,12 +281,12 @@ def test_few_plants_are_misjudged(row: str) -> None:
     lines = [plant(row, number, SEED) for number in range(PLANTS)]
     wrong = {line["truth"]: faults(line["effects"], line.get("known", {}), line["causes"]) for line in lines}
     wrong = {truth: said for truth, said in wrong.items() if said}
-    assert len(wrong) <= STATISTICS[row] * PLANTS, wrong
+    assert len(wrong) <= most(STATISTICS[row]), wrong
 
 
 @pytest.mark.slow
 def test_few_plants_with_something_else_get_a_name() -> None:
     lines = [plant("outside", number, SEED) for number in range(PLANTS)]
-    assert sum(bool(line["causes"]) for line in lines) <= 0.1 * PLANTS, lines
+    assert sum(bool(line["causes"]) for line in lines) <= most(OUTSIDE), lines
     plain = [line for line in lines if line["visible"] > 100.0]
     assert plain and np.mean([bool(line["unexplained"]) for line in plain]) >= 0.9, plain

@@ -14,7 +14,7 @@ from flytrack_sysid.diagnosis.lanes import make_lanes, thinned
 from flytrack_sysid.diagnosis.linear import Outlook, cost_of
 from flytrack_sysid.diagnosis.problem import Problem
 from flytrack_sysid.diagnosis.result import Unexplained
-from flytrack_sysid.diagnosis.search import MOST_EFFECTS, Found, add_best, base_fit, fitted, full_outlook
+from flytrack_sysid.diagnosis.search import Found, base_fit, fitted, full_outlook, searched
 from flytrack_sysid.diagnosis.stand_ins import Suspect, stand_ins
 from flytrack_sysid.diagnosis.unexplained import look
 from flytrack_sysid.diagnosis.weigh import Weighed, settle, without
@@ -58,16 +58,11 @@ def settled(log: FlightLog, judged: np.ndarray, model: ModelParameters) -> Settl
     outlook = full_outlook(problem, base.vector)
     problem.set_noise(noises.fit_noise(lanes, saturated(problem, outlook)))
     base = found = fitted(problem, (), base.vector, full_outlook(problem, base.vector))
-    outlook = full_outlook(problem, found.vector)
-    while len(found.chosen) < MOST_EFFECTS:
-        more = add_best(problem, found, outlook)
-        if more is None:
-            break
-        found = more
-        outlook = full_outlook(problem, found.vector)
-    if found.chosen:
+    # A large effect hides small ones as long as its remainder is taken for noise.
+    while (more := searched(problem, found)) is not found:
+        outlook = full_outlook(problem, more.vector)
         problem.set_noise(noises.fit_noise(lanes, saturated(problem, outlook), problem.noise))
-        found = fitted(problem, found.chosen, found.vector, full_outlook(problem, found.vector))
+        found = fitted(problem, more.chosen, more.vector, full_outlook(problem, more.vector))
         base = fitted(problem, (), base.vector)
     found, weighed = settle(problem, found)
     while (other := simpler(problem, found)) is not None:

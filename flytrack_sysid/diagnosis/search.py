@@ -135,6 +135,16 @@ def _on_the_way(problem: Problem, found: Found, scored: Scored) -> np.ndarray:
     return problem.clipped(vector[None])[0]
 
 
+def searched(problem: Problem, found: Found) -> Found:
+    """Return the model with all effects added that explain enough, the best first; the same if none does."""
+    while len(found.chosen) < MOST_EFFECTS:
+        more = add_best(problem, found, full_outlook(problem, found.vector))
+        if more is None:
+            break
+        found = more
+    return found
+
+
 def add_best(problem: Problem, found: Found, outlook: Outlook) -> Found | None:
     """Return the model with the effect added that explains most; None where none explains enough."""
     ranked = [
