@@ -238,7 +238,10 @@ def check_content(one: Found) -> None:
 def test_a_diagnosis_has_the_content_it_says(name, found, folder) -> None:
     check_content(found[name])
     file = f"log_{name}.npz"
-    assert found[name]["data"] == {"file": file, "sha256": load_log(folder / file).sha256}
+    log, data = load_log(folder / file), found[name]["data"]
+    assert (data["file"], data["sha256"]) == (file, log.sha256)
+    low, high = data["voltages"]
+    assert log["v_bat"].min() <= low < high <= log["v_bat"].max()
 
 
 def test_the_extended_model_can_be_flown(folder, found, cases) -> None:
