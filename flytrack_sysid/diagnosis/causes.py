@@ -22,6 +22,7 @@ BY_CHANCE = 3.0  # times SAME: so much a chi2 that is expected below SAME hardly
 # cause would gain there, and less than that share of its size is there: laws are not exact where they are
 # flown harder than before.
 HELD_OUT_SIGMAS, HELD_OUT_SHARE = 4.0, 0.35
+SHOWN = 20.0  # of chi2: rows that would not show so much say nothing against a cause
 OF_LAW = 0.01  # of an effect's gain: no more is its law's remainder
 LOOSE = 0.5  # of what was known beforehand: a parameter known no better is not determined by the log
 # Equal but for a name: mass, payload, battery and motors all scale the thrust over the mass.
@@ -121,8 +122,10 @@ def is_contradicted(gain: float, expected: float, inflation: float) -> bool:
 
     expected: what it would be if it were; the spread is that of a chi2 about it.
     """
-    spread = 2.0 * np.sqrt(max(expected, 1.0) * inflation)
-    share = 0.5 * (1.0 + gain / max(expected, 1.0))
+    if expected < SHOWN * inflation:
+        return False
+    spread = 2.0 * np.sqrt(expected * inflation)
+    share = 0.5 * (1.0 + gain / expected)
     return gain < expected - HELD_OUT_SIGMAS * spread and share < HELD_OUT_SHARE
 
 
@@ -156,22 +159,12 @@ def base_causes(
         channel = channel_of(problem, nominal, found.vector)
         if _is_remainder(gain, channel, effects):
             continue
-        own = name, estimates(problem, outlook, found, acting)
+        parameters, twins = estimates(problem, outlook, found, acting), ()
         if name == "thrust_curve":
             scaled = _as_scale(problem.start[places], found.vector[places], covered)
-            own = own if scaled is None else ("thrust_scale", {"factor": scaled})
-        causes.append(
-            Cause(
-                effect=own[0],
-                equivalent=SCALE_TWINS if own[0] == "thrust_scale" else (),
-                channel=channel,
-                parameters=own[1],
-                chi2_gain=gain,
-                heldout_gain=held,
-                lambda_=gain,
-                lambda_sep=gain,
-            )
-        )
+            if scaled is not None:
+                name, parameters, twins = "thrust_scale", {"factor": scaled}, SCALE_TWINS
+        causes.append(Cause(name, twins, channel, parameters, gain, held, lambda_=gain, lambda_sep=gain))
     return sorted(causes, key=lambda cause: -cause.chi2_gain), lost
 
 

@@ -41,28 +41,32 @@ def stand_ins(
     left, slopes = seen(problem, found)
     flight = flight_of(problem, found)
     disturbed = {name.split(":")[0] for name in rest.shares}
+
+    def lambdas(one: Suspect, side: str) -> tuple[float, float]:
+        """Return a suspect's lambda on a side, and beside what the rest depends on."""
+        axes = SIDES[side]
+        own = [found.places.index(place) for place in problem.index(one.fields)]
+        acting = slopes[own][..., axes, :]
+        if not (problem.lanes.counts[..., axes, :].any() and np.abs(acting).max() > 0.0):
+            return 0.0, 0.0
+        sums = Side(problem, side, left, np.delete(slopes, own, axis=0))
+        columns = blocks_of(acting * sums.root)
+        before = sums.lambda_of(columns, one.size)
+        more = [dependence.columns for dependence in dependences_found if dependence.side == side]
+        if more:
+            more.append(blocks_of(whitened(problem, constants(flight, side), side) * sums.root))
+            sums.given = np.concatenate([sums.given, *more], axis=1)
+        return before, sums.lambda_of(columns, one.size)
+
     result = []
     for one in suspects:
-        own = [found.places.index(place) for place in problem.index(one.fields)]
-        others = [place for place in range(len(found.places)) if place not in own]
-        before, after = dict.fromkeys(SIDES, 0.0), dict.fromkeys(SIDES, 0.0)
-        for side, axes in SIDES.items():
-            acting = slopes[own][..., axes, :]
-            if not (problem.lanes.counts[..., axes, :].any() and np.abs(acting).max() > 0.0):
-                continue
-            sums = Side(problem, side, left, slopes[others])
-            columns = blocks_of(acting * sums.root)
-            before[side] = sums.lambda_of(columns, one.size)
-            more = [dependence.columns for dependence in dependences_found if dependence.side == side]
-            if more:
-                more.append(blocks_of(whitened(problem, constants(flight, side), side) * sums.root))
-                sums.given = np.concatenate([sums.given, *more], axis=1)
-            after[side] = sums.lambda_of(columns, one.size)
-        if not any(before.values()):
+        by_side = {side: lambdas(one, side) for side in SIDES}
+        before, after = (sum(values) for values in zip(*by_side.values(), strict=True))
+        if before == 0.0:
             continue  # it acts on neither side: the battery
-        own_side = max(before, key=before.get)
+        own_side = max(by_side, key=lambda side: by_side[side][0])
         least = threshold(one.count)
-        is_gone = sum(after.values()) < max(KEPT_SHARE * sum(before.values()), least)
+        is_gone = after < max(KEPT_SHARE * before, least)
         if is_gone or (own_side in disturbed and one.robust < DISTURBED * least):
             result.append(one.name)
     return result
