@@ -22,7 +22,7 @@ from flytrack_sysid.diagnosis.diagnose import left_out
 from flytrack_sysid.diagnosis.lanes import LANE_S, LEAD_IN_S, NUM_AXES, make_lanes, thinned
 from flytrack_sysid.diagnosis.pipeline import taken_back
 from flytrack_sysid.diagnosis.problem import Problem
-from flytrack_sysid.diagnosis.search import fitted
+from flytrack_sysid.diagnosis.search import fitted, full_outlook
 from flytrack_sysid.parameters import TAUS
 from flytrack_sysid.record import make_record
 from flytrack_sysid.replay import replay
@@ -269,6 +269,20 @@ def test_what_was_held_for_an_effect_is_free_without_it(flown, lanes):
         left, _ = taken_back(problem, found, ["command_delay"])
     assert problem.held == ("c0",) and "command_delay" in problem.refused
     assert left.chosen == () and set(problem.index(TAUS)) <= set(left.places)
+
+
+def test_a_model_with_an_effect_that_had_no_slope_is_not_nearby(flown, lanes):
+    with jax.enable_x64(True):
+        problem = Problem(lanes, model_of(flown[0]))
+        problem.set_noise(noises.first_guess(lanes, problem.left(problem.start[None])[0]))
+        outlook = full_outlook(problem, problem.start)
+        limited, lagging = problem.start.copy(), problem.start.copy()
+        limited[problem.names.index("rate_slew_limit.inverse")] = 0.003
+        lagging[problem.names.index("tau_roll")] *= 1.0001
+        assert outlook.distance(limited) == np.inf and 0.0 < outlook.distance(lagging) < 1.0
+        assert full_outlook(problem, lagging).slopes is outlook.slopes
+        column = full_outlook(problem, limited).column("rate_slew_limit.inverse")
+        assert problem.last_outlook.total[column, column] > 1e3 * outlook.total[column, column]
 
 
 def test_delays_end_where_no_older_row_is_remembered(flown):

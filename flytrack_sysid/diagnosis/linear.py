@@ -13,6 +13,8 @@ from flytrack_sysid.diagnosis.problem import Problem, Slopes, blocks_of, robust_
 # A direction of which the others leave less than this share is not told apart from them.
 LEAST_OWN_SHARE = 1e-7
 AT_BOUND = 1e-9
+PROBES = [candidate for candidate in CANDIDATES if candidate.probe is not None]
+ALIKE = 0.1  # relative change of a parameter that is looked for at probes, in which its slope stays
 PROBE_PRIOR = 1e-2  # a step to a probe is known to be less than ten times that
 
 
@@ -91,7 +93,10 @@ class Outlook:
         change = vector - self.slopes.vector
         places = np.array(self.places)
         elsewhere = np.delete(change, places)
-        if np.any(elsewhere != 0.0):
+        sloping = self.problem.index(sorted({one.probe[0] for one in PROBES}))
+        size = np.maximum(np.abs(vector), np.abs(self.slopes.vector))
+        # Where there was no slope, none says how far away the model is.
+        if np.any(elsewhere != 0.0) or np.any((np.abs(change) > ALIKE * size)[sloping]):
             return np.inf
         count = len(places)
         return float(change[places] @ self.total[:count, :count] @ change[places])
@@ -213,6 +218,3 @@ def cost_of(problem: Problem, vectors: np.ndarray, white: np.ndarray) -> np.ndar
     """Return minus twice the log likelihood of models, and what is known beforehand, (count,)."""
     known = prior_information(problem) * (vectors - problem.start) ** 2
     return np.array([robust_square(one) for one in white]) + known.sum(axis=1)
-
-
-PROBES = [candidate for candidate in CANDIDATES if candidate.probe is not None]
