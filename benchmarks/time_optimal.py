@@ -193,7 +193,9 @@ def main() -> None:
         )
     try:
         is_good = run(arguments)
-    except (ValueError, OSError, RuntimeError, ImportError) as error:
+    except ImportError as error:
+        parser.error(f"{error}; pip install .[optimal]")
+    except (ValueError, OSError, RuntimeError) as error:
         parser.error(str(error))
     raise SystemExit(0 if is_good else 1)
 
