@@ -34,8 +34,8 @@ EXPLAINED = (
     "code. *Free times*: with the segments' times free instead and gates at nodes; where that differs "
     "little, the grid costs little. *Starts agree*: of the searches on coarse grids, those within "
     f"{AGREE_SHARE:.1%} of the best. These are local optima: nothing proves that no better one exists. "
-    "The model `nominal` is the simulator's own; `black_box` is the `extended_model.json` that the README's "
-    "commands `collect`, `fit` and `diagnose` make of the shipped black box.\n\n"
+    "The model `nominal` is the simulator's own; `black_box` is what the README's commands `collect`, `fit` "
+    "and `diagnose` made of the shipped black box (`benchmarks/data/time_optimal/black_box.json`).\n\n"
 )
 FLOWN_AGAIN = (
     "\n## Flown again\n\nThe stored commands, open loop, without any feedback, in the environment at 100 Hz "
