@@ -103,10 +103,12 @@ def _optimum_row(reference: Reference) -> str:
 
 def _replay_row(reference: Reference, flown_by: str, flown: Replay) -> str:
     ended = f", {', '.join(flown.ended_by)}" if flown.ended_by else ""
+    late_ms = MILLI * (flown.time_s - reference.time_s)
+    taken = "- | -" if np.isnan(flown.time_s) else f"{flown.time_s:.4f} | {late_ms:+.3f}"
     return (
         f"| {reference.track} | {reference.model_name} | {TITLES[reference.kind]} | {flown_by} | "
-        f"{flown.gates_passed} of {len(reference.gate_times_s)}{ended} | {flown.time_s:.4f} | "
-        f"{MILLI * (flown.time_s - reference.time_s):+.3f} | {MILLI * flown.drift_m:.2f} | "
+        f"{flown.gates_passed} of {len(reference.gate_times_s)}{ended} | {taken} | "
+        f"{MILLI * flown.drift_m:.2f} | "
         f"{flown.frames_touched} |\n"
     )
 
