@@ -1,0 +1,97 @@
+"""A reference flown again: its commands, open loop, in the environment with the simulator at 100 Hz."""
+
+from functools import cache
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from benchmarks.optimal.reference import Reference
+from flytrack_env import EnvParams, EnvState, FlyTrack, ModelParameters
+from flytrack_env.plants import Plant
+from flytrack_env.quaternion import Vec3
+from flytrack_env.race import Race
+from flytrack_env.state import POSITION, pack, unpack, unpack_action
+from flytrack_env.terminations import Causes
+from flytrack_env.tracks import Track, cross_gate
+
+
+class Replay(NamedTuple):
+    """What came of a reference's commands.
+
+    states: (N + 1, 21), float32. gates_passed: in order, by the environment. time_s: to the last gate as the
+    environment interpolates it, NaN if it was not passed. ended_by: causes of termination. drift_m: largest
+    distance from the reference. frames_touched: of all gates, also those that were not next.
+    """
+
+    states: np.ndarray
+    gates_passed: int
+    time_s: float
+    ended_by: tuple[str, ...]
+    drift_m: float
+    frames_touched: int
+
+
+class _Told(NamedTuple):
+    """What is kept of every step: the packed state, the causes of termination, the race."""
+
+    state: jax.Array
+    causes: Causes
+    race: Race
+
+
+@cache
+def _environment(plant: Plant | None) -> tuple[FlyTrack, Any]:
+    """Return the environment and its compiled step, shared by all tracks and models of one form."""
+    env = FlyTrack(plant=plant)
+
+    def fly(state: EnvState, command: jax.Array, params: EnvParams) -> tuple[EnvState, _Told]:
+        after, _, causes, _ = env.transition(state, unpack_action(command), params)
+        return after, _Told(pack(env.drone(after)), causes, env.race(after))
+
+    return env, jax.jit(fly)
+
+
+def _params(track: Track, model: ModelParameters, dt_s: float) -> EnvParams:
+    model = jax.tree.map(lambda leaf: np.asarray(leaf, np.float32), model)
+    params = FlyTrack(track=track, model=model).default_params.replace(dt=dt_s)
+    return jax.device_put(params)  # once, not in every step
+
+
+def _frames_touched(positions: np.ndarray, params: EnvParams) -> int:
+    """Return how many gates' frames the straight lines between positions, (N, 3), touch."""
+    lines = (
+        Vec3(*(jnp.asarray(axis)[:, None] for axis in ends.T)) for ends in (positions[:-1], positions[1:])
+    )
+    crossing = cross_gate(params.course.gates, *lines, params.drone_radius)
+    return int(np.asarray(crossing.is_frame).any(axis=0).sum())
+
+
+def replay(reference: Reference, track: Track, plant: Plant | None = None) -> Replay:
+    """Return what the environment says of a reference's commands: open loop, nothing corrects the flight.
+
+    The environment is that of ``FlyTrack-v0`` with the reference's model, float32, or with another plant,
+    such as a black box; the flight ends at the first cause of termination.
+    """
+    env, step = _environment(plant)
+    params = _params(track, reference.model, reference.dt_s)
+    first = jnp.asarray(reference.states[0], jnp.float32)
+    state, steps = env.begin(unpack(first), 0, params), []
+    for command in np.asarray(reference.commands, np.float32):
+        state, told = step(state, command, params)
+        steps.append(told)
+    flown = jax.tree.map(lambda *leaves: np.stack(leaves), *steps)
+    is_over = np.any(np.stack(flown.causes), axis=0)
+    last = int(np.argmax(is_over)) if is_over.any() else len(steps) - 1
+    states = np.concatenate([np.asarray(first)[None], flown.state[: last + 1]])
+    drift = np.linalg.norm(states[:, POSITION] - reference.states[: last + 2, POSITION], axis=1)
+    race = jax.tree.map(lambda leaf: leaf[last], flown.race)
+    return Replay(
+        states=states,
+        gates_passed=int(race.gates_passed),
+        time_s=float(race.lap_time_s) if int(race.laps) else float("nan"),
+        ended_by=tuple(name for name, cause in flown.causes._asdict().items() if cause[last]),
+        drift_m=float(drift.max()),
+        frames_touched=_frames_touched(states[:, POSITION], params),
+    )
