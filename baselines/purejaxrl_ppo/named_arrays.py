@@ -1,4 +1,7 @@
-"""Any tree of arrays as named NumPy arrays, and back into a tree that says what it expects."""
+"""Any tree of arrays as named NumPy arrays, and back into a tree that says what it expects.
+
+Random keys are of JAX's default implementation.
+"""
 
 from typing import Any
 
@@ -7,16 +10,21 @@ import jax.numpy as jnp
 import numpy as np
 
 
+def name_of(path: Any) -> str:
+    """Return the path of a leaf as a dotted name."""
+    return jax.tree_util.keystr(path, simple=True, separator=".")
+
+
 def is_key(leaf: Any) -> bool:
     """Return whether an array, or its shape and type, is one of random keys."""
     return jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
 
 
 def as_named_arrays(tree: Any) -> dict[str, np.ndarray]:
-    """Return the leaves of a tree by their paths, bit for bit; random keys as their words."""
+    """Return the leaves of a tree by their dotted paths, bit for bit; random keys as their words."""
     leaves = jax.tree_util.tree_leaves_with_path(tree)
     return {
-        jax.tree_util.keystr(path): np.asarray(
+        name_of(path): np.asarray(
             jax.random.key_data(leaf) if isinstance(leaf, jax.Array) and is_key(leaf) else leaf
         )
         for path, leaf in leaves
@@ -41,14 +49,12 @@ def find_misfits(arrays: dict[str, np.ndarray], target: Any) -> list[str]:
 def from_named_arrays(arrays: dict[str, np.ndarray], target: Any) -> Any:
     """Return the tree that ``target`` (shapes and types) describes, of arrays that fit it (find_misfits)."""
     leaves, structure = jax.tree_util.tree_flatten_with_path(target)
-    return jax.tree.unflatten(
-        structure, [_read(arrays[jax.tree_util.keystr(path)], leaf) for path, leaf in leaves]
-    )
+    return jax.tree.unflatten(structure, [_read(arrays[name_of(path)], leaf) for path, leaf in leaves])
 
 
 def _read(array: np.ndarray, wanted: Any) -> jax.Array:
     words = jnp.asarray(array)
-    return jax.random.wrap_key_data(words, impl=jax.random.key_impl(wanted)) if is_key(wanted) else words
+    return jax.random.wrap_key_data(words) if is_key(wanted) else words
 
 
 def _forms(target: Any) -> dict[str, tuple[tuple[int, ...], np.dtype]]:
@@ -56,5 +62,5 @@ def _forms(target: Any) -> dict[str, tuple[tuple[int, ...], np.dtype]]:
     forms = {}
     for path, leaf in jax.tree_util.tree_leaves_with_path(target):
         stored = jax.eval_shape(jax.random.key_data, leaf) if is_key(leaf) else leaf
-        forms[jax.tree_util.keystr(path)] = (tuple(stored.shape), np.dtype(stored.dtype))
+        forms[name_of(path)] = (tuple(stored.shape), np.dtype(stored.dtype))
     return forms

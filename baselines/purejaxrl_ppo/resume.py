@@ -50,7 +50,7 @@ def describe_run(env: Any, env_id: str, track: str, config: Config, seed: int) -
             "observation": observation_layout(env),
             "seed": seed,
             "model": model_as_json(params.model),
-            "environment": {name.lstrip("."): values.tolist() for name, values in others.items()},
+            "environment": {name: values.tolist() for name, values in others.items()},
             "config": dataclasses.asdict(config),
         }
     )
