@@ -2,6 +2,7 @@
 
 import json
 import logging
+import re
 import shutil
 import subprocess
 import sys
@@ -12,7 +13,7 @@ import jax
 import numpy as np
 import pytest
 
-from baselines.purejaxrl_ppo import CheckpointError, Config, load_checkpoint, monitor, tracking
+from baselines.purejaxrl_ppo import CheckpointError, Config, load_checkpoint, monitor, tracking, train_ppo
 from baselines.purejaxrl_ppo.checkpoint import save_checkpoint
 from baselines.purejaxrl_ppo.metrics import summarise_updates
 from baselines.purejaxrl_ppo.resume import check_same_run, describe_run, newest_intact, restore_runner
@@ -303,6 +304,56 @@ def test_uploading_refuses_what_it_cannot_do(tmp_path, monkeypatch, capsys):
 
 
 # The command.
+
+
+def plans_of(*arguments):
+    return train_ppo.make_plans(train_ppo.make_parser().parse_args([*map(str, arguments)]))
+
+
+def test_resuming_takes_from_the_checkpoint_what_is_not_given(whole, tmp_path):
+    arguments = train_ppo.make_parser().parse_args(["--resume", str(whole[0])])
+    (plan,) = train_ppo.make_plans(arguments)
+    assert (plan.seed, plan.out, plan.resume) == (SEED, whole[0], whole[0] / "final.msgpack")
+    found = train_ppo.make_trainer(arguments, plan.checkpoint)
+    assert found.config == CONFIG and found.env_id == "FlyTrackRobust-v0"
+    check_same_run(
+        plan.resume,
+        plan.checkpoint,
+        describe_run(found.env, found.env_id, found.track, found.config, plan.seed),
+    )
+    assert plans_of("--resume", whole[0], "--out", tmp_path)[0].out == tmp_path
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--learning-rate", "0.1"], r"config\.learning_rate: found 0\.003, expected 0\.1$"),
+        (["--seed", "4"], r"seed: found 3, expected 4$"),
+        (["--track", "split_s"], r"track_data\.name: found 'flytrack', expected 'split_s'"),
+    ],
+)
+def test_resuming_with_other_settings_is_refused(whole, tmp_path, arguments, message, monkeypatch, capsys):
+    common = ["--resume", str(whole[0]), "--no-tracking", "--out", str(tmp_path / "out")]
+    monkeypatch.setattr(sys, "argv", ["train_ppo", *common, *arguments])
+    with pytest.raises(SystemExit):
+        train_ppo.main()
+    assert re.search(message, capsys.readouterr().err.strip())
+    assert not (tmp_path / "out").exists()
+
+
+def test_every_seed_of_several_has_its_folder(whole, tmp_path):
+    shutil.copytree(whole[0], tmp_path / "seed1")
+    plans = plans_of("--num-seeds", 2, "--resume", tmp_path)
+    assert [(plan.seed, plan.out, plan.resume) for plan in plans] == [
+        (0, tmp_path / "seed0", None),
+        (1, tmp_path / "seed1", tmp_path / "seed1" / "final.msgpack"),
+    ]
+    with pytest.raises(ValueError, match="seed1 holds the checkpoints of a run"):
+        plans_of("--num-seeds", 2, "--out", tmp_path)
+    with pytest.raises(ValueError, match="holds the checkpoints of a run"):
+        plans_of("--out", whole[0])
+    with pytest.raises(ValueError, match="--num-seeds: found 0"):
+        plans_of("--num-seeds", 0)
 
 
 def command_line(out: Path, *arguments: str) -> list[str]:
