@@ -4,6 +4,7 @@ import json
 import logging
 import re
 import shutil
+import socket
 import subprocess
 import sys
 import time
@@ -13,7 +14,15 @@ import jax
 import numpy as np
 import pytest
 
-from baselines.purejaxrl_ppo import CheckpointError, Config, load_checkpoint, monitor, tracking, train_ppo
+from baselines.purejaxrl_ppo import (
+    CheckpointError,
+    Config,
+    load_checkpoint,
+    monitor,
+    tracking,
+    train_ppo,
+    training,
+)
 from baselines.purejaxrl_ppo.checkpoint import save_checkpoint
 from baselines.purejaxrl_ppo.metrics import summarise_updates
 from baselines.purejaxrl_ppo.resume import check_same_run, describe_run, newest_intact, restore_runner
@@ -249,6 +258,8 @@ def test_mlflow_is_told_everything_once_though_the_run_was_cut_off(trainer, tmp_
             assert run.data.params[name] == text
     assert run.data.params["seed"] == str(SEED) and run.data.params["env_id"] == "FlyTrackRobust-v0"
     assert set(run.data.metrics) >= ISSUE_METRICS
+    page = (ROOT / "docs" / "baseline.md").read_text(encoding="utf-8")
+    assert {name for name in run.data.metrics if f"`{name}`" not in page} == set()
     before = history(client, run, "policy_loss")
     assert [step for step, _ in before] == [2 * BATCH, 4 * BATCH, 6 * BATCH, 7 * BATCH]
     assert [step for step, _ in history(client, run, "evaluation_success")] == [4 * BATCH, 7 * BATCH]
@@ -275,7 +286,7 @@ def test_a_server_that_is_down_does_not_end_the_training(
 ):
     trainer.train(tmp_path, SEED, EVERY_OTHER_UPDATE._replace(tracking_uri=DEAD_URI))
     assert_same_end(tmp_path / "final.msgpack", whole[0] / "final.msgpack")
-    (report,) = [r.getMessage() for r in caplog.records if r.name.endswith("ppo.tracking")]
+    (report,) = reports_of(caplog)
     command = f"python -m baselines.purejaxrl_ppo.tracking {tmp_path} --tracking-uri {DEAD_URI}"
     assert DEAD_URI in report and command in report
     uri = tracking.local_uri(tmp_path / "store")
@@ -288,6 +299,55 @@ def test_a_server_that_is_down_does_not_end_the_training(
     assert run.data.params["config.num_envs"] == "16" and run.info.status == "FINISHED"
     assert len(history(client, run, "value_loss")) == 4
     assert len(client.list_artifacts(run.info.run_id, "checkpoints")) == 4
+
+
+def reports_of(caplog):
+    return [record.getMessage() for record in caplog.records if record.name == tracking.__name__]
+
+
+@quiet_mlflow
+def test_a_server_that_never_answers_is_given_up(trainer, whole, tmp_path, caplog, monkeypatch):
+    monkeypatch.setenv("MLFLOW_HTTP_REQUEST_TIMEOUT", "1")
+    monkeypatch.setenv("MLFLOW_HTTP_REQUEST_MAX_RETRIES", "0")
+    with socket.create_server(("127.0.0.1", 0)) as silent:
+        uri = f"http://127.0.0.1:{silent.getsockname()[1]}"
+        trainer.train(tmp_path, SEED, Options(tracking_uri=uri))
+    assert_same_end(tmp_path / "final.msgpack", whole[0] / "final.msgpack")
+    assert len(reports_of(caplog)) == 1
+
+
+def test_a_server_that_goes_down_under_way_is_reported_once(trainer, tmp_path, caplog, monkeypatch):
+    sent = []
+
+    def send(journal, uri):
+        if sent:
+            raise ConnectionError("gone")
+        sent.append(len(journal.entries))
+
+    monkeypatch.setattr(tracking, "send_journal", send)
+    monkeypatch.setattr(tracking, "SEND_EVERY_S", -1.0)
+    trainer.train(tmp_path, SEED, EVERY_OTHER_UPDATE._replace(tracking_uri="http://127.0.0.1:9"))
+    (report,) = reports_of(caplog)
+    assert "ConnectionError: gone" in report and sent == [2]  # what the run is, and that it runs
+    kinds = [entry["kind"] for entry in tracking.Journal(tmp_path).entries]
+    assert (kinds.count("metrics"), kinds.count("file"), kinds[-1]) == (4, 4, "status")
+
+
+@pytest.mark.parametrize(("error", "status"), [(KeyboardInterrupt, "KILLED"), (OSError, "FAILED")])
+def test_how_a_run_ended_is_told(trainer, tmp_path, monkeypatch, error, status):
+    def fail(*arguments):
+        raise error
+
+    monkeypatch.setattr(tracking, "send_journal", lambda journal, uri: None)
+    monkeypatch.setattr(training.Run, "checkpoint", fail)
+    with pytest.raises(error):
+        trainer.train(tmp_path, SEED, Options(tracking_uri=DEAD_URI))
+    assert tracking.Journal(tmp_path).entries[-1]["status"] == status
+
+
+def test_mlflow_is_imported_when_it_is_used():
+    code = "import sys, baselines.purejaxrl_ppo.train_ppo; sys.exit('mlflow' in sys.modules)"
+    subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=True, timeout=120)
 
 
 @quiet_mlflow
