@@ -57,11 +57,11 @@ def main() -> None:
     text = (
         "# Training speed\n\n"
         f"`python -m benchmarks.training_speed --repeats {arguments.repeats} --total-timesteps "
-        f"{arguments.total_timesteps:g}`: the default recipe, 2 x 64 network. Environment steps per CPU second, "
-        "end to end; compilation apart.\n\n"
+        f"{arguments.total_timesteps:g}`: the default recipe, 2 x 64 network. Environment steps per CPU "
+        "second, end to end; compilation apart.\n\n"
         "| training | median | lowest to highest |\n|---|---|---|\n" + rows + "\n"
-        f"Checkpoints, evaluations, charts and MLflow, a new store included, cost {1.0 - watched / alone:.1%} "
-        f"(aim: at most {AIM_COST:.0%}). Aim with all of it: {AIM_STEPS_PER_S:,}.\n\n"
+        f"Checkpoints, evaluations, charts and MLflow, a new store included, cost "
+        f"{1.0 - watched / alone:.1%} (aim: at most {AIM_COST:.0%}). Aim with all of it: {AIM_STEPS_PER_S:,}.\n\n"
         f"{cpu_name()}, {pinned}; {', '.join(f'{name} {number}' for name, number in versions().items())}.\n"
     )
     write_atomically(arguments.out, text.encode())
