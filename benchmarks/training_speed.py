@@ -61,7 +61,8 @@ def main() -> None:
         "second, end to end; compilation apart.\n\n"
         "| training | median | lowest to highest |\n|---|---|---|\n" + rows + "\n"
         f"Checkpoints, evaluations, charts and MLflow, a new store included, cost "
-        f"{1.0 - watched / alone:.1%} (aim: at most {AIM_COST:.0%}). Aim with all of it: {AIM_STEPS_PER_S:,}.\n\n"
+        f"{1.0 - watched / alone:.1%} (aim: at most {AIM_COST:.0%}). Aim with all of it: "
+        f"{AIM_STEPS_PER_S:,}.\n\n"
         f"{cpu_name()}, {pinned}; {', '.join(f'{name} {number}' for name, number in versions().items())}.\n"
     )
     write_atomically(arguments.out, text.encode())

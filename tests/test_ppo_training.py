@@ -412,6 +412,8 @@ def test_every_seed_of_several_has_its_folder(whole, tmp_path):
         plans_of("--num-seeds", 2, "--out", tmp_path)
     with pytest.raises(ValueError, match="holds the checkpoints of a run"):
         plans_of("--out", whole[0])
+    with pytest.raises(ValueError, match=r"--resume: found .*final\.msgpack, expected the folder"):
+        plans_of("--num-seeds", 2, "--resume", whole[0] / "final.msgpack")
     with pytest.raises(ValueError, match="--num-seeds: found 0"):
         plans_of("--num-seeds", 0)
 

@@ -92,6 +92,8 @@ def make_plans(arguments: argparse.Namespace) -> list[Plan]:
     if is_one and arguments.resume is not None:
         path, checkpoint = newest_intact(arguments.resume)
         return [Plan(checkpoint.meta["seed"] if seed is None else seed, out, path, checkpoint)]
+    if arguments.resume is not None and not arguments.resume.is_dir():
+        raise ValueError(f"--resume: found {arguments.resume}, expected the folder that holds seed<N>")
     first = seed or 0
     if not 0 <= first <= MAX_SEED - arguments.num_seeds:
         raise ValueError(f"--seed: found {first}, expected 0 to {MAX_SEED - arguments.num_seeds}")
