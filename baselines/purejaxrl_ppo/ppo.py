@@ -20,6 +20,7 @@ and the setting (``config.py``) that switches it off:
 """
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -31,6 +32,8 @@ from gymnax.environments import spaces
 from baselines.purejaxrl_ppo.config import Config
 from baselines.purejaxrl_ppo.metrics import summarise_episodes, summarise_race
 from baselines.purejaxrl_ppo.networks import ActorCritic, make_network
+
+Metrics = dict[str, jax.Array]
 
 
 class Batch(NamedTuple):
@@ -70,7 +73,7 @@ class Algorithm(NamedTuple):
     """
 
     start: Callable[[jax.Array], Runner]
-    update: Callable[[Runner], tuple[Runner, dict[str, jax.Array]]]
+    update: Callable[[Runner], tuple[Runner, Metrics]]
 
 
 def choose_step(env: Any, config: Config) -> Callable:
@@ -115,13 +118,6 @@ def affine_permutation(key: jax.Array, size: int) -> jax.Array:
     return (index & (size - 1)).astype(jnp.int32)
 
 
-def permutation(key: jax.Array, config: Config) -> jax.Array:
-    """Return the order in which an epoch goes through the batch."""
-    if config.affine_shuffle:
-        return affine_permutation(key, config.batch_size)
-    return jax.random.permutation(key, config.batch_size)
-
-
 def ppo_loss(
     network_params: Any,
     network: ActorCritic,
@@ -129,7 +125,7 @@ def ppo_loss(
     advantage: jax.Array,
     target: jax.Array,
     config: Config,
-) -> tuple[jax.Array, dict[str, jax.Array]]:
+) -> tuple[jax.Array, Metrics]:
     """Return the clipped objective plus clipped value loss, and its parts."""
     policy, value = network.apply(network_params, batch.observation)
     log_prob = policy.log_prob(batch.action)
@@ -239,22 +235,21 @@ def make_ppo(env: Any, env_params: Any, config: Config) -> Algorithm:
         return train_state.apply_gradients(grads=grads), parts
 
     def update_epoch(train_state: TrainState, key: jax.Array, data: tuple) -> tuple:
-        order = permutation(key, config)
+        permutation = affine_permutation if config.affine_shuffle else jax.random.permutation
+        order = permutation(key, config.batch_size)
         shuffled = jax.tree.map(lambda leaf: leaf[order], data)
         minibatches = jax.tree.map(
             lambda leaf: leaf.reshape(config.num_minibatches, -1, *leaf.shape[1:]), shuffled
         )
         return jax.lax.scan(update_minibatch, train_state, minibatches)
 
-    def update(runner: Runner) -> tuple[Runner, dict[str, jax.Array]]:
+    def update(runner: Runner) -> tuple[Runner, Metrics]:
         runner, (batch, log) = jax.lax.scan(collect_step, runner, None, config.num_steps)
         last_value = network.apply(runner.train_state.params, runner.observation, method="value")
         advantage = generalized_advantages(batch, last_value, config.gamma, config.gae_lambda)
         target = advantage + batch.value
-        data = jax.tree.map(
-            lambda leaf: leaf.reshape(config.batch_size, *leaf.shape[2:]),
-            (batch, advantage, target),
-        )
+        flatten = partial(jax.tree.map, lambda leaf: leaf.reshape(config.batch_size, *leaf.shape[2:]))
+        data = flatten((batch, advantage, target))
         key, *epoch_keys = jax.random.split(runner.key, config.update_epochs + 1)
         train_state, parts = jax.lax.scan(
             lambda train_state, key: update_epoch(train_state, key, data),
@@ -288,9 +283,7 @@ def make_ppo(env: Any, env_params: Any, config: Config) -> Algorithm:
     return Algorithm(start, update)
 
 
-def make_train(
-    env: Any, env_params: Any, config: Config
-) -> Callable[[jax.Array], tuple[Runner, dict[str, jax.Array]]]:
+def make_train(env: Any, env_params: Any, config: Config) -> Callable[[jax.Array], tuple[Runner, Metrics]]:
     """Return ``train(key) -> (runner, metrics)``, to be jitted: a whole run; metrics (num_updates,).
 
     Raises:
@@ -298,7 +291,7 @@ def make_train(
     """
     ppo = make_ppo(env, env_params, config)
 
-    def train(key: jax.Array) -> tuple[Runner, dict[str, jax.Array]]:
+    def train(key: jax.Array) -> tuple[Runner, Metrics]:
         return jax.lax.scan(lambda runner, _: ppo.update(runner), ppo.start(key), None, config.num_updates)
 
     return train

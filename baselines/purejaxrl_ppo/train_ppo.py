@@ -1,4 +1,4 @@
-"""Train PPO on a FlyTrack environment: ``python -m baselines.purejaxrl_ppo.train_ppo`` (docs/training.md)."""
+"""Train PPO on a FlyTrack environment: ``python -m baselines.purejaxrl_ppo.train_ppo`` (docs/baseline.md)."""
 
 import argparse
 import dataclasses
