@@ -18,6 +18,8 @@ def write_atomically(path: str | Path, content: bytes) -> None:
     try:
         with temporary.open("xb") as file:
             file.write(content)
+            file.flush()
+            os.fsync(file.fileno())  # else a loss of power can leave the new name with no content
         os.replace(temporary, path)
     except BaseException:
         temporary.unlink(missing_ok=True)

@@ -95,8 +95,18 @@ def load_model(path: str | Path) -> ModelParameters:
     Raises:
         ModelFileError: missing file, not JSON, a newer version, a field missing, unknown or out of range.
     """
+    return model_from_json(_read_json(Path(path)), path)
+
+
+def model_from_json(data: dict[str, Any], path: str | Path) -> ModelParameters:
+    """Return the parameters in the JSON values of a model file, or of ``model_as_json``.
+
+    path: where they come from, for messages.
+
+    Raises:
+        ModelFileError: a newer version, a field missing, unknown or out of range.
+    """
     path = Path(path)
-    data = _read_json(path)
     version = data.get("version", MODEL_FILE_VERSION)
     if version != MODEL_FILE_VERSION:
         is_newer = isinstance(version, int) and version > MODEL_FILE_VERSION

@@ -1,6 +1,7 @@
 """Checkpoints come back as they were written, or are refused with the reason."""
 
 import dataclasses
+import json
 
 import flax.serialization
 import jax
@@ -9,7 +10,7 @@ import numpy as np
 import pytest
 
 from baselines.purejaxrl_ppo import CheckpointError, Config, load_checkpoint, make_network
-from baselines.purejaxrl_ppo.checkpoint import save_checkpoint
+from baselines.purejaxrl_ppo.checkpoint import find_differences, observation_layout, save_checkpoint
 from flytrack_env import FlyTrack
 from flytrack_env.observations import OBSERVATION_SIZE
 
@@ -20,6 +21,12 @@ DESCRIPTION = {
     "missed_gate": "terminate",
     "observation_size": OBSERVATION_SIZE,
 }
+
+
+def content_of(path):
+    """Return what a checkpoint file holds beneath its checksum."""
+    whole = flax.serialization.msgpack_restore(path.read_bytes())
+    return flax.serialization.msgpack_restore(whole["content"])
 
 
 @pytest.fixture
@@ -96,7 +103,50 @@ def test_damaged_description_is_refused(tmp_path, params, name, value):
 
 
 def test_parameters_that_are_no_tree_are_refused(tmp_path, path):
-    content = flax.serialization.msgpack_restore(path.read_bytes())
+    content = content_of(path)
     path.write_bytes(flax.serialization.msgpack_serialize({**content, "params": 5}))
-    with pytest.raises(CheckpointError, match=r"a\.msgpack"):
+    with pytest.raises(CheckpointError, match=r"a\.msgpack.*log_std.*missing"):
         load_checkpoint(path)
+
+
+def test_every_flipped_bit_is_noticed(path):
+    whole = path.read_bytes()
+    for place in np.random.default_rng(0).integers(0, len(whole), 50):
+        damaged = bytearray(whole)
+        damaged[place] ^= 1 << int(place % 8)
+        path.write_bytes(bytes(damaged))
+        with pytest.raises(CheckpointError, match=r"a\.msgpack"):
+            load_checkpoint(path)
+
+
+def test_a_policy_of_the_first_format_is_read(path, params):
+    content = content_of(path)
+    meta = json.loads(content["meta"])
+    old = {
+        name: value for name, value in meta["config"].items() if name not in ("adam_eps", "affine_shuffle")
+    }
+    content["meta"] = json.dumps({**meta, "format": "flytrack-ppo-1", "config": old})
+    path.write_bytes(flax.serialization.msgpack_serialize(content))
+    checkpoint = load_checkpoint(path)
+    assert checkpoint.config == CONFIG and checkpoint.training is None
+    jax.tree.map(np.testing.assert_array_equal, checkpoint.params, params)
+
+
+def test_another_observation_of_the_same_size_is_refused_row_by_row(tmp_path, params):
+    env = FlyTrack()
+    layout = observation_layout(env)
+    layout["row 1 (velocity)"]["scale"] = 4.0
+    save_checkpoint(tmp_path / "g.msgpack", params, CONFIG, {**DESCRIPTION, "observation": layout})
+    with pytest.raises(CheckpointError, match=r"row 1 \(velocity\)\.scale: found 4\.0, expected 5\.0$"):
+        load_checkpoint(tmp_path / "g.msgpack").check_fits(env)
+
+
+def test_differences_name_every_field():
+    found = {"a": {"b": 1, "c": [1, 2]}, "d": "x", "same": 3}
+    expected = {"a": {"b": 2, "c": [1, 5]}, "e": "y", "same": 3}
+    assert sorted(find_differences(found, expected, "run")) == [
+        "run.a.b: found 1, expected 2",
+        "run.a.c[1]: found 2, expected 5",
+        "run.d: found 'x', expected nothing",
+        "run.e: found nothing, expected 'y'",
+    ]

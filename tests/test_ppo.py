@@ -8,12 +8,14 @@ from flax import struct
 from gymnax.environments import environment, spaces
 
 from baselines.purejaxrl_ppo import Config, make_network, make_train
+from baselines.purejaxrl_ppo.metrics import summarise_episodes, summarise_race
 from baselines.purejaxrl_ppo.ppo import (
     Batch,
     affine_permutation,
     generalized_advantages,
+    make_network_for,
+    make_schedule,
     ppo_loss,
-    summarise_episodes,
 )
 
 
@@ -28,30 +30,41 @@ class ProbeParams:
 
 
 class Probe(environment.Environment):
-    """Reward 1 each step; ends every 8 steps, by truncation or by termination."""
+    """Reward 1 each step; ends every 8 steps, by truncation or by termination; the clock is hidden.
 
-    def __init__(self, terminates: bool):
+    Variants: is_clock_seen; reward(time, action, length); num_choices of discrete actions.
+    """
+
+    def __init__(
+        self, terminates, is_clock_seen=False, reward=lambda time, action, length: 1.0, num_choices=0
+    ):
         super().__init__()
-        self.terminates = terminates
+        self.terminates, self.is_clock_seen = terminates, is_clock_seen
+        self.reward, self.num_choices = reward, num_choices
 
     @property
     def default_params(self):
         return ProbeParams()
 
+    def look(self, state):
+        return jnp.array([1.0, 0.0]) * state.time * self.is_clock_seen
+
     def step_env(self, key, state, action, params):
+        reward = jnp.asarray(self.reward(state.time, action, params.max_steps_in_episode), float)
         state = ProbeState(time=state.time + 1)
         at_end = state.time >= params.max_steps_in_episode
         terminated = at_end if self.terminates else jnp.asarray(False)
-        return jnp.zeros(2), state, jnp.asarray(1.0), terminated, {}
+        return self.look(state), state, reward.reshape(()), terminated, {}
 
     def is_truncated(self, state, params):
         return (state.time >= params.max_steps_in_episode) & (not self.terminates)
 
     def reset_env(self, key, params):
-        return jnp.zeros(2), ProbeState(time=jnp.int32(0))
+        state = ProbeState(time=jnp.int32(0))
+        return self.look(state), state
 
     def action_space(self, params):
-        return spaces.Box(-1.0, 1.0, (1,))
+        return spaces.Discrete(self.num_choices) if self.num_choices else spaces.Box(-1.0, 1.0, (1,))
 
 
 def tiny(**changes) -> Config:
@@ -68,11 +81,22 @@ def tiny(**changes) -> Config:
     return Config(**{**settings, **changes})
 
 
-def train_value(terminates: bool) -> float:
-    env, config = Probe(terminates), tiny()
-    runner, _ = jax.jit(make_train(env, env.default_params, config))(jax.random.key(0))
-    network = make_network(config)
-    return float(network.apply(runner.train_state.params, jnp.zeros(2), method="value"))
+def train(env, params=None, **changes):
+    """Return the trained network and its parameters."""
+    config, params = tiny(**changes), env.default_params if params is None else params
+    # Compiling takes all of the time, so that optimising does not pay.
+    train = jax.jit(make_train(env, params, config), compiler_options={"xla_backend_optimization_level": 0})
+    runner, _ = train(jax.random.key(0))
+    return make_network_for(env, params, config), runner.train_state.params
+
+
+def train_value(terminates: bool, **changes) -> float:
+    network, params = train(Probe(terminates), **changes)
+    return float(network.apply(params, jnp.zeros(2), method="value"))
+
+
+# Mean over the 8 steps of the discounted sum of what is left of a reward of 1 each.
+VALUE_OF_EIGHT = np.mean([(1 - 0.9**left) / (1 - 0.9) for left in range(1, 9)])
 
 
 def test_value_bootstraps_through_truncation():
@@ -80,10 +104,63 @@ def test_value_bootstraps_through_truncation():
     assert train_value(terminates=False) == pytest.approx(10.0, rel=0.05)
 
 
+def test_with_all_differences_off_truncation_is_termination():
+    switches = ("bootstrap_at_truncation", "batched_step", "affine_shuffle", "anneal_every_gradient")
+    found = train_value(terminates=False, min_std=0.0, **dict.fromkeys(switches, False))
+    assert found == pytest.approx(VALUE_OF_EIGHT, rel=0.1)
+
+
 def test_value_stops_at_termination():
-    # Mean over the 8 steps of the discounted sum of what is left: well below the endless value.
-    expected = np.mean([(1 - 0.9**left) / (1 - 0.9) for left in range(1, 9)])
-    assert train_value(terminates=True) == pytest.approx(expected, rel=0.1)
+    assert train_value(terminates=True) == pytest.approx(VALUE_OF_EIGHT, rel=0.1)
+
+
+def test_delayed_reward_is_discounted_back():
+    # Reward 1 on the last of three steps, and the clock is seen: values 0.81, 0.9, 1.
+    env = Probe(True, is_clock_seen=True, reward=lambda time, action, length: time == length - 1)
+    network, params = train(env, ProbeParams(max_steps_in_episode=3))
+    clock = jnp.array([[0.0, 0.0], [1.0, 0.0], [2.0, 0.0]])
+    np.testing.assert_allclose(network.apply(params, clock, method="value"), [0.81, 0.9, 1.0], atol=0.04)
+
+
+def test_rewarded_action_is_learnt():
+    # Reward 1 - (u - 0.4)^2 on one step: the best mean is 0.4, its value 1 less the variance.
+    env = Probe(True, reward=lambda time, action, length: 1.0 - (action - 0.4) ** 2)
+    network, params = train(env, ProbeParams(max_steps_in_episode=1))
+    policy, value = network.apply(params, jnp.zeros(2))
+    assert float(policy.mode()[0]) == pytest.approx(0.4, abs=0.05)
+    variance = float(policy.stddev()[0]) ** 2
+    assert float(value) == pytest.approx(1.0 - variance, abs=0.05)
+
+
+def test_rewarded_choice_is_learnt():
+    env = Probe(True, reward=lambda time, action, length: action == 2, num_choices=3)
+    network, params = train(env, ProbeParams(max_steps_in_episode=1))
+    policy, value = network.apply(params, jnp.zeros(2))
+    assert float(policy.probs[2]) > 0.95
+    assert float(value) == pytest.approx(1.0, abs=0.05)
+
+
+@pytest.mark.parametrize("every_gradient", [True, False])
+def test_the_step_size_falls_linearly(every_gradient):
+    config = tiny(anneal_every_gradient=every_gradient, final_learning_rate_fraction=0.1)
+    schedule, per_update = make_schedule(config), config.gradients_per_update
+    for count in (0, 1, per_update, 5 * per_update + 3):
+        done = count / per_update if every_gradient else count // per_update
+        expected = config.learning_rate * (1 - 0.9 * done / config.num_updates)
+        assert float(schedule(count)) == pytest.approx(expected, rel=1e-5)
+
+
+def test_gae_of_a_constant_reward():
+    # With values of 0, the sum of a geometric series; with the true values of a race without end, nothing.
+    gamma, lam, num_steps = 0.9, 0.8, 5
+    ones, never = jnp.ones((num_steps, 1)), jnp.zeros((num_steps, 1), bool)
+    naught = Batch(None, None, None, 0 * ones, ones, never)
+    found = generalized_advantages(naught, jnp.zeros(1), gamma, lam)
+    left = np.arange(num_steps, 0, -1)
+    np.testing.assert_allclose(found[:, 0], (1 - (gamma * lam) ** left) / (1 - gamma * lam), rtol=1e-5)
+    true = Batch(None, None, None, ones / (1 - gamma), ones, never)
+    found = generalized_advantages(true, jnp.ones(1) / (1 - gamma), gamma, lam)
+    np.testing.assert_allclose(found, 0.0, atol=1e-5)
 
 
 def test_gae_equals_the_definition():
@@ -144,6 +221,17 @@ def test_episodes_are_averaged_over_those_that_ended():
     summary = summarise_episodes(log)
     assert summary["episode_return"] == 2.0
     assert summary["episode_laps"] == 3.0
+    assert summary["episodes_ended"] == 2
+
+
+def test_lap_times_are_averaged_over_the_laps():
+    log = {
+        "lap_completed": jnp.array([[True, False], [False, True]]),
+        "lap_time_s": jnp.array([[4.0, 9.0], [9.0, 5.0]]),
+        "gate_distance_m": jnp.array([[1.0, 2.0], [3.0, 6.0]]),
+    }
+    assert summarise_race(log) == {"laps_completed": 2, "lap_time_s": 4.5, "gate_distance_m": 3.0}
+    assert summarise_race({"done": log["lap_completed"]}) == {}
 
 
 def test_std_has_a_floor():
@@ -156,7 +244,11 @@ def test_std_has_a_floor():
 
 @pytest.mark.parametrize(
     ("changes", "field"),
-    [({"total_timesteps": 100}, "total_timesteps"), ({"num_minibatches": 7}, "num_minibatches")],
+    [
+        ({"total_timesteps": 100}, "total_timesteps"),
+        ({"num_minibatches": 7}, "num_minibatches"),
+        ({"initial_action": (0.0, 0.0)}, "initial_action"),
+    ],
 )
 def test_settings_that_cannot_train_are_refused(changes, field):
     with pytest.raises(ValueError, match=field):

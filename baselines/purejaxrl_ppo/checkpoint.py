@@ -1,7 +1,9 @@
-"""Checkpoints: network parameters and all that is needed to fly them, in one file."""
+"""Checkpoints: network parameters, all that is needed to fly them, and all that training needs to go on."""
 
 import dataclasses
+import hashlib
 import json
+import reprlib
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -11,11 +13,14 @@ import jax.numpy as jnp
 import numpy as np
 
 import flytrack_env
-from baselines.purejaxrl_ppo.config import Config
+from baselines.purejaxrl_ppo.config import Config, config_from_json
+from baselines.purejaxrl_ppo.named_arrays import as_named_arrays, find_misfits, from_named_arrays
 from baselines.purejaxrl_ppo.networks import ActorCritic, make_network
 from flytrack_env.files import write_atomically
 
-FORMAT = "flytrack-ppo-1"
+FORMAT = "flytrack-ppo-2"
+FORMAT_WITHOUT_TRAINING = "flytrack-ppo-1"  # of before there was a checksum and a state of the training
+MOST_DIFFERENCES = 12  # as many as can be read in a terminal
 
 
 class CheckpointError(ValueError):
@@ -23,10 +28,11 @@ class CheckpointError(ValueError):
 
 
 class Checkpoint(NamedTuple):
-    """A trained policy.
+    """A trained policy, and perhaps its training.
 
     params: of the network. config: of the training. env_id, track: what it was trained on.
-    observation_size: of its input. meta: the whole description as stored.
+    observation_size: of its input. meta: the whole description as stored. training: named arrays of the
+    rest of the training's state (optimiser, environments, random keys); None in a policy alone.
     """
 
     params: Any
@@ -35,6 +41,7 @@ class Checkpoint(NamedTuple):
     track: str
     observation_size: int
     meta: dict[str, Any]
+    training: dict[str, np.ndarray] | None = None
 
     @property
     def network(self) -> ActorCritic:
@@ -42,19 +49,64 @@ class Checkpoint(NamedTuple):
         return make_network(self.config)
 
     def check_fits(self, env: Any) -> None:
-        """Raise CheckpointError unless the policy's input is this environment's observation."""
+        """Raise CheckpointError unless the policy's input is this environment's observation, row by row."""
         found = env.observation_space(env.default_params).shape
         if found != (self.observation_size,):
             raise CheckpointError(
                 f"checkpoint: trained on observations of size {self.observation_size} "
                 f"({self.env_id}), but the environment's have shape {found}"
             )
+        if "observation" in self.meta:
+            lines = find_differences(self.meta["observation"], observation_layout(env), "observation")
+            check_none("checkpoint", lines)
 
 
-def save_checkpoint(path: str | Path, params: Any, config: Config, description: dict[str, Any]) -> None:
-    """Write a checkpoint atomically.
+def observation_layout(env: Any) -> dict[str, Any]:
+    """Return an environment's observation as JSON values: each row's meaning, frame, unit, scale, limit."""
+    return as_json({f"row {i} ({e.key})": e._asdict() for i, e in enumerate(env.observation_table)})
+
+
+def as_json(value: Any) -> Any:
+    """Return values as they come back from JSON: lists for tuples."""
+    return json.loads(json.dumps(value))
+
+
+def find_differences(found: Any, expected: Any, where: str) -> list[str]:
+    """Return, field by field, where JSON values differ; ``where`` is their name."""
+    if isinstance(found, dict) and isinstance(expected, dict):
+        names = {**expected, **found}
+        pairs = {name: (found.get(name), expected.get(name)) for name in names}
+        return [line for name, pair in pairs.items() for line in find_differences(*pair, f"{where}.{name}")]
+    if isinstance(found, list) and isinstance(expected, list) and len(found) == len(expected):
+        pairs = list(zip(found, expected, strict=True))
+        return [line for i, pair in enumerate(pairs) for line in find_differences(*pair, f"{where}[{i}]")]
+    if found == expected:
+        return []
+    return [f"{where}: found {_show(found)}, expected {_show(expected)}"]
+
+
+def _show(value: Any) -> str:
+    return "nothing" if value is None else reprlib.repr(value)
+
+
+def check_none(where: Any, lines: list[str]) -> None:
+    """Raise CheckpointError with the differences, if there are any; ``where`` is the file."""
+    if lines:
+        more = [f"and {len(lines) - MOST_DIFFERENCES} more"] if len(lines) > MOST_DIFFERENCES else []
+        raise CheckpointError(f"{where}: does not fit: " + "; ".join(lines[:MOST_DIFFERENCES] + more))
+
+
+def save_checkpoint(
+    path: str | Path,
+    params: Any,
+    config: Config,
+    description: dict[str, Any],
+    training: dict[str, np.ndarray] | None = None,
+) -> None:
+    """Write a checkpoint atomically, with a checksum of its content.
 
     description: JSON values; needs env_id, track, missed_gate and observation_size, may hold anything else.
+    training: named arrays of what else training needs to go on; without, the file is a policy alone.
     """
     meta = {
         "format": FORMAT,
@@ -62,8 +114,12 @@ def save_checkpoint(path: str | Path, params: Any, config: Config, description: 
         "config": dataclasses.asdict(config),
         **description,
     }
-    content = {"meta": json.dumps(meta), "params": flax.serialization.to_state_dict(params)}
-    write_atomically(path, flax.serialization.msgpack_serialize(content))
+    parts = {"meta": json.dumps(meta), "params": flax.serialization.to_state_dict(params)}
+    if training is not None:
+        parts["training"] = training
+    content = flax.serialization.msgpack_serialize(parts)
+    whole = {"checksum": hashlib.sha256(content).hexdigest(), "content": content}
+    write_atomically(path, flax.serialization.msgpack_serialize(whole))
 
 
 def load_checkpoint(path: str | Path) -> Checkpoint:
@@ -74,47 +130,54 @@ def load_checkpoint(path: str | Path) -> Checkpoint:
             network that the file describes.
     """
     path = Path(path)
-    try:
-        content = flax.serialization.msgpack_restore(path.read_bytes())
-    except OSError as error:
-        raise CheckpointError(f"{path}: cannot be read: {error}") from error
-    except Exception as error:  # msgpack raises what it likes on damaged bytes
-        raise CheckpointError(f"{path}: not a checkpoint, or damaged: {error}") from error
+    content = _read_content(path)
     try:
         meta = json.loads(content["meta"])
         found_format = meta["format"]
     except (KeyError, IndexError, TypeError, AttributeError, json.JSONDecodeError) as error:
         raise CheckpointError(f"{path}: not a checkpoint: no description in it") from error
-    if found_format != FORMAT:
+    if found_format not in (FORMAT, FORMAT_WITHOUT_TRAINING):
         raise CheckpointError(f"{path}: format: found {found_format!r}, expected {FORMAT!r}")
     try:
-        config = _config_from(meta["config"])
-        size = int(meta["observation_size"])
-        network = make_network(config)
-        expected = jax.eval_shape(network.init, jax.random.key(0), jnp.zeros((1, size)))
-        params = flax.serialization.from_state_dict(expected, content["params"])
-        _check_shapes(path, expected, params)
-        for name in ("env_id", "track", "missed_gate"):
-            if not isinstance(meta[name], str):
-                raise CheckpointError(f"{path}: {name}: found {meta[name]!r}, expected a string")
-        return Checkpoint(params, config, meta["env_id"], meta["track"], size, meta)
+        return _read_parts(path, meta, content)
     except CheckpointError:
         raise
     except (KeyError, IndexError, TypeError, AttributeError, ValueError) as error:
         raise CheckpointError(f"{path}: damaged description or parameters: {error}") from error
 
 
-def _config_from(values: dict[str, Any]) -> Config:
-    """Return the configuration of a JSON object; tuples come back from lists."""
-    return Config(**{k: tuple(v) if isinstance(v, list) else v for k, v in values.items()})
+def _read_content(path: Path) -> Any:
+    """Return what is in a file, its checksum compared."""
+    try:
+        whole = flax.serialization.msgpack_restore(path.read_bytes())
+        if not isinstance(whole, dict) or "checksum" not in whole:
+            return whole
+        found = hashlib.sha256(whole["content"]).hexdigest()
+        if found != whole["checksum"]:
+            raise CheckpointError(
+                f"{path}: damaged: found content with checksum {found}, expected {whole['checksum']}"
+            )
+        return flax.serialization.msgpack_restore(whole["content"])
+    except CheckpointError:
+        raise
+    except OSError as error:
+        raise CheckpointError(f"{path}: cannot be read: {error}") from error
+    except Exception as error:  # msgpack raises what it likes on damaged bytes
+        raise CheckpointError(f"{path}: not a checkpoint, or damaged: {error}") from error
 
 
-def _check_shapes(path: Path, expected: Any, params: Any) -> None:
-    """Raise CheckpointError where an array is not of the network's shape or not finite."""
-    found_leaves = jax.tree_util.tree_leaves_with_path(params)
-    for (where, leaf), wanted in zip(found_leaves, jax.tree.leaves(expected), strict=True):
-        name = jax.tree_util.keystr(where)
-        if np.shape(leaf) != wanted.shape:
-            raise CheckpointError(f"{path}: {name}: found shape {np.shape(leaf)}, expected {wanted.shape}")
-        if not np.isfinite(leaf).all():
+def _read_parts(path: Path, meta: dict[str, Any], content: dict[str, Any]) -> Checkpoint:
+    """Return the checkpoint of a file's description and arrays, checked against each other."""
+    config = config_from_json(meta["config"])
+    size = int(meta["observation_size"])
+    for name in ("env_id", "track", "missed_gate"):
+        if not isinstance(meta[name], str):
+            raise CheckpointError(f"{path}: {name}: found {meta[name]!r}, expected a string")
+    expected = jax.eval_shape(make_network(config).init, jax.random.key(0), jnp.zeros((1, size)))
+    arrays = as_named_arrays(content["params"])
+    check_none(path, find_misfits(arrays, expected))
+    for name, array in arrays.items():
+        if not np.isfinite(array).all():
             raise CheckpointError(f"{path}: {name}: found values that are not finite")
+    params = from_named_arrays(arrays, expected)
+    return Checkpoint(params, config, meta["env_id"], meta["track"], size, meta, content.get("training"))

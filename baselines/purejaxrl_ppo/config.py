@@ -1,9 +1,29 @@
-"""Every setting of a training run."""
+"""Every hyperparameter of a training run: as a dataclass, as flags, as a TOML file."""
 
-from dataclasses import dataclass
+import argparse
+import ast
+import dataclasses
+import inspect
+import itertools
+import math
+import textwrap
+import tomllib
+import typing
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+COUNTS = ("num_envs", "num_steps", "episode_steps", "update_epochs", "num_minibatches")
+SHARES = ("final_learning_rate_fraction", "gamma", "gae_lambda")
+POSITIVE = ("learning_rate", "adam_eps", "clip_eps", "max_grad_norm", "initial_std")
+NOT_NEGATIVE = ("entropy_coef", "value_coef", "min_std")
 
 
-@dataclass(frozen=True)
+class ConfigError(ValueError):
+    """A setting that cannot be used; the message names file, field, what was found and expected."""
+
+
+@dataclasses.dataclass(frozen=True)
 class Config:
     """Hyperparameters of PPO; the defaults are the recipe for FlyTrack-v0 (docs/training.md)."""
 
@@ -24,6 +44,8 @@ class Config:
     """Adam's step size at the start."""
     final_learning_rate_fraction: float = 0.02
     """The step size falls linearly to this fraction of it at the end."""
+    adam_eps: float = 1e-5
+    """Added to the root in Adam's denominator."""
     gamma: float = 0.99
     """Discount per step."""
     gae_lambda: float = 0.95
@@ -39,11 +61,20 @@ class Config:
     hidden_sizes: tuple[int, ...] = (64, 64)
     """Widths of the hidden layers, tanh, of actor and critic each."""
     initial_std: float = 0.5
-    """Standard deviation of the actions at the start; it does not depend on the state."""
+    """Standard deviation of the actions at the start; it does not depend on the state. PureJaxRL: 1."""
     min_std: float = 0.05
-    """Floor of that standard deviation."""
+    """Floor of that standard deviation. PureJaxRL: 0, no floor."""
     initial_action: tuple[float, ...] = (0.0, 0.0, 0.0, -0.2)
-    """Mean action of the untrained policy: sticks centred, thrust about that of hovering."""
+    """Mean action of the untrained policy: sticks centred, thrust about that of hovering. PureJaxRL: zeros.
+    Its length is the number of actions; unused where actions are discrete."""
+    bootstrap_at_truncation: bool = True
+    """Add the value of the final observation where the time limit cuts an episode off. PureJaxRL: no."""
+    batched_step: bool = True
+    """Step the environments as a batch where they offer it, not one by one under vmap. PureJaxRL: no."""
+    affine_shuffle: bool = True
+    """Draw minibatches with an affine permutation, not with one from a sort. PureJaxRL: no."""
+    anneal_every_gradient: bool = True
+    """Lower the step size at every gradient step, not once per update. PureJaxRL: no."""
 
     @property
     def batch_size(self) -> int:
@@ -55,15 +86,143 @@ class Config:
         """Number of updates."""
         return self.total_timesteps // self.batch_size
 
+    @property
+    def gradients_per_update(self) -> int:
+        """Gradient steps per update."""
+        return self.update_epochs * self.num_minibatches
+
     def check(self) -> None:
-        """Raise ValueError, naming the field, for settings that cannot be trained with."""
+        """Raise ConfigError, naming the field, for settings that cannot be trained with."""
+        self._check_range(COUNTS, lambda value: value >= 1, "at least 1")
+        self._check_range(SHARES, lambda value: 0 <= value <= 1, "0 to 1")
+        self._check_range(POSITIVE, lambda value: 0 < value < math.inf, "a positive number")
+        self._check_range(NOT_NEGATIVE, lambda value: 0 <= value < math.inf, "a number that is not negative")
+        if not self.hidden_sizes or min(self.hidden_sizes) < 1:
+            raise ConfigError(f"hidden_sizes: found {self.hidden_sizes}, expected widths of at least 1")
         if self.num_updates < 1:
-            raise ValueError(
+            raise ConfigError(
                 f"total_timesteps: found {self.total_timesteps}, expected at least one update of "
                 f"{self.batch_size} steps (num_envs x num_steps)"
             )
         if self.batch_size % self.num_minibatches:
-            raise ValueError(
+            raise ConfigError(
                 f"num_minibatches: found {self.num_minibatches}, expected a divisor of the "
                 f"{self.batch_size} steps of an update"
             )
+
+    def _check_range(self, names: tuple[str, ...], is_valid: Callable[[Any], bool], expected: str) -> None:
+        for name in names:
+            value = getattr(self, name)
+            if not is_valid(value):
+                raise ConfigError(f"{name}: found {value}, expected {expected}")
+
+
+FIELD_TYPES: dict[str, Any] = typing.get_type_hints(Config)
+
+
+def field_docs() -> dict[str, str]:
+    """Return what the class says below each field, on one line."""
+    tree = ast.parse(textwrap.dedent(inspect.getsource(Config)))
+    body = tree.body[0].body  # type: ignore[attr-defined]
+    return {
+        field.target.id: " ".join(doc.value.value.split())
+        for field, doc in itertools.pairwise(body)
+        if isinstance(field, ast.AnnAssign) and isinstance(doc, ast.Expr)
+    }
+
+
+def read_value(where: str, kind: Any, value: Any) -> Any:
+    """Return a value of a file or a flag as the field's type; whole floats (2e7) are whole numbers.
+
+    where: what the message begins with: file and field.
+
+    Raises:
+        ConfigError: a value of another type.
+    """
+    if typing.get_origin(kind) is tuple:
+        if not isinstance(value, (list, tuple)):
+            raise ConfigError(f"{where}: found {value!r}, expected a list")
+        return tuple(read_value(where, typing.get_args(kind)[0], one) for one in value)
+    is_number = isinstance(value, (int, float)) and not isinstance(value, bool)
+    if kind is bool and isinstance(value, bool):
+        return value
+    if kind is float and is_number and math.isfinite(value):
+        return float(value)
+    if kind is int and is_number and math.isfinite(value) and value == int(value):
+        return int(value)
+    expected = {bool: "true or false", float: "a finite number", int: "a whole number"}[kind]
+    found = "infinity" if value in (math.inf, -math.inf) else repr(value)
+    raise ConfigError(f"{where}: found {found}, expected {expected}")
+
+
+def settings_in_file(path: Path) -> dict[str, Any]:
+    """Return the fields of ``Config`` that a TOML file sets.
+
+    Raises:
+        ConfigError: missing file, not TOML, an unknown key, or a value of another type.
+    """
+    try:
+        values = tomllib.loads(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path}: cannot be read: {error}") from error
+    except tomllib.TOMLDecodeError as error:
+        raise ConfigError(f"{path}: not a TOML file: {error}") from error
+    for name in values:
+        if name not in FIELD_TYPES:
+            raise ConfigError(f"{path}: {name}: unknown; expected one of {', '.join(FIELD_TYPES)}")
+    return {name: read_value(f"{path}: {name}", FIELD_TYPES[name], value) for name, value in values.items()}
+
+
+def config_from_json(values: dict[str, Any]) -> Config:
+    """Return the configuration of a JSON object; tuples come back from lists, absent fields are default.
+
+    Raises:
+        ConfigError: an unknown field, or a value of another type.
+    """
+    for name in values:
+        if name not in FIELD_TYPES:
+            raise ConfigError(f"config: {name}: unknown to this version; expected {', '.join(FIELD_TYPES)}")
+    return Config(**{n: read_value(f"config: {n}", FIELD_TYPES[n], value) for n, value in values.items()})
+
+
+def add_flags(parser: argparse.ArgumentParser) -> None:
+    """Give a parser ``--config`` and one flag per field of ``Config``; what is not given is left out."""
+    parser.add_argument("--config", type=Path, help="TOML file of the settings below; flags override it")
+    group = parser.add_argument_group("hyperparameters")
+    docs = field_docs()
+    for field in dataclasses.fields(Config):
+        kind = FIELD_TYPES[field.name]
+        is_tuple = typing.get_origin(kind) is tuple
+        default = " ".join(map(str, field.default)) if is_tuple else field.default
+        group.add_argument(
+            f"--{field.name.replace('_', '-')}",
+            help=f"{docs[field.name]} (default: {default})".replace("%", "%%"),
+            default=argparse.SUPPRESS,
+            **_flag_form(typing.get_args(kind)[0] if is_tuple else kind, is_tuple),
+        )
+
+
+def _flag_form(kind: Any, is_tuple: bool) -> dict[str, Any]:
+    """Return how argparse reads a type: a pair of switches, or one or more numbers."""
+    if kind is bool:
+        return {"action": argparse.BooleanOptionalAction}
+
+    def read(text: str) -> Any:
+        try:
+            return read_value("value", kind, float(text))
+        except ConfigError as error:
+            raise argparse.ArgumentTypeError(str(error)) from error
+
+    read.__name__ = "number"
+    return {"type": read, "metavar": kind.__name__.upper(), **({"nargs": "+"} if is_tuple else {})}
+
+
+def settings_of(arguments: argparse.Namespace) -> dict[str, Any]:
+    """Return the fields that the command line sets, in its file or by flags, which win.
+
+    Raises:
+        ConfigError: a file that cannot be used.
+    """
+    in_file = {} if arguments.config is None else settings_in_file(arguments.config)
+    flags = {name: value for name, value in vars(arguments).items() if name in FIELD_TYPES}
+    return {**in_file, **{n: tuple(v) if isinstance(v, list) else v for n, v in flags.items()}}

@@ -1,14 +1,22 @@
 """Proximal policy optimisation, top to bottom, as PureJaxRL writes it.
 
-Source: J. Schulman et al., arXiv 1707.06347; C. Lu et al., PureJaxRL. One ``jit``, a ``scan`` over
-updates. What differs from PureJaxRL, and why:
+Source: J. Schulman et al., arXiv 1707.06347; C. Lu et al., PureJaxRL. What differs from PureJaxRL, why,
+and the setting (``config.py``) that switches it off:
 
-- Truncation is bootstrapped: the value of the final observation is added to the last reward of an
-  episode that the time limit cut off, because the race would have gone on.
-- Environments are stepped as a batch where they offer ``step_batch`` (faster).
+- Truncation is bootstrapped: the value of the final observation is added to the last reward of an episode
+  that the time limit cut off, because the race would have gone on (``bootstrap_at_truncation = false``).
+- Environments are stepped as a batch where they offer ``step_batch``, which is faster
+  (``batched_step = false``: one by one under ``vmap``).
 - Minibatches come from an affine permutation, i -> a i + b mod n, because a sort of 65,536 keys per epoch
-  costs as much as the environments.
-- The standard deviation has a floor (``networks.py``), so that exploration cannot die out early.
+  costs as much as the environments (``affine_shuffle = false``).
+- The standard deviation has a floor, so that exploration cannot die out early, and begins at 0.5, because
+  full stick at random crashes at once (``min_std = 0``, ``initial_std = 1``).
+- The untrained policy's mean thrust is about that of hovering, so that its episodes last
+  (``initial_action`` of zeros).
+- The step size falls with every gradient step, which is optax's own schedule, and not to 0, so that the
+  last updates still learn (``anneal_every_gradient = false``, ``final_learning_rate_fraction = 0``).
+- One update is a function of its own (``Algorithm``), so that a run can be logged, stored and taken up again
+  between updates; ``make_train`` is PureJaxRL's: one ``jit``, a ``scan`` over updates.
 """
 
 from collections.abc import Callable
@@ -19,9 +27,13 @@ import jax
 import jax.numpy as jnp
 import optax
 from flax.training.train_state import TrainState
+from gymnax.environments import spaces
 
 from baselines.purejaxrl_ppo.config import Config
+from baselines.purejaxrl_ppo.metrics import summarise_episodes, summarise_race
 from baselines.purejaxrl_ppo.networks import ActorCritic, make_network
+
+Metrics = dict[str, jax.Array]
 
 
 class Batch(NamedTuple):
@@ -35,19 +47,38 @@ class Batch(NamedTuple):
     done: jax.Array
 
 
+class Episodes(NamedTuple):
+    """What is kept of every environment's episode, (num_envs,): so far, and of the last that ended."""
+
+    so_far: jax.Array
+    length: jax.Array
+    last_return: jax.Array
+
+
 class Runner(NamedTuple):
-    """What the scan over updates carries."""
+    """What the loop over updates carries: all that a run needs to go on."""
 
     train_state: TrainState
     env_state: Any
     observation: jax.Array
-    episode_return: jax.Array
+    episodes: Episodes
     key: jax.Array
 
 
-def batched_step(env: Any) -> Callable:
+class Algorithm(NamedTuple):
+    """PPO on one environment, as two functions to be jitted.
+
+    start: key -> runner, before the first update. update: runner -> (runner, metrics), one update; metrics
+    are scalars.
+    """
+
+    start: Callable[[jax.Array], Runner]
+    update: Callable[[Runner], tuple[Runner, Metrics]]
+
+
+def choose_step(env: Any, config: Config) -> Callable:
     """Return a step of a whole batch with one key: the environment's own, else a vmap."""
-    if hasattr(env, "step_batch"):
+    if config.batched_step and hasattr(env, "step_batch"):
         return env.step_batch
 
     def step(key: jax.Array, states: Any, actions: jax.Array, params: Any) -> tuple:
@@ -94,7 +125,7 @@ def ppo_loss(
     advantage: jax.Array,
     target: jax.Array,
     config: Config,
-) -> tuple[jax.Array, dict[str, jax.Array]]:
+) -> tuple[jax.Array, Metrics]:
     """Return the clipped objective plus clipped value loss, and its parts."""
     policy, value = network.apply(network_params, batch.observation)
     log_prob = policy.log_prob(batch.action)
@@ -119,36 +150,49 @@ def ppo_loss(
     return loss, parts
 
 
-def make_train_state(key: jax.Array, observation_size: int, config: Config) -> TrainState:
-    """Return fresh network parameters with Adam, gradient clipping and linear annealing."""
-    network = make_network(config)
-    schedule = optax.linear_schedule(
-        config.learning_rate,
-        config.learning_rate * config.final_learning_rate_fraction,
-        config.num_updates * config.update_epochs * config.num_minibatches,
-    )
-    optimizer = optax.chain(optax.clip_by_global_norm(config.max_grad_norm), optax.adam(schedule, eps=1e-5))
-    params = network.init(key, jnp.zeros((1, observation_size)))
-    return TrainState.create(apply_fn=network.apply, params=params, tx=optimizer)
+def make_schedule(config: Config) -> optax.Schedule:
+    """Return the step size over the number of gradient steps taken: linear, from first to last update."""
+    last = config.learning_rate * config.final_learning_rate_fraction
+    if config.anneal_every_gradient:
+        num_gradients = config.num_updates * config.gradients_per_update
+        return optax.linear_schedule(config.learning_rate, last, num_gradients)
+    by_update = optax.linear_schedule(config.learning_rate, last, config.num_updates)
+    return lambda count: by_update(count // config.gradients_per_update)
 
 
-def make_train(
-    env: Any,
-    env_params: Any,
-    config: Config,
-    report: Callable[[dict[str, Any]], None] | None = None,
-) -> Callable[[jax.Array], tuple[Runner, dict[str, jax.Array]]]:
-    """Return ``train(key) -> (runner, metrics)``, to be jitted.
+def make_optimizer(config: Config) -> optax.GradientTransformation:
+    """Return Adam with gradient clipping and linear annealing."""
+    adam = optax.adam(make_schedule(config), eps=config.adam_eps)
+    return optax.chain(optax.clip_by_global_norm(config.max_grad_norm), adam)
 
-    env, env_params: a gymnax environment and its parameters. report: called on the host with the
-    metrics of every update as it ends. metrics: leaves (num_updates,).
+
+def make_network_for(env: Any, env_params: Any, config: Config) -> ActorCritic:
+    """Return the network with as many outputs as the environment has actions.
+
+    Raises:
+        ValueError: ``initial_action`` of another length than the environment's actions.
+    """
+    space = env.action_space(env_params)
+    if isinstance(space, spaces.Discrete):
+        return make_network(config, int(space.n))
+    if space.shape != (len(config.initial_action),):
+        raise ValueError(
+            f"initial_action: found {len(config.initial_action)} values, expected the environment's "
+            f"action shape {space.shape}"
+        )
+    return make_network(config)
+
+
+def make_ppo(env: Any, env_params: Any, config: Config) -> Algorithm:
+    """Return PPO on a gymnax environment with its parameters.
 
     Raises:
         ValueError: a configuration that cannot be trained with.
     """
     config.check()
-    network = make_network(config)
-    step_all = batched_step(env)
+    network = make_network_for(env, env_params, config)
+    optimizer, schedule = make_optimizer(config), make_schedule(config)
+    step_all = choose_step(env, config)
 
     def collect_step(runner: Runner, _: None) -> tuple[Runner, tuple]:
         key, key_action, key_step = jax.random.split(runner.key, 3)
@@ -158,24 +202,29 @@ def make_train(
             key_step, runner.env_state, action, env_params
         )
         done = terminated | truncated
-        episode_return = runner.episode_return + reward
-        # Few steps see a truncation, so that its value is rarely worth computing.
-        final_value = jax.lax.cond(
-            truncated.any(),
-            lambda: network.apply(runner.train_state.params, info["final_observation"], method="value"),
-            lambda: jnp.zeros_like(value),
-        )
-        bootstrapped = reward + config.gamma * final_value * (truncated & ~terminated)
-        batch = Batch(runner.observation, action, log_prob, value, bootstrapped, done)
+        total, length = runner.episodes.so_far + reward, runner.episodes.length + 1
+        last_return = jnp.where(done, total, runner.episodes.last_return)
+        if config.bootstrap_at_truncation:
+            # Few steps see a truncation, so that its value is rarely worth computing.
+            final_value = jax.lax.cond(
+                truncated.any(),
+                lambda: network.apply(runner.train_state.params, info["final_observation"], method="value"),
+                lambda: jnp.zeros_like(value),
+            )
+            reward = reward + config.gamma * final_value * (truncated & ~terminated)
+        batch = Batch(runner.observation, action, log_prob, value, reward, done)
         log = {
-            "done": done,
-            "episode_return": episode_return,
             **{name: leaf for name, leaf in info.items() if leaf.shape == done.shape},
+            "done": done,
+            "truncated": truncated,
+            "episode_return": total,
+            "episode_length": length,
+            "last_return": last_return,
         }
         runner = runner._replace(
             env_state=env_state,
             observation=observation,
-            episode_return=jnp.where(done, 0.0, episode_return),
+            episodes=Episodes(jnp.where(done, 0.0, total), jnp.where(done, 0, length), last_return),
             key=key,
         )
         return runner, (batch, log)
@@ -186,22 +235,21 @@ def make_train(
         return train_state.apply_gradients(grads=grads), parts
 
     def update_epoch(train_state: TrainState, key: jax.Array, data: tuple) -> tuple:
-        order = affine_permutation(key, config.batch_size)
+        permutation = affine_permutation if config.affine_shuffle else jax.random.permutation
+        order = permutation(key, config.batch_size)
         shuffled = jax.tree.map(lambda leaf: leaf[order], data)
         minibatches = jax.tree.map(
             lambda leaf: leaf.reshape(config.num_minibatches, -1, *leaf.shape[1:]), shuffled
         )
         return jax.lax.scan(update_minibatch, train_state, minibatches)
 
-    def update(runner: Runner, _: None) -> tuple[Runner, dict[str, jax.Array]]:
+    def update(runner: Runner) -> tuple[Runner, Metrics]:
         runner, (batch, log) = jax.lax.scan(collect_step, runner, None, config.num_steps)
         last_value = network.apply(runner.train_state.params, runner.observation, method="value")
         advantage = generalized_advantages(batch, last_value, config.gamma, config.gae_lambda)
         target = advantage + batch.value
-        data = jax.tree.map(
-            lambda leaf: leaf.reshape(config.batch_size, *leaf.shape[2:]),
-            (batch, advantage, target),
-        )
+        flatten = partial(jax.tree.map, lambda leaf: leaf.reshape(config.batch_size, *leaf.shape[2:]))
+        data = flatten((batch, advantage, target))
         key, *epoch_keys = jax.random.split(runner.key, config.update_epochs + 1)
         train_state, parts = jax.lax.scan(
             lambda train_state, key: update_epoch(train_state, key, data),
@@ -210,41 +258,40 @@ def make_train(
         )
         metrics = {
             **summarise_episodes(log),
+            **summarise_race(log),
             **jax.tree.map(jnp.mean, parts),
+            "last_return": log["last_return"].mean(),
             "explained_variance": 1.0 - jnp.var(target - batch.value) / jnp.var(target),
+            "learning_rate": jnp.asarray(schedule(runner.train_state.step)),
         }
-        if report is not None:
-            jax.debug.callback(report, metrics)
         return runner._replace(train_state=train_state, key=key), metrics
 
-    def train(key: jax.Array) -> tuple[Runner, dict[str, jax.Array]]:
+    def start(key: jax.Array) -> Runner:
         key, key_network, key_reset = jax.random.split(key, 3)
         reset_keys = jax.random.split(key_reset, config.num_envs)
         observation, env_state = jax.vmap(env.reset, in_axes=(0, None))(reset_keys, env_params)
-        runner = Runner(
-            train_state=make_train_state(key_network, observation.shape[-1], config),
+        params = network.init(key_network, observation[:1])
+        nothing = jnp.zeros(config.num_envs)
+        return Runner(
+            train_state=TrainState.create(apply_fn=network.apply, params=params, tx=optimizer),
             env_state=env_state,
             observation=observation,
-            episode_return=jnp.zeros(config.num_envs),
+            episodes=Episodes(nothing, nothing.astype(jnp.int32), nothing),
             key=key,
         )
-        return jax.lax.scan(update, runner, None, config.num_updates)
+
+    return Algorithm(start, update)
+
+
+def make_train(env: Any, env_params: Any, config: Config) -> Callable[[jax.Array], tuple[Runner, Metrics]]:
+    """Return ``train(key) -> (runner, metrics)``, to be jitted: a whole run; metrics (num_updates,).
+
+    Raises:
+        ValueError: a configuration that cannot be trained with.
+    """
+    ppo = make_ppo(env, env_params, config)
+
+    def train(key: jax.Array) -> tuple[Runner, Metrics]:
+        return jax.lax.scan(lambda runner, _: ppo.update(runner), ppo.start(key), None, config.num_updates)
 
     return train
-
-
-def summarise_episodes(log: dict[str, jax.Array]) -> dict[str, jax.Array]:
-    """Return means over the episodes that ended in an update; 0 where none did.
-
-    ``log`` holds (num_steps, num_envs) arrays: done, episode_return and the environment's info.
-    """
-    done = log["done"]
-    num_ended = jnp.maximum(done.sum(), 1)
-    per_episode = partial(jnp.where, done)
-    return {
-        f"episode_{name}" if not name.startswith("episode_") else name: (
-            per_episode(values, 0).sum() / num_ended
-        )
-        for name, values in log.items()
-        if name != "done"
-    }

@@ -1,0 +1,60 @@
+"""What is told of an update: its episodes, and where they are a race, laps and distance to the gate."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+# What a mean over updates is weighted by; counts are summed.
+OF_EPISODES, OF_LAPS = "episodes_ended", "laps_completed"
+NOT_OF_AN_EPISODE = ("done", "last_return")
+
+
+def summarise_episodes(log: dict[str, jax.Array]) -> dict[str, jax.Array]:
+    """Return how many episodes ended in an update, and means over them; 0 where none did.
+
+    ``log`` holds (num_steps, num_envs) arrays: done, episode_return and the environment's info.
+    """
+    done = log["done"]
+    num_ended = jnp.maximum(done.sum(), 1)
+    summary = {OF_EPISODES: done.sum()}
+    for name, values in log.items():
+        if name not in NOT_OF_AN_EPISODE:
+            name = name if name.startswith("episode_") else f"episode_{name}"
+            summary[name] = jnp.where(done, values, 0).sum() / num_ended
+    return summary
+
+
+def summarise_race(log: dict[str, jax.Array]) -> dict[str, jax.Array]:
+    """Return what a racing environment's info says of all steps of an update; nothing for others.
+
+    laps_completed: number of them. lap_time_s: their mean, 0 where there was none. gate_distance_m: mean.
+    """
+    if "lap_completed" not in log:
+        return {}
+    completed = log["lap_completed"]
+    total_s = jnp.where(completed, log["lap_time_s"], 0.0).sum()
+    return {
+        OF_LAPS: completed.sum(),
+        "lap_time_s": total_s / jnp.maximum(completed.sum(), 1),
+        "gate_distance_m": log["gate_distance_m"].mean(),
+    }
+
+
+def summarise_updates(metrics: dict[str, np.ndarray]) -> dict[str, float]:
+    """Return one value per metric of some updates, (num_updates,) each, leaving out means over nothing.
+
+    Means per episode are weighted by the episodes, times per lap by the laps; counts are summed.
+    """
+    summary = {}
+    for name, values in metrics.items():
+        if name in (OF_EPISODES, OF_LAPS):
+            summary[name] = float(values.sum())
+            continue
+        weights = np.ones(len(values))
+        if name.startswith("episode_"):
+            weights = metrics[OF_EPISODES].astype(float)
+        elif name == "lap_time_s":
+            weights = metrics[OF_LAPS].astype(float)
+        if weights.sum() > 0:
+            summary[name] = float(np.average(values.astype(float), weights=weights))
+    return summary

@@ -1,0 +1,106 @@
+"""What is seen of a policy while it trains: evaluation flights, their files, and the live line."""
+
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from tqdm import tqdm
+
+from baselines.purejaxrl_ppo.density import draw_position_density
+from baselines.purejaxrl_ppo.evaluate import Flight, fly_many, score
+from baselines.purejaxrl_ppo.networks import ActorCritic
+from flytrack_env.rollout import save_rollout
+
+NUM_LAPS = 3
+NUM_STEPS = 2500  # 25 s at 100 Hz: three laps of the slowest shipped track, flown by a beginner
+EVALUATION_SEED = 20_000  # of the noisy starts: the same at every evaluation, none of a usual training seed
+
+
+def evaluation_metrics(flights: Flight) -> dict[str, float]:
+    """Return what evaluation flights show; times that there is none of are left out.
+
+    success: share that completed the laps. flying_lap_s: mean; best_lap_s: shortest flying lap. ended_*:
+    share that each cause ended; ended_time_limit: of those still in the air, their laps not complete.
+    """
+    result = score(flights, NUM_LAPS)._asdict()
+    laps, is_completed = np.asarray(flights.laps), np.asarray(flights.lap_completed)
+    flying_s = np.asarray(flights.lap_time_s)[is_completed & (laps > 1)]
+    causes = {f"ended_{n}": np.asarray(c).any(axis=1) for n, c in flights.causes._asdict().items()}
+    is_ended = np.any(list(causes.values()), axis=0) | (laps.max(axis=1) >= NUM_LAPS)
+    values = {
+        **result,
+        "laps": laps.max(axis=1).mean(),
+        "best_lap_s": flying_s.min(initial=np.inf),
+        "steps": np.asarray(flights.is_flying).sum(axis=1).mean(),
+        **{name: happened.mean() for name, happened in causes.items()},
+        "ended_time_limit": (~is_ended).mean(),
+    }
+    return {f"evaluation_{name}": float(value) for name, value in values.items() if np.isfinite(value)}
+
+
+def evaluate_policy(
+    env: Any, network: ActorCritic, params: Any, num_episodes: int, out: Path, steps: int
+) -> tuple[dict[str, float], list[Path]]:
+    """Fly noisy starts and write the first flight and the position density of all; return metrics and files.
+
+    out: folder of the run. steps: environment steps of training so far, which name the files.
+    """
+    flights = fly_many(env, network, params, EVALUATION_SEED, num_episodes, NUM_STEPS, NUM_LAPS)
+    folder = out / "evaluation"
+    rollout, chart = folder / f"rollout_{steps}.npy", folder / f"position_density_{steps}.png"
+    is_flying = np.asarray(flights.is_flying[0])
+    save_rollout(rollout, np.asarray(flights.states[0])[is_flying], np.asarray(flights.actions[0])[is_flying])
+    draw_position_density(chart, flights.positions(), env.track)
+    return evaluation_metrics(flights), [rollout, chart]
+
+
+def record_flight(rollout: Path, track: Any) -> Path | None:
+    """Write a rollout file's flight as a Rerun recording beside it; None where Rerun is not installed."""
+    if find_spec("rerun") is None:
+        return None
+    from flytrack_env.rollout import load_rollout
+    from flytrack_env.viz_rerun import visualize_state_action_sequence
+
+    states, actions = load_rollout(rollout)
+    path = rollout.with_suffix(".rrd")
+    visualize_state_action_sequence(list(zip(states, actions, strict=True)), track.rows(), str(path))
+    return path
+
+
+class LiveLine:
+    """One line: steps, rate, time left, mean return of the last episodes, success, best lap so far."""
+
+    def __init__(self, total: int, done: int):
+        self._bar = tqdm(total=total, initial=done, unit="step", unit_scale=True, desc="compile")
+        self._return = 0.0
+        self._success: float | None = None
+        self._best_lap_s: float | None = None
+
+    def begin(self) -> None:
+        """Count time from now on: what came before was compilation."""
+        self._bar.set_description("train")
+        self._bar.unpause()
+
+    def trained(self, steps: int, last_return: float) -> None:
+        """Move on to a number of environment steps."""
+        self._return = last_return
+        self._bar.set_postfix_str(self._text(), refresh=False)
+        self._bar.update(steps - self._bar.n)
+
+    def evaluated(self, metrics: dict[str, float]) -> None:
+        """Show another evaluation."""
+        self._success = metrics["evaluation_success"]
+        lap_s = metrics.get("evaluation_best_lap_s")
+        if lap_s is not None:
+            self._best_lap_s = min(lap_s, self._best_lap_s or lap_s)
+        self._bar.set_postfix_str(self._text())
+
+    def _text(self) -> str:
+        success = "-" if self._success is None else f"{self._success:.0%}"
+        best_lap = "-" if self._best_lap_s is None else f"{self._best_lap_s:.2f} s"
+        return f"return {self._return:.1f}, success {success}, best lap {best_lap}"
+
+    def close(self) -> None:
+        """Leave the line as it is."""
+        self._bar.close()

@@ -1,0 +1,128 @@
+"""Going on with a training that was cut off: what a run is, its newest intact checkpoint, its state."""
+
+import dataclasses
+import logging
+import re
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+import flytrack_env
+from baselines.purejaxrl_ppo.checkpoint import (
+    Checkpoint,
+    CheckpointError,
+    as_json,
+    check_none,
+    find_differences,
+    load_checkpoint,
+    observation_layout,
+    save_checkpoint,
+)
+from baselines.purejaxrl_ppo.config import Config
+from baselines.purejaxrl_ppo.named_arrays import as_named_arrays, find_misfits, from_named_arrays
+from baselines.purejaxrl_ppo.ppo import Runner
+from flytrack_env.model_file import model_as_json
+
+FINAL = "final.msgpack"
+STEP_FILE = re.compile(r"step_(\d+)\.msgpack")
+MUST_FIT = ("env_id", "seed", "missed_gate", "config", "observation", "track_data", "model", "environment")
+
+logger = logging.getLogger(__name__)
+
+
+def describe_run(env: Any, env_id: str, track: str, config: Config, seed: int) -> dict[str, Any]:
+    """Return what a run is, as JSON values: what its checkpoints say of themselves.
+
+    track: what finds it again, a name or a path; its gates and bounds stand under ``track_data``.
+    environment: the other parameters (rewards, starts, time step, wrappers) by their paths.
+    """
+    params = env.default_params
+    others = as_named_arrays(params.replace(model=None, course=None))
+    return as_json(
+        {
+            "env_id": env_id,
+            "track": track,
+            "track_data": dataclasses.asdict(env.track),
+            "missed_gate": env.missed_gate,
+            "observation_size": int(env.observation_space().shape[0]),
+            "observation": observation_layout(env),
+            "seed": seed,
+            "model": model_as_json(params.model),
+            "environment": {name: values.tolist() for name, values in others.items()},
+            "config": dataclasses.asdict(config),
+        }
+    )
+
+
+def save_run(path: Path, runner: Runner, config: Config, description: dict[str, Any]) -> None:
+    """Write a checkpoint that training can go on from, atomically."""
+    state = runner.train_state
+    rest = runner._replace(train_state=state.replace(params=None))
+    save_checkpoint(path, state.params, config, description, as_named_arrays(rest))
+
+
+def checkpoints_in(folder: Path) -> list[Path]:
+    """Return the checkpoints in a folder, newest first: by the steps in their names, the final one first."""
+    steps = {path: match for path in folder.glob("*.msgpack") if (match := STEP_FILE.fullmatch(path.name))}
+    by_age = sorted(steps, key=lambda path: int(steps[path][1]), reverse=True)
+    return [path for path in (folder / FINAL,) if path.exists()] + by_age
+
+
+def newest_intact(path: Path) -> tuple[Path, Checkpoint]:
+    """Return the checkpoint in a file, or the newest one in a folder that is intact, and its path.
+
+    Raises:
+        CheckpointError: a file that cannot be used, a folder without an intact one, or a policy alone.
+    """
+    candidates = checkpoints_in(path) if path.is_dir() else [path]
+    if not candidates:
+        raise CheckpointError(f"{path}: found no checkpoint, expected {FINAL} or step_<N>.msgpack")
+    *newer, oldest = candidates
+    for candidate in newer:
+        try:
+            return candidate, _load_training(candidate)
+        except CheckpointError as error:
+            logger.warning("%s; the checkpoint before it is used", error)
+    return oldest, _load_training(oldest)
+
+
+def _load_training(path: Path) -> Checkpoint:
+    checkpoint = load_checkpoint(path)
+    if checkpoint.training is None:
+        raise CheckpointError(f"{path}: found a policy alone, expected one with its training")
+    return checkpoint
+
+
+def check_same_run(path: Path, checkpoint: Checkpoint, description: dict[str, Any]) -> None:
+    """Raise CheckpointError, field by field, where a checkpoint is not of the run described.
+
+    Another package version alone is a warning: it may go on differently than it would have.
+    """
+    found = {**checkpoint.meta, "config": as_json(dataclasses.asdict(checkpoint.config))}
+    lines = [
+        line for name in MUST_FIT for line in find_differences(found.get(name), description.get(name), name)
+    ]
+    version = find_differences(
+        checkpoint.meta.get("package_version"), flytrack_env.__version__, "package_version"
+    )
+    if version and not lines:
+        logger.warning("%s: %s; going on, perhaps not bit for bit", path, version[0])
+    check_none(path, [*lines, *version] if lines else [])
+
+
+def restore_runner(path: Path, checkpoint: Checkpoint, target: Runner) -> Runner:
+    """Return the state of the training in a checkpoint; ``target``: its shapes and types.
+
+    Raises:
+        CheckpointError: arrays that are not what the training expects, leaf by leaf.
+    """
+    rest = target._replace(train_state=target.train_state.replace(params=None))
+    training = checkpoint.training or {}
+    if not all(isinstance(array, np.ndarray) for array in training.values()):
+        raise CheckpointError(f"{path}: training: found something else than arrays")
+    check_none(path, find_misfits(training, rest))
+    runner = from_named_arrays(training, rest)
+    params = jax.tree.map(jax.numpy.asarray, checkpoint.params)
+    return runner._replace(train_state=runner.train_state.replace(params=params))
