@@ -102,7 +102,8 @@ def causes_table(found: Diagnosis) -> str:
             f"{name} {with_unit(number(one.value), one.unit)} ({' to '.join(map(number, one.ci95))})"
             for name, one in cause.parameters.items()
         )
-        alike = ", ".join(cause.equivalent) or f"no (closest: {cause.closest})" if cause.closest else "no"
+        against = f"no (closest: {cause.closest})" if cause.closest else "not tried"
+        alike = ", ".join(cause.equivalent) or against
         gains = (cause.chi2_gain, cause.heldout_gain, cause.lambda_, cause.lambda_sep)
         rows.append([f"`{cause.effect}`", values, *map(number, gains), alike])
     header = (
