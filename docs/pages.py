@@ -117,8 +117,11 @@ def reward_section(env: Any) -> list[str]:
         (f"`{term.__name__}`", f"{getattr(weights, term.__name__):g}", sentence(term.__doc__ or ""))
         for term in TERMS
     ]
-    text = "The sum of these terms, each times its weight, a field of `params.reward`."
-    return ["## Reward", "", text, "", *table(("term", "weight", "what"), rows)]
+    text = paragraph(
+        "The sum of these terms, each times its weight: a field of `params.reward`, and a key of",
+        "`make(..., reward={...})`.",
+    )
+    return ["## Reward", "", *text, *table(("term", "weight", "what"), rows)]
 
 
 def start_section(env: Any) -> list[str]:
@@ -162,13 +165,15 @@ def arguments_section(env_id: str) -> list[str]:
     entries = re.findall(r"^ {8}(\w+): (.*(?:\n {12}.*)*)", body, re.MULTILINE)
     rows = [(f"`{name}`", re.sub(r"\s+", " ", text).replace("``", "`")) for name, text in entries]
     parameters = inspect.signature(FlyTrack).parameters.values()
-    shown = (f"{parameter.name}={parameter.default!r}" for parameter in parameters)
-    defaults = ", ".join(shown).replace("'", '"')
+    shown = [f"    {parameter.name}={parameter.default!r},".replace("'", '"') for parameter in parameters]
     lines = [
         "## Arguments",
         "",
         "```python",
-        f'gymnax.make("{env_id}", {defaults})',
+        "gymnax.make(",
+        f'    "{env_id}",',
+        *shown,
+        ")",
         f'gymnasium.make("flytrack_env:{env_id}", track="split_s")  # the same arguments',
         "```",
         "",

@@ -1,5 +1,6 @@
 """FlyTrack: the drone-racing environment, native to gymnax 1.0."""
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -17,7 +18,7 @@ from flytrack_env.params import EnvParams
 from flytrack_env.plants import Plant, Simulator
 from flytrack_env.race import Race, RaceEvents, advance_race, look_up_gates, start_race
 from flytrack_env.resets import ResetParams, sample_start
-from flytrack_env.rewards import RewardWeights, Transition, total_reward
+from flytrack_env.rewards import Transition, make_weights, total_reward
 from flytrack_env.state import Action, Drone
 from flytrack_env.terminations import Causes, find_causes
 from flytrack_env.tracks import Track, build_course, load_track
@@ -42,10 +43,11 @@ class FlyTrack(EpisodicEnvironment):
         plant: what moves the drone; the simulator if None. Black boxes: ``flytrack_env.blackbox``.
         missed_gate: "terminate" the episode when a gate's plane is crossed outside its frame, or
             "fly_on" with the same gate still to be flown.
+        reward: weights of reward terms by name, for those that are not to have the default weight.
 
     Raises:
         TrackError, ModelFileError: a track or model that cannot be read.
-        ValueError: another value of ``missed_gate``.
+        ValueError: another value of ``missed_gate``; an unknown reward term, or a weight that is no number.
     """
 
     def __init__(
@@ -54,6 +56,7 @@ class FlyTrack(EpisodicEnvironment):
         model: ModelParameters | str | Path | None = None,
         plant: Plant | None = None,
         missed_gate: str = "terminate",
+        reward: Mapping[str, float] | None = None,
     ):
         super().__init__()
         if missed_gate not in MISSED_GATE_CHOICES:
@@ -69,7 +72,7 @@ class FlyTrack(EpisodicEnvironment):
             model=model,
             course=build_course(self.track),
             reset=ResetParams(),
-            reward=RewardWeights(),
+            reward=make_weights(reward or {}),
         )
 
     @property

@@ -1,5 +1,7 @@
 """The reward: a weighted sum of small terms, each a pure function of one transition."""
 
+import math
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import jax
@@ -34,6 +36,21 @@ class RewardWeights(NamedTuple):
     termination: Scalar = -1.0
     body_rates: Scalar = -4e-5
     action_change: Scalar = -1e-2
+
+
+def make_weights(changes: Mapping[str, float]) -> RewardWeights:
+    """Return the default weights with some of them changed, by the name of the term.
+
+    Raises:
+        ValueError: an unknown term, or a weight that is not a finite number.
+    """
+    for name, weight in changes.items():
+        if name not in RewardWeights._fields:
+            expected = ", ".join(RewardWeights._fields)
+            raise ValueError(f"reward: found {name!r}, expected one of {expected}")
+        if isinstance(weight, bool) or not isinstance(weight, (int, float)) or not math.isfinite(weight):
+            raise ValueError(f"reward.{name}: found {weight!r}, expected a finite number")
+    return RewardWeights()._replace(**{name: float(weight) for name, weight in changes.items()})
 
 
 def progress(transition: Transition) -> Scalar:

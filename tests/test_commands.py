@@ -63,6 +63,8 @@ def test_eval_agent_refuses(checkpoint_path, tmp_path, arguments, message):
     ("arguments", "message"),
     [
         (["--track", "nowhere"], "nowhere"),
+        (["--reward", "speed=1"], "reward: found 'speed', expected one of progress"),
+        (["--reward", "progress"], "found 'progress', expected TERM=WEIGHT"),
         (["--model", "missing.json"], "missing.json"),
         (["--total-timesteps", "10"], "total_timesteps"),
         (["--env-id", "FlyTrack-v9"], "FlyTrack-v9"),

@@ -384,6 +384,16 @@ def test_resuming_takes_from_the_checkpoint_what_is_not_given(whole, tmp_path):
     assert plans_of("--resume", whole[0], "--out", tmp_path)[0].out == tmp_path
 
 
+def test_resuming_keeps_the_reward_that_was_trained_for(whole):
+    checkpoint = load_checkpoint(whole[0] / "final.msgpack")
+    checkpoint.meta["environment"]["reward.off_centre"] = -0.25
+    parser = train_ppo.make_parser()
+    kept = train_ppo.make_trainer(parser.parse_args(["--resume", "x"]), checkpoint)
+    asked = train_ppo.make_trainer(parser.parse_args(["--reward", "off_centre=-0.5"]), checkpoint)
+    assert kept.env.default_params.reward.off_centre == -0.25
+    assert asked.env.default_params.reward.off_centre == -0.5
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [

@@ -92,6 +92,12 @@ def test_total_is_the_weighted_sum(make_transition: MakeTransition) -> None:
     assert float(total_reward(transition, weights)) == pytest.approx(expected, rel=1e-5)
 
 
+def test_weights_that_are_given_replace_the_defaults() -> None:
+    weights = FlyTrack(reward={"off_centre": -0.5, "gate_pass": 2}).default_params.reward
+    assert weights == RewardWeights(off_centre=-0.5, gate_pass=2.0)
+    assert FlyTrack(reward={}).default_params.reward == RewardWeights()
+
+
 def test_default_weights_have_the_right_signs() -> None:
     weights = RewardWeights()
     assert weights.progress > 0.0 and weights.gate_pass > 0.0

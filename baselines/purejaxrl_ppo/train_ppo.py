@@ -31,12 +31,28 @@ def whole_number(text: str) -> int:
     return value
 
 
+def reward_weight(text: str) -> tuple[str, float]:
+    """Return the term and the weight of ``TERM=WEIGHT``."""
+    name, _, weight = text.partition("=")
+    try:
+        return name, float(weight)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(f"found {text!r}, expected TERM=WEIGHT") from error
+
+
 def make_parser() -> argparse.ArgumentParser:
     """Return the command line: what is trained and told, and one flag per hyperparameter."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--env-id", help=f"default: {DEFAULT_ENV_ID}")
     parser.add_argument("--track", help=f"name of a track, or path of its file (default: {DEFAULT_TRACK})")
     parser.add_argument("--model", help="path of a model file; the nominal model if not given")
+    parser.add_argument(
+        "--reward",
+        type=reward_weight,
+        nargs="+",
+        metavar="TERM=WEIGHT",
+        help="weights of reward terms (docs/envs); the others are default",
+    )
     parser.add_argument("--seed", type=int, help="default: 0")
     parser.add_argument(
         "--num-seeds", type=int, default=1, help="train seeds seed, seed + 1, ..., each in OUT/seed<N>"
@@ -114,15 +130,27 @@ def make_trainer(arguments: argparse.Namespace, base: Checkpoint | None) -> Trai
     """Return the trainer of a command line; what it does not say is as in the checkpoint, if there is one."""
     asked = settings_of(arguments)
     if base is None:
-        env_arguments: dict[str, Any] = {"track": arguments.track or DEFAULT_TRACK, "model": arguments.model}
+        env_arguments: dict[str, Any] = {
+            "track": arguments.track or DEFAULT_TRACK,
+            "model": arguments.model,
+            "reward": dict(arguments.reward or ()),
+        }
         return Trainer(Config(**asked), arguments.env_id or DEFAULT_ENV_ID, **env_arguments)
     env_arguments = {
         "track": arguments.track or base.track,
         "model": arguments.model or model_from_json(base.meta["model"], "checkpoint: model"),
         "missed_gate": base.meta["missed_gate"],
+        "reward": {**reward_of(base), **dict(arguments.reward or ())},
     }
     config = dataclasses.replace(base.config, **asked)
     return Trainer(config, arguments.env_id or base.env_id, **env_arguments)
+
+
+def reward_of(checkpoint: Checkpoint) -> dict[str, float]:
+    """Return the weights of the reward terms that a checkpoint was trained with."""
+    prefix = "reward."
+    values = checkpoint.meta["environment"].items()
+    return {name.removeprefix(prefix): value for name, value in values if name.startswith(prefix)}
 
 
 def run(arguments: argparse.Namespace) -> None:

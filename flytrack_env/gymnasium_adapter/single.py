@@ -21,7 +21,7 @@ class FlyTrackEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         env_id: an id of ``flytrack_env.registration.ENVIRONMENTS``.
         render_mode: None, "rgb_array" or "human".
         params: replace the environment's default parameters.
-        overrides: further arguments of ``flytrack_env.make``: track, model, plant, missed_gate.
+        overrides: further arguments of ``flytrack_env.make``: track, model, plant, missed_gate, reward.
 
     Raises:
         ValueError: what ``flytrack_env.make`` and ``check_params`` refuse, or an unknown render mode.

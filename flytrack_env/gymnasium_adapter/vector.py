@@ -29,7 +29,7 @@ class FlyTrackVectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.nd
         num_envs: how many.
         render_mode: None or "rgb_array".
         params: replace the environment's default parameters.
-        overrides: further arguments of ``flytrack_env.make``: track, model, plant, missed_gate.
+        overrides: further arguments of ``flytrack_env.make``: track, model, plant, missed_gate, reward.
 
     Raises:
         ValueError: what ``flytrack_env.make`` and ``check_params`` refuse, an unknown render mode, or no
