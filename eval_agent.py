@@ -12,7 +12,8 @@ import numpy as np
 
 import flytrack_env
 from baselines.purejaxrl_ppo.checkpoint import Checkpoint, load_checkpoint
-from baselines.purejaxrl_ppo.evaluate import Flight, fly_episode, start_pose_params
+from baselines.purejaxrl_ppo.evaluate import fly_episode, start_pose_params
+from baselines.purejaxrl_ppo.flights import Flight
 from flytrack_env import FlyTrack, blackbox
 from flytrack_env.rollout import save_rollout
 
