@@ -135,7 +135,7 @@ def _note(outcome: Outcomes, flown: Flight) -> Outcomes:
     )
 
 
-@partial(jax.jit, static_argnames=("env", "network", "num_steps", "num_laps"))
+@partial(jax.jit, static_argnames=("env", "network", "num_laps"))
 def _race_batch(
     env: EpisodicEnvironment,
     network: ActorCritic,

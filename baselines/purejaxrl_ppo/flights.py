@@ -1,10 +1,12 @@
 """What is known of flights: every step of them, or what came of them; and their score."""
 
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 
+from flytrack_env.rollout import save_rollout
 from flytrack_env.state import POSITION
 from flytrack_env.terminations import Causes
 
@@ -108,6 +110,12 @@ def outcomes_of(flights: Flight, num_laps: int, num_gates: int) -> Outcomes:
         gate_times_s=gate_times_s,
         causes=Causes(*(cause.any(axis=1) for cause in flights.causes)),
     )
+
+
+def save_flown(path: Path, flight: Flight) -> None:
+    """Write the steps that were flown of one flight as a rollout file."""
+    is_flying = np.asarray(flight.is_flying)
+    save_rollout(path, np.asarray(flight.states)[is_flying], np.asarray(flight.actions)[is_flying])
 
 
 def score(outcomes: Outcomes) -> Score:

@@ -4,14 +4,14 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
+import jax
 import numpy as np
 from tqdm import tqdm
 
 from baselines.purejaxrl_ppo.density import draw_position_density
 from baselines.purejaxrl_ppo.evaluate import fly_many
-from baselines.purejaxrl_ppo.flights import Outcomes, outcomes_of, score
+from baselines.purejaxrl_ppo.flights import Outcomes, outcomes_of, save_flown, score
 from baselines.purejaxrl_ppo.networks import ActorCritic
-from flytrack_env.rollout import save_rollout
 
 NUM_LAPS = 3
 NUM_STEPS = 2500  # 25 s at 100 Hz: three laps of the slowest shipped track, flown by a beginner
@@ -44,8 +44,7 @@ def evaluate_policy(
     flights = fly_many(env, network, params, EVALUATION_SEED, num_episodes, NUM_STEPS, NUM_LAPS)
     folder = out / "evaluation"
     rollout, chart = folder / f"rollout_{steps}.npy", folder / f"position_density_{steps}.png"
-    is_flying = np.asarray(flights.is_flying[0])
-    save_rollout(rollout, np.asarray(flights.states[0])[is_flying], np.asarray(flights.actions[0])[is_flying])
+    save_flown(rollout, jax.tree.map(lambda leaf: leaf[0], flights))
     draw_position_density(chart, flights.positions(), env.track)
     outcomes = outcomes_of(flights, NUM_LAPS, len(env.track.gates))
     return evaluation_metrics(outcomes), [rollout, chart]

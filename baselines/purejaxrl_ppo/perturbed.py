@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from baselines.purejaxrl_ppo.statistics import share
+from baselines.purejaxrl_ppo.summary import share
 from flytrack_env.dynamics import ModelParameters
 from flytrack_env.effects import effect_of
 from flytrack_env.params import EnvParams
@@ -46,9 +46,10 @@ class Plants(NamedTuple):
     """Drawn plants.
 
     models: leaves (num_plants, ...). drawn: by the names of ``PlantRanges``, (num_plants,) each; of the
-    drag, the mean of the three axes.
+    drag, the mean of the three axes. ranges: what they were drawn from.
     """
 
+    ranges: PlantRanges
     models: ModelParameters
     drawn: dict[str, np.ndarray]
 
@@ -59,6 +60,17 @@ class Plants(NamedTuple):
     def repeated(self, times: int) -> ModelParameters:
         """Return every model that many times, one after the other, leaves (num_plants * times, ...)."""
         return jax.tree.map(lambda leaf: np.repeat(leaf, times, axis=0), self.models)
+
+    def summarise(self, is_complete: np.ndarray) -> dict[str, Any]:
+        """Return on how many plants every flight completes its laps, as JSON values.
+
+        is_complete: (num_plants, num_episodes), which flights did.
+        """
+        return {
+            "success": share(is_complete.all(axis=1)),
+            "ranges": {name: list(bounds) for name, bounds in self.ranges._asdict().items()},
+            "by_thirds": by_thirds(self.drawn, is_complete),
+        }
 
 
 def perturb(
@@ -111,7 +123,8 @@ def draw_plants(
     wind_w = wind[:, None] * np.stack([np.cos(towards_rad), np.sin(towards_rad)], axis=1)
     models = jax.vmap(partial(perturb, model))(drag, thrust, wind_w, delay)
     drawn = (drag.mean(axis=1), thrust, wind, delay)
-    return Plants(jax.tree.map(np.asarray, models), dict(zip(PlantRanges._fields, drawn, strict=True)))
+    by_name = dict(zip(PlantRanges._fields, drawn, strict=True))
+    return Plants(ranges, jax.tree.map(np.asarray, models), by_name)
 
 
 def with_model_as_given(params: EnvParams) -> EnvParams:

@@ -9,10 +9,12 @@ from benchmarks.optimal.reference import (
     KINDS,
     Reference,
     ReferenceFileError,
+    model_digest,
     shipped_path,
     shipped_reference,
     track_digest,
 )
+from flytrack_env import ModelParameters
 from flytrack_env.tracks import Track
 
 References = dict[str, Reference]
@@ -36,10 +38,17 @@ def shipped_references(track: Track, model_names: tuple[str, ...]) -> References
     return references
 
 
+def is_model_of(track: str, model_name: str, model: ModelParameters) -> bool:
+    """Return whether a track has a reference of that name that was found with just this model."""
+    if not shipped_path(track, "flying", model_name).is_file():
+        return False
+    return model_digest(model) == model_digest(shipped_reference(track, "flying", model_name).model)
+
+
 def compare(summary: dict[str, Any], references: References) -> dict[str, Any]:
     """Return how far lap times are above the optimum, as JSON values.
 
-    summary: as ``statistics.summarise`` returns it. For each kind of lap: ``time_s`` of the optimum,
+    summary: as ``summary.summarise`` returns it. For each kind of lap: ``time_s`` of the optimum,
     ``mean_percent_above`` and ``min_percent_above`` of the laps flown, None where there were none.
     """
     compared: dict[str, Any] = {"model": references["flying"].model_name}
