@@ -42,7 +42,7 @@ DEFAULT_LAPS = 3
 MAX_SEED = 2**31
 MAX_STEPS = 1_000_000  # hours: the battery is empty after minutes
 MAX_LAPS = 100  # their gate times are kept for every flight
-MAX_FLIGHTS = 1_000_000  # so that what came of them fits into memory
+MAX_FLIGHTS = 100_000  # so that the gate times of all of them fit into memory
 BLACK_BOX_MODELS, NOMINAL_MODELS = ("black_box", "nominal"), ("nominal",)  # of references, the best first
 
 

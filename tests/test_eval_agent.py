@@ -375,7 +375,7 @@ def make_bad_files(folder: Path) -> None:
         (["--episodes", "0"], ["--episodes: found 0", "expected 1 to"]),
         (["--episodes", "2000000"], ["--episodes: found 2000000"]),
         (["--plants", "0"], ["--plants: found 0"]),
-        (["--plants", "2000", "--episodes", "1000"], ["--plants: found 2000", "expected 1 to 1000"]),
+        (["--plants", "2000", "--episodes", "1000"], ["--plants: found 2000", "expected 1 to 100"]),
         (["--plants", "2", "--black-box", "any.bin"], ["--plants", "--black-box any.bin", "one of the two"]),
         (["--plants", "2", "--checkpoint", "no_model.msgpack"], ["model", "found none"]),
         (["--laps", "0"], ["--laps: found 0"]),
