@@ -11,7 +11,8 @@ import numpy as np
 import eval_agent
 from baselines.purejaxrl_ppo import Config
 from baselines.purejaxrl_ppo.density import draw_position_density
-from baselines.purejaxrl_ppo.evaluate import fly_many, score
+from baselines.purejaxrl_ppo.evaluate import fly_many
+from baselines.purejaxrl_ppo.flights import outcomes_of, score
 from baselines.purejaxrl_ppo.train_ppo import train_policy
 from flytrack_env import blackbox, load_track, save_model
 from flytrack_env.files import write_atomically
@@ -90,7 +91,7 @@ def run(arguments: argparse.Namespace) -> None:
     print(eval_agent.describe(flight, blackbox.DT))
     env = eval_agent.black_box_env(checkpoint, arguments.black_box)
     flights = fly_many(env, checkpoint.network, checkpoint.params, seed, NUM_EPISODES, NUM_STEPS, NUM_LAPS)
-    result = score(flights, NUM_LAPS)
+    result = score(outcomes_of(flights, NUM_LAPS, len(env.track.gates)))
 
     print("4/4 draw")
     states, actions = load_rollout(out / "rollout.npy")

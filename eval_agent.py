@@ -1,37 +1,83 @@
-"""Fly a checkpoint on a black box: ``python eval_agent.py --checkpoint PATH --steps N``.
+"""Fly a checkpoint: ``python eval_agent.py --checkpoint PATH --steps N [--episodes E] [--plants K]``.
 
-The black box moves the drone; the environment's own gate logic says what was passed, when, and why
-the flight ended. The rollout is written as a plain numeric array (T, 25) = [x 21 | u 4].
+A black box moves the drone; the environment's own gate logic says what was passed, when, and why a flight
+ended. With ``--plants``, drawn simulated plants move it instead. The first flight's rollout is written as a
+plain numeric array (T, 25) = [x 21 | u 4]. What is printed and stored: docs/baseline.md.
 """
 
 import argparse
+import json
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 
 import flytrack_env
-from baselines.purejaxrl_ppo.checkpoint import Checkpoint, load_checkpoint
-from baselines.purejaxrl_ppo.evaluate import Flight, fly_episode, start_pose_params
-from flytrack_env import FlyTrack, blackbox
+from baselines.purejaxrl_ppo.checkpoint import Checkpoint, CheckpointError, load_checkpoint
+from baselines.purejaxrl_ppo.evaluate import fly_episode, race_many, start_keys, start_pose_params
+from baselines.purejaxrl_ppo.flights import Flight, Outcomes, outcomes_of, save_flown
+from baselines.purejaxrl_ppo.perturbed import Plants, draw_plants, with_model_as_given
+from baselines.purejaxrl_ppo.report import describe, describe_report, lap_times, reason_ended
+from baselines.purejaxrl_ppo.summary import summarise
+from benchmarks.optimal import ReferenceFileError
+from benchmarks.optimal.ghost import (
+    References,
+    compare,
+    ghost_rollout,
+    is_model_of,
+    shipped_references,
+    time_lost,
+)
+from flytrack_env import EnvParams, blackbox
+from flytrack_env.episodes import EpisodicEnvironment
+from flytrack_env.files import write_atomically
+from flytrack_env.model_file import model_from_json
 from flytrack_env.rollout import save_rollout
 
 SHIPPED_BLACK_BOX = Path(__file__).parent / "blackbox" / "acro_step.bin"
 
+SCHEMA = 1
+DEFAULT_LAPS = 3
 MAX_SEED = 2**31
+MAX_STEPS = 1_000_000  # hours: the battery is empty after minutes
+MAX_LAPS = 100  # their gate times are kept for every flight
+MAX_FLIGHTS = 100_000  # so that the gate times of all of them fit into memory
+BLACK_BOX_MODELS, NOMINAL_MODELS = ("black_box", "nominal"), ("nominal",)  # of references, the best first
 
 
-def black_box_env(checkpoint: Checkpoint, black_box: Path) -> FlyTrack:
+def black_box_env(
+    checkpoint: Checkpoint, black_box: Path, track: str | Path | None = None
+) -> EpisodicEnvironment:
     """Return the checkpoint's environment with the black box in place of the simulator.
+
+    track: name or file; the checkpoint's if None.
 
     Raises:
         BlackBoxError, CheckpointError, TrackError: a file that cannot be used.
     """
+    return _checked_env(checkpoint, track, plant=blackbox.load(black_box))
+
+
+def simulated_env(checkpoint: Checkpoint, track: str | Path | None = None) -> EpisodicEnvironment:
+    """Return the checkpoint's environment with the simulator and the model that it was trained on.
+
+    Raises:
+        CheckpointError, TrackError: a file that cannot be used, a checkpoint that does not hold its model.
+    """
+    if "model" not in checkpoint.meta:
+        raise CheckpointError("checkpoint: model: found none in it, expected the one it was trained on")
+    return _checked_env(
+        checkpoint, track, model=model_from_json(checkpoint.meta["model"], "checkpoint: model")
+    )
+
+
+def _checked_env(checkpoint: Checkpoint, track: str | Path | None, **arguments: Any) -> EpisodicEnvironment:
     env = flytrack_env.make(
         checkpoint.env_id,
-        track=checkpoint.track,
-        plant=blackbox.load(black_box),
+        track=checkpoint.track if track is None else track,
         missed_gate=checkpoint.meta["missed_gate"],
+        **arguments,
     )
     checkpoint.check_fits(env)
     env.check_params(env.default_params)
@@ -41,65 +87,189 @@ def black_box_env(checkpoint: Checkpoint, black_box: Path) -> FlyTrack:
 def fly_on_black_box(checkpoint: Checkpoint, black_box: Path, num_steps: int, seed: int) -> Flight:
     """Return one flight of the policy on a black box, from a noisy start pose, any number of laps."""
     env = black_box_env(checkpoint, black_box)
-    params = start_pose_params(env.default_params, num_steps)
-    key = jax.random.key(seed)
-    network, policy_params = checkpoint.network, checkpoint.params
-    return fly_episode(env, network, policy_params, key, params, num_steps, num_steps)
+    return _fly_one(env, checkpoint, jax.random.key(seed), env.default_params, num_steps, num_steps)
 
 
-def lap_times(flight: Flight) -> np.ndarray:
-    """Return the lap times of one flight, s, in order; the first is from the standing start."""
-    return np.asarray(flight.lap_time_s)[np.asarray(flight.lap_completed)]
+def _fly_one(
+    env: EpisodicEnvironment,
+    checkpoint: Checkpoint,
+    key: jax.Array,
+    params: EnvParams,
+    num_steps: int,
+    num_laps: int,
+) -> Flight:
+    network, params = checkpoint.network, start_pose_params(params, num_steps)
+    return fly_episode(env, network, checkpoint.params, key, params, num_steps, num_laps)
 
 
-def reason_ended(flight: Flight) -> str:
-    """Return the causes of termination, or that the steps ran out."""
-    causes = [name for name, happened in flight.causes._asdict().items() if np.any(happened)]
-    return ", ".join(causes) or "all steps flown"
+def ghost_path(out: Path) -> Path:
+    """Return where the ghost of a rollout lies."""
+    return out.with_name(f"{out.stem}_ghost.npy")
 
 
-def describe(flight: Flight, dt: float) -> str:
-    """Return what a pilot wants to know of a flight."""
-    num_flown = int(np.sum(flight.is_flying))
-    times = lap_times(flight)
-    laps = ", ".join(f"{seconds:.3f} s" for seconds in times) or "none"
-    return (
-        f"flown: {num_flown} steps, {num_flown * dt:.2f} s\n"
-        f"gates: {int(np.max(flight.gates_passed))}, laps: {len(times)}\n"
-        f"lap times: {laps}\n"
-        f"ended: {reason_ended(flight)}"
+class Scene(NamedTuple):
+    """What is flown: environment, its parameters, drawn plants (None: a black box), references if any."""
+
+    env: EpisodicEnvironment
+    params: EnvParams
+    plants: Plants | None
+    references: References | None
+
+
+def set_scene(checkpoint: Checkpoint, arguments: argparse.Namespace) -> Scene:
+    """Return what the command line asks to fly; raises ValueError or OSError for what cannot be used."""
+    if arguments.plants is None:
+        black_box = arguments.black_box or SHIPPED_BLACK_BOX
+        env, plants = black_box_env(checkpoint, black_box, arguments.track), None
+        is_shipped = black_box.read_bytes() == SHIPPED_BLACK_BOX.read_bytes()
+    else:
+        env = simulated_env(checkpoint, arguments.track)
+        model = env.default_params.model
+        plants = draw_plants(arguments.seed, arguments.plants, model)
+        is_shipped = is_model_of(env.track.name, BLACK_BOX_MODELS[0], model)
+    try:
+        references = shipped_references(env.track, BLACK_BOX_MODELS if is_shipped else NOMINAL_MODELS)
+    except ReferenceFileError:
+        if arguments.ghost:
+            raise
+        references = None
+    return Scene(env, with_model_as_given(env.default_params), plants, references)
+
+
+def fly_scene(scene: Scene, checkpoint: Checkpoint, arguments: argparse.Namespace) -> tuple[Outcomes, Flight]:
+    """Return what came of all flights, and the first flight step by step."""
+    env, params, plants, _ = scene
+    steps, episodes = arguments.steps, arguments.episodes
+    if plants is None and episodes == 1:
+        key, num_laps = jax.random.key(arguments.seed), arguments.laps or steps
+        flight = _fly_one(env, checkpoint, key, params, steps, num_laps)
+        flights = jax.tree.map(lambda leaf: leaf[None], flight)
+        return outcomes_of(flights, num_laps, len(env.track.gates)), flight
+    keys = start_keys(arguments.seed, episodes * (arguments.plants or 1))
+    models = None if plants is None else plants.repeated(episodes)
+    policy = (checkpoint.network, checkpoint.params)
+    outcomes = race_many(env, *policy, keys, steps, arguments.laps, params, models)
+    if plants is not None:
+        params = params.replace(model=plants.model(0))
+    return outcomes, _fly_one(env, checkpoint, keys[0], params, steps, arguments.laps)
+
+
+def make_report(
+    scene: Scene, checkpoint: Checkpoint, arguments: argparse.Namespace, outcomes: Outcomes
+) -> dict[str, Any]:
+    """Return all that is told of an evaluation, as JSON values: docs/baseline.md says what each is."""
+    plants, references = scene.plants, scene.references
+    report: dict[str, Any] = {
+        "schema": SCHEMA,
+        "package_version": flytrack_env.__version__,
+        "checkpoint": str(arguments.checkpoint),
+        "env_id": checkpoint.env_id,
+        "track": scene.env.track.name,
+        "gates_per_lap": len(scene.env.track.gates),
+        "black_box": None if plants is not None else str(arguments.black_box or SHIPPED_BLACK_BOX),
+        "seed": arguments.seed,
+        "steps_limit": arguments.steps,
+        "laps": arguments.laps,
+        "episodes": arguments.episodes,
+        **summarise(outcomes, is_limited=arguments.laps is not None),
+        "plants": None,
+        "optimal": None,
+        "time_lost_s": None,
+    }
+    if plants is not None:
+        is_complete = outcomes.is_complete().reshape(arguments.plants, arguments.episodes)
+        report["success"] |= {} if arguments.episodes == 1 else {"low": None, "high": None}
+        report["plants"] = plants.summarise(is_complete)
+    if references is not None:
+        report["optimal"] = compare(report, references)
+        if arguments.ghost:
+            report["time_lost_s"] = time_lost(outcomes, references)
+    return report
+
+
+def evaluate(arguments: argparse.Namespace) -> None:
+    """Fly, print, write; raises ValueError or OSError for what cannot be used, before anything is flown."""
+    checkpoint = load_checkpoint(arguments.checkpoint)
+    scene = set_scene(checkpoint, arguments)
+    outcomes, flight = fly_scene(scene, checkpoint, arguments)
+    report = make_report(scene, checkpoint, arguments, outcomes)
+    if arguments.episodes == 1 and arguments.plants is None:
+        print(describe(flight, float(scene.params.dt), arguments.laps))
+    if arguments.laps is not None or arguments.ghost:
+        print(describe_report(report), end="")
+    save_flown(arguments.out, flight)
+    print(f"rollout: {arguments.out}")
+    first_flight = {
+        "steps": int(np.sum(flight.is_flying)),
+        "gates": int(np.max(flight.gates_passed)),
+        "lap_times_s": lap_times(flight).tolist(),
+        "ended": reason_ended(flight, arguments.laps),
+    }
+    written = {"first_flight": first_flight, "rollout": str(arguments.out), "ghost": None}
+    if arguments.ghost:
+        path = ghost_path(arguments.out)
+        save_rollout(path, *ghost_rollout(scene.references, first_flight["steps"]))
+        written["ghost"] = str(path)
+        print(f"ghost: {path}")
+    if arguments.json is not None:
+        content = json.dumps(report | written, indent=2, allow_nan=False) + "\n"
+        write_atomically(arguments.json, content.encode())
+        print(f"json: {arguments.json}")
+
+
+def parse_arguments(parser: argparse.ArgumentParser) -> argparse.Namespace:
+    """Return the command line's arguments, checked as far as that goes without reading a file."""
+    parser.add_argument("--checkpoint", type=Path, required=True)
+    parser.add_argument("--steps", type=int, required=True, help="time limit; at 100 Hz, 2000 are 20 s")
+    parser.add_argument("--episodes", type=int, default=1, help="noisy starts, on each plant (%(default)s)")
+    parser.add_argument("--laps", type=int, help=f"to complete ({DEFAULT_LAPS}; one flight: no limit)")
+    parser.add_argument(
+        "--plants", type=int, metavar="K", help="fly K simulated plants, drawn around the checkpoint's model"
     )
+    parser.add_argument("--black-box", type=Path, help=f"file ({SHIPPED_BLACK_BOX.name}, as shipped)")
+    parser.add_argument("--track", metavar="NAME_OR_FILE", help="default: the checkpoint's")
+    parser.add_argument("--seed", type=int, default=0, help="of the noisy starts and of the plants")
+    parser.add_argument("--ghost", action="store_true", help="compare with the time-optimal flight, write it")
+    parser.add_argument("--out", type=Path, default=Path("rollout.npy"), help="of the first flight")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write all that is printed")
+    arguments = parser.parse_args()
+    if arguments.plants is not None and arguments.black_box is not None:
+        parser.error(f"--plants: found --black-box {arguments.black_box} beside it, expected one of the two")
+    is_many = arguments.episodes != 1 or arguments.plants is not None
+    if arguments.laps is None and is_many:
+        arguments.laps = DEFAULT_LAPS
+    limits = {"steps": (1, MAX_STEPS), "episodes": (1, MAX_FLIGHTS), "laps": (1, MAX_LAPS)}
+    limits |= {"plants": (1, MAX_FLIGHTS // max(arguments.episodes, 1)), "seed": (0, MAX_SEED - 1)}
+    for name, (low, high) in limits.items():
+        value = getattr(arguments, name)
+        if value is not None and not low <= value <= high:
+            parser.error(f"--{name}: found {value}, expected {low} to {high}")
+    check_files(parser, arguments.out, arguments.json)
+    return arguments
 
 
-def save_flown(path: Path, flight: Flight) -> None:
-    """Write the steps that were flown as a rollout file."""
-    is_flying = np.asarray(flight.is_flying)
-    save_rollout(path, np.asarray(flight.states)[is_flying], np.asarray(flight.actions)[is_flying])
+def check_files(parser: argparse.ArgumentParser, out: Path, json_file: Path | None) -> None:
+    """End the program, saying why, where a file could not be written."""
+    for name, path in (("--out", out), ("--json", json_file)):
+        if path is None:
+            continue
+        if path.is_dir():
+            parser.error(f"{name}: {path} is a folder, expected the path of a file")
+        nearest = next(folder for folder in path.absolute().parents if folder.exists())
+        if not nearest.is_dir():
+            parser.error(f"{name}: {path}: found a file {nearest}, expected a folder")
+    if json_file is not None and json_file.absolute() in (out.absolute(), ghost_path(out).absolute()):
+        parser.error(f"--json: found {json_file}, expected another file than the rollouts")
 
 
 def main() -> None:
-    """Parse the command line, fly, print the result, write the rollout."""
+    """Parse the command line, fly, print the result, write the files."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--checkpoint", type=Path, required=True)
-    parser.add_argument("--steps", type=int, required=True, help="at 100 Hz; 2000 are 20 s")
-    parser.add_argument("--black-box", type=Path, default=SHIPPED_BLACK_BOX)
-    parser.add_argument("--seed", type=int, default=0, help="of the noisy start pose")
-    parser.add_argument("--out", type=Path, default=Path("rollout.npy"))
-    arguments = parser.parse_args()
-    if arguments.steps < 1:
-        parser.error(f"--steps: found {arguments.steps}, expected at least 1")
-    if not 0 <= arguments.seed < MAX_SEED:
-        parser.error(f"--seed: found {arguments.seed}, expected 0 to {MAX_SEED - 1}")
-    if arguments.out.is_dir():
-        parser.error(f"--out: {arguments.out} is a folder, expected the path of a file")
+    arguments = parse_arguments(parser)
     try:
-        checkpoint = load_checkpoint(arguments.checkpoint)
-        flight = fly_on_black_box(checkpoint, arguments.black_box, arguments.steps, arguments.seed)
-        print(describe(flight, dt=blackbox.DT))
-        save_flown(arguments.out, flight)
+        evaluate(arguments)
     except (ValueError, OSError) as error:
         parser.error(str(error))
-    print(f"rollout: {arguments.out}")
 
 
 if __name__ == "__main__":

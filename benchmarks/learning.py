@@ -13,7 +13,8 @@ import jax
 
 import eval_agent
 from baselines.purejaxrl_ppo import Config
-from baselines.purejaxrl_ppo.evaluate import fly_many, score
+from baselines.purejaxrl_ppo.evaluate import race_many, start_keys
+from baselines.purejaxrl_ppo.flights import score
 from baselines.purejaxrl_ppo.train_ppo import train_policy
 from demo import NUM_EPISODES, NUM_LAPS, NUM_STEPS, identify
 from flytrack_env.files import write_atomically
@@ -31,8 +32,8 @@ def measure_seed(seed: int, black_box: Path, out: Path, config: Config) -> tuple
     checkpoint, _ = train_policy(out / f"seed{seed}", config, seed, model=out / "model.json")
     cpu_seconds = time.process_time() - started
     env = eval_agent.black_box_env(checkpoint, black_box)
-    flights = fly_many(env, checkpoint.network, checkpoint.params, seed, NUM_EPISODES, NUM_STEPS, NUM_LAPS)
-    result = score(flights, NUM_LAPS)
+    keys = start_keys(seed, NUM_EPISODES)
+    result = score(race_many(env, checkpoint.network, checkpoint.params, keys, NUM_STEPS, NUM_LAPS))
     row = (
         f"| {seed} | {result.success:.1%} | {result.gates:.2f} | {result.first_lap_s:.3f} | "
         f"{result.flying_lap_s:.3f} | {cpu_seconds:.0f} | {checkpoint.meta['seconds']:.0f} |\n"

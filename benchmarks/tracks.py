@@ -14,7 +14,8 @@ import numpy as np
 
 import flytrack_env
 from baselines.purejaxrl_ppo import Config
-from baselines.purejaxrl_ppo.evaluate import Flight, fly_many, score
+from baselines.purejaxrl_ppo.evaluate import fly_many
+from baselines.purejaxrl_ppo.flights import Outcomes, outcomes_of, score
 from baselines.purejaxrl_ppo.train_ppo import train_policy
 from flytrack_env.files import write_atomically
 from flytrack_env.state import VELOCITY
@@ -29,13 +30,9 @@ HEADER = (
 )
 
 
-def describe_ends(flight: Flight) -> str:
+def describe_ends(outcomes: Outcomes) -> str:
     """Return what ended episodes before the last lap, with how often."""
-    is_unfinished = np.asarray(flight.laps).max(axis=1) < NUM_LAPS
-    causes = flight.causes._asdict()
-    ends = {name: np.asarray(cause).any(axis=1) & is_unfinished for name, cause in causes.items()}
-    ends["time limit"] = is_unfinished & ~np.any(list(ends.values()), axis=0)
-    return ", ".join(f"{name} {end.sum()}" for name, end in ends.items() if end.any()) or "-"
+    return ", ".join(f"{name} {end.sum()}" for name, end in outcomes.ends().items() if end.any()) or "-"
 
 
 def measure_track(name: str, track: str | Path, seed: int, out: Path, config: Config) -> str:
@@ -45,12 +42,13 @@ def measure_track(name: str, track: str | Path, seed: int, out: Path, config: Co
     length, num_gates = way_length(build_course(env.track)), len(env.track.gates)
     num_steps = math.ceil(NUM_LAPS * length / SLOWEST_MEAN_SPEED / env.default_params.dt)
     flight = fly_many(env, checkpoint.network, checkpoint.params, seed, NUM_EPISODES, num_steps, NUM_LAPS)
-    result = score(flight, NUM_LAPS)
+    outcomes = outcomes_of(flight, NUM_LAPS, num_gates)
+    result = score(outcomes)
     velocities = np.asarray(flight.states)[np.asarray(flight.is_flying)][:, VELOCITY]
     return (
         f"| {name} | {num_gates} | {length:.1f} | {result.success:.1%} | {result.gates:.2f} of "
         f"{NUM_LAPS * num_gates} | {result.first_lap_s:.3f} | {result.flying_lap_s:.3f} | "
-        f"{np.linalg.norm(velocities, axis=1).max():.1f} | {describe_ends(flight)} |\n"
+        f"{np.linalg.norm(velocities, axis=1).max():.1f} | {describe_ends(outcomes)} |\n"
     )
 
 

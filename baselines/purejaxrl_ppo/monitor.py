@@ -4,37 +4,32 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
+import jax
 import numpy as np
 from tqdm import tqdm
 
 from baselines.purejaxrl_ppo.density import draw_position_density
-from baselines.purejaxrl_ppo.evaluate import Flight, fly_many, score
+from baselines.purejaxrl_ppo.evaluate import fly_many
+from baselines.purejaxrl_ppo.flights import Outcomes, outcomes_of, save_flown, score
 from baselines.purejaxrl_ppo.networks import ActorCritic
-from flytrack_env.rollout import save_rollout
 
 NUM_LAPS = 3
 NUM_STEPS = 2500  # 25 s at 100 Hz: three laps of the slowest shipped track, flown by a beginner
 EVALUATION_SEED = 20_000  # of the noisy starts: the same at every evaluation, none of a usual training seed
 
 
-def evaluation_metrics(flights: Flight) -> dict[str, float]:
+def evaluation_metrics(outcomes: Outcomes) -> dict[str, float]:
     """Return what evaluation flights show; times that there is none of are left out.
 
     success: share that completed the laps. flying_lap_s: mean; best_lap_s: shortest flying lap. ended_*:
     share that each cause ended; ended_time_limit: of those still in the air, their laps not complete.
     """
-    result = score(flights, NUM_LAPS)._asdict()
-    laps, is_completed = np.asarray(flights.laps), np.asarray(flights.lap_completed)
-    flying_s = np.asarray(flights.lap_time_s)[is_completed & (laps > 1)]
-    causes = {f"ended_{n}": np.asarray(c).any(axis=1) for n, c in flights.causes._asdict().items()}
-    is_ended = np.any(list(causes.values()), axis=0) | (laps.max(axis=1) >= NUM_LAPS)
     values = {
-        **result,
-        "laps": laps.max(axis=1).mean(),
-        "best_lap_s": flying_s.min(initial=np.inf),
-        "steps": np.asarray(flights.is_flying).sum(axis=1).mean(),
-        **{name: happened.mean() for name, happened in causes.items()},
-        "ended_time_limit": (~is_ended).mean(),
+        **score(outcomes)._asdict(),
+        "laps": outcomes.laps.mean(),
+        "best_lap_s": outcomes.flying_laps_s().min(initial=np.inf),
+        "steps": outcomes.steps.mean(),
+        **{f"ended_{name}": happened.mean() for name, happened in outcomes.ends().items()},
     }
     return {f"evaluation_{name}": float(value) for name, value in values.items() if np.isfinite(value)}
 
@@ -49,10 +44,10 @@ def evaluate_policy(
     flights = fly_many(env, network, params, EVALUATION_SEED, num_episodes, NUM_STEPS, NUM_LAPS)
     folder = out / "evaluation"
     rollout, chart = folder / f"rollout_{steps}.npy", folder / f"position_density_{steps}.png"
-    is_flying = np.asarray(flights.is_flying[0])
-    save_rollout(rollout, np.asarray(flights.states[0])[is_flying], np.asarray(flights.actions[0])[is_flying])
+    save_flown(rollout, jax.tree.map(lambda leaf: leaf[0], flights))
     draw_position_density(chart, flights.positions(), env.track)
-    return evaluation_metrics(flights), [rollout, chart]
+    outcomes = outcomes_of(flights, NUM_LAPS, len(env.track.gates))
+    return evaluation_metrics(outcomes), [rollout, chart]
 
 
 def record_flight(rollout: Path, track: Any) -> Path | None:

@@ -1,0 +1,412 @@
+"""Evaluation: many flights and single ones agree, known lap times come out, drawn plants, ghost, refusals."""
+
+import json
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import eval_agent
+from baselines.purejaxrl_ppo import Config, evaluate
+from baselines.purejaxrl_ppo.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
+from baselines.purejaxrl_ppo.evaluate import fly_many, race_many, start_keys
+from baselines.purejaxrl_ppo.flights import Flight, Outcomes, outcomes_of, score
+from baselines.purejaxrl_ppo.networks import make_network
+from baselines.purejaxrl_ppo.perturbed import (
+    PlantRanges,
+    by_thirds,
+    draw_plants,
+    perturb,
+    with_model_as_given,
+)
+from baselines.purejaxrl_ppo.resume import describe_run
+from baselines.purejaxrl_ppo.summary import distribution, share, summarise
+from benchmarks.optimal import shipped_reference
+from benchmarks.optimal.ghost import compare, ghost_rollout, shipped_references, time_lost
+from flytrack_env import FlyTrack, load_track, make, nominal_parameters, save_track
+from flytrack_env.dynamics import ModelParameters
+from flytrack_env.effects import CommandDelay, LinearDrag, QuadraticDrag, ThrustScale
+from flytrack_env.plants import Simulator
+from flytrack_env.quaternion import Scalar, Vec3
+from flytrack_env.rollout import load_rollout
+from flytrack_env.state import BATTERY, BATTERY_FULL_V, POSITION, VELOCITY, Action, Drone
+from flytrack_env.tracks import random_track
+from flytrack_env.wrappers import DomainRandomization
+from flytrack_env.wrappers.domain_randomization import sample_model
+
+ROOT = Path(__file__).parent.parent
+NUM_LAPS, NUM_STEPS, NUM_FLIGHTS = 3, 1400, 10
+TOLERANCE_S = 2e-3
+SLOWER_PER_V = 0.1
+FAILS_BELOW_V, FAILS_AT_S = 23.6, 2.0
+
+
+class OnReference(NamedTuple):
+    """State of ``Rails``: the drone and the time since the reset, s."""
+
+    drone: Drone
+    time_s: jax.Array
+
+
+class Rails:
+    """A plant that flies the time-optimal start and laps, whatever the command.
+
+    The lower its battery, the slower it is, by ``pace``; one that is low indeed falls to the ground.
+    """
+
+    def __init__(self) -> None:
+        self.references = [shipped_reference("flytrack", kind) for kind in ("standing", "flying")]
+
+    @staticmethod
+    def pace(battery_v: Any) -> Any:
+        """Return how many times longer than the optimum it takes."""
+        return 1.0 + SLOWER_PER_V * (BATTERY_FULL_V - battery_v)
+
+    def _at(self, drone: Drone, time_s: jax.Array) -> Drone:
+        standing, flying = self.references
+        own_s = time_s / self.pace(drone.battery_v)
+        lap_s = (own_s - standing.time_s) % flying.time_s
+
+        def position(reference: Any, at_s: jax.Array) -> jax.Array:
+            """Return where the reference is, (3,): straight lines between its samples."""
+            table = jnp.asarray(reference.states[:, POSITION], jnp.float32)
+            sample = jnp.clip(at_s / reference.dt_s, 0.0, len(table) - 1.001)
+            before = sample.astype(int)
+            part = sample - before
+            return (1.0 - part) * table[before] + part * table[before + 1]
+
+        is_start = own_s < standing.time_s
+        pos_w = Vec3(*jnp.where(is_start, position(standing, own_s), position(flying, lap_s)))
+        is_falling = (drone.battery_v < FAILS_BELOW_V) & (time_s > FAILS_AT_S)
+        return drone._replace(pos_w=pos_w._replace(z=jnp.where(is_falling, -1.0, pos_w.z)))
+
+    def reset(self, drone: Drone, model: ModelParameters) -> OnReference:
+        """Return the drone at the start of the rails."""
+        return OnReference(self._at(drone, jnp.float32(0.0)), jnp.float32(0.0))
+
+    def step(self, state: OnReference, command: Action, dt: Scalar, model: ModelParameters) -> OnReference:
+        """Return the drone a step further."""
+        time_s = state.time_s + dt
+        return OnReference(self._at(state.drone, time_s), time_s)
+
+    def drone(self, state: OnReference) -> Drone:
+        """Return the drone."""
+        return state.drone
+
+
+def write_checkpoint(path: Path, env_id: str = "FlyTrackRandomized-v0") -> Path:
+    """Write a policy that has learned nothing, with all that a checkpoint tells."""
+    env = make(env_id, model=nominal_parameters().with_effects(LinearDrag(0.3, 0.3, 0.1)))
+    config = Config(hidden_sizes=(8,))
+    size = env.observation_space().shape[0]
+    params = make_network(config).init(jax.random.key(0), jnp.zeros((1, size)))
+    save_checkpoint(path, params, config, describe_run(env, env_id, "flytrack", config, seed=0))
+    return path
+
+
+@pytest.fixture(scope="module")
+def checkpoint_path(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_checkpoint(tmp_path_factory.mktemp("checkpoint") / "policy.msgpack")
+
+
+@pytest.fixture(scope="module")
+def checkpoint(checkpoint_path: Path) -> Checkpoint:
+    return load_checkpoint(checkpoint_path)
+
+
+@pytest.fixture(scope="module")
+def on_rails() -> FlyTrack:
+    return FlyTrack(plant=Rails())
+
+
+@pytest.fixture(scope="module")
+def flights(on_rails: FlyTrack, checkpoint: Checkpoint) -> Flight:
+    policy = (checkpoint.network, checkpoint.params)
+    return fly_many(on_rails, *policy, 0, NUM_FLIGHTS, NUM_STEPS, NUM_LAPS)
+
+
+@pytest.fixture(scope="module")
+def raced(on_rails: FlyTrack, checkpoint: Checkpoint) -> Outcomes:
+    """The same flights, in batches, the last one not full."""
+    policy = (checkpoint.network, checkpoint.params)
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(evaluate, "BATCH", 4)
+        return race_many(on_rails, *policy, start_keys(0, NUM_FLIGHTS), NUM_STEPS, NUM_LAPS)
+
+
+@pytest.fixture(scope="module")
+def paces(flights: Flight) -> np.ndarray:
+    """How slow each flight on rails is; 0 where it falls."""
+    battery_v = np.asarray(flights.states)[:, 0, BATTERY]
+    return np.where(battery_v < FAILS_BELOW_V, 0.0, Rails.pace(battery_v))
+
+
+def assert_same(found: Outcomes, expected: Outcomes) -> None:
+    for name, values in expected._asdict().items():
+        for a, b in zip(jax.tree.leaves(getattr(found, name)), jax.tree.leaves(values), strict=True):
+            np.testing.assert_allclose(a, b, atol=1e-5, err_msg=name)
+
+
+def test_lap_times_are_those_of_the_rails(raced: Outcomes, paces: np.ndarray) -> None:
+    is_good = paces > 0.0
+    assert 0 < is_good.sum() < NUM_FLIGHTS  # else this test would see one kind only
+    np.testing.assert_array_equal(raced.is_complete(), is_good)
+    np.testing.assert_array_equal(raced.ends()["ground"], ~is_good)
+    standing, flying = (shipped_reference("flytrack", kind) for kind in ("standing", "flying"))
+    expected = paces[is_good, None] * np.array([[standing.time_s, flying.time_s, flying.time_s]])
+    np.testing.assert_allclose(raced.lap_times_s[is_good], expected, atol=TOLERANCE_S)
+    gates_s = paces[is_good, None] * standing.gate_times_s
+    np.testing.assert_allclose(raced.gate_times_s[is_good, :8], gates_s, atol=TOLERANCE_S)
+    assert np.isnan(raced.lap_times_s[~is_good]).all() and (raced.steps[~is_good] < 210).all()
+    assert score(raced).success == is_good.mean()
+
+
+def test_every_step_kept_or_not_is_the_same_flight(flights: Flight, raced: Outcomes) -> None:
+    assert NUM_FLIGHTS % 4
+    assert_same(raced, outcomes_of(flights, NUM_LAPS, 8))
+
+
+def test_time_lost_adds_up_to_the_lap(raced: Outcomes, paces: np.ndarray) -> None:
+    references = shipped_references(load_track("flytrack"), ("nominal",))
+    slow = paces[paces > 0.0].mean() - 1.0
+    compared = compare(summarise(raced, is_limited=True), references)
+    assert compared["model"] == "nominal"
+    for lap, kind in (("first_lap_s", "standing"), ("flying_lap_s", "flying")):
+        lost = [row[lap] for row in time_lost(raced, references)]
+        reference = references[kind]
+        np.testing.assert_allclose(lost, slow * np.diff(reference.gate_times_s, prepend=0.0), atol=2e-3)
+        assert sum(lost) == pytest.approx(slow * reference.time_s, abs=TOLERANCE_S)
+        assert compared[lap]["mean_percent_above"] == pytest.approx(100.0 * slow, abs=0.1)
+        assert 0.0 <= compared[lap]["min_percent_above"] < compared[lap]["mean_percent_above"]
+
+
+def test_no_laps_are_no_numbers() -> None:
+    references = shipped_references(load_track("split_s"), ("black_box", "nominal"))
+    never = np.full((2, 3), np.nan), np.full((2, 21), np.nan)
+    causes = evaluate.Causes(*(np.array([True, False]) if i == 0 else np.zeros(2, bool) for i in range(5)))
+    nothing = Outcomes(np.array([5, 9]), np.array([0, 1]), np.zeros(2, int), *never, causes)
+    summary = summarise(nothing, is_limited=True)
+    assert summary["first_lap_s"]["mean"] is None and summary["ended"]["time_limit"] == 1
+    rows = time_lost(nothing, references)
+    assert len(rows) == 7 and rows[0] == {"gate": 1, "first_lap_s": None, "flying_lap_s": None}
+    json.dumps([summary, rows, compare(summary, references)], allow_nan=False)
+
+
+def test_ghost_is_the_reference_nearest_in_time() -> None:
+    references = shipped_references(load_track("flytrack"), ("black_box",))
+    standing, flying = references["standing"], references["flying"]
+    assert standing.model_name == "black_box"
+    states, commands = ghost_rollout(references, 1200)
+    assert states.shape == (1200, 21) and commands.shape == (1200, 4)
+    np.testing.assert_array_equal(states[:300], standing.states[:300])
+    np.testing.assert_array_equal(commands[:300], standing.commands[:300])
+    # The second flying lap, a third of its time in.
+    at = round((standing.time_s + 4.0 / 3.0 * flying.time_s) / 0.01)
+    offset_s = at * 0.01 - standing.time_s - flying.time_s
+    grid_s = 0.01 * np.arange(len(flying.states))
+    expected = [np.interp(offset_s, grid_s, column) for column in flying.states[:, POSITION].T]
+    speed = np.linalg.norm(states[at, VELOCITY])
+    assert np.linalg.norm(states[at, POSITION] - expected) <= 0.5 * 0.01 * speed * 1.05
+
+
+def test_shares_have_wilsons_interval() -> None:
+    # Closed forms for none of n, z^2 / (n + z^2), and for all of n, n / (n + z^2).
+    squared = 1.959964**2
+    none, whole = share(np.zeros(10, bool)), share(np.ones(256, bool))
+    assert none["low"] == 0.0 and none["high"] == pytest.approx(squared / (10 + squared), rel=1e-5)
+    assert whole["low"] == pytest.approx(256 / (256 + squared), rel=1e-6) and whole["high"] == 1.0
+    times = distribution(np.array([3.0, 1.0, 2.0]))
+    assert times == {"number": 3, "mean": 2.0, "min": 1.0, "q05": 1.1, "q50": 2.0, "q95": 2.9}
+
+
+def test_plants_are_drawn_from_the_ranges_around_the_model() -> None:
+    known = (LinearDrag(0.4, 0.4, 0.2), CommandDelay(0.03), ThrustScale(0.9), QuadraticDrag(0.01, shared=0.0))
+    model = nominal_parameters().with_effects(*known)
+    plants = draw_plants(3, 200, model)
+    for name, bounds in PlantRanges()._asdict().items():
+        drawn = plants.drawn[name]
+        assert bounds[0] <= drawn.min() and drawn.max() <= bounds[1] and np.ptp(drawn) > 0.5 * np.ptp(bounds)
+    found = plants.models
+    np.testing.assert_allclose(found.effect("thrust_scale").factor, 0.9 * plants.drawn["thrust_scale"], 1e-6)
+    np.testing.assert_allclose(found.effect("linear_drag").d_x, np.float32(0.4))
+    assert found.effect("command_delay").delay_s.max() == np.float32(0.04)  # as late as can be
+    quadratic, wind = found.effect("quadratic_drag"), found.effect("wind")
+    assert quadratic.k_x.min() >= 0.01 and (quadratic.shared == 0.0).all()
+    np.testing.assert_allclose(np.hypot(wind.v_x, wind.v_y), plants.drawn["wind_m_s"], atol=1e-6)
+    assert (wind.v_x < 0).any() and (wind.v_y < 0).any() and not np.any(wind.v_z)
+    fewer = draw_plants(3, 5, model)
+    np.testing.assert_array_equal(fewer.models.effect("wind").v_x, wind.v_x[:5])
+    assert not np.array_equal(draw_plants(4, 5, model).drawn["wind_m_s"], fewer.drawn["wind_m_s"])
+
+
+def test_wind_pushes_through_the_drag(make_drone: Any) -> None:
+    plant, hovering = Simulator(), make_drone((0.0, 0.0, 5.0))
+
+    @jax.jit
+    def push(drag: jax.Array) -> jax.Array:
+        model = perturb(nominal_parameters(), jnp.stack([drag] * 3), 1.0, jnp.array([0.0, 3.0]), 0.0)
+        after = plant.step(plant.reset(hovering, model), Action(0.0, 0.0, 0.0, 0.0), 0.01, model)
+        return after.drone.vel_w.y / 0.01
+
+    assert push(0.02) == pytest.approx(0.02 * 3.0**2, rel=1e-3)
+    assert push(0.0) == pytest.approx(0.0, abs=1e-6)
+
+
+def test_what_breaks_the_policy_shows_in_its_thirds() -> None:
+    drawn = draw_plants(0, 90, nominal_parameters()).drawn
+    is_good = drawn["command_delay_s"] < np.quantile(drawn["command_delay_s"], 2.0 / 3.0)
+    rows = by_thirds(drawn, np.stack([is_good, np.ones(90, bool)], axis=1))
+    shares = {name: [r["plants"]["share"] for r in rows if r["quantity"] == name] for name in drawn}
+    assert shares["command_delay_s"] == [1.0, 1.0, 0.0]
+    assert all(min(shares[name]) > 0.3 for name in set(drawn) - {"command_delay_s"})
+    assert {row["flights_share"] for row in rows if row["quantity"] == "command_delay_s"} == {1.0, 0.5}
+    assert len(by_thirds(drawn, np.ones((90, 1), bool))) == 12
+    assert len(by_thirds({"wind_m_s": np.ones(1)}, np.ones((1, 1), bool))) == 1
+
+
+def test_ids_that_draw_models_fly_the_one_that_is_given(checkpoint: Checkpoint) -> None:
+    env = eval_agent.simulated_env(checkpoint)
+    params = with_model_as_given(env.default_params)
+    env.check_params(params)
+    ranges, given = params.wrappers[DomainRandomization.key], env.default_params.model
+    found = sample_model(jnp.uint32(5), given, ranges)
+    assert type(found.effects[0]) is LinearDrag and len(found.effects) == 1
+    for a, b in zip(
+        jax.tree.leaves(found._replace(tau=np.stack(found.tau))), jax.tree.leaves(given), strict=True
+    ):
+        np.testing.assert_allclose(a, b, rtol=1e-6)
+    plain = make("FlyTrackNoisy-v0").default_params
+    assert with_model_as_given(plain) is plain
+
+
+def run(monkeypatch: pytest.MonkeyPatch, *arguments: Any) -> None:
+    monkeypatch.setattr(sys, "argv", ["eval_agent.py", *map(str, arguments)])
+    eval_agent.main()
+
+
+@pytest.mark.parametrize("flown_by", ["black box", "plants"])
+def test_command_flies_many(
+    flown_by: str,
+    checkpoint_path: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    flights: Flight,
+) -> None:
+    flown = []
+    fly_scene = eval_agent.fly_scene
+    monkeypatch.setattr(eval_agent, "fly_scene", lambda *a: flown.append(fly_scene(*a)) or flown[0])
+    if flown_by == "black box":  # one program less to compile: single flights are those of test_commands
+        monkeypatch.setattr(eval_agent, "_fly_one", lambda *_: jax.tree.map(lambda leaf: leaf[0], flights))
+    out, file = tmp_path / "flight.npy", tmp_path / "new" / "report.json"
+    more = ["--episodes", 2, "--plants", 3] if flown_by == "plants" else ["--episodes", 6, "--laps", 1]
+    where = ["--checkpoint", checkpoint_path, "--out", out, "--json", file]
+    run(monkeypatch, *where, "--steps", 120, "--track", "split_s", "--ghost", *more)
+    outcomes, flight = flown[0]
+    report, text = json.loads(file.read_text()), capsys.readouterr().out
+    assert report["schema"] == 1 and report["flights"] == 6 and report["track"] == "split_s"
+    assert report["steps"] == outcomes.steps.sum() and report["success"]["of"] == 6
+    assert "track split_s" in text and f"complete {report['laps']} laps: 0 of 6" in text
+    states, _ = load_rollout(out)
+    assert len(states) == report["first_flight"]["steps"] == np.sum(flight.is_flying)
+    assert len(load_rollout(report["ghost"])[0]) == len(states)
+    if flown_by == "plants":
+        single = outcomes_of(jax.tree.map(lambda leaf: leaf[None], flight), 3, 7)
+        assert_same(jax.tree.map(lambda leaf: leaf[:1], outcomes), single)
+        assert "in the simulator, not on a black box" in text and report["black_box"] is None
+        assert report["optimal"]["model"] == "nominal" and report["success"]["low"] is None
+        assert report["plants"]["success"]["of"] == 3 and len(report["plants"]["by_thirds"]) == 12
+        assert len(set(outcomes.steps[::2].tolist())) > 1  # the plants differ
+    else:
+        assert report["optimal"]["model"] == "black_box" and report["plants"] is None
+        assert report["success"]["high"] == pytest.approx(0.390334, abs=1e-5)  # Wilson's, of none of 6
+
+
+def keys_of(value: Any) -> set[str]:
+    """Return every name of JSON values, however deep."""
+    if isinstance(value, dict):
+        return set(value) | {name for part in value.values() for name in keys_of(part)}
+    return {name for part in value for name in keys_of(part)} if isinstance(value, list) else set()
+
+
+def test_single_flight_is_told_as_json_and_docs_name_every_key(
+    checkpoint_path: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    flights: Flight,
+    raced: Outcomes,
+) -> None:
+    index = int(np.argmax(raced.is_complete()))
+    monkeypatch.setattr(eval_agent, "_fly_one", lambda *_: jax.tree.map(lambda leaf: leaf[index], flights))
+    out, file = tmp_path / "flight.npy", tmp_path / "report.json"
+    where = ["--checkpoint", checkpoint_path, "--out", out, "--json", file, "--steps", NUM_STEPS]
+    run(monkeypatch, *where)
+    text, report = capsys.readouterr().out, json.loads(file.read_text())
+    assert "interval" not in text and report["success"] is None and report["ghost"] is None
+    np.testing.assert_allclose(report["first_flight"]["lap_times_s"], raced.lap_times_s[index], atol=1e-5)
+    assert [line.split(":")[0] for line in text.splitlines()][:4] == ["flown", "gates", "lap times", "ended"]
+    plants = draw_plants(0, 3, nominal_parameters()).summarise(np.ones((3, 1), bool))
+    text = (ROOT / "docs" / "baseline.md").read_text()
+    missing = {name for name in keys_of({**report, "plants": plants}) if f"`{name}`" not in text}
+    assert not missing
+
+
+def make_bad_files(folder: Path) -> None:
+    """Write what is refused: a policy of before the model was told, tracks without a reference."""
+    old = load_checkpoint(write_checkpoint(folder / "policy.msgpack"))
+    meta = {name: value for name, value in old.meta.items() if name != "model"}
+    save_checkpoint(folder / "no_model.msgpack", old.params, old.config, meta)
+    save_track(folder / "random.toml", random_track(0))
+    moved = load_track("flytrack")
+    moved = replace(moved, start_position=(moved.start_position[0] + 0.5, *moved.start_position[1:]))
+    save_track(folder / "moved.toml", moved)
+    (folder / "file").write_text("")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "messages"),
+    [
+        (["--episodes", "0"], ["--episodes: found 0", "expected 1 to"]),
+        (["--episodes", "2000000"], ["--episodes: found 2000000"]),
+        (["--plants", "0"], ["--plants: found 0"]),
+        (["--plants", "2000", "--episodes", "1000"], ["--plants: found 2000", "expected 1 to 100"]),
+        (["--plants", "2", "--black-box", "any.bin"], ["--plants", "--black-box any.bin", "one of the two"]),
+        (["--plants", "2", "--checkpoint", "no_model.msgpack"], ["model", "found none"]),
+        (["--laps", "0"], ["--laps: found 0"]),
+        (["--steps", "10000000"], ["--steps: found 10000000"]),
+        (["--seed", "-1"], ["--seed: found -1"]),
+        (["--track", "nowhere"], ["nowhere", "flytrack"]),
+        (["--track", "random.toml", "--ghost"], ["found no 'random", "expected one of", "flytrack_nominal"]),
+        (["--track", "moved.toml", "--ghost"], ["flytrack", "another track of that name"]),
+        (["--out", "."], ["--out: . is a folder"]),
+        (["--json", "file/report.json"], ["--json", "found a file", "expected a folder"]),
+        (["--json", "rollout_ghost.npy"], ["--json", "another file than the rollouts"]),
+        (["--checkpoint", "file"], ["file", "not a checkpoint"]),
+    ],
+)
+def test_command_refuses_before_it_flies(
+    arguments: list[str],
+    messages: list[str],
+    bad_files: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(bad_files)
+    monkeypatch.setattr(eval_agent, "fly_scene", lambda *_: pytest.fail("it flew"))
+    with pytest.raises(SystemExit) as ended:
+        run(monkeypatch, "--checkpoint", "policy.msgpack", "--steps", "5", *arguments)
+    said = capsys.readouterr().err
+    assert ended.value.code == 2 and all(message in said for message in messages), said
+
+
+@pytest.fixture(scope="module")
+def bad_files(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("bad")
+    make_bad_files(folder)
+    return folder
