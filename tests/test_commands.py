@@ -11,7 +11,7 @@ import pytest
 import demo
 import eval_agent
 from baselines.purejaxrl_ppo import Config
-from baselines.purejaxrl_ppo.density import draw_position_density
+from baselines.purejaxrl_ppo.density import count_positions, draw_position_density
 from baselines.purejaxrl_ppo.train_ppo import train_policy
 from flytrack_env import load_model, load_track
 from flytrack_env.rollout import load_rollout
@@ -108,7 +108,11 @@ def test_demo_refuses_before_any_work(tmp_path, monkeypatch, capsys):
 
 
 def test_density_counts_positions_in_bins(tmp_path):
-    positions = np.tile([[10.0, 10.0, 1.0]], (50, 1))
+    positions = np.array([[10.02, 10.03, 1.0]] * 50 + [[10.02, 10.13, 2.0]] * 7 + [[1e3, 0.0, 1.0]])
+    density, x_edges, y_edges = count_positions(positions, load_track("flytrack"))
+    assert np.allclose(np.diff(x_edges), 0.1) and np.allclose(np.diff(y_edges), 0.1)
+    column, row = np.searchsorted(x_edges, 10.02) - 1, np.searchsorted(y_edges, 10.03) - 1
+    assert (density[column, row], density[column, row + 1], density.sum()) == (50, 7, 57)
     draw_position_density(tmp_path / "density.png", positions, load_track("flytrack"))
     assert (tmp_path / "density.png").read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"
 

@@ -15,6 +15,7 @@ from flytrack_env.tracks import Track, build_course
 BIN_M = 0.1
 MARGIN_M = 3.0
 ARROW_M = 1.5
+AXES, SCALE = (0.08, 0.06, 0.76, 0.89), (0.86, 0.15, 0.03, 0.7)  # left, bottom, width, height of the figure
 
 
 def draw_gates(axes: Axes, track: Track) -> None:
@@ -37,25 +38,35 @@ def draw_gates(axes: Axes, track: Track) -> None:
         axes.text(*label, str(index + 1), color="tab:red", ha="center", va="center")
 
 
+def count_positions(positions: np.ndarray, track: Track) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return how many positions lie in each bin of 0.1 m x 0.1 m, (num_x, num_y), and the edges, m.
+
+    positions: (num_samples, 3), world, m. The bins cover gates and start and some way around them.
+    """
+    corners = np.array([gate.position[:2] for gate in track.gates] + [track.start_position[:2]])
+    low, high = corners.min(axis=0) - MARGIN_M, corners.max(axis=0) + MARGIN_M
+    edges = [np.arange(a, b + BIN_M, BIN_M) for a, b in zip(low, high, strict=True)]
+    return np.histogram2d(positions[:, 0], positions[:, 1], bins=edges)
+
+
 def draw_position_density(path: str | Path, positions: np.ndarray, track: Track) -> None:
     """Write a PNG heat map of x-y positions, (num_samples, 3) m, in bins of 0.1 m x 0.1 m.
 
     The colour is the number of samples (100 a second) per bin, on a logarithmic scale.
     """
-    corners = np.array([gate.position[:2] for gate in track.gates] + [track.start_position[:2]])
-    low, high = corners.min(axis=0) - MARGIN_M, corners.max(axis=0) + MARGIN_M
-    edges = [np.arange(a, b + BIN_M, BIN_M) for a, b in zip(low, high, strict=True)]
-    density, *_ = np.histogram2d(positions[:, 0], positions[:, 1], bins=edges)
-    figure = Figure(figsize=(8, 9), layout="constrained")
-    axes = figure.subplots()
+    density, *edges = count_positions(positions, track)
+    figure = Figure(figsize=(8, 9))  # placed by hand: a layout engine draws everything twice
+    axes, scale = figure.add_axes(AXES), figure.add_axes(SCALE)
     axes.set_facecolor(matplotlib.colormaps["viridis"](0.0))
-    image = axes.pcolormesh(
-        *edges,
+    image = axes.imshow(
         np.ma.masked_equal(density.T, 0),
+        extent=(edges[0][0], edges[0][-1], edges[1][0], edges[1][-1]),
+        origin="lower",
+        interpolation="none",
         cmap="viridis",
         norm=LogNorm(vmin=1, vmax=max(density.max(), 10)),
     )
-    figure.colorbar(image, ax=axes, label="samples per 0.1 m x 0.1 m (100 Hz)", shrink=0.8)
+    figure.colorbar(image, cax=scale, label="samples per 0.1 m x 0.1 m (100 Hz)")
     draw_gates(axes, track)
     axes.plot(*track.start_position[:2], "o", color="white", markersize=5)
     axes.text(track.start_position[0], track.start_position[1] - 0.8, "start", color="white")
