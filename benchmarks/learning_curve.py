@@ -1,0 +1,141 @@
+"""How fast racing is learnt from scratch: ``python -m benchmarks.learning_curve [--seeds 5]``.
+
+Trains the default recipe, or another by the flags of training, on FlyTrack-v0, one seed after the other, and
+every half a million environment steps flies 256 noisy starts over 3 laps in the simulator. What counts is
+from when on 95 % of them finish and do so at every later evaluation. CPU seconds are those of training
+alone, without compilation and evaluations. Writes a page and a chart.
+"""
+
+import argparse
+import io
+import time
+from pathlib import Path
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from matplotlib.figure import Figure
+from tqdm import tqdm
+
+from baselines.purejaxrl_ppo import Config
+from baselines.purejaxrl_ppo.config import add_flags, settings_of
+from baselines.purejaxrl_ppo.evaluate import race_many, start_keys
+from baselines.purejaxrl_ppo.flights import score
+from baselines.purejaxrl_ppo.training import Trainer, is_due
+from benchmarks.env_speed import cpu_name, pin_to_one_core, versions
+from flytrack_env.files import write_atomically
+
+TARGET_SUCCESS = 0.95
+AIM_STEPS = 8_000_000
+EVERY = 500_000  # environment steps
+NUM_EPISODES, NUM_LAPS, NUM_STEPS = 256, 3, 2500
+EVALUATION_SEED = 30_000
+HEADER = (
+    "| seed | 95 % held from (M steps) | CPU s until then | CPU s of the whole run | success at the end | "
+    "first lap (s) | flying lap (s) |\n|---|---|---|---|---|---|---|\n"
+)
+
+
+class Point(NamedTuple):
+    """One evaluation: environment steps and CPU seconds of training so far, and how it flies."""
+
+    steps: int
+    cpu_s: float
+    success: float
+    first_lap_s: float
+    flying_lap_s: float
+
+
+def evaluate(trainer: Trainer, policy_params: object, steps: int, cpu_s: float) -> Point:
+    """Return how a policy flies noisy starts."""
+    keys = start_keys(EVALUATION_SEED, NUM_EPISODES)
+    result = score(race_many(trainer.env, trainer.network, policy_params, keys, NUM_STEPS, NUM_LAPS))
+    return Point(steps, cpu_s, result.success, result.first_lap_s, result.flying_lap_s)
+
+
+def train(trainer: Trainer, seed: int) -> list[Point]:
+    """Train one seed; return its evaluations."""
+    config = trainer.config
+    runner = trainer.start(jax.random.key(seed))
+    trainer.chunk(runner, jnp.int32(0))  # compiles
+    points, cpu_s = [], 0.0
+    for update in tqdm(range(1, config.num_updates + 1), desc=f"seed {seed}"):
+        started_s = time.process_time()
+        runner, _ = jax.block_until_ready(trainer.chunk(runner, jnp.int32(1)))
+        cpu_s += time.process_time() - started_s
+        if is_due(update, EVERY, config.batch_size) or update == config.num_updates:
+            points.append(evaluate(trainer, runner.train_state.params, update * config.batch_size, cpu_s))
+    return points
+
+
+def held_from(points: list[Point]) -> Point | None:
+    """Return the first evaluation from which on the target is met at every one, to the end; None: never."""
+    missed = [index for index, point in enumerate(points) if point.success < TARGET_SUCCESS]
+    first = missed[-1] + 1 if missed else 0
+    return points[first] if first < len(points) else None
+
+
+def row_of(seed: int, points: list[Point]) -> str:
+    """Return a seed's row of the table."""
+    held, last = held_from(points), points[-1]
+    since = ("never", "") if held is None else (f"{held.steps / 1e6:.2f}", f"{held.cpu_s:.1f}")
+    return (
+        f"| {seed} | {since[0]} | {since[1]} | {last.cpu_s:.1f} | {last.success:.1%} | "
+        f"{last.first_lap_s:.3f} | {last.flying_lap_s:.3f} |\n"
+    )
+
+
+def draw(path: Path, curves: dict[int, list[Point]]) -> None:
+    """Write a PNG of success and flying lap over environment steps, a line a seed."""
+    figure = Figure(figsize=(8, 6), layout="constrained")
+    upper, lower = figure.subplots(2, 1, sharex=True)
+    for seed, points in curves.items():
+        steps = np.array([point.steps for point in points]) / 1e6
+        upper.plot(steps, [100 * point.success for point in points], marker="o", label=f"seed {seed}")
+        lower.plot(steps, [point.flying_lap_s for point in points], marker="o")
+    upper.axhline(100 * TARGET_SUCCESS, color="0.5", linestyle=":")
+    upper.set(ylabel=f"{NUM_LAPS} laps completed (%)", title="FlyTrack-v0 from scratch")
+    upper.legend()
+    lower.set(xlabel="environment steps (millions)", ylabel="mean flying lap (s)")
+    content = io.BytesIO()
+    figure.savefig(content, format="png", dpi=120)
+    write_atomically(path, content.getvalue())
+
+
+def main() -> None:
+    """Measure every seed, print and write page and chart; exit 1 if a seed never holds the target."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--seeds", type=int, default=5)
+    parser.add_argument("--out", type=Path, default=Path("docs/results/learning_curve.md"))
+    add_flags(parser)
+    arguments = parser.parse_args()
+    pinned = pin_to_one_core()
+    settings = {"total_timesteps": AIM_STEPS, **settings_of(arguments)}
+    trainer = Trainer(Config(**settings))
+    evaluate(trainer, trainer.start(jax.random.key(0)).train_state.params, 0, 0.0)  # compiles
+    curves, rows = {}, []
+    for seed in range(arguments.seeds):
+        curves[seed] = train(trainer, seed)
+        rows.append(row_of(seed, curves[seed]))
+        print(rows[-1], end="", flush=True)
+    chart = arguments.out.with_suffix(".png")
+    draw(chart, curves)
+    num_held = sum(held_from(points) is not None for points in curves.values())
+    text = (
+        "# Learning to race from scratch\n\n"
+        f"`python -m benchmarks.learning_curve --seeds {arguments.seeds}` with "
+        f"{', '.join(f'{name} {value:g}' for name, value in settings.items())}, the rest as it is by default, "
+        f"on FlyTrack-v0. Every {EVERY / 1e6:g} M environment steps {NUM_EPISODES} noisy starts, {NUM_LAPS} "
+        "laps, in the simulator. CPU seconds of training alone, without compilation and evaluations. Seeds "
+        f"that hold {TARGET_SUCCESS:.0%} to the end of the run: "
+        f"**{num_held} of {len(curves)}**.\n\n" + HEADER + "".join(rows) + f"\n![curves]({chart.name})\n\n"
+        f"{cpu_name()}, {pinned}; {', '.join(f'{name} {number}' for name, number in versions().items())}.\n"
+    )
+    write_atomically(arguments.out, text.encode())
+    if num_held < len(curves):
+        raise SystemExit(1)
+
+
+if __name__ == "__main__":
+    main()
