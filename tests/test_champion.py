@@ -1,0 +1,43 @@
+"""The shipped champion: a policy alone that races on the shipped black box near the time-optimal lap."""
+
+import tomllib
+from pathlib import Path
+
+import baselines.purejaxrl_ppo
+import eval_agent
+from baselines.purejaxrl_ppo import load_checkpoint
+from baselines.purejaxrl_ppo.evaluate import race_many, start_keys
+from baselines.purejaxrl_ppo.flights import score
+from benchmarks.champion import AIM, CHAMPION, MODEL
+from benchmarks.optimal import shipped_reference
+from benchmarks.optimal.reference import model_digest
+from flytrack_env import load_model
+from flytrack_env.model_file import model_from_json
+
+MOST_BYTES = 100_000
+NUM_FLIGHTS, NUM_STEPS, NUM_LAPS = 32, 2500, 3
+
+
+def test_champion_races_on_the_black_box_near_the_optimum():
+    champion = load_checkpoint(CHAMPION)
+    env = eval_agent.black_box_env(champion, eval_agent.SHIPPED_BLACK_BOX)
+    keys = start_keys(7, NUM_FLIGHTS)
+    result = score(race_many(env, champion.network, champion.params, keys, NUM_STEPS, NUM_LAPS))
+    optimum = shipped_reference("flytrack", "flying", "black_box")
+    assert result.success == 1.0
+    assert optimum.time_s < result.flying_lap_s <= AIM * optimum.time_s
+
+
+def test_champion_is_a_small_policy_of_the_model_of_its_reference():
+    champion = load_checkpoint(CHAMPION)
+    assert champion.training is None and CHAMPION.stat().st_size < MOST_BYTES
+    model = model_from_json(champion.meta["model"], "champion")
+    assert model_digest(model) == model_digest(load_model(MODEL))
+    assert model_digest(model) == model_digest(shipped_reference("flytrack", "flying", "black_box").model)
+
+
+def test_champion_is_part_of_the_package():
+    pyproject = tomllib.loads((Path(eval_agent.__file__).parent / "pyproject.toml").read_text())
+    package = Path(baselines.purejaxrl_ppo.__file__).parent
+    patterns = pyproject["tool"]["setuptools"]["package-data"]["baselines.purejaxrl_ppo"]
+    assert CHAMPION in [path for pattern in patterns for path in package.glob(pattern)]
