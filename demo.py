@@ -96,7 +96,7 @@ def run(arguments: argparse.Namespace) -> None:
     print("4/4 draw")
     states, actions = load_rollout(out / "rollout.npy")
     track = load_track(checkpoint.track)
-    draw_position_density(out / "position_density.png", flights.positions(), track)
+    draw_position_density(out / "position_density.png", flights.positions(), track, NUM_EPISODES)
     visualize_state_action_sequence(
         list(zip(states, actions, strict=True)), track.rows(), str(out / "rollout.rrd")
     )

@@ -113,7 +113,7 @@ def test_density_counts_positions_in_bins(tmp_path):
     assert np.allclose(np.diff(x_edges), 0.1) and np.allclose(np.diff(y_edges), 0.1)
     column, row = np.searchsorted(x_edges, 10.02) - 1, np.searchsorted(y_edges, 10.03) - 1
     assert (density[column, row], density[column, row + 1], density.sum()) == (50, 7, 57)
-    draw_position_density(tmp_path / "density.png", positions, load_track("flytrack"))
+    draw_position_density(tmp_path / "density.png", positions, load_track("flytrack"), 4)
     assert (tmp_path / "density.png").read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"
 
 

@@ -15,6 +15,8 @@ from flytrack_env.tracks import Track, build_course
 BIN_M = 0.1
 MARGIN_M = 3.0
 ARROW_M = 1.5
+SAMPLE_MS = 10.0
+LIMITS_MS = (0.1, 100.0)  # a few of many flights, to all of them on one line, lap after lap
 AXES, SCALE = (0.08, 0.06, 0.76, 0.89), (0.86, 0.15, 0.03, 0.7)  # left, bottom, width, height of the figure
 
 
@@ -49,28 +51,34 @@ def count_positions(positions: np.ndarray, track: Track) -> tuple[np.ndarray, np
     return np.histogram2d(positions[:, 0], positions[:, 1], bins=edges)
 
 
-def draw_position_density(path: str | Path, positions: np.ndarray, track: Track) -> None:
-    """Write a PNG heat map of x-y positions, (num_samples, 3) m, in bins of 0.1 m x 0.1 m.
+def draw_position_density(
+    path: str | Path, positions: np.ndarray, track: Track, num_flights: int, label: str = ""
+) -> None:
+    """Write a PNG heat map of x-y positions, (num_samples, 3) m at 100 Hz, in bins of 0.1 m x 0.1 m.
 
-    The colour is the number of samples (100 a second) per bin, on a logarithmic scale.
+    The colour is the time that a flight spends in a bin, ms, on a logarithmic scale that is the same for all
+    charts, so that those of one run can be compared. label: what stands beside the track's name.
     """
-    density, *edges = count_positions(positions, track)
+    counts, *edges = count_positions(positions, track)
     figure = Figure(figsize=(8, 9))  # placed by hand: a layout engine draws everything twice
     axes, scale = figure.add_axes(AXES), figure.add_axes(SCALE)
     axes.set_facecolor(matplotlib.colormaps["viridis"](0.0))
     image = axes.imshow(
-        np.ma.masked_equal(density.T, 0),
+        np.ma.masked_equal(counts.T, 0) * SAMPLE_MS / num_flights,
         extent=(edges[0][0], edges[0][-1], edges[1][0], edges[1][-1]),
         origin="lower",
         interpolation="none",
         cmap="viridis",
-        norm=LogNorm(vmin=1, vmax=max(density.max(), 10)),
+        norm=LogNorm(*LIMITS_MS),
     )
-    figure.colorbar(image, cax=scale, label="samples per 0.1 m x 0.1 m (100 Hz)")
+    figure.colorbar(image, cax=scale, label="time per flight in 0.1 m x 0.1 m (ms)")
     draw_gates(axes, track)
     axes.plot(*track.start_position[:2], "o", color="white", markersize=5)
     axes.text(track.start_position[0], track.start_position[1] - 0.8, "start", color="white")
-    axes.set(xlabel="x (m)", ylabel="y (m)", aspect="equal", title=f"Position density: {track.name}")
+    outside = 1.0 - counts.sum() / max(len(positions), 1)
+    parts = (track.name, label, f"{outside:.1%} of the time outside the chart" if outside > 0.0 else "")
+    axes.set(xlabel="x (m)", ylabel="y (m)", aspect="equal")
+    axes.set_title("Position density: " + ", ".join(filter(None, parts)))
     content = io.BytesIO()
     figure.savefig(content, format="png", dpi=120)
     write_atomically(path, content.getvalue())

@@ -45,7 +45,8 @@ def evaluate_policy(
     folder = out / "evaluation"
     rollout, chart = folder / f"rollout_{steps}.npy", folder / f"position_density_{steps}.png"
     save_flown(rollout, jax.tree.map(lambda leaf: leaf[0], flights))
-    draw_position_density(chart, flights.positions(), env.track)
+    label = f"{steps:,} training steps"
+    draw_position_density(chart, flights.positions(), env.track, num_episodes, label)
     outcomes = outcomes_of(flights, NUM_LAPS, len(env.track.gates))
     return evaluation_metrics(outcomes), [rollout, chart]
 
