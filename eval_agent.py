@@ -7,6 +7,7 @@ plain numeric array (T, 25) = [x 21 | u 4]. What is printed and stored: docs/bas
 
 import argparse
 import json
+import os
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -219,7 +220,7 @@ def evaluate(arguments: argparse.Namespace) -> None:
 
 def parse_arguments(parser: argparse.ArgumentParser) -> argparse.Namespace:
     """Return the command line's arguments, checked as far as that goes without reading a file."""
-    parser.add_argument("--checkpoint", type=Path, required=True)
+    parser.add_argument("--checkpoint", type=Path, required=True, help="of train_ppo: final.msgpack")
     parser.add_argument("--steps", type=int, required=True, help="time limit; at 100 Hz, 2000 are 20 s")
     parser.add_argument("--episodes", type=int, default=1, help="noisy starts, on each plant (%(default)s)")
     parser.add_argument("--laps", type=int, help=f"to complete ({DEFAULT_LAPS}; one flight: no limit)")
@@ -230,7 +231,9 @@ def parse_arguments(parser: argparse.ArgumentParser) -> argparse.Namespace:
     parser.add_argument("--track", metavar="NAME_OR_FILE", help="default: the checkpoint's")
     parser.add_argument("--seed", type=int, default=0, help="of the noisy starts and of the plants")
     parser.add_argument("--ghost", action="store_true", help="compare with the time-optimal flight, write it")
-    parser.add_argument("--out", type=Path, default=Path("rollout.npy"), help="of the first flight")
+    parser.add_argument(
+        "--out", type=Path, default=Path("rollout.npy"), help="rollout of the first flight (%(default)s)"
+    )
     parser.add_argument("--json", type=Path, metavar="FILE", help="write all that is printed")
     arguments = parser.parse_args()
     if arguments.plants is not None and arguments.black_box is not None:
@@ -244,20 +247,26 @@ def parse_arguments(parser: argparse.ArgumentParser) -> argparse.Namespace:
         value = getattr(arguments, name)
         if value is not None and not low <= value <= high:
             parser.error(f"--{name}: found {value}, expected {low} to {high}")
-    check_files(parser, arguments.out, arguments.json)
+    check_files(parser, arguments)
     return arguments
 
 
-def check_files(parser: argparse.ArgumentParser, out: Path, json_file: Path | None) -> None:
-    """End the program, saying why, where a file could not be written."""
+def check_files(parser: argparse.ArgumentParser, arguments: argparse.Namespace) -> None:
+    """End the program, saying why, where a file could not be written, or would replace one that is read."""
+    out, json_file = arguments.out, arguments.json
+    read = {path.resolve() for path in (arguments.checkpoint, arguments.black_box) if path is not None}
     for name, path in (("--out", out), ("--json", json_file)):
         if path is None:
             continue
+        if path.resolve() in read:
+            parser.error(f"{name}: found {path}, which is read, expected another file")
         if path.is_dir():
             parser.error(f"{name}: {path} is a folder, expected the path of a file")
         nearest = next(folder for folder in path.absolute().parents if folder.exists())
         if not nearest.is_dir():
             parser.error(f"{name}: {path}: found a file {nearest}, expected a folder")
+        if not os.access(nearest, os.W_OK):
+            parser.error(f"{name}: {path}: found no permission to write in {nearest}")
     if json_file is not None and json_file.absolute() in (out.absolute(), ghost_path(out).absolute()):
         parser.error(f"--json: found {json_file}, expected another file than the rollouts")
 

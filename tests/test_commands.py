@@ -5,15 +5,17 @@ import subprocess
 import sys
 from pathlib import Path
 
+import jax
 import numpy as np
 import pytest
 
 import demo
 import eval_agent
-from baselines.purejaxrl_ppo import Config
+from baselines.purejaxrl_ppo import Config, load_checkpoint
 from baselines.purejaxrl_ppo.density import count_positions, draw_position_density
 from baselines.purejaxrl_ppo.train_ppo import train_policy
-from flytrack_env import load_model, load_track
+from benchmarks.champion import CHAMPION
+from flytrack_env import blackbox, load_model, load_track
 from flytrack_env.rollout import load_rollout
 
 ROOT = Path(__file__).parent.parent
@@ -38,8 +40,10 @@ def test_eval_agent_writes_the_rollout(checkpoint_path, tmp_path):
     assert "gates: 0" in done.stdout and "ended:" in done.stdout
     states, actions = load_rollout(out)
     assert np.load(out).shape == (len(states), 25) and 1 <= len(states) <= 50
-    # Row after row is the black box: the applied action lags behind the command.
-    assert np.abs(actions).max() <= 1.0
+    # Row after row is what the black box makes of the row before.
+    step = jax.jit(blackbox.load(eval_agent.SHIPPED_BLACK_BOX).step_vector)
+    for before, action, after in zip(states[:-1], actions[:-1], states[1:], strict=True):
+        np.testing.assert_allclose(step(before, action), after, atol=1e-5)
     np.testing.assert_allclose(states[0, :2], [18.6, 2.0], atol=0.31)
 
 
@@ -117,8 +121,11 @@ def test_density_counts_positions_in_bins(tmp_path):
     assert (tmp_path / "density.png").read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"
 
 
-def test_lap_times_and_reason_of_a_flight(checkpoint_path):
-    checkpoint = eval_agent.load_checkpoint(checkpoint_path)
-    flight = eval_agent.fly_on_black_box(checkpoint, eval_agent.SHIPPED_BLACK_BOX, 20, seed=1)
+def test_lap_times_and_reason_of_a_flight():
+    champion = load_checkpoint(CHAMPION)
+    flight = eval_agent.fly_on_black_box(champion, eval_agent.SHIPPED_BLACK_BOX, 850, seed=1)
+    first_s, second_s = eval_agent.lap_times(flight)
+    crossings_s = np.flatnonzero(flight.lap_completed) * blackbox.DT
+    np.testing.assert_allclose([first_s, first_s + second_s], crossings_s, atol=blackbox.DT)
     assert eval_agent.reason_ended(flight) == "all steps flown"
-    assert eval_agent.lap_times(flight).size == 0
+    assert eval_agent.reason_ended(flight, 2) == "laps complete"

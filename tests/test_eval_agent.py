@@ -385,6 +385,8 @@ def make_bad_files(folder: Path) -> None:
         (["--track", "random.toml", "--ghost"], ["found no 'random", "expected one of", "flytrack_nominal"]),
         (["--track", "moved.toml", "--ghost"], ["flytrack", "another track of that name"]),
         (["--out", "."], ["--out: . is a folder"]),
+        (["--out", "policy.msgpack"], ["--out: found policy.msgpack, which is read"]),
+        (["--out", "locked/rollout.npy"], ["--out: locked/rollout.npy", "no permission to write"]),
         (["--json", "file/report.json"], ["--json", "found a file", "expected a folder"]),
         (["--json", "rollout_ghost.npy"], ["--json", "another file than the rollouts"]),
         (["--checkpoint", "file"], ["file", "not a checkpoint"]),
@@ -398,6 +400,8 @@ def test_command_refuses_before_it_flies(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     monkeypatch.chdir(bad_files)
+    # Whoever runs the tests as root may write anywhere.
+    monkeypatch.setattr(eval_agent.os, "access", lambda path, mode: Path(path).name != "locked")
     monkeypatch.setattr(eval_agent, "fly_scene", lambda *_: pytest.fail("it flew"))
     with pytest.raises(SystemExit) as ended:
         run(monkeypatch, "--checkpoint", "policy.msgpack", "--steps", "5", *arguments)
@@ -409,4 +413,5 @@ def test_command_refuses_before_it_flies(
 def bad_files(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("bad")
     make_bad_files(folder)
+    (folder / "locked").mkdir()
     return folder
