@@ -33,7 +33,7 @@ def measure(trainer: Trainer, options: Options, is_tracked: bool) -> float:
 
 
 def main() -> None:
-    """Measure in turns, print and write the table."""
+    """Measure in turns, print and write the table; exit 1 if an aim is missed."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--total-timesteps", type=float, default=Config.total_timesteps)
     parser.add_argument("--repeats", type=int, default=1)
@@ -66,6 +66,8 @@ def main() -> None:
     )
     write_atomically(arguments.out, text.encode())
     print(text)
+    if watched < AIM_STEPS_PER_S or 1.0 - watched / alone > AIM_COST:
+        raise SystemExit(1)
 
 
 if __name__ == "__main__":
