@@ -22,7 +22,8 @@ from baselines.purejaxrl_ppo import Config
 from baselines.purejaxrl_ppo.config import add_flags, settings_of
 from baselines.purejaxrl_ppo.evaluate import race_many, start_keys
 from baselines.purejaxrl_ppo.flights import score
-from baselines.purejaxrl_ppo.training import Trainer, is_due
+from baselines.purejaxrl_ppo.options import is_due
+from baselines.purejaxrl_ppo.training import Trainer
 from benchmarks.env_speed import cpu_name, pin_to_one_core, versions
 from flytrack_env.files import write_atomically
 
@@ -125,8 +126,8 @@ def main() -> None:
     text = (
         "# Learning to race from scratch\n\n"
         f"`python -m benchmarks.learning_curve --seeds {arguments.seeds}` with "
-        f"{', '.join(f'{name} {value:g}' for name, value in settings.items())}, the rest as it is by default, "
-        f"on FlyTrack-v0. Every {EVERY / 1e6:g} M environment steps {NUM_EPISODES} noisy starts, {NUM_LAPS} "
+        f"{', '.join(f'{name} {value:g}' for name, value in settings.items())}, the rest as it is by default, on "
+        f"FlyTrack-v0. Every {EVERY / 1e6:g} M environment steps {NUM_EPISODES} noisy starts, {NUM_LAPS} "
         "laps, in the simulator. CPU seconds of training alone, without compilation and evaluations. Seeds "
         f"that hold {TARGET_SUCCESS:.0%} to the end of the run: "
         f"**{num_held} of {len(curves)}**.\n\n" + HEADER + "".join(rows) + f"\n![curves]({chart.name})\n\n"

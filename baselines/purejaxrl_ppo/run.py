@@ -1,0 +1,143 @@
+"""One seed's training under way: between its chunks checkpoints, evaluations, tracking, a line."""
+
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import flytrack_env
+from baselines.purejaxrl_ppo.checkpoint import Checkpoint, load_checkpoint
+from baselines.purejaxrl_ppo.metrics import summarise_updates
+from baselines.purejaxrl_ppo.monitor import LiveLine, evaluate_policy, record_flight
+from baselines.purejaxrl_ppo.options import Options, is_due, next_due
+from baselines.purejaxrl_ppo.ppo import Runner
+from baselines.purejaxrl_ppo.resume import FINAL, save_run
+from baselines.purejaxrl_ppo.tracking import Tracker
+
+if TYPE_CHECKING:
+    from baselines.purejaxrl_ppo.training import Trainer
+
+Metrics = dict[str, np.ndarray]
+
+
+class Chunk(NamedTuple):
+    """Where a training stands after some updates: state, updates so far, metrics and rate of the chunk."""
+
+    runner: Runner
+    update: int
+    metrics: Metrics
+    steps_per_second: float
+
+
+class Run:
+    """One seed's training under way: where it writes, and who is told of it."""
+
+    def __init__(
+        self, trainer: "Trainer", out: Path, description: dict[str, Any], options: Options, seconds: float
+    ):
+        self.trainer, self.config, self.out = trainer, trainer.config, out
+        self.description, self.options = description, options
+        self.started_s = time.perf_counter() - seconds
+        self.tracker: Tracker | None = None
+        out.mkdir(parents=True, exist_ok=True)
+
+    def finish(self, runner: Runner, update: int) -> tuple[Checkpoint, Metrics]:
+        """Train from an update on to the end; return the final checkpoint and the metrics since."""
+        if self.options.checkpoint_every is not None and update == 0:
+            self.checkpoint("step_0.msgpack", runner, update)
+        if self.options.tracking_uri is not None:
+            self.tracker = self._make_tracker(self.options.tracking_uri)
+        batch_size = self.config.batch_size
+        line = LiveLine(self.config.num_updates * batch_size, update * batch_size)
+        status = "FAILED"
+        try:
+            rows = []
+            self.trainer.chunk(runner, jnp.int32(0))  # compiles
+            line.begin()
+            for chunk in self._chunks(runner, update):
+                runner = chunk.runner
+                rows.append(chunk.metrics)
+                self._between_chunks(chunk, line)
+            path = self.checkpoint(FINAL, runner, self.config.num_updates)
+            status = "FINISHED"
+        except KeyboardInterrupt:
+            status = "KILLED"
+            raise
+        finally:
+            line.close()
+            if self.tracker is not None:
+                self.tracker.end(status)
+        metrics = jax.tree.map(lambda *parts: np.concatenate(parts), *rows) if rows else {}
+        return load_checkpoint(path), metrics
+
+    def _make_tracker(self, uri: str) -> Tracker:
+        """Return who tells MLflow; parameters are the whole description but the observation's table."""
+        params = {name: value for name, value in self.description.items() if name != "observation"}
+        software = {"flytrack": flytrack_env.__version__, "jax": jax.__version__}
+        device = f"{jax.device_count()} {jax.default_backend()}"
+        params |= {"version": software, "device": device}
+        name = f"{self.trainer.env_id} {Path(self.trainer.track).stem} seed {self.description['seed']}"
+        return Tracker(self.out, uri, name, params, is_new=self.options.resume is None)
+
+    def _chunks(self, runner: Runner, update: int) -> Iterator[Chunk]:
+        """Train, yielding between chunks."""
+        config, options = self.config, self.options
+        while update < config.num_updates:
+            due = (
+                next_due(update, every, config.batch_size)
+                for every in (options.checkpoint_every, options.evaluate_every)
+            )
+            count = int(min(*due, update + self.trainer.most, config.num_updates)) - update
+            started_s = time.perf_counter()
+            runner, rows = jax.block_until_ready(self.trainer.chunk(runner, jnp.int32(count)))
+            rate = count * config.batch_size / (time.perf_counter() - started_s)
+            update += count
+            metrics = {name: np.asarray(row)[:count] for name, row in rows.items()}
+            yield Chunk(runner, update, metrics, rate)
+
+    def _between_chunks(self, chunk: Chunk, line: LiveLine) -> None:
+        """Show, store, evaluate and tell what is due after a chunk."""
+        config, options = self.config, self.options
+        runner, update = chunk.runner, chunk.update
+        steps, is_last = update * config.batch_size, update == config.num_updates
+        values = {**summarise_updates(chunk.metrics), "steps_per_second": chunk.steps_per_second}
+        line.trained(steps, values["last_return"])
+        if not is_last and is_due(update, options.checkpoint_every, config.batch_size):
+            self.checkpoint(f"step_{steps}.msgpack", runner, update)
+        if options.evaluate_every and (is_last or is_due(update, options.evaluate_every, config.batch_size)):
+            evaluation = self._evaluate(runner, steps, is_last)
+            line.evaluated(evaluation)
+            values = {**values, **evaluation}
+        if self.tracker is not None:
+            self.tracker.metrics(steps, values)
+
+    def _evaluate(self, runner: Runner, steps: int, is_last: bool) -> dict[str, float]:
+        """Fly and draw the policy as it is; return the metrics."""
+        env, params = self.trainer.env, runner.train_state.params
+        metrics, files = evaluate_policy(
+            env, self.trainer.network, params, self.options.evaluation_episodes, self.out, steps
+        )
+        if is_last and (recording := record_flight(files[0], env.track)) is not None:
+            files.append(recording)
+        for path in files:
+            self._tell(path, "evaluation")
+        return metrics
+
+    def checkpoint(self, name: str, runner: Runner, update: int) -> Path:
+        """Write a checkpoint and return its path."""
+        path = self.out / name
+        progress = {
+            "steps": update * self.config.batch_size,
+            "seconds": round(time.perf_counter() - self.started_s, 1),
+        }
+        save_run(path, runner, self.config, {**self.description, **progress})
+        self._tell(path, "checkpoints")
+        return path
+
+    def _tell(self, path: Path, group: str) -> None:
+        if self.tracker is not None:
+            self.tracker.file(path, group)
