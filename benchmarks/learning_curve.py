@@ -126,7 +126,7 @@ def main() -> None:
     text = (
         "# Learning to race from scratch\n\n"
         f"`python -m benchmarks.learning_curve --seeds {arguments.seeds}` with "
-        f"{', '.join(f'{name} {value:g}' for name, value in settings.items())}, the rest as it is by default, on "
+        f"{', '.join(f'{name} {value:g}' for name, value in settings.items())}, the rest as by default, on "
         f"FlyTrack-v0. Every {EVERY / 1e6:g} M environment steps {NUM_EPISODES} noisy starts, {NUM_LAPS} "
         "laps, in the simulator. CPU seconds of training alone, without compilation and evaluations. Seeds "
         f"that hold {TARGET_SUCCESS:.0%} to the end of the run: "

@@ -255,7 +255,7 @@ def test_mlflow_is_told_everything_once_though_the_run_was_cut_off(trainer, tmp_
     assert [step for step, _ in history(client, run, "evaluation_success")] == [4 * BATCH, 7 * BATCH]
     names = {file.path for file in client.list_artifacts(run.info.run_id, "evaluation")}
     assert {f"evaluation/position_density_{7 * BATCH}.png", f"evaluation/rollout_{4 * BATCH}.npy"} <= names
-    assert len(client.list_artifacts(run.info.run_id, "checkpoints")) == 4
+    assert len(client.list_artifacts(run.info.run_id, "checkpoints")) == 5
     states, actions = load_rollout(tmp_path / "evaluation" / f"rollout_{7 * BATCH}.npy")
     assert states.shape[1] + actions.shape[1] == 25
 
@@ -288,7 +288,7 @@ def test_a_server_that_is_down_does_not_end_the_training(
     client, run = only_run(uri)
     assert run.data.params["config.num_envs"] == "16" and run.info.status == "FINISHED"
     assert len(history(client, run, "value_loss")) == 4
-    assert len(client.list_artifacts(run.info.run_id, "checkpoints")) == 4
+    assert len(client.list_artifacts(run.info.run_id, "checkpoints")) == 5
 
 
 def reports_of(caplog):
@@ -320,7 +320,7 @@ def test_a_server_that_goes_down_under_way_is_reported_once(trainer, tmp_path, c
     (report,) = reports_of(caplog)
     assert "ConnectionError: gone" in report and sent == [2]  # what the run is, and that it runs
     kinds = [entry["kind"] for entry in tracking.Journal(tmp_path).entries]
-    assert (kinds.count("metrics"), kinds.count("file"), kinds[-1]) == (4, 4, "status")
+    assert (kinds.count("metrics"), kinds.count("file"), kinds[-1]) == (4, 5, "status")
 
 
 @pytest.mark.parametrize(("error", "status"), [(KeyboardInterrupt, "KILLED"), (OSError, "FAILED")])
@@ -467,7 +467,7 @@ def test_a_served_store_is_told_everything(trainer, tmp_path):
         trainer.train(tmp_path / "run", SEED, EVERY_OTHER_UPDATE._replace(tracking_uri=uri))
         client, run = only_run(uri)
         assert run.info.status == "FINISHED" and len(history(client, run, "entropy")) == 4
-        assert len(client.list_artifacts(run.info.run_id, "checkpoints")) == 4
+        assert len(client.list_artifacts(run.info.run_id, "checkpoints")) == 5
     finally:
         server.terminate()
         server.wait(timeout=60)

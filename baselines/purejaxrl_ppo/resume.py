@@ -2,6 +2,7 @@
 
 import dataclasses
 import logging
+import math
 import re
 from pathlib import Path
 from typing import Any
@@ -63,11 +64,16 @@ def save_run(path: Path, runner: Runner, config: Config, description: dict[str, 
     save_checkpoint(path, state.params, config, description, as_named_arrays(rest))
 
 
+def steps_of(path: Path) -> float:
+    """Return the steps in a checkpoint's name; infinity for one without, as the final one."""
+    match = STEP_FILE.fullmatch(path.name)
+    return int(match[1]) if match else math.inf
+
+
 def checkpoints_in(folder: Path) -> list[Path]:
     """Return the checkpoints in a folder, newest first: by the steps in their names, the final one first."""
-    steps = {path: match for path in folder.glob("*.msgpack") if (match := STEP_FILE.fullmatch(path.name))}
-    by_age = sorted(steps, key=lambda path: int(steps[path][1]), reverse=True)
-    return [path for path in (folder / FINAL,) if path.exists()] + by_age
+    steps = [path for path in folder.glob("*.msgpack") if STEP_FILE.fullmatch(path.name)]
+    return [path for path in (folder / FINAL,) if path.exists()] + sorted(steps, key=steps_of, reverse=True)
 
 
 def newest_intact(path: Path) -> tuple[Path, Checkpoint]:

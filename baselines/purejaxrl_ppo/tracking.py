@@ -68,6 +68,11 @@ class Journal:
             file.write(json.dumps(entry) + "\n")
         self.entries.append(entry)
 
+    def flush(self) -> None:
+        """Return when all entries are on the disk, and not only with the system."""
+        with self.path.open("ab") as file:
+            os.fsync(file.fileno())
+
     def of_kind(self, kind: str) -> list[dict[str, Any]]:
         """Return the entries of a kind."""
         return [entry for entry in self.entries if entry["kind"] == kind]
@@ -103,8 +108,15 @@ class Tracker:
             self.journal.append("run", experiment=EXPERIMENT, name=name, params=params)
         self._last_step = max((entry["step"] for entry in self.journal.of_kind("metrics")), default=-1)
         self._told = {entry["path"] for entry in self.journal.of_kind("file")}
+
+    def begin(self) -> None:
+        """Tell that the run is under way."""
         self.journal.append("status", status="RUNNING")
         self.send()
+
+    def keep(self) -> None:
+        """Have all that was told on the disk: before a checkpoint, which a run goes on from, says it was."""
+        self.journal.flush()
 
     def metrics(self, step: int, values: dict[str, float]) -> None:
         """Tell metrics after a number of environment steps; all of a step at once."""
