@@ -135,14 +135,6 @@ def test_a_checkpoint_of_another_run_is_refused_field_by_field(trainer, whole, t
         check_same_run(path, checkpoint, own)
 
 
-def test_another_version_is_reported(trainer, whole, caplog):
-    path, checkpoint = newest_intact(whole[0])
-    checkpoint.meta["package_version"] = "0.0.1"
-    description = describe_run(trainer.env, trainer.env_id, trainer.track, CONFIG, SEED)
-    check_same_run(path, checkpoint, description)
-    assert "package_version: found '0.0.1'" in caplog.text
-
-
 def test_a_state_of_other_shapes_is_refused_leaf_by_leaf(trainer, whole):
     path, checkpoint = newest_intact(whole[0])
     target = jax.eval_shape(trainer.start, jax.random.key(0))

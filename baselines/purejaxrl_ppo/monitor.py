@@ -5,7 +5,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -106,38 +106,46 @@ def record_flight(rollout: Path, track: Any) -> Path | None:
     return path
 
 
+class Seen(NamedTuple):
+    """What evaluations have shown so far: the last one's success, the shortest flying lap of all, s."""
+
+    success: float | None = None
+    best_lap_s: float | None = None
+
+    def after(self, evaluation: dict[str, float]) -> "Seen":
+        """Return what has been seen after another evaluation, which may have failed."""
+        laps = (self.best_lap_s, evaluation.get("evaluation_best_lap_s"))
+        return Seen(
+            evaluation.get("evaluation_success", self.success),
+            min((lap_s for lap_s in laps if lap_s is not None), default=None),
+        )
+
+    def metrics(self) -> dict[str, float]:
+        """Return what no single evaluation tells."""
+        return {} if self.best_lap_s is None else {"evaluation_best_lap_so_far_s": self.best_lap_s}
+
+
 class LiveLine:
     """One line: steps, rate, time left, mean return of the last episodes, success, best lap so far."""
 
     def __init__(self, total: int, done: int):
         self._bar = tqdm(total=total, initial=done, unit="step", unit_scale=True, desc="compile")
-        self._return = 0.0
-        self._success: float | None = None
-        self._best_lap_s: float | None = None
 
     def begin(self) -> None:
         """Count time from now on: what came before was compilation."""
         self._bar.set_description("train")
         self._bar.unpause()
 
-    def trained(self, steps: int, last_return: float) -> None:
+    def trained(self, steps: int) -> None:
         """Move on to a number of environment steps."""
-        self._return = last_return
-        self._bar.set_postfix_str(self._text(), refresh=False)
         self._bar.update(steps - self._bar.n)
 
-    def evaluated(self, metrics: dict[str, float]) -> None:
-        """Show another evaluation; nothing changes where it failed."""
-        self._success = metrics.get("evaluation_success", self._success)
-        lap_s = metrics.get("evaluation_best_lap_s")
-        if lap_s is not None:
-            self._best_lap_s = min(lap_s, self._best_lap_s or lap_s)
-        self._bar.set_postfix_str(self._text())
-
-    def _text(self) -> str:
-        success = "-" if self._success is None else f"{self._success:.0%}"
-        best_lap = "-" if self._best_lap_s is None else f"{self._best_lap_s:.2f} s"
-        return f"return {self._return:.1f}, success {success}, best lap {best_lap}"
+    def show(self, last_return: float, seen: Seen) -> None:
+        """Show how the policy does."""
+        success = "-" if seen.success is None else f"{seen.success:.0%}"
+        best_lap = "-" if seen.best_lap_s is None else f"{seen.best_lap_s:.2f} s"
+        text = f"return {last_return:.1f}, success {success}, best lap {best_lap}"
+        self._bar.set_postfix_str(text, refresh=False)
 
     def close(self) -> None:
         """Leave the line as it is."""

@@ -1,5 +1,6 @@
 """One seed's training under way: between its chunks checkpoints, evaluations, tracking, a line."""
 
+import math
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -11,8 +12,9 @@ import numpy as np
 
 import flytrack_env
 from baselines.purejaxrl_ppo.checkpoint import Checkpoint, load_checkpoint
+from baselines.purejaxrl_ppo.journal import JOURNAL
 from baselines.purejaxrl_ppo.metrics import summarise_updates
-from baselines.purejaxrl_ppo.monitor import LiveLine, evaluate_policy
+from baselines.purejaxrl_ppo.monitor import LiveLine, Seen, evaluate_policy
 from baselines.purejaxrl_ppo.named_arrays import as_named_arrays
 from baselines.purejaxrl_ppo.options import Options, is_due, next_due
 from baselines.purejaxrl_ppo.ppo import Runner
@@ -44,14 +46,31 @@ class Run:
     """One seed's training under way: where it writes, and who is told of it."""
 
     def __init__(
-        self, trainer: "Trainer", out: Path, description: dict[str, Any], options: Options, seconds: float
+        self,
+        trainer: "Trainer",
+        out: Path,
+        description: dict[str, Any],
+        options: Options,
+        before: dict[str, Any] | None = None,
     ):
         self.trainer, self.config, self.out = trainer, trainer.config, out
         self.description, self.options = description, options
-        self.started_s = time.perf_counter() - seconds
+        before = before or {}
+        self.started_s = time.perf_counter() - float(before.get("seconds", 0.0))
+        self.seen = Seen(**before.get("seen", {}))
         self.tracker: Tracker | None = None
         self.last_path: Path | None = options.resume
         out.mkdir(parents=True, exist_ok=True)
+
+    def send_unsent(self) -> None:
+        """Tell what a run that is complete had not told when it was killed; nothing of one not tracked."""
+        if self.options.tracking_uri is None or not (self.out / JOURNAL).exists():
+            return
+        tracker = self.tracker = self._make_tracker(self.options.tracking_uri)
+        self._tell_checkpoints(math.inf)
+        if not tracker.has_ended("FINISHED"):
+            tracker.end("FINISHED")
+        tracker.send()
 
     def finish(self, runner: Runner, update: int) -> tuple[Checkpoint, Metrics]:
         """Train from an update on to the end; return the final checkpoint and the metrics since.
@@ -60,12 +79,15 @@ class Run:
             DivergedError: metrics or parameters that are not finite; no checkpoint has them.
         """
         batch_size = self.config.batch_size
-        line = LiveLine(self.config.num_updates * batch_size, update * batch_size)
+        self.trainer.steps = update * batch_size
+        line = LiveLine(self.config.num_updates * batch_size, self.trainer.steps)
+        line.show(mean_last_return(runner), self.seen)
         status = "FAILED"
         try:
             self._begin(runner, update)
             rows = []
-            self.trainer.chunk(runner, jnp.int32(0))  # compiles
+            if update < self.config.num_updates:
+                self.trainer.chunk(runner, jnp.int32(0))  # compiles
             line.begin()
             for chunk in self._chunks(runner, update):
                 runner = chunk.runner
@@ -88,20 +110,22 @@ class Run:
         if self.options.tracking_uri is not None:
             self.tracker = self._make_tracker(self.options.tracking_uri)
             self.tracker.begin()
-        for path in reversed(checkpoints_in(self.out)):
-            if steps_of(path) <= update * self.config.batch_size:
-                self._tell(path, "checkpoints")
+        self._tell_checkpoints(update * self.config.batch_size)
         if self.options.checkpoint_every is not None and update == 0:
             self.checkpoint("step_0.msgpack", runner, update)
+
+    def _tell_checkpoints(self, steps: float) -> None:
+        """Tell of the checkpoints that there are, up to a number of steps."""
+        for path in reversed(checkpoints_in(self.out)):
+            if steps_of(path) <= steps:
+                self._tell(path, "checkpoints")
 
     def _make_tracker(self, uri: str) -> Tracker:
         """Return who tells MLflow; parameters are the whole description but the observation's table."""
         params = {name: value for name, value in self.description.items() if name != "observation"}
-        software = {"flytrack": flytrack_env.__version__, "jax": jax.__version__}
-        device = f"{jax.device_count()} {jax.default_backend()}"
-        params |= {"version": software, "device": device}
+        params["package_version"] = flytrack_env.__version__
         name = f"{self.trainer.env_id} {Path(self.trainer.track).stem} seed {self.description['seed']}"
-        return Tracker(self.out, uri, name, params, is_new=self.options.resume is None)
+        return Tracker(self.out, uri, name, params)
 
     def _chunks(self, runner: Runner, update: int) -> Iterator[Chunk]:
         """Train, yielding between chunks."""
@@ -129,13 +153,15 @@ class Run:
         runner, update = chunk.runner, chunk.update
         steps, is_last = update * config.batch_size, update == config.num_updates
         values = {**summarise_updates(chunk.metrics), "steps_per_second": chunk.steps_per_second}
-        line.trained(steps, values["last_return"])
+        self.trainer.steps = steps
+        line.trained(steps)
         broken = find_not_finite(chunk)
         is_evaluated = is_last or is_due(update, options.evaluate_every, config.batch_size)
         if options.evaluate_every and is_evaluated and not broken:
             evaluation = self._evaluate(runner, steps, is_last)
-            line.evaluated(evaluation)
-            values = {**values, **evaluation}
+            self.seen = self.seen.after(evaluation)
+            values = {**values, **evaluation, **self.seen.metrics()}
+        line.show(mean_last_return(runner), self.seen)
         if self.tracker is not None:
             self.tracker.metrics(steps, values)
         if broken:
@@ -146,9 +172,10 @@ class Run:
     def _say_diverged(self, chunk: Chunk, broken: list[str]) -> str:
         first, last = (update * self.config.batch_size for update in (chunk.before, chunk.update))
         good = "there is none" if self.last_path is None else self.last_path
+        rate = self.config.learning_rate
         return (
             f"training diverged between steps {first} and {last}: found {', '.join(broken[:MOST_NAMES])} not "
-            f"finite; the last good checkpoint: {good}. Try a smaller --learning-rate (it was {self.config.learning_rate:g})"
+            f"finite; the last good checkpoint: {good}. Try a smaller --learning-rate (it was {rate:g})"
         )
 
     def _evaluate(self, runner: Runner, steps: int, is_last: bool) -> dict[str, float]:
@@ -168,6 +195,7 @@ class Run:
         progress = {
             "steps": update * self.config.batch_size,
             "seconds": round(time.perf_counter() - self.started_s, 1),
+            "seen": self.seen._asdict(),
         }
         if self.tracker is not None:
             self.tracker.keep()
@@ -179,6 +207,11 @@ class Run:
     def _tell(self, path: Path, group: str) -> None:
         if self.tracker is not None:
             self.tracker.file(path, group)
+
+
+def mean_last_return(runner: Runner) -> float:
+    """Return the mean over environments of the return of their last episode; 0 for those without one."""
+    return float(runner.episodes.last_return.mean())
 
 
 def find_not_finite(chunk: Chunk) -> list[str]:

@@ -14,10 +14,20 @@ import jax.numpy as jnp
 import flytrack_env
 from baselines.purejaxrl_ppo.checkpoint import Checkpoint
 from baselines.purejaxrl_ppo.config import Config
+from baselines.purejaxrl_ppo.journal import forget
 from baselines.purejaxrl_ppo.named_arrays import is_key
 from baselines.purejaxrl_ppo.options import Options
 from baselines.purejaxrl_ppo.ppo import Algorithm, Runner, make_network_for, make_ppo
-from baselines.purejaxrl_ppo.resume import check_same_run, describe_run, newest_intact, restore_runner
+from baselines.purejaxrl_ppo.resume import (
+    FINAL,
+    check_free,
+    check_same_run,
+    describe_run,
+    is_its_folder,
+    newest_intact,
+    restore_runner,
+    warn_of_other_bits,
+)
 from baselines.purejaxrl_ppo.run import Metrics, Run
 
 CHUNK_STEPS = 131_072  # environment steps between two looks from outside: a fraction of a second
@@ -53,7 +63,7 @@ def with_strong_types(runner: Runner) -> Runner:
 
 
 class Trainer:
-    """PPO on one environment, compiled once for any number of seeds.
+    """PPO on one environment, compiled once for any number of seeds; ``steps``: of the run under way.
 
     Raises:
         ValueError: settings, id, track or model that cannot be used, before any training.
@@ -69,27 +79,44 @@ class Trainer:
         ppo = make_ppo(self.env, params, config)
         self.network = make_network_for(self.env, params, config)
         self.most = max(1, CHUNK_STEPS // config.batch_size)
+        self.steps = 0
         self.start = jax.jit(lambda key: with_strong_types(ppo.start(key)))
         self.chunk = make_chunk(ppo, self.most)
 
     def train(self, out: Path, seed: int, options: Options) -> tuple[Checkpoint, Metrics]:
         """Train and write ``out``/final.msgpack; return it, and the metrics of every update made here.
 
+        A run that is complete stays as it is.
+
         Raises:
             CheckpointError: a checkpoint to go on from that cannot be used or is of another run.
+            ValueError: ``out`` holds another run.
+            DivergedError: numbers that are not finite.
         """
         options.check()
-        description = describe_run(self.env, self.env_id, self.track, self.config, seed)
+        source = options.resume
+        check_free(out, source)
+        description = self.describe(seed)
         key = jax.random.key(seed)
-        if options.resume is None:
-            runner, update, seconds = self.start(key), 0, 0.0
-        else:
-            path, checkpoint = newest_intact(options.resume)
-            check_same_run(path, checkpoint, description)
-            runner = restore_runner(path, checkpoint, jax.eval_shape(self.start, key))
-            update = checkpoint.meta["steps"] // self.config.batch_size
-            seconds = float(checkpoint.meta["seconds"])
-        return Run(self, out, description, options, seconds).finish(runner, update)
+        if not is_its_folder(out, source):
+            forget(out)
+        if source is None:
+            return Run(self, out, description, options).finish(self.start(key), 0)
+        path, checkpoint = newest_intact(source)
+        check_same_run(path, checkpoint, description)
+        run = Run(self, out, description, options._replace(resume=path), checkpoint.meta)
+        update = checkpoint.meta["steps"] // self.config.batch_size
+        self.steps = checkpoint.meta["steps"]
+        if update == self.config.num_updates and path.resolve() == (out / FINAL).resolve():
+            run.send_unsent()
+            return checkpoint, {}
+        warn_of_other_bits(path, checkpoint, description)
+        runner = restore_runner(path, checkpoint, jax.eval_shape(self.start, key))
+        return run.finish(runner, update)
+
+    def describe(self, seed: int) -> dict[str, Any]:
+        """Return what the run of a seed is, as its checkpoints say."""
+        return describe_run(self.env, self.env_id, self.track, self.config, seed)
 
 
 def track_reference(track: str | Path) -> str:
@@ -117,6 +144,8 @@ def train_policy(
     those since then.
 
     Raises:
-        ValueError: settings, id, track, model or checkpoint that cannot be used, before any training.
+        ValueError: settings, id, track, model or checkpoint that cannot be used, or ``out`` that holds
+            another run, before any training.
+        DivergedError: numbers that are not finite.
     """
     return Trainer(config, env_id, **env_arguments).train(out, seed, options)
