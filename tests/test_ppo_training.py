@@ -395,7 +395,7 @@ def test_resuming_with_other_settings_is_refused(whole, tmp_path, arguments, mes
 
 def test_every_seed_of_several_has_its_folder(whole, tmp_path):
     shutil.copytree(whole[0], tmp_path / "seed1")
-    plans = plans_of("--num-seeds", 2, "--resume", tmp_path)
+    plans = plans_of("--seed", 0, "--num-seeds", 2, "--resume", tmp_path)
     assert [(plan.seed, plan.out, plan.resume) for plan in plans] == [
         (0, tmp_path / "seed0", None),
         (1, tmp_path / "seed1", tmp_path / "seed1" / "final.msgpack"),

@@ -25,10 +25,12 @@ from baselines.purejaxrl_ppo.checkpoint import (
 from baselines.purejaxrl_ppo.config import Config
 from baselines.purejaxrl_ppo.journal import Journal
 from baselines.purejaxrl_ppo.named_arrays import as_named_arrays, find_misfits, from_named_arrays
+from baselines.purejaxrl_ppo.options import OPTIONS
 from baselines.purejaxrl_ppo.ppo import Runner
 from flytrack_env.model_file import model_as_json
 
 FINAL = "final.msgpack"
+SEED_FOLDER = re.compile(r"seed(\d+)")
 STEP_FILE = re.compile(r"step_(\d+)\.msgpack")
 MUST_FIT = ("env_id", "seed", "missed_gate", "config", "observation", "track_data", "model", "environment")
 
@@ -94,6 +96,16 @@ def checkpoints_in(folder: Path) -> list[Path]:
     return [path for path in (folder / FINAL,) if path.exists()] + sorted(steps, key=steps_of, reverse=True)
 
 
+def seeds_in(folder: Path) -> list[int]:
+    """Return the seeds of which a folder holds runs, as seed<N>, begun or about to begin."""
+    matches = [(path, SEED_FOLDER.fullmatch(path.name)) for path in folder.glob("seed*")]
+    return sorted(
+        int(match[1])
+        for path, match in matches
+        if match and (checkpoints_in(path) or (path / OPTIONS).exists())
+    )
+
+
 def is_its_folder(folder: Path, source: Path | None) -> bool:
     """Return whether a checkpoint, or folder of checkpoints, to go on from is in a folder."""
     if source is None:
@@ -101,18 +113,18 @@ def is_its_folder(folder: Path, source: Path | None) -> bool:
     return folder.resolve() == (source if source.is_dir() else source.parent).resolve()
 
 
-def check_free(folder: Path, source: Path | None = None) -> None:
+def check_free(folder: Path, source: Path | None = None, root: Path | None = None) -> None:
     """Raise ValueError where a folder holds a run that a training would overwrite.
 
     source: the checkpoint, or the folder of checkpoints, that the training goes on from; its own folder is
-    where it may. A journal that no store has all of counts as a run.
+    where it may. root: of the seeds of which this is one. A journal that no store has all of counts as a run.
     """
     if is_its_folder(folder, source):
         return
     if checkpoints_in(folder):
         raise ValueError(
-            f"{folder} holds the checkpoints of a run; go on with it (--resume {folder}), give another "
-            "folder (--out), or remove it"
+            f"{folder} holds the checkpoints of a run; go on with it (--resume {root or folder}), give "
+            "another folder (--out), or remove it"
         )
     journal = Journal(folder)
     if not journal.is_sent():
@@ -130,6 +142,9 @@ def newest_intact(path: Path) -> tuple[Path, Checkpoint]:
         CheckpointError: a file that cannot be used, a folder without an intact one, or a policy alone.
     """
     candidates = checkpoints_in(path) if path.is_dir() else [path]
+    if not candidates and seeds_in(path):
+        names = ", ".join(f"seed{seed}" for seed in seeds_in(path))
+        raise CheckpointError(f"{path}: found the runs of several seeds, expected that of one: {names} in it")
     if not candidates:
         raise CheckpointError(f"{path}: found no checkpoint, expected {FINAL} or step_<N>.msgpack")
     *newer, oldest = candidates

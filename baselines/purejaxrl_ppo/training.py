@@ -98,12 +98,13 @@ class Trainer:
         check_free(out, source)
         description = self.describe(seed)
         key = jax.random.key(seed)
-        if not is_its_folder(out, source):
-            forget(out)
         if source is None:
+            forget(out)
             return Run(self, out, description, options).finish(self.start(key), 0)
         path, checkpoint = newest_intact(source)
         check_same_run(path, checkpoint, description)
+        if not is_its_folder(out, source):
+            forget(out)
         run = Run(self, out, description, options._replace(resume=path), checkpoint.meta)
         update = checkpoint.meta["steps"] // self.config.batch_size
         self.steps = checkpoint.meta["steps"]
