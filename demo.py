@@ -13,6 +13,7 @@ from baselines.purejaxrl_ppo import Config
 from baselines.purejaxrl_ppo.density import draw_position_density
 from baselines.purejaxrl_ppo.evaluate import fly_many
 from baselines.purejaxrl_ppo.flights import outcomes_of, score
+from baselines.purejaxrl_ppo.resume import checkpoints_in
 from baselines.purejaxrl_ppo.train_ppo import train_policy
 from flytrack_env import blackbox, load_track, save_model
 from flytrack_env.files import write_atomically
@@ -76,6 +77,8 @@ def run(arguments: argparse.Namespace) -> None:
     config = Config(total_timesteps=int(arguments.total_timesteps))
     config.check()
     out, seed = arguments.out, arguments.seed
+    if checkpoints_in(out):
+        raise ValueError(f"--out: {out} holds the run of an earlier demo; remove it, or give another folder")
     out.mkdir(parents=True, exist_ok=True)
 
     print(f"1/4 collect and identify: {arguments.black_box}")

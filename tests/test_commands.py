@@ -109,6 +109,12 @@ def test_demo_refuses_before_any_work(tmp_path, monkeypatch, capsys):
             demo.main()
         assert arguments[1] in capsys.readouterr().err
     assert not any(out.glob("*"))
+    (out / "final.msgpack").touch()
+    monkeypatch.setattr(sys, "argv", ["demo.py", "--out", str(out)])
+    with pytest.raises(SystemExit):
+        demo.main()
+    assert f"--out: {out} holds the run of an earlier demo" in capsys.readouterr().err
+    assert [path.name for path in out.iterdir()] == ["final.msgpack"]
 
 
 def test_density_counts_positions_in_bins(tmp_path):

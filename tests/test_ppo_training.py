@@ -21,26 +21,23 @@ from baselines.purejaxrl_ppo import (
     monitor,
     tracking,
     train_ppo,
-    training,
 )
 from baselines.purejaxrl_ppo.checkpoint import save_checkpoint
 from baselines.purejaxrl_ppo.metrics import summarise_updates
+from baselines.purejaxrl_ppo.named_arrays import as_named_arrays
+from baselines.purejaxrl_ppo.options import is_due, next_due
 from baselines.purejaxrl_ppo.resume import check_same_run, describe_run, newest_intact, restore_runner
-from baselines.purejaxrl_ppo.training import Options, Trainer, is_due, next_due
+from baselines.purejaxrl_ppo.run import Run
+from baselines.purejaxrl_ppo.training import Options, Trainer
 from flytrack_env.rollout import load_rollout
+from tests.ppo_runs import BATCH, CONFIG, DEAD_URI, EVERY_OTHER_UPDATE, SEED, assert_same_end, make_trainer
 
 ROOT = Path(__file__).parent.parent
-SEED = 3
-BATCH = 16 * 24
-CONFIG = Config(total_timesteps=7 * BATCH, num_envs=16, num_steps=24, num_minibatches=4, hidden_sizes=(8,))
-EVERY_OTHER_UPDATE = Options(checkpoint_every=2 * BATCH)
-DEAD_URI = "http://127.0.0.1:9"  # the port at which nothing listens
 
 
 @pytest.fixture(scope="module")
 def trainer():
-    # The id with the most state: another drone in every episode, sensor noise, a history of commands.
-    return Trainer(CONFIG, "FlyTrackRobust-v0")
+    return make_trainer()
 
 
 @pytest.fixture(scope="module")
@@ -48,16 +45,6 @@ def whole(trainer, tmp_path_factory):
     """An uninterrupted run: its folder and its metrics."""
     out = tmp_path_factory.mktemp("whole")
     return out, trainer.train(out, SEED, EVERY_OTHER_UPDATE)[1]
-
-
-def assert_same_end(path, expected):
-    """Compare every array and everything said but the time it took."""
-    found, wanted = load_checkpoint(path), load_checkpoint(expected)
-    jax.tree.map(np.testing.assert_array_equal, found.params, wanted.params)
-    assert found.training.keys() == wanted.training.keys()
-    for name, array in wanted.training.items():
-        assert found.training[name].tobytes() == array.tobytes(), name
-    assert {**found.meta, "seconds": 0} == {**wanted.meta, "seconds": 0}
 
 
 def test_checkpoints_are_written_at_the_steps_asked_for(whole):
@@ -88,8 +75,11 @@ def test_a_run_that_is_complete_stays_as_it_is(trainer, whole, tmp_path):
 
 def test_another_seed_ends_elsewhere(trainer, whole, tmp_path):
     trainer.train(tmp_path, SEED + 1, Options())
-    with pytest.raises(AssertionError):
-        assert_same_end(tmp_path / "final.msgpack", whole[0] / "final.msgpack")
+    found, other = (
+        as_named_arrays(load_checkpoint(folder / "final.msgpack").params) for folder in (tmp_path, whole[0])
+    )
+    kernels = [name for name in found if name.endswith("kernel")]
+    assert kernels and not any(np.array_equal(found[name], other[name]) for name in kernels)
 
 
 def test_the_newest_intact_checkpoint_is_taken(trainer, whole, tmp_path, caplog):
@@ -143,14 +133,6 @@ def test_a_checkpoint_of_another_run_is_refused_field_by_field(trainer, whole, t
         own = describe_run(trainer.env, trainer.env_id, trainer.track, CONFIG, SEED)
         own["config"]["learning_rate"] = 0.001
         check_same_run(path, checkpoint, own)
-
-
-def test_another_version_is_reported(trainer, whole, caplog):
-    path, checkpoint = newest_intact(whole[0])
-    checkpoint.meta["package_version"] = "0.0.1"
-    description = describe_run(trainer.env, trainer.env_id, trainer.track, CONFIG, SEED)
-    check_same_run(path, checkpoint, description)
-    assert "package_version: found '0.0.1'" in caplog.text
 
 
 def test_a_state_of_other_shapes_is_refused_leaf_by_leaf(trainer, whole):
@@ -265,7 +247,7 @@ def test_mlflow_is_told_everything_once_though_the_run_was_cut_off(trainer, tmp_
     assert [step for step, _ in history(client, run, "evaluation_success")] == [4 * BATCH, 7 * BATCH]
     names = {file.path for file in client.list_artifacts(run.info.run_id, "evaluation")}
     assert {f"evaluation/position_density_{7 * BATCH}.png", f"evaluation/rollout_{4 * BATCH}.npy"} <= names
-    assert len(client.list_artifacts(run.info.run_id, "checkpoints")) == 4
+    assert len(client.list_artifacts(run.info.run_id, "checkpoints")) == 5
     states, actions = load_rollout(tmp_path / "evaluation" / f"rollout_{7 * BATCH}.npy")
     assert states.shape[1] + actions.shape[1] == 25
 
@@ -298,7 +280,7 @@ def test_a_server_that_is_down_does_not_end_the_training(
     client, run = only_run(uri)
     assert run.data.params["config.num_envs"] == "16" and run.info.status == "FINISHED"
     assert len(history(client, run, "value_loss")) == 4
-    assert len(client.list_artifacts(run.info.run_id, "checkpoints")) == 4
+    assert len(client.list_artifacts(run.info.run_id, "checkpoints")) == 5
 
 
 def reports_of(caplog):
@@ -330,7 +312,7 @@ def test_a_server_that_goes_down_under_way_is_reported_once(trainer, tmp_path, c
     (report,) = reports_of(caplog)
     assert "ConnectionError: gone" in report and sent == [2]  # what the run is, and that it runs
     kinds = [entry["kind"] for entry in tracking.Journal(tmp_path).entries]
-    assert (kinds.count("metrics"), kinds.count("file"), kinds[-1]) == (4, 4, "status")
+    assert (kinds.count("metrics"), kinds.count("file"), kinds[-1]) == (4, 5, "status")
 
 
 @pytest.mark.parametrize(("error", "status"), [(KeyboardInterrupt, "KILLED"), (OSError, "FAILED")])
@@ -339,7 +321,7 @@ def test_how_a_run_ended_is_told(trainer, tmp_path, monkeypatch, error, status):
         raise error
 
     monkeypatch.setattr(tracking, "send_journal", lambda journal, uri: None)
-    monkeypatch.setattr(training.Run, "checkpoint", fail)
+    monkeypatch.setattr(Run, "checkpoint", fail)
     with pytest.raises(error):
         trainer.train(tmp_path, SEED, Options(tracking_uri=DEAD_URI))
     assert tracking.Journal(tmp_path).entries[-1]["status"] == status
@@ -413,7 +395,7 @@ def test_resuming_with_other_settings_is_refused(whole, tmp_path, arguments, mes
 
 def test_every_seed_of_several_has_its_folder(whole, tmp_path):
     shutil.copytree(whole[0], tmp_path / "seed1")
-    plans = plans_of("--num-seeds", 2, "--resume", tmp_path)
+    plans = plans_of("--seed", 0, "--num-seeds", 2, "--resume", tmp_path)
     assert [(plan.seed, plan.out, plan.resume) for plan in plans] == [
         (0, tmp_path / "seed0", None),
         (1, tmp_path / "seed1", tmp_path / "seed1" / "final.msgpack"),
@@ -477,7 +459,7 @@ def test_a_served_store_is_told_everything(trainer, tmp_path):
         trainer.train(tmp_path / "run", SEED, EVERY_OTHER_UPDATE._replace(tracking_uri=uri))
         client, run = only_run(uri)
         assert run.info.status == "FINISHED" and len(history(client, run, "entropy")) == 4
-        assert len(client.list_artifacts(run.info.run_id, "checkpoints")) == 4
+        assert len(client.list_artifacts(run.info.run_id, "checkpoints")) == 5
     finally:
         server.terminate()
         server.wait(timeout=60)

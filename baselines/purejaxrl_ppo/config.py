@@ -34,8 +34,8 @@ class Config:
     num_steps: int = 64
     """Steps of every environment per update."""
     episode_steps: int = 200
-    """Time limit of training episodes. Long ones spend most experience on the one line that the policy
-    flies already, and a policy that knows nothing beside it fails on another plant."""
+    """Time limit of training episodes, in environment steps. Long ones spend most experience on the one
+    line that the policy flies already, and a policy that knows nothing beside it fails on another plant."""
     update_epochs: int = 1
     """Passes over the collected batch per update. Gradients are nearly all of the time that training takes,
     so that one pass in many small steps gets further in a second than several in larger ones."""

@@ -6,7 +6,7 @@ import numpy as np
 
 # What a mean over updates is weighted by; counts are summed.
 OF_EPISODES, OF_LAPS = "episodes_ended", "laps_completed"
-NOT_OF_AN_EPISODE = ("done", "last_return")
+NOT_OF_AN_EPISODE = ("done", "last_return", "lap_time_s")  # of a lap: zero at the end of most episodes
 
 
 def summarise_episodes(log: dict[str, jax.Array]) -> dict[str, jax.Array]:

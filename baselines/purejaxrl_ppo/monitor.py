@@ -1,8 +1,11 @@
 """What is seen of a policy while it trains: evaluation flights, their files, and the live line."""
 
+import logging
+from collections.abc import Iterator
+from contextlib import contextmanager
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -16,6 +19,8 @@ from baselines.purejaxrl_ppo.networks import ActorCritic
 NUM_LAPS = 3
 NUM_STEPS = 2500  # 25 s at 100 Hz: three laps of the slowest shipped track, flown by a beginner
 EVALUATION_SEED = 20_000  # of the noisy starts: the same at every evaluation, none of a usual training seed
+
+logger = logging.getLogger(__name__)
 
 
 def evaluation_metrics(outcomes: Outcomes) -> dict[str, float]:
@@ -34,21 +39,59 @@ def evaluation_metrics(outcomes: Outcomes) -> dict[str, float]:
     return {f"evaluation_{name}": float(value) for name, value in values.items() if np.isfinite(value)}
 
 
+@contextmanager
+def attempt(what: str, steps: int) -> Iterator[None]:
+    """Warn of an error and go on: no evaluation is worth the training that it watches."""
+    try:
+        yield
+    except Exception as error:  # whatever libraries that draw and record raise
+        text = (str(error).splitlines() or [""])[0]
+        logger.warning(
+            "evaluation after %d steps: %s failed: %s: %s; training goes on",
+            steps,
+            what,
+            type(error).__name__,
+            text,
+        )
+
+
 def evaluate_policy(
-    env: Any, network: ActorCritic, params: Any, num_episodes: int, out: Path, steps: int
+    env: Any,
+    network: ActorCritic,
+    params: Any,
+    num_episodes: int,
+    out: Path,
+    steps: int,
+    is_recorded: bool = False,
 ) -> tuple[dict[str, float], list[Path]]:
     """Fly noisy starts and write the first flight and the position density of all; return metrics and files.
 
-    out: folder of the run. steps: environment steps of training so far, which name the files.
+    out: folder of the run. steps: environment steps of training so far, which name the files. is_recorded:
+    write the first flight as a Rerun recording too, where that is installed. What fails is reported, and
+    what came of the rest is returned.
     """
-    flights = fly_many(env, network, params, EVALUATION_SEED, num_episodes, NUM_STEPS, NUM_LAPS)
+    metrics: dict[str, float] = {}
+    files: list[Path] = []
+    flights = None
+    with attempt("flying", steps):
+        flights = fly_many(env, network, params, EVALUATION_SEED, num_episodes, NUM_STEPS, NUM_LAPS)
+        metrics = evaluation_metrics(outcomes_of(flights, NUM_LAPS, len(env.track.gates)))
+    if flights is None:
+        return metrics, files
     folder = out / "evaluation"
     rollout, chart = folder / f"rollout_{steps}.npy", folder / f"position_density_{steps}.png"
-    save_flown(rollout, jax.tree.map(lambda leaf: leaf[0], flights))
-    label = f"{steps:,} training steps"
-    draw_position_density(chart, flights.positions(), env.track, num_episodes, label)
-    outcomes = outcomes_of(flights, NUM_LAPS, len(env.track.gates))
-    return evaluation_metrics(outcomes), [rollout, chart]
+    with attempt("writing the rollout", steps):
+        save_flown(rollout, jax.tree.map(lambda leaf: leaf[0], flights))
+        files.append(rollout)
+    with attempt("drawing the position density", steps):
+        label = f"{steps:,} training steps"
+        draw_position_density(chart, flights.positions(), env.track, num_episodes, label)
+        files.append(chart)
+    if is_recorded and rollout in files:
+        with attempt("recording with Rerun", steps):
+            recording = record_flight(rollout, env.track)
+            files += [] if recording is None else [recording]
+    return metrics, files
 
 
 def record_flight(rollout: Path, track: Any) -> Path | None:
@@ -64,38 +107,46 @@ def record_flight(rollout: Path, track: Any) -> Path | None:
     return path
 
 
+class Seen(NamedTuple):
+    """What evaluations have shown so far: the last one's success, the shortest flying lap of all, s."""
+
+    success: float | None = None
+    best_lap_s: float | None = None
+
+    def after(self, evaluation: dict[str, float]) -> "Seen":
+        """Return what has been seen after another evaluation, which may have failed."""
+        laps = (self.best_lap_s, evaluation.get("evaluation_best_lap_s"))
+        return Seen(
+            evaluation.get("evaluation_success", self.success),
+            min((lap_s for lap_s in laps if lap_s is not None), default=None),
+        )
+
+    def metrics(self) -> dict[str, float]:
+        """Return what no single evaluation tells."""
+        return {} if self.best_lap_s is None else {"evaluation_best_lap_so_far_s": self.best_lap_s}
+
+
 class LiveLine:
     """One line: steps, rate, time left, mean return of the last episodes, success, best lap so far."""
 
     def __init__(self, total: int, done: int):
         self._bar = tqdm(total=total, initial=done, unit="step", unit_scale=True, desc="compile")
-        self._return = 0.0
-        self._success: float | None = None
-        self._best_lap_s: float | None = None
 
     def begin(self) -> None:
         """Count time from now on: what came before was compilation."""
         self._bar.set_description("train")
         self._bar.unpause()
 
-    def trained(self, steps: int, last_return: float) -> None:
+    def trained(self, steps: int) -> None:
         """Move on to a number of environment steps."""
-        self._return = last_return
-        self._bar.set_postfix_str(self._text(), refresh=False)
         self._bar.update(steps - self._bar.n)
 
-    def evaluated(self, metrics: dict[str, float]) -> None:
-        """Show another evaluation."""
-        self._success = metrics["evaluation_success"]
-        lap_s = metrics.get("evaluation_best_lap_s")
-        if lap_s is not None:
-            self._best_lap_s = min(lap_s, self._best_lap_s or lap_s)
-        self._bar.set_postfix_str(self._text())
-
-    def _text(self) -> str:
-        success = "-" if self._success is None else f"{self._success:.0%}"
-        best_lap = "-" if self._best_lap_s is None else f"{self._best_lap_s:.2f} s"
-        return f"return {self._return:.1f}, success {success}, best lap {best_lap}"
+    def show(self, last_return: float, seen: Seen) -> None:
+        """Show how the policy does."""
+        success = "-" if seen.success is None else f"{seen.success:.0%}"
+        best_lap = "-" if seen.best_lap_s is None else f"{seen.best_lap_s:.2f} s"
+        text = f"return {last_return:.1f}, success {success}, best lap {best_lap}"
+        self._bar.set_postfix_str(text, refresh=False)
 
     def close(self) -> None:
         """Leave the line as it is."""

@@ -2,6 +2,8 @@
 
 import dataclasses
 import logging
+import math
+import os
 import re
 from pathlib import Path
 from typing import Any
@@ -21,11 +23,14 @@ from baselines.purejaxrl_ppo.checkpoint import (
     save_checkpoint,
 )
 from baselines.purejaxrl_ppo.config import Config
+from baselines.purejaxrl_ppo.journal import Journal
 from baselines.purejaxrl_ppo.named_arrays import as_named_arrays, find_misfits, from_named_arrays
+from baselines.purejaxrl_ppo.options import OPTIONS
 from baselines.purejaxrl_ppo.ppo import Runner
 from flytrack_env.model_file import model_as_json
 
 FINAL = "final.msgpack"
+SEED_FOLDER = re.compile(r"seed(\d+)")
 STEP_FILE = re.compile(r"step_(\d+)\.msgpack")
 MUST_FIT = ("env_id", "seed", "missed_gate", "config", "observation", "track_data", "model", "environment")
 
@@ -52,8 +57,24 @@ def describe_run(env: Any, env_id: str, track: str, config: Config, seed: int) -
             "model": model_as_json(params.model),
             "environment": {name: values.tolist() for name, values in others.items()},
             "config": dataclasses.asdict(config),
+            "software": {"jax": jax.__version__},
+            "machine": describe_machine(),
         }
     )
+
+
+def describe_machine() -> dict[str, Any]:
+    """Return what of a machine decides the last bits: XLA splits sums by the number of its threads.
+
+    threads: cores that this process may use. NPROC: XLA's own setting of that number, where there is one.
+    """
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    return {
+        "backend": jax.default_backend(),
+        "devices": jax.device_count(),
+        "threads": cores,
+        "NPROC": os.environ.get("NPROC"),
+    }
 
 
 def save_run(path: Path, runner: Runner, config: Config, description: dict[str, Any]) -> None:
@@ -63,11 +84,55 @@ def save_run(path: Path, runner: Runner, config: Config, description: dict[str, 
     save_checkpoint(path, state.params, config, description, as_named_arrays(rest))
 
 
+def steps_of(path: Path) -> float:
+    """Return the steps in a checkpoint's name; infinity for one without, as the final one."""
+    match = STEP_FILE.fullmatch(path.name)
+    return int(match[1]) if match else math.inf
+
+
 def checkpoints_in(folder: Path) -> list[Path]:
     """Return the checkpoints in a folder, newest first: by the steps in their names, the final one first."""
-    steps = {path: match for path in folder.glob("*.msgpack") if (match := STEP_FILE.fullmatch(path.name))}
-    by_age = sorted(steps, key=lambda path: int(steps[path][1]), reverse=True)
-    return [path for path in (folder / FINAL,) if path.exists()] + by_age
+    steps = [path for path in folder.glob("*.msgpack") if STEP_FILE.fullmatch(path.name)]
+    return [path for path in (folder / FINAL,) if path.exists()] + sorted(steps, key=steps_of, reverse=True)
+
+
+def seeds_in(folder: Path) -> list[int]:
+    """Return the seeds of which a folder holds runs, as seed<N>, begun or about to begin."""
+    matches = [(path, SEED_FOLDER.fullmatch(path.name)) for path in folder.glob("seed*")]
+    return sorted(
+        int(match[1])
+        for path, match in matches
+        if match and (checkpoints_in(path) or (path / OPTIONS).exists())
+    )
+
+
+def is_its_folder(folder: Path, source: Path | None) -> bool:
+    """Return whether a checkpoint, or folder of checkpoints, to go on from is in a folder."""
+    if source is None:
+        return False
+    return folder.resolve() == (source if source.is_dir() else source.parent).resolve()
+
+
+def check_free(folder: Path, source: Path | None = None, root: Path | None = None) -> None:
+    """Raise ValueError where a folder holds a run that a training would overwrite.
+
+    source: the checkpoint, or the folder of checkpoints, that the training goes on from; its own folder is
+    where it may. root: of the seeds of which this is one. A journal that no store has all of counts as a run.
+    """
+    if is_its_folder(folder, source):
+        return
+    if checkpoints_in(folder):
+        raise ValueError(
+            f"{folder} holds the checkpoints of a run; go on with it (--resume {root or folder}), give "
+            "another folder (--out), or remove it"
+        )
+    journal = Journal(folder)
+    if not journal.is_sent():
+        raise ValueError(
+            f"{journal.path} tells of a run, and no store has all of it; upload it (python -m "
+            f"baselines.purejaxrl_ppo.tracking {folder} --tracking-uri URI), give another folder (--out), or "
+            "remove it"
+        )
 
 
 def newest_intact(path: Path) -> tuple[Path, Checkpoint]:
@@ -77,6 +142,9 @@ def newest_intact(path: Path) -> tuple[Path, Checkpoint]:
         CheckpointError: a file that cannot be used, a folder without an intact one, or a policy alone.
     """
     candidates = checkpoints_in(path) if path.is_dir() else [path]
+    if not candidates and seeds_in(path):
+        names = ", ".join(f"seed{seed}" for seed in seeds_in(path))
+        raise CheckpointError(f"{path}: found the runs of several seeds, expected that of one: {names} in it")
     if not candidates:
         raise CheckpointError(f"{path}: found no checkpoint, expected {FINAL} or step_<N>.msgpack")
     *newer, oldest = candidates
@@ -96,20 +164,28 @@ def _load_training(path: Path) -> Checkpoint:
 
 
 def check_same_run(path: Path, checkpoint: Checkpoint, description: dict[str, Any]) -> None:
-    """Raise CheckpointError, field by field, where a checkpoint is not of the run described.
-
-    Another package version alone is a warning: it may go on differently than it would have.
-    """
+    """Raise CheckpointError, field by field, where a checkpoint is not of the run described."""
     found = {**checkpoint.meta, "config": as_json(dataclasses.asdict(checkpoint.config))}
     lines = [
         line for name in MUST_FIT for line in find_differences(found.get(name), description.get(name), name)
     ]
-    version = find_differences(
-        checkpoint.meta.get("package_version"), flytrack_env.__version__, "package_version"
-    )
-    if version and not lines:
-        logger.warning("%s: %s; going on, perhaps not bit for bit", path, version[0])
-    check_none(path, [*lines, *version] if lines else [])
+    check_none(path, [*lines, *_other_bits(checkpoint, description)] if lines else [])
+
+
+def warn_of_other_bits(path: Path, checkpoint: Checkpoint, description: dict[str, Any]) -> None:
+    """Warn where software or machine are not what a checkpoint was written with: it may go on differently."""
+    lines = _other_bits(checkpoint, description)
+    if lines:
+        logger.warning("%s: %s; going on, perhaps not bit for bit", path, "; ".join(lines))
+
+
+def _other_bits(checkpoint: Checkpoint, description: dict[str, Any]) -> list[str]:
+    expected = {**description, "package_version": flytrack_env.__version__}
+    return [
+        line
+        for name in ("package_version", "software", "machine")
+        for line in find_differences(checkpoint.meta.get(name), expected[name], name)
+    ]
 
 
 def restore_runner(path: Path, checkpoint: Checkpoint, target: Runner) -> Runner:

@@ -15,10 +15,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from flytrack_env.files import write_atomically
+from baselines.purejaxrl_ppo.journal import JOURNAL, SQLITE, Journal, JournalError
 
-JOURNAL = "tracking.jsonl"
-SENT = "tracking_sent.json"
 LOCAL_STORE = "mlflow.db"
 LOCAL_ARTIFACTS = "mlflow_artifacts"
 EXPERIMENT = "flytrack"
@@ -39,50 +37,7 @@ logger = logging.getLogger(__name__)
 
 def local_uri(folder: Path) -> str:
     """Return the address of the SQLite store in a folder."""
-    return f"sqlite:///{(folder / LOCAL_STORE).resolve()}"
-
-
-class Journal:
-    """The entries of one run, in a file that only grows; what the store was told, in another.
-
-    A line that a killed process left unfinished is dropped. is_new: forget what the folder has.
-    """
-
-    def __init__(self, folder: Path, is_new: bool = False):
-        self.folder = folder
-        self.path = folder / JOURNAL
-        folder.mkdir(parents=True, exist_ok=True)
-        if is_new:
-            self.path.unlink(missing_ok=True)
-            (folder / SENT).unlink(missing_ok=True)
-        content = self.path.read_bytes() if self.path.exists() else b""
-        whole = content[: content.rfind(b"\n") + 1]
-        if whole != content:
-            write_atomically(self.path, whole)
-        self.entries = [json.loads(line) for line in whole.splitlines()]
-
-    def append(self, kind: str, **values: Any) -> None:
-        """Add an entry."""
-        entry = {"kind": kind, "time_ms": int(time.time() * 1000), **values}
-        with self.path.open("a", encoding="utf-8") as file:
-            file.write(json.dumps(entry) + "\n")
-        self.entries.append(entry)
-
-    def of_kind(self, kind: str) -> list[dict[str, Any]]:
-        """Return the entries of a kind."""
-        return [entry for entry in self.entries if entry["kind"] == kind]
-
-    def sent(self, uri: str) -> tuple[str | None, int]:
-        """Return the run's id in a store and how many entries it has; None and 0 before the first."""
-        path = self.folder / SENT
-        stores = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
-        return tuple(stores.get(uri, (None, 0)))
-
-    def mark_sent(self, uri: str, run_id: str, count: int) -> None:
-        """Note that a store has a run with the first ``count`` entries."""
-        path = self.folder / SENT
-        stores = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
-        write_atomically(path, (json.dumps({**stores, uri: [run_id, count]}) + "\n").encode())
+    return f"{SQLITE}{(folder / LOCAL_STORE).resolve()}"
 
 
 class Tracker:
@@ -93,18 +48,30 @@ class Tracker:
 
     Args:
         folder: of the run; files that are told of are in it. uri: of the store. name: of the MLflow run.
-        params: of the run, nested JSON values. is_new: a run that begins, whatever the folder has.
+        params: of the run, nested JSON values.
     """
 
-    def __init__(self, folder: Path, uri: str, name: str, params: dict[str, Any], is_new: bool):
-        self.journal, self.uri = Journal(folder, is_new), uri
+    def __init__(self, folder: Path, uri: str, name: str, params: dict[str, Any]):
+        self.journal, self.uri = Journal(folder), uri
         self._is_listening, self._last_sent_s = True, -SEND_EVERY_S
-        if not self.journal.entries:
+        if not self.journal.of_kind("run"):
             self.journal.append("run", experiment=EXPERIMENT, name=name, params=params)
         self._last_step = max((entry["step"] for entry in self.journal.of_kind("metrics")), default=-1)
         self._told = {entry["path"] for entry in self.journal.of_kind("file")}
+
+    def begin(self) -> None:
+        """Tell that the run is under way."""
         self.journal.append("status", status="RUNNING")
         self.send()
+
+    def has_ended(self, status: str) -> bool:
+        """Return whether this is how the run was last told to have ended."""
+        told = self.journal.of_kind("status")
+        return bool(told) and told[-1]["status"] == status
+
+    def keep(self) -> None:
+        """Have all that was told on the disk: before a checkpoint, which a run goes on from, says it was."""
+        self.journal.flush()
 
     def metrics(self, step: int, values: dict[str, float]) -> None:
         """Tell metrics after a number of environment steps; all of a step at once."""
@@ -162,8 +129,10 @@ def send_journal(journal: Journal, uri: str) -> str:
     """Send what a store has not got of a journal, and return the run's id in it.
 
     Raises:
+        JournalError: a journal that says nothing of a run.
         Exception: whatever MLflow and the store raise; what was sent before that is noted.
     """
+    beginning = journal.beginning()
     for name, value in QUIET.items():
         os.environ.setdefault(name, value)
     from mlflow import MlflowClient
@@ -173,7 +142,7 @@ def send_journal(journal: Journal, uri: str) -> str:
     client = MlflowClient(tracking_uri=uri)
     run_id, count = journal.sent(uri)
     if run_id is None:
-        run_id = _create_run(client, uri, journal.entries[0])
+        run_id = _create_run(client, uri, beginning)
         journal.mark_sent(uri, run_id, 0)
     while count < len(journal.entries):
         entries = journal.entries[count : count + ENTRIES_AT_ONCE]
@@ -188,9 +157,9 @@ def _create_run(client: Any, uri: str, entry: dict[str, Any]) -> str:
     found = client.get_experiment_by_name(entry["experiment"])
     if found is not None:
         experiment_id = found.experiment_id
-    elif uri.startswith("sqlite:///"):
+    elif uri.startswith(SQLITE):
         # MLflow would put the files of a local store wherever the command was typed.
-        folder = Path(uri.removeprefix("sqlite:///")).resolve().parent / LOCAL_ARTIFACTS
+        folder = Path(uri.removeprefix(SQLITE)).resolve().parent / LOCAL_ARTIFACTS
         experiment_id = client.create_experiment(entry["experiment"], artifact_location=folder.as_uri())
     else:
         experiment_id = client.create_experiment(entry["experiment"])
@@ -234,9 +203,11 @@ def main() -> None:
     arguments = parser.parse_args()
     if not (arguments.folder / JOURNAL).exists():
         parser.error(f"{arguments.folder}: found no {JOURNAL}, expected the folder of a tracked run")
-    journal = Journal(arguments.folder)
     try:
+        journal = Journal(arguments.folder)
         run_id = send_journal(journal, arguments.tracking_uri)
+    except JournalError as error:
+        parser.error(str(error))
     except Exception as error:  # whatever a store or its client raises
         parser.error(f"{arguments.tracking_uri}: cannot be used: {type(error).__name__}: {error}")
     print(f"uploaded: {len(journal.entries)} entries to run {run_id} of {arguments.tracking_uri}")

@@ -1,0 +1,32 @@
+"""Small training runs that the tests of the baseline share: settings, a trainer, comparisons."""
+
+from functools import cache
+
+import jax
+import numpy as np
+
+from baselines.purejaxrl_ppo import Config, load_checkpoint
+from baselines.purejaxrl_ppo.training import Options, Trainer
+
+SEED = 3
+BATCH = 16 * 24
+CONFIG = Config(total_timesteps=7 * BATCH, num_envs=16, num_steps=24, num_minibatches=4, hidden_sizes=(8,))
+EVERY_OTHER_UPDATE = Options(checkpoint_every=2 * BATCH)
+DEAD_URI = "http://127.0.0.1:9"  # the port at which nothing listens
+
+
+@cache
+def make_trainer() -> Trainer:
+    """Return the trainer, compiled once for all tests of a process."""
+    # The id with the most state: another drone in every episode, sensor noise, a history of commands.
+    return Trainer(CONFIG, "FlyTrackRobust-v0")
+
+
+def assert_same_end(path, expected):
+    """Compare every array and everything said but the time it took."""
+    found, wanted = load_checkpoint(path), load_checkpoint(expected)
+    jax.tree.map(np.testing.assert_array_equal, found.params, wanted.params)
+    assert found.training.keys() == wanted.training.keys()
+    for name, array in wanted.training.items():
+        assert found.training[name].tobytes() == array.tobytes(), name
+    assert {**found.meta, "seconds": 0} == {**wanted.meta, "seconds": 0}

@@ -1,0 +1,127 @@
+"""The command of the training: what it takes up again, of which seeds, and how it ends."""
+
+import shutil
+import sys
+
+import pytest
+
+from baselines.purejaxrl_ppo import plans as plans_module
+from baselines.purejaxrl_ppo import tracking, train_ppo
+from baselines.purejaxrl_ppo.options import OPTIONS, read_options, write_options
+from baselines.purejaxrl_ppo.resume import newest_intact, seeds_in
+from baselines.purejaxrl_ppo.run import DivergedError
+from baselines.purejaxrl_ppo.training import Options
+from tests.ppo_runs import DEAD_URI, EVERY_OTHER_UPDATE, SEED, make_trainer
+
+
+def parse(*arguments):
+    return train_ppo.make_parser().parse_args([*map(str, arguments)])
+
+
+def call(monkeypatch, *arguments):
+    """Run the command; return its exit code."""
+    monkeypatch.setattr(sys, "argv", ["train_ppo", *map(str, arguments)])
+    with pytest.raises(SystemExit) as caught:
+        train_ppo.main()
+    return caught.value.code
+
+
+@pytest.fixture(scope="module")
+def cut_off(tmp_path_factory):
+    """A folder of seeds 3, complete, and 4, of which only the options are there."""
+    out = tmp_path_factory.mktemp("seeds")
+    make_trainer().train(out / "seed3", SEED, EVERY_OTHER_UPDATE)
+    options = Options(5, None, 7, tracking.local_uri(out))
+    for seed in (3, 4):
+        write_options(out / f"seed{seed}", options)
+    (out / tracking.LOCAL_STORE).touch()
+    return out
+
+
+def test_a_resumed_run_goes_on_with_its_options(cut_off, tmp_path):
+    moved = tmp_path / "moved"
+    shutil.copytree(cut_off, moved)
+    for source in (moved, moved / "seed3", moved / "seed3" / "step_0.msgpack"):
+        arguments = parse("--resume", source)
+        plans = plans_module.make_plans(arguments)
+        for plan, options in zip(plans, plans_module.options_of(arguments, plans), strict=True):
+            assert options == Options(5, None, 7, tracking.local_uri(moved), plan.resume)
+    arguments = parse("--resume", moved / "seed3", "--no-tracking", "--checkpoint-every", 0)
+    plans = plans_module.make_plans(arguments)
+    (options,) = plans_module.options_of(arguments, plans)
+    assert options == Options(None, None, 7, None, plans[0].resume)
+    (moved / "seed3" / OPTIONS).write_text('{"checkpoint_every": "often"}')
+    with pytest.raises(ValueError, match=r"options\.json: damaged"):
+        plans_module.options_of(arguments, plans)
+
+
+def test_a_store_elsewhere_is_found_again(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for uri, expected in (
+        ("sqlite:///store/all.db", f"sqlite:///{tmp_path}/store/all.db"),
+        ("http://server:5000", "http://server:5000"),
+        (None, None),
+    ):
+        write_options(tmp_path / "run", Options(tracking_uri=uri))
+        (tmp_path / "run").rename(tmp_path / "moved")
+        assert read_options(tmp_path / "moved") == Options(tracking_uri=expected)
+        shutil.rmtree(tmp_path / "moved")
+
+
+def test_seeds_are_those_of_the_folder(cut_off, tmp_path):
+    def seeds(*arguments):
+        return [plan.seed for plan in plans_module.make_plans(parse("--resume", *arguments))]
+
+    assert seeds(cut_off) == [3, 4]
+    assert seeds(cut_off, "--num-seeds", 3) == [3, 4, 5]
+    assert seeds(cut_off, "--seed", 3) == [3]
+    for arguments, message in (
+        ([cut_off, "--seed", 8, "--num-seeds", 2], r"no checkpoint of seeds \[8, 9\].*holds seeds \[3, 4\]"),
+        ([cut_off / "seed3", "--num-seeds", 2], "checkpoints of one run: leave out --num-seeds"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            seeds(*arguments)
+    with pytest.raises(ValueError, match="runs of several seeds, expected that of one: seed3, seed4"):
+        newest_intact(cut_off)
+    for arguments in (["--num-seeds", 2, "--seed", 3], []):
+        with pytest.raises(ValueError, match=f"--resume (it|{cut_off})[,)]"):
+            plans_module.make_plans(parse("--out", cut_off, *arguments))
+
+
+def test_every_checkpoint_is_checked_before_any_training(cut_off, tmp_path):
+    shutil.copytree(cut_off, tmp_path / "seeds")
+    shutil.copytree(cut_off / "seed3", tmp_path / "seeds" / "seed5")
+    with pytest.raises(ValueError, match=r"seed5.*: does not fit: seed: found 3, expected 5"):
+        train_ppo.prepare(parse("--resume", tmp_path / "seeds"))
+    shutil.copytree(cut_off / "seed3", tmp_path / "other")
+    with pytest.raises(ValueError, match="other holds the checkpoints of a run"):
+        train_ppo.prepare(parse("--resume", cut_off / "seed3", "--out", tmp_path / "other"))
+
+
+def test_seeds_that_have_not_begun_are_in_the_folder(tmp_path, monkeypatch, capsys):
+    def interrupt(self, out, seed, options):
+        self.steps = 40
+        if is_checkpointed:
+            (out / "step_0.msgpack").touch()
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(train_ppo.Trainer, "train", interrupt)
+    is_checkpointed = False
+    assert call(monkeypatch, "--out", tmp_path / "out", "--num-seeds", 3, "--seed", 5) == 130
+    assert capsys.readouterr().err == "stopped at 40 steps, before the first checkpoint\n"
+    assert seeds_in(tmp_path / "out") == [5, 6, 7]
+    is_checkpointed = True
+    assert call(monkeypatch, "--out", tmp_path / "one") == 130
+    assert capsys.readouterr().err == f"stopped at 40 steps; go on with --resume {tmp_path / 'one'}\n"
+
+
+def test_only_errors_of_arguments_show_the_usage(tmp_path, monkeypatch, capsys):
+    def diverge(self, out, seed, options):
+        raise DivergedError("training diverged")
+
+    monkeypatch.setattr(train_ppo.Trainer, "train", diverge)
+    assert call(monkeypatch, "--out", tmp_path) == 1
+    assert capsys.readouterr().err == "train_ppo: error: training diverged\n"
+    assert call(monkeypatch, "--out", tmp_path, "--no-tracking", "--tracking-uri", DEAD_URI) == 2
+    usage, error = capsys.readouterr().err.splitlines()
+    assert usage == "usage: train_ppo [options]" and "not allowed with" in error
