@@ -16,12 +16,13 @@ from baselines.purejaxrl_ppo.flights import outcomes_of, score
 from baselines.purejaxrl_ppo.resume import checkpoints_in
 from baselines.purejaxrl_ppo.train_ppo import train_policy
 from flytrack_env import blackbox, load_track, save_model
-from flytrack_env.files import write_atomically
+from flytrack_env.files import fresh_folder, write_atomically
 from flytrack_env.rollout import load_rollout
 from flytrack_env.viz_rerun import visualize_state_action_sequence
 from flytrack_sysid import Validation, collect, fit, held_out_rows, load_log, save_log, validate
 from flytrack_sysid.validate import NAMES
 
+DEFAULT_OUT = Path("runs/demo")
 NUM_LAPS = 3
 NUM_STEPS = 2500
 NUM_EPISODES = 256
@@ -58,10 +59,10 @@ def describe_identification(validations: dict[str, Validation]) -> None:
 
 
 def main() -> None:
-    """Run the job, print lap times, write ``runs/demo``."""
+    """Run the job, print lap times, write ``runs/demo``, or the next folder that is free."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--black-box", type=Path, default=eval_agent.SHIPPED_BLACK_BOX)
-    parser.add_argument("--out", type=Path, default=Path("runs/demo"))
+    parser.add_argument("--out", type=Path, help=f"folder (default: {DEFAULT_OUT}, or the next free one)")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--total-timesteps", type=float, default=Config.total_timesteps)
     arguments = parser.parse_args()
@@ -76,7 +77,7 @@ def run(arguments: argparse.Namespace) -> None:
     started = time.perf_counter()
     config = Config(total_timesteps=int(arguments.total_timesteps))
     config.check()
-    out, seed = arguments.out, arguments.seed
+    out, seed = arguments.out or fresh_folder(DEFAULT_OUT), arguments.seed
     if checkpoints_in(out):
         raise ValueError(f"--out: {out} holds the run of an earlier demo; remove it, or give another folder")
     out.mkdir(parents=True, exist_ok=True)

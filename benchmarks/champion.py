@@ -15,7 +15,7 @@ from baselines.purejaxrl_ppo.checkpoint import save_checkpoint
 from baselines.purejaxrl_ppo.training import Options, train_policy
 from benchmarks.env_speed import cpu_name, versions
 from benchmarks.flown import ROOT, evaluate
-from flytrack_env.files import write_atomically
+from flytrack_env.files import fresh_folder, write_atomically
 
 CHAMPION = ROOT / "baselines" / "purejaxrl_ppo" / "champion" / "flytrack.msgpack"
 MODEL = ROOT / "benchmarks" / "data" / "time_optimal" / "black_box.json"
@@ -60,7 +60,7 @@ def main() -> None:
     parser.add_argument("--work", type=Path, default=Path("runs/champion"), help="folder of the training")
     parser.add_argument("--out", type=Path, default=Path("docs/results/champion.md"))
     arguments = parser.parse_args()
-    policy = CHAMPION if arguments.only_fly else train(arguments.work)
+    policy = CHAMPION if arguments.only_fly else train(fresh_folder(arguments.work))
     report, text = evaluate(policy, FLIGHTS)
     print(text)
     percent = report["optimal"]["flying_lap_s"]["mean_percent_above"]

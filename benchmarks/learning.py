@@ -17,7 +17,7 @@ from baselines.purejaxrl_ppo.evaluate import race_many, start_keys
 from baselines.purejaxrl_ppo.flights import score
 from baselines.purejaxrl_ppo.train_ppo import train_policy
 from demo import NUM_EPISODES, NUM_LAPS, NUM_STEPS, identify
-from flytrack_env.files import write_atomically
+from flytrack_env.files import fresh_folder, write_atomically
 
 TARGET_SUCCESS = 0.95
 HEADER = (
@@ -52,10 +52,11 @@ def main() -> None:
     arguments = parser.parse_args()
     config = Config(total_timesteps=int(arguments.total_timesteps))
     config.check()
-    identify(arguments.black_box, arguments.out, seed=0)
+    out = fresh_folder(arguments.out)
+    identify(arguments.black_box, out, seed=0)
     successes, rows = [], []
     for seed in range(arguments.seeds):
-        success, row = measure_seed(seed, arguments.black_box, arguments.out, config)
+        success, row = measure_seed(seed, arguments.black_box, out, config)
         successes.append(success)
         rows.append(row)
         print(row, end="", flush=True)

@@ -12,7 +12,7 @@ from baselines.purejaxrl_ppo import Config
 from baselines.purejaxrl_ppo.training import Options, train_policy
 from benchmarks.env_speed import cpu_name, versions
 from benchmarks.flown import evaluate
-from flytrack_env.files import write_atomically
+from flytrack_env.files import fresh_folder, write_atomically
 
 ENV_IDS = {"robust": "FlyTrackRobust-v0", "plain": "FlyTrack-v0"}
 SEED = 0
@@ -31,13 +31,14 @@ def main() -> None:
     parser.add_argument("--work", type=Path, default=Path("runs/robustness"), help="folder of the trainings")
     parser.add_argument("--out", type=Path, default=Path("docs/results/robustness.md"))
     arguments = parser.parse_args()
+    work = fresh_folder(arguments.work)
     config = Config(total_timesteps=int(arguments.total_timesteps))
     rows, details, is_reached = "", "", True
     for name, env_id in ENV_IDS.items():
         started_s = time.process_time()
-        train_policy(arguments.work / name, config, SEED, env_id, options=Options())
+        train_policy(work / name, config, SEED, env_id, options=Options())
         cpu_s = time.process_time() - started_s
-        report, text = evaluate(arguments.work / name / "final.msgpack", FLIGHTS)
+        report, text = evaluate(work / name / "final.msgpack", FLIGHTS)
         success, lap_s = report["plants"]["success"], report["flying_lap_s"]["mean"]
         percent = report["optimal"]["flying_lap_s"]["mean_percent_above"]
         times = float("inf") if percent is None else 1.0 + percent / 100.0

@@ -17,7 +17,7 @@ from baselines.purejaxrl_ppo import Config
 from baselines.purejaxrl_ppo.evaluate import fly_many
 from baselines.purejaxrl_ppo.flights import Outcomes, outcomes_of, score
 from baselines.purejaxrl_ppo.train_ppo import train_policy
-from flytrack_env.files import write_atomically
+from flytrack_env.files import fresh_folder, write_atomically
 from flytrack_env.state import VELOCITY
 from flytrack_env.tracks import available_tracks, build_course, random_track, save_track, way_length
 
@@ -62,14 +62,15 @@ def main() -> None:
     arguments = parser.parse_args()
     config = Config(total_timesteps=int(arguments.total_timesteps))
     config.check()
+    out = fresh_folder(arguments.out)
     tracks: dict[str, str | Path] = {name: name for name in available_tracks()}
     for seed in RANDOM_SEEDS:
-        path = arguments.out / f"random_{seed}.toml"
+        path = out / f"random_{seed}.toml"
         save_track(path, random_track(seed))
         tracks[f"random_track({seed})"] = path
     rows = []
     for name, track in tracks.items():
-        rows.append(measure_track(name, track, arguments.seed, arguments.out, config))
+        rows.append(measure_track(name, track, arguments.seed, out, config))
         print(rows[-1], end="", flush=True)
     text = (
         "# Racing on every track\n\n"

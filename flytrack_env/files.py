@@ -1,5 +1,6 @@
 """Writing files so that nothing is lost: a reader sees the old file or the whole new one."""
 
+import itertools
 import os
 import secrets
 from pathlib import Path
@@ -24,3 +25,14 @@ def write_atomically(path: str | Path, content: bytes) -> None:
     except BaseException:
         temporary.unlink(missing_ok=True)
         raise
+
+
+def fresh_folder(path: Path) -> Path:
+    """Return a folder in which nothing is lost: the path if nothing is there, else ``path_2``, ``path_3``, ...
+
+    The folder is not made.
+    """
+    names = itertools.chain(
+        [path], (path.with_name(f"{path.name}_{number}") for number in itertools.count(2))
+    )
+    return next(name for name in names if not name.exists() or (name.is_dir() and not any(name.iterdir())))
