@@ -81,9 +81,9 @@ def main() -> None:
         print(rows.splitlines()[-1], flush=True)
     text = (
         "# Evaluation speed\n\n"
-        f"`python -m benchmarks.evaluation_speed CHECKPOINT --episodes {arguments.episodes} --seed "
-        f"{arguments.seed}`: {arguments.episodes:,} flights of {NUM_LAPS} laps from noisy starts, at most "
-        f"{NUM_STEPS} steps each, of a {checkpoint.env_id} policy on {checkpoint.track}. "
+        f"`python -m benchmarks.evaluation_speed {arguments.checkpoint} --episodes {arguments.episodes} "
+        f"--seed {arguments.seed}`: {arguments.episodes:,} flights of {NUM_LAPS} laps from noisy starts, at "
+        f"most {NUM_STEPS} steps each, of a {checkpoint.env_id} policy on {checkpoint.track}. "
         f"Aim: {AIM_FLIGHTS:,} flights in {AIM_S:g} s.\n\n" + HEADER + rows + "\n"
         f"{cpu_name()}, {pinned}; {', '.join(f'{name} {number}' for name, number in versions().items())}.\n"
     )

@@ -28,10 +28,7 @@ def write_atomically(path: str | Path, content: bytes) -> None:
 
 
 def fresh_folder(path: Path) -> Path:
-    """Return a folder in which nothing is lost: the path if nothing is there, else ``path_2``, ``path_3``, ...
-
-    The folder is not made.
-    """
+    """Return a folder that holds nothing yet: the path, else ``path_2``, ``path_3``, ...; it is not made."""
     names = itertools.chain(
         [path], (path.with_name(f"{path.name}_{number}") for number in itertools.count(2))
     )

@@ -27,7 +27,7 @@ class ConfigError(ValueError):
 class Config:
     """Hyperparameters of PPO; the defaults are the recipe for FlyTrack-v0 (docs/training.md)."""
 
-    total_timesteps: int = 12_000_000
+    total_timesteps: int = 20_000_000
     """Environment steps over all environments; rounded down to whole updates."""
     num_envs: int = 1024
     """Environments stepped side by side."""

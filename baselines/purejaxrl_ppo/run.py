@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from baselines.purejaxrl_ppo.training import Trainer
 
 Metrics = dict[str, np.ndarray]
+UNDEFINED = "explained_variance"  # where all returns are the same there is no variance to explain
 MOST_NAMES = 4  # of what is not finite: where one is, most soon are
 
 
@@ -215,7 +216,9 @@ def mean_last_return(runner: Runner) -> float:
 
 
 def find_not_finite(chunk: Chunk) -> list[str]:
-    """Return the names of metrics and parameters that are not finite after a chunk."""
-    metrics = [name for name, row in chunk.metrics.items() if not np.isfinite(row).all()]
+    """Return the names of metrics and parameters that are not finite after a chunk, and should be."""
+    metrics = [
+        name for name, row in chunk.metrics.items() if name != UNDEFINED and not np.isfinite(row).all()
+    ]
     arrays = as_named_arrays(chunk.runner.train_state.params)
     return metrics + [name for name, array in arrays.items() if not np.isfinite(array).all()]
