@@ -80,5 +80,5 @@ def draw_position_density(
     axes.set(xlabel="x (m)", ylabel="y (m)", aspect="equal")
     axes.set_title("Position density: " + ", ".join(filter(None, parts)))
     content = io.BytesIO()
-    figure.savefig(content, format="png", dpi=120)
+    figure.savefig(content, format="png", dpi=100)
     write_atomically(path, content.getvalue())

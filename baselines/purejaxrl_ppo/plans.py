@@ -16,7 +16,7 @@ from flytrack_env.model_file import model_from_json
 MAX_SEED = 2**31
 DEFAULT_OUT = Path("runs/train")
 DEFAULT_ENV_ID, DEFAULT_TRACK = "FlyTrack-v0", "flytrack"
-DEFAULTS = Options(checkpoint_every=1_000_000, evaluate_every=2_000_000)
+DEFAULTS = Options(checkpoint_every=1_000_000, evaluate_every=4_000_000)
 
 
 class Plan(NamedTuple):
