@@ -212,3 +212,20 @@ def coasting_envs(
         return FlyTrack(track=path, plant=coasting, missed_gate=missed_gate)
 
     return build
+
+
+@pytest.fixture(scope="module")
+def trainer() -> Any:
+    """The small trainer of the baseline's tests, compiled once for a process."""
+    from tests.ppo_runs import make_trainer
+
+    return make_trainer()
+
+
+@pytest.fixture(scope="module")
+def whole(trainer: Any, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, np.ndarray]]:
+    """A training run that nothing cut off: its folder and its metrics."""
+    from tests.ppo_runs import EVERY_OTHER_UPDATE, SEED
+
+    out = tmp_path_factory.mktemp("whole")
+    return out, trainer.train(out, SEED, EVERY_OTHER_UPDATE)[1]

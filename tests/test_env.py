@@ -1,4 +1,4 @@
-"""The environment as a gymnax client sees it: episodes, flags, observations, laps, gradients."""
+"""The environment as a gymnax client sees it: episodes, flags, observations."""
 
 import copy
 import pickle
@@ -12,12 +12,13 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from flytrack_env.env import EnvParams, EnvState, FlyTrack
+from flytrack_env.env import EnvParams, FlyTrack
 from flytrack_env.model_file import ModelFileError
 from flytrack_env.observations import OBSERVATION, OBSERVATION_SIZE
 from flytrack_env.state import Action, pack
 from flytrack_env.tracks import TrackError, load_track
 from flytrack_env.wrappers import LegacyStep
+from tests.trees import assert_close, stack
 
 CAUSES = ("crash", "ground", "out_of_bounds", "missed_gate", "battery_empty")
 INFO_KEYS = {
@@ -31,20 +32,6 @@ INFO_KEYS = {
     "truncated",
     "final_observation",
 }
-SPEED = 20.0
-YAW_180 = (0.0, 0.0, 0.0, 1.0)
-
-
-def stack(trees: list[Any]) -> Any:
-    """Return a batch of equal trees."""
-    return jax.tree.map(lambda *leaves: jnp.stack([jnp.asarray(x) for x in leaves]), *trees)
-
-
-def assert_close(a: Any, b: Any, tolerance: float = 1e-5) -> None:
-    """Compare two trees leaf by leaf."""
-    assert jax.tree.structure(a) == jax.tree.structure(b)
-    for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True):
-        np.testing.assert_allclose(x, y, rtol=tolerance, atol=tolerance)
 
 
 @pytest.fixture(scope="module")
@@ -438,126 +425,6 @@ def test_observation_is_clipped_to_its_range(env: FlyTrack, params: EnvParams, m
     limits = np.asarray(env.observation_space(params).high)
     rows, signs = np.array([0, 1, 3, 18, 19, 22]), np.array([-1, 1, -1, 1, -1, 1])
     np.testing.assert_allclose(observation[rows], signs * limits[rows])
-
-
-# --- Laps, with a plant on rails ----------------------------------------------------------------
-
-
-@pytest.fixture(scope="module")
-def rails(make_railway: Any) -> tuple[FlyTrack, Any]:
-    """The shipped course with a plant on rails straight through every gate, and the rails."""
-    corners = []
-    for gate in load_track("flytrack").gates:
-        axes = Rotation.from_quat(gate.quaternion, scalar_first=True).as_matrix()
-        forward = gate.direction * axes[:, 1]
-        corners += [gate.position - forward, gate.position + forward]
-    railway = make_railway(np.array(corners), SPEED)
-    return FlyTrack(plant=railway, missed_gate="fly_on"), railway
-
-
-NUM_LAPS = 5
-FIRST_GATES = (0, 3, 7)
-
-
-@pytest.fixture(scope="module")
-def laps(rails: tuple[FlyTrack, Any], rollout: Any, make_drone: Any) -> Any:
-    """Outputs of a little over five laps from before each of the first gates."""
-    env, railway = rails
-    params = env.default_params.replace(max_steps_in_episode=100_000)
-    states = stack([env.begin(make_drone(railway.corners[2 * gate]), gate, params) for gate in FIRST_GATES])
-    num_steps = int((NUM_LAPS + 0.1) * railway.arcs[-1] / SPEED / 0.01)
-    actions = jnp.zeros((num_steps, len(FIRST_GATES), 4))
-    return rollout(env, jax.random.key(0), states, actions, params)[1]
-
-
-def test_laps_are_counted_from_wherever_the_episode_began(laps: Any) -> None:
-    _, states, _, terminated, truncated, info = laps
-    assert not (terminated | truncated).any()
-    np.testing.assert_array_equal(info["laps"][-1], NUM_LAPS)
-    np.testing.assert_array_equal(info["lap_completed"].sum(axis=0), NUM_LAPS)
-    gates = np.asarray(info["gates_passed"])
-    np.testing.assert_array_equal(gates // 8, info["laps"])
-    assert (np.diff(gates, axis=0) >= 0).all() and (np.diff(gates, axis=0) <= 1).all()
-    np.testing.assert_array_equal(states.race.gate_index, (gates + np.array(FIRST_GATES)) % 8)
-
-
-def test_lap_times_are_interpolated_at_the_crossing(laps: Any, rails: tuple[FlyTrack, Any]) -> None:
-    info, (_, railway) = laps[5], rails
-    length = railway.arcs[-1]
-    done = np.asarray(info["lap_completed"])
-    times = np.asarray(info["lap_time_s"])
-    for column, gate in enumerate(FIRST_GATES):
-        lap_times = times[done[:, column], column]
-        # The first lap ends a metre behind the corner before the last of the eight gates.
-        entries = railway.arcs[:-1:2]
-        first = (entries[gate - 1] - entries[gate]) % length + 1.0
-        np.testing.assert_allclose(lap_times[0], first / SPEED, atol=1e-3)
-        np.testing.assert_allclose(lap_times[1:], length / SPEED, atol=1e-3)
-        assert not times[: np.argmax(done[:, column]), column].any()
-
-
-def test_steps_with_two_seeds_of_the_same_rails_agree(rails: tuple[FlyTrack, Any], make_drone: Any) -> None:
-    env, railway = rails
-    state = env.begin(make_drone(railway.corners[0]), 0, env.default_params)
-    outputs = [env.step(jax.random.key(i), state, jnp.zeros(4)) for i in range(2)]
-    assert_close(outputs[0], outputs[1], 0.0)
-
-
-# --- Gradients ----------------------------------------------------------------------------------
-
-
-def differentiable(env: FlyTrack, state: EnvState, params: EnvParams) -> Callable[..., Any]:
-    """Return a smooth scalar of observation and next state, as a function of action and speed."""
-
-    @jax.jit
-    def scalar(action: jax.Array, speed: jax.Array) -> jax.Array:
-        drone = env.drone(state)
-        plant = state.plant._replace(drone=drone._replace(vel_w=drone.vel_w._replace(y=speed)))
-        observation, after, *_ = env.step_env(None, state._replace(plant=plant), action, params)
-        return jnp.sum(observation**2) + sum(leaf**2 for leaf in jax.tree.leaves(after.plant))
-
-    return scalar
-
-
-def test_transition_gradients_are_detached_unless_asked_for(
-    env: FlyTrack, params: EnvParams, make_drone: Any
-) -> None:
-    attached = env.with_transition_gradients()
-    assert env.supports_transition_gradients and not env.transition_gradients_enabled
-    action, speed = np.array([0.2, -0.3, 0.4, 0.1]), np.array(1.5)
-    with jax.enable_x64(True):
-        state = env.begin(make_drone((15.0, 2.5, 1.0), (-5.0, 1.0, 0.5)), 0, params)
-        state = jax.tree.map(lambda leaf: leaf.astype(float) if leaf.dtype == jnp.float32 else leaf, state)
-        detached = jax.grad(differentiable(env, state, params), argnums=(0, 1))(action, speed)
-        scalar = differentiable(attached, state, params)
-        gradient = jax.grad(scalar, argnums=(0, 1))(action, speed)
-        shifts = 1e-6 * np.eye(4)
-        numeric = [(scalar(action + s, speed) - scalar(action - s, speed)) / 2e-6 for s in shifts]
-        slope = (scalar(action, speed + 1e-6) - scalar(action, speed - 1e-6)) / 2e-6
-    assert not np.asarray(detached[0]).any() and not np.asarray(detached[1]).any()
-    np.testing.assert_allclose(gradient[0], numeric, rtol=1e-4, atol=1e-5)
-    np.testing.assert_allclose(gradient[1], slope, rtol=1e-4, atol=1e-5)
-    assert np.abs(numeric).min() > 1e-6
-
-
-def test_gradients_of_a_flight_and_its_rewards_are_finite(
-    env: FlyTrack, params: EnvParams, make_drone: Any
-) -> None:
-    attached = env.with_transition_gradients()
-    state = env.begin(make_drone((18.6, 2.0, 1.0), quat=YAW_180), 0, params)
-
-    @jax.jit
-    @jax.grad
-    def gradient(actions: jax.Array) -> jax.Array:
-        def one(state: EnvState, action: jax.Array) -> tuple[EnvState, jax.Array]:
-            _, state, reward, *_ = attached.step_env(None, state, action, params)
-            return state, reward
-
-        return jax.lax.scan(one, state, actions)[1].sum()
-
-    value = np.asarray(gradient(jnp.full((50, 4), 0.1)))
-    assert np.isfinite(value).all()
-    assert (np.abs(value[0]) > 0.0).all()
 
 
 # --- Wrapper for clients of five values ---------------------------------------------------------

@@ -1,17 +1,18 @@
 """The command of the training: what it takes up again, of which seeds, and how it ends."""
 
+import re
 import shutil
 import sys
 
 import pytest
 
+from baselines.purejaxrl_ppo import load_checkpoint, tracking, train_ppo
 from baselines.purejaxrl_ppo import plans as plans_module
-from baselines.purejaxrl_ppo import tracking, train_ppo
 from baselines.purejaxrl_ppo.options import OPTIONS, read_options, write_options
-from baselines.purejaxrl_ppo.resume import newest_intact, seeds_in
+from baselines.purejaxrl_ppo.resume import check_same_run, describe_run, newest_intact, seeds_in
 from baselines.purejaxrl_ppo.run import DivergedError
 from baselines.purejaxrl_ppo.training import Options
-from tests.ppo_runs import DEAD_URI, EVERY_OTHER_UPDATE, SEED, make_trainer
+from tests.ppo_runs import CONFIG, DEAD_URI, EVERY_OTHER_UPDATE, SEED, make_trainer
 
 
 def parse(*arguments):
@@ -125,3 +126,68 @@ def test_only_errors_of_arguments_show_the_usage(tmp_path, monkeypatch, capsys):
     assert call(monkeypatch, "--out", tmp_path, "--no-tracking", "--tracking-uri", DEAD_URI) == 2
     usage, error = capsys.readouterr().err.splitlines()
     assert usage == "usage: train_ppo [options]" and "not allowed with" in error
+
+
+# What is taken from the checkpoint.
+
+
+def plans_of(*arguments):
+    return train_ppo.make_plans(parse(*arguments))
+
+
+def test_resuming_takes_from_the_checkpoint_what_is_not_given(whole, tmp_path):
+    arguments = train_ppo.make_parser().parse_args(["--resume", str(whole[0])])
+    (plan,) = train_ppo.make_plans(arguments)
+    assert (plan.seed, plan.out, plan.resume) == (SEED, whole[0], whole[0] / "final.msgpack")
+    found = train_ppo.make_trainer(arguments, plan.checkpoint)
+    assert found.config == CONFIG and found.env_id == "FlyTrackRobust-v0"
+    check_same_run(
+        plan.resume,
+        plan.checkpoint,
+        describe_run(found.env, found.env_id, found.track, found.config, plan.seed),
+    )
+    assert plans_of("--resume", whole[0], "--out", tmp_path)[0].out == tmp_path
+
+
+def test_resuming_keeps_the_reward_that_was_trained_for(whole):
+    checkpoint = load_checkpoint(whole[0] / "final.msgpack")
+    checkpoint.meta["environment"]["reward.off_centre"] = -0.25
+    parser = train_ppo.make_parser()
+    kept = train_ppo.make_trainer(parser.parse_args(["--resume", "x"]), checkpoint)
+    asked = train_ppo.make_trainer(parser.parse_args(["--reward", "off_centre=-0.5"]), checkpoint)
+    assert kept.env.default_params.reward.off_centre == -0.25
+    assert asked.env.default_params.reward.off_centre == -0.5
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--learning-rate", "0.1"], r"config\.learning_rate: found 0\.003, expected 0\.1$"),
+        (["--seed", "4"], r"seed: found 3, expected 4$"),
+        (["--track", "split_s"], r"track_data\.name: found 'flytrack', expected 'split_s'"),
+    ],
+)
+def test_resuming_with_other_settings_is_refused(whole, tmp_path, arguments, message, monkeypatch, capsys):
+    common = ["--resume", str(whole[0]), "--no-tracking", "--out", str(tmp_path / "out")]
+    monkeypatch.setattr(sys, "argv", ["train_ppo", *common, *arguments])
+    with pytest.raises(SystemExit):
+        train_ppo.main()
+    assert re.search(message, capsys.readouterr().err.strip())
+    assert not (tmp_path / "out").exists()
+
+
+def test_every_seed_of_several_has_its_folder(whole, tmp_path):
+    shutil.copytree(whole[0], tmp_path / "seed1")
+    plans = plans_of("--seed", 0, "--num-seeds", 2, "--resume", tmp_path)
+    assert [(plan.seed, plan.out, plan.resume) for plan in plans] == [
+        (0, tmp_path / "seed0", None),
+        (1, tmp_path / "seed1", tmp_path / "seed1" / "final.msgpack"),
+    ]
+    with pytest.raises(ValueError, match="seed1 holds the checkpoints of a run"):
+        plans_of("--num-seeds", 2, "--out", tmp_path)
+    with pytest.raises(ValueError, match="holds the checkpoints of a run"):
+        plans_of("--out", whole[0])
+    with pytest.raises(ValueError, match=r"--resume: found .*final\.msgpack, expected the folder"):
+        plans_of("--num-seeds", 2, "--resume", whole[0] / "final.msgpack")
+    with pytest.raises(ValueError, match="--num-seeds: found 0"):
+        plans_of("--num-seeds", 0)

@@ -16,14 +16,9 @@ from baselines.purejaxrl_ppo.checkpoint import Checkpoint
 from baselines.purejaxrl_ppo.resume import check_same_run, newest_intact, warn_of_other_bits
 from baselines.purejaxrl_ppo.run import DivergedError
 from baselines.purejaxrl_ppo.training import Options
-from tests.ppo_runs import BATCH, DEAD_URI, EVERY_OTHER_UPDATE, SEED, make_trainer
+from tests.ppo_runs import BATCH, DEAD_URI, EVERY_OTHER_UPDATE, SEED
 
 EVALUATED = EVERY_OTHER_UPDATE._replace(evaluate_every=2 * BATCH, evaluation_episodes=2)
-
-
-@pytest.fixture(scope="module")
-def trainer():
-    return make_trainer()
 
 
 @pytest.fixture
