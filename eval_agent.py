@@ -21,19 +21,18 @@ from baselines.purejaxrl_ppo.flights import Flight, Outcomes, outcomes_of, save_
 from baselines.purejaxrl_ppo.perturbed import Plants, draw_plants, with_model_as_given
 from baselines.purejaxrl_ppo.report import describe, describe_report, lap_times, reason_ended
 from baselines.purejaxrl_ppo.summary import summarise
-from benchmarks.optimal import ReferenceFileError
-from benchmarks.optimal.ghost import (
-    References,
-    compare,
-    ghost_rollout,
-    is_model_of,
-    shipped_references,
-    time_lost,
-)
+from benchmarks.optimal.compared import compare, time_lost
 from flytrack_env import EnvParams, blackbox
 from flytrack_env.episodes import EpisodicEnvironment
 from flytrack_env.files import write_atomically
 from flytrack_env.model_file import model_from_json
+from flytrack_env.references import (
+    ReferenceFileError,
+    References,
+    ghost_rollout,
+    is_model_of,
+    shipped_references,
+)
 from flytrack_env.rollout import save_rollout
 
 SHIPPED_BLACK_BOX = Path(__file__).parent / "blackbox" / "acro_step.bin"

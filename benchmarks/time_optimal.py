@@ -16,7 +16,11 @@ import jax.numpy as jnp
 import numpy as np
 
 import eval_agent
-from benchmarks.optimal.reference import (
+from benchmarks.optimal.replay import Replay, replay
+from flytrack_env import FlyTrack, ModelParameters, Track, available_tracks, blackbox, load_model, load_track
+from flytrack_env import nominal_parameters as nominal
+from flytrack_env.dynamics import SECONDS_PER_MINUTE, step
+from flytrack_env.references import (
     FOLDER,
     KINDS,
     Reference,
@@ -25,10 +29,6 @@ from benchmarks.optimal.reference import (
     save_reference,
     track_digest,
 )
-from benchmarks.optimal.replay import Replay, replay
-from flytrack_env import FlyTrack, ModelParameters, Track, available_tracks, blackbox, load_model, load_track
-from flytrack_env import nominal_parameters as nominal
-from flytrack_env.dynamics import SECONDS_PER_MINUTE, step
 from flytrack_env.resets import STILL_THRUST
 from flytrack_env.state import (
     ACTION_SIZE,

@@ -1,7 +1,9 @@
 """Rollout files: the states and actions of one flight as a plain numeric ``.npy``.
 
-A row is one step, ``[x (21) | u (4)]``, laid out and in the units of ``flytrack_env.state``. Files
-are read without unpickling, so that a rollout from a stranger cannot run code.
+A row is one step, ``[x (21) | u (4)]``, laid out and in the units of ``flytrack_env.state``; that is
+what is written. Read are also rows of 22, which have of the applied action the thrust only, and, where the
+caller allows it, pickled arrays of (x, u) pairs, such as the handout's. Nothing else is unpickled, so that
+a rollout from a stranger cannot run code.
 """
 
 import io
@@ -15,10 +17,12 @@ from numpy.lib import format as npy_format
 from numpy.typing import ArrayLike
 
 from flytrack_env.files import write_atomically
-from flytrack_env.state import ACTION_SIZE, STATE_SIZE
+from flytrack_env.state import ACTION_SIZE, APPLIED_ACTION, STATE_SIZE
 
 ROW_SIZE = STATE_SIZE + ACTION_SIZE
-EXPECTED = f"a plain numeric array of shape (T, {ROW_SIZE}) with T >= 1"
+SHORT_ROW_SIZE = ROW_SIZE - 3
+EXPECTED = f"a plain numeric array of shape (T, {ROW_SIZE}) or (T, {SHORT_ROW_SIZE}) with T >= 1"
+PICKLED = "read only if pickles are allowed, as unpickling runs what the file holds"
 
 
 class RolloutError(ValueError):
@@ -46,26 +50,37 @@ def save_rollout(path: str | Path, states: ArrayLike, actions: ArrayLike) -> Non
     write_atomically(path, content.getvalue())
 
 
-def load_rollout(path: str | Path) -> tuple[np.ndarray, np.ndarray]:
+def load_rollout(path: str | Path, allow_pickle: bool = False) -> tuple[np.ndarray, np.ndarray]:
     """Return the states (T, 21) and the actions (T, 4) of a rollout file, float32.
 
+    The roll, pitch and yaw that were applied are NaN where the file does not have them: in rows of 22.
+    allow_pickle: also read files of pickled objects, which runs whatever code they hold: only for files
+    from those you trust.
+
     Raises:
-        RolloutError: missing file, not an ``.npy``, pickled objects, another shape, no steps, a
-            file cut short, or a number that is not finite.
+        RolloutError: missing file, not an ``.npy``, pickled objects unless allowed, another shape, no
+            steps, a file cut short, or a number that is not finite.
     """
     path = Path(path)
     try:
         with path.open("rb") as file:
-            _check_header(path, file)
-            rows = np.load(file, allow_pickle=False)
+            is_pickled = _check_header(path, file, allow_pickle)
+            rows = np.load(file, allow_pickle=is_pickled)
     except OSError as error:
         raise RolloutError(f"{path}: cannot be read: {error}; expected {EXPECTED}") from error
-    rows = _as_rows(path, rows)
+    except Exception as error:  # whatever unpickling raises
+        if isinstance(error, RolloutError) or not allow_pickle:
+            raise
+        said = f"{type(error).__name__}: {error}"
+        raise RolloutError(f"{path}: cannot be unpickled: {said}; expected {EXPECTED}") from error
+    if is_pickled:
+        rows = _rows_of_pairs(path, rows)
+    rows = _widened(_as_rows(path, rows))
     return rows[:, :STATE_SIZE], rows[:, STATE_SIZE:]
 
 
-def _check_header(path: Path, file: BinaryIO) -> None:
-    """Refuse, before any data is read, a file whose header does not announce a rollout."""
+def _check_header(path: Path, file: BinaryIO, allow_pickle: bool) -> bool:
+    """Return whether the file is pickled; refuse, before any data is read, what announces no rollout."""
     try:
         version = npy_format.read_magic(file)
         is_first = version == (1, 0)
@@ -73,10 +88,13 @@ def _check_header(path: Path, file: BinaryIO) -> None:
         shape, _, dtype = read(file)
     except ValueError as error:
         raise RolloutError(f"{path}: not an .npy file: {error}; expected {EXPECTED}") from error
+    if dtype.hasobject and allow_pickle:
+        file.seek(0)
+        return True
     if dtype.kind not in "fiu":
-        found = "an object array (pickled)" if dtype.hasobject else f"an array of {dtype}"
+        found = f"an object array (pickled; {PICKLED})" if dtype.hasobject else f"an array of {dtype}"
         raise RolloutError(f"{path}: found {found}, expected {EXPECTED}")
-    if len(shape) != 2 or shape[1] != ROW_SIZE or shape[0] == 0:
+    if len(shape) != 2 or shape[1] not in (ROW_SIZE, SHORT_ROW_SIZE) or shape[0] == 0:
         raise RolloutError(f"{path}: found shape {shape}, expected {EXPECTED}")
     announced = math.prod(shape) * dtype.itemsize
     found_bytes = os.fstat(file.fileno()).st_size - file.tell()
@@ -84,10 +102,40 @@ def _check_header(path: Path, file: BinaryIO) -> None:
         reason = f"found {found_bytes} bytes of data, expected {announced} for shape {shape}"
         raise RolloutError(f"{path}: cut short: {reason}")
     file.seek(0)
+    return False
+
+
+def _rows_of_pairs(path: Path, pairs: np.ndarray) -> np.ndarray:
+    """Return the rows (T, 25) or (T, 22) of an unpickled list of (x, u) pairs."""
+    sizes = {ROW_SIZE: STATE_SIZE, SHORT_ROW_SIZE: SHORT_ROW_SIZE - ACTION_SIZE}
+    expected = " or ".join(f"x ({size},) and u ({ACTION_SIZE},)" for size in sizes.values())
+    if np.ndim(pairs) not in (1, 2) or len(pairs) == 0:
+        raise RolloutError(f"{path}: found objects of shape {np.shape(pairs)}, expected pairs of {expected}")
+    rows: list[np.ndarray] = []
+    for step, pair in enumerate(pairs):
+        try:
+            x, u = (np.asarray(part, float) for part in pair)
+        except (TypeError, ValueError) as error:
+            raise RolloutError(f"{path}: step {step}: {error}; expected a pair of {expected}") from error
+        size = sizes.get(len(rows[0])) if rows else x.size
+        if u.shape != (ACTION_SIZE,) or x.shape != (size,) or size not in sizes.values():
+            found = f"shapes {x.shape} and {u.shape}"
+            raise RolloutError(f"{path}: step {step}: found {found}, expected {expected}, alike in all steps")
+        rows.append(np.concatenate([x, u]))
+    return np.array(rows)
+
+
+def _widened(rows: np.ndarray) -> np.ndarray:
+    """Return rows (T, 25) of rows that may lack the applied roll, pitch and yaw, which then are NaN."""
+    if rows.shape[1] == ROW_SIZE:
+        return rows
+    missing = np.full((len(rows), ROW_SIZE - SHORT_ROW_SIZE), np.nan, np.float32)
+    before = APPLIED_ACTION.start
+    return np.concatenate([rows[:, :before], missing, rows[:, before:]], axis=1)
 
 
 def _as_rows(path: Path, rows: np.ndarray) -> np.ndarray:
-    """Return rows (T, 25) as contiguous float32, all finite."""
+    """Return rows as contiguous float32, all finite."""
     # A double too large for float32 becomes inf, which the check below reports in words.
     with np.errstate(over="ignore"):
         rows = np.ascontiguousarray(rows, np.float32)

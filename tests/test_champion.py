@@ -9,10 +9,9 @@ from baselines.purejaxrl_ppo import load_checkpoint
 from baselines.purejaxrl_ppo.evaluate import race_many, start_keys
 from baselines.purejaxrl_ppo.flights import score
 from benchmarks.champion import AIM, CHAMPION, MODEL
-from benchmarks.optimal import shipped_reference
-from benchmarks.optimal.reference import model_digest
 from flytrack_env import load_model
 from flytrack_env.model_file import model_from_json
+from flytrack_env.references import model_digest, shipped_reference
 
 MOST_BYTES = 100_000
 NUM_FLIGHTS, NUM_STEPS, NUM_LAPS = 32, 2500, 3

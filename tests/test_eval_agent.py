@@ -26,13 +26,13 @@ from baselines.purejaxrl_ppo.perturbed import (
 )
 from baselines.purejaxrl_ppo.resume import describe_run
 from baselines.purejaxrl_ppo.summary import distribution, share, summarise
-from benchmarks.optimal import shipped_reference
-from benchmarks.optimal.ghost import compare, ghost_rollout, shipped_references, time_lost
+from benchmarks.optimal.compared import compare, time_lost
 from flytrack_env import FlyTrack, load_track, make, nominal_parameters, save_track
 from flytrack_env.dynamics import ModelParameters
 from flytrack_env.effects import CommandDelay, LinearDrag, QuadraticDrag, ThrustScale
 from flytrack_env.plants import Simulator
 from flytrack_env.quaternion import Scalar, Vec3
+from flytrack_env.references import ghost_rollout, shipped_reference, shipped_references
 from flytrack_env.rollout import load_rollout
 from flytrack_env.state import BATTERY, BATTERY_FULL_V, POSITION, VELOCITY, Action, Drone
 from flytrack_env.tracks import random_track

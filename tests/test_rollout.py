@@ -81,13 +81,96 @@ BAD_FILES = {
     "objects": (npy_bytes(np.array([[None, None]] * 3, object)), "found an object array"),
     "text array": (npy_bytes(np.full((3, 25), "a")), "found an array of <U1"),
     "complex": (npy_bytes(np.zeros((3, 25), complex)), "found an array of complex128"),
-    "older layout": (npy_bytes(np.zeros((3, 22))), r"found shape \(3, 22\), expected .*\(T, 25\)"),
+    "other layout": (
+        npy_bytes(np.zeros((3, 23))),
+        r"found shape \(3, 23\), expected .*\(T, 25\) or \(T, 22\)",
+    ),
+    "short row with nan": (npy_bytes(np.full((3, 22), np.nan)), "found nan at step 0, column 0"),
     "one row": (npy_bytes(np.zeros(25)), r"found shape \(25,\)"),
     "no steps": (npy_bytes(np.zeros((0, 25))), r"found shape \(0, 25\), expected .*T >= 1"),
     "nan": (npy_bytes(rows_with(np.nan)), "found nan at step 1, column 9, expected finite"),
     "inf": (npy_bytes(rows_with(np.inf)), "found inf at step 1"),
     "beyond float32": (npy_bytes(rows_with(1e300)), "found inf at step 1"),
 }
+
+
+def test_short_rows_are_read_and_what_they_lack_is_a_gap(tmp_path):
+    """[position, velocity, acceleration, quaternion, rates, previous thrust, battery | u]."""
+    states, actions = make_flight(6)
+    short = np.hstack([states[:, :16], states[:, 19:], actions])
+    assert short.shape == (6, 22)
+    np.save(tmp_path / "flight.npy", short)
+    read_states, read_actions = load_rollout(tmp_path / "flight.npy")
+    assert np.isnan(read_states[:, 16:19]).all()
+    states[:, 16:19] = np.nan
+    np.testing.assert_array_equal(read_states, states)
+    np.testing.assert_array_equal(read_actions, actions)
+
+
+def pickled(form: str, size: int, steps: int = 5) -> np.ndarray:
+    """Return a flight as the handout's object arrays, (T, 2) or a list of pairs."""
+    states, actions = make_flight(steps)
+    if size == 18:
+        states = np.delete(states, (16, 17, 18), axis=1)
+    pairs = np.empty((steps, 2) if form == "columns" else steps, object)
+    for step, pair in enumerate(zip(states, actions, strict=True)):
+        pairs[step] = pair
+    return pairs
+
+
+@pytest.mark.parametrize("size", [21, 18])
+@pytest.mark.parametrize("form", ["columns", "pairs"])
+def test_pickled_pairs_are_read_only_where_allowed(tmp_path, form, size):
+    path = tmp_path / "flight.npy"
+    np.save(path, pickled(form, size), allow_pickle=True)
+    with pytest.raises(RolloutError, match=r"object array \(pickled; read only if"):
+        load_rollout(path)
+    states, actions = make_flight(5)
+    if size == 18:
+        states[:, 16:19] = np.nan
+    read_states, read_actions = load_rollout(path, allow_pickle=True)
+    np.testing.assert_array_equal(read_states, states)
+    np.testing.assert_array_equal(read_actions, actions)
+
+
+def test_plain_files_are_read_alike_where_pickles_are_allowed(tmp_path):
+    states, actions = make_flight(4)
+    save_rollout(tmp_path / "flight.npy", states, actions)
+    read = load_rollout(tmp_path / "flight.npy", allow_pickle=True)
+    np.testing.assert_array_equal(np.hstack(read), np.hstack([states, actions]))
+
+
+def objects(*pairs: object) -> np.ndarray:
+    array = np.empty(len(pairs), object)
+    array[:] = pairs
+    return array
+
+
+class Unreadable:
+    """Cannot be unpickled."""
+
+    def __reduce__(self):
+        return (int, ("no number",))
+
+
+GOOD_PAIR = (np.zeros(21), np.zeros(4))
+BAD_OBJECTS = {
+    "no pairs": (np.empty((0, 2), object), "found objects of shape"),
+    "other state": (objects((np.zeros(17), np.zeros(4))), r"step 0: found shapes \(17,\) and \(4,\)"),
+    "two kinds": (objects(GOOD_PAIR, (np.zeros(18), np.zeros(4))), "step 1: .*alike in all steps"),
+    "no pair": (objects(GOOD_PAIR, None), "step 1: .*expected a pair"),
+    "words": (objects(("a", "b")), "step 0: .*expected a pair"),
+    "nan": (objects((np.full(21, np.nan), np.zeros(4))), "found nan at step 0"),
+    "broken": (objects((Unreadable(), 0)), "cannot be unpickled: ValueError"),
+}
+
+
+@pytest.mark.parametrize("case", BAD_OBJECTS)
+def test_bad_pickled_objects_are_refused(tmp_path, case):
+    content, reason = BAD_OBJECTS[case]
+    np.save(tmp_path / "flight.npy", content, allow_pickle=True)
+    with pytest.raises(RolloutError, match=reason):
+        load_rollout(tmp_path / "flight.npy", allow_pickle=True)
 
 
 @pytest.mark.parametrize("case", BAD_FILES)

@@ -11,7 +11,13 @@ import numpy as np
 import pytest
 
 from benchmarks import time_optimal
-from benchmarks.optimal import (
+from benchmarks.optimal.replay import replay
+from flytrack_env import Track, available_tracks, load_track, nominal_parameters
+from flytrack_env.dynamics import ModelParameters, step
+from flytrack_env.effects import EFFECTS, CommandDelay, GyroBias, RateSlewLimit
+from flytrack_env.quaternion import Vec3
+from flytrack_env.references import (
+    FOLDER,
     KINDS,
     Reference,
     ReferenceFileError,
@@ -22,12 +28,6 @@ from benchmarks.optimal import (
     shipped_reference,
     track_digest,
 )
-from benchmarks.optimal.reference import FOLDER
-from benchmarks.optimal.replay import replay
-from flytrack_env import Track, available_tracks, load_track, nominal_parameters
-from flytrack_env.dynamics import ModelParameters, step
-from flytrack_env.effects import EFFECTS, CommandDelay, GyroBias, RateSlewLimit
-from flytrack_env.quaternion import Vec3
 from flytrack_env.state import BATTERY, POSITION, QUATERNION, RATES, STATE_SIZE, VELOCITY
 from flytrack_env.tracks import build_course
 

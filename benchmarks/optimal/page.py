@@ -7,10 +7,10 @@ import numpy as np
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 
-from benchmarks.optimal.reference import Reference
 from benchmarks.optimal.replay import Replay
 from docs.draw_tracks import draw_gates, label_from_above
 from flytrack_env.files import write_atomically
+from flytrack_env.references import Reference
 from flytrack_env.state import POSITION, VELOCITY
 from flytrack_env.tracks import Track
 

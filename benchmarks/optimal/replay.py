@@ -7,11 +7,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from benchmarks.optimal.reference import Reference
 from flytrack_env import EnvParams, EnvState, FlyTrack, ModelParameters
 from flytrack_env.plants import Plant
 from flytrack_env.quaternion import Vec3
 from flytrack_env.race import Race
+from flytrack_env.references import Reference
 from flytrack_env.state import POSITION, pack, unpack, unpack_action
 from flytrack_env.terminations import Causes
 from flytrack_env.tracks import Track, cross_gate

@@ -14,14 +14,14 @@ from typing import Any
 
 import numpy as np
 
-from flytrack_env import ModelParameters
+from flytrack_env.dynamics import ModelParameters
 from flytrack_env.effects import BY_NAME
 from flytrack_env.files import write_atomically
 from flytrack_env.model_file import SIZES, model_as_json
 from flytrack_env.state import ACTION_SIZE, STATE_SIZE
 from flytrack_env.tracks import Track
 
-FOLDER = Path(__file__).parent.parent / "data" / "time_optimal"
+FOLDER = Path(__file__).parent
 KINDS = ("flying", "standing")
 FILE_VERSION = 1
 ARRAYS = ("states", "commands", "gate_times_s")

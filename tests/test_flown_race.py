@@ -1,0 +1,141 @@
+"""The race that a recorded flight flew: the environment's own counts, times, laps and end."""
+
+from dataclasses import replace
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from flytrack_env import FlyTrack, load_track
+from flytrack_env.flown_race import PADDED_TO, follow_race, why_ended
+from flytrack_env.references import ghost_rollout, shipped_references
+from flytrack_env.state import BATTERY, POSITION, VELOCITY, Action, unpack
+
+TRACK = load_track("flytrack")
+REFERENCES = shipped_references(TRACK, ("nominal",))
+
+
+def test_ghost_passes_every_gate_at_the_times_of_its_references():
+    states, _ = ghost_rollout(REFERENCES, 800)
+    passes = follow_race(states[:, POSITION], TRACK).passes
+    standing = REFERENCES["standing"]
+    assert [one.gate for one in passes] == [index % 8 for index in range(len(passes))]
+    times_s = [one.time_s for one in passes[:8]]
+    np.testing.assert_allclose(times_s, standing.gate_times_s, atol=2e-3)
+    assert [one.lap for one in passes[:9]] == [0] * 7 + [1, 0]
+    assert passes[7].lap_time_s == pytest.approx(passes[7].time_s, abs=1e-6)
+    second = passes[15]
+    assert second.lap == 2 and second.lap_time_s == pytest.approx(second.time_s - passes[7].time_s, abs=1e-5)
+    for one in passes:
+        centre, edge = TRACK.gates[one.gate].position, TRACK.gates[one.gate].opening
+        assert np.abs(one.pos_w - centre).max() < 0.5 * edge
+
+
+class Recorded:
+    """A plant that moves the drone along recorded states (T, 21), whatever it is told."""
+
+    def __init__(self, states: np.ndarray):
+        self.states = jnp.asarray(states, jnp.float32)
+
+    def reset(self, drone: Any, model: Any) -> Any:
+        return jnp.int32(0)
+
+    def step(self, state: Any, command: Any, dt: Any, model: Any) -> Any:
+        return state + 1
+
+    def drone(self, state: Any) -> Any:
+        return unpack(self.states[state])
+
+
+def fly_recorded(states: np.ndarray, first_gate: int) -> tuple[Any, Any]:
+    """Return the races at each state and the causes after each step, as the environment has them."""
+    env = FlyTrack(plant=Recorded(states), missed_gate="fly_on")
+    params = env.default_params
+    begun = env.begin(unpack(states[0]), first_gate, params)
+
+    def one(state: Any, _: Any) -> tuple[Any, Any]:
+        after, _, causes, events = env.transition(state, Action(0.0, 0.0, 0.0, 0.0), params)
+        return after, (after.race, causes._replace(missed_gate=events.is_miss))
+
+    _, (races, causes) = jax.jit(lambda: jax.lax.scan(one, begun, None, len(states) - 1))()
+    return jax.tree.map(lambda a, b: np.append(a, b), begun.race, races), jax.device_get(causes)
+
+
+@pytest.mark.parametrize("shift", [0.0, 0.5, 0.9, 2.0])
+def test_race_is_the_environments_number_by_number(shift):
+    """Flown aside by up to 2 m: gates are passed, touched and missed."""
+    states, _ = ghost_rollout(REFERENCES, 900)
+    states[:, POSITION] += np.linspace(0.0, 1.0, 900)[:, None] * (0.0, shift, 0.0)
+    found = follow_race(states[:, POSITION], TRACK, first_gate=0)
+    races, _ = fly_recorded(states, 0)
+    np.testing.assert_array_equal(found.gate, races.gate_index)
+    np.testing.assert_array_equal(found.laps, races.laps)
+    np.testing.assert_allclose(found.lap_time_s, races.lap_time_s, atol=1e-5)
+    np.testing.assert_allclose(found.lap_start_s, races.lap_start_s, atol=1e-5)
+    centres = np.stack(races.gate.centre, axis=-1)
+    distance = np.linalg.norm(states[:, POSITION] - centres, axis=1)
+    np.testing.assert_allclose(found.gate_distance_m, distance, rtol=1e-5)
+    assert len(found.passes) == races.gates_passed[-1]
+    assert shift < 2.0 or len(found.passes) < 17  # the ghost's, which flies on
+
+
+def test_flight_is_followed_from_the_gate_that_it_passes_first():
+    states, _ = ghost_rollout(REFERENCES, 900)
+    found = follow_race(states[200:, POSITION], TRACK)
+    assert [one.gate for one in found.passes[:3]] == [4, 5, 6]
+    assert found.gate[0] == 4
+
+
+def test_flight_that_passes_nothing_has_the_first_gate_ahead():
+    found = follow_race(np.zeros((5, 3)), TRACK)
+    assert found.passes == () and set(found.gate) == {0} and set(found.laps) == {0}
+    distance = np.linalg.norm(TRACK.gates[0].position)
+    np.testing.assert_allclose(found.gate_distance_m, distance, rtol=1e-6)
+
+
+@pytest.mark.parametrize("length", [1, 2, PADDED_TO, PADDED_TO + 1, PADDED_TO + 2])
+def test_padding_is_not_seen(length):
+    found = follow_race(np.zeros((length, 3)), TRACK)
+    assert {len(leaf) for leaf in found[:5]} == {length}
+
+
+def test_track_without_gates_is_refused():
+    with pytest.raises(ValueError, match="track: found no gates"):
+        follow_race(np.zeros((2, 3)), replace(TRACK, gates=()))
+
+
+def straight(start: tuple[float, ...], velocity: tuple[float, ...]) -> np.ndarray:
+    """Return the states (T, 21) of a flight along a line, 5 s."""
+    states, _ = ghost_rollout(REFERENCES, 500)
+    states[:, VELOCITY] = velocity
+    states[:, POSITION] = start + 0.01 * np.arange(500)[:, None] * np.array(velocity)
+    return states
+
+
+ENDS = {  # the first gate, at (12.5, 2, 1.35), is flown towards -x
+    "ground": ((15.0, 2.0, 1.35), (0.0, 0.0, -2.0)),
+    "out of bounds": ((15.0, 2.0, 1.35), (0.0, 0.0, 20.0)),
+    "crash": ((15.0, 3.0, 1.35), (-8.0, 0.0, 0.0)),
+    "missed gate": ((15.0, 4.0, 1.35), (-8.0, 0.0, 0.0)),
+}
+
+
+@pytest.mark.parametrize("end", ENDS)
+def test_end_is_told_as_the_environment_does(end):
+    """Cut where the environment ends a flight, the last state tells why."""
+    states = straight(*ENDS[end])
+    _, causes = fly_recorded(states, 0)
+    last = int(np.argmax(np.any(list(causes), axis=0)))
+    names = [name.replace("_", " ") for name, happened in causes._asdict().items() if happened[last]]
+    assert names == [end]
+    flown = states[: last + 1]
+    assert why_ended(flown, TRACK, follow_race(flown[:, POSITION], TRACK, 0)) == end
+
+
+def test_flight_that_goes_on_ended_when_its_steps_did():
+    states, _ = ghost_rollout(REFERENCES, 100)
+    assert why_ended(states, TRACK, follow_race(states[:, POSITION], TRACK)) == "all steps flown"
+    states[-1, BATTERY] = 21.9
+    assert why_ended(states, TRACK, follow_race(states[:, POSITION], TRACK)) == "battery empty"
