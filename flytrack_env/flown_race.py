@@ -67,11 +67,10 @@ def follow_race(positions: np.ndarray, track: Track, first_gate: int | None = No
     course = build_course(track)
     positions = np.asarray(positions, np.float32)
     num_steps = len(positions) - 1
-    # Standing still at the end passes nothing.
-    padding = max(PADDED_TO, math.ceil(num_steps / PADDED_TO) * PADDED_TO) - num_steps
-    padded = np.concatenate([positions, np.repeat(positions[-1:], padding, axis=0)])
     if first_gate is None:
-        first_gate = int(_first_passed(padded, course))
+        is_pass = gates_passed(positions, track)
+        first_gate = int(is_pass[is_pass.any(axis=1).argmax()].argmax()) if is_pass.any() else 0
+    padded = _padded(positions)
     followed, fractions = jax.tree.map(np.asarray, _follow(padded, np.int32(first_gate), course))
     followed = _Followed(*(leaf[: num_steps + 1] for leaf in followed))
     centres = np.stack(course.gates.centre, axis=-1)[followed.gate]
@@ -83,6 +82,21 @@ def follow_race(positions: np.ndarray, track: Track, first_gate: int | None = No
         lap_time_s=followed.lap_time_s,
         passes=_passes(followed, fractions[:num_steps], positions, len(track.gates)),
     )
+
+
+def gates_passed(positions: np.ndarray, track: Track) -> np.ndarray:
+    """Return which gates each step passes in the direction of flight, whatever their order.
+
+    positions: (T, 3), world, m. Returned: (T - 1, num_gates) bool.
+    """
+    is_pass = _passed(_padded(np.asarray(positions, np.float32)), build_course(track))
+    return np.asarray(is_pass)[: len(positions) - 1]
+
+
+def _padded(positions: np.ndarray) -> np.ndarray:
+    """Return positions (T, 3) with the last repeated: who stands still passes nothing."""
+    padding = max(1, math.ceil((len(positions) - 1) / PADDED_TO)) * PADDED_TO - len(positions) + 1
+    return np.concatenate([positions, np.repeat(positions[-1:], padding, axis=0)])
 
 
 def why_ended(states: np.ndarray, track: Track, race: FlownRace) -> str:
@@ -117,15 +131,12 @@ def _kept(race: Race) -> _Followed:
 
 
 @jax.jit
-def _first_passed(positions: jax.Array, course: Course) -> jax.Array:
-    """Return the index of the gate that is passed first, 0 if none is."""
-
+def _passed(positions: jax.Array, course: Course) -> jax.Array:
     def passes(gate: GateFrame, start_w: jax.Array, end_w: jax.Array) -> jax.Array:
         return cross_gate(gate, Vec3(*start_w), Vec3(*end_w), DRONE_RADIUS_M).is_pass
 
     of_gates = jax.vmap(passes, in_axes=(0, None, None))
-    is_pass = jax.vmap(of_gates, in_axes=(None, 0, 0))(course.gates, positions[:-1], positions[1:])
-    return jnp.argmax(is_pass[jnp.argmax(is_pass.any(axis=1))])
+    return jax.vmap(of_gates, in_axes=(None, 0, 0))(course.gates, positions[:-1], positions[1:])
 
 
 @jax.jit

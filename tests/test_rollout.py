@@ -230,7 +230,7 @@ def test_bad_arrays_are_not_written(tmp_path, states, actions, reason):
 
 def test_rollout_is_recorded_from_the_command_line(tmp_path, capsys):
     pytest.importorskip("rerun", reason="rerun-sdk is not installed (extra flytrack[viz])")
-    viz = importlib.import_module("flytrack_env.viz_rerun")
+    viz = importlib.import_module("flytrack_env.viz_rerun.command")
     rollout, out = tmp_path / "flight.npy", tmp_path / "new" / "flight.rrd"
     states, actions = make_flight(5)
     states[:, 9:13] = (1, 0, 0, 0)

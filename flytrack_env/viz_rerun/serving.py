@@ -1,0 +1,78 @@
+"""Rerun's own web viewer on a recording, served to this machine only."""
+
+import socket
+import subprocess
+import sys
+from pathlib import Path
+
+MAGIC = b"RRF"  # what every recording begins with
+HOST = "127.0.0.1"
+
+
+class ServeError(ValueError):
+    """A recording that cannot be served; the message names the file or the port."""
+
+
+def check_recording(path: str | Path) -> None:
+    """Raise ServeError for a file that is no recording."""
+    try:
+        with Path(path).open("rb") as file:
+            found = file.read(len(MAGIC))
+    except OSError as error:
+        raise ServeError(f"{path}: cannot be read: {error}; expected a recording (.rrd)") from error
+    if found != MAGIC:
+        raise ServeError(f"{path}: found a file that begins with {found!r}, expected a recording (.rrd)")
+
+
+def free_port() -> int:
+    """Return a port of this machine that nothing listens on."""
+    with socket.socket() as probe:
+        probe.bind((HOST, 0))
+        return probe.getsockname()[1]
+
+
+def check_port(port: int) -> None:
+    """Raise ServeError for a port that something listens on already."""
+    with socket.socket() as probe:
+        try:
+            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            probe.bind((HOST, port))
+        except (OSError, OverflowError) as error:
+            raise ServeError(f"port {port}: {error}; expected one that is free, 1024 to 65535") from error
+
+
+def start_server(path: str | Path, port: int, open_browser: bool) -> tuple[subprocess.Popen, str]:
+    """Start a server of the web viewer for a recording; return its process and the page's address.
+
+    port: of the page. The process serves until it is ended, to this machine only.
+
+    Raises:
+        ServeError: no recording, or a port that is taken.
+    """
+    check_recording(path)
+    check_port(port)
+    data_port = free_port()
+    # Unlike the SDK's own functions, the command can be told not to listen to other machines.
+    command = [sys.executable, "-m", "rerun", str(path), "--bind", HOST]
+    command += ["--port", str(data_port), "--web-viewer-port", str(port)]
+    command.append("--web-viewer" if open_browser else "--serve-web")
+    server = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    return server, f"http://{HOST}:{port}/?url=rerun%2Bhttp%3A%2F%2F{HOST}%3A{data_port}%2Fproxy"
+
+
+def serve(path: str | Path, port: int, open_browser: bool) -> None:
+    """Serve the web viewer on a recording until it is interrupted (Ctrl-C).
+
+    Raises:
+        ServeError: no recording, a port that is taken, or a server that ends by itself.
+    """
+    server, address = start_server(path, port, open_browser)
+    print(f"{path}: {address} (Ctrl-C ends it)", flush=True)
+    try:
+        status = server.wait()
+    except KeyboardInterrupt:
+        return
+    finally:
+        server.terminate()
+        server.wait()
+    raise ServeError(f"{path}: the viewer's server ended with status {status}, expected it to go on")

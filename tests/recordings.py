@@ -1,0 +1,69 @@
+"""Recordings read back with Rerun's own reader, and flights to record."""
+
+from collections import defaultdict
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+
+def rotate(quaternion: np.ndarray, vector: np.ndarray) -> np.ndarray:
+    """Return a vector rotated by a quaternion (w, x, y, z), by cross products."""
+    w, axis = quaternion[0], np.asarray(quaternion[1:])
+    return vector + 2 * w * np.cross(axis, vector) + 2 * np.cross(axis, np.cross(axis, vector))
+
+
+def make_sequence(steps: int) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Return a random flight as pairs of state (21,) and action (4,), float32."""
+    rng = np.random.default_rng(7)
+    states = rng.normal(size=(steps, 21))
+    states[:, 0:3] = np.cumsum(0.1 * states[:, 0:3], axis=0)
+    states[:, 9:13] /= np.linalg.norm(states[:, 9:13], axis=1, keepdims=True)
+    actions = rng.uniform(-1, 1, (steps, 4))
+    return list(zip(states.astype(np.float32), actions.astype(np.float32), strict=True))
+
+
+class Recording:
+    """A recording's rows by (entity, component); times only for what is not static."""
+
+    def __init__(self, path: Path):
+        missing = "this rerun-sdk has no reader (rerun.chunk)"
+        reader = pytest.importorskip("rerun.chunk", reason=missing).RrdReader(path)
+        (entry,) = reader.recordings()
+        self.app_id = entry.application_id
+        self.static: dict[tuple[str, str], list] = defaultdict(list)
+        self.rows: dict[tuple[str, str], list] = defaultdict(list)
+        self.times: dict[str, list[tuple[int, int]]] = defaultdict(list)
+        self.timelines: set[str] = set()
+        for chunk in reader.stream().to_chunks():
+            self._read(chunk)
+
+    def _read(self, chunk) -> None:
+        batch = chunk.to_record_batch()
+        indexes = {"rerun.controls.RowId", *chunk.timeline_names}
+        self.timelines |= set(chunk.timeline_names)
+        if not chunk.is_static:
+            steps = batch.column("step").to_pylist()
+            nanoseconds = batch.column("sim_time").cast("int64").to_pylist()
+            self.times[chunk.entity_path] += zip(steps, nanoseconds, strict=True)
+        for name in set(batch.schema.names) - indexes:
+            rows = self.static if chunk.is_static else self.rows
+            rows[chunk.entity_path, name] += batch.column(name).to_pylist()
+
+    def once(self, entity: str, component: str) -> np.ndarray:
+        """Return a static component's instances, logged exactly once."""
+        (value,) = self.static[entity, component]
+        return np.array(value)
+
+    def series(self, entity: str, component: str) -> np.ndarray:
+        """Return the one instance per row of a component, in the order of the steps."""
+        order = np.argsort([step for step, _ in self.times[entity]])
+        rows = np.array(self.rows[entity, component])
+        assert rows.shape[1] == 1 and len(rows) == len(order)
+        return rows[order, 0]
+
+    def latest_strip(self, entity: str, step: int) -> list | None:
+        """Return the line strip that a viewer shows at a step."""
+        strips = self.rows[entity, "LineStrips3D:strips"]
+        known = [(at, i) for i, (at, _) in enumerate(self.times[entity]) if at <= step]
+        return strips[max(known)[1]][0] if known else None
