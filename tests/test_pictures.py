@@ -239,6 +239,9 @@ def test_pictures_of_the_video_are_the_laps_states_with_the_race(ghost, install_
     renderer, rows = install_renderer(), shown_rows(ghost)
     with make_clip(ghost, rows) as clip:
         assert sum(1 for _ in clip.iter_frames(fps=50.0)) == len(rows)
+    with make_clip(ghost, range(0, 57, 2)) as clip:  # 29 pictures: 29 / 50 * 50 is rounded to less
+        assert sum(1 for _ in clip.iter_frames(fps=50.0)) == 29
+    renderer.drawn = renderer.drawn[: len(rows)]
     scenes = np.array([row for row, _ in renderer.drawn])
     np.testing.assert_array_equal(scenes[:, :21], STATES[rows])
     np.testing.assert_array_equal(scenes[:, 21], ghost.race.gate[rows])

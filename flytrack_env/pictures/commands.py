@@ -10,7 +10,7 @@ from flytrack_env.pictures.flight import PASSED, Flight
 from flytrack_env.pictures.style import BLUE, GREEN, GREY, ORANGE, new_figure, plain
 from flytrack_env.state import APPLIED_ACTION, BATTERY, Action
 
-SECOND_IN, WIDTHS_IN, HEIGHT_IN = 0.9, (10.0, 24.0), 9.5
+SECOND_IN, WIDTHS_IN, HEIGHT_IN = 0.9, (10.0, 24.0), 8.0
 HEIGHTS = (1.0, 1.0, 1.0, 1.0, 1.0, 0.7)
 LABEL_IN = 0.22  # that much apart, gates' numbers can be read
 MARKS = {

@@ -72,7 +72,7 @@ class Flight(NamedTuple):
     def title(self) -> str:
         """What was flown, in a line."""
         gates = _count(len(self.race.passes), "gate")
-        return f"{self.name} on {self.track.name}: {self.times_s[-1]:.2f} s, {gates}, {self.ended}"
+        return f"{self.name} on {self.track.name}: {STEP_S * len(self.states):.2f} s, {gates}, {self.ended}"
 
     @property
     def laps_in_words(self) -> str:
@@ -136,7 +136,7 @@ def _meetings(
         for step in np.flatnonzero(is_met):
             fraction = float(met.fraction[step])
             where = positions[step] + fraction * (ends[step] - positions[step])
-            found.append((step, where, STEP_S * (step + fraction), int(race.gate[step]), outcome))
+            found.append((step, where, STEP_S * (int(step) + fraction), int(race.gate[step]), outcome))
 
     def meeting(step: int, pos_w: np.ndarray, time_s: float, index: int, outcome: str) -> Meeting:
         gate = jax.tree.map(lambda leaf: float(leaf[index]), gates)

@@ -12,15 +12,14 @@ from proglog import TqdmProgressBarLogger
 
 from flytrack_env.flown_race import STEP_S
 from flytrack_env.pictures.flight import Flight
-from flytrack_env.rendering import SCENE_SIZE, FlightLog, make_renderer
-from flytrack_env.state import STATE_SIZE
+from flytrack_env.rendering import FlightLog, make_renderer
+from flytrack_env.rendering.scene import LAP_START
 from flytrack_env.tracks import build_course
 
 STEPS_PER_PICTURE = 2
 PICTURES_PER_S = 1.0 / (STEP_S * STEPS_PER_PICTURE)
 LONGEST_STEPS = 2000  # of a flight without a lap
 LEAD_IN_STEPS = 100  # flown before the first picture, for the trail and for the camera, which lags
-LAP_START = STATE_SIZE + 2  # column of a scene
 
 
 def shown_rows(flight: Flight) -> range:
@@ -40,12 +39,10 @@ def shown_rows(flight: Flight) -> range:
 
 
 def scene_rows(flight: Flight) -> np.ndarray:
-    """Return what the renderer draws, a row per state, (T, SCENE_SIZE), float32."""
+    """Return what the renderer draws, a row of ``flytrack_env.rendering.scene`` per state, float32."""
     race = flight.race
     numbers = np.stack([race.gate, race.laps, race.lap_start_s, race.lap_time_s], axis=1)
-    rows = np.concatenate([flight.states, numbers], axis=1).astype(np.float32)
-    assert rows.shape[1] == SCENE_SIZE
-    return rows
+    return np.concatenate([flight.states, numbers], axis=1).astype(np.float32)
 
 
 def make_clip(flight: Flight, rows: range) -> VideoClip:
