@@ -24,6 +24,7 @@ from flytrack_env.pictures import (
 from flytrack_env.pictures.__main__ import main
 from flytrack_env.pictures.commands import draw_commands
 from flytrack_env.pictures.side import draw_side
+from flytrack_env.pictures.style import with_room
 from flytrack_env.pictures.top import draw_top
 from flytrack_env.references import ghost_rollout, shipped_references
 from flytrack_env.rollout import save_rollout
@@ -167,6 +168,12 @@ def test_commands_are_the_data_and_what_the_file_lacks_is_a_gap(ghost):
         assert "lap 2: 3.833 s" in texts
         assert texts.count("applied: not in the file") == (3 if flight.name == "short" else 0)
         figure.draw_without_rendering()
+
+
+def test_labels_that_would_overlap_are_left_out():
+    labels = [(0.0, "missed"), (0.1, "missed"), (5.0, "missed"), (5.4, "7")]
+    assert with_room(labels, inch=1.0) == {labels[0], labels[2], labels[3]}
+    assert with_room(labels, inch=0.01) == {*labels}
 
 
 def test_comparison_has_a_path_per_flight_in_a_colour_of_its_own(ghost):

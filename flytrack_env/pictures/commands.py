@@ -7,12 +7,11 @@ from matplotlib.lines import Line2D
 
 from flytrack_env.flown_race import STEP_S
 from flytrack_env.pictures.flight import PASSED, Flight
-from flytrack_env.pictures.style import BLUE, GREEN, GREY, ORANGE, new_figure, plain
+from flytrack_env.pictures.style import BLUE, GREEN, GREY, ORANGE, new_figure, plain, with_room
 from flytrack_env.state import APPLIED_ACTION, BATTERY, Action
 
 SECOND_IN, WIDTHS_IN, HEIGHT_IN = 0.9, (10.0, 24.0), 8.0
 HEIGHTS = (1.0, 1.0, 1.0, 1.0, 1.0, 0.7)
-LABEL_IN = 0.22  # that much apart, gates' numbers can be read
 MARKS = {
     "gate": Line2D([], [], color="0.7", linewidth=0.9, label="gate passed"),
     "lap": Line2D([], [], color=GREEN, linewidth=1.8, label="lap complete"),
@@ -73,17 +72,14 @@ def _mark(panel: Axes, flight: Flight) -> None:
 
 def _label(panel: Axes, flight: Flight, width_in: float) -> None:
     """Write the gates' ids and the lap times above a panel, where there is room for them."""
-    has_room = len(flight.meetings) * LABEL_IN < width_in
-    texts = [
-        (one.time_s, 3, GREY, str(flight.track.gates[one.gate].id)) for one in flight.meetings if has_room
-    ]
-    texts += [
-        (one.time_s, 13, GREEN, f"lap {one.lap}: {one.lap_time_s:.3f} s")
-        for one in flight.race.passes
-        if one.lap
-    ]
-    texts += [(one.time_s, 13, "black", one.outcome) for one in flight.meetings if one.outcome != PASSED]
-    for time_s, above, colour, text in texts:
+    ids = [(one.time_s, str(flight.track.gates[one.gate].id)) for one in flight.meetings]
+    laps = [(one.time_s, f"lap {one.lap}: {one.lap_time_s:.3f} s") for one in flight.race.passes if one.lap]
+    failures = [(one.time_s, one.outcome) for one in flight.meetings if one.outcome != PASSED]
+    inch_s = flight.times_s[-1] / width_in
+    texts = [(*label, 3, GREY) for label in with_room(ids, inch_s)]
+    for time_s, text in with_room([*laps, *failures], inch_s):
+        texts.append((time_s, text, 13, GREEN if (time_s, text) in laps else "black"))
+    for time_s, text, above, colour in texts:
         panel.annotate(
             text, (time_s, 1.0), (0, above), xycoords=panel.get_xaxis_transform(),
             textcoords="offset points", ha="center", fontsize="small", color=colour,

@@ -10,13 +10,13 @@ from matplotlib.patches import Rectangle
 from flytrack_env.flown_race import DRONE_RADIUS_M
 from flytrack_env.pictures.course_view import FRAME_COLOUR, HEADROOM, OPENING_COLOUR, draw_path
 from flytrack_env.pictures.flight import PASSED, Flight, Meeting
-from flytrack_env.pictures.style import BLUE, new_figure, plain
+from flytrack_env.pictures.style import BLUE, new_figure, plain, with_room
 from flytrack_env.state import POSITION
-from flytrack_env.tracks import Gate, build_course
+from flytrack_env.tracks import Gate, Track, build_course
 
 METRE_IN, WIDTHS_IN, HEIGHT_IN = 0.05, (10.0, 24.0), 3.6
 GATE_IN, GATES_TITLE_IN = 1.25, 0.5
-LABEL_IN = 0.22
+MOST_LABELLED = 3
 AROUND = 1.12  # of a gate's half frame, or of the farthest meeting
 
 
@@ -42,9 +42,9 @@ def _draw_height(figure: SubFigure, flight: Flight, top: float, width_in: float)
     points = np.stack([flight.distances_m, heights_m], axis=1)
     lines = draw_path(axes, points, flight.speeds_m_s[:-1], top, 2.4)
     lines.set_zorder(4)
-    has_room = len(flight.meetings) * LABEL_IN < width_in
     for meeting in flight.meetings:
-        _draw_bar(axes, flight, meeting, has_room)
+        _draw_bar(axes, flight, meeting)
+    _label_bars(axes, flight, width_in)
     floor_m = flight.track.bounds_low[2]
     axes.axhline(floor_m, color="0.3", linewidth=1.5)
     axes.plot(*points[0], "o", color=BLUE, markersize=8, markeredgecolor="white", zorder=6)
@@ -60,11 +60,10 @@ def _draw_height(figure: SubFigure, flight: Flight, top: float, width_in: float)
     figure.colorbar(lines, ax=axes, label="speed (m/s)", pad=0.01)
 
 
-def _draw_bar(axes: Axes, flight: Flight, meeting: Meeting, has_id: bool) -> None:
+def _draw_bar(axes: Axes, flight: Flight, meeting: Meeting) -> None:
     """Draw a gate's frame as a grey bar with its opening in red, and a cross where it was not passed."""
-    gate, frames = flight.track.gates[meeting.gate], build_course(flight.track).gates
-    upwards = abs(frames.up.z[meeting.gate]) + abs(frames.left().z[meeting.gate])  # less where it is tilted
-    x, z = meeting.distance_m, gate.position[2]
+    gate, x = flight.track.gates[meeting.gate], meeting.distance_m
+    z, upwards = gate.position[2], _upwards(flight.track, meeting.gate)
     half_frame, half_opening = (0.5 * edge * upwards for edge in (gate.frame, gate.opening))
     for half, colour, width in (
         (half_frame, FRAME_COLOUR, 3.2),
@@ -72,15 +71,30 @@ def _draw_bar(axes: Axes, flight: Flight, meeting: Meeting, has_id: bool) -> Non
         (half_opening, OPENING_COLOUR, 1.2),
     ):
         axes.plot([x, x], [z - half, z + half], color=colour, linewidth=width, zorder=2)
-    texts = [(3, OPENING_COLOUR, str(gate.id))] if has_id else []
     if meeting.outcome != PASSED:
-        texts.append((14, "black", meeting.outcome))
         axes.plot(x, meeting.pos_w[2], "X", color="black", markersize=10, markeredgecolor="white", zorder=6)
-    for above, colour, text in texts:
-        axes.annotate(
-            text, (x, z + half_frame), (0, above), textcoords="offset points", color=colour, ha="center",
-            weight="bold", fontsize="small",
-        )  # fmt: skip
+
+
+def _upwards(track: Track, index: int) -> float:
+    """Return the height of a gate over its edge: 1 if it stands upright."""
+    gates = build_course(track).gates
+    return float(abs(gates.up.z[index]) + abs(gates.left().z[index]))
+
+
+def _label_bars(axes: Axes, flight: Flight, width_in: float) -> None:
+    """Write above the bars the gates' ids, and what failed, where there is room."""
+    inch_m = flight.distances_m[-1] / width_in
+    ids = [(one.distance_m, str(flight.track.gates[one.gate].id)) for one in flight.meetings]
+    failures = [(one.distance_m, one.outcome) for one in flight.meetings if one.outcome != PASSED]
+    gates = {one.distance_m: one.gate for one in flight.meetings}
+    for labels, above, colour in ((ids, 3, OPENING_COLOUR), (failures, 14, "black")):
+        for x, text in with_room(labels, inch_m):
+            gate = flight.track.gates[gates[x]]
+            top_m = gate.position[2] + 0.5 * gate.frame * _upwards(flight.track, gates[x])
+            axes.annotate(
+                text, (x, top_m), (0, above), textcoords="offset points", color=colour, ha="center",
+                weight="bold", fontsize="small",
+            )  # fmt: skip
 
 
 def _draw_fronts(figure: SubFigure, flight: Flight, top: float, shape: tuple[int, int]) -> None:
@@ -110,10 +124,9 @@ def _draw_front(panel: Axes, gate: Gate, meetings: list[Meeting], top: float) ->
         speeds = [one.speed_m_s for one in shown]
         limits = {"vmin": 0.0, "vmax": top}
         panel.scatter(*places.T, size, speeds, marker=marker, edgecolors="black", linewidths=0.6, **limits)
-    for one in meetings:
-        if one.outcome != PASSED:
-            place = (one.right_m, one.up_m)
-            panel.annotate(f"lap {one.lap}", place, (7, 2), textcoords="offset points", fontsize="small")
+    for one in [one for one in meetings if one.outcome != PASSED][:MOST_LABELLED]:
+        place = (one.right_m, one.up_m)
+        panel.annotate(f"lap {one.lap}", place, (7, 2), textcoords="offset points", fontsize="small")
     reach = AROUND * max([0.5 * gate.frame, *(max(abs(one.right_m), abs(one.up_m)) for one in meetings)])
     num_passed = sum(one.outcome == PASSED for one in meetings)
     panel.set(aspect="equal", xlim=(-reach, reach), ylim=(-reach, reach))

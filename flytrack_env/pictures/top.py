@@ -16,18 +16,14 @@ from flytrack_env.pictures.course_view import (
     taken_from_above,
 )
 from flytrack_env.pictures.flight import PASSED, Flight
-from flytrack_env.pictures.style import BLUE, COLOURS, LINES, ORANGE, new_figure
+from flytrack_env.pictures.style import BLUE, COLOURS, LETTER_IN, LINES, ORANGE, new_figure
 from flytrack_env.state import POSITION
 from flytrack_env.tracks import Track
 
 PANEL_IN, BESIDE_IN, TITLE_IN = 7.0, 1.6, 1.0  # the view's longer side; room beside and above it
 NARROWEST = 0.35  # of the longer side
 MARGIN_SHARE = 0.03
-LETTER_IN, SMALL_LETTER_IN, LINE_IN = (
-    0.085,
-    0.068,
-    0.17,
-)  # per letter of a bold text and of a small one; a text's height
+BOLD_LETTER_IN, LINE_IN = 0.085, 0.17  # per letter of a bold text; a text's height
 VIEW = [0, 1]
 
 
@@ -56,7 +52,7 @@ def draw_comparison(flights: Sequence[Flight]) -> Figure:
     """Return the course from above with a path per flight, all on one track, in a colour of its own."""
     texts = [f"{flight.name}\n{flight.laps_in_words}\n{flight.ended}" for flight in flights]
     longest = max(len(line) for text in texts for line in text.splitlines())
-    figure, axes, _ = _course(flights, BESIDE_IN + SMALL_LETTER_IN * longest)
+    figure, axes, _ = _course(flights, BESIDE_IN + LETTER_IN * longest)
     styles = itertools.cycle(itertools.product(LINES, COLOURS))
     for flight, text, (line, colour) in zip(flights, texts, styles, strict=False):
         points = flight.states[:, POSITION][:, :2]
@@ -95,7 +91,7 @@ def _limits(flights: Sequence[Flight], track: Track) -> tuple[np.ndarray, np.nda
 
 def _free_place(at: np.ndarray, text: str, avoid: np.ndarray, axes: Axes, inch_m: float) -> np.ndarray:
     """Return the middle (2,) of a text beside a point: of eight places the one with the most room."""
-    half = 0.5 * inch_m * np.array([LETTER_IN * len(text), LINE_IN])
+    half = 0.5 * inch_m * np.array([BOLD_LETTER_IN * len(text), LINE_IN])
     limits = np.array([axes.get_xlim(), axes.get_ylim()])
 
     def room(middle: np.ndarray) -> float:

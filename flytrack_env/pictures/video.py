@@ -82,15 +82,26 @@ def write_video(flight: Flight, path: Path, has_bar: bool = False) -> None:
         rows = shown_rows(flight)
         with make_clip(flight, rows) as clip:
             logger = TqdmProgressBarLogger(print_messages=False) if has_bar else None
-            clip.write_videofile(
-                str(temporary), PICTURES_PER_S, "libx264", audio=False, logger=logger,
-                ffmpeg_params=["-movflags", "+faststart"],
-            )  # fmt: skip
+            _encode(clip, temporary, path, logger)
         _check(temporary, path, len(rows))
         os.replace(temporary, path)
     except BaseException:
         temporary.unlink(missing_ok=True)
         raise
+
+
+def _encode(clip: VideoClip, temporary: Path, path: Path, logger: TqdmProgressBarLogger | None) -> None:
+    """Draw and encode all pictures; ffmpeg's own words are in the error."""
+    try:
+        clip.write_videofile(
+            str(temporary), PICTURES_PER_S, "libx264", audio=False, logger=logger,
+            ffmpeg_params=["-movflags", "+faststart"],
+        )  # fmt: skip
+    except OSError as error:
+        said = str(error).split("\n\n")[-1].strip().split("\n")[0]
+        raise OSError(
+            f"{path}: found a video that cannot be written, expected room for it: {said}"
+        ) from error
 
 
 def _check(written: Path, path: Path, num_pictures: int) -> None:
