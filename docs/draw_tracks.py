@@ -2,17 +2,25 @@
 
 import argparse
 import hashlib
-import io
 from pathlib import Path
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
-from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
 from flytrack_env.files import write_atomically
+from flytrack_env.pictures.course_view import (
+    HEADROOM,
+    LABEL_SHARE,
+    OPENING_COLOUR,
+    draw_gates,
+    draw_path,
+    extent,
+    label_from_above,
+)
+from flytrack_env.pictures.style import png_of
 from flytrack_env.tracks import Track, available_tracks, build_course, load_track, random_track, sample_way
 
 RANDOM_SEEDS = (0, 1)
@@ -20,47 +28,15 @@ NUM_SAMPLES = 100
 DPI = 110
 PANEL_IN = (6.8, 6.5)  # the largest width and height of the view from above
 LEFT_IN, RIGHT_IN, BOTTOM_IN, TOP_IN, GAP_IN, BAR_IN = 0.75, 1.0, 0.6, 0.45, 0.35, 0.18
-MARGIN_SHARE, LABEL_SHARE, ARROW_SHARE = 0.03, 0.026, 0.055  # of the larger extent
-SHORTEST_ARROW = 0.3  # of a unit vector: a direction seen more head-on than that has no arrow
+MARGIN_SHARE = 0.03  # of the larger extent
 TOP_VIEW, SIDE_VIEW = [0, 1], [0, 2]
-FRAME_COLOUR, OPENING_COLOUR, START_COLOUR = "0.25", "tab:red", "tab:blue"
-LOWEST_TOP_M, HEADROOM = 3.0, 1.2  # of the colour scale, whose last colours are too pale for a line
+START_COLOUR = "tab:blue"
+LOWEST_TOP_M = 3.0  # of the colour scale
 
 
 def digest(track: Track) -> str:
     """Return what tells a picture of this track from one of another."""
     return hashlib.sha256(repr(track).encode()).hexdigest()
-
-
-def extent(track: Track) -> np.ndarray:
-    """Return the size of the bounds, (3,), m."""
-    return np.subtract(track.bounds_high, track.bounds_low)
-
-
-def draw_gates(axes: Axes, track: Track, view: list[int]) -> None:
-    """Draw every gate's frame, opening and direction of flight, seen along the axis not in ``view``."""
-    gates = build_course(track).gates
-    frames = zip(*(np.stack(axis, -1) for axis in (gates.forward, gates.left(), gates.up)), strict=True)
-    for gate, (forward, left, up) in zip(track.gates, frames, strict=True):
-        centre = np.array(gate.position)
-        for edge, colour in ((gate.frame, FRAME_COLOUR), (gate.opening, OPENING_COLOUR)):
-            signs = ((1, 1), (1, -1), (-1, -1), (-1, 1), (1, 1))
-            corners = np.array([centre + 0.5 * edge * (a * left + b * up) for a, b in signs])
-            axes.plot(*corners[:, view].T, color=colour, linewidth=2.2, solid_capstyle="butt", zorder=3)
-        seen = forward[view]
-        if np.linalg.norm(seen) > SHORTEST_ARROW:
-            tip = centre[view] + ARROW_SHARE * extent(track).max() * seen
-            arrow = {"arrowstyle": "-|>", "color": OPENING_COLOUR, "linewidth": 1.5, "shrinkA": 0}
-            axes.annotate("", xy=tip, xytext=centre[view], arrowprops=arrow, zorder=4)
-
-
-def label_from_above(axes: Axes, track: Track) -> None:
-    """Write every gate's id beside it."""
-    left = np.stack(build_course(track).gates.left(), -1)
-    for gate, side in zip(track.gates, left, strict=True):
-        distance = 0.5 * gate.frame + LABEL_SHARE * extent(track).max()
-        place = np.array(gate.position) + distance * side
-        axes.text(*place[:2], str(gate.id), color=OPENING_COLOUR, ha="center", va="center", weight="bold")
 
 
 def label_from_the_side(axes: Axes, track: Track) -> None:
@@ -87,14 +63,8 @@ def draw_view(axes: Axes, track: Track, view: list[int]) -> LineCollection:
     style = {"fill": False, "edgecolor": "0.6", "linestyle": "--"}
     axes.add_patch(Rectangle(low, *size, **style))
     points = sample_way(build_course(track), NUM_SAMPLES).reshape(-1, 3)
-    lines = LineCollection(
-        np.stack([points[:-1, view], points[1:, view]], axis=1),
-        array=points[:-1, 2],
-        norm=Normalize(0.0, HEADROOM * max(points[:, 2].max(), LOWEST_TOP_M)),
-        linewidth=2,
-        capstyle="round",
-    )
-    axes.add_collection(lines)
+    top_m = HEADROOM * max(points[:, 2].max(), LOWEST_TOP_M)
+    lines = draw_path(axes, points[:, view], points[:-1, 2], top_m)
     draw_gates(axes, track, view)
     start = np.array(track.start_position)[view]
     axes.plot(*start, "o", color=START_COLOUR, markersize=7, zorder=5)
@@ -136,9 +106,7 @@ def draw_track(path: str | Path, track: Track) -> None:
     top.tick_params(labelbottom=False)
     bar = place(LEFT_IN + width + BAR_IN, BOTTOM_IN + height + GAP_IN, BAR_IN, depth)
     figure.colorbar(lines, cax=bar, label="height of the way (m)")
-    content = io.BytesIO()
-    figure.savefig(content, format="png", dpi=DPI, metadata={"Track": digest(track)})
-    write_atomically(path, content.getvalue())
+    write_atomically(path, png_of(figure, DPI, {"Track": digest(track)}))
 
 
 def drawn_tracks() -> dict[str, Track]:

@@ -11,6 +11,7 @@ PAGES = (
     "wrappers.md",
     "effects.md",
     "gymnasium.md",
+    "pictures.md",
     "identification.md",
     "real_logs.md",
     "diagnosis.md",

@@ -31,13 +31,20 @@ LAYERS = (
     {"env"},
     {"references"},
     {"wrappers", "blackbox", "rollout", "rendering", "flown_race"},
-    {"registration", "viz_rerun"},
+    {"registration", "viz_rerun", "pictures"},
     {"gymnasium_adapter"},
     {"__init__"},
 )
 RANKS = {name: rank for rank, layer in enumerate(LAYERS) for name in layer}
 CONSUMERS = ("flytrack_sysid", "baselines", "benchmarks", "blackbox", "clients", "eval_agent", "demo")
-ONLY_IN = {"gymnasium": "gymnasium_adapter", "PIL": "rendering", "pygame": "rendering", "rerun": "viz_rerun"}
+ONLY_IN = {
+    "gymnasium": "gymnasium_adapter",
+    "PIL": "rendering",
+    "pygame": "rendering",
+    "rerun": "viz_rerun",
+    "matplotlib": "pictures",
+    "moviepy": "pictures",
+}
 
 
 def files_of(name: str) -> list[Path]:

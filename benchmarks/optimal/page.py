@@ -1,15 +1,14 @@
 """Pictures and the page of the shipped references: docs/results/time_optimal.md."""
 
-import io
 from pathlib import Path
 
 import numpy as np
-from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 
 from benchmarks.optimal.replay import Replay
-from docs.draw_tracks import draw_gates, label_from_above
 from flytrack_env.files import write_atomically
+from flytrack_env.pictures.course_view import draw_gates, draw_path, label_from_above
+from flytrack_env.pictures.style import png_of
 from flytrack_env.references import Reference
 from flytrack_env.state import POSITION, VELOCITY
 from flytrack_env.tracks import Track
@@ -70,10 +69,7 @@ def _draw(path: Path, track: Track, references: list[Reference]) -> None:
     panels = np.atleast_1d(figure.subplots(rows, columns))
     for axes, reference, speed in zip(panels, references, speeds, strict=True):
         points = reference.states[:, POSITION][:, :2]
-        lines = LineCollection(
-            np.stack([points[:-1], points[1:]], axis=1), array=speed[1:], clim=(0.0, top), linewidth=2.5
-        )
-        axes.add_collection(lines)
+        lines = draw_path(axes, points, speed[1:], top, linewidth=2.5)
         draw_gates(axes, track, [0, 1])
         label_from_above(axes, track)
         if reference.kind == "standing":
@@ -84,9 +80,7 @@ def _draw(path: Path, track: Track, references: list[Reference]) -> None:
             f"{track.name}, {reference.model_name}: {TITLES[reference.kind]} {reference.time_s:.3f} s"
         )
     figure.colorbar(lines, ax=list(panels), label="speed (m/s)", shrink=0.8)
-    content = io.BytesIO()
-    figure.savefig(content, format="png", dpi=DPI, metadata={"Software": None})
-    write_atomically(path, content.getvalue())
+    write_atomically(path, png_of(figure, DPI))
 
 
 def _optimum_row(reference: Reference) -> str:

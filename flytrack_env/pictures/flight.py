@@ -1,0 +1,156 @@
+"""A recorded flight with what follows from it: the race, every meeting with a gate, why it ended."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import jax
+import numpy as np
+
+from flytrack_env.flown_race import DRONE_RADIUS_M, STEP_S, FlownRace, follow_race, why_ended
+from flytrack_env.quaternion import Vec3
+from flytrack_env.rollout import RolloutError, load_rollout
+from flytrack_env.state import POSITION, VELOCITY
+from flytrack_env.tracks import Track, build_course, cross_gate
+
+PASSED, TOUCHED, MISSED = "passed", "frame touched", "missed"
+COMPARISON = "comparison"
+SHOWN_LAPS = 6
+
+
+class Meeting(NamedTuple):
+    """The drone in the plane of the gate that is next.
+
+    outcome: PASSED, TOUCHED or MISSED. gate: index in flying order. time_s: since the first state.
+    distance_m: flown until then. pos_w: where, (3,), world, m. right_m, up_m: off the gate's centre, as the
+    drone comes to it. speed_m_s: before it. lap: in which, counted from 1.
+    """
+
+    outcome: str
+    gate: int
+    time_s: float
+    distance_m: float
+    pos_w: np.ndarray
+    right_m: float
+    up_m: float
+    speed_m_s: float
+    lap: int
+
+
+class Flight(NamedTuple):
+    """One recorded flight at 100 Hz.
+
+    name: of its pictures. states: (T, 21), the applied roll, pitch and yaw may be NaN. commands: (T, 4).
+    distances_m: flown until each state, (T,). meetings: in order. ended: why, in words.
+    """
+
+    name: str
+    states: np.ndarray
+    commands: np.ndarray
+    track: Track
+    race: FlownRace
+    distances_m: np.ndarray
+    meetings: tuple[Meeting, ...]
+    ended: str
+
+    @property
+    def speeds_m_s(self) -> np.ndarray:
+        """Speed in each state, (T,)."""
+        return np.linalg.norm(self.states[:, VELOCITY], axis=1)
+
+    @property
+    def times_s(self) -> np.ndarray:
+        """Time of each state since the first one, (T,)."""
+        return STEP_S * np.arange(len(self.states))
+
+    @property
+    def lap_times_s(self) -> list[float]:
+        """Times of the complete laps, in order."""
+        return [one.lap_time_s for one in self.race.passes if one.lap]
+
+    @property
+    def title(self) -> str:
+        """What was flown, in a line."""
+        gates = _count(len(self.race.passes), "gate")
+        return f"{self.name} on {self.track.name}: {STEP_S * len(self.states):.2f} s, {gates}, {self.ended}"
+
+    @property
+    def laps_in_words(self) -> str:
+        """The lap times in a line; of many laps the first and the fastest."""
+        times = self.lap_times_s
+        if not times:
+            return "no complete lap"
+        if len(times) > SHOWN_LAPS:
+            return f"{len(times)} laps, first {times[0]:.3f} s, fastest {min(times):.3f} s"
+        return f"{'lap' if len(times) == 1 else 'laps'} {', '.join(f'{time:.3f}' for time in times)} s"
+
+
+def _count(number: int, what: str) -> str:
+    return f"{number} {what}{'' if number == 1 else 's'}"
+
+
+def make_flight(name: str, states: np.ndarray, commands: np.ndarray, track: Track) -> Flight:
+    """Return the flight of states (T, 21) and commands (T, 4) on a track; positions must be finite."""
+    race = follow_race(states[:, POSITION], track)
+    steps_m = np.linalg.norm(np.diff(states[:, POSITION].astype(float), axis=0), axis=1)
+    distances_m = np.concatenate([[0.0], np.cumsum(steps_m)])
+    meetings = _meetings(states, distances_m, track, race)
+    return Flight(name, states, commands, track, race, distances_m, meetings, why_ended(states, track, race))
+
+
+def read_flights(paths: Sequence[str | Path], track: Track, allow_pickle: bool = False) -> tuple[Flight, ...]:
+    """Return the flights of rollout files, named after them, and after their folders where that is needed.
+
+    Raises:
+        RolloutError: a file that is no rollout, or files that cannot be told apart by these names.
+    """
+    files = [Path(path) for path in paths]
+    names = [file.stem for file in files]
+    if len(set(names)) < len(names):
+        names = [f"{file.resolve().parent.name}_{file.stem}" for file in files]
+    taken = {COMPARISON: "the comparison"} if len(files) > 1 else {}
+    for name, file in zip(names, files, strict=True):
+        if name in taken:
+            found = f"found {name!r} for {taken[name]}, too"
+            raise RolloutError(f"{file}: name of its pictures: {found}, expected one of its own")
+        taken[name] = str(file)
+    rollouts = [load_rollout(file, allow_pickle) for file in files]
+    return tuple(make_flight(name, *rollout, track) for name, rollout in zip(names, rollouts, strict=True))
+
+
+def _meetings(
+    states: np.ndarray, distances_m: np.ndarray, track: Track, race: FlownRace
+) -> tuple[Meeting, ...]:
+    """Return every crossing of the next gate's plane that passed, touched or missed it.
+
+    The last state is carried on for a step at its velocity, as in ``why_ended``: that is where most
+    flights that fail meet their last gate.
+    """
+    positions = states[:, POSITION]
+    ends = np.concatenate([positions[1:], positions[-1:] + STEP_S * states[-1:, VELOCITY]])
+    gates = build_course(track).gates
+    of_step = jax.tree.map(lambda leaf: leaf[race.gate], gates)
+    met = cross_gate(of_step, Vec3(*positions.T), Vec3(*ends.T), DRONE_RADIUS_M)
+    found = [(one.row - 1, one.pos_w, one.time_s, one.gate, PASSED) for one in race.passes]
+    for outcome, is_met in ((TOUCHED, met.is_frame), (MISSED, met.is_miss)):
+        for step in np.flatnonzero(is_met):
+            fraction = float(met.fraction[step])
+            where = positions[step] + fraction * (ends[step] - positions[step])
+            found.append((step, where, STEP_S * (int(step) + fraction), int(race.gate[step]), outcome))
+
+    def meeting(step: int, pos_w: np.ndarray, time_s: float, index: int, outcome: str) -> Meeting:
+        gate = jax.tree.map(lambda leaf: float(leaf[index]), gates)
+        off = gate.to_frame(Vec3(*pos_w.astype(float)) - gate.centre)
+        return Meeting(
+            outcome,
+            index,
+            time_s,
+            distance_m=float(distances_m[step] + np.linalg.norm(pos_w - positions[step])),
+            pos_w=pos_w,
+            right_m=float(-off.y),
+            up_m=float(off.z),
+            speed_m_s=float(np.linalg.norm(states[step, VELOCITY])),
+            lap=int(race.laps[step]) + 1,
+        )
+
+    return tuple(meeting(*one) for one in sorted(found, key=lambda one: one[2]))

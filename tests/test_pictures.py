@@ -1,0 +1,339 @@
+"""Pictures and videos of recorded flights: what is drawn is what was flown."""
+
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from matplotlib.collections import LineCollection, PathCollection
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+
+from flytrack_env.flown_race import Pass
+from flytrack_env.pictures import (
+    Flight,
+    draw_comparison,
+    draw_flight,
+    make_flight,
+    read_flights,
+    write_pictures,
+    write_video,
+)
+from flytrack_env.pictures.__main__ import main
+from flytrack_env.pictures.commands import draw_commands
+from flytrack_env.pictures.side import draw_side
+from flytrack_env.pictures.style import with_room
+from flytrack_env.pictures.top import draw_top
+from flytrack_env.references import ghost_rollout, shipped_references
+from flytrack_env.rollout import save_rollout
+from flytrack_env.tracks import load_track
+
+TRACK = load_track("flytrack")
+STATES, COMMANDS = ghost_rollout(shipped_references(TRACK, ("nominal",)), 820)
+STATES, COMMANDS = np.asarray(STATES, np.float32), np.asarray(COMMANDS, np.float32)
+LEVEL = (1.0, 0.0, 0.0, 0.0)
+
+
+@pytest.fixture(scope="module")
+def ghost() -> Flight:
+    """Two laps of the time-optimal flight, from standstill: 3.880 s and 3.833 s."""
+    return make_flight("ghost", STATES, COMMANDS, TRACK)
+
+
+def straight(right_m: float, up_m: float, num_steps: int = 30) -> Flight:
+    """Return a flight through the plane of gate 0, which is flown towards -x, at 10 m/s."""
+    x, y, z = TRACK.gates[0].position
+    states = np.zeros((num_steps, 21), np.float32)
+    states[:, 0] = x + 1.45 - 0.1 * np.arange(num_steps)
+    states[:, 1:3] = y + right_m, z + up_m  # towards -x, +y is to the right
+    states[:, 3] = -10.0
+    states[:, 9:13] = LEVEL
+    states[:, 20] = 24.0
+    return make_flight("straight", states, np.zeros((num_steps, 4), np.float32), TRACK)
+
+
+def lines_of(figure: Figure) -> list[Line2D]:
+    return [line for axes in figure.axes for line in axes.lines]
+
+
+def texts_of(figure: Figure) -> list[str]:
+    return [text.get_text() for text in figure.findobj(lambda artist: hasattr(artist, "get_text"))]
+
+
+def the_path(figure: Figure) -> LineCollection:
+    (path,) = [c for c in figure.axes[0].collections if isinstance(c, LineCollection)]
+    return path
+
+
+def test_path_from_above_is_the_states_in_the_colours_of_their_speeds(ghost):
+    figure = draw_top(ghost)
+    path = the_path(figure)
+    segments = np.array(path.get_segments())
+    np.testing.assert_allclose(segments[:, 0], STATES[:-1, :2], atol=1e-6)
+    np.testing.assert_allclose(segments[:, 1], STATES[1:, :2], atol=1e-6)
+    speeds = np.linalg.norm(STATES[:, 3:6], axis=1)
+    np.testing.assert_allclose(path.get_array(), speeds[:-1], rtol=1e-6)
+    np.testing.assert_allclose(path.norm((0.0, 0.5 * path.norm.vmax)), (0.0, 0.5))
+    assert path.norm.vmax > speeds.max()
+    texts = texts_of(figure)
+    assert {"start", "all steps flown", "speed (m/s)"} < set(texts)
+    assert any("laps 3.880, 3.833 s" in text for text in texts)
+
+
+def test_every_gate_is_where_it_stands_with_its_id_beside_it(ghost):
+    axes = draw_top(ghost).axes[0]
+    squares = [np.array(line.get_xydata()) for line in axes.lines if len(line.get_xydata()) == 5]
+    assert len(squares) == 2 * len(TRACK.gates)
+    middles = np.array([square[:4].mean(axis=0) for square in squares])
+    for gate in TRACK.gates:
+        centre = np.array(gate.position[:2])
+        assert (np.linalg.norm(middles - centre, axis=1) < 1e-5).sum() == 2
+        (label,) = [text for text in axes.texts if text.get_text() == str(gate.id)]
+        away_m = np.linalg.norm(np.array(label.get_position()) - centre)
+        assert 0.5 * gate.frame < away_m < 0.5 * gate.frame + 2.0
+
+
+def test_side_view_has_a_bar_at_every_pass_and_its_place_in_the_gate(ghost):
+    figure = draw_side(ghost)
+    axes = figure.axes[0]
+    bars = [np.array(line.get_xydata()) for line in axes.lines if len(line.get_xydata()) == 2]
+    steps_m = np.linalg.norm(np.diff(STATES[:, :3], axis=0), axis=1)
+    flown_m = np.concatenate([[0.0], np.cumsum(steps_m)])
+    passes = ghost.race.passes
+    assert len(passes) >= 16
+    for one in passes:
+        at_m = np.interp(one.time_s, 0.01 * np.arange(len(STATES)), flown_m)
+        gate = TRACK.gates[one.gate]
+        z = gate.position[2]
+        for edge in (gate.frame, gate.opening):
+            wanted = [(at_m, z - 0.5 * edge), (at_m, z + 0.5 * edge)]
+            assert any(np.abs(bar - wanted).max() < 1e-2 for bar in bars)
+    fronts = figure.axes[-8:]
+    for index, (panel, gate) in enumerate(zip(fronts, TRACK.gates, strict=True)):
+        shown = [dots for dots in panel.collections if isinstance(dots, PathCollection)]
+        offsets = np.concatenate([np.asarray(dots.get_offsets()) for dots in shown])
+        own = [one for one in passes if one.gate == index]
+        assert len(offsets) == len(own) and panel.get_title().startswith(f"gate {gate.id}: {len(own)} of")
+        # Gates stand upright: up is z, and what is left is sideways.
+        off = np.array([one.pos_w - gate.position for one in own])
+        np.testing.assert_allclose(offsets[:, 1], off[:, 2], atol=1e-5)
+        np.testing.assert_allclose(np.hypot(*offsets.T), np.linalg.norm(off, axis=1), atol=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("right_m", "up_m", "outcome"),
+    [(0.3, -0.35, "passed"), (-1.0, 0.2, "frame touched"), (1.6, 0.1, "missed")],
+)
+def test_meetings_say_how_and_where_a_gate_was_met(right_m: float, up_m: float, outcome: str) -> None:
+    flight = straight(right_m, up_m)
+    (met,) = flight.meetings
+    assert (met.outcome, met.gate, met.lap) == (outcome, 0, 1)
+    assert (met.right_m, met.up_m) == pytest.approx((right_m, up_m), abs=1e-5)
+    assert (met.time_s, met.distance_m) == pytest.approx((0.145, 1.45), abs=1e-5)
+    assert met.speed_m_s == pytest.approx(10.0)
+    crosses = [line for line in draw_top(flight).axes[0].lines if line.get_color() == "black"]
+    places = [place for line in crosses for place in line.get_xydata().tolist()]
+    wanted = [] if outcome == "passed" else [pytest.approx(met.pos_w[:2].tolist())]
+    assert places == wanted
+
+
+def test_gate_missed_in_the_step_after_the_last_state_is_shown():
+    flight = straight(1.6, 0.0, num_steps=15)
+    (met,) = flight.meetings
+    assert met.outcome == "missed" and flight.ended == "missed gate"
+    assert met.time_s == pytest.approx(0.145, abs=1e-5) and met.time_s > flight.times_s[-1]
+    side, commands = draw_side(flight).axes[0], draw_commands(flight).axes[0]
+    assert side.get_xlim()[1] > met.distance_m and commands.get_xlim()[1] >= met.time_s
+    assert "missed" in texts_of(side.figure) and "missed" in texts_of(commands.figure)
+
+
+def test_commands_are_the_data_and_what_the_file_lacks_is_a_gap(ghost):
+    states = STATES.copy()
+    states[:, 16:19] = np.nan
+    for flight in (ghost, make_flight("short", states, COMMANDS, TRACK)):
+        figure = draw_commands(flight)
+        for stick in range(4):
+            commanded, applied = figure.axes[stick].lines[:2]
+            np.testing.assert_array_equal(commanded.get_ydata(), COMMANDS[:, stick])
+            np.testing.assert_array_equal(applied.get_ydata(), flight.states[:, 16 + stick])
+            np.testing.assert_allclose(commanded.get_xdata(), 0.01 * np.arange(len(STATES)))
+        speed, battery = (figure.axes[panel].lines[0].get_ydata() for panel in (4, 5))
+        np.testing.assert_allclose(speed, np.linalg.norm(STATES[:, 3:6], axis=1), rtol=1e-6)
+        np.testing.assert_array_equal(battery, STATES[:, 20])
+        marks = [line.get_xdata()[0] for line in figure.axes[5].lines[1:]]
+        np.testing.assert_allclose(marks, [one.time_s for one in flight.race.passes])
+        texts = texts_of(figure)
+        assert "lap 2: 3.833 s" in texts
+        assert texts.count("applied: not in the file") == (3 if flight.name == "short" else 0)
+        figure.draw_without_rendering()
+
+
+def test_labels_that_would_overlap_are_left_out():
+    labels = [(0.0, "missed"), (0.1, "missed"), (5.0, "missed"), (5.4, "7")]
+    assert with_room(labels, inch=1.0) == {labels[0], labels[2], labels[3]}
+    assert with_room(labels, inch=0.01) == {*labels}
+
+
+def test_comparison_has_a_path_per_flight_in_a_colour_of_its_own(ghost):
+    slow = make_flight("other", STATES[:300], COMMANDS[:300], TRACK)
+    figure = draw_comparison([ghost, slow])
+    paths = [line for line in figure.axes[0].lines if len(line.get_xydata()) > 5]
+    for path, flight in zip(paths, (ghost, slow), strict=True):
+        np.testing.assert_allclose(path.get_xydata(), flight.states[:, :2])
+        assert path.get_label().splitlines() == [flight.name, flight.laps_in_words, "all steps flown"]
+    assert paths[0].get_color() != paths[1].get_color()
+    elsewhere = slow._replace(track=load_track("split_s"))
+    with pytest.raises(ValueError, match=r"flytrack.*split_s"):
+        draw_comparison([ghost, elsewhere])
+
+
+def with_laps(flight: Flight, num_steps: int, *laps: tuple[int, float]) -> Flight:
+    """Return a flight of that many steps that completed laps at these rows in these times."""
+    passes = tuple(
+        Pass(row, 0.01 * row, 7, np.zeros(3), number, time_s) for number, (row, time_s) in enumerate(laps, 1)
+    )
+    return flight._replace(race=flight.race._replace(passes=passes), states=np.zeros((num_steps + 1, 21)))
+
+
+def test_video_shows_the_fastest_flying_lap_else_the_first_else_the_flight(ghost):
+    video = pytest.importorskip("flytrack_env.pictures.video")
+
+    def shown(num_steps: int, *laps: tuple[int, float]) -> range:
+        return video.shown_rows(with_laps(ghost, num_steps, *laps))
+
+    assert shown(2000, (390, 3.7), (790, 4.0), (1180, 3.8), (1570, 3.9)) == range(790, 1181, 2)
+    assert shown(2000, (390, 3.7), (791, 4.0)) == range(390, 793, 2)  # an odd number of steps: one more
+    assert shown(791, (390, 3.7), (791, 4.0))[-1] == 790  # which there is not
+    assert shown(600, (390, 3.7)) == range(0, 391, 2)
+    assert shown(2500) == range(0, 2001, 2)
+    assert shown(7) == range(0, 8, 2)
+    assert shown(0) == range(0, 1, 2)
+    rows = video.shown_rows(ghost)
+    assert (rows[0], rows[-1]) == (388, 772)
+
+
+class Recorder:
+    """A renderer that notes what it is asked to draw."""
+
+    def __init__(self, fails_at: int = -1):
+        self.drawn: list[tuple[np.ndarray, float]] = []
+        self.fails_at = fails_at
+
+    def draw(self, log: Any) -> np.ndarray:
+        if len(self.drawn) == self.fails_at:
+            raise RuntimeError("the renderer fails")
+        self.drawn.append((log.rows[-1].copy(), log.time_s - log.rows[-1, 23]))
+        return np.full((32, 48, 3), len(self.drawn) % 256, np.uint8)
+
+
+@pytest.fixture
+def install_renderer(monkeypatch: pytest.MonkeyPatch) -> Callable[[int], Recorder]:
+    video = pytest.importorskip("flytrack_env.pictures.video")
+
+    def install(fails_at: int = -1) -> Recorder:
+        renderer = Recorder(fails_at)
+        monkeypatch.setattr(video, "make_renderer", lambda course: renderer)
+        return renderer
+
+    return install
+
+
+def test_pictures_of_the_video_are_the_laps_states_with_the_race(ghost, install_renderer):
+    from flytrack_env.pictures.video import make_clip, shown_rows
+
+    renderer, rows = install_renderer(), shown_rows(ghost)
+    with make_clip(ghost, rows) as clip:
+        assert sum(1 for _ in clip.iter_frames(fps=50.0)) == len(rows)
+    with make_clip(ghost, range(0, 57, 2)) as clip:  # 29 pictures: 29 / 50 * 50 is rounded to less
+        assert sum(1 for _ in clip.iter_frames(fps=50.0)) == 29
+    renderer.drawn = renderer.drawn[: len(rows)]
+    scenes = np.array([row for row, _ in renderer.drawn])
+    np.testing.assert_array_equal(scenes[:, :21], STATES[rows])
+    np.testing.assert_array_equal(scenes[:, 21], ghost.race.gate[rows])
+    np.testing.assert_array_equal(scenes[:, 22], ghost.race.laps[rows])
+    # The lap time in the picture: since the crossing that began the lap, though the log begins later.
+    start_s, since_s = ghost.race.passes[7].time_s, np.array([lap_s for _, lap_s in renderer.drawn])
+    own = ghost.race.laps[rows] == 1
+    np.testing.assert_allclose(since_s[own], 0.01 * np.array(rows)[own] - start_s, atol=1e-4)
+    assert own.sum() in (len(rows) - 1, len(rows)) and since_s[own].max() == pytest.approx(3.833, abs=0.02)
+
+
+def test_video_has_fifty_pictures_a_second_at_the_speed_of_the_flight(tmp_path, ghost):
+    moviepy = pytest.importorskip("moviepy")
+    flight = make_flight("start", STATES[:9], COMMANDS[:9], TRACK)
+    path = write_video(flight, tmp_path / "new")
+    assert path == tmp_path / "new" / "start.mp4" and [*path.parent.iterdir()] == [path]
+    with moviepy.VideoFileClip(str(path)) as clip:
+        assert (clip.fps, clip.n_frames, tuple(clip.size)) == (50.0, 5, (960, 540))
+        assert clip.duration == pytest.approx(0.1)
+        assert clip.get_frame(0.0).std() > 20.0
+
+
+def test_video_that_fails_leaves_what_was_there(tmp_path, ghost, install_renderer, monkeypatch):
+    moviepy = pytest.importorskip("moviepy")
+    old = tmp_path / "ghost.mp4"
+    old.write_bytes(b"old")
+    install_renderer(fails_at=3)
+    with pytest.raises(RuntimeError, match="the renderer fails"):
+        write_video(ghost, tmp_path)
+    install_renderer()
+    short = make_flight("ghost", STATES[:5], COMMANDS[:5], TRACK)
+    with monkeypatch.context() as patch:
+        patch.setattr(moviepy.VideoClip, "write_videofile", lambda self, name, *_, **__: None)
+        with pytest.raises(OSError, match=r"ghost\.mp4: found a video that cannot be read back"):
+            write_video(short, tmp_path)
+    assert [*tmp_path.iterdir()] == [old] and old.read_bytes() == b"old"
+
+
+def test_command_draws_every_rollout_and_tells_same_names_apart(tmp_path, capsys):
+    for folder, end in (("a", 30), ("b", 25)):
+        save_rollout(tmp_path / folder / "rollout.npy", STATES[:end], COMMANDS[:end])
+    paths = [str(tmp_path / folder / "rollout.npy") for folder in "ab"]
+    assert main([*paths, "--out", str(tmp_path / "out")]) == 0
+    views = [f"{name}_rollout_{view}.png" for name in "ab" for view in ("top", "side", "commands")]
+    written = {path.name: path.read_bytes() for path in (tmp_path / "out").iterdir()}
+    assert set(written) == {*views, "comparison_top.png"}
+    assert all(content.startswith(b"\x89PNG") for content in written.values())
+    lines = capsys.readouterr().out.splitlines()
+    assert [Path(line.split(":")[0]).name for line in lines] == [*views, "comparison_top.png"]
+
+
+def test_what_cannot_be_drawn_is_said_in_one_line_and_nothing_is_written(tmp_path, capsys):
+    good = tmp_path / "good.npy"
+    save_rollout(good, STATES[:3], COMMANDS[:3])
+    np.save(tmp_path / "none.npy", np.zeros((0, 25), np.float32))
+    np.save(tmp_path / "pickled.npy", np.array([{}], object), allow_pickle=True)
+    before, out = {*tmp_path.rglob("*")}, tmp_path / "out"
+    for files, folder, more, said in (
+        (["missing.npy"], out, [], "missing.npy: cannot be read"),
+        (["good.npy", "none.npy"], out, [], "none.npy"),
+        (["pickled.npy"], out, [], "pickles are allowed"),
+        (["good.npy"], out, ["--track", "monza"], "found 'monza', expected one of"),
+        (["good.npy"], good, [], "good.npy: found a file"),
+        (["good.npy"], good / "under", [], f"under: found a file, {good}, expected a folder"),
+        (["good.npy", "good.npy"], out, [], "expected one of its own"),
+    ):
+        status = main([*(str(tmp_path / name) for name in files), "--out", str(folder), *more])
+        (line,) = capsys.readouterr().err.splitlines()
+        assert status == 1 and line.startswith("error: ") and said in line, line
+        assert {*tmp_path.rglob("*")} == before
+
+
+def test_a_single_state_of_a_short_row_is_drawn(tmp_path):
+    rows = np.concatenate([STATES[:1, :16], STATES[:1, 19:], COMMANDS[:1]], axis=1)
+    np.save(tmp_path / "short.npy", rows)
+    flights = read_flights([tmp_path / "short.npy"], TRACK)
+    assert np.isnan(flights[0].states[:, 16:19]).all()
+    names = [path.name for path in write_pictures(flights, tmp_path)]
+    assert names == ["short_top.png", "short_side.png", "short_commands.png"]
+
+
+@pytest.mark.parametrize(("library", "extra"), [("matplotlib", "viz"), ("moviepy", "render")])
+def test_missing_library_is_named_with_its_extra(
+    library: str, extra: str, ghost: Flight, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, library, None)
+    with pytest.raises(ImportError, match=rf"{library}.*flytrack\[{extra}\]"):
+        draw_flight(ghost) if library == "matplotlib" else write_video(ghost, tmp_path)
