@@ -6,6 +6,7 @@ import time
 from pathlib import Path
 from typing import Any
 
+import jax
 import numpy as np
 
 import eval_agent
@@ -13,12 +14,13 @@ from baselines.purejaxrl_ppo import Config
 from baselines.purejaxrl_ppo.density import draw_position_density
 from baselines.purejaxrl_ppo.evaluate import fly_many
 from baselines.purejaxrl_ppo.flights import outcomes_of, score
+from baselines.purejaxrl_ppo.recording import record_flights
 from baselines.purejaxrl_ppo.resume import checkpoints_in
 from baselines.purejaxrl_ppo.train_ppo import train_policy
-from flytrack_env import blackbox, load_track, save_model
+from flytrack_env import blackbox, save_model
 from flytrack_env.files import fresh_folder, write_atomically
-from flytrack_env.rollout import load_rollout
-from flytrack_env.viz_rerun import visualize_state_action_sequence
+from flytrack_env.pictures import read_flights, write_pictures
+from flytrack_env.references import shipped_references
 from flytrack_sysid import Validation, collect, fit, held_out_rows, load_log, save_log, validate
 from flytrack_sysid.validate import NAMES
 
@@ -98,12 +100,12 @@ def run(arguments: argparse.Namespace) -> None:
     result = score(outcomes_of(flights, NUM_LAPS, len(env.track.gates)))
 
     print("4/4 draw")
-    states, actions = load_rollout(out / "rollout.npy")
-    track = load_track(checkpoint.track)
-    draw_position_density(out / "position_density.png", flights.positions(), track, NUM_EPISODES)
-    visualize_state_action_sequence(
-        list(zip(states, actions, strict=True)), track.rows(), str(out / "rollout.rrd")
-    )
+    draw_position_density(out / "position_density.png", flights.positions(), env.track, NUM_EPISODES)
+    write_pictures(read_flights([out / "rollout.npy"], env.track), out)
+    beside = eval_agent.fly_beside(checkpoint, jax.random.key(seed), NUM_STEPS, NUM_STEPS, env.track)
+    references = shipped_references(env.track, eval_agent.reference_models(arguments.black_box))
+    shown = {"black box": flight, "simulator": beside}
+    record_flights(out / "rollout.rrd", shown, env.track, references=references)
     summary: dict[str, Any] = {
         "seed": seed,
         "black_box": arguments.black_box.name,

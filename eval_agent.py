@@ -7,7 +7,6 @@ plain numeric array (T, 25) = [x 21 | u 4]. What is printed and stored: docs/bas
 
 import argparse
 import json
-import os
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -16,9 +15,11 @@ import numpy as np
 
 import flytrack_env
 from baselines.purejaxrl_ppo.checkpoint import Checkpoint, CheckpointError, load_checkpoint
+from baselines.purejaxrl_ppo.eval_options import ghost_path, parse_arguments
 from baselines.purejaxrl_ppo.evaluate import fly_episode, race_many, start_keys, start_pose_params
 from baselines.purejaxrl_ppo.flights import Flight, Outcomes, outcomes_of, save_flown
 from baselines.purejaxrl_ppo.perturbed import Plants, draw_plants, with_model_as_given
+from baselines.purejaxrl_ppo.recording import record_flights
 from baselines.purejaxrl_ppo.report import describe, describe_report, lap_times, reason_ended
 from baselines.purejaxrl_ppo.summary import summarise
 from benchmarks.optimal.compared import compare, time_lost
@@ -34,15 +35,11 @@ from flytrack_env.references import (
     shipped_references,
 )
 from flytrack_env.rollout import save_rollout
+from flytrack_env.tracks import Track
 
 SHIPPED_BLACK_BOX = Path(__file__).parent / "blackbox" / "acro_step.bin"
 
 SCHEMA = 1
-DEFAULT_LAPS = 3
-MAX_SEED = 2**31
-MAX_STEPS = 1_000_000  # hours: the battery is empty after minutes
-MAX_LAPS = 100  # their gate times are kept for every flight
-MAX_FLIGHTS = 100_000  # so that the gate times of all of them fit into memory
 BLACK_BOX_MODELS, NOMINAL_MODELS = ("black_box", "nominal"), ("nominal",)  # of references, the best first
 
 
@@ -102,9 +99,10 @@ def _fly_one(
     return fly_episode(env, network, checkpoint.params, key, params, num_steps, num_laps)
 
 
-def ghost_path(out: Path) -> Path:
-    """Return where the ghost of a rollout lies."""
-    return out.with_name(f"{out.stem}_ghost.npy")
+def reference_models(black_box: Path) -> tuple[str, ...]:
+    """Return the names of the models whose time-optimal flights a black box is compared with, best first."""
+    is_shipped = black_box.read_bytes() == SHIPPED_BLACK_BOX.read_bytes()
+    return BLACK_BOX_MODELS if is_shipped else NOMINAL_MODELS
 
 
 class Scene(NamedTuple):
@@ -121,14 +119,15 @@ def set_scene(checkpoint: Checkpoint, arguments: argparse.Namespace) -> Scene:
     if arguments.plants is None:
         black_box = arguments.black_box or SHIPPED_BLACK_BOX
         env, plants = black_box_env(checkpoint, black_box, arguments.track), None
-        is_shipped = black_box.read_bytes() == SHIPPED_BLACK_BOX.read_bytes()
+        models = reference_models(black_box)
     else:
         env = simulated_env(checkpoint, arguments.track)
         model = env.default_params.model
         plants = draw_plants(arguments.seed, arguments.plants, model)
         is_shipped = is_model_of(env.track.name, BLACK_BOX_MODELS[0], model)
+        models = BLACK_BOX_MODELS if is_shipped else NOMINAL_MODELS
     try:
-        references = shipped_references(env.track, BLACK_BOX_MODELS if is_shipped else NOMINAL_MODELS)
+        references = shipped_references(env.track, models)
     except ReferenceFileError:
         if arguments.ghost:
             raise
@@ -141,17 +140,52 @@ def fly_scene(scene: Scene, checkpoint: Checkpoint, arguments: argparse.Namespac
     env, params, plants, _ = scene
     steps, episodes = arguments.steps, arguments.episodes
     if plants is None and episodes == 1:
-        key, num_laps = jax.random.key(arguments.seed), arguments.laps or steps
-        flight = _fly_one(env, checkpoint, key, params, steps, num_laps)
+        num_laps = arguments.laps or steps
+        flight = _fly_one(env, checkpoint, first_key(arguments), params, steps, num_laps)
         flights = jax.tree.map(lambda leaf: leaf[None], flight)
         return outcomes_of(flights, num_laps, len(env.track.gates)), flight
-    keys = start_keys(arguments.seed, episodes * (arguments.plants or 1))
+    keys = _start_keys(arguments)
     models = None if plants is None else plants.repeated(episodes)
     policy = (checkpoint.network, checkpoint.params)
     outcomes = race_many(env, *policy, keys, steps, arguments.laps, params, models)
     if plants is not None:
         params = params.replace(model=plants.model(0))
     return outcomes, _fly_one(env, checkpoint, keys[0], params, steps, arguments.laps)
+
+
+def _start_keys(arguments: argparse.Namespace) -> jax.Array:
+    return start_keys(arguments.seed, arguments.episodes * (arguments.plants or 1))
+
+
+def first_key(arguments: argparse.Namespace) -> jax.Array:
+    """Return the key that the first flight starts from."""
+    is_many = arguments.episodes != 1 or arguments.plants is not None
+    return _start_keys(arguments)[0] if is_many else jax.random.key(arguments.seed)
+
+
+def fly_beside(checkpoint: Checkpoint, key: jax.Array, num_steps: int, num_laps: int, track: Track) -> Flight:
+    """Return the flight from the same start in the simulator, with the model that the policy learnt on.
+
+    Beside a flight on a plant it shows what that simulator gets wrong.
+
+    Raises:
+        CheckpointError: a checkpoint that does not hold its model.
+    """
+    env = simulated_env(checkpoint, track)
+    return _fly_one(env, checkpoint, key, with_model_as_given(env.default_params), num_steps, num_laps)
+
+
+def record(scene: Scene, checkpoint: Checkpoint, arguments: argparse.Namespace, flight: Flight) -> None:
+    """Write the first flight as a Rerun recording, the simulator's beside it, and the ghost if asked for."""
+    flights = {"black box" if scene.plants is None else "first plant": flight}
+    if "model" in checkpoint.meta:
+        num_laps = arguments.laps or arguments.steps
+        flights["simulator"] = fly_beside(
+            checkpoint, first_key(arguments), arguments.steps, num_laps, scene.env.track
+        )
+    references = scene.references if arguments.ghost else None
+    record_flights(arguments.rrd, flights, scene.env.track, arguments.laps, references)
+    print(f"recording: {arguments.rrd}, {', '.join(flights)}: {arguments.rrd.stat().st_size} bytes")
 
 
 def make_report(
@@ -205,78 +239,28 @@ def evaluate(arguments: argparse.Namespace) -> None:
         "lap_times_s": lap_times(flight).tolist(),
         "ended": reason_ended(flight, arguments.laps),
     }
-    written = {"first_flight": first_flight, "rollout": str(arguments.out), "ghost": None}
+    written = {"first_flight": first_flight, "rollout": str(arguments.out), "ghost": None, "recording": None}
     if arguments.ghost:
         path = ghost_path(arguments.out)
         save_rollout(path, *ghost_rollout(scene.references, first_flight["steps"]))
         written["ghost"] = str(path)
         print(f"ghost: {path}")
+    if arguments.rrd is not None:
+        record(scene, checkpoint, arguments, flight)
+        written["recording"] = str(arguments.rrd)
     if arguments.json is not None:
         content = json.dumps(report | written, indent=2, allow_nan=False) + "\n"
         write_atomically(arguments.json, content.encode())
         print(f"json: {arguments.json}")
 
 
-def parse_arguments(parser: argparse.ArgumentParser) -> argparse.Namespace:
-    """Return the command line's arguments, checked as far as that goes without reading a file."""
-    parser.add_argument("--checkpoint", type=Path, required=True, help="of train_ppo: final.msgpack")
-    parser.add_argument("--steps", type=int, required=True, help="time limit; at 100 Hz, 2000 are 20 s")
-    parser.add_argument("--episodes", type=int, default=1, help="noisy starts, on each plant (%(default)s)")
-    parser.add_argument("--laps", type=int, help=f"to complete ({DEFAULT_LAPS}; one flight: no limit)")
-    parser.add_argument(
-        "--plants", type=int, metavar="K", help="fly K simulated plants, drawn around the checkpoint's model"
-    )
-    parser.add_argument("--black-box", type=Path, help=f"file ({SHIPPED_BLACK_BOX.name}, as shipped)")
-    parser.add_argument("--track", metavar="NAME_OR_FILE", help="default: the checkpoint's")
-    parser.add_argument("--seed", type=int, default=0, help="of the noisy starts and of the plants")
-    parser.add_argument("--ghost", action="store_true", help="compare with the time-optimal flight, write it")
-    parser.add_argument(
-        "--out", type=Path, default=Path("rollout.npy"), help="rollout of the first flight (%(default)s)"
-    )
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write all that is printed")
-    arguments = parser.parse_args()
-    if arguments.plants is not None and arguments.black_box is not None:
-        parser.error(f"--plants: found --black-box {arguments.black_box} beside it, expected one of the two")
-    is_many = arguments.episodes != 1 or arguments.plants is not None
-    if arguments.laps is None and is_many:
-        arguments.laps = DEFAULT_LAPS
-    limits = {"steps": (1, MAX_STEPS), "episodes": (1, MAX_FLIGHTS), "laps": (1, MAX_LAPS)}
-    limits |= {"plants": (1, MAX_FLIGHTS // max(arguments.episodes, 1)), "seed": (0, MAX_SEED - 1)}
-    for name, (low, high) in limits.items():
-        value = getattr(arguments, name)
-        if value is not None and not low <= value <= high:
-            parser.error(f"--{name}: found {value}, expected {low} to {high}")
-    check_files(parser, arguments)
-    return arguments
-
-
-def check_files(parser: argparse.ArgumentParser, arguments: argparse.Namespace) -> None:
-    """End the program, saying why, where a file could not be written, or would replace one that is read."""
-    out, json_file = arguments.out, arguments.json
-    read = {path.resolve() for path in (arguments.checkpoint, arguments.black_box) if path is not None}
-    for name, path in (("--out", out), ("--json", json_file)):
-        if path is None:
-            continue
-        if path.resolve() in read:
-            parser.error(f"{name}: found {path}, which is read, expected another file")
-        if path.is_dir():
-            parser.error(f"{name}: {path} is a folder, expected the path of a file")
-        nearest = next(folder for folder in path.absolute().parents if folder.exists())
-        if not nearest.is_dir():
-            parser.error(f"{name}: {path}: found a file {nearest}, expected a folder")
-        if not os.access(nearest, os.W_OK):
-            parser.error(f"{name}: {path}: found no permission to write in {nearest}")
-    if json_file is not None and json_file.absolute() in (out.absolute(), ghost_path(out).absolute()):
-        parser.error(f"--json: found {json_file}, expected another file than the rollouts")
-
-
 def main() -> None:
     """Parse the command line, fly, print the result, write the files."""
     parser = argparse.ArgumentParser(description=__doc__)
-    arguments = parse_arguments(parser)
+    arguments = parse_arguments(parser, SHIPPED_BLACK_BOX)
     try:
         evaluate(arguments)
-    except (ValueError, OSError) as error:
+    except (ImportError, ValueError, OSError) as error:
         parser.error(str(error))
 
 

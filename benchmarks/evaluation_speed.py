@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 import eval_agent
 from baselines.purejaxrl_ppo.checkpoint import Checkpoint, load_checkpoint
+from baselines.purejaxrl_ppo.eval_options import MAX_FLIGHTS
 from baselines.purejaxrl_ppo.evaluate import race_many, start_keys
 from baselines.purejaxrl_ppo.monitor import NUM_LAPS, NUM_STEPS
 from baselines.purejaxrl_ppo.perturbed import with_model_as_given
@@ -62,8 +63,8 @@ def main() -> None:
     parser.add_argument("--black-box", type=Path, default=eval_agent.SHIPPED_BLACK_BOX)
     parser.add_argument("--out", type=Path, default=Path("docs/results/evaluation_speed.md"))
     arguments = parser.parse_args()
-    if not 1 <= arguments.episodes <= eval_agent.MAX_FLIGHTS:
-        expected = f"expected 1 to {eval_agent.MAX_FLIGHTS}"
+    if not 1 <= arguments.episodes <= MAX_FLIGHTS:
+        expected = f"expected 1 to {MAX_FLIGHTS}"
         parser.error(f"--episodes: found {arguments.episodes}, {expected}")
     pinned = pin_to_one_core()
     try:

@@ -14,7 +14,7 @@ import numpy as np
 from flytrack_env.quaternion import Vec3
 from flytrack_env.race import Race, advance_race, start_race
 from flytrack_env.state import POSITION, VELOCITY, unpack
-from flytrack_env.terminations import find_causes
+from flytrack_env.terminations import Causes, find_causes
 from flytrack_env.tracks import Course, GateFrame, Track, build_course, cross_gate
 
 STEP_S = 0.01
@@ -25,9 +25,9 @@ PADDED_TO = 1024  # steps: flights of about the same length share one compiled p
 class Pass(NamedTuple):
     """One gate passed, or a lap completed by it.
 
-    row: of the first state behind the gate. time_s: of the crossing, interpolated, s since the first state.
-    gate: index in flying order. pos_w: where, (3,), world, m. lap: that it completed, counted from 1, 0 if
-    none. lap_time_s: of that lap, 0.0 if none.
+    row: of the first state behind the gate; the number of states if that is after the last. time_s: of the
+    crossing, interpolated, s since the first state. gate: index in flying order. pos_w: where, (3,), world,
+    m. lap: that it completed, counted from 1, 0 if none. lap_time_s: of that lap, 0.0 if none.
     """
 
     row: int
@@ -53,11 +53,17 @@ class FlownRace(NamedTuple):
     passes: tuple[Pass, ...]
 
 
-def follow_race(positions: np.ndarray, track: Track, first_gate: int | None = None) -> FlownRace:
+def follow_race(
+    positions: np.ndarray,
+    track: Track,
+    first_gate: int | None = None,
+    last_vel_w: np.ndarray | None = None,
+) -> FlownRace:
     """Return the race that a flight at 100 Hz through these positions was; the rules of ``advance_race``.
 
     positions: (T, 3), world, m, finite. first_gate: index of the gate to fly first; if None, the one that
-    the flight passes first, gate 0 if it passes none.
+    the flight passes first, gate 0 if it passes none. last_vel_w: (3,), m/s, of the last state: a rollout
+    ends before its last step, often just before a gate, and that step is carried on at this velocity.
 
     Raises:
         ValueError: a track without gates.
@@ -65,7 +71,10 @@ def follow_race(positions: np.ndarray, track: Track, first_gate: int | None = No
     if not track.gates:
         raise ValueError("track: found no gates, expected at least one")
     course = build_course(track)
-    positions = np.asarray(positions, np.float32)
+    count, positions = len(positions), np.asarray(positions, np.float32)
+    if last_vel_w is not None:
+        ahead_w = positions[-1] + STEP_S * np.asarray(last_vel_w, np.float32)
+        positions = np.concatenate([positions, ahead_w[None]])
     num_steps = len(positions) - 1
     if first_gate is None:
         is_pass = gates_passed(positions, track)
@@ -75,11 +84,11 @@ def follow_race(positions: np.ndarray, track: Track, first_gate: int | None = No
     followed = _Followed(*(leaf[: num_steps + 1] for leaf in followed))
     centres = np.stack(course.gates.centre, axis=-1)[followed.gate]
     return FlownRace(
-        gate=followed.gate,
-        gate_distance_m=np.linalg.norm(positions - centres, axis=1),
-        laps=followed.laps,
-        lap_start_s=followed.lap_start_s,
-        lap_time_s=followed.lap_time_s,
+        gate=followed.gate[:count],
+        gate_distance_m=np.linalg.norm(positions - centres, axis=1)[:count],
+        laps=followed.laps[:count],
+        lap_start_s=followed.lap_start_s[:count],
+        lap_time_s=followed.lap_time_s[:count],
         passes=_passes(followed, fractions[:num_steps], positions, len(track.gates)),
     )
 
@@ -105,15 +114,19 @@ def why_ended(states: np.ndarray, track: Track, race: FlownRace) -> str:
     A rollout's last row is the state before its last step; the step is carried on at the last velocity.
     states: (T, 21).
     """
-    course = build_course(track)
-    last = np.asarray(states[-1], np.float32)
-    ahead_w = last[POSITION] + STEP_S * last[VELOCITY]
-    gate = course.gate(jnp.int32(race.gate[-1]))
-    crossing = cross_gate(gate, Vec3(*last[POSITION]), Vec3(*ahead_w), DRONE_RADIUS_M)
-    ahead = unpack(np.concatenate([ahead_w, last[3:]]))
-    causes = find_causes(ahead, course, crossing.is_frame, crossing.is_miss)
+    causes = _causes(np.asarray(states[-1], np.float32), np.int32(race.gate[-1]), build_course(track))
     names = [name.replace("_", " ") for name, happened in causes._asdict().items() if happened]
     return ", ".join(names) or "all steps flown"
+
+
+@jax.jit
+def _causes(last: jax.Array, gate_index: jax.Array, course: Course) -> Causes:
+    """Return what would end the flight in the step after a state (21,)."""
+    ahead_w = last[POSITION] + STEP_S * last[VELOCITY]
+    gate = course.gate(gate_index)
+    crossing = cross_gate(gate, Vec3(*last[POSITION]), Vec3(*ahead_w), DRONE_RADIUS_M)
+    ahead = unpack(last.at[POSITION].set(ahead_w))
+    return find_causes(ahead, course, crossing.is_frame, crossing.is_miss)
 
 
 class _Followed(NamedTuple):

@@ -93,6 +93,7 @@ def test_demo_writes_everything(tmp_path, monkeypatch, capsys):
     )
     demo.main()
     names = {"final.msgpack", "model.json", "position_density.png", "rollout.npy", "rollout.rrd"}
+    names |= {"rollout_top.png", "rollout_side.png", "rollout_commands.png"}
     assert {path.name for path in out.iterdir()} == names | {"flight_log.npz", "summary.json"}
     summary = json.loads((out / "summary.json").read_text())
     assert summary["noisy_starts"]["episodes"] == 4

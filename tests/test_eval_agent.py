@@ -1,6 +1,8 @@
 """Evaluation: many flights and single ones agree, known lap times come out, drawn plants, ghost, refusals."""
 
+import importlib.util
 import json
+import os
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -38,6 +40,7 @@ from flytrack_env.state import BATTERY, BATTERY_FULL_V, POSITION, VELOCITY, Acti
 from flytrack_env.tracks import random_track
 from flytrack_env.wrappers import DomainRandomization
 from flytrack_env.wrappers.domain_randomization import sample_model
+from tests.recordings import Recording
 
 ROOT = Path(__file__).parent.parent
 NUM_LAPS, NUM_STEPS, NUM_FLIGHTS = 3, 1400, 10
@@ -346,8 +349,17 @@ def test_single_flight_is_told_as_json_and_docs_name_every_key(
     monkeypatch.setattr(eval_agent, "_fly_one", lambda *_: jax.tree.map(lambda leaf: leaf[index], flights))
     out, file = tmp_path / "flight.npy", tmp_path / "report.json"
     where = ["--checkpoint", checkpoint_path, "--out", out, "--json", file, "--steps", NUM_STEPS]
+    recording = tmp_path / "flight.rrd"
+    if importlib.util.find_spec("rerun") is not None:
+        where += ["--rrd", recording]
     run(monkeypatch, *where)
     text, report = capsys.readouterr().out, json.loads(file.read_text())
+    if report["recording"] is not None:
+        assert report["recording"] == str(recording)
+        found = Recording(recording)
+        for drone in ("/world/drone", "/world/flights/simulator/drone"):
+            place = found.series(drone, "Transform3D:translation")
+            np.testing.assert_allclose(place, load_rollout(out)[0][:, POSITION])
     assert "interval" not in text and report["success"] is None and report["ghost"] is None
     np.testing.assert_allclose(report["first_flight"]["lap_times_s"], raced.lap_times_s[index], atol=1e-5)
     assert [line.split(":")[0] for line in text.splitlines()][:4] == ["flown", "gates", "lap times", "ended"]
@@ -388,7 +400,10 @@ def make_bad_files(folder: Path) -> None:
         (["--out", "policy.msgpack"], ["--out: found policy.msgpack, which is read"]),
         (["--out", "locked/rollout.npy"], ["--out: locked/rollout.npy", "no permission to write"]),
         (["--json", "file/report.json"], ["--json", "found a file", "expected a folder"]),
-        (["--json", "rollout_ghost.npy"], ["--json", "another file than the rollouts"]),
+        (["--json", "rollout_ghost.npy"], ["--json", "the rollout of the ghost, expected another file"]),
+        (["--rrd", "rollout.npy"], ["--rrd", "which is that of --out, expected another file"]),
+        (["--rrd", "a.rrd", "--json", "a.rrd"], ["--json", "which is that of --rrd, expected another file"]),
+        (["--rrd", "."], ["--rrd", "is a folder"]),
         (["--checkpoint", "file"], ["file", "not a checkpoint"]),
     ],
 )
@@ -401,7 +416,7 @@ def test_command_refuses_before_it_flies(
 ) -> None:
     monkeypatch.chdir(bad_files)
     # Whoever runs the tests as root may write anywhere.
-    monkeypatch.setattr(eval_agent.os, "access", lambda path, mode: Path(path).name != "locked")
+    monkeypatch.setattr(os, "access", lambda path, mode: Path(path).name != "locked")
     monkeypatch.setattr(eval_agent, "fly_scene", lambda *_: pytest.fail("it flew"))
     with pytest.raises(SystemExit) as ended:
         run(monkeypatch, "--checkpoint", "policy.msgpack", "--steps", "5", *arguments)

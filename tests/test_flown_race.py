@@ -88,6 +88,21 @@ def test_flight_is_followed_from_the_gate_that_it_passes_first():
     assert found.gate[0] == 4
 
 
+def test_step_after_the_last_state_is_carried_on():
+    """A rollout of complete laps ends before the step that completes the last one."""
+    states, _ = ghost_rollout(REFERENCES, 900)
+    whole = follow_race(states[:, POSITION], TRACK)
+    lap = whole.passes[7]
+    cut = states[: lap.row]
+    without = follow_race(cut[:, POSITION], TRACK)
+    found = follow_race(cut[:, POSITION], TRACK, last_vel_w=cut[-1, VELOCITY])
+    assert len(without.passes) == 7 and len(found.passes) == 8
+    assert found.passes[7].row == len(cut) and found.passes[7].lap == 1
+    assert found.passes[7].lap_time_s == pytest.approx(REFERENCES["standing"].time_s, abs=2e-4)
+    for one, other in zip(found[:5], without[:5], strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
 def test_flight_that_passes_nothing_has_the_first_gate_ahead():
     found = follow_race(np.zeros((5, 3)), TRACK)
     assert found.passes == () and set(found.gate) == {0} and set(found.laps) == {0}

@@ -3,7 +3,6 @@
 import logging
 from collections.abc import Iterator
 from contextlib import contextmanager
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -15,6 +14,7 @@ from baselines.purejaxrl_ppo.density import draw_position_density
 from baselines.purejaxrl_ppo.evaluate import fly_many
 from baselines.purejaxrl_ppo.flights import Outcomes, outcomes_of, save_flown, score
 from baselines.purejaxrl_ppo.networks import ActorCritic
+from baselines.purejaxrl_ppo.recording import can_record, record_flights
 
 NUM_LAPS = 3
 NUM_STEPS = 2500  # 25 s at 100 Hz: three laps of the slowest shipped track, flown by a beginner
@@ -80,31 +80,19 @@ def evaluate_policy(
         return metrics, files
     folder = out / "evaluation"
     rollout, chart = folder / f"rollout_{steps}.npy", folder / f"position_density_{steps}.png"
+    first = jax.tree.map(lambda leaf: leaf[0], flights)
     with attempt("writing the rollout", steps):
-        save_flown(rollout, jax.tree.map(lambda leaf: leaf[0], flights))
+        save_flown(rollout, first)
         files.append(rollout)
     with attempt("drawing the position density", steps):
         label = f"{steps:,} training steps"
         draw_position_density(chart, flights.positions(), env.track, num_episodes, label)
         files.append(chart)
-    if is_recorded and rollout in files:
+    if is_recorded and can_record():
         with attempt("recording with Rerun", steps):
-            recording = record_flight(rollout, env.track)
-            files += [] if recording is None else [recording]
+            record_flights(rollout.with_suffix(".rrd"), {"policy": first}, env.track, NUM_LAPS)
+            files.append(rollout.with_suffix(".rrd"))
     return metrics, files
-
-
-def record_flight(rollout: Path, track: Any) -> Path | None:
-    """Write a rollout file's flight as a Rerun recording beside it; None where Rerun is not installed."""
-    if find_spec("rerun") is None:
-        return None
-    from flytrack_env.rollout import load_rollout
-    from flytrack_env.viz_rerun import visualize_state_action_sequence
-
-    states, actions = load_rollout(rollout)
-    path = rollout.with_suffix(".rrd")
-    visualize_state_action_sequence(list(zip(states, actions, strict=True)), track.rows(), str(path))
-    return path
 
 
 class Seen(NamedTuple):

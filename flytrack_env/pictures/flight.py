@@ -91,7 +91,7 @@ def _count(number: int, what: str) -> str:
 
 def make_flight(name: str, states: np.ndarray, commands: np.ndarray, track: Track) -> Flight:
     """Return the flight of states (T, 21) and commands (T, 4) on a track; positions must be finite."""
-    race = follow_race(states[:, POSITION], track)
+    race = follow_race(states[:, POSITION], track, last_vel_w=states[-1, VELOCITY])
     steps_m = np.linalg.norm(np.diff(states[:, POSITION].astype(float), axis=0), axis=1)
     distances_m = np.concatenate([[0.0], np.cumsum(steps_m)])
     meetings = _meetings(states, distances_m, track, race)

@@ -30,9 +30,11 @@ class Sender:
 
     def __init__(self, recording: rr.RecordingStream, flight: ShownFlight):
         self.recording, self.flight = recording, flight
+        self.last_row = len(flight.states) - 1
 
     def send(self, entity: str, rows: np.ndarray, columns: rr.ComponentColumnList) -> None:
-        """Send an entity's columns, one row for each of these rows of the flight."""
+        """Send an entity's columns for these rows of the flight; what is after its end, at its end."""
+        rows = np.minimum(rows, self.last_row)
         indexes = [
             rr.TimeColumn("step", sequence=rows),
             rr.TimeColumn("sim_time", duration=self.flight.time_ns[rows].astype("timedelta64[ns]")),
@@ -163,7 +165,7 @@ def send_events(
             lap = f"; lap {one.lap}: {one.lap_time_s:.3f} s" if one.lap else ""
             gate = track.gates[one.gate].id
             lines.append((one.row, f"{name}: passed gate {gate} at {one.time_s:.3f} s{lap}"))
-    lines.append((len(sender.flight.states) - 1, f"{name}: ended: {ended}"))
+    lines.append((sender.last_row, f"{name}: ended: {ended}"))
     rows, texts = zip(*lines, strict=True)
     columns = rr.TextLog.columns(text=texts, level=["INFO"] * len(texts))
     sender.send(entities.events, np.array(rows), columns)

@@ -7,7 +7,7 @@ from functools import cached_property
 import numpy as np
 
 from flytrack_env.flown_race import STEP_S, FlownRace, follow_race, gates_passed, why_ended
-from flytrack_env.state import ACTION_SIZE, POSITION, QUATERNION, STATE_SIZE
+from flytrack_env.state import ACTION_SIZE, POSITION, QUATERNION, STATE_SIZE, VELOCITY
 from flytrack_env.tracks import Gate, Track
 
 GATE_OUTER_M = 2.7
@@ -139,7 +139,7 @@ def race_of(flight: ShownFlight, track: Track | None) -> FlownRace | None:
     """Return the race that the flight flew; None without gates, or where it is not flown at 100 Hz."""
     if track is None or not track.gates or flight.time_s is not None:
         return None
-    return follow_race(flight.positions, track)
+    return follow_race(flight.positions, track, last_vel_w=flight.states[-1, VELOCITY])
 
 
 def end_of(flight: ShownFlight, track: Track | None, race: FlownRace | None) -> str:

@@ -145,10 +145,10 @@ def _send(recording: rr.RecordingStream, shown: _Shown, track: Track | None) -> 
 
 def _describe(shown: Sequence[_Shown]) -> str:
     """Return a table of the flights, Markdown."""
-    lines = ["| flight | time (s) | gates | laps (s) | ended |", "|---|---|---|---|---|"]
+    lines = ["| flight | ended | time (s) | gates | laps (s) |", "|---|---|---|---|---|"]
     for one in shown:
         passes = () if one.race is None else one.race.passes
         laps = ", ".join(f"{each.lap_time_s:.3f}" for each in passes if each.lap) or "-"
         lasts_s = one.flight.time_ns[-1] * 1e-9
-        lines.append(f"| {one.flight.name} | {lasts_s:.2f} | {len(passes)} | {laps} | {one.ended} |")
+        lines.append(f"| {one.flight.name} | {one.ended} | {lasts_s:.2f} | {len(passes)} | {laps} |")
     return "\n".join(lines)

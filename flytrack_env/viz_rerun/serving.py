@@ -1,8 +1,11 @@
 """Rerun's own web viewer on a recording, served to this machine only."""
 
+import os
+import signal
 import socket
 import subprocess
 import sys
+from contextlib import suppress
 from pathlib import Path
 
 MAGIC = b"RRF"  # what every recording begins with
@@ -44,7 +47,7 @@ def check_port(port: int) -> None:
 def start_server(path: str | Path, port: int, open_browser: bool) -> tuple[subprocess.Popen, str]:
     """Start a server of the web viewer for a recording; return its process and the page's address.
 
-    port: of the page. The process serves until it is ended, to this machine only.
+    port: of the page. The process serves until ``stop_server`` ends it, to this machine only.
 
     Raises:
         ServeError: no recording, or a port that is taken.
@@ -56,8 +59,16 @@ def start_server(path: str | Path, port: int, open_browser: bool) -> tuple[subpr
     command = [sys.executable, "-m", "rerun", str(path), "--bind", HOST]
     command += ["--port", str(data_port), "--web-viewer-port", str(port)]
     command.append("--web-viewer" if open_browser else "--serve-web")
-    server = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+    server = subprocess.Popen(command, start_new_session=True, **quiet)
     return server, f"http://{HOST}:{port}/?url=rerun%2Bhttp%3A%2F%2F{HOST}%3A{data_port}%2Fproxy"
+
+
+def stop_server(server: subprocess.Popen) -> None:
+    """End a server and wait for it: the whole group, as the command is a wrapper around a program."""
+    with suppress(ProcessLookupError):
+        os.killpg(server.pid, signal.SIGTERM)
+    server.wait()
 
 
 def serve(path: str | Path, port: int, open_browser: bool) -> None:
@@ -73,6 +84,5 @@ def serve(path: str | Path, port: int, open_browser: bool) -> None:
     except KeyboardInterrupt:
         return
     finally:
-        server.terminate()
-        server.wait()
+        stop_server(server)
     raise ServeError(f"{path}: the viewer's server ended with status {status}, expected it to go on")

@@ -1,0 +1,47 @@
+"""Flights as Rerun recordings; Rerun is imported when one is written."""
+
+from collections.abc import Mapping
+from importlib.util import find_spec
+from pathlib import Path
+
+import numpy as np
+
+from baselines.purejaxrl_ppo.flights import Flight
+from baselines.purejaxrl_ppo.report import reason_ended
+from flytrack_env.references import References, ghost_rollout
+from flytrack_env.tracks import Track
+
+
+def can_record() -> bool:
+    """Return whether Rerun is installed."""
+    return find_spec("rerun") is not None
+
+
+def record_flights(
+    path: Path,
+    flights: Mapping[str, Flight],
+    track: Track,
+    num_laps: int | None = None,
+    references: References | None = None,
+) -> None:
+    """Write flights by name on one time line as a Rerun recording; the first is in the foreground.
+
+    num_laps: that a flight was asked for, if any. references: the time-optimal flights of the track, to go
+    along as a ghost.
+
+    Raises:
+        ImportError: Rerun is not installed; the message says how to install it.
+        ValueError: a path that cannot be written.
+    """
+    from flytrack_env.viz_rerun import ShownFlight, write_recording
+
+    shown = []
+    for name, flight in flights.items():
+        is_flying = np.asarray(flight.is_flying)
+        states, actions = (np.asarray(part)[is_flying] for part in (flight.states, flight.actions))
+        ended = reason_ended(flight, num_laps).replace("_", " ")
+        shown.append(ShownFlight(name, states, actions, ended=ended))
+    if references is not None:
+        longest = max(len(one.states) for one in shown)
+        shown.append(ShownFlight("time-optimal", *ghost_rollout(references, longest)))
+    write_recording(path, shown, track)
