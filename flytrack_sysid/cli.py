@@ -17,7 +17,9 @@ from flytrack_sysid.collect import CollectError, collect
 from flytrack_sysid.diagnosis import diagnose, joined, write_diagnosis
 from flytrack_sysid.diagnosis import text_of as text_of_diagnosis
 from flytrack_sysid.diagnosis.next_flight import next_flight
+from flytrack_sysid.diagnosis.report import traces_of
 from flytrack_sysid.fit import fit
+from flytrack_sysid.flight_recording import write_flight_recording
 from flytrack_sysid.importing import FORMATS, import_log
 from flytrack_sysid.log import FlightLog
 from flytrack_sysid.log_file import check_name, describe, load_log, save_log
@@ -27,6 +29,8 @@ from flytrack_sysid.script_file import load_script, save_script
 from flytrack_sysid.split import HELD_OUT_EVERY, held_out_rows
 from flytrack_sysid.validate import validate
 from flytrack_sysid.validation_report import text_of, write_validation
+
+RECORDING_NAME = "flight.rrd"
 
 
 def load_plant(where: str) -> Any:
@@ -187,7 +191,12 @@ def run_diagnose(arguments: argparse.Namespace) -> None:
     found = diagnose(logs, model, held_out, _Bar("stages"))
     written = write_diagnosis(arguments.out, found, log)
     print(text_of_diagnosis(found))
-    print(f"written: {', '.join(str(path) for path in written)}")
+    recording = arguments.out / RECORDING_NAME
+    models = {"nominal": found.nominal, "extended": found.extended}
+    reason = write_flight_recording(recording, log, models, traces_of(found, log))
+    print(f"written: {', '.join(str(path) for path in [*written, *[recording] * (not reason)])}")
+    if reason:
+        print(f"{recording}: left out: {reason}")
 
 
 def run_plan(arguments: argparse.Namespace) -> None:

@@ -1,6 +1,7 @@
 """What changes from step to step, sent as whole columns."""
 
 import math
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -11,18 +12,19 @@ from flytrack_env.state import APPLIED_ACTION, BATTERY, QUATERNION, RATES, VELOC
 from flytrack_env.tracks import Track
 from flytrack_env.viz_rerun.entities import Entities
 from flytrack_env.viz_rerun.flights import ShownFlight
-from flytrack_env.viz_rerun.scene import SCALED_FORCE, Colour
+from flytrack_env.viz_rerun.scene import ARROW_RADIUS, SCALED_FORCE, Colour
 
 DIM = 0.6  # of what is commanded beside what is applied
 THIN, THICK = 1.0, 2.0
 
 
 class Plot(NamedTuple):
-    """One line of a plot: its path below that of the plots, label, values (T,)."""
+    """One line of a plot: its path below that of the plots, label, values (T,), the model it is of."""
 
     path: str
     label: str
     values: np.ndarray
+    model: str = ""
 
 
 class Sender:
@@ -124,15 +126,21 @@ def plots_of(flight: ShownFlight, race: FlownRace | None) -> list[Plot]:
     for name, forces_w in flight.residuals_w.items():
         size = np.linalg.norm(forces_w, axis=1)
         part = rr.escape_entity_path_part(name)
-        plots.append(Plot(f"residual/{part}", f"force left open by {name} [m/s²]", size))
+        plots.append(Plot(f"residual/{part}", f"force left open by {name} [m/s²]", size, name))
     return plots
 
 
-def send_plots(sender: Sender, entity: str, plots: list[Plot], label: str, colour: Colour) -> None:
-    """Send the lines of plots, and their names once; label: before each name."""
+def send_plots(
+    sender: Sender, entity: str, plots: list[Plot], label: str, colours: Mapping[str, Colour]
+) -> None:
+    """Send the lines of plots, and their names once; label: before each name.
+
+    colours: by the names of flights and models; a line of a model has that one's.
+    """
     for plot in plots:
         is_command = plot.path.startswith("action/")
-        shade = tuple(int(DIM**is_command * part) for part in colour)
+        own = colours[plot.model or sender.flight.name]
+        shade = tuple(int(DIM**is_command * part) for part in own)
         width = THIN if is_command else THICK
         line = rr.SeriesLines(names=label + plot.label, colors=shade, widths=width)
         sender.recording.log(f"{entity}/{plot.path}", line, static=True, strict=True)
@@ -171,11 +179,16 @@ def send_events(
     sender.send(entities.events, np.array(rows), columns)
 
 
-def send_residuals(sender: Sender, entities: Entities) -> None:
-    """Send arrows at the drone for the specific force that models leave open, 0.1 m for 1 m/s^2."""
+def send_residuals(sender: Sender, entities: Entities, colours: Mapping[str, Colour]) -> None:
+    """Send arrows at the drone for the specific force that models leave open, 0.1 m for 1 m/s^2.
+
+    colours: by the names of models.
+    """
     for name, forces_w in sender.flight.residuals_w.items():
         rows = np.flatnonzero(np.isfinite(forces_w).all(axis=1))
         if len(rows):
             vectors, origins = SCALED_FORCE * forces_w[rows], sender.flight.positions[rows]
-            arrows = rr.Arrows3D.columns(vectors=vectors, origins=origins)
-            sender.send(f"{entities.residual}/{rr.escape_entity_path_part(name)}", rows, arrows)
+            entity = f"{entities.residual}/{rr.escape_entity_path_part(name)}"
+            style = rr.Arrows3D.from_fields(radii=ARROW_RADIUS, colors=colours[name])
+            sender.recording.log(entity, style, static=True, strict=True)
+            sender.send(entity, rows, rr.Arrows3D.columns(vectors=vectors, origins=origins))

@@ -1,6 +1,6 @@
 """Writing flights as one recording, whole or not at all."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -74,7 +74,9 @@ def write_recording(
     names = [flight.name for flight in flights]
     if len(set(names)) != len(names) or not names:
         raise ValueError(f"flights: found names {names}, expected at least one, each once")
-    shown = [_show(flight, place, len(flights) == 1, track) for place, flight in enumerate(flights)]
+    colours = _colours(flights)
+    is_alone = len(flights) == 1
+    shown = [_show(flight, place == 0, colours, is_alone, track) for place, flight in enumerate(flights)]
     content = _record(app_id, shown, track)
     try:
         write_atomically(path, content)
@@ -84,26 +86,41 @@ def write_recording(
 
 
 class _Shown(NamedTuple):
-    """A flight with all that is shown of it; label: before the names of its lines."""
+    """A flight with all that is shown of it; label: before the names of its lines.
+
+    colours: by the names of flights and models.
+    """
 
     flight: ShownFlight
     entities: Entities
     race: FlownRace | None
     ended: str
     plots: list[Plot]
-    colour: Colour
+    colours: Mapping[str, Colour]
     label: str
 
 
-def _show(flight: ShownFlight, place: int, is_alone: bool, track: Track | None) -> _Shown:
+def _colours(flights: Sequence[ShownFlight]) -> dict[str, Colour]:
+    """Return the colours of flights, and of models whose forces they have: that of the flight of its name."""
+    models = [model for flight in flights for model in flight.residuals_w]
+    names = dict.fromkeys([*(flight.name for flight in flights), *models])
+    return {name: colour_of(place) for place, name in enumerate(names)}
+
+
+def _show(
+    flight: ShownFlight, is_first: bool, colours: Mapping[str, Colour], is_alone: bool, track: Track | None
+) -> _Shown:
     race = race_of(flight, track)
+    plots = plots_of(flight, race)
+    if not is_first:  # the first one has the entities of the handout
+        plots = [plot for plot in plots if np.isfinite(plot.values).any()]
     return _Shown(
         flight=flight,
-        entities=entities_of(flight.name, place == 0),
+        entities=entities_of(flight.name, is_first),
         race=race,
         ended=end_of(flight, track, race),
-        plots=plots_of(flight, race),
-        colour=colour_of(place),
+        plots=plots,
+        colours=colours,
         label="" if is_alone else f"{flight.name}: ",
     )
 
@@ -132,12 +149,12 @@ def _record(app_id: str, shown: Sequence[_Shown], track: Track | None) -> bytes:
 def _send(recording: rr.RecordingStream, shown: _Shown, track: Track | None) -> None:
     """Send all of one flight."""
     sender, entities = Sender(recording, shown.flight), shown.entities
-    log_drone(recording, entities, shown.colour)
+    log_drone(recording, entities, shown.colours[shown.flight.name])
     send_pose(sender, entities.drone)
     send_chase(sender, entities.chase)
     send_trajectory(sender, entities.trajectory)
-    send_plots(sender, entities.plots, shown.plots, shown.label, shown.colour)
-    send_residuals(sender, entities)
+    send_plots(sender, entities.plots, shown.plots, shown.label, shown.colours)
+    send_residuals(sender, entities, shown.colours)
     send_events(sender, entities, track, shown.race, shown.ended)
     if shown.race is not None:
         send_passes(sender, entities, shown.race)
