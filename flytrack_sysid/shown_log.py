@@ -104,9 +104,10 @@ def open_force_w(left: Traces, model: str, time_s: np.ndarray) -> np.ndarray:
     NaN where nothing is judged. time_s: (num_rows,), as of ``time_in_line``.
     """
     columns, counts = zip(*(left.column(model, f"force_world_{axis}") for axis in "xyz"), strict=True)
+    parts = np.column_stack([*columns, np.ones(len(time_s))])
     # By duration, so that the noise of velocities cancels between the ends of a window.
-    weight = np.where(counts[0], np.diff(time_s, prepend=time_s[:1]), 0.0)
-    parts = np.column_stack([*columns, np.ones(len(weight))])
+    is_judged = counts[0] & np.isfinite(parts).all(axis=1)
+    weight = np.where(is_judged, np.diff(time_s, prepend=time_s[:1]), 0.0)
     summed = np.cumsum(np.where(weight[:, None] > 0.0, parts * weight[:, None], 0.0), axis=0)
     summed = np.concatenate([np.zeros((1, 4)), summed])
     begin = np.searchsorted(time_s, time_s - 0.5 * WINDOW_S)
@@ -126,7 +127,7 @@ def measured_flight(timed: _Timed, name: str, residuals_w: Mapping[str, np.ndarr
         states=states_of(log.channels)[rows],
         actions=log["u"][rows],
         time_s=timed.time_s[rows],
-        ended="the log ends" + (f"; 1 row in {timed.every} is shown" if timed.every > 1 else ""),
+        ended="the log ends" + (f", 1 row in {timed.every} is shown" if timed.every > 1 else ""),
         restarts=starts[rows],
         residuals_w={model: forces_w[rows] for model, forces_w in residuals_w.items()},
     )
@@ -197,13 +198,13 @@ def _joined(timed: _Timed, name: str, pieces: list[_Piece]) -> ShownFlight:
     rows = np.concatenate([piece.rows for piece in pieces])
     restarts = np.concatenate([np.arange(len(piece.rows)) == 0 for piece in pieces])
     ran_away = sum(piece.ran_away for piece in pieces)
-    astray = f"; {ran_away} flights ran away, {AWAY_M:g} m off" if ran_away else ""
+    astray = f"; ran away {ran_away} times" if ran_away else ""
     return ShownFlight(
         name=name,
         states=np.concatenate([piece.states for piece in pieces]),
         actions=np.full((len(rows), ACTION_SIZE), np.nan),  # those of the log: one line would hide another
         time_s=timed.time_s[rows],
-        ended=f"the log ends; flown anew every {RESTART_S:g} s{astray}",
+        ended=f"the log ends; anew every {RESTART_S:g} s{astray}",
         restarts=restarts,
     )
 
