@@ -3,6 +3,7 @@
 import json
 import subprocess
 import sys
+from functools import partial
 from pathlib import Path
 
 import jax
@@ -88,6 +89,7 @@ def test_demo_writes_everything(tmp_path, monkeypatch, capsys):
     out = tmp_path / "demo"
     monkeypatch.setattr(demo, "NUM_STEPS", 100)
     monkeypatch.setattr(demo, "NUM_EPISODES", 4)
+    monkeypatch.setattr(demo, "collect", partial(demo.collect, minutes=1.0))
     monkeypatch.setattr(
         sys, "argv", ["demo.py", "--out", str(out), "--total-timesteps", str(Config().batch_size)]
     )

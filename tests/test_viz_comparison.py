@@ -143,6 +143,18 @@ def test_forces_are_arrows_at_the_drone_where_they_are_known(recording):
     assert np.isnan(size[:100]).all()
 
 
+def test_no_arrow_stands_where_a_force_is_not_known(tmp_path):
+    forces_w = np.ones((10, 3))
+    forces_w[[0, 4, 5, 9]] = np.nan
+    flight = viz.ShownFlight("log", STATES[:10], ACTIONS[:10], residuals_w={"base": forces_w})
+    viz.write_recording(tmp_path / "flight.rrd", [flight], TRACK)
+    found = Recording(tmp_path / "flight.rrd")
+    at = [step for step, _ in found.times["/world/residual/base"]]
+    arrows = dict(zip(at, found.rows["/world/residual/base", "Arrows3D:vectors"], strict=True))
+    counts = {step: len(one) for step, one in arrows.items()}
+    assert counts == {**dict.fromkeys((1, 2, 3, 6, 7, 8), 1), 4: 0, 9: 0}
+
+
 def test_chasing_eye_looks_where_the_drone_flies(recording):
     rotations = recording.series("/world/chase", "Transform3D:quaternion")
     for row in (0, 50, 300):

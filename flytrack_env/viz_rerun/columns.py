@@ -185,10 +185,16 @@ def send_residuals(sender: Sender, entities: Entities, colours: Mapping[str, Col
     colours: by the names of models.
     """
     for name, forces_w in sender.flight.residuals_w.items():
-        rows = np.flatnonzero(np.isfinite(forces_w).all(axis=1))
-        if len(rows):
-            vectors, origins = SCALED_FORCE * forces_w[rows], sender.flight.positions[rows]
+        is_known = np.isfinite(forces_w).all(axis=1)
+        if is_known.any():
+            # No arrow in the row after a known one, or it would stand there until the next.
+            rows = np.flatnonzero(is_known | np.append(False, is_known[:-1]))
+            known = rows[is_known[rows]]
+            vectors, origins = SCALED_FORCE * forces_w[known], sender.flight.positions[known]
+            arrows = rr.Arrows3D.columns(vectors=vectors, origins=origins).partition(
+                is_known[rows].astype(int)
+            )
             entity = f"{entities.residual}/{rr.escape_entity_path_part(name)}"
             style = rr.Arrows3D.from_fields(radii=ARROW_RADIUS, colors=colours[name])
             sender.recording.log(entity, style, static=True, strict=True)
-            sender.send(entity, rows, rr.Arrows3D.columns(vectors=vectors, origins=origins))
+            sender.send(entity, rows, arrows)
