@@ -56,11 +56,12 @@ class Recording:
         return np.array(value)
 
     def series(self, entity: str, component: str) -> np.ndarray:
-        """Return the one instance per row of a component, in the order of the steps."""
-        order = np.argsort([step for step, _ in self.times[entity]])
-        rows = np.array(self.rows[entity, component])
-        assert rows.shape[1] == 1 and len(rows) == len(order)
-        return rows[order, 0]
+        """Return the one instance per row of a component, by steps; rows without any are left out."""
+        steps = [step for step, _ in self.times[entity]]
+        found = zip(steps, self.rows[entity, component], strict=True)
+        rows = [row for _, row in sorted(found, key=lambda pair: pair[0]) if row]
+        assert {len(row) for row in rows} == {1}
+        return np.array(rows)[:, 0]
 
     def latest_strip(self, entity: str, step: int) -> list | None:
         """Return the line strip that a viewer shows at a step."""

@@ -98,7 +98,9 @@ def test_arrows_are_the_force_that_the_model_lacks_along_the_world(flown, record
     quat = Rotation.from_quat(log["q"], scalar_first=True)
     drag_w = quat.apply(-np.array(DRAG) * quat.inv().apply(log["v"]))  # of the step after a row
     half = round(0.5 * WINDOW_S / DT_S)
-    steps = sorted(step for step, _ in recording.times["/world/residual/nominal"])
+    entity = "/world/residual/nominal"
+    drawn = zip(recording.times[entity], recording.rows[entity, "Arrows3D:vectors"], strict=True)
+    steps = sorted(step for (step, _), row in drawn if row)
     arrows = {
         name: recording.series(f"/world/residual/{name}", "Arrows3D:vectors") for name in ("nominal", "true")
     }

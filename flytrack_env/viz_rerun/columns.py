@@ -191,10 +191,8 @@ def send_residuals(sender: Sender, entities: Entities, colours: Mapping[str, Col
             rows = np.flatnonzero(is_known | np.append(False, is_known[:-1]))
             known = rows[is_known[rows]]
             vectors, origins = SCALED_FORCE * forces_w[known], sender.flight.positions[known]
-            arrows = rr.Arrows3D.columns(vectors=vectors, origins=origins).partition(
-                is_known[rows].astype(int)
-            )
+            arrows = rr.Arrows3D.columns(vectors=vectors, origins=origins)
             entity = f"{entities.residual}/{rr.escape_entity_path_part(name)}"
             style = rr.Arrows3D.from_fields(radii=ARROW_RADIUS, colors=colours[name])
             sender.recording.log(entity, style, static=True, strict=True)
-            sender.send(entity, rows, arrows)
+            sender.send(entity, rows, arrows.partition(is_known[rows].astype(int)))
