@@ -11,13 +11,14 @@ import numpy as np
 
 import eval_agent
 from baselines.purejaxrl_ppo import Config
+from baselines.purejaxrl_ppo.checkpoint import Checkpoint
 from baselines.purejaxrl_ppo.density import draw_position_density
 from baselines.purejaxrl_ppo.evaluate import fly_many
-from baselines.purejaxrl_ppo.flights import outcomes_of, score
-from baselines.purejaxrl_ppo.recording import record_flights
+from baselines.purejaxrl_ppo.flights import Flight, outcomes_of, score
+from baselines.purejaxrl_ppo.recording import CANNOT_RECORD, can_record, record_flights
 from baselines.purejaxrl_ppo.resume import checkpoints_in
 from baselines.purejaxrl_ppo.train_ppo import train_policy
-from flytrack_env import blackbox, save_model
+from flytrack_env import blackbox, load_track, save_model
 from flytrack_env.files import fresh_folder, write_atomically
 from flytrack_env.pictures import read_flights, write_pictures
 from flytrack_env.references import shipped_references
@@ -60,6 +61,15 @@ def describe_identification(validations: dict[str, Validation]) -> None:
         print(f"      {speeds:36} {before.rms:9.3f} {after.rms:9.3f}")
 
 
+def draw_flight(out: Path, checkpoint: Checkpoint, black_box: Path, flight: Flight, seed: int) -> None:
+    """Write pictures of the flight, and a recording of it beside the simulator's and the time-optimal one."""
+    track = load_track(checkpoint.track)
+    write_pictures(read_flights([out / "rollout.npy"], track), out)
+    beside = eval_agent.fly_beside(checkpoint, jax.random.key(seed), NUM_STEPS, NUM_STEPS, track)
+    references = shipped_references(track, eval_agent.reference_models(black_box))
+    record_flights(out / "rollout.rrd", {"black box": flight, "simulator": beside}, track, None, references)
+
+
 def main() -> None:
     """Run the job, print lap times, write ``runs/demo``, or the next folder that is free."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -79,6 +89,8 @@ def run(arguments: argparse.Namespace) -> None:
     started = time.perf_counter()
     config = Config(total_timesteps=int(arguments.total_timesteps))
     config.check()
+    if not can_record():
+        raise ValueError(f"the recording: {CANNOT_RECORD}")
     out, seed = arguments.out or fresh_folder(DEFAULT_OUT), arguments.seed
     if checkpoints_in(out):
         raise ValueError(f"--out: {out} holds the run of an earlier demo; remove it, or give another folder")
@@ -99,13 +111,6 @@ def run(arguments: argparse.Namespace) -> None:
     flights = fly_many(env, checkpoint.network, checkpoint.params, seed, NUM_EPISODES, NUM_STEPS, NUM_LAPS)
     result = score(outcomes_of(flights, NUM_LAPS, len(env.track.gates)))
 
-    print("4/4 draw")
-    draw_position_density(out / "position_density.png", flights.positions(), env.track, NUM_EPISODES)
-    write_pictures(read_flights([out / "rollout.npy"], env.track), out)
-    beside = eval_agent.fly_beside(checkpoint, jax.random.key(seed), NUM_STEPS, NUM_STEPS, env.track)
-    references = shipped_references(env.track, eval_agent.reference_models(arguments.black_box))
-    shown = {"black box": flight, "simulator": beside}
-    record_flights(out / "rollout.rrd", shown, env.track, references=references)
     summary: dict[str, Any] = {
         "seed": seed,
         "black_box": arguments.black_box.name,
@@ -126,6 +131,9 @@ def run(arguments: argparse.Namespace) -> None:
         "seconds": round(time.perf_counter() - started, 1),
     }
     write_atomically(out / "summary.json", (json.dumps(summary, indent=2) + "\n").encode())
+    print("4/4 draw")
+    draw_position_density(out / "position_density.png", flights.positions(), env.track, NUM_EPISODES)
+    draw_flight(out, checkpoint, arguments.black_box, flight, seed)
     print(
         f"{result.success:.1%} of {NUM_EPISODES} noisy starts finish {NUM_LAPS} laps on the black "
         f"box; first lap {result.first_lap_s:.2f} s, flying lap {result.flying_lap_s:.2f} s"

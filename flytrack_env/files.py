@@ -12,7 +12,9 @@ def write_atomically(path: str | Path, content: bytes) -> None:
     Raises:
         OSError: what the system says; nothing half-written is left.
     """
-    path = Path(path)
+    path = Path(os.path.realpath(path))  # a link stays one
+    if path.exists() and not path.is_file():
+        raise OSError(f"{path}: found a folder or a device, expected a regular file or a new path")
     path.parent.mkdir(parents=True, exist_ok=True)
     # Not tempfile: its files are private to the user, and these are ordinary ones.
     temporary = path.with_name(f".{path.name}.{secrets.token_hex(8)}")

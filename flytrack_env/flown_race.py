@@ -11,14 +11,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from flytrack_env.params import EnvParams
 from flytrack_env.quaternion import Vec3
 from flytrack_env.race import Race, advance_race, start_race
 from flytrack_env.state import POSITION, VELOCITY, unpack
 from flytrack_env.terminations import Causes, find_causes
 from flytrack_env.tracks import Course, GateFrame, Track, build_course, cross_gate
 
-STEP_S = 0.01
-DRONE_RADIUS_M = 0.15  # of ``EnvParams``
+STEP_S: float = EnvParams.dt
+DRONE_RADIUS_M: float = EnvParams.drone_radius
+NEAR_START_M = 1.0  # starts are noisy
 PADDED_TO = 1024  # steps: flights of about the same length share one compiled program
 
 
@@ -42,7 +44,9 @@ class FlownRace(NamedTuple):
     """The race at each state of a flight, leaves (T,), and its events.
 
     gate: index of the gate to fly next. gate_distance_m: to its centre. laps: completed. lap_start_s: time of
-    the crossing that began the lap. lap_time_s: of the last complete lap, 0 if none. passes: in order.
+    the crossing that began the lap. lap_time_s: of the last complete lap, 0 if none. is_frame, is_miss:
+    whether the step from this state on touches the frame of the gate or misses it; of the last state's step
+    only where it is carried on. passes: in order.
     """
 
     gate: np.ndarray
@@ -50,6 +54,8 @@ class FlownRace(NamedTuple):
     laps: np.ndarray
     lap_start_s: np.ndarray
     lap_time_s: np.ndarray
+    is_frame: np.ndarray
+    is_miss: np.ndarray
     passes: tuple[Pass, ...]
 
 
@@ -61,9 +67,10 @@ def follow_race(
 ) -> FlownRace:
     """Return the race that a flight at 100 Hz through these positions was; the rules of ``advance_race``.
 
-    positions: (T, 3), world, m, finite. first_gate: index of the gate to fly first; if None, the one that
-    the flight passes first, gate 0 if it passes none. last_vel_w: (3,), m/s, of the last state: a rollout
-    ends before its last step, often just before a gate, and that step is carried on at this velocity.
+    positions: (T, 3), world, m, finite. first_gate: index of the gate to fly first; if None, gate 0 for a
+    flight that begins near the track's start or passes no gate, else the one that it passes first.
+    last_vel_w: (3,), m/s, of the last state: a rollout ends before its last step, often just before a gate,
+    and that step is carried on at this velocity, if it is finite.
 
     Raises:
         ValueError: a track without gates.
@@ -72,25 +79,36 @@ def follow_race(
         raise ValueError("track: found no gates, expected at least one")
     course = build_course(track)
     count, positions = len(positions), np.asarray(positions, np.float32)
-    if last_vel_w is not None:
+    if first_gate is None:
+        first_gate = _first_gate(positions, track)
+    if last_vel_w is not None and np.isfinite(last_vel_w).all():
         ahead_w = positions[-1] + STEP_S * np.asarray(last_vel_w, np.float32)
         positions = np.concatenate([positions, ahead_w[None]])
     num_steps = len(positions) - 1
-    if first_gate is None:
-        is_pass = gates_passed(positions, track)
-        first_gate = int(is_pass[is_pass.any(axis=1).argmax()].argmax()) if is_pass.any() else 0
-    padded = _padded(positions)
-    followed, fractions = jax.tree.map(np.asarray, _follow(padded, np.int32(first_gate), course))
-    followed = _Followed(*(leaf[: num_steps + 1] for leaf in followed))
-    centres = np.stack(course.gates.centre, axis=-1)[followed.gate]
+    followed = _follow(_padded(positions), np.int32(first_gate), course)
+    states, steps = jax.tree.map(np.asarray, followed)
+    states = _Followed(*(leaf[: num_steps + 1] for leaf in states))
+    steps = _Step(*(leaf[:num_steps] for leaf in steps))
+    centres = np.stack(course.gates.centre, axis=-1)[states.gate]
+    missing = (0, count - num_steps)  # the last state's step, where it is not known
     return FlownRace(
-        gate=followed.gate[:count],
+        gate=states.gate[:count],
         gate_distance_m=np.linalg.norm(positions - centres, axis=1)[:count],
-        laps=followed.laps[:count],
-        lap_start_s=followed.lap_start_s[:count],
-        lap_time_s=followed.lap_time_s[:count],
-        passes=_passes(followed, fractions[:num_steps], positions, len(track.gates)),
+        laps=states.laps[:count],
+        lap_start_s=states.lap_start_s[:count],
+        lap_time_s=states.lap_time_s[:count],
+        is_frame=np.pad(steps.is_frame, missing),
+        is_miss=np.pad(steps.is_miss, missing),
+        passes=_passes(states, steps, positions, len(track.gates)),
     )
+
+
+def _first_gate(positions: np.ndarray, track: Track) -> int:
+    """Return the gate that a flight probably had to fly first."""
+    if np.linalg.norm(positions[0] - track.start_position) < NEAR_START_M:
+        return 0
+    is_pass = gates_passed(positions, track)
+    return int(is_pass[is_pass.any(axis=1).argmax()].argmax()) if is_pass.any() else 0
 
 
 def gates_passed(positions: np.ndarray, track: Track) -> np.ndarray:
@@ -112,21 +130,21 @@ def why_ended(states: np.ndarray, track: Track, race: FlownRace) -> str:
     """Return why the flight ends after its last state, as far as that state tells.
 
     A rollout's last row is the state before its last step; the step is carried on at the last velocity.
-    states: (T, 21).
+    states: (T, 21). race: as ``follow_race`` returns it for them with ``last_vel_w``.
     """
-    causes = _causes(np.asarray(states[-1], np.float32), np.int32(race.gate[-1]), build_course(track))
+    causes = _causes(
+        np.asarray(states[-1], np.float32), build_course(track), race.is_frame[-1], race.is_miss[-1]
+    )
     names = [name.replace("_", " ") for name, happened in causes._asdict().items() if happened]
     return ", ".join(names) or "all steps flown"
 
 
 @jax.jit
-def _causes(last: jax.Array, gate_index: jax.Array, course: Course) -> Causes:
+def _causes(last: jax.Array, course: Course, is_frame: jax.Array, is_miss: jax.Array) -> Causes:
     """Return what would end the flight in the step after a state (21,)."""
     ahead_w = last[POSITION] + STEP_S * last[VELOCITY]
-    gate = course.gate(gate_index)
-    crossing = cross_gate(gate, Vec3(*last[POSITION]), Vec3(*ahead_w), DRONE_RADIUS_M)
-    ahead = unpack(last.at[POSITION].set(ahead_w))
-    return find_causes(ahead, course, crossing.is_frame, crossing.is_miss)
+    ahead_w = jnp.where(jnp.isfinite(ahead_w).all(), ahead_w, last[POSITION])
+    return find_causes(unpack(last.at[POSITION].set(ahead_w)), course, is_frame, is_miss)
 
 
 class _Followed(NamedTuple):
@@ -137,6 +155,14 @@ class _Followed(NamedTuple):
     lap_start_s: jax.Array
     lap_time_s: jax.Array
     gates_passed: jax.Array
+
+
+class _Step(NamedTuple):
+    """What happened between two states; fractions: where the gate and the one behind it were crossed."""
+
+    is_frame: jax.Array
+    is_miss: jax.Array
+    fractions: jax.Array
 
 
 def _kept(race: Race) -> _Followed:
@@ -153,42 +179,42 @@ def _passed(positions: jax.Array, course: Course) -> jax.Array:
 
 
 @jax.jit
-def _follow(positions: jax.Array, first_gate: jax.Array, course: Course) -> tuple[_Followed, jax.Array]:
-    """Return the race at each state, and where between two states a gate's plane was crossed, in [0, 1]."""
+def _follow(positions: jax.Array, first_gate: jax.Array, course: Course) -> tuple[_Followed, _Step]:
+    """Return the race at each state, and what happened between them."""
 
-    def one(race: Race, segment: tuple) -> tuple[Race, tuple[_Followed, jax.Array]]:
+    def one(race: Race, segment: tuple) -> tuple[Race, tuple[_Followed, _Step]]:
         start_w, end_w = Vec3(*segment[0]), Vec3(*segment[1])
-        fraction = cross_gate(race.gate, start_w, end_w, DRONE_RADIUS_M).fraction
+        first = cross_gate(race.gate, start_w, end_w, DRONE_RADIUS_M).fraction
+        middle_w = start_w + (end_w - start_w).scale(first)
+        second = cross_gate(race.next_gate, middle_w, end_w, DRONE_RADIUS_M).fraction
+        fractions = jnp.stack([first, first + (1.0 - first) * second])
         start_time_s = segment[2] * STEP_S
-        race, _ = advance_race(race, start_w, end_w, start_time_s, STEP_S, course, DRONE_RADIUS_M)
-        return race, (_kept(race), fraction)
+        race, events = advance_race(race, start_w, end_w, start_time_s, STEP_S, course, DRONE_RADIUS_M)
+        return race, (_kept(race), _Step(events.is_frame, events.is_miss, fractions))
 
     begun = start_race(first_gate, course)
-    steps = jnp.arange(len(positions) - 1)
-    _, (followed, fractions) = jax.lax.scan(one, begun, (positions[:-1], positions[1:], steps))
+    indices = jnp.arange(len(positions) - 1)
+    _, (followed, steps) = jax.lax.scan(one, begun, (positions[:-1], positions[1:], indices))
     joined = jax.tree.map(lambda first, rest: jnp.concatenate([first[None], rest]), _kept(begun), followed)
-    return joined, fractions
+    return joined, steps
 
 
-def _passes(
-    followed: _Followed, fractions: np.ndarray, positions: np.ndarray, num_gates: int
-) -> tuple[Pass, ...]:
-    """Return the gates passed, in order; two in one step have the first one's time and place."""
+def _passes(states: _Followed, steps: _Step, positions: np.ndarray, num_gates: int) -> tuple[Pass, ...]:
+    """Return the gates passed, in order; of two in one step each has its own time and place."""
     found = []
-    for row in np.flatnonzero(np.diff(followed.gates_passed)) + 1:
-        fraction = float(fractions[row - 1])
-        where = positions[row - 1] + fraction * (positions[row] - positions[row - 1])
-        count = int(followed.gates_passed[row - 1])
-        for nth in range(int(followed.gates_passed[row]) - count):
-            is_lap = (count + nth + 1) % num_gates == 0
+    for step in np.flatnonzero(np.diff(states.gates_passed)):
+        before = int(states.gates_passed[step])
+        for nth in range(int(states.gates_passed[step + 1]) - before):
+            fraction = float(steps.fractions[step, nth])
+            is_lap = (before + nth + 1) % num_gates == 0
             found.append(
                 Pass(
-                    row=int(row),
-                    time_s=float(row - 1 + fraction) * STEP_S,
-                    gate=int((followed.gate[row - 1] + nth) % num_gates),
-                    pos_w=where,
-                    lap=int(followed.laps[row]) if is_lap else 0,
-                    lap_time_s=float(followed.lap_time_s[row]) if is_lap else 0.0,
+                    row=int(step) + 1,
+                    time_s=(float(step) + fraction) * STEP_S,
+                    gate=int((states.gate[step] + nth) % num_gates),
+                    pos_w=positions[step] + fraction * (positions[step + 1] - positions[step]),
+                    lap=int(states.laps[step + 1]) if is_lap else 0,
+                    lap_time_s=float(states.lap_time_s[step + 1]) if is_lap else 0.0,
                 )
             )
     return tuple(found)

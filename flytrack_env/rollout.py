@@ -9,6 +9,7 @@ a rollout from a stranger cannot run code.
 import io
 import math
 import os
+from collections.abc import Sequence
 from pathlib import Path
 from typing import BinaryIO
 
@@ -68,15 +69,39 @@ def load_rollout(path: str | Path, allow_pickle: bool = False) -> tuple[np.ndarr
             rows = np.load(file, allow_pickle=is_pickled)
     except OSError as error:
         raise RolloutError(f"{path}: cannot be read: {error}; expected {EXPECTED}") from error
-    except Exception as error:  # whatever unpickling raises
-        if isinstance(error, RolloutError) or not allow_pickle:
-            raise
+    except RolloutError:
+        raise
+    except (Exception, SystemExit) as error:  # whatever unpickling and damaged headers raise
         said = f"{type(error).__name__}: {error}"
-        raise RolloutError(f"{path}: cannot be unpickled: {said}; expected {EXPECTED}") from error
+        raise RolloutError(f"{path}: cannot be read: {said}; expected {EXPECTED}") from error
     if is_pickled:
         rows = _rows_of_pairs(path, rows)
     rows = _widened(_as_rows(path, rows))
     return rows[:, :STATE_SIZE], rows[:, STATE_SIZE:]
+
+
+def load_named_rollouts(
+    paths: Sequence[str | Path], allow_pickle: bool = False
+) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    """Return rollouts by a short name: that of the file, after that of its folder where files are alike.
+
+    allow_pickle: see ``load_rollout``.
+
+    Raises:
+        RolloutError: a file that is no rollout, or two files of the same names.
+    """
+    files = [Path(path) for path in paths]
+    names = [file.stem for file in files]
+    if len(set(names)) < len(names):
+        names = [f"{file.resolve().parent.name}_{file.stem}" for file in files]
+    taken: dict[str, Path] = {}
+    for name, file in zip(names, files, strict=True):
+        if name in taken:
+            raise RolloutError(
+                f"{file}: found the name {name!r}, which {taken[name]} has, expected one of its own"
+            )
+        taken[name] = file
+    return {name: load_rollout(file, allow_pickle) for name, file in taken.items()}
 
 
 def _check_header(path: Path, file: BinaryIO, allow_pickle: bool) -> bool:
@@ -94,7 +119,7 @@ def _check_header(path: Path, file: BinaryIO, allow_pickle: bool) -> bool:
     if dtype.kind not in "fiu":
         found = f"an object array (pickled; {PICKLED})" if dtype.hasobject else f"an array of {dtype}"
         raise RolloutError(f"{path}: found {found}, expected {EXPECTED}")
-    if len(shape) != 2 or shape[1] not in (ROW_SIZE, SHORT_ROW_SIZE) or shape[0] == 0:
+    if len(shape) != 2 or shape[1] not in (ROW_SIZE, SHORT_ROW_SIZE) or shape[0] < 1 or shape[0] is True:
         raise RolloutError(f"{path}: found shape {shape}, expected {EXPECTED}")
     announced = math.prod(shape) * dtype.itemsize
     found_bytes = os.fstat(file.fileno()).st_size - file.tell()

@@ -11,7 +11,8 @@ import pytest
 from flytrack_env import FlyTrack, load_track
 from flytrack_env.flown_race import PADDED_TO, follow_race, why_ended
 from flytrack_env.references import ghost_rollout, shipped_references
-from flytrack_env.state import BATTERY, POSITION, VELOCITY, Action, unpack
+from flytrack_env.state import BATTERY, POSITION, QUATERNION, VELOCITY, Action, unpack
+from flytrack_env.tracks import Gate, Track
 
 TRACK = load_track("flytrack")
 REFERENCES = shipped_references(TRACK, ("nominal",))
@@ -146,7 +147,50 @@ def test_end_is_told_as_the_environment_does(end):
     names = [name.replace("_", " ") for name, happened in causes._asdict().items() if happened[last]]
     assert names == [end]
     flown = states[: last + 1]
-    assert why_ended(flown, TRACK, follow_race(flown[:, POSITION], TRACK, 0)) == end
+    race = follow_race(flown[:, POSITION], TRACK, last_vel_w=flown[-1, VELOCITY])
+    assert why_ended(flown, TRACK, race) == end
+
+
+def test_first_gate_is_the_tracks_where_the_flight_begins_at_its_start():
+    """Flown past gate 0 and on through all others: that lap has not begun."""
+    states, _ = ghost_rollout(REFERENCES, 388)
+    near = np.abs(states[:, POSITION] - TRACK.gates[0].position).max(axis=1) < 4.0
+    states[near, 1] += 4.0
+    found = follow_race(states[:, POSITION], TRACK)
+    races, _ = fly_recorded(states, 0)
+    assert found.passes == () and races.gates_passed[-1] == 0
+    assert found.is_miss.sum() == 1 and set(found.gate) == {0}
+
+
+def two_gates(apart_m: float, shift_m: float) -> Track:
+    """Return a course of three gates flown towards +x; the second is close behind the first, and aside."""
+    places = [(2.0, 0.0, 2.0), (2.0 + apart_m, shift_m, 2.0), (20.0, 0.0, 2.0)]
+    turned = {"quaternion": (np.sqrt(0.5), 0.0, 0.0, -np.sqrt(0.5)), "direction": 1.0}
+    gates = tuple(
+        Gate(id=index, position=place, opening=1.5, frame=2.7, **turned) for index, place in enumerate(places)
+    )
+    return replace(TRACK, name="close", gates=gates, start_position=(0.0, 0.0, 2.0))
+
+
+@pytest.mark.parametrize(("shift_m", "end"), [(0.0, "all steps flown"), (1.0, "crash"), (3.0, "missed gate")])
+def test_two_gates_in_one_step_each_have_their_time_and_end(shift_m, end):
+    track = two_gates(0.1, shift_m)
+    states = np.zeros((10, 21))
+    states[:, POSITION] = np.stack([0.2 * np.arange(10), np.zeros(10), np.full(10, 2.0)], axis=1)
+    states[:, POSITION] += (0.15, 0.0, 0.0)
+    states[:, QUATERNION.start], states[:, BATTERY], states[:, VELOCITY] = 1.0, 24.0, (20.0, 0.0, 0.0)
+    race = follow_race(states[:, POSITION], track, last_vel_w=states[-1, VELOCITY])
+    assert why_ended(states, track, race) == end
+    times_s = [one.time_s for one in race.passes]
+    np.testing.assert_allclose(times_s, [0.0925, 0.0975][: 1 + (shift_m == 0.0)], atol=1e-5)
+    np.testing.assert_allclose([one.pos_w[0] for one in race.passes], [2.0, 2.1][: len(times_s)], atol=1e-5)
+
+
+def test_velocity_that_is_not_known_ends_nothing():
+    states, _ = ghost_rollout(REFERENCES, 50)
+    states[:, VELOCITY] = np.nan
+    race = follow_race(states[:, POSITION], TRACK, last_vel_w=states[-1, VELOCITY])
+    assert why_ended(states, TRACK, race) == "all steps flown"
 
 
 def test_flight_that_goes_on_ended_when_its_steps_did():

@@ -161,7 +161,7 @@ BAD_OBJECTS = {
     "no pair": (objects(GOOD_PAIR, None), "step 1: .*expected a pair"),
     "words": (objects(("a", "b")), "step 0: .*expected a pair"),
     "nan": (objects((np.full(21, np.nan), np.zeros(4))), "found nan at step 0"),
-    "broken": (objects((Unreadable(), 0)), "cannot be unpickled: ValueError"),
+    "broken": (objects((Unreadable(), 0)), "cannot be read: ValueError"),
 }
 
 

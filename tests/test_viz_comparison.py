@@ -113,6 +113,7 @@ def test_passes_are_marked_where_and_when_they_were(recording):
     assert [step for step, _ in times] == [one.row for one in RACE.passes]
     for count, points in enumerate(rows, start=1):
         np.testing.assert_allclose(points, [one.pos_w for one in RACE.passes[:count]], rtol=1e-6)
+    assert [step for step, _ in recording.times["/world/laps"]] == [one.row for one in RACE.passes if one.lap]
     (label,) = recording.rows["/world/laps", "Points3D:labels"]
     lap = next(one for one in RACE.passes if one.lap)
     assert label == [f"lap 1: {lap.lap_time_s:.3f} s"]
@@ -120,6 +121,8 @@ def test_passes_are_marked_where_and_when_they_were(recording):
 
 def test_events_and_table_say_what_happened(recording):
     texts = [text for (text,) in recording.rows["/events", "TextLog:text"]]
+    rows = [*(one.row for one in RACE.passes), STEPS - 1]
+    assert [step for step, _ in recording.times["/events"]] == rows
     first, lap = RACE.passes[0], RACE.passes[7]
     assert texts[0] == f"policy: passed gate 0 at {first.time_s:.3f} s"
     expected = f"policy: passed gate 10 at {lap.time_s:.3f} s; lap 1: {lap.lap_time_s:.3f} s"
@@ -183,6 +186,8 @@ def test_path_begins_anew_where_a_flight_does(tmp_path):
         expected = np.split(positions[start : row + 1], [one - start for one in cuts])
         for strip, piece in zip(strips[at.index(row)], expected, strict=True):
             np.testing.assert_array_equal(strip, piece)
+    flown = found.rows["/world/trajectory/flown", "LineStrips3D:strips"][-1]
+    assert [len(strip) for strip in flown] == [200, 1, 442 - 201]
 
 
 def test_times_of_a_log_are_kept(tmp_path):
@@ -247,7 +252,7 @@ def test_command_shows_rollouts_beside_the_ghost(tmp_path, capsys):
     found = Recording(out)
     (table,) = found.once("/about", "TextDocument:text")
     names = [line.split("|")[1].strip() for line in table.splitlines()[2:]]
-    assert names == [str(tmp_path / "a" / "flight"), str(tmp_path / "b" / "flight"), "time-optimal"]
+    assert names == ["a_flight", "b_flight", "time-optimal"]
     ghost = found.series("/world/flights/time-optimal/drone", "Transform3D:translation")
     np.testing.assert_allclose(ghost, STATES[:20, POSITION], rtol=1e-6)
 
@@ -273,10 +278,12 @@ def test_command_reads_pickles_only_where_asked(tmp_path, capsys):
 @pytest.mark.parametrize(
     ("arguments", "reason"),
     [
-        (["a.npy", "a.npy"], "expected every file once"),
+        (["a.npy", "a.npy"], "expected one of its own"),
         (["--ghost", "time_optimal", "--track", "TRACK"], "reference: found no 'own_nominal_"),
         (["--serve", "absent.rrd"], "absent.rrd: cannot be read"),
-        (["a.npy", "--serve", "b.rrd"], "--serve: found 1 rollouts beside it"),
+        (["a.npy", "--serve", "b.rrd"], "rollouts: found beside --serve"),
+        (["a.npy", "--port", "1234"], "port: found beside no --serve"),
+        (["a.npy", "--out", "a.npy"], "--out: found a.npy, which is read"),
     ],
 )
 def test_command_refuses_in_one_line(tmp_path, capsys, monkeypatch, arguments, reason):

@@ -193,7 +193,12 @@ BAD_INPUT = [
     (SEQUENCE, np.zeros((3, 7)), r"gates: found shape \(3, 7\), expected \(N, >=8\)"),
     (SEQUENCE, np.zeros(8), r"gates: found shape \(8,\)"),
     (SEQUENCE, np.zeros((3, 8)), r"gates\[0\]: found quaternion norm 0"),
-    (SEQUENCE, np.full((3, 8), np.nan), r"gates\[0\]: found position"),
+    (SEQUENCE, np.full((3, 8), np.nan), "gates: found ids"),
+    (SEQUENCE, np.array([[0.0, np.nan, 0, 0, 1, 0, 0, 0]]), r"gates\[0\]: found position"),
+    (SEQUENCE, np.array([[0.0, 1e35, 0, 0, 1, 0, 0, 0]]), r"gates\[0\]: found position.*within float32"),
+    (SEQUENCE, [[0.0, 1.0], [2.0]], "gates: .*expected numbers"),
+    (SEQUENCE, np.full((1, 8), "a"), "gates: .*expected numbers"),
+    ([None], GATES, r"sequence\[0\]: found shapes None, expected"),
 ]
 
 

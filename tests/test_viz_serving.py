@@ -75,7 +75,8 @@ def test_page_is_served_to_this_machine_only(address):
         assert hosts == {"0100007F"}, hosts  # 127.0.0.1
 
 
-def test_command_serves_until_it_is_interrupted(recording):
+@pytest.mark.parametrize("ending", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_command_serves_until_it_is_ended(recording, ending):
     port = serving.free_port()
     command = [sys.executable, "-m", "flytrack_env.viz_rerun", "--serve", recording]
     command += ["--port", str(port), "--no-browser"]
@@ -84,7 +85,7 @@ def test_command_serves_until_it_is_interrupted(recording):
         said = process.stdout.readline()
         assert said.startswith(f"{recording}: http://127.0.0.1:{port}/?url=")
         wait_until(lambda: answers(said.split()[1]), "the served page")
-        process.send_signal(signal.SIGINT)
+        process.send_signal(ending)
         assert process.wait(PATIENCE_S) == 0
         wait_until(lambda: not answers(f"http://127.0.0.1:{port}/"), "the end of the server")
     finally:
@@ -95,7 +96,12 @@ def test_command_serves_until_it_is_interrupted(recording):
 
 @pytest.mark.parametrize(
     ("content", "reason"),
-    [(None, "cannot be read"), (b"", "begins with b''"), (b"\x93NUMPY", "expected a recording")],
+    [
+        (None, "cannot be read"),
+        (b"", "begins with b''"),
+        (b"\x93NUMPY", "expected a recording"),
+        (b"RRF2" + bytes(range(200)), "flight.rrd: .*expected"),
+    ],
 )
 def test_files_that_are_no_recordings_are_refused(tmp_path, content, reason):
     path = tmp_path / "flight.rrd"
@@ -110,8 +116,9 @@ def test_port_that_is_taken_is_refused(recording):
         port = taken.getsockname()[1]
         with pytest.raises(viz.ServeError, match=f"port {port}: .*expected one that is free"):
             viz.serve(recording, port, open_browser=False)
-    with pytest.raises(viz.ServeError, match="port 99999"):
-        viz.serve(recording, 99999, open_browser=False)
+    for port in (0, -1, 99999):
+        with pytest.raises(viz.ServeError, match=f"port {port}: found no port"):
+            viz.serve(recording, port, open_browser=False)
 
 
 def screenshot(address: str) -> np.ndarray:

@@ -4,7 +4,7 @@ import argparse
 import os
 from pathlib import Path
 
-from baselines.purejaxrl_ppo.recording import can_record
+from baselines.purejaxrl_ppo.recording import CANNOT_RECORD, can_record
 
 DEFAULT_LAPS = 3
 MAX_SEED = 2**31
@@ -60,7 +60,7 @@ def parse_arguments(parser: argparse.ArgumentParser, shipped: Path) -> argparse.
 def check_files(parser: argparse.ArgumentParser, arguments: argparse.Namespace) -> None:
     """End the program, saying why, where a file could not be written, or would replace another one."""
     if arguments.rrd is not None and not can_record():
-        parser.error("--rrd: found no rerun-sdk, expected pip install 'flytrack[viz]'")
+        parser.error(f"--rrd: {CANNOT_RECORD}")
     read = {path.resolve() for path in (arguments.checkpoint, arguments.black_box) if path is not None}
     taken: dict[Path, str] = {}
     for name, path in (("--out", arguments.out), ("--rrd", arguments.rrd), ("--json", arguments.json)):

@@ -11,10 +11,16 @@ from baselines.purejaxrl_ppo.report import reason_ended
 from flytrack_env.references import References, ghost_rollout
 from flytrack_env.tracks import Track
 
+CANNOT_RECORD = "found no rerun-sdk, or RERUN turned off; expected pip install 'flytrack[viz]', RERUN unset"
+
 
 def can_record() -> bool:
-    """Return whether Rerun is installed."""
-    return find_spec("rerun") is not None
+    """Return whether Rerun is installed, and not turned off by its environment variable."""
+    if find_spec("rerun") is None:
+        return False
+    import rerun
+
+    return rerun.is_enabled(rerun.RecordingStream("flytrack_probe"))
 
 
 def record_flights(

@@ -7,7 +7,7 @@ from matplotlib.lines import Line2D
 
 from flytrack_env.flown_race import STEP_S
 from flytrack_env.pictures.flight import PASSED, Flight
-from flytrack_env.pictures.style import BLUE, GREEN, GREY, ORANGE, new_figure, plain, with_room
+from flytrack_env.pictures.style import BLUE, GREEN, GREY, ORANGE, literal, new_figure, plain, with_room
 from flytrack_env.state import APPLIED_ACTION, BATTERY, Action
 
 SECOND_IN, WIDTHS_IN, HEIGHT_IN = 0.9, (10.0, 24.0), 8.0
@@ -43,7 +43,7 @@ def draw_commands(flight: Flight) -> Figure:
     figure.align_ylabels(panels)
     sticks = panels[3].get_legend_handles_labels()[0]
     figure.legend(handles=[*sticks, *MARKS.values()], loc="outside lower center", ncols=5, frameon=False)
-    figure.suptitle(f"{flight.title}\n{flight.laps_in_words}", fontsize="medium")
+    figure.suptitle(literal(f"{flight.title}\n{flight.laps_in_words}"), fontsize="medium")
     return figure
 
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from flytrack_env.flown_race import DRONE_RADIUS_M, STEP_S, FlownRace, follow_race, why_ended
 from flytrack_env.quaternion import Vec3
-from flytrack_env.rollout import RolloutError, load_rollout
+from flytrack_env.rollout import RolloutError, load_named_rollouts
 from flytrack_env.state import POSITION, VELOCITY
 from flytrack_env.tracks import Track, build_course, cross_gate
 
@@ -104,18 +104,10 @@ def read_flights(paths: Sequence[str | Path], track: Track, allow_pickle: bool =
     Raises:
         RolloutError: a file that is no rollout, or files that cannot be told apart by these names.
     """
-    files = [Path(path) for path in paths]
-    names = [file.stem for file in files]
-    if len(set(names)) < len(names):
-        names = [f"{file.resolve().parent.name}_{file.stem}" for file in files]
-    taken = {COMPARISON: "the comparison"} if len(files) > 1 else {}
-    for name, file in zip(names, files, strict=True):
-        if name in taken:
-            found = f"found {name!r} for {taken[name]}, too"
-            raise RolloutError(f"{file}: name of its pictures: {found}, expected one of its own")
-        taken[name] = str(file)
-    rollouts = [load_rollout(file, allow_pickle) for file in files]
-    return tuple(make_flight(name, *rollout, track) for name, rollout in zip(names, rollouts, strict=True))
+    rollouts = load_named_rollouts(paths, allow_pickle)
+    if len(rollouts) > 1 and COMPARISON in rollouts:
+        raise RolloutError(f"{COMPARISON}: found a rollout of the comparison's name, expected another name")
+    return tuple(make_flight(name, *rollout, track) for name, rollout in rollouts.items())
 
 
 def _meetings(

@@ -10,7 +10,7 @@ from matplotlib.patches import Rectangle
 from flytrack_env.flown_race import DRONE_RADIUS_M
 from flytrack_env.pictures.course_view import FRAME_COLOUR, HEADROOM, OPENING_COLOUR, draw_path
 from flytrack_env.pictures.flight import PASSED, Flight, Meeting
-from flytrack_env.pictures.style import BLUE, new_figure, plain, with_room
+from flytrack_env.pictures.style import BLUE, literal, new_figure, plain, with_room
 from flytrack_env.state import POSITION
 from flytrack_env.tracks import Gate, Track, build_course
 
@@ -31,7 +31,7 @@ def draw_side(flight: Flight) -> Figure:
     top = HEADROOM * max(float(flight.speeds_m_s.max()), 1.0)
     _draw_height(upper, flight, top, width)
     _draw_fronts(lower, flight, top, (num_rows, num_columns))
-    figure.suptitle(f"{flight.title}\n{flight.laps_in_words}", fontsize="medium")
+    figure.suptitle(literal(f"{flight.title}\n{flight.laps_in_words}"), fontsize="medium")
     return figure
 
 

@@ -14,6 +14,12 @@ DPI = 100
 LETTER_IN = 0.068  # of a small text's width
 
 
+def literal(text: str) -> str:
+    """Return a text that matplotlib writes as it is: no mathematics between dollars, no hidden label."""
+    text = text.replace("$", r"\$")
+    return f" {text}" if text.startswith("_") else text
+
+
 def new_figure(width_in: float, height_in: float) -> Figure:
     """Return an empty figure of that size; it belongs to no window and no global state."""
     return Figure(figsize=(width_in, height_in), layout="constrained")

@@ -16,7 +16,7 @@ from flytrack_env.pictures.course_view import (
     taken_from_above,
 )
 from flytrack_env.pictures.flight import PASSED, Flight
-from flytrack_env.pictures.style import BLUE, COLOURS, LETTER_IN, LINES, ORANGE, new_figure
+from flytrack_env.pictures.style import BLUE, COLOURS, LETTER_IN, LINES, ORANGE, literal, new_figure
 from flytrack_env.state import POSITION
 from flytrack_env.tracks import Track
 
@@ -43,14 +43,14 @@ def draw_top(flight: Flight) -> Figure:
         middle = _free_place(place, text, avoid, axes, inch_m)
         axes.text(*middle, text, color=colour, ha="center", va="center", weight="bold", zorder=7)
         avoid = np.concatenate([avoid, middle[None]])
-    axes.set_title(f"{flight.title}\n{flight.laps_in_words}", fontsize="medium")
+    axes.set_title(literal(f"{flight.title}\n{flight.laps_in_words}"), fontsize="medium")
     figure.colorbar(lines, ax=axes, label="speed (m/s)", shrink=0.8)
     return figure
 
 
 def draw_comparison(flights: Sequence[Flight]) -> Figure:
     """Return the course from above with a path per flight, all on one track, in a colour of its own."""
-    texts = [f"{flight.name}\n{flight.laps_in_words}\n{flight.ended}" for flight in flights]
+    texts = [literal(f"{flight.name}\n{flight.laps_in_words}\n{flight.ended}") for flight in flights]
     longest = max(len(line) for text in texts for line in text.splitlines())
     figure, axes, _ = _course(flights, BESIDE_IN + LETTER_IN * longest)
     styles = itertools.cycle(itertools.product(LINES, COLOURS))
@@ -59,7 +59,7 @@ def draw_comparison(flights: Sequence[Flight]) -> Figure:
         axes.plot(*points.T, line, color=colour, linewidth=1.5, label=text)
         axes.plot(*points[0], "o", color=colour, markeredgecolor="white", zorder=6)
         axes.plot(*points[-1], "X", color=colour, markersize=9, markeredgecolor="white", zorder=6)
-    axes.set_title(f"{len(flights)} flights on {flights[0].track.name}", fontsize="medium")
+    axes.set_title(literal(f"{len(flights)} flights on {flights[0].track.name}"), fontsize="medium")
     figure.legend(loc="outside right upper", frameon=False, fontsize="small", labelspacing=1.0)
     return figure
 

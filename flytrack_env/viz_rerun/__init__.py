@@ -34,7 +34,6 @@ except ImportError as error:
         "recordings need rerun-sdk, which is not installed: pip install 'flytrack[viz]'"
     ) from error
 
-from flytrack_env.viz_rerun.command import ghost_flight, rollout_flights
 from flytrack_env.viz_rerun.flights import ShownFlight
 from flytrack_env.viz_rerun.recording import visualize_state_action_sequence, write_recording
 from flytrack_env.viz_rerun.scene import gate_corners
@@ -44,8 +43,6 @@ __all__ = [
     "ServeError",
     "ShownFlight",
     "gate_corners",
-    "ghost_flight",
-    "rollout_flights",
     "serve",
     "visualize_state_action_sequence",
     "write_recording",

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from flytrack_env.references import ghost_rollout, shipped_references
-from flytrack_env.rollout import load_rollout
+from flytrack_env.rollout import load_named_rollouts
 from flytrack_env.tracks import Track, load_track
 from flytrack_env.viz_rerun.flights import ShownFlight
 from flytrack_env.viz_rerun.recording import write_recording
@@ -30,21 +30,6 @@ def ghost_flight(track: Track, num_steps: int, model_name: str = GHOST_MODELS[0]
     return ShownFlight("time-optimal", states, actions)
 
 
-def rollout_flights(paths: Sequence[Path], allow_pickle: bool = False) -> list[ShownFlight]:
-    """Return the flights of rollout files, named after their files, with their folders where those are alike.
-
-    Raises:
-        RolloutError: a file that is no rollout. ValueError: a file that is given twice.
-    """
-    stems = [path.stem for path in paths]
-    names = stems if len(set(stems)) == len(stems) else [str(path.with_suffix("")) for path in paths]
-    if len(set(names)) != len(names):
-        raise ValueError(f"rollout: found {', '.join(map(str, paths))}, expected every file once")
-    return [
-        ShownFlight(name, *load_rollout(path, allow_pickle)) for name, path in zip(names, paths, strict=True)
-    ]
-
-
 def make_parser() -> argparse.ArgumentParser:
     """Return the parser of the command."""
     parser = argparse.ArgumentParser(
@@ -65,15 +50,28 @@ def make_parser() -> argparse.ArgumentParser:
     return parser
 
 
+def _check_together(options: argparse.Namespace) -> None:
+    """Raise ValueError for options that have nothing to do with each other."""
+    writing = {"rollouts": options.rollouts, "ghost": options.ghost, "allow-pickle": options.allow_pickle}
+    serving = {"port": options.port != DEFAULT_PORT, "no-browser": options.no_browser}
+    beside, what = (writing, "--serve") if options.serve is not None else (serving, "no --serve")
+    found = [name for name, given in beside.items() if given]
+    if found:
+        raise ValueError(f"{', '.join(found)}: found beside {what}, expected without")
+
+
 def run(options: argparse.Namespace) -> None:
     """Do what the command line asks for; raises ValueError for what cannot be used."""
+    _check_together(options)
     if options.serve is not None:
-        if options.rollouts:
-            raise ValueError(f"--serve: found {len(options.rollouts)} rollouts beside it, expected none")
         serve(options.serve, options.port, not options.no_browser)
         return
+    read = [*options.rollouts, Path(options.track)]
+    if options.out.resolve() in {path.resolve() for path in read}:
+        raise ValueError(f"--out: found {options.out}, which is read, expected another file")
     track = load_track(options.track)
-    flights = rollout_flights(options.rollouts, options.allow_pickle)
+    rollouts = load_named_rollouts(options.rollouts, options.allow_pickle)
+    flights = [ShownFlight(name, *rollout) for name, rollout in rollouts.items()]
     num_steps = max((len(flight.states) for flight in flights), default=DEMO_STEPS)
     if options.ghost or not flights:
         flights.append(ghost_flight(track, num_steps, options.ghost_model))

@@ -14,8 +14,9 @@ GATE_OUTER_M = 2.7
 GATE_INNER_M = 1.5
 GATE_COLUMNS = 8
 UNIT_NORM_TOLERANCE = 1e-3
+LARGEST_M = 1e30
 
-Sequence21 = Sequence[tuple[np.ndarray, np.ndarray]]
+Pairs = Sequence[tuple[np.ndarray, np.ndarray]]
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -75,7 +76,7 @@ def checked(flight: ShownFlight, where: str | None = None) -> ShownFlight:
     return dataclasses.replace(flight, states=states, actions=actions)
 
 
-def flight_of_pairs(sequence: Sequence21) -> ShownFlight:
+def flight_of_pairs(sequence: Pairs) -> ShownFlight:
     """Return the flight of pairs of state (21,) and action (4,).
 
     Raises:
@@ -86,7 +87,7 @@ def flight_of_pairs(sequence: Sequence21) -> ShownFlight:
     states = np.empty((len(sequence), STATE_SIZE))
     actions = np.empty((len(sequence), ACTION_SIZE))
     for step, pair in enumerate(sequence):
-        shapes = [np.shape(part) for part in pair]
+        shapes = [np.shape(part) for part in pair] if isinstance(pair, Sequence | np.ndarray) else pair
         if shapes != [(STATE_SIZE,), (ACTION_SIZE,)]:
             expected = f"(x ({STATE_SIZE},), u ({ACTION_SIZE},))"
             raise ValueError(f"sequence[{step}]: found shapes {shapes}, expected {expected}")
@@ -103,10 +104,16 @@ def track_of_gates(gates: np.ndarray, positions: np.ndarray) -> Track:
     Raises:
         ValueError: another shape, or a pose that is not finite or no rotation.
     """
-    found = np.shape(gates)
+    try:
+        gates = np.asarray(gates, float)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"gates: {error}; expected numbers (N, >={GATE_COLUMNS})") from error
+    found = gates.shape
     if len(found) != 2 or found[1] < GATE_COLUMNS:
         raise ValueError(f"gates: found shape {found}, expected (N, >={GATE_COLUMNS})")
-    rows = np.array(gates, float)[:, :GATE_COLUMNS]
+    rows = gates[:, :GATE_COLUMNS].copy()
+    if not np.isfinite(rows[:, 0]).all():
+        raise ValueError(f"gates: found ids {rows[:, 0]}, expected numbers")
     check_poses("gates", rows, slice(1, 4), slice(4, 8))
 
     def flown(direction: float, of: np.ndarray) -> Track:
@@ -151,12 +158,13 @@ def end_of(flight: ShownFlight, track: Track | None, race: FlownRace | None) -> 
 
 def check_poses(name: str, rows: np.ndarray, position: slice, quaternion: slice) -> None:
     """Refuse rows whose pose is not finite or not a rotation, and renormalise the rest in place."""
-    is_finite = np.isfinite(rows[:, position]).all(axis=1)
+    # What is shown has float32: what is beyond is infinite there.
+    is_finite = (np.abs(rows[:, position]) < LARGEST_M).all(axis=1)
     is_finite &= np.isfinite(rows[:, quaternion]).all(axis=1)
     if not is_finite.all():
         row = int(np.argmin(is_finite))
         found = f"position {rows[row, position]} and quaternion {rows[row, quaternion]}"
-        raise ValueError(f"{name}[{row}]: found {found}, expected finite numbers")
+        raise ValueError(f"{name}[{row}]: found {found}, expected finite numbers within float32")
     norms = np.linalg.norm(rows[:, quaternion], axis=1)
     is_unit = np.abs(norms - 1.0) <= UNIT_NORM_TOLERANCE
     if not is_unit.all():

@@ -67,7 +67,7 @@ def log_course(recording: rr.RecordingStream, track: Track | None) -> None:
     if track is None:
         return
     rows = track.rows().reshape(-1, 8)
-    names = [f"gate {gate.id:g}" for gate in track.gates]
+    names = [f"gate {gate.id}" for gate in track.gates]
     centres = rr.Points3D(rows[:, 1:4], labels=names, radii=0.05, colors=GATE_COLOUR)
     _log(recording, "world/gates/centre", centres)
     edges = {"outer": [gate.frame for gate in track.gates], "inner": [gate.opening for gate in track.gates]}

@@ -7,9 +7,14 @@ import subprocess
 import sys
 from contextlib import suppress
 from pathlib import Path
+from typing import Any, NoReturn
+
+from rerun.chunk import RrdReader
 
 MAGIC = b"RRF"  # what every recording begins with
 HOST = "127.0.0.1"
+PORTS = (1, 65535)
+ENDING = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name))
 
 
 class ServeError(ValueError):
@@ -25,6 +30,12 @@ def check_recording(path: str | Path) -> None:
         raise ServeError(f"{path}: cannot be read: {error}; expected a recording (.rrd)") from error
     if found != MAGIC:
         raise ServeError(f"{path}: found a file that begins with {found!r}, expected a recording (.rrd)")
+    try:
+        found_recordings = RrdReader(path).recordings()
+    except Exception as error:  # whatever the reader raises
+        raise ServeError(f"{path}: cannot be read: {error}; expected a recording (.rrd)") from error
+    if not found_recordings:
+        raise ServeError(f"{path}: found no recording in it, expected one")
 
 
 def free_port() -> int:
@@ -35,13 +46,15 @@ def free_port() -> int:
 
 
 def check_port(port: int) -> None:
-    """Raise ServeError for a port that something listens on already."""
+    """Raise ServeError for what is no port, or one that something listens on already."""
+    if not PORTS[0] <= port <= PORTS[1]:
+        raise ServeError(f"port {port}: found no port, expected one of {PORTS[0]} to {PORTS[1]}")
     with socket.socket() as probe:
         try:
             probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             probe.bind((HOST, port))
-        except (OSError, OverflowError) as error:
-            raise ServeError(f"port {port}: {error}; expected one that is free, 1024 to 65535") from error
+        except OSError as error:
+            raise ServeError(f"port {port}: {error}; expected one that is free") from error
 
 
 def start_server(path: str | Path, port: int, open_browser: bool) -> tuple[subprocess.Popen, str]:
@@ -71,18 +84,28 @@ def stop_server(server: subprocess.Popen) -> None:
     server.wait()
 
 
+def _end(*_: Any) -> NoReturn:
+    raise KeyboardInterrupt
+
+
 def serve(path: str | Path, port: int, open_browser: bool) -> None:
-    """Serve the web viewer on a recording until it is interrupted (Ctrl-C).
+    """Serve the web viewer on a recording until the program is interrupted or told to end; main thread only.
 
     Raises:
         ServeError: no recording, a port that is taken, or a server that ends by itself.
     """
-    server, address = start_server(path, port, open_browser)
-    print(f"{path}: {address} (Ctrl-C ends it)", flush=True)
+    # The server is in a session of its own: it would go on after whatever ends this program unasked.
+    before = {one: signal.signal(one, _end) for one in ENDING}
+    server = None
     try:
+        server, address = start_server(path, port, open_browser)
+        print(f"{path}: {address} (Ctrl-C ends it)", flush=True)
         status = server.wait()
     except KeyboardInterrupt:
         return
     finally:
-        stop_server(server)
+        if server is not None:
+            stop_server(server)
+        for one, handler in before.items():
+            signal.signal(one, handler)
     raise ServeError(f"{path}: the viewer's server ended with status {status}, expected it to go on")
