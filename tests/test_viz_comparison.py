@@ -14,7 +14,7 @@ from flytrack_env.references import ghost_rollout, shipped_references
 from flytrack_env.rollout import save_rollout
 from flytrack_env.state import BATTERY, POSITION, QUATERNION, VELOCITY
 from flytrack_env.tracks import build_course, load_track, save_track
-from tests.recordings import Recording, make_sequence, rotate
+from tests.recordings import Recording, layout_of, make_sequence, rotate
 
 pytest.importorskip("rerun", reason="rerun-sdk is not installed (extra flytrack[viz])")
 viz = importlib.import_module("flytrack_env.viz_rerun")
@@ -144,6 +144,35 @@ def test_forces_are_arrows_at_the_drone_where_they_are_known(recording):
     size = recording.series(f"/plots/{SECOND}/residual/base", "Scalars:scalars")
     np.testing.assert_allclose(size[100:], math.sqrt(14.0), rtol=1e-6)
     assert np.isnan(size[:100]).all()
+
+
+def test_viewer_opens_laid_out(recording):
+    """The views that open, what they look at, and that everything logged is in one of them."""
+    views = layout_of(recording.path)
+    second = f"/plots/{SECOND}"
+    for title, line in (
+        ("speed [m/s]", "speed"),
+        ("angular speed [rad/s]", "angular_speed"),
+        ("battery [V]", "battery"),
+        ("distance to the next gate [m]", "gate_distance"),
+        ("roll angle [deg]", "orientation/roll"),
+        ("pitch angle [deg]", "orientation/pitch"),
+        ("yaw angle [deg]", "orientation/yaw"),
+    ):
+        assert views[title] == ("TimeSeries", "/", [f"/plots/{line}", f"{second}/{line}"])
+    for stick in ("roll", "pitch", "yaw", "thrust"):
+        lines = [f"{root}/{kind}/{stick}" for root in ("/plots", second) for kind in ("action", "applied")]
+        assert views[f"{stick} stick"] == ("TimeSeries", "/", lines)
+    assert views["force left open [m/s²]"][2] == ["/plots/residual/**", f"{second}/residual/**"]
+    assert views["course"] == ("3D", "/world", ["$origin/**"])
+    assert views["follow policy"] == ("3D", "/world/chase", ["/world/**"])
+    assert views["follow plant / 2"] == ("3D", f"/world/{SECOND}/chase", ["/world/**"])
+    assert views["what happened"] == ("TextLog", "/", ["/events/**"])
+    assert views["flights"] == ("TextDocument", "/about", ["$origin/**"])
+    shown = {line for _, origin, lines in views.values() for line in lines}
+    plotted = {entity for entity, _ in recording.rows if entity.startswith("/plots/")}
+    hidden = {entity for entity in plotted - shown if f"{entity.rpartition('/')[0]}/**" not in shown}
+    assert plotted and not hidden
 
 
 def test_no_arrow_stands_where_a_force_is_not_known(tmp_path):

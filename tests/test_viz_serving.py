@@ -25,7 +25,8 @@ serving = importlib.import_module("flytrack_env.viz_rerun.serving")
 TRACK = load_track("flytrack")
 PATIENCE_S = 60.0
 GATE_COLOUR = (255, 140, 0)
-DRONE_COLOUR = (120, 220, 120)
+PATH_COLOUR = (120, 220, 120)
+CAMERA_COLOUR = (80, 200, 255)
 
 
 @pytest.fixture(scope="module")
@@ -75,7 +76,7 @@ def test_page_is_served_to_this_machine_only(address):
         assert hosts == {"0100007F"}, hosts  # 127.0.0.1
 
 
-@pytest.mark.parametrize("ending", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+@pytest.mark.parametrize("ending", [signal.SIGINT, signal.SIGTERM])
 def test_command_serves_until_it_is_ended(recording, ending):
     port = serving.free_port()
     command = [sys.executable, "-m", "flytrack_env.viz_rerun", "--serve", recording]
@@ -155,10 +156,11 @@ def count_of(picture: np.ndarray, colour: tuple[int, int, int]) -> int:
 
 
 def shows_all(picture: np.ndarray) -> bool:
-    """Return whether gates and the drone's colour are in the course's view and in the one that follows."""
+    """Return whether gates and the path are in both views, and the drone in the one that follows it."""
     left = picture[:, : picture.shape[1] // 2]
     views = left[: len(left) * 2 // 5], left[len(left) * 2 // 5 : len(left) * 4 // 5]
-    return all(count_of(view, colour) > 20 for view in views for colour in (GATE_COLOUR, DRONE_COLOUR))
+    has_course = all(count_of(view, colour) > 20 for view in views for colour in (GATE_COLOUR, PATH_COLOUR))
+    return has_course and count_of(views[1], CAMERA_COLOUR) > 5  # the ray at the drone, and only there
 
 
 def test_viewer_shows_a_course_and_a_drone(address, tmp_path):
