@@ -136,7 +136,7 @@ class Wrapper(EpisodicEnvironment):
         if own is None:
             return
         found = params.wrappers.get(self.key)
-        if jax.tree.structure(found) != jax.tree.structure(own):
+        if jax.tree.structure(found) != jax.tree.structure(own):  # type: ignore[operator]  # jaxlib's stub has no !=
             raise ValueError(
                 f"params.wrappers[{self.key!r}]: found {found!r}, expected {type(own).__name__}, "
                 "as in this environment's default_params"
