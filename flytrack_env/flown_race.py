@@ -5,7 +5,7 @@ own rules.
 """
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -130,13 +130,13 @@ def _causes(last: jax.Array, gate_index: jax.Array, course: Course) -> Causes:
 
 
 class _Followed(NamedTuple):
-    """What is kept of the race at each state."""
+    """What is kept of the race at each state: scalars, or arrays (T,) of JAX or NumPy."""
 
-    gate: jax.Array
-    laps: jax.Array
-    lap_start_s: jax.Array
-    lap_time_s: jax.Array
-    gates_passed: jax.Array
+    gate: Any
+    laps: Any
+    lap_start_s: Any
+    lap_time_s: Any
+    gates_passed: Any
 
 
 def _kept(race: Race) -> _Followed:
@@ -156,7 +156,7 @@ def _passed(positions: jax.Array, course: Course) -> jax.Array:
 def _follow(positions: jax.Array, first_gate: jax.Array, course: Course) -> tuple[_Followed, jax.Array]:
     """Return the race at each state, and where between two states a gate's plane was crossed, in [0, 1]."""
 
-    def one(race: Race, segment: tuple) -> tuple[Race, tuple[_Followed, jax.Array]]:
+    def one(race: Race, segment: tuple[jax.Array, ...]) -> tuple[Race, tuple[_Followed, jax.Array]]:
         start_w, end_w = Vec3(*segment[0]), Vec3(*segment[1])
         fraction = cross_gate(race.gate, start_w, end_w, DRONE_RADIUS_M).fraction
         start_time_s = segment[2] * STEP_S
