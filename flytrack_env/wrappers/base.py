@@ -90,7 +90,7 @@ class Wrapper(EpisodicEnvironment):
         return self.env.missed_gate
 
     @property
-    def default_params(self) -> EnvParams:
+    def default_params(self) -> EnvParams:  # type: ignore[override]  # of gymnax: see EpisodicEnvironment
         """The inner environment's, with this wrapper's own."""
         params = self.env.default_params
         own = self.own_defaults()
