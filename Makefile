@@ -42,6 +42,7 @@ test-clients: $(CLIENTS_STAMP)
 lint: setup
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
+	$(BIN)/mypy
 
 # Rewrites the lock file from pyproject.toml, for every supported Python; needs uv in the environment.
 lock:

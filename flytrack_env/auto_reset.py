@@ -38,7 +38,7 @@ Sample = Callable[[jax.Array, Any], Tree]
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
-def reset_ended(sample: Sample, ended: jax.Array, olds: Tree, inputs: Any) -> Tree:
+def reset_ended(sample: Sample[Tree], ended: jax.Array, olds: Tree, inputs: Any) -> Tree:
     """Return ``olds`` with a fresh start in the place of each environment that ended.
 
     sample: returns the starts of some environments, leaves (count, ...), from their indices (count,)

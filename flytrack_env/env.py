@@ -76,7 +76,7 @@ class FlyTrack(EpisodicEnvironment):
         )
 
     @property
-    def default_params(self) -> EnvParams:
+    def default_params(self) -> EnvParams:  # type: ignore[override]  # of gymnax: see EpisodicEnvironment
         """Parameters with the track and model that the environment was made with."""
         return self._default_params
 

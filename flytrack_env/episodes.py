@@ -39,7 +39,8 @@ def without_nan(command: Action) -> Action:
     return Action(*(jnp.where(jnp.isnan(value), 0.0, value) for value in command))
 
 
-class EpisodicEnvironment(environment.Environment[Any, EnvParams]):
+# Our EnvParams are not of gymnax's class, which its annotations ask for and its code does not.
+class EpisodicEnvironment(environment.Environment[Any, EnvParams]):  # type: ignore[type-var]
     """An environment for gymnax, made of hooks for one drone; a state is any pytree.
 
     track: what is flown. plant: what flies. missed_gate: "terminate" or "fly_on". env_id: as registered.
@@ -54,7 +55,7 @@ class EpisodicEnvironment(environment.Environment[Any, EnvParams]):
     # The hooks.
 
     @property
-    def default_params(self) -> EnvParams:
+    def default_params(self) -> EnvParams:  # type: ignore[override]
         """Parameters that the environment was made with."""
         raise NotImplementedError
 
@@ -134,7 +135,7 @@ class EpisodicEnvironment(environment.Environment[Any, EnvParams]):
         del key, action
         return jnp.stack(self.observe_drone(self.drone(state), state, params))
 
-    def step_env(
+    def step_env(  # type: ignore[override]  # actions are arrays here
         self, key: jax.Array | None, state: Any, action: jax.Array, params: EnvParams
     ) -> tuple[jax.Array, Any, jax.Array, jax.Array, dict[str, Any]]:
         """Return observation, state, reward, terminated and info of one step, without auto-reset."""
@@ -144,7 +145,9 @@ class EpisodicEnvironment(environment.Environment[Any, EnvParams]):
         observation, next_state = self._apply_transition_gradient_policy(observation, next_state)
         return observation, next_state, reward, terminated, info
 
-    def reset(self, key: jax.Array, params: EnvParams | None = None) -> tuple[jax.Array, Any]:
+    def reset(  # type: ignore[override]  # gymnax's is compiled; this one checks, then calls it
+        self, key: jax.Array, params: EnvParams | None = None
+    ) -> tuple[jax.Array, Any]:
         """Return observation and state of an episode that begins.
 
         Raises:

@@ -5,7 +5,7 @@ own rules.
 """
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -18,8 +18,8 @@ from flytrack_env.state import POSITION, VELOCITY, unpack
 from flytrack_env.terminations import Causes, find_causes
 from flytrack_env.tracks import Course, GateFrame, Track, build_course, cross_gate
 
-STEP_S: float = EnvParams.dt
-DRONE_RADIUS_M: float = EnvParams.drone_radius
+STEP_S = float(EnvParams.dt)
+DRONE_RADIUS_M = float(EnvParams.drone_radius)
 NEAR_START_M = 1.0  # starts are noisy
 PADDED_TO = 1024  # steps: flights of about the same length share one compiled program
 
@@ -148,21 +148,21 @@ def _causes(last: jax.Array, course: Course, is_frame: jax.Array, is_miss: jax.A
 
 
 class _Followed(NamedTuple):
-    """What is kept of the race at each state."""
+    """What is kept of the race at each state: scalars, or arrays (T,) of JAX or NumPy."""
 
-    gate: jax.Array
-    laps: jax.Array
-    lap_start_s: jax.Array
-    lap_time_s: jax.Array
-    gates_passed: jax.Array
+    gate: Any
+    laps: Any
+    lap_start_s: Any
+    lap_time_s: Any
+    gates_passed: Any
 
 
 class _Step(NamedTuple):
     """What happened between two states; fractions: where the gate and the one behind it were crossed."""
 
-    is_frame: jax.Array
-    is_miss: jax.Array
-    fractions: jax.Array
+    is_frame: Any
+    is_miss: Any
+    fractions: Any
 
 
 def _kept(race: Race) -> _Followed:
@@ -182,7 +182,7 @@ def _passed(positions: jax.Array, course: Course) -> jax.Array:
 def _follow(positions: jax.Array, first_gate: jax.Array, course: Course) -> tuple[_Followed, _Step]:
     """Return the race at each state, and what happened between them."""
 
-    def one(race: Race, segment: tuple) -> tuple[Race, tuple[_Followed, _Step]]:
+    def one(race: Race, segment: tuple[jax.Array, ...]) -> tuple[Race, tuple[_Followed, _Step]]:
         start_w, end_w = Vec3(*segment[0]), Vec3(*segment[1])
         first = cross_gate(race.gate, start_w, end_w, DRONE_RADIUS_M).fraction
         middle_w = start_w + (end_w - start_w).scale(first)

@@ -1,7 +1,7 @@
 """The parameters of an environment."""
 
 from dataclasses import field
-from typing import Any
+from typing import TYPE_CHECKING, Any, Self
 
 import chex
 import numpy as np
@@ -31,6 +31,10 @@ class EnvParams:
     drone_radius: Scalar = 0.15
     max_steps_in_episode: Scalar = 1000
     wrappers: dict[str, Any] = field(default_factory=dict)
+
+    if TYPE_CHECKING:  # chex adds it, and tells no type checker
+
+        def replace(self, **changes: Any) -> Self: ...
 
     def check(self) -> None:
         """Raise ValueError, naming the field, for values that no episode can be flown with.

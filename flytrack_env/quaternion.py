@@ -14,7 +14,7 @@ import numpy as np
 
 from flytrack_env.fusion import compute_once
 
-Scalar = jax.Array | np.ndarray | float
+Scalar = jax.Array | np.ndarray | np.floating | float
 
 
 class Vec3(NamedTuple):
@@ -121,7 +121,8 @@ def half_angle(angle: Scalar) -> tuple[Scalar, Scalar]:
     any angle, was a quarter of the whole step.
     """
     square = 0.25 * angle * angle
-    cosine, sine = 1.0, 1.0
+    cosine: Scalar = 1.0
+    sine: Scalar = 1.0
     for n in (12, 10, 8, 6, 4, 2):
         cosine = 1.0 - cosine * square * (1.0 / (n * (n - 1)))
         sine = 1.0 - sine * square * (1.0 / (n * (n + 1)))

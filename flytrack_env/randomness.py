@@ -70,7 +70,7 @@ class Draws:
     def uniform(self, name: str, low: Scalar, high: Scalar) -> jax.Array:
         """Return a float32 in [low, high]; the same name gives the same number."""
         unit = (self.word(name) >> (32 - UNIFORM_BITS)).astype(jnp.float32) * (2.0**-UNIFORM_BITS)
-        return low + (high - low) * unit
+        return jnp.asarray(low + (high - low) * unit)
 
     def normal(self, name: str) -> jax.Array:
         """Return a float32, standard normal but for a distribution function off by up to 0.001; within 4.5.

@@ -31,7 +31,7 @@ class Causes(NamedTuple):
 
 def is_below_ground(pos_w: Vec3, course: Course) -> jax.Array:
     """Return whether a position is below the floor of the bounds."""
-    return pos_w.z < course.bounds_low.z
+    return jnp.asarray(pos_w.z < course.bounds_low.z)
 
 
 def is_out_of_bounds(pos_w: Vec3, course: Course) -> jax.Array:
@@ -44,12 +44,12 @@ def is_out_of_bounds(pos_w: Vec3, course: Course) -> jax.Array:
         & (pos_w.y <= high.y)
         & (pos_w.z <= high.z)
     )
-    return ~is_inside
+    return ~jnp.asarray(is_inside)
 
 
 def is_battery_empty(drone: Drone) -> jax.Array:
     """Return whether the battery is below its valid range."""
-    return drone.battery_v < BATTERY_EMPTY_V
+    return jnp.asarray(drone.battery_v < BATTERY_EMPTY_V)
 
 
 def find_causes(drone: Drone, course: Course, is_crash: jax.Array, is_missed: jax.Array) -> Causes:

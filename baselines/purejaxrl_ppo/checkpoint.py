@@ -75,11 +75,14 @@ def find_differences(found: Any, expected: Any, where: str) -> list[str]:
     """Return, field by field, where JSON values differ; ``where`` is their name."""
     if isinstance(found, dict) and isinstance(expected, dict):
         names = {**expected, **found}
-        pairs = {name: (found.get(name), expected.get(name)) for name in names}
-        return [line for name, pair in pairs.items() for line in find_differences(*pair, f"{where}.{name}")]
+        return [
+            line
+            for name in names
+            for line in find_differences(found.get(name), expected.get(name), f"{where}.{name}")
+        ]
     if isinstance(found, list) and isinstance(expected, list) and len(found) == len(expected):
-        pairs = list(zip(found, expected, strict=True))
-        return [line for i, pair in enumerate(pairs) for line in find_differences(*pair, f"{where}[{i}]")]
+        pairs = enumerate(zip(found, expected, strict=True))
+        return [line for i, (one, other) in pairs for line in find_differences(one, other, f"{where}[{i}]")]
     if found == expected:
         return []
     return [f"{where}: found {_show(found)}, expected {_show(expected)}"]

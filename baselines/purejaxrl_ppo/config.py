@@ -124,9 +124,9 @@ FIELD_TYPES: dict[str, Any] = typing.get_type_hints(Config)
 def field_docs() -> dict[str, str]:
     """Return what the class says below each field, on one line."""
     tree = ast.parse(textwrap.dedent(inspect.getsource(Config)))
-    body = tree.body[0].body  # type: ignore[attr-defined]
+    body: list[Any] = tree.body[0].body  # type: ignore[attr-defined]  # the source of one class
     return {
-        field.target.id: " ".join(doc.value.value.split())
+        ast.unparse(field.target): " ".join(ast.literal_eval(doc.value).split())
         for field, doc in itertools.pairwise(body)
         if isinstance(field, ast.AnnAssign) and isinstance(doc, ast.Expr)
     }
@@ -194,7 +194,8 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
     for field in dataclasses.fields(Config):
         kind = FIELD_TYPES[field.name]
         is_tuple = typing.get_origin(kind) is tuple
-        default = " ".join(map(str, field.default)) if is_tuple else field.default
+        default: Any = field.default  # every field has one
+        default = " ".join(map(str, default)) if is_tuple else default
         group.add_argument(
             f"--{field.name.replace('_', '-')}",
             help=f"{docs[field.name]} (default: {default})".replace("%", "%%"),

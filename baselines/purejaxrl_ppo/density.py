@@ -25,19 +25,19 @@ def draw_gates(axes: Axes, track: Track) -> None:
     gates = build_course(track).gates
     for index, gate in enumerate(track.gates):
         centre = np.array(gate.position[:2])
-        forward = np.array([gates.forward.x[index], gates.forward.y[index]])
+        forward = np.array([np.asarray(axis)[index] for axis in (gates.forward.x, gates.forward.y)])
         across = np.array([-forward[1], forward[0]])
         for edge, width, colour in ((gate.frame, 2, "0.35"), (gate.opening, 4, "tab:red")):
             ends = np.stack([centre - 0.5 * edge * across, centre + 0.5 * edge * across])
             axes.plot(*ends.T, color=colour, linewidth=width, solid_capstyle="butt")
         axes.annotate(
             "",
-            xy=centre + ARROW_M * forward,
-            xytext=centre,
+            xy=tuple(centre + ARROW_M * forward),
+            xytext=tuple(centre),
             arrowprops={"arrowstyle": "->", "color": "tab:red"},
         )
         label = centre + (0.5 * gate.frame + 0.7) * across
-        axes.text(*label, str(index + 1), color="tab:red", ha="center", va="center")
+        axes.text(label[0], label[1], str(index + 1), color="tab:red", ha="center", va="center")
 
 
 def count_positions(positions: np.ndarray, track: Track) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

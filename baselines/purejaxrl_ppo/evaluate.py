@@ -41,9 +41,9 @@ def make_step(
     without its axis of steps. index: of the step, from 0.
     """
 
-    def step(observation: jax.Array, state: Any, index: jax.Array) -> tuple:
-        mean = network.apply(policy_params, observation, method="policy").mode()
-        action = jnp.clip(mean, -1.0, 1.0)
+    def step(observation: jax.Array, state: Any, index: jax.Array) -> tuple[Any, ...]:
+        policy: Any = network.apply(policy_params, observation, method="policy")
+        action = jnp.clip(policy.mode(), -1.0, 1.0)
         next_observation, next_state, _, terminated, info = env.step_env(None, state, action, params)
         before, race = env.drone(state), env.race(state)
         after = env.drone(next_state)
@@ -78,7 +78,7 @@ def fly_episode(
     """Return one episode of the mean action, from a reset to its end or to ``num_laps`` laps."""
     step = make_step(env, network, policy_params, params, num_laps)
 
-    def go_on(carry: tuple[jax.Array, Any, jax.Array], index: jax.Array) -> tuple:
+    def go_on(carry: tuple[jax.Array, Any, jax.Array], index: jax.Array) -> tuple[Any, ...]:
         observation, state, is_flying = carry
         next_observation, next_state, is_over, flown = step(observation, state, index)
         race = env.race(state)
@@ -153,11 +153,11 @@ def _race_batch(
         own = params if model is None else params.replace(model=model)
         step = make_step(env, network, policy_params, own, num_laps)
 
-        def is_flying(carry: tuple) -> jax.Array:
+        def is_flying(carry: tuple[Any, ...]) -> jax.Array:
             *_, is_over, outcome = carry
             return ~is_over & (outcome.steps < num_steps)
 
-        def go_on(carry: tuple) -> tuple:
+        def go_on(carry: tuple[Any, ...]) -> tuple[Any, ...]:
             observation, state, _, outcome = carry
             observation, state, is_over, flown = step(observation, state, outcome.steps)
             return observation, state, is_over, _note(outcome, flown)

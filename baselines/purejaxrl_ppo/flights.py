@@ -95,7 +95,7 @@ def outcomes_of(flights: Flight, num_laps: int, num_gates: int) -> Outcomes:
     lap_times_s = np.full((len(before), num_laps), np.nan, np.float32)
     gate_times_s = np.full((len(before), num_laps * num_gates), np.nan, np.float32)
 
-    def put(times_s: np.ndarray, is_event: np.ndarray, places: np.ndarray, values: np.ndarray) -> None:
+    def put(times_s: np.ndarray, is_event: Any, places: Any, values: Any) -> None:  # NumPy's, of a Flight
         where = is_event & (places < times_s.shape[1])
         times_s[np.nonzero(where)[0], places[where]] = values[where]
 

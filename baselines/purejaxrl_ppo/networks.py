@@ -1,6 +1,7 @@
 """Actor and critic: separate tanh networks, orthogonal initialisation, state-independent deviation."""
 
 from collections.abc import Sequence
+from typing import Any
 
 import distrax
 import flax.linen as nn
@@ -36,7 +37,7 @@ class ActorCritic(nn.Module):
         )
 
     def _tower(self, name: str, size: int, last_scale: float) -> nn.Sequential:
-        layers: list = []
+        layers: list[Any] = []
         for width in self.hidden_sizes:
             layers += [nn.Dense(width, kernel_init=nn.initializers.orthogonal(np.sqrt(2))), nn.tanh]
         layers.append(nn.Dense(size, kernel_init=nn.initializers.orthogonal(last_scale)))

@@ -67,7 +67,7 @@ class Plants(NamedTuple):
         is_complete: (num_plants, num_episodes), which flights did.
         """
         return {
-            "success": share(is_complete.all(axis=1)),
+            "success": share(np.asarray(is_complete.all(axis=1))),
             "ranges": {name: list(bounds) for name, bounds in self.ranges._asdict().items()},
             "by_thirds": by_thirds(self.drawn, is_complete),
         }
@@ -150,7 +150,7 @@ def by_thirds(drawn: dict[str, np.ndarray], is_complete: np.ndarray) -> list[dic
                         "third": third + 1,
                         "from": float(values[plants].min()),
                         "to": float(values[plants].max()),
-                        "plants": share(is_complete[plants].all(axis=1)),
+                        "plants": share(np.asarray(is_complete[plants].all(axis=1))),
                         "flights_share": float(is_complete[plants].mean()),
                     }
                 )

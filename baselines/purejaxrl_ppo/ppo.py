@@ -76,12 +76,12 @@ class Algorithm(NamedTuple):
     update: Callable[[Runner], tuple[Runner, Metrics]]
 
 
-def choose_step(env: Any, config: Config) -> Callable:
+def choose_step(env: Any, config: Config) -> Callable[..., Any]:
     """Return a step of a whole batch with one key: the environment's own, else a vmap."""
     if config.batched_step and hasattr(env, "step_batch"):
         return env.step_batch
 
-    def step(key: jax.Array, states: Any, actions: jax.Array, params: Any) -> tuple:
+    def step(key: jax.Array, states: Any, actions: jax.Array, params: Any) -> tuple[Any, ...]:
         keys = jax.random.split(key, actions.shape[0])
         return jax.vmap(env.step, in_axes=(0, 0, 0, None))(keys, states, actions, params)
 
@@ -94,7 +94,7 @@ def generalized_advantages(batch: Batch, last_value: jax.Array, gamma: float, ga
     The reward of a truncated step already holds the bootstrapped value of its final observation.
     """
 
-    def backwards(carry: tuple, step: tuple) -> tuple:
+    def backwards(carry: tuple[Any, ...], step: tuple[Any, ...]) -> tuple[Any, ...]:
         advantage, next_value = carry
         reward, value, done = step
         delta = reward + gamma * next_value * (1.0 - done) - value
@@ -127,7 +127,8 @@ def ppo_loss(
     config: Config,
 ) -> tuple[jax.Array, Metrics]:
     """Return the clipped objective plus clipped value loss, and its parts."""
-    policy, value = network.apply(network_params, batch.observation)
+    said: Any = network.apply(network_params, batch.observation)
+    policy, value = said
     log_prob = policy.log_prob(batch.action)
     value_clipped = batch.value + jnp.clip(value - batch.value, -config.clip_eps, config.clip_eps)
     value_error = jnp.maximum((value - target) ** 2, (value_clipped - target) ** 2)
@@ -194,9 +195,10 @@ def make_ppo(env: Any, env_params: Any, config: Config) -> Algorithm:
     optimizer, schedule = make_optimizer(config), make_schedule(config)
     step_all = choose_step(env, config)
 
-    def collect_step(runner: Runner, _: None) -> tuple[Runner, tuple]:
+    def collect_step(runner: Runner, _: None) -> tuple[Runner, tuple[Batch, dict[str, jax.Array]]]:
         key, key_action, key_step = jax.random.split(runner.key, 3)
-        policy, value = network.apply(runner.train_state.params, runner.observation)
+        said: Any = network.apply(runner.train_state.params, runner.observation)
+        policy, value = said
         action, log_prob = policy.sample_and_log_prob(seed=key_action)
         observation, env_state, reward, terminated, truncated, info = step_all(
             key_step, runner.env_state, action, env_params
@@ -229,12 +231,14 @@ def make_ppo(env: Any, env_params: Any, config: Config) -> Algorithm:
         )
         return runner, (batch, log)
 
-    def update_minibatch(train_state: TrainState, minibatch: tuple) -> tuple[TrainState, dict]:
+    def update_minibatch(train_state: TrainState, minibatch: tuple[Any, ...]) -> tuple[TrainState, Metrics]:
         gradient = jax.grad(ppo_loss, has_aux=True)
         grads, parts = gradient(train_state.params, network, *minibatch, config)
         return train_state.apply_gradients(grads=grads), parts
 
-    def update_epoch(train_state: TrainState, key: jax.Array, data: tuple) -> tuple:
+    def update_epoch(
+        train_state: TrainState, key: jax.Array, data: tuple[Any, ...]
+    ) -> tuple[TrainState, Metrics]:
         permutation = affine_permutation if config.affine_shuffle else jax.random.permutation
         order = permutation(key, config.batch_size)
         shuffled = jax.tree.map(lambda leaf: leaf[order], data)
@@ -245,7 +249,7 @@ def make_ppo(env: Any, env_params: Any, config: Config) -> Algorithm:
 
     def update(runner: Runner) -> tuple[Runner, Metrics]:
         runner, (batch, log) = jax.lax.scan(collect_step, runner, None, config.num_steps)
-        last_value = network.apply(runner.train_state.params, runner.observation, method="value")
+        last_value: Any = network.apply(runner.train_state.params, runner.observation, method="value")
         advantage = generalized_advantages(batch, last_value, config.gamma, config.gae_lambda)
         target = advantage + batch.value
         flatten = partial(jax.tree.map, lambda leaf: leaf.reshape(config.batch_size, *leaf.shape[2:]))

@@ -75,7 +75,9 @@ class Columns:
 
     def batched(self, blocks: tuple[jax.Array, ...]) -> Any:
         """Return the pytree of a batch, leaves (num_envs, ...): new, writable NumPy arrays."""
-        arrays = [np.array(block, dtype) for block, dtype in zip(blocks, HOST_DTYPES, strict=True)]
+        arrays: list[np.ndarray] = [
+            np.array(block, dtype) for block, dtype in zip(blocks, HOST_DTYPES, strict=True)
+        ]
         leaves = []
         for block, row, shape in self.places:
             if shape:

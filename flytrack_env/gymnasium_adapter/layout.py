@@ -62,13 +62,15 @@ class Layout(NamedTuple):
         return jax.tree.unflatten(self.structure, leaves)
 
     def _join(self, leaves: list[jax.Array]) -> Packed:
-        groups = {kind: [] for kind in self.kinds}
+        groups: dict[Any, list[jax.Array]] = {kind: [] for kind in self.kinds}
         for leaf, dtype in zip(leaves, self.dtypes, strict=True):
             groups[dtype].append(leaf)
         return tuple(jnp.concatenate(group) for group in groups.values())
 
     def _split(self, packed: Packed) -> list[jax.Array]:
-        arrays, starts, leaves = dict(zip(self.kinds, packed, strict=True)), {}, []
+        arrays = dict(zip(self.kinds, packed, strict=True))
+        starts: dict[Any, int] = {}
+        leaves = []
         for shape, dtype in zip(self.shapes, self.dtypes, strict=True):
             start = starts.get(dtype, 0)
             starts[dtype] = start + math.prod(shape)

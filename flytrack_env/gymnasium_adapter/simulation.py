@@ -92,16 +92,16 @@ class Programs:
     @partial(jax.jit, static_argnums=0)
     def reset(self, words: jax.Array, params: Packed) -> tuple[Packed, jax.Array, jax.Array]:
         """Return state, observation and scene of an episode that begins as drawn from a key's words."""
-        state, *seen = self._reset(words, params)
-        return self.state_layout.pack(state), *seen
+        state, observation, scene = self._reset(words, params)
+        return self.state_layout.pack(state), observation, scene
 
     @partial(jax.jit, static_argnums=0)
     def begin(
         self, words: jax.Array, drone: jax.Array, gate_index: Any, params: Packed
     ) -> tuple[Packed, jax.Array, jax.Array]:
         """Return the same of an episode that begins with a drone (21,) and a gate to fly first."""
-        state, *seen = self._begin(words, drone, gate_index, params)
-        return self.state_layout.pack(state), *seen
+        state, observation, scene = self._begin(words, drone, gate_index, params)
+        return self.state_layout.pack(state), observation, scene
 
     @partial(jax.jit, static_argnums=0)
     def step(self, state: Packed, action: jax.Array, params: Packed) -> tuple[Any, ...]:
@@ -115,8 +115,8 @@ class Programs:
     @partial(jax.jit, static_argnums=0)
     def reset_batch(self, words: jax.Array, params: Packed) -> tuple[Packed, jax.Array, jax.Array]:
         """Return states, observations and scenes of a batch; words: (num_envs, KEY_WORDS)."""
-        states, *seen = jax.vmap(self._reset, in_axes=(0, None))(words, params)
-        return self.state_layout.pack_batch(states), *seen
+        states, observations, scenes = jax.vmap(self._reset, in_axes=(0, None))(words, params)
+        return self.state_layout.pack_batch(states), observations, scenes
 
     @partial(jax.jit, static_argnums=0)
     def begin_batch(
@@ -124,8 +124,8 @@ class Programs:
     ) -> tuple[Packed, jax.Array, jax.Array]:
         """Return the same of episodes that begin with drones (num_envs, 21) and gates (num_envs,)."""
         begin_all = jax.vmap(self._begin, in_axes=(0, 0, 0, None))
-        states, *seen = begin_all(words, drones, gate_indices, params)
-        return self.state_layout.pack_batch(states), *seen
+        states, observations, scenes = begin_all(words, drones, gate_indices, params)
+        return self.state_layout.pack_batch(states), observations, scenes
 
     @partial(jax.jit, static_argnums=(0, 6))
     def step_batch(
@@ -217,7 +217,7 @@ def _check_shapes(params: EnvParams, default: EnvParams) -> None:
     if not isinstance(params, EnvParams):
         raise TypeError(f"params: found {type(params).__name__}, expected EnvParams")
     params = params.replace(course=default.course)
-    if jax.tree.structure(params) != jax.tree.structure(default):
+    if jax.tree.structure(params) != jax.tree.structure(default):  # type: ignore[operator]  # jaxlib's stub has no !=
         return  # other effects, say
     found = jax.tree_util.tree_leaves_with_path(params)
     for (path, leaf), expected in zip(found, jax.tree.leaves(default), strict=True):
@@ -247,8 +247,8 @@ def _shared(env_id: str, overrides: dict[str, Any]) -> tuple[EpisodicEnvironment
     except TypeError:  # an argument of arrays, say
         return make(env_id, **overrides), {}
     if key not in _SHARED:
-        made = make(env_id, **overrides), {}
+        env = make(env_id, **overrides)
         if len(_SHARED) == MOST_SHARED:
             del _SHARED[next(iter(_SHARED))]
-        _SHARED[key] = made
+        _SHARED[key] = env, {}
     return _SHARED[key]

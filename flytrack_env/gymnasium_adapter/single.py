@@ -1,6 +1,6 @@
 """One environment behind ``gymnasium.make``."""
 
-from typing import Any, ClassVar
+from typing import Any
 
 import gymnasium
 import numpy as np
@@ -29,7 +29,7 @@ class FlyTrackEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         ImportError: a render mode whose package is not installed.
     """
 
-    metadata: ClassVar[dict[str, Any]] = {"render_modes": list(RENDER_MODES), "render_fps": 100}
+    metadata: dict[str, Any] = {"render_modes": list(RENDER_MODES), "render_fps": 100}  # noqa: RUF012  # as Gymnasium declares it
 
     def __init__(
         self,
@@ -98,11 +98,12 @@ class FlyTrackEnv(gymnasium.Env[np.ndarray, np.ndarray]):
 
     def _show(self, scene: Any) -> None:
         """Log what a picture needs, and show it in the window if there is one."""
-        if self._renderer is None:
+        renderer = self._renderer
+        if renderer is None:
             return
         self._log.append(np.asarray(scene))
         if self._window is not None:
-            self._window.show(lambda: self._renderer.draw(self._log), is_first=len(self._log.rows) == 1)
+            self._window.show(lambda: renderer.draw(self._log), is_first=len(self._log.rows) == 1)
 
     def render(self) -> np.ndarray | None:
         """Return a picture (540, 960, 3), uint8, in mode "rgb_array"; else None.
@@ -112,7 +113,7 @@ class FlyTrackEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         Raises:
             gymnasium.error.ResetNeeded: no episode has begun.
         """
-        if self.render_mode != "rgb_array":
+        if self.render_mode != "rgb_array" or self._renderer is None:
             return None
         if self._state is None:
             raise gymnasium.error.ResetNeeded("render: found no episode, expected a reset before it")

@@ -1,6 +1,6 @@
 """Many environments behind ``gymnasium.make_vec``: one compiled step for all of them."""
 
-from typing import Any, ClassVar
+from typing import Any
 
 import gymnasium
 import numpy as np
@@ -38,7 +38,7 @@ class FlyTrackVectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.nd
         ImportError: a render mode without Pillow.
     """
 
-    metadata: ClassVar[dict[str, Any]] = {
+    metadata: dict[str, Any] = {  # noqa: RUF012  # as Gymnasium declares it
         "render_modes": list(RENDER_MODES),
         "render_fps": 100,
         "autoreset_mode": AutoresetMode.SAME_STEP,
@@ -105,7 +105,7 @@ class FlyTrackVectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.nd
         if seed is None:
             return draw_key(self.np_random, (self.num_envs,))
         if isinstance(seed, (int, np.integer)):
-            seeds = [int(seed) + index for index in range(self.num_envs)]
+            seeds: list[int | None] = [int(seed) + index for index in range(self.num_envs)]
         else:
             seeds = [one if one is None else int(one) for one in seed]
         if len(seeds) != self.num_envs:

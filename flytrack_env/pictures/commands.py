@@ -1,5 +1,7 @@
 """What was commanded, what the drone applied of it, speed and battery over time."""
 
+from typing import Any
+
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -66,7 +68,11 @@ def _mark(panel: Axes, flight: Flight) -> None:
     marks += [(one.time_s, "failure") for one in flight.meetings if one.outcome != PASSED]
     for time_s, kind in marks:
         mark = MARKS[kind]
-        style = {"color": mark.get_color(), "linewidth": mark.get_linewidth(), "ls": mark.get_linestyle()}
+        style: dict[str, Any] = {
+            "color": mark.get_color(),
+            "linewidth": mark.get_linewidth(),
+            "ls": mark.get_linestyle(),
+        }
         panel.axvline(time_s, zorder=0.5, **style)
 
 

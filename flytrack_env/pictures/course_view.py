@@ -32,7 +32,7 @@ def draw_gates(axes: Axes, track: Track, view: list[int]) -> None:
         if np.linalg.norm(seen) > SHORTEST_ARROW:
             tip = centre[view] + ARROW_SHARE * extent(track).max() * seen
             arrow = {"arrowstyle": "-|>", "color": OPENING_COLOUR, "linewidth": 1.5, "shrinkA": 0}
-            axes.annotate("", xy=tip, xytext=centre[view], arrowprops=arrow, zorder=4)
+            axes.annotate("", xy=tip, xytext=tuple(centre[view]), arrowprops=arrow, zorder=4)
 
 
 def label_places(track: Track) -> np.ndarray:
@@ -50,7 +50,7 @@ def taken_from_above(track: Track) -> np.ndarray:
     centres, left, forward = (
         np.stack(axis, -1)[:, :2] for axis in (gates.centre, gates.left(), gates.forward)
     )
-    sides = [share * gates.half_frame[:, None] * left for share in np.linspace(-1.0, 1.0, 5)]
+    sides = [share * np.asarray(gates.half_frame)[:, None] * left for share in np.linspace(-1.0, 1.0, 5)]
     tips = [share * extent(track).max() * forward for share in (0.5 * ARROW_SHARE, ARROW_SHARE)]
     return np.concatenate([*(centres + offset for offset in (*sides, *tips)), label_places(track)])
 
@@ -58,7 +58,9 @@ def taken_from_above(track: Track) -> np.ndarray:
 def label_from_above(axes: Axes, track: Track) -> None:
     """Write every gate's id beside it."""
     for gate, place in zip(track.gates, label_places(track), strict=True):
-        axes.text(*place, str(gate.id), color=OPENING_COLOUR, ha="center", va="center", weight="bold")
+        axes.text(
+            place[0], place[1], str(gate.id), color=OPENING_COLOUR, ha="center", va="center", weight="bold"
+        )
 
 
 def draw_path(
@@ -69,7 +71,7 @@ def draw_path(
     points: (n, 2). values: (n - 1,), of the segments. top: of the colour scale, which begins at 0.
     """
     lines = LineCollection(
-        np.stack([points[:-1], points[1:]], axis=1),
+        list(np.stack([points[:-1], points[1:]], axis=1)),
         array=values,
         norm=Normalize(0.0, top),
         linewidth=linewidth,

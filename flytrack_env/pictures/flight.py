@@ -128,7 +128,7 @@ def _meetings(
         for step in np.flatnonzero(is_met):
             fraction = float(met.fraction[step])
             where = positions[step] + fraction * (ends[step] - positions[step])
-            found.append((step, where, STEP_S * (int(step) + fraction), int(race.gate[step]), outcome))
+            found.append((int(step), where, STEP_S * (int(step) + fraction), int(race.gate[step]), outcome))
 
     def meeting(step: int, pos_w: np.ndarray, time_s: float, index: int, outcome: str) -> Meeting:
         gate = jax.tree.map(lambda leaf: float(leaf[index]), gates)

@@ -27,7 +27,7 @@ def draw_side(flight: Flight) -> Figure:
     num_columns = math.ceil(len(flight.track.gates) / num_rows)
     gates_in = num_rows * (GATE_IN + 0.3) + GATES_TITLE_IN
     figure = new_figure(width, HEIGHT_IN + gates_in)
-    upper, lower = figure.subfigures(2, 1, height_ratios=(HEIGHT_IN, gates_in))
+    upper, lower = figure.subfigures(2, 1, squeeze=False, height_ratios=(HEIGHT_IN, gates_in)).ravel()
     top = HEADROOM * max(float(flight.speeds_m_s.max()), 1.0)
     _draw_height(upper, flight, top, width)
     _draw_fronts(lower, flight, top, (num_rows, num_columns))
@@ -78,7 +78,7 @@ def _draw_bar(axes: Axes, flight: Flight, meeting: Meeting) -> None:
 def _upwards(track: Track, index: int) -> float:
     """Return the height of a gate over its edge: 1 if it stands upright."""
     gates = build_course(track).gates
-    return float(abs(gates.up.z[index]) + abs(gates.left().z[index]))
+    return float(abs(np.asarray(gates.up.z)[index]) + abs(np.asarray(gates.left().z)[index]))
 
 
 def _label_bars(axes: Axes, flight: Flight, width_in: float) -> None:
@@ -120,10 +120,11 @@ def _draw_front(panel: Axes, gate: Gate, meetings: list[Meeting], top: float) ->
         panel.add_patch(Rectangle(corner, edge, edge, facecolor=face, edgecolor=colour, linestyle=line))
     for outcome_passed, marker, size in ((True, "o", 36), (False, "X", 110)):
         shown = [one for one in meetings if (one.outcome == PASSED) is outcome_passed]
-        places = np.array([(one.right_m, one.up_m) for one in shown]).reshape(-1, 2)
+        right, up = [one.right_m for one in shown], [one.up_m for one in shown]
         speeds = [one.speed_m_s for one in shown]
-        limits = {"vmin": 0.0, "vmax": top}
-        panel.scatter(*places.T, size, speeds, marker=marker, edgecolors="black", linewidths=0.6, **limits)
+        panel.scatter(
+            right, up, size, speeds, marker=marker, edgecolors="black", linewidths=0.6, vmin=0.0, vmax=top
+        )
     for one in [one for one in meetings if one.outcome != PASSED][:MOST_LABELLED]:
         place = (one.right_m, one.up_m)
         panel.annotate(f"lap {one.lap}", place, (7, 2), textcoords="offset points", fontsize="small")

@@ -41,7 +41,7 @@ def draw_top(flight: Flight) -> Figure:
     for text, place, colour, marker in marks:
         axes.plot(*place, marker, color=colour, markersize=9, markeredgecolor="white", zorder=6)
         middle = _free_place(place, text, avoid, axes, inch_m)
-        axes.text(*middle, text, color=colour, ha="center", va="center", weight="bold", zorder=7)
+        axes.text(middle[0], middle[1], text, color=colour, ha="center", va="center", weight="bold", zorder=7)
         avoid = np.concatenate([avoid, middle[None]])
     axes.set_title(literal(f"{flight.title}\n{flight.laps_in_words}"), fontsize="medium")
     figure.colorbar(lines, ax=axes, label="speed (m/s)", shrink=0.8)

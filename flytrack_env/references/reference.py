@@ -156,9 +156,11 @@ def _read(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
 def _model_of(path: Path, values: Any) -> ModelParameters:
     """Return the model of a file's JSON values; raises ReferenceFileError."""
     try:
-        base = ModelParameters(**{name: np.asarray(values["parameters"][name], float) for name in SIZES})
+        base: dict[str, Any] = {name: np.asarray(values["parameters"][name], float) for name in SIZES}
         effects = values["effects"].items()
-        return base.with_effects(*(BY_NAME[name].parameters(**numbers) for name, numbers in effects))
+        return ModelParameters(**base).with_effects(
+            *(BY_NAME[name].parameters(**numbers) for name, numbers in effects)
+        )
     except (AttributeError, KeyError, TypeError, ValueError) as error:
         raise ReferenceFileError(f"{path}: model: cannot be read: {error!r}") from error
 

@@ -4,6 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from flytrack_env.quaternion import Scalar
 from flytrack_env.tracks import Course
 
 UP_W = np.array([0.0, 0.0, 1.0])
@@ -31,7 +32,7 @@ def gates_of(course: Course) -> Gates:
     )
     left = np.cross(up, forward)
 
-    def corners(half_edge: np.ndarray) -> np.ndarray:
+    def corners(half_edge: Scalar) -> np.ndarray:
         half = np.asarray(half_edge, float)[:, None]
         signs = ((-1, -1), (1, -1), (1, 1), (-1, 1))
         return np.stack([centres + half * (a * left + b * up) for a, b in signs], axis=1)

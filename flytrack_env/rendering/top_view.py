@@ -78,7 +78,7 @@ class TopView:
             self._draw_gate(draw, index, palette.GATE)
             place = self._label_place(index, labels, 0.5 * (low + high)[:2])
             labels.append(place)
-            draw.text(*self._flat(place[None]), str(index), palette.TEXT, font, anchor="mm")
+            draw.text(self._flat(place[None])[0], str(index), palette.TEXT, font, anchor="mm")
 
     def _label_place(self, index: int, taken: list[np.ndarray], middle: np.ndarray) -> np.ndarray:
         """Return a place (2,), world, beside a gate: away from the middle, unless another label is there."""

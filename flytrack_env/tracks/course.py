@@ -5,6 +5,7 @@ the gate's local z, y to the left. Observations and crossings are expressed in i
 of the gate" means x < 0 whichever side of its local y axis the gate is flown from.
 """
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax
@@ -101,7 +102,7 @@ def cross_gate(gate: GateFrame, start_w: Vec3, end_w: Vec3, radius: Scalar) -> C
     """
     start = gate.to_frame(start_w - gate.centre)
     end = gate.to_frame(end_w - gate.centre)
-    start_x, end_x = compute_once((start.x, end.x))
+    start_x, end_x = compute_once((jnp.asarray(start.x), jnp.asarray(end.x)))
     is_forward = (start_x < 0.0) & (end_x >= 0.0)
     is_backward = (start_x >= 0.0) & (end_x < 0.0)
     is_crossing = is_forward | is_backward
@@ -126,10 +127,10 @@ def cross_gate(gate: GateFrame, start_w: Vec3, end_w: Vec3, radius: Scalar) -> C
 def build_course(track: Track) -> Course:
     """Return a track as arrays, float32: the gates' flight frames, start pose and bounds."""
 
-    def column(rows: list[tuple[float, ...]], index: int) -> np.ndarray:
+    def column(rows: Sequence[tuple[float, ...]], index: int) -> np.ndarray:
         return np.array([row[index] for row in rows], np.float32)
 
-    def vectors(rows: list[tuple[float, ...]]) -> Vec3:
+    def vectors(rows: Sequence[tuple[float, ...]]) -> Vec3:
         return Vec3(*(column(rows, index) for index in range(3)))
 
     forward, up = [], []

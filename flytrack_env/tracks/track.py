@@ -228,8 +228,8 @@ class _Reader:
             raise self.fail(header, index, "frame", reason)
         return Gate(
             id=data["id"],
-            position=self.numbers(data, header, index, "position", 3),  # type: ignore[arg-type]
-            quaternion=self.quaternion(data, header, index),  # type: ignore[arg-type]
+            position=self.numbers(data, header, index, "position", 3),
+            quaternion=self.quaternion(data, header, index),
             direction=DIRECTIONS[data["direction"]],
             opening=data["opening"],
             frame=data["frame"],
@@ -268,8 +268,8 @@ class _Reader:
         return Track(
             name=data["name"],
             gates=gates,
-            start_position=start,  # type: ignore[arg-type]
-            start_quaternion=self.quaternion(data["start"], "[start]", 0),  # type: ignore[arg-type]
-            bounds_low=low,  # type: ignore[arg-type]
-            bounds_high=high,  # type: ignore[arg-type]
+            start_position=start,
+            start_quaternion=self.quaternion(data["start"], "[start]", 0),
+            bounds_low=low,
+            bounds_high=high,
         )

@@ -79,7 +79,7 @@ def send_trajectory(sender: Sender, entity: str) -> None:
     positions, restarts = sender.flight.positions, sender.flight.restarts
     breaks = np.zeros(0, int) if restarts is None else np.flatnonzero(restarts)
 
-    def strips(first: int, last: int) -> list[np.ndarray]:
+    def strips(first: np.integer | int, last: np.integer) -> list[np.ndarray]:
         inside = breaks[(breaks > first) & (breaks <= last)]
         return np.split(positions[first : last + 1], inside - first)
 

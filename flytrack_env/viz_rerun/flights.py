@@ -63,9 +63,12 @@ def checked(flight: ShownFlight, where: str | None = None) -> ShownFlight:
     count = len(states) if states.ndim else 0
     if count == 0:
         raise ValueError(f"{flight.name}: found no steps, expected at least one")
-    shapes = {"states": (states, (count, STATE_SIZE)), "actions": (actions, (count, ACTION_SIZE))}
-    optional = {"time_s": (flight.time_s, (count,)), "restarts": (flight.restarts, (count,))}
-    shapes |= {name: pair for name, pair in optional.items() if pair[0] is not None}
+    shapes: dict[str, tuple[np.ndarray, tuple[int, ...]]] = {
+        "states": (states, (count, STATE_SIZE)),
+        "actions": (actions, (count, ACTION_SIZE)),
+    }
+    optional = {"time_s": flight.time_s, "restarts": flight.restarts}
+    shapes |= {name: (part, (count,)) for name, part in optional.items() if part is not None}
     shapes |= {f"residuals_w {name}": (one, (count, 3)) for name, one in flight.residuals_w.items()}
     for name, (array, shape) in shapes.items():
         if np.shape(array) != shape:

@@ -13,8 +13,10 @@ CAMERA_RAY_M = 0.3
 DIRECTION_M = 1.0
 SCALED_FORCE = 0.1  # m of an arrow per m/s^2
 # On the screen, so that they are seen from the other end of the course.
-PATH_RADIUS, PASS_RADIUS, LAP_RADIUS = (float(rr.Radius.ui_points(points)) for points in (1.5, 3.5, 5.0))
-ARROW_RADIUS = float(rr.Radius.ui_points(2.5))
+PATH_RADIUS, PASS_RADIUS, LAP_RADIUS = (
+    float(np.asarray(rr.Radius.ui_points(points))) for points in (1.5, 3.5, 5.0)
+)
+ARROW_RADIUS = float(np.asarray(rr.Radius.ui_points(2.5)))
 
 # Body frame, m: x forward, y left, z up.
 FRONT_LEFT, FRONT_RIGHT = (0.15, 0.09, 0.0), (0.15, -0.09, 0.0)

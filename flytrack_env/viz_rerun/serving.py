@@ -57,7 +57,7 @@ def check_port(port: int) -> None:
             raise ServeError(f"port {port}: {error}; expected one that is free") from error
 
 
-def start_server(path: str | Path, port: int, open_browser: bool) -> tuple[subprocess.Popen, str]:
+def start_server(path: str | Path, port: int, open_browser: bool) -> tuple[subprocess.Popen[bytes], str]:
     """Start a server of the web viewer for a recording; return its process and the page's address.
 
     port: of the page. The process serves until ``stop_server`` ends it, to this machine only.
@@ -72,12 +72,12 @@ def start_server(path: str | Path, port: int, open_browser: bool) -> tuple[subpr
     command = [sys.executable, "-m", "rerun", str(path), "--bind", HOST]
     command += ["--port", str(data_port), "--web-viewer-port", str(port)]
     command.append("--web-viewer" if open_browser else "--serve-web")
-    quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
-    server = subprocess.Popen(command, start_new_session=True, **quiet)
+    quiet = subprocess.DEVNULL
+    server = subprocess.Popen(command, start_new_session=True, stdout=quiet, stderr=quiet)
     return server, f"http://{HOST}:{port}/?url=rerun%2Bhttp%3A%2F%2F{HOST}%3A{data_port}%2Fproxy"
 
 
-def stop_server(server: subprocess.Popen) -> None:
+def stop_server(server: subprocess.Popen[bytes]) -> None:
     """End a server and wait for it: the whole group, as the command is a wrapper around a program."""
     with suppress(ProcessLookupError):
         os.killpg(server.pid, signal.SIGTERM)

@@ -3,6 +3,7 @@
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 
 from flytrack_env.episodes import EpisodicEnvironment, without_nan
 from flytrack_env.observations import Entry
@@ -68,11 +69,11 @@ class ActionHistory(Wrapper):
         self, state: ActionHistoryState, command: Action, params: EnvParams
     ) -> tuple[ActionHistoryState, jax.Array, jax.Array, dict[str, Any]]:
         """Return the next state with this action in front, reward, terminated and info."""
-        inner, *outcome = self.env.advance(state.inner, command, params)
+        inner, reward, terminated, info = self.env.advance(state.inner, command, params)
         latest = without_nan(command) if self.kind == "commanded" else self.env.drone(inner).applied
-        return ActionHistoryState(inner, (latest, *state.actions[:-1])), *outcome
+        return ActionHistoryState(inner, (latest, *state.actions[:-1])), reward, terminated, info
 
     def observe_drone(self, drone: Drone, state: ActionHistoryState, params: EnvParams) -> list[jax.Array]:
         """Return the inner observation with the actions behind it."""
-        values = [value for action in state.actions for value in action]
+        values = [jnp.asarray(value) for action in state.actions for value in action]
         return [*self.env.observe_drone(drone, state.inner, params), *values]

@@ -90,7 +90,7 @@ class Wrapper(EpisodicEnvironment):
         return self.env.missed_gate
 
     @property
-    def default_params(self) -> EnvParams:
+    def default_params(self) -> EnvParams:  # type: ignore[override]  # of gymnax: see EpisodicEnvironment
         """The inner environment's, with this wrapper's own."""
         params = self.env.default_params
         own = self.own_defaults()
@@ -136,7 +136,7 @@ class Wrapper(EpisodicEnvironment):
         if own is None:
             return
         found = params.wrappers.get(self.key)
-        if jax.tree.structure(found) != jax.tree.structure(own):
+        if jax.tree.structure(found) != jax.tree.structure(own):  # type: ignore[operator]  # jaxlib's stub has no !=
             raise ValueError(
                 f"params.wrappers[{self.key!r}]: found {found!r}, expected {type(own).__name__}, "
                 "as in this environment's default_params"

@@ -70,5 +70,6 @@ class CommandDelay(Wrapper):
         flight = Flight(drone=self.env.drone(state.inner), command=without_nan(command), dt=params.dt)
         arriving = command_delay.delayed(delay, state.past, flight.command, flight)
         arriving = Action(*(jnp.where(is_nan, jnp.nan, value) for value in arriving))
-        inner, *outcome = self.env.advance(state.inner, arriving, params)
-        return CommandDelayState(inner, command_delay.remember(delay, state.past, flight)), *outcome
+        inner, reward, terminated, info = self.env.advance(state.inner, arriving, params)
+        past = command_delay.remember(delay, state.past, flight)
+        return CommandDelayState(inner, past), reward, terminated, info

@@ -15,6 +15,8 @@ from flytrack_env.randomness import Draws
 from flytrack_env.state import Action, Drone
 from flytrack_env.wrappers.base import Wrapper, WrapperError
 
+LEFT_ALONE: Any = None  # in the place of a parameter's bound: not drawn
+
 
 class RandomizationParams(NamedTuple):
     """Ranges of uniform draws, once per episode.
@@ -35,13 +37,13 @@ class RandomizationParams(NamedTuple):
     low: tuple[Any, ...] = (
         CommandDelay(0.0),
         ThrustScale(0.85),
-        Wind(-3.0, -3.0, None, a_x=None, a_y=None, a_z=None),
+        Wind(-3.0, -3.0, LEFT_ALONE, a_x=LEFT_ALONE, a_y=LEFT_ALONE, a_z=LEFT_ALONE),
         LinearDrag(0.0, 0.0, 0.0),
     )
     high: tuple[Any, ...] = (
         CommandDelay(0.02),
         ThrustScale(1.15),
-        Wind(3.0, 3.0, None, a_x=None, a_y=None, a_z=None),
+        Wind(3.0, 3.0, LEFT_ALONE, a_x=LEFT_ALONE, a_y=LEFT_ALONE, a_z=LEFT_ALONE),
         LinearDrag(0.5, 0.5, 0.3),
     )
 
@@ -64,7 +66,8 @@ def sample_model(word: jax.Array, model: ModelParameters, ranges: RandomizationP
         draws.uniform(f"lag_{axis}", ranges.lag_factor_low, ranges.lag_factor_high)
         for axis in ("roll", "pitch", "yaw", "thrust")
     ]
-    tau = [model.tau[i] * factor for i, factor in enumerate(lag_factors)]
+    # As scalars, which batch without a gather; who reads a drawn model stacks them.
+    tau: Any = [model.tau[i] * factor for i, factor in enumerate(lag_factors)]
     drawn = [
         _draw(draws, model, low, high, (ranges.effect_factor_low, ranges.effect_factor_high))
         for low, high in zip(ranges.low, ranges.high, strict=True)
@@ -159,8 +162,10 @@ class DomainRandomization(Wrapper):
         self, state: RandomizedState, command: Action, params: EnvParams
     ) -> tuple[RandomizedState, jax.Array, jax.Array, dict[str, Any]]:
         """Return the outcome of the inner environment with this episode's model."""
-        inner, *outcome = self.env.advance(state.inner, command, self._drawn(state.word, params))
-        return RandomizedState(inner, state.word), *outcome
+        inner, reward, terminated, info = self.env.advance(
+            state.inner, command, self._drawn(state.word, params)
+        )
+        return RandomizedState(inner, state.word), reward, terminated, info
 
 
 def _check_ranges(ranges: RandomizationParams, dt: Any) -> None:

@@ -64,8 +64,8 @@ class ObservationNoise(Wrapper):
         self, state: NoisyState, command: Action, params: EnvParams
     ) -> tuple[NoisyState, jax.Array, jax.Array, dict[str, Any]]:
         """Return the outcome of the inner environment, with another draw of noise to come."""
-        inner, *outcome = self.env.advance(state.inner, command, params)
-        return NoisyState(inner, next_word(state.word)), *outcome
+        inner, reward, terminated, info = self.env.advance(state.inner, command, params)
+        return NoisyState(inner, next_word(state.word)), reward, terminated, info
 
     def observe_drone(self, drone: Drone, state: NoisyState, params: EnvParams) -> list[jax.Array]:
         """Return the inner observation of a drone as noisy sensors report it.
