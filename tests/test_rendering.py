@@ -22,6 +22,7 @@ from flytrack_env.rendering import palette
 from flytrack_env.rendering.camera import NEAREST_M, Camera
 from flytrack_env.rendering.geometry import gates_of
 from flytrack_env.rendering.renderer import BAR_HEIGHT, Renderer
+from flytrack_env.rendering.window import LATE_S
 
 BASE = "FlyTrack-v0"
 WIDTH, HEIGHT = palette.FRAME_SIZE
@@ -275,7 +276,8 @@ def test_human_mode_keeps_real_time(dummy_display: None, caplog: pytest.LogCaptu
     start_s = time.monotonic()
     for _ in range(30):
         env.step(np.array([0.0, 0.0, 0.0, 0.6]))
-    assert time.monotonic() - start_s > 0.25
+    # Up to LATE_S behind, as after a step that compiles, the window makes up for lost time.
+    assert time.monotonic() - start_s > 30 * 0.01 - LATE_S
     assert env.render() is None
     env.close()
     env.close()
