@@ -1,14 +1,11 @@
 """Writing the recording of a log, where that can be done; reads Rerun only then (extra ``flytrack[viz]``)."""
 
 from collections.abc import Mapping
-from importlib.util import find_spec
 from pathlib import Path
 
 from flytrack_env.dynamics import ModelParameters
 from flytrack_sysid.diagnosis.traces import Traces
 from flytrack_sysid.log import FlightLog
-
-NOT_INSTALLED = "rerun-sdk is not installed: pip install 'flytrack[viz]'"
 
 
 def write_flight_recording(
@@ -29,13 +26,11 @@ def write_flight_recording(
 
 
 def _written(path: Path, log: FlightLog, models: Mapping[str, ModelParameters], left: Traces | None) -> str:
-    if find_spec("rerun") is None:
-        return NOT_INSTALLED
-    from flytrack_env.viz_rerun import write_recording
-    from flytrack_sysid.shown_log import flights_of
-
     try:
+        from flytrack_env.viz_rerun import write_recording
+        from flytrack_sysid.shown_log import flights_of
+
         write_recording(path, flights_of(log, models, left), None)
-    except ValueError as error:
+    except (ImportError, ValueError) as error:  # Rerun is not installed; what cannot be shown or written
         return str(error)
     return ""

@@ -1,6 +1,7 @@
 """The recording of a flight log, read back: measured numbers, forces left open, free flight of models."""
 
 import importlib
+import sys
 from dataclasses import replace
 
 import numpy as np
@@ -10,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from benchmarks.hidden import draw_base, fly, measure
 from flytrack_env.dynamics import ModelParameters
 from flytrack_env.effects import LinearDrag
-from flytrack_sysid import FlightLog, cli, flight_recording, save_log
+from flytrack_sysid import FlightLog, cli, save_log
 from flytrack_sysid.diagnosis import Diagnosis
 from flytrack_sysid.diagnosis.result import CONSISTENT, Unexplained
 from flytrack_sysid.flight_recording import write_flight_recording
@@ -210,7 +211,8 @@ def test_diagnose_writes_the_recording_or_says_why_not(flown, models, tmp_path, 
     assert drones == {"/world/drone", "/world/flights/nominal/drone", "/world/flights/extended/drone"}
     said = diagnosed("turns.npz")  # and takes away what is of another log
     assert "left out" in said and "expected q (attitude)" in said and not path.exists()
-    monkeypatch.setattr(flight_recording, "find_spec", lambda name: None)
+    monkeypatch.setitem(sys.modules, "rerun", None)  # as if it were not installed
+    monkeypatch.delitem(sys.modules, "flytrack_env.viz_rerun")
     said = diagnosed("log.npz")
     assert "pip install 'flytrack[viz]'" in said and f"written: {out / 'diagnosis.json'}\n" in said
     assert not path.exists()
