@@ -185,7 +185,8 @@ def record(scene: Scene, checkpoint: Checkpoint, arguments: argparse.Namespace, 
         )
     references = scene.references if arguments.ghost else None
     record_flights(arguments.rrd, flights, scene.env.track, arguments.laps, references)
-    print(f"recording: {arguments.rrd}, {', '.join(flights)}: {arguments.rrd.stat().st_size} bytes")
+    names = ", ".join([*flights, *(["time-optimal"] if references is not None else [])])
+    print(f"recording: {arguments.rrd}, {names}: {arguments.rrd.stat().st_size} bytes")
 
 
 def make_report(
