@@ -14,10 +14,11 @@ import jax
 import numpy as np
 
 import flytrack_env
-from baselines.purejaxrl_ppo.checkpoint import Checkpoint, CheckpointError, load_checkpoint
+from baselines.purejaxrl_ppo.checkpoint import Checkpoint, load_checkpoint
 from baselines.purejaxrl_ppo.eval_options import ghost_path, parse_arguments
 from baselines.purejaxrl_ppo.evaluate import fly_episode, race_many, start_keys, start_pose_params
 from baselines.purejaxrl_ppo.flights import Flight, Outcomes, outcomes_of, save_flown
+from baselines.purejaxrl_ppo.flown_env import plant_env, simulated_env
 from baselines.purejaxrl_ppo.perturbed import Plants, draw_plants, with_model_as_given
 from baselines.purejaxrl_ppo.recording import record_flights
 from baselines.purejaxrl_ppo.report import describe, describe_report, lap_times, reason_ended
@@ -26,7 +27,6 @@ from benchmarks.optimal.compared import compare, time_lost
 from flytrack_env import EnvParams, blackbox
 from flytrack_env.episodes import EpisodicEnvironment
 from flytrack_env.files import write_atomically
-from flytrack_env.model_file import model_from_json
 from flytrack_env.references import (
     ReferenceFileError,
     References,
@@ -53,32 +53,7 @@ def black_box_env(
     Raises:
         BlackBoxError, CheckpointError, TrackError: a file that cannot be used.
     """
-    return _checked_env(checkpoint, track, plant=blackbox.load(black_box))
-
-
-def simulated_env(checkpoint: Checkpoint, track: str | Path | None = None) -> EpisodicEnvironment:
-    """Return the checkpoint's environment with the simulator and the model that it was trained on.
-
-    Raises:
-        CheckpointError, TrackError: a file that cannot be used, a checkpoint that does not hold its model.
-    """
-    if "model" not in checkpoint.meta:
-        raise CheckpointError("checkpoint: model: found none in it, expected the one it was trained on")
-    return _checked_env(
-        checkpoint, track, model=model_from_json(checkpoint.meta["model"], "checkpoint: model")
-    )
-
-
-def _checked_env(checkpoint: Checkpoint, track: str | Path | None, **arguments: Any) -> EpisodicEnvironment:
-    env = flytrack_env.make(
-        checkpoint.env_id,
-        track=checkpoint.track if track is None else track,
-        missed_gate=checkpoint.meta["missed_gate"],
-        **arguments,
-    )
-    checkpoint.check_fits(env)
-    env.check_params(env.default_params)
-    return env
+    return plant_env(checkpoint, blackbox.load(black_box), track)
 
 
 def fly_on_black_box(checkpoint: Checkpoint, black_box: Path, num_steps: int, seed: int) -> Flight:

@@ -13,6 +13,7 @@ import eval_agent
 from baselines.purejaxrl_ppo.checkpoint import Checkpoint, load_checkpoint
 from baselines.purejaxrl_ppo.eval_options import MAX_FLIGHTS
 from baselines.purejaxrl_ppo.evaluate import race_many, start_keys
+from baselines.purejaxrl_ppo.flown_env import simulated_env
 from baselines.purejaxrl_ppo.monitor import NUM_LAPS, NUM_STEPS
 from baselines.purejaxrl_ppo.perturbed import with_model_as_given
 from benchmarks.env_speed import cpu_name, pin_to_one_core, versions
@@ -71,7 +72,7 @@ def main() -> None:
         checkpoint = load_checkpoint(arguments.checkpoint)
         scenes = {
             "black box": eval_agent.black_box_env(checkpoint, arguments.black_box),
-            "simulator": eval_agent.simulated_env(checkpoint),
+            "simulator": simulated_env(checkpoint),
         }
     except (ValueError, OSError) as error:
         parser.error(str(error))

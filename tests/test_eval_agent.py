@@ -18,6 +18,7 @@ from baselines.purejaxrl_ppo import Config, evaluate
 from baselines.purejaxrl_ppo.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
 from baselines.purejaxrl_ppo.evaluate import fly_many, race_many, start_keys
 from baselines.purejaxrl_ppo.flights import Flight, Outcomes, outcomes_of, score
+from baselines.purejaxrl_ppo.flown_env import simulated_env
 from baselines.purejaxrl_ppo.networks import make_network
 from baselines.purejaxrl_ppo.perturbed import (
     PlantRanges,
@@ -273,7 +274,7 @@ def test_what_breaks_the_policy_shows_in_its_thirds() -> None:
 
 
 def test_ids_that_draw_models_fly_the_one_that_is_given(checkpoint: Checkpoint) -> None:
-    env = eval_agent.simulated_env(checkpoint)
+    env = simulated_env(checkpoint)
     params = with_model_as_given(env.default_params)
     env.check_params(params)
     ranges, given = params.wrappers[DomainRandomization.key], env.default_params.model

@@ -14,6 +14,8 @@ from baselines.purejaxrl_ppo.config import (
     field_docs,
     settings_of,
 )
+from baselines.purejaxrl_ppo.training import training_params
+from flytrack_env import make
 
 NAMES = [field.name for field in dataclasses.fields(Config)]
 
@@ -99,6 +101,25 @@ def test_files_that_cannot_be_used_are_refused(tmp_path, content, message):
         path.write_text(content)
     with pytest.raises(ConfigError, match=message):
         parse("--config", path)
+
+
+def test_files_from_before_the_margin_were_trained_without():
+    values = {name: value for name, value in dataclasses.asdict(Config()).items() if name != "gate_margin"}
+    assert config_from_json(values).gate_margin == 0.0 != Config().gate_margin
+
+
+def test_a_drone_is_thicker_in_training_and_not_in_the_race():
+    env = make("FlyTrack-v0")
+    params = training_params(env, Config(gate_margin=0.25, episode_steps=77))
+    assert params.drone_radius == pytest.approx(env.default_params.drone_radius + 0.25)
+    assert params.max_steps_in_episode == 77
+    plain = training_params(env, Config(gate_margin=0.0))
+    assert plain.drone_radius == env.default_params.drone_radius == 0.15
+
+
+def test_a_margin_that_leaves_no_opening_is_refused():
+    with pytest.raises(ValueError, match=r"gate_margin: found 0.6: drone_radius: found 0.75"):
+        training_params(make("FlyTrack-v0"), Config(gate_margin=0.6))
 
 
 def test_configuration_comes_back_from_json():

@@ -16,7 +16,9 @@ from typing import Any
 COUNTS = ("num_envs", "num_steps", "episode_steps", "update_epochs", "num_minibatches")
 SHARES = ("final_learning_rate_fraction", "gamma", "gae_lambda")
 POSITIVE = ("learning_rate", "adam_eps", "clip_eps", "max_grad_norm", "initial_std")
-NOT_NEGATIVE = ("entropy_coef", "value_coef", "min_std")
+NOT_NEGATIVE = ("entropy_coef", "value_coef", "min_std", "gate_margin")
+# What files of earlier versions, which do not name them, were trained with.
+BEFORE = {"gate_margin": 0.0}
 
 
 class ConfigError(ValueError):
@@ -36,6 +38,9 @@ class Config:
     episode_steps: int = 200
     """Time limit of training episodes, in environment steps. Long ones spend most experience on the one
     line that the policy flies already, and a policy that knows nothing beside it fails on another plant."""
+    gate_margin: float = 0.15
+    """Metres by which the drone is thicker, to every side, in training than in the race. A policy that
+    uses the whole opening is perfect in the simulator and crashes where the plant differs a little."""
     update_epochs: int = 1
     """Passes over the collected batch per update. Gradients are nearly all of the time that training takes,
     so that one pass in many small steps gets further in a second than several in larger ones."""
@@ -177,13 +182,16 @@ def settings_in_file(path: Path) -> dict[str, Any]:
 def config_from_json(values: dict[str, Any]) -> Config:
     """Return the configuration of a JSON object; tuples come back from lists, absent fields are default.
 
+    Of fields that are younger than the format, the absent ones are as training was before them.
+
     Raises:
         ConfigError: an unknown field, or a value of another type.
     """
     for name in values:
         if name not in FIELD_TYPES:
             raise ConfigError(f"config: {name}: unknown to this version; expected {', '.join(FIELD_TYPES)}")
-    return Config(**{n: read_value(f"config: {n}", FIELD_TYPES[n], value) for n, value in values.items()})
+    named = {n: read_value(f"config: {n}", FIELD_TYPES[n], value) for n, value in values.items()}
+    return Config(**{**BEFORE, **named})
 
 
 def add_flags(parser: argparse.ArgumentParser) -> None:

@@ -29,6 +29,8 @@ from baselines.purejaxrl_ppo.resume import (
     warn_of_other_bits,
 )
 from baselines.purejaxrl_ppo.run import Metrics, Run
+from flytrack_env.episodes import EpisodicEnvironment
+from flytrack_env.params import EnvParams
 
 CHUNK_STEPS = 131_072  # environment steps between two looks from outside: a fraction of a second
 
@@ -62,6 +64,23 @@ def with_strong_types(runner: Runner) -> Runner:
     return jax.tree.map(strong, runner)
 
 
+def training_params(env: EpisodicEnvironment, config: Config) -> EnvParams:
+    """Return the parameters to train with: short episodes, and a drone that is thicker than in the race.
+
+    Raises:
+        ValueError: a margin that leaves no opening.
+    """
+    params = env.default_params
+    params = params.replace(
+        max_steps_in_episode=config.episode_steps, drone_radius=params.drone_radius + config.gate_margin
+    )
+    try:
+        env.check_params(params)
+    except ValueError as error:
+        raise ValueError(f"gate_margin: found {config.gate_margin}: {error}") from error
+    return params
+
+
 class Trainer:
     """PPO on one environment, compiled once for any number of seeds; ``steps``: of the run under way.
 
@@ -75,7 +94,7 @@ class Trainer:
         self.env = flytrack_env.make(env_id, **env_arguments)
         config.check()
         self.env.check_params(self.env.default_params)
-        params = self.env.default_params.replace(max_steps_in_episode=config.episode_steps)
+        params = training_params(self.env, config)
         ppo = make_ppo(self.env, params, config)
         self.network = make_network_for(self.env, params, config)
         self.most = max(1, CHUNK_STEPS // config.batch_size)
