@@ -8,7 +8,7 @@ CLIENTS := .venv-clients
 CLIENTS_STAMP := $(CLIENTS)/.locked
 CHECK_PYTHON = $(PYTHON) -c 'import sys; v = sys.version_info; sys.exit(v < (3, 11) and f"Python 3.11 or newer is needed, found {v.major}.{v.minor}; try PYTHON=python3.11")'
 
-.PHONY: setup demo test test-clients lint lock clean
+.PHONY: setup demo loop test test-clients lint lock clean
 
 setup: $(STAMP)
 
@@ -22,6 +22,10 @@ $(STAMP): requirements.lock pyproject.toml
 
 demo: setup
 	$(BIN)/python demo.py
+
+# The loop from diagnosis to a better policy, on the shipped black box and five hidden plants: runs/loop/loop.md.
+loop: setup
+	$(BIN)/python -m benchmarks.loop
 
 test: setup
 	$(BIN)/python -m pytest --numprocesses 2 --dist loadfile

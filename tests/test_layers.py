@@ -36,7 +36,16 @@ LAYERS = (
     {"__init__"},
 )
 RANKS = {name: rank for rank, layer in enumerate(LAYERS) for name in layer}
-CONSUMERS = ("flytrack_sysid", "baselines", "benchmarks", "blackbox", "clients", "eval_agent", "demo")
+CONSUMERS = (
+    "flytrack_sysid",
+    "baselines",
+    "flytrack_loop",
+    "benchmarks",
+    "blackbox",
+    "clients",
+    "eval_agent",
+    "demo",
+)
 ONLY_IN = {
     "gymnasium": "gymnasium_adapter",
     "PIL": "rendering",

@@ -1,0 +1,87 @@
+"""FlyTrack with something taken out of the observation, for ``benchmarks.ablations``."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from flytrack_env.episodes import EpisodicEnvironment
+from flytrack_env.observations import Entry
+from flytrack_env.params import EnvParams
+from flytrack_env.state import Drone
+from flytrack_env.wrappers import Wrapper
+
+# Of the world frame: the course spans 25 m and 35 m, and speeds and directions are as in the gate's frame.
+WORLD = (
+    Entry("position", "position", 3, "world", "m", 10.0, 10.0),
+    Entry("velocity", "velocity", 3, "world", "m/s", 5.0, 12.0),
+    Entry("attitude", "rotation matrix body to world, row by row", 9, "world", "1", 1.0, 1.0),
+    Entry("rates", "angular velocity", 3, "body", "rad/s", 5.0, 3.0),
+    Entry("applied", "previous applied action: roll, pitch, yaw, thrust", 4, "body", "1", 1.0, 1.0),
+    Entry("battery", "battery voltage above 23 V", 1, "-", "V", 1.0, 1.0),
+    Entry("gate", "gate's centre relative to the drone", 3, "world", "m", 3.0, 30.0),
+    Entry("direction", "gate's direction of flight", 3, "world", "1", 1.0, 1.0),
+    Entry("next_gate", "next gate's centre relative to the gate's centre", 3, "world", "m", 5.0, 20.0),
+    Entry("next_direction", "next gate's direction of flight", 3, "world", "1", 1.0, 1.0),
+)
+BATTERY_MIDDLE_V = 23.0
+
+
+class WithoutEntries(Wrapper):
+    """Show zeros in place of some entries of the observation.
+
+    Raises:
+        ValueError: a key that the observation does not have.
+    """
+
+    key = "without_entries"
+
+    def __init__(self, env: EpisodicEnvironment, keys: tuple[str, ...]):
+        super().__init__(env)
+        known = [entry.key for entry in env.observation_table]
+        for key in keys:
+            if key not in known:
+                raise ValueError(f"keys: found {key!r}, expected some of {', '.join(known)}")
+        self.keys = keys
+
+    def observe_drone(self, drone: Drone, state: Any, params: EnvParams) -> list[jax.Array]:
+        """Return the inner observation with zeros where the entries were."""
+        values = self.env.observe_drone(drone, state, params)
+        hidden = [entry.key in self.keys for entry in self.observation_table for _ in range(entry.size)]
+        return [
+            jnp.zeros_like(value) if is_hidden else value
+            for value, is_hidden in zip(values, hidden, strict=True)
+        ]
+
+
+class InWorldFrame(Wrapper):
+    """Show everything in the world's frame, the same quantities as in the gate's."""
+
+    key = "in_world_frame"
+
+    @property
+    def observation_table(self) -> tuple[Entry, ...]:
+        """The rows of ``WORLD``."""
+        return WORLD
+
+    def observe_drone(self, drone: Drone, state: Any, params: EnvParams) -> list[jax.Array]:
+        """Return the observation; gates as the race of the state has them."""
+        race = self.race(state)
+        body_axes = drone.quat.axes()
+        quantities: list[tuple[Any, ...]] = [
+            drone.pos_w,
+            drone.vel_w,
+            tuple(component for row in zip(*body_axes, strict=True) for component in row),
+            drone.rates_b,
+            drone.applied,
+            (drone.battery_v - BATTERY_MIDDLE_V,),
+            race.gate.centre - drone.pos_w,
+            race.gate.forward,
+            race.next_gate.centre - race.gate.centre,
+            race.next_gate.forward,
+        ]
+        return [
+            jnp.clip(value * (1.0 / entry.scale), -entry.limit, entry.limit)
+            for entry, group in zip(WORLD, quantities, strict=True)
+            for value in group
+        ]

@@ -1,0 +1,251 @@
+"""What each part of the recipe is worth: ``python -m benchmarks.ablations [--seeds 3] [--only NAME ...]``.
+
+Trains PPO with one thing taken out or put in, several seeds each, on the model that ``make demo`` identifies
+from the shipped black box; flies 256 noisy starts over 3 laps in that simulator, on the black box and on
+256 drones drawn around the model. Writes a page and a chart; lines that are there already (``--lines``) are
+not measured again.
+"""
+
+import argparse
+import io
+import json
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from matplotlib.figure import Figure
+from tqdm import tqdm
+
+import flytrack_env
+from baselines.purejaxrl_ppo import Config
+from baselines.purejaxrl_ppo.evaluate import race_many, start_keys
+from baselines.purejaxrl_ppo.flights import score
+from baselines.purejaxrl_ppo.options import is_due
+from baselines.purejaxrl_ppo.perturbed import draw_plants, with_model_as_given
+from baselines.purejaxrl_ppo.ppo import make_network_for, make_ppo
+from baselines.purejaxrl_ppo.training import make_chunk, training_params, with_strong_types
+from benchmarks.ablated import InWorldFrame, WithoutEntries
+from benchmarks.env_speed import cpu_name, pin_to_one_core, versions
+from eval_agent import SHIPPED_BLACK_BOX
+from flytrack_env import EnvParams, blackbox, load_model
+from flytrack_env.dynamics import ModelParameters
+from flytrack_env.effects import CommandDelay
+from flytrack_env.episodes import EpisodicEnvironment
+from flytrack_env.files import write_atomically
+
+NUM_EPISODES, NUM_LAPS, NUM_STEPS = 256, 3, 2500
+EVALUATION_SEED, PLANTS_SEED = 30_000, 200
+EVERY = 2_000_000  # environment steps between points of a curve
+DELAY_S = 0.03
+LONG_EPISODE = 1000  # steps: from the start pose, in 2 s no more than two gates are reached
+Wrap = Callable[[EpisodicEnvironment], EpisodicEnvironment]
+
+
+@dataclass(frozen=True)
+class Ablation:
+    """One change of the recipe: settings, id, reward, starts, observation, drone; says: what, in words."""
+
+    says: str
+    config: Mapping[str, Any] = field(default_factory=dict)
+    env_id: str = "FlyTrack-v0"
+    reward: Mapping[str, float] = field(default_factory=dict)
+    reset: Mapping[str, float] = field(default_factory=dict)
+    wrap: Wrap = lambda env: env
+    delay_s: float = 0.0
+
+
+NO_RATE_TERMS = {"body_rates": 0.0, "action_change": 0.0}
+ABLATIONS = {
+    "default": Ablation("the recipe as it is"),
+    "no_curriculum": Ablation(
+        "all episodes start at the start pose, and last 10 s",
+        config={"episode_steps": LONG_EPISODE},
+        reset={"course_fraction": 0.0},
+    ),
+    "world_frame": Ablation("observation in the world's frame, not the gate's", wrap=InWorldFrame),
+    "no_action": Ablation(
+        "no applied action in the observation", wrap=partial(WithoutEntries, keys=("applied",))
+    ),
+    "no_next_gate": Ablation(
+        "no next gate in the observation", wrap=partial(WithoutEntries, keys=("next_gate", "next_direction"))
+    ),
+    "truncation_terminates": Ablation(
+        "the time limit counts as an end: nothing is bootstrapped", config={"bootstrap_at_truncation": False}
+    ),
+    "no_rate_terms": Ablation("no penalty on body rates and changes of the action", reward=NO_RATE_TERMS),
+    "no_margin": Ablation("gates as wide in training as in the race", config={"gate_margin": 0.0}),
+    "randomised": Ablation(
+        "FlyTrackRandomized-v0: another drone every episode", env_id="FlyTrackRandomized-v0"
+    ),
+    "delay": Ablation(f"commands {1e3 * DELAY_S:g} ms late, in training and in the race", delay_s=DELAY_S),
+    "delay_history": Ablation(
+        "the same, with the last three commands in the observation",
+        env_id="FlyTrackActionHistory-v0",
+        delay_s=DELAY_S,
+    ),
+}
+
+
+def make_env(ablation: Ablation, **arguments: Any) -> EpisodicEnvironment:
+    """Return the environment of an ablation; arguments: of ``flytrack_env.make``."""
+    return ablation.wrap(flytrack_env.make(ablation.env_id, reward=ablation.reward, **arguments))
+
+
+def with_delay(model: ModelParameters, delay_s: float) -> ModelParameters:
+    """Return a model whose commands are late."""
+    return model.with_effects(CommandDelay(delay_s)) if delay_s else model
+
+
+class Contest:
+    """An ablation, compiled once: trains a seed and races it in the simulator as it learns."""
+
+    def __init__(self, ablation: Ablation, model: ModelParameters, total_timesteps: int):
+        self.ablation = ablation
+        self.model = with_delay(model, ablation.delay_s)
+        self.config = replace(Config(total_timesteps=total_timesteps), **ablation.config)
+        self.env = make_env(ablation, model=self.model)
+        params = training_params(self.env, self.config)
+        params = params.replace(reset=params.reset._replace(**ablation.reset))
+        ppo = make_ppo(self.env, params, self.config)
+        self.network = make_network_for(self.env, params, self.config)
+        self.start = jax.jit(lambda key: with_strong_types(ppo.start(key)))
+        self.chunk = make_chunk(ppo, 1)
+
+    def race(
+        self, policy: Any, env: EpisodicEnvironment, params: EnvParams, models: ModelParameters | None = None
+    ) -> dict[str, float | None]:
+        """Return success and flying lap of 256 noisy starts; models: a drone for each flight."""
+        keys = start_keys(EVALUATION_SEED, NUM_EPISODES)
+        result = score(race_many(env, self.network, policy, keys, NUM_STEPS, NUM_LAPS, params, models))
+        lap_s = result.flying_lap_s
+        return {"success": result.success, "flying_lap_s": None if np.isnan(lap_s) else lap_s}
+
+    def in_simulator(self, policy: Any) -> dict[str, float | None]:
+        """Return the race in the simulator, on the model itself."""
+        return self.race(policy, self.env, with_model_as_given(self.env.default_params))
+
+    def train(self, seed: int) -> dict[str, Any]:
+        """Return the curve of a seed, and its race in the simulator, on the black box, on drawn drones."""
+        runner, curve = self.start(jax.random.key(seed)), []
+        for update in tqdm(range(1, self.config.num_updates + 1), desc=f"seed {seed}"):
+            runner, _ = self.chunk(runner, jnp.int32(1))
+            if is_due(update, EVERY, self.config.batch_size) or update == self.config.num_updates:
+                raced = self.in_simulator(runner.train_state.params)
+                curve.append([update * self.config.batch_size, raced["success"]])
+        policy, params = runner.train_state.params, with_model_as_given(self.env.default_params)
+        plants = draw_plants(PLANTS_SEED, NUM_EPISODES, self.model)
+        result = {
+            "curve": curve,
+            "simulator": self.in_simulator(policy),
+            "drawn": self.race(policy, self.env, params, plants.models),
+            "black_box": None,
+        }
+        if not self.ablation.delay_s:
+            env = make_env(self.ablation, plant=blackbox.load(SHIPPED_BLACK_BOX))
+            result["black_box"] = self.race(policy, env, with_model_as_given(env.default_params))
+        return result
+
+
+def measure(arguments: argparse.Namespace, model: ModelParameters) -> dict[tuple[str, int], dict[str, Any]]:
+    """Return a result per ablation and seed, of the file of lines or measured now and added to it."""
+    text = arguments.lines.read_text() if arguments.lines.exists() else ""
+    lines = [json.loads(line) for line in text.splitlines()]
+    done = {(line["ablation"], line["seed"]): line for line in lines if line["steps"] == arguments.steps}
+    for name in arguments.only or ABLATIONS:
+        missing = [seed for seed in range(arguments.seeds) if (name, seed) not in done]
+        contest = Contest(ABLATIONS[name], model, arguments.steps) if missing else None
+        for seed in missing:
+            started_s = time.process_time()
+            line = {"ablation": name, "seed": seed, "steps": arguments.steps, **contest.train(seed)}
+            done[name, seed] = line | {"cpu_s": round(time.process_time() - started_s, 1)}
+            text += json.dumps(done[name, seed], allow_nan=False) + "\n"
+            write_atomically(arguments.lines, text.encode())
+    return done
+
+
+def _range(values: list[float | None], form: str) -> str:
+    numbers = sorted(value for value in values if value is not None)
+    if not numbers:
+        return "-"
+    return " ".join(format(value, form) for value in numbers)
+
+
+def table(done: Mapping[tuple[str, int], dict[str, Any]]) -> str:
+    """Return a row per ablation, a number per seed, the smallest first."""
+    text = (
+        "| ablation | what is different | simulator | flying lap (s) | black box | flying lap (s) | "
+        "drawn drones |\n"
+        "|---|---|---|---|---|---|---|\n"
+    )
+    for name, ablation in ABLATIONS.items():
+        rows = [line for (of, _), line in sorted(done.items()) if of == name]
+        cells = []
+        for place in ("simulator", "black_box", "drawn"):
+            raced = [row[place] for row in rows if row[place] is not None]
+            cells.append(_range([one["success"] for one in raced], ".1%"))
+            if place != "drawn":
+                cells.append(_range([one["flying_lap_s"] for one in raced], ".3f"))
+        if rows:
+            text += f"| {name} | {ablation.says} | {' | '.join(cells)} |\n"
+    return text
+
+
+def draw(path: Path, done: Mapping[tuple[str, int], dict[str, Any]]) -> None:
+    """Write a PNG: the share that finishes 3 laps in the simulator over training, a panel per ablation."""
+    names = [name for name in ABLATIONS if any(of == name for of, _ in done)]
+    num_rows = -(-len(names) // 4)
+    figure = Figure(figsize=(12, 2.2 * num_rows + 0.6), layout="constrained")
+    panels = figure.subplots(num_rows, 4, sharex=True, sharey=True, squeeze=False)
+    for panel, name in zip(panels.flat, names, strict=False):
+        for (of, _), line in sorted(done.items()):
+            if of in (name, "default"):
+                steps, success = np.array(line["curve"]).T
+                style = {"color": "C0"} if of == name else {"color": "0.8", "zorder": 0}
+                panel.plot(steps / 1e6, 100 * success, **style)
+        panel.set_title(name, fontsize=10)
+    for panel in panels.flat[len(names) :]:
+        panel.set_axis_off()
+    figure.supxlabel("environment steps (millions); grey: the recipe as it is")
+    figure.supylabel("3 laps in the simulator (%)")
+    content = io.BytesIO()
+    figure.savefig(content, format="png", dpi=110)
+    write_atomically(path, content.getvalue())
+
+
+def main() -> None:
+    """Measure what is missing, print and write page, lines and chart."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--seeds", type=int, default=3)
+    parser.add_argument("--steps", type=int, default=Config.total_timesteps)
+    parser.add_argument("--only", nargs="+", choices=ABLATIONS, default=[])
+    parser.add_argument("--model", type=Path, default=Path("benchmarks/data/ablations/model.json"))
+    parser.add_argument("--lines", type=Path, default=Path("docs/results/ablations.jsonl"))
+    parser.add_argument("--out", type=Path, default=Path("docs/results/ablations.md"))
+    arguments = parser.parse_args()
+    pinned = pin_to_one_core()
+    done = measure(arguments, load_model(arguments.model))
+    chart = arguments.out.with_suffix(".png")
+    draw(chart, done)
+    text = (
+        "# Ablations: what each part of the recipe is worth\n\n"
+        f"`python -m benchmarks.ablations --seeds {arguments.seeds} --steps {arguments.steps}`: the default "
+        f"recipe ({arguments.steps / 1e6:g} M environment steps) with one thing changed, seeds 0 to "
+        f"{arguments.seeds - 1}. Trained on `{arguments.model}`, which `make demo` (seed 0) identified from "
+        f"the shipped black box. Share of {NUM_EPISODES} noisy starts that finish {NUM_LAPS} laps, and mean "
+        "flying lap: in that simulator, on the black box, on as many drones drawn around the model (drag, "
+        "thrust, wind, delay: `eval_agent.py --plants`). One number per seed, in order of size.\n\n"
+        f"{table(done)}\n![Learning curves]({chart.name})\n\n"
+        f"{cpu_name()}, {pinned}; {', '.join(f'{name} {number}' for name, number in versions().items())}.\n"
+    )
+    write_atomically(arguments.out, text.encode())
+    print(table(done))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,121 @@
+"""The loop: collect, fit, train, fly, diagnose that flight, extend the model, retrain, fly again."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from baselines.purejaxrl_ppo import Config
+from flytrack_env import save_model
+from flytrack_env.files import write_atomically
+from flytrack_env.plants import Plant
+from flytrack_loop.flown import fly_log
+from flytrack_loop.stages import Stage, errors_of, stage_as_json, train_stage
+from flytrack_sysid import Diagnosis, FlightLog, collect, diagnose, fit, save_log
+from flytrack_sysid.diagnosis import joined, text_of, write_diagnosis
+
+SCHEMA = 1
+# One stream of random numbers per use, all of one seed.
+STREAMS = ("collect", "train", "race_log", "held_out_log", "evaluation")
+
+
+class Settings(NamedTuple):
+    """What the loop flies and how it is measured.
+
+    minutes: of excitation. log_seconds: of the policy's own flights in the log that is diagnosed. noise: of
+    the sensors of all logs, 0 none, 1 common ones. The policy itself sees the plant's state.
+    """
+
+    minutes: float = 2.0
+    log_seconds: float = 60.0
+    noise: float = 1.0
+
+
+class Loop(NamedTuple):
+    """What came of the loop on a plant; ``diagnosis`` is of ``race_log``, beside the excitation.
+
+    before, after: policies of the minimal and of the extended model. after is before where nothing was named.
+    """
+
+    before: Stage
+    diagnosis: Diagnosis
+    after: Stage
+    excitation: FlightLog
+    race_log: FlightLog
+    held_out: FlightLog
+
+
+def seeds_of(seed: int) -> dict[str, int]:
+    """Return a seed for each of the loop's uses of randomness."""
+    words = np.random.SeedSequence(seed).generate_state(len(STREAMS))
+    return {name: int(word >> 1) for name, word in zip(STREAMS, words, strict=True)}
+
+
+def close_loop(
+    plant: Plant,
+    out: Path,
+    config: Config = Config(),  # noqa: B008, a frozen dataclass
+    seed: int = 0,
+    settings: Settings = Settings(),  # noqa: B008, a tuple of constants
+    tell: Callable[[str], None] = print,
+) -> Loop:
+    """Close the loop on a plant; write logs, models, diagnosis, trainings and ``loop.json`` into ``out``.
+
+    plant: a black box, or whatever has the methods of ``flytrack_env.plants.Plant``. config: of both
+    trainings. tell: called with a line per step.
+
+    Raises:
+        ValueError: a plant that does not fly, settings that cannot be used, ``out`` with another run in it.
+    """
+    config.check()
+    out.mkdir(parents=True, exist_ok=True)
+    seeds = seeds_of(seed)
+    tell("1/6 collect and fit the minimal model")
+    excitation = collect(plant, settings.minutes, seeds["collect"], settings.noise)
+    save_log(out / "excitation.npz", excitation)
+    fitted = fit(excitation)
+    save_model(out / "minimal.json", fitted.model, fitted.provenance())
+
+    tell("2/6 train on it")
+    rest = (plant, out, config, seeds["train"], seeds["evaluation"])
+    before = train_stage("before", fitted.model, *rest)
+    tell("3/6 fly, and log the flight")
+    length, noise = settings.log_seconds, settings.noise
+    race_log = fly_log(plant, before.checkpoint, seeds["race_log"], length, noise)
+    held_out = fly_log(plant, before.checkpoint, seeds["held_out_log"], length, noise)
+    save_log(out / "race.npz", race_log)
+    save_log(out / "held_out.npz", held_out)
+    before = before._replace(errors=errors_of(fitted.model, held_out))
+
+    tell("4/6 diagnose the flight, extend the model")
+    logs = [race_log, excitation]
+    found = diagnose(logs, fitted.model)
+    write_diagnosis(out / "diagnosis", found, joined(logs))
+    tell(text_of(found))
+    if found.causes:
+        tell("5/6 train on the extended model")
+        after = train_stage("after", found.extended, *rest, held_out)
+    else:
+        tell("5/6 nothing was named: the policy stays")
+        after = before._replace(name="after")
+    loop = Loop(before, found, after, excitation, race_log, held_out)
+    tell("6/6 flown again")
+    content = json.dumps(loop_as_json(loop, seed, config, settings), indent=2, allow_nan=False) + "\n"
+    write_atomically(out / "loop.json", content.encode())
+    return loop
+
+
+def loop_as_json(loop: Loop, seed: int, config: Config, settings: Settings) -> dict[str, Any]:
+    """Return what was measured as JSON values."""
+    return {
+        "schema": SCHEMA,
+        "seed": seed,
+        "training_steps": config.num_updates * config.batch_size,
+        "settings": settings._asdict(),
+        "verdict": loop.diagnosis.verdict,
+        "causes": [cause.effect for cause in loop.diagnosis.causes],
+        "race_log_s": round(len(loop.race_log) * 0.01, 2),
+        "stages": [stage_as_json(stage) for stage in (loop.before, loop.after)],
+    }

@@ -1,0 +1,130 @@
+"""One stage of the loop: a model, the policy that was trained on it, and how both hold on the plant."""
+
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from baselines.purejaxrl_ppo import Checkpoint, Config
+from baselines.purejaxrl_ppo.evaluate import race_many, start_keys
+from baselines.purejaxrl_ppo.flights import Score, score
+from baselines.purejaxrl_ppo.flown_env import plant_env, simulated_env
+from baselines.purejaxrl_ppo.perturbed import with_model_as_given
+from baselines.purejaxrl_ppo.train_ppo import train_policy
+from flytrack_env.dynamics import ModelParameters
+from flytrack_env.episodes import EpisodicEnvironment
+from flytrack_env.plants import Plant
+from flytrack_sysid import FlightLog, validate
+
+NUM_EPISODES, NUM_LAPS, NUM_STEPS = 256, 3, 2500
+
+
+class Errors(NamedTuple):
+    """What a model gets wrong on flights that it has not seen.
+
+    one_step_nrmse: by channel; 1 is as bad as "nothing changes" or the mean. position_m: median error of
+    free flight, by seconds. Both lack what the log cannot tell: flights end where the drone crashes.
+    """
+
+    one_step_nrmse: dict[str, float]
+    position_m: dict[str, float]
+
+
+class Gap(NamedTuple):
+    """The same policy in the simulator that it learnt in and on the plant, from the same noisy starts."""
+
+    simulator: Score
+    plant: Score
+
+    @property
+    def lap_percent(self) -> float:
+        """How much longer a flying lap takes on the plant than in the simulator, %; NaN without laps."""
+        return 100.0 * (self.plant.flying_lap_s / self.simulator.flying_lap_s - 1.0)
+
+
+class Stage(NamedTuple):
+    """A model, the policy that was trained on it, the errors of one and the race of the other."""
+
+    name: str
+    model: ModelParameters
+    checkpoint: Checkpoint
+    gap: Gap
+    errors: Errors | None
+
+
+def errors_of(model: ModelParameters, log: FlightLog) -> Errors:
+    """Return what a model gets wrong on a log, all of which is judged."""
+    found = validate(model, log)
+    one_step = {name: one.nrmse for name, one in found.one_step.channels.items() if one.nrmse is not None}
+    position = {
+        f"{rollout.horizon_s:g}": rollout.errors["position"].median
+        for rollout in found.rollouts
+        if "position" in rollout.errors
+    }
+    return Errors(one_step, position)
+
+
+def race(checkpoint: Checkpoint, env: EpisodicEnvironment, seed: int, episodes: int = NUM_EPISODES) -> Score:
+    """Return how a policy races from perturbed starts: share that finishes 3 laps, mean lap times."""
+    keys, params = start_keys(seed, episodes), with_model_as_given(env.default_params)
+    policy = (checkpoint.network, checkpoint.params)
+    return score(race_many(env, *policy, keys, NUM_STEPS, NUM_LAPS, params))
+
+
+def measure_gap(checkpoint: Checkpoint, plant: Plant, seed: int, episodes: int = NUM_EPISODES) -> Gap:
+    """Return the race in the simulator and on the plant."""
+    return Gap(
+        race(checkpoint, simulated_env(checkpoint), seed, episodes),
+        race(checkpoint, plant_env(checkpoint, plant), seed, episodes),
+    )
+
+
+def train_stage(
+    name: str,
+    model: ModelParameters,
+    plant: Plant,
+    out: Path,
+    config: Config,
+    seed: int,
+    evaluation_seed: int,
+    held_out: FlightLog | None = None,
+    env_id: str = "FlyTrack-v0",
+) -> Stage:
+    """Train a policy on a model, from scratch, and race it; ``out``/NAME holds the training.
+
+    evaluation_seed: of the noisy starts. held_out: a log to judge the model by, if there is one.
+    """
+    checkpoint, _ = train_policy(out / name, config, seed, env_id, model=model)
+    return judge(name, model, checkpoint, plant, evaluation_seed, held_out)
+
+
+def judge(
+    name: str,
+    model: ModelParameters,
+    checkpoint: Checkpoint,
+    plant: Plant,
+    evaluation_seed: int,
+    held_out: FlightLog | None = None,
+) -> Stage:
+    """Return the stage of a policy that is trained already."""
+    gap = measure_gap(checkpoint, plant, evaluation_seed)
+    return Stage(name, model, checkpoint, gap, None if held_out is None else errors_of(model, held_out))
+
+
+def stage_as_json(stage: Stage) -> dict[str, Any]:
+    """Return what was measured of a stage as JSON values; null where there is no number."""
+
+    def number(value: float) -> float | None:
+        return round(float(value), 6) if np.isfinite(value) else None
+
+    sides = {"simulator": stage.gap.simulator, "plant": stage.gap.plant}
+    return {
+        "name": stage.name,
+        **{side: {key: number(v) for key, v in one._asdict().items()} for side, one in sides.items()},
+        "lap_gap_percent": number(stage.gap.lap_percent),
+        "errors": None
+        if stage.errors is None
+        else {
+            kind: {k: number(v) for k, v in values.items()} for kind, values in stage.errors._asdict().items()
+        },
+    }

@@ -1,0 +1,169 @@
+"""The loop's parts: the log of a policy's flights, the gap, what the page says of results."""
+
+import math
+
+import numpy as np
+import pytest
+
+from baselines.purejaxrl_ppo import load_checkpoint
+from baselines.purejaxrl_ppo.evaluate import fly_many
+from baselines.purejaxrl_ppo.flights import Score
+from baselines.purejaxrl_ppo.flown_env import plant_env
+from benchmarks.champion import CHAMPION
+from benchmarks.loop.chart import draw_chart
+from benchmarks.loop.draws import HIDDEN, draw_plant
+from benchmarks.loop.page import (
+    POLICIES,
+    does_matter,
+    is_reached,
+    model_table,
+    race_table,
+    verdict,
+    where_it_does_not_help,
+)
+from benchmarks.loop.plant import HiddenPlant
+from eval_agent import SHIPPED_BLACK_BOX
+from flytrack_env import blackbox, nominal_parameters
+from flytrack_loop import Gap, errors_of
+from flytrack_loop.__main__ import main
+from flytrack_loop.flown import log_of_flights
+from flytrack_loop.loop import STREAMS, seeds_of
+from flytrack_loop.stages import measure_gap
+
+
+@pytest.fixture(scope="module")
+def champion():
+    return load_checkpoint(CHAMPION)
+
+
+@pytest.fixture(scope="module")
+def shipped():
+    return blackbox.load(SHIPPED_BLACK_BOX)
+
+
+@pytest.fixture(scope="module")
+def flights(champion, shipped):
+    env = plant_env(champion, shipped)
+    return fly_many(env, champion.network, champion.params, 3, 4, 450, 1)
+
+
+@pytest.fixture(scope="module")
+def log(flights):
+    return log_of_flights(flights, 0.01, 3, 12.0, 0.0)
+
+
+def test_the_log_is_what_the_plant_did(log, shipped):
+    assert 12.0 <= len(log) * 0.01 < 12.0 + 4.5
+    row = 200
+    state = np.concatenate([log[name][row] for name in ("p", "v", "a", "q", "w")])
+    state = np.concatenate([state, log["uprev"][row], log["v_bat"][row]]).astype(np.float32)
+    after = np.asarray(shipped.step_vector(state, log["u"][row].astype(np.float32)))
+    np.testing.assert_allclose(log["p"][row + 1], after[:3], atol=1e-5)
+    np.testing.assert_allclose(log["w"][row + 1], after[13:16], atol=1e-4)
+
+
+def test_the_log_has_a_segment_per_flight_and_is_noisy_on_request(log, flights):
+    starts = log["p"][log.is_start()]
+    assert len(starts) == len(np.unique(log.segment)) == 3  # of four that were flown: 12 s are enough
+    assert np.ptp(starts[:, 0]) > 0.01  # each flight from a start of its own
+    noisy = log_of_flights(flights, 0.01, 3, 12.0, 1.0)
+    assert "uprev" not in noisy and "f" in noisy and len(noisy) < len(log)
+
+
+def test_flights_that_end_at_once_are_no_log(flights):
+    short = flights._replace(is_flying=np.arange(450) < np.full((4, 1), 49))
+    with pytest.raises(ValueError, match="found 4 flights of at most 49 steps, expected one of 50"):
+        log_of_flights(short, 0.01, 3, 12.0, 0.0)
+
+
+def test_errors_are_those_of_the_model(log):
+    errors = errors_of(nominal_parameters(), log)
+    assert errors.one_step_nrmse["v"] > 0.01 and errors.position_m["1"] > 0.1
+    assert errors.position_m["0.1"] < errors.position_m["1"]
+
+
+def test_the_gap_is_between_the_plant_and_the_simulator_learnt_in(champion):
+    lost = draw_plant(2, 0)
+    assert set(lost.effects) == {"thrust_scale"} and lost.effects["thrust_scale"]["factor"] < 1.0
+    gap = measure_gap(champion, HiddenPlant(lost), seed=1, episodes=8)
+    assert gap.simulator.success == 1.0 > gap.plant.success
+
+
+def test_a_policy_without_laps_has_no_gap():
+    crashed, flown = Score(0.0, 1.0, math.nan, math.nan), Score(1.0, 24.0, 4.0, 4.0)
+    assert math.isnan(Gap(flown, crashed).lap_percent)
+    assert Gap(flown, flown._replace(flying_lap_s=4.04)).lap_percent == pytest.approx(1.0)
+
+
+def test_every_use_of_randomness_has_a_seed_of_its_own():
+    seeds = [seeds_of(seed)[name] for seed in (0, 1) for name in STREAMS]
+    assert len(set(seeds)) == 2 * len(STREAMS)
+
+
+def test_drawn_plants_have_delay_drag_and_thrust_loss_and_follow_the_seed():
+    names = {name for number in range(len(HIDDEN)) for name in draw_plant(number, 0).effects}
+    assert {"command_delay", "quadratic_drag", "thrust_scale"} <= names
+    assert draw_plant(4, 0) == draw_plant(4, 0) != draw_plant(4, 1)
+    assert len(draw_plant(4, 0).effects) == 3
+
+
+def test_the_command_refuses_what_it_cannot_use(tmp_path, capsys):
+    for flags, said in (
+        (["--black-box", str(tmp_path / "none.bin")], "none.bin: found nothing"),
+        (["--black-box", str(SHIPPED_BLACK_BOX), "--total-timesteps", "10"], "total_timesteps: found 10"),
+        (["--black-box", str(SHIPPED_BLACK_BOX), "--noise", "-1"], "noise: found -1"),
+        (["--black-box", str(SHIPPED_BLACK_BOX), "--minutes", "0"], "minutes: found 0"),
+    ):
+        with pytest.raises(SystemExit):
+            main([*flags, "--out", str(tmp_path / "out")])
+        assert said in capsys.readouterr().err
+
+
+def stage(name: str, success: float, gap: float | None, simulator: float = 1.0) -> dict:
+    raced = {"success": simulator, "gates": 24.0, "first_lap_s": 4.2, "flying_lap_s": 4.0}
+    flown = raced | {"success": success, "flying_lap_s": None if gap is None else 4.0 * (1 + gap / 100)}
+    errors = {"one_step_nrmse": {"v": 0.1, "q": 0.01}, "position_m": {}}
+    return {"name": name, "simulator": raced, "plant": flown, "lap_gap_percent": gap, "errors": errors}
+
+
+def result(before: tuple, after: tuple, base: tuple = (0.0, None), causes=("wind",), job="0") -> dict:
+    stages = [stage("before", *before), stage("after", *after), stage("refitted_base", *base)]
+    stages += [stage("nominal", 0.0, None), stage("randomised", 0.5, 9.0)]
+    return {"job": job, "hidden": "x", "causes": list(causes), "race_log_s": 60.0, "stages": stages}
+
+
+HELPED = result((0.1, -4.0), (1.0, 0.2))
+HARMLESS = result((1.0, 0.5), (1.0, 0.1), job="harmless")
+LOST = result((0.5, 2.0), (0.9, 0.1), job="lost")
+SLOW = result((1.0, 5.0), (1.0, -1.5), job="slow")
+
+
+def test_what_matters_and_what_is_reached():
+    assert [does_matter(one) for one in (HELPED, HARMLESS, LOST, SLOW)] == [True, False, True, True]
+    assert [is_reached(one) for one in (HELPED, HARMLESS, LOST, SLOW)] == [True, True, False, False]
+    assert does_matter(result((1.0, None), (1.0, 0.0)))  # no lap on the plant is no small gap
+
+
+def test_the_verdict_counts_plants_that_matter():
+    text, is_met = verdict([HELPED, HARMLESS, LOST])
+    assert "**1 of 2**" in text and "not on lost" in text and not is_met
+    assert verdict([HELPED, HARMLESS])[1]
+    assert verdict([HELPED] * 9 + [SLOW])[1] and not verdict([HELPED] * 8 + [SLOW])[1]
+
+
+def test_it_is_said_where_the_extension_does_not_help():
+    assert where_it_does_not_help(HELPED) is None
+    assert where_it_does_not_help(HARMLESS) == "the minimal model is as good"
+    assert (
+        where_it_does_not_help(result((0.1, 4.0), (1.0, 0.2), base=(1.0, 0.1)))
+        == "the refitted base is as good"
+    )
+    assert where_it_does_not_help(result((0.9, 0.0), (0.5, 0.0))) == "success falls from 90.0% to 50.0%"
+    assert where_it_does_not_help(result((0.9, 0.0), (0.9, 0.0), causes=())) == "nothing was named"
+
+
+def test_tables_and_chart_show_every_plant():
+    results = [HELPED, LOST]
+    assert race_table(results).count("\n") == model_table(results).count("\n") == 4
+    assert "| 0 | yes | 10.0% (100.0%), 3.840 s, -4.00 % | 100.0%" in race_table(results)
+    assert draw_chart(results, POLICIES).startswith(b"\x89PNG")
