@@ -1,6 +1,6 @@
 """FlyTrack with something taken out of the observation, for ``benchmarks.ablations``."""
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from flytrack_env.episodes import EpisodicEnvironment
 from flytrack_env.observations import Entry
 from flytrack_env.params import EnvParams
-from flytrack_env.state import Drone
+from flytrack_env.state import Action, Drone
 from flytrack_env.wrappers import Wrapper
 
 # Of the world frame: the course spans 25 m and 35 m, and speeds and directions are as in the gate's frame.
@@ -27,7 +27,28 @@ WORLD = (
 BATTERY_MIDDLE_V = 23.0
 
 
-class WithoutEntries(Wrapper):
+class Shown(NamedTuple):
+    """The inner state and nothing else."""
+
+    inner: Any
+
+
+class OtherObservation(Wrapper):
+    """A wrapper that changes only what is shown."""
+
+    def begin(self, drone: Drone, gate_index: Any, params: EnvParams, seed: Any = 0) -> Shown:
+        """Return the inner state of an episode that begins."""
+        return Shown(self.env.begin(drone, gate_index, params, seed))
+
+    def advance(
+        self, state: Shown, command: Action, params: EnvParams
+    ) -> tuple[Shown, jax.Array, jax.Array, dict[str, Any]]:
+        """Return the outcome of the inner environment."""
+        inner, *outcome = self.env.advance(state.inner, command, params)
+        return Shown(inner), *outcome
+
+
+class WithoutEntries(OtherObservation):
     """Show zeros in place of some entries of the observation.
 
     Raises:
@@ -46,7 +67,7 @@ class WithoutEntries(Wrapper):
 
     def observe_drone(self, drone: Drone, state: Any, params: EnvParams) -> list[jax.Array]:
         """Return the inner observation with zeros where the entries were."""
-        values = self.env.observe_drone(drone, state, params)
+        values = self.env.observe_drone(drone, state.inner, params)
         hidden = [entry.key in self.keys for entry in self.observation_table for _ in range(entry.size)]
         return [
             jnp.zeros_like(value) if is_hidden else value
@@ -54,7 +75,7 @@ class WithoutEntries(Wrapper):
         ]
 
 
-class InWorldFrame(Wrapper):
+class InWorldFrame(OtherObservation):
     """Show everything in the world's frame, the same quantities as in the gate's."""
 
     key = "in_world_frame"

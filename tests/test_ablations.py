@@ -1,0 +1,87 @@
+"""Ablated observations: only what is meant to be gone is gone, and the race is the same."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from benchmarks.ablated import WORLD, InWorldFrame, WithoutEntries
+from benchmarks.ablations import ABLATIONS, DELAY_S, make_env, table, with_delay
+from flytrack_env import make, nominal_parameters
+from flytrack_env.quaternion import Vec3
+
+
+def rows_of(table, key):
+    start = 0
+    for entry in table:
+        if entry.key == key:
+            return slice(start, start + entry.size)
+        start += entry.size
+    raise KeyError(key)
+
+
+@pytest.fixture(scope="module")
+def started():
+    env = make("FlyTrack-v0")
+    return env, *env.reset(jax.random.key(5), env.default_params)
+
+
+def test_entries_are_gone_and_the_others_stay(started):
+    env, observation, _ = started
+    shown, _ = WithoutEntries(env, ("applied", "next_gate")).reset(jax.random.key(5), env.default_params)
+    gone = np.zeros(len(observation), bool)
+    for key in ("applied", "next_gate"):
+        gone[rows_of(env.observation_table, key)] = True
+    assert np.all(np.asarray(observation)[rows_of(env.observation_table, "next_gate")][:2] != 0.0)
+    np.testing.assert_array_equal(shown, np.where(gone, 0.0, observation))
+    with pytest.raises(ValueError, match="keys: found 'wind', expected some of position"):
+        WithoutEntries(env, ("wind",))
+
+
+def test_the_world_frame_shows_the_same_in_another_frame(started):
+    env, observation, state = started
+    world = InWorldFrame(env)
+    shown, _ = world.reset(jax.random.key(5), env.default_params)
+    drone, gate = env.drone(state), env.race(state).gate
+
+    def said(key):
+        entry = next(one for one in WORLD if one.key == key)
+        return np.asarray(shown[rows_of(WORLD, key)]) * entry.scale
+
+    np.testing.assert_allclose(said("position"), drone.pos_w, rtol=1e-6)
+    np.testing.assert_allclose(said("velocity"), drone.vel_w, rtol=1e-6, atol=1e-6)
+    np.testing.assert_allclose(said("gate"), gate.centre - drone.pos_w, rtol=1e-5, atol=1e-5)
+    matrix = said("attitude").reshape(3, 3)  # body to world
+    np.testing.assert_allclose(
+        matrix @ [0.0, 0.0, 1.0], drone.quat.rotate(Vec3(0.0, 0.0, 1.0)), rtol=1e-5, atol=1e-6
+    )
+    for key in ("rates", "applied", "battery"):
+        np.testing.assert_array_equal(
+            shown[rows_of(WORLD, key)], observation[rows_of(env.observation_table, key)]
+        )
+
+
+@pytest.mark.parametrize("name", ["world_frame", "no_action", "randomised", "delay_history"])
+def test_every_environment_flies(name):
+    ablation = ABLATIONS[name]
+    env = make_env(ablation, model=with_delay(nominal_parameters(), ablation.delay_s))
+    params = env.default_params
+    observation, state = env.reset(jax.random.key(0), params)
+    observation, _, reward, _, _, _ = env.step(jax.random.key(1), state, jnp.zeros(4), params)
+    assert np.isfinite(reward) and env.observation_space(params).contains(observation)
+
+
+def test_a_delay_is_in_the_model_only_where_it_is_asked_for():
+    assert with_delay(nominal_parameters(), DELAY_S).effect("command_delay").delay_s == DELAY_S
+    assert with_delay(nominal_parameters(), 0.0).effects == ()
+
+
+def test_the_table_has_a_number_per_seed_the_smallest_first():
+    def line(success, lap_s):
+        raced = {"success": success, "flying_lap_s": lap_s}
+        return {"simulator": raced, "black_box": raced, "drawn": raced}
+
+    done = {("default", 1): line(0.5, None), ("default", 0): line(1.0, 4.25)}
+    row = table(done).splitlines()[-1]
+    cells = "50.0% 100.0% | 4.250 | 50.0% 100.0% | 4.250 | 50.0% 100.0%"
+    assert row == f"| default | the recipe as it is | {cells} |"
