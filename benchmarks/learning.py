@@ -82,9 +82,10 @@ def main() -> None:
         "# Learning: from black box to race\n\n"
         f"`python -m benchmarks.learning --seeds {arguments.seeds} "
         f"--total-timesteps {config.total_timesteps:g}` on {cpu_name()}, "
-        f"{len(os.sched_getaffinity(0))} cores, jax {jax.__version__}. CPU seconds include compilation. {NUM_EPISODES} noisy starts, {NUM_LAPS} "
-        f"laps; training seeds with at least {TARGET_SUCCESS:.0%}: **{reached} of {len(successes)}**. "
-        f"Margin: by how much thicker, to every side, the drone could be for {TARGET_SUCCESS:.0%} still to finish "
+        f"{len(os.sched_getaffinity(0))} cores, jax {jax.__version__}. CPU seconds include compilation. "
+        f"{NUM_EPISODES} noisy starts, {NUM_LAPS} laps; training seeds with at least {TARGET_SUCCESS:.0%}: "
+        f"**{reached} of {len(successes)}**. Margin: by how much thicker, to every side, the drone could be "
+        f"for {TARGET_SUCCESS:.0%} still to finish "
         f"({', '.join(f'{thicker:g}' for thicker in THICKER_M)} m were tried).\n\n" + HEADER + "".join(rows)
     )
     write_atomically(arguments.table, text.encode())
