@@ -15,6 +15,7 @@ from flytrack_loop.flown import fly_log
 from flytrack_loop.stages import Stage, errors_of, stage_as_json, train_stage
 from flytrack_sysid import Diagnosis, FlightLog, collect, diagnose, fit, save_log
 from flytrack_sysid.diagnosis import joined, text_of, write_diagnosis
+from flytrack_sysid.progress import ProgressBar
 
 SCHEMA = 1
 # One stream of random numbers per use, all of one seed.
@@ -73,9 +74,9 @@ def close_loop(
     out.mkdir(parents=True, exist_ok=True)
     seeds = seeds_of(seed)
     tell("1/6 collect and fit the minimal model")
-    excitation = collect(plant, settings.minutes, seeds["collect"], settings.noise)
+    excitation = collect(plant, settings.minutes, seeds["collect"], settings.noise, ProgressBar("flights"))
     save_log(out / "excitation.npz", excitation)
-    fitted = fit(excitation)
+    fitted = fit(excitation, report=ProgressBar("rounds"))
     save_model(out / "minimal.json", fitted.model, fitted.provenance())
 
     tell("2/6 train on it")
@@ -91,7 +92,7 @@ def close_loop(
 
     tell("4/6 diagnose the flight, extend the model")
     logs = [race_log, excitation]
-    found = diagnose(logs, fitted.model)
+    found = diagnose(logs, fitted.model, report=ProgressBar("stages"))
     write_diagnosis(out / "diagnosis", found, joined(logs))
     tell(text_of(found))
     if found.causes:

@@ -29,7 +29,7 @@ def describe(loop: Loop) -> str:
     lines = [f"{'':58}{'before':>12}{'after':>12}"]
     if before.errors is not None and after.errors is not None:
         for name, value in before.errors.one_step_nrmse.items():
-            label = f"held-out flight, one step, {name}: error over change"
+            label = f"held-out flight, one step, {name}: NRMSE"
             lines.append(line(label, value, after.errors.one_step_nrmse.get(name), ".4f"))
         for horizon, value in before.errors.position_m.items():
             label = f"held-out flight, {horizon} s of free flight: position, m"

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from tqdm import tqdm
 
 from flytrack_env import blackbox, load_model, load_provenance, save_model
 from flytrack_env.dynamics import nominal_parameters
@@ -24,6 +23,7 @@ from flytrack_sysid.importing import FORMATS, import_log
 from flytrack_sysid.log import FlightLog
 from flytrack_sysid.log_file import check_name, describe, load_log, save_log
 from flytrack_sysid.plausibility import check_plausible
+from flytrack_sysid.progress import ProgressBar
 from flytrack_sysid.script_file import check_name as check_script_name
 from flytrack_sysid.script_file import load_script, save_script
 from flytrack_sysid.split import HELD_OUT_EVERY, held_out_rows
@@ -61,25 +61,12 @@ def load_plant(where: str) -> Any:
     return found
 
 
-class _Bar:
-    """A progress bar to be called with what is done and what there is to do."""
-
-    def __init__(self, unit: str):
-        self.bar = tqdm(unit=f" {unit}", leave=False, disable=None)
-
-    def __call__(self, done: int, total: int) -> None:
-        self.bar.total = total
-        self.bar.update(done - self.bar.n)
-        if done == total:
-            self.bar.close()
-
-
 def run_collect(arguments: argparse.Namespace) -> None:
     """Fly the excitation, or a script, and write the log."""
     check_name(arguments.out)
     script = None if arguments.script is None else load_script(arguments.script)
     plant = load_plant(arguments.black_box)
-    log = collect(plant, arguments.minutes, arguments.seed, arguments.noise, _Bar("flights"), script)
+    log = collect(plant, arguments.minutes, arguments.seed, arguments.noise, ProgressBar("flights"), script)
     save_log(arguments.out, log)
     print(describe(load_log(arguments.out)))
 
@@ -135,7 +122,7 @@ def run_fit(arguments: argparse.Namespace) -> None:
     fixed = fixed_values(arguments.fix)
     start = None if arguments.start is None else load_model(arguments.start)
     log = load_log(arguments.log)
-    found = fit(log, start, fixed, arguments.effect, arguments.hold_out_every, _Bar("rounds"))
+    found = fit(log, start, fixed, arguments.effect, arguments.hold_out_every, ProgressBar("rounds"))
     provenance = found.provenance()
     provenance["started_from"] = "nominal parameters" if start is None else Path(arguments.start).name
     provenance["fixed"] = fixed
@@ -188,7 +175,7 @@ def run_diagnose(arguments: argparse.Namespace) -> None:
     count = sum(len(one) for one in learnt)
     held_out = np.arange(len(log)) >= count if judged else None
     model = None if arguments.model is None else load_model(arguments.model)
-    found = diagnose(logs, model, held_out, _Bar("stages"))
+    found = diagnose(logs, model, held_out, ProgressBar("stages"))
     written = write_diagnosis(arguments.out, found, log)
     print(text_of_diagnosis(found))
     recording = arguments.out / RECORDING_NAME

@@ -12,8 +12,9 @@ from flytrack_env import nominal_parameters
 
 LAG_SPREAD, THRUST_SPREAD = 0.2, 0.05  # |ln factor| of the lags, and of the thrust map, at most
 LARGE = 2.0 / 3.0  # of the way from the smallest size to the largest, on a log scale: the least that is drawn
-# What the first plants have, then over again: one effect of the three that every drone has, or several.
+# What the first plants have: one effect of the three that every drone has, or so many; later ones have LATER.
 HIDDEN = (("command_delay",), ("quadratic_drag",), ("thrust_scale",), 2, 3)
+LATER = 3
 
 
 def _size(name: str, rng: np.random.Generator) -> float:
@@ -46,7 +47,7 @@ def draw_base(rng: np.random.Generator) -> Truth:
 def draw_plant(number: int, seed: int) -> Truth:
     """Return a plant by its number, from 0: what is hidden follows ``HIDDEN``, how large it is the seed."""
     rng = np.random.default_rng([seed, number])
-    hidden = HIDDEN[number % len(HIDDEN)]
+    hidden = HIDDEN[number] if number < len(HIDDEN) else LATER
     if isinstance(hidden, int):
         hidden = tuple(str(name) for name in rng.choice(EFFECTS, size=hidden, replace=False))
     base = draw_base(rng)

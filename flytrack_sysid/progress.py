@@ -1,0 +1,17 @@
+"""A progress bar for what calls back with how much is done: ``collect``, ``diagnose``."""
+
+from tqdm import tqdm
+
+
+class ProgressBar:
+    """A bar to be called with what is done and what there is to do; shown on terminals only."""
+
+    def __init__(self, unit: str):
+        self.bar = tqdm(unit=f" {unit}", leave=False, disable=None)
+
+    def __call__(self, done: int, total: int) -> None:
+        """Show that ``done`` of ``total`` is done; the last one closes the bar."""
+        self.bar.total = total
+        self.bar.update(done - self.bar.n)
+        if done == total:
+            self.bar.close()
