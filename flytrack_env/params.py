@@ -20,8 +20,8 @@ class EnvParams:
     """Everything that may be fitted, randomised or tuned: a pytree without static fields.
 
     model: the simulated drone. course: the track as arrays. reset: how episodes start. reward: weights.
-    dt: s. drone_radius: m. max_steps_in_episode: the time limit, steps. wrappers: the parameters of each wrapper
-    around the environment, by its name; a wrapper's class says what they are.
+    dt: s. drone_radius: m. max_steps_in_episode: the time limit, steps. wrappers: the parameters of each
+    wrapper around the environment, by its name; a wrapper's class says what they are.
     """
 
     model: ModelParameters

@@ -19,8 +19,8 @@ ROOT = Path(__file__).parent.parent
 PACKAGES = ("flytrack_env", "flytrack_sysid", "baselines")
 MODULES = [module for group in GROUPS.values() for module in group.modules]
 PAGES = api_pages()
-# Recorded results belong to these files by a hash of their bytes (benchmarks/diagnosis.py): they say in groups
-# ("along body x, y, z") what others say field by field. All have docstrings and name what they raise.
+# Recorded results belong to these files by a hash of their bytes (benchmarks/diagnosis.py). They say in
+# groups ("along body x, y, z") what others say by field; all have docstrings and name what they raise.
 FROZEN = (
     r"flytrack_env\.(dynamics|effects\.\w+|effects)",
     r"flytrack_sysid\.(log|record|split|parameters|diagnosis\..*)",
