@@ -35,7 +35,9 @@ class EnvParams:
 
     if TYPE_CHECKING:  # chex adds it, and tells no type checker
 
-        def replace(self, **changes: Any) -> Self: ...
+        def replace(self, **changes: Any) -> Self:
+            """Return the parameters with some fields changed."""
+            ...
 
     def check(self) -> None:
         """Raise ValueError, naming the field, for values that no episode can be flown with.

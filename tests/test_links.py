@@ -52,3 +52,13 @@ def test_what_is_broken_is_found() -> None:
     text = "[a](nowhere.md) [b](faq.md#nowhere) [c](quick_start.md) [d](https://example.org)\n```\n[e](no.md)\n```\n"
     assert broken(page, text) == ["nowhere.md", "faq.md#nowhere"]
     assert len(PAGES) > 80 and slug("`diagnosis.json`, and *more*") == "diagnosisjson-and-more"
+
+
+def test_every_page_is_in_the_navigation() -> None:
+    text = (ROOT / "mkdocs.yml").read_text(encoding="utf-8")
+    nav = re.findall(r"^ +- (?:[^#:\n]*: )?(\S+\.md)$", text[text.index("\nnav:") :], re.MULTILINE)
+    outside = [name.removeprefix("repository/") for name in nav if name.startswith("repository/")]
+    inside = [name for name in nav if not name.startswith("repository/")]
+    pages = [str(path.relative_to(ROOT / "docs")) for path in (ROOT / "docs").rglob("*.md")]
+    assert sorted(inside) == sorted(pages) and len(set(nav)) == len(nav)
+    assert all((ROOT / name).is_file() for name in outside) and outside

@@ -2,12 +2,13 @@
 
 import re
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from docs.pages import DOCS, pages
-from flytrack_env.effects import EFFECTS, Effect
+from flytrack_env.effects import EFFECTS, Effect, effect_of
 from flytrack_env.references import KINDS, shipped_reference
 from flytrack_env.registration import ENVIRONMENTS
 from flytrack_env.tracks import available_tracks, build_course, load_track
@@ -70,3 +71,15 @@ def test_a_page_has_every_section(env_id: str) -> None:
     ]
     assert [heading for heading in headings if heading != "What is different"] == wanted
     assert ("What is different" in headings) == bool(ENVIRONMENTS[env_id].wrappers)
+
+
+@pytest.mark.parametrize(
+    "path", [path for path in PAGES if path.parent.name in ("effects", "tracks")], ids=lambda p: p.stem
+)
+def test_a_page_shows_python_that_runs(path: Path) -> None:
+    code = "\n".join(re.findall(r"^```python\n(.*?)^```", PAGES[path], re.MULTILINE | re.DOTALL))
+    names: dict[str, Any] = {}
+    exec(compile(code, path.name, "exec"), names)
+    names["env"].check_params(names["params"])
+    if path.parent.name == "effects":
+        assert effect_of(names["ranges"].low[0]).name == effect_of(names["effect"]).name == path.stem
