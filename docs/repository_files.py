@@ -9,10 +9,12 @@ import posixpath
 import re
 from collections.abc import Callable
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from mkdocs.config.defaults import MkDocsConfig
-from mkdocs.structure.files import File, Files
-from mkdocs.structure.pages import Page
+if TYPE_CHECKING:
+    from mkdocs.config.defaults import MkDocsConfig
+    from mkdocs.structure.files import Files
+    from mkdocs.structure.pages import Page
 
 FOLDER = "repository"
 LINK = re.compile(r"(!?\[[^\]]*\])\(([^)#\s]+)(#[^)\s]*)?\)")
@@ -58,33 +60,28 @@ def resolved(path: str, target: str) -> str:
     return posixpath.normpath(posixpath.join(posixpath.dirname(path), target))
 
 
-def on_files(files: Files, config: MkDocsConfig) -> Files:
-    """Add the files that pages link to, and those that these link to."""
-    root = Path(config.docs_dir).parent
-    waiting = [f"docs/{file.src_uri}" for file in files.documentation_pages()]
-    seen = set(waiting)
+def linked_files(root: Path, pages: list[str]) -> dict[str, str]:
+    """Return the files outside of ``docs/`` that pages lead to: their paths and what is shown of them."""
+    waiting, found = list(pages), {}
     while waiting:
         path = waiting.pop()
         for target in links_of((root / path).read_text(encoding="utf-8")):
             linked = resolved(path, target)
-            if linked in seen or linked.startswith(("docs/", "..")) or not (root / linked).is_file():
+            if linked in found or linked.startswith(("docs/", "..")) or not (root / linked).is_file():
                 continue
-            seen.add(linked)
             content = (root / linked).read_text(encoding="utf-8")
             if linked.endswith(".md"):
                 waiting.append(linked)
             else:
                 language = LANGUAGES.get(Path(linked).suffix, "text")
                 content = f"# {linked}\n\n````{language}\n{content}\n````\n"
-            files.append(File.generated(config, page_of(linked), content=content))
-    return files
+            found[linked] = content
+    return found
 
 
-def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:
+def led(root: Path, page: str, markdown: str) -> str:
     """Return a page's Markdown with its links led to where the site has their targets."""
-    root = Path(config.docs_dir).parent
-    here = page.file.src_uri
-    path = place(root, here)
+    path = place(root, page)
 
     def lead(match: re.Match[str]) -> str:
         text, target, anchor = match.group(1), match.group(2), match.group(3) or ""
@@ -93,7 +90,22 @@ def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Fil
         linked = resolved(path, target)
         if (root / linked).is_dir():
             return text[1:-1]
-        goal = posixpath.relpath(page_of(linked), posixpath.dirname(here) or ".")
+        goal = posixpath.relpath(page_of(linked), posixpath.dirname(page) or ".")
         return f"{text}({goal}{anchor})"
 
     return outside_code(markdown, lambda stretch: LINK.sub(lead, stretch))
+
+
+def on_files(files: "Files", config: "MkDocsConfig") -> "Files":
+    """Add the files that pages link to, and those that these link to."""
+    from mkdocs.structure.files import File  # here, so that the rest is there without MkDocs
+
+    pages = [f"docs/{file.src_uri}" for file in files.documentation_pages()]
+    for path, content in linked_files(Path(config.docs_dir).parent, pages).items():
+        files.append(File.generated(config, page_of(path), content=content))
+    return files
+
+
+def on_page_markdown(markdown: str, page: "Page", config: "MkDocsConfig", files: "Files") -> str:
+    """Return a page's Markdown with its links led to where the site has their targets."""
+    return led(Path(config.docs_dir).parent, page.file.src_uri, markdown)
