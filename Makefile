@@ -49,8 +49,9 @@ $(DOCS_STAMP): docs/requirements.lock
 	$(DOCS)/bin/python -m pip install --disable-pip-version-check --quiet --no-deps --require-hashes -r docs/requirements.lock
 	touch $(DOCS_STAMP)
 
+# Not --quiet: MkDocs then counts no warnings.
 docs: $(DOCS_STAMP)
-	NO_MKDOCS_2_WARNING=1 $(DOCS)/bin/python -m mkdocs build --strict --quiet
+	NO_MKDOCS_2_WARNING=1 $(DOCS)/bin/python -m mkdocs build --strict
 
 lint: setup
 	$(BIN)/ruff check .
