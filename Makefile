@@ -1,14 +1,17 @@
 # `make setup` builds .venv from the lock file; `make demo` and `make test` build on it.
 # `make test-clients` builds .venv-clients, with RL code of others on top (docs/clients.md).
+# `make docs` builds .venv-docs and, in site/, the documentation (docs/contributing.md).
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.locked
 CLIENTS := .venv-clients
 CLIENTS_STAMP := $(CLIENTS)/.locked
+DOCS := .venv-docs
+DOCS_STAMP := $(DOCS)/.locked
 CHECK_PYTHON = $(PYTHON) -c 'import sys; v = sys.version_info; sys.exit(v < (3, 11) and f"Python 3.11 or newer is needed, found {v.major}.{v.minor}; try PYTHON=python3.11")'
 
-.PHONY: setup demo loop test test-clients lint lock clean
+.PHONY: setup demo loop test test-clients docs lint lock clean
 
 setup: $(STAMP)
 
@@ -43,6 +46,17 @@ $(CLIENTS_STAMP): requirements.lock clients/requirements.txt pyproject.toml
 test-clients: $(CLIENTS_STAMP)
 	$(CLIENTS)/bin/python -m pytest clients
 
+# The docstrings are read without importing them, so that the tools are all that is needed.
+$(DOCS_STAMP): docs/requirements.lock
+	$(CHECK_PYTHON)
+	test -x $(DOCS)/bin/python || $(PYTHON) -m venv $(DOCS)
+	$(DOCS)/bin/python -m pip install --disable-pip-version-check --quiet --no-deps --require-hashes -r docs/requirements.lock
+	touch $(DOCS_STAMP)
+
+# Not --quiet: MkDocs then counts no warnings.
+docs: $(DOCS_STAMP)
+	NO_MKDOCS_2_WARNING=1 $(DOCS)/bin/python -m mkdocs build --strict
+
 lint: setup
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
@@ -53,6 +67,9 @@ lock:
 	$(BIN)/python -m pip install --quiet uv
 	$(BIN)/uv pip compile --quiet --universal --python-version 3.11 --generate-hashes --no-annotate \
 		--no-header --extra train --extra sysid --extra viz --extra dev --output-file requirements.lock pyproject.toml
+	$(BIN)/python -c 'import tomllib; print("\n".join(tomllib.load(open("pyproject.toml", "rb"))["project"]["optional-dependencies"]["docs"]))' \
+		| $(BIN)/uv pip compile --quiet --universal --python-version 3.11 --generate-hashes --no-annotate \
+		--no-header --output-file docs/requirements.lock -
 
 clean:
-	rm -rf $(VENV) $(CLIENTS) build dist *.egg-info
+	rm -rf $(VENV) $(CLIENTS) $(DOCS) site build dist *.egg-info

@@ -1,309 +1,40 @@
 """Write the documentation's pages that the code determines: ``python -m docs.pages``.
 
-One page per environment id in ``docs/envs/``, and ``docs/effects.md``. A test holds that the committed
-pages are what this writes.
+A page per environment id, effect and shipped track, the overview of effects, and the API reference's
+lists of names. A test holds that the committed pages are what this writes.
 """
 
 import argparse
-import inspect
-import re
-import textwrap
 from pathlib import Path
-from typing import Any
 
-import jax
-import jax.numpy as jnp
-
-import flytrack_env
-from flytrack_env.effects import EFFECTS, STAGES, effect_of
-from flytrack_env.env import FlyTrack
+from docs.api_pages import api_pages
+from docs.effect_pages import effect_page, effects_page
+from docs.env_pages import env_page
+from docs.track_pages import track_page
+from flytrack_env.effects import EFFECTS
 from flytrack_env.files import write_atomically
 from flytrack_env.registration import ENVIRONMENTS
-from flytrack_env.resets import ResetParams
-from flytrack_env.rewards import TERMS
-from flytrack_env.terminations import Causes
-from flytrack_env.wrappers import Wrapper, layers_of
+from flytrack_env.tracks import available_tracks
 
 DOCS = Path(__file__).parent
-GENERATED = "<!-- Written by `python -m docs.pages`; change the code or that script, not this page. -->"
-
-WIDTH = 120
-DESCRIPTION = (
-    "A quadcopter in acro (rate) mode races through the gates of a track, laps repeating, at 100 Hz. "
-    "World frame: x forward, y left, z up; quaternions (w, x, y, z), body to world; body frame: x "
-    "forward, y left, z up. SI units. What a gate is and how passing it is decided: "
-    "[environment](../environment.md)."
-)
-
-# Keys of info that are not causes of termination.
-INFO = {
-    "gates_passed": "gates passed in this episode",
-    "laps": "laps completed; a lap is as many gates as the track has, from wherever the episode began",
-    "lap_completed": "whether a lap was completed in this step",
-    "lap_time_s": "time of the last complete lap, interpolated at the crossing, s; 0 before the first",
-    "gate_distance_m": "distance to the centre of the gate to fly next, m",
-    "terminated": "as returned",
-    "truncated": "as returned",
-    "final_observation": "the observation before auto-reset",
-}
-
-RATES = (
-    "roll rate command, positive left side up",
-    "pitch rate command, positive nose down",
-    "yaw rate command, positive nose left",
-)
-
-HISTORY = {"v0": "First version."}
-
-
-def sentence(text: str) -> str:
-    """Return a docstring's first sentence without its "Return"."""
-    first = re.sub(r"\s+", " ", text.split("\n\n")[0]).removeprefix("Return ").strip().rstrip(".")
-    return first.removeprefix("whether ").replace("``", "`")
-
-
-def paragraph(*texts: str) -> list[str]:
-    """Return sentences as wrapped lines, and a blank line."""
-    return [*textwrap.wrap(" ".join(texts), WIDTH, break_long_words=False, break_on_hyphens=False), ""]
-
-
-def table(header: tuple[str, ...], rows: list[tuple[Any, ...]]) -> list[str]:
-    """Return a Markdown table, and a blank line."""
-    lines = ["| " + " | ".join(header) + " |", "|" + "---|" * len(header)]
-    return [*lines, *("| " + " | ".join(str(cell) for cell in row) + " |" for row in rows), ""]
-
-
-def field_texts(record: Any) -> dict[str, str]:
-    """Return what a class's docstring says of its fields, each "name: text." or "name, name: text."."""
-    body = re.sub(r"\s+", " ", record.__doc__.partition("\n\n")[2]).strip()
-    parts = re.split(r"(?:^|(?<=[.;] ))((?:[a-z_*/]+(?:, )?)+): ", body)
-    return {name: text.strip().rstrip(".;") for name, text in zip(parts[1::2], parts[2::2], strict=True)}
-
-
-def action_section(env: Any) -> list[str]:
-    """Return the action table."""
-    max_rate = env.default_params.model.max_rate
-    rows = [(i, name, "[-1, 1]", f"1 = {max_rate[i]:g} deg/s") for i, name in enumerate(RATES)]
-    rows.append((3, "collective thrust command; -1 none, 1 all", "[-1, 1]", "1 = full thrust"))
-    text = paragraph(
-        "`Box(-1, 1, (4,), float32)`. Values beyond the range are clipped, infinite ones too. A NaN is "
-        "flown as 0 and ends the episode as a crash. An action of another shape raises `ValueError`."
-    )
-    return ["## Action", "", *table(("number", "meaning", "range", "unit"), rows), *text]
-
-
-def observation_section(env: Any) -> list[str]:
-    """Return the observation table."""
-    rows, start = [], 0
-    for entry in env.observation_table:
-        end = start + entry.size
-        index = str(start) if entry.size == 1 else f"{start}:{end}"
-        limits = f"[{-entry.limit:g}, {entry.limit:g}]"
-        rows.append((index, entry.name, entry.frame, entry.unit, f"{entry.scale:g}", limits))
-        start = end
-    text = paragraph(
-        f"{start} float32. A value is the quantity in its unit divided by the scale, clipped to the range.",
-        "The gate frame is the flight frame of the gate to fly next: origin at its centre, x along the",
-        "direction of flight, z the gate's up, y left.",
-    )
-    header = ("index", "meaning", "frame", "unit", "scale", "range")
-    return ["## Observation", "", *text, *table(header, rows)]
-
-
-def reward_section(env: Any) -> list[str]:
-    """Return the reward terms with their weights."""
-    weights = env.default_params.reward
-    rows = [
-        (f"`{term.__name__}`", f"{getattr(weights, term.__name__):g}", sentence(term.__doc__ or ""))
-        for term in TERMS
-    ]
-    text = paragraph(
-        "The sum of these terms, each times its weight: a field of `params.reward`, and a key of",
-        "`make(..., reward={...})`.",
-    )
-    return ["## Reward", "", *text, *table(("term", "weight", "what"), rows)]
-
-
-def start_section(env: Any) -> list[str]:
-    """Return how episodes start, with the ranges."""
-    params = env.default_params.reset
-    share = params.course_fraction
-    text = paragraph(
-        f"With probability {share:g} in flight between two gates, on a curve that leaves and meets them",
-        "along their directions of flight; else at rest at the track's start pose with noise. Uniform",
-        "draws; fields of `params.reset`:",
-    )
-    rows = [(f"`{name}`", f"{value:g}") for name, value in params._asdict().items()]
-    note = f"What they mean: `{ResetParams.__module__}.{ResetParams.__name__}`."
-    return ["## Start", "", *text, *table(("field", "value"), rows), note, ""]
-
-
-def end_section(env: Any) -> list[str]:
-    """Return causes of termination, and truncation."""
-    texts = field_texts(Causes)
-    rows = [(f"`{name}`", texts[name]) for name in Causes._fields]
-    steps = env.default_params.max_steps_in_episode
-    text = paragraph(
-        f"`truncated`: after `params.max_steps_in_episode` ({steps}) steps. `terminated`: for one of these",
-        "causes, each a key of `info`.",
-    )
-    return ["## End of an episode", "", *text, *table(("cause", "when"), rows)]
-
-
-def info_section(env: Any) -> list[str]:
-    """Return every other key of info."""
-    params = env.default_params
-    _, state = jax.eval_shape(env.reset, jax.random.key(0), params)
-    *_, info = jax.eval_shape(env.step, jax.random.key(0), state, jnp.zeros(4), params)
-    rows = [(f"`{name}`", INFO[name]) for name in info if name not in Causes._fields]
-    return ["## Info", "", *table(("key", "what"), rows)]
-
-
-def arguments_section(env_id: str) -> list[str]:
-    """Return the arguments of ``make``, from the class's docstring."""
-    body = (FlyTrack.__doc__ or "").partition("Args:")[2].partition("Raises:")[0]
-    entries = re.findall(r"^ {8}(\w+): (.*(?:\n {12}.*)*)", body, re.MULTILINE)
-    rows = [(f"`{name}`", re.sub(r"\s+", " ", text).replace("``", "`")) for name, text in entries]
-    parameters = inspect.signature(FlyTrack).parameters.values()
-    shown = [f"    {parameter.name}={parameter.default!r},".replace("'", '"') for parameter in parameters]
-    lines = [
-        "## Arguments",
-        "",
-        "```python",
-        "gymnax.make(",
-        f'    "{env_id}",',
-        *shown,
-        ")",
-        f'gymnasium.make("flytrack_env:{env_id}", track="split_s")  # the same arguments',
-        "```",
-        "",
-        *table(("argument", "what"), rows),
-        *paragraph(
-            "`params` is a pytree of which every leaf may be batched, fitted or randomised: `model`,",
-            "`course`, `reset`, `reward`, `dt`, `drone_radius`, `max_steps_in_episode`, and `wrappers`,",
-            "each wrapper's own.",
-        ),
-    ]
-    return lines
-
-
-def range_rows(ranges: Any) -> list[tuple[str, str, str]]:
-    """Return the rows of a randomisation: what, from, to."""
-    effect_factors = f"{ranges.effect_factor_low:g}", f"{ranges.effect_factor_high:g}"
-    rows = [
-        ("mass, factor", f"{ranges.mass_factor_low:g}", f"{ranges.mass_factor_high:g}"),
-        ("what the model has of the effects below, factor", *effect_factors),
-        ("each of the four lags, factor", f"{ranges.lag_factor_low:g}", f"{ranges.lag_factor_high:g}"),
-    ]
-    for low, high in zip(ranges.low, ranges.high, strict=True):
-        effect = effect_of(low)
-        for name, lowest in low._asdict().items():
-            if lowest is not None:
-                what = f"`{effect.name}.{name}`, {effect.ranges[name].unit}"
-                rows.append((what, f"{lowest:g}", f"{getattr(high, name):g}"))
-    return rows
-
-
-def wrappers_section(env: Any) -> list[str]:
-    """Return what the variant's wrappers are and draw."""
-    wrappers = [layer for layer in reversed(layers_of(env)) if isinstance(layer, Wrapper)]
-    if not wrappers:
-        return []
-    lines = ["## What is different", ""]
-    for wrapper in wrappers:
-        name, own = type(wrapper).__name__, wrapper.own_defaults()
-        about = sentence(type(wrapper).__doc__ or "")
-        arguments = {"length": getattr(wrapper, "length", None), "kind": getattr(wrapper, "kind", None)}
-        given = ", ".join(f"{key} {value}" for key, value in arguments.items() if value is not None)
-        lines += paragraph(f"**{name}**{f' ({given})' if given else ''}. {about}.")
-        if hasattr(own, "mass_factor_low"):
-            lines += paragraph(
-                f'Once per episode, uniform; `params.wrappers["{wrapper.key}"]`. Effects:',
-                "[effects](../effects.md).",
-            )
-            lines += [*table(("what", "from", "to"), range_rows(own))]
-        elif own is not None:
-            rows = [(f"`{field}`", f"{value:g}") for field, value in own._asdict().items()]
-            lines += [f'`params.wrappers["{wrapper.key}"]`:', "", *table(("field", "value"), rows)]
-    return lines
-
-
-def env_page(env_id: str) -> str:
-    """Return the page of an environment id."""
-    variant, env = ENVIRONMENTS[env_id], flytrack_env.make(env_id)
-    history = [(version, text) for version, text in HISTORY.items()]
-    lines = [
-        GENERATED,
-        "",
-        f"# {env_id}",
-        "",
-        *paragraph(variant.summary, DESCRIPTION),
-        *wrappers_section(env),
-        *action_section(env),
-        *observation_section(env),
-        *reward_section(env),
-        *start_section(env),
-        *end_section(env),
-        *info_section(env),
-        *arguments_section(env_id),
-        "## Versions",
-        "",
-        *table(("version", "change"), history),
-    ]
-    return "\n".join(lines).rstrip() + "\n"
-
-
-def effects_page() -> str:
-    """Return the page of all effects."""
-    lines = [
-        GENERATED,
-        "",
-        "# Effects",
-        "",
-        *paragraph(
-            "What a drone does beyond the minimal model, one file each in `flytrack_env/effects/`. A",
-            "model carries the parameters of the effects that it has; the simulator folds them in the",
-            f"order of this page within the stages of a step: {', '.join(STAGES)}. At its neutral value an",
-            "effect does nothing, bit for bit. Effects on a sensor change what it says and nothing of the",
-            "flight: `flytrack_env.dynamics.read_sensors` reads both sensors, and the body rates of an",
-            "observation are the gyro's.",
-        ),
-        "```python",
-        "from flytrack_env import nominal_parameters",
-        "from flytrack_env.effects import CommandDelay, LinearDrag",
-        "",
-        "model = nominal_parameters().with_effects(LinearDrag(0.3, 0.3, 0.1), CommandDelay(0.02))",
-        'env, params = gymnax.make("FlyTrack-v0", model=model)',
-        "```",
-        "",
-    ]
-    for effect in EFFECTS:
-        neutral = effect.parameters()
-        texts = [
-            f"`{effect.equation}`. Acts on: {', '.join(effect.acts_on)} (stage {', '.join(effect.stages)}).",
-            *(["It has a memory."] if effect.start else []),
-            f"Source: {effect.source}.",
-        ]
-        rows = [
-            (f"`{name}`", bounds.unit, f"{getattr(neutral, name):g}", f"{bounds.low:g} to {bounds.high:g}")
-            for name, bounds in effect.ranges.items()
-        ]
-        about = re.sub(r"\s+", " ", effect.parameters.__doc__ or "")
-        lines += [f"## `{effect.name}`", "", *paragraph(about, *texts)]
-        lines += table(("parameter", "unit", "neutral", "range"), rows)
-    return "\n".join(lines).rstrip() + "\n"
 
 
 def pages() -> dict[Path, str]:
     """Return every generated page by its path."""
-    written = {DOCS / "envs" / f"{env_id}.md": env_page(env_id) for env_id in ENVIRONMENTS}
-    return {**written, DOCS / "effects.md": effects_page()}
+    return {
+        **{DOCS / "envs" / f"{env_id}.md": env_page(env_id) for env_id in ENVIRONMENTS},
+        DOCS / "effects.md": effects_page(),
+        **{DOCS / "effects" / f"{effect.name}.md": effect_page(effect) for effect in EFFECTS},
+        **{DOCS / "tracks" / f"{name}.md": track_page(name) for name in available_tracks()},
+        **{DOCS / "api" / name: text for name, text in api_pages().items()},
+    }
 
 
 def main() -> None:
     """Write the pages."""
     argparse.ArgumentParser(description=__doc__).parse_args()
     for path, text in pages().items():
+        path.parent.mkdir(exist_ok=True)
         write_atomically(path, text.encode())
         print(path)
 

@@ -27,7 +27,7 @@ MISSED_GATE_CHOICES = ("terminate", "fly_on")
 
 
 class EnvState(NamedTuple):
-    """State of one episode: the plant's own state, the race, and steps since the reset."""
+    """State of one episode: the plant's own state, the race, and time, in steps since the reset."""
 
     plant: Any
     race: Race
@@ -114,7 +114,7 @@ class FlyTrack(EpisodicEnvironment):
     def transition(
         self, state: EnvState, command: Action, params: EnvParams
     ) -> tuple[EnvState, jax.Array, Causes, RaceEvents]:
-        """Return the next state, the reward, the causes of termination and the race's events."""
+        """Return the next state, the reward (a scalar), the causes of termination and the race's events."""
         is_nan = jnp.isnan(sum(command))
         command = without_nan(command)
         before = self.drone(state)

@@ -77,7 +77,7 @@ class EpisodicEnvironment(environment.Environment[Any, EnvParams]):  # type: ign
         raise NotImplementedError
 
     def sample_start(self, seed: jax.Array, params: EnvParams) -> tuple[Drone, jax.Array]:
-        """Return a drone that begins an episode, and the gate to fly first, of a uint32 word."""
+        """Return a drone that begins an episode, and the gate to fly first (an index), of a uint32 scalar."""
         raise NotImplementedError
 
     def begin(self, drone: Drone, gate_index: Any, params: EnvParams, seed: Any = 0) -> Any:
@@ -92,12 +92,13 @@ class EpisodicEnvironment(environment.Environment[Any, EnvParams]):  # type: ign
     ) -> tuple[Any, jax.Array, jax.Array, dict[str, Any]]:
         """Return the next state, the reward, whether the episode terminates, and info; no auto-reset.
 
-        command: within [-1, 1]; one that is not a number ends the episode and may not get into the state.
+        reward, terminated: scalars. command: within [-1, 1]; one that is not a number ends the episode and
+        may not get into the state.
         """
         raise NotImplementedError
 
     def observe_drone(self, drone: Drone, state: Any, params: EnvParams) -> list[jax.Array]:
-        """Return the observation of a state whose sensors report ``drone``, value by value."""
+        """Return the observation of a state whose sensors report ``drone``: a float32 scalar per row."""
         raise NotImplementedError
 
     def settle(self, state: Any, params: EnvParams) -> Any:
@@ -138,7 +139,10 @@ class EpisodicEnvironment(environment.Environment[Any, EnvParams]):  # type: ign
     def step_env(  # type: ignore[override]  # actions are arrays here
         self, key: jax.Array | None, state: Any, action: jax.Array, params: EnvParams
     ) -> tuple[jax.Array, Any, jax.Array, jax.Array, dict[str, Any]]:
-        """Return observation, state, reward, terminated and info of one step, without auto-reset."""
+        """Return observation, state, reward, terminated and info of one step, without auto-reset.
+
+        action: (4,). The observation is (size,) float32; reward and terminated are scalars. key is unused.
+        """
         del key
         next_state, reward, terminated, info = self.advance(state, clip_action(action), params)
         observation = self.observe(None, next_state, action, params)
@@ -148,7 +152,7 @@ class EpisodicEnvironment(environment.Environment[Any, EnvParams]):  # type: ign
     def reset(  # type: ignore[override]  # gymnax's is compiled; this one checks, then calls it
         self, key: jax.Array, params: EnvParams | None = None
     ) -> tuple[jax.Array, Any]:
-        """Return observation and state of an episode that begins.
+        """Return observation, (size,) float32, and state of an episode that begins.
 
         Raises:
             ValueError: parameters of another environment's wrappers; or that no episode can be flown with,
@@ -166,7 +170,7 @@ class EpisodicEnvironment(environment.Environment[Any, EnvParams]):  # type: ign
         return super().reset(key, params)
 
     def reset_env(self, key: jax.Array, params: EnvParams) -> tuple[jax.Array, Any]:
-        """Return observation and state of an episode that begins."""
+        """Return observation, (size,) float32, and state of an episode that begins; nothing is checked."""
         state = self._begin_from(seed_of(key), params)
         return self.observe(None, state, None, params), state
 

@@ -19,6 +19,7 @@ from flytrack_env.tracks import Course
 class EnvParams:
     """Everything that may be fitted, randomised or tuned: a pytree without static fields.
 
+    model: the simulated drone. course: the track as arrays. reset: how episodes start. reward: weights.
     dt: s. drone_radius: m. max_steps_in_episode: the time limit, steps. wrappers: the parameters of each
     wrapper around the environment, by its name; a wrapper's class says what they are.
     """
@@ -34,7 +35,9 @@ class EnvParams:
 
     if TYPE_CHECKING:  # chex adds it, and tells no type checker
 
-        def replace(self, **changes: Any) -> Self: ...
+        def replace(self, **changes: Any) -> Self:
+            """Return the parameters with some fields changed."""
+            ...
 
     def check(self) -> None:
         """Raise ValueError, naming the field, for values that no episode can be flown with.

@@ -32,7 +32,7 @@ class Plant(Protocol):
 
 
 class SimulatorState(NamedTuple):
-    """The drone, and what each effect of the model remembers."""
+    """The drone, and memories: what each effect of the model remembers, None for most."""
 
     drone: Drone
     memories: tuple[Any, ...]

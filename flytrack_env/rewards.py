@@ -12,7 +12,7 @@ from flytrack_env.state import Drone
 
 
 class Transition(NamedTuple):
-    """What the reward terms may look at.
+    """What the reward terms may look at; before, after: the drone before and after the step.
 
     gate_centre_w: centre of the gate that was flown to when the step began, m.
     num_passed: gates passed in this step. offset: how far off-centre, 0 at the centre, 1 at the edge
@@ -28,7 +28,10 @@ class Transition(NamedTuple):
 
 
 class RewardWeights(NamedTuple):
-    """Weight of each term; the names are those of the functions in ``TERMS``."""
+    """Weight of each term; the names are those of the functions in ``TERMS``, which say what they measure.
+
+    progress, gate_pass, off_centre, termination, body_rates, action_change.
+    """
 
     progress: Scalar = 0.2
     gate_pass: Scalar = 1.0
@@ -89,5 +92,5 @@ TERMS = (progress, gate_pass, off_centre, termination, body_rates, action_change
 
 
 def total_reward(transition: Transition, weights: RewardWeights) -> jax.Array:
-    """Return the weighted sum of all terms."""
+    """Return the weighted sum of all terms, a scalar."""
     return sum(getattr(weights, term.__name__) * term(transition) for term in TERMS)

@@ -85,7 +85,7 @@ def load_named_rollouts(
 ) -> dict[str, tuple[np.ndarray, np.ndarray]]:
     """Return rollouts by a short name: that of the file, after that of its folder where files are alike.
 
-    allow_pickle: see ``load_rollout``.
+    Each is states (T, 21) and actions (T, 4). allow_pickle: see ``load_rollout``.
 
     Raises:
         RolloutError: a file that is no rollout, or two files of the same names.

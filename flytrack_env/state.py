@@ -36,7 +36,7 @@ BATTERY_EMPTY_V = 22.0
 
 
 class Action(NamedTuple):
-    """Stick positions in [-1, 1]; thrust -1 is none and +1 is all there is."""
+    """Stick positions roll, pitch, yaw, thrust in [-1, 1]; thrust -1 is none and +1 is all there is."""
 
     roll: Scalar
     pitch: Scalar
@@ -45,7 +45,11 @@ class Action(NamedTuple):
 
 
 class Drone(NamedTuple):
-    """State of one drone, a scalar per leaf; frames and units as in the module's table."""
+    """State of one drone, a scalar per leaf.
+
+    pos_w, vel_w, acc_w: world, m, m/s, m/s^2. quat: body to world. rates_b: body, rad/s. applied: the lagged
+    action. battery_v: V.
+    """
 
     pos_w: Vec3
     vel_w: Vec3

@@ -25,17 +25,17 @@ class Causes(NamedTuple):
     battery_empty: jax.Array
 
     def any(self) -> jax.Array:
-        """Return whether the episode terminates."""
+        """Return whether the episode terminates, a bool scalar."""
         return self.crash | self.ground | self.out_of_bounds | self.missed_gate | self.battery_empty
 
 
 def is_below_ground(pos_w: Vec3, course: Course) -> jax.Array:
-    """Return whether a position is below the floor of the bounds."""
+    """Return whether a position is below the floor of the bounds, a bool scalar."""
     return jnp.asarray(pos_w.z < course.bounds_low.z)
 
 
 def is_out_of_bounds(pos_w: Vec3, course: Course) -> jax.Array:
-    """Return whether a position is beyond the walls or the ceiling, or is not a number."""
+    """Return whether a position is beyond the walls or the ceiling, or is not a number; a bool scalar."""
     low, high = course.bounds_low, course.bounds_high
     is_inside = (
         (pos_w.x >= low.x)
@@ -48,12 +48,15 @@ def is_out_of_bounds(pos_w: Vec3, course: Course) -> jax.Array:
 
 
 def is_battery_empty(drone: Drone) -> jax.Array:
-    """Return whether the battery is below its valid range."""
+    """Return whether the battery is below its valid range, a bool scalar."""
     return jnp.asarray(drone.battery_v < BATTERY_EMPTY_V)
 
 
 def find_causes(drone: Drone, course: Course, is_crash: jax.Array, is_missed: jax.Array) -> Causes:
-    """Return the causes of termination after a step."""
+    """Return the causes of termination after a step.
+
+    is_crash, is_missed: what the gate's crossing says, bool scalars.
+    """
     return Causes(
         crash=jnp.asarray(is_crash),
         ground=is_below_ground(drone.pos_w, course),

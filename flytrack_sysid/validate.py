@@ -27,6 +27,8 @@ NAMES = {
 class Validation(NamedTuple):
     """Errors of a model on the judged rows of a log.
 
+    num_rows, num_judged: rows of the log, and those that were judged. one_step: errors of single steps.
+    rollouts: of free flight, by its length. steps: answers to commanded steps.
     notes: what could not be judged and why, and what was assumed; sentences.
     thrust, open_force: None where the log cannot tell.
     """

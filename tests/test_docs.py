@@ -37,11 +37,3 @@ def test_examples_run(page: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     monkeypatch.chdir(tmp_path)  # pages may write files
     assert re.search(r"\S", code), f"{page}: no example"
     exec(compile("import gymnax\n" + code, page, "exec"), {})
-
-
-@pytest.mark.parametrize(
-    "path", [DOCS.parent / "README.md", *sorted(DOCS.glob("**/*.md"))], ids=lambda p: p.name
-)
-def test_links_lead_somewhere(path: Path) -> None:
-    for target in re.findall(r"\]\(([^)#]+)\)", path.read_text(encoding="utf-8")):
-        assert target.startswith("http") or (path.parent / target).exists(), target

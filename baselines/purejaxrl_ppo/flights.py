@@ -55,17 +55,20 @@ class Outcomes(NamedTuple):
         return np.asarray(self.laps) >= np.shape(self.lap_times_s)[-1]
 
     def first_laps_s(self) -> np.ndarray:
-        """Return the times of the first laps that were completed, from standstill, s."""
+        """Return the times of the first laps that were completed, from standstill, s, (number of these,)."""
         times = np.asarray(self.lap_times_s)[..., 0]
         return times[np.isfinite(times)]
 
     def flying_laps_s(self) -> np.ndarray:
-        """Return the times of all later laps that were completed, s."""
+        """Return the times of all later laps that were completed, s, (number of these,)."""
         times = np.asarray(self.lap_times_s)[..., 1:]
         return times[np.isfinite(times)]
 
     def ends(self) -> dict[str, np.ndarray]:
-        """Return which flights each cause ended before their laps were complete, and the time limit."""
+        """Return which flights each cause ended before their laps were complete, and the time limit.
+
+        Masks (num_flights,).
+        """
         is_complete = self.is_complete()
         causes = {name: np.asarray(cause) & ~is_complete for name, cause in self.causes._asdict().items()}
         is_ended = np.any(list(causes.values()), axis=0)

@@ -13,9 +13,10 @@ from baselines.purejaxrl_ppo.config import Config
 
 
 class ActorCritic(nn.Module):
-    """Policy and value of an observation; fields as in ``Config``.
+    """Policy and value of an observation.
 
-    num_choices: number of discrete actions; 0 for continuous ones.
+    hidden_sizes, initial_action, initial_std, min_std: as in ``Config``. num_choices: number of discrete
+    actions; 0 for continuous ones.
     """
 
     hidden_sizes: Sequence[int]
@@ -52,7 +53,7 @@ class ActorCritic(nn.Module):
         return distrax.MultivariateNormalDiag(mean, jnp.broadcast_to(std, mean.shape))
 
     def value(self, observation: jax.Array) -> jax.Array:
-        """Return the value."""
+        """Return the value, batch shape as the observation's."""
         return self.critic(observation).squeeze(-1)
 
     def __call__(self, observation: jax.Array) -> tuple[distrax.Distribution, jax.Array]:

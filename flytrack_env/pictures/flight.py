@@ -41,6 +41,7 @@ class Flight(NamedTuple):
     """One recorded flight at 100 Hz.
 
     name: of its pictures. states: (T, 21), the applied roll, pitch and yaw may be NaN. commands: (T, 4).
+    track: that was flown. race: gates and laps, followed through the positions.
     distances_m: flown until each state, (T,). meetings: in order. ended: why, in words.
     """
 

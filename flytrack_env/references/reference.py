@@ -37,9 +37,10 @@ class ReferenceFileError(ValueError):
 class Reference:
     """A time-optimal flight, sampled at the simulator's step.
 
-    track, model_name: names. kind: "flying", a lap from the last gate's plane to itself, periodic but for
-    the battery; or "standing", from rest at the start pose through every gate once. model: what it was
-    found with. dt_s: s. time_s: to the last gate's plane, s; for "flying" the lap time.
+    track, model_name: names. track_sha256: what tells the track from another of its name. kind: "flying", a
+    lap from the last gate's plane to itself, periodic but for the battery; or "standing", from rest at the
+    start pose through every gate once. model: what it was found with. dt_s: s. time_s: to the last gate's
+    plane, s; for "flying" the lap time.
     states: (N + 1, 21) and commands: (N, 4), float64, laid out as ``flytrack_env.state`` says; each command
     is held over its step, and the last gate is passed in the last step. gate_times_s: (num_gates,), s from
     the first state. found: how it was found, JSON values (solver, status, seconds, versions, command).

@@ -20,7 +20,9 @@ LENGTH_SAMPLES = 1000
 
 
 class GateFrame(NamedTuple):
-    """Flight frame of one gate: centre and axes in the world, half edges in m.
+    """Flight frame of one gate: centre, m, and the axes forward (x) and up (z) in the world; half edges, m.
+
+    half_opening, half_frame: of the inner and the outer square.
 
     The leaves are scalars, or arrays of shape (num_gates,) for the gates of a course.
     """
@@ -41,7 +43,11 @@ class GateFrame(NamedTuple):
 
 
 class Course(NamedTuple):
-    """What the environment needs of a track; a pytree of arrays, so that courses can be batched."""
+    """What the environment needs of a track; a pytree of arrays, so that courses can be batched.
+
+    gates: leaves (num_gates,), in flying order. start_pos_w: m. start_quat: body to world. bounds_low,
+    bounds_high: m.
+    """
 
     gates: GateFrame
     start_pos_w: Vec3
@@ -72,7 +78,7 @@ class Course(NamedTuple):
         return compute_once(jax.tree.map(select, self.gates))
 
     def next_index(self, index: jax.Array) -> jax.Array:
-        """Return the index of the gate after this one, laps repeating."""
+        """Return the index of the gate after this one, laps repeating; a scalar, as the index is."""
         return jnp.where(index + 1 >= self.num_gates, 0, index + 1)
 
 

@@ -31,8 +31,8 @@ class TrackError(ValueError):
 class Gate:
     """One square gate; position in m, quaternion (w, x, y, z) gate to world, edges in m.
 
-    direction: +1 if flown towards the gate's local +y, -1 if towards -y.
-    opening: inner edge. frame: outer edge.
+    id: a number for people, any but another gate's. direction: +1 if flown towards the gate's local +y, -1 if
+    towards -y. opening: inner edge. frame: outer edge.
     """
 
     id: int
@@ -45,7 +45,11 @@ class Gate:
 
 @dataclasses.dataclass(frozen=True)
 class Track:
-    """A course: gates in flying order (laps repeat), start pose and bounds; SI units, world frame."""
+    """A course: gates in flying order (laps repeat), start pose and bounds; SI units, world frame.
+
+    name: as in its file. start_position: m. start_quaternion: (w, x, y, z), body to world. bounds_low,
+    bounds_high: corners of the box that must not be left, m; the ground is the lower one's z.
+    """
 
     name: str
     gates: tuple[Gate, ...]
