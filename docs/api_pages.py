@@ -58,8 +58,10 @@ GROUPS = {
             "baselines.purejaxrl_ppo.evaluate",
             "baselines.purejaxrl_ppo.flights",
             "baselines.purejaxrl_ppo.training",
+            "baselines.purejaxrl_ppo.flown_env",
         ),
     ),
+    "loop": Group("The loop", ("flytrack_loop", "flytrack_loop.report")),
 }
 # Of modules without a list of their own (``__all__``), where not all that has no underscore is for users.
 ONLY = {"flytrack_sysid.diagnosis.plan": ("advise",)}

@@ -35,9 +35,11 @@ class Settings(NamedTuple):
 
 
 class Loop(NamedTuple):
-    """What came of the loop on a plant; ``diagnosis`` is of ``race_log``, beside the excitation.
+    """What came of the loop on a plant.
 
-    before, after: policies of the minimal and of the extended model. after is before where nothing was named.
+    before, after: policies of the minimal and of the extended model; where nothing was named, after is before.
+    diagnosis: of race_log, flights of the first policy, together with the excitation. held_out: other
+    flights of it, which nothing was learnt from.
     """
 
     before: Stage

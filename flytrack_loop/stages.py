@@ -31,7 +31,10 @@ class Errors(NamedTuple):
 
 
 class Gap(NamedTuple):
-    """The same policy in the simulator that it learnt in and on the plant, from the same noisy starts."""
+    """The same policy in the simulator that it learnt in and on the plant, from the same noisy starts.
+
+    simulator, plant: the race there.
+    """
 
     simulator: Score
     plant: Score
@@ -43,7 +46,11 @@ class Gap(NamedTuple):
 
 
 class Stage(NamedTuple):
-    """A model, the policy that was trained on it, the errors of one and the race of the other."""
+    """A model and the policy that was trained on it.
+
+    name: of the stage, and of the training's folder. checkpoint: of the policy. gap: its race. errors: of the
+    model, None where there was no log to judge it by.
+    """
 
     name: str
     model: ModelParameters

@@ -16,7 +16,7 @@ import pytest
 from docs.api_pages import GROUPS, api_pages, documented_names, public_names
 
 ROOT = Path(__file__).parent.parent
-PACKAGES = ("flytrack_env", "flytrack_sysid", "baselines")
+PACKAGES = ("flytrack_env", "flytrack_sysid", "flytrack_loop", "baselines")
 MODULES = [module for group in GROUPS.values() for module in group.modules]
 PAGES = api_pages()
 # Recorded results belong to these files by a hash of their bytes (benchmarks/diagnosis.py). They say in

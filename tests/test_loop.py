@@ -17,6 +17,7 @@ from benchmarks.loop.page import (
     does_matter,
     is_reached,
     model_table,
+    names_not_there,
     race_table,
     verdict,
     where_it_does_not_help,
@@ -167,3 +168,9 @@ def test_tables_and_chart_show_every_plant():
     assert race_table(results).count("\n") == model_table(results).count("\n") == 4
     assert "| 0 | yes | 10.0% (100.0%), 3.840 s, -4.00 % | 100.0%" in race_table(results)
     assert draw_chart(results, POLICIES).startswith(b"\x89PNG")
+
+
+def test_names_that_are_not_in_the_plant_are_told():
+    one = result((0.1, 4.0), (1.0, 0.2), causes=("wind", "linear_drag", "tau_roll"))
+    assert names_not_there(one | {"hidden": "linear_drag(d_x 0.4) + thrust_scale(factor 0.9)"}) == ["wind"]
+    assert names_not_there(one | {"hidden": "the shipped black box"}) == []

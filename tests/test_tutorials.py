@@ -77,3 +77,13 @@ def test_flight_log_is_diagnosed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     assert set(causes) == {"linear_drag", "thrust_curve"}
     drag = load_model(tmp_path / "diagnosis" / "extended_model.json").effect("linear_drag")
     assert drag == pytest.approx((0.4, 0.4, 0.2), rel=0.05)
+
+
+@pytest.mark.slow
+def test_better_policy(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    names = run("tutorials/better_policy.md", tmp_path, monkeypatch)
+    loop, errors = names["loop"], names["errors_of"](names["found"].extended, names["loop"].held_out)
+    assert errors.position_m["0.5"] < loop.before.errors.position_m["0.5"]
+    assert loop.after.errors.position_m["0.5"] < loop.before.errors.position_m["0.5"]
+    files = {path.name for path in (tmp_path / "loop").iterdir()}
+    assert {"loop.json", "comparison_top.png", "after_plant.npy", "race.npz", "history"} <= files

@@ -2,11 +2,13 @@
 
 import argparse
 import math
+import re
 from pathlib import Path
 from typing import Any
 
 from benchmarks.env_speed import cpu_name, versions
 from benchmarks.loop.chart import draw_chart
+from flytrack_env.effects import BY_NAME as ALL_EFFECTS
 from flytrack_env.files import write_atomically
 
 POLICIES = {
@@ -128,6 +130,12 @@ def verdict(results: list[dict[str, Any]]) -> tuple[str, bool]:
     return text + (f"; not on {', '.join(lost)}." if lost else "."), len(reached) >= AIM_SHARE * len(matter)
 
 
+def names_not_there(result: dict[str, Any]) -> list[str]:
+    """Return the effects that were named on a hidden plant and are not in it."""
+    hidden = re.findall(r"(\w+)\(", result["hidden"])
+    return [name for name in result["causes"] if name in ALL_EFFECTS and hidden and name not in hidden]
+
+
 PAGE = """# The loop: does the diagnosis make better policies?
 
 `python -m benchmarks.loop --plants {plants} --seed {seed} --steps {steps}`. Every policy: {millions:g} M
@@ -152,6 +160,9 @@ refitted base / extended. Velocity and attitude: error of one step over the meas
 noise in it. Free flight: median error of position. Log: how long the flights lasted that were diagnosed.
 
 {models}
+Effects that were named and are not in the plant: {strangers}. Base parameters (`tau_roll`, `thrust_curve`, ...) are
+not counted: the minimal model had bent them.
+
 ## Where the extension does not help
 
 {useless}
@@ -169,6 +180,7 @@ def write_page(
     chart = path.with_suffix(".png")
     write_atomically(chart, draw_chart(results, POLICIES))
     useless = [(result["job"], why) for result in results if (why := where_it_does_not_help(result))]
+    strangers = [(result["job"], names) for result in results if (names := names_not_there(result))]
     page = PAGE.format(
         plants=arguments.plants,
         seed=arguments.seed,
@@ -179,6 +191,7 @@ def write_page(
         race=race_table(results),
         models=model_table(results),
         useless="".join(f"- {job}: {why}.\n" for job, why in useless) or "On none of these plants.\n",
+        strangers="; ".join(f"plant {job}: {', '.join(names)}" for job, names in strangers) or "none",
         wall_min=wall_s / 60.0,
         cpu_min=sum(result["cpu_s"] for result in results) / 60.0,
         machine=f"{cpu_name()}; {', '.join(f'{name} {number}' for name, number in versions().items())}",
