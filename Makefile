@@ -8,7 +8,7 @@ CLIENTS := .venv-clients
 CLIENTS_STAMP := $(CLIENTS)/.locked
 CHECK_PYTHON = $(PYTHON) -c 'import sys; v = sys.version_info; sys.exit(v < (3, 11) and f"Python 3.11 or newer is needed, found {v.major}.{v.minor}; try PYTHON=python3.11")'
 
-.PHONY: setup demo test test-clients lint lock clean
+.PHONY: setup demo test test-clients lint lock dist check-wheel check-versions clean
 
 setup: $(STAMP)
 
@@ -49,6 +49,22 @@ lock:
 	$(BIN)/python -m pip install --quiet uv
 	$(BIN)/uv pip compile --quiet --universal --python-version 3.11 --generate-hashes --no-annotate \
 		--no-header --extra train --extra sysid --extra viz --extra dev --output-file requirements.lock pyproject.toml
+
+# These need uv in the environment; they build environments of their own.
+dist check-wheel check-versions: setup
+	$(BIN)/python -m pip install --quiet uv
+
+# dist/: the source distribution, and the wheel built from it.
+dist:
+	$(BIN)/uv build --quiet --clear --out-dir dist .
+
+# Installs the wheel with each extra alone and uses it; runs the fast tests from the source distribution.
+check-wheel:
+	$(BIN)/python -m release.check_wheel
+
+# Rewrites docs/results/versions.md: the fast tests with the newest and the oldest versions that are allowed.
+check-versions:
+	$(BIN)/python -m release.versions
 
 clean:
 	rm -rf $(VENV) $(CLIENTS) build dist *.egg-info

@@ -15,8 +15,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-import eval_agent
 from benchmarks.optimal.replay import Replay, replay
+from blackbox.acro_step_runtime import DEFAULT_PATH as SHIPPED_BLACK_BOX
 from flytrack_env import FlyTrack, ModelParameters, Track, available_tracks, blackbox, load_model, load_track
 from flytrack_env import nominal_parameters as nominal
 from flytrack_env.dynamics import SECONDS_PER_MINUTE, step
@@ -183,7 +183,7 @@ def main() -> None:
     parser.add_argument("--name", help="of the model in file names; default: that of its file")
     parser.add_argument("--battery-v", type=float, default=BATTERY_FULL_V, help="at the start")
     parser.add_argument("--verify", action="store_true", help="find nothing, fly what is there")
-    parser.add_argument("--black-box", type=Path, default=eval_agent.SHIPPED_BLACK_BOX)
+    parser.add_argument("--black-box", type=Path, default=SHIPPED_BLACK_BOX)
     parser.add_argument("--out", type=Path, default=FOLDER, help="folder of the references")
     parser.add_argument("--page", type=Path, help=f"write a page and pictures, such as {PAGE}")
     arguments = parser.parse_args()
