@@ -3,6 +3,7 @@
 import json
 import subprocess
 import sys
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
@@ -12,7 +13,7 @@ import pytest
 
 import demo
 import eval_agent
-from baselines.purejaxrl_ppo import Config, load_checkpoint
+from baselines.purejaxrl_ppo import Config, load_checkpoint, train_ppo
 from baselines.purejaxrl_ppo.density import count_positions, draw_position_density
 from baselines.purejaxrl_ppo.train_ppo import train_policy
 from benchmarks.champion import CHAMPION
@@ -32,6 +33,16 @@ def checkpoint_path(tmp_path_factory):
 
 def run(*arguments: str) -> subprocess.CompletedProcess:
     return subprocess.run([sys.executable, *arguments], cwd=ROOT, capture_output=True, text=True, timeout=300)
+
+
+def refused(main: Callable[[], None], monkeypatch, capsys, *arguments: str) -> str:
+    """Call a command, which must end with status 2 and no other error; return what it says of it."""
+    monkeypatch.chdir(ROOT)
+    monkeypatch.setattr(sys, "argv", ["command", *arguments])
+    with pytest.raises(SystemExit) as stopped:
+        main()
+    assert stopped.value.code == 2
+    return capsys.readouterr().err
 
 
 def test_eval_agent_writes_the_rollout(checkpoint_path, tmp_path):
@@ -56,11 +67,10 @@ def test_eval_agent_writes_the_rollout(checkpoint_path, tmp_path):
         (["--checkpoint", "CHECKPOINT", "--steps", "5", "--black-box", "no.bin"], "no.bin"),
     ],
 )
-def test_eval_agent_refuses(checkpoint_path, tmp_path, arguments, message):
+def test_eval_agent_refuses(checkpoint_path, tmp_path, monkeypatch, capsys, arguments, message):
     arguments = [str(checkpoint_path) if a == "CHECKPOINT" else a for a in arguments]
     out = tmp_path / "rollout.npy"
-    done = run("eval_agent.py", *arguments, "--out", str(out))
-    assert done.returncode == 2 and message in done.stderr and "Traceback" not in done.stderr
+    assert message in refused(eval_agent.main, monkeypatch, capsys, *arguments, "--out", str(out))
     assert not out.exists()
 
 
@@ -77,10 +87,23 @@ def test_eval_agent_refuses(checkpoint_path, tmp_path, arguments, message):
         (["--seed", "99999999999999"], "--seed"),
     ],
 )
-def test_training_refuses_before_any_work(tmp_path, arguments, message):
+def test_training_refuses_before_any_work(tmp_path, monkeypatch, capsys, arguments, message):
     out = tmp_path / "out"
-    done = run("-m", "baselines.purejaxrl_ppo.train_ppo", *arguments, "--out", str(out))
-    assert done.returncode == 2 and message in done.stderr and "Traceback" not in done.stderr
+    assert message in refused(train_ppo.main, monkeypatch, capsys, *arguments, "--out", str(out))
+    assert not out.exists()
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        ["-m", "baselines.purejaxrl_ppo.train_ppo", "--track", "nowhere"],
+        ["eval_agent.py", "--checkpoint", "nowhere.msgpack", "--steps", "5"],
+    ],
+)
+def test_a_refusal_is_one_message_in_a_shell(tmp_path, command):
+    out = tmp_path / "out"
+    done = run(*command, "--out", str(out))
+    assert done.returncode == 2 and "nowhere" in done.stderr and "Traceback" not in done.stderr
     assert not out.exists()
 
 
