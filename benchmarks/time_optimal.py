@@ -16,7 +16,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from benchmarks.optimal.replay import Replay, replay
-from blackbox.acro_step_runtime import DEFAULT_PATH as SHIPPED_BLACK_BOX
 from flytrack_env import FlyTrack, ModelParameters, Track, available_tracks, blackbox, load_model, load_track
 from flytrack_env import nominal_parameters as nominal
 from flytrack_env.dynamics import SECONDS_PER_MINUTE, step
@@ -42,6 +41,7 @@ from flytrack_env.state import (
 )
 
 PAGE = Path("docs/results/time_optimal.md")
+SHIPPED_BLACK_BOX = Path(__file__).parents[1] / "blackbox" / "acro_step.bin"
 NOMINAL, BLACK_BOX = "nominal", "black_box"
 LATEST_S = 1e-3  # s, how far from the optimum the replay's time may be
 
