@@ -106,11 +106,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         with tempfile.TemporaryDirectory(prefix="flytrack_versions_") as name:
             checkout = copy_checkout(Path(name) / "checkout")
-            rows = [try_row(python, which, checkout, Path(name)) for python, which in wanted]
+            rows: list[Row] = []
+            for python, which in wanted:
+                rows.append(try_row(python, which, checkout, Path(name)))
+                write_atomically(options.page, as_markdown(rows).encode())
     except ReleaseError as error:
         print(f"release: {error}", file=sys.stderr)
         return 1
-    write_atomically(options.page, as_markdown(rows).encode())
     print(as_markdown(rows))
     return 0 if all(row.is_good for row in rows) else 1
 
