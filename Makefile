@@ -67,4 +67,4 @@ check-versions:
 	$(BIN)/python -m release.versions
 
 clean:
-	rm -rf $(VENV) $(CLIENTS) build dist *.egg-info
+	rm -rf $(VENV) $(CLIENTS) .jax_cache build dist *.egg-info
