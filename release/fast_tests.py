@@ -31,5 +31,4 @@ FAST_TESTS = (
     # Identification.
     "tests/test_collect.py::test_log_is_what_the_plant_did",
     "tests/test_fit.py::test_truth_is_found_without_noise",
-    "tests/test_validate.py::test_truth_has_no_error",
 )
