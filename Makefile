@@ -11,7 +11,7 @@ DOCS := .venv-docs
 DOCS_STAMP := $(DOCS)/.locked
 CHECK_PYTHON = $(PYTHON) -c 'import sys; v = sys.version_info; sys.exit(v < (3, 11) and f"Python 3.11 or newer is needed, found {v.major}.{v.minor}; try PYTHON=python3.11")'
 
-.PHONY: setup demo loop test test-clients docs lint lock clean
+.PHONY: setup demo loop test test-clients docs lint lock dist check-wheel check-versions clean
 
 setup: $(STAMP)
 
@@ -71,5 +71,21 @@ lock:
 		| $(BIN)/uv pip compile --quiet --universal --python-version 3.11 --generate-hashes --no-annotate \
 		--no-header --output-file docs/requirements.lock -
 
+# These need uv in the environment; they build environments of their own.
+dist check-wheel check-versions: setup
+	$(BIN)/python -m pip install --quiet uv
+
+# dist/: the source distribution, and the wheel built from it.
+dist:
+	$(BIN)/uv build --quiet --clear --out-dir dist .
+
+# Installs the wheel with each extra alone and uses it; runs the fast tests from the source distribution.
+check-wheel:
+	$(BIN)/python -m release.check_wheel
+
+# Rewrites docs/results/versions.md: the fast tests with the newest and the oldest versions that are allowed.
+check-versions:
+	$(BIN)/python -m release.versions
+
 clean:
-	rm -rf $(VENV) $(CLIENTS) $(DOCS) site build dist *.egg-info
+	rm -rf $(VENV) $(CLIENTS) $(DOCS) .jax_cache site build dist *.egg-info

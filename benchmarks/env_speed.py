@@ -102,6 +102,9 @@ def jax_contestant(name: str, env_id: str, num_envs: int, length: int, is_batch:
 
 def l2f_contestant(name: str, num_envs: int, length: int) -> Contestant:
     """Return ``length`` full steps of l2f: dynamics, reward, termination, reset, observation."""
+    from flytrack_env.extras import check_installed
+
+    check_installed("bench", "comparisons with l2f", "l2f")
     import l2f
     import numpy as np
 

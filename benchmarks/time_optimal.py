@@ -15,7 +15,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-import eval_agent
 from benchmarks.optimal.replay import Replay, replay
 from flytrack_env import FlyTrack, ModelParameters, Track, available_tracks, blackbox, load_model, load_track
 from flytrack_env import nominal_parameters as nominal
@@ -42,6 +41,7 @@ from flytrack_env.state import (
 )
 
 PAGE = Path("docs/results/time_optimal.md")
+SHIPPED_BLACK_BOX = Path(__file__).parents[1] / "blackbox" / "acro_step.bin"
 NOMINAL, BLACK_BOX = "nominal", "black_box"
 LATEST_S = 1e-3  # s, how far from the optimum the replay's time may be
 
@@ -183,7 +183,7 @@ def main() -> None:
     parser.add_argument("--name", help="of the model in file names; default: that of its file")
     parser.add_argument("--battery-v", type=float, default=BATTERY_FULL_V, help="at the start")
     parser.add_argument("--verify", action="store_true", help="find nothing, fly what is there")
-    parser.add_argument("--black-box", type=Path, default=eval_agent.SHIPPED_BLACK_BOX)
+    parser.add_argument("--black-box", type=Path, default=SHIPPED_BLACK_BOX)
     parser.add_argument("--out", type=Path, default=FOLDER, help="folder of the references")
     parser.add_argument("--page", type=Path, help=f"write a page and pictures, such as {PAGE}")
     arguments = parser.parse_args()

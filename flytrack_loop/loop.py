@@ -37,7 +37,7 @@ class Settings(NamedTuple):
 class Loop(NamedTuple):
     """What came of the loop on a plant.
 
-    before, after: policies of the minimal and of the extended model; where nothing was named, after is before.
+    before, after: policies of the minimal and of the extended model, the same where nothing was named.
     diagnosis: of race_log, flights of the first policy, together with the excitation. held_out: other
     flights of it, which nothing was learnt from.
     """

@@ -1,5 +1,9 @@
 """Identification of a plant: fly an excitation on it, fit a model, say how good it is and what is left."""
 
+from flytrack_env.extras import check_installed
+
+check_installed("sysid", "identification and diagnosis", "scipy", "matplotlib", "tqdm")
+
 from flytrack_sysid.collect import CollectError, collect
 from flytrack_sysid.diagnosis import Diagnosis, DiagnosisError, diagnose
 from flytrack_sysid.estimate import FitError

@@ -47,7 +47,7 @@ def _fly_plant(plant: Plant) -> Fly:
     model = nominal_parameters()  # part of the contract; a black box does not look at it
 
     def fly_one(start: jax.Array, command: jax.Array) -> jax.Array:
-        def step(state: Any, action: jax.Array) -> tuple:
+        def step(state: Any, action: jax.Array) -> tuple[Any, jax.Array]:
             return plant.step(state, unpack_action(action), DT_S, model), pack(plant.drone(state))
 
         last, states = jax.lax.scan(step, plant.reset(unpack(start), model), command)
@@ -87,6 +87,13 @@ def _fly_function(step: StepFunction, report: Report) -> Fly:
         return states
 
     return fly
+
+
+def _fly_any(plant: Plant | StepFunction, report: Report) -> Fly:
+    """Return a function that flies a plant, or one that calls a function of the state."""
+    known: Any = plant
+    is_plant = hasattr(plant, "reset") and hasattr(plant, "drone")
+    return _fly_plant(known) if is_plant else _fly_function(known, report)
 
 
 def find_hover(fly: Fly) -> float:
@@ -137,10 +144,9 @@ def collect(
     if seed < 0:
         raise CollectError(f"seed: found {seed}, expected 0 or more")
     rng = np.random.default_rng(seed)
-    is_plant = hasattr(plant, "reset") and hasattr(plant, "drone")
-    fly = _fly_plant(plant) if is_plant else _fly_function(plant, report)
+    fly = _fly_any(plant, report)
     if script is None:
-        hover = find_hover(_fly_plant(plant) if is_plant else _fly_function(plant, lambda done, total: None))
+        hover = find_hover(_fly_any(plant, lambda done, total: None))
         number = round(minutes * 60.0 / SECONDS_PER_FLIGHT)
         flown, heights = script_of(excitation.script(number, hover, rng)), HEIGHTS
     else:
@@ -148,7 +154,7 @@ def collect(
         flown, heights = script, SCRIPT_HEIGHTS
     log = log_of_states(_cut(*_states(fly, flown), heights), DT_S, "collected")
     if noise > 0.0:
-        log = measure(log, noise, nominal_parameters().g, rng)
+        log = measure(log, noise, float(nominal_parameters().g), rng)
     return log
 
 

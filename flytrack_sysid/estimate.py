@@ -53,7 +53,7 @@ class Estimate(NamedTuple):
     covariance: np.ndarray
     noise: dict[str, np.ndarray]
     measured: dict[str, np.ndarray]
-    count: int
+    count: int  # type: ignore[assignment]  # hides tuple.count
 
 
 @jax.jit
@@ -63,7 +63,7 @@ def _weighted(
     vector: jax.Array,
     like: ModelParameters,
     problem: Problem,
-    weights: dict,
+    weights: dict[str, jax.Array],
 ) -> jax.Array:
     """Return all residuals times their weights, flat, with ``values`` in these places of the vector."""
     found = residuals(from_vector(vector.at[where].set(values), like), problem)

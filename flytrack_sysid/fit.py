@@ -152,12 +152,13 @@ def _map_doubt(result: Estimate, log: FlightLog) -> MapDoubt | None:
     is_usual = volts.min() >= BATTERY_EMPTY_V - 1.0 and volts.max() <= BATTERY_FULL_V + 1.0
     low, high = (BATTERY_EMPTY_V, BATTERY_FULL_V) if is_usual else (volts.min(), volts.max())
     action, battery_v = np.meshgrid(np.linspace(-1, 1, BOX_ACTIONS), np.linspace(low, high, BOX_VOLTAGES))
-    units = np.eye(len(THRUST_COEFFS))
+    units: Any = np.eye(len(THRUST_COEFFS))
+    coeffs: Any = np.asarray(result.model.thrust_coeffs)
     terms = np.stack([np.asarray(collective_thrust(action, battery_v, unit)) for unit in units], axis=-1)
     terms = terms[..., [THRUST_COEFFS.index(result.free[index]) for index in where]]
     covariance = result.covariance[np.ix_(where, where)]
     half = TWO_SIDED_95 * np.sqrt(np.einsum("...i,ij,...j->...", terms, covariance, terms))
-    full = np.abs(collective_thrust(action, battery_v, np.asarray(result.model.thrust_coeffs))).max()
+    full = np.abs(collective_thrust(action, battery_v, coeffs)).max()
     worst = np.unravel_index(np.argmax(half), half.shape)
     width = float(half[worst])
     return MapDoubt(width, width / float(full), float(action[worst]), float(battery_v[worst]))

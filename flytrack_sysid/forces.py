@@ -46,7 +46,7 @@ class SpeedBin(NamedTuple):
 
     low: float
     high: float
-    count: int
+    count: int  # type: ignore[assignment]  # hides tuple.count
     rms: float
     rms_b: tuple[float, float, float]
     mean_against_velocity: float
@@ -107,7 +107,7 @@ def _from_velocity(
     modelled[:, 2] = mean(predicted_channel("f", prediction, model)[:, 2])
     measured = modelled.copy()
     measured[:, 2] += np.sum(axis_w * error_w, axis=1)
-    action, battery_v = prediction.after.applied.thrust, prediction.before.battery_v
+    action, battery_v = map(np.asarray, (prediction.after.applied.thrust, prediction.before.battery_v))
     return ForceSamples("v", measured, modelled, mean(action), mean(battery_v), rows)
 
 
@@ -131,8 +131,8 @@ def force_samples(
         source=source,
         measured_b=measured,
         modelled_b=predicted_channel("f", prediction, model)[here],
-        action=prediction.after.applied.thrust[here],
-        battery_v=prediction.before.battery_v[here],
+        action=np.asarray(prediction.after.applied.thrust)[here],
+        battery_v=np.asarray(prediction.before.battery_v)[here],
         rows=here,
     )
 

@@ -8,7 +8,7 @@ import csv
 import io
 import zipfile
 from array import array
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from functools import partial
 from itertools import islice
 from pathlib import Path
@@ -18,6 +18,9 @@ import numpy as np
 from flytrack_env.files import write_atomically
 from flytrack_sysid.log import CHANNELS, GAP_STEPS, FlightLog, LogError, usual_step
 from flytrack_sysid.log_table import Table, check_names, log_of_table
+
+Reader = Callable[[str, bytes], Table]
+Writer = Callable[[dict[str, np.ndarray]], bytes]
 
 LARGEST_BYTES = 512 * 2**20  # unpacked: all columns as float64 at 1 kHz for half an hour fit
 UNPACKED = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
@@ -241,15 +244,18 @@ def _write_npz(columns: dict[str, np.ndarray]) -> bytes:
 
 def _write_csv(columns: dict[str, np.ndarray]) -> bytes:
     """Return a CSV file with the shortest digits that give each float64 back."""
-    rows: Iterable[tuple] = zip(*(values.tolist() for values in columns.values()), strict=True)
+    rows: Iterable[tuple[float, ...]] = zip(*(values.tolist() for values in columns.values()), strict=True)
     lines = [",".join(columns), *(",".join(map(repr, row)) for row in rows)]
     return ("\n".join(lines) + "\n").encode()
 
 
-_FORMATS = {".npz": (_read_npz, _write_npz), ".csv": (_read_csv, _write_csv)}
+_FORMATS: dict[str, tuple[Reader, Writer]] = {
+    ".npz": (_read_npz, _write_npz),
+    ".csv": (_read_csv, _write_csv),
+}
 
 
-def _format_of(path: Path) -> tuple:
+def _format_of(path: Path) -> tuple[Reader, Writer]:
     """Return the reader and the writer of a file's format."""
     if path.suffix.lower() not in _FORMATS:
         raise LogError(f"{path}: found suffix {path.suffix!r}, expected {' or '.join(_FORMATS)}")

@@ -5,7 +5,7 @@ often: eight flights of 2.5 s. What each is for, and how to fly it on a real dro
 """
 
 from collections.abc import Callable, Iterable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -184,7 +184,8 @@ def hover_action(model: ModelParameters, voltages: tuple[float, float] = VOLTAGE
     less than matters to where a flight begins.
     """
     middle_v = 0.5 * sum(voltages)
-    thrust_n = np.asarray(collective_thrust(ACTIONS, middle_v, np.asarray(model.thrust_coeffs, float)))
+    coeffs: Any = np.asarray(model.thrust_coeffs, float)
+    thrust_n = np.asarray(collective_thrust(ACTIONS, middle_v, coeffs))
     above = thrust_n > float(model.m) * float(model.g)
     if not above.any() or above.all():
         return float(ACTIONS[-1] if not above.any() else ACTIONS[0])

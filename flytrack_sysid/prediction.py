@@ -162,7 +162,7 @@ def _step_from_every_row(
 ) -> tuple[Action, tuple[Any, ...], Drone]:
     """Return applied actions and memories before, and the drones after, the steps of all rows."""
 
-    def one(carry: Any, row: tuple) -> Any:
+    def one(carry: Any, row: tuple[Any, ...]) -> Any:
         measured, command, duration, is_start = row
         applied, memories = carry
         if has_applied:
@@ -183,7 +183,7 @@ def _is_settled(model: ModelParameters, filled: Filled, steps: Steps, has_memory
     """Return where applied action and memories no longer depend on what is not known of the past."""
     begins = filled.log.is_start()
     if "uprev" in filled.log:
-        is_known = np.ones(len(filled.log), bool)
+        is_known: Any = np.ones(len(filled.log), bool)
     else:
         tau = np.asarray(model.tau, float)
         doubt = applied_doubt(steps.duration, filled.command_doubt, begins, np.zeros_like(begins), tau)
@@ -219,8 +219,10 @@ def _fly(
 ) -> dict[str, Any]:
     """Return free flights: p, v, q, w after every step; leaves (num_steps, BATCH)."""
 
-    def one(carry: Any, row: tuple) -> Any:
-        drone, memories = jax.vmap(advance, in_axes=(0, 0, 0, 0, None))(*carry, *row, model)
+    def one(carry: Any, row: tuple[Any, ...]) -> Any:
+        (drone, memories), (command, duration) = carry, row
+        step_all = jax.vmap(advance, in_axes=(0, 0, 0, 0, None))
+        drone, memories = step_all(drone, memories, command, duration, model)
         seen = {"p": drone.pos_w, "v": drone.vel_w, "q": drone.quat, "w": drone.rates_b}
         return (drone, memories), seen
 

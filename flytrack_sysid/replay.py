@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from flytrack_env.dynamics import ModelParameters, advance, integrate_attitude, start_rates
 from flytrack_env.effects import start_memories
@@ -48,12 +49,12 @@ def drone_of(row: Record, applied: Action, rates_b: Vec3) -> Drone:
     )
 
 
-def chosen(condition: jax.Array, yes: Any, no: Any) -> Any:
+def chosen(condition: jax.Array | np.ndarray, yes: Any, no: Any) -> Any:
     """Return one of two trees, leaf by leaf."""
     return jax.tree.map(partial(jnp.where, condition), yes, no)
 
 
-def replay(model: ModelParameters, record: Record, turns_afresh: jax.Array) -> Replay:
+def replay(model: ModelParameters, record: Record, turns_afresh: jax.Array | np.ndarray) -> Replay:
     """Return what a model says of every row; differentiable in the model.
 
     turns_afresh: (num_rows,) bool, where the attitude is taken from the log again. In float64 where the
@@ -63,7 +64,9 @@ def replay(model: ModelParameters, record: Record, turns_afresh: jax.Array) -> R
     record = jax.tree.map(jnp.asarray, record)
     applied, rates_b, memories = _remembered(model, record)
 
-    def said_of_next(row: Record, applied: Action, rates_b: Vec3, memories: tuple) -> tuple:
+    def said_of_next(
+        row: Record, applied: Action, rates_b: Vec3, memories: tuple[Any, ...]
+    ) -> tuple[Any, ...]:
         drone = drone_of(row, applied, rates_b)
         after, _ = advance(drone, memories, Action(*row.command), row.step_s, model)
         force_w = after.acc_w + Vec3(0.0, 0.0, model.g)
@@ -79,17 +82,17 @@ def replay(model: ModelParameters, record: Record, turns_afresh: jax.Array) -> R
     def moved_on(values: jax.Array) -> jax.Array:  # said at a row, of the next one
         return jnp.concatenate([jnp.zeros_like(values[:1]), values[:-1]])
 
-    rates_b, force_b, acc_w = (moved_on(stacked(leaves)) for leaves in of_next[:3])
-    return Replay(stacked(applied), rates_b, force_b, acc_w, stacked(quat), moved_on(of_next[3]))
+    rates, force_b, acc_w = (moved_on(stacked(leaves)) for leaves in of_next[:3])
+    return Replay(stacked(applied), rates, force_b, acc_w, stacked(quat), moved_on(of_next[3]))
 
 
-def _remembered(model: ModelParameters, record: Record) -> tuple[Action, Vec3, tuple]:
+def _remembered(model: ModelParameters, record: Record) -> tuple[Action, Vec3, tuple[Any, ...]]:
     """Return the applied action, body rates and effects' memories at every row.
 
     Only these follow from the row before; the rest of a step is done for all rows at once.
     """
 
-    def next_row(carry: tuple, row: Record) -> tuple:
+    def next_row(carry: tuple[Any, ...], row: Record) -> tuple[Any, ...]:
         applied, rates_b, memories = carry
         applied = chosen(row.begins | row.is_applied_known, Action(*row.applied), applied)
         drone = drone_of(row, applied, rates_b)
@@ -104,10 +107,10 @@ def _remembered(model: ModelParameters, record: Record) -> tuple[Action, Vec3, t
     return jax.lax.scan(next_row, start, record)[1]
 
 
-def _turned(record: Record, rates_b: Vec3, is_fresh: jax.Array) -> Quaternion:
+def _turned(record: Record, rates_b: Vec3, is_fresh: jax.Array | np.ndarray) -> Quaternion:
     """Return the attitude that rates lead to at every row, from the measured one where it is fresh."""
 
-    def next_row(quat: Quaternion, inputs: tuple) -> tuple:
+    def next_row(quat: Quaternion, inputs: tuple[Any, ...]) -> tuple[Quaternion, Quaternion]:
         measured, rates_b, step_s, is_fresh = inputs
         quat = chosen(is_fresh, measured, quat)
         return integrate_attitude(quat, rates_b, step_s), quat

@@ -14,7 +14,7 @@ channel   residual                                                              
 Centring takes out what a window began with, which is measured with noise like the rest.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -105,7 +105,7 @@ def make_problem(log: FlightLog, record: Record, judged: np.ndarray, model: Mode
     return Problem(record, turns_afresh, channels)
 
 
-def _windows(record: Record, is_certain: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _windows(record: Record, is_certain: Any) -> tuple[np.ndarray, np.ndarray]:
     """Return windows, new ones also where doubt ends, and where they begin."""
     is_back = is_certain & ~np.append(True, is_certain[:-1])
     is_new = np.append(True, np.diff(record.piece) != 0) | record.begins | is_back
@@ -149,19 +149,20 @@ def _rotation_between(measured: jax.Array, said: jax.Array) -> jax.Array:
 def _raw(name: str, channel: Channel, said: Replay, record: Record) -> jax.Array:
     """Return measured minus said of one channel, before centring."""
     step_s = jnp.concatenate([jnp.zeros(1), record.step_s[:-1]])[:, None]  # of the step to the row
+    measured = jnp.asarray(channel.measured)
     if name == "w":
-        return channel.measured - said.rates_b
+        return measured - said.rates_b
     if name == "f":
-        return channel.measured - said.force_b
+        return measured - said.force_b
     if name == "q":
-        return _rotation_between(channel.measured, said.quat)
+        return _rotation_between(measured, said.quat)
     if name == "v_bat":
-        return channel.measured - jnp.cumsum(said.battery_change_v)[:, None]
+        return measured - jnp.cumsum(said.battery_change_v)[:, None]
     vel_change = jnp.cumsum(said.acc_w * step_s, axis=0)
     if name == "v":
-        return channel.measured - vel_change
+        return measured - vel_change
     moved = (vel_change - said.acc_w * step_s) * step_s + 0.5 * said.acc_w * step_s**2
-    return channel.measured - jnp.cumsum(moved, axis=0)
+    return measured - jnp.cumsum(moved, axis=0)
 
 
 def residuals(model: ModelParameters, problem: Problem) -> dict[str, jax.Array]:
@@ -173,8 +174,8 @@ def residuals(model: ModelParameters, problem: Problem) -> dict[str, jax.Array]:
     for name, channel in problem.channels.items():
         values, counts = _raw(name, channel, said, record), jnp.asarray(channel.counts)
         if name == "p":
-            values = _without_slope(values, time, counts, channel.window)
+            values = _without_slope(values, time, counts, jnp.asarray(channel.window))
         elif name in CENTRED:
-            values = _centred(values, counts, channel.window)
+            values = _centred(values, counts, jnp.asarray(channel.window))
         found[name] = values * counts
     return found

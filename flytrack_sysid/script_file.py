@@ -85,12 +85,12 @@ def _check_ranges(starts: np.ndarray, commands: np.ndarray, source: str) -> None
             found = sticks[tuple(bad[0])]
             raise ScriptError(f"{source}: {name}: found {found:g} in flight {bad[0][0]}, expected -1 to 1")
     norm = np.linalg.norm(starts[:, QUATERNION], axis=1)
-    bad = np.flatnonzero(np.abs(norm - 1.0) > LARGEST_NORM_ERROR)
-    if len(bad):
-        found = f"a quaternion of norm {norm[bad[0]]:.4g}"
-        raise ScriptError(f"{source}: starts: found {found} in flight {bad[0]}, expected 1")
-    bad = np.flatnonzero(~is_inside(starts, SCRIPT_HEIGHTS, ANY_VOLTAGE))
-    if len(bad):
+    flights = np.flatnonzero(np.abs(norm - 1.0) > LARGEST_NORM_ERROR)
+    if len(flights):
+        found = f"a quaternion of norm {norm[flights[0]]:.4g}"
+        raise ScriptError(f"{source}: starts: found {found} in flight {flights[0]}, expected 1")
+    flights = np.flatnonzero(~is_inside(starts, SCRIPT_HEIGHTS, ANY_VOLTAGE))
+    if len(flights):
         expected = (
             f"at most {LARGEST_SPEED:g} m/s, {SCRIPT_HEIGHTS[0]:g} to {SCRIPT_HEIGHTS[1]:g} m, a voltage"
         )

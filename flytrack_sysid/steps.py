@@ -108,7 +108,7 @@ def step_responses(
     shown = [(axis, *place) for axis in range(len(AXES)) for place in _clearest(log, prediction, rows, axis)]
     firsts = np.array([first for _, first, _, _ in shown], int)
     num_steps = max([longest_flight(prediction), *(end - first - 1 for _, first, _, end in shown)])
-    responses = []
+    responses: list[StepResponse] = []
     for batch, flown in free_flights(model, log, prediction, firsts, num_steps):
         for index in range(len(batch)):
             axis, first, step, end = shown[len(responses)]

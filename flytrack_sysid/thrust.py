@@ -42,7 +42,7 @@ class ThrustError(NamedTuple):
     source: str
     action_edges: np.ndarray
     voltage_edges: np.ndarray
-    count: np.ndarray
+    count: np.ndarray  # type: ignore[assignment]  # hides tuple.count
     mean_n: np.ndarray
     rms_n: np.ndarray
     curves: tuple[ThrustCurve, ...]
@@ -79,7 +79,7 @@ class ThrustError(NamedTuple):
 def _force_at_rest(action: jax.Array, battery_v: jax.Array, dt: Any, model: ModelParameters) -> jax.Array:
     """Return the specific force along body z of a drone at rest, all (num_points,), m/s^2."""
 
-    def one(action: jax.Array, battery_v: jax.Array) -> jax.Array:
+    def one(action: jax.Array, battery_v: jax.Array) -> Any:
         zero = jnp.zeros_like(action)
         still, upright = Vec3(zero, zero, zero), Quaternion(zero + 1.0, zero, zero, zero)
         command = Action(zero, zero, zero, action)

@@ -17,6 +17,9 @@ from flytrack_env.env import EnvParams, EnvState, FlyTrack
 from flytrack_env.quaternion import Quaternion, Scalar, Vec3
 from flytrack_env.state import Action, Drone
 from flytrack_env.tracks import Gate, Track
+from tests.compiled_programs import share_compiled_programs
+
+share_compiled_programs()
 
 MEMORY_MAPS, MOST_MEMORY_MAPS = Path("/proc/self/maps"), 25_000
 FACING_X = (0.5**0.5, 0.0, 0.0, -(0.5**0.5))  # yaw -90 degrees: the gate's local +y is world +x

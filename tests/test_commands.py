@@ -1,10 +1,14 @@
 """The commands a user types: training, evaluating, the demo; and what they refuse."""
 
+import contextlib
+import io
 import json
 import subprocess
 import sys
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
+from typing import NamedTuple
 
 import jax
 import numpy as np
@@ -12,9 +16,8 @@ import pytest
 
 import demo
 import eval_agent
-from baselines.purejaxrl_ppo import Config, load_checkpoint
+from baselines.purejaxrl_ppo import Config, load_checkpoint, train_ppo
 from baselines.purejaxrl_ppo.density import count_positions, draw_position_density
-from baselines.purejaxrl_ppo.train_ppo import train_policy
 from benchmarks.champion import CHAMPION
 from flytrack_env import blackbox, load_model, load_track
 from flytrack_env.rollout import load_rollout
@@ -22,16 +25,47 @@ from flytrack_env.rollout import load_rollout
 ROOT = Path(__file__).parent.parent
 
 
+class Demo(NamedTuple):
+    """A demo that ran: its folder and what it printed."""
+
+    out: Path
+    said: str
+
+
 @pytest.fixture(scope="module")
-def checkpoint_path(tmp_path_factory):
-    out = tmp_path_factory.mktemp("train")
-    config = Config(total_timesteps=4096, num_envs=64, num_steps=32, hidden_sizes=(16,))
-    train_policy(out, config, seed=0)
-    return out / "final.msgpack"
+def small_demo(tmp_path_factory):
+    """The whole demo, of a minute of flight, one update, few evaluation flights; run once for all tests."""
+    pytest.importorskip("rerun")
+    out = tmp_path_factory.mktemp("demo") / "demo"
+    arguments = ["demo.py", "--out", str(out), "--total-timesteps", str(Config().batch_size)]
+    said = io.StringIO()
+    with pytest.MonkeyPatch.context() as patched, contextlib.redirect_stdout(said):
+        patched.setattr(demo, "NUM_STEPS", 100)
+        patched.setattr(demo, "NUM_EPISODES", 4)
+        patched.setattr(demo, "collect", partial(demo.collect, minutes=1.0))
+        patched.setattr(sys, "argv", arguments)
+        demo.main()
+    return Demo(out, said.getvalue())
+
+
+@pytest.fixture(scope="module")
+def checkpoint_path(small_demo):
+    """A checkpoint as training writes it."""
+    return small_demo.out / "final.msgpack"
 
 
 def run(*arguments: str) -> subprocess.CompletedProcess:
     return subprocess.run([sys.executable, *arguments], cwd=ROOT, capture_output=True, text=True, timeout=300)
+
+
+def refused(main: Callable[[], None], monkeypatch, capsys, *arguments: str) -> str:
+    """Call a command, which must end with status 2 and no other error; return what it says of it."""
+    monkeypatch.chdir(ROOT)
+    monkeypatch.setattr(sys, "argv", ["command", *arguments])
+    with pytest.raises(SystemExit) as stopped:
+        main()
+    assert stopped.value.code == 2
+    return capsys.readouterr().err
 
 
 def test_eval_agent_writes_the_rollout(checkpoint_path, tmp_path):
@@ -56,11 +90,10 @@ def test_eval_agent_writes_the_rollout(checkpoint_path, tmp_path):
         (["--checkpoint", "CHECKPOINT", "--steps", "5", "--black-box", "no.bin"], "no.bin"),
     ],
 )
-def test_eval_agent_refuses(checkpoint_path, tmp_path, arguments, message):
+def test_eval_agent_refuses(checkpoint_path, tmp_path, monkeypatch, capsys, arguments, message):
     arguments = [str(checkpoint_path) if a == "CHECKPOINT" else a for a in arguments]
     out = tmp_path / "rollout.npy"
-    done = run("eval_agent.py", *arguments, "--out", str(out))
-    assert done.returncode == 2 and message in done.stderr and "Traceback" not in done.stderr
+    assert message in refused(eval_agent.main, monkeypatch, capsys, *arguments, "--out", str(out))
     assert not out.exists()
 
 
@@ -77,23 +110,28 @@ def test_eval_agent_refuses(checkpoint_path, tmp_path, arguments, message):
         (["--seed", "99999999999999"], "--seed"),
     ],
 )
-def test_training_refuses_before_any_work(tmp_path, arguments, message):
+def test_training_refuses_before_any_work(tmp_path, monkeypatch, capsys, arguments, message):
     out = tmp_path / "out"
-    done = run("-m", "baselines.purejaxrl_ppo.train_ppo", *arguments, "--out", str(out))
-    assert done.returncode == 2 and message in done.stderr and "Traceback" not in done.stderr
+    assert message in refused(train_ppo.main, monkeypatch, capsys, *arguments, "--out", str(out))
     assert not out.exists()
 
 
-def test_demo_writes_everything(tmp_path, monkeypatch, capsys):
-    pytest.importorskip("rerun")
-    out = tmp_path / "demo"
-    monkeypatch.setattr(demo, "NUM_STEPS", 100)
-    monkeypatch.setattr(demo, "NUM_EPISODES", 4)
-    monkeypatch.setattr(demo, "collect", partial(demo.collect, minutes=1.0))
-    monkeypatch.setattr(
-        sys, "argv", ["demo.py", "--out", str(out), "--total-timesteps", str(Config().batch_size)]
-    )
-    demo.main()
+@pytest.mark.parametrize(
+    "command",
+    [
+        ["-m", "baselines.purejaxrl_ppo.train_ppo", "--track", "nowhere"],
+        ["eval_agent.py", "--checkpoint", "nowhere.msgpack", "--steps", "5"],
+    ],
+)
+def test_a_refusal_is_one_message_in_a_shell(tmp_path, command):
+    out = tmp_path / "out"
+    done = run(*command, "--out", str(out))
+    assert done.returncode == 2 and "nowhere" in done.stderr and "Traceback" not in done.stderr
+    assert not out.exists()
+
+
+def test_demo_writes_everything(small_demo):
+    out = small_demo.out
     names = {"final.msgpack", "model.json", "position_density.png", "rollout.npy", "rollout.rrd"}
     names |= {"rollout_top.png", "rollout_side.png", "rollout_commands.png"}
     assert {path.name for path in out.iterdir()} == names | {"flight_log.npz", "summary.json"}
@@ -101,7 +139,7 @@ def test_demo_writes_everything(tmp_path, monkeypatch, capsys):
     assert summary["noisy_starts"]["episodes"] == 4
     assert set(summary["validation"]["minimal"]["one_step"]["channels"]) == {"p", "v", "q", "w", "a"}
     assert load_model(out / "model.json").tau.shape == (4,)
-    assert "noisy starts finish 3 laps" in capsys.readouterr().out
+    assert "noisy starts finish 3 laps" in small_demo.said
 
 
 def test_demo_refuses_before_any_work(tmp_path, monkeypatch, capsys):

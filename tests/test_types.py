@@ -7,6 +7,7 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
+PACKAGES = [name.rstrip("*") for name in PROJECT["tool"]["setuptools"]["packages"]["find"]["include"]]
 
 CONSUMER = """
 import flytrack_env
@@ -18,8 +19,13 @@ gates: int = flytrack_env.load_track("flytrack").gates
 def test_the_marker_of_types_is_shipped():
     """Without it a type checker takes everything that an installed package gives for Any."""
     shipped = PROJECT["tool"]["setuptools"]["package-data"]
-    assert "py.typed" in shipped["flytrack_env"]
-    assert (ROOT / "flytrack_env" / "py.typed").is_file()
+    for package in PACKAGES:
+        assert "py.typed" in shipped[package]
+        assert (ROOT / package / "py.typed").is_file()
+
+
+def test_every_package_of_the_wheel_is_checked():
+    assert set(PACKAGES) <= set(PROJECT["tool"]["mypy"]["packages"])
 
 
 @pytest.mark.slow

@@ -160,8 +160,8 @@ refitted base / extended. Velocity and attitude: error of one step over the meas
 noise in it. Free flight: median error of position. Log: how long the flights lasted that were diagnosed.
 
 {models}
-Effects that were named and are not in the plant: {strangers}. Base parameters (`tau_roll`, `thrust_curve`, ...) are
-not counted: the minimal model had bent them.
+Effects that were named and are not in the plant: {strangers}. Base parameters (`tau_roll`, `thrust_curve`, ...)
+are not counted: the minimal model had bent them.
 
 ## Where the extension does not help
 

@@ -10,6 +10,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING
 
+from flytrack_env.extras import check_installed
 from flytrack_env.files import write_atomically
 from flytrack_env.pictures.flight import COMPARISON, Flight, Meeting, make_flight, read_flights
 
@@ -37,12 +38,8 @@ def _module(name: str, needs: str) -> ModuleType:
     Raises:
         ImportError: that library is not installed; the message says how to install it.
     """
-    try:
-        importlib.import_module(needs)
-    except ImportError as error:
-        what = "videos" if needs == "moviepy" else "pictures"
-        install = f"pip install 'flytrack[{EXTRAS[needs]}]'"
-        raise ImportError(f"{what} of flights need {needs}, which cannot be imported: {install}") from error
+    what = "videos" if needs == "moviepy" else "pictures"
+    check_installed(EXTRAS[needs], f"{what} of flights", needs)
     return importlib.import_module(f"{__name__}.{name}")
 
 

@@ -6,6 +6,7 @@ compiled step, what a picture shows; ``FlightLog`` collects such rows; ``make_re
 
 from typing import TYPE_CHECKING
 
+from flytrack_env.extras import check_installed
 from flytrack_env.rendering.scene import SCENE_SIZE, FlightLog, scene_row
 from flytrack_env.tracks import Course
 
@@ -15,8 +16,6 @@ if TYPE_CHECKING:
 
 __all__ = ["SCENE_SIZE", "FlightLog", "make_renderer", "open_window", "scene_row"]
 
-INSTALL = "pip install 'flytrack[render]'"
-
 
 def make_renderer(course: Course) -> "Renderer":
     """Return what draws flights on a course.
@@ -24,10 +23,9 @@ def make_renderer(course: Course) -> "Renderer":
     Raises:
         ImportError: Pillow is not installed; the message says how to install it.
     """
-    try:
-        from flytrack_env.rendering.renderer import Renderer
-    except ImportError as error:
-        raise ImportError(f"pictures need Pillow, which cannot be imported: {INSTALL}") from error
+    check_installed("render", "pictures", "PIL")
+    from flytrack_env.rendering.renderer import Renderer
+
     return Renderer(course)
 
 
@@ -37,9 +35,7 @@ def open_window(step_s: float) -> "Window":
     Raises:
         ImportError: pygame is not installed; the message says how to install it.
     """
+    check_installed("render", "windows", "pygame")
     from flytrack_env.rendering.window import Window
 
-    try:
-        return Window(step_s)
-    except ImportError as error:
-        raise ImportError(f"windows need pygame, which cannot be imported: {INSTALL}") from error
+    return Window(step_s)

@@ -27,12 +27,9 @@ Of several flights the first has these; others have ``world/flights/NAME/drone``
 ``plots/flights/NAME/speed`` and so on, and ``events/flights/NAME``.
 """
 
-try:
-    import rerun  # noqa: F401
-except ImportError as error:
-    raise ImportError(
-        "recordings need rerun-sdk, which is not installed: pip install 'flytrack[viz]'"
-    ) from error
+from flytrack_env.extras import check_installed
+
+check_installed("viz", "recordings", "rerun")
 
 from flytrack_env.viz_rerun.flights import ShownFlight
 from flytrack_env.viz_rerun.recording import visualize_state_action_sequence, write_recording

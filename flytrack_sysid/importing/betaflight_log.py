@@ -95,7 +95,7 @@ def _flight(path: Path, number: int, num_logs: int, mapping: Mapping) -> Flight:
     table = Table(source, {name: values[is_used] for name, values in columns.items()})
     log = log_of_table(table._replace(columns=_channels(table, headers, craft)))
     dropped = np.count_nonzero(~is_used)
-    notes = (f"{source}: {revision}, {len(frames)} frames",)
+    notes: tuple[str, ...] = (f"{source}: {revision}, {len(frames)} frames",)
     if dropped:
         notes += (f"{source}: {dropped} frames left out: their time was not later than those before",)
     return Flight(log, craft, notes)
@@ -105,7 +105,7 @@ def _channels(table: Table, headers: dict[str, Any], craft: Craft) -> dict[str, 
     """Return the columns of the log."""
     is_fine = _header(table.source, headers, "blackbox_high_resolution", 1, [0])[0] > 0
     per_unit = 1.0 / FINE if is_fine else 1.0  # deg/s
-    full = np.array([*craft.max_rate_deg_s, FULL_THROTTLE])
+    full = np.array([*(craft.max_rate_deg_s or ()), FULL_THROTTLE])
     units = np.array([per_unit, per_unit, per_unit, 1.0])
     commands = table.matrix(STICKS) * units / full
     commands[:, 3] = 2.0 * commands[:, 3] - 1.0
@@ -135,14 +135,14 @@ def _header(
     source: str, headers: dict[str, Any], name: str, size: int, default: list[float] | None = None
 ) -> list[float]:
     """Return some numbers of the header, 0 or more, or the default where the header has none."""
-    value = headers.get(name, default)
+    value: Any = headers.get(name, default)
     values = value if isinstance(value, list) else [value]
     if len(values) != size or not all(isinstance(one, (int, float)) and one >= 0 for one in values):
         raise LogError(f"{source}: header {name}: found {value!r}, expected {size} numbers of at least 0")
     return [float(one) for one in values]
 
 
-def _full_stick(source: str, headers: dict[str, Any]) -> tuple[float, ...]:
+def _full_stick(source: str, headers: dict[str, Any]) -> tuple[float, float, float]:
     """Return the rates at full stick of roll, pitch, yaw, deg/s."""
     if "rc_rates" not in headers:
         hint = "a mapping can state craft.max_rate_deg_s"
@@ -151,10 +151,11 @@ def _full_stick(source: str, headers: dict[str, Any]) -> tuple[float, ...]:
     if number >= len(RATES_TYPES):
         raise LogError(f"{source}: header rates_type: found {number}, expected below {len(RATES_TYPES)}")
     settings = [_header(source, headers, name, 3) for name in ("rc_rates", "rates", "rate_limits")]
-    rates = tuple(full_stick_rate(RATES_TYPES[number], *axis) for axis in zip(*settings, strict=True))
+    axes = zip(*settings, strict=True)
+    roll, pitch, yaw = rates = tuple(full_stick_rate(RATES_TYPES[number], *axis) for axis in axes)
     if min(rates) <= 0.0:
         raise LogError(f"{source}: headers rc_rates, rates, rate_limits: found full stick at {rates} deg/s")
-    return rates
+    return roll, pitch, yaw
 
 
 def _split(path: Path) -> list[bytes]:

@@ -1,6 +1,6 @@
 """What a log or its mapping states of the craft, and the nominal model that follows from it."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -45,18 +45,19 @@ def nominal_model(craft: Craft, source: str) -> ModelParameters:
     Raises:
         LogError: full-stick rates, mass or voltage are unknown.
     """
-    for name, value in craft._asdict().items():
-        if value is None:
-            raise LogError(
-                f"{source}: craft.{name}: not in the log, and no mapping states it; a model needs it"
-            )
+    if craft.max_rate_deg_s is None or craft.mass_kg is None or craft.voltage_v is None:
+        name = next(name for name, value in craft._asdict().items() if value is None)
+        raise LogError(f"{source}: craft.{name}: not in the log, and no mapping states it; a model needs it")
     nominal = nominal_parameters()
     per_volt = NOMINAL_FULL_V / craft.voltage_v[1]
     coeffs = np.asarray(nominal.thrust_coeffs, float) * craft.mass_kg / float(nominal.m)
     coeffs[VOLTAGE_TERMS:] *= per_volt
+    leaves: dict[str, Any] = {  # of NumPy
+        "thrust_coeffs": coeffs.astype(np.float32),
+        "max_rate": np.asarray(craft.max_rate_deg_s, np.float32),
+    }
     return nominal._replace(
-        thrust_coeffs=coeffs.astype(np.float32),
-        max_rate=np.asarray(craft.max_rate_deg_s, np.float32),
+        **leaves,
         m=craft.mass_kg,
         battery_drain_v_per_min=float(nominal.battery_drain_v_per_min) / per_volt,
     )

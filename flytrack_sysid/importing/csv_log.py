@@ -6,6 +6,7 @@ import io
 import math
 import zlib
 from array import array
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -87,7 +88,7 @@ def _read(path: Path, columns: Columns, mapping: str) -> Table:
     return Table(str(path), dict(zip(wanted, matrix.T.copy(), strict=True)), np.array(lines))
 
 
-def _number(path: Path, lines: array, column: str, cell: str) -> float:
+def _number(path: Path, lines: Sequence[int], column: str, cell: str) -> float:
     place = f"{path}: row {len(lines) - 1} (line {lines[-1]}), column {column}"
     try:
         value = float(cell)
@@ -103,7 +104,8 @@ def _time(table: Table, columns: Columns) -> np.ndarray:
     """Return time from 0 on, s: large numbers of us would cost digits."""
     time = columns.time
     if time.column is None:
-        return np.arange(len(table.lines)) * time.scale
+        num_rows = len(next(iter(table.columns.values())))
+        return np.arange(num_rows) * time.scale
     values = table.columns[time.column]
     return (values - values[0]) * time.scale
 

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from flytrack_sysid.importing.craft import Craft
-from flytrack_sysid.importing.mapping import Mapping, Rows
+from flytrack_sysid.importing.mapping import Manifest, Mapping
 from flytrack_sysid.log import FlightLog, LogError
 
 
@@ -26,7 +26,7 @@ def used_rows(path: Path, log: FlightLog, mapping: Mapping) -> FlightLog:
         LogError: none are left, or the manifest does not say how many.
     """
     rows = mapping.rows
-    count = rows.count if rows.manifest is None else _count_of(path, rows)
+    count = rows.count if rows.manifest is None else _count_of(path, rows.manifest)
     since_start = log.time - log.time[:1]
     is_used = since_start >= rows.from_s
     if rows.to_s is not None:
@@ -40,24 +40,24 @@ def used_rows(path: Path, log: FlightLog, mapping: Mapping) -> FlightLog:
     return log.select(is_used)
 
 
-def _count_of(path: Path, rows: Rows) -> int:
+def _count_of(path: Path, said: Manifest) -> int:
     """Return how many rows of a file the manifest beside it says to use."""
-    manifest = path.parent / rows.manifest.file
+    manifest = path.parent / said.file
     try:
         with manifest.open(encoding="utf-8-sig", newline="") as file:
             table = csv.DictReader(file, strict=True)
             entries, names = list(table), table.fieldnames or []
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise LogError(f"{manifest}: cannot be read as a manifest: {error}") from error
-    for name in (rows.manifest.key, rows.manifest.count):
+    for name in (said.key, said.count):
         if name not in names:
             raise LogError(f"{manifest}: column {name}: missing; found {', '.join(names)}")
     for entry in entries:
-        if entry[rows.manifest.key] == path.name:
-            text = entry[rows.manifest.count]
+        if entry[said.key] == path.name:
+            text = entry[said.count]
             if not (text or "").strip().isdecimal():
                 raise LogError(
-                    f"{manifest}: {path.name}: {rows.manifest.count}: found {text!r}, expected a whole number"
+                    f"{manifest}: {path.name}: {said.count}: found {text!r}, expected a whole number"
                 )
             return int(text)
-    raise LogError(f"{manifest}: column {rows.manifest.key}: {path.name}: missing")
+    raise LogError(f"{manifest}: column {said.key}: {path.name}: missing")

@@ -100,15 +100,15 @@ def import_log(
     Raises:
         LogError: what cannot be read or meant; the message names file and field, found and expected.
     """
-    paths = [Path(path) for path in ([paths] if isinstance(paths, (str, Path)) else paths)]
+    files = [Path(path) for path in ([paths] if isinstance(paths, (str, Path)) else paths)]
     if format not in READERS:
         raise LogError(f"format: found {format!r}, expected one of {', '.join(FORMATS)}")
-    if not paths:
+    if not files:
         raise LogError("found no files to import, expected at least one")
     if not isinstance(mapping, Mapping):
         mapping = Mapping() if mapping is None else load_mapping(mapping)
     flights, sources = [], []
-    for path in paths:
+    for path in files:
         for flight in READERS[format](path, mapping):
             flights.append(flight._replace(log=used_rows(path, flight.log, mapping)))
             sources.append(flight.log.source)

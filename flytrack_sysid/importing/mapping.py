@@ -71,7 +71,7 @@ class Manifest(NamedTuple):
 
     file: str
     key: str
-    count: str
+    count: str  # type: ignore[assignment]  # hides tuple.count
 
 
 class Rows(NamedTuple):
@@ -81,7 +81,7 @@ class Rows(NamedTuple):
     """
 
     first: int = 0
-    count: int | None = None
+    count: int | None = None  # type: ignore[assignment]  # hides tuple.count
     every: int = 1
     from_s: float = 0.0
     to_s: float | None = None
@@ -170,9 +170,9 @@ def _craft(fields: Fields | None) -> Craft:
 
 def _columns(top: Fields) -> Columns:
     time, command = top.table("time"), top.table("command")
-    for name, fields in (("time", time), ("command", command)):
-        if fields is None:
-            raise top.error(name, "missing, expected a table: every log has it")
+    if time is None or command is None:
+        name = "time" if time is None else "command"
+        raise top.error(name, "missing, expected a table: every log has it")
     tables = {name: top.table(name) for name in VECTORS}
     attitude, battery = top.table("attitude"), top.table("battery")
     delimiter = top.text("delimiter", ",")

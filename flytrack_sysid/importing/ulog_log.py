@@ -196,7 +196,7 @@ def _commands(setpoints: np.ndarray, craft: Craft) -> np.ndarray:
     return np.column_stack([rates, 2.0 * np.abs(setpoints[:, 3]) - 1.0])
 
 
-def _full_stick(path: Path, parameters: dict[str, Any]) -> tuple[float, ...]:
+def _full_stick(path: Path, parameters: dict[str, Any]) -> tuple[float, float, float]:
     """Return the rates of roll, pitch and yaw that a command of 1 means, deg/s."""
     rates = []
     for names in RATE_PARAMETERS:
@@ -207,4 +207,5 @@ def _full_stick(path: Path, parameters: dict[str, Any]) -> tuple[float, ...]:
                 f"{path}: parameter {' or '.join(names)}: missing, so full stick is unknown; {hint}"
             )
         rates.append(max(known))
-    return tuple(rates)
+    roll, pitch, yaw = rates
+    return roll, pitch, yaw
