@@ -148,6 +148,7 @@ def test_what_matters_and_what_is_reached():
 def test_the_verdict_counts_plants_that_matter():
     text, is_met = verdict([HELPED, HARMLESS, LOST])
     assert "**1 of 2**" in text and "not on lost" in text and not is_met
+    assert "On all 3: at least 90.0% and a lap gap of at most 0.20 %" in text
     assert verdict([HELPED, HARMLESS])[1]
     assert verdict([HELPED] * 9 + [SLOW])[1] and not verdict([HELPED] * 8 + [SLOW])[1]
 
@@ -159,6 +160,9 @@ def test_it_is_said_where_the_extension_does_not_help():
         where_it_does_not_help(result((0.1, 4.0), (1.0, 0.2), base=(1.0, 0.1)))
         == "the refitted base is as good"
     )
+    slower = result((1.0, 0.5), (1.0, 0.1))
+    slower["stages"][0]["plant"]["flying_lap_s"] = 4.2  # as near its own simulator, and slower than after
+    assert where_it_does_not_help(slower) is None
     assert where_it_does_not_help(result((0.9, 0.0), (0.5, 0.0))) == "success falls from 90.0% to 50.0%"
     assert where_it_does_not_help(result((0.9, 0.0), (0.9, 0.0), causes=())) == "nothing was named"
 

@@ -4,6 +4,7 @@ import argparse
 import math
 import re
 from pathlib import Path
+from statistics import median
 from typing import Any
 
 from benchmarks.env_speed import cpu_name, versions
@@ -21,7 +22,7 @@ POLICIES = {
 # Of the policy of the minimal model: where its race holds this, the effect does not matter.
 MATTERS_BELOW, MATTERS_ABOVE_PERCENT = 0.80, 3.0
 AIM_SUCCESS, AIM_GAP_PERCENT, AIM_SHARE = 0.95, 1.0, 0.9
-LITTLE = 0.01  # of success: less is chance, of 256 flights
+LITTLE = 0.01  # of success, where less is chance of 256 flights, and of a lap
 
 
 def stage(result: dict[str, Any], name: str) -> dict[str, Any]:
@@ -33,6 +34,12 @@ def gap_percent(one: dict[str, Any]) -> float:
     """Return the size of a stage's lap gap, %; infinite where the plant saw no lap."""
     gap = one["lap_gap_percent"]
     return math.inf if gap is None else abs(gap)
+
+
+def lap_s(one: dict[str, Any]) -> float:
+    """Return a stage's flying lap on the plant, s; infinite where there was none."""
+    value = one["plant"]["flying_lap_s"]
+    return math.inf if value is None else value
 
 
 def does_matter(result: dict[str, Any]) -> bool:
@@ -57,7 +64,8 @@ def where_it_does_not_help(result: dict[str, Any]) -> str | None:
     reasons = []
     for name, one in (("the minimal model", before), ("the refitted base", base)):
         is_as_safe = one["plant"]["success"] >= after["plant"]["success"] - LITTLE
-        if is_as_safe and gap_percent(one) <= max(gap_percent(after), AIM_GAP_PERCENT):
+        is_as_near = gap_percent(one) <= max(gap_percent(after), AIM_GAP_PERCENT)
+        if is_as_safe and is_as_near and lap_s(one) <= (1.0 + LITTLE) * lap_s(after):
             reasons.append(f"{name} is as good")
     return "; ".join(reasons) or None
 
@@ -127,7 +135,26 @@ def verdict(results: list[dict[str, Any]]) -> tuple[str, bool]:
         f"policy of the extended model reaches at least {AIM_SUCCESS:.0%} with a lap gap of at most "
         f"{AIM_GAP_PERCENT:g} % (aim: 9 of 10)"
     )
-    return text + (f"; not on {', '.join(lost)}." if lost else "."), len(reached) >= AIM_SHARE * len(matter)
+    text += f"; not on {', '.join(lost)}." if lost else "."
+    return text + of_all(results), len(reached) >= AIM_SHARE * len(matter)
+
+
+def of_all(results: list[dict[str, Any]]) -> str:
+    """Return a sentence on all plants, whether what is hidden matters or not."""
+    if not results:
+        return ""
+    pairs = [(stage(result, "before"), stage(result, "after")) for result in results]
+    lowest = min(after["plant"]["success"] for _, after in pairs)
+    widest = max(gap_percent(after) for _, after in pairs)
+    shares = [lap_s(after) / lap_s(before) for before, after in pairs if math.isfinite(lap_s(before))]
+    text = f" On all {len(results)}: at least {lowest:.1%} and a lap gap of at most {widest:.2f} %"
+    if shares:
+        text += (
+            f"; where both fly laps, its flying lap is {100.0 * (1.0 - median(shares)):.1f} % shorter than "
+            f"that of the minimal model's policy (median; {100.0 * (1.0 - max(shares)):+.1f} % to "
+            f"{100.0 * (1.0 - min(shares)):+.1f} %)"
+        )
+    return f"{text}."
 
 
 def names_not_there(result: dict[str, Any]) -> list[str]:
@@ -160,8 +187,9 @@ refitted base / extended. Velocity and attitude: error of one step over the meas
 noise in it. Free flight: median error of position. Log: how long the flights lasted that were diagnosed.
 
 {models}
-Effects that were named and are not in the plant: {strangers}. Base parameters (`tau_roll`, `thrust_curve`, ...)
-are not counted: the minimal model had bent them.
+Effects that were named and are not in the plant: {strangers}. Base parameters (`tau_roll`, `thrust_curve`)
+are not counted: the minimal model had bent them. The attitude of these logs is noisy (0.5 degrees), and the
+diagnosis takes it as true; small names that are not there come of that.
 
 ## Where the extension does not help
 
