@@ -65,9 +65,10 @@ def main() -> None:
     parser.add_argument("--black-box", type=Path, default=eval_agent.SHIPPED_BLACK_BOX)
     parser.add_argument("--out", type=Path, default=Path("runs/learning"))
     parser.add_argument("--total-timesteps", type=float, default=Config.total_timesteps)
+    parser.add_argument("--gate-margin", type=float, default=Config.gate_margin, help="m; of the recipe")
     parser.add_argument("--table", type=Path, default=Path("docs/results/learning.md"))
     arguments = parser.parse_args()
-    config = Config(total_timesteps=int(arguments.total_timesteps))
+    config = Config(total_timesteps=int(arguments.total_timesteps), gate_margin=arguments.gate_margin)
     config.check()
     out = fresh_folder(arguments.out)
     identify(arguments.black_box, out, seed=0)
@@ -81,8 +82,9 @@ def main() -> None:
     text = (
         "# Learning: from black box to race\n\n"
         f"`python -m benchmarks.learning --seeds {arguments.seeds} "
-        f"--total-timesteps {config.total_timesteps:g}` on {cpu_name()}, "
-        f"{len(os.sched_getaffinity(0))} cores, jax {jax.__version__}. CPU seconds include compilation. "
+        f"--total-timesteps {config.total_timesteps:g} --gate-margin {config.gate_margin:g}` on "
+        f"{cpu_name()}, {len(os.sched_getaffinity(0))} cores, jax {jax.__version__}. CPU seconds include "
+        "compilation. "
         f"{NUM_EPISODES} noisy starts, {NUM_LAPS} laps; training seeds with at least {TARGET_SUCCESS:.0%}: "
         f"**{reached} of {len(successes)}**. Margin: by how much thicker, to every side, the drone could be "
         f"for {TARGET_SUCCESS:.0%} still to finish "

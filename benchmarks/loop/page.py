@@ -194,8 +194,7 @@ diagnosis takes it as true; small names that are not there come of that.
 ## Where the extension does not help
 
 {useless}
-Wall time of this run: {wall_min:.1f} min (jobs that were done before are not done again); {cpu_min:.1f} CPU
-min on plants. {machine}.
+{cpu_min:.1f} CPU min on these plants. {machine}.
 """
 
 
@@ -220,10 +219,9 @@ def write_page(
         models=model_table(results),
         useless="".join(f"- {job}: {why}.\n" for job, why in useless) or "On none of these plants.\n",
         strangers="; ".join(f"plant {job}: {', '.join(names)}" for job, names in strangers) or "none",
-        wall_min=wall_s / 60.0,
         cpu_min=sum(result["cpu_s"] for result in results) / 60.0,
         machine=f"{cpu_name()}; {', '.join(f'{name} {number}' for name, number in versions().items())}",
     )
     write_atomically(path, page.encode())
-    print(f"written: {path}, {chart}")
+    print(f"written: {path}, {chart}; {wall_s / 60.0:.1f} min, without jobs that were done before")
     return is_met
