@@ -11,7 +11,7 @@ DOCS := .venv-docs
 DOCS_STAMP := $(DOCS)/.locked
 CHECK_PYTHON = $(PYTHON) -c 'import sys; v = sys.version_info; sys.exit(v < (3, 11) and f"Python 3.11 or newer is needed, found {v.major}.{v.minor}; try PYTHON=python3.11")'
 
-.PHONY: setup demo loop test test-clients docs lint lock dist check-wheel check-versions clean
+.PHONY: setup demo loop test test-clients docs lint lock uv dist check-wheel check-versions clean
 
 setup: $(STAMP)
 
@@ -63,28 +63,27 @@ lint: setup
 	$(BIN)/mypy
 
 # Rewrites the lock file from pyproject.toml, for every supported Python; needs uv in the environment.
-lock:
-	$(BIN)/python -m pip install --quiet uv
+lock: uv
 	$(BIN)/uv pip compile --quiet --universal --python-version 3.11 --generate-hashes --no-annotate \
 		--no-header --extra train --extra sysid --extra viz --extra dev --output-file requirements.lock pyproject.toml
 	$(BIN)/python -c 'import tomllib; print("\n".join(tomllib.load(open("pyproject.toml", "rb"))["project"]["optional-dependencies"]["docs"]))' \
 		| $(BIN)/uv pip compile --quiet --universal --python-version 3.11 --generate-hashes --no-annotate \
 		--no-header --output-file docs/requirements.lock -
 
-# These need uv in the environment; they build environments of their own.
-dist check-wheel check-versions: setup
+# The next three need it; they build environments of their own.
+uv: setup
 	$(BIN)/python -m pip install --quiet uv
 
 # dist/: the source distribution, and the wheel built from it.
-dist:
+dist: uv
 	$(BIN)/uv build --quiet --clear --out-dir dist .
 
 # Installs the wheel with each extra alone and uses it; runs the fast tests from the source distribution.
-check-wheel:
+check-wheel: uv
 	$(BIN)/python -m release.check_wheel
 
 # Rewrites docs/results/versions.md: the fast tests with the newest and the oldest versions that are allowed.
-check-versions:
+check-versions: uv
 	$(BIN)/python -m release.versions
 
 clean:
