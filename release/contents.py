@@ -8,7 +8,7 @@ from pathlib import Path, PurePosixPath
 from release.environments import ReleaseError, find_uv, must
 
 ROOT = Path(__file__).parents[1]
-PACKAGES = ("baselines", "flytrack_env", "flytrack_sysid")
+PACKAGES = ("baselines", "flytrack_env", "flytrack_loop", "flytrack_sysid")
 FOR_GIT = (".gitignore", ".ci/run")  # tracked, and of no use without a clone
 MADE = ("PKG-INFO", "setup.cfg")  # by setuptools; besides flytrack.egg-info
 ABOUT_A_WHEEL = ("METADATA", "RECORD", "WHEEL", "entry_points.txt", "top_level.txt", "licenses/LICENSE")

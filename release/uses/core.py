@@ -20,7 +20,7 @@ import numpy as np
 import flytrack_env
 from flytrack_env import pictures
 
-PACKAGES = ("flytrack_env", "flytrack_sysid", "baselines")
+PACKAGES = ("flytrack_env", "flytrack_sysid", "flytrack_loop", "baselines")
 # Their modules are imported by functions of their package, which ask for the extra themselves (``ASKED``).
 ON_DEMAND = ("flytrack_env.pictures.", "flytrack_env.rendering.")
 SITE = Path(flytrack_env.__file__).parents[1]
