@@ -95,7 +95,7 @@ def _check_ranges(starts: np.ndarray, commands: np.ndarray, source: str) -> None
             f"at most {LARGEST_SPEED:g} m/s, {SCRIPT_HEIGHTS[0]:g} to {SCRIPT_HEIGHTS[1]:g} m, a voltage"
         )
         raise ScriptError(
-            f"{source}: starts: found flight {bad[0]} outside of the envelope, expected {expected}"
+            f"{source}: starts: found flight {flights[0]} outside of the envelope, expected {expected}"
         )
 
 
