@@ -1,6 +1,9 @@
 """The loop's parts: the log of a policy's flights, the gap, what the page says of results."""
 
+import argparse
 import math
+import queue
+import subprocess
 
 import numpy as np
 import pytest
@@ -10,8 +13,10 @@ from baselines.purejaxrl_ppo.evaluate import fly_many
 from baselines.purejaxrl_ppo.flights import Score
 from baselines.purejaxrl_ppo.flown_env import plant_env
 from benchmarks.champion import CHAMPION
+from benchmarks.loop.__main__ import LOG, run_job
 from benchmarks.loop.chart import draw_chart
 from benchmarks.loop.draws import HIDDEN, draw_plant
+from benchmarks.loop.one import RESULT
 from benchmarks.loop.page import (
     POLICIES,
     does_matter,
@@ -178,3 +183,21 @@ def test_names_that_are_not_in_the_plant_are_told():
     one = result((0.1, 4.0), (1.0, 0.2), causes=("wind", "linear_drag", "tau_roll"))
     assert names_not_there(one | {"hidden": "linear_drag(d_x 0.4) + thrust_scale(factor 0.9)"}) == ["wind"]
     assert names_not_there(one | {"hidden": "the shipped black box"}) == []
+
+
+def test_a_job_that_was_cut_off_begins_anew_and_a_done_one_stays(tmp_path, monkeypatch):
+    calls = []
+
+    def run(command, **_):
+        calls.append(command[3])
+        assert not (tmp_path / command[3] / "before").exists()
+        (tmp_path / command[3] / RESULT).write_text('{"job": "0"}')
+        return subprocess.CompletedProcess(command, 0)
+
+    monkeypatch.setattr(subprocess, "run", run)
+    (tmp_path / "0" / "before").mkdir(parents=True)
+    (tmp_path / "0" / LOG).touch()
+    cores, arguments = queue.Queue(), argparse.Namespace(out=tmp_path, seed=0, steps=1)
+    cores.put(0)
+    assert run_job("0", cores, arguments) == run_job("0", cores, arguments) == {"job": "0"}
+    assert calls == ["0"] and cores.qsize() == 1

@@ -10,6 +10,7 @@ import argparse
 import json
 import os
 import queue
+import shutil
 import subprocess
 import sys
 import time
@@ -24,23 +25,27 @@ from benchmarks.flown import ROOT
 from benchmarks.loop.one import RESULT, SHARED
 from benchmarks.loop.page import write_page
 
+LOG = "log.txt"
+
 
 def run_job(job: str, cores: "queue.Queue[int]", arguments: argparse.Namespace) -> dict[str, Any] | None:
     """Run a job on a free core and return its result; None where it failed, and its log says why."""
     folder = arguments.out / job
-    folder.mkdir(parents=True, exist_ok=True)
     if not (folder / RESULT).exists():
+        if (folder / LOG).exists():  # a job that was cut off: its trainings would be refused as another run's
+            shutil.rmtree(folder)
+        folder.mkdir(parents=True, exist_ok=True)
         core = cores.get()
         flags = ["--core", core, "--seed", arguments.seed, "--steps", arguments.steps]
         command = [sys.executable, "-m", "benchmarks.loop.one", job, arguments.out.resolve(), *flags]
         try:
-            with (folder / "log.txt").open("wb") as log:
+            with (folder / LOG).open("wb") as log:
                 done = subprocess.run([*map(str, command)], cwd=ROOT, stdout=log, stderr=subprocess.STDOUT)
         finally:
             cores.put(core)
         if done.returncode:
-            tail = (folder / "log.txt").read_text(errors="replace").splitlines()[-1:]
-            tqdm.write(f"{job}: failed, {folder / 'log.txt'}: {''.join(tail)}")
+            tail = (folder / LOG).read_text(errors="replace").splitlines()[-1:]
+            tqdm.write(f"{job}: failed, {folder / LOG}: {''.join(tail)}")
             return None
     return json.loads((folder / RESULT).read_text())
 
