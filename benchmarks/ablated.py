@@ -6,25 +6,33 @@ import jax
 import jax.numpy as jnp
 
 from flytrack_env.episodes import EpisodicEnvironment
-from flytrack_env.observations import Entry
+from flytrack_env.observations import BATTERY_MIDDLE_V, OBSERVATION, Entry
 from flytrack_env.params import EnvParams
 from flytrack_env.state import Action, Drone
 from flytrack_env.wrappers import Wrapper
 
-# Of the world frame: the course spans 25 m and 35 m, and speeds and directions are as in the gate's frame.
+GATE_FRAME = {entry.key: entry for entry in OBSERVATION}
+
+
+def _in_world(key: str) -> Entry:
+    """Return an entry of the observation, as it is called in the world's frame."""
+    entry = GATE_FRAME[key]
+    return entry._replace(name=entry.name.replace("body to gate", "body to world"), frame="world")
+
+
+# The course spans 25 m and 35 m, hence the scale of the position; all else is scaled as in the gate's frame.
 WORLD = (
     Entry("position", "position", 3, "world", "m", 10.0, 10.0),
-    Entry("velocity", "velocity", 3, "world", "m/s", 5.0, 12.0),
-    Entry("attitude", "rotation matrix body to world, row by row", 9, "world", "1", 1.0, 1.0),
-    Entry("rates", "angular velocity", 3, "body", "rad/s", 5.0, 3.0),
-    Entry("applied", "previous applied action: roll, pitch, yaw, thrust", 4, "body", "1", 1.0, 1.0),
-    Entry("battery", "battery voltage above 23 V", 1, "-", "V", 1.0, 1.0),
+    _in_world("velocity"),
+    _in_world("attitude"),
+    GATE_FRAME["rates"],
+    GATE_FRAME["applied"],
+    GATE_FRAME["battery"],
     Entry("gate", "gate's centre relative to the drone", 3, "world", "m", 3.0, 30.0),
     Entry("direction", "gate's direction of flight", 3, "world", "1", 1.0, 1.0),
-    Entry("next_gate", "next gate's centre relative to the gate's centre", 3, "world", "m", 5.0, 20.0),
-    Entry("next_direction", "next gate's direction of flight", 3, "world", "1", 1.0, 1.0),
+    _in_world("next_gate"),
+    _in_world("next_direction"),
 )
-BATTERY_MIDDLE_V = 23.0
 
 
 class Shown(NamedTuple):

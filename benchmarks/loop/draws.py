@@ -12,9 +12,9 @@ from flytrack_env import nominal_parameters
 
 LAG_SPREAD, THRUST_SPREAD = 0.2, 0.05  # |ln factor| of the lags, and of the thrust map, at most
 LARGE = 2.0 / 3.0  # of the way from the smallest size to the largest, on a log scale: the least that is drawn
-# What the first plants have: one effect of the three that every drone has, or so many; later ones have LATER.
+# What the first plants have: one effect of the three that every drone has, or a number of drawn ones.
 HIDDEN = (("command_delay",), ("quadratic_drag",), ("thrust_scale",), 2, 3)
-LATER = 3
+LATER = 3  # effects of every plant after these, drawn
 
 
 def _size(name: str, rng: np.random.Generator) -> float:
