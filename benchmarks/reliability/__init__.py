@@ -1,1 +1,1 @@
-"""What FlyTrack withstands, measured: ``python -m benchmarks.reliability`` writes docs/results/reliability.md."""
+"""What FlyTrack withstands, measured: ``python -m benchmarks.reliability``."""

@@ -1,7 +1,8 @@
 """Measures parts of the reliability page: ``python -m benchmarks.reliability PART ... [--share 1]``.
 
-Each part's figures are kept in ``reliability_<part>.json`` beside the page, which is written of all that there
-are. ``--share 0.01`` measures a hundredth of everything, to try it out. Ends with 1 where a promise was broken.
+Each part's figures are kept in ``reliability_<part>.json`` beside the page, which is written of all that
+there are. ``--share 0.01`` measures a hundredth of everything, to try it out. Ends with 1 where a promise
+was broken.
 """
 
 import argparse
@@ -72,12 +73,13 @@ def main() -> None:
         )
     broken = []
     for name in arguments.parts:
-        result = measure(by_name[name], arguments.seed, arguments.share)
-        write_atomically(
-            path_of(arguments.out, by_name[name]), (json.dumps(result, indent=2) + "\n").encode()
-        )
-        print(by_name[name].as_markdown(result))
-        broken += [] if by_name[name].is_held(result) else [name]
+        section = by_name[name]
+        result = measure(section, arguments.seed, arguments.share)
+        content = json.dumps(result, indent=2) + "
+"
+        write_atomically(path_of(arguments.out, section), content.encode())
+        print(section.as_markdown(result))
+        broken += [] if section.is_held(result) else [name]
     write_page(arguments.out)
     if broken:
         raise SystemExit(f"promises broken: {', '.join(broken)}")
