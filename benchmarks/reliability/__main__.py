@@ -59,24 +59,20 @@ def main() -> None:
     """Measure the parts that are named, write their figures and the page."""
     parser = argparse.ArgumentParser(description=__doc__)
     by_name = {section.name: section for section in SECTIONS}
-    parser.add_argument(
-        "parts", nargs="*", metavar="PART", help=f"of {', '.join(by_name)}; none: only the page"
-    )
+    names = ", ".join(by_name)
+    parser.add_argument("parts", nargs="*", metavar="PART", help=f"of {names}; none: only the page")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--share", type=float, default=1.0, help="of the full measurement (default: 1)")
     parser.add_argument("--out", type=Path, default=RESULTS, help="folder of the page (default: %(default)s)")
     arguments = parser.parse_args()
     unknown = [name for name in arguments.parts if name not in by_name]
     if unknown or not 0.0 < arguments.share <= 1.0:
-        parser.error(
-            f"found {unknown or arguments.share}, expected parts of {list(by_name)}, a share in (0, 1]"
-        )
+        parser.error(f"found {unknown or arguments.share}, expected parts of {names}, a share in (0, 1]")
     broken = []
     for name in arguments.parts:
         section = by_name[name]
         result = measure(section, arguments.seed, arguments.share)
-        content = json.dumps(result, indent=2) + "
-"
+        content = json.dumps(result, indent=2) + "\n"
         write_atomically(path_of(arguments.out, section), content.encode())
         print(section.as_markdown(result))
         broken += [] if section.is_held(result) else [name]
