@@ -5,6 +5,8 @@ import dataclasses
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from jax.sharding import Mesh
+
 from baselines.purejaxrl_ppo.checkpoint import Checkpoint
 from baselines.purejaxrl_ppo.config import Config, settings_of
 from baselines.purejaxrl_ppo.options import INTERVALS, Options, read_options
@@ -127,7 +129,7 @@ def check_plans(trainer: Trainer, plans: list[Plan]) -> None:
             check_same_run(plan.resume, plan.checkpoint, trainer.describe(plan.seed))
 
 
-def make_trainer(arguments: argparse.Namespace, base: Checkpoint | None) -> Trainer:
+def make_trainer(arguments: argparse.Namespace, base: Checkpoint | None, mesh: Mesh | None = None) -> Trainer:
     """Return the trainer of a command line; what it does not say is as in the checkpoint, if there is one."""
     asked = settings_of(arguments)
     if base is None:
@@ -136,7 +138,7 @@ def make_trainer(arguments: argparse.Namespace, base: Checkpoint | None) -> Trai
             "model": arguments.model,
             "reward": dict(arguments.reward or ()),
         }
-        return Trainer(Config(**asked), arguments.env_id or DEFAULT_ENV_ID, **env_arguments)
+        return Trainer(Config(**asked), arguments.env_id or DEFAULT_ENV_ID, mesh, **env_arguments)
     env_arguments = {
         "track": arguments.track or base.track,
         "model": arguments.model or model_from_json(base.meta["model"], "checkpoint: model"),
@@ -144,7 +146,7 @@ def make_trainer(arguments: argparse.Namespace, base: Checkpoint | None) -> Trai
         "reward": {**reward_of(base), **dict(arguments.reward or ())},
     }
     config = dataclasses.replace(base.config, **asked)
-    return Trainer(config, arguments.env_id or base.env_id, **env_arguments)
+    return Trainer(config, arguments.env_id or base.env_id, mesh, **env_arguments)
 
 
 def reward_of(checkpoint: Checkpoint) -> dict[str, float]:

@@ -37,9 +37,12 @@ MUST_FIT = ("env_id", "seed", "missed_gate", "config", "observation", "track_dat
 logger = logging.getLogger(__name__)
 
 
-def describe_run(env: Any, env_id: str, track: str, config: Config, seed: int) -> dict[str, Any]:
+def describe_run(
+    env: Any, env_id: str, track: str, config: Config, seed: int, number: int = 1
+) -> dict[str, Any]:
     """Return what a run is, as JSON values: what its checkpoints say of themselves.
 
+    number: of seeds that train side by side.
     track: what finds it again, a name or a path; its gates and bounds stand under ``track_data``.
     environment: the other parameters (rewards, starts, time step, wrappers) by their paths.
     """
@@ -58,15 +61,16 @@ def describe_run(env: Any, env_id: str, track: str, config: Config, seed: int) -
             "environment": {name: values.tolist() for name, values in others.items()},
             "config": dataclasses.asdict(config),
             "software": {"jax": jax.__version__},
-            "machine": describe_machine(),
+            "machine": describe_machine(number),
         }
     )
 
 
-def describe_machine() -> dict[str, Any]:
+def describe_machine(number: int = 1) -> dict[str, Any]:
     """Return what of a machine decides the last bits: XLA splits sums by the number of its threads.
 
     threads: cores that this process may use. NPROC: XLA's own setting of that number, where there is one.
+    seeds: that train side by side, where there are several, because their program is another.
     """
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     return {
@@ -74,6 +78,7 @@ def describe_machine() -> dict[str, Any]:
         "devices": jax.device_count(),
         "threads": cores,
         "NPROC": os.environ.get("NPROC"),
+        **({"seeds": number} if number > 1 else {}),
     }
 
 
