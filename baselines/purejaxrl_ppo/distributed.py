@@ -81,9 +81,9 @@ def check_agree(what: str, value: Any) -> None:
 
 
 def digest(values: Any) -> int:
-    """Return a number that two processes share where they have the same JSON values."""
+    """Return a number, of an int32, that two processes share where they have the same JSON values."""
     text = json.dumps(values, sort_keys=True, default=str)
-    return int.from_bytes(hashlib.sha256(text.encode()).digest()[:4])
+    return int.from_bytes(hashlib.sha256(text.encode()).digest()[:4]) >> 1
 
 
 def wait_for_all(where: str) -> None:

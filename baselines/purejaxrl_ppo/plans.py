@@ -10,7 +10,14 @@ from jax.sharding import Mesh
 from baselines.purejaxrl_ppo.checkpoint import Checkpoint
 from baselines.purejaxrl_ppo.config import Config, settings_of
 from baselines.purejaxrl_ppo.options import INTERVALS, Options, read_options
-from baselines.purejaxrl_ppo.resume import check_free, check_same_run, checkpoints_in, newest_intact, seeds_in
+from baselines.purejaxrl_ppo.resume import (
+    at_common_step,
+    check_free,
+    check_same_run,
+    checkpoints_in,
+    newest_intact,
+    seeds_in,
+)
 from baselines.purejaxrl_ppo.tracking import local_uri
 from baselines.purejaxrl_ppo.training import Trainer
 from flytrack_env.model_file import model_from_json
@@ -80,11 +87,12 @@ def _plans_of_several(arguments: argparse.Namespace, out: Path) -> list[Plan]:
     if arguments.seed is not None or arguments.num_seeds is not None:
         first = (found or [0])[0] if arguments.seed is None else arguments.seed
         seeds = _seeds(first, arguments.num_seeds or 1)
-    plans = []
-    for seed in seeds:
-        source = resume / f"seed{seed}"
-        start = newest_intact(source) if checkpoints_in(source) else (None, None)
-        plans.append(Plan(seed, out / source.name, *start))
+    folders = [resume / f"seed{seed}" for seed in seeds]
+    starts = [newest_intact(source) if checkpoints_in(source) else None for source in folders]
+    plans = [
+        Plan(seed, out / source.name, *(start or (None, None)))
+        for seed, source, start in zip(seeds, folders, at_common_step(starts), strict=True)
+    ]
     if all(plan.checkpoint is None for plan in plans):
         has = (
             "the checkpoints of one run: leave out --num-seeds"

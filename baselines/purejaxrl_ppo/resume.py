@@ -36,6 +36,8 @@ MUST_FIT = ("env_id", "seed", "missed_gate", "config", "observation", "track_dat
 
 logger = logging.getLogger(__name__)
 
+Start = tuple[Path, Checkpoint]  # a checkpoint to go on from, and its path
+
 
 def describe_run(
     env: Any, env_id: str, track: str, config: Config, seed: int, number: int = 1
@@ -159,6 +161,31 @@ def newest_intact(path: Path) -> tuple[Path, Checkpoint]:
         except CheckpointError as error:
             logger.warning("%s; the checkpoint before it is used", error)
     return oldest, _load_training(oldest)
+
+
+def at_common_step(starts: list[Start | None]) -> list[Start | None]:
+    """Return where seeds go on that trained side by side: all at the last step that all have stored.
+
+    A kill between their checkpoints leaves some ahead, and alone they would not go on bit for bit.
+    Others, None for those that begin, stay as they are.
+    """
+    found = [start for start in starts if start is not None]
+    steps = {checkpoint.meta["steps"] for _, checkpoint in found}
+    are_together = all(
+        checkpoint.meta.get("machine", {}).get("seeds") == len(starts) == len(found)
+        for _, checkpoint in found
+    )
+    if not are_together or len(steps) <= 1:
+        return starts
+    name = f"step_{min(steps)}.msgpack"
+    try:
+        return [
+            start if start[1].meta["steps"] == min(steps) else newest_intact(start[0].with_name(name))
+            for start in found
+        ]
+    except CheckpointError as error:
+        logger.warning("%s; the seeds go on from where each of them was", error)
+        return starts
 
 
 def _load_training(path: Path) -> Checkpoint:

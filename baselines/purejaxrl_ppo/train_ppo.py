@@ -74,7 +74,8 @@ def make_parser() -> argparse.ArgumentParser:
         "--num-seeds",
         type=int,
         metavar="N",
-        help="train N seeds from --seed on, each in OUT/seed<N> (default: 1, or as many as --resume holds)",
+        help="train N seeds from --seed on, side by side in one program, each in OUT/seed<N> (default: 1, "
+        "or as many as --resume holds)",
     )
     parser.add_argument("--out", type=Path, help=f"folder (default: {DEFAULT_OUT}, or that of --resume)")
     parser.add_argument(
@@ -134,10 +135,16 @@ def run(asked: Asked) -> None:
     for plan, options in zip(asked.plans, asked.options, strict=True):
         if is_first() and not (plan.out / FINAL).exists():
             write_options(plan.out, options)
-    for plan, options in zip(asked.plans, asked.options, strict=True):
-        checkpoint, _ = asked.trainer.train(plan.out, plan.seed, options)
-        meta = checkpoint.meta
-        print(f"seed {plan.seed}: {meta['steps']} steps in {meta['seconds']} s: {plan.out / FINAL}")
+    all_seeds = [
+        (plan.out, plan.seed, options) for plan, options in zip(asked.plans, asked.options, strict=True)
+    ]
+    # On several devices one seed after the other: a seed fills them.
+    together = [all_seeds] if asked.trainer.mesh is None else [[one] for one in all_seeds]
+    for seeds in together:
+        for (out, seed, _), (checkpoint, _) in zip(seeds, asked.trainer.train_all(seeds), strict=True):
+            meta = checkpoint.meta
+            if is_first():
+                print(f"seed {seed}: {meta['steps']} steps in {meta['seconds']} s: {out / FINAL}")
 
 
 def say_stopped(steps: int, arguments: argparse.Namespace) -> str:
