@@ -99,7 +99,7 @@ class Run:
         params = {name: value for name, value in self.description.items() if name != "observation"}
         params["package_version"] = flytrack_env.__version__
         name = f"{self.trainer.env_id} {Path(self.trainer.track).stem} seed {self.description['seed']}"
-        return Tracker(self.out, uri, name, params)
+        return Tracker(self.out, uri, name, params, self.options.parent)
 
     def took(self, chunk: Chunk) -> None:
         """Evaluate, tell and store what is due after a chunk.
@@ -119,6 +119,8 @@ class Run:
         if self.is_first and options.evaluate_every and is_evaluated and not broken:
             evaluation = self._evaluate(runner, steps, is_last)
             self.seen = self.seen.after(evaluation)
+            if options.report is not None:
+                options.report(steps, evaluation)
             values = {**values, **evaluation, **self.seen.metrics()}
         if self.tracker is not None:
             self.tracker.metrics(steps, values)
