@@ -12,7 +12,8 @@ from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
-from benchmarks.env_speed import cpu_name, pin_to_one_core, versions
+from benchmarks.env_speed import cpu_name, versions
+from benchmarks.scaling.tables import measure_table, table
 from flytrack_env.files import write_atomically
 
 PROCESSES = "processes"
@@ -24,30 +25,6 @@ figures mean, and how to train on several machines: [scaling](../scaling.md). Ra
 second of CPU time, of one core; each is the median of five calls. Start: compiling, and the first call.
 
 """
-
-
-def measure_table(name: str) -> dict[str, Any]:
-    """Return the rows of a table, and where they were measured."""
-    where = pin_to_one_core()
-    import jax
-    from tqdm import tqdm
-
-    from benchmarks.scaling.rates import TABLES
-
-    title, rows = TABLES[name]
-    device = cpu_name() if jax.default_backend() == "cpu" else jax.devices()[0].device_kind
-    return {"title": title, "rows": list(tqdm(rows(), unit=name)), "device": f"{device}; {where}"}
-
-
-def table(result: dict[str, Any]) -> str:
-    """Return a table of rates."""
-    lines = [f"| {result['title']} | million steps per second | start (s) |", "|---|---|---|"]
-    lines += [f"| {_text(what)} | {rate:.3g} | {start:.1f} |" for what, rate, start in result["rows"]]
-    return "\n".join(lines) + "\n"
-
-
-def _text(what: Any) -> str:
-    return f"{what:,}" if isinstance(what, int) else str(what)
 
 
 def write_page(path: Path, results: dict[str, Any]) -> None:
