@@ -21,8 +21,8 @@ PARTS = ("environments", "effects", "gates", "training", "networks", "seeds", PR
 HEAD = """# Scaling
 
 `python -m benchmarks.scaling`: how cost grows, and what more devices, processes and seeds bring. What the
-figures mean, and how to train on several machines: [scaling](../scaling.md). Rates on a CPU: million steps per
-second of CPU time, of one core; each is the median of five calls. Start: compiling, and the first call.
+figures mean, and how to train on several machines: [scaling](../scaling.md). Rates on a CPU: million steps
+per second of CPU time, of one core; each is the median of five calls. Start: compiling, and the first call.
 
 """
 
