@@ -32,6 +32,7 @@ from flytrack_env.model_file import model_as_json
 FINAL = "final.msgpack"
 SEED_FOLDER = re.compile(r"seed(\d+)")
 STEP_FILE = re.compile(r"step_(\d+)\.msgpack")
+HALF_WRITTEN = re.compile(r"\.(step_\d+|final)\.msgpack\.[0-9a-f]{16}")  # as write_atomically names them
 MUST_FIT = ("env_id", "seed", "missed_gate", "config", "observation", "track_data", "model", "environment")
 
 logger = logging.getLogger(__name__)
@@ -101,6 +102,13 @@ def checkpoints_in(folder: Path) -> list[Path]:
     """Return the checkpoints in a folder, newest first: by the steps in their names, the final one first."""
     steps = [path for path in folder.glob("*.msgpack") if STEP_FILE.fullmatch(path.name)]
     return [path for path in (folder / FINAL,) if path.exists()] + sorted(steps, key=steps_of, reverse=True)
+
+
+def remove_half_written(folder: Path) -> None:
+    """Remove what a killed process was writing: no checkpoint, and in nobody's way but the disk's."""
+    for path in folder.glob(".*.msgpack.*"):
+        if HALF_WRITTEN.fullmatch(path.name):
+            path.unlink(missing_ok=True)
 
 
 def seeds_in(folder: Path) -> list[int]:

@@ -20,6 +20,7 @@ from baselines.purejaxrl_ppo.distributed import (
     check_agree,
     check_divides,
     digest,
+    is_first,
     on_devices,
     spread,
     wait_for_all,
@@ -36,6 +37,7 @@ from baselines.purejaxrl_ppo.resume import (
     describe_run,
     is_its_folder,
     newest_intact,
+    remove_half_written,
     restore_runner,
     warn_of_other_bits,
 )
@@ -170,6 +172,8 @@ class Trainer:
         check_same_run(path, checkpoint, description)
         if not is_its_folder(out, source):
             forget(out)
+        elif is_first():
+            remove_half_written(out)
         run = Run(self, out, description, options._replace(resume=path), checkpoint.meta)
         update = checkpoint.meta["steps"] // self.config.batch_size
         self.steps = checkpoint.meta["steps"]
