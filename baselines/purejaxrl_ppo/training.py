@@ -162,7 +162,8 @@ class Trainer:
         description = self.describe(seed, number)
         if self.mesh is not None:
             wait_for_all("checked")  # before the first process writes what the others would find
-            check_agree("settings", digest([options._asdict(), description]))
+            shared = {name: value for name, value in description.items() if name != "machine"}
+            check_agree("settings", digest([options._replace(report=None), shared]))
         key = jax.random.key(seed)
         if source is None:
             forget(out)
