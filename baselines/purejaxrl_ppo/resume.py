@@ -171,6 +171,12 @@ def newest_intact(path: Path) -> tuple[Path, Checkpoint]:
     return oldest, _load_training(oldest)
 
 
+def seeds_side_by_side(starts: list[Start | None]) -> int:
+    """Return how many seeds trained side by side, as the first checkpoint says; all of them without one."""
+    metas = [start[1].meta for start in starts if start is not None]
+    return int(metas[0].get("machine", {}).get("seeds", 1)) if metas else len(starts)
+
+
 def at_common_step(starts: list[Start | None]) -> list[Start | None]:
     """Return where seeds go on that trained side by side: all at the last step that all have stored.
 
