@@ -5,10 +5,19 @@ import dataclasses
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from jax.sharding import Mesh
+
 from baselines.purejaxrl_ppo.checkpoint import Checkpoint
 from baselines.purejaxrl_ppo.config import Config, settings_of
 from baselines.purejaxrl_ppo.options import INTERVALS, Options, read_options
-from baselines.purejaxrl_ppo.resume import check_free, check_same_run, checkpoints_in, newest_intact, seeds_in
+from baselines.purejaxrl_ppo.resume import (
+    at_common_step,
+    check_free,
+    check_same_run,
+    checkpoints_in,
+    newest_intact,
+    seeds_in,
+)
 from baselines.purejaxrl_ppo.tracking import local_uri
 from baselines.purejaxrl_ppo.training import Trainer
 from flytrack_env.model_file import model_from_json
@@ -78,11 +87,12 @@ def _plans_of_several(arguments: argparse.Namespace, out: Path) -> list[Plan]:
     if arguments.seed is not None or arguments.num_seeds is not None:
         first = (found or [0])[0] if arguments.seed is None else arguments.seed
         seeds = _seeds(first, arguments.num_seeds or 1)
-    plans = []
-    for seed in seeds:
-        source = resume / f"seed{seed}"
-        start = newest_intact(source) if checkpoints_in(source) else (None, None)
-        plans.append(Plan(seed, out / source.name, *start))
+    folders = [resume / f"seed{seed}" for seed in seeds]
+    starts = [newest_intact(source) if checkpoints_in(source) else None for source in folders]
+    plans = [
+        Plan(seed, out / source.name, *(start or (None, None)))
+        for seed, source, start in zip(seeds, folders, at_common_step(starts), strict=True)
+    ]
     if all(plan.checkpoint is None for plan in plans):
         has = (
             "the checkpoints of one run: leave out --num-seeds"
@@ -127,7 +137,7 @@ def check_plans(trainer: Trainer, plans: list[Plan]) -> None:
             check_same_run(plan.resume, plan.checkpoint, trainer.describe(plan.seed))
 
 
-def make_trainer(arguments: argparse.Namespace, base: Checkpoint | None) -> Trainer:
+def make_trainer(arguments: argparse.Namespace, base: Checkpoint | None, mesh: Mesh | None = None) -> Trainer:
     """Return the trainer of a command line; what it does not say is as in the checkpoint, if there is one."""
     asked = settings_of(arguments)
     if base is None:
@@ -136,7 +146,7 @@ def make_trainer(arguments: argparse.Namespace, base: Checkpoint | None) -> Trai
             "model": arguments.model,
             "reward": dict(arguments.reward or ()),
         }
-        return Trainer(Config(**asked), arguments.env_id or DEFAULT_ENV_ID, **env_arguments)
+        return Trainer(Config(**asked), arguments.env_id or DEFAULT_ENV_ID, mesh, **env_arguments)
     env_arguments = {
         "track": arguments.track or base.track,
         "model": arguments.model or model_from_json(base.meta["model"], "checkpoint: model"),
@@ -144,7 +154,7 @@ def make_trainer(arguments: argparse.Namespace, base: Checkpoint | None) -> Trai
         "reward": {**reward_of(base), **dict(arguments.reward or ())},
     }
     config = dataclasses.replace(base.config, **asked)
-    return Trainer(config, arguments.env_id or base.env_id, **env_arguments)
+    return Trainer(config, arguments.env_id or base.env_id, mesh, **env_arguments)
 
 
 def reward_of(checkpoint: Checkpoint) -> dict[str, float]:

@@ -36,10 +36,15 @@ MUST_FIT = ("env_id", "seed", "missed_gate", "config", "observation", "track_dat
 
 logger = logging.getLogger(__name__)
 
+Start = tuple[Path, Checkpoint]  # a checkpoint to go on from, and its path
 
-def describe_run(env: Any, env_id: str, track: str, config: Config, seed: int) -> dict[str, Any]:
+
+def describe_run(
+    env: Any, env_id: str, track: str, config: Config, seed: int, number: int = 1
+) -> dict[str, Any]:
     """Return what a run is, as JSON values: what its checkpoints say of themselves.
 
+    number: of seeds that train side by side.
     track: what finds it again, a name or a path; its gates and bounds stand under ``track_data``.
     environment: the other parameters (rewards, starts, time step, wrappers) by their paths.
     """
@@ -58,15 +63,16 @@ def describe_run(env: Any, env_id: str, track: str, config: Config, seed: int) -
             "environment": {name: values.tolist() for name, values in others.items()},
             "config": dataclasses.asdict(config),
             "software": {"jax": jax.__version__},
-            "machine": describe_machine(),
+            "machine": describe_machine(number),
         }
     )
 
 
-def describe_machine() -> dict[str, Any]:
+def describe_machine(number: int = 1) -> dict[str, Any]:
     """Return what of a machine decides the last bits: XLA splits sums by the number of its threads.
 
     threads: cores that this process may use. NPROC: XLA's own setting of that number, where there is one.
+    seeds: that train side by side, where there are several, because their program is another.
     """
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     return {
@@ -74,6 +80,7 @@ def describe_machine() -> dict[str, Any]:
         "devices": jax.device_count(),
         "threads": cores,
         "NPROC": os.environ.get("NPROC"),
+        **({"seeds": number} if number > 1 else {}),
     }
 
 
@@ -154,6 +161,31 @@ def newest_intact(path: Path) -> tuple[Path, Checkpoint]:
         except CheckpointError as error:
             logger.warning("%s; the checkpoint before it is used", error)
     return oldest, _load_training(oldest)
+
+
+def at_common_step(starts: list[Start | None]) -> list[Start | None]:
+    """Return where seeds go on that trained side by side: all at the last step that all have stored.
+
+    A kill between their checkpoints leaves some ahead, and alone they would not go on bit for bit.
+    Others, None for those that begin, stay as they are.
+    """
+    found = [start for start in starts if start is not None]
+    steps = {checkpoint.meta["steps"] for _, checkpoint in found}
+    are_together = all(
+        checkpoint.meta.get("machine", {}).get("seeds") == len(starts) == len(found)
+        for _, checkpoint in found
+    )
+    if not are_together or len(steps) <= 1:
+        return starts
+    name = f"step_{min(steps)}.msgpack"
+    try:
+        return [
+            start if start[1].meta["steps"] == min(steps) else newest_intact(start[0].with_name(name))
+            for start in found
+        ]
+    except CheckpointError as error:
+        logger.warning("%s; the seeds go on from where each of them was", error)
+        return starts
 
 
 def _load_training(path: Path) -> Checkpoint:
