@@ -178,9 +178,9 @@ class Simulation:
         self.params = self.env.default_params if params is None else params
         _check_shapes(self.params, self.env.default_params)
         self.env.check_params(self.params)
-        _, state = jax.eval_shape(self.env.reset, jax.random.key(0), self.params)
         layout = Layout.of(self.params)
         if layout not in programs:
+            _, state = jax.eval_shape(self.env.reset, jax.random.key(0), self.params)
             programs[layout] = Programs(self.env, self.params, state)
         self.programs = programs[layout]
         self.packed_params = self.programs.pack_params(self.params)
