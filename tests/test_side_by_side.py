@@ -7,7 +7,7 @@ import pytest
 
 from baselines.purejaxrl_ppo.checkpoint import load_checkpoint
 from baselines.purejaxrl_ppo.named_arrays import as_named_arrays
-from baselines.purejaxrl_ppo.plans import make_plans
+from baselines.purejaxrl_ppo.plans import batched, make_plans
 from baselines.purejaxrl_ppo.resume import at_common_step, newest_intact
 from baselines.purejaxrl_ppo.run import DivergedError, Run
 from baselines.purejaxrl_ppo.side_by_side import Ready, groups_of
@@ -85,6 +85,20 @@ def test_seeds_that_did_not_train_together_stay_where_they_are(trainer, together
     lost[1].meta["steps"] = 5 * BATCH  # of which nobody has a checkpoint
     assert at_common_step([lost, *starts[1:]])[0] is lost
     assert "go on from where each of them was" in caplog.text
+
+
+def test_groups_of_seeds_are_as_asked_for_or_as_before(together, tmp_path):
+    def at_once(*flags):
+        return {plan.at_once for plan in make_plans(make_parser().parse_args([*map(str, flags)]))}
+
+    root = together[0]
+    assert at_once("--resume", root) == {3} and at_once("--resume", root, "--seeds-at-once", 2) == {2}
+    new = ("--out", tmp_path / "new", "--num-seeds", 5)
+    assert at_once(*new) == {5} and at_once(*new, "--seeds-at-once", 2) == {2}
+    assert at_once("--out", tmp_path / "new") == {1}
+    assert batched([1, 2, 3], 2) == [[1, 2], [3]]
+    with pytest.raises(ValueError, match="--seeds-at-once: found 0"):
+        at_once(*new, "--seeds-at-once", 0)
 
 
 def test_one_that_diverges_does_not_end_the_others(trainer, tmp_path, monkeypatch):

@@ -32,6 +32,7 @@ from flytrack_env.model_file import model_as_json
 FINAL = "final.msgpack"
 SEED_FOLDER = re.compile(r"seed(\d+)")
 STEP_FILE = re.compile(r"step_(\d+)\.msgpack")
+HALF_WRITTEN = re.compile(r"\.(step_\d+|final)\.msgpack\.[0-9a-f]{16}")  # as write_atomically names them
 MUST_FIT = ("env_id", "seed", "missed_gate", "config", "observation", "track_data", "model", "environment")
 
 logger = logging.getLogger(__name__)
@@ -103,6 +104,13 @@ def checkpoints_in(folder: Path) -> list[Path]:
     return [path for path in (folder / FINAL,) if path.exists()] + sorted(steps, key=steps_of, reverse=True)
 
 
+def remove_half_written(folder: Path) -> None:
+    """Remove what a killed process was writing: no checkpoint, and in nobody's way but the disk's."""
+    for path in folder.glob(".*.msgpack.*"):
+        if HALF_WRITTEN.fullmatch(path.name):
+            path.unlink(missing_ok=True)
+
+
 def seeds_in(folder: Path) -> list[int]:
     """Return the seeds of which a folder holds runs, as seed<N>, begun or about to begin."""
     matches = [(path, SEED_FOLDER.fullmatch(path.name)) for path in folder.glob("seed*")]
@@ -161,6 +169,12 @@ def newest_intact(path: Path) -> tuple[Path, Checkpoint]:
         except CheckpointError as error:
             logger.warning("%s; the checkpoint before it is used", error)
     return oldest, _load_training(oldest)
+
+
+def seeds_side_by_side(starts: list[Start | None]) -> int:
+    """Return how many seeds trained side by side, as the first checkpoint says; all of them without one."""
+    metas = [start[1].meta for start in starts if start is not None]
+    return int(metas[0].get("machine", {}).get("seeds", 1)) if metas else len(starts)
 
 
 def at_common_step(starts: list[Start | None]) -> list[Start | None]:

@@ -18,6 +18,7 @@ from baselines.purejaxrl_ppo.plans import (
     DEFAULT_TRACK,
     DEFAULTS,
     Plan,
+    batched,
     check_plans,
     make_plans,
     make_trainer,
@@ -76,6 +77,13 @@ def make_parser() -> argparse.ArgumentParser:
         metavar="N",
         help="train N seeds from --seed on, side by side in one program, each in OUT/seed<N> (default: 1, "
         "or as many as --resume holds)",
+    )
+    parser.add_argument(
+        "--seeds-at-once",
+        type=int,
+        metavar="N",
+        help="so many of them side by side, the others after them; on a CPU 1 is quickest (default: all, or "
+        "as before)",
     )
     parser.add_argument("--out", type=Path, help=f"folder (default: {DEFAULT_OUT}, or that of --resume)")
     parser.add_argument(
@@ -139,8 +147,8 @@ def run(asked: Asked) -> None:
         (plan.out, plan.seed, options) for plan, options in zip(asked.plans, asked.options, strict=True)
     ]
     # On several devices one seed after the other: a seed fills them.
-    together = [all_seeds] if asked.trainer.mesh is None else [[one] for one in all_seeds]
-    for seeds in together:
+    at_once = asked.plans[0].at_once if asked.trainer.mesh is None else 1
+    for seeds in batched(all_seeds, at_once):
         for (out, seed, _), (checkpoint, _) in zip(seeds, asked.trainer.train_all(seeds), strict=True):
             meta = checkpoint.meta
             if is_first():

@@ -20,6 +20,7 @@ from baselines.purejaxrl_ppo.distributed import (
     check_agree,
     check_divides,
     digest,
+    is_first,
     on_devices,
     spread,
     wait_for_all,
@@ -36,6 +37,7 @@ from baselines.purejaxrl_ppo.resume import (
     describe_run,
     is_its_folder,
     newest_intact,
+    remove_half_written,
     restore_runner,
     warn_of_other_bits,
 )
@@ -160,7 +162,8 @@ class Trainer:
         description = self.describe(seed, number)
         if self.mesh is not None:
             wait_for_all("checked")  # before the first process writes what the others would find
-            check_agree("settings", digest([options._asdict(), description]))
+            shared = {name: value for name, value in description.items() if name != "machine"}
+            check_agree("settings", digest([options._replace(report=None), shared]))
         key = jax.random.key(seed)
         if source is None:
             forget(out)
@@ -170,6 +173,8 @@ class Trainer:
         check_same_run(path, checkpoint, description)
         if not is_its_folder(out, source):
             forget(out)
+        elif is_first():
+            remove_half_written(out)
         run = Run(self, out, description, options._replace(resume=path), checkpoint.meta)
         update = checkpoint.meta["steps"] // self.config.batch_size
         self.steps = checkpoint.meta["steps"]

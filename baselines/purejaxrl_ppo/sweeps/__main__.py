@@ -84,7 +84,7 @@ def prepare(arguments: argparse.Namespace) -> tuple[Base, Space]:
     config = Config(**fixed)
     track = str(Path(arguments.track).resolve()) if arguments.track.endswith(".toml") else arguments.track
     model = None if arguments.model is None else str(Path(arguments.model).resolve())
-    env_arguments = {"track": track, "model": model}
+    env_arguments: dict[str, Any] = {"track": track, "model": model}
     Trainer(config, arguments.env_id, **env_arguments)  # refuses what no trial could use
     uri = None if arguments.no_tracking else arguments.tracking_uri or local_uri(out)
     options = Options(evaluate_every=config.total_timesteps, tracking_uri=uri, parent=out)
@@ -112,7 +112,8 @@ def run_trials(base: Base, space: Space, arguments: argparse.Namespace) -> list[
             ),
             run_config=tune.RunConfig(name="ray", storage_path=str(base.out), verbose=0, callbacks=[bar]),
         )
-        return [_trial(base, result) for result in tuner.fit()]
+        results = tuner.fit()
+        return [_trial(base, results[index]) for index in range(len(results))]
     finally:
         bar.bar.close()
         ray.shutdown()

@@ -4,10 +4,12 @@ import json
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator, NullFormatter
 
 from flytrack_env.files import write_atomically
-from flytrack_env.pictures.style import new_figure, plain, png_of
+from flytrack_env.pictures.style import BLUE, new_figure, plain, png_of
 
 PANEL_IN = 3.0
 SUCCESS, LAP_S = "evaluation_success", "evaluation_flying_lap_s"
@@ -62,19 +64,30 @@ def draw(trials: list[Trial]) -> Figure:
     """Return a picture: for each setting that was drawn, success and flying lap over its values."""
     names = list(trials[0].settings)
     figure = new_figure(PANEL_IN * len(names) + 1.0, 2 * PANEL_IN)
-    axes = figure.subplots(2, len(names), squeeze=False, sharey="row")
+    axes = figure.subplots(2, len(names), squeeze=False, sharex="col", sharey="row")
     whole = [trial for trial in trials if trial.error is None]
     for column, name in enumerate(names):
-        values = [trial.settings[name] for trial in whole]
-        is_number = all(isinstance(value, float) for value in values)
-        places = values if is_number else [str(value) for value in values]
+        places = _place(axes[1, column], [trial.settings[name] for trial in whole])
         for row, (key, scale) in enumerate(((SUCCESS, 100.0), (LAP_S, 1.0))):
             shown = [scale * trial.evaluation.get(key, float("nan")) for trial in whole]
-            plain(axes[row, column]).plot(places, shown, "o")
-        if is_number and values and min(values) > 0.0 and max(values) > 5.0 * min(values):
-            axes[0, column].set_xscale("log")
-            axes[1, column].set_xscale("log")
+            plain(axes[row, column]).plot(places, shown, "o", color=BLUE)
         axes[1, column].set_xlabel(name)
     axes[0, 0].set_ylabel("success (%)")
+    axes[0, 0].set_ylim(-5.0, 105.0)
     axes[1, 0].set_ylabel("flying lap (s)")
     return figure
+
+
+def _place(axes: Axes, values: list[Any]) -> list[float]:
+    """Return where values stand along x: numbers where they are, others side by side, with their names."""
+    if all(isinstance(value, float) for value in values):
+        if values and min(values) > 0.0 and max(values) > 5.0 * min(values):
+            axes.set_xscale("log")
+            axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+            axes.xaxis.set_major_formatter("{x:g}")
+            axes.xaxis.set_minor_formatter(NullFormatter())
+        return values
+    known = sorted(set(values))
+    axes.set_xticks(range(len(known)), [str(value) for value in known])
+    axes.set_xlim(-0.5, len(known) - 0.5)
+    return [float(known.index(value)) for value in values]

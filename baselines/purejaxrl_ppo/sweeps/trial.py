@@ -36,7 +36,7 @@ def run_trial(settings: dict[str, Any], base: Base) -> None:
     def report(steps: int, evaluation: dict[str, float]) -> None:
         tune.report({"steps": steps, **evaluation})
 
-    drawn = {name: tuple(value) if isinstance(value, list) else value for name, value in settings.items()}
+    drawn: dict[str, Any] = {n: tuple(v) if isinstance(v, list) else v for n, v in settings.items()}
     config = dataclasses.replace(base.config, **drawn)
     out = folder_of(base, tune.get_context().get_trial_id())
     write_options(out, base.options)
