@@ -11,7 +11,7 @@ import numpy as np
 from baselines.purejaxrl_ppo.monitor import LiveLine, Seen
 from baselines.purejaxrl_ppo.options import next_due
 from baselines.purejaxrl_ppo.ppo import Runner
-from baselines.purejaxrl_ppo.run import Chunk, DivergedError, Run
+from baselines.purejaxrl_ppo.run import Chunk, DivergedError, Metrics, Run
 
 if TYPE_CHECKING:
     from baselines.purejaxrl_ppo.training import Trainer
@@ -99,9 +99,14 @@ def _chunks(trainer: "Trainer", group: list[Ready], line: LiveLine) -> Iterator[
         rate = count * config.batch_size / (time.perf_counter() - started_s)
         update += count
         yield [
-            Chunk(runner, before, update, {name: np.asarray(row)[:count] for name, row in own.items()}, rate)
+            Chunk(runner, before, update, _first(own, count), rate)
             for runner, own in zip(split(state), split(rows), strict=True)
         ]
+
+
+def _first(rows: Metrics, count: int) -> Metrics:
+    """Return the first rows as arrays of their own: a view would keep JAX's, of every chunk, to the end."""
+    return {name: np.asarray(row)[:count].copy() for name, row in rows.items()}
 
 
 @jax.jit

@@ -13,11 +13,16 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.env_speed import cpu_name, versions
-from benchmarks.reliability import training
+from benchmarks.reliability import determinism, memory, simulation, training
 from benchmarks.reliability.section import Section
 from flytrack_env.files import write_atomically
 
-SECTIONS: tuple[Section, ...] = (training.SECTION,)
+SECTIONS: tuple[Section, ...] = (
+    simulation.SECTION,
+    training.SECTION,
+    memory.SECTION,
+    determinism.SECTION,
+)
 RESULTS = Path("docs/results")
 PAGE = """# Reliability
 
