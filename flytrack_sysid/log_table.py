@@ -1,6 +1,7 @@
 """Checks of the columns of a file on their way to a flight log; every refusal says where it stands."""
 
 import difflib
+import reprlib
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -11,6 +12,7 @@ from flytrack_sysid.log import CHANNELS, COLUMNS, REQUIRED, FlightLog, LogError
 LARGEST_NORM_ERROR = 1e-2  # of quaternions: estimators drift a little; more is no unit quaternion
 SMALLEST_NORM_ERROR = 1e-12  # below it a norm is 1 up to rounding, and the values stay as they are
 COMMAND_MARGIN = 1e-6  # beyond [-1, 1]: rounding in whoever wrote the log
+LONGEST_NAME = max(map(len, COLUMNS)) + 3  # what is longer is like none
 LARGEST_SEGMENT = 2**53  # float64 tells whole numbers apart below it
 PWM_LOW_US, PWM_HIGH_US = 800, 2200  # receivers' pulses: 1000 to 2000 us, and a little past the ends
 PERCENT_LOW, PERCENT_HIGH = 10, 100  # a largest command in between looks like percent of full stick
@@ -40,9 +42,11 @@ def check_names(source: str, names: Sequence[str]) -> None:
     """Raise LogError unless the names make up a flight log: each known, once, none missing of a vector."""
     for name in names:
         if name not in COLUMNS:
-            near = difflib.get_close_matches(name.lower(), COLUMNS, n=1)
+            near = difflib.get_close_matches(name[:LONGEST_NAME].lower(), COLUMNS, n=1)
             hint = f"; did you mean {near[0]}?" if near else ""
-            raise LogError(f"{source}: column {name!r}: unknown{hint} (known: {', '.join(COLUMNS)})")
+            raise LogError(
+                f"{source}: column {reprlib.repr(name)}: unknown{hint} (known: {', '.join(COLUMNS)})"
+            )
         if names.count(name) > 1:
             raise LogError(f"{source}: column {name}: found {names.count(name)} times, expected once")
     for name in REQUIRED:
@@ -58,7 +62,8 @@ def check_names(source: str, names: Sequence[str]) -> None:
 def log_of_table(table: Table) -> FlightLog:
     """Return the log that a table holds; a table without segments is one.
 
-    Quaternions are normalised. The names must have passed ``check_names``.
+    Quaternions are normalised. The names must have passed ``check_names``. The columns are taken out of the
+    table one after the other.
 
     Raises:
         LogError: no rows, columns of different lengths, or a value that no log can have, with its place.
@@ -74,7 +79,11 @@ def log_of_table(table: Table) -> FlightLog:
     _check_time(table, segment)
     _check_commands(table)
     present = {name: columns for name, columns in CHANNELS.items() if columns[0] in table.columns}
-    channels = {name: table.matrix(columns) for name, columns in present.items()}
+    channels = {}
+    for name, columns in present.items():
+        channels[name] = table.matrix(columns)
+        for column in columns:  # a log of the largest size is not there twice
+            del table.columns[column]
     if "q" in channels:
         channels["q"] = _normalised(table, channels["q"])
     return FlightLog(table.columns["t"], channels, segment, table.source)

@@ -18,7 +18,7 @@ PACKAGE = "flytrack_env"
 
 # Low to high. A module imports only from rows above its own here; a package counts as one module.
 LAYERS = (
-    {"files", "extras", "fusion", "auto_reset", "apart", "apart_server", "artifact"},
+    {"files", "extras", "fusion", "auto_reset", "apart", "apart_server", "artifact", "npz_file"},
     {"quaternion"},
     {"state"},
     {"tracks", "randomness"},
