@@ -9,7 +9,7 @@ import numpy as np
 
 from flytrack_env import effects
 from flytrack_env.dynamics import ModelParameters
-from flytrack_env.files import write_atomically
+from flytrack_env.files import named, read_at_most, write_atomically
 
 MODEL_FILE_VERSION = 1
 SIZES = {
@@ -28,6 +28,7 @@ UNITS = {
     "g": "m/s^2",
     "battery_drain_v_per_min": "V/min",
 }
+LARGEST_BYTES = 4 * 2**20
 LARGEST = float(np.finfo(np.float32).max)
 MUST_BE_POSITIVE = ("tau", "max_rate", "m")
 
@@ -48,7 +49,7 @@ def _read_field(path: Path, name: str, value: Any) -> Any:
         found = reprlib.repr(value)
         raise ModelFileError(f"{path}: {name}: found {found}, expected {expected} (float32)")
     if name in MUST_BE_POSITIVE and min(values) <= 0.0:
-        raise ModelFileError(f"{path}: {name}: found {value!r}, expected > 0")
+        raise ModelFileError(f"{path}: {name}: found {reprlib.repr(value)}, expected > 0")
     return np.array(value, np.float32) if size else float(value)
 
 
@@ -56,14 +57,15 @@ def _read_effect(path: Path, name: str, values: Any) -> Any:
     """Return the parameters of one effect; those that are not in the file are neutral."""
     effect = effects.BY_NAME.get(name)
     if effect is None:
-        raise ModelFileError(f"{path}: effects: {name}: unknown; expected of {', '.join(effects.BY_NAME)}")
+        expected = ", ".join(effects.BY_NAME)
+        raise ModelFileError(f"{path}: effects: {named(name)}: unknown; expected of {expected}")
     if not isinstance(values, dict):
         raise ModelFileError(f"{path}: effects: {name}: found {reprlib.repr(values)}, expected an object")
     for field, value in values.items():
         bounds = effect.ranges.get(field)
         if bounds is None:
             expected = ", ".join(effect.ranges)
-            raise ModelFileError(f"{path}: effects: {name}: {field}: unknown; expected of {expected}")
+            raise ModelFileError(f"{path}: effects: {name}: {named(field)}: unknown; expected of {expected}")
         is_number = isinstance(value, (int, float)) and not isinstance(value, bool)
         if not is_number or not bounds.low <= value <= bounds.high:
             expected = f"{bounds.low:g} to {bounds.high:g} {bounds.unit}"
@@ -75,7 +77,7 @@ def _read_effect(path: Path, name: str, values: Any) -> Any:
 def _read_json(path: Path) -> dict[str, Any]:
     """Return the object in a JSON file."""
     try:
-        data = json.loads(path.read_text(encoding="utf-8"))
+        data = json.loads(read_at_most(path, LARGEST_BYTES).decode())
     except (OSError, UnicodeDecodeError) as error:
         raise ModelFileError(f"{path}: cannot be read: {error}") from error
     except (ValueError, RecursionError) as error:  # ValueError also for endless digits
@@ -111,15 +113,17 @@ def model_from_json(data: dict[str, Any], path: str | Path) -> ModelParameters:
     if version != MODEL_FILE_VERSION:
         is_newer = isinstance(version, int) and version > MODEL_FILE_VERSION
         why = "; written by a newer FlyTrack, update to read it" if is_newer else ""
-        raise ModelFileError(f"{path}: version: found {version!r}, expected {MODEL_FILE_VERSION}{why}")
+        found = reprlib.repr(version)
+        raise ModelFileError(f"{path}: version: found {found}, expected {MODEL_FILE_VERSION}{why}")
     values = data.get("parameters", data)
     if not isinstance(values, dict):
         raise ModelFileError(f"{path}: parameters: found {reprlib.repr(values)}, expected an object")
     for name in SIZES:
         if name not in values:
             raise ModelFileError(f"{path}: {name}: missing")
-    for name in set(values) - set(SIZES) - {"version", "effects"}:
-        raise ModelFileError(f"{path}: {name}: unknown; expected {', '.join(SIZES)}, effects")
+    for name in values:
+        if name not in (*SIZES, "version", "effects"):
+            raise ModelFileError(f"{path}: {named(name)}: unknown; expected {', '.join(SIZES)}, effects")
     found = data.get("effects", values.get("effects", {}))
     if not isinstance(found, dict):
         raise ModelFileError(f"{path}: effects: found {reprlib.repr(found)}, expected an object")

@@ -6,6 +6,7 @@ import contextlib
 import io
 import math
 import re
+import reprlib
 import struct
 import zipfile
 from collections.abc import Iterator
@@ -20,6 +21,7 @@ HEADERS = {
     (2, 0): np.lib.format.read_array_header_2_0,
 }
 SUFFIX = ".npy"
+LONGEST_TEXT = 200
 LARGEST_LIST_BYTES = 2**16  # of the archive's list of its files: hundreds of them
 # End of an archive, and what points to a list of more than 4 GiB or 65,535 files.
 END, END_BYTES, LIST_BYTES_AT, LARGE_END = b"PK\x05\x06", 22, 12, b"PK\x06\x07"
@@ -94,13 +96,18 @@ class NpzFile:
             raise NpzError(f"damaged, cannot be read: {type(error).__name__}: {error}") from error
 
 
+def _named(dtype: np.dtype) -> str:
+    return str(dtype)[:LONGEST_TEXT]  # of a structured one, the file writes it
+
+
 def _check(header: Header, num_bytes: int) -> None:
     """Raise NpzError unless a header announces plain values, as many as there are bytes for."""
     shape, _, dtype = header
     if dtype.hasobject:
-        raise NpzError(f"found an array of {dtype}, expected plain values: pickles are never read")
+        raise NpzError(f"found an array of {_named(dtype)}, expected plain values: pickles are never read")
     if not all(type(size) is int and size >= 0 for size in shape) or dtype.itemsize == 0:
-        raise NpzError(f"found an array of {dtype}, shape {shape}, expected one of values that take room")
+        found = f"an array of {_named(dtype)}, shape {reprlib.repr(shape)}"
+        raise NpzError(f"found {found}, expected one of values that take room")
     if header.num_values * dtype.itemsize != num_bytes:
         numbers = "numbers" if dtype.kind in "iuf" else "values"
         expected = f"{header.num_values} {numbers} of {dtype.itemsize} bytes"

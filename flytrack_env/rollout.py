@@ -9,6 +9,7 @@ a rollout from a stranger cannot run code.
 import io
 import math
 import os
+import reprlib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import BinaryIO
@@ -23,6 +24,9 @@ from flytrack_env.state import ACTION_SIZE, APPLIED_ACTION, STATE_SIZE
 ROW_SIZE = STATE_SIZE + ACTION_SIZE
 SHORT_ROW_SIZE = ROW_SIZE - 3
 EXPECTED = f"a plain numeric array of shape (T, {ROW_SIZE}) or (T, {SHORT_ROW_SIZE}) with T >= 1"
+MOST_STEPS = 2**21  # close to six hours at 100 Hz; with the copies made of them, below 1 GiB
+LARGEST_ITEM_BYTES = 8
+LONGEST_TEXT = 200  # characters of what a header says
 PICKLED = "read only if pickles are allowed, as unpickling runs what the file holds"
 
 
@@ -36,12 +40,14 @@ def save_rollout(path: str | Path, states: ArrayLike, actions: ArrayLike) -> Non
     states: (T, 21), actions: (T, 4); row t is the state and the action commanded in it.
 
     Raises:
-        RolloutError: wrong shapes, no steps, or a number that is not finite.
+        RolloutError: wrong shapes, no steps or more than MOST_STEPS, or a number that is not finite.
         OSError: the file cannot be written.
     """
     path = Path(path)
     states, actions = np.asarray(states), np.asarray(actions)
     steps = len(states) if states.ndim else 0
+    if steps > MOST_STEPS:
+        raise RolloutError(f"{path}: found {steps} steps, expected at most {MOST_STEPS}")
     for name, array, size in (("states", states, STATE_SIZE), ("actions", actions, ACTION_SIZE)):
         if array.shape != (steps, size) or steps == 0 or array.dtype.kind not in "fiu":
             found = f"{array.dtype} of shape {array.shape}"
@@ -60,7 +66,7 @@ def load_rollout(path: str | Path, allow_pickle: bool = False) -> tuple[np.ndarr
 
     Raises:
         RolloutError: missing file, not an ``.npy``, pickled objects unless allowed, another shape, no
-            steps, a file cut short, or a number that is not finite.
+            steps or more than MOST_STEPS, a file cut short, or a number that is not finite.
     """
     path = Path(path)
     try:
@@ -116,16 +122,19 @@ def _check_header(path: Path, file: BinaryIO, allow_pickle: bool) -> bool:
     if dtype.hasobject and allow_pickle:
         file.seek(0)
         return True
-    if dtype.kind not in "fiu":
-        found = f"an object array (pickled; {PICKLED})" if dtype.hasobject else f"an array of {dtype}"
+    if dtype.kind not in "fiu" or dtype.itemsize > LARGEST_ITEM_BYTES:
+        array = f"an array of {str(dtype)[:LONGEST_TEXT]}"
+        found = f"an object array (pickled; {PICKLED})" if dtype.hasobject else array
         raise RolloutError(f"{path}: found {found}, expected {EXPECTED}")
     if len(shape) != 2 or shape[1] not in (ROW_SIZE, SHORT_ROW_SIZE) or shape[0] < 1 or shape[0] is True:
-        raise RolloutError(f"{path}: found shape {shape}, expected {EXPECTED}")
+        raise RolloutError(f"{path}: found shape {reprlib.repr(shape)}, expected {EXPECTED}")
     announced = math.prod(shape) * dtype.itemsize
     found_bytes = os.fstat(file.fileno()).st_size - file.tell()
     if found_bytes < announced:
         reason = f"found {found_bytes} bytes of data, expected {announced} for shape {shape}"
         raise RolloutError(f"{path}: cut short: {reason}")
+    if shape[0] > MOST_STEPS:
+        raise RolloutError(f"{path}: found {shape[0]} steps, expected at most {MOST_STEPS}")
     file.seek(0)
     return False
 
