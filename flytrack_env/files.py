@@ -23,6 +23,14 @@ def named(name: object) -> str:
     return text if text.isprintable() and len(text) <= LONGEST_NAME else reprlib.repr(text)
 
 
+def shown(value: object) -> str:
+    """Return a value out of a stranger's file as a message can have it: short."""
+    try:
+        return reprlib.repr(value)
+    except ValueError:  # Python writes no numbers of more than 4300 digits
+        return "a number of thousands of digits"
+
+
 class TooLargeError(OSError):
     """A file of more bytes than it may have; the message does not name it."""
 

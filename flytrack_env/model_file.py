@@ -113,8 +113,8 @@ def model_from_json(data: dict[str, Any], path: str | Path) -> ModelParameters:
     if version != MODEL_FILE_VERSION:
         is_newer = isinstance(version, int) and version > MODEL_FILE_VERSION
         why = "; written by a newer FlyTrack, update to read it" if is_newer else ""
-        found = reprlib.repr(version)
-        raise ModelFileError(f"{path}: version: found {found}, expected {MODEL_FILE_VERSION}{why}")
+        shown = reprlib.repr(version)
+        raise ModelFileError(f"{path}: version: found {shown}, expected {MODEL_FILE_VERSION}{why}")
     values = data.get("parameters", data)
     if not isinstance(values, dict):
         raise ModelFileError(f"{path}: parameters: found {reprlib.repr(values)}, expected an object")

@@ -7,7 +7,6 @@ a header of column names, then one row of numbers, separated by commas, per samp
 import csv
 import io
 import reprlib
-from array import array
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -17,7 +16,7 @@ import numpy as np
 from flytrack_env.files import AtMost, TooLargeError, check_size, write_atomically
 from flytrack_env.npz_file import Header, NpzError, NpzFile, open_npz
 from flytrack_sysid.log import CHANNELS, GAP_STEPS, FlightLog, LogError, usual_step
-from flytrack_sysid.log_table import Table, check_names, log_of_table
+from flytrack_sysid.log_table import Rows, Table, check_names, check_number, log_of_table
 
 if TYPE_CHECKING:
     import _csv
@@ -26,8 +25,6 @@ Reader = Callable[[Path], Table]
 Writer = Callable[[dict[str, np.ndarray]], bytes]
 
 LARGEST_BYTES = 512 * 2**20  # as they are in the file, unpacked
-LARGEST_VALUES = 56 * 2**20  # all columns at 1 kHz for half an hour fit; twice as many float64 are 1 GiB
-BLOCK_VALUES = 2**20
 
 
 def load_log(path: str | Path) -> FlightLog:
@@ -135,7 +132,7 @@ def _read_npz(path: Path) -> Table:
             check_names(str(path), archive.names)
             check_size(archive.num_bytes, LARGEST_BYTES)
             num_values = sum(_header(path, archive, name).num_values for name in archive.names)
-            _check_number(str(path), num_values)
+            check_number(str(path), num_values)
             return Table(str(path), {name: _read_array(path, archive, name) for name in archive.names})
     except NpzError as error:
         raise LogError(f"{path}: {error}") from error
@@ -164,11 +161,6 @@ def _read_array(path: Path, archive: NpzFile, name: str) -> np.ndarray:
         raise LogError(f"{path}: column {name}: {error}") from error
 
 
-def _check_number(source: str, num_values: int) -> None:
-    if num_values > LARGEST_VALUES:
-        raise LogError(f"{source}: found more than {LARGEST_VALUES} numbers, expected at most that")
-
-
 def _read_csv(path: Path) -> Table:
     """Return the columns of a CSV file."""
     with path.open("rb") as file:
@@ -187,25 +179,11 @@ def _table(source: str, rows: "_csv.Reader") -> Table:
         found = f"no comma in {reprlib.repr(header[0])}"
         raise LogError(f"{source}: line 1: found {found}, expected names with commas")
     check_names(source, header)
-    # In blocks: a list of all rows and its transpose would be twice the memory.
-    blocks, values, lines = list[dict[str, np.ndarray]](), array("d"), array("q")
+    table_rows = Rows(source, header)
     for cells in rows:
         if cells:
-            lines.append(rows.line_num)
-            values.extend(_numbers(source, header, cells, len(lines) - 1, rows.line_num))
-            if len(values) >= BLOCK_VALUES:
-                _check_number(source, len(lines) * len(header))
-                blocks.append(_block(header, values))
-                values = array("d")
-    blocks.append(_block(header, values))
-    columns = {name: np.concatenate([block.pop(name) for block in blocks]) for name in header}
-    return Table(source, columns, np.frombuffer(lines, np.int64) if lines else np.zeros(0, np.int64))
-
-
-def _block(header: list[str], values: array) -> dict[str, np.ndarray]:  # type: ignore[type-arg]
-    """Return some rows as columns."""
-    table = np.array(values, float).reshape(-1, len(header))
-    return dict(zip(header, table.T.copy(), strict=True))
+            table_rows.add(_numbers(source, header, cells, len(table_rows), rows.line_num), rows.line_num)
+    return table_rows.table()
 
 
 def _numbers(source: str, header: list[str], cells: list[str], row: int, line: int) -> list[float]:

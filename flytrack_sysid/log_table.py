@@ -2,7 +2,8 @@
 
 import difflib
 import reprlib
-from collections.abc import Sequence
+from array import array
+from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -11,6 +12,10 @@ from flytrack_sysid.log import CHANNELS, COLUMNS, REQUIRED, FlightLog, LogError
 
 LARGEST_NORM_ERROR = 1e-2  # of quaternions: estimators drift a little; more is no unit quaternion
 SMALLEST_NORM_ERROR = 1e-12  # below it a norm is 1 up to rounding, and the values stay as they are
+LARGEST_VALUES = (
+    56 * 2**20
+)  # all columns at 1 kHz for half an hour fit; twice as many float64 are below 1 GiB
+BLOCK_VALUES = 2**20
 COMMAND_MARGIN = 1e-6  # beyond [-1, 1]: rounding in whoever wrote the log
 LONGEST_NAME = max(map(len, COLUMNS)) + 3  # what is longer is like none
 LARGEST_SEGMENT = 2**53  # float64 tells whole numbers apart below it
@@ -36,6 +41,50 @@ class Table(NamedTuple):
     def matrix(self, columns: Sequence[str]) -> np.ndarray:
         """Return some of the columns side by side, (num_rows, len(columns))."""
         return np.stack([self.columns[column] for column in columns], axis=1)
+
+
+class Rows:
+    """Rows of numbers, as a text file has them one after the other, on their way to a table.
+
+    They are kept in blocks of columns: a list of all rows and its transpose would be twice the memory.
+    """
+
+    def __init__(self, source: str, names: Sequence[str]):
+        self._source, self._names = source, names
+        self._blocks: list[dict[str, np.ndarray]] = []
+        self._values, self._lines = array("d"), array("q")
+
+    def __len__(self) -> int:
+        return len(self._lines)
+
+    def add(self, numbers: Iterable[float], line: int) -> None:
+        """Add a row.
+
+        Raises:
+            LogError: more numbers than there may be.
+        """
+        self._lines.append(line)
+        self._values.extend(numbers)
+        if len(self._values) >= BLOCK_VALUES:
+            check_number(self._source, len(self) * len(self._names))
+            self._end_block()
+
+    def _end_block(self) -> None:
+        rows = np.array(self._values, float).reshape(-1, len(self._names))
+        self._blocks.append(dict(zip(self._names, rows.T.copy(), strict=True)))
+        self._values = array("d")
+
+    def table(self) -> Table:
+        """Return the rows as a table; there are none any more."""
+        self._end_block()
+        columns = {name: np.concatenate([block.pop(name) for block in self._blocks]) for name in self._names}
+        return Table(self._source, columns, np.array(self._lines, np.int64))
+
+
+def check_number(source: str, num_values: int) -> None:
+    """Raise LogError for more numbers than a log may have."""
+    if num_values > LARGEST_VALUES:
+        raise LogError(f"{source}: found more than {LARGEST_VALUES} numbers, expected at most that")
 
 
 def check_names(source: str, names: Sequence[str]) -> None:

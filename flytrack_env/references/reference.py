@@ -8,7 +8,6 @@ import dataclasses
 import hashlib
 import io
 import json
-import reprlib
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +15,7 @@ import numpy as np
 
 from flytrack_env.dynamics import ModelParameters
 from flytrack_env.effects import BY_NAME
-from flytrack_env.files import check_size, write_atomically
+from flytrack_env.files import check_size, shown, write_atomically
 from flytrack_env.model_file import SIZES, model_as_json, model_from_json
 from flytrack_env.npz_file import NpzError, open_npz
 from flytrack_env.state import ACTION_SIZE, STATE_SIZE
@@ -84,17 +83,25 @@ def shipped_path(track: str, kind: str, model_name: str) -> Path:
     return FOLDER / f"{track}_{model_name}_{kind}.npz"
 
 
+def is_shipped(track: str, kind: str, model_name: str) -> bool:
+    """Return whether there is a reference of that track, kind and model.
+
+    A stranger's track can have any name, also that of another folder's file.
+    """
+    return shipped_path(track, kind, model_name) in FOLDER.glob("*.npz")
+
+
 def shipped_reference(track: str, kind: str = "flying", model_name: str = "nominal") -> Reference:
     """Return a shipped reference by the names of track, kind ("flying", "standing") and model.
 
     Raises:
         ReferenceFileError: none of these names; the message lists those that are there.
     """
-    path = shipped_path(track, kind, model_name)
-    if not path.is_file():
+    if not is_shipped(track, kind, model_name):
+        name = shown(shipped_path(track, kind, model_name).stem)
         names = ", ".join(sorted(found.stem for found in FOLDER.glob("*.npz"))) or "none"
-        raise ReferenceFileError(f"reference: found no {path.stem!r}, expected one of {names}")
-    return load_reference(path)
+        raise ReferenceFileError(f"reference: found no {name}, expected one of {names}")
+    return load_reference(shipped_path(track, kind, model_name))
 
 
 def save_reference(path: str | Path, reference: Reference) -> None:
@@ -139,7 +146,7 @@ def _check_arrays(path: Path, data: dict[str, np.ndarray]) -> None:
             raise ReferenceFileError(f"{path}: {name}: found something else, expected finite numbers")
     times_s = data["gate_times_s"]
     if times_s.ndim != 1 or times_s.size == 0 or (times_s < 0.0).any() or (np.diff(times_s) < 0.0).any():
-        found = f"{times_s.shape}, {reprlib.repr(times_s.tolist())}"
+        found = f"{times_s.shape}, {shown(times_s.tolist())}"
         raise ReferenceFileError(f"{path}: gate_times_s: found {found}, expected a row of growing times, s")
     most = np.abs(data["commands"]).max()
     if most > 1.0 + BEYOND:
@@ -163,7 +170,7 @@ def _read(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     if missing:
         raise ReferenceFileError(f"{path}: notes: {', '.join(missing)}: missing")
     if notes["version"] != FILE_VERSION:
-        found = reprlib.repr(notes["version"])
+        found = shown(notes["version"])
         raise ReferenceFileError(f"{path}: version: found {found}, expected {FILE_VERSION}")
     _check_notes(path, notes)
     return data, notes
@@ -174,16 +181,16 @@ def _check_notes(path: Path, notes: dict[str, Any]) -> None:
     for name in (*TEXTS, "found"):
         is_text = name in TEXTS
         if not isinstance(notes[name], str if is_text else dict):
-            found, expected = reprlib.repr(notes[name]), "a text" if is_text else "an object"
+            found, expected = shown(notes[name]), "a text" if is_text else "an object"
             raise ReferenceFileError(f"{path}: {name}: found {found}, expected {expected}")
     for name in ("dt_s", "time_s"):
         value = notes[name]
         is_number = isinstance(value, (int, float)) and not isinstance(value, bool)
         if not is_number or not 0.0 < value < LONGEST_S:
-            found = reprlib.repr(value)
+            found = shown(value)
             raise ReferenceFileError(f"{path}: {name}: found {found}, expected seconds above 0")
     if notes["kind"] not in KINDS:
-        found = reprlib.repr(notes["kind"])
+        found = shown(notes["kind"])
         raise ReferenceFileError(f"{path}: kind: found {found}, expected one of {', '.join(KINDS)}")
 
 

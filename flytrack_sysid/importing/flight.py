@@ -1,14 +1,20 @@
 """What a reader returns of one file, and which of its rows are used."""
 
 import csv
+import io
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
+from flytrack_env.files import AtMost, named, shown
 from flytrack_sysid.importing.craft import Craft
 from flytrack_sysid.importing.mapping import Manifest, Mapping
 from flytrack_sysid.log import FlightLog, LogError
+
+LARGEST_MANIFEST_BYTES = 2**24
+MOST_DIGITS = 15
+LONGEST_LIST = 1000  # characters of a header
 
 
 class Flight(NamedTuple):
@@ -44,20 +50,31 @@ def _count_of(path: Path, said: Manifest) -> int:
     """Return how many rows of a file the manifest beside it says to use."""
     manifest = path.parent / said.file
     try:
-        with manifest.open(encoding="utf-8-sig", newline="") as file:
-            table = csv.DictReader(file, strict=True)
-            entries, names = list(table), table.fieldnames or []
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        with manifest.open("rb") as file:
+            content = io.BufferedReader(AtMost(file, LARGEST_MANIFEST_BYTES))
+            text = io.TextIOWrapper(content, encoding="utf-8-sig", newline="")
+            count = _find_count(manifest, csv.DictReader(text, strict=True), said, path.name)
+    except (OSError, ValueError, csv.Error) as error:  # ValueError: no text, or a NUL in the name
+        if isinstance(error, LogError):
+            raise
         raise LogError(f"{manifest}: cannot be read as a manifest: {error}") from error
+    if count is None:
+        raise LogError(f"{manifest}: column {said.key}: {path.name}: missing")
+    return count
+
+
+def _find_count(manifest: Path, table: "csv.DictReader[str]", said: Manifest, file: str) -> int | None:
+    """Return what a manifest's row of a file says, None where there is no such row."""
+    names = table.fieldnames or []
     for name in (said.key, said.count):
         if name not in names:
-            raise LogError(f"{manifest}: column {name}: missing; found {', '.join(names)}")
-    for entry in entries:
-        if entry[said.key] == path.name:
-            text = entry[said.count]
-            if not (text or "").strip().isdecimal():
-                raise LogError(
-                    f"{manifest}: {path.name}: {said.count}: found {text!r}, expected a whole number"
-                )
+            listed = ", ".join(map(named, names))[:LONGEST_LIST]
+            raise LogError(f"{manifest}: column {name}: missing; found {listed}")
+    for entry in table:
+        if entry[said.key] == file:
+            text = (entry[said.count] or "").strip()
+            if not text.isdecimal() or len(text) > MOST_DIGITS:
+                expected = f"a whole number of at most {MOST_DIGITS} digits"
+                raise LogError(f"{manifest}: {file}: {said.count}: found {shown(text)}, expected {expected}")
             return int(text)
-    raise LogError(f"{manifest}: column {said.key}: {path.name}: missing")
+    return None
