@@ -5,7 +5,6 @@ the whole new one.
 import io
 import itertools
 import os
-import reprlib
 import secrets
 from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO
@@ -14,21 +13,6 @@ if TYPE_CHECKING:
     from _typeshed import WriteableBuffer
 
 READ_BYTES = 2**20
-LONGEST_NAME = 60  # characters
-
-
-def named(name: object) -> str:
-    """Return a name out of a stranger's file as a message can have it: short, and of printable characters."""
-    text = str(name)
-    return text if text.isprintable() and len(text) <= LONGEST_NAME else reprlib.repr(text)
-
-
-def shown(value: object) -> str:
-    """Return a value out of a stranger's file as a message can have it: short."""
-    try:
-        return reprlib.repr(value)
-    except ValueError:  # Python writes no numbers of more than 4300 digits
-        return "a number of thousands of digits"
 
 
 class TooLargeError(OSError):

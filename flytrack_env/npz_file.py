@@ -6,7 +6,6 @@ import contextlib
 import io
 import math
 import re
-import reprlib
 import struct
 import zipfile
 from collections.abc import Iterator
@@ -14,6 +13,8 @@ from pathlib import Path
 from typing import BinaryIO, NamedTuple
 
 import numpy as np
+
+from flytrack_env.words import said, shown
 
 UNPACKED = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)  # whose unpacking zipfile bounds, as it does no other's
 HEADERS = {
@@ -93,7 +94,7 @@ class NpzFile:
         except NpzError:
             raise
         except Exception as error:  # damaged archives raise anything from struct.error to RuntimeError
-            raise NpzError(f"damaged, cannot be read: {type(error).__name__}: {error}") from error
+            raise NpzError(f"damaged, cannot be read: {type(error).__name__}: {said(error)}") from error
 
 
 def _named(dtype: np.dtype) -> str:
@@ -106,7 +107,7 @@ def _check(header: Header, num_bytes: int) -> None:
     if dtype.hasobject:
         raise NpzError(f"found an array of {_named(dtype)}, expected plain values: pickles are never read")
     if not all(type(size) is int and size >= 0 for size in shape) or dtype.itemsize == 0:
-        found = f"an array of {_named(dtype)}, shape {reprlib.repr(shape)}"
+        found = f"an array of {_named(dtype)}, shape {shown(shape)}"
         raise NpzError(f"found {found}, expected one of values that take room")
     if header.num_values * dtype.itemsize != num_bytes:
         numbers = "numbers" if dtype.kind in "iuf" else "values"
@@ -129,7 +130,7 @@ def open_npz(path: Path) -> Iterator[NpzFile]:
         except NpzError:
             raise
         except Exception as error:  # as above
-            raise NpzError(f"not an .npz file, or cut off: {error}") from error
+            raise NpzError(f"not an .npz file, or cut off: {said(error)}") from error
         with archive:
             yield NpzFile(archive)
 

@@ -9,7 +9,6 @@ a rollout from a stranger cannot run code.
 import io
 import math
 import os
-import reprlib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import BinaryIO
@@ -20,6 +19,7 @@ from numpy.typing import ArrayLike
 
 from flytrack_env.files import write_atomically
 from flytrack_env.state import ACTION_SIZE, APPLIED_ACTION, STATE_SIZE
+from flytrack_env.words import said, shown
 
 ROW_SIZE = STATE_SIZE + ACTION_SIZE
 SHORT_ROW_SIZE = ROW_SIZE - 3
@@ -74,12 +74,12 @@ def load_rollout(path: str | Path, allow_pickle: bool = False) -> tuple[np.ndarr
             is_pickled = _check_header(path, file, allow_pickle)
             rows = np.load(file, allow_pickle=is_pickled)
     except OSError as error:
-        raise RolloutError(f"{path}: cannot be read: {error}; expected {EXPECTED}") from error
+        raise RolloutError(f"{path}: cannot be read: {said(error)}; expected {EXPECTED}") from error
     except RolloutError:
         raise
     except (Exception, SystemExit) as error:  # whatever unpickling and damaged headers raise
-        said = f"{type(error).__name__}: {error}"
-        raise RolloutError(f"{path}: cannot be read: {said}; expected {EXPECTED}") from error
+        found = f"{type(error).__name__}: {said(error)}"
+        raise RolloutError(f"{path}: cannot be read: {found}; expected {EXPECTED}") from error
     if is_pickled:
         rows = _rows_of_pairs(path, rows)
     rows = _widened(_as_rows(path, rows))
@@ -118,7 +118,7 @@ def _check_header(path: Path, file: BinaryIO, allow_pickle: bool) -> bool:
         read = npy_format.read_array_header_1_0 if is_first else npy_format.read_array_header_2_0
         shape, _, dtype = read(file)
     except ValueError as error:
-        raise RolloutError(f"{path}: not an .npy file: {error}; expected {EXPECTED}") from error
+        raise RolloutError(f"{path}: not an .npy file: {said(error)}; expected {EXPECTED}") from error
     if dtype.hasobject and allow_pickle:
         file.seek(0)
         return True
@@ -127,7 +127,7 @@ def _check_header(path: Path, file: BinaryIO, allow_pickle: bool) -> bool:
         found = f"an object array (pickled; {PICKLED})" if dtype.hasobject else array
         raise RolloutError(f"{path}: found {found}, expected {EXPECTED}")
     if len(shape) != 2 or shape[1] not in (ROW_SIZE, SHORT_ROW_SIZE) or shape[0] < 1 or shape[0] is True:
-        raise RolloutError(f"{path}: found shape {reprlib.repr(shape)}, expected {EXPECTED}")
+        raise RolloutError(f"{path}: found shape {shown(shape)}, expected {EXPECTED}")
     announced = math.prod(shape) * dtype.itemsize
     found_bytes = os.fstat(file.fileno()).st_size - file.tell()
     if found_bytes < announced:
@@ -150,7 +150,9 @@ def _rows_of_pairs(path: Path, pairs: np.ndarray) -> np.ndarray:
         try:
             x, u = (np.asarray(part, float) for part in pair)
         except (TypeError, ValueError) as error:
-            raise RolloutError(f"{path}: step {step}: {error}; expected a pair of {expected}") from error
+            raise RolloutError(
+                f"{path}: step {step}: {said(error)}; expected a pair of {expected}"
+            ) from error
         size = sizes.get(len(rows[0])) if rows else x.size
         if u.shape != (ACTION_SIZE,) or x.shape != (size,) or size not in sizes.values():
             found = f"shapes {x.shape} and {u.shape}"

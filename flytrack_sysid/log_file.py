@@ -6,7 +6,6 @@ a header of column names, then one row of numbers, separated by commas, per samp
 
 import csv
 import io
-import reprlib
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -15,6 +14,7 @@ import numpy as np
 
 from flytrack_env.files import AtMost, TooLargeError, check_size, write_atomically
 from flytrack_env.npz_file import Header, NpzError, NpzFile, open_npz
+from flytrack_env.words import said, shown
 from flytrack_sysid.log import CHANNELS, GAP_STEPS, FlightLog, LogError, usual_step
 from flytrack_sysid.log_table import Rows, Table, check_names, check_number, log_of_table
 
@@ -47,7 +47,7 @@ def load_log(path: str | Path) -> FlightLog:
     except TooLargeError as error:
         raise LogError(f"{path}: {error}") from error
     except (OSError, ValueError) as error:  # ValueError: a NUL in the name
-        raise LogError(f"{path}: cannot be read: {error}") from error
+        raise LogError(f"{path}: cannot be read: {said(error)}") from error
     return log_of_table(table)
 
 
@@ -169,14 +169,14 @@ def _read_csv(path: Path) -> Table:
         try:
             return _table(str(path), rows)
         except (UnicodeDecodeError, csv.Error) as error:
-            raise LogError(f"{path}: near line {rows.line_num + 1}: not a CSV file: {error}") from error
+            raise LogError(f"{path}: near line {rows.line_num + 1}: not a CSV file: {said(error)}") from error
 
 
 def _table(source: str, rows: "_csv.Reader") -> Table:
     """Return the columns of the rows of a CSV file, the first of which has their names."""
     header = [name.strip() for name in next(rows, [])]
     if len(header) == 1 and any(mark in header[0] for mark in ";\t"):
-        found = f"no comma in {reprlib.repr(header[0])}"
+        found = f"no comma in {shown(header[0])}"
         raise LogError(f"{source}: line 1: found {found}, expected names with commas")
     check_names(source, header)
     table_rows = Rows(source, header)
@@ -196,7 +196,7 @@ def _numbers(source: str, header: list[str], cells: list[str], row: int, line: i
         return [_number(cell) for cell in cells]
     except ValueError:
         column, cell = next(pair for pair in zip(header, cells, strict=True) if not _is_number(pair[1]))
-    found = reprlib.repr(cell) if cell.strip() else "an empty cell"
+    found = shown(cell) if cell.strip() else "an empty cell"
     raise LogError(f"{place}, column {column}: found {found}, expected a number")
 
 

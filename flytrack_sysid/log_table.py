@@ -1,13 +1,13 @@
 """Checks of the columns of a file on their way to a flight log; every refusal says where it stands."""
 
 import difflib
-import reprlib
 from array import array
 from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 import numpy as np
 
+from flytrack_env.words import shown
 from flytrack_sysid.log import CHANNELS, COLUMNS, REQUIRED, FlightLog, LogError
 
 LARGEST_NORM_ERROR = 1e-2  # of quaternions: estimators drift a little; more is no unit quaternion
@@ -93,9 +93,7 @@ def check_names(source: str, names: Sequence[str]) -> None:
         if name not in COLUMNS:
             near = difflib.get_close_matches(name[:LONGEST_NAME].lower(), COLUMNS, n=1)
             hint = f"; did you mean {near[0]}?" if near else ""
-            raise LogError(
-                f"{source}: column {reprlib.repr(name)}: unknown{hint} (known: {', '.join(COLUMNS)})"
-            )
+            raise LogError(f"{source}: column {shown(name)}: unknown{hint} (known: {', '.join(COLUMNS)})")
         if names.count(name) > 1:
             raise LogError(f"{source}: column {name}: found {names.count(name)} times, expected once")
     for name in REQUIRED:

@@ -10,7 +10,6 @@ commands    (N, T, 4)       commands in [-1, 1], one per 0.01 s
 """
 
 import io
-import reprlib
 from collections.abc import Iterable
 from pathlib import Path
 from typing import NamedTuple
@@ -20,6 +19,7 @@ import numpy as np
 from flytrack_env.files import check_size, write_atomically
 from flytrack_env.npz_file import open_npz
 from flytrack_env.state import ACTION_SIZE, APPLIED_ACTION, QUATERNION, STATE_SIZE
+from flytrack_env.words import said, shown
 from flytrack_sysid.envelope import ANY_VOLTAGE, FEWEST_STEPS, LARGEST_SPEED, SCRIPT_HEIGHTS, is_inside
 from flytrack_sysid.excitation import Flight
 from flytrack_sysid.manoeuvres import MANOEUVRES
@@ -77,7 +77,7 @@ def check_script(script: Script, source: str = "script") -> None:
     unknown = [kind for kind in kinds if kind not in MANOEUVRES]
     if unknown:
         raise ScriptError(
-            f"{source}: kinds: found {reprlib.repr(unknown[0])}, expected one of {', '.join(MANOEUVRES)}"
+            f"{source}: kinds: found {shown(unknown[0])}, expected one of {', '.join(MANOEUVRES)}"
         )
     _check_ranges(starts, commands, source)
 
@@ -134,7 +134,7 @@ def load_script(path: str | Path) -> Script:
     try:
         kinds = tuple(arrays["kinds"].tolist())
     except ValueError as error:  # numbers that are no characters
-        raise ScriptError(f"{path}: kinds: {error}; expected a row of names") from error
+        raise ScriptError(f"{path}: kinds: {said(error)}; expected a row of names") from error
     script = Script(kinds, arrays["starts"].astype(float), arrays["commands"].astype(float))
     check_script(script, str(path))
     return script
@@ -159,5 +159,5 @@ def _arrays(path: Path) -> dict[str, np.ndarray]:
     except ScriptError:
         raise
     except (OSError, ValueError) as error:  # ValueError: NpzError, or a NUL in the name
-        found = f"{type(error).__name__}: {error}"
+        found = f"{type(error).__name__}: {said(error)}"
         raise ScriptError(f"{path}: not a script, or damaged; nothing is unpickled: {found}") from error

@@ -16,7 +16,8 @@ from baselines.purejaxrl_ppo.config import Config, config_from_json
 from baselines.purejaxrl_ppo.named_arrays import as_named_arrays, find_misfits, from_named_arrays
 from baselines.purejaxrl_ppo.networks import ActorCritic, make_network
 from baselines.purejaxrl_ppo.unpack import LARGEST_BYTES, UnpackError, unpack
-from flytrack_env.files import read_at_most, shown, write_atomically
+from flytrack_env.files import read_at_most, write_atomically
+from flytrack_env.words import said, shown
 
 FORMAT = "flytrack-ppo-2"
 FORMAT_WITHOUT_TRAINING = "flytrack-ppo-1"  # of before there was a checksum and a state of the training
@@ -150,7 +151,7 @@ def load_checkpoint(path: str | Path) -> Checkpoint:
     except CheckpointError:
         raise
     except (KeyError, IndexError, TypeError, AttributeError, ValueError) as error:
-        raise CheckpointError(f"{path}: damaged description or parameters: {error}") from error
+        raise CheckpointError(f"{path}: damaged description or parameters: {said(error)}") from error
 
 
 def _read_content(path: Path) -> Any:
@@ -170,9 +171,9 @@ def _read_content(path: Path) -> Any:
             )
         return unpack(content)
     except OSError as error:
-        raise CheckpointError(f"{path}: cannot be read: {error}") from error
+        raise CheckpointError(f"{path}: cannot be read: {said(error)}") from error
     except UnpackError as error:
-        raise CheckpointError(f"{path}: not a checkpoint, or damaged: {error}") from error
+        raise CheckpointError(f"{path}: not a checkpoint, or damaged: {said(error)}") from error
 
 
 def _check_size(path: Path, config: Config, size: Any) -> None:

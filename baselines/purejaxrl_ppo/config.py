@@ -13,8 +13,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from flytrack_env.files import named, shown
 from flytrack_env.toml_file import TomlError, parse_toml, read_text
+from flytrack_env.words import named, said, shown
 
 COUNTS = ("num_envs", "num_steps", "episode_steps", "update_epochs", "num_minibatches")
 SHARES = ("final_learning_rate_fraction", "gamma", "gae_lambda")
@@ -174,9 +174,9 @@ def settings_in_file(path: Path) -> dict[str, Any]:
     try:
         values = parse_toml(read_text(path))
     except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path}: cannot be read: {error}") from error
+        raise ConfigError(f"{path}: cannot be read: {said(error)}") from error
     except TomlError as error:
-        raise ConfigError(f"{path}: not a TOML file: {error}") from error
+        raise ConfigError(f"{path}: not a TOML file: {said(error)}") from error
     for name in values:
         if name not in FIELD_TYPES:
             raise ConfigError(f"{path}: {named(name)}: unknown; expected one of {', '.join(FIELD_TYPES)}")

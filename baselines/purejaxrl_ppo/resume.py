@@ -28,8 +28,8 @@ from baselines.purejaxrl_ppo.journal import Journal
 from baselines.purejaxrl_ppo.named_arrays import as_named_arrays, find_misfits, from_named_arrays
 from baselines.purejaxrl_ppo.options import OPTIONS
 from baselines.purejaxrl_ppo.ppo import Runner
-from flytrack_env.files import shown
 from flytrack_env.model_file import model_as_json
+from flytrack_env.words import shown
 
 FINAL = "final.msgpack"
 SEED_FOLDER = re.compile(r"seed(\d+)")

@@ -10,6 +10,8 @@ import jax.numpy as jnp
 import msgpack
 import numpy as np
 
+from flytrack_env.words import said
+
 LARGEST_BYTES = 2**28  # of a file: three times that in memory
 MOST_ENTRIES = 100_000  # of all maps together
 LONGEST_NAME = 200  # characters
@@ -66,4 +68,4 @@ def unpack(content: bytes) -> Any:
     except UnpackError:
         raise
     except Exception as error:  # msgpack raises what it likes on damaged bytes
-        raise UnpackError(f"{type(error).__name__}: {error}") from error
+        raise UnpackError(f"{type(error).__name__}: {said(error)}") from error

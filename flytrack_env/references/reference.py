@@ -15,11 +15,12 @@ import numpy as np
 
 from flytrack_env.dynamics import ModelParameters
 from flytrack_env.effects import BY_NAME
-from flytrack_env.files import check_size, shown, write_atomically
+from flytrack_env.files import check_size, write_atomically
 from flytrack_env.model_file import SIZES, model_as_json, model_from_json
 from flytrack_env.npz_file import NpzError, open_npz
 from flytrack_env.state import ACTION_SIZE, STATE_SIZE
 from flytrack_env.tracks import Track
+from flytrack_env.words import said, shown
 
 FOLDER = Path(__file__).parent
 KINDS = ("flying", "standing")
@@ -165,7 +166,9 @@ def _read(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
             data = {name: archive.read(name) for name in (*ARRAYS, "notes")}
         notes = json.loads(str(data.pop("notes")))
     except (OSError, ValueError, RecursionError) as error:  # ValueError: NpzError, no text, no JSON
-        raise ReferenceFileError(f"{path}: cannot be read: {error}; expected a reference file") from error
+        raise ReferenceFileError(
+            f"{path}: cannot be read: {said(error)}; expected a reference file"
+        ) from error
     missing = [name for name in (*NOTES, "found") if not isinstance(notes, dict) or name not in notes]
     if missing:
         raise ReferenceFileError(f"{path}: notes: {', '.join(missing)}: missing")
@@ -204,7 +207,9 @@ def _model_of(path: Path, values: Any) -> ModelParameters:
             *(BY_NAME[name].parameters(**numbers) for name, numbers in effects)
         )
     except (AttributeError, KeyError, TypeError, ValueError) as error:
-        raise ReferenceFileError(f"{path}: model: cannot be read: {error!r}") from error
+        raise ReferenceFileError(
+            f"{path}: model: cannot be read: {type(error).__name__}: {said(error)}"
+        ) from error
 
 
 def load_reference(path: str | Path) -> Reference:

@@ -13,8 +13,9 @@ from typing import Any
 
 import numpy as np
 
-from flytrack_env.files import named, shown, write_atomically
+from flytrack_env.files import write_atomically
 from flytrack_env.toml_file import TomlError, parse_toml, read_text
+from flytrack_env.words import named, said, shown
 
 TRACK_FOLDER = Path(__file__).parent
 DIRECTIONS = {"+y": 1.0, "-y": -1.0}
@@ -87,7 +88,7 @@ def load_track(name_or_path: str | Path) -> Track:
     try:
         text = read_text(path)
     except (OSError, UnicodeDecodeError) as error:
-        raise TrackError(f"{path}: cannot be read: {error}") from error
+        raise TrackError(f"{path}: cannot be read: {said(error)}") from error
     return _parse(path, text)
 
 
@@ -153,7 +154,7 @@ def _parse(path: Path, text: str) -> Track:
     try:
         data = parse_toml(text)
     except TomlError as error:
-        raise TrackError(f"{path}: not a TOML file: {error}") from error
+        raise TrackError(f"{path}: not a TOML file: {said(error)}") from error
     return _Reader(path, text).track(data)
 
 

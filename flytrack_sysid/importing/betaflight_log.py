@@ -10,7 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from flytrack_env.files import named, read_at_most, shown
+from flytrack_env.files import read_at_most
+from flytrack_env.words import named, said, shown
 from flytrack_sysid.importing.craft import Craft
 from flytrack_sysid.importing.decoding import decode
 from flytrack_sysid.importing.flight import Flight
@@ -173,7 +174,7 @@ def _count(path: Path) -> int:
     try:
         content = read_at_most(path, LARGEST_BYTES)
     except OSError as error:
-        raise LogError(f"{path}: cannot be read: {error}") from error
+        raise LogError(f"{path}: cannot be read: {said(error)}") from error
     if not content.startswith(FIRST_BYTES):
         raise LogError(f"{path}: found {content[: len(FIRST_BYTES)]!r} first, expected {FIRST_BYTES!r}")
     logs = content.split(FIRST_BYTES)[1:]

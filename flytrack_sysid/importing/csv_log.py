@@ -13,7 +13,8 @@ from typing import TYPE_CHECKING, BinaryIO, TextIO, cast
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from flytrack_env.files import AtMost, named, shown
+from flytrack_env.files import AtMost
+from flytrack_env.words import named, said, shown
 from flytrack_sysid.importing.flight import Flight
 from flytrack_sysid.importing.mapping import Attitude, Columns, Command, Mapping, Vector
 from flytrack_sysid.importing.units import quaternion_from, vector_from
@@ -79,7 +80,7 @@ def _opened(path: Path) -> Iterator[TextIO]:
     except (OSError, EOFError, zlib.error, ValueError) as error:
         if isinstance(error, LogError):
             raise
-        raise LogError(f"{path}: cannot be read as text: {error}") from error
+        raise LogError(f"{path}: cannot be read as text: {said(error)}") from error
 
 
 def _read(path: Path, columns: Columns, mapping: str) -> Table:
@@ -89,7 +90,7 @@ def _read(path: Path, columns: Columns, mapping: str) -> Table:
         try:
             return _table(path, rows, columns, mapping)
         except csv.Error as error:
-            raise LogError(f"{path}: near line {rows.line_num + 1}: not a CSV file: {error}") from error
+            raise LogError(f"{path}: near line {rows.line_num + 1}: not a CSV file: {said(error)}") from error
 
 
 def _table(path: Path, rows: "_csv.Reader", columns: Columns, mapping: str) -> Table:

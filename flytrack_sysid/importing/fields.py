@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from flytrack_env.files import named, shown
 from flytrack_env.toml_file import TomlError, parse_toml, read_text
+from flytrack_env.words import named, said, shown
 from flytrack_sysid.log import LogError
 
 LARGEST_COUNT = 2**53
@@ -24,7 +24,7 @@ def read_toml(path: Path) -> dict[str, Any]:
     try:
         return parse_toml(read_text(path))
     except (OSError, UnicodeDecodeError, TomlError) as error:
-        raise LogError(f"{path}: not a readable TOML file: {error}") from error
+        raise LogError(f"{path}: not a readable TOML file: {said(error)}") from error
 
 
 class Fields:

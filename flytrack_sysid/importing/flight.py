@@ -7,7 +7,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from flytrack_env.files import AtMost, named, shown
+from flytrack_env.files import AtMost
+from flytrack_env.words import named, said, shown
 from flytrack_sysid.importing.craft import Craft
 from flytrack_sysid.importing.mapping import Manifest, Mapping
 from flytrack_sysid.log import FlightLog, LogError
@@ -46,35 +47,36 @@ def used_rows(path: Path, log: FlightLog, mapping: Mapping) -> FlightLog:
     return log.select(is_used)
 
 
-def _count_of(path: Path, said: Manifest) -> int:
+def _count_of(path: Path, asked: Manifest) -> int:
     """Return how many rows of a file the manifest beside it says to use."""
-    manifest = path.parent / said.file
+    manifest = path.parent / asked.file
+    where = f"{path.parent}/{named(asked.file)}"
     try:
         with manifest.open("rb") as file:
             content = io.BufferedReader(AtMost(file, LARGEST_MANIFEST_BYTES))
             text = io.TextIOWrapper(content, encoding="utf-8-sig", newline="")
-            count = _find_count(manifest, csv.DictReader(text, strict=True), said, path.name)
+            count = _find_count(where, csv.DictReader(text, strict=True), asked, path.name)
     except (OSError, ValueError, csv.Error) as error:  # ValueError: no text, or a NUL in the name
         if isinstance(error, LogError):
             raise
-        raise LogError(f"{manifest}: cannot be read as a manifest: {error}") from error
+        raise LogError(f"{where}: cannot be read as a manifest: {said(error)}") from error
     if count is None:
-        raise LogError(f"{manifest}: column {said.key}: {path.name}: missing")
+        raise LogError(f"{where}: column {named(asked.key)}: {path.name}: missing")
     return count
 
 
-def _find_count(manifest: Path, table: "csv.DictReader[str]", said: Manifest, file: str) -> int | None:
+def _find_count(where: str, table: "csv.DictReader[str]", asked: Manifest, file: str) -> int | None:
     """Return what a manifest's row of a file says, None where there is no such row."""
     names = table.fieldnames or []
-    for name in (said.key, said.count):
+    for name in (asked.key, asked.count):
         if name not in names:
             listed = ", ".join(map(named, names))[:LONGEST_LIST]
-            raise LogError(f"{manifest}: column {name}: missing; found {listed}")
+            raise LogError(f"{where}: column {named(name)}: missing; found {listed}")
     for entry in table:
-        if entry[said.key] == file:
-            text = (entry[said.count] or "").strip()
+        if entry[asked.key] == file:
+            text = (entry[asked.count] or "").strip()
             if not text.isdecimal() or len(text) > MOST_DIGITS:
-                expected = f"a whole number of at most {MOST_DIGITS} digits"
-                raise LogError(f"{manifest}: {file}: {said.count}: found {shown(text)}, expected {expected}")
+                found, expected = shown(text), f"a whole number of at most {MOST_DIGITS} digits"
+                raise LogError(f"{where}: {file}: {named(asked.count)}: found {found}, expected {expected}")
             return int(text)
     return None

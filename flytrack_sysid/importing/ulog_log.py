@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from flytrack_env.words import said
 from flytrack_sysid.importing.craft import Craft
 from flytrack_sysid.importing.decoding import decode
 from flytrack_sysid.importing.flight import Flight
@@ -74,7 +75,7 @@ class _Topics:
             with path.open("rb") as file:
                 found = file.read(len(FIRST_BYTES))
         except OSError as error:
-            raise LogError(f"{path}: cannot be read: {error}") from error
+            raise LogError(f"{path}: cannot be read: {said(error)}") from error
         if found != FIRST_BYTES:
             raise LogError(f"{path}: found {found!r} first, expected {FIRST_BYTES!r}, as every ULog begins")
         notes, arrays = decode(str(path), "ulog", path, FIELDS)
