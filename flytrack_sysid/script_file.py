@@ -19,7 +19,7 @@ import numpy as np
 from flytrack_env.files import check_size, write_atomically
 from flytrack_env.npz_file import open_npz
 from flytrack_env.state import ACTION_SIZE, APPLIED_ACTION, QUATERNION, STATE_SIZE
-from flytrack_env.words import said, shown
+from flytrack_env.words import named, said, shown
 from flytrack_sysid.envelope import ANY_VOLTAGE, FEWEST_STEPS, LARGEST_SPEED, SCRIPT_HEIGHTS, is_inside
 from flytrack_sysid.excitation import Flight
 from flytrack_sysid.manoeuvres import MANOEUVRES
@@ -151,7 +151,7 @@ def _arrays(path: Path) -> dict[str, np.ndarray]:
         with open_npz(path) as archive:
             names = sorted(archive.names)
             if names != sorted(ARRAYS):
-                found = ", ".join(names)[:LONGEST_LIST]
+                found = ", ".join(map(named, names))[:LONGEST_LIST]
                 raise ScriptError(f"{path}: found arrays {found}, expected {', '.join(ARRAYS)}")
             num_values = sum(archive.header(name).num_values for name in ARRAYS)
             check_size(max(archive.num_bytes, num_values * np.dtype(float).itemsize), LARGEST_BYTES)

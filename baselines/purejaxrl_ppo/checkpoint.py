@@ -17,7 +17,7 @@ from baselines.purejaxrl_ppo.named_arrays import as_named_arrays, find_misfits, 
 from baselines.purejaxrl_ppo.networks import ActorCritic, make_network
 from baselines.purejaxrl_ppo.unpack import LARGEST_BYTES, UnpackError, unpack
 from flytrack_env.files import read_at_most, write_atomically
-from flytrack_env.words import said, shown
+from flytrack_env.words import named, said, shown
 
 FORMAT = "flytrack-ppo-2"
 FORMAT_WITHOUT_TRAINING = "flytrack-ppo-1"  # of before there was a checksum and a state of the training
@@ -81,7 +81,7 @@ def find_differences(found: Any, expected: Any, where: str) -> list[str]:
         return [
             line
             for name in names
-            for line in find_differences(found.get(name), expected.get(name), f"{where}.{name}")
+            for line in find_differences(found.get(name), expected.get(name), f"{where}.{named(name)}")
         ]
     if isinstance(found, list) and isinstance(expected, list) and len(found) == len(expected):
         pairs = enumerate(zip(found, expected, strict=True))

@@ -84,7 +84,7 @@ def _damage_message(rng: Rng, kind: bytes, content: bytes) -> bytes:
     """Return another content of a message."""
     way = rng.random()
     if kind == b"F" and way < 0.8:
-        name = content.split(b":")[0].decode() if way < 0.6 else "other"
+        name = content.split(b":")[0].decode(errors="replace") if way < 0.6 else "other"
         field = str(rng.choice(FORMATS))
         return f"{name}:uint64_t timestamp;{field};".encode()
     if kind == b"P" and way < 0.8:
@@ -194,5 +194,5 @@ def hostile_blackboxes(content: bytes) -> list[bytes]:
     return [
         wide + b"I" * 2**18 + b"E\xffEnd of log\x00",
         blackbox(rows, BLACKBOX_NAMES, {**BLACKBOX_HEADERS, **waiting}),
-        content * 3000,
+        content * 700,
     ]

@@ -7,7 +7,7 @@ import numpy as np
 
 Rng = np.random.Generator
 
-LARGEST_BYTES = 2**20  # of what becomes of a file: small ones are enough, and cheap
+LARGEST_BYTES = 2**19  # twice that, of what becomes of a file: small ones are enough, and cheap
 LONGEST_NOISE = 64
 WORDS = [0, 1, 2**7, 2**15, 2**16 - 1, 2**31 - 1, 2**31, 2**32 - 1, 2**40, 2**63 - 1, 2**63, 2**64 - 1]
 # What stands where text has a number, a string, or anything.

@@ -1,5 +1,6 @@
 """Damage to what JSON and TOML hold: values of other kinds and sizes, names missing, new or twice."""
 
+import copy
 import json
 import math
 from typing import Any
@@ -45,7 +46,7 @@ def odd_value(rng: Rng, value: Any) -> Any:
         factor = float(rng.choice([-1.0, 0.0, 0.5, 2.0, 1000.0, 1e30]))
         return value * factor if rng.random() < 0.7 else str(value)
     if type(value) is int and rng.random() < 0.4:
-        return [value + 1, value - 1, -value, 2 * value, float(min(value, 10**6)), 1000 * value][
+        return [value + 1, value - 1, -value, 2 * value, float(max(min(value, 10**6), -1)), 1000 * value][
             int(rng.integers(6))
         ]
     if isinstance(value, list) and rng.random() < 0.5:
@@ -54,7 +55,11 @@ def odd_value(rng: Rng, value: Any) -> Any:
         ]
     if isinstance(value, str) and rng.random() < 0.3:
         return value[:-1] if rng.random() < 0.5 else value + "x"
-    return ODD[int(rng.integers(len(ODD)))]
+    return _odd(rng)
+
+
+def _odd(rng: Rng) -> Any:
+    return copy.deepcopy(ODD[int(rng.integers(len(ODD)))])  # what is put into a tree may be damaged next
 
 
 def damage_tree(rng: Rng, tree: Any) -> Any:
@@ -63,7 +68,7 @@ def damage_tree(rng: Rng, tree: Any) -> Any:
     for _ in range(int(rng.integers(1, 4))):
         places = _places(tree)
         if not places:
-            return ODD[int(rng.integers(len(ODD)))]
+            return _odd(rng)
         holder, name = places[int(rng.integers(len(places)))]
         way = rng.random()
         if way < 0.7:
@@ -72,11 +77,11 @@ def damage_tree(rng: Rng, tree: Any) -> Any:
             del holder[name]
         elif isinstance(holder, dict):
             key = ["x", "../x", "", name.upper(), "x" * 5000, "a\nb", "version"][int(rng.integers(7))]
-            holder[key] = holder[name] if rng.random() < 0.5 else holder.pop(name)
+            holder[key] = copy.deepcopy(holder[name]) if rng.random() < 0.5 else holder.pop(name)
         else:
-            holder.insert(name, holder[name])
+            holder.insert(name, copy.deepcopy(holder[name]))
     if rng.random() < 0.02:
-        return ODD[int(rng.integers(len(ODD)))]
+        return _odd(rng)
     return tree
 
 
