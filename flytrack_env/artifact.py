@@ -27,7 +27,12 @@ class ArtifactError(ValueError):
 
 def said(error: BaseException) -> str:
     """Return an exception in one line that is not too long, whatever the file made it say."""
-    return " ".join(f"{type(error).__name__}: {error}".split())[:LONGEST_TEXT]
+    return _printable(" ".join(f"{type(error).__name__}: {error}".split()))
+
+
+def _printable(text: str) -> str:
+    text = text[:LONGEST_TEXT]
+    return text if text.isprintable() else ascii(text)[1:-1]
 
 
 def deserialize(content: bytes) -> export.Exported:
@@ -55,7 +60,8 @@ def check_signature(exported: export.Exported, sizes: Sequence[int], num_actions
         ArtifactError: for another platform, or of another signature.
     """
     if "cpu" not in exported.platforms:
-        raise ArtifactError(f"platforms: found {exported.platforms}, expected ('cpu',)")
+        found = str(exported.platforms)[:LONGEST_TEXT]
+        raise ArtifactError(f"platforms: found {found}, expected ('cpu',)")
     if exported.nr_devices != 1:
         raise ArtifactError(f"devices: found {exported.nr_devices}, expected 1")
     inputs = [(aval.shape, aval.dtype) for aval in exported.in_avals]
@@ -67,7 +73,7 @@ def check_signature(exported: export.Exported, sizes: Sequence[int], num_actions
             return size
     found = f"({', '.join(map(str, exported.in_avals))}) -> ({', '.join(map(str, exported.out_avals))})"
     raise ArtifactError(
-        f"signature: found {found[:LONGEST_TEXT]}, expected (float32[n], float32[{num_actions}]) -> "
+        f"signature: found {_printable(found)}, expected (float32[n], float32[{num_actions}]) -> "
         f"(float32[n]) with n = {' or '.join(map(str, sizes))}"
     )
 
@@ -109,7 +115,7 @@ def check_closed(content: bytes, exported: export.Exported, is_trusted: bool) ->
         raise ArtifactError(_cannot(content, error)) from error
     names = list(dict.fromkeys([*effects, *(name for name in found if name is not None)]))
     if names:
-        listed = ", ".join(names[:MOST_NAMED])[:LONGEST_TEXT]
+        listed = _printable(", ".join(names[:MOST_NAMED]))
         raise ArtifactError(f"found {listed}, expected a pure function that calls nothing")
 
 

@@ -17,10 +17,12 @@ import numpy as np
 from flytrack_env.words import said, shown
 
 UNPACKED = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)  # whose unpacking zipfile bounds, as it does no other's
+# By version: in how many bytes a header's length stands, and what reads from there on.
 HEADERS = {
-    (1, 0): np.lib.format.read_array_header_1_0,
-    (2, 0): np.lib.format.read_array_header_2_0,
+    (1, 0): (2, np.lib.format.read_array_header_1_0),
+    (2, 0): (4, np.lib.format.read_array_header_2_0),
 }
+LARGEST_HEADER_BYTES = 2**16
 SUFFIX = ".npy"
 LONGEST_TEXT = 200
 LARGEST_LIST_BYTES = 2**16  # of the archive's list of its files: hundreds of them
@@ -44,6 +46,23 @@ class Header(NamedTuple):
     def num_values(self) -> int:
         """Number of values."""
         return math.prod(self.shape)
+
+
+def read_header(file: BinaryIO) -> Header:
+    """Return the header of an array's file, which is read as far as that.
+
+    Raises:
+        ValueError: no such file, or damaged.
+    """
+    version = np.lib.format.read_magic(file)
+    if version not in HEADERS:
+        raise NpzError(f"found version {version}, expected {' or '.join(map(str, HEADERS))}")
+    length_bytes, read = HEADERS[version]
+    announced = file.read(length_bytes)
+    length = int.from_bytes(announced, "little")
+    if length > LARGEST_HEADER_BYTES:  # it would be made room for
+        raise NpzError(f"found a header of {length} bytes, expected at most {LARGEST_HEADER_BYTES}")
+    return Header(*read(io.BytesIO(announced + file.read(length))))
 
 
 class NpzFile:
@@ -88,7 +107,7 @@ class NpzFile:
                 found = f"compression {member.compress_type}"
                 raise NpzError(f"found {found}, expected none or deflate, as numpy writes")
             with self._archive.open(member) as file:
-                header = Header(*HEADERS[np.lib.format.read_magic(file)](file))
+                header = read_header(file)  # type: ignore[arg-type]  # as good as binary
                 _check(header, member.file_size - file.tell())
                 yield file, header  # type: ignore[misc]
         except NpzError:

@@ -14,10 +14,10 @@ from pathlib import Path
 from typing import BinaryIO
 
 import numpy as np
-from numpy.lib import format as npy_format
 from numpy.typing import ArrayLike
 
 from flytrack_env.files import write_atomically
+from flytrack_env.npz_file import read_header
 from flytrack_env.state import ACTION_SIZE, APPLIED_ACTION, STATE_SIZE
 from flytrack_env.words import said, shown
 
@@ -113,10 +113,7 @@ def load_named_rollouts(
 def _check_header(path: Path, file: BinaryIO, allow_pickle: bool) -> bool:
     """Return whether the file is pickled; refuse, before any data is read, what announces no rollout."""
     try:
-        version = npy_format.read_magic(file)
-        is_first = version == (1, 0)
-        read = npy_format.read_array_header_1_0 if is_first else npy_format.read_array_header_2_0
-        shape, _, dtype = read(file)
+        shape, _, dtype = read_header(file)
     except ValueError as error:
         raise RolloutError(f"{path}: not an .npy file: {said(error)}; expected {EXPECTED}") from error
     if dtype.hasobject and allow_pickle:

@@ -35,9 +35,13 @@ class _Maps:
         if self._num_entries > MOST_ENTRIES:
             raise UnpackError(f"found more than {MOST_ENTRIES} entries, expected at most that")
         names = {name for name, _ in pairs}
-        if len(names) < len(pairs) or not all(isinstance(n, str) and len(n) <= LONGEST_NAME for n in names):
+        if len(names) < len(pairs) or not all(map(_is_name, names)):
             raise UnpackError(f"found names that are not {len(pairs)} different short texts")
         return dict(pairs)
+
+
+def _is_name(value: Any) -> bool:
+    return isinstance(value, str) and len(value) <= LONGEST_NAME and value.isprintable()
 
 
 def _array(code: int, data: bytes) -> np.ndarray:

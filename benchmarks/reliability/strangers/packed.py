@@ -55,7 +55,10 @@ def _damage_leaf(rng: Rng, leaf: Any) -> Any:
         return odd if _can_be_packed(odd) else None
     shape, name, content = leaf
     if way < 0.5:
-        array = np.frombuffer(content, name.decode()).reshape(shape)
+        try:
+            array = np.frombuffer(content, name.decode()).reshape(shape)
+        except (TypeError, ValueError):  # it is damaged already
+            return leaf
         found = damage_array(rng, array)
         return list(found.shape), found.dtype.name.encode(), b"" if found.dtype.hasobject else found.tobytes()
     if way < 0.7:

@@ -23,7 +23,7 @@ KEPT = ("loaded", "refused")
 
 
 class WorkerError(RuntimeError):
-    """A worker that ended before it loaded anything: a mistake in the measurement."""
+    """A worker that ended before a load, or could not make a file: a mistake in the measurement."""
 
 
 class _Worker:
@@ -49,6 +49,8 @@ class _Worker:
             self._rest += part
         text, _, self._rest = self._rest.partition(b"\n")
         found: dict[str, Any] = json.loads(text)
+        if "mistake" in found:
+            raise WorkerError(found["mistake"])
         return found
 
     def death(self) -> tuple[str, str]:
@@ -77,7 +79,7 @@ def outcomes(kind: str, seed: int, count: int, folder: Path) -> Iterator[dict[st
     """Yield what came of each of a kind's files, by number; what ended a worker is one of them.
 
     Raises:
-        WorkerError: a worker ended before it loaded anything.
+        WorkerError: a mistake in the measurement.
     """
     number, log = 0, folder / f"{kind}.stderr"
     for _ in range(MOST_DEATHS):

@@ -5,6 +5,7 @@ numbers of an example it makes and loads that file again. It ends with the proce
 """
 
 import argparse
+import ast
 import json
 import sys
 import traceback
@@ -34,7 +35,7 @@ class Outcome(NamedTuple):
 
 
 def contents_of(kind: Kind, seed: int, number: int, wells: list[bytes], hostile: list[bytes]) -> bytes:
-    """Return the content of a file by its number: first those that are well, then hostile ones, then damage."""
+    """Return the content of a file by its number: first what is well, then what is hostile, then damage."""
     if number < len(wells):
         return wells[number]
     if number < len(wells) + len(hostile):
@@ -46,10 +47,15 @@ def contents_of(kind: Kind, seed: int, number: int, wells: list[bytes], hostile:
 def _has_no_memory(error: BaseException | None) -> bool:
     """Return whether an exception, or one that led to it, is that there was no memory left."""
     while error is not None:
-        if isinstance(error, MemoryError) and "Parser stack" not in str(error):
+        if isinstance(error, MemoryError) and not _is_of_parser(error):
             return True
         error = error.__cause__ or error.__context__
     return False
+
+
+def _is_of_parser(error: BaseException) -> bool:
+    """Return whether Python's parser raised an exception: it calls what is nested too deeply so, too."""
+    return traceback.extract_tb(error.__traceback__)[-1].filename == ast.__file__
 
 
 def _judge_error(kind: Kind, path: Path, error: BaseException) -> tuple[str, str]:
@@ -113,7 +119,11 @@ def work(name: str, seed: int, first: int, last: int, folder: Path) -> None:
     watch, processes = Watch(work_folder), children()
     print(json.dumps({"ready": len(wells), "hostile": len(hostile)}), file=answers, flush=True)
     for number in range(first, last):
-        path.write_bytes(contents_of(kind, seed, number, wells, hostile))
+        try:
+            path.write_bytes(contents_of(kind, seed, number, wells, hostile))
+        except Exception as error:
+            print(json.dumps({"mistake": f"{name}, number {number}: {error!r}"}), file=answers, flush=True)
+            raise
         outcome = judge(kind, path, watch, processes)
         if number < len(wells) and outcome.sort == "refused":
             outcome = outcome._replace(sort="refused though well")
