@@ -1,9 +1,66 @@
-"""Writing files so that nothing is lost: a reader sees the old file or the whole new one."""
+"""Reading no more of a file than it may have; writing so that nothing is lost: a reader sees the old file or
+the whole new one.
+"""
 
+import io
 import itertools
 import os
 import secrets
 from pathlib import Path
+from typing import TYPE_CHECKING, BinaryIO
+
+if TYPE_CHECKING:
+    from _typeshed import WriteableBuffer
+
+READ_BYTES = 2**20
+
+
+class TooLargeError(OSError):
+    """A file of more bytes than it may have; the message does not name it."""
+
+
+def check_size(num_bytes: int, most_bytes: int) -> None:
+    """Raise TooLargeError for more bytes than there may be."""
+    if num_bytes > most_bytes:
+        raise TooLargeError(f"found more than {most_bytes} bytes, expected at most that")
+
+
+class AtMost(io.RawIOBase):
+    """An open file that ends in a TooLargeError where more is read of it than it may have.
+
+    Devices and what is unpacked announce no size, or any.
+    """
+
+    def __init__(self, file: BinaryIO, most_bytes: int):
+        self._file, self._most_bytes, self._num_bytes = file, most_bytes, 0
+
+    def readable(self) -> bool:
+        """Return True."""
+        return True
+
+    def readinto(self, buffer: "WriteableBuffer") -> int:
+        """Read into a buffer and return how many bytes; 0 at the end."""
+        view = memoryview(buffer)
+        part = self._file.read(min(len(view), READ_BYTES))
+        self._num_bytes += len(part)
+        check_size(self._num_bytes, self._most_bytes)
+        view[: len(part)] = part
+        return len(part)
+
+
+def read_at_most(path: Path, most_bytes: int) -> bytes:
+    """Return the bytes of a file; never holds many more than it may have.
+
+    Raises:
+        TooLargeError: it has more; where it says so, it is not opened.
+        OSError: what the system says.
+    """
+    try:
+        check_size(path.stat().st_size, most_bytes)
+        with path.open("rb") as file:
+            return AtMost(file, most_bytes).readall()
+    except ValueError as error:  # a NUL in the name
+        raise OSError(str(error)) from error
 
 
 def write_atomically(path: str | Path, content: bytes) -> None:

@@ -14,15 +14,19 @@ from pathlib import Path
 from typing import BinaryIO
 
 import numpy as np
-from numpy.lib import format as npy_format
 from numpy.typing import ArrayLike
 
 from flytrack_env.files import write_atomically
+from flytrack_env.npz_file import read_header
 from flytrack_env.state import ACTION_SIZE, APPLIED_ACTION, STATE_SIZE
+from flytrack_env.words import said, shown
 
 ROW_SIZE = STATE_SIZE + ACTION_SIZE
 SHORT_ROW_SIZE = ROW_SIZE - 3
 EXPECTED = f"a plain numeric array of shape (T, {ROW_SIZE}) or (T, {SHORT_ROW_SIZE}) with T >= 1"
+MOST_STEPS = 2**21  # close to six hours at 100 Hz; with the copies made of them, below 1 GiB
+LARGEST_ITEM_BYTES = 8
+LONGEST_TEXT = 200  # characters of what a header says
 PICKLED = "read only if pickles are allowed, as unpickling runs what the file holds"
 
 
@@ -36,12 +40,14 @@ def save_rollout(path: str | Path, states: ArrayLike, actions: ArrayLike) -> Non
     states: (T, 21), actions: (T, 4); row t is the state and the action commanded in it.
 
     Raises:
-        RolloutError: wrong shapes, no steps, or a number that is not finite.
+        RolloutError: wrong shapes, no steps or more than MOST_STEPS, or a number that is not finite.
         OSError: the file cannot be written.
     """
     path = Path(path)
     states, actions = np.asarray(states), np.asarray(actions)
     steps = len(states) if states.ndim else 0
+    if steps > MOST_STEPS:
+        raise RolloutError(f"{path}: found {steps} steps, expected at most {MOST_STEPS}")
     for name, array, size in (("states", states, STATE_SIZE), ("actions", actions, ACTION_SIZE)):
         if array.shape != (steps, size) or steps == 0 or array.dtype.kind not in "fiu":
             found = f"{array.dtype} of shape {array.shape}"
@@ -60,7 +66,7 @@ def load_rollout(path: str | Path, allow_pickle: bool = False) -> tuple[np.ndarr
 
     Raises:
         RolloutError: missing file, not an ``.npy``, pickled objects unless allowed, another shape, no
-            steps, a file cut short, or a number that is not finite.
+            steps or more than MOST_STEPS, a file cut short, or a number that is not finite.
     """
     path = Path(path)
     try:
@@ -68,12 +74,12 @@ def load_rollout(path: str | Path, allow_pickle: bool = False) -> tuple[np.ndarr
             is_pickled = _check_header(path, file, allow_pickle)
             rows = np.load(file, allow_pickle=is_pickled)
     except OSError as error:
-        raise RolloutError(f"{path}: cannot be read: {error}; expected {EXPECTED}") from error
+        raise RolloutError(f"{path}: cannot be read: {said(error)}; expected {EXPECTED}") from error
     except RolloutError:
         raise
     except (Exception, SystemExit) as error:  # whatever unpickling and damaged headers raise
-        said = f"{type(error).__name__}: {error}"
-        raise RolloutError(f"{path}: cannot be read: {said}; expected {EXPECTED}") from error
+        found = f"{type(error).__name__}: {said(error)}"
+        raise RolloutError(f"{path}: cannot be read: {found}; expected {EXPECTED}") from error
     if is_pickled:
         rows = _rows_of_pairs(path, rows)
     rows = _widened(_as_rows(path, rows))
@@ -107,25 +113,25 @@ def load_named_rollouts(
 def _check_header(path: Path, file: BinaryIO, allow_pickle: bool) -> bool:
     """Return whether the file is pickled; refuse, before any data is read, what announces no rollout."""
     try:
-        version = npy_format.read_magic(file)
-        is_first = version == (1, 0)
-        read = npy_format.read_array_header_1_0 if is_first else npy_format.read_array_header_2_0
-        shape, _, dtype = read(file)
+        shape, _, dtype = read_header(file)
     except ValueError as error:
-        raise RolloutError(f"{path}: not an .npy file: {error}; expected {EXPECTED}") from error
+        raise RolloutError(f"{path}: not an .npy file: {said(error)}; expected {EXPECTED}") from error
     if dtype.hasobject and allow_pickle:
         file.seek(0)
         return True
-    if dtype.kind not in "fiu":
-        found = f"an object array (pickled; {PICKLED})" if dtype.hasobject else f"an array of {dtype}"
+    if dtype.kind not in "fiu" or dtype.itemsize > LARGEST_ITEM_BYTES:
+        array = f"an array of {str(dtype)[:LONGEST_TEXT]}"
+        found = f"an object array (pickled; {PICKLED})" if dtype.hasobject else array
         raise RolloutError(f"{path}: found {found}, expected {EXPECTED}")
     if len(shape) != 2 or shape[1] not in (ROW_SIZE, SHORT_ROW_SIZE) or shape[0] < 1 or shape[0] is True:
-        raise RolloutError(f"{path}: found shape {shape}, expected {EXPECTED}")
+        raise RolloutError(f"{path}: found shape {shown(shape)}, expected {EXPECTED}")
     announced = math.prod(shape) * dtype.itemsize
     found_bytes = os.fstat(file.fileno()).st_size - file.tell()
     if found_bytes < announced:
         reason = f"found {found_bytes} bytes of data, expected {announced} for shape {shape}"
         raise RolloutError(f"{path}: cut short: {reason}")
+    if shape[0] > MOST_STEPS:
+        raise RolloutError(f"{path}: found {shape[0]} steps, expected at most {MOST_STEPS}")
     file.seek(0)
     return False
 
@@ -141,7 +147,9 @@ def _rows_of_pairs(path: Path, pairs: np.ndarray) -> np.ndarray:
         try:
             x, u = (np.asarray(part, float) for part in pair)
         except (TypeError, ValueError) as error:
-            raise RolloutError(f"{path}: step {step}: {error}; expected a pair of {expected}") from error
+            raise RolloutError(
+                f"{path}: step {step}: {said(error)}; expected a pair of {expected}"
+            ) from error
         size = sizes.get(len(rows[0])) if rows else x.size
         if u.shape != (ACTION_SIZE,) or x.shape != (size,) or size not in sizes.values():
             found = f"shapes {x.shape} and {u.shape}"

@@ -6,29 +6,25 @@ a header of column names, then one row of numbers, separated by commas, per samp
 
 import csv
 import io
-import zipfile
-from array import array
 from collections.abc import Callable, Iterable
-from functools import partial
-from itertools import islice
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from flytrack_env.files import write_atomically
+from flytrack_env.files import AtMost, TooLargeError, check_size, write_atomically
+from flytrack_env.npz_file import Header, NpzError, NpzFile, open_npz
+from flytrack_env.words import said, shown
 from flytrack_sysid.log import CHANNELS, GAP_STEPS, FlightLog, LogError, usual_step
-from flytrack_sysid.log_table import Table, check_names, log_of_table
+from flytrack_sysid.log_table import Rows, Table, check_names, check_number, log_of_table
 
-Reader = Callable[[str, bytes], Table]
+if TYPE_CHECKING:
+    import _csv
+
+Reader = Callable[[Path], Table]
 Writer = Callable[[dict[str, np.ndarray]], bytes]
 
-LARGEST_BYTES = 512 * 2**20  # unpacked: all columns as float64 at 1 kHz for half an hour fit
-UNPACKED = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
-READ_BYTES = 2**20
-NPY_HEADERS = {
-    (1, 0): np.lib.format.read_array_header_1_0,
-    (2, 0): np.lib.format.read_array_header_2_0,
-}
+LARGEST_BYTES = 512 * 2**20  # as they are in the file, unpacked
 
 
 def load_log(path: str | Path) -> FlightLog:
@@ -43,8 +39,16 @@ def load_log(path: str | Path) -> FlightLog:
     """
     path = Path(path)
     read, _ = _format_of(path)
-    content = _content(path)
-    return log_of_table(read(str(path), content))
+    try:
+        check_size(path.stat().st_size, LARGEST_BYTES)
+        table = read(path)
+    except LogError:
+        raise
+    except TooLargeError as error:
+        raise LogError(f"{path}: {error}") from error
+    except (OSError, ValueError) as error:  # ValueError: a NUL in the name
+        raise LogError(f"{path}: cannot be read: {said(error)}") from error
+    return log_of_table(table)
 
 
 def save_log(path: str | Path, log: FlightLog) -> None:
@@ -121,90 +125,65 @@ def _ranges(log: FlightLog) -> list[str]:
     return [f"commands: {'; '.join(commands)}", *(["; ".join(ranges)] if ranges else [])]
 
 
-def _content(path: Path) -> bytes:
-    """Return the bytes of a file that is not too large."""
-    try:
-        _check_size(str(path), path.stat().st_size)
-        with path.open("rb") as file:
-            # In pieces: devices announce nothing and never end, and a small file needs little memory.
-            pieces = iter(partial(file.read, READ_BYTES), b"")
-            content = b"".join(islice(pieces, LARGEST_BYTES // READ_BYTES + 1))
-    except LogError:
-        raise
-    except (OSError, ValueError) as error:  # ValueError: a NUL in the name
-        raise LogError(f"{path}: cannot be read: {error}") from error
-    _check_size(str(path), len(content))
-    return content
-
-
-def _check_size(source: str, size: int) -> None:
-    if size > LARGEST_BYTES:
-        raise LogError(f"{source}: found more than {LARGEST_BYTES} bytes, expected a log of at most that")
-
-
-def _read_npz(source: str, content: bytes) -> Table:
+def _read_npz(path: Path) -> Table:
     """Return the arrays of an .npz file, once the archive's list of them is that of a log."""
     try:
-        archive = zipfile.ZipFile(io.BytesIO(content))
-    except Exception as error:  # damaged archives raise anything from struct.error to RuntimeError
-        raise LogError(f"{source}: not an .npz file, or cut off: {error}") from error
-    members = archive.infolist()
-    check_names(source, [member.filename.removesuffix(".npy") for member in members])
-    _check_size(source, sum(member.file_size for member in members))
-    columns = {}
-    for member in members:
-        name = member.filename.removesuffix(".npy")
-        try:
-            columns[name] = _read_array(archive, member)
-        except LogError as error:
-            raise LogError(f"{source}: column {name}: {error}") from error
-        except Exception as error:  # as above, and what numpy says of damaged headers
-            found = f"{type(error).__name__}: {error}"
-            raise LogError(f"{source}: column {name}: damaged, cannot be read: {found}") from error
-    return Table(source, columns)
+        with open_npz(path) as archive:
+            check_names(str(path), archive.names)
+            check_size(archive.num_bytes, LARGEST_BYTES)
+            num_values = sum(_header(path, archive, name).num_values for name in archive.names)
+            check_number(str(path), num_values)
+            return Table(str(path), {name: _read_array(path, archive, name) for name in archive.names})
+    except NpzError as error:
+        raise LogError(f"{path}: {error}") from error
 
 
-def _read_array(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> np.ndarray:
-    """Return one array of numbers, (num_rows,) float64; a header that promises anything else is refused.
-
-    Never unpacks much more than the archive announces: zipfile bounds what it unpacks of stored and
-    deflated members if asked for a number of bytes, and of no others.
-    """
-    if member.compress_type not in UNPACKED:
-        raise LogError(f"found compression {member.compress_type}, expected none or deflate, as numpy writes")
-    with archive.open(member) as file:
-        shape, _, dtype = NPY_HEADERS[np.lib.format.read_magic(file)](file)
-        if dtype.kind not in "iuf":
-            hint = ": pickles are never read" if dtype.hasobject else ""
-            raise LogError(f"found an array of {dtype}, expected numbers{hint}")
-        if len(shape) != 1:
-            raise LogError(f"found an array of shape {shape}, expected one dimension")
-        size = member.file_size - file.tell()
-        if size != shape[0] * dtype.itemsize:
-            raise LogError(f"found {size} bytes, expected {shape[0]} numbers of {dtype.itemsize} bytes")
-        data = file.read(size)
-    return np.frombuffer(data, dtype).astype(float)
-
-
-def _read_csv(source: str, content: bytes) -> Table:
-    """Return the columns of a CSV file."""
-    text = io.TextIOWrapper(io.BytesIO(content), encoding="utf-8-sig", newline="")
-    rows = csv.reader(text, strict=True)
+def _header(path: Path, archive: NpzFile, name: str) -> Header:
+    """Return what the array of a column announces; what is no row of numbers is refused."""
     try:
-        header = [name.strip() for name in next(rows, [])]
-        if len(header) == 1 and any(mark in header[0] for mark in ";\t"):
-            raise LogError(f"{source}: line 1: found no comma in {header[0]!r}, expected names with commas")
-        check_names(source, header)
-        values, lines = array("d"), array("q")
-        for cells in rows:
-            if cells:
-                lines.append(rows.line_num)
-                values.extend(_numbers(source, header, cells, len(lines) - 1, rows.line_num))
-    except (UnicodeDecodeError, csv.Error) as error:
-        raise LogError(f"{source}: near line {rows.line_num + 1}: not a CSV file: {error}") from error
-    table = np.frombuffer(values, float) if values else np.zeros(0)
-    columns = dict(zip(header, table.reshape(-1, len(header)).T.copy(), strict=True))
-    return Table(source, columns, np.array(lines))
+        header = archive.header(name)
+    except NpzError as error:
+        raise LogError(f"{path}: column {name}: {error}") from error
+    if header.dtype.kind not in "iuf":
+        raise LogError(f"{path}: column {name}: found an array of {header.dtype}, expected numbers")
+    if len(header.shape) != 1:
+        raise LogError(
+            f"{path}: column {name}: found an array of shape {header.shape}, expected one dimension"
+        )
+    return header
+
+
+def _read_array(path: Path, archive: NpzFile, name: str) -> np.ndarray:
+    """Return the array of a column, (num_rows,) float64."""
+    try:
+        return archive.read(name).astype(float)
+    except NpzError as error:
+        raise LogError(f"{path}: column {name}: {error}") from error
+
+
+def _read_csv(path: Path) -> Table:
+    """Return the columns of a CSV file."""
+    with path.open("rb") as file:
+        content = io.BufferedReader(AtMost(file, LARGEST_BYTES))
+        rows = csv.reader(io.TextIOWrapper(content, encoding="utf-8-sig", newline=""), strict=True)
+        try:
+            return _table(str(path), rows)
+        except (UnicodeDecodeError, csv.Error) as error:
+            raise LogError(f"{path}: near line {rows.line_num + 1}: not a CSV file: {said(error)}") from error
+
+
+def _table(source: str, rows: "_csv.Reader") -> Table:
+    """Return the columns of the rows of a CSV file, the first of which has their names."""
+    header = [name.strip() for name in next(rows, [])]
+    if len(header) == 1 and any(mark in header[0] for mark in ";\t"):
+        found = f"no comma in {shown(header[0])}"
+        raise LogError(f"{source}: line 1: found {found}, expected names with commas")
+    check_names(source, header)
+    table_rows = Rows(source, header)
+    for cells in rows:
+        if cells:
+            table_rows.add(_numbers(source, header, cells, len(table_rows), rows.line_num), rows.line_num)
+    return table_rows.table()
 
 
 def _numbers(source: str, header: list[str], cells: list[str], row: int, line: int) -> list[float]:
@@ -217,7 +196,7 @@ def _numbers(source: str, header: list[str], cells: list[str], row: int, line: i
         return [_number(cell) for cell in cells]
     except ValueError:
         column, cell = next(pair for pair in zip(header, cells, strict=True) if not _is_number(pair[1]))
-    found = repr(cell) if cell.strip() else "an empty cell"
+    found = shown(cell) if cell.strip() else "an empty cell"
     raise LogError(f"{place}, column {column}: found {found}, expected a number")
 
 

@@ -1,16 +1,23 @@
 """Checks of the columns of a file on their way to a flight log; every refusal says where it stands."""
 
 import difflib
-from collections.abc import Sequence
+from array import array
+from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 import numpy as np
 
+from flytrack_env.words import shown
 from flytrack_sysid.log import CHANNELS, COLUMNS, REQUIRED, FlightLog, LogError
 
 LARGEST_NORM_ERROR = 1e-2  # of quaternions: estimators drift a little; more is no unit quaternion
 SMALLEST_NORM_ERROR = 1e-12  # below it a norm is 1 up to rounding, and the values stay as they are
+LARGEST_VALUES = (
+    56 * 2**20
+)  # all columns at 1 kHz for half an hour fit; twice as many float64 are below 1 GiB
+BLOCK_VALUES = 2**20
 COMMAND_MARGIN = 1e-6  # beyond [-1, 1]: rounding in whoever wrote the log
+LONGEST_NAME = max(map(len, COLUMNS)) + 3  # what is longer is like none
 LARGEST_SEGMENT = 2**53  # float64 tells whole numbers apart below it
 PWM_LOW_US, PWM_HIGH_US = 800, 2200  # receivers' pulses: 1000 to 2000 us, and a little past the ends
 PERCENT_LOW, PERCENT_HIGH = 10, 100  # a largest command in between looks like percent of full stick
@@ -36,13 +43,57 @@ class Table(NamedTuple):
         return np.stack([self.columns[column] for column in columns], axis=1)
 
 
+class Rows:
+    """Rows of numbers, as a text file has them one after the other, on their way to a table.
+
+    They are kept in blocks of columns: a list of all rows and its transpose would be twice the memory.
+    """
+
+    def __init__(self, source: str, names: Sequence[str]):
+        self._source, self._names = source, names
+        self._blocks: list[dict[str, np.ndarray]] = []
+        self._values, self._lines = array("d"), array("q")
+
+    def __len__(self) -> int:
+        return len(self._lines)
+
+    def add(self, numbers: Iterable[float], line: int) -> None:
+        """Add a row.
+
+        Raises:
+            LogError: more numbers than there may be.
+        """
+        self._lines.append(line)
+        self._values.extend(numbers)
+        if len(self._values) >= BLOCK_VALUES:
+            check_number(self._source, len(self) * len(self._names))
+            self._end_block()
+
+    def _end_block(self) -> None:
+        rows = np.array(self._values, float).reshape(-1, len(self._names))
+        self._blocks.append(dict(zip(self._names, rows.T.copy(), strict=True)))
+        self._values = array("d")
+
+    def table(self) -> Table:
+        """Return the rows as a table; there are none any more."""
+        self._end_block()
+        columns = {name: np.concatenate([block.pop(name) for block in self._blocks]) for name in self._names}
+        return Table(self._source, columns, np.array(self._lines, np.int64))
+
+
+def check_number(source: str, num_values: int) -> None:
+    """Raise LogError for more numbers than a log may have."""
+    if num_values > LARGEST_VALUES:
+        raise LogError(f"{source}: found more than {LARGEST_VALUES} numbers, expected at most that")
+
+
 def check_names(source: str, names: Sequence[str]) -> None:
     """Raise LogError unless the names make up a flight log: each known, once, none missing of a vector."""
     for name in names:
         if name not in COLUMNS:
-            near = difflib.get_close_matches(name.lower(), COLUMNS, n=1)
+            near = difflib.get_close_matches(name[:LONGEST_NAME].lower(), COLUMNS, n=1)
             hint = f"; did you mean {near[0]}?" if near else ""
-            raise LogError(f"{source}: column {name!r}: unknown{hint} (known: {', '.join(COLUMNS)})")
+            raise LogError(f"{source}: column {shown(name)}: unknown{hint} (known: {', '.join(COLUMNS)})")
         if names.count(name) > 1:
             raise LogError(f"{source}: column {name}: found {names.count(name)} times, expected once")
     for name in REQUIRED:
@@ -58,7 +109,8 @@ def check_names(source: str, names: Sequence[str]) -> None:
 def log_of_table(table: Table) -> FlightLog:
     """Return the log that a table holds; a table without segments is one.
 
-    Quaternions are normalised. The names must have passed ``check_names``.
+    Quaternions are normalised. The names must have passed ``check_names``. The columns are taken out of the
+    table one after the other.
 
     Raises:
         LogError: no rows, columns of different lengths, or a value that no log can have, with its place.
@@ -74,7 +126,11 @@ def log_of_table(table: Table) -> FlightLog:
     _check_time(table, segment)
     _check_commands(table)
     present = {name: columns for name, columns in CHANNELS.items() if columns[0] in table.columns}
-    channels = {name: table.matrix(columns) for name, columns in present.items()}
+    channels = {}
+    for name, columns in present.items():
+        channels[name] = table.matrix(columns)
+        for column in columns:  # a log of the largest size is not there twice
+            del table.columns[column]
     if "q" in channels:
         channels["q"] = _normalised(table, channels["q"])
     return FlightLog(table.columns["t"], channels, segment, table.source)

@@ -10,22 +10,24 @@ commands    (N, T, 4)       commands in [-1, 1], one per 0.01 s
 """
 
 import io
-import zipfile
 from collections.abc import Iterable
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
-from flytrack_env.files import write_atomically
+from flytrack_env.files import check_size, write_atomically
+from flytrack_env.npz_file import open_npz
 from flytrack_env.state import ACTION_SIZE, APPLIED_ACTION, QUATERNION, STATE_SIZE
+from flytrack_env.words import named, said, shown
 from flytrack_sysid.envelope import ANY_VOLTAGE, FEWEST_STEPS, LARGEST_SPEED, SCRIPT_HEIGHTS, is_inside
 from flytrack_sysid.excitation import Flight
 from flytrack_sysid.manoeuvres import MANOEUVRES
 
 SUFFIX = ".npz"
 ARRAYS = ("kinds", "starts", "commands")
-LARGEST_BYTES = 64 * 2**20  # unpacked: thousands of flights of 2.5 s
+LARGEST_BYTES = 64 * 2**20  # in the file, and as float64: thousands of flights of 2.5 s
+LONGEST_LIST = 200  # characters of names that are not expected
 LARGEST_NORM_ERROR = 1e-3  # of a start's quaternion
 ROUNDING = 1e-6  # of numbers that were float32
 
@@ -74,7 +76,9 @@ def check_script(script: Script, source: str = "script") -> None:
             )
     unknown = [kind for kind in kinds if kind not in MANOEUVRES]
     if unknown:
-        raise ScriptError(f"{source}: kinds: found {unknown[0]!r}, expected one of {', '.join(MANOEUVRES)}")
+        raise ScriptError(
+            f"{source}: kinds: found {shown(unknown[0])}, expected one of {', '.join(MANOEUVRES)}"
+        )
     _check_ranges(starts, commands, source)
 
 
@@ -127,8 +131,11 @@ def load_script(path: str | Path) -> Script:
     for name in ("starts", "commands"):
         if arrays[name].dtype.kind not in "iuf":
             raise ScriptError(f"{path}: {name}: found {_described(arrays[name])}, expected numbers")
-    starts, commands = arrays["starts"].astype(float), arrays["commands"].astype(float)
-    script = Script(tuple(arrays["kinds"].tolist()), starts, commands)
+    try:
+        kinds = tuple(arrays["kinds"].tolist())
+    except ValueError as error:  # numbers that are no characters
+        raise ScriptError(f"{path}: kinds: {said(error)}; expected a row of names") from error
+    script = Script(kinds, arrays["starts"].astype(float), arrays["commands"].astype(float))
     check_script(script, str(path))
     return script
 
@@ -140,17 +147,17 @@ def _described(values: np.ndarray) -> str:
 def _arrays(path: Path) -> dict[str, np.ndarray]:
     """Return the arrays of a file that has just those of a script."""
     try:
-        with zipfile.ZipFile(path) as archive:
-            size = sum(member.file_size for member in archive.infolist())
-            names = sorted(member.filename.removesuffix(".npy") for member in archive.infolist())
-        if size > LARGEST_BYTES:
-            raise ScriptError(f"{path}: found {size} bytes, expected a script of at most {LARGEST_BYTES}")
-        if names != sorted(ARRAYS):
-            raise ScriptError(f"{path}: found arrays {', '.join(names)}, expected {', '.join(ARRAYS)}")
-        with np.load(path, allow_pickle=False) as archive:
-            return {name: archive[name] for name in ARRAYS}
+        check_size(path.stat().st_size, LARGEST_BYTES)
+        with open_npz(path) as archive:
+            names = sorted(archive.names)
+            if names != sorted(ARRAYS):
+                found = ", ".join(map(named, names))[:LONGEST_LIST]
+                raise ScriptError(f"{path}: found arrays {found}, expected {', '.join(ARRAYS)}")
+            num_values = sum(archive.header(name).num_values for name in ARRAYS)
+            check_size(max(archive.num_bytes, num_values * np.dtype(float).itemsize), LARGEST_BYTES)
+            return {name: archive.read(name) for name in ARRAYS}
     except ScriptError:
         raise
-    except Exception as error:  # damaged archives raise anything, and numpy refuses pickles by ValueError
-        found = f"{type(error).__name__}: {error}"
+    except (OSError, ValueError) as error:  # ValueError: NpzError, or a NUL in the name
+        found = f"{type(error).__name__}: {said(error)}"
         raise ScriptError(f"{path}: not a script, or damaged; nothing is unpickled: {found}") from error

@@ -6,9 +6,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from real_logs import BETAFLIGHT, BLACKBOX_HEADERS, blackbox, shared
+from real_logs import BETAFLIGHT, shared
 from scipy.spatial.transform import Rotation
 
+from benchmarks.reliability.strangers.log_writers import BLACKBOX_HEADERS, blackbox
 from flytrack_sysid import LogError, import_log
 from flytrack_sysid.importing.betaflight_log import full_stick_rate
 

@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from real_logs import UlogWriter
 from scipy.spatial.transform import Rotation
 
+from benchmarks.reliability.strangers.log_writers import UlogWriter
 from flytrack_sysid import LogError, import_log
 
 pytest.importorskip("pyulog", reason="pyulog is not installed: pip install 'flytrack[logs]'")

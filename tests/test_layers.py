@@ -18,8 +18,8 @@ PACKAGE = "flytrack_env"
 
 # Low to high. A module imports only from rows above its own here; a package counts as one module.
 LAYERS = (
-    {"files", "extras", "fusion", "auto_reset"},
-    {"quaternion"},
+    {"files", "extras", "fusion", "auto_reset", "apart", "apart_server", "artifact", "words"},
+    {"quaternion", "toml_file", "npz_file"},
     {"state"},
     {"tracks", "randomness"},
     {"effects"},

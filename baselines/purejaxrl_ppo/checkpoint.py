@@ -3,7 +3,6 @@
 import dataclasses
 import hashlib
 import json
-import reprlib
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -16,10 +15,14 @@ import flytrack_env
 from baselines.purejaxrl_ppo.config import Config, config_from_json
 from baselines.purejaxrl_ppo.named_arrays import as_named_arrays, find_misfits, from_named_arrays
 from baselines.purejaxrl_ppo.networks import ActorCritic, make_network
-from flytrack_env.files import write_atomically
+from baselines.purejaxrl_ppo.unpack import LARGEST_BYTES, UnpackError, unpack
+from flytrack_env.files import read_at_most, write_atomically
+from flytrack_env.words import named, said, shown
 
 FORMAT = "flytrack-ppo-2"
 FORMAT_WITHOUT_TRAINING = "flytrack-ppo-1"  # of before there was a checksum and a state of the training
+LONGEST_META = 2**22  # characters: a track of ten thousand gates
+MOST_LAYERS, WIDEST = 64, 2**16  # of networks
 MOST_DIFFERENCES = 12  # as many as can be read in a terminal
 
 
@@ -78,7 +81,7 @@ def find_differences(found: Any, expected: Any, where: str) -> list[str]:
         return [
             line
             for name in names
-            for line in find_differences(found.get(name), expected.get(name), f"{where}.{name}")
+            for line in find_differences(found.get(name), expected.get(name), f"{where}.{named(name)}")
         ]
     if isinstance(found, list) and isinstance(expected, list) and len(found) == len(expected):
         pairs = enumerate(zip(found, expected, strict=True))
@@ -89,7 +92,7 @@ def find_differences(found: Any, expected: Any, where: str) -> list[str]:
 
 
 def _show(value: Any) -> str:
-    return "nothing" if value is None else reprlib.repr(value)
+    return "nothing" if value is None else shown(value)
 
 
 def check_none(where: Any, lines: list[str]) -> None:
@@ -135,52 +138,73 @@ def load_checkpoint(path: str | Path) -> Checkpoint:
     path = Path(path)
     content = _read_content(path)
     try:
+        if len(content["meta"]) > LONGEST_META:
+            raise ValueError(f"found {len(content['meta'])} characters")
         meta = json.loads(content["meta"])
         found_format = meta["format"]
-    except (KeyError, IndexError, TypeError, AttributeError, json.JSONDecodeError) as error:
+    except (KeyError, IndexError, TypeError, AttributeError, ValueError, RecursionError) as error:
         raise CheckpointError(f"{path}: not a checkpoint: no description in it") from error
     if found_format not in (FORMAT, FORMAT_WITHOUT_TRAINING):
-        raise CheckpointError(f"{path}: format: found {found_format!r}, expected {FORMAT!r}")
+        raise CheckpointError(f"{path}: format: found {shown(found_format)}, expected {FORMAT!r}")
     try:
         return _read_parts(path, meta, content)
     except CheckpointError:
         raise
     except (KeyError, IndexError, TypeError, AttributeError, ValueError) as error:
-        raise CheckpointError(f"{path}: damaged description or parameters: {error}") from error
+        raise CheckpointError(f"{path}: damaged description or parameters: {said(error)}") from error
 
 
 def _read_content(path: Path) -> Any:
     """Return what is in a file, its checksum compared."""
     try:
-        whole = flax.serialization.msgpack_restore(path.read_bytes())
+        whole = unpack(read_at_most(path, LARGEST_BYTES))
         if not isinstance(whole, dict) or "checksum" not in whole:
             return whole
-        found = hashlib.sha256(whole["content"]).hexdigest()
+        content = whole.get("content")
+        if not isinstance(content, bytes):
+            raise UnpackError("found a checksum of nothing")
+        found = hashlib.sha256(content).hexdigest()
         if found != whole["checksum"]:
+            expected = shown(whole["checksum"])
             raise CheckpointError(
-                f"{path}: damaged: found content with checksum {found}, expected {whole['checksum']}"
+                f"{path}: damaged: found content with checksum {found}, expected {expected}"
             )
-        return flax.serialization.msgpack_restore(whole["content"])
-    except CheckpointError:
-        raise
+        return unpack(content)
     except OSError as error:
-        raise CheckpointError(f"{path}: cannot be read: {error}") from error
-    except Exception as error:  # msgpack raises what it likes on damaged bytes
-        raise CheckpointError(f"{path}: not a checkpoint, or damaged: {error}") from error
+        raise CheckpointError(f"{path}: cannot be read: {said(error)}") from error
+    except UnpackError as error:
+        raise CheckpointError(f"{path}: not a checkpoint, or damaged: {said(error)}") from error
+
+
+def _check_size(path: Path, config: Config, size: Any) -> None:
+    """Raise CheckpointError for a network that is none, or larger than any of ours: it is traced below."""
+    widths = (size, len(config.initial_action), *config.hidden_sizes)
+    if not all(type(width) is int and 1 <= width <= WIDEST for width in widths) or len(widths) > MOST_LAYERS:
+        found = f"observation_size {shown(size)} and hidden_sizes {shown(config.hidden_sizes)}"
+        raise CheckpointError(
+            f"{path}: found {found}, expected at most {MOST_LAYERS} layers, 1 to {WIDEST} wide"
+        )
 
 
 def _read_parts(path: Path, meta: dict[str, Any], content: dict[str, Any]) -> Checkpoint:
     """Return the checkpoint of a file's description and arrays, checked against each other."""
     config = config_from_json(meta["config"])
-    size = int(meta["observation_size"])
+    config.check()
+    size = meta["observation_size"]
+    _check_size(path, config, size)
     for name in ("env_id", "track", "missed_gate"):
         if not isinstance(meta[name], str):
-            raise CheckpointError(f"{path}: {name}: found {meta[name]!r}, expected a string")
-    expected = jax.eval_shape(make_network(config).init, jax.random.key(0), jnp.zeros((1, size)))
+            raise CheckpointError(f"{path}: {name}: found {shown(meta[name])}, expected a string")
+    observation = jax.ShapeDtypeStruct((1, size), jnp.float32)
+    expected = jax.eval_shape(make_network(config).init, jax.random.key(0), observation)
     arrays = as_named_arrays(content["params"])
     check_none(path, find_misfits(arrays, expected))
     for name, array in arrays.items():
         if not np.isfinite(array).all():
             raise CheckpointError(f"{path}: {name}: found values that are not finite")
+    training = content.get("training")
+    is_tree = isinstance(training, dict) and all(isinstance(one, np.ndarray) for one in training.values())
+    if not (training is None or is_tree):
+        raise CheckpointError(f"{path}: training: found something else than arrays")
     params = from_named_arrays(arrays, expected)
-    return Checkpoint(params, config, meta["env_id"], meta["track"], size, meta, content.get("training"))
+    return Checkpoint(params, config, meta["env_id"], meta["track"], size, meta, training)

@@ -6,17 +6,21 @@ import dataclasses
 import inspect
 import itertools
 import math
+import sys
 import textwrap
-import tomllib
 import typing
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from flytrack_env.toml_file import TomlError, parse_toml, read_text
+from flytrack_env.words import named, said, shown
+
 COUNTS = ("num_envs", "num_steps", "episode_steps", "update_epochs", "num_minibatches")
 SHARES = ("final_learning_rate_fraction", "gamma", "gae_lambda")
 POSITIVE = ("learning_rate", "adam_eps", "clip_eps", "max_grad_norm", "initial_std")
 NOT_NEGATIVE = ("entropy_coef", "value_coef", "min_std", "gate_margin")
+LARGEST = sys.float_info.max  # whole numbers in files know no bound
 # What files of earlier versions, which do not name them, were trained with.
 BEFORE = {"gate_margin": 0.0}
 
@@ -147,17 +151,17 @@ def read_value(where: str, kind: Any, value: Any) -> Any:
     """
     if typing.get_origin(kind) is tuple:
         if not isinstance(value, (list, tuple)):
-            raise ConfigError(f"{where}: found {value!r}, expected a list")
+            raise ConfigError(f"{where}: found {shown(value)}, expected a list")
         return tuple(read_value(where, typing.get_args(kind)[0], one) for one in value)
-    is_number = isinstance(value, (int, float)) and not isinstance(value, bool)
+    is_number = isinstance(value, (int, float)) and not isinstance(value, bool) and abs(value) <= LARGEST
     if kind is bool and isinstance(value, bool):
         return value
-    if kind is float and is_number and math.isfinite(value):
+    if kind is float and is_number:
         return float(value)
-    if kind is int and is_number and math.isfinite(value) and value == int(value):
+    if kind is int and is_number and value == int(value):
         return int(value)
     expected = {bool: "true or false", float: "a finite number", int: "a whole number"}[kind]
-    found = "infinity" if value in (math.inf, -math.inf) else repr(value)
+    found = "infinity" if value in (math.inf, -math.inf) else shown(value)
     raise ConfigError(f"{where}: found {found}, expected {expected}")
 
 
@@ -168,14 +172,14 @@ def settings_in_file(path: Path) -> dict[str, Any]:
         ConfigError: missing file, not TOML, an unknown key, or a value of another type.
     """
     try:
-        values = tomllib.loads(path.read_text(encoding="utf-8"))
+        values = parse_toml(read_text(path))
     except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path}: cannot be read: {error}") from error
-    except tomllib.TOMLDecodeError as error:
-        raise ConfigError(f"{path}: not a TOML file: {error}") from error
+        raise ConfigError(f"{path}: cannot be read: {said(error)}") from error
+    except TomlError as error:
+        raise ConfigError(f"{path}: not a TOML file: {said(error)}") from error
     for name in values:
         if name not in FIELD_TYPES:
-            raise ConfigError(f"{path}: {name}: unknown; expected one of {', '.join(FIELD_TYPES)}")
+            raise ConfigError(f"{path}: {named(name)}: unknown; expected one of {', '.join(FIELD_TYPES)}")
     return {name: read_value(f"{path}: {name}", FIELD_TYPES[name], value) for name, value in values.items()}
 
 
@@ -189,9 +193,10 @@ def config_from_json(values: dict[str, Any]) -> Config:
     """
     for name in values:
         if name not in FIELD_TYPES:
-            raise ConfigError(f"config: {name}: unknown to this version; expected {', '.join(FIELD_TYPES)}")
-    named = {n: read_value(f"config: {n}", FIELD_TYPES[n], value) for n, value in values.items()}
-    return Config(**{**BEFORE, **named})
+            expected = ", ".join(FIELD_TYPES)
+            raise ConfigError(f"config: {named(name)}: unknown to this version; expected {expected}")
+    fields = {n: read_value(f"config: {n}", FIELD_TYPES[n], value) for n, value in values.items()}
+    return Config(**{**BEFORE, **fields})
 
 
 def add_flags(parser: argparse.ArgumentParser) -> None:

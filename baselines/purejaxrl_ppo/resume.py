@@ -5,6 +5,7 @@ import logging
 import math
 import os
 import re
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +29,7 @@ from baselines.purejaxrl_ppo.named_arrays import as_named_arrays, find_misfits, 
 from baselines.purejaxrl_ppo.options import OPTIONS
 from baselines.purejaxrl_ppo.ppo import Runner
 from flytrack_env.model_file import model_as_json
+from flytrack_env.words import shown
 
 FINAL = "final.msgpack"
 SEED_FOLDER = re.compile(r"seed(\d+)")
@@ -206,7 +208,50 @@ def _load_training(path: Path) -> Checkpoint:
     checkpoint = load_checkpoint(path)
     if checkpoint.training is None:
         raise CheckpointError(f"{path}: found a policy alone, expected one with its training")
+    _check_progress(path, checkpoint)
     return checkpoint
+
+
+def _check_progress(path: Path, checkpoint: Checkpoint) -> None:
+    """Raise CheckpointError where a description does not say how far the training is, and of what."""
+    meta = checkpoint.meta
+    for name, (is_right, expected) in PROGRESS.items():
+        if not is_right(meta.get(name)):
+            found = shown(meta.get(name))
+            raise CheckpointError(f"{path}: {name}: found {found}, expected {expected}")
+    batch_size = checkpoint.config.batch_size
+    if meta["steps"] % batch_size:
+        found = meta["steps"]
+        raise CheckpointError(f"{path}: steps: found {found}, expected a multiple of {batch_size}, an update")
+
+
+def _is_count(value: Any) -> bool:
+    return type(value) is int and 0 <= value < 2**63
+
+
+def _is_number(value: Any) -> bool:
+    return type(value) in (int, float) and abs(value) < sys.float_info.max
+
+
+def _is_object(value: Any) -> bool:
+    return isinstance(value, dict)
+
+
+# What is used before, or without, being compared with the run that goes on.
+PROGRESS = {
+    "steps": (_is_count, "a whole number"),
+    "seed": (_is_count, "a whole number"),
+    "seconds": (lambda value: value is None or _is_number(value), "a number"),
+    "seen": (
+        lambda value: (
+            value is None
+            or (_is_object(value) and all(one is None or _is_number(one) for one in value.values()))
+        ),
+        "an object of numbers",
+    ),
+    "model": (_is_object, "an object"),
+    "environment": (_is_object, "an object"),
+}
 
 
 def check_same_run(path: Path, checkpoint: Checkpoint, description: dict[str, Any]) -> None:

@@ -60,8 +60,9 @@ class Run:
         self.trainer, self.config, self.out = trainer, trainer.config, out
         self.description, self.options = description, options
         before = before or {}
-        self.started_s = time.perf_counter() - float(before.get("seconds", 0.0))
-        self.seen = Seen(**before.get("seen", {}))
+        self.started_s = time.perf_counter() - float(before.get("seconds") or 0.0)
+        seen = before.get("seen") or {}
+        self.seen = Seen(*(seen.get(name) for name in Seen._fields))
         self.tracker: Tracker | None = None
         self.last_path: Path | None = options.resume
         self.status, self.rows = "FAILED", list[Metrics]()

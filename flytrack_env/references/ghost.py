@@ -7,8 +7,8 @@ from flytrack_env.references.reference import (
     KINDS,
     Reference,
     ReferenceFileError,
+    is_shipped,
     model_digest,
-    shipped_path,
     shipped_reference,
     track_digest,
 )
@@ -23,7 +23,7 @@ def shipped_references(track: Track, model_names: tuple[str, ...]) -> References
     Raises:
         ReferenceFileError: none for this track; the message lists those that are there.
     """
-    names = [name for name in model_names if all(shipped_path(track.name, k, name).is_file() for k in KINDS)]
+    names = [name for name in model_names if all(is_shipped(track.name, kind, name) for kind in KINDS)]
     name = names[0] if names else model_names[-1]
     references = {kind: shipped_reference(track.name, kind, name) for kind in KINDS}
     for reference in references.values():
@@ -36,7 +36,7 @@ def shipped_references(track: Track, model_names: tuple[str, ...]) -> References
 
 def is_model_of(track: str, model_name: str, model: ModelParameters) -> bool:
     """Return whether a track has a reference of that name that was found with just this model."""
-    if not shipped_path(track, "flying", model_name).is_file():
+    if not is_shipped(track, "flying", model_name):
         return False
     return model_digest(model) == model_digest(shipped_reference(track, "flying", model_name).model)
 

@@ -8,7 +8,6 @@ import dataclasses
 import hashlib
 import io
 import json
-import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -16,16 +15,21 @@ import numpy as np
 
 from flytrack_env.dynamics import ModelParameters
 from flytrack_env.effects import BY_NAME
-from flytrack_env.files import write_atomically
-from flytrack_env.model_file import SIZES, model_as_json
+from flytrack_env.files import check_size, write_atomically
+from flytrack_env.model_file import SIZES, model_as_json, model_from_json
+from flytrack_env.npz_file import NpzError, open_npz
 from flytrack_env.state import ACTION_SIZE, STATE_SIZE
 from flytrack_env.tracks import Track
+from flytrack_env.words import said, shown
 
 FOLDER = Path(__file__).parent
 KINDS = ("flying", "standing")
 FILE_VERSION = 1
 ARRAYS = ("states", "commands", "gate_times_s")
 NOTES = ("version", "track", "track_sha256", "kind", "model_name", "model_sha256", "model", "dt_s", "time_s")
+TEXTS = ("track", "track_sha256", "kind", "model_name", "model_sha256")
+LARGEST_BYTES = 16 * 2**20  # in the file, and unpacked: hours of flight
+LONGEST_S = 3600.0  # of a lap, or of one step
 BEYOND = 1e-6  # of a command beyond full stick: the solver's tolerance
 
 
@@ -80,17 +84,25 @@ def shipped_path(track: str, kind: str, model_name: str) -> Path:
     return FOLDER / f"{track}_{model_name}_{kind}.npz"
 
 
+def is_shipped(track: str, kind: str, model_name: str) -> bool:
+    """Return whether there is a reference of that track, kind and model.
+
+    A stranger's track can have any name, also that of another folder's file.
+    """
+    return shipped_path(track, kind, model_name) in FOLDER.glob("*.npz")
+
+
 def shipped_reference(track: str, kind: str = "flying", model_name: str = "nominal") -> Reference:
     """Return a shipped reference by the names of track, kind ("flying", "standing") and model.
 
     Raises:
         ReferenceFileError: none of these names; the message lists those that are there.
     """
-    path = shipped_path(track, kind, model_name)
-    if not path.is_file():
+    if not is_shipped(track, kind, model_name):
+        name = shown(shipped_path(track, kind, model_name).stem)
         names = ", ".join(sorted(found.stem for found in FOLDER.glob("*.npz"))) or "none"
-        raise ReferenceFileError(f"reference: found no {path.stem!r}, expected one of {names}")
-    return load_reference(path)
+        raise ReferenceFileError(f"reference: found no {name}, expected one of {names}")
+    return load_reference(shipped_path(track, kind, model_name))
 
 
 def save_reference(path: str | Path, reference: Reference) -> None:
@@ -133,6 +145,10 @@ def _check_arrays(path: Path, data: dict[str, np.ndarray]) -> None:
     for name in ARRAYS:
         if data[name].dtype.kind != "f" or not np.isfinite(data[name]).all():
             raise ReferenceFileError(f"{path}: {name}: found something else, expected finite numbers")
+    times_s = data["gate_times_s"]
+    if times_s.ndim != 1 or times_s.size == 0 or (times_s < 0.0).any() or (np.diff(times_s) < 0.0).any():
+        found = f"{times_s.shape}, {shown(times_s.tolist())}"
+        raise ReferenceFileError(f"{path}: gate_times_s: found {found}, expected a row of growing times, s")
     most = np.abs(data["commands"]).max()
     if most > 1.0 + BEYOND:
         raise ReferenceFileError(f"{path}: commands: found {most:.7g}, expected within [-1, 1]")
@@ -141,29 +157,59 @@ def _check_arrays(path: Path, data: dict[str, np.ndarray]) -> None:
 def _read(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     """Return the arrays and the notes of a reference file; raises ReferenceFileError."""
     try:
-        with path.open("rb") as stored, np.load(stored, allow_pickle=False) as file:
-            data = {name: file[name] for name in (*ARRAYS, "notes")}
+        check_size(path.stat().st_size, LARGEST_BYTES)
+        with open_npz(path) as archive:
+            check_size(archive.num_bytes, LARGEST_BYTES)
+            missing = [name for name in (*ARRAYS, "notes") if name not in archive.names]
+            if missing:
+                raise NpzError(f"{', '.join(missing)}: missing")
+            data = {name: archive.read(name) for name in (*ARRAYS, "notes")}
         notes = json.loads(str(data.pop("notes")))
-    except (OSError, KeyError, ValueError, zipfile.BadZipFile, EOFError) as error:
-        raise ReferenceFileError(f"{path}: cannot be read: {error}; expected a reference file") from error
+    except (OSError, ValueError, RecursionError) as error:  # ValueError: NpzError, no text, no JSON
+        raise ReferenceFileError(
+            f"{path}: cannot be read: {said(error)}; expected a reference file"
+        ) from error
     missing = [name for name in (*NOTES, "found") if not isinstance(notes, dict) or name not in notes]
     if missing:
         raise ReferenceFileError(f"{path}: notes: {', '.join(missing)}: missing")
     if notes["version"] != FILE_VERSION:
-        raise ReferenceFileError(f"{path}: version: found {notes['version']!r}, expected {FILE_VERSION}")
+        found = shown(notes["version"])
+        raise ReferenceFileError(f"{path}: version: found {found}, expected {FILE_VERSION}")
+    _check_notes(path, notes)
     return data, notes
 
 
+def _check_notes(path: Path, notes: dict[str, Any]) -> None:
+    """Raise ReferenceFileError for notes of other types than those written, or of no time."""
+    for name in (*TEXTS, "found"):
+        is_text = name in TEXTS
+        if not isinstance(notes[name], str if is_text else dict):
+            found, expected = shown(notes[name]), "a text" if is_text else "an object"
+            raise ReferenceFileError(f"{path}: {name}: found {found}, expected {expected}")
+    for name in ("dt_s", "time_s"):
+        value = notes[name]
+        is_number = isinstance(value, (int, float)) and not isinstance(value, bool)
+        if not is_number or not 0.0 < value < LONGEST_S:
+            found = shown(value)
+            raise ReferenceFileError(f"{path}: {name}: found {found}, expected seconds above 0")
+    if notes["kind"] not in KINDS:
+        found = shown(notes["kind"])
+        raise ReferenceFileError(f"{path}: kind: found {found}, expected one of {', '.join(KINDS)}")
+
+
 def _model_of(path: Path, values: Any) -> ModelParameters:
-    """Return the model of a file's JSON values; raises ReferenceFileError."""
+    """Return the model of a file's JSON values, with the digits that it has; raises ReferenceFileError."""
     try:
+        model_from_json(values, path)  # is each number of its kind and within its range?
         base: dict[str, Any] = {name: np.asarray(values["parameters"][name], float) for name in SIZES}
         effects = values["effects"].items()
         return ModelParameters(**base).with_effects(
             *(BY_NAME[name].parameters(**numbers) for name, numbers in effects)
         )
     except (AttributeError, KeyError, TypeError, ValueError) as error:
-        raise ReferenceFileError(f"{path}: model: cannot be read: {error!r}") from error
+        raise ReferenceFileError(
+            f"{path}: model: cannot be read: {type(error).__name__}: {said(error)}"
+        ) from error
 
 
 def load_reference(path: str | Path) -> Reference:
@@ -171,14 +217,13 @@ def load_reference(path: str | Path) -> Reference:
 
     Raises:
         ReferenceFileError: missing or damaged file, pickled objects, another version, arrays that are no
-            flight, commands beyond [-1, 1], or a model that is not the one whose digest is written.
+            flight, commands beyond [-1, 1], notes of another type, or a model that is not the one whose
+            digest is written.
     """
     path = Path(path)
     data, notes = _read(path)
     _check_arrays(path, data)
     model = _model_of(path, notes["model"])
-    if notes["kind"] not in KINDS:
-        raise ReferenceFileError(f"{path}: kind: found {notes['kind']!r}, expected one of {', '.join(KINDS)}")
     if model_digest(model) != notes["model_sha256"]:
         raise ReferenceFileError(f"{path}: model: found another one than its digest, expected the same")
     fields = {name: notes[name] for name in ("track", "track_sha256", "kind", "model_name", "found")}
@@ -189,5 +234,5 @@ def load_reference(path: str | Path) -> Reference:
         time_s=float(notes["time_s"]),
         states=data["states"].astype(float),
         commands=np.clip(data["commands"].astype(float), -1.0, 1.0),
-        gate_times_s=data["gate_times_s"],
+        gate_times_s=data["gate_times_s"].astype(float),
     )

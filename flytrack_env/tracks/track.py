@@ -8,18 +8,20 @@ import dataclasses
 import json
 import math
 import re
-import tomllib
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from flytrack_env.files import write_atomically
+from flytrack_env.toml_file import TomlError, parse_toml, read_text
+from flytrack_env.words import named, said, shown
 
 TRACK_FOLDER = Path(__file__).parent
 DIRECTIONS = {"+y": 1.0, "-y": -1.0}
 UNIT_NORM_TOLERANCE = 1e-3
 ROUNDING = 1e-12  # of a norm: a quaternion that is this close to a unit was not rounded for a file
+LARGEST_ID = 2**53  # float64 tells whole numbers apart below it
 LARGEST = 1e6  # m: beyond that, float32 positions are coarser than a drone
 
 
@@ -31,8 +33,8 @@ class TrackError(ValueError):
 class Gate:
     """One square gate; position in m, quaternion (w, x, y, z) gate to world, edges in m.
 
-    id: a number for people, any but another gate's. direction: +1 if flown towards the gate's local +y, -1 if
-    towards -y. opening: inner edge. frame: outer edge.
+    id: a number for people, any below 2^53 but another gate's. direction: +1 if flown towards the gate's
+    local +y, -1 if towards -y. opening: inner edge. frame: outer edge.
     """
 
     id: int
@@ -84,9 +86,9 @@ def load_track(name_or_path: str | Path) -> Track:
                 f"{', '.join(available_tracks())} or the path of a .toml file"
             )
     try:
-        text = path.read_text(encoding="utf-8")
+        text = read_text(path)
     except (OSError, UnicodeDecodeError) as error:
-        raise TrackError(f"{path}: cannot be read: {error}") from error
+        raise TrackError(f"{path}: cannot be read: {said(error)}") from error
     return _parse(path, text)
 
 
@@ -150,9 +152,9 @@ def _write(track: Track) -> str:
 def _parse(path: Path, text: str) -> Track:
     """Return the checked track of a file's text; raises TrackError."""
     try:
-        data = tomllib.loads(text)
-    except (ValueError, RecursionError) as error:  # TOMLDecodeError, endless digits, endless nesting
-        raise TrackError(f"{path}: not a TOML file: {error}") from error
+        data = parse_toml(text)
+    except TomlError as error:
+        raise TrackError(f"{path}: not a TOML file: {said(error)}") from error
     return _Reader(path, text).track(data)
 
 
@@ -178,7 +180,7 @@ class _Reader:
     def fail(self, header: str, index: int, field: str, reason: str) -> TrackError:
         where = f"{header}[{index}] " if header == "[[gates]]" else f"{header} " if header else ""
         line = self.line_of(header, index, field)
-        return TrackError(f"{self.path}, line {line}: {where}{field}: {reason}")
+        return TrackError(f"{self.path}, line {line}: {where}{named(field)}: {reason}")
 
     def table(self, data: dict[str, Any], header: str, index: int, fields: set[str]) -> None:
         """Check that a table has these fields and no others."""
@@ -195,10 +197,10 @@ class _Reader:
         """Return a list of that many finite numbers."""
         value = data[field]
         if not isinstance(value, list) or len(value) != size:
-            raise self.fail(header, index, field, f"found {value!r}, expected {size} numbers")
+            raise self.fail(header, index, field, f"found {shown(value)}, expected {size} numbers")
         for number in value:
             if isinstance(number, bool) or not isinstance(number, (int, float)):
-                raise self.fail(header, index, field, f"found {number!r}, expected a number")
+                raise self.fail(header, index, field, f"found {shown(number)}, expected a number")
             if not -LARGEST < number < LARGEST:  # false for NaN too
                 found = number if isinstance(number, float) else f"an integer of {number.bit_length()} bits"
                 reason = f"found {found}, expected a finite number within +-{LARGEST:g}"
@@ -219,9 +221,11 @@ class _Reader:
         fields = {"id", "position", "quaternion", "direction", "opening", "frame"}
         self.table(data, header, index, fields)
         if isinstance(data["id"], bool) or not isinstance(data["id"], int):
-            raise self.fail(header, index, "id", f"found {data['id']!r}, expected an integer")
+            raise self.fail(header, index, "id", f"found {shown(data['id'])}, expected an integer")
+        if not -LARGEST_ID < data["id"] < LARGEST_ID:
+            raise self.fail(header, index, "id", f"found {shown(data['id'])}, expected less than 2^53")
         if not isinstance(data["direction"], str) or data["direction"] not in DIRECTIONS:
-            reason = f"found {data['direction']!r}, expected one of {', '.join(DIRECTIONS)}"
+            reason = f"found {shown(data['direction'])}, expected one of {', '.join(DIRECTIONS)}"
             raise self.fail(header, index, "direction", reason)
         for field in ("opening", "frame"):
             data = {**data, field: self.numbers({field: [data[field]]}, header, index, field, 1)[0]}
@@ -243,16 +247,17 @@ class _Reader:
         """Return the checked track."""
         self.table(data, "", 0, {"name", "start", "bounds", "gates"})
         if not isinstance(data["name"], str) or not data["name"]:
-            raise self.fail("", 0, "name", f"found {data['name']!r}, expected a non-empty string")
+            raise self.fail("", 0, "name", f"found {shown(data['name'])}, expected a non-empty string")
         self.table(data["start"], "[start]", 0, {"position", "quaternion"})
         self.table(data["bounds"], "[bounds]", 0, {"low", "high"})
         if not isinstance(data["gates"], list) or len(data["gates"]) < 2:
             raise self.fail("", 0, "gates", "expected at least two [[gates]] tables")
         gates = tuple(self.gate(gate, index) for index, gate in enumerate(data["gates"]))
-        ids = [gate.id for gate in gates]
-        for index, gate_id in enumerate(ids):
-            if gate_id in ids[:index]:
-                raise self.fail("[[gates]]", index, "id", f"{gate_id} is used twice")
+        ids: set[int] = set()
+        for index, gate in enumerate(gates):
+            if gate.id in ids:
+                raise self.fail("[[gates]]", index, "id", f"{gate.id} is used twice")
+            ids.add(gate.id)
         low = self.numbers(data["bounds"], "[bounds]", 0, "low", 3)
         high = self.numbers(data["bounds"], "[bounds]", 0, "high", 3)
         if not all(a < b for a, b in zip(low, high, strict=True)):

@@ -5,14 +5,15 @@ positive yaw is to the left. docs/real_logs.md says how that was checked on a re
 attitude or velocity in these logs.
 """
 
-import logging
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from flytrack_env.files import read_at_most
+from flytrack_env.words import named, said, shown
 from flytrack_sysid.importing.craft import Craft
-from flytrack_sysid.importing.extra import needed_module
+from flytrack_sysid.importing.decoding import decode
 from flytrack_sysid.importing.flight import Flight
 from flytrack_sysid.importing.mapping import Mapping
 from flytrack_sysid.importing.resample import growing
@@ -21,7 +22,7 @@ from flytrack_sysid.log import CHANNELS, LogError
 from flytrack_sysid.log_table import Table, log_of_table
 
 FIRMWARE = "Betaflight"
-MAIN_FRAME = "I"  # frame type whose fields the others repeat
+LARGEST_BYTES = 2**29  # of a chip
 FIRST_BYTES = b"H Product:Blackbox"
 END_OF_LOG = b"E\xffEnd of log"  # the event that a logger writes last
 STICKS = tuple(f"setpoint[{axis}]" for axis in range(4))
@@ -40,6 +41,8 @@ BETAFLIGHT_RATE_DEG_S = 200.0  # at RC rate 1
 KISS_RATE_DEG_S = 200.0  # at RC rate 1
 TENS = 10.0  # deg/s in one unit of the other types' settings
 QUICK_RATE_DEG_S = 2.0  # per unit of RC rate
+LARGEST = 1e9  # of numbers in the header
+LONGEST_LIST = 1000  # characters of names of fields
 LEAST_REMAINDER = 0.01  # of 1 less the super rate, as the firmware bounds it
 
 
@@ -74,19 +77,25 @@ def read_betaflight(path: Path, mapping: Mapping) -> list[Flight]:
         LogError: orangebox is not installed; no blackbox file of Betaflight 4, or cut off; a field of the
             header or of the frames that is missing or cannot be meant. The message names file and field.
     """
-    logs = _split(path)
-    return [_flight(path, number, len(logs), mapping) for number in range(1, len(logs) + 1)]
+    num_logs = _count(path)
+    notes, frames = decode(str(path), "betaflight", path, num_logs)
+    return [
+        _flight(str(path) if num_logs == 1 else f"{path}, log {number}", said, rows, mapping)
+        for number, (said, rows) in enumerate(zip(notes, frames, strict=True), start=1)
+    ]
 
 
-def _flight(path: Path, number: int, num_logs: int, mapping: Mapping) -> Flight:
-    source = str(path) if num_logs == 1 else f"{path}, log {number}"
-    headers, names, frames = _decode(source, path, number)
+def _flight(source: str, said: dict[str, Any], frames: np.ndarray, mapping: Mapping) -> Flight:
+    headers, names = said["headers"], said["names"]
+    if not len(frames):
+        raise LogError(f"{source}: found no frames, expected at least one")
     revision = str(headers.get("Firmware revision", "none"))
     if not revision.startswith(FIRMWARE):
-        raise LogError(f"{source}: header Firmware revision: found {revision!r}, expected {FIRMWARE} 4")
+        raise LogError(f"{source}: header Firmware revision: found {shown(revision)}, expected {FIRMWARE} 4")
     for name in ("time", *STICKS, *GYRO, *ACCELEROMETER):
         if name not in names:
-            raise LogError(f"{source}: field {name}: missing; found {', '.join(names)}")
+            listed = ", ".join(map(named, names))[:LONGEST_LIST]
+            raise LogError(f"{source}: field {name}: missing; found {listed}")
     columns = dict(zip(names, frames.T, strict=True))
     is_used = growing(columns["time"])
     craft = mapping.craft
@@ -95,7 +104,7 @@ def _flight(path: Path, number: int, num_logs: int, mapping: Mapping) -> Flight:
     table = Table(source, {name: values[is_used] for name, values in columns.items()})
     log = log_of_table(table._replace(columns=_channels(table, headers, craft)))
     dropped = np.count_nonzero(~is_used)
-    notes: tuple[str, ...] = (f"{source}: {revision}, {len(frames)} frames",)
+    notes: tuple[str, ...] = (f"{source}: {named(revision)}, {len(frames)} frames",)
     if dropped:
         notes += (f"{source}: {dropped} frames left out: their time was not later than those before",)
     return Flight(log, craft, notes)
@@ -137,8 +146,10 @@ def _header(
     """Return some numbers of the header, 0 or more, or the default where the header has none."""
     value: Any = headers.get(name, default)
     values = value if isinstance(value, list) else [value]
-    if len(values) != size or not all(isinstance(one, (int, float)) and one >= 0 for one in values):
-        raise LogError(f"{source}: header {name}: found {value!r}, expected {size} numbers of at least 0")
+    if len(values) != size or not all(isinstance(one, (int, float)) and 0 <= one < LARGEST for one in values):
+        raise LogError(
+            f"{source}: header {name}: found {shown(value)}, expected {size} numbers of at least 0"
+        )
     return [float(one) for one in values]
 
 
@@ -158,12 +169,12 @@ def _full_stick(source: str, headers: dict[str, Any]) -> tuple[float, float, flo
     return roll, pitch, yaw
 
 
-def _split(path: Path) -> list[bytes]:
-    """Return the logs in a blackbox file, each with its end."""
+def _count(path: Path) -> int:
+    """Return the number of logs in a blackbox file, each of which has its end."""
     try:
-        content = path.read_bytes()
+        content = read_at_most(path, LARGEST_BYTES)
     except OSError as error:
-        raise LogError(f"{path}: cannot be read: {error}") from error
+        raise LogError(f"{path}: cannot be read: {said(error)}") from error
     if not content.startswith(FIRST_BYTES):
         raise LogError(f"{path}: found {content[: len(FIRST_BYTES)]!r} first, expected {FIRST_BYTES!r}")
     logs = content.split(FIRST_BYTES)[1:]
@@ -171,22 +182,4 @@ def _split(path: Path) -> list[bytes]:
         if END_OF_LOG not in log:
             found = f"no end-of-log event in {len(log)} bytes"
             raise LogError(f"{path}: log {number} of {len(logs)}: cut off: found {found}")
-    return logs
-
-
-def _decode(source: str, path: Path, number: int) -> tuple[dict[str, Any], list[str], np.ndarray]:
-    """Return the header, the names of the main frames' fields, and the frames (num_frames, num_fields)."""
-    orangebox = needed_module("orangebox", "logs", path)
-    logging.getLogger("orangebox").setLevel(logging.ERROR)  # it warns of events that it does not know
-    try:
-        parser = orangebox.Parser.load(str(path), number)
-        fields = parser.reader.field_defs
-        main = next(fields[kind] for kind in fields if kind.value == MAIN_FRAME)
-        names = [field.name for field in main]
-        frames = np.array([frame.data[: len(names)] for frame in parser.frames()], float)
-    except Exception as error:  # whatever a decoder raises on damaged bytes
-        said = f"{type(error).__name__}: {error}"
-        raise LogError(f"{source}: damaged, cannot be decoded: {said}") from error
-    if not len(frames):
-        raise LogError(f"{source}: found no frames, expected at least one")
-    return parser.headers, names, frames
+    return len(logs)

@@ -1,23 +1,35 @@
 """CSV logs of anybody, by a mapping file; gzip-compressed ones too."""
 
+import contextlib
 import csv
 import gzip
 import io
 import math
 import zlib
-from array import array
-from collections.abc import Sequence
+from collections.abc import Iterator
 from pathlib import Path
+from typing import TYPE_CHECKING, BinaryIO, TextIO, cast
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from flytrack_env.files import AtMost
+from flytrack_env.words import named, said, shown
 from flytrack_sysid.importing.flight import Flight
 from flytrack_sysid.importing.mapping import Attitude, Columns, Command, Mapping, Vector
 from flytrack_sysid.importing.units import quaternion_from, vector_from
 from flytrack_sysid.log import CHANNELS, LogError
 from flytrack_sysid.log_file import LARGEST_BYTES
-from flytrack_sysid.log_table import LARGEST_NORM_ERROR, Table, log_of_table
+from flytrack_sysid.log_table import LARGEST_NORM_ERROR, Rows, Table, log_of_table
+
+if TYPE_CHECKING:
+    import _csv
+
+PACKED_BYTES, LARGEST_RATIO = (
+    2**24,
+    32,
+)  # what a compressed file may hold: that much, or as many times its size
+LONGEST_LIST = 1000  # characters of a header
 
 
 def read_csv(path: Path, mapping: Mapping) -> Flight:
@@ -50,53 +62,68 @@ def _wanted(columns: Columns) -> dict[str, str]:
     return wanted
 
 
-def _text(path: Path) -> io.StringIO:
-    """Return what a file, perhaps compressed, holds; never unpacks more than the largest log."""
+@contextlib.contextmanager
+def _opened(path: Path) -> Iterator[TextIO]:
+    """Yield the text of a file, perhaps compressed, of which no more is unpacked than there may be.
+
+    What is raised while it is read becomes a LogError.
+    """
     try:
-        with gzip.open(path, "rb") if path.suffix == ".gz" else path.open("rb") as file:
-            content = file.read(LARGEST_BYTES + 1)
-        if len(content) > LARGEST_BYTES:
-            raise LogError(f"{path}: found more than {LARGEST_BYTES} bytes, expected a log of at most that")
-        return io.StringIO(content.decode("utf-8-sig"), newline="")
-    except (OSError, EOFError, zlib.error, UnicodeDecodeError) as error:
-        raise LogError(f"{path}: cannot be read as text: {error}") from error
+        with path.open("rb") as file:
+            most_bytes, unpacked = LARGEST_BYTES, cast(BinaryIO, file)
+            if path.suffix == ".gz":
+                most_bytes = min(most_bytes, max(PACKED_BYTES, LARGEST_RATIO * path.stat().st_size))
+                unpacked = cast(BinaryIO, gzip.GzipFile(fileobj=file))
+            content = io.BufferedReader(AtMost(unpacked, most_bytes))
+            yield io.TextIOWrapper(content, encoding="utf-8-sig", newline="")
+    # ValueError: UnicodeDecodeError, or a NUL in the name.
+    except (OSError, EOFError, zlib.error, ValueError) as error:
+        if isinstance(error, LogError):
+            raise
+        raise LogError(f"{path}: cannot be read as text: {said(error)}") from error
 
 
 def _read(path: Path, columns: Columns, mapping: str) -> Table:
     """Return the columns that the mapping names, as they are in the file."""
-    rows = csv.reader(_text(path), delimiter=columns.delimiter, strict=True)
-    wanted, values, lines = _wanted(columns), array("d"), array("q")
-    try:
-        header = [name.strip() for name in next(rows, [])]
-        for name, table in wanted.items():
-            if header.count(name) != 1:
-                found = f"found {header.count(name)} times among {', '.join(header)}"
-                raise LogError(f"{path}: column {name}: {found}; expected once by {mapping}: {table}")
-        places = [header.index(name) for name in wanted]
-        for cells in rows:
-            if cells:
-                if len(cells) != len(header):
-                    found = f"found {len(cells)} cells, expected {len(header)} as in the header"
-                    raise LogError(f"{path}: row {len(lines)} (line {rows.line_num}): {found}")
-                lines.append(rows.line_num)
-                values.extend(_number(path, lines, header[place], cells[place]) for place in places)
-    except csv.Error as error:
-        raise LogError(f"{path}: near line {rows.line_num + 1}: not a CSV file: {error}") from error
-    if not lines:
+    with _opened(path) as text:
+        rows = csv.reader(text, delimiter=columns.delimiter, strict=True)
+        try:
+            return _table(path, rows, columns, mapping)
+        except csv.Error as error:
+            raise LogError(f"{path}: near line {rows.line_num + 1}: not a CSV file: {said(error)}") from error
+
+
+def _table(path: Path, rows: "_csv.Reader", columns: Columns, mapping: str) -> Table:
+    """Return the columns that the mapping names, of the rows of a file, the first of which has the names."""
+    wanted = _wanted(columns)
+    header = [name.strip() for name in next(rows, [])]
+    for name, table in wanted.items():
+        if header.count(name) != 1:
+            found = f"found {header.count(name)} times among {', '.join(map(named, header))[:LONGEST_LIST]}"
+            raise LogError(f"{path}: column {named(name)}: {found}; expected once by {mapping}: {table}")
+    places = [header.index(name) for name in wanted]
+    found_rows = Rows(str(path), list(wanted))
+    for cells in rows:
+        if cells:
+            where = f"{path}: row {len(found_rows)} (line {rows.line_num})"
+            if len(cells) != len(header):
+                raise LogError(f"{where}: found {len(cells)} cells, expected {len(header)} as in the header")
+            found_rows.add([_number(where, header[place], cells[place]) for place in places], rows.line_num)
+    if not len(found_rows):
         raise LogError(f"{path}: found no rows, expected at least one")
-    matrix = np.frombuffer(values, float).reshape(-1, len(wanted))
-    return Table(str(path), dict(zip(wanted, matrix.T.copy(), strict=True)), np.array(lines))
+    return found_rows.table()
 
 
-def _number(path: Path, lines: Sequence[int], column: str, cell: str) -> float:
-    place = f"{path}: row {len(lines) - 1} (line {lines[-1]}), column {column}"
+def _number(where: str, column: str, cell: str) -> float:
     try:
         value = float(cell)
     except ValueError:
-        found = repr(cell) if cell.strip() else "an empty cell"
-        raise LogError(f"{place}: found {found}, expected a number") from None
+        found = shown(cell) if cell.strip() else "an empty cell"
+        raise LogError(f"{where}, column {named(column)}: found {found}, expected a number") from None
     if not math.isfinite(value):
-        raise LogError(f"{place}: found {cell.strip()}, expected a finite number")
+        raise LogError(
+            f"{where}, column {named(column)}: found {named(cell.strip())}, expected a finite number"
+        )
     return value
 
 

@@ -1,14 +1,17 @@
 """Reading tables of a TOML file: every field checked, every refusal with file, field, found and expected."""
 
 import math
-import reprlib
-import tomllib
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from flytrack_env.toml_file import TomlError, parse_toml, read_text
+from flytrack_env.words import named, said, shown
 from flytrack_sysid.log import LogError
 
+LARGEST_COUNT = 2**53
+LARGEST = sys.float_info.max  # whole numbers in TOML know no bound
 REQUIRED: Any = object()  # a default that says there is none
 
 
@@ -19,9 +22,9 @@ def read_toml(path: Path) -> dict[str, Any]:
         LogError: a file that cannot be read or is not TOML.
     """
     try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, ValueError) as error:  # ValueError: a NUL in the name
-        raise LogError(f"{path}: not a readable TOML file: {error}") from error
+        return parse_toml(read_text(path))
+    except (OSError, UnicodeDecodeError, TomlError) as error:
+        raise LogError(f"{path}: not a readable TOML file: {said(error)}") from error
 
 
 class Fields:
@@ -30,7 +33,7 @@ class Fields:
     def __init__(self, source: str, name: str, table: Any):
         self.source, self.name = source, name
         if not isinstance(table, dict):
-            raise self.error("", f"found {reprlib.repr(table)}, expected a table")
+            raise self.error("", f"found {shown(table)}, expected a table")
         self.left, self.known = dict(table), list[str]()
 
     def error(self, field: str, text: str) -> LogError:
@@ -48,7 +51,7 @@ class Fields:
         return self.left.pop(field, default)
 
     def _refuse(self, field: str, value: Any, expected: str) -> LogError:
-        return self.error(field, f"found {reprlib.repr(value)}, expected {expected}")
+        return self.error(field, f"found {shown(value)}, expected {expected}")
 
     def table(self, field: str) -> "Fields | None":
         """Return a table of the table, None if it is not there."""
@@ -89,8 +92,8 @@ class Fields:
         """Return a whole number that is at least a bound."""
         value = self._take(field, default, "a whole number")
         is_whole = isinstance(value, int) and not isinstance(value, bool)
-        if value is not default and not (is_whole and value >= least):
-            raise self._refuse(field, value, f"a whole number of at least {least}")
+        if value is not default and not (is_whole and least <= value < LARGEST_COUNT):
+            raise self._refuse(field, value, f"a whole number of at least {least}, below 2^53")
         return value
 
     def numbers(self, field: str, size: int, default: Any = REQUIRED, above: float = -math.inf) -> Any:
@@ -115,8 +118,9 @@ class Fields:
     def done(self) -> None:
         """Refuse fields that nothing has asked for."""
         for field in self.left:
-            raise self.error(field, f"unknown; expected of {', '.join(self.known) or 'nothing'}")
+            raise self.error(named(field), f"unknown; expected of {', '.join(self.known) or 'nothing'}")
 
 
 def _is_number(value: Any) -> bool:
-    return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
+    is_number = isinstance(value, (int, float)) and not isinstance(value, bool)
+    return is_number and -LARGEST < value < LARGEST  # false for NaN too

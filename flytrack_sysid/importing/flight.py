@@ -1,14 +1,21 @@
 """What a reader returns of one file, and which of its rows are used."""
 
 import csv
+import io
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
+from flytrack_env.files import AtMost
+from flytrack_env.words import named, said, shown
 from flytrack_sysid.importing.craft import Craft
 from flytrack_sysid.importing.mapping import Manifest, Mapping
 from flytrack_sysid.log import FlightLog, LogError
+
+LARGEST_MANIFEST_BYTES = 2**24
+MOST_DIGITS = 15
+LONGEST_LIST = 1000  # characters of a header
 
 
 class Flight(NamedTuple):
@@ -40,24 +47,36 @@ def used_rows(path: Path, log: FlightLog, mapping: Mapping) -> FlightLog:
     return log.select(is_used)
 
 
-def _count_of(path: Path, said: Manifest) -> int:
+def _count_of(path: Path, asked: Manifest) -> int:
     """Return how many rows of a file the manifest beside it says to use."""
-    manifest = path.parent / said.file
+    manifest = path.parent / asked.file
+    where = f"{path.parent}/{named(asked.file)}"
     try:
-        with manifest.open(encoding="utf-8-sig", newline="") as file:
-            table = csv.DictReader(file, strict=True)
-            entries, names = list(table), table.fieldnames or []
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise LogError(f"{manifest}: cannot be read as a manifest: {error}") from error
-    for name in (said.key, said.count):
+        with manifest.open("rb") as file:
+            content = io.BufferedReader(AtMost(file, LARGEST_MANIFEST_BYTES))
+            text = io.TextIOWrapper(content, encoding="utf-8-sig", newline="")
+            count = _find_count(where, csv.DictReader(text, strict=True), asked, path.name)
+    except (OSError, ValueError, csv.Error) as error:  # ValueError: no text, or a NUL in the name
+        if isinstance(error, LogError):
+            raise
+        raise LogError(f"{where}: cannot be read as a manifest: {said(error)}") from error
+    if count is None:
+        raise LogError(f"{where}: column {named(asked.key)}: {path.name}: missing")
+    return count
+
+
+def _find_count(where: str, table: "csv.DictReader[str]", asked: Manifest, file: str) -> int | None:
+    """Return what a manifest's row of a file says, None where there is no such row."""
+    names = table.fieldnames or []
+    for name in (asked.key, asked.count):
         if name not in names:
-            raise LogError(f"{manifest}: column {name}: missing; found {', '.join(names)}")
-    for entry in entries:
-        if entry[said.key] == path.name:
-            text = entry[said.count]
-            if not (text or "").strip().isdecimal():
-                raise LogError(
-                    f"{manifest}: {path.name}: {said.count}: found {text!r}, expected a whole number"
-                )
+            listed = ", ".join(map(named, names))[:LONGEST_LIST]
+            raise LogError(f"{where}: column {named(name)}: missing; found {listed}")
+    for entry in table:
+        if entry[asked.key] == file:
+            text = (entry[asked.count] or "").strip()
+            if not text.isdecimal() or len(text) > MOST_DIGITS:
+                found, expected = shown(text), f"a whole number of at most {MOST_DIGITS} digits"
+                raise LogError(f"{where}: {file}: {named(asked.count)}: found {found}, expected {expected}")
             return int(text)
-    raise LogError(f"{manifest}: column {said.key}: {path.name}: missing")
+    return None

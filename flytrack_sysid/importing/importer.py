@@ -95,7 +95,7 @@ def import_log(
     paths: one file or several. format: of ``FORMATS``. mapping: a mapping file, or the name of a shipped
     one; CSV needs it, and other formats take its ``rows`` and ``craft``. align: correct the offsets between
     sensors' clocks that are significant (``flytrack_sysid.importing.clocks``); else only report them.
-    Voltages that nobody states are those of the log.
+    Voltages that nobody states are those of the log, where all are above 0.
 
     Raises:
         LogError: what cannot be read or meant; the message names file and field, found and expected.
@@ -119,7 +119,7 @@ def import_log(
     else:
         offsets = tuple(offset.left() for offset in offsets)
     craft = _agreed(flights, sources)
-    if craft.voltage_v is None and "v_bat" in log:
+    if craft.voltage_v is None and "v_bat" in log and log["v_bat"].min() > 0.0:
         craft = craft._replace(voltage_v=(float(log["v_bat"].min()), float(log["v_bat"].max())))
     notes = tuple(note for flight in flights for note in flight.notes)
     return Imported(log, tuple(sources), craft, offsets, notes, tuple(find_problems(log)))

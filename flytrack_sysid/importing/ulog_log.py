@@ -4,16 +4,15 @@ Rows are the samples of the body rates; other sensors are interpolated in betwee
 held. Where a topic misses more than three of its usual steps, or the craft has landed, there are no rows.
 """
 
-import contextlib
-import sys
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from flytrack_env.words import said
 from flytrack_sysid.importing.craft import Craft
-from flytrack_sysid.importing.extra import needed_module
+from flytrack_sysid.importing.decoding import decode
 from flytrack_sysid.importing.flight import Flight
 from flytrack_sysid.importing.mapping import Mapping
 from flytrack_sysid.importing.resample import growing, hold, interpolate, interpolate_quaternions
@@ -61,13 +60,10 @@ SETPOINT = (
 )
 BATTERY = (Source("battery_status", ("voltage_v",)),)
 LANDED = (Source("vehicle_land_detected", ("landed",)),)
-TOPICS = sorted(
-    {
-        source.topic
-        for sources in (RATES, FORCE, ATTITUDE, POSITION, SETPOINT, BATTERY, LANDED)
-        for source in sources
-    }
-)
+TIMES = ("timestamp", "timestamp_sample")
+FIELDS: dict[str, list[str]] = {}  # of all of them, by topic
+for _source in (*RATES, *FORCE, *ATTITUDE, *POSITION, *VELOCITY, *SETPOINT, *BATTERY, *LANDED):
+    FIELDS[_source.topic] = [*FIELDS.get(_source.topic, TIMES), *_source.fields]
 
 
 class _Topics:
@@ -75,23 +71,19 @@ class _Topics:
 
     def __init__(self, path: Path):
         self.path = path
-        pyulog = needed_module("pyulog", "logs", path)
         try:
-            # pyulog prints what it finds damaged; that is no part of what a command answers.
-            with path.open("rb") as file, contextlib.redirect_stdout(sys.stderr):
+            with path.open("rb") as file:
                 found = file.read(len(FIRST_BYTES))
-                file.seek(0)
-                ulog = pyulog.ULog(file, TOPICS) if found == FIRST_BYTES else None
         except OSError as error:
-            raise LogError(f"{path}: cannot be read: {error}") from error
-        except Exception as error:  # whatever a parser raises on damaged bytes
-            said = f"{type(error).__name__}: {error}"
-            raise LogError(f"{path}: damaged, cannot be parsed: {said}") from error
-        if ulog is None:
+            raise LogError(f"{path}: cannot be read: {said(error)}") from error
+        if found != FIRST_BYTES:
             raise LogError(f"{path}: found {found!r} first, expected {FIRST_BYTES!r}, as every ULog begins")
-        self.is_damaged = ulog.file_corruption
-        self.parameters: dict[str, Any] = ulog.initial_parameters
-        self.data = {data.name: data.data for data in ulog.data_list if data.multi_id == 0}
+        notes, arrays = decode(str(path), "ulog", path, FIELDS)
+        self.is_damaged: bool = notes["is_damaged"]
+        self.parameters: dict[str, float] = notes["parameters"]
+        self.data: dict[str, dict[str, np.ndarray]] = {}
+        for (topic, field), values in zip(notes["fields"], arrays, strict=True):
+            self.data.setdefault(topic, {})[field] = values
 
     def find(self, sources: tuple[Source, ...]) -> Series | None:
         """Return the times, us, and values (num_rows, n) of the first source there is, or None."""
@@ -100,8 +92,8 @@ class _Topics:
             if all(field in data for field in ("timestamp", *fields)) and len(data["timestamp"]):
                 # The time a sensor was read, where the topic says it; else when it was published.
                 stamp = data.get("timestamp_sample", data["timestamp"])
-                times = (stamp if np.all(stamp > 0) else data["timestamp"]).astype(float)
-                values = np.stack([data[field].astype(float) for field in fields], axis=1)
+                times = stamp if np.all(stamp > 0) else data["timestamp"]
+                values = np.stack([data[field] for field in fields], axis=1)
                 is_used = np.isfinite(values).all(axis=1)
                 times, values = times[is_used], values[is_used]
                 is_used = growing(times)

@@ -1,0 +1,75 @@
+"""Reading msgpack as flax writes it, with bounds on what it may hold: numbers, texts, arrays in named trees.
+
+A map of a few bytes takes fifty times as much in memory, and flax asks for no bound.
+"""
+
+import re
+from typing import Any
+
+import jax.numpy as jnp
+import msgpack
+import numpy as np
+
+from flytrack_env.words import said
+
+LARGEST_BYTES = 2**28  # of a file: three times that in memory
+MOST_ENTRIES = 100_000  # of all maps together
+LONGEST_NAME = 200  # characters
+MOST_DIMENSIONS = 32
+ARRAY = 1  # flax's number of arrays among msgpack's extensions
+DTYPE = re.compile(r"[a-z]+[0-9]*")
+
+
+class UnpackError(ValueError):
+    """Bytes that flax did not write, or more than one of ours writes; the message does not name the file."""
+
+
+class _Maps:
+    """Makes maps of their entries, and counts them."""
+
+    def __init__(self) -> None:
+        self._num_entries = 0
+
+    def __call__(self, pairs: list[tuple[Any, Any]]) -> dict[str, Any]:
+        self._num_entries += len(pairs)
+        if self._num_entries > MOST_ENTRIES:
+            raise UnpackError(f"found more than {MOST_ENTRIES} entries, expected at most that")
+        names = {name for name, _ in pairs}
+        if len(names) < len(pairs) or not all(map(_is_name, names)):
+            raise UnpackError(f"found names that are not {len(pairs)} different short texts")
+        return dict(pairs)
+
+
+def _is_name(value: Any) -> bool:
+    return isinstance(value, str) and len(value) <= LONGEST_NAME and value.isprintable()
+
+
+def _array(code: int, data: bytes) -> np.ndarray:
+    """Return an array: packed are its shape, the name of its type, and its bytes."""
+    if code != ARRAY:
+        raise UnpackError(f"found an extension {code}, expected arrays")
+    shape, name, content = msgpack.unpackb(data, raw=True, max_array_len=MOST_DIMENSIONS, max_map_len=0)
+    if not DTYPE.fullmatch(text := name.decode()):
+        raise UnpackError("found an array of an unknown type, expected numbers")
+    dtype = jnp.dtype(text)
+    if not (jnp.issubdtype(dtype, np.number) or dtype == np.bool_):
+        raise UnpackError(f"found an array of {dtype}, expected numbers")
+    if not all(type(size) is int and size >= 0 for size in shape):
+        raise UnpackError("found an array of a shape that is none")
+    return np.frombuffer(content, dtype).reshape(shape)
+
+
+def unpack(content: bytes) -> Any:
+    """Return what bytes hold: maps, texts, bytes, numbers, arrays; no lists.
+
+    Raises:
+        UnpackError: damaged, or something else, or more than a checkpoint has.
+    """
+    try:
+        return msgpack.unpackb(
+            content, raw=False, max_array_len=0, ext_hook=_array, object_pairs_hook=_Maps()
+        )
+    except UnpackError:
+        raise
+    except Exception as error:  # msgpack raises what it likes on damaged bytes
+        raise UnpackError(f"{type(error).__name__}: {said(error)}") from error

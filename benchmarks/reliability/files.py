@@ -1,0 +1,78 @@
+"""Files from strangers: damaged at random and on purpose, they load as they should or are refused in words."""
+
+from pathlib import Path
+from typing import Any
+
+from tqdm import tqdm
+
+from benchmarks.reliability.section import Section
+from benchmarks.reliability.strangers.kinds import KINDS
+from benchmarks.reliability.strangers.pool import measure_kind
+
+FILES_PER_KIND = 10_000
+TITLES = {
+    "track": "track (`.toml`)",
+    "model": "model file (`.json`)",
+    "rollout": "rollout (`.npy`)",
+    "log_npz": "flight log (`.npz`)",
+    "log_csv": "flight log (`.csv`)",
+    "script": "script (`.npz`)",
+    "reference": "reference (`.npz`)",
+    "mapping": "mapping of an import (`.toml`)",
+    "import_csv": "import of a CSV log",
+    "import_gz": "import of a compressed CSV log",
+    "ulog": "import of a PX4 log (`.ulg`)",
+    "betaflight": "import of a Betaflight log (`.bbl`)",
+    "settings": "settings of a training (`.toml`)",
+    "checkpoint": "checkpoint (`.msgpack`)",
+    "resume": "checkpoint that a training is resumed from",
+    "black_box": "black box (`acro_step.bin`)",
+}
+TEXT = """Files of every kind that is read, written by the package itself and then damaged: bits, bytes and blocks changed, left out,
+repeated and mixed; values, types, names, shapes and sizes inside changed to what is odd, huge, missing or not a number; pickles; archives
+that unpack to gigabytes; programs that never end. Each is loaded by itself, in a process that may use 5 s of processor time and 1 GiB of
+memory more than it had, and whose file accesses, processes, sockets, unpickling and running of code are watched. Two outcomes are
+promised: a load that is sound, or the documented error, in a message that can be read and names the file.
+
+"""
+
+
+def measure(seed: int, share: float, folder: Path) -> dict[str, Any]:
+    """Return what came of every kind's files: a share of 10,000 of each."""
+    count = max(round(share * FILES_PER_KIND), 1)
+    found = {}
+    with tqdm(total=count * len(KINDS), unit="file") as bar:
+        for kind in KINDS:
+            bar.set_description(kind)
+            found[kind] = measure_kind(kind, seed, count, folder, bar.update)
+    return {"seed": seed, "kinds": found}
+
+
+def as_markdown(result: dict[str, Any]) -> str:
+    """Return a table of all kinds, and examples of what broke the promise."""
+    lines = [
+        "| kind of file | files | loaded | refused | promise broken | slowest, CPU s |",
+        "|---|---:|---:|---:|---:|---:|",
+    ]
+    broken = []
+    for name, found in result["kinds"].items():
+        number = sum(found["broken"].values())
+        lines.append(
+            f"| {TITLES[name]} | {found['files']} | {found['loaded']} | {found['refused']} | {number} | "
+            f"{found['slowest_s']:g} |"
+        )
+        broken += [
+            f"- {TITLES[name]}, number {one['number']} of seed {result['seed']}: {one['sort']}: `{one['text']}`"
+            for one in found["examples"]
+        ]
+    if broken:
+        lines += ["", "Broken promises:", "", *broken]
+    return TEXT + "\n".join(lines)
+
+
+def is_held(result: dict[str, Any]) -> bool:
+    """Return whether no file broke the promise."""
+    return not any(found["broken"] for found in result["kinds"].values())
+
+
+SECTION = Section("files", "Files from strangers", measure, as_markdown, is_held)

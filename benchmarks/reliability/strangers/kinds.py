@@ -1,0 +1,272 @@
+"""Every kind of file that is read: how it is written, damaged and loaded, and what may come of it."""
+
+import csv
+import gzip
+import io
+import json
+import tomllib
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from baselines.purejaxrl_ppo import CheckpointError, load_checkpoint
+from baselines.purejaxrl_ppo.config import ConfigError, settings_in_file
+from benchmarks.reliability.strangers import archives, flight_logs, packed, programs, seeds, soundness
+from benchmarks.reliability.strangers.noise import Rng, damage, damage_text
+from benchmarks.reliability.strangers.resuming import resume, write_trainings
+from benchmarks.reliability.strangers.trees import as_json, as_toml, damage_tree
+from flytrack_env import ModelFileError, TrackError, load_model, load_provenance, load_track
+from flytrack_env.blackbox import BlackBoxError
+from flytrack_env.blackbox import load as load_black_box
+from flytrack_env.references import ReferenceFileError, load_reference
+from flytrack_env.rollout import RolloutError, load_rollout
+from flytrack_sysid import LogError, ScriptError, import_log, load_log, load_script
+from flytrack_sysid.importing import load_mapping
+
+Mutator = Callable[[Rng, list[bytes]], bytes]
+
+
+def _no_files(_: list[bytes]) -> list[bytes]:
+    return []
+
+
+class Kind(NamedTuple):
+    """A kind of file.
+
+    suffix: of its files. write: writes files that are well into a folder. load: of a path. error: the only
+    one that it may raise. check: raises AssertionError for what no such file may load as. mutate: damages one
+    of the files that are well. hostile: of those, makes files that are meant to harm.
+    """
+
+    suffix: str
+    write: Callable[[Path], None]
+    load: Callable[[Path], Any]
+    error: type[Exception]
+    check: Callable[[Any], None]
+    mutate: Mutator
+    hostile: Callable[[list[bytes]], list[bytes]] = _no_files
+
+
+def _either(*ways: tuple[float, Mutator]) -> Mutator:
+    """Return a mutator that damages in one of some ways; shares."""
+
+    def mutate(rng: Rng, contents: list[bytes]) -> bytes:
+        way = rng.choice(len(ways), p=[share for share, _ in ways])
+        return ways[int(way)][1](rng, contents)
+
+    return mutate
+
+
+def _one(rng: Rng, contents: Sequence[bytes]) -> bytes:
+    return contents[int(rng.integers(len(contents)))]
+
+
+def _json(rng: Rng, contents: list[bytes]) -> bytes:
+    return as_json(rng, damage_tree(rng, json.loads(_one(rng, contents))))
+
+
+def _toml(rng: Rng, contents: list[bytes]) -> bytes:
+    return as_toml(damage_tree(rng, tomllib.loads(_one(rng, contents).decode())))
+
+
+def _arrays(content: bytes) -> archives.Arrays:
+    with np.load(io.BytesIO(content)) as file:
+        return dict(file)
+
+
+def _npz(rng: Rng, contents: list[bytes]) -> bytes:
+    return archives.damage_npz(rng, _arrays(_one(rng, contents)), {})
+
+
+def _npy(rng: Rng, contents: list[bytes]) -> bytes:
+    return archives.damage_npy(rng, np.load(io.BytesIO(_one(rng, contents))))
+
+
+def _reference(rng: Rng, contents: list[bytes]) -> bytes:
+    arrays = _arrays(_one(rng, contents))
+    notes = json.loads(str(arrays["notes"]))
+
+    def damaged(rng: Rng) -> str:
+        return as_json(rng, damage_tree(rng, notes)).decode(errors="replace")
+
+    return archives.damage_npz(rng, arrays, {"notes": damaged})
+
+
+def _bombs(contents: list[bytes]) -> list[bytes]:
+    return archives.bombs(_arrays(contents[0]))
+
+
+def _cells(rng: Rng, contents: list[bytes]) -> bytes:
+    """Change whole cells and columns of a CSV file."""
+    rows = list(csv.reader(io.StringIO(_one(rng, contents).decode())))
+    for _ in range(int(rng.integers(1, 4))):
+        row = rows[int(rng.integers(len(rows)))]
+        if not row:
+            continue
+        at, way = int(rng.integers(len(row))), rng.random()
+        if way < 0.6:
+            odd = (
+                "nan",
+                "inf",
+                "",
+                " ",
+                "1e308",
+                "-5",
+                "x",
+                "1e-400",
+                "1" * 400,
+                '"',
+                "0x10",
+                "1_0",
+                "7" * 9,
+            )
+            row[at] = str(odd[int(rng.integers(len(odd)))])
+        elif way < 0.7:
+            del row[at]
+        elif way < 0.8:
+            row.insert(at, row[at])
+        else:
+            for other in rows:
+                other[at:at] = other[at : at + 1]
+    text = io.StringIO()
+    csv.writer(text, lineterminator="\n").writerows(rows)
+    return text.getvalue().encode()
+
+
+def _packed_text(rng: Rng, contents: list[bytes]) -> bytes:
+    text = damage_text(rng, [gzip.decompress(_one(rng, contents))])
+    return gzip.compress(text, 1, mtime=0)
+
+
+def _packed_bombs(contents: list[bytes]) -> list[bytes]:
+    header = gzip.decompress(contents[0]).split(b"\n")[0] + b"\n"
+    row = b",".join([b"0"] * (header.count(b",") + 1)) + b"\n"
+    texts = [header + b"\n" * 2**26, header + row * 2**22, b"x" * 2**26, header + b'"' + b"\n" * 2**24]
+    return [gzip.compress(text, 6, mtime=0) for text in texts]
+
+
+def _texts(contents: list[bytes]) -> list[bytes]:
+    """Return texts that are long in one way each."""
+    dots, quotes = b"a" + b".a" * 2**16 + b" = 1\n", b'"' + b"x" * 2**20
+    return [dots, quotes, b"[" * 2**20, b"0," * 2**19, b"\n" * 2**22]
+
+
+def _import(form: str) -> Callable[[Path], Any]:
+    def load(path: Path) -> Any:
+        mapping = path.parent / "map.toml"
+        if form == "csv" and not mapping.exists():
+            mapping.write_text(seeds.MAPPING)
+        return import_log(path, form, mapping if form == "csv" else None)
+
+    return load
+
+
+def _import_by_mapping(path: Path) -> Any:
+    """Return a log that fits, imported by a stranger's mapping."""
+    log = path.with_name("file.csv")
+    if not log.exists():
+        log.write_text(seeds.foreign_csv())
+        path.with_name("manifest.csv").write_text(seeds.MANIFEST)
+    return import_log(log, "csv", load_mapping(path))
+
+
+_TEXT = _either((0.3, damage), (0.35, damage_text), (0.35, _toml))
+_ARRAYS = _either((0.3, damage), (0.7, _npz))
+_TABLE = _either((0.2, damage), (0.4, damage_text), (0.4, _cells))
+
+KINDS: dict[str, Kind] = {
+    "track": Kind(".toml", seeds.write_tracks, load_track, TrackError, soundness.track, _TEXT, _texts),
+    "model": Kind(
+        ".json",
+        seeds.write_models,
+        lambda path: (load_model(path), load_provenance(path)),
+        ModelFileError,
+        soundness.model,
+        _either((0.3, damage), (0.3, damage_text), (0.4, _json)),
+        _texts,
+    ),
+    "rollout": Kind(
+        ".npy",
+        seeds.write_rollouts,
+        load_rollout,
+        RolloutError,
+        soundness.rollout,
+        _either((0.3, damage), (0.7, _npy)),
+    ),
+    "log_npz": Kind(".npz", seeds.write_logs(".npz"), load_log, LogError, soundness.log, _ARRAYS, _bombs),
+    "log_csv": Kind(".csv", seeds.write_logs(".csv"), load_log, LogError, soundness.log, _TABLE, _texts),
+    "script": Kind(".npz", seeds.write_scripts, load_script, ScriptError, soundness.script, _ARRAYS, _bombs),
+    "reference": Kind(
+        ".npz",
+        seeds.write_references,
+        load_reference,
+        ReferenceFileError,
+        soundness.reference,
+        _either((0.3, damage), (0.7, _reference)),
+        _bombs,
+    ),
+    "mapping": Kind(
+        ".toml", seeds.write_mappings, _import_by_mapping, LogError, soundness.imported, _TEXT, _texts
+    ),
+    "import_csv": Kind(
+        ".csv", seeds.write_foreign_csv, _import("csv"), LogError, soundness.imported, _TABLE, _texts
+    ),
+    "import_gz": Kind(
+        ".csv.gz",
+        seeds.write_packed_csv,
+        _import("csv"),
+        LogError,
+        soundness.imported,
+        _either((0.5, damage), (0.5, _packed_text)),
+        _packed_bombs,
+    ),
+    "ulog": Kind(
+        ".ulg",
+        seeds.write_ulogs,
+        _import("ulog"),
+        LogError,
+        soundness.imported,
+        _either((0.4, damage), (0.6, flight_logs.damage_ulog)),
+        lambda contents: flight_logs.hostile_ulogs(contents[0]),
+    ),
+    "betaflight": Kind(
+        ".bbl",
+        seeds.write_blackboxes,
+        _import("betaflight"),
+        LogError,
+        soundness.imported,
+        _either((0.4, damage), (0.6, flight_logs.damage_blackbox)),
+        lambda contents: flight_logs.hostile_blackboxes(contents[0]),
+    ),
+    "settings": Kind(
+        ".toml", seeds.write_settings, settings_in_file, ConfigError, soundness.settings, _TEXT, _texts
+    ),
+    "checkpoint": Kind(
+        ".msgpack",
+        seeds.write_policies,
+        load_checkpoint,
+        CheckpointError,
+        soundness.checkpoint,
+        _either((0.3, damage), (0.7, packed.damage_checkpoint)),
+        lambda _: packed.hostile_checkpoints(),
+    ),
+    "resume": Kind(
+        ".msgpack",
+        write_trainings,
+        resume,
+        CheckpointError,
+        soundness.runner,
+        _either((0.1, damage), (0.9, packed.damage_checkpoint)),
+    ),
+    "black_box": Kind(
+        ".bin",
+        programs.write_plants,
+        load_black_box,
+        BlackBoxError,
+        soundness.black_box,
+        _either((0.4, damage), (0.6, programs.damage_program)),
+        lambda _: programs.hostile_programs(),
+    ),
+}

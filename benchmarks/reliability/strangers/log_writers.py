@@ -1,0 +1,91 @@
+"""Writers of small logs in other people's formats, by their specifications: PX4's, Betaflight's."""
+
+import struct
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+ULOG_TYPES = {"uint64_t": "Q", "float": "f", "bool": "?", "uint8_t": "B"}
+
+
+class UlogWriter:
+    """A ULog file by PX4's specification of the format: header, definitions, subscriptions, data."""
+
+    def __init__(self, parameters: dict[str, float]):
+        self.definitions = self.message("B", bytes(40)) + b"".join(
+            self.message("P", self.key(f"float {name}") + struct.pack("<f", value))
+            for name, value in parameters.items()
+        )
+        self.data = b""
+        self.num_topics = 0
+
+    @staticmethod
+    def message(kind: str, content: bytes) -> bytes:
+        return struct.pack("<Hc", len(content), kind.encode()) + content
+
+    @staticmethod
+    def key(text: str) -> bytes:
+        return struct.pack("<B", len(text)) + text.encode()
+
+    def add(self, name: str, fields: list[tuple[str, str, int]], rows: list[tuple[Any, ...]]) -> None:
+        """Add a topic: fields are (type, name, array size or 0), rows flat with the time in us first."""
+        fields = [("uint64_t", "timestamp", 0), *fields]
+        text = "".join(f"{kind}{f'[{size}]' if size else ''} {field};" for kind, field, size in fields)
+        self.definitions += self.message("F", f"{name}:{text}".encode())
+        pattern = "<" + "".join(ULOG_TYPES[kind] * max(size, 1) for kind, _, size in fields)
+        self.data += self.message("A", struct.pack("<BH", 0, self.num_topics) + name.encode())
+        for row in rows:
+            content = struct.pack("<H", self.num_topics) + struct.pack(pattern, *row)
+            self.data += self.message("D", content)
+        self.num_topics += 1
+
+    def write(self, path: Path) -> Path:
+        header = b"ULog\x01\x12\x35" + struct.pack("<BQ", 1, 0)
+        path.write_bytes(header + self.definitions + self.data)
+        return path
+
+
+def _variable_bytes(value: int, is_signed: bool) -> bytes:
+    """Return a whole number as blackbox logs have it: zigzag if signed, seven bits a byte."""
+    rest = (value << 1 if value >= 0 else (-value << 1) - 1) if is_signed else value
+    found = bytearray()
+    while rest > 0x7F:
+        found.append(rest & 0x7F | 0x80)
+        rest >>= 7
+    return bytes([*found, rest])
+
+
+BLACKBOX_HEADERS = {
+    "Firmware type": "Cleanflight",
+    "Firmware revision": "Betaflight 4.5.1 (77d01ba3b) STM32F405",
+    "looptime": "125",
+    "acc_1G": "2048",
+    "vbatref": "2485",
+    "vbatcellvoltage": "330,360,430",
+    "rc_rates": "220,100,50",
+    "rates": "0,70,80",
+    "rate_limits": "1998,1998,1998",
+    "rates_type": "0",
+}
+
+
+def blackbox(rows: np.ndarray, names: list[str], headers: dict[str, str]) -> bytes:
+    """Return a blackbox log of full frames only: rows (num_rows, len(names)) of whole numbers."""
+    signed = [int(name not in ("loopIteration", "time")) for name in names]
+    lines = {
+        "Product": "Blackbox flight data recorder by Nicholas Sherlock",
+        "Data version": "2",
+        "Field I name": ",".join(names),
+        "Field I signed": ",".join(map(str, signed)),
+        "Field I predictor": ",".join("0" * len(names)),
+        "Field I encoding": ",".join(str(1 - sign) for sign in signed),
+        **headers,
+    }
+    text = "".join(f"H {name}:{value}\n" for name, value in lines.items()).encode()
+    frames = b"".join(
+        b"I"
+        + b"".join(_variable_bytes(int(value), bool(sign)) for value, sign in zip(row, signed, strict=True))
+        for row in rows
+    )
+    return text + frames + b"E\xffEnd of log\x00"
