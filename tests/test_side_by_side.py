@@ -81,6 +81,8 @@ def test_seeds_that_did_not_train_together_stay_where_they_are(trainer, together
     assert [start[1].meta["steps"] for start in at_common_step([behind, *starts[1:]])] == [4 * BATCH] * 3
     for others in ([behind, starts[1]], [behind, starts[1], None], [None] * 3, []):
         assert at_common_step(others) is others
+    behind[1].meta["machine"] = "a stranger's"
+    assert at_common_step([behind, *starts[1:]])[0] is behind
     lost = newest_intact(together[0] / f"seed{SEED}" / f"step_{4 * BATCH}.msgpack")
     lost[1].meta["steps"] = 5 * BATCH  # of which nobody has a checkpoint
     assert at_common_step([lost, *starts[1:]])[0] is lost

@@ -175,8 +175,15 @@ def newest_intact(path: Path) -> tuple[Path, Checkpoint]:
 
 def seeds_side_by_side(starts: list[Start | None]) -> int:
     """Return how many seeds trained side by side, as the first checkpoint says; all of them without one."""
-    metas = [start[1].meta for start in starts if start is not None]
-    return int(metas[0].get("machine", {}).get("seeds", 1)) if metas else len(starts)
+    found = [start[1] for start in starts if start is not None]
+    return _seeds_noted(found[0]) if found else len(starts)
+
+
+def _seeds_noted(checkpoint: Checkpoint) -> int:
+    """Return beside how many seeds, itself one of them, a checkpoint says that its seed trained."""
+    machine = checkpoint.meta.get("machine")
+    number = machine.get("seeds") if isinstance(machine, dict) else None
+    return number if isinstance(number, int) and number > 0 else 1
 
 
 def at_common_step(starts: list[Start | None]) -> list[Start | None]:
@@ -187,10 +194,7 @@ def at_common_step(starts: list[Start | None]) -> list[Start | None]:
     """
     found = [start for start in starts if start is not None]
     steps = {checkpoint.meta["steps"] for _, checkpoint in found}
-    are_together = all(
-        checkpoint.meta.get("machine", {}).get("seeds") == len(starts) == len(found)
-        for _, checkpoint in found
-    )
+    are_together = all(_seeds_noted(checkpoint) == len(starts) == len(found) for _, checkpoint in found)
     if not are_together or len(steps) <= 1:
         return starts
     name = f"step_{min(steps)}.msgpack"
