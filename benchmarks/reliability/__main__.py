@@ -13,10 +13,11 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.env_speed import cpu_name, versions
+from benchmarks.reliability import files
 from benchmarks.reliability.section import Section
 from flytrack_env.files import write_atomically
 
-SECTIONS: tuple[Section, ...] = ()
+SECTIONS: tuple[Section, ...] = (files.SECTION,)
 RESULTS = Path("docs/results")
 PAGE = """# Reliability
 
