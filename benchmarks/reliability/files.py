@@ -1,4 +1,4 @@
-"""Files from strangers: damaged at random and on purpose, they load as they should or are refused in words."""
+"""Files from strangers, damaged at random and on purpose: they load as they should, or are refused."""
 
 from pathlib import Path
 from typing import Any
@@ -28,11 +28,13 @@ TITLES = {
     "resume": "checkpoint that a training is resumed from",
     "black_box": "black box (`acro_step.bin`)",
 }
-TEXT = """Files of every kind that is read, written by the package itself and then damaged: bits, bytes and blocks changed, left out,
-repeated and mixed; values, types, names, shapes and sizes inside changed to what is odd, huge, missing or not a number; pickles; archives
-that unpack to gigabytes; programs that never end. Each is loaded by itself, in a process that may use 5 s of processor time and 1 GiB of
-memory more than it had, and whose file accesses, processes, sockets, unpickling and running of code are watched. Two outcomes are
-promised: a load that is sound, or the documented error, in a message that can be read and names the file.
+TEXT = """Files of every kind that is read, up to 1 MiB or so, written by the package itself and then damaged:
+bits, bytes and blocks changed, left out, repeated and mixed; values, types, names, shapes and sizes inside
+that are odd, huge, missing or no numbers; pickles; archives that unpack to gigabytes; programs that never
+end. Each is loaded in a process that may use 5 s of processor time and 1 GiB of memory more than it had, and
+whose writing of files, processes, sockets, unpickling and running of code are watched. Two outcomes are
+promised: a load that is sound, or the documented error, with a message that can be read and names the file.
+What the loaders do for that: [files from strangers](../strangers.md).
 
 """
 
@@ -62,11 +64,11 @@ def as_markdown(result: dict[str, Any]) -> str:
             f"{found['slowest_s']:g} |"
         )
         broken += [
-            f"- {TITLES[name]}, number {one['number']} of seed {result['seed']}: {one['sort']}: `{one['text']}`"
+            f"- {TITLES[name]}, number {one['number']}: {one['sort']}: `{one['text']}`"
             for one in found["examples"]
         ]
     if broken:
-        lines += ["", "Broken promises:", "", *broken]
+        lines += ["", f"Broken promises, seed {result['seed']}:", "", *broken]
     return TEXT + "\n".join(lines)
 
 

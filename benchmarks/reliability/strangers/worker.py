@@ -35,7 +35,7 @@ class Outcome(NamedTuple):
 
 
 def contents_of(kind: Kind, seed: int, number: int, wells: list[bytes], hostile: list[bytes]) -> bytes:
-    """Return the content of a file by its number: first what is well, then what is hostile, then damage."""
+    """Return a file's content by its number: first what is well, then what is hostile, then damage."""
     if number < len(wells):
         return wells[number]
     if number < len(wells) + len(hostile):
