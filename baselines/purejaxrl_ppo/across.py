@@ -4,6 +4,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jax.flatten_util import ravel_pytree
 
 AXIS = "devices"  # of the mesh that the environments are spread over
 
@@ -31,4 +32,7 @@ class Across(NamedTuple):
 
     def averaged(self, tree: Any) -> Any:
         """Return the mean over devices of every leaf: of gradients and means of equal shards."""
-        return tree if self.axis is None else jax.lax.pmean(tree, self.axis)
+        if self.axis is None:
+            return tree
+        values, as_tree = ravel_pytree(tree)  # one message instead of one per leaf
+        return as_tree(jax.lax.pmean(values, self.axis))

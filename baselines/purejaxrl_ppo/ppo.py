@@ -241,8 +241,8 @@ def make_ppo(env: Any, env_params: Any, config: Config, num_shards: int = 1) -> 
 
     def update_minibatch(train_state: TrainState, minibatch: tuple[Any, ...]) -> tuple[TrainState, Metrics]:
         gradient = jax.grad(ppo_loss, has_aux=True)
-        grads, parts = gradient(train_state.params, network, *minibatch, config, across)
-        return train_state.apply_gradients(grads=across.averaged(grads)), parts
+        grads, parts = across.averaged(gradient(train_state.params, network, *minibatch, config, across))
+        return train_state.apply_gradients(grads=grads), parts
 
     def update_epoch(
         train_state: TrainState, key: jax.Array, data: tuple[Any, ...]
@@ -271,7 +271,7 @@ def make_ppo(env: Any, env_params: Any, config: Config, num_shards: int = 1) -> 
         metrics = {
             **summarise_episodes(log, across),
             **summarise_race(log, across),
-            **jax.tree.map(across.mean, parts),
+            **jax.tree.map(jnp.mean, parts),
             "last_return": across.mean(log["last_return"]),
             "explained_variance": 1.0 - across.variance(target - batch.value) / across.variance(target),
             "learning_rate": jnp.asarray(schedule(runner.train_state.step)),

@@ -9,8 +9,6 @@ import time
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from baselines.purejaxrl_ppo import load_checkpoint
 from benchmarks.flown import ROOT
 
@@ -57,10 +55,10 @@ def train(out: Path, seed: int, steps: int, processes: int, devices: int) -> flo
     return ended.children_user + ended.children_system - started.children_user - started.children_system
 
 
-def learned(out: Path) -> tuple[float, float]:
-    """Return success and the best flying lap so far, s, of the evaluation at the end of a training."""
+def learned(out: Path) -> tuple[float, float | None]:
+    """Return success, and the best flying lap, s, of the evaluation at the end of a training."""
     seen = load_checkpoint(out / "final.msgpack").meta["seen"]
-    return float(seen["success"]), float(seen["best_lap_s"] or np.nan)
+    return seen["success"], seen["best_lap_s"]
 
 
 def measure(folder: Path, seeds: int, steps: int) -> list[dict[str, Any]]:
@@ -96,8 +94,9 @@ def as_markdown(rows: list[dict[str, Any]], steps: int) -> str:
     ]
     for row in rows:
         success = ", ".join(f"{one:.1%}" for one in row["success"])
-        laps = ", ".join(f"{one:.2f}" for one in row["best_lap_s"])
-        mean = f"{statistics.mean(row['success']):.1%}", f"{statistics.mean(row['best_lap_s']):.2f}"
+        laps = ", ".join("-" if one is None else f"{one:.2f}" for one in row["best_lap_s"])
+        flown = [lap_s for lap_s in row["best_lap_s"] if lap_s is not None]
+        mean = f"{statistics.mean(row['success']):.1%}", f"{statistics.mean(flown):.2f}" if flown else "-"
         lines.append(
             f"| {row['arrangement']} | {success}: mean {mean[0]} | {laps}: mean {mean[1]} | "
             f"{row['cpu_s']:.0f} | {row['wall_s']:.0f} |"
