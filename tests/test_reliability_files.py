@@ -83,7 +83,7 @@ def test_damage_is_the_same_for_the_same_seed_and_damages():
     for mutate in (noise.damage, noise.damage_text):
         found = [mutate(np.random.default_rng([5, number]), [text]) for number in range(200)]
         assert found == [mutate(np.random.default_rng([5, number]), [text]) for number in range(200)]
-        assert len(set(found)) > 150 and text not in found[:20]
+        assert len(set(found)) > 150 and found.count(text) < 20
     tree = {"a": [1, 2.5, {"b": "text"}], "c": None}
     written = [
         trees.as_json(rng, trees.damage_tree(rng, tree)) for rng in map(np.random.default_rng, range(99))
