@@ -14,6 +14,7 @@ import pytest
 
 from baselines.purejaxrl_ppo import CheckpointError, Config, load_checkpoint, make_network
 from baselines.purejaxrl_ppo.checkpoint import find_differences, observation_layout, save_checkpoint
+from baselines.purejaxrl_ppo.resume import newest_intact
 from baselines.purejaxrl_ppo.unpack import unpack
 from flytrack_env import FlyTrack
 from flytrack_env.observations import OBSERVATION_SIZE
@@ -251,3 +252,31 @@ def test_differences_name_every_field():
         "run.d: found 'x', expected nothing",
         "run.e: found nothing, expected 'y'",
     ]
+
+
+PROGRESS = {"steps": 3 * CONFIG.batch_size, "seed": 1, "model": {}, "environment": {}}
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "reason"),
+    [
+        ("steps", None, "steps: found None, expected a whole number"),
+        ("steps", "many", "steps: found 'many', expected a whole number"),
+        ("steps", -1, "steps: found -1, expected a whole number"),
+        ("steps", 10**400, "steps: found 1000.*, expected a whole number"),
+        ("steps", CONFIG.batch_size + 1, "steps: found .*, expected a multiple of"),
+        ("seed", 1.5, "seed: found 1.5, expected a whole number"),
+        ("seconds", "long", "seconds: found 'long', expected a number"),
+        ("seen", [1.0], "seen: found .*, expected an object of numbers"),
+        ("seen", {"success": "all"}, "seen: found .*, expected an object of numbers"),
+        ("model", "nominal", "model: found 'nominal', expected an object"),
+        ("environment", None, "environment: found None, expected an object"),
+    ],
+)
+def test_a_training_that_does_not_say_how_far_it_is_is_not_resumed(tmp_path, params, name, value, reason):
+    path, training = tmp_path / "k.msgpack", {"a": np.zeros(1)}
+    save_checkpoint(path, params, CONFIG, {**DESCRIPTION, **PROGRESS}, training)
+    assert newest_intact(path)[1].meta["steps"] == PROGRESS["steps"]
+    save_checkpoint(path, params, CONFIG, {**DESCRIPTION, **PROGRESS, name: value}, training)
+    with pytest.raises(CheckpointError, match=rf"k\.msgpack: {reason}"):
+        newest_intact(path)
