@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from baselines.purejaxrl_ppo import CheckpointError, Config, load_checkpoint, make_network
+from baselines.purejaxrl_ppo import checkpoint as checkpoint_module
 from baselines.purejaxrl_ppo.checkpoint import find_differences, observation_layout, save_checkpoint
 from baselines.purejaxrl_ppo.resume import newest_intact
 from baselines.purejaxrl_ppo.unpack import unpack
@@ -174,10 +175,27 @@ def test_arrays_of_every_number_come_back(dtype):
         ("track", ["x" * 999] * 999, "track: found .{1,200}, expected a string"),
     ],
 )
-def test_descriptions_of_no_network_are_refused(tmp_path, params, name, value, reason):
-    save_checkpoint(tmp_path / "j.msgpack", params, CONFIG, {**DESCRIPTION, name: value})
-    with pytest.raises(CheckpointError, match=rf"j\.msgpack: .*{reason}"):
-        load_checkpoint(tmp_path / "j.msgpack")
+def test_descriptions_of_no_network_are_refused(tmp_path, params, path, name, value, reason):
+    content = content_of(path)
+    meta = {**json.loads(content["meta"]), name: value}
+    path.write_bytes(
+        with_checksum(flax.serialization.msgpack_serialize({**content, "meta": json.dumps(meta)}))
+    )
+    with pytest.raises(CheckpointError, match=rf"a\.msgpack: .*{reason}"):
+        load_checkpoint(path)
+
+
+def test_what_would_not_be_read_is_not_written(tmp_path, params, monkeypatch):
+    path = tmp_path / "l.msgpack"
+    with pytest.raises(CheckpointError, match=r"l\.msgpack: found observation_size 65537"):
+        save_checkpoint(path, params, CONFIG, {**DESCRIPTION, "observation_size": 65537})
+    deep = dataclasses.replace(CONFIG, hidden_sizes=(8,) * 65)
+    with pytest.raises(CheckpointError, match="expected at most 64 layers"):
+        save_checkpoint(path, params, deep, DESCRIPTION)
+    monkeypatch.setattr(checkpoint_module, "LARGEST_BYTES", 3000)
+    with pytest.raises(CheckpointError, match=r"l\.msgpack: found \d+ bytes to write, expected at most 3000"):
+        save_checkpoint(path, params, CONFIG, DESCRIPTION)
+    assert not path.exists()
 
 
 @pytest.mark.parametrize("training", [[1.0], "a", {"a": {"b": np.zeros(1)}}, {"a": 1.0}])

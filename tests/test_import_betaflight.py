@@ -10,7 +10,7 @@ from real_logs import BETAFLIGHT, shared
 from scipy.spatial.transform import Rotation
 
 from benchmarks.reliability.strangers.log_writers import BLACKBOX_HEADERS, blackbox
-from flytrack_env.apart import Limits
+from flytrack_env.apart import ResourceLimits
 from flytrack_sysid import LogError, import_log
 from flytrack_sysid.importing import decoding
 from flytrack_sysid.importing.betaflight_log import full_stick_rate
@@ -129,7 +129,7 @@ def test_what_cannot_be_meant_is_refused(tmp_path, content, message):
 def test_headers_that_make_the_decoder_wait_for_ever_are_refused_in_time(tmp_path, monkeypatch):
     waits = {"Field I predictor": ",".join("6" * len(NAMES)), "P interval": "0/32"}
     path = write(tmp_path / "a.bbl", log_with(**waits))
-    monkeypatch.setattr(decoding, "limits_of", lambda num_bytes: Limits(cpu_s=1))
+    monkeypatch.setattr(decoding, "limits_of", lambda num_bytes: ResourceLimits(cpu_s=1))
     with pytest.raises(
         LogError, match=r"a\.bbl: damaged, cannot be decoded: it took more than 1 s of processor"
     ):
@@ -137,8 +137,8 @@ def test_headers_that_make_the_decoder_wait_for_ever_are_refused_in_time(tmp_pat
 
 
 def test_large_files_may_take_longer_to_decode():
-    assert decoding.limits_of(2**20 - 1).cpu_s == Limits().cpu_s < decoding.limits_of(2**20).cpu_s
-    assert decoding.limits_of(2**24).memory_bytes > Limits().memory_bytes
+    assert decoding.limits_of(2**20 - 1).cpu_s == ResourceLimits().cpu_s < decoding.limits_of(2**20).cpu_s
+    assert decoding.limits_of(2**24).memory_bytes > ResourceLimits().memory_bytes
 
 
 def test_without_fork_the_decoder_works_here(tmp_path, monkeypatch):

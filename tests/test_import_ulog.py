@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from benchmarks.reliability.strangers.log_writers import UlogWriter
-from flytrack_env.apart import Limits
+from flytrack_env.apart import ResourceLimits
 from flytrack_sysid import LogError, import_log
 from flytrack_sysid.importing import decoding
 
@@ -182,7 +182,7 @@ def test_topics_of_arrays_of_arrays_are_refused_in_time(tmp_path, monkeypatch):
     subscription = UlogWriter.message("A", b"\x00\x00\x00vehicle_attitude")
     path = tmp_path / "a.ulg"
     path.write_bytes(with_definitions(b"ULog\x01\x12\x35" + bytes(9), *formats) + subscription)
-    limits = Limits(cpu_s=2, memory_bytes=2**27)
+    limits = ResourceLimits(cpu_s=2, memory_bytes=2**27)
     monkeypatch.setattr(decoding, "limits_of", lambda num_bytes: limits)
     with pytest.raises(LogError, match=r"a\.ulg: damaged, cannot be decoded: it (took|needs) more than"):
         import_log(path, "ulog")
