@@ -1,18 +1,53 @@
 """The parameters of an environment."""
 
+from collections.abc import Mapping
 from dataclasses import field
+from operator import attrgetter
 from typing import TYPE_CHECKING, Any, Self
 
 import chex
+import jax
 import numpy as np
 
 from flytrack_env.dynamics import ModelParameters
-from flytrack_env.effects import check_parameters
+from flytrack_env.effects import ROUNDING, Range, check_parameters
 from flytrack_env.quaternion import Scalar
 from flytrack_env.resets import ResetParams
 from flytrack_env.rewards import RewardWeights
 from flytrack_env.state import BATTERY_EMPTY_V, BATTERY_FULL_V
 from flytrack_env.tracks import Course
+from flytrack_env.tracks.track import LARGEST
+
+# Where numbers stay finite, attitudes unit quaternions and observations in their space, whatever is flown;
+# wider than anything that flies. Of effects, their own ranges; of wrappers, what these say.
+RANGES: Mapping[str, Range] = {
+    "dt": Range(5e-4, 1.0, "s"),
+    "drone_radius": Range(1e-3, 1e3, "m"),
+    "max_steps_in_episode": Range(1, 2e9, "steps"),
+    "model.tau": Range(1e-6, 1e3, "s"),
+    "model.thrust_coeffs": Range(-1e4, 1e4, "N"),
+    "model.max_rate": Range(1e-3, 1e5, "deg/s"),
+    "model.m": Range(1e-3, 1e3, "kg"),
+    "model.g": Range(0.0, 1e3, "m/s^2"),
+    "model.battery_drain_v_per_min": Range(-1e3, 1e3, "V/min"),
+    "reset.course_fraction": Range(0.0, 1.0, "1"),
+    "reset.start_position_noise": Range(0.0, LARGEST, "m"),
+    "reset.start_height_noise": Range(0.0, LARGEST, "m"),
+    "reset.start_yaw_noise_deg": Range(0.0, 180.0, "deg"),
+    "reset.start_tilt_noise_deg": Range(0.0, 180.0, "deg"),
+    "reset.start_battery_low_v": Range(BATTERY_EMPTY_V, BATTERY_FULL_V, "V"),
+    "reset.course_offset": Range(0.0, LARGEST, "m"),
+    "reset.course_speed": Range(0.0, 1e3, "m/s"),
+    "reset.course_yaw_deg": Range(0.0, 180.0, "deg"),
+    "reset.course_tilt_deg": Range(0.0, 180.0, "deg"),
+    "reset.course_stick": Range(0.0, 1.0, "1"),
+    "reset.course_thrust_low": Range(-1.0, 1.0, "1"),
+    "reset.course_thrust_high": Range(-1.0, 1.0, "1"),
+    "reset.course_battery_low_v": Range(BATTERY_EMPTY_V, BATTERY_FULL_V, "V"),
+    **{f"reward.{name}": Range(-1e6, 1e6, "1") for name in RewardWeights._fields},
+}
+LEAST_GATES = 2
+UNIT_TOLERANCE = 1e-5  # of a norm
 
 
 @chex.dataclass(frozen=True, mappable_dataclass=False)
@@ -42,21 +77,40 @@ class EnvParams:
     def check(self) -> None:
         """Raise ValueError, naming the field, for values that no episode can be flown with.
 
-        For concrete values, before work begins: under ``jit`` nothing can be refused any more.
+        For concrete values, before work begins: under ``jit`` nothing can be refused any more. Any of them
+        may be batched, as ``vmap`` takes them.
         """
-        for name in ("start_battery_low_v", "course_battery_low_v"):
-            value = getattr(self.reset, name)
-            if not np.all((np.asarray(value) >= BATTERY_EMPTY_V) & (np.asarray(value) <= BATTERY_FULL_V)):
-                raise ValueError(
-                    f"reset.{name}: found {value}, expected {BATTERY_EMPTY_V:g} to {BATTERY_FULL_V:g} V"
-                )
+        for name, bounds in RANGES.items():
+            value = attrgetter(name)(self)
+            low = bounds.low - ROUNDING * abs(bounds.low)
+            high = bounds.high + ROUNDING * abs(bounds.high)
+            if not np.all((np.asarray(value) >= low) & (np.asarray(value) <= high)):
+                expected = f"{bounds.low:g} to {bounds.high:g} {bounds.unit}"
+                raise ValueError(f"{name}: found {value}, expected {expected}")
         for parameters in self.model.effects:
             check_parameters(parameters, self.dt)
-        for name in ("dt", "drone_radius", "max_steps_in_episode"):
-            value = getattr(self, name)
-            if not np.all(np.asarray(value) > 0):
-                raise ValueError(f"{name}: found {value}, expected > 0")
-        if not np.all(np.asarray(self.course.gates.half_opening) > self.drone_radius):
+        _check_course(self.course)
+        if not np.all(np.asarray(self.course.gates.half_opening) > np.asarray(self.drone_radius)[..., None]):
             raise ValueError(
                 f"drone_radius: found {self.drone_radius}, expected less than half of every gate's opening"
             )
+
+
+def _check_course(course: Course) -> None:
+    """Raise ValueError for a course of one gate, which a pass would count twice, or numbers that are none."""
+    num_gates = np.shape(course.gates.half_opening)[-1]
+    if num_gates < LEAST_GATES:
+        raise ValueError(f"course.gates: found {num_gates}, expected at least {LEAST_GATES}")
+    for path, leaf in jax.tree_util.tree_leaves_with_path(course):
+        if not np.all(np.abs(leaf) <= LARGEST):
+            name = f"course{jax.tree_util.keystr(path)}"
+            raise ValueError(f"{name}: found {leaf}, expected finite numbers within +-{LARGEST:g}")
+    units = {
+        "start_quat": course.start_quat,
+        "gates.forward": course.gates.forward,
+        "gates.up": course.gates.up,
+    }
+    for name, components in units.items():
+        norm = np.sqrt(sum(np.square(np.asarray(component, float)) for component in components))
+        if not np.all(np.abs(norm - 1.0) <= UNIT_TOLERANCE):
+            raise ValueError(f"course.{name}: found norm {norm}, expected 1")

@@ -46,6 +46,7 @@ def script(name: str) -> Use:
 USE_OF = {
     CORE: script("core"),
     "train": script("train"),
+    "sweep": script("sweep"),
     "sysid": script("sysid"),
     "logs": Use(("-m", "pytest", "-q", *TESTS_OF_LOGS), True, ("pytest>=8", "hypothesis>=6")),
     "viz": script("viz"),

@@ -344,6 +344,7 @@ def test_a_track_stays_until_another_is_named(
         ({"yaw_deg": True}, "yaw_deg.*found True, expected a finite number"),
         ({"yaw_deg": [3.0]}, "yaw_deg.*expected a finite number"),
         ({"velocity": (1e39, 0.0, 0.0)}, "velocity.*expected 3 finite numbers"),
+        ({"velocity": (0.0, -1001.0, 0.0)}, "velocity.*expected at most 1000 m/s along every axis"),
         ({"battery_v": 21.9}, "battery_v.*found 21.9, expected above 22 and up to 24 V"),
         ({"battery_v": 24.1}, "battery_v.*expected above 22 and up to 24 V"),
         ({"gate_index": 8}, "gate_index.*found 8, expected an integer from 0 to 7"),

@@ -1,10 +1,17 @@
 """Parameters that no episode can be flown with are refused by name."""
 
+import dataclasses
+import re
+from operator import attrgetter
+from typing import Any
+
 import jax
+import numpy as np
 import pytest
 
 from flytrack_env import FlyTrack
 from flytrack_env.effects import CommandDelay
+from flytrack_env.params import RANGES, EnvParams
 from flytrack_env.plants import Simulator
 
 PARAMS = FlyTrack().default_params
@@ -57,3 +64,71 @@ def test_effects_outside_their_range(delay_s):
     with pytest.raises(ValueError, match=r"command_delay\.delay_s: found .*, expected 0 to 0\.04 s"):
         PARAMS.replace(model=model).check()
     PARAMS.replace(model=PARAMS.model.with_effects(CommandDelay(0.02))).check()
+
+
+def with_value(name: str, value: Any) -> EnvParams:
+    """Return the default parameters with another value of a field of RANGES."""
+    part, _, field = name.rpartition(".")
+    if not part:
+        return PARAMS.replace(**{field: value})
+    return PARAMS.replace(**{part: getattr(PARAMS, part)._replace(**{field: value})})
+
+
+@pytest.mark.parametrize("name", RANGES)
+def test_ends_of_ranges_pass_and_what_lies_beyond_is_refused(name: str) -> None:
+    bounds, shape = RANGES[name], np.shape(attrgetter(name)(PARAMS))
+    for end in (bounds.low, bounds.high):
+        try:
+            with_value(name, np.full(shape, end, np.float32)).check()
+        except ValueError as error:  # a drone that is wider than the opening of a gate
+            assert name == "drone_radius" and "half of every gate's opening" in str(error)
+    below, above = bounds.low - 0.01 * abs(bounds.low) - 1e-9, bounds.high * 1.01
+    for value in (below, above, np.nan, np.inf, -np.inf):
+        wrong = np.full(shape, attrgetter(name)(PARAMS), float)
+        wrong.reshape(-1)[-1] = value
+        with pytest.raises(
+            ValueError, match=rf"(?s)^{name}: found .*, expected .* to .* {re.escape(bounds.unit)}$"
+        ):
+            with_value(name, wrong).check()
+
+
+def test_every_number_of_the_parameters_has_a_range() -> None:
+    parts = ("model", "reset", "reward")
+    fields = {f"{part}.{name}" for part in parts for name in getattr(PARAMS, part)._fields}
+    own = {field.name for field in dataclasses.fields(EnvParams)} - {*parts, "course", "wrappers"}
+    assert set(RANGES) == (fields | own) - {"model.effects"}
+
+
+def test_courses_that_cannot_be_flown() -> None:
+    course = PARAMS.course
+    one = course._replace(gates=jax.tree.map(lambda leaf: leaf[:1], course.gates))
+    far = course._replace(bounds_high=course.bounds_high._replace(y=np.float32(np.inf)))
+    crooked = course._replace(start_quat=course.start_quat._replace(w=np.float32(0.01)))
+    cases = (
+        (one, r"course\.gates: found 1, expected at least 2"),
+        (far, r"course\.bounds_high\.y: found inf, expected finite numbers within \+-1e\+06"),
+        (crooked, r"course\.start_quat: found norm 1\.0000\d+, expected 1"),
+    )
+    for wrong, reason in cases:
+        with pytest.raises(ValueError, match=reason):
+            PARAMS.replace(course=wrong).check()
+
+
+def test_batches_are_checked_as_one() -> None:
+    def repeated(leaf: Any) -> np.ndarray:
+        return np.repeat(np.asarray(leaf)[None], 3, axis=0)
+
+    batch = jax.tree.map(repeated, PARAMS)
+    batch.check()
+    for name, wrong in (("drone_radius", 0.8), ("dt", 0.0)):
+        with pytest.raises(ValueError, match=name):
+            batch.replace(**{name: np.array([0.1, 0.1, wrong])}).check()
+    PARAMS.replace(drone_radius=np.array([0.1, 0.2, 0.3])).check()
+
+
+def test_a_single_gate_is_refused_where_an_episode_begins() -> None:
+    """Its pass would be counted twice, as it is the gate after itself."""
+    track = FlyTrack().track
+    env = FlyTrack(track=dataclasses.replace(track, gates=track.gates[:1]))
+    with pytest.raises(ValueError, match=r"course\.gates: found 1"):
+        env.reset(jax.random.key(0))

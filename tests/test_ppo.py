@@ -8,6 +8,7 @@ from flax import struct
 from gymnax.environments import environment, spaces
 
 from baselines.purejaxrl_ppo import Config, make_network, make_train
+from baselines.purejaxrl_ppo.across import Across
 from baselines.purejaxrl_ppo.metrics import summarise_episodes, summarise_race
 from baselines.purejaxrl_ppo.ppo import (
     Batch,
@@ -218,7 +219,7 @@ def test_episodes_are_averaged_over_those_that_ended():
         "episode_return": jnp.array([[1.0, 50.0], [60.0, 3.0]]),
         "laps": jnp.array([[2, 9], [9, 4]]),
     }
-    summary = summarise_episodes(log)
+    summary = summarise_episodes(log, Across())
     assert summary["episode_return"] == 2.0
     assert summary["episode_laps"] == 3.0
     assert summary["episodes_ended"] == 2
@@ -230,8 +231,8 @@ def test_lap_times_are_averaged_over_the_laps():
         "lap_time_s": jnp.array([[4.0, 9.0], [9.0, 5.0]]),
         "gate_distance_m": jnp.array([[1.0, 2.0], [3.0, 6.0]]),
     }
-    assert summarise_race(log) == {"laps_completed": 2, "lap_time_s": 4.5, "gate_distance_m": 3.0}
-    assert summarise_race({"done": log["lap_completed"]}) == {}
+    assert summarise_race(log, Across()) == {"laps_completed": 2, "lap_time_s": 4.5, "gate_distance_m": 3.0}
+    assert summarise_race({"done": log["lap_completed"]}, Across()) == {}
 
 
 def test_std_has_a_floor():

@@ -100,13 +100,13 @@ def test_every_checkpoint_is_checked_before_any_training(cut_off, tmp_path):
 
 
 def test_seeds_that_have_not_begun_are_in_the_folder(tmp_path, monkeypatch, capsys):
-    def interrupt(self, out, seed, options):
+    def interrupt(self, asked):
         self.steps = 40
         if is_checkpointed:
-            (out / "step_0.msgpack").touch()
+            (asked[0][0] / "step_0.msgpack").touch()
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(train_ppo.Trainer, "train", interrupt)
+    monkeypatch.setattr(train_ppo.Trainer, "train_all", interrupt)
     is_checkpointed = False
     assert call(monkeypatch, "--out", tmp_path / "out", "--num-seeds", 3, "--seed", 5) == 130
     assert capsys.readouterr().err == "stopped at 40 steps, before the first checkpoint\n"
@@ -117,10 +117,10 @@ def test_seeds_that_have_not_begun_are_in_the_folder(tmp_path, monkeypatch, caps
 
 
 def test_only_errors_of_arguments_show_the_usage(tmp_path, monkeypatch, capsys):
-    def diverge(self, out, seed, options):
+    def diverge(self, asked):
         raise DivergedError("training diverged")
 
-    monkeypatch.setattr(train_ppo.Trainer, "train", diverge)
+    monkeypatch.setattr(train_ppo.Trainer, "train_all", diverge)
     assert call(monkeypatch, "--out", tmp_path) == 1
     assert capsys.readouterr().err == "train_ppo: error: training diverged\n"
     assert call(monkeypatch, "--out", tmp_path, "--no-tracking", "--tracking-uri", DEAD_URI) == 2

@@ -79,6 +79,17 @@ def test_the_newest_intact_checkpoint_is_taken(trainer, whole, tmp_path, caplog)
     assert_same_end(tmp_path / "resumed" / "final.msgpack", whole[0] / "final.msgpack")
 
 
+def test_what_a_killed_process_was_writing_is_removed(trainer, whole, tmp_path):
+    out = tmp_path / "killed"
+    shutil.copytree(whole[0], out)
+    (out / "final.msgpack").unlink()
+    others = {".step_5.msgpack.swp", f".mine.msgpack.{'0' * 16}", "step_5.msgpack~"}
+    for name in {*others, f".step_{7 * BATCH}.msgpack.{'a1' * 8}", f".final.msgpack.{'0' * 16}"}:
+        (out / name).write_bytes(b"half")
+    trainer.train(out, SEED, Options(resume=out))
+    assert {path.name for path in out.iterdir()} == {path.name for path in whole[0].iterdir()} | others
+
+
 def test_folders_without_an_intact_checkpoint_are_refused(whole, tmp_path):
     with pytest.raises(CheckpointError, match="found no checkpoint"):
         newest_intact(tmp_path)

@@ -345,7 +345,8 @@ def test_noise_stays_inside_the_space_and_off_the_flight() -> None:
 
 
 @pytest.mark.parametrize(
-    ("field", "value"), [("position_m", -0.1), ("attitude_deg", np.inf), ("rates_rad_per_s", np.nan)]
+    ("field", "value"),
+    [("position_m", -0.1), ("attitude_deg", np.inf), ("attitude_deg", 181.0), ("rates_rad_per_s", np.nan)],
 )
 def test_bad_deviations_are_refused(field: str, value: float) -> None:
     env = wrapped(ObservationNoise)
@@ -506,6 +507,12 @@ BASE = RandomizationParams()
 BAD_RANGES = [
     (BASE._replace(mass_factor_low=1.3), r"mass_factor: found a range from 1\.3 to 1\.2"),
     (BASE._replace(lag_factor_low=0.0), r"lag_factor: found a range from 0\.0 to 1\.3"),
+    (
+        BASE._replace(mass_factor_high=np.inf),
+        r"mass_factor: found a range from 0\.8 to inf, expected one within",
+    ),
+    (BASE._replace(mass_factor_low=1e-4), r"mass_factor: .* expected one within 0\.00099999 to 1000\.01"),
+    (BASE._replace(effect_factor_high=np.inf), r"effect_factor: found a range from 0\.8 to inf"),
     (BASE._replace(low=BASE.low[1:]), r"high: found effects \['CommandDelay', .* expected those of low"),
     (
         BASE._replace(high=(BASE.high[0]._replace(delay_s=0.1), *BASE.high[1:])),

@@ -11,6 +11,7 @@ import numpy as np
 from tqdm import tqdm
 
 from baselines.purejaxrl_ppo.density import draw_position_density
+from baselines.purejaxrl_ppo.distributed import is_first
 from baselines.purejaxrl_ppo.evaluate import fly_many
 from baselines.purejaxrl_ppo.flights import Outcomes, outcomes_of, save_flown, score
 from baselines.purejaxrl_ppo.networks import ActorCritic
@@ -118,7 +119,10 @@ class LiveLine:
     """One line: steps, rate, time left, mean return of the last episodes, success, best lap so far."""
 
     def __init__(self, total: int, done: int):
-        self._bar = tqdm(total=total, initial=done, unit="step", unit_scale=True, desc="compile")
+        is_hidden = not is_first()
+        self._bar = tqdm(
+            total=total, initial=done, unit="step", unit_scale=True, desc="compile", disable=is_hidden
+        )
 
     def begin(self) -> None:
         """Count time from now on: what came before was compilation."""

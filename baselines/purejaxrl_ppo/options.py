@@ -2,6 +2,7 @@
 
 import json
 import os
+from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
@@ -17,7 +18,8 @@ class Options(NamedTuple):
 
     checkpoint_every, evaluate_every: environment steps; None: only the final checkpoint, no evaluation.
     evaluation_episodes: noisy starts of an evaluation. tracking_uri: MLflow store; None: no tracking.
-    resume: checkpoint, or folder of checkpoints, to go on from.
+    resume: checkpoint, or folder of checkpoints, to go on from. parent: folder of the sweep that this is a
+    trial of, tracked before. report: called with steps and metrics after every evaluation.
     """
 
     checkpoint_every: int | None = None
@@ -25,6 +27,8 @@ class Options(NamedTuple):
     evaluation_episodes: int = 64
     tracking_uri: str | None = None
     resume: Path | None = None
+    parent: Path | None = None
+    report: Callable[[int, dict[str, float]], None] | None = None
 
     def check(self) -> None:
         """Raise ValueError, naming the option, for numbers that are not positive."""

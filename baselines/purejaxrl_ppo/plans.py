@@ -3,15 +3,27 @@
 import argparse
 import dataclasses
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
+
+from jax.sharding import Mesh
 
 from baselines.purejaxrl_ppo.checkpoint import Checkpoint
 from baselines.purejaxrl_ppo.config import Config, settings_of
 from baselines.purejaxrl_ppo.options import INTERVALS, Options, read_options
-from baselines.purejaxrl_ppo.resume import check_free, check_same_run, checkpoints_in, newest_intact, seeds_in
+from baselines.purejaxrl_ppo.resume import (
+    at_common_step,
+    check_free,
+    check_same_run,
+    checkpoints_in,
+    newest_intact,
+    seeds_in,
+    seeds_side_by_side,
+)
 from baselines.purejaxrl_ppo.tracking import local_uri
 from baselines.purejaxrl_ppo.training import Trainer
 from flytrack_env.model_file import model_from_json
+
+T = TypeVar("T")
 
 MAX_SEED = 2**31
 DEFAULT_OUT = Path("runs/train")
@@ -20,12 +32,16 @@ DEFAULTS = Options(checkpoint_every=1_000_000, evaluate_every=4_000_000)
 
 
 class Plan(NamedTuple):
-    """One seed's run: where it writes, and the checkpoint that it goes on from, if any."""
+    """One seed's run: where it writes, and the checkpoint that it goes on from, if any.
+
+    at_once: how many seeds train side by side.
+    """
 
     seed: int
     out: Path
     resume: Path | None = None
     checkpoint: Checkpoint | None = None
+    at_once: int = 1
 
 
 def root_folder(arguments: argparse.Namespace) -> Path:
@@ -45,13 +61,16 @@ def make_plans(arguments: argparse.Namespace) -> list[Plan]:
     resume, number = arguments.resume, arguments.num_seeds
     if number is not None and number < 1:
         raise ValueError(f"--num-seeds: found {number}, expected at least 1")
+    if arguments.seeds_at_once is not None and arguments.seeds_at_once < 1:
+        raise ValueError(f"--seeds-at-once: found {arguments.seeds_at_once}, expected at least 1")
     out, is_one = root_folder(arguments), (number or 1) == 1
     if resume is None:
         seeds = _seeds(arguments.seed or 0, number or 1)
         if is_one and seeds_in(out):
             raise ValueError(f"--out: {out} holds the runs of several seeds; --resume it, or give another")
         check_free(out)
-        plans = [Plan(seed, out if is_one else out / f"seed{seed}") for seed in seeds]
+        at_once = arguments.seeds_at_once or len(seeds)
+        plans = [Plan(seed, out if is_one else out / f"seed{seed}", at_once=at_once) for seed in seeds]
     elif is_one and (checkpoints_in(resume) or not seeds_in(resume)):
         path, checkpoint = newest_intact(resume)
         seed = checkpoint.meta["seed"] if arguments.seed is None else arguments.seed
@@ -69,6 +88,11 @@ def _seeds(first: int, number: int) -> list[int]:
     return list(range(first, first + number))
 
 
+def batched(values: list[T], size: int) -> list[list[T]]:
+    """Return values in groups of a size, the last of them perhaps smaller."""
+    return [values[start : start + size] for start in range(0, len(values), size)]
+
+
 def _plans_of_several(arguments: argparse.Namespace, out: Path) -> list[Plan]:
     """Return the plans of seeds that are taken up again; which, the folder says where the flags do not."""
     resume = arguments.resume
@@ -78,11 +102,14 @@ def _plans_of_several(arguments: argparse.Namespace, out: Path) -> list[Plan]:
     if arguments.seed is not None or arguments.num_seeds is not None:
         first = (found or [0])[0] if arguments.seed is None else arguments.seed
         seeds = _seeds(first, arguments.num_seeds or 1)
-    plans = []
-    for seed in seeds:
-        source = resume / f"seed{seed}"
-        start = newest_intact(source) if checkpoints_in(source) else (None, None)
-        plans.append(Plan(seed, out / source.name, *start))
+    folders = [resume / f"seed{seed}" for seed in seeds]
+    starts = [newest_intact(source) if checkpoints_in(source) else None for source in folders]
+    at_once = arguments.seeds_at_once or seeds_side_by_side(starts)
+    starts = [start for group in batched(starts, at_once) for start in at_common_step(group)]
+    plans = [
+        Plan(seed, out / source.name, *(start or (None, None)), at_once)
+        for seed, source, start in zip(seeds, folders, starts, strict=True)
+    ]
     if all(plan.checkpoint is None for plan in plans):
         has = (
             "the checkpoints of one run: leave out --num-seeds"
@@ -127,7 +154,7 @@ def check_plans(trainer: Trainer, plans: list[Plan]) -> None:
             check_same_run(plan.resume, plan.checkpoint, trainer.describe(plan.seed))
 
 
-def make_trainer(arguments: argparse.Namespace, base: Checkpoint | None) -> Trainer:
+def make_trainer(arguments: argparse.Namespace, base: Checkpoint | None, mesh: Mesh | None = None) -> Trainer:
     """Return the trainer of a command line; what it does not say is as in the checkpoint, if there is one."""
     asked = settings_of(arguments)
     if base is None:
@@ -136,7 +163,7 @@ def make_trainer(arguments: argparse.Namespace, base: Checkpoint | None) -> Trai
             "model": arguments.model,
             "reward": dict(arguments.reward or ()),
         }
-        return Trainer(Config(**asked), arguments.env_id or DEFAULT_ENV_ID, **env_arguments)
+        return Trainer(Config(**asked), arguments.env_id or DEFAULT_ENV_ID, mesh, **env_arguments)
     env_arguments = {
         "track": arguments.track or base.track,
         "model": arguments.model or model_from_json(base.meta["model"], "checkpoint: model"),
@@ -144,7 +171,7 @@ def make_trainer(arguments: argparse.Namespace, base: Checkpoint | None) -> Trai
         "reward": {**reward_of(base), **dict(arguments.reward or ())},
     }
     config = dataclasses.replace(base.config, **asked)
-    return Trainer(config, arguments.env_id or base.env_id, **env_arguments)
+    return Trainer(config, arguments.env_id or base.env_id, mesh, **env_arguments)
 
 
 def reward_of(checkpoint: Checkpoint) -> dict[str, float]:

@@ -17,6 +17,7 @@ and the setting (``config.py``) that switches it off:
   last updates still learn (``anneal_every_gradient = false``, ``final_learning_rate_fraction = 0``).
 - One update is a function of its own (``Algorithm``), so that a run can be logged, stored and taken up again
   between updates; ``make_train`` is PureJaxRL's: one ``jit``, a ``scan`` over updates.
+- An update may see one shard of the environments, its gradients averaged over all (``distributed.py``).
 """
 
 from collections.abc import Callable
@@ -29,6 +30,7 @@ import optax
 from flax.training.train_state import TrainState
 from gymnax.environments import spaces
 
+from baselines.purejaxrl_ppo.across import AXIS, Across
 from baselines.purejaxrl_ppo.config import Config
 from baselines.purejaxrl_ppo.metrics import summarise_episodes, summarise_race
 from baselines.purejaxrl_ppo.networks import ActorCritic, make_network
@@ -125,8 +127,9 @@ def ppo_loss(
     advantage: jax.Array,
     target: jax.Array,
     config: Config,
+    across: Across = Across(),  # noqa: B008, a tuple
 ) -> tuple[jax.Array, Metrics]:
-    """Return the clipped objective plus clipped value loss, and its parts."""
+    """Return the clipped objective plus clipped value loss of this device's experience, and its parts."""
     said: Any = network.apply(network_params, batch.observation)
     policy, value = said
     log_prob = policy.log_prob(batch.action)
@@ -136,7 +139,8 @@ def ppo_loss(
 
     log_ratio = log_prob - batch.log_prob
     ratio = jnp.exp(log_ratio)
-    advantage = (advantage - advantage.mean()) / (advantage.std() + 1e-8)
+    advantage_std = jnp.sqrt(across.variance(advantage))
+    advantage = (advantage - across.mean(advantage)) / (advantage_std + 1e-8)
     clipped_ratio = jnp.clip(ratio, 1.0 - config.clip_eps, 1.0 + config.clip_eps)
     policy_loss = -jnp.minimum(ratio * advantage, clipped_ratio * advantage).mean()
     entropy = policy.entropy().mean()
@@ -184,13 +188,17 @@ def make_network_for(env: Any, env_params: Any, config: Config) -> ActorCritic:
     return make_network(config)
 
 
-def make_ppo(env: Any, env_params: Any, config: Config) -> Algorithm:
+def make_ppo(env: Any, env_params: Any, config: Config, num_shards: int = 1) -> Algorithm:
     """Return PPO on a gymnax environment with its parameters.
+
+    num_shards: of the environments; of more than one, an update is of a shard, under the axis ``AXIS``.
 
     Raises:
         ValueError: a configuration that cannot be trained with.
     """
     config.check()
+    across = Across(AXIS if num_shards > 1 else None)
+    batch_size = config.batch_size // num_shards
     network = make_network_for(env, env_params, config)
     optimizer, schedule = make_optimizer(config), make_schedule(config)
     step_all = choose_step(env, config)
@@ -233,14 +241,14 @@ def make_ppo(env: Any, env_params: Any, config: Config) -> Algorithm:
 
     def update_minibatch(train_state: TrainState, minibatch: tuple[Any, ...]) -> tuple[TrainState, Metrics]:
         gradient = jax.grad(ppo_loss, has_aux=True)
-        grads, parts = gradient(train_state.params, network, *minibatch, config)
-        return train_state.apply_gradients(grads=grads), parts
+        grads, parts = gradient(train_state.params, network, *minibatch, config, across)
+        return train_state.apply_gradients(grads=across.averaged(grads)), parts
 
     def update_epoch(
         train_state: TrainState, key: jax.Array, data: tuple[Any, ...]
     ) -> tuple[TrainState, Metrics]:
         permutation = affine_permutation if config.affine_shuffle else jax.random.permutation
-        order = permutation(key, config.batch_size)
+        order = permutation(key, batch_size)
         shuffled = jax.tree.map(lambda leaf: leaf[order], data)
         minibatches = jax.tree.map(
             lambda leaf: leaf.reshape(config.num_minibatches, -1, *leaf.shape[1:]), shuffled
@@ -252,7 +260,7 @@ def make_ppo(env: Any, env_params: Any, config: Config) -> Algorithm:
         last_value: Any = network.apply(runner.train_state.params, runner.observation, method="value")
         advantage = generalized_advantages(batch, last_value, config.gamma, config.gae_lambda)
         target = advantage + batch.value
-        flatten = partial(jax.tree.map, lambda leaf: leaf.reshape(config.batch_size, *leaf.shape[2:]))
+        flatten = partial(jax.tree.map, lambda leaf: leaf.reshape(batch_size, *leaf.shape[2:]))
         data = flatten((batch, advantage, target))
         key, *epoch_keys = jax.random.split(runner.key, config.update_epochs + 1)
         train_state, parts = jax.lax.scan(
@@ -261,11 +269,11 @@ def make_ppo(env: Any, env_params: Any, config: Config) -> Algorithm:
             jnp.stack(epoch_keys),
         )
         metrics = {
-            **summarise_episodes(log),
-            **summarise_race(log),
-            **jax.tree.map(jnp.mean, parts),
-            "last_return": log["last_return"].mean(),
-            "explained_variance": 1.0 - jnp.var(target - batch.value) / jnp.var(target),
+            **summarise_episodes(log, across),
+            **summarise_race(log, across),
+            **jax.tree.map(across.mean, parts),
+            "last_return": across.mean(log["last_return"]),
+            "explained_variance": 1.0 - across.variance(target - batch.value) / across.variance(target),
             "learning_rate": jnp.asarray(schedule(runner.train_state.step)),
         }
         return runner._replace(train_state=train_state, key=key), metrics

@@ -34,14 +34,20 @@ from flytrack_env.words import shown
 FINAL = "final.msgpack"
 SEED_FOLDER = re.compile(r"seed(\d+)")
 STEP_FILE = re.compile(r"step_(\d+)\.msgpack")
+HALF_WRITTEN = re.compile(r"\.(step_\d+|final)\.msgpack\.[0-9a-f]{16}")  # as write_atomically names them
 MUST_FIT = ("env_id", "seed", "missed_gate", "config", "observation", "track_data", "model", "environment")
 
 logger = logging.getLogger(__name__)
 
+Start = tuple[Path, Checkpoint]  # a checkpoint to go on from, and its path
 
-def describe_run(env: Any, env_id: str, track: str, config: Config, seed: int) -> dict[str, Any]:
+
+def describe_run(
+    env: Any, env_id: str, track: str, config: Config, seed: int, number: int = 1
+) -> dict[str, Any]:
     """Return what a run is, as JSON values: what its checkpoints say of themselves.
 
+    number: of seeds that train side by side.
     track: what finds it again, a name or a path; its gates and bounds stand under ``track_data``.
     environment: the other parameters (rewards, starts, time step, wrappers) by their paths.
     """
@@ -60,15 +66,16 @@ def describe_run(env: Any, env_id: str, track: str, config: Config, seed: int) -
             "environment": {name: values.tolist() for name, values in others.items()},
             "config": dataclasses.asdict(config),
             "software": {"jax": jax.__version__},
-            "machine": describe_machine(),
+            "machine": describe_machine(number),
         }
     )
 
 
-def describe_machine() -> dict[str, Any]:
+def describe_machine(number: int = 1) -> dict[str, Any]:
     """Return what of a machine decides the last bits: XLA splits sums by the number of its threads.
 
     threads: cores that this process may use. NPROC: XLA's own setting of that number, where there is one.
+    seeds: that train side by side, where there are several, because their program is another.
     """
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     return {
@@ -76,6 +83,7 @@ def describe_machine() -> dict[str, Any]:
         "devices": jax.device_count(),
         "threads": cores,
         "NPROC": os.environ.get("NPROC"),
+        **({"seeds": number} if number > 1 else {}),
     }
 
 
@@ -96,6 +104,13 @@ def checkpoints_in(folder: Path) -> list[Path]:
     """Return the checkpoints in a folder, newest first: by the steps in their names, the final one first."""
     steps = [path for path in folder.glob("*.msgpack") if STEP_FILE.fullmatch(path.name)]
     return [path for path in (folder / FINAL,) if path.exists()] + sorted(steps, key=steps_of, reverse=True)
+
+
+def remove_half_written(folder: Path) -> None:
+    """Remove what a killed process was writing: no checkpoint, and in nobody's way but the disk's."""
+    for path in folder.glob(".*.msgpack.*"):
+        if HALF_WRITTEN.fullmatch(path.name):
+            path.unlink(missing_ok=True)
 
 
 def seeds_in(folder: Path) -> list[int]:
@@ -156,6 +171,41 @@ def newest_intact(path: Path) -> tuple[Path, Checkpoint]:
         except CheckpointError as error:
             logger.warning("%s; the checkpoint before it is used", error)
     return oldest, _load_training(oldest)
+
+
+def seeds_side_by_side(starts: list[Start | None]) -> int:
+    """Return how many seeds trained side by side, as the first checkpoint says; all of them without one."""
+    found = [start[1] for start in starts if start is not None]
+    return _seeds_noted(found[0]) if found else len(starts)
+
+
+def _seeds_noted(checkpoint: Checkpoint) -> int:
+    """Return beside how many seeds, itself one of them, a checkpoint says that its seed trained."""
+    machine = checkpoint.meta.get("machine")
+    number = machine.get("seeds") if isinstance(machine, dict) else None
+    return number if isinstance(number, int) and number > 0 else 1
+
+
+def at_common_step(starts: list[Start | None]) -> list[Start | None]:
+    """Return where seeds go on that trained side by side: all at the last step that all have stored.
+
+    A kill between their checkpoints leaves some ahead, and alone they would not go on bit for bit.
+    Others, None for those that begin, stay as they are.
+    """
+    found = [start for start in starts if start is not None]
+    steps = {checkpoint.meta["steps"] for _, checkpoint in found}
+    are_together = all(_seeds_noted(checkpoint) == len(starts) == len(found) for _, checkpoint in found)
+    if not are_together or len(steps) <= 1:
+        return starts
+    name = f"step_{min(steps)}.msgpack"
+    try:
+        return [
+            start if start[1].meta["steps"] == min(steps) else newest_intact(start[0].with_name(name))
+            for start in found
+        ]
+    except CheckpointError as error:
+        logger.warning("%s; the seeds go on from where each of them was", error)
+        return starts
 
 
 def _load_training(path: Path) -> Checkpoint:

@@ -1,22 +1,21 @@
-"""One seed's training under way: between its chunks checkpoints, evaluations, tracking, a line."""
+"""One seed's training under way: between its chunks checkpoints, evaluations, tracking."""
 
 import math
 import time
-from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 import flytrack_env
 from baselines.purejaxrl_ppo.checkpoint import Checkpoint, load_checkpoint
+from baselines.purejaxrl_ppo.distributed import is_first
 from baselines.purejaxrl_ppo.journal import JOURNAL
 from baselines.purejaxrl_ppo.metrics import summarise_updates
-from baselines.purejaxrl_ppo.monitor import LiveLine, Seen, evaluate_policy
+from baselines.purejaxrl_ppo.monitor import Seen, evaluate_policy
 from baselines.purejaxrl_ppo.named_arrays import as_named_arrays
-from baselines.purejaxrl_ppo.options import Options, is_due, next_due
+from baselines.purejaxrl_ppo.options import Options, is_due
 from baselines.purejaxrl_ppo.ppo import Runner
 from baselines.purejaxrl_ppo.resume import FINAL, checkpoints_in, save_run, steps_of
 from baselines.purejaxrl_ppo.tracking import Tracker
@@ -44,7 +43,11 @@ class Chunk(NamedTuple):
 
 
 class Run:
-    """One seed's training under way: where it writes, and who is told of it."""
+    """One seed's training under way: where it writes, and who is told of it.
+
+    Of a training's processes the first writes and tells; the others only take part in what all have to.
+    status: how it ended, as MLflow says it. rows: metrics of its chunks.
+    """
 
     def __init__(
         self,
@@ -62,11 +65,14 @@ class Run:
         self.seen = Seen(*(seen.get(name) for name in Seen._fields))
         self.tracker: Tracker | None = None
         self.last_path: Path | None = options.resume
-        out.mkdir(parents=True, exist_ok=True)
+        self.status, self.rows = "FAILED", list[Metrics]()
+        self.is_first = is_first()
+        if self.is_first:
+            out.mkdir(parents=True, exist_ok=True)
 
     def send_unsent(self) -> None:
         """Tell what a run that is complete had not told when it was killed; nothing of one not tracked."""
-        if self.options.tracking_uri is None or not (self.out / JOURNAL).exists():
+        if not self.is_first or self.options.tracking_uri is None or not (self.out / JOURNAL).exists():
             return
         tracker = self.tracker = self._make_tracker(self.options.tracking_uri)
         self._tell_checkpoints(math.inf)
@@ -74,42 +80,9 @@ class Run:
             tracker.end("FINISHED")
         tracker.send()
 
-    def finish(self, runner: Runner, update: int) -> tuple[Checkpoint, Metrics]:
-        """Train from an update on to the end; return the final checkpoint and the metrics since.
-
-        Raises:
-            DivergedError: metrics or parameters that are not finite; no checkpoint has them.
-        """
-        batch_size = self.config.batch_size
-        self.trainer.steps = update * batch_size
-        line = LiveLine(self.config.num_updates * batch_size, self.trainer.steps)
-        line.show(mean_last_return(runner), self.seen)
-        status = "FAILED"
-        try:
-            self._begin(runner, update)
-            rows = []
-            if update < self.config.num_updates:
-                self.trainer.chunk(runner, jnp.int32(0))  # compiles
-            line.begin()
-            for chunk in self._chunks(runner, update):
-                runner = chunk.runner
-                rows.append(chunk.metrics)
-                self._between_chunks(chunk, line)
-            path = self.checkpoint(FINAL, runner, self.config.num_updates)
-            status = "FINISHED"
-        except KeyboardInterrupt:
-            status = "KILLED"
-            raise
-        finally:
-            line.close()
-            if self.tracker is not None:
-                self.tracker.end(status)
-        metrics = jax.tree.map(lambda *parts: np.concatenate(parts), *rows) if rows else {}
-        return load_checkpoint(path), metrics
-
-    def _begin(self, runner: Runner, update: int) -> None:
+    def begin(self, runner: Runner, update: int) -> None:
         """Tell of a run that begins or goes on, and of checkpoints that a killed process had not told."""
-        if self.options.tracking_uri is not None:
+        if self.is_first and self.options.tracking_uri is not None:
             self.tracker = self._make_tracker(self.options.tracking_uri)
             self.tracker.begin()
         self._tell_checkpoints(update * self.config.batch_size)
@@ -127,43 +100,29 @@ class Run:
         params = {name: value for name, value in self.description.items() if name != "observation"}
         params["package_version"] = flytrack_env.__version__
         name = f"{self.trainer.env_id} {Path(self.trainer.track).stem} seed {self.description['seed']}"
-        return Tracker(self.out, uri, name, params)
+        return Tracker(self.out, uri, name, params, self.options.parent)
 
-    def _chunks(self, runner: Runner, update: int) -> Iterator[Chunk]:
-        """Train, yielding between chunks."""
-        config, options = self.config, self.options
-        while update < config.num_updates:
-            due = (
-                next_due(update, every, config.batch_size)
-                for every in (options.checkpoint_every, options.evaluate_every)
-            )
-            before = update
-            count = int(min(*due, update + self.trainer.most, config.num_updates)) - update
-            started_s = time.perf_counter()
-            runner, rows = jax.block_until_ready(self.trainer.chunk(runner, jnp.int32(count)))
-            rate = count * config.batch_size / (time.perf_counter() - started_s)
-            update += count
-            metrics = {name: np.asarray(row)[:count] for name, row in rows.items()}
-            yield Chunk(runner, before, update, metrics, rate)
-
-    def _between_chunks(self, chunk: Chunk, line: LiveLine) -> None:
-        """Show, evaluate, tell and store what is due after a chunk.
+    def took(self, chunk: Chunk) -> None:
+        """Evaluate, tell and store what is due after a chunk.
 
         The checkpoint is last: a run that is killed before it comes here again, and loses no evaluation.
+
+        Raises:
+            DivergedError: metrics or parameters that are not finite; no checkpoint has them.
         """
         config, options = self.config, self.options
         runner, update = chunk.runner, chunk.update
         steps, is_last = update * config.batch_size, update == config.num_updates
+        self.rows.append(chunk.metrics)
         values = {**summarise_updates(chunk.metrics), "steps_per_second": chunk.steps_per_second}
-        self.trainer.steps = steps
-        line.trained(steps)
         broken = find_not_finite(chunk)
         is_evaluated = is_last or is_due(update, options.evaluate_every, config.batch_size)
-        if options.evaluate_every and is_evaluated and not broken:
+        if self.is_first and options.evaluate_every and is_evaluated and not broken:
             evaluation = self._evaluate(runner, steps, is_last)
             self.seen = self.seen.after(evaluation)
+            if options.report is not None:
+                options.report(steps, evaluation)
             values = {**values, **evaluation, **self.seen.metrics()}
-        line.show(mean_last_return(runner), self.seen)
         if self.tracker is not None:
             self.tracker.metrics(steps, values)
         if broken:
@@ -182,7 +141,7 @@ class Run:
 
     def _evaluate(self, runner: Runner, steps: int, is_last: bool) -> dict[str, float]:
         """Fly and draw the policy as it is; return the metrics, none where it could not be flown."""
-        env, params = self.trainer.env, runner.train_state.params
+        env, params = self.trainer.env, self.trainer.policy_of(runner)
         num_episodes = self.options.evaluation_episodes
         metrics, files = evaluate_policy(
             env, self.trainer.network, params, num_episodes, self.out, steps, is_recorded=is_last
@@ -191,9 +150,30 @@ class Run:
             self._tell(path, "evaluation")
         return metrics
 
-    def checkpoint(self, name: str, runner: Runner, update: int) -> Path:
-        """Write a checkpoint and return its path."""
-        path = self.out / name
+    def complete(self, runner: Runner) -> None:
+        """Write the final checkpoint."""
+        self.checkpoint(FINAL, runner, self.config.num_updates)
+        self.status = "FINISHED"
+
+    def stopped(self) -> None:
+        """Note that somebody stopped it, unless it is complete."""
+        self.status = self.status if self.status == "FINISHED" else "KILLED"
+
+    def end(self) -> None:
+        """Tell how it ended."""
+        if self.tracker is not None:
+            self.tracker.end(self.status)
+
+    def result(self) -> tuple[Checkpoint, Metrics]:
+        """Return the final checkpoint, and the metrics of every update made here."""
+        metrics = jax.tree.map(lambda *parts: np.concatenate(parts), *self.rows) if self.rows else {}
+        return load_checkpoint(self.out / FINAL), metrics
+
+    def checkpoint(self, name: str, runner: Runner, update: int) -> None:
+        """Write a checkpoint."""
+        path, runner = self.out / name, self.trainer.whole(runner)
+        if not self.is_first:
+            return
         progress = {
             "steps": update * self.config.batch_size,
             "seconds": round(time.perf_counter() - self.started_s, 1),
@@ -204,16 +184,10 @@ class Run:
         save_run(path, runner, self.config, {**self.description, **progress})
         self.last_path = path
         self._tell(path, "checkpoints")
-        return path
 
     def _tell(self, path: Path, group: str) -> None:
         if self.tracker is not None:
             self.tracker.file(path, group)
-
-
-def mean_last_return(runner: Runner) -> float:
-    """Return the mean over environments of the return of their last episode; 0 for those without one."""
-    return float(runner.episodes.last_return.mean())
 
 
 def find_not_finite(chunk: Chunk) -> list[str]:

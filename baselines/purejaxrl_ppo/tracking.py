@@ -25,6 +25,7 @@ ENTRIES_AT_ONCE = 32
 PARAMS_AT_ONCE = 100  # MLflow's limits
 METRICS_AT_ONCE = 1000
 LONGEST_PARAM = 6000
+MLFLOW_PARENT = "mlflow.parentRunId"  # the tag by which MLflow shows a run below another
 # A server that is down shall cost seconds, where MLflow's own settings are minutes; and no telemetry.
 QUIET = {
     "MLFLOW_HTTP_REQUEST_MAX_RETRIES": "1",
@@ -48,14 +49,15 @@ class Tracker:
 
     Args:
         folder: of the run; files that are told of are in it. uri: of the store. name: of the MLflow run.
-        params: of the run, nested JSON values.
+        params: of the run, nested JSON values. parent: folder of the run that this is a part of, if any.
     """
 
-    def __init__(self, folder: Path, uri: str, name: str, params: dict[str, Any]):
+    def __init__(self, folder: Path, uri: str, name: str, params: dict[str, Any], parent: Path | None = None):
         self.journal, self.uri = Journal(folder), uri
         self._is_listening, self._last_sent_s = True, -SEND_EVERY_S
         if not self.journal.of_kind("run"):
-            self.journal.append("run", experiment=EXPERIMENT, name=name, params=params)
+            above = {} if parent is None else {"parent": os.path.relpath(parent, folder)}
+            self.journal.append("run", experiment=EXPERIMENT, name=name, params=params, **above)
         self._last_step = max((entry["step"] for entry in self.journal.of_kind("metrics")), default=-1)
         self._told = {entry["path"] for entry in self.journal.of_kind("file")}
 
@@ -94,12 +96,15 @@ class Tracker:
         self.journal.append("status", status=status)
         self.send()
 
-    def send(self) -> None:
-        """Send what was not sent; the first time that it fails, warn and stop sending."""
+    def send(self, journal: Journal | None = None) -> None:
+        """Send what was not sent; the first time that it fails, warn and stop sending.
+
+        journal: of a part of this run; None: its own.
+        """
         if not self._is_listening:
             return
         try:
-            send_journal(self.journal, self.uri)
+            send_journal(journal or self.journal, self.uri)
         except Exception as error:  # whatever a store or its client raises, training goes on
             self._is_listening = False
             logger.warning(
@@ -142,7 +147,7 @@ def send_journal(journal: Journal, uri: str) -> str:
     client = MlflowClient(tracking_uri=uri)
     run_id, count = journal.sent(uri)
     if run_id is None:
-        run_id = _create_run(client, uri, beginning)
+        run_id = _create_run(client, uri, beginning, parent_of(journal, uri))
         journal.mark_sent(uri, run_id, 0)
     while count < len(journal.entries):
         entries = journal.entries[count : count + ENTRIES_AT_ONCE]
@@ -152,7 +157,25 @@ def send_journal(journal: Journal, uri: str) -> str:
     return run_id
 
 
-def _create_run(client: Any, uri: str, entry: dict[str, Any]) -> str:
+def parent_of(journal: Journal, uri: str) -> str | None:
+    """Return the id in a store of the run that a journal's run is a part of; None for a run by itself.
+
+    Raises:
+        JournalError: the store does not know that run.
+    """
+    parent = journal.beginning().get("parent")
+    if parent is None:
+        return None
+    folder = (journal.folder / str(parent)).resolve()
+    run_id, _ = Journal(folder).sent(uri)
+    if run_id is None:
+        raise JournalError(
+            f"{journal.path}: a part of {folder}, which {uri} was not told of; upload it first"
+        )
+    return run_id
+
+
+def _create_run(client: Any, uri: str, entry: dict[str, Any], parent: str | None) -> str:
     """Create the run of a journal, and its experiment if there is none, and return the run's id."""
     found = client.get_experiment_by_name(entry["experiment"])
     if found is not None:
@@ -163,7 +186,8 @@ def _create_run(client: Any, uri: str, entry: dict[str, Any]) -> str:
         experiment_id = client.create_experiment(entry["experiment"], artifact_location=folder.as_uri())
     else:
         experiment_id = client.create_experiment(entry["experiment"])
-    run = client.create_run(experiment_id, start_time=entry["time_ms"], run_name=entry["name"])
+    tags = {} if parent is None else {MLFLOW_PARENT: parent}
+    run = client.create_run(experiment_id, start_time=entry["time_ms"], run_name=entry["name"], tags=tags)
     return run.info.run_id
 
 

@@ -1,10 +1,16 @@
 """Train PPO on a FlyTrack environment: ``python -m baselines.purejaxrl_ppo.train_ppo`` (docs/baseline.md)."""
 
 import argparse
+import os
+import sys
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, NoReturn
 
+import jax
+
+from baselines.joining import add_job_flags, begin_anew, job_of
 from baselines.purejaxrl_ppo.config import add_flags
+from baselines.purejaxrl_ppo.distributed import all_devices, is_first, wait_for_all
 from baselines.purejaxrl_ppo.options import Options, write_options
 from baselines.purejaxrl_ppo.plans import (
     DEFAULT_ENV_ID,
@@ -12,6 +18,7 @@ from baselines.purejaxrl_ppo.plans import (
     DEFAULT_TRACK,
     DEFAULTS,
     Plan,
+    batched,
     check_plans,
     make_plans,
     make_trainer,
@@ -49,6 +56,7 @@ def reward_weight(text: str) -> tuple[str, float]:
 def make_parser() -> argparse.ArgumentParser:
     """Return the command line: what is trained and told, and one flag per hyperparameter."""
     parser = argparse.ArgumentParser(
+        prog="train_ppo",
         usage="%(prog)s [options]",
         description="Train PPO on a FlyTrack environment; docs/baseline.md describes what comes of it.",
     )
@@ -67,7 +75,15 @@ def make_parser() -> argparse.ArgumentParser:
         "--num-seeds",
         type=int,
         metavar="N",
-        help="train N seeds from --seed on, each in OUT/seed<N> (default: 1, or as many as --resume holds)",
+        help="train N seeds from --seed on, side by side in one program, each in OUT/seed<N> (default: 1, "
+        "or as many as --resume holds)",
+    )
+    parser.add_argument(
+        "--seeds-at-once",
+        type=int,
+        metavar="N",
+        help="so many of them side by side, the others after them; on a CPU 1 is quickest (default: all, or "
+        "as before)",
     )
     parser.add_argument("--out", type=Path, help=f"folder (default: {DEFAULT_OUT}, or that of --resume)")
     parser.add_argument(
@@ -91,6 +107,7 @@ def make_parser() -> argparse.ArgumentParser:
         "--tracking-uri", metavar="URI", help="MLflow store (default: an SQLite file in OUT)"
     )
     tracking.add_argument("--no-tracking", action="store_true", help="tell MLflow nothing")
+    add_job_flags(parser)
     add_flags(parser)
     return parser
 
@@ -112,8 +129,11 @@ def prepare(arguments: argparse.Namespace) -> Asked:
     plans = make_plans(arguments)
     options = options_of(arguments, plans)
     base = next((plan.checkpoint for plan in plans if plan.checkpoint is not None), None)
-    trainer = make_trainer(arguments, base)
+    mesh = all_devices() if arguments.distributed else None
+    trainer = make_trainer(arguments, base, mesh)
     check_plans(trainer, plans)
+    if trainer.mesh is not None:
+        wait_for_all("prepared")  # before the first process writes what the others would find
     return Asked(trainer, plans, options)
 
 
@@ -121,12 +141,18 @@ def run(asked: Asked) -> None:
     """Train every seed, and say where its checkpoint is."""
     # All before any: whoever takes them up again finds the seeds that had not begun.
     for plan, options in zip(asked.plans, asked.options, strict=True):
-        if not (plan.out / FINAL).exists():
+        if is_first() and not (plan.out / FINAL).exists():
             write_options(plan.out, options)
-    for plan, options in zip(asked.plans, asked.options, strict=True):
-        checkpoint, _ = asked.trainer.train(plan.out, plan.seed, options)
-        meta = checkpoint.meta
-        print(f"seed {plan.seed}: {meta['steps']} steps in {meta['seconds']} s: {plan.out / FINAL}")
+    all_seeds = [
+        (plan.out, plan.seed, options) for plan, options in zip(asked.plans, asked.options, strict=True)
+    ]
+    # On several devices one seed after the other: a seed fills them.
+    at_once = asked.plans[0].at_once if asked.trainer.mesh is None else 1
+    for seeds in batched(all_seeds, at_once):
+        for (out, seed, _), (checkpoint, _) in zip(seeds, asked.trainer.train_all(seeds), strict=True):
+            meta = checkpoint.meta
+            if is_first():
+                print(f"seed {seed}: {meta['steps']} steps in {meta['seconds']} s: {out / FINAL}")
 
 
 def say_stopped(steps: int, arguments: argparse.Namespace) -> str:
@@ -138,20 +164,48 @@ def say_stopped(steps: int, arguments: argparse.Namespace) -> str:
     return f"stopped at {steps} steps, before the first checkpoint"
 
 
-def main() -> None:
-    """Parse the command line, train, say where the checkpoints are."""
+def say_lost(steps: int, arguments: argparse.Namespace, error: Exception) -> str:
+    """Return the line for who has lost another process of the training."""
+    reason = (str(error).splitlines() or [""])[0]
+    return (
+        f"process {jax.process_index()} of {jax.process_count()} has lost another ({reason}); "
+        f"{say_stopped(steps, arguments)}, with any number of processes"
+    )
+
+
+def leave(status: int, text: str) -> NoReturn:
+    """End with a message; of several processes at once, because those that are left would wait for it."""
+    print(text, file=sys.stderr, flush=True)
+    if jax.process_count() > 1:
+        os._exit(status)
+    raise SystemExit(status)
+
+
+def main(has_joined: bool = False) -> None:
+    """Parse the command line, train, say where the checkpoints are.
+
+    has_joined: whether this process has met the others of its training.
+    """
     parser = make_parser()
     arguments = parser.parse_args()
+    error = f"{parser.prog}: error:"
     try:
+        job_of(arguments)
+        if arguments.distributed and not has_joined:
+            begin_anew()
         asked = prepare(arguments)
-    except (ValueError, OverflowError, OSError) as error:
-        parser.error(str(error))
+    except (ValueError, OverflowError, OSError) as found:
+        leave(2, f"{parser.format_usage()}{error} {found}")
     try:
         run(asked)
     except KeyboardInterrupt:
-        parser.exit(INTERRUPTED, say_stopped(asked.trainer.steps, arguments) + "\n")
-    except (ValueError, OSError) as error:
-        parser.exit(1, f"{parser.prog}: error: {error}\n")
+        leave(INTERRUPTED, say_stopped(asked.trainer.steps, arguments))
+    except (ValueError, OSError) as found:
+        leave(1, f"{error} {found}")
+    except jax.errors.JaxRuntimeError as found:
+        if jax.process_count() == 1:
+            raise
+        leave(1, f"{error} {say_lost(asked.trainer.steps, arguments, found)}")
 
 
 if __name__ == "__main__":

@@ -10,10 +10,22 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
+from jax.sharding import Mesh
 
 import flytrack_env
 from baselines.purejaxrl_ppo.checkpoint import Checkpoint
 from baselines.purejaxrl_ppo.config import Config
+from baselines.purejaxrl_ppo.distributed import (
+    check_agree,
+    check_divides,
+    digest,
+    is_first,
+    on_devices,
+    spread,
+    wait_for_all,
+    whole,
+)
 from baselines.purejaxrl_ppo.journal import forget
 from baselines.purejaxrl_ppo.named_arrays import is_key
 from baselines.purejaxrl_ppo.options import Options
@@ -25,10 +37,12 @@ from baselines.purejaxrl_ppo.resume import (
     describe_run,
     is_its_folder,
     newest_intact,
+    remove_half_written,
     restore_runner,
     warn_of_other_bits,
 )
 from baselines.purejaxrl_ppo.run import Metrics, Run
+from baselines.purejaxrl_ppo.side_by_side import Ready, finish, groups_of
 from flytrack_env.episodes import EpisodicEnvironment
 from flytrack_env.params import EnvParams
 
@@ -84,23 +98,33 @@ def training_params(env: EpisodicEnvironment, config: Config) -> EnvParams:
 class Trainer:
     """PPO on one environment, compiled once for any number of seeds; ``steps``: of the run under way.
 
+    mesh: of the devices that the environments are spread over (``distributed.all_devices``); None: one.
+
     Raises:
         ValueError: settings, id, track or model that cannot be used, before any training.
     """
 
-    def __init__(self, config: Config, env_id: str = "FlyTrack-v0", **env_arguments: Any):
+    def __init__(
+        self, config: Config, env_id: str = "FlyTrack-v0", mesh: Mesh | None = None, **env_arguments: Any
+    ):
         self.config, self.env_id = config, env_id
+        self.mesh = mesh if mesh is not None and mesh.size > 1 else None
         self.track = track_reference(env_arguments.get("track", "flytrack"))
         self.env = flytrack_env.make(env_id, **env_arguments)
         config.check()
         self.env.check_params(self.env.default_params)
         params = training_params(self.env, config)
-        ppo = make_ppo(self.env, params, config)
+        if self.mesh is None:
+            ppo = make_ppo(self.env, params, config)
+        else:
+            check_divides(config, self.mesh)
+            ppo = on_devices(make_ppo(self.env, params, config, self.mesh.size), self.mesh)
         self.network = make_network_for(self.env, params, config)
         self.most = max(1, CHUNK_STEPS // config.batch_size)
         self.steps = 0
         self.start = jax.jit(lambda key: with_strong_types(ppo.start(key)))
         self.chunk = make_chunk(ppo, self.most)
+        self.chunk_of_many = jax.jit(jax.vmap(self.chunk, in_axes=(0, None)))
 
     def train(self, out: Path, seed: int, options: Options) -> tuple[Checkpoint, Metrics]:
         """Train and write ``out``/final.msgpack; return it, and the metrics of every update made here.
@@ -112,31 +136,70 @@ class Trainer:
             ValueError: ``out`` holds another run.
             DivergedError: numbers that are not finite.
         """
+        return self.train_all([(out, seed, options)])[0]
+
+    def train_all(self, asked: list[tuple[Path, int, Options]]) -> list[tuple[Checkpoint, Metrics]]:
+        """Train seeds side by side, in one program: as ``train``, for each folder, seed and options.
+
+        Seeds that are not as far as each other, or are looked at at other times, train one after the other.
+        """
+        runs, ready = [], list[Ready]()
+        for out, seed, options in asked:
+            run, start = self._prepare(out, seed, options, len(asked))
+            runs.append(run)
+            ready += [start] if start is not None else []
+        for group in groups_of(ready):
+            finish(self, group)
+        if self.mesh is not None:
+            wait_for_all("trained")
+        return [run.result() for run in runs]
+
+    def _prepare(self, out: Path, seed: int, options: Options, number: int) -> tuple[Run, Ready | None]:
+        """Return a run and how it begins or goes on; None where it is complete. number: side by side."""
         options.check()
         source = options.resume
         check_free(out, source)
-        description = self.describe(seed)
+        description = self.describe(seed, number)
+        if self.mesh is not None:
+            wait_for_all("checked")  # before the first process writes what the others would find
+            shared = {name: value for name, value in description.items() if name != "machine"}
+            check_agree("settings", digest([options._replace(report=None), shared]))
         key = jax.random.key(seed)
         if source is None:
             forget(out)
-            return Run(self, out, description, options).finish(self.start(key), 0)
+            run = Run(self, out, description, options)
+            return run, Ready(run, self.start(key), 0)
         path, checkpoint = newest_intact(source)
         check_same_run(path, checkpoint, description)
         if not is_its_folder(out, source):
             forget(out)
+        elif is_first():
+            remove_half_written(out)
         run = Run(self, out, description, options._replace(resume=path), checkpoint.meta)
         update = checkpoint.meta["steps"] // self.config.batch_size
         self.steps = checkpoint.meta["steps"]
         if update == self.config.num_updates and path.resolve() == (out / FINAL).resolve():
             run.send_unsent()
-            return checkpoint, {}
+            return run, None
         warn_of_other_bits(path, checkpoint, description)
         runner = restore_runner(path, checkpoint, jax.eval_shape(self.start, key))
-        return run.finish(runner, update)
+        if self.mesh is not None:
+            check_agree(f"{path}: steps", checkpoint.meta["steps"])
+            runner = spread(runner, self.mesh)
+        return run, Ready(run, runner, update)
 
-    def describe(self, seed: int) -> dict[str, Any]:
-        """Return what the run of a seed is, as its checkpoints say."""
-        return describe_run(self.env, self.env_id, self.track, self.config, seed)
+    def whole(self, runner: Runner) -> Runner:
+        """Return the state as this process can read it; on several devices all processes have to ask."""
+        return runner if self.mesh is None else whole(runner, self.mesh)
+
+    def policy_of(self, runner: Runner) -> Any:
+        """Return the network's parameters as this process alone can compute with."""
+        params = runner.train_state.params
+        return params if self.mesh is None else jax.tree.map(np.asarray, params)
+
+    def describe(self, seed: int, number: int = 1) -> dict[str, Any]:
+        """Return what the run of a seed is, as its checkpoints say. number: of seeds side by side."""
+        return describe_run(self.env, self.env_id, self.track, self.config, seed, number)
 
 
 def track_reference(track: str | Path) -> str:

@@ -14,7 +14,7 @@ LAG_SPREAD, THRUST_SPREAD = 0.2, 0.05  # |ln factor| of the lags, and of the thr
 LARGE = 2.0 / 3.0  # of the way from the smallest size to the largest, on a log scale: the least that is drawn
 # What the first plants have: one effect of the three that every drone has, or a number of drawn ones.
 HIDDEN = (("command_delay",), ("quadratic_drag",), ("thrust_scale",), 2, 3)
-LATER = 3  # effects of every plant after these, drawn
+LATER = 5  # effects of every plant after these, drawn: together they matter more often
 
 
 def _size(name: str, rng: np.random.Generator) -> float:

@@ -13,11 +13,17 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.env_speed import cpu_name, versions
-from benchmarks.reliability import files
+from benchmarks.reliability import determinism, files, memory, simulation, training
 from benchmarks.reliability.section import Section
 from flytrack_env.files import write_atomically
 
-SECTIONS: tuple[Section, ...] = (files.SECTION,)
+SECTIONS: tuple[Section, ...] = (
+    simulation.SECTION,
+    training.SECTION,
+    files.SECTION,
+    memory.SECTION,
+    determinism.SECTION,
+)
 RESULTS = Path("docs/results")
 PAGE = """# Reliability
 

@@ -16,6 +16,12 @@ def box(space: Any) -> gymnasium.spaces.Box:
     return gymnasium.spaces.Box(low, high, space.shape, np.float32)
 
 
+def as_float32(actions: Any) -> np.ndarray:
+    """Return actions as an array of float32; what is beyond it is infinite, and clipped as such."""
+    with np.errstate(over="ignore"):
+        return np.asarray(actions, np.float32)
+
+
 def metadata_of(simulation: Simulation, render_modes: tuple[str, ...]) -> dict[str, Any]:
     """Return an environment's metadata; a step is a picture."""
     return {"render_modes": list(render_modes), "render_fps": round(1.0 / float(simulation.params.dt))}

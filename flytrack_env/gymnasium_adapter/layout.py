@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from flytrack_env.fusion import compute_once
 
@@ -28,8 +29,9 @@ class Layout(NamedTuple):
     @classmethod
     def of(cls, tree: Any) -> "Layout":
         """Return the layout of a pytree of arrays, numbers or shapes."""
-        leaves, structure = jax.tree.flatten(jax.eval_shape(lambda: tree))
-        return cls(structure, *zip(*((leaf.shape, leaf.dtype) for leaf in leaves), strict=True))
+        leaves, structure = jax.tree.flatten(tree)
+        forms = ((np.shape(leaf), jnp.result_type(leaf)) for leaf in leaves)
+        return cls(structure, *zip(*forms, strict=True))
 
     @property
     def kinds(self) -> tuple[Any, ...]:

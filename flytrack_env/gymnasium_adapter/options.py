@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from flytrack_env.params import RANGES
 from flytrack_env.state import (
     APPLIED_ACTION,
     BATTERY,
@@ -23,6 +24,7 @@ TRACK, BATTERY_V = "track", "battery_v"
 POSE_NAMES = ("position", "quaternion", "yaw_deg", "velocity", "gate_index")
 NAMES = (*POSE_NAMES, BATTERY_V, TRACK)
 UNIT_NORM_TOLERANCE = 1e-3
+LARGEST_SPEED = RANGES["reset.course_speed"].high
 LARGEST = float(np.finfo(np.float32).max)
 STILL_ROTORS = (0.0, 0.0, 0.0, -1.0)
 
@@ -78,7 +80,7 @@ def read_start(options: Mapping[str, Any], course: Course) -> Start:
     drone[POSITION] = _position(options, course)
     drone[QUATERNION] = _quaternion(options, course)
     if "velocity" in options:
-        drone[VELOCITY] = _numbers(options, "velocity", 3)
+        drone[VELOCITY] = _velocity(options)
     drone[APPLIED_ACTION] = STILL_ROTORS
     drone[BATTERY] = BATTERY_FULL_V
     return Start(drone, _gate_index(options, course.num_gates), battery_v)
@@ -92,6 +94,13 @@ def _position(options: Mapping[str, Any], course: Course) -> np.ndarray:
     if not ((position >= low) & (position <= high)).all():
         raise _error("position", options, f"within the bounds, {low.tolist()} to {high.tolist()} m")
     return position
+
+
+def _velocity(options: Mapping[str, Any]) -> np.ndarray:
+    velocity = _numbers(options, "velocity", 3)
+    if not (abs(velocity) <= LARGEST_SPEED).all():
+        raise _error("velocity", options, f"at most {LARGEST_SPEED:g} m/s along every axis")
+    return velocity
 
 
 def _quaternion(options: Mapping[str, Any], course: Course) -> np.ndarray:

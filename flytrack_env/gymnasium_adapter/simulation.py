@@ -157,22 +157,30 @@ class Programs:
 class Simulation:
     """An environment of an id with its parameters. Never changes; copies share what is compiled.
 
-    env_id, overrides: what ``flytrack_env.make`` takes. params: replace the defaults if not None.
+    env_id, overrides: what ``flytrack_env.make`` takes. params: replace the defaults if not None. shared: the
+    environment of another simulation of these, with what it has compiled.
 
     Raises:
         ValueError: what ``flytrack_env.make`` and ``check_params`` refuse, and leaves of another shape.
         TypeError: params of another type.
     """
 
-    def __init__(self, env_id: str, params: EnvParams | None, overrides: dict[str, Any]):
+    def __init__(
+        self,
+        env_id: str,
+        params: EnvParams | None,
+        overrides: dict[str, Any],
+        shared: "Shared | None" = None,
+    ):
         self.env_id, self.overrides = env_id, overrides
-        self.env, programs = _shared(env_id, overrides)
+        self._shared = _find_shared(env_id, overrides) if shared is None else shared
+        self.env, programs = self._shared
         self.params = self.env.default_params if params is None else params
         _check_shapes(self.params, self.env.default_params)
         self.env.check_params(self.params)
-        _, state = jax.eval_shape(self.env.reset, jax.random.key(0), self.params)
         layout = Layout.of(self.params)
         if layout not in programs:
+            _, state = jax.eval_shape(self.env.reset, jax.random.key(0), self.params)
             programs[layout] = Programs(self.env, self.params, state)
         self.programs = programs[layout]
         self.packed_params = self.programs.pack_params(self.params)
@@ -184,7 +192,7 @@ class Simulation:
             TrackError: a track that cannot be read.
         """
         course = build_course(track if isinstance(track, Track) else load_track(track))
-        return Simulation(self.env_id, self.params.replace(course=course), self.overrides)
+        return Simulation(self.env_id, self.params.replace(course=course), self.overrides, self._shared)
 
     def begin(self, words: np.ndarray, start: Start) -> tuple[Packed, jax.Array, jax.Array]:
         """Return packed state, observation and scene of an episode that begins.
@@ -226,25 +234,35 @@ def _check_shapes(params: EnvParams, default: EnvParams) -> None:
             raise ValueError(f"{name}: found shape {np.shape(leaf)}, expected {np.shape(expected)}")
 
 
+Shared = tuple[EpisodicEnvironment, dict[Layout, Programs]]
 # Environments by what they were made with: the second one of a kind needs no compilation.
-_SHARED: dict[Any, tuple[EpisodicEnvironment, dict[Layout, Programs]]] = {}
+_SHARED: dict[Any, Shared] = {}
 MOST_SHARED = 16
 
 
 def _identity(value: Any) -> Any:
-    """Return something hashable that changes where an argument, or the file it names, does."""
+    """Return something hashable that changes where an argument, a number in it or the file it names does.
+
+    Where there is no such thing, what is returned cannot be hashed.
+    """
     if isinstance(value, (str, Path)) and Path(value).is_file():
         status = Path(value).stat()
         return str(Path(value).resolve()), status.st_mtime_ns, status.st_size
-    return value
+    leaves, structure = jax.tree.flatten(value)
+    arrays = (isinstance(leaf, (np.ndarray, jax.Array)) for leaf in leaves)
+    known = (
+        (np.shape(leaf), leaf.dtype, np.asarray(leaf).tobytes()) if is_array else (type(leaf), leaf)
+        for leaf, is_array in zip(leaves, arrays, strict=True)
+    )
+    return structure, tuple(known)
 
 
-def _shared(env_id: str, overrides: dict[str, Any]) -> tuple[EpisodicEnvironment, dict[Layout, Programs]]:
+def _find_shared(env_id: str, overrides: dict[str, Any]) -> Shared:
     """Return an environment and its programs by their parameters' layout."""
     try:
         key = (env_id, frozenset((name, _identity(value)) for name, value in overrides.items()))
         hash(key)
-    except TypeError:  # an argument of arrays, say
+    except TypeError:  # a plant that compares its arrays, say
         return make(env_id, **overrides), {}
     if key not in _SHARED:
         env = make(env_id, **overrides)

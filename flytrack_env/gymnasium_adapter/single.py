@@ -6,7 +6,7 @@ import gymnasium
 import numpy as np
 
 from flytrack_env.env import EnvParams
-from flytrack_env.gymnasium_adapter.common import box, check_render_mode, metadata_of
+from flytrack_env.gymnasium_adapter.common import as_float32, box, check_render_mode, metadata_of
 from flytrack_env.gymnasium_adapter.options import TRACK, check_names, read_start
 from flytrack_env.gymnasium_adapter.simulation import Simulation, draw_key
 from flytrack_env.rendering import FlightLog, make_renderer, open_window
@@ -86,7 +86,7 @@ class FlyTrackEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         """
         if self._state is None:
             raise gymnasium.error.ResetNeeded("step: found no episode, expected a reset before it")
-        action = np.asarray(action, np.float32)
+        action = as_float32(action)
         if action.shape != self.action_space.shape:
             raise ValueError(f"action: found shape {action.shape}, expected {self.action_space.shape}")
         programs = self._simulation.programs

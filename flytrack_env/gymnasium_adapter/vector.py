@@ -9,13 +9,14 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
 from flytrack_env.env import EnvParams
-from flytrack_env.gymnasium_adapter.common import box, check_render_mode, metadata_of
+from flytrack_env.gymnasium_adapter.common import as_float32, box, check_render_mode, metadata_of
 from flytrack_env.gymnasium_adapter.options import TRACK, check_names, read_start
 from flytrack_env.gymnasium_adapter.simulation import Simulation, draw_key
 from flytrack_env.rendering import FlightLog, make_renderer
 
 RENDER_MODES = ("rgb_array",)
 SEED_WORDS = 4
+MOST_STEPS = 2**32  # that a word tells apart
 
 
 class FlyTrackVectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
@@ -130,7 +131,7 @@ class FlyTrackVectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.nd
         """
         if self._states is None:
             raise gymnasium.error.ResetNeeded("step: found no episodes, expected a reset before it")
-        actions = np.asarray(actions, np.float32)
+        actions = as_float32(actions)
         if actions.shape != self.action_space.shape:
             raise ValueError(f"actions: found shape {actions.shape}, expected {self.action_space.shape}")
         programs = self._simulation.programs
@@ -142,7 +143,7 @@ class FlyTrackVectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.nd
             self._simulation.packed_params,
             self._renderer is not None,
         )
-        self._count += 1
+        self._count = (self._count + 1) % MOST_STEPS
         columns = programs.batch_columns.batched(blocks)
         rewards, terminated, truncated, infos, final_info, final_masks = columns
         done = terminated | truncated

@@ -7,14 +7,24 @@ import jax.numpy as jnp
 import numpy as np
 
 from flytrack_env.dynamics import ModelParameters
-from flytrack_env.effects import CommandDelay, LinearDrag, ThrustScale, Wind, check_parameters, effect_of
+from flytrack_env.effects import (
+    ROUNDING,
+    CommandDelay,
+    LinearDrag,
+    Range,
+    ThrustScale,
+    Wind,
+    check_parameters,
+    effect_of,
+)
 from flytrack_env.episodes import EpisodicEnvironment
-from flytrack_env.params import EnvParams
+from flytrack_env.params import RANGES, EnvParams
 from flytrack_env.quaternion import Scalar
 from flytrack_env.randomness import Draws
 from flytrack_env.state import Action, Drone
 from flytrack_env.wrappers.base import Wrapper, WrapperError
 
+EFFECT_FACTORS = (1e-6, 1e6)
 LEFT_ALONE: Any = None  # in the place of a parameter's bound: not drawn
 
 
@@ -127,7 +137,7 @@ class DomainRandomization(Wrapper):
         if not isinstance(ranges, RandomizationParams):
             expected = "RandomizationParams, as in this environment's default_params"
             raise ValueError(f"params.wrappers[{self.key!r}]: found {ranges!r}, expected {expected}")
-        _check_ranges(ranges, params.dt)
+        _check_ranges(ranges, params)
 
     def model(self, state: RandomizedState, params: EnvParams) -> ModelParameters:
         """Return the model that a state's episode is flown with."""
@@ -168,32 +178,39 @@ class DomainRandomization(Wrapper):
         return RandomizedState(inner, state.word), reward, terminated, info
 
 
-def _check_ranges(ranges: RandomizationParams, dt: Any) -> None:
-    """Raise ValueError for an empty range, one beyond an effect's own, or effects that do not match."""
+def _check_ranges(ranges: RandomizationParams, params: EnvParams) -> None:
+    """Raise ValueError for an empty range, one beyond what can be flown, or effects that do not match."""
     classes = [
         [effect_of(parameters).parameters for parameters in side] for side in (ranges.low, ranges.high)
     ]
     if classes[0] != classes[1]:
         names = [[parameters.__name__ for parameters in side] for side in classes]
         raise ValueError(f"high: found effects {names[1]}, expected those of low, {names[0]}")
-    rows = [
-        ("mass_factor", ranges.mass_factor_low, ranges.mass_factor_high, 0.0, np.inf),
-        ("lag_factor", ranges.lag_factor_low, ranges.lag_factor_high, 0.0, np.inf),
-        ("effect_factor", ranges.effect_factor_low, ranges.effect_factor_high, 0.0, np.inf),
+    masses = _factors(RANGES["model.m"], np.asarray(params.model.m)[..., None])
+    lags = _factors(RANGES["model.tau"], params.model.tau)
+    rows: list[tuple[Any, ...]] = [
+        ("mass_factor", ranges.mass_factor_low, ranges.mass_factor_high, *masses),
+        ("lag_factor", ranges.lag_factor_low, ranges.lag_factor_high, *lags),
+        ("effect_factor", ranges.effect_factor_low, ranges.effect_factor_high, *EFFECT_FACTORS),
     ]
     for low, high in zip(ranges.low, ranges.high, strict=True):
         effect = effect_of(low)
         known = {name: value for name, value in high._asdict().items() if value is not None}
-        check_parameters(effect.parameters()._replace(**known), dt)
+        check_parameters(effect.parameters()._replace(**known), params.dt)
         for name, bounds in effect.ranges.items():
             pair = getattr(low, name), getattr(high, name)
-            if pair != (None, None):
+            if any(end is not None for end in pair):
                 rows.append((f"{effect.name}.{name}", *pair, bounds.low, bounds.high))
     for name, low, high, lowest, highest in rows:
         # NaN, not 0, for None; not jnp, which would be traced under jit.
         lows, highs = (np.asarray(np.nan if edge is None else edge) for edge in (low, high))
-        is_range = np.all((lowest <= lows) & (lows <= highs) & (highs <= highest))
-        if not is_range or (name.endswith("_factor") and np.any(lows <= 0.0)):
-            raise ValueError(
-                f"{name}: found a range from {low} to {high}, expected one within {lowest:g} to {highest:g}"
-            )
+        if not np.all((lowest <= lows) & (lows <= highs) & (highs <= highest)):
+            expected = f"one within {np.max(lowest):g} to {np.min(highest):g}"
+            raise ValueError(f"{name}: found a range from {low} to {high}, expected {expected}")
+
+
+def _factors(bounds: Range, values: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Return the least and the largest factor that leave all values (..., N) within bounds, (...)."""
+    values = np.asarray(values, float)
+    lowest, highest = bounds.low / values.min(axis=-1), bounds.high / values.max(axis=-1)
+    return lowest * (1.0 - ROUNDING), highest * (1.0 + ROUNDING)

@@ -5,15 +5,22 @@ from typing import Any
 
 import jax
 
+from flytrack_env.wrappers.base import WrapperError
+
 
 class LegacyStep:
     """Wrap an environment so that ``step`` returns obs, state, reward, done, info.
 
     ``done`` is terminated or truncated; both stay in ``info``, as does ``final_observation``.
     Survives ``copy.deepcopy`` and ``pickle``.
+
+    Raises:
+        WrapperError: an environment whose step has five values already.
     """
 
     def __init__(self, env: Any):
+        if isinstance(env, LegacyStep):
+            raise WrapperError("LegacyStep around LegacyStep: the step inside has five values already")
         self._env = env
 
     def __getattr__(self, name: str) -> Any:

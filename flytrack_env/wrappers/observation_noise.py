@@ -1,11 +1,13 @@
 """Sensor noise: the policy sees a drone that is a little elsewhere."""
 
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from flytrack_env.effects import Range
 from flytrack_env.fusion import compute_once
 from flytrack_env.params import EnvParams
 from flytrack_env.quaternion import Quaternion, Scalar, Vec3
@@ -25,6 +27,14 @@ class NoiseParams(NamedTuple):
     velocity_m_per_s: Scalar = 0.05
     attitude_deg: Scalar = 0.5
     rates_rad_per_s: Scalar = 0.1
+
+
+RANGES: Mapping[str, Range] = {
+    "position_m": Range(0.0, 1e6, "m"),
+    "velocity_m_per_s": Range(0.0, 1e6, "m/s"),
+    "attitude_deg": Range(0.0, 180.0, "deg"),
+    "rates_rad_per_s": Range(0.0, 1e6, "rad/s"),
+}
 
 
 class NoisyState(NamedTuple):
@@ -49,11 +59,12 @@ class ObservationNoise(Wrapper):
         return NoiseParams()
 
     def check_params(self, params: EnvParams) -> None:
-        """Raise ValueError for a negative standard deviation, and what the inner check refuses."""
+        """Raise ValueError for a standard deviation beyond ``RANGES``, and what the inner check refuses."""
         super().check_params(params)
         for name, value in self.own_params(params)._asdict().items():
-            if not np.all((np.asarray(value) >= 0.0) & np.isfinite(value)):
-                expected = "finite and >= 0"
+            bounds = RANGES[name]
+            if not np.all((np.asarray(value) >= bounds.low) & (np.asarray(value) <= bounds.high)):
+                expected = f"finite and >= 0, at most {bounds.high:g} {bounds.unit}"
                 raise ValueError(f"params.wrappers[{self.key!r}].{name}: found {value}, expected {expected}")
 
     def begin(self, drone: Drone, gate_index: Any, params: EnvParams, seed: Any = 0) -> NoisyState:

@@ -1,0 +1,74 @@
+"""The space of a sweep: a TOML file that says, for each setting, how Ray Tune draws its values."""
+
+import inspect
+import math
+import tomllib
+import typing
+from pathlib import Path
+from typing import Any
+
+from ray import tune
+
+from baselines.purejaxrl_ppo.config import FIELD_TYPES, ConfigError, read_value
+
+LISTS = ("choice", "grid_search")  # of values; the others are ranges of numbers
+KINDS = (*LISTS, "uniform", "quniform", "loguniform", "qloguniform", "randint", "lograndint")
+
+Space = dict[str, dict[str, list[Any]]]
+
+
+def read_space(path: Path) -> Space:
+    """Return a file's settings: ``{field of Config: {kind: values}}``, a kind per field.
+
+    A file is of tables such as ``[learning_rate]`` with ``loguniform = [1e-3, 1e-2]``.
+
+    Raises:
+        ConfigError: a file, field, kind or value that cannot be used.
+    """
+    try:
+        space = tomllib.loads(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        raise ConfigError(f"{path}: cannot be read: {error}") from error
+    if not space:
+        raise ConfigError(f"{path}: found no setting, expected at least one of {', '.join(FIELD_TYPES)}")
+    for name, how in space.items():
+        if name not in FIELD_TYPES:
+            raise ConfigError(f"{path}: {name}: unknown; expected one of {', '.join(FIELD_TYPES)}")
+        if not isinstance(how, dict) or len(how) != 1 or next(iter(how)) not in KINDS:
+            raise ConfigError(f"{path}: {name}: found {how!r}, expected one of {', '.join(KINDS)}")
+        (kind, values) = next(iter(how.items()))
+        how[kind] = _read_values(f"{path}: {name}", name, kind, values)
+    return space
+
+
+def _read_values(where: str, name: str, kind: str, values: Any) -> list[Any]:
+    """Return the values of a kind, of the field's type."""
+    if not isinstance(values, list) or not values:
+        raise ConfigError(f"{where}: {kind}: found {values!r}, expected a list of values")
+    if kind in LISTS:
+        return [read_value(where, FIELD_TYPES[name], value) for value in values]
+    if typing.get_origin(FIELD_TYPES[name]) is tuple or FIELD_TYPES[name] is bool:
+        raise ConfigError(f"{where}: found {kind}, expected one of {', '.join(LISTS)}: it is no number")
+    arguments = list(inspect.signature(getattr(tune, kind)).parameters)
+    number = 3 if "q" in arguments and kind.startswith("q") else 2
+    if len(values) != number:
+        raise ConfigError(f"{where}: {kind}: found {values!r}, expected {', '.join(arguments[:number])}")
+    numbers = [read_value(where, FIELD_TYPES[name], value) for value in values]
+    if not numbers[0] < numbers[1]:
+        raise ConfigError(f"{where}: {kind}: found {numbers}, expected the smaller one first")
+    return numbers
+
+
+def for_tune(space: Space) -> dict[str, Any]:
+    """Return the space as Ray Tune takes it."""
+    parts = {}
+    for name, how in space.items():
+        (kind, values) = next(iter(how.items()))
+        make = getattr(tune, kind)
+        parts[name] = make(values) if kind in LISTS else make(*values)
+    return parts
+
+
+def points_of(space: Space) -> int:
+    """Return how many points the grid of a space has; 1 without one."""
+    return math.prod(len(how["grid_search"]) for how in space.values() if "grid_search" in how)

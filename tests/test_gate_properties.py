@@ -1,0 +1,204 @@
+"""What holds of any gate and any segment: the geometry in another arithmetic, other frames, other cuts."""
+
+from itertools import pairwise
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from flytrack_env.quaternion import Vec3
+from flytrack_env.race import Race, RaceEvents, advance_race, start_race
+from flytrack_env.tracks import Gate, Track, build_course, cross_gate
+
+NUM = 8  # segments at once: one shape, compiled once
+CLOSE_M = 2e-3  # to an edge or the plane, where float32 and float64 may differ
+BOUNDS = ((-1e6, -1e6, -1e6), (1e6, 1e6, 1e6))
+FARTHEST_M = 2.0**40  # that what moves a thousand km out of bounds in a step may reach
+
+cross = jax.jit(jax.vmap(cross_gate, in_axes=(None, 0, 0, None)))
+unit_turns = st.integers(0, 2**32 - 1).map(lambda seed: Rotation.random(rng=np.random.default_rng(seed)))
+centres = st.tuples(*[st.floats(-50.0, 50.0)] * 3)
+openings = st.floats(0.4, 5.0)
+thicknesses = st.floats(0.01, 3.0)
+
+
+def vectors(rows: np.ndarray) -> Vec3:
+    """Return rows (N, 3) as a vector of columns, float32."""
+    return Vec3(*jnp.asarray(np.asarray(rows, np.float32).T))
+
+
+def gates_of(*gates: Gate) -> Any:
+    """Return the flight frames of gates, leaves (N,)."""
+    return build_course(Track("test", gates, (0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), *BOUNDS)).gates
+
+
+def gate_of(turn: Rotation, centre: Any, direction: float, opening: float, thickness: float) -> Gate:
+    """Return a gate; thickness: of its frame, m."""
+    quat = tuple(turn.as_quat(scalar_first=True).tolist())
+    return Gate(0, tuple(centre), quat, direction, opening, opening + 2.0 * thickness)
+
+
+def events_in_float64(gate: Gate, start: np.ndarray, end: np.ndarray, radius: float) -> tuple[str, float]:
+    """Return what a segment (world, m) does to a gate, and how near float32 may get it wrong, m.
+
+    By rotating the segment into the gate's own frame, where it is flown along +-y and stands in x and z.
+    """
+    turn = Rotation.from_quat(gate.quaternion, scalar_first=True)
+    (x0, y0, z0), (x1, y1, z1) = turn.inv().apply(np.stack([start, end]) - gate.position)
+    y0, y1 = gate.direction * y0, gate.direction * y1
+    if not (y0 < 0.0) ^ (y1 < 0.0):
+        return "none", min(abs(y0), abs(y1))
+    share = y0 / (y0 - y1)
+    at = max(abs(x0 + share * (x1 - x0)), abs(z0 + share * (z1 - z0)))
+    free, solid = 0.5 * gate.opening - radius, 0.5 * gate.frame + radius
+    doubt = min(abs(y0), abs(y1), abs(at - free), abs(at - solid)) * min(1.0, abs(y0 - y1))
+    if free < at <= solid:
+        return "frame", doubt
+    if y1 < 0.0:
+        return "none", doubt
+    return ("pass" if at <= free else "miss"), doubt
+
+
+def name_of(crossing: Any, index: int) -> str:
+    """Return the one event of a crossing."""
+    flags = [bool(flag[index]) for flag in (crossing.is_pass, crossing.is_frame, crossing.is_miss)]
+    assert sum(flags) <= 1
+    return ["pass", "frame", "miss", "none"][flags.index(True) if any(flags) else 3]
+
+
+@settings(max_examples=200, deadline=None)
+@given(
+    turn=unit_turns,
+    centre=centres,
+    direction=st.sampled_from([1.0, -1.0]),
+    opening=openings,
+    thickness=thicknesses,
+    radius=st.floats(0.01, 0.19),
+    seed=st.integers(0, 2**32 - 1),
+)
+def test_any_segment_meets_any_gate_as_in_the_gates_own_frame(
+    turn: Rotation,
+    centre: Any,
+    direction: float,
+    opening: float,
+    thickness: float,
+    radius: float,
+    seed: int,
+) -> None:
+    gate = gate_of(turn, centre, direction, opening, thickness)
+    rng = np.random.default_rng(seed)
+    spread = rng.choice([0.3, 1.0, 4.0], (2, NUM, 1)) * opening
+    start, end = np.asarray(centre) + spread * rng.uniform(-1.0, 1.0, (2, NUM, 3))
+    frame = jax.tree.map(lambda leaf: leaf[0], gates_of(gate))
+    crossing = cross(frame, vectors(start), vectors(end), np.float32(radius))
+    for index in range(NUM):
+        expected, doubt = events_in_float64(gate, start[index], end[index], radius)
+        if doubt > CLOSE_M:
+            assert name_of(crossing, index) == expected
+    assert ((np.asarray(crossing.fraction) >= 0.0) & (np.asarray(crossing.fraction) <= 1.0)).all()
+    is_pass = np.asarray(crossing.is_pass)
+    assert (np.asarray(crossing.offset)[is_pass] <= 1.0).all()
+
+
+@settings(max_examples=100, deadline=None)
+@given(
+    turn=unit_turns,
+    opening=openings,
+    numbers=st.lists(
+        st.floats(-FARTHEST_M, FARTHEST_M, width=32) | st.sampled_from([0.0, -0.0, 1e-40, -1e-40, 1e6, -1e6]),
+        min_size=6 * NUM,
+        max_size=6 * NUM,
+    ),
+)
+def test_no_segment_is_two_events_or_leaves_the_unit_interval(
+    turn: Rotation, opening: float, numbers: list[float]
+) -> None:
+    """However long, short, far away or degenerate."""
+    frame = jax.tree.map(lambda leaf: leaf[0], gates_of(gate_of(turn, (1.0, 2.0, 3.0), 1.0, opening, 0.5)))
+    start, end = np.array(numbers).reshape(2, NUM, 3)
+    end[0] = start[0]
+    crossing = cross(frame, vectors(start), vectors(end), np.float32(0.1))
+    assert name_of(crossing, 0) == "none"
+    for index in range(1, NUM):
+        name_of(crossing, index)
+    for values in (crossing.fraction, crossing.offset):
+        assert np.isfinite(values).all() and (np.asarray(values) >= 0.0).all()
+    assert (np.asarray(crossing.fraction) <= 1.0).all()
+
+
+@settings(max_examples=100, deadline=None)
+@given(turn=unit_turns, centre=centres, opening=openings, seed=st.integers(0, 2**32 - 1))
+def test_flying_back_is_the_frame_again_or_nothing(
+    turn: Rotation, centre: Any, opening: float, seed: int
+) -> None:
+    """A path and its reverse touch the same frame; a gate that is turned round passes what flew backwards."""
+    start, end = np.asarray(centre) + opening * np.random.default_rng(seed).uniform(-2.0, 2.0, (2, NUM, 3))
+    names = {}
+    for direction in (1.0, -1.0):
+        gate = gate_of(turn, centre, direction, opening, 0.4)
+        doubts = [events_in_float64(gate, *pair, 0.1)[1] for pair in zip(start, end, strict=True)]
+        assume(min(doubts) > CLOSE_M)
+        frame = jax.tree.map(lambda leaf: leaf[0], gates_of(gate))
+        for way, ends in ((1.0, (start, end)), (-1.0, (end, start))):
+            crossing = cross(frame, *map(vectors, ends), np.float32(0.1))
+            names[direction, way] = [name_of(crossing, index) for index in range(NUM)]
+    assert names[1.0, 1.0] == names[-1.0, -1.0] and names[1.0, -1.0] == names[-1.0, 1.0]
+    for there, back in zip(names[1.0, 1.0], names[1.0, -1.0], strict=True):
+        assert (there == "frame") == (back == "frame")
+        assert there in ("frame", "none") or back == "none"
+
+
+# --- Races ------------------------------------------------------------------------------------------
+
+
+LENGTH = 24  # legs of a path
+fly_race = jax.jit(
+    lambda race, starts, ends, times, dts, course, radius: jax.lax.scan(
+        lambda race, leg: advance_race(race, *leg, course, radius), race, (starts, ends, times, dts)
+    )
+)
+
+
+@settings(max_examples=60, deadline=None)
+@given(seed=st.integers(0, 2**32 - 1), num_gates=st.sampled_from([2, 3, 8]))
+def test_a_race_counts_what_its_gates_see_one_after_the_other(seed: int, num_gates: int) -> None:
+    """Passes, laps and the gate to fly next along a path at random, against a reading gate by gate."""
+    rng = np.random.default_rng(seed)
+    gates = [
+        gate_of(Rotation.random(rng=rng), rng.uniform(-3.0, 3.0, 3), rng.choice([-1.0, 1.0]), 4.0, 0.5)
+        for _ in range(num_gates)
+    ]
+    course = build_course(Track("test", tuple(gates), (0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), *BOUNDS))
+    points = rng.uniform(-4.0, 4.0, (LENGTH + 1, 3))
+    first = int(rng.integers(num_gates))
+    times = np.arange(LENGTH, dtype=np.float32) * 0.01
+    arguments = (vectors(points[:-1]), vectors(points[1:]), times, np.full(LENGTH, np.float32(0.01)))
+    last, events = fly_race(start_race(jnp.int32(first), course), *arguments, course, np.float32(0.1))
+    check_race(last, events, gates, points, first)
+
+
+def check_race(last: Race, events: RaceEvents, gates: list[Gate], points: np.ndarray, first: int) -> None:
+    """Compare a race with its gates read one after the other, in float64; give up where they are close."""
+    index, passed = first, 0
+    for leg, (start, end) in enumerate(pairwise(points)):
+        event, doubt = events_in_float64(gates[index], start, end, 0.1)
+        assume(doubt > CLOSE_M)
+        num_passed = int(event == "pass")
+        if event == "pass":
+            local = Rotation.from_quat(gates[index].quaternion, scalar_first=True).inv()
+            before, after = (local.apply(point - gates[index].position)[1] for point in (start, end))
+            middle = start + before / (before - after) * (end - start)
+            event, doubt = events_in_float64(gates[(index + 1) % len(gates)], middle, end, 0.1)
+            assume(doubt > CLOSE_M)
+            num_passed += int(event == "pass")
+        index, passed = (index + num_passed) % len(gates), passed + num_passed
+        assert int(events.num_passed[leg]) == num_passed
+        assert bool(events.is_frame[leg]) == (event == "frame")
+        assert bool(events.is_miss[leg]) == (event == "miss")
+    assert int(last.gate_index) == index and int(last.gates_passed) == passed
+    assert int(last.laps) == passed // len(gates) == int(np.asarray(events.is_lap).sum())
+    assert 0.0 <= float(last.lap_time_s) <= LENGTH * 0.01 + 1e-6
