@@ -27,7 +27,9 @@ GROUPS = {
     "dynamics": Group(
         "Physics and state", ("flytrack_env.dynamics", "flytrack_env.state", "flytrack_env.quaternion")
     ),
-    "plants": Group("Plants and black boxes", ("flytrack_env.plants", "flytrack_env.blackbox")),
+    "plants": Group(
+        "Plants and black boxes", ("flytrack_env.plants", "flytrack_env.blackbox", "flytrack_env.apart")
+    ),
     "parts": Group(
         "Parts of an episode",
         (
@@ -64,7 +66,7 @@ GROUPS = {
     "loop": Group("The loop", ("flytrack_loop", "flytrack_loop.report")),
 }
 # Of modules without a list of their own (``__all__``), where not all that has no underscore is for users.
-ONLY = {"flytrack_sysid.diagnosis.plan": ("advise",)}
+ONLY = {"flytrack_sysid.diagnosis.plan": ("advise",), "flytrack_env.apart": ("ResourceLimits",)}
 
 
 def public_names(module_name: str) -> tuple[str, ...]:

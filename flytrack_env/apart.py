@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 SERVER = Path(__file__).with_name("apart_server.py")
 
 
-class Limits(NamedTuple):
+class ResourceLimits(NamedTuple):
     """What a call may use.
 
     cpu_s: whole seconds of processor time. memory_bytes: beyond what an idle process has. wall_s: s on the
@@ -48,7 +48,8 @@ def is_possible() -> bool:
 class Apart:
     """A function ``(argument, content) -> bytes`` in a file, run apart; argument: JSON values.
 
-    The file is read on its own, without the package around it, so that it imports no more than it needs.
+    The file is read on its own, without the package around it, so that it imports no more than it needs. A
+    function ``prepare`` in it is called once, before any call.
     environment: added to that of the server.
     """
 
@@ -60,7 +61,7 @@ class Apart:
         self._lock = threading.Lock()
         atexit.register(self.close)
 
-    def __call__(self, argument: Any, content: bytes, limits: Limits) -> bytes:
+    def __call__(self, argument: Any, content: bytes, limits: ResourceLimits) -> bytes:
         """Return what the function returns.
 
         Raises:
@@ -120,7 +121,7 @@ class Apart:
         server.wait()
 
 
-def _in_words(answer: dict[str, Any], limits: Limits) -> str:
+def _in_words(answer: dict[str, Any], limits: ResourceLimits) -> str:
     """Return what became of a call."""
     return {
         "raised": answer["text"],

@@ -149,12 +149,14 @@ def main(calls: BinaryIO, answers: BinaryIO) -> None:
     """Answer calls until there are no more."""
     setup = json.loads(calls.readline())
     sys.path[:] = setup["path"]
-    function = vars(_module(Path(setup["file"])))[setup["function"]]
+    module = _module(Path(setup["file"]))
+    if hasattr(module, "prepare"):
+        module.prepare()
     answers.write(b'{"ended": "ready", "size": 0}\n')
     answers.flush()
     while line := calls.readline():
         call = json.loads(line)
-        answer, result = serve(function, call, calls.read(call["size"]))
+        answer, result = serve(getattr(module, setup["function"]), call, calls.read(call["size"]))
         answers.write(json.dumps({**answer, "size": len(result)}).encode() + b"\n" + result)
         answers.flush()
 

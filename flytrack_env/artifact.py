@@ -4,6 +4,7 @@ Imports JAX and nothing of this package, because the file is read alone where bl
 (``flytrack_env.apart``).
 """
 
+import importlib
 from collections.abc import Iterator, Sequence
 from typing import Any
 
@@ -159,6 +160,11 @@ def check(content: bytes, starts: Sequence[Sequence[float]], num_actions: int, i
     size = check_signature(exported, [len(start) for start in starts], num_actions)
     check_closed(content, exported, is_trusted)
     check_runs(exported, next(start for start in starts if len(start) == size), num_actions)
+
+
+def prepare() -> None:
+    """Import what JAX else imports in every child anew, where it first lowers a program."""
+    importlib.import_module("scipy.linalg")
 
 
 def try_out(argument: Any, content: bytes) -> bytes:

@@ -36,7 +36,7 @@ from jax import export
 from jax.custom_batching import custom_vmap
 
 from flytrack_env import artifact
-from flytrack_env.apart import Apart, ApartError, Limits, is_possible
+from flytrack_env.apart import Apart, ApartError, ResourceLimits, is_possible
 from flytrack_env.dynamics import ModelParameters
 from flytrack_env.quaternion import Quaternion, Scalar, Vec3
 from flytrack_env.state import (
@@ -63,7 +63,12 @@ _REDUCED = np.r_[0:16, 19:21]
 _TRIAL = Apart(
     Path(artifact.__file__),
     "try_out",
-    {"JAX_PLATFORMS": "cpu", "JAX_ENABLE_COMPILATION_CACHE": "false", "NPROC": "1"},
+    {
+        "JAX_PLATFORMS": "cpu",
+        "JAX_ENABLE_COMPILATION_CACHE": "false",
+        "NPROC": "1",
+        "OPENBLAS_NUM_THREADS": "1",
+    },
 )
 _TRIED: set[str] = set()  # digests of what went well in this process
 
@@ -193,7 +198,7 @@ def _starts() -> list[list[float]]:
     return [start.tolist(), start[_REDUCED].tolist()]
 
 
-def _try_out(content: bytes, limits: Limits) -> None:
+def _try_out(content: bytes, limits: ResourceLimits) -> None:
     """Raise ApartError unless a stranger's bytes go well in a process of their own."""
     if not is_possible():
         raise ApartError(
@@ -206,7 +211,7 @@ def _try_out(content: bytes, limits: Limits) -> None:
 def load(
     path: str | Path,
     max_rate: tuple[float, float, float] = MAX_RATE_DEG_S,
-    limits: Limits | None = Limits(),  # noqa: B008, a tuple of constants
+    limits: ResourceLimits | None = ResourceLimits(),  # noqa: B008, a tuple of constants
 ) -> BlackBox:
     """Return the plant in a file; see the module for what a file may hold and what that risks.
 

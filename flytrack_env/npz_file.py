@@ -7,6 +7,7 @@ import io
 import math
 import re
 import struct
+import sys
 import zipfile
 from collections.abc import Iterator
 from pathlib import Path
@@ -25,6 +26,7 @@ HEADERS = {
 LARGEST_HEADER_BYTES = 2**16
 SUFFIX = ".npy"
 LONGEST_TEXT = 200
+FIRST_SURROGATE, LAST_SURROGATE = 0xD800, 0xDFFF  # halves of characters
 LARGEST_LIST_BYTES = 2**16  # of the archive's list of its files: hundreds of them
 # End of an archive, and what points to a list of more than 4 GiB or 65,535 files.
 END, END_BYTES, LIST_BYTES_AT, LARGE_END = b"PK\x05\x06", 22, 12, b"PK\x06\x07"
@@ -95,6 +97,7 @@ class NpzFile:
         """
         with self._opened(name) as (file, header):
             data = file.read(header.num_values * header.dtype.itemsize)
+            _check_text(header.dtype, data)
             values = np.frombuffer(data, header.dtype)
             return values.reshape(header.shape, order="F" if header.is_fortran else "C")
 
@@ -132,6 +135,16 @@ def _check(header: Header, num_bytes: int) -> None:
         numbers = "numbers" if dtype.kind in "iuf" else "values"
         expected = f"{header.num_values} {numbers} of {dtype.itemsize} bytes"
         raise NpzError(f"found {num_bytes} bytes, expected {expected}")
+
+
+def _check_text(dtype: np.dtype, data: bytes) -> None:
+    """Raise NpzError for text of numbers that are no characters: NumPy is not prepared for it."""
+    if dtype.kind != "U":
+        return
+    codes = np.frombuffer(data, np.dtype(np.uint32).newbyteorder(dtype.byteorder))
+    is_surrogate = (codes >= FIRST_SURROGATE) & (codes <= LAST_SURROGATE)
+    if (is_surrogate | (codes > sys.maxunicode)).any():
+        raise NpzError("found text of numbers that are no characters")
 
 
 @contextlib.contextmanager

@@ -131,10 +131,7 @@ def load_script(path: str | Path) -> Script:
     for name in ("starts", "commands"):
         if arrays[name].dtype.kind not in "iuf":
             raise ScriptError(f"{path}: {name}: found {_described(arrays[name])}, expected numbers")
-    try:
-        kinds = tuple(arrays["kinds"].tolist())
-    except ValueError as error:  # numbers that are no characters
-        raise ScriptError(f"{path}: kinds: {said(error)}; expected a row of names") from error
+    kinds = tuple(arrays["kinds"].tolist())
     script = Script(kinds, arrays["starts"].astype(float), arrays["commands"].astype(float))
     check_script(script, str(path))
     return script

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from flytrack_env.apart import Apart, ApartError, Limits, is_possible
+from flytrack_env.apart import Apart, ApartError, ResourceLimits, is_possible
 
 pytestmark = pytest.mark.skipif(not is_possible(), reason="this system has no os.fork")
 
@@ -40,7 +40,7 @@ def do(argument, content):
         case "write": open(content.decode(), "wb", buffering=0).write(b"x"); return b"written"
         case "shout": sys.stderr.write("x" * 2**20); return b"quiet"
 """
-LIMITS = Limits(cpu_s=1, memory_bytes=2**27, wall_s=30.0)
+LIMITS = ResourceLimits(cpu_s=1, memory_bytes=2**27, wall_s=30.0)
 
 
 @pytest.fixture(scope="module")
@@ -128,8 +128,9 @@ def is_running(process: int) -> bool:
 def test_the_server_ends_with_its_process_even_one_that_is_killed(tmp_path: Path):
     (tmp_path / "deeds.py").write_text(FUNCTION)
     code = (  # with no guard, as users write scripts
-        "import os, signal\nfrom pathlib import Path\nfrom flytrack_env.apart import Apart, Limits\n"
-        "apart = Apart(Path('deeds.py'), 'do', {})\nprint(apart('pid', b'', Limits()).decode(), flush=True)\n"
+        "import os, signal\nfrom pathlib import Path\nfrom flytrack_env.apart import Apart, ResourceLimits\n"
+        "apart = Apart(Path('deeds.py'), 'do', {})\n"
+        "print(apart('pid', b'', ResourceLimits()).decode(), flush=True)\n"
     )
     for end in ("", "os.kill(os.getpid(), signal.SIGKILL)"):
         (tmp_path / "script.py").write_text(code + end)

@@ -12,7 +12,7 @@ import pytest
 from jax import export
 
 from flytrack_env import blackbox
-from flytrack_env.apart import ApartError, Limits
+from flytrack_env.apart import ApartError, ResourceLimits
 from flytrack_env.blackbox import BlackBoxError, load
 
 SHIPPED = Path(__file__).resolve().parents[1] / "blackbox" / "acro_step.bin"
@@ -24,7 +24,7 @@ def trials(monkeypatch: pytest.MonkeyPatch) -> list[bytes]:
     seen: list[bytes] = []
     really = blackbox._TRIAL
 
-    def count(argument: Any, content: bytes, limits: Limits) -> bytes:
+    def count(argument: Any, content: bytes, limits: ResourceLimits) -> bytes:
         seen.append(content)
         return really(argument, content, limits)
 
@@ -94,7 +94,7 @@ def test_hunger_hanging_and_foreign_calls_are_refused(
 ) -> None:
     path = write(tmp_path / "a.bin", step)
     with pytest.raises(BlackBoxError, match=rf"^{path}: .*({message})"):
-        load(path, limits=Limits(cpu_s=1) if step is forever else Limits())
+        load(path, limits=ResourceLimits(cpu_s=1) if step is forever else ResourceLimits())
 
 
 def test_a_trusted_file_is_not_tried_and_may_call_lapack(trials: list[bytes], tmp_path: Path) -> None:
@@ -103,8 +103,8 @@ def test_a_trusted_file_is_not_tried_and_may_call_lapack(trials: list[bytes], tm
     np.testing.assert_allclose(box.step_vector(np.zeros(21), np.zeros(4))[:4], 1.0, rtol=1e-5)
 
 
-@pytest.mark.parametrize("limits", [None, Limits()])
-def test_calls_that_nobody_vouches_for_are_refused(limits: Limits | None, tmp_path: Path) -> None:
+@pytest.mark.parametrize("limits", [None, ResourceLimits()])
+def test_calls_that_nobody_vouches_for_are_refused(limits: ResourceLimits | None, tmp_path: Path) -> None:
     def step(x: jax.Array, u: jax.Array) -> jax.Array:
         return jax.ffi.ffi_call("my callback", jax.ShapeDtypeStruct(x.shape, x.dtype))(x)
 

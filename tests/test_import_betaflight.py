@@ -10,7 +10,9 @@ from real_logs import BETAFLIGHT, shared
 from scipy.spatial.transform import Rotation
 
 from benchmarks.reliability.strangers.log_writers import BLACKBOX_HEADERS, blackbox
+from flytrack_env.apart import ResourceLimits
 from flytrack_sysid import LogError, import_log
+from flytrack_sysid.importing import decoding
 from flytrack_sysid.importing.betaflight_log import full_stick_rate
 
 pytest.importorskip("orangebox", reason="orangebox is not installed: pip install 'flytrack[logs]'")
@@ -110,6 +112,10 @@ def test_rates_at_full_stick_are_the_firmwares(rates_type, rc_rate, super_rate, 
         (log_with(rates_type="9"), r"a\.bbl: header rates_type: found 9, expected below 5"),
         (log_with(rc_rates="0,0,0"), r"full stick at \(0\.0, 0\.0, 0\.0\) deg/s"),
         (log_with(acc_1G=None), r"a\.bbl: header acc_1G: found None, expected 1 numbers of at least 0"),
+        (log_with(acc_1G="1e999"), r"a\.bbl: header acc_1G: found inf, expected 1 numbers"),
+        (log_with(**{"Firmware revision": "x" * 5000}), r"Firmware revision: found 'xxx.{1,60}, expected"),
+        (log_with(names=[*NAMES[:-1], "y" * 5000]), r"accSmooth\[2\]: missing; found .{1,1000}$"),
+        (log_with(names=[NAMES[0], "\x1b[2J", *NAMES[2:]]), r"field time: missing; found [ -~]+$"),
         (log_with(acc_1G="0"), r"a\.bbl: header acc_1G: found 0, expected"),
         (log_with(names=[*NAMES[:-1], "x"]), r"a\.bbl: field accSmooth\[2\]: missing; found loopIteration"),
         (log_with(rc_rates="50,50,50"), r"column u_roll: found 5\.11, expected a command in \[-1, 1\]"),
@@ -118,6 +124,30 @@ def test_rates_at_full_stick_are_the_firmwares(rates_type, rc_rate, super_rate, 
 def test_what_cannot_be_meant_is_refused(tmp_path, content, message):
     with pytest.raises(LogError, match=message):
         import_log(write(tmp_path / "a.bbl", content), "betaflight")
+
+
+def test_headers_that_make_the_decoder_wait_for_ever_are_refused_in_time(tmp_path, monkeypatch):
+    waits = {"Field I predictor": ",".join("6" * len(NAMES)), "P interval": "0/32"}
+    path = write(tmp_path / "a.bbl", log_with(**waits))
+    monkeypatch.setattr(decoding, "limits_of", lambda num_bytes: ResourceLimits(cpu_s=1))
+    with pytest.raises(
+        LogError, match=r"a\.bbl: damaged, cannot be decoded: it took more than 1 s of processor"
+    ):
+        import_log(path, "betaflight")
+
+
+def test_large_files_may_take_longer_to_decode():
+    assert decoding.limits_of(2**20 - 1).cpu_s == ResourceLimits().cpu_s < decoding.limits_of(2**20).cpu_s
+    assert decoding.limits_of(2**24).memory_bytes > ResourceLimits().memory_bytes
+
+
+def test_without_fork_the_decoder_works_here(tmp_path, monkeypatch):
+    apart = import_log(write(tmp_path / "a.bbl", log_with()), "betaflight").log
+    monkeypatch.setattr(decoding, "is_possible", lambda: False)
+    np.testing.assert_array_equal(import_log(tmp_path / "a.bbl", "betaflight").log["w"], apart["w"])
+    write(tmp_path / "bad.bbl", log_with().replace(b"encoding:1", b"encoding:77"))
+    with pytest.raises(LogError, match=r"bad\.bbl: damaged, cannot be decoded: RuntimeError"):
+        import_log(tmp_path / "bad.bbl", "betaflight")
 
 
 def test_a_missing_file_or_package_is_named(tmp_path, monkeypatch):

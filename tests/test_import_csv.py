@@ -3,6 +3,7 @@
 import csv
 import gzip
 import json
+import time
 from pathlib import Path
 
 import numpy as np
@@ -174,6 +175,16 @@ def test_rows_are_chosen_and_files_become_segments(folder, tmp_path):
             r"map\.toml: rows: none of the 300 rows of .*flight\.csv",
         ),
         ("[time]", "[time", r"map\.toml: not a readable TOML file"),
+        ("[time]", "x = " + "[" * 9000 + "\n[time]", r"map\.toml: not a readable TOML file"),
+        ("[time]", "a" + ".a" * 5000 + " = 1\n[time]", r"map\.toml: not a readable TOML file: line 2"),
+        (
+            "mass_kg = 0.5",
+            "mass_kg = 1" + "0" * 400,
+            r"craft\.mass_kg: found 1000.*, expected a number above 0",
+        ),
+        ("mass_kg = 0.5", "mass_kg = 0x" + "f" * 5000, "mass_kg: found a number of thousands of digits"),
+        ("[craft]", "[rows]\nfirst = 0xffffffffffffffffff\n[craft]", r"rows\.first: .*below 2\^53"),
+        ("[battery]", '["' + "y" * 5000 + '"]', r"map\.toml: 'yyy.{1,80}: unknown; expected of"),
     ],
 )
 def test_mappings_that_cannot_be_meant_are_refused(folder, tmp_path, old, new, message):
@@ -215,6 +226,53 @@ def test_files_that_are_missing_cut_off_or_unmapped_are_refused(folder, tmp_path
         import_log(tmp_path / "cut.csv.gz", "csv", folder / "map.toml")
     with pytest.raises(LogError, match="format: found 'mat'"):
         import_log(folder / "flight.csv", "mat")
+
+
+def test_a_small_file_that_unpacks_to_much_is_refused_on_the_way(folder, tmp_path):
+    header = (folder / "flight.csv").read_text().splitlines()[0]
+    path = tmp_path / "bomb.csv.gz"
+    path.write_bytes(gzip.compress(header.encode() + b"\n" * 2**26, 1))
+    assert path.stat().st_size < 2**19
+    started_s = time.process_time()
+    with pytest.raises(LogError, match=r"bomb\.csv\.gz: cannot be read as text: found more than \d+ bytes"):
+        import_log(path, "csv", folder / "map.toml")
+    assert time.process_time() - started_s < 5.0
+
+
+@pytest.mark.parametrize(
+    ("manifest", "message"),
+    [
+        (
+            "file,rows\nflight.csv," + "7" * 5000,
+            "rows: found '777.{1,60}, expected a whole number of at most 15",
+        ),
+        ("file,rows\nflight.csv,\u0661x", "rows: found '\u0661x', expected a whole number"),
+        ("file," + "x" * 5000 + "\n", "column rows: missing; found file, 'xxx.{1,100}$"),
+        (
+            "file,rows\n" + "other.csv,1\n" * 2**21,
+            "cannot be read as a manifest: found more than 16777216 bytes",
+        ),
+        (None, "cannot be read as a manifest"),
+    ],
+)
+def test_manifests_that_cannot_be_meant_are_refused(folder, tmp_path, manifest, message):
+    for name in ("flight.csv", "map.toml"):
+        (tmp_path / name).write_bytes((folder / name).read_bytes())
+    with (tmp_path / "map.toml").open("a") as file:
+        file.write('[rows.manifest]\nfile = "manifest.csv"\nkey = "file"\ncount = "rows"\n')
+    if manifest is not None:
+        (tmp_path / "manifest.csv").write_text(manifest, encoding="utf-8")
+    with pytest.raises(LogError, match=rf"manifest\.csv: (flight\.csv: )?{message}"):
+        import_log(tmp_path / "flight.csv", "csv", tmp_path / "map.toml")
+
+
+def test_voltages_that_are_none_are_not_the_crafts(folder, tmp_path):
+    lines = (folder / "flight.csv").read_text().splitlines()
+    lines[5] = ",".join([*lines[5].split(",")[:-1], "0"])
+    (tmp_path / "flat.csv").write_text("\n".join(lines))
+    (tmp_path / "map.toml").write_text(MAPPING.replace("voltage_v = [14.0, 16.8]", ""))
+    assert import_log(tmp_path / "flat.csv", "csv", tmp_path / "map.toml").craft.voltage_v is None
+    assert import_log(folder / "flight.csv", "csv", tmp_path / "map.toml").craft.voltage_v is not None
 
 
 def test_nominal_model_hovers_where_the_nominal_craft_does():

@@ -9,7 +9,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from benchmarks.reliability.strangers.log_writers import UlogWriter
+from flytrack_env.apart import ResourceLimits
 from flytrack_sysid import LogError, import_log
+from flytrack_sysid.importing import decoding
 
 pytest.importorskip("pyulog", reason="pyulog is not installed: pip install 'flytrack[logs]'")
 
@@ -166,6 +168,36 @@ def test_what_is_no_ulog_is_refused(tmp_path, content, message):
     (tmp_path / "a.ulg").write_bytes(content)
     with pytest.raises(LogError, match=message):
         import_log(tmp_path / "a.ulg", "ulog")
+
+
+def with_definitions(content: bytes, *definitions: str) -> bytes:
+    """Return a log with other formats of topics before its own messages."""
+    return (
+        content[:16] + b"".join(UlogWriter.message("F", text.encode()) for text in definitions) + content[16:]
+    )
+
+
+def test_topics_of_arrays_of_arrays_are_refused_in_time(tmp_path, monkeypatch):
+    formats = ("vehicle_attitude:b[60000] q;", "b:c[60000] q;", "c:float[60000] q;")
+    subscription = UlogWriter.message("A", b"\x00\x00\x00vehicle_attitude")
+    path = tmp_path / "a.ulg"
+    path.write_bytes(with_definitions(b"ULog\x01\x12\x35" + bytes(9), *formats) + subscription)
+    limits = ResourceLimits(cpu_s=2, memory_bytes=2**27)
+    monkeypatch.setattr(decoding, "limits_of", lambda num_bytes: limits)
+    with pytest.raises(LogError, match=r"a\.ulg: damaged, cannot be decoded: it (took|needs) more than"):
+        import_log(path, "ulog")
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_parameters_that_are_no_numbers_are_missing(tmp_path, value):
+    path = write(tmp_path / "a.ulg", topics(), {**PARAMETERS, "MC_ACRO_P_MAX": value})
+    with pytest.raises(LogError, match=r"a\.ulg: parameter MC_ACRO_P_MAX or MC_PITCHRATE_MAX: missing"):
+        import_log(path, "ulog")
+    content = write(tmp_path / "b.ulg", topics()).read_bytes()
+    assert content.count(b"float MC_ACRO_P_MAX") == 1
+    (tmp_path / "b.ulg").write_bytes(content.replace(b"float MC_ACRO_P_MAX", b"char[ MC_ACRO_P_MAX"))
+    with pytest.raises(LogError, match=r"b\.ulg: parameter MC_ACRO_P_MAX or MC_PITCHRATE_MAX: missing"):
+        import_log(tmp_path / "b.ulg", "ulog")
 
 
 def test_damage_is_noted_and_the_rest_read(tmp_path, capsys):

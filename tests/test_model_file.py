@@ -184,6 +184,23 @@ def test_files_that_cannot_be_read(tmp_path: Path) -> None:
             load_model(path)
 
 
+def test_endless_and_deep_values_are_refused_in_few_words(tmp_path: Path) -> None:
+    path = tmp_path / "model.json"
+    texts = {
+        "version: found": json.dumps({**FIELDS, "version": "x" * 5000}),
+        "m: found": json.dumps({**FIELDS, "m": [["x" * 5000]] * 500}),
+        "'yyy.*': unknown": json.dumps({**FIELDS, "y" * 5000: 1}),
+        "not a JSON file": "[" * 100_000,
+        "expected 1": json.dumps({**FIELDS, "version": 1})[:-3] + "[" * 900 + "]" * 900 + "}",
+        "found more than 4194304 bytes": json.dumps(FIELDS) + " " * 2**22,
+    }
+    for reason, text in texts.items():
+        path.write_text(text, encoding="utf-8")
+        with pytest.raises(ModelFileError, match=reason) as caught:
+            load_model(path)
+        assert str(caught.value).startswith(str(path)) and len(str(caught.value)) < 600
+
+
 @contextmanager
 def full_disk() -> Iterator[None]:
     """Let every write to a file fail after a few bytes, as on a full disk."""

@@ -93,6 +93,16 @@ def test_whole_numbers_may_be_written_as_powers_of_ten(tmp_path):
         ("hidden_sizes = ['a']", r"run\.toml: hidden_sizes: found 'a', expected a whole number"),
         ("learning_rate = ", r"run\.toml: not a TOML file"),
         (None, r"run\.toml: cannot be read"),
+        (
+            "num_envs = 0x" + "f" * 5000,
+            r"run\.toml: num_envs: found a number of thousands of digits, expected",
+        ),
+        (
+            "learning_rate = 1" + "0" * 400,
+            r"run\.toml: learning_rate: found 1000.*, expected a finite number",
+        ),
+        ("num_envs = " + "[" * 9000, r"run\.toml: not a TOML file"),
+        ("a" + ".a" * 5000 + " = 1", r"run\.toml: not a TOML file: line 1: found 5000 dots"),
     ],
 )
 def test_files_that_cannot_be_used_are_refused(tmp_path, content, message):
@@ -127,6 +137,8 @@ def test_configuration_comes_back_from_json():
     assert config_from_json(json.loads(json.dumps(dataclasses.asdict(config)))) == config
     with pytest.raises(ConfigError, match="config: from_the_future: unknown to this version"):
         config_from_json({"from_the_future": 1})
+    with pytest.raises(ConfigError, match=r"config: gamma: found 1000.*, expected a finite number"):
+        config_from_json({"gamma": 10**400})
 
 
 @pytest.mark.parametrize(

@@ -5,10 +5,12 @@ import io
 import pickle
 import subprocess
 import sys
+import tracemalloc
 
 import numpy as np
 import pytest
 
+from flytrack_env import rollout
 from flytrack_env.rollout import RolloutError, load_rollout, save_rollout
 
 
@@ -90,6 +92,16 @@ BAD_FILES = {
     "no steps": (npy_bytes(np.zeros((0, 25))), r"found shape \(0, 25\), expected .*T >= 1"),
     "nan": (npy_bytes(rows_with(np.nan)), "found nan at step 1, column 9, expected finite"),
     "inf": (npy_bytes(rows_with(np.inf)), "found inf at step 1"),
+    "long doubles": (npy_bytes(np.zeros((3, 25), np.longdouble)), "found an array of float128"),
+    "unknown version": (b"\x93NUMPY\x09\x09" + bytes(99), r"not an .npy file: found version \(9, 9\)"),
+    "long header": (
+        npy_bytes(np.zeros((3, 25), np.dtype([("a", "<f8")] * 1)))[:8] + b"\xff" * 2 + b"x" * 99,
+        "not an .npy file: EOF",
+    ),
+    "structure of many names": (
+        npy_bytes(np.zeros(3, [("a" * 900, "<f8")])),
+        "found an array of .{1,250}, exp",
+    ),
     "beyond float32": (npy_bytes(rows_with(1e300)), "found inf at step 1"),
 }
 
@@ -204,6 +216,29 @@ def test_shape_larger_than_the_file_is_refused_before_allocating(tmp_path):
     assert len(huge) == len(content) and huge != content
     with pytest.raises(RolloutError, match="cut short"):
         load_rollout(path)
+
+
+def test_header_larger_than_any_is_not_made_room_for(tmp_path):
+    path = tmp_path / "flight.npy"
+    path.write_bytes(b"\x93NUMPY\x02\x00\xff\xff\xff\x7f{'descr'" + bytes(200))
+    tracemalloc.start()
+    try:
+        with pytest.raises(RolloutError, match=r"not an \.npy file: found a header of 2147483647 bytes"):
+            load_rollout(path)
+        assert tracemalloc.get_traced_memory()[1] < 2**20
+    finally:
+        tracemalloc.stop()
+
+
+def test_rollouts_of_too_many_steps_are_neither_read_nor_written(tmp_path, monkeypatch):
+    states, actions = make_flight(6)
+    save_rollout(tmp_path / "flight.npy", states, actions)
+    monkeypatch.setattr(rollout, "MOST_STEPS", 5)
+    with pytest.raises(RolloutError, match=r"flight\.npy: found 6 steps, expected at most 5"):
+        load_rollout(tmp_path / "flight.npy")
+    with pytest.raises(RolloutError, match=r"other\.npy: found 6 steps, expected at most 5"):
+        save_rollout(tmp_path / "other.npy", states, actions)
+    assert not (tmp_path / "other.npy").exists()
 
 
 def test_missing_file_is_refused(tmp_path):

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from handout_plant import HandoutPlant
 
+from benchmarks.reliability.strangers.archives import zipped
 from flytrack_env.dynamics import collective_thrust, nominal_parameters
 from flytrack_env.state import APPLIED_ACTION, BATTERY
 from flytrack_sysid import collect, load_log
@@ -130,6 +131,9 @@ BAD = {
     "kinds: found no flight": {"kinds": np.array([], "U1")},
     "kinds: found an array of float64": {"kinds": np.zeros(8)},
     "starts: found an array of <U4": {"starts": np.full((8, 21), "text")},
+    "found text of numbers that are no characters": {"kinds": np.full(8, 0x7FFFFFFF, np.int32).view("<U1")},
+    r"kinds: found 'xxx.{0,80}, expected one of headings": {"kinds": np.array(["x" * 5000] * 8)},
+    "found more than 67108864 bytes": {"commands": np.zeros((8, 2**20 + 1, 1), np.int8)},
     "nothing is unpickled": {"starts": np.array([Harmful()] * 8, object)},
     "found arrays commands, kinds, more, starts, expected kinds, starts, commands": {"more": np.zeros(1)},
 }
@@ -154,6 +158,9 @@ def test_files_that_are_no_scripts_are_refused(tmp_path):
     for bad, message in ((path, "not a script, or damaged"), (tmp_path / "none.npz", "FileNotFoundError")):
         with pytest.raises(ScriptError, match=message):
             load_script(bad)
+    path.write_bytes(zipped([(f"{name}.npy", b"no array") for name in ("kinds", "starts", "commands")]))
+    with pytest.raises(ScriptError, match=r"cut\.npz: not a script, or damaged; .*NpzError"):
+        load_script(path)
     with pytest.raises(ScriptError, match=r"found suffix '\.csv', expected \.npz"):
         load_script(tmp_path / "flight.csv")
     script = made("headings")

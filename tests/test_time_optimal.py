@@ -182,12 +182,13 @@ def rewritten(path: Path, **changes: Any) -> Path:
     with np.load(shipped_path("flytrack", "flying", "nominal")) as file:
         data = dict(file)
     notes = json.loads(str(data["notes"]))
+    text = changes.pop("notes", None)
     for name, value in changes.items():
         if name in data:
             data[name] = value
         else:
             notes[name] = value
-    np.savez(path, **{**data, "notes": np.array(json.dumps(notes))})
+    np.savez(path, **{**data, "notes": np.array(json.dumps(notes)) if text is None else text})
     return path
 
 
@@ -201,7 +202,22 @@ def rewritten(path: Path, **changes: Any) -> Path:
         ({"kind": "hovering"}, "kind: found 'hovering', expected one of flying, standing"),
         ({"model_sha256": "0"}, "model: found another"),
         ({"model": {}}, "model: cannot be read"),
-        ({"gate_times_s": np.array([object()])}, "cannot be read"),
+        ({"gate_times_s": np.array([object()])}, "cannot be read: .*pickles are never read"),
+        ({"gate_times_s": np.array([[0.1]])}, "gate_times_s: found .*expected a row of growing times"),
+        ({"gate_times_s": np.array([0.2, 0.1])}, "gate_times_s: found .*expected a row of growing times"),
+        (
+            {"notes": np.full((), 0xD800, np.uint32).view("<U1")},
+            "found text of numbers that are no characters",
+        ),
+        ({"dt_s": "soon"}, "dt_s: found 'soon', expected seconds above 0"),
+        ({"dt_s": True}, "dt_s: found True, expected seconds above 0"),
+        ({"time_s": -1.0}, "time_s: found -1.0, expected seconds above 0"),
+        ({"time_s": 10**400}, "time_s: found 1000.*, expected seconds above 0"),
+        ({"track": ["flytrack"]}, r"track: found \['flytrack'\], expected a text"),
+        ({"found": "by chance"}, "found: found 'by chance', expected an object"),
+        ({"version": [["x" * 999]] * 999}, "version: found .{1,300}, expected 1"),
+        ({"model": {"parameters": {"m": "x" * 999}, "effects": {}}}, "model: cannot be read: .{1,400}$"),
+        ({"states": np.zeros((2**20, 21))}, "cannot be read: found more than 16777216 bytes"),
     ],
 )
 def test_a_damaged_file_is_refused(changes: dict[str, Any], reason: str, tmp_path: Path) -> None:

@@ -22,6 +22,7 @@ from flytrack_env.words import named, said, shown
 FORMAT = "flytrack-ppo-2"
 FORMAT_WITHOUT_TRAINING = "flytrack-ppo-1"  # of before there was a checksum and a state of the training
 LONGEST_META = 2**22  # characters: a track of ten thousand gates
+ROOM_BYTES = 2**10  # of the checksum and what is around the content
 MOST_LAYERS, WIDEST = 64, 2**16  # of networks
 MOST_DIFFERENCES = 12  # as many as can be read in a terminal
 
@@ -113,7 +114,12 @@ def save_checkpoint(
 
     description: JSON values; needs env_id, track, missed_gate and observation_size, may hold anything else.
     training: named arrays of what else training needs to go on; without, the file is a policy alone.
+
+    Raises:
+        CheckpointError: a network that is larger than ``load_checkpoint`` takes.
+        OSError: what the system says.
     """
+    _check_size(Path(path), config, description["observation_size"])
     meta = {
         "format": FORMAT,
         "package_version": flytrack_env.__version__,
@@ -124,6 +130,10 @@ def save_checkpoint(
     if training is not None:
         parts["training"] = training
     content = flax.serialization.msgpack_serialize(parts)
+    if len(content) > LARGEST_BYTES - ROOM_BYTES:
+        raise CheckpointError(
+            f"{path}: found {len(content)} bytes to write, expected at most {LARGEST_BYTES}"
+        )
     whole = {"checksum": hashlib.sha256(content).hexdigest(), "content": content}
     write_atomically(path, flax.serialization.msgpack_serialize(whole))
 
@@ -137,15 +147,9 @@ def load_checkpoint(path: str | Path) -> Checkpoint:
     """
     path = Path(path)
     content = _read_content(path)
-    try:
-        if len(content["meta"]) > LONGEST_META:
-            raise ValueError(f"found {len(content['meta'])} characters")
-        meta = json.loads(content["meta"])
-        found_format = meta["format"]
-    except (KeyError, IndexError, TypeError, AttributeError, ValueError, RecursionError) as error:
-        raise CheckpointError(f"{path}: not a checkpoint: no description in it") from error
-    if found_format not in (FORMAT, FORMAT_WITHOUT_TRAINING):
-        raise CheckpointError(f"{path}: format: found {shown(found_format)}, expected {FORMAT!r}")
+    meta = _read_meta(path, content)
+    if meta["format"] not in (FORMAT, FORMAT_WITHOUT_TRAINING):
+        raise CheckpointError(f"{path}: format: found {shown(meta['format'])}, expected {FORMAT!r}")
     try:
         return _read_parts(path, meta, content)
     except CheckpointError:
@@ -174,6 +178,18 @@ def _read_content(path: Path) -> Any:
         raise CheckpointError(f"{path}: cannot be read: {said(error)}") from error
     except UnpackError as error:
         raise CheckpointError(f"{path}: not a checkpoint, or damaged: {said(error)}") from error
+
+
+def _read_meta(path: Path, content: Any) -> dict[str, Any]:
+    """Return the description in a file's content, which says what format it is of."""
+    text = content.get("meta") if isinstance(content, dict) else None
+    try:
+        meta = json.loads(text) if isinstance(text, str) and len(text) <= LONGEST_META else None
+    except (ValueError, RecursionError) as error:
+        raise CheckpointError(f"{path}: not a checkpoint: no description in it: {said(error)}") from error
+    if not isinstance(meta, dict) or "format" not in meta:
+        raise CheckpointError(f"{path}: not a checkpoint: no description in it")
+    return meta
 
 
 def _check_size(path: Path, config: Config, size: Any) -> None:

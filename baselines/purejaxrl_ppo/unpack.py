@@ -12,7 +12,7 @@ import numpy as np
 
 from flytrack_env.words import said
 
-LARGEST_BYTES = 2**28  # of a file: three times that in memory
+LARGEST_BYTES = 3 * 2**27  # of a file: a little more than twice that in memory, below 1 GiB
 MOST_ENTRIES = 100_000  # of all maps together
 LONGEST_NAME = 200  # characters
 MOST_DIMENSIONS = 32

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from flytrack_env.apart import Apart, ApartError, Limits, is_possible
+from flytrack_env.apart import Apart, ApartError, ResourceLimits, is_possible
 from flytrack_env.npz_file import NpzError, NpzFile
 from flytrack_env.words import said
 from flytrack_sysid.importing.extra import needed_module
@@ -23,10 +23,10 @@ CPU_S_PER_MIB, BYTES_PER_BYTE = 4, 32
 _DECODERS = Apart(Path(__file__).with_name("decoders.py"), "decode", {})
 
 
-def limits_of(num_bytes: int) -> Limits:
+def limits_of(num_bytes: int) -> ResourceLimits:
     """Return what decoding a file of that size may use."""
-    usual, more_s = Limits(), CPU_S_PER_MIB * (num_bytes // 2**20)
-    return Limits(
+    usual, more_s = ResourceLimits(), CPU_S_PER_MIB * (num_bytes // 2**20)
+    return ResourceLimits(
         usual.cpu_s + more_s, usual.memory_bytes + BYTES_PER_BYTE * num_bytes, usual.wall_s + 4.0 * more_s
     )
 

@@ -7,13 +7,14 @@ import json
 import tomllib
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from baselines.purejaxrl_ppo import CheckpointError, load_checkpoint
 from baselines.purejaxrl_ppo.config import ConfigError, settings_in_file
 from benchmarks.reliability.strangers import archives, flight_logs, packed, programs, seeds, soundness
+from benchmarks.reliability.strangers.kind import Kind, Mutator
 from benchmarks.reliability.strangers.noise import Rng, damage, damage_text
 from benchmarks.reliability.strangers.resuming import resume, write_trainings
 from benchmarks.reliability.strangers.trees import as_json, as_toml, damage_tree
@@ -24,29 +25,6 @@ from flytrack_env.references import ReferenceFileError, load_reference
 from flytrack_env.rollout import RolloutError, load_rollout
 from flytrack_sysid import LogError, ScriptError, import_log, load_log, load_script
 from flytrack_sysid.importing import load_mapping
-
-Mutator = Callable[[Rng, list[bytes]], bytes]
-
-
-def _no_files(_: list[bytes]) -> list[bytes]:
-    return []
-
-
-class Kind(NamedTuple):
-    """A kind of file.
-
-    suffix: of its files. write: writes files that are well into a folder. load: of a path. error: the only
-    one that it may raise. check: raises AssertionError for what no such file may load as. mutate: damages one
-    of the files that are well. hostile: of those, makes files that are meant to harm.
-    """
-
-    suffix: str
-    write: Callable[[Path], None]
-    load: Callable[[Path], Any]
-    error: type[Exception]
-    check: Callable[[Any], None]
-    mutate: Mutator
-    hostile: Callable[[list[bytes]], list[bytes]] = _no_files
 
 
 def _either(*ways: tuple[float, Mutator]) -> Mutator:

@@ -12,12 +12,13 @@ from pathlib import Path
 from typing import IO, Any
 
 from benchmarks.reliability.strangers.watch import CPU_S
+from benchmarks.reliability.strangers.worker import KINDS_MODULE
 
 START_S, WAIT_S = (
     300.0,
     120.0,
 )  # on the clock: until a worker is ready; for a load, which may wait for a trial
-MOST_EXAMPLES = 5  # kept of each sort that is broken
+MOST_EXAMPLES = 10  # kept of each sort that is broken
 MOST_DEATHS = 200  # of workers of a kind: what ends one so often is known by then
 KEPT = ("loaded", "refused")
 
@@ -69,14 +70,16 @@ class _Worker:
         self._output.close()
 
 
-def _command(kind: str, seed: int, first: int, last: int, folder: Path) -> list[str]:
+def _command(kind: str, seed: int, first: int, last: int, folder: Path, kinds: str) -> list[str]:
     module = "benchmarks.reliability.strangers.worker"
     numbers = ["--seed", str(seed), "--first", str(first), "--last", str(last)]
-    return [sys.executable, "-m", module, kind, *numbers, "--folder", str(folder)]
+    return [sys.executable, "-m", module, kind, *numbers, "--folder", str(folder), "--kinds", kinds]
 
 
-def outcomes(kind: str, seed: int, count: int, folder: Path) -> Iterator[dict[str, Any]]:
+def outcomes(kind: str, seed: int, count: int, folder: Path, kinds: str) -> Iterator[dict[str, Any]]:
     """Yield what came of each of a kind's files, by number; what ended a worker is one of them.
+
+    kinds: the module that has the kind.
 
     Raises:
         WorkerError: a mistake in the measurement.
@@ -84,7 +87,7 @@ def outcomes(kind: str, seed: int, count: int, folder: Path) -> Iterator[dict[st
     number, log = 0, folder / f"{kind}.stderr"
     for _ in range(MOST_DEATHS):
         with log.open("wb") as errors:
-            worker = _Worker(_command(kind, seed, number, count, folder), errors)
+            worker = _Worker(_command(kind, seed, number, count, folder, kinds), errors)
         try:
             if worker.line(START_S) is None:
                 raise WorkerError(f"{kind}: {worker.death()}: {log.read_text(errors='replace')[-2000:]}")
@@ -105,7 +108,12 @@ def outcomes(kind: str, seed: int, count: int, folder: Path) -> Iterator[dict[st
 
 
 def measure_kind(
-    kind: str, seed: int, count: int, folder: Path, tell: Callable[[], object] = lambda: None
+    kind: str,
+    seed: int,
+    count: int,
+    folder: Path,
+    tell: Callable[[], object] = lambda: None,
+    kinds: str = KINDS_MODULE,
 ) -> dict[str, Any]:
     """Return what came of a kind's files, as JSON values; ``tell`` is called after each.
 
@@ -115,7 +123,7 @@ def measure_kind(
     sorts: Counter[str] = Counter()
     examples: list[dict[str, Any]] = []
     slowest_s, cpu_s = 0.0, 0.0
-    for found in outcomes(kind, seed, count, folder):
+    for found in outcomes(kind, seed, count, folder, kinds):
         sort = found["sort"]
         sorts[sort] += 1
         if sort not in KEPT and sorts[sort] <= MOST_EXAMPLES:

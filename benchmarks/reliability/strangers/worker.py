@@ -6,18 +6,21 @@ numbers of an example it makes and loads that file again. It ends with the proce
 
 import argparse
 import ast
+import importlib
 import json
 import sys
 import traceback
 import warnings
+import zlib
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from benchmarks.reliability.strangers.kinds import KINDS, Kind
+from benchmarks.reliability.strangers.kind import Kind
 from benchmarks.reliability.strangers.watch import CPU_S, Watch, bounded, children, cpu_of
 
+KINDS_MODULE = "benchmarks.reliability.strangers.kinds"
 LONGEST_MESSAGE = 4000  # characters of a message that can still be read
 LONGEST_TEXT = 600  # of what is kept of one
 
@@ -34,13 +37,15 @@ class Outcome(NamedTuple):
     cpu_s: float
 
 
-def contents_of(kind: Kind, seed: int, number: int, wells: list[bytes], hostile: list[bytes]) -> bytes:
+def content_of(
+    name: str, kind: Kind, seed: int, number: int, wells: list[bytes], hostile: list[bytes]
+) -> bytes:
     """Return a file's content by its number: first what is well, then what is hostile, then damage."""
     if number < len(wells):
         return wells[number]
     if number < len(wells) + len(hostile):
         return hostile[number - len(wells)]
-    rng = np.random.default_rng([seed, list(KINDS.values()).index(kind), number])
+    rng = np.random.default_rng([seed, zlib.crc32(name.encode()), number])
     return kind.mutate(rng, wells)
 
 
@@ -99,9 +104,8 @@ def judge(kind: Kind, path: Path, watch: Watch, processes: list[int]) -> Outcome
     return Outcome(sort, text[:LONGEST_TEXT], cpu_s)
 
 
-def work(name: str, seed: int, first: int, last: int, folder: Path) -> None:
+def work(kind: Kind, name: str, seed: int, first: int, last: int, folder: Path) -> None:
     """Judge the files of some numbers; write a line each to standard output."""
-    kind = KINDS[name]
     answers, sys.stdout = sys.stdout, sys.stderr
     sys.dont_write_bytecode = True
     warnings.simplefilter("ignore")  # of numbers that are too large for NumPy: what comes of them counts
@@ -120,7 +124,7 @@ def work(name: str, seed: int, first: int, last: int, folder: Path) -> None:
     print(json.dumps({"ready": len(wells), "hostile": len(hostile)}), file=answers, flush=True)
     for number in range(first, last):
         try:
-            path.write_bytes(contents_of(kind, seed, number, wells, hostile))
+            path.write_bytes(content_of(name, kind, seed, number, wells, hostile))
         except Exception as error:
             print(json.dumps({"mistake": f"{name}, number {number}: {error!r}"}), file=answers, flush=True)
             raise
@@ -133,13 +137,17 @@ def work(name: str, seed: int, first: int, last: int, folder: Path) -> None:
 def main() -> None:
     """Judge the files of a kind that the command line asks for."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("kind", choices=KINDS)
+    parser.add_argument("kind")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--first", type=int, required=True, help="number of the first file")
     parser.add_argument("--last", type=int, required=True, help="number after that of the last file")
     parser.add_argument("--folder", type=Path, required=True, help="to write and load files in")
+    parser.add_argument("--kinds", default=KINDS_MODULE, help="module that has them (default: %(default)s)")
     given = parser.parse_args()
-    work(given.kind, given.seed, given.first, given.last, given.folder)
+    kinds: dict[str, Kind] = importlib.import_module(given.kinds).KINDS
+    if given.kind not in kinds:
+        parser.error(f"found {given.kind!r}, expected one of {', '.join(kinds)}")
+    work(kinds[given.kind], given.kind, given.seed, given.first, given.last, given.folder)
 
 
 if __name__ == "__main__":
