@@ -26,7 +26,7 @@ from tests.ppo_runs import BATCH, CONFIG
 
 ROOT = Path(__file__).parent.parent
 SIZE = 29  # of an observation
-SMALL = "--num-envs 16 --num-steps 24 --num-minibatches 4 --hidden-sizes 8 --evaluate-every 0"
+SMALL = "--num-envs 16 --num-steps 24 --num-minibatches 4 --hidden-sizes 8 --evaluate-every 0 --no-tracking"
 
 
 # The update.
@@ -129,6 +129,18 @@ def free_port():
         return one.getsockname()[1]
 
 
+STARTED = []
+
+
+@pytest.fixture(autouse=True)
+def no_process_is_left():
+    yield
+    while STARTED:
+        process = STARTED.pop()
+        process.kill()
+        process.communicate()
+
+
 def start(out, *flags, devices=1, number=1, index=0, port=None):
     job = ["--distributed"] if devices > 1 or number > 1 else []
     if number > 1:
@@ -147,7 +159,7 @@ def start(out, *flags, devices=1, number=1, index=0, port=None):
         *flags,
     ]
     xla = f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count={devices}"
-    return subprocess.Popen(
+    process = subprocess.Popen(
         [*map(str, command)],
         cwd=ROOT,
         env={**os.environ, "XLA_FLAGS": xla, "JAX_PLATFORMS": "cpu"},
@@ -155,6 +167,8 @@ def start(out, *flags, devices=1, number=1, index=0, port=None):
         stderr=subprocess.PIPE,
         text=True,
     )
+    STARTED.append(process)
+    return process
 
 
 def end_of(process):
