@@ -71,7 +71,8 @@ def draw_position_density(
         cmap="viridis",
         norm=LogNorm(*LIMITS_MS),
     )
-    figure.colorbar(image, cax=scale, label="time per flight in 0.1 m x 0.1 m (ms)")
+    # Plain numbers: what parses the powers of ten keeps, in its exceptions, all that the callers hold.
+    figure.colorbar(image, cax=scale, label="time per flight in 0.1 m x 0.1 m (ms)", format="%g")
     draw_gates(axes, track)
     axes.plot(*track.start_position[:2], "o", color="white", markersize=5)
     axes.text(track.start_position[0], track.start_position[1] - 0.8, "start", color="white")

@@ -33,10 +33,12 @@ from benchmarks.reliability.section import Section
 from flytrack_env import available_tracks, nominal_parameters
 
 TRAINING_STEPS = 200_000_000
-NUM_CHECKPOINTS, NUM_EVALUATIONS = 40, 20  # of a training
+# Of a training, as the command makes them by default in so many steps. Python's cyclic garbage, of charts
+# above all, is collected about every ten evaluations: the slope has to see that several times.
+NUM_CHECKPOINTS, NUM_EVALUATIONS = 200, 50
 SAMPLE_S = 1.0
 NUM_RESETS = 10_000
-NUM_SAMPLES = 100  # of the resets
+NUM_SAMPLES, UNSEEN_RESETS = 100, 1000  # of the resets; before the first one that counts
 STEPS_AFTER_RESET = 3
 WARM_UP = 0.2  # of the whole; in a training, a few evaluations
 # How much each may grow in the whole. A training returns the metrics of every update and keeps what it told
@@ -147,19 +149,22 @@ def options_of(index: int) -> dict[str, Any]:
     return choices[index % len(choices)]
 
 
-def watch_resets(env: Any, num_resets: int) -> list[Sample]:
-    """Reset an environment, single or vector, again and again, a few steps in between; return samples."""
+def watch_resets(env: Any, num_resets: int, unseen: int = UNSEEN_RESETS) -> list[Sample]:
+    """Reset an environment, single or vector, again and again, a few steps in between; return samples.
+
+    unseen: resets before the first that counts, in which caches of JAX and NumPy fill up.
+    """
     every = num_resets // NUM_SAMPLES
     table = np.zeros((NUM_SAMPLES, len(Sample._fields)))  # filled, so that samples are no growth themselves
     env.action_space.seed(0)
     gc.freeze()  # what is there already is not looked through at every sample
-    for index in trange(every * NUM_SAMPLES, unit="reset", mininterval=1.0):
-        env.reset(seed=index if index % 5 == 0 else None, options=options_of(index))
+    for index in trange(-unseen, every * NUM_SAMPLES, unit="reset", mininterval=1.0):
+        env.reset(seed=abs(index) if index % 5 == 0 else None, options=options_of(index))
         for _ in range(STEPS_AFTER_RESET):
             env.step(env.action_space.sample())
         if index % (10 * every) == 0:
             env.render()
-        if (index + 1) % every == 0:
+        if index >= 0 and (index + 1) % every == 0:
             gc.collect()
             table[index // every] = take_sample(index + 1)
     gc.unfreeze()
@@ -235,7 +240,8 @@ def as_markdown(result: dict[str, Any]) -> str:
         "of resident MiB, blocks of Python's allocator and live JAX arrays, each with what is allowed. A "
         "training returns the metrics of every update and keeps what it told MLflow: that is its growth. It "
         f"evaluates {NUM_EVALUATIONS} times and writes {NUM_CHECKPOINTS} checkpoints. A reset has other "
-        f"options than the one before, tracks among them, and {STEPS_AFTER_RESET} steps come after it.\n\n"
+        f"options than the one before, tracks among them, and {STEPS_AFTER_RESET} steps come after it; "
+        f"{UNSEEN_RESETS:,} resets are made before the first that counts.\n\n"
         f"| what | how much | {shown} | growth, MiB | blocks | arrays | |\n"
     )
     text += "|---" * (len(SHOWN) + 6) + "|\n"
