@@ -220,6 +220,25 @@ def _wait_for(uri):
             time.sleep(0.5)
 
 
+def test_files_outside_of_the_run_are_not_uploaded_whatever_a_journal_says(tmp_path, caplog):
+    folder, sent = tmp_path / "run", []
+    folder.mkdir()
+    for path in (folder / "chart.png", tmp_path / "secret"):
+        path.write_text("x")
+    (folder / "link").symlink_to(tmp_path / "secret")
+
+    class Client:
+        def log_artifact(self, run_id, path, group):
+            sent.append(path)
+
+    names = ("chart.png", "../secret", str(tmp_path / "secret"), "link", "gone.png", "../run/chart.png")
+    entries = [{"kind": "file", "path": name, "group": "evaluation", "time_ms": 0} for name in names]
+    tracking._send_entries(Client(), "id", folder, entries)
+    assert [Path(path).name for path in sent] == ["chart.png", "chart.png"]
+    assert caplog.text.count("leads out of the run's folder, not uploaded") == 3
+    assert "gone.png: not there any more" in caplog.text
+
+
 def test_journal_is_plain_json_lines(tmp_path):
     journal = tracking.Journal(tmp_path)
     journal.append("metrics", step=1, values={"entropy": 0.5})

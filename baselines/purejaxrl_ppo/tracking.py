@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from baselines.purejaxrl_ppo.journal import JOURNAL, SQLITE, Journal, JournalError
+from flytrack_env.words import named
 
 LOCAL_STORE = "mlflow.db"
 LOCAL_ARTIFACTS = "mlflow_artifacts"
@@ -208,15 +209,23 @@ def _send_entries(client: Any, run_id: str, folder: Path, entries: list[dict[str
     for start in range(0, len(metrics), METRICS_AT_ONCE):
         client.log_batch(run_id, metrics=metrics[start : start + METRICS_AT_ONCE])
     for entry in entries:
-        path = folder / entry.get("path", "")
-        if entry["kind"] == "file" and not path.exists():
-            logger.warning("tracking: %s: not there any more, not uploaded", path)
-        elif entry["kind"] == "file":
-            client.log_artifact(run_id, str(path), entry["group"])
+        if entry["kind"] == "file":
+            _send_file(client, run_id, folder, entry)
         elif entry["kind"] == "status" and entry["status"] == "RUNNING":
             client.update_run(run_id, status="RUNNING")
         elif entry["kind"] == "status":
             client.set_terminated(run_id, entry["status"], end_time=entry["time_ms"])
+
+
+def _send_file(client: Any, run_id: str, folder: Path, entry: dict[str, Any]) -> None:
+    """Send a file of the run's folder, and no other: a journal may be a stranger's."""
+    path = folder / entry["path"]
+    if not path.resolve().is_relative_to(folder.resolve()):
+        logger.warning("tracking: %s: leads out of the run's folder, not uploaded", named(path))
+    elif not path.exists():
+        logger.warning("tracking: %s: not there any more, not uploaded", path)
+    else:
+        client.log_artifact(run_id, str(path), entry["group"])
 
 
 def main() -> None:
