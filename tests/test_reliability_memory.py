@@ -1,6 +1,7 @@
 """The part of the reliability page on memory: what does not grow passes, what does is seen."""
 
 import gc
+import mmap
 import weakref
 from pathlib import Path
 from typing import Any
@@ -56,6 +57,13 @@ def test_a_warm_up_a_jump_and_noise_are_no_growth_and_a_leak_is() -> None:
     assert SECTION.is_held(result) and "grows" not in SECTION.as_markdown(result)
 
 
+def fresh_pages(num_bytes: int) -> mmap.mmap:
+    """Return memory that was nobody's: what an earlier test gave back to C's allocator would hide a leak."""
+    pages = mmap.mmap(-1, num_bytes)
+    pages.write(b"\1" * num_bytes)
+    return pages
+
+
 class Empty(gymnasium.Env[np.ndarray, np.ndarray]):
     """An environment that does nothing, and keeps what it is told to."""
 
@@ -80,7 +88,7 @@ LEAKS: dict[str, Any] = {
     "nothing": None,
     "JAX arrays": lambda: jnp.zeros(3),
     "blocks of Python's": lambda: float(np.random.default_rng().random()),
-    "resident MiB": lambda: np.ones(4096),
+    "resident MiB": lambda: fresh_pages(2**15),
 }
 
 
@@ -145,7 +153,7 @@ def test_a_training_that_leaks_is_seen(slow_trainer: Trainer, tmp_path: Path) ->
 
         def leaking(self: Run, chunk: Any) -> None:
             took(self, chunk)
-            kept.append((chunk.runner, np.ones(2**20)))
+            kept.append((chunk.runner, fresh_pages(2**23)))
 
         patch.setattr(Run, "took", leaking)
         samples = watch_training(slow_trainer, tmp_path / "run", Options(), 0.001)
