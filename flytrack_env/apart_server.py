@@ -130,8 +130,11 @@ def serve(function: Callable[[Any, bytes], bytes], call: dict[str, Any], content
         return {"ended": "returned", "text": ""}, found[1:]
     if status == 0 and is_in_time and found[:1] == RAISED:
         error = json.loads(found[1:])
-        ended = "memory" if error["type"] == "MemoryError" else "raised"
-        return {"ended": ended, **error}, b""
+        if (
+            error["type"] == "MemoryError"
+        ):  # the bound is at fault, as where the function did not live to say so
+            return {"ended": "memory", "text": ""}, b""
+        return {"ended": "raised", **error}, b""
     return _how_it_ended(status, is_in_time, last_words), b""
 
 

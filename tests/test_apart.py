@@ -79,10 +79,13 @@ def test_what_goes_wrong_is_told_and_the_next_call_is_well(apart: Apart, deed: s
     assert apart("pid", b"", LIMITS) == server
 
 
-def test_the_name_of_an_exception_is_told(apart: Apart):
+def test_the_name_of_an_exception_is_told_but_not_of_a_bound(apart: Apart):
     with pytest.raises(ApartError) as caught:
         apart("raise", b"", LIMITS)
     assert caught.value.kind == "KeyError"
+    with pytest.raises(ApartError) as caught:
+        apart("eat", b"", LIMITS)
+    assert caught.value.kind == ""  # as where it is ended from outside: one outcome, one message
 
 
 def test_what_waits_or_says_too_much_is_ended(apart: Apart):

@@ -1,6 +1,7 @@
 """Sweeps: which spaces are taken, and a local one of four trials, each an MLflow run below the sweep's."""
 
 import json
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -119,7 +120,11 @@ def test_a_local_sweep_of_four_trials(tmp_path):
     out = tmp_path / "sweep"
     flags = ("--trials", 2, "--out", out, "--total-timesteps", 2 * BATCH, *SMALL)
     command = (sys.executable, "-m", "baselines.purejaxrl_ppo.sweeps", written(tmp_path, GRID), *flags)
-    done = subprocess.run([*map(str, command)], cwd=ROOT, capture_output=True, text=True, timeout=500)
+    # Ray's processes are nice, and get next to nothing beside another worker of these tests.
+    environment = {**os.environ, "RAY_worker_niceness": "0"}
+    done = subprocess.run(
+        [*map(str, command)], cwd=ROOT, env=environment, capture_output=True, text=True, timeout=500
+    )
     assert done.returncode == 0, done.stderr
     assert len(done.stdout.splitlines()) == 4 and "failed" not in done.stdout
     assert "4/4" in done.stderr and "Warning" not in done.stderr
