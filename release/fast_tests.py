@@ -22,7 +22,7 @@ FAST_TESTS = (
     "tests/test_gymnasium.py::test_vector_environment_returns_what_gymnasiums_own_does",
     "tests/test_gymnasium.py::test_constructors_survive_cloudpickle",
     # A black box: jax.export, out and in.
-    "tests/test_blackbox.py::test_rebuilt_artifact_is_the_committed_one",
+    "tests/test_blackbox_plant.py::test_rebuilt_artifact_is_the_committed_one",
     "tests/test_blackbox.py::test_environment_flies_the_black_box",
     # PPO, checkpoints, MLflow.
     "tests/test_ppo.py",

@@ -12,11 +12,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from flytrack_env.blackbox import BlackBox
+from flytrack_env.blackbox import load as load_black_box
 from flytrack_env.dynamics import ModelParameters
 from flytrack_env.env import EnvParams, EnvState, FlyTrack
 from flytrack_env.quaternion import Quaternion, Scalar, Vec3
 from flytrack_env.state import Action, Drone
 from flytrack_env.tracks import Gate, Track
+from tests.black_boxes import SHIPPED
 from tests.compiled_programs import share_compiled_programs
 
 share_compiled_programs()
@@ -232,3 +235,16 @@ def whole(trainer: Any, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path,
 
     out = tmp_path_factory.mktemp("whole")
     return out, trainer.train(out, SEED, EVERY_OTHER_UPDATE)[1]
+
+
+@pytest.fixture(scope="module")
+def black_box() -> BlackBox:
+    """The shipped black box."""
+    return load_black_box(SHIPPED)
+
+
+@pytest.fixture(scope="module")
+def fly_black_box(black_box: BlackBox) -> Callable[..., np.ndarray]:
+    """One step of the shipped plant, compiled once for the module."""
+    step = jax.jit(black_box.step_vector)
+    return lambda x, u: np.asarray(step(x, u))

@@ -1,0 +1,52 @@
+"""Random logs, and their columns in files, right or wrong."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from flytrack_sysid.log import CHANNELS, FlightLog
+
+SUFFIXES = (".npz", ".csv")
+NUM_ROWS = 6
+
+
+def make_log(seed: int = 0, num_rows: int = NUM_ROWS, names: tuple[str, ...] = tuple(CHANNELS)) -> FlightLog:
+    """Return a log of random numbers in two segments that every check of a file passes."""
+    rng = np.random.default_rng(seed)
+    channels = {name: rng.standard_normal((num_rows, len(CHANNELS[name]))) for name in names}
+    channels["u"] = rng.uniform(-1.0, 1.0, (num_rows, 4))
+    if "q" in channels:
+        channels["q"] /= np.linalg.norm(channels["q"], axis=1, keepdims=True)
+    segment = np.where(np.arange(num_rows) < num_rows // 2, 7, -2)
+    return FlightLog(np.cumsum(rng.uniform(1e-3, 0.1, num_rows)), channels, segment)
+
+
+def columns_of(log: FlightLog) -> dict[str, np.ndarray]:
+    """Return the columns of a log's file, by name."""
+    columns = {"t": log.time.copy(), "segment": log.segment.copy()}
+    for name, values in log.channels.items():
+        columns |= {column: values[:, i].copy() for i, column in enumerate(CHANNELS[name])}
+    return columns
+
+
+def write(path: Path, columns: dict[str, Any]) -> None:
+    """Write columns as they are, right or wrong."""
+    if path.suffix == ".npz":
+        np.savez(path, **columns)
+        return
+    rows = zip(*(np.asarray(values).tolist() for values in columns.values()), strict=True)
+    lines = [",".join(columns), *(",".join(map(str, row)) for row in rows)]
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+def assert_same_log(found: FlightLog, expected: FlightLog) -> None:
+    np.testing.assert_array_equal(found.time, expected.time)
+    np.testing.assert_array_equal(found.segment, expected.segment)
+    assert set(found.channels) == set(expected.channels)
+    for name, values in expected.channels.items():
+        assert found[name].dtype == np.float64
+        if name == "q":
+            np.testing.assert_allclose(found[name], values, atol=1e-15, rtol=0)
+        else:
+            np.testing.assert_array_equal(found[name], values, err_msg=name)
