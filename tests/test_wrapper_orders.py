@@ -13,7 +13,7 @@ from gymnax.wrappers import LogWrapper
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from flytrack_env import FlyTrack
+from flytrack_env import FlyTrack, wrappers
 from flytrack_env.observations import OBSERVATION_SIZE
 from flytrack_env.wrappers import (
     ActionHistory,
@@ -39,6 +39,12 @@ MAKERS: dict[str, Any] = {
 OTHER_STEP = ("legacy", "log")
 ROWS = {"commanded": 8, "applied": 4}
 orders = st.lists(st.sampled_from(sorted(MAKERS)), max_size=7)
+
+
+def test_every_public_wrapper_is_tried() -> None:
+    exported = [getattr(wrappers, name) for name in wrappers.__all__]
+    public = {one for one in exported if isinstance(one, type) and issubclass(one, wrappers.Wrapper)}
+    assert public - {wrappers.Wrapper} < {type(make(FlyTrack())) for make in MAKERS.values()}
 
 
 def reasons_against(name: str, inside: list[str]) -> list[str]:

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from gymnax.wrappers import LogWrapper
 
+from flytrack_env import wrappers
 from flytrack_env.env import FlyTrack
 from flytrack_env.observations import OBSERVATION_SIZE
 from flytrack_env.state import Action, pack
@@ -33,48 +34,53 @@ ALL = (DomainRandomization, CommandDelay, ObservationNoise, ActionHistory, Episo
 OVER_WRAPPERS = pytest.mark.parametrize("wrapper", ALL, ids=lambda wrapper: wrapper.__name__)
 
 
+def state_of(env: Any, state: Any, wrapper: type) -> Any:
+    """Return the state of one of an environment's wrappers."""
+    while type(env) is not wrapper:
+        env, state = env.env, state.inner
+    return state
+
+
 # --- Composition ----------------------------------------------------------------------------------
+
+
+def is_sensible(order: tuple[Any, ...]) -> bool:
+    """Return whether wrappers may go around each other, the innermost first."""
+    try:
+        wrapped(*order)
+    except WrapperError:
+        return False
+    return True
+
+
+def test_all_wrappers_are_tried() -> None:
+    exported = [getattr(wrappers, name) for name in wrappers.__all__]
+    public = {one for one in exported if isinstance(one, type) and issubclass(one, wrappers.Wrapper)}
+    assert public - {wrappers.Wrapper} == set(ALL)
 
 
 def test_orders_that_make_sense_have_the_same_spaces_and_parameters() -> None:
     """The others are refused: exactly those with the history of commands inside the delay."""
-    refused = []
+    with_params = {"domain_randomization", "command_delay", "observation_noise"}
     for order in permutations(ALL):
-        try:
-            env: Any = FlyTrack()
-            for wrapper in order:
-                env = wrapper(env)
-        except WrapperError:
-            refused.append(order)
+        is_refused = order.index(ActionHistory) < order.index(CommandDelay)
+        assert is_sensible(order) != is_refused, order
+        if is_refused:
             continue
+        env = wrapped(*order)
         assert env.observation_space().shape == (OBSERVATION_SIZE + 3 * 4,)
-        assert set(env.default_params.wrappers) == {
-            "domain_randomization",
-            "command_delay",
-            "observation_noise",
-        }
-    assert len(refused) == 60
-    assert all(order.index(ActionHistory) < order.index(CommandDelay) for order in refused)
+        assert set(env.default_params.wrappers) == with_params
 
 
+# In which of the orders that make sense, as a share of them: the first is as far from that of ALL as can be.
 @pytest.mark.parametrize(
-    "order",
-    [
-        (EpisodeStatistics, ObservationNoise, CommandDelay, ActionHistory, DomainRandomization),
-        pytest.param(
-            (CommandDelay, ActionHistory, DomainRandomization, EpisodeStatistics, ObservationNoise),
-            marks=pytest.mark.slow,
-        ),
-        pytest.param(
-            (ObservationNoise, EpisodeStatistics, DomainRandomization, CommandDelay, ActionHistory),
-            marks=pytest.mark.slow,
-        ),
-    ],
+    "share", [0.0, pytest.param(0.37, marks=pytest.mark.slow), pytest.param(0.71, marks=pytest.mark.slow)]
 )
-def test_the_order_does_not_change_the_flight(order: tuple[Any, ...]) -> None:
+def test_the_order_does_not_change_the_flight(share: float) -> None:
     """What is drawn hangs on names, not on the order of wrapping."""
+    sensible = [order for order in permutations(reversed(ALL)) if is_sensible(order)]
     reference = fly(wrapped(*ALL))
-    other = fly(wrapped(*order))
+    other = fly(wrapped(*sensible[int(share * len(sensible))]))
     np.testing.assert_allclose(other[2][0], reference[2][0], atol=2e-4)
     np.testing.assert_array_equal(other[2][3], reference[2][3])
 
@@ -210,8 +216,8 @@ def test_after_every_kind_of_end_an_episode_begins_as_if_nothing_had_been(make_d
     for found, expected in pairs:
         np.testing.assert_allclose(found, expected, atol=1e-5)
     # What a wrapper kept was not that of the fresh episode already.
-    history = np.asarray(stacked.inner.actions[0].roll)
-    assert (history != np.asarray(after.inner.actions[0].roll)).all()
+    before, fresh_history = (state_of(env, state, ActionHistory).actions[0] for state in (stacked, after))
+    assert (np.asarray(before.roll) != np.asarray(fresh_history.roll)).all()
 
 
 def _aged(steps: int, path: Any, leaf: jax.Array) -> jax.Array:
@@ -235,10 +241,10 @@ def test_step_batch_begins_episodes_afresh_and_each_its_own() -> None:
     drones = jax.vmap(lambda state: pack(env.drone(state)))(states)
     assert len(np.unique(np.asarray(drones), axis=0)) == 16
     words = [leaf for leaf in jax.tree.leaves(states) if leaf.dtype == jnp.uint32]
-    assert len(words) == 2  # the noise's and the model's
+    assert len(words) >= 2  # the noise's and the model's
     for word in words:
         assert len(np.unique(np.asarray(word))) == 16
-    np.testing.assert_array_equal(states.episode_length, 0)
+    np.testing.assert_array_equal(state_of(env, states, EpisodeStatistics).episode_length, 0)
 
 
 def test_final_observation_is_the_next_one_where_the_episode_goes_on() -> None:

@@ -162,8 +162,7 @@ def watch_resets(env: Any, num_resets: int, unseen: int = UNSEEN_RESETS) -> list
         env.reset(seed=abs(index) if index % 5 == 0 else None, options=options_of(index))
         for _ in range(STEPS_AFTER_RESET):
             env.step(env.action_space.sample())
-        if index % (10 * every) == 0:
-            env.render()
+        env.render()  # in each, so that what it fills once is full before the first that counts
         if index >= 0 and (index + 1) % every == 0:
             gc.collect()
             table[index // every] = take_sample(index + 1)

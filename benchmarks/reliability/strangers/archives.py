@@ -90,7 +90,7 @@ def _of_type(array: np.ndarray, name: str) -> np.ndarray:
         warnings.simplefilter("ignore")  # of imaginary parts, and of what does not fit
         try:
             return np.asarray(array).astype(name)
-        except (TypeError, ValueError):
+        except (TypeError, ValueError, OverflowError):
             return np.zeros(array.shape, name)
 
 

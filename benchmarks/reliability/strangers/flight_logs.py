@@ -87,7 +87,7 @@ def _damage_message(rng: Rng, kind: bytes, content: bytes) -> bytes:
         name = content.split(b":")[0].decode(errors="replace") if way < 0.6 else "other"
         field = str(rng.choice(FORMATS))
         return f"{name}:uint64_t timestamp;{field};".encode()
-    if kind == b"P" and way < 0.8:
+    if kind == b"P" and way < 0.8 and content:
         value = struct.pack("<f", float(rng.choice(FLOATS)))
         key = content[1 : 1 + content[0]] if way < 0.6 else b"char[4] MC_ACRO_R_MAX"
         return bytes([len(key) % 256]) + key + value
