@@ -185,5 +185,5 @@ def effects_page() -> str:
             "[diagnosis](diagnosis.md) cannot be asked about the effect; every log needs `w` or `q`.",
         ),
         *table(("effect", "in words", "stage", "acts on", "a log needs"), rows),
-        *paragraph("To add an effect: [architecture](architecture.md)."),
+        *paragraph("To add an effect: [contributing](../CONTRIBUTING.md#add-an-effect)."),
     )

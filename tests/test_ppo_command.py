@@ -147,6 +147,9 @@ def test_resuming_takes_from_the_checkpoint_what_is_not_given(whole, tmp_path):
         describe_run(found.env, found.env_id, found.track, found.config, plan.seed),
     )
     assert plans_of("--resume", whole[0], "--out", tmp_path)[0].out == tmp_path
+    steps = plan.checkpoint.meta["steps"]
+    assert train_ppo.say_resumed(plan) == f"seed {SEED}: from step {steps}, {whole[0] / 'final.msgpack'}"
+    assert train_ppo.say_resumed(plan._replace(resume=None, checkpoint=None)) is None
 
 
 def test_resuming_keeps_the_reward_that_was_trained_for(whole):

@@ -137,8 +137,18 @@ def prepare(arguments: argparse.Namespace) -> Asked:
     return Asked(trainer, plans, options)
 
 
+def say_resumed(plan: Plan) -> str | None:
+    """Return the line for a seed that is gone on with, None for one that begins."""
+    if plan.resume is None or plan.checkpoint is None:
+        return None
+    return f"seed {plan.seed}: from step {plan.checkpoint.meta['steps']}, {plan.resume}"
+
+
 def run(asked: Asked) -> None:
-    """Train every seed, and say where its checkpoint is."""
+    """Train every seed; say from where where it goes on, and where its checkpoint is."""
+    for line in filter(None, map(say_resumed, asked.plans)):
+        if is_first():
+            print(line)
     # All before any: whoever takes them up again finds the seeds that had not begun.
     for plan, options in zip(asked.plans, asked.options, strict=True):
         if is_first() and not (plan.out / FINAL).exists():

@@ -244,10 +244,10 @@ def as_markdown(result: dict[str, Any]) -> str:
     rows = [
         (
             "SIGKILL at random moments, resumed each time",
-            f"{result['kills']} kills in {result['runs']} runs of {result['updates']} updates, "
-            f"{result['while writing']} of them while a checkpoint was written",
-            f"{result['checkpoints lost']} checkpoints lost, {result['runs that end otherwise']} runs end in "
-            "other bits than one left alone",
+            f"{result['kills']} kills; trainings: {result['runs']}, of {result['updates']:,} updates; "
+            f"{result['while writing']} of the kills while a checkpoint was written",
+            f"{result['checkpoints lost']} checkpoints lost, {result['runs that end otherwise']} trainings "
+            "end in other bits than one left alone",
         ),
         (
             "newest checkpoint cut off, or one bit changed",
