@@ -11,12 +11,13 @@ import jax.numpy as jnp
 import msgpack
 import numpy as np
 import pytest
+from msgpack import fallback
 
 from baselines.purejaxrl_ppo import CheckpointError, Config, load_checkpoint, make_network
 from baselines.purejaxrl_ppo import checkpoint as checkpoint_module
 from baselines.purejaxrl_ppo.checkpoint import find_differences, observation_layout, save_checkpoint
 from baselines.purejaxrl_ppo.resume import newest_intact
-from baselines.purejaxrl_ppo.unpack import unpack
+from baselines.purejaxrl_ppo.unpack import UnpackError, unpack
 from flytrack_env import FlyTrack
 from flytrack_env.observations import OBSERVATION_SIZE
 
@@ -52,6 +53,18 @@ def test_round_trip(path, params):
     assert checkpoint.config == CONFIG
     assert (checkpoint.env_id, checkpoint.track) == ("FlyTrack-v0", "flytrack")
     checkpoint.check_fits(FlyTrack())
+
+
+def test_a_msgpack_that_is_not_compiled_reads_the_same(path, params, monkeypatch):
+    def unpackb(packed, **arguments):
+        unpacker = fallback.Unpacker(None, max_buffer_size=len(packed), **arguments)
+        unpacker.feed(packed)
+        return unpacker.unpack()
+
+    monkeypatch.setattr(msgpack, "unpackb", unpackb)
+    jax.tree.map(np.testing.assert_array_equal, load_checkpoint(path).params, params)
+    with pytest.raises(UnpackError, match="found names that are not 2 different short texts"):
+        unpack(b"\x82\xa1a\x01\xa1a\x02")
 
 
 def test_other_observation_size_is_refused(tmp_path):

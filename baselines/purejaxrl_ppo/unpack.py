@@ -4,6 +4,7 @@ A map of a few bytes takes fifty times as much in memory, and flax asks for no b
 """
 
 import re
+from collections.abc import Iterable
 from typing import Any
 
 import jax.numpy as jnp
@@ -30,7 +31,8 @@ class _Maps:
     def __init__(self) -> None:
         self._num_entries = 0
 
-    def __call__(self, pairs: list[tuple[Any, Any]]) -> dict[str, Any]:
+    def __call__(self, entries: Iterable[tuple[Any, Any]]) -> dict[str, Any]:
+        pairs = list(entries)  # a list, or where msgpack is not compiled, a generator
         self._num_entries += len(pairs)
         if self._num_entries > MOST_ENTRIES:
             raise UnpackError(f"found more than {MOST_ENTRIES} entries, expected at most that")

@@ -69,7 +69,7 @@ def as_markdown(result: dict[str, Any]) -> str:
         ]
     if broken:
         lines += ["", f"Broken promises, seed {result['seed']}:", "", *broken]
-    return TEXT + "\n".join(lines)
+    return TEXT + "\n".join(lines) + "\n"
 
 
 def is_held(result: dict[str, Any]) -> bool:
