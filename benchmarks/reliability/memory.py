@@ -4,7 +4,8 @@ What a process holds grows for a while: libraries are imported, programs compile
 and JAX find out how much they need. So each measurement has a process of its own, its first WARM_UP is left
 out, and what counts is the slope of the rest (Theil and Sen: the median of the slopes of all pairs, which a
 jump near either end hardly moves), times the length of the whole. Beside resident memory two numbers are
-counted that no allocator blurs: blocks of Python's allocator and live JAX arrays.
+counted that no allocator blurs: blocks of Python's allocator and live JAX arrays. Cyclic garbage is collected
+before each sample.
 """
 
 import gc
@@ -33,10 +34,9 @@ from benchmarks.reliability.section import Section
 from flytrack_env import available_tracks, nominal_parameters
 
 TRAINING_STEPS = 200_000_000
-# Of a training, as the command makes them by default in so many steps. Python's cyclic garbage, of charts
-# above all, is collected about every ten evaluations: the slope has to see that several times.
+# Of a training, as the command makes them by default in so many steps.
 NUM_CHECKPOINTS, NUM_EVALUATIONS = 200, 50
-SAMPLE_S = 1.0
+SAMPLE_S = 4.0
 NUM_RESETS = 10_000
 NUM_SAMPLES, UNSEEN_RESETS = 100, 1000  # of the resets; before the first one that counts
 STEPS_AFTER_RESET = 3
@@ -67,7 +67,11 @@ class Sample(NamedTuple):
 
 
 def take_sample(amount: int) -> Sample:
-    """Return what this process holds now."""
+    """Return what this process holds now, after collecting Python's cyclic garbage.
+
+    Python itself collects that of charts about every ten evaluations of a training: it comes and goes.
+    """
+    gc.collect()
     pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1])
     resident_mib = pages * os.sysconf("SC_PAGE_SIZE") / 2**20
     return Sample(amount, resident_mib, sys.getallocatedblocks(), len(jax.live_arrays()))
@@ -108,12 +112,14 @@ def sampling(amount: Callable[[], int], every_s: float) -> Iterator[list[Sample]
             samples.append(take_sample(amount()))
 
     thread = threading.Thread(target=watch)
+    gc.freeze()  # what is there already is not looked through at every sample
     thread.start()
     try:
         yield samples
     finally:
         is_over.set()
         thread.join()
+        gc.unfreeze()
 
 
 def watch_training(trainer: Trainer, out: Path, options: Options, every_s: float) -> list[Sample]:
@@ -164,7 +170,6 @@ def watch_resets(env: Any, num_resets: int, unseen: int = UNSEEN_RESETS) -> list
             env.step(env.action_space.sample())
         env.render()  # in each, so that what it fills once is full before the first that counts
         if index >= 0 and (index + 1) % every == 0:
-            gc.collect()
             table[index // every] = take_sample(index + 1)
     gc.unfreeze()
     return [Sample(int(row[0]), float(row[1]), int(row[2]), int(row[3])) for row in table]
@@ -236,7 +241,8 @@ def as_markdown(result: dict[str, Any]) -> str:
         f"Each in a process of its own; {result['cpu_minutes']:g} minutes of processor time. Resident MiB on "
         f"the way; and the growth over the whole, at the pace after the first {WARM_UP:.0%}, in which "
         "libraries are imported and allocators warm up (the median of the slopes of all pairs of samples), "
-        "of resident MiB, blocks of Python's allocator and live JAX arrays, each with what is allowed. A "
+        "of resident MiB, blocks of Python's allocator and live JAX arrays, each with what is allowed; after "
+        "cyclic garbage is collected, which comes and goes with the charts of evaluations. A "
         "training returns the metrics of every update and keeps what it told MLflow: that is its growth. It "
         f"evaluates {NUM_EVALUATIONS} times and writes {NUM_CHECKPOINTS} checkpoints. A reset has other "
         f"options than the one before, tracks among them, and {STEPS_AFTER_RESET} steps come after it; "
