@@ -107,7 +107,7 @@ def _plans_of_several(arguments: argparse.Namespace, out: Path) -> list[Plan]:
     at_once = arguments.seeds_at_once or seeds_side_by_side(starts)
     starts = [start for group in batched(starts, at_once) for start in at_common_step(group)]
     plans = [
-        Plan(seed, out / source.name, *(start or (None, None)), at_once)
+        Plan(seed, out / source.name, start and start[0], start and start[1], at_once)
         for seed, source, start in zip(seeds, folders, starts, strict=True)
     ]
     if all(plan.checkpoint is None for plan in plans):
