@@ -10,6 +10,7 @@ import atexit
 import contextlib
 import json
 import os
+import signal
 import subprocess
 import sys
 import threading
@@ -74,6 +75,9 @@ class Apart:
             except (OSError, ValueError) as error:
                 self._forget()
                 raise ApartError(f"the process that tries files out is gone: {error}") from error
+            except BaseException:  # Ctrl+C: its answer, still to come, is none to the next call
+                self._kill()
+                raise
         if answer["ended"] != "returned":
             raise ApartError(_in_words(answer, limits), answer.get("type", ""))
         return result
@@ -108,6 +112,14 @@ class Apart:
             server.stdin.flush()
             json.loads(server.stdout.readline())  # nothing, which is no JSON, where it could not begin
         return server
+
+    def _kill(self) -> None:
+        """End the server and what it runs at once."""
+        server = self._servers.get(os.getpid())
+        if server is not None:
+            with contextlib.suppress(ProcessLookupError):
+                os.killpg(server.pid, signal.SIGKILL)  # the server leads a session of its own
+        self._forget()
 
     def _forget(self) -> None:
         """End the server, so that the next call starts another."""

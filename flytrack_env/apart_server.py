@@ -83,12 +83,16 @@ def _fork(
         os._exit(0)
 
 
-def _read(result: int, most_bytes: int, deadline_s: float) -> tuple[bytes, bool]:
-    """Return what a child writes until it ends, and whether it ended in time and wrote no more than that."""
+def _read(result: int, caller: int, most_bytes: int, deadline_s: float) -> tuple[bytes, bool]:
+    """Return what a child writes until it ends, and whether it ended in time and wrote no more than that.
+
+    caller: whence calls come; there is nothing to be read before this one is answered, but its end.
+    """
     parts: list[bytes] = []
     size = 0
     while size <= most_bytes:
-        if not select.select([result], [], [], max(deadline_s - time.monotonic(), 0.0))[0]:
+        ready = select.select([result, caller], [], [], max(deadline_s - time.monotonic(), 0.0))[0]
+        if result not in ready:
             return b"".join(parts), False
         part = os.read(result, READ_BYTES)
         if not part:
@@ -112,10 +116,12 @@ def _how_it_ended(status: int, is_in_time: bool, said: bytes) -> dict[str, str]:
     return {"ended": "crashed", "text": f"{signal.Signals(number).name}: {text}"}
 
 
-def serve(function: Callable[[Any, bytes], bytes], call: dict[str, Any], content: bytes) -> tuple[Any, bytes]:
+def serve(
+    function: Callable[[Any, bytes], bytes], call: dict[str, Any], content: bytes, caller: int
+) -> tuple[Any, bytes]:
     """Return the answer to a call (``ended``, ``text``), and the bytes of its result."""
     child, result, said = _fork(function, call, content)
-    found, is_in_time = _read(result, call["memory_bytes"], time.monotonic() + call["wall_s"])
+    found, is_in_time = _read(result, caller, call["memory_bytes"], time.monotonic() + call["wall_s"])
     if not is_in_time:
         os.kill(child, signal.SIGKILL)
     status = os.waitpid(child, 0)[1]
@@ -159,7 +165,8 @@ def main(calls: BinaryIO, answers: BinaryIO) -> None:
     answers.flush()
     while line := calls.readline():
         call = json.loads(line)
-        answer, result = serve(getattr(module, setup["function"]), call, calls.read(call["size"]))
+        content = calls.read(call["size"])
+        answer, result = serve(getattr(module, setup["function"]), call, content, calls.fileno())
         answers.write(json.dumps({**answer, "size": len(result)}).encode() + b"\n" + result)
         answers.flush()
 

@@ -6,6 +6,7 @@ import io
 import itertools
 import os
 import secrets
+import stat
 from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO
 
@@ -56,7 +57,10 @@ def read_at_most(path: Path, most_bytes: int) -> bytes:
         OSError: what the system says.
     """
     try:
-        check_size(path.stat().st_size, most_bytes)
+        status = path.stat()
+        if stat.S_ISFIFO(status.st_mode) or stat.S_ISSOCK(status.st_mode):
+            raise OSError(f"{path}: found a pipe or a socket, expected a file")  # it may never end
+        check_size(status.st_size, most_bytes)
         with path.open("rb") as file:
             return AtMost(file, most_bytes).readall()
     except ValueError as error:  # a NUL in the name

@@ -48,7 +48,7 @@ def _read_field(path: Path, name: str, value: Any) -> Any:
         expected = f"{size} finite numbers" if size else "a finite number"
         found = shown(value)
         raise ModelFileError(f"{path}: {name}: found {found}, expected {expected} (float32)")
-    if name in MUST_BE_POSITIVE and min(values) <= 0.0:
+    if name in MUST_BE_POSITIVE and min(map(np.float32, values)) <= 0.0:  # 1e-50 is 0 in float32
         raise ModelFileError(f"{path}: {name}: found {shown(value)}, expected > 0")
     return np.array(value, np.float32) if size else float(value)
 

@@ -4,6 +4,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -86,6 +87,42 @@ def test_the_name_of_an_exception_is_told_but_not_of_a_bound(apart: Apart):
     with pytest.raises(ApartError) as caught:
         apart("eat", b"", LIMITS)
     assert caught.value.kind == ""  # as where it is ended from outside: one outcome, one message
+
+
+def test_an_interrupted_call_leaves_no_answer_to_the_next(apart: Apart):
+    interrupt = threading.Timer(0.5, signal.raise_signal, [signal.SIGINT])
+    interrupt.start()
+    with pytest.raises(KeyboardInterrupt):
+        apart("wait", b"", LIMITS)
+    started_s = time.monotonic()
+    assert apart("reverse", b"12", LIMITS) == b"21"
+    assert time.monotonic() - started_s < 20.0  # nobody waited for what was interrupted
+
+
+CALLER = """
+import sys
+from pathlib import Path
+from flytrack_env.apart import Apart, ResourceLimits
+apart = Apart(Path(sys.argv[1]), "do", {})
+limits = ResourceLimits(cpu_s=60, memory_bytes=2**27, wall_s=600.0)
+print(apart("pid", b"", limits).decode(), flush=True)
+apart("wait", b"", limits)
+"""
+
+
+def test_a_caller_that_is_gone_leaves_nothing_running(tmp_path: Path):
+    file = tmp_path / "deeds.py"
+    file.write_text(FUNCTION)
+    caller = subprocess.Popen([sys.executable, "-c", CALLER, str(file)], stdout=subprocess.PIPE, text=True)
+    assert caller.stdout is not None
+    server = int(caller.stdout.readline())
+    time.sleep(0.5)
+    caller.kill()
+    caller.communicate()
+    ends_s = time.monotonic() + 20.0
+    while Path(f"/proc/{server}").exists() and "State:\tZ" not in Path(f"/proc/{server}/status").read_text():
+        assert time.monotonic() < ends_s, "the server outlives its caller"
+        time.sleep(0.05)
 
 
 def test_what_waits_or_says_too_much_is_ended(apart: Apart):

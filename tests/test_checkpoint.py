@@ -296,6 +296,7 @@ PROGRESS = {"steps": 3 * CONFIG.batch_size, "seed": 1, "model": {}, "environment
         ("steps", -1, "steps: found -1, expected a whole number"),
         ("steps", 10**400, "steps: found 1000.*, expected a whole number"),
         ("steps", CONFIG.batch_size + 1, "steps: found .*, expected a multiple of"),
+        ("steps", 10**6 * CONFIG.batch_size, "steps: found .*, expected at most .*, the whole training"),
         ("seed", 1.5, "seed: found 1.5, expected a whole number"),
         ("seconds", "long", "seconds: found 'long', expected a number"),
         ("seen", [1.0], "seen: found .*, expected an object of numbers"),

@@ -1,5 +1,7 @@
 """Offsets between sensors' clocks: found, corrected, and never made of the plant's lag."""
 
+import tracemalloc
+
 import numpy as np
 import pytest
 from made_flight import TIME_S, flight, noisy
@@ -68,3 +70,17 @@ def test_crazyflie_attitude_is_late_by_the_same_on_every_axis():
     assert 0.004 < mean_s < 0.008
     for one in found:
         assert abs(one.offset_s - mean_s) < 3.0 * one.sigma_s + 5e-4, one.describe()
+
+
+def test_steps_of_days_need_no_memory(truth):
+    """A table of all seconds between the rows was made."""
+    half = np.arange(len(truth)) < len(truth) // 2
+    time = np.where(half, truth.time, truth.time + 1e6 * np.cumsum(~half))
+    apart = FlightLog(time, dict(truth.channels), truth.segment)
+    tracemalloc.start()
+    try:
+        clocks.align_clocks(apart)
+        peak_bytes = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert peak_bytes < 2**28

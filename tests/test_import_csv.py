@@ -253,9 +253,15 @@ def test_a_small_file_that_unpacks_to_much_is_refused_on_the_way(folder, tmp_pat
             "cannot be read as a manifest: found more than 16777216 bytes",
         ),
         (None, "cannot be read as a manifest"),
+        # Of each line a table of all names would be made.
+        (
+            "file,rows," + ",".join(map(str, range(20_000))) + "\nx" * 20_000,
+            "column file: flight.csv: missing",
+        ),
     ],
 )
 def test_manifests_that_cannot_be_meant_are_refused(folder, tmp_path, manifest, message):
+    started_s = time.process_time()
     for name in ("flight.csv", "map.toml"):
         (tmp_path / name).write_bytes((folder / name).read_bytes())
     with (tmp_path / "map.toml").open("a") as file:
@@ -263,6 +269,17 @@ def test_manifests_that_cannot_be_meant_are_refused(folder, tmp_path, manifest, 
     if manifest is not None:
         (tmp_path / "manifest.csv").write_text(manifest, encoding="utf-8")
     with pytest.raises(LogError, match=rf"manifest\.csv: (flight\.csv: )?{message}"):
+        import_log(tmp_path / "flight.csv", "csv", tmp_path / "map.toml")
+    assert time.process_time() - started_s < 5.0
+
+
+@pytest.mark.parametrize("name", ["/etc/passwd", "../manifest.csv", "a/b.csv"])
+def test_a_manifest_lies_beside_the_log(folder, tmp_path, name):
+    for copied in ("flight.csv", "map.toml"):
+        (tmp_path / copied).write_bytes((folder / copied).read_bytes())
+    with (tmp_path / "map.toml").open("a") as file:
+        file.write(f'[rows.manifest]\nfile = "{name}"\nkey = "file"\ncount = "rows"\n')
+    with pytest.raises(LogError, match="expected the name of a file beside the log, not a path"):
         import_log(tmp_path / "flight.csv", "csv", tmp_path / "map.toml")
 
 

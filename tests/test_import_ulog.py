@@ -170,6 +170,27 @@ def test_what_is_no_ulog_is_refused(tmp_path, content, message):
         import_log(tmp_path / "a.ulg", "ulog")
 
 
+def test_attitudes_of_before_there_was_one_are_left_out(tmp_path):
+    tables = topics()
+    fields, rows = tables["vehicle_attitude"]
+    late = [(*row[:1], 0.0, 0.0, 0.0, 0.0) if index < 3 else row for index, row in enumerate(rows)]
+    whole = import_log(write(tmp_path / "a.ulg", tables), "ulog").log
+    found = import_log(write(tmp_path / "b.ulg", {**tables, "vehicle_attitude": (fields, late)}), "ulog").log
+    assert 0 < len(found) < len(whole)
+    none = [(*row[:1], 0.0, 0.0, 0.0, 0.0) for row in rows]
+    path = write(tmp_path / "c.ulg", {**tables, "vehicle_attitude": (fields, none)})
+    with pytest.raises(LogError, match=r"c\.ulg: topic vehicle_attitude: q: found no unit quaternion"):
+        import_log(path, "ulog")
+
+
+def test_a_large_file_is_refused_before_it_is_decoded(tmp_path):
+    path = write(tmp_path / "a.ulg", topics())
+    with path.open("r+b") as file:
+        file.truncate(2**32)
+    with pytest.raises(LogError, match=r"a\.ulg: cannot be read: found more than 536870912 bytes"):
+        import_log(path, "ulog")
+
+
 def with_definitions(content: bytes, *definitions: str) -> bytes:
     """Return a log with other formats of topics before its own messages."""
     return (

@@ -160,8 +160,8 @@ BAD_VALUES = [
         for name in ("m", "g", "battery_drain_v_per_min")
         for bad in ([1.0], "1", True, None, float("nan"), float("-inf"), {})
     ],
-    *[("m", bad, "> 0") for bad in (0, -1.0)],
-    *[("tau", [0.04, 0.04, bad, 0.04], "> 0") for bad in (0.0, -0.01)],
+    *[("m", bad, "> 0") for bad in (0, -1.0, 1e-300)],
+    *[("tau", [0.04, 0.04, bad, 0.04], "> 0") for bad in (0.0, -0.01, 1e-50)],  # float32 has none so small
     ("max_rate", [618.0, -618.0, 120.0], "> 0"),
 ]
 

@@ -2,6 +2,7 @@
 
 import copy
 import math
+import os
 import time
 from pathlib import Path
 from typing import Any
@@ -113,6 +114,20 @@ def test_random_damage_is_a_refusal_or_a_track(
     track = load(path, content[:start] + put + content[max(start, end) :])
     if track is not None:
         check(track, path)
+
+
+@pytest.mark.parametrize("spaces", [60_000, 100_000])
+def test_a_key_of_spaces_is_refused_soon(spaces: int, tmp_path: Path) -> None:
+    started_s = time.process_time()
+    content = b'"' + b" " * spaces + b'" = 1\n' + b" " * spaces + b"\n" + as_toml(TREE)
+    assert load(tmp_path / "spaces.toml", content) is None
+    assert time.process_time() - started_s < 5.0
+
+
+def test_a_pipe_is_refused(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe.toml")
+    with pytest.raises(TrackError, match=r"pipe\.toml: .*found a pipe or a socket, expected a file"):
+        load_track(tmp_path / "pipe.toml")
 
 
 def test_the_tree_of_these_tests_is_a_track(tmp_path: Path) -> None:

@@ -227,6 +227,11 @@ def _check_progress(path: Path, checkpoint: Checkpoint) -> None:
     if meta["steps"] % batch_size:
         found = meta["steps"]
         raise CheckpointError(f"{path}: steps: found {found}, expected a multiple of {batch_size}, an update")
+    total = checkpoint.config.num_updates * batch_size
+    if meta["steps"] > total:
+        raise CheckpointError(
+            f"{path}: steps: found {meta['steps']}, expected at most {total}, the whole training"
+        )
 
 
 def _is_count(value: Any) -> bool:

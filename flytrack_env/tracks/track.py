@@ -173,7 +173,8 @@ class _Reader:
         for number in range(start + 1, len(self.lines)):
             if self.lines[number].lstrip().startswith("["):
                 break
-            if re.match(rf"^\s*{re.escape(field)}\s*=", self.lines[number]):
+            line = self.lines[number].lstrip()
+            if line.startswith(field) and line[len(field) :].lstrip().startswith("="):
                 return number + 1
         return max(start, 0) + 1
 

@@ -134,7 +134,7 @@ def _sums(pieces: list[_Piece], offset_s: float) -> tuple[np.ndarray, np.ndarray
     top, bottom, products = [], [], np.zeros(3)
     for piece in pieces:
         grown, summed, slope = piece.differences(offset_s)
-        block = piece.block - piece.block[0]
+        _, block = np.unique(piece.block, return_inverse=True)  # none is empty, however long the gaps
         top.append(np.bincount(block, np.sum(slope * (grown - summed), axis=1)))
         bottom.append(np.bincount(block, np.sum(slope**2, axis=1)))
         products += [np.sum(grown * summed), np.sum(grown**2), np.sum(summed**2)]

@@ -2,6 +2,7 @@
 
 import csv
 import io
+from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
@@ -51,11 +52,13 @@ def _count_of(path: Path, asked: Manifest) -> int:
     """Return how many rows of a file the manifest beside it says to use."""
     manifest = path.parent / asked.file
     where = f"{path.parent}/{named(asked.file)}"
+    if manifest.name != asked.file:
+        raise LogError(f"{where}: expected the name of a file beside the log, not a path")
     try:
         with manifest.open("rb") as file:
             content = io.BufferedReader(AtMost(file, LARGEST_MANIFEST_BYTES))
             text = io.TextIOWrapper(content, encoding="utf-8-sig", newline="")
-            count = _find_count(where, csv.DictReader(text, strict=True), asked, path.name)
+            count = _find_count(where, csv.reader(text, strict=True), asked, path.name)
     except (OSError, ValueError, csv.Error) as error:  # ValueError: no text, or a NUL in the name
         if isinstance(error, LogError):
             raise
@@ -65,16 +68,17 @@ def _count_of(path: Path, asked: Manifest) -> int:
     return count
 
 
-def _find_count(where: str, table: "csv.DictReader[str]", asked: Manifest, file: str) -> int | None:
+def _find_count(where: str, table: Iterator[list[str]], asked: Manifest, file: str) -> int | None:
     """Return what a manifest's row of a file says, None where there is no such row."""
-    names = table.fieldnames or []
+    names = next(table, [])
     for name in (asked.key, asked.count):
         if name not in names:
             listed = ", ".join(map(named, names))[:LONGEST_LIST]
             raise LogError(f"{where}: column {named(name)}: missing; found {listed}")
+    key, count = names.index(asked.key), names.index(asked.count)
     for entry in table:
-        if entry[asked.key] == file:
-            text = (entry[asked.count] or "").strip()
+        if entry[key : key + 1] == [file]:
+            text = "".join(entry[count : count + 1]).strip()
             if not text.isdecimal() or len(text) > MOST_DIGITS:
                 found, expected = shown(text), f"a whole number of at most {MOST_DIGITS} digits"
                 raise LogError(f"{where}: {file}: {named(asked.count)}: found {found}, expected {expected}")

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from flytrack_env.files import check_size
 from flytrack_env.words import said
 from flytrack_sysid.importing.craft import Craft
 from flytrack_sysid.importing.decoding import decode
@@ -18,8 +19,9 @@ from flytrack_sysid.importing.mapping import Mapping
 from flytrack_sysid.importing.resample import growing, hold, interpolate, interpolate_quaternions
 from flytrack_sysid.importing.units import PER_DEGREE, UNITS, quaternion_from, vector_from
 from flytrack_sysid.log import CHANNELS, LogError
-from flytrack_sysid.log_table import Table, log_of_table
+from flytrack_sysid.log_table import LARGEST_NORM_ERROR, Table, log_of_table
 
+LARGEST_BYTES = 2**29
 FIRST_BYTES = b"ULog\x01\x12\x35"
 MICROSECOND = UNITS["time"]["us"]
 # Full stick in acro mode, and the limit of other modes, deg/s; a setpoint keeps below the larger of both.
@@ -72,6 +74,7 @@ class _Topics:
     def __init__(self, path: Path):
         self.path = path
         try:
+            check_size(path.stat().st_size, LARGEST_BYTES)
             with path.open("rb") as file:
                 found = file.read(len(FIRST_BYTES))
         except OSError as error:
@@ -134,6 +137,10 @@ def read_ulog(path: Path, mapping: Mapping) -> Flight:
     setpoint_times, setpoints = topics.need(SETPOINT)
     commands, is_known = hold(setpoint_times, _commands(setpoints, craft), base)
     attitude_times, quat = topics.need(ATTITUDE)
+    is_attitude = abs(np.linalg.norm(quat, axis=1) - 1.0) <= LARGEST_NORM_ERROR  # none before its filter runs
+    if not is_attitude.any():
+        raise LogError(f"{path}: topic vehicle_attitude: q: found no unit quaternion, expected norm 1")
+    attitude_times, quat = attitude_times[is_attitude], quat[is_attitude]
     quat = quaternion_from(Rotation.from_quat(quat, scalar_first=True), True, True)
     quat, is_attitude_known = interpolate_quaternions(attitude_times, quat, base)
     channels = {"u": commands, "w": vector_from(rates, True), "q": quat}
