@@ -128,7 +128,7 @@ def _check_header(path: Path, file: BinaryIO, allow_pickle: bool) -> bool:
     announced = math.prod(shape) * dtype.itemsize
     found_bytes = os.fstat(file.fileno()).st_size - file.tell()
     if found_bytes < announced:
-        reason = f"found {found_bytes} bytes of data, expected {announced} for shape {shape}"
+        reason = f"found {found_bytes} bytes of data, expected {shown(announced)} for shape {shown(shape)}"
         raise RolloutError(f"{path}: cut short: {reason}")
     if shape[0] > MOST_STEPS:
         raise RolloutError(f"{path}: found {shape[0]} steps, expected at most {MOST_STEPS}")

@@ -28,12 +28,14 @@ def parse_toml(text: str) -> dict[str, Any]:
     """Return what a TOML text holds.
 
     Raises:
-        TomlError: it is not TOML, or a line of it has very many dots.
+        TomlError: it is not TOML, or a line of it, or all together, have very many dots.
     """
     dots = [line.count(".") for line in text.split("\n")]
     if max(dots) > MOST_DOTS:
         number = dots.index(max(dots)) + 1
         raise TomlError(f"line {number}: found {max(dots)} dots, expected at most {MOST_DOTS}")
+    if sum(number * number for number in dots) > MOST_DOTS**2:
+        raise TomlError("found very many lines of many dots, expected names of few parts")
     try:
         return tomllib.loads(text)
     except (ValueError, RecursionError) as error:  # TOMLDecodeError, endless digits, endless nesting

@@ -124,6 +124,14 @@ def test_a_key_of_spaces_is_refused_soon(spaces: int, tmp_path: Path) -> None:
     assert time.process_time() - started_s < 5.0
 
 
+def test_very_many_dots_in_all_are_refused_soon(tmp_path: Path) -> None:
+    started_s = time.process_time()
+    lines = [f"a{index}." + ".".join("a" * 998) + " = 1" for index in range(120)]
+    content = ("[" + ".".join("b" * 1000) + "]\n" + "\n".join(lines)).encode()
+    assert load(tmp_path / "dots.toml", content) is None
+    assert time.process_time() - started_s < 1.0
+
+
 def test_a_pipe_is_refused(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe.toml")
     with pytest.raises(TrackError, match=r"pipe\.toml: .*found a pipe or a socket, expected a file"):

@@ -149,7 +149,7 @@ def _commands(table: Table, command: Command) -> np.ndarray:
         text = (
             f"found {values[row, stick]:g}, expected {low[stick]:g} to {high[stick]:g} by command.low, high"
         )
-        raise table.error(row, command.columns[stick], f"{text}; clip = true cuts it")
+        raise table.error(row, named(command.columns[stick]), f"{text}; clip = true cuts it")
     return 2.0 * (values - low) / (high - low) - 1.0
 
 
@@ -172,7 +172,7 @@ def _quaternions(table: Table, attitude: Attitude) -> np.ndarray:
     values = table.matrix(attitude.columns) * np.array(attitude.scales)
     bad = np.flatnonzero(~np.isfinite(values).all(axis=1))
     if len(bad):
-        raise table.error(bad[0], ", ".join(attitude.columns), "found no finite numbers")
+        raise table.error(bad[0], ", ".join(map(named, attitude.columns)), "found no finite numbers")
     if attitude.order == "euler":
         rotation = Rotation.from_euler("ZYX", values[:, ::-1])
     else:
@@ -180,7 +180,7 @@ def _quaternions(table: Table, attitude: Attitude) -> np.ndarray:
         bad = np.flatnonzero(np.abs(norm - 1.0) > LARGEST_NORM_ERROR)
         if len(bad):
             text = f"found a quaternion of norm {norm[bad[0]]:.4g}, expected 1"
-            raise table.error(bad[0], ", ".join(attitude.columns), text)
+            raise table.error(bad[0], ", ".join(map(named, attitude.columns)), text)
         rotation = Rotation.from_quat(values, scalar_first=attitude.order == "wxyz")
     if attitude.is_inverted:
         rotation = rotation.inv()
