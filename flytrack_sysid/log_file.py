@@ -6,15 +6,15 @@ a header of column names, then one row of numbers, separated by commas, per samp
 
 import csv
 import io
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TextIO
 
 import numpy as np
 
 from flytrack_env.files import AtMost, TooLargeError, check_size, write_atomically
 from flytrack_env.npz_file import Header, NpzError, NpzFile, open_npz
-from flytrack_env.words import said, shown
+from flytrack_env.words import named, said, shown
 from flytrack_sysid.log import CHANNELS, GAP_STEPS, FlightLog, LogError, usual_step
 from flytrack_sysid.log_table import Rows, Table, check_names, check_number, log_of_table
 
@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 Reader = Callable[[Path], Table]
 Writer = Callable[[dict[str, np.ndarray]], bytes]
 
+LONGEST_LINE = 2**16  # characters of a CSV file: some thousand times a row of all columns
 LARGEST_BYTES = 512 * 2**20  # as they are in the file, unpacked
 
 
@@ -145,10 +146,10 @@ def _header(path: Path, archive: NpzFile, name: str) -> Header:
     except NpzError as error:
         raise LogError(f"{path}: column {name}: {error}") from error
     if header.dtype.kind not in "iuf":
-        raise LogError(f"{path}: column {name}: found an array of {header.dtype}, expected numbers")
+        raise LogError(f"{path}: column {name}: found an array of {named(header.dtype)}, expected numbers")
     if len(header.shape) != 1:
         raise LogError(
-            f"{path}: column {name}: found an array of shape {header.shape}, expected one dimension"
+            f"{path}: column {name}: found an array of shape {shown(header.shape)}, expected one dimension"
         )
     return header
 
@@ -165,11 +166,22 @@ def _read_csv(path: Path) -> Table:
     """Return the columns of a CSV file."""
     with path.open("rb") as file:
         content = io.BufferedReader(AtMost(file, LARGEST_BYTES))
-        rows = csv.reader(io.TextIOWrapper(content, encoding="utf-8-sig", newline=""), strict=True)
+        text = io.TextIOWrapper(content, encoding="utf-8-sig", newline="")
+        rows = csv.reader(_lines(text), strict=True)
         try:
             return _table(str(path), rows)
         except (UnicodeDecodeError, csv.Error) as error:
             raise LogError(f"{path}: near line {rows.line_num + 1}: not a CSV file: {said(error)}") from error
+
+
+def _lines(text: TextIO) -> Iterator[str]:
+    """Yield the lines of a CSV file, of which a row has one: csv would read all of an endless one first."""
+    while line := text.readline(LONGEST_LINE):
+        if len(line) == LONGEST_LINE:
+            raise csv.Error(f"found a line of {LONGEST_LINE} characters or more, expected fewer")
+        if line.count('"') % 2:
+            raise csv.Error("found a quotation mark that the line does not close")
+        yield line
 
 
 def _table(source: str, rows: "_csv.Reader") -> Table:

@@ -10,6 +10,7 @@ import numpy as np
 from flytrack_env.words import shown
 from flytrack_sysid.log import CHANNELS, COLUMNS, REQUIRED, FlightLog, LogError
 
+MOST_SEGMENTS = 100_000
 LARGEST_NORM_ERROR = 1e-2  # of quaternions: estimators drift a little; more is no unit quaternion
 SMALLEST_NORM_ERROR = 1e-12  # below it a norm is 1 up to rounding, and the values stay as they are
 LARGEST_VALUES = (
@@ -155,6 +156,9 @@ def _segments(table: Table) -> np.ndarray:
         raise table.error(bad[0], "segment", f"found {values[bad[0]]}, expected a whole number below 2^53")
     segment = values.astype(np.int64)
     starts = np.flatnonzero(np.concatenate([[True], segment[1:] != segment[:-1]]))
+    if len(starts) > MOST_SEGMENTS:
+        text = f"found {len(starts)} segments, expected at most {MOST_SEGMENTS}, one for each flight"
+        raise table.error(starts[MOST_SEGMENTS], "segment", text)
     first_of = np.unique(segment[starts], return_index=True)[1]
     again = np.setdiff1d(np.arange(len(starts)), first_of)
     if len(again):

@@ -14,7 +14,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from flytrack_sysid import log_file
+from flytrack_sysid import log_file, log_table
 from flytrack_sysid.log import REQUIRED, LogError
 from flytrack_sysid.log_file import load_log, save_log
 from tests.written_logs import NUM_ROWS, SUFFIXES, columns_of, make_log, write
@@ -146,7 +146,7 @@ BAD_TEXTS = {
     "empty cell": (f"{HEADER}\n0,0,0,0,0, \n", r"row 0 \(line 2\), column v_bat: found an empty cell"),
     "nan": (f"{HEADER}\n0,0,0,0,0,NaN\n", r"row 0 \(line 2\), column v_bat: found nan"),
     "too large": (f"{HEADER}\n0,0,0,0,0,1e400\n", r"row 0 \(line 2\), column v_bat: found inf"),
-    "open quote": (f'{HEADER}\n"0,0,0,0,0,1\n', "near line 3: not a CSV file"),
+    "open quote": (f'{HEADER}\n"0,0,0,0,0,1\n', "near line 2: not a CSV file"),
     "no text": (b"\xff\xfe\x00", "near line 1: not a CSV file"),
     "nul": (f"{HEADER}\n0,0,0,0,0,\0\n", r"row 0 \(line 2\), column v_bat: found '\\x00'"),
 }
@@ -254,6 +254,47 @@ def test_array_that_unpacks_to_more_than_announced_is_not_unpacked(tmp_path, met
         assert tracemalloc.get_traced_memory()[1] < unpacked / 8
     finally:
         tracemalloc.stop()
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("," * 2**22, "line 1: not a CSV file: found a line of 65536 characters or more"),
+        (HEADER + "\n" + '"1\n","' * 2**18, "line 2: not a CSV file: found a quotation mark"),
+    ],
+)
+def test_endless_lines_take_no_memory(tmp_path, text, message):
+    (tmp_path / "flight.csv").write_text(text)
+    del text
+    tracemalloc.start()
+    try:
+        with pytest.raises(LogError, match=message):
+            load_log(tmp_path / "flight.csv")
+        assert tracemalloc.get_traced_memory()[1] < 2**20
+    finally:
+        tracemalloc.stop()
+
+
+def test_a_segment_for_every_row_is_refused_at_once(tmp_path):
+    num_rows = log_table.MOST_SEGMENTS + 1
+    columns = {name: np.zeros(num_rows) for name in REQUIRED} | {"segment": np.arange(num_rows)}
+    write(tmp_path / "flight.npz", columns)
+    with pytest.raises(LogError, match="column segment: found 100001 segments, expected at most 100000"):
+        load_log(tmp_path / "flight.npz")
+
+
+@pytest.mark.parametrize(
+    ("array", "message"),
+    [
+        (np.zeros(1, [(f"field_{index}", float) for index in range(300)]), "expected numbers"),
+        (np.zeros((1,) * 32), "expected one dimension"),
+    ],
+)
+def test_odd_arrays_are_refused_in_few_words(tmp_path, array, message):
+    np.savez(tmp_path / "flight.npz", **{name: array for name in REQUIRED})
+    with pytest.raises(LogError, match=message) as caught:
+        load_log(tmp_path / "flight.npz")
+    assert len(str(caught.value)) < 1000
 
 
 def test_sparse_file_beyond_the_limit_is_refused_unopened(tmp_path, monkeypatch):
