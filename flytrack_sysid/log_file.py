@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 Reader = Callable[[Path], Table]
 Writer = Callable[[dict[str, np.ndarray]], bytes]
 
-LONGEST_LINE = 2**16  # characters of a CSV file: some thousand times a row of all columns
+LONGEST_LINE = 2**16  # characters of a CSV file: some hundred times a row of all columns
 LARGEST_BYTES = 512 * 2**20  # as they are in the file, unpacked
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from flytrack_env.words import shown
 from flytrack_sysid.log import CHANNELS, COLUMNS, REQUIRED, FlightLog, LogError
 
-MOST_SEGMENTS = 100_000
+MOST_SEGMENTS = 100_000  # one for each flight: beyond it is a number for every row
 LARGEST_NORM_ERROR = 1e-2  # of quaternions: estimators drift a little; more is no unit quaternion
 SMALLEST_NORM_ERROR = 1e-12  # below it a norm is 1 up to rounding, and the values stay as they are
 LARGEST_VALUES = (

@@ -145,7 +145,7 @@ def say_resumed(plan: Plan) -> str | None:
 
 
 def run(asked: Asked) -> None:
-    """Train every seed; say from where where it goes on, and where its checkpoint is."""
+    """Train every seed; say from where those go on that had begun, and where its checkpoint is."""
     for line in filter(None, map(say_resumed, asked.plans)):
         if is_first():
             print(line)

@@ -21,7 +21,7 @@ from flytrack_sysid.importing.units import PER_DEGREE, UNITS, quaternion_from, v
 from flytrack_sysid.log import CHANNELS, LogError
 from flytrack_sysid.log_table import LARGEST_NORM_ERROR, Table, log_of_table
 
-LARGEST_BYTES = 2**29
+LARGEST_BYTES = 2**29  # the decoder may take time and memory in proportion
 FIRST_BYTES = b"ULog\x01\x12\x35"
 MICROSECOND = UNITS["time"]["us"]
 # Full stick in acro mode, and the limit of other modes, deg/s; a setpoint keeps below the larger of both.
