@@ -9,7 +9,7 @@ FAST_TESTS = (
     "tests/test_model_file.py",
     "tests/test_env.py::test_flight_ends_in_many_ways_and_stays_finite",
     "tests/test_env.py::test_auto_reset_leaves_nothing_behind_in_a_flight",
-    "tests/test_env.py::test_final_observation_is_the_one_before_the_reset",
+    "tests/test_episode_ends.py::test_final_observation_is_the_one_before_the_reset",
     "tests/test_env.py::test_wrong_arguments_say_what_was_expected",
     # Wrappers, ours and gymnax's.
     "tests/test_wrappers.py::test_orders_that_make_sense_have_the_same_spaces_and_parameters",

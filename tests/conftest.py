@@ -248,3 +248,15 @@ def fly_black_box(black_box: BlackBox) -> Callable[..., np.ndarray]:
     """One step of the shipped plant, compiled once for the module."""
     step = jax.jit(black_box.step_vector)
     return lambda x, u: np.asarray(step(x, u))
+
+
+@pytest.fixture(scope="module")
+def step_all(env: FlyTrack) -> Callable[..., Any]:
+    """``env.step`` for a batch."""
+    return jax.jit(jax.vmap(env.step, in_axes=(0, 0, 0, None)))
+
+
+@pytest.fixture(scope="module")
+def step_env_all(env: FlyTrack) -> Callable[..., Any]:
+    """``env.step_env`` for a batch."""
+    return jax.jit(jax.vmap(env.step_env, in_axes=(None, 0, 0, None)))
