@@ -16,7 +16,7 @@ from baselines.purejaxrl_ppo.density import draw_position_density
 from baselines.purejaxrl_ppo.evaluate import fly_many
 from baselines.purejaxrl_ppo.flights import Flight, outcomes_of, score
 from baselines.purejaxrl_ppo.recording import CANNOT_RECORD, can_record, record_flights
-from baselines.purejaxrl_ppo.resume import checkpoints_in
+from baselines.purejaxrl_ppo.run_folder import checkpoints_in
 from baselines.purejaxrl_ppo.train_ppo import train_policy
 from flytrack_env import blackbox, load_track, save_model
 from flytrack_env.files import fresh_folder, write_atomically

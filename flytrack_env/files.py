@@ -7,6 +7,7 @@ import itertools
 import os
 import secrets
 import stat
+from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO
 
@@ -73,20 +74,36 @@ def write_atomically(path: str | Path, content: bytes) -> None:
     Raises:
         OSError: what the system says; nothing half-written is left.
     """
-    path = Path(os.path.realpath(path))  # a link stays one
-    if path.exists() and not path.is_file():
-        raise OSError(f"{path}: found a folder or a device, expected a regular file or a new path")
-    path.parent.mkdir(parents=True, exist_ok=True)
-    # Not tempfile: its files are private to the user, and these are ordinary ones.
-    temporary = path.with_name(f".{path.name}.{secrets.token_hex(8)}")
+    write_together([(path, content)])
+
+
+def write_together(files: Iterable[tuple[str | Path, bytes]]) -> None:
+    """Write files as ``write_atomically``, and rename them when all are written.
+
+    files: of path and content, read one by one.
+
+    Raises:
+        OSError: what the system says; none of the files was written.
+    """
+    renames: list[tuple[Path, Path]] = []
     try:
-        with temporary.open("xb") as file:
-            file.write(content)
-            file.flush()
-            os.fsync(file.fileno())  # else a loss of power can leave the new name with no content
-        os.replace(temporary, path)
+        for name, content in files:
+            path = Path(os.path.realpath(name))  # a link stays one
+            if path.exists() and not path.is_file():
+                raise OSError(f"{path}: found a folder or a device, expected a regular file or a new path")
+            path.parent.mkdir(parents=True, exist_ok=True)
+            # Not tempfile: its files are private to the user, and these are ordinary ones.
+            temporary = path.with_name(f".{path.name}.{secrets.token_hex(8)}")
+            renames.append((temporary, path))
+            with temporary.open("xb") as file:
+                file.write(content)
+                file.flush()
+                os.fsync(file.fileno())  # else a loss of power can leave the new name with no content
+        for temporary, path in renames:
+            os.replace(temporary, path)
     except BaseException:
-        temporary.unlink(missing_ok=True)
+        for temporary, _ in renames:
+            temporary.unlink(missing_ok=True)
         raise
 
 

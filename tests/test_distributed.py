@@ -20,7 +20,8 @@ from baselines.purejaxrl_ppo.across import AXIS, Across
 from baselines.purejaxrl_ppo.distributed import check_divides, digest
 from baselines.purejaxrl_ppo.named_arrays import as_named_arrays
 from baselines.purejaxrl_ppo.ppo import Batch, make_network_for, ppo_loss
-from baselines.purejaxrl_ppo.resume import checkpoints_in, newest_intact
+from baselines.purejaxrl_ppo.resume import newest_intact
+from baselines.purejaxrl_ppo.run_folder import checkpoints_in
 from baselines.purejaxrl_ppo.train_ppo import make_parser
 from tests.ppo_runs import BATCH, CONFIG
 

@@ -8,9 +8,11 @@ import pytest
 
 from baselines.purejaxrl_ppo import load_checkpoint, tracking, train_ppo
 from baselines.purejaxrl_ppo import plans as plans_module
+from baselines.purejaxrl_ppo.checkpoint import save_checkpoint
 from baselines.purejaxrl_ppo.options import OPTIONS, read_options, write_options
-from baselines.purejaxrl_ppo.resume import check_same_run, describe_run, newest_intact, seeds_in
+from baselines.purejaxrl_ppo.resume import check_same_run, describe_run, newest_intact
 from baselines.purejaxrl_ppo.run import DivergedError
+from baselines.purejaxrl_ppo.run_folder import seeds_in
 from baselines.purejaxrl_ppo.training import Options
 from tests.ppo_runs import CONFIG, DEAD_URI, EVERY_OTHER_UPDATE, SEED, make_trainer
 
@@ -51,9 +53,10 @@ def test_a_resumed_run_goes_on_with_its_options(cut_off, tmp_path):
     plans = plans_module.make_plans(arguments)
     (options,) = plans_module.options_of(arguments, plans)
     assert options == Options(None, None, 7, None, plans[0].resume)
-    (moved / "seed3" / OPTIONS).write_text('{"checkpoint_every": "often"}')
-    with pytest.raises(ValueError, match=r"options\.json: damaged"):
-        plans_module.options_of(arguments, plans)
+    for content in ('{"checkpoint_every": "often"}', "[" * 100_000):
+        (moved / "seed3" / OPTIONS).write_text(content)
+        with pytest.raises(ValueError, match=r"options\.json: damaged"):
+            plans_module.options_of(arguments, plans)
 
 
 def test_a_store_elsewhere_is_found_again(tmp_path, monkeypatch):
@@ -139,7 +142,7 @@ def test_resuming_takes_from_the_checkpoint_what_is_not_given(whole, tmp_path):
     arguments = train_ppo.make_parser().parse_args(["--resume", str(whole[0])])
     (plan,) = train_ppo.make_plans(arguments)
     assert (plan.seed, plan.out, plan.resume) == (SEED, whole[0], whole[0] / "final.msgpack")
-    found = train_ppo.make_trainer(arguments, plan.checkpoint)
+    found = train_ppo.make_trainer(arguments, plan)
     assert found.config == CONFIG and found.env_id == "FlyTrackRobust-v0"
     check_same_run(
         plan.resume,
@@ -153,13 +156,39 @@ def test_resuming_takes_from_the_checkpoint_what_is_not_given(whole, tmp_path):
 
 
 def test_resuming_keeps_the_reward_that_was_trained_for(whole):
-    checkpoint = load_checkpoint(whole[0] / "final.msgpack")
-    checkpoint.meta["environment"]["reward.off_centre"] = -0.25
-    parser = train_ppo.make_parser()
-    kept = train_ppo.make_trainer(parser.parse_args(["--resume", "x"]), checkpoint)
-    asked = train_ppo.make_trainer(parser.parse_args(["--reward", "off_centre=-0.5"]), checkpoint)
+    (plan,) = plans_of("--resume", whole[0])
+    plan.checkpoint.meta["environment"]["reward.off_centre"] = -0.25
+    kept = train_ppo.make_trainer(parse("--resume", "x"), plan)
+    asked = train_ppo.make_trainer(parse("--reward", "off_centre=-0.5"), plan)
     assert kept.env.default_params.reward.off_centre == -0.25
     assert asked.env.default_params.reward.off_centre == -0.5
+
+
+def write_changed(source, path, **changes):
+    """Write a checkpoint whose description says something else."""
+    checkpoint = load_checkpoint(source)
+    meta = {**checkpoint.meta, **changes}
+    save_checkpoint(path, checkpoint.params, checkpoint.config, meta, checkpoint.training)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"environment": {"reward.gate_pass": "a lot"}}, "environment: found .*numbers for weights"),
+        ({"environment": {"reward.beauty": 1.0}}, "with its settings and the flags: .*beauty"),
+        ({"env_id": "Hover-v0"}, "with its settings and the flags: env_id: found 'Hover-v0'"),
+        ({"track": "/nowhere/track.toml"}, "with its settings and the flags: .*track.toml"),
+        ({"missed_gate": "sometimes"}, "with its settings and the flags: .*'sometimes'"),
+        ({"model": {"m": "heavy"}}, "with its settings and the flags: model: "),
+    ],
+)
+def test_settings_of_a_checkpoint_that_cannot_be_used_are_told_with_its_name(
+    whole, tmp_path, changes, message
+):
+    path = tmp_path / "final.msgpack"
+    write_changed(whole[0] / "final.msgpack", path, **changes)
+    with pytest.raises(ValueError, match=f"{path}: {message}"):
+        train_ppo.prepare(parse("--resume", path, "--no-tracking"))
 
 
 @pytest.mark.parametrize(

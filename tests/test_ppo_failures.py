@@ -254,7 +254,22 @@ def test_damaged_lines_are_skipped_and_keep_their_place(tmp_path, caplog):
     ]
 
 
-@pytest.mark.parametrize("content", [b"", b"nothing\n", b'{"kind": "run"}\n'])
+def test_after_a_full_disk_a_line_of_the_journal_is_whole_again(tmp_path):
+    journal = tracking.Journal(tmp_path)
+    journal.append("status", status="RUNNING")
+    with Path("/dev/full").open("a") as full, pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Path, "open", lambda *_, **__: full)
+        with pytest.raises(OSError, match="No space left"):
+            journal.append("metrics", step=1, values={})
+    with journal.path.open("a") as file:
+        file.write('{"kind": "met')  # as much as there was room for
+    journal.append("status", status="FAILED")
+    again = tracking.Journal(tmp_path)
+    assert again.entries == journal.entries
+    assert [entry.get("status") for entry in again.entries] == ["RUNNING", None, "FAILED"]
+
+
+@pytest.mark.parametrize("content", [b"", b"nothing\n", b'{"kind": "run"}\n', b"[" * 10**5 + b"\n"])
 def test_uploading_a_bad_journal_says_what_is_wrong(tmp_path, monkeypatch, capsys, content):
     (tmp_path / tracking.JOURNAL).write_bytes(content)
     monkeypatch.setattr(sys, "argv", ["tracking", str(tmp_path), "--tracking-uri", DEAD_URI])

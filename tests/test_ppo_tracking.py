@@ -122,6 +122,36 @@ def test_a_server_that_is_down_does_not_end_the_training(
     assert len(client.list_artifacts(run.info.run_id, "checkpoints")) == 5
 
 
+@quiet_mlflow
+def test_a_run_whose_id_a_kill_left_unnoted_is_found_again(tmp_path, monkeypatch):
+    (tmp_path / "run").mkdir()
+    uri = tracking.local_uri(tmp_path)
+    tracker = tracking.Tracker(tmp_path / "run", uri, "name", {"seed": 3})
+
+    def die(self, uri, run_id, count):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(tracking.Journal, "mark_sent", die)
+        tracker.begin()
+    run_id = tracking.send_journal(tracking.Journal(tmp_path / "run"), uri)
+    _, run = only_run(uri)
+    assert run.info.run_id == run_id and run.data.params["seed"] == "3"
+    strange = tracking.Journal(tmp_path / "strange")
+    strange.append("run", experiment=tracking.EXPERIMENT, name="n", params={}, journal="x' OR 'x' = 'x")
+    assert tracking.send_journal(strange, uri) != run_id
+
+
+def test_what_a_store_is_noted_to_have_is_on_the_disk(tmp_path, monkeypatch):
+    done = []
+    monkeypatch.setattr(tracking.Journal, "flush", lambda self: done.append("flush"))
+    monkeypatch.setattr(tracking.Journal, "mark_sent", lambda *arguments: done.append("mark"))
+    journal = tracking.Journal(tmp_path / "run")
+    journal.append("run", experiment=tracking.EXPERIMENT, name="n", params={})
+    tracking.send_journal(journal, tracking.local_uri(tmp_path))
+    assert done == ["flush", "mark", "mark"]
+
+
 def reports_of(caplog):
     return [record.getMessage() for record in caplog.records if record.name == tracking.__name__]
 

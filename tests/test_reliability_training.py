@@ -4,7 +4,7 @@ import random
 
 import pytest
 
-from baselines.purejaxrl_ppo.resume import checkpoints_in
+from baselines.purejaxrl_ppo.run_folder import checkpoints_in
 from benchmarks.reliability.training import (
     SECTION,
     are_equal,

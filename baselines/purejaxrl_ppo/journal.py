@@ -50,16 +50,19 @@ class Journal:
             logger.warning("%s: line %s: damaged or cut off, skipped", self.path, numbers)
 
     def append(self, kind: str, **values: Any) -> None:
-        """Add an entry."""
+        """Add an entry.
+
+        Raises:
+            OSError: what the system says; what is in the file of the entry is a damaged line.
+        """
         entry = {"kind": kind, "time_ms": int(time.time() * 1000), **values}
         self.folder.mkdir(parents=True, exist_ok=True)
+        before = [UNREADABLE] if self._is_cut_off else []
+        self._is_cut_off = True
         with self.path.open("a", encoding="utf-8") as file:
-            if self._is_cut_off:
-                file.write("\n")
-                self.entries.append(UNREADABLE)
-                self._is_cut_off = False
-            file.write(json.dumps(entry) + "\n")
-        self.entries.append(entry)
+            file.write("\n" * len(before) + json.dumps(entry) + "\n")
+        self._is_cut_off = False
+        self.entries += [*before, entry]
 
     def flush(self) -> None:
         """Return when all entries are on the disk, and not only with the system."""
@@ -116,7 +119,7 @@ class Journal:
         try:
             stores = json.loads(path.read_bytes())
             return {uri: (str(run_id), int(count)) for uri, (run_id, count) in stores.items()}
-        except (ValueError, AttributeError, TypeError) as error:
+        except (ValueError, AttributeError, TypeError, RecursionError) as error:
             raise JournalError(
                 f"{path}: damaged: {error}; remove it to send everything again, as another run"
             ) from error
@@ -134,6 +137,6 @@ def _read_entry(line: bytes) -> dict[str, Any]:
         entry = json.loads(line)
         fields = {"time_ms": int, **FIELDS[entry["kind"]]}
         is_whole = all(isinstance(entry[name], kind) for name, kind in fields.items())
-    except (ValueError, TypeError, KeyError):
+    except (ValueError, TypeError, KeyError, RecursionError):
         return UNREADABLE
     return entry if is_whole else UNREADABLE

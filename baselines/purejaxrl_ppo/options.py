@@ -83,6 +83,6 @@ def read_options(folder: Path) -> Options | None:
         store = values.get("store_from_here")
         if store is not None and (folder / store).exists():
             options = options._replace(tracking_uri=f"{SQLITE}{(folder / store).resolve()}")
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise ValueError(f"{path}: damaged: {error!r}; remove it to go on with the defaults") from error
     return options

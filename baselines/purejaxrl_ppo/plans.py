@@ -7,21 +7,21 @@ from typing import Any, NamedTuple, TypeVar
 
 from jax.sharding import Mesh
 
-from baselines.purejaxrl_ppo.checkpoint import Checkpoint
+from baselines.purejaxrl_ppo.checkpoint import Checkpoint, CheckpointError
 from baselines.purejaxrl_ppo.config import Config, settings_of
 from baselines.purejaxrl_ppo.options import INTERVALS, Options, read_options
 from baselines.purejaxrl_ppo.resume import (
+    REWARD,
     at_common_step,
-    check_free,
     check_same_run,
-    checkpoints_in,
     newest_intact,
-    seeds_in,
     seeds_side_by_side,
 )
+from baselines.purejaxrl_ppo.run_folder import check_free, checkpoints_in, folder_of, seeds_in
 from baselines.purejaxrl_ppo.tracking import local_uri
 from baselines.purejaxrl_ppo.training import Trainer
 from flytrack_env.model_file import model_from_json
+from flytrack_env.words import said
 
 T = TypeVar("T")
 
@@ -34,6 +34,7 @@ DEFAULTS = Options(checkpoint_every=1_000_000, evaluate_every=4_000_000)
 class Plan(NamedTuple):
     """One seed's run: where it writes, and the checkpoint that it goes on from, if any.
 
+    resume: the checkpoint's path; or the run's own folder, which was killed before it had one.
     at_once: how many seeds train side by side.
     """
 
@@ -49,7 +50,7 @@ def root_folder(arguments: argparse.Namespace) -> Path:
     resume = arguments.resume
     if arguments.out is not None or resume is None:
         return arguments.out or DEFAULT_OUT
-    return resume if resume.is_dir() else resume.parent
+    return folder_of(resume)
 
 
 def make_plans(arguments: argparse.Namespace) -> list[Plan]:
@@ -106,9 +107,14 @@ def _plans_of_several(arguments: argparse.Namespace, out: Path) -> list[Plan]:
     starts = [newest_intact(source) if checkpoints_in(source) else None for source in folders]
     at_once = arguments.seeds_at_once or seeds_side_by_side(starts)
     starts = [start for group in batched(starts, at_once) for start in at_common_step(group)]
+    is_same = out.resolve() == resume.resolve()
+    found_or_own = [
+        start or (source if is_same and source.is_dir() else None, None)
+        for source, start in zip(folders, starts, strict=True)
+    ]
     plans = [
-        Plan(seed, out / source.name, start and start[0], start and start[1], at_once)
-        for seed, source, start in zip(seeds, folders, starts, strict=True)
+        Plan(seed, out / source.name, path, checkpoint, at_once)
+        for seed, source, (path, checkpoint) in zip(seeds, folders, found_or_own, strict=True)
     ]
     if all(plan.checkpoint is None for plan in plans):
         has = (
@@ -129,7 +135,7 @@ def options_of(arguments: argparse.Namespace, plans: list[Plan]) -> list[Options
     Raises:
         ValueError: numbers that cannot be used.
     """
-    sources = [None if plan.resume is None else plan.resume.parent for plan in plans]
+    sources = [None if plan.resume is None else folder_of(plan.resume) for plan in plans]
     known = [None if source is None else read_options(source) for source in sources]
     usual = DEFAULTS._replace(tracking_uri=local_uri(root_folder(arguments)))
     of_others = next((options for options in known if options is not None), usual)
@@ -154,28 +160,35 @@ def check_plans(trainer: Trainer, plans: list[Plan]) -> None:
             check_same_run(plan.resume, plan.checkpoint, trainer.describe(plan.seed))
 
 
-def make_trainer(arguments: argparse.Namespace, base: Checkpoint | None, mesh: Mesh | None = None) -> Trainer:
-    """Return the trainer of a command line; what it does not say is as in the checkpoint, if there is one."""
+def make_trainer(arguments: argparse.Namespace, plan: Plan | None, mesh: Mesh | None = None) -> Trainer:
+    """Return the trainer of a command line; what it does not say is as in a plan's checkpoint, if any.
+
+    Raises:
+        ValueError: settings that cannot be used; where a checkpoint has some of them, the message names it.
+    """
     asked = settings_of(arguments)
-    if base is None:
+    if plan is None or plan.checkpoint is None:
         env_arguments: dict[str, Any] = {
             "track": arguments.track or DEFAULT_TRACK,
             "model": arguments.model,
             "reward": dict(arguments.reward or ()),
         }
         return Trainer(Config(**asked), arguments.env_id or DEFAULT_ENV_ID, mesh, **env_arguments)
-    env_arguments = {
-        "track": arguments.track or base.track,
-        "model": arguments.model or model_from_json(base.meta["model"], "checkpoint: model"),
-        "missed_gate": base.meta["missed_gate"],
-        "reward": {**reward_of(base), **dict(arguments.reward or ())},
-    }
-    config = dataclasses.replace(base.config, **asked)
-    return Trainer(config, arguments.env_id or base.env_id, mesh, **env_arguments)
+    base = plan.checkpoint
+    try:
+        env_arguments = {
+            "track": arguments.track or base.track,
+            "model": arguments.model or model_from_json(base.meta["model"], "model"),
+            "missed_gate": base.meta["missed_gate"],
+            "reward": {**reward_of(base), **dict(arguments.reward or ())},
+        }
+        config = dataclasses.replace(base.config, **asked)
+        return Trainer(config, arguments.env_id or base.env_id, mesh, **env_arguments)
+    except (ValueError, OverflowError, OSError) as error:
+        raise CheckpointError(f"{plan.resume}: with its settings and the flags: {said(error)}") from error
 
 
 def reward_of(checkpoint: Checkpoint) -> dict[str, float]:
     """Return the weights of the reward terms that a checkpoint was trained with."""
-    prefix = "reward."
     values = checkpoint.meta["environment"].items()
-    return {name.removeprefix(prefix): value for name, value in values if name.startswith(prefix)}
+    return {name.removeprefix(REWARD): value for name, value in values if name.startswith(REWARD)}

@@ -2,9 +2,7 @@
 
 import dataclasses
 import logging
-import math
 import os
-import re
 import sys
 from pathlib import Path
 from typing import Any
@@ -24,17 +22,16 @@ from baselines.purejaxrl_ppo.checkpoint import (
     save_checkpoint,
 )
 from baselines.purejaxrl_ppo.config import Config
-from baselines.purejaxrl_ppo.journal import Journal
+from baselines.purejaxrl_ppo.distributed import is_first
+from baselines.purejaxrl_ppo.journal import forget
 from baselines.purejaxrl_ppo.named_arrays import as_named_arrays, find_misfits, from_named_arrays
-from baselines.purejaxrl_ppo.options import OPTIONS
 from baselines.purejaxrl_ppo.ppo import Runner
+from baselines.purejaxrl_ppo.run_folder import FINAL, checkpoints_in, is_its_folder, seeds_in
+from flytrack_env.files import write_together
 from flytrack_env.model_file import model_as_json
 from flytrack_env.words import shown
 
-FINAL = "final.msgpack"
-SEED_FOLDER = re.compile(r"seed(\d+)")
-STEP_FILE = re.compile(r"step_(\d+)\.msgpack")
-HALF_WRITTEN = re.compile(r"\.(step_\d+|final)\.msgpack\.[0-9a-f]{16}")  # as write_atomically names them
+REWARD = "reward."  # what paths of the reward's weights begin with
 MUST_FIT = ("env_id", "seed", "missed_gate", "config", "observation", "track_data", "model", "environment")
 
 logger = logging.getLogger(__name__)
@@ -94,64 +91,6 @@ def save_run(path: Path, runner: Runner, config: Config, description: dict[str, 
     save_checkpoint(path, state.params, config, description, as_named_arrays(rest))
 
 
-def steps_of(path: Path) -> float:
-    """Return the steps in a checkpoint's name; infinity for one without, as the final one."""
-    match = STEP_FILE.fullmatch(path.name)
-    return int(match[1]) if match else math.inf
-
-
-def checkpoints_in(folder: Path) -> list[Path]:
-    """Return the checkpoints in a folder, newest first: by the steps in their names, the final one first."""
-    steps = [path for path in folder.glob("*.msgpack") if STEP_FILE.fullmatch(path.name)]
-    return [path for path in (folder / FINAL,) if path.exists()] + sorted(steps, key=steps_of, reverse=True)
-
-
-def remove_half_written(folder: Path) -> None:
-    """Remove what a killed process was writing: no checkpoint, and in nobody's way but the disk's."""
-    for path in folder.glob(".*.msgpack.*"):
-        if HALF_WRITTEN.fullmatch(path.name):
-            path.unlink(missing_ok=True)
-
-
-def seeds_in(folder: Path) -> list[int]:
-    """Return the seeds of which a folder holds runs, as seed<N>, begun or about to begin."""
-    matches = [(path, SEED_FOLDER.fullmatch(path.name)) for path in folder.glob("seed*")]
-    return sorted(
-        int(match[1])
-        for path, match in matches
-        if match and (checkpoints_in(path) or (path / OPTIONS).exists())
-    )
-
-
-def is_its_folder(folder: Path, source: Path | None) -> bool:
-    """Return whether a checkpoint, or folder of checkpoints, to go on from is in a folder."""
-    if source is None:
-        return False
-    return folder.resolve() == (source if source.is_dir() else source.parent).resolve()
-
-
-def check_free(folder: Path, source: Path | None = None, root: Path | None = None) -> None:
-    """Raise ValueError where a folder holds a run that a training would overwrite.
-
-    source: the checkpoint, or the folder of checkpoints, that the training goes on from; its own folder is
-    where it may. root: of the seeds of which this is one. A journal that no store has all of counts as a run.
-    """
-    if is_its_folder(folder, source):
-        return
-    if checkpoints_in(folder):
-        raise ValueError(
-            f"{folder} holds the checkpoints of a run; go on with it (--resume {root or folder}), give "
-            "another folder (--out), or remove it"
-        )
-    journal = Journal(folder)
-    if not journal.is_sent():
-        raise ValueError(
-            f"{journal.path} tells of a run, and no store has all of it; upload it (python -m "
-            f"baselines.purejaxrl_ppo.tracking {folder} --tracking-uri URI), give another folder (--out), or "
-            "remove it"
-        )
-
-
 def newest_intact(path: Path) -> tuple[Path, Checkpoint]:
     """Return the checkpoint in a file, or the newest one in a folder that is intact, and its path.
 
@@ -171,6 +110,24 @@ def newest_intact(path: Path) -> tuple[Path, Checkpoint]:
         except CheckpointError as error:
             logger.warning("%s; the checkpoint before it is used", error)
     return oldest, _load_training(oldest)
+
+
+def take_over(starts: list[tuple[Path, Start]]) -> list[Path]:
+    """Have every run's checkpoint in its own folder, and return the paths; all are written there, or none.
+
+    starts: a run's folder, which holds no other run, and where the run goes on. Killed before it writes a
+    checkpoint of its own, it goes on from that one.
+    """
+    paths = [
+        path if is_its_folder(out, path) else out / f"step_{checkpoint.meta['steps']}.msgpack"
+        for out, (path, checkpoint) in starts
+    ]
+    moves = [(source, path) for (_, (source, _)), path in zip(starts, paths, strict=True) if source != path]
+    if is_first():
+        for _, path in moves:
+            forget(path.parent)
+        write_together((path, source.read_bytes()) for source, path in moves)
+    return paths
 
 
 def seeds_side_by_side(starts: list[Start | None]) -> int:
@@ -259,7 +216,13 @@ PROGRESS = {
         "an object of numbers",
     ),
     "model": (_is_object, "an object"),
-    "environment": (_is_object, "an object"),
+    "environment": (
+        lambda value: (
+            _is_object(value)
+            and all(_is_number(one) for name, one in value.items() if name.startswith(REWARD))
+        ),
+        "an object, with numbers for weights of the reward",
+    ),
 }
 
 

@@ -17,7 +17,8 @@ from baselines.purejaxrl_ppo.monitor import Seen, evaluate_policy
 from baselines.purejaxrl_ppo.named_arrays import as_named_arrays
 from baselines.purejaxrl_ppo.options import Options, is_due
 from baselines.purejaxrl_ppo.ppo import Runner
-from baselines.purejaxrl_ppo.resume import FINAL, checkpoints_in, save_run, steps_of
+from baselines.purejaxrl_ppo.resume import save_run
+from baselines.purejaxrl_ppo.run_folder import FINAL, checkpoints_in, steps_of
 from baselines.purejaxrl_ppo.tracking import Tracker
 
 if TYPE_CHECKING:

@@ -10,6 +10,7 @@ import argparse
 import json
 import logging
 import os
+import secrets
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -26,6 +27,7 @@ ENTRIES_AT_ONCE = 32
 PARAMS_AT_ONCE = 100  # MLflow's limits
 METRICS_AT_ONCE = 1000
 LONGEST_PARAM = 6000
+JOURNAL_TAG = "flytrack.journal"  # by which a run is found again that a kill left without a note of its id
 MLFLOW_PARENT = "mlflow.parentRunId"  # the tag by which MLflow shows a run below another
 # A server that is down shall cost seconds, where MLflow's own settings are minutes; and no telemetry.
 QUIET = {
@@ -58,7 +60,8 @@ class Tracker:
         self._is_listening, self._last_sent_s = True, -SEND_EVERY_S
         if not self.journal.of_kind("run"):
             above = {} if parent is None else {"parent": os.path.relpath(parent, folder)}
-            self.journal.append("run", experiment=EXPERIMENT, name=name, params=params, **above)
+            own = {"journal": secrets.token_hex(8)}
+            self.journal.append("run", experiment=EXPERIMENT, name=name, params=params, **own, **above)
         self._last_step = max((entry["step"] for entry in self.journal.of_kind("metrics")), default=-1)
         self._told = {entry["path"] for entry in self.journal.of_kind("file")}
 
@@ -146,6 +149,7 @@ def send_journal(journal: Journal, uri: str) -> str:
     for name in ("mlflow", "alembic"):
         logging.getLogger(name).setLevel(logging.WARNING)
     client = MlflowClient(tracking_uri=uri)
+    journal.flush()  # else a loss of power can leave notes of entries that are gone, and keep new ones back
     run_id, count = journal.sent(uri)
     if run_id is None:
         run_id = _create_run(client, uri, beginning, parent_of(journal, uri))
@@ -177,7 +181,7 @@ def parent_of(journal: Journal, uri: str) -> str | None:
 
 
 def _create_run(client: Any, uri: str, entry: dict[str, Any], parent: str | None) -> str:
-    """Create the run of a journal, and its experiment if there is none, and return the run's id."""
+    """Create the run of a journal, and its experiment, where there is none, and return the run's id."""
     found = client.get_experiment_by_name(entry["experiment"])
     if found is not None:
         experiment_id = found.experiment_id
@@ -188,6 +192,12 @@ def _create_run(client: Any, uri: str, entry: dict[str, Any], parent: str | None
     else:
         experiment_id = client.create_experiment(entry["experiment"])
     tags = {} if parent is None else {MLFLOW_PARENT: parent}
+    name = entry.get("journal")
+    if isinstance(name, str) and name.isalnum():
+        known = client.search_runs([experiment_id], f"tags.`{JOURNAL_TAG}` = '{name}'")
+        if known:
+            return known[0].info.run_id
+        tags[JOURNAL_TAG] = name
     run = client.create_run(experiment_id, start_time=entry["time_ms"], run_name=entry["name"], tags=tags)
     return run.info.run_id
 

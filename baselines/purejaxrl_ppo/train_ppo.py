@@ -25,7 +25,8 @@ from baselines.purejaxrl_ppo.plans import (
     options_of,
     root_folder,
 )
-from baselines.purejaxrl_ppo.resume import FINAL, checkpoints_in, seeds_in
+from baselines.purejaxrl_ppo.resume import take_over
+from baselines.purejaxrl_ppo.run_folder import FINAL, checkpoints_in, seeds_in
 from baselines.purejaxrl_ppo.training import Trainer, train_policy
 
 __all__ = ["DEFAULTS", "main", "train_policy"]
@@ -128,7 +129,7 @@ def prepare(arguments: argparse.Namespace) -> Asked:
     """
     plans = make_plans(arguments)
     options = options_of(arguments, plans)
-    base = next((plan.checkpoint for plan in plans if plan.checkpoint is not None), None)
+    base = next((plan for plan in plans if plan.checkpoint is not None), None)
     mesh = all_devices() if arguments.distributed else None
     trainer = make_trainer(arguments, base, mesh)
     check_plans(trainer, plans)
@@ -144,17 +145,32 @@ def say_resumed(plan: Plan) -> str | None:
     return f"seed {plan.seed}: from step {plan.checkpoint.meta['steps']}, {plan.resume}"
 
 
+def with_own_starts(asked: Asked) -> list[Options]:
+    """Have the checkpoints that seeds go on from in their folders, and return the options that say so."""
+    starts = {
+        plan.out: (plan.resume, plan.checkpoint) for plan in asked.plans if plan.checkpoint and plan.resume
+    }
+    paths = dict(zip(starts, take_over(list(starts.items())), strict=True))
+    if asked.trainer.mesh is not None:
+        wait_for_all("taken over")  # before the others look for what the first process wrote
+    return [
+        options._replace(resume=paths.get(plan.out, plan.resume))
+        for plan, options in zip(asked.plans, asked.options, strict=True)
+    ]
+
+
 def run(asked: Asked) -> None:
     """Train every seed; say from where those go on that had begun, and where its checkpoint is."""
     for line in filter(None, map(say_resumed, asked.plans)):
         if is_first():
             print(line)
     # All before any: whoever takes them up again finds the seeds that had not begun.
-    for plan, options in zip(asked.plans, asked.options, strict=True):
+    all_options = with_own_starts(asked)
+    for plan, options in zip(asked.plans, all_options, strict=True):
         if is_first() and not (plan.out / FINAL).exists():
             write_options(plan.out, options)
     all_seeds = [
-        (plan.out, plan.seed, options) for plan, options in zip(asked.plans, asked.options, strict=True)
+        (plan.out, plan.seed, options) for plan, options in zip(asked.plans, all_options, strict=True)
     ]
     # On several devices one seed after the other: a seed fills them.
     at_once = asked.plans[0].at_once if asked.trainer.mesh is None else 1

@@ -31,17 +31,15 @@ from baselines.purejaxrl_ppo.named_arrays import is_key
 from baselines.purejaxrl_ppo.options import Options
 from baselines.purejaxrl_ppo.ppo import Algorithm, Runner, make_network_for, make_ppo
 from baselines.purejaxrl_ppo.resume import (
-    FINAL,
-    check_free,
     check_same_run,
     describe_run,
-    is_its_folder,
     newest_intact,
-    remove_half_written,
     restore_runner,
+    take_over,
     warn_of_other_bits,
 )
 from baselines.purejaxrl_ppo.run import Metrics, Run
+from baselines.purejaxrl_ppo.run_folder import FINAL, begins, check_free, remove_half_written
 from baselines.purejaxrl_ppo.side_by_side import Ready, finish, groups_of
 from flytrack_env.episodes import EpisodicEnvironment
 from flytrack_env.params import EnvParams
@@ -159,22 +157,23 @@ class Trainer:
         options.check()
         source = options.resume
         check_free(out, source)
+        is_new = begins(out, source)
         description = self.describe(seed, number)
         if self.mesh is not None:
             wait_for_all("checked")  # before the first process writes what the others would find
             shared = {name: value for name, value in description.items() if name != "machine"}
             check_agree("settings", digest([options._replace(report=None), shared]))
         key = jax.random.key(seed)
-        if source is None:
-            forget(out)
-            run = Run(self, out, description, options)
+        if source is None or is_new:
+            if source is None:
+                forget(out)
+            run = Run(self, out, description, options._replace(resume=None))
             return run, Ready(run, self.start(key), 0)
         path, checkpoint = newest_intact(source)
         check_same_run(path, checkpoint, description)
-        if not is_its_folder(out, source):
-            forget(out)
-        elif is_first():
+        if is_first():
             remove_half_written(out)
+        (path,) = take_over([(out, (path, checkpoint))])
         run = Run(self, out, description, options._replace(resume=path), checkpoint.meta)
         update = checkpoint.meta["steps"] // self.config.batch_size
         self.steps = checkpoint.meta["steps"]

@@ -22,7 +22,7 @@ from baselines.purejaxrl_ppo import Config, load_checkpoint
 from baselines.purejaxrl_ppo.config import config_from_json
 from baselines.purejaxrl_ppo.named_arrays import as_named_arrays
 from baselines.purejaxrl_ppo.options import Options
-from baselines.purejaxrl_ppo.resume import FINAL
+from baselines.purejaxrl_ppo.run_folder import FINAL
 from baselines.purejaxrl_ppo.tracking import local_uri
 from baselines.purejaxrl_ppo.training import Trainer, train_policy
 from benchmarks.flown import ROOT

@@ -15,7 +15,8 @@ from typing import Any
 from tqdm import tqdm
 
 from baselines.purejaxrl_ppo import CheckpointError, load_checkpoint
-from baselines.purejaxrl_ppo.resume import FINAL, checkpoints_in, newest_intact
+from baselines.purejaxrl_ppo.resume import newest_intact
+from baselines.purejaxrl_ppo.run_folder import FINAL, checkpoints_in
 from benchmarks.flown import ROOT
 from benchmarks.reliability.section import Section
 

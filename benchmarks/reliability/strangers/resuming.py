@@ -1,5 +1,6 @@
 """Resuming a training from a stranger's checkpoint, as far as the training itself."""
 
+import argparse
 import functools
 from pathlib import Path
 from typing import Any
@@ -10,7 +11,9 @@ import numpy as np
 from baselines.purejaxrl_ppo import Config
 from baselines.purejaxrl_ppo.checkpoint import save_checkpoint
 from baselines.purejaxrl_ppo.named_arrays import as_named_arrays, is_key
-from baselines.purejaxrl_ppo.resume import check_same_run, newest_intact, restore_runner
+from baselines.purejaxrl_ppo.plans import check_plans, make_plans, make_trainer
+from baselines.purejaxrl_ppo.resume import check_same_run, restore_runner
+from baselines.purejaxrl_ppo.train_ppo import make_parser
 from baselines.purejaxrl_ppo.training import Trainer
 
 SEED = 3
@@ -46,8 +49,16 @@ def write_trainings(folder: Path) -> None:
         save_checkpoint(folder / f"{name}.msgpack", params, CONFIG, description, rest)
 
 
+@functools.cache
+def _parser() -> argparse.ArgumentParser:
+    return make_parser()  # it compiles a part of the package to read what it says of itself
+
+
 def resume(path: Path) -> tuple[Any, int]:
-    """Return the state that a training goes on from, and its steps."""
-    found, checkpoint = newest_intact(path)
-    check_same_run(found, checkpoint, _trainer().describe(SEED))
-    return restore_runner(found, checkpoint, _target()), checkpoint.meta["steps"]
+    """Return the state that the command would go on from, with the settings in the file, and its steps."""
+    arguments = _parser().parse_args(["--resume", str(path), "--no-tracking"])
+    (plan,) = make_plans(arguments)
+    assert plan.resume is not None and plan.checkpoint is not None
+    check_plans(make_trainer(arguments, plan), [plan])
+    check_same_run(plan.resume, plan.checkpoint, _trainer().describe(SEED))
+    return restore_runner(plan.resume, plan.checkpoint, _target()), plan.checkpoint.meta["steps"]
