@@ -7,6 +7,7 @@ import numpy as np
 from scipy import stats
 
 from flytrack_env.dynamics import collective_thrust
+from flytrack_env.effects import BY_NAME
 from flytrack_sysid.diagnosis.candidates import BASE_CAUSES
 from flytrack_sysid.diagnosis.linear import Outlook, inflation_of, solve
 from flytrack_sysid.diagnosis.problem import Problem
@@ -121,6 +122,15 @@ def simpler(problem: Problem, found: Found) -> Found | None:
     return None
 
 
+def is_determined(problem: Problem, found: Found, fields: Sequence[str]) -> bool:
+    """Return whether a log tells one of an effect's parameters, those of a model, from having no effect."""
+    places = problem.index(fields)
+    change = np.abs(found.vector[places] - problem.start[places])
+    acting = [field.split(".")[1] not in BY_NAME[field.split(".")[0]].shapes for field in fields]
+    covered = Covered(full_outlook(problem, found.vector), found, fields)
+    return bool(np.any((change > covered.half_widths()) & acting))
+
+
 def _best_instead(problem: Problem, found: Found, fields: Sequence[str]) -> Found | None:
     """Return the best model with one effect more while some base parameters are held, if it is better."""
     vector = found.vector.copy()
@@ -134,6 +144,6 @@ def _best_instead(problem: Problem, found: Found, fields: Sequence[str]) -> Foun
             continue
         trial = with_effect(problem, seen, less, one)
         cost = trial.cost + PER_PARAMETER * one.candidate.price
-        if cost < limit:
+        if cost < limit and is_determined(problem, trial, one.candidate.fields):
             best, limit = trial, cost
     return best

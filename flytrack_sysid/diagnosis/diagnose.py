@@ -18,6 +18,7 @@ from flytrack_sysid.diagnosis.causes import (
     sensor_noise,
 )
 from flytrack_sysid.diagnosis.cautions import cautions
+from flytrack_sysid.diagnosis.doubt import unfounded
 from flytrack_sysid.diagnosis.errors import errors_of
 from flytrack_sysid.diagnosis.lanes import make_lanes, thinned, voltages_of
 from flytrack_sysid.diagnosis.limits import unseen
@@ -161,7 +162,10 @@ def _found(
 
 
 def _held(result: Settled, judge: Problem) -> tuple[Settled, list[str]]:
-    """Return the result without effects that held-out rows contradict, and their names."""
+    """Return the result without effects that held-out rows contradict, and their names.
+
+    Those that the log says too little of are taken back without a word: nothing came and went.
+    """
     lost: list[str] = []
     while True:
         now = [
@@ -169,9 +173,10 @@ def _held(result: Settled, judge: Problem) -> tuple[Settled, list[str]]:
             for effect, weight in result.weighed.items()
             if _is_contradicted(judge, weight, result.found)
         ]
+        lost += now
+        now = now or unfounded(result, judge)
         if not now:
             return result, lost
-        lost += now
         result = reviewed(result.problem, result.base, *taken_back(result.problem, result.found, now))
 
 
