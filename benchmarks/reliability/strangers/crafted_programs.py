@@ -148,7 +148,7 @@ def called(depth: int) -> Step:
 STEPS: tuple[Step, ...] = (
     *(_long, _nested, _many, _tangled, _deep, _remembers, _unfolded, _wide, _multiplies, _convolves, _sorts),
     *(_gathers, _scatters, _slices, _divides),
-    *(called(20), called(150), called(185)),
+    *(called(20), called(90)),
 )
 
 
