@@ -20,8 +20,8 @@ HARMLESS_CALLS = ("Sharding", "SPMDFullToShardShape", "SPMDShardToFullShape", "a
 TALK = ("stablehlo.infeed", "stablehlo.outfeed", "stablehlo.send", "stablehlo.recv")
 LONGEST_TEXT = 500  # characters of what others say of a file, which the file has a say in
 MOST_NAMED = 5
-# Of loops in loops, and functions that call one another, which count twice. The compiler calls itself for each:
-# from 180 on it crashes, a little sooner where a step is part of a larger program than where it is tried out.
+# Of loops in loops, and functions that call one another, which count twice. The compiler calls itself for
+# each, and crashes from 180 on; a little sooner where a step is part of a larger program than in its trial.
 MOST_DEPTH = 64
 CALLS = {"func.call": "callee", "stablehlo.composite": "decomposition"}
 
