@@ -198,7 +198,7 @@ def blackboxes(contents: list[bytes]) -> list[bytes]:
     head = b"\n".join(lines) + b"\n"
     first, frames = lines[0] + b"\n", content[len(head) :]
     line = b"H Field I predictor:" + b",".join([b"0"] * len(BLACKBOX_NAMES)) + b"\n"
-    found += [head + line * 5000 + frames, head + b"H x%d:1\n" * 0 + frames]
+    found += [head + line * 5000 + frames]
     found += [b"".join([head, *(b"H x%d:1\n" % one for one in range(MANY)), frames])]
     found += [first * MANY + END_OF_LOG, (first + END_OF_LOG) * MANY, content * 300, first + END_OF_LOG]
     found += [head + b"H" + b"x" * LONG, head + b"x" * LONG + END_OF_LOG, head + b"\n" * LONG + END_OF_LOG]
