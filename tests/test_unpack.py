@@ -17,7 +17,11 @@ def _deep_maps() -> bytes:
 
 
 def _deep_lists() -> bytes:
-    inner = b"\x93" + b"\xdc\x00\x20" * 1 + (b"\x9f" + b"\x90" * 15) * 2**18
+    """Return an array whose shape is a tree of lists, fifteen in each."""
+    tree = b"\x90"
+    for _ in range(5):
+        tree = b"\x9f" + tree * 15
+    inner = b"\x93" + tree + b"\xa0\xa0"
     return b"\x81\xa1a" + ARRAY % len(inner).to_bytes(4, "big") + inner
 
 

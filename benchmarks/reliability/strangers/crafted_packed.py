@@ -54,9 +54,11 @@ def _arrays() -> list[bytes]:
         (2, b"float32", bytes(8)),
     )
     inner = [msgpack.packb(form) for form in forms]
-    lists = b"\x93\x91" + b"\x9f" + b"\x90" * 15
+    lists = b"\x90"
+    for _ in range(5):
+        lists = b"\x9f" + lists * 15
     inner += [
-        lists,
+        b"\x93" + lists + b"\xa0\xa0",
         b"\x93" + b"\x91" * 400 + b"\xc0",
         b"\x93" + (b"\xdc\x00\x20" + b"\x90" * 31) * 400 + b"\x90",
     ]
