@@ -20,6 +20,10 @@ HARMLESS_CALLS = ("Sharding", "SPMDFullToShardShape", "SPMDShardToFullShape", "a
 TALK = ("stablehlo.infeed", "stablehlo.outfeed", "stablehlo.send", "stablehlo.recv")
 LONGEST_TEXT = 500  # characters of what others say of a file, which the file has a say in
 MOST_NAMED = 5
+# Of loops in loops, and functions that call one another, which count twice. The compiler calls itself for
+# each, and crashes from 180 on; a little sooner where a step is part of a larger program than in its trial.
+MOST_DEPTH = 64
+CALLS = {"func.call": "callee", "stablehlo.composite": "decomposition"}
 
 
 class ArtifactError(ValueError):
@@ -79,15 +83,48 @@ def check_signature(exported: export.Exported, sizes: Sequence[int], num_actions
     )
 
 
-def _operations(operation: Any) -> Iterator[Any]:
-    """Yield an operation and all within it."""
-    open_operations = [operation]
+def _operations(operation: Any) -> Iterator[tuple[Any, int]]:
+    """Yield an operation and all within it, each with how deep it lies there."""
+    open_operations = [(operation, 0)]
     while open_operations:
-        one = open_operations.pop()
-        yield one
+        one, depth = open_operations.pop()
+        yield one, depth
         for region in one.regions:
             for block in region:
-                open_operations += [inner.operation for inner in block]
+                open_operations += [(inner.operation, depth + 1) for inner in block]
+
+
+class _Depths:
+    """How deep the functions of a program are: what lies within, and what is called there."""
+
+    def __init__(self, module: Any):
+        self._functions = {
+            ir.StringAttr(one.operation.attributes["sym_name"]).value: one.operation for one in module.body
+        }
+        self._found: dict[str, int] = {}
+
+    def check(self) -> None:
+        """Raise ArtifactError for a program that is too deep, or without a bottom."""
+        for name in self._functions:
+            self._depth_of(name, MOST_DEPTH)
+
+    def _depth_of(self, name: str, most: int) -> int:
+        if most >= 0 and name not in self._found:
+            self._found[name] = max(
+                depth if callee is None else depth + 1 + self._depth_of(callee, most - depth - 1)
+                for depth, callee in self._calls(name)
+            )
+        if most < 0 or self._found[name] > most:
+            expected = f"at most {MOST_DEPTH} deep"
+            raise ArtifactError(f"found functions and loops that are nested deeper, expected {expected}")
+        return self._found[name]
+
+    def _calls(self, name: str) -> Iterator[tuple[int, str | None]]:
+        """Yield how deep each operation of a function lies in it, and which function it calls, if any."""
+        for one, depth in _operations(self._functions[name]):
+            attribute = CALLS.get(one.name)
+            callee = None if attribute is None else ir.FlatSymbolRefAttr(one.attributes[attribute]).value
+            yield depth, callee
 
 
 def _reaches_out(operation: Any, is_trusted: bool) -> str | None:
@@ -102,7 +139,7 @@ def _reaches_out(operation: Any, is_trusted: bool) -> str | None:
 
 
 def check_closed(content: bytes, exported: export.Exported, is_trusted: bool) -> None:
-    """Raise ArtifactError if an artifact has side effects, calls Python, or calls what it cannot be let call.
+    """Raise ArtifactError if an artifact has side effects, calls what it cannot be let call, or is very deep.
 
     That is any code beside its own, of which there are LAPACK's functions in a process: they take what
     they are given. is_trusted: let it call those.
@@ -111,7 +148,11 @@ def check_closed(content: bytes, exported: export.Exported, is_trusted: bool) ->
     try:
         with make_ir_context():
             module = mlir.deserialize_portable_artifact(exported.mlir_module_serialized)
-            found = [_reaches_out(operation, is_trusted) for operation in _operations(module.operation)]
+            found = [_reaches_out(operation, is_trusted) for operation, _ in _operations(module.operation)]
+            if not is_trusted:
+                _Depths(module).check()
+    except ArtifactError:
+        raise
     except Exception as error:  # as above: the program is read here for the first time
         raise ArtifactError(_cannot(content, error)) from error
     names = list(dict.fromkeys([*effects, *(name for name in found if name is not None)]))

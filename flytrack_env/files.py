@@ -50,19 +50,31 @@ class AtMost(io.RawIOBase):
         return len(part)
 
 
+def open_file(path: Path) -> BinaryIO:
+    """Return a file, opened to be read, unless it is one that may never begin.
+
+    Devices never end: ``AtMost`` does.
+
+    Raises:
+        OSError: a pipe or a socket, or what the system says.
+        ValueError: a NUL in the name.
+    """
+    mode = path.stat().st_mode
+    if stat.S_ISFIFO(mode) or stat.S_ISSOCK(mode):
+        raise OSError(f"{path}: found a pipe or a socket, expected a file")
+    return path.open("rb")
+
+
 def read_at_most(path: Path, most_bytes: int) -> bytes:
     """Return the bytes of a file; never holds many more than it may have.
 
     Raises:
         TooLargeError: it has more; where it says so, it is not opened.
-        OSError: what the system says.
+        OSError: what the system says, or a pipe or a socket.
     """
     try:
-        status = path.stat()
-        if stat.S_ISFIFO(status.st_mode) or stat.S_ISSOCK(status.st_mode):
-            raise OSError(f"{path}: found a pipe or a socket, expected a file")  # it may never end
-        check_size(status.st_size, most_bytes)
-        with path.open("rb") as file:
+        check_size(path.stat().st_size, most_bytes)
+        with open_file(path) as file:
             return AtMost(file, most_bytes).readall()
     except ValueError as error:  # a NUL in the name
         raise OSError(str(error)) from error

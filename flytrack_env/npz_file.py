@@ -15,6 +15,7 @@ from typing import BinaryIO, NamedTuple
 
 import numpy as np
 
+from flytrack_env.files import open_file
 from flytrack_env.words import said, shown
 
 UNPACKED = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)  # whose unpacking zipfile bounds, as it does no other's
@@ -155,7 +156,7 @@ def open_npz(path: Path) -> Iterator[NpzFile]:
         NpzError: no archive, or one whose list of files is too long.
         OSError: what the system says.
     """
-    with path.open("rb") as file:
+    with open_file(path) as file:
         try:
             _check_list(file)
             archive = zipfile.ZipFile(file)
@@ -168,8 +169,13 @@ def open_npz(path: Path) -> Iterator[NpzFile]:
 
 
 def _check_list(file: BinaryIO) -> None:
-    """Raise NpzError for an archive that lists more files than any of ours: the list is read at once."""
+    """Raise NpzError for nothing, and for an archive that lists more files than any of ours.
+
+    The list is read at once.
+    """
     size = file.seek(0, io.SEEK_END)
+    if size == 0:  # so says a device, too, whose end zipfile would look for
+        raise NpzError("not an .npz file, or cut off: found no bytes")
     file.seek(max(size - LONGEST_TAIL, 0))
     tail = file.read(LONGEST_TAIL)
     file.seek(0)

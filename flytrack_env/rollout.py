@@ -16,7 +16,7 @@ from typing import BinaryIO
 import numpy as np
 from numpy.typing import ArrayLike
 
-from flytrack_env.files import write_atomically
+from flytrack_env.files import open_file, write_atomically
 from flytrack_env.npz_file import read_header
 from flytrack_env.state import ACTION_SIZE, APPLIED_ACTION, STATE_SIZE
 from flytrack_env.words import said, shown
@@ -70,7 +70,7 @@ def load_rollout(path: str | Path, allow_pickle: bool = False) -> tuple[np.ndarr
     """
     path = Path(path)
     try:
-        with path.open("rb") as file:
+        with open_file(path) as file:
             is_pickled = _check_header(path, file, allow_pickle)
             rows = np.load(file, allow_pickle=is_pickled)
     except OSError as error:

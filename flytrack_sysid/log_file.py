@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, TextIO
 
 import numpy as np
 
-from flytrack_env.files import AtMost, TooLargeError, check_size, write_atomically
+from flytrack_env.files import AtMost, TooLargeError, check_size, open_file, write_atomically
 from flytrack_env.npz_file import Header, NpzError, NpzFile, open_npz
 from flytrack_env.words import named, said, shown
 from flytrack_sysid.log import CHANNELS, GAP_STEPS, FlightLog, LogError, usual_step
@@ -164,7 +164,7 @@ def _read_array(path: Path, archive: NpzFile, name: str) -> np.ndarray:
 
 def _read_csv(path: Path) -> Table:
     """Return the columns of a CSV file."""
-    with path.open("rb") as file:
+    with open_file(path) as file:
         content = io.BufferedReader(AtMost(file, LARGEST_BYTES))
         text = io.TextIOWrapper(content, encoding="utf-8-sig", newline="")
         rows = csv.reader(_lines(text), strict=True)

@@ -131,6 +131,9 @@ def load_script(path: str | Path) -> Script:
     for name in ("starts", "commands"):
         if arrays[name].dtype.kind not in "iuf":
             raise ScriptError(f"{path}: {name}: found {_described(arrays[name])}, expected numbers")
+    number, starts = len(arrays["kinds"]), arrays["starts"].shape
+    if number and starts != (number, STATE_SIZE):  # else a name for nothing, twenty times its room
+        raise ScriptError(f"{path}: starts: found shape {starts}, expected ({number}, {STATE_SIZE})")
     kinds = tuple(arrays["kinds"].tolist())
     script = Script(kinds, arrays["starts"].astype(float), arrays["commands"].astype(float))
     check_script(script, str(path))

@@ -58,6 +58,38 @@ def solving(x: jax.Array, u: jax.Array) -> jax.Array:
     return x.at[:4].set(jnp.linalg.svd(jnp.eye(4) + u, compute_uv=False))
 
 
+def calling(depth: int) -> Callable[..., Any]:
+    """Return functions that call one another."""
+
+    def outer(inner: Callable[..., Any]) -> Callable[..., Any]:
+        return jax.jit(lambda x, u: 0.5 * inner(x, u))
+
+    step: Callable[..., Any] = lambda x, u: x  # noqa: E731
+    for _ in range(depth):
+        step = outer(step)
+    return step
+
+
+def branching(depth: int) -> Callable[..., Any]:
+    """Return conditions in conditions."""
+
+    def step(x: jax.Array, u: jax.Array, left: int = depth) -> jax.Array:
+        if left == 0:
+            return 0.5 * x
+        return jax.lax.cond(x[0] > left, lambda: step(x, u, left - 1), lambda: x)
+
+    return step
+
+
+@pytest.mark.parametrize("make", [calling, branching])
+def test_what_is_nested_deeply_is_refused_before_it_crashes_the_compiler(
+    make: Callable[[int], Callable[..., Any]], tmp_path: Path
+) -> None:
+    assert load(write(tmp_path / "some.bin", make(25))).state_size == 21
+    with pytest.raises(BlackBoxError, match=r"deep\.bin: found functions and loops that are nested deeper"):
+        load(write(tmp_path / "deep.bin", make(80)))
+
+
 def test_the_shipped_one_is_known_and_not_tried(trials: list[bytes]) -> None:
     assert hashlib.sha256(SHIPPED.read_bytes()).hexdigest() == blackbox.SHIPPED_SHA256
     load(SHIPPED)

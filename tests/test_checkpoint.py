@@ -117,7 +117,11 @@ def with_checksum(content):
     ("content", "reason"),
     [
         (b"\xdd" + (2**22).to_bytes(4, "big") + b"\x80" * 2**22, "not a checkpoint, or damaged"),
-        (msgpack.packb({f"{number:06d}": {} for number in range(100_001)}), "found more than 100000 entries"),
+        (
+            msgpack.packb({str(one): {str(other): {} for other in range(1000)} for one in range(100)}),
+            "found more than 100000 entries",
+        ),
+        (msgpack.packb({f"{number:06d}": {} for number in range(100_001)}), "100001 exceeds max_map_len"),
         (b"\x81\xa1a" * 5000 + b"\xc0", "not a checkpoint, or damaged"),
         (b"\x82\xa1a\x01\xa1a\x02", "found names that are not 2 different short texts"),
         (msgpack.packb({"x" * 201: 1}), "found names that are not 1 different short texts"),

@@ -42,6 +42,7 @@ def test_every_broken_promise_is_reported_and_nothing_else(planted):
     assert list(BROKEN) == list(FAULTS)
     sorts = Counter(sort for sort, _ in BROKEN.values())
     assert (planted["loaded"], planted["refused"], planted["broken"]) == (1, 5, sorts)
+    assert planted["crafted"] == len(FAULTS) and planted["failure"] is None
     assert not files.is_held({"kinds": {"planted": planted}})
 
 
@@ -58,18 +59,48 @@ def test_a_share_of_some_kinds_keeps_the_promise(tmp_path, monkeypatch):
     assert files.SECTION.is_held(result), result
     for found in result["kinds"].values():
         assert found["files"] == 200 == found["loaded"] + found["refused"]
+        assert 30 < found["crafted"] < 150 and found["failure"] is None
         assert found["loaded"] > 3 and found["refused"] > 100
     text = files.SECTION.as_markdown(result)
-    assert "| rollout (`.npy`) | 200 |" in text and "Broken" not in text
+    assert (
+        f"| rollout (`.npy`) | 200 | {result['kinds']['rollout']['crafted']} |" in text
+        and "Broken" not in text
+    )
 
 
 def test_examples_of_what_broke_are_on_the_page():
     example = {"number": 7, "sort": "crash", "text": "the process ended with -11"}
-    found = {"files": 9, "loaded": 1, "refused": 7, "broken": {"crash": 1}, "slowest_s": 0.1, "cpu_s": 1.0}
+    found = {
+        "files": 9,
+        "crafted": 4,
+        "loaded": 1,
+        "refused": 7,
+        "broken": {"crash": 1},
+        "slowest_s": 0.1,
+        "cpu_s": 1.0,
+    }
     result = {"seed": 3, "kinds": {"black_box": {**found, "examples": [example]}}}
     text = files.SECTION.as_markdown(result)
-    assert "| black box (`acro_step.bin`) | 9 | 1 | 7 | 1 | 0.1 |" in text
+    assert "| black box (`acro_step.bin`) | 9 | 4 | 1 | 7 | 1 | 0.1 |" in text
     assert "seed 3" in text and "number 7: crash: `the process ended with -11`" in text
+
+
+def test_figures_of_before_crafted_files_were_counted_are_shown():
+    found = {"files": 9, "loaded": 1, "refused": 8, "broken": {}, "examples": [], "slowest_s": 0.1}
+    result = {"seed": 3, "kinds": {"track": found}}
+    assert "| track (`.toml`) | 9 | not counted | 1 | 8 | 0 | 0.1 |" in files.SECTION.as_markdown(result)
+    assert files.SECTION.is_held(result)
+
+
+def test_a_failed_measurement_of_a_kind_is_shown_and_loses_no_other(tmp_path, monkeypatch):
+    monkeypatch.setattr(files, "KINDS", dict.fromkeys(("no_such_kind", "rollout")))
+    monkeypatch.setitem(files.TITLES, "no_such_kind", "none")
+    result = json.loads(json.dumps(files.SECTION.measure(0, 0.0005, tmp_path)))
+    assert not files.SECTION.is_held(result)
+    text = files.SECTION.as_markdown(result)
+    assert "| none | 0 | 0 | 0 | 0 | 0, then the measurement failed | 0 |" in text
+    assert "- none: the measurement failed: `" in text and "found 'no_such_kind'" in text
+    assert result["kinds"]["rollout"]["files"] == 5 and result["kinds"]["rollout"]["failure"] is None
 
 
 def test_every_kind_has_a_title():

@@ -2,6 +2,7 @@
 
 import io
 import json
+import tracemalloc
 from pathlib import Path
 from typing import Any
 
@@ -149,6 +150,20 @@ def test_bad_scripts_are_refused(tmp_path, message):
     path.write_bytes(buffer.getvalue())
     with pytest.raises(ScriptError, match=f"bad.npz: .*{message}"):
         load_script(path)
+
+
+def test_names_without_flights_take_no_memory(tmp_path):
+    path, script = tmp_path / "names.npz", made("headings")
+    names = np.full(2**20, "\U0001f681" * 2)
+    np.savez(path, kinds=names, starts=script.starts, commands=script.commands)
+    del names
+    tracemalloc.start()
+    try:
+        with pytest.raises(ScriptError, match=r"starts: found shape \(8, 21\), expected \(1048576, 21\)"):
+            load_script(path)
+        assert tracemalloc.get_traced_memory()[1] < 2**26
+    finally:
+        tracemalloc.stop()
 
 
 def test_files_that_are_no_scripts_are_refused(tmp_path):

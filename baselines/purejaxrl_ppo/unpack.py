@@ -15,6 +15,8 @@ from flytrack_env.words import said
 
 LARGEST_BYTES = 3 * 2**27  # of a file: a little more than twice that in memory, below 1 GiB
 MOST_ENTRIES = 100_000  # of all maps together
+MOST_IN_MAP = 2000  # of one, which is made room for before it is counted, as are all that it lies in
+LONGEST_TEXT = 2**24  # bytes: one wide character makes all of a text four times as large
 LONGEST_NAME = 200  # characters
 MOST_DIMENSIONS = 32
 ARRAY = 1  # flax's number of arrays among msgpack's extensions
@@ -42,6 +44,19 @@ class _Maps:
         return dict(pairs)
 
 
+class _Lists:
+    """Lets through the lists of an array: its shape, and what the shape stands in."""
+
+    def __init__(self) -> None:
+        self._number = 0
+
+    def __call__(self, values: list[Any]) -> list[Any]:
+        self._number += 1
+        if self._number > 2:
+            raise UnpackError("found lists in lists, expected an array's shape, type and bytes")
+        return values
+
+
 def _is_name(value: Any) -> bool:
     return isinstance(value, str) and len(value) <= LONGEST_NAME and value.isprintable()
 
@@ -50,7 +65,9 @@ def _array(code: int, data: bytes) -> np.ndarray:
     """Return an array: packed are its shape, the name of its type, and its bytes."""
     if code != ARRAY:
         raise UnpackError(f"found an extension {code}, expected arrays")
-    shape, name, content = msgpack.unpackb(data, raw=True, max_array_len=MOST_DIMENSIONS, max_map_len=0)
+    shape, name, content = msgpack.unpackb(
+        data, raw=True, max_array_len=MOST_DIMENSIONS, max_map_len=0, list_hook=_Lists()
+    )
     if not DTYPE.fullmatch(text := name.decode()):
         raise UnpackError("found an array of an unknown type, expected numbers")
     dtype = jnp.dtype(text)
@@ -69,7 +86,13 @@ def unpack(content: bytes) -> Any:
     """
     try:
         return msgpack.unpackb(
-            content, raw=False, max_array_len=0, ext_hook=_array, object_pairs_hook=_Maps()
+            content,
+            raw=False,
+            max_array_len=0,
+            max_map_len=MOST_IN_MAP,
+            max_str_len=LONGEST_TEXT,
+            ext_hook=_array,
+            object_pairs_hook=_Maps(),
         )
     except UnpackError:
         raise

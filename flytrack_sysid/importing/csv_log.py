@@ -2,19 +2,19 @@
 
 import contextlib
 import csv
-import gzip
 import io
 import math
 import zlib
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, BinaryIO, TextIO, cast
+from typing import BinaryIO, TextIO, cast
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from flytrack_env.files import AtMost
+from flytrack_env.files import AtMost, check_size, open_file
 from flytrack_env.words import named, said, shown
+from flytrack_sysid.importing import gunzip
 from flytrack_sysid.importing.flight import Flight
 from flytrack_sysid.importing.mapping import Attitude, Columns, Command, Mapping, Vector
 from flytrack_sysid.importing.units import quaternion_from, vector_from
@@ -22,13 +22,11 @@ from flytrack_sysid.log import CHANNELS, LogError
 from flytrack_sysid.log_file import LARGEST_BYTES
 from flytrack_sysid.log_table import LARGEST_NORM_ERROR, Rows, Table, log_of_table
 
-if TYPE_CHECKING:
-    import _csv
-
 PACKED_BYTES, LARGEST_RATIO = (
     2**24,
     32,
 )  # what a compressed file may hold: that much, or as many times its size
+LONGEST_ROW = 2**16  # characters: thousands of columns
 LONGEST_LIST = 1000  # characters of a header
 
 
@@ -69,11 +67,12 @@ def _opened(path: Path) -> Iterator[TextIO]:
     What is raised while it is read becomes a LogError.
     """
     try:
-        with path.open("rb") as file:
-            most_bytes, unpacked = LARGEST_BYTES, cast(BinaryIO, file)
+        with open_file(path) as file:
+            most_bytes, unpacked = LARGEST_BYTES, file
+            check_size(path.stat().st_size, LARGEST_BYTES)
             if path.suffix == ".gz":
                 most_bytes = min(most_bytes, max(PACKED_BYTES, LARGEST_RATIO * path.stat().st_size))
-                unpacked = cast(BinaryIO, gzip.GzipFile(fileobj=file))
+                unpacked = cast(BinaryIO, gunzip.Gunzip(file))
             content = io.BufferedReader(AtMost(unpacked, most_bytes))
             yield io.TextIOWrapper(content, encoding="utf-8-sig", newline="")
     # ValueError: UnicodeDecodeError, or a NUL in the name.
@@ -83,20 +82,46 @@ def _opened(path: Path) -> Iterator[TextIO]:
         raise LogError(f"{path}: cannot be read as text: {said(error)}") from error
 
 
+class _Rows:
+    """The rows of a CSV file, lists of cells; csv itself would read all of an endless one first."""
+
+    def __init__(self, text: TextIO, delimiter: str):
+        self._text, self._num_characters = text, 0
+        self._rows = csv.reader(self._lines(), delimiter=delimiter, strict=True)
+
+    def _lines(self) -> Iterator[str]:
+        """Yield the lines of the file, of which a row may have several."""
+        while line := self._text.readline(LONGEST_ROW):
+            self._num_characters += len(line)
+            if self._num_characters >= LONGEST_ROW:
+                raise csv.Error(f"found a row of {LONGEST_ROW} characters or more, expected fewer")
+            yield line
+
+    def __iter__(self) -> Iterator[list[str]]:
+        for cells in self._rows:
+            self._num_characters = 0
+            yield cells
+
+    @property
+    def line_num(self) -> int:
+        """Number of lines read."""
+        return self._rows.line_num
+
+
 def _read(path: Path, columns: Columns, mapping: str) -> Table:
     """Return the columns that the mapping names, as they are in the file."""
     with _opened(path) as text:
-        rows = csv.reader(text, delimiter=columns.delimiter, strict=True)
+        rows = _Rows(text, columns.delimiter)
         try:
             return _table(path, rows, columns, mapping)
         except csv.Error as error:
             raise LogError(f"{path}: near line {rows.line_num + 1}: not a CSV file: {said(error)}") from error
 
 
-def _table(path: Path, rows: "_csv.Reader", columns: Columns, mapping: str) -> Table:
+def _table(path: Path, rows: _Rows, columns: Columns, mapping: str) -> Table:
     """Return the columns that the mapping names, of the rows of a file, the first of which has the names."""
     wanted = _wanted(columns)
-    header = [name.strip() for name in next(rows, [])]
+    header = [name.strip() for name in next(iter(rows), [])]
     for name, table in wanted.items():
         if header.count(name) != 1:
             found = f"found {header.count(name)} times among {', '.join(map(named, header))[:LONGEST_LIST]}"

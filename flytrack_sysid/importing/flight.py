@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from flytrack_env.files import AtMost
+from flytrack_env.files import AtMost, open_file
 from flytrack_env.words import named, said, shown
 from flytrack_sysid.importing.craft import Craft
 from flytrack_sysid.importing.mapping import Manifest, Mapping
@@ -55,7 +55,7 @@ def _count_of(path: Path, asked: Manifest) -> int:
     if manifest.name != asked.file:
         raise LogError(f"{where}: expected the name of a file beside the log, not a path")
     try:
-        with manifest.open("rb") as file:
+        with open_file(manifest) as file:
             content = io.BufferedReader(AtMost(file, LARGEST_MANIFEST_BYTES))
             text = io.TextIOWrapper(content, encoding="utf-8-sig", newline="")
             count = _find_count(where, csv.reader(text, strict=True), asked, path.name)

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from flytrack_env.files import check_size
+from flytrack_env.files import check_size, open_file
 from flytrack_env.words import said
 from flytrack_sysid.importing.craft import Craft
 from flytrack_sysid.importing.decoding import decode
@@ -75,7 +75,7 @@ class _Topics:
         self.path = path
         try:
             check_size(path.stat().st_size, LARGEST_BYTES)
-            with path.open("rb") as file:
+            with open_file(path) as file:
                 found = file.read(len(FIRST_BYTES))
         except OSError as error:
             raise LogError(f"{path}: cannot be read: {said(error)}") from error

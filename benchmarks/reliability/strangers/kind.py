@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 from benchmarks.reliability.strangers.noise import Rng
 
 Mutator = Callable[[Rng, list[bytes]], bytes]
+Hostile = Callable[[list[bytes]], list[bytes]]  # of files that are well, makes files that are meant to harm
 
 
 def _no_files(_: list[bytes]) -> list[bytes]:
@@ -27,4 +28,4 @@ class Kind(NamedTuple):
     error: type[Exception]
     check: Callable[[Any], None]
     mutate: Mutator
-    hostile: Callable[[list[bytes]], list[bytes]] = _no_files
+    hostile: Hostile = _no_files

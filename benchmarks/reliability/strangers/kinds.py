@@ -1,6 +1,5 @@
 """Every kind of file that is read: how it is written, damaged and loaded, and what may come of it."""
 
-import csv
 import gzip
 import io
 import json
@@ -13,9 +12,21 @@ import numpy as np
 
 from baselines.purejaxrl_ppo import CheckpointError, load_checkpoint
 from baselines.purejaxrl_ppo.config import ConfigError, settings_in_file
-from benchmarks.reliability.strangers import archives, flight_logs, packed, programs, seeds, soundness
-from benchmarks.reliability.strangers.kind import Kind, Mutator
-from benchmarks.reliability.strangers.noise import Rng, damage, damage_text
+from benchmarks.reliability.strangers import (
+    archives,
+    crafted_arrays,
+    crafted_logs,
+    crafted_packed,
+    crafted_programs,
+    crafted_texts,
+    flight_logs,
+    packed,
+    programs,
+    seeds,
+    soundness,
+)
+from benchmarks.reliability.strangers.kind import Hostile, Kind, Mutator
+from benchmarks.reliability.strangers.noise import Rng, damage, damage_cells, damage_text
 from benchmarks.reliability.strangers.resuming import resume, write_trainings
 from benchmarks.reliability.strangers.trees import as_json, as_toml, damage_tree
 from flytrack_env import ModelFileError, TrackError, load_model, load_provenance, load_track
@@ -72,63 +83,19 @@ def _reference(rng: Rng, contents: list[bytes]) -> bytes:
     return archives.damage_npz(rng, arrays, {"notes": damaged})
 
 
-def _bombs(contents: list[bytes]) -> list[bytes]:
-    return archives.bombs(_arrays(contents[0]))
+def _of_arrays(hostile: Callable[[archives.Arrays], list[bytes]]) -> Hostile:
+    """Return what makes hostile archives of the first that is well."""
+    return lambda contents: hostile(_arrays(contents[0]))
 
 
-def _cells(rng: Rng, contents: list[bytes]) -> bytes:
-    """Change whole cells and columns of a CSV file."""
-    rows = list(csv.reader(io.StringIO(_one(rng, contents).decode())))
-    for _ in range(int(rng.integers(1, 4))):
-        row = rows[int(rng.integers(len(rows)))]
-        if not row:
-            continue
-        at, way = int(rng.integers(len(row))), rng.random()
-        if way < 0.6:
-            odd = (
-                "nan",
-                "inf",
-                "",
-                " ",
-                "1e308",
-                "-5",
-                "x",
-                "1e-400",
-                "1" * 400,
-                '"',
-                "0x10",
-                "1_0",
-                "7" * 9,
-            )
-            row[at] = str(odd[int(rng.integers(len(odd)))])
-        elif way < 0.7:
-            del row[at]
-        elif way < 0.8:
-            row.insert(at, row[at])
-        else:
-            for other in rows:
-                other[at:at] = other[at : at + 1]
-    text = io.StringIO()
-    csv.writer(text, lineterminator="\n").writerows(rows)
-    return text.getvalue().encode()
+def _of_texts(hostile: Hostile) -> Hostile:
+    """Return what makes hostile texts: those of a kind, and such as are long in one way each."""
+    return lambda contents: [*hostile(contents), *crafted_texts.endless(contents)]
 
 
 def _packed_text(rng: Rng, contents: list[bytes]) -> bytes:
     text = damage_text(rng, [gzip.decompress(_one(rng, contents))])
     return gzip.compress(text, 1, mtime=0)
-
-
-def _packed_bombs(contents: list[bytes]) -> list[bytes]:
-    header = gzip.decompress(contents[0]).split(b"\n")[0] + b"\n"
-    row = b",".join([b"0"] * (header.count(b",") + 1)) + b"\n"
-    texts = [header + b"\n" * 2**26, header + row * 2**22, b"x" * 2**26, header + b'"' + b"\n" * 2**24]
-    return [gzip.compress(text, 6, mtime=0) for text in texts]
-
-
-def _texts(contents: list[bytes]) -> list[bytes]:
-    """Return texts that are long in one way each."""
-    dots, quotes = b"a" + b".a" * 2**16 + b" = 1\n", b'"' + b"x" * 2**20
-    return [dots, quotes, b"[" * 2**20, b"0," * 2**19, b"\n" * 2**22]
 
 
 def _import(form: str) -> Callable[[Path], Any]:
@@ -152,10 +119,18 @@ def _import_by_mapping(path: Path) -> Any:
 
 _TEXT = _either((0.3, damage), (0.35, damage_text), (0.35, _toml))
 _ARRAYS = _either((0.3, damage), (0.7, _npz))
-_TABLE = _either((0.2, damage), (0.4, damage_text), (0.4, _cells))
+_TABLE = _either((0.2, damage), (0.4, damage_text), (0.4, damage_cells))
 
 KINDS: dict[str, Kind] = {
-    "track": Kind(".toml", seeds.write_tracks, load_track, TrackError, soundness.track, _TEXT, _texts),
+    "track": Kind(
+        ".toml",
+        seeds.write_tracks,
+        load_track,
+        TrackError,
+        soundness.track,
+        _TEXT,
+        _of_texts(crafted_texts.tomls),
+    ),
     "model": Kind(
         ".json",
         seeds.write_models,
@@ -163,7 +138,7 @@ KINDS: dict[str, Kind] = {
         ModelFileError,
         soundness.model,
         _either((0.3, damage), (0.3, damage_text), (0.4, _json)),
-        _texts,
+        _of_texts(crafted_texts.models),
     ),
     "rollout": Kind(
         ".npy",
@@ -172,10 +147,35 @@ KINDS: dict[str, Kind] = {
         RolloutError,
         soundness.rollout,
         _either((0.3, damage), (0.7, _npy)),
+        lambda contents: crafted_arrays.hostile_rollouts(np.load(io.BytesIO(contents[0]))),
     ),
-    "log_npz": Kind(".npz", seeds.write_logs(".npz"), load_log, LogError, soundness.log, _ARRAYS, _bombs),
-    "log_csv": Kind(".csv", seeds.write_logs(".csv"), load_log, LogError, soundness.log, _TABLE, _texts),
-    "script": Kind(".npz", seeds.write_scripts, load_script, ScriptError, soundness.script, _ARRAYS, _bombs),
+    "log_npz": Kind(
+        ".npz",
+        seeds.write_logs(".npz"),
+        load_log,
+        LogError,
+        soundness.log,
+        _ARRAYS,
+        _of_arrays(crafted_arrays.hostile_logs),
+    ),
+    "log_csv": Kind(
+        ".csv",
+        seeds.write_logs(".csv"),
+        load_log,
+        LogError,
+        soundness.log,
+        _TABLE,
+        _of_texts(crafted_texts.logs_csv),
+    ),
+    "script": Kind(
+        ".npz",
+        seeds.write_scripts,
+        load_script,
+        ScriptError,
+        soundness.script,
+        _ARRAYS,
+        _of_arrays(crafted_arrays.hostile_scripts),
+    ),
     "reference": Kind(
         ".npz",
         seeds.write_references,
@@ -183,13 +183,25 @@ KINDS: dict[str, Kind] = {
         ReferenceFileError,
         soundness.reference,
         _either((0.3, damage), (0.7, _reference)),
-        _bombs,
+        _of_arrays(crafted_arrays.hostile_references),
     ),
     "mapping": Kind(
-        ".toml", seeds.write_mappings, _import_by_mapping, LogError, soundness.imported, _TEXT, _texts
+        ".toml",
+        seeds.write_mappings,
+        _import_by_mapping,
+        LogError,
+        soundness.imported,
+        _TEXT,
+        _of_texts(crafted_texts.mappings),
     ),
     "import_csv": Kind(
-        ".csv", seeds.write_foreign_csv, _import("csv"), LogError, soundness.imported, _TABLE, _texts
+        ".csv",
+        seeds.write_foreign_csv,
+        _import("csv"),
+        LogError,
+        soundness.imported,
+        _TABLE,
+        _of_texts(crafted_texts.imported_csvs),
     ),
     "import_gz": Kind(
         ".csv.gz",
@@ -198,7 +210,7 @@ KINDS: dict[str, Kind] = {
         LogError,
         soundness.imported,
         _either((0.5, damage), (0.5, _packed_text)),
-        _packed_bombs,
+        crafted_logs.packed_csvs,
     ),
     "ulog": Kind(
         ".ulg",
@@ -207,7 +219,7 @@ KINDS: dict[str, Kind] = {
         LogError,
         soundness.imported,
         _either((0.4, damage), (0.6, flight_logs.damage_ulog)),
-        lambda contents: flight_logs.hostile_ulogs(contents[0]),
+        crafted_logs.ulogs,
     ),
     "betaflight": Kind(
         ".bbl",
@@ -216,10 +228,16 @@ KINDS: dict[str, Kind] = {
         LogError,
         soundness.imported,
         _either((0.4, damage), (0.6, flight_logs.damage_blackbox)),
-        lambda contents: flight_logs.hostile_blackboxes(contents[0]),
+        crafted_logs.blackboxes,
     ),
     "settings": Kind(
-        ".toml", seeds.write_settings, settings_in_file, ConfigError, soundness.settings, _TEXT, _texts
+        ".toml",
+        seeds.write_settings,
+        settings_in_file,
+        ConfigError,
+        soundness.settings,
+        _TEXT,
+        _of_texts(crafted_texts.settings),
     ),
     "checkpoint": Kind(
         ".msgpack",
@@ -228,7 +246,7 @@ KINDS: dict[str, Kind] = {
         CheckpointError,
         soundness.checkpoint,
         _either((0.3, damage), (0.7, packed.damage_checkpoint)),
-        lambda _: packed.hostile_checkpoints(),
+        crafted_packed.hostile_policies,
     ),
     "resume": Kind(
         ".msgpack",
@@ -237,6 +255,7 @@ KINDS: dict[str, Kind] = {
         CheckpointError,
         soundness.runner,
         _either((0.1, damage), (0.9, packed.damage_checkpoint)),
+        crafted_packed.hostile_trainings,
     ),
     "black_box": Kind(
         ".bin",
@@ -245,6 +264,6 @@ KINDS: dict[str, Kind] = {
         BlackBoxError,
         soundness.black_box,
         _either((0.4, damage), (0.6, programs.damage_program)),
-        lambda _: programs.hostile_programs(),
+        crafted_programs.on_purpose,
     ),
 }

@@ -1,5 +1,7 @@
 """Damage that knows nothing of a file's format, and damage to text."""
 
+import csv
+import io
 import re
 from collections.abc import Callable, Sequence
 
@@ -149,3 +151,40 @@ def _move_lines(rng: Rng, content: bytes) -> bytes:
     size = sum(map(len, block)) + len(block)
     times = min(int(rng.integers(2, 200)), LARGEST_BYTES // size)
     return b"\n".join(lines[:start] + block * times + lines[end + 1 :])
+
+
+def damage_cells(rng: Rng, contents: Sequence[bytes]) -> bytes:
+    """Change whole cells and columns of a CSV file."""
+    rows = list(csv.reader(io.StringIO(contents[int(rng.integers(len(contents)))].decode())))
+    for _ in range(int(rng.integers(1, 4))):
+        row = rows[int(rng.integers(len(rows)))]
+        if not row:
+            continue
+        at, way = int(rng.integers(len(row))), rng.random()
+        if way < 0.6:
+            odd = (
+                "nan",
+                "inf",
+                "",
+                " ",
+                "1e308",
+                "-5",
+                "x",
+                "1e-400",
+                "1" * 400,
+                '"',
+                "0x10",
+                "1_0",
+                "7" * 9,
+            )
+            row[at] = str(odd[int(rng.integers(len(odd)))])
+        elif way < 0.7:
+            del row[at]
+        elif way < 0.8:
+            row.insert(at, row[at])
+        else:
+            for other in rows:
+                other[at:at] = other[at : at + 1]
+    text = io.StringIO()
+    csv.writer(text, lineterminator="\n").writerows(rows)
+    return text.getvalue().encode()

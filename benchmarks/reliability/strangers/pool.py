@@ -20,6 +20,7 @@ START_S, WAIT_S = (
 )  # on the clock: until a worker is ready; for a load, which may wait for a trial
 MOST_EXAMPLES = 10  # kept of each sort that is broken
 MOST_DEATHS = 200  # of workers of a kind: what ends one so often is known by then
+LONGEST_FAILURE = 600  # characters
 KEPT = ("loaded", "refused")
 
 
@@ -79,7 +80,7 @@ def _command(kind: str, seed: int, first: int, last: int, folder: Path, kinds: s
 def outcomes(kind: str, seed: int, count: int, folder: Path, kinds: str) -> Iterator[dict[str, Any]]:
     """Yield what came of each of a kind's files, by number; what ended a worker is one of them.
 
-    kinds: the module that has the kind.
+    ``is_crafted`` says which were made on purpose. kinds: the module that has the kind.
 
     Raises:
         WorkerError: a mistake in the measurement.
@@ -89,18 +90,26 @@ def outcomes(kind: str, seed: int, count: int, folder: Path, kinds: str) -> Iter
         with log.open("wb") as errors:
             worker = _Worker(_command(kind, seed, number, count, folder, kinds), errors)
         try:
-            if worker.line(START_S) is None:
+            ready = worker.line(START_S)
+            if ready is None:
                 raise WorkerError(f"{kind}: {worker.death()}: {log.read_text(errors='replace')[-2000:]}")
+            crafted = range(ready["ready"], ready["ready"] + ready["hostile"])
             while number < count:
                 found = worker.line(WAIT_S)
+                is_alive = found is not None
                 if found is None:
                     sort, text = worker.death()
                     said = log.read_text(errors="replace").strip().splitlines() or [""]
-                    yield {"number": number, "sort": sort, "text": f"{text}: {said[-1]}"[:600], "cpu_s": 0.0}
-                    number += 1
-                    break
-                yield found
+                    found = {
+                        "number": number,
+                        "sort": sort,
+                        "text": f"{text}: {said[-1]}"[:600],
+                        "cpu_s": 0.0,
+                    }
                 number = found["number"] + 1
+                yield {**found, "is_crafted": found["number"] in crafted}
+                if not is_alive:
+                    break
         finally:
             worker.close()
         if number >= count:
@@ -117,24 +126,31 @@ def measure_kind(
 ) -> dict[str, Any]:
     """Return what came of a kind's files, as JSON values; ``tell`` is called after each.
 
-    files, loaded, refused; broken: number by sort; examples of the broken; slowest_s and cpu_s, of
-    processor time.
+    files, crafted (those of them made on purpose), loaded, refused; broken: number by sort; examples of the
+    broken; failure: what ended the measurement before all were judged, None if nothing did; slowest_s and
+    cpu_s, of processor time.
     """
     sorts: Counter[str] = Counter()
     examples: list[dict[str, Any]] = []
-    slowest_s, cpu_s = 0.0, 0.0
-    for found in outcomes(kind, seed, count, folder, kinds):
-        sort = found["sort"]
-        sorts[sort] += 1
-        if sort not in KEPT and sorts[sort] <= MOST_EXAMPLES:
-            examples.append({"number": found["number"], "sort": sort, "text": found["text"]})
-        slowest_s, cpu_s = max(slowest_s, found["cpu_s"]), cpu_s + found["cpu_s"]
-        tell()
+    slowest_s, cpu_s, num_crafted, failure = 0.0, 0.0, 0, None
+    try:
+        for found in outcomes(kind, seed, count, folder, kinds):
+            sort = found["sort"]
+            sorts[sort] += 1
+            num_crafted += found["is_crafted"]
+            if sort not in KEPT and sorts[sort] <= MOST_EXAMPLES:
+                examples.append({"number": found["number"], "sort": sort, "text": found["text"]})
+            slowest_s, cpu_s = max(slowest_s, found["cpu_s"]), cpu_s + found["cpu_s"]
+            tell()
+    except WorkerError as error:  # what was found so far, and of other kinds, is not lost
+        failure = str(error)[-LONGEST_FAILURE:]
     return {
         "files": sorts.total(),
+        "crafted": num_crafted,
         **{sort: sorts[sort] for sort in KEPT},
         "broken": {sort: number for sort, number in sorts.items() if sort not in KEPT},
         "examples": examples,
+        "failure": failure,
         "slowest_s": round(slowest_s, 2),
         "cpu_s": round(cpu_s, 1),
     }

@@ -17,16 +17,22 @@ FULL, REDUCED, ACTION = 21, 18, 4
 HEAD_SHARE = 0.3  # of damage that goes to what stands around the program
 
 
-def _export(
+def exported(
     step: Step, sizes: tuple[int, ...] = (FULL, ACTION), dtype: Any = jnp.float32, **options: Any
-) -> bytes:
-    """Return a function as an artifact's bytes."""
+) -> export.Exported:
+    """Return a function as an artifact."""
     options.setdefault("platforms", ["cpu"])
     forms = [jax.ShapeDtypeStruct((size,), dtype) for size in sizes]
-    return bytes(export.export(jax.jit(step), **options)(*forms).serialize())
+    return export.export(jax.jit(step), **options)(*forms)
 
 
-def _fall(x: jax.Array, u: jax.Array) -> jax.Array:
+def serialized(step: Step, *arguments: Any, **options: Any) -> bytes:
+    """Return a function as an artifact's bytes; arguments and options: of ``exported``."""
+    return bytes(exported(step, *arguments, **options).serialize())
+
+
+def fall(x: jax.Array, u: jax.Array) -> jax.Array:
+    """Return the state of what falls, pushed about by the sticks."""
     velocity = x[3:6] + 0.01 * jnp.array([u[0], u[1], u[3] - 9.81])
     return x.at[0:3].add(0.01 * velocity).at[3:6].set(velocity).at[-1].add(-1e-4)
 
@@ -43,10 +49,10 @@ def _substeps(x: jax.Array, u: jax.Array) -> jax.Array:
 def write_plants(folder: Path) -> None:
     """Write small plants: a few operations, a loop, and one of the reduced state."""
     contents = [
-        _export(_fall),
-        _export(_substeps),
-        _export(_turn),
-        _export(_fall, (REDUCED, ACTION)),
+        serialized(fall),
+        serialized(_substeps),
+        serialized(_turn),
+        serialized(fall, (REDUCED, ACTION)),
     ]
     for number, content in enumerate(contents):
         (folder / f"plant{number}.bin").write_bytes(content)
@@ -72,16 +78,16 @@ def hostile_programs() -> list[bytes]:
     """Return programs that hang, eat memory, call Python, LAPACK or nothing there is, or are no plant."""
     trusted = {name: [export.DisabledSafetyCheck.custom_call(name)] for name in (CALLBACK, "no_such_target")}
     return [
-        _export(_forever),
-        _export(_hungry),
-        *(_export(_calling(name), disabled_checks=checks) for name, checks in trusted.items()),
-        _export(lambda x, u: x.at[:4].set(jnp.linalg.svd(jnp.eye(4) + u, compute_uv=False))),
-        _export(lambda x, u: x.at[8].set(x[8] / x[0])),
-        _export(_fall, platforms=["cuda"]),
-        _export(lambda x, u: x, (20, ACTION)),
-        _export(lambda x, u: (x, u)),
-        _export(lambda x, u: x, dtype=jnp.float16),
-        _export(lambda x: x, (FULL,)),
+        serialized(_forever),
+        serialized(_hungry),
+        *(serialized(_calling(name), disabled_checks=checks) for name, checks in trusted.items()),
+        serialized(lambda x, u: x.at[:4].set(jnp.linalg.svd(jnp.eye(4) + u, compute_uv=False))),
+        serialized(lambda x, u: x.at[8].set(x[8] / x[0])),
+        serialized(fall, platforms=["cuda"]),
+        serialized(lambda x, u: x, (20, ACTION)),
+        serialized(lambda x, u: (x, u)),
+        serialized(lambda x, u: x, dtype=jnp.float16),
+        serialized(lambda x: x, (FULL,)),
     ]
 
 
