@@ -48,6 +48,7 @@ def test_a_space_is_read_and_drawn_from(tmp_path):
     [
         ("", "found no setting"),
         ("learning_rate", "cannot be read"),
+        ("[" * 100_000, "cannot be read"),
         ("[speed]\nchoice = [1]", "speed: unknown; expected one of total_timesteps"),
         ("learning_rate = 3", "learning_rate: found 3, expected one of choice"),
         ("[learning_rate]\nnormal = [0, 1]", "expected one of choice"),
