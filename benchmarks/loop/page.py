@@ -188,8 +188,7 @@ noise in it. Free flight: median error of position. Log: how long the flights la
 
 {models}
 Effects that were named and are not in the plant: {strangers}. Base parameters (`tau_roll`, `thrust_curve`)
-are not counted: the minimal model had bent them. The attitude of these logs is noisy (0.5 degrees), and the
-diagnosis takes it as true; small names that are not there come of that.
+are not counted: the minimal model had bent them.
 
 ## Where the extension does not help
 
