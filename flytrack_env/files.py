@@ -90,14 +90,15 @@ def write_atomically(path: str | Path, content: bytes) -> None:
 
 
 def write_together(files: Iterable[tuple[str | Path, bytes]]) -> None:
-    """Write files as ``write_atomically``, and rename them when all are written.
+    """Write files as ``write_atomically``, and rename them one after the other when all are written.
 
     files: of path and content, read one by one.
 
     Raises:
-        OSError: what the system says; none of the files was written.
+        OSError: what the system says; of files that were not there before, none is left.
     """
     renames: list[tuple[Path, Path]] = []
+    new: list[Path] = []
     try:
         for name, content in files:
             path = Path(os.path.realpath(name))  # a link stays one
@@ -112,10 +113,12 @@ def write_together(files: Iterable[tuple[str | Path, bytes]]) -> None:
                 file.flush()
                 os.fsync(file.fileno())  # else a loss of power can leave the new name with no content
         for temporary, path in renames:
+            is_new = not path.exists()
             os.replace(temporary, path)
+            new += [path] if is_new else []
     except BaseException:
-        for temporary, _ in renames:
-            temporary.unlink(missing_ok=True)
+        for path in (*new, *(temporary for temporary, _ in renames)):
+            path.unlink(missing_ok=True)
         raise
 
 

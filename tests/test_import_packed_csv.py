@@ -90,6 +90,15 @@ def test_rows_without_an_end_take_no_memory(content: bytes, tmp_path: Path) -> N
         tracemalloc.stop()
 
 
+def test_blank_lines_without_an_end_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(csv_log, "MOST_BLANK_LINES", 100)
+    few = TEXT.replace(b"\n", b"\n" * 50)
+    assert np.array_equal(_import(tmp_path / "a.csv", few), _import(tmp_path / "b.csv", TEXT))
+    many = TEXT + b"\n" * 102
+    with pytest.raises(LogError, match="more than 100 blank lines in a row"):
+        _import(tmp_path / "a.csv", many)
+
+
 def test_a_row_may_have_several_lines(tmp_path: Path) -> None:
     expected = _import(tmp_path / "a.csv", TEXT)
     header, *rows = TEXT.decode().splitlines()

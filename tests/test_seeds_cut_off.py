@@ -37,6 +37,7 @@ def test_a_seed_killed_before_its_first_checkpoint_begins_in_its_folder(alone, t
     write_options(tmp_path / "seed3", options)
     killed = tmp_path / "seed4"
     write_options(killed, options._replace(evaluation_episodes=7))
+    (killed / ".step_0.msgpack.0123456789abcdef").touch()
     tracker = tracking.Tracker(killed, DEAD_URI, "the run that was killed", {})
     tracker.metrics(2 * BATCH, {"policy_loss": 9.0})
     arguments = parse("--resume", tmp_path)
@@ -52,6 +53,7 @@ def test_a_seed_killed_before_its_first_checkpoint_begins_in_its_folder(alone, t
     assert_same_end(killed / "final.msgpack", alone / "seed4" / "final.msgpack")
     journal = tracking.Journal(killed)
     assert journal.beginning()["name"] == "the run that was killed"
+    assert not list(killed.glob(".*"))
     steps = [entry["step"] for entry in journal.of_kind("metrics")]
     assert steps == [2 * BATCH, 4 * BATCH, 6 * BATCH, 7 * BATCH]
 

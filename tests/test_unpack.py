@@ -5,15 +5,17 @@ import tracemalloc
 import msgpack
 import pytest
 
-from baselines.purejaxrl_ppo.unpack import LONGEST_TEXT, MOST_IN_MAP, UnpackError, unpack
+from baselines.purejaxrl_ppo.unpack import MOST_ARRAYS, MOST_IN_MAP, UnpackError, unpack
 
+EMPTY = b"\xc7\n\x01\x93\x91\x00\xa4bool\xc4\x00"  # an array of nothing
 ARRAY = b"\xc9%s\x01"  # an extension: how long, and that it is an array
 
 
-def _deep_maps() -> bytes:
-    """Return maps in maps, each the last value of one of many names."""
-    level = b"".join(b"\xa3%03x\xc0" % number for number in range(3000))
-    return b"".join(b"\xde" + (3001).to_bytes(2, "big") + level + b"\xa1z" for _ in range(500)) + b"\xc0"
+def _deep_maps(value: bytes, depth: int) -> bytes:
+    """Return maps in maps, each the last value of one of many names, beside others."""
+    level = b"".join(b"\xa3%03x" % number + value for number in range(MOST_IN_MAP - 1))
+    head = b"\xde" + MOST_IN_MAP.to_bytes(2, "big")
+    return b"".join(head + level + b"\xa1z" for _ in range(depth)) + b"\xc0"
 
 
 def _deep_lists() -> bytes:
@@ -30,21 +32,21 @@ def _many_in_a_map() -> bytes:
 
 
 @pytest.mark.parametrize(
-    "content",
+    ("content", "most_bytes"),
     [
-        msgpack.packb({"meta": "a" * (LONGEST_TEXT - 3) + "\U0001f681"}),
-        _deep_maps(),
-        _deep_lists(),
-        _many_in_a_map(),
+        (_deep_maps(b"\xc0", 900), 2**28),  # as deep as msgpack goes
+        (_deep_maps(EMPTY, 900), 2**23),
+        (_deep_lists(), 2**23),
+        (_many_in_a_map(), 2**23),
     ],
-    ids=["wide text", "maps in maps", "lists in lists", "a large map"],
+    ids=["maps in maps", "arrays in maps in maps", "lists in lists", "a large map"],
 )
-def test_what_is_made_to_take_memory_is_refused_first(content: bytes) -> None:
+def test_what_is_made_to_take_memory_is_refused_first(content: bytes, most_bytes: int) -> None:
     tracemalloc.start()
     try:
         with pytest.raises(UnpackError):
             unpack(content)
-        assert tracemalloc.get_traced_memory()[1] < 2**23
+        assert tracemalloc.get_traced_memory()[1] < most_bytes
     finally:
         tracemalloc.stop()
 
@@ -52,5 +54,16 @@ def test_what_is_made_to_take_memory_is_refused_first(content: bytes) -> None:
 def test_as_many_as_may_be_are_read() -> None:
     found = unpack(msgpack.packb({str(number): number for number in range(MOST_IN_MAP)}))
     assert len(found) == MOST_IN_MAP
-    text = "\U0001f681" * (LONGEST_TEXT // 4)
-    assert unpack(msgpack.packb({"meta": text})) == {"meta": text}
+    found = unpack(_deep_maps(EMPTY, MOST_ARRAYS // MOST_IN_MAP))
+    assert found["000"].shape == (0,) and found["z"]["z"]["001"].dtype == bool
+
+
+def test_wide_texts_take_no_more_than_they_are_long() -> None:
+    text = ("a" * 2**20 + "\U0001f681").encode()
+    content = msgpack.packb({str(number): text.decode() for number in range(20)})
+    tracemalloc.start()
+    try:
+        assert unpack(content) == {str(number): text for number in range(20)}
+        assert tracemalloc.get_traced_memory()[1] < 1.5 * len(content)
+    finally:
+        tracemalloc.stop()

@@ -168,8 +168,8 @@ def _read_content(path: Path) -> Any:
         if not isinstance(content, bytes):
             raise UnpackError("found a checksum of nothing")
         found = hashlib.sha256(content).hexdigest()
-        if found != whole["checksum"]:
-            expected = shown(whole["checksum"])
+        if found.encode() != whole["checksum"]:
+            expected = shown(_as_text(whole["checksum"]))
             raise CheckpointError(
                 f"{path}: damaged: found content with checksum {found}, expected {expected}"
             )
@@ -180,11 +180,15 @@ def _read_content(path: Path) -> Any:
         raise CheckpointError(f"{path}: not a checkpoint, or damaged: {said(error)}") from error
 
 
+def _as_text(value: Any) -> Any:
+    return value.decode(errors="replace") if isinstance(value, bytes) else value
+
+
 def _read_meta(path: Path, content: Any) -> dict[str, Any]:
     """Return the description in a file's content, which says what format it is of."""
     text = content.get("meta") if isinstance(content, dict) else None
     try:
-        meta = json.loads(text) if isinstance(text, str) and len(text) <= LONGEST_META else None
+        meta = json.loads(text.decode()) if isinstance(text, bytes) and len(text) <= LONGEST_META else None
     except (ValueError, RecursionError) as error:
         raise CheckpointError(f"{path}: not a checkpoint: no description in it: {said(error)}") from error
     if not isinstance(meta, dict) or "format" not in meta:

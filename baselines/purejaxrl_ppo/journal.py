@@ -120,9 +120,7 @@ class Journal:
             stores = json.loads(path.read_bytes())
             return {uri: (str(run_id), int(count)) for uri, (run_id, count) in stores.items()}
         except (ValueError, AttributeError, TypeError, RecursionError) as error:
-            raise JournalError(
-                f"{path}: damaged: {error}; remove it to send everything again, as another run"
-            ) from error
+            raise JournalError(f"{path}: damaged: {error}; remove it to send everything again") from error
 
 
 def forget(folder: Path) -> None:

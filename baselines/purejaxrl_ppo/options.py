@@ -52,7 +52,12 @@ def is_due(update: int, every: int | None, batch_size: int) -> bool:
 
 
 def write_options(folder: Path, options: Options) -> None:
-    """Write what a run does beside training into its folder, as OPTIONS.
+    """Write what a run does beside training into its folder, as OPTIONS."""
+    write_atomically(folder / OPTIONS, options_as_bytes(folder, options))
+
+
+def options_as_bytes(folder: Path, options: Options) -> bytes:
+    """Return what OPTIONS holds in a run's folder.
 
     A store in a file is written by its path and by the way to it from the folder, so that it is found again
     when both were moved.
@@ -64,7 +69,7 @@ def write_options(folder: Path, options: Options) -> None:
         uri = f"{SQLITE}{path}"
         values["store_from_here"] = os.path.relpath(path, folder.resolve())
     values["tracking_uri"] = uri
-    write_atomically(folder / OPTIONS, (json.dumps(values, indent=2) + "\n").encode())
+    return (json.dumps(values, indent=2) + "\n").encode()
 
 
 def read_options(folder: Path) -> Options | None:

@@ -124,7 +124,7 @@ def _plans_of_several(arguments: argparse.Namespace, out: Path) -> list[Plan]:
         )
         raise ValueError(
             f"--resume: {resume}: found no checkpoint of seeds {seeds} in seed<N>; expected at least one. It "
-            f"holds {has}"
+            f"holds {has}; to begin again, remove it or give another folder (--out)"
         )
     return plans
 

@@ -1,9 +1,11 @@
 """Going on with a training that was cut off: what a run is, its newest intact checkpoint, its state."""
 
 import dataclasses
+import itertools
 import logging
 import os
 import sys
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -112,22 +114,24 @@ def newest_intact(path: Path) -> tuple[Path, Checkpoint]:
     return oldest, _load_training(oldest)
 
 
-def take_over(starts: list[tuple[Path, Start]]) -> list[Path]:
-    """Have every run's checkpoint in its own folder, and return the paths; all are written there, or none.
+def own_start(out: Path, start: Start) -> Path:
+    """Return the path, in a run's folder, of the checkpoint that it goes on from."""
+    path, checkpoint = start
+    return path if is_its_folder(out, path) else out / f"step_{checkpoint.meta['steps']}.msgpack"
 
-    starts: a run's folder, which holds no other run, and where the run goes on. Killed before it writes a
-    checkpoint of its own, it goes on from that one.
+
+def take_over(starts: list[tuple[Path, Start]], beside: Iterable[tuple[Path, bytes]] = ()) -> None:
+    """Have every run's start in its own folder: killed before its first checkpoint, it goes on from there.
+
+    starts: a run's folder, which holds no other run, and where the run goes on. beside: files that are
+    written with them; where one cannot be written, none is.
     """
-    paths = [
-        path if is_its_folder(out, path) else out / f"step_{checkpoint.meta['steps']}.msgpack"
-        for out, (path, checkpoint) in starts
-    ]
-    moves = [(source, path) for (_, (source, _)), path in zip(starts, paths, strict=True) if source != path]
+    moves = [(start[0], own_start(out, start)) for out, start in starts]
+    moves = [(source, path) for source, path in moves if source != path]
     if is_first():
         for _, path in moves:
             forget(path.parent)
-        write_together((path, source.read_bytes()) for source, path in moves)
-    return paths
+        write_together(itertools.chain(beside, ((path, source.read_bytes()) for source, path in moves)))
 
 
 def seeds_side_by_side(starts: list[Start | None]) -> int:

@@ -11,7 +11,7 @@ import jax
 from baselines.joining import add_job_flags, begin_anew, job_of
 from baselines.purejaxrl_ppo.config import add_flags
 from baselines.purejaxrl_ppo.distributed import all_devices, is_first, wait_for_all
-from baselines.purejaxrl_ppo.options import Options, write_options
+from baselines.purejaxrl_ppo.options import OPTIONS, Options, options_as_bytes
 from baselines.purejaxrl_ppo.plans import (
     DEFAULT_ENV_ID,
     DEFAULT_OUT,
@@ -25,7 +25,7 @@ from baselines.purejaxrl_ppo.plans import (
     options_of,
     root_folder,
 )
-from baselines.purejaxrl_ppo.resume import take_over
+from baselines.purejaxrl_ppo.resume import own_start, take_over
 from baselines.purejaxrl_ppo.run_folder import FINAL, checkpoints_in, seeds_in
 from baselines.purejaxrl_ppo.training import Trainer, train_policy
 
@@ -145,18 +145,28 @@ def say_resumed(plan: Plan) -> str | None:
     return f"seed {plan.seed}: from step {plan.checkpoint.meta['steps']}, {plan.resume}"
 
 
-def with_own_starts(asked: Asked) -> list[Options]:
-    """Have the checkpoints that seeds go on from in their folders, and return the options that say so."""
+def begin_folders(asked: Asked) -> list[Options]:
+    """Have in every seed's folder what it goes on from, and its options; return these.
+
+    All before any is trained: whoever takes them up again finds the seeds that had not begun.
+    """
     starts = {
         plan.out: (plan.resume, plan.checkpoint) for plan in asked.plans if plan.checkpoint and plan.resume
     }
-    paths = dict(zip(starts, take_over(list(starts.items())), strict=True))
-    if asked.trainer.mesh is not None:
-        wait_for_all("taken over")  # before the others look for what the first process wrote
-    return [
+    paths = {out: own_start(out, start) for out, start in starts.items()}
+    every = [
         options._replace(resume=paths.get(plan.out, plan.resume))
         for plan, options in zip(asked.plans, asked.options, strict=True)
     ]
+    beside = (
+        (plan.out / OPTIONS, options_as_bytes(plan.out, options))
+        for plan, options in zip(asked.plans, every, strict=True)
+        if not (plan.out / FINAL).exists()
+    )
+    take_over(list(starts.items()), beside)
+    if asked.trainer.mesh is not None:
+        wait_for_all("taken over")  # before the others look for what the first process wrote
+    return every
 
 
 def run(asked: Asked) -> None:
@@ -164,11 +174,7 @@ def run(asked: Asked) -> None:
     for line in filter(None, map(say_resumed, asked.plans)):
         if is_first():
             print(line)
-    # All before any: whoever takes them up again finds the seeds that had not begun.
-    all_options = with_own_starts(asked)
-    for plan, options in zip(asked.plans, all_options, strict=True):
-        if is_first() and not (plan.out / FINAL).exists():
-            write_options(plan.out, options)
+    all_options = begin_folders(asked)
     all_seeds = [
         (plan.out, plan.seed, options) for plan, options in zip(asked.plans, all_options, strict=True)
     ]

@@ -34,6 +34,7 @@ from baselines.purejaxrl_ppo.resume import (
     check_same_run,
     describe_run,
     newest_intact,
+    own_start,
     restore_runner,
     take_over,
     warn_of_other_bits,
@@ -164,16 +165,17 @@ class Trainer:
             shared = {name: value for name, value in description.items() if name != "machine"}
             check_agree("settings", digest([options._replace(report=None), shared]))
         key = jax.random.key(seed)
-        if source is None or is_new:
+        if is_first():
+            remove_half_written(out)
             if source is None:
                 forget(out)
+        if source is None or is_new:
             run = Run(self, out, description, options._replace(resume=None))
             return run, Ready(run, self.start(key), 0)
         path, checkpoint = newest_intact(source)
         check_same_run(path, checkpoint, description)
-        if is_first():
-            remove_half_written(out)
-        (path,) = take_over([(out, (path, checkpoint))])
+        take_over([(out, (path, checkpoint))])
+        path = own_start(out, (path, checkpoint))
         run = Run(self, out, description, options._replace(resume=path), checkpoint.meta)
         update = checkpoint.meta["steps"] // self.config.batch_size
         self.steps = checkpoint.meta["steps"]

@@ -16,8 +16,8 @@ from flytrack_env.words import said
 LARGEST_BYTES = 3 * 2**27  # of a file: a little more than twice that in memory, below 1 GiB
 MOST_ENTRIES = 100_000  # of all maps together
 MOST_IN_MAP = 2000  # of one, which is made room for before it is counted, as are all that it lies in
-LONGEST_TEXT = 2**24  # bytes: one wide character makes all of a text four times as large
-LONGEST_NAME = 200  # characters
+MOST_ARRAYS = 10_000  # each of which calls Python, and is read before the map that it stands in is counted
+LONGEST_NAME = 200  # bytes
 MOST_DIMENSIONS = 32
 ARRAY = 1  # flax's number of arrays among msgpack's extensions
 DTYPE = re.compile(r"[a-z]+[0-9]*")
@@ -38,10 +38,11 @@ class _Maps:
         self._num_entries += len(pairs)
         if self._num_entries > MOST_ENTRIES:
             raise UnpackError(f"found more than {MOST_ENTRIES} entries, expected at most that")
-        names = {name for name, _ in pairs}
-        if len(names) < len(pairs) or not all(map(_is_name, names)):
+        found = ((_name_of(name), value) for name, value in pairs)
+        named = {name: value for name, value in found if name is not None}
+        if len(named) < len(pairs):
             raise UnpackError(f"found names that are not {len(pairs)} different short texts")
-        return dict(pairs)
+        return named
 
 
 class _Lists:
@@ -57,8 +58,23 @@ class _Lists:
         return values
 
 
-def _is_name(value: Any) -> bool:
-    return isinstance(value, str) and len(value) <= LONGEST_NAME and value.isprintable()
+class _Arrays:
+    """Makes arrays of extensions, and counts them."""
+
+    def __init__(self) -> None:
+        self._number = 0
+
+    def __call__(self, code: int, data: bytes) -> np.ndarray:
+        self._number += 1
+        if self._number > MOST_ARRAYS:
+            raise UnpackError(f"found more than {MOST_ARRAYS} arrays, expected at most that")
+        return _array(code, data)
+
+
+def _name_of(value: Any) -> str | None:
+    """Return the name of an entry; None where it is none."""
+    is_short = isinstance(value, bytes) and len(value) <= LONGEST_NAME
+    return name if is_short and (name := value.decode()).isprintable() else None
 
 
 def _array(code: int, data: bytes) -> np.ndarray:
@@ -79,7 +95,9 @@ def _array(code: int, data: bytes) -> np.ndarray:
 
 
 def unpack(content: bytes) -> Any:
-    """Return what bytes hold: maps, texts, bytes, numbers, arrays; no lists.
+    """Return what bytes hold: maps with names, bytes, numbers, arrays; no lists.
+
+    Texts stay bytes: one wide character would make all of a text four times as large.
 
     Raises:
         UnpackError: damaged, or something else, or more than a checkpoint has.
@@ -87,11 +105,10 @@ def unpack(content: bytes) -> Any:
     try:
         return msgpack.unpackb(
             content,
-            raw=False,
+            raw=True,
             max_array_len=0,
             max_map_len=MOST_IN_MAP,
-            max_str_len=LONGEST_TEXT,
-            ext_hook=_array,
+            ext_hook=_Arrays(),
             object_pairs_hook=_Maps(),
         )
     except UnpackError:

@@ -22,11 +22,9 @@ from flytrack_sysid.log import CHANNELS, LogError
 from flytrack_sysid.log_file import LARGEST_BYTES
 from flytrack_sysid.log_table import LARGEST_NORM_ERROR, Rows, Table, log_of_table
 
-PACKED_BYTES, LARGEST_RATIO = (
-    2**24,
-    32,
-)  # what a compressed file may hold: that much, or as many times its size
+PACKED_BYTES, LARGEST_RATIO = 2**24, 32  # what a compressed file may hold: that, or as many times its size
 LONGEST_ROW = 2**16  # characters: thousands of columns
+MOST_BLANK_LINES = 2**24  # in a row: some seconds
 LONGEST_LIST = 1000  # characters of a header
 
 
@@ -86,7 +84,7 @@ class _Rows:
     """The rows of a CSV file, lists of cells; csv itself would read all of an endless one first."""
 
     def __init__(self, text: TextIO, delimiter: str):
-        self._text, self._num_characters = text, 0
+        self._text, self._num_characters, self._num_blank = text, 0, 0
         self._rows = csv.reader(self._lines(), delimiter=delimiter, strict=True)
 
     def _lines(self) -> Iterator[str]:
@@ -97,10 +95,16 @@ class _Rows:
                 raise csv.Error(f"found a row of {LONGEST_ROW} characters or more, expected fewer")
             yield line
 
-    def __iter__(self) -> Iterator[list[str]]:
-        for cells in self._rows:
-            self._num_characters = 0
-            yield cells
+    def __iter__(self) -> "_Rows":
+        return self
+
+    def __next__(self) -> list[str]:
+        cells = next(self._rows)
+        self._num_characters = 0
+        self._num_blank = 0 if cells else self._num_blank + 1
+        if self._num_blank > MOST_BLANK_LINES:
+            raise csv.Error(f"found more than {MOST_BLANK_LINES} blank lines in a row, expected fewer")
+        return cells
 
     @property
     def line_num(self) -> int:
@@ -121,7 +125,7 @@ def _read(path: Path, columns: Columns, mapping: str) -> Table:
 def _table(path: Path, rows: _Rows, columns: Columns, mapping: str) -> Table:
     """Return the columns that the mapping names, of the rows of a file, the first of which has the names."""
     wanted = _wanted(columns)
-    header = [name.strip() for name in next(iter(rows), [])]
+    header = [name.strip() for name in next(rows, [])]
     for name, table in wanted.items():
         if header.count(name) != 1:
             found = f"found {header.count(name)} times among {', '.join(map(named, header))[:LONGEST_LIST]}"

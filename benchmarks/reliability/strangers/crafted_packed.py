@@ -18,6 +18,7 @@ from benchmarks.reliability.strangers.packed import (
 from benchmarks.reliability.strangers.trees import RAW
 
 MANY = 50_000
+EMPTY = b"\x93\x91\x00\xa4bool\xc4\x00"  # an array of nothing
 
 
 def _extension(code: int, content: bytes) -> bytes:
@@ -30,10 +31,10 @@ def _map(entries: list[tuple[bytes, bytes]]) -> bytes:
     return b"\xdf" + len(entries).to_bytes(4, "big") + b"".join(name + value for name, value in entries)
 
 
-def _wide_and_deep(depth: int) -> bytes:
-    """Return maps in maps, each the last value of one of many."""
-    level = b"".join(b"\xa2%02x\xc0" % number for number in range(250))
-    return b"".join(b"\xde\x00\xfb" + level + b"\xa1z" for _ in range(depth)) + b"\xc0"
+def _wide_and_deep(number: int, depth: int, value: bytes) -> bytes:
+    """Return maps in maps, each the last of many values."""
+    level = b"".join(b"\xa3%03x" % name + value for name in range(number - 1))
+    return b"".join(b"\xde" + number.to_bytes(2, "big") + level + b"\xa1z" for _ in range(depth)) + b"\xc0"
 
 
 def _arrays() -> list[bytes]:
@@ -74,7 +75,11 @@ def _values() -> list[bytes]:
     nested = [_extension(ARRAY, _extension(ARRAY, _extension(ARRAY, b""))), b"\x81\xa1a" * 500 + b"\xc0"]
     texts = [b"\xdb\x00\x10\x00\x00" + b"a" * (2**20 - 4) + "\U0001f681".encode(), b"\xa4\xff\xff\xff\xff"]
     numbers = [b"\xcf" + b"\xff" * 8, b"\xcb\x7f\xf8" + bytes(6), b"\xca\x7f\x80\x00\x00"]
-    return [*stamps, *nested, *texts, *numbers, _wide_and_deep(500), *_arrays()]
+    nested += [_wide_and_deep(251, 500, b"\xc0"), _wide_and_deep(2000, 900, b"\xc0")]
+    nested.append(_wide_and_deep(2000, 300, msgpack.packb(msgpack.ExtType(ARRAY, EMPTY))))
+    wide = msgpack.packb("a" * 2**20 + "\U0001f681")
+    texts.append(_map([(msgpack.packb(str(name)), wide) for name in range(24)]))
+    return [*stamps, *nested, *texts, *numbers, *_arrays()]
 
 
 def _names() -> list[bytes]:

@@ -93,7 +93,7 @@ def _convolves(x: Array, u: Array) -> Array:
 
 
 def _sorts(x: Array, u: Array) -> Array:
-    """A comparison that is none, of which a sort may never come to an end."""
+    """Many equal numbers, sorted by two keys."""
     wide = jnp.broadcast_to(x, (2**12, len(x))).reshape(-1)
     return x + 0.0 * jax.lax.sort((wide, wide[::-1]), num_keys=2)[0][0]
 
