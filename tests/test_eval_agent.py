@@ -1,116 +1,34 @@
-"""Evaluation: many flights and single ones agree, known lap times come out, drawn plants, ghost, refusals."""
+"""Evaluation: many flights and single ones agree, known lap times come out, ghost, what the command tells."""
 
 import importlib.util
 import json
-import os
-import sys
-from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import eval_agent
-from baselines.purejaxrl_ppo import Config, evaluate
-from baselines.purejaxrl_ppo.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
+from baselines.purejaxrl_ppo import evaluate
+from baselines.purejaxrl_ppo.checkpoint import Checkpoint, load_checkpoint
 from baselines.purejaxrl_ppo.evaluate import fly_many, race_many, start_keys
 from baselines.purejaxrl_ppo.flights import Flight, Outcomes, outcomes_of, score
-from baselines.purejaxrl_ppo.flown_env import simulated_env
-from baselines.purejaxrl_ppo.networks import make_network
 from baselines.purejaxrl_ppo.perturbed import (
-    PlantRanges,
-    by_thirds,
     draw_plants,
-    perturb,
-    with_model_as_given,
 )
-from baselines.purejaxrl_ppo.resume import describe_run
 from baselines.purejaxrl_ppo.summary import distribution, share, summarise
 from benchmarks.optimal.compared import compare, time_lost
-from flytrack_env import FlyTrack, load_track, make, nominal_parameters, save_track
-from flytrack_env.dynamics import ModelParameters
-from flytrack_env.effects import CommandDelay, LinearDrag, QuadraticDrag, ThrustScale
-from flytrack_env.plants import Simulator
-from flytrack_env.quaternion import Scalar, Vec3
+from flytrack_env import FlyTrack, load_track, nominal_parameters
 from flytrack_env.references import ghost_rollout, shipped_reference, shipped_references
 from flytrack_env.rollout import load_rollout
-from flytrack_env.state import BATTERY, BATTERY_FULL_V, POSITION, VELOCITY, Action, Drone
-from flytrack_env.tracks import random_track
-from flytrack_env.wrappers import DomainRandomization
-from flytrack_env.wrappers.domain_randomization import sample_model
+from flytrack_env.state import BATTERY, POSITION, VELOCITY
+from tests.evaluated import FAILS_BELOW_V, Rails, run, write_checkpoint
 from tests.recordings import Recording
 
 ROOT = Path(__file__).parent.parent
 NUM_LAPS, NUM_STEPS, NUM_FLIGHTS = 3, 1400, 10
 TOLERANCE_S = 2e-3
-SLOWER_PER_V = 0.1
-FAILS_BELOW_V, FAILS_AT_S = 23.6, 2.0
-
-
-class OnReference(NamedTuple):
-    """State of ``Rails``: the drone and the time since the reset, s."""
-
-    drone: Drone
-    time_s: jax.Array
-
-
-class Rails:
-    """A plant that flies the time-optimal start and laps, whatever the command.
-
-    The lower its battery, the slower it is, by ``pace``; one that is low indeed falls to the ground.
-    """
-
-    def __init__(self) -> None:
-        self.references = [shipped_reference("flytrack", kind) for kind in ("standing", "flying")]
-
-    @staticmethod
-    def pace(battery_v: Any) -> Any:
-        """Return how many times longer than the optimum it takes."""
-        return 1.0 + SLOWER_PER_V * (BATTERY_FULL_V - battery_v)
-
-    def _at(self, drone: Drone, time_s: jax.Array) -> Drone:
-        standing, flying = self.references
-        own_s = time_s / self.pace(drone.battery_v)
-        lap_s = (own_s - standing.time_s) % flying.time_s
-
-        def position(reference: Any, at_s: jax.Array) -> jax.Array:
-            """Return where the reference is, (3,): straight lines between its samples."""
-            table = jnp.asarray(reference.states[:, POSITION], jnp.float32)
-            sample = jnp.clip(at_s / reference.dt_s, 0.0, len(table) - 1.001)
-            before = sample.astype(int)
-            part = sample - before
-            return (1.0 - part) * table[before] + part * table[before + 1]
-
-        is_start = own_s < standing.time_s
-        pos_w = Vec3(*jnp.where(is_start, position(standing, own_s), position(flying, lap_s)))
-        is_falling = (drone.battery_v < FAILS_BELOW_V) & (time_s > FAILS_AT_S)
-        return drone._replace(pos_w=pos_w._replace(z=jnp.where(is_falling, -1.0, pos_w.z)))
-
-    def reset(self, drone: Drone, model: ModelParameters) -> OnReference:
-        """Return the drone at the start of the rails."""
-        return OnReference(self._at(drone, jnp.float32(0.0)), jnp.float32(0.0))
-
-    def step(self, state: OnReference, command: Action, dt: Scalar, model: ModelParameters) -> OnReference:
-        """Return the drone a step further."""
-        time_s = state.time_s + dt
-        return OnReference(self._at(state.drone, time_s), time_s)
-
-    def drone(self, state: OnReference) -> Drone:
-        """Return the drone."""
-        return state.drone
-
-
-def write_checkpoint(path: Path, env_id: str = "FlyTrackRandomized-v0") -> Path:
-    """Write a policy that has learned nothing, with all that a checkpoint tells."""
-    env = make(env_id, model=nominal_parameters().with_effects(LinearDrag(0.3, 0.3, 0.1)))
-    config = Config(hidden_sizes=(8,))
-    size = env.observation_space().shape[0]
-    params = make_network(config).init(jax.random.key(0), jnp.zeros((1, size)))
-    save_checkpoint(path, params, config, describe_run(env, env_id, "flytrack", config, seed=0))
-    return path
 
 
 @pytest.fixture(scope="module")
@@ -228,71 +146,6 @@ def test_shares_have_wilsons_interval() -> None:
     assert times == {"number": 3, "mean": 2.0, "min": 1.0, "q05": 1.1, "q50": 2.0, "q95": 2.9}
 
 
-def test_plants_are_drawn_from_the_ranges_around_the_model() -> None:
-    known = (LinearDrag(0.4, 0.4, 0.2), CommandDelay(0.03), ThrustScale(0.9), QuadraticDrag(0.01, shared=0.0))
-    model = nominal_parameters().with_effects(*known)
-    plants = draw_plants(3, 200, model)
-    for name, bounds in PlantRanges()._asdict().items():
-        drawn = plants.drawn[name]
-        assert bounds[0] <= drawn.min() and drawn.max() <= bounds[1] and np.ptp(drawn) > 0.5 * np.ptp(bounds)
-    found = plants.models
-    np.testing.assert_allclose(found.effect("thrust_scale").factor, 0.9 * plants.drawn["thrust_scale"], 1e-6)
-    np.testing.assert_allclose(found.effect("linear_drag").d_x, np.float32(0.4))
-    assert found.effect("command_delay").delay_s.max() == np.float32(0.04)  # as late as can be
-    quadratic, wind = found.effect("quadratic_drag"), found.effect("wind")
-    assert quadratic.k_x.min() >= 0.01 and (quadratic.shared == 0.0).all()
-    np.testing.assert_allclose(np.hypot(wind.v_x, wind.v_y), plants.drawn["wind_m_s"], atol=1e-6)
-    assert (wind.v_x < 0).any() and (wind.v_y < 0).any() and not np.any(wind.v_z)
-    fewer = draw_plants(3, 5, model)
-    np.testing.assert_array_equal(fewer.models.effect("wind").v_x, wind.v_x[:5])
-    assert not np.array_equal(draw_plants(4, 5, model).drawn["wind_m_s"], fewer.drawn["wind_m_s"])
-
-
-def test_wind_pushes_through_the_drag(make_drone: Any) -> None:
-    plant, hovering = Simulator(), make_drone((0.0, 0.0, 5.0))
-
-    @jax.jit
-    def push(drag: jax.Array) -> jax.Array:
-        model = perturb(nominal_parameters(), jnp.stack([drag] * 3), 1.0, jnp.array([0.0, 3.0]), 0.0)
-        after = plant.step(plant.reset(hovering, model), Action(0.0, 0.0, 0.0, 0.0), 0.01, model)
-        return after.drone.vel_w.y / 0.01
-
-    assert push(0.02) == pytest.approx(0.02 * 3.0**2, rel=1e-3)
-    assert push(0.0) == pytest.approx(0.0, abs=1e-6)
-
-
-def test_what_breaks_the_policy_shows_in_its_thirds() -> None:
-    drawn = draw_plants(0, 90, nominal_parameters()).drawn
-    is_good = drawn["command_delay_s"] < np.quantile(drawn["command_delay_s"], 2.0 / 3.0)
-    rows = by_thirds(drawn, np.stack([is_good, np.ones(90, bool)], axis=1))
-    shares = {name: [r["plants"]["share"] for r in rows if r["quantity"] == name] for name in drawn}
-    assert shares["command_delay_s"] == [1.0, 1.0, 0.0]
-    assert all(min(shares[name]) > 0.3 for name in set(drawn) - {"command_delay_s"})
-    assert {row["flights_share"] for row in rows if row["quantity"] == "command_delay_s"} == {1.0, 0.5}
-    assert len(by_thirds(drawn, np.ones((90, 1), bool))) == 12
-    assert len(by_thirds({"wind_m_s": np.ones(1)}, np.ones((1, 1), bool))) == 1
-
-
-def test_ids_that_draw_models_fly_the_one_that_is_given(checkpoint: Checkpoint) -> None:
-    env = simulated_env(checkpoint)
-    params = with_model_as_given(env.default_params)
-    env.check_params(params)
-    ranges, given = params.wrappers[DomainRandomization.key], env.default_params.model
-    found = sample_model(jnp.uint32(5), given, ranges)
-    assert type(found.effects[0]) is LinearDrag and len(found.effects) == 1
-    for a, b in zip(
-        jax.tree.leaves(found._replace(tau=np.stack(found.tau))), jax.tree.leaves(given), strict=True
-    ):
-        np.testing.assert_allclose(a, b, rtol=1e-6)
-    plain = make("FlyTrackNoisy-v0").default_params
-    assert with_model_as_given(plain) is plain
-
-
-def run(monkeypatch: pytest.MonkeyPatch, *arguments: Any) -> None:
-    monkeypatch.setattr(sys, "argv", ["eval_agent.py", *map(str, arguments)])
-    eval_agent.main()
-
-
 @pytest.mark.parametrize("flown_by", ["black box", "plants"])
 def test_command_flies_many(
     flown_by: str,
@@ -368,66 +221,3 @@ def test_single_flight_is_told_as_json_and_docs_name_every_key(
     text = (ROOT / "docs" / "baseline.md").read_text()
     missing = {name for name in keys_of({**report, "plants": plants}) if f"`{name}`" not in text}
     assert not missing
-
-
-def make_bad_files(folder: Path) -> None:
-    """Write what is refused: a policy of before the model was told, tracks without a reference."""
-    old = load_checkpoint(write_checkpoint(folder / "policy.msgpack"))
-    meta = {name: value for name, value in old.meta.items() if name != "model"}
-    save_checkpoint(folder / "no_model.msgpack", old.params, old.config, meta)
-    save_track(folder / "random.toml", random_track(0))
-    moved = load_track("flytrack")
-    moved = replace(moved, start_position=(moved.start_position[0] + 0.5, *moved.start_position[1:]))
-    save_track(folder / "moved.toml", moved)
-    (folder / "file").write_text("")
-
-
-@pytest.mark.parametrize(
-    ("arguments", "messages"),
-    [
-        (["--episodes", "0"], ["--episodes: found 0", "expected 1 to"]),
-        (["--episodes", "2000000"], ["--episodes: found 2000000"]),
-        (["--plants", "0"], ["--plants: found 0"]),
-        (["--plants", "2000", "--episodes", "1000"], ["--plants: found 2000", "expected 1 to 100"]),
-        (["--plants", "2", "--black-box", "any.bin"], ["--plants", "--black-box any.bin", "one of the two"]),
-        (["--plants", "2", "--checkpoint", "no_model.msgpack"], ["model", "found none"]),
-        (["--laps", "0"], ["--laps: found 0"]),
-        (["--steps", "10000000"], ["--steps: found 10000000"]),
-        (["--seed", "-1"], ["--seed: found -1"]),
-        (["--track", "nowhere"], ["nowhere", "flytrack"]),
-        (["--track", "random.toml", "--ghost"], ["found no 'random", "expected one of", "flytrack_nominal"]),
-        (["--track", "moved.toml", "--ghost"], ["flytrack", "another track of that name"]),
-        (["--out", "."], ["--out: . is a folder"]),
-        (["--out", "policy.msgpack"], ["--out: found policy.msgpack, which is read"]),
-        (["--out", "locked/rollout.npy"], ["--out: locked/rollout.npy", "no permission to write"]),
-        (["--json", "file/report.json"], ["--json", "found a file", "expected a folder"]),
-        (["--json", "rollout_ghost.npy"], ["--json", "the rollout of the ghost, expected another file"]),
-        (["--rrd", "rollout.npy"], ["--rrd", "which is that of --out, expected another file"]),
-        (["--rrd", "a.rrd", "--json", "a.rrd"], ["--json", "which is that of --rrd, expected another file"]),
-        (["--rrd", "."], ["--rrd", "is a folder"]),
-        (["--checkpoint", "file"], ["file", "not a checkpoint"]),
-    ],
-)
-def test_command_refuses_before_it_flies(
-    arguments: list[str],
-    messages: list[str],
-    bad_files: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    monkeypatch.chdir(bad_files)
-    # Whoever runs the tests as root may write anywhere.
-    monkeypatch.setattr(os, "access", lambda path, mode: Path(path).name != "locked")
-    monkeypatch.setattr(eval_agent, "fly_scene", lambda *_: pytest.fail("it flew"))
-    with pytest.raises(SystemExit) as ended:
-        run(monkeypatch, "--checkpoint", "policy.msgpack", "--steps", "5", *arguments)
-    said = capsys.readouterr().err
-    assert ended.value.code == 2 and all(message in said for message in messages), said
-
-
-@pytest.fixture(scope="module")
-def bad_files(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("bad")
-    make_bad_files(folder)
-    (folder / "locked").mkdir()
-    return folder
