@@ -76,6 +76,7 @@ def test_examples_of_what_broke_are_on_the_page():
         "loaded": 1,
         "refused": 7,
         "broken": {"crash": 1},
+        "failure": None,
         "slowest_s": 0.1,
         "cpu_s": 1.0,
     }
@@ -83,13 +84,6 @@ def test_examples_of_what_broke_are_on_the_page():
     text = files.SECTION.as_markdown(result)
     assert "| black box (`acro_step.bin`) | 9 | 4 | 1 | 7 | 1 | 0.1 |" in text
     assert "seed 3" in text and "number 7: crash: `the process ended with -11`" in text
-
-
-def test_figures_of_before_crafted_files_were_counted_are_shown():
-    found = {"files": 9, "loaded": 1, "refused": 8, "broken": {}, "examples": [], "slowest_s": 0.1}
-    result = {"seed": 3, "kinds": {"track": found}}
-    assert "| track (`.toml`) | 9 | not counted | 1 | 8 | 0 | 0.1 |" in files.SECTION.as_markdown(result)
-    assert files.SECTION.is_held(result)
 
 
 def test_a_failed_measurement_of_a_kind_is_shown_and_loses_no_other(tmp_path, monkeypatch):

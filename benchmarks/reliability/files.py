@@ -64,17 +64,16 @@ def as_markdown(result: dict[str, Any]) -> str:
     broken = []
     for name, found in result["kinds"].items():
         number = sum(found["broken"].values())
-        crafted = found.get("crafted", "not counted")  # figures of before they were
-        said = f"{number}, then the measurement failed" if found.get("failure") else number
+        said = f"{number}, then the measurement failed" if found["failure"] else number
         lines.append(
-            f"| {TITLES[name]} | {found['files']} | {crafted} | {found['loaded']} | {found['refused']} | "
-            f"{said} | {found['slowest_s']:g} |"
+            f"| {TITLES[name]} | {found['files']} | {found['crafted']} | {found['loaded']} | "
+            f"{found['refused']} | {said} | {found['slowest_s']:g} |"
         )
         broken += [
             f"- {TITLES[name]}, number {one['number']}: {one['sort']}: `{one['text']}`"
             for one in found["examples"]
         ]
-        if found.get("failure"):
+        if found["failure"]:
             broken.append(f"- {TITLES[name]}: the measurement failed: `{' '.join(found['failure'].split())}`")
     if broken:
         lines += ["", f"Broken promises, seed {result['seed']}:", "", *broken]
@@ -83,7 +82,7 @@ def as_markdown(result: dict[str, Any]) -> str:
 
 def is_held(result: dict[str, Any]) -> bool:
     """Return whether no file broke the promise, and all were judged."""
-    return not any(found["broken"] or found.get("failure") for found in result["kinds"].values())
+    return not any(found["broken"] or found["failure"] for found in result["kinds"].values())
 
 
 SECTION = Section("files", "Files from strangers", measure, as_markdown, is_held)
