@@ -22,7 +22,7 @@ USES = ROOT / "release" / "uses"
 CORE = "core"
 # What is not in a wheel, and uses it: put beside an environment for the extras that serve a checkout.
 BESIDE = ("benchmarks", "blackbox", "tests", "pyproject.toml")
-TESTS_OF_LOGS = ("tests/test_import_ulog.py", "tests/test_import_betaflight.py")
+TESTS_OF_LOGS = ("tests/unit/test_import_ulog.py", "tests/unit/test_import_betaflight.py")
 OPTIMAL = ("--tracks", "speedway", "--kinds", "flying", "--out", "found")
 L2F = "from benchmarks.env_speed import l2f_contestant as contestant; contestant('l2f', 1024, 8).run()"
 

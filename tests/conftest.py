@@ -19,8 +19,8 @@ from flytrack_env.env import EnvParams, EnvState, FlyTrack
 from flytrack_env.quaternion import Quaternion, Scalar, Vec3
 from flytrack_env.state import Action, Drone
 from flytrack_env.tracks import Gate, Track
-from tests.black_boxes import SHIPPED
-from tests.compiled_programs import share_compiled_programs
+from tests.support.black_boxes import SHIPPED
+from tests.support.compiled_programs import share_compiled_programs
 
 share_compiled_programs()
 
@@ -223,7 +223,7 @@ def coasting_envs(
 @pytest.fixture(scope="module")
 def trainer() -> Any:
     """The small trainer of the baseline's tests, compiled once for a process."""
-    from tests.ppo_runs import make_trainer
+    from tests.support.ppo_runs import make_trainer
 
     return make_trainer()
 
@@ -231,7 +231,7 @@ def trainer() -> Any:
 @pytest.fixture(scope="module")
 def whole(trainer: Any, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, np.ndarray]]:
     """A training run that nothing cut off: its folder and its metrics."""
-    from tests.ppo_runs import EVERY_OTHER_UPDATE, SEED
+    from tests.support.ppo_runs import EVERY_OTHER_UPDATE, SEED
 
     out = tmp_path_factory.mktemp("whole")
     return out, trainer.train(out, SEED, EVERY_OTHER_UPDATE)[1]

@@ -1,0 +1,158 @@
+"""Arrows point downwards: who may import whom, and that look-alike classes cannot be confused."""
+
+import ast
+import dataclasses
+import importlib
+import itertools
+import pkgutil
+import types
+from pathlib import Path
+
+import jax
+import pytest
+
+import flytrack_env
+
+ROOT = Path(__file__).parents[2]
+PACKAGE = "flytrack_env"
+
+# Low to high. A module imports only from rows above its own here; a package counts as one module.
+LAYERS = (
+    {"files", "extras", "fusion", "auto_reset", "apart", "apart_server", "artifact", "words"},
+    {"quaternion", "toml_file", "npz_file"},
+    {"state"},
+    {"tracks", "randomness"},
+    {"effects"},
+    {"dynamics"},
+    {"plants"},
+    {"race", "resets", "observations", "rewards", "terminations", "model_file"},
+    {"params"},
+    {"episodes"},
+    {"env"},
+    {"references"},
+    {"wrappers", "blackbox", "rollout", "rendering", "flown_race"},
+    {"registration", "viz_rerun", "pictures"},
+    {"gymnasium_adapter"},
+    {"__init__"},
+)
+RANKS = {name: rank for rank, layer in enumerate(LAYERS) for name in layer}
+CONSUMERS = (
+    "flytrack_sysid",
+    "baselines",
+    "flytrack_loop",
+    "benchmarks",
+    "blackbox",
+    "clients",
+    "eval_agent",
+    "demo",
+)
+ONLY_IN = {
+    "gymnasium": "gymnasium_adapter",
+    "PIL": "rendering",
+    "pygame": "rendering",
+    "rerun": "viz_rerun",
+    "matplotlib": "pictures",
+    "moviepy": "pictures",
+}
+
+
+def files_of(name: str) -> list[Path]:
+    """Return the Python files of a package or script at the root of the repository."""
+    path = ROOT / name
+    return sorted(path.rglob("*.py")) if path.is_dir() else [*ROOT.glob(f"{name}.py")]
+
+
+def imports_of(path: Path) -> list[tuple[str, int]]:
+    """Return every dotted name that a file imports, anywhere in it, with its line."""
+    found = []
+    package = path.relative_to(ROOT).parent.parts
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            found += [(alias.name, node.lineno) for alias in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            above = package[: len(package) - node.level + 1] if node.level else ()
+            base = ".".join([*above, *([node.module] if node.module else [])])
+            found += [(f"{base}.{alias.name}", node.lineno) for alias in node.names]
+    return found
+
+
+def module_of(path: Path) -> str:
+    """Return the name of the layer's module that a file of the package belongs to."""
+    return path.relative_to(ROOT / PACKAGE).with_suffix("").parts[0]
+
+
+MODULES = files_of(PACKAGE)
+
+
+@pytest.mark.parametrize("path", MODULES, ids=lambda path: str(path.relative_to(ROOT)))
+def test_no_arrow_points_up(path: Path) -> None:
+    module = module_of(path)
+    assert module in RANKS, f"{module}: not in LAYERS of this test; give it a row"
+    for name, line in imports_of(path):
+        parts = name.split(".")
+        if parts[0] != PACKAGE:
+            continue
+        target = parts[1] if len(parts) > 1 and parts[1] in RANKS else "__init__"
+        is_within = target == module and path.parent != ROOT / PACKAGE
+        assert is_within or RANKS[target] < RANKS[module], (
+            f"{path.relative_to(ROOT)}, line {line}: {module} imports {name}"
+        )
+
+
+@pytest.mark.parametrize("path", MODULES, ids=lambda path: str(path.relative_to(ROOT)))
+def test_package_imports_no_consumer_and_no_foreign_viewer(path: Path) -> None:
+    for name, line in imports_of(path):
+        top = name.split(".")[0]
+        where = f"{path.relative_to(ROOT)}, line {line}: imports {name}"
+        assert top not in CONSUMERS and top != "tests", where
+        assert ONLY_IN.get(top, module_of(path)) == module_of(path), where
+
+
+CONSUMER_FILES = [path for name in CONSUMERS for path in files_of(name)]
+
+
+@pytest.mark.parametrize("path", CONSUMER_FILES, ids=lambda path: str(path.relative_to(ROOT)))
+def test_consumers_use_public_names_of_the_package(path: Path) -> None:
+    for name, line in imports_of(path):
+        parts = name.split(".")
+        is_private = any(part.startswith("_") and not part.endswith("__") for part in parts)
+        assert not (parts[0] == PACKAGE and is_private), (
+            f"{path.relative_to(ROOT)}, line {line}: imports {name}"
+        )
+
+
+def test_this_test_sees_imports() -> None:
+    seen = {name for path in MODULES for name, _ in imports_of(path)}
+    assert "flytrack_env.dynamics.ModelParameters" in seen and "gymnax" in seen
+    assert len(CONSUMER_FILES) > 0
+
+
+def tree_classes() -> list[type]:
+    """Return every class of the package whose instances are pytrees with leaves of their own."""
+    found = {}
+    for info in pkgutil.walk_packages(flytrack_env.__path__, f"{PACKAGE}."):
+        if info.name.split(".")[1] in ONLY_IN.values():
+            continue
+        for value in vars(importlib.import_module(info.name)).values():
+            is_class = isinstance(value, type) and not isinstance(value, types.GenericAlias)
+            if is_class and value.__module__.startswith(PACKAGE):
+                is_record = hasattr(value, "_fields") or dataclasses.is_dataclass(value)
+                if is_record and not jax.tree_util.treedef_is_leaf(jax.tree.structure(filled(value))):
+                    found[f"{value.__module__}.{value.__qualname__}"] = value
+    return list(found.values())
+
+
+def filled(record: type) -> object:
+    """Return an instance with a number in every field."""
+    if hasattr(record, "_fields"):
+        return record(*[0.0] * len(record._fields))
+    return record(**{field.name: 0.0 for field in dataclasses.fields(record) if field.init})
+
+
+def test_look_alike_classes_have_different_tree_definitions() -> None:
+    classes = tree_classes()
+    names = {record.__name__ for record in classes}
+    assert {"ModelParameters", "EnvParams", "EnvState", "Drone", "Race", "Course"} <= names
+    for a, b in itertools.combinations(classes, 2):
+        definitions = jax.tree.structure(filled(a)), jax.tree.structure(filled(b))
+        assert definitions[0] != definitions[1], f"{a.__qualname__} and {b.__qualname__}"

@@ -1,0 +1,230 @@
+"""Scripts: what manoeuvres are, their files, the flights a diagnosis asks for, and collecting them."""
+
+import io
+import json
+import tracemalloc
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from handout_plant import HandoutPlant
+
+from benchmarks.reliability.strangers.archives import zipped
+from flytrack_env.dynamics import collective_thrust, nominal_parameters
+from flytrack_env.state import APPLIED_ACTION, BATTERY
+from flytrack_sysid import collect, load_log
+from flytrack_sysid.cli import main
+from flytrack_sysid.diagnosis.lanes import LANE_S
+from flytrack_sysid.diagnosis.next_flight import next_flight
+from flytrack_sysid.diagnosis.plan import LANES_PER_MANOEUVRE
+from flytrack_sysid.envelope import HEIGHTS, SCRIPT_HEIGHTS
+from flytrack_sysid.excitation import DT_S, FLIGHT_STEPS
+from flytrack_sysid.manoeuvres import FLIGHTS_PER_MANOEUVRE, MANOEUVRES, flights_of, hover_action
+from flytrack_sysid.script_file import Script, ScriptError, check_script, load_script, save_script, script_of
+
+HOVER = hover_action(HandoutPlant().model())
+SHIPPED = Path(__file__).parents[2] / "blackbox" / "acro_step.bin"
+
+
+def made(*names: str) -> Script:
+    return script_of(flights_of(names or MANOEUVRES, HOVER))
+
+
+def test_every_manoeuvre_can_be_flown_and_says_how():
+    script = made()
+    check_script(script)
+    assert script.kinds == tuple(name for name in MANOEUVRES for _ in range(FLIGHTS_PER_MANOEUVRE))
+    assert all(one.how.endswith(".") and len(one.how) > 20 for one in MANOEUVRES.values())
+    assert FLIGHTS_PER_MANOEUVRE * FLIGHT_STEPS * DT_S == LANES_PER_MANOEUVRE * LANE_S
+    flights = script.commands.reshape(-1, FLIGHT_STEPS * 4)
+    assert len(np.unique(np.hstack([script.starts, flights]), axis=0)) == len(flights), "no flight twice"
+
+
+def test_a_manoeuvre_does_not_depend_on_the_others():
+    alone, among = made("spins"), made()
+    own = np.array(among.kinds) == "spins"
+    np.testing.assert_array_equal(alone.commands, among.commands[own])
+    np.testing.assert_array_equal(alone.starts, among.starts[own])
+
+
+def test_hover_of_a_model():
+    found = collect(HandoutPlant(), script=made("headings"))
+    assert np.abs(found["v"]).max() < 1.0, "it hovers"
+    model = nominal_parameters()
+    assert hover_action(model._replace(m=1e3)) == 1.0, "no thrust holds it"
+    assert hover_action(model._replace(thrust_coeffs=np.full(6, 20.0) * (np.arange(6) == 0))) == -1.0, (
+        "any does"
+    )
+
+
+def test_flights_of_a_small_craft_are_at_its_voltages(tmp_path):
+    voltages, model = (3.2, 4.1), nominal_parameters()
+    small = model._replace(thrust_coeffs=np.array([0.0, 4.0, 0.0, 0.0, 2.7, 0.0]))  # of the volts alone
+    hover = hover_action(small, voltages)
+    thrust_n = float(collective_thrust(hover, 0.5 * sum(voltages), small.thrust_coeffs))
+    assert thrust_n == pytest.approx(float(small.m) * float(small.g), rel=1e-3)
+    assert hover_action(small) != pytest.approx(hover, abs=0.1)
+    path = tmp_path / "diagnosis.json"
+    path.write_text(json.dumps(asked(("wind", "voltages")) | {"data": {"voltages": voltages}}))
+    script = next_flight(path, small).script
+    assert script.starts[:, BATTERY].max() == pytest.approx(4.1) and script.starts[:, BATTERY].min() > 3.2
+    np.testing.assert_allclose(script.starts[:, APPLIED_ACTION][:, 3], hover)
+    save_script(tmp_path / "flight.npz", script)
+    assert load_script(tmp_path / "flight.npz").kinds == script.kinds
+
+
+@pytest.mark.parametrize("voltages", [[3.0], [4.0, 3.0], ["a", "b"], [0.0, 4.0], "3 V"])
+def test_voltages_that_cannot_be_are_refused(tmp_path, voltages):
+    path = tmp_path / "diagnosis.json"
+    path.write_text(json.dumps(asked(("wind", "voltages")) | {"data": {"voltages": voltages}}))
+    with pytest.raises(ScriptError, match=r"diagnosis.json: data: voltages: found .* expected the lowest"):
+        next_flight(path, nominal_parameters())
+
+
+def test_scripts_go_lower_than_the_excitation():
+    log = collect(HandoutPlant(), script=made("low_passes", "speeds"))
+    assert SCRIPT_HEIGHTS[0] <= log["p"][:, 2].min() < 0.3 < HEIGHTS[0]
+    lengths = np.unique(log.segment, return_counts=True)[1]
+    assert len(lengths) == 16 and np.median(lengths) == FLIGHT_STEPS
+
+
+def test_a_script_comes_back_the_same(tmp_path):
+    script = made("speeds", "spins")
+    save_script(tmp_path / "flight.npz", script)
+    found = load_script(tmp_path / "flight.npz")
+    assert found.kinds == script.kinds
+    np.testing.assert_array_equal(found.starts, script.starts)
+    np.testing.assert_array_equal(found.commands, script.commands)
+    again = tmp_path / "again.npz"
+    save_script(again, script)
+    assert again.read_bytes() == (tmp_path / "flight.npz").read_bytes()
+
+
+def changed(name: str, place: Any, value: float) -> dict[str, Any]:
+    values = getattr(made("headings"), name).copy()
+    values[place] = value
+    return {name: values}
+
+
+class Harmful:
+    """Something that only a pickle can bring back."""
+
+    def __reduce__(self) -> tuple:
+        return (pytest.fail, ("a pickle was read",))
+
+
+BAD = {
+    r"starts\[3, 5\]: found nan, expected a finite number": changed("starts", (3, 5), np.nan),
+    r"commands\[1, 2, 3\]: found inf": changed("commands", (1, 2, 3), np.inf),
+    r"commands: found 1.5 in flight 2, expected -1 to 1": changed("commands", (2, 7, 0), 1.5),
+    "applied action.: found -2 in flight 0": changed("starts", (0, 19), -2.0),
+    "quaternion of norm 2 in flight 4": changed("starts", (4, 9), np.sqrt(4.0)),
+    "found flight 1 outside of the envelope": changed("starts", (1, 2), 0.01),
+    "found flight 0 outside of the envelope": changed("starts", (0, 20), -1.0),
+    r"starts: found shape \(8, 20\), expected \(8, 21\)": {"starts": made("headings").starts[:, :20]},
+    r"commands: found shape \(7, 250, 4\), expected \(8, 2 or more, 4\)": {
+        "commands": made("headings").commands[:7]
+    },
+    r"commands: found shape \(8, 1, 4\)": {"commands": made("headings").commands[:, :1]},
+    r"commands: found shape \(8, 1000\)": {"commands": made("headings").commands.reshape(8, -1)},
+    "kinds: found 'loop', expected one of headings": {"kinds": np.array(["loop"] * 8)},
+    "kinds: found no flight": {"kinds": np.array([], "U1")},
+    "kinds: found an array of float64": {"kinds": np.zeros(8)},
+    "starts: found an array of <U4": {"starts": np.full((8, 21), "text")},
+    "found text of numbers that are no characters": {"kinds": np.full(8, 0x7FFFFFFF, np.int32).view("<U1")},
+    r"kinds: found 'xxx.{0,80}, expected one of headings": {"kinds": np.array(["x" * 5000] * 8)},
+    "found more than 67108864 bytes": {"commands": np.zeros((8, 2**20 + 1, 1), np.int8)},
+    "nothing is unpickled": {"starts": np.array([Harmful()] * 8, object)},
+    "found arrays commands, kinds, more, starts, expected kinds, starts, commands": {"more": np.zeros(1)},
+}
+
+
+@pytest.mark.parametrize("message", BAD)
+def test_bad_scripts_are_refused(tmp_path, message):
+    script = made("headings")
+    arrays = {"kinds": np.array(script.kinds), "starts": script.starts, "commands": script.commands}
+    buffer = io.BytesIO()
+    np.savez(buffer, **{**arrays, **BAD[message]})
+    path = tmp_path / "bad.npz"
+    path.write_bytes(buffer.getvalue())
+    with pytest.raises(ScriptError, match=f"bad.npz: .*{message}"):
+        load_script(path)
+
+
+def test_names_without_flights_take_no_memory(tmp_path):
+    path, script = tmp_path / "names.npz", made("headings")
+    names = np.full(2**20, "\U0001f681" * 2)
+    np.savez(path, kinds=names, starts=script.starts, commands=script.commands)
+    del names
+    tracemalloc.start()
+    try:
+        with pytest.raises(ScriptError, match=r"starts: found shape \(8, 21\), expected \(1048576, 21\)"):
+            load_script(path)
+        assert tracemalloc.get_traced_memory()[1] < 2**26
+    finally:
+        tracemalloc.stop()
+
+
+def test_files_that_are_no_scripts_are_refused(tmp_path):
+    path = tmp_path / "cut.npz"
+    save_script(path, made("headings"))
+    path.write_bytes(path.read_bytes()[:1000])
+    for bad, message in ((path, "not a script, or damaged"), (tmp_path / "none.npz", "FileNotFoundError")):
+        with pytest.raises(ScriptError, match=message):
+            load_script(bad)
+    path.write_bytes(zipped([(f"{name}.npy", b"no array") for name in ("kinds", "starts", "commands")]))
+    with pytest.raises(ScriptError, match=r"cut\.npz: not a script, or damaged; .*NpzError"):
+        load_script(path)
+    with pytest.raises(ScriptError, match=r"found suffix '\.csv', expected \.npz"):
+        load_script(tmp_path / "flight.csv")
+    script = made("headings")
+    with pytest.raises(ScriptError, match=r"commands\[0, 0, 0\]: found nan"):
+        save_script(path, script._replace(commands=script.commands * np.nan))
+
+
+def asked(*pairs: tuple[str, str]) -> dict[str, Any]:
+    return {"schema": 1, "not_identifiable": [{"effect": effect, "fly": fly} for effect, fly in pairs]}
+
+
+def test_a_diagnosis_asks_for_flights(tmp_path):
+    path = tmp_path / "diagnosis.json"
+    path.write_text(json.dumps(asked(("gyro_scale", "spins"), ("wind", "headings"), ("imu_offset", "spins"))))
+    found = next_flight(path, nominal_parameters())
+    assert found.reasons == {"headings": ("wind",), "spins": ("gyro_scale", "imu_offset")}
+    assert found.script.kinds == ("headings",) * 8 + ("spins",) * 8
+    said = found.describe()
+    assert "spins: to settle gyro_scale, imu_offset" in said and MANOEUVRES["spins"].how in said
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ({"schema": 9, "not_identifiable": []}, "schema: found 9, expected 1"),
+        ([], "schema: found 'list'"),
+        ({"schema": 1}, "not_identifiable: found NoneType, expected a list"),
+        (asked(), "not_identifiable: found nothing that another flight would settle"),
+        (asked(("wind", "headings"), ("wind", "loop")), r"not_identifiable\[1\]: fly: found 'loop'"),
+        ({"schema": 1, "not_identifiable": ["wind"]}, r"not_identifiable\[0\]: effect: found None"),
+    ],
+)
+def test_what_is_no_diagnosis_is_refused(tmp_path, content, message):
+    path = tmp_path / "diagnosis.json"
+    path.write_text(json.dumps(content))
+    with pytest.raises(ScriptError, match=f"diagnosis.json: {message}"):
+        next_flight(path, nominal_parameters())
+    path.write_text("{")
+    with pytest.raises(ScriptError, match="cannot be read"):
+        next_flight(path, nominal_parameters())
+
+
+def test_commands_plan_and_collect(tmp_path, capsys):
+    (tmp_path / "diagnosis.json").write_text(json.dumps(asked(("ground_effect", "low_passes"))))
+    main(["plan", str(tmp_path / "diagnosis.json"), "--out", str(tmp_path / "flight.npz")])
+    assert "low_passes: to settle ground_effect" in capsys.readouterr().out
+    script, log = str(tmp_path / "flight.npz"), tmp_path / "log.npz"
+    main(["collect", "--black-box", str(SHIPPED), "--script", script, "--out", str(log)])
+    assert load_log(log)["p"][:, 2].max() < HEIGHTS[0]
+    with pytest.raises(SystemExit):
+        main(["collect", "--black-box", "x", "--script", script, "--minutes", "3", "--out", str(log)])
+    assert "not allowed with argument" in capsys.readouterr().err

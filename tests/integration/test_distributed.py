@@ -1,0 +1,242 @@
+"""Training on several devices and in several processes: one update, one set of files, a process lost."""
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import flytrack_env
+from baselines.joining import Job, add_job_flags, job_of
+from baselines.purejaxrl_ppo import Config, load_checkpoint
+from baselines.purejaxrl_ppo.across import AXIS, Across
+from baselines.purejaxrl_ppo.distributed import check_divides, digest
+from baselines.purejaxrl_ppo.named_arrays import as_named_arrays
+from baselines.purejaxrl_ppo.ppo import Batch, make_network_for, ppo_loss
+from baselines.purejaxrl_ppo.resume import newest_intact
+from baselines.purejaxrl_ppo.run_folder import checkpoints_in
+from baselines.purejaxrl_ppo.train_ppo import make_parser
+from tests.support.ppo_runs import BATCH, CONFIG
+
+ROOT = Path(__file__).parents[2]
+SIZE = 29  # of an observation
+SMALL = "--num-envs 16 --num-steps 24 --num-minibatches 4 --hidden-sizes 8 --evaluate-every 0 --no-tracking"
+
+
+# The update.
+
+
+def experience(network, params, size, seed):
+    """Return what a policy did in ``size`` drawn observations, with drawn advantages and targets."""
+    keys = jax.random.split(jax.random.key(seed), 6)
+    observation = jax.random.normal(keys[0], (size, SIZE))
+    policy, value = network.apply(params, observation)
+    action, log_prob = policy.sample_and_log_prob(seed=keys[1])
+    noise = 0.3 * jax.random.normal(keys[2], (2, size))
+    batch = Batch(observation, action, log_prob + noise[0], value + noise[1], value, jnp.zeros(size, bool))
+    return batch, 3.0 + 2.0 * jax.random.normal(keys[3], (size,)), jax.random.normal(keys[4], (size,))
+
+
+@pytest.mark.parametrize("num_shards", [2, 4])
+def test_the_gradient_of_equal_data_is_that_of_one_device(num_shards):
+    env = flytrack_env.make("FlyTrack-v0")
+    network = make_network_for(env, env.default_params, CONFIG)
+    params = network.init(jax.random.key(0), jnp.zeros((1, SIZE)))
+    data = experience(network, params, 64, seed=1)
+    gradient = jax.grad(ppo_loss, has_aux=True)
+    whole, parts = jax.jit(lambda *data: gradient(params, network, *data, CONFIG))(*data)
+    across = Across(AXIS)
+
+    def of_shard(batch, advantage, target):
+        return across.averaged(gradient(params, network, batch, advantage, target, CONFIG, across))
+
+    shards = jax.tree.map(lambda leaf: leaf.reshape(num_shards, -1, *leaf.shape[1:]), data)
+    found = jax.jit(jax.vmap(of_shard, axis_name=AXIS))(*shards)
+    for one in range(num_shards):
+        jax.tree.map(
+            lambda got, want: np.testing.assert_allclose(got, want, rtol=1e-4, atol=1e-6),
+            jax.tree.map(lambda leaf, one=one: leaf[one], found),
+            (whole, parts),
+        )
+
+
+def test_sums_and_means_over_shards_are_those_of_the_whole():
+    values = jax.random.normal(jax.random.key(0), (8, 5)) + 3.0
+    shards = values.reshape(4, 2, 5)
+    for name in ("sum", "mean", "variance"):
+        found = jax.vmap(getattr(Across(AXIS), name), axis_name=AXIS)(shards)
+        np.testing.assert_allclose(found, jnp.full(4, getattr(Across(), name)(values)), rtol=1e-5)
+
+
+def test_environments_and_minibatches_divide_into_shards():
+    mesh = jax.sharding.Mesh(np.array(jax.devices() * 3), (AXIS,))
+    with pytest.raises(ValueError, match="num_envs: found 16, expected a multiple of 3 devices"):
+        check_divides(CONFIG, mesh)
+    with pytest.raises(ValueError, match="num_minibatches: found 64, expected a divisor of the 96 steps"):
+        check_divides(Config(num_envs=12, num_steps=24, num_minibatches=64), mesh)
+
+
+def test_the_same_values_have_the_same_number_that_devices_can_compare():
+    numbers = [digest([{"a": value, "b": Path("x")}]) for value in range(50)]
+    assert len(set(numbers)) == 50 and min(numbers) >= 0 and 2**30 < max(numbers) < 2**31
+    assert digest([{"b": Path("x"), "a": 0}]) == numbers[0]
+
+
+# The job.
+
+
+@pytest.mark.parametrize(
+    ("flags", "message"),
+    [
+        ("--coordinator a:1", "expected --distributed with it"),
+        ("--distributed --coordinator a:1", "found --coordinator, expected all of --coordinator, --num-pro"),
+        (
+            "--distributed --coordinator a --num-processes 2 --process-index 0",
+            "found 'a', expected HOST:PORT",
+        ),
+        ("--distributed --coordinator a:b --num-processes 2 --process-index 0", "expected HOST:PORT"),
+        ("--distributed --coordinator a:1 --num-processes 0 --process-index 0", "expected at least 1"),
+        ("--distributed --coordinator a:1 --num-processes 2 --process-index 2", "found 2, expected 0 to 1"),
+    ],
+)
+def test_what_is_no_job_is_refused(flags, message):
+    with pytest.raises(ValueError, match=message):
+        job_of(make_parser().parse_args(flags.split()))
+
+
+def test_a_job_is_where_the_flags_or_the_cluster_say():
+    import argparse
+
+    parser = argparse.ArgumentParser()
+    add_job_flags(parser)
+    assert job_of(parser.parse_args(["--distributed"])) == Job()
+    flags = "--distributed --coordinator a:1 --num-processes 2 --process-index 1"
+    assert job_of(parser.parse_args(flags.split())) == Job("a:1", 2, 1)
+
+
+# Whole processes.
+
+
+def free_port():
+    with socket.socket() as one:
+        one.bind(("127.0.0.1", 0))
+        return one.getsockname()[1]
+
+
+STARTED = []
+
+
+@pytest.fixture(autouse=True)
+def no_process_is_left():
+    yield
+    while STARTED:
+        process = STARTED.pop()
+        process.kill()
+        process.communicate()
+
+
+def start(out, *flags, devices=1, number=1, index=0, port=None):
+    job = ["--distributed"] if devices > 1 or number > 1 else []
+    if number > 1:
+        job += [
+            *("--coordinator", f"127.0.0.1:{port}"),
+            *("--num-processes", number, "--process-index", index),
+        ]
+    command = [
+        sys.executable,
+        "-m",
+        "baselines.purejaxrl_ppo.train_ppo",
+        "--out",
+        out,
+        *SMALL.split(),
+        *job,
+        *flags,
+    ]
+    xla = f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count={devices}"
+    process = subprocess.Popen(
+        [*map(str, command)],
+        cwd=ROOT,
+        env={**os.environ, "XLA_FLAGS": xla, "JAX_PLATFORMS": "cpu"},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    STARTED.append(process)
+    return process
+
+
+def end_of(process):
+    said, errors = process.communicate(timeout=240)
+    return process.returncode, said, errors
+
+
+def parameters(folder, name="final.msgpack"):
+    return as_named_arrays(load_checkpoint(folder / name).params)
+
+
+def test_two_processes_train_as_two_devices(tmp_path):
+    flags = ["--total-timesteps", 7 * BATCH, "--checkpoint-every", 2 * BATCH]
+    devices = start(tmp_path / "devices", *flags, devices=2)
+    port = free_port()
+    pair = [start(tmp_path / "pair", *flags, number=2, index=i, port=port) for i in (0, 1)]
+    status, said, errors = end_of(devices)
+    assert status == 0, errors
+    (first, said_first, errors_first), (second, said_second, errors_second) = map(end_of, pair)
+    assert (first, second) == (0, 0), errors_first + errors_second
+    # Files are written once, by the first process, and each says as much as one alone.
+    assert "final.msgpack" in said_first and "final.msgpack" in said
+    assert "msgpack" not in said_second
+    names = sorted(path.name for path in (tmp_path / "devices").iterdir())
+    assert sorted(path.name for path in (tmp_path / "pair").iterdir()) == names
+    assert sum(name.startswith("step_") for name in names) == 4
+    of_pair, of_devices = parameters(tmp_path / "pair"), parameters(tmp_path / "devices")
+    for name, array in of_devices.items():
+        np.testing.assert_allclose(of_pair[name], array, rtol=1e-4, atol=1e-6, err_msg=name)
+
+
+def test_a_lost_process_ends_the_job_and_another_number_goes_on(tmp_path):
+    port, long = free_port(), ["--total-timesteps", 200_000 * BATCH, "--checkpoint-every", 50 * BATCH]
+    out = tmp_path / "lost"
+    pair = [start(out, *long, number=2, index=i, port=port) for i in (0, 1)]
+    while not (out / f"step_{50 * BATCH}.msgpack").exists():
+        assert [one.poll() for one in pair] == [None, None], [end_of(one) for one in pair]
+        time.sleep(0.1)
+    pair[1].send_signal(signal.SIGKILL)
+    status, _, errors = end_of(pair[0])
+    end_of(pair[1])
+    assert status == 1
+    assert "process 0 of 2 has lost another" in errors and f"go on with --resume {out}" in errors
+    assert "Traceback" not in errors
+    stored = newest_intact(out)[0]
+    # Another number of processes goes on, and says that the bits may be others.
+    status, _, errors = end_of(start(out, "--resume", out, "--learning-rate", 1e-4))
+    assert status == 2 and "config.learning_rate" in errors and "machine.devices: found 2" in errors
+    alone = start(out, "--resume", out)
+    while checkpoints_in(out)[0] == stored:
+        assert alone.poll() is None, end_of(alone)
+        time.sleep(0.1)
+    alone.send_signal(signal.SIGINT)
+    status, _, errors = end_of(alone)
+    assert status == 130 and "found 2, expected 1; going on, perhaps not bit for bit" in errors
+
+
+def test_one_device_alone_is_no_job(tmp_path):
+    command = "-m baselines.purejaxrl_ppo.train_ppo --distributed --out"
+    process = subprocess.run(
+        [sys.executable, *command.split(), tmp_path / "x"],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        env={**os.environ, "JAX_PLATFORMS": "cpu"},
+    )
+    assert process.returncode == 1 and not (tmp_path / "x").exists()
+    assert (
+        "train_ppo: error: --distributed: found no job of SLURM or Open MPI, and one device" in process.stderr
+    )

@@ -1,0 +1,223 @@
+"""Evaluation: many flights and single ones agree, known lap times come out, ghost, what the command tells."""
+
+import importlib.util
+import json
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+import pytest
+
+import eval_agent
+from baselines.purejaxrl_ppo import evaluate
+from baselines.purejaxrl_ppo.checkpoint import Checkpoint, load_checkpoint
+from baselines.purejaxrl_ppo.evaluate import fly_many, race_many, start_keys
+from baselines.purejaxrl_ppo.flights import Flight, Outcomes, outcomes_of, score
+from baselines.purejaxrl_ppo.perturbed import (
+    draw_plants,
+)
+from baselines.purejaxrl_ppo.summary import distribution, share, summarise
+from benchmarks.optimal.compared import compare, time_lost
+from flytrack_env import FlyTrack, load_track, nominal_parameters
+from flytrack_env.references import ghost_rollout, shipped_reference, shipped_references
+from flytrack_env.rollout import load_rollout
+from flytrack_env.state import BATTERY, POSITION, VELOCITY
+from tests.support.evaluated import FAILS_BELOW_V, Rails, run, write_checkpoint
+from tests.support.recordings import Recording
+
+ROOT = Path(__file__).parents[2]
+NUM_LAPS, NUM_STEPS, NUM_FLIGHTS = 3, 1400, 10
+TOLERANCE_S = 2e-3
+
+
+@pytest.fixture(scope="module")
+def checkpoint_path(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_checkpoint(tmp_path_factory.mktemp("checkpoint") / "policy.msgpack")
+
+
+@pytest.fixture(scope="module")
+def checkpoint(checkpoint_path: Path) -> Checkpoint:
+    return load_checkpoint(checkpoint_path)
+
+
+@pytest.fixture(scope="module")
+def on_rails() -> FlyTrack:
+    return FlyTrack(plant=Rails())
+
+
+@pytest.fixture(scope="module")
+def flights(on_rails: FlyTrack, checkpoint: Checkpoint) -> Flight:
+    policy = (checkpoint.network, checkpoint.params)
+    return fly_many(on_rails, *policy, 0, NUM_FLIGHTS, NUM_STEPS, NUM_LAPS)
+
+
+@pytest.fixture(scope="module")
+def raced(on_rails: FlyTrack, checkpoint: Checkpoint) -> Outcomes:
+    """The same flights, in batches, the last one not full."""
+    policy = (checkpoint.network, checkpoint.params)
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(evaluate, "BATCH", 4)
+        return race_many(on_rails, *policy, start_keys(0, NUM_FLIGHTS), NUM_STEPS, NUM_LAPS)
+
+
+@pytest.fixture(scope="module")
+def paces(flights: Flight) -> np.ndarray:
+    """How slow each flight on rails is; 0 where it falls."""
+    battery_v = np.asarray(flights.states)[:, 0, BATTERY]
+    return np.where(battery_v < FAILS_BELOW_V, 0.0, Rails.pace(battery_v))
+
+
+def assert_same(found: Outcomes, expected: Outcomes) -> None:
+    for name, values in expected._asdict().items():
+        for a, b in zip(jax.tree.leaves(getattr(found, name)), jax.tree.leaves(values), strict=True):
+            np.testing.assert_allclose(a, b, atol=1e-5, err_msg=name)
+
+
+def test_lap_times_are_those_of_the_rails(raced: Outcomes, paces: np.ndarray) -> None:
+    is_good = paces > 0.0
+    assert 0 < is_good.sum() < NUM_FLIGHTS  # else this test would see one kind only
+    np.testing.assert_array_equal(raced.is_complete(), is_good)
+    np.testing.assert_array_equal(raced.ends()["ground"], ~is_good)
+    standing, flying = (shipped_reference("flytrack", kind) for kind in ("standing", "flying"))
+    expected = paces[is_good, None] * np.array([[standing.time_s, flying.time_s, flying.time_s]])
+    np.testing.assert_allclose(raced.lap_times_s[is_good], expected, atol=TOLERANCE_S)
+    gates_s = paces[is_good, None] * standing.gate_times_s
+    np.testing.assert_allclose(raced.gate_times_s[is_good, :8], gates_s, atol=TOLERANCE_S)
+    assert np.isnan(raced.lap_times_s[~is_good]).all() and (raced.steps[~is_good] < 210).all()
+    assert score(raced).success == is_good.mean()
+
+
+def test_every_step_kept_or_not_is_the_same_flight(flights: Flight, raced: Outcomes) -> None:
+    assert NUM_FLIGHTS % 4
+    assert_same(raced, outcomes_of(flights, NUM_LAPS, 8))
+
+
+def test_time_lost_adds_up_to_the_lap(raced: Outcomes, paces: np.ndarray) -> None:
+    references = shipped_references(load_track("flytrack"), ("nominal",))
+    slow = paces[paces > 0.0].mean() - 1.0
+    compared = compare(summarise(raced, is_limited=True), references)
+    assert compared["model"] == "nominal"
+    for lap, kind in (("first_lap_s", "standing"), ("flying_lap_s", "flying")):
+        lost = [row[lap] for row in time_lost(raced, references)]
+        reference = references[kind]
+        np.testing.assert_allclose(lost, slow * np.diff(reference.gate_times_s, prepend=0.0), atol=2e-3)
+        assert sum(lost) == pytest.approx(slow * reference.time_s, abs=TOLERANCE_S)
+        assert compared[lap]["mean_percent_above"] == pytest.approx(100.0 * slow, abs=0.1)
+        assert 0.0 <= compared[lap]["min_percent_above"] < compared[lap]["mean_percent_above"]
+
+
+def test_no_laps_are_no_numbers() -> None:
+    references = shipped_references(load_track("split_s"), ("black_box", "nominal"))
+    never = np.full((2, 3), np.nan), np.full((2, 21), np.nan)
+    causes = evaluate.Causes(*(np.array([True, False]) if i == 0 else np.zeros(2, bool) for i in range(5)))
+    nothing = Outcomes(np.array([5, 9]), np.array([0, 1]), np.zeros(2, int), *never, causes)
+    summary = summarise(nothing, is_limited=True)
+    assert summary["first_lap_s"]["mean"] is None and summary["ended"]["time_limit"] == 1
+    rows = time_lost(nothing, references)
+    assert len(rows) == 7 and rows[0] == {"gate": 1, "first_lap_s": None, "flying_lap_s": None}
+    json.dumps([summary, rows, compare(summary, references)], allow_nan=False)
+
+
+def test_ghost_is_the_reference_nearest_in_time() -> None:
+    references = shipped_references(load_track("flytrack"), ("black_box",))
+    standing, flying = references["standing"], references["flying"]
+    assert standing.model_name == "black_box"
+    states, commands = ghost_rollout(references, 1200)
+    assert states.shape == (1200, 21) and commands.shape == (1200, 4)
+    np.testing.assert_array_equal(states[:300], standing.states[:300])
+    np.testing.assert_array_equal(commands[:300], standing.commands[:300])
+    # The second flying lap, a third of its time in.
+    at = round((standing.time_s + 4.0 / 3.0 * flying.time_s) / 0.01)
+    offset_s = at * 0.01 - standing.time_s - flying.time_s
+    grid_s = 0.01 * np.arange(len(flying.states))
+    expected = [np.interp(offset_s, grid_s, column) for column in flying.states[:, POSITION].T]
+    speed = np.linalg.norm(states[at, VELOCITY])
+    assert np.linalg.norm(states[at, POSITION] - expected) <= 0.5 * 0.01 * speed * 1.05
+
+
+def test_shares_have_wilsons_interval() -> None:
+    # Closed forms for none of n, z^2 / (n + z^2), and for all of n, n / (n + z^2).
+    squared = 1.959964**2
+    none, whole = share(np.zeros(10, bool)), share(np.ones(256, bool))
+    assert none["low"] == 0.0 and none["high"] == pytest.approx(squared / (10 + squared), rel=1e-5)
+    assert whole["low"] == pytest.approx(256 / (256 + squared), rel=1e-6) and whole["high"] == 1.0
+    times = distribution(np.array([3.0, 1.0, 2.0]))
+    assert times == {"number": 3, "mean": 2.0, "min": 1.0, "q05": 1.1, "q50": 2.0, "q95": 2.9}
+
+
+@pytest.mark.parametrize("flown_by", ["black box", "plants"])
+def test_command_flies_many(
+    flown_by: str,
+    checkpoint_path: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    flights: Flight,
+) -> None:
+    flown = []
+    fly_scene = eval_agent.fly_scene
+    monkeypatch.setattr(eval_agent, "fly_scene", lambda *a: flown.append(fly_scene(*a)) or flown[0])
+    if flown_by == "black box":  # one program less to compile: single flights are those of test_commands
+        monkeypatch.setattr(eval_agent, "_fly_one", lambda *_: jax.tree.map(lambda leaf: leaf[0], flights))
+    out, file = tmp_path / "flight.npy", tmp_path / "new" / "report.json"
+    more = ["--episodes", 2, "--plants", 3] if flown_by == "plants" else ["--episodes", 6, "--laps", 1]
+    where = ["--checkpoint", checkpoint_path, "--out", out, "--json", file]
+    run(monkeypatch, *where, "--steps", 120, "--track", "split_s", "--ghost", *more)
+    outcomes, flight = flown[0]
+    report, text = json.loads(file.read_text()), capsys.readouterr().out
+    assert report["schema"] == 1 and report["flights"] == 6 and report["track"] == "split_s"
+    assert report["steps"] == outcomes.steps.sum() and report["success"]["of"] == 6
+    assert "track split_s" in text and f"complete {report['laps']} laps: 0 of 6" in text
+    states, _ = load_rollout(out)
+    assert len(states) == report["first_flight"]["steps"] == np.sum(flight.is_flying)
+    assert len(load_rollout(report["ghost"])[0]) == len(states)
+    if flown_by == "plants":
+        single = outcomes_of(jax.tree.map(lambda leaf: leaf[None], flight), 3, 7)
+        assert_same(jax.tree.map(lambda leaf: leaf[:1], outcomes), single)
+        assert "in the simulator, not on a black box" in text and report["black_box"] is None
+        assert report["optimal"]["model"] == "nominal" and report["success"]["low"] is None
+        assert report["plants"]["success"]["of"] == 3 and len(report["plants"]["by_thirds"]) == 12
+        assert len(set(outcomes.steps[::2].tolist())) > 1  # the plants differ
+    else:
+        assert report["optimal"]["model"] == "black_box" and report["plants"] is None
+        assert report["success"]["high"] == pytest.approx(0.390334, abs=1e-5)  # Wilson's, of none of 6
+
+
+def keys_of(value: Any) -> set[str]:
+    """Return every name of JSON values, however deep."""
+    if isinstance(value, dict):
+        return set(value) | {name for part in value.values() for name in keys_of(part)}
+    return {name for part in value for name in keys_of(part)} if isinstance(value, list) else set()
+
+
+def test_single_flight_is_told_as_json_and_docs_name_every_key(
+    checkpoint_path: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    flights: Flight,
+    raced: Outcomes,
+) -> None:
+    index = int(np.argmax(raced.is_complete()))
+    monkeypatch.setattr(eval_agent, "_fly_one", lambda *_: jax.tree.map(lambda leaf: leaf[index], flights))
+    out, file = tmp_path / "flight.npy", tmp_path / "report.json"
+    where = ["--checkpoint", checkpoint_path, "--out", out, "--json", file, "--steps", NUM_STEPS]
+    recording = tmp_path / "flight.rrd"
+    if importlib.util.find_spec("rerun") is not None:
+        where += ["--rrd", recording]
+    run(monkeypatch, *where)
+    text, report = capsys.readouterr().out, json.loads(file.read_text())
+    if report["recording"] is not None:
+        assert report["recording"] == str(recording)
+        found = Recording(recording)
+        for drone in ("/world/drone", "/world/flights/simulator/drone"):
+            place = found.series(drone, "Transform3D:translation")
+            np.testing.assert_allclose(place, load_rollout(out)[0][:, POSITION])
+    assert "interval" not in text and report["success"] is None and report["ghost"] is None
+    np.testing.assert_allclose(report["first_flight"]["lap_times_s"], raced.lap_times_s[index], atol=1e-5)
+    assert [line.split(":")[0] for line in text.splitlines()][:4] == ["flown", "gates", "lap times", "ended"]
+    plants = draw_plants(0, 3, nominal_parameters()).summarise(np.ones((3, 1), bool))
+    text = (ROOT / "docs" / "baseline.md").read_text()
+    missing = {name for name in keys_of({**report, "plants": plants}) if f"`{name}`" not in text}
+    assert not missing

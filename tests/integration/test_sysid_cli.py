@@ -1,0 +1,248 @@
+"""The command flytrack-sysid: from a plant to a model and its report, and what it refuses."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import gymnax
+import numpy as np
+import pytest
+
+from blackbox.build import build
+from blackbox.plant import PlantParameters
+from flytrack_env import load_model, load_provenance, save_model
+from flytrack_env.dynamics import nominal_parameters
+from flytrack_sysid import collect, load_log, save_log
+from flytrack_sysid.cli import load_plant, main
+from flytrack_sysid.log import FlightLog
+
+SHIPPED = Path(__file__).parents[2] / "blackbox" / "acro_step.bin"
+TAUS = (0.02, 0.05, 0.07, 0.03)
+OTHER = PlantParameters(
+    mass=1.0,
+    gravity=9.80665,
+    battery_drain=1.0,
+    lag=TAUS,
+    max_rate=(618.0, 618.0, 120.0),
+    thrust=(-7.0, -3.0, 3.0, -1.0, 0.9, 0.9),
+    body_drag=(0.0, 0.0, 0.0),
+    rotor_drag=0.0,
+    translational_lift=0.0,
+    translational_speed=1.0,
+    ground_radius=0.0,
+)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory) -> Path:
+    """A folder in which the command has collected, fitted and validated another plant than the shipped."""
+    out = tmp_path_factory.mktemp("sysid")
+    build(OTHER, out / "other.bin")
+    collect = ["collect", "--black-box", out / "other.bin", "--out", out / "data.npz", "--minutes", "1"]
+    for arguments in (
+        collect,
+        ["fit", out / "data.npz", "--out", out / "model.json"],
+        ["validate", out / "model.json", out / "data.npz", "--out", out / "report"],
+    ):
+        main([str(argument) for argument in arguments])
+    return out
+
+
+def refused(capsys, *arguments: object) -> str:
+    """Run a command that must be refused and return what it says."""
+    with pytest.raises(SystemExit) as stopped:
+        main([str(argument) for argument in arguments])
+    assert stopped.value.code == 2
+    said = capsys.readouterr().err
+    assert "Traceback" not in said
+    return said
+
+
+def test_artifact_of_other_parameters_is_identified(folder):
+    model = load_model(folder / "model.json")
+    np.testing.assert_allclose(model.tau, TAUS, rtol=1e-4)
+    terms = np.array([1.0, 0.5, 0.25, 0.125, 23.0, 11.5])  # 1, u, u^2, u^3, V, u V at u = 0.5
+    assert model.thrust_coeffs @ terms == pytest.approx(np.array(OTHER.thrust) @ terms, rel=1e-4)
+
+
+def test_model_file_says_where_it_is_from(folder):
+    provenance = load_provenance(folder / "model.json")
+    assert provenance["data"] == {"file": "data.npz", "sha256": load_log(folder / "data.npz").sha256}
+    assert provenance["split"]["held_out_every"] == 4
+    interval = provenance["intervals_95"]["tau_yaw"]
+    assert interval["low"] <= interval["value"] <= interval["high"] and interval["unit"] == "s"
+    assert np.shape(provenance["correlation"]["matrix"]) == (11, 11)
+
+
+def test_model_file_flies(folder):
+    _, params = gymnax.make("FlyTrack-v0", model=str(folder / "model.json"))
+    np.testing.assert_allclose(params.model.tau, TAUS, rtol=1e-4)
+
+
+def test_report_is_of_the_held_out_part(folder):
+    report = json.loads((folder / "report" / "validation.json").read_text())
+    text = json.dumps(report)
+    assert '"judged_rows"' in text and "thrust" in text
+    log = load_log(folder / "data.npz")
+    judged = next(part for part in (report, *report.values()) if "judged_rows" in part)["judged_rows"]
+    assert 0.2 * len(log) < judged < 0.3 * len(log)
+    names = {path.name for path in (folder / "report").iterdir()}
+    assert {"validation.html", "validation.txt", "validation.json", "steps.png", "thrust.png"} <= names
+
+
+def test_other_log_is_judged_whole(folder, capsys, tmp_path):
+    save_log(tmp_path / "other.csv", load_log(folder / "data.npz").without("a"))
+    main(["validate", str(folder / "model.json"), str(tmp_path / "other.csv"), "--out", str(tmp_path / "r")])
+    assert "all rows are judged" in capsys.readouterr().out
+
+
+def test_fix_and_from(folder, tmp_path):
+    out = tmp_path / "fixed.json"
+    start = tmp_path / "start.json"
+    heavy = nominal_parameters()._replace(m=2.0)
+    save_model(start, heavy, {})
+    arguments = ["fit", folder / "data.npz", "--out", out, "--fix", "tau_yaw=0.05", "--from", start]
+    main([str(argument) for argument in arguments])
+    model = load_model(out)
+    assert model.tau[2] == np.float32(0.05) and model.m == 2.0
+    np.testing.assert_allclose(
+        model.thrust_coeffs, 2.0 * load_model(folder / "model.json").thrust_coeffs, 1e-2
+    )
+    assert "tau_yaw" not in load_provenance(out)["intervals_95"]
+
+
+MODULE = """
+import numpy as np
+
+def step(x, u):
+    return np.asarray(x)
+
+def broken(x, u):
+    raise RuntimeError("motors are off")
+
+def in_place(x, u):
+    x[8] = 20.0 * u[3]
+    x[5] += 0.01 * x[8]
+    x[16:20] = u
+    return x
+
+number = 3
+"""
+
+
+def test_module_and_step_are_imported_from_the_working_folder(tmp_path, monkeypatch):
+    (tmp_path / "my_robot.py").write_text(MODULE)
+    monkeypatch.chdir(tmp_path)
+    assert load_plant("my_robot:step")(np.ones(2), None).tolist() == [1.0, 1.0]
+
+
+@pytest.mark.parametrize(
+    ("plant", "options", "message"),
+    [
+        ("missing.bin", [], "missing.bin"),
+        ("no_such_module:step", [], "no_such_module:step: cannot be imported"),
+        ("my_robot:land", [], "my_robot:land: cannot be imported"),
+        ("my_robot:number", [], "found int"),
+        ("my_robot:broken", [], "RuntimeError: motors are off"),
+        ("my_robot:step", [], "expected it to sink and to climb"),
+        ("unfinished:step", [], "unfinished:step: cannot be imported: SyntaxError"),
+        (".my_robot:step", [], ".my_robot:step: cannot be imported: TypeError"),
+        (SHIPPED, ["--minutes", "0.2"], "minutes"),
+        (SHIPPED, ["--minutes", "inf"], "minutes: found inf"),
+        (SHIPPED, ["--noise", "-1"], "noise"),
+        (SHIPPED, ["--noise", "inf"], "noise: found inf"),
+        (SHIPPED, ["--noise", "50"], "noise: found 50.0, expected 0 or more, below 50"),
+        (SHIPPED, ["--seed", "-1"], "seed: found -1"),
+        (SHIPPED, ["--out", "data.mat"], "data.mat"),
+    ],
+)
+def test_collect_refuses(capsys, tmp_path, monkeypatch, plant, options, message):
+    (tmp_path / "my_robot.py").write_text(MODULE)
+    (tmp_path / "unfinished.py").write_text("def step(x, u) return x")
+    monkeypatch.chdir(tmp_path)
+    assert message in refused(capsys, "collect", "--black-box", plant, "--out", "data.npz", *options)
+    assert {path.name for path in tmp_path.iterdir()} <= {"my_robot.py", "unfinished.py", "__pycache__"}
+
+
+def test_function_that_changes_its_arguments_changes_no_logged_row(tmp_path, monkeypatch):
+    (tmp_path / "my_robot.py").write_text(MODULE)
+    monkeypatch.chdir(tmp_path)
+    log = collect(load_plant("my_robot:in_place"), minutes=1.0)
+    inside = ~log.is_start()[1:]
+    grown = np.diff(log["v"][:, 2])[inside]
+    np.testing.assert_allclose(grown, 0.01 * log["a"][1:, 2][inside], atol=1e-5)
+    # The action applied at a row is the one commanded before it.
+    np.testing.assert_array_equal(log["uprev"][1:][inside], log["u"][:-1][inside])
+
+
+def in_degrees(log: FlightLog) -> FlightLog:
+    """Return the log with gyro rates in deg/s."""
+    return FlightLog(log.time, {**log.channels, "w": np.rad2deg(log["w"])}, log.segment)
+
+
+def stuck(log: FlightLog) -> FlightLog:
+    """Return the log with a yaw stick that never moved."""
+    commands = log["u"] * np.array([1.0, 1.0, 0.0, 1.0])
+    return FlightLog(log.time, {**log.channels, "u": commands}, log.segment)
+
+
+def test_fit_does_not_overwrite_a_log(folder, capsys):
+    before = (folder / "data.npz").read_bytes()
+    said = refused(capsys, "fit", folder / "data.npz", "--out", folder / "data.npz")
+    assert "data.npz: found suffix '.npz', expected .json" in said
+    assert (folder / "data.npz").read_bytes() == before
+
+
+@pytest.mark.parametrize(
+    ("spoil", "options", "message"),
+    [
+        (in_degrees, [], "deg/s"),
+        (stuck, [], "u_yaw: stuck"),
+        (lambda log: log.select(slice(50)), [], "too short"),
+        (lambda log: log, ["--fix", "tau_yaw"], "NAME=VALUE"),
+        (lambda log: log, ["--fix", "tau=1"], "tau: unknown"),
+        (lambda log: log, ["--effect", "magic"], "magic"),
+        (lambda log: log, ["--hold-out-every", "1"], "every: found 1"),
+        (lambda log: log, ["--from", "absent.json"], "absent.json"),
+    ],
+)
+def test_fit_refuses(folder, capsys, tmp_path, spoil, options, message):
+    save_log(tmp_path / "log.npz", spoil(load_log(folder / "data.npz")))
+    out = tmp_path / "model.json"
+    assert message in refused(capsys, "fit", tmp_path / "log.npz", "--out", out, *options)
+    assert not out.exists()
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"version": 99}, "version: found 99, expected 1; written by a newer FlyTrack"),
+        ({"provenance": 3}, "provenance: found 3"),
+        ({"split": {"held_out_every": "x"}}, "held_out_every: found 'x'"),
+        ({"split": {"held_out_every": 0}}, "validate it on another log"),
+    ],
+)
+def test_validate_refuses(folder, capsys, tmp_path, change, message):
+    document = json.loads((folder / "model.json").read_text())
+    (document["provenance"] if "split" in change else document).update(change)
+    path = tmp_path / "changed.json"
+    path.write_text(json.dumps(document))
+    assert message in refused(capsys, "validate", path, folder / "data.npz", "--out", tmp_path / "report")
+    assert not (tmp_path / "report").exists()
+
+
+@pytest.mark.parametrize(
+    ("spoil", "message"), [(in_degrees, "deg/s"), (lambda log: log.select(slice(50)), "too short")]
+)
+def test_validate_refuses_what_cannot_be_a_flight(folder, capsys, tmp_path, spoil, message):
+    save_log(tmp_path / "other.npz", spoil(load_log(folder / "data.npz")))
+    out = tmp_path / "report"
+    assert message in refused(capsys, "validate", folder / "model.json", tmp_path / "other.npz", "--out", out)
+    assert not out.exists()
+
+
+def test_the_command_is_installed():
+    command = Path(sys.executable).with_name("flytrack-sysid")
+    done = subprocess.run([command, "--help"], capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0 and "validate" in done.stdout

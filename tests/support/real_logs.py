@@ -1,0 +1,18 @@
+"""Where the tests find measured flights."""
+
+import os
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+VARIABLE = "FLYTRACK_SHARED_DATA"
+CRAZYFLIE, BETAFLIGHT = "crazyflie_rate_flights", "betaflight_acro_log"
+
+
+def shared(name: str) -> Path:
+    """Return a folder of measured flights; skips the test where it is absent."""
+    folder = Path(os.environ.get(VARIABLE, ROOT.parent / "shared" / "data")) / name
+    if not folder.is_dir():
+        pytest.skip(f"no measured flights at {folder}; {VARIABLE} can name the folder of {name}")
+    return folder

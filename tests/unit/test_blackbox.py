@@ -1,0 +1,207 @@
+"""Black boxes: loading any, refusing the rest, flying them in bulk and in the environment."""
+
+import gymnax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax import export
+
+import flytrack_env
+from flytrack_env import blackbox, nominal_parameters
+from flytrack_env.blackbox import BlackBoxError, load
+from flytrack_env.state import (
+    BATTERY,
+    POSITION,
+    Action,
+    unpack,
+    unpack_action,
+)
+from tests.support.black_boxes import SHIPPED, random_inputs, write_artifact
+
+# Loading
+
+
+def test_missing_directory_and_empty(tmp_path):
+    (tmp_path / "empty.bin").write_bytes(b"")
+    cases = {"missing.bin": "found nothing", ".": "found a directory", "empty.bin": "found 0 bytes"}
+    for name, found in cases.items():
+        with pytest.raises(BlackBoxError, match=found) as caught:
+            load(tmp_path / name)
+        assert str(tmp_path / name) in str(caught.value)
+
+
+def test_huge_file(tmp_path):
+    path = tmp_path / "huge.bin"
+    with path.open("wb") as file:
+        file.truncate(2**40)  # sparse: takes no room
+    with pytest.raises(BlackBoxError, match=f"found {2**40} bytes, expected 1 to"):
+        load(path)
+
+
+def test_truncated(tmp_path):
+    content = SHIPPED.read_bytes()
+    path = tmp_path / "truncated.bin"
+    # The last dozen bytes are padding that the format does not need.
+    lengths = [1, 3, 4, 8, 20, 64, *range(100, len(content) - 12, 97), len(content) - 13]
+    for length in lengths:
+        path.write_bytes(content[:length])
+        with pytest.raises(BlackBoxError, match=f"found {length} bytes that cannot be deserialised"):
+            load(path)
+
+
+def test_random_bytes_and_foreign_formats(tmp_path):
+    path = tmp_path / "noise.bin"
+    rng = np.random.default_rng(0)
+    contents = [rng.bytes(size) for size in (16, 300, 5000, 100_000)]
+    contents += [b"\0" * 4096, b"\xff" * 4096, b"{}", b"\x80\x04K\x01.", b"PK\x03\x04" * 100]
+    for content in contents:
+        path.write_bytes(content)
+        with pytest.raises(BlackBoxError, match=r"noise\.bin: .*expected"):
+            load(path)
+
+
+@pytest.mark.parametrize(
+    ("function", "shapes", "dtype", "found"),
+    [
+        (lambda x, u: x, ((20,), (4,)), jnp.float32, r"float32\[20\], float32\[4\]"),
+        (lambda x, u: x, ((21,), (3,)), jnp.float32, r"float32\[21\], float32\[3\]"),
+        (lambda x, u: x[:18], ((21,), (4,)), jnp.float32, r"-> \(float32\[18\]\)"),
+        (lambda x, u: (x, u), ((21,), (4,)), jnp.float32, r"-> \(float32\[21\], float32\[4\]\)"),
+        (lambda x: x, ((21,),), jnp.float32, r"\(float32\[21\]\) ->"),
+        (lambda x, u, dt: x, ((21,), (4,), ()), jnp.float32, r"float32\[\]"),
+        (lambda x, u: x, ((21,), (4,)), jnp.float16, r"float16\[21\]"),
+        (lambda x, u: x, ((21,), (4,)), jnp.int32, r"int32\[21\]"),
+    ],
+)
+def test_wrong_signature(tmp_path, function, shapes, dtype, found):
+    path = write_artifact(tmp_path / "other.bin", function, shapes, dtype=dtype)
+    with pytest.raises(BlackBoxError, match=f"signature: found .*{found}.*expected") as caught:
+        load(path)
+    assert "other.bin" in str(caught.value)
+
+
+def test_wrong_platform(tmp_path):
+    path = write_artifact(tmp_path / "gpu.bin", lambda x, u: x, platforms=["cuda"])
+    with pytest.raises(BlackBoxError, match=r"gpu\.bin: platforms: found \('cuda',\)"):
+        load(path)
+
+
+def test_not_finite(tmp_path):
+    path = write_artifact(tmp_path / "nan.bin", lambda x, u: x.at[8].set(x[8] / x[0]))
+    with pytest.raises(BlackBoxError, match=r"nan\.bin: components \[8\] .*expected finite numbers"):
+        load(path)
+
+
+def test_calls_into_python_are_refused(tmp_path):
+    def step(x: jax.Array, u: jax.Array) -> jax.Array:
+        return jax.ffi.ffi_call(target, jax.ShapeDtypeStruct(x.shape, x.dtype))(x)
+
+    target = "xla_ffi_python_cpu_callback"
+    checks = [export.DisabledSafetyCheck.custom_call(target)]
+    path = write_artifact(tmp_path / "callback.bin", step, disabled_checks=checks)
+    with pytest.raises(BlackBoxError, match=rf"callback\.bin: found .*{target}"):
+        load(path)
+
+
+# Flying
+
+
+def test_vmap_nested_vmap_and_scan_agree_with_a_loop(black_box, fly_black_box):
+    states, actions = random_inputs(12)
+    one_by_one = np.stack([fly_black_box(x, u) for x, u in zip(states, actions, strict=True)])
+    close = {"rtol": 1e-5, "atol": 1e-5}
+    batched = jax.jit(jax.vmap(black_box.step_vector))(states, actions)
+    np.testing.assert_allclose(batched, one_by_one, **close)
+    grid = (states.reshape(3, 4, 21), actions.reshape(3, 4, 4))
+    nested = jax.jit(jax.vmap(jax.vmap(black_box.step_vector)))(*grid)
+    np.testing.assert_allclose(nested.reshape(12, 21), one_by_one, **close)
+    one_state = jax.vmap(black_box.step_vector, in_axes=(None, 0))(states[0], actions)
+    expected = np.stack([fly_black_box(states[0], u) for u in actions])
+    np.testing.assert_allclose(one_state, expected, **close)
+
+    def body(x, u):
+        x = jax.vmap(black_box.step_vector, in_axes=(0, None))(x, u)
+        return x, x
+
+    _, path = jax.jit(lambda x: jax.lax.scan(body, x, actions))(states[:2])
+    x = states[1]
+    for u, row in zip(actions, path[:, 1], strict=True):
+        x = fly_black_box(x, u)
+        np.testing.assert_allclose(row, x, rtol=1e-4, atol=1e-4)
+
+
+def test_many_drones_fly_in_one_loop(black_box):
+    text = jax.jit(jax.vmap(jax.vmap(black_box.step_vector))).lower(
+        jnp.zeros((16, 16, 21)), jnp.zeros((16, 16, 4))
+    )
+    assert text.as_text().count("stablehlo.while") == 1
+
+
+def test_plant_protocol(black_box, fly_black_box):
+    x, u = (rows[0] for rows in random_inputs(1))
+    command = unpack_action(jnp.asarray(u))
+    state = black_box.reset(unpack(jnp.asarray(x)), nominal_parameters())
+    after = black_box.drone(black_box.step(state, command, blackbox.DT, None))
+    np.testing.assert_allclose(jnp.stack(jax.tree.leaves(after)), fly_black_box(x, u), rtol=1e-6, atol=1e-6)
+    with pytest.raises(ValueError, match=r"dt: found 0\.02 s, expected 0\.01 s"):
+        black_box.step(state, command, 0.02, None)
+
+
+def test_another_backend_is_a_clear_error(black_box):
+    traced = jax.jit(black_box.step_vector).trace(jnp.zeros(21), jnp.zeros(4))
+    with pytest.raises(ValueError, match="exported for platforms"):
+        traced.lower(lowering_platforms=("cuda",))
+
+
+def test_artifact_of_18_components(tmp_path):
+    def reduced_step(x: jax.Array, u: jax.Array) -> jax.Array:
+        # Position, velocity, acceleration and quaternion stay; the rest is made recognisable.
+        rates = jnp.deg2rad(jnp.array([618.0, 618.0, 120.0])) * u[:3]
+        return jnp.concatenate([x[:13], rates, u[3:] * x[16], x[17:] - 1.0])
+
+    path = write_artifact(tmp_path / "reduced.bin", reduced_step, ((18,), (4,)))
+    box = load(path)
+    assert box.state_size == 18
+    states, actions = random_inputs(5)
+    after = np.asarray(jax.jit(jax.vmap(box.step_vector))(states, actions))
+    np.testing.assert_array_equal(after[:, POSITION], states[:, POSITION])
+    np.testing.assert_array_equal(after[:, :13], states[:, :13])
+    np.testing.assert_allclose(after[:, 16:19], actions[:, :3], rtol=1e-5)
+    np.testing.assert_allclose(after[:, 19], actions[:, 3] * states[:, 19], rtol=1e-6)
+    np.testing.assert_allclose(after[:, BATTERY], states[:, BATTERY] - 1.0, rtol=1e-6)
+    slower = load(path, max_rate=(309.0, 618.0, 120.0)).step_vector(states[0], actions[0])
+    np.testing.assert_allclose(slower[16], 2.0 * actions[0, 0], rtol=1e-5)
+
+
+def test_environment_flies_the_black_box(black_box, fly_black_box):
+    env, params = gymnax.make("FlyTrack-v0", plant=black_box)
+    assert isinstance(env, flytrack_env.FlyTrack)
+    keys = jax.random.split(jax.random.key(0), 3)
+    actions = jnp.array([[0.1, 0.2, -0.3, 0.4], [0.0, 0.1, 0.0, 0.2], [0.3, 0.0, 0.1, -0.5]])
+
+    @jax.jit
+    def rollout(params):
+        _, states = jax.vmap(env.reset, in_axes=(0, None))(keys, params)
+
+        def body(states, _):
+            _, states, reward, *_ = env.step_batch(keys[0], states, actions, params)
+            return states, (jax.vmap(env.drone)(states), reward)
+
+        first = jax.vmap(env.drone)(states)
+        return first, jax.lax.scan(body, states, None, length=3)[1]
+
+    first, (drones, rewards) = rollout(params)
+    assert np.isfinite(rewards).all()
+    path = np.stack(jax.tree.leaves(drones), axis=-1)
+    for index in range(3):
+        x = np.stack(jax.tree.leaves(first), axis=-1)[index]
+        for step in range(3):
+            x = fly_black_box(x, actions[index])
+            np.testing.assert_allclose(path[step, index], x, rtol=1e-5, atol=1e-4)
+
+
+def test_command_leaves_may_be_python_numbers(black_box):
+    state = black_box.reset(unpack(blackbox.start_vector()), nominal_parameters())
+    after = black_box.step(state, Action(0, 0, 0, -1), 0.01, None)
+    assert after.pos_w.z.dtype == jnp.float32

@@ -1,0 +1,218 @@
+"""The recording of a flight log, read back: measured numbers, forces left open, free flight of models."""
+
+import importlib
+import sys
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from benchmarks.hidden import draw_base, fly, measure
+from flytrack_env.dynamics import ModelParameters
+from flytrack_env.effects import LinearDrag
+from flytrack_sysid import FlightLog, cli, save_log
+from flytrack_sysid.diagnosis import Diagnosis
+from flytrack_sysid.diagnosis.result import CONSISTENT, Unexplained
+from flytrack_sysid.flight_recording import write_flight_recording
+from flytrack_sysid.forces import WINDOW_S
+from tests.support.made_flight import TIME_S, flight
+from tests.support.recordings import Recording
+
+pytest.importorskip("rerun", reason="rerun-sdk is not installed (extra flytrack[viz])")
+shown_log = importlib.import_module("flytrack_sysid.shown_log")
+
+SECONDS, DT_S = 12.0, 0.01
+DRAG = LinearDrag(0.3, 0.4, 0.1)
+SECOND = 600  # the first row of the second segment
+SETTLED = 60  # rows until memories are forgotten
+SCALED_FORCE = 0.1  # m of an arrow for 1 m/s^2
+
+
+@pytest.fixture(scope="module")
+def flown() -> tuple[ModelParameters, FlightLog]:
+    """A plant with drag, as a model without it, and the log of two flights, each with a clock from 0 on."""
+    rng = np.random.default_rng(5)
+    truth = replace(draw_base(rng), effects={"linear_drag": DRAG._asdict()})
+    log = measure(fly(truth, "scripted", SECONDS, rng), "none", rng)
+    leaves = (np.array(truth.tau), np.array(truth.coeffs), np.array(truth.max_rate))
+    model = ModelParameters(*leaves, truth.mass, truth.gravity, truth.drain)
+    segment = (np.arange(len(log)) >= SECOND).astype(int)
+    return model, replace(log, time=log.time - segment * log.time[SECOND], segment=segment)
+
+
+@pytest.fixture(scope="module")
+def models(flown) -> dict[str, ModelParameters]:
+    """Without what the plant has, and with it; and two that fly off or end in no number."""
+    base = flown[0]
+    strong = base._replace(thrust_coeffs=50.0 * base.thrust_coeffs)
+    void = base._replace(m=0.0)
+    return {"nominal": base, "true": base.with_effects(DRAG), "strong": strong, "void": void}
+
+
+@pytest.fixture(scope="module")
+def flights(flown, models) -> dict:
+    """What is shown, by name."""
+    return {one.name: one for one in shown_log.flights_of(flown[1], models)}
+
+
+@pytest.fixture(scope="module")
+def recording(flown, models, tmp_path_factory) -> Recording:
+    """The recording of both models that stay, read back."""
+    path = tmp_path_factory.mktemp("recording") / "flight.rrd"
+    assert write_flight_recording(path, flown[1], {name: models[name] for name in ("nominal", "true")}) == ""
+    return Recording(path)
+
+
+def test_the_measured_flight_is_the_logs_numbers(flown, recording):
+    log = flown[1]
+    np.testing.assert_allclose(
+        recording.series("/world/drone", "Transform3D:translation"), log["p"], rtol=1e-6, atol=1e-6
+    )
+    x_first = np.roll(log["q"], -1, axis=1)
+    found = recording.series("/world/drone", "Transform3D:quaternion")
+    np.testing.assert_allclose(found, x_first, atol=1e-6)
+    lines = {
+        "speed": np.linalg.norm(log["v"], axis=1),
+        "angular_speed": np.linalg.norm(log["w"], axis=1),
+        "battery": log["v_bat"][:, 0],
+        "action/thrust": log["u"][:, 3],
+        "applied/roll": np.full(len(log), np.nan),  # not measured
+    }
+    for path, values in lines.items():
+        found = recording.series(f"/plots/{path}", "Scalars:scalars")
+        np.testing.assert_allclose(found, values, rtol=1e-6, atol=1e-9, err_msg=path)
+
+
+def test_segments_follow_one_another_a_second_apart(flown, recording):
+    log = flown[1]
+    time_s = log.time + (log.time[SECOND - 1] + 1.0) * log.segment
+    found = np.array(sorted(recording.times["/world/drone"]))[:, 1] * 1e-9
+    np.testing.assert_allclose(found, time_s, atol=1e-9)
+    strips = recording.rows["/world/trajectory/flown", "LineStrips3D:strips"]
+    breaks = [len(strip) for strip in strips[-1]]
+    assert breaks[0] == SECOND and len(breaks) == 2
+
+
+def test_arrows_are_the_force_that_the_model_lacks_along_the_world(flown, recording):
+    log = flown[1]
+    quat = Rotation.from_quat(log["q"], scalar_first=True)
+    drag_w = quat.apply(-np.array(DRAG) * quat.inv().apply(log["v"]))  # of the step after a row
+    half = round(0.5 * WINDOW_S / DT_S)
+    entity = "/world/residual/nominal"
+    drawn = zip(recording.times[entity], recording.rows[entity, "Arrows3D:vectors"], strict=True)
+    steps = sorted(step for (step, _), row in drawn if row)
+    arrows = {
+        name: recording.series(f"/world/residual/{name}", "Arrows3D:vectors") for name in ("nominal", "true")
+    }
+    inside = [at for at, row in enumerate(steps) if SECOND + SETTLED + half < row < len(log) - half]
+    assert len(inside) > 400
+    rows = np.array(steps)[inside]
+    expected = np.mean([drag_w[rows - 1 + shift] for shift in range(-half, half + 1)], axis=0)
+    assert np.abs(expected).max(axis=0).min() > 0.3
+    np.testing.assert_allclose(arrows["nominal"][inside] / SCALED_FORCE, expected, atol=0.02)
+    assert np.abs(arrows["true"][inside]).max() < 1e-3 * SCALED_FORCE
+    starts = recording.series("/world/residual/nominal", "Arrows3D:origins")[inside]
+    np.testing.assert_allclose(starts, log["p"][rows], rtol=1e-6, atol=1e-6)
+    plotted = recording.series("/plots/residual/nominal", "Scalars:scalars")[rows]
+    np.testing.assert_allclose(plotted, np.linalg.norm(expected, axis=1), atol=0.02)
+    assert np.isnan(recording.series("/plots/residual/nominal", "Scalars:scalars")[[0, SECOND]]).all()
+
+
+def apart_m(shown, log) -> np.ndarray:
+    """Return how far a flight is from the measured one at its rows, (T,) m."""
+    time_s = shown_log.time_in_line(log)
+    rows = np.searchsorted(time_s, shown.time_s - 1e-6)
+    np.testing.assert_allclose(time_s[rows], shown.time_s, atol=1e-9)
+    return np.linalg.norm(shown.positions - log["p"][rows], axis=1)
+
+
+def test_a_model_flies_by_itself_and_starts_anew_every_second(flown, flights):
+    log = flown[1]
+    wrong, right = flights["nominal"], flights["true"]
+    starts_s = right.time_s[right.restarts]
+    assert starts_s[0] == 0.0 and right.time_s[-1] == pytest.approx(shown_log.time_in_line(log)[-1])
+    gaps = np.diff(starts_s[1:])
+    is_jump = gaps > 1.5  # from the first segment into the second
+    assert is_jump.sum() == 1 and len(gaps) >= 9
+    np.testing.assert_allclose(gaps[~is_jump], 1.0, atol=1e-6)
+    assert apart_m(right, log).max() < 1e-3
+    away = apart_m(wrong, log)
+    assert away[wrong.restarts].max() < 1e-9 and away.max() > 0.3
+    ends = np.flatnonzero(np.append(wrong.restarts[1:], True))
+    assert away[ends].max() == away.max()
+    assert np.isnan(right.actions).all() and "ran away" not in right.ended
+
+
+def test_a_model_that_runs_away_is_cut_off(flown, flights):
+    away = apart_m(flights["strong"], flown[1])
+    assert 3.0 < away.max() < shown_log.AWAY_M
+    assert f"ran away {flights['strong'].restarts.sum() - 1} times" in flights["strong"].ended
+    void = flights["void"]
+    assert len(void.states) == void.restarts.sum() and apart_m(void, flown[1]).max() == 0.0
+
+
+def test_models_have_their_own_colour_and_no_empty_lines(recording):
+    arrows = recording.once("/world/residual/nominal", "Arrows3D:colors")
+    assert arrows == recording.once("/world/flights/nominal/drone/motors", "Points3D:colors")
+    assert arrows == recording.once("/plots/residual/nominal", "SeriesLines:colors")
+    assert arrows != recording.once("/world/residual/true", "Arrows3D:colors")
+    paths = {path for path, _ in recording.rows if path.startswith("/plots/flights/nominal")}
+    assert {path.rsplit("/", 1)[1] for path in paths} == {"speed", "angular_speed", "roll", "pitch", "yaw"}
+
+
+@pytest.fixture(scope="module")
+def made() -> FlightLog:
+    """A made-up flight of 6 s, cut in the middle."""
+    return replace(flight(TIME_S[:600]), segment=np.repeat([0, 1], 300))
+
+
+def test_position_is_integrated_where_it_was_not_measured(made):
+    halves = made.without("p")
+    (shown,) = shown_log.flights_of(halves, {})
+    assert shown.name == "measured (position integrated)"
+    moved = made["p"] - np.repeat(made["p"][[0, 300]], 300, axis=0)
+    assert np.abs(moved).max() > 1.0
+    np.testing.assert_allclose(shown.positions, moved, atol=2e-3)
+    (still,) = shown_log.flights_of(made.without("p", "v"), {})
+    assert still.name == "measured (no position)" and (still.positions == 0.0).all()
+    assert np.isnan(still.states[:, 3:9]).all() and np.isfinite(still.states[:, 9:16]).all()
+
+
+def test_of_a_long_log_rows_are_left_out_but_no_start(monkeypatch, made):
+    monkeypatch.setattr(shown_log, "MOST_ROWS", 150)
+    (shown,) = shown_log.flights_of(made, {})
+    kept = [*range(0, 300, 4), *range(300, 600, 4)]
+    np.testing.assert_array_equal(shown.positions, made["p"][kept])
+    assert np.flatnonzero(shown.restarts).tolist() == [0, 75] and "1 row in 4" in shown.ended
+
+
+def found_by_hand(flown, models) -> Diagnosis:
+    """Return a diagnosis that names nothing."""
+    models = {"nominal": flown[0], "base": flown[0], "extended": models["true"]}
+    rest = {"noise": {}, "source": "log", "sha256": "", "seconds": 0.0}
+    return Diagnosis(CONSISTENT, (), Unexplained(), (), {}, **models, **rest)
+
+
+def test_diagnose_writes_the_recording_or_says_why_not(flown, models, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(cli, "diagnose", lambda *_: found_by_hand(flown, models))  # the rest is the real one
+    monkeypatch.setattr(cli, "write_diagnosis", lambda folder, *_: [folder / "diagnosis.json"])
+    save_log(tmp_path / "log.npz", flown[1])
+    save_log(tmp_path / "turns.npz", flown[1].without("q"))
+    out = tmp_path / "out"
+    path = out / "flight.rrd"
+
+    def diagnosed(name: str) -> str:
+        cli.main(["diagnose", str(tmp_path / name), "--out", str(out)])
+        return capsys.readouterr().out
+
+    assert f"written: {out / 'diagnosis.json'}, {path}\n" in diagnosed("log.npz")
+    drones = {entity for entity, _ in Recording(path).rows if entity.endswith("/drone")}
+    assert drones == {"/world/drone", "/world/flights/nominal/drone", "/world/flights/extended/drone"}
+    said = diagnosed("turns.npz")  # and takes away what is of another log
+    assert "left out" in said and "expected q (attitude)" in said and not path.exists()
+    monkeypatch.setitem(sys.modules, "rerun", None)  # as if it were not installed
+    monkeypatch.delitem(sys.modules, "flytrack_env.viz_rerun")
+    said = diagnosed("log.npz")
+    assert "pip install 'flytrack[viz]'" in said and f"written: {out / 'diagnosis.json'}\n" in said
+    assert not path.exists()

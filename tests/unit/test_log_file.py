@@ -1,0 +1,132 @@
+"""Files of logs: what is written comes back, and a file is described."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from flytrack_sysid.log import CHANNELS, COLUMNS, FlightLog, LogError
+from flytrack_sysid.log_file import describe, gaps_of, load_log, save_log
+from tests.support.written_logs import NUM_ROWS, SUFFIXES, assert_same_log, columns_of, make_log, write
+
+
+@pytest.mark.parametrize("suffix", SUFFIXES)
+def test_round_trip(suffix, tmp_path):
+    log, path = make_log(), tmp_path / "new" / f"flight{suffix}"
+    save_log(path, log)
+    found = load_log(str(path))
+    assert_same_log(found, log)
+    assert found.source == str(path)
+    assert found.sha256 == log.sha256 != replace(log, time=log.time + 1.0).sha256
+    again = tmp_path / f"again{suffix}"
+    save_log(again, found)
+    assert again.read_bytes() == path.read_bytes()
+    assert sorted(file.name for file in path.parent.iterdir()) == [path.name]
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    num_rows=st.integers(1, 20),
+    names=st.sets(st.sampled_from(list(CHANNELS))),
+    suffix=st.sampled_from(SUFFIXES),
+    number=st.floats(allow_nan=False, allow_infinity=False),
+)
+def test_any_log_comes_back(seed, num_rows, names, suffix, number, tmp_path_factory):
+    log = make_log(seed, num_rows, tuple(names))
+    if "p" in log:
+        log["p"][-1, 1] = number
+    path = tmp_path_factory.mktemp("log") / f"flight{suffix}"
+    save_log(path, log)
+    one_segment = replace(log, segment=np.zeros(num_rows, int))
+    assert_same_log(load_log(path), log if num_rows > 1 else one_segment)
+
+
+@pytest.mark.parametrize("suffix", SUFFIXES)
+def test_one_segment_needs_no_column(suffix, tmp_path):
+    path = tmp_path / f"flight{suffix}"
+    log = replace(make_log(), segment=np.full(NUM_ROWS, 3))
+    save_log(path, log)
+    assert b"segment" not in path.read_bytes()
+    assert_same_log(load_log(path), replace(log, segment=np.zeros(NUM_ROWS, int)))
+
+
+def test_files_of_other_writers(tmp_path):
+    log = make_log(names=("w",))
+    columns = columns_of(log)
+    path = tmp_path / "flight.npz"
+    np.savez_compressed(path, **{name: values.astype(np.float32) for name, values in columns.items()})
+    np.testing.assert_allclose(load_log(path)["w"], log["w"], rtol=1e-6)
+    path = tmp_path / "flight.CSV"
+    write(path, columns)
+    text = path.read_text(encoding="utf-8").replace(",", " , ").replace("\n", "\r\n\r\n")
+    path.write_bytes(b"\xef\xbb\xbf" + text.encode())
+    assert_same_log(load_log(path), log)
+
+
+def test_quaternions_drift_a_little_and_may_flip(tmp_path):
+    log = make_log(names=("q",))
+    factors = np.array([1.0, -1.0, 1.005, -0.995, 1.0, 1.0])[:, None]
+    write(
+        tmp_path / "flight.csv", columns_of(replace(log, channels={**log.channels, "q": factors * log["q"]}))
+    )
+    found = load_log(tmp_path / "flight.csv")["q"]
+    np.testing.assert_allclose(found, np.sign(factors) * log["q"], atol=1e-12)
+
+
+def test_what_would_be_refused_is_not_written(tmp_path):
+    log = make_log()
+    bad = replace(log, time=log.time[::-1])
+    for name, wrong, expected in (
+        ("flight.csv", bad, "row 1, column t: "),
+        ("flight.npz", log.select(slice(0)), "found no rows"),
+        ("flight.mat", log, "found suffix '.mat'"),
+    ):
+        with pytest.raises(LogError, match=f"{name}: {expected}"):
+            save_log(tmp_path / name, wrong)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_gaps_are_long_steps_within_a_segment():
+    # Two flights at different rates with a pause between; one sample lost in the first, two in the second.
+    first, second = np.delete(np.arange(10), 4) * 0.01, 9.0 + np.delete(np.arange(12), [6, 7]) * 0.1
+    time = np.concatenate([first, second, [20.0]])
+    segment = np.repeat([0, 1, 2], [len(first), len(second), 1])
+    log = FlightLog(time, {"u": np.zeros((len(time), 4))}, segment)
+    np.testing.assert_array_equal(gaps_of(log), [3, len(first) + 5])
+    assert len(gaps_of(log.select(slice(0)))) == 0
+    jitter = np.random.default_rng(0).uniform(-0.002, 0.002, 200)
+    steady = FlightLog(np.arange(200) * 0.01 + jitter, {"u": np.zeros((200, 4))}, np.zeros(200, int))
+    assert len(gaps_of(steady)) == 0
+    assert "gaps: none" in describe(steady)
+
+
+def test_description_says_what_is_in_a_log():
+    log = make_log(num_rows=8, names=("p", "v", "v_bat"))
+    time = np.array([0.0, 0.01, 0.02, 0.03, 0.5, 0.51, 0.55, 0.56])
+    log = replace(log, time=time, source="flight.csv")
+    log["v"][:] = 0.0
+    log["v"][3] = [0.0, -3.0, 4.0]
+    log["p"][:, 2] = np.arange(8) - 2
+    log["v_bat"][:, 0] = np.linspace(16.5, 14.0, 8)
+    log["u"][:] = np.outer(np.linspace(0.0, 1.0, 8), [0.5, -0.25, 0.0, 1.0])
+    log["u"][0] = [-0.1, 0.1, 0.0, -1.0]
+    assert describe(log).splitlines() == [
+        "flight.csv: 8 rows, 2 segments, 0.09 s",
+        "sample interval: 0.01 s (median), 100 Hz",
+        "gaps: 1, longest 0.04 s, after row 5",
+        "channels: p, v, v_bat, u; absent: a, f, q, w, uprev",
+        "commands: u_roll -0.1 to 0.5; u_pitch -0.25 to 0.1; u_yaw 0 to 0; u_thrust -1 to 1",
+        "speed up to 5 m/s; height -2 to 5 m; voltage 14 to 16.5 V",
+    ]
+    assert describe(log.without("p", "v", "v_bat").select(slice(1))).splitlines() == [
+        "flight.csv: 1 rows, 1 segments, 0.00 s",
+        "channels: u; absent: p, v, a, f, q, w, uprev, v_bat",
+        "commands: u_roll -0.1 to -0.1; u_pitch 0.1 to 0.1; u_yaw 0 to 0; u_thrust -1 to -1",
+    ]
+
+
+def test_every_column_has_a_place():
+    assert set(columns_of(make_log())) == set(COLUMNS)

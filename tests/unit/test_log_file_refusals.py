@@ -1,0 +1,328 @@
+"""Files of logs: everything that is refused, in words, soon, and in little memory."""
+
+import io
+import pickle
+import re
+import tracemalloc
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from flytrack_sysid import log_file, log_table
+from flytrack_sysid.log import REQUIRED, LogError
+from flytrack_sysid.log_file import load_log, save_log
+from tests.support.written_logs import NUM_ROWS, SUFFIXES, columns_of, make_log, write
+
+
+def set_cell(column: str, row: int, value: float) -> Callable[[dict], None]:
+    def change(columns: dict) -> None:
+        columns[column][row] = value
+
+    return change
+
+
+def rename(old: str, new: str) -> Callable[[dict], None]:
+    return lambda columns: columns.update({new: columns.pop(old)})
+
+
+def replaced(column: str, values: Any) -> Callable[[dict], None]:
+    return lambda columns: columns.update({column: np.asarray(values)})
+
+
+def no_rows(columns: dict) -> None:
+    columns.update({name: values[:0] for name, values in columns.items()})
+
+
+PWM = np.linspace(1000.0, 2000.0, NUM_ROWS)
+PERCENT = np.linspace(-40.0, 100.0, NUM_ROWS)
+# What is done to the columns -> what the message says after the file; {row} with the line in a CSV file.
+BAD_COLUMNS = {
+    "unknown": (rename("w_x", "w_roll"), r"column 'w_roll': unknown; .*\(known: t, segment, u_roll, "),
+    "nearest": (rename("v_bat", "V_Batt"), r"column 'V_Batt': unknown; did you mean v_bat\?"),
+    "no time": (rename("t", "segment"), r"column t: missing; found "),
+    "no command": (lambda columns: columns.pop("u_yaw"), "column u_yaw: missing; found t, segment, u_roll"),
+    "half a vector": (lambda columns: columns.pop("p_y"), "column p_y: missing; found only p_x, p_z of it"),
+    "nan": (set_cell("v_y", 4, np.nan), "{row 4}, column v_y: found nan, expected a finite number"),
+    "inf": (set_cell("t", 5, -np.inf), "{row 5}, column t: found -inf, expected a finite number"),
+    "no rows": (no_rows, "found no rows"),
+    "duplicate row": (
+        lambda columns: set_cell("t", 2, columns["t"][1])(columns),
+        r"{row 2}, column t: found (\S+) after \1, expected a later time .*\(a duplicate row\)",
+    ),
+    "time runs back": (set_cell("t", 4, -1.0), r"{row 4}, column t: found -1\.0 after .*rows out of order"),
+    "half a segment": (
+        replaced("segment", [0, 0, 0.5, 1, 1, 1]),
+        r"{row 2}, column segment: found 0\.5, expected a whole number",
+    ),
+    "huge segment": (
+        replaced("segment", [0, 0, 0, 0, 0, 2**53 + 1]),
+        r"{row 5}, column segment: found .*, expected a whole number below 2\^53",
+    ),
+    "torn segment": (
+        replaced("segment", [4, 4, 2, 4, 2, 2]),
+        "{row 3}, column segment: found 4 again after other segments",
+    ),
+    "quaternion": (
+        lambda columns: columns.update({f"q_{axis}": columns[f"q_{axis}"] * 1.02 for axis in "wxyz"}),
+        r"{row 0}, column q_w, q_x, q_y, q_z: found a quaternion of norm 1\.02, expected 1 within 0\.01",
+    ),
+    "command": (
+        set_cell("u_pitch", 1, -1.00001),
+        r"{row 1}, column u_pitch: found -1\.00001, expected a command in \[-1, 1\]$",
+    ),
+    "pwm": (replaced("u_roll", PWM), "{row 0}, column u_roll: found 1000, .*PWM pulses in us"),
+    "percent": (replaced("u_thrust", PERCENT), "{row 0}, column u_thrust: found -40, .*look like percent"),
+}
+
+
+@pytest.mark.parametrize("suffix", SUFFIXES)
+@pytest.mark.parametrize("bad", BAD_COLUMNS)
+def test_bad_columns_are_refused(bad, suffix, tmp_path):
+    path, columns = tmp_path / f"flight{suffix}", columns_of(make_log())
+    change, expected = BAD_COLUMNS[bad]
+    change(columns)
+    write(path, columns)
+    line = r"row \1 \\(line {}\\)" if suffix == ".csv" else r"row \1"
+    expected = re.sub(r"{row (\d)}", lambda row: row.expand(line).format(int(row[1]) + 2), expected)
+    with pytest.raises(LogError, match=f"^{re.escape(str(path))}: {expected}"):
+        load_log(path)
+
+
+@pytest.mark.parametrize("values", [np.array([1.0 + 5e-7] * NUM_ROWS), np.array([-1.0] * NUM_ROWS)])
+def test_full_stick_within_rounding_is_fine(values, tmp_path):
+    columns = columns_of(make_log())
+    columns["u_roll"] = values
+    write(tmp_path / "flight.npz", columns)
+    np.testing.assert_array_equal(load_log(tmp_path / "flight.npz")["u"][:, 0], values)
+
+
+class Trap:
+    """What an unpickler would run."""
+
+    def __reduce__(self) -> tuple:
+        return (pytest.fail, ("the pickle was read",))
+
+
+BAD_ARRAYS = {
+    "pickle": (
+        np.array([Trap()] * NUM_ROWS),
+        "column w_x: found an array of object, .*never read",
+    ),
+    "text": (np.array(["1"] * NUM_ROWS), "column w_x: found an array of <U1, expected numbers"),
+    "complex": (np.ones(NUM_ROWS, complex), "column w_x: found an array of complex128, expected numbers"),
+    "matrix": (np.ones((NUM_ROWS, 1)), r"column w_x: found an array of shape \(6, 1\), expected one dim"),
+    "number": (np.float64(1.0), r"column w_x: found an array of shape \(\), expected one dimension"),
+    "length": (np.ones(NUM_ROWS - 1), "column w_x: found 5 rows, expected 6 as in t"),
+}
+
+
+@pytest.mark.parametrize("bad", BAD_ARRAYS)
+def test_bad_arrays_are_refused(bad, tmp_path):
+    array, expected = BAD_ARRAYS[bad]
+    np.savez(tmp_path / "flight.npz", **{**columns_of(make_log()), "w_x": array})
+    with pytest.raises(LogError, match=f"flight.npz: {expected}"):
+        load_log(tmp_path / "flight.npz")
+
+
+HEADER = "t,u_roll,u_pitch,u_yaw,u_thrust,v_bat"
+BAD_TEXTS = {
+    "empty file": ("", "column t: missing; found no column"),
+    "header only": (HEADER, "found no rows"),
+    "duplicate": (f"{HEADER},v_bat\n", "column v_bat: found 2 times, expected once"),
+    "semicolons": (HEADER.replace(",", ";"), "line 1: found no comma"),
+    "short row": (
+        f"{HEADER}\n0,0,0,0,0,1\n\n1,0,0,0\n",
+        r"row 1 \(line 4\), column u_thrust: found 4 cells, expected 6 as in the header",
+    ),
+    "long row": (f"{HEADER}\n0,0,0,0,0,1,2\n", r"row 0 \(line 2\): found 7 cells, expected 6"),
+    "word": (f"{HEADER}\n0,0,0,on,0,1\n", r"row 0 \(line 2\), column u_yaw: found 'on', expected a number"),
+    "digits": (f"{HEADER}\n1_0,0,0,0,0,1\n", r"row 0 \(line 2\), column t: found '1_0', expected a number"),
+    "empty cell": (f"{HEADER}\n0,0,0,0,0, \n", r"row 0 \(line 2\), column v_bat: found an empty cell"),
+    "nan": (f"{HEADER}\n0,0,0,0,0,NaN\n", r"row 0 \(line 2\), column v_bat: found nan"),
+    "too large": (f"{HEADER}\n0,0,0,0,0,1e400\n", r"row 0 \(line 2\), column v_bat: found inf"),
+    "open quote": (f'{HEADER}\n"0,0,0,0,0,1\n', "near line 2: not a CSV file"),
+    "no text": (b"\xff\xfe\x00", "near line 1: not a CSV file"),
+    "nul": (f"{HEADER}\n0,0,0,0,0,\0\n", r"row 0 \(line 2\), column v_bat: found '\\x00'"),
+}
+
+
+@pytest.mark.parametrize("bad", BAD_TEXTS)
+def test_bad_texts_are_refused(bad, tmp_path):
+    text, expected = BAD_TEXTS[bad]
+    path = tmp_path / "flight.csv"
+    path.write_bytes(text if isinstance(text, bytes) else text.encode())
+    with pytest.raises(LogError, match=f"flight.csv: {expected}"):
+        load_log(path)
+
+
+def test_files_that_are_no_logs(tmp_path):
+    save_log(tmp_path / "good.npz", make_log())
+    content = (tmp_path / "good.npz").read_bytes()
+    files = {
+        "cut.npz": (content[: len(content) // 2], "not an .npz file, or cut off"),
+        "none.npz": (b"", "not an .npz file, or cut off"),
+        "pickle.npz": (pickle.dumps(Trap()), "not an .npz file, or cut off"),
+        "flight.txt": (content, "found suffix '.txt', expected .npz or .csv"),
+        "flight": (content, "found suffix '', expected .npz or .csv"),
+        "damaged.npz": (content.replace(b"\x93NUMPY", b"\x93numpy", 1), "column t: damaged, cannot be read"),
+    }
+    for name, (data, expected) in files.items():
+        (tmp_path / name).write_bytes(data)
+        with pytest.raises(LogError, match=f"{name}: {expected}"):
+            load_log(tmp_path / name)
+    (tmp_path / "folder.csv").mkdir()
+    for name in ("folder.csv", "absent.npz", "nul\0.csv"):
+        with pytest.raises(LogError, match="cannot be read: "):
+            load_log(tmp_path / name)
+
+
+def test_column_twice_in_an_archive_is_refused(tmp_path):
+    path = tmp_path / "flight.npz"
+    save_log(path, make_log())
+    with zipfile.ZipFile(path, "a") as archive, pytest.warns(UserWarning, match="Duplicate name"):
+        archive.writestr("t.npy", archive.read("t.npy"))
+    with pytest.raises(LogError, match="column t: found 2 times, expected once"):
+        load_log(path)
+
+
+@settings(max_examples=150, deadline=None)
+@given(where=st.floats(0, 1, exclude_max=True), byte=st.integers(0, 255), cut=st.booleans())
+def test_damaged_archive_is_refused_in_words_or_read(where, byte, cut, tmp_path_factory):
+    buffer = io.BytesIO()
+    np.savez_compressed(buffer, **columns_of(make_log()))
+    content = bytearray(buffer.getvalue())
+    index = int(where * len(content))
+    content[index] = byte
+    path = tmp_path_factory.mktemp("log") / "flight.npz"
+    path.write_bytes(content[:index] if cut else content)
+    try:
+        load_log(path)
+    except LogError as error:
+        assert str(error).startswith(str(path))
+
+
+def test_large_files_are_refused_unread(tmp_path, monkeypatch):
+    columns = {**columns_of(make_log()), "w_x": np.zeros(100_000)}
+    np.savez_compressed(tmp_path / "bomb.npz", **columns)
+    assert (tmp_path / "bomb.npz").stat().st_size < 20_000
+    (tmp_path / "large.csv").write_text(HEADER + "\n" * 200_000, encoding="utf-8")
+    monkeypatch.setattr(log_file, "LARGEST_BYTES", 100_000)
+    monkeypatch.setattr(log_file, "_read_array", lambda *_: pytest.fail("the array was read"))
+    monkeypatch.setattr(log_file, "_numbers", lambda *_: pytest.fail("the row was read"))
+    for name in ("bomb.npz", "large.csv"):
+        with pytest.raises(LogError, match=f"{name}: found more than 100000 bytes"):
+            load_log(tmp_path / name)
+
+
+def test_small_file_needs_little_memory(tmp_path):
+    save_log(tmp_path / "flight.npz", make_log())
+    tracemalloc.start()
+    try:
+        load_log(tmp_path / "flight.npz")
+        assert tracemalloc.get_traced_memory()[1] < 16 * 2**20
+    finally:
+        tracemalloc.stop()
+
+
+@pytest.mark.parametrize(
+    ("method", "message"),
+    [
+        (zipfile.ZIP_DEFLATED, "column t: damaged"),
+        (zipfile.ZIP_BZIP2, "column t: found compression 12, expected none or deflate"),
+        (zipfile.ZIP_LZMA, "column t: found compression 14, expected none or deflate"),
+    ],
+)
+def test_array_that_unpacks_to_more_than_announced_is_not_unpacked(tmp_path, method, message):
+    header, num_rows, unpacked = io.BytesIO(), 1000, 64 * 2**20
+    np.lib.format.write_array_header_1_0(
+        header, {"descr": "<f8", "fortran_order": False, "shape": (num_rows,)}
+    )
+    with zipfile.ZipFile(tmp_path / "bomb.npz", "w", method) as archive:
+        for column in REQUIRED:
+            archive.writestr(f"{column}.npy", header.getvalue() + bytes(unpacked if column == "t" else 8000))
+        archive.getinfo("t.npy").file_size = len(header.getvalue()) + 8 * num_rows
+    tracemalloc.start()
+    try:
+        with pytest.raises(LogError, match=message):
+            load_log(tmp_path / "bomb.npz")
+        assert tracemalloc.get_traced_memory()[1] < unpacked / 8
+    finally:
+        tracemalloc.stop()
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("," * 2**22, "line 1: not a CSV file: found a line of 65536 characters or more"),
+        (HEADER + "\n" + '"1\n","' * 2**18, "line 2: not a CSV file: found a quotation mark"),
+    ],
+)
+def test_endless_lines_take_no_memory(tmp_path, text, message):
+    (tmp_path / "flight.csv").write_text(text)
+    del text
+    tracemalloc.start()
+    try:
+        with pytest.raises(LogError, match=message):
+            load_log(tmp_path / "flight.csv")
+        assert tracemalloc.get_traced_memory()[1] < 2**20
+    finally:
+        tracemalloc.stop()
+
+
+def test_a_segment_for_every_row_is_refused_at_once(tmp_path):
+    num_rows = log_table.MOST_SEGMENTS + 1
+    columns = {name: np.zeros(num_rows) for name in REQUIRED} | {"segment": np.arange(num_rows)}
+    write(tmp_path / "flight.npz", columns)
+    with pytest.raises(LogError, match="column segment: found 100001 segments, expected at most 100000"):
+        load_log(tmp_path / "flight.npz")
+
+
+@pytest.mark.parametrize(
+    ("array", "message"),
+    [
+        (np.zeros(1, [(f"field_{index}", float) for index in range(300)]), "expected numbers"),
+        (np.zeros((1,) * 32), "expected one dimension"),
+    ],
+)
+def test_odd_arrays_are_refused_in_few_words(tmp_path, array, message):
+    np.savez(tmp_path / "flight.npz", **{name: array for name in REQUIRED})
+    with pytest.raises(LogError, match=message) as caught:
+        load_log(tmp_path / "flight.npz")
+    assert len(str(caught.value)) < 1000
+
+
+def test_sparse_file_beyond_the_limit_is_refused_unopened(tmp_path, monkeypatch):
+    with (tmp_path / "flight.csv").open("wb") as file:
+        file.truncate(log_file.LARGEST_BYTES + 1)
+    monkeypatch.setattr(Path, "open", lambda *_: pytest.fail("the file was opened"))
+    with pytest.raises(LogError, match="found more than 536870912 bytes"):
+        load_log(tmp_path / "flight.csv")
+
+
+@pytest.mark.skipif(not Path("/dev/zero").exists(), reason="needs a device that never ends")
+def test_device_is_read_to_the_limit_only(tmp_path, monkeypatch):
+    (tmp_path / "flight.csv").symlink_to("/dev/zero")
+    monkeypatch.setattr(log_file, "LARGEST_BYTES", 1000)
+    with pytest.raises(LogError, match="found more than 1000 bytes"):
+        load_log(tmp_path / "flight.csv")
+
+
+def test_header_that_promises_too_much_allocates_nothing(tmp_path):
+    path = tmp_path / "flight.npz"
+    save_log(path, make_log())
+    header = io.BytesIO()
+    np.lib.format.write_array_header_1_0(header, {"descr": "<f8", "fortran_order": False, "shape": (10**15,)})
+    with zipfile.ZipFile(path) as archive:
+        members = {name: archive.read(name) for name in archive.namelist()}
+    members["t.npy"] = header.getvalue()
+    with zipfile.ZipFile(path, "w") as archive:
+        for name, data in members.items():
+            archive.writestr(name, data)
+    with pytest.raises(LogError, match="column t: found 0 bytes, expected 1000000000000000 numbers"):
+        load_log(path)
