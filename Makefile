@@ -11,7 +11,7 @@ DOCS := .venv-docs
 DOCS_STAMP := $(DOCS)/.locked
 CHECK_PYTHON = $(PYTHON) -c 'import sys; v = sys.version_info; sys.exit(v < (3, 11) and f"Python 3.11 or newer is needed, found {v.major}.{v.minor}; try PYTHON=python3.11")'
 
-.PHONY: setup demo loop test test-clients docs lint lock uv dist check-wheel check-versions clean
+.PHONY: setup demo loop test check-diagnosis test-clients docs lint lock uv dist check-wheel check-versions clean
 
 setup: $(STAMP)
 
@@ -32,6 +32,10 @@ loop: setup
 
 test: setup
 	$(BIN)/python -m pytest --numprocesses 2 --dist loadfile
+
+# Diagnoses 60 recorded plants again: names must stay and intervals agree to 1e-6; about 8 CPU minutes.
+check-diagnosis: setup
+	$(BIN)/python -m benchmarks.check_diagnosis
 
 # With dependencies: what the clients need beyond the lock file is in their requirements.
 $(CLIENTS_STAMP): requirements.lock clients/requirements.txt pyproject.toml

@@ -3,18 +3,20 @@
 ``python -m benchmarks.diagnosis [--plants 200] [--rows clean,one,...] [--seed 0]`` flies every plant for a
 minute (benchmarks.hidden), shows the diagnosis the log and the model without the hidden effects, and grades
 what it says by what the log could show (benchmarks.hidden.oracle). A line a plant goes to
-docs/results/diagnosis.jsonl as it is done; what is there already, of the same code, is not done again.
-``--write`` makes docs/results/diagnosis.md of the lines.
+docs/results/diagnosis.jsonl as it is done, with the commit and versions it was measured at; what is there
+already, of the same commit, is not done again. ``--write`` makes docs/results/diagnosis.md of the lines of
+the last commit. Whether a change altered results is told by ``benchmarks.check_diagnosis``.
 """
 
 import argparse
-import hashlib
 import json
 import os
 import platform
+import subprocess
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from datetime import date
 from pathlib import Path
 from typing import Any
 
@@ -35,18 +37,12 @@ from benchmarks.hidden import (
 from benchmarks.hidden.oracle import known, removed
 from flytrack_env.dynamics import ModelParameters
 from flytrack_sysid.diagnosis import Diagnosis, diagnose
+from flytrack_sysid.log import FlightLog
 from flytrack_sysid.split import held_out_rows
 
 ROOT = Path(__file__).parent.parent
 LINES = ROOT / "docs" / "results" / "diagnosis.jsonl"
 SECONDS = 60.0
-CODE = (
-    "flytrack_sysid/diagnosis/*.py",
-    *(f"flytrack_sysid/{name}.py" for name in ("log", "parameters", "record", "split")),
-    "flytrack_env/effects/*.py",
-    "flytrack_env/dynamics.py",
-    "benchmarks/hidden/*.py",
-)
 AMPLITUDES = (0.5, 3.0)  # of effects outside the list, times the noise
 Rng = np.random.Generator
 
@@ -81,22 +77,24 @@ def model_of(truth: Truth) -> ModelParameters:
     )
 
 
-def code_hash() -> str:
-    """Return a hash of what a line depends on: effects, the diagnosis, and the hidden plants."""
-    digest = hashlib.sha256()
-    for path in sorted(path for pattern in CODE for path in ROOT.glob(pattern)):
-        digest.update(path.read_bytes())
-    return digest.hexdigest()[:12]
+def commit_of_checkout() -> str:
+    """Return the checkout's commit, and whether files that it knows have changed since."""
+    command = ["git", "describe", "--always", "--exclude=*", "--dirty"]
+    return subprocess.run(command, cwd=ROOT, check=True, capture_output=True, text=True).stdout.strip()
 
 
-def plant(row: str, number: int, seed: int) -> dict[str, Any]:
-    """Return what one plant's diagnosis said and what it could have."""
+def make_log(row: str, number: int, seed: int) -> tuple[Truth, FlightLog, FlightLog, ModelParameters, Rng]:
+    """Return a plant, its flight without and with noise, its team's model, and the generator that drew it."""
     draw, noise = ROWS[row]
     rng = np.random.default_rng([seed, number, list(ROWS).index(row)])
     truth = draw(rng)
     clean = fly(truth, "scripted", SECONDS, rng)
-    log = measure(clean, noise, rng)
-    model = model_of(truth)
+    return truth, clean, measure(clean, noise, rng), model_of(truth), rng
+
+
+def plant(row: str, number: int, seed: int) -> dict[str, Any]:
+    """Return what one plant's diagnosis said and what it could have."""
+    truth, clean, log, model, rng = make_log(row, number, seed)
     started = time.process_time()
     found = diagnose(log, model)
     seconds = time.process_time() - started
@@ -144,26 +142,27 @@ def _removed(truth: Truth, found: Diagnosis, rng: Rng) -> list[float]:
     return [round(share, 4), round(size, 4)]
 
 
-def read_lines(code: str | None) -> dict[tuple[str, int, int], dict[str, Any]]:
-    """Return the lines of a code's hash by row, seed and number; of the last line's if None."""
+def read_lines(commit: str | None) -> dict[tuple[str, int, int], dict[str, Any]]:
+    """Return the lines of a commit by row, seed and number; of the last line's if None."""
     if not LINES.exists():
         return {}
     # What a kill has cut off has no end of line.
     whole = [text for text in LINES.read_text().splitlines(keepends=True) if text.endswith("\n")]
     lines = [json.loads(text) for text in whole]
-    code = lines[-1]["code"] if code is None and lines else code
-    kept = [line for line in lines if line["code"] == code]
+    commit = lines[-1]["commit"] if commit is None and lines else commit
+    kept = [line for line in lines if line["commit"] == commit]
     return {(line["row"], line["seed"], line["number"]): line for line in kept}
 
 
 def run(rows: list[str], plants: range, seed: int) -> None:
     """Diagnose what is not done yet, all rows in turn, and append the lines."""
-    code = code_hash()
-    done = read_lines(code)
+    commit = commit_of_checkout()
+    done = read_lines(commit)
     todo = [(row, number) for number in plants for row in rows if (row, seed, number) not in done]
     machine = f"{platform.machine()}, {os.cpu_count()} cores, jax {jax.__version__}"
     for row, number in tqdm(todo, unit=" plants", disable=None):
-        line = {"row": row, "seed": seed, "number": number, "code": code, "machine": machine}
+        line = {"row": row, "seed": seed, "number": number}
+        line |= {"commit": commit, "date": str(date.today()), "machine": machine}
         try:
             line |= plant(row, number, seed)
         except Exception as error:  # a crash is a result too, and the others go on

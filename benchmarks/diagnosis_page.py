@@ -189,14 +189,14 @@ def page() -> str:
     by_row = {row: [line for line in lines if line["row"] == row and "error" not in line] for row in ROWS}
     table = ["| figure | aim | measured |", "|---|---|---|"]
     table += [f"| {what} | {aim} | {value} |" for what, aim, value in figures(by_row)]
-    codes = sorted({line["code"] for line in lines})
+    commits = sorted({f"{line['commit']} of {line['date']}" for line in lines})
     machines = sorted({line["machine"] for line in lines})
     counts = ", ".join(f"{row} {len(by_row[row])}" for row in ROWS)
     return f"""# How well hidden effects are named
 
 Written by `python -m benchmarks.diagnosis --write` of the lines that `python -m benchmarks.diagnosis` wrote
 to docs/results/diagnosis.jsonl, a line a plant. Plants: {counts}; crashed: {len(crashed)}.
-Seeds {sorted({line["seed"] for line in lines})}; code {", ".join(codes)}; {"; ".join(machines)}.
+Seeds {sorted({line["seed"] for line in lines})}; measured at {", ".join(commits)}; {"; ".join(machines)}.
 
 Every plant is flown for 60 s (benchmarks/hidden: other equations than the simulator's, some of another
 form), and measured: gyro 0.1 rad/s, accelerometer 1.5 m/s^2, velocity 0.05 m/s, attitude 0.5 degrees,
