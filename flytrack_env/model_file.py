@@ -9,7 +9,7 @@ import numpy as np
 from flytrack_env import effects
 from flytrack_env.dynamics import ModelParameters
 from flytrack_env.files import read_at_most, write_atomically
-from flytrack_env.words import named, said, shown
+from flytrack_env.messages import error_text, quote_name, quote_value
 
 MODEL_FILE_VERSION = 1
 SIZES = {
@@ -46,10 +46,10 @@ def _read_field(path: Path, name: str, value: Any) -> Any:
     )
     if not is_right_shape or not are_numbers:
         expected = f"{size} finite numbers" if size else "a finite number"
-        found = shown(value)
+        found = quote_value(value)
         raise ModelFileError(f"{path}: {name}: found {found}, expected {expected} (float32)")
     if name in MUST_BE_POSITIVE and min(map(np.float32, values)) <= 0.0:  # 1e-50 is 0 in float32
-        raise ModelFileError(f"{path}: {name}: found {shown(value)}, expected > 0")
+        raise ModelFileError(f"{path}: {name}: found {quote_value(value)}, expected > 0")
     return np.array(value, np.float32) if size else float(value)
 
 
@@ -58,18 +58,20 @@ def _read_effect(path: Path, name: str, values: Any) -> Any:
     effect = effects.BY_NAME.get(name)
     if effect is None:
         expected = ", ".join(effects.BY_NAME)
-        raise ModelFileError(f"{path}: effects: {named(name)}: unknown; expected of {expected}")
+        raise ModelFileError(f"{path}: effects: {quote_name(name)}: unknown; expected of {expected}")
     if not isinstance(values, dict):
-        raise ModelFileError(f"{path}: effects: {name}: found {shown(values)}, expected an object")
+        raise ModelFileError(f"{path}: effects: {name}: found {quote_value(values)}, expected an object")
     for field, value in values.items():
         bounds = effect.ranges.get(field)
         if bounds is None:
             expected = ", ".join(effect.ranges)
-            raise ModelFileError(f"{path}: effects: {name}: {named(field)}: unknown; expected of {expected}")
+            raise ModelFileError(
+                f"{path}: effects: {name}: {quote_name(field)}: unknown; expected of {expected}"
+            )
         is_number = isinstance(value, (int, float)) and not isinstance(value, bool)
         if not is_number or not bounds.low <= value <= bounds.high:
             expected = f"{bounds.low:g} to {bounds.high:g} {bounds.unit}"
-            found = shown(value)
+            found = quote_value(value)
             raise ModelFileError(f"{path}: effects: {name}: {field}: found {found}, expected {expected}")
     return effect.parameters(**{field: float(value) for field, value in values.items()})
 
@@ -79,9 +81,9 @@ def _read_json(path: Path) -> dict[str, Any]:
     try:
         data = json.loads(read_at_most(path, LARGEST_BYTES).decode())
     except (OSError, UnicodeDecodeError) as error:
-        raise ModelFileError(f"{path}: cannot be read: {said(error)}") from error
+        raise ModelFileError(f"{path}: cannot be read: {error_text(error)}") from error
     except (ValueError, RecursionError) as error:  # ValueError also for endless digits
-        raise ModelFileError(f"{path}: not a JSON file: {said(error)}") from error
+        raise ModelFileError(f"{path}: not a JSON file: {error_text(error)}") from error
     if not isinstance(data, dict):
         raise ModelFileError(f"{path}: found a {type(data).__name__}, expected an object")
     return data
@@ -113,19 +115,21 @@ def model_from_json(data: dict[str, Any], path: str | Path) -> ModelParameters:
     if version != MODEL_FILE_VERSION:
         is_newer = isinstance(version, int) and version > MODEL_FILE_VERSION
         why = "; written by a newer FlyTrack, update to read it" if is_newer else ""
-        raise ModelFileError(f"{path}: version: found {shown(version)}, expected {MODEL_FILE_VERSION}{why}")
+        raise ModelFileError(
+            f"{path}: version: found {quote_value(version)}, expected {MODEL_FILE_VERSION}{why}"
+        )
     values = data.get("parameters", data)
     if not isinstance(values, dict):
-        raise ModelFileError(f"{path}: parameters: found {shown(values)}, expected an object")
+        raise ModelFileError(f"{path}: parameters: found {quote_value(values)}, expected an object")
     for name in SIZES:
         if name not in values:
             raise ModelFileError(f"{path}: {name}: missing")
     for name in values:
         if name not in (*SIZES, "version", "effects"):
-            raise ModelFileError(f"{path}: {named(name)}: unknown; expected {', '.join(SIZES)}, effects")
+            raise ModelFileError(f"{path}: {quote_name(name)}: unknown; expected {', '.join(SIZES)}, effects")
     found = data.get("effects", values.get("effects", {}))
     if not isinstance(found, dict):
-        raise ModelFileError(f"{path}: effects: found {shown(found)}, expected an object")
+        raise ModelFileError(f"{path}: effects: found {quote_value(found)}, expected an object")
     base = ModelParameters(**{name: _read_field(path, name, values[name]) for name in SIZES})
     return base.with_effects(*(_read_effect(path, name, found[name]) for name in found))
 
@@ -139,7 +143,7 @@ def load_provenance(path: str | Path) -> dict[str, Any]:
     path = Path(path)
     provenance = _read_json(path).get("provenance", {})
     if not isinstance(provenance, dict):
-        raise ModelFileError(f"{path}: provenance: found {shown(provenance)}, expected an object")
+        raise ModelFileError(f"{path}: provenance: found {quote_value(provenance)}, expected an object")
     return provenance
 
 

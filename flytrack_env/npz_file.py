@@ -16,7 +16,7 @@ from typing import BinaryIO, NamedTuple
 import numpy as np
 
 from flytrack_env.files import open_file
-from flytrack_env.words import said, shown
+from flytrack_env.messages import error_text, quote_value
 
 UNPACKED = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)  # whose unpacking zipfile bounds, as it does no other's
 # By version: in how many bytes a header's length stands, and what reads from there on.
@@ -117,7 +117,7 @@ class NpzFile:
         except NpzError:
             raise
         except Exception as error:  # damaged archives raise anything from struct.error to RuntimeError
-            raise NpzError(f"damaged, cannot be read: {type(error).__name__}: {said(error)}") from error
+            raise NpzError(f"damaged, cannot be read: {type(error).__name__}: {error_text(error)}") from error
 
 
 def _named(dtype: np.dtype) -> str:
@@ -130,7 +130,7 @@ def _check(header: Header, num_bytes: int) -> None:
     if dtype.hasobject:
         raise NpzError(f"found an array of {_named(dtype)}, expected plain values: pickles are never read")
     if not all(type(size) is int and size >= 0 for size in shape) or dtype.itemsize == 0:
-        found = f"an array of {_named(dtype)}, shape {shown(shape)}"
+        found = f"an array of {_named(dtype)}, shape {quote_value(shape)}"
         raise NpzError(f"found {found}, expected one of values that take room")
     if header.num_values * dtype.itemsize != num_bytes:
         numbers = "numbers" if dtype.kind in "iuf" else "values"
@@ -163,7 +163,7 @@ def open_npz(path: Path) -> Iterator[NpzFile]:
         except NpzError:
             raise
         except Exception as error:  # as above
-            raise NpzError(f"not an .npz file, or cut off: {said(error)}") from error
+            raise NpzError(f"not an .npz file, or cut off: {error_text(error)}") from error
         with archive:
             yield NpzFile(archive)
 

@@ -18,7 +18,7 @@ UNIFORM_BITS = 24  # the mantissa of a float32
 GOLDEN_RATIO_32 = 0x9E3779B9
 EVEN_BYTES = 0x00FF00FF
 BYTES_DEVIATION = 147.8  # of the sum of four bytes: sqrt(4 (256^2 - 1) / 12)
-# Least squares of the normal quantiles over that sum's distribution; tests/unit/test_randomness.py fits it again.
+# Least squares of the normal quantiles over that sum (tests/unit/test_randomness.py).
 NORMAL = (0.96776, 0.0040022, 0.0019047)
 
 

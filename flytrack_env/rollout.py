@@ -17,9 +17,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from flytrack_env.files import open_file, write_atomically
+from flytrack_env.messages import error_text, quote_value
 from flytrack_env.npz_file import read_header
 from flytrack_env.state import ACTION_SIZE, APPLIED_ACTION, STATE_SIZE
-from flytrack_env.words import said, shown
 
 ROW_SIZE = STATE_SIZE + ACTION_SIZE
 SHORT_ROW_SIZE = ROW_SIZE - 3
@@ -74,11 +74,11 @@ def load_rollout(path: str | Path, allow_pickle: bool = False) -> tuple[np.ndarr
             is_pickled = _check_header(path, file, allow_pickle)
             rows = np.load(file, allow_pickle=is_pickled)
     except OSError as error:
-        raise RolloutError(f"{path}: cannot be read: {said(error)}; expected {EXPECTED}") from error
+        raise RolloutError(f"{path}: cannot be read: {error_text(error)}; expected {EXPECTED}") from error
     except RolloutError:
         raise
     except (Exception, SystemExit) as error:  # whatever unpickling and damaged headers raise
-        found = f"{type(error).__name__}: {said(error)}"
+        found = f"{type(error).__name__}: {error_text(error)}"
         raise RolloutError(f"{path}: cannot be read: {found}; expected {EXPECTED}") from error
     if is_pickled:
         rows = _rows_of_pairs(path, rows)
@@ -115,7 +115,7 @@ def _check_header(path: Path, file: BinaryIO, allow_pickle: bool) -> bool:
     try:
         shape, _, dtype = read_header(file)
     except ValueError as error:
-        raise RolloutError(f"{path}: not an .npy file: {said(error)}; expected {EXPECTED}") from error
+        raise RolloutError(f"{path}: not an .npy file: {error_text(error)}; expected {EXPECTED}") from error
     if dtype.hasobject and allow_pickle:
         file.seek(0)
         return True
@@ -124,12 +124,12 @@ def _check_header(path: Path, file: BinaryIO, allow_pickle: bool) -> bool:
         found = f"an object array (pickled; {PICKLED})" if dtype.hasobject else array
         raise RolloutError(f"{path}: found {found}, expected {EXPECTED}")
     if len(shape) != 2 or shape[1] not in (ROW_SIZE, SHORT_ROW_SIZE) or shape[0] < 1 or shape[0] is True:
-        raise RolloutError(f"{path}: found shape {shown(shape)}, expected {EXPECTED}")
+        raise RolloutError(f"{path}: found shape {quote_value(shape)}, expected {EXPECTED}")
     announced = math.prod(shape) * dtype.itemsize
     found_bytes = os.fstat(file.fileno()).st_size - file.tell()
     if found_bytes < announced:
-        reason = f"found {found_bytes} bytes of data, expected {shown(announced)} for shape {shown(shape)}"
-        raise RolloutError(f"{path}: cut short: {reason}")
+        expected = f"{quote_value(announced)} for shape {quote_value(shape)}"
+        raise RolloutError(f"{path}: cut short: found {found_bytes} bytes of data, expected {expected}")
     if shape[0] > MOST_STEPS:
         raise RolloutError(f"{path}: found {shape[0]} steps, expected at most {MOST_STEPS}")
     file.seek(0)
@@ -148,7 +148,7 @@ def _rows_of_pairs(path: Path, pairs: np.ndarray) -> np.ndarray:
             x, u = (np.asarray(part, float) for part in pair)
         except (TypeError, ValueError) as error:
             raise RolloutError(
-                f"{path}: step {step}: {said(error)}; expected a pair of {expected}"
+                f"{path}: step {step}: {error_text(error)}; expected a pair of {expected}"
             ) from error
         size = sizes.get(len(rows[0])) if rows else x.size
         if u.shape != (ACTION_SIZE,) or x.shape != (size,) or size not in sizes.values():

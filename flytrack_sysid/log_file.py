@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, TextIO
 import numpy as np
 
 from flytrack_env.files import AtMost, TooLargeError, check_size, open_file, write_atomically
+from flytrack_env.messages import error_text, quote_name, quote_value
 from flytrack_env.npz_file import Header, NpzError, NpzFile, open_npz
-from flytrack_env.words import named, said, shown
 from flytrack_sysid.log import CHANNELS, GAP_STEPS, FlightLog, LogError, usual_step
 from flytrack_sysid.log_table import Rows, Table, check_names, check_number, log_of_table
 
@@ -48,7 +48,7 @@ def load_log(path: str | Path) -> FlightLog:
     except TooLargeError as error:
         raise LogError(f"{path}: {error}") from error
     except (OSError, ValueError) as error:  # ValueError: a NUL in the name
-        raise LogError(f"{path}: cannot be read: {said(error)}") from error
+        raise LogError(f"{path}: cannot be read: {error_text(error)}") from error
     return log_of_table(table)
 
 
@@ -146,10 +146,13 @@ def _header(path: Path, archive: NpzFile, name: str) -> Header:
     except NpzError as error:
         raise LogError(f"{path}: column {name}: {error}") from error
     if header.dtype.kind not in "iuf":
-        raise LogError(f"{path}: column {name}: found an array of {named(header.dtype)}, expected numbers")
+        raise LogError(
+            f"{path}: column {name}: found an array of {quote_name(header.dtype)}, expected numbers"
+        )
     if len(header.shape) != 1:
         raise LogError(
-            f"{path}: column {name}: found an array of shape {shown(header.shape)}, expected one dimension"
+            f"{path}: column {name}: found an array of shape {quote_value(header.shape)}, "
+            "expected one dimension"
         )
     return header
 
@@ -171,7 +174,9 @@ def _read_csv(path: Path) -> Table:
         try:
             return _table(str(path), rows)
         except (UnicodeDecodeError, csv.Error) as error:
-            raise LogError(f"{path}: near line {rows.line_num + 1}: not a CSV file: {said(error)}") from error
+            raise LogError(
+                f"{path}: near line {rows.line_num + 1}: not a CSV file: {error_text(error)}"
+            ) from error
 
 
 def _lines(text: TextIO) -> Iterator[str]:
@@ -188,7 +193,7 @@ def _table(source: str, rows: "_csv.Reader") -> Table:
     """Return the columns of the rows of a CSV file, the first of which has their names."""
     header = [name.strip() for name in next(rows, [])]
     if len(header) == 1 and any(mark in header[0] for mark in ";\t"):
-        found = f"no comma in {shown(header[0])}"
+        found = f"no comma in {quote_value(header[0])}"
         raise LogError(f"{source}: line 1: found {found}, expected names with commas")
     check_names(source, header)
     table_rows = Rows(source, header)
@@ -208,7 +213,7 @@ def _numbers(source: str, header: list[str], cells: list[str], row: int, line: i
         return [_number(cell) for cell in cells]
     except ValueError:
         column, cell = next(pair for pair in zip(header, cells, strict=True) if not _is_number(pair[1]))
-    found = shown(cell) if cell.strip() else "an empty cell"
+    found = quote_value(cell) if cell.strip() else "an empty cell"
     raise LogError(f"{place}, column {column}: found {found}, expected a number")
 
 

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from flytrack_env.words import shown
+from flytrack_env.messages import quote_value
 from flytrack_sysid.log import CHANNELS, COLUMNS, REQUIRED, FlightLog, LogError
 
 MOST_SEGMENTS = 100_000  # one for each flight: beyond it is a number for every row
@@ -94,7 +94,9 @@ def check_names(source: str, names: Sequence[str]) -> None:
         if name not in COLUMNS:
             near = difflib.get_close_matches(name[:LONGEST_NAME].lower(), COLUMNS, n=1)
             hint = f"; did you mean {near[0]}?" if near else ""
-            raise LogError(f"{source}: column {shown(name)}: unknown{hint} (known: {', '.join(COLUMNS)})")
+            raise LogError(
+                f"{source}: column {quote_value(name)}: unknown{hint} (known: {', '.join(COLUMNS)})"
+            )
         if names.count(name) > 1:
             raise LogError(f"{source}: column {name}: found {names.count(name)} times, expected once")
     for name in REQUIRED:

@@ -17,9 +17,9 @@ from typing import NamedTuple
 import numpy as np
 
 from flytrack_env.files import check_size, write_atomically
+from flytrack_env.messages import error_text, quote_name, quote_value
 from flytrack_env.npz_file import open_npz
 from flytrack_env.state import ACTION_SIZE, APPLIED_ACTION, QUATERNION, STATE_SIZE
-from flytrack_env.words import named, said, shown
 from flytrack_sysid.envelope import ANY_VOLTAGE, FEWEST_STEPS, LARGEST_SPEED, SCRIPT_HEIGHTS, is_inside
 from flytrack_sysid.excitation import Flight
 from flytrack_sysid.manoeuvres import MANOEUVRES
@@ -77,7 +77,7 @@ def check_script(script: Script, source: str = "script") -> None:
     unknown = [kind for kind in kinds if kind not in MANOEUVRES]
     if unknown:
         raise ScriptError(
-            f"{source}: kinds: found {shown(unknown[0])}, expected one of {', '.join(MANOEUVRES)}"
+            f"{source}: kinds: found {quote_value(unknown[0])}, expected one of {', '.join(MANOEUVRES)}"
         )
     _check_ranges(starts, commands, source)
 
@@ -151,7 +151,7 @@ def _arrays(path: Path) -> dict[str, np.ndarray]:
         with open_npz(path) as archive:
             names = sorted(archive.names)
             if names != sorted(ARRAYS):
-                found = ", ".join(map(named, names))[:LONGEST_LIST]
+                found = ", ".join(map(quote_name, names))[:LONGEST_LIST]
                 raise ScriptError(f"{path}: found arrays {found}, expected {', '.join(ARRAYS)}")
             num_values = sum(archive.header(name).num_values for name in ARRAYS)
             check_size(max(archive.num_bytes, num_values * np.dtype(float).itemsize), LARGEST_BYTES)
@@ -159,5 +159,5 @@ def _arrays(path: Path) -> dict[str, np.ndarray]:
     except ScriptError:
         raise
     except (OSError, ValueError) as error:  # ValueError: NpzError, or a NUL in the name
-        found = f"{type(error).__name__}: {said(error)}"
+        found = f"{type(error).__name__}: {error_text(error)}"
         raise ScriptError(f"{path}: not a script, or damaged; nothing is unpickled: {found}") from error

@@ -17,7 +17,7 @@ from baselines.purejaxrl_ppo.named_arrays import as_named_arrays, find_misfits, 
 from baselines.purejaxrl_ppo.networks import ActorCritic, make_network
 from baselines.purejaxrl_ppo.unpack import LARGEST_BYTES, UnpackError, unpack
 from flytrack_env.files import read_at_most, write_atomically
-from flytrack_env.words import named, said, shown
+from flytrack_env.messages import error_text, quote_name, quote_value
 
 FORMAT = "flytrack-ppo-2"
 FORMAT_WITHOUT_TRAINING = "flytrack-ppo-1"  # of before there was a checksum and a state of the training
@@ -82,7 +82,7 @@ def find_differences(found: Any, expected: Any, where: str) -> list[str]:
         return [
             line
             for name in names
-            for line in find_differences(found.get(name), expected.get(name), f"{where}.{named(name)}")
+            for line in find_differences(found.get(name), expected.get(name), f"{where}.{quote_name(name)}")
         ]
     if isinstance(found, list) and isinstance(expected, list) and len(found) == len(expected):
         pairs = enumerate(zip(found, expected, strict=True))
@@ -93,7 +93,7 @@ def find_differences(found: Any, expected: Any, where: str) -> list[str]:
 
 
 def _show(value: Any) -> str:
-    return "nothing" if value is None else shown(value)
+    return "nothing" if value is None else quote_value(value)
 
 
 def check_none(where: Any, lines: list[str]) -> None:
@@ -149,13 +149,13 @@ def load_checkpoint(path: str | Path) -> Checkpoint:
     content = _read_content(path)
     meta = _read_meta(path, content)
     if meta["format"] not in (FORMAT, FORMAT_WITHOUT_TRAINING):
-        raise CheckpointError(f"{path}: format: found {shown(meta['format'])}, expected {FORMAT!r}")
+        raise CheckpointError(f"{path}: format: found {quote_value(meta['format'])}, expected {FORMAT!r}")
     try:
         return _read_parts(path, meta, content)
     except CheckpointError:
         raise
     except (KeyError, IndexError, TypeError, AttributeError, ValueError) as error:
-        raise CheckpointError(f"{path}: damaged description or parameters: {said(error)}") from error
+        raise CheckpointError(f"{path}: damaged description or parameters: {error_text(error)}") from error
 
 
 def _read_content(path: Path) -> Any:
@@ -169,15 +169,15 @@ def _read_content(path: Path) -> Any:
             raise UnpackError("found a checksum of nothing")
         found = hashlib.sha256(content).hexdigest()
         if found.encode() != whole["checksum"]:
-            expected = shown(_as_text(whole["checksum"]))
+            expected = quote_value(_as_text(whole["checksum"]))
             raise CheckpointError(
                 f"{path}: damaged: found content with checksum {found}, expected {expected}"
             )
         return unpack(content)
     except OSError as error:
-        raise CheckpointError(f"{path}: cannot be read: {said(error)}") from error
+        raise CheckpointError(f"{path}: cannot be read: {error_text(error)}") from error
     except UnpackError as error:
-        raise CheckpointError(f"{path}: not a checkpoint, or damaged: {said(error)}") from error
+        raise CheckpointError(f"{path}: not a checkpoint, or damaged: {error_text(error)}") from error
 
 
 def _as_text(value: Any) -> Any:
@@ -190,7 +190,9 @@ def _read_meta(path: Path, content: Any) -> dict[str, Any]:
     try:
         meta = json.loads(text.decode()) if isinstance(text, bytes) and len(text) <= LONGEST_META else None
     except (ValueError, RecursionError) as error:
-        raise CheckpointError(f"{path}: not a checkpoint: no description in it: {said(error)}") from error
+        raise CheckpointError(
+            f"{path}: not a checkpoint: no description in it: {error_text(error)}"
+        ) from error
     if not isinstance(meta, dict) or "format" not in meta:
         raise CheckpointError(f"{path}: not a checkpoint: no description in it")
     return meta
@@ -200,7 +202,7 @@ def _check_size(path: Path, config: Config, size: Any) -> None:
     """Raise CheckpointError for a network that is none, or larger than any of ours: it is traced below."""
     widths = (size, len(config.initial_action), *config.hidden_sizes)
     if not all(type(width) is int and 1 <= width <= WIDEST for width in widths) or len(widths) > MOST_LAYERS:
-        found = f"observation_size {shown(size)} and hidden_sizes {shown(config.hidden_sizes)}"
+        found = f"observation_size {quote_value(size)} and hidden_sizes {quote_value(config.hidden_sizes)}"
         raise CheckpointError(
             f"{path}: found {found}, expected at most {MOST_LAYERS} layers, 1 to {WIDEST} wide"
         )
@@ -214,7 +216,7 @@ def _read_parts(path: Path, meta: dict[str, Any], content: dict[str, Any]) -> Ch
     _check_size(path, config, size)
     for name in ("env_id", "track", "missed_gate"):
         if not isinstance(meta[name], str):
-            raise CheckpointError(f"{path}: {name}: found {shown(meta[name])}, expected a string")
+            raise CheckpointError(f"{path}: {name}: found {quote_value(meta[name])}, expected a string")
     observation = jax.ShapeDtypeStruct((1, size), jnp.float32)
     expected = jax.eval_shape(make_network(config).init, jax.random.key(0), observation)
     arrays = as_named_arrays(content["params"])

@@ -13,8 +13,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from flytrack_env.messages import error_text, quote_name, quote_value
 from flytrack_env.toml_file import TomlError, parse_toml, read_text
-from flytrack_env.words import named, said, shown
 
 COUNTS = ("num_envs", "num_steps", "episode_steps", "update_epochs", "num_minibatches")
 SHARES = ("final_learning_rate_fraction", "gamma", "gae_lambda")
@@ -151,7 +151,7 @@ def read_value(where: str, kind: Any, value: Any) -> Any:
     """
     if typing.get_origin(kind) is tuple:
         if not isinstance(value, (list, tuple)):
-            raise ConfigError(f"{where}: found {shown(value)}, expected a list")
+            raise ConfigError(f"{where}: found {quote_value(value)}, expected a list")
         return tuple(read_value(where, typing.get_args(kind)[0], one) for one in value)
     is_number = isinstance(value, (int, float)) and not isinstance(value, bool) and abs(value) <= LARGEST
     if kind is bool and isinstance(value, bool):
@@ -161,7 +161,7 @@ def read_value(where: str, kind: Any, value: Any) -> Any:
     if kind is int and is_number and value == int(value):
         return int(value)
     expected = {bool: "true or false", float: "a finite number", int: "a whole number"}[kind]
-    found = "infinity" if value in (math.inf, -math.inf) else shown(value)
+    found = "infinity" if value in (math.inf, -math.inf) else quote_value(value)
     raise ConfigError(f"{where}: found {found}, expected {expected}")
 
 
@@ -174,12 +174,14 @@ def settings_in_file(path: Path) -> dict[str, Any]:
     try:
         values = parse_toml(read_text(path))
     except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path}: cannot be read: {said(error)}") from error
+        raise ConfigError(f"{path}: cannot be read: {error_text(error)}") from error
     except TomlError as error:
-        raise ConfigError(f"{path}: not a TOML file: {said(error)}") from error
+        raise ConfigError(f"{path}: not a TOML file: {error_text(error)}") from error
     for name in values:
         if name not in FIELD_TYPES:
-            raise ConfigError(f"{path}: {named(name)}: unknown; expected one of {', '.join(FIELD_TYPES)}")
+            raise ConfigError(
+                f"{path}: {quote_name(name)}: unknown; expected one of {', '.join(FIELD_TYPES)}"
+            )
     return {name: read_value(f"{path}: {name}", FIELD_TYPES[name], value) for name, value in values.items()}
 
 
@@ -194,7 +196,7 @@ def config_from_json(values: dict[str, Any]) -> Config:
     for name in values:
         if name not in FIELD_TYPES:
             expected = ", ".join(FIELD_TYPES)
-            raise ConfigError(f"config: {named(name)}: unknown to this version; expected {expected}")
+            raise ConfigError(f"config: {quote_name(name)}: unknown to this version; expected {expected}")
     fields = {n: read_value(f"config: {n}", FIELD_TYPES[n], value) for n, value in values.items()}
     return Config(**{**BEFORE, **fields})
 

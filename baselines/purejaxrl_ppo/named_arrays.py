@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from flytrack_env.words import named
+from flytrack_env.messages import quote_name
 
 
 def name_of(path: Any) -> str:
@@ -45,7 +45,7 @@ def find_misfits(arrays: dict[str, np.ndarray], target: Any) -> list[str]:
             lines.append(f"{name}: found shape {found.shape}, expected shape {shape}")
         elif found.dtype != dtype:
             lines.append(f"{name}: found {found.dtype}, expected {dtype}")
-    return lines + [f"{named(name)}: found, but not expected" for name in arrays if name not in expected]
+    return lines + [f"{quote_name(name)}: found, but not expected" for name in arrays if name not in expected]
 
 
 def from_named_arrays(arrays: dict[str, np.ndarray], target: Any) -> Any:

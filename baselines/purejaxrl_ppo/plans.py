@@ -20,8 +20,8 @@ from baselines.purejaxrl_ppo.resume import (
 from baselines.purejaxrl_ppo.run_folder import check_free, checkpoints_in, folder_of, seeds_in
 from baselines.purejaxrl_ppo.tracking import local_uri
 from baselines.purejaxrl_ppo.training import Trainer
+from flytrack_env.messages import error_text
 from flytrack_env.model_file import model_from_json
-from flytrack_env.words import said
 
 T = TypeVar("T")
 
@@ -185,7 +185,9 @@ def make_trainer(arguments: argparse.Namespace, plan: Plan | None, mesh: Mesh | 
         config = dataclasses.replace(base.config, **asked)
         return Trainer(config, arguments.env_id or base.env_id, mesh, **env_arguments)
     except (ValueError, OverflowError, OSError) as error:
-        raise CheckpointError(f"{plan.resume}: with its settings and the flags: {said(error)}") from error
+        raise CheckpointError(
+            f"{plan.resume}: with its settings and the flags: {error_text(error)}"
+        ) from error
 
 
 def reward_of(checkpoint: Checkpoint) -> dict[str, float]:

@@ -30,8 +30,8 @@ from baselines.purejaxrl_ppo.named_arrays import as_named_arrays, find_misfits, 
 from baselines.purejaxrl_ppo.ppo import Runner
 from baselines.purejaxrl_ppo.run_folder import FINAL, checkpoints_in, is_its_folder, seeds_in
 from flytrack_env.files import write_together
+from flytrack_env.messages import quote_value
 from flytrack_env.model_file import model_as_json
-from flytrack_env.words import shown
 
 REWARD = "reward."  # what paths of the reward's weights begin with
 MUST_FIT = ("env_id", "seed", "missed_gate", "config", "observation", "track_data", "model", "environment")
@@ -182,7 +182,7 @@ def _check_progress(path: Path, checkpoint: Checkpoint) -> None:
     meta = checkpoint.meta
     for name, (is_right, expected) in PROGRESS.items():
         if not is_right(meta.get(name)):
-            found = shown(meta.get(name))
+            found = quote_value(meta.get(name))
             raise CheckpointError(f"{path}: {name}: found {found}, expected {expected}")
     batch_size = checkpoint.config.batch_size
     if meta["steps"] % batch_size:

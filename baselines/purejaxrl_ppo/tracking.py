@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from baselines.purejaxrl_ppo.journal import JOURNAL, SQLITE, Journal, JournalError
-from flytrack_env.words import named
+from flytrack_env.messages import quote_name
 
 LOCAL_STORE = "mlflow.db"
 LOCAL_ARTIFACTS = "mlflow_artifacts"
@@ -231,7 +231,7 @@ def _send_file(client: Any, run_id: str, folder: Path, entry: dict[str, Any]) ->
     """Send a file of the run's folder, and no other: a journal may be a stranger's."""
     path = folder / entry["path"]
     if not path.resolve().is_relative_to(folder.resolve()):
-        logger.warning("tracking: %s: leads out of the run's folder, not uploaded", named(path))
+        logger.warning("tracking: %s: leads out of the run's folder, not uploaded", quote_name(path))
     elif not path.exists():
         logger.warning("tracking: %s: not there any more, not uploaded", path)
     else:

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import msgpack
 import numpy as np
 
-from flytrack_env.words import said
+from flytrack_env.messages import error_text
 
 LARGEST_BYTES = 3 * 2**27  # of a file: a little more than twice that in memory, below 1 GiB
 MOST_ENTRIES = 100_000  # of all maps together
@@ -114,4 +114,4 @@ def unpack(content: bytes) -> Any:
     except UnpackError:
         raise
     except Exception as error:  # msgpack raises what it likes on damaged bytes
-        raise UnpackError(f"{type(error).__name__}: {said(error)}") from error
+        raise UnpackError(f"{type(error).__name__}: {error_text(error)}") from error

@@ -16,11 +16,11 @@ import numpy as np
 from flytrack_env.dynamics import ModelParameters
 from flytrack_env.effects import BY_NAME
 from flytrack_env.files import check_size, write_atomically
+from flytrack_env.messages import error_text, quote_value
 from flytrack_env.model_file import SIZES, model_as_json, model_from_json
 from flytrack_env.npz_file import NpzError, open_npz
 from flytrack_env.state import ACTION_SIZE, STATE_SIZE
 from flytrack_env.tracks import Track
-from flytrack_env.words import said, shown
 
 FOLDER = Path(__file__).parent
 KINDS = ("flying", "standing")
@@ -99,7 +99,7 @@ def shipped_reference(track: str, kind: str = "flying", model_name: str = "nomin
         ReferenceFileError: none of these names; the message lists those that are there.
     """
     if not is_shipped(track, kind, model_name):
-        name = shown(shipped_path(track, kind, model_name).stem)
+        name = quote_value(shipped_path(track, kind, model_name).stem)
         names = ", ".join(sorted(found.stem for found in FOLDER.glob("*.npz"))) or "none"
         raise ReferenceFileError(f"reference: found no {name}, expected one of {names}")
     return load_reference(shipped_path(track, kind, model_name))
@@ -147,7 +147,7 @@ def _check_arrays(path: Path, data: dict[str, np.ndarray]) -> None:
             raise ReferenceFileError(f"{path}: {name}: found something else, expected finite numbers")
     times_s = data["gate_times_s"]
     if times_s.ndim != 1 or times_s.size == 0 or (times_s < 0.0).any() or (np.diff(times_s) < 0.0).any():
-        found = f"{times_s.shape}, {shown(times_s.tolist())}"
+        found = f"{times_s.shape}, {quote_value(times_s.tolist())}"
         raise ReferenceFileError(f"{path}: gate_times_s: found {found}, expected a row of growing times, s")
     most = np.abs(data["commands"]).max()
     if most > 1.0 + BEYOND:
@@ -167,13 +167,13 @@ def _read(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
         notes = json.loads(str(data.pop("notes")))
     except (OSError, ValueError, RecursionError) as error:  # ValueError: NpzError, no text, no JSON
         raise ReferenceFileError(
-            f"{path}: cannot be read: {said(error)}; expected a reference file"
+            f"{path}: cannot be read: {error_text(error)}; expected a reference file"
         ) from error
     missing = [name for name in (*NOTES, "found") if not isinstance(notes, dict) or name not in notes]
     if missing:
         raise ReferenceFileError(f"{path}: notes: {', '.join(missing)}: missing")
     if notes["version"] != FILE_VERSION:
-        found = shown(notes["version"])
+        found = quote_value(notes["version"])
         raise ReferenceFileError(f"{path}: version: found {found}, expected {FILE_VERSION}")
     _check_notes(path, notes)
     return data, notes
@@ -184,16 +184,16 @@ def _check_notes(path: Path, notes: dict[str, Any]) -> None:
     for name in (*TEXTS, "found"):
         is_text = name in TEXTS
         if not isinstance(notes[name], str if is_text else dict):
-            found, expected = shown(notes[name]), "a text" if is_text else "an object"
+            found, expected = quote_value(notes[name]), "a text" if is_text else "an object"
             raise ReferenceFileError(f"{path}: {name}: found {found}, expected {expected}")
     for name in ("dt_s", "time_s"):
         value = notes[name]
         is_number = isinstance(value, (int, float)) and not isinstance(value, bool)
         if not is_number or not 0.0 < value < LONGEST_S:
-            found = shown(value)
+            found = quote_value(value)
             raise ReferenceFileError(f"{path}: {name}: found {found}, expected seconds above 0")
     if notes["kind"] not in KINDS:
-        found = shown(notes["kind"])
+        found = quote_value(notes["kind"])
         raise ReferenceFileError(f"{path}: kind: found {found}, expected one of {', '.join(KINDS)}")
 
 
@@ -208,7 +208,7 @@ def _model_of(path: Path, values: Any) -> ModelParameters:
         )
     except (AttributeError, KeyError, TypeError, ValueError) as error:
         raise ReferenceFileError(
-            f"{path}: model: cannot be read: {type(error).__name__}: {said(error)}"
+            f"{path}: model: cannot be read: {type(error).__name__}: {error_text(error)}"
         ) from error
 
 

@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 
 from flytrack_env.files import write_atomically
+from flytrack_env.messages import error_text, quote_name, quote_value
 from flytrack_env.toml_file import TomlError, parse_toml, read_text
-from flytrack_env.words import named, said, shown
 
 TRACK_FOLDER = Path(__file__).parent
 DIRECTIONS = {"+y": 1.0, "-y": -1.0}
@@ -88,7 +88,7 @@ def load_track(name_or_path: str | Path) -> Track:
     try:
         text = read_text(path)
     except (OSError, UnicodeDecodeError) as error:
-        raise TrackError(f"{path}: cannot be read: {said(error)}") from error
+        raise TrackError(f"{path}: cannot be read: {error_text(error)}") from error
     return _parse(path, text)
 
 
@@ -154,7 +154,7 @@ def _parse(path: Path, text: str) -> Track:
     try:
         data = parse_toml(text)
     except TomlError as error:
-        raise TrackError(f"{path}: not a TOML file: {said(error)}") from error
+        raise TrackError(f"{path}: not a TOML file: {error_text(error)}") from error
     return _Reader(path, text).track(data)
 
 
@@ -181,7 +181,7 @@ class _Reader:
     def fail(self, header: str, index: int, field: str, reason: str) -> TrackError:
         where = f"{header}[{index}] " if header == "[[gates]]" else f"{header} " if header else ""
         line = self.line_of(header, index, field)
-        return TrackError(f"{self.path}, line {line}: {where}{named(field)}: {reason}")
+        return TrackError(f"{self.path}, line {line}: {where}{quote_name(field)}: {reason}")
 
     def table(self, data: dict[str, Any], header: str, index: int, fields: set[str]) -> None:
         """Check that a table has these fields and no others."""
@@ -198,10 +198,10 @@ class _Reader:
         """Return a list of that many finite numbers."""
         value = data[field]
         if not isinstance(value, list) or len(value) != size:
-            raise self.fail(header, index, field, f"found {shown(value)}, expected {size} numbers")
+            raise self.fail(header, index, field, f"found {quote_value(value)}, expected {size} numbers")
         for number in value:
             if isinstance(number, bool) or not isinstance(number, (int, float)):
-                raise self.fail(header, index, field, f"found {shown(number)}, expected a number")
+                raise self.fail(header, index, field, f"found {quote_value(number)}, expected a number")
             if not -LARGEST < number < LARGEST:  # false for NaN too
                 found = number if isinstance(number, float) else f"an integer of {number.bit_length()} bits"
                 reason = f"found {found}, expected a finite number within +-{LARGEST:g}"
@@ -222,11 +222,11 @@ class _Reader:
         fields = {"id", "position", "quaternion", "direction", "opening", "frame"}
         self.table(data, header, index, fields)
         if isinstance(data["id"], bool) or not isinstance(data["id"], int):
-            raise self.fail(header, index, "id", f"found {shown(data['id'])}, expected an integer")
+            raise self.fail(header, index, "id", f"found {quote_value(data['id'])}, expected an integer")
         if not -LARGEST_ID < data["id"] < LARGEST_ID:
-            raise self.fail(header, index, "id", f"found {shown(data['id'])}, expected less than 2^53")
+            raise self.fail(header, index, "id", f"found {quote_value(data['id'])}, expected less than 2^53")
         if not isinstance(data["direction"], str) or data["direction"] not in DIRECTIONS:
-            reason = f"found {shown(data['direction'])}, expected one of {', '.join(DIRECTIONS)}"
+            reason = f"found {quote_value(data['direction'])}, expected one of {', '.join(DIRECTIONS)}"
             raise self.fail(header, index, "direction", reason)
         for field in ("opening", "frame"):
             data = {**data, field: self.numbers({field: [data[field]]}, header, index, field, 1)[0]}
@@ -248,7 +248,7 @@ class _Reader:
         """Return the checked track."""
         self.table(data, "", 0, {"name", "start", "bounds", "gates"})
         if not isinstance(data["name"], str) or not data["name"]:
-            raise self.fail("", 0, "name", f"found {shown(data['name'])}, expected a non-empty string")
+            raise self.fail("", 0, "name", f"found {quote_value(data['name'])}, expected a non-empty string")
         self.table(data["start"], "[start]", 0, {"position", "quaternion"})
         self.table(data["bounds"], "[bounds]", 0, {"low", "high"})
         if not isinstance(data["gates"], list) or len(data["gates"]) < 2:

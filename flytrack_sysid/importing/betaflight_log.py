@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from flytrack_env.files import read_at_most
-from flytrack_env.words import named, said, shown
+from flytrack_env.messages import error_text, quote_name, quote_value
 from flytrack_sysid.importing.craft import Craft
 from flytrack_sysid.importing.decoding import decode
 from flytrack_sysid.importing.flight import Flight
@@ -80,21 +80,23 @@ def read_betaflight(path: Path, mapping: Mapping) -> list[Flight]:
     num_logs = _count(path)
     notes, frames = decode(str(path), "betaflight", path, num_logs)
     return [
-        _flight(str(path) if num_logs == 1 else f"{path}, log {number}", said, rows, mapping)
-        for number, (said, rows) in enumerate(zip(notes, frames, strict=True), start=1)
+        _flight(str(path) if num_logs == 1 else f"{path}, log {number}", error_text, rows, mapping)
+        for number, (error_text, rows) in enumerate(zip(notes, frames, strict=True), start=1)
     ]
 
 
-def _flight(source: str, said: dict[str, Any], frames: np.ndarray, mapping: Mapping) -> Flight:
-    headers, names = said["headers"], said["names"]
+def _flight(source: str, error_text: dict[str, Any], frames: np.ndarray, mapping: Mapping) -> Flight:
+    headers, names = error_text["headers"], error_text["names"]
     if not len(frames):
         raise LogError(f"{source}: found no frames, expected at least one")
     revision = str(headers.get("Firmware revision", "none"))
     if not revision.startswith(FIRMWARE):
-        raise LogError(f"{source}: header Firmware revision: found {shown(revision)}, expected {FIRMWARE} 4")
+        raise LogError(
+            f"{source}: header Firmware revision: found {quote_value(revision)}, expected {FIRMWARE} 4"
+        )
     for name in ("time", *STICKS, *GYRO, *ACCELEROMETER):
         if name not in names:
-            listed = ", ".join(map(named, names))[:LONGEST_LIST]
+            listed = ", ".join(map(quote_name, names))[:LONGEST_LIST]
             raise LogError(f"{source}: field {name}: missing; found {listed}")
     columns = dict(zip(names, frames.T, strict=True))
     is_used = growing(columns["time"])
@@ -104,7 +106,7 @@ def _flight(source: str, said: dict[str, Any], frames: np.ndarray, mapping: Mapp
     table = Table(source, {name: values[is_used] for name, values in columns.items()})
     log = log_of_table(table._replace(columns=_channels(table, headers, craft)))
     dropped = np.count_nonzero(~is_used)
-    notes: tuple[str, ...] = (f"{source}: {named(revision)}, {len(frames)} frames",)
+    notes: tuple[str, ...] = (f"{source}: {quote_name(revision)}, {len(frames)} frames",)
     if dropped:
         notes += (f"{source}: {dropped} frames left out: their time was not later than those before",)
     return Flight(log, craft, notes)
@@ -148,7 +150,7 @@ def _header(
     values = value if isinstance(value, list) else [value]
     if len(values) != size or not all(isinstance(one, (int, float)) and 0 <= one < LARGEST for one in values):
         raise LogError(
-            f"{source}: header {name}: found {shown(value)}, expected {size} numbers of at least 0"
+            f"{source}: header {name}: found {quote_value(value)}, expected {size} numbers of at least 0"
         )
     return [float(one) for one in values]
 
@@ -174,7 +176,7 @@ def _count(path: Path) -> int:
     try:
         content = read_at_most(path, LARGEST_BYTES)
     except OSError as error:
-        raise LogError(f"{path}: cannot be read: {said(error)}") from error
+        raise LogError(f"{path}: cannot be read: {error_text(error)}") from error
     if not content.startswith(FIRST_BYTES):
         raise LogError(f"{path}: found {content[: len(FIRST_BYTES)]!r} first, expected {FIRST_BYTES!r}")
     logs = content.split(FIRST_BYTES)[1:]

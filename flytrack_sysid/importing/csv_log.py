@@ -13,7 +13,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from flytrack_env.files import AtMost, check_size, open_file
-from flytrack_env.words import named, said, shown
+from flytrack_env.messages import error_text, quote_name, quote_value
 from flytrack_sysid.importing import gunzip
 from flytrack_sysid.importing.flight import Flight
 from flytrack_sysid.importing.mapping import Attitude, Columns, Command, Mapping, Vector
@@ -77,7 +77,7 @@ def _opened(path: Path) -> Iterator[TextIO]:
     except (OSError, EOFError, zlib.error, ValueError) as error:
         if isinstance(error, LogError):
             raise
-        raise LogError(f"{path}: cannot be read as text: {said(error)}") from error
+        raise LogError(f"{path}: cannot be read as text: {error_text(error)}") from error
 
 
 class _Rows:
@@ -119,7 +119,9 @@ def _read(path: Path, columns: Columns, mapping: str) -> Table:
         try:
             return _table(path, rows, columns, mapping)
         except csv.Error as error:
-            raise LogError(f"{path}: near line {rows.line_num + 1}: not a CSV file: {said(error)}") from error
+            raise LogError(
+                f"{path}: near line {rows.line_num + 1}: not a CSV file: {error_text(error)}"
+            ) from error
 
 
 def _table(path: Path, rows: _Rows, columns: Columns, mapping: str) -> Table:
@@ -128,8 +130,10 @@ def _table(path: Path, rows: _Rows, columns: Columns, mapping: str) -> Table:
     header = [name.strip() for name in next(rows, [])]
     for name, table in wanted.items():
         if header.count(name) != 1:
-            found = f"found {header.count(name)} times among {', '.join(map(named, header))[:LONGEST_LIST]}"
-            raise LogError(f"{path}: column {named(name)}: {found}; expected once by {mapping}: {table}")
+            found = (
+                f"found {header.count(name)} times among {', '.join(map(quote_name, header))[:LONGEST_LIST]}"
+            )
+            raise LogError(f"{path}: column {quote_name(name)}: {found}; expected once by {mapping}: {table}")
     places = [header.index(name) for name in wanted]
     found_rows = Rows(str(path), list(wanted))
     for cells in rows:
@@ -147,11 +151,12 @@ def _number(where: str, column: str, cell: str) -> float:
     try:
         value = float(cell)
     except ValueError:
-        found = shown(cell) if cell.strip() else "an empty cell"
-        raise LogError(f"{where}, column {named(column)}: found {found}, expected a number") from None
+        found = quote_value(cell) if cell.strip() else "an empty cell"
+        raise LogError(f"{where}, column {quote_name(column)}: found {found}, expected a number") from None
     if not math.isfinite(value):
         raise LogError(
-            f"{where}, column {named(column)}: found {named(cell.strip())}, expected a finite number"
+            f"{where}, column {quote_name(column)}: "
+            f"found {quote_name(cell.strip())}, expected a finite number"
         )
     return value
 
@@ -178,7 +183,7 @@ def _commands(table: Table, command: Command) -> np.ndarray:
         text = (
             f"found {values[row, stick]:g}, expected {low[stick]:g} to {high[stick]:g} by command.low, high"
         )
-        raise table.error(row, named(command.columns[stick]), f"{text}; clip = true cuts it")
+        raise table.error(row, quote_name(command.columns[stick]), f"{text}; clip = true cuts it")
     return 2.0 * (values - low) / (high - low) - 1.0
 
 
@@ -201,7 +206,7 @@ def _quaternions(table: Table, attitude: Attitude) -> np.ndarray:
     values = table.matrix(attitude.columns) * np.array(attitude.scales)
     bad = np.flatnonzero(~np.isfinite(values).all(axis=1))
     if len(bad):
-        raise table.error(bad[0], ", ".join(map(named, attitude.columns)), "found no finite numbers")
+        raise table.error(bad[0], ", ".join(map(quote_name, attitude.columns)), "found no finite numbers")
     if attitude.order == "euler":
         rotation = Rotation.from_euler("ZYX", values[:, ::-1])
     else:
@@ -209,7 +214,7 @@ def _quaternions(table: Table, attitude: Attitude) -> np.ndarray:
         bad = np.flatnonzero(np.abs(norm - 1.0) > LARGEST_NORM_ERROR)
         if len(bad):
             text = f"found a quaternion of norm {norm[bad[0]]:.4g}, expected 1"
-            raise table.error(bad[0], ", ".join(map(named, attitude.columns)), text)
+            raise table.error(bad[0], ", ".join(map(quote_name, attitude.columns)), text)
         rotation = Rotation.from_quat(values, scalar_first=attitude.order == "wxyz")
     if attitude.is_inverted:
         rotation = rotation.inv()

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 
 from flytrack_env.apart import Apart, ApartError, ResourceLimits, is_possible
+from flytrack_env.messages import error_text
 from flytrack_env.npz_file import NpzError, NpzFile
-from flytrack_env.words import said
 from flytrack_sysid.importing.extra import needed_module
 from flytrack_sysid.log import LogError
 
@@ -49,10 +49,10 @@ def decode(source: str, format_name: str, path: Path, *rest: Any) -> tuple[Any, 
             notes, *values = [arrays.read(name) for name in arrays.names]
             return json.loads(notes.tobytes()), values
     except OSError as error:
-        raise LogError(f"{source}: cannot be read: {said(error)}") from error
+        raise LogError(f"{source}: cannot be read: {error_text(error)}") from error
     except (ApartError, NpzError, zipfile.BadZipFile) as error:
         kind = f"{error.kind}: " if isinstance(error, ApartError) and error.kind else ""
-        raise LogError(f"{source}: damaged, cannot be decoded: {kind}{said(error)}") from error
+        raise LogError(f"{source}: damaged, cannot be decoded: {kind}{error_text(error)}") from error
 
 
 def _ask(argument: list[Any], num_bytes: int) -> bytes:

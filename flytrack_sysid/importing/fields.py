@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from flytrack_env.messages import error_text, quote_name, quote_value
 from flytrack_env.toml_file import TomlError, parse_toml, read_text
-from flytrack_env.words import named, said, shown
 from flytrack_sysid.log import LogError
 
 LARGEST_COUNT = 2**53
@@ -24,7 +24,7 @@ def read_toml(path: Path) -> dict[str, Any]:
     try:
         return parse_toml(read_text(path))
     except (OSError, UnicodeDecodeError, TomlError) as error:
-        raise LogError(f"{path}: not a readable TOML file: {said(error)}") from error
+        raise LogError(f"{path}: not a readable TOML file: {error_text(error)}") from error
 
 
 class Fields:
@@ -33,7 +33,7 @@ class Fields:
     def __init__(self, source: str, name: str, table: Any):
         self.source, self.name = source, name
         if not isinstance(table, dict):
-            raise self.error("", f"found {shown(table)}, expected a table")
+            raise self.error("", f"found {quote_value(table)}, expected a table")
         self.left, self.known = dict(table), list[str]()
 
     def error(self, field: str, text: str) -> LogError:
@@ -51,7 +51,7 @@ class Fields:
         return self.left.pop(field, default)
 
     def _refuse(self, field: str, value: Any, expected: str) -> LogError:
-        return self.error(field, f"found {shown(value)}, expected {expected}")
+        return self.error(field, f"found {quote_value(value)}, expected {expected}")
 
     def table(self, field: str) -> "Fields | None":
         """Return a table of the table, None if it is not there."""
@@ -118,7 +118,7 @@ class Fields:
     def done(self) -> None:
         """Refuse fields that nothing has asked for."""
         for field in self.left:
-            raise self.error(named(field), f"unknown; expected of {', '.join(self.known) or 'nothing'}")
+            raise self.error(quote_name(field), f"unknown; expected of {', '.join(self.known) or 'nothing'}")
 
 
 def _is_number(value: Any) -> bool:

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from flytrack_env.files import AtMost, open_file
-from flytrack_env.words import named, said, shown
+from flytrack_env.messages import error_text, quote_name, quote_value
 from flytrack_sysid.importing.craft import Craft
 from flytrack_sysid.importing.mapping import Manifest, Mapping
 from flytrack_sysid.log import FlightLog, LogError
@@ -51,7 +51,7 @@ def used_rows(path: Path, log: FlightLog, mapping: Mapping) -> FlightLog:
 def _count_of(path: Path, asked: Manifest) -> int:
     """Return how many rows of a file the manifest beside it says to use."""
     manifest = path.parent / asked.file
-    where = f"{path.parent}/{named(asked.file)}"
+    where = f"{path.parent}/{quote_name(asked.file)}"
     if manifest.name != asked.file:
         raise LogError(f"{where}: expected the name of a file beside the log, not a path")
     try:
@@ -62,9 +62,9 @@ def _count_of(path: Path, asked: Manifest) -> int:
     except (OSError, ValueError, csv.Error) as error:  # ValueError: no text, or a NUL in the name
         if isinstance(error, LogError):
             raise
-        raise LogError(f"{where}: cannot be read as a manifest: {said(error)}") from error
+        raise LogError(f"{where}: cannot be read as a manifest: {error_text(error)}") from error
     if count is None:
-        raise LogError(f"{where}: column {named(asked.key)}: {path.name}: missing")
+        raise LogError(f"{where}: column {quote_name(asked.key)}: {path.name}: missing")
     return count
 
 
@@ -73,14 +73,16 @@ def _find_count(where: str, table: Iterator[list[str]], asked: Manifest, file: s
     names = next(table, [])
     for name in (asked.key, asked.count):
         if name not in names:
-            listed = ", ".join(map(named, names))[:LONGEST_LIST]
-            raise LogError(f"{where}: column {named(name)}: missing; found {listed}")
+            listed = ", ".join(map(quote_name, names))[:LONGEST_LIST]
+            raise LogError(f"{where}: column {quote_name(name)}: missing; found {listed}")
     key, count = names.index(asked.key), names.index(asked.count)
     for entry in table:
         if entry[key : key + 1] == [file]:
             text = "".join(entry[count : count + 1]).strip()
             if not text.isdecimal() or len(text) > MOST_DIGITS:
-                found, expected = shown(text), f"a whole number of at most {MOST_DIGITS} digits"
-                raise LogError(f"{where}: {file}: {named(asked.count)}: found {found}, expected {expected}")
+                found, expected = quote_value(text), f"a whole number of at most {MOST_DIGITS} digits"
+                raise LogError(
+                    f"{where}: {file}: {quote_name(asked.count)}: found {found}, expected {expected}"
+                )
             return int(text)
     return None

@@ -6,7 +6,7 @@ TOML. Every table and field is in docs/real_logs.md; ``rows`` and ``craft`` serv
 from pathlib import Path
 from typing import NamedTuple
 
-from flytrack_env.words import shown
+from flytrack_env.messages import quote_value
 from flytrack_sysid.importing.craft import Craft
 from flytrack_sysid.importing.fields import Fields, read_toml
 from flytrack_sysid.importing.units import TURNED, UNITS
@@ -178,7 +178,7 @@ def _columns(top: Fields) -> Columns:
     attitude, battery = top.table("attitude"), top.table("battery")
     delimiter = top.text("delimiter", ",")
     if len(delimiter) != 1:
-        raise top.error("delimiter", f"found {shown(delimiter)}, expected one character")
+        raise top.error("delimiter", f"found {quote_value(delimiter)}, expected one character")
     return Columns(
         delimiter=delimiter,
         time=_time(time),

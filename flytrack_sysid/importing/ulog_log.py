@@ -11,7 +11,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from flytrack_env.files import check_size, open_file
-from flytrack_env.words import said
+from flytrack_env.messages import error_text
 from flytrack_sysid.importing.craft import Craft
 from flytrack_sysid.importing.decoding import decode
 from flytrack_sysid.importing.flight import Flight
@@ -78,7 +78,7 @@ class _Topics:
             with open_file(path) as file:
                 found = file.read(len(FIRST_BYTES))
         except OSError as error:
-            raise LogError(f"{path}: cannot be read: {said(error)}") from error
+            raise LogError(f"{path}: cannot be read: {error_text(error)}") from error
         if found != FIRST_BYTES:
             raise LogError(f"{path}: found {found!r} first, expected {FIRST_BYTES!r}, as every ULog begins")
         notes, arrays = decode(str(path), "ulog", path, FIELDS)

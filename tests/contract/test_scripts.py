@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from handout_plant import HandoutPlant
 
 from benchmarks.reliability.strangers.archives import zipped
 from flytrack_env.dynamics import collective_thrust, nominal_parameters
@@ -22,6 +21,7 @@ from flytrack_sysid.envelope import HEIGHTS, SCRIPT_HEIGHTS
 from flytrack_sysid.excitation import DT_S, FLIGHT_STEPS
 from flytrack_sysid.manoeuvres import FLIGHTS_PER_MANOEUVRE, MANOEUVRES, flights_of, hover_action
 from flytrack_sysid.script_file import Script, ScriptError, check_script, load_script, save_script, script_of
+from tests.support.handout_plant import HandoutPlant
 
 HOVER = hover_action(HandoutPlant().model())
 SHIPPED = Path(__file__).parents[2] / "blackbox" / "acro_step.bin"

@@ -62,7 +62,14 @@ def folder(cases: dict[str, Case], tmp_path_factory: pytest.TempPathFactory) -> 
         model = nominal_parameters() if name == "simulated" else model_of(case.believed)
         save_model(folder / f"model_{name}.json", model, {})
     # A warning of NumPy's in there is a fault as well.
-    command = [sys.executable, "-W", "error::RuntimeWarning", "-m", "tests.support.diagnose_apart", str(folder)]
+    command = [
+        sys.executable,
+        "-W",
+        "error::RuntimeWarning",
+        "-m",
+        "tests.support.diagnose_apart",
+        str(folder),
+    ]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=TIMEOUT_S)
     assert done.returncode == 0, done.stderr
     return folder

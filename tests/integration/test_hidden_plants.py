@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from handout_plant import HandoutPlant
 
 from benchmarks.hidden import (
     EFFECTS,
@@ -16,6 +15,7 @@ from benchmarks.hidden import (
 )
 from benchmarks.hidden.plant import Plant, Start
 from flytrack_sysid.log import FlightLog
+from tests.support.handout_plant import HandoutPlant
 
 START = Start((1.0, -2.0, 6.0), 0.7, 23.8, -0.2)
 ROUNDING = 1e-12

@@ -4,11 +4,11 @@ import json
 
 import numpy as np
 import pytest
-from real_logs import CRAZYFLIE, shared
 
 from benchmarks.answers import ANSWER_ROWS, answers, velocity_scale
 from benchmarks.real_logs import main
 from flytrack_sysid import FlightLog, diagnose, import_log
+from tests.support.real_logs import CRAZYFLIE, shared
 
 DT_S = 0.01
 PARTS = ("seed00053_log2", "seed00067_log1")  # 11 s of two policies

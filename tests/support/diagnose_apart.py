@@ -1,6 +1,6 @@
 """Diagnoses logs in a process of its own, which sees nothing but the logs and the nominal models.
 
-``python -m tests.support.diagnose_apart FOLDER`` reads log_NAME.npz and model_NAME.json of the folder, and writes
+``python -m tests.support.diagnose_apart FOLDER`` reads log_NAME.npz and model_NAME.json there, and writes
 found_NAME.json: the diagnosis, or ``{"raised": type, "message": text}``. Of the log called REPORTED it writes
 all files of a diagnosis too, into a folder of that name.
 """

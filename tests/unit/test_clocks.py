@@ -4,12 +4,12 @@ import tracemalloc
 
 import numpy as np
 import pytest
-from made_flight import TIME_S, flight, noisy
-from real_logs import CRAZYFLIE, shared
 from scipy.spatial.transform import Rotation
 
 from flytrack_sysid import FlightLog, import_log
 from flytrack_sysid.importing import clocks
+from tests.support.made_flight import TIME_S, flight, noisy
+from tests.support.real_logs import CRAZYFLIE, shared
 
 
 @pytest.fixture(scope="module")

@@ -4,11 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from handout_plant import GRAVITY, HandoutPlant
 
 from flytrack_env.dynamics import advance
 from flytrack_sysid import CollectError, collect
 from flytrack_sysid.envelope import HEIGHTS, LARGEST_SPEED
+from tests.support.handout_plant import GRAVITY, HandoutPlant
 
 
 class Simulated:

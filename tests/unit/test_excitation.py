@@ -2,12 +2,12 @@
 
 import numpy as np
 import pytest
-from handout_plant import HOVER, HandoutPlant
 
 from flytrack_sysid.collect import collect
 from flytrack_sysid.excitation import AMPLITUDES, FLIGHT_STEPS, KINDS, LEG_SPEEDS, script, switching, wave
 from flytrack_sysid.log import FlightLog
 from flytrack_sysid.split import held_out_rows
+from tests.support.handout_plant import HOVER, HandoutPlant
 
 STICKS = ("roll", "pitch", "yaw", "thrust")
 

@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from handout_plant import GRAVITY, HandoutPlant, excited
 
 from flytrack_env.dynamics import collective_thrust
 from flytrack_sysid import FitError, LogError, fit
@@ -13,6 +12,7 @@ from flytrack_sysid.log import FlightLog
 from flytrack_sysid.parameters import BASE, DRAIN, TAUS, THRUST_COEFFS, to_vector
 from flytrack_sysid.sensors import measure
 from flytrack_sysid.split import held_out_rows
+from tests.support.handout_plant import GRAVITY, HandoutPlant, excited
 
 PLANT = HandoutPlant()
 DRAG = (0.3, 0.5, 0.2)

@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from real_logs import BETAFLIGHT, shared
 from scipy.spatial.transform import Rotation
 
 from benchmarks.reliability.strangers.log_writers import BLACKBOX_HEADERS, blackbox
@@ -14,6 +13,7 @@ from flytrack_env.apart import ResourceLimits
 from flytrack_sysid import LogError, import_log
 from flytrack_sysid.importing import decoding
 from flytrack_sysid.importing.betaflight_log import full_stick_rate
+from tests.support.real_logs import BETAFLIGHT, shared
 
 pytest.importorskip("orangebox", reason="orangebox is not installed: pip install 'flytrack[logs]'")
 

@@ -8,14 +8,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from made_flight import GRAVITY, TIME_S, flight
-from real_logs import CRAZYFLIE, shared
 from scipy.spatial.transform import Rotation
 
 from flytrack_env import load_model, nominal_parameters
 from flytrack_sysid import FlightLog, LogError, import_log, load_log
 from flytrack_sysid.cli import main
 from flytrack_sysid.importing.craft import Craft, nominal_model
+from tests.support.made_flight import GRAVITY, TIME_S, flight
+from tests.support.real_logs import CRAZYFLIE, shared
 
 FLIP = np.array([1.0, -1.0, -1.0])
 HEADER = ["ms", "n", "e", "d", "vn", "ve", "vd", "ax", "ay", "az", "p", "q", "r", "qx", "qy", "qz", "qw"]

@@ -4,12 +4,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from handout_plant import HandoutPlant, excited
 from scipy.spatial.transform import Rotation
 
 from flytrack_sysid.log import FlightLog
 from flytrack_sysid.record import PADDED_TO, WINDOW_S, applied_doubt, fill_gaps, make_record
 from flytrack_sysid.split import blocks_of
+from tests.support.handout_plant import HandoutPlant, excited
 
 
 def ramp(*lost: int, rows: int = 12, jump_at: int | None = None, slope: float = 0.02) -> FlightLog:

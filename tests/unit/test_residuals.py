@@ -5,7 +5,6 @@ from dataclasses import replace
 import jax
 import numpy as np
 import pytest
-from handout_plant import GRAVITY, HandoutPlant, excited
 from scipy.spatial.transform import Rotation
 
 from flytrack_env.dynamics import ModelParameters
@@ -15,6 +14,7 @@ from flytrack_sysid.record import make_record
 from flytrack_sysid.residuals import Problem, make_problem, residuals
 from flytrack_sysid.sensors import specific_force_b
 from flytrack_sysid.split import held_out_rows
+from tests.support.handout_plant import GRAVITY, HandoutPlant, excited
 
 PLANT = HandoutPlant()
 EVERY_CHANNEL = {"w", "q", "f", "v", "v_bat"}

@@ -4,10 +4,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from handout_plant import HandoutPlant, excited
 
 from flytrack_sysid import FitError, fit
 from flytrack_sysid.log import FlightLog
+from tests.support.handout_plant import HandoutPlant, excited
 
 SHORT_S = 0.14  # a few lags: what was applied before is not forgotten
 

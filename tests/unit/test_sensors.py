@@ -2,11 +2,11 @@
 
 import numpy as np
 import pytest
-from handout_plant import GRAVITY, HandoutPlant, excited, rotation
 from scipy.spatial.transform import Rotation
 
 from flytrack_sysid import sensors
 from flytrack_sysid.log import FlightLog
+from tests.support.handout_plant import GRAVITY, HandoutPlant, excited, rotation
 
 
 @pytest.fixture(scope="module")

@@ -9,8 +9,8 @@ from typing import Any
 from ray import tune
 
 from baselines.purejaxrl_ppo.config import FIELD_TYPES, ConfigError, read_value
+from flytrack_env.messages import error_text, quote_name, quote_value
 from flytrack_env.toml_file import TomlError, parse_toml, read_text
-from flytrack_env.words import named, said, shown
 
 LISTS = ("choice", "grid_search")  # of values; the others are ranges of numbers
 KINDS = (*LISTS, "uniform", "quniform", "loguniform", "qloguniform", "randint", "lograndint")
@@ -29,14 +29,16 @@ def read_space(path: Path) -> Space:
     try:
         space = parse_toml(read_text(path))
     except (OSError, UnicodeDecodeError, TomlError) as error:
-        raise ConfigError(f"{path}: cannot be read: {said(error)}") from error
+        raise ConfigError(f"{path}: cannot be read: {error_text(error)}") from error
     if not space:
         raise ConfigError(f"{path}: found no setting, expected at least one of {', '.join(FIELD_TYPES)}")
     for name, how in space.items():
         if name not in FIELD_TYPES:
-            raise ConfigError(f"{path}: {named(name)}: unknown; expected one of {', '.join(FIELD_TYPES)}")
+            raise ConfigError(
+                f"{path}: {quote_name(name)}: unknown; expected one of {', '.join(FIELD_TYPES)}"
+            )
         if not isinstance(how, dict) or len(how) != 1 or next(iter(how)) not in KINDS:
-            raise ConfigError(f"{path}: {name}: found {shown(how)}, expected one of {', '.join(KINDS)}")
+            raise ConfigError(f"{path}: {name}: found {quote_value(how)}, expected one of {', '.join(KINDS)}")
         (kind, values) = next(iter(how.items()))
         how[kind] = _read_values(f"{path}: {name}", name, kind, values)
     return space
@@ -45,7 +47,7 @@ def read_space(path: Path) -> Space:
 def _read_values(where: str, name: str, kind: str, values: Any) -> list[Any]:
     """Return the values of a kind, of the field's type."""
     if not isinstance(values, list) or not values:
-        raise ConfigError(f"{where}: {kind}: found {shown(values)}, expected a list of values")
+        raise ConfigError(f"{where}: {kind}: found {quote_value(values)}, expected a list of values")
     if kind in LISTS:
         return [read_value(where, FIELD_TYPES[name], value) for value in values]
     if typing.get_origin(FIELD_TYPES[name]) is tuple or FIELD_TYPES[name] is bool:
@@ -53,7 +55,9 @@ def _read_values(where: str, name: str, kind: str, values: Any) -> list[Any]:
     arguments = list(inspect.signature(getattr(tune, kind)).parameters)
     number = 3 if "q" in arguments and kind.startswith("q") else 2
     if len(values) != number:
-        raise ConfigError(f"{where}: {kind}: found {shown(values)}, expected {', '.join(arguments[:number])}")
+        raise ConfigError(
+            f"{where}: {kind}: found {quote_value(values)}, expected {', '.join(arguments[:number])}"
+        )
     numbers = [read_value(where, FIELD_TYPES[name], value) for value in values]
     if not numbers[0] < numbers[1]:
         raise ConfigError(f"{where}: {kind}: found {numbers}, expected the smaller one first")
