@@ -48,7 +48,7 @@ def digest(env_id: str) -> str:
 
 @OVER_IDS
 def test_identical_seeds_fly_identically_in_another_process(env_id: str) -> None:
-    code = f"from tests.test_variants import digest; print(digest({env_id!r}))"
+    code = f"from tests.contract.test_variants import digest; print(digest({env_id!r}))"
     with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True) as other:
         here = digest(env_id)
         output, _ = other.communicate(timeout=300)

@@ -4,10 +4,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from test_docs import DOCS, examples
 
 from flytrack_env import find_problems, load_model, load_track
 from flytrack_env.rollout import load_rollout
+from tests.contract.test_docs import DOCS, examples
 
 
 def run(page: str, folder: Path, monkeypatch: pytest.MonkeyPatch, until: str = "") -> dict[str, Any]:

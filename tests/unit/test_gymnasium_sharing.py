@@ -5,9 +5,9 @@ from typing import Any
 import gymnasium
 import numpy as np
 import pytest
-from tests.contract.test_gymnasium import BASE, make_vector
 
 from flytrack_env.dynamics import nominal_parameters
+from tests.contract.test_gymnasium import BASE, make_vector
 
 
 @pytest.mark.parametrize("overrides", [{"model": nominal_parameters()}, {"reward": {"gate_pass": 2.0}}])
