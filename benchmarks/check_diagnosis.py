@@ -19,7 +19,8 @@ import jax
 import numpy as np
 from tqdm import tqdm
 
-from benchmarks.diagnosis import ROWS, commit_of_checkout, make_log
+from benchmarks.diagnosis import ROWS, make_log
+from benchmarks.report import commit_of_checkout
 from flytrack_env.files import write_atomically
 from flytrack_sysid.diagnosis import Diagnosis, diagnose
 

@@ -12,12 +12,10 @@ import argparse
 import json
 import os
 import platform
-import subprocess
 import time
 from collections.abc import Callable
 from dataclasses import replace
 from datetime import date
-from pathlib import Path
 from typing import Any
 
 import jax
@@ -35,12 +33,12 @@ from benchmarks.hidden import (
     signal_to_noise,
 )
 from benchmarks.hidden.oracle import known, removed
+from benchmarks.report import ROOT, commit_of_checkout
 from flytrack_env.dynamics import ModelParameters
 from flytrack_sysid.diagnosis import Diagnosis, diagnose
 from flytrack_sysid.log import FlightLog
 from flytrack_sysid.split import held_out_rows
 
-ROOT = Path(__file__).parent.parent
 LINES = ROOT / "docs" / "results" / "diagnosis.jsonl"
 SECONDS = 60.0
 AMPLITUDES = (0.5, 3.0)  # of effects outside the list, times the noise
@@ -75,12 +73,6 @@ def model_of(truth: Truth) -> ModelParameters:
         g=truth.gravity,
         battery_drain_v_per_min=truth.drain,
     )
-
-
-def commit_of_checkout() -> str:
-    """Return the checkout's commit, and whether files that it knows have changed since."""
-    command = ["git", "describe", "--always", "--exclude=*", "--dirty"]
-    return subprocess.run(command, cwd=ROOT, check=True, capture_output=True, text=True).stdout.strip()
 
 
 def make_log(row: str, number: int, seed: int) -> tuple[Truth, FlightLog, FlightLog, ModelParameters, Rng]:

@@ -7,21 +7,28 @@ because machines drift: compare ratios of one run, not rates of two.
 """
 
 import argparse
-import json
-import os
-import platform
 import statistics
 import time
 from collections.abc import Callable
 from importlib import import_module
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from benchmarks.report import cpu_name as cpu_name
+from benchmarks.report import (
+    page,
+    pin_to_one_core,
+    provenance,
+    provenance_line,
+    spread,
+    table,
+    write_json,
+    write_page,
+)
+from benchmarks.report import versions as versions
+
 NUM_ACTIONS_L2F = 16  # drawn in advance and flown in turn
 L2F_TIME_LIMIT = 500  # steps
-MINIMUM_REPEATS = 5
-PACKAGES = ("jax", "jaxlib", "gymnax", "l2f", "numpy")
 
 PENDULUM = "gymnax Pendulum-v1, vmap, 1,024"
 L2F_SMALL, L2F_LARGE = "l2f full step, 1,024", "l2f full step, 4,096"
@@ -56,17 +63,6 @@ class Contestant(NamedTuple):
     name: str
     num_steps: int
     run: Callable[[], None]
-
-
-def pin_to_one_core() -> str:
-    """Keep this process, and the libraries it loads later, on one core; return what was done."""
-    os.environ["OMP_NUM_THREADS"] = "1"
-    os.environ.setdefault("JAX_PLATFORMS", "cpu")
-    if not hasattr(os, "sched_setaffinity"):
-        return "not pinned: this system has no sched_setaffinity"
-    core = max(os.sched_getaffinity(0))
-    os.sched_setaffinity(0, {core})
-    return f"pinned to core {core}"
 
 
 def jax_contestant(name: str, env_id: str, num_envs: int, length: int, is_batch: bool) -> Contestant:
@@ -171,27 +167,6 @@ def measure(entries: list[Contestant], repeats: int, warm_up: int = 3) -> dict[s
     return rates
 
 
-def cpu_name() -> str:
-    """Return the processor's name as the system gives it."""
-    try:
-        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
-    except OSError:
-        return platform.processor() or platform.machine()
-    names = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
-    return names[0] if names else platform.machine()
-
-
-def versions() -> dict[str, str]:
-    """Return the versions of what was measured."""
-    found = {"python": platform.python_version()}
-    for package in PACKAGES:
-        try:
-            found[package] = version(package)
-        except PackageNotFoundError:
-            found[package] = "not installed"
-    return found
-
-
 def ratios(rates: dict[str, list[float]]) -> list[dict[str, Any]]:
     """Return the measured ratio of each target whose contestants all ran.
 
@@ -215,59 +190,46 @@ def costs(rates: dict[str, list[float]]) -> dict[str, float]:
     }
 
 
-def as_markdown(result: dict[str, Any]) -> str:
-    """Return the result as two tables and a line about the machine."""
-    lines = [
-        "# Environment speed",
-        "",
+def as_page(result: dict[str, Any]) -> str:
+    """Return the result as a page."""
+    rates = (
+        (name, f"{statistics.median(found):.2f}", spread(found, ".2f"))
+        for name, found in result["rates"].items()
+    )
+    targets = (
+        (f"{row['ours']} to {row['peer']}", f"{row['ratio']:.1f}", f"{row['goal']:g}", f"{row['stretch']:g}")
+        for row in result["ratios"]
+    )
+    costs = ((name, f"{cost:.2f}", f"{MOST_COSTLY:g}") for name, cost in result["costs"].items())
+    return page(
+        "Environment speed",
         f"`python -m benchmarks.env_speed --repeats {result['repeats']}`; what limits it: docs/speed.md.",
-        "",
-        "| environment | million steps per CPU second, median | lowest to highest |",
-        "|---|---|---|",
-    ]
-    for name, rates in result["rates"].items():
-        spread = f"{min(rates):.2f} to {max(rates):.2f}"
-        lines.append(f"| {name} | {statistics.median(rates):.2f} | {spread} |")
-    lines += ["", "| ratio | measured | target | stretch |", "|---|---|---|---|"]
-    for row in result["ratios"]:
-        numbers = f"{row['ratio']:.1f} | {row['goal']:g} | {row['stretch']:g}"
-        lines.append(f"| {row['ours']} to {row['peer']} | {numbers} |")
-    lines += ["", "| variant | cost over the plain step | at most |", "|---|---|---|"]
-    for name, cost in result["costs"].items():
-        lines.append(f"| {name} | {cost:.2f} | {MOST_COSTLY:g} |")
-    packages = ", ".join(f"{name} {number}" for name, number in result["versions"].items())
-    lines += ["", f"{result['cpu']}, {result['core']}, {result['repeats']} rounds; {packages}."]
-    return "\n".join(lines) + "\n"
+        table(("environment", "million steps per CPU second, median", "lowest to highest"), rates),
+        table(("ratio", "measured", "target", "stretch"), targets),
+        table(("variant", "cost over the plain step", "at most"), costs),
+        f"{result['repeats']} rounds, {result['core']}. {provenance_line(result['provenance'])}",
+    )
 
 
 def main() -> None:
     """Measure, print and write."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--repeats", type=int, default=7, help="rounds, at least 5")
+    parser.add_argument("--repeats", type=int, default=7, help="rounds, at least 5 for figures to publish")
     parser.add_argument("--out", type=Path, help="path of the results without its suffix")
     arguments = parser.parse_args()
-    if arguments.repeats < MINIMUM_REPEATS:
-        parser.error(f"--repeats: found {arguments.repeats}, expected at least {MINIMUM_REPEATS}")
     core = pin_to_one_core()
     rates = measure(contestants(), arguments.repeats)
     result = {
         "rates": rates,
         "ratios": ratios(rates),
         "costs": costs(rates),
-        "cpu": cpu_name(),
         "core": core,
         "repeats": arguments.repeats,
-        "versions": versions(),
+        "provenance": provenance("l2f"),
     }
-    table = as_markdown(result)
-    print(table, end="")
+    write_page(arguments.out and arguments.out.with_suffix(".md"), as_page(result))
     if arguments.out:
-        # Not at the top: it imports jax, whose threads must be born on the pinned core.
-        from flytrack_env.files import write_atomically
-
-        write_atomically(arguments.out.with_suffix(".md"), table.encode())
-        text = json.dumps(result, indent=2) + "\n"
-        write_atomically(arguments.out.with_suffix(".json"), text.encode())
+        write_json(arguments.out.with_suffix(".json"), result)
 
 
 if __name__ == "__main__":

@@ -1,0 +1,117 @@
+"""What all benchmarks share: tables and pages in Markdown, and a record of what was measured where and when.
+
+Nothing here imports JAX at the top, so that ``pin_to_one_core`` can run before JAX starts its threads.
+"""
+
+import json
+import os
+import platform
+import subprocess
+from collections.abc import Iterable, Sequence
+from datetime import date
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).parent.parent
+RESULTS = ROOT / "docs" / "results"
+PACKAGES = ("jax", "jaxlib", "gymnax", "numpy")
+
+
+def pin_to_one_core() -> str:
+    """Keep this process, and the libraries it loads later, on one core; return what was done."""
+    os.environ["OMP_NUM_THREADS"] = "1"
+    os.environ.setdefault("JAX_PLATFORMS", "cpu")
+    if not hasattr(os, "sched_setaffinity"):
+        return "not pinned: this system has no sched_setaffinity"
+    core = max(os.sched_getaffinity(0))
+    os.sched_setaffinity(0, {core})
+    return f"pinned to core {core}"
+
+
+def cpu_name() -> str:
+    """Return the processor's name as the system gives it."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+    except OSError:
+        return platform.processor() or platform.machine()
+    names = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
+    return names[0] if names else platform.machine()
+
+
+def versions(*packages: str) -> dict[str, str]:
+    """Return the versions of Python, of ``PACKAGES`` and of further ones; "not installed" if missing."""
+    found = {"python": platform.python_version()}
+    for package in (*PACKAGES, *packages):
+        try:
+            found[package] = version(package)
+        except PackageNotFoundError:
+            found[package] = "not installed"
+    return found
+
+
+def commit_of_checkout() -> str:
+    """Return the checkout's commit, with ``-dirty`` if tracked files have changed since."""
+    command = ["git", "describe", "--always", "--exclude=*", "--dirty"]
+    try:
+        return subprocess.run(command, cwd=ROOT, check=True, capture_output=True, text=True).stdout.strip()
+    except (OSError, subprocess.CalledProcessError):  # a copy without git
+        return "unknown"
+
+
+def provenance(*packages: str) -> dict[str, Any]:
+    """Return what every record names: commit, date, machine and versions, as JSON values.
+
+    packages: whose versions matter besides those of ``PACKAGES``.
+    """
+    return {
+        "commit": commit_of_checkout(),
+        "date": str(date.today()),
+        "machine": f"{cpu_name()}, {len(os.sched_getaffinity(0))} cores",
+        "versions": versions(*packages),
+    }
+
+
+def provenance_line(record: dict[str, Any]) -> str:
+    """Return a record's provenance as the last line of a page."""
+    packages = ", ".join(f"{name} {number}" for name, number in record["versions"].items())
+    return f"Measured at commit {record['commit']} on {record['date']}; {record['machine']}; {packages}."
+
+
+def table(header: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
+    """Return a table in Markdown, without a newline at its end."""
+    lines = [header, ["---"] * len(header), *rows]
+    return "\n".join(f"| {' | '.join(map(str, line))} |" for line in lines)
+
+
+def percent(flags: Sequence[bool | int]) -> str:
+    """Return the share of true values with their number, as in "97.5 % of 200"; "none" of no values."""
+    return f"{100.0 * sum(flags) / len(flags):.1f} % of {len(flags)}" if len(flags) else "none"
+
+
+def spread(values: Sequence[float], digits: str = ",.0f") -> str:
+    """Return the lowest and the highest value as text."""
+    return f"{min(values):{digits}} to {max(values):{digits}}"
+
+
+def page(title: str, *parts: str) -> str:
+    """Return a page in Markdown: its title and its parts, a blank line between them."""
+    return "\n\n".join([f"# {title}", *(part.strip("\n") for part in parts)]) + "\n"
+
+
+def write_page(path: Path | None, text: str) -> None:
+    """Print a page and write it atomically; path: None to print only."""
+    print(text, end="", flush=True)
+    if path is not None:
+        _write(path, text)
+
+
+def write_json(path: Path, value: Any) -> None:
+    """Write JSON values atomically, indented."""
+    _write(path, json.dumps(value, indent=1) + "\n")
+
+
+def _write(path: Path, text: str) -> None:
+    from flytrack_env.files import write_atomically  # not at the top: it imports JAX
+
+    write_atomically(path, text.encode())
