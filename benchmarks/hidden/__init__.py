@@ -1,7 +1,7 @@
-"""Plants with hidden effects, in equations that share nothing with the package: what a diagnosis has to name.
+"""Plants with hidden effects, for grading the diagnosis, in equations that share nothing with the package.
 
 ``draw_base``, ``draw_effect``, ``draw_truth``, ``draw_outside``, ``draw_gust`` and ``draw_change`` draw a
-``Truth``; ``fly`` flies it, ``measure`` makes a log as sensors would have written it.
+``Truth``; ``fly`` flies it; ``measure`` turns the clean log into what sensors would have logged.
 """
 
 from benchmarks.hidden.draws import (
@@ -16,10 +16,10 @@ from benchmarks.hidden.draws import (
     with_effects,
 )
 from benchmarks.hidden.flights import CrashError, fly
-from benchmarks.hidden.kinds import FLIGHT_KINDS
 from benchmarks.hidden.noise import NOISE_KINDS, measure
 from benchmarks.hidden.outside import KINDS as OUTSIDE_KINDS
-from benchmarks.hidden.outside_draws import draw_outside
+from benchmarks.hidden.outside import draw_outside
+from benchmarks.hidden.plans import FLIGHT_KINDS
 from benchmarks.hidden.truth import Gust, Outside, Truth
 from benchmarks.hidden.visibility import signal_to_noise
 

@@ -1,8 +1,7 @@
 """Random truths: the list of hidden effects, how large they are drawn, and the plants that have them.
 
-A **size** is what an effect is drawn by: log-uniform between what a flight of a minute barely shows under
-the noise of ``benchmarks.hidden.noise`` and what nobody overlooks; ``python -m benchmarks.hidden`` says how
-plainly. ``EFFECTS`` says what a size is of.
+Each effect is drawn by its **size**, log-uniform between what a flight of a minute barely shows under the
+noise of ``benchmarks.hidden.noise`` and what cannot be missed. ``EFFECTS`` gives the unit of each size.
 """
 
 import math
@@ -18,12 +17,12 @@ Values = dict[str, float]
 Rng = np.random.Generator
 
 
-# Of what a size does not say: shares of it on other axes and of drag along y, m, 1.
+# What the size leaves open: shares of it on other axes and of drag along y; m; damping.
 OTHER_AXES, SIDEWAYS, GROUND_M, ZETA = (0.5, 1.0), (0.7, 1.4), (0.2, 0.5), (0.4, 0.9)
 
 
-class Drawn(NamedTuple):
-    """How an effect is drawn: smallest and largest size, unit, and its parameters at a size."""
+class EffectRange(NamedTuple):
+    """How an effect is drawn: smallest and largest size, their unit, and its parameters at a size."""
 
     low: float
     high: float
@@ -44,7 +43,7 @@ def _positive(name: str) -> Callable[[float, Rng], Values]:
 
 
 def _direction(*names: str) -> Callable[[float, Rng], Values]:
-    """Return a maker of a vector of that length in a random direction."""
+    """Return a maker of vectors in a random direction, of the size's length."""
 
     def make(size: float, rng: Rng) -> Values:
         way = rng.standard_normal(len(names))
@@ -54,7 +53,7 @@ def _direction(*names: str) -> Callable[[float, Rng], Values]:
 
 
 def _factors(*names: str) -> Callable[[float, Rng], Values]:
-    """Return a maker of factors e^(+-size) on some axes, by half of it or more on the others."""
+    """Return a maker of factors e^(+-size) on one axis, of half the size or more on the others."""
 
     def make(size: float, rng: Rng) -> Values:
         shares = rng.uniform(*OTHER_AXES, len(names))
@@ -86,38 +85,38 @@ def _oscillator(size: float, rng: Rng) -> Values:
     return {"wn": 1.0 / size, "zeta": float(rng.uniform(*ZETA))}
 
 
-# What a size is: see the unit, and the maker. Parameters and signs as in the package where laws agree.
-EFFECTS: dict[str, Drawn] = {
-    "command_delay": Drawn(0.0006, 0.02, "s", _positive("delay_s")),
-    "thrust_lag_asymmetry": Drawn(0.25, 1.2, "|ln ratio|", _log_factor("ratio")),
-    "rate_expo": Drawn(0.006, 0.15, "1", _signed("expo")),
-    "rate_scale": Drawn(0.005, 0.1, "|ln factor|", _factors("roll", "pitch", "yaw")),
-    "rate_saturation": Drawn(0.008, 0.2, "share lost at full stick", _positive("lost")),
-    "rate_cross_coupling": Drawn(0.005, 0.08, "1", _direction("from_roll", "from_pitch")),
-    "motor_imbalance": Drawn(0.0006, 0.01, "rad/s per m/s^2", _direction("roll", "pitch")),
-    "yaw_reaction": Drawn(0.003, 0.05, "rad", _signed("angle")),
-    "second_order_rates": Drawn(0.002, 0.025, "s, 1 / wn", _oscillator),
-    "rate_slew_limit": Drawn(0.0025, 0.03, "s^2/rad", _positive("inverse")),
-    "wind": Drawn(0.12, 1.5, "m/s^2; with drag 6 times that in m/s", _direction("a_x", "a_y", "a_z")),
-    "thrust_scale": Drawn(0.01, 0.2, "|ln factor|", _log_factor("factor")),
-    "translational_lift": Drawn(0.03, 0.4, "share of thrust", _positive("gain")),
-    "ground_effect": Drawn(0.06, 0.5, "share of thrust", _ground),
-    "linear_drag": Drawn(0.03, 0.6, "1/s", _drag("d", (0.2, 1.0))),
-    "quadratic_drag": Drawn(0.003, 0.05, "1/m", _drag("k", (0.5, 2.0))),
-    "rotor_drag": Drawn(0.003, 0.05, "s/m", _positive("h")),
-    "thrust_tilt": Drawn(0.008, 0.12, "rad", _direction("towards_x", "towards_y")),
-    "voltage_sag": Drawn(0.01, 1.0, "V at full thrust", _positive("at_full_v")),
-    "accelerometer_bias": Drawn(0.12, 1.5, "m/s^2", _direction("x", "y", "z")),
-    "accelerometer_scale": Drawn(0.008, 0.12, "|ln factor|", _factors("x", "y", "z")),
-    "gyro_bias": Drawn(0.006, 0.1, "rad/s", _direction("x", "y", "z")),
-    "gyro_scale": Drawn(0.005, 0.1, "|ln factor|", _factors("x", "y", "z")),
-    "imu_offset": Drawn(0.005, 0.06, "m", _direction("x", "y", "z")),
-    "imu_latency": Drawn(0.0006, 0.015, "s", _positive("latency_s")),
+# Parameters and signs are the package's where the laws agree.
+EFFECTS: dict[str, EffectRange] = {
+    "command_delay": EffectRange(0.0006, 0.02, "s", _positive("delay_s")),
+    "thrust_lag_asymmetry": EffectRange(0.25, 1.2, "|ln ratio|", _log_factor("ratio")),
+    "rate_expo": EffectRange(0.006, 0.15, "1", _signed("expo")),
+    "rate_scale": EffectRange(0.005, 0.1, "|ln factor|", _factors("roll", "pitch", "yaw")),
+    "rate_saturation": EffectRange(0.008, 0.2, "share lost at full stick", _positive("lost")),
+    "rate_cross_coupling": EffectRange(0.005, 0.08, "1", _direction("from_roll", "from_pitch")),
+    "motor_imbalance": EffectRange(0.0006, 0.01, "rad/s per m/s^2", _direction("roll", "pitch")),
+    "yaw_reaction": EffectRange(0.003, 0.05, "rad", _signed("angle")),
+    "second_order_rates": EffectRange(0.002, 0.025, "s, 1 / wn", _oscillator),
+    "rate_slew_limit": EffectRange(0.0025, 0.03, "s^2/rad", _positive("inverse")),
+    "wind": EffectRange(0.12, 1.5, "m/s^2; with drag 6 times that in m/s", _direction("a_x", "a_y", "a_z")),
+    "thrust_scale": EffectRange(0.01, 0.2, "|ln factor|", _log_factor("factor")),
+    "translational_lift": EffectRange(0.03, 0.4, "share of thrust", _positive("gain")),
+    "ground_effect": EffectRange(0.06, 0.5, "share of thrust", _ground),
+    "linear_drag": EffectRange(0.03, 0.6, "1/s", _drag("d", (0.2, 1.0))),
+    "quadratic_drag": EffectRange(0.003, 0.05, "1/m", _drag("k", (0.5, 2.0))),
+    "rotor_drag": EffectRange(0.003, 0.05, "s/m", _positive("h")),
+    "thrust_tilt": EffectRange(0.008, 0.12, "rad", _direction("towards_x", "towards_y")),
+    "voltage_sag": EffectRange(0.01, 1.0, "V at full thrust", _positive("at_full_v")),
+    "accelerometer_bias": EffectRange(0.12, 1.5, "m/s^2", _direction("x", "y", "z")),
+    "accelerometer_scale": EffectRange(0.008, 0.12, "|ln factor|", _factors("x", "y", "z")),
+    "gyro_bias": EffectRange(0.006, 0.1, "rad/s", _direction("x", "y", "z")),
+    "gyro_scale": EffectRange(0.005, 0.1, "|ln factor|", _factors("x", "y", "z")),
+    "imu_offset": EffectRange(0.005, 0.06, "m", _direction("x", "y", "z")),
+    "imu_latency": EffectRange(0.0006, 0.015, "s", _positive("latency_s")),
 }
 NAMES = tuple(EFFECTS)
 DRAGS = ("linear_drag", "quadratic_drag", "rotor_drag")
 AIR_PER_PUSH = 6.0  # m/s of wind per m/s^2 of its size, where there is drag
-# Base parameters: each log-uniform or uniform. Thrust is put together at REFERENCE_V.
+# Base parameters, log-uniform or uniform. The thrust curve is given at REFERENCE_V.
 TAU_S = (0.015, 0.07)
 FULL_THRUST_N, IDLE_THRUST_N, REFERENCE_V = (28.0, 45.0), (0.3, 1.0), 23.0
 CURVED, CUBIC = (0.3, 0.75), (-0.03, 0.03)  # shares of the thrust between idle and full
@@ -131,7 +130,7 @@ def _log_uniform(low: float, high: float, rng: Rng) -> float:
 
 
 def draw_base(rng: Rng) -> Truth:
-    """Return a plant without effects: lags of 15 to 70 ms, a thrust curve of its own, else the handout's."""
+    """Return a plant without effects: lags of 15 to 70 ms, a drawn thrust curve, else the handout."""
     tau = tuple(_log_uniform(*TAU_S, rng) for _ in range(4))
     full, idle = rng.uniform(*FULL_THRUST_N), rng.uniform(*IDLE_THRUST_N)
     curved, cubic = rng.uniform(*CURVED), rng.uniform(*CUBIC)
@@ -152,9 +151,9 @@ def draw_base(rng: Rng) -> Truth:
 
 
 def draw_effect(name: str, rng: Rng, size: float | None = None, has_drag: bool = False) -> Values:
-    """Return parameters of an effect in a random direction, by a size that is drawn if not given.
+    """Return an effect's parameters, in a random direction; the size is drawn if not given.
 
-    has_drag: of the rest of the plant; wind is then moving air, else a steady push.
+    has_drag: whether the plant has drag: wind is then moving air, else a steady push.
 
     Raises:
         KeyError: if there is no such effect.
@@ -168,14 +167,14 @@ def draw_effect(name: str, rng: Rng, size: float | None = None, has_drag: bool =
 
 
 def with_effects(truth: Truth, names: tuple[str, ...], rng: Rng) -> Truth:
-    """Return a plant that has these effects too, drawn in this order."""
+    """Return the plant with these effects added, drawn in this order."""
     has_drag = any(name in DRAGS for name in (*names, *truth.effects))
     effects = {name: draw_effect(name, rng, has_drag=has_drag) for name in names}
     return replace(truth, effects={**truth.effects, **effects})
 
 
 def draw_truth(rng: Rng, num_effects: int) -> Truth:
-    """Return a plant with so many different effects of the list."""
+    """Return a plant with this many different effects."""
     names = rng.choice(NAMES, size=num_effects, replace=False)
     return with_effects(draw_base(rng), tuple(str(name) for name in names), rng)
 
@@ -186,8 +185,8 @@ def draw_gust(rng: Rng) -> Gust:
     return Gust(_log_uniform(*GUST_STD, rng), _log_uniform(*GUST_S, rng), rate_std)
 
 
-class Changed(NamedTuple):
-    """How a base parameter is changed: smallest and largest size, and the plant after it."""
+class BaseChange(NamedTuple):
+    """How a base parameter is changed: smallest and largest size, and a function to the changed plant."""
 
     low: float
     high: float
@@ -200,7 +199,7 @@ def _scaled(values: tuple[float, ...], size: float, rng: Rng) -> tuple[float, ..
 
 
 def _other_curve(truth: Truth, size: float, rng: Rng) -> Truth:
-    """Return a plant of another thrust curve: offset, slope and bend change, by size times half its span."""
+    """Return a plant whose thrust curve has another offset, slope and bend, by size times half its span."""
     half_span = 0.5 * (truth.thrust(1.0, REFERENCE_V) - truth.thrust(-1.0, REFERENCE_V))
     way = rng.standard_normal(3)
     moved = size * half_span * way / np.linalg.norm(way)
@@ -208,26 +207,26 @@ def _other_curve(truth: Truth, size: float, rng: Rng) -> Truth:
     return replace(truth, coeffs=tuple(old + change for old, change in pairs))
 
 
-# Sizes are of |ln factor|, of all values of the parameter; of the thrust curve, a share of half its span.
-CHANGES: dict[str, Changed] = {
-    "tau": Changed(0.05, 0.6, lambda truth, size, rng: replace(truth, tau=_scaled(truth.tau, size, rng))),
-    "coeffs": Changed(0.005, 0.08, _other_curve),
-    "max_rate": Changed(
+# Sizes are |ln factor| of all values of the parameter; of the thrust curve, a share of half its span.
+CHANGES: dict[str, BaseChange] = {
+    "tau": BaseChange(0.05, 0.6, lambda truth, size, rng: replace(truth, tau=_scaled(truth.tau, size, rng))),
+    "coeffs": BaseChange(0.005, 0.08, _other_curve),
+    "max_rate": BaseChange(
         0.005, 0.15, lambda truth, size, rng: replace(truth, max_rate=_scaled(truth.max_rate, size, rng))
     ),
-    "drain": Changed(
+    "drain": BaseChange(
         0.05, 0.6, lambda truth, size, rng: replace(truth, drain=_scaled((truth.drain,), size, rng)[0])
     ),
-    "mass": Changed(
+    "mass": BaseChange(
         0.01, 0.2, lambda truth, size, rng: replace(truth, mass=_scaled((truth.mass,), size, rng)[0])
     ),
 }
 
 
 def draw_change(truth: Truth, name: str, rng: Rng, size: float | None = None) -> Truth:
-    """Return a plant of which one base parameter is another: of ``CHANGES``.
+    """Return the plant with one base parameter of ``CHANGES`` changed.
 
-    size: as said there; drawn if not given.
+    size: in the unit given there; drawn if not given.
 
     Raises:
         KeyError: if there is no such change.

@@ -1,7 +1,7 @@
-"""Sensors' noise: what a log shows of a flight when it is measured.
+"""Sensor noise: how a flight is logged.
 
-All kinds have the same standard deviations, quantise, and lose rows; they differ in how errors are
-distributed ("heavy": Student's t of 3 degrees of freedom) and in whether they last ("coloured": AR(1)).
+All kinds have the same standard deviations, quantise, and lose rows; they differ in the distribution of
+errors ("heavy": Student's t with 3 degrees of freedom) and in their correlation ("coloured": AR(1)).
 """
 
 from collections.abc import Callable
@@ -26,7 +26,7 @@ STD = {
     "w": GYRO_STD,
     "v_bat": 0.0,
 }
-# What the last digit of a logged number is: m, m/s, m/s^2, 1, rad/s, V; 16 bits over 32 g and 4000 deg/s.
+# Resolution of a logged number: m, m/s, m/s^2, 1, rad/s, V; 16 bits over 32 g and 4000 deg/s.
 DIGIT = {
     "p": 1e-3,
     "v": 1e-3,
@@ -52,12 +52,12 @@ def _heavy(shape: tuple[int, int], rng: np.random.Generator) -> np.ndarray:
 
 
 def _coloured(shape: tuple[int, int], rng: np.random.Generator) -> np.ndarray:
-    """Return AR(1) noise that has gone on for ever, each column with a coefficient of its own."""
+    """Return stationary AR(1) noise, each column with its own coefficient."""
     columns = []
     for fresh in rng.standard_normal(shape).T:
         keep = rng.uniform(*COLOURS)
         gain = np.sqrt(1.0 - keep**2)
-        # The filter's memory before the first row makes that of standard deviation 1 too.
+        # The filter starts in its stationary distribution.
         column, _ = signal.lfilter([gain], [1.0, -keep], fresh, zi=[keep * rng.standard_normal()])
         columns.append(column)
     return np.stack(columns, axis=1)
@@ -68,9 +68,9 @@ NOISE_KINDS = (*NOISES, "none")
 
 
 def measure(log: FlightLog, noise: str, rng: np.random.Generator) -> FlightLog:
-    """Return a flight as sensors log it: noisy, quantised, with rows lost; without acceleration.
+    """Return a flight as sensors log it: noisy, quantised, with rows lost, without acceleration.
 
-    noise: of ``NOISE_KINDS``; "none" only leaves out the acceleration, which no sensor tells.
+    noise: of ``NOISE_KINDS``; "none" only drops the acceleration, which no sensor measures.
 
     Raises:
         ValueError: if there is no such noise.

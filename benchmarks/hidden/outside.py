@@ -1,4 +1,4 @@
-"""Effects that no list has: each a smooth function of something, with a random shape.
+"""Effects outside the package's list, and their random draws: each a smooth function of one quantity.
 
 =============  ==================================================  =======================================
 kind           what it is                                          how it acts, at most
@@ -24,7 +24,7 @@ import numpy as np
 
 from benchmarks.hidden.noise import ACCELEROMETER_STD, GYRO_STD
 from benchmarks.hidden.truth import DT_S, Outside, Truth
-from benchmarks.hidden.vectors import Vector, norm, scaled, to_body
+from benchmarks.hidden.vectors import Vector, norm, scale, to_body
 
 DEPENDS_ON = {
     "position": ("position",),
@@ -37,17 +37,31 @@ DEPENDS_ON = {
     "stochastic": ("chance",),
 }
 KINDS = tuple(DEPENDS_ON)
-# What an amplitude of 1 is: m/s^2 of forces and thrust over mass, rad/s of rates.
+# An amplitude of 1: m/s^2 of forces and of thrust over mass, rad/s of rates.
 SCALES = {"force": ACCELEROMETER_STD, "thrust": ACCELEROMETER_STD, "rate": GYRO_STD}
 SMALLEST, LARGEST = 0.3, 3.0  # amplitudes that are drawn
 HEADING_ORDERS = (2, 3)
-CIRCLE = np.linspace(-np.pi, np.pi, 3601)  # rad, headings at which the largest is looked for
+CIRCLE = np.linspace(-np.pi, np.pi, 3601)  # rad, headings at which the maximum is searched
 REFERENCE_V = 23.0  # at which the slope of the thrust turns a force into a share of the stick
 TINY_SPEED = 1e-6  # m/s, keeps 0 / 0 away
+Rng = np.random.Generator
+Shape = dict[str, float]
+ChannelAndShape = tuple[str, Shape]
+AXES = ("x", "y", "z")
+STICK_AXES = 4
+YAW = {"x": 0.0, "y": 0.0, "z": 1.0}
+UP = {"x": 0.0, "y": 0.0, "z": 1.0}
+# Ranges of shape parameters.
+MOST_LEAN, WAVE = math.radians(40.0), (0.3, 1.0)  # rad; shares of waves in the heading
+RADIUS_M, MIDDLE_SHARE = (4.0, 12.0), (0.25, 0.75)
+STEP_WIDTH_SHARE, HUMP_WIDTH_SHARE = (0.005, 0.05), (0.05, 0.15)
+SPEED_MS, SPEED_WIDTH_MS = (4.0, 11.0), (0.7, 1.5)
+TILT_DEG, TILT_WIDTH_DEG = (12.0, 40.0), (4.0, 10.0)
+STICK, FREQUENCY_HZ, GUST_S = (-0.5, 0.5), (0.5, 20.0), (0.05, 0.5)
 
 
 class FirstOrderNoise:
-    """Independent random processes of standard deviation 1 that forget with a time constant, s."""
+    """Independent first-order random processes of standard deviation 1 with a time constant, s."""
 
     def __init__(self, time_constant_s: float, rng: np.random.Generator, count: int = 3):
         self._keep = math.exp(-DT_S / time_constant_s)
@@ -84,7 +98,7 @@ def _time(shape: Any, plant: Any) -> float:
 
 
 def heading_waves(shape: Any, heading: Any) -> Any:
-    """Return waves of the orders 2 and 3 in the heading, rad, a number or many."""
+    """Return the sum of waves of orders 2 and 3 in the heading, rad; a float or an array."""
     cosine = math.cos if isinstance(heading, float) else np.cos
     orders = HEADING_ORDERS
     return sum(shape[f"size_{n}"] * cosine(n * heading + shape[f"phase_{n}"]) for n in orders)
@@ -118,29 +132,29 @@ SIGNALS: dict[str, Callable[[Any, Any], float]] = {
 
 
 def vector_hook(outside: Outside, rng: np.random.Generator) -> Callable[[Any], Vector]:
-    """Return a function of the plant: force in the body, m/s^2, or body rates, rad/s, to be added."""
+    """Return a hook that adds a force, body, m/s^2, or body rates, rad/s."""
     size, shape = outside.amplitude * SCALES[outside.channel], outside.shape
     if outside.kind == "stochastic":
         process = FirstOrderNoise(shape["time_constant_s"], rng)
         if outside.channel == "rate":
-            return lambda plant: scaled(size, process.step())
-        return lambda plant: to_body(plant.rows, scaled(size, process.step()))
+            return lambda plant: scale(size, process.step())
+        return lambda plant: to_body(plant.rows, scale(size, process.step()))
     signal = SIGNALS[outside.kind]
     if outside.kind == "airspeed":
 
         def against(plant: Any) -> Vector:
             speed = max(norm(plant.airspeed_b), TINY_SPEED)
-            return scaled(-size * signal(shape, plant) / speed, plant.airspeed_b)
+            return scale(-size * signal(shape, plant) / speed, plant.airspeed_b)
 
         return against
     direction = _direction(shape)
     if outside.kind == "position":
-        return lambda plant: to_body(plant.rows, scaled(size * signal(shape, plant), direction))
-    return lambda plant: scaled(size * signal(shape, plant), direction)
+        return lambda plant: to_body(plant.rows, scale(size * signal(shape, plant), direction))
+    return lambda plant: scale(size * signal(shape, plant), direction)
 
 
 def command_hook(outside: Outside, truth: Truth) -> Callable[[Any, tuple], tuple]:
-    """Return a function of the plant and its command that flattens or delays one stick."""
+    """Return a hook on commands: a dead zone or backlash of one stick."""
     axis = int(outside.shape["axis"])
     size = outside.amplitude * SCALES[outside.channel]
     if outside.channel == "thrust":
@@ -159,3 +173,96 @@ def command_hook(outside: Outside, truth: Truth) -> Callable[[Any, tuple], tuple
         return (*command[:axis], stick, *command[axis + 1 :])
 
     return act
+
+
+def _random_direction(rng: Rng, size: int = 3) -> Shape:
+    """Return a random direction, in x and y only if size is 2."""
+    way = np.zeros(3)
+    way[:size] = rng.standard_normal(size)
+    return dict(zip(AXES, (way / np.linalg.norm(way)).tolist(), strict=True))
+
+
+def _draw_position(rng: Rng) -> ChannelAndShape:
+    # Mostly up or down, as thermals go.
+    up = float(rng.choice([-1.0, 1.0]))
+    side, lean = rng.uniform(-math.pi, math.pi), rng.uniform(0.0, MOST_LEAN)
+    way = (math.sin(lean) * math.cos(side), math.sin(lean) * math.sin(side), up * math.cos(lean))
+    shape = dict(zip(AXES, way, strict=True))
+    return "force", {
+        **shape,
+        "radius_m": rng.uniform(*RADIUS_M),
+        "at_share": rng.uniform(*MIDDLE_SHARE),
+    }
+
+
+def _draw_time(rng: Rng) -> ChannelAndShape:
+    is_step, is_thrust = rng.random() < 0.5, rng.random() < 0.5
+    width = rng.uniform(*(STEP_WIDTH_SHARE if is_step else HUMP_WIDTH_SHARE))
+    shape = {"is_step": float(is_step), "middle_share": rng.uniform(*MIDDLE_SHARE), "width_share": width}
+    sign = float(rng.choice([-1.0, 1.0]))
+    if is_thrust:
+        return "thrust", {**shape, "x": 0.0, "y": 0.0, "z": sign}
+    return "rate", {**shape, **_random_direction(rng)}
+
+
+def _draw_heading(rng: Rng) -> ChannelAndShape:
+    shape = {f"size_{order}": rng.uniform(*WAVE) for order in HEADING_ORDERS}
+    shape |= {f"phase_{order}": rng.uniform(-math.pi, math.pi) for order in HEADING_ORDERS}
+    shape["largest"] = float(np.abs(heading_waves(shape, CIRCLE)).max())
+    return (
+        ("force", {**shape, **_random_direction(rng, 2)})
+        if rng.random() < 0.5
+        else ("rate", {**shape, **YAW})
+    )
+
+
+def _draw_airspeed(rng: Rng) -> ChannelAndShape:
+    return "force", {"speed_ms": rng.uniform(*SPEED_MS), "width_ms": rng.uniform(*SPEED_WIDTH_MS)}
+
+
+def _draw_attitude(rng: Rng) -> ChannelAndShape:
+    shape = {"tilt_deg": rng.uniform(*TILT_DEG), "width_deg": rng.uniform(*TILT_WIDTH_DEG)}
+    return "thrust", {**shape, **{axis: -part for axis, part in UP.items()}}
+
+
+def _draw_command(rng: Rng) -> ChannelAndShape:
+    axis = int(rng.integers(STICK_AXES))
+    shape = {"axis": axis, "stick": rng.uniform(*STICK), "is_backlash": float(rng.random() < 0.5)}
+    return "thrust" if axis == STICK_AXES - 1 else "rate", shape
+
+
+def _draw_periodic(rng: Rng) -> ChannelAndShape:
+    low, high = (math.log(value) for value in FREQUENCY_HZ)
+    shape = {"frequency_hz": math.exp(rng.uniform(low, high)), "phase": rng.uniform(-math.pi, math.pi)}
+    return ("force" if rng.random() < 0.5 else "rate"), {**shape, **_random_direction(rng)}
+
+
+def _draw_stochastic(rng: Rng) -> ChannelAndShape:
+    return ("force" if rng.random() < 0.5 else "rate"), {"time_constant_s": rng.uniform(*GUST_S)}
+
+
+SHAPES: dict[str, Callable[[Rng], ChannelAndShape]] = {
+    "position": _draw_position,
+    "time": _draw_time,
+    "heading": _draw_heading,
+    "airspeed": _draw_airspeed,
+    "attitude": _draw_attitude,
+    "command": _draw_command,
+    "periodic": _draw_periodic,
+    "stochastic": _draw_stochastic,
+}
+
+
+def draw_outside(rng: Rng, kind: str | None = None, amplitude: float | None = None) -> Outside:
+    """Return an effect outside the list; kind and amplitude are drawn if not given, the latter log-uniform.
+
+    amplitude: as a multiple of the sensor noise in its channel.
+
+    Raises:
+        KeyError: if there is no such kind.
+    """
+    kind = str(rng.choice(KINDS)) if kind is None else kind
+    if amplitude is None:
+        amplitude = math.exp(rng.uniform(math.log(SMALLEST), math.log(LARGEST)))
+    channel, shape = SHAPES[kind](rng)
+    return Outside(kind, DEPENDS_ON[kind], channel, float(amplitude), shape)

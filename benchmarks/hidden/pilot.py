@@ -1,7 +1,7 @@
-"""A pilot who has got used to the drone: a cascade from position to sticks, on the true state.
+"""A pilot who knows the drone: cascaded control from position to sticks, on the true state.
 
-The gains follow the plant's own lags, so that a slow drone is flown gently and no hidden effect makes it
-swing. The pilot knows the thrust curve without effects, and learns steady errors of force in flight.
+The gains follow the plant's own lags, so that slow drones are flown gently and no hidden effect makes the
+loop oscillate. The pilot knows the thrust curve without effects and integrates steady force errors in flight.
 """
 
 import math
@@ -11,30 +11,30 @@ import numpy as np
 from benchmarks.hidden.outside import FirstOrderNoise
 from benchmarks.hidden.plans import Moment
 from benchmarks.hidden.truth import DT_S, Truth
-from benchmarks.hidden.vectors import Vector, norm, rotation, to_body, within, wrapped
+from benchmarks.hidden.vectors import Vector, clip_length, norm, rotation, to_body, wrap_angle
 
-# Gains as shares of what comes before them, so that no loop chases the one inside it.
+# Each gain is a share of the inner loop's, so that no loop is faster than the one inside it.
 ATTITUDE_PER_LAG, VELOCITY_PER_ATTITUDE, POSITION_PER_VELOCITY, LEARN_PER_VELOCITY = 0.4, 0.3, 0.35, 0.3
 QUICKEST_ATTITUDE, QUICKEST_HEIGHT = 12.0, 5.0  # 1/s
 YAW_GAIN, MOST_YAW_RATE = 2.5, 1.6  # 1/s, rad/s
-MOST_TILTED = math.radians(65.0)  # of the thrust that is asked for
+MOST_TILTED = math.radians(65.0)  # of the commanded thrust
 MOST_UP, MOST_DOWN = 14.0, 6.0  # m/s^2
-MOST_LESSON = 2.0  # m/s, error of speed beyond which nothing more is learnt
+MOST_LESSON = 2.0  # m/s, limit of the speed error in the integrator
 MOST_SPEED, MOST_CORRECTION, MOST_LEARNT = 18.0, 4.0, 5.0  # m/s, m/s, m/s^2
-UPRIGHT = 0.3  # cosine of the tilt beyond which a heading means nothing
+UPRIGHT = 0.3  # cosine of the tilt beyond which the heading is undefined
 TINY, LEAST_SLOPE, CUBE_POWER = 1e-9, 1.0, 3.0  # m/s^2; N per stick; of the thrust curve's last term
-TREMBLE, TREMBLE_S = 0.01, 0.1  # of all sticks that the hands hold still, and s
+TREMBLE, TREMBLE_S = 0.01, 0.1  # of sticks that are held still, and its time constant, s
 USUAL_TURN = 3.0  # rad/s, change of rates that a slew limit stretches
-NEWTON_STEPS = 4  # from the stick before, which is close
-FIRST_STICK = -0.2  # before there is one
-# Manoeuvres on one stick are cut off below a height that leaves room to brake, and above a speed.
+NEWTON_STEPS = 4  # from the previous stick, which is close
+FIRST_STICK = -0.2
+# Manoeuvres on one stick are cut off where there is no room left to brake, and above a speed.
 BRAKING, ROOM_M, FASTEST = 5.0, 4.0, 15.0  # m/s^2, m, m/s
-# The flown height looks ahead, and near the ground the climb that it asks for is never less than this.
+# Near the ground the predicted height commands at least this climb.
 LOOK_AHEAD_S, FLOOR_M, FLOOR_GAIN = 0.25, 0.14, 12.0
 
 
 class Pilot:
-    """Gives commands for moments of a plan."""
+    """Computes stick commands for the moments of a plan."""
 
     def __init__(self, truth: Truth, rng: np.random.Generator):
         self._truth = truth
@@ -54,7 +54,7 @@ class Pilot:
         self._stick, self._is_cut_off = FIRST_STICK, False
 
     def command(self, plant, moment: Moment) -> tuple[float, float, float, float]:
-        """Return the sticks for the plant's state at a moment of the plan, in [-1, 1]."""
+        """Return sticks in [-1, 1] for the plant's state at a moment of the plan."""
         has_stick = moment.sticks is not None
         self._is_cut_off = has_stick and (self._is_cut_off or self._is_unsafe(plant))
         is_free = not has_stick or self._is_cut_off
@@ -77,28 +77,28 @@ class Pilot:
         return low or norm(plant.vel_w) > FASTEST
 
     def _force(self, plant, moment: Moment, is_free: bool) -> Vector:
-        """Return the specific force that is wanted, world, m/s^2."""
+        """Return the wanted specific force, world, m/s^2."""
         gains = (self._level, self._level, self._upright)
         away = tuple(
             POSITION_PER_VELOCITY * gain * (there - here)
             for gain, there, here in zip(gains, moment.pos_w, plant.pos_w, strict=True)
         )
-        wanted = tuple(a + b for a, b in zip(within(away, MOST_CORRECTION), moment.vel_w, strict=True))
-        error = tuple(a - b for a, b in zip(within(wanted, MOST_SPEED), plant.vel_w, strict=True))
+        wanted = tuple(a + b for a, b in zip(clip_length(away, MOST_CORRECTION), moment.vel_w, strict=True))
+        error = tuple(a - b for a, b in zip(clip_length(wanted, MOST_SPEED), plant.vel_w, strict=True))
         acc = [
             a + gain * e + k for a, gain, e, k in zip(moment.acc_w, gains, error, self._learnt_w, strict=True)
         ]
         if is_free:
             learn = tuple(
                 known + DT_S * LEARN_PER_VELOCITY * gain * gain * e
-                for known, gain, e in zip(self._learnt_w, gains, within(error, MOST_LESSON), strict=True)
+                for known, gain, e in zip(self._learnt_w, gains, clip_length(error, MOST_LESSON), strict=True)
             )
-            self._learnt_w = within(learn, MOST_LEARNT)
+            self._learnt_w = clip_length(learn, MOST_LEARNT)
         ahead = plant.pos_w[2] + LOOK_AHEAD_S * plant.vel_w[2]
         if ahead < FLOOR_M:
             acc[2] += FLOOR_GAIN * self._upright * (FLOOR_M - ahead)
         up = self._truth.gravity + max(-MOST_DOWN, min(MOST_UP, acc[2]))
-        side = within((acc[0], acc[1], 0.0), up * math.tan(MOST_TILTED))
+        side = clip_length((acc[0], acc[1], 0.0), up * math.tan(MOST_TILTED))
         return (side[0], side[1], up)
 
     def _sticks(self, plant, force_w: Vector, heading: float) -> tuple[float, float, float, float]:
@@ -109,14 +109,14 @@ class Pilot:
         angle = self._attitude * math.atan2(across, z) / max(across, TINY)
         yaw = 0.0
         if rows[2][2] > UPRIGHT:
-            error = wrapped(heading - math.atan2(rows[1][0], rows[0][0]))
+            error = wrap_angle(heading - math.atan2(rows[1][0], rows[0][0]))
             yaw = max(-MOST_YAW_RATE, min(MOST_YAW_RATE, YAW_GAIN * error))
         rates = (-angle * y, angle * x, yaw)
         sticks = tuple(rate / full for rate, full in zip(rates, self._full_rates, strict=True))
         return (*sticks, self._thrust_stick(max(z, 0.0) * self._truth.mass, plant.battery_v))
 
     def _thrust_stick(self, thrust_n: float, battery_v: float) -> float:
-        """Return the stick of a thrust by the curve without effects, by Newton's method."""
+        """Return the stick for a thrust by the curve without effects, by Newton's method."""
         _, linear, square, cube, _, both = self._truth.coeffs
         stick = self._stick
         for _ in range(NEWTON_STEPS):

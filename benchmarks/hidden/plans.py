@@ -1,23 +1,65 @@
-"""Plans of flights: where a pilot wants to be at every moment, and which sticks are moved by hand.
+"""What a pilot is to fly: plans of flights, put together from legs and manoeuvres.
 
-A plan does not depend on the plant, so that it is known before the flight where it leads.
+A plan does not depend on the plant, so where it leads is known before the flight. Its kinds:
+
+==============  ===================================================================================
+kind            what is flown
+==============  ===================================================================================
+scripted        everything: legs of 0 to 18 m/s, low passes, waves on one stick, flips, thrust steps
+race            fast through waypoints, the nose ahead, no deliberate manoeuvres
+hover           one place, one heading, small corrections
+hover_headings  one place, several headings
+slow            legs of 0.5 to 3 m/s
+==============  ===================================================================================
 """
 
 import math
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
 
 from benchmarks.hidden.truth import DT_S
-from benchmarks.hidden.vectors import Vector, wrapped
+from benchmarks.hidden.vectors import Vector, wrap_angle
 
 Rng = np.random.Generator
 CLIMB, TURN_RATE = 5.0, math.radians(70.0)  # m/s, rad/s: what a plan asks for
 SMOOTH_S = 0.4  # over which a plan's velocity and heading are smoothed
+# Manoeuvres.
+# Amplitudes of rate sticks: in a minute, each axis gets one of each row. Beyond QUICK, pulses are short.
+AMPLITUDES, QUICK = ((0.1, 0.2), (0.35, 0.6), (1.0,)), 0.6
+PULSE_S, QUICK_PULSE_S = (0.15, 0.3), (0.08, 0.16)  # a full stick turns by 90 degrees in 0.15 s
+CHIRP_S, CHIRP_FROM_HZ, CHIRP_HZ_PER_S = 1.3, 1.2, (3.0, 8.0)
+RECOVER_S, AFTER_FLIP_S, AFTER_STEPS_S, AFTER_LOW_S = 1.0, 1.6, 0.8, 0.4
+JUMP_S, JUMP_STICK, FLIP_S, FLIP_STICK = 0.2, 0.6, (0.45, 0.62), (-0.6, -0.1)
+# Thrust steps: sticks and durations; the higher, the shorter, to end near the same speed.
+STEPS_UP, STEPS_DOWN, HELD_DOWN_S = (0.1, 1.0), (-1.0, -0.4), 0.3
+HELD_UP_S, SHORTER_S, UNEVEN = 0.45, 0.3, (0.8, 1.2)  # the middle one per unit of stick
+HOMEWARD_M, HOMEWARD_SPREAD = 30.0, 0.4  # from the origin, where legs lead back; rad
+SPEEDING_UP, MOST_NOSE_RATE = 7.0, 1.0  # m/s^2, rad/s
+HIGH_M = (16.0, 24.0)  # where manoeuvres on one stick are flown
+HIGH_SPEEDS, HIGH_HOLD_S, HIGH_TURNING = (2.0, 18.0), (0.4, 1.2), 0.5  # m/s, s, rad/s
+LOW_SPEEDS, LOW_HOLD_S, LOW_TURNING = (0.5, 12.0), (0.5, 1.2), 0.3
+LOW_M, SINK_M, SINK_S, SETTLE_S = (0.15, 1.0), 0.7, 0.8, 0.7  # the last metre is sunk slowly
+LOWER_M, SLOWER = 0.2, 0.9  # changes of low heights and of speeds per repeated attempt
+YAW_TURN = (1.2, math.pi)  # rad
+# Kinds of flights.
+HOVER_M, RACE_M, SLOW_M = (1.5, 8.0), (1.5, 5.0), (1.5, 6.0)  # heights
+CORRECTION_M, CORRECTION_S = 0.25, 0.8  # of small moves in a hover
+RACE_SPEEDS, SLOW_SPEEDS = (7.0, 16.0), (0.5, 3.0)  # m/s
+WAYPOINTS_M = 25.0  # their spread, horizontally
+MOST_SIDEWAYS = 13.0  # m/s^2, of a race's turns
+RACE_SPEEDING_UP, RACE_CLIMB = 6.0, 1.5  # m/s^2, m/s
+TURN_GAIN, SLOWEST_TURN = 3.0, 3.0  # 1/s; m/s, below which turns are no quicker
+NEAR_S, CHASE_S = 0.3, (3.0, 6.0)  # to a waypoint that counts as met; how long one is flown at
+BEGIN_S, STILL_S = 0.5, (2.0, 4.5)  # of hover before something begins, and between moves
+SLOW_HOLD_S, SLOW_TURNING = (2.0, 4.0), 0.3  # s, rad/s
+START_SPREAD_M = 5.0
+HIGHER_M = 1.5  # per repeated attempt, for kinds that are flown low throughout
 
 
 class Moment(NamedTuple):
-    """What is wanted at one time: world, m, m/s, m/s^2, rad; sticks by hand, None where the pilot's own."""
+    """The target at one time: m, m/s, m/s^2, rad, world; sticks moved by hand, None where the pilot flies."""
 
     pos_w: Vector
     vel_w: Vector
@@ -27,9 +69,9 @@ class Moment(NamedTuple):
 
 
 class Sketch:
-    """A plan in the making: velocities, headings and sticks, a row per 10 ms.
+    """A plan under construction: velocities, headings and sticks, a row per 10 ms.
 
-    caution: how often this has been flown too low or too fast already.
+    caution: number of earlier attempts that were too low or too fast.
     """
 
     def __init__(self, rng: Rng, start_w: Vector, heading: float, caution: int):
@@ -43,7 +85,7 @@ class Sketch:
         return len(self._velocities)
 
     def add(self, vel_w: Vector, heading: float | None = None, sticks: tuple | None = None) -> None:
-        """Append a moment; without a heading, the one before is kept."""
+        """Append a moment; the heading is kept if not given."""
         self.heading = self.heading if heading is None else heading
         self._velocities.append(vel_w)
         self._headings.append(self.heading)
@@ -56,8 +98,8 @@ class Sketch:
             self.add((0.0, 0.0, 0.0))
 
     def turn_to(self, heading: float) -> None:
-        """Append a hover in which the nose turns to a heading, the shorter way."""
-        way = wrapped(heading - self.heading)
+        """Append a hover that turns to a heading the shorter way."""
+        way = wrap_angle(heading - self.heading)
         first, steps = self.heading, max(1, steps_of(abs(way) / TURN_RATE))
         for step in range(steps):
             self.add((0.0, 0.0, 0.0), first + way * (step + 1) / steps)
@@ -70,13 +112,13 @@ class Sketch:
             self.add((0.0, 0.0, way / steps / DT_S))
 
     def hands_on(self, sticks: np.ndarray) -> None:
-        """Append moments in which sticks (num_rows, 4) are moved by hand; nan where the pilot's own."""
+        """Append moments with sticks (num_rows, 4) moved by hand; nan where the pilot flies."""
         for row in sticks.tolist():
             given = tuple(None if math.isnan(stick) else stick for stick in row)
             self.add((0.0, 0.0, 0.0), None, given)
 
     def moments(self, seconds: float) -> list[Moment]:
-        """Return the plan of this length, with smooth velocities and headings."""
+        """Return a plan of this length with smoothed velocities and headings."""
         count = steps_of(seconds)
         if len(self) < count:
             self.wait((count - len(self)) * DT_S)
@@ -98,5 +140,210 @@ class Sketch:
 
 
 def steps_of(seconds: float) -> int:
-    """Return how many steps of 10 ms a time is."""
+    """Return the number of steps of 10 ms in a time."""
     return round(seconds / DT_S)
+
+
+def leg(sketch: Sketch, speed: float, hold_s: float, turning: float) -> None:
+    """Append a leg: accelerate to a speed, hold it, brake; the direction turns, rad/s, and leads home.
+
+    The nose points anywhere and turns slowly.
+    """
+    rng = sketch.rng
+    x, y, _ = sketch.pos_w
+    way = rng.uniform(-math.pi, math.pi)
+    if math.hypot(x, y) > HOMEWARD_M:
+        way = math.atan2(-y, -x) + rng.normal(0.0, HOMEWARD_SPREAD)
+    sketch.turn_to(sketch.heading + rng.uniform(-1.0, 1.0) * math.pi * rng.integers(2))
+    nose = rng.uniform(-1.0, 1.0) * MOST_NOSE_RATE
+    ramp = max(1, steps_of(speed / SPEEDING_UP))
+    shares = np.concatenate([np.linspace(0, 1, ramp), np.ones(steps_of(hold_s)), np.linspace(1, 0, ramp)])
+    for share in shares.tolist():
+        way += turning * DT_S
+        vel_w = (share * speed * math.cos(way), share * speed * math.sin(way), 0.0)
+        sketch.add(vel_w, sketch.heading + nose * DT_S)
+
+
+def wave(axis: int, amplitude: float, rng: Rng) -> np.ndarray:
+    """Return a doublet, chirp or short pulse on one rate stick, the other two centred, (num_rows, 4)."""
+    name, sign = rng.choice(["doublet", "chirp", "pulses"]), rng.choice([-1.0, 1.0])
+    if name == "chirp":
+        time = np.arange(steps_of(CHIRP_S)) * DT_S
+        shape = np.cos(2.0 * np.pi * (CHIRP_FROM_HZ * time + 0.5 * rng.uniform(*CHIRP_HZ_PER_S) * time**2))
+    else:
+        steps = steps_of(rng.uniform(*(QUICK_PULSE_S if amplitude >= QUICK else PULSE_S)))
+        gap = 0 if name == "doublet" else steps
+        shape = np.concatenate([np.ones(steps), np.zeros(gap), -np.ones(steps), np.zeros(gap)])
+    sticks = np.zeros((len(shape), 4))
+    sticks[:, axis], sticks[:, 3] = sign * amplitude * shape, np.nan
+    return sticks
+
+
+def manoeuvre(sketch: Sketch, axis: int, amplitude: float) -> None:
+    """Append a wave on one rate stick, and time to recover."""
+    sketch.hands_on(wave(axis, amplitude, sketch.rng))
+    sketch.wait(RECOVER_S)
+
+
+def flip(sketch: Sketch) -> None:
+    """Append a jump, about one turn at full stick, and time to recover."""
+    rng = sketch.rng
+    jump, turn = np.full((steps_of(JUMP_S), 4), np.nan), np.zeros((steps_of(rng.uniform(*FLIP_S)), 4))
+    jump[:, 3] = JUMP_STICK
+    turn[:, rng.integers(2)], turn[:, 3] = rng.choice([-1.0, 1.0]), rng.uniform(*FLIP_STICK)
+    sketch.hands_on(np.concatenate([jump, turn]))
+    sketch.wait(AFTER_FLIP_S)
+
+
+def thrust_steps(sketch: Sketch) -> None:
+    """Append steps of the thrust stick up and down, upright, and time to recover."""
+    rng = sketch.rng
+    sticks = []
+    for up in rng.permutation([1.0, 0.0, 1.0, 0.0]).tolist():
+        level = rng.uniform(*(STEPS_UP if up else STEPS_DOWN))
+        seconds = rng.uniform(*UNEVEN) * (HELD_UP_S - SHORTER_S * level if up else HELD_DOWN_S)
+        sticks.append(np.tile([np.nan, np.nan, np.nan, level], (steps_of(seconds), 1)))
+    sketch.hands_on(np.concatenate(sticks))
+    sketch.wait(AFTER_STEPS_S)
+
+
+def low_pass(sketch: Sketch) -> None:
+    """Append a descent, a leg near the ground, and a climb half way."""
+    rng = sketch.rng
+    raised = LOWER_M * sketch.caution
+    height = math.exp(rng.uniform(*np.log(LOW_M))) + raised
+    sketch.climb_to(height + SINK_M)
+    for _ in range(steps_of(SINK_S)):
+        sketch.add((0.0, 0.0, -SINK_M / SINK_S))
+    sketch.wait(SETTLE_S)
+    speed = SLOWER**sketch.caution * rng.uniform(*LOW_SPEEDS)
+    leg(sketch, speed, rng.uniform(*LOW_HOLD_S), rng.normal(0.0, LOW_TURNING))
+    sketch.wait(AFTER_LOW_S)
+
+
+Block = Callable[[Sketch], None]
+
+
+def _fast(low: float, high: float) -> Block:
+    def block(sketch: Sketch) -> None:
+        rng = sketch.rng
+        speed = SLOWER**sketch.caution * rng.uniform(low, high)
+        leg(sketch, speed, rng.uniform(*HIGH_HOLD_S), rng.normal(0.0, HIGH_TURNING))
+
+    return block
+
+
+def _yaw_turn(sketch: Sketch) -> None:
+    sketch.turn_to(sketch.heading + sketch.rng.choice([-1.0, 1.0]) * sketch.rng.uniform(*YAW_TURN))
+
+
+def _on_axis(axis: int, amplitude: float) -> Block:
+    return lambda sketch: manoeuvre(sketch, axis, amplitude)
+
+
+def cycle(sketch: Sketch) -> None:
+    """Append 50 to 60 s: manoeuvres and legs at height, two low passes among them."""
+    rng = sketch.rng
+    waves = [(axis, float(rng.choice(row))) for axis in range(3) for row in AMPLITUDES]
+    first, last = HIGH_SPEEDS
+    middle = 0.5 * (first + last)
+    blocks: list[Block] = [
+        *(_on_axis(*one) for one in waves),
+        _fast(middle, last),
+        _fast(first, middle),
+        _fast(first, last),
+        thrust_steps,
+        thrust_steps,
+        flip,
+        _yaw_turn,
+    ]
+    blocks = [blocks[number] for number in rng.permutation(len(blocks))]
+    half = len(blocks) // 2
+    for number, block in enumerate(blocks):
+        if number == half:
+            low_pass(sketch)
+            low_pass(sketch)
+            sketch.climb_to(rng.uniform(*HIGH_M))
+        block(sketch)
+
+
+def _scripted(sketch: Sketch, seconds: float) -> None:
+    sketch.wait(BEGIN_S)
+    while len(sketch) * DT_S < seconds:
+        cycle(sketch)
+
+
+def _hover(sketch: Sketch, seconds: float) -> None:
+    rng = sketch.rng
+    while len(sketch) * DT_S < seconds:
+        sketch.wait(rng.uniform(*STILL_S))
+        move = rng.uniform(-1.0, 1.0, 3) * CORRECTION_M
+        # Back towards where the hover began, so that corrections do not wander off.
+        there = np.array(sketch.start_w) + move
+        speed = tuple(((there - sketch.pos_w) / CORRECTION_S).tolist())
+        for _ in range(steps_of(CORRECTION_S)):
+            sketch.add(speed)
+
+
+def _hover_headings(sketch: Sketch, seconds: float) -> None:
+    while len(sketch) * DT_S < seconds:
+        sketch.wait(sketch.rng.uniform(*STILL_S))
+        sketch.turn_to(sketch.rng.uniform(-math.pi, math.pi))
+
+
+def _slow(sketch: Sketch, seconds: float) -> None:
+    rng = sketch.rng
+    while len(sketch) * DT_S < seconds:
+        leg(sketch, rng.uniform(*SLOW_SPEEDS), rng.uniform(*SLOW_HOLD_S), rng.normal(0.0, SLOW_TURNING))
+        sketch.wait(BEGIN_S)
+        sketch.climb_to(HIGHER_M * sketch.caution + rng.uniform(*SLOW_M))
+
+
+def _race(sketch: Sketch, seconds: float) -> None:
+    """Steer towards waypoints at limited turn rates; take the next when one is near or out of time."""
+    rng = sketch.rng
+    slower = SLOWER**sketch.caution
+    way, speed, waypoint, wanted, left = sketch.heading, 0.0, None, 0.0, 0
+    while len(sketch) * DT_S < seconds:
+        if waypoint is None or left == 0 or math.dist(waypoint[:2], sketch.pos_w[:2]) < speed * NEAR_S:
+            place = rng.normal(0.0, WAYPOINTS_M, 2).clip(-2.0 * WAYPOINTS_M, 2.0 * WAYPOINTS_M)
+            height = HIGHER_M * sketch.caution + rng.uniform(*RACE_M)
+            waypoint, wanted = (*place.tolist(), height), slower * rng.uniform(*RACE_SPEEDS)
+            left = steps_of(rng.uniform(*CHASE_S))
+        left -= 1
+        x, y, z = (there - here for there, here in zip(waypoint, sketch.pos_w, strict=True))
+        speed += max(-RACE_SPEEDING_UP * DT_S, min(RACE_SPEEDING_UP * DT_S, wanted - speed))
+        turn = slower * MOST_SIDEWAYS / max(speed, SLOWEST_TURN)
+        error = wrap_angle(math.atan2(y, x) - way)
+        change = max(-turn, min(turn, TURN_GAIN * error)) * DT_S
+        way += change
+        sketch.add((speed * math.cos(way), speed * math.sin(way), max(-RACE_CLIMB, min(RACE_CLIMB, z))), way)
+
+
+FLIGHT_KINDS: dict[str, tuple[tuple[float, float], Callable[[Sketch, float], None]]] = {
+    "scripted": (HIGH_M, _scripted),
+    "race": (RACE_M, _race),
+    "hover": (HOVER_M, _hover),
+    "hover_headings": (HOVER_M, _hover_headings),
+    "slow": (SLOW_M, _slow),
+}
+
+
+def plan(kind: str, seconds: float, rng: Rng, caution: int = 0) -> list[Moment]:
+    """Return the plan of a flight, a moment per 10 ms.
+
+    caution: number of earlier attempts that were too low or too fast.
+
+    Raises:
+        ValueError: if there is no such kind.
+    """
+    if kind not in FLIGHT_KINDS:
+        raise ValueError(f"kind: found {kind!r}, expected one of {', '.join(FLIGHT_KINDS)}")
+    heights, draw = FLIGHT_KINDS[kind]
+    start_w = (
+        *rng.uniform(-START_SPREAD_M, START_SPREAD_M, 2).tolist(),
+        HIGHER_M * caution + float(rng.uniform(*heights)),
+    )
+    sketch = Sketch(rng, start_w, float(rng.uniform(-math.pi, math.pi)), caution)
+    draw(sketch, seconds)
+    return sketch.moments(seconds)

@@ -1,21 +1,36 @@
-"""The plant: the handout's step in plain floats, with hidden effects where they act."""
+"""The plant: the handout's step in plain floats, with hooks for the hidden effects."""
 
 import math
 from typing import NamedTuple
 
 import numpy as np
 
-from benchmarks.hidden.actuators import COMMAND_MAKERS, RATE_MAKERS, Sticks
-from benchmarks.hidden.forces import AIR_VELOCITY, FORCE_MAKERS, THRUST_MAKERS
+from benchmarks.hidden.effects import (
+    AIR_VELOCITY,
+    COMMAND_EFFECTS,
+    FORCE_EFFECTS,
+    RATE_EFFECTS,
+    THRUST_EFFECTS,
+    Sticks,
+)
 from benchmarks.hidden.outside import FirstOrderNoise, command_hook, vector_hook
 from benchmarks.hidden.truth import DT_S, Truth
-from benchmarks.hidden.vectors import Quaternion, Vector, plus, rotation, scaled, to_body, to_world, turned
+from benchmarks.hidden.vectors import (
+    Quaternion,
+    Vector,
+    add,
+    integrate_attitude,
+    rotation,
+    scale,
+    to_body,
+    to_world,
+)
 
 SECONDS_PER_MINUTE = 60.0
 
 
 class Start(NamedTuple):
-    """Where a flight begins, at rest in the air: world, m; rad; the battery's voltage without load, V."""
+    """The start of a flight, at rest in the air: position, m; heading, rad; voltage without load, V."""
 
     pos_w: Vector
     heading: float
@@ -39,7 +54,7 @@ class Plant:
         duration_s: float = 60.0,
         centre_w: Vector = (0.0, 0.0, 0.0),
     ):
-        """duration_s, centre_w: what effects outside the list refer to."""
+        """duration_s, centre_w: of the flight, for effects outside the list."""
         self.truth, self.duration_s, self.centre_w = truth, duration_s, centre_w
         self.pos_w, self.vel_w, self.acc_w = start.pos_w, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
         self.quat: Quaternion = (math.cos(0.5 * start.heading), 0.0, 0.0, math.sin(0.5 * start.heading))
@@ -56,14 +71,14 @@ class Plant:
         self._hooks(rng)
 
     def _hooks(self, rng: np.random.Generator) -> None:
-        """Collect what acts, each in the order of its table."""
+        """Collect the hooks of each stage, in the order of its table."""
         effects, outside, gust = self.truth.effects, self.truth.outside, self.truth.gust
 
         def made(makers: dict) -> list:
             return [make(effects[name]) for name, make in makers.items() if name in effects]
 
-        self._command_hooks, self._rate_hooks = made(COMMAND_MAKERS), made(RATE_MAKERS)
-        self._thrust_hooks, self._force_hooks = made(THRUST_MAKERS), made(FORCE_MAKERS)
+        self._command_hooks, self._rate_hooks = made(COMMAND_EFFECTS), made(RATE_EFFECTS)
+        self._thrust_hooks, self._force_hooks = made(THRUST_EFFECTS), made(FORCE_EFFECTS)
         self._turn_hooks = []
         if outside is not None and outside.kind == "command":
             self._command_hooks.append(command_hook(outside, self.truth))
@@ -73,10 +88,10 @@ class Plant:
         if gust is not None:
             air, turns = (FirstOrderNoise(gust.time_constant, rng) for _ in range(2))
             self._force_hooks.append(
-                lambda plant: to_body(plant.rows, scaled(gust.std, air.step())),
+                lambda plant: to_body(plant.rows, scale(gust.std, air.step())),
             )
             if gust.rate_std:
-                self._turn_hooks.append(lambda plant: scaled(gust.rate_std, turns.step()))
+                self._turn_hooks.append(lambda plant: scale(gust.rate_std, turns.step()))
         asymmetry = effects.get("thrust_lag_asymmetry", {}).get("ratio", 1.0)
         self._shares = tuple(-math.expm1(-DT_S / tau) for tau in self.truth.tau)
         self._falling_share = -math.expm1(-DT_S / (asymmetry * self.truth.tau[3]))
@@ -101,10 +116,10 @@ class Plant:
         for hook in self._rate_hooks:
             rates = hook(self, rates)
         for hook in self._turn_hooks:
-            rates = plus(rates, hook(self))
+            rates = add(rates, hook(self))
         force = (0.0, 0.0, self.thrust_acc)
         for hook in self._force_hooks:
-            force = plus(force, hook(self))
+            force = add(force, hook(self))
         self._move(force, rates)
 
     def _lag(self, command: Sticks) -> None:
@@ -119,7 +134,7 @@ class Plant:
         )
 
     def _move(self, force_b: Vector, rates_b: Vector) -> None:
-        """Integrate as the handout does: acceleration of the attitude before, rates after the step."""
+        """Integrate as the handout does: acceleration in the old attitude, rates after the step."""
         x, y, z = to_world(self.rows, force_b)
         acc = (x, y, z - self.truth.gravity)
         half = 0.5 * DT_S * DT_S
@@ -127,7 +142,7 @@ class Plant:
             p + v * DT_S + a * half for p, v, a in zip(self.pos_w, self.vel_w, acc, strict=True)
         )
         self.vel_w = tuple(v + a * DT_S for v, a in zip(self.vel_w, acc, strict=True))
-        self.quat = turned(self.quat, rates_b, DT_S)
+        self.quat = integrate_attitude(self.quat, rates_b, DT_S)
         self.acc_w, self.force_b, self.rates_b = acc, force_b, rates_b
         self._open_v -= self.truth.drain / SECONDS_PER_MINUTE * DT_S
         self.battery_v = self._loaded_v()

@@ -1,4 +1,4 @@
-"""What a plant with hidden effects is: its parameters, and nothing that computes a flight."""
+"""The parameters of a plant with hidden effects."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -9,11 +9,11 @@ DT_S = 0.01  # of a step
 
 @dataclass(frozen=True)
 class Outside:
-    """An effect that no list has, with a shape of its own.
+    """An effect outside the package's list.
 
-    kind: of ``benchmarks.hidden.outside.KINDS``. depends_on: what it is a function of, tags. channel: what
-    it changes, as in ``outside.SCALES``. amplitude: its largest size, as a multiple of the noise that the
-    sensors of ``benchmarks.hidden.noise`` have in the channel. shape: parameters of the kind.
+    kind: of ``benchmarks.hidden.outside.KINDS``. depends_on: tags of what it is a function of. channel: what
+    it changes, of ``outside.SCALES``. amplitude: its largest size over the noise of
+    ``benchmarks.hidden.noise`` in that channel. shape: parameters of the kind.
     """
 
     kind: str
@@ -25,7 +25,7 @@ class Outside:
 
 @dataclass(frozen=True)
 class Gust:
-    """Moving air as a random process of first order, per world axis; the accelerometer feels it.
+    """Gusts as a first-order random process per world axis, felt by the accelerometer.
 
     std: m/s^2, specific force. time_constant: s. rate_std: rad/s, the same of body rates; 0 for none.
     """
@@ -37,7 +37,7 @@ class Gust:
 
 @dataclass(frozen=True)
 class Truth:
-    """A plant; without effects it is the handout's.
+    """A plant; the handout's if it has no effects.
 
     tau: s. coeffs: N, of 1, u, u^2, u^3, V, u V. max_rate: deg/s. drain: V/min. mass: kg. gravity: m/s^2.
     effects: name -> parameter -> value, units as in ``benchmarks.hidden.draws``.
@@ -54,12 +54,12 @@ class Truth:
     gust: Gust | None = None
 
     def thrust(self, stick: float, battery_v: float) -> float:
-        """Return the thrust of an applied thrust action at a voltage, N, without effects."""
+        """Return thrust without effects, N, of an applied thrust stick at a voltage."""
         one, linear, square, cube, volt, both = self.coeffs
         return one + stick * (linear + stick * (square + stick * cube)) + battery_v * (volt + stick * both)
 
     def text(self) -> str:
-        """Return one line that says what is hidden."""
+        """Return the hidden effects in one line."""
         parts = [f"{name}({_values(values)})" for name, values in self.effects.items()]
         if self.outside is not None:
             out = self.outside

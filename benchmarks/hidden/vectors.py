@@ -1,4 +1,4 @@
-"""Vectors and quaternions as tuples of floats: for three numbers, faster than arrays by far."""
+"""Vectors and quaternions as tuples of floats, which is much faster than arrays for three numbers."""
 
 import math
 
@@ -33,8 +33,8 @@ def to_body(rows: tuple[Vector, Vector, Vector], vector_w: Vector) -> Vector:
     )
 
 
-def turned(quat: Quaternion, rates_b: Vector, step_s: float) -> Quaternion:
-    """Return the attitude after a step at body rates, rad/s: the handout's first order, of norm 1."""
+def integrate_attitude(quat: Quaternion, rates_b: Vector, step_s: float) -> Quaternion:
+    """Return the attitude after a step at body rates, rad/s: first order as in the handout, normalised."""
     w, x, y, z = quat
     half = 0.5 * step_s
     roll, pitch, yaw = half * rates_b[0], half * rates_b[1], half * rates_b[2]
@@ -48,12 +48,12 @@ def turned(quat: Quaternion, rates_b: Vector, step_s: float) -> Quaternion:
     return (new[0] / norm, new[1] / norm, new[2] / norm, new[3] / norm)
 
 
-def plus(first: Vector, second: Vector) -> Vector:
+def add(first: Vector, second: Vector) -> Vector:
     """Return the sum of two vectors."""
     return (first[0] + second[0], first[1] + second[1], first[2] + second[2])
 
 
-def scaled(factor: float, vector: Vector) -> Vector:
+def scale(factor: float, vector: Vector) -> Vector:
     """Return a vector times a number."""
     return (factor * vector[0], factor * vector[1], factor * vector[2])
 
@@ -63,12 +63,12 @@ def norm(vector: Vector) -> float:
     return math.sqrt(vector[0] * vector[0] + vector[1] * vector[1] + vector[2] * vector[2])
 
 
-def within(vector: Vector, most: float) -> Vector:
-    """Return a vector cut to a length."""
+def clip_length(vector: Vector, most: float) -> Vector:
+    """Return a vector shortened to a length, if it is longer."""
     length = norm(vector)
-    return vector if length <= most else scaled(most / length, vector)
+    return vector if length <= most else scale(most / length, vector)
 
 
-def wrapped(angle_rad: float) -> float:
+def wrap_angle(angle_rad: float) -> float:
     """Return an angle in [-pi, pi]."""
     return math.remainder(angle_rad, 2.0 * math.pi)

@@ -1,4 +1,4 @@
-"""How plainly a flight shows what is hidden in its plant: what a diagnosis could reach at best."""
+"""Signal-to-noise ratio of the hidden effects in a flight: a bound on what a diagnosis could reach."""
 
 import math
 
@@ -11,12 +11,12 @@ from flytrack_sysid.log import FlightLog
 
 NUDGE = 1e-3  # of lags, relative
 SECONDS_PER_MINUTE = 60.0
-FIRST_ROW = 100  # before it, lags remember commands that the log does not have
+FIRST_ROW = 100  # before it, lags depend on commands from before the log
 SCALES = np.array([ACCELEROMETER_STD] * 3 + [GYRO_STD] * 3 + [DIGIT["v_bat"]])
 
 
-def _held(log: FlightLog, tau: np.ndarray) -> np.ndarray:
-    """Return the applied action of the step to each row, (num_rows, 4); it begins as the first command."""
+def _applied(log: FlightLog, tau: np.ndarray) -> np.ndarray:
+    """Return the applied action in the step to each row, (num_rows, 4), started at the first command."""
     sticks = np.vstack([log["u"][:1], log["u"][:-1]])
     columns = []
     for column, keep in zip(sticks.T, np.exp(-DT_S / tau), strict=True):
@@ -32,7 +32,7 @@ def _terms(log: FlightLog, stick: np.ndarray) -> np.ndarray:
 
 def _expected(truth: Truth, log: FlightLog, tau: np.ndarray) -> np.ndarray:
     """Return specific force, body rates and voltage of the plant without effects, (num_rows, 7)."""
-    applied = _held(log, tau)
+    applied = _applied(log, tau)
     expected = np.zeros((len(log), len(SCALES)))
     expected[:, 2] = _terms(log, applied[:, 3]) @ np.array(truth.coeffs) / truth.mass
     expected[:, 3:6] = np.radians(truth.max_rate) * applied[:, :3]
@@ -40,31 +40,31 @@ def _expected(truth: Truth, log: FlightLog, tau: np.ndarray) -> np.ndarray:
     return expected
 
 
-def _free(truth: Truth, log: FlightLog) -> np.ndarray:
-    """Return what other lags and another thrust curve would change, (columns, num_rows, 7)."""
+def _jacobian(truth: Truth, log: FlightLog) -> np.ndarray:
+    """Return derivatives by the lags and the thrust coefficients, (columns, num_rows, 7)."""
     tau = np.array(truth.tau)
     plain, slopes = _expected(truth, log, tau), []
     for axis in range(len(tau)):
         other = np.where(np.arange(len(tau)) == axis, tau * (1.0 + NUDGE), tau)
         slopes.append((_expected(truth, log, other) - plain) / NUDGE)
-    for term in _terms(log, _held(log, tau)[:, 3]).T:
+    for term in _terms(log, _applied(log, tau)[:, 3]).T:
         slopes.append(np.zeros_like(plain))
         slopes[-1][:, 2] = term
     return np.stack(slopes)
 
 
 def signal_to_noise(truth: Truth, log: FlightLog, is_base_known: bool = False) -> float:
-    """Return how far clean accelerometer, gyro and voltage lie from those of the plant without any effects.
+    """Return how far clean accelerometer, gyro and voltage are from those of the plant without effects.
 
-    The root of the sum of squares of the differences, each as a multiple of the noise of
-    ``benchmarks.hidden.noise``, of the voltage its last digit: about how many standard deviations the effects
-    are from nothing for who knows their shape. Position, velocity and attitude would tell more of some.
-    log: clean, from ``fly``. is_base_known: if not, only what other lags and another thrust curve cannot
+    The root of the sum of squared differences, each over the noise of ``benchmarks.hidden.noise`` (voltage:
+    over its resolution): by about how many standard deviations the effects are visible to an observer who
+    knows their shape. Position, velocity and attitude are not used and would show more of some effects.
+    log: clean, from ``fly``. is_base_known: if False, only what other lags and another thrust curve cannot
     explain counts.
     """
     missing = np.column_stack([log["f"], log["w"], log["v_bat"]]) - _expected(truth, log, np.array(truth.tau))
     missing = (missing / SCALES)[FIRST_ROW:].ravel()
     if not is_base_known:
-        design = (_free(truth, log) / SCALES)[:, FIRST_ROW:].reshape(-1, len(missing)).T
+        design = (_jacobian(truth, log) / SCALES)[:, FIRST_ROW:].reshape(-1, len(missing)).T
         missing = missing - design @ np.linalg.lstsq(design, missing, rcond=None)[0]
     return float(math.sqrt(missing @ missing))

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 
 from benchmarks.hidden import Truth
-from benchmarks.hidden.forces import LIFT_SPEED
+from benchmarks.hidden.effects import LIFT_SPEED
 from flytrack_env.dynamics import ModelParameters
 from flytrack_env.quaternion import Scalar
 from flytrack_env.state import (

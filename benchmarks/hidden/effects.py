@@ -1,8 +1,9 @@
-"""Hidden effects of sticks, motors and rate loops, each from its own equation.
+"""The hidden effects' equations, by the stage at which they act: commands, body rates, thrust, forces.
 
-A maker takes an effect's parameters and returns a function of the plant and the value so far. Sticks: roll,
-pitch, yaw, thrust, 1. Rates: body, rad/s. Where the package has another law for an effect of the same name,
-the difference is wanted: no real plant follows the package's.
+A function here takes an effect's parameters and returns a hook, a function of the plant and the value so far:
+sticks (roll, pitch, yaw, thrust) in [-1, 1], body rates in rad/s, thrust in N. Hooks of forces take the plant
+alone and return what they add to the specific force, body, m/s^2. Where the package has another law for an
+effect of the same name, the difference is intended: no real plant follows the package's laws.
 """
 
 import cmath
@@ -12,13 +13,15 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from benchmarks.hidden.truth import DT_S
-from benchmarks.hidden.vectors import Vector
+from benchmarks.hidden.vectors import Vector, to_body
 
 Parameters = Mapping[str, float]
 Sticks = tuple[float, float, float, float]
 Hook = Callable[[Any, Any], Any]
-MOST_STEPS = 8  # of commands that a delay remembers
+MOST_STEPS = 8  # commands that a delay remembers
 BISECTIONS = 60  # halve an interval down to rounding
+LIFT_SPEED = 8.0  # m/s, airspeed at which translational lift has 1 - 1/e of its gain
+AIR_VELOCITY = ("v_x", "v_y", "v_z")  # of wind, m/s
 
 
 def _command_delay(values: Parameters) -> Hook:
@@ -55,9 +58,9 @@ def _rate_scale(values: Parameters) -> Hook:
 
 
 def _rate_saturation(values: Parameters) -> Hook:
-    """omega = limit tanh(omega / limit), per axis; at full stick, ``lost`` of it is missing.
+    """omega = limit tanh(omega / limit), per axis; at full stick the share ``lost`` of it is missing.
 
-    Not the package's law, which mixes a hard limit and a gradual one of another shape.
+    Not the package's law, which mixes a hard limit with a gradual one of another shape.
     """
     low, high = 0.0, 1.0
     # In x = 1 / (limit as a share of full stick): tanh(x) / x falls from 1.
@@ -111,14 +114,13 @@ def _yaw_reaction(values: Parameters) -> Hook:
 def _second_order_rates(values: Parameters) -> Hook:
     """y'' + 2 zeta wn y' + wn^2 y = wn^2 omega: an oscillator, exact for rates held over the step.
 
-    wn: rad/s. zeta: other than 1.
-
-    The package has the same law with other parameters: lag_s is 2 zeta / wn, damping is zeta.
+    wn: rad/s. zeta: not 1. The package has the same law with other parameters: lag_s is 2 zeta / wn,
+    damping is zeta.
     """
     natural, damping = values["wn"], values["zeta"]
     decay, root = natural * damping, natural * cmath.sqrt(damping * damping - 1.0)
     shrink = math.exp(-decay * DT_S)
-    # Both are real, whether the root is (two lags) or not (an oscillation).
+    # Both are real, whether the root is (two lags) or not (oscillation).
     even, odd = cmath.cosh(root * DT_S).real, (cmath.sinh(root * DT_S) / root).real
     stay, follow = shrink * (even + decay * odd), shrink * odd
     pull, keep = -natural * natural * shrink * odd, shrink * (even - decay * odd)
@@ -147,9 +149,85 @@ def _rate_slew_limit(values: Parameters) -> Hook:
     return act
 
 
-COMMAND_MAKERS = {"command_delay": _command_delay}
-# In the order in which they act: what the flight controller asks for, then what the frame does with it.
-RATE_MAKERS = {
+def _thrust_scale(values: Parameters) -> Hook:
+    """T *= factor."""
+    return lambda plant, thrust: values["factor"] * thrust
+
+
+def _translational_lift(values: Parameters) -> Hook:
+    """T *= 1 + gain (1 - exp(-s^2 / (8 m/s)^2)), s the airspeed along body x and y.
+
+    Not the package's law, which approaches the gain as a rational function.
+    """
+    gain = values["gain"]
+
+    def act(plant: Any, thrust: float) -> float:
+        x, y, _ = plant.airspeed_b
+        return thrust * (1.0 - gain * math.expm1(-(x * x + y * y) / LIFT_SPEED**2))
+
+    return act
+
+
+def _ground_effect(values: Parameters) -> Hook:
+    """T *= 1 + gain exp(-z / height_m).
+
+    Not the package's law, which falls off with 1 / z^2.
+    """
+    gain, height = values["gain"], values["height_m"]
+    return lambda plant, thrust: thrust * (1.0 + gain * math.exp(-max(plant.pos_w[2], 0.0) / height))
+
+
+def _linear_drag(values: Parameters) -> Hook:
+    """f -= (d_x v_x, d_y v_y, d_z v_z), v the airspeed in the body."""
+
+    def act(plant: Any) -> Vector:
+        x, y, z = plant.airspeed_b
+        return (-values["d_x"] * x, -values["d_y"] * y, -values["d_z"] * z)
+
+    return act
+
+
+def _quadratic_drag(values: Parameters) -> Hook:
+    """f_i -= k_i |v_i| v_i, each axis for itself.
+
+    The package's law with ``shared`` at 0; by default it multiplies each axis by the whole speed.
+    """
+
+    def act(plant: Any) -> Vector:
+        x, y, z = plant.airspeed_b
+        return (-values["k_x"] * abs(x) * x, -values["k_y"] * abs(y) * y, -values["k_z"] * abs(z) * z)
+
+    return act
+
+
+def _rotor_drag(values: Parameters) -> Hook:
+    """f -= h T/m (v_x, v_y, 0), v the airspeed in the body."""
+
+    def act(plant: Any) -> Vector:
+        lean = -values["h"] * plant.thrust_acc
+        return (lean * plant.airspeed_b[0], lean * plant.airspeed_b[1], 0.0)
+
+    return act
+
+
+def _thrust_tilt(values: Parameters) -> Hook:
+    """f += T/m (towards_x, towards_y, 0); rad."""
+    return lambda plant: (
+        values["towards_x"] * plant.thrust_acc,
+        values["towards_y"] * plant.thrust_acc,
+        0.0,
+    )
+
+
+def _wind(values: Parameters) -> Hook:
+    """f += R^T a; the air's velocity is part of ``plant.airspeed_b`` already."""
+    push_w = tuple(values.get(name, 0.0) for name in ("a_x", "a_y", "a_z"))
+    return lambda plant: to_body(plant.rows, push_w)
+
+
+COMMAND_EFFECTS = {"command_delay": _command_delay}
+# In the order in which they act: first the flight controller, then the frame.
+RATE_EFFECTS = {
     "rate_expo": _rate_expo,
     "rate_scale": _rate_scale,
     "rate_saturation": _rate_saturation,
@@ -158,4 +236,16 @@ RATE_MAKERS = {
     "yaw_reaction": _yaw_reaction,
     "second_order_rates": _second_order_rates,
     "rate_slew_limit": _rate_slew_limit,
+}
+THRUST_EFFECTS = {
+    "thrust_scale": _thrust_scale,
+    "translational_lift": _translational_lift,
+    "ground_effect": _ground_effect,
+}
+FORCE_EFFECTS = {
+    "linear_drag": _linear_drag,
+    "quadratic_drag": _quadratic_drag,
+    "rotor_drag": _rotor_drag,
+    "thrust_tilt": _thrust_tilt,
+    "wind": _wind,
 }
