@@ -1,9 +1,9 @@
-"""Environment steps per second of process CPU time on one core, next to a toy and to l2f.
+"""Environment steps per second of process CPU time on one core, next to Pendulum and to l2f.
 
-``python -m benchmarks.env_speed [--repeats 7] [--out results]`` prints a table and writes
-``results.md`` and ``results.json``. Keys and actions are drawn before the clock starts; every
-output of a step is kept, so that nothing can be left out of it. The contestants take turns,
-because machines drift: compare ratios of one run, not rates of two.
+``python -m benchmarks.env_speed [--repeats 7] [--out results]`` prints a table and writes ``results.md`` and
+``results.json``. Keys and actions are drawn before the clock starts; every output of a step is kept, so that
+nothing of it can be optimised away. The contestants take turns, because machines drift: compare ratios of
+one run, not rates of two runs.
 """
 
 import argparse
@@ -14,17 +14,8 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from benchmarks import report
 from benchmarks.report import cpu_name as cpu_name
-from benchmarks.report import (
-    page,
-    pin_to_one_core,
-    provenance,
-    provenance_line,
-    spread,
-    table,
-    write_json,
-    write_page,
-)
 from benchmarks.report import versions as versions
 
 NUM_ACTIONS_L2F = 16  # drawn in advance and flown in turn
@@ -46,7 +37,7 @@ MOST_COSTLY = 1.5  # a variant's step over the plain one's
 
 
 class Target(NamedTuple):
-    """A ratio that is wanted: at least ``goal``, hopefully ``stretch``."""
+    """A ratio of rates to reach."""
 
     ours: str
     peer: str
@@ -58,11 +49,12 @@ TARGETS = (Target(PLAIN, L2F_SMALL, 3.0, 5.0), Target(BATCH, L2F_LARGE, 8.0, 12.
 
 
 class Contestant(NamedTuple):
-    """Something that makes ``num_steps`` environment steps each time it is run."""
+    """Something that does ``amount`` of work, in the unit of its rate, each time it is run."""
 
     name: str
-    num_steps: int
-    run: Callable[[], None]
+    amount: float
+    run: Callable[[], Any]
+    clock: Callable[[], float] = time.process_time
 
 
 def jax_contestant(name: str, env_id: str, num_envs: int, length: int, is_batch: bool) -> Contestant:
@@ -93,7 +85,7 @@ def jax_contestant(name: str, env_id: str, num_envs: int, length: int, is_batch:
         outputs = jax.block_until_ready(fly(state, keys, actions, params))
         state = outputs[1]
 
-    return Contestant(name, (length + 1) * num_envs, run)
+    return Contestant(name, (length + 1) * num_envs / 1e6, run)
 
 
 def l2f_contestant(name: str, num_envs: int, length: int) -> Contestant:
@@ -135,35 +127,35 @@ def l2f_contestant(name: str, num_envs: int, length: int) -> Contestant:
             vector.observe(*world, next_state, observation, rng)
             state, next_state = next_state, state
 
-    return Contestant(name, length * num_envs, run)
+    return Contestant(name, length * num_envs / 1e6, run)
 
 
 def contestants() -> list[Contestant]:
-    """Return everything that is measured; l2f only where it is installed."""
-    found = [
+    """Return all contestants, l2f only where it is installed."""
+    entries = [
         jax_contestant(PENDULUM, "Pendulum-v1", 1024, 200, is_batch=False),
         jax_contestant(PLAIN, "FlyTrack-v0", 1024, 200, is_batch=False),
         jax_contestant(BATCH, "FlyTrack-v0", 4096, 200, is_batch=True),
         *(jax_contestant(name, env_id, 1024, 200, is_batch=False) for name, env_id in VARIANTS.items()),
     ]
     try:
-        found += [l2f_contestant(L2F_SMALL, 1024, 200), l2f_contestant(L2F_LARGE, 4096, 50)]
+        entries += [l2f_contestant(L2F_SMALL, 1024, 200), l2f_contestant(L2F_LARGE, 4096, 50)]
     except ImportError as error:
         print(f"l2f is skipped, and the ratios with it: {error}. Install it: pip install l2f")
-    return found
+    return entries
 
 
 def measure(entries: list[Contestant], repeats: int, warm_up: int = 3) -> dict[str, list[float]]:
-    """Return the rates of each contestant, million steps per CPU second, all taking turns."""
+    """Return the rates of each contestant, amount per second of its clock, all taking turns."""
     for entry in entries:
         for _ in range(warm_up):
             entry.run()
     rates: dict[str, list[float]] = {entry.name: [] for entry in entries}
     for _ in range(repeats):
         for entry in entries:
-            start = time.process_time()
+            start = entry.clock()
             entry.run()
-            rates[entry.name].append(entry.num_steps / (time.process_time() - start) / 1e6)
+            rates[entry.name].append(entry.amount / (entry.clock() - start))
     return rates
 
 
@@ -193,7 +185,7 @@ def costs(rates: dict[str, list[float]]) -> dict[str, float]:
 def as_page(result: dict[str, Any]) -> str:
     """Return the result as a page."""
     rates = (
-        (name, f"{statistics.median(found):.2f}", spread(found, ".2f"))
+        (name, f"{statistics.median(found):.2f}", report.spread(found, ".2f"))
         for name, found in result["rates"].items()
     )
     targets = (
@@ -201,13 +193,13 @@ def as_page(result: dict[str, Any]) -> str:
         for row in result["ratios"]
     )
     costs = ((name, f"{cost:.2f}", f"{MOST_COSTLY:g}") for name, cost in result["costs"].items())
-    return page(
+    return report.page(
         "Environment speed",
-        f"`python -m benchmarks.env_speed --repeats {result['repeats']}`; what limits it: docs/speed.md.",
-        table(("environment", "million steps per CPU second, median", "lowest to highest"), rates),
-        table(("ratio", "measured", "target", "stretch"), targets),
-        table(("variant", "cost over the plain step", "at most"), costs),
-        f"{result['repeats']} rounds, {result['core']}. {provenance_line(result['provenance'])}",
+        f"{report.command_line()}; what limits it: docs/speed.md.",
+        report.table("environment | million steps per CPU second, median | lowest to highest", rates),
+        report.table("ratio | measured | target | stretch", targets),
+        report.table("variant | cost over the plain step | at most", costs),
+        f"{result['repeats']} rounds, {result['core']}. {report.provenance_line(result['provenance'])}",
     )
 
 
@@ -217,7 +209,7 @@ def main() -> None:
     parser.add_argument("--repeats", type=int, default=7, help="rounds, at least 5 for figures to publish")
     parser.add_argument("--out", type=Path, help="path of the results without its suffix")
     arguments = parser.parse_args()
-    core = pin_to_one_core()
+    core = report.pin_to_one_core()
     rates = measure(contestants(), arguments.repeats)
     result = {
         "rates": rates,
@@ -225,11 +217,11 @@ def main() -> None:
         "costs": costs(rates),
         "core": core,
         "repeats": arguments.repeats,
-        "provenance": provenance("l2f"),
+        "provenance": report.provenance("l2f"),
     }
-    write_page(arguments.out and arguments.out.with_suffix(".md"), as_page(result))
+    report.write_page(arguments.out and arguments.out.with_suffix(".md"), as_page(result))
     if arguments.out:
-        write_json(arguments.out.with_suffix(".json"), result)
+        report.write_json(arguments.out.with_suffix(".json"), result)
 
 
 if __name__ == "__main__":

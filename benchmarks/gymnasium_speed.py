@@ -1,9 +1,8 @@
 """Steps per second through Gymnasium and pictures per second, on one core.
 
-``python -m benchmarks.gymnasium_speed [--repeats 7] [--out docs/results/gymnasium_speed.md]`` prints a
-table and writes it. Steps and pictures count process CPU time; a video counts wall time, because
-another process encodes it. Actions are drawn before the clock starts; whatever ends an episode is
-part of the time. The contestants take turns, because machines drift. Needs the extra ``[dev]``.
+``python -m benchmarks.gymnasium_speed [--repeats 7] [--out docs/results/gymnasium_speed.md]`` prints a table
+and writes it. Steps and pictures count process CPU time; a video counts wall time, because another process
+encodes it. Actions are drawn before the clock starts; resets count. Needs the extra ``[dev]``.
 """
 
 import argparse
@@ -11,31 +10,19 @@ import statistics
 import tempfile
 import time
 from collections.abc import Callable
-from importlib.metadata import version
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
-from benchmarks.env_speed import MINIMUM_REPEATS, cpu_name, pin_to_one_core, versions
+from benchmarks import report
+from benchmarks.env_speed import Contestant, measure
 
 ENV_ID = "flytrack_env:FlyTrack-v0"
 NUM_ENVS = 1024
 NUM_ACTIONS = 16  # drawn in advance and flown in turn
-PACKAGES = ("gymnasium", "pillow", "moviepy")
-
-
-class Contestant(NamedTuple):
-    """Something that does ``amount`` of its unit each time it is run; ``goal`` is wanted per second."""
-
-    name: str
-    unit: str
-    goal: float
-    amount: float
-    clock: Callable[[], float]
-    run: Callable[[], Any]
 
 
 def vector_contestant(num_steps: int = 200) -> Contestant:
-    """Return steps of the vector environment: NumPy in, and all that it returns."""
+    """Return million steps of the vector environment: NumPy in and out."""
     import gymnasium
     import numpy as np
 
@@ -48,9 +35,7 @@ def vector_contestant(num_steps: int = 200) -> Contestant:
         for index in range(num_steps):
             envs.step(actions[index % NUM_ACTIONS])
 
-    amount = num_steps * NUM_ENVS / 1e6
-    name = f"vector environment, {NUM_ENVS:,}"
-    return Contestant(name, "million steps per CPU s", 2.5, amount, time.process_time, run)
+    return Contestant(f"vector environment, {NUM_ENVS:,}", num_steps * NUM_ENVS / 1e6, run)
 
 
 def single_contestant(num_steps: int = 2000) -> Contestant:
@@ -68,15 +53,15 @@ def single_contestant(num_steps: int = 2000) -> Contestant:
             if terminated or truncated:
                 env.reset()
 
-    return Contestant("single environment", "steps per CPU s", 5e3, num_steps, time.process_time, run)
+    return Contestant("single environment", num_steps, run)
 
 
-def fly_slowly(env: Any, num_steps: int, see: Callable[[], Any]) -> None:
-    """Fly from the start pose, begin again where an episode ends, and see every step."""
+def fly_slowly(env: Any, num_steps: int, after_step: Callable[[], Any]) -> None:
+    """Fly from the start pose, start again where an episode ends, and call a function after every step."""
     env.reset(seed=0, options={"gate_index": 0})
     for _ in range(num_steps):
         _, _, terminated, truncated, _ = env.step((0.0, 0.01, 0.0, 0.25))
-        see()
+        after_step()
         if terminated or truncated:
             env.reset(options={"gate_index": 0})
 
@@ -86,16 +71,13 @@ def picture_contestant(num_steps: int = 100) -> Contestant:
     import gymnasium
 
     env = gymnasium.make(ENV_ID, render_mode="rgb_array")
-    name = "rgb_array, a picture per step"
-
-    def run() -> None:
-        fly_slowly(env, num_steps, see=env.render)
-
-    return Contestant(name, "pictures per CPU s", 100, num_steps, time.process_time, run)
+    return Contestant(
+        "rgb_array, a picture per step", num_steps, lambda: fly_slowly(env, num_steps, env.render)
+    )
 
 
 def video_contestant(num_steps: int = 100) -> Contestant:
-    """Return videos of a flight through ``RecordVideo``: steps, pictures and encoding."""
+    """Return pictures of videos of a flight through ``RecordVideo``: steps, rendering and encoding."""
     import gymnasium
     from gymnasium.wrappers import RecordVideo
 
@@ -103,24 +85,19 @@ def video_contestant(num_steps: int = 100) -> Contestant:
         with tempfile.TemporaryDirectory() as folder:
             env = gymnasium.make(ENV_ID, render_mode="rgb_array")
             env = RecordVideo(env, f"{folder}/video", episode_trigger=lambda _: True)
-            fly_slowly(env, num_steps, see=lambda: None)  # the wrapper sees to it
+            fly_slowly(env, num_steps, lambda: None)  # the wrapper renders
             env.close()
 
-    name = "RecordVideo, a picture per step"
-    return Contestant(name, "pictures per wall s", 25, num_steps, time.perf_counter, run)
+    return Contestant("RecordVideo, a picture per step", num_steps, run, time.perf_counter)
 
 
-def measure(entries: list[Contestant], repeats: int) -> dict[str, list[float]]:
-    """Return the rates of each contestant in its unit, all taking turns, after one run to warm up."""
-    for entry in entries:
-        entry.run()
-    rates: dict[str, list[float]] = {entry.name: [] for entry in entries}
-    for _ in range(repeats):
-        for entry in entries:
-            start = entry.clock()
-            entry.run()
-            rates[entry.name].append(entry.amount / (entry.clock() - start))
-    return rates
+# Contestant, unit of its rate, aim.
+CONTESTANTS: tuple[tuple[Callable[[], Contestant], str, float], ...] = (
+    (vector_contestant, "million steps per CPU s", 2.5),
+    (single_contestant, "steps per CPU s", 5e3),
+    (picture_contestant, "pictures per CPU s", 100),
+    (video_contestant, "pictures per wall s", 25),
+)
 
 
 def as_number(value: float) -> str:
@@ -128,47 +105,27 @@ def as_number(value: float) -> str:
     return f"{value:,.0f}" if value >= 100 else f"{value:.3g}"
 
 
-def as_markdown(entries: list[Contestant], rates: dict[str, list[float]], machine: str) -> str:
-    """Return a table of medians, spreads and goals."""
-    repeats = len(rates[entries[0].name])
-    lines = [
-        "# Speed through Gymnasium",
-        "",
-        f"`python -m benchmarks.gymnasium_speed --repeats {repeats}`; how to use it: docs/gymnasium.md.",
-        "",
-        "| what | unit | median | lowest to highest | aim |",
-        "|---|---|---|---|---|",
-    ]
-    for entry in entries:
-        found = rates[entry.name]
-        median, low, high = map(as_number, (statistics.median(found), min(found), max(found)))
-        lines.append(
-            f"| {entry.name} | {entry.unit} | {median} | {low} to {high} | {as_number(entry.goal)} |"
-        )
-    return "\n".join([*lines, "", machine]) + "\n"
-
-
 def main() -> None:
     """Measure, print and write."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--repeats", type=int, default=7, help="rounds, at least 5")
-    parser.add_argument("--out", type=Path, help="path of the table (.md)")
+    parser.add_argument("--repeats", type=int, default=7, help="rounds, at least 5 for figures to publish")
+    parser.add_argument("--out", type=Path, help="path of the page (.md)")
     arguments = parser.parse_args()
-    if arguments.repeats < MINIMUM_REPEATS:
-        parser.error(f"--repeats: found {arguments.repeats}, expected at least {MINIMUM_REPEATS}")
-    core = pin_to_one_core()
-    entries = [vector_contestant(), single_contestant(), picture_contestant(), video_contestant()]
-    rates = measure(entries, arguments.repeats)
-    found = versions() | {package: version(package) for package in PACKAGES}
-    packages = ", ".join(f"{name} {number}" for name, number in found.items() if name != "l2f")
-    machine = f"{cpu_name()}, {core}, {arguments.repeats} rounds; {packages}."
-    table = as_markdown(entries, rates, machine)
-    print(table, end="")
-    if arguments.out:
-        # Not at the top: it imports jax, whose threads must be born on the pinned core.
-        from flytrack_env.files import write_atomically
-
-        write_atomically(arguments.out, table.encode())
+    core = report.pin_to_one_core()
+    entries = [make() for make, _, _ in CONTESTANTS]
+    rates = measure(entries, arguments.repeats, warm_up=1)
+    rows = []
+    for (_, unit, aim), (name, values) in zip(CONTESTANTS, rates.items(), strict=True):
+        median, low, high = map(as_number, (statistics.median(values), min(values), max(values)))
+        rows.append((name, unit, median, f"{low} to {high}", as_number(aim)))
+    record = report.provenance("gymnasium", "pillow", "moviepy")
+    text = report.page(
+        "Speed through Gymnasium",
+        f"{report.command_line()}; how to use it: docs/gymnasium.md.",
+        report.table("what | unit | median | lowest to highest | aim", rows),
+        f"{arguments.repeats} rounds, {core}. {report.provenance_line(record)}",
+    )
+    report.write_page(arguments.out, text)
 
 
 if __name__ == "__main__":

@@ -1,44 +1,44 @@
 """How well lags and thrust maps of plants drawn at run time are identified.
 
 ``python -m benchmarks.identification [--plants 50] [--seed 0]`` writes docs/results/identification_plants.md.
-Every plant has four lags of 0.01 to 0.08 s and a thrust curve of its own, in equations that
-share nothing with the package, is flown for two minutes, and is identified from four logs: as it is, as
-common sensors would see it, the same without accelerometer, and with velocity and attitude only (besides the
-battery). The log's last of every four blocks is held out. Figures that the estimates are to meet stand beside
-those measured.
+Every plant has four lags of 0.01 to 0.08 s and a thrust curve of its own, in equations that share nothing
+with the package. It is flown for two minutes and identified from four logs: clean, measured by common
+sensors, the same without accelerometer, and with velocity and attitude only (besides the battery). Every
+fourth block of a log is held out.
 """
 
 import argparse
-import os
-import platform
 import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
-import jax
 import numpy as np
 from tqdm import tqdm
 
-from flytrack_env.files import write_atomically
+from benchmarks import report
 from flytrack_env.state import ACTION_SIZE
 from flytrack_sysid import collect, fit, held_out_rows, validate
 from flytrack_sysid.log import FlightLog
 from flytrack_sysid.parameters import TAUS, THRUST_COEFFS
 from flytrack_sysid.sensors import measure
 
-RESULT = Path(__file__).parent.parent / "docs" / "results" / "identification_plants.md"
+PAGE = report.RESULTS / "identification_plants.md"
 DT_S, GRAVITY = 0.01, 9.80665
 TAU_RANGE_S = (0.01, 0.08)
 FULL_STICK = np.deg2rad([618.0, 618.0, 120.0])
 MINUTES = 2.0
-# What each kind of log is to give: largest error of a lag, and of the map over full thrust.
+# Aims for each kind of log: largest error of a lag, and of the thrust map over full thrust.
 AIMS = {
     "clean": (1e-4, 1e-4),
     "sensors": (0.02, 0.005),
     "no accelerometer": (0.04, 0.01),
     "velocity and attitude only": (0.04, 0.01),
 }
+HEADER = (
+    "log | lags: worst error of any plant | aim | median | thrust map: worst, of full thrust | aim | "
+    "median | truth inside the 95 % interval | CPU s a fit, median / largest"
+)
 COVERAGE_AIM = (0.90, 0.99)
 
 
@@ -50,7 +50,7 @@ class Truth(NamedTuple):
 
 
 def draw_truth(rng: np.random.Generator) -> Truth:
-    """Return a plant whose thrust grows from about nothing at idle to 2 to 5 times its weight."""
+    """Return a plant whose thrust grows from about 0 at idle to 2 to 5 times its weight."""
     low, quadratic, cubic = rng.uniform(-9.0, -6.0), rng.uniform(1.0, 5.0), rng.uniform(-1.0, 1.0)
     per_volt, idle = rng.uniform(0.7, 1.2), rng.uniform(0.0, 1.0)
     # (1 + u) (low + quadratic u + cubic u^2 + per_volt V) + idle
@@ -131,66 +131,42 @@ def run(num_plants: int, seed: int) -> tuple[dict[str, list[Outcome]], dict[str,
     return outcomes, one_step
 
 
-def table(outcomes: dict[str, list[Outcome]]) -> list[str]:
-    """Return the results as a table in Markdown."""
-    lines = [
-        "| log | lags: worst error of any plant | aim | median | thrust map: worst, of full thrust | aim "
-        "| median | truth inside the 95 % interval | CPU s a fit, median / largest |",
-        "|---|---|---|---|---|---|---|---|---|",
-    ]
-    for name, rows in outcomes.items():
-        tau, thrust = np.array([row.tau_error for row in rows]), np.array([row.map_error for row in rows])
-        seconds = [row.seconds for row in rows[1:]]  # the first compiles
-        cover = "" if name == "clean" else f"{np.mean([row.covers for row in rows]):.1%}"
-        lines.append(
-            f"| {name} | {tau.max():.4%} | {AIMS[name][0]:.2%} | {np.median(tau):.4%} | {thrust.max():.4%} "
-            f"| {AIMS[name][1]:.2%} | {np.median(thrust):.4%} | {cover} "
-            f"| {np.median(seconds):.1f} / {max(seconds):.1f} |"
-        )
-    return lines
-
-
-def report(
-    outcomes: dict[str, list[Outcome]], one_step: dict[str, float], arguments: argparse.Namespace
-) -> str:
+def as_page(outcomes: dict[str, list[Outcome]], one_step: dict[str, float]) -> str:
     """Return the results as a page in Markdown."""
-    command = f"python -m benchmarks.identification --plants {arguments.plants} --seed {arguments.seed}"
-    machine = f"{platform.machine()}, {os.cpu_count()} cores, jax {jax.__version__}"
+    rows = []
+    for name, found in outcomes.items():
+        tau, thrust = np.array([[one.tau_error, one.map_error] for one in found]).T
+        seconds = [one.seconds for one in found[1:] or found]  # the first compiles
+        cover = "" if name == "clean" else f"{np.mean([one.covers for one in found]):.1%}"
+        times = f"{np.median(seconds):.1f} / {max(seconds):.1f}"
+        cells = [f"{tau.max():.4%}", f"{AIMS[name][0]:.2%}", f"{np.median(tau):.4%}"]
+        cells += [f"{thrust.max():.4%}", f"{AIMS[name][1]:.2%}", f"{np.median(thrust):.4%}"]
+        rows.append((name, *cells, cover, times))
     errors = ", ".join(f"{channel} {error:.1e}" for channel, error in one_step.items())
-    return "\n".join(
-        [
-            "# Identification of plants drawn at run time",
-            "",
-            f"`{command}`, on {machine}.",
-            f"{arguments.plants} plants, two minutes each, three quarters of it fitted, on one core.",
-            "Sensors: gyro 0.1 rad/s, accelerometer 1.5 m/s^2, velocity 0.05 m/s, attitude 0.5 degrees,",
-            "quantised, 2 % of rows lost, no applied action (`flytrack_sysid/sensors.py`).",
-            "",
-            *table(outcomes),
-            "",
-            "The interval is asked of four lags and six coefficients of every plant; the aim is "
-            f"{COVERAGE_AIM[0]:.0%} to {COVERAGE_AIM[1]:.0%}.",
-            "Clean logs leave rounding only, which intervals of noise do not describe. The largest times",
-            "include compiling anew for logs of another length.",
-            "",
-            "Clean logs, held-out part: the largest one-step error of any plant, over the change in a step "
-            "(p, v, q)",
-            f"or the channel's spread (w, a): {errors}. That is float32 rounding.",
-            "",
-        ]
+    return report.page(
+        "Identification of plants drawn at run time",
+        f"{report.command_line()}: two minutes of each plant, three quarters of it fitted, on one core.\n"
+        "Sensors: gyro 0.1 rad/s, accelerometer 1.5 m/s^2, velocity 0.05 m/s, attitude 0.5 degrees,\n"
+        "quantised, 2 % of rows lost, no applied action (`flytrack_sysid/sensors.py`).",
+        report.table(HEADER, rows),
+        "Intervals are of the four lags and six coefficients of every plant; the aim is "
+        f"{COVERAGE_AIM[0]:.0%} to {COVERAGE_AIM[1]:.0%}. Clean logs\ncontain only rounding, which intervals "
+        "of noise do not describe. The largest times include compiling for logs\nof another length.",
+        "Clean logs, held-out part: the largest one-step error of any plant, over the change in a step "
+        f"(p, v, q) or\nthe channel's spread (w, a): {errors}. That is float32 rounding.",
+        report.provenance_line(report.provenance()),
     )
 
 
 def main() -> None:
     """Measure and write the page."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("--plants", type=int, default=50)
-    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--plants", type=int, default=50, help="number of plants")
+    parser.add_argument("--seed", type=int, default=0, help="of the plants and logs")
+    parser.add_argument("--page", type=Path, default=PAGE, help="page to write")
     arguments = parser.parse_args()
-    os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})  # one core, for the times
-    page = report(*run(arguments.plants, arguments.seed), arguments)
-    write_atomically(RESULT, page.encode())
-    print(page)
+    report.pin_to_one_core()
+    report.write_page(arguments.page, as_page(*run(arguments.plants, arguments.seed)))
 
 
 if __name__ == "__main__":

@@ -6,7 +6,9 @@ Nothing here imports JAX at the top, so that ``pin_to_one_core`` can run before 
 import json
 import os
 import platform
+import shlex
 import subprocess
+import sys
 from collections.abc import Iterable, Sequence
 from datetime import date
 from importlib.metadata import PackageNotFoundError, version
@@ -59,6 +61,13 @@ def commit_of_checkout() -> str:
         return "unknown"
 
 
+def command_line() -> str:
+    """Return the command that runs now, as a page names it."""
+    spec = sys.modules["__main__"].__spec__
+    module = spec.name.removesuffix(".__main__") if spec is not None else "benchmarks"
+    return f"`{shlex.join(['python', '-m', module, *sys.argv[1:]])}`"
+
+
 def provenance(*packages: str) -> dict[str, Any]:
     """Return what every record names: commit, date, machine and versions, as JSON values.
 
@@ -67,7 +76,7 @@ def provenance(*packages: str) -> dict[str, Any]:
     return {
         "commit": commit_of_checkout(),
         "date": str(date.today()),
-        "machine": f"{cpu_name()}, {len(os.sched_getaffinity(0))} cores",
+        "machine": f"{cpu_name()}, {os.cpu_count()} cores",
         "versions": versions(*packages),
     }
 
@@ -78,9 +87,10 @@ def provenance_line(record: dict[str, Any]) -> str:
     return f"Measured at commit {record['commit']} on {record['date']}; {record['machine']}; {packages}."
 
 
-def table(header: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
-    """Return a table in Markdown, without a newline at its end."""
-    lines = [header, ["---"] * len(header), *rows]
+def table(header: str | Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
+    """Return a table in Markdown, without a newline at its end; header: "column | column" or a sequence."""
+    columns = header.split(" | ") if isinstance(header, str) else header
+    lines = [columns, ["---"] * len(columns), *rows]
     return "\n".join(f"| {' | '.join(map(str, line))} |" for line in lines)
 
 

@@ -5,7 +5,6 @@ of the first one. Writes ``docs/results/training_curves.png`` and ``position_den
 """
 
 import argparse
-import io
 from pathlib import Path
 from typing import Any
 
@@ -19,13 +18,15 @@ from baselines.purejaxrl_ppo import Config
 from baselines.purejaxrl_ppo.density import draw_position_density
 from baselines.purejaxrl_ppo.evaluate import fly_many
 from baselines.purejaxrl_ppo.training import Trainer
-from benchmarks.env_speed import pin_to_one_core
+from benchmarks.report import RESULTS, ROOT, pin_to_one_core
 from flytrack_env.files import write_atomically
+from flytrack_env.pictures.style import png_of
 
+MODEL = ROOT / "benchmarks" / "data" / "ablations" / "model.json"
 STAGES_STEPS = (1_000_000, 2_000_000, 4_000_000, 20_000_000)
 NUM_EPISODES, NUM_LAPS, NUM_STEPS = 256, 3, 2500
 EVALUATION_SEED = 30_000
-# Panels: a metric of an update, and what stands beside it.
+# Panels: a metric of an update and its label.
 CURVES = {
     "episode_return": "return of an episode",
     "episode_length": "length of an episode (steps)",
@@ -52,7 +53,7 @@ def train(trainer: Trainer, seed: int, folder: Path | None) -> dict[str, np.ndar
 
 
 def draw_stage(trainer: Trainer, policy: Any, steps: int, folder: Path) -> None:
-    """Write where the flights of a stage spend their time."""
+    """Write the position density of a stage's flights."""
     flights = fly_many(
         trainer.env, trainer.network, policy, EVALUATION_SEED, NUM_EPISODES, NUM_STEPS, NUM_LAPS
     )
@@ -72,22 +73,18 @@ def draw_curves(curves: list[dict[str, np.ndarray]], batch_size: int) -> bytes:
         panel.grid(alpha=0.3)
     figure.axes[0].legend(fontsize=8)
     figure.supxlabel("environment steps (millions)")
-    content = io.BytesIO()
-    figure.savefig(content, format="png", dpi=110)
-    return content.getvalue()
+    return png_of(figure, 110)
 
 
 def main() -> None:
     """Train, draw, write."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--seeds", type=int, default=3)
-    parser.add_argument("--total-timesteps", type=float, default=Config.total_timesteps)
-    parser.add_argument("--model", type=Path, default=Path("benchmarks/data/ablations/model.json"))
-    parser.add_argument("--out", type=Path, default=Path("docs/results"))
+    parser.add_argument("--seeds", type=int, default=3, help="number of trainings")
+    parser.add_argument("--total-timesteps", type=float, default=Config.total_timesteps, help="per training")
+    parser.add_argument("--out", type=Path, default=RESULTS, help="folder of the pictures")
     arguments = parser.parse_args()
     pin_to_one_core()
-    arguments.out.mkdir(parents=True, exist_ok=True)
-    trainer = Trainer(Config(total_timesteps=int(arguments.total_timesteps)), model=arguments.model)
+    trainer = Trainer(Config(total_timesteps=int(arguments.total_timesteps)), model=MODEL)
     curves = [train(trainer, seed, arguments.out if seed == 0 else None) for seed in range(arguments.seeds)]
     write_atomically(arguments.out / "training_curves.png", draw_curves(curves, trainer.config.batch_size))
 
