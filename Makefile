@@ -1,17 +1,15 @@
 # `make setup` builds .venv from the lock file; `make demo` and `make test` build on it.
 # `make test-clients` builds .venv-clients, with RL code of others on top (docs/clients.md).
-# `make docs` builds .venv-docs and, in site/, the documentation (docs/contributing.md).
+# `make docs` builds the documentation into site/.
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.locked
 CLIENTS := .venv-clients
 CLIENTS_STAMP := $(CLIENTS)/.locked
-DOCS := .venv-docs
-DOCS_STAMP := $(DOCS)/.locked
 CHECK_PYTHON = $(PYTHON) -c 'import sys; v = sys.version_info; sys.exit(v < (3, 11) and f"Python 3.11 or newer is needed, found {v.major}.{v.minor}; try PYTHON=python3.11")'
 
-.PHONY: setup demo loop test check-diagnosis test-clients docs lint lock uv dist check-wheel check-versions clean
+.PHONY: setup demo loop test test-all check-diagnosis test-clients docs lint lock dist check-wheel check-versions clean
 
 setup: $(STAMP)
 
@@ -30,8 +28,13 @@ demo: setup
 loop: setup
 	$(BIN)/python -m benchmarks.loop
 
+# The fast tests: every capability once.
 test: setup
-	$(BIN)/python -m pytest --numprocesses 2 --dist loadfile
+	$(BIN)/python -m pytest --numprocesses 2 --dist loadfile -m "not slow"
+
+# The rest: statistics, long trainings, every tutorial.
+test-all: setup
+	$(BIN)/python -m pytest --numprocesses 2 --dist loadfile -m slow
 
 # Diagnoses 60 recorded plants again: names must stay and intervals agree to 1e-6; about 8 CPU minutes.
 check-diagnosis: setup
@@ -50,45 +53,29 @@ $(CLIENTS_STAMP): requirements.lock clients/requirements.txt pyproject.toml
 test-clients: $(CLIENTS_STAMP)
 	$(CLIENTS)/bin/python -m pytest clients
 
-# The docstrings are read without importing them, so that the tools are all that is needed.
-$(DOCS_STAMP): docs/requirements.lock
-	$(CHECK_PYTHON)
-	test -x $(DOCS)/bin/python || $(PYTHON) -m venv $(DOCS)
-	$(DOCS)/bin/python -m pip install --disable-pip-version-check --quiet --no-deps --require-hashes -r docs/requirements.lock
-	touch $(DOCS_STAMP)
-
-# Not --quiet: MkDocs then counts no warnings.
-docs: $(DOCS_STAMP)
-	NO_MKDOCS_2_WARNING=1 $(DOCS)/bin/python -m mkdocs build --strict
+docs: setup
+	$(BIN)/nox --session docs
 
 lint: setup
-	$(BIN)/ruff check .
-	$(BIN)/ruff format --check .
-	$(BIN)/mypy
+	$(BIN)/nox --session lint
 
-# Rewrites the lock file from pyproject.toml, for every supported Python; needs uv in the environment.
-lock: uv
+# Rewrites the lock file from pyproject.toml, for every supported Python.
+lock: setup
 	$(BIN)/uv pip compile --quiet --universal --python-version 3.11 --generate-hashes --no-annotate \
-		--no-header --extra train --extra sysid --extra viz --extra dev --output-file requirements.lock pyproject.toml
-	$(BIN)/python -c 'import tomllib; print("\n".join(tomllib.load(open("pyproject.toml", "rb"))["project"]["optional-dependencies"]["docs"]))' \
-		| $(BIN)/uv pip compile --quiet --universal --python-version 3.11 --generate-hashes --no-annotate \
-		--no-header --output-file docs/requirements.lock -
-
-# The next three need it; they build environments of their own.
-uv: setup
-	$(BIN)/python -m pip install --quiet uv
+		--no-header --extra train --extra sysid --extra viz --extra dev --extra docs \
+		--output-file requirements.lock pyproject.toml
 
 # dist/: the source distribution, and the wheel built from it.
-dist: uv
+dist: setup
 	$(BIN)/uv build --quiet --clear --out-dir dist .
 
-# Installs the wheel with each extra alone and uses it; runs the fast tests from the source distribution.
-check-wheel: uv
-	$(BIN)/python -m release.check_wheel
+# Installs the wheel with each extra alone and uses it; runs tests from the source distribution.
+check-wheel: setup
+	$(BIN)/nox --tags wheel
 
-# Rewrites docs/results/versions.md: the fast tests with the newest and the oldest versions that are allowed.
-check-versions: uv
-	$(BIN)/python -m release.versions
+# Runs the unit tests with the oldest and the newest versions that are allowed.
+check-versions: setup
+	$(BIN)/nox --tags versions
 
 clean:
-	rm -rf $(VENV) $(CLIENTS) $(DOCS) .jax_cache site build dist *.egg-info
+	rm -rf $(VENV) $(CLIENTS) .nox .jax_cache site build dist *.egg-info

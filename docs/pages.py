@@ -1,43 +1,86 @@
-"""Write the documentation's pages that the code determines: ``python -m docs.pages``.
+"""The site's pages that are not in ``docs/``, written by mkdocs-gen-files when the site is built.
 
-A page per environment id, effect and shipped track, the overview of effects, and the API reference's
-lists of names. A test holds that the committed pages are what this writes.
+They are the pages that the code determines (environment ids, effects, tracks), and Markdown from outside of
+``docs/``. Links in the repository's Markdown are relative paths, so that they work where it is browsed; here
+they are rewritten to the pages of the site. A link to a source file that has no page becomes plain text.
 """
 
-import argparse
+import posixpath
+import re
 from pathlib import Path
 
-from docs.api_pages import api_pages
-from docs.effect_pages import effect_page, effects_page
+from docs.effect_pages import effect_page, effects_table
 from docs.env_pages import env_page
 from docs.track_pages import track_page
 from flytrack_env.effects import EFFECTS
-from flytrack_env.files import write_atomically
 from flytrack_env.registration import ENVIRONMENTS
 from flytrack_env.tracks import available_tracks
 
-DOCS = Path(__file__).parent
+ROOT = Path(__file__).parents[1]
+COPIED = ("CHANGELOG.md", "CONTRIBUTING.md", "report.md", "blackbox/README.md")  # to repository/
+LINK = re.compile(r"(!?\[[^\]]*\])\((?!\w+:)([^)#\s]+)(#[^)\s]*)?\)")
+BLOCK = re.compile(r"(^`{3,}.*?^`{3,}$)", re.MULTILINE | re.DOTALL)
+# Pages of the site for what is a source file in the repository.
+PAGES_OF_SOURCES = {
+    "README.md": "index.md",
+    **{path: f"repository/{path}" for path in COPIED},
+    **{f"flytrack_env/effects/{effect.name}.py": f"effects/{effect.name}.md" for effect in EFFECTS},
+    **{f"flytrack_env/tracks/{name}.toml": f"tracks/{name}.md" for name in available_tracks()},
+}
 
 
-def pages() -> dict[Path, str]:
-    """Return every generated page by its path."""
+def generated_pages() -> dict[str, str]:
+    """Return the pages that the code determines, by their path on the site."""
     return {
-        **{DOCS / "envs" / f"{env_id}.md": env_page(env_id) for env_id in ENVIRONMENTS},
-        DOCS / "effects.md": effects_page(),
-        **{DOCS / "effects" / f"{effect.name}.md": effect_page(effect) for effect in EFFECTS},
-        **{DOCS / "tracks" / f"{name}.md": track_page(name) for name in available_tracks()},
-        **{DOCS / "api" / name: text for name, text in api_pages().items()},
+        **{f"envs/{env_id}.md": env_page(env_id) for env_id in ENVIRONMENTS},
+        **{f"effects/{effect.name}.md": effect_page(effect) for effect in EFFECTS},
+        **{f"tracks/{name}.md": track_page(name) for name in available_tracks()},
     }
 
 
-def main() -> None:
-    """Write the pages."""
-    argparse.ArgumentParser(description=__doc__).parse_args()
-    for path, text in pages().items():
-        path.parent.mkdir(exist_ok=True)
-        write_atomically(path, text.encode())
-        print(path)
+def appendices() -> dict[str, str]:
+    """Return what the site appends to hand-written pages: lists of generated pages."""
+    ids = "".join(f"- [{env_id}](envs/{env_id}.md)\n" for env_id in ENVIRONMENTS)
+    return {"effects.md": effects_table(), "environment.md": f"\n## Every id in detail\n\n{ids}"}
 
 
-if __name__ == "__main__":
-    main()
+def with_links(markdown: str, path: str, page: str) -> str:
+    """Return the Markdown of a file of the repository with its links as ``page`` of the site needs them."""
+
+    def rewrite(match: re.Match[str]) -> str:
+        text, target, anchor = match.group(1), match.group(2), match.group(3) or ""
+        linked = posixpath.normpath(posixpath.join(posixpath.dirname(path), target))
+        goal = linked.removeprefix("docs/") if linked.startswith("docs/") else PAGES_OF_SOURCES.get(linked)
+        if goal is None and (ROOT / linked).exists():
+            return text[1:-1]
+        relative = posixpath.relpath(goal or linked, posixpath.dirname(page) or ".")
+        return f"{text}({relative}{anchor})"
+
+    parts = BLOCK.split(markdown)  # every second part is a block of code
+    return "".join(part if i % 2 else LINK.sub(rewrite, part) for i, part in enumerate(parts))
+
+
+def site_pages() -> dict[str, str]:
+    """Return all pages that the site adds or changes, by their path on it."""
+    sources = {str(path.relative_to(ROOT)): path for path in sorted((ROOT / "docs").rglob("*.md"))}
+    sources |= {path: ROOT / path for path in COPIED}
+    appended = appendices()
+    pages = generated_pages()
+    for path, file in sources.items():
+        page = PAGES_OF_SOURCES.get(path, path.removeprefix("docs/"))
+        text = with_links(file.read_text(encoding="utf-8"), path, page)
+        pages[page] = text + appended.get(page, "")
+    return pages
+
+
+def write() -> None:
+    """Hand the pages to MkDocs."""
+    import mkdocs_gen_files  # of the documentation's tools
+
+    for path, text in site_pages().items():
+        with mkdocs_gen_files.open(path, "w") as file:
+            file.write(text)
+
+
+if __name__ == "<run_path>":  # as mkdocs-gen-files runs it
+    write()

@@ -1,39 +1,121 @@
-"""The examples in the docs run, in order, as one script per page."""
+"""The documentation agrees with the code: API reference, generated pages, tables, examples."""
 
+import ast
+import importlib
 import re
 from pathlib import Path
 
+import numpy as np
 import pytest
 
-DOCS = Path(__file__).parents[2] / "docs"
-PAGES = (
-    "environment.md",
-    "wrappers.md",
-    "effects.md",
-    "gymnasium.md",
-    "pictures.md",
-    "identification.md",
-    "real_logs.md",
-    "diagnosis.md",
-)
+from docs.effect_pages import effect_page
+from docs.env_pages import env_page
+from docs.track_pages import gate_rows, track_page
+from flytrack_env.effects import EFFECTS
+from flytrack_env.registration import ENVIRONMENTS
+from flytrack_env.tracks import DEMANDS, Limits, available_tracks, build_course, load_track, way_length
+from tests.support.pages import BLOCK, DOCS, ROOT, examples, run_examples
+
+PACKAGES = ("flytrack_env", "flytrack_sysid", "flytrack_loop", "baselines")
+REFERENCE = {
+    module
+    for path in (DOCS / "api").glob("*.md")
+    for module in re.findall(r"^::: ([\w.]+)$", path.read_text(), re.MULTILINE)
+}
+PAGES = [ROOT / "README.md", *sorted(DOCS.rglob("*.md"))]
+FAST = "environment.md"  # one page's examples run in the fast tests
+RUN = ("wrappers.md", "effects.md", "gymnasium.md", "pictures.md", "identification.md", "real_logs.md")
+RUN = (FAST, *RUN, "diagnosis.md", "quick_start.md", "faq.md")
 
 
-def examples(page: str) -> str:
-    """Return the Python of a page, its line numbers kept."""
-    text = (DOCS / page).read_text(encoding="utf-8")
-    kept, is_code = [], False
-    for line in text.splitlines():
-        if line.startswith("```"):
-            is_code = line == "```python"
-            line = ""
-        kept.append(line if is_code else "")
-    return "\n".join(kept)
+def slow_but(first: str, names: tuple[str, ...]) -> list:
+    """Return parameters of a test of which only the first is fast."""
+    return [pytest.param(name, marks=[] if name == first else pytest.mark.slow) for name in names]
 
 
-@pytest.mark.parametrize("page", PAGES)
+def test_every_public_package_is_in_the_reference() -> None:
+    files = [path for package in PACKAGES for path in (ROOT / package).rglob("__init__.py")]
+    packages = {".".join(path.relative_to(ROOT).parent.parts) for path in files}
+    public = {name for name in packages if hasattr(importlib.import_module(name), "__all__")}
+    assert public <= REFERENCE
+
+
+def test_every_module_of_the_reference_has_documented_names() -> None:
+    for name in REFERENCE:
+        module = importlib.import_module(name)
+        own = [key for key in vars(module) if getattr(vars(module)[key], "__module__", "") == name]
+        for key in getattr(module, "__all__", own):
+            value = getattr(module, key)
+            if callable(value) and not key.startswith("_"):
+                assert value.__doc__, f"{name}.{key}"
+
+
+@pytest.mark.parametrize("path", PAGES, ids=lambda path: str(path.relative_to(ROOT)))
+def test_what_a_page_imports_is_public(path: Path) -> None:
+    for node in ast.walk(ast.parse(examples(path.read_text(encoding="utf-8")))):
+        if isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[0] in PACKAGES:
+            module = importlib.import_module(node.module)
+            for alias in node.names:
+                is_module = f"{node.module}.{alias.name}" in REFERENCE
+                assert is_module or node.module in REFERENCE, f"{node.module}: not in the reference"
+                assert hasattr(module, alias.name), f"{node.module} has no {alias.name}"
+
+
+@pytest.mark.parametrize("page", slow_but(FAST, RUN))
 def test_examples_run(page: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    code = examples(page)
-    (tmp_path / "blackbox").symlink_to(DOCS.parent / "blackbox")
-    monkeypatch.chdir(tmp_path)  # pages may write files
-    assert re.search(r"\S", code), f"{page}: no example"
-    exec(compile("import gymnax\n" + code, page, "exec"), {})
+    run_examples((DOCS / page).read_text(encoding="utf-8"), tmp_path, monkeypatch)
+
+
+@pytest.mark.parametrize("env_id", ENVIRONMENTS)
+def test_page_of_an_id_has_every_table(env_id: str) -> None:
+    text = env_page(env_id)
+    assert text.count("|---|") >= 6 and ("## What is different" in text) == (env_id != "FlyTrack-v0")
+
+
+@pytest.mark.parametrize("name", slow_but("linear_drag", tuple(effect.name for effect in EFFECTS)))
+def test_page_of_an_effect_has_its_parameters_and_python_that_runs(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    effect = next(effect for effect in EFFECTS if effect.name == name)
+    text = effect_page(effect)
+    assert "<math" in text and all(f"\n| `{parameter}` |" in text for parameter in effect.ranges)
+    names = run_examples(text, tmp_path, monkeypatch)
+    names["env"].check_params(names["params"])
+
+
+@pytest.mark.parametrize("name", available_tracks())
+def test_page_of_a_track_has_the_headings_of_its_gates(name: str) -> None:
+    track = load_track(name)
+    forward = np.stack(build_course(track).gates.forward, axis=-1)[:, :2]
+    headings = np.deg2rad([heading_deg for _, _, heading_deg, _ in gate_rows(track)])
+    np.testing.assert_allclose(forward, np.stack([np.cos(headings), np.sin(headings)], -1), atol=1e-5)
+    assert BLOCK.search(track_page(name)) and (DOCS / "tracks" / f"{name}.png").is_file()
+
+
+def test_table_of_tracks_is_that_of_the_files() -> None:
+    text = (DOCS / "tracks.md").read_text(encoding="utf-8")
+    rows = {
+        name: cells.split(" | ")[:4] for name, cells in re.findall(r"^\| `(\w+)` \| (.*) \|$", text, re.M)
+    }
+    expected = {}
+    for name in available_tracks():
+        track = load_track(name)
+        heights = [gate.position[2] for gate in track.gates]
+        length = f"{way_length(build_course(track)):.1f}"
+        sizes = [str(len(track.gates)), f"{track.gates[0].opening:g}", length]
+        expected[name] = [*sizes, f"{min(heights):g} to {max(heights):g}"]
+    assert rows == expected
+
+
+def test_documented_limits_are_the_checks() -> None:
+    text = (DOCS / "tracks.md").read_text(encoding="utf-8")
+    rows = dict(re.findall(r"^\| ([a-z ]+) \| (.*) \|$", text[text.index("| demand |") :], re.M)[1:])
+    limits = Limits()
+    numbers = {
+        "opening": f"{limits.min_opening:g} m",
+        "spacing": f"{limits.min_spacing:g} to {limits.max_spacing:g} m",
+        "turn": f"{limits.max_turn_deg:g} deg",
+        "path": f"{limits.clearance:g} m",
+        "start": f"{limits.min_start_distance:g} to {limits.max_spacing:g} m",
+    }
+    assert tuple(rows) == DEMANDS and all(number in rows[demand] for demand, number in numbers.items())

@@ -1,48 +1,29 @@
-"""The tutorials, the quick start and the FAQ run as they are written, and end where they say."""
+"""The tutorials run as they are written, and end where they say."""
 
 from pathlib import Path
-from typing import Any
 
 import pytest
 
 from flytrack_env import find_problems, load_model, load_track
 from flytrack_env.rollout import load_rollout
-from tests.contract.test_docs import DOCS, examples
+from tests.support.pages import DOCS, examples, run_examples
+
+pytestmark = pytest.mark.slow
 
 
-def run(page: str, folder: Path, monkeypatch: pytest.MonkeyPatch, until: str = "") -> dict[str, Any]:
-    """Run a page's Python in a folder, up to a heading if one is given, and return its names."""
-    (folder / "blackbox").symlink_to(DOCS.parent / "blackbox")
-    monkeypatch.chdir(folder)
-    code, names = examples(page), {}
-    if until:
-        line = (DOCS / page).read_text(encoding="utf-8").splitlines().index(until)
-        code = "\n".join(code.splitlines()[:line])
-    exec(compile(code, page, "exec"), names)
-    return names
+def tutorial(name: str) -> str:
+    """Return a tutorial's text."""
+    return (DOCS / "tutorials" / f"{name}.md").read_text(encoding="utf-8")
 
 
-def test_quick_start(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    names = run("quick_start.md", tmp_path, monkeypatch)
-    assert names["rewards"].shape == (100, 256) and int(names["terminated"].sum()) > 0
-
-
-def test_faq(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    run("faq.md", tmp_path, monkeypatch)  # it asserts what it claims
-
-
-def test_algorithm_improves_what_it_earns(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    names = run("tutorials/algorithm.md", tmp_path, monkeypatch)
+def test_algorithm_improves_its_return(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    names = run_examples(tutorial("algorithm"), tmp_path, monkeypatch)
     assert names["after"] > names["before"] + 0.3
+    assert len([line for line in examples(tutorial("algorithm")).splitlines() if line.strip()]) < 80
 
 
-def test_algorithm_is_short() -> None:
-    lines = [line for line in examples("tutorials/algorithm.md").splitlines() if line.strip()]
-    assert len(lines) < 80
-
-
-def test_track_is_mended_and_flown(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    names = run("tutorials/track.md", tmp_path, monkeypatch)
+def test_track_is_corrected_and_flown(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    names = run_examples(tutorial("track"), tmp_path, monkeypatch)
     assert [problem.demand for problem in names["problems"]] == ["ground"]
     assert not find_problems(load_track(tmp_path / "square.toml"))
     states, _ = load_rollout(tmp_path / "square.npy")
@@ -51,37 +32,24 @@ def test_track_is_mended_and_flown(tmp_path: Path, monkeypatch: pytest.MonkeyPat
 
 
 def test_black_box(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    names = run("tutorials/black_box.md", tmp_path, monkeypatch)
-    assert "signature: found" in capture(names) and names["rewards"].shape == (8,)
-    assert len(names["log"]) > 4000
-
-
-def capture(names: dict[str, Any]) -> str:
-    """Return what loading the tutorial's wrong file says."""
-    with pytest.raises(names["blackbox"].BlackBoxError) as refused:
+    names = run_examples(tutorial("black_box"), tmp_path, monkeypatch)
+    with pytest.raises(names["blackbox"].BlackBoxError, match="signature: found"):
         names["blackbox"].load("wrong.bin")
-    return str(refused.value)
+    assert names["rewards"].shape == (8,) and len(names["log"]) > 4000
 
 
-def test_flight_log_is_imported_and_fitted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    names = run("tutorials/flight_log.md", tmp_path, monkeypatch, until="## Diagnose")
+def test_flight_log(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    names = run_examples(tutorial("flight_log"), tmp_path, monkeypatch)
     assert len(names["log"]) > 2500 and set(names["log"].channels) == {"u", "q", "v", "w", "f", "v_bat"}
     assert load_model(tmp_path / "model.json").tau[:3] == pytest.approx([0.04] * 3, rel=0.02)
-    assert names["errors"].one_step.channels["f"].nrmse > 0.2  # the drag that it lacks
-
-
-@pytest.mark.slow
-def test_flight_log_is_diagnosed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    names = run("tutorials/flight_log.md", tmp_path, monkeypatch)
-    causes = {cause.effect: cause for cause in names["diagnosis"].causes}
-    assert set(causes) == {"linear_drag", "thrust_curve"}
+    assert names["errors"].one_step.channels["f"].nrmse > 0.2  # the model lacks the drag
+    assert {cause.effect for cause in names["diagnosis"].causes} == {"linear_drag", "thrust_curve"}
     drag = load_model(tmp_path / "diagnosis" / "extended_model.json").effect("linear_drag")
     assert drag == pytest.approx((0.4, 0.4, 0.2), rel=0.05)
 
 
-@pytest.mark.slow
 def test_better_policy(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    names = run("tutorials/better_policy.md", tmp_path, monkeypatch)
+    names = run_examples(tutorial("better_policy"), tmp_path, monkeypatch)
     loop, errors = names["loop"], names["errors_of"](names["found"].extended, names["loop"].held_out)
     assert errors.position_m["0.5"] < loop.before.errors.position_m["0.5"]
     assert loop.after.errors.position_m["0.5"] < loop.before.errors.position_m["0.5"]

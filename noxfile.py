@@ -1,0 +1,159 @@
+"""Checks of the repository and of its releases: ``make lint docs check-wheel check-versions``.
+
+``nox --list`` names the sessions. Those of a release install into fresh environments, made by uv, and run in
+empty folders, so that nothing of the checkout can be imported by accident.
+"""
+
+import shlex
+import shutil
+import subprocess
+import sys
+import tarfile
+import zipfile
+from functools import cache
+from pathlib import Path
+
+import nox
+
+nox.options.default_venv_backend = "uv"
+nox.options.sessions = ["lint", "docs"]
+nox.options.error_on_missing_interpreters = False
+
+ROOT = Path(__file__).parent
+PACKAGES = ("baselines", "flytrack_env", "flytrack_loop", "flytrack_sysid")
+HEADLESS = {"JAX_PLATFORMS": "cpu", "MPLBACKEND": "agg", "SDL_VIDEODRIVER": "dummy", "PYTHONPATH": ""}
+TEST_TOOLS = ("pytest>=9", "hypothesis>=6.150", "pillow", "pyulog>=1.2", "orangebox>=0.4,<0.5")
+PLANT = ROOT / "blackbox" / "acro_step.bin"
+
+FLY_EVERY_ID = """
+import gymnasium, gymnax, jax, flytrack_env
+for env_id in flytrack_env.registration.ENVIRONMENTS:
+    env, params = gymnax.make(env_id)
+    observation, state = env.reset(jax.random.key(0), params)
+    env.step(jax.random.key(1), state, env.action_space(params).sample(jax.random.key(2)), params)
+    envs = gymnasium.make_vec(f"flytrack_env:{env_id}", num_envs=3, vectorization_mode="vector_entry_point")
+    assert envs.reset(seed=0)[0].shape == envs.step(envs.action_space.sample())[0].shape
+"""
+MISSING_EXTRA_IS_NAMED = """
+import importlib
+from pytest import raises
+modules = {"sysid": "flytrack_sysid", "train": "baselines.purejaxrl_ppo", "viz": "flytrack_env.viz_rerun"}
+for extra, module in modules.items():
+    with raises(ImportError, match=rf"pip install 'flytrack\\[{extra}\\]'"):
+        importlib.import_module(module)
+"""
+LOAD_CHAMPION = """
+from importlib import resources
+from baselines.purejaxrl_ppo import load_checkpoint
+load_checkpoint(next((resources.files("baselines.purejaxrl_ppo") / "champion").glob("flytrack.*")))
+"""
+SAVE_GHOST = """
+import numpy as np
+from flytrack_env import load_track
+from flytrack_env.references import ghost_rollout, shipped_references
+from flytrack_env.rollout import save_rollout
+ghost = shipped_references(load_track("flytrack"), ("nominal",))
+save_rollout("flight.npy", *map(np.asarray, ghost_rollout(ghost, 400)))
+"""
+RENDER = """
+import gymnasium
+from gymnasium.wrappers import RecordVideo
+film = gymnasium.make("flytrack_env:FlyTrack-v0", render_mode="rgb_array")
+window = gymnasium.make("FlyTrack-v0", render_mode="human")
+for env in (RecordVideo(film, "videos", lambda number: True, video_length=30), window):
+    env.reset(seed=0)
+    [env.step(env.action_space.sample()) for _ in range(40)]
+    env.close()
+"""
+L2F = "from benchmarks.env_speed import l2f_contestant; l2f_contestant('l2f', 1024, 8).run()"
+SIZES = "--num-envs 16 --num-steps 32 --num-minibatches 4 --total-timesteps 1024 --hidden-sizes 8"
+
+# What each extra is for: modules with their arguments, or code.
+USES = {
+    "": (FLY_EVERY_ID, MISSING_EXTRA_IS_NAMED),
+    "train": (f"-m baselines.purejaxrl_ppo.train_ppo {SIZES} --out small", LOAD_CHAMPION),
+    "sweep": (f"-m baselines.purejaxrl_ppo.sweeps space.toml {SIZES} --out sweep",),
+    "sysid": (
+        f"-m flytrack_sysid.cli collect --black-box {PLANT} --minutes 1 --out data.npz",
+        "-m flytrack_sysid.cli fit data.npz --out model.json",
+        "-m flytrack_sysid.cli validate model.json data.npz --out report",
+        "-m flytrack_sysid.cli diagnose data.npz --model model.json --out diagnosis",
+    ),
+    "logs": ("-m pytest -q -k 'ulog or betaflight' tests/unit",),
+    "viz": (
+        SAVE_GHOST,
+        "-m flytrack_env.viz_rerun flight.npy --out flight.rrd",
+        "-m flytrack_env.pictures flight.npy --out pictures",
+    ),
+    "render": (RENDER,),
+    "optimal": ("-m benchmarks.time_optimal --tracks speedway --kinds flying --out made",),
+    "bench": (L2F,),  # compiles l2f for ten minutes, in 4 GB
+}
+WITH_CHECKOUT = ("logs", "optimal", "bench")  # use files that the wheel does not have:
+COPIED = ("benchmarks", "blackbox", "tests", "pyproject.toml")
+
+
+@cache
+def built() -> tuple[Path, Path]:
+    """Build the source distribution and, from it, the wheel; return both: wheel, source."""
+    folder = ROOT / ".nox" / "dist"
+    subprocess.run([sys.executable, "-m", "uv", "build", "--clear", "--out-dir", folder, ROOT], check=True)
+    return next(folder.glob("*.whl")), next(folder.glob("*.tar.gz"))
+
+
+@nox.session(tags=["wheel"])
+def contents(session: nox.Session) -> None:
+    """The wheel has the packages' files; the source distribution has every tracked file."""
+    listed = subprocess.run(["git", "ls-files"], cwd=ROOT, capture_output=True, text=True, check=True)
+    tracked = set(listed.stdout.splitlines())
+    wheel, source = built()
+    with zipfile.ZipFile(wheel) as archive:
+        in_wheel = {name for name in archive.namelist() if ".dist-info/" not in name}
+    with tarfile.open(source) as archive:
+        in_source = {entry.name.partition("/")[2] for entry in archive if entry.isfile()}
+    in_packages = {path for path in tracked if path.startswith(PACKAGES)}
+    if difference := in_wheel ^ in_packages:
+        session.error(f"{wheel.name}: differs from the repository in {sorted(difference)}")
+    if missing := tracked - in_source - {".gitignore", ".ci/run"}:
+        session.error(f"{source.name}: lacks {sorted(missing)}")
+
+
+@nox.session(tags=["wheel"])
+@nox.parametrize("extra", list(USES), ids=[extra or "core" for extra in USES])
+def wheel(session: nox.Session, extra: str) -> None:
+    """Install the wheel with one extra alone, or none, and use what the extra is for."""
+    tools = TEST_TOOLS if extra == "logs" else ("pytest",)
+    session.install(f"flytrack{f'[{extra}]' if extra else ''} @ {built()[0].as_uri()}", *tools)
+    folder = Path(session.create_tmp())
+    for name in COPIED if extra in WITH_CHECKOUT else ():
+        copy = shutil.copytree if (ROOT / name).is_dir() else shutil.copy2
+        copy(ROOT / name, folder / name)
+    (folder / "space.toml").write_text("[learning_rate]\ngrid_search = [1e-3, 2e-3]\n")
+    with session.chdir(folder):
+        for use in USES[extra]:
+            arguments = shlex.split(use) if use.startswith("-m ") else ["-c", use]
+            session.run("python", *arguments, env=HEADLESS)
+
+
+@nox.session(tags=["versions"], python=["3.11", "3.12", "3.13"])
+@nox.parametrize("resolution", ["highest", "lowest-direct"])
+def versions(session: nox.Session, resolution: str) -> None:
+    """Run the unit tests with the newest allowed versions, and on the oldest Python with the oldest."""
+    if resolution == "lowest-direct" and session.python != "3.11":
+        session.skip("the oldest versions are tried on the oldest Python alone")
+    session.install(".[train,sysid,viz]", *TEST_TOOLS, "--resolution", resolution)
+    lenient = ("-W", "default::DeprecationWarning") if resolution == "lowest-direct" else ()
+    session.run("python", "-m", "pytest", "-q", "-m", "not slow", *lenient, "tests/unit", env=HEADLESS)
+
+
+@nox.session(venv_backend="none")
+def lint(session: nox.Session) -> None:
+    """Run ruff and mypy in the current environment."""
+    for command in ("ruff check .", "ruff format --check .", "mypy"):
+        session.run(sys.executable, "-m", *command.split())
+
+
+@nox.session(venv_backend="none")
+def docs(session: nox.Session) -> None:
+    """Build the documentation into site/; broken links and pages outside of the navigation are errors."""
+    session.run(sys.executable, "-m", "mkdocs", "build", "--strict", env={"NO_MKDOCS_2_WARNING": "1"})

@@ -1,0 +1,37 @@
+"""Markdown pages: their Python examples and their commands."""
+
+import re
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+DOCS = ROOT / "docs"
+BLOCK = re.compile(r"^```(\w*)\n(.*?)^```", re.MULTILINE | re.DOTALL)
+
+
+def examples(text: str) -> str:
+    """Return the Python of a page."""
+    return "\n".join(code for language, code in BLOCK.findall(text) if language == "python")
+
+
+def run_examples(text: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
+    """Run a page's Python as one script in a folder and return its names."""
+    (folder / "blackbox").symlink_to(ROOT / "blackbox")
+    monkeypatch.chdir(folder)
+    names: dict[str, Any] = {}
+    exec(compile("import gymnax\n" + examples(text), "page", "exec"), names)
+    return names
+
+
+def commands(text: str) -> list[str]:
+    """Return the commands in a page's blocks without a language, one a line, without their comments."""
+    lines = [
+        line
+        for language, code in BLOCK.findall(text)
+        if language in ("", "bash")
+        for line in code.splitlines()
+    ]
+    starts = (".venv/bin/", "make ", "python ", "flytrack-sysid ")
+    return [line.partition("  #")[0].removeprefix(".venv/bin/") for line in lines if line.startswith(starts)]
