@@ -38,6 +38,7 @@ from jax.custom_batching import custom_vmap
 from flytrack_env import artifact
 from flytrack_env.apart import Apart, ApartError, ResourceLimits, is_possible
 from flytrack_env.dynamics import ModelParameters
+from flytrack_env.plants import Plant
 from flytrack_env.quaternion import Quaternion, Scalar, Vec3
 from flytrack_env.state import (
     ACTION_SIZE,
@@ -134,8 +135,8 @@ def _mapped(exported: export.Exported) -> Callable[[jax.Array, jax.Array], jax.A
     return call_rows
 
 
-class BlackBox:
-    """A plant (``flytrack_env.plants``) that steps an artifact; ``load`` makes one.
+class BlackBox(Plant):
+    """A plant that steps an artifact; ``load`` makes one.
 
     Its state is the drone with scalar leaves: environments choose between states leaf by leaf.
     Works under ``jit``, ``vmap`` and ``scan`` on the CPU; nothing differentiates through it. Where

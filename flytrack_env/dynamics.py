@@ -12,13 +12,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from flytrack_env import effects
-from flytrack_env.effects import Flight
+from flytrack_env.effects import StepContext
 from flytrack_env.fusion import compute_once
 from flytrack_env.quaternion import Quaternion, Scalar, Vec3
 from flytrack_env.state import ACTION_SIZE, Action, Drone, pack, unpack, unpack_action
 
 SECONDS_PER_MINUTE = 60.0
-HELD_S = 1e6  # s, how long "for long" is: lags, leads and limits of the rates are over, to float32's rounding
+HELD_S = 1e6  # s, long enough for lags and limits of the rates to settle, to float32's rounding
 
 
 class ModelParameters(NamedTuple):
@@ -31,9 +31,9 @@ class ModelParameters(NamedTuple):
     has, in the order of ``flytrack_env.effects.EFFECTS``; without any, the model is the handout's.
     """
 
-    tau: jax.Array
-    thrust_coeffs: jax.Array
-    max_rate: jax.Array
+    tau: jax.Array | np.ndarray
+    thrust_coeffs: jax.Array | np.ndarray
+    max_rate: jax.Array | np.ndarray
     m: Scalar
     g: Scalar
     battery_drain_v_per_min: Scalar = 1.0
@@ -72,7 +72,7 @@ def nominal_parameters() -> ModelParameters:
     )
 
 
-def collective_thrust(thrust_action: Scalar, battery_v: Scalar, coeffs: jax.Array) -> Scalar:
+def collective_thrust(thrust_action: Scalar, battery_v: Scalar, coeffs: jax.Array | np.ndarray) -> Scalar:
     """Return the thrust in N along body z for a lagged thrust action and a battery voltage.
 
     ``coeffs`` has shape (6,); handout, task 1, equation 3.
@@ -93,7 +93,7 @@ def lag(applied: Action, command: Action, dt: Scalar, tau: Any) -> Action:
     return Action(*(old + fraction * (new - old) for old, new, fraction in pairs))
 
 
-def body_rates(applied: Action, max_rate: jax.Array) -> Vec3:
+def body_rates(applied: Action, max_rate: jax.Array | np.ndarray) -> Vec3:
     """Return body rates in rad/s of an applied action; ``max_rate`` has shape (3,), deg/s."""
     full_stick = jnp.deg2rad(jnp.asarray(max_rate))
     return Vec3(applied.roll * full_stick[0], applied.pitch * full_stick[1], applied.yaw * full_stick[2])
@@ -107,36 +107,36 @@ def integrate_attitude(quat: Quaternion, rates_b: Vec3, dt: Scalar) -> Quaternio
 
 
 def start_rates(drone: Drone, params: ModelParameters) -> Vec3:
-    """Return the body rates, rad/s, of a drone that has flown with its applied action for long."""
+    """Return the steady body rates, rad/s, of a drone's applied action."""
     rates_b = body_rates(drone.applied, params.max_rate)
     if not effects.acts(params.effects, "rates"):
         return rates_b
     applied, axes = drone.applied, drone.quat.axes()
-    flight = Flight(drone=drone, command=applied, dt=HELD_S, applied=applied, body_axes_w=axes)
+    context = StepContext(drone=drone, command=applied, dt=HELD_S, applied=applied, body_axes_w=axes)
     memories = effects.start_memories(params.effects, drone)
-    flight = _with_thrust(flight, params, memories)
-    return effects.fold("rates", params.effects, memories, rates_b, flight)
+    context = _with_thrust(context, params, memories)
+    return effects.fold("rates", params.effects, memories, rates_b, context)
 
 
-def _with_thrust(flight: Flight, params: ModelParameters, memories: tuple[Any, ...]) -> Flight:
-    """Return the flight with what the stages air and thrust find out."""
+def _with_thrust(context: StepContext, params: ModelParameters, memories: tuple[Any, ...]) -> StepContext:
+    """Return the context with the results of the stages air and thrust."""
     air_w = Vec3(0.0, 0.0, 0.0)
     if effects.acts(params.effects, "air"):
-        air_w = compute_once(effects.fold("air", params.effects, memories, air_w, flight))
-    flight = flight._replace(air_w=air_w)
-    thrust = collective_thrust(flight.applied.thrust, flight.drone.battery_v, params.thrust_coeffs)
-    thrust = effects.fold("thrust", params.effects, memories, thrust, flight)
-    return flight._replace(thrust_acc=compute_once(thrust / params.m))
+        air_w = compute_once(effects.fold("air", params.effects, memories, air_w, context))
+    context = context._replace(air_w=air_w)
+    thrust = collective_thrust(context.applied.thrust, context.drone.battery_v, params.thrust_coeffs)
+    thrust = effects.fold("thrust", params.effects, memories, thrust, context)
+    return context._replace(thrust_acc=compute_once(thrust / params.m))
 
 
-def _forces(flight: Flight, params: ModelParameters, memories: tuple[Any, ...]) -> tuple[Vec3, Vec3]:
+def _forces(context: StepContext, params: ModelParameters, memories: tuple[Any, ...]) -> tuple[Vec3, Vec3]:
     """Return the acceleration, world, and the specific force, body, m/s^2: thrust and what effects add."""
-    axes, thrust_acc = flight.body_axes_w, flight.thrust_acc
+    axes, thrust_acc = context.body_axes_w, context.thrust_acc
     acc_w = axes[2].scale(thrust_acc) - Vec3(0.0, 0.0, params.g)
     if not effects.acts(params.effects, "force"):
         return acc_w, Vec3(jnp.zeros_like(thrust_acc), jnp.zeros_like(thrust_acc), thrust_acc)
     still = Vec3(0.0, 0.0, 0.0)
-    beside_b = compute_once(effects.fold("force", params.effects, memories, still, flight))
+    beside_b = compute_once(effects.fold("force", params.effects, memories, still, context))
     acc_w = acc_w + (axes[0].scale(beside_b.x) + axes[1].scale(beside_b.y) + axes[2].scale(beside_b.z))
     return acc_w, beside_b._replace(z=beside_b.z + thrust_acc)
 
@@ -144,27 +144,27 @@ def _forces(flight: Flight, params: ModelParameters, memories: tuple[Any, ...]) 
 def advance(
     drone: Drone, memories: tuple[Any, ...], command: Action, dt: Scalar, params: ModelParameters
 ) -> tuple[Drone, tuple[Any, ...]]:
-    """Return the drone ``dt`` seconds later under a held command, and what its effects remember then.
+    """Return the drone ``dt`` seconds later under a held command, and the memories of its effects.
 
     The acceleration uses the attitude *before* the step and the thrust of the lagged action
     *after* it (handout, equations 1 to 4). Commands are not clipped here. memories: as from
     ``effects.start_memories``.
     """
-    flight = Flight(drone=drone, command=command, dt=dt)
+    context = StepContext(drone=drone, command=command, dt=dt)
 
-    def fold(stage: str, value: Any) -> Any:  # with what is known of the flight by then
-        return effects.fold(stage, params.effects, memories, value, flight)
+    def fold(stage: str, value: Any) -> Any:  # sees the context of the moment
+        return effects.fold(stage, params.effects, memories, value, context)
 
     acting = fold("command", command)
-    flight = flight._replace(acting=acting)
+    context = context._replace(acting=acting)
     tau = fold("lag", Action(*(params.tau[i] for i in range(ACTION_SIZE))))
     applied = compute_once(lag(drone.applied, acting, dt, tau))
-    flight = flight._replace(applied=applied, body_axes_w=compute_once(drone.quat.axes()))
-    flight = _with_thrust(flight, params, memories)
+    context = context._replace(applied=applied, body_axes_w=compute_once(drone.quat.axes()))
+    context = _with_thrust(context, params, memories)
     rates_b = fold("rates", body_rates(applied, params.max_rate))
-    flight = flight._replace(rates_b=rates_b)
-    acc_w, force_b = _forces(flight, params, memories)
-    acc_w, flight = compute_once(acc_w), flight._replace(force_b=force_b)
+    context = context._replace(rates_b=rates_b)
+    acc_w, force_b = _forces(context, params, memories)
+    acc_w, context = compute_once(acc_w), context._replace(force_b=force_b)
     after = Drone(
         pos_w=drone.pos_w + drone.vel_w.scale(dt) + acc_w.scale(0.5 * dt * dt),
         vel_w=drone.vel_w + acc_w.scale(dt),
@@ -174,37 +174,39 @@ def advance(
         applied=applied,
         battery_v=fold("battery", drone.battery_v - params.battery_drain_v_per_min / SECONDS_PER_MINUTE * dt),
     )
-    return compute_once(after), effects.remember(params.effects, memories, flight)
+    return compute_once(after), effects.remember(params.effects, memories, context)
 
 
 class Reading(NamedTuple):
-    """What the sensors say after a step: body rates, rad/s, and specific force, m/s^2, body frame."""
+    """What the sensors read after a step: body rates, rad/s, and specific force, m/s^2, body frame."""
 
     rates_b: Vec3
     force_b: Vec3
 
 
 def read_gyro(drone: Drone, memories: tuple[Any, ...], dt: Scalar, params: ModelParameters) -> Vec3:
-    """Return what the gyro says of a drone's body rates, rad/s.
+    """Return the body rates that the gyro of a drone reads, rad/s.
 
-    memories: what effects remember of the flight up to this drone. dt: s, the step between readings.
+    memories: of the effects, up to this drone. dt: s, the step between readings.
     """
-    flight = Flight(drone=drone, command=drone.applied, dt=dt, applied=drone.applied, rates_b=drone.rates_b)
-    return effects.fold("gyro", params.effects, memories, drone.rates_b, flight)
+    context = StepContext(
+        drone=drone, command=drone.applied, dt=dt, applied=drone.applied, rates_b=drone.rates_b
+    )
+    return effects.fold("gyro", params.effects, memories, drone.rates_b, context)
 
 
 def read_sensors(
     before: Drone, after: Drone, memories: tuple[Any, ...], dt: Scalar, params: ModelParameters
 ) -> Reading:
-    """Return what gyro and accelerometer say after a step of ``dt`` seconds.
+    """Return the readings of gyro and accelerometer after a step of ``dt`` seconds.
 
-    The true specific force is that of the step, in the body frame before it, as ``advance`` has it.
-    memories: what effects remember *after* the step.
+    The true specific force is that of the step, in the body frame before it, as in ``advance``.
+    memories: of the effects, *after* the step.
     """
     axes = before.quat.axes()
     force_w = after.acc_w + Vec3(0.0, 0.0, params.g)
     force_b = compute_once(Vec3(*(axis.dot(force_w) for axis in axes)))
-    flight = Flight(
+    context = StepContext(
         drone=before,
         command=after.applied,
         dt=dt,
@@ -215,7 +217,7 @@ def read_sensors(
     )
     return Reading(
         rates_b=read_gyro(after, memories, dt, params),
-        force_b=effects.fold("accelerometer", params.effects, memories, force_b, flight),
+        force_b=effects.fold("accelerometer", params.effects, memories, force_b, context),
     )
 
 

@@ -48,6 +48,7 @@ class FlyTrack(EpisodicEnvironment):
     Raises:
         TrackError, ModelFileError: a track or model that cannot be read.
         ValueError: another value of ``missed_gate``; an unknown reward term, or a weight that is no number.
+        TypeError: a plant that is not a ``flytrack_env.plants.Plant``.
     """
 
     def __init__(
@@ -63,6 +64,8 @@ class FlyTrack(EpisodicEnvironment):
             raise ValueError(f"missed_gate: found {missed_gate!r}, expected one of {MISSED_GATE_CHOICES}")
         self.track: Track = track if isinstance(track, Track) else load_track(track)
         self.plant: Plant = Simulator() if plant is None else plant
+        if not isinstance(self.plant, Plant):
+            raise TypeError(f"plant: found {type(plant).__name__}, expected a subclass of plants.Plant")
         self.missed_gate = missed_gate
         if model is None:
             model = nominal_parameters()
@@ -100,9 +103,9 @@ class FlyTrack(EpisodicEnvironment):
     def observe_drone(self, drone: Drone, state: EnvState, params: EnvParams) -> list[jax.Array]:
         """Return the observation before the gate to be flown, float32 scalars.
 
-        Body rates are the gyro's reading where the model has effects on it and the plant is the simulator.
+        Body rates are the gyro's reading where the model has effects on it.
         """
-        if acts(params.model.effects, "gyro") and hasattr(self.plant, "read_gyro"):
+        if acts(params.model.effects, "gyro"):
             rates_b = self.plant.read_gyro(state.plant, drone, params.dt, params.model)
             drone = drone._replace(rates_b=rates_b)
         return observe_race(drone, state.race.gate, state.race.next_gate)
@@ -183,6 +186,6 @@ class FlyTrack(EpisodicEnvironment):
     def check_params(self, params: EnvParams) -> None:
         """Raise ValueError for what cannot be flown, or a step of time that the plant does not have."""
         params.check()
-        plant_dt = getattr(self.plant, "dt", params.dt)
-        if not np.allclose(params.dt, plant_dt, rtol=1e-5):
+        plant_dt = self.plant.dt
+        if plant_dt is not None and not np.allclose(params.dt, plant_dt, rtol=1e-5):
             raise ValueError(f"dt: found {params.dt} s, expected {plant_dt} s, which the plant has baked in")

@@ -101,6 +101,10 @@ class EpisodicEnvironment(environment.Environment[Any, EnvParams]):  # type: ign
         """Return the observation of a state whose sensors report ``drone``: a float32 scalar per row."""
         raise NotImplementedError
 
+    def is_truncated(self, state: Any, params: EnvParams) -> jax.Array:
+        """Return whether the episode is cut off, by the time limit, a bool scalar."""
+        raise NotImplementedError
+
     def settle(self, state: Any, params: EnvParams) -> Any:
         """Return a state that auto-reset has chosen with everything that follows from the rest of it."""
         raise NotImplementedError

@@ -1,11 +1,12 @@
 """Plants: what moves the drone. The simulator is one, a black box is another.
 
-The environment, the evaluator and the identification tools fly anything with this contract.
-A plant's state is a pytree of its own, because a plant may remember more than the drone shows (a
-delay buffer, say); whoever holds a state asks for the drone in it.
+The environment, the evaluator and the identification tools fly any subclass of ``Plant``. A plant's
+state is a pytree of its own, because it may hold more than the drone (a delay buffer, say);
+``Plant.drone`` returns the drone in it.
 """
 
-from typing import Any, NamedTuple, Protocol
+from abc import ABC, abstractmethod
+from typing import Any, NamedTuple
 
 from flytrack_env.dynamics import ModelParameters, advance, read_gyro
 from flytrack_env.effects import start_memories
@@ -13,22 +14,30 @@ from flytrack_env.quaternion import Scalar, Vec3
 from flytrack_env.state import Action, Drone
 
 
-class Plant(Protocol):
+class Plant(ABC):
     """Pure functions for one drone; all of them work under ``jit``, ``vmap`` and ``scan``.
 
-    A plant with everything baked in says so with an attribute ``dt``, its only step of time, s: it does
-    not look at ``model`` either. A plant whose gyro can say something else than the drone's rates has a
-    ``read_gyro`` as the simulator's.
+    dt: the only time step that the plant can take, s; None if it takes any. A plant with a ``dt`` has its
+    parameters baked in and ignores ``model`` as well.
     """
 
+    dt: float | None = None
+
+    @abstractmethod
     def reset(self, drone: Drone, model: ModelParameters) -> Any:
         """Return the plant's state with the drone in that state and nothing remembered."""
 
+    @abstractmethod
     def step(self, state: Any, command: Action, dt: Scalar, model: ModelParameters) -> Any:
         """Return the plant's state ``dt`` seconds later under a held command in [-1, 1]."""
 
+    @abstractmethod
     def drone(self, state: Any) -> Drone:
         """Return the drone of a plant's state."""
+
+    def read_gyro(self, state: Any, drone: Drone, dt: Scalar, model: ModelParameters) -> Vec3:
+        """Return the body rates that the gyro of a drone reads, rad/s: the true ones by default."""
+        return drone.rates_b
 
 
 class SimulatorState(NamedTuple):
@@ -38,7 +47,7 @@ class SimulatorState(NamedTuple):
     memories: tuple[Any, ...]
 
 
-class Simulator:
+class Simulator(Plant):
     """The differentiable model: ``flytrack_env.dynamics`` with the model's effects."""
 
     def reset(self, drone: Drone, model: ModelParameters) -> SimulatorState:
@@ -56,5 +65,5 @@ class Simulator:
         return state.drone
 
     def read_gyro(self, state: SimulatorState, drone: Drone, dt: Scalar, model: ModelParameters) -> Vec3:
-        """Return what the gyro says of a drone's body rates, rad/s; what it remembers is the state's."""
+        """Return the body rates that the gyro of a drone reads, rad/s, with the memories of the state."""
         return read_gyro(drone, state.memories, dt, model)

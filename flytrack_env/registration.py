@@ -52,7 +52,7 @@ def make(env_id: str, **overrides: Any) -> EpisodicEnvironment:
     variant = ENVIRONMENTS[env_id]
     env: EpisodicEnvironment = FlyTrack(**{**variant.arguments, **overrides})
     for wrapper in variant.wrappers:
-        if wrapper is DomainRandomization and hasattr(env.plant, "dt"):
+        if wrapper is DomainRandomization and env.plant.dt is not None:
             continue
         env = wrapper(env)
     env.env_id = env_id

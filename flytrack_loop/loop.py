@@ -66,7 +66,7 @@ def close_loop(
 ) -> Loop:
     """Close the loop on a plant; write logs, models, diagnosis, trainings and ``loop.json`` into ``out``.
 
-    plant: a black box, or whatever has the methods of ``flytrack_env.plants.Plant``. config: of both
+    plant: a black box, or any ``flytrack_env.plants.Plant``. config: of both
     trainings. tell: called with a line per step.
 
     Raises:

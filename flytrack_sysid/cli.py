@@ -12,6 +12,7 @@ import numpy as np
 from flytrack_env import blackbox, load_model, load_provenance, save_model
 from flytrack_env.dynamics import nominal_parameters
 from flytrack_env.model_file import ModelFileError
+from flytrack_env.plants import Plant
 from flytrack_sysid.collect import CollectError, collect
 from flytrack_sysid.diagnosis import diagnose, joined, write_diagnosis
 from flytrack_sysid.diagnosis import text_of as text_of_diagnosis
@@ -53,8 +54,7 @@ def load_plant(where: str) -> Any:
     except Exception as error:  # whatever a user's module raises
         said = f"{type(error).__name__}: {error}"
         raise CollectError(f"--black-box {where}: cannot be imported: {said}") from error
-    is_plant = hasattr(found, "reset") and hasattr(found, "drone")
-    if not is_plant and not callable(found):
+    if not isinstance(found, Plant) and not callable(found):
         raise CollectError(
             f"--black-box {where}: found {type(found).__name__}, expected step(x, u) or a plant"
         )

@@ -91,9 +91,7 @@ def _fly_function(step: StepFunction, report: Report) -> Fly:
 
 def _fly_any(plant: Plant | StepFunction, report: Report) -> Fly:
     """Return a function that flies a plant, or one that calls a function of the state."""
-    known: Any = plant
-    is_plant = hasattr(plant, "reset") and hasattr(plant, "drone")
-    return _fly_plant(known) if is_plant else _fly_function(known, report)
+    return _fly_plant(plant) if isinstance(plant, Plant) else _fly_function(plant, report)
 
 
 def find_hover(fly: Fly) -> float:

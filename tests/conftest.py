@@ -16,6 +16,7 @@ from flytrack_env.blackbox import BlackBox
 from flytrack_env.blackbox import load as load_black_box
 from flytrack_env.dynamics import ModelParameters
 from flytrack_env.env import EnvParams, EnvState, FlyTrack
+from flytrack_env.plants import Plant
 from flytrack_env.quaternion import Quaternion, Scalar, Vec3
 from flytrack_env.state import Action, Drone
 from flytrack_env.tracks import Gate, Track
@@ -28,7 +29,7 @@ MEMORY_MAPS, MOST_MEMORY_MAPS = Path("/proc/self/maps"), 25_000
 FACING_X = (0.5**0.5, 0.0, 0.0, -(0.5**0.5))  # yaw -90 degrees: the gate's local +y is world +x
 
 
-class Coasting:
+class Coasting(Plant):
     """A plant that flies straight on at constant velocity, whatever the command."""
 
     def reset(self, drone: Drone, model: ModelParameters) -> Drone:
@@ -52,7 +53,7 @@ class OnRails(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Railway:
+class Railway(Plant):
     """A plant that flies a closed polyline at constant speed; starts at the nearest corner."""
 
     corners: np.ndarray

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 from benchmarks.hidden import Truth
 from benchmarks.hidden.effects import LIFT_SPEED
 from flytrack_env.dynamics import ModelParameters
+from flytrack_env.plants import Plant
 from flytrack_env.quaternion import Scalar
 from flytrack_env.state import (
     APPLIED_ACTION,
@@ -55,8 +56,8 @@ class HiddenState(NamedTuple):
     num_past: jax.Array
 
 
-class HiddenPlant:
-    """A plant (``flytrack_env.plants``) that flies a ``Truth``; its state is a ``HiddenState``.
+class HiddenPlant(Plant):
+    """A plant that flies a ``Truth``; its state is a ``HiddenState``.
 
     Raises:
         ValueError: a truth with gusts, with an effect of no list, or with one that is not of ``EFFECTS``.

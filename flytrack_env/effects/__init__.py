@@ -10,7 +10,7 @@ import numpy as np
 
 from flytrack_env.effects.accelerometer_bias import ACCELEROMETER_BIAS, AccelerometerBias
 from flytrack_env.effects.accelerometer_scale import ACCELEROMETER_SCALE, AccelerometerScale
-from flytrack_env.effects.base import STAGES, Effect, Flight, Range
+from flytrack_env.effects.base import STAGES, Effect, Range, StepContext
 from flytrack_env.effects.command_delay import COMMAND_DELAY, CommandDelay
 from flytrack_env.effects.ground_effect import GROUND_EFFECT, GroundEffect
 from flytrack_env.effects.gyro_bias import GYRO_BIAS, GyroBias
@@ -116,21 +116,23 @@ def acts(effects: tuple[Any, ...], stage: str) -> bool:
     return any(stage in effect_of(parameters).stages for parameters in effects)
 
 
-def fold(stage: str, effects: tuple[Any, ...], memories: tuple[Any, ...], value: Any, flight: Flight) -> Any:
+def fold(
+    stage: str, effects: tuple[Any, ...], memories: tuple[Any, ...], value: Any, context: StepContext
+) -> Any:
     """Return a stage's value after all effects of a model that act there, in order."""
     for parameters, memory in zip(effects, memories, strict=True):
         hook = getattr(effect_of(parameters), stage)
         if hook is not None:
-            value = hook(parameters, memory, value, flight)
+            value = hook(parameters, memory, value, context)
     return value
 
 
-def remember(effects: tuple[Any, ...], memories: tuple[Any, ...], flight: Flight) -> tuple[Any, ...]:
+def remember(effects: tuple[Any, ...], memories: tuple[Any, ...], context: StepContext) -> tuple[Any, ...]:
     """Return what the effects of a model remember after a step."""
     updates = ((effect_of(parameters).remember, parameters) for parameters in effects)
     pairs = zip(updates, memories, strict=True)
     return tuple(
-        update(parameters, memory, flight) if update else memory for (update, parameters), memory in pairs
+        update(parameters, memory, context) if update else memory for (update, parameters), memory in pairs
     )
 
 
@@ -142,7 +144,6 @@ __all__ = [
     "AccelerometerScale",
     "CommandDelay",
     "Effect",
-    "Flight",
     "GroundEffect",
     "GyroBias",
     "GyroScale",
@@ -159,6 +160,7 @@ __all__ = [
     "RateSlewLimit",
     "RotorDrag",
     "SecondOrderRates",
+    "StepContext",
     "ThrustLagAsymmetry",
     "ThrustScale",
     "ThrustTilt",

@@ -2,7 +2,7 @@
 
 from typing import NamedTuple
 
-from flytrack_env.effects.base import Effect, Flight, Range
+from flytrack_env.effects.base import Effect, Range, StepContext
 from flytrack_env.quaternion import Scalar, Vec3
 
 
@@ -14,7 +14,7 @@ class AccelerometerBias(NamedTuple):
     z: Scalar = 0.0
 
 
-def _accelerometer(bias: AccelerometerBias, memory: None, force_b: Vec3, flight: Flight) -> Vec3:
+def _accelerometer(bias: AccelerometerBias, memory: None, force_b: Vec3, context: StepContext) -> Vec3:
     return force_b + Vec3(*bias)
 
 

@@ -2,7 +2,7 @@
 
 from typing import NamedTuple
 
-from flytrack_env.effects.base import Effect, Flight, Range
+from flytrack_env.effects.base import Effect, Range, StepContext
 from flytrack_env.quaternion import Scalar, Vec3
 
 
@@ -14,7 +14,7 @@ class AccelerometerScale(NamedTuple):
     z: Scalar = 1.0
 
 
-def _accelerometer(scale: AccelerometerScale, memory: None, force_b: Vec3, flight: Flight) -> Vec3:
+def _accelerometer(scale: AccelerometerScale, memory: None, force_b: Vec3, context: StepContext) -> Vec3:
     return Vec3(scale.x * force_b.x, scale.y * force_b.y, scale.z * force_b.z)
 
 

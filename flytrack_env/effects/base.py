@@ -22,8 +22,8 @@ accelerometer  ``Vec3``, m/s^2, body  what the accelerometer says of the specifi
 What the sensors say changes nothing of the flight. They are read after the step, with what effects remember
 then (``flytrack_env.dynamics.read_sensors``); nobody reads them unless asked to.
 
-A hook takes the effect's parameters, its memory, the value so far and the ``Flight``, and returns the
-value. At neutral parameters it returns the value bit for bit, so that neutral equals absent.
+A hook takes the effect's parameters, its memory, the value so far and the ``StepContext``, and returns
+the value. At neutral parameters it returns the value bit for bit, so that neutral equals absent.
 """
 
 from collections.abc import Callable, Mapping
@@ -46,9 +46,11 @@ STAGES = {
     "accelerometer": "sensor",
 }
 
+NOT_YET: Any = None  # in place of a value that a later stage of the step computes
 
-class Flight(NamedTuple):
-    """What an effect may look at; what later stages find out is None before them.
+
+class StepContext(NamedTuple):
+    """What an effect may look at; a field is ``NOT_YET`` before the stage that fills it.
 
     drone: before the step. command: as given, before any effect. dt: s. acting: the command after the stage
     command.
@@ -64,13 +66,13 @@ class Flight(NamedTuple):
     drone: Drone
     command: Action
     dt: Scalar
-    acting: Action | None = None
-    applied: Action | None = None
-    body_axes_w: tuple[Vec3, Vec3, Vec3] | None = None
-    air_w: Vec3 | None = None
-    thrust_acc: Scalar | None = None
-    rates_b: Vec3 | None = None
-    force_b: Vec3 | None = None
+    acting: Action = NOT_YET
+    applied: Action = NOT_YET
+    body_axes_w: tuple[Vec3, Vec3, Vec3] = NOT_YET
+    air_w: Vec3 = NOT_YET
+    thrust_acc: Scalar = NOT_YET
+    rates_b: Vec3 = NOT_YET
+    force_b: Vec3 = NOT_YET
 
     def airspeed_b(self) -> Vec3:
         """Return the velocity through the air, body frame, m/s; from the stage thrust on."""
@@ -89,7 +91,7 @@ class Range(NamedTuple):
     unit: str
 
 
-Hook = Callable[[Any, Any, Any, Flight], Any]
+Hook = Callable[[Any, Any, Any, StepContext], Any]
 
 
 @dataclass(frozen=True)
@@ -107,7 +109,7 @@ class Effect:
     groups: parameters that are looked for together; all of them if empty. shapes: parameters that only shape
     what others do, and do nothing while those are neutral.
     start: (parameters, drone) -> memory of an episode that begins; no memory if None.
-    remember: (parameters, memory, flight) -> memory after a step.
+    remember: (parameters, memory, context) -> memory after a step.
     """
 
     name: str
@@ -131,7 +133,7 @@ class Effect:
     gyro: Hook | None = None
     accelerometer: Hook | None = None
     start: Callable[[Any, Drone], Any] | None = None
-    remember: Callable[[Any, Any, Flight], Any] | None = None
+    remember: Callable[[Any, Any, StepContext], Any] | None = None
 
     @property
     def stages(self) -> tuple[str, ...]:

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from flytrack_env.effects.base import Effect, Flight, Range
+from flytrack_env.effects.base import Effect, Range, StepContext
 from flytrack_env.quaternion import Scalar
 from flytrack_env.state import Action, Drone
 
@@ -46,21 +46,21 @@ def age_weights(delay_s: Scalar, dt: Scalar) -> list[jax.Array]:
     return [weight(age) for age in range(BUFFER_STEPS + 1)]
 
 
-def delayed(delay: CommandDelay, past: PastCommands, command: Action, flight: Flight) -> Action:
+def delayed(delay: CommandDelay, past: PastCommands, command: Action, context: StepContext) -> Action:
     """Return the command that acts: the mean of what arrives during the step.
 
     A command is held over its step, so that ``age_weights`` are the shares of the step that each acts.
     """
-    weights = age_weights(delay.delay_s, flight.dt)
+    weights = age_weights(delay.delay_s, context.dt)
     by_channel = zip(*(command, *past.commands), strict=True)
     return Action(
         *(sum(w * value for w, value in zip(weights, values, strict=True)) for values in by_channel)
     )
 
 
-def remember(delay: CommandDelay, past: PastCommands, flight: Flight) -> PastCommands:
+def remember(delay: CommandDelay, past: PastCommands, context: StepContext) -> PastCommands:
     """Return the memory after a step."""
-    return PastCommands((flight.command, *past.commands[:-1]))
+    return PastCommands((context.command, *past.commands[:-1]))
 
 
 COMMAND_DELAY = Effect(

@@ -2,7 +2,7 @@
 
 from typing import NamedTuple
 
-from flytrack_env.effects.base import Effect, Flight, Range
+from flytrack_env.effects.base import Effect, Range, StepContext
 from flytrack_env.quaternion import Scalar, Vec3
 
 
@@ -14,7 +14,7 @@ class GyroScale(NamedTuple):
     z: Scalar = 1.0
 
 
-def _gyro(scale: GyroScale, memory: None, rates_b: Vec3, flight: Flight) -> Vec3:
+def _gyro(scale: GyroScale, memory: None, rates_b: Vec3, context: StepContext) -> Vec3:
     return Vec3(scale.x * rates_b.x, scale.y * rates_b.y, scale.z * rates_b.z)
 
 

@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 
-from flytrack_env.effects.base import Effect, Flight, Range
+from flytrack_env.effects.base import Effect, Range, StepContext
 from flytrack_env.effects.command_delay import BUFFER_STEPS, age_weights
 from flytrack_env.quaternion import Scalar, Vec3
 from flytrack_env.state import Drone
@@ -34,31 +34,31 @@ def start(latency: ImuLatency, drone: Drone) -> PastReadings:
     return PastReadings((drone.rates_b,) * size, (still,) * size, jnp.ones_like(drone.battery_v, bool))
 
 
-def _late(latency: ImuLatency, present: Vec3, readings: tuple[Vec3, ...], flight: Flight) -> Vec3:
+def _late(latency: ImuLatency, present: Vec3, readings: tuple[Vec3, ...], context: StepContext) -> Vec3:
     """Return the mean of the readings between which the delayed time lies, by their nearness."""
-    weights = age_weights(latency.latency_s, flight.dt)
+    weights = age_weights(latency.latency_s, context.dt)
     by_axis = zip(*(present, *readings[1:]), strict=True)  # the first one remembered is the present one
     return Vec3(*(sum(w * value for w, value in zip(weights, values, strict=True)) for values in by_axis))
 
 
-def _gyro(latency: ImuLatency, past: PastReadings, rates_b: Vec3, flight: Flight) -> Vec3:
-    return _late(latency, rates_b, past.rates_b, flight)
+def _gyro(latency: ImuLatency, past: PastReadings, rates_b: Vec3, context: StepContext) -> Vec3:
+    return _late(latency, rates_b, past.rates_b, context)
 
 
-def _accelerometer(latency: ImuLatency, past: PastReadings, force_b: Vec3, flight: Flight) -> Vec3:
-    return _late(latency, force_b, past.forces_b, flight)
+def _accelerometer(latency: ImuLatency, past: PastReadings, force_b: Vec3, context: StepContext) -> Vec3:
+    return _late(latency, force_b, past.forces_b, context)
 
 
-def remember(latency: ImuLatency, past: PastReadings, flight: Flight) -> PastReadings:
+def remember(latency: ImuLatency, past: PastReadings, context: StepContext) -> PastReadings:
     """Return the memory after a step; before the first, the force is taken to have been that of the first."""
 
     def or_first(force_b: Vec3) -> Vec3:
-        pairs = zip(flight.force_b, force_b, strict=True)
+        pairs = zip(context.force_b, force_b, strict=True)
         return Vec3(*(jnp.where(past.is_fresh, first, known) for first, known in pairs))
 
     return PastReadings(
-        rates_b=(flight.rates_b, *past.rates_b[:-1]),
-        forces_b=(flight.force_b, *(or_first(force_b) for force_b in past.forces_b[:-1])),
+        rates_b=(context.rates_b, *past.rates_b[:-1]),
+        forces_b=(context.force_b, *(or_first(force_b) for force_b in past.forces_b[:-1])),
         is_fresh=jnp.zeros_like(past.is_fresh),
     )
 

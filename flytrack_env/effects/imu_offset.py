@@ -2,7 +2,7 @@
 
 from typing import NamedTuple
 
-from flytrack_env.effects.base import Effect, Flight, Range
+from flytrack_env.effects.base import Effect, Range, StepContext
 from flytrack_env.quaternion import Scalar, Vec3
 
 
@@ -14,11 +14,11 @@ class ImuOffset(NamedTuple):
     z: Scalar = 0.0
 
 
-def _accelerometer(offset: ImuOffset, memory: None, force_b: Vec3, flight: Flight) -> Vec3:
+def _accelerometer(offset: ImuOffset, memory: None, force_b: Vec3, context: StepContext) -> Vec3:
     """Return the reading with the mean rates of the step: there the change of rates is centred."""
-    arm_b, before = Vec3(*offset), flight.drone.rates_b
-    mean_rates_b = (before + flight.rates_b).scale(0.5)
-    angular_acc_b = (flight.rates_b - before).scale(1.0 / flight.dt)
+    arm_b, before = Vec3(*offset), context.drone.rates_b
+    mean_rates_b = (before + context.rates_b).scale(0.5)
+    angular_acc_b = (context.rates_b - before).scale(1.0 / context.dt)
     centripetal = mean_rates_b.cross(mean_rates_b.cross(arm_b))
     return force_b + (centripetal + angular_acc_b.cross(arm_b))
 

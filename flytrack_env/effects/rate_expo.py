@@ -2,7 +2,7 @@
 
 from typing import NamedTuple
 
-from flytrack_env.effects.base import Effect, Flight, Range
+from flytrack_env.effects.base import Effect, Range, StepContext
 from flytrack_env.quaternion import Scalar, Vec3
 
 
@@ -12,8 +12,8 @@ class RateExpo(NamedTuple):
     expo: Scalar = 0.0
 
 
-def _rates(curve: RateExpo, memory: None, rates_b: Vec3, flight: Flight) -> Vec3:
-    sticks = flight.applied[:3]
+def _rates(curve: RateExpo, memory: None, rates_b: Vec3, context: StepContext) -> Vec3:
+    sticks = context.applied[:3]
     linear = 1.0 - curve.expo
     return Vec3(*(r * (linear + curve.expo * (u * u)) for r, u in zip(rates_b, sticks, strict=True)))
 

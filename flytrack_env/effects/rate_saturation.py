@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 
-from flytrack_env.effects.base import Effect, Flight, Range
+from flytrack_env.effects.base import Effect, Range, StepContext
 from flytrack_env.quaternion import Scalar, Vec3
 
 CENTRED = 1e-6  # of a stick: nothing saturates there, and nothing is divided by 0
@@ -17,7 +17,7 @@ class RateSaturation(NamedTuple):
     softness: Scalar = 0.5
 
 
-def _rates(limit: RateSaturation, memory: None, rates_b: Vec3, flight: Flight) -> Vec3:
+def _rates(limit: RateSaturation, memory: None, rates_b: Vec3, context: StepContext) -> Vec3:
     reachable = 1.0 - limit.lost
     bend = 1.0 / (reachable * reachable) - 1.0
 
@@ -27,7 +27,7 @@ def _rates(limit: RateSaturation, memory: None, rates_b: Vec3, flight: Flight) -
         gradual = 1.0 / jnp.sqrt(1.0 + bend * size * size)
         return rate * (corner + limit.softness * (gradual - corner))
 
-    return Vec3(*(limited(rate, stick) for rate, stick in zip(rates_b, flight.applied[:3], strict=True)))
+    return Vec3(*(limited(rate, stick) for rate, stick in zip(rates_b, context.applied[:3], strict=True)))
 
 
 RATE_SATURATION = Effect(

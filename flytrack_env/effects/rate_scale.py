@@ -2,7 +2,7 @@
 
 from typing import NamedTuple
 
-from flytrack_env.effects.base import Effect, Flight, Range
+from flytrack_env.effects.base import Effect, Range, StepContext
 from flytrack_env.quaternion import Scalar, Vec3
 
 
@@ -14,7 +14,7 @@ class RateScale(NamedTuple):
     yaw: Scalar = 1.0
 
 
-def _rates(scale: RateScale, memory: None, rates_b: Vec3, flight: Flight) -> Vec3:
+def _rates(scale: RateScale, memory: None, rates_b: Vec3, context: StepContext) -> Vec3:
     return Vec3(scale.roll * rates_b.x, scale.pitch * rates_b.y, scale.yaw * rates_b.z)
 
 

@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 
-from flytrack_env.effects.base import Effect, Flight, Range
+from flytrack_env.effects.base import Effect, Range, StepContext
 from flytrack_env.quaternion import Scalar, Vec3
 
 
@@ -14,15 +14,15 @@ class RateSlewLimit(NamedTuple):
     inverse: Scalar = 0.0
 
 
-def _rates(limit: RateSlewLimit, memory: None, rates_b: Vec3, flight: Flight) -> Vec3:
+def _rates(limit: RateSlewLimit, memory: None, rates_b: Vec3, context: StepContext) -> Vec3:
     def limited(rate: Scalar, before: Scalar) -> Scalar:
         change = rate - before
-        is_beyond = limit.inverse * jnp.abs(change) > flight.dt
+        is_beyond = limit.inverse * jnp.abs(change) > context.dt
         # Guard inside the where: dt / 0 has no slope even where it is not selected.
-        largest = flight.dt / jnp.where(is_beyond, limit.inverse, 1.0)
+        largest = context.dt / jnp.where(is_beyond, limit.inverse, 1.0)
         return jnp.where(is_beyond, before + jnp.sign(change) * largest, rate)
 
-    pairs = zip(rates_b, flight.drone.rates_b, strict=True)
+    pairs = zip(rates_b, context.drone.rates_b, strict=True)
     return Vec3(*(limited(rate, before) for rate, before in pairs))
 
 

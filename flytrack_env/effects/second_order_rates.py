@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 
-from flytrack_env.effects.base import Effect, Flight, Range
+from flytrack_env.effects.base import Effect, Range, StepContext
 from flytrack_env.quaternion import Scalar, Vec3
 from flytrack_env.state import Drone
 
@@ -56,22 +56,22 @@ def _response(loop: SecondOrderRates, dt: Scalar) -> _Response:
     return _Response(*(jnp.where(is_lag, value, 0.0) for value in found))
 
 
-def _rates(loop: SecondOrderRates, memory: Turning, rates_b: Vec3, flight: Flight) -> Vec3:
-    left = _response(loop, flight.dt)
+def _rates(loop: SecondOrderRates, memory: Turning, rates_b: Vec3, context: StepContext) -> Vec3:
+    left = _response(loop, context.dt)
     axes = zip(rates_b, memory.rates_b, memory.slopes_b, strict=True)
     return Vec3(*(new + left.offset * (old - new) + left.offset_of_slope * slope for new, old, slope in axes))
 
 
-def remember(loop: SecondOrderRates, memory: Turning, flight: Flight) -> Turning:
+def remember(loop: SecondOrderRates, memory: Turning, context: StepContext) -> Turning:
     """Return the memory after a step; the input of the step is found back from the rates it led to."""
-    left = _response(loop, flight.dt)
+    left = _response(loop, context.dt)
 
     def slope_after(rate: Scalar, old: Scalar, slope: Scalar) -> Scalar:
         held = (rate - left.offset * old - left.offset_of_slope * slope) / (1.0 - left.offset)
         return left.slope_of_offset * (old - held) + left.slope * slope
 
-    axes = zip(flight.rates_b, memory.rates_b, memory.slopes_b, strict=True)
-    return Turning(flight.rates_b, Vec3(*(slope_after(*axis) for axis in axes)))
+    axes = zip(context.rates_b, memory.rates_b, memory.slopes_b, strict=True)
+    return Turning(context.rates_b, Vec3(*(slope_after(*axis) for axis in axes)))
 
 
 SECOND_ORDER_RATES = Effect(

@@ -2,7 +2,7 @@
 
 from typing import NamedTuple
 
-from flytrack_env.effects.base import Effect, Flight, Range
+from flytrack_env.effects.base import Effect, Range, StepContext
 from flytrack_env.quaternion import Scalar
 
 
@@ -12,7 +12,7 @@ class ThrustScale(NamedTuple):
     factor: Scalar = 1.0
 
 
-def _thrust(scale: ThrustScale, memory: None, thrust_n: Scalar, flight: Flight) -> Scalar:
+def _thrust(scale: ThrustScale, memory: None, thrust_n: Scalar, context: StepContext) -> Scalar:
     return scale.factor * thrust_n
 
 

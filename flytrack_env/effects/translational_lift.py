@@ -2,7 +2,7 @@
 
 from typing import NamedTuple
 
-from flytrack_env.effects.base import Effect, Flight, Range
+from flytrack_env.effects.base import Effect, Range, StepContext
 from flytrack_env.quaternion import Scalar
 
 # m/s, airspeed at which half of the gain is there: about the velocity that a racing quadcopter's rotors
@@ -16,8 +16,8 @@ class TranslationalLift(NamedTuple):
     gain: Scalar = 0.0
 
 
-def _thrust(lift: TranslationalLift, memory: None, thrust_n: Scalar, flight: Flight) -> Scalar:
-    airspeed_b = flight.airspeed_b()
+def _thrust(lift: TranslationalLift, memory: None, thrust_n: Scalar, context: StepContext) -> Scalar:
+    airspeed_b = context.airspeed_b()
     squared = airspeed_b.x * airspeed_b.x + airspeed_b.y * airspeed_b.y
     return thrust_n * (1.0 + lift.gain * (squared / (squared + HALF_SPEED * HALF_SPEED)))
 

@@ -2,7 +2,7 @@
 
 from typing import NamedTuple
 
-from flytrack_env.effects.base import Effect, Flight, Range
+from flytrack_env.effects.base import Effect, Range, StepContext
 from flytrack_env.quaternion import Scalar
 
 
@@ -21,9 +21,9 @@ def load_of(thrust_action: Scalar) -> Scalar:
     return stick * stick
 
 
-def _battery(sag: VoltageSag, memory: None, battery_v: Scalar, flight: Flight) -> Scalar:
+def _battery(sag: VoltageSag, memory: None, battery_v: Scalar, context: StepContext) -> Scalar:
     # The state has the voltage under load: only what the load changed in the step counts.
-    change = load_of(flight.applied.thrust) - load_of(flight.drone.applied.thrust)
+    change = load_of(context.applied.thrust) - load_of(context.drone.applied.thrust)
     return battery_v - sag.at_full_v * change
 
 

@@ -6,7 +6,7 @@ parameters are apart because their units are.
 
 from typing import NamedTuple
 
-from flytrack_env.effects.base import Effect, Flight, Range
+from flytrack_env.effects.base import Effect, Range, StepContext
 from flytrack_env.quaternion import Scalar, Vec3
 
 
@@ -21,13 +21,13 @@ class Wind(NamedTuple):
     a_z: Scalar = 0.0
 
 
-def _air(wind: Wind, memory: None, air_w: Vec3, flight: Flight) -> Vec3:
+def _air(wind: Wind, memory: None, air_w: Vec3, context: StepContext) -> Vec3:
     return air_w + Vec3(wind.v_x, wind.v_y, wind.v_z)
 
 
-def _force(wind: Wind, memory: None, force_b: Vec3, flight: Flight) -> Vec3:
+def _force(wind: Wind, memory: None, force_b: Vec3, context: StepContext) -> Vec3:
     push_w = Vec3(wind.a_x, wind.a_y, wind.a_z)
-    return force_b + Vec3(*(axis.dot(push_w) for axis in flight.body_axes_w))
+    return force_b + Vec3(*(axis.dot(push_w) for axis in context.body_axes_w))
 
 
 WIND = Effect(

@@ -2,7 +2,7 @@
 
 from typing import NamedTuple
 
-from flytrack_env.effects.base import Effect, Flight, Range
+from flytrack_env.effects.base import Effect, Range, StepContext
 from flytrack_env.quaternion import Scalar, Vec3
 
 
@@ -12,8 +12,8 @@ class YawReaction(NamedTuple):
     angle: Scalar = 0.0
 
 
-def _rates(reaction: YawReaction, memory: None, rates_b: Vec3, flight: Flight) -> Vec3:
-    change = (flight.applied.thrust - flight.drone.applied.thrust) / flight.dt
+def _rates(reaction: YawReaction, memory: None, rates_b: Vec3, context: StepContext) -> Vec3:
+    change = (context.applied.thrust - context.drone.applied.thrust) / context.dt
     return rates_b._replace(z=rates_b.z + reaction.angle * change)
 
 

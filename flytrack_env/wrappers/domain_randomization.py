@@ -118,7 +118,7 @@ class DomainRandomization(Wrapper):
 
     def __init__(self, env: EpisodicEnvironment):
         super().__init__(env)
-        if hasattr(env.plant, "dt"):
+        if env.plant.dt is not None:
             raise WrapperError(
                 f"DomainRandomization around {env.plant!r}: its parameters are baked in, none can be drawn"
             )

@@ -16,6 +16,7 @@ from baselines.purejaxrl_ppo.resume import describe_run
 from flytrack_env import make, nominal_parameters
 from flytrack_env.dynamics import ModelParameters
 from flytrack_env.effects import LinearDrag
+from flytrack_env.plants import Plant
 from flytrack_env.quaternion import Scalar, Vec3
 from flytrack_env.references import shipped_reference
 from flytrack_env.state import BATTERY_FULL_V, POSITION, Action, Drone
@@ -31,7 +32,7 @@ class OnReference(NamedTuple):
     time_s: jax.Array
 
 
-class Rails:
+class Rails(Plant):
     """A plant that flies the time-optimal start and laps, whatever the command.
 
     The lower its battery, the slower it is, by ``pace``; one that is low indeed falls to the ground.

@@ -6,12 +6,13 @@ import numpy as np
 import pytest
 
 from flytrack_env.dynamics import advance
+from flytrack_env.plants import Plant
 from flytrack_sysid import CollectError, collect
 from flytrack_sysid.envelope import HEIGHTS, LARGEST_SPEED
 from tests.support.handout_plant import GRAVITY, HandoutPlant
 
 
-class Simulated:
+class Simulated(Plant):
     """The simulator with the handout plant's parameters, as a plant."""
 
     def reset(self, drone, model):

@@ -10,6 +10,7 @@ import pytest
 
 from flytrack_env import FlyTrack, load_track
 from flytrack_env.flown_race import PADDED_TO, follow_race, why_ended
+from flytrack_env.plants import Plant
 from flytrack_env.references import ghost_rollout, shipped_references
 from flytrack_env.state import BATTERY, POSITION, QUATERNION, VELOCITY, Action, unpack
 from flytrack_env.tracks import Gate, Track
@@ -34,7 +35,7 @@ def test_ghost_passes_every_gate_at_the_times_of_its_references():
         assert np.abs(one.pos_w - centre).max() < 0.5 * edge
 
 
-class Recorded:
+class Recorded(Plant):
     """A plant that moves the drone along recorded states (T, 21), whatever it is told."""
 
     def __init__(self, states: np.ndarray):

@@ -9,6 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from flytrack_env.dynamics import advance, nominal_parameters, step
+from flytrack_env.plants import Plant
 from flytrack_sysid import collect
 from flytrack_sysid.log import CHANNELS, FlightLog, LogError, log_of_states
 from flytrack_sysid.plausibility import FEWEST_ROWS, GRAVITY, check_plausible, find_problems
@@ -263,7 +264,7 @@ def test_scale_errors_and_biases_of_sensors_pass(logs):
     assert find_problems(shifted("a", np.array([0.3, -0.5, 1.5]))(shifted("w", 0.2)(log))) == []
 
 
-class Nominal:
+class Nominal(Plant):
     """The nominal model as a plant."""
 
     def reset(self, drone, model):

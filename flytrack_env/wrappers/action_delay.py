@@ -5,8 +5,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from flytrack_env.effects import CommandDelay as Delay
-from flytrack_env.effects import Flight, check_parameters, command_delay
+from flytrack_env.effects import CommandDelay, StepContext, check_parameters, command_delay
 from flytrack_env.episodes import EpisodicEnvironment, without_nan
 from flytrack_env.params import EnvParams
 from flytrack_env.state import Action, Drone
@@ -14,28 +13,29 @@ from flytrack_env.wrappers.action_history import ActionHistory
 from flytrack_env.wrappers.base import Wrapper
 
 
-class CommandDelayState(NamedTuple):
+class ActionDelayState(NamedTuple):
     """The inner state, and the commands that are still on their way."""
 
     inner: Any
     past: command_delay.PastCommands
 
 
-class CommandDelay(Wrapper):
-    """Delay every command by ``params.wrappers["command_delay"].delay_s``, the effect of that name.
+class ActionDelay(Wrapper):
+    """Delay every action by ``params.wrappers["action_delay"].delay_s``.
 
-    Where the simulator flies, the effect in its model does the same; this does it for other plants too.
+    The parameters are those of the effect ``command_delay``, which does the same inside the simulator's
+    model; this wrapper does it for any plant.
 
     Raises:
         ValueError: a delay outside the effect's range.
         WrapperError: as ``Wrapper``, or a history of commands inside.
     """
 
-    key = "command_delay"
+    key = "action_delay"
 
     def __init__(self, env: EpisodicEnvironment, delay_s: float = 0.02):
         super().__init__(env)
-        self._default = Delay(delay_s)
+        self._default = CommandDelay(delay_s)
         check_parameters(self._default, float(env.default_params.dt))
 
     def refusal(self, inside: EpisodicEnvironment) -> str | None:
@@ -44,7 +44,7 @@ class CommandDelay(Wrapper):
             return "the history would hold the delayed commands; put the history outside the delay"
         return super().refusal(inside)
 
-    def own_defaults(self) -> Delay:
+    def own_defaults(self) -> CommandDelay:
         """Return the delay that the wrapper was made with."""
         return self._default
 
@@ -53,23 +53,23 @@ class CommandDelay(Wrapper):
         super().check_params(params)
         check_parameters(self.own_params(params), params.dt)
 
-    def begin(self, drone: Drone, gate_index: Any, params: EnvParams, seed: Any = 0) -> CommandDelayState:
+    def begin(self, drone: Drone, gate_index: Any, params: EnvParams, seed: Any = 0) -> ActionDelayState:
         """Return the state of an episode that begins, as if its applied action were commanded for long."""
         inner = self.env.begin(drone, gate_index, params, seed)
-        return CommandDelayState(inner, command_delay.start(self.own_params(params), drone))
+        return ActionDelayState(inner, command_delay.start(self.own_params(params), drone))
 
     def advance(
-        self, state: CommandDelayState, command: Action, params: EnvParams
-    ) -> tuple[CommandDelayState, jax.Array, jax.Array, dict[str, Any]]:
+        self, state: ActionDelayState, command: Action, params: EnvParams
+    ) -> tuple[ActionDelayState, jax.Array, jax.Array, dict[str, Any]]:
         """Return the outcome of the command that arrives during this step.
 
         An action that is not a number ends the episode at once, whatever the delay.
         """
         delay = self.own_params(params)
         is_nan = jnp.isnan(sum(command))
-        flight = Flight(drone=self.env.drone(state.inner), command=without_nan(command), dt=params.dt)
-        arriving = command_delay.delayed(delay, state.past, flight.command, flight)
+        context = StepContext(drone=self.env.drone(state.inner), command=without_nan(command), dt=params.dt)
+        arriving = command_delay.delayed(delay, state.past, context.command, context)
         arriving = Action(*(jnp.where(is_nan, jnp.nan, value) for value in arriving))
         inner, reward, terminated, info = self.env.advance(state.inner, arriving, params)
-        past = command_delay.remember(delay, state.past, flight)
-        return CommandDelayState(inner, past), reward, terminated, info
+        past = command_delay.remember(delay, state.past, context)
+        return ActionDelayState(inner, past), reward, terminated, info
