@@ -27,8 +27,8 @@ from flytrack_env.params import EnvParams
 from flytrack_env.registration import ENVIRONMENTS
 from flytrack_env.tracks import available_tracks, build_course, load_track, random_track
 from flytrack_env.wrappers import (
+    ActionDelay,
     ActionHistory,
-    CommandDelay,
     DomainRandomization,
     EpisodeStatistics,
     ObservationNoise,
@@ -76,7 +76,7 @@ def with_all_effects() -> Checked:
 
 def with_all_wrappers() -> Checked:
     """Return the plain environment in every wrapper that there is."""
-    env: Any = CommandDelay(DomainRandomization(flytrack_env.make("FlyTrack-v0")))
+    env: Any = ActionDelay(DomainRandomization(flytrack_env.make("FlyTrack-v0")))
     env = ActionHistory(ActionHistory(ObservationNoise(env), kind="applied"), length=2)
     return Checked(EpisodeStatistics(env))
 

@@ -24,7 +24,7 @@ from flytrack_env.effects import (
 from flytrack_env.effects.command_delay import BUFFER_STEPS
 from flytrack_env.env import FlyTrack
 from flytrack_env.observations import OBSERVATION
-from flytrack_env.plants import Simulator
+from flytrack_env.plants import Plant, Simulator
 from flytrack_env.state import ACCELERATION, QUATERNION, RATES, Action, pack, unpack, unpack_action
 from flytrack_env.wrappers import DomainRandomization, NoiseParams, ObservationNoise, RandomizationParams
 
@@ -200,10 +200,10 @@ def test_a_drone_without_effects_on_its_gyro_is_shown_as_it_is():
 
 
 def test_another_plant_reports_rates_of_its_own():
-    class Bare:
+    class Bare(Plant):
         """The simulator without a gyro."""
 
-        reset, step, drone = SIMULATOR.reset, SIMULATOR.step, SIMULATOR.drone
+        reset, step, drone = Simulator.reset, Simulator.step, Simulator.drone
 
     env = FlyTrack(model=nominal_parameters().with_effects(GyroBias(0.5)), plant=Bare())
     shown, true = shown_and_true(env, env.default_params)

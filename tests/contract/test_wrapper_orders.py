@@ -16,8 +16,8 @@ from hypothesis import strategies as st
 from flytrack_env import FlyTrack, wrappers
 from flytrack_env.observations import OBSERVATION_SIZE
 from flytrack_env.wrappers import (
+    ActionDelay,
     ActionHistory,
-    CommandDelay,
     DomainRandomization,
     EpisodeStatistics,
     LegacyStep,
@@ -30,7 +30,7 @@ MAKERS: dict[str, Any] = {
     "noise": ObservationNoise,
     "commanded": partial(ActionHistory, length=2),
     "applied": partial(ActionHistory, length=1, kind="applied"),
-    "delay": CommandDelay,
+    "delay": ActionDelay,
     "randomization": DomainRandomization,
     "statistics": EpisodeStatistics,
     "legacy": LegacyStep,

@@ -8,11 +8,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from flytrack_env.effects import CommandDelay as Delay
-from flytrack_env.effects import LinearDrag, QuadraticDrag, ThrustScale, effect_of
+from flytrack_env.effects import CommandDelay, LinearDrag, QuadraticDrag, ThrustScale, effect_of
 from flytrack_env.env import FlyTrack
 from flytrack_env.wrappers import (
-    CommandDelay,
+    ActionDelay,
     DomainRandomization,
     RandomizationParams,
 )
@@ -23,8 +22,8 @@ from tests.support.wrapped_flights import fly, wrapped
 
 @pytest.mark.parametrize("delay_s", [0.0, 0.013, 0.04])
 def test_the_wrapper_does_what_the_effect_in_the_model_does(delay_s: float) -> None:
-    outside = fly(wrapped(CommandDelay), wrappers={"command_delay": Delay(delay_s)})
-    model = FlyTrack().default_params.model.with_effects(Delay(delay_s))
+    outside = fly(wrapped(ActionDelay), wrappers={"action_delay": CommandDelay(delay_s)})
+    model = FlyTrack().default_params.model.with_effects(CommandDelay(delay_s))
     inside = fly(wrapped(), model=model)
     np.testing.assert_allclose(outside[2][0], inside[2][0], atol=2e-4)
     np.testing.assert_array_equal(outside[2][3], inside[2][3])
@@ -32,15 +31,15 @@ def test_the_wrapper_does_what_the_effect_in_the_model_does(delay_s: float) -> N
 
 def test_a_delay_beyond_the_memory_is_refused() -> None:
     with pytest.raises(ValueError, match=r"delay_s: found 0\.05, expected 0 to 0\.04 s"):
-        CommandDelay(FlyTrack(), delay_s=0.05)
-    env = wrapped(CommandDelay)
-    negative = {"command_delay": env.own_defaults()._replace(delay_s=-0.01)}
+        ActionDelay(FlyTrack(), delay_s=0.05)
+    env = wrapped(ActionDelay)
+    negative = {"action_delay": env.own_defaults()._replace(delay_s=-0.01)}
     with pytest.raises(ValueError, match=r"delay_s: found -0\.01"):
         env.reset(jax.random.key(0), env.default_params.replace(wrappers=negative))
 
 
 def test_what_is_no_number_ends_the_episode_at_once_whatever_the_delay() -> None:
-    env = wrapped(partial(CommandDelay, delay_s=0.04))
+    env = wrapped(partial(ActionDelay, delay_s=0.04))
     params = env.default_params
     _, state = env.reset(jax.random.key(0), params)
     _, after, _, terminated, info = env.step_env(None, state, jnp.array([0.0, jnp.nan, 0.0, 0.0]), params)
@@ -108,7 +107,7 @@ def test_no_range_is_the_plain_environment() -> None:
 def test_what_the_model_itself_has_is_drawn_around_it() -> None:
     """An identified effect is known: scaled, within its range. What is not among the ranges stays."""
     env = wrapped(DomainRandomization)
-    known = (Delay(0.036), ThrustScale(0.6), LinearDrag(1.0, -0.5, 0.0), QuadraticDrag(0.1))
+    known = (CommandDelay(0.036), ThrustScale(0.6), LinearDrag(1.0, -0.5, 0.0), QuadraticDrag(0.1))
     params = env.default_params.replace(model=FlyTrack().default_params.model.with_effects(*known))
     keys = jax.random.split(jax.random.key(0), 500)
     models = jax.jit(jax.vmap(lambda key: env.model(env.reset(key, params)[1], params)))(keys)

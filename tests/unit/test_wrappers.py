@@ -16,10 +16,11 @@ from gymnax.wrappers import LogWrapper
 from flytrack_env import wrappers
 from flytrack_env.env import FlyTrack
 from flytrack_env.observations import OBSERVATION_SIZE
+from flytrack_env.plants import Simulator
 from flytrack_env.state import Action, pack
 from flytrack_env.wrappers import (
+    ActionDelay,
     ActionHistory,
-    CommandDelay,
     DomainRandomization,
     EpisodeStatistics,
     LegacyStep,
@@ -30,7 +31,7 @@ from flytrack_env.wrappers import (
 )
 from tests.support.wrapped_flights import NUM_STEPS, fly, wrapped
 
-ALL = (DomainRandomization, CommandDelay, ObservationNoise, ActionHistory, EpisodeStatistics)
+ALL = (DomainRandomization, ActionDelay, ObservationNoise, ActionHistory, EpisodeStatistics)
 OVER_WRAPPERS = pytest.mark.parametrize("wrapper", ALL, ids=lambda wrapper: wrapper.__name__)
 
 
@@ -61,9 +62,9 @@ def test_all_wrappers_are_tried() -> None:
 
 def test_orders_that_make_sense_have_the_same_spaces_and_parameters() -> None:
     """The others are refused: exactly those with the history of commands inside the delay."""
-    with_params = {"domain_randomization", "command_delay", "observation_noise"}
+    with_params = {"domain_randomization", "action_delay", "observation_noise"}
     for order in permutations(ALL):
-        is_refused = order.index(ActionHistory) < order.index(CommandDelay)
+        is_refused = order.index(ActionHistory) < order.index(ActionDelay)
         assert is_sensible(order) != is_refused, order
         if is_refused:
             continue
@@ -94,8 +95,8 @@ def test_twice_is_refused(wrapper: Any) -> None:
 
 
 def test_a_history_inside_the_delay_is_refused_with_the_reason() -> None:
-    with pytest.raises(WrapperError, match="CommandDelay around ActionHistory: the history would hold"):
-        CommandDelay(ActionHistory(FlyTrack()))
+    with pytest.raises(WrapperError, match="ActionDelay around ActionHistory: the history would hold"):
+        ActionDelay(ActionHistory(FlyTrack()))
 
 
 @OVER_WRAPPERS
@@ -106,7 +107,7 @@ def test_another_step_inside_is_refused_with_the_reason(wrapper: Any, inside: An
 
 
 def test_randomising_what_is_baked_in_is_refused() -> None:
-    class Baked:
+    class Baked(Simulator):
         dt = 0.01
 
     with pytest.raises(WrapperError, match="baked in, none can be drawn"):
@@ -140,7 +141,7 @@ def test_parameters_of_another_environment_are_refused(wrapper: Any) -> None:
 
 
 def test_histories_of_both_kinds_and_a_delay_around_applied_actions_make_sense() -> None:
-    env = ActionHistory(CommandDelay(ActionHistory(FlyTrack(), kind="applied", length=2)), length=1)
+    env = ActionHistory(ActionDelay(ActionHistory(FlyTrack(), kind="applied", length=2)), length=1)
     assert env.observation_space().shape == (OBSERVATION_SIZE + 3 * 4,)
     assert len({entry.key for entry in env.observation_table}) == len(env.observation_table)
 
@@ -154,8 +155,8 @@ def test_a_subclass_counts_as_what_it_is() -> None:
 
     with pytest.raises(WrapperError, match="Louder around ObservationNoise: both"):
         Louder(ObservationNoise(FlyTrack()))
-    with pytest.raises(WrapperError, match="CommandDelay around Longer: the history would hold"):
-        CommandDelay(Longer(FlyTrack()))
+    with pytest.raises(WrapperError, match="ActionDelay around Longer: the history would hold"):
+        ActionDelay(Longer(FlyTrack()))
 
 
 @OVER_WRAPPERS
