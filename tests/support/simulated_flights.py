@@ -1,0 +1,75 @@
+"""Flights of the simulator with every effect in its model: one compiled program for all tests of effects."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from flytrack_env.dynamics import ModelParameters, nominal_parameters, read_sensors
+from flytrack_env.effects import EFFECTS
+from flytrack_env.plants import Simulator
+from flytrack_env.state import BATTERY, QUATERNION, Action, Drone, pack, unpack, unpack_action
+
+DT, NUM_STEPS = 0.01, 200
+NOMINAL = nominal_parameters()
+# Neutral effects change no bit (tests/contract/test_effects.py), so that a test may replace any of them.
+ALL_NEUTRAL = NOMINAL.with_effects(*(effect.parameters() for effect in EFFECTS))
+_SIMULATOR = Simulator()
+
+
+@jax.jit
+def fly(drone: Drone, commands: jax.Array, model: ModelParameters) -> jax.Array:
+    """Return the packed states after each command, gyro and accelerometer behind them, (num_steps, 27)."""
+
+    def one(state: Any, action: jax.Array) -> tuple[Any, jax.Array]:
+        after = _SIMULATOR.step(state, unpack_action(action), DT, model)
+        reading = read_sensors(state.drone, after.drone, after.memories, DT, model)
+        return after, jnp.concatenate([pack(after.drone), jnp.stack([*reading.rates_b, *reading.force_b])])
+
+    return jax.lax.scan(one, _SIMULATOR.reset(drone, model), commands)[1]
+
+
+def flown(
+    parameters: Any = (), commands: Any = None, drone: Drone | None = None, model: ModelParameters = NOMINAL
+) -> np.ndarray:
+    """Return a flight, (num_steps, 27), float64, with one effect or a tuple of them."""
+    effects = parameters if type(parameters) is tuple else (parameters,)
+    full = model._replace(effects=ALL_NEUTRAL.effects).with_effects(*effects)
+    commands = held(1) if commands is None else np.asarray(commands, np.float32)
+    padded = np.zeros((NUM_STEPS, 4), np.float32)
+    padded[: len(commands)] = commands
+    padded[len(commands) :] = commands[-1]
+    return np.asarray(fly(drone_with() if drone is None else drone, padded, full), float)[: len(commands)]
+
+
+def held(num_steps: int = 1, **sticks: float) -> np.ndarray:
+    """Return commands (num_steps, 4) that hold sticks; those not named are 0."""
+    return np.tile(np.array(Action(**{**dict.fromkeys(Action._fields, 0.0), **sticks})), (num_steps, 1))
+
+
+def drone_with(**fields: Any) -> Drone:
+    """Return a drone, level and at rest 1 km up, some of whose fields are replaced, float32."""
+    x = np.zeros(21, np.float32)
+    x[2], x[QUATERNION.start], x[BATTERY] = 1e3, 1.0, 24.0
+    drone = unpack(jnp.asarray(x))
+    fields = {name: type(getattr(drone, name))(*value) for name, value in fields.items()}
+    return jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32), drone._replace(**fields))
+
+
+def random_drone(seed: int) -> Drone:
+    """Return a drone near the ground in a random attitude, fast, with sticks off centre."""
+    rng = np.random.default_rng(seed)
+    return drone_with(
+        pos_w=rng.normal(size=3) + np.array([0.0, 0.0, 5.0]),
+        vel_w=rng.normal(size=3) * 8.0,
+        quat=Rotation.random(rng=rng).as_quat(scalar_first=True),
+        rates_b=rng.normal(size=3),
+        applied=rng.uniform(-0.8, 0.8, 4),
+    )
+
+
+def random_commands(seed: int, num_steps: int) -> np.ndarray:
+    """Return commands all over the sticks' range, (num_steps, 4)."""
+    return np.random.default_rng([seed, 1]).uniform(-1.0, 1.0, (num_steps, 4)).astype(np.float32)

@@ -1,0 +1,403 @@
+"""What each effect does, against its equations by hand, and what the environment shows of the gyro."""
+
+from itertools import pairwise
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy import signal
+from scipy.spatial.transform import Rotation
+
+from flytrack_env.dynamics import nominal_parameters, read_gyro, read_sensors
+from flytrack_env.effects import (
+    AccelerometerBias,
+    AccelerometerScale,
+    CommandDelay,
+    GroundEffect,
+    GyroBias,
+    GyroScale,
+    ImuLatency,
+    ImuOffset,
+    LinearDrag,
+    MotorImbalance,
+    QuadraticDrag,
+    RateCrossCoupling,
+    RateExpo,
+    RateSaturation,
+    RateScale,
+    RateSlewLimit,
+    RotorDrag,
+    SecondOrderRates,
+    ThrustLagAsymmetry,
+    ThrustScale,
+    ThrustTilt,
+    TranslationalLift,
+    VoltageSag,
+    Wind,
+    YawReaction,
+)
+from flytrack_env.effects.command_delay import BUFFER_STEPS
+from flytrack_env.effects.translational_lift import HALF_SPEED
+from flytrack_env.env import FlyTrack
+from flytrack_env.observations import OBSERVATION
+from flytrack_env.plants import Plant, Simulator
+from flytrack_env.state import ACCELERATION, APPLIED_ACTION, QUATERNION, RATES, Action
+from flytrack_env.wrappers import DomainRandomization, RandomizationParams
+from tests.support.simulated_flights import (
+    DT,
+    NOMINAL,
+    drone_with,
+    flown,
+    held,
+    random_commands,
+    random_drone,
+)
+
+GRAVITY_W = np.array([0.0, 0.0, 9.80665])
+FULL_STICK = np.deg2rad(618.0)
+NO_THRUST = NOMINAL._replace(thrust_coeffs=np.zeros(6, np.float32))
+YAWED = (np.sqrt(0.5), 0.0, 0.0, np.sqrt(0.5))  # 90 degrees: the world's x is the body's -y
+
+# --- Forces -----------------------------------------------------------------------------------------
+
+
+def force_of(parameters: Any, thrust: float = -1.0, model: Any = NOMINAL, **fields: Any) -> np.ndarray:
+    """Return the acceleration without gravity of one step, world, m/s^2."""
+    drone = drone_with(applied=(0.0, 0.0, 0.0, thrust), **fields)
+    return flown(parameters, held(thrust=thrust), drone, model)[0, ACCELERATION] + GRAVITY_W
+
+
+@pytest.mark.parametrize(
+    ("parameters", "vel_w", "quat", "expected"),
+    [
+        (LinearDrag(0.1, 0.2, 0.3), (1.0, 2.0, 3.0), (1.0, 0.0, 0.0, 0.0), (-0.1, -0.4, -0.9)),
+        (LinearDrag(0.1, 0.2, 0.3), (1.0, 0.0, 0.0), YAWED, (-0.2, 0.0, 0.0)),
+        (QuadraticDrag(0.1, 0.2, 0.3), (3.0, 4.0, 0.0), (1.0, 0.0, 0.0, 0.0), (-1.5, -4.0, 0.0)),
+        (QuadraticDrag(0.1, 0.2, 0.3), (5.0, 0.0, 0.0), YAWED, (-5.0, 0.0, 0.0)),
+        (Wind(a_x=0.5, a_y=-0.2, a_z=0.1), (3.0, 1.0, 0.0), YAWED, (0.5, -0.2, 0.1)),
+        (Wind(v_x=3.0), (0.0, 0.0, 0.0), YAWED, (0.0, 0.0, 0.0)),  # moving air without drag: nothing
+    ],
+)
+def test_forces(parameters: Any, vel_w: Any, quat: Any, expected: Any) -> None:
+    found = force_of(parameters, model=NO_THRUST, vel_w=vel_w, quat=quat)
+    np.testing.assert_allclose(found, expected, atol=2e-5)
+
+
+@pytest.mark.parametrize("drag", [LinearDrag(0.1, 0.2, 0.3), QuadraticDrag(0.01, 0.02, 0.03)])
+def test_drag_follows_airspeed(drag: Any) -> None:
+    """Flying with the wind is hovering in still air; a headwind adds to the speed."""
+    wind = Wind(v_x=4.0, v_y=-2.0, v_z=1.0)
+    drifting = force_of((wind, drag), model=NO_THRUST, vel_w=(4.0, -2.0, 1.0))
+    np.testing.assert_allclose(drifting, 0.0, atol=2e-6)
+    against = force_of((wind, drag), model=NO_THRUST, vel_w=(-1.0, 0.0, 0.0))
+    still = force_of(drag, model=NO_THRUST, vel_w=(-5.0, 2.0, -1.0))
+    np.testing.assert_allclose(against, still, rtol=1e-5, atol=2e-6)
+
+
+@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("drag", [LinearDrag(0.1, 0.2, 0.3), QuadraticDrag(0.1, 0.2, 0.3), RotorDrag(0.05)])
+def test_drag_takes_energy_in_any_attitude(seed: int, drag: Any) -> None:
+    rng = np.random.default_rng(seed)
+    rotation, vel_w = Rotation.random(rng=rng), rng.normal(size=3) * 10
+    flight = {"quat": rotation.as_quat(scalar_first=True), "vel_w": vel_w, "thrust": rng.uniform(-0.9, 0.9)}
+    drag_w = force_of(drag, **flight) - force_of((), **flight)
+    assert drag_w @ vel_w < -1e-3
+    drag_b, airspeed_b = rotation.inv().apply(np.stack([drag_w, vel_w]))
+    assert (drag_b * airspeed_b <= 1e-4).all()  # along each axis against the motion
+    assert not isinstance(drag, RotorDrag) or abs(drag_b[2]) < 1e-4  # in the rotors' plane
+
+
+def test_thrust_scale_and_mass_are_one_class() -> None:
+    """No log can tell them apart: 80 % of the thrust is 125 % of the mass."""
+    scaled = force_of(ThrustScale(0.8), 0.2)
+    np.testing.assert_allclose(scaled, force_of((), 0.2, NOMINAL._replace(m=1.25)), rtol=1e-5)
+
+
+def lift_ratio(parameters: Any, **fields: Any) -> float:
+    """Return the vertical specific force with an effect over that without."""
+    return float(force_of(parameters, 0.0, **fields)[2] / force_of((), 0.0, **fields)[2])
+
+
+@pytest.mark.parametrize(("speed", "share"), [(0.0, 0.0), (HALF_SPEED, 0.5), (3 * HALF_SPEED, 0.9)])
+def test_translational_lift_grows_with_airspeed_in_the_rotors_plane(speed: float, share: float) -> None:
+    lift, expected = TranslationalLift(0.2), pytest.approx(1.0 + 0.2 * share, rel=1e-5)
+    assert lift_ratio(lift, vel_w=(speed, 0.0, 5.0)) == expected
+    assert lift_ratio((lift, Wind(v_y=-speed))) == expected
+
+
+def test_ground_effect_is_cheeseman_and_bennetts_from_two_radii_on() -> None:
+    radius = 0.2
+    for height in (2 * radius, 4 * radius, 20 * radius):
+        theirs = 1.0 / (1.0 - (radius / (4 * height)) ** 2)
+        found = lift_ratio(GroundEffect(1 / 16, radius), pos_w=(0.0, 0.0, height))
+        assert found - 1.0 == pytest.approx(theirs - 1.0, rel=0.25)
+    for height, expected in ((0.0, 1.2), (radius, 1.1)):
+        found = lift_ratio(GroundEffect(0.2, radius), pos_w=(0.0, 0.0, height))
+        assert found == pytest.approx(expected, rel=1e-4)
+
+
+def test_thrust_tilt_pushes_sideways_in_proportion_to_thrust() -> None:
+    for thrust in (-0.5, 0.5):
+        force = force_of(ThrustTilt(0.02, -0.01), thrust)
+        np.testing.assert_allclose(force[:2] / force[2], [0.02, -0.01], rtol=1e-4)
+
+
+# --- Commands, lags and rates -----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("steps", range(BUFFER_STEPS + 1))
+def test_a_delay_of_whole_steps_shifts_the_commands(steps: int) -> None:
+    drone, commands = random_drone(2), random_commands(2, 20)
+    delayed = flown(CommandDelay(steps * DT), commands, drone)
+    before = np.tile(np.stack(drone.applied), (steps, 1))  # what was commanded before the flight
+    shifted = flown((), np.concatenate([before, commands])[:20], drone)
+    np.testing.assert_allclose(delayed, shifted, rtol=1e-4, atol=1e-4)
+
+
+def test_a_delay_within_a_step_is_the_mean_of_what_arrives() -> None:
+    """A step of the stick that arrives 1.3 steps later moves the lag by 0.7 of it in the second step."""
+    roll = flown(CommandDelay(1.3 * DT), held(4, roll=1.0))[:, APPLIED_ACTION.start]
+    blend = 1.0 - np.exp(-DT / float(NOMINAL.tau[0]))
+    assert roll[0] == 0.0
+    assert roll[1] == pytest.approx(0.7 * blend, rel=1e-4)
+    assert roll[2] == pytest.approx(roll[1] + blend * (1.0 - roll[1]), rel=1e-4)
+
+
+def test_longer_delays_act_later() -> None:
+    delays = np.linspace(0.0, BUFFER_STEPS * DT, 9)
+    pitch = [flown(CommandDelay(delay), held(10, pitch=1.0))[-1, 17] for delay in delays]
+    assert all(later < sooner for sooner, later in pairwise(pitch))
+
+
+def test_thrust_falls_with_another_lag_than_it_rises() -> None:
+    tau, ratio = float(NOMINAL.tau[3]), 2.0
+    rising, falling = (flown(ThrustLagAsymmetry(ratio), held(5, thrust=to))[:, 19] for to in (1.0, -1.0))
+    time = DT * np.arange(1, 6)
+    np.testing.assert_allclose(rising, 1 - np.exp(-time / tau), rtol=1e-5)
+    np.testing.assert_allclose(falling, np.exp(-time / (ratio * tau)) - 1, rtol=1e-5)
+
+
+def test_a_late_command_falls_when_it_arrives() -> None:
+    commands = np.concatenate([held(20, thrust=0.6), held(20, thrust=-0.6)])
+    late = flown((CommandDelay(2 * DT), ThrustLagAsymmetry(2.0)), commands)[:, 19]
+    np.testing.assert_allclose(late[2:], flown(ThrustLagAsymmetry(2.0), commands)[:-2, 19], atol=1e-6)
+
+
+def test_rate_scale_scales_rates_only() -> None:
+    scaled, plain = (
+        flown(each, random_commands(0, 1), random_drone(0))[0] for each in (RateScale(0.9, 1.1, 1.2), ())
+    )
+    np.testing.assert_allclose(scaled[RATES], plain[RATES] * [0.9, 1.1, 1.2], rtol=1e-6)
+    np.testing.assert_array_equal(scaled[APPLIED_ACTION], plain[APPLIED_ACTION])
+
+
+@pytest.mark.parametrize("stick", [-1.0, -0.5, 0.25, 1.0])
+def test_stick_curves_at_rest(stick: float) -> None:
+    at_stick = held(roll=stick), drone_with(applied=(stick, 0.0, 0.0, 0.0))
+    expo = flown(RateExpo(0.4), *at_stick)[0, 13]
+    assert expo == pytest.approx(FULL_STICK * (0.6 * stick + 0.4 * stick**3), rel=1e-5)
+    saturated = flown(RateSaturation(0.4, 0.0), *at_stick)[0, 13]
+    assert saturated == pytest.approx(FULL_STICK * np.clip(stick, -0.6, 0.6), rel=1e-5)
+
+
+def test_slew_limit_bounds_the_angular_acceleration_and_arrives() -> None:
+    rates = flown(RateSlewLimit(0.01), held(60, pitch=1.0))[:, 14]
+    assert np.diff(rates, prepend=0.0).max() <= DT / 0.01 * (1 + 1e-5)
+    assert rates[-1] == pytest.approx(FULL_STICK, rel=1e-4)
+
+
+@pytest.mark.parametrize("damping", [0.3, 1.0, 2.0])
+def test_rates_obey_the_differential_equation_of_a_second_order(damping: float) -> None:
+    """From rest, to the sticks that the first lag leaves: scipy's own simulation of a held input."""
+    lag_s = 0.05
+    frequency = 2.0 * damping / lag_s
+    plain = flown((), held(60, roll=0.5))[:, 13]
+    slope = np.array([[0.0, 1.0], [-(frequency**2), -2.0 * damping * frequency]])
+    servo = (slope, np.array([[0.0], [frequency**2]]), np.array([[1.0, 0.0]]), np.zeros((1, 1)))
+    expected = signal.dlsim(signal.cont2discrete(servo, DT, method="zoh"), np.append(plain, plain[-1]))[1]
+    found = flown(SecondOrderRates(lag_s, damping), held(60, roll=0.5))[:, 13]
+    np.testing.assert_allclose(found, expected[1:, 0], rtol=2e-4, atol=2e-4)
+    assert (found.max() > 1.02 * plain[-1]) == (damping < 0.7)
+
+
+def test_yaw_turns_by_an_angle_for_each_change_of_thrust() -> None:
+    yaw_rate = flown(YawReaction(0.05), held(100, thrust=1.0))[:, 15]
+    assert yaw_rate.sum() * DT == pytest.approx(0.05, rel=1e-3)  # u from 0 to 1
+    assert np.abs(yaw_rate[-10:]).max() < 1e-3
+
+
+def test_roll_and_pitch_rates_leak_into_yaw() -> None:
+    commands = held(20, roll=0.5, pitch=-0.4, yaw=0.3)
+    rates, plain = (flown(each, commands)[:, RATES] for each in (RateCrossCoupling(0.1, -0.2), ()))
+    np.testing.assert_array_equal(rates[:, :2], plain[:, :2])
+    np.testing.assert_allclose(rates[:, 2], plain @ [0.1, -0.2, 1.0], rtol=1e-5)
+
+
+@pytest.mark.parametrize("thrust", [-0.5, 0.0, 0.8])
+def test_roll_and_pitch_creep_with_thrust(thrust: float) -> None:
+    drone = drone_with(applied=(0.0, 0.0, 0.0, thrust))
+    state = flown(MotorImbalance(0.01, -0.02), held(thrust=thrust), drone)[0]
+    thrust_acc = state[8] + 9.80665  # level: all of it is up
+    np.testing.assert_allclose(state[RATES], [0.01 * thrust_acc, -0.02 * thrust_acc, 0.0], rtol=1e-4)
+
+
+def test_a_second_lag_does_not_remember_the_imbalance_twice() -> None:
+    """Rates that settle at the bias: it goes into the lag, and comes out of it once."""
+    commands, drone = held(60, thrust=-0.5), drone_with(applied=(0.0, 0.0, 0.0, -0.5))
+    creeping = flown((MotorImbalance(0.01), SecondOrderRates(0.03, 1.0)), commands, drone)
+    direct = flown(MotorImbalance(0.01), commands, drone)
+    assert creeping[0, 13] < 0.5 * direct[0, 13]
+    assert creeping[-1, 13] == pytest.approx(direct[-1, 13], rel=1e-3)
+
+
+def test_sag_comes_and_goes_with_the_load() -> None:
+    commands = np.concatenate([held(100, thrust=1.0), held(100, thrust=-1.0)])
+    idle = drone_with(applied=(0.0, 0.0, 0.0, -1.0))
+    sagged = flown(VoltageSag(1.5), commands, idle)[:, 20] - flown((), commands, idle)[:, 20]
+    assert sagged[99] == pytest.approx(-1.5, abs=1e-3) and sagged[-1] == pytest.approx(0.0, abs=1e-3)
+    assert sagged.min() >= -1.5 - 1e-3
+
+
+# --- Sensors ----------------------------------------------------------------------------------------
+
+# Forces that are not thrust, and rates that are not sticks.
+DISTURBED = (LinearDrag(0.3, 0.2, 0.1), Wind(3.0), MotorImbalance(0.01, 0.02))
+
+
+class Readings:
+    """Truth and readings of rates, rad/s, and specific force, m/s^2, body, of a flight, (num_steps, 3)."""
+
+    def __init__(self, *parameters: Any, commands: Any = None, drone: Any = None):
+        drone = random_drone(0) if drone is None else drone
+        commands = random_commands(0, 20) if commands is None else commands
+        rows = flown((*DISTURBED, *parameters), commands, drone)
+        self.start_rates, self.rates = np.stack(drone.rates_b), rows[:, RATES]
+        attitudes = np.concatenate([np.stack(drone.quat)[None], rows[:-1, QUATERNION]])
+        to_body = Rotation.from_quat(attitudes, scalar_first=True).inv()
+        self.force = to_body.apply(rows[:, ACCELERATION] + GRAVITY_W)
+        self.gyro, self.accelerometer = rows[:, 21:24], rows[:, 24:27]
+
+
+def assert_reads(found: np.ndarray, expected: np.ndarray) -> None:
+    np.testing.assert_allclose(found, expected, rtol=2e-5, atol=2e-4)
+
+
+def test_perfect_sensors_read_the_truth() -> None:
+    flight = Readings()
+    np.testing.assert_array_equal(flight.gyro, flight.rates)
+    assert_reads(flight.accelerometer, flight.force)
+    assert np.abs(flight.force[:, :2]).max() > 0.5  # drag is felt, gravity is not
+
+
+def test_scale_then_bias_of_each_sensor() -> None:
+    biases = AccelerometerBias(0.3, -0.2, 0.1), GyroBias(0.05, -0.04, 0.03)
+    scales = AccelerometerScale(1.1, 0.9, 1.05), GyroScale(0.95, 1.02, 1.1)
+    flight = Readings(*biases, *scales)
+    assert_reads(flight.accelerometer, flight.force * [1.1, 0.9, 1.05] + [0.3, -0.2, 0.1])
+    assert_reads(flight.gyro, flight.rates * [0.95, 1.02, 1.1] + [0.05, -0.04, 0.03])
+
+
+def test_an_accelerometer_on_an_arm_feels_the_spin() -> None:
+    """At a constant yaw rate w, on an arm r along x: the centripetal r w^2, inwards."""
+    yaw_rate = np.deg2rad(120.0)
+    spin = (0.0, 0.0, 1.0, -1.0)  # idle, so that the motors' imbalance does nothing
+    spinning = {
+        "commands": np.tile(spin, (5, 1)),
+        "drone": drone_with(applied=spin, rates_b=(0.0, 0.0, yaw_rate)),
+    }
+    for arm, felt in ((0.1, -0.1 * yaw_rate**2), (-0.05, 0.05 * yaw_rate**2)):
+        flight = Readings(ImuOffset(arm), **spinning)
+        assert_reads(flight.accelerometer - flight.force, np.tile([felt, 0.0, 0.0], (5, 1)))
+    along = Readings(ImuOffset(0.0, 0.0, 0.1), **spinning)  # on the axis of rotation: nothing
+    assert_reads(along.accelerometer, along.force)
+
+
+def test_an_arm_in_any_direction_follows_the_rigid_body() -> None:
+    arm = np.array([0.05, -0.08, 0.03])
+    flight = Readings(ImuOffset(*arm))
+    before = np.concatenate([flight.start_rates[None], flight.rates[:-1]])
+    mean, change = 0.5 * (before + flight.rates), (flight.rates - before) / DT
+    felt = np.cross(mean, np.cross(mean, arm)) + np.cross(change, arm)
+    assert_reads(flight.accelerometer, flight.force + felt)
+
+
+@pytest.mark.parametrize("steps", [0.0, 1.0, 2.0, 4.0, 0.3, 2.6])
+def test_late_sensors_read_the_past(steps: float) -> None:
+    """Before the flight, the rates are taken to have been those of the start, the force that of its first."""
+    flight = Readings(ImuLatency(steps * DT))
+    time = np.arange(-BUFFER_STEPS, 20)
+    for found, truth, before in (
+        (flight.gyro, flight.rates, flight.start_rates),
+        (flight.accelerometer, flight.force, flight.force[0]),
+    ):
+        known = np.concatenate([np.tile(before, (BUFFER_STEPS, 1)), truth])
+        then = [np.interp(time[BUFFER_STEPS:] - steps, time, known[:, axis]) for axis in range(3)]
+        assert_reads(found, np.stack(then, axis=1))
+
+
+def test_the_gyro_alone_reads_the_same() -> None:
+    model, simulator = NOMINAL.with_effects(GyroBias(0.1), ImuLatency(0.007)), Simulator()
+    before = simulator.reset(drone_with(), model)
+    after = simulator.step(before, Action(1.0, 1.0, 1.0, 0.0), DT, model)
+    both = read_sensors(before.drone, after.drone, after.memories, DT, model)
+    alone = read_gyro(after.drone, after.memories, DT, model)
+    np.testing.assert_array_equal(both.rates_b, alone)
+    assert np.abs(np.array(alone) - np.array(after.drone.rates_b)).max() > 0.05
+
+
+# --- What the environment shows of the gyro ---------------------------------------------------------
+
+SHOWN = slice(15, 18)  # where the observation has the body rates
+GYRO_SCALE = next(entry.scale for entry in OBSERVATION if entry.key == "rates")
+
+
+class WithoutGyro(Plant):
+    """The simulator without a gyro of its own."""
+
+    reset, step, drone = Simulator.reset, Simulator.step, Simulator.drone
+
+
+def shown_and_true(env: Any, params: Any, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    """Return the rates that observations show and the true ones, (4, 3) rad/s, from a start on."""
+    step = jax.jit(env.step_env)
+    state = env.begin(drone_with(rates_b=(0.5, -0.3, 0.2)), 0, params, jnp.uint32(seed))
+    rows = [(env.observe(None, state, None, params)[SHOWN] * GYRO_SCALE, np.stack(env.drone(state).rates_b))]
+    for _ in range(3):
+        observation, state, *_ = step(None, state, jnp.array([0.2, -0.1, 0.3, 0.0]), params)
+        rows.append((observation[SHOWN] * GYRO_SCALE, np.stack(env.drone(state).rates_b)))
+    shown, true = zip(*rows, strict=True)
+    return np.stack(shown), np.stack(true)
+
+
+@pytest.mark.parametrize(
+    ("effects", "plant", "lateness", "bias"),
+    [
+        ((GyroBias(0.1, -0.2, 0.3), AccelerometerBias(1.0)), None, 0, (0.1, -0.2, 0.3)),
+        ((ImuLatency(DT),), None, 1, (0.0, 0.0, 0.0)),
+        ((AccelerometerBias(1.0), ImuOffset(0.1)), None, 0, (0.0, 0.0, 0.0)),
+        ((GyroBias(0.5),), WithoutGyro(), 0, (0.0, 0.0, 0.0)),
+    ],
+)
+def test_the_observation_shows_the_gyro_of_the_plant(
+    effects: tuple[Any, ...], plant: Plant | None, lateness: int, bias: tuple[float, ...]
+) -> None:
+    env = FlyTrack(model=nominal_parameters().with_effects(*effects), plant=plant)
+    shown, true = shown_and_true(env, env.default_params)
+    rows = np.maximum(np.arange(4) - lateness, 0)
+    np.testing.assert_allclose(shown, true[rows] + bias, atol=1e-5)
+    assert np.abs(np.diff(true, axis=0)).min() > 1e-3
+
+
+def test_gyros_can_be_drawn() -> None:
+    env = DomainRandomization(FlyTrack())
+    ranges = RandomizationParams(low=(GyroBias(-0.3, -0.3, None),), high=(GyroBias(0.3, 0.3, None),))
+    params = env.default_params.replace(wrappers={"domain_randomization": ranges})
+    drawn = []
+    for seed in range(3):
+        shown, true = shown_and_true(env, params, seed)
+        state = env.begin(drone_with(), 0, params, jnp.uint32(seed))
+        drawn.append(np.array(env.model(state, params).effect("gyro_bias")))
+        np.testing.assert_allclose(shown - true, np.tile(drawn[-1], (4, 1)), atol=1e-5)
+    assert np.ptp(drawn, axis=0)[:2].min() > 0.0 and not np.any(np.stack(drawn)[:, 2])
