@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from tqdm import tqdm
 
 from benchmarks import report
 from flytrack_env.state import ACTION_SIZE
@@ -114,7 +113,7 @@ def run(num_plants: int, seed: int) -> tuple[dict[str, list[Outcome]], dict[str,
     """Return outcomes by kind of log, and the largest one-step NRMSE of any clean log by channel."""
     outcomes: dict[str, list[Outcome]] = {name: [] for name in AIMS}
     one_step: dict[str, float] = {}
-    for number in tqdm(range(num_plants), unit=" plants", disable=None):
+    for number in report.progress(range(num_plants), "plants"):
         rng = np.random.default_rng([seed, number])
         truth = draw_truth(rng)
         clean = collect(step_of(truth), MINUTES, seed=number)

@@ -13,8 +13,11 @@ from collections.abc import Iterable, Sequence
 from datetime import date
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
+from tqdm import tqdm
+
+Item = TypeVar("Item")
 ROOT = Path(__file__).parent.parent
 RESULTS = ROOT / "docs" / "results"
 PACKAGES = ("jax", "jaxlib", "gymnax", "numpy")
@@ -102,6 +105,11 @@ def percent(flags: Sequence[bool | int]) -> str:
 def spread(values: Sequence[float], digits: str = ",.0f") -> str:
     """Return the lowest and the highest value as text."""
     return f"{min(values):{digits}} to {max(values):{digits}}"
+
+
+def progress(items: Iterable[Item], unit: str) -> Iterable[Item]:
+    """Return items with a progress bar, shown on a terminal only; unit: what is counted."""
+    return tqdm(items, unit=f" {unit}", disable=None)
 
 
 def page(title: str, *parts: str) -> str:

@@ -1,4 +1,4 @@
-"""Rates of environments and of trainings of different sizes; of CPU time on a CPU, of wall time elsewhere."""
+"""Rates of environments and trainings by size, for ``benchmarks.scaling``."""
 
 import statistics
 import time
@@ -21,19 +21,19 @@ WIDTHS = (16, 32, 64, 128, 256)
 GATES, ARENA_M = (4, 8, 16, 24), (60.0, 80.0)
 NUM_EFFECTS = (0, 1, 2, 4, 8, len(EFFECTS))
 SEEDS = (1, 2, 4, 8)
-STEPS_A_CALL = 2**20  # of environments: long enough to time, short enough to repeat
+STEPS_PER_CALL = 2**20  # long enough to time, short enough to repeat
 REPEATS = 5
 
 Row = tuple[Any, float, float]  # what was varied, million steps a second (median), compile time, s
 
 
 def clock() -> float:
-    """Return seconds: of this process's CPU time on a CPU, because others share it; else of the wall."""
+    """Return seconds of CPU time on a CPU, which other processes share; else of wall time."""
     return time.process_time() if jax.default_backend() == "cpu" else time.perf_counter()
 
 
 def rate(call: Callable[[], Any], num_steps: int) -> tuple[float, float]:
-    """Return the median rate of a call, million steps a second, and how long the first call took more, s."""
+    """Return the median rate of a call, million steps a second, and the first call's additional time, s."""
     started = time.perf_counter()
     jax.block_until_ready(call())
     first_s = time.perf_counter() - started
@@ -46,8 +46,8 @@ def rate(call: Callable[[], Any], num_steps: int) -> tuple[float, float]:
 
 
 def environment_rate(env: Any, num_envs: int) -> tuple[float, float]:
-    """Return the rate of stepping a batch with drawn actions."""
-    length, params = max(1, STEPS_A_CALL // num_envs), env.default_params
+    """Return the rate of stepping a batch with random actions."""
+    length, params = max(1, STEPS_PER_CALL // num_envs), env.default_params
     _, state = jax.jit(jax.vmap(env.reset, in_axes=(0, None)))(
         jax.random.split(jax.random.key(0), num_envs), params
     )
@@ -80,14 +80,14 @@ def effects() -> Iterator[Row]:
 
 
 def gates() -> Iterator[Row]:
-    """Yield rates over the number of gates of a drawn course."""
+    """Yield rates over the number of gates of a random course."""
     for number in GATES:
         track = random_track(0, num_gates=number, size=ARENA_M)
         yield number, *environment_rate(flytrack_env.make("FlyTrack-v0", track=track), NUM_ENVS)
 
 
 def training_rate(config: Config, num_seeds: int = 1) -> tuple[float, float]:
-    """Return the rate of one update, of one seed or of several side by side."""
+    """Return the rate of one update, of one or several seeds trained together."""
     trainer = Trainer(config)
     runners = [trainer.start(jax.random.key(seed)) for seed in range(num_seeds)]
     steps = num_seeds * config.batch_size
@@ -98,7 +98,7 @@ def training_rate(config: Config, num_seeds: int = 1) -> tuple[float, float]:
 
 
 def trained_environments() -> Iterator[Row]:
-    """Yield rates of training over the number of environments, minibatches as large as in the recipe."""
+    """Yield rates of training over the number of environments, at the recipe's minibatch size."""
     recipe = Config()
     for num_envs in TRAINED_ENVS:
         minibatches = max(1, recipe.num_minibatches * num_envs // recipe.num_envs)
@@ -113,7 +113,7 @@ def widths() -> Iterator[Row]:
 
 
 def seeds() -> Iterator[Row]:
-    """Yield rates of training, all seeds together, over the number of seeds side by side."""
+    """Yield rates of training over the number of seeds trained together, total steps of all."""
     for number in SEEDS:
         yield number, *training_rate(Config(), number)
 

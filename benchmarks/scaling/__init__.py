@@ -1,1 +1,0 @@
-"""How cost grows, and what more devices, processes and seeds bring: ``python -m benchmarks.scaling``."""
