@@ -26,10 +26,10 @@ PARTS = (*TABLES, PROCESSES)
 # Name -> processes, devices of each.
 ARRANGEMENTS = {"one device": (1, 1), "two devices": (1, 2), "two processes": (2, 1), "four devices": (1, 4)}
 EPISODES = 256
-INTRODUCTION = """`python -m benchmarks.scaling`: how cost grows, and what more devices, processes and seeds bring.
-What the figures mean, and how to train on several machines: [scaling](../scaling.md). Rates on a CPU are
-million steps per second of CPU time, of one core; each is the median of five calls. Start: compilation and
-the first call."""
+INTRODUCTION = """`python -m benchmarks.scaling`: how cost grows, and what more devices, processes and seeds
+bring. What the figures mean, and how to train on several machines: [scaling](../scaling.md). Rates on a CPU
+are million steps per second of CPU time, of one core; each is the median of five calls. Start: compilation
+and the first call."""
 
 
 def measure_table(name: str) -> dict[str, Any]:
@@ -130,8 +130,8 @@ def process_table(rows: list[dict[str, Any]], steps: int) -> str:
         means = f"{success}: mean {statistics.mean(row['success']):.1%}", f"{laps}: mean {mean_lap}"
         cells.append((row["arrangement"], *means, f"{row['cpu_s']:.0f}", f"{row['wall_s']:.0f}"))
     return (
-        f"`train_ppo --total-timesteps {steps}`: success of {EPISODES} noisy starts in the simulator and best "
-        "lap, by seed; CPU and wall time of a training, including its start.\n\n"
+        f"`train_ppo --total-timesteps {steps}`: success of {EPISODES} noisy starts in the simulator and "
+        "best lap, by seed; CPU and wall time of a training, including its start.\n\n"
         + report.table(
             "arrangement | success, by seed | best lap (s), by seed | CPU (s) | wall (s)",
             cells,

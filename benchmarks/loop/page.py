@@ -1,16 +1,17 @@
-"""The page of the loop: what each policy does on each plant, and whether the extension helped."""
+"""The page of the loop's benchmark: how each policy does on each plant, and whether the extension helped."""
 
-import argparse
 import math
 import re
 from pathlib import Path
 from statistics import median
 from typing import Any
 
-from benchmarks.env_speed import cpu_name, versions
-from benchmarks.loop.chart import draw_chart
+from matplotlib.figure import Figure
+
+from benchmarks import report
 from flytrack_env.effects import BY_NAME as ALL_EFFECTS
 from flytrack_env.files import write_atomically
+from flytrack_env.pictures.style import png_of
 
 POLICIES = {
     "before": "minimal model",
@@ -19,10 +20,20 @@ POLICIES = {
     "nominal": "nominal model",
     "randomised": "randomised, no identification",
 }
-# Of the policy of the minimal model: where its race holds this, the effect does not matter.
+# The hidden effects matter where the minimal model's policy is worse than this.
 MATTERS_BELOW, MATTERS_ABOVE_PERCENT = 0.80, 3.0
 AIM_SUCCESS, AIM_GAP_PERCENT, AIM_SHARE = 0.95, 1.0, 0.9
-LITTLE = 0.01  # of success, where less is chance of 256 flights, and of a lap
+LITTLE = 0.01  # of success, where less may be chance in 256 flights, and of a lap
+MARKS = {
+    "before": ("o", "C3"),
+    "after": ("o", "C2"),
+    "refitted_base": ("s", "C0"),
+    "nominal": ("v", "0.5"),
+    "randomised": ("^", "C1"),
+}
+LARGEST_GAP_PERCENT = 10.0  # larger gaps, and policies without a lap, are drawn here
+SPREAD = 0.12  # between the marks of a column
+DPI = 130
 
 
 def stage(result: dict[str, Any], name: str) -> dict[str, Any]:
@@ -31,7 +42,7 @@ def stage(result: dict[str, Any], name: str) -> dict[str, Any]:
 
 
 def gap_percent(one: dict[str, Any]) -> float:
-    """Return the size of a stage's lap gap, %; infinite where the plant saw no lap."""
+    """Return the size of a stage's lap gap, %; infinite where no lap was completed."""
     gap = one["lap_gap_percent"]
     return math.inf if gap is None else abs(gap)
 
@@ -43,19 +54,19 @@ def lap_s(one: dict[str, Any]) -> float:
 
 
 def does_matter(result: dict[str, Any]) -> bool:
-    """Return whether what is hidden spoils the race of the policy of the minimal model."""
+    """Return whether the hidden effects spoil the race of the minimal model's policy."""
     before = stage(result, "before")
     return before["plant"]["success"] < MATTERS_BELOW or gap_percent(before) > MATTERS_ABOVE_PERCENT
 
 
 def is_reached(result: dict[str, Any]) -> bool:
-    """Return whether the extended model's policy races as the aim asks."""
+    """Return whether the extended model's policy meets the aim."""
     after = stage(result, "after")
     return after["plant"]["success"] >= AIM_SUCCESS and gap_percent(after) <= AIM_GAP_PERCENT
 
 
 def where_it_does_not_help(result: dict[str, Any]) -> str | None:
-    """Return why the extension is of no use on a plant; None where it is."""
+    """Return why the extension does not help on a plant; None where it does."""
     before, after, base = (stage(result, name) for name in ("before", "after", "refitted_base"))
     if not result["causes"]:
         return "nothing was named"
@@ -74,11 +85,6 @@ def _number(value: float | None, form: str) -> str:
     return "-" if value is None else format(value, form)
 
 
-def _table(head: list[str], rows: list[list[str]]) -> str:
-    lines = [head, ["---"] * len(head), *rows]
-    return "".join(f"| {' | '.join(line)} |\n" for line in lines)
-
-
 def _race_cell(one: dict[str, Any]) -> str:
     plant, gap = one["plant"], one["lap_gap_percent"]
     success = f"{plant['success']:.1%} ({one['simulator']['success']:.1%})"
@@ -95,7 +101,7 @@ def race_table(results: list[dict[str, Any]]) -> str:
         ]
         for result in results
     ]
-    return _table(["plant", "matters", *POLICIES.values()], rows)
+    return report.table(["plant", "matters", *POLICIES.values()], rows)
 
 
 def _model_cells(result: dict[str, Any]) -> list[str]:
@@ -108,8 +114,7 @@ def _model_cells(result: dict[str, Any]) -> list[str]:
 
 
 def model_table(results: list[dict[str, Any]]) -> str:
-    """Return what is hidden and named, and the errors of the models on held-out flights."""
-    head = ["plant", "hidden", "named", "log", "velocity", "attitude", "free flight of 1 s (m)"]
+    """Return hidden and named effects, and the models' errors on held-out flights."""
     rows = [
         [
             result["job"],
@@ -120,27 +125,27 @@ def model_table(results: list[dict[str, Any]]) -> str:
         ]
         for result in results
     ]
-    return _table(head, rows)
+    return report.table("plant | hidden | named | log | velocity | attitude | free flight of 1 s (m)", rows)
 
 
 def verdict(results: list[dict[str, Any]]) -> tuple[str, bool]:
-    """Return whether the aim is met, as text and as truth; without a plant that matters it is."""
+    """Return the verdict as text, and whether the aim is met; without a plant that matters it is."""
     matter = [result for result in results if does_matter(result)]
     reached = [result for result in matter if is_reached(result)]
     lost = [result["job"] for result in matter if not is_reached(result)]
     text = (
-        f"Of {len(results)} plants, what is hidden matters on {len(matter)}: the policy of the minimal model "
+        f"The hidden effects matter on {len(matter)} of {len(results)} plants: the minimal model's policy "
         f"finishes less than {MATTERS_BELOW:.0%}, or its lap differs by more than "
         f"{MATTERS_ABOVE_PERCENT:g} % from the simulator's. On **{len(reached)} of {len(matter)}** the "
         f"policy of the extended model reaches at least {AIM_SUCCESS:.0%} with a lap gap of at most "
         f"{AIM_GAP_PERCENT:g} % (aim: 9 of 10)"
     )
     text += f"; not on {', '.join(lost)}." if lost else "."
-    return text + of_all(results), len(reached) >= AIM_SHARE * len(matter)
+    return text + summary_of_all(results), len(reached) >= AIM_SHARE * len(matter)
 
 
-def of_all(results: list[dict[str, Any]]) -> str:
-    """Return a sentence on all plants, whether what is hidden matters or not."""
+def summary_of_all(results: list[dict[str, Any]]) -> str:
+    """Return a sentence on all plants, whether the hidden effects matter or not."""
     if not results:
         return ""
     pairs = [(stage(result, "before"), stage(result, "after")) for result in results]
@@ -158,17 +163,40 @@ def of_all(results: list[dict[str, Any]]) -> str:
 
 
 def names_not_there(result: dict[str, Any]) -> list[str]:
-    """Return the effects that were named on a hidden plant and are not in it."""
+    """Return the effects that were named on a hidden plant but are not in it."""
     hidden = re.findall(r"(\w+)\(", result["hidden"])
     return [name for name in result["causes"] if name in ALL_EFFECTS and hidden and name not in hidden]
 
 
-PAGE = """# The loop: does the diagnosis make better policies?
+def draw_chart(results: list[dict[str, Any]]) -> bytes:
+    """Return the chart as PNG: success and lap gap, a column per plant, a mark per policy."""
+    figure = Figure(figsize=(max(7.0, 0.75 * len(results) + 2.0), 6.0), layout="constrained")
+    success, gap = figure.subplots(2, 1, sharex=True)
+    for place, (name, label) in enumerate(POLICIES.items()):
+        stages = [next(one for one in result["stages"] if one["name"] == name) for result in results]
+        marker, colour = MARKS[name]
+        where = [index + SPREAD * (place - 2) for index in range(len(results))]
+        style = {"linestyle": "", "marker": marker, "color": colour, "label": label, "markersize": 7}
+        success.plot(where, [100.0 * one["plant"]["success"] for one in stages], **style)
+        gaps = [one["lap_gap_percent"] for one in stages]
+        sizes = [math.inf if one is None else abs(one) for one in gaps]
+        gap.plot(where, [min(size, LARGEST_GAP_PERCENT) for size in sizes], **style)
+    success.set_ylabel("finish 3 laps on the plant (%)")
+    gap.set_ylabel(f"|lap gap| (%), {LARGEST_GAP_PERCENT:g}: more, or no lap")
+    gap.axhline(1.0, color="0.7", linewidth=1.0)
+    success.axhline(95.0, color="0.7", linewidth=1.0)
+    gap.set_xticks(range(len(results)), [result["job"] for result in results])
+    gap.set_xlabel("plant")
+    for axes in (success, gap):
+        axes.grid(axis="y", alpha=0.3)
+    figure.legend(*success.get_legend_handles_labels(), loc="outside upper center", ncols=3)
+    return png_of(figure, DPI)
 
-`python -m benchmarks.loop --plants {plants} --seed {seed} --steps {steps}`. Every policy: {millions:g} M
-environment steps of the default recipe, one training seed; 256 perturbed starts x 3 laps. Logs as of common
-sensors; the policies see the plant's state. The diagnosis was shown flights of the minimal model's policy and
-the excitation that the minimal model was fitted to.
+
+PAGE = """Every policy: {millions:g} M environment steps of the default recipe, one training seed; 256
+perturbed starts x 3 laps. Logs with common sensor noise; the policies observe the plant's state. The
+diagnosis was given flights of the minimal model's policy, and the excitation to which the minimal model was
+fitted.
 
 {verdict}
 
@@ -176,51 +204,47 @@ the excitation that the minimal model was fitted to.
 
 ## The race
 
-Success on the plant (in the simulator that the policy learnt in), mean flying lap on the plant, and how much
-longer that is than in the simulator. Lap times are of laps that were completed.
+Success on the plant (in the simulator in which the policy was trained), mean flying lap on the plant, and by
+how much it is longer than in the simulator. Lap times are of completed laps.
 
 {race}
+
 ## The models
 
-On flights of the minimal model's policy from other starts, which no fit and no diagnosis saw: minimal /
-refitted base / extended. Velocity and attitude: error of one step over the measured change, the sensors'
-noise in it. Free flight: median error of position. Log: how long the flights lasted that were diagnosed.
+On held-out flights of the minimal model's policy from other starts: minimal / refitted base / extended.
+Velocity and attitude: error of one step over the measured change, including sensor noise. Free flight: median
+error of position. Log: length of the diagnosed flights.
 
 {models}
-Effects that were named and are not in the plant: {strangers}. Base parameters (`tau_roll`, `thrust_curve`)
-are not counted: the minimal model had bent them.
+
+Effects that were named and are not in the plant: {false_names}. Base parameters (`tau_roll`, `thrust_curve`)
+are not counted: they were biased in the minimal model.
 
 ## Where the extension does not help
 
 {useless}
-{cpu_min:.1f} CPU min on these plants. {machine}.
-"""
+
+{cpu_min:.1f} CPU min on these plants."""
 
 
-def write_page(
-    path: Path, results: list[dict[str, Any]], arguments: argparse.Namespace, wall_s: float
-) -> bool:
-    """Write the page and its chart, print the verdict; return whether the aim is met."""
+def write_page(path: Path, results: list[dict[str, Any]], steps: int) -> bool:
+    """Write the page and its chart; return whether the aim is met."""
     text, is_met = verdict(results)
-    print(text)
     chart = path.with_suffix(".png")
-    write_atomically(chart, draw_chart(results, POLICIES))
+    write_atomically(chart, draw_chart(results))
     useless = [(result["job"], why) for result in results if (why := where_it_does_not_help(result))]
-    strangers = [(result["job"], names) for result in results if (names := names_not_there(result))]
-    page = PAGE.format(
-        plants=arguments.plants,
-        seed=arguments.seed,
-        steps=arguments.steps,
-        millions=arguments.steps / 1e6,
+    false_names = [(result["job"], names) for result in results if (names := names_not_there(result))]
+    body = PAGE.format(
+        millions=steps / 1e6,
         verdict=text,
         chart=chart.name,
         race=race_table(results),
         models=model_table(results),
-        useless="".join(f"- {job}: {why}.\n" for job, why in useless) or "On none of these plants.\n",
-        strangers="; ".join(f"plant {job}: {', '.join(names)}" for job, names in strangers) or "none",
+        useless="\n".join(f"- {job}: {why}." for job, why in useless) or "On none of these plants.",
+        false_names="; ".join(f"plant {job}: {', '.join(names)}" for job, names in false_names) or "none",
         cpu_min=sum(result["cpu_s"] for result in results) / 60.0,
-        machine=f"{cpu_name()}; {', '.join(f'{name} {number}' for name, number in versions().items())}",
     )
-    write_atomically(path, page.encode())
-    print(f"written: {path}, {chart}; {wall_s / 60.0:.1f} min, without jobs that were done before")
+    origin = report.provenance_line(report.provenance())
+    title = "The loop: does the diagnosis make better policies?"
+    report.write_page(path, report.page(title, report.command_line(), body, origin))
     return is_met

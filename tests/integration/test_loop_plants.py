@@ -6,7 +6,7 @@ import pytest
 
 from benchmarks.hidden import Outside, Truth, draw_base, draw_effect, with_effects
 from benchmarks.hidden.plant import Plant, Start
-from benchmarks.loop.plant import EFFECTS, HiddenPlant
+from benchmarks.loop.plants import EFFECTS, HiddenPlant
 from flytrack_env import nominal_parameters
 from flytrack_env.quaternion import Quaternion, Vec3
 from flytrack_env.state import Action, Drone, pack

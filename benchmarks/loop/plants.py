@@ -1,18 +1,24 @@
-"""Hidden plants that an environment can fly: the equations of ``benchmarks.hidden``, written for JAX.
+"""Hidden plants that an environment can fly, drawn from a seed: ``benchmarks.hidden`` written for JAX.
 
-Nothing here is shared with the simulator but the layout of the state. A test holds each step to the plain
+Nothing but the layout of the state is shared with the simulator. A test compares each step with the plain
 floats of ``benchmarks.hidden.plant``.
 """
 
 import math
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
-from benchmarks.hidden import Truth
-from benchmarks.hidden.effects import LIFT_SPEED
+from benchmarks.hidden import EFFECTS as EFFECT_RANGES
+from benchmarks.hidden import Truth, draw_effect
+from benchmarks.hidden.effects import LIFT_SPEED, MOST_STEPS
+from benchmarks.hidden.plant import SECONDS_PER_MINUTE
+from benchmarks.hidden.truth import DT_S
+from flytrack_env import nominal_parameters
 from flytrack_env.dynamics import ModelParameters
 from flytrack_env.plants import Plant
 from flytrack_env.quaternion import Scalar
@@ -27,9 +33,6 @@ from flytrack_env.state import (
     unpack,
 )
 
-DT_S = 0.01
-SECONDS_PER_MINUTE = 60.0
-MOST_STEPS = 8  # of commands that a delay remembers
 EFFECTS = (
     "command_delay",
     "thrust_lag_asymmetry",
@@ -42,12 +45,17 @@ EFFECTS = (
     "thrust_tilt",
     "voltage_sag",
 )
+LAG_SPREAD, THRUST_SPREAD = 0.2, 0.05  # |ln factor| of the lags, and of the thrust map, at most
+LARGE = 2.0 / 3.0  # smallest size drawn, as a share of the log range
+# Hidden effects of the first plants: named, or a number of random ones.
+HIDDEN = (("command_delay",), ("quadratic_drag",), ("thrust_scale",), 2, 3)
+LATER = 5  # random effects of all later plants
 
 
 class HiddenState(NamedTuple):
     """A plant in flight: the handout's state (21,), the battery without load (), V, and past commands.
 
-    past: (MOST_STEPS, 4), the newest first. num_past: how many of them were given.
+    past: (MOST_STEPS, 4), newest first. num_past: how many of them are valid.
     """
 
     x: jax.Array
@@ -60,7 +68,7 @@ class HiddenPlant(Plant):
     """A plant that flies a ``Truth``; its state is a ``HiddenState``.
 
     Raises:
-        ValueError: a truth with gusts, with an effect of no list, or with one that is not of ``EFFECTS``.
+        ValueError: a truth with gusts, with an effect outside the list, or with one not in ``EFFECTS``.
     """
 
     dt = DT_S
@@ -98,7 +106,7 @@ class HiddenPlant(Plant):
         past = jnp.concatenate([newest[None], state.past[:-1]])
         num_past = jnp.minimum(state.num_past + 1, MOST_STEPS)
         x = state.x
-        applied = self._lagged(x[APPLIED_ACTION], self._late(past, num_past))
+        applied = self._lagged(x[APPLIED_ACTION], self._delayed(past, num_past))
         to_world = _rotation(x[QUATERNION])
         airspeed_b = x[VELOCITY] @ to_world
         thrust_acc = self._thrust_acc(applied[3], x[20], airspeed_b)
@@ -117,8 +125,8 @@ class HiddenPlant(Plant):
         ]
         return HiddenState(jnp.concatenate(after), open_v, past, num_past)
 
-    def _late(self, past: jax.Array, num_past: jax.Array) -> jax.Array:
-        """Return the command that acts, (4,): u(t - delay_s), averaged over the step."""
+    def _delayed(self, past: jax.Array, num_past: jax.Array) -> jax.Array:
+        """Return the delayed command, (4,): u(t - delay_s), averaged over the step."""
         part, whole = math.modf(self._of("command_delay").get("delay_s", 0.0) / DT_S)
         newer, older = (past[jnp.minimum(int(whole) + more, num_past - 1)] for more in (0, 1))
         return (1.0 - part) * newer + part * older
@@ -177,3 +185,40 @@ def _turned(quat: jax.Array, rates_b: jax.Array) -> jax.Array:
     spin = jnp.concatenate([-(axis @ rates_b)[None], w * rates_b + jnp.cross(axis, rates_b)])
     moved = quat + 0.5 * DT_S * spin
     return moved / jnp.linalg.norm(moved)
+
+
+def _size(name: str, rng: np.random.Generator) -> float:
+    """Return a size from the upper third of its range."""
+    low, high = math.log(EFFECT_RANGES[name].low), math.log(EFFECT_RANGES[name].high)
+    return math.exp(rng.uniform(low + LARGE * (high - low), high))
+
+
+def _draw_values(name: str, rng: np.random.Generator) -> dict[str, float]:
+    if name == "thrust_scale":  # a loss: old packs, worn propellers and payload do not add thrust
+        return {"factor": math.exp(-_size(name, rng))}
+    return draw_effect(name, rng, _size(name, rng))
+
+
+def draw_base(rng: np.random.Generator) -> Truth:
+    """Return the handout's nominal drone with other lags and another thrust map."""
+    nominal = nominal_parameters()
+    factors = np.exp(rng.uniform(-LAG_SPREAD, LAG_SPREAD, 4))
+    thrust = math.exp(rng.uniform(-THRUST_SPREAD, THRUST_SPREAD))
+    return Truth(
+        tau=tuple(float(tau * factor) for tau, factor in zip(nominal.tau, factors, strict=True)),
+        coeffs=tuple(float(thrust * one) for one in nominal.thrust_coeffs),
+        max_rate=tuple(float(rate) for rate in nominal.max_rate),
+        drain=float(nominal.battery_drain_v_per_min),
+        mass=float(nominal.m),
+        gravity=float(nominal.g),
+    )
+
+
+def draw_plant(number: int, seed: int) -> Truth:
+    """Return a plant by its number, from 0: its effects follow ``HIDDEN``, their sizes the seed."""
+    rng = np.random.default_rng([seed, number])
+    hidden = HIDDEN[number] if number < len(HIDDEN) else LATER
+    if isinstance(hidden, int):
+        hidden = tuple(str(name) for name in rng.choice(EFFECTS, size=hidden, replace=False))
+    base = draw_base(rng)
+    return replace(base, effects={name: _draw_values(name, rng) for name in hidden})

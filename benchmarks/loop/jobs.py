@@ -1,0 +1,92 @@
+"""The jobs of the loop's benchmark, each on one core: policies that need no plant, and one job per plant.
+
+A job is ``nominal`` or ``randomised`` (shared policies), ``shipped``, or the number of a hidden plant. JAX is
+imported by the jobs only, because its threads stay on the core to which ``pin`` has moved the process.
+"""
+
+import json
+import os
+import shutil
+import time
+import traceback
+from contextlib import redirect_stderr, redirect_stdout
+from pathlib import Path
+from typing import Any
+
+from benchmarks.report import write_json
+
+SHARED = {"nominal": "FlyTrack-v0", "randomised": "FlyTrackRandomized-v0"}
+RESULT, LOG = "result.json", "log.txt"
+
+
+def pin(free_cores: Any) -> None:
+    """Keep this process on a core taken from a queue."""
+    os.environ["OMP_NUM_THREADS"] = "1"
+    if hasattr(os, "sched_setaffinity"):
+        os.sched_setaffinity(0, {free_cores.get()})
+
+
+def run_job(job: str, out: Path, steps: int, seed: int) -> dict[str, Any]:
+    """Return a job's result, from its file if it was finished before; an unfinished job starts again.
+
+    What it prints, and the traceback of an error, go to a log in the job's folder.
+    """
+    folder = out / job
+    if (folder / RESULT).exists():
+        return dict(json.loads((folder / RESULT).read_text()))
+    shutil.rmtree(folder, ignore_errors=True)  # else its trainings would be refused as another run's
+    folder.mkdir(parents=True)
+    started_s = time.process_time()
+    with (folder / LOG).open("w") as log, redirect_stdout(log), redirect_stderr(log):
+        try:
+            result = (train_shared if job in SHARED else measure_plant)(job, out, steps, seed)
+        except BaseException:
+            traceback.print_exc()
+            raise
+    result["cpu_s"] = time.process_time() - started_s
+    write_json(folder / RESULT, result)
+    return result
+
+
+def train_shared(job: str, out: Path, steps: int, seed: int) -> dict[str, Any]:
+    """Train a policy on the nominal drone, or on randomised drones around it."""
+    from baselines.purejaxrl_ppo import Config
+    from baselines.purejaxrl_ppo.train_ppo import train_policy
+    from flytrack_loop.loop import seeds_of
+
+    train_policy(out / job, Config(total_timesteps=steps), seeds_of(seed)["train"], SHARED[job])
+    return {"job": job}
+
+
+def make_plant(job: str, seed: int) -> tuple[Any, str]:
+    """Return the plant of a job, and its hidden effects as text."""
+    from benchmarks.loop.plants import HiddenPlant, draw_plant
+    from eval_agent import SHIPPED_BLACK_BOX
+    from flytrack_env import blackbox
+
+    if job == "shipped":
+        return blackbox.load(SHIPPED_BLACK_BOX), "the shipped black box"
+    truth = draw_plant(int(job), seed)
+    return HiddenPlant(truth), truth.text()
+
+
+def measure_plant(job: str, out: Path, steps: int, seed: int) -> dict[str, Any]:
+    """Close the loop on a plant, train on the refitted base model, and fly the shared policies."""
+    from baselines.purejaxrl_ppo import Config, load_checkpoint
+    from flytrack_env import nominal_parameters
+    from flytrack_loop import close_loop, train_stage
+    from flytrack_loop.loop import Settings, loop_as_json, seeds_of
+    from flytrack_loop.stages import judge, stage_as_json
+
+    plant, hidden = make_plant(job, seed)
+    config, seeds, settings = Config(total_timesteps=steps), seeds_of(seed), Settings()
+    loop = close_loop(plant, out / job, config, seed, settings)
+    rest = (seeds["train"], seeds["evaluation"], loop.held_out)
+    stages = [train_stage("refitted_base", loop.diagnosis.base, plant, out / job, config, *rest)]
+    for name in SHARED:
+        checkpoint = load_checkpoint(out / name / "final.msgpack")
+        model = nominal_parameters()
+        stages.append(judge(name, model, checkpoint, plant, seeds["evaluation"], loop.held_out))
+    content = loop_as_json(loop, seed, config, settings)
+    content["stages"] += [stage_as_json(stage) for stage in stages]
+    return {"job": job, "hidden": hidden, **content}
