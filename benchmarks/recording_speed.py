@@ -12,7 +12,7 @@ from pathlib import Path
 from benchmarks import report
 from flytrack_env import load_track
 from flytrack_env.references import ghost_rollout, shipped_references
-from flytrack_env.viz_rerun import ShownFlight, write_recording
+from flytrack_env.viz_rerun import Trajectory, write_recording
 
 STEPS = 6000
 AIM_S = 3.0
@@ -26,7 +26,7 @@ def main() -> None:
     pinned = report.pin_to_one_core()
     track = load_track("flytrack")
     states, actions = ghost_rollout(shipped_references(track, ("nominal",)), STEPS)
-    flights = [ShownFlight(name, states, actions) for name in ("flight", "second", "third")]
+    flights = [Trajectory(name, states, actions) for name in ("flight", "second", "third")]
     cases = {
         "one flight, first call": flights[:1],
         "one flight, later calls": flights[:1],

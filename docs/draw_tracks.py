@@ -11,16 +11,16 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
 from flytrack_env.files import write_atomically
-from flytrack_env.pictures.course_view import (
+from flytrack_env.pictures.drawing import (
     HEADROOM,
     LABEL_SHARE,
-    OPENING_COLOUR,
     draw_gates,
     draw_path,
     extent,
     label_from_above,
+    png_of,
 )
-from flytrack_env.pictures.style import png_of
+from flytrack_env.scene import PAPER_OPENING
 from flytrack_env.tracks import Track, available_tracks, build_course, load_track, random_track, sample_way
 
 RANDOM_SEEDS = (0, 1)
@@ -53,7 +53,7 @@ def label_from_the_side(axes: Axes, track: Track) -> None:
         x = np.mean([gate.position[0] for gate in column])
         z = max(gate.position[2] + 0.5 * gate.frame for gate in column) + room
         text = ", ".join(str(gate.id) for gate in ordered)
-        axes.text(x, z, text, color=OPENING_COLOUR, ha="center", va="center", weight="bold")
+        axes.text(x, z, text, color=PAPER_OPENING, ha="center", va="center", weight="bold")
 
 
 def draw_view(axes: Axes, track: Track, view: list[int]) -> LineCollection:

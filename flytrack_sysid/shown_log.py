@@ -16,7 +16,7 @@ import numpy as np
 from flytrack_env.dynamics import ModelParameters
 from flytrack_env.effects import BY_NAME
 from flytrack_env.state import ACTION_SIZE, STATE_SIZE
-from flytrack_env.viz_rerun import ShownFlight
+from flytrack_env.viz_rerun import Trajectory
 from flytrack_sysid.diagnosis.traces import Traces, traces
 from flytrack_sysid.forces import WINDOW_S
 from flytrack_sysid.log import NOMINAL_STEP_S, FlightLog, log_of_states
@@ -117,12 +117,12 @@ def open_force_w(left: Traces, model: str, time_s: np.ndarray) -> np.ndarray:
     return np.divide(total[:, :3], total[:, 3:], out=np.full((len(total), 3), np.nan), where=counted)
 
 
-def measured_flight(timed: _Timed, name: str, residuals_w: Mapping[str, np.ndarray]) -> ShownFlight:
+def measured_flight(timed: _Timed, name: str, residuals_w: Mapping[str, np.ndarray]) -> Trajectory:
     """Return the flight as it was measured."""
     log, starts = timed.log, timed.log.is_start()
     first = np.flatnonzero(starts)[np.cumsum(starts) - 1]
     rows = np.flatnonzero((np.arange(len(log)) - first) % timed.every == 0)
-    return ShownFlight(
+    return Trajectory(
         name=name,
         states=states_of(log.channels)[rows],
         actions=log["u"][rows],
@@ -171,7 +171,7 @@ def _piece(filled: Filled, start: int, end: int, flown: Mapping[str, np.ndarray]
     return _Piece(filled.source_row[rows[shown]], states[shown], count < len(rows))
 
 
-def model_flight(timed: _Timed, name: str, model: ModelParameters) -> ShownFlight | None:
+def model_flight(timed: _Timed, name: str, model: ModelParameters) -> Trajectory | None:
     """Return a model's free flight, anew every second; None where the log lacks what it starts from."""
     model = with_neutral_effects(model, BY_NAME)  # so that one program flies every one
     if inputs_that_lack(model, timed.log)["p"]:
@@ -190,7 +190,7 @@ def model_flight(timed: _Timed, name: str, model: ModelParameters) -> ShownFligh
     return _joined(timed, name, pieces)
 
 
-def _joined(timed: _Timed, name: str, pieces: list[_Piece]) -> ShownFlight:
+def _joined(timed: _Timed, name: str, pieces: list[_Piece]) -> Trajectory:
     """Return pieces as one flight; it begins with the log's first row, so that all flights have one clock."""
     if pieces[0].rows[0] > 0:
         first = states_of({channel: timed.log[channel][:1] for channel in FLOWN if channel in timed.log})
@@ -199,7 +199,7 @@ def _joined(timed: _Timed, name: str, pieces: list[_Piece]) -> ShownFlight:
     restarts = np.concatenate([np.arange(len(piece.rows)) == 0 for piece in pieces])
     ran_away = sum(piece.ran_away for piece in pieces)
     astray = f"; ran away {ran_away} times" if ran_away else ""
-    return ShownFlight(
+    return Trajectory(
         name=name,
         states=np.concatenate([piece.states for piece in pieces]),
         actions=np.full((len(rows), ACTION_SIZE), np.nan),  # those of the log: one line would hide another
@@ -211,7 +211,7 @@ def _joined(timed: _Timed, name: str, pieces: list[_Piece]) -> ShownFlight:
 
 def flights_of(
     log: FlightLog, models: Mapping[str, ModelParameters], left: Traces | None = None
-) -> list[ShownFlight]:
+) -> list[Trajectory]:
     """Return the flights of a log that are to be shown: measured, and one of each model that can fly it.
 
     models: by the names to show. left: what they leave of the log (``traces``), if that is known. Of more

@@ -39,15 +39,15 @@ def record_flights(
         ImportError: Rerun is not installed; the message says how to install it.
         ValueError: a path that cannot be written.
     """
-    from flytrack_env.viz_rerun import ShownFlight, write_recording
+    from flytrack_env.viz_rerun import Trajectory, write_recording
 
     shown = []
     for name, flight in flights.items():
         is_flying = np.asarray(flight.is_flying)
         states, actions = (np.asarray(part)[is_flying] for part in (flight.states, flight.actions))
         ended = reason_ended(flight, num_laps).replace("_", " ")
-        shown.append(ShownFlight(name, states, actions, ended=ended))
+        shown.append(Trajectory(name, states, actions, ended=ended))
     if references is not None:
         longest = max(len(one.states) for one in shown)
-        shown.append(ShownFlight("time-optimal", *ghost_rollout(references, longest)))
+        shown.append(Trajectory("time-optimal", *ghost_rollout(references, longest)))
     write_recording(path, shown, track)

@@ -7,8 +7,7 @@ from matplotlib.figure import Figure
 
 from benchmarks.optimal.replay import Replay
 from flytrack_env.files import write_atomically
-from flytrack_env.pictures.course_view import draw_gates, draw_path, label_from_above
-from flytrack_env.pictures.style import png_of
+from flytrack_env.pictures.drawing import draw_gates, draw_path, label_from_above, png_of
 from flytrack_env.references import Reference
 from flytrack_env.state import POSITION, VELOCITY
 from flytrack_env.tracks import Track

@@ -16,7 +16,7 @@ from flytrack_env.gymnasium_adapter.options import Start
 from flytrack_env.randomness import seed_of
 from flytrack_env.registration import make
 from flytrack_env.rendering import scene_row
-from flytrack_env.rendering.scene import GATE_INDEX
+from flytrack_env.rendering.flight_log import GATE_INDEX
 from flytrack_env.state import BATTERY, STATE_SIZE, unpack
 from flytrack_env.tracks import Track, build_course, load_track
 

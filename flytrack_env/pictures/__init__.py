@@ -1,7 +1,7 @@
-"""Recorded flights as PNGs and MP4s, without a viewer and without a display.
+"""Recorded flights as PNG, MP4 and GIF files, without a viewer and without a display.
 
 ``python -m flytrack_env.pictures`` draws rollout files. Needs the extra ``flytrack[viz]``, and
-``flytrack[render]`` for videos; importing this package does not.
+``flytrack[render]`` for videos and animations; importing this package does not.
 """
 
 import importlib
@@ -12,7 +12,9 @@ from typing import TYPE_CHECKING
 
 from flytrack_env.extras import check_installed
 from flytrack_env.files import write_atomically
-from flytrack_env.pictures.flight import COMPARISON, Flight, Meeting, make_flight, read_flights
+from flytrack_env.pictures.flight import Flight, Meeting, make_flight, read_flights
+from flytrack_env.references import Reference
+from flytrack_env.tracks import build_course
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -24,23 +26,22 @@ __all__ = [
     "draw_flight",
     "make_flight",
     "read_flights",
+    "write_animation",
     "write_pictures",
     "write_video",
 ]
 
-EXTRAS = {"matplotlib": "viz", "moviepy": "render"}
 VIEWS = ("top", "side", "commands")
 
 
-def _module(name: str, needs: str) -> ModuleType:
-    """Return one of this package's modules that need a library.
+def _load(name: str, extra: str, library: str) -> ModuleType:
+    """Return a module that needs a library of an extra; raises ImportError if that is not installed."""
+    check_installed(extra, "pictures of flights" if extra == "viz" else "videos of flights", library)
+    return importlib.import_module(f"flytrack_env.{name}")
 
-    Raises:
-        ImportError: that library is not installed; the message says how to install it.
-    """
-    what = "videos" if needs == "moviepy" else "pictures"
-    check_installed(EXTRAS[needs], f"{what} of flights", needs)
-    return importlib.import_module(f"{__name__}.{name}")
+
+def _figures() -> ModuleType:
+    return _load("pictures.figures", "viz", "matplotlib")
 
 
 def draw_flight(flight: Flight) -> dict[str, "Figure"]:
@@ -49,7 +50,8 @@ def draw_flight(flight: Flight) -> dict[str, "Figure"]:
     Raises:
         ImportError: matplotlib is not installed.
     """
-    return {name: getattr(_module(name, "matplotlib"), f"draw_{name}")(flight) for name in VIEWS}
+    figures = _figures()
+    return {name: getattr(figures, f"draw_{name}")(flight) for name in VIEWS}
 
 
 def draw_comparison(flights: Sequence[Flight]) -> "Figure":
@@ -62,7 +64,7 @@ def draw_comparison(flights: Sequence[Flight]) -> "Figure":
     tracks = sorted({flight.track.name for flight in flights})
     if len(tracks) != 1:
         raise ValueError(f"flights: found tracks {tracks}, expected flights on one")
-    return _module("top", "matplotlib").draw_comparison(flights)
+    return _figures().draw_comparison(flights)
 
 
 def write_pictures(flights: Sequence[Flight], folder: str | Path) -> list[Path]:
@@ -79,23 +81,40 @@ def write_pictures(flights: Sequence[Flight], folder: str | Path) -> list[Path]:
         f"{flight.name}_{name}": figure for flight in flights for name, figure in draw_flight(flight).items()
     }
     if len(flights) > 1:
-        figures[f"{COMPARISON}_top"] = draw_comparison(flights)
-    png_of = _module("style", "matplotlib").png_of
+        figures["comparison_top"] = draw_comparison(flights)
+    png_of = _load("pictures.drawing", "viz", "matplotlib").png_of
     contents = {Path(folder) / f"{name}.png": png_of(figure) for name, figure in figures.items()}
     for path, content in contents.items():
         write_atomically(path, content)
     return list(contents)
 
 
-def write_video(flight: Flight, folder: str | Path, has_bar: bool = False) -> Path:
+def write_video(flight: Flight, folder: str | Path) -> Path:
     """Write ``NAME.mp4``, the fastest flying lap at the speed at which it was flown; return its path.
 
-    Else the first lap; without a complete lap the flight, up to 20 s. has_bar: show a progress bar.
+    Else the first lap; without a complete lap the flight, up to 20 s.
 
     Raises:
         ImportError: moviepy or Pillow is not installed.
         OSError: the file cannot be written; nothing half-written is left.
     """
     path = Path(folder) / f"{flight.name}.mp4"
-    _module("video", "moviepy").write_video(flight, path, has_bar)
+    _load("pictures.video", "render", "moviepy").write_video(flight, path)
+    return path
+
+
+def write_animation(flight: Flight, reference: Reference, folder: str | Path) -> Path:
+    """Write ``NAME.gif``, the fastest flying lap beside the time-optimal one; return its path.
+
+    reference: a time-optimal flying lap of the same track.
+
+    Raises:
+        ImportError: moviepy or Pillow is not installed.
+        ValueError: a flight without a complete flying lap.
+        OSError: the file cannot be written; nothing half-written is left.
+    """
+    laps = _load("pictures.video", "render", "moviepy").laps_to_compare(flight, reference)
+    make_gif = _load("rendering.animation", "render", "PIL").make_gif
+    path = Path(folder) / f"{flight.name}.gif"
+    write_atomically(path, make_gif(build_course(flight.track), laps))
     return path

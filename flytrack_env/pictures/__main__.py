@@ -1,52 +1,71 @@
 """Pictures of rollout files: ``python -m flytrack_env.pictures ROLLOUT ... --out FOLDER``."""
 
-import argparse
 import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated, Literal
 
-from flytrack_env.pictures import read_flights, write_pictures, write_video
+import tyro
+
+from flytrack_env.pictures import read_flights, write_animation, write_pictures, write_video
+from flytrack_env.references import shipped_reference
 from flytrack_env.tracks import load_track
 
 
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="python -m flytrack_env.pictures", description="Draw rollouts as PNGs, and a lap of each as MP4."
-    )
-    parser.add_argument("rollouts", metavar="ROLLOUT", nargs="+", help="rollout files (.npy)")
-    parser.add_argument(
-        "--out", metavar="FOLDER", type=Path, required=True, help="where pictures are written"
-    )
-    parser.add_argument("--track", default="flytrack", help="track name or .toml (%(default)s)")
-    parser.add_argument("--video", action="store_true", help="also write a lap of each as MP4")
-    parser.add_argument(
-        "--allow-pickle",
-        action="store_true",
-        help="read pickled rollouts; this runs whatever code they hold: only for files from those you trust",
-    )
-    return parser
+@dataclass(frozen=True)
+class Settings:
+    """Draw rollouts as PNGs, and a lap of each as MP4 or GIF."""
+
+    rollouts: Annotated[tuple[Path, ...], tyro.conf.Positional]
+    """Rollout files (.npy)."""
+    out: Path
+    """Folder to write to."""
+    track: str = "flytrack"
+    """Name of a shipped track, or a track file (.toml)."""
+    allow_pickle: bool = False
+    """Read pickled rollouts. Unpickling runs whatever code a file holds: allow it for files you trust."""
+    video: bool = False
+    """Also write a lap of each as MP4."""
+    animation: bool = False
+    """Also write the fastest flying lap of each beside the time-optimal one as GIF."""
+    ghost_model: Literal["nominal", "black_box"] = "nominal"
+    """Drone for which the animation's other lap is optimal."""
 
 
-def _check_folder(folder: Path) -> None:
-    """Refuse a path that is a file or below one, before anything is drawn."""
+def _draw(settings: Settings) -> None:
+    """Draw the flights; raises ImportError, OSError or ValueError for what cannot be drawn."""
+    if not settings.rollouts:
+        raise ValueError("rollouts: found none, expected at least one file")
+    folder = settings.out
     found = next(path for path in (folder, *folder.parents) if path.exists())
     if not found.is_dir():
         raise NotADirectoryError(f"--out {folder}: found a file, {found}, expected a folder or a new path")
+    track = load_track(settings.track)
+    flights = read_flights(settings.rollouts, track, settings.allow_pickle)
+    paths = write_pictures(flights, folder)
+    if settings.video:
+        paths += [write_video(flight, folder) for flight in flights]
+    if settings.animation:
+        reference = shipped_reference(track.name, "flying", settings.ghost_model)
+        paths += [write_animation(flight, reference, folder) for flight in flights]
+    for path in paths:
+        print(f"{path}: {path.stat().st_size} bytes")
 
 
-def main(arguments: list[str] | None = None) -> int:
+def main(arguments: Sequence[str] | None = None) -> int:
     """Draw rollout files from the command line; return the exit status."""
-    options = _parser().parse_args(arguments)
+    settings = tyro.cli(
+        Settings,
+        args=arguments,
+        prog="python -m flytrack_env.pictures",
+        config=[tyro.conf.FlagCreatePairsOff],
+    )
     try:
-        _check_folder(options.out)
-        flights = read_flights(options.rollouts, load_track(options.track), options.allow_pickle)
-        for path in write_pictures(flights, options.out):
-            print(f"{path}: {path.stat().st_size} bytes")
-        for flight in flights if options.video else ():
-            path = write_video(flight, options.out, has_bar=True)
-            print(f"{path}: {path.stat().st_size} bytes")
+        _draw(settings)
     except (ImportError, OSError, ValueError) as error:
         print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
-        return 1
+        return 2
     return 0
 
 

@@ -9,17 +9,16 @@ import numpy as np
 
 from flytrack_env.flown_race import DRONE_RADIUS_M, STEP_S, FlownRace, follow_race, why_ended
 from flytrack_env.quaternion import Vec3
-from flytrack_env.rollout import RolloutError, load_named_rollouts
+from flytrack_env.rollout import load_named_rollouts
 from flytrack_env.state import POSITION, VELOCITY
 from flytrack_env.tracks import Track, build_course, cross_gate
 
 PASSED, TOUCHED, MISSED = "passed", "frame touched", "missed"
-COMPARISON = "comparison"
 SHOWN_LAPS = 6
 
 
 class Meeting(NamedTuple):
-    """The drone in the plane of the gate that is next.
+    """The drone in the plane of the gate to fly next.
 
     outcome: PASSED, TOUCHED or MISSED. gate: index in flying order. time_s: since the first state.
     distance_m: flown until then. pos_w: where, (3,), world, m. right_m, up_m: off the gate's centre, as the
@@ -40,9 +39,9 @@ class Meeting(NamedTuple):
 class Flight(NamedTuple):
     """One recorded flight at 100 Hz.
 
-    name: of its pictures. states: (T, 21), the applied roll, pitch and yaw may be NaN. commands: (T, 4).
-    track: that was flown. race: gates and laps, followed through the positions.
-    distances_m: flown until each state, (T,). meetings: in order. ended: why, in words.
+    name: of its pictures. states: (T, 21), whose applied roll, pitch and yaw may be NaN. commands: (T, 4).
+    race: gates and laps, followed through the positions. distances_m: flown until each state, (T,).
+    meetings: in order. ended: why the flight ended.
     """
 
     name: str
@@ -71,12 +70,13 @@ class Flight(NamedTuple):
 
     @property
     def title(self) -> str:
-        """What was flown, in a line."""
-        gates = _count(len(self.race.passes), "gate")
-        return f"{self.name} on {self.track.name}: {STEP_S * len(self.states):.2f} s, {gates}, {self.ended}"
+        """Name, track, duration, gates passed and the reason of the end, in a line."""
+        gates = len(self.race.passes)
+        flown = f"{STEP_S * len(self.states):.2f} s, {gates} gate{'' if gates == 1 else 's'}"
+        return f"{self.name} on {self.track.name}: {flown}, {self.ended}"
 
     @property
-    def laps_in_words(self) -> str:
+    def laps_text(self) -> str:
         """The lap times in a line; of many laps the first and the fastest."""
         times = self.lap_times_s
         if not times:
@@ -84,10 +84,6 @@ class Flight(NamedTuple):
         if len(times) > SHOWN_LAPS:
             return f"{len(times)} laps, first {times[0]:.3f} s, fastest {min(times):.3f} s"
         return f"{'lap' if len(times) == 1 else 'laps'} {', '.join(f'{time:.3f}' for time in times)} s"
-
-
-def _count(number: int, what: str) -> str:
-    return f"{number} {what}{'' if number == 1 else 's'}"
 
 
 def make_flight(name: str, states: np.ndarray, commands: np.ndarray, track: Track) -> Flight:
@@ -100,14 +96,12 @@ def make_flight(name: str, states: np.ndarray, commands: np.ndarray, track: Trac
 
 
 def read_flights(paths: Sequence[str | Path], track: Track, allow_pickle: bool = False) -> tuple[Flight, ...]:
-    """Return the flights of rollout files, named after them, and after their folders where that is needed.
+    """Return the flights of rollout files, named after the files, and their folders where files are alike.
 
     Raises:
-        RolloutError: a file that is no rollout, or files that cannot be told apart by these names.
+        RolloutError: a file that is no rollout, or two files of the same name and folder's name.
     """
     rollouts = load_named_rollouts(paths, allow_pickle)
-    if len(rollouts) > 1 and COMPARISON in rollouts:
-        raise RolloutError(f"{COMPARISON}: found a rollout of the comparison's name, expected another name")
     return tuple(make_flight(name, *rollout, track) for name, rollout in rollouts.items())
 
 
@@ -116,8 +110,8 @@ def _meetings(
 ) -> tuple[Meeting, ...]:
     """Return every crossing of the next gate's plane that passed, touched or missed it.
 
-    The last state is carried on for a step at its velocity, as in ``why_ended``: that is where most
-    flights that fail meet their last gate.
+    The last state is extrapolated for a step at its velocity, as in ``why_ended``: most flights that fail
+    meet their last gate in that step.
     """
     positions = states[:, POSITION]
     ends = np.concatenate([positions[1:], positions[-1:] + STEP_S * states[-1:, VELOCITY]])

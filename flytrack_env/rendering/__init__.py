@@ -7,11 +7,11 @@ compiled step, what a picture shows; ``FlightLog`` collects such rows; ``make_re
 from typing import TYPE_CHECKING
 
 from flytrack_env.extras import check_installed
-from flytrack_env.rendering.scene import SCENE_SIZE, FlightLog, scene_row
+from flytrack_env.rendering.flight_log import SCENE_SIZE, FlightLog, scene_row
 from flytrack_env.tracks import Course
 
 if TYPE_CHECKING:
-    from flytrack_env.rendering.renderer import Renderer
+    from flytrack_env.rendering.views import Renderer
     from flytrack_env.rendering.window import Window
 
 __all__ = ["SCENE_SIZE", "FlightLog", "make_renderer", "open_window", "scene_row"]
@@ -24,7 +24,7 @@ def make_renderer(course: Course) -> "Renderer":
         ImportError: Pillow is not installed; the message says how to install it.
     """
     check_installed("render", "pictures", "PIL")
-    from flytrack_env.rendering.renderer import Renderer
+    from flytrack_env.rendering.views import Renderer
 
     return Renderer(course)
 

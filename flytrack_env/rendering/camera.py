@@ -2,9 +2,15 @@
 
 import numpy as np
 
-from flytrack_env.rendering.geometry import UP_W, unit
+from flytrack_env.scene import UP_W
 
 NEAREST_M = 0.15  # what is nearer to the camera is cut away
+
+
+def unit(vector: np.ndarray, fallback: np.ndarray) -> np.ndarray:
+    """Return a vector (3,) at length 1, or the fallback where it has none."""
+    length = np.linalg.norm(vector)
+    return vector / length if length > 1e-6 else fallback
 
 
 class Camera:
@@ -24,7 +30,7 @@ class Camera:
         return (points_w - self.eye_w) @ self.axes.T
 
     def pixels(self, points_c: np.ndarray) -> np.ndarray:
-        """Return where points (..., 3) of the camera's frame, all before it, are, (..., 2)."""
+        """Return the pixels (..., 2) of points (..., 3) in the camera's frame, all in front of it."""
         return self.centre_px + self.focal_px * points_c[..., :2] / points_c[..., 2:]
 
     def horizon_px(self) -> float:
@@ -47,7 +53,7 @@ class Camera:
     def polygon(self, points_c: np.ndarray) -> list[float]:
         """Return the visible part of a polygon (n, 3), camera's frame, as x, y, x, y, ... in pixels.
 
-        Empty where nothing of it is before the camera.
+        Empty if all of it is behind the camera.
         """
         depths = points_c[:, 2].tolist()
         if max(depths) < NEAREST_M:
@@ -58,7 +64,7 @@ class Camera:
 
 
 def _cut(points_c: np.ndarray) -> np.ndarray:
-    """Return the part of a polygon (n, 3) that is partly before the nearest plane, (m, 3)."""
+    """Return the part (m, 3) in front of the nearest plane of a polygon (n, 3) that crosses it."""
     kept = []
     for start, end in zip(points_c, np.roll(points_c, -1, axis=0), strict=True):
         is_seen = start[2] >= NEAREST_M

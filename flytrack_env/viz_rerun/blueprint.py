@@ -1,4 +1,4 @@
-"""How the viewer opens: the course, a view that follows the drone, the plots, what happened when."""
+"""How the viewer opens: the course, a view that follows the drone, the plots, and the events."""
 
 from collections.abc import Sequence
 
@@ -7,13 +7,13 @@ import rerun.blueprint as rrb
 from rerun.blueprint.encodings import TextLogColumn, TextLogColumnKind
 
 from flytrack_env.state import Action
-from flytrack_env.viz_rerun.entities import Entities
-from flytrack_env.viz_rerun.flights import ShownFlight
+from flytrack_env.viz_rerun.entities import Writer
 
 BEHIND_M = (-2.5, 0.0, 1.2)
 SMALLEST_M = 4.0  # of what a view of the course shows
 ANGLES = {f"{angle} angle [deg]": (f"orientation/{angle}",) for angle in ("roll", "pitch", "yaw")}
-KEYS = ("speed [m/s]", "roll stick", "force left open [m/s²]")  # plots whose legends serve the others
+FORCE = "force not explained [m/s²]"
+KEYS = ("speed [m/s]", "roll stick", FORCE)  # plots whose legends serve the others
 # Title of each plot, and the lines in it, or the folder of them.
 PLOTS = {
     "speed [m/s]": ("speed",),
@@ -21,63 +21,60 @@ PLOTS = {
     **{f"{stick} stick": (f"action/{stick}", f"applied/{stick}") for stick in Action._fields},
     "battery [V]": ("battery",),
     "distance to the next gate [m]": ("gate_distance",),
-    "force left open [m/s²]": ("residual/**",),
+    FORCE: ("residual/**",),
 }
 
 
-def _around(flights: Sequence[ShownFlight]) -> rrb.EyeControls3D:
-    """Return an eye that sees all paths, from behind and above."""
-    positions = np.concatenate([flight.positions for flight in flights])
+def _course_view(writers: Sequence[Writer]) -> rrb.Spatial3DView:
+    """Return a view of all paths, from behind and above."""
+    positions = np.concatenate([writer.trajectory.positions for writer in writers])
     low, high = positions.min(axis=0), positions.max(axis=0)
     middle, size = 0.5 * (low + high), max(float(np.linalg.norm(high - low)), SMALLEST_M)
     position = middle + size * np.array([-0.55, -0.35, 0.5])
-    return rrb.EyeControls3D(kind=rrb.Eye3DKind.Orbital, position=position, look_target=middle)
+    eye = rrb.EyeControls3D(kind=rrb.Eye3DKind.Orbital, position=position, look_target=middle)
+    return rrb.Spatial3DView(origin="/world", name="course", eye_controls=eye)
 
 
-def _following(flight: ShownFlight, entities: Entities) -> rrb.Spatial3DView:
+def _chase_view(writer: Writer) -> rrb.Spatial3DView:
     """Return a view of the course from behind a drone: the world in a frame that flies along."""
     eye = rrb.EyeControls3D(kind=rrb.Eye3DKind.Orbital, position=BEHIND_M, look_target=(0.0, 0.0, 0.0))
     return rrb.Spatial3DView(
-        origin=f"/{entities.chase}",
+        origin=f"/{writer.world}/chase",
         contents="/world/**",
-        name=f"follow {flight.name}",
+        name=f"follow {writer.trajectory.name}",
         eye_controls=eye,
         line_grid=False,
     )
 
 
-def _plot(title: str, lines: Sequence[str], entities: Sequence[Entities]) -> rrb.TimeSeriesView:
-    contents = [f"/{own.plots}/{line}" for own in entities for line in lines]
+def _plot(title: str, lines: Sequence[str], writers: Sequence[Writer]) -> rrb.TimeSeriesView:
+    contents = [f"/{writer.plots}/{line}" for writer in writers for line in lines]
     # A legend hides a third of a small plot.
     legend = rrb.PlotLegend(rrb.Corner2D.RightTop, visible=title in KEYS)
     return rrb.TimeSeriesView(origin="/", contents=contents, name=title, plot_legend=legend)
 
 
-def _plots(entities: Sequence[Entities], paths: set[str]) -> rrb.Grid:
-    """Return a view for every plot that has lines; the angles share a place."""
-    views: list[rrb.View | rrb.Container] = []
-    for title, lines in PLOTS.items():
-        if any(path.startswith(tuple(line.removesuffix("**") for line in lines)) for path in paths):
-            views.append(_plot(title, lines, entities))
-    return rrb.Grid(*views, rrb.Tabs(*(_plot(*angle, entities) for angle in ANGLES.items())), grid_columns=2)
-
-
-def make_blueprint(
-    flights: Sequence[ShownFlight], entities: Sequence[Entities], paths: set[str]
-) -> rrb.Blueprint:
-    """Return the layout of a recording; paths: the lines that its plots have, below that of the plots."""
+def make_blueprint(writers: Sequence[Writer], paths: set[str]) -> rrb.Blueprint:
+    """Return the layout of a recording; paths: of the lines that its plots have, below that of the plots."""
+    has_line = {
+        title: any(path.startswith(tuple(line.removesuffix("**") for line in lines)) for path in paths)
+        for title, lines in PLOTS.items()
+    }
+    plots = [_plot(title, lines, writers) for title, lines in PLOTS.items() if has_line[title]]
+    angles = rrb.Tabs(*(_plot(title, lines, writers) for title, lines in ANGLES.items()))
     body = rrb.TextLogColumns(text_log_columns=[TextLogColumn(TextLogColumnKind.Body)])
-    events = rrb.TextLogView(origin="/", contents="/events/**", name="what happened", columns=body)
-    about = rrb.TextDocumentView(origin="/about", name="flights")
-    follow = [_following(flight, own) for flight, own in zip(flights, entities, strict=True)]
+    chases = [_chase_view(writer) for writer in writers]
     left = rrb.Vertical(
-        rrb.Spatial3DView(origin="/world", name="course", eye_controls=_around(flights)),
-        rrb.Tabs(*follow) if len(follow) > 1 else follow[0],
-        rrb.Horizontal(about, events),
+        _course_view(writers),
+        rrb.Tabs(*chases) if len(chases) > 1 else chases[0],
+        rrb.Horizontal(
+            rrb.TextDocumentView(origin="/about", name="flights"),
+            rrb.TextLogView(origin="/", contents="/events/**", name="events", columns=body),
+        ),
         row_shares=[4.0, 4.0, 2.0],
     )
     return rrb.Blueprint(
-        rrb.Horizontal(left, _plots(entities, paths), column_shares=[1.0, 1.0]),
+        rrb.Horizontal(left, rrb.Grid(*plots, angles, grid_columns=2), column_shares=[1.0, 1.0]),
         rrb.TimePanel(state="collapsed", timeline="sim_time", play_state="playing", loop_mode="all"),
         rrb.SelectionPanel(state="collapsed"),
         rrb.BlueprintPanel(state="collapsed"),

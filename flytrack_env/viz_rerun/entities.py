@@ -1,34 +1,243 @@
-"""Where the parts of a flight lie in a recording."""
+"""The entities of a recording: what is logged once, and what changes from step to step as whole columns."""
 
+import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
+import numpy as np
 import rerun as rr
 
+from flytrack_env import scene
+from flytrack_env.flown_race import FlownRace
+from flytrack_env.scene import Colour, gates_of, rotations
+from flytrack_env.state import APPLIED_ACTION, BATTERY, QUATERNION, RATES, VELOCITY, Action
+from flytrack_env.tracks import Track, build_course
+from flytrack_env.viz_rerun.trajectory import Trajectory
 
-class Entities(NamedTuple):
-    """Entity paths of one flight: what is in the world, the folder of its plots, its events."""
-
-    drone: str
-    chase: str
-    trajectory: str
-    passes: str
-    laps: str
-    residual: str
-    plots: str
-    events: str
+CAMERA_RAY_M, DIRECTION_M = 0.3, 1.0
+SCALED_FORCE = 0.1  # m of an arrow per m/s^2
+DIM = 0.6  # of the commanded action's line beside the applied one's
+THIN, THICK = 1.0, 2.0
+# On the screen, so that they are seen from the other end of the course.
+PATH_RADIUS, PASS_RADIUS, LAP_RADIUS, ARROW_RADIUS = (
+    float(np.asarray(rr.Radius.ui_points(points))) for points in (1.5, 3.5, 5.0, 2.5)
+)
 
 
-def entities_of(name: str, is_first: bool) -> Entities:
-    """Return the paths of a flight; the first one has those of the handout."""
-    part = "" if is_first else f"/flights/{rr.escape_entity_path_part(name)}"
-    world = f"world{part}"
-    return Entities(
-        drone=f"{world}/drone",
-        chase=f"{world}/chase",
-        trajectory=f"{world}/trajectory",
-        passes=f"{world}/passes",
-        laps=f"{world}/laps",
-        residual=f"{world}/residual",
-        plots=f"plots{part}",
-        events=f"events{part}",
-    )
+class Plot(NamedTuple):
+    """One line of a plot: its path below that of the plots, label, values (T,), the model it is of."""
+
+    path: str
+    label: str
+    values: np.ndarray
+    model: str = ""
+
+
+def log_course(recording: rr.RecordingStream, track: Track | None) -> None:
+    """Log the axes, the gates (centre, frame, opening, direction of flight) and the bounds, once."""
+
+    def log(entity: str, archetype: rr.AsComponents) -> None:
+        recording.log(entity, archetype, static=True, strict=True)
+
+    log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP)
+    if track is None:
+        return
+    style = {"colors": scene.NEXT_GATE}
+    positions = np.reshape([gate.position for gate in track.gates], (-1, 3))
+    names = [f"gate {gate.id}" for gate in track.gates]
+    log("world/gates/centre", rr.Points3D(positions, labels=names, radii=0.05, **style))
+    if track.gates:
+        gates = gates_of(build_course(track))
+        for name, corners in (("outer", gates.outer), ("inner", gates.inner)):
+            closed = np.concatenate([corners, corners[:, :1]], axis=1)
+            log(f"world/gates/{name}", rr.LineStrips3D(closed, radii=0.02, **style))
+        forward = DIRECTION_M * gates.forward
+        log("world/gates/direction", rr.Arrows3D(vectors=forward, origins=positions, radii=0.02, **style))
+    low, high = np.array(track.bounds_low), np.array(track.bounds_high)
+    if np.isfinite(high - low).all():
+        box = rr.Boxes3D(
+            centers=[0.5 * (low + high)],
+            half_sizes=[0.5 * (high - low)],
+            fill_mode=rr.components.FillMode.MajorWireframe,
+            colors=scene.BOUNDS,
+        )
+        log("world/bounds", box)
+
+
+def plots_of(trajectory: Trajectory, race: FlownRace | None) -> list[Plot]:
+    """Return the lines of a flight's plots."""
+    states = trajectory.states
+    plots = [
+        Plot("speed", "speed [m/s]", np.linalg.norm(states[:, VELOCITY], axis=1)),
+        Plot("angular_speed", "angular speed [rad/s]", np.linalg.norm(states[:, RATES], axis=1)),
+        Plot("battery", "battery [V]", states[:, BATTERY]),
+    ]
+    applied = states[:, APPLIED_ACTION]
+    for column, name in enumerate(Action._fields):
+        plots.append(Plot(f"action/{name}", f"{name} action", trajectory.actions[:, column]))
+        plots.append(Plot(f"applied/{name}", f"{name} applied", applied[:, column]))
+    angles_deg = _angles_deg(states[:, QUATERNION])
+    for name, values in zip(("roll", "pitch", "yaw"), angles_deg.T, strict=True):
+        plots.append(Plot(f"orientation/{name}", f"{name} [deg]", values))
+    if race is not None:
+        plots.append(Plot("gate_distance", "distance to the next gate [m]", race.gate_distance_m))
+    for name, forces_w in trajectory.residuals_w.items():
+        path = f"residual/{rr.escape_entity_path_part(name)}"
+        size = np.linalg.norm(forces_w, axis=1)
+        plots.append(Plot(path, f"force not explained by {name} [m/s²]", size, name))
+    return plots
+
+
+def _angles_deg(quaternions: np.ndarray) -> np.ndarray:
+    """Return roll, pitch and yaw of quaternions (T, 4), (T, 3) deg, in the order z, y, x, without jumps."""
+    w, x, y, z = quaternions.T
+    roll = np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
+    pitch = np.arcsin(np.clip(2 * (w * y - z * x), -1.0, 1.0))
+    yaw = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+    return np.degrees(np.stack([np.unwrap(roll), pitch, np.unwrap(yaw)], axis=1))
+
+
+class Writer:
+    """Writes the entities of one flight.
+
+    The first flight has ``world/drone`` and so on, as in the handout; others ``world/flights/NAME/drone``.
+    colours: by the names of flights and models.
+    """
+
+    def __init__(self, trajectory: Trajectory, is_first: bool, colours: dict[str, Colour]):
+        part = "" if is_first else f"/flights/{rr.escape_entity_path_part(trajectory.name)}"
+        self.world, self.plots, self.events = f"world{part}", f"plots{part}", f"events{part}"
+        self.trajectory, self.colours = trajectory, colours
+        self.all_rows = np.arange(len(trajectory.states))
+
+    def write(
+        self,
+        recording: rr.RecordingStream,
+        plots: Sequence[Plot],
+        label: str,
+        events: Sequence[tuple[int, str]],
+        race: FlownRace | None,
+    ) -> None:
+        """Write all of the flight.
+
+        label: before the name of each line. events: pairs of row and text.
+        """
+        self.recording = recording
+        self._log_drone()
+        self._send_poses()
+        self._send_path()
+        for plot in plots:
+            self._send_plot(plot, label)
+        for model, forces_w in self.trajectory.residuals_w.items():
+            self._send_arrows(model, forces_w)
+        rows, texts = zip(*events, strict=True)
+        columns = rr.TextLog.columns(text=texts, level=["INFO"] * len(texts))
+        self._send(self.events, np.array(rows), columns)
+        if race is not None and race.passes:
+            self._send_passes(race)
+
+    def _log(self, entity: str, archetype: rr.AsComponents) -> None:
+        self.recording.log(entity, archetype, static=True, strict=True)
+
+    def _send(self, entity: str, rows: np.ndarray, columns: rr.ComponentColumnList) -> None:
+        """Send an entity's columns for these rows of the flight; rows after its end count as the last one."""
+        rows = np.minimum(rows, self.all_rows[-1])
+        indexes = [
+            rr.TimeColumn("step", sequence=rows),
+            rr.TimeColumn("sim_time", duration=self.trajectory.time_ns[rows].astype("timedelta64[ns]")),
+        ]
+        self.recording.send_columns(entity, indexes, columns, strict=True)
+
+    def _log_drone(self) -> None:
+        """Log the drone's body in its own frame, and the look of its path and of its passes, once."""
+        drone, colour = f"{self.world}/drone", self.colours[self.trajectory.name]
+        pitch = math.radians(scene.CAMERA_PITCH_DEG)
+        ray_b = CAMERA_RAY_M * np.array([math.cos(pitch), 0.0, math.sin(pitch)])
+        self._log(f"{drone}/motors", rr.Points3D(scene.MOTORS_B, radii=0.03, colors=colour))
+        self._log(f"{drone}/arms", rr.LineStrips3D(scene.ARMS_B, radii=0.01, colors=colour))
+        ray = rr.Arrows3D(vectors=[ray_b], origins=[(0.0, 0.0, 0.0)], colors=scene.CAMERA)
+        self._log(f"{drone}/camera", ray)
+        for name in ("flown", "recent"):
+            style = rr.LineStrips3D.from_fields(radii=PATH_RADIUS, colors=colour)
+            self._log(f"{self.world}/trajectory/{name}", style)
+        self._log(f"{self.world}/passes", rr.Points3D.from_fields(radii=PASS_RADIUS, colors=colour))
+        laps = rr.Points3D.from_fields(radii=LAP_RADIUS, colors=colour, show_labels=True)
+        self._log(f"{self.world}/laps", laps)
+
+    def _send_poses(self) -> None:
+        """Send the drone's pose, and a level frame that flies along, x ahead, for the view from behind."""
+        states, positions = self.trajectory.states, self.trajectory.positions
+        x_first = np.roll(states[:, QUATERNION], -1, axis=1)
+        pose = rr.Transform3D.columns(translation=positions, quaternion=x_first)
+        self._send(f"{self.world}/drone", self.all_rows, pose)
+        # In the direction of flight; at rest, where the nose points.
+        ahead_w = np.nan_to_num(states[:, VELOCITY][:, :2]) + rotations(states[:, QUATERNION])[:, :2, 0]
+        half_yaw = 0.5 * np.arctan2(ahead_w[:, 1], ahead_w[:, 0])
+        level = np.zeros_like(half_yaw)
+        quaternions = np.stack([level, level, np.sin(half_yaw), np.cos(half_yaw)], axis=1)
+        frame = rr.Transform3D.columns(translation=positions, quaternion=quaternions)
+        self._send(f"{self.world}/chase", self.all_rows, frame)
+
+    def _send_path(self) -> None:
+        """Send the path flown so far, for every step from 1 on.
+
+        The whole path in every row would grow with T^2. So ``flown`` holds it up to the last multiple
+        of ``block`` and changes once a block, and ``recent`` holds the rest; sqrt(T) balances the two.
+        """
+        positions, restarts = self.trajectory.positions, self.trajectory.restarts
+        breaks = np.zeros(0, int) if restarts is None else np.flatnonzero(restarts)
+
+        def strips(first: np.integer | int, last: np.integer) -> list[np.ndarray]:
+            inside = breaks[(breaks > first) & (breaks <= last)]
+            return np.split(positions[first : last + 1], inside - first)
+
+        block = max(1, math.isqrt(len(positions)))
+        steps = np.arange(1, len(positions))
+        starts = (steps - 1) // block * block
+        is_new_block = (starts == steps - 1) & (starts > 0)
+        paths = {
+            "recent": (steps, [strips(a, b) for a, b in zip(starts, steps, strict=True)]),
+            "flown": (steps[is_new_block], [strips(0, a) for a in starts[is_new_block]]),
+        }
+        for name, (rows, found) in paths.items():
+            if found:
+                columns = rr.LineStrips3D.columns(strips=[strip for one in found for strip in one])
+                lengths = [len(one) for one in found]
+                self._send(f"{self.world}/trajectory/{name}", rows, columns.partition(lengths))
+
+    def _send_plot(self, plot: Plot, label: str) -> None:
+        """Send a line of a plot, in the colour of its model or of the flight, and its name once."""
+        entity, is_command = f"{self.plots}/{plot.path}", plot.path.startswith("action/")
+        colour = self.colours[plot.model or self.trajectory.name]
+        shade = tuple(int(DIM**is_command * part) for part in colour)
+        width = THIN if is_command else THICK
+        self._log(entity, rr.SeriesLines(names=label + plot.label, colors=shade, widths=width))
+        self._send(entity, self.all_rows, rr.Scalars.columns(scalars=plot.values))
+
+    def _send_passes(self, race: FlownRace) -> None:
+        """Send markers where gates were passed, all so far, and at the last lap's end its time."""
+        # Of two gates passed in one step the later has both markers.
+        last = {one.row: count for count, one in enumerate(race.passes, start=1)}
+        places = [[one.pos_w for one in race.passes[:count]] for count in last.values()]
+        points = rr.Points3D.columns(positions=np.concatenate(places))
+        lengths = [len(one) for one in places]
+        self._send(f"{self.world}/passes", np.array(list(last)), points.partition(lengths))
+        laps = [one for one in race.passes if one.lap]
+        if laps:
+            labels = [f"lap {one.lap}: {one.lap_time_s:.3f} s" for one in laps]
+            markers = rr.Points3D.columns(positions=[one.pos_w for one in laps], labels=labels)
+            self._send(f"{self.world}/laps", np.array([one.row for one in laps]), markers)
+
+    def _send_arrows(self, model: str, forces_w: np.ndarray) -> None:
+        """Send arrows at the drone for the specific force that a model does not explain."""
+        is_known = np.isfinite(forces_w).all(axis=1)
+        if not is_known.any():
+            return
+        # No arrow in the row after a known one, or it would stand there until the next.
+        rows = np.flatnonzero(is_known | np.append(False, is_known[:-1]))
+        known = rows[is_known[rows]]
+        vectors, origins = SCALED_FORCE * forces_w[known], self.trajectory.positions[known]
+        arrows = rr.Arrows3D.columns(vectors=vectors, origins=origins)
+        entity = f"{self.world}/residual/{rr.escape_entity_path_part(model)}"
+        self._log(entity, rr.Arrows3D.from_fields(radii=ARROW_RADIUS, colors=self.colours[model]))
+        self._send(entity, rows, arrows.partition(is_known[rows].astype(int)))

@@ -13,7 +13,6 @@ from rerun.chunk import RrdReader
 
 MAGIC = b"RRF"  # what every recording begins with
 HOST = "127.0.0.1"
-PORTS = (1, 65535)
 ENDING = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name))
 
 
@@ -26,35 +25,22 @@ def check_recording(path: str | Path) -> None:
     try:
         with Path(path).open("rb") as file:
             found = file.read(len(MAGIC))
-    except OSError as error:
+        is_recording = found == MAGIC and len(RrdReader(path).recordings()) > 0
+    except Exception as error:  # OSError, or whatever the reader raises
         raise ServeError(f"{path}: cannot be read: {error}; expected a recording (.rrd)") from error
-    if found != MAGIC:
+    if not is_recording:
         raise ServeError(f"{path}: found a file that begins with {found!r}, expected a recording (.rrd)")
-    try:
-        found_recordings = RrdReader(path).recordings()
-    except Exception as error:  # whatever the reader raises
-        raise ServeError(f"{path}: cannot be read: {error}; expected a recording (.rrd)") from error
-    if not found_recordings:
-        raise ServeError(f"{path}: found no recording in it, expected one")
 
 
-def free_port() -> int:
-    """Return a port of this machine that nothing listens on."""
-    with socket.socket() as probe:
-        probe.bind((HOST, 0))
-        return probe.getsockname()[1]
-
-
-def check_port(port: int) -> None:
-    """Raise ServeError for what is no port, or one that something listens on already."""
-    if not PORTS[0] <= port <= PORTS[1]:
-        raise ServeError(f"port {port}: found no port, expected one of {PORTS[0]} to {PORTS[1]}")
+def bind_port(port: int) -> int:
+    """Return a port that can be bound, any free one for 0; raises ServeError for one that cannot."""
     with socket.socket() as probe:
         try:
             probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             probe.bind((HOST, port))
-        except OSError as error:
+        except (OSError, OverflowError) as error:
             raise ServeError(f"port {port}: {error}; expected one that is free") from error
+        return probe.getsockname()[1]
 
 
 def start_server(path: str | Path, port: int, open_browser: bool) -> tuple[subprocess.Popen[bytes], str]:
@@ -66,9 +52,8 @@ def start_server(path: str | Path, port: int, open_browser: bool) -> tuple[subpr
         ServeError: no recording, or a port that is taken.
     """
     check_recording(path)
-    check_port(port)
-    data_port = free_port()
-    # Unlike the SDK's own functions, the command can be told not to listen to other machines.
+    port, data_port = bind_port(port), bind_port(0)
+    # Unlike the SDK's own functions, the command can be restricted to this machine.
     command = [sys.executable, "-m", "rerun", str(path), "--bind", HOST]
     command += ["--port", str(data_port), "--web-viewer-port", str(port)]
     command.append("--web-viewer" if open_browser else "--serve-web")
@@ -84,18 +69,18 @@ def stop_server(server: subprocess.Popen[bytes]) -> None:
     server.wait()
 
 
-def _end(*_: Any) -> NoReturn:
+def _interrupt(*_: Any) -> NoReturn:
     raise KeyboardInterrupt
 
 
 def serve(path: str | Path, port: int, open_browser: bool) -> None:
-    """Serve the web viewer on a recording until the program is interrupted or told to end; main thread only.
+    """Serve the web viewer on a recording until the program is interrupted or terminated; main thread only.
 
     Raises:
         ServeError: no recording, a port that is taken, or a server that ends by itself.
     """
-    # The server is in a session of its own: it would go on after whatever ends this program unasked.
-    before = {one: signal.signal(one, _end) for one in ENDING}
+    # The server is in a session of its own, and would go on when a signal ends this program.
+    before = {one: signal.signal(one, _interrupt) for one in ENDING}
     server = None
     try:
         server, address = start_server(path, port, open_browser)

@@ -227,7 +227,7 @@ def test_another_process_flies_the_same_and_imports_no_viewer() -> None:
 import json, sys, gymnasium
 env = gymnasium.make("flytrack_env:{BASE}")
 start = env.reset(seed=9)[0].tolist()
-viewers = [name for name in ("pygame", "flytrack_env.rendering.renderer") if name in sys.modules]
+viewers = [name for name in ("pygame", "flytrack_env.rendering.views") if name in sys.modules]
 print(json.dumps([start, env.step([0.1] * 4)[0].tolist(), viewers]))
 """
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

@@ -29,7 +29,7 @@ LAYERS = (
     {"params"},
     {"episodes"},
     {"env"},
-    {"references"},
+    {"references", "scene"},
     {"wrappers", "blackbox", "rollout", "rendering", "flown_race"},
     {"registration", "viz_rerun", "pictures"},
     {"gymnasium_adapter"},

@@ -1,6 +1,5 @@
 """Rollout files: what is written comes back, and everything else is refused with a reason."""
 
-import importlib
 import io
 import pickle
 import subprocess
@@ -261,22 +260,6 @@ def test_bad_arrays_are_not_written(tmp_path, states, actions, reason):
     with pytest.raises(RolloutError, match=reason):
         save_rollout(tmp_path / "flight.npy", states, actions)
     assert list(tmp_path.iterdir()) == []
-
-
-def test_rollout_is_recorded_from_the_command_line(tmp_path, capsys):
-    pytest.importorskip("rerun", reason="rerun-sdk is not installed (extra flytrack[viz])")
-    viz = importlib.import_module("flytrack_env.viz_rerun.command")
-    rollout, out = tmp_path / "flight.npy", tmp_path / "new" / "flight.rrd"
-    states, actions = make_flight(5)
-    states[:, 9:13] = (1, 0, 0, 0)
-    save_rollout(rollout, states, actions)
-    assert viz.main([str(tmp_path / "absent.npy"), "--out", str(out)]) == 1
-    assert "absent.npy: cannot be read" in capsys.readouterr().err
-    assert viz.main([str(rollout), "--out", str(out), "--track", "nowhere"]) == 1
-    assert "'nowhere'" in capsys.readouterr().err
-    assert not out.exists()
-    assert viz.main([str(rollout), "--out", str(out)]) == 0
-    assert capsys.readouterr().out == f"{out}: 5 steps, {out.stat().st_size} bytes\n"
 
 
 def test_package_does_without_rerun_and_its_viewer_says_what_to_install():

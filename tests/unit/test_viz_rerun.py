@@ -1,30 +1,35 @@
-"""The recording, read back with Rerun's own reader and compared number by number."""
+"""Recordings, read back with Rerun's own reader and compared number by number."""
 
 import importlib
 import math
 import os
-import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from flytrack_env.tracks import load_track
-from tests.support.recordings import Recording, make_sequence, rotate
+from flytrack_env.flown_race import follow_race
+from flytrack_env.references import ghost_rollout, shipped_references
+from flytrack_env.rollout import save_rollout
+from flytrack_env.state import BATTERY, POSITION, QUATERNION, VELOCITY, Action
+from flytrack_env.tracks import build_course, load_track, save_track
+from tests.support.recordings import Recording, layout_of, make_sequence, rotate
 
 rr = pytest.importorskip("rerun", reason="rerun-sdk is not installed (extra flytrack[viz])")
 viz = importlib.import_module("flytrack_env.viz_rerun")
+command = importlib.import_module("flytrack_env.viz_rerun.__main__")
 
-STEPS = 250
+TRACK = load_track("flytrack")
+GATES = TRACK.rows()
+STEPS = 450
+STATES, ACTIONS = ghost_rollout(shipped_references(TRACK, ("nominal",)), STEPS)
+RACE = follow_race(STATES[:, POSITION], TRACK)
 QUARTER_TURN = math.sqrt(0.5)
-SCALARS = {f"/plots/action/{name}": i for i, name in enumerate(("roll", "pitch", "yaw", "thrust"))}
+SECOND = "flights/plant\\ \\/\\ 2"
 
 
-SEQUENCE = make_sequence(STEPS)
-GATES = load_track("flytrack").rows()
-
-
-def record(folder: Path, sequence=SEQUENCE, gates=GATES, **options) -> Recording:
+def record(folder: Path, sequence, gates=GATES, **options) -> Recording:
     """Return what was recorded as the only file of an empty folder."""
     path = folder / "flight.rrd"
     viz.visualize_state_action_sequence(sequence, gates, str(path), **options)
@@ -32,147 +37,121 @@ def record(folder: Path, sequence=SEQUENCE, gates=GATES, **options) -> Recording
     return Recording(path)
 
 
+def write(folder: Path, flight, track=TRACK) -> Recording:
+    """Return the recording of one flight."""
+    viz.write_recording(folder / "flight.rrd", [flight], track)
+    return Recording(folder / "flight.rrd")
+
+
+def aside(shift: float) -> np.ndarray:
+    """Return the states of a flight beside the time-optimal one."""
+    states = STATES.copy()
+    states[:, POSITION] += (0.0, shift, 0.0)
+    return states
+
+
 @pytest.fixture(scope="module")
 def recording(tmp_path_factory) -> Recording:
-    return record(tmp_path_factory.mktemp("viz"), app_id="test_app")
+    """Two flights on one time line; the second has forces and its own end, and is shorter."""
+    forces_w = np.tile([1.0, -2.0, 3.0], (300, 1))
+    forces_w[:100] = np.nan
+    second = viz.Trajectory(
+        "plant / 2", aside(0.2)[:300], ACTIONS[:300], ended="battery", residuals_w={"base": forces_w}
+    )
+    path = tmp_path_factory.mktemp("viz") / "two.rrd"
+    viz.write_recording(path, [viz.Trajectory("policy", STATES, ACTIONS), second], TRACK)
+    return Recording(path)
 
 
-def test_pose_is_the_states(recording):
-    translation = recording.series("/world/drone", "Transform3D:translation")
-    rotation = recording.series("/world/drone", "Transform3D:quaternion")
-    assert len(translation) == len(rotation) == STEPS
-    for step in (0, 1, 100, STEPS - 1):
-        x, _ = SEQUENCE[step]
-        np.testing.assert_array_equal(translation[step], x[0:3])
-        # Rerun stores the scalar part last.
-        np.testing.assert_allclose(rotation[step], x[[10, 11, 12, 9]], atol=1e-6)
+@pytest.fixture(scope="module")
+def handout(tmp_path_factory) -> Recording:
+    """The handout's function on a random flight."""
+    return record(tmp_path_factory.mktemp("viz"), make_sequence(100), app_id="test_app")
 
 
-def test_scalars_are_the_states_and_actions(recording):
-    x = np.array([pair[0] for pair in SEQUENCE], float)
-    u = np.array([pair[1] for pair in SEQUENCE], float)
+def test_handouts_function_records_the_numbers_that_it_is_given(handout):
+    x, u = (np.array(part, float) for part in zip(*make_sequence(100), strict=True))
+    np.testing.assert_array_equal(handout.series("/world/drone", "Transform3D:translation"), x[:, 0:3])
+    rotation = handout.series("/world/drone", "Transform3D:quaternion")
+    np.testing.assert_allclose(rotation, x[:, [10, 11, 12, 9]], atol=1e-6)  # scalar last
     expected = {
-        "/plots/speed": np.sqrt((x[:, 3:6] ** 2).sum(axis=1)),
-        "/plots/angular_speed": np.sqrt((x[:, 13:16] ** 2).sum(axis=1)),
-        **{entity: u[:, column] for entity, column in SCALARS.items()},
+        "speed": np.linalg.norm(x[:, 3:6], axis=1),
+        "angular_speed": np.linalg.norm(x[:, 13:16], axis=1),
+        **{f"action/{name}": u[:, column] for column, name in enumerate(Action._fields)},
     }
-    for entity, values in expected.items():
-        found = recording.series(entity, "Scalars:scalars")
-        np.testing.assert_allclose(found, values, rtol=1e-12, err_msg=entity)
-    assert recording.once("/plots/speed", "SeriesLines:names").tolist() == ["speed [m/s]"]
+    grid = [(step, step * 10_000_000) for step in range(100)]
+    for path, values in expected.items():
+        found = handout.series(f"/plots/{path}", "Scalars:scalars")
+        np.testing.assert_allclose(found, values, rtol=1e-12, err_msg=path)
+        assert sorted(handout.times[f"/plots/{path}"]) == grid, path
+    assert handout.app_id == "test_app" and handout.timelines == {"step", "sim_time"}
 
 
-def test_app_id_and_timelines(recording):
-    assert recording.app_id == "test_app"
-    assert recording.timelines == {"step", "sim_time"}
-    grid = [(step, step * 10_000_000) for step in range(STEPS)]
-    for entity in ("/world/drone", "/plots/speed", "/plots/angular_speed", *SCALARS):
-        assert sorted(recording.times[entity]) == grid, entity
-    assert sorted(recording.times["/world/trajectory/recent"]) == grid[1:]
-
-
-def test_trajectory_at_a_step_is_the_path_up_to_it(recording):
-    positions = np.array([x[0:3] for x, _ in SEQUENCE])
-    for step in range(1, STEPS):
-        flown = recording.latest_strip("/world/trajectory/flown", step)
-        recent = recording.latest_strip("/world/trajectory/recent", step)
-        assert len(recent) >= 2
+def test_trajectory_at_a_step_is_the_path_up_to_it(handout):
+    positions = np.array([x[0:3] for x, _ in make_sequence(100)])
+    for step in range(1, 100):
+        flown = handout.latest_strip("/world/trajectory/flown", step)
+        recent = handout.latest_strip("/world/trajectory/recent", step)
         # The two meet in one point, so that the line has no hole.
         path = recent if flown is None else flown + recent[1:]
         assert flown is None or flown[-1] == recent[0]
         np.testing.assert_array_equal(path, positions[: step + 1])
 
 
-def test_static_data_is_logged_once_whatever_the_length(recording, tmp_path):
-    assert [key for key, rows in recording.static.items() if len(rows) != 1] == []
-    short = record(tmp_path, make_sequence(2))
-    assert set(short.static) == set(recording.static)
-    moving = {entity for entity, _ in recording.rows}
-    assert not any(entity.startswith("/world/gates") for entity in moving)
-    assert moving & {"/world", "/world/drone/motors", "/world/drone/arms"} == set()
+def test_static_data_is_logged_once(handout, recording):
+    for found in (handout, recording):
+        assert [key for key, rows in found.static.items() if len(rows) != 1] == []
+        moving = {entity for entity, _ in found.rows}
+        assert not any(entity.startswith("/world/gates") for entity in moving)
+        assert moving & {"/world", "/world/drone/motors", "/world/drone/arms"} == set()
     right, forward, up = 3, 5, 1  # Rerun's numbers for directions
-    assert recording.once("/world", "ViewCoordinates:xyz").tolist() == [[right, forward, up]]
+    assert handout.once("/world", "ViewCoordinates:xyz").tolist() == [[right, forward, up]]
 
 
-def test_gate_centres_and_rectangles_are_in_the_world(recording):
-    centres = recording.once("/world/gates/centre", "Points3D:positions")
+def test_gate_centres_and_squares_are_in_the_world(handout):
+    centres = handout.once("/world/gates/centre", "Points3D:positions")
     np.testing.assert_allclose(centres, GATES[:, 1:4], atol=1e-6)
-    labels = recording.once("/world/gates/centre", "Points3D:labels").tolist()
+    labels = handout.once("/world/gates/centre", "Points3D:labels").tolist()
     assert labels == [f"gate {i}" for i in (0, 1, 2, 3, 4, 8, 9, 10)]
     for name, edge in (("outer", 2.7), ("inner", 1.5)):
-        strips = recording.once(f"/world/gates/{name}", "LineStrips3D:strips")
-        assert strips.shape == (len(GATES), 5, 3)
+        strips = handout.once(f"/world/gates/{name}", "LineStrips3D:strips")
         np.testing.assert_array_equal(strips[:, 0], strips[:, 4])
         for gate, strip in zip(GATES, strips, strict=True):
-            around = [(-1, -1), (1, -1), (1, 1), (-1, 1)]
-            local = [0.5 * edge * np.array([x, 0.0, z]) for x, z in around]
+            local = [0.5 * edge * np.array([x, 0.0, z]) for x in (-1, 1) for z in (-1, 1)]
             corners = [gate[1:4] + rotate(gate[4:8], corner) for corner in local]
-            np.testing.assert_allclose(strip[:4], corners, atol=1e-5)
-    # By hand: the inner square of gate 0 at (12.5, 2, 1.35), yaw 270 degrees: local x is along -y.
-    expected = [(12.5, 2.75, 0.6), (12.5, 1.25, 0.6), (12.5, 1.25, 2.1), (12.5, 2.75, 2.1)]
-    np.testing.assert_allclose(strips[0, :4], expected, atol=1e-5)
+            distances = np.linalg.norm(strip[:4, None] - corners, axis=2)
+            assert distances.min(axis=0).max() < 1e-5  # every corner is there
+            assert np.linalg.norm(np.diff(strip, axis=0), axis=1) == pytest.approx(edge, abs=1e-5)
 
 
-def test_gate_lying_flat_has_its_rectangle_in_the_horizontal_plane(tmp_path):
+def test_gate_lying_flat_has_its_square_in_the_horizontal_plane(tmp_path):
     """Rolled 90 degrees about x, local z points along -y; extra columns are ignored."""
     gate = np.array([[5, 1.0, 2.0, 3.0, QUARTER_TURN, QUARTER_TURN, 0, 0, 99.0]])
-    found = record(tmp_path, make_sequence(2), gate)
-    inner = found.once("/world/gates/inner", "LineStrips3D:strips")[0]
-    expected = [(0.25, 2.75, 3), (1.75, 2.75, 3), (1.75, 1.25, 3), (0.25, 1.25, 3)]
-    np.testing.assert_allclose(inner[:4], expected, atol=1e-6)
+    inner = record(tmp_path, make_sequence(2), gate).once("/world/gates/inner", "LineStrips3D:strips")[0]
+    expected = {(0.25, 2.75, 3.0), (1.75, 2.75, 3.0), (1.75, 1.25, 3.0), (0.25, 1.25, 3.0)}
+    assert {tuple(corner) for corner in np.round(inner[:4], 6).tolist()} == expected
 
 
-def test_body_is_the_handouts(recording):
+def test_body_is_the_handouts(handout):
     front_left, front_right = (0.15, 0.09, 0), (0.15, -0.09, 0)
     back_left, back_right = (-0.15, 0.14, 0), (-0.15, -0.14, 0)
-    motors = recording.once("/world/drone/motors", "Points3D:positions")
+    motors = handout.once("/world/drone/motors", "Points3D:positions")
     np.testing.assert_allclose(motors, [front_left, front_right, back_left, back_right])
-    arms = recording.once("/world/drone/arms", "LineStrips3D:strips")
+    arms = handout.once("/world/drone/arms", "LineStrips3D:strips")
     np.testing.assert_allclose(arms, [[front_left, back_right], [front_right, back_left]])
-    (ray,) = recording.once("/world/drone/camera", "Arrows3D:vectors")
+    (ray,) = handout.once("/world/drone/camera", "Arrows3D:vectors")
     assert ray[0] > 0 and ray[1] == 0
     assert math.degrees(math.atan2(ray[2], ray[0])) == pytest.approx(40.0, abs=1e-4)
 
 
-def test_drone_yawed_left_looks_along_y(tmp_path):
-    x = np.zeros(21, np.float32)
-    x[[9, 12]] = QUARTER_TURN
-    found = record(tmp_path, [(x, np.zeros(4))])
-    qx, qy, qz, qw = found.series("/world/drone", "Transform3D:quaternion")[0]
-    quaternion = np.array([qw, qx, qy, qz])
-    np.testing.assert_allclose(rotate(quaternion, np.array([1.0, 0, 0])), (0, 1, 0), atol=1e-6)
-    (ray,) = found.once("/world/drone/camera", "Arrows3D:vectors")
-    pitch = math.radians(40)
-    direction = rotate(quaternion, ray / np.linalg.norm(ray))
-    np.testing.assert_allclose(direction, (0, math.cos(pitch), math.sin(pitch)), atol=1e-6)
-
-
-def test_nan_outside_the_pose_is_a_gap_in_its_plot(tmp_path):
-    found = record(tmp_path, with_state(3, np.nan))
-    speed = found.series("/plots/speed", "Scalars:scalars")
-    assert np.isnan(speed).tolist() == [False, False, True]
-
-
-def test_callers_own_recording_is_left_alone(tmp_path):
-    before = rr.get_data_recording()
-    record(tmp_path, make_sequence(1), np.zeros((0, 8)))
-    assert rr.get_data_recording() is before
-
-
-def test_a_minute_of_flight_is_written_fast_and_small(tmp_path):
-    sequence = make_sequence(6000)
-    path = tmp_path / "minute.rrd"
-    start = time.perf_counter()
-    viz.visualize_state_action_sequence(sequence, GATES, str(path))
-    # The goal is 3 s; the rest is for a slow or busy machine.
-    assert time.perf_counter() - start < 10.0
-    assert path.stat().st_size < 10e6
-
-
-def refuse(path: Path, reason: str, sequence=SEQUENCE, gates=GATES) -> None:
-    """Expect a recording to be refused for a reason, a regular expression."""
-    with pytest.raises(ValueError, match=reason):
-        viz.visualize_state_action_sequence(sequence, gates, str(path))
+@pytest.mark.parametrize("is_back", [False, True])
+def test_gates_alone_are_flown_as_the_flight_passes_them(tmp_path, is_back):
+    """The handout's rows do not tell the direction of flight."""
+    states = STATES[::-1].copy() if is_back else STATES
+    found = record(tmp_path, list(zip(states, ACTIONS, strict=True)))
+    vectors = found.once("/world/gates/direction", "Arrows3D:vectors")
+    forward = np.stack(build_course(TRACK).gates.forward, axis=-1)
+    np.testing.assert_allclose(vectors, -forward if is_back else forward, atol=1e-6)
 
 
 def with_state(index, value) -> list:
@@ -182,58 +161,225 @@ def with_state(index, value) -> list:
     return sequence
 
 
+def test_nan_outside_the_pose_is_a_gap_and_rounded_quaternions_are_normalised(tmp_path):
+    sequence = with_state(slice(9, 13), 0.5004)
+    sequence[2][0][3] = np.nan
+    before = rr.get_data_recording()
+    found = record(tmp_path, sequence, np.zeros((0, 8)))
+    assert rr.get_data_recording() is before  # the caller's own
+    speed = found.series("/plots/speed", "Scalars:scalars")
+    assert np.isnan(speed).tolist() == [False, False, True]
+    rotation = found.series("/world/drone", "Transform3D:quaternion")[2]
+    np.testing.assert_allclose(rotation, np.full(4, 0.5), atol=1e-7)
+
+
 BAD_INPUT = [
     ([], GATES, "sequence: found no steps"),
-    (with_state(1, np.nan), GATES, r"sequence\[2\]: found position.*expected finite"),
-    (with_state(9, np.inf), GATES, r"sequence\[2\]: found position.*expected finite"),
-    (with_state(slice(9, 13), 0), GATES, r"sequence\[2\]: found quaternion norm 0"),
-    (with_state(slice(9, 13), 0.501), GATES, "norm 1.002, expected 1 within 0.001"),
+    (with_state(1, np.nan), GATES, r"sequence: states\[2\]: found position.*expected finite"),
+    (with_state(slice(9, 13), 0), GATES, r"sequence: states\[2\]: found quaternion norm 0"),
     ([(np.zeros(17), np.zeros(4))], GATES, r"sequence\[0\]: found shapes \[\(17,\)"),
-    ([(np.zeros(21),)], GATES, r"sequence\[0\]: found shapes \[\(21,\)\], expected"),
-    (SEQUENCE, np.zeros((3, 7)), r"gates: found shape \(3, 7\), expected \(N, >=8\)"),
-    (SEQUENCE, np.zeros(8), r"gates: found shape \(8,\)"),
-    (SEQUENCE, np.zeros((3, 8)), r"gates\[0\]: found quaternion norm 0"),
-    (SEQUENCE, np.full((3, 8), np.nan), "gates: found ids"),
-    (SEQUENCE, np.array([[0.0, np.nan, 0, 0, 1, 0, 0, 0]]), r"gates\[0\]: found position"),
-    (SEQUENCE, np.array([[0.0, 1e35, 0, 0, 1, 0, 0, 0]]), r"gates\[0\]: found position.*within float32"),
-    (SEQUENCE, [[0.0, 1.0], [2.0]], "gates: .*expected numbers"),
-    (SEQUENCE, np.full((1, 8), "a"), "gates: .*expected numbers"),
     ([None], GATES, r"sequence\[0\]: found shapes None, expected"),
+    (make_sequence(3), np.zeros((3, 7)), r"gates: found shape \(3, 7\), expected \(N, >=8\)"),
+    (make_sequence(3), np.zeros((3, 8)), r"gates\[0\]: found quaternion norm 0"),
+    (make_sequence(3), np.full((3, 8), np.nan), "gates: found ids"),
+    (make_sequence(3), np.array([[0.0, 1e35, 0, 0, 1, 0, 0, 0]]), r"gates\[0\]: found pos.*within float32"),
+    (make_sequence(3), np.full((1, 8), "a"), "gates: .*expected numbers"),
 ]
 
 
 @pytest.mark.parametrize(("sequence", "gates", "reason"), BAD_INPUT)
 def test_bad_input_is_refused_and_leaves_no_file(tmp_path, sequence, gates, reason):
-    refuse(tmp_path / "flight.rrd", reason, sequence, gates)
+    with pytest.raises(ValueError, match=reason):
+        viz.visualize_state_action_sequence(sequence, gates, str(tmp_path / "flight.rrd"))
     assert list(tmp_path.iterdir()) == []
 
 
-def test_rounded_quaternion_is_renormalised(tmp_path):
-    found = record(tmp_path, with_state(slice(9, 13), 0.5004))
-    rotation = found.series("/world/drone", "Transform3D:quaternion")[2]
-    np.testing.assert_allclose(rotation, np.full(4, 0.5), atol=1e-7)
+BAD_FLIGHTS = {
+    "none": ([], "flights: found names \\[\\], expected at least one"),
+    "alike": ([("a", {}), ("a", {})], "found names \\['a', 'a'\\], expected at least one, each once"),
+    "states": ([("a", {"states": np.zeros((STEPS, 20))})], r"a: states: found shape \(450, 20\)"),
+    "actions": ([("a", {"actions": np.zeros((3, 4))})], r"a: actions: found shape \(3, 4\), expected \(450"),
+    "time": ([("a", {"time_s": np.full(STEPS, np.nan)})], "a: time_s: found times that do not grow"),
+    "restarts": ([("a", {"restarts": np.zeros(3, bool)})], r"a: restarts: found shape \(3,\)"),
+    "forces": ([("a", {"residuals_w": {"m": np.zeros(3)}})], r"a: residuals_w m: found shape \(3,\)"),
+}
 
 
-@pytest.mark.parametrize("name", ["folder", "file/flight.rrd"])
-def test_unwritable_path_is_refused(tmp_path, name):
-    (tmp_path / "folder").mkdir()
-    (tmp_path / "file").write_text("in the way")
-    refuse(tmp_path / name, r"recording_path .*cannot be written.*expected")
-    assert sorted(path.name for path in tmp_path.rglob("*")) == ["file", "folder"]
-
-
-def test_rerun_turned_off_is_an_error_and_no_empty_file(tmp_path, monkeypatch):
-    monkeypatch.setenv("RERUN", "0")
-    refuse(tmp_path / "flight.rrd", "RERUN: found it turned off")
+@pytest.mark.parametrize("case", BAD_FLIGHTS)
+def test_flights_that_cannot_be_shown_are_refused(tmp_path, case):
+    flights, reason = BAD_FLIGHTS[case]
+    made = [viz.Trajectory(name, **{"states": STATES, "actions": ACTIONS, **more}) for name, more in flights]
+    with pytest.raises(ValueError, match=reason):
+        viz.write_recording(tmp_path / "flight.rrd", made, TRACK)
     assert list(tmp_path.iterdir()) == []
 
 
-def test_failure_midway_keeps_the_old_recording(tmp_path, monkeypatch):
+def test_failures_to_write_keep_the_old_recording(tmp_path, monkeypatch):
     def fail(*_):
         raise OSError("disk full")
 
     path = tmp_path / "flight.rrd"
     path.write_bytes(b"old")
-    monkeypatch.setattr(os, "replace", fail)
-    refuse(path, "disk full")
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "replace", fail)
+        with pytest.raises(ValueError, match=r"recording_path .*cannot be written.*disk full.*expected"):
+            viz.visualize_state_action_sequence(make_sequence(3), GATES, str(path))
+    monkeypatch.setenv("RERUN", "0")
+    with pytest.raises(ValueError, match="RERUN: found it turned off"):
+        viz.visualize_state_action_sequence(make_sequence(3), GATES, str(path))
     assert list(tmp_path.iterdir()) == [path] and path.read_bytes() == b"old"
+
+
+def test_every_flight_has_its_own_entities_on_one_time_line(recording):
+    for entity, states in (("/world/drone", STATES), (f"/world/{SECOND}/drone", aside(0.2)[:300])):
+        found = recording.series(entity, "Transform3D:translation")
+        np.testing.assert_allclose(found, states[:, POSITION], rtol=1e-6)
+        steps = np.arange(len(states)).tolist()
+        assert sorted(recording.times[entity]) == [(step, step * 10_000_000) for step in steps]
+    names = recording.once(f"/plots/{SECOND}/speed", "SeriesLines:names").tolist()
+    assert names == ["plant / 2: speed [m/s]"]
+
+
+def test_applied_battery_distance_and_angles_are_those_of_the_flight(recording):
+    expected = {
+        "battery": STATES[:, BATTERY],
+        "gate_distance": RACE.gate_distance_m,
+        **{f"applied/{name}": STATES[:, 16 + i] for i, name in enumerate(Action._fields)},
+    }
+    for path, values in expected.items():
+        found = recording.series(f"/plots/{path}", "Scalars:scalars")
+        np.testing.assert_allclose(found, values, rtol=1e-6, err_msg=path)
+    roll, pitch, yaw = (
+        recording.series(f"/plots/orientation/{name}", "Scalars:scalars") for name in ("roll", "pitch", "yaw")
+    )
+    for row in (0, 100, STEPS - 1):
+        half = np.radians([roll[row], pitch[row], yaw[row]]) / 2.0
+        (sr, sp, sy), (cr, cp, cy) = np.sin(half), np.cos(half)
+        made = [cr * cp * cy + sr * sp * sy, sr * cp * cy - cr * sp * sy]
+        made += [cr * sp * cy + sr * cp * sy, cr * cp * sy - sr * sp * cy]
+        assert abs(np.dot(made, STATES[row, QUATERNION])) == pytest.approx(1.0, abs=1e-6)
+    assert max(np.abs(np.diff(angle)).max() for angle in (roll, pitch, yaw)) < 180.0  # no jumps
+
+
+def test_passes_laps_events_and_table_are_the_races(recording):
+    rows = recording.rows["/world/passes", "Points3D:positions"]
+    assert [step for step, _ in recording.times["/world/passes"]] == [one.row for one in RACE.passes]
+    for count, points in enumerate(rows, start=1):
+        np.testing.assert_allclose(points, [one.pos_w for one in RACE.passes[:count]], rtol=1e-6)
+    first, lap = RACE.passes[0], RACE.passes[7]
+    assert [step for step, _ in recording.times["/world/laps"]] == [lap.row]
+    assert recording.rows["/world/laps", "Points3D:labels"] == [[f"lap 1: {lap.lap_time_s:.3f} s"]]
+    texts = [text for (text,) in recording.rows["/events", "TextLog:text"]]
+    assert texts[0] == f"policy: passed gate 0 at {first.time_s:.3f} s"
+    assert texts[7] == f"policy: passed gate 10 at {lap.time_s:.3f} s; lap 1: {lap.lap_time_s:.3f} s"
+    assert texts[-1] == "policy: ended: all steps flown"
+    assert recording.rows[f"/events/{SECOND}", "TextLog:text"][-1] == ["plant / 2: ended: battery"]
+    (table,) = recording.once("/about", "TextDocument:text")
+    assert f"| policy | all steps flown | 4.49 | {len(RACE.passes)} | {lap.lap_time_s:.3f} |" in table
+
+
+def test_forces_are_arrows_at_the_drone_where_they_are_known(recording, tmp_path):
+    entity = f"/world/{SECOND}/residual/base"
+    vectors = recording.series(entity, "Arrows3D:vectors")
+    np.testing.assert_allclose(vectors, np.tile([0.1, -0.2, 0.3], (200, 1)), rtol=1e-6)
+    origins = recording.series(entity, "Arrows3D:origins")
+    np.testing.assert_allclose(origins, aside(0.2)[100:300, POSITION], rtol=1e-6)
+    size = recording.series(f"/plots/{SECOND}/residual/base", "Scalars:scalars")
+    np.testing.assert_allclose(size[100:], math.sqrt(14.0), rtol=1e-6)
+    assert np.isnan(size[:100]).all()
+    forces_w = np.ones((10, 3))
+    forces_w[[0, 4, 5, 9]] = np.nan
+    found = write(tmp_path, viz.Trajectory("log", STATES[:10], ACTIONS[:10], residuals_w={"base": forces_w}))
+    at = [step for step, _ in found.times["/world/residual/base"]]
+    arrows = dict(zip(at, found.rows["/world/residual/base", "Arrows3D:vectors"], strict=True))
+    counts = {step: len(one) for step, one in arrows.items()}
+    assert counts == {**dict.fromkeys((1, 2, 3, 6, 7, 8), 1), 4: 0, 9: 0}  # none remains where none is known
+
+
+def test_viewer_opens_laid_out(recording):
+    """The views that open, what they look at, and that everything logged is in one of them."""
+    views = layout_of(recording.path)
+    for stick in Action._fields:
+        roots = ("/plots", f"/plots/{SECOND}")
+        lines = [f"{root}/{kind}/{stick}" for root in roots for kind in ("action", "applied")]
+        assert views[f"{stick} stick"] == ("TimeSeries", "/", lines)
+    assert views["course"] == ("3D", "/world", ["$origin/**"])
+    assert views["follow policy"] == ("3D", "/world/chase", ["/world/**"])
+    assert views["follow plant / 2"] == ("3D", f"/world/{SECOND}/chase", ["/world/**"])
+    assert views["events"] == ("TextLog", "/", ["/events/**"])
+    assert views["flights"] == ("TextDocument", "/about", ["$origin/**"])
+    shown = {line for _, origin, lines in views.values() for line in lines}
+    plotted = {entity for entity, _ in recording.rows if entity.startswith("/plots/")}
+    hidden = {entity for entity in plotted - shown if f"{entity.rpartition('/')[0]}/**" not in shown}
+    assert plotted and not hidden
+
+
+def test_chasing_eye_looks_where_the_drone_flies(recording):
+    rotations = recording.series("/world/chase", "Transform3D:quaternion")
+    for row in (0, 50, 300):
+        x, y, z, w = rotations[row]
+        ahead = rotate(np.array([w, x, y, z]), np.array([1.0, 0.0, 0.0]))
+        nose = rotate(STATES[row, QUATERNION], np.array([1.0, 0.0, 0.0]))
+        expected = STATES[row, VELOCITY][:2] + nose[:2]
+        assert ahead[2] == pytest.approx(0.0, abs=1e-6)
+        np.testing.assert_allclose(ahead[:2], expected / np.linalg.norm(expected), atol=1e-5)
+
+
+def test_path_begins_anew_where_a_flight_does_and_times_of_a_log_are_kept(tmp_path):
+    restarts = np.zeros(STEPS, bool)
+    restarts[[0, 200, 201]] = True
+    time_s = 7.0 + np.cumsum(np.random.default_rng(1).uniform(0.002, 0.02, STEPS))
+    found = write(tmp_path, viz.Trajectory("pieces", STATES, ACTIONS, time_s=time_s, restarts=restarts))
+    flown = found.rows["/world/trajectory/flown", "LineStrips3D:strips"][-1]
+    assert [len(strip) for strip in flown] == [200, 1, 442 - 201]
+    seconds = [nanoseconds * 1e-9 for _, nanoseconds in sorted(found.times["/world/drone"])]
+    np.testing.assert_allclose(seconds, time_s - time_s[0], atol=1e-9)
+    assert ("/plots/gate_distance", "Scalars:scalars") not in found.rows  # races are flown at 100 Hz
+
+
+def test_command_shows_rollouts_beside_the_ghost(tmp_path, capsys):
+    for folder in ("a", "b"):
+        (tmp_path / folder).mkdir()
+        save_rollout(tmp_path / folder / "flight.npy", STATES[:20], ACTIONS[:20])
+    out = tmp_path / "both.rrd"
+    files = [str(tmp_path / folder / "flight.npy") for folder in ("a", "b")]
+    assert command.main([*files, "--out", str(out), "--ghost", "time_optimal"]) == 0
+    assert capsys.readouterr().out == f"{out}: 20 steps, {out.stat().st_size} bytes\n"
+    found = Recording(out)
+    (table,) = found.once("/about", "TextDocument:text")
+    names = [line.split("|")[1].strip() for line in table.splitlines()[2:]]
+    assert names == ["a_flight", "b_flight", "time-optimal"]
+    ghost = found.series("/world/flights/time-optimal/drone", "Transform3D:translation")
+    np.testing.assert_allclose(ghost, STATES[:20, POSITION], rtol=1e-6)
+
+
+def test_demo_needs_no_file(tmp_path):
+    assert command.main(["--out", str(tmp_path / "demo.rrd"), "--track", "split_s"]) == 0
+    (table,) = Recording(tmp_path / "demo.rrd").once("/about", "TextDocument:text")
+    assert "| time-optimal | all steps flown | 11.99 |" in table
+
+
+@pytest.mark.parametrize(
+    ("arguments", "reason"),
+    [
+        (["a.npy", "a.npy"], "expected one of its own"),
+        (["pickled.npy"], "pickled"),
+        (["--ghost", "time_optimal", "--track", "own.toml"], "reference: found no 'own_nominal_"),
+        (["--serve", "absent.rrd"], "absent.rrd: cannot be read"),
+        (["a.npy", "--serve", "b.rrd"], "rollouts: found them beside --serve"),
+        (["a.npy", "--out", "a.npy"], "--out: found a.npy, which is read"),
+    ],
+)
+def test_command_refuses_in_one_line(tmp_path, capsys, monkeypatch, arguments, reason):
+    monkeypatch.chdir(tmp_path)
+    save_track("own.toml", replace(TRACK, name="own"))
+    pairs = np.empty((30, 2), object)
+    for step, pair in enumerate(make_sequence(30)):
+        pairs[step] = pair
+    np.save("pickled.npy", pairs, allow_pickle=True)
+    assert command.main(arguments) == 2
+    error = capsys.readouterr().err
+    assert reason in error and error.startswith("error: ") and error.count("\n") == 1
+    assert not Path("rollout.rrd").exists()
+    if arguments == ["pickled.npy"]:
+        assert command.main([*arguments, "--allow-pickle"]) == 0

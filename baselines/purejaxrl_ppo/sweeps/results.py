@@ -9,7 +9,8 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter
 
 from flytrack_env.files import write_atomically
-from flytrack_env.pictures.style import BLUE, new_figure, plain, png_of
+from flytrack_env.pictures.drawing import new_figure, plain, png_of
+from flytrack_env.scene import BLUE
 
 PANEL_IN = 3.0
 SUCCESS, LAP_S = "evaluation_success", "evaluation_flying_lap_s"

@@ -1,0 +1,286 @@
+"""The figures of a flight: the course from above, height and gates from the front, commands over time."""
+
+import itertools
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure, SubFigure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Rectangle
+
+from flytrack_env.flown_race import DRONE_RADIUS_M, STEP_S
+from flytrack_env.pictures.drawing import (
+    HEADROOM,
+    LETTER_IN,
+    draw_gates,
+    draw_path,
+    escape,
+    label_from_above,
+    new_figure,
+    plain,
+    with_room,
+)
+from flytrack_env.pictures.flight import PASSED, Flight, Meeting
+from flytrack_env.scene import BLUE, GREEN, GREY, ORANGE, PAPER_COLOURS, PAPER_FRAME, PAPER_OPENING, gates_of
+from flytrack_env.state import APPLIED_ACTION, BATTERY, POSITION, Action
+from flytrack_env.tracks import Gate, Track, build_course
+
+# From above.
+PANEL_IN, BESIDE_IN, TITLE_IN = 7.0, 1.6, 1.0  # the view's longer side; room beside and above it
+NARROWEST = 0.35  # of the longer side
+MARGIN_SHARE = 0.03
+TOP_VIEW = [0, 1]
+LINES = ("-", "--", ":", "-.")
+
+# Widths grow with the flight, within limits.
+WIDTHS_IN = (10.0, 24.0)
+METRE_IN, SIDE_IN = 0.05, 3.6  # width of a metre flown; height of the side view
+GATE_IN, GATES_TITLE_IN = 1.25, 0.5
+MOST_LABELLED = 3
+AROUND = 1.12  # of a gate's half frame, or of the farthest meeting
+SECOND_IN, COMMANDS_IN = 0.9, 8.0  # width of a second; height of the commands
+PANEL_HEIGHTS = (1.0, 1.0, 1.0, 1.0, 1.0, 0.7)
+MARKS = {
+    "gate": Line2D([], [], color="0.7", linewidth=0.9, label="gate passed"),
+    "lap": Line2D([], [], color=GREEN, linewidth=1.8, label="lap complete"),
+    "failure": Line2D([], [], color="black", linewidth=1.2, linestyle="--", label="gate touched or missed"),
+}
+
+
+def draw_top(flight: Flight) -> Figure:
+    """Return the course from above, the path coloured by speed, lap times in the title."""
+    figure, axes = _course([flight], BESIDE_IN)
+    points, speeds = flight.states[:, POSITION][:, :2], flight.speeds_m_s
+    lines = draw_path(axes, points, speeds[:-1], HEADROOM * max(float(speeds.max()), 1.0), 2.2)
+    failures = np.reshape([one.pos_w[:2] for one in flight.meetings if one.outcome != PASSED], (-1, 2))
+    axes.plot(*failures.T, "X", color="black", markersize=8, markeredgecolor="white", zorder=5)
+    marks = [("start", points[0], BLUE, "o"), (escape(flight.ended), points[-1], ORANGE, "X")]
+    for text, place, colour, marker in marks:
+        style: dict[str, Any] = {
+            "color": colour,
+            "markersize": 9,
+            "markeredgecolor": "white",
+            "linestyle": "",
+        }
+        axes.plot(*place, marker=marker, label=text, zorder=6, **style)
+    figure.legend(loc="outside lower center", ncols=2, frameon=False)
+    axes.set_title(escape(f"{flight.title}\n{flight.laps_text}"), fontsize="medium")
+    figure.colorbar(lines, ax=axes, label="speed (m/s)", shrink=0.8)
+    return figure
+
+
+def draw_comparison(flights: Sequence[Flight]) -> Figure:
+    """Return the course from above with a path per flight, all on one track, in a colour of its own."""
+    texts = [escape(f"{flight.name}\n{flight.laps_text}\n{flight.ended}") for flight in flights]
+    longest = max(len(line) for text in texts for line in text.splitlines())
+    figure, axes = _course(flights, BESIDE_IN + LETTER_IN * longest)
+    styles = itertools.cycle(itertools.product(LINES, PAPER_COLOURS))
+    for flight, text, (line, colour) in zip(flights, texts, styles, strict=False):
+        points = flight.states[:, POSITION][:, :2]
+        axes.plot(*points.T, line, color=colour, linewidth=1.5, label=text)
+        axes.plot(*points[0], "o", color=colour, markeredgecolor="white", zorder=6)
+        axes.plot(*points[-1], "X", color=colour, markersize=9, markeredgecolor="white", zorder=6)
+    axes.set_title(escape(f"{len(flights)} flights on {flights[0].track.name}"), fontsize="medium")
+    figure.legend(loc="outside right upper", frameon=False, fontsize="small", labelspacing=1.0)
+    return figure
+
+
+def _course(flights: Sequence[Flight], beside_in: float) -> tuple[Figure, Axes]:
+    """Return a figure with bounds and gates, wide enough for flights that leave the bounds."""
+    track = flights[0].track
+    ends = np.array([track.bounds_low, track.bounds_high])[:, :2]
+    seen = np.concatenate([*(flight.states[:, POSITION][:, :2] for flight in flights), ends])
+    low, high = seen.min(axis=0), seen.max(axis=0)
+    margin = MARGIN_SHARE * (high - low).max()
+    low, high = low - margin, high + margin
+    width, height = PANEL_IN * np.maximum((high - low) / (high - low).max(), NARROWEST)
+    figure = new_figure(width + beside_in, height + TITLE_IN)
+    axes = figure.add_subplot()
+    axes.add_patch(Rectangle(ends[0], *(ends[1] - ends[0]), fill=False, edgecolor="0.6", linestyle="--"))
+    draw_gates(axes, track, TOP_VIEW)
+    label_from_above(axes, track)
+    axes.set(aspect="equal", xlim=(low[0], high[0]), ylim=(low[1], high[1]), xlabel="x (m)", ylabel="y (m)")
+    return figure, axes
+
+
+def draw_side(flight: Flight) -> Figure:
+    """Return height over distance, coloured by speed, above the gates as the drone saw them."""
+    width = float(np.clip(METRE_IN * flight.distances_m[-1], *WIDTHS_IN))
+    num_rows = math.ceil(len(flight.track.gates) * GATE_IN / width)
+    num_columns = math.ceil(len(flight.track.gates) / num_rows)
+    gates_in = num_rows * (GATE_IN + 0.3) + GATES_TITLE_IN
+    figure = new_figure(width, SIDE_IN + gates_in)
+    upper, lower = figure.subfigures(2, 1, squeeze=False, height_ratios=(SIDE_IN, gates_in)).ravel()
+    top = HEADROOM * max(float(flight.speeds_m_s.max()), 1.0)
+    _draw_height(upper, flight, top, width)
+    _draw_fronts(lower, flight, top, (num_rows, num_columns))
+    figure.suptitle(escape(f"{flight.title}\n{flight.laps_text}"), fontsize="medium")
+    return figure
+
+
+def _draw_height(figure: SubFigure, flight: Flight, top: float, width_in: float) -> None:
+    """Draw the path's height, and a bar for every gate where its plane was met."""
+    axes = plain(figure.add_subplot())
+    heights_m = flight.states[:, POSITION][:, 2]
+    points = np.stack([flight.distances_m, heights_m], axis=1)
+    lines = draw_path(axes, points, flight.speeds_m_s[:-1], top, 2.4)
+    lines.set_zorder(4)
+    half_heights_m = _half_heights_m(flight.track)
+    for meeting in flight.meetings:
+        _draw_bar(axes, flight.track.gates[meeting.gate], meeting, half_heights_m[meeting.gate])
+    _label_bars(axes, flight, half_heights_m, width_in)
+    floor_m = flight.track.bounds_low[2]
+    axes.axhline(floor_m, color="0.3", linewidth=1.5)
+    axes.plot(*points[0], "o", color=BLUE, markersize=8, markeredgecolor="white", zorder=6)
+    edges_m = [gate.position[2] + 0.5 * gate.frame for gate in flight.track.gates]
+    highest, lowest = max(*edges_m, float(heights_m.max())), min(floor_m, float(heights_m.min()))
+    room = 0.05 * (highest - lowest)
+    # The last step, after the last state, may have met a gate.
+    end_m = max(points[-1, 0], *(meeting.distance_m for meeting in flight.meetings), 1.0)
+    axes.set(xlim=(-0.01 * end_m, 1.01 * end_m), ylim=(lowest - room, highest + 4.0 * room))
+    axes.set(xlabel="distance flown (m)", ylabel="height z (m)")
+    figure.colorbar(lines, ax=axes, label="speed (m/s)", pad=0.01)
+
+
+def _half_heights_m(track: Track) -> np.ndarray:
+    """Return half the height of each gate's frame and opening, (num_gates, 2), m: less if it leans."""
+    gates = gates_of(build_course(track))
+    return 0.5 * np.stack([np.ptp(corners[..., 2], axis=1) for corners in (gates.outer, gates.inner)], axis=1)
+
+
+def _draw_bar(axes: Axes, gate: Gate, meeting: Meeting, half_heights_m: np.ndarray) -> None:
+    """Draw a gate's frame as a grey bar with its opening in red, and a cross where it was not passed."""
+    x, z = meeting.distance_m, gate.position[2]
+    half_frame, half_opening = half_heights_m
+    for half, colour, width in (
+        (half_frame, PAPER_FRAME, 3.2),
+        (half_opening, "white", 3.2),
+        (half_opening, PAPER_OPENING, 1.2),
+    ):
+        axes.plot([x, x], [z - half, z + half], color=colour, linewidth=width, zorder=2)
+    if meeting.outcome != PASSED:
+        axes.plot(x, meeting.pos_w[2], "X", color="black", markersize=10, markeredgecolor="white", zorder=6)
+
+
+def _label_bars(axes: Axes, flight: Flight, half_heights_m: np.ndarray, width_in: float) -> None:
+    """Write above the bars the gates' ids, and what failed, where there is room."""
+    inch_m = flight.distances_m[-1] / width_in
+    ids = [(one.distance_m, str(flight.track.gates[one.gate].id)) for one in flight.meetings]
+    failures = [(one.distance_m, one.outcome) for one in flight.meetings if one.outcome != PASSED]
+    gates = {one.distance_m: one.gate for one in flight.meetings}
+    for labels, above, colour in ((ids, 3, PAPER_OPENING), (failures, 14, "black")):
+        for x, text in with_room(labels, inch_m):
+            top_m = flight.track.gates[gates[x]].position[2] + half_heights_m[gates[x], 0]
+            axes.annotate(
+                text, (x, top_m), (0, above), textcoords="offset points", color=colour, ha="center",
+                weight="bold", fontsize="small",
+            )  # fmt: skip
+
+
+def _draw_fronts(figure: SubFigure, flight: Flight, top: float, shape: tuple[int, int]) -> None:
+    """Draw every gate from the front, in flying order."""
+    panels = figure.subplots(*shape, squeeze=False).ravel()
+    for panel in panels:
+        panel.set_axis_off()
+    for index, (panel, gate) in enumerate(zip(panels, flight.track.gates, strict=False)):
+        _draw_front(panel, gate, [one for one in flight.meetings if one.gate == index], top)
+    figure.suptitle(
+        "Gates as the drone approaches them, and how often it passed of how often it met them. Dashed: free "
+        f"for a drone of {DRONE_RADIUS_M:g} m radius.\nDots: passed; crosses: frame touched, or missed. "
+        "Colours: speed.",
+        fontsize="small",
+    )
+
+
+def _draw_front(panel: Axes, gate: Gate, meetings: list[Meeting], top: float) -> None:
+    """Draw one gate and where the drone met its plane, coloured by speed."""
+    free = gate.opening - 2.0 * DRONE_RADIUS_M
+    edges = ((gate.frame, "0.85", "-", PAPER_FRAME), (gate.opening, "white", "-", PAPER_OPENING))
+    for edge, face, line, colour in (*edges, (free, "none", "--", PAPER_OPENING)):
+        corner = (-0.5 * edge, -0.5 * edge)
+        panel.add_patch(Rectangle(corner, edge, edge, facecolor=face, edgecolor=colour, linestyle=line))
+    for is_pass, marker, size in ((True, "o", 36), (False, "X", 110)):
+        shown = [one for one in meetings if (one.outcome == PASSED) is is_pass]
+        panel.scatter(
+            [one.right_m for one in shown], [one.up_m for one in shown], size,
+            [one.speed_m_s for one in shown], marker=marker, edgecolors="black", linewidths=0.6,
+            vmin=0.0, vmax=top,
+        )  # fmt: skip
+    for one in [one for one in meetings if one.outcome != PASSED][:MOST_LABELLED]:
+        place = (one.right_m, one.up_m)
+        panel.annotate(f"lap {one.lap}", place, (7, 2), textcoords="offset points", fontsize="small")
+    reach = AROUND * max([0.5 * gate.frame, *(max(abs(one.right_m), abs(one.up_m)) for one in meetings)])
+    num_passed = sum(one.outcome == PASSED for one in meetings)
+    panel.set(aspect="equal", xlim=(-reach, reach), ylim=(-reach, reach))
+    panel.set_title(f"gate {gate.id}: {num_passed} of {len(meetings)}", fontsize="small")
+
+
+def draw_commands(flight: Flight) -> Figure:
+    """Return four sticks, commanded against applied, speed and battery; gates passed and laps as marks."""
+    times = flight.times_s
+    # The last step, after the last state, may have met a gate.
+    end_s = max(times[-1], *(one.time_s for one in flight.meetings), STEP_S)
+    width = float(np.clip(SECOND_IN * times[-1], *WIDTHS_IN))
+    figure = new_figure(width, COMMANDS_IN)
+    panels = figure.subplots(len(PANEL_HEIGHTS), 1, sharex=True, height_ratios=PANEL_HEIGHTS)
+    for panel, name, command, applied in zip(
+        panels, Action._fields, flight.commands.T, flight.states[:, APPLIED_ACTION].T, strict=False
+    ):
+        _draw_stick(panel, times, command, applied)
+        panel.set_ylabel(f"{name} stick")
+    panels[4].plot(times, flight.speeds_m_s, color=BLUE)
+    panels[4].set(ylabel="speed (m/s)", ylim=(0.0, None))
+    panels[5].plot(times, flight.states[:, BATTERY], color=BLUE)
+    panels[5].set(ylabel="battery (V)", xlabel="time (s)", xlim=(0.0, end_s))
+    for panel in panels:
+        _mark_events(plain(panel), flight)
+    _label_events(panels[0], flight, width)
+    figure.align_ylabels(panels)
+    sticks = panels[3].get_legend_handles_labels()[0]
+    figure.legend(handles=[*sticks, *MARKS.values()], loc="outside lower center", ncols=5, frameon=False)
+    figure.suptitle(escape(f"{flight.title}\n{flight.laps_text}"), fontsize="medium")
+    return figure
+
+
+def _draw_stick(panel: Axes, times: np.ndarray, command: np.ndarray, applied: np.ndarray) -> None:
+    """Draw one stick; a command holds for a step, from its state on. NaN is a gap."""
+    panel.plot(times, command, color=ORANGE, linewidth=1.0, drawstyle="steps-post", label="commanded")
+    panel.plot(times, applied, color=BLUE, linewidth=1.6, label="applied")
+    if np.isnan(applied).all():
+        box = {"facecolor": "white", "edgecolor": "none", "alpha": 0.8}
+        panel.text(0.01, 0.08, "applied: not in the file", color=GREY, transform=panel.transAxes, bbox=box)
+    # Commands outside of the sticks' range are shown where they are.
+    reach = max(1.0, float(np.abs(command).max()))
+    panel.set_ylim(-1.08 * reach, 1.08 * reach)
+
+
+def _mark_events(panel: Axes, flight: Flight) -> None:
+    """Draw a line where a gate was passed, a bold one where a lap ended, a dashed one at failures."""
+    marks = [(one.time_s, MARKS["lap" if one.lap else "gate"]) for one in flight.race.passes]
+    marks += [(one.time_s, MARKS["failure"]) for one in flight.meetings if one.outcome != PASSED]
+    for time_s, mark in marks:
+        style: dict[str, Any] = {
+            "color": mark.get_color(),
+            "lw": mark.get_linewidth(),
+            "ls": mark.get_linestyle(),
+        }
+        panel.axvline(time_s, zorder=0.5, **style)
+
+
+def _label_events(panel: Axes, flight: Flight, width_in: float) -> None:
+    """Write the gates' ids and the lap times above a panel, where there is room for them."""
+    ids = [(one.time_s, str(flight.track.gates[one.gate].id)) for one in flight.meetings]
+    laps = [(one.time_s, f"lap {one.lap}: {one.lap_time_s:.3f} s") for one in flight.race.passes if one.lap]
+    failures = [(one.time_s, one.outcome) for one in flight.meetings if one.outcome != PASSED]
+    inch_s = flight.times_s[-1] / width_in
+    texts = [(*label, 3, GREY) for label in with_room(ids, inch_s)]
+    for time_s, text in with_room([*laps, *failures], inch_s):
+        texts.append((time_s, text, 13, GREEN if (time_s, text) in laps else "black"))
+    for time_s, text, above, colour in texts:
+        panel.annotate(
+            text, (time_s, 1.0), (0, above), xycoords=panel.get_xaxis_transform(),
+            textcoords="offset points", ha="center", fontsize="small", color=colour,
+        )  # fmt: skip

@@ -1,0 +1,136 @@
+"""What pictures, videos, windows and recordings share: shapes in the world, the drone's body, and colours."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from flytrack_env.quaternion import Scalar
+from flytrack_env.tracks import Course
+
+Colour = tuple[int, int, int]
+
+# On white: colours of M. Okabe and K. Ito, which colour-blind readers can tell apart.
+BLUE, ORANGE, GREEN, GREY = "#0072B2", "#D55E00", "#009E73", "#666666"
+PAPER_COLOURS = (BLUE, ORANGE, GREEN, "#CC79A7", "#E69F00", "#56B4E9", "#000000")
+PAPER_FRAME, PAPER_OPENING = "0.25", "tab:red"
+
+# On dark ground.
+BACKGROUND: Colour = (20, 24, 31)
+GRID: Colour = (38, 45, 57)
+BOUNDS: Colour = (66, 76, 92)
+SKY_TOP: Colour = (44, 62, 92)
+SKY_HORIZON: Colour = (112, 134, 160)
+GROUND: Colour = (34, 40, 48)
+GROUND_GRID: Colour = (58, 67, 80)
+SHADOW: Colour = (14, 17, 22)
+GATE: Colour = (150, 160, 175)
+NEXT_GATE: Colour = (255, 140, 0)
+GATE_AFTER: Colour = (250, 215, 140)
+DRONE: Colour = (255, 255, 255)
+FRONT_ROTOR: Colour = (255, 70, 70)
+REAR_ROTOR: Colour = (225, 230, 238)
+CAMERA: Colour = (80, 200, 255)
+TEXT: Colour = (235, 239, 245)
+FAINT_TEXT: Colour = (150, 160, 175)
+FLIGHT_COLOURS: tuple[Colour, ...] = (
+    (120, 220, 120),
+    (90, 160, 255),
+    (240, 110, 200),
+    (240, 220, 90),
+    (100, 220, 220),
+    (200, 160, 255),
+)
+# Blue, cyan, green, yellow, red: slow to fast.
+SPEED_STOPS = np.array([(70, 110, 255), (60, 200, 240), (80, 220, 110), (250, 215, 60), (255, 70, 60)])
+FASTEST_M_S = 20.0  # and above: the last of the speed colours
+NUM_SPEED_COLOURS = 64
+
+UP_W = np.array([0.0, 0.0, 1.0])
+SQUARE = ((-1, -1), (1, -1), (1, 1), (-1, 1))  # corners in order around it
+# Body frame, m: x forward, y left, z up. Motors: front left, front right, back left, back right.
+MOTORS_B = np.array([(0.15, 0.09, 0.0), (0.15, -0.09, 0.0), (-0.15, 0.14, 0.0), (-0.15, -0.14, 0.0)])
+ARMS_B = MOTORS_B[[[0, 3], [1, 2]]]
+ROTOR_M = 0.08  # radius
+CAMERA_PITCH_DEG = 40.0  # upwards
+
+
+class Gates(NamedTuple):
+    """The gates of a course in flying order, world frame, m.
+
+    centres, forward: (n, 3); forward is the direction of flight. outer, inner: (n, 4, 3), the corners
+    of frame and opening, in order around the square.
+    """
+
+    centres: np.ndarray
+    forward: np.ndarray
+    outer: np.ndarray
+    inner: np.ndarray
+
+
+def gates_of(course: Course) -> Gates:
+    """Return the gates of a course as arrays."""
+    frames = course.gates
+    centres, forward, up = (
+        np.stack([np.asarray(component, float) for component in vector], axis=-1)
+        for vector in (frames.centre, frames.forward, frames.up)
+    )
+    left = np.cross(up, forward)
+
+    def corners(half_edge: Scalar) -> np.ndarray:
+        return squares(centres, left, up, np.asarray(half_edge, float))
+
+    return Gates(centres, forward, corners(frames.half_frame), corners(frames.half_opening))
+
+
+def squares(centres: np.ndarray, first: np.ndarray, second: np.ndarray, half_edge: np.ndarray) -> np.ndarray:
+    """Return the corners of squares, (n, 4, 3).
+
+    centres: (n, 3), m. first, second: (n, 3), unit vectors along the edges. half_edge: (n,), m.
+    """
+    half = half_edge[:, None]
+    return np.stack([centres + half * (a * first + b * second) for a, b in SQUARE], axis=1)
+
+
+def rotations(quaternions: np.ndarray) -> np.ndarray:
+    """Return the rotation matrices (..., 3, 3), body to world, of unit quaternions (..., 4), scalar first."""
+    w, x, y, z = np.moveaxis(np.asarray(quaternions, float), -1, 0)
+    rows = (
+        (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
+        (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
+        (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
+    )
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def ground_grid(low: np.ndarray, high: np.ndarray, spacing_m: float) -> np.ndarray:
+    """Return the lines of a grid on the floor of a box from low to high, (n, 2, 3), world, m."""
+    lines = []
+    for axis, other in ((0, 1), (1, 0)):
+        first, last = np.ceil(low[axis] / spacing_m), np.floor(high[axis] / spacing_m)
+        for place in spacing_m * np.arange(first, last + 1):
+            line = np.full((2, 3), low[2])
+            line[:, axis] = place
+            line[:, other] = low[other], high[other]
+            lines.append(line)
+    return np.array(lines).reshape(-1, 2, 3)
+
+
+def _speed_table() -> list[Colour]:
+    places = np.linspace(0.0, len(SPEED_STOPS) - 1.0, NUM_SPEED_COLOURS)
+    channels = [np.interp(places, np.arange(len(SPEED_STOPS)), channel) for channel in SPEED_STOPS.T]
+    return [(int(r), int(g), int(b)) for r, g, b in zip(*channels, strict=True)]
+
+
+SPEED_COLOURS = _speed_table()
+
+
+def speed_colours(speeds_m_s: np.ndarray) -> list[Colour]:
+    """Return the trail's colour at each speed (n,), m/s."""
+    places = np.clip(speeds_m_s * (NUM_SPEED_COLOURS / FASTEST_M_S), 0, NUM_SPEED_COLOURS - 1)
+    return [SPEED_COLOURS[place] for place in places.astype(int).tolist()]
+
+
+def blend(colour: Colour, other: Colour, share: float) -> Colour:
+    """Return a colour with that share, 0 to 1, of another one."""
+    r, g, b = (round(a + (o - a) * share) for a, o in zip(colour, other, strict=True))
+    return r, g, b
