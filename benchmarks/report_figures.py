@@ -20,7 +20,7 @@ from baselines.purejaxrl_ppo.evaluate import fly_many
 from baselines.purejaxrl_ppo.training import Trainer
 from benchmarks.report import RESULTS, ROOT, pin_to_one_core
 from flytrack_env.files import write_atomically
-from flytrack_env.pictures.style import png_of
+from flytrack_env.pictures.drawing import png_of
 
 MODEL = ROOT / "benchmarks" / "data" / "ablations" / "model.json"
 STAGES_STEPS = (1_000_000, 2_000_000, 4_000_000, 20_000_000)

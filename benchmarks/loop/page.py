@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from benchmarks import report
 from flytrack_env.effects import BY_NAME as ALL_EFFECTS
 from flytrack_env.files import write_atomically
-from flytrack_env.pictures.style import png_of
+from flytrack_env.pictures.drawing import png_of
 
 POLICIES = {
     "before": "minimal model",
