@@ -1,31 +1,34 @@
-"""Any order of the wrappers composes or is refused with the reason; an episode's end forgets all of them."""
+"""Which wrappers may go around which others, and whose parameters they take."""
 
+import copy
+import pickle
 import re
 from functools import partial
-from itertools import pairwise
+from itertools import product
 from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 import pytest
 from gymnax.wrappers import LogWrapper
-from hypothesis import assume, given, settings
-from hypothesis import strategies as st
 
 from flytrack_env import FlyTrack, wrappers
 from flytrack_env.observations import OBSERVATION_SIZE
+from flytrack_env.plants import Simulator
 from flytrack_env.wrappers import (
     ActionDelay,
     ActionHistory,
     DomainRandomization,
     EpisodeStatistics,
     LegacyStep,
+    NoiseParams,
     ObservationNoise,
     WrapperError,
+    layers_of,
 )
+from tests.support.wrapped_flights import ALL, wrapped
 
-# Every public wrapper, both kinds of history among them, and one of gymnax's: how it is made, its key if any.
+# Every public wrapper, both kinds of history among them, and one of gymnax's.
 MAKERS: dict[str, Any] = {
     "noise": ObservationNoise,
     "commanded": partial(ActionHistory, length=2),
@@ -38,7 +41,6 @@ MAKERS: dict[str, Any] = {
 }
 OTHER_STEP = ("legacy", "log")
 ROWS = {"commanded": 8, "applied": 4}
-orders = st.lists(st.sampled_from(sorted(MAKERS)), max_size=7)
 
 
 def test_every_public_wrapper_is_tried() -> None:
@@ -47,128 +49,107 @@ def test_every_public_wrapper_is_tried() -> None:
     assert public - {wrappers.Wrapper} < {type(make(FlyTrack())) for make in MAKERS.values()}
 
 
-def reasons_against(name: str, inside: list[str]) -> list[str]:
-    """Return why a wrapper may not go around others, innermost first: none, or any of these is said."""
+def reasons_against(name: str, inside: tuple[str, ...]) -> list[str]:
+    """Return why a wrapper may not go around others, innermost first: one of these is the message."""
     if name == "legacy":
-        return ["the step inside has five values already"] * (inside[-1:] == ["legacy"])
+        return ["the step inside has five values already"] * (inside[-1:] == ("legacy",))
     if name == "log":
         return []
     if any(other in OTHER_STEP for other in inside):
         return ["found (LegacyStep|LogWrapper) inside, expected FlyTrack or a wrapper that acts before"]
-    reasons = ["both have the name"] * (name in inside)
     is_late = name == "delay" and "commanded" in inside
-    return reasons + ["the history would hold the delayed commands; put the history outside"] * is_late
+    return ["both have the name"] * (name in inside) + [
+        "the history would hold the delayed commands"
+    ] * is_late
 
 
-def wrap(order: list[str]) -> tuple[Any, int, str | None]:
-    """Return the environment in wrappers, how many went around it, and why the next one did not."""
-    env: Any = FlyTrack()
-    for index, name in enumerate(order):
-        try:
+def test_any_three_compose_or_are_refused_with_the_reason() -> None:
+    base = FlyTrack()
+    for order in product(MAKERS, repeat=3):
+        env: Any = base
+        for index, name in enumerate(order):
+            reasons = reasons_against(name, order[:index])
+            if reasons:
+                with pytest.raises(WrapperError) as caught:
+                    MAKERS[name](env)
+                assert any(re.search(reason, str(caught.value)) for reason in reasons), order
+                break
             env = MAKERS[name](env)
-        except WrapperError as error:
-            return env, index, str(error)
-    return env, len(order), None
+        else:
+            if not set(order) & set(OTHER_STEP):
+                keys = [entry.key for entry in env.observation_table]
+                assert len(set(keys)) == len(keys)
+                assert env.observation_space().shape == (
+                    OBSERVATION_SIZE + sum(ROWS.get(n, 0) for n in order),
+                )
+                env.check_params(env.default_params)
 
 
-@settings(max_examples=300, deadline=None)
-@given(order=orders)
-def test_any_order_composes_or_is_refused_with_the_reason(order: list[str]) -> None:
-    env, number, message = wrap(order)
-    reasons = [reasons_against(name, order[:index]) for index, name in enumerate(order)]
-    assert not any(reasons[:number])
-    if message is None:
-        assert number == len(order)
-    else:
-        assert any(re.search(reason, message) for reason in reasons[number])
-    if any(name in OTHER_STEP for name in order[:number]):
-        return
-    keys = [entry.key for entry in env.observation_table]
-    assert len(set(keys)) == len(keys)
-    size = OBSERVATION_SIZE + sum(ROWS.get(name, 0) for name in order[:number])
-    assert env.observation_space().shape == (size,)
-    env.check_params(env.default_params)
-
-
-@settings(max_examples=8, deadline=None)
-@given(order=orders)
-def test_what_composes_can_be_reset_and_stepped(order: list[str]) -> None:
-    """Traced, not compiled: the same structures go in and come out, for one and for a batch."""
-    assume(("legacy", "log") not in pairwise(order))  # gymnax's wants six values of a step
-    env, _, _ = wrap(order)
-    key = jax.random.key(0)
-    observation, state = jax.eval_shape(env.reset, key)
-    outputs = jax.eval_shape(env.step, key, state, jnp.zeros(4))
-    form = jax.tree.map(lambda leaf: (leaf.shape, leaf.dtype), (observation, state))
-    assert jax.tree.map(lambda leaf: (leaf.shape, leaf.dtype), tuple(outputs[:2])) == form
-    assert observation.shape == env.observation_space(FlyTrack().default_params).shape
-
-
-# --- Nothing survives an episode --------------------------------------------------------------------
-
-NUM_ENVS, LIMIT = 64, 50
-ALL = ("randomization", "delay", "applied", "noise", "commanded", "statistics")
-POISONS = ("nan", "infinite", "huge", "random", "zero")
-
-
-@pytest.fixture(scope="module")
-def ended() -> Any:
-    """The environment in every wrapper, its parameters, a batch of states and the compiled steps."""
-    env = wrap(list(ALL))[0]
-    params = env.default_params.replace(max_steps_in_episode=LIMIT)
-    keys = jax.random.split(jax.random.key(0), NUM_ENVS)
-    states = jax.jit(jax.vmap(env.reset, in_axes=(0, None)))(keys, params)[1]
-    return env, params, states, jax.jit(jax.vmap(env.step, in_axes=(0, 0, 0, None)))
-
-
-def poisoned(states: Any, poison: str, rng: np.random.Generator) -> Any:
-    """Return states of which every number is anything, at an episode's last step."""
-
-    def anything(path: Any, leaf: jax.Array) -> np.ndarray:
-        if getattr(path[-1], "name", "") == "time":
-            return np.full(leaf.shape, LIMIT - 1, leaf.dtype)
-        if leaf.dtype == bool:
-            return rng.random(leaf.shape) < 0.5
-        if jnp.issubdtype(leaf.dtype, jnp.integer):
-            return rng.integers(0, 1000, leaf.shape).astype(leaf.dtype)
-        values = rng.normal(size=leaf.shape)
-        fill = {"nan": np.nan, "infinite": np.inf * values, "huge": 3e38 * np.sign(values), "zero": 0.0}
-        return np.broadcast_to(fill.get(poison, values), leaf.shape).astype(leaf.dtype)
-
-    return jax.tree_util.tree_map_with_path(anything, states)
-
-
-@settings(max_examples=30, deadline=None)
-@given(poison=st.sampled_from(POISONS), seed=st.integers(0, 2**32 - 1))
-def test_what_begins_depends_on_nothing_of_what_ended(ended: Any, poison: str, seed: int) -> None:
-    """Bit for bit: the same key, another past, another last action, in every wrapper at once."""
-    env, params, states, step = ended
-    rng = np.random.default_rng(seed)
-    keys = jax.random.split(jax.random.key(seed), NUM_ENVS)
-    found = []
-    for past in ("zero", poison):
-        actions = rng.choice([0.3, 1.0, np.inf, np.nan], (NUM_ENVS, 4)).astype(np.float32)
-        before = poisoned(states, past, rng)
-        one = step(keys, before, actions, params)
-        batch = env.step_batch(keys[0], before, actions, params)
-        for outputs in (one, batch):
-            assert np.asarray(outputs[4]).all()
-        found.append(jax.tree.leaves((one[:2], batch[:2])))
-    for clean, after in zip(*found, strict=True):
-        np.testing.assert_array_equal(np.asarray(clean), np.asarray(after))
-        assert np.isfinite(np.asarray(after)).all()
-
-
-def test_an_episode_that_goes_on_does_depend_on_its_past(ended: Any) -> None:
-    """So that the test above can see what survives."""
-    _, params, states, step = ended
-    keys = jax.random.split(jax.random.key(1), NUM_ENVS)
-    found = []
-    for stick in (0.3, -0.3):
-        outputs = step(keys, states, jnp.full((NUM_ENVS, 4), stick), params)
-        assert not np.asarray(outputs[3] | outputs[4]).all()
-        found.append(outputs[1])
-    is_alike = [np.array_equal(*pair) for pair in zip(*map(jax.tree.leaves, found), strict=True)]
-    assert not all(is_alike) and not np.array_equal(
-        found[0].inner.actions[0].roll, found[1].inner.actions[0].roll
+def test_subclasses_count_as_what_they_are() -> None:
+    louder, longer = (
+        type(name, (base,), {}) for name, base in (("L", ObservationNoise), ("H", ActionHistory))
     )
+    with pytest.raises(WrapperError, match="L around ObservationNoise: both"):
+        louder(ObservationNoise(FlyTrack()))
+    with pytest.raises(WrapperError, match="ActionDelay around H: the history would hold"):
+        ActionDelay(longer(FlyTrack()))
+
+
+def test_randomising_what_is_baked_in_is_refused() -> None:
+    class Baked(Simulator):
+        dt = 0.01
+
+    with pytest.raises(WrapperError, match="baked in, none can be drawn"):
+        DomainRandomization(FlyTrack(plant=Baked()))
+
+
+def test_layers() -> None:
+    env = wrapped(*ALL)
+    assert [layer.env_id for layer in layers_of(env)][-1] == "FlyTrack-v0" and len(layers_of(env)) == 7
+    assert env.track.name == "flytrack" and env.missed_gate == "terminate"
+    smooth = ObservationNoise(FlyTrack()).with_transition_gradients()
+    assert ActionHistory(smooth).transition_gradients_enabled
+    legacy = LegacyStep(ObservationNoise(FlyTrack())).with_transition_gradients()
+    assert isinstance(legacy, LegacyStep) and legacy.transition_gradients_enabled
+
+
+@pytest.mark.parametrize("wrapper", [DomainRandomization, ActionDelay, ObservationNoise])
+def test_parameters_of_another_environment_are_refused(wrapper: Any) -> None:
+    env, others = wrapped(wrapper), FlyTrack().default_params
+    with pytest.raises(ValueError, match=rf"params\.wrappers: found \[\], expected \['{env.key}'\]"):
+        env.reset(jax.random.key(0), others)
+    with pytest.raises(ValueError, match=rf"params\.wrappers: found \[\], expected '{env.key}' among them"):
+        env.own_params(others)
+    unknown = others.replace(wrappers={env.key: env.own_defaults(), "nois": NoiseParams()})
+    with pytest.raises(ValueError, match=r"params\.wrappers: found \[.*'nois'.*\], expected"):
+        env.reset(jax.random.key(0), unknown)
+
+
+def test_resets_and_steps_can_be_traced_and_gymnaxs_wrappers_go_around() -> None:
+    env, key = wrapped(*ALL), jax.random.key(0)
+    params = jax.tree.map(jnp.asarray, env.default_params)
+    observation, state = jax.eval_shape(lambda key: env.reset(key, params), key)
+    assert jax.tree.structure(jax.eval_shape(env.reset, key)[1]) == jax.tree.structure(state)
+    for outer, num_values in ((LogWrapper(env), 6), (LegacyStep(env), 5)):
+        _, state = jax.eval_shape(outer.reset, key, params)
+        outputs = jax.eval_shape(outer.step, key, state, jnp.zeros(4), params)
+        assert len(outputs) == num_values and outputs[0].shape == observation.shape
+
+
+class SixValues:
+    """An environment of gymnax's protocol that does nothing."""
+
+    name = "six"
+
+    def step(self, key: Any, state: Any, action: Any, params: Any) -> tuple[Any, ...]:
+        return action, state, state, action > 0.0, action > 1.0, {"truncated": action > 1.0}
+
+
+@pytest.mark.parametrize("clone", [copy.copy, copy.deepcopy, lambda one: pickle.loads(pickle.dumps(one))])
+def test_legacy_step_joins_the_flags_and_survives_copies(clone: Any) -> None:
+    env = clone(LegacyStep(SixValues()))
+    _, _, reward, done, info = env.step(None, 3.0, jnp.array([-1.0, 0.5, 2.0]))
+    assert float(reward) == 3.0 and env.name == "six"
+    assert done.tolist() == [False, True, True] and info["truncated"].tolist() == [False, False, True]
+    with pytest.raises(AttributeError):
+        getattr(env, "no_such_" + "attribute")

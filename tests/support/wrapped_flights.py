@@ -1,14 +1,38 @@
-"""Random flights of FlyTrack in wrappers, which the tests of these share."""
+"""Flights of FlyTrack in wrappers, which tests share: each environment's step is compiled once."""
 
 from functools import cache, partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
-from flytrack_env.env import EnvParams, FlyTrack
+from flytrack_env.env import FlyTrack
+from flytrack_env.wrappers import (
+    ActionDelay,
+    ActionHistory,
+    DomainRandomization,
+    EpisodeStatistics,
+    ObservationNoise,
+)
 
-NUM_STEPS, NUM_ENVS = 100, 8
+NUM_ENVS = 16
+COMMANDED = partial(ActionHistory, length=3)
+APPLIED = partial(ActionHistory, length=1, kind="applied")
+ALL = (DomainRandomization, ActionDelay, APPLIED, ObservationNoise, COMMANDED, EpisodeStatistics)
+
+
+class Flight(NamedTuple):
+    """Random flights: what their reset gave, the actions, and what each step returned, (T, NUM_ENVS, ...)."""
+
+    first: Any
+    start: Any
+    actions: Any
+    observations: Any
+    states: Any
+    rewards: Any
+    terminated: Any
+    truncated: Any
+    info: Any
 
 
 @cache
@@ -20,25 +44,33 @@ def wrapped(*wrappers: Any) -> Any:
     return env
 
 
-def fly(env: Any, **changes: Any) -> Any:
-    """Return observations, states, rewards, ends and infos of random flights, leaves (T, N, ...).
-
-    ``changes`` are of the default parameters. One shape for all tests: compiling is what takes time.
-    """
-    return _fly(env, jax.random.key(0), env.default_params.replace(**changes))
+@cache
+def resets_of(env: Any) -> Any:
+    """Return the compiled reset of NUM_ENVS environments."""
+    return jax.jit(jax.vmap(env.reset, in_axes=(0, None)))
 
 
-@partial(jax.jit, static_argnums=0)
-def _fly(env: Any, key: jax.Array, params: EnvParams) -> Any:
-    key_reset, key_actions, key_steps = jax.random.split(key, 3)
-    actions = jax.random.uniform(key_actions, (NUM_STEPS, NUM_ENVS, 4), minval=-1.0)
-    first, start = jax.vmap(env.reset, in_axes=(0, None))(jax.random.split(key_reset, NUM_ENVS), params)
+@cache
+def steps_of(env: Any) -> Any:
+    """Return the compiled step, with auto-reset, of NUM_ENVS environments."""
+    return jax.jit(jax.vmap(env.step, in_axes=(0, 0, 0, None)))
 
-    def one(state: Any, inputs: Any) -> Any:
-        index, action = inputs
+
+def fly(env: Any, num_steps: int = 60, params: Any = None, **wrappers: Any) -> Flight:
+    """Return random flights; ``wrappers``: parameters of wrappers that are not the default ones."""
+    params = env.default_params if params is None else params
+    params = arrays(params.replace(wrappers={**params.wrappers, **wrappers}))
+    key_reset, key_actions, key_steps = jax.random.split(jax.random.key(0), 3)
+    actions = jax.random.uniform(key_actions, (num_steps, NUM_ENVS, 4), minval=-1.0)
+    first, start = resets_of(env)(jax.random.split(key_reset, NUM_ENVS), params)
+    state, outputs = start, []
+    for index, action in enumerate(actions):
         keys = jax.random.split(jax.random.fold_in(key_steps, index), NUM_ENVS)
-        outputs = jax.vmap(env.step, in_axes=(0, 0, 0, None))(keys, state, action, params)
-        return outputs[1], outputs
+        outputs.append(steps_of(env)(keys, state, action, params))
+        state = outputs[-1][1]
+    return Flight(first, start, actions, *jax.tree.map(lambda *leaves: jnp.stack(leaves), *outputs))
 
-    outputs = jax.lax.scan(one, start, (jnp.arange(NUM_STEPS), actions))[1]
-    return (first, start), actions, outputs
+
+def arrays(params: Any) -> Any:
+    """Return parameters of float32 arrays, so that no other type of a number compiles a step anew."""
+    return jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32), params)

@@ -1,185 +1,287 @@
-"""Wrappers: that they compose, and that nothing survives an episode."""
+"""What each wrapper adds to a flight, and that nothing of it survives an episode."""
 
-import copy
-import pickle
 from functools import partial
-from itertools import permutations
 from typing import Any
 
-import gymnax
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from gymnax.wrappers import LogWrapper
 
-from flytrack_env import wrappers
+from flytrack_env.dynamics import nominal_parameters
+from flytrack_env.effects import CommandDelay, LinearDrag, QuadraticDrag, ThrustScale, Wind, effect_of
 from flytrack_env.env import FlyTrack
-from flytrack_env.observations import OBSERVATION_SIZE
-from flytrack_env.plants import Simulator
-from flytrack_env.state import Action, pack
+from flytrack_env.randomness import next_word
+from flytrack_env.state import Action
 from flytrack_env.wrappers import (
     ActionDelay,
     ActionHistory,
     DomainRandomization,
-    EpisodeStatistics,
-    LegacyStep,
     NoiseParams,
     ObservationNoise,
-    WrapperError,
-    layers_of,
+    RandomizationParams,
 )
-from tests.support.wrapped_flights import NUM_STEPS, fly, wrapped
+from flytrack_env.wrappers.domain_randomization import sample_model
+from tests.support.trees import stack
+from tests.support.wrapped_flights import ALL, NUM_ENVS, Flight, arrays, fly, resets_of, steps_of, wrapped
 
-ALL = (DomainRandomization, ActionDelay, ObservationNoise, ActionHistory, EpisodeStatistics)
-OVER_WRAPPERS = pytest.mark.parametrize("wrapper", ALL, ids=lambda wrapper: wrapper.__name__)
+SIZE = 29  # of FlyTrack's own observation; behind it, one applied and three commanded actions
+NO_NOISE = NoiseParams(0.0, 0.0, 0.0, 0.0)
+LATE_S = 0.013
 
 
-def state_of(env: Any, state: Any, wrapper: type) -> Any:
-    """Return the state of one of an environment's wrappers."""
-    while type(env) is not wrapper:
-        env, state = env.env, state.inner
+def same_model(delay_s: float = 0.0) -> RandomizationParams:
+    """Return ranges from which the nominal model is drawn, with a delay, in the default's structure."""
+    still = Wind(0.0, 0.0, None, None, None, None)
+    ends = (CommandDelay(delay_s), ThrustScale(1.0), still, LinearDrag(0.0, 0.0, 0.0))
+    return RandomizationParams(1.0, 1.0, 1.0, 1.0, low=ends, high=ends)
+
+
+def state_of(state: Any, field: str) -> Any:
+    """Return the state of the outermost wrapper that has a field of that name."""
+    while not hasattr(state, field):
+        state = state.inner
     return state
 
 
-# --- Composition ----------------------------------------------------------------------------------
-
-
-def is_sensible(order: tuple[Any, ...]) -> bool:
-    """Return whether wrappers may go around each other, the innermost first."""
-    try:
-        wrapped(*order)
-    except WrapperError:
-        return False
-    return True
-
-
-def test_all_wrappers_are_tried() -> None:
-    exported = [getattr(wrappers, name) for name in wrappers.__all__]
-    public = {one for one in exported if isinstance(one, type) and issubclass(one, wrappers.Wrapper)}
-    assert public - {wrappers.Wrapper} == set(ALL)
-
-
-def test_orders_that_make_sense_have_the_same_spaces_and_parameters() -> None:
-    """The others are refused: exactly those with the history of commands inside the delay."""
-    with_params = {"domain_randomization", "action_delay", "observation_noise"}
-    for order in permutations(ALL):
-        is_refused = order.index(ActionHistory) < order.index(ActionDelay)
-        assert is_sensible(order) != is_refused, order
-        if is_refused:
-            continue
-        env = wrapped(*order)
-        assert env.observation_space().shape == (OBSERVATION_SIZE + 3 * 4,)
-        assert set(env.default_params.wrappers) == with_params
-
-
-# In which of the orders that make sense, as a share of them: the first is as far from that of ALL as can be.
-@pytest.mark.parametrize(
-    "share", [0.0, pytest.param(0.37, marks=pytest.mark.slow), pytest.param(0.71, marks=pytest.mark.slow)]
-)
-def test_the_order_does_not_change_the_flight(share: float) -> None:
-    """What is drawn hangs on names, not on the order of wrapping."""
-    sensible = [order for order in permutations(reversed(ALL)) if is_sensible(order)]
-    reference = fly(wrapped(*ALL))
-    other = fly(wrapped(*sensible[int(share * len(sensible))]))
-    np.testing.assert_allclose(other[2][0], reference[2][0], atol=2e-4)
-    np.testing.assert_array_equal(other[2][3], reference[2][3])
-
-
-@OVER_WRAPPERS
-def test_twice_is_refused(wrapper: Any) -> None:
-    with pytest.raises(WrapperError, match=f"{wrapper.__name__} around {wrapper.__name__}: both"):
-        wrapper(
-            ObservationNoise(wrapper(FlyTrack())) if wrapper is not ObservationNoise else wrapped(wrapper)
-        )
-
-
-def test_a_history_inside_the_delay_is_refused_with_the_reason() -> None:
-    with pytest.raises(WrapperError, match="ActionDelay around ActionHistory: the history would hold"):
-        ActionDelay(ActionHistory(FlyTrack()))
-
-
-@OVER_WRAPPERS
-@pytest.mark.parametrize("inside", [LegacyStep, LogWrapper], ids=lambda inside: inside.__name__)
-def test_another_step_inside_is_refused_with_the_reason(wrapper: Any, inside: Any) -> None:
-    with pytest.raises(WrapperError, match=rf"found {inside.__name__} inside, .* go outermost"):
-        wrapper(inside(FlyTrack()))
-
-
-def test_randomising_what_is_baked_in_is_refused() -> None:
-    class Baked(Simulator):
-        dt = 0.01
-
-    with pytest.raises(WrapperError, match="baked in, none can be drawn"):
-        DomainRandomization(FlyTrack(plant=Baked()))
-
-
-def test_layers() -> None:
+@pytest.fixture(scope="module")
+def flight() -> Flight:
+    """Flights in all wrappers with their default parameters."""
     env = wrapped(*ALL)
-    _, state = env.reset(jax.random.key(0))
-    assert len(env.model(state, env.default_params).effects) == 4
-    assert FlyTrack().model(None, FlyTrack().default_params).effects == ()
-    assert [type(layer) for layer in layers_of(env)] == [*reversed(ALL), FlyTrack]
-    assert env.track.name == "flytrack" and env.missed_gate == "terminate"
+    return fly(env, params=env.default_params.replace(max_steps_in_episode=50))
 
 
-@OVER_WRAPPERS
-def test_parameters_of_another_environment_are_refused(wrapper: Any) -> None:
+@pytest.fixture(scope="module")
+def quiet_flights() -> dict[str, Flight]:
+    """Flights in all wrappers, without noise and with one model; commands are late by effect or wrapper."""
+    cases = {"neither": (0.0, 0.0), "effect": (LATE_S, 0.0), "wrapper": (0.0, LATE_S)}
+    return {
+        name: fly(
+            wrapped(*ALL),
+            observation_noise=NO_NOISE,
+            domain_randomization=same_model(in_effect),
+            action_delay=CommandDelay(in_wrapper),
+        )
+        for name, (in_effect, in_wrapper) in cases.items()
+    }
+
+
+def ended(flight: Flight) -> np.ndarray:
+    return np.asarray(flight.terminated | flight.truncated)
+
+
+def test_neutral_wrappers_fly_as_none_do(quiet_flights: dict[str, Flight]) -> None:
+    plain, found = fly(wrapped()), quiet_flights["neither"]
+    np.testing.assert_allclose(found.observations[..., :SIZE], plain.observations, atol=1e-4)
+    np.testing.assert_allclose(found.rewards, plain.rewards, atol=1e-4)
+    np.testing.assert_array_equal(ended(found), ended(plain))
+    assert ended(plain).any()
+
+
+def test_the_delay_does_what_the_effect_in_the_model_does(quiet_flights: dict[str, Flight]) -> None:
+    late, plain = quiet_flights["effect"], quiet_flights["neither"]
+    np.testing.assert_allclose(late.observations, quiet_flights["wrapper"].observations, atol=2e-4)
+    np.testing.assert_array_equal(late.terminated, quiet_flights["wrapper"].terminated)
+    assert np.abs(late.observations - plain.observations).max() > 0.1
+
+
+def test_the_order_of_wrapping_does_not_change_the_flight(flight: Flight) -> None:
+    """What is drawn hangs on names."""
+    env = wrapped(ALL[5], ALL[3], ALL[1], ALL[0], ALL[2], ALL[4])
+    other = fly(env, params=env.default_params.replace(max_steps_in_episode=50))
+    np.testing.assert_allclose(other.observations, flight.observations, atol=5e-4)
+    np.testing.assert_array_equal(ended(other), ended(flight))
+
+
+# --- Each wrapper -----------------------------------------------------------------------------------
+
+
+def test_statistics_are_those_of_the_episode(flight: Flight) -> None:
+    total, length = np.zeros(NUM_ENVS), np.zeros(NUM_ENVS, int)
+    for i, is_end in enumerate(ended(flight)):
+        total, length = total + np.asarray(flight.rewards[i], float), length + 1
+        np.testing.assert_allclose(flight.info["episode_return"][i], total, atol=1e-4)
+        np.testing.assert_array_equal(flight.info["episode_length"][i], length)
+        total, length = np.where(is_end, 0.0, total), np.where(is_end, 0, length)
+    assert ended(flight).any() and flight.truncated.any()
+
+
+def test_commands_are_remembered_the_latest_first_within_the_episode(flight: Flight) -> None:
+    applied, one, three = np.split(np.asarray(flight.observations), [SIZE, SIZE + 4], axis=-1)
+    applied = applied[..., 18:22]
+    np.testing.assert_array_equal(one, applied)
+    first = np.asarray(flight.first)
+    expected = np.repeat(first[:, None, 18:22], 3, axis=1)
+    np.testing.assert_array_equal(first[:, SIZE + 4 :].reshape(-1, 3, 4), expected)
+    for i, is_end in enumerate(ended(flight)):
+        shifted = np.concatenate([np.asarray(flight.actions[i])[:, None], expected[:, :-1]], axis=1)
+        expected = np.where(is_end[:, None, None], np.repeat(applied[i][:, None], 3, axis=1), shifted)
+        np.testing.assert_allclose(three[i].reshape(-1, 3, 4), expected, atol=1e-6)
+
+
+def test_a_model_and_the_noise_hold_for_their_episode_and_their_step(flight: Flight) -> None:
+    states = jax.tree.map(
+        lambda *leaves: np.concatenate([leaves[0][None], leaves[1]]), flight.start, flight.states
+    )
+    env, is_end = wrapped(*ALL), ended(flight)
+    noise = env.env.env  # inside the statistics and the history of commands
+    assert isinstance(noise, ObservationNoise)
+    words = {"noise": states.inner.inner.word, "model": states.inner.inner.inner.inner.inner.word}
+    assert (words["noise"][1:] != words["noise"][:-1]).all()
+    np.testing.assert_array_equal(words["model"][1:][~is_end], words["model"][:-1][~is_end])
+    assert (words["model"][1:][is_end] != words["model"][:-1][is_end]).all()
+    for word in words.values():
+        assert len(np.unique(word[-1])) == NUM_ENVS
+
+
+def test_noise_has_the_stated_deviations_and_is_white() -> None:
+    """In the observation's rows, at rest on the start pose, where the drone itself does not move."""
+    env = wrapped(ObservationNoise)
+    noise = NoiseParams(position_m=0.1, velocity_m_per_s=0.2, attitude_deg=2.0, rates_rad_per_s=0.3)
+    params = env.default_params.replace(wrappers={"observation_noise": noise})
+    inner = env.env.reset(jax.random.key(0))[1]
+    drone = env.env.drone(inner)
+
+    def observations(seed: jax.Array) -> jax.Array:
+        state = env.begin(drone, 0, params, seed)
+        later = state._replace(word=next_word(state.word))
+        return jnp.stack([env.observe(None, each, None, params) for each in (state, later)])
+
+    both = np.asarray(jax.jit(jax.vmap(observations))(jnp.arange(4000, dtype=jnp.uint32)), float)
+    plain = np.asarray(env.env.observe(None, env.env.begin(drone, 0, params), None, params), float)
+    error, next_error = (both - plain).swapaxes(0, 1)
+    for rows, deviation in ((slice(0, 3), 0.1 / 3), (slice(3, 6), 0.2 / 5), (slice(15, 18), 0.3 / 5)):
+        np.testing.assert_allclose(error[:, rows].std(axis=0), deviation, rtol=0.05)
+        np.testing.assert_allclose(error[:, rows].mean(axis=0), 0.0, atol=0.08 * deviation)
+        for axis in range(rows.start, rows.stop):  # white: the next step's noise does not know this one's
+            assert abs(np.corrcoef(error[:, axis], next_error[:, axis])[0, 1]) < 0.06
+    twist = np.einsum("ji,njk->nik", plain[6:15].reshape(3, 3), both[:, 0, 6:15].reshape(-1, 3, 3))
+    assert np.rad2deg(0.5 * (twist[:, 2, 1] - twist[:, 1, 2])).std() == pytest.approx(2.0, rel=0.05)
+    assert (error[:, 18:] == 0.0).all()  # applied action, battery and the track are known
+
+
+def test_noise_stays_inside_the_space_and_off_the_flight(quiet_flights: dict[str, Flight]) -> None:
+    quiet = {"domain_randomization": same_model(), "action_delay": CommandDelay(0.0)}
+    loud = fly(wrapped(*ALL), observation_noise=NoiseParams(50.0, 50.0, 90.0, 50.0), **quiet)
+    assert (np.abs(loud.observations) <= np.asarray(wrapped(*ALL).observation_space().high)).all()
+    attitude = np.asarray(loud.observations)[..., 6:15].reshape(-1, 3, 3)
+    eye = np.broadcast_to(np.eye(3), attitude.shape)
+    np.testing.assert_allclose(attitude @ attitude.transpose(0, 2, 1), eye, atol=1e-5)
+    np.testing.assert_array_equal(loud.rewards, quiet_flights["neither"].rewards)  # of the true flight
+
+
+def sampled_models(
+    ranges: RandomizationParams | None = None, model: Any = None, num: int = 2000
+) -> tuple[Any, RandomizationParams]:
+    """Return models of that many words, leaves (num,), and the ranges that they were drawn from."""
+    ranges = RandomizationParams() if ranges is None else ranges
+    model = nominal_parameters() if model is None else model
+    words = jax.random.bits(jax.random.key(0), (num,))
+    return jax.jit(jax.vmap(lambda word: sample_model(word, model, ranges)))(words), ranges
+
+
+def test_everything_that_has_a_range_fills_it_and_independently() -> None:
+    models, ranges = sampled_models()
+    columns = [(models.m, 0.8, 1.2)] + [(tau, 0.7 * 0.04, 1.3 * 0.04) for tau in models.tau]
+    assert len(models.effects) == len(ranges.low)
+    for low, high in zip(ranges.low, ranges.high, strict=True):
+        found = models.effect(effect_of(low).name)
+        for name, lowest in low._asdict().items():
+            value = np.asarray(getattr(found, name))
+            if lowest is None:
+                assert (value == 0.0).all()
+            elif lowest < getattr(high, name):
+                columns.append((value, lowest, getattr(high, name)))
+    assert len(columns) == 1 + 4 + 1 + 1 + 2 + 3
+    units = []
+    for values, low, high in columns:
+        unit = (np.asarray(values, float) - low) / (high - low)
+        assert -1e-6 <= unit.min() < 0.01 and 0.99 < unit.max() <= 1.0 + 1e-5
+        assert abs(unit.mean() - 0.5) < 0.03
+        units.append(unit)
+    assert np.abs(np.corrcoef(units) - np.eye(len(units))).max() < 0.1
+
+
+def test_what_the_model_itself_has_is_drawn_around_it() -> None:
+    """An identified effect is known: scaled, within its range. What is not among the ranges stays."""
+    known = (CommandDelay(0.036), ThrustScale(0.6), LinearDrag(1.0, -0.5, 0.0), QuadraticDrag(0.1))
+    models, _ = sampled_models(model=nominal_parameters().with_effects(*known), num=500)
+    by_name = {effect_of(effect).name: jax.tree.map(np.asarray, effect) for effect in models.effects}
+    assert set(by_name) == {"command_delay", "thrust_scale", "wind", "linear_drag", "quadratic_drag"}
+    delay_s = by_name["command_delay"].delay_s
+    assert 0.8 * 0.036 <= delay_s.min() < 0.03 and delay_s.max() == np.float32(0.04)
+    factor, drag = by_name["thrust_scale"].factor, by_name["linear_drag"]
+    assert 1.0 - 0.4 * 1.2 <= factor.min() < 0.54 and 0.66 < factor.max() <= 1.0 - 0.4 * 0.8 + 1e-6
+    assert 0.8 - 1e-6 <= drag.d_x.min() < 0.83 and 1.17 < drag.d_x.max() <= 1.2 + 1e-6
+    assert -0.6 - 1e-6 <= drag.d_y.min() < -0.58 and (drag.d_z == 0.0).all()
+    assert (by_name["quadratic_drag"].k_x == np.float32(0.1)).all()
+
+
+BASE = RandomizationParams()
+LATE, UNKNOWN = CommandDelay(0.1), CommandDelay(None)  # type: ignore[arg-type]
+REFUSALS: list[tuple[Any, Any, str]] = [
+    (
+        DomainRandomization,
+        BASE._replace(mass_factor_low=1.3),
+        r"mass_factor: found a range from 1\.3 to 1\.2",
+    ),
+    (DomainRandomization, BASE._replace(lag_factor_low=0.0), r"lag_factor: found a range from 0\.0 to 1\.3"),
+    (DomainRandomization, BASE._replace(mass_factor_high=np.inf), r"mass_factor: found .* to inf, expected"),
+    (
+        DomainRandomization,
+        BASE._replace(mass_factor_low=1e-4),
+        r"expected one within 0\.00099999 to 1000\.01",
+    ),
+    (DomainRandomization, BASE._replace(effect_factor_high=np.inf), r"effect_factor: .* from 0\.8 to inf"),
+    (
+        DomainRandomization,
+        BASE._replace(low=BASE.low[1:]),
+        r"high: found effects \['CommandDelay', .* of low",
+    ),
+    (
+        DomainRandomization,
+        BASE._replace(high=(LATE, *BASE.high[1:])),
+        r"delay_s: found 0\.1, expected 0 to 0",
+    ),
+    (
+        DomainRandomization,
+        BASE._replace(high=(UNKNOWN, *BASE.high[1:])),
+        r"delay_s: found .* from 0\.0 to None",
+    ),
+    (ActionDelay, CommandDelay(-0.01), r"delay_s: found -0\.01"),
+    (ObservationNoise, NO_NOISE._replace(position_m=-0.1), r"\.position_m: found -0.1, expected finite"),
+    (
+        ObservationNoise,
+        NO_NOISE._replace(attitude_deg=181.0),
+        r"\.attitude_deg: found 181.0, expected finite",
+    ),
+    (
+        ObservationNoise,
+        NO_NOISE._replace(rates_rad_per_s=np.nan),
+        r"rates_rad_per_s: found nan, expected finite",
+    ),
+]
+
+
+@pytest.mark.parametrize(("wrapper", "parameters", "reason"), REFUSALS)
+def test_bad_parameters_are_refused(wrapper: Any, parameters: Any, reason: str) -> None:
     env = wrapped(wrapper)
-    if env.own_defaults() is None:
-        env.reset(jax.random.key(0), FlyTrack().default_params)
-        return
-    others = FlyTrack().default_params
-    with pytest.raises(ValueError, match=rf"params\.wrappers: found \[\], expected \['{env.key}'\]"):
-        env.reset(jax.random.key(0), others)
-    _, state = env.reset(jax.random.key(0))
-    with pytest.raises(ValueError, match=rf"params\.wrappers: found \[\], expected '{env.key}' among them"):
-        env.step(jax.random.key(0), state, jnp.zeros(4), others)
-    unknown = others.replace(wrappers={env.key: env.own_defaults(), "nois": NoiseParams()})
-    with pytest.raises(ValueError, match=r"params\.wrappers: found \[.*'nois'.*\], expected"):
-        env.reset(jax.random.key(0), unknown)
+    with pytest.raises(ValueError, match=reason):
+        env.check_params(env.default_params.replace(wrappers={env.key: parameters}))
 
 
-def test_histories_of_both_kinds_and_a_delay_around_applied_actions_make_sense() -> None:
-    env = ActionHistory(ActionDelay(ActionHistory(FlyTrack(), kind="applied", length=2)), length=1)
-    assert env.observation_space().shape == (OBSERVATION_SIZE + 3 * 4,)
-    assert len({entry.key for entry in env.observation_table}) == len(env.observation_table)
+def test_bad_arguments_are_refused() -> None:
+    with pytest.raises(ValueError, match=r"delay_s: found 0\.05, expected 0 to 0\.04 s"):
+        ActionDelay(FlyTrack(), delay_s=0.05)
+    for argument, value in (("length", 0), ("kind", "wanted")):
+        with pytest.raises(ValueError, match=f"{argument}: found {value!r}, expected"):
+            ActionHistory(FlyTrack(), **{argument: value})
 
 
-def test_a_subclass_counts_as_what_it_is() -> None:
-    class Louder(ObservationNoise):
-        pass
+# --- Nothing survives an episode --------------------------------------------------------------------
 
-    class Longer(ActionHistory):
-        pass
-
-    with pytest.raises(WrapperError, match="Louder around ObservationNoise: both"):
-        Louder(ObservationNoise(FlyTrack()))
-    with pytest.raises(WrapperError, match="ActionDelay around Longer: the history would hold"):
-        ActionDelay(Longer(FlyTrack()))
-
-
-@OVER_WRAPPERS
-def test_a_reset_may_be_traced_with_parameters_that_are_not(wrapper: Any) -> None:
-    env, key = wrapped(wrapper), jax.random.key(0)
-    arrays = jax.tree.map(jnp.asarray, env.default_params)
-    jax.eval_shape(env.reset, key)
-    jax.eval_shape(lambda key: env.reset(key, env.default_params), key)
-    jax.eval_shape(lambda key: env.reset(key, arrays), key)
-    jax.eval_shape(LogWrapper(env).reset, key)
-    jax.eval_shape(LegacyStep(env).reset, key)
-
-
-def test_gradients_stay_wanted_through_wrapping() -> None:
-    smooth = ObservationNoise(FlyTrack()).with_transition_gradients()
-    assert ActionHistory(smooth).transition_gradients_enabled
-    legacy = LegacyStep(ObservationNoise(FlyTrack())).with_transition_gradients()
-    assert isinstance(legacy, LegacyStep) and legacy.transition_gradients_enabled
-
-
-# --- Nothing survives an episode ------------------------------------------------------------------
-
-# One drone per kind of end that is about to meet it on the FlyTrack course: its state, and its action.
+LIMIT = 50
+# One drone per kind of end that is about to meet it on the FlyTrack course, and its action.
 FULL_STICK = (0.9, -0.8, 0.7, -0.6)
 ENDS: dict[str, Any] = {
     "ground": ({"position": (15.0, 10.0, 0.05), "velocity": (0.0, 0.0, -20.0)}, FULL_STICK),
@@ -188,105 +290,103 @@ ENDS: dict[str, Any] = {
     "missed_gate": ({"position": (12.55, 6.0, 1.35), "velocity": (-20.0, 0.0, 0.0)}, FULL_STICK),
     "crash": ({"position": (12.55, 3.0, 1.35), "velocity": (-20.0, 0.0, 0.0)}, FULL_STICK),
     "battery_empty": ({"position": (15.0, 10.0, 2.0), "battery_v": 22.0}, FULL_STICK),
-    "nan": ({"position": (15.0, 10.0, 2.0)}, (np.nan, 0.0, 0.0, 0.0)),
-    "truncated": ({"position": (15.0, 10.0, 2.0), "steps": 49}, FULL_STICK),
+    "nan": ({"position": (15.0, 10.0, 2.0)}, (np.nan, 2.0, -np.inf, 0.5)),  # at once, whatever the delay
+    "truncated": ({"position": (15.0, 10.0, 2.0), "steps": LIMIT - 1}, FULL_STICK),
 }
 
 
-def test_after_every_kind_of_end_an_episode_begins_as_if_nothing_had_been(make_drone: Any) -> None:
-    """The state after an end is that of a reset with the same key, in every leaf of every wrapper."""
+@pytest.fixture(scope="module")
+def limited() -> tuple[Any, Any, Any]:
+    """The environment in every wrapper, its parameters, and a function that steps a batch both ways."""
     env = wrapped(*ALL)
-    params = env.default_params.replace(max_steps_in_episode=50)
-    states, actions = [], []
-    for i, (drone, action) in enumerate(ENDS.values()):
-        drone, applied = dict(drone), jax.tree.map(jnp.float32, Action(0.5, -0.5, 0.4, 0.3))
-        steps = drone.pop("steps", 0)
-        state = env.begin(make_drone(**drone, applied=applied), 0, params, jnp.uint32(i))
-        states.append(jax.tree_util.tree_map_with_path(partial(_aged, steps), state))
-        actions.append(action)
-    keys = jax.random.split(jax.random.key(7), len(ENDS))
-    stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *states)
-    step = jax.jit(jax.vmap(env.step, in_axes=(0, 0, 0, None)))
-    observation, after, _, terminated, truncated, info = step(keys, stacked, jnp.array(actions), params)
-    for i, end in enumerate(ENDS):
-        cause = "crash" if end == "nan" else end
-        assert bool(info[cause][i]), end
-        assert bool(truncated[i]) == (end == "truncated") and bool(terminated[i]) != bool(truncated[i])
-    fresh = jax.jit(jax.vmap(env.reset, in_axes=(0, None)))(keys, params)
-    pairs = zip(jax.tree.leaves((observation, after)), jax.tree.leaves(fresh), strict=True)
-    for found, expected in pairs:
-        np.testing.assert_allclose(found, expected, atol=1e-5)
-    # What a wrapper kept was not that of the fresh episode already.
-    before, fresh_history = (state_of(env, state, ActionHistory).actions[0] for state in (stacked, after))
-    assert (np.asarray(before.roll) != np.asarray(fresh_history.roll)).all()
+    params = arrays(env.default_params.replace(max_steps_in_episode=LIMIT))
+
+    def both(keys: jax.Array, states: Any, actions: Any) -> tuple[Any, Any]:
+        actions = jnp.asarray(actions, jnp.float32)
+        return steps_of(env)(keys, states, actions, params), env.step_batch(keys[0], states, actions, params)
+
+    return env, params, both
 
 
-def _aged(steps: int, path: Any, leaf: jax.Array) -> jax.Array:
-    """Return a leaf, or that number of steps where it is the environment's time."""
+def with_time(steps: int, path: Any, leaf: jax.Array) -> jax.Array:
+    """Return a leaf, or a number of steps where it is the environment's time."""
     return jnp.int32(steps) if getattr(path[-1], "name", "") == "time" else leaf
 
 
-def test_step_batch_begins_episodes_afresh_and_each_its_own() -> None:
-    env = wrapped(*ALL)
-    params = env.default_params.replace(max_steps_in_episode=3)
-    _, states = jax.vmap(env.reset, in_axes=(0, None))(jax.random.split(jax.random.key(0), 16), params)
-    for i in range(3):
-        actions = jax.random.uniform(jax.random.key(i), (16, 4), minval=-1.0)
-        observations, states, _, _, truncated, info = env.step_batch(
-            jax.random.key(i), states, actions, params
-        )
-    assert truncated.all()
-    assert (np.asarray(info["final_observation"]) != np.asarray(observations)).any(axis=1).all()
-    expected = jax.vmap(env.observe, in_axes=(None, 0, None, None))(None, states, None, params)
-    np.testing.assert_allclose(observations, expected, atol=1e-6)
-    drones = jax.vmap(lambda state: pack(env.drone(state)))(states)
-    assert len(np.unique(np.asarray(drones), axis=0)) == 16
-    words = [leaf for leaf in jax.tree.leaves(states) if leaf.dtype == jnp.uint32]
-    assert len(words) >= 2  # the noise's and the model's
-    for word in words:
-        assert len(np.unique(np.asarray(word))) == 16
-    np.testing.assert_array_equal(state_of(env, states, EpisodeStatistics).episode_length, 0)
+def test_after_every_kind_of_end_an_episode_begins_as_if_nothing_had_been(
+    limited: Any, make_drone: Any
+) -> None:
+    """The state after an end is that of a reset with the same key, in every leaf of every wrapper."""
+    env, params, both = limited
+    states, actions = [], []
+    for i in range(NUM_ENVS):
+        drone, action = list(ENDS.values())[i % len(ENDS)]
+        drone, applied = dict(drone), jax.tree.map(jnp.float32, Action(0.5, -0.5, 0.4, 0.3))
+        steps = drone.pop("steps", 0)
+        state = env.begin(make_drone(**drone, applied=applied), 0, params, jnp.uint32(i))
+        states.append(jax.tree_util.tree_map_with_path(partial(with_time, steps), state))
+        actions.append(action)
+    keys = jax.random.split(jax.random.key(7), NUM_ENVS)
+    one, batch = both(keys, stack(states), np.array(actions))
+    for i in range(NUM_ENVS):
+        end = list(ENDS)[i % len(ENDS)]
+        for _, _, _, terminated, truncated, info in (one, batch):
+            assert bool(truncated[i]) == (end == "truncated") and bool(terminated[i]) != bool(truncated[i])
+            assert end == "truncated" or bool(info["crash" if end == "nan" else end][i])
+    fresh = resets_of(env)(keys, params)
+    for found, expected in zip(jax.tree.leaves(one[:2]), jax.tree.leaves(fresh), strict=True):
+        np.testing.assert_allclose(found, expected, atol=1e-5)
+    last = np.asarray(one[5]["final_observation"])
+    assert np.isfinite(last).all() and (last != np.asarray(one[0])).any(axis=1).all()
+    # What is no number is remembered as 0, and the rest of the action clipped.
+    np.testing.assert_allclose(last[list(ENDS).index("nan"), SIZE + 4 : SIZE + 8], [0.0, 1.0, -1.0, 0.5])
+    starts = np.stack(jax.tree.leaves(env.drone(batch[1]).pos_w), -1)
+    assert len(np.unique(starts, axis=0)) == NUM_ENVS
+    np.testing.assert_array_equal(batch[1].episode_length, 0)
 
 
-def test_final_observation_is_the_next_one_where_the_episode_goes_on() -> None:
-    _, _, outputs = fly(wrapped(*ALL))
-    goes_on = ~np.asarray(outputs[3] | outputs[4])
-    final = np.asarray(outputs[5]["final_observation"])
-    np.testing.assert_allclose(final[goes_on], np.asarray(outputs[0])[goes_on], atol=1e-6)
+def poisoned(states: Any, poison: str, rng: np.random.Generator) -> Any:
+    """Return states of which every number is anything, at an episode's last step."""
+
+    def anything(path: Any, leaf: jax.Array) -> np.ndarray:
+        if getattr(path[-1], "name", "") == "time":
+            return np.full(leaf.shape, LIMIT - 1, leaf.dtype)
+        if leaf.dtype == bool:
+            return rng.random(leaf.shape) < 0.5
+        if jnp.issubdtype(leaf.dtype, jnp.integer):
+            return rng.integers(0, 1000, leaf.shape).astype(leaf.dtype)
+        values = rng.normal(size=leaf.shape)
+        fill = {"nan": np.nan, "infinite": np.inf * values, "huge": 3e38 * np.sign(values), "zero": 0.0}
+        return np.broadcast_to(fill.get(poison, values), leaf.shape).astype(leaf.dtype)
+
+    return jax.tree_util.tree_map_with_path(anything, states)
 
 
-# --- Episode statistics ---------------------------------------------------------------------------
+@pytest.mark.parametrize("poison", ["nan", "infinite", "huge", "random"])
+def test_what_begins_depends_on_nothing_of_what_ended(limited: Any, flight: Flight, poison: str) -> None:
+    """Bit for bit: the same key, another past, another last action, in every wrapper at once."""
+    _, _, both = limited
+    rng, states = np.random.default_rng(0), flight.start
+    for seed in range(3):
+        keys, found = jax.random.split(jax.random.key(seed), NUM_ENVS), []
+        for past in ("zero", poison):
+            actions = rng.choice([0.3, 1.0, np.inf, np.nan], (NUM_ENVS, 4))
+            outputs = both(keys, poisoned(states, past, rng), actions)
+            assert all(np.asarray(output[4]).all() for output in outputs)
+            found.append(jax.tree.leaves([output[:2] for output in outputs]))
+        for clean, after in zip(*found, strict=True):
+            np.testing.assert_array_equal(np.asarray(clean), np.asarray(after))
+            assert np.isfinite(np.asarray(after)).all()
 
 
-def test_returns_and_lengths_are_those_of_the_episode() -> None:
-    _, _, outputs = fly(wrapped(EpisodeStatistics), max_steps_in_episode=50)
-    rewards, ended = np.asarray(outputs[2], float), np.asarray(outputs[3] | outputs[4])
-    total, length = np.zeros(8), np.zeros(8, int)
-    for i in range(NUM_STEPS):
-        total, length = total + rewards[i], length + 1
-        np.testing.assert_allclose(outputs[5]["episode_return"][i], total, atol=1e-4)
-        np.testing.assert_array_equal(outputs[5]["episode_length"][i], length)
-        total, length = np.where(ended[i], 0.0, total), np.where(ended[i], 0, length)
-    assert ended.any()
+def test_an_episode_that_goes_on_does_depend_on_its_past(limited: Any, flight: Flight) -> None:
+    """So that the test above can see what survives."""
+    keys = jax.random.split(jax.random.key(1), NUM_ENVS)
+    found = [limited[2](keys, flight.start, np.full((NUM_ENVS, 4), stick))[0][1] for stick in (0.3, -0.3)]
+    histories = [np.asarray(state_of(state, "actions").actions[0].roll) for state in found]
+    assert not np.array_equal(*histories)
 
 
-# --- The five-value step --------------------------------------------------------------------------
-
-
-def test_legacy_step_goes_around_all_of_them_and_can_be_copied() -> None:
-    env = LegacyStep(wrapped(*ALL))
-    params = env.default_params
-    for copied in (env, copy.deepcopy(env), pickle.loads(pickle.dumps(env))):
-        observation, state = copied.reset(jax.random.key(0), params)
-        outputs = copied.step(jax.random.key(1), state, jnp.zeros(4), params)
-        assert len(outputs) == 5 and outputs[0].shape == observation.shape
-
-
-def test_gymnax_wrappers_go_around_ours() -> None:
-    env = LogWrapper(wrapped(*ALL))
-    params = wrapped(*ALL).default_params
-    observation, state = env.reset(jax.random.key(0), params)
-    outputs = env.step(jax.random.key(1), state, jnp.zeros(4), params)
-    assert outputs[0].shape == observation.shape
-    assert "returned_episode_returns" in outputs[-1]
-    assert gymnax.make("FlyTrack-v0")[0].observation_space().shape == (OBSERVATION_SIZE,)
+def test_final_observation_is_the_next_one_where_the_episode_goes_on(flight: Flight) -> None:
+    goes_on, final = ~ended(flight), np.asarray(flight.info["final_observation"])
+    np.testing.assert_allclose(final[goes_on], np.asarray(flight.observations)[goes_on], atol=1e-6)
