@@ -1,13 +1,18 @@
-"""The command ``flytrack-sysid``: collect, import, fit, validate, diagnose, plan; skins over functions."""
+"""Identify a plant and diagnose a model: collect, import, fit, validate, diagnose, plan.
 
-import argparse
+Each command is a dataclass of its flags around a function of ``flytrack_sysid``.
+"""
+
 import importlib
 import sys
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
+import tyro
+from tyro.conf import FlagCreatePairsOff, Positional, UseAppendAction, arg, create_mutex_group, subcommand
 
 from flytrack_env import blackbox, load_model, load_provenance, save_model
 from flytrack_env.dynamics import nominal_parameters
@@ -20,7 +25,7 @@ from flytrack_sysid.diagnosis.next_flight import next_flight
 from flytrack_sysid.diagnosis.report import traces_of
 from flytrack_sysid.fit import fit
 from flytrack_sysid.flight_recording import write_flight_recording
-from flytrack_sysid.importing import FORMATS, import_log
+from flytrack_sysid.importing import import_log
 from flytrack_sysid.log import FlightLog
 from flytrack_sysid.log_file import check_name, describe, load_log, save_log
 from flytrack_sysid.plausibility import check_plausible
@@ -31,29 +36,34 @@ from flytrack_sysid.split import HELD_OUT_EVERY, held_out_rows
 from flytrack_sysid.validate import validate
 from flytrack_sysid.validation_report import text_of, write_validation
 
+PROG = "flytrack-sysid"
 RECORDING_NAME = "flight.rrd"
+EXCITATION_OR_SCRIPT = create_mutex_group(required=False)
+NO_HINT = "(optional)"  # tyro would print "(default: None)"
+Paths = Positional[tuple[Path, ...]]
+OptionalPath = Annotated[Path | None, arg(metavar="PATH", help_behavior_hint=NO_HINT)]
 
 
 def load_plant(where: str) -> Any:
     """Return the plant in an artifact, or the object that ``module:name`` names.
 
-    Importing a module runs it, as importing does; the working directory is searched first.
+    Importing a module runs it; the working directory is searched first.
 
     Raises:
         BlackBoxError: an artifact that cannot be used.
-        CollectError: a module or name that cannot be imported.
+        CollectError: a module or name that cannot be imported, or is no plant.
     """
     module, colon, name = where.partition(":")
     if not colon or Path(where).exists():
         return blackbox.load(where)
-    sys.path.insert(0, str(Path.cwd()))  # and it stays: the module may import later
+    sys.path.insert(0, str(Path.cwd()))  # stays there: the module may import later
     try:
         found: Any = importlib.import_module(module)
         for part in name.split("."):
             found = getattr(found, part)
     except Exception as error:  # whatever a user's module raises
-        said = f"{type(error).__name__}: {error}"
-        raise CollectError(f"--black-box {where}: cannot be imported: {said}") from error
+        reason = f"{type(error).__name__}: {error}"
+        raise CollectError(f"--black-box {where}: cannot be imported: {reason}") from error
     if not isinstance(found, Plant) and not callable(found):
         raise CollectError(
             f"--black-box {where}: found {type(found).__name__}, expected step(x, u) or a plant"
@@ -61,39 +71,197 @@ def load_plant(where: str) -> Any:
     return found
 
 
-def run_collect(arguments: argparse.Namespace) -> None:
-    """Fly the excitation, or a script, and write the log."""
-    check_name(arguments.out)
-    script = None if arguments.script is None else load_script(arguments.script)
-    plant = load_plant(arguments.black_box)
-    log = collect(plant, arguments.minutes, arguments.seed, arguments.noise, ProgressBar("flights"), script)
-    save_log(arguments.out, log)
-    print(describe(load_log(arguments.out)))
+@dataclass(frozen=True)
+class Collect:
+    """Fly an excitation or a script on a plant and write the flight log."""
+
+    black_box: str
+    """The plant: an acro_step.bin, or module:name of a function step(x, u) or of a plant."""
+    out: Path
+    """The log, .npz or .csv."""
+    minutes: Annotated[float, EXCITATION_OR_SCRIPT] = 2.0
+    """Duration of the excitation, at least 1."""
+    script: Annotated[OptionalPath, EXCITATION_OR_SCRIPT] = None
+    """A script to fly instead, .npz, as `plan` writes it."""
+    seed: int = 0
+    """Seed of the excitation and of the noise."""
+    noise: float = 0.0
+    """0 logs the state itself, 1 what common sensors measure; other levels scale their noise."""
+
+    def run(self) -> None:
+        """Fly, and write the log."""
+        check_name(self.out)
+        script = None if self.script is None else load_script(self.script)
+        plant = load_plant(self.black_box)
+        log = collect(plant, self.minutes, self.seed, self.noise, ProgressBar("flights"), script)
+        save_log(self.out, log)
+        print(describe(load_log(self.out)))
 
 
-def run_import(arguments: argparse.Namespace) -> None:
-    """Read measured flights and write them as a log, with what the log cannot hold beside it."""
-    check_name(arguments.out)
-    if arguments.model_out is not None:
-        check_model_name(arguments.model_out)
-    found = import_log(arguments.files, arguments.format, arguments.map, not arguments.keep_clocks)
-    written = [arguments.out, arguments.out.with_suffix(".import.json")]
-    model = None if arguments.model_out is None else found.nominal_model()  # before anything is written
-    save_log(arguments.out, found.log)
-    found.save_details(written[1])
-    if model is not None:
-        about = {
-            "nominal": "generic quadcopter, scaled to the craft",
-            "imported_from": [Path(source).name for source in found.sources],
-        }
-        save_model(arguments.model_out, model, about)
-        written.append(arguments.model_out)
-    print(found.describe())
-    print(f"written: {', '.join(str(path) for path in written)}")
+@dataclass(frozen=True)
+class Import:
+    """Convert logs of real flights into a flight log."""
+
+    files: Annotated[Paths, arg(metavar="FILE [FILE ...]", help_behavior_hint="(at least one)")]
+    """Logs of one craft."""
+    format: Literal["csv", "ulog", "betaflight"]
+    """Their format."""
+    out: Path
+    """The log, .npz or .csv."""
+    map: Annotated[str | None, arg(metavar="MAPPING", help_behavior_hint=NO_HINT)] = None
+    """A mapping file, .toml, or the name of a shipped one; CSV needs it."""
+    model_out: OptionalPath = None
+    """Also write the nominal model of this craft, .json."""
+    keep_clocks: FlagCreatePairsOff[bool] = False
+    """Report offsets between the sensors' clocks without correcting them."""
+
+    def run(self) -> None:
+        """Read the logs, and write them as one with its details beside it."""
+        check_name(self.out)
+        if self.model_out is not None:
+            check_model_name(self.model_out)
+        found = import_log(self.files, self.format, self.map, not self.keep_clocks)
+        written = [self.out, self.out.with_suffix(".import.json")]
+        model = None if self.model_out is None else found.nominal_model()  # before anything is written
+        save_log(self.out, found.log)
+        found.save_details(written[1])
+        if self.model_out is not None and model is not None:
+            provenance = {
+                "nominal": "generic quadcopter, scaled to the craft",
+                "imported_from": [Path(source).name for source in found.sources],
+            }
+            save_model(self.model_out, model, provenance)
+            written.append(self.model_out)
+        print(found.describe())
+        print_written(written)
+
+
+@dataclass(frozen=True)
+class Fit:
+    """Identify a model from a flight log."""
+
+    log: Positional[Path]
+    """The flight log."""
+    out: Path
+    """The model, .json."""
+    fix: UseAppendAction[Annotated[tuple[str, ...], arg(metavar="NAME=VALUE")]] = ()
+    """Hold a parameter at a value; may be repeated."""
+    start: Annotated[str | None, arg(name="from", metavar="MODEL", help_behavior_hint=NO_HINT)] = None
+    """Start from the values of this model; default: the nominal model."""
+    effect: UseAppendAction[Annotated[tuple[str, ...], arg(metavar="NAME")]] = ()
+    """Identify the parameters of this effect too; may be repeated."""
+    hold_out_every: int = HELD_OUT_EVERY
+    """Hold out the last of every so many blocks; 0: none."""
+
+    def run(self) -> None:
+        """Fit the model and write it."""
+        check_model_name(self.out)  # before the work
+        fixed = fixed_values(self.fix)
+        start = None if self.start is None else load_model(self.start)
+        log = load_log(self.log)
+        found = fit(log, start, fixed, self.effect, self.hold_out_every, ProgressBar("rounds"))
+        provenance = found.provenance()
+        provenance["started_from"] = "nominal parameters" if self.start is None else Path(self.start).name
+        provenance["fixed"] = fixed
+        save_model(self.out, found.model, provenance)
+        print(found.describe())
+        print_written([self.out])
+
+
+@dataclass(frozen=True)
+class Validate:
+    """Judge a model on flight that it was not fitted to."""
+
+    model: Positional[Path]
+    """The model, .json."""
+    log: Positional[Path]
+    """The flight log."""
+    out: Path
+    """The folder of the report."""
+
+    def run(self) -> None:
+        """Validate the model and write the report."""
+        model = load_model(self.model)
+        log = load_log(self.log)
+        check_plausible(log)
+        rows, note = judged_rows(self.model, log)
+        found = validate(model, log, rows)
+        found = found._replace(notes=(note, *found.notes))
+        written = write_validation(self.out, found, self.model.name, log)
+        print(text_of(found, self.model.name, log))
+        print_written(written)
+
+
+@dataclass(frozen=True)
+class Diagnose:
+    """Name what a model gets wrong about flights, and write a report and the extended model."""
+
+    logs: Annotated[Paths, arg(metavar="LOG [LOG ...]", help_behavior_hint="(at least one)")]
+    """Flight logs to learn from."""
+    out: Path
+    """The folder of the report."""
+    model: OptionalPath = None
+    """The model to diagnose, .json; default: the nominal model."""
+    hold_out: Annotated[tuple[Path, ...], arg(metavar="LOG [LOG ...]", help_behavior_hint=NO_HINT)] = ()
+    """Logs to judge by and not to learn from; default: the last of every four blocks of the others."""
+
+    def run(self) -> None:
+        """Diagnose the model; write the report, the extended model and a recording."""
+        if not self.logs:
+            raise ValueError("LOG: found none, expected at least one flight log")
+        train, test = [load_log(path) for path in self.logs], [load_log(path) for path in self.hold_out]
+        logs = [*train, *test]
+        for one in logs:
+            check_plausible(one)
+        log = joined(logs)
+        held_out = np.arange(len(log)) >= sum(map(len, train)) if test else None
+        model = None if self.model is None else load_model(self.model)
+        found = diagnose(logs, model, held_out, ProgressBar("stages"))
+        written = write_diagnosis(self.out, found, log)
+        print(text_of_diagnosis(found))
+        recording = self.out / RECORDING_NAME
+        models = {"nominal": found.nominal, "extended": found.extended}
+        reason = write_flight_recording(recording, log, models, traces_of(found, log))
+        print_written([*written, *[recording] * (not reason)])
+        if reason:
+            print(f"{recording}: left out: {reason}")
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Write a script of flights that settle what a log could not show."""
+
+    diagnosis: Positional[Path]
+    """The diagnosis, diagnosis.json."""
+    out: Path
+    """The script, .npz, for `collect --script`."""
+    model: OptionalPath = None
+    """The model whose hovering thrust the flights start with, .json; default: the nominal model."""
+    seed: int = 0
+    """Seed of the flights."""
+
+    def run(self) -> None:
+        """Plan the flights, write their script and print what they are for."""
+        check_script_name(self.out)
+        model = nominal_parameters() if self.model is None else load_model(self.model)
+        found = next_flight(self.diagnosis, model, self.seed)
+        save_script(self.out, found.script)
+        print(found.describe())
+        print_written([self.out])
+
+
+Command = (
+    Annotated[Collect, subcommand("collect")]
+    | Annotated[Import, subcommand("import")]
+    | Annotated[Fit, subcommand("fit")]
+    | Annotated[Validate, subcommand("validate")]
+    | Annotated[Diagnose, subcommand("diagnose")]
+    | Annotated[Plan, subcommand("plan")]
+)
 
 
 def check_model_name(path: Path) -> None:
-    """Raise ModelFileError for a model's file that is not .json, lest a log is overwritten."""
+    """Raise ModelFileError for a model file that is not .json, lest a log is overwritten."""
     if path.suffix != ".json":
         raise ModelFileError(f"{path}: found suffix {path.suffix!r}, expected .json")
 
@@ -116,34 +284,18 @@ def fixed_values(pairs: Sequence[str]) -> dict[str, float]:
     return values
 
 
-def run_fit(arguments: argparse.Namespace) -> None:
-    """Identify a model and write it."""
-    check_model_name(arguments.out)  # before the work
-    fixed = fixed_values(arguments.fix)
-    start = None if arguments.start is None else load_model(arguments.start)
-    log = load_log(arguments.log)
-    found = fit(log, start, fixed, arguments.effect, arguments.hold_out_every, ProgressBar("rounds"))
-    provenance = found.provenance()
-    provenance["started_from"] = "nominal parameters" if start is None else Path(arguments.start).name
-    provenance["fixed"] = fixed
-    save_model(arguments.out, found.model, provenance)
-    print(found.describe())
-    print(f"written: {arguments.out}")
+def judged_rows(model_path: Path, log: FlightLog) -> tuple[np.ndarray | None, str]:
+    """Return the rows of a log that a model was not fitted to, (num_rows,) bool, and a note on them.
 
-
-def judged_rows(model_path: str | Path, log: FlightLog) -> tuple[Any, str]:
-    """Return the rows of a log that a model was not fitted to, (num_rows,) bool, and a sentence on them.
-
-    All rows of a log that the fit did not see, as its file's hash tells.
+    None stands for all rows: of a log whose hash is not that of the log which the model was fitted to.
 
     Raises:
-        ModelFileError: a model file whose split cannot be read.
+        ModelFileError: a model file whose split cannot be read, or a model fitted to the whole log.
     """
     provenance = load_provenance(model_path)
     data, split = provenance.get("data"), provenance.get("split")
     if not isinstance(data, dict) or data.get("sha256") != log.sha256:
-        names = Path(log.source).name, Path(model_path).name
-        return None, f"all rows are judged: {names[0]} is not what {names[1]} was fitted to"
+        return None, f"all rows are judged: {model_path.name} was not fitted to {Path(log.source).name}"
     every = split.get("held_out_every") if isinstance(split, dict) else None
     if not isinstance(every, int) or isinstance(every, bool) or every < 0 or every == 1:
         raise ModelFileError(f"{model_path}: split: held_out_every: found {every!r}, expected 0, 2, 3, ...")
@@ -152,115 +304,19 @@ def judged_rows(model_path: str | Path, log: FlightLog) -> tuple[Any, str]:
     return held_out_rows(log, every), f"held-out part: the last of every {every} blocks"
 
 
-def run_validate(arguments: argparse.Namespace) -> None:
-    """Judge a model on what it was not fitted to, and write the report."""
-    model = load_model(arguments.model)
-    log = load_log(arguments.log)
-    check_plausible(log)
-    rows, which = judged_rows(arguments.model, log)
-    found = validate(model, log, rows)
-    found = found._replace(notes=(which, *found.notes))
-    written = write_validation(arguments.out, found, Path(arguments.model).name, log)
-    print(text_of(found, Path(arguments.model).name, log))
-    print(f"written: {', '.join(str(path) for path in written)}")
-
-
-def run_diagnose(arguments: argparse.Namespace) -> None:
-    """Say what a model gets wrong about flights, and write the report and the extended model."""
-    learnt, judged = ([load_log(path) for path in paths] for paths in (arguments.logs, arguments.hold_out))
-    logs = [*learnt, *judged]
-    for one in logs:
-        check_plausible(one)
-    log = joined(logs)
-    count = sum(len(one) for one in learnt)
-    held_out = np.arange(len(log)) >= count if judged else None
-    model = None if arguments.model is None else load_model(arguments.model)
-    found = diagnose(logs, model, held_out, ProgressBar("stages"))
-    written = write_diagnosis(arguments.out, found, log)
-    print(text_of_diagnosis(found))
-    recording = arguments.out / RECORDING_NAME
-    models = {"nominal": found.nominal, "extended": found.extended}
-    reason = write_flight_recording(recording, log, models, traces_of(found, log))
-    print(f"written: {', '.join(str(path) for path in [*written, *[recording] * (not reason)])}")
-    if reason:
-        print(f"{recording}: left out: {reason}")
-
-
-def run_plan(arguments: argparse.Namespace) -> None:
-    """Write the script of what a diagnosis asks to fly, and say why."""
-    check_script_name(arguments.out)
-    model = nominal_parameters() if arguments.model is None else load_model(arguments.model)
-    found = next_flight(arguments.diagnosis, model, arguments.seed)
-    save_script(arguments.out, found.script)
-    print(found.describe())
-    print(f"written: {arguments.out}")
-
-
-def make_parser() -> argparse.ArgumentParser:
-    """Return the parser of the command."""
-    parser = argparse.ArgumentParser(prog="flytrack-sysid", description=__doc__)
-    commands = parser.add_subparsers(required=True, metavar="COMMAND")
-
-    one = commands.add_parser("collect", help="fly an excitation on a plant and write a flight log")
-    one.add_argument("--black-box", required=True, help="an acro_step.bin, or module:step with step(x, u)")
-    one.add_argument("--out", type=Path, required=True, help="the log, .npz or .csv")
-    either = one.add_mutually_exclusive_group()
-    either.add_argument("--minutes", type=float, default=2.0, help="of excitation; default: %(default)s")
-    either.add_argument("--script", type=Path, help="fly this instead, .npz, as from plan")
-    one.add_argument("--seed", type=int, default=0)
-    one.add_argument("--noise", type=float, default=0.0, help="0: the state itself; 1: common sensors")
-    one.set_defaults(run=run_collect)
-
-    one = commands.add_parser("import", help="turn logs of real flights into a flight log")
-    one.add_argument("files", type=Path, nargs="+", metavar="FILE")
-    one.add_argument("--format", required=True, choices=FORMATS)
-    one.add_argument("--map", metavar="MAPPING", help="a mapping file, .toml, or the name of a shipped one")
-    one.add_argument("--out", type=Path, required=True, help="the log, .npz or .csv")
-    one.add_argument("--model-out", type=Path, help="also write the nominal model of this craft, .json")
-    one.add_argument("--keep-clocks", action="store_true", help="report clock offsets, correct none")
-    one.set_defaults(run=run_import)
-
-    one = commands.add_parser("fit", help="identify a model from a flight log")
-    one.add_argument("log", type=Path)
-    one.add_argument("--out", type=Path, required=True, help="the model, .json")
-    one.add_argument("--fix", action="append", default=[], metavar="NAME=VALUE", help="hold a parameter")
-    one.add_argument("--from", dest="start", metavar="MODEL", help="start from this model's values")
-    one.add_argument("--effect", action="append", default=[], metavar="NAME", help="identify it too")
-    every = one.add_argument("--hold-out-every", type=int, default=HELD_OUT_EVERY, metavar="N")
-    every.help = "hold out the last of every N blocks, none if 0; default: %(default)s"
-    one.set_defaults(run=run_fit)
-
-    one = commands.add_parser("validate", help="judge a model on held-out flight")
-    one.add_argument("model", type=Path)
-    one.add_argument("log", type=Path)
-    one.add_argument("--out", type=Path, required=True, help="a folder for the report")
-    one.set_defaults(run=run_validate)
-
-    one = commands.add_parser("diagnose", help="name what a model gets wrong about flights")
-    one.add_argument("logs", type=Path, nargs="+", metavar="LOG")
-    one.add_argument("--model", help="what is held against the logs, .json; default: the nominal model")
-    hold_out = one.add_argument("--hold-out", type=Path, nargs="+", default=[], metavar="LOG")
-    hold_out.help = "logs to judge by and not to learn from; default: the last of every four blocks"
-    one.add_argument("--out", type=Path, required=True, help="a folder for the report")
-    one.set_defaults(run=run_diagnose)
-
-    one = commands.add_parser("plan", help="write a script of flights that settle what a log did not show")
-    one.add_argument("diagnosis", type=Path, help="diagnosis.json")
-    one.add_argument("--out", type=Path, required=True, help="the script, .npz, for collect --script")
-    one.add_argument("--model", type=Path, help="whose hovering thrust to begin with; default: nominal")
-    one.add_argument("--seed", type=int, default=0)
-    one.set_defaults(run=run_plan)
-    return parser
+def print_written(paths: Sequence[Path]) -> None:
+    """Print which files were written."""
+    print(f"written: {', '.join(map(str, paths))}")
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Run a command; what cannot be used is said in one line, with exit status 2."""
-    parser = make_parser()
-    parsed = parser.parse_args(arguments)
+    """Run a command; what it refuses ends with one line and exit status 2."""
+    command = tyro.cli(Command, prog=PROG, description=__doc__.partition("\n")[0], args=arguments)
     try:
-        parsed.run(parsed)
+        command.run()
     except (ValueError, OSError) as error:
-        parser.exit(2, f"flytrack-sysid: error: {error}\n")
+        print(f"{PROG}: error: {error}", file=sys.stderr)
+        raise SystemExit(2) from error
 
 
 if __name__ == "__main__":
