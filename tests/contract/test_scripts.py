@@ -227,4 +227,4 @@ def test_commands_plan_and_collect(tmp_path, capsys):
     assert load_log(log)["p"][:, 2].max() < HEIGHTS[0]
     with pytest.raises(SystemExit):
         main(["collect", "--black-box", "x", "--script", script, "--minutes", "3", "--out", str(log)])
-    assert "not allowed with argument" in capsys.readouterr().err
+    assert "not allowed together" in capsys.readouterr().err
