@@ -1,6 +1,6 @@
-"""The race as a recorded flight flew it: gates passed and when, laps, the gate that came next, how it ended.
+"""The race that a recorded flight flew: gates passed and when, laps, the gate to fly next, why it ended.
 
-A rollout holds states and actions, not the race; the race follows from the positions, by the environment's
+A rollout holds states and actions, not the race; the race follows from the positions by the environment's
 own rules.
 """
 
@@ -13,7 +13,7 @@ import numpy as np
 
 from flytrack_env.params import EnvParams
 from flytrack_env.quaternion import Vec3
-from flytrack_env.race import Race, advance_race, start_race
+from flytrack_env.race import Race, RaceEvents, advance_race, start_race
 from flytrack_env.state import POSITION, VELOCITY, unpack
 from flytrack_env.terminations import Causes, find_causes
 from flytrack_env.tracks import Course, GateFrame, Track, build_course, cross_gate
@@ -45,8 +45,8 @@ class FlownRace(NamedTuple):
 
     gate: index of the gate to fly next. gate_distance_m: to its centre. laps: completed. lap_start_s: time of
     the crossing that began the lap. lap_time_s: of the last complete lap, 0 if none. is_frame, is_miss:
-    whether the step from this state on touches the frame of the gate or misses it; of the last state's step
-    only where it is carried on. passes: in order.
+    whether the step from this state on touches the frame of the gate or misses it; for the last state only
+    where that step is extrapolated. passes: in order.
     """
 
     gate: np.ndarray
@@ -65,12 +65,12 @@ def follow_race(
     first_gate: int | None = None,
     last_vel_w: np.ndarray | None = None,
 ) -> FlownRace:
-    """Return the race that a flight at 100 Hz through these positions was; the rules of ``advance_race``.
+    """Return the race of a flight at 100 Hz through these positions, by the rules of ``advance_race``.
 
     positions: (T, 3), world, m, finite. first_gate: index of the gate to fly first; if None, gate 0 for a
     flight that begins near the track's start or passes no gate, else the one that it passes first.
     last_vel_w: (3,), m/s, of the last state: a rollout ends before its last step, often just before a gate,
-    and that step is carried on at this velocity, if it is finite.
+    and that step is extrapolated at this velocity, if it is finite.
 
     Raises:
         ValueError: a track without gates.
@@ -85,26 +85,25 @@ def follow_race(
         ahead_w = positions[-1] + STEP_S * np.asarray(last_vel_w, np.float32)
         positions = np.concatenate([positions, ahead_w[None]])
     num_steps = len(positions) - 1
-    followed = _follow(_padded(positions), np.int32(first_gate), course)
-    states, steps = jax.tree.map(np.asarray, followed)
-    states = _Followed(*(leaf[: num_steps + 1] for leaf in states))
-    steps = _Step(*(leaf[:num_steps] for leaf in steps))
-    centres = np.stack(course.gates.centre, axis=-1)[states.gate]
+    followed = jax.tree.map(np.asarray, _follow(_padded(positions), np.int32(first_gate), course))
+    races, events, fractions = followed
+    races = jax.tree.map(lambda leaf: leaf[: num_steps + 1], races)
+    distances_m = np.linalg.norm(positions - np.stack(races.gate.centre, axis=-1), axis=1)
     missing = (0, count - num_steps)  # the last state's step, where it is not known
     return FlownRace(
-        gate=states.gate[:count],
-        gate_distance_m=np.linalg.norm(positions - centres, axis=1)[:count],
-        laps=states.laps[:count],
-        lap_start_s=states.lap_start_s[:count],
-        lap_time_s=states.lap_time_s[:count],
-        is_frame=np.pad(steps.is_frame, missing),
-        is_miss=np.pad(steps.is_miss, missing),
-        passes=_passes(states, steps, positions, len(track.gates)),
+        gate=races.gate_index[:count],
+        gate_distance_m=distances_m[:count],
+        laps=races.laps[:count],
+        lap_start_s=races.lap_start_s[:count],
+        lap_time_s=races.lap_time_s[:count],
+        is_frame=np.pad(events.is_frame[:num_steps], missing),
+        is_miss=np.pad(events.is_miss[:num_steps], missing),
+        passes=_passes(races, fractions, positions, len(track.gates)),
     )
 
 
 def _first_gate(positions: np.ndarray, track: Track) -> int:
-    """Return the gate that a flight probably had to fly first."""
+    """Return the gate that a flight probably set out for."""
     if np.linalg.norm(positions[0] - track.start_position) < NEAR_START_M:
         return 0
     is_pass = gates_passed(positions, track)
@@ -121,15 +120,15 @@ def gates_passed(positions: np.ndarray, track: Track) -> np.ndarray:
 
 
 def _padded(positions: np.ndarray) -> np.ndarray:
-    """Return positions (T, 3) with the last repeated: who stands still passes nothing."""
+    """Return positions (T, 3) with the last repeated, which passes no gate."""
     padding = max(1, math.ceil((len(positions) - 1) / PADDED_TO)) * PADDED_TO - len(positions) + 1
     return np.concatenate([positions, np.repeat(positions[-1:], padding, axis=0)])
 
 
 def why_ended(states: np.ndarray, track: Track, race: FlownRace) -> str:
-    """Return why the flight ends after its last state, as far as that state tells.
+    """Return why the flight ended, as far as its last state tells.
 
-    A rollout's last row is the state before its last step; the step is carried on at the last velocity.
+    A rollout's last row is the state before its last step, which is extrapolated at the last velocity.
     states: (T, 21). race: as ``follow_race`` returns it for them with ``last_vel_w``.
     """
     causes = _causes(
@@ -147,28 +146,6 @@ def _causes(last: jax.Array, course: Course, is_frame: jax.Array, is_miss: jax.A
     return find_causes(unpack(last.at[POSITION].set(ahead_w)), course, is_frame, is_miss)
 
 
-class _Followed(NamedTuple):
-    """What is kept of the race at each state: scalars, or arrays (T,) of JAX or NumPy."""
-
-    gate: Any
-    laps: Any
-    lap_start_s: Any
-    lap_time_s: Any
-    gates_passed: Any
-
-
-class _Step(NamedTuple):
-    """What happened between two states; fractions: where the gate and the one behind it were crossed."""
-
-    is_frame: Any
-    is_miss: Any
-    fractions: Any
-
-
-def _kept(race: Race) -> _Followed:
-    return _Followed(race.gate_index, race.laps, race.lap_start_s, race.lap_time_s, race.gates_passed)
-
-
 @jax.jit
 def _passed(positions: jax.Array, course: Course) -> jax.Array:
     def passes(gate: GateFrame, start_w: jax.Array, end_w: jax.Array) -> jax.Array:
@@ -179,10 +156,15 @@ def _passed(positions: jax.Array, course: Course) -> jax.Array:
 
 
 @jax.jit
-def _follow(positions: jax.Array, first_gate: jax.Array, course: Course) -> tuple[_Followed, _Step]:
-    """Return the race at each state, and what happened between them."""
+def _follow(
+    positions: jax.Array, first_gate: jax.Array, course: Course
+) -> tuple[Race, RaceEvents, jax.Array]:
+    """Return the race at each state, leaves (T,), and of each step the events and where it crossed gates.
 
-    def one(race: Race, segment: tuple[jax.Array, ...]) -> tuple[Race, tuple[_Followed, _Step]]:
+    The fractions of a step, (T - 1, 2), are those at the gate and at the one behind it.
+    """
+
+    def one(race: Race, segment: tuple[jax.Array, ...]) -> tuple[Race, Any]:
         start_w, end_w = Vec3(*segment[0]), Vec3(*segment[1])
         first = cross_gate(race.gate, start_w, end_w, DRONE_RADIUS_M).fraction
         middle_w = start_w + (end_w - start_w).scale(first)
@@ -190,31 +172,30 @@ def _follow(positions: jax.Array, first_gate: jax.Array, course: Course) -> tupl
         fractions = jnp.stack([first, first + (1.0 - first) * second])
         start_time_s = segment[2] * STEP_S
         race, events = advance_race(race, start_w, end_w, start_time_s, STEP_S, course, DRONE_RADIUS_M)
-        return race, (_kept(race), _Step(events.is_frame, events.is_miss, fractions))
+        return race, (race, events, fractions)
 
-    begun = start_race(first_gate, course)
+    start = start_race(first_gate, course)
     indices = jnp.arange(len(positions) - 1)
-    _, (followed, steps) = jax.lax.scan(one, begun, (positions[:-1], positions[1:], indices))
-    joined = jax.tree.map(lambda first, rest: jnp.concatenate([first[None], rest]), _kept(begun), followed)
-    return joined, steps
+    _, (races, events, fractions) = jax.lax.scan(one, start, (positions[:-1], positions[1:], indices))
+    return jax.tree.map(lambda one, rest: jnp.concatenate([one[None], rest]), start, races), events, fractions
 
 
-def _passes(states: _Followed, steps: _Step, positions: np.ndarray, num_gates: int) -> tuple[Pass, ...]:
+def _passes(races: Race, fractions: np.ndarray, positions: np.ndarray, num_gates: int) -> tuple[Pass, ...]:
     """Return the gates passed, in order; of two in one step each has its own time and place."""
     found = []
-    for step in np.flatnonzero(np.diff(states.gates_passed)):
-        before = int(states.gates_passed[step])
-        for nth in range(int(states.gates_passed[step + 1]) - before):
-            fraction = float(steps.fractions[step, nth])
+    for step in np.flatnonzero(np.diff(races.gates_passed)):
+        before = int(races.gates_passed[step])
+        for nth in range(int(races.gates_passed[step + 1]) - before):
+            fraction = float(fractions[step, nth])
             is_lap = (before + nth + 1) % num_gates == 0
             found.append(
                 Pass(
                     row=int(step) + 1,
                     time_s=(float(step) + fraction) * STEP_S,
-                    gate=int((states.gate[step] + nth) % num_gates),
+                    gate=int((races.gate_index[step] + nth) % num_gates),
                     pos_w=positions[step] + fraction * (positions[step + 1] - positions[step]),
-                    lap=int(states.laps[step + 1]) if is_lap else 0,
-                    lap_time_s=float(states.lap_time_s[step + 1]) if is_lap else 0.0,
+                    lap=int(races.laps[step + 1]) if is_lap else 0,
+                    lap_time_s=float(races.lap_time_s[step + 1]) if is_lap else 0.0,
                 )
             )
     return tuple(found)

@@ -36,7 +36,7 @@ def test_ghost_passes_every_gate_at_the_times_of_its_references():
 
 
 class Recorded(Plant):
-    """A plant that moves the drone along recorded states (T, 21), whatever it is told."""
+    """A plant that moves the drone along recorded states (T, 21), whatever is commanded."""
 
     def __init__(self, states: np.ndarray):
         self.states = jnp.asarray(states, jnp.float32)
@@ -65,7 +65,7 @@ def fly_recorded(states: np.ndarray, first_gate: int) -> tuple[Any, Any]:
     return jax.tree.map(lambda a, b: np.append(a, b), begun.race, races), jax.device_get(causes)
 
 
-@pytest.mark.parametrize("shift", [0.0, 0.5, 0.9, 2.0])
+@pytest.mark.parametrize("shift", [0.0, 0.9, 2.0])
 def test_race_is_the_environments_number_by_number(shift):
     """Flown aside by up to 2 m: gates are passed, touched and missed."""
     states, _ = ghost_rollout(REFERENCES, 900)
@@ -90,7 +90,7 @@ def test_flight_is_followed_from_the_gate_that_it_passes_first():
     assert found.gate[0] == 4
 
 
-def test_step_after_the_last_state_is_carried_on():
+def test_step_after_the_last_state_is_extrapolated():
     """A rollout of complete laps ends before the step that completes the last one."""
     states, _ = ghost_rollout(REFERENCES, 900)
     whole = follow_race(states[:, POSITION], TRACK)
@@ -105,17 +105,13 @@ def test_step_after_the_last_state_is_carried_on():
         np.testing.assert_array_equal(one, other)
 
 
-def test_flight_that_passes_nothing_has_the_first_gate_ahead():
-    found = follow_race(np.zeros((5, 3)), TRACK)
-    assert found.passes == () and set(found.gate) == {0} and set(found.laps) == {0}
-    distance = np.linalg.norm(TRACK.gates[0].position)
-    np.testing.assert_allclose(found.gate_distance_m, distance, rtol=1e-6)
-
-
-@pytest.mark.parametrize("length", [1, 2, PADDED_TO, PADDED_TO + 1, PADDED_TO + 2])
+@pytest.mark.parametrize("length", [1, PADDED_TO + 1, PADDED_TO + 2])
 def test_padding_is_not_seen(length):
     found = follow_race(np.zeros((length, 3)), TRACK)
     assert {len(leaf) for leaf in found[:5]} == {length}
+    assert found.passes == () and set(found.gate) == {0} and set(found.laps) == {0}
+    distance = np.linalg.norm(TRACK.gates[0].position)
+    np.testing.assert_allclose(found.gate_distance_m, distance, rtol=1e-6)
 
 
 def test_track_without_gates_is_refused():
@@ -140,8 +136,8 @@ ENDS = {  # the first gate, at (12.5, 2, 1.35), is flown towards -x
 
 
 @pytest.mark.parametrize("end", ENDS)
-def test_end_is_told_as_the_environment_does(end):
-    """Cut where the environment ends a flight, the last state tells why."""
+def test_end_is_the_environments(end):
+    """The last state before the environment ends a flight shows why."""
     states = straight(*ENDS[end])
     _, causes = fly_recorded(states, 0)
     last = int(np.argmax(np.any(list(causes), axis=0)))
@@ -187,15 +183,11 @@ def test_two_gates_in_one_step_each_have_their_time_and_end(shift_m, end):
     np.testing.assert_allclose([one.pos_w[0] for one in race.passes], [2.0, 2.1][: len(times_s)], atol=1e-5)
 
 
-def test_velocity_that_is_not_known_ends_nothing():
-    states, _ = ghost_rollout(REFERENCES, 50)
-    states[:, VELOCITY] = np.nan
-    race = follow_race(states[:, POSITION], TRACK, last_vel_w=states[-1, VELOCITY])
-    assert why_ended(states, TRACK, race) == "all steps flown"
-
-
 def test_flight_that_goes_on_ended_when_its_steps_did():
     states, _ = ghost_rollout(REFERENCES, 100)
     assert why_ended(states, TRACK, follow_race(states[:, POSITION], TRACK)) == "all steps flown"
     states[-1, BATTERY] = 21.9
     assert why_ended(states, TRACK, follow_race(states[:, POSITION], TRACK)) == "battery empty"
+    states[:, BATTERY], states[:, VELOCITY] = 24.0, np.nan  # an unknown velocity ends nothing
+    race = follow_race(states[:, POSITION], TRACK, last_vel_w=states[-1, VELOCITY])
+    assert why_ended(states, TRACK, race) == "all steps flown"

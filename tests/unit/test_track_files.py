@@ -14,8 +14,12 @@ from hypothesis import strategies as st
 
 from benchmarks.reliability.strangers.trees import as_toml
 from flytrack_env import toml_file
-from flytrack_env.references import ReferenceFileError, shipped_reference, shipped_references
-from flytrack_env.references.ghost import is_model_of
+from flytrack_env.references import (
+    ReferenceFileError,
+    is_model_of,
+    shipped_reference,
+    shipped_references,
+)
 from flytrack_env.tracks import Track, TrackError, build_course, load_track, save_track
 
 GATE: dict[str, Any] = {"id": 7, "direction": "+y", "opening": 1.5, "frame": 2.7}
