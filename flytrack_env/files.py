@@ -1,6 +1,4 @@
-"""Reading no more of a file than it may have; writing so that nothing is lost: a reader sees the old file or
-the whole new one.
-"""
+"""Reading files of bounded size, and writing them atomically: a reader sees the old file or the new one."""
 
 import io
 import itertools

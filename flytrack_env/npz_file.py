@@ -1,6 +1,4 @@
-"""Reading ``.npz`` files of others: nothing is unpickled, and what they announce is checked before it is
-made room for.
-"""
+"""Reading ``.npz`` files: nothing is unpickled, and sizes are checked before memory is allocated."""
 
 import contextlib
 import io

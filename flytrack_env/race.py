@@ -62,8 +62,7 @@ def look_up_gates(race: Race, course: Course) -> Race:
 
 
 def _count_pass(race: Race, is_pass: jax.Array, time_s: Scalar, course: Course) -> tuple[Race, jax.Array]:
-    """Return the race after a possible pass at a time, its gate frames not yet moved on; and whether
-    the pass completed a lap."""
+    """Return the race after a possible pass, its gate frames not yet moved on, and whether a lap ended."""
     gates_passed = race.gates_passed + is_pass
     is_lap = is_pass & (gates_passed == (race.laps + 1) * course.num_gates)
     counted = race._replace(

@@ -60,7 +60,6 @@ def replay(model: ModelParameters, record: Record, turns_afresh: jax.Array | np.
     turns_afresh: (num_rows,) bool, where the attitude is taken from the log again. In float64 where the
     arguments are, inside of ``jax.enable_x64(True)``.
     """
-
     record = jax.tree.map(jnp.asarray, record)
     applied, rates_b, memories = _remembered(model, record)
 

@@ -69,8 +69,10 @@ def _by_channel(errors: np.ndarray, scales: np.ndarray, problem: Problem) -> dic
 
 
 def _positions(model: ModelParameters, log: FlightLog, rows: np.ndarray) -> dict[str, float]:
-    """Return rms position errors of free flight, m, by horizon; a model has all effects, so that one program
-    flies every one."""
+    """Return rms position errors of free flight, m, by horizon.
+
+    A model has all effects, so that one program flies every one.
+    """
     if not {"p", "v", "q"} <= set(log.channels):
         return {}
     filled = fill_gaps(log)
