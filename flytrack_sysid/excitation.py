@@ -50,7 +50,7 @@ FAST_STEPS, SLOW_STEPS = (3, 12), (15, 40)
 RESERVE_V = 0.1
 
 
-class Flight(NamedTuple):
+class ScriptedFlight(NamedTuple):
     """One flight: kind, start (21,) and commands (FLIGHT_STEPS, 4), before anything is clipped."""
 
     kind: str
@@ -113,27 +113,27 @@ def _axis_command(axis: int, turn: int, number: int, hover: float, rng: np.rando
 
 def _flight(
     kind: str, turn: int, number: int, voltage: float, hover: float, rng: np.random.Generator
-) -> Flight:
+) -> ScriptedFlight:
     """Return one flight of a kind; ``number`` counts within the four of its turn."""
     if kind in KINDS[:3]:
         start = start_state(rng, voltage, hover, 0.0, 0.0)
-        return Flight(kind, start, _axis_command(KINDS.index(kind), turn, number, hover, rng))
+        return ScriptedFlight(kind, start, _axis_command(KINDS.index(kind), turn, number, hover, rng))
     command = np.tile([0.0, 0.0, 0.0, hover], (FLIGHT_STEPS, 1))
     if kind == "thrust":
         name = ("sine", "step", "doublet", "chirp")[number]
         command[:, 3] = np.append(wave(name, rng), switching(rng, 0.5, SLOW_STEPS)[SLOT_STEPS:])
-        return Flight(kind, start_state(rng, voltage, hover, rng.uniform(0.0, 20.0), 0.0), command)
+        return ScriptedFlight(kind, start_state(rng, voltage, hover, rng.uniform(0.0, 20.0), 0.0), command)
     command[:, 2] = switching(rng)
     if kind == "free":
         amplitude = FREE_AMPLITUDES[number]
         command[:, :2] = amplitude * np.stack([switching(rng), switching(rng)], axis=1)
         command[:, 3] = switching(rng, smallest=0.0)
-        return Flight(kind, start_state(rng, voltage, hover, rng.uniform(20.0, 80.0), 0.0), command)
+        return ScriptedFlight(kind, start_state(rng, voltage, hover, rng.uniform(20.0, 80.0), 0.0), command)
     time = np.arange(FLIGHT_STEPS) * DT_S
     slow = [np.sin(2 * np.pi * rng.uniform(0.5, 1.5) * time + rng.uniform(0, 2 * np.pi)) for _ in range(3)]
     command[:, :2] = LEG_STICK * np.stack(slow[:2], axis=1)
     command[:, 3] += LEG_SWING * slow[2]
-    return Flight(
+    return ScriptedFlight(
         kind, start_state(rng, voltage, hover, rng.uniform(10.0, 50.0), LEG_SPEEDS[number]), command
     )
 
@@ -153,7 +153,7 @@ def _voltages(kind: str, turns: int, rng: np.random.Generator) -> np.ndarray:
     return np.column_stack([others, rng.permutation(levels[last])])
 
 
-def script(num_flights: int, hover: float, rng: np.random.Generator) -> list[Flight]:
+def script(num_flights: int, hover: float, rng: np.random.Generator) -> list[ScriptedFlight]:
     """Return the flights of an excitation; ``hover`` is the thrust action that holds the weight."""
     turns = -(-num_flights // (FLIGHTS_PER_KIND * len(KINDS)))
     voltages = {kind: _voltages(kind, turns, rng) for kind in KINDS}

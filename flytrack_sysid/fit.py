@@ -1,4 +1,4 @@
-"""Identifying a model from a flight log: lags, thrust map, drain, and effects that are asked for."""
+"""Identification of a model from a flight log: lags, thrust map, battery drain, and chosen effects."""
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
@@ -6,13 +6,13 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from scipy import signal
 
 from flytrack_env import __version__
 from flytrack_env.dynamics import ModelParameters, collective_thrust, nominal_parameters
 from flytrack_env.state import BATTERY_EMPTY_V, BATTERY_FULL_V
 from flytrack_sysid.estimate import Estimate, FitError, estimate
-from flytrack_sysid.fit_checks import check_answer, check_data, check_result
-from flytrack_sysid.log import FlightLog
+from flytrack_sysid.log import CHANNELS, FlightLog, usual_step
 from flytrack_sysid.parameters import (
     DRAIN,
     TAU_BOUNDS,
@@ -36,6 +36,10 @@ TWO_SIDED_95 = 1.959964  # standard deviations of a normal distribution
 # What makes a warning: half the width of the 95 % interval, relative to a time constant, to full thrust.
 UNCERTAIN_TAU, UNCERTAIN_THRUST = 0.2, 0.02
 BOX_ACTIONS, BOX_VOLTAGES = 41, 9
+NEVER_MOVED = 1e-3  # of a stick's travel from -1 to 1
+LEAST_RESPONSE = 0.1  # correlation of a rate with its lagged command; chance gives less in a minute of noise
+AT_BOUND = 1.01
+AT_END = 1e-3  # of the range of an effect's parameter
 
 
 class Interval(NamedTuple):
@@ -46,8 +50,8 @@ class Interval(NamedTuple):
     high: float
 
 
-class MapDoubt(NamedTuple):
-    """Where the thrust map is known worst: half the 95 % interval, N, and as a share of full thrust."""
+class MapUncertainty(NamedTuple):
+    """The largest uncertainty of the thrust map: half the 95 % interval, N, and as a share of full thrust."""
 
     half_width_n: float
     share: float
@@ -59,16 +63,16 @@ class MapDoubt(NamedTuple):
 class Fit:
     """An identified model.
 
-    model: float32, as the environment takes it. estimate: the same in float64, with covariance and what is
-    left of each channel. intervals: by name. map_doubt: None where the thrust map was not fitted.
-    warnings: what the data do not determine; sentences. every: which part was held out
-    (``flytrack_sysid.split``), 0 for none. source, sha256: of the log, the hash of what it holds.
+    model: float32, as the environment takes it. estimate: the same in float64, with covariance and residuals
+    of each channel. intervals: by name. map_uncertainty: None where the thrust map was not fitted.
+    warnings: sentences on what the data do not determine. every: which part was held out
+    (``flytrack_sysid.split``), 0 for none. source, sha256: of the log, and the hash of its content.
     """
 
     model: ModelParameters
     estimate: Estimate
     intervals: Mapping[str, Interval]
-    map_doubt: MapDoubt | None
+    map_uncertainty: MapUncertainty | None
     warnings: tuple[str, ...]
     every: int
     source: str
@@ -94,7 +98,7 @@ class Fit:
                 "of": names,
                 "matrix": np.round(self.estimate.covariance / np.where(scale > 0.0, scale, 1.0), 4).tolist(),
             },
-            "thrust_map_worst": None if self.map_doubt is None else self.map_doubt._asdict(),
+            "thrust_map_worst": None if self.map_uncertainty is None else self.map_uncertainty._asdict(),
             "left_rms": {name: left.tolist() for name, left in self.estimate.noise.items()},
             "warnings": list(self.warnings),
         }
@@ -104,8 +108,8 @@ class Fit:
         lines = [f"{'parameter':28} {'estimate':>12} {'95 % interval':>27}  unit"]
         for name, (value, low, high) in self.intervals.items():
             lines.append(f"{name:28} {value:12.6g} {low:12.6g} to {high:11.6g}  {unit_of(name)}")
-        if self.map_doubt is not None:
-            worst = self.map_doubt
+        if self.map_uncertainty is not None:
+            worst = self.map_uncertainty
             lines.append(
                 f"thrust map: known to {worst.half_width_n:.3g} N ({worst.share:.2%} of full thrust) or "
                 f"better; worst at action {worst.action:.2g}, {worst.battery_v:.3g} V"
@@ -115,7 +119,7 @@ class Fit:
 
 
 def _free_names(model: ModelParameters, log: FlightLog, fixed: Mapping[str, float]) -> tuple[str, ...]:
-    """Return what is estimated: lags, thrust map, drain and effects, as far as the log has channels."""
+    """Return what is estimated: lags, thrust map, drain and effects, as far as the log has the channels."""
     names = names_of(model)
     unknown = [name for name in fixed if name not in names]
     if unknown:
@@ -143,8 +147,8 @@ def _intervals(result: Estimate) -> dict[str, Interval]:
     return found
 
 
-def _map_doubt(result: Estimate, log: FlightLog) -> MapDoubt | None:
-    """Return where the thrust map is known worst, over all actions and 22 to 24 V, or the log's own range."""
+def _map_uncertainty(result: Estimate, log: FlightLog) -> MapUncertainty | None:
+    """Return the largest uncertainty over all actions and 22 to 24 V, or the log's own voltages."""
     where = [index for index, name in enumerate(result.free) if name in THRUST_COEFFS]
     if not where:
         return None
@@ -161,24 +165,27 @@ def _map_doubt(result: Estimate, log: FlightLog) -> MapDoubt | None:
     full = np.abs(collective_thrust(action, battery_v, coeffs)).max()
     worst = np.unravel_index(np.argmax(half), half.shape)
     width = float(half[worst])
-    return MapDoubt(width, width / float(full), float(action[worst]), float(battery_v[worst]))
+    return MapUncertainty(width, width / float(full), float(action[worst]), float(battery_v[worst]))
 
 
-def _warnings(fit_intervals: Mapping[str, Interval], doubt: MapDoubt | None, log: FlightLog) -> list[str]:
+def _warnings(
+    intervals: Mapping[str, Interval], uncertainty: MapUncertainty | None, log: FlightLog
+) -> list[str]:
     """Return what the data do not determine."""
     found = []
-    for name, (value, low, high) in fit_intervals.items():
+    for name, (value, low, high) in intervals.items():
         if name in TAUS and 0.5 * (high - low) > UNCERTAIN_TAU * value:
             found.append(f"{name} is not determined by the data: {low:.3g} to {high:.3g} s")
         elif "." in name and low <= (neutral := neutral_value(name)) <= high:
             found.append(f"{name} cannot be told from {neutral:g}: {low:.3g} to {high:.3g} {unit_of(name)}")
-    if doubt is not None and doubt.share > UNCERTAIN_THRUST:
+    if uncertainty is not None and uncertainty.share > UNCERTAIN_THRUST:
+        half_width_n, share, action, battery_v = uncertainty
         thrust = log["u"][:, 3]
         volts = f" at {log['v_bat'].min():.4g} to {log['v_bat'].max():.4g} V" if "v_bat" in log else ""
         found.append(
-            f"the thrust map is not determined by the data everywhere: +-{doubt.half_width_n:.3g} N "
-            f"({doubt.share:.0%} of full thrust) at action {doubt.action:.2g}, {doubt.battery_v:.4g} V; the "
-            f"log commands {thrust.min():.2g} to {thrust.max():.2g}{volts}"
+            f"the thrust map is not determined by the data everywhere: +-{half_width_n:.3g} N "
+            f"({share:.0%} of full thrust) at action {action:.2g}, {battery_v:.4g} V; the log commands "
+            f"{thrust.min():.2g} to {thrust.max():.2g}{volts}"
         )
     if "v_bat" not in log:
         found.append(
@@ -196,16 +203,16 @@ def fit(
     every: int = HELD_OUT_EVERY,
     report: Callable[[int, int], None] = lambda done, rounds: None,
 ) -> Fit:
-    """Identify lags, thrust map and battery drain from a log; mass, gravity, full-stick rates are given.
+    """Identify lags, thrust map and battery drain from a log; mass, gravity and full-stick rates are given.
 
-    start: where the search starts, and what is taken for granted; nominal if None. fixed: values of
-    parameters that are not estimated, by name (``tau_yaw``, ``c4``, ``max_rate_roll``, ``m``,
-    ``linear_drag.d_x``, ...). effects: names of effects whose parameters are estimated too. every: which
-    rows are held out (``flytrack_sysid.split``), 0 for none. report: called with rounds done and in all.
+    start: initial values, also of what is not estimated; nominal if None. fixed: values of parameters that
+    are not estimated, by name (``tau_yaw``, ``c4``, ``max_rate_roll``, ``m``, ``linear_drag.d_x``, ...).
+    effects: names of effects whose parameters are estimated too. every: which rows are held out
+    (``flytrack_sysid.split``), 0 for none. report: called with the rounds done and in all.
 
     Raises:
-        LogError: a log that looks wrong (``flytrack_sysid.plausibility``).
-        FitError: channels or motion are missing, an unknown name, a fit that diverged.
+        LogError: an implausible log (``flytrack_sysid.plausibility``).
+        FitError: missing channels or motion, an unknown name, or a fit that diverged.
     """
     fixed = dict(fixed or {})
     check_plausible(log)
@@ -216,22 +223,86 @@ def fit(
     free = _free_names(model, log, fixed)
     model = with_values(model, fixed)
     judged = ~held_out_rows(log, every)
-    check_data(log, judged, free)
-    check_answer(log, model)
+    _check_data(log, judged, free)
+    _check_response(log, model)
     try:
         result = estimate(log, judged, model, free, report)
     except FitError as error:
         raise FitError(f"{log.source}: {error}") from error
-    check_result(result, log)
+    _check_result(result, log)
     intervals = _intervals(result)
-    doubt = _map_doubt(result, log)
+    uncertainty = _map_uncertainty(result, log)
     return Fit(
         model=as_float32(from_vector(to_vector(result.model), result.model)),
         estimate=result,
         intervals=intervals,
-        map_doubt=doubt,
-        warnings=tuple(_warnings(intervals, doubt, log)),
+        map_uncertainty=uncertainty,
+        warnings=tuple(_warnings(intervals, uncertainty, log)),
         every=every,
         source=log.source,
         sha256=log.sha256,
     )
+
+
+def _check_data(log: FlightLog, judged: np.ndarray, free: tuple[str, ...]) -> None:
+    """Raise FitError where the log lacks channels or motion to estimate the free parameters."""
+    if not free:
+        raise FitError("fixed: found every parameter, expected one to estimate at least")
+    has_turns = "w" in log or "q" in log
+    if not has_turns and any(name in free for name in TAUS[:3]):
+        raise FitError(f"{log.source}: w and q are absent; the lags of the body rates need one of them")
+    has_forces = "f" in log or ("q" in log and any(name in log for name in ("a", "v", "p")))
+    if not has_forces and any(name in free for name in (TAUS[3], *THRUST_COEFFS)):
+        raise FitError(
+            f"{log.source}: thrust needs f, or q with one of a, v and p; found {', '.join(log.channels)}"
+        )
+    for axis, (column, tau) in enumerate(zip(CHANNELS["u"], TAUS, strict=True)):
+        stick = log["u"][judged, axis]
+        if tau in free and np.ptp(stick) < NEVER_MOVED:
+            raise FitError(
+                f"{log.source}: {column}: stuck at {stick[0]:.4g}; {tau} cannot be identified: move "
+                f"it, or fix {tau}"
+            )
+
+
+def _check_response(log: FlightLog, start: ModelParameters) -> None:
+    """Raise FitError where no body rate follows its command: motors off, on the ground, another log."""
+    if "w" not in log:
+        return
+    answers = []
+    for axis, keep in enumerate(np.exp(-usual_step(log)[0] / np.asarray(start.tau, float)[:3])):
+        expected = signal.lfilter([1.0 - keep], [1.0, -keep], log["u"][:, axis])
+        if np.ptp(expected) > NEVER_MOVED and np.ptp(log["w"][:, axis]) > 0.0:
+            answers.append(abs(np.corrcoef(expected, log["w"][:, axis])[0, 1]))
+    if answers and max(answers) < LEAST_RESPONSE:
+        raise FitError(
+            f"{log.source}: w: found no body rate that follows its command (correlation at most "
+            f"{max(answers):.2g}), expected a drone in flight; is it motionless?"
+        )
+
+
+def _check_result(result: Estimate, log: FlightLog) -> None:
+    """Raise FitError where the best model is no model of a drone."""
+    values = dict(zip(names_of(result.model), to_vector(result.model), strict=True))
+    for name in TAUS:
+        if name in result.free and not TAU_BOUNDS.low * AT_BOUND < values[name] < TAU_BOUNDS.high / AT_BOUND:
+            raise FitError(
+                f"{log.source}: {name}: the fit ended at {values[name]:.3g} s, expected {TAU_BOUNDS.low} to "
+                f"{TAU_BOUNDS.high} s; does {CHANNELS['u'][TAUS.index(name)]} drive this drone?"
+            )
+    for name in (name for name in result.free if "." in name):
+        low, high = bounds_of(name)
+        ends = [end for end in (low, high) if end != neutral_value(name)]
+        if np.isclose(values[name], ends, rtol=0.0, atol=AT_END * (high - low)).any():
+            raise FitError(
+                f"{log.source}: {name}: the fit ended at {values[name]:.3g} {unit_of(name)}, expected it "
+                f"within {low:g} to {high:g}"
+            )
+    if "w" in result.noise:
+        for axis, column in enumerate(CHANNELS["w"]):
+            left, measured = result.noise["w"][axis], result.measured["w"][axis]
+            if TAUS[axis] in result.free and left > AT_BOUND * measured:
+                raise FitError(
+                    f"{log.source}: {column}: the model leaves more ({left:.3g} rad/s rms) than was measured "
+                    f"({measured:.3g}); do sign and order of {CHANNELS['u'][axis]} and {column} agree?"
+                )

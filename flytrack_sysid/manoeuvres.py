@@ -33,7 +33,7 @@ from flytrack_sysid.excitation import (
     RESERVE_V,
     SLOT_STEPS,
     SLOW_STEPS,
-    Flight,
+    ScriptedFlight,
     switching,
     wave,
 )
@@ -196,7 +196,7 @@ def hover_action(model: ModelParameters, voltages: tuple[float, float] = VOLTAGE
 
 def flights_of(
     names: Iterable[str], hover: float, seed: int = 0, voltages: tuple[float, float] = VOLTAGES
-) -> list[Flight]:
+) -> list[ScriptedFlight]:
     """Return the flights of manoeuvres, eight of each, in the order of the names.
 
     hover: the thrust action that holds the weight. The flights of a manoeuvre do not depend on the others.
@@ -212,5 +212,5 @@ def flights_of(
         for number in range(FLIGHTS_PER_MANOEUVRE):
             start, command = manoeuvre.flight(number, hover, rng)
             start[BATTERY] = np.interp(start[BATTERY], VOLTAGES, voltages)
-            flights.append(Flight(name, start, np.clip(command, -1.0, 1.0)))
+            flights.append(ScriptedFlight(name, start, np.clip(command, -1.0, 1.0)))
     return flights

@@ -8,11 +8,10 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from flytrack_sysid.forces import OpenForce
+from flytrack_sysid.forces import OpenForce, ThrustError
 from flytrack_sysid.one_step import UNITS, OneStep
 from flytrack_sysid.open_loop import QUANTITIES, Rollout
 from flytrack_sysid.steps import AXES, StepResponse
-from flytrack_sysid.thrust import ThrustError
 from flytrack_sysid.validate import NAMES, Validation
 
 DPI = 150

@@ -21,7 +21,7 @@ from flytrack_env.messages import error_text, quote_name, quote_value
 from flytrack_env.npz_file import open_npz
 from flytrack_env.state import ACTION_SIZE, APPLIED_ACTION, QUATERNION, STATE_SIZE
 from flytrack_sysid.envelope import ANY_VOLTAGE, FEWEST_STEPS, LARGEST_SPEED, SCRIPT_HEIGHTS, is_inside
-from flytrack_sysid.excitation import Flight
+from flytrack_sysid.excitation import ScriptedFlight
 from flytrack_sysid.manoeuvres import MANOEUVRES
 
 SUFFIX = ".npz"
@@ -44,7 +44,7 @@ class Script(NamedTuple):
     commands: np.ndarray
 
 
-def script_of(flights: Iterable[Flight]) -> Script:
+def script_of(flights: Iterable[ScriptedFlight]) -> Script:
     """Return the script of flights of equal length."""
     kinds, starts, commands = zip(*flights, strict=True)
     return Script(tuple(kinds), np.stack(starts).astype(float), np.stack(commands).astype(float))

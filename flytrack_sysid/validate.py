@@ -1,18 +1,17 @@
-"""How well a model predicts a flight log, and what it leaves open."""
+"""Validation: how well a model predicts a flight log, and the forces that it does not explain."""
 
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from flytrack_env.dynamics import ModelParameters
-from flytrack_sysid.forces import OpenForce, force_samples, open_force
+from flytrack_sysid.forces import OpenForce, ThrustError, force_samples, open_force, thrust_error
 from flytrack_sysid.log import FlightLog
 from flytrack_sysid.one_step import OneStep, one_step_errors
 from flytrack_sysid.open_loop import Rollout, rollout_errors
 from flytrack_sysid.prediction import Prediction, inputs_that_lack, predict
 from flytrack_sysid.record import BATTERY_UNKNOWN_V, fill_gaps
 from flytrack_sysid.steps import HELD_AFTER_S, HELD_BEFORE_S, LEAST_JUMP, StepResponse, step_responses
-from flytrack_sysid.thrust import ThrustError, thrust_error
 
 NAMES = {
     "p": "position",
@@ -28,9 +27,9 @@ class Validation(NamedTuple):
     """Errors of a model on the judged rows of a log.
 
     num_rows, num_judged: rows of the log, and those that were judged. one_step: errors of single steps.
-    rollouts: of free flight, by its length. steps: answers to commanded steps.
-    notes: what could not be judged and why, and what was assumed; sentences.
-    thrust, open_force: None where the log cannot tell.
+    rollouts: errors of free flight, by its length. steps: responses to commanded steps.
+    notes: sentences on what could not be judged and why, and on what was assumed.
+    thrust, open_force: None where the log has no measurement of them.
     """
 
     num_rows: int
@@ -44,17 +43,14 @@ class Validation(NamedTuple):
 
     def as_json(self) -> dict[str, Any]:
         """Return the numbers as JSON values; what could not be judged is absent, and in the notes."""
-        parts = {
-            "thrust": self.thrust and self.thrust.as_json(),
-            "open_force": self.open_force and self.open_force.as_json(),
-        }
+        parts = {"thrust": self.thrust, "open_force": self.open_force}
         return _finite(
             {
                 "rows": self.num_rows,
                 "judged_rows": self.num_judged,
                 "one_step": self.one_step.as_json(),
                 "rollouts": [rollout.as_json() for rollout in self.rollouts],
-                **{name: part for name, part in parts.items() if part is not None},
+                **{name: part.as_json() for name, part in parts.items() if part is not None},
                 "steps": [step.as_json() for step in self.steps],
                 "notes": list(self.notes),
             }
@@ -62,7 +58,7 @@ class Validation(NamedTuple):
 
 
 def _finite(value: Any) -> Any:
-    """Return JSON values with null for what is not finite: a model that ran away."""
+    """Return JSON values with null for numbers that are not finite: empty bins, a model that diverged."""
     if isinstance(value, dict):
         return {name: _finite(item) for name, item in value.items()}
     if isinstance(value, list):
@@ -82,17 +78,17 @@ def _notes_of(model: ModelParameters, log: FlightLog, prediction: Prediction) ->
     if "a" not in log and "f" not in log:
         notes.append("acceleration (a) and specific force (f): not in the log")
     if "v_bat" not in log and np.any(np.asarray(model.thrust_coeffs)[4:]):
-        notes.append(f"battery (v_bat): not in the log; {BATTERY_UNKNOWN_V:g} V is taken for thrust")
+        notes.append(f"battery (v_bat): not in the log; {BATTERY_UNKNOWN_V:g} V is assumed for thrust")
     if prediction.applied_from == "lag":
         notes.append(
-            "applied action (uprev): not in the log; it follows the commands by the model's own lags, as if "
-            "the first command of a segment had been held before"
+            "applied action (uprev): not in the log; computed from the commands by the model's own lags, as "
+            "if the first command of a segment had been held before"
         )
     if not prediction.is_settled.all():
         count = int(np.sum(~prediction.is_settled))
         notes.append(
-            f"{count} rows after a segment's start or lost commands begin no judged step or flight: the "
-            "applied action, or what the model's effects remember, is not known there"
+            f"{count} rows after a segment's start or lost commands start no judged step or flight: the "
+            "applied action, or the memory of the model's effects, is not known there"
         )
     return notes
 
@@ -100,12 +96,12 @@ def _notes_of(model: ModelParameters, log: FlightLog, prediction: Prediction) ->
 def _forces(
     model: ModelParameters, log: FlightLog, prediction: Prediction, rows: np.ndarray
 ) -> tuple[ThrustError | None, OpenForce | None, list[str]]:
-    """Return the error of thrust, the force left open, and notes on what the log cannot tell of them."""
+    """Return the error of thrust, the unexplained force, and notes on what of them cannot be judged."""
     thrust = left = None
     samples = force_samples(model, log, prediction, rows)
     if samples is None:
-        why = "no judged step has f, a or v that the model can be held to"
-        return None, None, [f"thrust and force left open: {why}"]
+        why = "no judged step has f, a or v to compare the model with"
+        return None, None, [f"thrust and unexplained force: {why}"]
     notes = []
     if "v_bat" in log:
         thrust = thrust_error(model, samples, prediction.steps.median)
@@ -114,15 +110,15 @@ def _forces(
     if samples.source != "v" and "v" in log and "q" in log:
         left = open_force(log, prediction, samples)
     else:
-        notes.append("force left open by speed: it needs v, q, and a or f")
+        notes.append("unexplained force by speed: it needs v, q, and a or f")
     return thrust, left, notes
 
 
 def validate(model: ModelParameters, log: FlightLog, rows: np.ndarray | None = None) -> Validation:
     """Return the errors of a model on a log, from the measured states under the logged commands.
 
-    rows: (num_rows,) bool, those that are judged (``split.held_out_rows``); all if None. Rows that are not
-    judged are used only to know the applied action and what effects remember.
+    rows: (num_rows,) bool, the judged ones (``split.held_out_rows``); all if None. Other rows are used only
+    for the applied action and the memories of effects.
 
     Raises:
         ValueError: ``rows`` has another shape, or is not of truth values.
@@ -142,7 +138,7 @@ def validate(model: ModelParameters, log: FlightLog, rows: np.ndarray | None = N
     rollouts = rollout_errors(model, log, prediction, rows)
     too_long = [f"{rollout.horizon_s:g} s" for rollout in rollouts if not rollout.num_starts]
     if too_long:
-        notes.append(f"free flight of {', '.join(too_long)}: no judged stretch is as long")
+        notes.append(f"free flight of {', '.join(too_long)}: no judged stretch is that long")
     thrust, left, force_notes = _forces(model, log, prediction, rows)
     notes += force_notes
     steps = step_responses(model, log, prediction, rows)

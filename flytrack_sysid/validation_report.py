@@ -8,13 +8,12 @@ from typing import Any
 import numpy as np
 
 from flytrack_env.files import write_atomically
-from flytrack_sysid.forces import OpenForce
+from flytrack_sysid.forces import OpenForce, ThrustError
 from flytrack_sysid.log import FlightLog
 from flytrack_sysid.one_step import NORMALISED_BY, NRMSE_MEANING, UNITS
 from flytrack_sysid.open_loop import QUANTITIES, START_EVERY_S
 from flytrack_sysid.page import Bullets, Picture, Section, Table, Text, page
 from flytrack_sysid.plots import draw_validation, png_of
-from flytrack_sysid.thrust import ThrustError
 from flytrack_sysid.validate import NAMES, Validation
 
 CAPTIONS = {

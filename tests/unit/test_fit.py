@@ -93,7 +93,7 @@ def test_intervals_hold_the_truth_and_widen_with_fewer_channels(noisy, fitted):
     inside = [low <= TRUTH[name] <= high for name, (_, low, high) in fitted.intervals.items()]
     assert sum(inside) >= len(inside) - 2
     assert tau_error(fitted) < 0.02 and map_error(fitted) < 0.01
-    assert fitted.map_doubt.share < 0.01 and map_error(fitted) < 2.0 * fitted.map_doubt.share
+    assert fitted.map_uncertainty.share < 0.01 and map_error(fitted) < 2.0 * fitted.map_uncertainty.share
     wide, narrow = half_widths(fit(noisy.without("w"))), half_widths(fitted)
     assert all(wide[name] > 1.2 * narrow[name] for name in TAUS[:3])
     assert wide["tau_thrust"] == pytest.approx(narrow["tau_thrust"], rel=0.05)
@@ -131,7 +131,7 @@ def test_what_the_model_lacks_widens_its_intervals(dragged, fitted):
         error, half = abs(found.intervals[name].value - TRUTH[name]), 0.5 * (high - low)
         assert error < 3.0 * half, name
         assert half > 1.2 * half_widths(fitted)[name], name
-    assert found.map_doubt.share > fitted.map_doubt.share
+    assert found.map_uncertainty.share > fitted.map_uncertainty.share
 
 
 def test_fixed_stays_as_given_and_is_what_the_rest_is_fitted_to(exact):
@@ -185,8 +185,8 @@ def test_thrust_that_hardly_moves_leaves_the_map_open():
     found = fit(log)
     text = "\n".join(found.warnings)
     assert "the thrust map is not determined by the data everywhere" in text
-    assert "the log commands -0.3 to -0.1" in text and found.map_doubt.share > 0.02
-    assert map_error(found) < 2.0 * found.map_doubt.share
+    assert "the log commands -0.3 to -0.1" in text and found.map_uncertainty.share > 0.02
+    assert map_error(found) < 2.0 * found.map_uncertainty.share
 
 
 def scaled(log: FlightLog, channel: str, factors: tuple[float, ...]) -> FlightLog:

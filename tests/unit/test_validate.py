@@ -233,7 +233,7 @@ def test_model_without_battery_needs_no_voltage(log):
 
 def test_without_voltage_a_middle_one_is_taken(log):
     bare = validate(TRUTH, log.without("v_bat"))
-    assert "battery (v_bat): not in the log; 23 V is taken for thrust" in bare.notes
+    assert "battery (v_bat): not in the log; 23 V is assumed for thrust" in bare.notes
     assert 1e-3 < nrmse(bare)["a"] < 0.2 and nrmse(bare)["w"] < 1e-6 and bare.thrust is None
 
 
