@@ -231,3 +231,26 @@ def applied_doubt(
         variances[row] = variance
         variance = keep[row] ** 2 * variance + enters[row]
     return np.sqrt(variances)
+
+
+def is_applied_certain(record: Record, tau: np.ndarray) -> np.ndarray:
+    """Return where the applied action of a replay is known well enough to judge a model by, (num_rows, 4)."""
+    doubt = applied_doubt(record.step_s, record.command_doubt, record.begins, record.is_applied_known, tau)
+    return doubt < LARGEST_DOUBT
+
+
+def measured_channels(log: FlightLog, record: Record, gravity: float) -> dict[str, np.ndarray]:
+    """Return what a log measured on the record's rows, by channel; anything in filled rows.
+
+    ``f`` comes from ``a`` where there is no accelerometer, ``p`` only without ``v``. Without ``q`` nothing
+    in the world frame can be compared.
+    """
+    row = record.source_row
+    own = {name: log[name][row] for name in ("w", "q", "v", "v_bat", "f") if name in log}
+    if "f" not in log and "a" in log and "q" in log:
+        before = np.roll(record.quat, 1, axis=0)
+        force_w = log["a"][row] + np.array([0.0, 0.0, gravity])
+        own["f"] = Rotation.from_quat(before, scalar_first=True).inv().apply(force_w)
+    if "v" not in log and "p" in log:
+        own["p"] = log["p"][row]
+    return own if "q" in log else {name: own[name] for name in own if name not in ("v", "p")}

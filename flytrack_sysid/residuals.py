@@ -1,4 +1,4 @@
-"""What a log measured minus what the model says, channel by channel.
+"""What a log measured minus what the model predicts, channel by channel.
 
 ========  ==============================================================================  =======
 channel   residual                                                                        unit
@@ -19,13 +19,12 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from scipy.spatial.transform import Rotation
 
-from flytrack_env.dynamics import ModelParameters
-from flytrack_env.quaternion import Quaternion
+from flytrack_env.dynamics import ModelParameters, integrate_attitude
+from flytrack_env.quaternion import Quaternion, Vec3
 from flytrack_sysid.log import FlightLog
-from flytrack_sysid.record import LARGEST_DOUBT, Record, applied_doubt
-from flytrack_sysid.replay import Replay, replay
+from flytrack_sysid.record import Record, is_applied_certain, measured_channels
+from flytrack_sysid.replay import Step, replay, where_true
 
 CENTRED = ("v", "p", "q", "v_bat")
 TURN_CHANNELS, FORCE_CHANNELS = ("w", "q"), ("f", "v", "p")
@@ -50,36 +49,12 @@ class Problem(NamedTuple):
     channels: dict[str, Channel]
 
 
-def measured_channels(log: FlightLog, record: Record, gravity: float) -> dict[str, np.ndarray]:
-    """Return what a log measured of each residual channel, on the record's rows; anything in filled ones."""
-    row = record.source_row
-    own = {name: log[name][row] for name in ("w", "q", "v", "v_bat") if name in log}
-    if "f" in log:
-        own["f"] = log["f"][row]
-    elif "a" in log and "q" in log:
-        before = np.roll(record.quat, 1, axis=0)
-        force_w = log["a"][row] + np.array([0.0, 0.0, gravity])
-        own["f"] = Rotation.from_quat(before, scalar_first=True).inv().apply(force_w)
-    if "v" not in log and "p" in log:
-        own["p"] = log["p"][row]
-    if "q" not in log:  # nothing in the world frame can be compared
-        own = {name: values for name, values in own.items() if name not in ("v", "p")}
-    return own
-
-
 def make_problem(log: FlightLog, record: Record, judged: np.ndarray, model: ModelParameters) -> Problem:
     """Return the problem of explaining the judged rows of a log.
 
     judged: (rows of the log,) bool. The lags of ``model`` say how long lost commands are remembered.
     """
-    doubt = applied_doubt(
-        record.step_s,
-        record.command_doubt,
-        record.begins,
-        record.is_applied_known,
-        np.asarray(model.tau, float),
-    )
-    is_certain = doubt < LARGEST_DOUBT
+    is_certain = is_applied_certain(record, np.asarray(model.tau, float))
     exists = (record.source_row >= 0) & judged[record.source_row]
     is_after = exists & ~record.begins
     behind = np.maximum.accumulate(record.source_row)  # of a filled row, the one before the gap
@@ -132,9 +107,9 @@ def _without_slope(values: jax.Array, time: jax.Array, counts: jax.Array, window
     return values - slope * time
 
 
-def _rotation_between(measured: jax.Array, said: jax.Array) -> jax.Array:
-    """Return the world-frame rotation vector from what is said to what was measured, rad."""
-    conjugate = Quaternion(*said.T)._replace(x=-said[:, 1], y=-said[:, 2], z=-said[:, 3])
+def _rotation_between(measured: jax.Array, predicted: jax.Array) -> jax.Array:
+    """Return the world-frame rotation vector from predicted to measured attitudes, rad."""
+    conjugate = Quaternion(*predicted.T)._replace(x=-predicted[:, 1], y=-predicted[:, 2], z=-predicted[:, 3])
     error = jnp.stack(tuple(Quaternion(*measured.T).multiply(conjugate)), axis=-1)
     error = error * jnp.where(error[:, :1] < 0.0, -1.0, 1.0)
     vector = error[:, 1:]
@@ -146,33 +121,80 @@ def _rotation_between(measured: jax.Array, said: jax.Array) -> jax.Array:
     return vector * factor
 
 
-def _raw(name: str, channel: Channel, said: Replay, record: Record) -> jax.Array:
-    """Return measured minus said of one channel, before centring."""
+class Predicted(NamedTuple):
+    """What the model predicts of the rows, (num_rows, ...), each from the row before; nothing of the first.
+
+    rates_b: (3,) rad/s. force_b: (3,) m/s^2, specific force of the step to the row, attitude before it.
+    acc_w: (3,) m/s^2, the same with gravity, world. battery_change_v: of the step to the row. quat: (4,),
+    integrated from the measured attitude where ``turns_afresh`` was last true.
+    """
+
+    rates_b: jax.Array
+    force_b: jax.Array
+    acc_w: jax.Array
+    battery_change_v: jax.Array
+    quat: jax.Array
+
+
+def predict_rows(model: ModelParameters, record: Record, turns_afresh: jax.Array | np.ndarray) -> Predicted:
+    """Return what a model predicts of every row; differentiable in the model.
+
+    turns_afresh: (num_rows,) bool, where the attitude is taken from the log again.
+    """
+
+    def observe(step: Step, _: None) -> tuple[jax.Array, ...]:
+        force_w = step.after.acc_w + Vec3(0.0, 0.0, model.g)
+        force_b = [axis.dot(force_w) for axis in step.before.quat.axes()]
+        stacked = (jnp.stack(tuple(leaves)) for leaves in (step.after.rates_b, force_b, step.after.acc_w))
+        return *stacked, step.after.battery_v - step.before.battery_v
+
+    of_next = replay(model, record, "commanded", None, observe)
+    quat = _integrated(record, Vec3(*of_next[0].T), record.begins | turns_afresh)
+    own = (jnp.concatenate([jnp.zeros_like(values[:1]), values[:-1]]) for values in of_next)
+    return Predicted(*own, quat)
+
+
+def _integrated(record: Record, rates_b: Vec3, is_fresh: jax.Array | np.ndarray) -> jax.Array:
+    """Return the attitude that rates lead to at every row, (num_rows, 4), as measured where it is fresh."""
+
+    def next_row(quat: Quaternion, inputs: tuple[Any, ...]) -> tuple[Quaternion, Quaternion]:
+        measured, rates_b, step_s, is_fresh = inputs
+        quat = where_true(is_fresh, measured, quat)
+        return integrate_attitude(quat, rates_b, step_s), quat
+
+    measured = Quaternion(*record.quat.T)
+    start = jax.tree.map(lambda column: column[0], measured)
+    found = jax.lax.scan(next_row, start, (measured, rates_b, record.step_s, is_fresh))[1]
+    return jnp.stack(tuple(found), axis=-1)
+
+
+def _raw(name: str, channel: Channel, predicted: Predicted, record: Record) -> jax.Array:
+    """Return measured minus predicted of one channel, before centring."""
     step_s = jnp.concatenate([jnp.zeros(1), record.step_s[:-1]])[:, None]  # of the step to the row
     measured = jnp.asarray(channel.measured)
     if name == "w":
-        return measured - said.rates_b
+        return measured - predicted.rates_b
     if name == "f":
-        return measured - said.force_b
+        return measured - predicted.force_b
     if name == "q":
-        return _rotation_between(measured, said.quat)
+        return _rotation_between(measured, predicted.quat)
     if name == "v_bat":
-        return measured - jnp.cumsum(said.battery_change_v)[:, None]
-    vel_change = jnp.cumsum(said.acc_w * step_s, axis=0)
+        return measured - jnp.cumsum(predicted.battery_change_v)[:, None]
+    vel_change = jnp.cumsum(predicted.acc_w * step_s, axis=0)
     if name == "v":
         return measured - vel_change
-    moved = (vel_change - said.acc_w * step_s) * step_s + 0.5 * said.acc_w * step_s**2
+    moved = (vel_change - predicted.acc_w * step_s) * step_s + 0.5 * predicted.acc_w * step_s**2
     return measured - jnp.cumsum(moved, axis=0)
 
 
 def residuals(model: ModelParameters, problem: Problem) -> dict[str, jax.Array]:
     """Return the residuals of each channel, (num_rows, components); 0 where a row does not count."""
     record = jax.tree.map(jnp.asarray, problem.record)
-    said = replay(model, record, problem.turns_afresh)
+    predicted = predict_rows(model, record, problem.turns_afresh)
     time = jnp.cumsum(record.step_s)
     found = {}
     for name, channel in problem.channels.items():
-        values, counts = _raw(name, channel, said, record), jnp.asarray(channel.counts)
+        values, counts = _raw(name, channel, predicted, record), jnp.asarray(channel.counts)
         if name == "p":
             values = _without_slope(values, time, counts, jnp.asarray(channel.window))
         elif name in CENTRED:

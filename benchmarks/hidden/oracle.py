@@ -6,6 +6,7 @@ length. All else is fitted again, each rival in the effect's place too.
 """
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from itertools import product
 from typing import NamedTuple
 
@@ -14,12 +15,12 @@ import numpy as np
 
 from benchmarks.hidden.noise import DIGIT, STD
 from flytrack_env.dynamics import ModelParameters
-from flytrack_sysid.diagnosis.candidates import CANDIDATES, Candidate, opened
+from flytrack_sysid.diagnosis.candidates import CANDIDATES, Candidate
 from flytrack_sysid.diagnosis.lanes import NUM_AXES, make_lanes
+from flytrack_sysid.diagnosis.model_selection import MOST_RIVALS, ablate
 from flytrack_sysid.diagnosis.noise import fit_noise
 from flytrack_sysid.diagnosis.problem import Problem
-from flytrack_sysid.diagnosis.search import Found, fitted, full_outlook, scores, with_effect
-from flytrack_sysid.diagnosis.weigh import MOST_RIVALS, weigh
+from flytrack_sysid.diagnosis.search import FittedModel, Held, SearchState, add_effect, score_candidates
 from flytrack_sysid.log import FlightLog
 from flytrack_sysid.parameters import THRUST_COEFFS
 
@@ -52,19 +53,18 @@ def clean_problem(clean: FlightLog, log: FlightLog, judged: np.ndarray, model: M
     """
     kept = clean.select(np.isin(np.round(clean.time, 6), np.round(log.time, 6)))
     tau, gravity = np.asarray(model.tau, float), float(model.g)
-    problem = Problem(make_lanes(kept, judged, tau, gravity), model)
-    measured = Problem(make_lanes(log, judged, tau, gravity), model)
-    errors = measured.left(problem.start[None])[0] - problem.left(problem.start[None])[0]
+    problem = Problem.of(make_lanes(kept, judged, tau, gravity), model)
+    measured = Problem.of(make_lanes(log, judged, tau, gravity), model)
+    errors = measured.residuals(problem.start[None])[0] - problem.residuals(problem.start[None])[0]
     noise = true_noise()
     noise[:, -1] = fit_noise(measured.lanes, errors, noise)[:, -1]
-    problem.set_noise(noise)
-    return problem
+    return problem.with_noise(noise)
 
 
-def with_all(problem: Problem, effects: Mapping[str, Mapping[str, float]]) -> Found:
+def with_all(state: SearchState, effects: Mapping[str, Mapping[str, float]]) -> FittedModel:
     """Return the model with all true effects that fits the clean log best, from the true parameters.
 
-    A law with other parameters than the truth's begins in each way in which it is looked for.
+    A law with other parameters than the truth's starts in each way in which it is looked for.
     """
     ways = []
     for name, values in effects.items():
@@ -72,41 +72,41 @@ def with_all(problem: Problem, effects: Mapping[str, Mapping[str, float]]) -> Fo
         whole = [one for one in own if len(one.fields) == max(len(other.fields) for other in own)]
         is_known = any(field.split(".")[1] in values for one in whole for field in one.fields)
         ways.append(whole[:1] if is_known else whole)
-    tried = [_begun_with(problem, chosen, effects) for chosen in product(*(own for own in ways if own))]
-    return min(tried, key=lambda found: found.cost)
+    tried = [_started_with(state, chosen, effects) for chosen in product(*(own for own in ways if own))]
+    return min(tried, key=lambda model: model.cost)
 
 
-def _begun_with(
-    problem: Problem, chosen: Sequence[Candidate], effects: Mapping[str, Mapping[str, float]]
-) -> Found:
+def _started_with(
+    state: SearchState, chosen: Sequence[Candidate], effects: Mapping[str, Mapping[str, float]]
+) -> FittedModel:
+    problem = state.problem
     vector = problem.start.copy()
     for way in chosen:
-        vector = opened(problem, vector, way)
+        vector = way.placed_in(problem, vector)
         for field in way.fields:
             place = problem.names.index(field)
             vector[place] = effects[way.effect].get(field.split(".")[1], vector[place])
-    return fitted(problem, chosen, problem.clipped(vector[None])[0])
+    return state.fitted(chosen, problem.clipped(vector))
 
 
-def _scale_known(problem: Problem, found: Found) -> Known:
+def _scale_known(state: SearchState, model: FittedModel) -> Known:
     """Return what the log could show of a scale of thrust, which a free thrust curve explains.
 
     Against the nominal curve, all else fitted, and the best rival beside that.
     """
-    places = problem.index(THRUST_COEFFS)
-    vector = found.vector.copy()
-    vector[places] = problem.start[places]
-    problem.held = THRUST_COEFFS
-    less = fitted(problem, found.chosen, vector)
-    seen = full_outlook(problem, less.vector)
+    places = state.problem.index(THRUST_COEFFS)
+    vector = model.vector.copy()
+    vector[places] = state.problem.start[places]
+    state = replace(state, held=tuple(Held(field, "") for field in THRUST_COEFFS))
+    less = state.fitted(model.candidates, vector)
+    state, nearby = state.linearized(less.vector)
     rivals = {}
-    others = [one for one in scores(problem, seen, less) if one.candidate.effect != "thrust_scale"]
+    others = [one for one in score_candidates(state, nearby, less) if one.candidate.effect != "thrust_scale"]
     for one in others[:MOST_RIVALS]:
-        rivals[one.candidate.effect] = with_effect(problem, seen, less, one).cost
-    problem.held = ()
+        rivals[one.candidate.effect] = add_effect(state, nearby, less, one).cost
     rival = min(rivals, key=rivals.get, default="")
-    gain = less.cost - found.cost
-    return Known(gain, max(min(rivals.get(rival, less.cost) - found.cost, gain), 0.0), rival)
+    gain = less.cost - model.cost
+    return Known(gain, max(min(rivals.get(rival, less.cost) - model.cost, gain), 0.0), rival)
 
 
 def known(
@@ -118,17 +118,17 @@ def known(
 ) -> dict[str, Known]:
     """Return, by hidden effect, what the judged rows of a log could show of it."""
     with jax.enable_x64(True):
-        problem = clean_problem(clean, log, judged, model)
-        found = with_all(problem, effects)
-        outlook = full_outlook(problem, found.vector)
+        state = SearchState(clean_problem(clean, log, judged, model))
+        found = with_all(state, effects)
+        state, linearization = state.linearized(found.vector)
         result = {}
-        for one in found.chosen:
-            weight = weigh(problem, found, outlook, one.effect)
-            rival = min(weight.rivals, key=weight.rivals.get, default="")
-            beside = min(weight.rivals.get(rival, weight.gain), weight.gain)
-            result[one.effect] = Known(weight.gain, max(beside, 0.0), rival)
+        for one in found.candidates:
+            ablation = ablate(state, found, linearization, one.effect)
+            rival = min(ablation.rivals, key=ablation.rivals.get, default="")
+            beside = min(ablation.rivals.get(rival, ablation.gain), ablation.gain)
+            result[one.effect] = Known(ablation.gain, max(beside, 0.0), rival)
         if "thrust_scale" in effects:
-            result["thrust_scale"] = _scale_known(problem, found)
+            result["thrust_scale"] = _scale_known(state, found)
     return result
 
 
@@ -141,9 +141,9 @@ def removed(
     """
     with jax.enable_x64(True):
         lanes = make_lanes(clean, np.ones(len(clean), bool), np.asarray(model.tau, float), float(model.g))
-        problem = Problem(lanes, model)
-        every = [Problem(lanes, one).start for one in (base, extended)]
-        left = problem.left(np.stack(every))
+        problem = Problem.of(lanes, model)
+        every = [Problem.of(lanes, one).start for one in (base, extended)]
+        left = problem.residuals(np.stack(every))
     size = np.array([STD["w"]] * 3 + [STD["f"]] * 3)
     counts = lanes.counts[..., :6, 0]
     power = [float(np.mean(np.square(one[..., :6, 0] / size)[counts])) for one in left]

@@ -8,15 +8,15 @@ from flytrack_env.effects import BY_NAME, EFFECTS, Effect
 from flytrack_sysid.diagnosis.problem import Problem
 from flytrack_sysid.parameters import DRAIN, TAUS, THRUST_COEFFS
 
-# What a base parameter that differs is called.
+# Names of causes in the base, and the parameters of each.
 BASE_CAUSES = {**{name: (name,) for name in TAUS}, "thrust_curve": THRUST_COEFFS, "battery_drain": (DRAIN,)}
 BASE_FREE = (*TAUS, *THRUST_COEFFS, DRAIN)
 
 
 class Candidate(NamedTuple):
-    """An effect and one way to begin with it.
+    """An effect and one way to look for it.
 
-    fields: ``effect.parameter`` names that are freed. probe: of one of them, its value to begin with, where
+    fields: ``effect.parameter`` names that are freed. probe: one of them and a value to start from, where
     there is no slope at neutral.
     """
 
@@ -25,10 +25,22 @@ class Candidate(NamedTuple):
     probe: tuple[str, float] | None = None
 
     @property
-    def price(self) -> int:
-        """Its parameters, without those that only shape what others do."""
+    def num_priced(self) -> int:
+        """How many of its parameters count against it: not those that only shape what others do."""
         shapes = [f"{self.effect}.{field}" for field in BY_NAME[self.effect].shapes]
         return sum(field not in shapes for field in self.fields)
+
+    @property
+    def other_fields(self) -> tuple[str, ...]:
+        """Its fields without that of the probe."""
+        return tuple(field for field in self.fields if self.probe is None or field != self.probe[0])
+
+    def placed_in(self, problem: Problem, vector: np.ndarray) -> np.ndarray:
+        """Return the vector with the probe in place."""
+        vector = vector.copy()
+        if self.probe is not None:
+            vector[problem.names.index(self.probe[0])] = self.probe[1]
+        return vector
 
 
 def candidates_of(effect: Effect) -> list[Candidate]:
@@ -44,16 +56,4 @@ def candidates_of(effect: Effect) -> list[Candidate]:
 
 
 CANDIDATES = [candidate for effect in EFFECTS for candidate in candidates_of(effect)]
-
-
-def opened(problem: Problem, vector: np.ndarray, candidate: Candidate) -> np.ndarray:
-    """Return the vector with the candidate's probe in place."""
-    vector = vector.copy()
-    if candidate.probe is not None:
-        vector[problem.names.index(candidate.probe[0])] = candidate.probe[1]
-    return vector
-
-
-def base_places(problem: Problem) -> list[int]:
-    """Return the places of the base parameters that are free."""
-    return [problem.names.index(name) for name in BASE_FREE if name not in problem.held]
+PROBES = [candidate for candidate in CANDIDATES if candidate.probe is not None]

@@ -9,10 +9,9 @@ from typing import NamedTuple
 
 import jax
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from flytrack_sysid.log import FlightLog
-from flytrack_sysid.record import LARGEST_DOUBT, Record, applied_doubt, make_record
+from flytrack_sysid.record import Record, is_applied_certain, make_record, measured_channels
 
 LEAD_IN_S, LANE_S = 1, 5
 PIECES = LEAD_IN_S + LANE_S  # of a second each, the lead-in first
@@ -23,6 +22,7 @@ LANES_PADDED_TO = 2  # logs of about the same length share one compiled program
 # measured directly, and a level, of which that is the rate of change.
 DIRECT, LEVEL = ("w", "f", None), ("q", "v", "v_bat")
 SIZES = (3, 3, 1)
+AXES = (slice(0, 3), slice(3, 6), slice(6, 7))  # of each side: rotation, force, battery
 NUM_AXES = sum(SIZES)
 
 
@@ -43,6 +43,16 @@ class Lanes(NamedTuple):
     is_known: np.ndarray
     row: np.ndarray
     quanta: np.ndarray
+
+    def selected(self, places: np.ndarray) -> "Lanes":
+        """Return some of the lanes, by their numbers."""
+        leaves = {name: value for name, value in self._asdict().items() if name != "quanta"}
+        return Lanes(**jax.tree.map(lambda leaf: leaf[:, places], leaves), quanta=self.quanta)
+
+    @property
+    def num_judged(self) -> int:
+        """The number of rows of which anything is to be explained."""
+        return int(self.counts.any(axis=(2, 3)).sum())
 
 
 def rows_per_second(record: Record) -> int:
@@ -75,24 +85,11 @@ def _index(exists: np.ndarray, rate: int) -> np.ndarray:
     return np.where((places >= 0) & (places < len(exists)) & (begin < len(exists)), places, -1)
 
 
-def measured_of(log: FlightLog, record: Record, gravity: float) -> dict[str, np.ndarray]:
-    """Return what a log measured of each channel on the record's rows; anything in filled rows."""
-    row = record.source_row
-    found = {name: log[name][row] for name in ("w", "q", "v", "v_bat", "f") if name in log}
-    if "f" not in log and "a" in log and "q" in log:
-        before = np.roll(record.quat, 1, axis=0)
-        force_w = log["a"][row] + np.array([0.0, 0.0, gravity])
-        found["f"] = Rotation.from_quat(before, scalar_first=True).inv().apply(force_w)
-    if "q" not in log:  # nothing in the world frame can be compared
-        found = {name: values for name, values in found.items() if name != "v"}
-    return found
-
-
 def _quanta(found: dict[str, np.ndarray]) -> np.ndarray:
     """Return the smallest change of each measured channel, (2, NUM_AXES); 0 for attitude."""
 
     def smallest(name: str | None) -> float:
-        if name not in found or name == "q":
+        if name is None or name not in found or name == "q":
             return 0.0
         steps = np.diff(np.unique(found[name]))
         return float(steps.min()) if len(steps) else 0.0
@@ -102,7 +99,7 @@ def _quanta(found: dict[str, np.ndarray]) -> np.ndarray:
 
 def _counting(name: str | None, size: int, allowed: dict, found: dict, index: np.ndarray) -> np.ndarray:
     """Return where a channel counts, (rows, lanes, size)."""
-    mask = allowed[name][index] if name in found else np.zeros(index.shape, bool)
+    mask = allowed[name][index] if name is not None and name in found else np.zeros(index.shape, bool)
     return np.repeat(mask[..., None], size, axis=-1)
 
 
@@ -112,8 +109,7 @@ def make_lanes(log: FlightLog, judged: np.ndarray, tau: np.ndarray, gravity: flo
     tau: (4,) s, lags that say how long lost commands are remembered.
     """
     record = make_record(log)
-    doubt = applied_doubt(record.step_s, record.command_doubt, record.begins, record.is_applied_known, tau)
-    is_certain = doubt < LARGEST_DOUBT
+    is_certain = is_applied_certain(record, tau)
     exists = (record.source_row >= 0) & judged[record.source_row]
     after = exists & ~record.begins
     turns, lifts = is_certain[:, :3].all(axis=1), is_certain[:, 3]
@@ -127,7 +123,7 @@ def make_lanes(log: FlightLog, judged: np.ndarray, tau: np.ndarray, gravity: flo
     num_rows = 1 + int(np.flatnonzero(record.source_row >= 0)[-1])
     index = _index(exists[:num_rows], rows_per_second(record))
     is_real = (index >= 0) & (np.arange(len(index)) >= lead_in_of(len(index)))[:, None]
-    found = measured_of(log, record, gravity)
+    found = measured_channels(log, record, gravity)
     counts = np.stack(
         [
             np.concatenate(
@@ -159,10 +155,8 @@ def voltages_of(lanes: Lanes) -> tuple[float, float] | None:
 
 def thinned(lanes: Lanes) -> Lanes:
     """Return lanes evenly spread, of MOST_ROWS at most, in place of those of a long log."""
-    rows, count = lanes.row.shape
+    rows, number = lanes.row.shape
     most = max(MOST_ROWS // (rows - lead_in_of(rows)) // LANES_PADDED_TO, 1) * LANES_PADDED_TO
-    if count <= most:
+    if number <= most:
         return lanes
-    kept = np.linspace(0, count - 1, most).round().astype(int)
-    by_lane = jax.tree.map(lambda leaf: leaf[:, kept], lanes._replace(quanta=None))
-    return by_lane._replace(quanta=lanes.quanta)
+    return lanes.selected(np.linspace(0, number - 1, most).round().astype(int))

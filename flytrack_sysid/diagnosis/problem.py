@@ -1,11 +1,12 @@
-"""A log against all that a model could be: residuals, slopes and their sums, over blocks of a second.
+"""A log and all that its model may be: residuals, slopes and whitening for a vector of all parameters.
 
 One program evaluates 20 models at once, another four, each with every effect of the list; a model without
 an effect has it at its neutral value. So no set of effects needs a compilation of its own.
 """
 
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import jax
 import numpy as np
@@ -14,17 +15,17 @@ from flytrack_env.dynamics import ModelParameters
 from flytrack_env.effects import BY_NAME, EFFECTS, effect_of
 from flytrack_sysid.diagnosis import noise as noises
 from flytrack_sysid.diagnosis.lanes import LANE_S, Lanes, lead_in_of
-from flytrack_sysid.diagnosis.said import unexplained
+from flytrack_sysid.diagnosis.residuals import residuals
 from flytrack_sysid.parameters import TAUS, bounds_of, names_of, to_vector
 
-BATCH, FEW = 20, 4
+BATCH, SMALL_BATCH = 20, 4
 RELATIVE_STEP = 1e-6  # of a parameter's scale, for slopes
 
 
 @jax.jit
-def _left(vectors: jax.Array, like: ModelParameters, lanes: Lanes) -> jax.Array:
-    """Return what models leave, (BATCH, rows, lanes, NUM_AXES, 2)."""
-    return jax.vmap(lambda vector: unexplained(vector, like, lanes))(vectors)
+def _residuals(vectors: jax.Array, like: ModelParameters, lanes: Lanes) -> jax.Array:
+    """Return residuals of models, (BATCH, rows, lanes, NUM_AXES, 2)."""
+    return jax.vmap(lambda vector: residuals(vector, like, lanes))(vectors)
 
 
 @jax.jit
@@ -36,75 +37,94 @@ _gains = jax.jit(noises.make_gains)
 
 
 class Slopes(NamedTuple):
-    """What a model leaves, (rows, lanes, NUM_AXES, 2), and how that changes, (count, ...), before whitening.
+    """A model's residuals, (rows, lanes, NUM_AXES, 2), and how they change, (num_columns, ...), not whitened.
 
-    places: of the first columns; ways to other vectors follow.
+    places: the parameters of the first columns; ways to other vectors follow.
     """
 
     vector: np.ndarray
-    left: np.ndarray
+    residuals: np.ndarray
     places: tuple[int, ...]
     columns: np.ndarray
 
 
+@dataclass(frozen=True, eq=False)
 class Problem:
-    """Judged rows of a log, and a noise; all parameters in one vector in the order of ``names``."""
+    """Judged rows of a log and a noise, for models as vectors in the order of ``names``.
 
-    def __init__(self, lanes: Lanes, model: ModelParameters):
-        # Those it has, and neutral ones.
+    like: the nominal model with every effect, float64. given_effects: those that the nominal model has.
+    low, high, scale: of each parameter, its bounds and the size of its steps. noise: (6, NUM_AXES), as of
+    ``noise.fit_noise``, and gains of its filter; None before ``with_noise``.
+    """
+
+    lanes: Lanes
+    like: ModelParameters
+    given_effects: tuple[str, ...]
+    names: tuple[str, ...]
+    start: np.ndarray
+    low: np.ndarray
+    high: np.ndarray
+    scale: np.ndarray
+    noise: np.ndarray | None = None
+    gains: noises.Gains | None = None
+
+    @classmethod
+    def of(cls, lanes: Lanes, model: ModelParameters) -> "Problem":
+        """Return the problem of lanes and a nominal model, without a noise."""
         every = model.with_effects(*(model.effect(effect.name) for effect in EFFECTS))
-        self.given_effects = tuple(effect_of(one).name for one in model.effects)
-        self.like = jax.tree.map(lambda leaf: np.asarray(leaf, float), every)
-        self.names = names_of(self.like)
-        self.start = to_vector(self.like)
-        self.lanes = lanes
-        self.counts = lanes.counts
-        self.low, self.high = np.array([bounds_of(name) for name in self.names]).T
-        self.high = np.minimum(self.high, _longest(self.names, lanes))
-        self.scale = np.array(
-            [_scale(name, value) for name, value in zip(self.names, self.start, strict=True)]
+        like = jax.tree.map(lambda leaf: np.asarray(leaf, float), every)
+        names, start = names_of(like), to_vector(like)
+        low, high = np.array([bounds_of(name) for name in names]).T
+        return cls(
+            lanes=lanes,
+            like=like,
+            given_effects=tuple(effect_of(one).name for one in model.effects),
+            names=names,
+            start=start,
+            low=low,
+            high=np.minimum(high, _longest(names, lanes)),
+            scale=np.array([_scale(name, value) for name, value in zip(names, start, strict=True)]),
         )
-        self.noise: np.ndarray | None = None
-        self.barred: tuple[str, ...] = ()  # effects that the log cannot be asked about
-        self.refused: tuple[str, ...] = ()  # effects that were taken back, and are not to come again
-        self.held: tuple[str, ...] = ()  # base parameters that stay nominal
-        self.held_for: dict[str, tuple[str, ...]] = {}  # those, by the effect that made them needless
-        self.last_outlook: Any = None  # ``linear.Outlook`` along everything: slopes are dear
 
-    def set_noise(self, sought: np.ndarray) -> None:
-        """Weigh from now on with this noise, (6, NUM_AXES)."""
-        self.noise = sought
-        step_s = noises.step_to(self.lanes)
-        self.gains = _gains(noises.noise_of(sought), step_s, self.lanes.is_known, self.counts)
+    def with_noise(self, noise: np.ndarray) -> "Problem":
+        """Return the same problem, weighted by this noise, (6, NUM_AXES)."""
+        lanes = self.lanes
+        gains = _gains(noises.noise_of(noise), noises.step_to(lanes), lanes.is_known, lanes.counts)
+        return replace(self, noise=noise, gains=gains)
 
-    def left(self, vectors: np.ndarray) -> np.ndarray:
-        """Return what models (count, parameters) leave, (count, rows, lanes, NUM_AXES, 2)."""
-        return self._in_batches(lambda part: _left(part, self.like, self.lanes), vectors)
+    @property
+    def fitted_noise(self) -> noises.Noise:
+        """The noise in the sensors' units."""
+        assert self.noise is not None, "with_noise comes first"
+        return noises.noise_of(self.noise)
+
+    @property
+    def counts(self) -> np.ndarray:
+        """What is to be explained, (rows, lanes, NUM_AXES, 2) bool."""
+        return self.lanes.counts
+
+    def residuals(self, vectors: np.ndarray) -> np.ndarray:
+        """Return residuals of models (num_models, parameters), (num_models, rows, lanes, NUM_AXES, 2)."""
+        return _in_batches(lambda part: _residuals(part, self.like, self.lanes), vectors)
 
     def whiten(self, left: np.ndarray, axes: slice = slice(None)) -> np.ndarray:
-        """Return residuals (count, rows, lanes, NUM_AXES, 2), or of some axes, as innovations."""
+        """Return residuals (num_models, rows, lanes, NUM_AXES, 2), or those of some axes, as innovations."""
+        assert self.gains is not None, "with_noise comes first"
         gains = noises.Gains(*(np.asarray(leaf)[..., axes] for leaf in self.gains))
-        return self._in_batches(lambda part: _whitened(part, gains, self.counts[..., axes, :]), left)
+        return _in_batches(lambda part: _whitened(part, gains, self.counts[..., axes, :]), left)
 
-    @staticmethod
-    def _in_batches(tell: Callable[[np.ndarray], jax.Array], values: np.ndarray) -> np.ndarray:
-        """Return what a program of fixed batch says of values, (count, ...)."""
-        size = FEW if len(values) <= FEW else BATCH
-        parts = []
-        for begin in range(0, len(values), size):
-            part = values[begin : begin + size]
-            filled = np.concatenate([part, np.repeat(part[-1:], size - len(part), axis=0)])
-            parts.append(np.asarray(tell(filled))[: len(part)])
-        return np.concatenate(parts)
+    def whitened_residuals(self, *vectors: np.ndarray) -> np.ndarray:
+        """Return the innovations of models, (num_models, rows, lanes, NUM_AXES, 2)."""
+        return self.whiten(self.residuals(np.stack(vectors)))
 
     def clipped(self, vectors: np.ndarray) -> np.ndarray:
         """Return vectors within bounds."""
         return np.clip(vectors, self.low, self.high)
 
-    def slopes(self, vector: np.ndarray, places: Sequence[int], others: np.ndarray | None = None) -> "Slopes":
-        """Return what a model leaves, its slopes along places, and the way to other vectors.
+    def slopes(self, vector: np.ndarray, places: Sequence[int], others: np.ndarray | None = None) -> Slopes:
+        """Return a model's residuals, their slopes along places, and the way to other vectors.
 
-        One-sided differences, into the bounds: what an effect does may begin at its neutral value.
+        One-sided differences, into the bounds: an effect may be defined on one side of neutral only.
         """
         places = list(places)
         step = RELATIVE_STEP * self.scale[places]
@@ -112,7 +132,7 @@ class Problem:
         moved = np.repeat(vector[None], len(places), axis=0)
         moved[np.arange(len(places)), places] += step
         others = np.zeros((0, len(vector))) if others is None else others
-        found = self.left(np.concatenate([vector[None], moved, others]))
+        found = self.residuals(np.concatenate([vector[None], moved, others]))
         away = found[1:] - found[0]
         away[: len(places)] /= step[:, None, None, None, None]
         return Slopes(vector, found[0], tuple(places), away)
@@ -122,16 +142,25 @@ class Problem:
         return [self.names.index(name) for name in names]
 
 
+def _in_batches(program: Callable[[np.ndarray], jax.Array], values: np.ndarray) -> np.ndarray:
+    """Return a program of fixed batch size applied to values, (num_values, ...)."""
+    size = SMALL_BATCH if len(values) <= SMALL_BATCH else BATCH
+    parts = []
+    for begin in range(0, len(values), size):
+        part = values[begin : begin + size]
+        filled = np.concatenate([part, np.repeat(part[-1:], size - len(part), axis=0)])
+        parts.append(np.asarray(program(filled))[: len(part)])
+    return np.concatenate(parts)
+
+
 def _longest(names: Sequence[str], lanes: Lanes) -> np.ndarray:
-    """Return the longest value of parameters that are times: so many steps of the log as are remembered."""
+    """Return the longest delays, s, for the steps that effects remember; infinity for other parameters."""
     step_s = float(np.median(lanes.record.step_s))
     fields = [name.partition(".") for name in names]
-    return np.array(
-        [
-            BY_NAME[effect].most_steps.get(field, np.inf) * step_s if field else np.inf
-            for effect, _, field in fields
-        ]
-    )
+    steps = [
+        BY_NAME[effect].most_steps.get(field, np.inf) if field else np.inf for effect, _, field in fields
+    ]
+    return np.array(steps) * step_s
 
 
 def _scale(name: str, value: float) -> float:
@@ -142,15 +171,15 @@ def _scale(name: str, value: float) -> float:
     return abs(value) if name in TAUS else max(abs(value), 1.0)
 
 
-def robust_weight(left: np.ndarray) -> np.ndarray:
-    """Return weights by which outliers count by their size, not its square."""
-    size = np.abs(left)
+def robust_weight(white: np.ndarray) -> np.ndarray:
+    """Return weights of innovations with which outliers count by their size, not its square (Huber)."""
+    size = np.abs(white)
     return np.where(size > noises.OUTLIER, noises.OUTLIER / np.maximum(size, noises.OUTLIER), 1.0)
 
 
-def robust_square(left: np.ndarray) -> float:
+def robust_square(white: np.ndarray) -> float:
     """Return the sum of squares of innovations, outliers counted by their size."""
-    size = np.abs(left)
+    size = np.abs(white)
     beyond = noises.OUTLIER * (2.0 * size - noises.OUTLIER)
     return float(np.where(size < noises.OUTLIER, size**2, beyond).sum())
 

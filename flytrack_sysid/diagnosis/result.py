@@ -11,6 +11,12 @@ from flytrack_env.dynamics import ModelParameters
 SCHEMA = 1
 TO_LOG = "log "  # what comes instead of a manoeuvre where a channel is missing
 CONSISTENT, CAUSES_FOUND, UNEXPLAINED = "consistent", "causes_found", "unexplained"
+# Direct and level channel of each side: rotation, force, battery.
+CHANNELS: tuple[tuple[str | None, str], ...] = (
+    ("rates", "attitude"),
+    ("force", "velocity"),
+    (None, "battery"),
+)
 
 
 @dataclass(frozen=True)

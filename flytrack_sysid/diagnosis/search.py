@@ -1,64 +1,148 @@
-"""Which effects a log shows: one after the other, each refitted together with all that was found before."""
+"""The search: effects are added one after the other, each refitted together with all that came before."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
-from scipy import stats
 
-from flytrack_sysid.diagnosis.candidates import CANDIDATES, Candidate, base_places, opened
-from flytrack_sysid.diagnosis.linear import PROBES, Gain, Outlook
-from flytrack_sysid.diagnosis.problem import Problem
-from flytrack_sysid.diagnosis.refine import STALE, refine
+from flytrack_env.effects import EFFECTS
+from flytrack_sysid.diagnosis import noise as noises
+from flytrack_sysid.diagnosis.candidates import BASE_FREE, CANDIDATES, PROBES, Candidate
+from flytrack_sysid.diagnosis.problem import SMALL_BATCH, Problem
+from flytrack_sysid.diagnosis.score_test import Gain, Linearization, costs_of, threshold
+from flytrack_sysid.log import FlightLog
 
-CHANCE = 1e-4  # of a name where there is nothing, for each effect
 PER_PARAMETER = 4.0  # of chi2: what one more parameter has to gain to be preferred to fewer
 MOST_EFFECTS = 6
-CLOSE = 0.6  # of the best gain: who comes so near to first order is refitted before one is chosen
+CLOSE = 0.6  # of the best gain: candidates that come so near to first order are refitted before one is chosen
 MOST_REFITTED = 4
-MOST_TURNS = 3  # of refits that come to nothing before a search ends
+MOST_FAILED_ROUNDS = 3  # of refits before a search ends
 PROMISING = 0.7  # of the threshold, to first order
-SHARE_OF_WAY = (0.02, 1.5)  # to a probe, at which a fit begins
+SHARE_OF_WAY = (0.02, 1.5)  # to a probe, at which a fit starts
 KEPT_PROMISE = 0.6  # of a gain to first order: a fit that comes to less may have gone astray
+SATURATED_SHARES = np.array([0.0, 1.0, 0.5, 0.2])  # of the step to everything at once
+# Gauss-Newton: rounds, the least gain of a round, shares of a step tried at once, and after how much gain
+# slopes are taken again; gains in minus twice the log likelihood.
+MOST_ROUNDS, LEAST_GAIN, STALE = 30, 0.05, 30.0
+STEP_SHARES = np.array([1.0, 0.5, 0.2, 0.05])[:SMALL_BATCH]
 
 
-class Found(NamedTuple):
-    """A model: which effects it has (in which way each), its vector, cost, and free places."""
+class FittedModel(NamedTuple):
+    """A fitted model: its effects (and in which way each was found), vector, cost, and free places."""
 
-    chosen: tuple[Candidate, ...]
+    candidates: tuple[Candidate, ...]
     vector: np.ndarray
     cost: float
     places: tuple[int, ...]
 
+    @property
+    def effects(self) -> set[str]:
+        """The names of its effects."""
+        return {one.effect for one in self.candidates}
 
-def threshold(count: int) -> float:
-    """Return the gain of chi2 from which so many parameters are named."""
-    return float(stats.chi2.isf(CHANCE, count))
-
-
-def places_of(problem: Problem, chosen: Sequence[Candidate]) -> list[int]:
-    """Return what is free with these effects: the base and their parameters."""
-    return base_places(problem) + [place for one in chosen for place in problem.index(one.fields)]
-
-
-def free_places(problem: Problem) -> list[int]:
-    """Return every place that may become free: the base, and all parameters of all effects."""
-    effects = [place for place, name in enumerate(problem.names) if "." in name]
-    return base_places(problem) + effects
+    def candidate(self, effect: str) -> Candidate:
+        """Return the way in which an effect of the model was found."""
+        return next(one for one in self.candidates if one.effect == effect)
 
 
-def fitted(
-    problem: Problem, chosen: Sequence[Candidate], vector: np.ndarray, nearby: Outlook | None = None
-) -> Found:
-    """Return the model with these effects that fits best, from a vector."""
-    places = places_of(problem, chosen)
-    vector, cost = refine(problem, vector, places, nearby)
-    return Found(tuple(chosen), vector, cost, tuple(places))
+class Held(NamedTuple):
+    """A base parameter held at its nominal value, since an effect explains it away ("" if none does)."""
+
+    field: str
+    effect: str
 
 
-def base_fit(problem: Problem) -> Found:
-    """Return the model without effects that fits best."""
-    return fitted(problem, (), problem.start)
+@dataclass(frozen=True, eq=False)
+class SearchState:
+    """What a search knows; every step of the search returns a new one.
+
+    problem: what is learnt from, with the noise. unobservable: effects that need channels the log lacks.
+    refused: effects that vetoes have rejected. held: base parameters that stay nominal. linearization:
+    the last one along everything, kept because slopes are expensive.
+    """
+
+    problem: Problem
+    unobservable: tuple[str, ...] = ()
+    refused: tuple[str, ...] = ()
+    held: tuple[Held, ...] = ()
+    linearization: Linearization | None = None
+
+    @classmethod
+    def start(cls, log: FlightLog, problem: Problem) -> "SearchState":
+        """Return the state before anything was searched for. problem: of rows of the log, with a noise."""
+        channels = {*log.channels, *problem.lanes.measured}
+        lacking = tuple(effect.name for effect in EFFECTS if not set(effect.needs) <= channels)
+        return cls(problem, unobservable=lacking)
+
+    @property
+    def base_places(self) -> list[int]:
+        """The places of the free base parameters."""
+        held = {one.field for one in self.held}
+        return self.problem.index([name for name in BASE_FREE if name not in held])
+
+    @property
+    def every_place(self) -> list[int]:
+        """The places that may become free: the base, and all parameters of all effects."""
+        return self.base_places + [place for place, name in enumerate(self.problem.names) if "." in name]
+
+    def with_noise(self, noise: np.ndarray) -> "SearchState":
+        """Return the state with another noise, (6, NUM_AXES)."""
+        return replace(self, problem=self.problem.with_noise(noise))
+
+    def linearized(self, vector: np.ndarray) -> tuple["SearchState", Linearization]:
+        """Return the linearization along everything, and the state that has it; slopes nearby serve again."""
+        problem, last = self.problem, self.linearization
+        if last is not None and last.places == self.every_place and last.distance(vector) < STALE:
+            if last.noise is not problem.noise:
+                last = Linearization(problem, last.slopes, PROBES)
+            found = last.moved(vector)
+        else:
+            others = problem.clipped(np.array([probe.placed_in(problem, vector) for probe in PROBES]))
+            found = Linearization(problem, problem.slopes(vector, self.every_place, others), PROBES)
+        return replace(self, linearization=found), found
+
+    def fitted(
+        self, candidates: Sequence[Candidate], vector: np.ndarray, nearby: Linearization | None = None
+    ) -> FittedModel:
+        """Return the model with these effects that fits best, from a vector. nearby: as in ``refine``."""
+        effects = [place for one in candidates for place in self.problem.index(one.fields)]
+        places = self.base_places + effects
+        vector, cost = refine(self.problem, vector, places, nearby)
+        return FittedModel(tuple(candidates), vector, cost, tuple(places))
+
+
+def refine(
+    problem: Problem, vector: np.ndarray, places: Sequence[int], nearby: Linearization | None = None
+) -> tuple[np.ndarray, float]:
+    """Return the model of least cost along some places, from a vector, and its cost, by Gauss-Newton.
+
+    Slopes are kept while little is gained: residuals cost a tenth of them. nearby: a linearization whose
+    slopes serve at first.
+    """
+    places = list(places)
+    if nearby is None:
+        now = Linearization(problem, problem.slopes(vector, places))
+    else:
+        now = nearby.narrowed(places).moved(vector)
+    since, is_fresh = now.cost, nearby is None
+    for _ in range(MOST_ROUNDS):
+        tried = np.repeat(now.vector[None], len(STEP_SHARES), axis=0)
+        tried[:, places] += STEP_SHARES[:, None] * now.step_inside()
+        tried = problem.clipped(tried)
+        white = problem.whitened_residuals(*tried)
+        costs = costs_of(problem, tried, white)
+        best = int(np.nanargmin(np.where(np.isfinite(costs), costs, np.inf)))
+        gained = now.cost - costs[best]
+        if gained > 0.0:
+            now = now.moved(tried[best], white[best])
+            is_fresh = False
+        if gained < LEAST_GAIN:
+            if is_fresh or since - now.cost < STALE:
+                break
+            now = Linearization(problem, problem.slopes(now.vector, places))
+            since, is_fresh = now.cost, True
+    return now.vector, float(now.cost)
 
 
 class Scored(NamedTuple):
@@ -70,18 +154,18 @@ class Scored(NamedTuple):
     @property
     def merit(self) -> float:
         """The gain over its inflation, less a price per parameter."""
-        return self.gain.robust - PER_PARAMETER * self.gain.count
+        return self.gain.robust - PER_PARAMETER * self.gain.num_parameters
 
 
-def scores(problem: Problem, outlook: Outlook, found: Found) -> list[Scored]:
-    """Return all effects that the model does not have, by merit to first order, one way of each."""
-    given = [outlook.places.index(place) for place in found.places]
-    present = {one.effect for one in found.chosen}
+def score_candidates(state: SearchState, linearization: Linearization, model: FittedModel) -> list[Scored]:
+    """Return all effects that a model does not have, by merit to first order, one way of each."""
+    given = linearization.columns_at(model.places)
+    excluded = {*model.effects, *state.unobservable, *state.refused}
     best: dict[str, Scored] = {}
     for candidate in CANDIDATES:
-        if candidate.effect in present or candidate.effect in (*problem.barred, *problem.refused):
+        if candidate.effect in excluded:
             continue
-        gain = outlook.gain(outlook.columns_of(candidate), given)
+        gain = linearization.gain(linearization.columns_of(candidate), given)
         if gain is None or (candidate.probe is not None and gain.step[0] <= 0.0):
             continue
         scored = Scored(candidate, gain)
@@ -90,84 +174,105 @@ def scores(problem: Problem, outlook: Outlook, found: Found) -> list[Scored]:
     return sorted(best.values(), key=lambda scored: -scored.merit)
 
 
-def full_outlook(problem: Problem, vector: np.ndarray) -> Outlook:
-    """Return the outlook along everything; slopes taken last serve again for a model nearby."""
-    last = problem.last_outlook
-    if last is not None and last.places == free_places(problem) and last.distance(vector) < STALE:
-        if last.noise is not problem.noise:
-            last = Outlook(problem, last.slopes, PROBES)
-        outlook = last.moved(vector, problem.whiten(problem.left(vector[None]))[0])
-    else:
-        others = problem.clipped(np.array([opened(problem, vector, probe) for probe in PROBES]))
-        outlook = Outlook(problem, problem.slopes(vector, free_places(problem), others), PROBES)
-    problem.last_outlook = outlook
-    return outlook
-
-
-def with_effect(problem: Problem, outlook: Outlook, found: Found, scored: Scored) -> Found:
+def add_effect(
+    state: SearchState, linearization: Linearization, model: FittedModel, scored: Scored
+) -> FittedModel:
     """Return the model with an effect more, fitted from where first order says.
 
-    An effect that is looked for at a probe also begins at that, if it came to much less than promised.
+    An effect that is looked for at a probe also starts there, if it came to much less than promised.
     """
-    candidate, gain = scored
-    chosen = (*found.chosen, candidate)
+    problem, (candidate, gain) = state.problem, scored
+    candidates = (*model.candidates, candidate)
     if candidate.probe is None:
-        vector = found.vector.copy()
+        vector = model.vector.copy()
         vector[problem.index(candidate.fields)] += gain.step
-        return fitted(problem, chosen, problem.clipped(vector[None])[0], outlook)
-    best = fitted(problem, chosen, _on_the_way(problem, found, scored))
-    if found.cost - best.cost < KEPT_PROMISE * gain.chi2:
-        other = fitted(problem, chosen, problem.clipped(opened(problem, found.vector, candidate)[None])[0])
-        best = min(best, other, key=lambda one: one.cost)
+        return state.fitted(candidates, problem.clipped(vector), linearization)
+    best = state.fitted(candidates, _on_the_way(problem, model, scored))
+    if model.cost - best.cost < KEPT_PROMISE * gain.chi2:
+        at_probe = problem.clipped(candidate.placed_in(problem, model.vector))
+        best = min(best, state.fitted(candidates, at_probe), key=lambda one: one.cost)
     return best
 
 
-def _on_the_way(problem: Problem, found: Found, scored: Scored) -> np.ndarray:
+def _on_the_way(problem: Problem, model: FittedModel, scored: Scored) -> np.ndarray:
     """Return the vector at the share of the way to a probe that explains most, all else moved along."""
     candidate, gain = scored
-    vector = found.vector.copy()
-    vector[list(found.places)] += gain.aside
-    others = [field for field in candidate.fields if field != candidate.probe[0]]
-    vector[problem.index(others)] += gain.step[1:]
+    assert candidate.probe is not None
+    vector = model.vector.copy()
+    vector[list(model.places)] += gain.given_step
+    vector[problem.index(candidate.other_fields)] += gain.step[1:]
     place = problem.names.index(candidate.probe[0])
     share = np.clip(gain.step[0], *SHARE_OF_WAY)
     vector[place] += share * (candidate.probe[1] - vector[place])
-    return problem.clipped(vector[None])[0]
+    return problem.clipped(vector)
 
 
-def searched(problem: Problem, found: Found) -> Found:
-    """Return the model with all effects added that explain enough, the best first; the same if none does."""
-    while len(found.chosen) < MOST_EFFECTS:
-        more = add_best(problem, found, full_outlook(problem, found.vector))
-        if more is None:
-            break
-        found = more
-    return found
-
-
-def add_best(problem: Problem, found: Found, outlook: Outlook) -> Found | None:
+def add_best(state: SearchState, linearization: Linearization, model: FittedModel) -> FittedModel | None:
     """Return the model with the effect added that explains most; None where none explains enough."""
     ranked = [
         one
-        for one in scores(problem, outlook, found)
-        if one.gain.robust > PROMISING * threshold(one.gain.count)
+        for one in score_candidates(state, linearization, model)
+        if one.gain.robust > PROMISING * threshold(one.gain.num_parameters)
     ]
-    for _ in range(MOST_TURNS):
+    for _ in range(MOST_FAILED_ROUNDS):
         near = [one for one in ranked[:MOST_REFITTED] if one.merit > CLOSE * ranked[0].merit]
-        trials = [_tried(problem, found, outlook, one) for one in near]
-        good = [trial for trial in trials if trial is not None]
-        if good:
-            return max(good, key=lambda pair: pair[0])[1]
+        best: tuple[float, FittedModel] | None = None
+        for one in near:
+            trial = add_effect(state, linearization, model, one)
+            gain = (model.cost - trial.cost) / one.gain.inflation
+            merit = gain - PER_PARAMETER * one.gain.num_parameters
+            if gain > threshold(one.gain.num_parameters) and (best is None or merit > best[0]):
+                best = merit, trial
+        if best is not None:
+            return best[1]
         ranked = ranked[max(len(near), 1) :]
         if not ranked:
             break
     return None
 
 
-def _tried(problem: Problem, found: Found, outlook: Outlook, one: Scored) -> tuple[float, Found] | None:
-    """Return the merit of a model with an effect more, and the model; None if it gains too little."""
-    trial = with_effect(problem, outlook, found, one)
-    gain = (found.cost - trial.cost) / one.gain.inflation
-    if gain <= threshold(one.gain.count):
-        return None
-    return gain - PER_PARAMETER * one.gain.count, trial
+def add_effects(state: SearchState, model: FittedModel) -> tuple[SearchState, FittedModel]:
+    """Return the model with all effects added that explain enough, the best first; the same if none does."""
+    while len(model.candidates) < MOST_EFFECTS:
+        state, linearization = state.linearized(model.vector)
+        more = add_best(state, linearization, model)
+        if more is None:
+            break
+        model = more
+    return state, model
+
+
+def saturated_residuals(problem: Problem, linearization: Linearization) -> np.ndarray:
+    """Return what a model leaves with every effect at once, one step away, regularised by the prior.
+
+    Noise is fitted to this, so that a missing effect is not mistaken for noise.
+    """
+    places = linearization.places
+    tried = np.repeat(linearization.vector[None], len(SATURATED_SHARES), axis=0)
+    tried[:, places] += SATURATED_SHARES[:, None] * linearization.step(range(len(places)))
+    tried = problem.clipped(tried)
+    left = problem.residuals(tried)
+    return left[int(np.nanargmin(costs_of(problem, tried, problem.whiten(left))))]
+
+
+def search(state: SearchState) -> tuple[SearchState, FittedModel, FittedModel]:
+    """Return the state with its noise, the base refitted without effects, and the model with effects.
+
+    Noise and effects take turns: a large effect hides small ones as long as its remainder passes for noise.
+    """
+    lanes = state.problem.lanes
+    base = state.fitted((), state.problem.start)
+    state, linearization = state.linearized(base.vector)
+    state = state.with_noise(noises.fit_noise(lanes, saturated_residuals(state.problem, linearization)))
+    state, linearization = state.linearized(base.vector)
+    base = model = state.fitted((), base.vector, linearization)
+    while True:
+        state, more = add_effects(state, model)
+        if more is model:
+            return state, base, model
+        state, linearization = state.linearized(more.vector)
+        left = saturated_residuals(state.problem, linearization)
+        state = state.with_noise(noises.fit_noise(lanes, left, state.problem.noise))
+        state, linearization = state.linearized(more.vector)
+        model = state.fitted(more.candidates, more.vector, linearization)
+        base = state.fitted((), base.vector)

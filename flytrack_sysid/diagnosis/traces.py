@@ -238,11 +238,11 @@ def traces(log: FlightLog, models: Mapping[str, ModelParameters], like: str) -> 
     base = models[like]
     with jax.enable_x64(True):
         lanes = make_lanes(log, np.ones(len(log), bool), np.asarray(base.tau, float), float(base.g))
-        problem = Problem(lanes, base)
+        problem = Problem.of(lanes, base)
         every = [
             model.with_effects(*(model.effect(one.name) for one in EFFECTS)) for model in models.values()
         ]
-        left = problem.left(np.array([to_vector(model) for model in every]))
+        left = problem.residuals(np.array([to_vector(model) for model in every]))
         lagged = _lagged(lanes.record, np.asarray(base.tau, float))
         applied = np.stack([np.asarray(stick) for stick in lagged], axis=-1)
     rows = _rows_of(lanes)

@@ -1,54 +1,63 @@
-"""A log seen from one model: what each parameter would change, to first order, and how sure that is."""
+"""The score test: what freeing parameters would gain to first order, from one linearization of a log.
+
+A ``Linearization`` has a model's whitened residuals and their slopes along every parameter, summed up over
+blocks of a second. Gains are divided by how much more the scores of blocks vary than independent rows would
+(``inflation``).
+"""
 
 import copy
 from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from scipy import linalg
+from scipy import linalg, stats
 
-from flytrack_sysid.diagnosis.candidates import CANDIDATES, Candidate
+from flytrack_sysid.diagnosis.candidates import PROBES, Candidate
 from flytrack_sysid.diagnosis.problem import Problem, Slopes, blocks_of, robust_square, robust_weight
 
-# A direction of which the others leave less than this share is not told apart from them.
+CHANCE = 1e-4  # of a name where there is nothing, for each effect
+# A direction of which the others leave less than this share cannot be told apart from them.
 LEAST_OWN_SHARE = 1e-7
 AT_BOUND = 1e-9
-PROBES = [candidate for candidate in CANDIDATES if candidate.probe is not None]
-ALIKE = 0.1  # relative change of a parameter that is looked for at probes, in which its slope stays
+SAME_SLOPE = 0.1  # relative change of a parameter that is looked for at probes, within which its slope holds
 PROBE_PRIOR = 1e-2  # a step to a probe is known to be less than ten times that
+
+
+def threshold(num_parameters: int) -> float:
+    """Return the gain of chi2 from which so many parameters are named."""
+    return float(stats.chi2.isf(CHANCE, num_parameters))
 
 
 class Gain(NamedTuple):
     """What freeing some parameters besides others would gain.
 
-    chi2: in minus twice the log likelihood. inflation: of its variance, where residuals of a second hang
-    together. step: of the parameters. aside: of the others, along with it. information: about those that
-    others do not do, what others explain taken out.
+    chi2: in minus twice the log likelihood. inflation: of its variance, where residuals within a second are
+    correlated. step: of the parameters. given_step: of the others, along with it. information: about those
+    that others cannot replace, with what others explain projected out.
     """
 
     chi2: float
     inflation: float
     step: np.ndarray
-    aside: np.ndarray
+    given_step: np.ndarray
     information: np.ndarray
 
     @property
-    def count(self) -> int:
-        """How many parameters the log says something of."""
+    def num_parameters(self) -> int:
+        """How many of the parameters the log determines."""
         return len(self.information)
 
     @property
     def robust(self) -> float:
-        """The gain over the inflation."""
+        """The gain over its inflation."""
         return self.chi2 / self.inflation
 
 
-class Outlook:
+class Linearization:
     """A model and, to first order, what every column would change: parameters, and ways to probes.
 
     vector: the model. places: parameters of the first columns. probes: candidates of further ones, whose
-    step is the share of the way to the probe. columns: whitened, by blocks of a second. Slopes may be
-    those at a model nearby (``at``).
+    step is the share of the way to the probe. columns: whitened. The slopes may be those of a nearby model.
     """
 
     def __init__(self, problem: Problem, slopes: Slopes, probes: Sequence[Candidate] = ()):
@@ -58,51 +67,51 @@ class Outlook:
             [prior_information(problem)[self.places], np.full(len(self.probes), PROBE_PRIOR)]
         )
         self.columns = problem.whiten(slopes.columns)
-        self.vector, self.white = slopes.vector, problem.whiten(slopes.left[None])[0]
-        self._weigh()
-
-    def _weigh(self) -> None:
+        self.vector, self.white = slopes.vector, problem.whiten(slopes.residuals[None])[0]
         root = np.sqrt(robust_weight(self.white))
-        weighed = blocks_of(self.columns * root)
-        rest = blocks_of(self.white * root)
-        self.by_block = weighed @ np.swapaxes(weighed, 1, 2)
-        self.score_by_block = -np.einsum("bpn,bn->bp", weighed, rest, optimize=True)
+        weighted = blocks_of(self.columns * root)
+        self.by_block = weighted @ np.swapaxes(weighted, 1, 2)
+        self.score_by_block = -np.einsum("bpn,bn->bp", weighted, blocks_of(self.white * root), optimize=True)
         self.total = self.by_block.sum(axis=0) + np.diag(self.prior)
-        self._rescore()
+        self._sum_scores()
 
-    def _rescore(self) -> None:
+    def _sum_scores(self) -> None:
         pull = np.zeros(len(self.prior))
         pull[: len(self.places)] = (
             (self.prior[: len(self.places)]) * (self.vector - self.problem.start)[self.places]
         )
         self.score = self.score_by_block.sum(axis=0) - pull
-        self.cost = cost_of(self.problem, self.vector[None], self.white[None])[0]
+        self.cost = costs_of(self.problem, self.vector[None], self.white[None])[0]
 
-    def moved(self, vector: np.ndarray, white: np.ndarray) -> "Outlook":
-        """Return the outlook from a model nearby, with the slopes of this one."""
+    def moved(self, vector: np.ndarray, white: np.ndarray | None = None) -> "Linearization":
+        """Return the linearization at a nearby model, with the slopes of this one.
+
+        white: its whitened residuals, if they are known.
+        """
         later = copy.copy(self)
-        later.vector, later.white = vector, white
-        root = np.sqrt(robust_weight(white))
-        rest = blocks_of(white * root * root)
-        later.score_by_block = -np.einsum("bpn,bn->bp", blocks_of(self.columns), rest, optimize=True)
-        later._rescore()
+        later.vector = vector
+        later.white = self.problem.whitened_residuals(vector)[0] if white is None else white
+        root = np.sqrt(robust_weight(later.white))
+        weighted = blocks_of(later.white * root * root)
+        later.score_by_block = -np.einsum("bpn,bn->bp", blocks_of(self.columns), weighted, optimize=True)
+        later._sum_scores()
         return later
 
     def distance(self, vector: np.ndarray) -> float:
-        """Return by how much, to first order, a model differs from where slopes were taken, as a chi2."""
+        """Return how far, as a chi2 to first order, a model is from where the slopes were taken."""
         change = vector - self.slopes.vector
         places = np.array(self.places)
         elsewhere = np.delete(change, places)
-        sloping = self.problem.index(sorted({one.probe[0] for one in PROBES}))
+        sloping = self.problem.index(sorted({one.probe[0] for one in PROBES if one.probe is not None}))
         size = np.maximum(np.abs(vector), np.abs(self.slopes.vector))
-        # Where there was no slope, none says how far away the model is.
-        if np.any(elsewhere != 0.0) or np.any((np.abs(change) > ALIKE * size)[sloping]):
+        # Where there was no slope, first order cannot measure the distance.
+        if np.any(elsewhere != 0.0) or np.any((np.abs(change) > SAME_SLOPE * size)[sloping]):
             return np.inf
-        count = len(places)
-        return float(change[places] @ self.total[:count, :count] @ change[places])
+        end = len(places)
+        return float(change[places] @ self.total[:end, :end] @ change[places])
 
-    def narrowed(self, places: Sequence[int]) -> "Outlook":
-        """Return the outlook along some of the places only."""
+    def narrowed(self, places: Sequence[int]) -> "Linearization":
+        """Return the linearization along some of the places only."""
         kept = [self.places.index(place) for place in places]
         later = copy.copy(self)
         later.places, later.probes = list(places), []
@@ -116,15 +125,19 @@ class Outlook:
         """Return the column of a parameter."""
         return self.places.index(self.problem.names.index(name))
 
+    def columns_at(self, places: Sequence[int], without: Sequence[int] = ()) -> list[int]:
+        """Return the columns of places in the vector, except some columns."""
+        columns = [self.places.index(place) for place in places]
+        return [column for column in columns if column not in without]
+
     def columns_of(self, candidate: Candidate) -> list[int]:
-        """Return a candidate's columns: its probe's and those of its other parameters."""
-        fields = [
-            field for field in candidate.fields if candidate.probe is None or field != candidate.probe[0]
-        ]
-        columns = [self.column(field) for field in fields]
-        if candidate.probe is not None:
-            columns.insert(0, len(self.places) + self.probes.index(candidate))
-        return columns
+        """Return a candidate's columns: its probe's, then those of its other parameters."""
+        columns = [self.column(field) for field in candidate.other_fields]
+        return columns if candidate.probe is None else [self.probe_column(candidate), *columns]
+
+    def probe_column(self, candidate: Candidate) -> int:
+        """Return the column of the way to a candidate's probe."""
+        return len(self.places) + self.probes.index(candidate)
 
     def acting(self, columns: Sequence[int]) -> list[int]:
         """Return the columns that change anything."""
@@ -136,7 +149,7 @@ class Outlook:
         return solve(self.total[np.ix_(columns, columns)], self.score[columns])
 
     def step_inside(self) -> np.ndarray:
-        """Return the step along all places that explains most within bounds: what is stuck there stays."""
+        """Return the step along all places that explains most within bounds; those stuck there stay."""
         problem, places = self.problem, np.array(self.places)
         low, high, now = problem.low[places], problem.high[places], self.vector[places]
         room = AT_BOUND * np.maximum(np.abs(now), 1.0)
@@ -151,19 +164,23 @@ class Outlook:
             step[stuck] = 0.0
         return step
 
+    def projected(self, columns: Sequence[int], given: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
+        """Return information about columns with given ones projected out, and the shares of these in them."""
+        across = self.total[np.ix_(given, columns)]
+        share = solve(self.total[np.ix_(given, given)], across)
+        return self.total[np.ix_(columns, columns)] - across.T @ share, share
+
     def gain(self, added: Sequence[int], given: Sequence[int]) -> Gain | None:
         """Return what freeing ``added`` columns besides ``given`` ones gains; None where those do the same.
 
-        Columns that those nearly do are left out, and their step is 0.
+        Columns that those nearly replace are left out, and their step is 0.
         """
         given, every = list(given), list(added)
         added = self._own(every, given)
         if not added:
             return None
-        across = self.total[np.ix_(given, added)]
         inner = self.total[np.ix_(given, given)]
-        share = solve(inner, across)
-        own = self.total[np.ix_(added, added)] - across.T @ share
+        own, share = self.projected(added, given)
         score = self.score[added] - share.T @ self.score[given]
         step = solve(own, score)
         both = np.concatenate([solve(inner, self.score[given]) - share @ step, step])
@@ -175,7 +192,7 @@ class Outlook:
         return Gain(float(score @ step), inflation_of(own, blocks), whole, both[: len(given)], own)
 
     def _own(self, columns: list[int], given: list[int]) -> list[int]:
-        """Return the columns that are not what given ones, or those before them, nearly do."""
+        """Return the columns that given ones, or those before them, do not nearly replace."""
         kept: list[int] = []
         for column in columns:
             others = given + kept
@@ -188,7 +205,7 @@ class Outlook:
 
 
 def inflation_of(information: np.ndarray, scores: np.ndarray) -> float:
-    """Return how much more scores of blocks, (blocks, count), vary than information says; at least 1."""
+    """Return how much more scores, (blocks, parameters), vary than information says; at least 1."""
     used = np.abs(scores).sum(axis=1) > 0.0
     spread = scores[used].T @ scores[used]
     number = max(int(used.sum()), 2)
@@ -208,13 +225,16 @@ def solve(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
 
 
 def prior_information(problem: Problem) -> np.ndarray:
-    """Return what is known of each parameter beforehand: next to nothing, and enough to keep it finite."""
+    """Return the weak prior information about each parameter, which only keeps estimates finite."""
     finite = np.isfinite(problem.high - problem.low)
     width = np.where(finite, problem.high - problem.low, 0.0)
     return 1.0 / np.where(finite, width, 10.0 * problem.scale) ** 2
 
 
-def cost_of(problem: Problem, vectors: np.ndarray, white: np.ndarray) -> np.ndarray:
-    """Return minus twice the log likelihood of models, and what is known beforehand, (count,)."""
-    known = prior_information(problem) * (vectors - problem.start) ** 2
-    return np.array([robust_square(one) for one in white]) + known.sum(axis=1)
+def costs_of(problem: Problem, vectors: np.ndarray, white: np.ndarray) -> np.ndarray:
+    """Return minus twice the log likelihood of models plus their prior, (num_models,).
+
+    white: their whitened residuals.
+    """
+    prior = prior_information(problem) * (vectors - problem.start) ** 2
+    return np.array([robust_square(one) for one in white]) + prior.sum(axis=1)

@@ -1,0 +1,293 @@
+"""What a log could not have shown or told apart, and what to fly to settle it.
+
+All manoeuvres are flown by the fitted model and seen by the log's sensors with their noise. The Fisher
+information that each would add to the log's decides which one to advise.
+"""
+
+import copy
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from flytrack_env.dynamics import ModelParameters
+from flytrack_env.effects import BY_NAME, EFFECTS
+from flytrack_env.plants import Simulator
+from flytrack_env.state import pack, unpack, unpack_action
+from flytrack_sysid.diagnosis.candidates import CANDIDATES, Candidate
+from flytrack_sysid.diagnosis.lanes import LANE_S, Lanes, make_lanes, voltages_of
+from flytrack_sysid.diagnosis.problem import Problem
+from flytrack_sysid.diagnosis.score_test import Linearization
+from flytrack_sysid.diagnosis.search import FittedModel, SearchState
+from flytrack_sysid.envelope import ANY_VOLTAGE, SCRIPT_HEIGHTS, VOLTAGES, is_inside
+from flytrack_sysid.excitation import DT_S, FLIGHT_STEPS
+from flytrack_sysid.log import FlightLog, log_of_states
+from flytrack_sysid.manoeuvres import FLIGHTS_PER_MANOEUVRE, MANOEUVRES, flights_of, hover_action
+from flytrack_sysid.parameters import TAUS, THRUST_COEFFS, from_vector
+from flytrack_sysid.record import BATTERY_UNKNOWN_V, UPRIGHT
+
+DETECTED = 30.0  # noncentrality from which a log shows an effect nearly always
+SEPARATE = 20.0  # noncentrality beside a rival from which it tells the two apart
+LOOKS_ALIKE = 0.1  # of an effect's noncentrality: what is left of it beside a look-alike
+ROUNDING = 1e-6  # of DETECTED
+BASE_ONLY = ("thrust_scale",)  # no log tells it from the free thrust curve: a cause of the base
+LANES_PER_MANOEUVRE = int(FLIGHTS_PER_MANOEUVRE * FLIGHT_STEPS * DT_S) // LANE_S
+PRIOR_SHARE = 1e-2  # of what shows an effect: less comes from the log's own prior
+NEARLY_BEST = (
+    0.8  # of the best share: a manoeuvre that comes so near is as good, and an easier one comes first
+)
+PLENTY = 30.0  # shares: thirty times what shows an effect
+
+
+def _typical_candidate(effect: str) -> Candidate:
+    """Return the way to look for an effect that is nearest to its notable size."""
+    ways = [one for one in CANDIDATES if one.effect == effect]
+
+    def distance(way: Candidate) -> float:
+        if way.probe is None:
+            return 0.0
+        return float(abs(np.log(way.probe[1] / BY_NAME[effect].notable[way.probe[0].split(".")[1]])))
+
+    return min(ways, key=distance)
+
+
+class Visibility:
+    """How well a log shows an effect: noncentrality of each of its parameters at its notable size."""
+
+    def __init__(self, linearization: Linearization, given: list[int], effect: str):
+        self.linearization, self.given, self.effect = linearization, given, effect
+        way, shapes = _typical_candidate(effect), BY_NAME[effect].shapes
+        notable = BY_NAME[effect].notable
+        fields = [field for field in way.other_fields if field.split(".")[1] not in shapes]
+        self.columns = [linearization.column(field) for field in fields]
+        sizes = [notable[field.split(".")[1]] for field in fields]
+        if way.probe is not None:  # its column comes first, in shares of the way to the probe
+            fields = [way.probe[0], *fields]
+            self.columns.insert(0, linearization.probe_column(way))
+            sizes.insert(0, notable[way.probe[0].split(".")[1]] / way.probe[1])
+        self.fields, self.sizes = fields, np.array(sizes)
+
+    def noncentralities(self, beside: Sequence[int] = ()) -> np.ndarray:
+        """Return the noncentrality of each parameter, all that is free and ``beside`` projected out."""
+        given = self.given + [column for column in beside if column not in self.given]
+        found = np.zeros(len(self.columns))
+        for number, column in enumerate(self.columns):
+            others = [one for one in given if one != column]
+            own = self.linearization.projected([column], others)[0][0, 0]
+            own -= self.linearization.prior[column]  # which does not come from the log
+            found[number] = max(float(own), 0.0) * self.sizes[number] ** 2
+        return found
+
+
+class Limit(NamedTuple):
+    """Of the parameter that is seen worst: smallest detectable size, infinite for none; and look-alikes."""
+
+    smallest: float
+    unit: str
+    look_alikes: tuple[str, ...]
+
+
+def unit_of(effect: str, field: str | None = None) -> str:
+    """Return the unit of an effect's parameter, the first notable one if None."""
+    return BY_NAME[effect].ranges[field or next(iter(BY_NAME[effect].notable))].unit
+
+
+def unseen_effects(state: SearchState, linearization: Linearization, model: FittedModel) -> dict[str, Limit]:
+    """Return effects that the log could not have shown, and how large they would have to be."""
+    given = linearization.columns_at(model.places)
+    result: dict[str, Limit] = {}
+    for effect in BY_NAME:
+        if effect in model.effects or effect in BASE_ONLY:
+            continue
+        if effect in state.unobservable:
+            result[effect] = Limit(float("inf"), unit_of(effect), ())
+            continue
+        visible = Visibility(linearization, given, effect)
+        sizes = visible.noncentralities()
+        worst = int(np.argmin(sizes))
+        if sizes[worst] >= DETECTED:
+            continue
+        field = visible.fields[worst].split(".")[1]
+        smallest = float("inf")
+        if sizes[worst] > DETECTED * ROUNDING:
+            smallest = float(BY_NAME[effect].notable[field] * np.sqrt(DETECTED / sizes[worst]))
+        alike = _look_alikes(state, linearization, given, visible) if sizes[worst] > 0.0 else ()
+        result[effect] = Limit(smallest, unit_of(effect, field), alike)
+    return result
+
+
+def _look_alikes(
+    state: SearchState, linearization: Linearization, given: list[int], visible: Visibility
+) -> tuple[str, ...]:
+    """Return effects beside which this one hardly shows any more."""
+    sizes = visible.noncentralities()
+    result = []
+    for other in EFFECTS:
+        if other.name in (visible.effect, *BASE_ONLY, *state.unobservable):
+            continue
+        beside = visible.noncentralities(Visibility(linearization, given, other.name).columns)
+        if np.any((beside < SEPARATE) & (beside < LOOKS_ALIKE * sizes)):
+            result.append(other.name)
+    return tuple(result)
+
+
+@jax.jit
+def _flown(vector: jax.Array, like: ModelParameters, starts: jax.Array, commands: jax.Array) -> jax.Array:
+    """Return the states of flights, (flights, steps, 21), each before its command."""
+    model, simulator = from_vector(vector, like), Simulator()
+
+    def step(state: Any, action: jax.Array) -> tuple[Any, jax.Array]:
+        return simulator.step(state, unpack_action(action), DT_S, model), pack(simulator.drone(state))
+
+    def fly(start: jax.Array, command: jax.Array) -> jax.Array:
+        return jax.lax.scan(step, simulator.reset(unpack(start), model), command)[1]
+
+    return jax.vmap(fly)(starts, commands)
+
+
+def _until_outside(states: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return flights that stand still once they leave the envelope, and where they are within it."""
+    inside = np.logical_and.accumulate(is_inside(states, SCRIPT_HEIGHTS, ANY_VOLTAGE), axis=1)
+    last = np.maximum.accumulate(np.where(inside, np.arange(states.shape[1]), 0), axis=1)
+    return np.take_along_axis(states, last[..., None], axis=1), inside
+
+
+def _absent_channels(lanes: Lanes) -> list[str]:
+    """Return the channels of states that the log of these lanes did not have."""
+    record, turned, moved = lanes.record, lanes.counts[..., 0, 1].any(), lanes.counts[..., 3, 1].any()
+    present = {
+        "w": "w" in lanes.measured,
+        "a": "f" in lanes.measured,
+        "q": bool(turned or np.any(record.quat != UPRIGHT)),
+        "v": bool(moved),
+        "p": bool(record.pos_w.any()),
+        "v_bat": bool(np.any(record.battery_v != BATTERY_UNKNOWN_V)),
+        "uprev": bool(record.is_applied_known.any()),
+    }
+    return [name for name, is_present in present.items() if not is_present]
+
+
+def _seen_flights(problem: Problem, vector: np.ndarray) -> tuple[FlightLog, np.ndarray]:
+    """Return all manoeuvres flown by a model, seen by the sensors of a problem's log, and rows that count."""
+    model = problem.like._replace(thrust_coeffs=vector[problem.index(THRUST_COEFFS)])
+    voltages = voltages_of(problem.lanes) or VOLTAGES
+    flights = flights_of(MANOEUVRES, hover_action(model, voltages), voltages=voltages)
+    starts = np.stack([one.start for one in flights])
+    commands = np.stack([one.command for one in flights])
+    states, inside = _until_outside(np.asarray(_flown(vector, problem.like, starts, commands)))
+    log = log_of_states(zip(states, commands, strict=True), DT_S, "manoeuvres")
+    return log.without(*_absent_channels(problem.lanes)), inside.reshape(-1)
+
+
+def _in_parts(lanes: Lanes, size: int) -> Iterator[Lanes]:
+    """Return lanes so many at a time, the last ones filled with lanes that count for nothing."""
+    number = lanes.counts.shape[1]
+    for begin in range(0, number, size):
+        places = np.arange(begin, begin + size)
+        part = lanes.selected(np.minimum(places, number - 1))
+        yield part._replace(counts=part.counts & (places < number)[:, None, None])
+
+
+def _information_along(
+    linearization: Linearization, columns: Sequence[int], ahead: Problem, vector: np.ndarray
+) -> np.ndarray:
+    """Return the information of lanes about some columns of a linearization, (lanes, columns, columns)."""
+    end = len(linearization.places)
+    places = [linearization.places[column] for column in columns if column < end]
+    probes = [linearization.probes[column - end] for column in columns if column >= end]
+    others = np.array([probe.placed_in(ahead, vector) for probe in probes]) if probes else None
+    slopes = ahead.slopes(vector, places, others)
+    # A model leaves no residuals of its own flight, and no outliers.
+    slopes = slopes._replace(residuals=np.zeros_like(slopes.residuals))
+    by_block = Linearization(ahead, slopes, probes).by_block
+    return by_block.reshape(-1, ahead.counts.shape[1], *by_block.shape[1:]).sum(axis=0)
+
+
+def information_of_manoeuvres(
+    problem: Problem, model: FittedModel, linearization: Linearization, columns: Sequence[int]
+) -> dict[str, np.ndarray]:
+    """Return the information that each manoeuvre would add to columns of a linearization's ``total``.
+
+    Fisher information at the fitted model, with the noise and the channels of the problem's log;
+    eight flights of 2.5 s each. 0 for other columns. Inside ``jax.enable_x64(True)``.
+    """
+    assert problem.noise is not None
+    columns = sorted(set(columns))
+    log, counts = _seen_flights(problem, model.vector)
+    lanes = make_lanes(log, counts, model.vector[problem.index(TAUS)], float(problem.like.g))
+    by_lane = []
+    # As many lanes at a time as the log has, for which programs are compiled.
+    for part in _in_parts(lanes, problem.counts.shape[1]):
+        ahead = Problem.of(part, problem.like).with_noise(problem.noise)
+        by_lane.append(_information_along(linearization, columns, ahead, model.vector))
+    every = np.concatenate(by_lane)[: len(MANOEUVRES) * LANES_PER_MANOEUVRE]
+    result = {}
+    for name, own in zip(MANOEUVRES, np.split(every, len(MANOEUVRES)), strict=True):
+        result[name] = np.zeros_like(linearization.total)
+        result[name][np.ix_(columns, columns)] = own.sum(axis=0)
+    return result
+
+
+class Question:
+    """An effect that a log did not show, or not beside those that look alike.
+
+    linearization: the log's, at the fitted model, along everything (``SearchState.linearized``).
+    """
+
+    def __init__(
+        self, linearization: Linearization, model: FittedModel, effect: str, alike: Iterable[str] = ()
+    ):
+        self.linearization, self.effect = linearization, effect
+        self.given = linearization.columns_at(model.places)
+        self.alike = [Visibility(linearization, self.given, other).columns for other in alike]
+
+    @property
+    def columns(self) -> list[int]:
+        """The columns of the linearization that the answer depends on."""
+        own = Visibility(self.linearization, self.given, self.effect).columns
+        return [*self.given, *own, *(column for columns in self.alike for column in columns)]
+
+    def shares(self, information: np.ndarray | float = 0.0) -> np.ndarray:
+        """Return how well the effect would show at its notable size, the worst first; from 1 on it does.
+
+        Noncentrality of each of its parameters over DETECTED, and beside each look-alike over SEPARATE.
+        information: added to the log's.
+        """
+        later = copy.copy(self.linearization)
+        later.total = self.linearization.total + information
+        visible = Visibility(later, self.given, self.effect)
+        beside = [visible.noncentralities(columns) / SEPARATE for columns in self.alike]
+        return np.sort(np.concatenate([visible.noncentralities() / DETECTED, *beside]))
+
+
+def _best_manoeuvre(shares: Mapping[str, np.ndarray]) -> str:
+    """Return the easiest manoeuvre whose shares are plenty, or about as large as those of the best.
+
+    The best has the largest worst share; where the worst shows in no manoeuvre, the next one decides.
+    """
+    floored = {name: np.where(own < PRIOR_SHARE, 0.0, own) for name, own in shares.items()}
+    best = max(floored.values(), key=lambda own: own.tolist())
+    return next(
+        name for name, own in floored.items() if np.all(own >= np.minimum(NEARLY_BEST * best, PLENTY))
+    )
+
+
+def advise(
+    problem: Problem, model: FittedModel, linearization: Linearization, wanted: Mapping[str, Sequence[str]]
+) -> dict[str, str]:
+    """Return for each wanted effect the manoeuvre that would show it best, of ``MANOEUVRES``.
+
+    problem: the log's, with its noise. linearization: of the model, along everything
+    (``SearchState.linearized``). wanted: effect -> effects that look alike in this log, maybe none. The best
+    is returned even where it would not do (``Question.shares`` below 1). Inside ``jax.enable_x64(True)``.
+    """
+    if not wanted:
+        return {}
+    questions = [Question(linearization, model, effect, alike) for effect, alike in wanted.items()]
+    columns = [column for question in questions for column in question.columns]
+    added = information_of_manoeuvres(problem, model, linearization, columns)
+    return {
+        question.effect: _best_manoeuvre({name: question.shares(one) for name, one in added.items()})
+        for question in questions
+    }

@@ -1,0 +1,275 @@
+"""Model selection: is each effect needed, does a rival explain as much, can one replace base changes?"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+from scipy import stats
+
+from flytrack_env.dynamics import collective_thrust
+from flytrack_env.effects import BY_NAME
+from flytrack_sysid.diagnosis.candidates import BASE_CAUSES, CANDIDATES
+from flytrack_sysid.diagnosis.problem import Problem
+from flytrack_sysid.diagnosis.score_test import Linearization, inflation_of, solve, threshold
+from flytrack_sysid.diagnosis.search import (
+    MOST_REFITTED,
+    PER_PARAMETER,
+    FittedModel,
+    Held,
+    SearchState,
+    add_effect,
+    score_candidates,
+)
+from flytrack_sysid.parameters import TAUS, THRUST_COEFFS
+
+EQUIVALENT = 10.0  # of chi2: a rival that explains so nearly as much cannot be told apart
+EQUIVALENT_BY_CHANCE = 30.0  # of chi2: where less than EQUIVALENT is expected, it hardly ever is as much
+MOST_RIVALS = 3
+# Rivals are refitted where first order says that they come within so much chi2, or within a share of the
+# gain: first order is less exact for large changes, and least for effects that are looked for at probes.
+NEARLY, NEAR_SHARE, PROBE_SHARE = 60.0, 0.15, 0.25
+CLEARLY_CHEAPER = 0.5  # of cost and price: swaps for less would go back and forth
+IMMATERIAL = 0.01  # of a lag or a drain
+IMMATERIAL_THRUST = 0.003  # of the weight, rms over what was flown
+HOPELESS = 0.01  # of the cost, above the limit to first order: not worth a fit
+
+
+class Ablation(NamedTuple):
+    """One effect of a model against doing without it and against its rivals.
+
+    gain: of chi2 over the model without it, refitted. inflation: of that gain's variance. num_parameters:
+    of its parameters, those that the log determines. rivals: effect -> how much worse the model is with that
+    one instead, of chi2; the better ones are refitted, and those are in ``swaps``. without: the model without
+    the effect.
+    """
+
+    gain: float
+    inflation: float
+    num_parameters: int
+    rivals: Mapping[str, float]
+    swaps: Mapping[str, FittedModel]
+    without: FittedModel
+
+    @property
+    def robust(self) -> float:
+        """The gain over its inflation."""
+        return self.gain / self.inflation
+
+
+def without_effect(state: SearchState, model: FittedModel, effect: str) -> FittedModel:
+    """Return the model without an effect, refitted."""
+    vector = model.vector.copy()
+    places = state.problem.index(model.candidate(effect).fields)
+    vector[places] = state.problem.start[places]  # neutral, or as the given model has it
+    return state.fitted([one for one in model.candidates if one.effect != effect], vector)
+
+
+def ablate(state: SearchState, model: FittedModel, linearization: Linearization, effect: str) -> Ablation:
+    """Return what an effect of a model is worth; linearization: of the model, along everything."""
+    less = without_effect(state, model, effect)
+    # Slopes with the effect serve without it: rivals that come near are refitted.
+    nearby = linearization.moved(less.vector)
+    gain = less.cost - model.cost
+    rivals: dict[str, float] = {}
+    swaps: dict[str, FittedModel] = {}
+    ranked = [one for one in score_candidates(state, nearby, less) if one.candidate.effect != effect]
+    for number, one in enumerate(ranked):
+        rival = one.candidate.effect
+        rivals[rival] = gain - one.gain.chi2
+        share = PROBE_SHARE if one.candidate.probe is not None else NEAR_SHARE
+        if number < MOST_RIVALS and rivals[rival] < max(NEARLY, share * gain):
+            swaps[rival] = add_effect(state, nearby, less, one)
+            rivals[rival] = swaps[rival].cost - model.cost
+    columns = [linearization.column(field) for field in model.candidate(effect).fields]
+    own = linearization.gain(columns, linearization.columns_at(model.places, without=columns))
+    inflation, determined = (1.0, 1) if own is None else (own.inflation, own.num_parameters)
+    return Ablation(gain, inflation, determined, rivals, swaps, less)
+
+
+def select_effects(
+    state: SearchState, model: FittedModel
+) -> tuple[SearchState, FittedModel, dict[str, Ablation]]:
+    """Return the model without effects that it does not need and with better ones swapped in, ablated."""
+    while True:
+        state, linearization = state.linearized(model.vector)
+        ablations = {one.effect: ablate(state, model, linearization, one.effect) for one in model.candidates}
+        margins = {name: one.robust - threshold(one.num_parameters) for name, one in ablations.items()}
+        if margins and min(margins.values()) < 0.0:
+            model = without_effect(state, model, min(margins, key=lambda name: margins[name]))
+            continue
+        swaps = [swap for one in ablations.values() for swap in one.swaps.values()]
+        best = min(swaps, key=price, default=model)
+        if price(best) >= price(model) - CLEARLY_CHEAPER:
+            return state, model, ablations
+        model = best
+
+
+def price(model: FittedModel) -> float:
+    """Return a model's cost and the price of its effects."""
+    return model.cost + PER_PARAMETER * sum(one.num_priced for one in model.candidates)
+
+
+class Separation(NamedTuple):
+    """An effect's noncentrality lambda, and what is left of it beside each rival, to first order.
+
+    lambda: squared norm of its signature with all else that is free projected out.
+    """
+
+    noncentrality: float
+    beside: Mapping[str, float]
+
+
+def separation(problem: Problem, linearization: Linearization, model: FittedModel, effect: str) -> Separation:
+    """Return how clearly a log shows an effect of a model, and tells it from others."""
+    own = model.candidate(effect)
+    columns = [linearization.column(field) for field in own.fields]
+    size = (model.vector - problem.start)[problem.index(own.fields)]
+    given = linearization.columns_at(model.places, without=columns)
+
+    def beside(others: list[int]) -> float:
+        return float(size @ linearization.projected(columns, others)[0] @ size)
+
+    rivals: dict[str, float] = {}
+    for candidate in CANDIDATES:
+        if candidate.effect not in model.effects:
+            left = beside(given + linearization.acting(linearization.columns_of(candidate)))
+            rivals[candidate.effect] = min(left, rivals.get(candidate.effect, np.inf))
+    return Separation(beside(given), rivals)
+
+
+def equivalents(ablation: Ablation, own: Separation) -> tuple[str, ...]:
+    """Return rivals that a log cannot tell from an effect: they explain as much, or chance alone decides."""
+
+    def is_equivalent(rival: str, worse: float) -> bool:
+        is_lost = own.beside.get(rival, own.noncentrality) < EQUIVALENT
+        return worse < EQUIVALENT or (is_lost and worse < EQUIVALENT_BY_CHANCE)
+
+    ranked = sorted(ablation.rivals.items(), key=lambda pair: pair[1])
+    return tuple(rival for rival, worse in ranked if rival in ablation.swaps and is_equivalent(rival, worse))
+
+
+class Marginal:
+    """Information about some free parameters of a model, all others fitted along with them."""
+
+    def __init__(self, linearization: Linearization, model: FittedModel, fields: Sequence[str]):
+        columns = [linearization.column(field) for field in fields]
+        given = linearization.columns_at(model.places, without=columns)
+        self.information, share = linearization.projected(columns, given)
+        blocks = linearization.score_by_block
+        self.scores = blocks[:, columns] - blocks[:, given] @ share
+        self.inflation = inflation_of(self.information, self.scores)
+
+    def half_widths(self) -> np.ndarray:
+        """Return half of each parameter's 95 % interval.
+
+        Its standard deviation is that of the information or, where it is larger, the sandwich estimate from
+        the scores of blocks; Student's t for so many blocks.
+        """
+        covariance = solve(self.information, np.eye(len(self.information)))
+        used = self.scores[np.abs(self.scores).sum(axis=1) > 0.0]
+        number = max(len(used), 2)
+        spread = used.T @ used * number / (number - 1)
+        variance = np.maximum(np.diag(covariance), np.diag(covariance @ spread @ covariance))
+        return np.sqrt(variance) * stats.t.ppf(0.975, number - 1)
+
+
+class BaseChange(NamedTuple):
+    """Base parameters that differ from their nominal values: names, information, chi2 of the difference."""
+
+    fields: list[str]
+    marginal: Marginal
+    gain: float
+
+
+def _is_immaterial(problem: Problem, fields: Sequence[str], model: FittedModel) -> bool:
+    """Return whether a lag, drain or thrust curve differs by less than matters; rounding does as much."""
+    places = problem.index(fields)
+    change = model.vector[places] - problem.start[places]
+    if fields != THRUST_COEFFS:
+        return bool(np.all(np.abs(change) < IMMATERIAL * np.abs(problem.start[places])))
+    record = problem.lanes.record
+    thrust = np.asarray(collective_thrust(record.command[..., 3], record.battery_v, change))
+    weight = float(problem.like.m) * float(problem.like.g)
+    return float(np.sqrt(np.mean(thrust[problem.counts.any(axis=(2, 3))] ** 2))) < IMMATERIAL_THRUST * weight
+
+
+def base_change(
+    state: SearchState, linearization: Linearization, model: FittedModel, fields: Sequence[str]
+) -> BaseChange | None:
+    """Return how the log contradicts nominal values of base parameters; None where it does not, or hardly."""
+    problem, held = state.problem, {one.field for one in state.held}
+    acting = [
+        field for field in fields if field not in held and linearization.acting([linearization.column(field)])
+    ]
+    if not acting or _is_immaterial(problem, fields, model):
+        return None
+    places = problem.index(acting)
+    marginal = Marginal(linearization, model, acting)
+    change = model.vector[places] - problem.start[places]
+    gain = float(change @ marginal.information @ change)
+    if gain / marginal.inflation < threshold(len(acting)):
+        return None
+    return BaseChange(acting, marginal, gain)
+
+
+def base_changes(
+    state: SearchState, linearization: Linearization, model: FittedModel
+) -> dict[str, BaseChange]:
+    """Return the causes of the base that the log shows, by name."""
+    found = {name: base_change(state, linearization, model, fields) for name, fields in BASE_CAUSES.items()}
+    return {name: one for name, one in found.items() if one is not None}
+
+
+def explain_base_by_effect(state: SearchState, model: FittedModel) -> tuple[SearchState, FittedModel | None]:
+    """Return a model with one effect more and base parameters held at nominal, if it explains as much.
+
+    A delay of all commands, say, looks like four longer lags.
+    """
+    state, linearization = state.linearized(model.vector)
+    changes = base_changes(state, linearization, model).values()
+    changed = tuple(field for one in changes for field in one.fields)
+    lags = tuple(field for field in changed if field in TAUS)
+    for fields in dict.fromkeys((changed, lags)):
+        if fields:
+            state, simpler = _best_instead(state, model, fields)
+            if simpler is not None:
+                return state, simpler
+    return state, None
+
+
+def _best_instead(
+    state: SearchState, model: FittedModel, fields: Sequence[str]
+) -> tuple[SearchState, FittedModel | None]:
+    """Return the best model with at most one effect more while base parameters are held, if it is better."""
+    problem, held = state.problem, state.held
+    state = replace(state, held=(*held, *(Held(field, "") for field in fields)))
+    vector = model.vector.copy()
+    vector[problem.index(fields)] = problem.start[problem.index(fields)]
+    less = state.fitted(model.candidates, vector)
+    state, nearby = state.linearized(less.vector)
+    limit = model.cost + PER_PARAMETER * len(fields)
+    best = less if less.cost < limit else None
+    for one in score_candidates(state, nearby, less)[:MOST_REFITTED]:
+        if less.cost - one.gain.chi2 > limit + less.cost * HOPELESS and one.candidate.probe is None:
+            continue
+        trial = add_effect(state, nearby, less, one)
+        cost = trial.cost + PER_PARAMETER * one.candidate.num_priced
+        if cost < limit:
+            state, determined = is_determined(state, trial, one.candidate.fields)
+            best, limit = (trial, cost) if determined else (best, limit)
+    if best is None:
+        return replace(state, held=held), None
+    effect = "".join(best.effects - model.effects)
+    return replace(state, held=(*held, *(Held(field, effect) for field in fields))), best
+
+
+def is_determined(state: SearchState, model: FittedModel, fields: Sequence[str]) -> tuple[SearchState, bool]:
+    """Return whether a log tells one of an effect's parameters, those of a model, from having no effect."""
+    problem = state.problem
+    places = problem.index(fields)
+    change = np.abs(model.vector[places] - problem.start[places])
+    acting = [field.split(".")[1] not in BY_NAME[field.split(".")[0]].shapes for field in fields]
+    state, linearization = state.linearized(model.vector)
+    half_widths = Marginal(linearization, model, fields).half_widths()
+    return state, bool(np.any((change > half_widths) & acting))

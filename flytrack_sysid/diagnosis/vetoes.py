@@ -1,0 +1,268 @@
+"""Vetoes: rules that reject an effect or a base change although it gains enough where it was fitted.
+
+``VETOES`` is the one list of rules on a selected model; each returns the effects that it rejects. A rejected
+effect is not searched for again, the model is selected again without it, and the rules start over.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from flytrack_env.effects import BY_NAME
+from flytrack_sysid.diagnosis.model_selection import (
+    Ablation,
+    base_changes,
+    explain_base_by_effect,
+    select_effects,
+    without_effect,
+)
+from flytrack_sysid.diagnosis.problem import Problem, blocks_of
+from flytrack_sysid.diagnosis.regressors import constants
+from flytrack_sysid.diagnosis.result import CHANNELS, Unexplained
+from flytrack_sysid.diagnosis.score_test import threshold
+from flytrack_sysid.diagnosis.search import FittedModel, SearchState
+from flytrack_sysid.diagnosis.unexplained import (
+    SIDES,
+    Dependence,
+    SideTest,
+    find_unexplained,
+    flight_of,
+    linearized_residuals,
+    whitened,
+)
+
+# Held-out rows contradict a cause where it gains so many standard deviations less than it would if it were
+# there, and less than that share of its size is there: laws are not exact where they are flown harder.
+HELD_OUT_SIGMAS, HELD_OUT_SHARE = 4.0, 0.35
+HELD_OUT_SHOWN = 20.0  # of chi2: held-out rows that would show less contradict nothing
+# A choice among many effects finds what fits the noise of one log: an effect that gains less than so many
+# thresholds has to gain on held-out rows, too, if they would show that much chi2 of it.
+BARELY, BARELY_SHOWN = 2.0, 1.0
+# No law of a force is exact to 5 % of the force, 1/400 of what it explains: an effect with less than that
+# beside another one is the remainder of the other's law.
+FORCE_REMAINDER = 0.0025
+# The same for a base change beside an effect that shows in the same channels: lags and thrust curves absorb
+# remainders more easily than a law does, so that the share is larger.
+BASE_REMAINDER = 0.01
+# A name on a side that something unknown disturbs needs so many thresholds; one that keeps less than that
+# share of its noncentrality beside what the unknown depends on stood in for it.
+DISTURBED, KEPT_SHARE = 3.0, 0.1
+
+
+class Selection(NamedTuple):
+    """A selected model, what it leaves unexplained, and the state of the search that led to it.
+
+    base: the refitted model without effects. ablations: of each effect of the model. stand_ins: effects and
+    causes in the base that stand in for something unknown.
+    """
+
+    state: SearchState
+    base: FittedModel
+    model: FittedModel
+    ablations: dict[str, Ablation]
+    unexplained: Unexplained = Unexplained()
+    stand_ins: tuple[str, ...] = ()
+
+
+Veto = Callable[[Selection, Problem], list[str]]
+
+
+class Rejection(NamedTuple):
+    """An effect that a veto has rejected; veto: the function's name."""
+
+    effect: str
+    veto: str
+
+
+def select(state: SearchState, base: FittedModel, model: FittedModel) -> Selection:
+    """Return the model with effects swapped, removed, or put in place of base changes where that helps."""
+    state, model, ablations = select_effects(state, model)
+    while True:
+        state, simpler = explain_base_by_effect(state, model)
+        if simpler is None:
+            return Selection(state, base, model, ablations)
+        state, model, ablations = select_effects(state, simpler)
+
+
+def reject(selection: Selection, effects: Sequence[str]) -> Selection:
+    """Return the selection without some effects, which are refused from now on; their base is free again."""
+    state, model = selection.state, selection.model
+    freed = {one.field for one in state.held if one.effect in effects}
+    held = tuple(one for one in state.held if one.field not in freed)
+    state = replace(state, refused=(*state.refused, *effects), held=held)
+    for effect in effects:
+        model = without_effect(state, model, effect)
+    state, model, ablations = select_effects(state, model)
+    return Selection(state, selection.base, model, ablations)
+
+
+def apply_vetoes(
+    selection: Selection, test: Problem, vetoes: Sequence[tuple[Veto, ...]] | None = None
+) -> tuple[Selection, list[Rejection]]:
+    """Return the selection without effects that a veto rejects, and those in the order of rejection.
+
+    test: held-out rows, with the noise of the selection's problem. vetoes: ``VETOES`` if None.
+    """
+    rejections: list[Rejection] = []
+    selection = examined(selection)
+    while True:
+        for rules in VETOES if vetoes is None else vetoes:
+            by_effect = {effect: rule.__name__ for rule in rules for effect in rule(selection, test)}
+            if by_effect:
+                rejections += [Rejection(effect, rule) for effect, rule in by_effect.items()]
+                selection = examined(reject(selection, tuple(by_effect)))
+                break
+        else:
+            return selection, rejections
+
+
+def examined(selection: Selection) -> Selection:
+    """Return the selection with what it leaves unexplained, and the names that stand in for that."""
+    problem, model = selection.state.problem, selection.model
+    rest, dependences = find_unexplained(problem, model, selection.base.vector)
+    selection = selection._replace(unexplained=rest, stand_ins=())
+    if not rest.flagged:
+        return selection
+    suspects = [
+        Suspect(one.effect, one.fields, weight.robust, weight.num_parameters)
+        for one, weight in zip(model.candidates, selection.ablations.values(), strict=True)
+    ]
+    state, linearization = selection.state.linearized(model.vector)
+    for name, change in base_changes(state, linearization, model).items():
+        robust = change.gain / change.marginal.inflation
+        suspects.append(Suspect(name, tuple(change.fields), robust, len(change.fields)))
+    names = find_stand_ins(problem, model, suspects, rest, dependences)
+    return selection._replace(state=state, stand_ins=tuple(names))
+
+
+class Suspect(NamedTuple):
+    """A name, its parameters, gain over its inflation, and how many parameters the log determines."""
+
+    name: str
+    fields: tuple[str, ...]
+    robust: float
+    num_parameters: int
+
+
+def find_stand_ins(
+    problem: Problem,
+    model: FittedModel,
+    suspects: Sequence[Suspect],
+    rest: Unexplained,
+    dependences: Sequence[Dependence],
+) -> list[str]:
+    """Return names that stand in for something that no list has.
+
+    Their gain is gone beside smooth functions of what the rest depends on (with the constants of those,
+    which a wind, say, would be), or is small where something unknown disturbs the same side.
+    """
+    left, slopes = linearized_residuals(problem, model)
+    flight = flight_of(problem, model)
+    disturbed = {name.split(":")[0] for name in rest.shares}
+
+    def noncentralities(one: Suspect, side: str) -> tuple[float, float]:
+        """Return a suspect's noncentrality on a side, and what is left beside what the rest depends on."""
+        axes = SIDES[side]
+        own = [model.places.index(place) for place in problem.index(one.fields)]
+        acting = slopes[own][..., axes, :]
+        if not (problem.counts[..., axes, :].any() and np.abs(acting).max() > 0.0):
+            return 0.0, 0.0
+        test = SideTest.of(side, left, np.delete(slopes, own, axis=0))
+        columns = blocks_of(acting * test.root)
+        size = (model.vector - problem.start)[problem.index(one.fields)]
+        before = test.noncentrality(columns, size)
+        more = [dependence.columns for dependence in dependences if dependence.side == side]
+        if more:
+            more.append(blocks_of(whitened(problem, constants(flight, side), side) * test.root))
+        return before, test.given_also(*more).noncentrality(columns, size)
+
+    result = []
+    for one in suspects:
+        by_side = {side: noncentralities(one, side) for side in SIDES}
+        before, after = (sum(values) for values in zip(*by_side.values(), strict=True))
+        if before == 0.0:
+            continue  # it acts on neither side: the battery
+        own_side = max(by_side, key=lambda side: by_side[side][0])
+        least = threshold(one.num_parameters)
+        is_gone = after < max(KEPT_SHARE * before, least)
+        if is_gone or (own_side in disturbed and one.robust < DISTURBED * least):
+            result.append(one.name)
+    return result
+
+
+def stands_in_for_unknown(selection: Selection, test: Problem) -> list[str]:
+    """Reject effects that stand in for something that no list has."""
+    return [effect for effect in selection.ablations if effect in selection.stand_ins]
+
+
+def held_out_gain(test: Problem, less: np.ndarray, full: np.ndarray) -> tuple[float, float]:
+    """Return what a model gains over a lesser one on other rows, and what it would if it were right there."""
+    white = test.whitened_residuals(less, full)
+    gain = float(np.sum(white[0] ** 2) - np.sum(white[1] ** 2))
+    return gain, float(np.sum((white[0] - white[1]) ** 2))
+
+
+def is_contradicted(gain: float, expected: float, inflation: float) -> bool:
+    """Return whether a gain on held-out rows says that a cause is not there.
+
+    expected: the gain if it were; its spread is that of a chi2 about it.
+    """
+    if expected < HELD_OUT_SHOWN * inflation:
+        return False
+    spread = 2.0 * np.sqrt(expected * inflation)
+    share = 0.5 * (1.0 + gain / expected)
+    return bool(gain < expected - HELD_OUT_SIGMAS * spread and share < HELD_OUT_SHARE)
+
+
+def contradicted_on_held_out(selection: Selection, test: Problem) -> list[str]:
+    """Reject effects of which held-out rows show too little: they were there for a time only, or never."""
+
+    def is_rejected(one: Ablation) -> bool:
+        gain, expected = held_out_gain(test, one.without.vector, selection.model.vector)
+        return is_contradicted(gain, expected, one.inflation)
+
+    return [effect for effect, one in selection.ablations.items() if is_rejected(one)]
+
+
+def _is_force_law(effect: str) -> bool:
+    """Return whether an effect is a law of a force, which may be wrong in form; a scale of thrust is not."""
+    one = BY_NAME[effect]
+    acts = one.thrust is not None or one.air is not None or one.force is not None
+    return acts and effect != "thrust_scale"
+
+
+def remainder_of_force_law(selection: Selection, test: Problem) -> list[str]:
+    """Reject laws of a force that explain next to nothing beside another one."""
+    gains = {effect: one.gain for effect, one in selection.ablations.items() if _is_force_law(effect)}
+    return [effect for effect, gain in gains.items() if gain < FORCE_REMAINDER * max(gains.values())]
+
+
+def seen_once(selection: Selection, test: Problem) -> list[str]:
+    """Reject effects that gain barely enough where they were fitted, and nothing on held-out rows."""
+
+    def is_rejected(one: Ablation) -> bool:
+        if one.robust >= BARELY * threshold(one.num_parameters):
+            return False
+        gain, expected = held_out_gain(test, one.without.vector, selection.model.vector)
+        return gain < 0.0 and expected > BARELY_SHOWN
+
+    return [effect for effect, one in selection.ablations.items() if is_rejected(one)]
+
+
+# Rules in one row act together, on the same selection.
+VETOES: tuple[tuple[Veto, ...], ...] = (
+    (stands_in_for_unknown,),
+    (contradicted_on_held_out,),
+    (remainder_of_force_law, seen_once),
+)
+
+
+def is_base_remainder(gain: float, channel: str, others: Sequence[tuple[str, float]]) -> bool:
+    """Return whether a base change gains next to nothing beside a cause that shows in the same channels.
+
+    others: channel and gain of each.
+    """
+    side = next(names for names in CHANNELS if channel in names)
+    return gain < BASE_REMAINDER * max((size for name, size in others if name in side), default=0.0)
