@@ -17,15 +17,11 @@ from flytrack_env.plants import Simulator
 from flytrack_sysid import collect
 from flytrack_sysid.diagnosis import DiagnosisError, diagnose, joined, regressors
 from flytrack_sysid.diagnosis import noise as noises
-from flytrack_sysid.diagnosis.candidates import CANDIDATES
-from flytrack_sysid.diagnosis.diagnose import left_out
+from flytrack_sysid.diagnosis.diagnose import unused_channels
 from flytrack_sysid.diagnosis.lanes import LANE_S, LEAD_IN_S, NUM_AXES, make_lanes, thinned
-from flytrack_sysid.diagnosis.pipeline import taken_back
 from flytrack_sysid.diagnosis.problem import Problem
-from flytrack_sysid.diagnosis.search import fitted, full_outlook
-from flytrack_sysid.parameters import TAUS
 from flytrack_sysid.record import make_record
-from flytrack_sysid.replay import replay
+from flytrack_sysid.residuals import predict_rows
 
 SECONDS, DT_S = 40.0, 0.01
 RATE = 100  # rows a second
@@ -148,24 +144,24 @@ def test_lanes_are_only_where_something_is_judged(flown):
     assert (np.diff(lead_in[:, :5], axis=0) == 1).all()  # flown for real, also where it is not judged
 
 
-def test_lanes_say_what_one_long_replay_says(flown, lanes):
+def test_lanes_agree_with_one_long_replay(flown, lanes):
     truth, log = flown
     model = model_of(truth).with_effects(
         CommandDelay(0.013), SecondOrderRates(0.01), LinearDrag(0.3, 0.3, 0.1)
     )
     with jax.enable_x64(True):
-        problem = Problem(lanes, model)
-        left = problem.left(problem.start[None])[0]
+        problem = Problem.of(lanes, model)
+        left = problem.residuals(problem.start[None])[0]
         like = jax.tree.map(lambda leaf: np.asarray(leaf, float), model)
         record = make_record(log)
-        said = jax.tree.map(np.asarray, jax.jit(replay)(like, record, np.ones(len(record.step_s), bool)))
+        predicted = jax.tree.map(np.asarray, jax.jit(predict_rows)(like, record, record.begins))
     before = Rotation.from_quat(np.roll(record.quat, 1, axis=0), scalar_first=True)
     source = record.source_row
     expected = {
-        (0, 0): before.apply(log["w"][source] - said.rates_b),
-        (3, 0): before.apply(log["f"][source] - said.force_b),
+        (0, 0): before.apply(log["w"][source] - predicted.rates_b),
+        (3, 0): before.apply(log["f"][source] - predicted.force_b),
         (3, 1): np.diff(record.vel_w, axis=0, prepend=record.vel_w[:1])
-        - said.acc_w * np.roll(record.step_s, 1)[:, None],
+        - predicted.acc_w * np.roll(record.step_s, 1)[:, None],
     }
     for (axis, channel), one in expected.items():
         axes = slice(axis, axis + 3)
@@ -184,7 +180,7 @@ def test_a_bump_is_about_a_place_on_the_way_and_along_one_axis(flown, lanes):
         axis = number % regressors.BUMP_SIZE
         assert np.all(feature[..., np.arange(3) != axis] == 0.0)
         size = feature[..., axis]
-        peak = np.unravel_index(np.argmax(np.where(flight.counts, size, 0.0)), size.shape)
+        peak = np.unravel_index(np.argmax(np.where(flight.is_counted, size, 0.0)), size.shape)
         assert size[peak] == pytest.approx(1.0)
         away = np.linalg.norm(flight.pos_w - flight.pos_w[peak], axis=-1)
         assert size[away > 4.0 * max(regressors.BUMP_WIDTHS_M)].max(initial=0.0) < 1e-3
@@ -196,8 +192,8 @@ def test_the_simulator_leaves_nothing_of_its_own_log():
     model = nominal_parameters()
     with jax.enable_x64(True):
         found = make_lanes(log, np.ones(len(log), bool), np.asarray(model.tau, float), float(model.g))
-        problem = Problem(found, model)
-        left = problem.left(problem.start[None])[0]
+        problem = Problem.of(found, model)
+        left = problem.residuals(problem.start[None])[0]
     # The log is in float32: positions of 60 m, speeds of 20 m/s, 24 V.
     largest = np.where(found.counts, np.abs(left), 0.0).max(axis=(0, 1))
     assert np.all(largest[:3] < 2e-5) and np.all(largest[3:6, 0] < 1e-3) and np.all(largest[3:6, 1] < 2e-5)
@@ -219,34 +215,7 @@ def test_held_out_rows_of_another_shape_are_refused(flown, held_out):
         diagnose(log, held_out=held_out)
 
 
-def assert_refused_or_silent(log, **given) -> None:
-    """Check that a log that says too little is refused, or that nothing is made of it."""
-    try:
-        found = diagnose(log, **given)
-    except DiagnosisError as error:
-        assert "found" in str(error) and "expected" in str(error)
-        return
-    assert found.causes == () and not found.unexplained.flagged
-    json.dumps(found.as_json(), allow_nan=False)
-
-
-def test_a_log_without_rows_is_refused(flown):
-    with pytest.raises(DiagnosisError, match="found 0 rows"):
-        diagnose(flown[1].select(slice(0, 0)))
-
-
-@pytest.mark.slow  # programs of their own have to be compiled
-@pytest.mark.parametrize("rows", [1, 2, 5, 40])
-def test_nothing_is_made_of_a_few_rows(flown, rows):
-    assert_refused_or_silent(flown[1].select(slice(0, rows)), model=model_of(flown[0]))
-
-
 @pytest.mark.slow
-def test_nothing_is_learnt_from_what_is_held_out(flown):
-    log = flown[1]
-    assert_refused_or_silent(log, model=model_of(flown[0]), held_out=np.ones(len(log), bool))
-
-
 def test_what_a_given_model_has_too_much_is_taken_out_again(flown):
     truth, log = flown
     model = model_of(truth)._replace(battery_drain_v_per_min=0.0)
@@ -259,37 +228,21 @@ def test_what_a_given_model_has_too_much_is_taken_out_again(flown):
     assert drain.parameters["battery_drain_v_per_min"].value == pytest.approx(truth.drain, rel=0.05)
 
 
-def test_what_was_held_for_an_effect_is_free_without_it(flown, lanes):
-    with jax.enable_x64(True):
-        problem = Problem(lanes, model_of(flown[0]))
-        problem.set_noise(noises.first_guess(lanes, problem.left(problem.start[None])[0]))
-        delay = next(one for one in CANDIDATES if one.effect == "command_delay")
-        problem.held, problem.held_for = (*TAUS, "c0"), {"command_delay": TAUS, "wind": ("c0",)}
-        found = fitted(problem, (delay,), problem.start)
-        left, _ = taken_back(problem, found, ["command_delay"])
-    assert problem.held == ("c0",) and "command_delay" in problem.refused
-    assert left.chosen == () and set(problem.index(TAUS)) <= set(left.places)
-
-
-def test_a_model_with_an_effect_that_had_no_slope_is_not_nearby(flown, lanes):
-    with jax.enable_x64(True):
-        problem = Problem(lanes, model_of(flown[0]))
-        problem.set_noise(noises.first_guess(lanes, problem.left(problem.start[None])[0]))
-        outlook = full_outlook(problem, problem.start)
-        limited, lagging = problem.start.copy(), problem.start.copy()
-        limited[problem.names.index("rate_slew_limit.inverse")] = 0.003
-        lagging[problem.names.index("tau_roll")] *= 1.0001
-        assert outlook.distance(limited) == np.inf and 0.0 < outlook.distance(lagging) < 1.0
-        assert full_outlook(problem, lagging).slopes is outlook.slopes
-        column = full_outlook(problem, limited).column("rate_slew_limit.inverse")
-        assert problem.last_outlook.total[column, column] > 1e3 * outlook.total[column, column]
+@pytest.mark.slow  # programs of their own have to be compiled
+@pytest.mark.parametrize("rows", [1, 2, 40, None])
+def test_nothing_is_made_of_a_few_rows_or_of_held_out_ones(flown, rows):
+    truth, log = flown
+    few = log.select(slice(0, rows))
+    found = diagnose(few, model_of(truth), np.full(len(few), rows is None))
+    assert found.causes == () and not found.unexplained.flagged
+    json.dumps(found.as_json(), allow_nan=False)
 
 
 def test_delays_end_where_no_older_row_is_remembered(flown):
     truth, log = flown
     quick = replace(log, time=0.1 * log.time)  # 1 kHz
     lanes = make_lanes(quick, np.ones(len(log), bool), np.array(truth.tau), truth.gravity)
-    problem = Problem(lanes, model_of(truth))
+    problem = Problem.of(lanes, model_of(truth))
     place = problem.names.index("command_delay.delay_s")
     assert problem.high[place] == pytest.approx(BUFFER_STEPS * 0.001, rel=1e-3)
 
@@ -304,11 +257,11 @@ def test_of_a_long_log_lanes_are_looked_at_evenly(lanes, monkeypatch):
     assert fewer.record.pos_w.shape == (*fewer.row.shape, 3)
 
 
-def test_channels_that_some_logs_lack_are_told(flown):
+def test_channels_that_some_logs_lack_are_warned_of(flown):
     first = replace(flown[1].select(slice(0, 30)), source="folder/a.npz")
     second = replace(flown[1].select(slice(30, 50)).without("f"), source="b.npz")
-    assert left_out([first, second]) == ["channel f is not used: b.npz has none"]
-    assert left_out([first, first]) == []
+    assert unused_channels([first, second]) == ["channel f is not used: b.npz has none"]
+    assert unused_channels([first, first]) == []
 
 
 def test_logs_are_joined_by_what_they_all_have(flown):

@@ -6,21 +6,23 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from flytrack_sysid.diagnosis.base import Covered
+from flytrack_sysid.diagnosis.model_selection import Marginal
+from flytrack_sysid.diagnosis.score_test import Linearization
 
 BLOCKS, FREE = 45, ("given", "first", "second")
 
 
-def outlook_of(scores: np.ndarray, information: np.ndarray) -> SimpleNamespace:
-    """An outlook along three parameters: what seconds say of them, (BLOCKS, 3), and their information."""
-    return SimpleNamespace(
-        places=[0, 1, 2], total=information, score_by_block=scores, column=lambda name: FREE.index(name)
-    )
+def linearization_of(scores: np.ndarray, information: np.ndarray) -> Linearization:
+    """Return a linearization along three parameters, of scores of seconds (BLOCKS, 3) and information."""
+    found = object.__new__(Linearization)
+    found.places, found.total, found.score_by_block = [0, 1, 2], information, scores
+    found.problem = SimpleNamespace(names=FREE)
+    return found
 
 
 def half_widths(scores: np.ndarray, information: np.ndarray) -> np.ndarray:
-    found = SimpleNamespace(places=(0, 1, 2))
-    return Covered(outlook_of(scores, information), found, FREE[1:]).half_widths()
+    model = SimpleNamespace(places=(0, 1, 2))
+    return Marginal(linearization_of(scores, information), model, FREE[1:]).half_widths()
 
 
 @pytest.fixture

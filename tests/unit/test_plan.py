@@ -11,11 +11,11 @@ import pytest
 from flytrack_env.dynamics import nominal_parameters
 from flytrack_env.plants import Simulator
 from flytrack_sysid import FlightLog, collect
+from flytrack_sysid.diagnosis.identifiability import Question, advise, information_of_manoeuvres
 from flytrack_sysid.diagnosis.lanes import make_lanes
-from flytrack_sysid.diagnosis.linear import Outlook
-from flytrack_sysid.diagnosis.plan import Question, advise, information_of_manoeuvres
 from flytrack_sysid.diagnosis.problem import Problem
-from flytrack_sysid.diagnosis.search import Found, base_places, full_outlook
+from flytrack_sysid.diagnosis.score_test import Linearization
+from flytrack_sysid.diagnosis.search import FittedModel, SearchState
 from flytrack_sysid.manoeuvres import MANOEUVRES, flights_of, hover_action
 from flytrack_sysid.script_file import script_of
 
@@ -59,12 +59,12 @@ class Drone(Simulator):
 
 
 class Logged(NamedTuple):
-    """A log, its problem, the model that is right, and the outlook of it."""
+    """A log, its problem, the model that is right, and its linearization."""
 
     log: FlightLog
     problem: Problem
-    found: Found
-    outlook: Outlook
+    model: FittedModel
+    linearization: Linearization
 
 
 def noise_of_sensors() -> np.ndarray:
@@ -74,16 +74,11 @@ def noise_of_sensors() -> np.ndarray:
     return np.concatenate([np.log([direct, level]), np.log(rest), np.zeros((1, 7))])
 
 
-def problem_of(log: FlightLog) -> Problem:
-    problem = Problem(make_lanes(log, np.ones(len(log), bool), np.asarray(MODEL.tau, float), MODEL.g), MODEL)
-    problem.set_noise(noise_of_sensors())
-    return problem
-
-
 def logged(log: FlightLog) -> Logged:
-    problem = problem_of(log)
-    found = Found((), problem.start, 0.0, tuple(base_places(problem)))
-    return Logged(log, problem, found, full_outlook(problem, found.vector))
+    lanes = make_lanes(log, np.ones(len(log), bool), np.asarray(MODEL.tau, float), MODEL.g)
+    state = SearchState(Problem.of(lanes, MODEL).with_noise(noise_of_sensors()))
+    model = FittedModel((), state.problem.start, 0.0, tuple(state.base_places))
+    return Logged(log, state.problem, model, state.linearized(model.vector)[1])
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -109,23 +104,24 @@ def told() -> Callable[[str], np.ndarray]:
 
     @cache
     def told_by(name: str) -> np.ndarray:
-        return logged(log.select(kinds == name)).outlook.by_block.sum(axis=0)
+        return logged(log.select(kinds == name)).linearization.by_block.sum(axis=0)
 
     return told_by
 
 
 def test_a_hovering_log_cannot_tell_wind_from_tilt(hover):
     alone, beside = (
-        Question(hover.outlook, hover.found, "thrust_tilt", alike).shares()[0] for alike in ((), ("wind",))
+        Question(hover.linearization, hover.model, "thrust_tilt", alike).shares()[0]
+        for alike in ((), ("wind",))
     )
     assert alone > 1.0 > 10.0 * beside
 
 
 def test_what_is_advised_shows_once_it_is_flown(hover, told):
-    advice = advise(hover.problem, hover.found, hover.outlook, WANTED)
+    advice = advise(hover.problem, hover.model, hover.linearization, WANTED)
     assert set(advice) == set(WANTED)
     for effect, alike in WANTED.items():
-        question = Question(hover.outlook, hover.found, effect, alike)
+        question = Question(hover.linearization, hover.model, effect, alike)
         assert advice[effect] in EXPECTED[effect], effect
         before, after = question.shares()[0], question.shares(told(advice[effect]))[0]
         assert before < 1.0 <= after, f"{effect}: {before} before and {after} after {advice[effect]}"
@@ -133,8 +129,8 @@ def test_what_is_advised_shows_once_it_is_flown(hover, told):
 
 def test_what_is_promised_is_what_collecting_brings(hover, told):
     """Each manoeuvre gets its own lanes: others would promise something else by orders of magnitude."""
-    question = Question(hover.outlook, hover.found, "yaw_reaction")
-    ahead = information_of_manoeuvres(hover.problem, hover.found, hover.outlook, question.columns)
+    question = Question(hover.linearization, hover.model, "yaw_reaction")
+    ahead = information_of_manoeuvres(hover.problem, hover.model, hover.linearization, question.columns)
     assert list(ahead) == list(MANOEUVRES)
     promised = {name: question.shares(one)[0] for name, one in ahead.items()}
     for name in ("low_passes", "speeds", "thrust_steps"):
@@ -144,17 +140,17 @@ def test_what_is_promised_is_what_collecting_brings(hover, told):
 
 def test_sensors_that_the_log_lacks_tell_nothing_ahead_either(hover):
     blind = logged(hover.log.without("v_bat"))
-    question = Question(blind.outlook, blind.found, "voltage_sag")
-    ahead = information_of_manoeuvres(blind.problem, blind.found, blind.outlook, question.columns)
+    question = Question(blind.linearization, blind.model, "voltage_sag")
+    ahead = information_of_manoeuvres(blind.problem, blind.model, blind.linearization, question.columns)
     assert max(question.shares(one)[0] for one in ahead.values()) < 0.01
 
 
 def test_nothing_wanted_nothing_advised(hover):
-    assert advise(hover.problem, hover.found, hover.outlook, {}) == {}
+    assert advise(hover.problem, hover.model, hover.linearization, {}) == {}
 
 
 def test_there_is_advice_even_where_nothing_would_do(hover, told):
     """No flight of a drone without drag tells the scale of an accelerometer sideways."""
-    advice = advise(hover.problem, hover.found, hover.outlook, {"accelerometer_scale": ()})
-    question = Question(hover.outlook, hover.found, "accelerometer_scale")
+    advice = advise(hover.problem, hover.model, hover.linearization, {"accelerometer_scale": ()})
+    question = Question(hover.linearization, hover.model, "accelerometer_scale")
     assert question.shares(told(advice["accelerometer_scale"]))[0] < 0.01

@@ -1,0 +1,195 @@
+"""Which effects vetoes reject although they gain enough, and what a reader is warned of."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import jax
+import numpy as np
+import pytest
+
+from benchmarks.diagnosis import model_of
+from benchmarks.hidden import draw_base, fly, measure
+from flytrack_env.effects import BY_NAME
+from flytrack_sysid.diagnosis import vetoes
+from flytrack_sysid.diagnosis.candidates import CANDIDATES
+from flytrack_sysid.diagnosis.diagnose import thinning_warning
+from flytrack_sysid.diagnosis.lanes import LANE_S, make_lanes, thinned
+from flytrack_sysid.diagnosis.model_selection import Ablation, is_determined
+from flytrack_sysid.diagnosis.noise import first_guess
+from flytrack_sysid.diagnosis.problem import Problem
+from flytrack_sysid.diagnosis.result import Cause, Errors, Estimated
+from flytrack_sysid.diagnosis.score_test import threshold
+from flytrack_sysid.diagnosis.search import FittedModel, Held, SearchState
+from flytrack_sysid.diagnosis.summary import warnings_of
+from flytrack_sysid.diagnosis.vetoes import HELD_OUT_SHOWN, Selection, is_contradicted, reject
+from flytrack_sysid.parameters import TAUS
+
+LIFT_GAIN = 20_000.0
+CAUSE = Cause("rate_scale", (), "rates", {}, 100.0, 30.0, 100.0, 90.0)
+AS_GOOD = {"refitted_base": Errors({}, {"1": 0.5}), "extended": Errors({}, {"1": 0.5})}
+
+
+@pytest.fixture(scope="module")
+def state():
+    """The state of a search in twenty seconds of flight without effects."""
+    rng = np.random.default_rng(3)
+    truth = draw_base(rng)
+    log = measure(fly(truth, "scripted", 20.0, rng), "sensors", rng)  # high up: no ground near
+    with jax.enable_x64(True):
+        lanes = make_lanes(log, np.ones(len(log), bool), np.array(truth.tau), truth.gravity)
+        problem = Problem.of(lanes, model_of(truth))
+        noise = first_guess(lanes, problem.residuals(problem.start[None])[0])
+        yield SearchState.start(log, problem.with_noise(noise))
+
+
+def ablation(gain: float, num_parameters: int = 1, inflation: float = 1.0) -> Ablation:
+    without = SimpleNamespace(vector=np.zeros(1))
+    return Ablation(gain, inflation, num_parameters, {}, {}, without)
+
+
+def selection_of(**ablations: Ablation) -> Selection:
+    return Selection(None, None, SimpleNamespace(vector=np.zeros(1)), ablations)
+
+
+def test_next_to_nothing_beside_a_larger_law_is_its_remainder():
+    for factor, expected in ((0.99, ["wind"]), (1.01, [])):
+        small = ablation(factor * vetoes.FORCE_REMAINDER * LIFT_GAIN)
+        selection = selection_of(translational_lift=ablation(LIFT_GAIN), wind=small)
+        assert vetoes.remainder_of_force_law(selection, None) == expected
+
+
+@pytest.mark.parametrize(
+    ("large", "small"),
+    [
+        ("thrust_scale", "linear_drag"),  # a factor is right or not
+        ("rate_scale", "wind"),  # turns say nothing of forces
+        ("rotor_drag", "voltage_sag"),  # which the battery shows
+        ("rotor_drag", "accelerometer_bias"),
+        ("rotor_drag", "thrust_lag_asymmetry"),
+    ],
+)
+def test_only_laws_of_a_force_leave_remainders(large, small):
+    assert {large, small} <= BY_NAME.keys()
+    selection = selection_of(**{large: ablation(1e9), small: ablation(20.0)})
+    assert vetoes.remainder_of_force_law(selection, None) == []
+
+
+@pytest.mark.parametrize(
+    ("thresholds", "held_out", "expected", "is_named"),
+    [
+        (1.9, -0.5, 9.0, False),  # barely seen, and not again
+        (1.9, 0.5, 9.0, True),
+        (2.1, -0.5, 9.0, True),  # seen clearly: ``is_contradicted`` decides
+        (1.9, -0.5, 0.9, True),  # held-out rows could not have shown it
+    ],
+)
+def test_what_is_barely_seen_has_to_be_seen_again(monkeypatch, thresholds, held_out, expected, is_named):
+    monkeypatch.setattr(vetoes, "held_out_gain", lambda test, less, full: (held_out, expected))
+    inflation = 1.5
+    own = ablation(thresholds * threshold(3) * inflation, 3, inflation)
+    assert vetoes.seen_once(selection_of(gyro_scale=own), None) == ([] if is_named else ["gyro_scale"])
+
+
+@pytest.mark.parametrize(
+    ("share", "contradicted"), [(1.0, False), (0.5, False), (0.2, True), (0.0, True), (-1.0, True)]
+)
+def test_what_held_out_rows_hardly_show_is_contradicted(share, contradicted):
+    expected = 1000.0  # the gain of a cause of which a share is there: 2 share - 1 of it
+    assert is_contradicted((2.0 * share - 1.0) * expected, expected, inflation=1.0) == contradicted
+
+
+def test_held_out_rows_that_would_not_show_an_effect_contradict_nothing():
+    assert not is_contradicted(-100.0, 0.9 * HELD_OUT_SHOWN, inflation=1.0)
+    assert not is_contradicted(-100.0, 1.5 * HELD_OUT_SHOWN, inflation=2.0)
+
+
+def test_true_causes_are_kept_in_noise():
+    rng, expected = np.random.default_rng(5), 60.0
+    gains = expected + 2.0 * np.sqrt(expected) * rng.standard_normal(10_000)
+    assert not any(is_contradicted(gain, expected, inflation=1.0) for gain in gains)
+
+
+def test_an_effect_that_could_as_well_be_none_is_not_determined(state):
+    problem = state.problem
+    for effect, value, expected in (
+        ("linear_drag", 0.0, False),
+        ("linear_drag", 0.5, True),
+        ("ground_effect", 0.03, False),
+    ):
+        way = next(one for one in CANDIDATES if one.effect == effect)
+        found = state.fitted((way,), problem.start)
+        vector = found.vector.copy()
+        vector[problem.index(way.fields)] = value
+        assert is_determined(state, found._replace(vector=vector), way.fields)[1] is expected
+
+
+def test_base_parameters_held_for_an_effect_are_free_without_it(state):
+    delay = next(one for one in CANDIDATES if one.effect == "command_delay")
+    held = (*(Held(tau, "command_delay") for tau in TAUS), Held("c0", "wind"))
+    holding = replace(state, held=held)
+    model = holding.fitted((delay,), holding.problem.start)
+    left = reject(Selection(holding, model, model, {}), ["command_delay"])
+    assert left.state.held == (Held("c0", "wind"),) and left.state.refused == ("command_delay",)
+    assert left.model.candidates == ()
+    assert set(state.problem.index(TAUS)) <= set(left.model.places)
+    assert holding.held == held and holding.refused == ()  # the state before is as it was
+
+
+def test_slopes_serve_again_nearby_and_not_for_an_effect_without_a_slope(state):
+    problem = state.problem
+    later, first = state.linearized(problem.start)
+    limited, lagging = problem.start.copy(), problem.start.copy()
+    limited[problem.names.index("rate_slew_limit.inverse")] = 0.003
+    lagging[problem.names.index("tau_roll")] *= 1.0001
+    assert first.distance(limited) == np.inf and 0.0 < first.distance(lagging) < 1.0
+    assert later.linearized(lagging)[1].slopes is first.slopes
+    other = later.linearized(limited)[1]
+    column = other.column("rate_slew_limit.inverse")
+    assert other.total[column, column] > 1e3 * first.total[column, column]
+
+
+def cause_with(problem: Problem, field: str, value: float) -> tuple[FittedModel, list[Cause]]:
+    """Return a model with one value, and the cause that has it."""
+    vector = problem.start.copy()
+    vector[problem.names.index(field)] = value
+    effect, _, name = field.rpartition(".")
+    parameters = {name: Estimated(value, (value, value), "1")}
+    return FittedModel((), vector, 0.0, ()), [replace(CAUSE, effect=effect or name, parameters=parameters)]
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "is_warned_of"),
+    [
+        ("rate_scale.yaw", 0.9, False),
+        ("rate_scale.yaw", None, True),
+        ("rate_saturation.softness", 0.0, False),  # a limit may well be hard
+        ("tau_roll", 0.1, False),  # the base has no range to end at
+    ],
+)
+def test_values_at_the_end_of_their_range_are_warned_of(state, field, value, is_warned_of):
+    problem = state.problem
+    value = problem.low[problem.names.index(field)] if value is None else value
+    found = warnings_of(problem, *cause_with(problem, field, value), AS_GOOD, [])
+    assert [one.startswith(f"{field} = {value:g} is at the end") for one in found] == [True] * is_warned_of
+
+
+def test_worse_free_flight_and_lost_causes_are_warned_of(state):
+    model = FittedModel((), state.problem.start, 0.0, ())
+    errors = AS_GOOD | {"extended": Errors({}, {"1": 0.78})}
+    lost, worse = warnings_of(state.problem, model, [], errors, ["wind"])
+    assert "0.78 m against 0.5 m after 1 s" in worse
+    assert lost.startswith("wind gained nothing on the held-out part")
+
+
+def test_a_long_log_is_thinned_with_a_warning_that_counts_judged_rows(state, monkeypatch):
+    """Lanes also hold rows that are not judged: those must not make up for judged rows that are lost."""
+    lanes = state.problem.lanes
+    half = lanes.counts & (np.arange(len(lanes.row)) % 2 == 0)[:, None, None, None]
+    every = lanes._replace(counts=half)
+    assert thinned(every) is every and thinning_warning(every, every) == []
+    monkeypatch.setattr("flytrack_sysid.diagnosis.lanes.MOST_ROWS", 2 * LANE_S * 100 + 10)
+    (warning,) = thinning_warning(every, thinned(every))
+    kept, number = thinned(every).num_judged, every.num_judged
+    assert kept < 0.8 * number and warning.startswith(f"only {kept} of {number} rows were learnt from")
+    in_lanes = int((thinned(every).row[100:] >= 0).sum())
+    assert in_lanes >= number  # as many rows as are judged: counting those would have hidden the loss
