@@ -100,8 +100,8 @@ class Effect:
 
     name: as in model files. parameters: the NamedTuple class; its defaults are neutral. ranges: of each
     parameter. notable: how far from neutral a parameter is worth knowing, a judgement: what is smaller
-    hardly shows in a lap or a reading. equation, source: for people. command, lag, air, thrust, rates,
-    force, battery, gyro, accelerometer: hooks at these stages.
+    hardly shows in a lap or a reading. equation: LaTeX. source: a publication, or the assumption. command,
+    lag, air, thrust, rates, force, battery, gyro, accelerometer: hooks at these stages.
     most_steps: of parameters that are times, how many steps of time they may last.
     needs: channels that a log has to have to be asked about it: p position, v velocity, q attitude, w gyro,
     f accelerometer, v_bat voltage.

@@ -68,7 +68,8 @@ COMMAND_DELAY = Effect(
     parameters=CommandDelay,
     ranges={"delay_s": Range(0.0, 0.04, "s")},
     notable={"delay_s": 0.005},
-    equation="u(t) = u(t - delay), averaged over the step",
+    equation=r"\mathbf{u}(t) \leftarrow \frac{1}{\Delta t} \int_t^{t + \Delta t} \mathbf{u}(s - "
+    r"\text{delay})\, ds",
     most_steps={"delay_s": BUFFER_STEPS},
     probes={"delay_s": (0.005, 0.01, 0.02, 0.03)},
     source="assumption: the same for all four commands, constant within a flight",

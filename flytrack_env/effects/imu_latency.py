@@ -68,7 +68,8 @@ IMU_LATENCY = Effect(
     parameters=ImuLatency,
     ranges={"latency_s": Range(0.0, 0.04, "s")},
     notable={"latency_s": 0.003},
-    equation="omega_measured(t) = omega(t - latency), f_measured(t) = f(t - latency), linear between steps",
+    equation=r"\boldsymbol{\omega}_\text{measured}(t) = \boldsymbol{\omega}(t - \text{latency}), \quad "
+    r"\mathbf{f}_\text{measured}(t) = \mathbf{f}(t - \text{latency})",
     source="assumption: the same for both sensors; what imu_offset adds is not late",
     most_steps={"latency_s": BUFFER_STEPS},
     probes={"latency_s": (0.005, 0.01, 0.02, 0.03)},

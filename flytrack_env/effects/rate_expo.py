@@ -23,7 +23,7 @@ RATE_EXPO = Effect(
     parameters=RateExpo,
     ranges={"expo": Range(-0.9, 0.9, "1")},
     notable={"expo": 0.05},
-    equation="omega = max_rate ((1 - expo) u + expo u^3), per axis, u the lagged stick",
+    equation=r"\omega_i = \omega_{\max,i} \left( (1 - \text{expo})\, u_i + \text{expo}\, u_i^3 \right)",
     source='the "expo" of radio transmitters; assumption: the same on all axes, behind the lag',
     rates=_rates,
 )

@@ -35,8 +35,9 @@ RATE_SATURATION = Effect(
     parameters=RateSaturation,
     ranges={"lost": Range(0.0, 0.9, "1"), "softness": Range(0.0, 1.0, "1")},
     notable={"lost": 0.05},
-    equation="omega = max_rate ((1 - softness) clip(u, -L, L) + softness u / sqrt(1 + (L^-2 - 1) u^2)), "
-    "L = 1 - lost",
+    equation=r"\omega_i = \omega_{\max,i} \left( (1 - s) \operatorname{clip}(u_i, -L, L) + \frac{s\, "
+    r"u_i}{\sqrt{1 + (L^{-2} - 1)\, u_i^2}} \right), \quad L = 1 - \text{lost}, \quad s = "
+    r"\text{softness}",
     source="assumption: full stick u gives L, small sticks all of theirs; the same on all axes",
     shapes=("softness",),
     probes={"lost": (0.03, 0.1, 0.3)},

@@ -31,7 +31,7 @@ RATE_SLEW_LIMIT = Effect(
     parameters=RateSlewLimit,
     ranges={"inverse": Range(0.0, 0.1, "s^2/rad")},
     notable={"inverse": 0.005},
-    equation="|omega - omega before| <= dt / inverse, per axis",
+    equation=r"|\omega_i(t + \Delta t) - \omega_i(t)| \le \frac{\Delta t}{\text{inverse}}",
     source="assumption: the same on all axes, at any thrust",
     probes={"inverse": (0.003, 0.01, 0.03)},
     rates=_rates,

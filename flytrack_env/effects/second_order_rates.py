@@ -79,7 +79,8 @@ SECOND_ORDER_RATES = Effect(
     parameters=SecondOrderRates,
     ranges={"lag_s": Range(0.0, 0.1, "s"), "damping": Range(0.2, 3.0, "1")},
     notable={"lag_s": 0.005},
-    equation="omega'' / wn^2 + lag_s omega' + omega = omega of the lagged stick, wn = 2 damping / lag_s",
+    equation=r"\frac{\ddot{\omega}}{\omega_n^2} + \text{lag}\, \dot{\omega} + \omega = \omega_\text{stick}, "
+    r"\quad \omega_n = \frac{2\, \text{damping}}{\text{lag}}",
     source="a second-order servo, exact for an input held over the step; assumption: the same on all axes",
     probes={"lag_s": (0.003, 0.01, 0.03)},
     shapes=("damping",),
