@@ -1,20 +1,18 @@
 """The time-optimal flying lap and standing start of a track: ``python -m benchmarks.time_optimal``.
 
-Finds them with CasADi and IPOPT (``pip install .[optimal]``), writes them as data, flies them again in the
-simulator and writes docs/results/time_optimal.md. With ``--verify`` it only flies what is there, which needs
-no solver. In Python: ``benchmarks.optimal.shipped_reference("flytrack", "flying").time_s``.
+Finds them with CasADi and IPOPT (``pip install .[optimal]``), writes them as data, replays them in the
+simulator and writes docs/results/time_optimal.md. With ``--verify`` it only replays existing files, which
+needs no solver. In Python: ``flytrack_env.references.shipped_reference("flytrack", "flying").time_s``.
 """
 
 import argparse
-import platform
-import shlex
-import sys
 from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from benchmarks import report
 from benchmarks.optimal.replay import Replay, replay
 from flytrack_env import FlyTrack, ModelParameters, Track, available_tracks, blackbox, load_model, load_track
 from flytrack_env import nominal_parameters as nominal
@@ -33,17 +31,15 @@ from flytrack_env.state import (
     ACTION_SIZE,
     APPLIED_ACTION,
     BATTERY,
-    BATTERY_EMPTY_V,
     BATTERY_FULL_V,
     POSITION,
     QUATERNION,
     STATE_SIZE,
 )
 
-PAGE = Path("docs/results/time_optimal.md")
 SHIPPED_BLACK_BOX = Path(__file__).parents[1] / "blackbox" / "acro_step.bin"
 NOMINAL, BLACK_BOX = "nominal", "black_box"
-LATEST_S = 1e-3  # s, how far from the optimum the replay's time may be
+LARGEST_ERROR_S = 1e-3  # s, of the replay's time
 
 
 def start_state(track: Track, battery_v: float) -> np.ndarray:
@@ -55,10 +51,10 @@ def start_state(track: Track, battery_v: float) -> np.ndarray:
 
 
 def drained_in_float32(model: ModelParameters, start: np.ndarray, dt_s: float) -> ModelParameters:
-    """Return the model with the battery drain that float32 makes of it, for the optimiser, which is exact.
+    """Return the model with the battery drain that results from float32, for the optimiser in float64.
 
-    A step drains so little that rounding the voltage changes it by up to a percent, in every step the same
-    way: millimetres on a path, after seconds. start: (21,), whose voltage is rounded as others are.
+    A step drains so little that rounding the voltage changes the drain by up to a percent, in every step the
+    same way: millimetres on a path, after seconds. start: (21,), the state at which rounding is measured.
     """
     rounded = jax.tree.map(lambda leaf: np.asarray(leaf, np.float32), model._replace(effects=()))
     after = step(jnp.asarray(start, jnp.float32), jnp.zeros(ACTION_SIZE), np.float32(dt_s), rounded)
@@ -66,33 +62,31 @@ def drained_in_float32(model: ModelParameters, start: np.ndarray, dt_s: float) -
     return model._replace(battery_drain_v_per_min=drained_v / dt_s * SECONDS_PER_MINUTE)
 
 
-def optimise(
-    track: Track, kind: str, model: ModelParameters, model_name: str, battery_v: float, command: str
-) -> Reference:
-    """Return the time-optimal flight of a track and a model; needs CasADi.
+def optimise(track: Track, kind: str, model: ModelParameters, model_name: str) -> Reference:
+    """Return the time-optimal flight of a track and a model, with a full battery; needs CasADi.
 
     Raises:
-        UnsupportedModelError: a model with an effect that cannot be expressed. UnsolvedError: none found.
+        UnsupportedModelError: an effect that cannot be expressed. UnsolvedError: no optimum was found.
     """
-    import casadi  # an extra, and needed for this alone
+    import casadi  # an extra, needed only here
 
     from benchmarks.optimal.problem import CLEARANCE_M, SMOOTHING_S, Task
     from benchmarks.optimal.solve import find_optimum
 
     env = FlyTrack(track=track, model=model)
     params = env.default_params
-    dt_s, start = float(params.dt), start_state(track, battery_v)
+    dt_s, start = float(params.dt), start_state(track, BATTERY_FULL_V)
     task = Task(kind, params.course, float(params.drone_radius), start)
     optimum = find_optimum(task, drained_in_float32(model, start, dt_s), dt_s)
     about = {
-        "command": command,
+        "command": report.command_line(),
         "casadi": casadi.__version__,
         "jax": jax.__version__,
-        "machine": platform.machine(),
-        "battery_v": battery_v,
+        "battery_v": BATTERY_FULL_V,
         "drone_radius_m": task.radius_m,
         "clearance_m": CLEARANCE_M,
         "smoothing_s": SMOOTHING_S,
+        **report.provenance(),
     }
     return Reference(
         track=track.name,
@@ -110,22 +104,21 @@ def optimise(
 
 
 def is_verified(reference: Reference, flown: Replay) -> bool:
-    """Return whether a replay passed every gate, touched no frame and took the time that it should."""
+    """Return whether a replay passed every gate, touched no frame and took the expected time."""
     is_whole = flown.gates_passed == len(reference.gate_times_s) and not flown.ended_by
-    return is_whole and flown.frames_touched == 0 and abs(flown.time_s - reference.time_s) <= LATEST_S
+    return is_whole and flown.frames_touched == 0 and abs(flown.time_s - reference.time_s) <= LARGEST_ERROR_S
 
 
-def verify(
-    folder: Path, black_box: Path, tracks: list[Track]
-) -> tuple[list[tuple[Reference, str, Replay]], bool]:
-    """Return every reference of a folder with its replays, and whether those in its own model are right.
+def verify(folder: Path, tracks: list[Track]) -> tuple[list[tuple[Reference, str, Replay]], bool]:
+    """Return a folder's references with their replays, and whether those in the reference's model are right.
 
-    References of the model ``black_box`` are flown on the black box, too. tracks: those that are not shipped.
+    References of the model ``black_box`` are flown on the shipped black box as well. tracks: where references
+    may be of tracks that are not shipped.
 
     Raises:
-        ReferenceFileError, TrackError, BlackBoxError: a file that cannot be used, or no references.
+        ReferenceFileError, TrackError: a file that cannot be used, or no references.
     """
-    plant = blackbox.load(black_box)
+    plant = blackbox.load(SHIPPED_BLACK_BOX)
     replays, is_good = [], True
     references = list(map(load_reference, folder.glob("*.npz")))
     if not references:
@@ -153,23 +146,22 @@ def describe(reference: Reference, flown_by: str, flown: Replay) -> str:
 
 
 def run(arguments: argparse.Namespace) -> bool:
-    """Do what the command line asks; return whether all references are verified."""
+    """Find, replay and describe references; return whether all are verified."""
     model = nominal() if arguments.model is None else load_model(arguments.model)
-    name = arguments.name or (NOMINAL if arguments.model is None else arguments.model.stem)
-    command = shlex.join(["python", "-m", "benchmarks.time_optimal", *sys.argv[1:]])
+    name = NOMINAL if arguments.model is None else arguments.model.stem
     tracks = list(map(load_track, arguments.tracks))
     for track in [] if arguments.verify else tracks:
         for kind in arguments.kinds:
-            found = optimise(track, kind, model, name, arguments.battery_v, command)
+            found = optimise(track, kind, model, name)
             save_reference(arguments.out / f"{track.name}_{name}_{kind}.npz", found)
             print(f"{track.name} {kind}: {found.time_s:.4f} s, {found.found['cpu_s']} CPU s", flush=True)
-    replays, is_good = verify(arguments.out, arguments.black_box, tracks)
+    replays, is_good = verify(arguments.out, tracks)
     for entry in replays:
         print(describe(*entry))
     if arguments.page is not None:
         from benchmarks.optimal.page import write_page, write_pictures  # matplotlib, for this alone
 
-        write_page(arguments.page, replays, command)
+        write_page(arguments.page, replays)
         write_pictures(arguments.page, [reference for reference, _, _ in replays], tracks)
     return is_good
 
@@ -177,20 +169,14 @@ def run(arguments: argparse.Namespace) -> bool:
 def main() -> None:
     """Parse the command line; exit 1 if a replay is not as it should be."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--tracks", nargs="+", default=list(available_tracks()), metavar="NAME_OR_FILE")
-    parser.add_argument("--kinds", nargs="+", default=list(KINDS), choices=KINDS)
-    parser.add_argument("--model", type=Path, help="a model file; default: the simulator's nominal model")
-    parser.add_argument("--name", help="of the model in file names; default: that of its file")
-    parser.add_argument("--battery-v", type=float, default=BATTERY_FULL_V, help="at the start")
-    parser.add_argument("--verify", action="store_true", help="find nothing, fly what is there")
-    parser.add_argument("--black-box", type=Path, default=SHIPPED_BLACK_BOX)
+    shipped = list(available_tracks())
+    parser.add_argument("--tracks", nargs="+", default=shipped, metavar="NAME_OR_FILE", help="default: all")
+    parser.add_argument("--kinds", nargs="+", default=list(KINDS), choices=KINDS, help="default: both")
+    parser.add_argument("--model", type=Path, help="model file; default: the simulator's nominal model")
+    parser.add_argument("--verify", action="store_true", help="only replay existing references")
     parser.add_argument("--out", type=Path, default=FOLDER, help="folder of the references")
-    parser.add_argument("--page", type=Path, help=f"write a page and pictures, such as {PAGE}")
+    parser.add_argument("--page", type=Path, help="page to write, with pictures beside it")
     arguments = parser.parse_args()
-    if not BATTERY_EMPTY_V < arguments.battery_v <= BATTERY_FULL_V:
-        parser.error(
-            f"--battery-v: found {arguments.battery_v}, expected {BATTERY_EMPTY_V:g} to {BATTERY_FULL_V:g}"
-        )
     try:
         is_good = run(arguments)
     except ImportError as error:

@@ -1,1 +1,1 @@
-"""How time-optimal laps are found and verified, and how flights compare with them."""
+"""Finding, replaying and reporting time-optimal laps."""

@@ -1,10 +1,12 @@
 """Pictures and the page of the shipped references: docs/results/time_optimal.md."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
 
+from benchmarks import report
 from benchmarks.optimal.replay import Replay
 from flytrack_env.files import write_atomically
 from flytrack_env.pictures.drawing import draw_gates, draw_path, label_from_above, png_of
@@ -17,30 +19,26 @@ PANEL_IN, BAR_IN, TITLE_IN = 5.6, 1.4, 0.7  # the longer side of a panel; room f
 TITLES = {"flying": "flying lap", "standing": "standing start"}
 MILLI = 1e3
 HEADER = (
-    "| track | model | flight | time (s) | free times (s) | starts agree | highest speed (m/s) | "
-    "lowest height (m) | solver | iterations | CPU (s) |\n|---|---|---|---|---|---|---|---|---|---|---|\n"
+    "track | model | flight | time (s) | free times (s) | starts agree | highest speed (m/s) | "
+    "lowest height (m) | solver | iterations | CPU (s)"
 )
 REPLAY_HEADER = (
-    "| track | model | flight | flown by | gates | time (s) | off the optimum (ms) | drift (mm) | "
-    "frames touched |\n|---|---|---|---|---|---|---|---|---|\n"
+    "track | model | flight | flown by | gates | time (s) | off the optimum (ms) | drift (mm) | "
+    "frames touched"
 )
-AGREE_SHARE = 1e-3  # of the time: starts within that of the best found about the same flight
-EXPLAINED = (
-    "A flying lap goes from the last gate's plane to itself and ends as it began, but for the battery. A "
-    "standing start goes from rest at the start pose, rotors still, through every gate once. Both are in "
-    "steps of 0.01 s with held commands: the simulator's own equations at its own rate, traced from its "
-    "code. *Free times*: with the segments' times free instead and gates at nodes; where that differs "
-    "little, the grid costs little. *Starts agree*: of the searches on coarse grids, those within "
-    f"{AGREE_SHARE:.1%} of the best. These are local optima: nothing proves that no better one exists. "
-    "The model `nominal` is the simulator's own; `black_box` is what the README's commands `collect`, `fit` "
-    "and `diagnose` made of the shipped black box (`benchmarks/data/time_optimal/black_box.json`).\n\n"
-)
-FLOWN_AGAIN = (
-    "\n## Flown again\n\nThe stored commands, open loop, without any feedback, in the environment at 100 Hz "
-    "(float32), which says which gates were passed and when. *Drift*: largest distance from the stored path. "
-    "*Frames touched*: of all gates, not only of the next. On the black box itself nothing corrects what the "
-    "model does not know: the drift says how far it carries, and it soon exceeds the clearance of a gate.\n\n"
-)
+AGREE_SHARE = 1e-3  # of the time: starts this near the best found about the same flight
+EXPLAINED = f"""A flying lap goes from the last gate's plane to itself and ends as it began, except for the
+battery. A standing start goes from rest at the start pose, rotors still, through every gate once. Both are in
+steps of 0.01 s with held commands: the simulator's own equations at its own rate, traced from its code. *Free
+times*: with free segment times and gates at nodes; where that differs little, the grid costs little. *Starts
+agree*: of the searches on coarse grids, those within {AGREE_SHARE:.1%} of the best. These are local optima:
+nothing proves that no better one exists. The model `nominal` is the simulator's own; `black_box` is what the
+README's commands `collect`, `fit` and `diagnose` made of the shipped black box
+(`benchmarks/data/time_optimal/black_box.json`)."""
+REPLAYED = """The stored commands, open loop, in the environment at 100 Hz (float32), which judges which gates
+were passed and when. *Drift*: largest distance from the stored path. *Frames touched*: of all gates, not only
+of the next. On the black box itself no feedback corrects the model's errors: the drift soon exceeds the
+clearance of a gate."""
 
 
 def write_pictures(page: Path, references: list[Reference], tracks: list[Track]) -> None:
@@ -82,60 +80,64 @@ def _draw(path: Path, track: Track, references: list[Reference]) -> None:
     write_atomically(path, png_of(figure, DPI))
 
 
-def _optimum_row(reference: Reference) -> str:
+def _optimum_row(reference: Reference) -> tuple[Any, ...]:
     found, states = reference.found, reference.states
     starts = [seconds for seconds in found["coarse_times_s"] if seconds is not None]
     agree = sum(seconds <= min(starts) * (1.0 + AGREE_SHARE) for seconds in starts)
     return (
-        f"| {reference.track} | {reference.model_name} | {TITLES[reference.kind]} | {reference.time_s:.4f} | "
-        f"{found['free_time_s']:.4f} | {agree} of {len(found['coarse_times_s'])} | "
-        f"{np.linalg.norm(states[:, VELOCITY], axis=1).max():.1f} | {states[:, POSITION][:, 2].min():.2f} | "
-        f"{found['status']} | {found['iterations']} | {found['cpu_s']:.0f} |\n"
+        reference.track,
+        reference.model_name,
+        TITLES[reference.kind],
+        f"{reference.time_s:.4f}",
+        f"{found['free_time_s']:.4f}",
+        f"{agree} of {len(found['coarse_times_s'])}",
+        f"{np.linalg.norm(states[:, VELOCITY], axis=1).max():.1f}",
+        f"{states[:, POSITION][:, 2].min():.2f}",
+        found["status"],
+        found["iterations"],
+        f"{found['cpu_s']:.0f}",
     )
 
 
-def _replay_row(reference: Reference, flown_by: str, flown: Replay) -> str:
-    ended = f", {', '.join(flown.ended_by)}" if flown.ended_by else ""
+def _replay_row(reference: Reference, flown_by: str, flown: Replay) -> tuple[Any, ...]:
     late_ms = MILLI * (flown.time_s - reference.time_s)
-    taken = "- | -" if np.isnan(flown.time_s) else f"{flown.time_s:.4f} | {late_ms:+.3f}"
-    return (
-        f"| {reference.track} | {reference.model_name} | {TITLES[reference.kind]} | {flown_by} | "
-        f"{flown.gates_passed} of {len(reference.gate_times_s)}{ended} | {taken} | "
-        f"{MILLI * flown.drift_m:.2f} | "
-        f"{flown.frames_touched} |\n"
-    )
+    times = ("-", "-") if np.isnan(flown.time_s) else (f"{flown.time_s:.4f}", f"{late_ms:+.3f}")
+    gates = ", ".join([f"{flown.gates_passed} of {len(reference.gate_times_s)}", *flown.ended_by])
+    names = reference.track, reference.model_name, TITLES[reference.kind], flown_by
+    return (*names, gates, *times, f"{MILLI * flown.drift_m:.2f}", flown.frames_touched)
 
 
-def write_page(path: Path, replays: list[tuple[Reference, str, Replay]], command: str) -> None:
-    """Write the tables of references and of their replays, and a picture per track beside the page.
+def write_page(path: Path, replays: list[tuple[Reference, str, Replay]]) -> None:
+    """Write the tables of references and their replays, with a picture per track.
 
-    replays: references with who flew them again, and what came of it; several of one reference are fine.
+    replays: references, the plants that flew them, and the replays; a reference may occur several times.
     """
     references = list({id(found): found for found, _, _ in replays}.values())
     notes = [reference.found for reference in references]
 
-    def each(line: str) -> str:  # what is the same for all of them once
+    def each(line: str) -> str:
+        """Return the line for each reference, without repetitions."""
         return "; ".join(sorted({line.format(**note) for note in notes}))
 
-    commands = sorted({note["command"] for note in notes})
+    commands = sorted({note["command"].strip("`") for note in notes})
     tracks = sorted({reference.track for reference in references})
     settings = (
         f"Found with {each('casadi {casadi}, jax {jax}')} on {each('{machine}')}, one core. Battery at the "
         f"start: {each('{battery_v:g} V')}. Gates are passed {each('{clearance_m:g} m')} inside what the "
         f"environment allows a drone of radius {each('{drone_radius_m:g} m')}. Squared changes of commands "
-        f"cost {each('{smoothing_s:g} s')} each, so that commands do not chatter.\n\n"
+        f"cost {each('{smoothing_s:g} s')} each, so that commands do not chatter."
     )
-    text = (
-        f"# Time-optimal flights\n\n`{command}` wrote this page. The flights were found by\n\n"
-        + "".join(f"- `{line}`\n" for line in commands)
-        + "\n"
-        + EXPLAINED
-        + settings
-        + HEADER
-        + "".join(map(_optimum_row, references))
-        + FLOWN_AGAIN
-        + REPLAY_HEADER
-        + "".join(_replay_row(*entry) for entry in replays)
-        + "".join(f"\n![{name}]({path.stem}_{name}.png)\n" for name in tracks)
+    text = report.page(
+        "Time-optimal flights",
+        f"{report.command_line()} wrote this page. The flights were found by",
+        "\n".join(f"- `{line}`" for line in commands),
+        EXPLAINED,
+        settings,
+        report.table(HEADER, map(_optimum_row, references)),
+        "## Replays",
+        REPLAYED,
+        report.table(REPLAY_HEADER, (_replay_row(*entry) for entry in replays)),
+        *(f"![{name}]({path.stem}_{name}.png)" for name in tracks),
+        report.provenance_line(report.provenance()),
     )
-    write_atomically(path, text.encode())
+    report.write_page(path, text)

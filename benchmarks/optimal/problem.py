@@ -17,15 +17,15 @@ from flytrack_env.state import ACTION_SIZE, BATTERY, POSITION, QUATERNION, STATE
 from flytrack_env.tracks import Course
 
 CLEARANCE_M = 2e-3  # kept from frames and bounds: float32 replays stray less
-SMOOTHING_S = 1e-6  # s per squared change of a command: leaves chatter no reason, costs below a millisecond
+SMOOTHING_S = 1e-6  # s per squared change of a command: prevents chatter, costs less than a millisecond
 ACROSS_M_S = 0.1  # m/s, least speed through a gate in its direction of flight
 SHORTEST_SHARE, LONGEST_SHARE = 0.2, 5.0  # of a free step's length, of its first guess
 LOOSE_UNIT = 1.1  # bound of a component of a unit quaternion, which the step itself normalises
-FRACTION_EDGE = 0.02  # of a step: a node on a gate's plane would be on either side of it after rounding
+FRACTION_EDGE = 0.02  # of a step: rounding could put a node on a gate's plane on either side of it
 
 
 class Guess(NamedTuple):
-    """A flight to begin with, or a solution; SI units.
+    """A first guess or a solution; SI units.
 
     states: (N + 1, 21). commands: (N, 4). steps_s: (num_gates,), length of a step of each segment.
     fractions: (num_gates,), where in the last step of each segment its gate is passed.
@@ -37,19 +37,19 @@ class Guess(NamedTuple):
     fractions: np.ndarray
 
     def times(self, counts: np.ndarray) -> np.ndarray:
-        """Return the time at which each gate is passed, s, for so many steps of each segment."""
+        """Return the time at which each gate is passed, s, given the steps of each segment."""
         return np.cumsum(counts * self.steps_s) - (1.0 - self.fractions) * self.steps_s
 
     def closure(self) -> float:
-        """Return 1 if the last attitude's quaternion is on the side of the first, -1 if opposite.
+        """Return 1 if the last attitude's quaternion has the sign of the first, else -1.
 
-        Both signs are one attitude. Which it is counts whole turns, and a search does not change it.
+        Both signs are the same attitude; the sign depends on whole turns, which a search does not change.
         """
         return 1.0 if self.states[0, QUATERNION] @ self.states[-1, QUATERNION] > 0.0 else -1.0
 
 
 class Solution(NamedTuple):
-    """What the solver found: the flight, its status in IPOPT's words, whether it is one, iterations."""
+    """A result of the solver: flight, IPOPT's status, whether it is solved, iterations."""
 
     flight: Guess
     status: str
@@ -59,7 +59,7 @@ class Solution(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class Task:
-    """What to fly: kind "flying" or "standing", gates and bounds, drone radius, m, and the first state.
+    """The task: kind "flying" or "standing", gates and bounds, drone radius, m, and the first state.
 
     start: (21,): where a standing start begins; of a flying lap only the battery voltage is taken.
     """
@@ -71,7 +71,7 @@ class Task:
 
     @property
     def is_lap(self) -> bool:
-        """Whether the end has to be the beginning."""
+        """Whether the flight is periodic."""
         return self.kind == "flying"
 
 

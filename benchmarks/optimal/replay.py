@@ -1,4 +1,4 @@
-"""A reference flown again: its commands, open loop, in the environment with the simulator at 100 Hz."""
+"""Replays of references: their commands, open loop, in the environment at 100 Hz."""
 
 from functools import cache
 from typing import Any, NamedTuple
@@ -18,7 +18,7 @@ from flytrack_env.tracks import Track, cross_gate
 
 
 class Replay(NamedTuple):
-    """What came of a reference's commands.
+    """The outcome of a reference's commands.
 
     states: (N + 1, 21), float32. gates_passed: in order, by the environment. time_s: to the last gate as the
     environment interpolates it, NaN if it was not passed. ended_by: causes of termination. drift_m: largest
@@ -33,8 +33,8 @@ class Replay(NamedTuple):
     frames_touched: int
 
 
-class _Told(NamedTuple):
-    """What is kept of every step: the packed state, the causes of termination, the race."""
+class _Step(NamedTuple):
+    """Outputs of a step: packed state, causes of termination, race."""
 
     state: jax.Array
     causes: Causes
@@ -46,9 +46,9 @@ def _environment(plant: Plant | None) -> tuple[FlyTrack, Any]:
     """Return the environment and its compiled step, shared by all tracks and models of one form."""
     env = FlyTrack(plant=plant)
 
-    def fly(state: EnvState, command: jax.Array, params: EnvParams) -> tuple[EnvState, _Told]:
+    def fly(state: EnvState, command: jax.Array, params: EnvParams) -> tuple[EnvState, _Step]:
         after, _, causes, _ = env.transition(state, unpack_action(command), params)
-        return after, _Told(pack(env.drone(after)), causes, env.race(after))
+        return after, _Step(pack(env.drone(after)), causes, env.race(after))
 
     return env, jax.jit(fly)
 
@@ -60,7 +60,7 @@ def _params(track: Track, model: ModelParameters, dt_s: float) -> EnvParams:
 
 
 def _frames_touched(positions: np.ndarray, params: EnvParams) -> int:
-    """Return how many gates' frames the straight lines between positions, (N, 3), touch."""
+    """Return the number of gates whose frames the lines between positions, (N, 3), touch."""
     lines = (
         Vec3(*(jnp.asarray(axis)[:, None] for axis in ends.T)) for ends in (positions[:-1], positions[1:])
     )
@@ -69,7 +69,7 @@ def _frames_touched(positions: np.ndarray, params: EnvParams) -> int:
 
 
 def replay(reference: Reference, track: Track, plant: Plant | None = None) -> Replay:
-    """Return what the environment says of a reference's commands: open loop, nothing corrects the flight.
+    """Return how a reference's commands fly, open loop, as judged by the environment.
 
     The environment is that of ``FlyTrack-v0`` with the reference's model, float32, or with another plant,
     such as a black box; the flight ends at the first cause of termination.
@@ -79,8 +79,8 @@ def replay(reference: Reference, track: Track, plant: Plant | None = None) -> Re
     first = jnp.asarray(reference.states[0], jnp.float32)
     state, steps = env.begin(unpack(first), 0, params), []
     for command in np.asarray(reference.commands, np.float32):
-        state, told = step(state, command, params)
-        steps.append(told)
+        state, outputs = step(state, command, params)
+        steps.append(outputs)
     flown = jax.tree.map(lambda *leaves: np.stack(leaves), *steps)
     is_over = np.any(np.stack(flown.causes), axis=0)
     last = int(np.argmax(is_over)) if is_over.any() else len(steps) - 1

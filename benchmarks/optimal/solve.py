@@ -5,26 +5,41 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from benchmarks.optimal.guess import FOLLOW, first_guess, resample, segment_lengths
 from benchmarks.optimal.problem import FRACTION_EDGE, Guess, Problem, Solution, Task
 from benchmarks.optimal.symbolic import needed_states, step_function
 from flytrack_env.dynamics import ModelParameters
+from flytrack_env.quaternion import Quaternion, Vec3
+from flytrack_env.state import (
+    ACCELERATION,
+    ACTION_SIZE,
+    APPLIED_ACTION,
+    BATTERY,
+    POSITION,
+    QUATERNION,
+    STATE_SIZE,
+    VELOCITY,
+)
+from flytrack_env.tracks import hermite_curve, sample_way
 
-COARSE_STEP_M = 0.6  # of the way, per step
+PATH_POINTS = 400  # per segment
+GRAVITY = np.array([0.0, 0.0, 9.80665])  # m/s^2, of first guesses, whatever the model's
+FOLLOW = None  # heading along the path
+UPSIDE_DOWN = 1e-6  # norm of a quaternion below which there is no shortest turn
+COARSE_STEP_M = 0.6  # of the path, per step
 FEWEST_STEPS = 4  # of a coarse segment
 QUARTER_TURN = 0.5 * np.pi
-SPEEDS_M_S = (10.0, 16.0)  # of first guesses: gently round the course, and fast enough to be upside down
-HEADINGS_RAD = (FOLLOW, 0.0, QUARTER_TURN / 2)  # of first guesses; four arms make quarter turns equal, nearly
-MOST_SHIFTS = 8  # rounds in which gates move to a step before or after
-NEAR_EDGE = 1e-3  # of a step: a gate this near to the end of its step's range may want another step
+SPEEDS_M_S = (10.0, 16.0)  # of first guesses: gentle, and fast enough to turn upside down
+HEADINGS_RAD = (FOLLOW, 0.0, QUARTER_TURN / 2)  # of first guesses; quarter turns are nearly equivalent
+MOST_SHIFTS = 8  # rounds in which gates move to an adjacent step
+NEAR_EDGE = 1e-3  # of a step: a gate this near to the end of its step's range is moved
 COARSE = {"ipopt.max_iter": 400, "ipopt.tol": 1e-5, "ipopt.acceptable_tol": 1e-4}
 FINE = {"ipopt.max_iter": 400, "ipopt.tol": 1e-7, "ipopt.acceptable_tol": 1e-6}
-WARM = {"ipopt.mu_init": 1e-3}  # a guess that is a solution but for the grid
+WARM = {"ipopt.mu_init": 1e-3}  # for a guess that is a solution on another grid
 QUIET = {"ipopt.print_level": 0, "ipopt.sb": "yes", "print_time": False}
 
 
 class UnsolvedError(RuntimeError):
-    """No start led to an optimum; the message has the solver's words."""
+    """No start led to an optimum; the message has the solver's status."""
 
 
 class Optimum(NamedTuple):
@@ -36,8 +51,89 @@ class Optimum(NamedTuple):
     found: dict[str, Any]
 
 
+def _paths(task: Task) -> np.ndarray:
+    """Return points of the path to every gate, (num_gates, PATH_POINTS, 3), m."""
+    ways = np.roll(sample_way(task.course, PATH_POINTS), 1, axis=0)
+    if not task.is_lap:
+        gates, position = task.course.gates, task.start[POSITION]
+        centre = np.array([np.float64(axis[0]) for axis in gates.centre])
+        forward = np.array([np.float64(axis[0]) for axis in gates.forward])
+        chord = centre - position
+        length = np.linalg.norm(chord)
+        s = np.linspace(0.0, 1.0, PATH_POINTS)
+        ends = (position, chord, centre, forward * length)
+        start, leave, end, meet = (Vec3(*vector) for vector in ends)
+        ways[0] = np.stack(hermite_curve(start, leave, end, meet, s)[0], axis=-1)
+    return ways
+
+
+def segment_lengths(task: Task) -> np.ndarray:
+    """Return the path's length to every gate from the one before or the start, (num_gates,), m."""
+    return np.linalg.norm(np.diff(_paths(task), axis=1), axis=-1).sum(axis=1)
+
+
+def _along(points: np.ndarray, shares: np.ndarray) -> np.ndarray:
+    """Return points at shares of the length of a polyline."""
+    lengths = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
+    return np.stack([np.interp(shares * lengths[-1], lengths, axis) for axis in points.T], axis=1)
+
+
+def _attitudes(thrust_w: np.ndarray, velocity: np.ndarray, heading_rad: float | None) -> np.ndarray:
+    """Return attitudes (N, 4) with body z along thrust_w and a heading, without jumps in sign."""
+    quats: list[np.ndarray] = []
+    for force, speed in zip(thrust_w, velocity, strict=True):
+        axis = force / np.linalg.norm(force)
+        # The shortest turn from the world's z to the axis, after a turn about z by the heading.
+        tilt = np.array([1.0 + axis[2], -axis[1], axis[0], 0.0])
+        tilt = tilt / max(np.linalg.norm(tilt), UPSIDE_DOWN)
+        half = 0.5 * (np.arctan2(speed[1], speed[0]) if heading_rad is None else heading_rad)
+        turn = Quaternion(np.cos(half), 0.0, 0.0, np.sin(half))
+        quat = np.array(Quaternion(*tilt).multiply(turn))
+        quats.append(-quat if quats and quat @ quats[-1] < 0.0 else quat)
+    return np.array(quats)
+
+
+def first_guess(task: Task, counts: np.ndarray, speed_m_s: float, heading_rad: float | None) -> Guess:
+    """Return a flight along the path at one speed, m/s, with a heading, rad, or along the path.
+
+    counts: (num_gates,), steps of each segment. The flight satisfies no equation of motion.
+    """
+    ways = _paths(task)
+    steps_s = segment_lengths(task) / speed_m_s / counts
+    pieces = [_along(way, np.arange(n) / n) for way, n in zip(ways, counts, strict=True)]
+    positions = np.concatenate([*pieces, ways[-1][-1:]])
+    times = np.concatenate([[0.0], np.cumsum(np.repeat(steps_s, counts))])
+    velocity = np.gradient(positions, times, axis=0)
+    acceleration = np.gradient(velocity, times, axis=0)
+    if task.is_lap:
+        velocity[0] = velocity[-1] = 0.5 * (velocity[0] + velocity[-1])
+    states = np.zeros((len(times), STATE_SIZE))
+    states[:, POSITION], states[:, VELOCITY], states[:, ACCELERATION] = positions, velocity, acceleration
+    states[:, QUATERNION] = _attitudes(acceleration + GRAVITY, velocity, heading_rad)
+    states[:, BATTERY] = task.start[BATTERY]
+    if not task.is_lap:
+        states[0] = task.start
+        if states[0, QUATERNION] @ states[1, QUATERNION] < 0.0:
+            states[1:, QUATERNION] *= -1.0
+    states[1:, APPLIED_ACTION] = 0.0
+    commands = np.zeros((len(times) - 1, ACTION_SIZE))
+    return Guess(states, commands, steps_s, np.ones(len(counts)))
+
+
+def resample(flight: Guess, counts: np.ndarray, new_counts: np.ndarray) -> Guess:
+    """Return a flight resampled to other numbers of steps of each segment, over the same times."""
+    old = np.concatenate([[0.0], np.cumsum(np.repeat(flight.steps_s, counts))])
+    steps_s = flight.steps_s * counts / new_counts
+    new = np.concatenate([[0.0], np.cumsum(np.repeat(steps_s, new_counts))])
+    states = np.stack([np.interp(new, old, column) for column in flight.states.T], axis=1)
+    states[:, QUATERNION] /= np.linalg.norm(states[:, QUATERNION], axis=1, keepdims=True)
+    middles = 0.5 * (new[:-1] + new[1:])
+    held = np.clip(np.searchsorted(old, middles, side="right") - 1, 0, len(flight.commands) - 1)
+    return Guess(states, flight.commands[held], steps_s, flight.fractions)
+
+
 class _Search:
-    """The stages of one search, which count iterations and say how they went."""
+    """The stages of one search; counts iterations."""
 
     def __init__(self, task: Task, model: ModelParameters, dt_s: float):
         self.task, self.dt_s = task, dt_s
@@ -53,7 +149,7 @@ class _Search:
         return found
 
     def coarse(self) -> tuple[Guess, np.ndarray, list[float]]:
-        """Return the best of all starts, its numbers of steps, and all starts' times, s, NaN if it failed."""
+        """Return the best of all starts, its numbers of steps, and all starts' times, s, NaN if failed."""
         counts = np.round(segment_lengths(self.task) / COARSE_STEP_M).astype(int)
         counts = np.maximum(counts, FEWEST_STEPS)
         best, times = None, []
@@ -100,7 +196,7 @@ class _Search:
 
 
 def _held(flight: Guess, counts: np.ndarray, nodes: np.ndarray, dt_s: float) -> Guess:
-    """Return a flight of free segment times in steps of one length, which end segments at these nodes."""
+    """Return a flight of free segment times resampled to steps of dt_s, segments ending at these nodes."""
     old = np.concatenate([[0.0], np.cumsum(np.repeat(flight.steps_s, counts))])
     new = dt_s * np.arange(nodes[-1] + 1)
     states = np.stack([np.interp(new, old, column) for column in flight.states.T], axis=1)
@@ -110,14 +206,14 @@ def _held(flight: Guess, counts: np.ndarray, nodes: np.ndarray, dt_s: float) -> 
 
 
 def _shifts(fractions: np.ndarray) -> np.ndarray:
-    """Return by how many steps each gate's step should move: those at an end of its range."""
+    """Return by how many steps each gate should move: -1, 0 or 1."""
     early = fractions < FRACTION_EDGE + NEAR_EDGE
     late = fractions > 1.0 - FRACTION_EDGE - NEAR_EDGE
     return late.astype(int) - early.astype(int)
 
 
 def _lengthened(flight: Guess, num_steps: int, shifts: np.ndarray) -> Guess:
-    """Return a flight with its last step repeated or left out, and gates at the other end of a moved step."""
+    """Return a flight with its last step repeated or dropped, and moved gates at the other end of a step."""
     fractions = np.where(
         shifts > 0, FRACTION_EDGE, np.where(shifts < 0, 1.0 - FRACTION_EDGE, flight.fractions)
     )
@@ -129,7 +225,7 @@ def _lengthened(flight: Guess, num_steps: int, shifts: np.ndarray) -> Guess:
 def find_optimum(task: Task, model: ModelParameters, dt_s: float) -> Optimum:
     """Return the best time-optimal flight that is found, in steps of ``dt_s``.
 
-    A local optimum, the best of several starts: nothing proves it to be the global one.
+    It is a local optimum, the best of several starts.
 
     Raises:
         UnsupportedModelError: a model that cannot be expressed. UnsolvedError: no optimum was found.

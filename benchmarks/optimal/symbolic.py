@@ -1,8 +1,8 @@
 """The simulator's own step as a CasADi function: its jaxpr, evaluated with symbols.
 
-There is no second copy of the physics. ``flytrack_env.dynamics.advance`` is traced by JAX, for one drone of
-scalars and one model, and every operation of the trace is carried out on CasADi symbols. Whatever an effect
-computes comes along, also one that does not exist yet.
+There is no second copy of the physics: ``flytrack_env.dynamics.advance`` is traced by JAX for one drone of
+scalars and one model, and every operation of the trace is carried out on CasADi symbols, including those of
+all effects.
 """
 
 import operator
@@ -17,11 +17,11 @@ from flytrack_env.dynamics import ModelParameters, advance
 from flytrack_env.effects import effect_of
 from flytrack_env.state import ACTION_SIZE, POSITION, STATE_SIZE, Action, Drone, unpack
 
-SENSOR = ("sensor",)  # where effects act that change nothing of the flight
+SENSOR = ("sensor",)  # stage of effects that do not change the flight
 
 
 class UnsupportedModelError(ValueError):
-    """A model that the optimiser cannot express; the message names the effect or the operation."""
+    """A model that CasADi cannot express; the message names the effect or the operation."""
 
 
 def _identity(value: Any) -> Any:
@@ -72,11 +72,10 @@ OPERATIONS: dict[str, Callable[..., Any]] = {
 
 
 def flown_effects(model: ModelParameters) -> tuple[Any, ...]:
-    """Return the effects of a model that change its flight: those on sensors alone do not.
+    """Return a model's effects without those of sensors, which do not change the flight.
 
     Raises:
-        UnsupportedModelError: an effect with a memory, which depends on the step of time and has no place in
-            a state vector.
+        UnsupportedModelError: an effect with a memory, which has no place in the state vector.
     """
     flown = tuple(effect for effect in model.effects if effect_of(effect).acts_on != SENSOR)
     for effect in map(effect_of, flown):
@@ -88,7 +87,7 @@ def flown_effects(model: ModelParameters) -> tuple[Any, ...]:
 
 
 def _apply(equation: Any, values: list[Any]) -> list[Any]:
-    """Return what one operation of a trace gives; numbers stay numbers."""
+    """Return the outputs of one operation of a trace; numbers stay numbers."""
     inner = equation.params.get("jaxpr", equation.params.get("call_jaxpr"))
     if inner is not None:
         return _evaluate(getattr(inner, "jaxpr", inner), getattr(inner, "consts", ()), values)
@@ -149,7 +148,7 @@ def step_function(model: ModelParameters) -> casadi.Function:
 
 
 def needed_states(step: casadi.Function) -> list[int]:
-    """Return the places of the state vector that a path depends on: position, what moves it, and so on."""
+    """Return the indices of the state vector on which a path depends, directly or indirectly."""
     depends = np.array(casadi.DM(step.jac_sparsity(0, 0), 1).full(), bool)
     needed = set(range(STATE_SIZE)[POSITION])
     while True:

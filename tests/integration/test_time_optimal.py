@@ -270,17 +270,17 @@ def test_the_battery_drains_as_float32_does() -> None:
 
 def test_guesses_and_grids() -> None:
     pytest.importorskip("casadi")
-    from benchmarks.optimal import guess, problem, solve
+    from benchmarks.optimal import problem, solve
 
     track = load_track("flytrack")
     start = time_optimal.start_state(track, 24.0)
     counts = np.full(len(track.gates), 5)
     for kind in KINDS:
         task = problem.Task(kind, build_course(track), RADIUS_M, start)
-        first = guess.first_guess(task, counts, 10.0, None)
+        first = solve.first_guess(task, counts, 10.0, None)
         gates = np.array([gate.position for gate in track.gates])
         np.testing.assert_allclose(first.states[np.cumsum(counts), POSITION], gates, atol=1e-5)
-        finer = guess.resample(first, counts, 3 * counts)
+        finer = solve.resample(first, counts, 3 * counts)
         np.testing.assert_allclose(finer.times(3 * counts), first.times(counts))
         np.testing.assert_allclose(finer.states[::3, POSITION], first.states[:, POSITION], atol=1e-9)
     flipped = first._replace(
