@@ -1,33 +1,44 @@
-"""Registration with gymnax: ids, overrides, and importing the package more than once."""
+"""Every registered id: made, reproducible, the same without ``jit``, differentiable, randomised."""
 
+import hashlib
 import importlib
+import subprocess
+import sys
+from collections.abc import Callable
 from typing import Any
 
 import gymnax
 import jax
+import jax.numpy as jnp
+import numpy as np
 import pytest
 from gymnax.registration import registered_envs
 
 import flytrack_env
+from flytrack_env.dynamics import collective_thrust
+from flytrack_env.effects import CommandDelay, ThrustScale
+from flytrack_env.env import EnvParams, EnvState, FlyTrack
 from flytrack_env.registration import ENVIRONMENTS, make, register_all
-from flytrack_env.wrappers import DomainRandomization, layers_of
+from flytrack_env.state import Action
+from flytrack_env.wrappers import DomainRandomization, RandomizationParams, layers_of
+
+OVER_IDS = pytest.mark.parametrize("env_id", ENVIRONMENTS)
+# The one with everything in every run; the others take as long to compile.
+FAST = "FlyTrackRobust-v0"
+COMPILED_IDS = pytest.mark.parametrize(
+    "env_id", [pytest.param(each, marks=() if each == FAST else pytest.mark.slow) for each in ENVIRONMENTS]
+)
 
 
-@pytest.mark.parametrize("env_id", sorted(ENVIRONMENTS))
-def test_every_id_is_made_twice_and_after_another_import(env_id: str) -> None:
+@OVER_IDS
+def test_every_id_follows_gymnaxs_protocol(env_id: str) -> None:
     first, first_params = gymnax.make(env_id)
     importlib.reload(flytrack_env)
     register_all()
-    second, second_params = gymnax.make(env_id)
-    assert first is not second
-    assert list(registered_envs).count(env_id) == 1
-    assert type(first) is type(second)
-    assert jax.tree.structure(first_params) == jax.tree.structure(second_params)
-
-
-@pytest.mark.parametrize("env_id", sorted(ENVIRONMENTS))
-def test_every_id_resets_and_steps(env_id: str) -> None:
     env, params = gymnax.make(env_id)
+    assert first is not env and list(registered_envs).count(env_id) == 1
+    assert jax.tree.structure(first_params) == jax.tree.structure(params)
+    assert env.name == env_id
     key = jax.random.key(0)
     observation, state = jax.eval_shape(env.reset, key, params)
     action = jax.eval_shape(env.action_space(params).sample, key)
@@ -37,19 +48,7 @@ def test_every_id_resets_and_steps(env_id: str) -> None:
     assert jax.tree.structure(outputs[1]) == jax.tree.structure(state)
 
 
-def test_flytrack_is_registered_under_its_name() -> None:
-    assert "FlyTrack-v0" in ENVIRONMENTS
-    assert gymnax.make("FlyTrack-v0")[0].name == "FlyTrack-v0"
-
-
-def test_overrides_reach_the_environment() -> None:
-    assert make("FlyTrack-v0", missed_gate="fly_on").missed_gate == "fly_on"
-    assert gymnax.make("FlyTrack-v0", missed_gate="fly_on")[0].missed_gate == "fly_on"
-    with pytest.raises(ValueError, match="missed_gate"):
-        gymnax.make("FlyTrack-v0", missed_gate="sometimes")
-
-
-@pytest.mark.parametrize("env_id", sorted(ENVIRONMENTS))
+@OVER_IDS
 def test_every_id_takes_a_plant_with_its_parameters_baked_in(env_id: str, coasting: Any) -> None:
     class Baked(type(coasting)):
         dt = 0.01
@@ -60,6 +59,173 @@ def test_every_id_takes_a_plant_with_its_parameters_baked_in(env_id: str, coasti
     assert not any(isinstance(layer, DomainRandomization) for layer in layers_of(env))
 
 
-def test_unknown_ids_are_refused() -> None:
+def test_overrides_reach_the_environment_and_unknown_ids_are_refused() -> None:
+    assert gymnax.make("FlyTrack-v0", missed_gate="fly_on")[0].missed_gate == "fly_on"
+    with pytest.raises(ValueError, match="missed_gate"):
+        gymnax.make("FlyTrack-v0", missed_gate="sometimes")
     with pytest.raises(ValueError, match=r"env_id: found 'FlyTrack-v9', expected one of .*FlyTrack-v0"):
         make("FlyTrack-v9")
+
+
+def digest(env_id: str) -> str:
+    """Return a digest of every bit of a seeded flight through several episodes."""
+    env, params = gymnax.make(env_id)
+    params = params.replace(max_steps_in_episode=3)
+    outputs = [env.reset(jax.random.key(3), params)]
+    for i, action in enumerate(jax.random.uniform(jax.random.key(4), (25, 4), minval=-1.0)):
+        outputs.append(env.step(jax.random.key(i), outputs[-1][1], action, params))
+    rows = [np.asarray(leaf).tobytes() for output in outputs for leaf in jax.tree.leaves(output)]
+    return hashlib.sha256(b"".join(rows)).hexdigest()
+
+
+@COMPILED_IDS
+def test_identical_seeds_fly_identically_in_another_process(env_id: str) -> None:
+    code = f"from tests.contract.test_registration import digest; print(digest({env_id!r}))"
+    here = digest(env_id)
+    other = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert other.stdout.strip().splitlines()[-1] == here
+
+
+@COMPILED_IDS
+def test_without_jit_it_flies_the_same(env_id: str) -> None:
+    """Within 1e-5: steps each from its own last state, and an end with its reset."""
+    env, params = gymnax.make(env_id)
+    params, start = params.replace(max_steps_in_episode=3), env.reset(jax.random.key(3), params)[1]
+
+    def flight() -> list[Any]:
+        results: list[Any] = [(None, start)]
+        for i, action in enumerate(jax.random.uniform(jax.random.key(4), (4, 4), minval=-1.0)):
+            results.append(env.step(jax.random.key(i), results[-1][1], action, params))
+        return results
+
+    compiled = flight()
+    with jax.disable_jit():
+        plain = flight()
+    assert bool(compiled[3][4]) and not bool(compiled[2][4])  # truncated after three steps
+    for a, b in zip(jax.tree.leaves(compiled), jax.tree.leaves(plain), strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-5)
+
+
+# --- Gradients ----------------------------------------------------------------------------------
+
+
+@COMPILED_IDS
+def test_gradients_are_those_of_finite_differences(env_id: str, make_drone: Any) -> None:
+    """Through three steps in free flight, away from every gate, in every action of the first one."""
+    env, params = gymnax.make(env_id)
+    attached = env.with_transition_gradients()
+    assert attached.transition_gradients_enabled and not env.transition_gradients_enabled
+    drone = make_drone((14.0, 12.0, 3.0), (3.0, -2.0, 1.0), applied=Action(0.1, -0.1, 0.2, 0.0))
+    state = env.begin(drone, 0, params, jnp.uint32(11))
+    weights = jax.random.normal(jax.random.key(2), env.observation_space(params).shape)
+
+    @jax.jit
+    def value(action: jax.Array) -> jax.Array:
+        flown = state
+        for command in (action, jnp.full(4, 0.2), jnp.full(4, -0.1)):
+            observation, flown, *_ = attached.step_env(None, flown, command, params)
+        return weights @ observation
+
+    action = jnp.array([0.2, -0.3, 0.1, 0.4])
+    found = np.asarray(jax.jit(jax.grad(value))(action))
+    shifts = 0.05 * np.eye(4, dtype=np.float32)
+    expected = [float(value(action + shift) - value(action - shift)) / 0.1 for shift in shifts]
+    assert np.abs(expected).max() > 0.05
+    np.testing.assert_allclose(found, expected, rtol=0.02, atol=2e-3)
+
+
+def test_transition_gradients_are_detached_unless_asked_for(
+    env: FlyTrack, params: EnvParams, make_drone: Any
+) -> None:
+    """In double precision, of a smooth scalar of observation and next state, in action and speed."""
+
+    def differentiable(env: FlyTrack, state: EnvState) -> Callable[..., jax.Array]:
+        def scalar(action: jax.Array, speed: jax.Array) -> jax.Array:
+            drone = env.drone(state)
+            plant = state.plant._replace(drone=drone._replace(vel_w=drone.vel_w._replace(y=speed)))
+            observation, after, *_ = env.step_env(None, state._replace(plant=plant), action, params)
+            return jnp.sum(observation**2) + sum(leaf**2 for leaf in jax.tree.leaves(after.plant))
+
+        return scalar
+
+    action, speed = np.array([0.2, -0.3, 0.4, 0.1]), np.array(1.5)
+    with jax.enable_x64(True):
+        state = env.begin(make_drone((15.0, 2.5, 1.0), (-5.0, 1.0, 0.5)), 0, params)
+        state = jax.tree.map(lambda leaf: leaf.astype(float) if leaf.dtype == jnp.float32 else leaf, state)
+        detached = jax.jit(jax.grad(differentiable(env, state), argnums=(0, 1)))(action, speed)
+        scalar = jax.jit(differentiable(env.with_transition_gradients(), state))
+        gradient = jax.jit(jax.grad(scalar, argnums=(0, 1)))(action, speed)
+        shifts = 1e-6 * np.eye(4)
+        numeric = [(scalar(action + s, speed) - scalar(action - s, speed)) / 2e-6 for s in shifts]
+        slope = (scalar(action, speed + 1e-6) - scalar(action, speed - 1e-6)) / 2e-6
+    assert not np.asarray(detached[0]).any() and not np.asarray(detached[1]).any()
+    np.testing.assert_allclose(gradient[0], numeric, rtol=1e-4, atol=1e-5)
+    np.testing.assert_allclose(gradient[1], slope, rtol=1e-4, atol=1e-5)
+    assert np.abs(numeric).min() > 1e-6
+
+
+def test_gradients_of_a_flight_and_its_rewards_are_finite(
+    env: FlyTrack, params: EnvParams, make_drone: Any
+) -> None:
+    attached = env.with_transition_gradients()
+    state = env.begin(make_drone((18.6, 2.0, 1.0), quat=(0.0, 0.0, 0.0, 1.0)), 0, params)
+
+    @jax.jit
+    @jax.grad
+    def gradient(actions: jax.Array) -> jax.Array:
+        def one(state: EnvState, action: jax.Array) -> tuple[EnvState, jax.Array]:
+            _, state, reward, *_ = attached.step_env(None, state, action, params)
+            return state, reward
+
+        return jax.lax.scan(one, state, actions)[1].sum()
+
+    value = np.asarray(gradient(jnp.full((50, 4), 0.1)))
+    assert np.isfinite(value).all()
+    assert (np.abs(value[0]) > 0.0).all()
+
+
+# --- Randomised drones --------------------------------------------------------------------------
+
+
+def hover_command(model: Any, battery_v: float) -> np.ndarray:
+    """Return the thrust command at which each model's thrust is its weight, by bisection."""
+    coeffs = np.asarray(model.thrust_coeffs, float)[0]  # the same for all: their factor is drawn
+    factor = np.asarray(model.effect("thrust_scale").factor)
+    low, high = np.full(factor.shape, -1.0), np.full(factor.shape, 1.0)
+    for _ in range(40):
+        middle = 0.5 * (low + high)
+        is_lifting = factor * collective_thrust(middle, battery_v, coeffs) > np.asarray(model.m) * model.g
+        low, high = np.where(is_lifting, low, middle), np.where(is_lifting, middle, high)
+    return middle
+
+
+def test_a_heavier_drone_hovers_at_another_command(make_drone: Any) -> None:
+    """Each sampled drone hangs still at the command that physics says, and only there."""
+    env, params = gymnax.make("FlyTrackRandomized-v0")
+    # In still air, without the delay: what is left is mass, thrust, lags.
+    low, high = (CommandDelay(0.0), ThrustScale(0.85)), (CommandDelay(0.0), ThrustScale(1.15))
+    params = params.replace(wrappers={"domain_randomization": RandomizationParams(low=low, high=high)})
+    seeds, battery_v = jnp.arange(200, dtype=jnp.uint32), 23.5
+    models = jax.vmap(lambda seed: env.model(env.begin(make_drone((0, 0, 2)), 0, params, seed), params))(
+        seeds
+    )
+    commands = jnp.asarray(hover_command(models, battery_v), jnp.float32)
+
+    def climb(seed: jax.Array, thrust: jax.Array) -> jax.Array:
+        applied = Action(0.0, 0.0, 0.0, thrust)
+        drone = make_drone((15.0, 10.0, 2.0), battery_v=battery_v)._replace(applied=applied)
+        state = env.begin(drone, 0, params, seed)
+        state = env.advance(state, applied, params)[0]
+        return env.drone(state).acc_w.z
+
+    climb = jax.jit(jax.vmap(climb))
+    np.testing.assert_allclose(climb(seeds, commands), 0.0, atol=2e-3)
+    nominal = jnp.full(200, np.median(commands))
+    # At one command for all, each climbs or sinks by what its thrust exceeds its weight.
+    thrust = collective_thrust(nominal, battery_v, params.model.thrust_coeffs)
+    excess = models.effects[1].factor * thrust / models.m - params.model.g
+    np.testing.assert_allclose(climb(seeds, nominal), excess, atol=2e-3)
+    weight_per_thrust = np.asarray(models.m / models.effects[1].factor)
+    order = np.argsort(weight_per_thrust)
+    assert (np.diff(np.asarray(commands)[order]) > -1e-5).all()
+    assert np.ptp(commands) > 0.1

@@ -5,6 +5,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from flytrack_env.env import FlyTrack
 from flytrack_env.wrappers import (
@@ -15,7 +16,7 @@ from flytrack_env.wrappers import (
     ObservationNoise,
 )
 
-NUM_ENVS = 16
+NUM_ENVS, NUM_STEPS = 16, 60
 COMMANDED = partial(ActionHistory, length=3)
 APPLIED = partial(ActionHistory, length=1, kind="applied")
 ALL = (DomainRandomization, ActionDelay, APPLIED, ObservationNoise, COMMANDED, EpisodeStatistics)
@@ -56,19 +57,23 @@ def steps_of(env: Any) -> Any:
     return jax.jit(jax.vmap(env.step, in_axes=(0, 0, 0, None)))
 
 
-def fly(env: Any, num_steps: int = 60, params: Any = None, **wrappers: Any) -> Flight:
-    """Return random flights; ``wrappers``: parameters of wrappers that are not the default ones."""
+def fly(env: Any, params: Any = None, actions: Any = None, **wrappers: Any) -> Flight:
+    """Return flights of random actions, or of given ones (T, NUM_ENVS, 4).
+
+    wrappers: parameters of wrappers that are not the default ones.
+    """
     params = env.default_params if params is None else params
     params = arrays(params.replace(wrappers={**params.wrappers, **wrappers}))
     key_reset, key_actions, key_steps = jax.random.split(jax.random.key(0), 3)
-    actions = jax.random.uniform(key_actions, (num_steps, NUM_ENVS, 4), minval=-1.0)
+    if actions is None:
+        actions = jax.random.uniform(key_actions, (NUM_STEPS, NUM_ENVS, 4), minval=-1.0)
     first, start = resets_of(env)(jax.random.split(key_reset, NUM_ENVS), params)
     state, outputs = start, []
     for index, action in enumerate(actions):
         keys = jax.random.split(jax.random.fold_in(key_steps, index), NUM_ENVS)
         outputs.append(steps_of(env)(keys, state, action, params))
         state = outputs[-1][1]
-    return Flight(first, start, actions, *jax.tree.map(lambda *leaves: jnp.stack(leaves), *outputs))
+    return Flight(first, start, actions, *jax.tree.map(lambda *leaves: np.stack(leaves), *outputs))
 
 
 def arrays(params: Any) -> Any:

@@ -1,4 +1,4 @@
-"""The environment as a gymnax client sees it: episodes, flags, observations."""
+"""The environment as a gymnax client sees it: the protocol, ends of episodes, actions, observations."""
 
 from pathlib import Path
 from typing import Any
@@ -10,168 +10,221 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from flytrack_env.env import EnvParams, FlyTrack
+from flytrack_env.episodes import clip_action
 from flytrack_env.model_file import ModelFileError
 from flytrack_env.observations import OBSERVATION, OBSERVATION_SIZE
 from flytrack_env.state import Action, pack
 from flytrack_env.tracks import TrackError, load_track
 from tests.support.trees import assert_close, stack
+from tests.support.wrapped_flights import NUM_ENVS, Flight, arrays, fly, resets_of, steps_of
 
 CAUSES = ("crash", "ground", "out_of_bounds", "missed_gate", "battery_empty")
-INFO_KEYS = {
-    *CAUSES,
-    "gates_passed",
-    "laps",
-    "lap_completed",
-    "lap_time_s",
-    "gate_distance_m",
-    "terminated",
-    "truncated",
-    "final_observation",
-}
+RACE = {"gates_passed", "laps", "lap_completed", "lap_time_s", "gate_distance_m"}
 
 
 @pytest.fixture(scope="module")
-def flight(env: FlyTrack, params: EnvParams, reset_many: Any, rollout: Any) -> Any:
-    """States and outputs of 256 random flights of 120 steps, extreme sticks among them."""
-    rng = np.random.default_rng(0)
-    actions = rng.uniform(-1.0, 1.0, (120, 256, 4)).astype(np.float32)
-    actions[:, :64] = np.sign(actions[0, :64])
-    actions[:, 64:96] = np.sign(actions[:, 64:96]) * np.float32(np.inf)
-    actions[:, 96:112] *= 1e30
-    _, states = reset_many(jax.random.split(jax.random.key(1), 256), params)
-    return rollout(env, jax.random.key(2), states, jnp.asarray(actions), params)
+def flight(env: FlyTrack) -> Flight:
+    """300 random steps of 16 drones, extreme sticks among them."""
+    actions = np.random.default_rng(0).uniform(-1.0, 1.0, (300, NUM_ENVS, 4)).astype(np.float32)
+    actions[:, :4] = np.sign(actions[0, :4])
+    actions[:, 4:6] = np.sign(actions[:, 4:6]) * np.float32(np.inf)
+    actions[:, 6] *= 1e30
+    return fly(env, actions=actions)
+
+
+def ended(flight: Flight) -> np.ndarray:
+    return np.asarray(flight.terminated | flight.truncated)
 
 
 # --- The protocol -------------------------------------------------------------------------------
 
 
-def test_step_returns_six_values_of_the_stated_types(
-    env: FlyTrack, params: EnvParams, reset_many: Any, step_all: Any
-) -> None:
-    keys = jax.random.split(jax.random.key(0), 3)
-    observation, states = reset_many(keys, params)
-    assert observation.shape == (3, OBSERVATION_SIZE) and observation.dtype == jnp.float32
-    outputs = step_all(keys, states, jnp.zeros((3, 4)), params)
-    assert len(outputs) == 6
-    observation, next_states, reward, terminated, truncated, info = outputs
-    assert observation.shape == (3, OBSERVATION_SIZE) and observation.dtype == jnp.float32
-    assert reward.shape == (3,) and reward.dtype == jnp.float32
-    assert terminated.dtype == truncated.dtype == jnp.bool_
-    assert set(info) == INFO_KEYS
-    assert info["final_observation"].shape == observation.shape
-    for before, after in zip(jax.tree.leaves(states), jax.tree.leaves(next_states), strict=True):
-        assert (before.shape, before.dtype) == (after.shape, after.dtype)
+def test_step_returns_values_of_the_stated_types(flight: Flight) -> None:
+    shape = flight.rewards.shape
+    for observation in (flight.observations, flight.info["final_observation"]):
+        assert observation.shape == (*shape, OBSERVATION_SIZE) and observation.dtype == jnp.float32
+    assert flight.rewards.dtype == jnp.float32
+    assert flight.terminated.dtype == flight.truncated.dtype == jnp.bool_
+    assert set(flight.info) == {*CAUSES, *RACE, "terminated", "truncated", "final_observation"}
+    for before, after in zip(jax.tree.leaves(flight.start), jax.tree.leaves(flight.states), strict=True):
+        assert (before.shape, before.dtype) == (after.shape[1:], after.dtype)
 
 
-def test_default_parameters_are_used_when_none_are_given(env: FlyTrack, params: EnvParams) -> None:
-    key = jax.random.key(3)
-    observation, state = env.reset(key)
-    assert_close((observation, state), env.reset(key, params), 1e-6)
-    assert_close(env.step(key, state, jnp.zeros(4)), env.step(key, state, jnp.zeros(4), params))
+def test_default_parameters_are_used_when_none_are_given(env: FlyTrack, flight: Flight) -> None:
+    """Without ``jit``, which changes nothing either."""
+    key, action = jax.random.key(3), np.full(4, 0.3, np.float32)
+    keys, states = jnp.stack([key] * NUM_ENVS), flight.start
+    expected = steps_of(env)(keys, states, np.tile(action, (NUM_ENVS, 1)), arrays(env.default_params))
+    with jax.disable_jit():
+        found = env.step(key, jax.tree.map(lambda leaf: leaf[0], states), action)
+    assert_close(found, jax.tree.map(lambda leaf: leaf[0], expected), 1e-5)
 
 
 def test_spaces_are_finite_and_contain_every_observation(
-    env: FlyTrack, params: EnvParams, flight: Any
+    env: FlyTrack, params: EnvParams, flight: Flight
 ) -> None:
     space, actions = env.observation_space(params), env.action_space(params)
-    assert space.shape == (OBSERVATION_SIZE,) and actions.shape == (4,)
+    assert space.shape == (OBSERVATION_SIZE,) and actions.shape == (4,) and env.num_actions == 4
     assert np.isfinite(space.low).all() and np.isfinite(space.high).all()
-    assert env.num_actions == 4
     assert actions.contains(actions.sample(jax.random.key(0)))
-    observation, *_, info = flight[1]
-    for array in (observation, info["final_observation"]):
-        assert np.isfinite(array).all()
-        assert jax.jit(jax.vmap(space.contains))(array.reshape(-1, OBSERVATION_SIZE)).all()
+    for array in (flight.observations, flight.info["final_observation"]):
+        assert ((array >= np.asarray(space.low)) & (array <= np.asarray(space.high))).all()
 
 
-def test_flight_ends_in_many_ways_and_stays_finite(flight: Any) -> None:
-    _, (_, states, reward, terminated, _, info) = flight
-    assert int(terminated.sum()) > 50
-    assert sum(bool(info[cause].any()) for cause in CAUSES) >= 3
-    assert int(info["gates_passed"].max()) >= 1
-    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves((states, reward)))
+def test_flights_end_in_many_ways_and_stay_finite(flight: Flight) -> None:
+    assert flight.terminated.sum() > 30
+    assert sum(flight.info[cause].any() for cause in CAUSES) >= 3 and flight.info["gates_passed"].max() >= 1
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves((flight.states, flight.rewards)))
 
 
-def test_auto_reset_leaves_nothing_behind_in_a_flight(flight: Any) -> None:
-    _, (observation, states, _, terminated, truncated, info) = flight
-    done = np.asarray(terminated | truncated)
-    race = states.race
-    for leaf in (states.time, race.gates_passed, race.laps, race.lap_start_s, race.lap_time_s):
-        assert not np.asarray(leaf)[done].any()
-    np.testing.assert_array_equal(
-        np.asarray(observation)[~done], np.asarray(info["final_observation"])[~done]
-    )
-    assert (np.asarray(observation)[done] != np.asarray(info["final_observation"])[done]).any(1).all()
+def test_auto_reset_leaves_nothing_behind(flight: Flight) -> None:
+    done, race = ended(flight), flight.states.race
+    for leaf in (flight.states.time, race.gates_passed, race.laps, race.lap_start_s, race.lap_time_s):
+        assert not leaf[done].any()
+    final = flight.info["final_observation"]
+    np.testing.assert_array_equal(flight.observations[~done], final[~done])
+    assert (flight.observations[done] != final[done]).any(axis=1).all()
 
 
-def test_info_belongs_to_the_step_not_to_the_reset(env: FlyTrack, params: EnvParams, flight: Any) -> None:
-    before, (_, states, _, terminated, truncated, info) = flight
-    done = np.asarray(terminated | truncated)
-    causes = np.stack([np.asarray(info[cause]) for cause in CAUSES])
-    np.testing.assert_array_equal(causes.any(axis=0), terminated)
-    np.testing.assert_array_equal(info["terminated"], terminated)
-    np.testing.assert_array_equal(info["truncated"], truncated)
+def test_info_belongs_to_the_step_not_to_the_reset(env: FlyTrack, flight: Flight) -> None:
+    done, states, info = ended(flight), flight.states, flight.info
+    np.testing.assert_array_equal(np.stack([info[cause] for cause in CAUSES]).any(axis=0), flight.terminated)
+    np.testing.assert_array_equal(info["terminated"], flight.terminated)
+    np.testing.assert_array_equal(info["truncated"], flight.truncated)
     # An ended episode still shows its own count.
-    assert (np.asarray(info["gates_passed"]) >= np.asarray(before.race.gates_passed)).all()
-    assert (np.asarray(info["gates_passed"])[done] > 0).any()
-    centre = np.stack([np.asarray(x)[~done] for x in states.race.gate.centre])
-    position = np.stack([np.asarray(x)[~done] for x in env.drone(states).pos_w])
-    distance = np.linalg.norm(position - centre, axis=0)
-    np.testing.assert_allclose(np.asarray(info["gate_distance_m"])[~done], distance, atol=1e-4)
-
-
-def test_same_inputs_give_the_same_outputs(
-    env: FlyTrack, params: EnvParams, reset_many: Any, step_all: Any
-) -> None:
-    keys = jax.random.split(jax.random.key(4), 3)
-    first, again = reset_many(keys, params), reset_many(keys, params)
-    assert_close(first, again, 0.0)
-    actions = jnp.full((3, 4), 0.3)
-    assert_close(step_all(keys, first[1], actions, params), step_all(keys, again[1], actions, params), 0.0)
-
-
-def test_without_jit_the_step_is_the_same(env: FlyTrack, params: EnvParams) -> None:
-    key, action = jax.random.key(5), jnp.array([0.2, -0.4, 0.6, 0.1])
-    state = env.reset(key, params)[1]
-    jitted = env.step(key, state, action, params)
-    with jax.disable_jit():
-        assert_close(env.step(key, state, action, params), jitted, 1e-5)
+    assert (info["gates_passed"][1:] >= states.race.gates_passed[:-1]).all()
+    offset = np.stack(env.drone(states).pos_w) - np.stack(states.race.gate.centre)
+    distance = np.linalg.norm(offset, axis=0)
+    np.testing.assert_allclose(info["gate_distance_m"][~done], distance[~done], atol=1e-4)
 
 
 def test_parameters_can_differ_between_environments(
-    env: FlyTrack, params: EnvParams, reset_many: Any
+    env: FlyTrack, params: EnvParams, make_drone: Any
 ) -> None:
-    _, states = reset_many(jax.random.split(jax.random.key(6), 3), params)
     masses = jnp.array([0.5, 1.0, 2.0])
     batched = params.replace(model=params.model._replace(m=masses))
     axes = jax.tree.map(lambda _: None, params).replace(
         model=jax.tree.map(lambda _: None, params.model)._replace(m=0)
     )
-    same = jax.tree.map(lambda leaf: jnp.stack([leaf[0]] * 3), states)
-    step = jax.jit(jax.vmap(env.step_env, in_axes=(None, 0, None, axes)))
-    after = env.drone(step(None, same, jnp.zeros(4), batched)[1])
-    weightless = np.stack([np.asarray(after.acc_w.x), np.asarray(after.acc_w.y)])
-    np.testing.assert_allclose(weightless * np.asarray(masses), weightless[:, 1:2].repeat(3, 1), rtol=1e-4)
+    tilted = make_drone((15.0, 2.0, 1.35), quat=(0.9, 0.3, 0.3, 0.1))
+    state = env.begin(tilted, 0, params)
+    step = jax.jit(jax.vmap(env.step_env, in_axes=(None, None, None, axes)))
+    acc_w = env.drone(step(None, state, jnp.zeros(4), batched)[1]).acc_w
+    weightless = np.stack([np.asarray(acc_w.x), np.asarray(acc_w.y)])
+    np.testing.assert_allclose(weightless * masses, weightless[:, 1:2].repeat(3, 1), rtol=1e-4)
+
+
+# --- Ends of episodes ---------------------------------------------------------------------------
+
+# Position, velocity, extra fields of the drone, steps already flown, action; causes; truncated.
+IN_FRONT = (12.55, 2.0, 1.35)
+FREE, FAST = (15.0, 2.0, 1.35), (-10.0, 0.0, 0.0)
+ZERO = (0.0, 0.0, 0.0, 0.0)
+NAN = float("nan")
+ENDS = {
+    "flies on": (FREE, FAST, {}, 100, ZERO, set(), False),
+    "passes": (IN_FRONT, FAST, {}, 100, ZERO, set(), False),
+    "frame": ((12.55, 3.0, 1.35), FAST, {}, 100, ZERO, {"crash"}, False),
+    "frame above": ((12.55, 2.0, 2.4), FAST, {}, 100, ZERO, {"crash"}, False),
+    "missed": ((12.55, 4.0, 1.35), FAST, {}, 100, ZERO, {"missed_gate"}, False),
+    "ground": ((15.0, 2.0, 0.01), (0.0, 0.0, -5.0), {}, 100, ZERO, {"ground"}, False),
+    "wall +x": ((25.49, 2.0, 1.0), (5.0, 0.0, 0.0), {}, 100, ZERO, {"out_of_bounds"}, False),
+    "wall -x": ((-2.49, 9.0, 1.0), (-5.0, 0.0, 0.0), {}, 100, ZERO, {"out_of_bounds"}, False),
+    "wall +y": ((15.0, 34.99, 1.0), (0.0, 5.0, 0.0), {}, 100, ZERO, {"out_of_bounds"}, False),
+    "wall -y": ((15.0, -2.99, 1.0), (0.0, -5.0, 0.0), {}, 100, ZERO, {"out_of_bounds"}, False),
+    "ceiling": ((15.0, 2.0, 6.34), (0.0, 0.0, 5.0), {}, 100, ZERO, {"out_of_bounds"}, False),
+    "corner": ((25.49, 2.0, 0.01), (9.0, 0, -9.0), {}, 100, ZERO, {"ground", "out_of_bounds"}, False),
+    "battery": (FREE, FAST, {"battery_v": 22.0001}, 9, ZERO, {"battery_empty"}, False),
+    "low battery": (FREE, FAST, {"battery_v": 22.01}, 9, ZERO, set(), False),
+    "nan roll": (FREE, FAST, {}, 100, (NAN, 0.0, 0.0, 0.0), {"crash"}, False),
+    "nan thrust": (FREE, FAST, {}, 100, (0.0, 0.0, 0.0, NAN), {"crash"}, False),
+    "time limit": (FREE, FAST, {}, 999, ZERO, set(), True),
+    "one before": (FREE, FAST, {}, 998, ZERO, set(), False),
+    "frame at time limit": ((12.55, 3.0, 1.35), FAST, {}, 999, ZERO, {"crash"}, True),
+    "pass at time limit": (IN_FRONT, FAST, {}, 999, ZERO, set(), True),
+}
+BATCHES = [list(ENDS)[:NUM_ENVS], list(ENDS)[NUM_ENVS:]]
+
+
+@pytest.fixture(scope="module")
+def ends(env: FlyTrack, make_drone: Any) -> list[tuple[Any, ...]]:
+    """One step, alone and as a batch, of every row of ``ENDS`` from a race that has gone on for a while."""
+    params, results = arrays(env.default_params), []
+    keys = jax.random.split(jax.random.key(7), NUM_ENVS)
+    for names in BATCHES:
+        states, actions = [], []
+        for name in np.resize(names, NUM_ENVS):
+            position, velocity, fields, time, action, _, _ = ENDS[name]
+            state = env.begin(make_drone(position, velocity, **fields), 0, params)
+            race = state.race._replace(
+                gates_passed=jnp.int32(8), laps=jnp.int32(1), lap_start_s=jnp.float32(0.7)
+            )
+            states.append(state._replace(race=race, time=jnp.int32(time)))
+            actions.append(action)
+        states, actions = stack(states), jnp.array(actions, jnp.float32)
+        single = steps_of(env)(keys, states, actions, params)
+        results.append((keys, single, env.step_batch(jax.random.key(8), states, actions, params)))
+    return results
+
+
+@pytest.mark.parametrize("name", ENDS)
+def test_every_end_has_its_own_cause_and_flags(name: str, ends: list[tuple[Any, ...]]) -> None:
+    batch = int(name in BATCHES[1])
+    row = BATCHES[batch].index(name)
+    *_, causes, is_truncated = ENDS[name]
+    for _, _, _, terminated, truncated, info in ends[batch][1:]:
+        assert {cause for cause in CAUSES if bool(info[cause][row])} == causes
+        assert bool(terminated[row]) is bool(causes) and bool(truncated[row]) is is_truncated
+
+
+def test_ended_episodes_begin_as_a_reset_does(env: FlyTrack, ends: list[tuple[Any, ...]]) -> None:
+    for keys, (observation, states, _, terminated, truncated, info), _ in ends:
+        done = np.asarray(terminated | truncated)
+        assert (np.asarray(states.race.laps)[~done] == 1).all()
+        fresh = resets_of(env)(keys, arrays(env.default_params))
+        pairs = zip(jax.tree.leaves((observation, states)), jax.tree.leaves(fresh), strict=True)
+        for leaf, expected in pairs:
+            np.testing.assert_allclose(np.asarray(leaf)[done], np.asarray(expected)[done], atol=1e-5)
+        final = np.asarray(info["final_observation"])
+        assert np.isfinite(final).all()
+        np.testing.assert_array_equal((np.asarray(observation) != final).any(axis=1), done)
+
+
+def test_batch_step_ends_the_same_episodes_and_resets_them_apart(
+    env: FlyTrack, params: EnvParams, ends: list[tuple[Any, ...]]
+) -> None:
+    _, single, batch = ends[0]
+    assert_close(batch[2:], single[2:], 2e-5)
+    done = np.asarray(batch[3] | batch[4])
+    goes_on = [jax.tree.map(lambda leaf: np.asarray(leaf)[~done], each[:2]) for each in (batch, single)]
+    assert_close(*goes_on, 2e-5)
+    observation, state = batch[:2]
+    race = state.race
+    for leaf in (state.time, race.gates_passed, race.laps, race.lap_start_s, race.lap_time_s):
+        assert not np.asarray(leaf)[done].any()
+    starts = np.stack([np.asarray(leaf)[done] for leaf in env.drone(state).pos_w], -1)
+    assert len(np.unique(starts, axis=0)) == done.sum()
+    expected = jax.jit(jax.vmap(env.observe, in_axes=(None, 0, None, None)))(None, state, None, params)
+    np.testing.assert_allclose(observation, expected, atol=1e-6)
 
 
 # --- Actions ------------------------------------------------------------------------------------
 
 
-def test_actions_beyond_the_range_are_clipped(params: EnvParams, reset_many: Any, step_all: Any) -> None:
-    keys = jax.random.split(jax.random.key(11), 1)
-    _, state = reset_many(keys, params)
-    corners = np.array([[1, -1, 1, 1], [-1, 1, -1, -1]], np.float32)
-    pairs = [(c, c * f) for c in corners for f in (1.001, 7.0, 1e30, np.float32(np.inf))]
-    for corner, beyond in pairs:
-        expected = step_all(keys, state, jnp.asarray(corner)[None], params)
-        assert_close(step_all(keys, state, jnp.asarray(beyond)[None], params), expected, 0.0)
+def test_actions_beyond_the_range_are_clipped(env: FlyTrack, flight: Flight) -> None:
+    corners = np.resize(np.array([[1, -1, 1, 1], [-1, 1, -1, -1]], np.float32), (NUM_ENVS, 4))
+    factors = np.resize(np.array([1.001, 7.0, 1e30, np.inf], np.float32).repeat(2), NUM_ENVS)[:, None]
+    keys = jax.random.split(jax.random.key(11), NUM_ENVS)
+    arguments = keys, flight.start
+    found, expected = (
+        steps_of(env)(*arguments, jnp.asarray(actions), arrays(env.default_params))
+        for actions in (corners * factors, corners)
+    )
+    assert_close(found, expected, 0.0)
 
 
-def test_integer_actions_are_as_good_as_real_ones(env: FlyTrack, params: EnvParams, make_drone: Any) -> None:
-    state = env.begin(make_drone((15.0, 2.0, 1.35)), 0, params)
-    key = jax.random.key(0)
-    real = env.step(key, state, jnp.array([1.0, 0.0, -1.0, 1.0]), params)
-    assert_close(env.step(key, state, jnp.array([1, 0, -1, 1]), params), real, 1e-6)
+def test_integer_actions_are_as_good_as_real_ones() -> None:
+    assert clip_action(jnp.array([3, 0, -2, 1])) == clip_action(jnp.array([1.0, 0.0, -1.0, 1.0]))
 
 
 @pytest.mark.parametrize("shape", [(), (3,), (5,), (4, 1), (1, 4)])
@@ -179,19 +232,11 @@ def test_actions_of_another_shape_are_refused(
     shape: tuple[int, ...], env: FlyTrack, params: EnvParams, make_drone: Any
 ) -> None:
     state = env.begin(make_drone((15.0, 2.0, 1.35)), 0, params)
-    with pytest.raises(ValueError, match=r"action: found shape .*expected \(4,\)"):
-        env.step(jax.random.key(0), state, jnp.zeros(shape), params)
-    with pytest.raises(ValueError, match=r"action: found shape .*expected \(4,\)"):
-        env.step_env(None, state, jnp.zeros(shape), params)
-
-
-@pytest.mark.parametrize("shape", [(2, 3), (3, 4), (4,)])
-def test_batches_of_actions_of_another_shape_are_refused(
-    shape: tuple[int, ...], env: FlyTrack, params: EnvParams, make_drone: Any
-) -> None:
-    states = stack([env.begin(make_drone((15.0, 2.0, 1.35)), 0, params)] * 2)
+    for step, key in ((env.step, jax.random.key(0)), (env.step_env, None)):
+        with pytest.raises(ValueError, match=r"action: found shape .*expected \(4,\)"):
+            step(key, state, jnp.zeros(shape), params)
     with pytest.raises(ValueError):
-        env.step_batch(jax.random.key(0), states, jnp.zeros(shape), params)
+        env.step_batch(jax.random.key(0), stack([state] * 2), jnp.zeros((2, 3)), params)
 
 
 # --- Construction -------------------------------------------------------------------------------
@@ -203,13 +248,10 @@ def test_batches_of_actions_of_another_shape_are_refused(
         ({"track": "monza"}, TrackError, "track: found 'monza', expected one of .*flytrack"),
         ({"track": Path("no/such.toml")}, TrackError, "no/such.toml: cannot be read"),
         ({"model": "no/such.json"}, ModelFileError, "no/such.json: cannot be read"),
+        ({"plant": "nominal"}, TypeError, r"plant: found str, expected a subclass of plants\.Plant"),
         ({"missed_gate": "ignore"}, ValueError, "missed_gate: found 'ignore', expected one of"),
         ({"missed_gate": True}, ValueError, "missed_gate: found True, expected one of"),
-        (
-            {"reward": {"speed": 1.0}},
-            ValueError,
-            "reward: found 'speed', expected one of progress",
-        ),
+        ({"reward": {"speed": 1.0}}, ValueError, "reward: found 'speed', expected one of progress"),
         ({"reward": {"progress": "much"}}, ValueError, r"reward\.progress: found 'much', expected a finite"),
         ({"reward": {"progress": float("nan")}}, ValueError, r"reward\.progress: found nan"),
     ],
@@ -252,17 +294,17 @@ def expected_observation(x: np.ndarray, gate_index: int) -> np.ndarray:
     return np.concatenate([np.clip(np.array(q) / e.scale, -e.limit, e.limit) for e, q in rows])
 
 
-def test_observation_index_by_index(env: FlyTrack, params: EnvParams, flight: Any) -> None:
+def test_observation_index_by_index(flight: Flight) -> None:
     assert [entry.size for entry in OBSERVATION] == [3, 3, 9, 3, 4, 1, 3, 3]
-    states, outputs = flight
-    observed = outputs[0][:-1, ::5].reshape(-1, OBSERVATION_SIZE)
-    seen = jax.tree.map(lambda leaf: leaf[1:, ::5].ravel(), states)
-    x = np.asarray(jax.vmap(pack)(seen.plant), float)
-    gate_indices = np.asarray(seen.race.gate_index)
-    assert set(gate_indices) == set(range(8))
-    rows = range(0, len(x), 7)
-    expected = np.stack([expected_observation(x[i], gate_indices[i]) for i in rows])
-    np.testing.assert_allclose(observed[np.array(rows)], expected, atol=2e-5)
+    rows = np.flatnonzero(np.arange(flight.rewards.size) % 7 == 0)
+    observed, drones, gates = jax.tree.map(
+        lambda leaf: leaf.reshape(-1, *leaf.shape[2:])[rows],
+        (flight.observations, flight.states.plant.drone, flight.states.race.gate_index),
+    )
+    x = np.asarray(jax.vmap(pack)(drones), float)
+    assert set(gates) == set(range(8))
+    expected = np.stack([expected_observation(*row) for row in zip(x, gates, strict=True)])
+    np.testing.assert_allclose(observed, expected, atol=2e-5)
 
 
 def test_observation_is_clipped_to_its_range(env: FlyTrack, params: EnvParams, make_drone: Any) -> None:

@@ -48,7 +48,7 @@ def state_of(state: Any, field: str) -> Any:
 def flight() -> Flight:
     """Flights in all wrappers with their default parameters."""
     env = wrapped(*ALL)
-    return fly(env, params=env.default_params.replace(max_steps_in_episode=50))
+    return fly(env, env.default_params.replace(max_steps_in_episode=50))
 
 
 @pytest.fixture(scope="module")
@@ -88,7 +88,7 @@ def test_the_delay_does_what_the_effect_in_the_model_does(quiet_flights: dict[st
 def test_the_order_of_wrapping_does_not_change_the_flight(flight: Flight) -> None:
     """What is drawn hangs on names."""
     env = wrapped(ALL[5], ALL[3], ALL[1], ALL[0], ALL[2], ALL[4])
-    other = fly(env, params=env.default_params.replace(max_steps_in_episode=50))
+    other = fly(env, env.default_params.replace(max_steps_in_episode=50))
     np.testing.assert_allclose(other.observations, flight.observations, atol=5e-4)
     np.testing.assert_array_equal(ended(other), ended(flight))
 
