@@ -1,6 +1,5 @@
-"""Figures of a validation; colours of M. Okabe and K. Ito, which colour-blind people can tell apart."""
+"""Figures of a validation, in the colours of ``flytrack_env.scene``."""
 
-import io
 from collections.abc import Sequence
 
 import matplotlib
@@ -8,43 +7,41 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from flytrack_sysid.forces import OpenForce, ThrustError
+from flytrack_env.pictures import drawing
+from flytrack_env.pictures.drawing import new_figure, plain
+from flytrack_env.scene import BLUE, GREEN, GREY, ORANGE
+from flytrack_sysid.forces import OpenForce, SpeedBin, ThrustError
 from flytrack_sysid.one_step import UNITS, OneStep
 from flytrack_sysid.open_loop import QUANTITIES, Rollout
 from flytrack_sysid.steps import AXES, StepResponse
 from flytrack_sysid.validate import NAMES, Validation
 
 DPI = 150
-WIDTH_IN, NOTHING_HEIGHT_IN = 7.0, 1.2
-BLUE, ORANGE, GREEN, GREY = "#0072B2", "#D55E00", "#009E73", "#666666"
+WIDTH_IN, EMPTY_HEIGHT_IN = 7.0, 1.2
 BY_AXIS = {"x": BLUE, "y": ORANGE, "z": GREEN}
 STYLES = ("-", "--", ":")
 NUM_BINS = 61
-# What lies beyond is in the histogram's last bins: single rows would else squeeze all others.
+# Errors beyond are in the histogram's last bins: single rows would otherwise squeeze all others.
 SHOWN_PERCENTILE = 99.5
 
 
 def png_of(figure: Figure) -> bytes:
     """Return a figure as a PNG file."""
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=DPI, metadata={"Software": None})
-    return buffer.getvalue()
+    return drawing.png_of(figure, DPI)
 
 
 def _figure(title: str, rows: int, columns: int, height_in: float) -> tuple[Figure, np.ndarray]:
-    figure = Figure(figsize=(WIDTH_IN, height_in), layout="constrained")
+    figure = new_figure(WIDTH_IN, height_in)
     figure.suptitle(title, fontsize="large", fontweight="bold")
     axes = figure.subplots(rows, columns, squeeze=False)
     for panel in axes.flat:
-        panel.spines[["top", "right"]].set_visible(False)
-        panel.grid(color="0.9", linewidth=0.8)
-        panel.set_axisbelow(True)
+        plain(panel)
     return figure, axes
 
 
-def _nothing(title: str, why: str) -> Figure:
+def _empty(title: str, why: str) -> Figure:
     """Return a low figure that says why there is nothing to show."""
-    figure, panels = _figure(title, 1, 1, NOTHING_HEIGHT_IN)
+    figure, panels = _figure(title, 1, 1, EMPTY_HEIGHT_IN)
     say(panels[0, 0], why)
     return figure
 
@@ -55,11 +52,17 @@ def say(axes: Axes, why: str) -> None:
     axes.text(0.5, 0.5, why, ha="center", va="center", color=GREY, transform=axes.transAxes, wrap=True)
 
 
+def _label(panel: Axes, x: str, y: str, num_columns: int = 1) -> None:
+    """Set the labels of a panel, and show its legend."""
+    panel.set(xlabel=x, ylabel=y)
+    panel.legend(fontsize="small", frameon=False, ncols=num_columns)
+
+
 def draw_steps(steps: Sequence[StepResponse]) -> Figure:
-    """Draw measured and modelled answers to the clearest commanded steps, a panel per axis."""
-    title = "Answer to commanded steps"
+    """Draw measured and modelled responses to the clearest commanded steps, a panel per axis."""
+    title = "Response to commanded steps"
     if not steps:
-        return _nothing(title, "no clear commanded step of roll, pitch or yaw is judged")
+        return _empty(title, "no clear commanded step of roll, pitch or yaw is judged")
     figure, panels = _figure(title, len(AXES), 1, 8.0)
     for panel, axis in zip(panels[:, 0], AXES, strict=True):
         own = [step for step in steps if step.axis == axis]
@@ -74,9 +77,8 @@ def draw_steps(steps: Sequence[StepResponse]) -> Figure:
             panel.plot(milliseconds, np.rad2deg(step.modelled), "--", color="black", linewidth=1.2)
         panel.plot([], [], "--", color="black", linewidth=1.2, label="model, flying freely")
         panel.axvline(0.0, color=GREY, linewidth=0.8)
-        panel.set_ylabel(f"{axis} rate (deg/s)")
-        panel.legend(fontsize="small", frameon=False)
-    panels[-1, 0].set_xlabel("time since the command (ms)")
+        is_last = axis == AXES[-1]
+        _label(panel, "time since the command (ms)" if is_last else "", f"{axis} rate (deg/s)")
     return figure
 
 
@@ -95,7 +97,7 @@ def draw_one_step(one_step: OneStep) -> Figure:
     names = ["p", "v", "q", "w", "f" if "f" in one_step.channels else "a"]
     title = "One-step errors, measured minus modelled"
     if not one_step.channels:
-        return _nothing(title, "no step is judged")
+        return _empty(title, "no step is judged")
     figure, panels = _figure(title, 3, 2, 8.0)
     panels.flat[-1].set_axis_off()
     for panel, name in zip(panels.flat, names, strict=False):
@@ -109,10 +111,8 @@ def draw_one_step(one_step: OneStep) -> Figure:
         _draw_histogram(panel, values)
         nrmse = "" if error.nrmse is None else f", NRMSE {error.nrmse:.2g}"
         panel.set_title(f"{NAMES[name]}{nrmse}", fontsize="medium", loc="left")
-        panel.set_xlabel(f"error ({unit})")
-        panel.set_ylabel("steps (%)")
         panel.ticklabel_format(axis="x", scilimits=(-2, 3))
-        panel.legend(fontsize="small", frameon=False)
+        _label(panel, f"error ({unit})", "steps (%)")
     return figure
 
 
@@ -128,21 +128,18 @@ def draw_rollouts(rollouts: Sequence[Rollout]) -> Figure:
         errors = [rollout.errors[name] for rollout in flown]
         panel.plot(horizons, [error.p95 for error in errors], "^--", color=ORANGE, label="95th percentile")
         panel.plot(horizons, [error.median for error in errors], "o-", color=BLUE, label="median")
-        panel.set_xlabel("length of the flight (s)")
-        panel.set_ylabel(f"{name} ({unit})")
-        panel.set_xlim(left=0.0)
-        panel.set_ylim(bottom=0.0)
-        panel.legend(fontsize="small", frameon=False)
+        panel.set(xlim=(0.0, None), ylim=(0.0, None))
+        _label(panel, "length of the flight (s)", f"{name} ({unit})")
     return figure
 
 
 def draw_thrust(thrust: ThrustError | None) -> Figure:
-    """Draw the error of thrust over applied action and voltage, and both curves at three voltages."""
+    """Draw the thrust error over applied action and voltage, and both curves at three voltages."""
     if thrust is None:
-        return _nothing("Thrust", "not judged: it needs v_bat, and f, or a or v with q")
+        return _empty("Thrust", "not judged: it needs v_bat, and f, or a or v with q")
     figure, panels = _figure("Thrust", 2, 1, 8.0)
     heat, curves = panels[:, 0]
-    limit = float(np.nanmax(np.abs(thrust.mean_n)))
+    limit = max(float(np.nanmax(np.abs(thrust.mean_n))), np.finfo(float).tiny)
     heat.grid(False)
     heat.set_facecolor("0.9")
     image = heat.pcolormesh(
@@ -150,8 +147,8 @@ def draw_thrust(thrust: ThrustError | None) -> Figure:
         thrust.voltage_edges,
         np.ma.masked_invalid(thrust.mean_n),
         cmap=matplotlib.colormaps["PuOr_r"],
-        vmin=-max(limit, np.finfo(float).tiny),
-        vmax=max(limit, np.finfo(float).tiny),
+        vmin=-limit,
+        vmax=limit,
     )
     figure.colorbar(image, ax=heat, label="measured minus modelled (N)")
     heat.set_title("mean error; grey: not flown", fontsize="medium", loc="left")
@@ -160,24 +157,24 @@ def draw_thrust(thrust: ThrustError | None) -> Figure:
         label = f"{curve.voltage_v:.1f} V"
         curves.plot(curve.modelled_action, curve.modelled_n, style, color=colour, label=f"model, {label}")
         curves.plot(curve.measured_action, curve.measured_n, "o", color=colour, label=f"measured, {label}")
-    curves.set_xlabel("applied thrust action (stick, after the lag)")
-    curves.set_ylabel("thrust (N)")
-    curves.legend(fontsize="small", frameon=False, ncols=2)
+    _label(curves, "applied thrust action (stick, after the lag)", "thrust (N)", num_columns=2)
     return figure
 
 
+def speed_text(part: SpeedBin) -> str:
+    """Return a range of speeds in m/s as text."""
+    return f"{part.low:g} to {part.high:g}" if np.isfinite(part.high) else f"over {part.low:g}"
+
+
 def draw_open_force(force: OpenForce | None) -> Figure:
-    """Draw the specific force that the model leaves open by speed."""
-    title = "Force that the model leaves open"
+    """Draw the specific force that the model does not explain, by speed."""
+    title = "Force that the model does not explain"
     if force is None:
-        return _nothing(title, "not judged: it needs v, q, and a or f")
+        return _empty(title, "not judged: it needs v, q, and a or f")
     figure, panels = _figure(title, 1, 1, 4.5)
     panel = panels[0, 0]
     place = np.arange(len(force.by_speed))
-    labels = [
-        f"{part.low:g} to {part.high:g}" if np.isfinite(part.high) else f"over {part.low:g}"
-        for part in force.by_speed
-    ]
+    labels = [speed_text(part) for part in force.by_speed]
     width = 0.2
     for index, axis in enumerate("xyz"):
         heights = [part.rms_b[index] for part in force.by_speed]
@@ -186,9 +183,7 @@ def draw_open_force(force: OpenForce | None) -> Figure:
     panel.plot(place, against, "D", color="black", label="against the flight's direction, mean")
     panel.axhline(0.0, color=GREY, linewidth=0.8)
     panel.set_xticks(place, labels)
-    panel.set_xlabel("speed (m/s)")
-    panel.set_ylabel("measured minus modelled (m/s²)")
-    panel.legend(fontsize="small", frameon=False)
+    _label(panel, "speed (m/s)", "measured minus modelled (m/s²)")
     return figure
 
 

@@ -1,4 +1,4 @@
-"""The recording of a flight log, read back: measured numbers, forces left open, free flight of models."""
+"""The recording of a flight log, read back: measured numbers, unexplained forces, free flight of models."""
 
 import importlib
 import sys
@@ -20,11 +20,11 @@ from tests.support.made_flight import TIME_S, flight
 from tests.support.recordings import Recording
 
 pytest.importorskip("rerun", reason="rerun-sdk is not installed (extra flytrack[viz])")
-shown_log = importlib.import_module("flytrack_sysid.shown_log")
+trajectories = importlib.import_module("flytrack_sysid.trajectories")
 
-SECONDS, DT_S = 12.0, 0.01
+SECONDS, DT_S = 8.0, 0.01
 DRAG = LinearDrag(0.3, 0.4, 0.1)
-SECOND = 600  # the first row of the second segment
+SECOND = 400  # the first row of the second segment
 SETTLED = 60  # rows until memories are forgotten
 SCALED_FORCE = 0.1  # m of an arrow for 1 m/s^2
 
@@ -53,7 +53,7 @@ def models(flown) -> dict[str, ModelParameters]:
 @pytest.fixture(scope="module")
 def flights(flown, models) -> dict:
     """What is shown, by name."""
-    return {one.name: one for one in shown_log.flights_of(flown[1], models)}
+    return {one.name: one for one in trajectories.trajectories_of(flown[1], models)}
 
 
 @pytest.fixture(scope="module")
@@ -106,7 +106,7 @@ def test_arrows_are_the_force_that_the_model_lacks_along_the_world(flown, record
         name: recording.series(f"/world/residual/{name}", "Arrows3D:vectors") for name in ("nominal", "true")
     }
     inside = [at for at, row in enumerate(steps) if SECOND + SETTLED + half < row < len(log) - half]
-    assert len(inside) > 400
+    assert len(inside) > 250
     rows = np.array(steps)[inside]
     expected = np.mean([drag_w[rows - 1 + shift] for shift in range(-half, half + 1)], axis=0)
     assert np.abs(expected).max(axis=0).min() > 0.3
@@ -119,9 +119,9 @@ def test_arrows_are_the_force_that_the_model_lacks_along_the_world(flown, record
     assert np.isnan(recording.series("/plots/residual/nominal", "Scalars:scalars")[[0, SECOND]]).all()
 
 
-def apart_m(shown, log) -> np.ndarray:
+def distance_m(shown, log) -> np.ndarray:
     """Return how far a flight is from the measured one at its rows, (T,) m."""
-    time_s = shown_log.time_in_line(log)
+    time_s = trajectories.time_in_line(log)
     rows = np.searchsorted(time_s, shown.time_s - 1e-6)
     np.testing.assert_allclose(time_s[rows], shown.time_s, atol=1e-9)
     return np.linalg.norm(shown.positions - log["p"][rows], axis=1)
@@ -131,25 +131,25 @@ def test_a_model_flies_by_itself_and_starts_anew_every_second(flown, flights):
     log = flown[1]
     wrong, right = flights["nominal"], flights["true"]
     starts_s = right.time_s[right.restarts]
-    assert starts_s[0] == 0.0 and right.time_s[-1] == pytest.approx(shown_log.time_in_line(log)[-1])
+    assert starts_s[0] == 0.0 and right.time_s[-1] == pytest.approx(trajectories.time_in_line(log)[-1])
     gaps = np.diff(starts_s[1:])
     is_jump = gaps > 1.5  # from the first segment into the second
-    assert is_jump.sum() == 1 and len(gaps) >= 9
+    assert is_jump.sum() == 1 and len(gaps) >= 5
     np.testing.assert_allclose(gaps[~is_jump], 1.0, atol=1e-6)
-    assert apart_m(right, log).max() < 1e-3
-    away = apart_m(wrong, log)
+    assert distance_m(right, log).max() < 1e-3
+    away = distance_m(wrong, log)
     assert away[wrong.restarts].max() < 1e-9 and away.max() > 0.3
     ends = np.flatnonzero(np.append(wrong.restarts[1:], True))
     assert away[ends].max() == away.max()
-    assert np.isnan(right.actions).all() and "ran away" not in right.ended
+    assert np.isnan(right.actions).all() and "diverged" not in right.ended
 
 
-def test_a_model_that_runs_away_is_cut_off(flown, flights):
-    away = apart_m(flights["strong"], flown[1])
-    assert 3.0 < away.max() < shown_log.AWAY_M
-    assert f"ran away {flights['strong'].restarts.sum() - 1} times" in flights["strong"].ended
+def test_a_model_that_diverges_is_cut_off(flown, flights):
+    away = distance_m(flights["strong"], flown[1])
+    assert 3.0 < away.max() < trajectories.AWAY_M
+    assert f"diverged {flights['strong'].restarts.sum() - 1} times" in flights["strong"].ended
     void = flights["void"]
-    assert len(void.states) == void.restarts.sum() and apart_m(void, flown[1]).max() == 0.0
+    assert len(void.states) == void.restarts.sum() and distance_m(void, flown[1]).max() == 0.0
 
 
 def test_models_have_their_own_colour_and_no_empty_lines(recording):
@@ -169,19 +169,19 @@ def made() -> FlightLog:
 
 def test_position_is_integrated_where_it_was_not_measured(made):
     halves = made.without("p")
-    (shown,) = shown_log.flights_of(halves, {})
+    (shown,) = trajectories.trajectories_of(halves, {})
     assert shown.name == "measured (position integrated)"
     moved = made["p"] - np.repeat(made["p"][[0, 300]], 300, axis=0)
     assert np.abs(moved).max() > 1.0
     np.testing.assert_allclose(shown.positions, moved, atol=2e-3)
-    (still,) = shown_log.flights_of(made.without("p", "v"), {})
+    (still,) = trajectories.trajectories_of(made.without("p", "v"), {})
     assert still.name == "measured (no position)" and (still.positions == 0.0).all()
     assert np.isnan(still.states[:, 3:9]).all() and np.isfinite(still.states[:, 9:16]).all()
 
 
 def test_of_a_long_log_rows_are_left_out_but_no_start(monkeypatch, made):
-    monkeypatch.setattr(shown_log, "MOST_ROWS", 150)
-    (shown,) = shown_log.flights_of(made, {})
+    monkeypatch.setattr(trajectories, "MOST_ROWS", 150)
+    (shown,) = trajectories.trajectories_of(made, {})
     kept = [*range(0, 300, 4), *range(300, 600, 4)]
     np.testing.assert_array_equal(shown.positions, made["p"][kept])
     assert np.flatnonzero(shown.restarts).tolist() == [0, 75] and "1 row in 4" in shown.ended
@@ -209,10 +209,10 @@ def test_diagnose_writes_the_recording_or_says_why_not(flown, models, tmp_path, 
     assert f"written: {out / 'diagnosis.json'}, {path}\n" in diagnosed("log.npz")
     drones = {entity for entity, _ in Recording(path).rows if entity.endswith("/drone")}
     assert drones == {"/world/drone", "/world/flights/nominal/drone", "/world/flights/extended/drone"}
-    said = diagnosed("turns.npz")  # and takes away what is of another log
-    assert "left out" in said and "expected q (attitude)" in said and not path.exists()
+    text = diagnosed("turns.npz")  # which removes the recording of another log
+    assert "left out" in text and "expected q (attitude)" in text and not path.exists()
     monkeypatch.setitem(sys.modules, "rerun", None)  # as if it were not installed
     monkeypatch.delitem(sys.modules, "flytrack_env.viz_rerun")
-    said = diagnosed("log.npz")
-    assert "pip install 'flytrack[viz]'" in said and f"written: {out / 'diagnosis.json'}\n" in said
+    text = diagnosed("log.npz")
+    assert "pip install 'flytrack[viz]'" in text and f"written: {out / 'diagnosis.json'}\n" in text
     assert not path.exists()
