@@ -13,14 +13,21 @@ from flytrack_sysid.log import FlightLog
 from flytrack_sysid.one_step import NORMALISED_BY, NRMSE_MEANING, UNITS
 from flytrack_sysid.open_loop import QUANTITIES, START_EVERY_S
 from flytrack_sysid.page import Bullets, Picture, Section, Table, Text, page
-from flytrack_sysid.plots import draw_validation, png_of
+from flytrack_sysid.plots import draw_validation, png_of, speed_text
 from flytrack_sysid.validate import NAMES, Validation
 
+# Heading of each figure, in the order of the page, and its caption.
+HEADINGS = {
+    "steps": "Step responses",
+    "rollouts": "Free flight",
+    "one_step": "One step",
+    "thrust": "Thrust by command and voltage",
+    "open_force": "Unexplained force by speed",
+}
 CAPTIONS = {
-    "steps": "Measured body rates (solid) and those of the model (dashed), which flies by itself from 0.1 s "
-    "before the command.",
-    "one_step": "Errors of the step from each measured row to the next; the last bins hold what is beyond.",
+    "steps": "Body rates, measured (solid) and of the model flying by itself from 0.1 s before the command.",
     "rollouts": "Errors of the model flying by itself under the logged commands, over all starts.",
+    "one_step": "Errors of the step from each measured row to the next; the last bins hold all larger ones.",
     "thrust": "Mass times specific force along body z. Above: error by applied action and voltage. Below: "
     "the model at rest (lines) and means of what was flown (dots) in thirds of the range of voltage.",
     "open_force": "Specific force, measured minus modelled. Diamonds above 0: drag that the model lacks.",
@@ -30,7 +37,7 @@ CAPTIONS = {
 def _number(value: float | None) -> str:
     if value is None:
         return "-"
-    return f"{value:.3g}" if np.isfinite(value) else "runs away"
+    return f"{value:.3g}" if np.isfinite(value) else "diverges"
 
 
 def _one_step_table(validation: Validation) -> Table:
@@ -71,10 +78,9 @@ def _thrust_table(thrust: ThrustError) -> Table:
 def _force_table(force: OpenForce) -> Table:
     rows = []
     for part in force.by_speed:
-        speed = f"{part.low:g} to {part.high:g}" if np.isfinite(part.high) else f"over {part.low:g}"
         numbers = (part.rms, *part.rms_b, part.mean_against_velocity)
-        rows.append([speed, *(_number(number) for number in numbers), str(part.count)])
-    caption = f"Specific force left open, m/s^2, by speed in m/s, measured with {force.source}"
+        rows.append([speed_text(part), *(_number(number) for number in numbers), str(part.count)])
+    caption = f"Specific force not explained, m/s^2, by speed in m/s, measured with {force.source}"
     return Table(["speed", "rms", "x", "y", "z", "drag-like mean", "steps"], rows, caption)
 
 
@@ -89,9 +95,8 @@ def _steps_table(validation: Validation) -> Table:
         ]
         for step in validation.steps
     ]
-    return Table(
-        ["axis", "segment", "time (s)", "command", "rms error (deg/s)"], rows, "Clearest commanded steps"
-    )
+    header = ["axis", "segment", "time (s)", "command", "rms error (deg/s)"]
+    return Table(header, rows, "Clearest commanded steps")
 
 
 def _tables(validation: Validation) -> dict[str, Table]:
@@ -109,27 +114,22 @@ def _tables(validation: Validation) -> dict[str, Table]:
 
 
 def _text_of_table(table: Table) -> str:
-    lines = [list(table.header), *(list(row) for row in table.rows)]
-    widths = [max(len(line[column]) for line in lines) for column in range(len(table.header))]
-    text = [
-        "  ".join(
-            cell.rjust(width) if column else cell.ljust(width)
-            for column, (cell, width) in enumerate(zip(line, widths, strict=True))
-        ).rstrip()
-        for line in lines
+    columns = list(zip(table.header, *table.rows, strict=True))
+    widths = [max(map(len, column)) for column in columns]
+    lines = [
+        "  ".join([line[0].ljust(widths[0]), *map(str.rjust, line[1:], widths[1:])]).rstrip()
+        for line in (table.header, *table.rows)
     ]
-    return "\n".join([table.caption, *text])
+    return "\n".join([table.caption, *lines])
 
 
-def _head(validation: Validation, model_name: str, log: FlightLog) -> list[str]:
-    return [
-        f"Model {model_name}, on {log.source}: "
-        f"{validation.num_judged} of {validation.num_rows} rows are judged.",
-    ]
+def _head(validation: Validation, model_name: str, log: FlightLog) -> str:
+    judged = f"{validation.num_judged} of {validation.num_rows} rows are judged"
+    return f"Model {model_name}, on {log.source}: {judged}."
 
 
 def _nrmse_meanings(validation: Validation) -> list[str]:
-    """Return what the NRMSE of the judged channels is, a sentence for each kind."""
+    """Return the definitions of the NRMSE of the judged channels, a sentence for each kind."""
     kinds: dict[str, list[str]] = {}
     for name in validation.one_step.channels:
         kinds.setdefault(NORMALISED_BY[name], []).append(name)
@@ -139,7 +139,7 @@ def _nrmse_meanings(validation: Validation) -> list[str]:
 def text_of(validation: Validation, model_name: str, log: FlightLog) -> str:
     """Return a validation as plain text, tables and notes."""
     tables = _tables(validation)
-    blocks = ["\n".join(_head(validation, model_name, log))]
+    blocks = [_head(validation, model_name, log)]
     for name, table in tables.items():
         block = _text_of_table(table)
         if name == "one_step":
@@ -157,34 +157,30 @@ def json_of(validation: Validation, model_name: str, log: FlightLog) -> dict[str
 
 def html_of(validation: Validation, model_name: str, log: FlightLog, pictures: dict[str, bytes]) -> str:
     """Return a validation as a self-contained page; pictures: PNG files by figure's name."""
-    headings = {
-        "steps": "Step responses",
-        "rollouts": "Free flight",
-        "one_step": "One step",
-        "thrust": "Thrust by command and voltage",
-        "open_force": "Force left open by speed",
-    }
     tables = _tables(validation)
     sections = []
-    for name, heading in headings.items():
+    for name, heading in HEADINGS.items():
         parts: list[Any] = [Picture(pictures[name], CAPTIONS[name])]
         parts += [tables[name]] if name in tables else []
         if name == "one_step":
             parts += [Text(meaning) for meaning in _nrmse_meanings(validation)]
         sections.append(Section(heading, parts))
-    introduction: list[Any] = [Text(line) for line in _head(validation, model_name, log)]
+    introduction: list[Any] = [Text(_head(validation, model_name, log))]
     if validation.notes:
-        introduction += [Text("What the log does not tell, and what was assumed:"), Bullets(validation.notes)]
+        introduction += [
+            Text("What the log lacks, and what was assumed:"),
+            Bullets(validation.notes),
+        ]
     return page(f"Validation of {model_name}", sections, introduction)
 
 
 def write_validation(out: str | Path, validation: Validation, model_name: str, log: FlightLog) -> list[Path]:
     """Write validation.json, .txt and .html and the figures into a folder; return their paths.
 
-    All is computed before the first file is written, each under a temporary name and renamed.
+    Everything is computed before the first file is written, each under a temporary name and renamed.
 
     Raises:
-        OSError: what the system says.
+        OSError: a file cannot be written.
     """
     pictures = {name: png_of(figure) for name, figure in draw_validation(validation).items()}
     document = json.dumps(json_of(validation, model_name, log), indent=1, allow_nan=False) + "\n"
