@@ -1,7 +1,7 @@
 """Pictures of a flight, without a display: a top view of the course beside a chase view.
 
-Needs the extra ``flytrack[render]``; importing this package does not. ``scene_row`` says, inside a
-compiled step, what a picture shows; ``FlightLog`` collects such rows; ``make_renderer`` draws them.
+Needs the extra ``flytrack[render]``; importing this package does not. ``scene_row`` returns, inside a
+compiled step, the numbers of a picture; ``FlightLog`` collects such rows; ``make_renderer`` draws them.
 """
 
 from typing import TYPE_CHECKING
@@ -30,7 +30,7 @@ def make_renderer(course: Course) -> "Renderer":
 
 
 def open_window(step_s: float) -> "Window":
-    """Return a window that shows pictures of a flight as it would go by, a step every ``step_s`` s.
+    """Return a window that shows pictures of a flight in real time, a step every ``step_s`` s.
 
     Raises:
         ImportError: pygame is not installed; the message says how to install it.

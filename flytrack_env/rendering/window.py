@@ -1,5 +1,6 @@
-"""A window that shows a flight at the speed at which it would go by."""
+"""A window that shows a flight in real time."""
 
+import importlib
 import logging
 import os
 import time
@@ -11,20 +12,13 @@ import numpy as np
 LOGGER = logging.getLogger(__name__)
 
 PICTURES_PER_S = 30.0
-LATE_S = 0.1  # further behind than this, time is not made up for
+LATE_S = 0.1  # delays longer than this are not caught up on
 DRIVER = "SDL_VIDEODRIVER"
 INVISIBLE = "offscreen"  # what SDL takes by itself where there is no display
 
 
-def _load_pygame() -> ModuleType:
-    os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
-    import pygame
-
-    return pygame
-
-
 class Window:
-    """Shows pictures through pygame; without a display nothing is seen, and a log message says so.
+    """Shows pictures through pygame; without a display it is invisible, and a warning is logged.
 
     step_s: time between two steps, s.
 
@@ -33,7 +27,8 @@ class Window:
     """
 
     def __init__(self, step_s: float):
-        self.pygame = _load_pygame()
+        os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
+        self.pygame: ModuleType = importlib.import_module("pygame")
         self.step_s = step_s
         self.step_due_s = self.picture_due_s = time.monotonic()
         self._open_display()
@@ -46,7 +41,7 @@ class Window:
         except self.pygame.error:
             if DRIVER in os.environ:
                 raise
-        LOGGER.warning("no display was found: the window uses SDL's dummy driver and is not to be seen")
+        LOGGER.warning("no display was found: the window uses SDL's dummy driver and is invisible")
         self.pygame.display.quit()
         os.environ[DRIVER] = "dummy"
         try:
@@ -55,10 +50,10 @@ class Window:
             del os.environ[DRIVER]
 
     def show(self, draw: Callable[[], np.ndarray], is_first: bool) -> None:
-        """Wait until the next step is due; draw and show a picture if one is due, too.
+        """Wait until the next step is due, and draw and show a picture if one is due.
 
-        draw: returns a picture (height, width, 3), uint8. is_first: an episode begins, whose picture is
-        always shown and waits for nothing.
+        draw: returns a picture (height, width, 3), uint8. is_first: whether an episode begins, whose first
+        picture is always shown, at once.
         """
         now_s = time.monotonic()
         self.step_due_s += self.step_s
