@@ -114,11 +114,6 @@ def test_padding_is_not_seen(length):
     np.testing.assert_allclose(found.gate_distance_m, distance, rtol=1e-6)
 
 
-def test_track_without_gates_is_refused():
-    with pytest.raises(ValueError, match="track: found no gates"):
-        follow_race(np.zeros((2, 3)), replace(TRACK, gates=()))
-
-
 def straight(start: tuple[float, ...], velocity: tuple[float, ...]) -> np.ndarray:
     """Return the states (T, 21) of a flight along a line, 5 s."""
     states, _ = ghost_rollout(REFERENCES, 500)
