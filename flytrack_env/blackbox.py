@@ -7,26 +7,20 @@
   action 1, battery 1. Such a plant does not report the lagged rate actions; they are reconstructed
   as angular velocity / max_rate, which is exact where the rates follow the handout's equation 2.
 
-The file holds StableHLO, a program for XLA's compiler. ``load`` lets nobody's program into this process
-untried. It reads, compiles and runs it for one step in a process of its own first, which may write no file
-and use 4 s of processor time and 1 GiB of memory (``limits``): a file that makes the compiler crash, hang or
-eat memory is a BlackBoxError. Bytes that went well are not tried again by this process, and the shipped
-black box never is.
+The file holds StableHLO, a program for XLA's compiler. ``load`` does not trust it: it is read, compiled and
+run for one step in a process of its own (``flytrack_env.sandbox``), with limits on time and memory
+(``limits``), so that a file that crashes, hangs or exhausts the compiler is a BlackBoxError. Bytes that
+passed are not tried again by the same process; the shipped black box is known and never tried.
 
-What loading can do: nothing in a file is unpickled, it holds no Python, and it calls none. It can call no
-other native code either (``custom_call``), LAPACK's functions included, unless ``limits`` is None.
-
-What loading cannot do: tell whether the plant is a sensible drone, or what it does later. After a good trial
-the program is compiled and run here, at full rights, for any state: a loop that ends from the start state
-may not end from another, and a program made to misuse a bug in XLA itself is not stopped. Without
-``os.fork`` (Windows) there is no trial, and files other than the shipped one need ``limits=None``; macOS
-bounds a trial's time but not its memory.
+Nothing in a file is unpickled, and it cannot call Python or native code (``custom_call``), not even LAPACK
+unless ``limits`` is None. The trial cannot show that the plant is a sensible drone, nor what it does later:
+the program then runs in this process, for any state. Windows limits only the wall-clock time of a trial,
+macOS does not limit its memory.
 """
 
 import hashlib
 import math
 from collections.abc import Callable
-from functools import cache
 from pathlib import Path
 
 import jax
@@ -35,11 +29,12 @@ import numpy as np
 from jax import export
 from jax.custom_batching import custom_vmap
 
-from flytrack_env import artifact
-from flytrack_env.apart import Apart, ApartError, ResourceLimits, is_possible
+from flytrack_env import artifact, sandbox
 from flytrack_env.dynamics import ModelParameters
+from flytrack_env.files import read_at_most
 from flytrack_env.plants import Plant
 from flytrack_env.quaternion import Quaternion, Scalar, Vec3
+from flytrack_env.sandbox import ResourceLimits, SandboxError
 from flytrack_env.state import (
     ACTION_SIZE,
     BATTERY_FULL_V,
@@ -57,38 +52,20 @@ MAX_FILE_BYTES = 64 * 2**20
 MAX_RATE_DEG_S = (618.0, 618.0, 120.0)
 SHIPPED_SHA256 = "c05e6c001da095b5b0434f7bbc4df90e7d01e548f56eb8e03a615383e383aedd"  # blackbox/acro_step.bin
 
-# Of the handout's 21 components, those that an 18-component artifact has: all but the rate actions.
+# Components of the handout's 21 that an 18-component artifact has: all but the rate actions.
 _REDUCED = np.r_[0:16, 19:21]
-
-# One thread, so that what XLA's threads take of the memory does not depend on the machine's cores.
-_TRIAL = Apart(
-    Path(artifact.__file__),
-    "try_out",
-    {
-        "JAX_PLATFORMS": "cpu",
-        "JAX_ENABLE_COMPILATION_CACHE": "false",
-        "NPROC": "1",
-        "OPENBLAS_NUM_THREADS": "1",
-    },
-)
-_TRIED: set[str] = set()  # digests of what went well in this process
+# One thread, so that the memory XLA's threads need does not depend on the machine's cores.
+_TRIAL_ENVIRONMENT = {
+    "JAX_PLATFORMS": "cpu",
+    "JAX_ENABLE_COMPILATION_CACHE": "false",
+    "NPROC": "1",
+    "OPENBLAS_NUM_THREADS": "1",
+}
+_PASSED: set[str] = set()  # digests of files that passed a trial in this process
 
 
 class BlackBoxError(ValueError):
     """A black box that cannot be used; the message names file, what was found and expected."""
-
-
-def _read(path: Path) -> bytes:
-    try:
-        if not path.is_file():
-            found = "a directory or device" if path.exists() else "nothing"
-            raise BlackBoxError(f"{path}: found {found}, expected a file")
-        size = path.stat().st_size
-        if not 0 < size <= MAX_FILE_BYTES:
-            raise BlackBoxError(f"{path}: found {size} bytes, expected 1 to {MAX_FILE_BYTES}")
-        return path.read_bytes()
-    except OSError as error:
-        raise BlackBoxError(f"{path}: cannot be read: {error}") from error
 
 
 def start_vector() -> jax.Array:
@@ -114,14 +91,11 @@ def _mapped(exported: export.Exported) -> Callable[[jax.Array, jax.Array], jax.A
     compiled loop. Nested ``vmap`` adds rows to that loop instead of nesting loops.
     """
 
-    def call_one(row: tuple[jax.Array, jax.Array]) -> jax.Array:
-        return artifact.call(exported, *row)
-
     @custom_vmap
     def call_rows(states: jax.Array, actions: jax.Array) -> jax.Array:
         if states.shape[0] == 1:
-            return call_one((states[0], actions[0]))[None]
-        return jax.lax.map(call_one, (states, actions))
+            return artifact.call(exported, states[0], actions[0])[None]
+        return jax.lax.map(lambda row: artifact.call(exported, *row), (states, actions))
 
     @call_rows.def_vmap
     def _batch_rule(size, batched, states, actions):  # type: ignore[no-untyped-def]
@@ -192,21 +166,17 @@ class BlackBox(Plant):
         return state
 
 
-@cache
-def _starts() -> list[list[float]]:
-    """Return the start state as both kinds of artifact have it."""
+def _check(content: bytes, limits: ResourceLimits | None) -> None:
+    """Raise ArtifactError or SandboxError unless a file's bytes are a plant."""
+    digest = hashlib.sha256(content).hexdigest()
     start = np.asarray(start_vector())
-    return [start.tolist(), start[_REDUCED].tolist()]
-
-
-def _try_out(content: bytes, limits: ResourceLimits) -> None:
-    """Raise ApartError unless a stranger's bytes go well in a process of their own."""
-    if not is_possible():
-        raise ApartError(
-            "this system has no os.fork to try it out in a process of its own; if you trust the file, load "
-            "it with limits=None"
-        )
-    _TRIAL([_starts(), ACTION_SIZE], content, limits)
+    starts = [start.tolist(), start[_REDUCED].tolist()]
+    if limits is None or digest == SHIPPED_SHA256:
+        artifact.check(content, starts, ACTION_SIZE, is_trusted=limits is None)
+    elif digest not in _PASSED:
+        file, argument = Path(artifact.__file__), [starts, ACTION_SIZE]
+        sandbox.run(file, "check_untrusted", argument, content, limits, _TRIAL_ENVIRONMENT)
+        _PASSED.add(digest)
 
 
 def load(
@@ -214,27 +184,21 @@ def load(
     max_rate: tuple[float, float, float] = MAX_RATE_DEG_S,
     limits: ResourceLimits | None = ResourceLimits(),  # noqa: B008, a tuple of constants
 ) -> BlackBox:
-    """Return the plant in a file; see the module for what a file may hold and what that risks.
+    """Return the plant in a file; see the module's description for what a file may hold, and the risks.
 
     max_rate: deg/s, body rates at full stick, used with 18-component artifacts only. limits: of the trial; a
-    large plant may need more. None: no trial, and what it calls is let through (but Python), for files of
-    those whose programs you would run.
+    large plant may need more. None: no trial, and calls of native code are allowed; only for files from
+    people whose programs you would run.
 
     Raises:
-        BlackBoxError: missing, unreadable, too large, damaged, for another platform, another signature, not
-            pure, or not finite after one step from the start state; or the trial ended in another way.
+        BlackBoxError: missing, unreadable, too large, damaged, for another platform, of another signature,
+            not pure, not finite after one step from the start state, or it crashed or exceeded ``limits``.
     """
     path = Path(path)
-    content = _read(path)
-    digest = hashlib.sha256(content).hexdigest()
-    is_known = digest == SHIPPED_SHA256
     try:
-        if limits is None or is_known:
-            artifact.check(content, _starts(), ACTION_SIZE, is_trusted=limits is None)
-        elif digest not in _TRIED:
-            _try_out(content, limits)
-            _TRIED.add(digest)
+        content = read_at_most(path, MAX_FILE_BYTES)
+        _check(content, limits)
         exported = artifact.deserialize(content)
-    except (artifact.ArtifactError, ApartError) as error:
+    except (OSError, artifact.ArtifactError, SandboxError) as error:
         raise BlackBoxError(f"{path}: {error}") from error
     return BlackBox(path, exported, max_rate)

@@ -1,81 +1,36 @@
 """Reading files of bounded size, and writing them atomically: a reader sees the old file or the new one."""
 
-import io
 import itertools
 import os
 import secrets
 import stat
 from collections.abc import Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING, BinaryIO
-
-if TYPE_CHECKING:
-    from _typeshed import WriteableBuffer
-
-READ_BYTES = 2**20
+from typing import BinaryIO
 
 
-class TooLargeError(OSError):
-    """A file of more bytes than it may have; the message does not name it."""
-
-
-def check_size(num_bytes: int, most_bytes: int) -> None:
-    """Raise TooLargeError for more bytes than there may be."""
-    if num_bytes > most_bytes:
-        raise TooLargeError(f"found more than {most_bytes} bytes, expected at most that")
-
-
-class AtMost(io.RawIOBase):
-    """An open file that ends in a TooLargeError where more is read of it than it may have.
-
-    Devices and what is unpacked announce no size, or any.
-    """
-
-    def __init__(self, file: BinaryIO, most_bytes: int):
-        self._file, self._most_bytes, self._num_bytes = file, most_bytes, 0
-
-    def readable(self) -> bool:
-        """Return True."""
-        return True
-
-    def readinto(self, buffer: "WriteableBuffer") -> int:
-        """Read into a buffer and return how many bytes; 0 at the end."""
-        view = memoryview(buffer)
-        part = self._file.read(min(len(view), READ_BYTES))
-        self._num_bytes += len(part)
-        check_size(self._num_bytes, self._most_bytes)
-        view[: len(part)] = part
-        return len(part)
-
-
-def open_file(path: Path) -> BinaryIO:
-    """Return a file, opened to be read, unless it is one that may never begin.
-
-    Devices never end: ``AtMost`` does.
+def open_file(path: Path, most_bytes: int) -> BinaryIO:
+    """Return a file opened for reading.
 
     Raises:
-        OSError: a pipe or a socket, or what the system says.
-        ValueError: a NUL in the name.
+        OSError: not a regular file (a pipe may never begin, a device never end), larger than ``most_bytes``,
+            or an error of the operating system.
     """
-    mode = path.stat().st_mode
-    if stat.S_ISFIFO(mode) or stat.S_ISSOCK(mode):
-        raise OSError(f"{path}: found a pipe or a socket, expected a file")
+    try:
+        status = path.stat()
+    except ValueError as error:  # a NUL in the name
+        raise OSError(str(error)) from error
+    if not stat.S_ISREG(status.st_mode):
+        raise OSError("found a folder, pipe or device, expected a regular file")
+    if status.st_size > most_bytes:
+        raise OSError(f"found {status.st_size} bytes, expected at most {most_bytes}")
     return path.open("rb")
 
 
 def read_at_most(path: Path, most_bytes: int) -> bytes:
-    """Return the bytes of a file; never holds many more than it may have.
-
-    Raises:
-        TooLargeError: it has more; where it says so, it is not opened.
-        OSError: what the system says, or a pipe or a socket.
-    """
-    try:
-        check_size(path.stat().st_size, most_bytes)
-        with open_file(path) as file:
-            return AtMost(file, most_bytes).readall()
-    except ValueError as error:  # a NUL in the name
-        raise OSError(str(error)) from error
+    """Return the content of a file; raises OSError as ``open_file`` does."""
+    with open_file(path, most_bytes) as file:
+        return file.read(most_bytes)
 
 
 def write_atomically(path: str | Path, content: bytes) -> None:
@@ -121,8 +76,18 @@ def write_together(files: Iterable[tuple[str | Path, bytes]]) -> None:
 
 
 def fresh_folder(path: Path) -> Path:
-    """Return a folder that holds nothing yet: the path, else ``path_2``, ``path_3``, ...; it is not made."""
-    names = itertools.chain(
-        [path], (path.with_name(f"{path.name}_{number}") for number in itertools.count(2))
-    )
-    return next(name for name in names if not name.exists() or (name.is_dir() and not any(name.iterdir())))
+    """Return a new or empty folder: the path, else ``path_2``, ``path_3``, ...; makes it.
+
+    No two callers are given the same new folder, even if they run at the same time.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    if path.is_dir() and not any(path.iterdir()):
+        return path
+    for number in itertools.count(1):
+        folder = path if number == 1 else path.with_name(f"{path.name}_{number}")
+        try:
+            folder.mkdir()
+        except FileExistsError:
+            continue
+        return folder
+    raise AssertionError("unreachable")

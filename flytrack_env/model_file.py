@@ -1,6 +1,7 @@
 """Model files: the parameters of a drone as JSON, by hand or from an identification."""
 
 import json
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -12,14 +13,7 @@ from flytrack_env.files import read_at_most, write_atomically
 from flytrack_env.messages import error_text, quote_name, quote_value
 
 MODEL_FILE_VERSION = 1
-SIZES = {
-    "tau": 4,
-    "thrust_coeffs": 6,
-    "max_rate": 3,
-    "m": 0,
-    "g": 0,
-    "battery_drain_v_per_min": 0,
-}
+SIZES = {"tau": 4, "thrust_coeffs": 6, "max_rate": 3, "m": 0, "g": 0, "battery_drain_v_per_min": 0}
 UNITS = {
     "tau": "s",
     "thrust_coeffs": "N, N, N, N, N/V, N/V",
@@ -37,17 +31,31 @@ class ModelFileError(ValueError):
     """A model file that cannot be used; the message names file, field, what was found and expected."""
 
 
+def _is_number(value: Any, low: float = -LARGEST, high: float = LARGEST) -> bool:
+    return isinstance(value, (int, float)) and not isinstance(value, bool) and low <= value <= high
+
+
+def _object(where: str, value: Any) -> dict[str, Any]:
+    """Return a value that must be a JSON object; raises ModelFileError."""
+    if not isinstance(value, dict):
+        raise ModelFileError(f"{where}: found {quote_value(value)}, expected an object")
+    return value
+
+
+def _known(where: str, name: str, names: Iterable[str]) -> str:
+    """Return a name that must be one of some; raises ModelFileError."""
+    if name not in names:
+        raise ModelFileError(f"{where}: {quote_name(name)}: unknown; expected one of {', '.join(names)}")
+    return name
+
+
 def _read_field(path: Path, name: str, value: Any) -> Any:
     size = SIZES[name]
     values = value if isinstance(value, list) else [value]
     is_right_shape = isinstance(value, list) == (size > 0) and len(values) == max(size, 1)
-    are_numbers = all(
-        isinstance(v, (int, float)) and not isinstance(v, bool) and -LARGEST < v < LARGEST for v in values
-    )
-    if not is_right_shape or not are_numbers:
+    if not is_right_shape or not all(map(_is_number, values)):
         expected = f"{size} finite numbers" if size else "a finite number"
-        found = quote_value(value)
-        raise ModelFileError(f"{path}: {name}: found {found}, expected {expected} (float32)")
+        raise ModelFileError(f"{path}: {name}: found {quote_value(value)}, expected {expected} (float32)")
     if name in MUST_BE_POSITIVE and min(map(np.float32, values)) <= 0.0:  # 1e-50 is 0 in float32
         raise ModelFileError(f"{path}: {name}: found {quote_value(value)}, expected > 0")
     return np.array(value, np.float32) if size else float(value)
@@ -55,38 +63,25 @@ def _read_field(path: Path, name: str, value: Any) -> Any:
 
 def _read_effect(path: Path, name: str, values: Any) -> Any:
     """Return the parameters of one effect; those that are not in the file are neutral."""
-    effect = effects.BY_NAME.get(name)
-    if effect is None:
-        expected = ", ".join(effects.BY_NAME)
-        raise ModelFileError(f"{path}: effects: {quote_name(name)}: unknown; expected of {expected}")
-    if not isinstance(values, dict):
-        raise ModelFileError(f"{path}: effects: {name}: found {quote_value(values)}, expected an object")
-    for field, value in values.items():
-        bounds = effect.ranges.get(field)
-        if bounds is None:
-            expected = ", ".join(effect.ranges)
-            raise ModelFileError(
-                f"{path}: effects: {name}: {quote_name(field)}: unknown; expected of {expected}"
-            )
-        is_number = isinstance(value, (int, float)) and not isinstance(value, bool)
-        if not is_number or not bounds.low <= value <= bounds.high:
+    effect = effects.BY_NAME[_known(f"{path}: effects", name, effects.BY_NAME)]
+    where = f"{path}: effects: {name}"
+    for field, value in _object(where, values).items():
+        bounds = effect.ranges[_known(where, field, effect.ranges)]
+        if not _is_number(value, bounds.low, bounds.high):
             expected = f"{bounds.low:g} to {bounds.high:g} {bounds.unit}"
-            found = quote_value(value)
-            raise ModelFileError(f"{path}: effects: {name}: {field}: found {found}, expected {expected}")
+            raise ModelFileError(f"{where}: {field}: found {quote_value(value)}, expected {expected}")
     return effect.parameters(**{field: float(value) for field, value in values.items()})
 
 
 def _read_json(path: Path) -> dict[str, Any]:
     """Return the object in a JSON file."""
     try:
-        data = json.loads(read_at_most(path, LARGEST_BYTES).decode())
-    except (OSError, UnicodeDecodeError) as error:
+        data = json.loads(read_at_most(path, LARGEST_BYTES))
+    except OSError as error:
         raise ModelFileError(f"{path}: cannot be read: {error_text(error)}") from error
-    except (ValueError, RecursionError) as error:  # ValueError also for endless digits
+    except (ValueError, RecursionError) as error:  # ValueError: no text, no JSON, or too many digits
         raise ModelFileError(f"{path}: not a JSON file: {error_text(error)}") from error
-    if not isinstance(data, dict):
-        raise ModelFileError(f"{path}: found a {type(data).__name__}, expected an object")
-    return data
+    return _object(str(path), data)
 
 
 def load_model(path: str | Path) -> ModelParameters:
@@ -94,7 +89,7 @@ def load_model(path: str | Path) -> ModelParameters:
 
     The file is a JSON object with ``tau``, ``thrust_coeffs``, ``max_rate``, ``m``, ``g`` and
     ``battery_drain_v_per_min`` at the top or under ``parameters``, units as in ``ModelParameters``; and
-    perhaps ``effects``, an object of effects' names (``flytrack_env.effects``) with their parameters.
+    optionally ``effects``, an object of effects' names (``flytrack_env.effects``) with their parameters.
 
     Raises:
         ModelFileError: missing file, not JSON, a newer version, a field missing, unknown or out of range.
@@ -118,33 +113,24 @@ def model_from_json(data: dict[str, Any], path: str | Path) -> ModelParameters:
         raise ModelFileError(
             f"{path}: version: found {quote_value(version)}, expected {MODEL_FILE_VERSION}{why}"
         )
-    values = data.get("parameters", data)
-    if not isinstance(values, dict):
-        raise ModelFileError(f"{path}: parameters: found {quote_value(values)}, expected an object")
+    values = _object(f"{path}: parameters", data.get("parameters", data))
     for name in SIZES:
         if name not in values:
             raise ModelFileError(f"{path}: {name}: missing")
     for name in values:
-        if name not in (*SIZES, "version", "effects"):
-            raise ModelFileError(f"{path}: {quote_name(name)}: unknown; expected {', '.join(SIZES)}, effects")
-    found = data.get("effects", values.get("effects", {}))
-    if not isinstance(found, dict):
-        raise ModelFileError(f"{path}: effects: found {quote_value(found)}, expected an object")
+        _known(str(path), name, (*SIZES, "effects", "version"))
+    by_name = _object(f"{path}: effects", data.get("effects", values.get("effects", {})))
     base = ModelParameters(**{name: _read_field(path, name, values[name]) for name in SIZES})
-    return base.with_effects(*(_read_effect(path, name, found[name]) for name in found))
+    return base.with_effects(*(_read_effect(path, name, by_name[name]) for name in by_name))
 
 
 def load_provenance(path: str | Path) -> dict[str, Any]:
-    """Return what a model file says of how its parameters came about; empty where it says nothing.
+    """Return a model file's record of how its parameters came about; empty if it has none.
 
     Raises:
         ModelFileError: missing file, not JSON, or a provenance that is no object.
     """
-    path = Path(path)
-    provenance = _read_json(path).get("provenance", {})
-    if not isinstance(provenance, dict):
-        raise ModelFileError(f"{path}: provenance: found {quote_value(provenance)}, expected an object")
-    return provenance
+    return _object(f"{path}: provenance", _read_json(Path(path)).get("provenance", {}))
 
 
 def model_as_json(model: ModelParameters) -> dict[str, Any]:
@@ -167,7 +153,7 @@ def model_as_json(model: ModelParameters) -> dict[str, Any]:
 def save_model(path: str | Path, model: ModelParameters, provenance: dict[str, Any]) -> None:
     """Write a model file; ``provenance`` (JSON values) says how the parameters came about.
 
-    Written to a temporary name beside the target and renamed, so that no half-written file is left.
+    Written under a temporary name and renamed, so no half-written file is left.
     """
     document = {"version": MODEL_FILE_VERSION, **model_as_json(model), "provenance": provenance}
     write_atomically(Path(path), (json.dumps(document, indent=2, allow_nan=False) + "\n").encode())

@@ -1,33 +1,29 @@
 """Rollout files: the states and actions of one flight as a plain numeric ``.npy``.
 
-A row is one step, ``[x (21) | u (4)]``, laid out and in the units of ``flytrack_env.state``; that is
-what is written. Read are also rows of 22, which have of the applied action the thrust only, and, where the
-caller allows it, pickled arrays of (x, u) pairs, such as the handout's. Nothing else is unpickled, so that
-a rollout from a stranger cannot run code.
+A row is one step, ``[x (21) | u (4)]``, laid out and in the units of ``flytrack_env.state``. Rows of 22,
+which have only the thrust of the applied action, are read as well, and, if the caller allows it, pickled
+arrays of (x, u) pairs such as the handout's. Nothing else is unpickled, so a foreign rollout cannot run code.
 """
 
 import io
-import math
-import os
 from collections.abc import Sequence
 from pathlib import Path
-from typing import BinaryIO
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from flytrack_env.files import open_file, write_atomically
-from flytrack_env.messages import error_text, quote_value
-from flytrack_env.npz_file import read_header
+from flytrack_env.messages import error_text, quote_name, quote_value
+from flytrack_env.npz_file import Header, read_header
 from flytrack_env.state import ACTION_SIZE, APPLIED_ACTION, STATE_SIZE
 
 ROW_SIZE = STATE_SIZE + ACTION_SIZE
 SHORT_ROW_SIZE = ROW_SIZE - 3
 EXPECTED = f"a plain numeric array of shape (T, {ROW_SIZE}) or (T, {SHORT_ROW_SIZE}) with T >= 1"
-MOST_STEPS = 2**21  # close to six hours at 100 Hz; with the copies made of them, below 1 GiB
+MOST_STEPS = 2**21  # close to six hours at 100 Hz
 LARGEST_ITEM_BYTES = 8
-LONGEST_TEXT = 200  # characters of what a header says
-PICKLED = "read only if pickles are allowed, as unpickling runs what the file holds"
+LARGEST_HEADER_BYTES = 2**16
+LARGEST_BYTES = LARGEST_HEADER_BYTES + MOST_STEPS * ROW_SIZE * LARGEST_ITEM_BYTES
 
 
 class RolloutError(ValueError):
@@ -60,9 +56,9 @@ def save_rollout(path: str | Path, states: ArrayLike, actions: ArrayLike) -> Non
 def load_rollout(path: str | Path, allow_pickle: bool = False) -> tuple[np.ndarray, np.ndarray]:
     """Return the states (T, 21) and the actions (T, 4) of a rollout file, float32.
 
-    The roll, pitch and yaw that were applied are NaN where the file does not have them: in rows of 22.
-    allow_pickle: also read files of pickled objects, which runs whatever code they hold: only for files
-    from those you trust.
+    The applied roll, pitch and yaw are NaN if the file lacks them (rows of 22).
+    allow_pickle: also read files of pickled objects, which runs whatever code they hold; only for files
+    from people you trust.
 
     Raises:
         RolloutError: missing file, not an ``.npy``, pickled objects unless allowed, another shape, no
@@ -70,107 +66,80 @@ def load_rollout(path: str | Path, allow_pickle: bool = False) -> tuple[np.ndarr
     """
     path = Path(path)
     try:
-        with open_file(path) as file:
-            is_pickled = _check_header(path, file, allow_pickle)
+        with open_file(path, LARGEST_BYTES) as file:
+            header = read_header(io.BytesIO(file.read(LARGEST_HEADER_BYTES)))
+            is_pickled = header.dtype.hasobject and allow_pickle
+            if not is_pickled:
+                _check_header(path, header)
+            file.seek(0)
             rows = np.load(file, allow_pickle=is_pickled)
-    except OSError as error:
-        raise RolloutError(f"{path}: cannot be read: {error_text(error)}; expected {EXPECTED}") from error
     except RolloutError:
         raise
-    except (Exception, SystemExit) as error:  # whatever unpickling and damaged headers raise
+    except Exception as error:  # whatever unpickling and damaged headers raise
         found = f"{type(error).__name__}: {error_text(error)}"
         raise RolloutError(f"{path}: cannot be read: {found}; expected {EXPECTED}") from error
-    if is_pickled:
-        rows = _rows_of_pairs(path, rows)
-    rows = _widened(_as_rows(path, rows))
+    rows = _as_rows(path, _rows_of_pairs(path, rows) if is_pickled else rows)
+    if rows.shape[1] == SHORT_ROW_SIZE:
+        rows = np.insert(rows, [APPLIED_ACTION.start] * (ROW_SIZE - SHORT_ROW_SIZE), np.nan, axis=1)
     return rows[:, :STATE_SIZE], rows[:, STATE_SIZE:]
 
 
 def load_named_rollouts(
     paths: Sequence[str | Path], allow_pickle: bool = False
 ) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-    """Return rollouts by a short name: that of the file, after that of its folder where files are alike.
+    """Return rollouts by file name without suffix; prefixed by the folder's name if file names repeat.
 
     Each is states (T, 21) and actions (T, 4). allow_pickle: see ``load_rollout``.
 
     Raises:
-        RolloutError: a file that is no rollout, or two files of the same names.
+        RolloutError: a file that is no rollout, or two files with the same folder and file name.
     """
     files = [Path(path) for path in paths]
     names = [file.stem for file in files]
     if len(set(names)) < len(names):
         names = [f"{file.resolve().parent.name}_{file.stem}" for file in files]
-    taken: dict[str, Path] = {}
-    for name, file in zip(names, files, strict=True):
-        if name in taken:
-            raise RolloutError(
-                f"{file}: found the name {name!r}, which {taken[name]} has, expected one of its own"
-            )
-        taken[name] = file
-    return {name: load_rollout(file, allow_pickle) for name, file in taken.items()}
+    for number, name in enumerate(names):
+        if name in names[:number]:
+            first = files[names.index(name)]
+            raise RolloutError(f"{files[number]}: found the name {name!r}, which {first} has as well")
+    return {name: load_rollout(file, allow_pickle) for name, file in zip(names, files, strict=True)}
 
 
-def _check_header(path: Path, file: BinaryIO, allow_pickle: bool) -> bool:
-    """Return whether the file is pickled; refuse, before any data is read, what announces no rollout."""
-    try:
-        shape, _, dtype = read_header(file)
-    except ValueError as error:
-        raise RolloutError(f"{path}: not an .npy file: {error_text(error)}; expected {EXPECTED}") from error
-    if dtype.hasobject and allow_pickle:
-        file.seek(0)
-        return True
+def _check_header(path: Path, header: Header) -> None:
+    """Raise RolloutError unless a header declares a rollout; no data has been read yet."""
+    shape, dtype = header.shape, header.dtype
+    if dtype.hasobject:
+        raise RolloutError(
+            f"{path}: found pickled objects, expected {EXPECTED}; pickles run the code they hold, "
+            "and are read only if allowed"
+        )
     if dtype.kind not in "fiu" or dtype.itemsize > LARGEST_ITEM_BYTES:
-        array = f"an array of {str(dtype)[:LONGEST_TEXT]}"
-        found = f"an object array (pickled; {PICKLED})" if dtype.hasobject else array
-        raise RolloutError(f"{path}: found {found}, expected {EXPECTED}")
-    if len(shape) != 2 or shape[1] not in (ROW_SIZE, SHORT_ROW_SIZE) or shape[0] < 1 or shape[0] is True:
+        raise RolloutError(f"{path}: found an array of {quote_name(dtype)}, expected {EXPECTED}")
+    if len(shape) != 2 or shape[1] not in (ROW_SIZE, SHORT_ROW_SIZE) or shape[0] < 1:
         raise RolloutError(f"{path}: found shape {quote_value(shape)}, expected {EXPECTED}")
-    announced = math.prod(shape) * dtype.itemsize
-    found_bytes = os.fstat(file.fileno()).st_size - file.tell()
-    if found_bytes < announced:
-        expected = f"{quote_value(announced)} for shape {quote_value(shape)}"
-        raise RolloutError(f"{path}: cut short: found {found_bytes} bytes of data, expected {expected}")
     if shape[0] > MOST_STEPS:
-        raise RolloutError(f"{path}: found {shape[0]} steps, expected at most {MOST_STEPS}")
-    file.seek(0)
-    return False
+        raise RolloutError(f"{path}: found {quote_value(shape[0])} steps, expected at most {MOST_STEPS}")
 
 
 def _rows_of_pairs(path: Path, pairs: np.ndarray) -> np.ndarray:
     """Return the rows (T, 25) or (T, 22) of an unpickled list of (x, u) pairs."""
-    sizes = {ROW_SIZE: STATE_SIZE, SHORT_ROW_SIZE: SHORT_ROW_SIZE - ACTION_SIZE}
-    expected = " or ".join(f"x ({size},) and u ({ACTION_SIZE},)" for size in sizes.values())
-    if np.ndim(pairs) not in (1, 2) or len(pairs) == 0:
-        raise RolloutError(f"{path}: found objects of shape {np.shape(pairs)}, expected pairs of {expected}")
-    rows: list[np.ndarray] = []
-    for step, pair in enumerate(pairs):
-        try:
-            x, u = (np.asarray(part, float) for part in pair)
-        except (TypeError, ValueError) as error:
-            raise RolloutError(
-                f"{path}: step {step}: {error_text(error)}; expected a pair of {expected}"
-            ) from error
-        size = sizes.get(len(rows[0])) if rows else x.size
-        if u.shape != (ACTION_SIZE,) or x.shape != (size,) or size not in sizes.values():
-            found = f"shapes {x.shape} and {u.shape}"
-            raise RolloutError(f"{path}: step {step}: found {found}, expected {expected}, alike in all steps")
-        rows.append(np.concatenate([x, u]))
-    return np.array(rows)
-
-
-def _widened(rows: np.ndarray) -> np.ndarray:
-    """Return rows (T, 25) of rows that may lack the applied roll, pitch and yaw, which then are NaN."""
-    if rows.shape[1] == ROW_SIZE:
-        return rows
-    missing = np.full((len(rows), ROW_SIZE - SHORT_ROW_SIZE), np.nan, np.float32)
-    before = APPLIED_ACTION.start
-    return np.concatenate([rows[:, :before], missing, rows[:, before:]], axis=1)
+    sizes = (STATE_SIZE, SHORT_ROW_SIZE - ACTION_SIZE)
+    expected = " or ".join(f"x ({size},) and u ({ACTION_SIZE},)" for size in sizes)
+    try:
+        rows = [(np.asarray(x, float), np.asarray(u, float)) for x, u in pairs]
+    except (TypeError, ValueError) as error:
+        raise RolloutError(f"{path}: found {error_text(error)}, expected pairs of {expected}") from error
+    shapes = {(x.shape, u.shape) for x, u in rows}
+    if len(shapes) != 1 or shapes.isdisjoint(((size,), (ACTION_SIZE,)) for size in sizes):
+        raise RolloutError(
+            f"{path}: found shapes {quote_value(shapes)}, expected pairs of {expected}, all alike"
+        )
+    return np.array([np.concatenate(pair) for pair in rows])
 
 
 def _as_rows(path: Path, rows: np.ndarray) -> np.ndarray:
     """Return rows as contiguous float32, all finite."""
-    # A double too large for float32 becomes inf, which the check below reports in words.
-    with np.errstate(over="ignore"):
+    with np.errstate(over="ignore"):  # a double too large for float32 becomes inf, which is refused below
         rows = np.ascontiguousarray(rows, np.float32)
     if not np.isfinite(rows).all():
         step, column = np.argwhere(~np.isfinite(rows))[0]

@@ -1,4 +1,4 @@
-"""Reading TOML files of others."""
+"""Reading TOML files of limited size."""
 
 import tomllib
 from pathlib import Path
@@ -7,7 +7,7 @@ from typing import Any
 from flytrack_env.files import read_at_most
 
 LARGEST_BYTES = 2**18  # a track of a thousand gates fits
-MOST_DOTS = 1000  # in a line: tomllib takes the square of a dotted key's length
+MOST_DOTS = 1000  # on one line; tomllib's time grows with the square of a dotted key's length
 
 
 class TomlError(ValueError):
@@ -15,28 +15,24 @@ class TomlError(ValueError):
 
 
 def read_text(path: Path) -> str:
-    """Return the text of a file, its lines ending in line feeds.
+    """Return the text of a file, with line feeds as line ends.
 
     Raises:
-        OSError: what the system says, or more bytes than such a file has.
-        UnicodeDecodeError: it is no text.
+        OSError: an error of the operating system, or more than LARGEST_BYTES.
+        UnicodeDecodeError: not UTF-8.
     """
     return read_at_most(path, LARGEST_BYTES).decode().replace("\r\n", "\n").replace("\r", "\n")
 
 
 def parse_toml(text: str) -> dict[str, Any]:
-    """Return what a TOML text holds.
+    """Return the content of a TOML text.
 
     Raises:
-        TomlError: it is not TOML, or a line of it, or all together, have very many dots.
+        TomlError: not TOML, or lines with very many dots.
     """
-    dots = [line.count(".") for line in text.split("\n")]
-    if max(dots) > MOST_DOTS:
-        number = dots.index(max(dots)) + 1
-        raise TomlError(f"line {number}: found {max(dots)} dots, expected at most {MOST_DOTS}")
-    if sum(number * number for number in dots) > MOST_DOTS**2:
-        raise TomlError("found very many lines of many dots, expected names of few parts")
+    if sum(line.count(".") ** 2 for line in text.split("\n")) > MOST_DOTS**2:
+        raise TomlError(f"found lines of very many dots, expected at most {MOST_DOTS} on one line")
     try:
         return tomllib.loads(text)
-    except (ValueError, RecursionError) as error:  # TOMLDecodeError, endless digits, endless nesting
+    except (ValueError, RecursionError) as error:  # TOMLDecodeError, too many digits, too deeply nested
         raise TomlError(str(error)) from error

@@ -1,4 +1,4 @@
-"""Files of flight logs: ``.npz`` and ``.csv``, checked when read, and the same bytes for the same log.
+"""Files of flight logs: ``.npz`` and ``.csv``, checked when read; the same log gives the same bytes.
 
 Columns are those of ``flytrack_sysid.log``. An ``.npz`` holds one array of numbers per column; a ``.csv`` has
 a header of column names, then one row of numbers, separated by commas, per sample; blank lines are skipped.
@@ -8,24 +8,19 @@ import csv
 import io
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, TextIO
 
 import numpy as np
 
-from flytrack_env.files import AtMost, TooLargeError, check_size, open_file, write_atomically
-from flytrack_env.messages import error_text, quote_name, quote_value
-from flytrack_env.npz_file import Header, NpzError, NpzFile, open_npz
+from flytrack_env.files import open_file, write_atomically
+from flytrack_env.messages import error_text, quote_value
+from flytrack_env.npz_file import NpzError, load_npz
 from flytrack_sysid.log import CHANNELS, GAP_STEPS, FlightLog, LogError, usual_step
-from flytrack_sysid.log_table import Rows, Table, check_names, check_number, log_of_table
-
-if TYPE_CHECKING:
-    import _csv
+from flytrack_sysid.log_table import CsvRows, Rows, Table, check_names, log_of_table
 
 Reader = Callable[[Path], Table]
 Writer = Callable[[dict[str, np.ndarray]], bytes]
 
-LONGEST_LINE = 2**16  # characters of a CSV file: some hundred times a row of all columns
-LARGEST_BYTES = 512 * 2**20  # as they are in the file, unpacked
+LARGEST_BYTES = 512 * 2**20  # in the file, and of all columns as float64
 
 
 def load_log(path: str | Path) -> FlightLog:
@@ -41,15 +36,9 @@ def load_log(path: str | Path) -> FlightLog:
     path = Path(path)
     read, _ = _format_of(path)
     try:
-        check_size(path.stat().st_size, LARGEST_BYTES)
-        table = read(path)
-    except LogError:
-        raise
-    except TooLargeError as error:
-        raise LogError(f"{path}: {error}") from error
-    except (OSError, ValueError) as error:  # ValueError: a NUL in the name
+        return log_of_table(read(path))
+    except OSError as error:
         raise LogError(f"{path}: cannot be read: {error_text(error)}") from error
-    return log_of_table(table)
 
 
 def save_log(path: str | Path, log: FlightLog) -> None:
@@ -127,108 +116,53 @@ def _ranges(log: FlightLog) -> list[str]:
 
 
 def _read_npz(path: Path) -> Table:
-    """Return the arrays of an .npz file, once the archive's list of them is that of a log."""
+    """Return the arrays of an .npz file as columns."""
     try:
-        with open_npz(path) as archive:
-            check_names(str(path), archive.names)
-            check_size(archive.num_bytes, LARGEST_BYTES)
-            num_values = sum(_header(path, archive, name).num_values for name in archive.names)
-            check_number(str(path), num_values)
-            return Table(str(path), {name: _read_array(path, archive, name) for name in archive.names})
+        arrays = load_npz(path, LARGEST_BYTES)
     except NpzError as error:
         raise LogError(f"{path}: {error}") from error
-
-
-def _header(path: Path, archive: NpzFile, name: str) -> Header:
-    """Return what the array of a column announces; what is no row of numbers is refused."""
-    try:
-        header = archive.header(name)
-    except NpzError as error:
-        raise LogError(f"{path}: column {name}: {error}") from error
-    if header.dtype.kind not in "iuf":
-        raise LogError(
-            f"{path}: column {name}: found an array of {quote_name(header.dtype)}, expected numbers"
-        )
-    if len(header.shape) != 1:
-        raise LogError(
-            f"{path}: column {name}: found an array of shape {quote_value(header.shape)}, "
-            "expected one dimension"
-        )
-    return header
-
-
-def _read_array(path: Path, archive: NpzFile, name: str) -> np.ndarray:
-    """Return the array of a column, (num_rows,) float64."""
-    try:
-        return archive.read(name).astype(float)
-    except NpzError as error:
-        raise LogError(f"{path}: column {name}: {error}") from error
+    check_names(str(path), list(arrays))
+    for name, values in arrays.items():
+        if values.dtype.kind not in "iuf" or values.ndim != 1:
+            found = f"an array of {values.dtype}, shape {values.shape}"
+            raise LogError(f"{path}: column {name}: found {found}, expected a row of numbers")
+    return Table(str(path), {name: np.asarray(values, float) for name, values in arrays.items()})
 
 
 def _read_csv(path: Path) -> Table:
     """Return the columns of a CSV file."""
-    with open_file(path) as file:
-        content = io.BufferedReader(AtMost(file, LARGEST_BYTES))
-        text = io.TextIOWrapper(content, encoding="utf-8-sig", newline="")
-        rows = csv.reader(_lines(text), strict=True)
+    with open_file(path, LARGEST_BYTES) as file:
+        rows = CsvRows(io.TextIOWrapper(file, encoding="utf-8-sig", newline=""))
         try:
-            return _table(str(path), rows)
+            header = [name.strip() for name in next(rows, [])]
+            if len(header) == 1 and any(mark in header[0] for mark in ";\t"):
+                found = f"no comma in {quote_value(header[0])}"
+                raise LogError(f"{path}: line 1: found {found}, expected names with commas")
+            check_names(str(path), header)
+            table_rows = Rows(str(path), header)
+            for cells in rows:
+                if cells:
+                    place = f"{path}: row {len(table_rows)} (line {rows.line_num})"
+                    table_rows.add(_numbers(place, header, cells), rows.line_num)
         except (UnicodeDecodeError, csv.Error) as error:
-            raise LogError(
-                f"{path}: near line {rows.line_num + 1}: not a CSV file: {error_text(error)}"
-            ) from error
-
-
-def _lines(text: TextIO) -> Iterator[str]:
-    """Yield the lines of a CSV file, of which a row has one: csv would read all of an endless one first."""
-    while line := text.readline(LONGEST_LINE):
-        if len(line) == LONGEST_LINE:
-            raise csv.Error(f"found a line of {LONGEST_LINE} characters or more, expected fewer")
-        if line.count('"') % 2:
-            raise csv.Error("found a quotation mark that the line does not close")
-        yield line
-
-
-def _table(source: str, rows: "_csv.Reader") -> Table:
-    """Return the columns of the rows of a CSV file, the first of which has their names."""
-    header = [name.strip() for name in next(rows, [])]
-    if len(header) == 1 and any(mark in header[0] for mark in ";\t"):
-        found = f"no comma in {quote_value(header[0])}"
-        raise LogError(f"{source}: line 1: found {found}, expected names with commas")
-    check_names(source, header)
-    table_rows = Rows(source, header)
-    for cells in rows:
-        if cells:
-            table_rows.add(_numbers(source, header, cells, len(table_rows), rows.line_num), rows.line_num)
+            where = f"{path}: near line {rows.line_num + 1}"
+            raise LogError(f"{where}: not a CSV file: {error_text(error)}") from error
     return table_rows.table()
 
 
-def _numbers(source: str, header: list[str], cells: list[str], row: int, line: int) -> list[float]:
-    """Return the numbers in one row of a CSV file."""
-    place = f"{source}: row {row} (line {line})"
+def _numbers(place: str, header: list[str], cells: list[str]) -> Iterator[float]:
+    """Yield the numbers in one row of a CSV file."""
     if len(cells) != len(header):
         column = f", column {header[len(cells)]}" if len(cells) < len(header) else ""
         raise LogError(f"{place}{column}: found {len(cells)} cells, expected {len(header)} as in the header")
-    try:
-        return [_number(cell) for cell in cells]
-    except ValueError:
-        column, cell = next(pair for pair in zip(header, cells, strict=True) if not _is_number(pair[1]))
-    found = quote_value(cell) if cell.strip() else "an empty cell"
-    raise LogError(f"{place}, column {column}: found {found}, expected a number")
-
-
-def _number(cell: str) -> float:
-    if "_" in cell:  # Python reads 1_000 as a number; nobody else does
-        raise ValueError(cell)
-    return float(cell)
-
-
-def _is_number(cell: str) -> bool:
-    try:
-        _number(cell)
-    except ValueError:
-        return False
-    return True
+    for column, cell in zip(header, cells, strict=True):
+        try:
+            if "_" in cell:  # Python reads 1_000 as a number, other programs do not
+                raise ValueError(cell)
+            yield float(cell)
+        except ValueError:
+            found = quote_value(cell) if cell.strip() else "an empty cell"
+            raise LogError(f"{place}, column {column}: found {found}, expected a number") from None
 
 
 def _write_npz(columns: dict[str, np.ndarray]) -> bytes:

@@ -1,25 +1,25 @@
-"""Checks of the columns of a file on their way to a flight log; every refusal says where it stands."""
+"""Checks of a file's columns on their way to a flight log; every refusal names the place."""
 
+import csv
 import difflib
+import math
 from array import array
-from collections.abc import Iterable, Sequence
-from typing import NamedTuple
+from collections.abc import Iterable, Iterator, Sequence
+from typing import NamedTuple, TextIO
 
 import numpy as np
 
 from flytrack_env.messages import quote_value
 from flytrack_sysid.log import CHANNELS, COLUMNS, REQUIRED, FlightLog, LogError
 
-MOST_SEGMENTS = 100_000  # one for each flight: beyond it is a number for every row
+MOST_SEGMENTS = 100_000  # one for each flight
 LARGEST_NORM_ERROR = 1e-2  # of quaternions: estimators drift a little; more is no unit quaternion
 SMALLEST_NORM_ERROR = 1e-12  # below it a norm is 1 up to rounding, and the values stay as they are
-LARGEST_VALUES = (
-    56 * 2**20
-)  # all columns at 1 kHz for half an hour fit; twice as many float64 are below 1 GiB
-BLOCK_VALUES = 2**20
-COMMAND_MARGIN = 1e-6  # beyond [-1, 1]: rounding in whoever wrote the log
-LONGEST_NAME = max(map(len, COLUMNS)) + 3  # what is longer is like none
-LARGEST_SEGMENT = 2**53  # float64 tells whole numbers apart below it
+LARGEST_VALUES = 56 * 2**20  # all columns at 1 kHz for half an hour; twice as many float64 are below 1 GiB
+LONGEST_ROW = 2**16  # characters of a CSV file: thousands of columns
+COMMAND_MARGIN = 1e-6  # beyond [-1, 1]: rounding by the program that wrote the log
+LONGEST_NAME = max(map(len, COLUMNS)) + 3  # longer names are similar to none
+LARGEST_SEGMENT = 2**53  # float64 is exact for whole numbers below it
 PWM_LOW_US, PWM_HIGH_US = 800, 2200  # receivers' pulses: 1000 to 2000 us, and a little past the ends
 PERCENT_LOW, PERCENT_HIGH = 10, 100  # a largest command in between looks like percent of full stick
 
@@ -44,48 +44,59 @@ class Table(NamedTuple):
         return np.stack([self.columns[column] for column in columns], axis=1)
 
 
-class Rows:
-    """Rows of numbers, as a text file has them one after the other, on their way to a table.
+class CsvRows:
+    """The rows of a CSV file, lists of cells, limited in length: ``csv`` itself reads a whole row at once."""
 
-    They are kept in blocks of columns: a list of all rows and its transpose would be twice the memory.
-    """
+    def __init__(self, text: TextIO, delimiter: str = ",", most_characters: float = math.inf):
+        self._text, self._most_characters = text, most_characters
+        self._num_characters = self._row_start = 0
+        self._rows = csv.reader(self._lines(), delimiter=delimiter, strict=True)
+
+    def _lines(self) -> Iterator[str]:
+        """Yield the lines of the file; a row may have several."""
+        while line := self._text.readline(LONGEST_ROW):
+            self._num_characters += len(line)
+            if self._num_characters - self._row_start >= LONGEST_ROW:
+                raise csv.Error(f"found a row of {LONGEST_ROW} characters or more, expected fewer")
+            if self._num_characters > self._most_characters:
+                raise csv.Error(f"found more than {self._most_characters} characters, expected at most that")
+            yield line
+
+    def __iter__(self) -> "CsvRows":
+        return self
+
+    def __next__(self) -> list[str]:
+        cells = next(self._rows)
+        self._row_start = self._num_characters
+        return cells
+
+    @property
+    def line_num(self) -> int:
+        """Number of lines read."""
+        return self._rows.line_num
+
+
+class Rows:
+    """Rows of numbers on their way to a table; columns of a text file are known only after its last row."""
 
     def __init__(self, source: str, names: Sequence[str]):
         self._source, self._names = source, names
-        self._blocks: list[dict[str, np.ndarray]] = []
         self._values, self._lines = array("d"), array("q")
 
     def __len__(self) -> int:
         return len(self._lines)
 
     def add(self, numbers: Iterable[float], line: int) -> None:
-        """Add a row.
-
-        Raises:
-            LogError: more numbers than there may be.
-        """
+        """Add a row; raises LogError beyond LARGEST_VALUES numbers."""
         self._lines.append(line)
         self._values.extend(numbers)
-        if len(self._values) >= BLOCK_VALUES:
-            check_number(self._source, len(self) * len(self._names))
-            self._end_block()
-
-    def _end_block(self) -> None:
-        rows = np.array(self._values, float).reshape(-1, len(self._names))
-        self._blocks.append(dict(zip(self._names, rows.T.copy(), strict=True)))
-        self._values = array("d")
+        if len(self._values) > LARGEST_VALUES:
+            raise LogError(f"{self._source}: found more than {LARGEST_VALUES} numbers, expected at most that")
 
     def table(self) -> Table:
-        """Return the rows as a table; there are none any more."""
-        self._end_block()
-        columns = {name: np.concatenate([block.pop(name) for block in self._blocks]) for name in self._names}
-        return Table(self._source, columns, np.array(self._lines, np.int64))
-
-
-def check_number(source: str, num_values: int) -> None:
-    """Raise LogError for more numbers than a log may have."""
-    if num_values > LARGEST_VALUES:
-        raise LogError(f"{source}: found more than {LARGEST_VALUES} numbers, expected at most that")
+        """Return the rows as a table."""
+        columns = np.asarray(self._values).reshape(-1, len(self._names)).T
+        return Table(self._source, dict(zip(self._names, columns, strict=True)), np.asarray(self._lines))
 
 
 def check_names(source: str, names: Sequence[str]) -> None:
@@ -112,8 +123,8 @@ def check_names(source: str, names: Sequence[str]) -> None:
 def log_of_table(table: Table) -> FlightLog:
     """Return the log that a table holds; a table without segments is one.
 
-    Quaternions are normalised. The names must have passed ``check_names``. The columns are taken out of the
-    table one after the other.
+    Quaternions are normalised. The names must have passed ``check_names``. Columns are removed from the table
+    as they are copied, so that a large log is not in memory twice.
 
     Raises:
         LogError: no rows, columns of different lengths, or a value that no log can have, with its place.
@@ -128,12 +139,12 @@ def log_of_table(table: Table) -> FlightLog:
     segment = _segments(table)
     _check_time(table, segment)
     _check_commands(table)
-    present = {name: columns for name, columns in CHANNELS.items() if columns[0] in table.columns}
     channels = {}
-    for name, columns in present.items():
-        channels[name] = table.matrix(columns)
-        for column in columns:  # a log of the largest size is not there twice
-            del table.columns[column]
+    for name, columns in CHANNELS.items():
+        if columns[0] in table.columns:
+            channels[name] = table.matrix(columns)
+            for column in columns:
+                del table.columns[column]
     if "q" in channels:
         channels["q"] = _normalised(table, channels["q"])
     return FlightLog(table.columns["t"], channels, segment, table.source)

@@ -1,4 +1,4 @@
-"""Scripts: flights to be flown, and their files.
+"""Scripts: flights to be flown, and the files that hold them.
 
 ==========  ==============  ==================================================================
 array       shape           what it is
@@ -16,9 +16,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from flytrack_env.files import check_size, write_atomically
+from flytrack_env.files import write_atomically
 from flytrack_env.messages import error_text, quote_name, quote_value
-from flytrack_env.npz_file import open_npz
+from flytrack_env.npz_file import NpzError, load_npz
 from flytrack_env.state import ACTION_SIZE, APPLIED_ACTION, QUATERNION, STATE_SIZE
 from flytrack_sysid.envelope import ANY_VOLTAGE, FEWEST_STEPS, LARGEST_SPEED, SCRIPT_HEIGHTS, is_inside
 from flytrack_sysid.excitation import ScriptedFlight
@@ -33,7 +33,7 @@ ROUNDING = 1e-6  # of numbers that were float32
 
 
 class ScriptError(ValueError):
-    """A script that cannot be flown, or a diagnosis that none can be made from."""
+    """A script that cannot be flown, or a diagnosis that no script can be made from."""
 
 
 class Script(NamedTuple):
@@ -89,22 +89,19 @@ def _check_ranges(starts: np.ndarray, commands: np.ndarray, source: str) -> None
             found = sticks[tuple(bad[0])]
             raise ScriptError(f"{source}: {name}: found {found:g} in flight {bad[0][0]}, expected -1 to 1")
     norm = np.linalg.norm(starts[:, QUATERNION], axis=1)
-    flights = np.flatnonzero(np.abs(norm - 1.0) > LARGEST_NORM_ERROR)
-    if len(flights):
-        found = f"a quaternion of norm {norm[flights[0]]:.4g}"
-        raise ScriptError(f"{source}: starts: found {found} in flight {flights[0]}, expected 1")
-    flights = np.flatnonzero(~is_inside(starts, SCRIPT_HEIGHTS, ANY_VOLTAGE))
-    if len(flights):
-        expected = (
-            f"at most {LARGEST_SPEED:g} m/s, {SCRIPT_HEIGHTS[0]:g} to {SCRIPT_HEIGHTS[1]:g} m, a voltage"
-        )
+    for flight in np.flatnonzero(np.abs(norm - 1.0) > LARGEST_NORM_ERROR):
+        found = f"a quaternion of norm {norm[flight]:.4g}"
+        raise ScriptError(f"{source}: starts: found {found} in flight {flight}, expected 1")
+    low, high = SCRIPT_HEIGHTS
+    for flight in np.flatnonzero(~is_inside(starts, SCRIPT_HEIGHTS, ANY_VOLTAGE)):
+        expected = f"at most {LARGEST_SPEED:g} m/s, {low:g} to {high:g} m, a voltage"
         raise ScriptError(
-            f"{source}: starts: found flight {flights[0]} outside of the envelope, expected {expected}"
+            f"{source}: starts: found flight {flight} outside of the envelope, expected {expected}"
         )
 
 
 def save_script(path: str | Path, script: Script) -> None:
-    """Write a script to an ``.npz`` file, whole or not at all; the same script gives the same bytes.
+    """Write a script to an ``.npz`` file, atomically; the same script gives the same bytes.
 
     Raises:
         ScriptError: another suffix, or a script that ``load_script`` would refuse.
@@ -119,45 +116,27 @@ def save_script(path: str | Path, script: Script) -> None:
 
 
 def load_script(path: str | Path) -> Script:
-    """Return the script in an ``.npz`` file. Nothing is ever unpickled.
+    """Return the script in an ``.npz`` file. Nothing is unpickled.
 
     Raises:
-        ScriptError: a file that cannot be read, or is no script that can be flown; the message says what.
+        ScriptError: a file that cannot be read, or no script that can be flown; the message says why.
     """
     check_name(path)
-    arrays = _arrays(Path(path))
-    if arrays["kinds"].ndim != 1 or arrays["kinds"].dtype.kind != "U":
-        raise ScriptError(f"{path}: kinds: found {_described(arrays['kinds'])}, expected a row of names")
-    for name in ("starts", "commands"):
-        if arrays[name].dtype.kind not in "iuf":
-            raise ScriptError(f"{path}: {name}: found {_described(arrays[name])}, expected numbers")
-    number, starts = len(arrays["kinds"]), arrays["starts"].shape
-    if number and starts != (number, STATE_SIZE):  # else a name for nothing, twenty times its room
-        raise ScriptError(f"{path}: starts: found shape {starts}, expected ({number}, {STATE_SIZE})")
-    kinds = tuple(arrays["kinds"].tolist())
-    script = Script(kinds, arrays["starts"].astype(float), arrays["commands"].astype(float))
+    path = Path(path)
+    try:
+        arrays = load_npz(path, LARGEST_BYTES)
+    except (OSError, NpzError) as error:
+        raise ScriptError(f"{path}: not a script, or damaged: {error_text(error)}") from error
+    if sorted(arrays) != sorted(ARRAYS):
+        found = ", ".join(map(quote_name, sorted(arrays)))[:LONGEST_LIST]
+        raise ScriptError(f"{path}: found arrays {found}, expected {', '.join(ARRAYS)}")
+    kinds, starts, commands = (arrays[name] for name in ARRAYS)
+    if kinds.ndim != 1 or kinds.dtype.kind != "U" or starts.ndim != 2 or len(kinds) != len(starts):
+        found = f"arrays of {kinds.dtype}, shape {kinds.shape}, and of shape {starts.shape}"
+        raise ScriptError(f"{path}: kinds, starts: found {found}, expected a name for each start")
+    for name, values in (("starts", starts), ("commands", commands)):
+        if values.dtype.kind not in "iuf":
+            raise ScriptError(f"{path}: {name}: found an array of {values.dtype}, expected numbers")
+    script = Script(tuple(kinds.tolist()), starts.astype(float), commands.astype(float))
     check_script(script, str(path))
     return script
-
-
-def _described(values: np.ndarray) -> str:
-    return f"an array of {values.dtype}, shape {values.shape}"
-
-
-def _arrays(path: Path) -> dict[str, np.ndarray]:
-    """Return the arrays of a file that has just those of a script."""
-    try:
-        check_size(path.stat().st_size, LARGEST_BYTES)
-        with open_npz(path) as archive:
-            names = sorted(archive.names)
-            if names != sorted(ARRAYS):
-                found = ", ".join(map(quote_name, names))[:LONGEST_LIST]
-                raise ScriptError(f"{path}: found arrays {found}, expected {', '.join(ARRAYS)}")
-            num_values = sum(archive.header(name).num_values for name in ARRAYS)
-            check_size(max(archive.num_bytes, num_values * np.dtype(float).itemsize), LARGEST_BYTES)
-            return {name: archive.read(name) for name in ARRAYS}
-    except ScriptError:
-        raise
-    except (OSError, ValueError) as error:  # ValueError: NpzError, or a NUL in the name
-        found = f"{type(error).__name__}: {error_text(error)}"
-        raise ScriptError(f"{path}: not a script, or damaged; nothing is unpickled: {found}") from error

@@ -1,88 +1,78 @@
-"""Files from strangers, damaged at random and on purpose: they load as they should, or are refused."""
+"""Files: valid ones of every kind that is read, damaged by hypothesis or crafted to do harm, and loaded.
 
-from pathlib import Path
-from typing import Any
-
-from tqdm import tqdm
-
-from benchmarks.reliability.section import Section
-from benchmarks.reliability.strangers.kinds import KINDS
-from benchmarks.reliability.strangers.pool import measure_kind
-
-FILES_PER_KIND = 10_000
-TITLES = {
-    "track": "track (`.toml`)",
-    "model": "model file (`.json`)",
-    "rollout": "rollout (`.npy`)",
-    "log_npz": "flight log (`.npz`)",
-    "log_csv": "flight log (`.csv`)",
-    "script": "script (`.npz`)",
-    "reference": "reference (`.npz`)",
-    "mapping": "mapping of an import (`.toml`)",
-    "import_csv": "import of a CSV log",
-    "import_gz": "import of a compressed CSV log",
-    "ulog": "import of a PX4 log (`.ulg`)",
-    "betaflight": "import of a Betaflight log (`.bbl`)",
-    "settings": "settings of a training (`.toml`)",
-    "checkpoint": "checkpoint (`.msgpack`)",
-    "resume": "checkpoint that a training is resumed from",
-    "black_box": "black box (`acro_step.bin`)",
-}
-TEXT = """Files of every kind that is read, written by the package itself. Most, up to 1 MiB or so, are
-damaged at random: bits, bytes and blocks changed, left out, repeated and mixed; values, types, names,
-shapes and sizes inside that are odd, huge, missing or no numbers; pickles. Others are made on purpose to
-do harm, up to 50 MB: text without end, or nested very deeply; archives that unpack to gigabytes, that lie
-about what is in them or hold it twice, encrypted or elsewhere; gzip files of half a million parts; maps
-and lists that take a hundred times their length; arrays of other sizes than they say; logs of headers and
-formats that lie, recur or are thousands, of clocks that jump by days, of attitudes that are zero;
-descriptions of other trainings; programs that never end, take all memory, call what they may not, or are
-of another kind than they say. Each is loaded in a process that may use 5 s of processor time and 1 GiB of
-memory more than it had, and whose writing of files, processes, sockets, unpickling and running of code
-are watched. Two outcomes are promised: a load that is sound, or the documented error, with a message that
-can be read and names the file. What the loaders do for that: [files from strangers](../strangers.md).
-
+Promised is a sound result or the loader's own error, naming the file, within CPU_S and MEMORY_BYTES and without
+unpickling anything.
 """
 
+import contextlib
+import gzip
+import io
+import json
+import resource
+import signal
+import sys
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
 
-def measure(seed: int, share: float, folder: Path) -> dict[str, Any]:
-    """Return what came of every kind's files: a share of 10,000 of each."""
-    count = max(round(share * FILES_PER_KIND), 1)
-    found = {}
-    with tqdm(total=count * len(KINDS), unit="file") as bar:
-        for kind in KINDS:
-            bar.set_description(kind)
-            found[kind] = measure_kind(kind, seed, count, folder, bar.update)
-    return {"seed": seed, "kinds": found}
+import hypothesis
+import jax
+import jax.numpy as jnp
+import numpy as np
+from hypothesis import strategies as st
+from jax import export
+
+import flytrack_sysid
+from baselines.purejaxrl_ppo import CheckpointError, load_checkpoint
+from baselines.purejaxrl_ppo.config import ConfigError, settings_in_file
+from benchmarks.champion import CHAMPION
+from benchmarks.reliability import foreign_logs
+from benchmarks.report import ROOT, table
+from flytrack_env import ModelFileError, TrackError, blackbox, load_model, load_track, sandbox
+from flytrack_env.references import ReferenceFileError, load_reference, shipped_path
+from flytrack_env.rollout import RolloutError, load_rollout, save_rollout
+from flytrack_env.tracks import build_course
+from flytrack_env.tracks.track import TRACK_FOLDER
+from flytrack_sysid import LogError, ScriptError
+from flytrack_sysid.importing import load_mapping
+from flytrack_sysid.manoeuvres import MANOEUVRES
+
+CPU_S, MEMORY_BYTES = 10.0, 2 * 2**30
+LONGEST_MESSAGE = 2000  # characters, and the file's name
+NUM_FILES, SLOW_SHARE = 1000, 0.2  # of each kind; of those that start a process for each
+TOKENS = [b"nan", b"1e999", b"-1", b"0", b"null", b'"', b"\n", b"\0", b"\xff", b",", b"[" * 2000, b"9" * 5000]
+SETTINGS = b'total_timesteps = 2e6\nhidden_sizes = [64, 64]\nlearning_rate = 3e-4\n'
+PLANT = ((21,), (4,))  # shapes of a black box's arguments
 
 
-def as_markdown(result: dict[str, Any]) -> str:
-    """Return a table of all kinds, and examples of what broke the promise."""
-    lines = [
-        "| kind of file | files | made on purpose | loaded | refused | promise broken | slowest, CPU s |",
-        "|---|---:|---:|---:|---:|---:|---:|",
-    ]
-    broken = []
-    for name, found in result["kinds"].items():
-        number = sum(found["broken"].values())
-        said = f"{number}, then the measurement failed" if found["failure"] else number
-        lines.append(
-            f"| {TITLES[name]} | {found['files']} | {found['crafted']} | {found['loaded']} | "
-            f"{found['refused']} | {said} | {found['slowest_s']:g} |"
-        )
-        broken += [
-            f"- {TITLES[name]}, number {one['number']}: {one['sort']}: `{one['text']}`"
-            for one in found["examples"]
-        ]
-        if found["failure"]:
-            broken.append(f"- {TITLES[name]}: the measurement failed: `{' '.join(found['failure'].split())}`")
-    if broken:
-        lines += ["", f"Broken promises, seed {result['seed']}:", "", *broken]
-    return TEXT + "\n".join(lines) + "\n"
+class Kind(NamedTuple):
+    """A kind of file. content: a valid one. numbers: of a loaded one, which must be finite.
+
+    crafted: return files made to do harm, of a valid one. is_slow: loading starts a process.
+    """
+
+    suffix: str
+    content: Callable[[], bytes]
+    load: Callable[[Path], Any]
+    error: type[Exception]
+    numbers: Callable[[Any], Any] = lambda loaded: ()
+    crafted: Callable[[bytes], list[bytes]] = lambda content: []
+    is_slow: bool = False
 
 
-def is_held(result: dict[str, Any]) -> bool:
-    """Return whether no file broke the promise, and all were judged."""
-    return not any(found["broken"] or found["failure"] for found in result["kinds"].values())
+def _written(save: Callable[..., None], suffix: str, *values: Any) -> bytes:
+    """Return the file that one of the package's writers makes."""
+    import tempfile
+
+    with tempfile.TemporaryDirectory() as folder:
+        save(path := Path(folder) / f"a{suffix}", *values)
+        return path.read_bytes()
 
 
-SECTION = Section("files", "Files from strangers", measure, as_markdown, is_held)
+def _log(suffix: str) -> bytes:
+    from tests.support.written_logs import make_log
+
+    return _written(flytrack_sysid.save_log, suffix, make_log(num_rows=12))

@@ -15,10 +15,10 @@ import numpy as np
 
 from flytrack_env.dynamics import ModelParameters
 from flytrack_env.effects import BY_NAME
-from flytrack_env.files import check_size, write_atomically
+from flytrack_env.files import write_atomically
 from flytrack_env.messages import error_text, quote_value
 from flytrack_env.model_file import SIZES, model_as_json, model_from_json
-from flytrack_env.npz_file import NpzError, open_npz
+from flytrack_env.npz_file import NpzError, load_npz
 from flytrack_env.state import ACTION_SIZE, STATE_SIZE
 from flytrack_env.tracks import Track
 
@@ -153,13 +153,10 @@ def _check_arrays(path: Path, data: dict[str, np.ndarray]) -> None:
 def _read(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     """Return the arrays and the notes of a reference file; raises ReferenceFileError."""
     try:
-        check_size(path.stat().st_size, LARGEST_BYTES)
-        with open_npz(path) as archive:
-            check_size(archive.num_bytes, LARGEST_BYTES)
-            missing = [name for name in (*ARRAYS, "notes") if name not in archive.names]
-            if missing:
-                raise NpzError(f"{', '.join(missing)}: missing")
-            data = {name: archive.read(name) for name in (*ARRAYS, "notes")}
+        data = load_npz(path, LARGEST_BYTES)
+        missing = [name for name in (*ARRAYS, "notes") if name not in data]
+        if missing:
+            raise NpzError(f"{', '.join(missing)}: missing")
         notes = json.loads(str(data.pop("notes")))
     except (OSError, ValueError, RecursionError) as error:  # ValueError: NpzError, no text, no JSON
         raise ReferenceFileError(

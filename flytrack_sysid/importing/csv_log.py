@@ -2,29 +2,27 @@
 
 import contextlib
 import csv
+import gzip
 import io
 import math
 import zlib
 from collections.abc import Iterator
 from pathlib import Path
-from typing import BinaryIO, TextIO, cast
+from typing import BinaryIO, cast
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from flytrack_env.files import AtMost, check_size, open_file
+from flytrack_env.files import open_file
 from flytrack_env.messages import error_text, quote_name, quote_value
-from flytrack_sysid.importing import gunzip
 from flytrack_sysid.importing.flight import Flight
 from flytrack_sysid.importing.mapping import Attitude, Columns, Command, Mapping, Vector
 from flytrack_sysid.importing.units import quaternion_from, vector_from
 from flytrack_sysid.log import CHANNELS, LogError
 from flytrack_sysid.log_file import LARGEST_BYTES
-from flytrack_sysid.log_table import LARGEST_NORM_ERROR, Rows, Table, log_of_table
+from flytrack_sysid.log_table import LARGEST_NORM_ERROR, CsvRows, Rows, Table, log_of_table
 
-PACKED_BYTES, LARGEST_RATIO = 2**24, 32  # what a compressed file may hold: that, or as many times its size
-LONGEST_ROW = 2**16  # characters: thousands of columns
-MOST_BLANK_LINES = 2**24  # in a row: some seconds
+PACKED_BYTES, LARGEST_RATIO = 2**24, 32  # characters in a compressed file: that, or as many times its size
 LONGEST_LIST = 1000  # characters of a header
 
 
@@ -59,20 +57,15 @@ def _wanted(columns: Columns) -> dict[str, str]:
 
 
 @contextlib.contextmanager
-def _opened(path: Path) -> Iterator[TextIO]:
-    """Yield the text of a file, perhaps compressed, of which no more is unpacked than there may be.
-
-    What is raised while it is read becomes a LogError.
-    """
+def _opened(path: Path, delimiter: str) -> Iterator[CsvRows]:
+    """Yield the rows of a file, perhaps compressed; errors while reading become LogErrors."""
     try:
-        with open_file(path) as file:
-            most_bytes, unpacked = LARGEST_BYTES, file
-            check_size(path.stat().st_size, LARGEST_BYTES)
+        with open_file(path, LARGEST_BYTES) as file, contextlib.ExitStack() as stack:
+            most, stream = LARGEST_BYTES, file
             if path.suffix == ".gz":
-                most_bytes = min(most_bytes, max(PACKED_BYTES, LARGEST_RATIO * path.stat().st_size))
-                unpacked = cast(BinaryIO, gunzip.Gunzip(file))
-            content = io.BufferedReader(AtMost(unpacked, most_bytes))
-            yield io.TextIOWrapper(content, encoding="utf-8-sig", newline="")
+                most = min(most, max(PACKED_BYTES, LARGEST_RATIO * path.stat().st_size))
+                stream = cast(BinaryIO, stack.enter_context(gzip.GzipFile(fileobj=file)))
+            yield CsvRows(io.TextIOWrapper(stream, encoding="utf-8-sig", newline=""), delimiter, most)
     # ValueError: UnicodeDecodeError, or a NUL in the name.
     except (OSError, EOFError, zlib.error, ValueError) as error:
         if isinstance(error, LogError):
@@ -80,42 +73,9 @@ def _opened(path: Path) -> Iterator[TextIO]:
         raise LogError(f"{path}: cannot be read as text: {error_text(error)}") from error
 
 
-class _Rows:
-    """The rows of a CSV file, lists of cells; csv itself would read all of an endless one first."""
-
-    def __init__(self, text: TextIO, delimiter: str):
-        self._text, self._num_characters, self._num_blank = text, 0, 0
-        self._rows = csv.reader(self._lines(), delimiter=delimiter, strict=True)
-
-    def _lines(self) -> Iterator[str]:
-        """Yield the lines of the file, of which a row may have several."""
-        while line := self._text.readline(LONGEST_ROW):
-            self._num_characters += len(line)
-            if self._num_characters >= LONGEST_ROW:
-                raise csv.Error(f"found a row of {LONGEST_ROW} characters or more, expected fewer")
-            yield line
-
-    def __iter__(self) -> "_Rows":
-        return self
-
-    def __next__(self) -> list[str]:
-        cells = next(self._rows)
-        self._num_characters = 0
-        self._num_blank = 0 if cells else self._num_blank + 1
-        if self._num_blank > MOST_BLANK_LINES:
-            raise csv.Error(f"found more than {MOST_BLANK_LINES} blank lines in a row, expected fewer")
-        return cells
-
-    @property
-    def line_num(self) -> int:
-        """Number of lines read."""
-        return self._rows.line_num
-
-
 def _read(path: Path, columns: Columns, mapping: str) -> Table:
     """Return the columns that the mapping names, as they are in the file."""
-    with _opened(path) as text:
-        rows = _Rows(text, columns.delimiter)
+    with _opened(path, columns.delimiter) as rows:
         try:
             return _table(path, rows, columns, mapping)
         except csv.Error as error:
@@ -124,7 +84,7 @@ def _read(path: Path, columns: Columns, mapping: str) -> Table:
             ) from error
 
 
-def _table(path: Path, rows: _Rows, columns: Columns, mapping: str) -> Table:
+def _table(path: Path, rows: CsvRows, columns: Columns, mapping: str) -> Table:
     """Return the columns that the mapping names, of the rows of a file, the first of which has the names."""
     wanted = _wanted(columns)
     header = [name.strip() for name in next(rows, [])]

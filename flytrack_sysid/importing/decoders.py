@@ -1,50 +1,38 @@
-"""Decoding other people's logs by other people's packages: pyulog, orangebox.
+"""Decoders of other programs' logs: pyulog and orangebox, run by ``flytrack_env.sandbox``.
 
-A small file can make either of them run for ever or eat all memory (an interval of 0; arrays of arrays), so
-they work in a process of their own (``decoding.py``). This file is read there alone: it imports nothing of
-this package, and of the two what is installed.
+A small file can make either of them run forever or exhaust the memory (an interval of 0; arrays of arrays).
+This file is imported alone there, so it imports nothing of this package. A decoder takes its arguments, the
+path first, and returns an ``.npz`` of notes (JSON) and arrays.
 """
 
-import contextlib
 import io
 import json
 import logging
 import math
 from array import array
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-with contextlib.suppress(ImportError):
-    import orangebox
-with contextlib.suppress(ImportError):
-    import pyulog
-
-MAIN_FRAME = "I"  # of Betaflight: frame type whose fields the others repeat
+MAIN_FRAME = "I"  # of Betaflight: the frame type whose fields the others repeat
 
 
-def decode(argument: Any, _: bytes) -> bytes:
-    """Return what a file holds, packed; argument: format, path, and what the format's function takes."""
-    format_name, path, *rest = argument
-    found: bytes = globals()[f"decode_{format_name}"](Path(path), *rest)
-    return found
-
-
-def pack(notes: Any, arrays: list[np.ndarray]) -> bytes:
-    """Return JSON values and arrays as the bytes of an ``.npz``."""
+def _pack(notes: Any, arrays: list[np.ndarray]) -> bytes:
     content = io.BytesIO()
     np.savez(content, np.frombuffer(json.dumps(notes).encode(), np.uint8), *arrays, allow_pickle=False)
     return content.getvalue()
 
 
-def decode_ulog(path: Path, wanted: dict[str, list[str]]) -> bytes:
-    """Return fields of a PX4 log's topics, their first instances.
+def decode_ulog(arguments: Any, _: bytes) -> bytes:
+    """Return fields of the first instances of a PX4 log's topics.
 
-    wanted: fields by topic. The arrays are float64, (num_rows,); their topics and fields are in the notes
-    (``fields``), with ``parameters`` (finite numbers) and ``is_damaged``.
+    arguments: path, and the wanted fields by topic. The arrays are float64, (num_rows,). The notes have their
+    topics and fields (``fields``), ``parameters`` (finite numbers) and ``is_damaged``.
     """
-    with path.open("rb") as file:
+    import pyulog
+
+    path, wanted = arguments
+    with open(path, "rb") as file:
         ulog = pyulog.ULog(file, list(wanted))
     found = {
         (data.name, field): data.data[field].astype(float)
@@ -59,22 +47,23 @@ def decode_ulog(path: Path, wanted: dict[str, list[str]]) -> bytes:
         if isinstance(value, (int, float)) and math.isfinite(value)
     }
     notes = {"fields": list(found), "parameters": parameters, "is_damaged": bool(ulog.file_corruption)}
-    return pack(notes, list(found.values()))
+    return _pack(notes, list(found.values()))
 
 
-def decode_betaflight(path: Path, num_logs: int) -> bytes:
+def decode_betaflight(arguments: Any, _: bytes) -> bytes:
     """Return the main frames of a blackbox file's logs, (num_frames, num_fields) float64 each.
 
-    The notes have, for each, ``headers`` and ``names``: of the fields.
+    arguments: path, number of logs. The notes have each log's ``headers`` and the fields' ``names``.
     """
+    import orangebox
+
+    path, num_logs = arguments
     logging.getLogger("orangebox").setLevel(logging.CRITICAL)  # it warns of events that it does not know
     notes, arrays = [], []
     for number in range(1, num_logs + 1):
-        parser = orangebox.Parser.load(str(path), number)
-        fields = parser.reader.field_defs
-        names = [
-            str(field.name) for field in next(fields[kind] for kind in fields if kind.value == MAIN_FRAME)
-        ]
+        parser = orangebox.Parser.load(path, number)
+        main = next(fields for kind, fields in parser.reader.field_defs.items() if kind.value == MAIN_FRAME)
+        names = [str(field.name) for field in main]
         values = array("d")
         for frame in parser.frames():
             if len(frame.data) < len(names):
@@ -82,4 +71,4 @@ def decode_betaflight(path: Path, num_logs: int) -> bytes:
             values.extend(frame.data[: len(names)])
         notes.append({"headers": parser.headers, "names": names})
         arrays.append(np.array(values, float).reshape(-1, len(names)))
-    return pack(notes, arrays)
+    return _pack(notes, arrays)

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from flytrack_env.files import AtMost, open_file
+from flytrack_env.files import open_file
 from flytrack_env.messages import error_text, quote_name, quote_value
 from flytrack_sysid.importing.craft import Craft
 from flytrack_sysid.importing.mapping import Manifest, Mapping
@@ -55,9 +55,8 @@ def _count_of(path: Path, asked: Manifest) -> int:
     if manifest.name != asked.file:
         raise LogError(f"{where}: expected the name of a file beside the log, not a path")
     try:
-        with open_file(manifest) as file:
-            content = io.BufferedReader(AtMost(file, LARGEST_MANIFEST_BYTES))
-            text = io.TextIOWrapper(content, encoding="utf-8-sig", newline="")
+        with open_file(manifest, LARGEST_MANIFEST_BYTES) as file:
+            text = io.TextIOWrapper(file, encoding="utf-8-sig", newline="")
             count = _find_count(where, csv.reader(text, strict=True), asked, path.name)
     except (OSError, ValueError, csv.Error) as error:  # ValueError: no text, or a NUL in the name
         if isinstance(error, LogError):

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from flytrack_env.files import check_size, open_file
+from flytrack_env.files import open_file
 from flytrack_env.messages import error_text
 from flytrack_sysid.importing.craft import Craft
 from flytrack_sysid.importing.decoding import decode
@@ -74,8 +74,7 @@ class _Topics:
     def __init__(self, path: Path):
         self.path = path
         try:
-            check_size(path.stat().st_size, LARGEST_BYTES)
-            with open_file(path) as file:
+            with open_file(path, LARGEST_BYTES) as file:
                 found = file.read(len(FIRST_BYTES))
         except OSError as error:
             raise LogError(f"{path}: cannot be read: {error_text(error)}") from error

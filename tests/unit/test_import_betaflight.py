@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from benchmarks.reliability.strangers.log_writers import BLACKBOX_HEADERS, blackbox
-from flytrack_env.apart import ResourceLimits
+from benchmarks.reliability.foreign_logs import BLACKBOX_HEADERS, blackbox
+from flytrack_env.sandbox import ResourceLimits
 from flytrack_sysid import LogError, import_log
 from flytrack_sysid.importing import decoding
 from flytrack_sysid.importing.betaflight_log import full_stick_rate
@@ -131,7 +131,7 @@ def test_headers_that_make_the_decoder_wait_for_ever_are_refused_in_time(tmp_pat
     path = write(tmp_path / "a.bbl", log_with(**waits))
     monkeypatch.setattr(decoding, "limits_of", lambda num_bytes: ResourceLimits(cpu_s=1))
     with pytest.raises(
-        LogError, match=r"a\.bbl: damaged, cannot be decoded: it took more than 1 s of processor"
+        LogError, match=r"a\.bbl: damaged, cannot be decoded: took more than 1 s of processor"
     ):
         import_log(path, "betaflight")
 
@@ -139,15 +139,6 @@ def test_headers_that_make_the_decoder_wait_for_ever_are_refused_in_time(tmp_pat
 def test_large_files_may_take_longer_to_decode():
     assert decoding.limits_of(2**20 - 1).cpu_s == ResourceLimits().cpu_s < decoding.limits_of(2**20).cpu_s
     assert decoding.limits_of(2**24).memory_bytes > ResourceLimits().memory_bytes
-
-
-def test_without_fork_the_decoder_works_here(tmp_path, monkeypatch):
-    apart = import_log(write(tmp_path / "a.bbl", log_with()), "betaflight").log
-    monkeypatch.setattr(decoding, "is_possible", lambda: False)
-    np.testing.assert_array_equal(import_log(tmp_path / "a.bbl", "betaflight").log["w"], apart["w"])
-    write(tmp_path / "bad.bbl", log_with().replace(b"encoding:1", b"encoding:77"))
-    with pytest.raises(LogError, match=r"bad\.bbl: damaged, cannot be decoded: RuntimeError"):
-        import_log(tmp_path / "bad.bbl", "betaflight")
 
 
 def test_a_missing_file_or_package_is_named(tmp_path, monkeypatch):

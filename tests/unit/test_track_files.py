@@ -12,7 +12,6 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from benchmarks.reliability.strangers.trees import as_toml
 from flytrack_env import toml_file
 from flytrack_env.references import (
     ReferenceFileError,
@@ -21,6 +20,7 @@ from flytrack_env.references import (
     shipped_references,
 )
 from flytrack_env.tracks import Track, TrackError, build_course, load_track, save_track
+from tests.support.trees import as_toml
 
 GATE: dict[str, Any] = {"id": 7, "direction": "+y", "opening": 1.5, "frame": 2.7}
 TREE: dict[str, Any] = {

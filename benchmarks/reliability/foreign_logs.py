@@ -1,4 +1,4 @@
-"""Writers of small logs in other people's formats, by their specifications: PX4's, Betaflight's."""
+"""Writers of small valid logs in the formats that are imported: PX4, Betaflight, CSV with a mapping."""
 
 import struct
 from pathlib import Path
@@ -7,6 +7,35 @@ from typing import Any
 import numpy as np
 
 ULOG_TYPES = {"uint64_t": "Q", "float": "f", "bool": "?", "uint8_t": "B"}
+NUM_ROWS, STEP_US = 30, 10_000
+ULOG_TOPICS: dict[str, tuple[list[tuple[str, str, int]], tuple[float, ...]]] = {
+    "vehicle_angular_velocity": ([("float", "xyz", 3)], (0.1, 0.2, 0.3)),
+    "vehicle_acceleration": ([("float", "xyz", 3)], (0.5, 0.25, -9.75)),
+    "vehicle_attitude": ([("float", "q", 4)], (0.8, 0.0, 0.0, 0.6)),
+    "vehicle_rates_setpoint": (
+        [*(("float", name, 0) for name in ("roll", "pitch", "yaw")), ("float", "thrust_body", 3)],
+        (0.5, 0.25, -0.25, 0.0, 0.0, -0.5),
+    ),
+    "battery_status": ([("float", "voltage_v", 0)], (16.25,)),
+}
+ULOG_PARAMETERS = {"MC_ACRO_R_MAX": 720.0, "MC_ACRO_P_MAX": 360.0, "MC_ACRO_Y_MAX": 90.0}
+MAPPING = """[time]
+column = "ms"
+unit = "ms"
+[command]
+columns = ["ail", "ele", "rud", "thr"]
+low = [1000, 2000, 2000, 1000]
+high = [2000, 1000, 1000, 2000]
+[rates]
+columns = ["p", "q", "r"]
+unit = "deg/s"
+frame = "frd"
+[battery]
+column = "mv"
+scale = 0.001
+[craft]
+max_rate_deg_s = [500, 500, 500]
+"""
 
 
 class UlogWriter:
@@ -40,9 +69,13 @@ class UlogWriter:
             self.data += self.message("D", content)
         self.num_topics += 1
 
+    def content(self) -> bytes:
+        """Return the file."""
+        return b"ULog\x01\x12\x35" + struct.pack("<BQ", 1, 0) + self.definitions + self.data
+
     def write(self, path: Path) -> Path:
-        header = b"ULog\x01\x12\x35" + struct.pack("<BQ", 1, 0)
-        path.write_bytes(header + self.definitions + self.data)
+        """Write the file and return its path."""
+        path.write_bytes(self.content())
         return path
 
 
@@ -89,3 +122,29 @@ def blackbox(rows: np.ndarray, names: list[str], headers: dict[str, str]) -> byt
         for row in rows
     )
     return text + frames + b"E\xffEnd of log\x00"
+
+
+def ulog() -> bytes:
+    """Return a small PX4 log."""
+    writer = UlogWriter(ULOG_PARAMETERS)
+    for name, (fields, values) in ULOG_TOPICS.items():
+        writer.add(name, fields, [(10**6 + STEP_US * row, *values) for row in range(NUM_ROWS)])
+    return writer.content()
+
+
+def betaflight() -> bytes:
+    """Return a small Betaflight log."""
+    sensors = [f"{sensor}[{axis}]" for sensor in ("gyroADC", "accSmooth") for axis in range(3)]
+    names = ["loopIteration", "time", *(f"setpoint[{axis}]" for axis in range(4)), "vbatLatest", *sensors]
+    rows = np.tile((0, 0, 511, -333, 250, 0, 2410, 100, -50, 25, 1024, -512, 2048), (NUM_ROWS, 1))
+    rows[:, 0], rows[:, 1] = np.arange(NUM_ROWS), 5_000_000 + STEP_US * np.arange(NUM_ROWS)
+    return blackbox(rows, names, BLACKBOX_HEADERS)
+
+
+def foreign_csv() -> bytes:
+    """Return a small CSV log that ``MAPPING`` fits."""
+    names = ["ms", "ail", "ele", "rud", "thr", "p", "q", "r", "mv"]
+    rows = np.random.default_rng(3).normal(size=(NUM_ROWS, len(names)))
+    rows[:, 0], rows[:, 1:5], rows[:, -1] = 10.0 * np.arange(NUM_ROWS), 1500.0, 16_000.0
+    lines = [",".join(names), *(",".join(f"{value:.6g}" for value in row) for row in rows)]
+    return ("\n".join(lines) + "\n").encode()

@@ -1,1 +1,0 @@
-"""Files from strangers: every kind of file that is read, damaged at random and on purpose (``files.py``)."""
