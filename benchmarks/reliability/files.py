@@ -1,19 +1,17 @@
 """Files: valid ones of every kind that is read, damaged by hypothesis or crafted to do harm, and loaded.
 
-Promised is a sound result or the loader's own error, naming the file, within CPU_S and MEMORY_BYTES and without
-unpickling anything.
+Promised is a sound result or the loader's own error, which names the file, within CPU_S and MEMORY_BYTES and
+without unpickling anything.
 """
 
-import contextlib
 import gzip
 import io
-import json
 import resource
-import signal
 import sys
+import tempfile
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -24,55 +22,327 @@ import jax.numpy as jnp
 import numpy as np
 from hypothesis import strategies as st
 from jax import export
+from tqdm import tqdm
 
-import flytrack_sysid
 from baselines.purejaxrl_ppo import CheckpointError, load_checkpoint
 from baselines.purejaxrl_ppo.config import ConfigError, settings_in_file
-from benchmarks.champion import CHAMPION
 from benchmarks.reliability import foreign_logs
 from benchmarks.report import ROOT, table
-from flytrack_env import ModelFileError, TrackError, blackbox, load_model, load_track, sandbox
+from flytrack_env import (
+    ModelFileError,
+    TrackError,
+    blackbox,
+    load_model,
+    load_track,
+    nominal_parameters,
+    sandbox,
+)
+from flytrack_env.effects import QuadraticDrag
+from flytrack_env.model_file import save_model
 from flytrack_env.references import ReferenceFileError, load_reference, shipped_path
 from flytrack_env.rollout import RolloutError, load_rollout, save_rollout
-from flytrack_env.tracks import build_course
 from flytrack_env.tracks.track import TRACK_FOLDER
-from flytrack_sysid import LogError, ScriptError
+from flytrack_sysid import (
+    LogError,
+    Script,
+    ScriptError,
+    import_log,
+    load_log,
+    load_script,
+    save_log,
+    save_script,
+)
 from flytrack_sysid.importing import load_mapping
+from flytrack_sysid.log import log_of_states
 from flytrack_sysid.manoeuvres import MANOEUVRES
 
-CPU_S, MEMORY_BYTES = 10.0, 2 * 2**30
-LONGEST_MESSAGE = 2000  # characters, and the file's name
-NUM_FILES, SLOW_SHARE = 1000, 0.2  # of each kind; of those that start a process for each
-TOKENS = [b"nan", b"1e999", b"-1", b"0", b"null", b'"', b"\n", b"\0", b"\xff", b",", b"[" * 2000, b"9" * 5000]
-SETTINGS = b'total_timesteps = 2e6\nhidden_sizes = [64, 64]\nlearning_rate = 3e-4\n'
-PLANT = ((21,), (4,))  # shapes of a black box's arguments
+CPU_S, MEMORY_BYTES = 10.0, 2 * 2**30  # that one file may take; the sandbox's own limits are lower
+LONGEST_MESSAGE = 2000  # characters
+SLOW_SHARE = 0.05  # of the files, of kinds whose loader starts a process
+TOKENS = (b"nan", b"1e999", b"-1", b"null", b'"', b"\n", b"\0", b"\xff", b",", b"[" * 2000, b"9" * 5000)
+CHAMPION = next((ROOT / "baselines" / "purejaxrl_ppo" / "champion").glob("flytrack.*"))
+SETTINGS = "total_timesteps = 2e6\nhidden_sizes = [64, 64]\nlearning_rate = 3e-4\n"
 
 
 class Kind(NamedTuple):
-    """A kind of file. content: a valid one. numbers: of a loaded one, which must be finite.
+    """A kind of file: a valid one, its loader, the error that the loader raises.
 
-    crafted: return files made to do harm, of a valid one. is_slow: loading starts a process.
+    crafted: return files made to do harm from a valid one. is_slow: the loader starts a process.
     """
 
     suffix: str
     content: Callable[[], bytes]
     load: Callable[[Path], Any]
     error: type[Exception]
-    numbers: Callable[[Any], Any] = lambda loaded: ()
     crafted: Callable[[bytes], list[bytes]] = lambda content: []
     is_slow: bool = False
 
 
-def _written(save: Callable[..., None], suffix: str, *values: Any) -> bytes:
-    """Return the file that one of the package's writers makes."""
-    import tempfile
-
+def written(save: Callable[..., Any], suffix: str, *values: Any) -> bytes:
+    """Return the file that one of the package's writers makes of some values."""
     with tempfile.TemporaryDirectory() as folder:
-        save(path := Path(folder) / f"a{suffix}", *values)
+        path = Path(folder) / f"valid{suffix}"
+        save(path, *values)
         return path.read_bytes()
 
 
-def _log(suffix: str) -> bytes:
-    from tests.support.written_logs import make_log
+def flight() -> tuple[np.ndarray, np.ndarray]:
+    """Return states (12, 21) and actions (12, 4) of a drone near hover."""
+    states = np.tile(np.asarray(blackbox.start_vector(), float), (12, 1))
+    states[:, 2] = 5.0
+    return states, np.random.default_rng(0).uniform(-1.0, 1.0, (12, 4))
 
-    return _written(flytrack_sysid.save_log, suffix, make_log(num_rows=12))
+
+def script() -> bytes:
+    """Return a script of two flights."""
+    states, actions = flight()
+    return written(save_script, ".npz", Script(tuple(MANOEUVRES)[:2], states[:2], np.stack([actions] * 2)))
+
+
+def exported(step: Callable[..., Any]) -> bytes:
+    """Return a step, (21,), (4,) -> (21,), as a black box."""
+    allow = [export.DisabledSafetyCheck.custom_call("callback")]
+    arguments = [jax.ShapeDtypeStruct((size,), jnp.float32) for size in (21, 4)]
+    return bytes(
+        export.export(jax.jit(step), platforms=["cpu"], disabled_checks=allow)(*arguments).serialize()
+    )
+
+
+def hostile_plants(_: bytes) -> list[bytes]:
+    """Return programs that never end, need 4 GiB, or call out."""
+    return [
+        exported(lambda x, u: jax.lax.while_loop(lambda c: c[0] >= 0.0, lambda c: 0.5 * c + 1.0, x)),
+        exported(
+            lambda x, u: x + jnp.sort(jnp.sin(jnp.arange(2.0**30).reshape(2**20, -1) * x[9]), axis=0).sum()
+        ),
+        exported(lambda x, u: jax.ffi.ffi_call("callback", jax.ShapeDtypeStruct(x.shape, x.dtype))(x)),
+    ]
+
+
+def hostile_arrays(content: bytes) -> list[bytes]:
+    """Return archives with pickles, arrays of other sizes than declared, and bombs."""
+    arrays = dict(np.load(io.BytesIO(content)))
+    name = next(iter(arrays))
+    odd = (np.array([print], object), np.zeros(2**27, np.int8), np.full(8, 2**31 - 1, np.int32).view("<U1"))
+    saved = [npz({**arrays, name: value}) for value in odd]
+    header = npz(arrays).replace(b"'shape': (", b"'shape': (9")
+    return [*saved, header, content + content, content.replace(b"\x93NUMPY\x01", b"\x93NUMPY\x02")]
+
+
+def npz(arrays: dict[str, np.ndarray]) -> bytes:
+    """Return arrays as a compressed archive."""
+    content = io.BytesIO()
+    np.savez_compressed(content, **arrays)
+    return content.getvalue()
+
+
+def hostile_texts(content: bytes) -> list[bytes]:
+    """Return texts without an end, nested deeply, or with keys of very many parts."""
+    dots = b"\n".join(b"a" + b".a" * 999 + b" = %d" % number for number in range(100))
+    return [
+        content + b" " * 2**26,
+        content + b"x" * 2**22,
+        b"[" * 10**5,
+        b"a = " + b"[" * 10**5,
+        dots,
+        b"9" * 10**5,
+    ]
+
+
+def hostile_rollouts(content: bytes) -> list[bytes]:
+    """Return arrays of objects, and headers that declare terabytes."""
+    pickled = io.BytesIO()
+    np.save(pickled, np.array([(print, print)], object))
+    return [
+        pickled.getvalue(),
+        content.replace(b"(12, 25), }" + b" " * 11, b"(12000000000, 25), }"),
+        b"\x93NUMPY\x02\x00\xff\xff\xff\x7f{'descr'" + bytes(200),
+    ]
+
+
+def hostile_gzips(_: bytes) -> list[bytes]:
+    """Return compressed files that unpack to 256 MiB, or have 100,000 parts."""
+    return [gzip.compress(b"0," * 2**27, 1), gzip.compress(b"\n" * 2**28, 1), gzip.compress(b"") * 100_000]
+
+
+def hostile_betaflight(content: bytes) -> list[bytes]:
+    """Return a log whose headers make the decoder wait forever."""
+    encoding = b"H Field I encoding"
+    return [content.replace(encoding, b"H P interval:0/32\nH Field I predictor:6,6\n" + encoding)]
+
+
+def hostile_ulogs(content: bytes) -> list[bytes]:
+    """Return a log with a topic of arrays of arrays of arrays."""
+    formats = (b"vehicle_attitude:b[60000] q;", b"b:c[60000] q;", b"c:float[60000] q;")
+    messages = b"".join(len(text).to_bytes(2, "little") + b"F" + text for text in formats)
+    return [content[:16] + messages + content[16:]]
+
+
+def import_csv(path: Path) -> Any:
+    """Return the log in a CSV file."""
+    mapping = path.with_name("mapping_of_csv.toml")
+    mapping.write_text(foreign_logs.MAPPING)
+    return import_log(path, "csv", mapping).log
+
+
+LOG, REFERENCE = log_of_states([flight()], 0.01), shipped_path("flytrack", "flying", "nominal")
+MODEL = nominal_parameters().with_effects(QuadraticDrag(0.1, 0.1, 0.2))
+PLAIN = partial(exported, lambda x, u: 0.5 * x + u.sum())
+PACKED = partial(gzip.compress, foreign_logs.foreign_csv(), mtime=0)
+npz_log, csv_log = (partial(written, save_log, suffix, LOG) for suffix in (".npz", ".csv"))
+rollout, model = (
+    partial(written, save_rollout, ".npy", *flight()),
+    partial(written, save_model, ".json", MODEL, {}),
+)
+import_ulog, import_betaflight = (partial(import_log, format=form) for form in ("ulog", "betaflight"))
+KINDS = {
+    "track": Kind(
+        ".toml", (TRACK_FOLDER / "flytrack.toml").read_bytes, load_track, TrackError, hostile_texts
+    ),
+    "model": Kind(".json", model, load_model, ModelFileError, hostile_texts),
+    "rollout": Kind(".npy", rollout, load_rollout, RolloutError, hostile_rollouts),
+    "flight log, .npz": Kind(".npz", npz_log, load_log, LogError, hostile_arrays),
+    "flight log, .csv": Kind(".csv", csv_log, load_log, LogError, hostile_texts),
+    "script": Kind(".npz", script, load_script, ScriptError, hostile_arrays),
+    "reference": Kind(".npz", REFERENCE.read_bytes, load_reference, ReferenceFileError, hostile_arrays),
+    "import mapping": Kind(".toml", foreign_logs.MAPPING.encode, load_mapping, LogError, hostile_texts),
+    "imported CSV": Kind(".csv", foreign_logs.foreign_csv, import_csv, LogError, hostile_texts),
+    "imported CSV, gzip": Kind(".csv.gz", PACKED, import_csv, LogError, hostile_gzips),
+    "imported PX4 log": Kind(".ulg", foreign_logs.ulog, import_ulog, LogError, hostile_ulogs, True),
+    "imported Betaflight log": Kind(
+        ".bbl", foreign_logs.betaflight, import_betaflight, LogError, hostile_betaflight, True
+    ),
+    "training settings": Kind(".toml", SETTINGS.encode, settings_in_file, ConfigError, hostile_texts),
+    "checkpoint": Kind(CHAMPION.suffix, CHAMPION.read_bytes, load_checkpoint, CheckpointError),
+    "black box": Kind(".bin", PLAIN, blackbox.load, blackbox.BlackBoxError, hostile_plants, True),
+}
+
+
+def numbers(loaded: Any) -> list[np.ndarray]:
+    """Return the arrays of floating point numbers in anything that was loaded."""
+    if hasattr(loaded, "log"):
+        loaded = loaded.log
+    leaves = [np.asarray(leaf) for leaf in jax.tree.leaves(getattr(loaded, "__dict__", loaded))]
+    return [leaf for leaf in leaves if leaf.dtype.kind == "f"]
+
+
+@st.composite
+def damaged(draw: st.DrawFn, valid: bytes) -> bytes:
+    """Return a file with one to four parts changed, cut, extended or duplicated."""
+    content = valid
+    if content[:2] == b"PK" and draw(st.booleans()):
+        return draw(damaged_arrays(valid))
+    is_packed = content[:2] == b"\x1f\x8b" and draw(st.booleans())
+    content = gzip.decompress(content) if is_packed else content
+    for _ in range(draw(st.integers(1, 4))):
+        start = draw(st.integers(0, len(content)))
+        end = min(start + draw(st.integers(0, 40)), len(content))
+        part = content[start:end]
+        new = draw(st.sampled_from(TOKENS) | st.binary(max_size=8) | st.just(part * 2) | st.just(part[::-1]))
+        content = content[:start] + new + (content[end:] if draw(st.integers(0, 9)) else b"")
+    return gzip.compress(content, 1) if is_packed else content
+
+
+@st.composite
+def damaged_arrays(draw: st.DrawFn, valid: bytes) -> bytes:
+    """Return an archive of which one array is missing, or of another type, shape or value."""
+    arrays = dict(np.load(io.BytesIO(valid)))
+    name = draw(st.sampled_from(sorted(arrays)))
+    old = arrays.pop(name)
+    other = old.astype(float) if old.dtype.kind in "iuf" else np.zeros(3)
+    changed = other.copy()
+    changed.flat[draw(st.integers(0, other.size - 1))] = draw(st.floats())
+    odd = [
+        changed,
+        other[:-1],
+        other[None],
+        other.astype(np.int8),
+        old.astype("S4"),
+        other[:0],
+        np.float64(1.0),
+    ]
+    new = draw(st.none() | st.sampled_from(odd))
+    return npz(arrays if new is None else {**arrays, draw(st.sampled_from([name, "../other"])): new})
+
+
+class Broken(AssertionError):
+    """A file that broke the promise."""
+
+
+def judge(kind: Kind, path: Path, unpickled: list[str]) -> str:
+    """Return "loaded" or "refused"; raises Broken for anything else that a file brings about."""
+    started_s = time.process_time()
+    unpickled.clear()
+    try:
+        loaded, outcome = kind.load(path), "loaded"
+    except kind.error as error:
+        text, loaded, outcome = str(error), None, "refused"
+        if path.name not in text or len(text) > LONGEST_MESSAGE or not text.isprintable():
+            raise Broken(f"refused with the message {text[:200]!r}") from error
+    except Exception as error:
+        raise Broken(f"raised {type(error).__name__}: {str(error)[:200]}") from error
+    if not all(np.isfinite(values).all() for values in numbers(loaded)):
+        raise Broken("loaded numbers that are not finite")
+    if unpickled or time.process_time() - started_s > CPU_S:
+        raise Broken(f"unpickled {unpickled}, took {time.process_time() - started_s:.1f} s")
+    return outcome
+
+
+def limit_memory() -> None:
+    """Let this process allocate MEMORY_BYTES more than it has; only where the system says how much it has."""
+    if sandbox.MEMORY_STATUS.exists():
+        status = dict(line.split(":", 1) for line in sandbox.MEMORY_STATUS.read_text().splitlines())
+        most = int(status["VmData"].split()[0]) * 1024 + MEMORY_BYTES
+        resource.setrlimit(resource.RLIMIT_DATA, (most, resource.getrlimit(resource.RLIMIT_DATA)[1]))
+
+
+def soak_kind(kind: Kind, num_files: int, folder: Path) -> dict[str, Any]:
+    """Return how many files of a kind were loaded and refused, the slowest, and what was broken first."""
+    outcomes: Counter[str] = Counter()
+    slowest_s, unpickled, path = 0.0, list[str](), folder / f"a{kind.suffix}"
+    sys.addaudithook(lambda event, _: unpickled.append(event) if event == "pickle.find_class" else None)
+
+    def check(content: bytes) -> None:
+        nonlocal slowest_s
+        path.write_bytes(content)
+        started_s = time.perf_counter()
+        outcomes[judge(kind, path, unpickled)] += 1
+        slowest_s = max(slowest_s, time.perf_counter() - started_s)
+
+    valid = kind.content()
+    settings = hypothesis.settings(
+        max_examples=max(round(num_files * (SLOW_SHARE if kind.is_slow else 1.0)), 1),
+        deadline=None,
+        database=None,
+        derandomize=True,
+        phases=[hypothesis.Phase.generate, hypothesis.Phase.shrink],
+        suppress_health_check=list(hypothesis.HealthCheck),
+    )
+    broken = ""
+    try:
+        check(valid)
+        if not outcomes["loaded"]:
+            raise Broken("refused the valid file")
+        for content in kind.crafted(valid):
+            check(content)
+        settings(hypothesis.given(damaged(valid))(check))()
+    except Broken as error:
+        broken = f"{error}; the file: {path.read_bytes()[:100]!r}"
+    return {**outcomes, "slowest_s": round(slowest_s, 2), "broken": broken}
+
+
+def measure(num_files: int) -> dict[str, Any]:
+    """Return what came of ``num_files`` damaged files of every kind, and the crafted ones."""
+    limit_memory()
+    with tempfile.TemporaryDirectory() as folder:
+        kinds = {name: soak_kind(kind, num_files, Path(folder)) for name, kind in tqdm(KINDS.items())}
+    return {"kinds": kinds, "is_held": not any(found["broken"] for found in kinds.values())}
+
+
+def as_markdown(result: dict[str, Any]) -> str:
+    """Return a table of all kinds."""
+    rows = [
+        (name, found.get("loaded", 0), found.get("refused", 0), found["slowest_s"], found["broken"] or "no")
+        for name, found in result["kinds"].items()
+    ]
+    return table("kind of file | loaded | refused | slowest, s | promise broken", rows)
