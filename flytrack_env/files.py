@@ -76,18 +76,16 @@ def write_together(files: Iterable[tuple[str | Path, bytes]]) -> None:
 
 
 def fresh_folder(path: Path) -> Path:
-    """Return a new or empty folder: the path, else ``path_2``, ``path_3``, ...; makes it.
+    """Make and return a new folder: the path, else ``path_2``, ``path_3``, ...
 
-    No two callers are given the same new folder, even if they run at the same time.
+    No two callers are given the same folder, even if they run at the same time.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
-    if path.is_dir() and not any(path.iterdir()):
-        return path
-    for number in itertools.count(1):
-        folder = path if number == 1 else path.with_name(f"{path.name}_{number}")
+    names = (path.with_name(f"{path.name}_{number}") for number in itertools.count(2))
+    for folder in itertools.chain([path], names):
         try:
             folder.mkdir()
+            return folder
         except FileExistsError:
             continue
-        return folder
-    raise AssertionError("unreachable")
+    raise AssertionError("there is always another number")

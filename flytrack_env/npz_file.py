@@ -88,10 +88,11 @@ def _read_arrays(archive: zipfile.ZipFile, most_bytes: int) -> dict[str, np.ndar
         num_bytes += max(member.file_size, 8 * math.prod(headers[name].shape))
         if num_bytes > most_bytes:
             raise NpzError(f"found arrays of {num_bytes} bytes or more, expected at most {most_bytes}")
-    return {
-        name: _array(name, archive.read(member), header)
-        for (name, header), member in zip(headers.items(), archive.infolist(), strict=True)
-    }
+    arrays = {}
+    for (name, header), member in zip(headers.items(), archive.infolist(), strict=True):
+        with archive.open(member) as file:  # reads no more than asked for, unlike archive.read
+            arrays[name] = _array(name, file.read(member.file_size), header)
+    return arrays
 
 
 def _check(name: str, file: BinaryIO, num_bytes: int) -> Header:

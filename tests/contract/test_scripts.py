@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from benchmarks.reliability.strangers.archives import zipped
 from flytrack_env.dynamics import collective_thrust, nominal_parameters
 from flytrack_env.state import APPLIED_ACTION, BATTERY
 from flytrack_sysid import collect, load_log
@@ -129,12 +128,12 @@ BAD = {
     r"commands: found shape \(8, 1, 4\)": {"commands": made("headings").commands[:, :1]},
     r"commands: found shape \(8, 1000\)": {"commands": made("headings").commands.reshape(8, -1)},
     "kinds: found 'loop', expected one of headings": {"kinds": np.array(["loop"] * 8)},
-    "kinds: found no flight": {"kinds": np.array([], "U1")},
-    "kinds: found an array of float64": {"kinds": np.zeros(8)},
+    "kinds, starts: found arrays of <U1": {"kinds": np.array([], "U1")},
+    "kinds, starts: found arrays of float64": {"kinds": np.zeros(8)},
     "starts: found an array of <U4": {"starts": np.full((8, 21), "text")},
-    "found text of numbers that are no characters": {"kinds": np.full(8, 0x7FFFFFFF, np.int32).view("<U1")},
+    "found text with numbers that are no characters": {"kinds": np.full(8, 0x7FFFFFFF, np.int32).view("<U1")},
     r"kinds: found 'xxx.{0,80}, expected one of headings": {"kinds": np.array(["x" * 5000] * 8)},
-    "found more than 67108864 bytes": {"commands": np.zeros((8, 2**20 + 1, 1), np.int8)},
+    "found arrays of 67110784 bytes or more": {"commands": np.zeros((8, 2**20 + 1, 1), np.int8)},
     "nothing is unpickled": {"starts": np.array([Harmful()] * 8, object)},
     "found arrays commands, kinds, more, starts, expected kinds, starts, commands": {"more": np.zeros(1)},
 }
@@ -159,7 +158,7 @@ def test_names_without_flights_take_no_memory(tmp_path):
     del names
     tracemalloc.start()
     try:
-        with pytest.raises(ScriptError, match=r"starts: found shape \(8, 21\), expected \(1048576, 21\)"):
+        with pytest.raises(ScriptError, match=r"names\.npz: kinds, starts: found arrays"):
             load_script(path)
         assert tracemalloc.get_traced_memory()[1] < 2**26
     finally:
@@ -170,12 +169,9 @@ def test_files_that_are_no_scripts_are_refused(tmp_path):
     path = tmp_path / "cut.npz"
     save_script(path, made("headings"))
     path.write_bytes(path.read_bytes()[:1000])
-    for bad, message in ((path, "not a script, or damaged"), (tmp_path / "none.npz", "FileNotFoundError")):
+    for bad, message in ((path, "not a script, or damaged"), (tmp_path / "none.npz", "No such file")):
         with pytest.raises(ScriptError, match=message):
             load_script(bad)
-    path.write_bytes(zipped([(f"{name}.npy", b"no array") for name in ("kinds", "starts", "commands")]))
-    with pytest.raises(ScriptError, match=r"cut\.npz: not a script, or damaged; .*NpzError"):
-        load_script(path)
     with pytest.raises(ScriptError, match=r"found suffix '\.csv', expected \.npz"):
         load_script(tmp_path / "flight.csv")
     script = made("headings")

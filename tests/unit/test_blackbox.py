@@ -5,7 +5,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from jax import export
 
 import flytrack_env
 from flytrack_env import blackbox, nominal_parameters
@@ -22,56 +21,29 @@ from tests.support.black_boxes import SHIPPED, random_inputs, write_artifact
 # Loading
 
 
-def test_missing_directory_and_empty(tmp_path):
-    (tmp_path / "empty.bin").write_bytes(b"")
-    cases = {"missing.bin": "found nothing", ".": "found a directory", "empty.bin": "found 0 bytes"}
-    for name, found in cases.items():
-        with pytest.raises(BlackBoxError, match=found) as caught:
-            load(tmp_path / name)
-        assert str(tmp_path / name) in str(caught.value)
-
-
 def test_huge_file(tmp_path):
     path = tmp_path / "huge.bin"
     with path.open("wb") as file:
         file.truncate(2**40)  # sparse: takes no room
-    with pytest.raises(BlackBoxError, match=f"found {2**40} bytes, expected 1 to"):
+    with pytest.raises(BlackBoxError, match=rf"huge\.bin: found {2**40} bytes, expected at most"):
         load(path)
 
 
-def test_truncated(tmp_path):
-    content = SHIPPED.read_bytes()
-    path = tmp_path / "truncated.bin"
-    # The last dozen bytes are padding that the format does not need.
-    lengths = [1, 3, 4, 8, 20, 64, *range(100, len(content) - 12, 97), len(content) - 13]
-    for length in lengths:
-        path.write_bytes(content[:length])
-        with pytest.raises(BlackBoxError, match=f"found {length} bytes that cannot be deserialised"):
-            load(path)
-
-
-def test_random_bytes_and_foreign_formats(tmp_path):
-    path = tmp_path / "noise.bin"
-    rng = np.random.default_rng(0)
-    contents = [rng.bytes(size) for size in (16, 300, 5000, 100_000)]
-    contents += [b"\0" * 4096, b"\xff" * 4096, b"{}", b"\x80\x04K\x01.", b"PK\x03\x04" * 100]
-    for content in contents:
-        path.write_bytes(content)
-        with pytest.raises(BlackBoxError, match=r"noise\.bin: .*expected"):
-            load(path)
+@pytest.mark.parametrize("length", [0, 3, 1000, -13])  # the last dozen bytes are padding
+def test_truncated(tmp_path, length):
+    path, content = tmp_path / "truncated.bin", SHIPPED.read_bytes()[:length]
+    path.write_bytes(content)
+    with pytest.raises(BlackBoxError, match=f"found {len(content)} bytes that cannot be deserialised"):
+        load(path)
 
 
 @pytest.mark.parametrize(
     ("function", "shapes", "dtype", "found"),
     [
         (lambda x, u: x, ((20,), (4,)), jnp.float32, r"float32\[20\], float32\[4\]"),
-        (lambda x, u: x, ((21,), (3,)), jnp.float32, r"float32\[21\], float32\[3\]"),
-        (lambda x, u: x[:18], ((21,), (4,)), jnp.float32, r"-> \(float32\[18\]\)"),
         (lambda x, u: (x, u), ((21,), (4,)), jnp.float32, r"-> \(float32\[21\], float32\[4\]\)"),
         (lambda x: x, ((21,),), jnp.float32, r"\(float32\[21\]\) ->"),
-        (lambda x, u, dt: x, ((21,), (4,), ()), jnp.float32, r"float32\[\]"),
         (lambda x, u: x, ((21,), (4,)), jnp.float16, r"float16\[21\]"),
-        (lambda x, u: x, ((21,), (4,)), jnp.int32, r"int32\[21\]"),
     ],
 )
 def test_wrong_signature(tmp_path, function, shapes, dtype, found):
@@ -90,17 +62,6 @@ def test_wrong_platform(tmp_path):
 def test_not_finite(tmp_path):
     path = write_artifact(tmp_path / "nan.bin", lambda x, u: x.at[8].set(x[8] / x[0]))
     with pytest.raises(BlackBoxError, match=r"nan\.bin: components \[8\] .*expected finite numbers"):
-        load(path)
-
-
-def test_calls_into_python_are_refused(tmp_path):
-    def step(x: jax.Array, u: jax.Array) -> jax.Array:
-        return jax.ffi.ffi_call(target, jax.ShapeDtypeStruct(x.shape, x.dtype))(x)
-
-    target = "xla_ffi_python_cpu_callback"
-    checks = [export.DisabledSafetyCheck.custom_call(target)]
-    path = write_artifact(tmp_path / "callback.bin", step, disabled_checks=checks)
-    with pytest.raises(BlackBoxError, match=rf"callback\.bin: found .*{target}"):
         load(path)
 
 

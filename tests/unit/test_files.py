@@ -1,10 +1,11 @@
-"""Folders and files in which nothing is lost."""
+"""Files written together or not at all, and new folders."""
 
 import os
+from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
-from flytrack_env.files import fresh_folder, write_atomically, write_together
+from flytrack_env.files import fresh_folder, write_together
 
 
 def test_files_that_cannot_be_renamed_leave_none_that_is_new(tmp_path, monkeypatch):
@@ -25,13 +26,14 @@ def test_files_that_cannot_be_renamed_leave_none_that_is_new(tmp_path, monkeypat
     assert {path.read_bytes() for path in tmp_path.iterdir()} == {b"after"}
 
 
-def test_a_folder_that_holds_something_is_never_chosen(tmp_path):
+def test_fresh_folders_are_new(tmp_path):
     wanted = tmp_path / "runs" / "demo"
-    assert fresh_folder(wanted) == wanted and not wanted.exists()
-    wanted.mkdir(parents=True)
-    assert fresh_folder(wanted) == wanted
-    for name in ("demo_2", "demo_3"):
-        write_atomically(fresh_folder(wanted) / "final.msgpack", b"kept")
-        assert fresh_folder(wanted) == wanted.with_name(name)
-    (wanted.with_name("demo_3")).write_text("a file")
-    assert fresh_folder(wanted) == wanted.with_name("demo_4")
+    assert fresh_folder(wanted) == wanted and wanted.is_dir()
+    wanted.with_name("demo_2").write_text("a file")
+    assert fresh_folder(wanted) == wanted.with_name("demo_3")
+
+
+def test_no_two_callers_are_given_the_same_folder(tmp_path):
+    with ThreadPoolExecutor(8) as pool:
+        folders = list(pool.map(lambda _: fresh_folder(tmp_path / "demo"), range(40)))
+    assert len(set(folders)) == 40 and all(folder.is_dir() for folder in folders)

@@ -70,29 +70,25 @@ def test_minimal_file_by_hand(tmp_path: Path) -> None:
     assert_same_model(load_model(nested), model)
 
 
-def without(name: str) -> dict[str, Any]:
-    """Return the fields of the minimal file but one."""
-    return {field: value for field, value in FIELDS.items() if field != name}
-
-
 BAD_TEXTS = {
+    "missing field": (json.dumps({"tau": [1, 1, 1, 1]}), "thrust_coeffs: missing"),
     "empty": ("", "not a JSON file"),
     "no json": ("tau = 3", "not a JSON file"),
     "cut short": (MINIMAL[:-4], "not a JSON file"),
     "deep": ("[" * 100_000, "not a JSON file"),
-    "list": ("[1, 2]", "found a list, expected an object"),
-    "number": ("3", "found a int, expected an object"),
+    "list": ("[1, 2]", r"found \[1, 2\], expected an object"),
+    "number": ("3", "found 3, expected an object"),
     "newer": (json.dumps({"version": 2, "parameters": FIELDS}), "version: found 2, expected 1"),
     "version as text": (json.dumps({**FIELDS, "version": "1"}), "version: found '1', expected 1"),
     "parameters as list": (json.dumps({"parameters": [1]}), r"parameters: found \[1\], expected"),
     "parameters as null": (json.dumps({"parameters": None}), "parameters: found None, expected"),
-    "unknown field": (json.dumps({**FIELDS, "mass": 1}), "mass: unknown; expected tau, "),
+    "unknown field": (json.dumps({**FIELDS, "mass": 1}), "mass: unknown; expected one of tau, "),
     "huge integer": (MINIMAL.replace('"m": 1,', f'"m": 1{400 * "0"},'), "m: found 1"),
     "too many digits": (MINIMAL.replace('"m": 1,', f'"m": 1{5000 * "0"},'), "not a JSON file"),
     "effects as list": (json.dumps({**FIELDS, "effects": [1]}), r"effects: found \[1\], expected an object"),
     "unknown effect": (
         json.dumps({**FIELDS, "effects": {"drag": {}}}),
-        "effects: drag: unknown; expected of comm",
+        "effects: drag: unknown; expected one of comm",
     ),
     "effect as number": (
         json.dumps({**FIELDS, "effects": {"wind": 3}}),
@@ -100,7 +96,7 @@ BAD_TEXTS = {
     ),
     "unknown parameter": (
         json.dumps({**FIELDS, "effects": {"wind": {"speed": 3}}}),
-        "effects: wind: speed: unknown; expected of v_x, ",
+        "effects: wind: speed: unknown; expected one of v_x, ",
     ),
     "parameter as text": (
         json.dumps({**FIELDS, "effects": {"wind": {"v_x": "3"}}}),
@@ -138,31 +134,12 @@ def test_effects_by_hand_beside_or_among_the_parameters(tmp_path: Path) -> None:
     assert load_model(path).effects == ()
 
 
-@pytest.mark.parametrize("name", sorted(FIELDS))
-def test_missing_fields_are_named(name: str, tmp_path: Path) -> None:
-    path = tmp_path / "model.json"
-    path.write_text(json.dumps(without(name)), encoding="utf-8")
-    with pytest.raises(ModelFileError, match=rf"^{re.escape(str(path))}: {name}: missing"):
-        load_model(path)
-
-
-VECTORS = [(name, len(value)) for name, value in FIELDS.items() if isinstance(value, list)]
 BAD_VALUES = [
-    *[(name, [1.0] * n, f"{size} finite numbers") for name, size in VECTORS for n in (0, size - 1, size + 1)],
-    *[(name, bad, f"{size} finite numbers") for name, size in VECTORS for bad in (1.0, "x", None)],
-    *[
-        (name, [*[1.0] * (size - 1), bad], "finite")
-        for name, size in VECTORS
-        for bad in ("1", True, None, [1.0], float("nan"), float("inf"))
-    ],
-    *[
-        (name, bad, "a finite number")
-        for name in ("m", "g", "battery_drain_v_per_min")
-        for bad in ([1.0], "1", True, None, float("nan"), float("-inf"), {})
-    ],
+    *[("tau", bad, "4 finite numbers") for bad in ([1.0] * 3, [1.0] * 5, 1.0, "x", None)],
+    *[("max_rate", [618.0, 618.0, bad], "finite") for bad in ("1", True, None, [1.0], float("nan"), 1e39)],
+    *[("m", bad, "a finite number") for bad in ([1.0], "1", True, None, float("inf"), {}, [["x" * 5000]])],
     *[("m", bad, "> 0") for bad in (0, -1.0, 1e-300)],
-    *[("tau", [0.04, 0.04, bad, 0.04], "> 0") for bad in (0.0, -0.01, 1e-50)],  # float32 has none so small
-    ("max_rate", [618.0, -618.0, 120.0], "> 0"),
+    ("tau", [0.04, 0.04, 1e-50, 0.04], "> 0"),  # 0 in float32
 ]
 
 
@@ -170,35 +147,9 @@ BAD_VALUES = [
 def test_bad_values_are_refused(name: str, value: Any, reason: str, tmp_path: Path) -> None:
     path = tmp_path / "model.json"
     path.write_text(json.dumps({**FIELDS, name: value}), encoding="utf-8")
-    with pytest.raises(
-        ModelFileError, match=rf"^{re.escape(str(path))}: {name}: found .*, expected .*{reason}"
-    ):
+    expected = rf"^{re.escape(str(path))}: {name}: found .{{1,300}}, expected .*{reason}"
+    with pytest.raises(ModelFileError, match=expected):
         load_model(path)
-
-
-def test_files_that_cannot_be_read(tmp_path: Path) -> None:
-    binary = tmp_path / "binary.json"
-    binary.write_bytes(b"\xff\xfe\x00")
-    for path in (tmp_path / "none.json", tmp_path, binary):
-        with pytest.raises(ModelFileError, match=rf"^{re.escape(str(path))}: cannot be read: "):
-            load_model(path)
-
-
-def test_endless_and_deep_values_are_refused_in_few_words(tmp_path: Path) -> None:
-    path = tmp_path / "model.json"
-    texts = {
-        "version: found": json.dumps({**FIELDS, "version": "x" * 5000}),
-        "m: found": json.dumps({**FIELDS, "m": [["x" * 5000]] * 500}),
-        "'yyy.*': unknown": json.dumps({**FIELDS, "y" * 5000: 1}),
-        "not a JSON file": "[" * 100_000,
-        "expected 1": json.dumps({**FIELDS, "version": 1})[:-3] + "[" * 900 + "]" * 900 + "}",
-        "found more than 4194304 bytes": json.dumps(FIELDS) + " " * 2**22,
-    }
-    for reason, text in texts.items():
-        path.write_text(text, encoding="utf-8")
-        with pytest.raises(ModelFileError, match=reason) as caught:
-            load_model(path)
-        assert str(caught.value).startswith(str(path)) and len(str(caught.value)) < 600
 
 
 @contextmanager
@@ -244,11 +195,3 @@ def test_missing_folders_are_made_and_old_files_replaced(tmp_path: Path) -> None
     for mass in (1.5, 2.5):
         save_model(path, nominal_parameters()._replace(m=mass), {})
         assert load_model(path).m == mass
-
-
-def test_written_files_have_the_usual_permissions(tmp_path: Path) -> None:
-    usual = tmp_path / "usual.json"
-    usual.write_text("{}", encoding="utf-8")
-    path = tmp_path / "model.json"
-    save_model(path, nominal_parameters(), {})
-    assert path.stat().st_mode == usual.stat().st_mode

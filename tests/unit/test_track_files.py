@@ -12,7 +12,6 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from flytrack_env import toml_file
 from flytrack_env.references import (
     ReferenceFileError,
     is_model_of,
@@ -138,7 +137,7 @@ def test_very_many_dots_in_all_are_refused_soon(tmp_path: Path) -> None:
 
 def test_a_pipe_is_refused(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe.toml")
-    with pytest.raises(TrackError, match=r"pipe\.toml: .*found a pipe or a socket, expected a file"):
+    with pytest.raises(TrackError, match=r"pipe\.toml: .*found a folder, pipe or device"):
         load_track(tmp_path / "pipe.toml")
 
 
@@ -182,21 +181,16 @@ def test_a_key_of_very_many_parts_is_refused_before_it_takes_minutes(tmp_path: P
     path = tmp_path / "dots.toml"
     path.write_text("a" + ".a" * 2**16 + " = 1\n")
     started_s = time.process_time()
-    with pytest.raises(TrackError, match=r"dots\.toml: not a TOML file: line 1: found 65536 dots"):
+    with pytest.raises(TrackError, match=r"dots\.toml: not a TOML file: found lines of very many dots"):
         load_track(path)
     assert time.process_time() - started_s < 1.0
 
 
-def test_large_files_are_refused_unread(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_large_files_are_refused_unread(tmp_path: Path) -> None:
     path = tmp_path / "large.toml"
     with path.open("wb") as file:
         file.truncate(2**40)  # sparse: takes no room
-    with pytest.raises(TrackError, match=r"large\.toml: cannot be read: found more than 262144 bytes"):
-        load_track(path)
-    monkeypatch.setattr(toml_file, "LARGEST_BYTES", 100)
-    path.unlink()
-    path.symlink_to("/dev/zero")
-    with pytest.raises(TrackError, match="found more than 100 bytes"):
+    with pytest.raises(TrackError, match=r"large\.toml: cannot be read: found 1099511627776 bytes"):
         load_track(path)
 
 

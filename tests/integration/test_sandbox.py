@@ -1,0 +1,168 @@
+"""The sandbox's limits, and foreign black boxes tried in it."""
+
+import hashlib
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax import export
+
+from flytrack_env import blackbox, sandbox
+from flytrack_env.blackbox import BlackBoxError, load
+from flytrack_env.sandbox import ResourceLimits, SandboxError
+from tests.support.black_boxes import SHIPPED, write_artifact
+
+FUNCTION = """
+import os, sys, time
+
+def do(argument, content):
+    match argument:
+        case "reverse": print("printed"); return content[::-1]
+        case "raise": raise KeyError("a name")
+        case "exit": sys.exit("enough")
+        case "abort": os.abort()
+        case "spin":
+            while True: pass
+        case "sleep": time.sleep(60.0)
+        case "allocate": return bytes(2**30)[:1]
+        case "write": open(content.decode(), "wb", buffering=0).write(b"x")
+"""
+LIMITS = ResourceLimits(cpu_s=1, memory_bytes=2**27, wall_s=30.0)
+
+
+@pytest.fixture
+def do(tmp_path: Path) -> Callable[..., bytes]:
+    """The function above, in the sandbox."""
+    (tmp_path / "function.py").write_text(FUNCTION)
+    return lambda argument, content=b"", limits=LIMITS: sandbox.run(
+        tmp_path / "function.py", "do", argument, content, limits
+    )
+
+
+def test_a_result_comes_back(do: Callable[..., bytes]) -> None:
+    assert do("reverse", b"\x00\n12") == b"21\n\x00"
+
+
+@pytest.mark.parametrize(
+    ("argument", "message", "kind"),
+    [
+        ("raise", "'a name'", "KeyError"),
+        ("exit", "enough", "SystemExit"),
+        ("abort", r"crashed the process that it was tried in \(SIGABRT\)", ""),
+        ("spin", "took more than 1 s of processor time", ""),
+        ("allocate", r"needs more than 0\.125 GiB of memory", ""),
+        ("write", "File too large|SIGXFSZ", None),
+    ],
+)
+def test_failures_are_reported(
+    argument: str, message: str, kind: str | None, do: Callable[..., bytes], tmp_path: Path
+) -> None:
+    with pytest.raises(SandboxError, match=message) as caught:
+        do(argument, str(tmp_path / "written").encode())
+    assert kind is None or caught.value.kind == kind
+    assert not (tmp_path / "written").exists() or not (tmp_path / "written").read_bytes()
+
+
+def test_waiting_is_limited(do: Callable[..., bytes]) -> None:
+    with pytest.raises(SandboxError, match=r"took more than 0\.5 s"):
+        do("sleep", limits=LIMITS._replace(wall_s=0.5))
+
+
+@pytest.fixture
+def trials(monkeypatch: pytest.MonkeyPatch) -> list[bytes]:
+    """The files that are tried from here on; none has passed yet."""
+    seen: list[bytes] = []
+    run = sandbox.run
+
+    def count(file: Path, function: str, argument: Any, content: bytes, *rest: Any) -> bytes:
+        seen.append(content)
+        return run(file, function, argument, content, *rest)
+
+    monkeypatch.setattr(sandbox, "run", count)
+    monkeypatch.setattr(blackbox, "_PASSED", set())
+    return seen
+
+
+def test_a_black_box_is_tried_once_and_the_shipped_one_never(trials: list[bytes], tmp_path: Path) -> None:
+    assert hashlib.sha256(SHIPPED.read_bytes()).hexdigest() == blackbox.SHIPPED_SHA256
+    load(SHIPPED)
+    assert trials == []
+    path = write_artifact(tmp_path / "one.bin", lambda x, u: 2.0 * x)
+    for box in (load(path), load(path), load(path.rename(tmp_path / "same.bin"))):
+        np.testing.assert_allclose(box.step_vector(np.ones(21), np.zeros(4)), 2.0)
+    assert len(trials) == 1
+
+
+def test_a_script_without_a_guard_may_load_a_black_box(tmp_path: Path) -> None:
+    write_artifact(tmp_path / "a.bin", lambda x, u: 3.0 * x)
+    (tmp_path / "script.py").write_text(
+        "print('ran once')\nfrom flytrack_env import blackbox\nprint(blackbox.load('a.bin'))\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "script.py"], cwd=tmp_path, capture_output=True, text=True, timeout=120
+    )
+    assert done.stdout.splitlines() == ["ran once", "BlackBox('a.bin', state_size=21)"], done.stderr
+
+
+def endless(x: jax.Array, u: jax.Array) -> jax.Array:
+    """Never end from the start state."""
+    return jax.lax.while_loop(lambda c: c[0] >= 0.0, lambda c: 0.5 * c + 1.0, x)
+
+
+def greedy(x: jax.Array, u: jax.Array) -> jax.Array:
+    """Need 4 GiB."""
+    grid = jnp.sin(jnp.arange(2**20, dtype=jnp.float32)[:, None] * jnp.arange(2**10) * x[9])
+    return x + jnp.sum(jnp.sort(grid, axis=0)[::2])
+
+
+def solving(x: jax.Array, u: jax.Array) -> jax.Array:
+    """Call LAPACK."""
+    return x.at[:4].set(jnp.linalg.svd(jnp.eye(4) + u, compute_uv=False))
+
+
+def calling(x: jax.Array, u: jax.Array) -> jax.Array:
+    """Call an unknown function."""
+    return jax.ffi.ffi_call("my callback", jax.ShapeDtypeStruct(x.shape, x.dtype))(x)
+
+
+def nested(x: jax.Array, u: jax.Array) -> jax.Array:
+    """Call functions that call functions, too deeply for the compiler."""
+    step: Callable[..., Any] = lambda x, u: x  # noqa: E731
+    for _ in range(200):
+        step = jax.jit(lambda x, u, inner=step: 0.5 * inner(x, u))
+    return step(x, u)
+
+
+@pytest.mark.parametrize(
+    ("step", "message"),
+    [
+        (endless, "took more than 1 s of processor time"),
+        (greedy, "does not run on the CPU .*Out of memory|needs more than 1 GiB|crashed"),
+        (solving, r"found a call of lapack_\w+, expected a pure function that calls nothing"),
+        (calling, "found a call of my callback, expected a pure function that calls nothing"),
+        (nested, r"crashed the process that it was tried in \(SIGSEGV\)"),
+    ],
+)
+def test_hostile_black_boxes_are_refused(step: Callable[..., Any], message: str, tmp_path: Path) -> None:
+    checks = [export.DisabledSafetyCheck.custom_call("my callback")]
+    depth = sys.getrecursionlimit()
+    sys.setrecursionlimit(20_000)
+    path = write_artifact(tmp_path / "a.bin", step, disabled_checks=checks)
+    sys.setrecursionlimit(depth)
+    with pytest.raises(BlackBoxError, match=rf"^{path}: .*({message})"):
+        load(path, limits=ResourceLimits(cpu_s=1) if step is endless else ResourceLimits())
+
+
+def test_a_trusted_file_is_not_tried_and_may_call_lapack(trials: list[bytes], tmp_path: Path) -> None:
+    box = load(write_artifact(tmp_path / "a.bin", solving), limits=None)
+    assert trials == []
+    np.testing.assert_allclose(box.step_vector(np.zeros(21), np.zeros(4))[:4], 1.0, rtol=1e-5)
+    checks = [export.DisabledSafetyCheck.custom_call("my callback")]
+    with pytest.raises(BlackBoxError, match="found a call of my callback"):
+        load(write_artifact(tmp_path / "b.bin", calling, disabled_checks=checks), limits=None)
