@@ -1,1 +1,1 @@
-"""FlyTrack under RL code of others: what docs/clients.md shows, run by ``make test-clients``."""
+"""FlyTrack with RL code of others: what docs/clients.md shows, run by ``make test-clients``."""

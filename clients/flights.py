@@ -1,4 +1,4 @@
-"""Flights of any policy, and how training is judged by them."""
+"""Flights of any policy, by which training is judged."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -11,7 +11,7 @@ NUM_FLIGHTS = 256
 
 
 class Outcome(NamedTuple):
-    """What a training run changed: means over the flights of an evaluation before it and one after it.
+    """Mean results of an evaluation before a training and of one after it.
 
     Returns are the client's own evaluation; gates are those passed in an episode.
     """
@@ -21,15 +21,10 @@ class Outcome(NamedTuple):
     gates_before: float
     gates_after: float
 
-    @property
-    def return_gain(self) -> float:
-        """How much the mean return rose."""
-        return self.return_after - self.return_before
-
-    @property
-    def gate_gain(self) -> float:
-        """How many gates more an episode passes."""
-        return self.gates_after - self.gates_before
+    def has_gained(self, return_margin: float, gate_margin: float) -> bool:
+        """Return whether return and gates rose by at least these margins."""
+        is_return_gained = self.return_after - self.return_before >= return_margin
+        return is_return_gained and self.gates_after - self.gates_before >= gate_margin
 
 
 def mean_gates(

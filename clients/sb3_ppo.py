@@ -24,7 +24,7 @@ def make_envs(num_envs: int) -> VecMonitor:
 
 def make_ppo(seed: int) -> PPO:
     """Return Stable-Baselines3's PPO for FlyTrack-v0, not trained yet."""
-    torch.set_num_threads(1)  # more of them and JAX's keep each other waiting
+    torch.set_num_threads(1)  # more threads compete with those of JAX
     model = PPO(
         "MlpPolicy",
         make_envs(256),

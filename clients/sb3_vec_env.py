@@ -1,4 +1,4 @@
-"""A Gymnasium vector environment as one of Stable-Baselines3's, which has a protocol of its own."""
+"""A Gymnasium vector environment as a vector environment of Stable-Baselines3."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -10,16 +10,16 @@ from stable_baselines3.common.vec_env import VecEnv
 
 
 class SameStepVecEnv(VecEnv):
-    """Give a Gymnasium vector environment that resets in the same step to Stable-Baselines3.
+    """Adapt a Gymnasium vector environment that resets in the same step to Stable-Baselines3.
 
-    Only the info of an ended episode is passed on, with ``terminal_observation`` and ``TimeLimit.truncated``;
-    the others are empty, because a dict per environment and step costs more than the step.
+    Only infos of ended episodes are passed on, with ``terminal_observation`` and ``TimeLimit.truncated``; the
+    others are empty, because a dict per environment and step costs more than the step.
 
     Args:
         env: what ``gymnasium.make_vec`` returns.
 
     Raises:
-        ValueError: an environment that resets in another step.
+        ValueError: an environment that does not reset in the same step.
     """
 
     def __init__(self, env: gymnasium.vector.VectorEnv):
@@ -31,8 +31,8 @@ class SameStepVecEnv(VecEnv):
         super().__init__(env.num_envs, env.single_observation_space, env.single_action_space)
 
     def reset(self) -> np.ndarray:
-        """Return the observations of episodes that begin, with the seeds and options set before."""
-        # None in every place means: draw on. Gymnasium's vector environments say that with one None.
+        """Return the first observations of new episodes, with the seeds and options set before."""
+        # Stable-Baselines3 has a None per environment where Gymnasium has a single None.
         seeds = None if None in self._seeds else list(self._seeds)
         if any(options != self._options[0] for options in self._options):
             raise ValueError(f"options: found {self._options}, expected the same for every environment")
@@ -72,11 +72,11 @@ class SameStepVecEnv(VecEnv):
 
     def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
         """Raise NotImplementedError: one compiled program steps all environments."""
-        raise NotImplementedError(f"set_attr({attr_name!r}): the environments are not apart")
+        raise NotImplementedError(f"set_attr({attr_name!r}): all environments share one program")
 
     def env_method(self, method_name: str, *args: Any, indices: Any = None, **kwargs: Any) -> list[Any]:
         """Raise NotImplementedError: one compiled program steps all environments."""
-        raise NotImplementedError(f"env_method({method_name!r}): the environments are not apart")
+        raise NotImplementedError(f"env_method({method_name!r}): all environments share one program")
 
     def env_is_wrapped(self, wrapper_class: type, indices: Any = None) -> list[bool]:
         """Return that no environment has a wrapper of its own."""

@@ -53,27 +53,6 @@ def test_the_log_is_that_of_the_episodes_flown(env_id: str) -> None:
 
 
 @every_id
-def test_each_wrapper_alone_gives_what_the_environment_gives(env_id: str) -> None:
-    env, params = gymnax.make(env_id)
-    flat, logged = FlattenObservationWrapper(env), LogWrapper(env)
-    fly = [lambda one=one: fly_at_random(one, params) for one in (env, flat, logged)]
-    (start, outputs), *others = (jax.eval_shape(one) for one in fly)
-    for other_start, others_outputs in others:
-        assert other_start == start
-        assert (others_outputs[0], *others_outputs[2:5]) == (outputs[0], *outputs[2:5])
-        assert others_outputs[5].items() >= outputs[5].items()
-    assert others[0][1][1] == outputs[1] and others[1][1][1].env_state == outputs[1]
-    assert flat.observation_space(params).shape == (int(np.prod(env.observation_space(params).shape)),)
-
-
-def test_flattened_observations_are_the_same_numbers() -> None:
-    env, params = gymnax.make("FlyTrack-v0")
-    flat = FlattenObservationWrapper(env)
-    expected, actual = jax.jit(lambda: (fly_at_random(env, params), fly_at_random(flat, params)))()
-    jax.tree.map(np.testing.assert_array_equal, actual, expected)
-
-
-@every_id
 def test_gymnax_to_gym_wrapper_flies_what_the_environment_flies(env_id: str) -> None:
     env, params = gymnax.make(env_id)
     wrapped = GymnaxToGymWrapper(env, params, seed=0)
