@@ -20,13 +20,8 @@ def measure_seed(name: str, seed: int) -> tuple[bool, tuple[str, ...]]:
     wall_start, cpu_start = time.perf_counter(), time.process_time()
     outcome = client.measure(seed)
     seconds = time.perf_counter() - wall_start, time.process_time() - cpu_start
-    is_reached = outcome.return_gain >= client.RETURN_MARGIN and outcome.gate_gain >= client.GATE_MARGIN
-    return is_reached, (
-        name,
-        str(seed),
-        *(f"{value:.2f}" for value in outcome),
-        *(f"{s:.0f}" for s in seconds),
-    )
+    cells = (name, str(seed), *(f"{value:.2f}" for value in outcome), *(f"{s:.0f}" for s in seconds))
+    return outcome.has_gained(client.RETURN_MARGIN, client.GATE_MARGIN), cells
 
 
 def main() -> None:
