@@ -8,32 +8,35 @@ import subprocess
 import sys
 import warnings
 from importlib.util import find_spec
+from pathlib import Path
 from typing import Any
 
-import cloudpickle
 import gymnasium
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
-from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
-from gymnasium.wrappers import RecordEpisodeStatistics, TimeLimit
-from gymnasium.wrappers.vector import RecordEpisodeStatistics as RecordVectorStatistics
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
+from gymnasium.wrappers import TimeLimit
 
 import flytrack_env
+from flytrack_env.dynamics import nominal_parameters
 from flytrack_env.env import EnvParams, FlyTrack
 from flytrack_env.registration import ENVIRONMENTS
-from tests.support.gymnasium_envs import BASE, make_vector
+from flytrack_env.tracks import load_track, save_track
+
+BASE = "FlyTrack-v0"
 
 IDS = sorted(ENVIRONMENTS)
-# For what takes long to compile: the last row of the table has everything that the others have.
-LAST = list(ENVIRONMENTS)[-1]
-SOME_SLOW_IDS = [pytest.param(env_id, marks=[] if env_id == LAST else pytest.mark.slow) for env_id in IDS]
+SOME_SLOW_IDS = [pytest.param(env_id, marks=[] if env_id == BASE else pytest.mark.slow) for env_id in IDS]
 CRASH = np.full(4, np.nan, np.float32)  # an action that ends the episode
-# Before, Gymnasium's wrapper left out the first step after an end (Gymnasium, pull request 1624).
-COUNTS_EVERY_STEP = tuple(map(int, gymnasium.__version__.split(".")[:2])) >= (1, 4)
 CAUSES = {"crash", "ground", "out_of_bounds", "missed_gate", "battery_empty"}
+
+
+def make_vector(env_id: str = BASE, num_envs: int = 3, **arguments: Any) -> Any:
+    """Return the vector environment of an id."""
+    return gymnasium.make_vec(env_id, num_envs=num_envs, vectorization_mode="vector_entry_point", **arguments)
 
 
 def fly(env: Any, seed: int, num_steps: int = 5) -> np.ndarray:
@@ -177,18 +180,6 @@ def test_truncation_and_termination_are_apart(still: EnvParams) -> None:
     assert terminated and not truncated and info["crash"]
 
 
-def test_returned_arrays_are_the_callers_own() -> None:
-    spoilt, untouched = make_vector(), make_vector()
-    spoilt.reset(seed=1)[0][:] = 7.0
-    untouched.reset(seed=1)
-    for _ in range(3):
-        result = spoilt.step(np.zeros((3, 4), np.float32))
-        expected = untouched.step(np.zeros((3, 4), np.float32))
-        assert_same(result[4], expected[4])
-        for array in (*result[:4], *result[4].values()):
-            array[:] = 1
-
-
 # --- Seeding ------------------------------------------------------------------------------------
 
 
@@ -238,55 +229,7 @@ print(json.dumps([start, env.step([0.1] * 4)[0].tolist(), viewers]))
     assert viewers == []
 
 
-@pytest.mark.slow
-def test_worker_processes_fly_the_same() -> None:
-    # Not "fork": JAX has threads, which a forked process lacks.
-    workers = AsyncVectorEnv([lambda: gymnasium.make(f"flytrack_env:{BASE}")] * 2, context="spawn")
-    try:
-        found = fly_vector(workers, seed=9)
-    finally:
-        workers.close()
-    np.testing.assert_array_equal(found, fly_vector(SyncVectorEnv([lambda: gymnasium.make(BASE)] * 2), 9))
-
-
-def fly_vector(env: Any, seed: int) -> np.ndarray:
-    """Return the observations of two flights from a seeded reset."""
-    action = np.full((2, 4), 0.1, np.float32)
-    return np.stack([env.reset(seed=seed)[0], *(env.step(action)[0] for _ in range(4))])
-
-
 # --- Wrappers and copies ------------------------------------------------------------------------
-
-
-def test_episode_statistics_add_up(still: EnvParams) -> None:
-    env = RecordEpisodeStatistics(gymnasium.make(BASE, params=still))
-    env.reset(seed=0)
-    rewards = []
-    for _ in range(12):
-        *_, info = result = env.step(np.array([0.0, 0.0, 0.0, 0.5]))
-        rewards.append(result[1])
-    assert info["episode"]["l"] == 12
-    np.testing.assert_allclose(info["episode"]["r"], sum(rewards), rtol=1e-5)
-
-
-def test_vector_episode_statistics_add_up(still: EnvParams) -> None:
-    env = RecordVectorStatistics(make_vector(params=still))
-    env.reset(seed=0)
-    totals, lengths, ends = np.zeros(3), np.zeros(3, int), np.zeros(3, int)
-    for index in range(20):
-        actions = np.tile([0.0, 0.0, 0.0, 0.5], (3, 1))
-        if index == 4:
-            actions[1] = CRASH
-        _, rewards, terminated, truncated, infos = env.step(actions)
-        totals, lengths = totals + rewards, lengths + 1
-        done = terminated | truncated
-        if done.any():
-            np.testing.assert_array_equal(infos["_episode"], done)
-            checked = done if COUNTS_EVERY_STEP else done & (ends == 0)
-            np.testing.assert_allclose(infos["episode"]["r"][checked], totals[checked], rtol=1e-5)
-            np.testing.assert_array_equal(infos["episode"]["l"][checked], lengths[checked])
-            totals[done], lengths[done], ends = 0.0, 0, ends + done
-    assert ends.tolist() == [1, 2, 1]
 
 
 @pytest.mark.parametrize("is_vector", [False, True])
@@ -302,9 +245,173 @@ def test_copies_fly_on_alike_and_apart(is_vector: bool) -> None:
         np.testing.assert_array_equal(again, flown)
 
 
-def test_constructors_survive_cloudpickle(params: EnvParams) -> None:
-    short = params.replace(max_steps_in_episode=1)
-    make_env = cloudpickle.loads(cloudpickle.dumps(lambda: gymnasium.make(BASE, params=short)))
-    env = make_env()
+# --- Options of reset ---------------------------------------------------------------------------
+
+POSE = {"position": (15.0, 2.5, 1.2), "yaw_deg": 180.0, "velocity": [-9.0, 0.0, 1.0], "battery_v": 22.5}
+
+
+@pytest.mark.parametrize("is_vector", [False, True])
+def test_options_set_the_start_of_one_episode(is_vector: bool) -> None:
+    env = make_vector() if is_vector else gymnasium.make(BASE)
+    observation = np.atleast_2d(env.reset(seed=0, options=POSE)[0])
+    # Gate 0 at (12.5, 2, 1.35) is flown towards -x.
+    np.testing.assert_allclose(
+        observation[:, :3], [[-2.5 / 3, -0.5 / 3, -0.15 / 3]] * len(observation), atol=1e-5
+    )
+    np.testing.assert_allclose(observation[:, 3:6], [[9 / 5, 0.0, 1 / 5]] * len(observation), atol=1e-5)
+    np.testing.assert_allclose(observation[:, 6:15], [np.eye(3).ravel()] * len(observation), atol=1e-5)
+    np.testing.assert_allclose(observation[:, 15:18], 0.0, atol=1e-6)
+    np.testing.assert_allclose(
+        observation[:, 18:23], [[0.0, 0.0, 0.0, -1.0, -0.5]] * len(observation), atol=1e-5
+    )
+    following = np.atleast_2d(env.reset()[0])
+    assert (abs(following[:, 22] + 0.5) > 1e-3).all()
+
+
+def test_battery_alone_leaves_the_drawn_start_as_it_is() -> None:
+    for env, size in ((gymnasium.make(BASE), ()), (make_vector(), (3,))):
+        drawn = env.reset(seed=4)[0]
+        lowered = env.reset(seed=4, options={"battery_v": 22.25})[0]
+        np.testing.assert_allclose(lowered[..., 22], np.full(size, -0.75), atol=1e-5)
+        np.testing.assert_allclose(np.delete(lowered, 22, -1), np.delete(drawn, 22, -1), atol=1e-5)
+
+
+def test_gate_and_quaternion_options() -> None:
+    env = gymnasium.make(BASE)
+    gate = load_track("flytrack").gates[3]
+    options = {"gate_index": 3, "position": gate.position, "quaternion": (0.0, 0.0, 0.0, 1.0)}
+    observation, _ = env.reset(options=options)
+    np.testing.assert_allclose(observation[:3], 0.0, atol=1e-6)
+    # Gate 3 is flown towards +y; the drone faces -x, which is to the left.
+    np.testing.assert_allclose(observation[6:15], [0, -1, 0, 1, 0, 0, 0, 0, 1], atol=1e-5)
+    start = env.reset(options={"gate_index": 0})[0]
+    np.testing.assert_allclose(start[:3], [-6.1 / 3, 0.0, -1.25 / 3], atol=1e-5)
+    np.testing.assert_allclose(start[3:6], 0.0, atol=1e-6)
+    assert start[22] == 1.0
+
+
+@pytest.mark.parametrize("is_vector", [False, True])
+def test_a_track_stays_until_another_is_named(is_vector: bool, row_track: Any, tmp_path: Path) -> None:
+    path = tmp_path / "row.toml"
+    num_gates = 8 if is_vector else 3  # another number of gates compiles anew
+    save_track(path, row_track([10.0 * index for index in range(num_gates)]))
+    env = make_vector() if is_vector else gymnasium.make(BASE)
+    at_start = {"gate_index": 0}
+    home = np.atleast_2d(env.reset(options=at_start)[0])
+    for options in ({"track": path} | at_start, at_start):
+        observation = np.atleast_2d(env.reset(options=options)[0])
+        np.testing.assert_allclose(observation[:, :3], [[-5 / 3, 0.0, 0.0]] * len(observation), atol=1e-5)
+    action = np.zeros((3, 4)) if is_vector else np.zeros(4)
+    distance = env.step(action)[4]["gate_distance_m"]
+    np.testing.assert_allclose(distance, 5.0, atol=0.1)
+    back = np.atleast_2d(env.reset(options={"track": "flytrack"} | at_start)[0])
+    np.testing.assert_array_equal(back, home)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"speed": 3.0}, r"options: found 'speed', expected one of position, .*track"),
+        ([1], "options: found list, expected a dict"),
+        ({"position": (1.0, 2.0)}, r"options\['position'\]: found \(1.0, 2.0\), expected 3 finite numbers"),
+        ({"position": (1.0, (2.0,), 3.0)}, "position.*expected 3 finite numbers"),
+        ({"position": (100.0, 2.0, 1.0)}, "position.*expected within the bounds"),
+        ({"quaternion": (1.0, 1.0, 0.0, 0.0)}, "quaternion.*expected norm 1"),
+        ({"quaternion": (1.0, 0.0, 0.0, 0.0), "yaw_deg": 3.0}, "expected one of them"),
+        ({"yaw_deg": True}, "yaw_deg.*found True, expected a finite number"),
+        ({"velocity": (1e39, 0.0, 0.0)}, "velocity.*expected 3 finite numbers"),
+        ({"velocity": (0.0, -1001.0, 0.0)}, "velocity.*expected at most 1000 m/s along every axis"),
+        ({"battery_v": 21.9}, "battery_v.*found 21.9, expected above 22 and up to 24 V"),
+        ({"gate_index": 8}, "gate_index.*found 8, expected an integer from 0 to 7"),
+        ({"gate_index": True}, "gate_index.*expected an integer from 0 to 7"),
+        ({"track": "nowhere"}, "track: found 'nowhere', expected one of"),
+        ({"track": 3}, r"options\['track'\]: found int, expected a name, a path or a Track"),
+    ],
+)
+def test_bad_options_are_refused_and_change_nothing(options: Any, message: str) -> None:
+    env, vector = gymnasium.make(BASE), make_vector()
+    for each in (env, vector):
+        each.reset(seed=1)
+        with pytest.raises(ValueError, match=message):
+            each.reset(seed=2, options=options)
+    np.testing.assert_array_equal(env.reset()[0], following_of_seed(env, 1))
+
+
+def following_of_seed(env: Any, seed: int) -> np.ndarray:
+    """Return the second start after a seeded reset."""
+    env.reset(seed=seed)
+    return env.reset()[0]
+
+
+# --- Arguments and misuse ----------------------------------------------------------------------------------
+
+
+def test_arguments_reach_the_environment(params: EnvParams, row_track: Any) -> None:
+    # Past the plane of a gate, outside its frame.
+    beside = {"position": (-0.05, 4.0, 2.0), "velocity": (10.0, 0.0, 0.0)}
+    beside["track"] = row_track([10.0 * index for index in range(8)])
+    for arguments, is_end in (({"missed_gate": "fly_on"}, False), ({}, True)):
+        env = gymnasium.make(BASE, **arguments)
+        env.reset(options=beside)
+        assert env.step(np.zeros(4))[2] is is_end
+    with pytest.raises(ValueError, match="missed_gate"):
+        gymnasium.make(BASE, missed_gate="sometimes")
+    with pytest.raises(TypeError, match="params: found dict, expected EnvParams"):
+        gymnasium.make(BASE, params={})
+    with pytest.raises(ValueError, match="drone_radius"):
+        make_vector(params=params.replace(drone_radius=1.0))
+    with pytest.raises(ValueError, match=r"params\.model\.m: found shape \(3,\), expected \(\)"):
+        gymnasium.make(BASE, params=params.replace(model=params.model._replace(m=np.ones(3))))
+
+
+def test_track_files_are_read_again(row_track: Any, tmp_path: Path) -> None:
+    path = tmp_path / "track.toml"
+    for far in (10.0, 30.0):
+        save_track(path, row_track([0.0, far]))
+        observation, _ = gymnasium.make(BASE, track=str(path)).reset(options={"gate_index": 1})
+        np.testing.assert_allclose(observation[0], -(far + 5.0) / 3.0, atol=1e-4)
+
+
+def test_wrong_use_is_refused() -> None:
+    env, vector = gymnasium.make(BASE).unwrapped, make_vector()
+    for each in (env, vector):
+        with pytest.raises(gymnasium.error.ResetNeeded, match="expected a reset"):
+            each.step(np.zeros(each.action_space.shape))
+        each.reset()
+        with pytest.raises(ValueError, match=r"actions?: found shape \(5,\), expected"):
+            each.step(np.zeros(5))
+        assert each.render() is None
+        with pytest.raises(ValueError, match="render_mode: found 'ansi', expected None, "):
+            type(each)(BASE, render_mode="ansi")
+    with pytest.raises(ValueError, match="num_envs: found 0"):
+        make_vector(num_envs=0)
+
+
+@pytest.mark.parametrize("overrides", [{"model": nominal_parameters()}, {"reward": {"gate_pass": 2.0}}])
+def test_arguments_of_numbers_are_compiled_once(overrides: dict[str, Any]) -> None:
+    """Also where a track is named in every reset, which compiled anew as often."""
+    env, again = (gymnasium.make(BASE, **overrides).unwrapped for _ in range(2))
+    programs = env._simulation.programs
+    assert again._simulation.programs is programs
+    for name in ("figure_eight", "flytrack"):  # of as many gates
+        env.reset(options={"track": name})
+        assert env._simulation.programs is programs and env._simulation.env.track.name == "flytrack"
+    heavier = nominal_parameters()._replace(m=1.1)
+    assert gymnasium.make(BASE, model=heavier).unwrapped._simulation.programs is not programs
+
+
+def test_actions_beyond_float32_are_clipped_without_a_warning() -> None:
+    for env in (gymnasium.make(BASE, disable_env_checker=True), make_vector()):
+        env.reset(seed=0)
+        found = env.step(np.full(env.action_space.shape, -1e300))[0]
+        env.reset(seed=0)
+        np.testing.assert_array_equal(found, env.step(np.full(env.action_space.shape, -1.0))[0])
+
+
+def test_a_vector_environment_counts_steps_for_ever() -> None:
+    env = make_vector()
     env.reset(seed=0)
-    assert env.step(np.zeros(4))[3] is True
+    env._count = 2**32 - 1
+    for _ in range(2):
+        env.step(np.zeros(env.action_space.shape))
+    assert env._count == 1

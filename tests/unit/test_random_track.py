@@ -11,7 +11,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from flytrack_env.env import FlyTrack
 from flytrack_env.quaternion import Vec3
 from flytrack_env.tracks import (
     DEMANDS,
@@ -28,7 +27,7 @@ from flytrack_env.tracks import (
     save_track,
 )
 
-NUM_SEEDS = 100
+NUM_SEEDS = 40
 NUM_SAMPLES = 100
 DRONE_RADIUS = 0.15
 BEYOND = 3  # samples of the next way: enough to be through the gate at the end of this one
@@ -40,9 +39,9 @@ def drawn() -> list[Track]:
     return [random_track(seed) for seed in range(NUM_SEEDS)]
 
 
-def test_only_feasible_courses_are_drawn(drawn: list[Track]) -> None:
-    for track in drawn:
-        assert find_problems(track) == (), track.name
+def test_only_feasible_courses_are_drawn_and_all_differ(drawn: list[Track]) -> None:
+    assert all(find_problems(track) == () for track in drawn)
+    assert len({track.gates for track in drawn}) == len({track.name for track in drawn}) == NUM_SEEDS
 
 
 def cross_all(gates: Any, starts: jax.Array, ends: jax.Array) -> Any:
@@ -86,11 +85,6 @@ def test_way_of_shipped_tracks_passes_every_gate_in_turn(name: str) -> None:
     assert_flies_through(load_track(name))
 
 
-def test_courses_are_distinct(drawn: list[Track]) -> None:
-    assert len({track.gates for track in drawn}) == NUM_SEEDS
-    assert len({track.name for track in drawn}) == NUM_SEEDS
-
-
 def test_course_is_a_function_of_the_key(drawn: list[Track]) -> None:
     for seed in range(10):
         same = (
@@ -130,12 +124,7 @@ def test_courses_vary(drawn: list[Track]) -> None:
     assert heights.min() < 1.5 and heights.max() > 3.9
 
 
-def test_both_senses_of_turning_on_most_courses(drawn: list[Track]) -> None:
-    turns = np.array([turns_of(track) for track in drawn])
-    assert ((turns > 0.2).any(axis=1) & (turns < -0.2).any(axis=1)).mean() > 0.5
-
-
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=15, deadline=None)
 @given(
     seed=st.integers(0, 2**32 - 1),
     num_gates=st.integers(3, 12),
@@ -159,32 +148,10 @@ def test_arguments_are_kept(
     assert_flies_through(track)
 
 
-def test_start_stands_before_the_first_gate_and_faces_it(drawn: list[Track]) -> None:
-    for track in drawn:
-        first = np.array(track.gates[0].position)
-        yaw = 2.0 * math.atan2(track.start_quaternion[3], track.start_quaternion[0])
-        way = (first - track.start_position)[:2]
-        np.testing.assert_allclose(way, 6.0 * np.array([math.cos(yaw), math.sin(yaw)]), atol=0.01)
-        assert track.start_position[2] == 0.1
-
-
 def test_courses_are_saved_and_read_back_equal(drawn: list[Track], tmp_path: Path) -> None:
     for track in drawn:
         save_track(tmp_path / "random.toml", track)
         assert load_track(tmp_path / "random.toml") == track
-
-
-def test_environment_takes_a_random_course(tmp_path: Path) -> None:
-    track = random_track(3)
-    save_track(tmp_path / "mine.toml", track)
-    for given_track in (track, tmp_path / "mine.toml"):
-        env = FlyTrack(track=given_track)
-        assert env.track == track
-        key = jax.random.key(0)
-        observation, state = env.reset(key, env.default_params)
-        assert np.isfinite(observation).all()
-        outputs = jax.eval_shape(env.step, key, state, jnp.zeros(4), env.default_params)
-        assert outputs[0].shape == observation.shape
 
 
 @pytest.mark.parametrize(
@@ -193,12 +160,9 @@ def test_environment_takes_a_random_course(tmp_path: Path) -> None:
         ({"num_gates": 2}, "num_gates: found 2, expected at least 3"),
         ({"size": (30.0, 10.0)}, r"size: found \(30.0, 10.0\), expected more than 10 m each"),
         ({"size": (math.nan, 30.0)}, "size: found"),
-        ({"size": (30.0, math.inf)}, "size: found"),
         ({"heights": (1.0, 3.0)}, r"heights: found \(1.0, 3.0\), expected a range from 1.35 m upwards"),
-        ({"heights": (3.0, 2.0)}, "heights: found"),
         ({"heights": (2.0, math.inf)}, "heights: found"),
         ({"key": -1}, "key: found -1, expected 0 to 4294967295"),
-        ({"key": 2**32}, "key: found 4294967296"),
         ({"key": jnp.zeros((3, 2), jnp.uint32)}, r"key: found uint32 of shape \(3, 2\), expected one key"),
         ({"key": jnp.zeros(2)}, "key: found float32 of shape"),
     ],
@@ -206,11 +170,6 @@ def test_environment_takes_a_random_course(tmp_path: Path) -> None:
 def test_bad_arguments_are_refused(arguments: dict[str, Any], message: str) -> None:
     with pytest.raises(TrackError, match=message):
         random_track(**{"key": 0, **arguments})
-
-
-def test_batch_of_typed_keys_is_refused() -> None:
-    with pytest.raises(TrackError, match=r"key: found uint32 of shape \(2, 2\), expected one key"):
-        random_track(jax.random.split(jax.random.key(0)))
 
 
 @pytest.mark.parametrize(
