@@ -1,4 +1,4 @@
-"""Identification of a plant: fly an excitation on it, fit a model, say how good it is and what is left."""
+"""System identification: fly an excitation, fit a model, validate it and diagnose what it lacks."""
 
 from flytrack_env.extras import check_installed
 

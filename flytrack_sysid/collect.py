@@ -1,7 +1,7 @@
-"""Collecting data: the excitation flown on a plant, as a flight log.
+"""Collection of flight logs: an excitation or a script flown on a plant.
 
-A plant is anything with the contract of ``flytrack_env.plants`` or a function ``step(x, u)`` of the
-handout's vectors. Only what comes out of it is used.
+A plant is a ``flytrack_env.plants.Plant`` or a function ``step(x, u)`` of the handout's vectors. Only its
+outputs are used.
 
 Envelope: a flight ends where the drone would become faster than 20 m/s, leave heights between 10 and
 110 m, or leave 22 to 24 V. A script may go down to 0.1 m.
@@ -16,13 +16,7 @@ import numpy as np
 
 from flytrack_env.dynamics import nominal_parameters
 from flytrack_env.plants import Plant
-from flytrack_env.state import (
-    ACCELERATION,
-    STATE_SIZE,
-    pack,
-    unpack,
-    unpack_action,
-)
+from flytrack_env.state import ACCELERATION, STATE_SIZE, pack, unpack, unpack_action
 from flytrack_sysid import excitation
 from flytrack_sysid.envelope import FEWEST_STEPS, HEIGHTS, MIDDLE_V, SCRIPT_HEIGHTS, is_inside
 from flytrack_sysid.excitation import DT_S, FLIGHT_STEPS, FLIGHTS_PER_KIND, KINDS, start_state
@@ -43,8 +37,8 @@ class CollectError(ValueError):
 
 
 def _fly_plant(plant: Plant) -> Fly:
-    """Return a function that flies a plant of ``flytrack_env.plants`` from starts, all at once."""
-    model = nominal_parameters()  # part of the contract; a black box does not look at it
+    """Return a function that flies a plant from all starts at once."""
+    model = nominal_parameters()  # part of the contract; a black box ignores it
 
     def fly_one(start: jax.Array, command: jax.Array) -> jax.Array:
         def step(state: Any, action: jax.Array) -> tuple[Any, jax.Array]:
@@ -90,7 +84,7 @@ def _fly_function(step: StepFunction, report: Report) -> Fly:
 
 
 def _fly_any(plant: Plant | StepFunction, report: Report) -> Fly:
-    """Return a function that flies a plant, or one that calls a function of the state."""
+    """Return a function that flies a plant or a step function."""
     return _fly_plant(plant) if isinstance(plant, Plant) else _fly_function(plant, report)
 
 
@@ -126,10 +120,10 @@ def collect(
 ) -> FlightLog:
     """Fly the excitation, or a script, on a plant and return the log, a segment per flight.
 
-    plant: a plant, or a function ``(x (21,), u (4,)) -> x (21,)``, 0.01 s a step, called from chosen
-    states. minutes: of flight before the envelope ends any, at least 1. noise: 0 logs the state as it is;
-    1 as common sensors would (``flytrack_sysid.sensors``). report: called with flights done and to do.
-    script: flown instead of the excitation, whatever minutes says; the plant's hover is not looked up.
+    plant: a plant, or a function ``(x (21,), u (4,)) -> x (21,)`` of a step of 0.01 s, started from chosen
+    states. minutes: of flight before the envelope cuts any, at least 1. noise: 0 logs the state itself, 1
+    what common sensors measure (``flytrack_sysid.sensors``). report: called with the flights done and in
+    all. script: flown instead of the excitation; minutes and the plant's hovering thrust are not used.
 
     Raises:
         CollectError: minutes, seed or noise out of range, a plant that does not fly or returns no state.
@@ -157,7 +151,7 @@ def collect(
 
 
 def _states(fly: Fly, flown: Script) -> tuple[np.ndarray, np.ndarray]:
-    """Return the states (N, T, 21) of a script and the commands (N, T, 4) given in them, float32."""
+    """Return the states (N, T, 21) of a script's flights and their commands (N, T, 4), float32."""
     starts, commands = flown.starts.astype(np.float32), flown.commands.astype(np.float32)
     # One step ahead of the log, so that the first row's acceleration is the plant's, not the start's.
     states = fly(starts, np.concatenate([commands[:, :1], commands], axis=1))
@@ -173,7 +167,7 @@ def _states(fly: Fly, flown: Script) -> tuple[np.ndarray, np.ndarray]:
 def _cut(
     states: np.ndarray, commands: np.ndarray, heights: tuple[float, float]
 ) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Return the part of each flight before it leaves the envelope; none of very short ones."""
+    """Return the part of each flight before it leaves the envelope, without those of less than two rows."""
     inside = is_inside(states, heights)
     lengths = np.where(inside.all(axis=1), states.shape[1], np.argmin(inside, axis=1))
     kept = [(x[:n], u[:n]) for x, u, n in zip(states, commands, lengths, strict=True) if n >= FEWEST_STEPS]

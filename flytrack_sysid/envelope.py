@@ -1,4 +1,4 @@
-"""Where collected flights stay: how fast, how high, at which voltage."""
+"""The envelope of collected flights: speed, height and voltage."""
 
 import numpy as np
 
@@ -10,7 +10,7 @@ SCRIPT_HEIGHTS = (0.1, 110.0)  # m, of a script, which may want flights close to
 VOLTAGES = (BATTERY_EMPTY_V, BATTERY_FULL_V)
 ANY_VOLTAGE = (0.0, np.inf)  # of other craft
 MIDDLE_V = 0.5 * (BATTERY_EMPTY_V + BATTERY_FULL_V)
-FEWEST_STEPS = 2  # of a flight; shorter ones say nothing
+FEWEST_STEPS = 2  # of a flight; a shorter one shows no step
 
 
 def is_inside(
@@ -18,7 +18,7 @@ def is_inside(
     heights: tuple[float, float] = HEIGHTS,
     voltages: tuple[float, float] = VOLTAGES,
 ) -> np.ndarray:
-    """Return where states (..., 21) are within the envelope; nowhere that they are no numbers.
+    """Return where states (..., 21) are within the envelope; NaN is not.
 
     heights: lowest and highest, m. voltages: lowest and highest, V.
     """

@@ -1,7 +1,7 @@
-"""Excitation: short flights that move one thing at a time, from chosen states.
+"""Excitation: short flights that excite one axis at a time, from chosen states.
 
 ==========  =====================================================================================
-kind        what is flown, from a state of its own at a voltage of its own
+kind        what is flown, each from a different state and voltage
 ==========  =====================================================================================
 roll,       chirp then step, or doublet then sine, on this axis alone and about hovering thrust,
 pitch, yaw  at amplitudes from a tenth of the stick to all of it
@@ -37,21 +37,21 @@ FLIGHT_STEPS = 2 * SLOT_STEPS
 FLIGHTS_PER_KIND = 4
 KINDS = ("roll", "pitch", "yaw", "thrust", "free", "leg")
 AMPLITUDES = (0.1, 0.3, 0.6, 1.0)
-# Where each wave begins to go round the amplitudes: the last of four, which may be held out, has a step
-# that shows, and no full stick, which tells the fit most.
+# The index at which each wave starts to cycle through the amplitudes: the last of four flights, which may be
+# held out, has a large step, and no full stick, which is the most informative for the fit.
 FIRST_AMPLITUDE = {"chirp": 2, "step": 3, "doublet": 3, "sine": 2}
 FREE_AMPLITUDES = (0.3, 0.5, 0.8, 1.0)
 LEG_SPEEDS = (3.0, 7.0, 11.0, 15.0)  # m/s
 HEIGHT = 60.0  # m, at the start of each flight
 LEG_SWING, LEG_STICK = 0.3, 0.2
-# How long switching commands are held: fast ones tell of lags, slow ones let thrust get to the end.
+# How long switching commands are held: fast ones identify lags, slow ones let thrust settle.
 FAST_STEPS, SLOW_STEPS = (3, 12), (15, 40)
-# Above empty: what the flight itself takes, at any drain that leaves a flight of a minute.
+# V above empty: the drain of the flight itself, for any battery that lasts a minute.
 RESERVE_V = 0.1
 
 
 class ScriptedFlight(NamedTuple):
-    """One flight: kind, start (21,) and commands (FLIGHT_STEPS, 4), before anything is clipped."""
+    """One flight of a script: kind, start (21,) and commands (FLIGHT_STEPS, 4), not clipped yet."""
 
     kind: str
     start: np.ndarray
@@ -102,7 +102,7 @@ def start_state(
 
 
 def _axis_command(axis: int, turn: int, number: int, hover: float, rng: np.random.Generator) -> np.ndarray:
-    """Return two waves on one axis; kinds of waves alternate by turn, amplitudes go round by number."""
+    """Return two waves on one axis; kinds of waves alternate by turn, amplitudes cycle by number."""
     names = ("chirp", "step") if turn % 2 == 0 else ("doublet", "sine")
     command = np.tile([0.0, 0.0, 0.0, hover], (FLIGHT_STEPS, 1))
     for slot, name in enumerate(names):
@@ -141,9 +141,9 @@ def _flight(
 def _voltages(kind: str, turns: int, rng: np.random.Generator) -> np.ndarray:
     """Return the voltages of a kind's flights, (turns, 4), between nearly empty and full.
 
-    Closer together towards both ends, which tell most of how thrust depends on the voltage. In random
-    order, but for the last of every four, which may be held out: each turn's lies in a range of its own,
-    and that of each kind elsewhere in it.
+    Denser towards both ends, which are the most informative on how thrust depends on the voltage. In random
+    order, except for the last of every four, which may be held out: these are spread over the range by turn
+    and kind.
     """
     lowest, count = BATTERY_EMPTY_V + RESERVE_V, turns * FLIGHTS_PER_KIND
     share = 0.5 - 0.5 * np.cos(np.pi * np.arange(count) / (count - 1))

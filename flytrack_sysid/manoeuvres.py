@@ -1,7 +1,7 @@
-"""Manoeuvres: flights that settle one question each, from chosen states.
+"""Manoeuvres: flights that answer one question each, from chosen states.
 
-Where the excitation (``flytrack_sysid.excitation``) moves everything a little, a manoeuvre does one thing
-often: eight flights of 2.5 s. What each is for, and how to fly it on a real drone, says ``MANOEUVRES``.
+The excitation (``flytrack_sysid.excitation``) excites everything a little; a manoeuvre repeats one thing:
+eight flights of 2.5 s. ``MANOEUVRES`` says how to fly each on a real drone.
 """
 
 from collections.abc import Callable, Iterable
@@ -38,19 +38,19 @@ from flytrack_sysid.excitation import (
     wave,
 )
 
-# All manoeuvres last as long, so that they can be compared. Even: two flights fill a lane of a diagnosis.
+# All manoeuvres have the same length to be comparable. Even: two flights fill a lane of a diagnosis.
 FLIGHTS_PER_MANOEUVRE = 8
 SECONDS_PER_MANOEUVRE = FLIGHTS_PER_MANOEUVRE * FLIGHT_STEPS * DT_S
 STARTS_V = np.linspace(BATTERY_EMPTY_V + RESERVE_V, BATTERY_FULL_V, FLIGHTS_PER_MANOEUVRE)
-SWING_HZ = 1.0  # of a thrust that goes up and down about hovering
-HOVER_SWING = 0.05  # of the stick: nobody holds it still
+SWING_HZ = 1.0  # of a thrust that oscillates about hovering
+HOVER_SWING = 0.05  # of the stick: no pilot holds it still
 VOLTAGE_SWING = 0.5
 STEEPNESS = 0.8  # climb of a leg over its speed along the ground, in turns up and down
 LOW_HEIGHTS = (0.2, 0.35, 0.6, 1.0)  # m: a rotor's radius or two, where the ground is felt
 LOW_SPEED = 2.0  # m/s, of every other low pass
 TILTS_DEG = (20.0, 40.0, 60.0, 80.0)
 QUICK_STEPS = (1, 6)  # how long fast switching is held
-# m/s upwards at the start of flips, whose thrust lifts nothing on average: half of what is lost in a flight.
+# m/s upwards at the start of flips, whose thrust lifts nothing on average: half of what a flight loses.
 FLIP_CLIMB = 0.5 * 9.8 * FLIGHT_STEPS * DT_S
 SPIN_STICKS = (
     *((sign, 0.0, 0.0) for sign in (1.0, -1.0)),
@@ -88,7 +88,7 @@ def _start(
 
 
 def _swing(hover: float, size: float, rng: np.random.Generator) -> np.ndarray:
-    """Return centred sticks and a thrust that goes slowly up and down about hovering, (FLIGHT_STEPS, 4)."""
+    """Return centred sticks and a thrust that oscillates slowly about hovering, (FLIGHT_STEPS, 4)."""
     command = np.zeros((FLIGHT_STEPS, 4))
     time = np.arange(FLIGHT_STEPS) * DT_S
     command[:, 3] = hover + size * np.sin(2 * np.pi * SWING_HZ * time + rng.uniform(0, 2 * np.pi))
@@ -180,8 +180,8 @@ MANOEUVRES = {
 def hover_action(model: ModelParameters, voltages: tuple[float, float] = VOLTAGES) -> float:
     """Return the thrust action at which a model's thrust curve holds its weight, half-way between voltages.
 
-    The nearest end of the stick for a model that no thrust holds. Effects are left out: they change it by
-    less than matters to where a flight begins.
+    The nearest end of the stick if none does. Effects are ignored: they matter little to where a flight
+    starts.
     """
     middle_v = 0.5 * sum(voltages)
     coeffs: Any = np.asarray(model.thrust_coeffs, float)
@@ -199,7 +199,7 @@ def flights_of(
 ) -> list[ScriptedFlight]:
     """Return the flights of manoeuvres, eight of each, in the order of the names.
 
-    hover: the thrust action that holds the weight. The flights of a manoeuvre do not depend on the others.
+    hover: the thrust action that holds the weight. A manoeuvre's flights do not depend on the other names.
     voltages: of an empty and a full battery, V.
 
     Raises:

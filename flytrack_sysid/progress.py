@@ -1,10 +1,10 @@
-"""A progress bar for what calls back with how much is done: ``collect``, ``diagnose``."""
+"""A progress bar as a callback of ``collect``, ``fit`` and ``diagnose``."""
 
 from tqdm import tqdm
 
 
 class ProgressBar:
-    """A bar to be called with what is done and what there is to do; shown on terminals only."""
+    """A bar that is called with the amounts done and in all; shown on terminals only."""
 
     def __init__(self, unit: str):
         self.bar = tqdm(unit=f" {unit}", leave=False, disable=None)

@@ -1,4 +1,4 @@
-"""Sensors: what a log shows of a flight when it is measured instead of known."""
+"""Sensors: noise, quantisation and lost rows of a measured flight log."""
 
 from dataclasses import replace
 
@@ -13,7 +13,7 @@ ACCELEROMETER_NOISE = 1.5  # m/s^2
 VELOCITY_NOISE = 0.05  # m/s
 POSITION_NOISE = 0.01  # m
 ATTITUDE_NOISE_DEG = 0.5
-# Steps of the numbers that are logged, at any level: 16 bits over 2000 deg/s and 16 g; mm/s, mm, 10 mV.
+# Quantisation of the log, at any level: 16 bits over 2000 deg/s and 16 g; mm/s, mm, 10 mV.
 GYRO_STEP = 4000.0 / 2**16 * np.pi / 180.0  # rad/s
 ACCELEROMETER_STEP = 32.0 * 9.80665 / 2**16  # m/s^2
 VELOCITY_STEP, POSITION_STEP, QUATERNION_STEP, BATTERY_STEP = 1e-3, 1e-3, 1e-4, 0.01
@@ -34,8 +34,8 @@ def specific_force_b(log: FlightLog, gravity: float) -> np.ndarray:
 def measure(log: FlightLog, level: float, gravity: float, rng: np.random.Generator) -> FlightLog:
     """Return a log as sensors would have written it: noisy, quantised, with rows lost.
 
-    level: 1 for the noise of this module, 0 for none. Known accelerations become an accelerometer's
-    specific force, and the applied action, which nobody measures, is absent.
+    level: 1 for the noise of this module, 0 for none. Accelerations become an accelerometer's specific
+    force, and the applied action, which is not measured, is absent.
     """
 
     def noisy(values: np.ndarray, noise: float, step: float) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""The clearest commanded steps of a log, and the model's answer to them."""
+"""Responses to the largest commanded steps of a log, measured and modelled."""
 
 from typing import Any, NamedTuple
 
@@ -49,9 +49,9 @@ class StepResponse(NamedTuple):
 
 
 def measured_rates(log: FlightLog, steps: Steps) -> np.ndarray | None:
-    """Return the body rates, (num_rows, 3) rad/s: w, else those between attitudes; None without either.
+    """Return the body rates, (num_rows, 3) rad/s: w, else from q; None without either.
 
-    Between attitudes: the rate that led to the row, as in the simulator; NaN behind a gap.
+    From q: the rate of the step that led to the row, as in the simulator; NaN behind a gap.
     """
     if "w" in log:
         return log["w"]
@@ -64,7 +64,7 @@ def measured_rates(log: FlightLog, steps: Steps) -> np.ndarray | None:
 
 
 def _steps_in(time: np.ndarray, command: np.ndarray) -> np.ndarray:
-    """Return the rows of one run where a command jumps between two constant values; both (num_rows,)."""
+    """Return the rows of one run where a command jumps between two constant values."""
     changes = np.flatnonzero(np.abs(np.diff(command)) > CONSTANT_WITHIN) + 1
     times = time[np.concatenate([[0], changes])]
     held_before = np.diff(times)
@@ -75,10 +75,10 @@ def _steps_in(time: np.ndarray, command: np.ndarray) -> np.ndarray:
     return changes[is_step]
 
 
-def _clearest(
+def _largest_steps(
     log: FlightLog, prediction: Prediction, rows: np.ndarray, axis: int
 ) -> list[tuple[int, int, int]]:
-    """Return the largest steps of an axis as first row shown, row of the step and end of what is shown."""
+    """Return the largest steps of an axis: first row shown, row of the step, end of the rows shown."""
     found = []
     command = log["u"][:, axis]
     for start, end in runs_of(rows, prediction.steps):
@@ -97,15 +97,17 @@ def _clearest(
 def step_responses(
     model: ModelParameters, log: FlightLog, prediction: Prediction, rows: np.ndarray
 ) -> tuple[StepResponse, ...]:
-    """Return the answers to the largest commanded steps of each rate axis; none if there are none.
+    """Return the responses to the largest commanded steps of each rate axis.
 
-    rows: (num_rows,) bool, those judged. A step is a jump by 0.2 at least between commands that are
+    rows: (num_rows,) bool, the judged ones. A step is a jump by at least 0.2 between commands that are
     constant for 0.08 s before and 0.15 s after it.
     """
     rates_b = measured_rates(log, prediction.steps)
     if rates_b is None:
         return ()
-    shown = [(axis, *place) for axis in range(len(AXES)) for place in _clearest(log, prediction, rows, axis)]
+    shown = [
+        (axis, *place) for axis in range(len(AXES)) for place in _largest_steps(log, prediction, rows, axis)
+    ]
     firsts = np.array([first for _, first, _, _ in shown], int)
     num_steps = max([longest_flight(prediction), *(end - first - 1 for _, first, _, end in shown)])
     responses: list[StepResponse] = []

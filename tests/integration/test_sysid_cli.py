@@ -1,8 +1,6 @@
-"""The command flytrack-sysid: from a plant to a model and its report, and what it refuses."""
+"""The command flytrack-sysid: from a plant to a model and its report, and its refusals."""
 
 import json
-import subprocess
-import sys
 from pathlib import Path
 
 import gymnax
@@ -49,66 +47,50 @@ def folder(tmp_path_factory) -> Path:
     return out
 
 
+def run(*arguments: object) -> None:
+    main([str(argument) for argument in arguments])
+
+
 def refused(capsys, *arguments: object) -> str:
-    """Run a command that must be refused and return what it says."""
+    """Run a command that must be refused and return its message."""
     with pytest.raises(SystemExit) as stopped:
-        main([str(argument) for argument in arguments])
+        run(*arguments)
     assert stopped.value.code == 2
-    said = capsys.readouterr().err
-    assert "Traceback" not in said
-    return said
+    return capsys.readouterr().err
 
 
-def test_artifact_of_other_parameters_is_identified(folder):
+def test_artifact_of_other_parameters_is_identified_and_flies(folder):
     model = load_model(folder / "model.json")
     np.testing.assert_allclose(model.tau, TAUS, rtol=1e-4)
     terms = np.array([1.0, 0.5, 0.25, 0.125, 23.0, 11.5])  # 1, u, u^2, u^3, V, u V at u = 0.5
     assert model.thrust_coeffs @ terms == pytest.approx(np.array(OTHER.thrust) @ terms, rel=1e-4)
-
-
-def test_model_file_says_where_it_is_from(folder):
+    _, params = gymnax.make("FlyTrack-v0", model=str(folder / "model.json"))
+    np.testing.assert_array_equal(params.model.tau, model.tau)
     provenance = load_provenance(folder / "model.json")
     assert provenance["data"] == {"file": "data.npz", "sha256": load_log(folder / "data.npz").sha256}
-    assert provenance["split"]["held_out_every"] == 4
     interval = provenance["intervals_95"]["tau_yaw"]
     assert interval["low"] <= interval["value"] <= interval["high"] and interval["unit"] == "s"
     assert np.shape(provenance["correlation"]["matrix"]) == (11, 11)
 
 
-def test_model_file_flies(folder):
-    _, params = gymnax.make("FlyTrack-v0", model=str(folder / "model.json"))
-    np.testing.assert_allclose(params.model.tau, TAUS, rtol=1e-4)
-
-
-def test_report_is_of_the_held_out_part(folder):
-    report = json.loads((folder / "report" / "validation.json").read_text())
-    text = json.dumps(report)
-    assert '"judged_rows"' in text and "thrust" in text
-    log = load_log(folder / "data.npz")
-    judged = next(part for part in (report, *report.values()) if "judged_rows" in part)["judged_rows"]
-    assert 0.2 * len(log) < judged < 0.3 * len(log)
+def test_report_is_of_the_held_out_part_or_of_all_of_another_log(folder, capsys, tmp_path):
+    log, report = load_log(folder / "data.npz"), json.loads((folder / "report/validation.json").read_text())
+    assert 0.2 * len(log) < report["judged_rows"] < 0.3 * len(log)
     names = {path.name for path in (folder / "report").iterdir()}
     assert {"validation.html", "validation.txt", "validation.json", "steps.png", "thrust.png"} <= names
-
-
-def test_other_log_is_judged_whole(folder, capsys, tmp_path):
-    save_log(tmp_path / "other.csv", load_log(folder / "data.npz").without("a"))
-    main(["validate", str(folder / "model.json"), str(tmp_path / "other.csv"), "--out", str(tmp_path / "r")])
+    save_log(tmp_path / "other.csv", log.without("a"))
+    run("validate", folder / "model.json", tmp_path / "other.csv", "--out", tmp_path / "report")
     assert "all rows are judged" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_fix_and_from(folder, tmp_path):
-    out = tmp_path / "fixed.json"
-    start = tmp_path / "start.json"
-    heavy = nominal_parameters()._replace(m=2.0)
-    save_model(start, heavy, {})
-    arguments = ["fit", folder / "data.npz", "--out", out, "--fix", "tau_yaw=0.05", "--from", start]
-    main([str(argument) for argument in arguments])
-    model = load_model(out)
+    out, start = tmp_path / "fixed.json", tmp_path / "start.json"
+    save_model(start, nominal_parameters()._replace(m=2.0), {})
+    run("fit", folder / "data.npz", "--out", out, "--fix", "tau_yaw=0.05", "--from", start)
+    model, other = load_model(out), load_model(folder / "model.json")
     assert model.tau[2] == np.float32(0.05) and model.m == 2.0
-    np.testing.assert_allclose(
-        model.thrust_coeffs, 2.0 * load_model(folder / "model.json").thrust_coeffs, 1e-2
-    )
+    np.testing.assert_allclose(model.thrust_coeffs, 2.0 * other.thrust_coeffs, 1e-2)
     assert "tau_yaw" not in load_provenance(out)["intervals_95"]
 
 
@@ -131,10 +113,14 @@ number = 3
 """
 
 
-def test_module_and_step_are_imported_from_the_working_folder(tmp_path, monkeypatch):
+def test_functions_of_the_working_folder_are_flown_and_may_change_their_arguments(tmp_path, monkeypatch):
     (tmp_path / "my_robot.py").write_text(MODULE)
     monkeypatch.chdir(tmp_path)
-    assert load_plant("my_robot:step")(np.ones(2), None).tolist() == [1.0, 1.0]
+    log = collect(load_plant("my_robot:in_place"), minutes=1.0)
+    inside = ~log.is_start()[1:]
+    change = np.diff(log["v"][:, 2])[inside]
+    np.testing.assert_allclose(change, 0.01 * log["a"][1:, 2][inside], atol=1e-5)
+    np.testing.assert_array_equal(log["uprev"][1:][inside], log["u"][:-1][inside])
 
 
 @pytest.mark.parametrize(
@@ -146,103 +132,59 @@ def test_module_and_step_are_imported_from_the_working_folder(tmp_path, monkeypa
         ("my_robot:number", [], "found int"),
         ("my_robot:broken", [], "RuntimeError: motors are off"),
         ("my_robot:step", [], "expected it to sink and to climb"),
-        ("unfinished:step", [], "unfinished:step: cannot be imported: SyntaxError"),
-        (".my_robot:step", [], ".my_robot:step: cannot be imported: TypeError"),
-        (SHIPPED, ["--minutes", "0.2"], "minutes"),
-        (SHIPPED, ["--minutes", "inf"], "minutes: found inf"),
-        (SHIPPED, ["--noise", "-1"], "noise"),
-        (SHIPPED, ["--noise", "inf"], "noise: found inf"),
+        (SHIPPED, ["--minutes", "0.2"], "minutes: found 0.2, expected at least 1"),
         (SHIPPED, ["--noise", "50"], "noise: found 50.0, expected 0 or more, below 50"),
         (SHIPPED, ["--seed", "-1"], "seed: found -1"),
+        (SHIPPED, ["--seed", "x"], "--seed"),
         (SHIPPED, ["--out", "data.mat"], "data.mat"),
     ],
 )
 def test_collect_refuses(capsys, tmp_path, monkeypatch, plant, options, message):
     (tmp_path / "my_robot.py").write_text(MODULE)
-    (tmp_path / "unfinished.py").write_text("def step(x, u) return x")
     monkeypatch.chdir(tmp_path)
-    assert message in refused(capsys, "collect", "--black-box", plant, "--out", "data.npz", *options)
-    assert {path.name for path in tmp_path.iterdir()} <= {"my_robot.py", "unfinished.py", "__pycache__"}
+    out = [] if "--out" in options else ["--out", "data.npz"]
+    assert message in refused(capsys, "collect", "--black-box", plant, *out, *options)
+    assert {path.name for path in tmp_path.iterdir()} <= {"my_robot.py", "__pycache__"}
 
 
-def test_function_that_changes_its_arguments_changes_no_logged_row(tmp_path, monkeypatch):
-    (tmp_path / "my_robot.py").write_text(MODULE)
-    monkeypatch.chdir(tmp_path)
-    log = collect(load_plant("my_robot:in_place"), minutes=1.0)
-    inside = ~log.is_start()[1:]
-    grown = np.diff(log["v"][:, 2])[inside]
-    np.testing.assert_allclose(grown, 0.01 * log["a"][1:, 2][inside], atol=1e-5)
-    # The action applied at a row is the one commanded before it.
-    np.testing.assert_array_equal(log["uprev"][1:][inside], log["u"][:-1][inside])
-
-
-def in_degrees(log: FlightLog) -> FlightLog:
-    """Return the log with gyro rates in deg/s."""
+def with_rates_in_degrees(log: FlightLog) -> FlightLog:
     return FlightLog(log.time, {**log.channels, "w": np.rad2deg(log["w"])}, log.segment)
 
 
-def stuck(log: FlightLog) -> FlightLog:
-    """Return the log with a yaw stick that never moved."""
-    commands = log["u"] * np.array([1.0, 1.0, 0.0, 1.0])
-    return FlightLog(log.time, {**log.channels, "u": commands}, log.segment)
-
-
-def test_fit_does_not_overwrite_a_log(folder, capsys):
-    before = (folder / "data.npz").read_bytes()
-    said = refused(capsys, "fit", folder / "data.npz", "--out", folder / "data.npz")
-    assert "data.npz: found suffix '.npz', expected .json" in said
-    assert (folder / "data.npz").read_bytes() == before
-
-
 @pytest.mark.parametrize(
-    ("spoil", "options", "message"),
+    ("change", "options", "message"),
     [
-        (in_degrees, [], "deg/s"),
-        (stuck, [], "u_yaw: stuck"),
+        (with_rates_in_degrees, [], "deg/s"),
         (lambda log: log.select(slice(50)), [], "too short"),
         (lambda log: log, ["--fix", "tau_yaw"], "NAME=VALUE"),
         (lambda log: log, ["--fix", "tau=1"], "tau: unknown"),
         (lambda log: log, ["--effect", "magic"], "magic"),
         (lambda log: log, ["--hold-out-every", "1"], "every: found 1"),
         (lambda log: log, ["--from", "absent.json"], "absent.json"),
+        (lambda log: log, ["--out", "data.npz"], "data.npz: found suffix '.npz', expected .json"),
     ],
 )
-def test_fit_refuses(folder, capsys, tmp_path, spoil, options, message):
-    save_log(tmp_path / "log.npz", spoil(load_log(folder / "data.npz")))
-    out = tmp_path / "model.json"
-    assert message in refused(capsys, "fit", tmp_path / "log.npz", "--out", out, *options)
-    assert not out.exists()
+def test_fit_and_validate_refuse(folder, capsys, tmp_path, change, options, message):
+    save_log(tmp_path / "log.npz", change(load_log(folder / "data.npz")))
+    out = [] if "--out" in options else ["--out", tmp_path / "model.json"]
+    assert message in refused(capsys, "fit", tmp_path / "log.npz", *out, *options)
+    if not options:
+        arguments = ["validate", folder / "model.json", tmp_path / "log.npz", "--out", tmp_path / "report"]
+        assert message in refused(capsys, *arguments)
+    assert [path.name for path in tmp_path.iterdir()] == ["log.npz"]
 
 
 @pytest.mark.parametrize(
     ("change", "message"),
     [
         ({"version": 99}, "version: found 99, expected 1; written by a newer FlyTrack"),
-        ({"provenance": 3}, "provenance: found 3"),
         ({"split": {"held_out_every": "x"}}, "held_out_every: found 'x'"),
         ({"split": {"held_out_every": 0}}, "validate it on another log"),
     ],
 )
-def test_validate_refuses(folder, capsys, tmp_path, change, message):
+def test_validate_refuses_model_files(folder, capsys, tmp_path, change, message):
     document = json.loads((folder / "model.json").read_text())
     (document["provenance"] if "split" in change else document).update(change)
     path = tmp_path / "changed.json"
     path.write_text(json.dumps(document))
     assert message in refused(capsys, "validate", path, folder / "data.npz", "--out", tmp_path / "report")
-    assert not (tmp_path / "report").exists()
-
-
-@pytest.mark.parametrize(
-    ("spoil", "message"), [(in_degrees, "deg/s"), (lambda log: log.select(slice(50)), "too short")]
-)
-def test_validate_refuses_what_cannot_be_a_flight(folder, capsys, tmp_path, spoil, message):
-    save_log(tmp_path / "other.npz", spoil(load_log(folder / "data.npz")))
-    out = tmp_path / "report"
-    assert message in refused(capsys, "validate", folder / "model.json", tmp_path / "other.npz", "--out", out)
-    assert not out.exists()
-
-
-def test_the_command_is_installed():
-    command = Path(sys.executable).with_name("flytrack-sysid")
-    done = subprocess.run([command, "--help"], capture_output=True, text=True, timeout=120)
-    assert done.returncode == 0 and "validate" in done.stdout

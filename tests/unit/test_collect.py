@@ -49,13 +49,6 @@ def test_log_is_what_the_plant_did():
     assert np.abs(log["a"][first]).max() > 0.1, "the first row's acceleration is the plant's"
 
 
-def test_noise_is_measured_with_the_same_seed_alike():
-    first, again = (collect(HandoutPlant(), minutes=1.0, seed=2, noise=1.0) for _ in range(2))
-    for name, values in first.channels.items():
-        np.testing.assert_array_equal(values, again[name])
-    assert "f" in first and "a" not in first and len(first) < 6000
-
-
 def test_envelope_cuts_a_plant_of_huge_thrust():
     strong = replace(HandoutPlant(), coeffs=(-24.0, -16.0, 14.0, 1.6, 3.2, 3.6))
     log = collect(strong, minutes=1.0)
@@ -90,17 +83,15 @@ def raises(x, u):
         (replace(HandoutPlant(), coeffs=(1.0, 1.0, 0, 0, 0, 0)), {}, "sink and to climb"),
         (replace(HandoutPlant(), coeffs=(2.0 * GRAVITY, 1.0, 0, 0, 0, 0)), {}, "sink and to climb"),
         (broken(where=20, value=np.nan), {}, "found nan in component 20, flight 0 .roll., step"),
-        (broken(where=7, value=np.inf), {}, "found inf in component 7"),
         (lambda x, u: HandoutPlant()(x, u)[:20], {}, r"shape \(20,\), expected \(21,\)"),
         (lambda x, u: x * np.nan, {}, "vertical accelerations of nan and nan"),
         (raises, {}, "RuntimeError: no link"),
         (broken(where=2, value=500.0), {}, "no flight stayed within the envelope"),
         (HandoutPlant(), {"minutes": 0.9}, "minutes: found 0.9, expected at least 1"),
         (HandoutPlant(), {"minutes": np.nan}, "minutes: found nan"),
-        (HandoutPlant(), {"minutes": np.inf}, "minutes: found inf"),
         (HandoutPlant(), {"noise": -1.0}, "noise: found -1.0, expected 0 or more"),
     ],
 )
-def test_what_does_not_fly_is_named(step, arguments, message):
+def test_plants_that_do_not_fly_are_refused(step, arguments, message):
     with pytest.raises(CollectError, match=message):
         collect(step, **{"minutes": 1.0, **arguments})

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from flytrack_env.dynamics import advance, nominal_parameters, step
-from flytrack_env.plants import Plant
+from flytrack_env.dynamics import nominal_parameters, step
 from flytrack_sysid import collect
 from flytrack_sysid.log import CHANNELS, FlightLog, LogError, log_of_states
 from flytrack_sysid.plausibility import FEWEST_ROWS, GRAVITY, check_plausible, find_problems
 from flytrack_sysid.split import blocks_of
+from tests.support.handout_plant import HandoutPlant
 
 DT = 0.01
 NUM_STEPS = 600
@@ -97,7 +97,6 @@ UPWARDS = np.array([0.0, 0.0, GRAVITY])
 WRONG = {
     "w in deg/s": (scaled("w", 180 / np.pi), columns("w"), "looks like deg/s"),
     "t in ms": (time_times(1e3), "t", "median step of 10, .* looks like ms"),
-    "t in us": (time_times(1e6), "t", r"median step of 1e\+04, .* looks like us"),
     "t in ns": (time_times(1e9), "t", r"median step of 1e\+07, .* looks like ns"),
     "q world to body": (scaled("q", np.array([1.0, -1.0, -1.0, -1.0])), columns("q"), "looks like world to"),
     "q stuck": (
@@ -106,7 +105,6 @@ WRONG = {
         "the attitude looks stuck",
     ),
     "v_bat in mV": (scaled("v_bat", 1000.0), "v_bat", "looks like mV$"),
-    "v_bat in hundredths": (scaled("v_bat", 100.0), "v_bat", "looks like hundredths of V$"),
     "v_bat in tenths": (scaled("v_bat", 10.0), "v_bat", "looks like tenths of V$"),
     "f in g": (scaled("f", 1 / GRAVITY), columns("f"), "looks like g$"),
     "f with z down": (scaled("f", np.array([1.0, -1.0, -1.0])), "f_z", "pointed down"),
@@ -118,7 +116,6 @@ WRONG = {
         "looks like g, not m/s",
     ),
     "p in mm": (scaled("p", 1000.0), columns("p"), "looks like mm, not m$"),
-    "p in cm": (scaled("p", 100.0), columns("p"), "looks like cm, not m$"),
     "commands stuck": (
         lambda log: replace(log, channels={**log.channels, "u": 0 * log["u"]}),
         columns("u"),
@@ -132,13 +129,7 @@ WRONG = {
     ),
     "too few rows": (lambda log: log.select(slice(0, FEWEST_ROWS - 1)), "t", "found 99 rows"),
 }
-NAMES = [f"{kind}{which}" for kind in ("clean", "noisy") for which in (" 0", " 1", " 2", ", segments")]
-
-
-@pytest.mark.parametrize("name", NAMES)
-def test_flight_raises_no_problem(logs, name):
-    assert find_problems(logs[name]) == []
-    check_plausible(logs[name])
+NAMES = ("clean 0", "noisy 1", "noisy, segments")
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -164,22 +155,13 @@ def test_all_problems_are_listed(logs):
     assert str(error.value).splitlines() == problems
 
 
-@pytest.mark.parametrize(
-    "measured", [("w",), ("v",), ("q",), ("w", "v", "q"), ("p", "v", "a", "f", "q", "w")]
-)
+@pytest.mark.parametrize("measured", [("q",), ("p", "v", "a", "f", "q", "w")])
 def test_drone_that_stands_while_commands_move(logs, measured):
     log = logs["clean 0"]
     frozen = {name: np.repeat(log[name][:1], len(log), axis=0) for name in measured}
     problems = find_problems(replace(log, channels={"u": log["u"], **frozen}))
     named = ", ".join(column for name in CHANNELS if name in measured for column in CHANNELS[name])
     assert len(problems) == 1 and f": {named}: found the same values in every row" in problems[0]
-
-
-def test_drone_that_stands_under_still_commands_is_one_problem(logs):
-    log = logs["clean 0"]
-    still = {name: np.repeat(log[name][:1], len(log), axis=0) for name in ("u", "w", "q")}
-    (problem,) = find_problems(replace(log, channels=still))
-    assert f": {columns('u')}: " in problem
 
 
 @pytest.mark.parametrize("wrong", [None, "w in deg/s", "p in mm", "a in g", "f in g"])
@@ -227,57 +209,26 @@ def test_free_fall_is_no_force_in_g(logs):
     assert find_problems(replace(log, channels=channels, segment=blocks_of(log))) == []
 
 
-@pytest.mark.parametrize("voltage", [3.0, 4.2, 16.8, 30.0, 60.0])
-def test_batteries_of_one_cell_to_fourteen_are_fine(logs, voltage):
-    assert find_problems(with_battery(logs["clean 0"], voltage)) == []
-
-
-@pytest.mark.parametrize(
-    ("value", "guess"),
-    [(168.0, "tenths of V"), (420.0, "hundredths of V or tenths of V"), (4100.0, "mV or hundredths of V")],
-)
-def test_battery_in_other_units(logs, value, guess):
-    (problem,) = find_problems(with_battery(logs["clean 0"], value))
-    assert problem.endswith(f"this looks like {guess}")
-
-
 def test_velocity_in_cm_per_s_is_not_blamed_on_position(logs):
     (problem,) = find_problems(scaled("v", 100.0)(logs["noisy 1"].without("a", "f")))
     assert f": {columns('v')}: " in problem and "looks like cm/s" in problem
 
 
-def test_velocity_in_other_units_is_not_blamed_on_gravity(logs):
-    # A slow sink that in cm/s happens to lie as far from the acceleration as gravity would.
-    log, sink_w = logs["clean 0"], np.array([0.0, 0.0, -GRAVITY / 99])
-    rate = 2 * np.pi * np.array([1.0, 2.0, 3.0])
-    time = log.time[:, None]
-    channels = {"u": log["u"], "a": np.cos(rate * time) + sink_w}
-    for scale in (1.0, 100.0):
-        velocity = scale * (np.sin(rate * time) / rate + sink_w * time)
-        assert find_problems(replace(log, channels={**channels, "v": velocity})) == []
+def test_flights_and_batteries_of_one_to_fourteen_cells_raise_no_problem(logs):
+    for name in NAMES:
+        assert find_problems(logs[name]) == []
+    for volts in (3.0, 16.8, 60.0):
+        assert find_problems(with_battery(logs["clean 0"], volts)) == []
+    (problem,) = find_problems(with_battery(logs["clean 0"], 420.0))
+    assert problem.endswith("this looks like hundredths of V or tenths of V")
 
 
-def test_scale_errors_and_biases_of_sensors_pass(logs):
+def test_scale_errors_and_biases_of_sensors_raise_no_problem(logs):
     log = logs["noisy 0"]
     for change in (scaled("w", 1.1), scaled("a", 0.9), scaled("p", 1.05), scaled("f", 1.1)):
         log = change(log)
     assert find_problems(shifted("a", np.array([0.3, -0.5, 1.5]))(shifted("w", 0.2)(log))) == []
 
 
-class Nominal(Plant):
-    """The nominal model as a plant."""
-
-    def reset(self, drone, model):
-        return drone
-
-    def step(self, state, command, dt, model):
-        return advance(state, (), command, dt, nominal_parameters())[0]
-
-    def drone(self, state):
-        return state
-
-
-@pytest.mark.parametrize("noise", [0.0, 1.0, 3.0])
-def test_excitation_raises_no_problem(noise):
-    log = collect(Nominal(), seed=1, noise=noise)
-    assert find_problems(log if "f" in log else with_force(log)) == []
+def test_excitation_raises_no_problem():
+    assert find_problems(collect(HandoutPlant(), minutes=1.0, seed=1, noise=3.0)) == []
