@@ -1,13 +1,12 @@
-"""Do the clocks of the channels agree? The offset between sensors that measure the same motion.
+"""Offsets between the clocks of sensors that measure the same motion.
 
-Compared are only sensors with sensors: attitude with gyroscope, velocity with accelerometer, position with
-velocity. Commands are left alone: how late the motion follows them is the plant's lag, not a clock. A slow
-estimator's lag cannot be told from a late clock and is corrected with it.
+Only sensors are compared: attitude with gyroscope, velocity with accelerometer, position with velocity.
+Commands are not: how late the motion follows them is the plant's lag. A slow estimator looks like a late
+clock and is corrected as one.
 
 Of a pair, one is the integral of the other. Both are taken as changes over the same windows of 0.1 s, so
 that both are filtered alike; the offset minimises the squared difference (Gauss-Newton from the best of a
-grid), and leaving out one stretch of 2 s after the other gives its uncertainty (jackknife; Efron and
-Tibshirani 1993, chapter 11).
+grid), and a jackknife over blocks of 2 s gives its standard error (Efron and Tibshirani 1993, chapter 11).
 """
 
 from collections.abc import Callable
@@ -22,6 +21,7 @@ from scipy.spatial.transform import Rotation
 from flytrack_sysid.importing.resample import interpolate, interpolate_quaternions
 from flytrack_sysid.importing.units import GRAVITY
 from flytrack_sysid.log import GAP_STEPS, FlightLog, usual_step
+from flytrack_sysid.plausibility import summed_turns
 from flytrack_sysid.windows import LEAST_CORRELATION
 
 LARGEST_OFFSET_S = 0.25  # beyond it, loggers are broken rather than late
@@ -39,7 +39,7 @@ class ClockOffset(NamedTuple):
     """How late one channel's clock is against another's.
 
     channel, reference: of ``CHANNELS``. offset_s: what ``channel`` shows at t happened at t - offset_s, s.
-    sigma_s: its standard error, s. correlation: of the changes that both show. verdict: what was done.
+    sigma_s: its standard error, s. correlation: of the changes in both. verdict: what was done.
     """
 
     channel: str
@@ -49,9 +49,9 @@ class ClockOffset(NamedTuple):
     correlation: float
     verdict: str
 
-    def left(self) -> "ClockOffset":
-        """Return the same with nothing corrected."""
-        return self._replace(verdict=LEFT) if self.verdict == CORRECTED else self
+    def as_json(self) -> dict[str, float | str | None]:
+        """Return the offset as JSON values, null where it is unknown."""
+        return {name: None if value != value else value for name, value in self._asdict().items()}
 
     def describe(self) -> str:
         """Return one line on the offset, in ms."""
@@ -62,28 +62,26 @@ class ClockOffset(NamedTuple):
         return f"{pair}: {late}, correlation {self.correlation:.3f}: {self.verdict}"
 
 
-class _Piece(NamedTuple):
-    """A stretch without gaps: windows' first and last times, what grew over them, its rate over time."""
+class _Stretch(NamedTuple):
+    """A stretch without gaps: start, end and block of its windows, the change over each, the rate by time."""
 
     starts: np.ndarray
     ends: np.ndarray
-    grown: np.ndarray
+    change: np.ndarray
     rate: Callable[[np.ndarray], np.ndarray]
     integral: Callable[[np.ndarray], np.ndarray]
     block: np.ndarray
 
     def differences(self, offset_s: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return what grew, what the rate says at an offset, and its slope by the offset, all centred."""
+        """Return the change, the integrated rate at an offset and its slope by the offset, centred."""
         starts, ends = self.starts - offset_s, self.ends - offset_s
-        summed = self.integral(ends) - self.integral(starts)
+        integral = self.integral(ends) - self.integral(starts)
         slope = self.rate(starts) - self.rate(ends)
-        return tuple(values - values.mean(axis=0) for values in (self.grown, summed, slope))
+        return tuple(values - values.mean(axis=0) for values in (self.change, integral, slope))
 
 
-def _turned(log: FlightLog) -> np.ndarray:
-    attitude = Rotation.from_quat(log["q"], scalar_first=True)
-    turns_b = (attitude[:-1].inv() * attitude[1:]).as_rotvec()
-    return np.concatenate([np.zeros((1, 3)), np.cumsum(turns_b, axis=0)])
+def _turns(log: FlightLog) -> np.ndarray:
+    return summed_turns(Rotation.from_quat(log["q"], scalar_first=True))
 
 
 def _acceleration(log: FlightLog) -> np.ndarray:
@@ -91,25 +89,25 @@ def _acceleration(log: FlightLog) -> np.ndarray:
     return force_w - np.array([0.0, 0.0, GRAVITY])
 
 
-# Channel, reference, what must be there, and both as functions of the log. In this order: each reference
-# is right by then.
+# Channel, reference, required channels, and both as functions of the log. In this order each reference has
+# been corrected before it is used.
 PAIRS = (
-    ("q", "w", ("q", "w"), _turned, lambda log: log["w"]),
+    ("q", "w", ("q", "w"), _turns, lambda log: log["w"]),
     ("v", "f", ("v", "f", "q"), lambda log: log["v"], _acceleration),
     ("p", "v", ("p", "v"), lambda log: log["p"], lambda log: log["v"]),
 )
 
 
-def _stretches(log: FlightLog) -> list[slice]:
-    """Return the rows of each stretch that no gap and no segment's end interrupts."""
+def _runs(log: FlightLog) -> list[slice]:
+    """Return the rows of each run without a gap within a segment."""
     is_gap = np.diff(log.time) > GAP_STEPS * usual_step(log)[:-1]
     edges = np.flatnonzero(np.append(is_gap | log.is_start()[1:], True)) + 1
     return [slice(start, end) for start, end in pairwise([0, *edges])]
 
 
-def _pieces(log: FlightLog, sums: np.ndarray, rates: np.ndarray) -> list[_Piece]:
-    pieces, num_blocks = [], 0
-    for rows in _stretches(log):
+def _stretches(log: FlightLog, sums: np.ndarray, rates: np.ndarray) -> list[_Stretch]:
+    stretches, num_blocks = [], 0
+    for rows in _runs(log):
         time = log.time[rows]
         is_start = (time - time[0] >= LARGEST_OFFSET_S) & (time[-1] - time >= LARGEST_OFFSET_S + WINDOW_S)
         starts = time[is_start]
@@ -120,59 +118,59 @@ def _pieces(log: FlightLog, sums: np.ndarray, rates: np.ndarray) -> list[_Piece]
         block = ((starts - starts[0]) // BLOCK_S).astype(int) + num_blocks
         num_blocks = block[-1] + 1
         ends = starts + WINDOW_S
-        pieces.append(_Piece(starts, ends, line(ends) - line(starts), rate, rate.antiderivative(), block))
-    return pieces
+        stretches.append(
+            _Stretch(starts, ends, line(ends) - line(starts), rate, rate.antiderivative(), block)
+        )
+    return stretches
 
 
-def _cost(pieces: list[_Piece], offset_s: float) -> float:
-    parts = (piece.differences(offset_s) for piece in pieces)
-    return sum(float(np.sum((grown - summed) ** 2)) for grown, summed, _ in parts)
+def _cost(stretches: list[_Stretch], offset_s: float) -> float:
+    parts = (stretch.differences(offset_s) for stretch in stretches)
+    return sum(float(np.sum((change - integral) ** 2)) for change, integral, _ in parts)
 
 
-def _sums(pieces: list[_Piece], offset_s: float) -> tuple[np.ndarray, np.ndarray, float]:
+def _sums(stretches: list[_Stretch], offset_s: float) -> tuple[np.ndarray, np.ndarray, float]:
     """Return Gauss-Newton's numerator and denominator of each block, (num_blocks,), and the correlation."""
-    top, bottom, products = [], [], np.zeros(3)
-    for piece in pieces:
-        grown, summed, slope = piece.differences(offset_s)
-        _, block = np.unique(piece.block, return_inverse=True)  # none is empty, however long the gaps
-        top.append(np.bincount(block, np.sum(slope * (grown - summed), axis=1)))
-        bottom.append(np.bincount(block, np.sum(slope**2, axis=1)))
-        products += [np.sum(grown * summed), np.sum(grown**2), np.sum(summed**2)]
+    numerator, denominator, products = [], [], np.zeros(3)
+    for stretch in stretches:
+        change, integral, slope = stretch.differences(offset_s)
+        _, block = np.unique(stretch.block, return_inverse=True)  # none is empty, however long the gaps
+        numerator.append(np.bincount(block, np.sum(slope * (change - integral), axis=1)))
+        denominator.append(np.bincount(block, np.sum(slope**2, axis=1)))
+        products += [np.sum(change * integral), np.sum(change**2), np.sum(integral**2)]
     correlation = products[0] / np.sqrt(products[1] * products[2]) if products[1:].all() else 0.0
-    return np.concatenate(top), np.concatenate(bottom), float(correlation)
+    return np.concatenate(numerator), np.concatenate(denominator), float(correlation)
 
 
 def _offset(log: FlightLog, sums: np.ndarray, rates: np.ndarray) -> tuple[float, float, float, str]:
-    """Return offset, standard error, correlation, and why there is none (empty if there is)."""
+    """Return offset, standard error and correlation, or why they are unknown (else empty)."""
     unknown = np.nan, np.nan, np.nan
-    pieces = _pieces(log, sums, rates)
-    if sum(piece.block[-1] - piece.block[0] + 1 for piece in pieces) < FEWEST_BLOCKS:
+    stretches = _stretches(log, sums, rates)
+    if sum(stretch.block[-1] - stretch.block[0] + 1 for stretch in stretches) < FEWEST_BLOCKS:
         return *unknown, f"not compared: less than {FEWEST_BLOCKS * BLOCK_S:g} s without a gap"
-    # Windows keep a margin of the largest offset from the ends of what is known; the grid stays within.
+    # Windows keep the largest offset away from the ends of the data; the grid stays within it.
     grid = np.arange(-LARGEST_OFFSET_S + GRID_S, LARGEST_OFFSET_S - GRID_S / 2, GRID_S)
-    best = int(np.argmin([_cost(pieces, offset) for offset in grid]))
+    best = int(np.argmin([_cost(stretches, offset) for offset in grid]))
     if best in (0, len(grid) - 1):
         return *unknown, f"not compared: they agree at no offset within {LARGEST_OFFSET_S:g} s"
     offset = float(grid[best])
     for _ in range(ROUNDS):
-        top, bottom, correlation = _sums(pieces, offset)
-        if bottom.sum() == 0.0 or correlation < LEAST_CORRELATION:
-            return (
-                *unknown,
-                f"not compared: correlation {correlation:.2f}: they do not show one motion clearly",
-            )
-        offset = float(np.clip(offset + top.sum() / bottom.sum(), grid[0], grid[-1]))
-    top, bottom, correlation = _sums(pieces, offset)
-    if np.any(bottom.sum() - bottom <= 0.0):
+        numerator, denominator, correlation = _sums(stretches, offset)
+        if denominator.sum() == 0.0 or correlation < LEAST_CORRELATION:
+            reason = f"correlation {correlation:.2f}: they do not show one motion clearly"
+            return *unknown, f"not compared: {reason}"
+        offset = float(np.clip(offset + numerator.sum() / denominator.sum(), grid[0], grid[-1]))
+    numerator, denominator, correlation = _sums(stretches, offset)
+    if np.any(denominator.sum() - denominator <= 0.0):
         return *unknown, f"not compared: all motion is within {BLOCK_S:g} s"
-    left_out = (top.sum() - top) / (bottom.sum() - bottom)
+    left_out = (numerator.sum() - numerator) / (denominator.sum() - denominator)
     count = len(left_out)
     sigma = float(np.sqrt((count - 1) / count * np.sum((left_out - left_out.mean()) ** 2)))
     return offset, sigma, correlation, ""
 
 
-def shifted(log: FlightLog, channel: str, offset_s: float) -> FlightLog:
-    """Return the log with one channel read ``offset_s`` later; rows where that is not known are left out."""
+def _shift(log: FlightLog, channel: str, offset_s: float) -> FlightLog:
+    """Return the log with one channel read ``offset_s`` later, without the rows where that is unknown."""
     values = np.array(log[channel], float)
     is_known = np.zeros(len(log), bool)
     bounds = np.append(np.flatnonzero(log.is_start()), len(log))
@@ -183,22 +181,23 @@ def shifted(log: FlightLog, channel: str, offset_s: float) -> FlightLog:
     return replace(log, channels={**log.channels, channel: values}).select(is_known)
 
 
-def align_clocks(log: FlightLog) -> tuple[FlightLog, tuple[ClockOffset, ...]]:
-    """Return a log with its sensors on one clock, and what was found of each pair that can be compared.
+def align_clocks(log: FlightLog, correct: bool = True) -> tuple[FlightLog, tuple[ClockOffset, ...]]:
+    """Return a log with its sensors on one clock, and the offset of each pair that can be compared.
 
-    Offsets above three standard errors and a tenth of the log's step are corrected, by reading the channel
-    later (in between samples: on the straight line or shortest arc); others are reported and left. Rates
-    and specific force count as one clock, with the commands: nothing in a log says otherwise.
+    Offsets above three standard errors and a tenth of the log's step are corrected by reading the channel
+    later (interpolated along the straight line or the shortest arc); others are only reported, and so are
+    all without ``correct``. Rates, specific force and commands count as one clock: nothing in a log tells
+    them apart.
     """
-    found = []
+    aligned, found = log, []
     for channel, reference, needed, sums, rates in PAIRS:
         if any(name not in log for name in needed):
             continue
-        offset, sigma, correlation, verdict = _offset(log, sums(log), rates(log))
-        step = float(np.median(usual_step(log)))
+        offset, sigma, correlation, verdict = _offset(aligned, sums(aligned), rates(aligned))
+        step = float(np.median(usual_step(aligned)))
         if not verdict and (abs(offset) <= SIGNIFICANT * sigma or abs(offset) <= LEAST_STEPS * step):
             verdict = "not significant, left"
         elif not verdict:
-            log, verdict = shifted(log, channel, offset), CORRECTED
+            aligned, verdict = _shift(aligned, channel, offset), CORRECTED if correct else LEFT
         found.append(ClockOffset(channel, reference, offset, sigma, correlation, verdict))
-    return log, tuple(found)
+    return aligned if correct else log, tuple(found)

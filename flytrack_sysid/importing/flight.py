@@ -1,87 +1,69 @@
-"""What a reader returns of one file, and which of its rows are used."""
+"""One imported flight, and the craft that it is of."""
 
-import csv
-import io
-from collections.abc import Iterator
-from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from flytrack_env.files import open_file
-from flytrack_env.messages import error_text, quote_name, quote_value
-from flytrack_sysid.importing.craft import Craft
-from flytrack_sysid.importing.mapping import Manifest, Mapping
+from flytrack_env.dynamics import ModelParameters, nominal_parameters
 from flytrack_sysid.log import FlightLog, LogError
 
-LARGEST_MANIFEST_BYTES = 2**24
-MOST_DIGITS = 15
-LONGEST_LIST = 1000  # characters of a header
+NOMINAL_FULL_V = 24.0  # the voltage that the nominal thrust map is stated at (``nominal_parameters``)
+VOLTAGE_TERMS = 4  # of the thrust map: from this coefficient on they multiply the voltage
 
 
-class Flight(NamedTuple):
-    """One file's flight: its log, what the file states of the craft, and what a reader should know of it."""
+class Craft(NamedTuple):
+    """What a log or its mapping states of a craft; None where it states nothing.
+
+    max_rate_deg_s: (roll, pitch, yaw), body rate at a command of 1. mass_kg. voltage_v: (lowest, highest)
+    in flight.
+    """
+
+    max_rate_deg_s: tuple[float, float, float] | None = None
+    mass_kg: float | None = None
+    voltage_v: tuple[float, float] | None = None
+
+    def describe(self) -> str:
+        """Return one line on the craft."""
+        rates = "full stick unknown"
+        if self.max_rate_deg_s:
+            rates = f"full stick {', '.join(f'{rate:.4g}' for rate in self.max_rate_deg_s)} deg/s"
+        mass = f"mass {self.mass_kg:g} kg" if self.mass_kg else "mass unknown"
+        volts = "voltage unknown"
+        if self.voltage_v:
+            volts = f"voltage {self.voltage_v[0]:.4g} to {self.voltage_v[1]:.4g} V"
+        return f"craft: {rates}; {mass}; {volts}"
+
+    def nominal_model(self, source: str) -> ModelParameters:
+        """Return the generic racing quadcopter scaled to this craft: where a fit may start.
+
+        Assumption: the nominal craft's lags, and its thrust-to-weight ratios at the same fractions of the
+        highest voltage: thrust scales with the mass, and a volt counts for more where there are fewer.
+        source: the log or mapping, for messages.
+
+        Raises:
+            LogError: full-stick rates, mass or voltage are unknown.
+        """
+        if self.max_rate_deg_s is None or self.mass_kg is None or self.voltage_v is None:
+            name = next(name for name, value in self._asdict().items() if value is None)
+            raise LogError(f"{source}: craft.{name}: missing in log and mapping; a model needs it")
+        nominal = nominal_parameters()
+        per_volt = NOMINAL_FULL_V / self.voltage_v[1]
+        coeffs = np.asarray(nominal.thrust_coeffs, float) * self.mass_kg / float(nominal.m)
+        coeffs[VOLTAGE_TERMS:] *= per_volt
+        leaves: dict[str, Any] = {  # of NumPy
+            "thrust_coeffs": coeffs.astype(np.float32),
+            "max_rate": np.asarray(self.max_rate_deg_s, np.float32),
+        }
+        return nominal._replace(
+            **leaves,
+            m=self.mass_kg,
+            battery_drain_v_per_min=float(nominal.battery_drain_v_per_min) / per_volt,
+        )
+
+
+class ImportedFlight(NamedTuple):
+    """A flight as a reader returns it: its log, the craft by file and mapping, and notes for the user."""
 
     log: FlightLog
     craft: Craft = Craft()
     notes: tuple[str, ...] = ()
-
-
-def used_rows(path: Path, log: FlightLog, mapping: Mapping) -> FlightLog:
-    """Return the rows of a file's log that the mapping wants.
-
-    Raises:
-        LogError: none are left, or the manifest does not say how many.
-    """
-    rows = mapping.rows
-    count = rows.count if rows.manifest is None else _count_of(path, rows.manifest)
-    since_start = log.time - log.time[:1]
-    is_used = since_start >= rows.from_s
-    if rows.to_s is not None:
-        is_used &= since_start <= rows.to_s
-    index = np.arange(len(log))
-    is_used &= (index >= rows.first) & ((index - rows.first) % rows.every == 0)
-    if count is not None:
-        is_used &= index < rows.first + count
-    if not is_used.any():
-        raise LogError(f"{mapping.source}: rows: none of the {len(log)} rows of {path} is left")
-    return log.select(is_used)
-
-
-def _count_of(path: Path, asked: Manifest) -> int:
-    """Return how many rows of a file the manifest beside it says to use."""
-    manifest = path.parent / asked.file
-    where = f"{path.parent}/{quote_name(asked.file)}"
-    if manifest.name != asked.file:
-        raise LogError(f"{where}: expected the name of a file beside the log, not a path")
-    try:
-        with open_file(manifest, LARGEST_MANIFEST_BYTES) as file:
-            text = io.TextIOWrapper(file, encoding="utf-8-sig", newline="")
-            count = _find_count(where, csv.reader(text, strict=True), asked, path.name)
-    except (OSError, ValueError, csv.Error) as error:  # ValueError: no text, or a NUL in the name
-        if isinstance(error, LogError):
-            raise
-        raise LogError(f"{where}: cannot be read as a manifest: {error_text(error)}") from error
-    if count is None:
-        raise LogError(f"{where}: column {quote_name(asked.key)}: {path.name}: missing")
-    return count
-
-
-def _find_count(where: str, table: Iterator[list[str]], asked: Manifest, file: str) -> int | None:
-    """Return what a manifest's row of a file says, None where there is no such row."""
-    names = next(table, [])
-    for name in (asked.key, asked.count):
-        if name not in names:
-            listed = ", ".join(map(quote_name, names))[:LONGEST_LIST]
-            raise LogError(f"{where}: column {quote_name(name)}: missing; found {listed}")
-    key, count = names.index(asked.key), names.index(asked.count)
-    for entry in table:
-        if entry[key : key + 1] == [file]:
-            text = "".join(entry[count : count + 1]).strip()
-            if not text.isdecimal() or len(text) > MOST_DIGITS:
-                found, expected = quote_value(text), f"a whole number of at most {MOST_DIGITS} digits"
-                raise LogError(
-                    f"{where}: {file}: {quote_name(asked.count)}: found {found}, expected {expected}"
-                )
-            return int(text)
-    return None

@@ -1,5 +1,6 @@
-"""From files of other people's flights to one flight log."""
+"""From files of measured flights to one flight log."""
 
+import csv
 import json
 from collections.abc import Iterable
 from dataclasses import replace
@@ -9,13 +10,13 @@ from typing import NamedTuple
 import numpy as np
 
 from flytrack_env.dynamics import ModelParameters
-from flytrack_env.files import write_atomically
+from flytrack_env.files import read_at_most, write_atomically
+from flytrack_env.messages import error_text, quote_name, quote_value
 from flytrack_sysid.importing.betaflight_log import read_betaflight
 from flytrack_sysid.importing.clocks import ClockOffset, align_clocks
-from flytrack_sysid.importing.craft import Craft, nominal_model
 from flytrack_sysid.importing.csv_log import read_csv
-from flytrack_sysid.importing.flight import Flight, used_rows
-from flytrack_sysid.importing.mapping import Mapping, load_mapping
+from flytrack_sysid.importing.flight import Craft, ImportedFlight
+from flytrack_sysid.importing.mapping import Manifest, Mapping, load_mapping
 from flytrack_sysid.importing.ulog_log import read_ulog
 from flytrack_sysid.log import FlightLog, LogError
 from flytrack_sysid.log_file import describe
@@ -27,14 +28,15 @@ READERS = {
     "betaflight": read_betaflight,
 }
 FORMATS = tuple(READERS)
+LARGEST_MANIFEST_BYTES = 2**24
 
 
 class Imported(NamedTuple):
-    """What an import found.
+    """The result of an import.
 
-    log: a segment per flight, numbered from 0. sources: the file of each segment. craft: what files and
-    mapping state. offsets: between the sensors' clocks. notes: what was left out. problems: what in the
-    log cannot be true of a flight, as ``fit`` would say it.
+    log: a segment per flight, numbered from 0. sources: the file of each segment. craft: by files and
+    mapping. offsets: between the sensors' clocks. notes: what was left out. problems: what in the log cannot
+    be true of a flight; ``fit`` would refuse it.
     """
 
     log: FlightLog
@@ -45,39 +47,36 @@ class Imported(NamedTuple):
     problems: tuple[str, ...]
 
     def nominal_model(self) -> ModelParameters:
-        """Return the generic quadcopter scaled to this craft: where a fit may begin.
+        """Return the generic quadcopter scaled to this craft: where a fit may start.
 
         Raises:
             LogError: full-stick rates, mass or voltage are unknown.
         """
-        return nominal_model(self.craft, self.log.source)
+        return self.craft.nominal_model(self.log.source)
 
     def describe(self) -> str:
         """Return the import in lines."""
-        log = self.log
+        num_rows = np.bincount(self.log.segment)
         segments = [
-            f"segment {number}: {source}, {np.count_nonzero(log.segment == number)} rows"
+            f"segment {number}: {source}, {num_rows[number]} rows"
             for number, source in enumerate(self.sources)
         ]
         clocks = [offset.describe() for offset in self.offsets]
         problems = [f"warning: {problem}" for problem in self.problems]
-        lines = [*segments, *self.notes, describe(log), self.craft.describe(), *clocks, *problems]
+        lines = [*segments, *self.notes, describe(self.log), self.craft.describe(), *clocks, *problems]
         return "\n".join(lines)
 
     def save_details(self, path: str | Path) -> None:
         """Write what the log itself cannot hold as JSON: sources, craft, clocks, notes, problems.
 
         Raises:
-            OSError: what the system says.
+            OSError: the file cannot be written.
         """
-        offsets = [
-            {name: _json(value) for name, value in offset._asdict().items()} for offset in self.offsets
-        ]
         document = {
             "sha256": self.log.sha256,
             "sources": self.sources,
             "craft": self.craft._asdict(),
-            "clocks": offsets,
+            "clocks": [offset.as_json() for offset in self.offsets],
             "notes": self.notes,
             "problems": self.problems,
         }
@@ -93,12 +92,12 @@ def import_log(
     """Return measured flights as one flight log in SI units and our frames, a segment each.
 
     paths: one file or several. format: of ``FORMATS``. mapping: a mapping file, or the name of a shipped
-    one; CSV needs it, and other formats take its ``rows`` and ``craft``. align: correct the offsets between
-    sensors' clocks that are significant (``flytrack_sysid.importing.clocks``); else only report them.
-    Voltages that nobody states are those of the log, where all are above 0.
+    one; CSV needs it, other formats use its ``rows`` and ``craft``. align: correct significant offsets
+    between the sensors' clocks (``flytrack_sysid.importing.clocks``) instead of only reporting them.
+    Voltages that neither files nor mapping state are those of the log, where all are above 0.
 
     Raises:
-        LogError: what cannot be read or meant; the message names file and field, found and expected.
+        LogError: a file that cannot be read or used; the message names file and field, found and expected.
     """
     files = [Path(path) for path in ([paths] if isinstance(paths, (str, Path)) else paths)]
     if format not in READERS:
@@ -110,23 +109,63 @@ def import_log(
     flights, sources = [], []
     for path in files:
         for flight in READERS[format](path, mapping):
-            flights.append(flight._replace(log=used_rows(path, flight.log, mapping)))
+            flights.append(flight._replace(log=_used_rows(path, flight.log, mapping)))
             sources.append(flight.log.source)
-    log = _joined([flight.log for flight in flights], sources)
-    aligned, offsets = align_clocks(log)
-    if align:
-        log = aligned
-    else:
-        offsets = tuple(offset.left() for offset in offsets)
-    craft = _agreed(flights, sources)
+    log = _concatenate([flight.log for flight in flights], sources)
+    log, offsets = align_clocks(log, align)
+    craft = _common_craft(flights, sources)
     if craft.voltage_v is None and "v_bat" in log and log["v_bat"].min() > 0.0:
         craft = craft._replace(voltage_v=(float(log["v_bat"].min()), float(log["v_bat"].max())))
     notes = tuple(note for flight in flights for note in flight.notes)
     return Imported(log, tuple(sources), craft, offsets, notes, tuple(find_problems(log)))
 
 
-def _joined(logs: list[FlightLog], sources: list[str]) -> FlightLog:
-    """Return the logs as segments of one, with the channels that all of them have."""
+def _used_rows(path: Path, log: FlightLog, mapping: Mapping) -> FlightLog:
+    """Return the rows of a file's log that the mapping selects."""
+    rows = mapping.rows
+    count = rows.count if rows.manifest is None else _count_of(path, rows.manifest)
+    since_start = log.time - log.time[:1]
+    is_used = since_start >= rows.from_s
+    if rows.to_s is not None:
+        is_used &= since_start <= rows.to_s
+    index = np.arange(len(log))
+    is_used &= (index >= rows.first) & ((index - rows.first) % rows.every == 0)
+    if count is not None:
+        is_used &= index < rows.first + count
+    if not is_used.any():
+        raise LogError(f"{mapping.source}: rows: none of the {len(log)} rows of {path} is left")
+    return log.select(is_used)
+
+
+def _count_of(path: Path, wanted: Manifest) -> int:
+    """Return how many rows of a file the manifest beside it says to use."""
+    manifest = path.parent / wanted.file
+    where = f"{path.parent}/{quote_name(wanted.file)}"
+    if manifest.name != wanted.file:
+        raise LogError(f"{where}: expected the name of a file beside the log, not a path")
+    try:
+        lines = read_at_most(manifest, LARGEST_MANIFEST_BYTES).decode("utf-8-sig").splitlines()
+        table = csv.reader(lines, strict=True)
+        names = next(table, [])
+        for name in (wanted.key, wanted.count):
+            if name not in names:
+                found = ", ".join(map(quote_name, names[:10]))
+                raise LogError(f"{where}: column {quote_name(name)}: missing; found {found}")
+        key, count = names.index(wanted.key), names.index(wanted.count)
+        text = next((row[count] for row in table if row[key : key + 1] == [path.name] and row[count:]), None)
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise LogError(f"{where}: cannot be read as a manifest: {error_text(error)}") from error
+    if text is None:
+        raise LogError(f"{where}: column {quote_name(wanted.key)}: {path.name}: missing")
+    try:
+        return int(text)
+    except ValueError as error:
+        found = f"found {quote_value(text)}, expected a whole number"
+        raise LogError(f"{where}: {path.name}: {quote_name(wanted.count)}: {found}") from error
+
+
+def _concatenate(logs: list[FlightLog], sources: list[str]) -> FlightLog:
+    """Return the logs as segments of one."""
     first = logs[0]
     for log, source in zip(logs, sources, strict=True):
         if set(log.channels) != set(first.channels):
@@ -141,18 +180,11 @@ def _joined(logs: list[FlightLog], sources: list[str]) -> FlightLog:
     )
 
 
-def _agreed(flights: list[Flight], sources: list[str]) -> Craft:
-    """Return the craft that all files are of."""
+def _common_craft(flights: list[ImportedFlight], sources: list[str]) -> Craft:
+    """Return the craft that all flights must be of."""
     first = flights[0].craft
     for flight, source in zip(flights, sources, strict=True):
         if flight.craft != first:
-            what = f"{source}: {flight.craft.describe()}"
-            raise LogError(
-                f"{what}; {sources[0]}: {first.describe()}; expected flights of one craft in one log"
-            )
+            found = f"{flight.craft.describe()}; {sources[0]}: {first.describe()}"
+            raise LogError(f"{source}: {found}; expected flights of one craft in one log")
     return first
-
-
-def _json(value: float | str) -> float | str | None:
-    """Return a value as JSON has it: what is unknown is null."""
-    return None if isinstance(value, float) and np.isnan(value) else value

@@ -1,19 +1,27 @@
 """Mapping files: what the columns of a CSV file are, which rows to use, and what is known of the craft.
 
-TOML. Every table and field is in docs/real_logs.md; ``rows`` and ``craft`` serve logs of every format.
+TOML. Every table and field is described in docs/real_logs.md; ``rows`` and ``craft`` apply to logs of every
+format.
 """
 
+import sys
+from collections.abc import Callable, Iterable
+from functools import partial
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
-from flytrack_env.messages import quote_value
-from flytrack_sysid.importing.craft import Craft
-from flytrack_sysid.importing.fields import Fields, read_toml
-from flytrack_sysid.importing.units import TURNED, UNITS
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from flytrack_env.messages import error_text, quote_name, quote_value
+from flytrack_env.toml_file import TomlError, parse_toml, read_text
+from flytrack_sysid.importing.flight import Craft
+from flytrack_sysid.importing.units import TURNED, UNITS, quaternion_from, vector_from
 from flytrack_sysid.log import LogError
+from flytrack_sysid.log_table import LARGEST_NORM_ERROR, Table
 
 SHIPPED = Path(__file__).parent.parent / "mappings"
-# Table of the file: channel of the log, dimension, what the axes belong to.
+# Table of the file: channel of the log, dimension, frame of the axes.
 VECTORS = {
     "position": ("p", "length", "world"),
     "velocity": ("v", "speed", "world"),
@@ -21,61 +29,36 @@ VECTORS = {
     "specific_force": ("f", "acceleration", "body"),
     "rates": ("w", "rate", "body"),
 }
-CSV_ONLY = ("delimiter", "time", "command", "attitude", "battery", *VECTORS)
 NUM_AXES, NUM_STICKS, NUM_QUATERNION = 3, 4, 4
+DIRECTIONS = ("body_to_world", "world_to_body")
+LARGEST_COUNT = 2**53
+LARGEST_NUMBER = sys.float_info.max  # integers in TOML are unbounded
+REQUIRED: Any = object()  # the default of a field that has none
+T = TypeVar("T")
 
 
-class TimeColumn(NamedTuple):
-    """Where time is from: a column and s per unit of it; or, without a column, s per row."""
+class Channel(NamedTuple):
+    """A channel of the log in a CSV file: where it is from and how it is converted.
 
-    column: str | None
-    scale: float
+    table: of the mapping, for messages. name: of ``CHANNELS``, or t. columns: of the file. convert: from the
+    file's table to the channel's columns, (num_rows, n), SI units and our frames.
+    """
 
-
-class Command(NamedTuple):
-    """Columns of roll, pitch, yaw, thrust; the values that mean -1 and 1; whether to clip what is beyond."""
-
+    table: str
+    name: str
     columns: tuple[str, ...]
-    low: tuple[float, ...]
-    high: tuple[float, ...]
-    clip: bool
-
-
-class Vector(NamedTuple):
-    """Columns of x, y, z; SI units per unit of each, with its sign; whether the axes are FRD or NED."""
-
-    columns: tuple[str, ...]
-    scales: tuple[float, ...]
-    is_turned: bool
-
-
-class Attitude(NamedTuple):
-    """Columns of a quaternion (order ``wxyz`` or ``xyzw``), or of roll, pitch, yaw (order ``euler``)."""
-
-    columns: tuple[str, ...]
-    order: str
-    scales: tuple[float, ...]
-    is_inverted: bool
-    is_body_turned: bool
-    is_world_turned: bool
-
-
-class Battery(NamedTuple):
-    """A column of voltages and V per unit of it."""
-
-    column: str
-    scale: float
+    convert: Callable[[Table], np.ndarray]
 
 
 class Manifest(NamedTuple):
-    """A CSV file beside the logs with, per file name (``key``), how many rows to use (``count``)."""
+    """A CSV file beside the logs: the column of file names (``key``) and that of rows to use (``count``)."""
 
     file: str
     key: str
     count: str  # type: ignore[assignment]  # hides tuple.count
 
 
-class Rows(NamedTuple):
+class UsedRows(NamedTuple):
     """Which rows to use: ``count`` from ``first`` on, of those from ``from_s`` to ``to_s``, every n-th.
 
     Seconds count from the first row of the file, rows from 0. None: to the end.
@@ -89,24 +72,114 @@ class Rows(NamedTuple):
     manifest: Manifest | None = None
 
 
-class Columns(NamedTuple):
-    """What the columns of a CSV file are; channels that are not named are not there."""
-
-    delimiter: str
-    time: TimeColumn
-    command: Command
-    vectors: dict[str, Vector]
-    attitude: Attitude | None
-    battery: Battery | None
-
-
 class Mapping(NamedTuple):
-    """A mapping file: ``columns`` is None in one that has no CSV tables."""
+    """A mapping file: ``channels`` and ``delimiter`` are of its CSV tables; no channels if it has none."""
 
     source: str = "no mapping"
-    rows: Rows = Rows()
+    rows: UsedRows = UsedRows()
     craft: Craft = Craft()
-    columns: Columns | None = None
+    channels: tuple[Channel, ...] = ()
+    delimiter: str = ","
+
+
+class Fields:
+    """One table of a TOML file; fields are taken by name, and what is left at the end is refused."""
+
+    def __init__(self, source: str, name: str, table: Any):
+        self.source, self.name = source, name
+        if not isinstance(table, dict):
+            raise self.error("", f"found {quote_value(table)}, expected a table")
+        self.left, self.known = dict(table), list[str]()
+
+    def error(self, field: str, text: str) -> LogError:
+        """Return the error about one field, or about the table itself."""
+        where = ".".join(part for part in (self.name, field) if part)
+        return LogError(f"{self.source}: {where}: {text}")
+
+    def __contains__(self, field: str) -> bool:
+        return field in self.left
+
+    def take(
+        self, field: str, is_valid: Callable[[Any], bool], expected: str, default: Any = REQUIRED
+    ) -> Any:
+        """Return the valid value of a field, or the default of an absent one."""
+        self.known.append(field)
+        if field not in self.left:
+            if default is REQUIRED:
+                raise self.error(field, f"missing, expected {expected}")
+            return default
+        value = self.left.pop(field)
+        if not is_valid(value):
+            raise self.error(field, f"found {quote_value(value)}, expected {expected}")
+        return value
+
+    def table(self, field: str, read: Callable[["Fields"], T]) -> T | None:
+        """Return what a function reads from a sub-table, all of whose fields it must take; None if absent."""
+        content = self.take(field, lambda value: True, "a table", None)
+        if content is None:
+            return None
+        fields = Fields(self.source, f"{self.name}.{field}" if self.name else field, content)
+        found = read(fields)
+        fields.check_empty()
+        return found
+
+    def check_empty(self) -> None:
+        """Raise LogError for a field that was not taken."""
+        for field in self.left:
+            raise self.error(quote_name(field), f"unknown; expected one of {', '.join(self.known)}")
+
+    def text(self, field: str) -> str:
+        """Return a text that is not empty."""
+        return str(self.take(field, _is_text, "a text"))
+
+    def choice(self, field: str, choices: Iterable[str], default: Any = REQUIRED) -> str:
+        """Return one of several words."""
+        words = tuple(choices)
+        return str(self.take(field, words.__contains__, f"one of {', '.join(words)}", default))
+
+    def number(self, field: str, default: Any = REQUIRED, above: float = -LARGEST_NUMBER) -> Any:
+        """Return a finite number above a bound, as a float, or the default."""
+        value = self.take(field, partial(_is_number, above=above), f"a number{_bound(above)}", default)
+        return value if value is default else float(value)
+
+    def count(self, field: str, default: int | None, least: int) -> Any:
+        """Return a whole number that is at least a bound, or the default."""
+        expected = f"a whole number of at least {least}, below 2^53"
+        return self.take(field, partial(_is_count, least=least), expected, default)
+
+    def numbers(self, field: str, size: int, default: Any = REQUIRED, above: float = -LARGEST_NUMBER) -> Any:
+        """Return a tuple of finite numbers above a bound, or the default."""
+
+        def is_valid(value: Any) -> bool:
+            return isinstance(value, list) and len(value) == size and all(_is_number(n, above) for n in value)
+
+        value = self.take(field, is_valid, f"{size} numbers{_bound(above)}", default)
+        return value if value is default else tuple(map(float, value))
+
+    def names(self, field: str, size: int) -> tuple[str, ...]:
+        """Return a tuple of different names."""
+
+        def is_valid(value: Any) -> bool:
+            return isinstance(value, list) and all(map(_is_text, value)) and len(set(value)) == size
+
+        return tuple(self.take(field, is_valid, f"{size} different names of columns"))
+
+
+def _is_text(value: Any) -> bool:
+    return isinstance(value, str) and bool(value)
+
+
+def _is_number(value: Any, above: float) -> bool:
+    is_number = isinstance(value, (int, float)) and not isinstance(value, bool)
+    return is_number and above < value <= LARGEST_NUMBER  # false for NaN too
+
+
+def _is_count(value: Any, least: int) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool) and least <= value < LARGEST_COUNT
+
+
+def _bound(above: float) -> str:
+    return f" above {above:g}" if above > -LARGEST_NUMBER else ""
 
 
 def load_mapping(where: str | Path) -> Mapping:
@@ -121,43 +194,55 @@ def load_mapping(where: str | Path) -> Mapping:
         path = shipped
     if not path.exists():
         names = ", ".join(sorted(file.stem for file in SHIPPED.glob("*.toml")))
-        raise LogError(f"{path}: no such mapping file, nor one that is shipped ({names})")
-    top = Fields(str(path), "", read_toml(path))
-    has_csv = any(name in top for name in CSV_ONLY)
-    rows, craft = _rows(top.table("rows")), _craft(top.table("craft"))
-    columns = _columns(top) if has_csv else None
-    top.known += [name for name in CSV_ONLY if name not in top.known]
-    top.done()
-    return Mapping(str(path), rows, craft, columns)
+        raise LogError(f"{path}: found no such mapping file; shipped ones are {names}")
+    try:
+        content = parse_toml(read_text(path))
+    except (OSError, UnicodeDecodeError, TomlError) as error:
+        raise LogError(f"{path}: not a readable TOML file: {error_text(error)}") from error
+    top = Fields(str(path), "", content)
+    mapping = Mapping(
+        source=str(path),
+        rows=top.table("rows", _rows) or UsedRows(),
+        craft=top.table("craft", _craft) or Craft(),
+        channels=_channels(top),
+        delimiter=top.take(
+            "delimiter", lambda value: _is_text(value) and len(value) == 1, "one character", ","
+        ),
+    )
+    top.check_empty()
+    return mapping
 
 
-def _rows(fields: Fields | None) -> Rows:
-    if fields is None:
-        return Rows()
-    manifest = fields.table("manifest")
-    found = Rows(
+def _channels(top: Fields) -> tuple[Channel, ...]:
+    """Return what the CSV tables say, nothing if there are none."""
+    found = [top.table("time", _time), top.table("command", _command)]
+    for table, (name, dimension, frame) in VECTORS.items():
+        found.append(top.table(table, partial(_vector, name=name, dimension=dimension, frame=frame)))
+    found += [top.table("attitude", _attitude), top.table("battery", _battery)]
+    channels = tuple(channel for channel in found if channel is not None)
+    for table, channel in zip(("time", "command"), found, strict=False):
+        if channels and channel is None:
+            raise top.error(table, "missing, expected a table: every log has it")
+    return channels
+
+
+def _rows(fields: Fields) -> UsedRows:
+    found = UsedRows(
         first=fields.count("first", 0, 0),
         count=fields.count("count", None, 1),
         every=fields.count("every", 1, 1),
         from_s=fields.number("from_s", 0.0),
         to_s=fields.number("to_s", None, above=0.0),
-        manifest=None if manifest is None else _manifest(manifest),
+        manifest=fields.table(
+            "manifest", lambda table: Manifest(table.text("file"), table.text("key"), table.text("count"))
+        ),
     )
-    if found.count is not None and manifest is not None:
+    if found.count is not None and found.manifest is not None:
         raise fields.error("count", "found together with manifest, expected one of them")
-    fields.done()
     return found
 
 
-def _manifest(fields: Fields) -> Manifest:
-    found = Manifest(fields.text("file"), fields.text("key"), fields.text("count"))
-    fields.done()
-    return found
-
-
-def _craft(fields: Fields | None) -> Craft:
-    if fields is None:
-        return Craft()
+def _craft(fields: Fields) -> Craft:
     found = Craft(
         max_rate_deg_s=fields.numbers("max_rate_deg_s", NUM_AXES, None, above=0.0),
         mass_kg=fields.number("mass_kg", None, above=0.0),
@@ -165,106 +250,103 @@ def _craft(fields: Fields | None) -> Craft:
     )
     if found.voltage_v is not None and found.voltage_v[0] >= found.voltage_v[1]:
         raise fields.error("voltage_v", f"found {list(found.voltage_v)}, expected the lower one first")
-    fields.done()
     return found
-
-
-def _columns(top: Fields) -> Columns:
-    time, command = top.table("time"), top.table("command")
-    if time is None or command is None:
-        name = "time" if time is None else "command"
-        raise top.error(name, "missing, expected a table: every log has it")
-    tables = {name: top.table(name) for name in VECTORS}
-    attitude, battery = top.table("attitude"), top.table("battery")
-    delimiter = top.text("delimiter", ",")
-    if len(delimiter) != 1:
-        raise top.error("delimiter", f"found {quote_value(delimiter)}, expected one character")
-    return Columns(
-        delimiter=delimiter,
-        time=_time(time),
-        command=_command(command),
-        vectors={VECTORS[name][0]: _vector(name, fields) for name, fields in tables.items() if fields},
-        attitude=None if attitude is None else _attitude(attitude),
-        battery=None if battery is None else _battery(battery),
-    )
 
 
 def _scale(fields: Fields, dimension: str) -> float:
-    """Return SI units per unit, of ``unit`` (a known one) or ``scale`` (a number), of which one is there."""
+    """Return SI units per unit, by ``unit`` (a known one) or ``scale`` (a number)."""
     if "scale" in fields and "unit" in fields:
         raise fields.error("scale", "found together with unit, expected one of them")
     if "scale" in fields:
-        return fields.number("scale", above=0.0)
-    return UNITS[dimension][fields.choice("unit", tuple(UNITS[dimension]))]
+        return float(fields.number("scale", above=0.0))
+    return UNITS[dimension][fields.choice("unit", UNITS[dimension])]
 
 
-def _signs(fields: Fields) -> tuple[float, ...]:
-    signs = fields.numbers("signs", NUM_AXES, (1.0,) * NUM_AXES)
-    if any(abs(sign) != 1.0 for sign in signs):
-        raise fields.error("signs", f"found {list(signs)}, expected 1 or -1 each")
-    return signs
+def _signed_scales(fields: Fields, dimension: str) -> np.ndarray:
+    scale, signs = _scale(fields, dimension), np.array(fields.numbers("signs", NUM_AXES, (1.0,) * NUM_AXES))
+    if np.any(np.abs(signs) != 1.0):
+        raise fields.error("signs", f"found {signs.tolist()}, expected 1 or -1 each")
+    return scale * signs
 
 
-def _time(fields: Fields) -> TimeColumn:
+def _time(fields: Fields) -> Channel:
+    """Return time from 0 on: large numbers of us would cost digits."""
     if ("column" in fields) == ("step_s" in fields):
         raise fields.error("", "expected either column, with its unit, or step_s, of one row")
     if "step_s" in fields:
-        found = TimeColumn(None, fields.number("step_s", above=0.0))
-    else:
-        found = TimeColumn(fields.text("column"), _scale(fields, "time"))
-    fields.done()
-    return found
+        step_s = fields.number("step_s", above=0.0)
+        return Channel(fields.name, "t", (), lambda table: np.arange(len(table.lines))[:, None] * step_s)
+    column, scale = fields.text("column"), _scale(fields, "time")
+
+    def convert(table: Table) -> np.ndarray:
+        values = table.matrix([column])
+        return (values - values[0]) * scale
+
+    return Channel(fields.name, "t", (column,), convert)
 
 
-def _command(fields: Fields) -> Command:
-    found = Command(
-        columns=fields.names("columns", NUM_STICKS),
-        low=fields.numbers("low", NUM_STICKS, (-1.0,) * NUM_STICKS),
-        high=fields.numbers("high", NUM_STICKS, (1.0,) * NUM_STICKS),
-        clip=fields.flag("clip"),
+def _battery(fields: Fields) -> Channel:
+    column, scale = fields.text("column"), _scale(fields, "voltage")
+    return Channel(fields.name, "v_bat", (column,), lambda table: table.matrix([column]) * scale)
+
+
+def _command(fields: Fields) -> Channel:
+    """Return the commands, scaled so that ``low`` and ``high`` are -1 and 1."""
+    columns = fields.names("columns", NUM_STICKS)
+    low = np.array(fields.numbers("low", NUM_STICKS, (-1.0,) * NUM_STICKS))
+    high = np.array(fields.numbers("high", NUM_STICKS, (1.0,) * NUM_STICKS))
+    is_clipped = fields.take("clip", lambda value: isinstance(value, bool), "true or false", False)
+    if np.any(low == high):
+        raise fields.error("high", f"found {high.tolist()}, expected other values than low")
+    least, most = np.minimum(low, high), np.maximum(low, high)
+
+    def convert(table: Table) -> np.ndarray:
+        values = table.matrix(columns)
+        if is_clipped:
+            values = np.clip(values, least, most)
+        for row, stick in np.argwhere((values < least) | (values > most))[:1]:
+            text = f"found {values[row, stick]:g}, expected {low[stick]:g} to {high[stick]:g} by command.low"
+            text += " and command.high; clip = true limits it"
+            raise table.error(row, quote_name(columns[stick]), text)
+        return 2.0 * (values - low) / (high - low) - 1.0
+
+    return Channel(fields.name, "u", columns, convert)
+
+
+def _vector(fields: Fields, name: str, dimension: str, frame: str) -> Channel:
+    columns = fields.names("columns", NUM_AXES)
+    scales = _signed_scales(fields, dimension)
+    is_turned = TURNED[frame][fields.choice("frame", TURNED[frame])]
+    return Channel(
+        fields.name, name, columns, lambda table: vector_from(table.matrix(columns) * scales, is_turned)
     )
-    if any(low == high for low, high in zip(found.low, found.high, strict=True)):
-        raise fields.error("high", f"found {list(found.high)}, expected other values than low")
-    fields.done()
-    return found
 
 
-def _vector(name: str, fields: Fields) -> Vector:
-    _, dimension, axes = VECTORS[name]
-    scale = _scale(fields, dimension)
-    found = Vector(
-        columns=fields.names("columns", NUM_AXES),
-        scales=tuple(scale * sign for sign in _signs(fields)),
-        is_turned=TURNED[axes][fields.choice("frame", tuple(TURNED[axes]))],
-    )
-    fields.done()
-    return found
-
-
-def _attitude(fields: Fields) -> Attitude:
+def _attitude(fields: Fields) -> Channel:
+    """Return the quaternions; Euler angles turn by yaw, then pitch, then roll, about moving axes."""
     if ("quaternion" in fields) == ("euler" in fields):
         raise fields.error("", "expected either quaternion, with its order, or euler, with its unit")
     if "euler" in fields:
-        scale = _scale(fields, "angle")
         columns, order = fields.names("euler", NUM_AXES), "euler"
-        scales = tuple(scale * sign for sign in _signs(fields))
+        scales = _signed_scales(fields, "angle")
     else:
-        columns, scales = fields.names("quaternion", NUM_QUATERNION), (1.0,) * NUM_QUATERNION
+        columns, scales = fields.names("quaternion", NUM_QUATERNION), np.ones(NUM_QUATERNION)
         order = fields.choice("order", ("wxyz", "xyzw"))
-    directions = ("body_to_world", "world_to_body")
-    found = Attitude(
-        columns,
-        order,
-        scales,
-        is_inverted=fields.choice("direction", directions, directions[0]) == directions[1],
-        is_body_turned=TURNED["body"][fields.choice("body", tuple(TURNED["body"]))],
-        is_world_turned=TURNED["world"][fields.choice("world", tuple(TURNED["world"]))],
-    )
-    fields.done()
-    return found
+    is_inverted = fields.choice("direction", DIRECTIONS, DIRECTIONS[0]) == DIRECTIONS[1]
+    is_body_turned = TURNED["body"][fields.choice("body", TURNED["body"])]
+    is_world_turned = TURNED["world"][fields.choice("world", TURNED["world"])]
 
+    def convert(table: Table) -> np.ndarray:
+        values = table.matrix(columns) * scales
+        if order == "euler":
+            rotation = Rotation.from_euler("ZYX", values[:, ::-1])
+        else:
+            norm = np.linalg.norm(values, axis=1)
+            for row in np.flatnonzero(np.abs(norm - 1.0) > LARGEST_NORM_ERROR)[:1]:
+                text = f"found a quaternion of norm {norm[row]:.4g}, expected 1"
+                raise table.error(row, ", ".join(map(quote_name, columns)), text)
+            rotation = Rotation.from_quat(values, scalar_first=order == "wxyz")
+        rotation = rotation.inv() if is_inverted else rotation
+        return quaternion_from(rotation, is_body_turned, is_world_turned)
 
-def _battery(fields: Fields) -> Battery:
-    found = Battery(fields.text("column"), _scale(fields, "voltage"))
-    fields.done()
-    return found
+    return Channel(fields.name, "q", columns, convert)

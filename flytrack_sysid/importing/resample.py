@@ -1,21 +1,21 @@
-"""Several clocks' samples on one time base, without smoothing; what was lost stays lost."""
+"""Samples of several clocks on one time base, without smoothing or filling of gaps."""
 
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
-LONGEST_BRIDGE_STEPS = 3.0  # of a channel's usual step: what is missing for longer is not made up
+LONGEST_BRIDGE_STEPS = 3.0  # of a channel's usual step: longer gaps are not interpolated
 
 
-def growing(times: np.ndarray) -> np.ndarray:
-    """Return which of the times (num_rows,) are later than all before, bool; loggers repeat and reorder."""
+def is_increasing(times: np.ndarray) -> np.ndarray:
+    """Return which of the times (num_rows,) are later than all before; loggers repeat and reorder."""
     latest = np.maximum.accumulate(times)
     return np.concatenate([[True], times[1:] > latest[:-1]])[: len(times)]
 
 
-def brackets(times: np.ndarray, at: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _brackets(times: np.ndarray, at: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the rows before and after each of the times ``at``, and whether both are near, (num_at,) each.
 
-    times: growing. Near: less than three usual steps of the channel lie between the two rows.
+    times: increasing. Near: at most three usual steps of the channel lie between the two rows.
     """
     after = np.clip(np.searchsorted(times, at, side="left"), 1, max(len(times) - 1, 1))
     if len(times) < 2:
@@ -27,11 +27,11 @@ def brackets(times: np.ndarray, at: np.ndarray) -> tuple[np.ndarray, np.ndarray,
 
 
 def interpolate(times: np.ndarray, values: np.ndarray, at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return values (num_rows, n) on the straight line between their neighbours, and where that is known.
+    """Return linearly interpolated values (num_at, n) and where they are known, (num_at,) bool.
 
-    Exact at a sample's own time. Returns (num_at, n) and (num_at,) bool.
+    values: (num_rows, n). Exact at a sample's own time.
     """
-    before, after, is_known = brackets(times, at)
+    before, after, is_known = _brackets(times, at)
     span = np.where(after > before, times[after] - times[before], 1.0)
     fraction = np.clip((at - times[before]) / span, 0.0, 1.0)[:, None]
     return values[before] + fraction * (values[after] - values[before]), is_known
@@ -40,8 +40,8 @@ def interpolate(times: np.ndarray, values: np.ndarray, at: np.ndarray) -> tuple[
 def interpolate_quaternions(
     times: np.ndarray, quat: np.ndarray, at: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return quaternions (num_at, 4) on the arc between their neighbours, and where that is known."""
-    _, _, is_known = brackets(times, at)
+    """Return quaternions (num_at, 4) on the arc between their neighbours, and where they are known."""
+    _, _, is_known = _brackets(times, at)
     found = np.tile(quat[:1], (len(at), 1))
     if is_known.any():
         arcs = Slerp(times, Rotation.from_quat(quat, scalar_first=True))
@@ -50,9 +50,9 @@ def interpolate_quaternions(
 
 
 def hold(times: np.ndarray, values: np.ndarray, at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the last of the values (num_rows, n) before each time, or at it, and where it is fresh.
+    """Return the last of the values (num_rows, n) up to each time, as commands act, and where it is known.
 
-    As commands act. Fresh: not older than three usual steps of the channel. Returns (num_at, n), (num_at,).
+    Known: not older than three usual steps of the channel. Returns (num_at, n), (num_at,) bool.
     """
     last = np.searchsorted(times, at, side="right") - 1
     longest = LONGEST_BRIDGE_STEPS * (np.median(np.diff(times)) if len(times) > 1 else np.inf)

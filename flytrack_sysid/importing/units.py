@@ -1,4 +1,4 @@
-"""Units and frames of other people's logs, and the way from them to ours.
+"""Conversion of units and frames to ours.
 
 Ours: SI units; world z up, body x forward, y left, z up; quaternions (w, x, y, z), body to world. A world
 with z up is ours whichever way its x points (north, east, or where the drone stood).
@@ -20,7 +20,7 @@ UNITS: dict[str, dict[str, float]] = {
     "acceleration": {"m/s^2": 1.0, "g": GRAVITY, "mg": 1e-3 * GRAVITY},
     "voltage": {"V": 1.0, "dV": 0.1, "cV": 1e-2, "mV": 1e-3},
 }
-# Half a turn about x leads from each to ours, and back.
+# Half a turn about x converts each to ours, and back.
 TURNED = {"body": {"flu": False, "frd": True}, "world": {"z_up": False, "ned": True}}
 AXES_TURNED = np.array([1.0, -1.0, -1.0])
 HALF_TURN = Rotation.from_rotvec([np.pi, 0.0, 0.0])
@@ -40,10 +40,10 @@ def quaternion_from(attitude: Rotation, is_body_turned: bool, is_world_turned: b
         attitude = HALF_TURN * attitude
     if is_body_turned:
         attitude = attitude * HALF_TURN
-    return continuous(attitude.as_quat(scalar_first=True))
+    return _continuous(attitude.as_quat(scalar_first=True))
 
 
-def continuous(quat: np.ndarray) -> np.ndarray:
+def _continuous(quat: np.ndarray) -> np.ndarray:
     """Return quaternions (num_rows, 4) with signs so that neighbours are close, the first with w >= 0."""
     flips = np.sum(quat[1:] * quat[:-1], axis=1) < 0.0
     first = quat[:1, 0] < 0.0
