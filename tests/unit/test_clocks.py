@@ -1,7 +1,5 @@
 """Offsets between sensors' clocks: found, corrected, and never made of the plant's lag."""
 
-import tracemalloc
-
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -30,10 +28,10 @@ def test_clock_offsets_between_sensors_are_found_and_corrected(truth, late_s):
         assert np.sqrt(np.mean((aligned[name] - truth[name][rows]) ** 2)) < bound, name
 
 
-def test_standard_errors_are_honest(truth):
-    found = [one for seed in range(8) for one in clocks.align_clocks(noisy(truth, seed))[1]]
+def test_standard_errors_are_those_of_other_draws_of_the_noise(truth):
+    found = [one for seed in range(4) for one in clocks.align_clocks(noisy(truth, seed))[1]]
     scores = np.array([one.offset_s / one.sigma_s for one in found])
-    assert len(scores) == 24 and 0.5 < scores.std() < 1.6 and np.mean(np.abs(scores) > 3.0) < 0.1
+    assert len(scores) == 12 and 0.5 < scores.std() < 1.6 and np.mean(np.abs(scores) > 3.0) < 0.1
 
 
 def test_clocks_that_agree_are_left(truth):
@@ -42,7 +40,7 @@ def test_clocks_that_agree_are_left(truth):
     np.testing.assert_array_equal(aligned["q"], truth["q"])
 
 
-def test_lag_of_the_plant_is_no_clock_offset(truth):
+def test_lag_of_the_plant_is_not_a_clock_offset(truth):
     later = FlightLog(truth.time, {**truth.channels, "u": np.roll(truth["u"], 20, axis=0)}, truth.segment)
     found, other = clocks.align_clocks(truth)[1], clocks.align_clocks(later)[1]
     assert found == other and all(one.verdict == "not significant, left" for one in found)
@@ -70,17 +68,3 @@ def test_crazyflie_attitude_is_late_by_the_same_on_every_axis():
     assert 0.004 < mean_s < 0.008
     for one in found:
         assert abs(one.offset_s - mean_s) < 3.0 * one.sigma_s + 5e-4, one.describe()
-
-
-def test_steps_of_days_need_no_memory(truth):
-    """A table of all seconds between the rows was made."""
-    half = np.arange(len(truth)) < len(truth) // 2
-    time = np.where(half, truth.time, truth.time + 1e6 * np.cumsum(~half))
-    apart = FlightLog(time, dict(truth.channels), truth.segment)
-    tracemalloc.start()
-    try:
-        clocks.align_clocks(apart)
-        peak_bytes = tracemalloc.get_traced_memory()[1]
-    finally:
-        tracemalloc.stop()
-    assert peak_bytes < 2**28

@@ -98,30 +98,24 @@ def test_rates_at_full_stick_are_the_firmwares(rates_type, rc_rate, super_rate, 
     ("content", "message"),
     [
         (b"", r"a\.bbl: found b'' first, expected b'H Product:Blackbox'"),
-        (b"time,x\n", r"a\.bbl: found b'time,x\\n' first"),
-        (log_with()[:-200], r"a\.bbl: log 1 of 1: cut off: found no end-of-log event in \d+ bytes"),
-        (log_with() + log_with()[:-200], r"a\.bbl: log 2 of 2: cut off"),
+        (log_with() + log_with()[:-200], r"a\.bbl: log 2 of 2: cut off: found no end-of-log event in \d+ b"),
         (log_with().replace(b"encoding:1", b"encoding:77"), r"a\.bbl: damaged, cannot be decoded"),
         (log_with(rows=frames(0)), r"a\.bbl: (found no frames|damaged)"),
         (
             log_with(**{"Firmware revision": "INAV 7.1"}),
-            r"Firmware revision: found 'INAV 7\.1', expected Beta",
+            r"Firmware revision: found 'INAV 7\.1', exp",
         ),
         (log_with(rc_rates=None), r"a\.bbl: header rc_rates: missing, so full stick is unknown"),
         (log_with(rates="0,70"), r"a\.bbl: header rates: found \[0, 70\], expected 3 numbers"),
         (log_with(rates_type="9"), r"a\.bbl: header rates_type: found 9, expected below 5"),
         (log_with(rc_rates="0,0,0"), r"full stick at \(0\.0, 0\.0, 0\.0\) deg/s"),
         (log_with(acc_1G=None), r"a\.bbl: header acc_1G: found None, expected 1 numbers of at least 0"),
-        (log_with(acc_1G="1e999"), r"a\.bbl: header acc_1G: found inf, expected 1 numbers"),
-        (log_with(**{"Firmware revision": "x" * 5000}), r"Firmware revision: found 'xxx.{1,60}, expected"),
-        (log_with(names=[*NAMES[:-1], "y" * 5000]), r"accSmooth\[2\]: missing; found .{1,1000}$"),
-        (log_with(names=[NAMES[0], "\x1b[2J", *NAMES[2:]]), r"field time: missing; found [ -~]+$"),
         (log_with(acc_1G="0"), r"a\.bbl: header acc_1G: found 0, expected"),
-        (log_with(names=[*NAMES[:-1], "x"]), r"a\.bbl: field accSmooth\[2\]: missing; found loopIteration"),
+        (log_with(names=[NAMES[0], "\x1b[2J", *NAMES[2:]]), r"field time: missing; found [ -~]+$"),
         (log_with(rc_rates="50,50,50"), r"column u_roll: found 5\.11, expected a command in \[-1, 1\]"),
     ],
 )
-def test_what_cannot_be_meant_is_refused(tmp_path, content, message):
+def test_wrong_files_are_refused(tmp_path, content, message):
     with pytest.raises(LogError, match=message):
         import_log(write(tmp_path / "a.bbl", content), "betaflight")
 
@@ -134,11 +128,6 @@ def test_headers_that_make_the_decoder_wait_for_ever_are_refused_in_time(tmp_pat
         LogError, match=r"a\.bbl: damaged, cannot be decoded: took more than 1 s of processor"
     ):
         import_log(path, "betaflight")
-
-
-def test_large_files_may_take_longer_to_decode():
-    assert decoding.limits_of(2**20 - 1).cpu_s == ResourceLimits().cpu_s < decoding.limits_of(2**20).cpu_s
-    assert decoding.limits_of(2**24).memory_bytes > ResourceLimits().memory_bytes
 
 
 def test_a_missing_file_or_package_is_named(tmp_path, monkeypatch):
@@ -182,14 +171,9 @@ def test_real_log_holds_what_another_decoder_found(real):
         np.testing.assert_allclose(force_g, decoded[f"accSmooth[{axis}]"] / 2048, atol=1e-9)
     np.testing.assert_allclose(every["v_bat"][:, 0], decoded["vbatLatest"] / 100, atol=1e-9)
     np.testing.assert_allclose(500.0 * (every["u"][:, 3] + 1.0), decoded["setpoint[3]"], atol=1e-9)
-
-
-def test_real_log_reaches_full_stick_where_its_header_says(real):
-    found, decoded = real
-    assert found.craft.max_rate_deg_s == pytest.approx((1021.6, 1021.6, 772.96))
-    for axis in (0, 1):
-        assert decoded[f"setpoint[{axis}]"].max() == 1022  # 1021.6, in whole numbers
-        assert found.log["u"][:, axis].max() == 1.0
+    assert real[0].craft.max_rate_deg_s == pytest.approx((1021.6, 1021.6, 772.96))
+    for axis in (0, 1):  # the largest setpoint is full stick, in whole numbers
+        assert decoded[f"setpoint[{axis}]"].max() == 1022 and log["u"][:, axis].max() == 1.0
 
 
 def test_real_log_turns_where_it_is_told_to_and_its_frame_is_ours(real):

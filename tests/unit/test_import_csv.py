@@ -3,7 +3,6 @@
 import csv
 import gzip
 import json
-import time
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from flytrack_env import load_model, nominal_parameters
 from flytrack_sysid import FlightLog, LogError, import_log, load_log
 from flytrack_sysid.cli import main
-from flytrack_sysid.importing.craft import Craft, nominal_model
+from flytrack_sysid.importing.flight import Craft
 from tests.support.made_flight import GRAVITY, TIME_S, flight
 from tests.support.real_logs import CRAZYFLIE, shared
 
@@ -154,14 +153,10 @@ def test_rows_are_chosen_and_files_become_segments(folder, tmp_path):
         ('column = "ms"', 'column = "us"', r"flight\.csv: column us: found 0 times.*map\.toml: time"),
         ('"ax", "ay", "az"', '"ax", "ay"', r"specific_force\.columns: .*expected 3 different names"),
         ('frame = "frd"', 'frame = "ned"', r"specific_force\.frame: found 'ned', expected one of flu, frd"),
-        ('order = "xyzw"\n', "", r"attitude\.order: missing, expected wxyz or xyzw"),
+        ('order = "xyzw"\n', "", r"attitude\.order: missing, expected one of wxyz, xyzw"),
         ("[time]", "[times]", r"map\.toml: time: missing"),
-        ("[battery]", "[batery]", r"map\.toml: batery: unknown; expected of rows, craft"),
-        (
-            "low = [1000",
-            "low = [1600",
-            r"flight\.csv: row \d+ \(line \d+\), column ail: found 1\d+.*, expected 1600",
-        ),
+        ("[battery]", "[batery]", r"map\.toml: batery: unknown; expected one of rows, craft"),
+        ("low = [1000", "low = [1600", r"csv: row \d+ \(line \d+\), column ail: found 1\d+.*, expected 1600"),
         ("high = [2000", "high = [1000", r"command\.high: found .*expected other values than low"),
         ("mass_kg = 0.5", "mass_kg = -1", r"craft\.mass_kg: found -1, expected a number above 0"),
         ("[14.0, 16.8]", "[16.8, 14.0]", r"craft\.voltage_v: .*lower one first"),
@@ -169,25 +164,13 @@ def test_rows_are_chosen_and_files_become_segments(folder, tmp_path):
         ('unit = "ms"', 'unit = "ms"\nstep_s = 0.1', r"time: expected either column.* or step_s"),
         ('unit = "deg/s"', 'unit = "deg/s"\nsigns = [1, 2, 1]', r"rates\.signs: .*expected 1 or -1"),
         ('"qx", "qy", "qz", "qw"', '"n", "e", "d", "qw"', r"row 0 \(line 2\), column n, e, d, qw: .*norm"),
-        (
-            "[craft]",
-            "[rows]\nfirst = 5000\n[craft]",
-            r"map\.toml: rows: none of the 300 rows of .*flight\.csv",
-        ),
+        ("[craft]", "[rows]\nfirst = 5000\n[craft]", r"map\.toml: rows: none of the 300 rows of .*csv"),
         ("[time]", "[time", r"map\.toml: not a readable TOML file"),
-        ("[time]", "x = " + "[" * 9000 + "\n[time]", r"map\.toml: not a readable TOML file"),
-        ("[time]", "a" + ".a" * 5000 + " = 1\n[time]", r"map\.toml: not a readable TOML file: found lines"),
-        (
-            "mass_kg = 0.5",
-            "mass_kg = 1" + "0" * 400,
-            r"craft\.mass_kg: found 1000.*, expected a number above 0",
-        ),
-        ("mass_kg = 0.5", "mass_kg = 0x" + "f" * 5000, "mass_kg: found a number of thousands of digits"),
+        ("mass_kg = 0.5", "mass_kg = 1" + "0" * 400, r"craft\.mass_kg: found 1000.*, expected a number"),
         ("[craft]", "[rows]\nfirst = 0xffffffffffffffffff\n[craft]", r"rows\.first: .*below 2\^53"),
-        ("[battery]", '["' + "y" * 5000 + '"]', r"map\.toml: 'yyy.{1,80}: unknown; expected of"),
     ],
 )
-def test_mappings_that_cannot_be_meant_are_refused(folder, tmp_path, old, new, message):
+def test_wrong_mappings_are_refused(folder, tmp_path, old, new, message):
     assert old in MAPPING
     (tmp_path / "map.toml").write_text(MAPPING.replace(old, new, 1))
     with pytest.raises(LogError, match=message):
@@ -199,13 +182,14 @@ def test_mappings_that_cannot_be_meant_are_refused(folder, tmp_path, old, new, m
     [
         (4, lambda cells: [*cells[:3], "", *cells[4:]], r"row 3 \(line 5\), column d: found an empty cell"),
         (4, lambda cells: [*cells[:3], "x", *cells[4:]], r"row 3 \(line 5\), column d: found 'x'"),
-        (4, lambda cells: [*cells[:3], "nan", *cells[4:]], r"row 3 \(line 5\), column d: found nan"),
+        (4, lambda cells: [*cells[:3], "nan", *cells[4:]], r"row 3 \(line 5\), column d: found 'nan'"),
         (4, lambda cells: cells[:5], r"row 3 \(line 5\): found 5 cells, expected 22"),
         (4, lambda cells: ["0", *cells[1:]], r"row 3 \(line 5\), column t: found -5\.0.*later time"),
+        (4, lambda cells: ["," * 2**16], r"near line 5: not a CSV file: found a row of 65536 characters"),
         (0, lambda cells: ["ms", *cells[:-1]], r"column n: found .*|column ms: found 2 times"),
     ],
 )
-def test_cells_that_cannot_be_meant_are_refused(folder, tmp_path, row, change, message):
+def test_wrong_cells_are_refused(folder, tmp_path, row, change, message):
     lines = (folder / "flight.csv").read_text().splitlines()
     lines[row] = ",".join(change(lines[row].split(",")))
     (tmp_path / "bad.csv").write_text("\n".join(lines))
@@ -213,88 +197,51 @@ def test_cells_that_cannot_be_meant_are_refused(folder, tmp_path, row, change, m
         import_log(tmp_path / "bad.csv", "csv", folder / "map.toml")
 
 
-def test_files_that_are_missing_cut_off_or_unmapped_are_refused(folder, tmp_path):
-    with pytest.raises(LogError, match=r"no\.csv: cannot be read as text"):
-        import_log(tmp_path / "no.csv", "csv", folder / "map.toml")
-    with pytest.raises(LogError, match=r"no\.toml: no such mapping file.*crazyflie_phoenix"):
-        import_log(folder / "flight.csv", "csv", tmp_path / "no.toml")
-    with pytest.raises(LogError, match=r"flight\.csv: no mapping names no columns"):
-        import_log(folder / "flight.csv", "csv")
+def test_missing_truncated_and_unmapped_files_are_refused(folder, tmp_path):
     packed = gzip.compress((folder / "flight.csv").read_bytes())
     (tmp_path / "cut.csv.gz").write_bytes(packed[: len(packed) // 2])
-    with pytest.raises(LogError, match=r"cut\.csv\.gz: cannot be read as text"):
-        import_log(tmp_path / "cut.csv.gz", "csv", folder / "map.toml")
-    with pytest.raises(LogError, match="format: found 'mat'"):
-        import_log(folder / "flight.csv", "mat")
-
-
-def test_a_small_file_that_unpacks_to_much_is_refused_on_the_way(folder, tmp_path):
-    header = (folder / "flight.csv").read_text().splitlines()[0]
-    path = tmp_path / "bomb.csv.gz"
-    path.write_bytes(gzip.compress(header.encode() + b"\n" * 2**26, 1))
-    assert path.stat().st_size < 2**19
-    started_s = time.process_time()
-    with pytest.raises(LogError, match=r"bomb\.csv\.gz: .* found more than \d+ characters"):
-        import_log(path, "csv", folder / "map.toml")
-    assert time.process_time() - started_s < 10.0
+    bomb = gzip.compress(",".join(HEADER).encode() + b"\n" * 2**25, 1)
+    (tmp_path / "bomb.csv.gz").write_bytes(bomb)
+    for path, format_name, mapping, message in (
+        (tmp_path / "no.csv", "csv", folder / "map.toml", r"no\.csv: cannot be read as text"),
+        (folder / "flight.csv", "csv", tmp_path / "no.toml", r"no\.toml: found no such .*crazyflie_phoenix"),
+        (folder / "flight.csv", "csv", None, r"flight\.csv: no mapping names no columns"),
+        (tmp_path / "cut.csv.gz", "csv", folder / "map.toml", r"cut\.csv\.gz: cannot be read as text"),
+        (tmp_path / "bomb.csv.gz", "csv", folder / "map.toml", r"bomb\.csv\.gz: .*found more than \d+ char"),
+        (folder / "flight.csv", "mat", None, "format: found 'mat'"),
+        ([], "csv", folder / "map.toml", "found no files"),
+    ):
+        with pytest.raises(LogError, match=message):
+            import_log(path, format_name, mapping)
 
 
 @pytest.mark.parametrize(
-    ("manifest", "message"),
+    ("name", "manifest", "message"),
     [
         (
-            "file,rows\nflight.csv," + "7" * 5000,
-            "rows: found '777.{1,60}, expected a whole number of at most 15",
+            "m.csv",
+            "file,rows\nflight.csv,7x",
+            r"m\.csv: flight\.csv: rows: found '7x', expected a whole number",
         ),
-        ("file,rows\nflight.csv,\u0661x", "rows: found '\u0661x', expected a whole number"),
-        ("file," + "x" * 5000 + "\n", "column rows: missing; found file, 'xxx.{1,100}$"),
-        (
-            "file,rows\n" + "other.csv,1\n" * 2**21,
-            "cannot be read as a manifest: found 25165834 bytes",
-        ),
-        (None, "cannot be read as a manifest"),
-        # Of each line a table of all names would be made.
-        (
-            "file,rows," + ",".join(map(str, range(20_000))) + "\nx" * 20_000,
-            "column file: flight.csv: missing",
-        ),
+        ("m.csv", "file,x\n", r"m\.csv: column rows: missing; found file, x"),
+        ("m.csv", "file,rows\nother.csv,7\n", r"m\.csv: column file: flight\.csv: missing"),
+        ("m.csv", " " * (2**24 + 1), r"m\.csv: cannot be read as a manifest: found 16777217 bytes"),
+        ("none.csv", "", r"none\.csv: cannot be read as a manifest"),
+        ("../m.csv", "", "expected the name of a file beside the log, not a path"),
     ],
 )
-def test_manifests_that_cannot_be_meant_are_refused(folder, tmp_path, manifest, message):
-    started_s = time.process_time()
-    for name in ("flight.csv", "map.toml"):
-        (tmp_path / name).write_bytes((folder / name).read_bytes())
-    with (tmp_path / "map.toml").open("a") as file:
-        file.write('[rows.manifest]\nfile = "manifest.csv"\nkey = "file"\ncount = "rows"\n')
-    if manifest is not None:
-        (tmp_path / "manifest.csv").write_text(manifest, encoding="utf-8")
-    with pytest.raises(LogError, match=rf"manifest\.csv: (flight\.csv: )?{message}"):
+def test_wrong_manifests_are_refused(folder, tmp_path, name, manifest, message):
+    (tmp_path / "flight.csv").write_bytes((folder / "flight.csv").read_bytes())
+    table = f'[rows.manifest]\nfile = "{name}"\nkey = "file"\ncount = "rows"\n'
+    (tmp_path / "map.toml").write_text(MAPPING + table)
+    (tmp_path / "m.csv").write_text(manifest)
+    with pytest.raises(LogError, match=message):
         import_log(tmp_path / "flight.csv", "csv", tmp_path / "map.toml")
-    assert time.process_time() - started_s < 10.0
-
-
-@pytest.mark.parametrize("name", ["/etc/passwd", "../manifest.csv", "a/b.csv"])
-def test_a_manifest_lies_beside_the_log(folder, tmp_path, name):
-    for copied in ("flight.csv", "map.toml"):
-        (tmp_path / copied).write_bytes((folder / copied).read_bytes())
-    with (tmp_path / "map.toml").open("a") as file:
-        file.write(f'[rows.manifest]\nfile = "{name}"\nkey = "file"\ncount = "rows"\n')
-    with pytest.raises(LogError, match="expected the name of a file beside the log, not a path"):
-        import_log(tmp_path / "flight.csv", "csv", tmp_path / "map.toml")
-
-
-def test_voltages_that_are_none_are_not_the_crafts(folder, tmp_path):
-    lines = (folder / "flight.csv").read_text().splitlines()
-    lines[5] = ",".join([*lines[5].split(",")[:-1], "0"])
-    (tmp_path / "flat.csv").write_text("\n".join(lines))
-    (tmp_path / "map.toml").write_text(MAPPING.replace("voltage_v = [14.0, 16.8]", ""))
-    assert import_log(tmp_path / "flat.csv", "csv", tmp_path / "map.toml").craft.voltage_v is None
-    assert import_log(folder / "flight.csv", "csv", tmp_path / "map.toml").craft.voltage_v is not None
 
 
 def test_nominal_model_hovers_where_the_nominal_craft_does():
     nominal = nominal_parameters()
-    craft = nominal_model(Craft((60.0, 50.0, 40.0), 0.03, (3.0, 4.0)), "a log")
+    craft = Craft((60.0, 50.0, 40.0), 0.03, (3.0, 4.0)).nominal_model("a log")
     powers = np.array([1.0, 0.5, 0.25, 0.125])
     for share in (0.9, 1.0):  # of the highest voltage
         own, usual = 4.0 * share, 24.0 * share
@@ -302,8 +249,8 @@ def test_nominal_model_hovers_where_the_nominal_craft_does():
         expected = nominal.thrust_coeffs @ np.array([*powers, usual, 0.5 * usual])
         assert thrust / craft.m == pytest.approx(expected / nominal.m, rel=1e-5)
     assert craft.max_rate.tolist() == [60.0, 50.0, 40.0] and craft.m == 0.03
-    with pytest.raises(LogError, match=r"a log: craft\.mass_kg: not in the log"):
-        nominal_model(Craft((60.0, 50.0, 40.0), None, (3.0, 4.0)), "a log")
+    with pytest.raises(LogError, match=r"a log: craft\.mass_kg: missing"):
+        Craft((60.0, 50.0, 40.0), None, (3.0, 4.0)).nominal_model("a log")
 
 
 def test_command_writes_log_details_and_model(folder, tmp_path, capsys):
@@ -326,20 +273,6 @@ def test_command_keeps_clocks_if_asked(folder, tmp_path, capsys):
         (line,) = (line for line in capsys.readouterr().out.splitlines() if line.startswith("clock of q"))
         assert "+20." in line and verdict in line
         assert abs(len(load_log(tmp_path / "a.npz")) - num_rows) <= 1
-
-
-def test_command_writes_nothing_where_the_model_lacks_a_value(folder, tmp_path, capsys):
-    (tmp_path / "map.toml").write_text(MAPPING.replace("mass_kg = 0.5", ""))
-    arguments = ["import", folder / "flight.csv", "--format", "csv", "--map", tmp_path / "map.toml"]
-    with pytest.raises(SystemExit) as stopped:
-        main(
-            [
-                str(part)
-                for part in (*arguments, "--out", tmp_path / "a.npz", "--model-out", tmp_path / "m.json")
-            ]
-        )
-    assert stopped.value.code == 2 and "craft.mass_kg" in capsys.readouterr().err
-    assert {path.name for path in tmp_path.iterdir()} == {"map.toml"}
 
 
 @pytest.fixture(scope="module")
