@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 
 from flytrack_env import sandbox
+from flytrack_env.extras import check_installed
 from flytrack_env.messages import error_text
 from flytrack_env.npz_file import NpzError, load_npz
-from flytrack_sysid.importing.extra import needed_module
 from flytrack_sysid.log import LogError
 
 DECODERS = Path(__file__).with_name("decoders.py")
@@ -35,7 +35,10 @@ def decode(source: str, format_name: str, path: Path, *rest: Any) -> tuple[Any, 
     Raises:
         LogError: its package is not installed, or it cannot decode the file; the message says why.
     """
-    needed_module(PACKAGES[format_name], "logs", path)
+    try:
+        check_installed("logs", f"{format_name} logs", PACKAGES[format_name])
+    except ImportError as error:
+        raise LogError(f"{source}: {error}") from error
     try:
         limits = limits_of(path.stat().st_size)
         packed = sandbox.run(DECODERS, f"decode_{format_name}", [str(path.absolute()), *rest], limits=limits)

@@ -58,19 +58,19 @@ def test_truth_is_found_without_noise(exact):
     assert tuple(found.intervals) == (*TAUS, *THRUST_COEFFS, DRAIN)
 
 
-# Absent channels; those without the applied action begin each flight with a guess that fades.
-ABSENT = {
-    "p instead of v and a": (("a", "v"), 1e-6),
-    "q instead of w, no applied action": (("w", "uprev", "a", "p"), 1e-3),
-}
-
-
-@pytest.mark.parametrize(("absent", "tolerance"), ABSENT.values(), ids=ABSENT)
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("absent", "tolerance"),
+    [(("a", "v"), 1e-6), (("w", "uprev", "a", "p"), 1e-3)],
+    ids=["p for v", "q for w"],
+)
 def test_truth_is_found_from_fewer_channels(exact, absent, tolerance):
+    """Without the applied action each flight begins with a guess that fades."""
     found = fit(exact.without(*absent))
     assert tau_error(found) < tolerance and map_error(found) < tolerance
 
 
+@pytest.mark.slow
 def test_thrust_is_found_from_the_accelerometer_alone(noisy):
     lags = {name: TRUTH[name] for name in TAUS[:3]}
     found = fit(noisy.without("w", "v", "p", "q"), fixed=lags)
@@ -79,6 +79,7 @@ def test_thrust_is_found_from_the_accelerometer_alone(noisy):
     np.testing.assert_array_equal(found.model.tau[:3], np.float32(list(lags.values())))
 
 
+@pytest.mark.slow
 def test_without_voltage_its_influence_is_kept_with_a_warning(exact):
     start = PLANT.model(thrust_coeffs=np.array([0.0, 0.0, 0.0, 0.0, 0.8, 0.9]), tau=np.full(4, 0.04))
     found = fit(exact.without("v_bat"), start)
@@ -89,24 +90,22 @@ def test_without_voltage_its_influence_is_kept_with_a_warning(exact):
     assert tau_error(found) < 0.05 and map_error(found) < 0.05
 
 
-def test_intervals_hold_the_truth_and_widen_with_fewer_channels(noisy, fitted):
+def test_intervals_hold_the_truth(fitted):
     inside = [low <= TRUTH[name] <= high for name, (_, low, high) in fitted.intervals.items()]
     assert sum(inside) >= len(inside) - 2
     assert tau_error(fitted) < 0.02 and map_error(fitted) < 0.01
     assert fitted.map_uncertainty.share < 0.01 and map_error(fitted) < 2.0 * fitted.map_uncertainty.share
-    wide, narrow = half_widths(fit(noisy.without("w"))), half_widths(fitted)
-    assert all(wide[name] > 1.2 * narrow[name] for name in TAUS[:3])
-    assert wide["tau_thrust"] == pytest.approx(narrow["tau_thrust"], rel=0.05)
 
 
 @pytest.mark.slow
-def test_intervals_are_those_of_other_draws_of_the_noise(exact, fitted):
-    """The spread of estimates over draws of the noise is that which the interval of one draw states."""
-    draws = [fit(measure(exact, 1.0, GRAVITY, np.random.default_rng(seed))) for seed in range(1, 7)]
-    for name in ("tau_roll", "tau_thrust", "c2", "c4"):
-        errors = [draw.intervals[name].value - TRUTH[name] for draw in draws]
-        stated = half_widths(fitted)[name] / 1.96
-        assert 0.3 * stated < np.sqrt(np.mean(np.square(errors))) < 2.0 * stated, name
+def test_intervals_widen_with_fewer_channels_and_with_what_the_model_lacks(noisy, fitted, dragged):
+    wide, narrow = half_widths(fit(noisy.without("w"))), half_widths(fitted)
+    assert all(wide[name] > 1.2 * narrow[name] for name in TAUS[:3])
+    assert wide["tau_thrust"] == pytest.approx(narrow["tau_thrust"], rel=0.05)
+    lacking = fit(measure(dragged, 1.0, GRAVITY, np.random.default_rng(0)))
+    for name, half in half_widths(lacking).items():
+        if name in ("tau_thrust", "c0", "c1", "c2", "c4"):
+            assert abs(lacking.intervals[name].value - TRUTH[name]) < 3.0 * half and half > 1.2 * narrow[name]
 
 
 @pytest.fixture(scope="session")
@@ -114,24 +113,17 @@ def dragged() -> FlightLog:
     return excited(replace(PLANT, drag_b=DRAG))
 
 
-def test_drag_is_found_where_it_is_and_open_where_it_is_not(noisy, dragged):
+def test_drag_is_found(dragged):
     found = fit(dragged, effects=("linear_drag",))
     np.testing.assert_allclose(found.estimate.model.effect("linear_drag"), DRAG, rtol=1e-4)
     assert tau_error(found) < 1e-4 and map_error(found) < 1e-4 and not found.warnings
-    none = fit(noisy, effects=("linear_drag",))
-    np.testing.assert_allclose(none.estimate.model.effect("linear_drag"), 0.0, atol=0.01)
-    open_ = [warning for warning in none.warnings if "cannot be told from 0" in warning]
-    assert len(open_) >= 2 and open_[0].startswith("linear_drag.d_")
 
 
-def test_what_the_model_lacks_widens_its_intervals(dragged, fitted):
-    found = fit(measure(dragged, 1.0, GRAVITY, np.random.default_rng(0)))
-    for name in ("tau_thrust", "c0", "c1", "c2", "c4"):
-        low, high = found.intervals[name].low, found.intervals[name].high
-        error, half = abs(found.intervals[name].value - TRUTH[name]), 0.5 * (high - low)
-        assert error < 3.0 * half, name
-        assert half > 1.2 * half_widths(fitted)[name], name
-    assert found.map_uncertainty.share > fitted.map_uncertainty.share
+@pytest.mark.slow
+def test_absent_drag_cannot_be_told_from_zero(noisy):
+    found = fit(noisy, effects=("linear_drag",))
+    np.testing.assert_allclose(found.estimate.model.effect("linear_drag"), 0.0, atol=0.01)
+    assert sum("cannot be told from 0" in warning for warning in found.warnings) >= 2
 
 
 def test_fixed_stays_as_given_and_is_what_the_rest_is_fitted_to(exact):
@@ -144,6 +136,7 @@ def test_fixed_stays_as_given_and_is_what_the_rest_is_fitted_to(exact):
     assert values["c4"] == pytest.approx(1.6, rel=0.05) and values["tau_roll"] == pytest.approx(0.021)
 
 
+@pytest.mark.slow
 def test_held_out_rows_do_not_influence_the_fit_and_are_used_with_every_0(noisy, fitted):
     out = held_out_rows(noisy)
     spoilt = {name: values.copy() for name, values in noisy.channels.items()}
@@ -159,20 +152,16 @@ def test_held_out_rows_do_not_influence_the_fit_and_are_used_with_every_0(noisy,
     assert everything.intervals["c2"].value != fitted.intervals["c2"].value
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
-    "shape",
-    [
-        {"jitter": 0.4},
-        pytest.param({"skip": 2}, marks=pytest.mark.slow),
-        pytest.param({"repeat": 5}, marks=pytest.mark.slow),
-    ],
-    ids=["uneven", "50 Hz", "500 Hz"],
+    "shape", [{"jitter": 0.4}, {"skip": 2}, {"repeat": 5}], ids=["uneven", "50 Hz", "500 Hz"]
 )
 def test_other_steps_of_time(shape):
     found = fit(measure(excited(PLANT, **shape), 1.0, GRAVITY, np.random.default_rng(0)))
     assert tau_error(found) < 0.02 and map_error(found) < 0.012
 
 
+@pytest.mark.slow
 def test_thrust_that_hardly_moves_leaves_the_map_open():
     log = measure(excited(PLANT, thrust=(-0.3, -0.1)), 1.0, GRAVITY, np.random.default_rng(0))
     found = fit(log)
@@ -211,15 +200,6 @@ REFUSED = {
 def test_what_cannot_be_identified_is_refused(noisy, change, arguments, message):
     with pytest.raises(FitError, match=message):
         fit(change(noisy), **arguments)
-
-
-@pytest.mark.slow
-def test_effect_beyond_what_is_looked_for_is_refused():
-    log = excited(replace(PLANT, drag_b=(5.0, 5.0, 5.0)))
-    with pytest.raises(
-        FitError, match=r"linear_drag\.d_x: the fit ended at 3 1/s, expected it within -3 to 3"
-    ):
-        fit(log, effects=("linear_drag",))
 
 
 def test_implausible_log_and_split_that_leaves_nothing_are_refused(noisy):

@@ -1,7 +1,6 @@
 """Betaflight blackbox logs: units, rates, refusals; and a real one against its decoded frames."""
 
 import gzip
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -9,9 +8,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from benchmarks.reliability.foreign_logs import BLACKBOX_HEADERS, blackbox
-from flytrack_env.sandbox import ResourceLimits
 from flytrack_sysid import LogError, import_log
-from flytrack_sysid.importing import decoding
 from flytrack_sysid.importing.betaflight_log import full_stick_rate
 from tests.support.real_logs import BETAFLIGHT, shared
 
@@ -118,25 +115,6 @@ def test_rates_at_full_stick_are_the_firmwares(rates_type, rc_rate, super_rate, 
 def test_wrong_files_are_refused(tmp_path, content, message):
     with pytest.raises(LogError, match=message):
         import_log(write(tmp_path / "a.bbl", content), "betaflight")
-
-
-def test_headers_that_make_the_decoder_wait_for_ever_are_refused_in_time(tmp_path, monkeypatch):
-    waits = {"Field I predictor": ",".join("6" * len(NAMES)), "P interval": "0/32"}
-    path = write(tmp_path / "a.bbl", log_with(**waits))
-    monkeypatch.setattr(decoding, "limits_of", lambda num_bytes: ResourceLimits(cpu_s=1))
-    with pytest.raises(
-        LogError, match=r"a\.bbl: damaged, cannot be decoded: took more than 1 s of processor"
-    ):
-        import_log(path, "betaflight")
-
-
-def test_a_missing_file_or_package_is_named(tmp_path, monkeypatch):
-    with pytest.raises(LogError, match=r"no\.bbl: cannot be read"):
-        import_log(tmp_path / "no.bbl", "betaflight")
-    path = write(tmp_path / "a.bbl", log_with())
-    monkeypatch.setitem(sys.modules, "orangebox", None)
-    with pytest.raises(LogError, match=r"a\.bbl: needs the package orangebox.*flytrack\[logs\]"):
-        import_log(path, "betaflight")
 
 
 def test_logs_of_different_craft_or_channels_make_no_log(tmp_path):

@@ -159,10 +159,8 @@ def test_rows_are_chosen_and_files_become_segments(folder, tmp_path):
         ("low = [1000", "low = [1600", r"csv: row \d+ \(line \d+\), column ail: found 1\d+.*, expected 1600"),
         ("high = [2000", "high = [1000", r"command\.high: found .*expected other values than low"),
         ("mass_kg = 0.5", "mass_kg = -1", r"craft\.mass_kg: found -1, expected a number above 0"),
-        ("[14.0, 16.8]", "[16.8, 14.0]", r"craft\.voltage_v: .*lower one first"),
         ('unit = "mV"', 'unit = "mV"\nscale = 1.0', r"battery\.scale: found together with unit"),
         ('unit = "ms"', 'unit = "ms"\nstep_s = 0.1', r"time: expected either column.* or step_s"),
-        ('unit = "deg/s"', 'unit = "deg/s"\nsigns = [1, 2, 1]', r"rates\.signs: .*expected 1 or -1"),
         ('"qx", "qy", "qz", "qw"', '"n", "e", "d", "qw"', r"row 0 \(line 2\), column n, e, d, qw: .*norm"),
         ("[craft]", "[rows]\nfirst = 5000\n[craft]", r"map\.toml: rows: none of the 300 rows of .*csv"),
         ("[time]", "[time", r"map\.toml: not a readable TOML file"),
@@ -275,27 +273,15 @@ def test_command_keeps_clocks_if_asked(folder, tmp_path, capsys):
         assert abs(len(load_log(tmp_path / "a.npz")) - num_rows) <= 1
 
 
-@pytest.fixture(scope="module")
-def crazyflie():
-    """All flights of the Crazyflie, as they are."""
+def test_crazyflie_frames_are_ours():
+    """It accelerates in the direction of its tilt, and turns as commanded."""
     files = sorted(shared(CRAZYFLIE).glob("seed*.csv.gz"))
-    return files, import_log(files, "csv", "crazyflie_phoenix", align=False)
-
-
-def test_crazyflie_flights_are_read_whole(crazyflie):
-    files, found = crazyflie
+    found = import_log(files, "csv", "crazyflie_phoenix", align=False)
     with (files[0].parent / "MANIFEST.csv").open() as file:
         usable = {row["file"]: int(row["usable_rows"]) for row in csv.DictReader(file)}
-    assert [Path(source).name for source in found.sources] == [path.name for path in files]
     assert np.bincount(found.log.segment).tolist() == [usable[path.name] for path in files]
     assert found.problems == () and found.craft.mass_kg == 0.03
-    heights = found.log["p"][:, 2]
-    assert heights.min() > 0.5 and heights.max() < 1.5
-
-
-def test_crazyflie_frames_are_ours(crazyflie):
-    """Where it is tilted to, it accelerates to; and it turns where it is told to."""
-    log = crazyflie[1].log
+    log = found.log
     up_w = Rotation.from_quat(log["q"], scalar_first=True).apply([0.0, 0.0, 1.0])[5:-5]
     acc_w = (log["v"][10:] - log["v"][:-10]) / 0.1
     inside = log.segment[10:] == log.segment[:-10]

@@ -3,7 +3,6 @@
 import json
 import re
 from dataclasses import replace
-from html import escape
 
 import jax
 import jax.numpy as jnp
@@ -11,7 +10,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from flytrack_env.dynamics import ModelParameters, advance, collective_thrust, nominal_parameters
+from flytrack_env.dynamics import ModelParameters, advance, nominal_parameters
 from flytrack_env.effects import CommandDelay, LinearDrag, QuadraticDrag, start_memories
 from flytrack_env.state import pack, unpack, unpack_action
 from flytrack_sysid.log import FlightLog, log_of_states
@@ -104,7 +103,7 @@ def test_truth_has_no_error(exact):
     assert exact.notes == ()
 
 
-def test_the_clearest_steps_are_found(exact):
+def test_the_largest_steps_are_found(exact):
     found = {axis: [step for step in exact.steps if step.axis == axis] for axis in ("roll", "pitch", "yaw")}
     assert all(len(steps) == MOST_PER_AXIS for steps in found.values())
     for axis, steps in found.items():
@@ -133,15 +132,6 @@ def test_wrong_thrust_shows_in_the_map_by_its_formula(log):
     np.testing.assert_allclose(wrong.thrust.mean_n[swept[0]], expected, atol=0.1)
     assert wrong.one_step.channels["w"].mse < 1e-9
     assert np.isnan(wrong.thrust.mean_n).any() and wrong.as_json()["thrust"]["mean_n"][0][0] is None
-
-
-def test_modelled_curve_is_the_simulators(exact):
-    for curve in exact.thrust.curves:
-        expected = collective_thrust(curve.modelled_action, curve.voltage_v, TRUTH.thrust_coeffs)
-        np.testing.assert_allclose(curve.modelled_n, expected, rtol=1e-6, atol=1e-5)
-        assert np.all(
-            np.abs(np.interp(curve.measured_action, curve.modelled_action, expected) - curve.measured_n) < 1.0
-        )
 
 
 def test_drag_shows_in_the_force_by_speed():
@@ -192,43 +182,28 @@ def test_thrust_is_measured_with_what_there_is(log, source):
 
 
 @pytest.mark.parametrize(
-    ("missing", "judged", "said"),
+    ("missing", "judged", "note"),
     [
         (("v",), {"q", "w", "a"}, r"position \(p\): not judged; v is not in the log"),
         (("w",), {"p", "v", "q", "a"}, r"body rates \(w\): not in the log"),
-        (("a",), {"p", "v", "q", "w"}, r"acceleration \(a\) and specific force \(f\)"),
         (("q",), {"w"}, r"velocity \(v\): not judged; q is not in the log"),
         (("q", "w"), set(), "step responses: no judged command"),
     ],
 )
-def test_what_is_missing_is_said_and_gives_no_number(log, missing, judged, said):
+def test_missing_channels_are_noted_and_give_no_number(log, missing, judged, note):
     validation = validate(TRUTH, log.without(*missing))
     assert set(validation.one_step.channels) == judged
-    assert any(re.search(said, note) for note in validation.notes), validation.notes
+    assert any(re.search(note, one) for one in validation.notes), validation.notes
     numbers = json.loads(json.dumps(validation.as_json(), allow_nan=False))
     assert set(numbers["one_step"]["channels"]) == judged
     assert max([0.0, *nrmse(validation).values()]) < 1e-6
     assert all(error.p95 < 1e-5 for rollout in validation.rollouts for error in rollout.errors.values())
 
 
-def test_drag_is_not_judged_without_the_velocity(log):
-    bare = with_force(log, TRUTH.g).without("v")
-    assert "f" in validate(TRUTH, bare).one_step.channels
-    dragging = validate(TRUTH.with_effects(DRAG), bare)
-    assert "f" not in dragging.one_step.channels and dragging.thrust is None
-
-
-def test_without_voltage_a_middle_one_is_taken(log):
+def test_without_voltage_a_middle_one_is_assumed(log):
     bare = validate(TRUTH, log.without("v_bat"))
     assert "battery (v_bat): not in the log; 23 V is assumed for thrust" in bare.notes
     assert 1e-3 < nrmse(bare)["a"] < 0.2 and nrmse(bare)["w"] < 1e-6 and bare.thrust is None
-
-
-def test_rates_of_steps_come_from_attitude_without_gyroscope(log):
-    validation = validate(TRUTH, log.without("w"))
-    assert len(validation.steps) == 3 * MOST_PER_AXIS
-    # The simulator normalises instead of turning exactly, third order in the angle of a step.
-    assert max(step.rms for step in validation.steps) < 5e-3
 
 
 def test_applied_action_is_recovered_from_commands(log):
@@ -258,7 +233,7 @@ def test_flights_go_on_across_gaps(log):
     assert max(nrmse(recovered).values()) < 2e-2
 
 
-def test_judges_only_the_rows_it_is_told(log):
+def test_only_the_chosen_rows_are_judged(log):
     rows = held_out_rows(log)
     rows[320:400] = True  # a piece with rows that are not judged on both sides
     damaged = {name: values.copy() for name, values in log.channels.items()}
@@ -271,12 +246,6 @@ def test_judges_only_the_rows_it_is_told(log):
     assert nothing.one_step.channels == {} and nothing.thrust is None and nothing.steps == ()
     with pytest.raises(ValueError, match="rows: found int64"):
         validate(TRUTH, log, np.flatnonzero(rows))
-
-
-def test_a_log_of_two_rows_is_one_step(log):
-    short = validate(TRUTH, log.select(slice(2)))
-    assert short.one_step.num_steps == 1 and short.steps == ()
-    assert [rollout.num_starts for rollout in short.rollouts] == [0, 0, 0, 0]
 
 
 def test_uneven_sampling_is_judged_by_its_times():
@@ -312,11 +281,3 @@ def test_report_is_whole_and_escapes_names(tmp_path, log, exact):
     velocity = numbers["one_step"]["channels"]["v"]
     for text in (html, (out / "validation.txt").read_text(encoding="utf-8")):
         assert f"{velocity['mse']:.3g}" in text and f"{velocity['nrmse']:.3g}" in text
-
-
-def test_report_of_a_poor_log_says_what_is_missing(tmp_path, log):
-    bare = log.without("v", "a", "w", "q")
-    validation = validate(TRUTH, bare)
-    write_validation(tmp_path, validation, "model.json", bare)
-    html = (tmp_path / "validation.html").read_text(encoding="utf-8")
-    assert all(escape(note) in html for note in validation.notes) and len(validation.notes) > 5
