@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 from flytrack_env import load_model, nominal_parameters
 from flytrack_sysid import FlightLog, LogError, import_log, load_log
 from flytrack_sysid.cli import main
+from flytrack_sysid.importing import csv_log
 from flytrack_sysid.importing.flight import Craft
 from tests.support.made_flight import GRAVITY, TIME_S, flight
 from tests.support.real_logs import CRAZYFLIE, shared
@@ -195,10 +196,11 @@ def test_wrong_cells_are_refused(folder, tmp_path, row, change, message):
         import_log(tmp_path / "bad.csv", "csv", folder / "map.toml")
 
 
-def test_missing_truncated_and_unmapped_files_are_refused(folder, tmp_path):
+def test_missing_truncated_and_unmapped_files_are_refused(folder, tmp_path, monkeypatch):
+    monkeypatch.setattr(csv_log, "UNPACKED", 2**16)
     packed = gzip.compress((folder / "flight.csv").read_bytes())
     (tmp_path / "cut.csv.gz").write_bytes(packed[: len(packed) // 2])
-    bomb = gzip.compress(",".join(HEADER).encode() + b"\n" * 2**25, 1)
+    bomb = gzip.compress(",".join(HEADER).encode() + b"\n" * 2**20, 1)
     (tmp_path / "bomb.csv.gz").write_bytes(bomb)
     for path, format_name, mapping, message in (
         (tmp_path / "no.csv", "csv", folder / "map.toml", r"no\.csv: cannot be read as text"),
