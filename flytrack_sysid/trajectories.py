@@ -81,8 +81,8 @@ def trajectories_of(
         RecordingError: a log without rows or without attitude.
     """
     if not len(log) or "q" not in log:
-        found = f"channels {', '.join(log.channels)}" if len(log) else "no rows"
-        raise RecordingError(f"{log.source}: found {found}, expected q (attitude) to show a flight")
+        content = f"channels {', '.join(log.channels)}" if len(log) else "no rows"
+        raise RecordingError(f"{log.source}: found {content}, expected q (attitude) to show a flight")
     positions, remark = position_of(log)
     placed = replace(log, channels={**log.channels, "p": positions})
     timed = _Timed(placed, time_in_line(log), -(-len(log) // MOST_ROWS))

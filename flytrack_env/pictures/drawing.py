@@ -1,7 +1,6 @@
 """What the figures share: figures and PNGs, a course with its gates, a path in colours, labels with room."""
 
 import io
-from collections.abc import Sequence
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -43,17 +42,6 @@ def png_of(figure: Figure, dpi: int = DPI, metadata: dict[str, str] | None = Non
     content = io.BytesIO()
     figure.savefig(content, format="png", dpi=dpi, metadata={"Software": None, **(metadata or {})})
     return content.getvalue()
-
-
-def with_room(labels: Sequence[tuple[float, str]], inch: float) -> set[tuple[float, str]]:
-    """Return the labels (place, small text), in order, that overlap no earlier one; inch: in places."""
-    kept, end = set(), -np.inf
-    for place, text in sorted(labels):
-        half = 0.5 * inch * LETTER_IN * (len(text) + 1)
-        if place - half >= end:
-            kept.add((place, text))
-            end = place + half
-    return kept
 
 
 def extent(track: Track) -> np.ndarray:

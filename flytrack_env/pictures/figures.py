@@ -21,7 +21,6 @@ from flytrack_env.pictures.drawing import (
     label_from_above,
     new_figure,
     plain,
-    with_room,
 )
 from flytrack_env.pictures.flight import PASSED, Flight, Meeting
 from flytrack_env.scene import BLUE, GREEN, GREY, ORANGE, PAPER_COLOURS, PAPER_FRAME, PAPER_OPENING, gates_of
@@ -115,13 +114,13 @@ def draw_side(flight: Flight) -> Figure:
     figure = new_figure(width, SIDE_IN + gates_in)
     upper, lower = figure.subfigures(2, 1, squeeze=False, height_ratios=(SIDE_IN, gates_in)).ravel()
     top = HEADROOM * max(float(flight.speeds_m_s.max()), 1.0)
-    _draw_height(upper, flight, top, width)
+    _draw_height(upper, flight, top)
     _draw_fronts(lower, flight, top, (num_rows, num_columns))
     figure.suptitle(escape(f"{flight.title}\n{flight.laps_text}"), fontsize="medium")
     return figure
 
 
-def _draw_height(figure: SubFigure, flight: Flight, top: float, width_in: float) -> None:
+def _draw_height(figure: SubFigure, flight: Flight, top: float) -> None:
     """Draw the path's height, and a bar for every gate where its plane was met."""
     axes = plain(figure.add_subplot())
     heights_m = flight.states[:, POSITION][:, 2]
@@ -131,7 +130,6 @@ def _draw_height(figure: SubFigure, flight: Flight, top: float, width_in: float)
     half_heights_m = _half_heights_m(flight.track)
     for meeting in flight.meetings:
         _draw_bar(axes, flight.track.gates[meeting.gate], meeting, half_heights_m[meeting.gate])
-    _label_bars(axes, flight, half_heights_m, width_in)
     floor_m = flight.track.bounds_low[2]
     axes.axhline(floor_m, color="0.3", linewidth=1.5)
     axes.plot(*points[0], "o", color=BLUE, markersize=8, markeredgecolor="white", zorder=6)
@@ -163,21 +161,9 @@ def _draw_bar(axes: Axes, gate: Gate, meeting: Meeting, half_heights_m: np.ndarr
         axes.plot([x, x], [z - half, z + half], color=colour, linewidth=width, zorder=2)
     if meeting.outcome != PASSED:
         axes.plot(x, meeting.pos_w[2], "X", color="black", markersize=10, markeredgecolor="white", zorder=6)
-
-
-def _label_bars(axes: Axes, flight: Flight, half_heights_m: np.ndarray, width_in: float) -> None:
-    """Write above the bars the gates' ids, and what failed, where there is room."""
-    inch_m = flight.distances_m[-1] / width_in
-    ids = [(one.distance_m, str(flight.track.gates[one.gate].id)) for one in flight.meetings]
-    failures = [(one.distance_m, one.outcome) for one in flight.meetings if one.outcome != PASSED]
-    gates = {one.distance_m: one.gate for one in flight.meetings}
-    for labels, above, colour in ((ids, 3, PAPER_OPENING), (failures, 14, "black")):
-        for x, text in with_room(labels, inch_m):
-            top_m = flight.track.gates[gates[x]].position[2] + half_heights_m[gates[x], 0]
-            axes.annotate(
-                text, (x, top_m), (0, above), textcoords="offset points", color=colour, ha="center",
-                weight="bold", fontsize="small",
-            )  # fmt: skip
+    text = str(gate.id) if meeting.outcome == PASSED else f"{meeting.outcome}\n{gate.id}"
+    style: Any = {"color": PAPER_OPENING, "ha": "center", "weight": "bold", "fontsize": "small"}
+    axes.annotate(text, (x, z + half_frame), (0, 3), textcoords="offset points", **style)
 
 
 def _draw_fronts(figure: SubFigure, flight: Flight, top: float, shape: tuple[int, int]) -> None:
@@ -237,7 +223,10 @@ def draw_commands(flight: Flight) -> Figure:
     panels[5].set(ylabel="battery (V)", xlabel="time (s)", xlim=(0.0, end_s))
     for panel in panels:
         _mark_events(plain(panel), flight)
-    _label_events(panels[0], flight, width)
+    for one in flight.meetings:
+        text = str(flight.track.gates[one.gate].id) + ("" if one.outcome == PASSED else f"\n{one.outcome}")
+        at = (one.time_s, 1.02)
+        panels[0].annotate(text, at, xycoords=panels[0].get_xaxis_transform(), ha="center", fontsize="small")
     figure.align_ylabels(panels)
     sticks = panels[3].get_legend_handles_labels()[0]
     figure.legend(handles=[*sticks, *MARKS.values()], loc="outside lower center", ncols=5, frameon=False)
@@ -268,19 +257,3 @@ def _mark_events(panel: Axes, flight: Flight) -> None:
             "ls": mark.get_linestyle(),
         }
         panel.axvline(time_s, zorder=0.5, **style)
-
-
-def _label_events(panel: Axes, flight: Flight, width_in: float) -> None:
-    """Write the gates' ids and the lap times above a panel, where there is room for them."""
-    ids = [(one.time_s, str(flight.track.gates[one.gate].id)) for one in flight.meetings]
-    laps = [(one.time_s, f"lap {one.lap}: {one.lap_time_s:.3f} s") for one in flight.race.passes if one.lap]
-    failures = [(one.time_s, one.outcome) for one in flight.meetings if one.outcome != PASSED]
-    inch_s = flight.times_s[-1] / width_in
-    texts = [(*label, 3, GREY) for label in with_room(ids, inch_s)]
-    for time_s, text in with_room([*laps, *failures], inch_s):
-        texts.append((time_s, text, 13, GREEN if (time_s, text) in laps else "black"))
-    for time_s, text, above, colour in texts:
-        panel.annotate(
-            text, (time_s, 1.0), (0, above), xycoords=panel.get_xaxis_transform(),
-            textcoords="offset points", ha="center", fontsize="small", color=colour,
-        )  # fmt: skip

@@ -10,7 +10,7 @@ from PIL import Image, ImageDraw
 
 from flytrack_env import scene
 from flytrack_env.rendering.camera import Camera, unit
-from flytrack_env.rendering.views import PIXEL, draw_drone, lettering
+from flytrack_env.rendering.views import PIXEL, draw_drone, font
 from flytrack_env.scene import Colour, gates_of, ground_grid
 from flytrack_env.state import POSITION, QUATERNION
 from flytrack_env.tracks import Course
@@ -104,8 +104,8 @@ class FixedView:
         canvas = Image.new("RGB", (PIXEL * WIDTH, PIXEL * HEIGHT), scene.BACKGROUND)
         draw = ImageDraw.Draw(canvas)
         draw.polygon(self.camera.polygon(self.camera.look(self.floor_w)), scene.GROUND)
-        for line in self.camera.segments(self.grid_w)[0]:
-            draw.line(line, scene.GROUND_GRID, PIXEL)
+        for line in self.camera.look(self.grid_w):
+            draw.line(self.camera.polygon(line), scene.GROUND_GRID, PIXEL)
         shapes = [self._shadow(lap, row) for lap in laps]
         solids = self._beams() + [shape for lap in laps for shape in self._path(lap, row)]
         shapes += sorted(solids, key=lambda shape: -shape.distance_m)
@@ -161,10 +161,9 @@ class FixedView:
         """Write the laps' labels and their times so far, from left to right."""
         left = MARGIN
         for lap in laps:
-            label = lettering(lap.label, TEXT_SIZE)
-            time_s = min(0.01 * row, lap.time_s)
             is_over = row >= len(lap.states) - 1
-            text = lettering(f"{lap.time_s:.3f} s" if is_over else f"{time_s:.2f} s", TEXT_SIZE)
-            draw.bitmap((left, 9), label, lap.colour)
-            draw.bitmap((left + label.width + 10, 9), text, scene.TEXT if is_over else scene.FAINT_TEXT)
+            text = f"{lap.time_s:.3f} s" if is_over else f"{0.01 * row:.2f} s"
+            draw.text((left, 6), lap.label, lap.colour, font(TEXT_SIZE))
+            indent = draw.textlength(lap.label, font(TEXT_SIZE)) + 10
+            draw.text((left + indent, 6), text, scene.TEXT if is_over else scene.FAINT_TEXT, font(TEXT_SIZE))
             left += WIDTH // 2

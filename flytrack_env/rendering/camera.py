@@ -38,20 +38,8 @@ class Camera:
         level = max(float(np.hypot(self.forward_w[0], self.forward_w[1])), 1e-3)
         return float(self.centre_px[1] + self.focal_px * self.forward_w[2] / level)
 
-    def segments(self, segments_w: np.ndarray) -> tuple[list[list[float]], list[int]]:
-        """Return the visible parts of segments (n, 2, 3) as x, y, x, y in pixels, and their indices."""
-        points = self.look(segments_w)
-        indices = np.flatnonzero((points[..., 2] > NEAREST_M).any(axis=1))
-        points = points[indices]
-        for end in (0, 1):
-            is_cut = points[:, end, 2] < NEAREST_M
-            hidden, seen = points[is_cut, end], points[is_cut, 1 - end]
-            share = (NEAREST_M - hidden[:, 2:]) / (seen[:, 2:] - hidden[:, 2:])
-            points[is_cut, end] = hidden + share * (seen - hidden)
-        return self.pixels(points).reshape(-1, 4).tolist(), indices.tolist()
-
     def polygon(self, points_c: np.ndarray) -> list[float]:
-        """Return the visible part of a polygon (n, 3), camera's frame, as x, y, x, y, ... in pixels.
+        """Return the visible part of a polygon or line (n, 3), camera's frame, as x, y, x, y, ... in pixels.
 
         Empty if all of it is behind the camera.
         """

@@ -1,6 +1,6 @@
 """One picture of a flight: the course from above, the flight from behind the drone, and a line of text."""
 
-from functools import cache, lru_cache
+from functools import cache
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -25,7 +25,7 @@ MARGIN = 28  # around the bounds
 GRID_M = 5.0
 WIDE_M = 60.0  # a course of more than this, or of more than twice, has a grid that much wider
 SMALLEST_GATE = 26  # gates of a wide course are drawn larger than they are
-LABEL_DISTANCE, LABEL_SPACING = 11, 15
+LABEL_DISTANCE = 11
 ARROW, DRONE_LENGTH = 18, 20
 # The drone's arrow, nose at +x, in units of its length.
 ARROWHEAD = np.array([(0.6, 0.0), (-0.4, 0.38), (-0.2, 0.0), (-0.4, -0.38)])
@@ -39,8 +39,6 @@ AIM_BEYOND_M = 3.0  # beyond the gate's centre, so that the view does not swing 
 SWING_STEPS = 25.0  # time constant with which the camera follows its aim
 MEMORY_STEPS, TRAIL_STEPS = 100, 150
 CHASE_GRID_M = 2.0
-HAZE_M = 60.0  # at this distance half of a gate's colour is the sky's
-NUMBER_M, NUMBER_NEAREST_M = 0.6, 1.0  # height of a gate's number; nearer than this it has none
 BODY_M, SHADOW_M = 0.05, 0.2
 ANGLES = np.linspace(0.0, 2.0 * np.pi, 14, endpoint=False)
 CIRCLE = np.stack([np.cos(ANGLES), np.sin(ANGLES), np.zeros(14)], axis=-1)
@@ -50,16 +48,6 @@ CIRCLE = np.stack([np.cos(ANGLES), np.sin(ANGLES), np.zeros(14)], axis=-1)
 def font(size: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
     """Return Pillow's own font in a size, pixels."""
     return ImageFont.load_default(size)
-
-
-@lru_cache(maxsize=1024)
-def lettering(text: str, size: int) -> Image.Image:
-    """Return a line of text as a mask; cached, because text takes longer to draw than gates."""
-    face = font(size)
-    _, _, right, bottom = face.getbbox(text, anchor="la")
-    mask = Image.new("L", (int(right) + 1, int(bottom) + 1))
-    ImageDraw.Draw(mask).text((0, 0), text, 255, face, anchor="la")
-    return mask
 
 
 class TopView:
@@ -76,8 +64,7 @@ class TopView:
         self.pixel_m = PIXEL / self.scale
         self.enlargement = max(1.0, SMALLEST_GATE * self.pixel_m / (2.0 * self.half_edges_m.min()))
         self.empty = Image.new("RGB", (width, height), scene.BACKGROUND)
-        self._draw_course(course, low, high)
-        self._draw_legend(width, height)
+        self._draw_course(low, high)
         # The trail of each flight that was drawn, and how many of its rows are in it.
         self.trails: WeakKeyDictionary[FlightLog, tuple[Image.Image, int]] = WeakKeyDictionary()
 
@@ -99,30 +86,19 @@ class TopView:
     def _pairs(self, points_w: np.ndarray) -> list[tuple[float, float]]:
         return [(x, y) for x, y in self.pixels(points_w).tolist()]
 
-    def _draw_course(self, course: Course, low: np.ndarray, high: np.ndarray) -> None:
+    def _draw_course(self, low: np.ndarray, high: np.ndarray) -> None:
         draw = ImageDraw.Draw(self.empty)
         for line in ground_grid(low, high, GRID_M * np.ceil((high - low)[:2].max() / WIDE_M)):
             draw.line(self._pairs(line), scene.GRID, PIXEL)
         corners = np.array([low[:2], (high[0], low[1]), high[:2], (low[0], high[1]), low[:2]])
         draw.line(self._pairs(corners), scene.BOUNDS, PIXEL)
-        start, radius = self.pixels(np.array(course.start_pos_w, float)), 4 * PIXEL
-        draw.ellipse([*(start - radius), *(start + radius)], outline=scene.FAINT_TEXT, width=PIXEL)
-        labels: list[np.ndarray] = []
-        for index in range(len(self.gates.centres)):
+        for index, (centre, forward) in enumerate(zip(self.gates.centres, self.gates.forward, strict=True)):
             self._draw_gate(draw, index, scene.GATE)
-            labels.append(self._label_place(index, labels, 0.5 * (low + high)[:2]))
-            draw.text(self._pairs(labels[-1][None])[0], str(index), scene.TEXT, font(13 * PIXEL), anchor="mm")
-
-    def _label_place(self, index: int, taken: list[np.ndarray], middle: np.ndarray) -> np.ndarray:
-        """Return a place (2,), world, beside a gate: away from the middle, unless another label is there."""
-        centre = self.gates.centres[index, :2]
-        left = np.array([-self.gates.forward[index, 1], self.gates.forward[index, 0]])
-        left = left / max(np.linalg.norm(left), 1e-6)
-        outwards = left if left @ (centre - middle) >= 0.0 else -left
-        distance = self.enlargement * self.half_edges_m[index] + LABEL_DISTANCE * self.pixel_m
-        place = centre + distance * outwards
-        is_taken = any(np.linalg.norm(place - other) < LABEL_SPACING * self.pixel_m for other in taken)
-        return centre - distance * outwards if is_taken else place
+            left = np.array([-forward[1], forward[0]]) / max(np.hypot(forward[0], forward[1]), 1e-6)
+            outwards = left if left @ (centre - 0.5 * (low + high))[:2] >= 0.0 else -left
+            distance = self.enlargement * self.half_edges_m[index] + LABEL_DISTANCE * self.pixel_m
+            (place,) = self._pairs((centre[:2] + distance * outwards)[None])
+            draw.text(place, str(index), scene.TEXT, font(13 * PIXEL), anchor="mm")
 
     def _draw_gate(self, draw: ImageDraw.ImageDraw, index: int, colour: Colour) -> None:
         """Draw a gate as a bar with a gap where its opening is, and an arrow in its direction of flight."""
@@ -136,18 +112,6 @@ class TopView:
         base, across = centre + 0.6 * arrow, 0.25 * np.array([-arrow[1], arrow[0]])
         draw.line(self._pairs(np.array([centre, base])), colour, PIXEL)
         draw.polygon(self._pairs(np.array([centre + arrow, base + across, base - across])), colour)
-
-    def _draw_legend(self, width: int, height: int) -> None:
-        """Draw the trail's colours with their speeds below the course."""
-        draw, face = ImageDraw.Draw(self.empty), font(11 * PIXEL)
-        left, right, bar, gap = 0.3 * width, 0.7 * width, 5 * PIXEL, 8 * PIXEL
-        top = height - 15 * PIXEL
-        edges = np.linspace(left, right, scene.NUM_SPEED_COLOURS + 1)
-        for colour, start, end in zip(scene.SPEED_COLOURS, edges, edges[1:], strict=False):
-            draw.rectangle([start, top, end, top + bar], colour)
-        middle = top + 0.5 * bar
-        draw.text((left - gap, middle), "0", scene.FAINT_TEXT, face, anchor="rm")
-        draw.text((right + gap, middle), f"{scene.FASTEST_M_S:g} m/s", scene.FAINT_TEXT, face, anchor="lm")
 
     def draw(self, canvas: Image.Image, log: FlightLog) -> None:
         """Draw the log's last row, and the trail of all of them, at the canvas's left."""
@@ -184,21 +148,11 @@ class ChaseView:
     def __init__(self, course: Course, gates: Gates, left: int, width: int, height: int):
         self.gates, self.left, self.width, self.height = gates, left, width, height
         self.corners_w = np.concatenate([gates.outer, gates.inner], axis=1)
-        self.tops_w = gates.centres + UP_W * (0.5 * np.ptp(gates.outer[..., 2:], axis=1) + 0.7 * NUMBER_M)
         self.focal_px = 0.5 * width / np.tan(0.5 * np.radians(FIELD_OF_VIEW_DEG))
         self.centre_px = np.array([0.5 * width, 0.5 * height])
         low, high = (np.array(corner, float) for corner in (course.bounds_low, course.bounds_high))
         self.floor_m = low[2]
         self.grid_w = ground_grid(low, high, CHASE_GRID_M)
-        self.backdrop = self._make_backdrop()
-
-    def _make_backdrop(self) -> Image.Image:
-        """Return sky above ground, three views high, to be shifted with the horizon."""
-        sky = np.linspace(scene.SKY_TOP, scene.SKY_HORIZON, self.height)
-        zenith = np.tile(sky[:1], (self.height // 2, 1))
-        ground = np.tile([scene.GROUND], (3 * self.height // 2, 1))
-        column = np.round(np.concatenate([zenith, sky, ground])).astype(np.uint8)
-        return Image.fromarray(np.tile(column[:, None], (1, self.width, 1)))
 
     def camera(self, rows: np.ndarray) -> Camera:
         """Return the camera behind the drone of the last row, looking towards the next gate.
@@ -223,16 +177,18 @@ class ChaseView:
         """Draw the view of the log's last row."""
         row = log.rows[-1].astype(float)
         camera = self.camera(log.rows)
-        top = int(np.clip(1.5 * self.height - camera.horizon_px(), 0, 2 * self.height))
-        picture = self.backdrop.crop((0, top, self.width, top + self.height))
+        picture = Image.new("RGB", (self.width, self.height), scene.SKY)
         draw = ImageDraw.Draw(picture)
+        horizon = max(camera.horizon_px(), 0.0)
+        if horizon < self.height:
+            draw.rectangle([0, horizon, self.width, self.height], scene.GROUND)
         self._draw_ground(draw, camera, row[POSITION])
         distances_m = np.linalg.norm(self.gates.centres - camera.eye_w, axis=1)
         is_beyond = distances_m > np.linalg.norm(row[POSITION] - camera.eye_w)
         corners_c, next_index = camera.look(self.corners_w), int(row[GATE_INDEX])
         order = np.argsort(-distances_m)
         for index in order[is_beyond[order]]:
-            self._draw_gate(draw, camera, index, next_index, corners_c[index])
+            draw_gate(draw, camera, corners_c[index], self._colour(index, next_index))
         self._draw_trail(draw, camera, log.rows)
         draw_drone(draw, camera, row[POSITION], row[QUATERNION])
         for index in order[~is_beyond[order]]:
@@ -241,8 +197,8 @@ class ChaseView:
         canvas.paste(picture, (self.left, 0))
 
     def _draw_ground(self, draw: ImageDraw.ImageDraw, camera: Camera, drone_w: np.ndarray) -> None:
-        for line in camera.segments(self.grid_w)[0]:
-            draw.line(line, scene.GROUND_GRID, PIXEL)
+        for line in camera.look(self.grid_w):
+            draw.line(camera.polygon(line), scene.GROUND_GRID, PIXEL)
         below = np.array([drone_w[0], drone_w[1], self.floor_m])
         shadow = camera.polygon(camera.look(below + SHADOW_M * CIRCLE))
         if shadow:
@@ -254,43 +210,26 @@ class ChaseView:
         is_after = index == (next_index + 1) % len(self.gates.centres)
         return scene.GATE_AFTER if is_after else scene.GATE
 
-    def _draw_gate(
-        self, draw: ImageDraw.ImageDraw, camera: Camera, index: int, next_index: int, corners_c: np.ndarray
-    ) -> None:
-        """Draw a gate's frame as a solid ring with its number above; corners: outer four, inner four."""
-        distance_m = float(np.linalg.norm(corners_c[:4].mean(axis=0)))
-        haze = distance_m / (distance_m + HAZE_M)
-        colour = scene.blend(self._colour(index, next_index), scene.SKY_HORIZON, haze)
-        draw_ring(draw, camera, corners_c, colour)
-        draw_outlines(draw, camera, corners_c, scene.blend(colour, scene.BACKGROUND, 0.6))
-        top_c = camera.look(self.tops_w[index])
-        if top_c[2] > NUMBER_NEAREST_M:
-            # In steps of 4 pixels, so that few sizes are drawn.
-            size = 4 * int(np.clip(NUMBER_M * self.focal_px / top_c[2], 24, 80) // 4)
-            number = lettering(str(index), size)
-            corner = camera.pixels(top_c) - 0.5 * np.array(number.size)
-            draw.bitmap((round(corner[0]), round(corner[1])), number, colour)
-
     def _draw_trail(self, draw: ImageDraw.ImageDraw, camera: Camera, rows: np.ndarray) -> None:
         recent = rows[-TRAIL_STEPS:].astype(float)
-        points_w = recent[:, POSITION]
+        points_c = camera.look(recent[:, POSITION])
         colours = speed_colours(np.linalg.norm(recent[1:, VELOCITY], axis=1))
-        lines, indices = camera.segments(np.stack([points_w[:-1], points_w[1:]], axis=1))
-        for line, index in zip(lines, indices, strict=True):
-            draw.line(line, colours[index], 2 * PIXEL)
+        for start, colour in enumerate(colours):
+            draw.line(camera.polygon(points_c[start : start + 2]), colour, 2 * PIXEL)
 
 
-def draw_ring(draw: ImageDraw.ImageDraw, camera: Camera, corners_c: np.ndarray, colour: Colour) -> None:
+def draw_gate(draw: ImageDraw.ImageDraw, camera: Camera, corners_c: np.ndarray, colour: Colour) -> None:
     """Draw a gate's frame as a solid ring; corners: (8, 3), outer four and inner four, camera's frame."""
     for a in range(4):
         b = (a + 1) % 4
         beam = camera.polygon(corners_c[[a, b, 4 + b, 4 + a]])
         if beam:
             draw.polygon(beam, colour)
+    draw_outlines(draw, camera, corners_c, scene.blend(colour, scene.BACKGROUND, 0.4))
 
 
 def draw_outlines(draw: ImageDraw.ImageDraw, camera: Camera, corners_c: np.ndarray, colour: Colour) -> None:
-    """Draw the edges of a gate's frame and opening; corners as for ``draw_ring``."""
+    """Draw the edges of a gate's frame and opening; corners as for ``draw_gate``."""
     for square_c in (corners_c[:4], corners_c[4:]):
         outline = camera.polygon(square_c)
         if outline:
@@ -308,8 +247,8 @@ def draw_drone(
     """Draw arms, rotors and body of a drone, the far rotors first; colours: body, front, rear rotors."""
     axes_w = enlargement * rotations(quaternion).T
     motors_w = pos_w + scene.MOTORS_B @ axes_w
-    for line in camera.segments(pos_w + scene.ARMS_B @ axes_w)[0]:
-        draw.line(line, colours[0], 4 * PIXEL)
+    for line in camera.look(pos_w + scene.ARMS_B @ axes_w):
+        draw.line(camera.polygon(line), colours[0], 4 * PIXEL)
     disc_w = scene.ROTOR_M * CIRCLE @ axes_w
     body_w = pos_w + enlargement * BODY_M * (CIRCLE @ np.stack([camera.axes[0], camera.axes[1], UP_W]))
     parts = [(motor_w + disc_w, colours[1 + place // 2]) for place, motor_w in enumerate(motors_w)]
@@ -360,5 +299,4 @@ class Renderer:
         )
         draw.rectangle([TOP_VIEW_WIDTH, 0, WIDTH, BAR_HEIGHT], scene.BACKGROUND)
         for column, text in zip(COLUMNS, texts, strict=True):
-            if text:
-                draw.bitmap((TOP_VIEW_WIDTH + column, TEXT_TOP), lettering(text, TEXT_SIZE), scene.TEXT)
+            draw.text((TOP_VIEW_WIDTH + column, TEXT_TOP), text, scene.TEXT, font(TEXT_SIZE))

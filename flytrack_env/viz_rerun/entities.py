@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import rerun as rr
@@ -42,7 +42,7 @@ def log_course(recording: rr.RecordingStream, track: Track | None) -> None:
     log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP)
     if track is None:
         return
-    style = {"colors": scene.NEXT_GATE}
+    style: Any = {"colors": scene.NEXT_GATE}
     positions = np.reshape([gate.position for gate in track.gates], (-1, 3))
     names = [f"gate {gate.id}" for gate in track.gates]
     log("world/gates/centre", rr.Points3D(positions, labels=names, radii=0.05, **style))

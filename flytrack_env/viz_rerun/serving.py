@@ -43,32 +43,6 @@ def bind_port(port: int) -> int:
         return probe.getsockname()[1]
 
 
-def start_server(path: str | Path, port: int, open_browser: bool) -> tuple[subprocess.Popen[bytes], str]:
-    """Start a server of the web viewer for a recording; return its process and the page's address.
-
-    port: of the page. The process serves until ``stop_server`` ends it, to this machine only.
-
-    Raises:
-        ServeError: no recording, or a port that is taken.
-    """
-    check_recording(path)
-    port, data_port = bind_port(port), bind_port(0)
-    # Unlike the SDK's own functions, the command can be restricted to this machine.
-    command = [sys.executable, "-m", "rerun", str(path), "--bind", HOST]
-    command += ["--port", str(data_port), "--web-viewer-port", str(port)]
-    command.append("--web-viewer" if open_browser else "--serve-web")
-    quiet = subprocess.DEVNULL
-    server = subprocess.Popen(command, start_new_session=True, stdout=quiet, stderr=quiet)
-    return server, f"http://{HOST}:{port}/?url=rerun%2Bhttp%3A%2F%2F{HOST}%3A{data_port}%2Fproxy"
-
-
-def stop_server(server: subprocess.Popen[bytes]) -> None:
-    """End a server and wait for it: the whole group, as the command is a wrapper around a program."""
-    with suppress(ProcessLookupError):
-        os.killpg(server.pid, signal.SIGTERM)
-    server.wait()
-
-
 def _interrupt(*_: Any) -> NoReturn:
     raise KeyboardInterrupt
 
@@ -79,18 +53,25 @@ def serve(path: str | Path, port: int, open_browser: bool) -> None:
     Raises:
         ServeError: no recording, a port that is taken, or a server that ends by itself.
     """
-    # The server is in a session of its own, and would go on when a signal ends this program.
+    check_recording(path)
+    port, data_port = bind_port(port), bind_port(0)
+    # Unlike the SDK's own functions, the command can be restricted to this machine.
+    command = [sys.executable, "-m", "rerun", str(path), "--bind", HOST, "--port", str(data_port)]
+    command += ["--web-viewer-port", str(port), "--web-viewer" if open_browser else "--serve-web"]
     before = {one: signal.signal(one, _interrupt) for one in ENDING}
-    server = None
+    # A session of its own, to be ended as a whole: the command is a wrapper around a program.
+    quiet = subprocess.DEVNULL
+    server = subprocess.Popen(command, start_new_session=True, stdout=quiet, stderr=quiet)
     try:
-        server, address = start_server(path, port, open_browser)
-        print(f"{path}: {address} (Ctrl-C ends it)", flush=True)
+        query = f"url=rerun%2Bhttp%3A%2F%2F{HOST}%3A{data_port}%2Fproxy"
+        print(f"{path}: http://{HOST}:{port}/?{query} (Ctrl-C ends it)", flush=True)
         status = server.wait()
     except KeyboardInterrupt:
         return
     finally:
-        if server is not None:
-            stop_server(server)
+        with suppress(ProcessLookupError):
+            os.killpg(server.pid, signal.SIGTERM)
+        server.wait()
         for one, handler in before.items():
             signal.signal(one, handler)
     raise ServeError(f"{path}: the viewer's server ended with status {status}, expected it to go on")

@@ -152,15 +152,6 @@ def test_a_model_that_diverges_is_cut_off(flown, flights):
     assert len(void.states) == void.restarts.sum() and distance_m(void, flown[1]).max() == 0.0
 
 
-def test_models_have_their_own_colour_and_no_empty_lines(recording):
-    arrows = recording.once("/world/residual/nominal", "Arrows3D:colors")
-    assert arrows == recording.once("/world/flights/nominal/drone/motors", "Points3D:colors")
-    assert arrows == recording.once("/plots/residual/nominal", "SeriesLines:colors")
-    assert arrows != recording.once("/world/residual/true", "Arrows3D:colors")
-    paths = {path for path, _ in recording.rows if path.startswith("/plots/flights/nominal")}
-    assert {path.rsplit("/", 1)[1] for path in paths} == {"speed", "angular_speed", "roll", "pitch", "yaw"}
-
-
 @pytest.fixture(scope="module")
 def made() -> FlightLog:
     """A made-up flight of 6 s, cut in the middle."""
