@@ -1,22 +1,18 @@
-"""What a model makes of a flight log: one step from every measured row, and free flight from some.
-
-Everything comes out of ``flytrack_env.dynamics.advance``, in float64.
-"""
+"""What a model predicts of a flight log, in float64: one step from every row, and free flight from some."""
 
 from collections.abc import Iterator
-from functools import partial
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from flytrack_env.dynamics import ModelParameters, advance
-from flytrack_env.effects import acts, start_memories
+from flytrack_env.effects import acts
 from flytrack_env.quaternion import Quaternion, Vec3
-from flytrack_env.state import ACTION_SIZE, Action, Drone
+from flytrack_env.state import Action, Drone
 from flytrack_sysid.log import FlightLog, usual_step
-from flytrack_sysid.record import BATTERY_UNKNOWN_V, LARGEST_DOUBT, Filled, applied_doubt, steps_after
+from flytrack_sysid.record import LARGEST_DOUBT, Filled, Record, applied_doubt, record_of, steps_after
+from flytrack_sysid.replay import replay
 
 # For effects that remember: what they remembered when a segment began is not known.
 SETTLING_S = 0.5
@@ -137,46 +133,12 @@ def in_float64(model: ModelParameters) -> ModelParameters:
     return jax.tree.map(lambda leaf: np.asarray(leaf, float), model)
 
 
-def _measured(log: FlightLog) -> Drone:
-    """Return the measured states; applied action and missing channels are fillers."""
-    zeros = np.zeros(len(log))
-
-    def channel(name: str, size: int) -> list[np.ndarray]:
-        return list(log[name].T) if name in log else [zeros] * size
-
-    assumed_v = np.full(len(log), BATTERY_UNKNOWN_V)
-    return Drone(
-        pos_w=Vec3(*channel("p", 3)),
-        vel_w=Vec3(*channel("v", 3)),
-        acc_w=Vec3(zeros, zeros, zeros),
-        quat=Quaternion(*(log["q"].T if "q" in log else [zeros + 1.0, zeros, zeros, zeros])),
-        rates_b=Vec3(*channel("w", 3)),
-        applied=Action(*channel("uprev", ACTION_SIZE)),
-        battery_v=log["v_bat"][:, 0] if "v_bat" in log else assumed_v,
-    )
-
-
-@partial(jax.jit, static_argnames="has_applied")
+@jax.jit
 def _step_from_every_row(
-    rows: tuple[Drone, Action, Any, Any], model: ModelParameters, has_applied: bool
-) -> tuple[Action, tuple[Any, ...], Drone]:
-    """Return applied actions and memories before, and the drones after, the steps of all rows."""
-
-    def one(carry: Any, row: tuple[Any, ...]) -> Any:
-        measured, command, duration, is_start = row
-        applied, memories = carry
-        if has_applied:
-            applied = measured.applied
-        else:  # what is commanded first is taken to have been commanded for long
-            applied = jax.tree.map(partial(jnp.where, is_start), command, applied)
-        drone = measured._replace(applied=applied)
-        fresh = start_memories(model.effects, drone)
-        memories = jax.tree.map(partial(jnp.where, is_start), fresh, memories)
-        after, later = advance(drone, memories, command, duration, model)
-        return (after.applied, later), (applied, memories, after)
-
-    first = jax.tree.map(lambda leaf: leaf[0], rows[0])
-    return jax.lax.scan(one, (first.applied, start_memories(model.effects, first)), rows)[1]
+    record: Record, gyro_b: np.ndarray, model: ModelParameters
+) -> tuple[Drone, tuple[Any, ...], Drone]:
+    """Return the drones and memories before, and the drones after, the steps of all rows."""
+    return replay(model, record, "measured", gyro_b, lambda step, _: (step.before, step.memories, step.after))
 
 
 def _is_settled(model: ModelParameters, filled: Filled, steps: Steps, has_memory: bool) -> np.ndarray:
@@ -197,14 +159,15 @@ def predict(model: ModelParameters, filled: Filled) -> Prediction:
     The applied action is the log's; without it, it follows the commands from the segment's start on.
     """
     log, steps = filled.log, steps_of(filled)
-    measured, has_applied = _measured(log), "uprev" in log
-    commands = Action(*log["u"].T)
+    has_applied = "uprev" in log
+    record = record_of(filled)
+    record = record._replace(is_applied_known=np.full(len(log), has_applied))
+    gyro_b = log["w"] if "w" in log else np.zeros((len(log), 3))
     with jax.enable_x64(True):
-        rows = (measured, commands, steps.duration, log.is_start())
-        found = _step_from_every_row(rows, in_float64(model), has_applied)
-        applied, memories, after = jax.tree.map(np.asarray, found)
+        found = _step_from_every_row(record, gyro_b, in_float64(model))
+        before, memories, after = jax.tree.map(np.asarray, found)
     return Prediction(
-        before=measured._replace(applied=applied),
+        before=before,
         memories=memories,
         after=after,
         steps=steps,

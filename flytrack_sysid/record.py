@@ -151,28 +151,34 @@ def fill_gaps(log: FlightLog) -> Filled:
     return Filled(filled, np.where(measured, rows, -1), behind, doubt)
 
 
-def make_record(log: FlightLog) -> Record:
-    """Return a log ready for replay."""
-    filled = fill_gaps(log)
-    full, begins = filled.log, filled.log.is_start()
-    zeros = np.zeros((len(full), 3))
-    longest_s = WINDOW_S if "v_bat" in log else WINDOW_WITHOUT_VOLTAGE_S
+def record_of(filled: Filled) -> Record:
+    """Return a log without gaps as a record, without padding and in one piece."""
+    log, begins = filled.log, filled.log.is_start()
+    zeros = np.zeros((len(log), 3))
     after_gap = np.append(False, filled.source_row[:-1] < 0) & (filled.source_row >= 0)
-    record = Record(
+    return Record(
         source_row=filled.source_row,
-        step_s=steps_after(full),
-        command=full["u"],
+        step_s=steps_after(log),
+        command=log["u"],
         command_doubt=filled.command_doubt,
         begins=begins,
         is_applied_known=(begins | after_gap) & ("uprev" in log),
-        applied=full["uprev"] if "uprev" in log else full["u"],
-        pos_w=full["p"] if "p" in log else zeros,
-        vel_w=_velocity(full),
-        quat=full["q"] if "q" in log else np.tile(UPRIGHT, (len(full), 1)),
-        battery_v=full["v_bat"][:, 0] if "v_bat" in log else zeros[:, 0] + BATTERY_UNKNOWN_V,
-        piece=_pieces(full.time, begins, blocks_of(log)[filled.behind], longest_s),
+        applied=log["uprev"] if "uprev" in log else log["u"],
+        pos_w=log.channels.get("p", zeros),
+        vel_w=_velocity(log),
+        quat=log["q"] if "q" in log else np.tile(UPRIGHT, (len(log), 1)),
+        battery_v=log["v_bat"][:, 0] if "v_bat" in log else zeros[:, 0] + BATTERY_UNKNOWN_V,
+        piece=np.zeros(len(log), int),
     )
-    return _padded(record)
+
+
+def make_record(log: FlightLog) -> Record:
+    """Return a log ready for replay."""
+    filled = fill_gaps(log)
+    record = record_of(filled)
+    longest_s = WINDOW_S if "v_bat" in log else WINDOW_WITHOUT_VOLTAGE_S
+    pieces = _pieces(filled.log.time, record.begins, blocks_of(log)[filled.behind], longest_s)
+    return _padded(record._replace(piece=pieces))
 
 
 def steps_after(log: FlightLog) -> np.ndarray:

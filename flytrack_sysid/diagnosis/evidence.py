@@ -1,4 +1,4 @@
-"""What each cause is in plain words, and the plot that convicts it: which residual against what."""
+"""What each cause is in plain words, and the plot that shows it: which residual against what."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -25,7 +25,7 @@ class After(NamedTuple):
 
 
 class Evidence(NamedTuple):
-    """Plain words of a cause, its panels, and how these convict it."""
+    """A cause in plain words, its panels, and how they show it."""
 
     words: str
     panels: tuple[Against | After, ...]
@@ -49,26 +49,28 @@ _BY_AIRSPEED = _against("force", "airspeed")
 _LATE_READING = (
     "Averaged over all steps of the command: the error is a kick that dies out once the drone has answered."
 )
-_GYRO = _against("rates", "said_rates") + _against("attitude", "said_rates")
+_GYRO = _against("rates", "model_rates") + _against("attitude", "model_rates")
 _GYRO_READING = "It shows in the gyro (above) and not in the turn of the attitude (below)."
-_ACCELEROMETER = _against("force", "said_force") + _against("velocity", "said_force")
+_ACCELEROMETER = _against("force", "model_force") + _against("velocity", "model_force")
 _ACCELEROMETER_READING = "It shows in the accelerometer (above) and not in the change of velocity (below)."
 
 EVIDENCE: dict[str, Evidence] = {
     "command_delay": Evidence("all commands act late", _LATE, _LATE_READING),
     "thrust_lag_asymmetry": Evidence(
-        "thrust falls at another speed than it rises",
+        "thrust falls faster or slower than it rises",
         (After("force_z", "thrust", 1), After("force_z", "thrust", -1)),
-        "The error after rising commands is another than after falling ones.",
+        "The error after rising commands differs from that after falling ones.",
     ),
     "rate_expo": Evidence(
         "the sticks have a cubic curve", _BY_STICK, "The error bends back to nothing at full stick."
     ),
     "rate_scale": Evidence(
-        "maximum body rates are other ones", _BY_STICK, "The error grows in proportion to the stick."
+        "maximum body rates differ", _BY_STICK, "The error grows in proportion to the stick."
     ),
     "rate_saturation": Evidence(
-        "body rates end below full stick", _BY_STICK, "No error near the centre, a steep one at the ends."
+        "body rates saturate before full stick",
+        _BY_STICK,
+        "No error near the centre, a steep rise.",
     ),
     "yaw_reaction": Evidence(
         "yaw is kicked when thrust changes",
@@ -77,12 +79,12 @@ EVIDENCE: dict[str, Evidence] = {
     ),
     "motor_imbalance": Evidence(
         "roll and pitch creep with thrust",
-        _all_against("rates", "said_force_z", "xy"),
+        _all_against("rates", "model_force_z", "xy"),
         "The error of the rate grows with thrust, whatever the sticks do.",
     ),
     "rate_cross_coupling": Evidence(
         "roll and pitch leak into yaw",
-        (Against("rates_z", "said_rates_x"), Against("rates_z", "said_rates_y")),
+        (Against("rates_z", "model_rates_x"), Against("rates_z", "model_rates_y")),
         "The yaw rate is off in proportion to the rates about the other axes.",
     ),
     "second_order_rates": Evidence("the rate loop has a second lag", _TURNS, _LATE_READING),
@@ -97,8 +99,8 @@ EVIDENCE: dict[str, Evidence] = {
         "The push keeps its direction in the world, whatever the heading.",
     ),
     "thrust_scale": Evidence(
-        "all thrust is scaled (or the mass is another)",
-        (Against("force_z", "said_force_z"),),
+        "all thrust is scaled (or the mass differs)",
+        (Against("force_z", "model_force_z"),),
         "The error grows in proportion to thrust.",
     ),
     "translational_lift": Evidence(
@@ -109,7 +111,7 @@ EVIDENCE: dict[str, Evidence] = {
     "ground_effect": Evidence(
         "thrust gained near the ground",
         (Against("force_z", "height"),),
-        "The error is there near the ground only.",
+        "The error appears only near the ground.",
     ),
     "linear_drag": Evidence(
         "drag in proportion to airspeed", _BY_AIRSPEED, "A force against the motion, on a straight line."
@@ -126,7 +128,7 @@ EVIDENCE: dict[str, Evidence] = {
     ),
     "thrust_tilt": Evidence(
         "the thrust axis leans",
-        _all_against("force", "said_force_z", "xy"),
+        _all_against("force", "model_force_z", "xy"),
         "A sideways force in proportion to thrust.",
     ),
     "voltage_sag": Evidence(
@@ -150,17 +152,17 @@ EVIDENCE: dict[str, Evidence] = {
     "accelerometer_bias": Evidence("the accelerometer has an offset", _ACCELEROMETER, _ACCELEROMETER_READING),
     "gyro_scale": Evidence("the gyro's scale is off", _GYRO, _GYRO_READING),
     "gyro_bias": Evidence("the gyro has an offset", _GYRO, _GYRO_READING),
-    "tau_roll": Evidence("roll answers at another speed", _TURNS[:1], _LATE_READING),
-    "tau_pitch": Evidence("pitch answers at another speed", _TURNS[1:2], _LATE_READING),
-    "tau_yaw": Evidence("yaw answers at another speed", _TURNS[2:], _LATE_READING),
-    "tau_thrust": Evidence("thrust answers at another speed", _LATE[2:], _LATE_READING),
+    "tau_roll": Evidence("the lag of roll differs", _TURNS[:1], _LATE_READING),
+    "tau_pitch": Evidence("the lag of pitch differs", _TURNS[1:2], _LATE_READING),
+    "tau_yaw": Evidence("the lag of yaw differs", _TURNS[2:], _LATE_READING),
+    "tau_thrust": Evidence("the lag of thrust differs", _LATE[2:], _LATE_READING),
     "thrust_curve": Evidence(
-        "the thrust curve is another",
+        "the thrust curve differs",
         (Against("force_z", "applied_thrust"),),
         "The error along the thrust axis follows the thrust action.",
     ),
     "battery_drain": Evidence(
-        "the battery drains at another speed",
+        "the battery drains faster or slower",
         (Against("battery", "time"),),
         "The voltage drifts away from the model's, evenly in time.",
     ),
@@ -186,6 +188,6 @@ def words_of(cause: str) -> str:
     return EVIDENCE[cause].words if cause in EVIDENCE else cause.replace("_", " ")
 
 
-def in_words(causes: Sequence[str]) -> str:
-    """Return causes in plain words, in a row."""
+def list_words(causes: Sequence[str]) -> str:
+    """Return causes in plain words, as a list in a sentence."""
     return "; ".join(words_of(cause) for cause in causes)

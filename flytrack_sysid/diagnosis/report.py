@@ -1,6 +1,5 @@
 """A diagnosis as one page that is read in two minutes: ``report.html``."""
 
-from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -8,48 +7,47 @@ from matplotlib.figure import Figure
 
 from flytrack_env.dynamics import SECONDS_PER_MINUTE
 from flytrack_env.files import write_atomically
-from flytrack_sysid.diagnosis.conviction import draw_cause
-from flytrack_sysid.diagnosis.evidence import EVIDENCE, in_words, without, words_of
-from flytrack_sysid.diagnosis.pictures import (
-    CHANNEL_WORDS,
+from flytrack_sysid.diagnosis.evidence import EVIDENCE, list_words, without, words_of
+from flytrack_sysid.diagnosis.figures import (
     FORCES,
-    MODELS,
     RATES,
-    autocorrelations,
     draw_against,
-    draw_errors,
-    draw_independence,
+    draw_cause,
     draw_over_time,
     draw_whiteness,
-    error_style,
-    keys_of,
 )
 from flytrack_sysid.diagnosis.result import CAUSES_FOUND, CONSISTENT, Cause, Diagnosis, Estimated
 from flytrack_sysid.diagnosis.traces import Traces, traces
-from flytrack_sysid.diagnosis.whiteness import whiteness
 from flytrack_sysid.log import FlightLog
 from flytrack_sysid.page import Bullets, Part, Picture, Section, Table, Text, Verdict, page
 from flytrack_sysid.plots import png_of
 
 MOST_PICTURED = 6  # causes, those with the largest gain: more pictures nobody reads
 MOST_LISTED = 3  # names in one cell
-DIFFERENCES = (
-    "The log lacks a gyro or an accelerometer; attitude or velocity stand in, by their change from row to "
-    "row. White noise of theirs shows as a correlation of -0.5 at the first lag."
-)
 NO_BREAK = "\u00a0"  # a space at which lines do not break
 HEADLINE_HORIZON = "1"  # s of free flight, whose error the first sentence gives
+CHANNEL_WORDS = {"rates": "body rates", "force": "specific force"}
+DIFFERENCES = (
+    "The log lacks a gyro or an accelerometer; attitude or velocity replace them, by their change from row "
+    "to row. White noise of theirs shows as a correlation of -0.5 at the first lag."
+)
 HOW = (
-    "Every step of the log is predicted from the row before it. What follows from the commands alone is "
-    "carried on by the model; attitude, velocity, position and voltage are taken from the log.",
+    "Every step of the log is predicted from the row before it. The model carries on what follows from the "
+    "commands alone; attitude, velocity, position and voltage are taken from the log.",
     "A cause is named where it explains more than chance on the fitted part, where the held-out part does "
     "not contradict it, and where no other cause explains more.",
-    "In the plot of a cause, orange dots are what the extended model leaves with this one cause taken out, "
+    "In the plot of a cause, orange dots are what the extended model leaves without this one cause and with "
     "nothing else refitted. The line is the difference between both models. Blue rings are what is left.",
-    "Residuals are measured less said by the model. Forces are specific forces along the body's axes, thrust "
-    "along z, where not said to be along the world's; rates are about the body's axes.",
+    "Residuals are measured minus modelled. Forces are specific forces along the body's axes, thrust along "
+    "z, except where world axes are given; rates are about the body's axes.",
     "Pictures show the whole log, the table of errors the held-out part.",
 )
+CAPTIONS = {
+    "over_time": "Means over short pieces of time. Noise is averaged out.",
+    "rates": "Means by bins with 95 % intervals. For a model that lacks nothing they are all at 0.",
+    "forces": "The same for the specific force along the body's axes.",
+    "whiteness": "White noise leaves the 95 % band at 5 lags in 100, the 99 % band at 1.",
+}
 
 
 def _number(value: float | None) -> str:
@@ -68,19 +66,12 @@ def _parameter(name: str, found: Estimated) -> str:
 
 def _confused(cause: Cause) -> str:
     if cause.equivalent:
-        return f"this log cannot tell it from: {in_words(cause.equivalent[:MOST_LISTED])}"
-    if cause.closest:
-        return f"told apart; closest is: {words_of(cause.closest)}"
-    return "not put against others"
-
-
-def _named(causes: tuple[Cause, ...]) -> str:
-    things = f"{len(causes)} things" if len(causes) > 1 else "one thing"
-    return f"The model lacks {things}: {in_words([cause.effect for cause in causes])}."
+        return f"this log cannot tell it from: {list_words(cause.equivalent[:MOST_LISTED])}"
+    return f"no; the closest is: {words_of(cause.closest)}" if cause.closest else "not compared"
 
 
 def _gained(diagnosis: Diagnosis) -> str:
-    """Return what the causes do for a second of free flight; nothing where that is not known."""
+    """Return what the causes gain over a second of free flight; nothing where that is not known."""
 
     def error(model: str) -> float:
         found = diagnosis.error[model].position_m if model in diagnosis.error else {}
@@ -97,10 +88,12 @@ def verdict_of(diagnosis: Diagnosis) -> Verdict:
     left = diagnosis.unexplained
     depends = f" It depends on {', '.join(left.depends_on)}." if left.depends_on else ""
     if diagnosis.verdict == CONSISTENT:
-        return Verdict("The log agrees with the model: what is left looks like the noise of sensors.", "good")
+        return Verdict("The log agrees with the model: the residuals look like sensor noise.", "good")
     if not diagnosis.causes:
         return Verdict(f"The model is wrong, and no known cause explains it.{depends}", "open")
-    text = _named(diagnosis.causes) + _gained(diagnosis)
+    number = f"{len(diagnosis.causes)} things" if len(diagnosis.causes) > 1 else "one thing"
+    names = list_words([cause.effect for cause in diagnosis.causes])
+    text = f"The model lacks {number}: {names}." + _gained(diagnosis)
     if diagnosis.verdict == CAUSES_FOUND:
         return Verdict(text, "found")
     return Verdict(f"{text} Something else remains that no known cause explains.{depends}", "open")
@@ -123,63 +116,49 @@ def _causes_part(diagnosis: Diagnosis) -> Part:
 
 
 def _errors_table(diagnosis: Diagnosis) -> Table:
-    error = diagnosis.error
+    models = diagnosis.error.values()
+    steps = dict.fromkeys(key for one in models for key in one.one_step_nrmse)
+    flights = dict.fromkeys(key for one in models for key in one.position_m)
     rows = [
-        [
-            CHANNEL_WORDS.get(key, key),
-            "NRMSE",
-            *(_number(one.one_step_nrmse.get(key)) for one in error.values()),
-        ]
-        for key in keys_of([one.one_step_nrmse for one in error.values()])
+        [CHANNEL_WORDS.get(key, key), "NRMSE", *(_number(one.one_step_nrmse.get(key)) for one in models)]
+        for key in steps
     ]
     rows += [
-        [
-            f"position after {key} s",
-            "m",
-            *(_number(one.position_m.get(key)) for one in error.values()),
-        ]
-        for key in keys_of([one.position_m for one in error.values()])
+        [f"position after {key} s", "m", *(_number(one.position_m.get(key)) for one in models)]
+        for key in flights
     ]
-    return Table(["error", "unit", *(error_style(name)[0] for name in error)], rows)
+    caption = "Held-out part. One step: 1 is as bad as predicting the mean; position in free flight, rms."
+    return Table(["error", "unit", *(name.replace("_", " ") for name in diagnosis.error)], rows, caption)
 
 
-def _not_seen(diagnosis: Diagnosis) -> list[Part]:
+def _limits_part(diagnosis: Diagnosis) -> Part:
     if not diagnosis.not_identifiable:
-        return [Text("This log could have shown every effect that is looked for, apart from all others.")]
+        return Text("This log could have shown every effect that is looked for, and told it from all others.")
     rows = [
         [
             f"{words_of(one.effect)}\n({one.effect})",
             (_number(one.smallest) + _unit(one.unit)).replace(" ", NO_BREAK),
-            in_words(one.confused_with[:MOST_LISTED]) or "noise",
+            list_words(one.confused_with[:MOST_LISTED]) or "noise",
             one.fly.replace("_", " "),
         ]
         for one in diagnosis.not_identifiable
     ]
-    caption = "Smaller than the second column, such an effect may be there, unseen in this log."
-    return [
-        Table(["effect", "seen from", "looks like", "fly this to settle it"], rows, caption, is_text=True)
-    ]
+    caption = "Smaller than the second column, such an effect may be there without showing in this log."
+    header = ["effect", "visible from", "looks like", "fly this to settle it"]
+    return Table(header, rows, caption, is_text=True)
 
 
-def _unexplained(diagnosis: Diagnosis) -> list[Part]:
+def _unexplained_parts(diagnosis: Diagnosis) -> list[Part]:
     left = diagnosis.unexplained
-    shares = [[name, _number(share)] for name, share in left.shares.items()]
+    if not left.flagged:
+        return [Text("Nothing: the residuals of the extended model are noise.")]
     what = ", ".join(left.depends_on) or "nothing that is known"
-    more = f"What is left is more than noise. It depends on: {what}."
-    parts: list[Part] = [Text(more if left.flagged else "Nothing: what the extended model leaves is noise.")]
-    if shares:
+    parts: list[Part] = [Text(f"What is left is more than noise. It depends on: {what}.")]
+    if left.shares:
+        shares = [[name, _number(share)] for name, share in left.shares.items()]
         caption = "Size of what is left (rms) by what it depends on, in units of the sensor noise"
         parts.append(Table(["channel: dependence", "times the sensor noise"], shares, caption))
     return parts
-
-
-def _whiteness_table(found: Traces) -> Table:
-    rows = []
-    for residual in (*RATES, *FORCES):
-        tests = {name: whiteness(one).statistic for name, one in autocorrelations(found, residual).items()}
-        rows.append([residual.replace("_", " "), *(_number(tests.get(name)) for name in MODELS)])
-    caption = "Sum of squared autocorrelations over that of white noise: 1 is white"
-    return Table(["residual", *(words for words, _ in MODELS.values())], rows, caption)
 
 
 _LESS = "without "
@@ -196,55 +175,15 @@ def traces_of(diagnosis: Diagnosis, log: FlightLog) -> Traces:
 def draw_report(diagnosis: Diagnosis, found: Traces) -> dict[str, Figure]:
     """Return the figures of a report by name; found: of ``traces_of``."""
     figures = {
-        "errors": draw_errors(diagnosis.error),
         "over_time": draw_over_time(found),
-        "rates": draw_against(found, RATES, "Body rates: what is left, and what it depends on"),
-        "forces": draw_against(found, FORCES, "Specific force: what is left, and what it depends on"),
+        "rates": draw_against(found, RATES, "Body rates: residuals, and what they depend on"),
+        "forces": draw_against(found, FORCES, "Specific force: residuals, and what they depend on"),
         "whiteness": draw_whiteness(found),
-        "independence": draw_independence(found),
     }
-    for cause in _pictured(diagnosis):
+    for cause in sorted(diagnosis.causes, key=lambda cause: -cause.chi2_gain)[:MOST_PICTURED]:
         panels = EVIDENCE[cause.effect].panels
         figures[cause.effect] = draw_cause(cause.effect, panels, found, _LESS + cause.effect, "extended")
     return figures
-
-
-def _pictured(diagnosis: Diagnosis) -> list[Cause]:
-    return sorted(diagnosis.causes, key=lambda cause: -cause.chi2_gain)[:MOST_PICTURED]
-
-
-def _evidence(diagnosis: Diagnosis, pictures: Mapping[str, bytes]) -> list[Section]:
-    if not diagnosis.causes:
-        return []
-    parts = [
-        Picture(pictures[cause.effect], f"{EVIDENCE[cause.effect].reading} ({cause.effect})")
-        for cause in _pictured(diagnosis)
-    ]
-    return [Section("The evidence, cause by cause", parts)]
-
-
-def _residual_parts(found: Traces, pictures: Mapping[str, bytes]) -> list[Part]:
-    parts: list[Part] = [
-        Picture(pictures["over_time"], "Means over short pieces of time. Noise has been averaged out."),
-        Picture(
-            pictures["rates"],
-            "Means by bins with 95 % intervals. A model that lacks nothing has them all at 0.",
-        ),
-        Picture(pictures["forces"], "The same for the specific force along the body's axes."),
-        Picture(
-            pictures["whiteness"],
-            "White noise leaves the 95 % band at 5 lags in 100, the 99 % band at 1.",
-        ),
-        _whiteness_table(found),
-        Picture(
-            pictures["independence"],
-            "Beyond the bands the model answers to the command in another way than the drone. Right of 0 the "
-            "residual follows the command; commands that change slowly show on both sides.",
-        ),
-    ]
-    if any(found.used(name) != name for name in (RATES[0], FORCES[0])):
-        parts.append(Text(DIFFERENCES))
-    return parts
 
 
 def html_of(diagnosis: Diagnosis, log: FlightLog) -> str:
@@ -259,12 +198,20 @@ def html_of(diagnosis: Diagnosis, log: FlightLog) -> str:
     ]
     if diagnosis.warnings:
         introduction.append(Bullets(diagnosis.warnings))
+    evidence: list[Part] = [
+        Picture(png, f"{EVIDENCE[name].reading} ({name})")
+        for name, png in pictures.items()
+        if name in EVIDENCE
+    ]
+    residuals: list[Part] = [Picture(pictures[name], caption) for name, caption in CAPTIONS.items()]
+    if any(found.used(name) != name for name in (RATES[0], FORCES[0])):
+        residuals.append(Text(DIFFERENCES))
     sections = [
-        Section("Errors before and after", [Picture(pictures["errors"], ""), _errors_table(diagnosis)]),
-        *_evidence(diagnosis, pictures),
-        Section("What this log could not show, and what to fly", _not_seen(diagnosis)),
-        Section("What remains unexplained", _unexplained(diagnosis)),
-        Section("Residuals, before and after", _residual_parts(found, pictures)),
+        Section("Errors before and after", [_errors_table(diagnosis)]),
+        *([Section("The evidence, cause by cause", evidence)] if evidence else []),
+        Section("What this log could not show, and what to fly", [_limits_part(diagnosis)]),
+        Section("What remains unexplained", _unexplained_parts(diagnosis)),
+        Section("Residuals, before and after", residuals),
         Section("How this was done", [Bullets(HOW)]),
     ]
     return page("What the model gets wrong", sections, introduction)
@@ -276,6 +223,6 @@ def write_report(path: str | Path, diagnosis: Diagnosis, log: FlightLog) -> None
     log: the one that was diagnosed.
 
     Raises:
-        OSError: what the system says.
+        OSError: the file cannot be written.
     """
     write_atomically(path, html_of(diagnosis, log).encode())

@@ -1,7 +1,7 @@
-"""What models leave of a log, row by row, and what it may be held against: speed, thrust, sticks, place.
+"""Residuals of models, row by row of a log, and regressors to plot them against: speed, sticks, place.
 
 ============  =====================================================================  =======
-channel       residual of a row, measured less said                                  unit
+channel       residual of a row, measured minus modelled                             unit
 ============  =====================================================================  =======
 ``rates``     gyro, body                                                             rad/s
 ``attitude``  mean rate of the turn since the row before, body                       rad/s
@@ -10,8 +10,8 @@ channel       residual of a row, measured less said                             
 ``battery``   voltage, summed up since the flight began                              V
 ============  =====================================================================  =======
 
-``attitude`` and ``velocity`` say the same as ``rates`` and ``force``, without gyro and accelerometer: what
-shows in one of a pair only is wrong with a sensor.
+``attitude`` and ``velocity`` measure the same as ``rates`` and ``force``, without gyro and accelerometer:
+what shows in only one of a pair is wrong with a sensor.
 """
 
 from collections.abc import Mapping
@@ -24,24 +24,23 @@ from scipy.spatial.transform import Rotation
 from flytrack_env.dynamics import ModelParameters, lag
 from flytrack_env.effects import EFFECTS
 from flytrack_env.state import Action
-from flytrack_sysid.diagnosis.lanes import Lanes, lead_in_of, make_lanes
+from flytrack_sysid.diagnosis.lanes import AXES, Lanes, lead_in_of, make_lanes
 from flytrack_sysid.diagnosis.problem import Problem
+from flytrack_sysid.diagnosis.result import CHANNELS
 from flytrack_sysid.log import FlightLog
-from flytrack_sysid.parameters import to_vector
+from flytrack_sysid.parameters import STICKS, to_vector
 from flytrack_sysid.record import Record
 
 UNITS = {"rates": "rad/s", "attitude": "rad/s", "force": "m/s²", "velocity": "m/s²", "battery": "V"}
-# Of Problem.left, (axes, channel): rotation is axes 0 to 2, force 3 to 5, battery 6; direct 0, level 1.
+# Of Problem.residuals: axes, and 0 for the direct channel, 1 for the level.
 _PLACES = {
-    "rates": (slice(0, 3), 0),
-    "attitude": (slice(0, 3), 1),
-    "force": (slice(3, 6), 0),
-    "velocity": (slice(3, 6), 1),
-    "battery": (slice(6, 7), 1),
+    name: (axes, number)
+    for axes, names in zip(AXES, CHANNELS, strict=True)
+    for number, name in enumerate(names)
+    if name is not None
 }
 _PER_STEP = ("attitude", "velocity", "battery")  # changes since the row before
 _INSTEAD = {"rates": "attitude", "force": "velocity"}
-_STICKS = ("roll", "pitch", "yaw", "thrust")
 _AXES = "xyz"
 BETWEEN_FLIGHTS = 1000  # slots: no lag of a correlation reaches from one flight into the next
 
@@ -66,7 +65,7 @@ class Traces(NamedTuple):
     attitude: Rotation
 
     def used(self, name: str) -> str:
-        """Return the column that stands for one: attitude for rates, velocity for force, without a sensor."""
+        """Return the column to use for one: without a sensor, attitude for rates and velocity for force."""
         channel, _, rest = name.partition("_")
         if not self.counts[channel].any():
             channel = _INSTEAD.get(channel, channel)
@@ -91,21 +90,21 @@ REGRESSORS: dict[str, tuple[str, str]] = {
     **{f"airspeed_{axis}": (f"airspeed along body {axis}", "m/s") for axis in _AXES},
     "airspeed_xy": ("airspeed in the rotor plane", "m/s"),
     "speed": ("speed", "m/s"),
-    **{f"command_{stick}": (f"{stick} command", "1") for stick in _STICKS},
-    **{f"applied_{stick}": (f"{stick} action, lagged", "1") for stick in _STICKS},
+    **{f"command_{stick}": (f"{stick} command", "1") for stick in STICKS},
+    **{f"applied_{stick}": (f"{stick} action, lagged", "1") for stick in STICKS},
     "thrust_change": ("change of the applied thrust action", "1/s"),
     **{
-        f"said_rates_{axis}": (f"{name} rate of the model", "rad/s")
-        for axis, name in zip(_AXES, _STICKS[:3], strict=True)
+        f"model_rates_{axis}": (f"{name} rate of the model", "rad/s")
+        for axis, name in zip(_AXES, STICKS[:3], strict=True)
     },
-    **{f"said_force_{axis}": (f"force of the model, body {axis}", "m/s²") for axis in _AXES},
+    **{f"model_force_{axis}": (f"force of the model, body {axis}", "m/s²") for axis in _AXES},
     **{
         f"turning_{axis}": (f"squared rates about {others}", "rad²/s²")
         for axis, others in zip(_AXES, ("y, z", "x, z", "x, y"), strict=True)
     },
     **{
         f"spin_up_{axis}": (f"{name} demanded", "rad/s²")
-        for axis, name in zip(_AXES, _STICKS[:3], strict=True)
+        for axis, name in zip(_AXES, STICKS[:3], strict=True)
     },
     **{f"position_{axis}": (f"position {axis}", "m") for axis in "xy"},
     "height": ("height", "m"),
@@ -198,17 +197,17 @@ def _regressors(model: ModelParameters, record: Record, applied: np.ndarray) -> 
     for index, axis in enumerate(_AXES):
         found[f"airspeed_{axis}"] = airspeed[:, index]
         found[f"spin_up_{axis}"] = change[:, index] * full_rates[index]
-    for index, stick in enumerate(_STICKS):
+    for index, stick in enumerate(STICKS):
         found[f"command_{stick}"] = record.command[:, index]
-    # What is said of a row is said of the step to it, from the row before; the lag acts first in a step.
+    # Values of a row are those of the step to it, from the row before; the lag acts first in a step.
     found = {name: np.roll(values, 1) for name, values in found.items()}
-    return found | {f"applied_{stick}": applied[:, index] for index, stick in enumerate(_STICKS)}
+    return found | {f"applied_{stick}": applied[:, index] for index, stick in enumerate(STICKS)}
 
 
-def _said(
+def _predicted(
     residuals: dict, lanes: Lanes, rows: _Rows, record: Record, before: Rotation, gravity: float
 ) -> dict[str, np.ndarray]:
-    """Return the rates and the true specific force that a model says: measured less its residual."""
+    """Return the rates and the true specific force that a model predicts: measured minus its residual."""
     step_s = np.roll(record.step_s, 1)[rows.kept, None]
     if "w" in lanes.measured:
         rates = rows.along(lanes.measured["w"])[rows.kept] - residuals["rates"]
@@ -219,21 +218,21 @@ def _said(
     force = before.inv().apply(moved + np.array([0.0, 0.0, gravity])) - residuals["velocity"]
     squares = rates**2
     turning = squares.sum(axis=1, keepdims=True) - squares
-    parts = {"said_rates": rates, "said_force": force, "turning": turning}
+    parts = {"model_rates": rates, "model_force": force, "turning": turning}
     return {
         f"{name}_{axis}": part[:, index] for name, part in parts.items() for index, axis in enumerate(_AXES)
     }
 
 
 def traces(log: FlightLog, models: Mapping[str, ModelParameters], like: str) -> Traces:
-    """Return what each of some models leaves of all rows of a log.
+    """Return the residuals of models on all rows of a log.
 
-    like: name of the model whose lags, rates and wind the regressors are made with; a delay of commands is
-    not among them. Regressors of a row are those of the step to it: what was flown and commanded in the row
-    before, the action after its lag.
+    like: name of the model whose lags, rates and wind make the regressors; a delay of commands does not
+    enter. Regressors of a row are those of the step to it: what was flown and commanded in the row before,
+    the action after its lag.
 
     Raises:
-        KeyError: ``like`` is none of the models.
+        KeyError: ``like`` is not one of the models.
     """
     base = models[like]
     with jax.enable_x64(True):
@@ -259,6 +258,6 @@ def traces(log: FlightLog, models: Mapping[str, ModelParameters], like: str) -> 
         "elapsed": step_s * rows.kept,
         **{name: values[rows.kept] for name, values in found.items()},
     }
-    regressors |= _said(residuals[like], lanes, rows, record, before, float(base.g))
+    regressors |= _predicted(residuals[like], lanes, rows, record, before, float(base.g))
     slot = np.arange(len(begins)) + BETWEEN_FLIGHTS * np.cumsum(begins)
     return Traces(residuals, _counts(lanes, rows, record), regressors, slot[rows.kept], step_s, before)

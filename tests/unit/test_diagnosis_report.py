@@ -11,8 +11,9 @@ from scipy.spatial.transform import Rotation
 from benchmarks.hidden import draw_base, fly, measure
 from flytrack_env.dynamics import ModelParameters
 from flytrack_env.effects import EFFECTS, AccelerometerBias, CommandDelay, LinearDrag
-from flytrack_sysid.diagnosis.conviction import draw_cause
-from flytrack_sysid.diagnosis.evidence import BASE_CAUSES, EVIDENCE, Against, without
+from flytrack_sysid.diagnosis.candidates import BASE_CAUSES
+from flytrack_sysid.diagnosis.evidence import EVIDENCE, Against, without
+from flytrack_sysid.diagnosis.figures import draw_cause
 from flytrack_sysid.diagnosis.report import html_of, verdict_of, write_report
 from flytrack_sysid.diagnosis.result import (
     CAUSES_FOUND,
@@ -63,7 +64,7 @@ def lagged(log, tau: np.ndarray) -> np.ndarray:
     return np.array(found)
 
 
-def test_residuals_are_measured_less_said(flown):
+def test_residuals_are_measured_minus_modelled(flown):
     base, log = flown
     wrong = base._replace(tau=1.3 * base.tau, battery_drain_v_per_min=0.5).with_effects(
         LinearDrag(0.1, 0.2, 0.0)
@@ -103,8 +104,8 @@ def test_regressors_are_those_of_the_step(flown):
     )
     np.testing.assert_allclose(regressors["command_roll"][1:], log["u"][:-1, 0])
     np.testing.assert_allclose(regressors["speed"][1:], np.linalg.norm(log["v"], axis=1)[:-1])
-    np.testing.assert_allclose(regressors["said_force_z"][later], log["f"][later, 2], atol=1e-3)
-    np.testing.assert_allclose(regressors["said_rates_y"][later], log["w"][later, 1], atol=1e-3)
+    np.testing.assert_allclose(regressors["model_force_z"][later], log["f"][later, 2], atol=1e-3)
+    np.testing.assert_allclose(regressors["model_rates_y"][later], log["w"][later, 1], atol=1e-3)
     np.testing.assert_allclose(
         regressors["turning_z"][later], (log["w"][later, :2] ** 2).sum(axis=1), atol=1e-2
     )
@@ -134,7 +135,7 @@ def test_attitude_stands_in_for_a_gyro(flown):
         found.column("base", "rates_y")[0], found.residuals["base"]["attitude"][:, 1]
     )
     with_gyro = traces(log, {"base": base}, like="base")
-    for name in ("said_rates_x", "said_rates_z"):
+    for name in ("model_rates_x", "model_rates_z"):
         apart = found.regressors[name][SETTLED:] - with_gyro.regressors[name][SETTLED:]
         assert np.abs(apart).max() < 0.05
 
@@ -267,13 +268,13 @@ def test_page_says_all_and_loads_nothing(tmp_path, diagnosis, measured):
     ):
         assert words in text.replace("&#x27;", "'"), words
     assert not re.search(r"https?://|url\(|@import|<link|<script", text)
-    assert text.count('src="data:image/png;base64,') == text.count("<img") == 6 + len(diagnosis.causes)
+    assert text.count('src="data:image/png;base64,') == text.count("<img") == 4 + len(diagnosis.causes)
     assert len(text) < 3e6
 
 
 def test_page_of_a_log_of_few_channels(diagnosis, measured):
     text = html_of(diagnosis, measured.without("w", "f", "v_bat"))
-    assert "attitude or velocity stand in" in text and text.count("<img") == 6 + len(diagnosis.causes)
+    assert "attitude or velocity replace them" in text and text.count("<img") == 4 + len(diagnosis.causes)
 
 
 def test_verdicts(diagnosis):
@@ -294,7 +295,7 @@ def test_curve_of_a_cause_goes_through_what_is_left_without_it(flown, measured):
     figure = draw_cause("linear_drag", EVIDENCE["linear_drag"].panels, found, "without", "extended")
     for panel in figure.axes:
         lines = {line.get_label(): line for line in panel.lines}
-        curve = lines["what the cause explains"].get_ydata()
+        curve = lines["explained by the cause"].get_ydata()
         (dots,) = panel.containers
         middles, ends = dots.lines[0].get_ydata(), dots.lines[2][0].get_segments()
         halves = np.array([0.5 * (end[1, 1] - end[0, 1]) for end in ends])
