@@ -6,22 +6,18 @@ import time
 from pathlib import Path
 from typing import Any
 
-import jax
 import numpy as np
 
-import eval_agent
 from baselines.purejaxrl_ppo import Config
-from baselines.purejaxrl_ppo.checkpoint import Checkpoint
 from baselines.purejaxrl_ppo.density import draw_position_density
-from baselines.purejaxrl_ppo.evaluate import fly_many
-from baselines.purejaxrl_ppo.flights import Flight, outcomes_of, score
-from baselines.purejaxrl_ppo.recording import CANNOT_RECORD, can_record, record_flights
-from baselines.purejaxrl_ppo.run_folder import checkpoints_in
-from baselines.purejaxrl_ppo.train_ppo import train_policy
-from flytrack_env import blackbox, load_track, save_model
+from baselines.purejaxrl_ppo.evaluate import SHIPPED_BLACK_BOX, EvaluationSettings, evaluate
+from baselines.purejaxrl_ppo.flights import fly_many, outcomes_of, score
+from baselines.purejaxrl_ppo.recording import CANNOT_RECORD, can_record
+from baselines.purejaxrl_ppo.resume import FINAL, checkpoints_in
+from baselines.purejaxrl_ppo.training import train_policy
+from flytrack_env import blackbox, save_model
 from flytrack_env.files import fresh_folder, write_atomically
 from flytrack_env.pictures import read_flights, write_pictures
-from flytrack_env.references import shipped_references
 from flytrack_sysid import Validation, collect, fit, held_out_rows, load_log, save_log, validate
 from flytrack_sysid.validate import NAMES
 
@@ -34,8 +30,7 @@ NUM_EPISODES = 256
 def identify(black_box: Path, out: Path, seed: int) -> dict[str, Validation]:
     """Fly the excitation on the black box, fit, write log and model to train on; return held-out errors.
 
-    The minimal model shows what is open; linear drag, which those who flew the original report, is then
-    added, and what it leaves is open still.
+    The minimal model leaves a force unexplained; linear drag, reported for the original drone, is then added.
     """
     save_log(out / "flight_log.npz", collect(blackbox.load(black_box), seed=seed))
     log = load_log(out / "flight_log.npz")
@@ -61,19 +56,10 @@ def describe_identification(validations: dict[str, Validation]) -> None:
         print(f"      {speeds:36} {before.rms:9.3f} {after.rms:9.3f}")
 
 
-def draw_flight(out: Path, checkpoint: Checkpoint, black_box: Path, flight: Flight, seed: int) -> None:
-    """Write pictures of the flight, and a recording of it beside the simulator's and the time-optimal one."""
-    track = load_track(checkpoint.track)
-    write_pictures(read_flights([out / "rollout.npy"], track), out)
-    beside = eval_agent.fly_beside(checkpoint, jax.random.key(seed), NUM_STEPS, NUM_STEPS, track)
-    references = shipped_references(track, eval_agent.reference_models(black_box))
-    record_flights(out / "rollout.rrd", {"black box": flight, "simulator": beside}, track, None, references)
-
-
 def main() -> None:
     """Run the job, print lap times, write ``runs/demo``, or the next folder that is free."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--black-box", type=Path, default=eval_agent.SHIPPED_BLACK_BOX)
+    parser.add_argument("--black-box", type=Path, default=SHIPPED_BLACK_BOX)
     parser.add_argument("--out", type=Path, help=f"folder (default: {DEFAULT_OUT}, or the next free one)")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--total-timesteps", type=float, default=Config.total_timesteps)
@@ -104,10 +90,13 @@ def run(arguments: argparse.Namespace) -> None:
     checkpoint, _ = train_policy(out, config, seed, model=out / "model.json")
 
     print("3/4 fly the checkpoint on the black box")
-    flight = eval_agent.fly_on_black_box(checkpoint, arguments.black_box, NUM_STEPS, seed)
-    eval_agent.save_flown(out / "rollout.npy", flight)
-    print(eval_agent.describe(flight, blackbox.DT))
-    env = eval_agent.black_box_env(checkpoint, arguments.black_box)
+    settings = EvaluationSettings(
+        out / FINAL, NUM_STEPS, black_box=arguments.black_box, seed=seed, out=out / "rollout.npy"
+    )
+    report = evaluate(settings)
+    report.write()
+    print(report.text)
+    env = report.scene.env
     flights = fly_many(env, checkpoint.network, checkpoint.params, seed, NUM_EPISODES, NUM_STEPS, NUM_LAPS)
     result = score(outcomes_of(flights, NUM_LAPS, len(env.track.gates)))
 
@@ -117,15 +106,11 @@ def run(arguments: argparse.Namespace) -> None:
         "validation": {name: errors.as_json() for name, errors in validations.items()},
         "training_steps": checkpoint.meta["steps"],
         "training_seconds": checkpoint.meta["seconds"],
-        "rollout": {
-            "lap_times_s": np.round(eval_agent.lap_times(flight), 3).tolist(),
-            "gates_passed": int(np.max(flight.gates_passed)),
-            "ended": eval_agent.reason_ended(flight),
-        },
+        "rollout": report.numbers["first_flight"],
         "noisy_starts": {
             "episodes": NUM_EPISODES,
             "laps": NUM_LAPS,
-            # JSON has no NaN: a time that there was none of is null.
+            # JSON has no NaN: a time without a lap is null.
             **{name: None if np.isnan(v) else v for name, v in result._asdict().items()},
         },
         "seconds": round(time.perf_counter() - started, 1),
@@ -133,7 +118,8 @@ def run(arguments: argparse.Namespace) -> None:
     write_atomically(out / "summary.json", (json.dumps(summary, indent=2) + "\n").encode())
     print("4/4 draw")
     draw_position_density(out / "position_density.png", flights.positions(), env.track, NUM_EPISODES)
-    draw_flight(out, checkpoint, arguments.black_box, flight, seed)
+    write_pictures(read_flights([out / "rollout.npy"], env.track), out)
+    report.record(out / "rollout.rrd", with_ghost=True)
     print(
         f"{result.success:.1%} of {NUM_EPISODES} noisy starts finish {NUM_LAPS} laps on the black "
         f"box; first lap {result.first_lap_s:.2f} s, flying lap {result.flying_lap_s:.2f} s"

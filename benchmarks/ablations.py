@@ -24,15 +24,15 @@ from tqdm import tqdm
 
 import flytrack_env
 from baselines.purejaxrl_ppo import Config
-from baselines.purejaxrl_ppo.evaluate import race_many, start_keys
-from baselines.purejaxrl_ppo.flights import score
-from baselines.purejaxrl_ppo.options import is_due
-from baselines.purejaxrl_ppo.perturbed import draw_plants, with_model_as_given
+from baselines.purejaxrl_ppo.evaluate import SHIPPED_BLACK_BOX
+from baselines.purejaxrl_ppo.flights import race_many, score, start_keys
+from baselines.purejaxrl_ppo.plants import draw_plants
 from baselines.purejaxrl_ppo.ppo import make_network_for, make_ppo
+from baselines.purejaxrl_ppo.race_env import with_model_as_given
+from baselines.purejaxrl_ppo.run import is_due
 from baselines.purejaxrl_ppo.training import make_chunk, training_params, with_strong_types
 from benchmarks.ablated import InWorldFrame, WithoutEntries
 from benchmarks.env_speed import cpu_name, pin_to_one_core, versions
-from eval_agent import SHIPPED_BLACK_BOX
 from flytrack_env import EnvParams, blackbox, load_model
 from flytrack_env.dynamics import ModelParameters
 from flytrack_env.effects import CommandDelay

@@ -2,7 +2,7 @@
 
 Trains it on the identified and extended model of the shipped black box and flies it on the black box itself,
 from noisy starts. Where all flights finish and are fast enough, the policy alone becomes
-baselines/purejaxrl_ppo/champion/flytrack.msgpack, and a page compares it with the time-optimal flight.
+baselines/purejaxrl_ppo/champion/flytrack.safetensors, and a page compares it with the time-optimal flight.
 ``--only-fly`` flies the one that is there.
 """
 
@@ -17,7 +17,7 @@ from benchmarks.env_speed import cpu_name, versions
 from benchmarks.flown import ROOT, evaluate
 from flytrack_env.files import fresh_folder, write_atomically
 
-CHAMPION = ROOT / "baselines" / "purejaxrl_ppo" / "champion" / "flytrack.msgpack"
+CHAMPION = ROOT / "baselines" / "purejaxrl_ppo" / "champion" / "flytrack.safetensors"
 MODEL = ROOT / "benchmarks" / "data" / "time_optimal" / "black_box.json"
 # Fast laps use the width of the openings, so that offsets at a pass cost less than in the default reward; and
 # a policy that explores less while it learns can fly nearer to the frames. Its model is exact: no margin.

@@ -9,14 +9,13 @@ import time
 from pathlib import Path
 from typing import NamedTuple
 
-import eval_agent
 from baselines.purejaxrl_ppo.checkpoint import Checkpoint, load_checkpoint
-from baselines.purejaxrl_ppo.eval_options import MAX_FLIGHTS
-from baselines.purejaxrl_ppo.evaluate import race_many, start_keys
-from baselines.purejaxrl_ppo.flown_env import simulated_env
+from baselines.purejaxrl_ppo.evaluate import MAX_FLIGHTS, SHIPPED_BLACK_BOX
+from baselines.purejaxrl_ppo.flights import race_many, start_keys
 from baselines.purejaxrl_ppo.monitor import NUM_LAPS, NUM_STEPS
-from baselines.purejaxrl_ppo.perturbed import with_model_as_given
+from baselines.purejaxrl_ppo.race_env import plant_env, simulated_env, with_model_as_given
 from benchmarks.env_speed import cpu_name, pin_to_one_core, versions
+from flytrack_env import blackbox
 from flytrack_env.episodes import EpisodicEnvironment
 from flytrack_env.files import write_atomically
 
@@ -61,7 +60,7 @@ def main() -> None:
     parser.add_argument("checkpoint", type=Path)
     parser.add_argument("--episodes", type=int, default=AIM_FLIGHTS)
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--black-box", type=Path, default=eval_agent.SHIPPED_BLACK_BOX)
+    parser.add_argument("--black-box", type=Path, default=SHIPPED_BLACK_BOX)
     parser.add_argument("--out", type=Path, default=Path("docs/results/evaluation_speed.md"))
     arguments = parser.parse_args()
     if not 1 <= arguments.episodes <= MAX_FLIGHTS:
@@ -71,7 +70,7 @@ def main() -> None:
     try:
         checkpoint = load_checkpoint(arguments.checkpoint)
         scenes = {
-            "black box": eval_agent.black_box_env(checkpoint, arguments.black_box),
+            "black box": plant_env(checkpoint, blackbox.load(arguments.black_box)),
             "simulator": simulated_env(checkpoint),
         }
     except (ValueError, OSError) as error:

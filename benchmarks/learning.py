@@ -12,13 +12,14 @@ from pathlib import Path
 
 import jax
 
-import eval_agent
 from baselines.purejaxrl_ppo import Checkpoint, Config
-from baselines.purejaxrl_ppo.evaluate import race_many, start_keys
-from baselines.purejaxrl_ppo.flights import score
-from baselines.purejaxrl_ppo.train_ppo import train_policy
+from baselines.purejaxrl_ppo.evaluate import SHIPPED_BLACK_BOX
+from baselines.purejaxrl_ppo.flights import race_many, score, start_keys
+from baselines.purejaxrl_ppo.race_env import plant_env
+from baselines.purejaxrl_ppo.training import train_policy
 from benchmarks.env_speed import cpu_name
 from demo import NUM_EPISODES, NUM_LAPS, NUM_STEPS, identify
+from flytrack_env import blackbox
 from flytrack_env.episodes import EpisodicEnvironment
 from flytrack_env.files import fresh_folder, write_atomically
 
@@ -47,7 +48,7 @@ def measure_seed(seed: int, black_box: Path, out: Path, config: Config) -> tuple
     started = time.process_time()
     checkpoint, _ = train_policy(out / f"seed{seed}", config, seed, model=out / "model.json")
     cpu_seconds = time.process_time() - started
-    env = eval_agent.black_box_env(checkpoint, black_box)
+    env = plant_env(checkpoint, blackbox.load(black_box))
     keys = start_keys(seed, NUM_EPISODES)
     result = score(race_many(env, checkpoint.network, checkpoint.params, keys, NUM_STEPS, NUM_LAPS))
     row = (
@@ -62,7 +63,7 @@ def main() -> None:
     """Measure every seed, print and write the table; exit 1 if a seed misses the target."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seeds", type=int, default=10)
-    parser.add_argument("--black-box", type=Path, default=eval_agent.SHIPPED_BLACK_BOX)
+    parser.add_argument("--black-box", type=Path, default=SHIPPED_BLACK_BOX)
     parser.add_argument("--out", type=Path, default=Path("runs/learning"))
     parser.add_argument("--total-timesteps", type=float, default=Config.total_timesteps)
     parser.add_argument("--gate-margin", type=float, default=Config.gate_margin, help="m; of the recipe")

@@ -16,7 +16,7 @@ from tqdm import tqdm
 
 from baselines.purejaxrl_ppo import Config
 from baselines.purejaxrl_ppo.density import draw_position_density
-from baselines.purejaxrl_ppo.evaluate import fly_many
+from baselines.purejaxrl_ppo.flights import fly_many
 from baselines.purejaxrl_ppo.training import Trainer
 from benchmarks.report import RESULTS, ROOT, pin_to_one_core
 from flytrack_env.files import write_atomically

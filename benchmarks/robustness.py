@@ -38,7 +38,7 @@ def main() -> None:
         started_s = time.process_time()
         train_policy(work / name, config, SEED, env_id, options=Options())
         cpu_s = time.process_time() - started_s
-        report, text = evaluate(work / name / "final.msgpack", FLIGHTS)
+        report, text = evaluate(work / name / "final.safetensors", FLIGHTS)
         success, lap_s = report["plants"]["success"], report["flying_lap_s"]["mean"]
         percent = report["optimal"]["flying_lap_s"]["mean_percent_above"]
         times = float("inf") if percent is None else 1.0 + percent / 100.0

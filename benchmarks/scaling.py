@@ -98,8 +98,8 @@ def last_evaluation(out: Path) -> tuple[float, float | None]:
     """Return success, and the best flying lap, s, of the evaluation at the end of a training."""
     from baselines.purejaxrl_ppo import load_checkpoint
 
-    seen = load_checkpoint(out / "final.msgpack").meta["seen"]
-    return seen["success"], seen["best_lap_s"]
+    meta = load_checkpoint(out / "final.safetensors").meta
+    return meta["success"], meta["best_lap_s"]
 
 
 def measure_processes(folder: Path, seeds: int, steps: int) -> dict[str, Any]:

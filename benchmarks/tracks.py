@@ -12,9 +12,8 @@ import numpy as np
 
 import flytrack_env
 from baselines.purejaxrl_ppo import Config
-from baselines.purejaxrl_ppo.evaluate import fly_many
-from baselines.purejaxrl_ppo.flights import Outcomes, outcomes_of, score
-from baselines.purejaxrl_ppo.train_ppo import train_policy
+from baselines.purejaxrl_ppo.flights import Outcomes, fly_many, outcomes_of, score
+from baselines.purejaxrl_ppo.training import train_policy
 from benchmarks import report
 from flytrack_env.files import fresh_folder
 from flytrack_env.state import VELOCITY

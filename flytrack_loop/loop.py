@@ -11,10 +11,11 @@ from baselines.purejaxrl_ppo import Config
 from flytrack_env import save_model
 from flytrack_env.files import write_atomically
 from flytrack_env.plants import Plant
-from flytrack_loop.flown import fly_log
+from flytrack_loop.flight_log import fly_log
 from flytrack_loop.stages import Stage, errors_of, stage_as_json, train_stage
 from flytrack_sysid import Diagnosis, FlightLog, collect, diagnose, fit, save_log
 from flytrack_sysid.diagnosis import joined, text_of, write_diagnosis
+from flytrack_sysid.log import usual_step
 from flytrack_sysid.progress import ProgressBar
 
 SCHEMA = 1
@@ -26,7 +27,7 @@ class Settings(NamedTuple):
     """What the loop flies and how it is measured.
 
     minutes: of excitation. log_seconds: of the policy's own flights in the log that is diagnosed. noise: of
-    the sensors of all logs, 0 none, 1 common ones. The policy itself sees the plant's state.
+    the sensors in all logs, 0 none, 1 common ones. The policy itself observes the plant's state.
     """
 
     minutes: float = 2.0
@@ -35,11 +36,11 @@ class Settings(NamedTuple):
 
 
 class Loop(NamedTuple):
-    """What came of the loop on a plant.
+    """The results of the loop on a plant.
 
-    before, after: policies of the minimal and of the extended model, the same where nothing was named.
-    diagnosis: of race_log, flights of the first policy, together with the excitation. held_out: other
-    flights of it, which nothing was learnt from.
+    before, after: policies of the minimal and of the extended model, the same if nothing was named.
+    diagnosis: of race_log, flights of the first policy, together with the excitation. held_out: more flights
+    of it, used for testing only.
     """
 
     before: Stage
@@ -62,12 +63,12 @@ def close_loop(
     config: Config = Config(),  # noqa: B008, a frozen dataclass
     seed: int = 0,
     settings: Settings = Settings(),  # noqa: B008, a tuple of constants
-    tell: Callable[[str], None] = print,
+    report: Callable[[str], None] = print,
 ) -> Loop:
     """Close the loop on a plant; write logs, models, diagnosis, trainings and ``loop.json`` into ``out``.
 
     plant: a black box, or any ``flytrack_env.plants.Plant``. config: of both
-    trainings. tell: called with a line per step.
+    trainings. report: called with a line per step.
 
     Raises:
         ValueError: a plant that does not fly, settings that cannot be used, ``out`` with another run in it.
@@ -75,16 +76,16 @@ def close_loop(
     config.check()
     out.mkdir(parents=True, exist_ok=True)
     seeds = seeds_of(seed)
-    tell("1/6 collect and fit the minimal model")
+    report("1/6 collect and fit the minimal model")
     excitation = collect(plant, settings.minutes, seeds["collect"], settings.noise, ProgressBar("flights"))
     save_log(out / "excitation.npz", excitation)
     fitted = fit(excitation, report=ProgressBar("rounds"))
     save_model(out / "minimal.json", fitted.model, fitted.provenance())
 
-    tell("2/6 train on it")
+    report("2/6 train on it")
     rest = (plant, out, config, seeds["train"], seeds["evaluation"])
     before = train_stage("before", fitted.model, *rest)
-    tell("3/6 fly, and log the flight")
+    report("3/6 fly, and log the flight")
     length, noise = settings.log_seconds, settings.noise
     race_log = fly_log(plant, before.checkpoint, seeds["race_log"], length, noise)
     held_out = fly_log(plant, before.checkpoint, seeds["held_out_log"], length, noise)
@@ -92,19 +93,19 @@ def close_loop(
     save_log(out / "held_out.npz", held_out)
     before = before._replace(errors=errors_of(fitted.model, held_out))
 
-    tell("4/6 diagnose the flight, extend the model")
+    report("4/6 diagnose the flight, extend the model")
     logs = [race_log, excitation]
     found = diagnose(logs, fitted.model, report=ProgressBar("stages"))
     write_diagnosis(out / "diagnosis", found, joined(logs))
-    tell(text_of(found))
+    report(text_of(found))
     if found.causes:
-        tell("5/6 train on the extended model")
+        report("5/6 train on the extended model")
         after = train_stage("after", found.extended, *rest, held_out)
     else:
-        tell("5/6 nothing was named: the policy stays")
+        report("5/6 nothing was named: the policy stays")
         after = before._replace(name="after")
     loop = Loop(before, found, after, excitation, race_log, held_out)
-    tell("6/6 flown again")
+    report("6/6 flown again")
     content = json.dumps(loop_as_json(loop, seed, config, settings), indent=2, allow_nan=False) + "\n"
     write_atomically(out / "loop.json", content.encode())
     return loop
@@ -119,6 +120,6 @@ def loop_as_json(loop: Loop, seed: int, config: Config, settings: Settings) -> d
         "settings": settings._asdict(),
         "verdict": loop.diagnosis.verdict,
         "causes": [cause.effect for cause in loop.diagnosis.causes],
-        "race_log_s": round(len(loop.race_log) * 0.01, 2),
+        "race_log_s": round(float(usual_step(loop.race_log).sum()), 2),
         "stages": [stage_as_json(stage) for stage in (loop.before, loop.after)],
     }

@@ -1,14 +1,12 @@
-"""What came of the loop, for people: a table; rollouts, pictures, a recording of flights before and after."""
+"""The loop's results for people: a table, rollouts, pictures, and a recording of flights before and after."""
 
 from pathlib import Path
 
 import jax
 import numpy as np
 
-from baselines.purejaxrl_ppo.evaluate import fly_episode, start_pose_params
-from baselines.purejaxrl_ppo.flights import Flight, save_flown
-from baselines.purejaxrl_ppo.flown_env import plant_env, simulated_env
-from baselines.purejaxrl_ppo.perturbed import with_model_as_given
+from baselines.purejaxrl_ppo.flights import Rollout, fly_episode, save_flight, start_pose_params
+from baselines.purejaxrl_ppo.race_env import plant_env, simulated_env, with_model_as_given
 from baselines.purejaxrl_ppo.recording import can_record, record_flights
 from flytrack_env import load_track
 from flytrack_env.episodes import EpisodicEnvironment
@@ -48,7 +46,7 @@ def describe(loop: Loop) -> str:
     return "\n".join(lines)
 
 
-def fly_one(stage: Stage, env: EpisodicEnvironment, seed: int) -> Flight:
+def fly_one(stage: Stage, env: EpisodicEnvironment, seed: int) -> Rollout:
     """Return one flight of a stage's policy from a noisy start."""
     params = start_pose_params(with_model_as_given(env.default_params), NUM_STEPS)
     policy = (stage.checkpoint.network, stage.checkpoint.params)
@@ -72,7 +70,7 @@ def write_flights(out: Path, loop: Loop, plant: Plant, seed: int) -> list[Path]:
     files = []
     for name, flight in flights.items():
         files.append(out / f"{name}.npy")
-        save_flown(files[-1], flight)
+        save_flight(files[-1], flight)
     files += write_pictures(read_flights(list(files), track), out)
     if can_record():
         record_flights(out / "flights.rrd", flights, track, NUM_LAPS, None)

@@ -6,11 +6,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from baselines.purejaxrl_ppo import Checkpoint, Config
-from baselines.purejaxrl_ppo.evaluate import race_many, start_keys
-from baselines.purejaxrl_ppo.flights import Score, score
-from baselines.purejaxrl_ppo.flown_env import plant_env, simulated_env
-from baselines.purejaxrl_ppo.perturbed import with_model_as_given
-from baselines.purejaxrl_ppo.train_ppo import train_policy
+from baselines.purejaxrl_ppo.flights import Score, race_many, score, start_keys
+from baselines.purejaxrl_ppo.race_env import plant_env, simulated_env, with_model_as_given
+from baselines.purejaxrl_ppo.training import train_policy
 from flytrack_env.dynamics import ModelParameters
 from flytrack_env.episodes import EpisodicEnvironment
 from flytrack_env.plants import Plant

@@ -3,7 +3,17 @@
 from flytrack_env.extras import check_installed
 
 # MLflow, which takes seconds to import, is imported when a run is tracked.
-check_installed("train", "training and policies", "optax", "distrax", "scipy", "matplotlib", "tqdm", "mlflow")
+check_installed(
+    "train",
+    "training and policies",
+    "safetensors",
+    "optax",
+    "distrax",
+    "scipy",
+    "matplotlib",
+    "tqdm",
+    "mlflow",
+)
 
 from baselines.purejaxrl_ppo.checkpoint import Checkpoint, CheckpointError, load_checkpoint
 from baselines.purejaxrl_ppo.config import Config

@@ -1,4 +1,8 @@
-"""Checkpoints: network parameters, all that is needed to fly them, and all that training needs to go on."""
+"""Checkpoints: a policy, all that is needed to fly it and, in a run, all that training needs to continue.
+
+A checkpoint is a safetensors file: arrays named ``policy.*`` and ``training.*``, and in the header a JSON
+description and a SHA-256 checksum of description and arrays. Nothing in it is executed.
+"""
 
 import dataclasses
 import hashlib
@@ -6,25 +10,26 @@ import json
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import flax.serialization
 import jax
 import jax.numpy as jnp
 import numpy as np
+import safetensors.numpy
 
 import flytrack_env
-from baselines.purejaxrl_ppo.config import Config, config_from_json
-from baselines.purejaxrl_ppo.named_arrays import as_named_arrays, find_misfits, from_named_arrays
+from baselines.purejaxrl_ppo.config import Config, read_settings
 from baselines.purejaxrl_ppo.networks import ActorCritic, make_network
-from baselines.purejaxrl_ppo.unpack import LARGEST_BYTES, UnpackError, unpack
 from flytrack_env.files import read_at_most, write_atomically
 from flytrack_env.messages import error_text, quote_name, quote_value
 
-FORMAT = "flytrack-ppo-2"
-FORMAT_WITHOUT_TRAINING = "flytrack-ppo-1"  # of before there was a checksum and a state of the training
-LONGEST_META = 2**22  # characters: a track of ten thousand gates
-ROOM_BYTES = 2**10  # of the checksum and what is around the content
+SUFFIX = ".safetensors"
+FORMAT = "flytrack-ppo-3"
+POLICY, TRAINING = "policy.", "training."  # prefixes of the arrays' names
+LARGEST_BYTES = 3 * 2**27
+LARGEST_HEADER_BYTES = 2**23  # the description of a track of ten thousand gates
 MOST_LAYERS, WIDEST = 64, 2**16  # of networks
-MOST_DIFFERENCES = 12  # as many as can be read in a terminal
+MOST_DIFFERENCES = 12  # in one message
+
+Arrays = dict[str, np.ndarray]
 
 
 class CheckpointError(ValueError):
@@ -32,11 +37,11 @@ class CheckpointError(ValueError):
 
 
 class Checkpoint(NamedTuple):
-    """A trained policy, and perhaps its training.
+    """A trained policy and, in a run, the state of its training.
 
     params: of the network. config: of the training. env_id, track: what it was trained on.
     observation_size: of its input. meta: the whole description as stored. training: named arrays of the
-    rest of the training's state (optimiser, environments, random keys); None in a policy alone.
+    rest of the training's state (optimiser, environments, random keys); None for a policy alone.
     """
 
     params: Any
@@ -45,7 +50,7 @@ class Checkpoint(NamedTuple):
     track: str
     observation_size: int
     meta: dict[str, Any]
-    training: dict[str, np.ndarray] | None = None
+    training: Arrays | None = None
 
     @property
     def network(self) -> ActorCritic:
@@ -61,8 +66,10 @@ class Checkpoint(NamedTuple):
                 f"({self.env_id}), but the environment's have shape {found}"
             )
         if "observation" in self.meta:
-            lines = find_differences(self.meta["observation"], observation_layout(env), "observation")
-            check_none("checkpoint", lines)
+            check_no_differences(
+                "checkpoint",
+                find_differences(self.meta["observation"], observation_layout(env), "observation"),
+            )
 
 
 def observation_layout(env: Any) -> dict[str, Any]:
@@ -78,29 +85,81 @@ def as_json(value: Any) -> Any:
 def find_differences(found: Any, expected: Any, where: str) -> list[str]:
     """Return, field by field, where JSON values differ; ``where`` is their name."""
     if isinstance(found, dict) and isinstance(expected, dict):
-        names = {**expected, **found}
-        return [
-            line
-            for name in names
-            for line in find_differences(found.get(name), expected.get(name), f"{where}.{quote_name(name)}")
-        ]
-    if isinstance(found, list) and isinstance(expected, list) and len(found) == len(expected):
-        pairs = enumerate(zip(found, expected, strict=True))
-        return [line for i, (one, other) in pairs for line in find_differences(one, other, f"{where}[{i}]")]
-    if found == expected:
+        pairs = [(f".{quote_name(name)}", name) for name in {**expected, **found}]
+        values = [(label, found.get(name), expected.get(name)) for label, name in pairs]
+    elif isinstance(found, list) and isinstance(expected, list) and len(found) == len(expected):
+        values = [(f"[{i}]", *pair) for i, pair in enumerate(zip(found, expected, strict=True))]
+    elif found == expected:
         return []
-    return [f"{where}: found {_show(found)}, expected {_show(expected)}"]
+    else:
+        shown = ["nothing" if value is None else quote_value(value) for value in (found, expected)]
+        return [f"{where}: found {shown[0]}, expected {shown[1]}"]
+    return [line for label, one, other in values for line in find_differences(one, other, where + label)]
 
 
-def _show(value: Any) -> str:
-    return "nothing" if value is None else quote_value(value)
-
-
-def check_none(where: Any, lines: list[str]) -> None:
+def check_no_differences(where: Any, lines: list[str]) -> None:
     """Raise CheckpointError with the differences, if there are any; ``where`` is the file."""
     if lines:
         more = [f"and {len(lines) - MOST_DIFFERENCES} more"] if len(lines) > MOST_DIFFERENCES else []
         raise CheckpointError(f"{where}: does not fit: " + "; ".join(lines[:MOST_DIFFERENCES] + more))
+
+
+def _is_key(leaf: Any) -> bool:
+    return jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
+
+
+def _name(path: Any) -> str:
+    return jax.tree_util.keystr(path, simple=True, separator=".")
+
+
+def as_named_arrays(tree: Any) -> Arrays:
+    """Return the leaves of a tree by their dotted paths, bit for bit; random keys as their integers."""
+    return {
+        _name(path): np.asarray(
+            jax.random.key_data(leaf) if isinstance(leaf, jax.Array) and _is_key(leaf) else leaf
+        )
+        for path, leaf in jax.tree_util.tree_leaves_with_path(tree)
+    }
+
+
+def from_named_arrays(where: Any, arrays: Arrays, target: Any) -> Any:
+    """Return named arrays as the tree that ``target`` describes by its shapes and types.
+
+    where: the file, for the message. Random keys are of JAX's default implementation.
+
+    Raises:
+        CheckpointError: leaves that are missing, superfluous, or of another shape or type.
+    """
+    paths, structure = jax.tree_util.tree_flatten_with_path(target)
+    expected = {
+        _name(path): jax.eval_shape(jax.random.key_data, leaf) if _is_key(leaf) else leaf
+        for path, leaf in paths
+    }
+    found = {name: f"{array.dtype} of shape {array.shape}" for name, array in arrays.items()}
+    wanted = {name: f"{np.dtype(leaf.dtype)} of shape {leaf.shape}" for name, leaf in expected.items()}
+    lines = [
+        f"{quote_name(name)}: found {found.get(name, 'nothing')}, expected {wanted.get(name, 'nothing')}"
+        for name in {**wanted, **found}
+        if found.get(name) != wanted.get(name)
+    ]
+    check_no_differences(where, lines)
+    leaves = [jnp.asarray(arrays[_name(path)]) for path, _ in paths]
+    return jax.tree.unflatten(
+        structure,
+        [
+            jax.random.wrap_key_data(leaf) if _is_key(target_leaf) else leaf
+            for leaf, (_, target_leaf) in zip(leaves, paths, strict=True)
+        ],
+    )
+
+
+def checksum(text: str, arrays: Arrays) -> str:
+    """Return the SHA-256 of a description and named arrays, as hexadecimal digits."""
+    digest = hashlib.sha256(text.encode())
+    for name in sorted(arrays):
+        digest.update(f"{name} {arrays[name].dtype} {arrays[name].shape}".encode())
+        digest.update(arrays[name].tobytes())
+    return digest.hexdigest()
 
 
 def save_checkpoint(
@@ -108,34 +167,34 @@ def save_checkpoint(
     params: Any,
     config: Config,
     description: dict[str, Any],
-    training: dict[str, np.ndarray] | None = None,
+    training: Arrays | None = None,
 ) -> None:
-    """Write a checkpoint atomically, with a checksum of its content.
+    """Write a checkpoint atomically.
 
     description: JSON values; needs env_id, track, missed_gate and observation_size, may hold anything else.
-    training: named arrays of what else training needs to go on; without, the file is a policy alone.
+    training: named arrays of what else training needs to continue; without, the file is a policy alone.
 
     Raises:
         CheckpointError: a network that is larger than ``load_checkpoint`` takes.
-        OSError: what the system says.
+        OSError: the file cannot be written.
     """
-    _check_size(Path(path), config, description["observation_size"])
+    _check_network_size(path, config, description["observation_size"])
     meta = {
         "format": FORMAT,
         "package_version": flytrack_env.__version__,
         "config": dataclasses.asdict(config),
         **description,
     }
-    parts = {"meta": json.dumps(meta), "params": flax.serialization.to_state_dict(params)}
-    if training is not None:
-        parts["training"] = training
-    content = flax.serialization.msgpack_serialize(parts)
-    if len(content) > LARGEST_BYTES - ROOM_BYTES:
+    arrays = {POLICY + name: array for name, array in as_named_arrays(params).items()}
+    arrays |= {TRAINING + name: array for name, array in (training or {}).items()}
+    arrays = {name: np.ascontiguousarray(array).reshape(array.shape) for name, array in arrays.items()}
+    text = json.dumps(meta)
+    content = safetensors.numpy.save(arrays, {"meta": text, "sha256": checksum(text, arrays)})
+    if len(content) > LARGEST_BYTES:
         raise CheckpointError(
             f"{path}: found {len(content)} bytes to write, expected at most {LARGEST_BYTES}"
         )
-    whole = {"checksum": hashlib.sha256(content).hexdigest(), "content": content}
-    write_atomically(path, flax.serialization.msgpack_serialize(whole))
+    write_atomically(path, content)
 
 
 def load_checkpoint(path: str | Path) -> Checkpoint:
@@ -146,60 +205,45 @@ def load_checkpoint(path: str | Path) -> Checkpoint:
             network that the file describes.
     """
     path = Path(path)
-    content = _read_content(path)
-    meta = _read_meta(path, content)
-    if meta["format"] not in (FORMAT, FORMAT_WITHOUT_TRAINING):
+    if path.suffix == ".msgpack":
+        raise CheckpointError(
+            f"{path}: found a .msgpack checkpoint of an earlier version, expected {SUFFIX}; train again"
+        )
+    meta, arrays = _read_file(path)
+    if meta["format"] != FORMAT:
         raise CheckpointError(f"{path}: format: found {quote_value(meta['format'])}, expected {FORMAT!r}")
     try:
-        return _read_parts(path, meta, content)
+        return _build(path, meta, arrays)
     except CheckpointError:
         raise
-    except (KeyError, IndexError, TypeError, AttributeError, ValueError) as error:
+    except (KeyError, TypeError, ValueError) as error:
         raise CheckpointError(f"{path}: damaged description or parameters: {error_text(error)}") from error
 
 
-def _read_content(path: Path) -> Any:
-    """Return what is in a file, its checksum compared."""
+def _read_file(path: Path) -> tuple[dict[str, Any], Arrays]:
+    """Return the description and the arrays in a file, with the checksum verified."""
     try:
-        whole = unpack(read_at_most(path, LARGEST_BYTES))
-        if not isinstance(whole, dict) or "checksum" not in whole:
-            return whole
-        content = whole.get("content")
-        if not isinstance(content, bytes):
-            raise UnpackError("found a checksum of nothing")
-        found = hashlib.sha256(content).hexdigest()
-        if found.encode() != whole["checksum"]:
-            expected = quote_value(_as_text(whole["checksum"]))
-            raise CheckpointError(
-                f"{path}: damaged: found content with checksum {found}, expected {expected}"
-            )
-        return unpack(content)
+        content = read_at_most(path, LARGEST_BYTES)
     except OSError as error:
         raise CheckpointError(f"{path}: cannot be read: {error_text(error)}") from error
-    except UnpackError as error:
-        raise CheckpointError(f"{path}: not a checkpoint, or damaged: {error_text(error)}") from error
-
-
-def _as_text(value: Any) -> Any:
-    return value.decode(errors="replace") if isinstance(value, bytes) else value
-
-
-def _read_meta(path: Path, content: Any) -> dict[str, Any]:
-    """Return the description in a file's content, which says what format it is of."""
-    text = content.get("meta") if isinstance(content, dict) else None
     try:
-        meta = json.loads(text.decode()) if isinstance(text, bytes) and len(text) <= LONGEST_META else None
-    except (ValueError, RecursionError) as error:
-        raise CheckpointError(
-            f"{path}: not a checkpoint: no description in it: {error_text(error)}"
-        ) from error
-    if not isinstance(meta, dict) or "format" not in meta:
-        raise CheckpointError(f"{path}: not a checkpoint: no description in it")
-    return meta
+        size = int.from_bytes(content[:8], "little")
+        if size > LARGEST_HEADER_BYTES:
+            raise ValueError(f"found a header of {size} bytes, expected at most {LARGEST_HEADER_BYTES}")
+        arrays = safetensors.numpy.load(content)
+        header = json.loads(content[8 : 8 + size])["__metadata__"]
+        if checksum(header["meta"], arrays) != header["sha256"]:
+            raise ValueError("the checksum does not match the content")
+        meta = json.loads(header["meta"])
+        if not isinstance(meta, dict) or "format" not in meta:
+            raise ValueError("found no description")
+    except (safetensors.SafetensorError, KeyError, TypeError, ValueError, RecursionError) as error:
+        raise CheckpointError(f"{path}: not a checkpoint, or damaged: {error_text(error)}") from error
+    return meta, arrays
 
 
-def _check_size(path: Path, config: Config, size: Any) -> None:
-    """Raise CheckpointError for a network that is none, or larger than any of ours: it is traced below."""
+def _check_network_size(path: str | Path, config: Config, size: Any) -> None:
+    """Raise CheckpointError unless a network is small enough to be traced."""
     widths = (size, len(config.initial_action), *config.hidden_sizes)
     if not all(type(width) is int and 1 <= width <= WIDEST for width in widths) or len(widths) > MOST_LAYERS:
         found = f"observation_size {quote_value(size)} and hidden_sizes {quote_value(config.hidden_sizes)}"
@@ -208,25 +252,23 @@ def _check_size(path: Path, config: Config, size: Any) -> None:
         )
 
 
-def _read_parts(path: Path, meta: dict[str, Any], content: dict[str, Any]) -> Checkpoint:
+def _build(path: Path, meta: dict[str, Any], arrays: Arrays) -> Checkpoint:
     """Return the checkpoint of a file's description and arrays, checked against each other."""
-    config = config_from_json(meta["config"])
+    config = Config(**read_settings("config", meta["config"]))
     config.check()
     size = meta["observation_size"]
-    _check_size(path, config, size)
+    _check_network_size(path, config, size)
     for name in ("env_id", "track", "missed_gate"):
         if not isinstance(meta[name], str):
             raise CheckpointError(f"{path}: {name}: found {quote_value(meta[name])}, expected a string")
     observation = jax.ShapeDtypeStruct((1, size), jnp.float32)
-    expected = jax.eval_shape(make_network(config).init, jax.random.key(0), observation)
-    arrays = as_named_arrays(content["params"])
-    check_none(path, find_misfits(arrays, expected))
-    for name, array in arrays.items():
+    target = jax.eval_shape(make_network(config).init, jax.random.key(0), observation)
+    policy, training = (
+        {name.removeprefix(prefix): array for name, array in arrays.items() if name.startswith(prefix)}
+        for prefix in (POLICY, TRAINING)
+    )
+    for name, array in policy.items():
         if not np.isfinite(array).all():
-            raise CheckpointError(f"{path}: {name}: found values that are not finite")
-    training = content.get("training")
-    is_tree = isinstance(training, dict) and all(isinstance(one, np.ndarray) for one in training.values())
-    if not (training is None or is_tree):
-        raise CheckpointError(f"{path}: training: found something else than arrays")
-    params = from_named_arrays(arrays, expected)
-    return Checkpoint(params, config, meta["env_id"], meta["track"], size, meta, training)
+            raise CheckpointError(f"{path}: {quote_name(name)}: found values that are not finite")
+    params = from_named_arrays(path, policy, target)
+    return Checkpoint(params, config, meta["env_id"], meta["track"], size, meta, training or None)

@@ -1,17 +1,14 @@
-"""Every hyperparameter of a training run: as a dataclass, as flags, as a TOML file."""
+"""Every hyperparameter of a training run, from the command line, a TOML file or a checkpoint."""
 
-import argparse
-import ast
 import dataclasses
-import inspect
-import itertools
 import math
 import sys
-import textwrap
 import typing
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+
+import tyro
 
 from flytrack_env.messages import error_text, quote_name, quote_value
 from flytrack_env.toml_file import TomlError, parse_toml, read_text
@@ -20,20 +17,42 @@ COUNTS = ("num_envs", "num_steps", "episode_steps", "update_epochs", "num_miniba
 SHARES = ("final_learning_rate_fraction", "gamma", "gae_lambda")
 POSITIVE = ("learning_rate", "adam_eps", "clip_eps", "max_grad_norm", "initial_std")
 NOT_NEGATIVE = ("entropy_coef", "value_coef", "min_std", "gate_margin")
-LARGEST = sys.float_info.max  # whole numbers in files know no bound
-# What files of earlier versions, which do not name them, were trained with.
-BEFORE = {"gate_margin": 0.0}
+LARGEST = sys.float_info.max  # integers in a file are unbounded
 
 
 class ConfigError(ValueError):
     """A setting that cannot be used; the message names file, field, what was found and expected."""
 
 
+def parse_count(text: str) -> int:
+    """Return an integer that may be written as 2e7.
+
+    Raises:
+        ValueError: not a whole number.
+    """
+    value = float(text)
+    if not value.is_integer():
+        raise ValueError(f"found {text}, expected a whole number")
+    return int(value)
+
+
+Count = typing.Annotated[
+    int,
+    tyro.constructors.PrimitiveConstructorSpec(
+        nargs=1,
+        metavar="INT",
+        instance_from_str=lambda words: parse_count(words[0]),
+        is_instance=lambda value: isinstance(value, int),
+        str_from_instance=lambda value: [str(value)],
+    ),
+]
+
+
 @dataclasses.dataclass(frozen=True)
 class Config:
-    """Hyperparameters of PPO; the defaults are the recipe for FlyTrack-v0 (docs/training.md)."""
+    """Hyperparameters of PPO; the defaults are the recipe for FlyTrack-v0 (report.md)."""
 
-    total_timesteps: int = 20_000_000
+    total_timesteps: Count = 20_000_000
     """Environment steps over all environments; rounded down to whole updates."""
     num_envs: int = 1024
     """Environments stepped side by side."""
@@ -130,21 +149,10 @@ class Config:
 FIELD_TYPES: dict[str, Any] = typing.get_type_hints(Config)
 
 
-def field_docs() -> dict[str, str]:
-    """Return what the class says below each field, on one line."""
-    tree = ast.parse(textwrap.dedent(inspect.getsource(Config)))
-    body: list[Any] = tree.body[0].body  # type: ignore[attr-defined]  # the source of one class
-    return {
-        ast.unparse(field.target): " ".join(ast.literal_eval(doc.value).split())
-        for field, doc in itertools.pairwise(body)
-        if isinstance(field, ast.AnnAssign) and isinstance(doc, ast.Expr)
-    }
-
-
 def read_value(where: str, kind: Any, value: Any) -> Any:
-    """Return a value of a file or a flag as the field's type; whole floats (2e7) are whole numbers.
+    """Return a value of a TOML or JSON file as a field's type; a whole float (2e7) is an integer.
 
-    where: what the message begins with: file and field.
+    where: file and field, which the error message begins with.
 
     Raises:
         ConfigError: a value of another type.
@@ -161,85 +169,43 @@ def read_value(where: str, kind: Any, value: Any) -> Any:
     if kind is int and is_number and value == int(value):
         return int(value)
     expected = {bool: "true or false", float: "a finite number", int: "a whole number"}[kind]
-    found = "infinity" if value in (math.inf, -math.inf) else quote_value(value)
-    raise ConfigError(f"{where}: found {found}, expected {expected}")
+    raise ConfigError(f"{where}: found {quote_value(value)}, expected {expected}")
+
+
+def read_settings(where: str, values: Any) -> dict[str, Any]:
+    """Return the fields of ``Config`` in a TOML or JSON object.
+
+    Raises:
+        ConfigError: not an object, an unknown field, or a value of another type.
+    """
+    if not isinstance(values, dict):
+        raise ConfigError(f"{where}: found {quote_value(values)}, expected an object")
+    for name in values:
+        if name not in FIELD_TYPES:
+            raise ConfigError(
+                f"{where}: {quote_name(name)}: unknown; expected one of {', '.join(FIELD_TYPES)}"
+            )
+    return {name: read_value(f"{where}: {name}", FIELD_TYPES[name], value) for name, value in values.items()}
+
+
+def load_toml(path: Path) -> dict[str, Any]:
+    """Return the contents of a TOML file.
+
+    Raises:
+        ConfigError: a file that cannot be read, or is not TOML.
+    """
+    try:
+        return parse_toml(read_text(path))
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path}: cannot be read: {error_text(error)}") from error
+    except TomlError as error:
+        raise ConfigError(f"{path}: not a TOML file: {error_text(error)}") from error
 
 
 def settings_in_file(path: Path) -> dict[str, Any]:
     """Return the fields of ``Config`` that a TOML file sets.
 
     Raises:
-        ConfigError: missing file, not TOML, an unknown key, or a value of another type.
+        ConfigError: a file that cannot be read, an unknown key, or a value of another type.
     """
-    try:
-        values = parse_toml(read_text(path))
-    except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path}: cannot be read: {error_text(error)}") from error
-    except TomlError as error:
-        raise ConfigError(f"{path}: not a TOML file: {error_text(error)}") from error
-    for name in values:
-        if name not in FIELD_TYPES:
-            raise ConfigError(
-                f"{path}: {quote_name(name)}: unknown; expected one of {', '.join(FIELD_TYPES)}"
-            )
-    return {name: read_value(f"{path}: {name}", FIELD_TYPES[name], value) for name, value in values.items()}
-
-
-def config_from_json(values: dict[str, Any]) -> Config:
-    """Return the configuration of a JSON object; tuples come back from lists, absent fields are default.
-
-    Of fields that are younger than the format, the absent ones are as training was before them.
-
-    Raises:
-        ConfigError: an unknown field, or a value of another type.
-    """
-    for name in values:
-        if name not in FIELD_TYPES:
-            expected = ", ".join(FIELD_TYPES)
-            raise ConfigError(f"config: {quote_name(name)}: unknown to this version; expected {expected}")
-    fields = {n: read_value(f"config: {n}", FIELD_TYPES[n], value) for n, value in values.items()}
-    return Config(**{**BEFORE, **fields})
-
-
-def add_flags(parser: argparse.ArgumentParser) -> None:
-    """Give a parser ``--config`` and one flag per field of ``Config``; what is not given is left out."""
-    parser.add_argument("--config", type=Path, help="TOML file of the settings below; flags override it")
-    group = parser.add_argument_group("hyperparameters")
-    docs = field_docs()
-    for field in dataclasses.fields(Config):
-        kind = FIELD_TYPES[field.name]
-        is_tuple = typing.get_origin(kind) is tuple
-        default: Any = field.default  # every field has one
-        default = " ".join(map(str, default)) if is_tuple else default
-        group.add_argument(
-            f"--{field.name.replace('_', '-')}",
-            help=f"{docs[field.name]} (default: {default})".replace("%", "%%"),
-            default=argparse.SUPPRESS,
-            **_flag_form(typing.get_args(kind)[0] if is_tuple else kind, is_tuple),
-        )
-
-
-def _flag_form(kind: Any, is_tuple: bool) -> dict[str, Any]:
-    """Return how argparse reads a type: a pair of switches, or one or more numbers."""
-    if kind is bool:
-        return {"action": argparse.BooleanOptionalAction}
-
-    def read(text: str) -> Any:
-        try:
-            return read_value("value", kind, float(text))
-        except ConfigError as error:
-            raise argparse.ArgumentTypeError(str(error)) from error
-
-    read.__name__ = "number"
-    return {"type": read, "metavar": kind.__name__.upper(), **({"nargs": "+"} if is_tuple else {})}
-
-
-def settings_of(arguments: argparse.Namespace) -> dict[str, Any]:
-    """Return the fields that the command line sets, in its file or by flags, which win.
-
-    Raises:
-        ConfigError: a file that cannot be used.
-    """
-    in_file = {} if arguments.config is None else settings_in_file(arguments.config)
-    flags = {name: value for name, value in vars(arguments).items() if name in FIELD_TYPES}
-    return {**in_file, **{n: tuple(v) if isinstance(v, list) else v for n, v in flags.items()}}
+    return read_settings(str(path), load_toml(path))

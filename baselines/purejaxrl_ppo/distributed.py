@@ -1,25 +1,76 @@
-"""Training on several devices, of one process or of many on several machines: environments in equal shards.
+"""Training on several devices, of one process or of many: environments in equal shards.
 
-Every device steps its shard of the environments and computes gradients on its own minibatches; gradients,
-and the statistics that advantages are normalised with, are averaged over all devices, so that every device
-takes the same gradient step. The processes meet in
-``baselines.joining``.
+Every device steps its shard of the environments and computes gradients on its own minibatches. Gradients and
+the statistics that normalise advantages are averaged over all devices, so that every device takes the same
+gradient step.
 """
 
 import hashlib
 import json
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 from jax.experimental import multihost_utils
+from jax.extend.backend import clear_backends
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
-from baselines.purejaxrl_ppo.across import AXIS
+from baselines.purejaxrl_ppo.collectives import AXIS
 from baselines.purejaxrl_ppo.config import Config
 from baselines.purejaxrl_ppo.ppo import Algorithm, Metrics, Runner
 
-EVERYWHERE, IN_SHARDS = PartitionSpec(), PartitionSpec(AXIS)
-LAYOUT = Runner(EVERYWHERE, IN_SHARDS, IN_SHARDS, IN_SHARDS, EVERYWHERE)  # type: ignore[arg-type]
+REPLICATED, SHARDED = PartitionSpec(), PartitionSpec(AXIS)
+LAYOUT = Runner(REPLICATED, SHARDED, SHARDED, SHARDED, REPLICATED)  # type: ignore[arg-type]
+HEARTBEAT_TIMEOUT_S = 30  # a process that is silent for longer counts as lost
+FLAGS = "--coordinator, --num-processes, --process-index"
+
+
+class Job(NamedTuple):
+    """How to reach the processes of a training; all None: as SLURM or Open MPI say.
+
+    coordinator: HOST:PORT of the first process. num_processes: their number. process: index of this one.
+    """
+
+    coordinator: str | None = None
+    num_processes: int | None = None
+    process: int | None = None
+
+    def check(self) -> None:
+        """Raise ValueError, naming the flag, unless this is a job."""
+        if self.coordinator is None or self.num_processes is None or self.process is None:
+            if self != Job():
+                raise ValueError(f"--distributed: found some of {FLAGS}, expected all of them or none")
+            return
+        host, _, port = self.coordinator.rpartition(":")
+        if not host or not port.isdecimal():
+            raise ValueError(f"--coordinator: found {self.coordinator!r}, expected HOST:PORT")
+        if self.num_processes < 1:
+            raise ValueError(f"--num-processes: found {self.num_processes}, expected at least 1")
+        if not 0 <= self.process < self.num_processes:
+            raise ValueError(f"--process-index: found {self.process}, expected 0 to {self.num_processes - 1}")
+
+
+def join(job: Job) -> None:
+    """Connect to the other processes; a process without a job stays alone with its several devices.
+
+    All arrays that exist become unusable: JAX computes once at import, and can be connected only before.
+
+    Raises:
+        ValueError: neither a job nor several devices, or other processes that cannot be reached.
+    """
+    job.check()
+    clear_backends()
+    try:
+        jax.distributed.initialize(
+            *job, heartbeat_timeout_seconds=HEARTBEAT_TIMEOUT_S, shutdown_timeout_seconds=HEARTBEAT_TIMEOUT_S
+        )
+    except ValueError as error:
+        if job != Job() or jax.device_count() == 1:
+            raise ValueError(
+                f"--distributed: found no job of SLURM or Open MPI, and one device ({error}); expected "
+                f"a job, several devices, or {FLAGS}"
+            ) from error
+    except RuntimeError as error:
+        raise ValueError(f"--distributed: {job.coordinator}: {error}") from error
 
 
 def all_devices() -> Mesh:
@@ -31,66 +82,68 @@ def check_divides(config: Config, mesh: Mesh) -> None:
     """Raise ValueError where environments or minibatches cannot be split over the devices."""
     if config.num_envs % mesh.size:
         raise ValueError(f"num_envs: found {config.num_envs}, expected a multiple of {mesh.size} devices")
-    of_shard = config.batch_size // mesh.size
-    if of_shard % config.num_minibatches:
+    per_shard = config.batch_size // mesh.size
+    if per_shard % config.num_minibatches:
         raise ValueError(
-            f"num_minibatches: found {config.num_minibatches}, expected a divisor of the {of_shard} steps of "
-            f"an update on each of {mesh.size} devices"
+            f"num_minibatches: found {config.num_minibatches}, expected a divisor of the {per_shard} steps "
+            f"of an update on each of {mesh.size} devices"
         )
 
 
 def on_devices(ppo: Algorithm, mesh: Mesh) -> Algorithm:
-    """Return PPO on all environments, of PPO on a shard (``make_ppo`` with as many shards as devices)."""
+    """Return PPO on all environments from PPO on one shard (``make_ppo`` with a shard per device)."""
 
     def update_shard(runner: Runner) -> tuple[Runner, Metrics]:
         shard = jax.lax.axis_index(AXIS)
         done, metrics = ppo.update(runner._replace(key=jax.random.fold_in(runner.key, shard)))
-        # The next key is the same everywhere, and none that a shard drew from.
+        # The next key is the same on every device, and no shard has drawn from it.
         return done._replace(key=jax.random.fold_in(runner.key, mesh.size)), metrics
 
     def start(key: jax.Array) -> Runner:
         return jax.lax.with_sharding_constraint(ppo.start(key), shardings(mesh))
 
-    # check_vma would have gradients summed by themselves, and every loop in the environment annotated.
-    out_specs = (LAYOUT, EVERYWHERE)
+    # check_vma would sum gradients implicitly, and require annotations in every loop of the environment.
+    out_specs = (LAYOUT, REPLICATED)
     update = jax.shard_map(update_shard, mesh=mesh, in_specs=(LAYOUT,), out_specs=out_specs, check_vma=False)
     return Algorithm(start, update)
 
 
 def shardings(mesh: Mesh) -> Runner:
-    """Return where the parts of a training's state lie."""
+    """Return the sharding of every part of a training's state."""
     return Runner(*(NamedSharding(mesh, spec) for spec in LAYOUT))  # type: ignore[arg-type]
 
 
 def spread(runner: Runner, mesh: Mesh) -> Runner:
-    """Return the state that every process has whole, spread over the devices."""
+    """Return a state that every process holds whole, spread over the devices."""
     return jax.jit(lambda whole: whole, out_shardings=shardings(mesh))(runner)
 
 
 def whole(runner: Runner, mesh: Mesh) -> Runner:
-    """Return the spread state as every process can read it; all of them have to ask."""
-    return jax.jit(lambda spread: spread, out_shardings=NamedSharding(mesh, EVERYWHERE))(runner)
+    """Return a spread state so that every process can read it; all processes must call this."""
+    return jax.jit(lambda spread: spread, out_shardings=NamedSharding(mesh, REPLICATED))(runner)
 
 
 def check_agree(what: str, value: Any) -> None:
-    """Raise ValueError where the processes do not have the same; all of them have to ask."""
+    """Raise ValueError unless all processes have the same value; all must call this."""
     try:
         multihost_utils.assert_equal(value)
     except AssertionError as error:
-        raise ValueError(f"{what}: process {jax.process_index()} found another than process 0") from error
+        raise ValueError(
+            f"{what}: process {jax.process_index()} found another value than process 0"
+        ) from error
 
 
 def digest(values: Any) -> int:
-    """Return a number, of an int32, that two processes share where they have the same JSON values."""
+    """Return a hash of JSON values as an int32 that processes can compare."""
     text = json.dumps(values, sort_keys=True, default=str)
     return int.from_bytes(hashlib.sha256(text.encode()).digest()[:4]) >> 1
 
 
 def wait_for_all(where: str) -> None:
-    """Return when all processes are here."""
+    """Return when all processes have called this."""
     multihost_utils.sync_global_devices(where)
 
 
 def is_first() -> bool:
-    """Return whether this process writes, draws and tells: the first, or the only one."""
+    """Return whether this process writes files and logs: the first, or the only one."""
     return jax.process_index() == 0

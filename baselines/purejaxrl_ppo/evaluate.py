@@ -1,204 +1,318 @@
-"""Flying a policy: whole episodes from noisy start poses, one or many side by side.
+"""Evaluations of a checkpoint: flights on a black box or on drawn plants, their report, and its files."""
 
-``fly_episode`` and ``fly_many`` keep every step; ``race_many`` keeps what came of a flight, flies no step
-beyond the last flight's end, and is for thousands. Both are made of the same step.
-"""
-
-from collections.abc import Callable
-from functools import partial
-from typing import Any
+import dataclasses
+import json
+import os
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
-from baselines.purejaxrl_ppo.flights import Flight, Outcomes
-from baselines.purejaxrl_ppo.networks import ActorCritic
-from flytrack_env.dynamics import ModelParameters
-from flytrack_env.env import EnvParams
+import flytrack_env
+from baselines.purejaxrl_ppo.checkpoint import Checkpoint, load_checkpoint
+from baselines.purejaxrl_ppo.flights import (
+    Outcomes,
+    Rollout,
+    fly_episode,
+    outcomes_of,
+    race_many,
+    save_flight,
+    start_keys,
+    start_pose_params,
+)
+from baselines.purejaxrl_ppo.plants import Plants, draw_plants
+from baselines.purejaxrl_ppo.race_env import plant_env, simulated_env, with_model_as_given
+from baselines.purejaxrl_ppo.recording import CANNOT_RECORD, can_record, record_flights
+from baselines.purejaxrl_ppo.report import describe_flight, describe_report
+from baselines.purejaxrl_ppo.summary import compare_with_optimum, summarise, time_lost
+from flytrack_env import EnvParams, blackbox
 from flytrack_env.episodes import EpisodicEnvironment
-from flytrack_env.state import pack
-from flytrack_env.terminations import Causes
-from flytrack_env.tracks import cross_gate
+from flytrack_env.files import write_atomically
+from flytrack_env.references import (
+    ReferenceFileError,
+    References,
+    ghost_rollout,
+    is_model_of,
+    shipped_references,
+)
+from flytrack_env.rollout import save_rollout
 
-BATCH = 1024  # flights side by side: more do not fit into a core's cache, fewer do not fill its vectors
+SHIPPED_BLACK_BOX = Path(__file__).parents[2] / "blackbox" / "acro_step.bin"  # in a checkout
+SCHEMA = 1
+DEFAULT_LAPS = 3
+MAX_SEED = 2**31
+MAX_STEPS = 1_000_000  # hours: the battery is empty after minutes
+MAX_LAPS = 100  # their gate times are kept for every flight
+MAX_FLIGHTS = 100_000  # so that the gate times of all of them fit into memory
+# Models of the time-optimal references, in order of preference.
+BLACK_BOX_MODELS, NOMINAL_MODELS = ("black_box", "nominal"), ("nominal",)
 
 
-def start_pose_params(params: EnvParams, num_steps: int) -> EnvParams:
-    """Return parameters whose episodes begin at the noisy start pose and may last that many steps."""
-    return params.replace(reset=params.reset._replace(course_fraction=0.0), max_steps_in_episode=num_steps)
+@dataclasses.dataclass(frozen=True)
+class EvaluationSettings:
+    """What is flown, and what is written; the fields are the flags of ``eval_agent.py``."""
+
+    checkpoint: Path
+    """Checkpoint of a training: final.safetensors."""
+    steps: int
+    """Time limit of a flight; at 100 Hz, 2000 steps are 20 s."""
+    episodes: int = 1
+    """Noisy starts, on each plant."""
+    laps: int | None = None
+    """Laps to complete; by default 3, and no limit for a single flight."""
+    plants: int | None = None
+    """Fly so many simulated plants, drawn around the checkpoint's model, instead of a black box."""
+    black_box: Path | None = None
+    """File of the black box; by default the shipped one."""
+    track: str | None = None
+    """Name or file of a track; by default the checkpoint's."""
+    seed: int = 0
+    """Of the noisy starts and of the plants."""
+    ghost: bool = False
+    """Compare with the time-optimal flight, and write it beside the rollout."""
+    out: Path = Path("rollout.npy")
+    """Rollout of the first flight, rows [x 21 | u 4]."""
+    rrd: Path | None = None
+    """Write a Rerun recording of the first flight."""
+    json: Path | None = None
+    """Write the report as JSON."""
+
+    @property
+    def is_single(self) -> bool:
+        """Whether there is a single flight, on a black box."""
+        return self.episodes == 1 and self.plants is None
+
+    @property
+    def num_laps(self) -> int | None:
+        """Laps to complete; None: no limit."""
+        return DEFAULT_LAPS if self.laps is None and not self.is_single else self.laps
+
+    @property
+    def ghost_path(self) -> Path:
+        """Where the time-optimal flight is written."""
+        return self.out.with_name(f"{self.out.stem}_ghost.npy")
+
+    def check(self) -> None:
+        """Raise ValueError, naming the flag, for settings that cannot be used."""
+        if self.plants is not None and self.black_box is not None:
+            raise ValueError(f"--plants: found --black-box {self.black_box} as well, expected one of the two")
+        limits = {
+            "steps": (1, MAX_STEPS),
+            "episodes": (1, MAX_FLIGHTS),
+            "laps": (1, MAX_LAPS),
+            "plants": (1, MAX_FLIGHTS // max(self.episodes, 1)),
+            "seed": (0, MAX_SEED - 1),
+        }
+        for name, (low, high) in limits.items():
+            value = getattr(self, name)
+            if value is not None and not low <= value <= high:
+                raise ValueError(f"--{name}: found {value}, expected {low} to {high}")
+        if self.rrd is not None and not can_record():
+            raise ValueError(f"--rrd: {CANNOT_RECORD}")
+        self._check_paths()
+
+    def _check_paths(self) -> None:
+        """Raise ValueError for files that cannot be written or would overwrite another one."""
+        taken = {path.resolve(): "an input" for path in (self.checkpoint, self.black_box) if path is not None}
+        outputs = [
+            ("--out", self.out),
+            ("--ghost", self.ghost_path),
+            ("--rrd", self.rrd),
+            ("--json", self.json),
+        ]
+        for flag, path in outputs:
+            if path is None:
+                continue
+            if path.resolve() in taken:
+                raise ValueError(f"{flag}: found {path}, which is {taken[path.resolve()]}, expected another")
+            taken[path.resolve()] = f"the file of {flag}"
+            nearest = next(folder for folder in path.absolute().parents if folder.exists())
+            if path.is_dir() or not nearest.is_dir() or not os.access(nearest, os.W_OK):
+                raise ValueError(f"{flag}: {path}: cannot be written, expected a file in a writable folder")
 
 
-Step = Callable[[jax.Array, Any, jax.Array], tuple[jax.Array, Any, jax.Array, Flight]]
+class Scene(NamedTuple):
+    """What is flown: environment, its parameters, drawn plants (None: a black box), references if any."""
+
+    env: EpisodicEnvironment
+    params: EnvParams
+    plants: Plants | None
+    references: References | None
 
 
-def make_step(
-    env: EpisodicEnvironment, network: ActorCritic, policy_params: Any, params: EnvParams, num_laps: Any
-) -> Step:
-    """Return ``step(observation, state, index)``: one step of the mean action.
+class Report(NamedTuple):
+    """An evaluation: ``numbers`` as JSON values (docs/baseline.md), and the first flight step by step."""
 
-    It returns the next observation and state, whether the flight is over, and the step as a ``Flight``
-    without its axis of steps. index: of the step, from 0.
+    settings: EvaluationSettings
+    checkpoint: Checkpoint
+    scene: Scene
+    rollout: Rollout
+    numbers: dict[str, Any]
+
+    @property
+    def text(self) -> str:
+        """The report for a terminal."""
+        settings, text = self.settings, ""
+        if settings.is_single:
+            text += describe_flight(self.rollout, float(self.scene.params.dt), settings.num_laps)
+        if settings.num_laps is not None or settings.ghost:
+            text += describe_report(self.numbers)
+        return text
+
+    def write(self) -> list[str]:
+        """Write the files that the settings ask for; return a line about each.
+
+        Raises:
+            OSError, ValueError: a file that cannot be written.
+        """
+        settings = self.settings
+        save_flight(settings.out, self.rollout)
+        lines = [f"rollout: {settings.out}"]
+        if settings.ghost and self.scene.references is not None:
+            num_steps = int(np.sum(self.rollout.is_flying))
+            save_rollout(settings.ghost_path, *ghost_rollout(self.scene.references, num_steps))
+            lines.append(f"ghost: {settings.ghost_path}")
+        if settings.rrd is not None:
+            names = ", ".join(self.record(settings.rrd, with_ghost=settings.ghost))
+            lines.append(f"recording: {settings.rrd}, {names}: {settings.rrd.stat().st_size} bytes")
+        if settings.json is not None:
+            content = json.dumps(self.numbers, indent=2, allow_nan=False) + "\n"
+            write_atomically(settings.json, content.encode())
+            lines.append(f"json: {settings.json}")
+        return lines
+
+    def record(self, path: Path, with_ghost: bool) -> list[str]:
+        """Write a Rerun recording of the first flight, and return the names of the flights in it.
+
+        Beside it is the flight from the same start in the simulator with the model that the policy was
+        trained on: it shows what that simulator gets wrong. with_ghost: the time-optimal flight as well.
+        """
+        env, _, plants, references = self.scene
+        flights = {"black box" if plants is None else "first plant": self.rollout}
+        if "model" in self.checkpoint.meta:
+            simulator = simulated_env(self.checkpoint, env.track)
+            params = with_model_as_given(simulator.default_params)
+            flights["simulator"] = _fly_first(simulator, params, self.checkpoint, self.settings)
+        ghost = references if with_ghost else None
+        record_flights(path, flights, env.track, self.settings.num_laps, ghost)
+        return [*flights, *(["time-optimal"] if ghost is not None else [])]
+
+
+def evaluate(settings: EvaluationSettings) -> Report:
+    """Fly a checkpoint and return the report; nothing is written.
+
+    Raises:
+        ValueError, OSError: settings or files that cannot be used, before anything is flown.
     """
-
-    def step(observation: jax.Array, state: Any, index: jax.Array) -> tuple[Any, ...]:
-        policy: Any = network.apply(policy_params, observation, method="policy")
-        action = jnp.clip(policy.mode(), -1.0, 1.0)
-        next_observation, next_state, _, terminated, info = env.step_env(None, state, action, params)
-        before, race = env.drone(state), env.race(state)
-        after = env.drone(next_state)
-        fraction = cross_gate(race.gate, before.pos_w, after.pos_w, params.drone_radius).fraction
-        is_pass = info["gates_passed"] > race.gates_passed
-        flown = Flight(
-            states=pack(before),
-            actions=action,
-            is_flying=jnp.asarray(True),
-            gates_passed=info["gates_passed"],
-            laps=info["laps"],
-            lap_completed=info["lap_completed"],
-            lap_time_s=info["lap_time_s"],
-            gate_time_s=jnp.where(is_pass, (index + fraction) * params.dt, 0.0),
-            causes=Causes(*(info[name] for name in Causes._fields)),
-        )
-        return next_observation, next_state, terminated | (info["laps"] >= num_laps), flown
-
-    return step
+    settings.check()
+    checkpoint = load_checkpoint(settings.checkpoint)
+    scene = make_scene(checkpoint, settings)
+    outcomes, rollout = fly_scene(scene, checkpoint, settings)
+    numbers = make_numbers(scene, checkpoint, settings, outcomes, rollout)
+    return Report(settings, checkpoint, scene, rollout, numbers)
 
 
-@partial(jax.jit, static_argnames=("env", "network", "num_steps"))
-def fly_episode(
-    env: EpisodicEnvironment,
-    network: ActorCritic,
-    policy_params: Any,
-    key: jax.Array,
-    params: EnvParams,
-    num_steps: int,
-    num_laps: int,
-) -> Flight:
-    """Return one episode of the mean action, from a reset to its end or to ``num_laps`` laps."""
-    step = make_step(env, network, policy_params, params, num_laps)
-
-    def go_on(carry: tuple[jax.Array, Any, jax.Array], index: jax.Array) -> tuple[Any, ...]:
-        observation, state, is_flying = carry
-        next_observation, next_state, is_over, flown = step(observation, state, index)
-        race = env.race(state)
-        padded = flown._replace(
-            is_flying=is_flying,
-            gates_passed=jnp.where(is_flying, flown.gates_passed, race.gates_passed),
-            laps=jnp.where(is_flying, flown.laps, race.laps),
-            lap_completed=flown.lap_completed & is_flying,
-            gate_time_s=jnp.where(is_flying, flown.gate_time_s, 0.0),
-            causes=Causes(*(cause & is_flying for cause in flown.causes)),
-        )
-        keep = partial(jax.tree.map, partial(jnp.where, is_flying))
-        observation, state = keep((next_observation, next_state), (observation, state))
-        return (observation, state, is_flying & ~is_over), padded
-
-    observation, state = env.reset(key, params)
-    start = (observation, state, jnp.asarray(True))
-    return jax.lax.scan(go_on, start, jnp.arange(num_steps))[1]
+def reference_models(black_box: Path) -> tuple[str, ...]:
+    """Return the models whose time-optimal flights a black box is compared with, in order of preference."""
+    is_shipped = SHIPPED_BLACK_BOX.exists() and black_box.read_bytes() == SHIPPED_BLACK_BOX.read_bytes()
+    return BLACK_BOX_MODELS if is_shipped else NOMINAL_MODELS
 
 
-def fly_many(
-    env: EpisodicEnvironment,
-    network: ActorCritic,
-    policy_params: Any,
-    seed: int,
-    num_episodes: int,
-    num_steps: int,
-    num_laps: int,
-    params: EnvParams | None = None,
-) -> Flight:
-    """Return episodes from noisy start poses, leaves (num_episodes, num_steps, ...)."""
-    params = start_pose_params(env.default_params if params is None else params, num_steps)
-    fly = partial(fly_episode, env, network, policy_params)
-    return jax.vmap(lambda key: fly(key, params, num_steps, num_laps))(start_keys(seed, num_episodes))
+def make_scene(checkpoint: Checkpoint, settings: EvaluationSettings) -> Scene:
+    """Return what the settings ask to fly.
 
-
-def start_keys(seed: int, num_episodes: int) -> jax.Array:
-    """Return the keys of episodes, (num_episodes,): those of fewer are the first of these."""
-    return jax.random.split(jax.random.key(seed), num_episodes)
-
-
-def _note(outcome: Outcomes, flown: Flight) -> Outcomes:
-    """Return the outcome of one flight after another step."""
-    lap, gate = jnp.arange(outcome.lap_times_s.size), jnp.arange(outcome.gate_times_s.size)
-    is_lap = flown.lap_completed & (lap == flown.laps - 1)
-    is_pass = (gate >= outcome.gates_passed) & (gate < flown.gates_passed)
-    return Outcomes(
-        steps=outcome.steps + 1,
-        gates_passed=flown.gates_passed,
-        laps=flown.laps,
-        lap_times_s=jnp.where(is_lap, flown.lap_time_s, outcome.lap_times_s),
-        gate_times_s=jnp.where(is_pass, flown.gate_time_s, outcome.gate_times_s),
-        causes=flown.causes,
-    )
-
-
-@partial(jax.jit, static_argnames=("env", "network", "num_laps"))
-def _race_batch(
-    env: EpisodicEnvironment,
-    network: ActorCritic,
-    policy_params: Any,
-    keys: jax.Array,
-    params: EnvParams,
-    models: ModelParameters | None,
-    num_steps: int,
-    num_laps: int,
-) -> Outcomes:
-    """Return the outcomes of one batch; models: one for each key, or None for that of ``params``."""
-    zero, never = jnp.int32(0), jnp.asarray(False)
-
-    def race(key: jax.Array, model: ModelParameters | None) -> Outcomes:
-        own = params if model is None else params.replace(model=model)
-        step = make_step(env, network, policy_params, own, num_laps)
-
-        def is_flying(carry: tuple[Any, ...]) -> jax.Array:
-            *_, is_over, outcome = carry
-            return ~is_over & (outcome.steps < num_steps)
-
-        def go_on(carry: tuple[Any, ...]) -> tuple[Any, ...]:
-            observation, state, _, outcome = carry
-            observation, state, is_over, flown = step(observation, state, outcome.steps)
-            return observation, state, is_over, _note(outcome, flown)
-
-        nothing = Outcomes(
-            steps=zero,
-            gates_passed=zero,
-            laps=zero,
-            lap_times_s=jnp.full(num_laps, jnp.nan),
-            gate_times_s=jnp.full(num_laps * params.course.num_gates, jnp.nan),
-            causes=Causes(*(never for _ in Causes._fields)),
-        )
-        # Under vmap the loop runs until no flight is left, and flights that are over stay as they are.
-        return jax.lax.while_loop(is_flying, go_on, (*env.reset(key, own), never, nothing))[-1]
-
-    return jax.vmap(race)(keys, models)
-
-
-def race_many(
-    env: EpisodicEnvironment,
-    network: ActorCritic,
-    policy_params: Any,
-    keys: jax.Array,
-    num_steps: int,
-    num_laps: int,
-    params: EnvParams | None = None,
-    models: ModelParameters | None = None,
-) -> Outcomes:
-    """Return what came of flights from noisy start poses, one per key, as NumPy arrays.
-
-    num_steps: time limit of each. params: of the environment, its default if None. models: a simulated
-    drone for each flight, leaves (num_flights, ...); None: that of the parameters, or a black box.
+    Raises:
+        ValueError, OSError: files that cannot be used, or a ghost without a reference.
     """
-    params = start_pose_params(env.default_params if params is None else params, num_steps)
-    num_flights = len(keys)
-    size = -(-num_flights // -(-num_flights // BATCH))  # equal batches: one compiled program serves them
-    parts = []
-    for first in range(0, num_flights, size):
-        # The last batch is filled up with its last flight.
-        rows = np.minimum(np.arange(first, first + size), num_flights - 1)
-        own = jax.tree.map(lambda leaf, rows=rows: leaf[rows], models)
-        batch = _race_batch(env, network, policy_params, keys[rows], params, own, num_steps, num_laps)
-        parts.append(jax.tree.map(np.asarray, batch))
-    return jax.tree.map(lambda *leaves: np.concatenate(leaves)[:num_flights], *parts)
+    if settings.plants is None:
+        black_box = settings.black_box or SHIPPED_BLACK_BOX
+        env, plants = plant_env(checkpoint, blackbox.load(black_box), settings.track), None
+        models = reference_models(black_box)
+    else:
+        env = simulated_env(checkpoint, settings.track)
+        model = env.default_params.model
+        plants = draw_plants(settings.seed, settings.plants, model)
+        is_shipped = is_model_of(env.track.name, BLACK_BOX_MODELS[0], model)
+        models = BLACK_BOX_MODELS if is_shipped else NOMINAL_MODELS
+    try:
+        references = shipped_references(env.track, models)
+    except ReferenceFileError:
+        if settings.ghost:
+            raise
+        references = None
+    return Scene(env, with_model_as_given(env.default_params), plants, references)
+
+
+def fly_scene(scene: Scene, checkpoint: Checkpoint, settings: EvaluationSettings) -> tuple[Outcomes, Rollout]:
+    """Return the outcomes of all flights, and the first flight step by step."""
+    env, params, plants, _ = scene
+    first = params if plants is None else params.replace(model=plants.model(0))
+    rollout = _fly_first(env, first, checkpoint, settings)
+    if settings.is_single:
+        one = jax.tree.map(lambda leaf: leaf[None], rollout)
+        return outcomes_of(one, settings.laps or settings.steps, len(env.track.gates)), rollout
+    models = None if plants is None else plants.repeated(settings.episodes)
+    num_laps = settings.num_laps or settings.steps
+    policy = (checkpoint.network, checkpoint.params)
+    return race_many(env, *policy, _keys(settings), settings.steps, num_laps, params, models), rollout
+
+
+def _keys(settings: EvaluationSettings) -> jax.Array:
+    return start_keys(settings.seed, settings.episodes * (settings.plants or 1))
+
+
+def _fly_first(
+    env: EpisodicEnvironment, params: EnvParams, checkpoint: Checkpoint, settings: EvaluationSettings
+) -> Rollout:
+    """Return the first flight of an evaluation in an environment."""
+    key = jax.random.key(settings.seed) if settings.is_single else _keys(settings)[0]
+    policy, params = (checkpoint.network, checkpoint.params), start_pose_params(params, settings.steps)
+    num_laps = settings.num_laps or settings.steps
+    return fly_episode(env, *policy, key, params, settings.steps, num_laps)
+
+
+def make_numbers(
+    scene: Scene,
+    checkpoint: Checkpoint,
+    settings: EvaluationSettings,
+    outcomes: Outcomes,
+    rollout: Rollout,
+) -> dict[str, Any]:
+    """Return the numbers of an evaluation, as JSON values; docs/baseline.md describes each."""
+    plants, references = scene.plants, scene.references
+    numbers: dict[str, Any] = {
+        "schema": SCHEMA,
+        "package_version": flytrack_env.__version__,
+        "checkpoint": str(settings.checkpoint),
+        "env_id": checkpoint.env_id,
+        "track": scene.env.track.name,
+        "gates_per_lap": len(scene.env.track.gates),
+        "black_box": None if plants is not None else str(settings.black_box or SHIPPED_BLACK_BOX),
+        "seed": settings.seed,
+        "steps_limit": settings.steps,
+        "laps": settings.num_laps,
+        "episodes": settings.episodes,
+        **summarise(outcomes, is_limited=settings.num_laps is not None),
+        "plants": None,
+        "optimal": None,
+        "time_lost_s": None,
+    }
+    if plants is not None:
+        is_complete = outcomes.is_complete().reshape(settings.plants, settings.episodes)
+        if settings.episodes > 1:  # flights of one plant are not independent
+            numbers["success"] |= {"low": None, "high": None}
+        numbers["plants"] = plants.summarise(is_complete)
+    if references is not None:
+        numbers["optimal"] = compare_with_optimum(numbers, references)
+        if settings.ghost:
+            numbers["time_lost_s"] = time_lost(outcomes, references)
+    numbers["first_flight"] = {
+        "steps": int(np.sum(rollout.is_flying)),
+        "gates": int(np.max(rollout.gates_passed)),
+        "lap_times_s": rollout.lap_times().tolist(),
+        "ended": rollout.end_reason(settings.num_laps),
+    }
+    files = {"rollout": settings.out, "ghost": settings.ghost_path if settings.ghost else None}
+    files["recording"] = settings.rrd
+    return numbers | {name: None if path is None else str(path) for name, path in files.items()}

@@ -1,23 +1,37 @@
-"""What is known of flights: every step of them, or what came of them; and their score."""
+"""Flying a policy from noisy start poses: rollouts, their outcomes and their score.
 
+``fly_episode`` and ``fly_many`` keep every step; ``race_many`` keeps the outcomes only, flies no step beyond
+the last flight's end, and is for thousands of flights. Both are made of the same step.
+"""
+
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
+from baselines.purejaxrl_ppo.networks import ActorCritic
+from flytrack_env.dynamics import ModelParameters
+from flytrack_env.env import EnvParams
+from flytrack_env.episodes import EpisodicEnvironment
 from flytrack_env.rollout import save_rollout
-from flytrack_env.state import POSITION
+from flytrack_env.state import POSITION, pack
 from flytrack_env.terminations import Causes
+from flytrack_env.tracks import cross_gate
+
+BATCH = 1024  # flights side by side: more exceed a core's cache, fewer leave its vector units idle
 
 
-class Flight(NamedTuple):
+class Rollout(NamedTuple):
     """One episode; leaves (num_steps, ...), or (num_episodes, num_steps, ...) for many.
 
     states: (21,) before the step. actions: (4,), clipped as commanded. is_flying: whether the step was
     flown; what follows the end is padding. gates_passed, laps, lap_completed, lap_time_s: after the
-    step. gate_time_s: of the gate passed in the step, s since the reset, interpolated; 0 without one. Two
-    gates in one step have the first one's. causes: of termination, in the step that ended the episode.
+    step. gate_time_s: of the gate passed in the step, s since the reset, interpolated; 0 without one, of the
+    first where two are passed in one step. causes: of termination, in the step that ended the episode.
     """
 
     states: jax.Array
@@ -34,12 +48,23 @@ class Flight(NamedTuple):
         """Return every position flown through, (num_samples, 3), world, m."""
         return np.asarray(self.states)[np.asarray(self.is_flying)][:, POSITION]
 
+    def lap_times(self) -> np.ndarray:
+        """Return the lap times of one flight, s, in order; the first is from the standing start."""
+        return np.asarray(self.lap_time_s)[np.asarray(self.lap_completed)]
+
+    def end_reason(self, num_laps: int | None = None) -> str:
+        """Return the causes of termination, that the laps were completed, or that the steps ran out."""
+        causes = [name for name, happened in self.causes._asdict().items() if np.any(happened)]
+        if num_laps is not None and len(self.lap_times()) >= num_laps:
+            return "laps complete"
+        return ", ".join(causes) or "all steps flown"
+
 
 class Outcomes(NamedTuple):
-    """What came of flights; leaves (num_flights, ...), or without the first axis for one.
+    """Outcomes of flights; leaves (num_flights, ...), or without the first axis for one.
 
-    steps: flown. gates_passed, laps: numbers. lap_times_s: (num_laps,), the first from standstill;
-    gate_times_s: (num_laps * num_gates,), s since the reset; both NaN for what was not reached. causes: of
+    steps: flown. gates_passed, laps: counts. lap_times_s: (num_laps,), the first from standstill.
+    gate_times_s: (num_laps * num_gates,), s since the reset. Both are NaN where not reached. causes: of
     termination.
     """
 
@@ -65,10 +90,7 @@ class Outcomes(NamedTuple):
         return times[np.isfinite(times)]
 
     def ends(self) -> dict[str, np.ndarray]:
-        """Return which flights each cause ended before their laps were complete, and the time limit.
-
-        Masks (num_flights,).
-        """
+        """Return masks, (num_flights,), of the flights that each cause ended before their last lap."""
         is_complete = self.is_complete()
         causes = {name: np.asarray(cause) & ~is_complete for name, cause in self.causes._asdict().items()}
         is_ended = np.any(list(causes.values()), axis=0)
@@ -76,7 +98,7 @@ class Outcomes(NamedTuple):
 
 
 class Score(NamedTuple):
-    """Result of many episodes.
+    """Score of many episodes.
 
     success: share that completed the laps. gates: mean number passed. first_lap_s, flying_lap_s: mean
     time of the first lap, from standstill, and of the later ones; NaN where there was none.
@@ -88,8 +110,8 @@ class Score(NamedTuple):
     flying_lap_s: float
 
 
-def outcomes_of(flights: Flight, num_laps: int, num_gates: int) -> Outcomes:
-    """Return what came of flights whose every step is known, leaves (num_flights, num_steps, ...).
+def outcomes_of(flights: Rollout, num_laps: int, num_gates: int) -> Outcomes:
+    """Return the outcomes of rollouts, leaves (num_flights, num_steps, ...).
 
     num_gates: of a lap.
     """
@@ -98,7 +120,7 @@ def outcomes_of(flights: Flight, num_laps: int, num_gates: int) -> Outcomes:
     lap_times_s = np.full((len(before), num_laps), np.nan, np.float32)
     gate_times_s = np.full((len(before), num_laps * num_gates), np.nan, np.float32)
 
-    def put(times_s: np.ndarray, is_event: Any, places: Any, values: Any) -> None:  # NumPy's, of a Flight
+    def put(times_s: np.ndarray, is_event: Any, places: Any, values: Any) -> None:
         where = is_event & (places < times_s.shape[1])
         times_s[np.nonzero(where)[0], places[where]] = values[where]
 
@@ -115,10 +137,10 @@ def outcomes_of(flights: Flight, num_laps: int, num_gates: int) -> Outcomes:
     )
 
 
-def save_flown(path: Path, flight: Flight) -> None:
-    """Write the steps that were flown of one flight as a rollout file."""
-    is_flying = np.asarray(flight.is_flying)
-    save_rollout(path, np.asarray(flight.states)[is_flying], np.asarray(flight.actions)[is_flying])
+def save_flight(path: Path, rollout: Rollout) -> None:
+    """Write the steps of one rollout that were flown as a rollout file."""
+    is_flying = np.asarray(rollout.is_flying)
+    save_rollout(path, np.asarray(rollout.states)[is_flying], np.asarray(rollout.actions)[is_flying])
 
 
 def score(outcomes: Outcomes) -> Score:
@@ -133,3 +155,183 @@ def score(outcomes: Outcomes) -> Score:
         first_lap_s=mean(outcomes.first_laps_s()),
         flying_lap_s=mean(outcomes.flying_laps_s()),
     )
+
+
+def start_pose_params(params: EnvParams, num_steps: int) -> EnvParams:
+    """Return parameters whose episodes begin at the noisy start pose and may last that many steps."""
+    return params.replace(reset=params.reset._replace(course_fraction=0.0), max_steps_in_episode=num_steps)
+
+
+Step = Callable[[jax.Array, Any, jax.Array], tuple[jax.Array, Any, jax.Array, Rollout]]
+
+
+def make_step(
+    env: EpisodicEnvironment, network: ActorCritic, policy_params: Any, params: EnvParams, num_laps: Any
+) -> Step:
+    """Return ``step(observation, state, index)``: one step of the mean action.
+
+    It returns the next observation and state, whether the flight is over, and the step as a ``Rollout``
+    without its axis of steps. index: of the step, from 0.
+    """
+
+    def step(observation: jax.Array, state: Any, index: jax.Array) -> tuple[Any, ...]:
+        policy: Any = network.apply(policy_params, observation, method="policy")
+        action = jnp.clip(policy.mode(), -1.0, 1.0)
+        next_observation, next_state, _, terminated, info = env.step_env(None, state, action, params)
+        before, race = env.drone(state), env.race(state)
+        after = env.drone(next_state)
+        fraction = cross_gate(race.gate, before.pos_w, after.pos_w, params.drone_radius).fraction
+        is_pass = info["gates_passed"] > race.gates_passed
+        flown = Rollout(
+            states=pack(before),
+            actions=action,
+            is_flying=jnp.asarray(True),
+            gates_passed=info["gates_passed"],
+            laps=info["laps"],
+            lap_completed=info["lap_completed"],
+            lap_time_s=info["lap_time_s"],
+            gate_time_s=jnp.where(is_pass, (index + fraction) * params.dt, 0.0),
+            causes=Causes(*(info[name] for name in Causes._fields)),
+        )
+        return next_observation, next_state, terminated | (info["laps"] >= num_laps), flown
+
+    return step
+
+
+@partial(jax.jit, static_argnames=("env", "network", "num_steps"))
+def fly_episode(
+    env: EpisodicEnvironment,
+    network: ActorCritic,
+    policy_params: Any,
+    key: jax.Array,
+    params: EnvParams,
+    num_steps: int,
+    num_laps: int,
+) -> Rollout:
+    """Return one episode of the mean action, from a reset to its end or to ``num_laps`` laps."""
+    step = make_step(env, network, policy_params, params, num_laps)
+
+    def advance(carry: tuple[jax.Array, Any, jax.Array], index: jax.Array) -> tuple[Any, ...]:
+        observation, state, is_flying = carry
+        next_observation, next_state, is_over, flown = step(observation, state, index)
+        race = env.race(state)
+        padded = flown._replace(
+            is_flying=is_flying,
+            gates_passed=jnp.where(is_flying, flown.gates_passed, race.gates_passed),
+            laps=jnp.where(is_flying, flown.laps, race.laps),
+            lap_completed=flown.lap_completed & is_flying,
+            gate_time_s=jnp.where(is_flying, flown.gate_time_s, 0.0),
+            causes=Causes(*(cause & is_flying for cause in flown.causes)),
+        )
+        keep = partial(jax.tree.map, partial(jnp.where, is_flying))
+        observation, state = keep((next_observation, next_state), (observation, state))
+        return (observation, state, is_flying & ~is_over), padded
+
+    observation, state = env.reset(key, params)
+    start = (observation, state, jnp.asarray(True))
+    return jax.lax.scan(advance, start, jnp.arange(num_steps))[1]
+
+
+def fly_many(
+    env: EpisodicEnvironment,
+    network: ActorCritic,
+    policy_params: Any,
+    seed: int,
+    num_episodes: int,
+    num_steps: int,
+    num_laps: int,
+    params: EnvParams | None = None,
+) -> Rollout:
+    """Return episodes from noisy start poses, leaves (num_episodes, num_steps, ...)."""
+    params = start_pose_params(env.default_params if params is None else params, num_steps)
+    fly = partial(fly_episode, env, network, policy_params)
+    return jax.vmap(lambda key: fly(key, params, num_steps, num_laps))(start_keys(seed, num_episodes))
+
+
+def start_keys(seed: int, num_episodes: int) -> jax.Array:
+    """Return keys of episodes, (num_episodes,); fewer episodes get the first of the same keys."""
+    return jax.random.split(jax.random.key(seed), num_episodes)
+
+
+def _update_outcome(outcome: Outcomes, flown: Rollout) -> Outcomes:
+    """Return the outcome of one flight after another step."""
+    lap, gate = jnp.arange(outcome.lap_times_s.size), jnp.arange(outcome.gate_times_s.size)
+    is_lap = flown.lap_completed & (lap == flown.laps - 1)
+    is_pass = (gate >= outcome.gates_passed) & (gate < flown.gates_passed)
+    return Outcomes(
+        steps=outcome.steps + 1,
+        gates_passed=flown.gates_passed,
+        laps=flown.laps,
+        lap_times_s=jnp.where(is_lap, flown.lap_time_s, outcome.lap_times_s),
+        gate_times_s=jnp.where(is_pass, flown.gate_time_s, outcome.gate_times_s),
+        causes=flown.causes,
+    )
+
+
+@partial(jax.jit, static_argnames=("env", "network", "num_laps"))
+def _race_batch(
+    env: EpisodicEnvironment,
+    network: ActorCritic,
+    policy_params: Any,
+    keys: jax.Array,
+    params: EnvParams,
+    models: ModelParameters | None,
+    num_steps: int,
+    num_laps: int,
+) -> Outcomes:
+    """Return the outcomes of one batch; models: one for each key, or None for that of ``params``."""
+    zero, never = jnp.int32(0), jnp.asarray(False)
+
+    def race(key: jax.Array, model: ModelParameters | None) -> Outcomes:
+        own = params if model is None else params.replace(model=model)
+        step = make_step(env, network, policy_params, own, num_laps)
+
+        def is_flying(carry: tuple[Any, ...]) -> jax.Array:
+            *_, is_over, outcome = carry
+            return ~is_over & (outcome.steps < num_steps)
+
+        def advance(carry: tuple[Any, ...]) -> tuple[Any, ...]:
+            observation, state, _, outcome = carry
+            observation, state, is_over, flown = step(observation, state, outcome.steps)
+            return observation, state, is_over, _update_outcome(outcome, flown)
+
+        nothing = Outcomes(
+            steps=zero,
+            gates_passed=zero,
+            laps=zero,
+            lap_times_s=jnp.full(num_laps, jnp.nan),
+            gate_times_s=jnp.full(num_laps * params.course.num_gates, jnp.nan),
+            causes=Causes(*(never for _ in Causes._fields)),
+        )
+        # Under vmap the loop runs until no flight is left, and flights that are over stay as they are.
+        return jax.lax.while_loop(is_flying, advance, (*env.reset(key, own), never, nothing))[-1]
+
+    return jax.vmap(race)(keys, models)
+
+
+def race_many(
+    env: EpisodicEnvironment,
+    network: ActorCritic,
+    policy_params: Any,
+    keys: jax.Array,
+    num_steps: int,
+    num_laps: int,
+    params: EnvParams | None = None,
+    models: ModelParameters | None = None,
+) -> Outcomes:
+    """Return the outcomes of flights from noisy start poses, one per key, as NumPy arrays.
+
+    num_steps: time limit of each. params: of the environment, its default if None. models: a simulated
+    drone for each flight, leaves (num_flights, ...); None: that of the parameters, or a black box.
+    """
+    params = start_pose_params(env.default_params if params is None else params, num_steps)
+    num_flights = len(keys)
+    size = -(-num_flights // -(-num_flights // BATCH))  # equal batches: one compiled program serves them
+    parts = []
+    for first in range(0, num_flights, size):
+        # The last batch is filled up with its last flight.
+        rows = np.minimum(np.arange(first, first + size), num_flights - 1)
+        own = jax.tree.map(lambda leaf, rows=rows: leaf[rows], models)
+        batch = _race_batch(env, network, policy_params, keys[rows], params, own, num_steps, num_laps)
+        parts.append(jax.tree.map(np.asarray, batch))
+    return jax.tree.map(lambda *leaves: np.concatenate(leaves)[:num_flights], *parts)

@@ -1,21 +1,21 @@
 """Proximal policy optimisation, top to bottom, as PureJaxRL writes it.
 
-Source: J. Schulman et al., arXiv 1707.06347; C. Lu et al., PureJaxRL. What differs from PureJaxRL, why,
-and the setting (``config.py``) that switches it off:
+Source: J. Schulman et al., arXiv 1707.06347; C. Lu et al., PureJaxRL. Differences from PureJaxRL, the reason
+for each, and the setting (``config.py``) that switches it off:
 
 - Truncation is bootstrapped: the value of the final observation is added to the last reward of an episode
   that the time limit cut off, because the race would have gone on (``bootstrap_at_truncation = false``).
 - Environments are stepped as a batch where they offer ``step_batch``, which is faster
   (``batched_step = false``: one by one under ``vmap``).
-- Minibatches come from an affine permutation, i -> a i + b mod n, because a sort of 65,536 keys per epoch
+- Minibatches come from an affine permutation, i -> a i + b mod n, because sorting 65,536 keys per epoch
   costs as much as the environments (``affine_shuffle = false``).
-- The standard deviation has a floor, so that exploration cannot die out early, and begins at 0.5, because
-  full stick at random crashes at once (``min_std = 0``, ``initial_std = 1``).
+- The standard deviation has a floor, so that exploration cannot die out early, and starts at 0.5, because
+  random full stick crashes at once (``min_std = 0``, ``initial_std = 1``).
 - The untrained policy's mean thrust is about that of hovering, so that its episodes last
   (``initial_action`` of zeros).
 - The step size falls with every gradient step, which is optax's own schedule, and not to 0, so that the
   last updates still learn (``anneal_every_gradient = false``, ``final_learning_rate_fraction = 0``).
-- One update is a function of its own (``Algorithm``), so that a run can be logged, stored and taken up again
+- One update is a function of its own (``Algorithm``), so that a run can be logged, stored and resumed
   between updates; ``make_train`` is PureJaxRL's: one ``jit``, a ``scan`` over updates.
 - An update may see one shard of the environments, its gradients averaged over all (``distributed.py``).
 """
@@ -30,7 +30,7 @@ import optax
 from flax.training.train_state import TrainState
 from gymnax.environments import spaces
 
-from baselines.purejaxrl_ppo.across import AXIS, Across
+from baselines.purejaxrl_ppo.collectives import AXIS, Collectives
 from baselines.purejaxrl_ppo.config import Config
 from baselines.purejaxrl_ppo.metrics import summarise_episodes, summarise_race
 from baselines.purejaxrl_ppo.networks import ActorCritic, make_network
@@ -50,7 +50,7 @@ class Batch(NamedTuple):
 
 
 class Episodes(NamedTuple):
-    """What is kept of every environment's episode, (num_envs,): so far, and of the last that ended."""
+    """Every environment's episode, (num_envs,): return and length so far, return of the last that ended."""
 
     so_far: jax.Array
     length: jax.Array
@@ -58,7 +58,7 @@ class Episodes(NamedTuple):
 
 
 class Runner(NamedTuple):
-    """What the loop over updates carries: all that a run needs to go on."""
+    """The carry of the loop over updates: all that a run needs to continue."""
 
     train_state: TrainState
     env_state: Any
@@ -127,11 +127,10 @@ def ppo_loss(
     advantage: jax.Array,
     target: jax.Array,
     config: Config,
-    across: Across = Across(),  # noqa: B008, a tuple
+    collectives: Collectives = Collectives(),  # noqa: B008, a tuple
 ) -> tuple[jax.Array, Metrics]:
     """Return the clipped objective plus clipped value loss of this device's experience, and its parts."""
-    said: Any = network.apply(network_params, batch.observation)
-    policy, value = said
+    policy, value = network.apply(network_params, batch.observation)
     log_prob = policy.log_prob(batch.action)
     value_clipped = batch.value + jnp.clip(value - batch.value, -config.clip_eps, config.clip_eps)
     value_error = jnp.maximum((value - target) ** 2, (value_clipped - target) ** 2)
@@ -139,8 +138,8 @@ def ppo_loss(
 
     log_ratio = log_prob - batch.log_prob
     ratio = jnp.exp(log_ratio)
-    advantage_std = jnp.sqrt(across.variance(advantage))
-    advantage = (advantage - across.mean(advantage)) / (advantage_std + 1e-8)
+    advantage_std = jnp.sqrt(collectives.variance(advantage))
+    advantage = (advantage - collectives.mean(advantage)) / (advantage_std + 1e-8)
     clipped_ratio = jnp.clip(ratio, 1.0 - config.clip_eps, 1.0 + config.clip_eps)
     policy_loss = -jnp.minimum(ratio * advantage, clipped_ratio * advantage).mean()
     entropy = policy.entropy().mean()
@@ -191,13 +190,13 @@ def make_network_for(env: Any, env_params: Any, config: Config) -> ActorCritic:
 def make_ppo(env: Any, env_params: Any, config: Config, num_shards: int = 1) -> Algorithm:
     """Return PPO on a gymnax environment with its parameters.
 
-    num_shards: of the environments; of more than one, an update is of a shard, under the axis ``AXIS``.
+    num_shards: of the environments; with more than one, an update is of one shard, under the axis ``AXIS``.
 
     Raises:
         ValueError: a configuration that cannot be trained with.
     """
     config.check()
-    across = Across(AXIS if num_shards > 1 else None)
+    collectives = Collectives(AXIS if num_shards > 1 else None)
     batch_size = config.batch_size // num_shards
     network = make_network_for(env, env_params, config)
     optimizer, schedule = make_optimizer(config), make_schedule(config)
@@ -205,8 +204,7 @@ def make_ppo(env: Any, env_params: Any, config: Config, num_shards: int = 1) -> 
 
     def collect_step(runner: Runner, _: None) -> tuple[Runner, tuple[Batch, dict[str, jax.Array]]]:
         key, key_action, key_step = jax.random.split(runner.key, 3)
-        said: Any = network.apply(runner.train_state.params, runner.observation)
-        policy, value = said
+        policy, value = network.apply(runner.train_state.params, runner.observation)
         action, log_prob = policy.sample_and_log_prob(seed=key_action)
         observation, env_state, reward, terminated, truncated, info = step_all(
             key_step, runner.env_state, action, env_params
@@ -241,7 +239,9 @@ def make_ppo(env: Any, env_params: Any, config: Config, num_shards: int = 1) -> 
 
     def update_minibatch(train_state: TrainState, minibatch: tuple[Any, ...]) -> tuple[TrainState, Metrics]:
         gradient = jax.grad(ppo_loss, has_aux=True)
-        grads, parts = across.averaged(gradient(train_state.params, network, *minibatch, config, across))
+        grads, parts = collectives.average(
+            gradient(train_state.params, network, *minibatch, config, collectives)
+        )
         return train_state.apply_gradients(grads=grads), parts
 
     def update_epoch(
@@ -269,11 +269,12 @@ def make_ppo(env: Any, env_params: Any, config: Config, num_shards: int = 1) -> 
             jnp.stack(epoch_keys),
         )
         metrics = {
-            **summarise_episodes(log, across),
-            **summarise_race(log, across),
+            **summarise_episodes(log, collectives),
+            **summarise_race(log, collectives),
             **jax.tree.map(jnp.mean, parts),
-            "last_return": across.mean(log["last_return"]),
-            "explained_variance": 1.0 - across.variance(target - batch.value) / across.variance(target),
+            "last_return": collectives.mean(log["last_return"]),
+            "explained_variance": 1.0
+            - collectives.variance(target - batch.value) / collectives.variance(target),
             "learning_rate": jnp.asarray(schedule(runner.train_state.step)),
         }
         return runner._replace(train_state=train_state, key=key), metrics

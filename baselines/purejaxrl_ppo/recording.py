@@ -6,8 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from baselines.purejaxrl_ppo.flights import Flight
-from baselines.purejaxrl_ppo.report import reason_ended
+from baselines.purejaxrl_ppo.flights import Rollout
 from flytrack_env.references import References, ghost_rollout
 from flytrack_env.tracks import Track
 
@@ -25,15 +24,14 @@ def can_record() -> bool:
 
 def record_flights(
     path: Path,
-    flights: Mapping[str, Flight],
+    flights: Mapping[str, Rollout],
     track: Track,
     num_laps: int | None = None,
     references: References | None = None,
 ) -> None:
-    """Write flights by name on one time line as a Rerun recording; the first is in the foreground.
+    """Write flights by name on one timeline as a Rerun recording; the first is in the foreground.
 
-    num_laps: that a flight was asked for, if any. references: the time-optimal flights of the track, to go
-    along as a ghost.
+    num_laps: laps to complete, if limited. references: the time-optimal flights of the track, shown as ghost.
 
     Raises:
         ImportError: Rerun is not installed; the message says how to install it.
@@ -45,7 +43,7 @@ def record_flights(
     for name, flight in flights.items():
         is_flying = np.asarray(flight.is_flying)
         states, actions = (np.asarray(part)[is_flying] for part in (flight.states, flight.actions))
-        ended = reason_ended(flight, num_laps).replace("_", " ")
+        ended = flight.end_reason(num_laps).replace("_", " ")
         shown.append(Trajectory(name, states, actions, ended=ended))
     if references is not None:
         longest = max(len(one.states) for one in shown)

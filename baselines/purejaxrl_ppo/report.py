@@ -1,10 +1,10 @@
-"""One flight, or an evaluation's report, as text for a terminal; what a report is: docs/baseline.md."""
+"""One flight, or the numbers of an evaluation (docs/baseline.md), as text for a terminal."""
 
 from typing import Any
 
 import numpy as np
 
-from baselines.purejaxrl_ppo.flights import Flight
+from baselines.purejaxrl_ppo.flights import Rollout
 from baselines.purejaxrl_ppo.summary import CONFIDENCE
 
 UNITS = {
@@ -16,34 +16,21 @@ UNITS = {
 LAPS = {"first_lap_s": "first lap", "flying_lap_s": "flying laps"}
 
 
-def lap_times(flight: Flight) -> np.ndarray:
-    """Return the lap times of one flight, s, in order; the first is from the standing start."""
-    return np.asarray(flight.lap_time_s)[np.asarray(flight.lap_completed)]
-
-
-def reason_ended(flight: Flight, num_laps: int | None = None) -> str:
-    """Return the causes of termination, that the laps were completed, or that the steps ran out."""
-    causes = [name for name, happened in flight.causes._asdict().items() if np.any(happened)]
-    if num_laps is not None and len(lap_times(flight)) >= num_laps:
-        return "laps complete"
-    return ", ".join(causes) or "all steps flown"
-
-
-def describe(flight: Flight, dt: float, num_laps: int | None = None) -> str:
-    """Return what a pilot wants to know of a flight; num_laps: that it was asked for, if any."""
-    num_flown = int(np.sum(flight.is_flying))
-    times = lap_times(flight)
+def describe_flight(rollout: Rollout, dt: float, num_laps: int | None = None) -> str:
+    """Return duration, gates, lap times and end of a flight; num_laps: laps to complete, if limited."""
+    num_flown = int(np.sum(rollout.is_flying))
+    times = rollout.lap_times()
     laps = ", ".join(f"{seconds:.3f} s" for seconds in times) or "none"
     return (
         f"flown: {num_flown} steps, {num_flown * dt:.2f} s\n"
-        f"gates: {int(np.max(flight.gates_passed))}, laps: {len(times)}\n"
+        f"gates: {int(np.max(rollout.gates_passed))}, laps: {len(times)}\n"
         f"lap times: {laps}\n"
-        f"ended: {reason_ended(flight, num_laps)}"
+        f"ended: {rollout.end_reason(num_laps)}\n"
     )
 
 
 def describe_share(share: dict[str, Any]) -> str:
-    """Return a share with its interval, where it has one."""
+    """Return a share and its interval, if it has one."""
     text = f"{share['number']} of {share['of']}, {share['share']:.1%}"
     if share["low"] is None:
         return text
@@ -51,7 +38,7 @@ def describe_share(share: dict[str, Any]) -> str:
 
 
 def describe_times(name: str, times: dict[str, Any], optimal: dict[str, Any] | None, model: str) -> str:
-    """Return one kind of lap: how many, how long, how far above the time-optimal one."""
+    """Return number and times of one kind of lap, and by how much they exceed the time-optimal one."""
     if times["number"] == 0:
         return f"{name}: none"
     text = (
@@ -66,7 +53,7 @@ def describe_times(name: str, times: dict[str, Any], optimal: dict[str, Any] | N
 
 
 def describe_flights(report: dict[str, Any]) -> list[str]:
-    """Return the lines on all flights together."""
+    """Return the lines about all flights."""
     ended = ", ".join(f"{name.replace('_', ' ')} {n}" for name, n in report["ended"].items() if n)
     gates = "" if report["laps"] is None else f" of {report['laps'] * report['gates_per_lap']}"
     return [
@@ -77,7 +64,7 @@ def describe_flights(report: dict[str, Any]) -> list[str]:
 
 
 def describe_laps(report: dict[str, Any]) -> list[str]:
-    """Return the lines on lap times."""
+    """Return the lines about lap times."""
     optimal = report["optimal"] or {"model": ""}
     return [
         describe_times(label, report[lap], optimal.get(lap), optimal["model"]) for lap, label in LAPS.items()
@@ -85,10 +72,10 @@ def describe_laps(report: dict[str, Any]) -> list[str]:
 
 
 def describe_plants(plants: dict[str, Any]) -> list[str]:
-    """Return the lines on drawn plants: how many are raced, and how that depends on what was drawn."""
+    """Return the lines about drawn plants: success, and how it depends on each quantity."""
     lines = [
         f"plants on which every flight completes its laps: {describe_share(plants['success'])}",
-        "by thirds of what was drawn:",
+        "by thirds of the drawn values:",
     ]
     for row in plants["by_thirds"]:
         label, unit = UNITS[row["quantity"]]
@@ -98,7 +85,7 @@ def describe_plants(plants: dict[str, Any]) -> list[str]:
 
 
 def describe_time_lost(rows: list[dict[str, Any]]) -> list[str]:
-    """Return the table of the mean time lost against the time-optimal flight on the way to each gate."""
+    """Return the table of mean time lost to the time-optimal flight on the way to each gate."""
 
     def column(lap: str, row: dict[str, Any]) -> str:
         return f"{'-' if row[lap] is None else format(row[lap], '+.3f'):>12}"
@@ -111,7 +98,7 @@ def describe_time_lost(rows: list[dict[str, Any]]) -> list[str]:
 
 
 def describe_report(report: dict[str, Any]) -> str:
-    """Return all lines on an evaluation."""
+    """Return the text about an evaluation."""
     where = f"the black box {report['black_box']}"
     if report["plants"] is not None:
         number = report["plants"]["success"]["of"]

@@ -1,53 +1,100 @@
-"""Going on with a training that was cut off: what a run is, its newest intact checkpoint, its state."""
+"""Continuing a training: the checkpoints in a folder, what a run is, and whether both fit."""
 
 import dataclasses
-import itertools
 import logging
+import math
 import os
+import re
 import sys
-from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
-import numpy as np
 
 import flytrack_env
 from baselines.purejaxrl_ppo.checkpoint import (
+    SUFFIX,
     Checkpoint,
     CheckpointError,
     as_json,
-    check_none,
+    as_named_arrays,
+    check_no_differences,
     find_differences,
+    from_named_arrays,
     load_checkpoint,
     observation_layout,
     save_checkpoint,
 )
 from baselines.purejaxrl_ppo.config import Config
-from baselines.purejaxrl_ppo.distributed import is_first
-from baselines.purejaxrl_ppo.journal import forget
-from baselines.purejaxrl_ppo.named_arrays import as_named_arrays, find_misfits, from_named_arrays
 from baselines.purejaxrl_ppo.ppo import Runner
-from baselines.purejaxrl_ppo.run_folder import FINAL, checkpoints_in, is_its_folder, seeds_in
-from flytrack_env.files import write_together
 from flytrack_env.messages import quote_value
 from flytrack_env.model_file import model_as_json
 
-REWARD = "reward."  # what paths of the reward's weights begin with
+FINAL = f"final{SUFFIX}"
+SEED_FOLDER = re.compile(r"seed(\d+)")
+STEP_FILE = re.compile(rf"step_(\d+)\{SUFFIX}")
+HALF_WRITTEN = re.compile(rf"\.(step_\d+|final)\{SUFFIX}\.[0-9a-f]{{16}}")  # as write_atomically names them
+REWARD = "reward."  # prefix of the reward's weights among the environment's parameters
 MUST_FIT = ("env_id", "seed", "missed_gate", "config", "observation", "track_data", "model", "environment")
 
 logger = logging.getLogger(__name__)
 
-Start = tuple[Path, Checkpoint]  # a checkpoint to go on from, and its path
+
+class Start(NamedTuple):
+    """A checkpoint to continue from, and its path."""
+
+    path: Path
+    checkpoint: Checkpoint
+
+    @property
+    def steps(self) -> int:
+        """Environment steps of training so far."""
+        return self.checkpoint.meta["steps"]
+
+
+def step_file(steps: int) -> str:
+    """Return the name of the checkpoint after a number of environment steps."""
+    return f"step_{steps}{SUFFIX}"
+
+
+def checkpoints_in(folder: Path) -> list[Path]:
+    """Return the checkpoints in a folder, newest first: the final one, then by the steps in their names."""
+    steps = {path: STEP_FILE.fullmatch(path.name) for path in folder.glob(f"step_*{SUFFIX}")}
+    known = {path: int(match[1]) for path, match in steps.items() if match}
+    if (folder / FINAL).exists():
+        known[folder / FINAL] = sys.maxsize
+    return sorted(known, key=lambda path: known[path], reverse=True)
+
+
+def seeds_in(folder: Path) -> list[int]:
+    """Return the seeds of which a folder holds checkpoints, in seed<N>."""
+    matches = [(path, SEED_FOLDER.fullmatch(path.name)) for path in folder.glob("seed*")]
+    return sorted(int(match[1]) for path, match in matches if match and checkpoints_in(path))
+
+
+def remove_half_written(folder: Path) -> None:
+    """Remove what a killed process was writing."""
+    for path in folder.glob(f".*{SUFFIX}.*"):
+        if HALF_WRITTEN.fullmatch(path.name):
+            path.unlink(missing_ok=True)
+
+
+def check_free(folder: Path, start: Start | None = None) -> None:
+    """Raise ValueError if a folder holds a run that is not the one to continue."""
+    is_own = start is not None and start.path.parent.resolve() == folder.resolve()
+    if not is_own and (checkpoints_in(folder) or seeds_in(folder)):
+        raise ValueError(
+            f"{folder} holds the checkpoints of a run; continue it (--resume {folder}), give another folder "
+            "(--out), or remove it"
+        )
 
 
 def describe_run(
-    env: Any, env_id: str, track: str, config: Config, seed: int, number: int = 1
+    env: Any, env_id: str, track: str, config: Config, seed: int, num_seeds: int = 1
 ) -> dict[str, Any]:
-    """Return what a run is, as JSON values: what its checkpoints say of themselves.
+    """Return the description of a run, as JSON values, that its checkpoints hold.
 
-    number: of seeds that train side by side.
-    track: what finds it again, a name or a path; its gates and bounds stand under ``track_data``.
+    num_seeds: that train side by side. track: its name or path; gates and bounds are under ``track_data``.
     environment: the other parameters (rewards, starts, time step, wrappers) by their paths.
     """
     params = env.default_params
@@ -65,16 +112,16 @@ def describe_run(
             "environment": {name: values.tolist() for name, values in others.items()},
             "config": dataclasses.asdict(config),
             "software": {"jax": jax.__version__},
-            "machine": describe_machine(number),
+            "machine": describe_machine(num_seeds),
         }
     )
 
 
-def describe_machine(number: int = 1) -> dict[str, Any]:
-    """Return what of a machine decides the last bits: XLA splits sums by the number of its threads.
+def describe_machine(num_seeds: int = 1) -> dict[str, Any]:
+    """Return what decides the last bits of a result: XLA splits sums by the number of its threads.
 
-    threads: cores that this process may use. NPROC: XLA's own setting of that number, where there is one.
-    seeds: that train side by side, where there are several, because their program is another.
+    threads: cores that this process may use. NPROC: XLA's own setting of that number, if any. seeds: that
+    train side by side in one program, if several.
     """
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     return {
@@ -82,171 +129,27 @@ def describe_machine(number: int = 1) -> dict[str, Any]:
         "devices": jax.device_count(),
         "threads": cores,
         "NPROC": os.environ.get("NPROC"),
-        **({"seeds": number} if number > 1 else {}),
+        **({"seeds": num_seeds} if num_seeds > 1 else {}),
     }
 
 
-def save_run(path: Path, runner: Runner, config: Config, description: dict[str, Any]) -> None:
-    """Write a checkpoint that training can go on from, atomically."""
-    state = runner.train_state
-    rest = runner._replace(train_state=state.replace(params=None))
-    save_checkpoint(path, state.params, config, description, as_named_arrays(rest))
-
-
-def newest_intact(path: Path) -> tuple[Path, Checkpoint]:
-    """Return the checkpoint in a file, or the newest one in a folder that is intact, and its path.
-
-    Raises:
-        CheckpointError: a file that cannot be used, a folder without an intact one, or a policy alone.
-    """
-    candidates = checkpoints_in(path) if path.is_dir() else [path]
-    if not candidates and seeds_in(path):
-        names = ", ".join(f"seed{seed}" for seed in seeds_in(path))
-        raise CheckpointError(f"{path}: found the runs of several seeds, expected that of one: {names} in it")
-    if not candidates:
-        raise CheckpointError(f"{path}: found no checkpoint, expected {FINAL} or step_<N>.msgpack")
-    *newer, oldest = candidates
-    for candidate in newer:
-        try:
-            return candidate, _load_training(candidate)
-        except CheckpointError as error:
-            logger.warning("%s; the checkpoint before it is used", error)
-    return oldest, _load_training(oldest)
-
-
-def own_start(out: Path, start: Start) -> Path:
-    """Return the path, in a run's folder, of the checkpoint that it goes on from."""
-    path, checkpoint = start
-    return path if is_its_folder(out, path) else out / f"step_{checkpoint.meta['steps']}.msgpack"
-
-
-def take_over(starts: list[tuple[Path, Start]], beside: Iterable[tuple[Path, bytes]] = ()) -> None:
-    """Have every run's start in its own folder: killed before its first checkpoint, it goes on from there.
-
-    starts: a run's folder, which holds no other run, and where the run goes on. beside: files that are
-    written with them; where one cannot be written, none is.
-    """
-    moves = [(start[0], own_start(out, start)) for out, start in starts]
-    moves = [(source, path) for source, path in moves if source != path]
-    if is_first():
-        for _, path in moves:
-            forget(path.parent)
-        write_together(itertools.chain(beside, ((path, source.read_bytes()) for source, path in moves)))
-
-
-def seeds_side_by_side(starts: list[Start | None]) -> int:
-    """Return how many seeds trained side by side, as the first checkpoint says; all of them without one."""
-    found = [start[1] for start in starts if start is not None]
-    return _seeds_noted(found[0]) if found else len(starts)
-
-
-def _seeds_noted(checkpoint: Checkpoint) -> int:
-    """Return beside how many seeds, itself one of them, a checkpoint says that its seed trained."""
-    machine = checkpoint.meta.get("machine")
-    number = machine.get("seeds") if isinstance(machine, dict) else None
-    return number if isinstance(number, int) and number > 0 else 1
-
-
-def at_common_step(starts: list[Start | None]) -> list[Start | None]:
-    """Return where seeds go on that trained side by side: all at the last step that all have stored.
-
-    A kill between their checkpoints leaves some ahead, and alone they would not go on bit for bit.
-    Others, None for those that begin, stay as they are.
-    """
-    found = [start for start in starts if start is not None]
-    steps = {checkpoint.meta["steps"] for _, checkpoint in found}
-    are_together = all(_seeds_noted(checkpoint) == len(starts) == len(found) for _, checkpoint in found)
-    if not are_together or len(steps) <= 1:
-        return starts
-    name = f"step_{min(steps)}.msgpack"
-    try:
-        return [
-            start if start[1].meta["steps"] == min(steps) else newest_intact(start[0].with_name(name))
-            for start in found
-        ]
-    except CheckpointError as error:
-        logger.warning("%s; the seeds go on from where each of them was", error)
-        return starts
-
-
-def _load_training(path: Path) -> Checkpoint:
-    checkpoint = load_checkpoint(path)
-    if checkpoint.training is None:
-        raise CheckpointError(f"{path}: found a policy alone, expected one with its training")
-    _check_progress(path, checkpoint)
-    return checkpoint
-
-
-def _check_progress(path: Path, checkpoint: Checkpoint) -> None:
-    """Raise CheckpointError where a description does not say how far the training is, and of what."""
-    meta = checkpoint.meta
-    for name, (is_right, expected) in PROGRESS.items():
-        if not is_right(meta.get(name)):
-            found = quote_value(meta.get(name))
-            raise CheckpointError(f"{path}: {name}: found {found}, expected {expected}")
-    batch_size = checkpoint.config.batch_size
-    if meta["steps"] % batch_size:
-        found = meta["steps"]
-        raise CheckpointError(f"{path}: steps: found {found}, expected a multiple of {batch_size}, an update")
-    total = checkpoint.config.num_updates * batch_size
-    if meta["steps"] > total:
-        raise CheckpointError(
-            f"{path}: steps: found {meta['steps']}, expected at most {total}, the whole training"
-        )
-
-
-def _is_count(value: Any) -> bool:
-    return type(value) is int and 0 <= value < 2**63
-
-
-def _is_number(value: Any) -> bool:
-    return type(value) in (int, float) and abs(value) < sys.float_info.max
-
-
-def _is_object(value: Any) -> bool:
-    return isinstance(value, dict)
-
-
-# What is used before, or without, being compared with the run that goes on.
-PROGRESS = {
-    "steps": (_is_count, "a whole number"),
-    "seed": (_is_count, "a whole number"),
-    "seconds": (lambda value: value is None or _is_number(value), "a number"),
-    "seen": (
-        lambda value: (
-            value is None
-            or (_is_object(value) and all(one is None or _is_number(one) for one in value.values()))
-        ),
-        "an object of numbers",
-    ),
-    "model": (_is_object, "an object"),
-    "environment": (
-        lambda value: (
-            _is_object(value)
-            and all(_is_number(one) for name, one in value.items() if name.startswith(REWARD))
-        ),
-        "an object, with numbers for weights of the reward",
-    ),
-}
-
-
 def check_same_run(path: Path, checkpoint: Checkpoint, description: dict[str, Any]) -> None:
-    """Raise CheckpointError, field by field, where a checkpoint is not of the run described."""
+    """Raise CheckpointError, field by field, unless a checkpoint is of the run described."""
     found = {**checkpoint.meta, "config": as_json(dataclasses.asdict(checkpoint.config))}
     lines = [
         line for name in MUST_FIT for line in find_differences(found.get(name), description.get(name), name)
     ]
-    check_none(path, [*lines, *_other_bits(checkpoint, description)] if lines else [])
+    check_no_differences(path, [*lines, *_machine_differences(checkpoint, description)] if lines else [])
 
 
-def warn_of_other_bits(path: Path, checkpoint: Checkpoint, description: dict[str, Any]) -> None:
-    """Warn where software or machine are not what a checkpoint was written with: it may go on differently."""
-    lines = _other_bits(checkpoint, description)
+def warn_of_other_machine(path: Path, checkpoint: Checkpoint, description: dict[str, Any]) -> None:
+    """Warn if software or machine differ from the checkpoint's: results may differ in the last bits."""
+    lines = _machine_differences(checkpoint, description)
     if lines:
-        logger.warning("%s: %s; going on, perhaps not bit for bit", path, "; ".join(lines))
+        logger.warning("%s: %s; continuing, perhaps not bit for bit", path, "; ".join(lines))
 
 
-def _other_bits(checkpoint: Checkpoint, description: dict[str, Any]) -> list[str]:
+def _machine_differences(checkpoint: Checkpoint, description: dict[str, Any]) -> list[str]:
     expected = {**description, "package_version": flytrack_env.__version__}
     return [
         line
@@ -255,17 +158,126 @@ def _other_bits(checkpoint: Checkpoint, description: dict[str, Any]) -> list[str
     ]
 
 
-def restore_runner(path: Path, checkpoint: Checkpoint, target: Runner) -> Runner:
+def save_run(path: Path, runner: Runner, config: Config, description: dict[str, Any]) -> None:
+    """Write a checkpoint that training can continue from, atomically."""
+    state = runner.train_state
+    rest = runner._replace(train_state=state.replace(params=None))
+    save_checkpoint(path, state.params, config, description, as_named_arrays(rest))
+
+
+def restore_runner(start: Start, target: Runner) -> Runner:
     """Return the state of the training in a checkpoint; ``target``: its shapes and types.
 
     Raises:
         CheckpointError: arrays that are not what the training expects, leaf by leaf.
     """
     rest = target._replace(train_state=target.train_state.replace(params=None))
-    training = checkpoint.training or {}
-    if not all(isinstance(array, np.ndarray) for array in training.values()):
-        raise CheckpointError(f"{path}: training: found something else than arrays")
-    check_none(path, find_misfits(training, rest))
-    runner = from_named_arrays(training, rest)
-    params = jax.tree.map(jax.numpy.asarray, checkpoint.params)
-    return runner._replace(train_state=runner.train_state.replace(params=params))
+    runner = from_named_arrays(start.path, start.checkpoint.training or {}, rest)
+    return runner._replace(train_state=runner.train_state.replace(params=start.checkpoint.params))
+
+
+def newest_intact(path: Path) -> Start:
+    """Return the checkpoint in a file, or the newest intact one in a folder.
+
+    Raises:
+        CheckpointError: a file that cannot be used, a folder without an intact one, or a policy alone.
+    """
+    candidates = checkpoints_in(path) if path.is_dir() else [path]
+    if not candidates and seeds_in(path):
+        names = ", ".join(f"seed{seed}" for seed in seeds_in(path))
+        raise CheckpointError(f"{path}: found the runs of several seeds ({names}), expected that of one")
+    if not candidates:
+        raise CheckpointError(f"{path}: found no checkpoint, expected {FINAL} or step_<N>{SUFFIX}")
+    *newer, oldest = candidates
+    for candidate in newer:
+        try:
+            return load_start(candidate)
+        except CheckpointError as error:
+            logger.warning("%s; the checkpoint before it is used", error)
+    return load_start(oldest)
+
+
+def load_start(path: Path) -> Start:
+    """Return a checkpoint that training can continue from.
+
+    Raises:
+        CheckpointError: a file that cannot be used, or a policy alone.
+    """
+    checkpoint = load_checkpoint(path)
+    if checkpoint.training is None:
+        raise CheckpointError(f"{path}: found a policy alone, expected one with its training")
+    for name, (is_valid, expected) in PROGRESS.items():
+        value = checkpoint.meta.get(name)
+        if not is_valid(value):
+            raise CheckpointError(f"{path}: {name}: found {quote_value(value)}, expected {expected}")
+    steps, batch_size = checkpoint.meta["steps"], checkpoint.config.batch_size
+    if steps % batch_size or steps > checkpoint.config.num_updates * batch_size:
+        raise CheckpointError(
+            f"{path}: steps: found {steps}, expected a multiple of {batch_size}, the steps of an update, "
+            f"and at most {checkpoint.config.num_updates * batch_size}"
+        )
+    return Start(path, checkpoint)
+
+
+def _is_number(value: Any) -> bool:
+    return type(value) in (int, float) and abs(value) <= sys.float_info.max
+
+
+def _is_number_or_none(value: Any) -> bool:
+    return value is None or _is_number(value)
+
+
+def _is_count(value: Any) -> bool:
+    return type(value) is int and 0 <= value < 2**63
+
+
+def _are_rewards(value: Any) -> bool:
+    return isinstance(value, dict) and all(
+        _is_number(weight) for name, weight in value.items() if name.startswith(REWARD)
+    )
+
+
+# Fields that are used before a checkpoint is compared with the run that continues.
+PROGRESS = {
+    "steps": (_is_count, "a whole number"),
+    "seed": (_is_count, "a whole number"),
+    "seconds": (_is_number, "a number"),
+    "success": (_is_number_or_none, "a number"),
+    "best_lap_s": (_is_number_or_none, "a number"),
+    "model": (lambda value: isinstance(value, dict), "an object"),
+    "environment": (_are_rewards, "an object, with numbers for weights of the reward"),
+}
+
+
+def rewards_of(checkpoint: Checkpoint) -> dict[str, float]:
+    """Return the weights of the reward terms that a checkpoint was trained with."""
+    values = checkpoint.meta["environment"].items()
+    return {name.removeprefix(REWARD): value for name, value in values if name.startswith(REWARD)}
+
+
+def seeds_side_by_side(checkpoint: Checkpoint) -> int:
+    """Return how many seeds trained in one program when a checkpoint was written."""
+    machine = checkpoint.meta.get("machine")
+    number = machine.get("seeds") if isinstance(machine, dict) else None
+    return number if isinstance(number, int) and number > 0 else 1
+
+
+def at_common_step(starts: list[Start | None]) -> list[Start | None]:
+    """Return where seeds continue that trained side by side: at the last step that all have stored.
+
+    A kill between their checkpoints leaves some ahead, and trained alone they would end in other bits.
+    Seeds that did not train side by side stay where they are.
+    """
+    found = [start for start in starts if start is not None]
+    steps = min((start.steps for start in found), default=math.inf)
+    are_together = all(seeds_side_by_side(start.checkpoint) == len(starts) == len(found) for start in found)
+    if not are_together or all(start.steps == steps for start in found):
+        return starts
+    try:
+        return [
+            start if start.steps == steps else load_start(start.path.with_name(step_file(int(steps))))
+            for start in found
+        ]
+    except CheckpointError as error:
+        logger.warning("%s; every seed continues from its own newest checkpoint", error)
+        return starts

@@ -1,243 +1,357 @@
 """Train PPO on a FlyTrack environment: ``python -m baselines.purejaxrl_ppo.train_ppo`` (docs/baseline.md)."""
 
-import argparse
+import dataclasses
 import os
 import sys
+from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple, NoReturn
+from typing import Annotated, Any, NamedTuple, NoReturn
 
 import jax
+import tyro
 
-from baselines.joining import add_job_flags, begin_anew, job_of
-from baselines.purejaxrl_ppo.config import add_flags
-from baselines.purejaxrl_ppo.distributed import all_devices, is_first, wait_for_all
-from baselines.purejaxrl_ppo.options import OPTIONS, Options, options_as_bytes
-from baselines.purejaxrl_ppo.plans import (
-    DEFAULT_ENV_ID,
-    DEFAULT_OUT,
-    DEFAULT_TRACK,
-    DEFAULTS,
-    Plan,
-    batched,
-    check_plans,
-    make_plans,
-    make_trainer,
-    options_of,
-    root_folder,
+from baselines.purejaxrl_ppo.checkpoint import CheckpointError
+from baselines.purejaxrl_ppo.config import Config, Count, read_value, settings_in_file
+from baselines.purejaxrl_ppo.distributed import Job, all_devices, is_first, join
+from baselines.purejaxrl_ppo.resume import (
+    FINAL,
+    Start,
+    at_common_step,
+    checkpoints_in,
+    newest_intact,
+    rewards_of,
+    seeds_in,
+    seeds_side_by_side,
 )
-from baselines.purejaxrl_ppo.resume import own_start, take_over
-from baselines.purejaxrl_ppo.run_folder import FINAL, checkpoints_in, seeds_in
-from baselines.purejaxrl_ppo.training import Trainer, train_policy
+from baselines.purejaxrl_ppo.run import Options
+from baselines.purejaxrl_ppo.tracking import SQLITE, local_uri
+from baselines.purejaxrl_ppo.training import Task, Trainer, train_policy
+from flytrack_env.messages import error_text
+from flytrack_env.model_file import model_from_json
 
 __all__ = ["DEFAULTS", "main", "train_policy"]
 
+PROG = "train_ppo"
+MAX_SEED = 2**31
 INTERRUPTED = 130  # what shells return for a command that Ctrl-C ended
+DEFAULT_OUT = Path("runs/train")
+DEFAULTS = Options(checkpoint_every=1_000_000, evaluate_every=4_000_000)
+LOCAL, OFF = "local", ""  # tracking URIs
 
 
-def whole_number(text: str) -> int:
-    """Return a whole number, also one written as 1e6."""
-    try:
-        value = int(float(text))
-    except (ValueError, OverflowError) as error:
-        raise argparse.ArgumentTypeError(f"found {text!r}, expected a whole number") from error
-    if value != float(text):
-        raise argparse.ArgumentTypeError(f"found {text!r}, expected a whole number")
-    return value
-
-
-def reward_weight(text: str) -> tuple[str, float]:
-    """Return the term and the weight of ``TERM=WEIGHT``."""
-    name, _, weight = text.partition("=")
-    try:
-        return name, float(weight)
-    except ValueError as error:
-        raise argparse.ArgumentTypeError(f"found {text!r}, expected TERM=WEIGHT") from error
-
-
-def make_parser() -> argparse.ArgumentParser:
-    """Return the command line: what is trained and told, and one flag per hyperparameter."""
-    parser = argparse.ArgumentParser(
-        prog="train_ppo",
-        usage="%(prog)s [options]",
-        description="Train PPO on a FlyTrack environment; docs/baseline.md describes what comes of it.",
-    )
-    parser.add_argument("--env-id", help=f"default: {DEFAULT_ENV_ID}")
-    parser.add_argument("--track", help=f"name of a track, or path of its file (default: {DEFAULT_TRACK})")
-    parser.add_argument("--model", help="path of a model file; the nominal model if not given")
-    parser.add_argument(
-        "--reward",
-        type=reward_weight,
-        nargs="+",
-        metavar="TERM=WEIGHT",
-        help="weights of reward terms (docs/envs); the others are default",
-    )
-    parser.add_argument("--seed", type=int, metavar="N", help="default: 0, or as in the checkpoint")
-    parser.add_argument(
-        "--num-seeds",
-        type=int,
-        metavar="N",
-        help="train N seeds from --seed on, side by side in one program, each in OUT/seed<N> (default: 1, "
-        "or as many as --resume holds)",
-    )
-    parser.add_argument(
-        "--seeds-at-once",
-        type=int,
-        metavar="N",
-        help="so many of them side by side, the others after them; on a CPU 1 is quickest (default: all, or "
-        "as before)",
-    )
-    parser.add_argument("--out", type=Path, help=f"folder (default: {DEFAULT_OUT}, or that of --resume)")
-    parser.add_argument(
-        "--resume",
-        type=Path,
-        metavar="FILE_OR_DIR",
-        help="go on from a checkpoint, from a folder's newest intact one, or with all seeds in a folder of "
-        "seed<N>; what is not given is as it was: settings from the checkpoint, the five options below from "
-        "options.json beside it",
-    )
-    intervals = (
-        ("--checkpoint-every", "write step_<N>.msgpack every N environment steps; 0: only at the end"),
-        ("--evaluate-every", "fly and draw the policy every N environment steps; 0: never"),
-        ("--evaluation-episodes", "noisy starts of an evaluation"),
-    )
-    for flag, text in intervals:
-        default = getattr(DEFAULTS, flag[2:].replace("-", "_"))
-        parser.add_argument(flag, type=whole_number, metavar="N", help=f"{text} (default: {default})")
-    tracking = parser.add_mutually_exclusive_group()
-    tracking.add_argument(
-        "--tracking-uri", metavar="URI", help="MLflow store (default: an SQLite file in OUT)"
-    )
-    tracking.add_argument("--no-tracking", action="store_true", help="tell MLflow nothing")
-    add_job_flags(parser)
-    add_flags(parser)
-    return parser
-
-
-class Asked(NamedTuple):
-    """What a command line asks for, checked: one trainer, and for every seed where to and how."""
-
-    trainer: Trainer
-    plans: list[Plan]
-    options: list[Options]
-
-
-def prepare(arguments: argparse.Namespace) -> Asked:
-    """Return what is to be done.
+def parse_rewards(words: list[str]) -> dict[str, float]:
+    """Return terms and weights of ``TERM=WEIGHT``.
 
     Raises:
-        ValueError, OSError: what cannot be used; nothing has been written.
+        ValueError: another form.
     """
-    plans = make_plans(arguments)
-    options = options_of(arguments, plans)
-    base = next((plan for plan in plans if plan.checkpoint is not None), None)
-    mesh = all_devices() if arguments.distributed else None
-    trainer = make_trainer(arguments, base, mesh)
-    check_plans(trainer, plans)
-    if trainer.mesh is not None:
-        wait_for_all("prepared")  # before the first process writes what the others would find
-    return Asked(trainer, plans, options)
+    rewards = {}
+    for word in words:
+        name, _, weight = word.partition("=")
+        try:
+            rewards[name] = float(weight)
+        except ValueError as error:
+            raise ValueError(f"found {word!r}, expected TERM=WEIGHT") from error
+    return rewards
 
 
-def say_resumed(plan: Plan) -> str | None:
-    """Return the line for a seed that is gone on with, None for one that begins."""
-    if plan.resume is None or plan.checkpoint is None:
-        return None
-    return f"seed {plan.seed}: from step {plan.checkpoint.meta['steps']}, {plan.resume}"
+Rewards = Annotated[
+    dict[str, float],
+    tyro.constructors.PrimitiveConstructorSpec(
+        nargs="*",
+        metavar="[TERM=WEIGHT ...]",
+        instance_from_str=parse_rewards,
+        is_instance=lambda value: isinstance(value, dict),
+        str_from_instance=lambda value: [f"{name}={weight:g}" for name, weight in value.items()],
+    ),
+]
 
 
-def begin_folders(asked: Asked) -> list[Options]:
-    """Have in every seed's folder what it goes on from, and its options; return these.
+@dataclasses.dataclass(frozen=True)
+class Sources:
+    """What decides the defaults of all other settings, and is read before them."""
 
-    All before any is trained: whoever takes them up again finds the seeds that had not begun.
+    config: Path | None = None
+    """TOML file of hyperparameters; flags override it."""
+    resume: Path | None = None
+    """Continue from a checkpoint, from a folder's newest intact one, or with all seeds in a folder of
+    seed<N>. What is not given is as it was."""
+    distributed: bool = False
+    """Spread the environments over all devices, of this process or of all processes of a job of SLURM or Open
+    MPI; elsewhere the next three flags say where the processes meet. All must see the same folder."""
+    coordinator: str | None = None
+    """HOST:PORT of the first process."""
+    num_processes: int | None = None
+    """Number of processes."""
+    process_index: int | None = None
+    """Which of them this is, from 0."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Settings(Sources):
+    """Train PPO on a FlyTrack environment; docs/baseline.md describes what it writes."""
+
+    env_id: str = "FlyTrack-v0"
+    """Id of the environment."""
+    track: str = "flytrack"
+    """Name of a track, or path of its file."""
+    model: Path | None = None
+    """Model file; by default the nominal model."""
+    reward: Rewards = dataclasses.field(default_factory=dict)
+    """Weights of reward terms (docs/envs); the others are default."""
+    seed: int = 0
+    """First seed."""
+    num_seeds: int = 1
+    """Train so many seeds, each in OUT/seed<N>."""
+    seeds_at_once: int | None = None
+    """So many of them side by side in one program; by default all. On a CPU, 1 is fastest."""
+    out: Path | None = None
+    """Folder; by default runs/train, or that of --resume."""
+    checkpoint_every: Count = DEFAULTS.checkpoint_every or 0
+    """Write step_<N>.safetensors every so many environment steps; 0: only at the end."""
+    evaluate_every: Count = DEFAULTS.evaluate_every or 0
+    """Fly and draw the policy every so many environment steps; 0: never."""
+    evaluation_episodes: int = DEFAULTS.evaluation_episodes
+    """Noisy starts of an evaluation."""
+    tracking_uri: str = LOCAL
+    """MLflow store; local: an SQLite file in OUT."""
+    no_tracking: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Do not use MLflow."""
+    hyperparameters: Config = Config()  # noqa: RUF009, frozen
+
+    def check(self) -> None:
+        """Raise ValueError, naming the flag, for numbers out of range."""
+        for name in ("num_seeds", "seeds_at_once"):
+            value = getattr(self, name)
+            if value is not None and value < 1:
+                raise ValueError(f"--{name.replace('_', '-')}: found {value}, expected at least 1")
+        if not 0 <= self.seed <= MAX_SEED - self.num_seeds:
+            raise ValueError(f"--seed: found {self.seed}, expected 0 to {MAX_SEED - self.num_seeds}")
+
+
+class Resumed(NamedTuple):
+    """What ``--resume`` found: the folder, and per seed where it continues (None: it has not begun)."""
+
+    folder: Path
+    starts: dict[int, Start | None]
+    is_single: bool
+
+    @property
+    def first(self) -> Start:
+        """The first checkpoint found."""
+        return next(start for start in self.starts.values() if start is not None)
+
+
+class Plan(NamedTuple):
+    """A checked command: the trainer, one task per seed, and how many train side by side."""
+
+    trainer: Trainer
+    tasks: list[Task]
+    at_once: int
+
+
+def find_starts(resume: Path) -> Resumed:
+    """Return what there is to resume in a file or folder.
+
+    Raises:
+        CheckpointError: nothing, or a checkpoint that cannot be used.
     """
-    starts = {
-        plan.out: (plan.resume, plan.checkpoint) for plan in asked.plans if plan.checkpoint and plan.resume
+    seeds = seeds_in(resume)
+    if not seeds or checkpoints_in(resume):
+        start = newest_intact(resume)
+        folder = resume if resume.is_dir() else resume.parent
+        return Resumed(folder, {start.checkpoint.meta["seed"]: start}, is_single=True)
+    found = {seed: newest_intact(resume / f"seed{seed}") for seed in seeds}
+    seeds = sorted({*seeds, *saved_options(next(iter(found.values()))).seeds})
+    return Resumed(resume, {seed: found.get(seed) for seed in seeds}, is_single=False)
+
+
+def saved_options(start: Start) -> Options:
+    """Return the options that a checkpoint was written with.
+
+    Raises:
+        ConfigError: values of another type.
+    """
+    values = start.checkpoint.meta.get("options")
+    where = f"{start.path}: options"
+    if not isinstance(values, dict):
+        return DEFAULTS
+    kinds: dict[str, Any] = {"checkpoint_every": int, "evaluate_every": int, "evaluation_episodes": int}
+    kinds["seeds"] = tuple[int, ...]
+    known = {
+        name: None if values.get(name) is None else read_value(f"{where}.{name}", kind, values[name])
+        for name, kind in kinds.items()
     }
-    paths = {out: own_start(out, start) for out, start in starts.items()}
-    every = [
-        options._replace(resume=paths.get(plan.out, plan.resume))
-        for plan, options in zip(asked.plans, asked.options, strict=True)
-    ]
-    beside = (
-        (plan.out / OPTIONS, options_as_bytes(plan.out, options))
-        for plan, options in zip(asked.plans, every, strict=True)
-        if not (plan.out / FINAL).exists()
+    uri = values.get("tracking_uri")
+    return Options(**known | {"seeds": known["seeds"] or ()}, tracking_uri=None if uri is None else str(uri))
+
+
+def defaults_of(resumed: Resumed) -> Settings:
+    """Return the settings of the run that is resumed, which flags override."""
+    start, options = resumed.first, saved_options(resumed.first)
+    uri = options.tracking_uri or OFF
+    has_moved = uri.startswith(SQLITE) and not Path(uri.removeprefix(SQLITE)).exists()
+    return Settings(
+        env_id=start.checkpoint.env_id,
+        track=start.checkpoint.track,
+        reward=rewards_of(start.checkpoint),
+        seed=min(resumed.starts),
+        num_seeds=len(resumed.starts),
+        seeds_at_once=seeds_side_by_side(start.checkpoint),
+        checkpoint_every=options.checkpoint_every or 0,
+        evaluate_every=options.evaluate_every or 0,
+        evaluation_episodes=options.evaluation_episodes,
+        tracking_uri=LOCAL if has_moved else uri,
+        hyperparameters=start.checkpoint.config,
     )
-    take_over(list(starts.items()), beside)
-    if asked.trainer.mesh is not None:
-        wait_for_all("taken over")  # before the others look for what the first process wrote
-    return every
 
 
-def run(asked: Asked) -> None:
-    """Train every seed; say from where those go on that had begun, and where its checkpoint is."""
-    for line in filter(None, map(say_resumed, asked.plans)):
-        if is_first():
-            print(line)
-    all_options = begin_folders(asked)
-    all_seeds = [
-        (plan.out, plan.seed, options) for plan, options in zip(asked.plans, all_options, strict=True)
-    ]
-    # On several devices one seed after the other: a seed fills them.
-    at_once = asked.plans[0].at_once if asked.trainer.mesh is None else 1
-    for seeds in batched(all_seeds, at_once):
-        for (out, seed, _), (checkpoint, _) in zip(seeds, asked.trainer.train_all(seeds), strict=True):
+def parse(words: Sequence[str]) -> tuple[Settings, Resumed | None]:
+    """Return the settings of a command line, and what it resumes; joins the other processes first.
+
+    Raises:
+        ValueError: a file that cannot be used, or processes that cannot be reached.
+    """
+    sources, _ = tyro.cli(Sources, args=words, prog=PROG, add_help=False, return_unknown_args=True)
+    job = Job(sources.coordinator, sources.num_processes, sources.process_index)
+    if sources.distributed:
+        join(job)
+    elif job != Job():
+        raise ValueError("--coordinator, --num-processes, --process-index: expected --distributed as well")
+    resumed = None if sources.resume is None else find_starts(sources.resume)
+    defaults = Settings() if resumed is None else defaults_of(resumed)
+    if sources.config is not None:
+        config = dataclasses.replace(defaults.hyperparameters, **settings_in_file(sources.config))
+        defaults = dataclasses.replace(defaults, hyperparameters=config)
+    settings = tyro.cli(
+        Settings, args=words, prog=PROG, default=defaults, config=(tyro.conf.OmitArgPrefixes,)
+    )
+    settings.check()
+    return settings, resumed
+
+
+def root_folder(settings: Settings) -> Path:
+    """Return the folder that everything is written to."""
+    if settings.out is not None or settings.resume is None:
+        return settings.out or DEFAULT_OUT
+    return settings.resume if settings.resume.is_dir() else settings.resume.parent
+
+
+def make_tasks(settings: Settings, resumed: Resumed | None, at_once: int) -> list[Task]:
+    """Return one task per seed.
+
+    Raises:
+        ValueError: other seeds than those of a folder that is resumed.
+    """
+    seeds = list(range(settings.seed, settings.seed + settings.num_seeds))
+    starts: list[Start | None] = [None] * len(seeds)
+    is_single = len(seeds) == 1
+    if resumed is not None:
+        is_single, known = resumed.is_single, list(resumed.starts)
+        if not is_single and seeds[0] == known[0] and len(seeds) == len(known):
+            seeds = known
+        elif not is_single or len(seeds) > 1:
+            found = f"seeds {seeds}, but {resumed.folder} holds {known}"
+            raise ValueError(f"--resume: found {found}; leave out --seed and --num-seeds")
+        starts = list(resumed.starts.values())
+        groups = [starts[first : first + at_once] for first in range(0, len(starts), at_once)]
+        starts = [start for group in groups for start in at_common_step(group)]
+    out = root_folder(settings)
+    uri = local_uri(out) if settings.tracking_uri == LOCAL else settings.tracking_uri
+    options = Options(
+        checkpoint_every=settings.checkpoint_every or None,
+        evaluate_every=settings.evaluate_every or None,
+        evaluation_episodes=settings.evaluation_episodes,
+        tracking_uri=None if settings.no_tracking or uri == OFF else uri,
+        seeds=tuple(seeds),
+    )
+    folders = [out if is_single else out / f"seed{seed}" for seed in seeds]
+    return [Task(*task, options, start) for *task, start in zip(folders, seeds, starts, strict=True)]
+
+
+def make_trainer(settings: Settings, resumed: Resumed | None) -> Trainer:
+    """Return the trainer of a command line.
+
+    Raises:
+        ValueError: settings that cannot be used; the message names the checkpoint that some come from.
+    """
+    mesh = all_devices() if settings.distributed else None
+    arguments: dict[str, Any] = {"track": settings.track, "reward": settings.reward, "model": settings.model}
+    if resumed is None:
+        return Trainer(settings.hyperparameters, settings.env_id, mesh, **arguments)
+    path, checkpoint = resumed.first
+    try:
+        arguments["model"] = settings.model or model_from_json(checkpoint.meta["model"], "model")
+        arguments["missed_gate"] = checkpoint.meta["missed_gate"]
+        arguments["reward"] = rewards_of(checkpoint) | settings.reward
+        return Trainer(settings.hyperparameters, settings.env_id, mesh, **arguments)
+    except (ValueError, OverflowError, OSError) as error:
+        raise CheckpointError(f"{path}: with its settings and the flags: {error_text(error)}") from error
+
+
+def make_plan(words: Sequence[str]) -> Plan:
+    """Return the plan of a command line; everything is checked before anything is trained.
+
+    Raises:
+        ValueError, OSError: what cannot be used.
+    """
+    settings, resumed = parse(words)
+    # With several devices one seed after the other: a seed fills them.
+    at_once = 1 if settings.distributed else settings.seeds_at_once or settings.num_seeds
+    tasks = make_tasks(settings, resumed, at_once)
+    trainer = make_trainer(settings, resumed)
+    return Plan(trainer, trainer.prepare(tasks, min(at_once, len(tasks))), at_once)
+
+
+def run(plan: Plan) -> None:
+    """Train every seed; print where it continues from and where its checkpoint is."""
+    for task in plan.tasks:
+        if task.start is not None and is_first():
+            print(f"seed {task.seed}: from step {task.start.steps}, {task.start.path}")
+    for first in range(0, len(plan.tasks), plan.at_once):
+        tasks = plan.tasks[first : first + plan.at_once]
+        for task, (checkpoint, _) in zip(tasks, plan.trainer.run(tasks), strict=True):
             meta = checkpoint.meta
             if is_first():
-                print(f"seed {seed}: {meta['steps']} steps in {meta['seconds']} s: {out / FINAL}")
+                print(f"seed {task.seed}: {meta['steps']} steps in {meta['seconds']} s: {task.out / FINAL}")
 
 
-def say_stopped(steps: int, arguments: argparse.Namespace) -> str:
-    """Return the line for who has stopped the training."""
-    out = root_folder(arguments)
-    folders = [out, *(out / f"seed{seed}" for seed in seeds_in(out))]
-    if any(checkpoints_in(folder) for folder in folders):
-        return f"stopped at {steps} steps; go on with --resume {out}"
-    return f"stopped at {steps} steps, before the first checkpoint"
-
-
-def say_lost(steps: int, arguments: argparse.Namespace, error: Exception) -> str:
-    """Return the line for who has lost another process of the training."""
-    reason = (str(error).splitlines() or [""])[0]
-    return (
-        f"process {jax.process_index()} of {jax.process_count()} has lost another ({reason}); "
-        f"{say_stopped(steps, arguments)}, with any number of processes"
-    )
+def stopped_text(plan: Plan) -> str:
+    """Return the message for a training that was stopped."""
+    folder = plan.tasks[0].out
+    folder = folder if len(plan.tasks) == 1 else folder.parent
+    if any(checkpoints_in(task.out) for task in plan.tasks):
+        return f"stopped at {plan.trainer.steps} steps; continue with --resume {folder}"
+    return f"stopped at {plan.trainer.steps} steps, before the first checkpoint"
 
 
 def leave(status: int, text: str) -> NoReturn:
-    """End with a message; of several processes at once, because those that are left would wait for it."""
+    """Exit with a message; one of several processes at once, because the others would wait for it."""
     print(text, file=sys.stderr, flush=True)
     if jax.process_count() > 1:
         os._exit(status)
     raise SystemExit(status)
 
 
-def main(has_joined: bool = False) -> None:
-    """Parse the command line, train, say where the checkpoints are.
-
-    has_joined: whether this process has met the others of its training.
-    """
-    parser = make_parser()
-    arguments = parser.parse_args()
-    error = f"{parser.prog}: error:"
+def main() -> None:
+    """Train as the command line says."""
+    error = f"{PROG}: error:"
     try:
-        job_of(arguments)
-        if arguments.distributed and not has_joined:
-            begin_anew()
-        asked = prepare(arguments)
+        plan = make_plan(sys.argv[1:])
     except (ValueError, OverflowError, OSError) as found:
-        leave(2, f"{parser.format_usage()}{error} {found}")
+        leave(2, f"{error} {found}")
     try:
-        run(asked)
+        run(plan)
     except KeyboardInterrupt:
-        leave(INTERRUPTED, say_stopped(asked.trainer.steps, arguments))
+        leave(INTERRUPTED, stopped_text(plan))
     except (ValueError, OSError) as found:
         leave(1, f"{error} {found}")
     except jax.errors.JaxRuntimeError as found:
         if jax.process_count() == 1:
             raise
-        leave(1, f"{error} {say_lost(asked.trainer.steps, arguments, found)}")
+        reason = (str(found).splitlines() or [""])[0]
+        process = f"process {jax.process_index()} of {jax.process_count()}"
+        leave(1, f"{error} {process} has lost another ({reason}); {stopped_text(plan)}")
 
 
 if __name__ == "__main__":

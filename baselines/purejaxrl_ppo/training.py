@@ -1,217 +1,260 @@
-"""A training: PPO compiled once, in chunks of updates, for any number of runs (``run.py``).
+"""Trainings: seeds begun or resumed, checked before anything is written, trained alone or side by side."""
 
-How long the chunks are, and where a run was cut off and taken up again, changes no bit of its result:
-the compiled program is one update in a loop whose length is an argument.
-"""
-
-from collections.abc import Callable
+import time
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.sharding import Mesh
 
-import flytrack_env
 from baselines.purejaxrl_ppo.checkpoint import Checkpoint
 from baselines.purejaxrl_ppo.config import Config
-from baselines.purejaxrl_ppo.distributed import (
-    check_agree,
-    check_divides,
-    digest,
-    is_first,
-    on_devices,
-    spread,
-    wait_for_all,
-    whole,
-)
-from baselines.purejaxrl_ppo.journal import forget
-from baselines.purejaxrl_ppo.named_arrays import is_key
-from baselines.purejaxrl_ppo.options import Options
-from baselines.purejaxrl_ppo.ppo import Algorithm, Runner, make_network_for, make_ppo
+from baselines.purejaxrl_ppo.distributed import check_agree, digest, is_first, spread, wait_for_all
+from baselines.purejaxrl_ppo.monitor import ProgressLine
+from baselines.purejaxrl_ppo.ppo import Runner
+from baselines.purejaxrl_ppo.program import Program, make_chunk, training_params, with_strong_types
 from baselines.purejaxrl_ppo.resume import (
+    FINAL,
+    Start,
+    check_free,
     check_same_run,
-    describe_run,
     newest_intact,
-    own_start,
+    remove_half_written,
     restore_runner,
-    take_over,
-    warn_of_other_bits,
+    step_file,
+    warn_of_other_machine,
 )
-from baselines.purejaxrl_ppo.run import Metrics, Run
-from baselines.purejaxrl_ppo.run_folder import FINAL, begins, check_free, remove_half_written
-from baselines.purejaxrl_ppo.side_by_side import Ready, finish, groups_of
-from flytrack_env.episodes import EpisodicEnvironment
-from flytrack_env.params import EnvParams
+from baselines.purejaxrl_ppo.run import Chunk, DivergedError, Metrics, Options, Run, next_due
+from flytrack_env.files import write_atomically
 
-CHUNK_STEPS = 131_072  # environment steps between two looks from outside: a fraction of a second
-
-
-def make_chunk(ppo: Algorithm, most: int) -> Callable[[Runner, jax.Array], tuple[Runner, Any]]:
-    """Return ``chunk(runner, count) -> (runner, metrics)``: ``count`` updates, at most ``most``.
-
-    metrics: leaves (most,), of which the first ``count`` are filled.
-    """
-
-    def chunk(runner: Runner, count: jax.Array) -> tuple[Runner, Any]:
-        def one(index: jax.Array, carry: tuple[Runner, Any]) -> tuple[Runner, Any]:
-            runner, rows = carry
-            runner, metrics = ppo.update(runner)
-            return runner, jax.tree.map(lambda row, value: row.at[index].set(value), rows, metrics)
-
-        forms = jax.eval_shape(ppo.update, runner)[1]
-        rows = jax.tree.map(lambda form: jnp.zeros((most,), form.dtype), forms)
-        return jax.lax.fori_loop(0, count, one, (runner, rows))
-
-    return jax.jit(chunk)
+__all__ = [
+    "DivergedError",
+    "Options",
+    "Task",
+    "Trainer",
+    "make_chunk",
+    "train_policy",
+    "training_params",
+    "with_strong_types",
+]
 
 
-def with_strong_types(runner: Runner) -> Runner:
-    """Return the state with JAX's weak types made strong, as they come from a file: one program for both."""
+class Task(NamedTuple):
+    """One seed's run: its folder, its seed, its options, and where it continues from, if anywhere."""
 
-    def strong(leaf: Any) -> jax.Array:
-        leaf = jnp.asarray(leaf)
-        return leaf if is_key(leaf) else jnp.asarray(leaf, leaf.dtype)
-
-    return jax.tree.map(strong, runner)
-
-
-def training_params(env: EpisodicEnvironment, config: Config) -> EnvParams:
-    """Return the parameters to train with: short episodes, and a drone that is thicker than in the race.
-
-    Raises:
-        ValueError: a margin that leaves no opening.
-    """
-    params = env.default_params
-    params = params.replace(
-        max_steps_in_episode=config.episode_steps, drone_radius=params.drone_radius + config.gate_margin
-    )
-    try:
-        env.check_params(params)
-    except ValueError as error:
-        raise ValueError(f"gate_margin: found {config.gate_margin}: {error}") from error
-    return params
+    out: Path
+    seed: int
+    options: Options
+    start: Start | None = None
 
 
-class Trainer:
-    """PPO on one environment, compiled once for any number of seeds; ``steps``: of the run under way.
+class Ready(NamedTuple):
+    """A run that can begin or continue, its state, and the updates that are behind it."""
 
-    mesh: of the devices that the environments are spread over (``distributed.all_devices``); None: one.
+    run: Run
+    runner: Runner
+    update: int
 
-    Raises:
-        ValueError: settings, id, track or model that cannot be used, before any training.
-    """
 
-    def __init__(
-        self, config: Config, env_id: str = "FlyTrack-v0", mesh: Mesh | None = None, **env_arguments: Any
-    ):
-        self.config, self.env_id = config, env_id
-        self.mesh = mesh if mesh is not None and mesh.size > 1 else None
-        self.track = track_reference(env_arguments.get("track", "flytrack"))
-        self.env = flytrack_env.make(env_id, **env_arguments)
-        config.check()
-        self.env.check_params(self.env.default_params)
-        params = training_params(self.env, config)
-        if self.mesh is None:
-            ppo = make_ppo(self.env, params, config)
-        else:
-            check_divides(config, self.mesh)
-            ppo = on_devices(make_ppo(self.env, params, config, self.mesh.size), self.mesh)
-        self.network = make_network_for(self.env, params, config)
-        self.most = max(1, CHUNK_STEPS // config.batch_size)
-        self.steps = 0
-        self.start = jax.jit(lambda key: with_strong_types(ppo.start(key)))
-        self.chunk = make_chunk(ppo, self.most)
-        self.chunk_of_many = jax.jit(jax.vmap(self.chunk, in_axes=(0, None)))
+class Trainer(Program):
+    """A compiled program with the runs that it trains; ``steps``: of the run under way."""
+
+    steps = 0
 
     def train(self, out: Path, seed: int, options: Options) -> tuple[Checkpoint, Metrics]:
-        """Train and write ``out``/final.msgpack; return it, and the metrics of every update made here.
+        """Train and write ``out``/final.safetensors; return it, and the metrics of every update made here.
 
         A run that is complete stays as it is.
 
         Raises:
-            CheckpointError: a checkpoint to go on from that cannot be used or is of another run.
+            CheckpointError: a checkpoint to continue from that cannot be used or is of another run.
             ValueError: ``out`` holds another run.
             DivergedError: numbers that are not finite.
         """
         return self.train_all([(out, seed, options)])[0]
 
     def train_all(self, asked: list[tuple[Path, int, Options]]) -> list[tuple[Checkpoint, Metrics]]:
-        """Train seeds side by side, in one program: as ``train``, for each folder, seed and options.
+        """Train seeds side by side, in one program: as ``train``, for each folder, seed and options."""
+        tasks = [
+            Task(out, seed, options, None if options.resume is None else newest_intact(options.resume))
+            for out, seed, options in asked
+        ]
+        return self.run(self.prepare(tasks, len(tasks)))
 
-        Seeds that are not as far as each other, or are looked at at other times, train one after the other.
+    def prepare(self, tasks: list[Task], at_once: int) -> list[Task]:
+        """Check tasks, all before anything is written, and return them as they can be run.
+
+        Checkpoints of other folders are copied: a run that is killed continues in its own folder.
+
+        Raises:
+            CheckpointError, ValueError: as ``train``.
+        """
+        for task in tasks:
+            task.options.check()
+            check_free(task.out, task.start)
+            description = self.describe(task.seed, at_once)
+            if task.start is not None:
+                check_same_run(*task.start, description)
+            if self.mesh is not None:
+                shared = {name: value for name, value in description.items() if name != "machine"}
+                start = None if task.start is None else task.start.steps
+                check_agree("settings", digest([task.options.as_json(), start, shared]))
+        if self.mesh is not None:
+            wait_for_all("checked")  # before the first process writes what the others would find
+        return [task._replace(start=own_start(task)) for task in tasks]
+
+    def run(self, tasks: list[Task]) -> list[tuple[Checkpoint, Metrics]]:
+        """Train prepared tasks; those that are as far as each other side by side.
+
+        Raises:
+            DivergedError: of the first run that did.
         """
         runs, ready = [], list[Ready]()
-        for out, seed, options in asked:
-            run, start = self._prepare(out, seed, options, len(asked))
+        for task in tasks:
+            run, start = self._load(task, len(tasks))
             runs.append(run)
             ready += [start] if start is not None else []
-        for group in groups_of(ready):
-            finish(self, group)
+        for group in group_by_progress(ready):
+            train_group(self, group)
         if self.mesh is not None:
             wait_for_all("trained")
         return [run.result() for run in runs]
 
-    def _prepare(self, out: Path, seed: int, options: Options, number: int) -> tuple[Run, Ready | None]:
-        """Return a run and how it begins or goes on; None where it is complete. number: side by side."""
-        options.check()
-        source = options.resume
-        check_free(out, source)
-        is_new = begins(out, source)
-        description = self.describe(seed, number)
-        if self.mesh is not None:
-            wait_for_all("checked")  # before the first process writes what the others would find
-            shared = {name: value for name, value in description.items() if name != "machine"}
-            check_agree("settings", digest([options._replace(report=None), shared]))
-        key = jax.random.key(seed)
+    def _load(self, task: Task, num_seeds: int) -> tuple[Run, Ready | None]:
+        """Return a run and its state; None where it is complete."""
+        description, key = self.describe(task.seed, num_seeds), jax.random.key(task.seed)
         if is_first():
-            remove_half_written(out)
-            if source is None:
-                forget(out)
-        if source is None or is_new:
-            run = Run(self, out, description, options._replace(resume=None))
+            remove_half_written(task.out)
+        run = Run(self, task.out, description, task.options, task.start)
+        if task.start is None:
             return run, Ready(run, self.start(key), 0)
-        path, checkpoint = newest_intact(source)
-        check_same_run(path, checkpoint, description)
-        take_over([(out, (path, checkpoint))])
-        path = own_start(out, (path, checkpoint))
-        run = Run(self, out, description, options._replace(resume=path), checkpoint.meta)
-        update = checkpoint.meta["steps"] // self.config.batch_size
-        self.steps = checkpoint.meta["steps"]
-        if update == self.config.num_updates and path.resolve() == (out / FINAL).resolve():
-            run.send_unsent()
+        self.steps = task.start.steps
+        update = self.steps // self.config.batch_size
+        if update == self.config.num_updates and task.start.path.name == FINAL:
+            run.finish_tracking()
             return run, None
-        warn_of_other_bits(path, checkpoint, description)
-        runner = restore_runner(path, checkpoint, jax.eval_shape(self.start, key))
-        if self.mesh is not None:
-            check_agree(f"{path}: steps", checkpoint.meta["steps"])
-            runner = spread(runner, self.mesh)
-        return run, Ready(run, runner, update)
-
-    def whole(self, runner: Runner) -> Runner:
-        """Return the state as this process can read it; on several devices all processes have to ask."""
-        return runner if self.mesh is None else whole(runner, self.mesh)
-
-    def policy_of(self, runner: Runner) -> Any:
-        """Return the network's parameters as this process alone can compute with."""
-        params = runner.train_state.params
-        return params if self.mesh is None else jax.tree.map(np.asarray, params)
-
-    def describe(self, seed: int, number: int = 1) -> dict[str, Any]:
-        """Return what the run of a seed is, as its checkpoints say. number: of seeds side by side."""
-        return describe_run(self.env, self.env_id, self.track, self.config, seed, number)
+        warn_of_other_machine(*task.start, description)
+        runner = restore_runner(task.start, jax.eval_shape(self.start, key))
+        return run, Ready(run, runner if self.mesh is None else spread(runner, self.mesh), update)
 
 
-def track_reference(track: str | Path) -> str:
-    """Return what finds a track from any folder: its name, or the absolute path of its file.
+def own_start(task: Task) -> Start | None:
+    """Return where a task continues from, with the checkpoint copied into its folder."""
+    if task.start is None or task.start.path.parent.resolve() == task.out.resolve():
+        return task.start
+    path = task.out / step_file(task.start.steps)
+    if is_first():
+        write_atomically(path, task.start.path.read_bytes())
+    return task.start._replace(path=path)
+
+
+def group_by_progress(ready: list[Ready]) -> list[list[Ready]]:
+    """Return the runs that can share a loop: as far as each other, stored and evaluated as often."""
+    groups: dict[tuple[int | None, ...], list[Ready]] = {}
+    for one in ready:
+        options = one.run.options
+        groups.setdefault((one.update, options.checkpoint_every, options.evaluate_every), []).append(one)
+    return list(groups.values())
+
+
+def train_group(trainer: Trainer, group: list[Ready]) -> None:
+    """Train runs of a group side by side to their end, and write their final checkpoints.
+
+    A run that diverges ends; the others go on.
 
     Raises:
-        ValueError: a ``Track``, which no checkpoint could name; save it to a file first.
+        DivergedError: of the first run that did.
     """
-    if not isinstance(track, (str, Path)):
-        raise ValueError(f"track: found a {type(track).__name__}, expected a name or the path of a file")
-    return str(Path(track).resolve()) if str(track).endswith(".toml") else str(track)
+    runs, config, update = [one.run for one in group], trainer.config, group[0].update
+    runners = [one.runner for one in group]
+    trainer.steps = update * config.batch_size
+    line = ProgressLine(config.num_updates * config.batch_size * len(runs), trainer.steps * len(runs))
+    diverged: dict[Run, DivergedError] = {}
+    try:
+        for one in group:
+            one.run.begin(one.runner, update)
+        for chunks in train_chunks(trainer, group, line):
+            runners = [chunk.runner for chunk in chunks]
+            trainer.steps = chunks[0].update * config.batch_size
+            for run, chunk in zip(runs, chunks, strict=True):
+                if run not in diverged:
+                    try:
+                        run.advance(chunk)
+                    except DivergedError as error:
+                        diverged[run] = error
+            show_progress(line, runs, chunks, trainer.steps)
+            if len(diverged) == len(runs):
+                break
+        for run, runner in zip(runs, runners, strict=True):
+            if run not in diverged:
+                run.complete(runner)
+    except KeyboardInterrupt:
+        for run in runs:
+            run.interrupt()
+        raise
+    finally:
+        line.close()
+        for run in runs:
+            run.end()
+    for first in diverged.values():
+        raise first
+
+
+def train_chunks(trainer: Trainer, group: list[Ready], line: ProgressLine) -> Iterator[list[Chunk]]:
+    """Train a group; yield, chunk by chunk, the result of every run."""
+    config, options, update = trainer.config, group[0].run.options, group[0].update
+    if update == config.num_updates:
+        return
+    advance, split = (trainer.chunk, _single) if len(group) == 1 else (trainer.chunk_of_many, _split)
+    state = group[0].runner if len(group) == 1 else _stack([one.runner for one in group])
+    advance(state, jnp.int32(0))  # compiles
+    line.begin()
+    while update < config.num_updates:
+        due = (
+            next_due(update, every, config.batch_size)
+            for every in (options.checkpoint_every, options.evaluate_every)
+        )
+        before = update
+        count = int(min(*due, update + trainer.most, config.num_updates)) - update
+        started_s = time.perf_counter()
+        state, rows = jax.block_until_ready(advance(state, jnp.int32(count)))
+        rate = count * config.batch_size / (time.perf_counter() - started_s)
+        update += count
+        yield [
+            Chunk(runner, before, update, _first_rows(own, count), rate)
+            for runner, own in zip(split(state), split(rows), strict=True)
+        ]
+
+
+def _first_rows(rows: Metrics, count: int) -> Metrics:
+    """Return the first rows as copies: a view would keep JAX's arrays of every chunk to the end."""
+    return {name: np.asarray(row)[:count].copy() for name, row in rows.items()}
+
+
+@jax.jit
+def _stack(runners: list[Runner]) -> Runner:
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *runners)
+
+
+@jax.jit
+def _split(tree: Any) -> list[Any]:
+    size = jax.tree.leaves(tree)[0].shape[0]
+    return [jax.tree.map(lambda leaf, index=index: leaf[index], tree) for index in range(size)]
+
+
+def _single(tree: Any) -> list[Any]:
+    return [tree]
+
+
+def show_progress(line: ProgressLine, runs: list[Run], chunks: list[Chunk], steps: int) -> None:
+    """Show means over the runs, and the best lap of any."""
+    successes = [run.success for run in runs if run.success is not None]
+    laps_s = [run.best_lap_s for run in runs if run.best_lap_s is not None]
+    last_return = np.mean([chunk.metrics["last_return"][-1] for chunk in chunks])
+    success = float(np.mean(successes)) if successes else None
+    line.update(steps * len(runs), float(last_return), success, min(laps_s, default=None))
 
 
 def train_policy(
@@ -222,9 +265,9 @@ def train_policy(
     options: Options = Options(),  # noqa: B008, a tuple of constants
     **env_arguments: Any,
 ) -> tuple[Checkpoint, Metrics]:
-    """Train and write ``out``/final.msgpack; return the checkpoint and the metrics, one value per update.
+    """Train and write ``out``/final.safetensors; return the checkpoint and the metrics, one value per update.
 
-    env_arguments: of ``flytrack_env.make``. Where training goes on (``options.resume``), the metrics are
+    env_arguments: of ``flytrack_env.make``. Where training continues (``options.resume``), the metrics are
     those since then.
 
     Raises:

@@ -51,7 +51,7 @@ def run_job(job: str, out: Path, steps: int, seed: int) -> dict[str, Any]:
 def train_shared(job: str, out: Path, steps: int, seed: int) -> dict[str, Any]:
     """Train a policy on the nominal drone, or on randomised drones around it."""
     from baselines.purejaxrl_ppo import Config
-    from baselines.purejaxrl_ppo.train_ppo import train_policy
+    from baselines.purejaxrl_ppo.training import train_policy
     from flytrack_loop.loop import seeds_of
 
     train_policy(out / job, Config(total_timesteps=steps), seeds_of(seed)["train"], SHARED[job])
@@ -60,8 +60,8 @@ def train_shared(job: str, out: Path, steps: int, seed: int) -> dict[str, Any]:
 
 def make_plant(job: str, seed: int) -> tuple[Any, str]:
     """Return the plant of a job, and its hidden effects as text."""
+    from baselines.purejaxrl_ppo.evaluate import SHIPPED_BLACK_BOX
     from benchmarks.loop.plants import HiddenPlant, draw_plant
-    from eval_agent import SHIPPED_BLACK_BOX
     from flytrack_env import blackbox
 
     if job == "shipped":
@@ -84,7 +84,7 @@ def measure_plant(job: str, out: Path, steps: int, seed: int) -> dict[str, Any]:
     rest = (seeds["train"], seeds["evaluation"], loop.held_out)
     stages = [train_stage("refitted_base", loop.diagnosis.base, plant, out / job, config, *rest)]
     for name in SHARED:
-        checkpoint = load_checkpoint(out / name / "final.msgpack")
+        checkpoint = load_checkpoint(out / name / "final.safetensors")
         model = nominal_parameters()
         stages.append(judge(name, model, checkpoint, plant, seeds["evaluation"], loop.held_out))
     content = loop_as_json(loop, seed, config, settings)

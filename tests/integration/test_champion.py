@@ -6,8 +6,7 @@ from pathlib import Path
 import baselines.purejaxrl_ppo
 import eval_agent
 from baselines.purejaxrl_ppo import load_checkpoint
-from baselines.purejaxrl_ppo.evaluate import race_many, start_keys
-from baselines.purejaxrl_ppo.flights import score
+from baselines.purejaxrl_ppo.flights import race_many, score, start_keys
 from benchmarks.champion import AIM, CHAMPION, MODEL
 from flytrack_env import load_model
 from flytrack_env.model_file import model_from_json

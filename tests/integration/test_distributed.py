@@ -12,16 +12,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from baselines.joining import Job, add_job_flags, job_of
+from baselines.purejaxrl_ppo.across import AXIS, Across
 
 import flytrack_env
-from baselines.joining import Job, add_job_flags, job_of
 from baselines.purejaxrl_ppo import Config, load_checkpoint
-from baselines.purejaxrl_ppo.across import AXIS, Across
+from baselines.purejaxrl_ppo.checkpoint import as_named_arrays
 from baselines.purejaxrl_ppo.distributed import check_divides, digest
-from baselines.purejaxrl_ppo.named_arrays import as_named_arrays
 from baselines.purejaxrl_ppo.ppo import Batch, make_network_for, ppo_loss
-from baselines.purejaxrl_ppo.resume import newest_intact
-from baselines.purejaxrl_ppo.run_folder import checkpoints_in
+from baselines.purejaxrl_ppo.resume import checkpoints_in, newest_intact
 from baselines.purejaxrl_ppo.train_ppo import make_parser
 from tests.support.ppo_runs import BATCH, CONFIG
 
@@ -177,7 +176,7 @@ def end_of(process):
     return process.returncode, said, errors
 
 
-def parameters(folder, name="final.msgpack"):
+def parameters(folder, name="final.safetensors"):
     return as_named_arrays(load_checkpoint(folder / name).params)
 
 
@@ -191,7 +190,7 @@ def test_two_processes_train_as_two_devices(tmp_path):
     (first, said_first, errors_first), (second, said_second, errors_second) = map(end_of, pair)
     assert (first, second) == (0, 0), errors_first + errors_second
     # Files are written once, by the first process, and each says as much as one alone.
-    assert "final.msgpack" in said_first and "final.msgpack" in said
+    assert "final.safetensors" in said_first and "final.safetensors" in said
     assert "msgpack" not in said_second
     names = sorted(path.name for path in (tmp_path / "devices").iterdir())
     assert sorted(path.name for path in (tmp_path / "pair").iterdir()) == names

@@ -8,17 +8,24 @@ from typing import Any
 import jax
 import numpy as np
 import pytest
+from baselines.purejaxrl_ppo.perturbed import (
+    draw_plants,
+)
+from benchmarks.optimal.compared import compare, time_lost
 
 import eval_agent
 from baselines.purejaxrl_ppo import evaluate
 from baselines.purejaxrl_ppo.checkpoint import Checkpoint, load_checkpoint
-from baselines.purejaxrl_ppo.evaluate import fly_many, race_many, start_keys
-from baselines.purejaxrl_ppo.flights import Flight, Outcomes, outcomes_of, score
-from baselines.purejaxrl_ppo.perturbed import (
-    draw_plants,
+from baselines.purejaxrl_ppo.flights import (
+    Flight,
+    Outcomes,
+    fly_many,
+    outcomes_of,
+    race_many,
+    score,
+    start_keys,
 )
 from baselines.purejaxrl_ppo.summary import distribution, share, summarise
-from benchmarks.optimal.compared import compare, time_lost
 from flytrack_env import FlyTrack, load_track, nominal_parameters
 from flytrack_env.references import ghost_rollout, shipped_reference, shipped_references
 from flytrack_env.rollout import load_rollout

@@ -4,11 +4,12 @@ import math
 
 import numpy as np
 import pytest
+from flytrack_loop.flown import log_of_flights
 
 from baselines.purejaxrl_ppo import load_checkpoint
-from baselines.purejaxrl_ppo.evaluate import fly_many
-from baselines.purejaxrl_ppo.flights import Score
-from baselines.purejaxrl_ppo.flown_env import plant_env
+from baselines.purejaxrl_ppo.evaluate import SHIPPED_BLACK_BOX
+from baselines.purejaxrl_ppo.flights import Score, fly_many
+from baselines.purejaxrl_ppo.race_env import plant_env
 from benchmarks.champion import CHAMPION
 from benchmarks.loop import jobs
 from benchmarks.loop.page import (
@@ -22,11 +23,9 @@ from benchmarks.loop.page import (
     where_it_does_not_help,
 )
 from benchmarks.loop.plants import HIDDEN, HiddenPlant, draw_plant
-from eval_agent import SHIPPED_BLACK_BOX
 from flytrack_env import blackbox, nominal_parameters
 from flytrack_loop import Gap, errors_of
 from flytrack_loop.__main__ import main
-from flytrack_loop.flown import log_of_flights
 from flytrack_loop.loop import STREAMS, seeds_of
 from flytrack_loop.stages import measure_gap
 

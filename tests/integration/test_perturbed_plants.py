@@ -7,9 +7,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-
-from baselines.purejaxrl_ppo.checkpoint import load_checkpoint
-from baselines.purejaxrl_ppo.flown_env import simulated_env
 from baselines.purejaxrl_ppo.perturbed import (
     PlantRanges,
     by_thirds,
@@ -17,6 +14,9 @@ from baselines.purejaxrl_ppo.perturbed import (
     perturb,
     with_model_as_given,
 )
+
+from baselines.purejaxrl_ppo.checkpoint import load_checkpoint
+from baselines.purejaxrl_ppo.race_env import simulated_env
 from flytrack_env import make, nominal_parameters
 from flytrack_env.effects import CommandDelay, LinearDrag, QuadraticDrag, ThrustScale
 from flytrack_env.plants import Simulator

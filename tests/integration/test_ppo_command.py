@@ -5,14 +5,13 @@ import shutil
 import sys
 
 import pytest
+from baselines.purejaxrl_ppo.options import OPTIONS, read_options, write_options
 
 from baselines.purejaxrl_ppo import load_checkpoint, tracking, train_ppo
 from baselines.purejaxrl_ppo import plans as plans_module
 from baselines.purejaxrl_ppo.checkpoint import save_checkpoint
-from baselines.purejaxrl_ppo.options import OPTIONS, read_options, write_options
-from baselines.purejaxrl_ppo.resume import check_same_run, describe_run, newest_intact
+from baselines.purejaxrl_ppo.resume import check_same_run, describe_run, newest_intact, seeds_in
 from baselines.purejaxrl_ppo.run import DivergedError
-from baselines.purejaxrl_ppo.run_folder import seeds_in
 from baselines.purejaxrl_ppo.training import Options
 from tests.support.ppo_runs import CONFIG, DEAD_URI, EVERY_OTHER_UPDATE, SEED, make_trainer
 
@@ -141,7 +140,7 @@ def plans_of(*arguments):
 def test_resuming_takes_from_the_checkpoint_what_is_not_given(whole, tmp_path):
     arguments = train_ppo.make_parser().parse_args(["--resume", str(whole[0])])
     (plan,) = train_ppo.make_plans(arguments)
-    assert (plan.seed, plan.out, plan.resume) == (SEED, whole[0], whole[0] / "final.msgpack")
+    assert (plan.seed, plan.out, plan.resume) == (SEED, whole[0], whole[0] / "final.safetensors")
     found = train_ppo.make_trainer(arguments, plan)
     assert found.config == CONFIG and found.env_id == "FlyTrackRobust-v0"
     check_same_run(
@@ -151,7 +150,7 @@ def test_resuming_takes_from_the_checkpoint_what_is_not_given(whole, tmp_path):
     )
     assert plans_of("--resume", whole[0], "--out", tmp_path)[0].out == tmp_path
     steps = plan.checkpoint.meta["steps"]
-    assert train_ppo.say_resumed(plan) == f"seed {SEED}: from step {steps}, {whole[0] / 'final.msgpack'}"
+    assert train_ppo.say_resumed(plan) == f"seed {SEED}: from step {steps}, {whole[0] / 'final.safetensors'}"
     assert train_ppo.say_resumed(plan._replace(resume=None, checkpoint=None)) is None
 
 
@@ -185,8 +184,8 @@ def write_changed(source, path, **changes):
 def test_settings_of_a_checkpoint_that_cannot_be_used_are_told_with_its_name(
     whole, tmp_path, changes, message
 ):
-    path = tmp_path / "final.msgpack"
-    write_changed(whole[0] / "final.msgpack", path, **changes)
+    path = tmp_path / "final.safetensors"
+    write_changed(whole[0] / "final.safetensors", path, **changes)
     with pytest.raises(ValueError, match=f"{path}: {message}"):
         train_ppo.prepare(parse("--resume", path, "--no-tracking"))
 
@@ -213,13 +212,13 @@ def test_every_seed_of_several_has_its_folder(whole, tmp_path):
     plans = plans_of("--seed", 0, "--num-seeds", 2, "--resume", tmp_path)
     assert [(plan.seed, plan.out, plan.resume) for plan in plans] == [
         (0, tmp_path / "seed0", None),
-        (1, tmp_path / "seed1", tmp_path / "seed1" / "final.msgpack"),
+        (1, tmp_path / "seed1", tmp_path / "seed1" / "final.safetensors"),
     ]
     with pytest.raises(ValueError, match="seed1 holds the checkpoints of a run"):
         plans_of("--num-seeds", 2, "--out", tmp_path)
     with pytest.raises(ValueError, match="holds the checkpoints of a run"):
         plans_of("--out", whole[0])
     with pytest.raises(ValueError, match=r"--resume: found .*final\.msgpack, expected the folder"):
-        plans_of("--num-seeds", 2, "--resume", whole[0] / "final.msgpack")
+        plans_of("--num-seeds", 2, "--resume", whole[0] / "final.safetensors")
     with pytest.raises(ValueError, match="--num-seeds: found 0"):
         plans_of("--num-seeds", 0)

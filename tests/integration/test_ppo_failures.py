@@ -111,7 +111,7 @@ def test_a_checkpoint_that_was_not_told_is_told_after_the_resume(trainer, tmp_pa
     assert (tmp_path / "step_0.msgpack").exists() and files_told(tmp_path) == []
     trainer.train(tmp_path, SEED, options._replace(resume=tmp_path))
     steps = [f"step_{updates * BATCH}.msgpack" for updates in (0, 2, 4, 6)]
-    assert files_told(tmp_path) == [*steps, "final.msgpack"]
+    assert files_told(tmp_path) == [*steps, "final.safetensors"]
 
 
 # Evaluations that fail.
@@ -128,7 +128,7 @@ def test_an_evaluation_that_fails_does_not_end_the_training(trainer, tmp_path, m
     options = Options(evaluate_every=100 * BATCH, evaluation_episodes=2)
     with caplog.at_level(logging.WARNING):
         trainer.train(tmp_path, SEED, options)
-    assert (tmp_path / "final.msgpack").exists()
+    assert (tmp_path / "final.safetensors").exists()
     (report,) = [record.getMessage() for record in caplog.records if record.name == monitor.__name__]
     assert f"after {7 * BATCH} steps" in report and report.endswith(
         "RuntimeError: out of paint; training goes on"
@@ -168,7 +168,7 @@ def test_no_run_is_overwritten(trainer, tmp_path, no_store):
 def test_a_run_that_is_complete_is_left_alone(trainer, tmp_path, monkeypatch, no_store):
     options = EVERY_OTHER_UPDATE._replace(tracking_uri=DEAD_URI)
     trainer.train(tmp_path, SEED, options)
-    final, journal = tmp_path / "final.msgpack", tmp_path / tracking.JOURNAL
+    final, journal = tmp_path / "final.safetensors", tmp_path / tracking.JOURNAL
     written, lines = final.stat().st_mtime_ns, journal.read_text().splitlines()
     # Killed before it could tell of its end.
     journal.write_text("\n".join(lines[:-2]) + "\n")
@@ -177,7 +177,7 @@ def test_a_run_that_is_complete_is_left_alone(trainer, tmp_path, monkeypatch, no
     for _ in range(2):
         assert trainer.train(tmp_path, SEED, options._replace(resume=tmp_path))[1] == {}
     assert final.stat().st_mtime_ns == written
-    assert files_told(tmp_path)[-1] == "final.msgpack" and len(files_told(tmp_path)) == 5
+    assert files_told(tmp_path)[-1] == "final.safetensors" and len(files_told(tmp_path)) == 5
     assert [entry["status"] for entry in told(tmp_path, "status")] == ["RUNNING", "FINISHED"]
 
 
@@ -187,7 +187,7 @@ def test_a_run_that_is_complete_is_left_alone(trainer, tmp_path, monkeypatch, no
 def test_best_lap_and_success_outlive_a_resume(trainer, tmp_path, evaluations, no_store, monkeypatch):
     options = EVALUATED._replace(tracking_uri=DEAD_URI)
     trainer.train(tmp_path, SEED, options)
-    for name in ("final.msgpack", f"step_{6 * BATCH}.msgpack"):
+    for name in ("final.safetensors", f"step_{6 * BATCH}.msgpack"):
         (tmp_path / name).unlink()
     shown = []
     monkeypatch.setattr(monitor.LiveLine, "show", lambda self, *values: shown.append(values))

@@ -73,7 +73,7 @@ def test_mlflow_is_told_everything_once_though_the_run_was_cut_off(trainer, tmp_
     options = EVERY_OTHER_UPDATE._replace(evaluate_every=4 * BATCH, evaluation_episodes=2, tracking_uri=uri)
     trainer.train(tmp_path, SEED, options)
     client, run = only_run(uri)
-    description = load_checkpoint(tmp_path / "final.msgpack").meta
+    description = load_checkpoint(tmp_path / "final.safetensors").meta
     for part in ("config", "environment", "model"):
         for name, text in tracking.flatten({part: description[part]}):
             assert run.data.params[name] == text
@@ -91,7 +91,7 @@ def test_mlflow_is_told_everything_once_though_the_run_was_cut_off(trainer, tmp_
     assert states.shape[1] + actions.shape[1] == 25
 
     # Killed after the checkpoint at 4, while the journal was being written.
-    for name in ("final.msgpack", f"step_{6 * BATCH}.msgpack"):
+    for name in ("final.safetensors", f"step_{6 * BATCH}.msgpack"):
         (tmp_path / name).unlink()
     with (tmp_path / tracking.JOURNAL).open("a") as file:
         file.write('{"kind": "metr')
@@ -106,7 +106,7 @@ def test_a_server_that_is_down_does_not_end_the_training(
     trainer, whole, tmp_path, caplog, monkeypatch, capsys
 ):
     trainer.train(tmp_path, SEED, EVERY_OTHER_UPDATE._replace(tracking_uri=DEAD_URI))
-    assert_same_end(tmp_path / "final.msgpack", whole[0] / "final.msgpack")
+    assert_same_end(tmp_path / "final.safetensors", whole[0] / "final.safetensors")
     (report,) = reports_of(caplog)
     command = f"python -m baselines.purejaxrl_ppo.tracking {tmp_path} --tracking-uri {DEAD_URI}"
     assert DEAD_URI in report and command in report
@@ -163,7 +163,7 @@ def test_a_server_that_never_answers_is_given_up(trainer, whole, tmp_path, caplo
     with socket.create_server(("127.0.0.1", 0)) as silent:
         uri = f"http://127.0.0.1:{silent.getsockname()[1]}"
         trainer.train(tmp_path, SEED, Options(tracking_uri=uri))
-    assert_same_end(tmp_path / "final.msgpack", whole[0] / "final.msgpack")
+    assert_same_end(tmp_path / "final.safetensors", whole[0] / "final.safetensors")
     assert len(reports_of(caplog)) == 1
 
 

@@ -16,11 +16,10 @@ from baselines.purejaxrl_ppo import (
     Config,
     load_checkpoint,
 )
-from baselines.purejaxrl_ppo.checkpoint import save_checkpoint
+from baselines.purejaxrl_ppo.checkpoint import as_named_arrays, save_checkpoint
 from baselines.purejaxrl_ppo.metrics import summarise_updates
-from baselines.purejaxrl_ppo.named_arrays import as_named_arrays
-from baselines.purejaxrl_ppo.options import is_due, next_due
 from baselines.purejaxrl_ppo.resume import check_same_run, describe_run, newest_intact, restore_runner
+from baselines.purejaxrl_ppo.run import is_due, next_due
 from baselines.purejaxrl_ppo.training import Options, Trainer
 from tests.support.ppo_runs import BATCH, CONFIG, EVERY_OTHER_UPDATE, SEED, assert_same_end
 
@@ -29,10 +28,10 @@ ROOT = Path(__file__).parents[2]
 
 def test_checkpoints_are_written_at_the_steps_asked_for(whole):
     steps = [0, 2 * BATCH, 4 * BATCH, 6 * BATCH]
-    assert {path.name for path in whole[0].iterdir()} == {"final.msgpack"} | {
+    assert {path.name for path in whole[0].iterdir()} == {"final.safetensors"} | {
         f"step_{step}.msgpack" for step in steps
     }
-    training = load_checkpoint(whole[0] / "final.msgpack").training
+    training = load_checkpoint(whole[0] / "final.safetensors").training
     for part in ("opt_state", "env_state", "observation", "episodes", "key"):
         assert any(part in name for name in training), part
 
@@ -42,7 +41,7 @@ def test_checkpoints_are_written_at_the_steps_asked_for(whole):
 def test_a_resumed_run_ends_bit_for_bit(trainer, whole, tmp_path, updates, options):
     source = whole[0] / f"step_{updates * BATCH}.msgpack"
     _, metrics = trainer.train(tmp_path, SEED, options._replace(resume=source))
-    assert_same_end(tmp_path / "final.msgpack", whole[0] / "final.msgpack")
+    assert_same_end(tmp_path / "final.safetensors", whole[0] / "final.safetensors")
     for name, values in metrics.items():
         np.testing.assert_array_equal(values, whole[1][name][updates:], err_msg=name)
 
@@ -50,13 +49,14 @@ def test_a_resumed_run_ends_bit_for_bit(trainer, whole, tmp_path, updates, optio
 def test_a_run_that_is_complete_stays_as_it_is(trainer, whole, tmp_path):
     _, metrics = trainer.train(tmp_path, SEED, Options(resume=whole[0]))
     assert metrics == {}
-    assert_same_end(tmp_path / "final.msgpack", whole[0] / "final.msgpack")
+    assert_same_end(tmp_path / "final.safetensors", whole[0] / "final.safetensors")
 
 
 def test_another_seed_ends_elsewhere(trainer, whole, tmp_path):
     trainer.train(tmp_path, SEED + 1, Options())
     found, other = (
-        as_named_arrays(load_checkpoint(folder / "final.msgpack").params) for folder in (tmp_path, whole[0])
+        as_named_arrays(load_checkpoint(folder / "final.safetensors").params)
+        for folder in (tmp_path, whole[0])
     )
     kernels = [name for name in found if name.endswith("kernel")]
     assert kernels and not any(np.array_equal(found[name], other[name]) for name in kernels)
@@ -65,7 +65,7 @@ def test_another_seed_ends_elsewhere(trainer, whole, tmp_path):
 def test_the_newest_intact_checkpoint_is_taken(trainer, whole, tmp_path, caplog):
     cut_off = tmp_path / "cut_off"
     shutil.copytree(whole[0], cut_off)
-    (cut_off / "final.msgpack").write_bytes((whole[0] / "final.msgpack").read_bytes()[:-100])
+    (cut_off / "final.safetensors").write_bytes((whole[0] / "final.safetensors").read_bytes()[:-100])
     newest = cut_off / f"step_{6 * BATCH}.msgpack"
     content = bytearray(newest.read_bytes())
     content[len(content) // 2] ^= 1
@@ -73,18 +73,18 @@ def test_the_newest_intact_checkpoint_is_taken(trainer, whole, tmp_path, caplog)
     with caplog.at_level(logging.WARNING):
         trainer.train(tmp_path / "resumed", SEED, Options(resume=cut_off))
     reports = [record.getMessage() for record in caplog.records]
-    assert len(reports) == 2 and "final.msgpack" in reports[0] and newest.name in reports[1]
+    assert len(reports) == 2 and "final.safetensors" in reports[0] and newest.name in reports[1]
     assert all("damaged" in report and "the checkpoint before it is used" in report for report in reports)
     assert newest_intact(cut_off)[0].name == f"step_{4 * BATCH}.msgpack"
-    assert_same_end(tmp_path / "resumed" / "final.msgpack", whole[0] / "final.msgpack")
+    assert_same_end(tmp_path / "resumed" / "final.safetensors", whole[0] / "final.safetensors")
 
 
 def test_what_a_killed_process_was_writing_is_removed(trainer, whole, tmp_path):
     out = tmp_path / "killed"
     shutil.copytree(whole[0], out)
-    (out / "final.msgpack").unlink()
+    (out / "final.safetensors").unlink()
     others = {".step_5.msgpack.swp", f".mine.msgpack.{'0' * 16}", "step_5.msgpack~"}
-    for name in {*others, f".step_{7 * BATCH}.msgpack.{'a1' * 8}", f".final.msgpack.{'0' * 16}"}:
+    for name in {*others, f".step_{7 * BATCH}.msgpack.{'a1' * 8}", f".final.safetensors.{'0' * 16}"}:
         (out / name).write_bytes(b"half")
     trainer.train(out, SEED, Options(resume=out))
     assert {path.name for path in out.iterdir()} == {path.name for path in whole[0].iterdir()} | others
@@ -96,7 +96,7 @@ def test_folders_without_an_intact_checkpoint_are_refused(whole, tmp_path):
     (tmp_path / "step_5.msgpack").write_bytes(b"nothing")
     with pytest.raises(CheckpointError, match=r"step_5\.msgpack: not a checkpoint"):
         newest_intact(tmp_path)
-    final = load_checkpoint(whole[0] / "final.msgpack")
+    final = load_checkpoint(whole[0] / "final.safetensors")
     save_checkpoint(tmp_path / "policy.msgpack", final.params, final.config, final.meta)
     with pytest.raises(CheckpointError, match=r"policy\.msgpack: found a policy alone"):
         newest_intact(tmp_path / "policy.msgpack")
@@ -111,7 +111,7 @@ def test_a_checkpoint_of_another_run_is_refused_field_by_field(trainer, whole, t
         check_same_run(path, checkpoint, description)
     message = str(caught.value)
     for part in (
-        "final.msgpack: does not fit",
+        "final.safetensors: does not fit",
         "env_id: found 'FlyTrackRobust-v0', expected 'FlyTrack-v0'",
         "seed: found 3, expected 1",
         "config.learning_rate: found 0.003, expected 0.0001",
@@ -183,7 +183,7 @@ def test_a_run_killed_at_any_moment_ends_in_the_same_bits(tmp_path):
     subprocess.run(command_line(whole), cwd=ROOT, check=True, capture_output=True, timeout=600)
     rng = np.random.default_rng()
     resume, kills = [], 0
-    while not (killed / "final.msgpack").exists():
+    while not (killed / "final.safetensors").exists():
         process = subprocess.Popen(
             command_line(killed, *resume), cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
         )
@@ -199,4 +199,4 @@ def test_a_run_killed_at_any_moment_ends_in_the_same_bits(tmp_path):
         process.wait(timeout=600)
         resume = ["--resume", str(killed)]
     assert kills == 4
-    assert_same_end(killed / "final.msgpack", whole / "final.msgpack")
+    assert_same_end(killed / "final.safetensors", whole / "final.safetensors")

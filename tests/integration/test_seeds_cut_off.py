@@ -1,10 +1,10 @@
 """Seeds that were cut off between each other: every one goes on from where it was, in which folder ever."""
 
 import pytest
-
-from baselines.purejaxrl_ppo import tracking, train_ppo
 from baselines.purejaxrl_ppo.options import OPTIONS, write_options
 from baselines.purejaxrl_ppo.plans import make_plans, options_of
+
+from baselines.purejaxrl_ppo import tracking, train_ppo
 from baselines.purejaxrl_ppo.resume import newest_intact
 from baselines.purejaxrl_ppo.training import Options, Trainer
 from tests.support.ppo_runs import BATCH, DEAD_URI, EVERY_OTHER_UPDATE, SEED, assert_same_end, make_trainer
@@ -43,14 +43,14 @@ def test_a_seed_killed_before_its_first_checkpoint_begins_in_its_folder(alone, t
     arguments = parse("--resume", tmp_path)
     plans = make_plans(arguments)
     assert [(plan.seed, plan.resume) for plan in plans] == [
-        (3, tmp_path / "seed3/final.msgpack"),
+        (3, tmp_path / "seed3/final.safetensors"),
         (4, killed),
     ]
     found = options_of(arguments, plans)
     assert found[1] == options._replace(evaluation_episodes=7, resume=killed)
     for plan, own in zip(plans, found, strict=True):
         make_trainer().train(plan.out, plan.seed, own)
-    assert_same_end(killed / "final.msgpack", alone / "seed4" / "final.msgpack")
+    assert_same_end(killed / "final.safetensors", alone / "seed4" / "final.safetensors")
     journal = tracking.Journal(killed)
     assert journal.beginning()["name"] == "the run that was killed"
     assert not list(killed.glob(".*"))
@@ -96,7 +96,7 @@ def test_seeds_that_go_on_elsewhere_are_there_before_any_trains(alone, tmp_path,
     for plan in plans:
         make_trainer().train(plan.out, plan.seed, Options(resume=plan.resume))
     for seed in SEEDS:
-        assert_same_end(after / f"seed{seed}/final.msgpack", alone / f"seed{seed}/final.msgpack")
+        assert_same_end(after / f"seed{seed}/final.safetensors", alone / f"seed{seed}/final.safetensors")
 
 
 def test_a_disk_that_is_full_leaves_no_seed_behind(alone, tmp_path, monkeypatch):

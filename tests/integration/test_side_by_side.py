@@ -4,13 +4,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-
-from baselines.purejaxrl_ppo.checkpoint import load_checkpoint
-from baselines.purejaxrl_ppo.named_arrays import as_named_arrays
 from baselines.purejaxrl_ppo.plans import batched, make_plans
+from baselines.purejaxrl_ppo.side_by_side import Ready, groups_of
+
+from baselines.purejaxrl_ppo.checkpoint import as_named_arrays, load_checkpoint
 from baselines.purejaxrl_ppo.resume import at_common_step, newest_intact
 from baselines.purejaxrl_ppo.run import DivergedError, Run
-from baselines.purejaxrl_ppo.side_by_side import Ready, groups_of
 from baselines.purejaxrl_ppo.train_ppo import make_parser
 from tests.support.ppo_runs import BATCH, EVERY_OTHER_UPDATE, SEED, assert_same_end, make_trainer
 
@@ -45,7 +44,7 @@ def test_a_seed_learns_what_it_learns_alone(trainer, together, tmp_path):
 def test_every_seed_has_its_checkpoints(together):
     for seed in SEEDS:
         names = {path.name for path in (together[0] / f"seed{seed}").iterdir()}
-        assert names == {"final.msgpack"} | {f"step_{step * BATCH}.msgpack" for step in (0, 2, 4, 6)}
+        assert names == {"final.safetensors"} | {f"step_{step * BATCH}.msgpack" for step in (0, 2, 4, 6)}
     kernels = [
         checkpoint.params["params"]["actor_tower"]["layers_0"]["kernel"] for checkpoint, _ in together[1]
     ]
@@ -72,7 +71,7 @@ def test_seeds_killed_between_their_checkpoints_end_bit_for_bit(
     options = [EVERY_OTHER_UPDATE._replace(resume=plan.resume) for plan in plans]
     trainer.train_all([(plan.out, plan.seed, own) for plan, own in zip(plans, options, strict=True)])
     for folder, _, _ in asked_for(tmp_path):
-        assert_same_end(folder / "final.msgpack", together[0] / folder.name / "final.msgpack")
+        assert_same_end(folder / "final.safetensors", together[0] / folder.name / "final.safetensors")
 
 
 def test_seeds_that_did_not_train_together_stay_where_they_are(trainer, together, caplog):
@@ -115,9 +114,9 @@ def test_one_that_diverges_does_not_end_the_others(trainer, tmp_path, monkeypatc
     monkeypatch.setattr(trainer, "chunk_of_many", poisoned)
     with pytest.raises(DivergedError, match="training diverged between steps 0 and"):
         trainer.train_all(asked_for(tmp_path))
-    complete = [(folder / "final.msgpack").exists() for folder, _, _ in asked_for(tmp_path)]
+    complete = [(folder / "final.safetensors").exists() for folder, _, _ in asked_for(tmp_path)]
     assert complete == [True, False, True]
-    arrays = as_named_arrays(load_checkpoint(tmp_path / f"seed{SEED}" / "final.msgpack").params)
+    arrays = as_named_arrays(load_checkpoint(tmp_path / f"seed{SEED}" / "final.safetensors").params)
     assert all(np.isfinite(array).all() for array in arrays.values())
 
 

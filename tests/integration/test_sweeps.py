@@ -7,12 +7,12 @@ import sys
 from pathlib import Path
 
 import pytest
+from baselines.purejaxrl_ppo.journal import JournalError
+from baselines.purejaxrl_ppo.sweeps.results import Trial, draw, in_order, table, write_results
 
 from baselines.purejaxrl_ppo import Config, load_checkpoint
 from baselines.purejaxrl_ppo.config import ConfigError
-from baselines.purejaxrl_ppo.journal import JournalError
 from baselines.purejaxrl_ppo.sweeps.__main__ import make_parser, prepare
-from baselines.purejaxrl_ppo.sweeps.results import Trial, draw, in_order, table, write_results
 from baselines.purejaxrl_ppo.sweeps.space import for_tune, points_of, read_space
 from baselines.purejaxrl_ppo.tracking import Tracker, send_journal
 
@@ -133,7 +133,7 @@ def test_a_local_sweep_of_four_trials(tmp_path):
     rates = {one["folder"]: one["settings"]["learning_rate"] for one in results}
     assert sorted(rates.values()) == [1e-3, 1e-3, 2e-3, 2e-3]
     for folder, rate in rates.items():
-        assert load_checkpoint(out / folder / "final.msgpack").config.learning_rate == rate
+        assert load_checkpoint(out / folder / "final.safetensors").config.learning_rate == rate
     assert all("evaluation_success" in one["evaluation"] and one["error"] is None for one in results)
     assert (out / "sweep.png").exists()
     client = MlflowClient(tracking_uri=f"sqlite:///{out / 'mlflow.db'}")

@@ -11,13 +11,13 @@ import jax.numpy as jnp
 import msgpack
 import numpy as np
 import pytest
+from baselines.purejaxrl_ppo.unpack import UnpackError, unpack
 from msgpack import fallback
 
 from baselines.purejaxrl_ppo import CheckpointError, Config, load_checkpoint, make_network
 from baselines.purejaxrl_ppo import checkpoint as checkpoint_module
 from baselines.purejaxrl_ppo.checkpoint import find_differences, observation_layout, save_checkpoint
 from baselines.purejaxrl_ppo.resume import newest_intact
-from baselines.purejaxrl_ppo.unpack import UnpackError, unpack
 from flytrack_env import FlyTrack
 from flytrack_env.observations import OBSERVATION_SIZE
 

@@ -4,11 +4,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from baselines.purejaxrl_ppo.across import Across
 from flax import struct
 from gymnax.environments import environment, spaces
 
 from baselines.purejaxrl_ppo import Config, make_network, make_train
-from baselines.purejaxrl_ppo.across import Across
 from baselines.purejaxrl_ppo.metrics import summarise_episodes, summarise_race
 from baselines.purejaxrl_ppo.ppo import (
     Batch,

@@ -4,7 +4,6 @@ import tracemalloc
 
 import msgpack
 import pytest
-
 from baselines.purejaxrl_ppo.unpack import MOST_ARRAYS, MOST_IN_MAP, UnpackError, unpack
 
 EMPTY = b"\xc7\n\x01\x93\x91\x00\xa4bool\xc4\x00"  # an array of nothing

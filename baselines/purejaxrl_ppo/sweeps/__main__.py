@@ -1,35 +1,83 @@
 """Trains with many settings: ``python -m baselines.purejaxrl_ppo.sweeps SPACE.toml --trials 16``.
 
-SPACE.toml says how settings are drawn (docs/scaling.md); all others are as flags say. Ray Tune starts the
-trials, on this machine or, where RAY_ADDRESS names one, on a cluster that sees the same folder. In MLflow
-every trial is a run below that of the sweep.
+SPACE.toml defines how settings are drawn (docs/scaling.md); all others are flags. Ray Tune runs the trials,
+here or, where RAY_ADDRESS names one, on a cluster that sees the same folder. In MLflow every trial is a run
+below that of the sweep.
 """
 
-import argparse
+import dataclasses
 import logging
 import os
+import sys
 import warnings
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, NamedTuple
 
 import ray
+import tyro
 from ray import tune
+from ray.tune import ResultGrid
 from tqdm import tqdm
 
-from baselines.purejaxrl_ppo.config import Config, ConfigError, add_flags, settings_of
-from baselines.purejaxrl_ppo.journal import Journal
-from baselines.purejaxrl_ppo.options import Options
-from baselines.purejaxrl_ppo.sweeps.results import Trial, table, write_results
+from baselines.purejaxrl_ppo.config import Config, ConfigError, settings_in_file
+from baselines.purejaxrl_ppo.run import Options
 from baselines.purejaxrl_ppo.sweeps.space import Space, for_tune, points_of, read_space
-from baselines.purejaxrl_ppo.sweeps.trial import Base, folder_of, run_trial
 from baselines.purejaxrl_ppo.tracking import Tracker, local_uri
 from baselines.purejaxrl_ppo.training import Trainer
+from flytrack_env.files import write_atomically
 
+PROG = "sweeps"
+METRIC = "evaluation_success"
 QUIET = {"RAY_USAGE_STATS_ENABLED": "0", "RAY_AIR_NEW_OUTPUT": "0", "TUNE_DISABLE_AUTO_CALLBACK_LOGGERS": "1"}
 
 
+@dataclasses.dataclass(frozen=True)
+class Settings:
+    """Train with many settings by Ray Tune."""
+
+    space: Annotated[Path, tyro.conf.Positional]
+    """TOML file of the settings that are drawn."""
+    trials: int = 16
+    """Draws; with a grid, of every point of it."""
+    out: Path = Path("runs/sweep")
+    """Folder."""
+    seed: int = 0
+    """Of the draws and of every training."""
+    env_id: str = "FlyTrack-v0"
+    """Id of the environment."""
+    track: str = "flytrack"
+    """Name of a track, or path of its file."""
+    model: Path | None = None
+    """Model file; by default the nominal model."""
+    cpus_per_trial: float = 1.0
+    """Cores."""
+    gpus_per_trial: float = 0.0
+    """0.25: four trials share one."""
+    tracking_uri: str | None = None
+    """MLflow store; by default an SQLite file in OUT."""
+    no_tracking: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Do not use MLflow."""
+    config: Path | None = None
+    """TOML file of hyperparameters; flags override it."""
+    hyperparameters: Config = Config()  # noqa: RUF009, frozen
+
+
+class Base(NamedTuple):
+    """What the trials of a sweep share.
+
+    config: in which each trial replaces what the space draws. env_arguments: of ``flytrack_env.make``.
+    """
+
+    out: Path
+    config: Config
+    seed: int
+    env_id: str
+    env_arguments: dict[str, Any]
+    options: Options
+
+
 class Bar(tune.Callback):
-    """Shows how many trials have ended."""
+    """Counts the trials that have ended."""
 
     def __init__(self, number: int):
         self.bar = tqdm(total=number, unit="trial")
@@ -43,131 +91,130 @@ class Bar(tune.Callback):
         self.bar.update()
 
 
-def make_parser() -> argparse.ArgumentParser:
-    """Return the command line: the space, the trials, and what all of them share."""
-    parser = argparse.ArgumentParser(prog="sweeps", usage="%(prog)s SPACE [options]", description=__doc__)
-    parser.add_argument("space", type=Path, help="TOML file of the settings that are drawn")
-    parser.add_argument(
-        "--trials",
-        type=int,
-        default=16,
-        help="draws, each of every point of the grid if there is one (default: %(default)s)",
-    )
-    parser.add_argument("--out", type=Path, default=Path("runs/sweep"), help="folder (default: %(default)s)")
-    parser.add_argument("--seed", type=int, default=0, help="of the draws and of every training")
-    parser.add_argument("--env-id", default="FlyTrack-v0", help="default: %(default)s")
-    parser.add_argument("--track", default="flytrack", help="name or path (default: %(default)s)")
-    parser.add_argument("--model", help="path of a model file; the nominal model if not given")
-    parser.add_argument("--cpus-per-trial", type=float, default=1.0, help="cores (default: %(default)g)")
-    parser.add_argument("--gpus-per-trial", type=float, default=0.0, help="0.25: four share one")
-    tracking = parser.add_mutually_exclusive_group()
-    tracking.add_argument("--tracking-uri", help="MLflow store (default: an SQLite file in OUT)")
-    tracking.add_argument("--no-tracking", action="store_true", help="tell MLflow nothing")
-    add_flags(parser)
-    return parser
+def parse(words: list[str]) -> Settings:
+    """Return the settings of a command line.
+
+    Raises:
+        ConfigError: a TOML file that cannot be used, or a setting that is both drawn and given.
+    """
+    config = (tyro.conf.OmitArgPrefixes,)
+    settings = tyro.cli(Settings, args=words, prog=PROG, config=config)
+    if settings.config is not None:
+        hyperparameters = Config(**settings_in_file(settings.config))
+        default = dataclasses.replace(settings, hyperparameters=hyperparameters)
+        settings = tyro.cli(Settings, args=words, prog=PROG, config=config, default=default)
+    return settings
 
 
-def prepare(arguments: argparse.Namespace) -> tuple[Base, Space]:
+def prepare(settings: Settings) -> tuple[Base, Space]:
     """Return what the trials share, and the space; nothing has been written.
 
     Raises:
         ValueError: what cannot be used.
     """
-    if arguments.trials < 1:
-        raise ConfigError(f"--trials: found {arguments.trials}, expected at least 1")
-    space, out = read_space(arguments.space), arguments.out.resolve()
+    if settings.trials < 1:
+        raise ConfigError(f"--trials: found {settings.trials}, expected at least 1")
+    space, out, config = read_space(settings.space), settings.out.resolve(), settings.hyperparameters
     if out.exists() and any(out.iterdir()):
         raise ConfigError(f"--out: {out} holds files, expected a new folder or an empty one")
-    fixed = settings_of(arguments)
-    if both := set(fixed) & set(space):
-        raise ConfigError(f"{', '.join(sorted(both))}: drawn by {arguments.space}, and given as well")
-    config = Config(**fixed)
-    track = str(Path(arguments.track).resolve()) if arguments.track.endswith(".toml") else arguments.track
-    model = None if arguments.model is None else str(Path(arguments.model).resolve())
+    fixed = {name for name, value in dataclasses.asdict(config).items() if value != getattr(Config(), name)}
+    if both := fixed & set(space):
+        raise ConfigError(f"{', '.join(sorted(both))}: drawn by {settings.space}, and given as well")
+    track = str(Path(settings.track).resolve()) if settings.track.endswith(".toml") else settings.track
+    model = None if settings.model is None else settings.model.resolve()
     env_arguments: dict[str, Any] = {"track": track, "model": model}
-    Trainer(config, arguments.env_id, **env_arguments)  # refuses what no trial could use
-    uri = None if arguments.no_tracking else arguments.tracking_uri or local_uri(out)
-    options = Options(evaluate_every=config.total_timesteps, tracking_uri=uri, parent=out)
-    return Base(out, config, arguments.seed, arguments.env_id, env_arguments, options), space
+    Trainer(config, settings.env_id, **env_arguments)  # refuses what no trial could use
+    uri = None if settings.no_tracking else settings.tracking_uri or local_uri(out)
+    options = Options(evaluate_every=config.total_timesteps, tracking_uri=uri)
+    return Base(out, config, settings.seed, settings.env_id, env_arguments, options), space
 
 
-def run_trials(base: Base, space: Space, arguments: argparse.Namespace) -> list[Trial]:
-    """Have Ray Tune run the trials; return what came of them."""
-    resources = {"cpu": arguments.cpus_per_trial, "gpu": arguments.gpus_per_trial}
+def trial_name(trial: Any) -> str:
+    """Return the folder of a trial: Ray numbers trials at the end of their ids."""
+    return f"trial{int(trial.trial_id.rsplit('_', 1)[-1])}"
+
+
+def run_trial(drawn: dict[str, Any], base: Base) -> None:
+    """Train with drawn settings in a process of its own, and report every evaluation to Ray Tune."""
+
+    def report(steps: int, evaluation: dict[str, float]) -> None:
+        tune.report({METRIC: 0.0, "steps": steps, **evaluation})
+
+    fields: dict[str, Any] = {n: tuple(v) if isinstance(v, list) else v for n, v in drawn.items()}
+    out = base.out / Path(tune.get_context().get_trial_dir()).name
+    trainer = Trainer(dataclasses.replace(base.config, **fields), base.env_id, **base.env_arguments)
+    trainer.train(out, base.seed, base.options._replace(report=report))
+
+
+def run_trials(base: Base, space: Space, settings: Settings) -> ResultGrid:
+    """Run the trials with Ray Tune; return its results."""
+    resources = {"cpu": settings.cpus_per_trial, "gpu": settings.gpus_per_trial}
     os.environ.update(QUIET)
     with warnings.catch_warnings():
-        # JAX warns of any fork; these become other programs at once.
+        # JAX warns of any fork; Ray's become other programs at once.
         warnings.filterwarnings("ignore", r"os\.fork\(\) was called", RuntimeWarning)
         ray.init(include_dashboard=False, log_to_driver=False, logging_level=logging.ERROR)
-    draws = tune.search.BasicVariantGenerator(random_state=arguments.seed)
-    bar = Bar(arguments.trials * points_of(space))
+    bar = Bar(settings.trials * points_of(space))
     try:
         tuner = tune.Tuner(
             tune.with_resources(tune.with_parameters(run_trial, base=base), resources),
             param_space=for_tune(space),
             tune_config=tune.TuneConfig(
-                num_samples=arguments.trials,
-                search_alg=draws,
-                trial_dirname_creator=lambda trial: folder_of(base, trial.trial_id).name,
+                num_samples=settings.trials,
+                search_alg=tune.search.BasicVariantGenerator(random_state=settings.seed),
+                trial_dirname_creator=trial_name,
             ),
             run_config=tune.RunConfig(name="ray", storage_path=str(base.out), verbose=0, callbacks=[bar]),
         )
-        results = tuner.fit()
-        return [_trial(base, results[index]) for index in range(len(results))]
+        return tuner.fit()
     finally:
         bar.bar.close()
         ray.shutdown()
 
 
-def _trial(base: Base, result: Any) -> Trial:
-    metrics = result.metrics or {}
-    evaluation = {name: value for name, value in metrics.items() if name.startswith("evaluation_")}
-    error = None if result.error is None else str(result.error).strip().splitlines()[-1]
-    return Trial(base.out / Path(result.path).name, result.config, evaluation, error)
-
-
-def run(base: Base, space: Space, arguments: argparse.Namespace) -> list[Trial]:
-    """Run the sweep, tell MLflow, write and print what came of it."""
-    options = base.options
-    tracker = None
+def run(base: Base, space: Space, settings: Settings) -> ResultGrid:
+    """Run the sweep as an MLflow run; write and print Ray's table of the results."""
     base.out.mkdir(parents=True, exist_ok=True)
-    if options.tracking_uri is not None:
-        params = {"space": space, "trials": arguments.trials, "seed": base.seed, "env_id": base.env_id}
-        tracker = Tracker(base.out, options.tracking_uri, f"sweep {arguments.space.stem}", params)
+    uri, tracker = base.options.tracking_uri, None
+    if uri is not None:
+        params = {"space": space, "trials": settings.trials, "seed": base.seed, "env_id": base.env_id}
+        tracker = Tracker(base.out, uri, f"sweep {settings.space.stem}", params)
         tracker.begin()
+        base = base._replace(options=base.options._replace(parent_run_id=tracker.run_id or None))
     status = "FAILED"
     try:
-        trials = run_trials(base, space, arguments)
-        for path in write_results(base.out, trials):
-            if tracker is not None:
-                tracker.file(path, "sweep")
+        results = run_trials(base, space, settings)
+        table = results.get_dataframe()
+        path = base.out / "sweep.csv"
+        write_atomically(path, table.to_csv(index=False).encode())
+        if tracker is not None:
+            tracker.file(path, "sweep")
         status = "FINISHED"
     finally:
         if tracker is not None:
-            send_rest(tracker, base.out)
             tracker.end(status)
-    print(table(trials))
-    return trials
-
-
-def send_rest(tracker: Tracker, out: Path) -> None:
-    """Send what trials could not while others wrote to the store."""
-    for folder in sorted(out.glob("trial*")):
-        journal = Journal(folder)
-        if journal.of_kind("run") and not journal.is_sent():
-            tracker.send(journal)
+    if METRIC in table:
+        shown = [name for name in table if name == METRIC or "lap_s" in name or name.startswith("config/")]
+        print(table.sort_values(METRIC, ascending=False)[shown].to_string(index=False))
+        best = results.get_best_result(METRIC, "max")
+        print(f"best: {base.out / Path(best.path).name}, success {best.metrics[METRIC]:.1%}")
+    for error in results.errors:
+        print(f"failed: {str(error).strip().splitlines()[-1]}", file=sys.stderr)
+    return results
 
 
 def main() -> None:
-    """Parse the command line and run the sweep; exit 1 where every trial failed."""
-    parser = make_parser()
-    arguments = parser.parse_args()
+    """Run the sweep as the command line says; exit 1 where every trial failed."""
     try:
-        base, space = prepare(arguments)
+        settings = parse(sys.argv[1:])
+        base, space = prepare(settings)
     except (ValueError, OSError) as error:
-        parser.error(str(error))
-    if all(trial.error is not None for trial in run(base, space, arguments)):
-        parser.exit(1, f"{parser.prog}: error: every trial failed; what they said is in {base.out / 'ray'}\n")
+        print(f"{PROG}: error: {error}", file=sys.stderr)
+        raise SystemExit(2) from error
+    results = run(base, space, settings)
+    if results.num_errors == len(results):
+        print(f"{PROG}: error: every trial failed; their logs are in {base.out / 'ray'}", file=sys.stderr)
+        raise SystemExit(1)
 
 
 if __name__ == "__main__":

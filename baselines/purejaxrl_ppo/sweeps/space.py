@@ -1,4 +1,4 @@
-"""The space of a sweep: a TOML file that says, for each setting, how Ray Tune draws its values."""
+"""The search space of a sweep: a TOML file that defines, for each setting, how Ray Tune draws its values."""
 
 import inspect
 import math
@@ -8,9 +8,8 @@ from typing import Any
 
 from ray import tune
 
-from baselines.purejaxrl_ppo.config import FIELD_TYPES, ConfigError, read_value
-from flytrack_env.messages import error_text, quote_name, quote_value
-from flytrack_env.toml_file import TomlError, parse_toml, read_text
+from baselines.purejaxrl_ppo.config import FIELD_TYPES, ConfigError, load_toml, read_value
+from flytrack_env.messages import quote_name, quote_value
 
 LISTS = ("choice", "grid_search")  # of values; the others are ranges of numbers
 KINDS = (*LISTS, "uniform", "quniform", "loguniform", "qloguniform", "randint", "lograndint")
@@ -19,28 +18,27 @@ Space = dict[str, dict[str, list[Any]]]
 
 
 def read_space(path: Path) -> Space:
-    """Return a file's settings: ``{field of Config: {kind: values}}``, a kind per field.
+    """Return a file's settings: ``{field of Config: {kind: values}}``, one kind per field.
 
-    A file is of tables such as ``[learning_rate]`` with ``loguniform = [1e-3, 1e-2]``.
+    A file has tables such as ``[learning_rate]`` with ``loguniform = [1e-3, 1e-2]``.
 
     Raises:
         ConfigError: a file, field, kind or value that cannot be used.
     """
-    try:
-        space = parse_toml(read_text(path))
-    except (OSError, UnicodeDecodeError, TomlError) as error:
-        raise ConfigError(f"{path}: cannot be read: {error_text(error)}") from error
+    space = load_toml(path)
     if not space:
         raise ConfigError(f"{path}: found no setting, expected at least one of {', '.join(FIELD_TYPES)}")
-    for name, how in space.items():
+    for name, entry in space.items():
         if name not in FIELD_TYPES:
             raise ConfigError(
                 f"{path}: {quote_name(name)}: unknown; expected one of {', '.join(FIELD_TYPES)}"
             )
-        if not isinstance(how, dict) or len(how) != 1 or next(iter(how)) not in KINDS:
-            raise ConfigError(f"{path}: {name}: found {quote_value(how)}, expected one of {', '.join(KINDS)}")
-        (kind, values) = next(iter(how.items()))
-        how[kind] = _read_values(f"{path}: {name}", name, kind, values)
+        if not isinstance(entry, dict) or len(entry) != 1 or next(iter(entry)) not in KINDS:
+            raise ConfigError(
+                f"{path}: {name}: found {quote_value(entry)}, expected one of {', '.join(KINDS)}"
+            )
+        (kind, values) = next(iter(entry.items()))
+        entry[kind] = _read_values(f"{path}: {name}", name, kind, values)
     return space
 
 
@@ -51,7 +49,7 @@ def _read_values(where: str, name: str, kind: str, values: Any) -> list[Any]:
     if kind in LISTS:
         return [read_value(where, FIELD_TYPES[name], value) for value in values]
     if typing.get_origin(FIELD_TYPES[name]) is tuple or FIELD_TYPES[name] is bool:
-        raise ConfigError(f"{where}: found {kind}, expected one of {', '.join(LISTS)}: it is no number")
+        raise ConfigError(f"{where}: found {kind}, expected one of {', '.join(LISTS)}: it is not a number")
     arguments = list(inspect.signature(getattr(tune, kind)).parameters)
     number = 3 if "q" in arguments and kind.startswith("q") else 2
     if len(values) != number:
@@ -67,13 +65,13 @@ def _read_values(where: str, name: str, kind: str, values: Any) -> list[Any]:
 def for_tune(space: Space) -> dict[str, Any]:
     """Return the space as Ray Tune takes it."""
     parts = {}
-    for name, how in space.items():
-        (kind, values) = next(iter(how.items()))
+    for name, entry in space.items():
+        (kind, values) = next(iter(entry.items()))
         make = getattr(tune, kind)
         parts[name] = make(values) if kind in LISTS else make(*values)
     return parts
 
 
 def points_of(space: Space) -> int:
-    """Return how many points the grid of a space has; 1 without one."""
-    return math.prod(len(how["grid_search"]) for how in space.values() if "grid_search" in how)
+    """Return the number of points of a space's grid, 1 without a grid."""
+    return math.prod(len(entry["grid_search"]) for entry in space.values() if "grid_search" in entry)

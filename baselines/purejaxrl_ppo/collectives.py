@@ -1,4 +1,4 @@
-"""Sums and means over one update's experience, wherever it lies: on one device, or in shards on several."""
+"""Sums and means over all environments, on one device or in shards on several."""
 
 from typing import Any, NamedTuple
 
@@ -6,10 +6,10 @@ import jax
 import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 
-AXIS = "devices"  # of the mesh that the environments are spread over
+AXIS = "devices"  # the mesh axis over which the environments are sharded
 
 
-class Across(NamedTuple):
+class Collectives(NamedTuple):
     """Reductions to scalars over all environments.
 
     axis: of the mesh whose devices hold equal shards of the environments; None: one device holds all.
@@ -24,14 +24,14 @@ class Across(NamedTuple):
 
     def mean(self, values: jax.Array) -> jax.Array:
         """Return the mean of all values."""
-        return self.averaged(values.mean())
+        return self.average(values.mean())
 
     def variance(self, values: jax.Array) -> jax.Array:
-        """Return the mean squared distance from the mean of all values."""
+        """Return the variance of all values."""
         return jnp.var(values) if self.axis is None else self.mean((values - self.mean(values)) ** 2)
 
-    def averaged(self, tree: Any) -> Any:
-        """Return the mean over devices of every leaf: of gradients and means of equal shards."""
+    def average(self, tree: Any) -> Any:
+        """Return the mean over devices of every leaf, such as gradients and means of equal shards."""
         if self.axis is None:
             return tree
         values, as_tree = ravel_pytree(tree)  # one message instead of one per leaf

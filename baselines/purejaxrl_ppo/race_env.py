@@ -1,4 +1,4 @@
-"""The environment that a checkpoint is flown in: its id and track, with any plant or its own model."""
+"""The environment that a checkpoint races in: its id and track, with any plant or its own model."""
 
 from pathlib import Path
 from typing import Any
@@ -7,7 +7,20 @@ import flytrack_env
 from baselines.purejaxrl_ppo.checkpoint import Checkpoint, CheckpointError
 from flytrack_env.episodes import EpisodicEnvironment
 from flytrack_env.model_file import model_from_json
+from flytrack_env.params import EnvParams
 from flytrack_env.plants import Plant
+from flytrack_env.wrappers import DomainRandomization, RandomizationParams
+
+MODEL_AS_GIVEN = RandomizationParams(
+    mass_factor_low=1.0,
+    mass_factor_high=1.0,
+    lag_factor_low=1.0,
+    lag_factor_high=1.0,
+    effect_factor_low=1.0,
+    effect_factor_high=1.0,
+    low=(),
+    high=(),
+)
 
 
 def plant_env(checkpoint: Checkpoint, plant: Plant, track: str | Path | None = None) -> EpisodicEnvironment:
@@ -28,7 +41,7 @@ def simulated_env(checkpoint: Checkpoint, track: str | Path | None = None) -> Ep
         CheckpointError, TrackError: a file that cannot be used, a checkpoint that does not hold its model.
     """
     if "model" not in checkpoint.meta:
-        raise CheckpointError("checkpoint: model: found none in it, expected the one it was trained on")
+        raise CheckpointError("checkpoint: model: found none, expected the one it was trained on")
     return _checked_env(
         checkpoint, track, model=model_from_json(checkpoint.meta["model"], "checkpoint: model")
     )
@@ -44,3 +57,10 @@ def _checked_env(checkpoint: Checkpoint, track: str | Path | None, **arguments: 
     checkpoint.check_fits(env)
     env.check_params(env.default_params)
     return env
+
+
+def with_model_as_given(params: EnvParams) -> EnvParams:
+    """Return parameters with which an id that randomises the model in every episode keeps the given one."""
+    if DomainRandomization.key not in params.wrappers:
+        return params
+    return params.replace(wrappers={**params.wrappers, DomainRandomization.key: MODEL_AS_GIVEN})

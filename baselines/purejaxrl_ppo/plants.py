@@ -1,4 +1,4 @@
-"""Plants drawn around a model, to see what a policy bears and what breaks it."""
+"""Plants drawn around a model, to find which deviations a policy tolerates."""
 
 from functools import partial
 from typing import Any, NamedTuple
@@ -10,30 +10,16 @@ import numpy as np
 from baselines.purejaxrl_ppo.summary import share
 from flytrack_env.dynamics import ModelParameters
 from flytrack_env.effects import effect_of
-from flytrack_env.params import EnvParams
-from flytrack_env.wrappers import DomainRandomization, RandomizationParams
 
 NUM_DRAWS = 7  # drag on three axes, thrust, wind and where it blows, delay
 
-MODEL_AS_GIVEN = RandomizationParams(
-    mass_factor_low=1.0,
-    mass_factor_high=1.0,
-    lag_factor_low=1.0,
-    lag_factor_high=1.0,
-    effect_factor_low=1.0,
-    effect_factor_high=1.0,
-    low=(),
-    high=(),
-)
-
 
 class PlantRanges(NamedTuple):
-    """From where to where each quantity is drawn, uniformly.
+    """Range of each quantity, drawn uniformly; the defaults are what the robust baseline must tolerate.
 
-    quadratic_drag_per_m: added to the model's on every body axis by itself, 1/m. thrust_scale: factor on
-    its thrust. wind_m_s: speed of the air, added to the model's, towards any side, horizontal, m/s; it acts
-    through the drag. command_delay_s: added to its delay, s. The standard ones are those that the baseline
-    promises to bear.
+    quadratic_drag_per_m: added to the model's, on each body axis independently, 1/m. thrust_scale: factor on
+    its thrust. wind_m_s: horizontal wind speed, in any direction, added to the model's, m/s; it acts through
+    the drag. command_delay_s: added to its delay, s.
     """
 
     quadratic_drag_per_m: tuple[float, float] = (0.0, 0.02)
@@ -45,8 +31,8 @@ class PlantRanges(NamedTuple):
 class Plants(NamedTuple):
     """Drawn plants.
 
-    models: leaves (num_plants, ...). drawn: by the names of ``PlantRanges``, (num_plants,) each; of the
-    drag, the mean of the three axes. ranges: what they were drawn from.
+    models: leaves (num_plants, ...). drawn: values by the names of ``PlantRanges``, (num_plants,) each; of
+    the drag, the mean of the three axes.
     """
 
     ranges: PlantRanges
@@ -58,13 +44,13 @@ class Plants(NamedTuple):
         return jax.tree.map(lambda leaf: leaf[index], self.models)
 
     def repeated(self, times: int) -> ModelParameters:
-        """Return every model that many times, one after the other, leaves (num_plants * times, ...)."""
+        """Return every model repeated, leaves (num_plants * times, ...)."""
         return jax.tree.map(lambda leaf: np.repeat(leaf, times, axis=0), self.models)
 
     def summarise(self, is_complete: np.ndarray) -> dict[str, Any]:
         """Return on how many plants every flight completes its laps, as JSON values.
 
-        is_complete: (num_plants, num_episodes), which flights did.
+        is_complete: (num_plants, num_episodes), of flights.
         """
         return {
             "success": share(np.asarray(is_complete.all(axis=1))),
@@ -79,25 +65,25 @@ def perturb(
     """Return one plant: a model with drag, wind and delay added, and its thrust multiplied.
 
     drag_per_m: quadratic, (3,), body axes, 1/m. wind_w_m_s: (2,), horizontal velocity of the air, world, m/s.
-    A sum beyond what an effect can do ends there.
+    Values are clipped to the effects' ranges.
     """
     drag, wind = model.effect("quadratic_drag"), model.effect("wind")
     thrust, delay = model.effect("thrust_scale"), model.effect("command_delay")
     return model.with_effects(
-        _bounded(
+        _clipped(
             drag,
             k_x=drag.k_x + drag_per_m[0],
             k_y=drag.k_y + drag_per_m[1],
             k_z=drag.k_z + drag_per_m[2],
         ),
-        _bounded(wind, v_x=wind.v_x + wind_w_m_s[0], v_y=wind.v_y + wind_w_m_s[1]),
-        _bounded(thrust, factor=thrust.factor * thrust_scale),
-        _bounded(delay, delay_s=delay.delay_s + delay_s),
+        _clipped(wind, v_x=wind.v_x + wind_w_m_s[0], v_y=wind.v_y + wind_w_m_s[1]),
+        _clipped(thrust, factor=thrust.factor * thrust_scale),
+        _clipped(delay, delay_s=delay.delay_s + delay_s),
     )
 
 
-def _bounded(parameters: Any, **values: jax.Array) -> Any:
-    """Return an effect's parameters with values within what it can do."""
+def _clipped(parameters: Any, **values: jax.Array) -> Any:
+    """Return an effect's parameters with new values, clipped to its ranges."""
     ranges = effect_of(parameters).ranges
     return parameters._replace(
         **{name: jnp.clip(value, ranges[name].low, ranges[name].high) for name, value in values.items()}
@@ -110,7 +96,7 @@ def draw_plants(
     model: ModelParameters,
     ranges: PlantRanges = PlantRanges(),  # noqa: B008, a tuple of constants
 ) -> Plants:
-    """Return plants around a model (``perturb``); those of fewer are the first of these."""
+    """Return plants around a model (``perturb``); a smaller number returns the first of the same plants."""
     # Row by row, so that the first plants do not depend on how many there are.
     uniform = np.random.default_rng(seed).uniform(size=(num_plants, NUM_DRAWS))
 
@@ -118,27 +104,19 @@ def draw_plants(
         return bounds[0] + (bounds[1] - bounds[0]) * uniform[:, columns]
 
     drag, thrust = draw(slice(0, 3), ranges.quadratic_drag_per_m), draw(3, ranges.thrust_scale)
-    wind, towards_rad = draw(4, ranges.wind_m_s), draw(5, (-np.pi, np.pi))
+    wind, heading_rad = draw(4, ranges.wind_m_s), draw(5, (-np.pi, np.pi))
     delay = draw(6, ranges.command_delay_s)
-    wind_w = wind[:, None] * np.stack([np.cos(towards_rad), np.sin(towards_rad)], axis=1)
+    wind_w = wind[:, None] * np.stack([np.cos(heading_rad), np.sin(heading_rad)], axis=1)
     models = jax.vmap(partial(perturb, model))(drag, thrust, wind_w, delay)
     drawn = (drag.mean(axis=1), thrust, wind, delay)
     by_name = dict(zip(PlantRanges._fields, drawn, strict=True))
     return Plants(ranges, jax.tree.map(np.asarray, models), by_name)
 
 
-def with_model_as_given(params: EnvParams) -> EnvParams:
-    """Return parameters with which an id that draws a model in every episode flies the one it is given."""
-    if DomainRandomization.key not in params.wrappers:
-        return params
-    return params.replace(wrappers={**params.wrappers, DomainRandomization.key: MODEL_AS_GIVEN})
-
-
 def by_thirds(drawn: dict[str, np.ndarray], is_complete: np.ndarray) -> list[dict[str, Any]]:
     """Return how success depends on each drawn quantity, as JSON values: a row per third of the plants.
 
-    is_complete: (num_plants, num_episodes), which flights completed their laps. Thirds have equally many
-    plants, as far as that goes; from, to: smallest and largest value drawn in the third.
+    is_complete: (num_plants, num_episodes), of flights. from, to: smallest and largest value in the third.
     """
     rows = []
     for name, values in drawn.items():

@@ -3,9 +3,8 @@
 import numpy as np
 
 from baselines.purejaxrl_ppo import Checkpoint
-from baselines.purejaxrl_ppo.evaluate import fly_many
-from baselines.purejaxrl_ppo.flights import Flight
-from baselines.purejaxrl_ppo.flown_env import plant_env
+from baselines.purejaxrl_ppo.flights import Rollout, fly_many
+from baselines.purejaxrl_ppo.race_env import plant_env
 from flytrack_env import nominal_parameters
 from flytrack_env.plants import Plant
 from flytrack_sysid import FlightLog, log_of_states
@@ -38,7 +37,7 @@ def fly_log(
     return log_of_flights(flights, float(env.default_params.dt), seed, seconds, noise)
 
 
-def log_of_flights(flights: Flight, dt: float, seed: int, seconds: float, noise: float) -> FlightLog:
+def log_of_flights(flights: Rollout, dt: float, seed: int, seconds: float, noise: float) -> FlightLog:
     """Return flights, leaves (num_flights, num_steps, ...), as ``fly_log`` does; seed: of the noise."""
     is_flying = np.asarray(flights.is_flying)
     kept: list[tuple[np.ndarray, np.ndarray]] = []
