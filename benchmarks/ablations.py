@@ -32,7 +32,7 @@ from baselines.purejaxrl_ppo.race_env import with_model_as_given
 from baselines.purejaxrl_ppo.run import is_due
 from baselines.purejaxrl_ppo.training import make_chunk, training_params, with_strong_types
 from benchmarks.ablated import InWorldFrame, WithoutEntries
-from benchmarks.env_speed import cpu_name, pin_to_one_core, versions
+from benchmarks.report import cpu_name, pin_to_one_core, versions
 from flytrack_env import EnvParams, blackbox, load_model
 from flytrack_env.dynamics import ModelParameters
 from flytrack_env.effects import CommandDelay

@@ -13,8 +13,8 @@ from pathlib import Path
 from baselines.purejaxrl_ppo import Config, load_checkpoint
 from baselines.purejaxrl_ppo.checkpoint import save_checkpoint
 from baselines.purejaxrl_ppo.training import Options, train_policy
-from benchmarks.env_speed import cpu_name, versions
 from benchmarks.flown import ROOT, evaluate
+from benchmarks.report import cpu_name, versions
 from flytrack_env.files import fresh_folder, write_atomically
 
 CHAMPION = ROOT / "baselines" / "purejaxrl_ppo" / "champion" / "flytrack.safetensors"

@@ -14,7 +14,7 @@ from baselines.purejaxrl_ppo.evaluate import MAX_FLIGHTS, SHIPPED_BLACK_BOX
 from baselines.purejaxrl_ppo.flights import race_many, start_keys
 from baselines.purejaxrl_ppo.monitor import NUM_LAPS, NUM_STEPS
 from baselines.purejaxrl_ppo.race_env import plant_env, simulated_env, with_model_as_given
-from benchmarks.env_speed import cpu_name, pin_to_one_core, versions
+from benchmarks.report import cpu_name, pin_to_one_core, versions
 from flytrack_env import blackbox
 from flytrack_env.episodes import EpisodicEnvironment
 from flytrack_env.files import write_atomically

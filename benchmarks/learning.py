@@ -17,7 +17,7 @@ from baselines.purejaxrl_ppo.evaluate import SHIPPED_BLACK_BOX
 from baselines.purejaxrl_ppo.flights import race_many, score, start_keys
 from baselines.purejaxrl_ppo.race_env import plant_env
 from baselines.purejaxrl_ppo.training import train_policy
-from benchmarks.env_speed import cpu_name
+from benchmarks.report import cpu_name
 from demo import NUM_EPISODES, NUM_LAPS, NUM_STEPS, identify
 from flytrack_env import blackbox
 from flytrack_env.episodes import EpisodicEnvironment

@@ -23,7 +23,7 @@ from baselines.purejaxrl_ppo.config import add_flags, settings_of
 from baselines.purejaxrl_ppo.flights import race_many, score, start_keys
 from baselines.purejaxrl_ppo.run import is_due
 from baselines.purejaxrl_ppo.training import Trainer
-from benchmarks.env_speed import cpu_name, pin_to_one_core, versions
+from benchmarks.report import cpu_name, pin_to_one_core, versions
 from flytrack_env.files import write_atomically
 
 TARGET_SUCCESS = 0.95

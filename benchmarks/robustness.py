@@ -10,8 +10,8 @@ from pathlib import Path
 
 from baselines.purejaxrl_ppo import Config
 from baselines.purejaxrl_ppo.training import Options, train_policy
-from benchmarks.env_speed import cpu_name, versions
 from benchmarks.flown import evaluate
+from benchmarks.report import cpu_name, versions
 from flytrack_env.files import fresh_folder, write_atomically
 
 ENV_IDS = {"robust": "FlyTrackRobust-v0", "plain": "FlyTrack-v0"}

@@ -15,7 +15,7 @@ from baselines.purejaxrl_ppo import Config
 from baselines.purejaxrl_ppo.tracking import local_uri
 from baselines.purejaxrl_ppo.train_ppo import DEFAULTS
 from baselines.purejaxrl_ppo.training import Options, Trainer
-from benchmarks.env_speed import cpu_name, pin_to_one_core, versions
+from benchmarks.report import cpu_name, pin_to_one_core, versions
 from flytrack_env.files import write_atomically
 
 AIM_STEPS_PER_S = 400_000

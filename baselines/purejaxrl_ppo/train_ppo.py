@@ -194,7 +194,6 @@ def defaults_of(resumed: Resumed) -> Settings:
     return Settings(
         env_id=start.checkpoint.env_id,
         track=start.checkpoint.track,
-        reward=rewards_of(start.checkpoint),
         seed=min(resumed.starts),
         num_seeds=len(resumed.starts),
         seeds_at_once=seeds_side_by_side(start.checkpoint),

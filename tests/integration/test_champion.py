@@ -4,11 +4,12 @@ import tomllib
 from pathlib import Path
 
 import baselines.purejaxrl_ppo
-import eval_agent
 from baselines.purejaxrl_ppo import load_checkpoint
+from baselines.purejaxrl_ppo.evaluate import SHIPPED_BLACK_BOX
 from baselines.purejaxrl_ppo.flights import race_many, score, start_keys
+from baselines.purejaxrl_ppo.race_env import plant_env
 from benchmarks.champion import AIM, CHAMPION, MODEL
-from flytrack_env import load_model
+from flytrack_env import blackbox, load_model
 from flytrack_env.model_file import model_from_json
 from flytrack_env.references import model_digest, shipped_reference
 
@@ -18,7 +19,7 @@ NUM_FLIGHTS, NUM_STEPS, NUM_LAPS = 32, 2500, 3
 
 def test_champion_races_on_the_black_box_near_the_optimum():
     champion = load_checkpoint(CHAMPION)
-    env = eval_agent.black_box_env(champion, eval_agent.SHIPPED_BLACK_BOX)
+    env = plant_env(champion, blackbox.load(SHIPPED_BLACK_BOX))
     keys = start_keys(7, NUM_FLIGHTS)
     result = score(race_many(env, champion.network, champion.params, keys, NUM_STEPS, NUM_LAPS))
     optimum = shipped_reference("flytrack", "flying", "black_box")
@@ -35,7 +36,7 @@ def test_champion_is_a_small_policy_of_the_model_of_its_reference():
 
 
 def test_champion_is_part_of_the_package():
-    pyproject = tomllib.loads((Path(eval_agent.__file__).parent / "pyproject.toml").read_text())
+    pyproject = tomllib.loads((Path(__file__).parents[2] / "pyproject.toml").read_text())
     package = Path(baselines.purejaxrl_ppo.__file__).parent
     patterns = pyproject["tool"]["setuptools"]["package-data"]["baselines.purejaxrl_ppo"]
     assert CHAMPION in [path for pattern in patterns for path in package.glob(pattern)]

@@ -12,16 +12,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from baselines.joining import Job, add_job_flags, job_of
-from baselines.purejaxrl_ppo.across import AXIS, Across
 
 import flytrack_env
 from baselines.purejaxrl_ppo import Config, load_checkpoint
 from baselines.purejaxrl_ppo.checkpoint import as_named_arrays
-from baselines.purejaxrl_ppo.distributed import check_divides, digest
+from baselines.purejaxrl_ppo.collectives import AXIS, Collectives
+from baselines.purejaxrl_ppo.distributed import Job, check_divides, digest
 from baselines.purejaxrl_ppo.ppo import Batch, make_network_for, ppo_loss
 from baselines.purejaxrl_ppo.resume import checkpoints_in, newest_intact
-from baselines.purejaxrl_ppo.train_ppo import make_parser
 from tests.support.ppo_runs import BATCH, CONFIG
 
 ROOT = Path(__file__).parents[2]
@@ -51,10 +49,10 @@ def test_the_gradient_of_equal_data_is_that_of_one_device(num_shards):
     data = experience(network, params, 64, seed=1)
     gradient = jax.grad(ppo_loss, has_aux=True)
     whole, parts = jax.jit(lambda *data: gradient(params, network, *data, CONFIG))(*data)
-    across = Across(AXIS)
+    collectives = Collectives(AXIS)
 
     def of_shard(batch, advantage, target):
-        return across.averaged(gradient(params, network, batch, advantage, target, CONFIG, across))
+        return collectives.average(gradient(params, network, batch, advantage, target, CONFIG, collectives))
 
     shards = jax.tree.map(lambda leaf: leaf.reshape(num_shards, -1, *leaf.shape[1:]), data)
     found = jax.jit(jax.vmap(of_shard, axis_name=AXIS))(*shards)
@@ -70,8 +68,8 @@ def test_sums_and_means_over_shards_are_those_of_the_whole():
     values = jax.random.normal(jax.random.key(0), (8, 5)) + 3.0
     shards = values.reshape(4, 2, 5)
     for name in ("sum", "mean", "variance"):
-        found = jax.vmap(getattr(Across(AXIS), name), axis_name=AXIS)(shards)
-        np.testing.assert_allclose(found, jnp.full(4, getattr(Across(), name)(values)), rtol=1e-5)
+        found = jax.vmap(getattr(Collectives(AXIS), name), axis_name=AXIS)(shards)
+        np.testing.assert_allclose(found, jnp.full(4, getattr(Collectives(), name)(values)), rtol=1e-5)
 
 
 def test_environments_and_minibatches_divide_into_shards():
@@ -88,36 +86,18 @@ def test_the_same_values_have_the_same_number_that_devices_can_compare():
     assert digest([{"b": Path("x"), "a": 0}]) == numbers[0]
 
 
-# The job.
-
-
 @pytest.mark.parametrize(
-    ("flags", "message"),
+    ("job", "message"),
     [
-        ("--coordinator a:1", "expected --distributed with it"),
-        ("--distributed --coordinator a:1", "found --coordinator, expected all of --coordinator, --num-pro"),
-        (
-            "--distributed --coordinator a --num-processes 2 --process-index 0",
-            "found 'a', expected HOST:PORT",
-        ),
-        ("--distributed --coordinator a:b --num-processes 2 --process-index 0", "expected HOST:PORT"),
-        ("--distributed --coordinator a:1 --num-processes 0 --process-index 0", "expected at least 1"),
-        ("--distributed --coordinator a:1 --num-processes 2 --process-index 2", "found 2, expected 0 to 1"),
+        (Job("a:1"), "found some of --coordinator, --num-processes, --process-index, expected all"),
+        (Job("a", 2, 0), "found 'a', expected HOST:PORT"),
+        (Job("a:1", 0, 0), "expected at least 1"),
+        (Job("a:1", 2, 2), "found 2, expected 0 to 1"),
     ],
 )
-def test_what_is_no_job_is_refused(flags, message):
+def test_what_is_not_a_job_is_refused(job, message):
     with pytest.raises(ValueError, match=message):
-        job_of(make_parser().parse_args(flags.split()))
-
-
-def test_a_job_is_where_the_flags_or_the_cluster_say():
-    import argparse
-
-    parser = argparse.ArgumentParser()
-    add_job_flags(parser)
-    assert job_of(parser.parse_args(["--distributed"])) == Job()
-    flags = "--distributed --coordinator a:1 --num-processes 2 --process-index 1"
-    assert job_of(parser.parse_args(flags.split())) == Job("a:1", 2, 1)
+        job.check()
 
 
 # Whole processes.
@@ -180,6 +160,7 @@ def parameters(folder, name="final.safetensors"):
     return as_named_arrays(load_checkpoint(folder / name).params)
 
 
+@pytest.mark.slow
 def test_two_processes_train_as_two_devices(tmp_path):
     flags = ["--total-timesteps", 7 * BATCH, "--checkpoint-every", 2 * BATCH]
     devices = start(tmp_path / "devices", *flags, devices=2)
@@ -191,7 +172,7 @@ def test_two_processes_train_as_two_devices(tmp_path):
     assert (first, second) == (0, 0), errors_first + errors_second
     # Files are written once, by the first process, and each says as much as one alone.
     assert "final.safetensors" in said_first and "final.safetensors" in said
-    assert "msgpack" not in said_second
+    assert "safetensors" not in said_second
     names = sorted(path.name for path in (tmp_path / "devices").iterdir())
     assert sorted(path.name for path in (tmp_path / "pair").iterdir()) == names
     assert sum(name.startswith("step_") for name in names) == 4
@@ -200,18 +181,19 @@ def test_two_processes_train_as_two_devices(tmp_path):
         np.testing.assert_allclose(of_pair[name], array, rtol=1e-4, atol=1e-6, err_msg=name)
 
 
+@pytest.mark.slow
 def test_a_lost_process_ends_the_job_and_another_number_goes_on(tmp_path):
     port, long = free_port(), ["--total-timesteps", 200_000 * BATCH, "--checkpoint-every", 50 * BATCH]
     out = tmp_path / "lost"
     pair = [start(out, *long, number=2, index=i, port=port) for i in (0, 1)]
-    while not (out / f"step_{50 * BATCH}.msgpack").exists():
+    while not (out / f"step_{50 * BATCH}.safetensors").exists():
         assert [one.poll() for one in pair] == [None, None], [end_of(one) for one in pair]
         time.sleep(0.1)
     pair[1].send_signal(signal.SIGKILL)
     status, _, errors = end_of(pair[0])
     end_of(pair[1])
     assert status == 1
-    assert "process 0 of 2 has lost another" in errors and f"go on with --resume {out}" in errors
+    assert "process 0 of 2 has lost another" in errors and f"continue with --resume {out}" in errors
     assert "Traceback" not in errors
     stored = newest_intact(out)[0]
     # Another number of processes goes on, and says that the bits may be others.
@@ -223,7 +205,7 @@ def test_a_lost_process_ends_the_job_and_another_number_goes_on(tmp_path):
         time.sleep(0.1)
     alone.send_signal(signal.SIGINT)
     status, _, errors = end_of(alone)
-    assert status == 130 and "found 2, expected 1; going on, perhaps not bit for bit" in errors
+    assert status == 130 and "found 2, expected 1; continuing, perhaps not bit for bit" in errors
 
 
 def test_one_device_alone_is_no_job(tmp_path):
@@ -235,7 +217,7 @@ def test_one_device_alone_is_no_job(tmp_path):
         text=True,
         env={**os.environ, "JAX_PLATFORMS": "cpu"},
     )
-    assert process.returncode == 1 and not (tmp_path / "x").exists()
+    assert process.returncode == 2 and not (tmp_path / "x").exists()
     assert (
         "train_ppo: error: --distributed: found no job of SLURM or Open MPI, and one device" in process.stderr
     )

@@ -4,7 +4,6 @@ import math
 
 import numpy as np
 import pytest
-from flytrack_loop.flown import log_of_flights
 
 from baselines.purejaxrl_ppo import load_checkpoint
 from baselines.purejaxrl_ppo.evaluate import SHIPPED_BLACK_BOX
@@ -26,6 +25,7 @@ from benchmarks.loop.plants import HIDDEN, HiddenPlant, draw_plant
 from flytrack_env import blackbox, nominal_parameters
 from flytrack_loop import Gap, errors_of
 from flytrack_loop.__main__ import main
+from flytrack_loop.flight_log import log_of_flights
 from flytrack_loop.loop import STREAMS, seeds_of
 from flytrack_loop.stages import measure_gap
 

@@ -4,12 +4,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from baselines.purejaxrl_ppo.across import Across
 from flax import struct
 from gymnax.environments import environment, spaces
 
 from baselines.purejaxrl_ppo import Config, make_network, make_train
-from baselines.purejaxrl_ppo.metrics import summarise_episodes, summarise_race
+from baselines.purejaxrl_ppo.collectives import Collectives
+from baselines.purejaxrl_ppo.metrics import summarise_episodes, summarise_race, summarise_updates
 from baselines.purejaxrl_ppo.ppo import (
     Batch,
     affine_permutation,
@@ -18,6 +18,7 @@ from baselines.purejaxrl_ppo.ppo import (
     make_schedule,
     ppo_loss,
 )
+from baselines.purejaxrl_ppo.run import is_due, next_due
 
 
 @struct.dataclass
@@ -219,7 +220,7 @@ def test_episodes_are_averaged_over_those_that_ended():
         "episode_return": jnp.array([[1.0, 50.0], [60.0, 3.0]]),
         "laps": jnp.array([[2, 9], [9, 4]]),
     }
-    summary = summarise_episodes(log, Across())
+    summary = summarise_episodes(log, Collectives())
     assert summary["episode_return"] == 2.0
     assert summary["episode_laps"] == 3.0
     assert summary["episodes_ended"] == 2
@@ -231,8 +232,33 @@ def test_lap_times_are_averaged_over_the_laps():
         "lap_time_s": jnp.array([[4.0, 9.0], [9.0, 5.0]]),
         "gate_distance_m": jnp.array([[1.0, 2.0], [3.0, 6.0]]),
     }
-    assert summarise_race(log, Across()) == {"laps_completed": 2, "lap_time_s": 4.5, "gate_distance_m": 3.0}
-    assert summarise_race({"done": log["lap_completed"]}, Across()) == {}
+    assert summarise_race(log, Collectives()) == {
+        "laps_completed": 2,
+        "lap_time_s": 4.5,
+        "gate_distance_m": 3.0,
+    }
+    assert summarise_race({"done": log["lap_completed"]}, Collectives()) == {}
+
+
+def test_means_over_updates_are_weighted_by_what_they_are_means_of():
+    metrics = {
+        "episodes_ended": np.array([1, 3]),
+        "laps_completed": np.array([0, 0]),
+        "episode_return": np.array([2.0, 6.0]),
+        "lap_time_s": np.array([0.0, 0.0]),
+        "entropy": np.array([1.0, 2.0]),
+    }
+    expected = {"episodes_ended": 4, "laps_completed": 0, "episode_return": 5.0, "entropy": 1.5}
+    assert summarise_updates(metrics) == expected
+
+
+@pytest.mark.parametrize(("every", "batch_size"), [(1, 7), (7, 7), (10, 7), (100, 7), (13, 64)])
+def test_intervals_hit_every_multiple_once(every, batch_size):
+    due = [n for n in range(1, 200) if n * batch_size // every > (n - 1) * batch_size // every]
+    assert [n for n in range(1, 200) if is_due(n, every, batch_size)] == due
+    for start in range(150):
+        assert next_due(start, every, batch_size) == min(n for n in due if n > start)
+    assert next_due(3, None, batch_size) == float("inf") and not is_due(3, None, batch_size)
 
 
 def test_std_has_a_floor():

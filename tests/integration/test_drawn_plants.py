@@ -7,16 +7,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from baselines.purejaxrl_ppo.perturbed import (
-    PlantRanges,
-    by_thirds,
-    draw_plants,
-    perturb,
-    with_model_as_given,
-)
 
 from baselines.purejaxrl_ppo.checkpoint import load_checkpoint
-from baselines.purejaxrl_ppo.race_env import simulated_env
+from baselines.purejaxrl_ppo.plants import PlantRanges, by_thirds, draw_plants, perturb
+from baselines.purejaxrl_ppo.race_env import simulated_env, with_model_as_given
 from flytrack_env import make, nominal_parameters
 from flytrack_env.effects import CommandDelay, LinearDrag, QuadraticDrag, ThrustScale
 from flytrack_env.plants import Simulator
@@ -72,7 +66,7 @@ def test_what_breaks_the_policy_shows_in_its_thirds() -> None:
 
 
 def test_ids_that_draw_models_fly_the_one_that_is_given(tmp_path: Path) -> None:
-    env = simulated_env(load_checkpoint(write_checkpoint(tmp_path / "policy.msgpack")))
+    env = simulated_env(load_checkpoint(write_checkpoint(tmp_path / "policy.safetensors")))
     params = with_model_as_given(env.default_params)
     env.check_params(params)
     ranges, given = params.wrappers[DomainRandomization.key], env.default_params.model

@@ -1,4 +1,4 @@
-"""Evaluation: many flights and single ones agree, known lap times come out, ghost, what the command tells."""
+"""Evaluation: single flights and many agree, known lap times, report, ghost, and refusals."""
 
 import importlib.util
 import json
@@ -8,28 +8,32 @@ from typing import Any
 import jax
 import numpy as np
 import pytest
-from baselines.purejaxrl_ppo.perturbed import (
-    draw_plants,
-)
-from benchmarks.optimal.compared import compare, time_lost
 
-import eval_agent
 from baselines.purejaxrl_ppo import evaluate
-from baselines.purejaxrl_ppo.checkpoint import Checkpoint, load_checkpoint
+from baselines.purejaxrl_ppo import flights as flights_module
+from baselines.purejaxrl_ppo.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
 from baselines.purejaxrl_ppo.flights import (
-    Flight,
     Outcomes,
+    Rollout,
     fly_many,
     outcomes_of,
     race_many,
     score,
     start_keys,
 )
-from baselines.purejaxrl_ppo.summary import distribution, share, summarise
-from flytrack_env import FlyTrack, load_track, nominal_parameters
+from baselines.purejaxrl_ppo.plants import draw_plants
+from baselines.purejaxrl_ppo.summary import (
+    compare_with_optimum,
+    distribution,
+    share,
+    summarise,
+    time_lost,
+)
+from flytrack_env import FlyTrack, load_track, nominal_parameters, save_track
 from flytrack_env.references import ghost_rollout, shipped_reference, shipped_references
 from flytrack_env.rollout import load_rollout
 from flytrack_env.state import BATTERY, POSITION, VELOCITY
+from flytrack_env.tracks import random_track
 from tests.support.evaluated import FAILS_BELOW_V, Rails, run, write_checkpoint
 from tests.support.recordings import Recording
 
@@ -40,7 +44,7 @@ TOLERANCE_S = 2e-3
 
 @pytest.fixture(scope="module")
 def checkpoint_path(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_checkpoint(tmp_path_factory.mktemp("checkpoint") / "policy.msgpack")
+    return write_checkpoint(tmp_path_factory.mktemp("checkpoint") / "policy.safetensors")
 
 
 @pytest.fixture(scope="module")
@@ -54,7 +58,7 @@ def on_rails() -> FlyTrack:
 
 
 @pytest.fixture(scope="module")
-def flights(on_rails: FlyTrack, checkpoint: Checkpoint) -> Flight:
+def flights(on_rails: FlyTrack, checkpoint: Checkpoint) -> Rollout:
     policy = (checkpoint.network, checkpoint.params)
     return fly_many(on_rails, *policy, 0, NUM_FLIGHTS, NUM_STEPS, NUM_LAPS)
 
@@ -64,12 +68,12 @@ def raced(on_rails: FlyTrack, checkpoint: Checkpoint) -> Outcomes:
     """The same flights, in batches, the last one not full."""
     policy = (checkpoint.network, checkpoint.params)
     with pytest.MonkeyPatch.context() as patched:
-        patched.setattr(evaluate, "BATCH", 4)
+        patched.setattr(flights_module, "BATCH", 4)
         return race_many(on_rails, *policy, start_keys(0, NUM_FLIGHTS), NUM_STEPS, NUM_LAPS)
 
 
 @pytest.fixture(scope="module")
-def paces(flights: Flight) -> np.ndarray:
+def paces(flights: Rollout) -> np.ndarray:
     """How slow each flight on rails is; 0 where it falls."""
     battery_v = np.asarray(flights.states)[:, 0, BATTERY]
     return np.where(battery_v < FAILS_BELOW_V, 0.0, Rails.pace(battery_v))
@@ -95,7 +99,7 @@ def test_lap_times_are_those_of_the_rails(raced: Outcomes, paces: np.ndarray) ->
     assert score(raced).success == is_good.mean()
 
 
-def test_every_step_kept_or_not_is_the_same_flight(flights: Flight, raced: Outcomes) -> None:
+def test_every_step_kept_or_not_is_the_same_flight(flights: Rollout, raced: Outcomes) -> None:
     assert NUM_FLIGHTS % 4
     assert_same(raced, outcomes_of(flights, NUM_LAPS, 8))
 
@@ -103,7 +107,7 @@ def test_every_step_kept_or_not_is_the_same_flight(flights: Flight, raced: Outco
 def test_time_lost_adds_up_to_the_lap(raced: Outcomes, paces: np.ndarray) -> None:
     references = shipped_references(load_track("flytrack"), ("nominal",))
     slow = paces[paces > 0.0].mean() - 1.0
-    compared = compare(summarise(raced, is_limited=True), references)
+    compared = compare_with_optimum(summarise(raced, is_limited=True), references)
     assert compared["model"] == "nominal"
     for lap, kind in (("first_lap_s", "standing"), ("flying_lap_s", "flying")):
         lost = [row[lap] for row in time_lost(raced, references)]
@@ -117,13 +121,15 @@ def test_time_lost_adds_up_to_the_lap(raced: Outcomes, paces: np.ndarray) -> Non
 def test_no_laps_are_no_numbers() -> None:
     references = shipped_references(load_track("split_s"), ("black_box", "nominal"))
     never = np.full((2, 3), np.nan), np.full((2, 21), np.nan)
-    causes = evaluate.Causes(*(np.array([True, False]) if i == 0 else np.zeros(2, bool) for i in range(5)))
+    causes = flights_module.Causes(
+        *(np.array([True, False]) if i == 0 else np.zeros(2, bool) for i in range(5))
+    )
     nothing = Outcomes(np.array([5, 9]), np.array([0, 1]), np.zeros(2, int), *never, causes)
     summary = summarise(nothing, is_limited=True)
     assert summary["first_lap_s"]["mean"] is None and summary["ended"]["time_limit"] == 1
     rows = time_lost(nothing, references)
     assert len(rows) == 7 and rows[0] == {"gate": 1, "first_lap_s": None, "flying_lap_s": None}
-    json.dumps([summary, rows, compare(summary, references)], allow_nan=False)
+    json.dumps([summary, rows, compare_with_optimum(summary, references)], allow_nan=False)
 
 
 def test_ghost_is_the_reference_nearest_in_time() -> None:
@@ -160,27 +166,27 @@ def test_command_flies_many(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
-    flights: Flight,
+    flights: Rollout,
 ) -> None:
     flown = []
-    fly_scene = eval_agent.fly_scene
-    monkeypatch.setattr(eval_agent, "fly_scene", lambda *a: flown.append(fly_scene(*a)) or flown[0])
+    fly_scene = evaluate.fly_scene
+    monkeypatch.setattr(evaluate, "fly_scene", lambda *a: flown.append(fly_scene(*a)) or flown[0])
     if flown_by == "black box":  # one program less to compile: single flights are those of test_commands
-        monkeypatch.setattr(eval_agent, "_fly_one", lambda *_: jax.tree.map(lambda leaf: leaf[0], flights))
+        monkeypatch.setattr(evaluate, "_fly_first", lambda *_: jax.tree.map(lambda leaf: leaf[0], flights))
     out, file = tmp_path / "flight.npy", tmp_path / "new" / "report.json"
     more = ["--episodes", 2, "--plants", 3] if flown_by == "plants" else ["--episodes", 6, "--laps", 1]
     where = ["--checkpoint", checkpoint_path, "--out", out, "--json", file]
     run(monkeypatch, *where, "--steps", 120, "--track", "split_s", "--ghost", *more)
-    outcomes, flight = flown[0]
+    outcomes, rollout = flown[0]
     report, text = json.loads(file.read_text()), capsys.readouterr().out
     assert report["schema"] == 1 and report["flights"] == 6 and report["track"] == "split_s"
     assert report["steps"] == outcomes.steps.sum() and report["success"]["of"] == 6
     assert "track split_s" in text and f"complete {report['laps']} laps: 0 of 6" in text
     states, _ = load_rollout(out)
-    assert len(states) == report["first_flight"]["steps"] == np.sum(flight.is_flying)
+    assert len(states) == report["first_flight"]["steps"] == np.sum(rollout.is_flying)
     assert len(load_rollout(report["ghost"])[0]) == len(states)
     if flown_by == "plants":
-        single = outcomes_of(jax.tree.map(lambda leaf: leaf[None], flight), 3, 7)
+        single = outcomes_of(jax.tree.map(lambda leaf: leaf[None], rollout), 3, 7)
         assert_same(jax.tree.map(lambda leaf: leaf[:1], outcomes), single)
         assert "in the simulator, not on a black box" in text and report["black_box"] is None
         assert report["optimal"]["model"] == "nominal" and report["success"]["low"] is None
@@ -198,16 +204,16 @@ def keys_of(value: Any) -> set[str]:
     return {name for part in value for name in keys_of(part)} if isinstance(value, list) else set()
 
 
-def test_single_flight_is_told_as_json_and_docs_name_every_key(
+def test_a_single_flight_as_json_and_docs_name_every_key(
     checkpoint_path: Path,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
-    flights: Flight,
+    flights: Rollout,
     raced: Outcomes,
 ) -> None:
     index = int(np.argmax(raced.is_complete()))
-    monkeypatch.setattr(eval_agent, "_fly_one", lambda *_: jax.tree.map(lambda leaf: leaf[index], flights))
+    monkeypatch.setattr(evaluate, "_fly_first", lambda *_: jax.tree.map(lambda leaf: leaf[index], flights))
     out, file = tmp_path / "flight.npy", tmp_path / "report.json"
     where = ["--checkpoint", checkpoint_path, "--out", out, "--json", file, "--steps", NUM_STEPS]
     recording = tmp_path / "flight.rrd"
@@ -228,3 +234,51 @@ def test_single_flight_is_told_as_json_and_docs_name_every_key(
     text = (ROOT / "docs" / "baseline.md").read_text()
     missing = {name for name in keys_of({**report, "plants": plants}) if f"`{name}`" not in text}
     assert not missing
+
+
+@pytest.fixture(scope="module")
+def bad_files(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder of a policy without its model, and of tracks without a reference."""
+    folder = tmp_path_factory.mktemp("bad")
+    old = load_checkpoint(write_checkpoint(folder / "policy.safetensors"))
+    meta = {name: value for name, value in old.meta.items() if name != "model"}
+    save_checkpoint(folder / "no_model.safetensors", old.params, old.config, meta)
+    save_track(folder / "random.toml", random_track(0))
+    (folder / "file").write_text("")
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("arguments", "messages"),
+    [
+        (["--episodes", "2000000"], ["--episodes: found 2000000", "expected 1 to"]),
+        (["--plants", "2000", "--episodes", "1000"], ["--plants: found 2000", "expected 1 to 100"]),
+        (["--plants", "2", "--black-box", "any.bin"], ["--plants", "--black-box any.bin", "one of the two"]),
+        (["--plants", "2", "--checkpoint", "no_model.safetensors"], ["model", "found none"]),
+        (["--steps", "0"], ["--steps: found 0"]),
+        (["--seed", "-1"], ["--seed: found -1"]),
+        (["--black-box", "no.bin"], ["no.bin"]),
+        (["--track", "nowhere"], ["nowhere", "flytrack"]),
+        (["--track", "random.toml", "--ghost"], ["found no 'random", "expected one of", "flytrack_nominal"]),
+        (["--out", "policy.safetensors"], ["--out: found policy.safetensors, which is an input"]),
+        (["--json", "file/report.json"], ["--json", "cannot be written"]),
+        (["--json", "rollout_ghost.npy"], ["--json", "which is the file of --ghost"]),
+        (["--rrd", "."], ["--rrd", "cannot be written"]),
+        (["--checkpoint", "file"], ["file", "not a checkpoint"]),
+    ],
+)
+def test_command_refuses_before_it_flies(
+    arguments: list[str],
+    messages: list[str],
+    bad_files: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(bad_files)
+    monkeypatch.setattr(evaluate, "can_record", lambda: True)
+    monkeypatch.setattr(evaluate, "fly_scene", lambda *_: pytest.fail("it flew"))
+    with pytest.raises(SystemExit) as ended:
+        run(monkeypatch, "--checkpoint", "policy.safetensors", "--steps", "5", *arguments)
+    error = capsys.readouterr().err
+    assert ended.value.code == 2 and all(message in error for message in messages), error
+    assert not (bad_files / "rollout.npy").exists()

@@ -1,0 +1,151 @@
+"""MLflow tracking: everything is recorded once, and training goes on without a server."""
+
+import subprocess
+import sys
+import time
+from pathlib import Path
+from urllib.error import URLError
+from urllib.request import urlopen
+
+import pytest
+
+from baselines.purejaxrl_ppo import load_checkpoint, monitor, tracking
+from baselines.purejaxrl_ppo.run import Run
+from baselines.purejaxrl_ppo.training import Options
+from flytrack_env.rollout import load_rollout
+from tests.support.ppo_runs import BATCH, DEAD_URI, EVERY_OTHER_UPDATE, SEED, assert_same_end
+
+ROOT = Path(__file__).parents[2]
+METRICS = {"episode_return", "policy_loss", "explained_variance", "episode_gates_passed", "gate_distance_m"}
+METRICS |= {"episode_crash", "evaluation_success", "evaluation_ended_time_limit", "steps_per_second"}
+
+pytestmark = pytest.mark.filterwarnings("default")  # deprecations in MLflow's own dependencies
+
+
+def only_run(uri):
+    from mlflow import MlflowClient
+
+    client = MlflowClient(tracking_uri=uri)
+    experiment = client.get_experiment_by_name(tracking.EXPERIMENT)
+    (run,) = client.search_runs([experiment.experiment_id])
+    return client, run
+
+
+def history(client, run, name):
+    return [(metric.step, metric.value) for metric in client.get_metric_history(run.info.run_id, name)]
+
+
+def reports_of(caplog):
+    return [record.getMessage() for record in caplog.records if record.name == tracking.__name__]
+
+
+def test_everything_is_recorded_once_though_the_run_was_cut_off(trainer, tmp_path, monkeypatch):
+    monkeypatch.setattr(monitor, "NUM_STEPS", 20)
+    uri = tracking.local_uri(tmp_path)
+    options = EVERY_OTHER_UPDATE._replace(evaluate_every=4 * BATCH, evaluation_episodes=2, tracking_uri=uri)
+    trainer.train(tmp_path, SEED, options)
+    client, run = only_run(uri)
+    description = load_checkpoint(tmp_path / "final.safetensors").meta
+    for part in ("config", "environment", "model"):
+        for name, text in tracking.flatten({part: description[part]}):
+            assert run.data.params[name] == text
+    assert run.data.params["seed"] == str(SEED) and run.data.params["env_id"] == "FlyTrackRobust-v0"
+    page = (ROOT / "docs" / "baseline.md").read_text(encoding="utf-8")
+    assert set(run.data.metrics) >= METRICS
+    assert {name for name in run.data.metrics if f"`{name}`" not in page} == set()
+    before = history(client, run, "policy_loss")
+    assert [step for step, _ in before] == [2 * BATCH, 4 * BATCH, 6 * BATCH, 7 * BATCH]
+    assert [step for step, _ in history(client, run, "evaluation_success")] == [4 * BATCH, 7 * BATCH]
+    names = {file.path for file in client.list_artifacts(run.info.run_id, "evaluation")}
+    assert {f"evaluation/position_density_{7 * BATCH}.png", f"evaluation/rollout_{4 * BATCH}.npy"} <= names
+    assert len(client.list_artifacts(run.info.run_id, "checkpoints")) == 5
+    states, actions = load_rollout(tmp_path / "evaluation" / f"rollout_{7 * BATCH}.npy")
+    assert states.shape[1] + actions.shape[1] == 25
+
+    # Killed after the checkpoint at 4; and the folder was moved.
+    for name in ("final.safetensors", f"step_{6 * BATCH}.safetensors"):
+        (tmp_path / name).unlink()
+    trainer.train(tmp_path, SEED, options._replace(resume=tmp_path))
+    client, run = only_run(uri)
+    assert run.info.status == "FINISHED" and history(client, run, "policy_loss") == before
+
+
+def test_a_server_that_is_down_does_not_end_the_training(trainer, whole, tmp_path, caplog):
+    trainer.train(tmp_path, SEED, EVERY_OTHER_UPDATE._replace(tracking_uri=DEAD_URI))
+    assert_same_end(tmp_path / "final.safetensors", whole[0] / "final.safetensors")
+    reports = reports_of(caplog)
+    assert len(reports) == 2 and DEAD_URI in reports[0] and "training goes on" in reports[0]
+    assert "4 steps were not recorded" in reports[1]
+
+
+def test_a_server_that_comes_back_gets_what_it_missed(tmp_path, monkeypatch, caplog):
+    monkeypatch.setattr(tracking, "RETRY_EVERY_S", 0.0)
+    uri = tracking.local_uri(tmp_path)
+    tracker = tracking.Tracker(tmp_path, uri, "name", {"seed": 3})
+    connect = tracker._connect
+
+    def fail():
+        raise ConnectionError("gone")
+
+    tracker._connect = fail
+    tracker.begin()
+    for step in (1, 2):
+        tracker.metrics(step, {tracking.EVERY_STEP: 0.5 * step})
+    tracker._connect = connect
+    tracker.end("FINISHED")
+    client, run = only_run(uri)
+    assert history(client, run, tracking.EVERY_STEP) == [(1, 0.5), (2, 1.0)]
+    assert run.info.status == "FINISHED" and run.data.params["seed"] == "3"
+    (report,) = reports_of(caplog)
+    assert "ConnectionError: gone" in report
+
+
+@pytest.mark.parametrize(("error", "status"), [(KeyboardInterrupt, "KILLED"), (OSError, "FAILED")])
+def test_how_a_run_ended_is_recorded(trainer, tmp_path, monkeypatch, error, status):
+    def fail(*arguments):
+        raise error
+
+    ends = []
+    monkeypatch.setattr(tracking.Tracker, "_connect", lambda self: None)
+    monkeypatch.setattr(tracking.Tracker, "end", lambda self, status: ends.append(status))
+    monkeypatch.setattr(Run, "_checkpoint", fail)
+    with pytest.raises(error):
+        trainer.train(tmp_path, SEED, Options(tracking_uri=DEAD_URI))
+    assert ends == [status]
+
+
+def test_mlflow_is_imported_when_it_is_used():
+    code = "import sys, baselines.purejaxrl_ppo.train_ppo; sys.exit('mlflow' in sys.modules)"
+    subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=True, timeout=120)
+
+
+@pytest.mark.slow
+def test_a_served_store_records_everything(trainer, tmp_path):
+    port = 5713
+    command = f"{sys.executable} -m mlflow server --port {port} --workers 1"
+    store = f"sqlite:///{tmp_path}/server.db"
+    server = subprocess.Popen(
+        [*command.split(), "--backend-store-uri", store, "--artifacts-destination", str(tmp_path)],
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+    )
+    uri = f"http://127.0.0.1:{port}"
+    try:
+        _wait_for(uri)
+        trainer.train(tmp_path / "run", SEED, EVERY_OTHER_UPDATE._replace(tracking_uri=uri))
+        client, run = only_run(uri)
+        assert run.info.status == "FINISHED" and len(history(client, run, "entropy")) == 4
+        assert len(client.list_artifacts(run.info.run_id, "checkpoints")) == 5
+    finally:
+        server.terminate()
+        server.wait(timeout=60)
+
+
+def _wait_for(uri):
+    deadline_s = time.monotonic() + 120
+    while True:
+        try:
+            return urlopen(f"{uri}/health").read()
+        except URLError:
+            assert time.monotonic() < deadline_s, f"{uri}: no server"
+            time.sleep(0.5)

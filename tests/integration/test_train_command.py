@@ -1,0 +1,181 @@
+"""The command of the training: its flags, what it resumes, what it refuses, and how it ends."""
+
+import dataclasses
+import shutil
+import sys
+
+import pytest
+
+from baselines.purejaxrl_ppo import Config, load_checkpoint, tracking, train_ppo
+from baselines.purejaxrl_ppo.checkpoint import save_checkpoint
+from baselines.purejaxrl_ppo.train_ppo import make_plan, make_tasks, parse
+from baselines.purejaxrl_ppo.training import DivergedError, Options, Trainer
+from tests.support.ppo_runs import BATCH, CONFIG, EVERY_OTHER_UPDATE, SEED, assert_same_end, make_trainer
+
+SEEDS = (SEED, SEED + 1)
+
+
+def read(*arguments):
+    return parse([*map(str, arguments)])
+
+
+def tasks_of(*arguments, at_once=1):
+    return make_tasks(*read(*arguments), at_once)
+
+
+def call(monkeypatch, *arguments):
+    """Run the command; return its exit code."""
+    monkeypatch.setattr(sys, "argv", ["train_ppo", *map(str, arguments)])
+    with pytest.raises(SystemExit) as caught:
+        train_ppo.main()
+    return caught.value.code
+
+
+@pytest.fixture(scope="module")
+def seeds(tmp_path_factory):
+    """A folder of seed 3, complete, and of seed 4, which has not begun."""
+    out = tmp_path_factory.mktemp("seeds")
+    options = EVERY_OTHER_UPDATE._replace(evaluation_episodes=7, seeds=SEEDS)
+    make_trainer().train(out / "seed3", SEED, options)
+    return out
+
+
+def test_flags_override_the_file_and_the_file_the_defaults(tmp_path):
+    path = tmp_path / "run.toml"
+    path.write_text("total_timesteps = 2e7\nlearning_rate = 1e-3\nhidden_sizes = [32, 32]\n")
+    settings, _ = read("--config", path, "--learning-rate", 2e-3, "--no-affine-shuffle", "--num-envs", 512)
+    expected = Config(20_000_000, 512, learning_rate=2e-3, hidden_sizes=(32, 32), affine_shuffle=False)
+    assert settings.hyperparameters == expected
+    settings, _ = read("--total-timesteps", "4e6", "--hidden-sizes", 8, 8, "--reward", "progress=2")
+    assert settings.hyperparameters == Config(4_000_000, hidden_sizes=(8, 8))
+    assert settings.reward == {"progress": 2.0}
+
+
+def test_every_flag_has_a_help_text(capsys):
+    with pytest.raises(SystemExit):
+        read("--help")
+    text = capsys.readouterr().out
+    for field in (*dataclasses.fields(Config), *dataclasses.fields(train_ppo.Settings)):
+        if field.name != "hyperparameters":
+            assert f"--{field.name.replace('_', '-')}" in text
+    assert "Adam's step size at the start." in text and "Noisy starts of an evaluation." in text
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--track", "nowhere"], "nowhere"),
+        (["--reward", "speed=1"], "reward: found 'speed', expected one of progress"),
+        (["--reward", "progress"], "expected TERM=WEIGHT"),
+        (["--model", "missing.json"], "missing.json"),
+        (["--total-timesteps", "10"], "total_timesteps"),
+        (["--env-id", "FlyTrack-v9"], "FlyTrack-v9"),
+        (["--seed", "99999999999999"], "--seed"),
+        (["--num-seeds", "0"], "--num-seeds: found 0"),
+        (["--config", "missing.toml"], "missing.toml: cannot be read"),
+        (["--resume", "missing"], "missing: cannot be read"),
+        (["--coordinator", "a:1"], "expected --distributed as well"),
+    ],
+)
+def test_what_cannot_be_used_is_refused_before_any_work(tmp_path, monkeypatch, capsys, arguments, message):
+    monkeypatch.chdir(tmp_path)
+    assert call(monkeypatch, *arguments, "--out", "out") == 2
+    assert message in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+def test_resuming_takes_from_the_checkpoint_what_is_not_given(whole, tmp_path):
+    settings, resumed = read("--resume", whole[0])
+    assert settings.hyperparameters == CONFIG and settings.env_id == "FlyTrackRobust-v0"
+    (task,) = make_tasks(settings, resumed, 1)
+    assert (task.seed, task.out, task.start.path) == (SEED, whole[0], whole[0] / "final.safetensors")
+    assert task.options == EVERY_OTHER_UPDATE._replace(seeds=(SEED,))
+    uri = tracking.local_uri(tmp_path)
+    (task,) = tasks_of(
+        "--resume", whole[0], "--checkpoint-every", 0, "--tracking-uri", "local", "--out", tmp_path
+    )
+    assert task.options == Options(tracking_uri=uri, seeds=(SEED,)) and task.out == tmp_path
+    checkpoint = resumed.first.checkpoint
+    checkpoint.meta["environment"]["reward.off_centre"] = -0.25
+    found = train_ppo.make_trainer(settings, resumed)
+    assert found.env.default_params.reward.off_centre == -0.25
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--learning-rate", "0.1"], "config.learning_rate: found 0.003, expected 0.1\n"),
+        (["--seed", "4"], "seed: found 3, expected 4\n"),
+        (["--track", "split_s"], "track_data.name: found 'flytrack', expected 'split_s'"),
+        (["--num-seeds", "2"], "leave out --seed and --num-seeds"),
+    ],
+)
+def test_resuming_with_other_settings_is_refused(whole, tmp_path, arguments, message, monkeypatch, capsys):
+    common = ["--resume", whole[0], "--no-tracking", "--out", tmp_path / "out"]
+    assert call(monkeypatch, *common, *arguments) == 2
+    assert message in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"environment": {"reward.gate_pass": "a lot"}}, "environment: found .*numbers for weights"),
+        ({"env_id": "Hover-v0"}, "with its settings and the flags: env_id: found 'Hover-v0'"),
+        ({"track": "/nowhere/track.toml"}, "with its settings and the flags: .*track.toml"),
+        ({"model": {"m": "heavy"}}, "with its settings and the flags: model: "),
+        ({"options": {"evaluate_every": "often"}}, "options.evaluate_every: found 'often'"),
+        ({"steps": 5}, "steps: found 5, expected a multiple of 384"),
+    ],
+)
+def test_a_checkpoint_that_cannot_be_resumed_is_named(whole, tmp_path, changes, message):
+    path = tmp_path / "final.safetensors"
+    old = load_checkpoint(whole[0] / "final.safetensors")
+    save_checkpoint(path, old.params, old.config, {**old.meta, **changes}, old.training)
+    with pytest.raises(ValueError, match=f"{path}: {message}"):
+        make_plan(["--resume", str(path), "--no-tracking"])
+
+
+def test_a_folder_of_seeds_is_resumed_with_those_that_had_not_begun(seeds, tmp_path):
+    moved = tmp_path / "moved"
+    shutil.copytree(seeds, moved)
+    first, second = tasks_of("--resume", moved)
+    assert (first.seed, first.start.path) == (3, moved / "seed3" / "final.safetensors")
+    assert (second.seed, second.out, second.start) == (4, moved / "seed4", None)
+    assert first.options.evaluation_episodes == 7 and first.options.seeds == SEEDS
+    with pytest.raises(ValueError, match="found the runs of several seeds"):
+        make_trainer().train(tmp_path / "x", SEED, Options(resume=moved))
+    for arguments in (["--num-seeds", 2, "--seed", 3], []):
+        with pytest.raises(ValueError, match=r"moved(.seed3)? holds the checkpoints of a run"):
+            make_plan([*map(str, ["--out", moved, "--no-tracking", *arguments])])
+    shutil.copytree(moved / "seed3", moved / "seed4")
+    with pytest.raises(ValueError, match=r"seed4.*: does not fit: seed: found 3, expected 4"):
+        make_plan(["--resume", str(moved)])
+
+
+def test_a_run_continues_in_another_folder(seeds, tmp_path, monkeypatch):
+    monkeypatch.setattr(train_ppo, "make_trainer", lambda *_: make_trainer())
+    step = seeds / "seed3" / f"step_{2 * BATCH}.safetensors"
+    plan = make_plan(["--resume", str(step), "--out", str(tmp_path), "--no-tracking"])
+    assert (tmp_path / step.name).read_bytes() == step.read_bytes()
+    train_ppo.run(plan)
+    assert_same_end(tmp_path / "final.safetensors", seeds / "seed3" / "final.safetensors")
+
+
+def test_exit_codes_and_messages(tmp_path, monkeypatch, capsys):
+    def stop(self, tasks):
+        self.steps = 40
+        if error is KeyboardInterrupt:
+            (tasks[0].out).mkdir(parents=True)
+            (tasks[0].out / "step_0.safetensors").touch()
+        raise error
+
+    monkeypatch.setattr(Trainer, "run", stop)
+    monkeypatch.setattr(train_ppo, "make_trainer", lambda *_: make_trainer())
+    error = DivergedError("training diverged")
+    assert call(monkeypatch, "--out", tmp_path, "--no-tracking") == 1
+    assert capsys.readouterr().err == "train_ppo: error: training diverged\n"
+    error = KeyboardInterrupt
+    out = tmp_path / "out"
+    assert call(monkeypatch, "--out", out, "--num-seeds", 2) == 130
+    assert capsys.readouterr().err == f"stopped at 40 steps; continue with --resume {out}\n"

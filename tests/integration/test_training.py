@@ -1,0 +1,268 @@
+"""Training runs: cut off and resumed, damaged, diverged, watched, side by side; the bits stay the same."""
+
+import logging
+import shutil
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from baselines.purejaxrl_ppo import CheckpointError, Config, load_checkpoint, monitor
+from baselines.purejaxrl_ppo.checkpoint import as_named_arrays, save_checkpoint
+from baselines.purejaxrl_ppo.resume import (
+    at_common_step,
+    check_same_run,
+    describe_run,
+    newest_intact,
+    warn_of_other_machine,
+)
+from baselines.purejaxrl_ppo.run import Run
+from baselines.purejaxrl_ppo.training import DivergedError, Options, Trainer
+from tests.support.ppo_runs import BATCH, EVERY_OTHER_UPDATE, SEED, assert_same_end
+
+ROOT = Path(__file__).parents[2]
+SEEDS = (SEED, SEED + 1, SEED + 2)
+EVALUATED = EVERY_OTHER_UPDATE._replace(evaluate_every=2 * BATCH, evaluation_episodes=2)
+
+
+def step_path(folder, updates):
+    return folder / f"step_{updates * BATCH}.safetensors"
+
+
+def test_checkpoints_are_written_at_the_steps_asked_for(whole):
+    names = {"final.safetensors"} | {step_path(whole[0], updates).name for updates in (0, 2, 4, 6)}
+    assert {path.name for path in whole[0].iterdir()} == names
+    training = load_checkpoint(whole[0] / "final.safetensors").training
+    for part in ("opt_state", "env_state", "observation", "episodes", "key"):
+        assert any(part in name for name in training), part
+
+
+@pytest.mark.parametrize("updates", [0, 2, 6])
+def test_a_resumed_run_ends_bit_for_bit(trainer, whole, tmp_path, updates):
+    options = EVERY_OTHER_UPDATE._replace(resume=step_path(whole[0], updates))
+    _, metrics = trainer.train(tmp_path, SEED, options)
+    assert_same_end(tmp_path / "final.safetensors", whole[0] / "final.safetensors")
+    for name, values in metrics.items():
+        np.testing.assert_array_equal(values, whole[1][name][updates:], err_msg=name)
+
+
+def test_a_complete_run_is_left_alone_and_no_run_is_overwritten(trainer, whole, tmp_path):
+    shutil.copytree(whole[0], tmp_path / "run")
+    final = tmp_path / "run" / "final.safetensors"
+    written = final.stat().st_mtime_ns
+    assert trainer.train(final.parent, SEED, Options(resume=final.parent))[1] == {}
+    assert final.stat().st_mtime_ns == written
+    for resume in (None, whole[0]):
+        with pytest.raises(ValueError, match=r"run holds the checkpoints of a run.*--resume .*run"):
+            trainer.train(final.parent, SEED, Options(resume=resume))
+
+
+def test_another_seed_ends_elsewhere(trainer, whole, tmp_path):
+    trainer.train(tmp_path, SEED + 1, Options())
+    found, other = (
+        as_named_arrays(load_checkpoint(folder / "final.safetensors").params)
+        for folder in (tmp_path, whole[0])
+    )
+    kernels = [name for name in found if name.endswith("kernel")]
+    assert kernels and not any(np.array_equal(found[name], other[name]) for name in kernels)
+
+
+def test_the_newest_intact_checkpoint_is_taken(trainer, whole, tmp_path, caplog):
+    shutil.copytree(whole[0], tmp_path / "cut_off")
+    cut_off, newest = tmp_path / "cut_off", step_path(tmp_path / "cut_off", 6)
+    (cut_off / "final.safetensors").write_bytes((whole[0] / "final.safetensors").read_bytes()[:-100])
+    content = bytearray(newest.read_bytes())
+    content[len(content) // 2] ^= 1
+    newest.write_bytes(content)
+    half_written = cut_off / f".{newest.name}.{'a1' * 8}"
+    half_written.write_bytes(b"half")
+    with caplog.at_level(logging.WARNING):
+        trainer.train(tmp_path / "resumed", SEED, Options(resume=cut_off))
+    reports = [record.getMessage() for record in caplog.records]
+    assert len(reports) == 2 and "final.safetensors" in reports[0] and newest.name in reports[1]
+    assert all("damaged" in report and "the checkpoint before it is used" in report for report in reports)
+    assert_same_end(tmp_path / "resumed" / "final.safetensors", whole[0] / "final.safetensors")
+    (cut_off / "final.safetensors").unlink()
+    newest.unlink()
+    trainer.train(cut_off, SEED, Options(resume=cut_off))
+    assert not half_written.exists()
+
+
+def test_folders_without_an_intact_checkpoint_are_refused(whole, tmp_path):
+    with pytest.raises(CheckpointError, match="found no checkpoint"):
+        newest_intact(tmp_path)
+    (tmp_path / "step_5.safetensors").write_bytes(b"nothing")
+    with pytest.raises(CheckpointError, match=r"step_5\.safetensors: not a checkpoint"):
+        newest_intact(tmp_path)
+    final = load_checkpoint(whole[0] / "final.safetensors")
+    save_checkpoint(tmp_path / "policy.safetensors", final.params, final.config, final.meta)
+    with pytest.raises(CheckpointError, match=r"policy\.safetensors: found a policy alone"):
+        newest_intact(tmp_path / "policy.safetensors")
+
+
+def test_a_checkpoint_of_another_run_is_refused_field_by_field(whole):
+    path, checkpoint = newest_intact(whole[0])
+    other = Trainer(Config(learning_rate=1e-4), "FlyTrack-v0", track="split_s")
+    description = describe_run(other.env, other.env_id, other.track, other.config, seed=1)
+    with pytest.raises(CheckpointError) as caught:
+        check_same_run(path, checkpoint, description)
+    for part in (
+        "final.safetensors: does not fit",
+        "env_id: found 'FlyTrackRobust-v0', expected 'FlyTrack-v0'",
+        "seed: found 3, expected 1",
+        "config.learning_rate: found 0.003, expected 0.0001",
+        "row 8",
+        "more",
+    ):
+        assert part in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"software": {"jax": "0.1.0"}}, "software.jax: found '0.1.0'"),
+        ({"machine": {"threads": 1000}}, "machine.threads: found 1000"),
+    ],
+)
+def test_another_machine_or_software_is_a_warning(trainer, whole, caplog, change, message):
+    path, checkpoint = newest_intact(whole[0])
+    warn_of_other_machine(path, checkpoint, trainer.describe(SEED))
+    assert caplog.text == ""
+    warn_of_other_machine(path, checkpoint._replace(meta=checkpoint.meta | change), trainer.describe(SEED))
+    assert message in caplog.text and "perhaps not bit for bit" in caplog.text
+
+
+def poison(trainer, monkeypatch, from_update):
+    """Have training give parameters that are not finite after some updates."""
+    chunk, done = trainer.chunk, [0]
+
+    def poisoned(runner, count):
+        runner, rows = chunk(runner, count)
+        done[0] += int(count)
+        if done[0] <= from_update:
+            return runner, rows
+        params = jax.tree.map(lambda leaf: leaf * jnp.nan, runner.train_state.params)
+        return runner._replace(train_state=runner.train_state.replace(params=params)), rows
+
+    monkeypatch.setattr(trainer, "chunk", poisoned)
+
+
+def test_a_diverged_run_ends_at_once_and_no_checkpoint_has_it(trainer, tmp_path, monkeypatch):
+    poison(trainer, monkeypatch, from_update=2)
+    with pytest.raises(DivergedError) as caught:
+        trainer.train(tmp_path, SEED, EVERY_OTHER_UPDATE)
+    last_good = step_path(tmp_path, 2)
+    for part in (f"between steps {2 * BATCH} and {4 * BATCH}", "params", str(last_good), "--learning-rate"):
+        assert part in str(caught.value)
+    assert newest_intact(tmp_path).path == last_good
+
+
+@pytest.mark.parametrize("broken", ["fly_many", "draw_position_density"])
+def test_an_evaluation_that_fails_does_not_end_the_training(trainer, tmp_path, monkeypatch, caplog, broken):
+    def fail(*arguments):
+        raise RuntimeError("out of paint\nand more")
+
+    monkeypatch.setattr(monitor, "NUM_STEPS", 20)
+    monkeypatch.setattr(monitor, "can_record", lambda: False)
+    monkeypatch.setattr(monitor, broken, fail)
+    trainer.train(tmp_path, SEED, Options(evaluate_every=100 * BATCH, evaluation_episodes=2))
+    assert (tmp_path / "final.safetensors").exists()
+    assert f"after {7 * BATCH} steps" in caplog.text and "out of paint; training goes on" in caplog.text
+
+
+def test_the_best_lap_survives_a_resume(trainer, tmp_path, monkeypatch):
+    steps_evaluated = []
+
+    def evaluate_policy(env, network, params, num_episodes, out, steps, is_recorded=False):
+        steps_evaluated.append(steps // BATCH)
+        return {"evaluation_success": 1.0, "evaluation_best_lap_s": 8.0 + steps / BATCH}, []
+
+    monkeypatch.setattr("baselines.purejaxrl_ppo.run.evaluate_policy", evaluate_policy)
+    trainer.train(tmp_path, SEED, EVALUATED)
+    for path in (tmp_path / "final.safetensors", step_path(tmp_path, 6)):
+        path.unlink()
+    steps_evaluated[:] = []
+    final, _ = trainer.train(tmp_path, SEED, EVALUATED._replace(resume=tmp_path))
+    assert steps_evaluated == [6, 7] and final.meta["best_lap_s"] == 10.0
+
+
+def asked_for(root, options=EVERY_OTHER_UPDATE):
+    return [(root / f"seed{seed}", seed, options) for seed in SEEDS]
+
+
+@pytest.fixture(scope="module")
+def together(trainer, tmp_path_factory):
+    root = tmp_path_factory.mktemp("together")
+    return root, trainer.train_all(asked_for(root))
+
+
+def test_a_seed_learns_what_it_learns_alone(trainer, together):
+    # Sums are taken in another order, and learning amplifies the difference: the first update only.
+    for seed, (checkpoint, metrics) in zip(SEEDS, together[1], strict=True):
+        assert checkpoint.meta["seed"] == seed
+        alone = trainer.chunk(trainer.start(jax.random.key(seed)), jnp.int32(1))[1]
+        for name, values in metrics.items():
+            np.testing.assert_allclose(values[0], alone[name][0], rtol=2e-3, atol=2e-5, err_msg=name)
+
+
+def test_seeds_killed_between_their_checkpoints_end_bit_for_bit(trainer, together, tmp_path, monkeypatch):
+    write = Run._checkpoint
+
+    def die(self, name, runner, update):
+        if update == 4 and self.description["seed"] == SEEDS[1]:
+            raise KeyboardInterrupt
+        write(self, name, runner, update)
+
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(Run, "_checkpoint", die)
+        trainer.train_all(asked_for(tmp_path))
+    starts = [newest_intact(folder) for folder, _, _ in asked_for(tmp_path)]
+    assert [start.steps // BATCH for start in starts] == [4, 2, 2]
+    starts = at_common_step(starts)
+    assert [start.steps // BATCH for start in starts] == [2, 2, 2]
+    asked = asked_for(tmp_path)
+    trainer.train_all(
+        [
+            (out, seed, options._replace(resume=start.path))
+            for (out, seed, options), start in zip(asked, starts, strict=True)
+        ]
+    )
+    for folder, _, _ in asked:
+        assert_same_end(folder / "final.safetensors", together[0] / folder.name / "final.safetensors")
+
+
+def command_line(out: Path, *arguments: str) -> list[str]:
+    settings = f"--num-envs 16 --num-steps 64 --total-timesteps {300 * 1024} --hidden-sizes 8 --seed 5"
+    watching = f"--checkpoint-every {10 * 1024} --evaluate-every 0 --no-tracking --out {out}"
+    train = "-m baselines.purejaxrl_ppo.train_ppo"
+    return [sys.executable, *train.split(), *settings.split(), *watching.split(), *arguments]
+
+
+@pytest.mark.slow
+def test_a_run_killed_at_any_moment_ends_in_the_same_bits(tmp_path):
+    whole, killed = tmp_path / "whole", tmp_path / "killed"
+    subprocess.run(command_line(whole), cwd=ROOT, check=True, capture_output=True, timeout=600)
+    rng = np.random.default_rng()
+    resume, kills = [], 0
+    while not (killed / "final.safetensors").exists():
+        process = subprocess.Popen(
+            command_line(killed, *resume), cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+        )
+        before = set(killed.glob("step_*.safetensors"))
+        deadline_s = time.monotonic() + 300
+        while set(killed.glob("step_*.safetensors")) == before and process.poll() is None:
+            assert time.monotonic() < deadline_s
+            time.sleep(0.01)
+        if kills < 4:
+            time.sleep(float(rng.uniform(0.0, 0.3)))
+            process.kill()
+            kills += 1
+        process.wait(timeout=600)
+        resume = ["--resume", str(killed)]
+    assert kills == 4
+    assert_same_end(killed / "final.safetensors", whole / "final.safetensors")
