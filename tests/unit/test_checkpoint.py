@@ -115,7 +115,7 @@ def test_what_is_not_a_checkpoint_is_refused(tmp_path, content, reason):
 
 def test_a_file_that_is_too_large_is_not_read(path, params, monkeypatch):
     monkeypatch.setattr(checkpoint_module, "LARGEST_BYTES", 3000)
-    with pytest.raises(CheckpointError, match="found more than 3000 bytes"):
+    with pytest.raises(CheckpointError, match="expected at most 3000"):
         load_checkpoint(path)
     with pytest.raises(CheckpointError, match=r"found \d+ bytes to write, expected at most 3000"):
         save_checkpoint(path, params, CONFIG, DESCRIPTION)
