@@ -42,17 +42,6 @@ def test_identity(leaf: str, transform: str) -> None:
         np.testing.assert_array_equal(np.signbit(result), np.signbit(value))
 
 
-@pytest.mark.parametrize("first", LEAVES)
-def test_trees_keep_structure_order_and_types(first: str) -> None:
-    tree = {"a": (LEAVES[first], [LEAVES["int"]]), "b": LEAVES["bool"], "c": None}
-    for function in (compute_once, jax.jit(compute_once)):
-        result = function(tree)
-        assert jax.tree.structure(result) == jax.tree.structure(tree)
-        for a, b in zip(jax.tree.leaves(result), jax.tree.leaves(tree), strict=True):
-            assert a.dtype == b.dtype
-            np.testing.assert_array_equal(a, b)
-
-
 def test_vmap_over_some_leaves_only() -> None:
     pair = jax.jit(jax.vmap(lambda x, y: compute_once((x, y)), in_axes=(0, None)))
     x, y = pair(jnp.arange(3.0), jnp.float32(5.0))
@@ -82,24 +71,6 @@ def test_derivatives_pass_through(order: int, differentiate: Any, is_jitted: boo
         functions.append(jax.jit(function) if is_jitted else function)
     expected, result = (function(jnp.float32(0.7), jnp.int32(3)) for function in functions)
     np.testing.assert_allclose(result, expected, rtol=1e-6)
-
-
-def test_jvp_and_vjp_pass_tangents_through() -> None:
-    x = jnp.array([1.0, 2.0])
-    tangent = jnp.array([0.3, -0.5])
-    for wrap in (lambda f: f, jax.jit):
-        value, pushed = jax.jvp(wrap(compute_once), (x,), (tangent,))
-        np.testing.assert_array_equal(value, x)
-        np.testing.assert_array_equal(pushed, tangent)
-        value, pull = jax.vjp(wrap(compute_once), x)
-        np.testing.assert_array_equal(pull(tangent)[0], tangent)
-
-
-def test_gradients_of_a_batch() -> None:
-    x = jnp.linspace(-1.0, 1.0, 5)
-    n = jnp.arange(5)
-    expected = jax.vmap(jax.grad(plain))(x, n)
-    np.testing.assert_allclose(jax.jit(jax.vmap(jax.grad(fenced)))(x, n), expected, rtol=1e-6)
 
 
 @pytest.mark.parametrize(

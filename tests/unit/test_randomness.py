@@ -1,4 +1,4 @@
-"""Normal draws: close to the normal distribution, and apart from each other."""
+"""Named draws: uniform or normal, and independent of each other."""
 
 import jax
 import jax.numpy as jnp
@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from flytrack_env.randomness import BYTES_DEVIATION, NORMAL, Draws, next_word
+from flytrack_env.randomness import BYTES_DEVIATION, NORMAL, Draws, next_word, seed_of, seeds_of
 
 NUM_DRAWS = 1_000_000
 
@@ -64,3 +64,51 @@ def test_names_and_steps_are_independent(normals: dict[str, np.ndarray]) -> None
     series = np.asarray(jax.vmap(lambda word: Draws(word).normal("a"))(jnp.array(chain, jnp.uint32)))
     for lag in (1, 2, 3):
         assert abs(np.corrcoef(series[lag:], series[:-lag])[0, 1]) < 0.08
+
+
+# --- Uniform draws and words ------------------------------------------------------------------------
+
+NAMES = ("kind", "gate", "roll", "pitch", "along", "offset_x", "offset_y", "speed", "yaw", "battery")
+NUM_WORDS = 20_000
+WORDS = {
+    "of keys": lambda: jax.vmap(seed_of)(jax.random.split(jax.random.key(0), NUM_WORDS)),
+    "of counted keys": lambda: jax.vmap(lambda i: seed_of(jax.random.key(i)))(jnp.arange(NUM_WORDS)),
+    "of one key": lambda: seeds_of(jax.random.key(0), jnp.arange(NUM_WORDS)),
+    "of a counter": lambda: jnp.arange(NUM_WORDS, dtype=jnp.uint32),
+}
+
+
+@jax.jit
+@jax.vmap
+def draw_all(word: jax.Array) -> jax.Array:
+    """Return a uniform draw per name."""
+    return jnp.stack([Draws(word).uniform(name, 0.0, 1.0) for name in NAMES])
+
+
+@pytest.mark.parametrize("source", WORDS)
+def test_draws_are_uniform_and_uncorrelated(source: str) -> None:
+    words = WORDS[source]()
+    assert words.dtype == jnp.uint32
+    values = np.asarray(draw_all(words), float)
+    assert values.min() >= 0.0 and values.max() < 1.0
+    for column in values.T:
+        assert stats.kstest(column, "uniform").pvalue > 1e-3
+    correlation = np.corrcoef(values.T) - np.eye(len(NAMES))
+    assert np.abs(correlation).max() < 4.5 / np.sqrt(NUM_WORDS)
+    lagged = [np.corrcoef(column[:-1], column[1:])[0, 1] for column in values.T]
+    assert np.abs(lagged).max() < 4.5 / np.sqrt(NUM_WORDS)
+
+
+@pytest.mark.parametrize("count", [1, 3, 8])
+def test_index_is_even_over_its_range(count: int) -> None:
+    words = seeds_of(jax.random.key(2), jnp.arange(NUM_WORDS))
+    indices = jax.vmap(lambda word: Draws(word).index("gate", count))(words)
+    assert indices.dtype == jnp.int32
+    counts = np.bincount(np.asarray(indices), minlength=count)
+    assert len(counts) == count
+    assert count == 1 or stats.chisquare(counts).pvalue > 1e-4
+
+
+def test_legacy_keys_are_as_good_as_typed_ones() -> None:
+    for seed in range(16):
+        assert int(seed_of(jax.random.key(seed))) == int(seed_of(jax.random.PRNGKey(seed)))
