@@ -18,34 +18,21 @@ from benchmarks import report
 from benchmarks.report import cpu_name as cpu_name
 from benchmarks.report import versions as versions
 
-NUM_ACTIONS_L2F = 16  # drawn in advance and flown in turn
+NUM_ACTIONS = 16  # drawn in advance and used in turn
 L2F_TIME_LIMIT = 500  # steps
 
 PENDULUM = "gymnax Pendulum-v1, vmap, 1,024"
 L2F_SMALL, L2F_LARGE = "l2f full step, 1,024", "l2f full step, 4,096"
 PLAIN, BATCH = "FlyTrack vmap(step), 1,024", "FlyTrack step_batch, 4,096"
 VARIANTS = {
-    f"{env_id} vmap(step), 1,024": env_id
-    for env_id in (
-        "FlyTrackNoisy-v0",
-        "FlyTrackActionHistory-v0",
-        "FlyTrackRandomized-v0",
-        "FlyTrackRobust-v0",
-    )
+    f"FlyTrack{name}-v0 vmap(step), 1,024": f"FlyTrack{name}-v0"
+    for name in ("Noisy", "ActionHistory", "Randomized", "Robust")
 }
 MOST_COSTLY = 1.5  # a variant's step over the plain one's
 
 
-class Target(NamedTuple):
-    """A ratio of rates to reach."""
-
-    ours: str
-    peer: str
-    goal: float
-    stretch: float
-
-
-TARGETS = (Target(PLAIN, L2F_SMALL, 3.0, 5.0), Target(BATCH, L2F_LARGE, 8.0, 12.0))
+# Our rate, the peer's, the ratio to reach and the one to hope for.
+TARGETS = ((PLAIN, L2F_SMALL, 3.0, 5.0), (BATCH, L2F_LARGE, 8.0, 12.0))
 
 
 class Contestant(NamedTuple):
@@ -98,16 +85,12 @@ def l2f_contestant(name: str, num_envs: int, length: int) -> Contestant:
 
     vector = l2f.vector_selector[num_envs]
     device, rng, env = l2f.Device(), vector.VectorRng(), vector.VectorEnvironment()
-    parameters, state, next_state = (
-        vector.VectorParameters(),
-        vector.VectorState(),
-        vector.VectorState(),
-    )
+    parameters, state, next_state = vector.VectorParameters(), vector.VectorState(), vector.VectorState()
     vector.initialize_rng(device, rng, 0)
     vector.initialize_environment(device, env)
     vector.sample_initial_parameters(device, env, parameters, rng)
     vector.sample_initial_state(device, env, parameters, state, rng)
-    shape = (NUM_ACTIONS_L2F, num_envs, 4)
+    shape = (NUM_ACTIONS, num_envs, 4)
     actions = np.random.default_rng(0).uniform(-1.0, 1.0, shape).astype(np.float32)
     observation = np.empty((num_envs, env.OBSERVATION_DIM), np.float32)
     reward, terminated = np.empty(num_envs, np.float32), np.empty(num_envs, bool)
@@ -117,7 +100,7 @@ def l2f_contestant(name: str, num_envs: int, length: int) -> Contestant:
         nonlocal state, next_state, age
         world = (device, env, parameters)
         for i in range(length):
-            action = actions[i % NUM_ACTIONS_L2F]
+            action = actions[i % NUM_ACTIONS]
             vector.step(*world, state, action, next_state, rng)
             vector.reward(*world, state, action, next_state, reward, rng)
             vector.terminated(*world, next_state, terminated, rng)
@@ -159,27 +142,9 @@ def measure(entries: list[Contestant], repeats: int, warm_up: int = 3) -> dict[s
     return rates
 
 
-def ratios(rates: dict[str, list[float]]) -> list[dict[str, Any]]:
-    """Return the measured ratio of each target whose contestants all ran.
-
-    The median over the rounds of the ratio within a round: drift of the machine cancels.
-    """
-    rows = []
-    for target in TARGETS:
-        if target.ours in rates and target.peer in rates:
-            pairs = zip(rates[target.ours], rates[target.peer], strict=True)
-            rows.append({**target._asdict(), "ratio": statistics.median(a / b for a, b in pairs)})
-    return rows
-
-
-def costs(rates: dict[str, list[float]]) -> dict[str, float]:
-    """Return what a step of each variant costs over a plain one: the median of the rounds' ratios."""
-    return {
-        name: statistics.median(
-            plain / variant for plain, variant in zip(rates[PLAIN], rates[name], strict=True)
-        )
-        for name in VARIANTS
-    }
+def median_ratio(rates: dict[str, list[float]], name: str, peer: str) -> float:
+    """Return the median of the rounds' ratios, in which drift of the machine cancels."""
+    return statistics.median(a / b for a, b in zip(rates[name], rates[peer], strict=True))
 
 
 def as_page(result: dict[str, Any]) -> str:
@@ -189,8 +154,9 @@ def as_page(result: dict[str, Any]) -> str:
         for name, found in result["rates"].items()
     )
     targets = (
-        (f"{row['ours']} to {row['peer']}", f"{row['ratio']:.1f}", f"{row['goal']:g}", f"{row['stretch']:g}")
-        for row in result["ratios"]
+        (f"{name} to {peer}", f"{result['ratios'][name]:.1f}", f"{goal:g}", f"{stretch:g}")
+        for name, peer, goal, stretch in TARGETS
+        if name in result["ratios"]
     )
     costs = ((name, f"{cost:.2f}", f"{MOST_COSTLY:g}") for name, cost in result["costs"].items())
     return report.page(
@@ -213,8 +179,8 @@ def main() -> None:
     rates = measure(contestants(), arguments.repeats)
     result = {
         "rates": rates,
-        "ratios": ratios(rates),
-        "costs": costs(rates),
+        "ratios": {name: median_ratio(rates, name, peer) for name, peer, *_ in TARGETS if peer in rates},
+        "costs": {name: median_ratio(rates, PLAIN, name) for name in VARIANTS},
         "core": core,
         "repeats": arguments.repeats,
         "provenance": report.provenance("l2f"),

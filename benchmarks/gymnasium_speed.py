@@ -14,11 +14,10 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks import report
-from benchmarks.env_speed import Contestant, measure
+from benchmarks.env_speed import NUM_ACTIONS, Contestant, measure
 
 ENV_ID = "flytrack_env:FlyTrack-v0"
 NUM_ENVS = 1024
-NUM_ACTIONS = 16  # drawn in advance and flown in turn
 
 
 def vector_contestant(num_steps: int = 200) -> Contestant:

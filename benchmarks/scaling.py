@@ -37,19 +37,19 @@ def measure_table(name: str) -> dict[str, Any]:
     pinned = report.pin_to_one_core()
     import jax
 
-    from benchmarks.scaling_rates import TABLES as ROWS
+    from benchmarks.scaling_rates import TABLES as RATES
 
-    title, rows = ROWS[name]
+    title, values, rate_of = RATES[name]
     device = report.cpu_name() if jax.default_backend() == "cpu" else jax.devices()[0].device_kind
-    measured = list(report.progress(rows(), name))
-    return {"title": title, "rows": measured, "device": f"{device}; {pinned}", **report.provenance()}
+    rows = [(value, *rate_of(value)) for value in report.progress(values, name)]
+    return {"title": title, "rows": rows, "device": f"{device}; {pinned}", **report.provenance()}
 
 
 def rate_table(result: dict[str, Any]) -> str:
     """Return a table of rates in Markdown."""
     rows = (
-        (f"{what:,}" if isinstance(what, int) else what, f"{rate:.3g}", f"{start_s:.1f}")
-        for what, rate, start_s in result["rows"]
+        (f"{value:,}" if isinstance(value, int) else value, f"{rate:.3g}", f"{start_s:.1f}")
+        for value, rate, start_s in result["rows"]
     )
     return report.table((result["title"], "million steps per second", "start (s)"), rows)
 
@@ -94,25 +94,19 @@ def train(out: Path, seed: int, steps: int, processes: int, devices: int) -> flo
     return ended.children_user + ended.children_system - started.children_user - started.children_system
 
 
-def last_evaluation(out: Path) -> tuple[float, float | None]:
-    """Return success, and the best flying lap, s, of the evaluation at the end of a training."""
-    from baselines.purejaxrl_ppo import load_checkpoint
-
-    meta = load_checkpoint(out / "final.safetensors").meta
-    return meta["success"], meta["best_lap_s"]
-
-
 def measure_processes(folder: Path, seeds: int, steps: int) -> dict[str, Any]:
     """Train every seed in every arrangement; return the results as JSON values."""
+    from baselines.purejaxrl_ppo import load_checkpoint
+
     rows = []
     for name, (processes, devices) in ARRANGEMENTS.items():
         results, cpu_s, started = [], 0.0, time.perf_counter()
         for seed in range(seeds):
             out = folder / f"{processes}x{devices}_{seed}"
             cpu_s += train(out, seed, steps, processes, devices)
-            results.append(last_evaluation(out))
-        success, laps_s = zip(*results, strict=True)
-        row = {"arrangement": name, "success": success, "best_lap_s": laps_s, "cpu_s": cpu_s / seeds}
+            results.append(load_checkpoint(out / "final.safetensors").meta)
+        row: dict[str, Any] = {"arrangement": name, "cpu_s": cpu_s / seeds}
+        row |= {key: [result[key] for result in results] for key in ("success", "best_lap_s")}
         rows.append(row | {"wall_s": (time.perf_counter() - started) / seeds})
     title = "the same training on several devices and in several processes"
     text = process_table(rows, steps)
@@ -132,10 +126,7 @@ def process_table(rows: list[dict[str, Any]], steps: int) -> str:
     return (
         f"`train_ppo --total-timesteps {steps}`: success of {EPISODES} noisy starts in the simulator and "
         "best lap, by seed; CPU and wall time of a training, including its start.\n\n"
-        + report.table(
-            "arrangement | success, by seed | best lap (s), by seed | CPU (s) | wall (s)",
-            cells,
-        )
+        + report.table("arrangement | success, by seed | best lap (s), by seed | CPU (s) | wall (s)", cells)
     )
 
 

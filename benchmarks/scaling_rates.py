@@ -2,7 +2,7 @@
 
 import statistics
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
@@ -16,15 +16,9 @@ from flytrack_env.tracks import random_track
 
 ON_CPU, ON_ACCELERATOR = (64, 256, 1_024, 4_096, 16_384, 65_536), (1_024, 16_384, 131_072, 1_048_576)
 NUM_ENVS = 4_096
-TRAINED_ENVS = (256, 1_024, 4_096, 16_384)
-WIDTHS = (16, 32, 64, 128, 256)
-GATES, ARENA_M = (4, 8, 16, 24), (60.0, 80.0)
-NUM_EFFECTS = (0, 1, 2, 4, 8, len(EFFECTS))
-SEEDS = (1, 2, 4, 8)
+ARENA_M = (60.0, 80.0)
 STEPS_PER_CALL = 2**20  # long enough to time, short enough to repeat
 REPEATS = 5
-
-Row = tuple[Any, float, float]  # what was varied, million steps a second (median), compile time, s
 
 
 def clock() -> float:
@@ -64,26 +58,17 @@ def environment_rate(env: Any, num_envs: int) -> tuple[float, float]:
     return rate(lambda: fly(state, jax.random.key(1)), length * num_envs)
 
 
-def environments() -> Iterator[Row]:
-    """Yield rates over the number of environments."""
-    env = flytrack_env.make("FlyTrack-v0")
-    for num_envs in ON_CPU if jax.default_backend() == "cpu" else ON_ACCELERATOR:
-        yield num_envs, *environment_rate(env, num_envs)
+def rate_with_effects(number: int) -> tuple[float, float]:
+    """Return the rate of a model with the first effects of the list."""
+    chosen = [effect.parameters() for effect in EFFECTS[:number]]
+    model = flytrack_env.nominal_parameters().with_effects(*chosen)
+    return environment_rate(flytrack_env.make("FlyTrack-v0", model=model), NUM_ENVS)
 
 
-def effects() -> Iterator[Row]:
-    """Yield rates over the number of effects in the model, in the order of the list."""
-    for number in NUM_EFFECTS:
-        chosen = [effect.parameters() for effect in EFFECTS[:number]]
-        model = flytrack_env.nominal_parameters().with_effects(*chosen)
-        yield number, *environment_rate(flytrack_env.make("FlyTrack-v0", model=model), NUM_ENVS)
-
-
-def gates() -> Iterator[Row]:
-    """Yield rates over the number of gates of a random course."""
-    for number in GATES:
-        track = random_track(0, num_gates=number, size=ARENA_M)
-        yield number, *environment_rate(flytrack_env.make("FlyTrack-v0", track=track), NUM_ENVS)
+def rate_with_gates(number: int) -> tuple[float, float]:
+    """Return the rate on a random course."""
+    track = random_track(0, num_gates=number, size=ARENA_M)
+    return environment_rate(flytrack_env.make("FlyTrack-v0", track=track), NUM_ENVS)
 
 
 def training_rate(config: Config, num_seeds: int = 1) -> tuple[float, float]:
@@ -97,32 +82,27 @@ def training_rate(config: Config, num_seeds: int = 1) -> tuple[float, float]:
     return rate(lambda: trainer.chunk_of_many(together, jnp.int32(1)), steps)
 
 
-def trained_environments() -> Iterator[Row]:
-    """Yield rates of training over the number of environments, at the recipe's minibatch size."""
+def training_rate_with_environments(num_envs: int) -> tuple[float, float]:
+    """Return the rate of training with a number of environments, at the recipe's minibatch size."""
     recipe = Config()
-    for num_envs in TRAINED_ENVS:
-        minibatches = max(1, recipe.num_minibatches * num_envs // recipe.num_envs)
-        config = Config(num_envs=num_envs, num_minibatches=minibatches)
-        yield num_envs, *training_rate(config)
+    minibatches = max(1, recipe.num_minibatches * num_envs // recipe.num_envs)
+    return training_rate(Config(num_envs=num_envs, num_minibatches=minibatches))
 
 
-def widths() -> Iterator[Row]:
-    """Yield rates of training over the width of both hidden layers."""
-    for width in WIDTHS:
-        yield f"2 x {width}", *training_rate(Config(hidden_sizes=(width, width)))
-
-
-def seeds() -> Iterator[Row]:
-    """Yield rates of training over the number of seeds trained together, total steps of all."""
-    for number in SEEDS:
-        yield number, *training_rate(Config(), number)
-
-
-TABLES: dict[str, tuple[str, Callable[[], Iterable[Row]]]] = {
-    "environments": ("environments", environments),
-    "effects": ("effects in the model", effects),
-    "gates": ("gates", gates),
-    "training": ("environments of a training", trained_environments),
-    "networks": ("hidden layers", widths),
-    "seeds": ("seeds side by side", seeds),
+# Title, values, rate at a value: million steps a second (median) and compile time, s.
+TABLES: dict[str, tuple[str, Sequence[Any], Callable[[Any], tuple[float, float]]]] = {
+    "environments": (
+        "environments",
+        ON_CPU if jax.default_backend() == "cpu" else ON_ACCELERATOR,
+        lambda number: environment_rate(flytrack_env.make("FlyTrack-v0"), number),
+    ),
+    "effects": ("effects in the model", (0, 1, 2, 4, 8, len(EFFECTS)), rate_with_effects),
+    "gates": ("gates", (4, 8, 16, 24), rate_with_gates),
+    "training": ("environments of a training", (256, 1_024, 4_096, 16_384), training_rate_with_environments),
+    "networks": (
+        "width of both hidden layers",
+        (16, 32, 64, 128, 256),
+        lambda width: training_rate(Config(hidden_sizes=(width, width))),
+    ),
+    "seeds": ("seeds side by side", (1, 2, 4, 8), lambda number: training_rate(Config(), number)),
 }

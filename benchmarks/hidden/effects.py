@@ -84,29 +84,20 @@ def _rate_saturation(values: Parameters) -> Hook:
 def _rate_cross_coupling(values: Parameters) -> Hook:
     """omega_z += from_roll omega_x + from_pitch omega_y."""
     from_roll, from_pitch = values["from_roll"], values["from_pitch"]
-    return lambda plant, rates: (
-        rates[0],
-        rates[1],
-        rates[2] + from_roll * rates[0] + from_pitch * rates[1],
-    )
+    return lambda plant, rates: (*rates[:2], rates[2] + from_roll * rates[0] + from_pitch * rates[1])
 
 
 def _motor_imbalance(values: Parameters) -> Hook:
     """omega_x += roll T/m, omega_y += pitch T/m; rad/s per m/s^2."""
-    roll, pitch = values["roll"], values["pitch"]
-    return lambda plant, rates: (
-        rates[0] + roll * plant.thrust_acc,
-        rates[1] + pitch * plant.thrust_acc,
-        rates[2],
-    )
+    gains = (values["roll"], values["pitch"], 0.0)
+    return lambda plant, rates: tuple(w + k * plant.thrust_acc for w, k in zip(rates, gains, strict=True))
 
 
 def _yaw_reaction(values: Parameters) -> Hook:
     """omega_z += angle du/dt, u the lagged thrust action; rad."""
     gain = values["angle"] / DT_S
     return lambda plant, rates: (
-        rates[0],
-        rates[1],
+        *rates[:2],
         rates[2] + gain * (plant.applied[3] - plant.applied_before[3]),
     )
 
@@ -179,12 +170,8 @@ def _ground_effect(values: Parameters) -> Hook:
 
 def _linear_drag(values: Parameters) -> Hook:
     """f -= (d_x v_x, d_y v_y, d_z v_z), v the airspeed in the body."""
-
-    def act(plant: Any) -> Vector:
-        x, y, z = plant.airspeed_b
-        return (-values["d_x"] * x, -values["d_y"] * y, -values["d_z"] * z)
-
-    return act
+    drag = (values["d_x"], values["d_y"], values["d_z"])
+    return lambda plant: tuple(-d * v for d, v in zip(drag, plant.airspeed_b, strict=True))
 
 
 def _quadratic_drag(values: Parameters) -> Hook:
@@ -192,12 +179,8 @@ def _quadratic_drag(values: Parameters) -> Hook:
 
     The package's law with ``shared`` at 0; by default it multiplies each axis by the whole speed.
     """
-
-    def act(plant: Any) -> Vector:
-        x, y, z = plant.airspeed_b
-        return (-values["k_x"] * abs(x) * x, -values["k_y"] * abs(y) * y, -values["k_z"] * abs(z) * z)
-
-    return act
+    drag = (values["k_x"], values["k_y"], values["k_z"])
+    return lambda plant: tuple(-k * abs(v) * v for k, v in zip(drag, plant.airspeed_b, strict=True))
 
 
 def _rotor_drag(values: Parameters) -> Hook:
@@ -212,11 +195,8 @@ def _rotor_drag(values: Parameters) -> Hook:
 
 def _thrust_tilt(values: Parameters) -> Hook:
     """f += T/m (towards_x, towards_y, 0); rad."""
-    return lambda plant: (
-        values["towards_x"] * plant.thrust_acc,
-        values["towards_y"] * plant.thrust_acc,
-        0.0,
-    )
+    x, y = values["towards_x"], values["towards_y"]
+    return lambda plant: (x * plant.thrust_acc, y * plant.thrust_acc, 0.0)
 
 
 def _wind(values: Parameters) -> Hook:

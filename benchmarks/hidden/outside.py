@@ -26,17 +26,6 @@ from benchmarks.hidden.noise import ACCELEROMETER_STD, GYRO_STD
 from benchmarks.hidden.truth import DT_S, Outside, Truth
 from benchmarks.hidden.vectors import Vector, norm, scale, to_body
 
-DEPENDS_ON = {
-    "position": ("position",),
-    "time": ("time",),
-    "heading": ("heading",),
-    "airspeed": ("airspeed",),
-    "attitude": ("tilt",),
-    "command": ("command",),
-    "periodic": ("frequency",),
-    "stochastic": ("chance",),
-}
-KINDS = tuple(DEPENDS_ON)
 # An amplitude of 1: m/s^2 of forces and of thrust over mass, rad/s of rates.
 SCALES = {"force": ACCELEROMETER_STD, "thrust": ACCELEROMETER_STD, "rate": GYRO_STD}
 SMALLEST, LARGEST = 0.3, 3.0  # amplitudes that are drawn
@@ -49,8 +38,7 @@ Shape = dict[str, float]
 ChannelAndShape = tuple[str, Shape]
 AXES = ("x", "y", "z")
 STICK_AXES = 4
-YAW = {"x": 0.0, "y": 0.0, "z": 1.0}
-UP = {"x": 0.0, "y": 0.0, "z": 1.0}
+YAW, DOWN = {"x": 0.0, "y": 0.0, "z": 1.0}, {"x": -0.0, "y": -0.0, "z": -1.0}
 # Ranges of shape parameters.
 MOST_LEAN, WAVE = math.radians(40.0), (0.3, 1.0)  # rad; shares of waves in the heading
 RADIUS_M, MIDDLE_SHARE = (4.0, 12.0), (0.25, 0.75)
@@ -79,10 +67,6 @@ class FirstOrderNoise:
 
 def _bump(value: float, middle: float, width: float) -> float:
     return math.exp(-0.5 * ((value - middle) / width) ** 2)
-
-
-def _direction(shape: Any) -> Vector:
-    return (shape["x"], shape["y"], shape["z"])
 
 
 def _position(shape: Any, plant: Any) -> float:
@@ -121,16 +105,6 @@ def _periodic(shape: Any, plant: Any) -> float:
     return math.sin(2.0 * math.pi * shape["frequency_hz"] * plant.time_s + shape["phase"])
 
 
-SIGNALS: dict[str, Callable[[Any, Any], float]] = {
-    "position": _position,
-    "time": _time,
-    "heading": _heading,
-    "airspeed": _airspeed,
-    "attitude": _attitude,
-    "periodic": _periodic,
-}
-
-
 def vector_hook(outside: Outside, rng: np.random.Generator) -> Callable[[Any], Vector]:
     """Return a hook that adds a force, body, m/s^2, or body rates, rad/s."""
     size, shape = outside.amplitude * SCALES[outside.channel], outside.shape
@@ -139,7 +113,7 @@ def vector_hook(outside: Outside, rng: np.random.Generator) -> Callable[[Any], V
         if outside.channel == "rate":
             return lambda plant: scale(size, process.step())
         return lambda plant: to_body(plant.rows, scale(size, process.step()))
-    signal = SIGNALS[outside.kind]
+    signal = TABLE[outside.kind][2]
     if outside.kind == "airspeed":
 
         def against(plant: Any) -> Vector:
@@ -147,7 +121,7 @@ def vector_hook(outside: Outside, rng: np.random.Generator) -> Callable[[Any], V
             return scale(-size * signal(shape, plant) / speed, plant.airspeed_b)
 
         return against
-    direction = _direction(shape)
+    direction = (shape["x"], shape["y"], shape["z"])
     if outside.kind == "position":
         return lambda plant: to_body(plant.rows, scale(size * signal(shape, plant), direction))
     return lambda plant: scale(size * signal(shape, plant), direction)
@@ -188,11 +162,7 @@ def _draw_position(rng: Rng) -> ChannelAndShape:
     side, lean = rng.uniform(-math.pi, math.pi), rng.uniform(0.0, MOST_LEAN)
     way = (math.sin(lean) * math.cos(side), math.sin(lean) * math.sin(side), up * math.cos(lean))
     shape = dict(zip(AXES, way, strict=True))
-    return "force", {
-        **shape,
-        "radius_m": rng.uniform(*RADIUS_M),
-        "at_share": rng.uniform(*MIDDLE_SHARE),
-    }
+    return "force", shape | {"radius_m": rng.uniform(*RADIUS_M), "at_share": rng.uniform(*MIDDLE_SHARE)}
 
 
 def _draw_time(rng: Rng) -> ChannelAndShape:
@@ -222,7 +192,7 @@ def _draw_airspeed(rng: Rng) -> ChannelAndShape:
 
 def _draw_attitude(rng: Rng) -> ChannelAndShape:
     shape = {"tilt_deg": rng.uniform(*TILT_DEG), "width_deg": rng.uniform(*TILT_WIDTH_DEG)}
-    return "thrust", {**shape, **{axis: -part for axis, part in UP.items()}}
+    return "thrust", {**shape, **DOWN}
 
 
 def _draw_command(rng: Rng) -> ChannelAndShape:
@@ -241,16 +211,18 @@ def _draw_stochastic(rng: Rng) -> ChannelAndShape:
     return ("force" if rng.random() < 0.5 else "rate"), {"time_constant_s": rng.uniform(*GUST_S)}
 
 
-SHAPES: dict[str, Callable[[Rng], ChannelAndShape]] = {
-    "position": _draw_position,
-    "time": _draw_time,
-    "heading": _draw_heading,
-    "airspeed": _draw_airspeed,
-    "attitude": _draw_attitude,
-    "command": _draw_command,
-    "periodic": _draw_periodic,
-    "stochastic": _draw_stochastic,
+# Kind -> what it is a function of, its draw, and its signal where it has one.
+TABLE: dict[str, tuple[str, Callable[[Rng], ChannelAndShape], Callable[[Any, Any], float] | None]] = {
+    "position": ("position", _draw_position, _position),
+    "time": ("time", _draw_time, _time),
+    "heading": ("heading", _draw_heading, _heading),
+    "airspeed": ("airspeed", _draw_airspeed, _airspeed),
+    "attitude": ("tilt", _draw_attitude, _attitude),
+    "command": ("command", _draw_command, None),
+    "periodic": ("frequency", _draw_periodic, _periodic),
+    "stochastic": ("chance", _draw_stochastic, None),
 }
+KINDS = tuple(TABLE)
 
 
 def draw_outside(rng: Rng, kind: str | None = None, amplitude: float | None = None) -> Outside:
@@ -264,5 +236,6 @@ def draw_outside(rng: Rng, kind: str | None = None, amplitude: float | None = No
     kind = str(rng.choice(KINDS)) if kind is None else kind
     if amplitude is None:
         amplitude = math.exp(rng.uniform(math.log(SMALLEST), math.log(LARGEST)))
-    channel, shape = SHAPES[kind](rng)
-    return Outside(kind, DEPENDS_ON[kind], channel, float(amplitude), shape)
+    depends_on, draw, _ = TABLE[kind]
+    channel, shape = draw(rng)
+    return Outside(kind, (depends_on,), channel, float(amplitude), shape)

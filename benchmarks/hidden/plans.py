@@ -2,15 +2,9 @@
 
 A plan does not depend on the plant, so where it leads is known before the flight. Its kinds:
 
-==============  ===================================================================================
-kind            what is flown
-==============  ===================================================================================
-scripted        everything: legs of 0 to 18 m/s, low passes, waves on one stick, flips, thrust steps
-race            fast through waypoints, the nose ahead, no deliberate manoeuvres
-hover           one place, one heading, small corrections
-hover_headings  one place, several headings
-slow            legs of 0.5 to 3 m/s
-==============  ===================================================================================
+- scripted: everything: legs of 0 to 18 m/s, low passes, waves on one stick, flips, thrust steps;
+- race: fast through waypoints, the nose ahead, no deliberate manoeuvres;
+- hover: one place, one heading, small corrections.
 """
 
 import math
@@ -44,16 +38,15 @@ LOW_M, SINK_M, SINK_S, SETTLE_S = (0.15, 1.0), 0.7, 0.8, 0.7  # the last metre i
 LOWER_M, SLOWER = 0.2, 0.9  # changes of low heights and of speeds per repeated attempt
 YAW_TURN = (1.2, math.pi)  # rad
 # Kinds of flights.
-HOVER_M, RACE_M, SLOW_M = (1.5, 8.0), (1.5, 5.0), (1.5, 6.0)  # heights
+HOVER_M, RACE_M = (1.5, 8.0), (1.5, 5.0)  # heights
 CORRECTION_M, CORRECTION_S = 0.25, 0.8  # of small moves in a hover
-RACE_SPEEDS, SLOW_SPEEDS = (7.0, 16.0), (0.5, 3.0)  # m/s
+RACE_SPEEDS = (7.0, 16.0)  # m/s
 WAYPOINTS_M = 25.0  # their spread, horizontally
 MOST_SIDEWAYS = 13.0  # m/s^2, of a race's turns
 RACE_SPEEDING_UP, RACE_CLIMB = 6.0, 1.5  # m/s^2, m/s
 TURN_GAIN, SLOWEST_TURN = 3.0, 3.0  # 1/s; m/s, below which turns are no quicker
 NEAR_S, CHASE_S = 0.3, (3.0, 6.0)  # to a waypoint that counts as met; how long one is flown at
 BEGIN_S, STILL_S = 0.5, (2.0, 4.5)  # of hover before something begins, and between moves
-SLOW_HOLD_S, SLOW_TURNING = (2.0, 4.0), 0.3  # s, rad/s
 START_SPREAD_M = 5.0
 HIGHER_M = 1.5  # per repeated attempt, for kinds that are flown low throughout
 
@@ -285,20 +278,6 @@ def _hover(sketch: Sketch, seconds: float) -> None:
             sketch.add(speed)
 
 
-def _hover_headings(sketch: Sketch, seconds: float) -> None:
-    while len(sketch) * DT_S < seconds:
-        sketch.wait(sketch.rng.uniform(*STILL_S))
-        sketch.turn_to(sketch.rng.uniform(-math.pi, math.pi))
-
-
-def _slow(sketch: Sketch, seconds: float) -> None:
-    rng = sketch.rng
-    while len(sketch) * DT_S < seconds:
-        leg(sketch, rng.uniform(*SLOW_SPEEDS), rng.uniform(*SLOW_HOLD_S), rng.normal(0.0, SLOW_TURNING))
-        sketch.wait(BEGIN_S)
-        sketch.climb_to(HIGHER_M * sketch.caution + rng.uniform(*SLOW_M))
-
-
 def _race(sketch: Sketch, seconds: float) -> None:
     """Steer towards waypoints at limited turn rates; take the next when one is near or out of time."""
     rng = sketch.rng
@@ -324,8 +303,6 @@ FLIGHT_KINDS: dict[str, tuple[tuple[float, float], Callable[[Sketch, float], Non
     "scripted": (HIGH_M, _scripted),
     "race": (RACE_M, _race),
     "hover": (HOVER_M, _hover),
-    "hover_headings": (HOVER_M, _hover_headings),
-    "slow": (SLOW_M, _slow),
 }
 
 

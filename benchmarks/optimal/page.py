@@ -4,18 +4,16 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib.figure import Figure
 
 from benchmarks import report
 from benchmarks.optimal.replay import Replay
 from flytrack_env.files import write_atomically
-from flytrack_env.pictures.drawing import draw_gates, draw_path, label_from_above, png_of
+from flytrack_env.pictures import draw_flight, make_flight
+from flytrack_env.pictures.drawing import png_of
 from flytrack_env.references import Reference
 from flytrack_env.state import POSITION, VELOCITY
 from flytrack_env.tracks import Track
 
-DPI = 100
-PANEL_IN, BAR_IN, TITLE_IN = 5.6, 1.4, 0.7  # the longer side of a panel; room for the scale and a title
 TITLES = {"flying": "flying lap", "standing": "standing start"}
 MILLI = 1e3
 HEADER = (
@@ -42,42 +40,16 @@ clearance of a gate."""
 
 
 def write_pictures(page: Path, references: list[Reference], tracks: list[Track]) -> None:
-    """Write beside the page a picture per track, of the first flight of each kind.
-
-    tracks: those that references are of, by name; others are not drawn.
-    """
+    """Write a picture per track of its flying lap from above, coloured by speed, beside the page."""
     for track in tracks:
-        seen = {found.kind: found for found in reversed(references) if found.track == track.name}
-        if seen:
-            path = page.with_name(f"{page.stem}_{track.name}.png")
-            _draw(path, track, [seen[kind] for kind in sorted(seen)])
-
-
-def _draw(path: Path, track: Track, references: list[Reference]) -> None:
-    """Write a picture of flights of one track from above, coloured by speed."""
-    speeds = [np.linalg.norm(found.states[:, VELOCITY], axis=1) for found in references]
-    top = max(values.max() for values in speeds)
-    extent = np.subtract(track.bounds_high, track.bounds_low)[:2]
-    panel = PANEL_IN * extent / extent.max()
-    is_wide = extent[0] > extent[1]  # panels one above the other
-    rows, columns = (len(references), 1) if is_wide else (1, len(references))
-    size = panel * (columns, rows) + (BAR_IN, TITLE_IN * rows)
-    figure = Figure(figsize=tuple(size), layout="constrained")
-    panels = np.atleast_1d(figure.subplots(rows, columns))
-    for axes, reference, speed in zip(panels, references, speeds, strict=True):
-        points = reference.states[:, POSITION][:, :2]
-        lines = draw_path(axes, points, speed[1:], top, linewidth=2.5)
-        draw_gates(axes, track, [0, 1])
-        label_from_above(axes, track)
-        if reference.kind == "standing":
-            axes.plot(*points[0], "o", color="tab:blue")
-        ends = np.stack([track.bounds_low, track.bounds_high], axis=1)
-        axes.set(aspect="equal", xlim=ends[0], ylim=ends[1], xlabel="x (m)", ylabel="y (m)")
-        axes.set_title(
-            f"{track.name}, {reference.model_name}: {TITLES[reference.kind]} {reference.time_s:.3f} s"
-        )
-    figure.colorbar(lines, ax=list(panels), label="speed (m/s)", shrink=0.8)
-    write_atomically(path, png_of(figure, DPI))
+        for found in references:
+            if (found.track, found.kind) == (track.name, "flying"):
+                name = f"{found.model_name} model, {TITLES[found.kind]}"
+                commands = np.concatenate([found.commands, found.commands[-1:]])  # one per state
+                flight = make_flight(name, found.states.astype(np.float32), commands, track)
+                picture = png_of(draw_flight(flight)["top"])
+                write_atomically(page.with_name(f"{page.stem}_{track.name}.png"), picture)
+                break
 
 
 def _optimum_row(reference: Reference) -> tuple[Any, ...]:

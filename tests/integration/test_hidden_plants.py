@@ -219,13 +219,12 @@ def test_other_kinds_of_flights() -> None:
         kind: np.ptp(Rotation.from_quat(log["q"], scalar_first=True).as_euler("ZYX")[:, 0])
         for kind, log in logs.items()
     }
-    assert turned["hover"] < 0.3 < 2.0 < turned["hover_headings"]
-    assert speeds["hover"].max() < 1.5 and speeds["hover_headings"].max() < 1.0 < speeds["slow"].max() < 7.0
-    assert np.median(speeds["race"]) > 8.0
+    assert turned["hover"] < 0.3 < 2.0 < turned["race"]
+    assert speeds["hover"].max() < 1.5 < 8.0 < np.median(speeds["race"])
     with pytest.raises(ValueError, match="found 'walk'"):
         flown(base(), "walk")
     with pytest.raises(CrashError, match=r"thrust_scale\(factor 0\.1\)"):
-        flown(base(thrust_scale={"factor": 0.1}), "slow", 5.0)
+        flown(base(thrust_scale={"factor": 0.1}), "hover", 5.0)
 
 
 def test_the_same_seed_gives_the_same_plant_and_log() -> None:

@@ -16,10 +16,8 @@ from benchmarks.loop.page import (
     draw_chart,
     is_reached,
     model_table,
-    names_not_there,
     race_table,
     verdict,
-    where_it_does_not_help,
 )
 from benchmarks.loop.plants import HIDDEN, HiddenPlant, draw_plant
 from flytrack_env import blackbox, nominal_parameters
@@ -151,31 +149,11 @@ def test_the_verdict_counts_plants_that_matter():
     assert verdict([HELPED] * 9 + [SLOW])[1] and not verdict([HELPED] * 8 + [SLOW])[1]
 
 
-def test_it_is_said_where_the_extension_does_not_help():
-    assert where_it_does_not_help(HELPED) is None
-    assert where_it_does_not_help(HARMLESS) == "the minimal model is as good"
-    assert (
-        where_it_does_not_help(result((0.1, 4.0), (1.0, 0.2), base=(1.0, 0.1)))
-        == "the refitted base is as good"
-    )
-    slower = result((1.0, 0.5), (1.0, 0.1))
-    slower["stages"][0]["plant"]["flying_lap_s"] = 4.2  # as near its own simulator, and slower than after
-    assert where_it_does_not_help(slower) is None
-    assert where_it_does_not_help(result((0.9, 0.0), (0.5, 0.0))) == "success falls from 90.0% to 50.0%"
-    assert where_it_does_not_help(result((0.9, 0.0), (0.9, 0.0), causes=())) == "nothing was named"
-
-
 def test_tables_and_chart_show_every_plant():
     results = [HELPED, LOST]
     assert race_table(results).count("\n") == model_table(results).count("\n") == 3
     assert "| 0 | yes | 10.0% (100.0%), 3.840 s, -4.00 % | 100.0%" in race_table(results)
     assert draw_chart(results).startswith(b"\x89PNG")
-
-
-def test_names_that_are_not_in_the_plant_are_told():
-    one = result((0.1, 4.0), (1.0, 0.2), causes=("wind", "linear_drag", "tau_roll"))
-    assert names_not_there(one | {"hidden": "linear_drag(d_x 0.4) + thrust_scale(factor 0.9)"}) == ["wind"]
-    assert names_not_there(one | {"hidden": "the shipped black box"}) == []
 
 
 def test_an_unfinished_job_starts_again_and_a_finished_one_is_kept(tmp_path, monkeypatch):
