@@ -57,8 +57,6 @@ def test_envelope_cuts_a_plant_of_huge_thrust():
     assert log["v_bat"].min() >= 22.0
     lengths = np.unique(log.segment, return_counts=True)[1]
     assert len(lengths) == 24 and lengths.min() < 250, "some flights are cut, and none is dropped"
-    drained = collect(replace(HandoutPlant(), drain=30.0), minutes=1.0)
-    assert drained["v_bat"].min() >= 22.0 and len(drained) < 5500
 
 
 def broken(**parts):

@@ -1,10 +1,9 @@
 """The excitation moves one thing at a time, over all amplitudes and voltages, the same for the same seed."""
 
 import numpy as np
-import pytest
 
 from flytrack_sysid.collect import collect
-from flytrack_sysid.excitation import AMPLITUDES, FLIGHT_STEPS, KINDS, LEG_SPEEDS, script, switching, wave
+from flytrack_sysid.excitation import AMPLITUDES, FLIGHT_STEPS, KINDS, LEG_SPEEDS, script, switching
 from flytrack_sysid.split import held_out_rows
 from tests.support.handout_plant import HOVER, HandoutPlant
 
@@ -41,18 +40,6 @@ def test_switching_holds_30_to_120_ms_and_always_changes_sign():
         assert np.all(command[changes] * command[changes + 1] < 0.0)
         holds = np.diff(changes)
         assert holds.min() >= 3 and holds.max() <= 12
-
-
-@pytest.mark.parametrize("name", ["sine", "step", "doublet", "chirp"])
-def test_waves_have_amplitude_one_and_begin_at_rest(name):
-    for seed in range(10):
-        values = wave(name, np.random.default_rng(seed))
-        assert 0.98 <= np.abs(values).max() <= 1.0
-        assert abs(values[0]) < 0.02
-        if name == "doublet":
-            assert {-1.0, 0.0, 1.0} == set(values) and abs(values.sum()) <= 1.0
-        if name == "step":
-            assert len(set(values)) == 2 and np.abs(np.diff(values)).sum() == 2.0
 
 
 def test_held_out_part_has_every_kind_a_clear_step_of_each_axis_and_all_voltages():

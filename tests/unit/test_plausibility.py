@@ -84,8 +84,8 @@ def time_times(factor: float) -> Change:
     return lambda log: replace(log, time=log.time * factor)
 
 
-def with_battery(log: FlightLog, value: float) -> FlightLog:
-    return replace(log, channels={**log.channels, "v_bat": np.full((len(log), 1), value)})
+def constant(channel: str, values: list[float]) -> Change:
+    return lambda log: replace(log, channels={**log.channels, channel: np.tile(values, (len(log), 1))})
 
 
 def columns(channel: str) -> str:
@@ -97,36 +97,18 @@ UPWARDS = np.array([0.0, 0.0, GRAVITY])
 WRONG = {
     "w in deg/s": (scaled("w", 180 / np.pi), columns("w"), "looks like deg/s"),
     "t in ms": (time_times(1e3), "t", "median step of 10, .* looks like ms"),
-    "t in ns": (time_times(1e9), "t", r"median step of 1e\+07, .* looks like ns"),
     "q world to body": (scaled("q", np.array([1.0, -1.0, -1.0, -1.0])), columns("q"), "looks like world to"),
-    "q stuck": (
-        lambda log: shifted("q", [1.0, 0.0, 0.0, 0.0])(scaled("q", 0.0)(log)),
-        columns("q"),
-        "the attitude looks stuck",
-    ),
+    "q stuck": (constant("q", [1.0, 0.0, 0.0, 0.0]), columns("q"), "the attitude looks stuck"),
     "v_bat in mV": (scaled("v_bat", 1000.0), "v_bat", "looks like mV$"),
     "v_bat in tenths": (scaled("v_bat", 10.0), "v_bat", "looks like tenths of V$"),
     "f in g": (scaled("f", 1 / GRAVITY), columns("f"), "looks like g$"),
     "f with z down": (scaled("f", np.array([1.0, -1.0, -1.0])), "f_z", "pointed down"),
     "a in g": (scaled("a", 1 / GRAVITY), columns("a"), "looks like g, not m/s"),
     "a with gravity": (shifted("a", UPWARDS), "a_z", "gravity looks left in"),
-    "a in g, with gravity": (
-        lambda log: scaled("a", 1 / GRAVITY)(shifted("a", UPWARDS)(log)),
-        columns("a"),
-        "looks like g, not m/s",
-    ),
     "p in mm": (scaled("p", 1000.0), columns("p"), "looks like mm, not m$"),
-    "commands stuck": (
-        lambda log: replace(log, channels={**log.channels, "u": 0 * log["u"]}),
-        columns("u"),
-        "look stuck",
-    ),
+    "commands stuck": (constant("u", [0.0] * 4), columns("u"), "look stuck"),
     # Of the log with segments these are more than 100 rows, but less than 2 s.
-    "too few seconds": (
-        lambda log: log.select(log.time < 0.6),
-        "t",
-        r"found \d+ rows and \d\.\d+ s, ",
-    ),
+    "too few seconds": (lambda log: log.select(log.time < 0.6), "t", r"found \d+ rows and \d\.\d+ s, "),
     "too few rows": (lambda log: log.select(slice(0, FEWEST_ROWS - 1)), "t", "found 99 rows"),
 }
 NAMES = ("clean 0", "noisy 1", "noisy, segments")
@@ -177,15 +159,6 @@ def test_noise_of_a_drone_that_stands_is_no_motion_to_judge(logs):
     assert "gravity looks left in" in find_problems(WRONG["a with gravity"][0](log))[0]
 
 
-def test_without_other_channels_to_compare_with(logs):
-    log = logs["noisy 2"].without("q", "v", "p", "a")
-    assert find_problems(log) == []
-    for wrong in ("f in g", "f with z down", "w in deg/s"):
-        (problem,) = find_problems(WRONG[wrong][0](log))
-        assert f": {WRONG[wrong][1]}: " in problem
-    assert find_problems(FlightLog(log.time, {"u": log["u"]}, log.segment)) == []
-
-
 def test_free_fall_is_no_force_in_g(logs):
     # Falling with little thrust measures about 1 m/s^2: the velocity tells it from g.
     log = logs["noisy 0"]
@@ -203,16 +176,9 @@ def test_flights_and_batteries_of_one_to_fourteen_cells_raise_no_problem(logs):
     for name in NAMES:
         assert find_problems(logs[name]) == []
     for volts in (3.0, 16.8, 60.0):
-        assert find_problems(with_battery(logs["clean 0"], volts)) == []
-    (problem,) = find_problems(with_battery(logs["clean 0"], 420.0))
+        assert find_problems(constant("v_bat", [volts])(logs["clean 0"])) == []
+    (problem,) = find_problems(constant("v_bat", [420.0])(logs["clean 0"]))
     assert problem.endswith("this looks like hundredths of V or tenths of V")
-
-
-def test_scale_errors_and_biases_of_sensors_raise_no_problem(logs):
-    log = logs["noisy 0"]
-    for change in (scaled("w", 1.1), scaled("a", 0.9), scaled("p", 1.05), scaled("f", 1.1)):
-        log = change(log)
-    assert find_problems(shifted("a", np.array([0.3, -0.5, 1.5]))(shifted("w", 0.2)(log))) == []
 
 
 def test_excitation_raises_no_problem():

@@ -14,7 +14,6 @@ from flytrack_env.dynamics import ModelParameters, advance, nominal_parameters
 from flytrack_env.effects import CommandDelay, LinearDrag, QuadraticDrag, start_memories
 from flytrack_env.state import pack, unpack, unpack_action
 from flytrack_sysid.log import FlightLog, log_of_states
-from flytrack_sysid.one_step import error_of
 from flytrack_sysid.open_loop import QUANTITIES
 from flytrack_sysid.prediction import columns, predict
 from flytrack_sysid.record import LARGEST_DOUBT, fill_gaps
@@ -145,18 +144,6 @@ def test_drag_shows_in_the_force_by_speed():
     assert max(known.open_force.rms_b) < 1e-5
 
 
-def test_model_of_nothing_changes_has_nrmse_one(log):
-    """A drone that the log shows moving, judged by a predictor that repeats the last row."""
-    before, after = log["v"][:-1], log["v"][1:]
-    assert error_of("v", before, after, before).nrmse == pytest.approx(1.0)
-    assert error_of("q", log["q"][:-1], log["q"][1:], -log["q"][:-1]).nrmse == pytest.approx(1.0)
-    rates_b = log["w"]
-    mean = np.broadcast_to(rates_b.mean(axis=0), rates_b.shape)
-    assert error_of("w", rates_b, rates_b, mean).nrmse == pytest.approx(1.0)
-    still = np.zeros((9, 3))
-    assert error_of("p", still, still, still).nrmse is None
-
-
 def test_delay_is_flown_with_its_memory():
     delayed = TRUTH.with_effects(DELAY)
     log = fly(delayed)
@@ -221,18 +208,6 @@ def test_applied_action_is_recovered_from_commands(log):
     assert any(note.startswith("applied action (uprev)") for note in validation.notes)
 
 
-def test_flights_go_on_across_gaps(log):
-    keep = np.arange(len(log)) % 97 != 96
-    gappy = validate(TRUTH, log.select(keep))
-    assert max(nrmse(gappy).values()) < 1e-6
-    assert gappy.rollouts[3].num_starts > 0
-    # Only what was commanded in the lost row is guessed.
-    assert gappy.rollouts[1].errors["velocity"].median < 0.01
-    recovered = validate(TRUTH, log.without("uprev").select(keep))
-    assert 0 < recovered.one_step.num_steps < gappy.one_step.num_steps
-    assert max(nrmse(recovered).values()) < 2e-2
-
-
 def test_only_the_chosen_rows_are_judged(log):
     rows = held_out_rows(log)
     rows[320:400] = True  # a piece with rows that are not judged on both sides
@@ -246,19 +221,6 @@ def test_only_the_chosen_rows_are_judged(log):
     assert nothing.one_step.channels == {} and nothing.thrust is None and nothing.steps == ()
     with pytest.raises(ValueError, match="rows: found int64"):
         validate(TRUTH, log, np.flatnonzero(rows))
-
-
-def test_uneven_sampling_is_judged_by_its_times():
-    rng = np.random.default_rng(1)
-    start, commands = (values[0] for values in scripts())
-    durations = DT * rng.uniform(0.7, 1.3, NUM_ROWS)
-    with jax.enable_x64(True):
-        states = np.asarray(_fly(jnp.asarray(start), jnp.asarray(commands), TRUTH, jnp.asarray(durations)))
-    even = log_of_states([(states, commands)], DT)
-    time = np.concatenate([[0.0], np.cumsum(durations)[:-1]])
-    validation = validate(TRUTH, replace(even, time=time))
-    assert max(nrmse(validation).values()) < 1e-6
-    assert all(error.p95 < 1e-4 for rollout in validation.rollouts for error in rollout.errors.values())
 
 
 def test_model_that_runs_away_is_still_reported(log):
