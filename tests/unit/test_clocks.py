@@ -16,8 +16,8 @@ def truth() -> FlightLog:
     return flight(TIME_S)
 
 
-@pytest.mark.parametrize("late_s", [(0.023, -0.012, 0.031), (-0.04, 0.008, -0.015)])
-def test_clock_offsets_between_sensors_are_found_and_corrected(truth, late_s):
+def test_clock_offsets_between_sensors_are_found_and_corrected(truth):
+    late_s = (0.023, -0.012, 0.031)
     aligned, found = clocks.align_clocks(noisy(flight(TIME_S, *late_s), seed=1))
     assert [(one.channel, one.reference) for one in found] == [("q", "w"), ("v", "f"), ("p", "v")]
     for one, expected in zip(found, late_s, strict=True):

@@ -108,11 +108,13 @@ def test_intervals_widen_with_fewer_channels_and_with_what_the_model_lacks(noisy
             assert abs(lacking.intervals[name].value - TRUTH[name]) < 3.0 * half and half > 1.2 * narrow[name]
 
 
+@pytest.mark.slow
 @pytest.fixture(scope="session")
 def dragged() -> FlightLog:
     return excited(replace(PLANT, drag_b=DRAG))
 
 
+@pytest.mark.slow
 def test_drag_is_found(dragged):
     found = fit(dragged, effects=("linear_drag",))
     np.testing.assert_allclose(found.estimate.model.effect("linear_drag"), DRAG, rtol=1e-4)
@@ -154,7 +156,6 @@ REFUSED = {
     "yaw stuck": (lambda log: scaled(log, "u", (1, 1, 0, 1)), {}, "u_yaw: stuck at 0; tau_yaw"),
     "no rates": (lambda log: log.without("w", "q"), {}, "w and q are absent"),
     "no force": (lambda log: log.without("f", "v", "p"), {}, "thrust needs f, or q with one of a, v and p"),
-    "sign of w_x": (lambda log: scaled(log, "w", (-1, 1, 1)), {}, "w_x: .* sign and order of u_roll and w_x"),
     "unknown name": (lambda log: log, {"fixed": {"tau_jaw": 0.1}}, "fixed: tau_jaw: unknown; expected"),
     "unknown effect": (lambda log: log, {"effects": ("rag",)}, "effects: rag: no effect of that name"),
     "nothing left": (lambda log: log, {"fixed": EVERYTHING}, "fixed: found every parameter"),
@@ -166,6 +167,12 @@ REFUSED = {
 def test_what_cannot_be_identified_is_refused(noisy, change, arguments, message):
     with pytest.raises(FitError, match=message):
         fit(change(noisy), **arguments)
+
+
+@pytest.mark.slow
+def test_a_wrong_sign_is_named(noisy):
+    with pytest.raises(FitError, match=r"w_x: .* do sign and order of u_roll and w_x agree"):
+        fit(scaled(noisy, "w", (-1, 1, 1)))
 
 
 def test_implausible_log_and_split_that_leaves_nothing_are_refused(noisy):

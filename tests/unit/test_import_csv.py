@@ -248,6 +248,7 @@ def test_nominal_model_hovers_where_the_nominal_craft_does():
         Craft((60.0, 50.0, 40.0), None, (3.0, 4.0)).nominal_model("a log")
 
 
+@pytest.mark.slow
 def test_command_writes_log_details_and_model(folder, tmp_path, capsys):
     out, model = tmp_path / "log.npz", tmp_path / "model.json"
     arguments = ["import", folder / "flight.csv", "--format", "csv", "--map", folder / "map.toml"]

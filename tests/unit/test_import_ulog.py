@@ -153,6 +153,7 @@ def test_samples_from_before_the_estimator_runs_are_left_out(tmp_path):
         import_log(write(tmp_path / "d.ulg", tables), "ulog")
 
 
+@pytest.mark.slow
 def test_missing_large_and_other_files_and_a_missing_package_are_named(tmp_path, monkeypatch):
     with pytest.raises(LogError, match=r"no\.ulg: cannot be read"):
         import_log(tmp_path / "no.ulg", "ulog")

@@ -133,6 +133,7 @@ def test_wrong_thrust_shows_in_the_map_by_its_formula(log):
     assert np.isnan(wrong.thrust.mean_n).any() and wrong.as_json()["thrust"]["mean_n"][0][0] is None
 
 
+@pytest.mark.slow
 def test_drag_shows_in_the_force_by_speed():
     dragging = fly(TRUTH.with_effects(DRAG))
     open_force = validate(TRUTH, dragging).open_force
@@ -223,6 +224,8 @@ def test_only_the_chosen_rows_are_judged(log):
         validate(TRUTH, log, np.flatnonzero(rows))
 
 
+@pytest.mark.slow
+@pytest.mark.slow
 def test_model_that_runs_away_is_still_reported(log):
     absurd = validate(TRUTH.with_effects(QuadraticDrag(-400.0, -400.0, -400.0)), log)
     assert not np.isfinite(absurd.rollouts[-1].errors["position"].rms)
