@@ -29,12 +29,6 @@ th:first-child, td:first-child { text-align: left; padding-left: 0; }
 .good { border-color: #009E73; } .found { border-color: #0072B2; } .open { border-color: #D55E00; }
 figure { margin: 1rem 0; }
 img { width: 100%; height: auto; background: #ffffff; border-radius: 4px; }
-@media print {
-  :root { --ink: #000000; --soft: #444444; --line: #bbbbbb; --paper: #ffffff; --note: #ffffff; }
-  body { max-width: none; padding: 0; font-size: 10pt; }
-  figure, tr { break-inside: avoid; }
-  h2 { break-after: avoid; }
-}
 """
 
 

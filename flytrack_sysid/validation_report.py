@@ -84,27 +84,11 @@ def _force_table(force: OpenForce) -> Table:
     return Table(["speed", "rms", "x", "y", "z", "drag-like mean", "steps"], rows, caption)
 
 
-def _steps_table(validation: Validation) -> Table:
-    rows = [
-        [
-            step.axis,
-            f"{step.segment}",
-            f"{step.time_s:.2f}",
-            f"{step.command_before:+.2f} to {step.command_after:+.2f}",
-            _number(float(np.rad2deg(step.rms))),
-        ]
-        for step in validation.steps
-    ]
-    header = ["axis", "segment", "time (s)", "command", "rms error (deg/s)"]
-    return Table(header, rows, "Clearest commanded steps")
-
-
 def _tables(validation: Validation) -> dict[str, Table]:
     """Return the tables that have any row, by the figure that they belong to."""
     tables = {
         "one_step": _one_step_table(validation),
         "rollouts": _rollout_table(validation),
-        "steps": _steps_table(validation),
     }
     if validation.thrust is not None:
         tables["thrust"] = _thrust_table(validation.thrust)

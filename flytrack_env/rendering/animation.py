@@ -1,7 +1,6 @@
 """Laps side by side as an animated GIF, seen from a fixed point above the course."""
 
 import io
-import itertools
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -10,7 +9,7 @@ from PIL import Image, ImageDraw
 
 from flytrack_env import scene
 from flytrack_env.rendering.camera import Camera, unit
-from flytrack_env.rendering.views import PIXEL, draw_drone, font
+from flytrack_env.rendering.views import PIXEL, draw_drone, draw_gate, font
 from flytrack_env.scene import Colour, gates_of, ground_grid
 from flytrack_env.state import POSITION, QUATERNION
 from flytrack_env.tracks import Course
@@ -24,7 +23,8 @@ AZIMUTH_DEG, ELEVATION_DEG = 20.0, 36.0  # of the eye: from the course's broad s
 DISTANCE = 1.1  # of the eye from the middle, in sizes of the course
 DRONE_ENLARGEMENT = 5.0
 GRID_M = 5.0
-PIECE_STEPS, RECENT_STEPS = 4, 50
+RECENT_STEPS = 50  # of the path that are bright
+GATE_COLOUR = scene.blend(scene.NEXT_GATE, scene.BACKGROUND, 0.25)
 TEXT_SIZE = 14
 NUM_COLOURS = 128
 
@@ -40,15 +40,6 @@ class Lap(NamedTuple):
     def at(self, row: int) -> np.ndarray:
         """Return the state at a row, or the last one, (21,)."""
         return self.states[min(row, len(self.states) - 1)].astype(float)
-
-
-class Shape(NamedTuple):
-    """A polygon, or with a width (pixels) a line; distance_m: from the eye, by which shapes are ordered."""
-
-    distance_m: float
-    outline: list[float]
-    colour: Colour
-    width: int = 0
 
 
 def make_gif(course: Course, laps: Sequence[Lap]) -> bytes:
@@ -75,12 +66,10 @@ class FixedView:
         low, high = (np.array(corner, float) for corner in (course.bounds_low, course.bounds_high))
         paths_w = np.concatenate([lap.states[:, POSITION] for lap in laps])
         shown_w = np.concatenate([self.gates.outer.reshape(-1, 3), paths_w])
-        self.floor_m = low[2]
         self.camera = self._fit(shown_w)
         self.grid_w = ground_grid(low, high, GRID_M)
         corners = [(low[0], low[1]), (high[0], low[1]), (high[0], high[1]), (low[0], high[1])]
         self.floor_w = np.array([(x, y, low[2]) for x, y in corners])
-        self.farthest_w = max(self.gates.centres, key=self._distance_m)
 
     def _fit(self, points_w: np.ndarray) -> Camera:
         """Return a camera that sees all of these points, as large as they fit."""
@@ -106,15 +95,17 @@ class FixedView:
         draw.polygon(self.camera.polygon(self.camera.look(self.floor_w)), scene.GROUND)
         for line in self.camera.look(self.grid_w):
             draw.line(self.camera.polygon(line), scene.GROUND_GRID, PIXEL)
-        shapes = [self._shadow(lap, row) for lap in laps]
-        solids = self._beams() + [shape for lap in laps for shape in self._path(lap, row)]
-        shapes += sorted(solids, key=lambda shape: -shape.distance_m)
-        for shape in shapes:
-            if shape.width:
-                draw.line(shape.outline, shape.colour, shape.width, joint="curve")
-            else:
-                draw.polygon(shape.outline, shape.colour)
-        for lap in sorted(laps, key=lambda lap: -self._distance_m(lap.at(row)[POSITION])):
+        gates_c = self.camera.look(np.concatenate([self.gates.outer, self.gates.inner], axis=1))
+        for index in np.argsort(-gates_c[:, :, 2].mean(axis=1)):
+            draw_gate(draw, self.camera, gates_c[index], GATE_COLOUR)
+        for lap in laps:
+            path_w = lap.states[: max(row, 1) + 1, POSITION].astype(float)
+            dim = scene.blend(lap.colour, scene.GROUND, 0.45)
+            shadow_w = np.where([True, True, False], path_w, self.floor_w[0])
+            draw.line(self._pixels(shadow_w), scene.SHADOW, PIXEL)
+            draw.line(self._pixels(path_w), dim, 2 * PIXEL, joint="curve")
+            draw.line(self._pixels(path_w[-RECENT_STEPS:]), lap.colour, 3 * PIXEL, joint="curve")
+        for lap in laps:
             state, rotors = lap.at(row), scene.blend(lap.colour, scene.TEXT, 0.6)
             colours = (lap.colour, rotors, lap.colour)
             draw_drone(draw, self.camera, state[POSITION], state[QUATERNION], colours, DRONE_ENLARGEMENT)
@@ -122,40 +113,8 @@ class FixedView:
         self._write(ImageDraw.Draw(picture), laps, row)
         return picture
 
-    def _distance_m(self, point_w: np.ndarray) -> float:
-        return float(np.linalg.norm(point_w - self.camera.eye_w))
-
-    def _beams(self) -> list[Shape]:
-        """Return the four beams of every gate's frame."""
-        found = []
-        for corners_w in np.concatenate([self.gates.outer, self.gates.inner], axis=1):
-            for a, b in itertools.pairwise((0, 1, 2, 3, 0)):
-                beam_w = corners_w[[a, b, 4 + b, 4 + a]]
-                distance_m = self._distance_m(beam_w.mean(axis=0))
-                haze = 0.3 * distance_m / self._distance_m(self.farthest_w)
-                colour = scene.blend(scene.NEXT_GATE, scene.BACKGROUND, haze)
-                found.append(Shape(distance_m, self.camera.polygon(self.camera.look(beam_w)), colour))
-        return found
-
     def _pixels(self, points_w: np.ndarray) -> list[float]:
         return self.camera.pixels(self.camera.look(points_w)).ravel().tolist()
-
-    def _shadow(self, lap: Lap, row: int) -> Shape:
-        path_w = lap.states[: max(row, 1) + 1, POSITION].astype(float)
-        path_w[:, 2] = self.floor_m
-        return Shape(np.inf, self._pixels(path_w), scene.SHADOW, PIXEL)
-
-    def _path(self, lap: Lap, row: int) -> list[Shape]:
-        """Return the path up to a row in pieces; the last half second is brighter."""
-        points_w = lap.states[: row + 1, POSITION].astype(float)
-        found = []
-        for first in range(0, len(points_w) - 1, PIECE_STEPS):
-            piece_w = points_w[first : first + PIECE_STEPS + 1]
-            is_recent = first > row - RECENT_STEPS
-            colour = lap.colour if is_recent else scene.blend(lap.colour, scene.GROUND, 0.45)
-            width = PIXEL * (3 if is_recent else 2)
-            found.append(Shape(self._distance_m(piece_w[0]), self._pixels(piece_w), colour, width))
-        return found
 
     def _write(self, draw: ImageDraw.ImageDraw, laps: Sequence[Lap], row: int) -> None:
         """Write the laps' labels and their times so far, from left to right."""

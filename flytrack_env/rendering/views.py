@@ -185,15 +185,16 @@ class ChaseView:
         self._draw_ground(draw, camera, row[POSITION])
         distances_m = np.linalg.norm(self.gates.centres - camera.eye_w, axis=1)
         is_beyond = distances_m > np.linalg.norm(row[POSITION] - camera.eye_w)
-        corners_c, next_index = camera.look(self.corners_w), int(row[GATE_INDEX])
+        corners_c, colours = camera.look(self.corners_w), [scene.GATE] * len(self.corners_w)
+        colours[int(row[GATE_INDEX])] = scene.NEXT_GATE
         order = np.argsort(-distances_m)
         for index in order[is_beyond[order]]:
-            draw_gate(draw, camera, corners_c[index], self._colour(index, next_index))
+            draw_gate(draw, camera, corners_c[index], colours[index])
         self._draw_trail(draw, camera, log.rows)
         draw_drone(draw, camera, row[POSITION], row[QUATERNION])
         for index in order[~is_beyond[order]]:
             # An outline only, so that the drone is seen through it.
-            draw_outlines(draw, camera, corners_c[index], self._colour(index, next_index))
+            draw_outlines(draw, camera, corners_c[index], colours[index])
         canvas.paste(picture, (self.left, 0))
 
     def _draw_ground(self, draw: ImageDraw.ImageDraw, camera: Camera, drone_w: np.ndarray) -> None:
@@ -203,12 +204,6 @@ class ChaseView:
         shadow = camera.polygon(camera.look(below + SHADOW_M * CIRCLE))
         if shadow:
             draw.polygon(shadow, scene.SHADOW)
-
-    def _colour(self, index: int, next_index: int) -> Colour:
-        if index == next_index:
-            return scene.NEXT_GATE
-        is_after = index == (next_index + 1) % len(self.gates.centres)
-        return scene.GATE_AFTER if is_after else scene.GATE
 
     def _draw_trail(self, draw: ImageDraw.ImageDraw, camera: Camera, rows: np.ndarray) -> None:
         recent = rows[-TRAIL_STEPS:].astype(float)

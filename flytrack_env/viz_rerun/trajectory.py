@@ -95,14 +95,11 @@ def trajectory_of_pairs(sequence: Pairs, name: str) -> Trajectory:
     Raises:
         ValueError: no pairs, or wrong shapes.
     """
-    if len(sequence) == 0:
-        raise ValueError(f"{name}: found no steps, expected at least one (x, u) pair")
-    for step, pair in enumerate(sequence):
-        shapes = [np.shape(part) for part in pair] if isinstance(pair, Sequence | np.ndarray) else pair
-        if shapes != [(STATE_SIZE,), (ACTION_SIZE,)]:
-            expected = f"(x ({STATE_SIZE},), u ({ACTION_SIZE},))"
-            raise ValueError(f"{name}[{step}]: found shapes {shapes}, expected {expected}")
-    states, actions = (np.array(part, float) for part in zip(*sequence, strict=True))
+    try:
+        states, actions = (np.array(part, float) for part in zip(*sequence, strict=True))
+    except (TypeError, ValueError) as error:
+        expected = f"(x ({STATE_SIZE},), u ({ACTION_SIZE},))"
+        raise ValueError(f"{name}: found no pairs of numbers ({error}), expected {expected}") from error
     return Trajectory(name, states, actions)
 
 
@@ -115,21 +112,16 @@ def track_of_gates(gates: np.ndarray, positions: np.ndarray) -> Track:
     Raises:
         ValueError: another shape, or a pose that is not finite or no rotation.
     """
-    try:
-        gates = np.asarray(gates, float)
-    except (TypeError, ValueError) as error:
-        raise ValueError(f"gates: {error}; expected numbers (N, >={GATE_COLUMNS})") from error
+    gates = np.asarray(gates, float)
     if gates.ndim != 2 or gates.shape[1] < GATE_COLUMNS:
         raise ValueError(f"gates: found shape {gates.shape}, expected (N, >={GATE_COLUMNS})")
     rows = gates[:, :GATE_COLUMNS].copy()
-    if not np.isfinite(rows[:, 0]).all():
-        raise ValueError(f"gates: found ids {rows[:, 0]}, expected numbers")
     _normalise_poses("gates", rows, slice(1, 4), slice(4, 8))
 
     def track(directions: np.ndarray) -> Track:
         made = [
             Gate(
-                id=int(row[0]) if row[0] == int(row[0]) else row[0],
+                id=int(row[0]),
                 position=tuple(row[1:4].tolist()),
                 quaternion=tuple(row[4:8].tolist()),
                 direction=direction,

@@ -1,6 +1,5 @@
 """Recordings read back with Rerun's own reader, and flights to record."""
 
-import uuid
 from collections import defaultdict
 from pathlib import Path
 
@@ -70,27 +69,3 @@ class Recording:
         strips = self.rows[entity, "LineStrips3D:strips"]
         known = [(at, i) for i, (at, _) in enumerate(self.times[entity]) if at <= step]
         return strips[max(known)[1]][0] if known else None
-
-
-def layout_of(path: Path) -> dict[str, tuple[str, str, list[str]]]:
-    """Return how a recording opens: kind, origin and contents of every view in the viewport, by its name."""
-    missing = "this rerun-sdk has no reader (rerun.chunk)"
-    reader = pytest.importorskip("rerun.chunk", reason=missing).RrdReader(path)
-    (store,) = reader.blueprints()
-    found: dict[tuple[str, str], list] = {}
-    for chunk in reader.stream(store=store).to_chunks():
-        batch = chunk.to_record_batch()
-        for name in batch.schema.names:
-            found[chunk.entity_path, name.split(":")[-1]] = batch.column(name).to_pylist()[-1]
-    (root,) = found["/viewport", "root_container"]
-    open_parts, views = [f"container/{uuid.UUID(bytes=bytes(root))}"], {}
-    while open_parts:
-        part = f"/{open_parts.pop()}"
-        if part.startswith("/container"):
-            open_parts += found[part, "contents"]
-            continue
-        (name,), (kind,), (origin,) = (
-            found[part, key] for key in ("display_name", "class_identifier", "space_origin")
-        )
-        views[name] = (kind, origin, found[f"{part}/ViewContents", "query"])
-    return views

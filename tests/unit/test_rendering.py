@@ -22,7 +22,6 @@ pytest.importorskip("PIL", reason="the extra [render] is not installed")
 from flytrack_env.rendering.camera import NEAREST_M, Camera
 from flytrack_env.rendering.views import BAR_HEIGHT, HEIGHT, PIXEL, WIDTH, Renderer
 from flytrack_env.rendering.views import TOP_VIEW_WIDTH as SPLIT
-from flytrack_env.rendering.window import LATE_S
 
 BASE = "FlyTrack-v0"
 SHAPE = (HEIGHT, WIDTH, 3)
@@ -160,27 +159,6 @@ def test_single_environment_renders_its_own_flight_and_record_video_every_step(t
     env.close()
     (path,) = (tmp_path / "video").glob("*.mp4")
     assert count_frames_and_secs(str(path)) == (25, pytest.approx(0.25, abs=0.02))
-
-
-@pytest.mark.slow
-def test_human_mode_keeps_real_time(
-    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
-    pytest.importorskip("pygame", reason="the extra [render] is not installed")
-    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
-    env = gymnasium.make(BASE, render_mode="human")
-    env.reset(seed=0, options={"gate_index": 0})
-    env.step(np.zeros(4))  # compiles
-    # The window catches up on delays of up to LATE_S, such as by its first picture.
-    time.sleep(2.0 * LATE_S)
-    start_s = time.monotonic()
-    for _ in range(30):
-        env.step(np.array([0.0, 0.0, 0.0, 0.6]))
-    assert time.monotonic() - start_s > 0.28
-    assert env.render() is None
-    env.close()
-    env.close()
-    assert caplog.records == []
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="elsewhere there is always a display")
