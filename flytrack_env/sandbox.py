@@ -85,21 +85,18 @@ def run(
     raise SandboxError(f"crashed the process that it was tried in ({how})")
 
 
-def _set_limits(limits: ResourceLimits) -> None:
-    """Limit what this process may use from here on."""
-    if sys.platform == "win32":
-        return
-    import resource  # not on Windows
-
-    values = {
-        resource.RLIMIT_CPU: limits.cpu_s + int(time.process_time()),
-        resource.RLIMIT_FSIZE: 0,
-        resource.RLIMIT_CORE: 0,
-    }
+def limit_memory(memory_bytes: int) -> None:
+    """Let this process allocate at most that much more than it has; on Linux only."""
     if MEMORY_STATUS.exists():
         status = dict(line.split(":", 1) for line in MEMORY_STATUS.read_text().splitlines())
-        values[resource.RLIMIT_DATA] = int(status["VmData"].split()[0]) * 1024 + limits.memory_bytes
-    for kind, value in values.items():
+        _limit("RLIMIT_DATA", int(status["VmData"].split()[0]) * 1024 + memory_bytes)
+
+
+def _limit(name: str, value: int) -> None:
+    if sys.platform != "win32":
+        import resource  # not on Windows
+
+        kind = getattr(resource, name)
         hard = resource.getrlimit(kind)[1]
         resource.setrlimit(kind, (value if hard == resource.RLIM_INFINITY else min(value, hard), hard))
 
@@ -115,7 +112,11 @@ def main() -> None:
             assert spec is not None and spec.loader is not None
             module = importlib.util.module_from_spec(spec)
             spec.loader.exec_module(module)
-            _set_limits(ResourceLimits(*call["limits"]))
+            limits = ResourceLimits(*call["limits"])
+            limit_memory(limits.memory_bytes)
+            _limit("RLIMIT_CPU", limits.cpu_s + int(time.process_time()))
+            _limit("RLIMIT_FSIZE", 0)
+            _limit("RLIMIT_CORE", 0)
             output.write(RETURNED + getattr(module, call["function"])(call["argument"], content))
         except BaseException as error:  # reported to the caller, whatever it is
             output.write(RAISED + json.dumps([type(error).__name__, str(error)[:LONGEST_MESSAGE]]).encode())

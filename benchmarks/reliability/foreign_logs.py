@@ -8,15 +8,14 @@ import numpy as np
 
 ULOG_TYPES = {"uint64_t": "Q", "float": "f", "bool": "?", "uint8_t": "B"}
 NUM_ROWS, STEP_US = 30, 10_000
+FLOAT = "float"
 ULOG_TOPICS: dict[str, tuple[list[tuple[str, str, int]], tuple[float, ...]]] = {
-    "vehicle_angular_velocity": ([("float", "xyz", 3)], (0.1, 0.2, 0.3)),
-    "vehicle_acceleration": ([("float", "xyz", 3)], (0.5, 0.25, -9.75)),
-    "vehicle_attitude": ([("float", "q", 4)], (0.8, 0.0, 0.0, 0.6)),
+    "vehicle_angular_velocity": ([(FLOAT, "xyz", 3)], (0.1, 0.2, 0.3)),
+    "vehicle_attitude": ([(FLOAT, "q", 4)], (0.8, 0.0, 0.0, 0.6)),
     "vehicle_rates_setpoint": (
-        [*(("float", name, 0) for name in ("roll", "pitch", "yaw")), ("float", "thrust_body", 3)],
+        [(FLOAT, "roll", 0), (FLOAT, "pitch", 0), (FLOAT, "yaw", 0), (FLOAT, "thrust_body", 3)],
         (0.5, 0.25, -0.25, 0.0, 0.0, -0.5),
     ),
-    "battery_status": ([("float", "voltage_v", 0)], (16.25,)),
 }
 ULOG_PARAMETERS = {"MC_ACRO_R_MAX": 720.0, "MC_ACRO_P_MAX": 360.0, "MC_ACRO_Y_MAX": 90.0}
 MAPPING = """[time]

@@ -21,12 +21,7 @@ from flytrack_env.registration import ENVIRONMENTS
 from flytrack_env.state import ACTION_SIZE
 from flytrack_env.terminations import Causes
 from flytrack_env.tracks import available_tracks, build_course, load_track, random_track
-from flytrack_env.wrappers import (
-    ActionDelay,
-    ActionHistory,
-    EpisodeStatistics,
-    ObservationNoise,
-)
+from flytrack_env.wrappers import ActionDelay, ActionHistory, EpisodeStatistics, ObservationNoise
 
 NUM_ENVS, NUM_STEPS = 1024, 1000  # of a flight
 HELD_STEPS = 40  # for which some actions stay the same
@@ -69,9 +64,7 @@ def is_finite(tree: Any) -> jax.Array:
     return jnp.stack([jnp.isfinite(one).all(axis=1) for one in numbers]).all(axis=0)
 
 
-def violations_of(
-    env: EpisodicEnvironment, actions: jax.Array, outputs: Any, is_late: jax.Array
-) -> jax.Array:
+def violations_of(env: EpisodicEnvironment, actions: Any, outputs: Any, is_late: Any) -> jax.Array:
     """Return which of ``VIOLATIONS`` a step shows, (len(VIOLATIONS), NUM_ENVS) bool."""
     observations, states, rewards, terminated, _, info = outputs
     both, limit = jnp.stack([observations, info["final_observation"]]), env.observation_space().high
@@ -91,9 +84,7 @@ def violations_of(
 
 
 @partial(jax.jit, static_argnames=("env", "is_batched"))
-def fly(
-    env: EpisodicEnvironment, key: jax.Array, params: EnvParams, is_batched: bool
-) -> dict[str, jax.Array]:
+def fly(env: EpisodicEnvironment, key: jax.Array, params: EnvParams, is_batched: bool) -> dict[str, Any]:
     """Return counts of ends and violations in NUM_STEPS steps of NUM_ENVS environments from a reset on.
 
     params: the same for all environments, or a batch, flown by ``vmap(step)``.
@@ -105,20 +96,18 @@ def fly(
     def advance(carry: Any, step: jax.Array) -> Any:
         states, ages = carry
         actions = draw_actions(key, step)
+        key_step = jax.random.fold_in(key, step)
         if is_batched:
-            outputs = jax.vmap(env.step)(
-                jax.random.split(jax.random.fold_in(key, step), NUM_ENVS), states, actions, params
-            )
+            outputs = jax.vmap(env.step)(jax.random.split(key_step, NUM_ENVS), states, actions, params)
         else:
-            outputs = env.step_batch(jax.random.fold_in(key, step), states, actions, params)
+            outputs = env.step_batch(key_step, states, actions, params)
         _, states, _, terminated, truncated, info = outputs
         done = terminated | truncated
         is_late = ages >= params.max_steps_in_episode
         counts = {"episodes": done.sum(), "truncated": truncated.sum()}
         counts |= {name: (info[name] & done).sum() for name in Causes._fields}
-        counts |= dict(
-            zip(VIOLATIONS, violations_of(env, actions, outputs, is_late).sum(axis=1), strict=True)
-        )
+        violations = violations_of(env, actions, outputs, is_late).sum(axis=1)
+        counts |= dict(zip(VIOLATIONS, violations, strict=True))
         return (states, jnp.where(done, 0, ages + 1)), counts
 
     carry = (states, jnp.zeros(NUM_ENVS, jnp.int32))
@@ -143,15 +132,12 @@ def draw_extremes(generator: np.random.Generator, params: EnvParams) -> EnvParam
             continue
         part, _, field = name.rpartition(".")
         value = within(bounds, attrgetter(name)(params))
-        batch = batch.replace(
-            **{part: getattr(batch, part)._replace(**{field: value})} if part else {field: value}
-        )
+        changed = {part: getattr(batch, part)._replace(**{field: value})} if part else {field: value}
+        batch = batch.replace(**changed)
     effects = []
     for parameters in params.model.effects:
-        effect = effect_of(parameters)
-        values = {
-            field: within(bounds, getattr(parameters, field)) for field, bounds in effect.ranges.items()
-        }
+        effect, neutral = effect_of(parameters), parameters._asdict()
+        values = {field: within(bounds, neutral[field]) for field, bounds in effect.ranges.items()}
         for field, most in effect.most_steps.items():
             values[field] = np.minimum(values[field], np.float32(most) * batch.dt)
         effects.append(effect.parameters(**values))
