@@ -2,7 +2,6 @@
 
 import io
 import json
-import tracemalloc
 from pathlib import Path
 from typing import Any
 
@@ -115,21 +114,16 @@ class Harmful:
 
 BAD = {
     r"starts\[3, 5\]: found nan, expected a finite number": changed("starts", (3, 5), np.nan),
-    r"commands\[1, 2, 3\]: found inf": changed("commands", (1, 2, 3), np.inf),
     r"commands: found 1.5 in flight 2, expected -1 to 1": changed("commands", (2, 7, 0), 1.5),
     "applied action.: found -2 in flight 0": changed("starts", (0, 19), -2.0),
     "quaternion of norm 2 in flight 4": changed("starts", (4, 9), np.sqrt(4.0)),
     "found flight 1 outside of the envelope": changed("starts", (1, 2), 0.01),
-    "found flight 0 outside of the envelope": changed("starts", (0, 20), -1.0),
     r"starts: found shape \(8, 20\), expected \(8, 21\)": {"starts": made("headings").starts[:, :20]},
     r"commands: found shape \(7, 250, 4\), expected \(8, 2 or more, 4\)": {
         "commands": made("headings").commands[:7]
     },
-    r"commands: found shape \(8, 1, 4\)": {"commands": made("headings").commands[:, :1]},
-    r"commands: found shape \(8, 1000\)": {"commands": made("headings").commands.reshape(8, -1)},
     "kinds: found 'loop', expected one of headings": {"kinds": np.array(["loop"] * 8)},
     "kinds, starts: found arrays of <U1": {"kinds": np.array([], "U1")},
-    "kinds, starts: found arrays of float64": {"kinds": np.zeros(8)},
     "starts: found an array of <U4": {"starts": np.full((8, 21), "text")},
     "found text with numbers that are no characters": {"kinds": np.full(8, 0x7FFFFFFF, np.int32).view("<U1")},
     r"kinds: found 'xxx.{0,80}, expected one of headings": {"kinds": np.array(["x" * 5000] * 8)},
@@ -151,32 +145,14 @@ def test_bad_scripts_are_refused(tmp_path, message):
         load_script(path)
 
 
-def test_names_without_flights_take_no_memory(tmp_path):
-    path, script = tmp_path / "names.npz", made("headings")
-    names = np.full(2**20, "\U0001f681" * 2)
-    np.savez(path, kinds=names, starts=script.starts, commands=script.commands)
-    del names
-    tracemalloc.start()
-    try:
-        with pytest.raises(ScriptError, match=r"names\.npz: kinds, starts: found arrays"):
-            load_script(path)
-        assert tracemalloc.get_traced_memory()[1] < 2**26
-    finally:
-        tracemalloc.stop()
-
-
-def test_files_that_are_no_scripts_are_refused(tmp_path):
-    path = tmp_path / "cut.npz"
-    save_script(path, made("headings"))
-    path.write_bytes(path.read_bytes()[:1000])
-    for bad, message in ((path, "not a script, or damaged"), (tmp_path / "none.npz", "No such file")):
-        with pytest.raises(ScriptError, match=message):
-            load_script(bad)
-    with pytest.raises(ScriptError, match=r"found suffix '\.csv', expected \.npz"):
-        load_script(tmp_path / "flight.csv")
+def test_other_suffixes_and_scripts_that_cannot_be_flown_are_not_written(tmp_path):
     script = made("headings")
-    with pytest.raises(ScriptError, match=r"commands\[0, 0, 0\]: found nan"):
-        save_script(path, script._replace(commands=script.commands * np.nan))
+    for name, wrong, message in (
+        ("flight.csv", script, r"found suffix '\.csv', expected \.npz"),
+        ("flight.npz", script._replace(commands=script.commands * np.nan), r"commands\[0, 0, 0\]: found nan"),
+    ):
+        with pytest.raises(ScriptError, match=message):
+            save_script(tmp_path / name, wrong)
 
 
 def asked(*pairs: tuple[str, str]) -> dict[str, Any]:

@@ -43,14 +43,6 @@ def test_thrust_to_weight(fly_black_box, volt, ratio):
     assert acceleration[2] / GRAVITY + 1.0 == pytest.approx(ratio, abs=0.08)
 
 
-def test_thrust_grows_with_the_command(fly_black_box):
-    thrust = [
-        fly_black_box(start(applied=[0.0, 0.0, 0.0, u], volt=22.0), [0.0, 0.0, 0.0, u])[8]
-        for u in np.linspace(-1.0, 1.0, 21)
-    ]
-    assert (np.diff(thrust) > 0.0).all()
-
-
 @pytest.mark.parametrize("axis", [0, 1, 2])
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 def test_drag_takes_energy(fly_black_box, axis, sign):
@@ -67,14 +59,6 @@ def test_drag_takes_energy(fly_black_box, axis, sign):
     lost_w_per_kg = (energy(x) - energy(after)) / 0.01
     assert abs((energy(x) - energy(airless)) / 0.01) < 5.0
     assert 8.0 < lost_w_per_kg < 60.0
-
-
-@pytest.mark.parametrize("axis", [0, 1])
-def test_drag_in_fast_level_flight(fly_black_box, axis):
-    x = start(applied=[0.0, 0.0, 0.0, -0.3])
-    x[3 + axis] = 15.0
-    acceleration = fly_black_box(x, [0.0, 0.0, 0.0, -0.3])[ACCELERATION]
-    assert 1.5 < -acceleration[axis] < 3.0
 
 
 def test_ground_and_airspeed_add_some_thrust(fly_black_box):
@@ -99,11 +83,6 @@ def test_airless_plant_is_the_minimal_model():
     found = jax.vmap(lambda x, u: plant.step(x, u, AIRLESS))(states, actions)
     expected = jax.vmap(lambda x, u: model_step(x, u, 0.01, model))(states, actions)
     np.testing.assert_allclose(found, expected, rtol=1e-5, atol=2e-5)
-
-
-def test_shipped_plant_feels_the_air(fly_black_box):
-    x = start(vel=[10.0, 0.0, 0.0], applied=[0.0, 0.0, 0.0, 0.0])
-    assert abs(fly_black_box(x, np.zeros(4))[6]) > 0.5
 
 
 def test_attitude_battery_and_clipping(fly_black_box):
@@ -186,68 +165,31 @@ def test_runtime_stands_alone():
 # Nobody peeks
 
 
-def imported_modules(tree: ast.AST) -> Iterator[str]:
+def imported_modules(source: str) -> Iterator[str]:
     """Every absolute module that a source imports, with the names it takes from it."""
-    for node in ast.walk(tree):
+    for node in ast.walk(ast.parse(source)):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom) and not node.level:
             yield from (f"{node.module}.{alias.name}" for alias in node.names)
 
 
-def mentions_numbers(tree: ast.AST) -> bool:
-    """Whether a source imports, names or spells out the file of numbers."""
-    words: list[str] = list(imported_modules(tree))
-    for node in ast.walk(tree):
-        match node:
-            case ast.ImportFrom(names=names):
-                words += [f"{node.module}.{alias.name}" for alias in names]
-            case ast.Constant(value=str(text)) | ast.Name(id=text) | ast.Attribute(attr=text):
-                words.append(text)
-    return any(FORBIDDEN in word for word in words)
+def sources() -> dict[Path, str]:
+    command = ["git", "ls-files", "-z", "--cached", "--others", "--exclude-standard", "*.py"]
+    found = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
+    paths = [ROOT / name for name in found.stdout.split("\0") if name] or list(ROOT.rglob("*.py"))
+    return {path: path.read_text(encoding="utf-8") for path in paths if path.is_file()}
 
 
-def sources() -> list[Path]:
-    found = subprocess.run(
-        ["git", "ls-files", "-z", "--cached", "--others", "--exclude-standard", "*.py"],
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-    )
-    if found.returncode == 0:
-        paths = [ROOT / name for name in found.stdout.split("\0") if name]
-    else:
-        paths = list(ROOT.rglob("*.py"))
-    return [path for path in paths if path.is_file()]
-
-
-@pytest.mark.parametrize(
-    "source",
-    [
-        f"import blackbox.{FORBIDDEN}",
-        f"from blackbox import {FORBIDDEN} as numbers",
-        f"from blackbox.{FORBIDDEN} import PARAMETERS",
-        f"from .{FORBIDDEN} import PARAMETERS",
-        f"open('blackbox/{FORBIDDEN}.py').read()",
-        f"import blackbox\nblackbox.{FORBIDDEN}.PARAMETERS",
-    ],
-)
-def test_search_finds_peeking(source):
-    assert mentions_numbers(ast.parse(source))
-
-
-def test_nothing_peeks_at_the_numbers():
+def test_nothing_mentions_the_numbers():
     allowed = {ROOT / "blackbox" / name for name in ("build.py", "plant.py", f"{FORBIDDEN}.py")}
-    paths = sources()
-    assert allowed < set(paths)
-    for path in set(paths) - allowed:
-        assert not mentions_numbers(ast.parse(path.read_text(encoding="utf-8"))), path
+    found = {path for path, source in sources().items() if FORBIDDEN in source}
+    assert found - allowed == set() and ROOT / "blackbox" / "build.py" in found
 
 
-def test_product_code_reaches_the_plant_through_its_artifact_only():
-    for path in sources():
-        top = path.relative_to(ROOT).parts[0]
-        modules = set(imported_modules(ast.parse(path.read_text(encoding="utf-8"))))
+def test_product_code_reaches_the_plant_only_through_its_artifact():
+    for path, source in sources().items():
+        top, modules = path.relative_to(ROOT).parts[0], set(imported_modules(source))
         if top == "blackbox":
             assert not any(name.startswith("flytrack") for name in modules), path
         elif top != "tests":

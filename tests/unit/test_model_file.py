@@ -74,25 +74,16 @@ BAD_TEXTS = {
     "missing field": (json.dumps({"tau": [1, 1, 1, 1]}), "thrust_coeffs: missing"),
     "empty": ("", "not a JSON file"),
     "no json": ("tau = 3", "not a JSON file"),
-    "cut short": (MINIMAL[:-4], "not a JSON file"),
     "deep": ("[" * 100_000, "not a JSON file"),
     "list": ("[1, 2]", r"found \[1, 2\], expected an object"),
-    "number": ("3", "found 3, expected an object"),
     "newer": (json.dumps({"version": 2, "parameters": FIELDS}), "version: found 2, expected 1"),
-    "version as text": (json.dumps({**FIELDS, "version": "1"}), "version: found '1', expected 1"),
     "parameters as list": (json.dumps({"parameters": [1]}), r"parameters: found \[1\], expected"),
-    "parameters as null": (json.dumps({"parameters": None}), "parameters: found None, expected"),
     "unknown field": (json.dumps({**FIELDS, "mass": 1}), "mass: unknown; expected one of tau, "),
-    "huge integer": (MINIMAL.replace('"m": 1,', f'"m": 1{400 * "0"},'), "m: found 1"),
     "too many digits": (MINIMAL.replace('"m": 1,', f'"m": 1{5000 * "0"},'), "not a JSON file"),
     "effects as list": (json.dumps({**FIELDS, "effects": [1]}), r"effects: found \[1\], expected an object"),
     "unknown effect": (
         json.dumps({**FIELDS, "effects": {"drag": {}}}),
         "effects: drag: unknown; expected one of comm",
-    ),
-    "effect as number": (
-        json.dumps({**FIELDS, "effects": {"wind": 3}}),
-        "effects: wind: found 3, expected an obj",
     ),
     "unknown parameter": (
         json.dumps({**FIELDS, "effects": {"wind": {"speed": 3}}}),
@@ -105,10 +96,6 @@ BAD_TEXTS = {
     "parameter out of range": (
         json.dumps({**FIELDS, "effects": {"command_delay": {"delay_s": 0.05}}}),
         "effects: command_delay: delay_s: found 0.05, expected 0 to 0.04 s",
-    ),
-    "parameter not a number": (
-        json.dumps({**FIELDS, "effects": {"wind": {"v_x": float("nan")}}}),
-        "effects: wind: v_x: found nan, expected -20 to 20 m/s",
     ),
     "beyond float32": (MINIMAL.replace("[0.03", "[1e39"), "tau: found "),
 }
@@ -188,10 +175,3 @@ def test_a_failed_write_leaves_the_old_file(trouble: Any, provenance: dict[str, 
         save_model(path, nominal_parameters()._replace(m=9.0), provenance)
     assert path.read_bytes() == old
     assert [entry.name for entry in tmp_path.iterdir()] == ["model.json"]
-
-
-def test_missing_folders_are_made_and_old_files_replaced(tmp_path: Path) -> None:
-    path = tmp_path / "a" / "b" / "model.json"
-    for mass in (1.5, 2.5):
-        save_model(path, nominal_parameters()._replace(m=mass), {})
-        assert load_model(path).m == mass
