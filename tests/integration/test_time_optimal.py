@@ -13,9 +13,8 @@ import pytest
 from benchmarks import time_optimal
 from benchmarks.optimal.replay import replay
 from flytrack_env import Track, available_tracks, load_track, nominal_parameters
-from flytrack_env.dynamics import ModelParameters, step
-from flytrack_env.effects import EFFECTS, CommandDelay, GyroBias
-from flytrack_env.quaternion import Vec3
+from flytrack_env.dynamics import step
+from flytrack_env.effects import EFFECTS
 from flytrack_env.references import (
     FOLDER,
     KINDS,
@@ -34,64 +33,27 @@ from flytrack_env.tracks import build_course
 SHIPPED = sorted(FOLDER.glob("*.npz"))
 RADIUS_M = 0.15
 EXACT = 1e-6  # of the simulator in float64
-ROUNDED = 1e-4  # what storing states as float32 leaves of an equation of motion
 
 
-def in_float64(model: ModelParameters) -> ModelParameters:
-    return jax.tree.map(lambda leaf: np.asarray(leaf, float), model)
-
-
-def with_all_effects(rng: np.random.Generator) -> ModelParameters:
-    """Return the nominal model with every effect that has no memory, some way off neutral."""
-    model = nominal_parameters()
+def test_the_symbolic_step_is_the_simulators() -> None:
+    symbolic = pytest.importorskip("benchmarks.optimal.symbolic", exc_type=ImportError)
+    rng, model = np.random.default_rng(0), nominal_parameters()
     for effect in EFFECTS:
-        if effect.start is None:
+        if effect.start is None:  # no memory
             neutral = effect.parameters()._asdict()
             sizes = {name: neutral[name] + effect.notable.get(name, 0.0) * rng.uniform() for name in neutral}
             model = model.with_effects(effect.parameters(**sizes))
-    return model
-
-
-STEPS = jax.jit(jax.vmap(step, in_axes=(0, 0, 0, None)))
-MOST_ROWS = 1000  # all flights are padded to this, so that one program serves them
-
-
-def step_many(states: Any, commands: Any, durations: Any, model: ModelParameters) -> np.ndarray:
-    rows = [np.resize(values, (MOST_ROWS, *values.shape[1:])) for values in (states, commands, durations)]
-    return np.array(STEPS(*rows, model))[: len(states)]
-
-
-def random_state(rng: np.random.Generator) -> np.ndarray:
-    x = rng.normal(size=STATE_SIZE) * 3.0
-    x[QUATERNION] /= np.linalg.norm(x[QUATERNION])
-    x[16:20] = rng.uniform(-1.0, 1.0, 4)
-    x[BATTERY] = rng.uniform(22.0, 24.0)
-    return x
-
-
-@pytest.mark.parametrize("has_effects", [False, True])
-def test_the_symbolic_step_is_the_simulators(has_effects: bool) -> None:
-    symbolic = pytest.importorskip("benchmarks.optimal.symbolic", exc_type=ImportError)
-    rng = np.random.default_rng(0)
-    model = with_all_effects(rng) if has_effects else nominal_parameters()
     traced = symbolic.step_function(model)
     with jax.enable_x64(True):
-        exact = in_float64(model)
+        exact = jax.tree.map(lambda leaf: np.asarray(leaf, float), model)
         simulated = jax.jit(lambda x, u, dt: step(x, u, dt, exact))
         for _ in range(100):
-            x, u, dt = random_state(rng), rng.uniform(-1.0, 1.0, 4), rng.uniform(0.002, 0.04)
-            found = traced(x, u, dt).full()[:, 0]
-            np.testing.assert_allclose(found, simulated(x, u, dt), rtol=0.0, atol=EXACT)
-
-
-def test_unsupported_models_are_refused_by_name(monkeypatch: pytest.MonkeyPatch) -> None:
-    symbolic = pytest.importorskip("benchmarks.optimal.symbolic", exc_type=ImportError)
-    with pytest.raises(symbolic.UnsupportedModelError, match=r"command_delay.*memory"):
-        symbolic.step_function(nominal_parameters().with_effects(CommandDelay(0.02)))
-    assert symbolic.flown_effects(nominal_parameters().with_effects(GyroBias(0.1))) == ()
-    monkeypatch.delitem(symbolic.OPERATIONS, "exp")
-    with pytest.raises(symbolic.UnsupportedModelError, match="operation exp"):
-        symbolic.step_function(nominal_parameters())
+            x, u, dt = rng.normal(size=STATE_SIZE), rng.uniform(-1.0, 1.0, 4), rng.uniform(0.002, 0.04)
+            x[QUATERNION] /= np.linalg.norm(x[QUATERNION])
+            x[16:20], x[BATTERY] = rng.uniform(-1.0, 1.0, 4), rng.uniform(22.0, 24.0)
+            np.testing.assert_allclose(
+                traced(x, u, dt).full()[:, 0], simulated(x, u, dt), rtol=0.0, atol=EXACT
+            )
 
 
 def test_every_track_has_its_references() -> None:
@@ -104,37 +66,6 @@ def test_every_track_has_its_references() -> None:
         shipped_reference("nowhere")
 
 
-@pytest.mark.parametrize("path", SHIPPED, ids=lambda path: path.stem)
-def test_a_shipped_flight_obeys_the_simulator_and_the_gates(path: Path) -> None:
-    found = load_reference(path)
-    assert path.stem == f"{found.track}_{found.model_name}_{found.kind}"
-    track, num_steps = load_track(found.track), len(found.commands)
-    assert found.track_sha256 == track_digest(track) and found.found["status"] == "Solve_Succeeded"
-    assert found.time_s == found.gate_times_s[-1] and len(found.gate_times_s) == len(track.gates)
-    with jax.enable_x64(True):
-        model, durations = in_float64(found.model), np.full(num_steps, found.dt_s)
-        after = step_many(found.states[:-1], found.commands, durations, model)
-        durations[-1] = found.time_s - (num_steps - 1) * found.dt_s
-        end = step_many(found.states[:-1], found.commands, durations, model)[-1]
-    np.testing.assert_allclose(found.states[1:], after, atol=ROUNDED)
-    gates = build_course(track).gates
-    for index, time_s in enumerate(found.gate_times_s):
-        gate = jax.tree.map(lambda leaf, i=index: float(np.asarray(leaf)[i]), gates)
-        node = int(time_s / found.dt_s)
-        part = time_s / found.dt_s - node
-        before, behind = found.states[node, POSITION], found.states[node + 1, POSITION]
-        at = gate.to_frame(Vec3(*(before + part * (behind - before))) - gate.centre)
-        free = gate.half_opening - RADIUS_M
-        assert abs(at.x) < 1e-3 and abs(at.y) < free and abs(at.z) < free
-        assert gate.forward.dot(Vec3(*found.states[node + 1, VELOCITY])) > 0.0
-    if found.kind == "flying":
-        end[QUATERNION] *= np.sign(end[QUATERNION] @ found.states[0, QUATERNION])
-        np.testing.assert_allclose(found.states[0, :BATTERY], end[:BATTERY], atol=ROUNDED)
-    else:
-        start = time_optimal.start_state(track, found.found["battery_v"])
-        np.testing.assert_allclose(found.states[0], start, atol=EXACT)
-
-
 # A program per number of gates and model: one track of them in every run.
 REPLAYED = [
     pytest.param(path, id=path.stem, marks=[] if path.stem.startswith("flytrack_") else pytest.mark.slow)
@@ -145,10 +76,19 @@ REPLAYED = [
 @pytest.mark.parametrize("path", REPLAYED)
 def test_its_commands_fly_in_the_simulator(path: Path) -> None:
     found = load_reference(path)
-    flown = replay(found, load_track(found.track))
+    track = load_track(found.track)
+    assert path.stem == f"{found.track}_{found.model_name}_{found.kind}"
+    assert found.track_sha256 == track_digest(track) and found.found["status"] == "Solve_Succeeded"
+    flown = replay(found, track)
     assert time_optimal.is_verified(found, flown)
     assert flown.time_s == pytest.approx(found.time_s, abs=1e-4)
     assert flown.drift_m < 1e-3, "half of the clearance"
+    before, behind = found.states[-2:]
+    end = before + (found.time_s / found.dt_s % 1.0) * (behind - before)
+    start = time_optimal.start_state(track, found.found["battery_v"])
+    first, wanted = (end, found.states[0]) if found.kind == "flying" else (found.states[0], start)
+    np.testing.assert_allclose(first[POSITION], wanted[POSITION], atol=5e-3)
+    np.testing.assert_allclose(first[VELOCITY], wanted[VELOCITY], atol=5e-3)
 
 
 def test_a_replay_sees_what_goes_wrong() -> None:
@@ -174,18 +114,12 @@ def rewritten(path: Path, **changes: Any) -> Path:
     ("changes", "reason"),
     [
         ({"states": np.zeros((3, STATE_SIZE))}, r"states: found shape \(3, 21\), expected \(385, 21\)"),
-        ({"states": np.zeros((2**20, 21))}, "cannot be read: found more than 16777216 bytes"),
-        ({"commands": np.full((384, 4), 1.5)}, "commands: found 1.5, expected within"),
         ({"commands": np.full((384, 4), np.nan)}, "commands: .*finite"),
         ({"version": 2}, "version: found 2, expected 1"),
         ({"kind": "hovering"}, "kind: found 'hovering', expected one of flying, standing"),
-        ({"model": {}}, "model: cannot be read"),
         ({"model_sha256": "0"}, "model: found another"),
-        ({"gate_times_s": np.array([object()])}, "cannot be read: .*pickles are never read"),
-        ({"gate_times_s": np.array([0.2, 0.1])}, "gate_times_s: found .*expected a row of growing times"),
+        ({"gate_times_s": np.array([object()])}, "cannot be read: .*nothing is unpickled"),
         ({"time_s": -1.0}, "time_s: found -1.0, expected seconds above 0"),
-        ({"track": ["flytrack"]}, r"track: found \['flytrack'\], expected a text"),
-        ({"found": "by chance"}, "found: found 'by chance', expected an object"),
     ],
 )
 def test_a_damaged_file_is_refused(changes: dict[str, Any], reason: str, tmp_path: Path) -> None:
@@ -221,23 +155,6 @@ def test_the_command_verifies_and_writes_the_page(
     assert capsys.readouterr().out.count("8 of 8 gates") == len(KINDS)
     assert page.read_text().count("8 of 8") == len(KINDS)
     assert (tmp_path / "page_flytrack.png").stat().st_size > 10_000
-
-
-def test_first_guesses_pass_the_gates_on_every_grid() -> None:
-    pytest.importorskip("casadi")
-    from benchmarks.optimal import problem, solve
-
-    track = load_track("flytrack")
-    start = time_optimal.start_state(track, 24.0)
-    counts = np.full(len(track.gates), 5)
-    for kind in KINDS:
-        task = problem.Task(kind, build_course(track), RADIUS_M, start)
-        first = solve.first_guess(task, counts, 10.0, None)
-        gates = np.array([gate.position for gate in track.gates])
-        np.testing.assert_allclose(first.states[np.cumsum(counts), POSITION], gates, atol=1e-5)
-        finer = solve.resample(first, counts, 3 * counts)
-        np.testing.assert_allclose(finer.times(3 * counts), first.times(counts))
-        np.testing.assert_allclose(finer.states[::3, POSITION], first.states[:, POSITION], atol=1e-9)
 
 
 def test_a_straight_flight_takes_as_long_as_it_has_to(row_track: Callable[[list[float]], Track]) -> None:
