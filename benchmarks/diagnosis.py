@@ -2,10 +2,10 @@
 
 ``python -m benchmarks.diagnosis [--plants 200] [--rows clean,one,...] [--seed 0]`` flies every plant for a
 minute (benchmarks.hidden), shows the diagnosis the log and the model without the hidden effects, and grades
-what it says by what the log could show (benchmarks.hidden.oracle). A line a plant goes to
-docs/results/diagnosis.jsonl as it is done, with the commit and versions it was measured at; what is there
-already, of the same commit, is not done again. ``--write`` makes docs/results/diagnosis.md of the lines of
-the last commit. Whether a change altered results is told by ``benchmarks.check_diagnosis``.
+the result by what the log could show (benchmarks.hidden.oracle). It appends a line a plant to
+docs/results/diagnosis.jsonl, with the commit and versions it was measured at, and skips plants that have a
+line of the same commit. ``python -m benchmarks.diagnosis_page`` writes the page of the last commit's lines,
+``benchmarks.check_diagnosis`` checks whether a change altered results.
 """
 
 import argparse
@@ -85,7 +85,7 @@ def make_log(row: str, number: int, seed: int) -> tuple[Truth, FlightLog, Flight
 
 
 def plant(row: str, number: int, seed: int) -> dict[str, Any]:
-    """Return what one plant's diagnosis said and what it could have."""
+    """Return the diagnosis of one plant, graded."""
     truth, clean, log, model, rng = make_log(row, number, seed)
     started = time.process_time()
     found = diagnose(log, model)
@@ -94,7 +94,7 @@ def plant(row: str, number: int, seed: int) -> dict[str, Any]:
         "truth": truth.text(),
         "effects": list(truth.effects),
         "verdict": found.verdict,
-        "causes": [_said(cause, truth) for cause in found.causes],
+        "causes": [_graded(cause, truth) for cause in found.causes],
         "unexplained": {name: round(size, 3) for name, size in found.unexplained.shares.items()},
         "not_identifiable": [one.effect for one in found.not_identifiable],
         "cpu_s": round(seconds, 2),
@@ -110,20 +110,19 @@ def plant(row: str, number: int, seed: int) -> dict[str, Any]:
     return line
 
 
-def _said(cause: Any, truth: Truth) -> dict[str, Any]:
-    """Return what is named, and by parameter what is true, what was found and its interval."""
+def _graded(cause: Any, truth: Truth) -> dict[str, Any]:
+    """Return a cause's name and, by parameter, the true value, the estimate and its interval."""
     true = truth.effects.get(cause.effect, {})
-    covers = {
-        name: [float(f"{value:.5g}") for value in (true[name], one.value, *one.ci95)]
-        for name, one in cause.parameters.items()
-        if name in true
-    }
     return {
         "effect": cause.effect,
         "equivalent": list(cause.equivalent),
         "gain": float(f"{cause.chi2_gain:.4g}"),
         "heldout": float(f"{cause.heldout_gain:.4g}"),
-        "intervals": covers,
+        "intervals": {
+            name: [float(f"{value:.5g}") for value in (true[name], one.value, *one.ci95)]
+            for name, one in cause.parameters.items()
+            if name in true
+        },
     }
 
 
@@ -164,19 +163,13 @@ def run(rows: list[str], plants: range, seed: int) -> None:
 
 
 def main() -> None:
-    """Run, or write the page."""
+    """Diagnose the plants of some rows."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--plants", type=int, default=200, help="of each row; default: %(default)s")
     parser.add_argument("--first", type=int, default=0, help="number of the first plant")
     parser.add_argument("--rows", default=",".join(ROWS), help="default: all")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--write", action="store_true", help="write the page of the lines that are there")
     arguments = parser.parse_args()
-    if arguments.write:
-        from benchmarks.diagnosis_page import write_page  # it reads this module's rows
-
-        write_page()
-        return
     run(arguments.rows.split(","), range(arguments.first, arguments.plants), arguments.seed)
 
 

@@ -2,7 +2,7 @@
 
 ``python -m benchmarks.real_logs [--data ../shared/data]`` writes docs/results/real_logs_diagnosis.md. Two
 crafts: a Crazyflie 2.1 flown by learned policies (some policies are held out), and an acro flight of a
-Betaflight quadcopter. What is named is held against a plain regression (``benchmarks.answers``).
+Betaflight quadcopter. The answers to commands are compared with a plain regression.
 Where the data or the reader of Betaflight logs are absent, it says so and writes nothing.
 """
 
@@ -10,7 +10,7 @@ import argparse
 import os
 import sys
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import NamedTuple
@@ -18,13 +18,12 @@ from typing import NamedTuple
 import jax
 import numpy as np
 
-from benchmarks.answers import answers, velocity_scale
+from benchmarks.report import RESULTS, ROOT, table
 from flytrack_env.files import write_atomically
 from flytrack_sysid import Diagnosis, FlightLog, LogError, diagnose, import_log
 from flytrack_sysid.diagnosis import joined
 
-ROOT = Path(__file__).parent.parent
-RESULT = ROOT / "docs" / "results" / "real_logs_diagnosis.md"
+RESULT = RESULTS / "real_logs_diagnosis.md"
 VARIABLE = "FLYTRACK_SHARED_DATA"
 CRAZYFLIE, BETAFLIGHT = "crazyflie_rate_flights", "betaflight_acro_log"
 # Every third policy, by its number, is for judging.
@@ -78,20 +77,10 @@ def betaflight(data: Path) -> Craft:
     return timed(found.log, found.nominal_model(), None)
 
 
-def with_unit(text: str, unit: str) -> str:
-    """Return a number with its unit, if it has one."""
+def number(value: float | None, unit: str = "1") -> str:
+    """Return three digits, and the unit if there is one."""
+    text = "none" if value is None or not np.isfinite(value) else f"{value:.3g}"
     return text if unit == "1" else f"{text} {unit}"
-
-
-def number(value: float | None) -> str:
-    """Return three digits."""
-    return "none" if value is None or not np.isfinite(value) else f"{value:.3g}"
-
-
-def table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """Return a table of Markdown."""
-    lines = [header, ["---"] * len(header), *rows]
-    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
 
 def causes_table(found: Diagnosis) -> str:
@@ -99,52 +88,38 @@ def causes_table(found: Diagnosis) -> str:
     rows = []
     for cause in found.causes:
         values = "<br>".join(
-            f"{name} {with_unit(number(one.value), one.unit)} ({' to '.join(map(number, one.ci95))})"
+            f"{name} {number(one.value, one.unit)} ({' to '.join(map(number, one.ci95))})"
             for name, one in cause.parameters.items()
         )
         against = f"no (closest: {cause.closest})" if cause.closest else "not tried"
-        alike = ", ".join(cause.equivalent) or against
         gains = (cause.chi2_gain, cause.heldout_gain, cause.lambda_, cause.lambda_sep)
+        alike = ", ".join(cause.equivalent) or against
         rows.append([f"`{cause.effect}`", values, *map(number, gains), alike])
-    header = (
-        "cause",
-        "values, 95 % intervals",
-        "chi2_gain",
-        "heldout_gain",
-        "lambda",
-        "lambda_sep",
-        "alike?",
-    )
+    header = "cause | values, 95 % intervals | chi2_gain | heldout_gain | lambda | lambda_sep | alike?"
     return table(header, rows)
 
 
 def errors_table(found: Diagnosis) -> str:
     """Return the errors of the models on held-out rows."""
-    models = list(found.error)
-    one_step = found.error[models[0]].one_step_nrmse
-    free = found.error[models[0]].position_m
+    models = list(found.error.values())
     rows = [
-        [f"{name}, one step, NRMSE", *(number(found.error[model].one_step_nrmse[name]) for model in models)]
-        for name in one_step
+        [f"{name}, one step, NRMSE", *(number(one.one_step_nrmse[name]) for one in models)]
+        for name in models[0].one_step_nrmse
     ]
     rows += [
-        [f"position after {name} s, m", *(number(found.error[model].position_m[name]) for model in models)]
-        for name in free
+        [f"position after {name} s, m", *(number(one.position_m[name]) for one in models)]
+        for name in models[0].position_m
     ]
-    return table(("error on held-out rows", *(model.replace("_", " ") for model in models)), rows)
+    return table(["error on held-out rows", *(name.replace("_", " ") for name in found.error)], rows)
 
 
 def unseen_table(found: Diagnosis) -> str:
     """Return what the log could not have shown."""
     rows = [
-        [
-            f"`{one.effect}`",
-            with_unit(number(one.smallest), one.unit),
-            ", ".join(one.confused_with) or "noise",
-        ]
+        [f"`{one.effect}`", number(one.smallest, one.unit), ", ".join(one.confused_with) or "noise"]
         for one in found.not_identifiable
     ]
-    return table(("effect", "seen for sure from", "looks like"), rows)
+    return table("effect | seen for sure from | looks like", rows)
 
 
 def section(craft: Craft) -> str:
@@ -163,6 +138,49 @@ def section(craft: Craft) -> str:
         unseen_table(found),
     ]
     return "\n\n".join(parts)
+
+
+ANSWER_ROWS = 30  # 0.3 s at 100 Hz: how far back a command still acts
+
+
+def answers(log: FlightLog, held_out: np.ndarray) -> tuple[Mapping[str, np.ndarray], Mapping[str, float]]:
+    """Return what a step of a command leads to, by regression, and the error of that on held-out rows.
+
+    Body rates by their own stick, rad/s per unit, and voltage by the squared thrust stick ((1 + u)/2)^2, V:
+    (ANSWER_ROWS + 1,), the sum of the regression's weights up to each row. Errors: rms over the spread.
+    """
+    squared = ((1.0 + log["u"][:, 3]) / 2.0) ** 2
+    pairs = {
+        name: (log["u"][:, axis], log["w"][:, axis]) for axis, name in enumerate(("roll", "pitch", "yaw"))
+    }
+    pairs["voltage"] = (squared, log["v_bat"][:, 0])
+    starts = np.maximum.accumulate(np.where(log.is_start(), np.arange(len(log)), 0))
+    rows = np.flatnonzero(np.arange(len(log)) - starts >= ANSWER_ROWS)
+    steps, errors = {}, {}
+    for name, (command, measured) in pairs.items():
+        past = np.stack(
+            [command[rows - lag] for lag in range(ANSWER_ROWS + 1)] + [np.ones(len(rows))], axis=1
+        )
+        out, wanted = held_out[rows], measured[rows]
+        weights = np.linalg.lstsq(past[~out], wanted[~out], rcond=None)[0]
+        left = (wanted - past @ weights)[out]
+        steps[name] = np.cumsum(weights[:-1])
+        errors[name] = float(np.sqrt(np.mean(left**2)) / wanted[out].std())
+    return steps, errors
+
+
+def velocity_scale(log: FlightLog) -> tuple[float, float]:
+    """Return how far a flight went over what its velocity says, horizontally and upwards, over a second.
+
+    The geometric mean of both regressions, as either channel is noisy.
+    """
+    rows = round(1.0 / float(np.median(np.diff(log.time))))
+    one_flight = log.segment[rows:] == log.segment[:-rows]
+    said = np.cumsum(log["v"], axis=0) / rows
+    moved, said = ((values[rows:] - values[:-rows])[one_flight] for values in (log["p"], said))
+    horizontal = np.sum(moved[:, :2] ** 2) / np.sum(said[:, :2] ** 2)
+    upward = np.sum(moved[:, 2] ** 2) / np.sum(said[:, 2] ** 2)
+    return float(np.sqrt(horizontal)), float(np.sqrt(upward))
 
 
 ANSWERS = """A check that shares nothing with the diagnosis: a linear regression on the commands of the last

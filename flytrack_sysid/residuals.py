@@ -142,7 +142,7 @@ def predict_rows(model: ModelParameters, record: Record, turns_afresh: jax.Array
     turns_afresh: (num_rows,) bool, where the attitude is taken from the log again.
     """
 
-    def observe(step: Step, _: None) -> tuple[jax.Array, ...]:
+    def observe(step: Step, _: None) -> tuple[Any, ...]:
         force_w = step.after.acc_w + Vec3(0.0, 0.0, model.g)
         force_b = [axis.dot(force_w) for axis in step.before.quat.axes()]
         stacked = (jnp.stack(tuple(leaves)) for leaves in (step.after.rates_b, force_b, step.after.acc_w))
@@ -150,8 +150,10 @@ def predict_rows(model: ModelParameters, record: Record, turns_afresh: jax.Array
 
     of_next = replay(model, record, "commanded", None, observe)
     quat = _integrated(record, Vec3(*of_next[0].T), record.begins | turns_afresh)
-    own = (jnp.concatenate([jnp.zeros_like(values[:1]), values[:-1]]) for values in of_next)
-    return Predicted(*own, quat)
+    rates_b, force_b, acc_w, change_v = (
+        jnp.concatenate([jnp.zeros_like(values[:1]), values[:-1]]) for values in of_next
+    )
+    return Predicted(rates_b, force_b, acc_w, change_v, quat)
 
 
 def _integrated(record: Record, rates_b: Vec3, is_fresh: jax.Array | np.ndarray) -> jax.Array:

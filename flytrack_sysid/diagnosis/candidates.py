@@ -48,7 +48,7 @@ def candidates_of(effect: Effect) -> list[Candidate]:
     found = []
     for group in effect.groups or (tuple(effect.ranges),):
         fields = tuple(f"{effect.name}.{field}" for field in group)
-        probes = [
+        probes: list[tuple[str, float] | None] = [
             (f"{effect.name}.{field}", value) for field in group for value in effect.probes.get(field, ())
         ]
         found += [Candidate(effect.name, fields, probe) for probe in probes or [None]]

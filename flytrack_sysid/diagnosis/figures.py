@@ -1,4 +1,4 @@
-"""Figures of the report: the evidence for each cause, and residuals over time, by regressor and by lag."""
+"""Figures of the report: the evidence for each cause, and residuals of the models by regressor."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -9,10 +9,9 @@ from matplotlib.figure import Figure
 
 from flytrack_sysid.diagnosis.evidence import After, Against, words_of
 from flytrack_sysid.diagnosis.statistics import (
-    BANDS,
     BLOCK_S,
     FEWEST_ROWS,
-    autocorrelation,
+    TWO_SIDED_95,
     bin_edges,
     binned_means,
     on_slots,
@@ -37,7 +36,6 @@ _TURN_AXES = {"x": "roll", "y": "pitch", "z": "yaw"}
 MODELS = {"nominal": ("nominal", "0.55"), "base": ("refitted", ORANGE), "extended": ("extended", BLUE)}
 RATES = tuple(f"rates_{axis}" for axis in "xyz")
 FORCES = tuple(f"force_{axis}" for axis in "xyz")
-MOST_TIME_BINS, LEAST_TIME_BIN_S = 200, 0.25
 NUM_REGRESSOR_BINS = 10
 ASIDE = 0.012  # of a panel's width, between the models' dots
 
@@ -137,7 +135,7 @@ def _draw_after(panel: Axes, traces: Traces, spec: After, without: str, full: st
     )
     # A row holds what its step led to: lag 0 is one step after the change.
     milliseconds = 1e3 * (before.lags_s + traces.step_s)
-    _draw_three(panel, milliseconds, before.values, BANDS[95] * before.std, explained.values, after.values)
+    _draw_three(panel, milliseconds, before.values, TWO_SIDED_95 * before.std, explained.values, after.values)
     panel.axvline(0.0, color=GREY, linewidth=0.8)
     which = {0: "step", 1: "rise", -1: "fall"}[spec.only]
     panel.set_xlabel(f"time since a {which} of {spec.stick} (ms)", fontsize="small")
@@ -189,31 +187,6 @@ def _models_in(traces: Traces) -> list[str]:
     return [name for name in MODELS if name in traces.residuals]
 
 
-def draw_over_time(traces: Traces) -> Figure:
-    """Draw the means of residuals over short pieces of time, before and after."""
-    figure, axes = _panels("Residuals over time", 4, 2, 8.0)
-    elapsed = traces.regressors["elapsed"]
-    num_bins = int(np.clip((elapsed[-1] - elapsed[0]) / LEAST_TIME_BIN_S, 1, MOST_TIME_BINS))
-    edges = np.linspace(elapsed[0], elapsed[-1] + traces.step_s, num_bins + 1)
-    names = [name for pair in zip(RATES, FORCES, strict=True) for name in pair] + ["battery"]
-    for panel, residual in zip(axes.flat, names, strict=False):
-        if not _can_show(traces, residual):
-            say(panel, f"{_label(residual)}:\n{NO_DATA}")
-            continue
-        for model in _models_in(traces):
-            values, counts = _column(traces, model, residual)
-            found = binned_means(elapsed[counts], values[counts], _blocks(traces)[counts], edges)
-            words, colour = MODELS[model]
-            panel.plot(found.at, found.means, color=colour, linewidth=0.9, label=words)
-        panel.axhline(0.0, color=GREY, linewidth=0.6)
-        panel.set_title(_label(traces.used(residual)), fontsize="small", loc="left")
-    axes.flat[-1].set_axis_off()
-    for panel in (axes[3, 0], axes[2, 1]):
-        panel.set_xlabel("time (s)", fontsize="small")
-    _legend_below(figure)
-    return figure
-
-
 def _regressors_of(residual: str) -> list[str]:
     """Return what a residual is drawn against: its own stick first."""
     stick = {"rates_x": "roll", "rates_y": "pitch", "rates_z": "yaw"}.get(residual)
@@ -250,30 +223,4 @@ def draw_against(traces: Traces, residuals: Sequence[str], title: str) -> Figure
             _draw_bins(panel, traces, residual, name)
         line[0].set_ylabel(_label(traces.used(residual)), fontsize="small")
     _legend_below(figure)
-    return figure
-
-
-def draw_whiteness(traces: Traces) -> Figure:
-    """Draw autocorrelations of residuals, with the bands that white noise stays within."""
-    figure, axes = _panels("Are the residuals white? Their autocorrelation", 2, 3, 5.4)
-    for panel, residual in zip(axes.flat, (*RATES, *FORCES), strict=True):
-        title = _label(traces.used(residual)).split(" (")[0]
-        if not _can_show(traces, residual):
-            say(panel, f"{title}:\n{NO_DATA}")
-            continue
-        for model in _models_in(traces):
-            values, counts = traces.column(model, residual)
-            found = autocorrelation(on_slots(values, traces.slot, counts), traces.step_s)
-            words, colour = MODELS[model]
-            lags_ms = 1e3 * found.lags_s[1:]  # 1 at lag 0 would dwarf the rest
-            panel.plot(
-                lags_ms, found.values[1:], ".-", color=colour, label=words, markersize=3, linewidth=0.8
-            )
-        for percent, shade in ((99, "0.9"), (95, "0.8")):
-            ends, label = BANDS[percent] * found.std[1:], f"{percent} % of noise"
-            panel.fill_between(lags_ms, -ends, ends, color=shade, linewidth=0.0, label=label, zorder=0)
-        panel.set_title(title, fontsize="small", loc="left")
-    for panel in axes[-1]:
-        panel.set_xlabel("lag (ms)", fontsize="small")
-    _legend_below(figure, columns=5)
     return figure

@@ -24,6 +24,7 @@ DIRECT, LEVEL = ("w", "f", None), ("q", "v", "v_bat")
 SIZES = (3, 3, 1)
 AXES = (slice(0, 3), slice(3, 6), slice(6, 7))  # of each side: rotation, force, battery
 NUM_AXES = sum(SIZES)
+Channels = dict[str, np.ndarray]
 
 
 class Lanes(NamedTuple):
@@ -97,7 +98,9 @@ def _quanta(found: dict[str, np.ndarray]) -> np.ndarray:
     return np.array([np.repeat([smallest(name) for name in names], SIZES) for names in (DIRECT, LEVEL)])
 
 
-def _counting(name: str | None, size: int, allowed: dict, found: dict, index: np.ndarray) -> np.ndarray:
+def _counting(
+    name: str | None, size: int, allowed: Channels, found: Channels, index: np.ndarray
+) -> np.ndarray:
     """Return where a channel counts, (rows, lanes, size)."""
     mask = allowed[name][index] if name is not None and name in found else np.zeros(index.shape, bool)
     return np.repeat(mask[..., None], size, axis=-1)
@@ -138,7 +141,7 @@ def make_lanes(log: FlightLog, judged: np.ndarray, tau: np.ndarray, gravity: flo
         axis=-1,
     )
     counts &= is_real[..., None, None]
-    sensed = {name: found[name][index] for name in ("w", "f") if name in found}
+    sensed: Channels = {name: found[name][index] for name in ("w", "f") if name in found}
     record = Record(*(leaf[index] for leaf in record))
     begins = record.begins | (np.arange(len(index)) == 0)[:, None] | (index < 0)
     certain = np.stack([turns, lifts, np.ones_like(turns)], axis=-1)

@@ -14,7 +14,7 @@ so that it is one linear map for residuals and their slopes. It has no windows: 
 counts from the first row to the last, where much does only its increments.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -68,7 +68,7 @@ class Gains(NamedTuple):
 def make_gains(noise: Noise, step_s: jax.Array, is_known: jax.Array, counts: jax.Array) -> Gains:
     """Return the gains; step_s (rows, lanes) to the row, counts (rows, lanes, NUM_AXES, 2) bool."""
 
-    def row(carry: tuple, inputs: tuple) -> tuple:
+    def row(carry: tuple[Any, ...], inputs: tuple[Any, ...]) -> tuple[Any, Any]:
         var_e, cov, var_d = carry
         dt, joined, counting, keep = inputs
         dt = dt[:, None]
@@ -102,7 +102,7 @@ def make_gains(noise: Noise, step_s: jax.Array, is_known: jax.Array, counts: jax
 def innovations(gains: Gains, increments: jax.Array, counts: jax.Array) -> jax.Array:
     """Return residuals (rows, lanes, axes, 2) as innovations of variance 1; 0 where nothing counts."""
 
-    def row(carry: tuple, inputs: tuple) -> tuple:
+    def row(carry: tuple[Any, ...], inputs: tuple[Any, ...]) -> tuple[Any, Any]:
         sum_e, wandered, disturbed = carry
         values, gain, counting = inputs
         level = sum_e + values[..., 1]
@@ -126,7 +126,7 @@ def step_to(lanes: Lanes) -> np.ndarray:
     return np.concatenate([step_s[:1], step_s[:-1]])
 
 
-def noise_of(sought: jax.Array) -> Noise:
+def noise_of(sought: jax.Array | np.ndarray) -> Noise:
     """Return the noise of logarithms and a logit, (6, NUM_AXES)."""
     direct, level = jnp.exp(sought[0]), jnp.exp(sought[1])
     disturbance = direct * jnp.exp(sought[3])

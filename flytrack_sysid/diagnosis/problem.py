@@ -110,7 +110,7 @@ class Problem:
     def whiten(self, left: np.ndarray, axes: slice = slice(None)) -> np.ndarray:
         """Return residuals (num_models, rows, lanes, NUM_AXES, 2), or those of some axes, as innovations."""
         assert self.gains is not None, "with_noise comes first"
-        gains = noises.Gains(*(np.asarray(leaf)[..., axes] for leaf in self.gains))
+        gains = jax.tree.map(lambda leaf: np.asarray(leaf)[..., axes], self.gains)
         return _in_batches(lambda part: _whitened(part, gains, self.counts[..., axes, :]), left)
 
     def whitened_residuals(self, *vectors: np.ndarray) -> np.ndarray:

@@ -46,7 +46,7 @@ def flown(lanes: Lanes, tau: np.ndarray) -> Flown:
     applied = _lagged(record.command, record.step_s, tau)
     change = (record.command - applied) / tau
     time_s = np.where(lanes.row >= 0, lanes.row, 0) * float(np.median(step_to(lanes)))
-    is_counted = lanes.counts.any(axis=(2, 3))
+    is_counted = np.asarray(lanes.counts.any(axis=(2, 3)))
     return Flown(
         rotation, before(record.pos_w), before(record.vel_w), applied, before(change), time_s, is_counted
     )

@@ -13,8 +13,6 @@ from flytrack_sysid.diagnosis.figures import (
     RATES,
     draw_against,
     draw_cause,
-    draw_over_time,
-    draw_whiteness,
 )
 from flytrack_sysid.diagnosis.result import CAUSES_FOUND, CONSISTENT, Cause, Diagnosis, Estimated
 from flytrack_sysid.diagnosis.traces import Traces, traces
@@ -28,8 +26,7 @@ NO_BREAK = "\u00a0"  # a space at which lines do not break
 HEADLINE_HORIZON = "1"  # s of free flight, whose error the first sentence gives
 CHANNEL_WORDS = {"rates": "body rates", "force": "specific force"}
 DIFFERENCES = (
-    "The log lacks a gyro or an accelerometer; attitude or velocity replace them, by their change from row "
-    "to row. White noise of theirs shows as a correlation of -0.5 at the first lag."
+    "The log lacks a gyro or an accelerometer; attitude or velocity replace them, by their change per row."
 )
 HOW = (
     "Every step of the log is predicted from the row before it. The model carries on what follows from the "
@@ -43,10 +40,8 @@ HOW = (
     "Pictures show the whole log, the table of errors the held-out part.",
 )
 CAPTIONS = {
-    "over_time": "Means over short pieces of time. Noise is averaged out.",
     "rates": "Means by bins with 95 % intervals. For a model that lacks nothing they are all at 0.",
     "forces": "The same for the specific force along the body's axes.",
-    "whiteness": "White noise leaves the 95 % band at 5 lags in 100, the 99 % band at 1.",
 }
 
 
@@ -175,10 +170,8 @@ def traces_of(diagnosis: Diagnosis, log: FlightLog) -> Traces:
 def draw_report(diagnosis: Diagnosis, found: Traces) -> dict[str, Figure]:
     """Return the figures of a report by name; found: of ``traces_of``."""
     figures = {
-        "over_time": draw_over_time(found),
         "rates": draw_against(found, RATES, "Body rates: residuals, and what they depend on"),
         "forces": draw_against(found, FORCES, "Specific force: residuals, and what they depend on"),
-        "whiteness": draw_whiteness(found),
     }
     for cause in sorted(diagnosis.causes, key=lambda cause: -cause.chi2_gain)[:MOST_PICTURED]:
         panels = EVIDENCE[cause.effect].panels

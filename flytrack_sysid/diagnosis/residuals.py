@@ -55,7 +55,9 @@ def _of_lane(model: ModelParameters, lane: Record, sensed: dict[str, Any]) -> ja
     """Return the residuals of a lane's rows; of its first row nothing is predicted."""
     rows, gyro_b = jax.tree.map(lambda leaf: leaf[:-1], (lane, sensed.get("w")))
     later = jax.tree.map(lambda leaf: leaf[1:], (lane, sensed))
-    found = replay(model, rows, "gyro", gyro_b, lambda step, extra: _of_step(step, *extra, model), later)
+    found = replay(
+        model, rows, "gyro", gyro_b, lambda step, extra: _of_step(step, extra[0], extra[1], model), later
+    )
     return jnp.concatenate([jnp.zeros_like(found[:1]), found])
 
 

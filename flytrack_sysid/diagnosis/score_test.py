@@ -156,7 +156,7 @@ class Linearization:
         free, step = np.ones(len(places), bool), np.zeros(len(places))
         while free.any():
             step[:] = 0.0
-            step[free] = self.step(np.flatnonzero(free))
+            step[free] = self.step(np.flatnonzero(free).tolist())
             stuck = free & (((now <= low + room) & (step < 0.0)) | ((now >= high - room) & (step > 0.0)))
             if not stuck.any():
                 break

@@ -1,4 +1,4 @@
-"""Statistics behind the report's plots: binned means, autocorrelations and step responses of residuals.
+"""Statistics behind the report's plots: binned means and step responses of residuals.
 
 All intervals allow for residuals that are correlated in time.
 """
@@ -6,7 +6,7 @@ All intervals allow for residuals that are correlated in time.
 from typing import NamedTuple
 
 import numpy as np
-from scipy import linalg, stats
+from scipy import linalg
 
 NUM_BINS = 15
 BLOCK_S = 1.0  # rows further apart than this count as independent
@@ -14,7 +14,7 @@ SHOWN_PERCENTILES = (0.5, 99.5)  # of the regressor: single rows far out would s
 FEWEST_ROWS, LEAST_ROWS = 20, 2  # of a bin: wanted, and without which there is no scatter
 FEWEST_BLOCKS = 10  # fewer say too little of their own scatter
 LONGEST_LAG_S = 0.5
-BANDS = {95: float(stats.norm.isf(0.025)), 99: float(stats.norm.isf(0.005))}  # percent -> standard deviations
+TWO_SIDED_95 = 1.959964  # standard deviations
 REGULARISED = 2e-3  # of the power of a command's changes
 FEWEST_PAIRS = 30  # of rows a lag apart
 
@@ -68,11 +68,11 @@ def binned_means(regressor: np.ndarray, values: np.ndarray, block: np.ndarray, e
     by_block = (sums**2).sum(axis=1)
     variance = np.where(used >= FEWEST_BLOCKS, by_block, np.maximum(by_block, by_row))
     kept = rows >= LEAST_ROWS
-    return Binned(at[kept], means[kept], (BANDS[95] * np.sqrt(variance) / some)[kept])
+    return Binned(at[kept], means[kept], (TWO_SIDED_95 * np.sqrt(variance) / some)[kept])
 
 
-class ByLag(NamedTuple):
-    """A correlation, or a response in the residual's unit, by lag, (num_lags,) each.
+class StepResponse(NamedTuple):
+    """A residual after a step of a command by 1, (num_lags,) each.
 
     lags_s: how much later the residual is. std: of values if there were none. NaN where the log has too few
     rows that far apart.
@@ -114,19 +114,6 @@ def _lags(step_s: float, first_s: float, last_s: float) -> np.ndarray:
     return np.arange(round(first_s / step_s), round(last_s / step_s) + 1)
 
 
-def autocorrelation(grid: np.ndarray, step_s: float) -> ByLag:
-    """Return the autocorrelation of a residual on slots, (num_slots,), from lag 0 on.
-
-    Pairs with a lost row are left out. std: of white noise, one over the root of the number of pairs.
-    A model that lacks nothing leaves white residuals (L. Ljung, System Identification, 1999, section 16.6).
-    """
-    grid = _centred(grid)
-    lags = _lags(step_s, 0.0, LONGEST_LAG_S)
-    means, pairs = _products(grid, grid, lags)
-    variance = max(means[0], np.finfo(float).tiny) if np.isfinite(means[0]) else np.nan
-    return ByLag(lags * step_s, means / variance, 1.0 / np.sqrt(np.maximum(pairs, 1.0)))
-
-
 def _convolved(change: np.ndarray, values: np.ndarray, lags: np.ndarray) -> np.ndarray:
     """Return the response to all changes, (num_slots,), values at lags each."""
     known = np.convolve(np.where(np.isfinite(change), change, 0.0), values)
@@ -136,7 +123,7 @@ def _convolved(change: np.ndarray, values: np.ndarray, lags: np.ndarray) -> np.n
 
 def step_response(
     change: np.ndarray, grid: np.ndarray, step_s: float, first_s: float, last_s: float
-) -> ByLag:
+) -> StepResponse:
     """Return what a step of a command by 1 leads to in a residual; columns on slots.
 
     change: of the command from one slot to the next. Least squares over all changes at once, so that steps
@@ -148,7 +135,7 @@ def step_response(
     means, pairs = _products(change, grid, lags)
     power, _ = _products(change, change, np.arange(len(lags)))
     if not (np.isfinite(means).all() and np.isfinite(power).all() and power[0] > 0.0):
-        return ByLag(lags * step_s, np.full(len(lags), np.nan), np.full(len(lags), np.nan))
+        return StepResponse(lags * step_s, np.full(len(lags), np.nan), np.full(len(lags), np.nan))
     inverse = np.linalg.inv(linalg.toeplitz(power) + REGULARISED * power[0] * np.eye(len(lags)))
     values = inverse @ means
     noise = _centred(grid - _convolved(change, values, lags))
@@ -158,4 +145,4 @@ def step_response(
     of_changes = np.nan_to_num(_products(change, change, further)[0])
     both = np.lib.stride_tricks.sliding_window_view(of_changes, len(reach)) @ of_noise
     variance = np.diag(inverse @ linalg.toeplitz(both) @ inverse)
-    return ByLag(lags * step_s, values, np.sqrt(np.maximum(variance, 0.0) / np.maximum(pairs, 1.0)))
+    return StepResponse(lags * step_s, values, np.sqrt(np.maximum(variance, 0.0) / np.maximum(pairs, 1.0)))

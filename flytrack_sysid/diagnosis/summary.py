@@ -290,7 +290,7 @@ def errors_of(
 
     def relative(errors: np.ndarray) -> dict[str, float]:
         return {
-            name: float(np.linalg.norm(own) / max(np.linalg.norm(scales[name]), 1e-12))
+            name: float(np.linalg.norm(own)) / max(float(np.linalg.norm(scales[name])), 1e-12)
             for name, own in _by_channel(errors, test).items()
         }
 

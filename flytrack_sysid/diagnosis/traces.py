@@ -167,15 +167,14 @@ def _counts(lanes: Lanes, rows: _Rows, record: Record) -> dict[str, np.ndarray]:
     """Return where channels count; changes since a row that was lost do not."""
     along = rows.along(lanes.counts)
     after_measured = np.append(False, record.source_row[:-1] >= 0) & ~record.begins
+    found = {name: along[:, axes, number].all(axis=1) for name, (axes, number) in _PLACES.items()}
     return {
-        name: (along[:, axes, number].all(axis=1) & (after_measured if name in _PER_STEP else True))[
-            rows.kept
-        ]
-        for name, (axes, number) in _PLACES.items()
+        name: np.logical_and(counts, after_measured | (name not in _PER_STEP))[rows.kept]
+        for name, counts in found.items()
     }
 
 
-def _regressors(model: ModelParameters, record: Record, applied: np.ndarray) -> dict:
+def _regressors(model: ModelParameters, record: Record, applied: np.ndarray) -> dict[str, np.ndarray]:
     """Return the regressors in the record's order; applied: (num_rows, 4)."""
     attitude = Rotation.from_quat(record.quat, scalar_first=True)
     wind = model.effect("wind")
@@ -205,7 +204,12 @@ def _regressors(model: ModelParameters, record: Record, applied: np.ndarray) -> 
 
 
 def _predicted(
-    residuals: dict, lanes: Lanes, rows: _Rows, record: Record, before: Rotation, gravity: float
+    residuals: dict[str, np.ndarray],
+    lanes: Lanes,
+    rows: _Rows,
+    record: Record,
+    before: Rotation,
+    gravity: float,
 ) -> dict[str, np.ndarray]:
     """Return the rates and the true specific force that a model predicts: measured minus its residual."""
     step_s = np.roll(record.step_s, 1)[rows.kept, None]

@@ -245,7 +245,7 @@ def find_lines(problem: Problem, model: FittedModel) -> list[Line]:
     left = problem.residuals(model.vector[None])[0]
     result = []
     for side, axes in SIDES.items():
-        counts = problem.counts[..., axes, 0].all(axis=-1)
+        counts = np.asarray(problem.counts[..., axes, 0].all(axis=-1))
         if not counts.any():
             continue
         body = np.einsum("rlji,rlj->rli", flight.body_to_world, left[..., axes, 0]) * counts[..., None]

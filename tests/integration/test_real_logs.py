@@ -5,8 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from benchmarks.answers import ANSWER_ROWS, answers, velocity_scale
-from benchmarks.real_logs import main
+from benchmarks.real_logs import ANSWER_ROWS, answers, main, velocity_scale
 from flytrack_sysid import FlightLog, diagnose, import_log
 from tests.support.real_logs import CRAZYFLIE, shared
 
@@ -36,6 +35,7 @@ def test_the_nominal_crazyflie_is_a_sane_start():
     assert thrust[0] < 0.2 * weight and 1.5 * weight < thrust[-1] < 6.0 * weight
 
 
+@pytest.mark.slow
 def test_what_the_nominal_crazyflie_certainly_lacks_is_named(crazyflie):
     assert crazyflie.verdict.startswith("causes_found")
     causes = {cause.effect: cause for cause in crazyflie.causes}
@@ -45,6 +45,7 @@ def test_what_the_nominal_crazyflie_certainly_lacks_is_named(crazyflie):
     assert json.loads(json.dumps(crazyflie.as_json(), allow_nan=False))["verdict"] == crazyflie.verdict
 
 
+@pytest.mark.slow
 def test_the_extended_crazyflie_flies_better_where_it_was_not_fitted(crazyflie):
     nominal, extended = crazyflie.error["nominal"], crazyflie.error["extended"]
     for channel in ("rates", "velocity"):
@@ -53,6 +54,7 @@ def test_the_extended_crazyflie_flies_better_where_it_was_not_fitted(crazyflie):
         assert error < 0.5 * nominal.position_m[horizon]
 
 
+@pytest.mark.slow
 def test_a_crazyflie_on_its_slow_circle_cannot_show_everything(crazyflie):
     unseen = {one.effect for one in crazyflie.not_identifiable}
     assert {"ground_effect", "translational_lift"} <= unseen  # at 1 m, below 2 m/s

@@ -27,7 +27,7 @@ from flytrack_sysid.diagnosis.result import (
     Unexplained,
 )
 from flytrack_sysid.diagnosis.traces import BETWEEN_FLIGHTS, REGRESSORS, traces
-from flytrack_sysid.parameters import to_vector, with_values
+from flytrack_sysid.parameters import names_of, to_vector, with_values
 
 SECONDS, DT_S = 12.0, 0.01
 SETTLED = 150  # rows until a start is forgotten
@@ -143,25 +143,12 @@ def test_attitude_stands_in_for_a_gyro(flown):
 def shown(model: ModelParameters, cause: str) -> ModelParameters:
     """Return the model with a cause, far from neutral."""
     if cause in BASE_CAUSES:
-        size = {
-            name: 1.4 * float(value)
-            for name, value in zip(BASE_CAUSES[cause], old_of(model, cause), strict=True)
-        }
-        return with_values(model, size)
+        values = dict(zip(names_of(model), to_vector(model), strict=True))
+        return with_values(model, {name: 1.4 * values[name] for name in BASE_CAUSES[cause]})
     effect = next(effect for effect in EFFECTS if effect.name == cause)
     return model.with_effects(
         effect.parameters(**{name: 0.9 * one.high for name, one in effect.ranges.items()})
     )
-
-
-def old_of(model: ModelParameters, cause: str) -> list[float]:
-    """Return the model's numbers of a base cause."""
-    names = {
-        f"tau_{stick}": model.tau[index] for index, stick in enumerate(("roll", "pitch", "yaw", "thrust"))
-    }
-    names |= {f"c{power}": model.thrust_coeffs[power] for power in range(6)}
-    names["battery_drain_v_per_min"] = model.battery_drain_v_per_min
-    return [float(names[name]) for name in BASE_CAUSES[cause]]
 
 
 def test_every_cause_has_a_plot_in_which_it_shows(flown):
@@ -204,28 +191,12 @@ def diagnosis(flown, measured):
     drag = {
         name: Estimated(value, (0.9 * value, 1.1 * value), "1/s") for name, value in DRAG._asdict().items()
     }
+    lag = {"tau_roll": Estimated(0.03, (0.02, 0.04), "s")}
+    offset = {"x": Estimated(0.2, (0.1, 0.3), "m/s^2")}
     causes = (
         Cause("linear_drag", (), "force", drag, 900.0, 310.0, 800.0, 500.0, "rotor_drag"),
-        Cause(
-            "tau_roll",
-            ("command_delay",),
-            "rates",
-            {"tau_roll": Estimated(0.03, (0.02, 0.04), "s")},
-            90.0,
-            31.0,
-            80.0,
-            1.0,
-        ),
-        Cause(
-            "accelerometer_bias",
-            (),
-            "force",
-            {"x": Estimated(0.2, (0.1, 0.3), "m/s^2")},
-            50.0,
-            20.0,
-            40.0,
-            30.0,
-        ),
+        Cause("tau_roll", ("command_delay",), "rates", lag, 90.0, 31.0, 80.0, 1.0),
+        Cause("accelerometer_bias", (), "force", offset, 50.0, 20.0, 40.0, 30.0),
     )
     error = {
         name: Errors(
@@ -268,13 +239,13 @@ def test_page_says_all_and_loads_nothing(tmp_path, diagnosis, measured):
     ):
         assert words in text.replace("&#x27;", "'"), words
     assert not re.search(r"https?://|url\(|@import|<link|<script", text)
-    assert text.count('src="data:image/png;base64,') == text.count("<img") == 4 + len(diagnosis.causes)
+    assert text.count('src="data:image/png;base64,') == text.count("<img") == 2 + len(diagnosis.causes)
     assert len(text) < 3e6
 
 
 def test_page_of_a_log_of_few_channels(diagnosis, measured):
     text = html_of(diagnosis, measured.without("w", "f", "v_bat"))
-    assert "attitude or velocity replace them" in text and text.count("<img") == 4 + len(diagnosis.causes)
+    assert "attitude or velocity replace them" in text and text.count("<img") == 2 + len(diagnosis.causes)
 
 
 def test_verdicts(diagnosis):

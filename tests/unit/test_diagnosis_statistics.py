@@ -1,47 +1,14 @@
-"""Correlations and intervals that allow for lost rows, and for rows that are correlated."""
+"""Step responses from overlapping steps, and intervals that allow for correlated rows."""
 
 import numpy as np
-import pytest
-from scipy import signal
 
 from flytrack_sysid.diagnosis.statistics import (
-    BANDS,
-    autocorrelation,
     bin_edges,
     binned_means,
-    on_slots,
     step_response,
 )
-from flytrack_sysid.diagnosis.traces import BETWEEN_FLIGHTS
 
 DT_S = 0.01
-
-
-def rows_of(num_rows: int, lost: float, rng) -> tuple[np.ndarray, np.ndarray]:
-    """Return slots of rows of two flights with some lost, and which of an even series they are."""
-    kept = np.flatnonzero(rng.random(num_rows) >= lost)
-    return kept + np.where(kept < num_rows // 2, 0, BETWEEN_FLIGHTS), kept
-
-
-@pytest.mark.parametrize("lost", [0.0, 0.2])
-def test_white_noise_is_white(lost):
-    rng = np.random.default_rng(1)
-    slot, kept = rows_of(6000, lost, rng)
-    counts = rng.random(len(kept)) < 0.95
-    grid = on_slots(0.3 + rng.standard_normal(6000)[kept], slot, counts)
-    found = autocorrelation(grid, DT_S)
-    assert found.values[0] == pytest.approx(1.0) and found.lags_s[-1] == pytest.approx(0.5)
-    assert np.mean(np.abs(found.values[1:]) > BANDS[99] * found.std[1:]) < 0.06
-
-
-@pytest.mark.parametrize("lost", [0.0, 0.2])
-def test_correlated_noise_is_not_white(lost):
-    rng = np.random.default_rng(2)
-    slot, kept = rows_of(6000, lost, rng)
-    series = signal.lfilter([1.0], [1.0, -0.6], rng.standard_normal(6000))
-    found = autocorrelation(on_slots(series[kept], slot, np.ones(len(kept), bool)), DT_S)
-    np.testing.assert_allclose(found.values[1:5], 0.6 ** np.arange(1, 5), atol=0.06)
-    assert np.all(found.values[1:5] > BANDS[99] * found.std[1:5])
 
 
 def test_response_tells_overlapping_steps_apart():
