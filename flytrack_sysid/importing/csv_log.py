@@ -20,7 +20,7 @@ from flytrack_sysid.log import CHANNELS, LogError
 from flytrack_sysid.log_file import LARGEST_BYTES
 from flytrack_sysid.log_table import CsvRows, Rows, Table, log_of_table
 
-UNPACKED, LARGEST_RATIO = 2**24, 32  # characters in a compressed file: that, or as many times its bytes
+PACKED_BYTES, LARGEST_RATIO = 2**24, 32  # characters in a compressed file: that, or as many times its bytes
 LONGEST_LIST = 1000  # characters of a header in a message
 
 
@@ -49,7 +49,7 @@ def _open_rows(path: Path, delimiter: str) -> Iterator[CsvRows]:
         with open_file(path, LARGEST_BYTES) as file:
             stream, most_characters = file, LARGEST_BYTES
             if path.suffix == ".gz":
-                most_characters = min(LARGEST_BYTES, max(UNPACKED, LARGEST_RATIO * path.stat().st_size))
+                most_characters = min(LARGEST_BYTES, max(PACKED_BYTES, LARGEST_RATIO * path.stat().st_size))
                 stream = cast(BinaryIO, gzip.GzipFile(fileobj=file))
             rows = CsvRows(
                 io.TextIOWrapper(stream, encoding="utf-8-sig", newline=""), delimiter, most_characters

@@ -86,7 +86,7 @@ class Imported(NamedTuple):
 def import_log(
     paths: str | Path | Iterable[str | Path],
     format: str,
-    mapping: str | Path | Mapping | None = None,
+    mapping: str | Path | None = None,
     align: bool = True,
 ) -> Imported:
     """Return measured flights as one flight log in SI units and our frames, a segment each.
@@ -104,12 +104,11 @@ def import_log(
         raise LogError(f"format: found {format!r}, expected one of {', '.join(FORMATS)}")
     if not files:
         raise LogError("found no files to import, expected at least one")
-    if not isinstance(mapping, Mapping):
-        mapping = Mapping() if mapping is None else load_mapping(mapping)
+    loaded = Mapping() if mapping is None else load_mapping(mapping)
     flights, sources = [], []
     for path in files:
-        for flight in READERS[format](path, mapping):
-            flights.append(flight._replace(log=_used_rows(path, flight.log, mapping)))
+        for flight in READERS[format](path, loaded):
+            flights.append(flight._replace(log=_used_rows(path, flight.log, loaded)))
             sources.append(flight.log.source)
     log = _concatenate([flight.log for flight in flights], sources)
     log, offsets = align_clocks(log, align)
@@ -123,15 +122,14 @@ def import_log(
 def _used_rows(path: Path, log: FlightLog, mapping: Mapping) -> FlightLog:
     """Return the rows of a file's log that the mapping selects."""
     rows = mapping.rows
-    count = rows.count if rows.manifest is None else _count_of(path, rows.manifest)
     since_start = log.time - log.time[:1]
     is_used = since_start >= rows.from_s
     if rows.to_s is not None:
         is_used &= since_start <= rows.to_s
     index = np.arange(len(log))
-    is_used &= (index >= rows.first) & ((index - rows.first) % rows.every == 0)
-    if count is not None:
-        is_used &= index < rows.first + count
+    is_used &= index % rows.every == 0
+    if rows.manifest is not None:
+        is_used &= index < _count_of(path, rows.manifest)
     if not is_used.any():
         raise LogError(f"{mapping.source}: rows: none of the {len(log)} rows of {path} is left")
     return log.select(is_used)
@@ -147,21 +145,22 @@ def _count_of(path: Path, wanted: Manifest) -> int:
         lines = read_at_most(manifest, LARGEST_MANIFEST_BYTES).decode("utf-8-sig").splitlines()
         table = csv.reader(lines, strict=True)
         names = next(table, [])
-        for name in (wanted.key, wanted.count):
+        for name in (wanted.name_column, wanted.count_column):
             if name not in names:
                 found = ", ".join(map(quote_name, names[:10]))
                 raise LogError(f"{where}: column {quote_name(name)}: missing; found {found}")
-        key, count = names.index(wanted.key), names.index(wanted.count)
-        text = next((row[count] for row in table if row[key : key + 1] == [path.name] and row[count:]), None)
+        rows = (dict(zip(names, row, strict=False)) for row in table)
+        mine = next((row for row in rows if row.get(wanted.name_column) == path.name), {})
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise LogError(f"{where}: cannot be read as a manifest: {error_text(error)}") from error
-    if text is None:
-        raise LogError(f"{where}: column {quote_name(wanted.key)}: {path.name}: missing")
+    if not mine:
+        raise LogError(f"{where}: column {quote_name(wanted.name_column)}: {path.name}: missing")
+    text = mine.get(wanted.count_column, "")
     try:
         return int(text)
     except ValueError as error:
         found = f"found {quote_value(text)}, expected a whole number"
-        raise LogError(f"{where}: {path.name}: {quote_name(wanted.count)}: {found}") from error
+        raise LogError(f"{where}: {path.name}: {quote_name(wanted.count_column)}: {found}") from error
 
 
 def _concatenate(logs: list[FlightLog], sources: list[str]) -> FlightLog:

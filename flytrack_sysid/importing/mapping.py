@@ -51,21 +51,16 @@ class Channel(NamedTuple):
 
 
 class Manifest(NamedTuple):
-    """A CSV file beside the logs: the column of file names (``key``) and that of rows to use (``count``)."""
+    """A CSV file beside the logs: its columns of file names and of how many rows to use."""
 
     file: str
-    key: str
-    count: str  # type: ignore[assignment]  # hides tuple.count
+    name_column: str
+    count_column: str
 
 
 class UsedRows(NamedTuple):
-    """Which rows to use: ``count`` from ``first`` on, of those from ``from_s`` to ``to_s``, every n-th.
+    """Which rows to use: every n-th from ``from_s`` to ``to_s`` after the first; a manifest limits them."""
 
-    Seconds count from the first row of the file, rows from 0. None: to the end.
-    """
-
-    first: int = 0
-    count: int | None = None  # type: ignore[assignment]  # hides tuple.count
     every: int = 1
     from_s: float = 0.0
     to_s: float | None = None
@@ -142,11 +137,6 @@ class Fields:
         value = self.take(field, partial(_is_number, above=above), f"a number{_bound(above)}", default)
         return value if value is default else float(value)
 
-    def count(self, field: str, default: int | None, least: int) -> Any:
-        """Return a whole number that is at least a bound, or the default."""
-        expected = f"a whole number of at least {least}, below 2^53"
-        return self.take(field, partial(_is_count, least=least), expected, default)
-
     def numbers(self, field: str, size: int, default: Any = REQUIRED, above: float = -LARGEST_NUMBER) -> Any:
         """Return a tuple of finite numbers above a bound, or the default."""
 
@@ -172,10 +162,6 @@ def _is_text(value: Any) -> bool:
 def _is_number(value: Any, above: float) -> bool:
     is_number = isinstance(value, (int, float)) and not isinstance(value, bool)
     return is_number and above < value <= LARGEST_NUMBER  # false for NaN too
-
-
-def _is_count(value: Any, least: int) -> bool:
-    return isinstance(value, int) and not isinstance(value, bool) and least <= value < LARGEST_COUNT
 
 
 def _bound(above: float) -> str:
@@ -227,19 +213,17 @@ def _channels(top: Fields) -> tuple[Channel, ...]:
 
 
 def _rows(fields: Fields) -> UsedRows:
-    found = UsedRows(
-        first=fields.count("first", 0, 0),
-        count=fields.count("count", None, 1),
-        every=fields.count("every", 1, 1),
+    def is_step(value: Any) -> bool:
+        return isinstance(value, int) and not isinstance(value, bool) and 1 <= value < LARGEST_COUNT
+
+    return UsedRows(
+        every=fields.take("every", is_step, "a whole number of at least 1, below 2^53", 1),
         from_s=fields.number("from_s", 0.0),
         to_s=fields.number("to_s", None, above=0.0),
         manifest=fields.table(
             "manifest", lambda table: Manifest(table.text("file"), table.text("key"), table.text("count"))
         ),
     )
-    if found.count is not None and found.manifest is not None:
-        raise fields.error("count", "found together with manifest, expected one of them")
-    return found
 
 
 def _craft(fields: Fields) -> Craft:

@@ -108,7 +108,6 @@ def test_intervals_widen_with_fewer_channels_and_with_what_the_model_lacks(noisy
             assert abs(lacking.intervals[name].value - TRUTH[name]) < 3.0 * half and half > 1.2 * narrow[name]
 
 
-@pytest.mark.slow
 @pytest.fixture(scope="session")
 def dragged() -> FlightLog:
     return excited(replace(PLANT, drag_b=DRAG))
@@ -121,6 +120,7 @@ def test_drag_is_found(dragged):
     assert tau_error(found) < 1e-4 and map_error(found) < 1e-4 and not found.warnings
 
 
+@pytest.mark.slow
 def test_fixed_stays_as_given_and_is_what_the_rest_is_fitted_to(exact):
     fixed = {"tau_yaw": 0.057, "c3": 0.4, "m": 2.0, "max_rate_roll": 618.0}
     found = fit(exact, fixed=fixed)

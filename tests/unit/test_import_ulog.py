@@ -153,7 +153,6 @@ def test_samples_from_before_the_estimator_runs_are_left_out(tmp_path):
         import_log(write(tmp_path / "d.ulg", tables), "ulog")
 
 
-@pytest.mark.slow
 def test_missing_large_and_other_files_and_a_missing_package_are_named(tmp_path, monkeypatch):
     with pytest.raises(LogError, match=r"no\.ulg: cannot be read"):
         import_log(tmp_path / "no.ulg", "ulog")
@@ -170,6 +169,7 @@ def test_missing_large_and_other_files_and_a_missing_package_are_named(tmp_path,
         import_log(path, "ulog")
 
 
+@pytest.mark.slow
 def test_topics_of_arrays_of_arrays_are_refused_in_time(tmp_path, monkeypatch):
     formats = ("vehicle_attitude:b[60000] q;", "b:c[60000] q;", "c:float[60000] q;")
     definitions = b"".join(UlogWriter.message("F", text.encode()) for text in formats)

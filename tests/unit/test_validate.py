@@ -133,7 +133,6 @@ def test_wrong_thrust_shows_in_the_map_by_its_formula(log):
     assert np.isnan(wrong.thrust.mean_n).any() and wrong.as_json()["thrust"]["mean_n"][0][0] is None
 
 
-@pytest.mark.slow
 def test_drag_shows_in_the_force_by_speed():
     dragging = fly(TRUTH.with_effects(DRAG))
     open_force = validate(TRUTH, dragging).open_force
@@ -145,6 +144,7 @@ def test_drag_shows_in_the_force_by_speed():
     assert max(known.open_force.rms_b) < 1e-5
 
 
+@pytest.mark.slow
 def test_delay_is_flown_with_its_memory():
     delayed = TRUTH.with_effects(DELAY)
     log = fly(delayed)
@@ -225,7 +225,6 @@ def test_only_the_chosen_rows_are_judged(log):
 
 
 @pytest.mark.slow
-@pytest.mark.slow
 def test_model_that_runs_away_is_still_reported(log):
     absurd = validate(TRUTH.with_effects(QuadraticDrag(-400.0, -400.0, -400.0)), log)
     assert not np.isfinite(absurd.rollouts[-1].errors["position"].rms)
@@ -234,6 +233,7 @@ def test_model_that_runs_away_is_still_reported(log):
     assert "diverges" in text_of(absurd, "absurd.json", log)
 
 
+@pytest.mark.slow
 def test_report_is_whole_and_escapes_names(tmp_path, log, exact):
     hostile, out = "<img src=x onerror=alert(1)>.npz", tmp_path / "new" / "out"
     paths = write_validation(out, exact, "<b>model</b>.json", replace(log, source=hostile))
