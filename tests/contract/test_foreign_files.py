@@ -70,7 +70,7 @@ def test_compressed_logs_are_read_and_bounded(tmp_path: Path, monkeypatch: pytes
     for content, message in (
         (gzip.compress(text)[:-1], "ended before"),
         (text, "Not a gzipped file"),
-        (gzip.compress(text + b"\n" * 2**20), "found more than 50000 characters"),
+        (gzip.compress(text + b"\n" * 2**20), "found more than [0-9]+ characters"),
         (gzip.compress(b"," * 2**20), "found a row of 65536 characters or more"),
     ):
         path.write_bytes(content)
