@@ -77,13 +77,12 @@ class Flight(NamedTuple):
 
     @property
     def laps_text(self) -> str:
-        """The lap times in a line; of many laps the first and the fastest."""
+        """The lap times in a line; of many laps the first six."""
         times = self.lap_times_s
         if not times:
             return "no complete lap"
-        if len(times) > SHOWN_LAPS:
-            return f"{len(times)} laps, first {times[0]:.3f} s, fastest {min(times):.3f} s"
-        return f"{'lap' if len(times) == 1 else 'laps'} {', '.join(f'{time:.3f}' for time in times)} s"
+        shown = ", ".join(f"{time:.3f}" for time in times[:SHOWN_LAPS])
+        return f"laps {shown} s" if len(times) <= SHOWN_LAPS else f"laps {shown}, ... s"
 
 
 def make_flight(name: str, states: np.ndarray, commands: np.ndarray, track: Track) -> Flight:

@@ -1,14 +1,7 @@
 """What a picture shows: one row of numbers per step, and the log of an episode.
 
-========  =====================================================  =====================
-column    quantity                                               unit
-========  =====================================================  =====================
-0:21      the drone, laid out as in ``flytrack_env.state``       see there
-21        index of the gate to fly next                          1
-22        laps completed                                         1
-23        time of the crossing that began the lap                s since the reset
-24        time of the last complete lap, 0 if none               s
-========  =====================================================  =====================
+A row is the drone's state, laid out as in ``flytrack_env.state``, and index of the gate to fly next, laps
+completed, time of the crossing that began the lap (s since the reset), last lap time (s, 0 if none).
 """
 
 import jax

@@ -31,22 +31,18 @@ class Window:
         self.pygame: ModuleType = importlib.import_module("pygame")
         self.step_s = step_s
         self.step_due_s = self.picture_due_s = time.monotonic()
-        self._open_display()
-
-    def _open_display(self) -> None:
         try:
             self.pygame.display.init()
-            if DRIVER in os.environ or self.pygame.display.get_driver() != INVISIBLE:
-                return
+            is_visible = DRIVER in os.environ or self.pygame.display.get_driver() != INVISIBLE
         except self.pygame.error:
             if DRIVER in os.environ:
                 raise
-        LOGGER.warning("no display was found: the window uses SDL's dummy driver and is invisible")
-        self.pygame.display.quit()
-        os.environ[DRIVER] = "dummy"
-        try:
+            is_visible = False
+        if not is_visible:
+            LOGGER.warning("no display was found: the window uses SDL's dummy driver and is invisible")
+            self.pygame.display.quit()
+            os.environ[DRIVER] = "dummy"
             self.pygame.display.init()
-        finally:
             del os.environ[DRIVER]
 
     def show(self, draw: Callable[[], np.ndarray], is_first: bool) -> None:

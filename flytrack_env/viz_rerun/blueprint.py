@@ -9,7 +9,8 @@ from rerun.blueprint.encodings import TextLogColumn, TextLogColumnKind
 from flytrack_env.state import Action
 from flytrack_env.viz_rerun.entities import Writer
 
-BEHIND_M = (-2.5, 0.0, 1.2)
+BEHIND_M = (-2.5, 0.0, 1.2)  # of the drone, in its level frame
+ABOVE = (-0.55, -0.35, 0.5)  # of the middle of the paths, in sizes of them
 SMALLEST_M = 4.0  # of what a view of the course shows
 ANGLES = {f"{angle} angle [deg]": (f"orientation/{angle}",) for angle in ("roll", "pitch", "yaw")}
 FORCE = "force not explained [m/s²]"
@@ -25,26 +26,10 @@ PLOTS = {
 }
 
 
-def _course_view(writers: Sequence[Writer]) -> rrb.Spatial3DView:
-    """Return a view of all paths, from behind and above."""
-    positions = np.concatenate([writer.trajectory.positions for writer in writers])
-    low, high = positions.min(axis=0), positions.max(axis=0)
-    middle, size = 0.5 * (low + high), max(float(np.linalg.norm(high - low)), SMALLEST_M)
-    position = middle + size * np.array([-0.55, -0.35, 0.5])
-    eye = rrb.EyeControls3D(kind=rrb.Eye3DKind.Orbital, position=position, look_target=middle)
-    return rrb.Spatial3DView(origin="/world", name="course", eye_controls=eye)
-
-
-def _chase_view(writer: Writer) -> rrb.Spatial3DView:
-    """Return a view of the course from behind a drone: the world in a frame that flies along."""
-    eye = rrb.EyeControls3D(kind=rrb.Eye3DKind.Orbital, position=BEHIND_M, look_target=(0.0, 0.0, 0.0))
-    return rrb.Spatial3DView(
-        origin=f"/{writer.world}/chase",
-        contents="/world/**",
-        name=f"follow {writer.trajectory.name}",
-        eye_controls=eye,
-        line_grid=False,
-    )
+def _view(name: str, origin: str, position: Sequence[float], target: Sequence[float]) -> rrb.Spatial3DView:
+    """Return a view of the world in the frame of an entity, from a position and towards a target in it."""
+    eye = rrb.EyeControls3D(kind=rrb.Eye3DKind.Orbital, position=position, look_target=target)
+    return rrb.Spatial3DView(origin=origin, contents="/world/**", name=name, eye_controls=eye)
 
 
 def _plot(title: str, lines: Sequence[str], writers: Sequence[Writer]) -> rrb.TimeSeriesView:
@@ -63,9 +48,15 @@ def make_blueprint(writers: Sequence[Writer], paths: set[str]) -> rrb.Blueprint:
     plots = [_plot(title, lines, writers) for title, lines in PLOTS.items() if has_line[title]]
     angles = rrb.Tabs(*(_plot(title, lines, writers) for title, lines in ANGLES.items()))
     body = rrb.TextLogColumns(text_log_columns=[TextLogColumn(TextLogColumnKind.Body)])
-    chases = [_chase_view(writer) for writer in writers]
+    positions = np.concatenate([writer.trajectory.positions for writer in writers])
+    low, high = positions.min(axis=0), positions.max(axis=0)
+    middle, size = 0.5 * (low + high), max(float(np.linalg.norm(high - low)), SMALLEST_M)
+    chases = [
+        _view(f"follow {writer.trajectory.name}", f"/{writer.world}/chase", BEHIND_M, (0.0, 0.0, 0.0))
+        for writer in writers
+    ]
     left = rrb.Vertical(
-        _course_view(writers),
+        _view("course", "/world", middle + size * np.array(ABOVE), middle),
         rrb.Tabs(*chases) if len(chases) > 1 else chases[0],
         rrb.Horizontal(
             rrb.TextDocumentView(origin="/about", name="flights"),

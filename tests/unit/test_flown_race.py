@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from flytrack_env import FlyTrack, load_track
-from flytrack_env.flown_race import PADDED_TO, follow_race, why_ended
+from flytrack_env.flown_race import follow_race, why_ended
 from flytrack_env.plants import Plant
 from flytrack_env.references import ghost_rollout, shipped_references
 from flytrack_env.state import BATTERY, POSITION, QUATERNION, VELOCITY, Action, unpack
@@ -96,15 +96,6 @@ def test_step_after_the_last_state_is_extrapolated():
     assert found.passes[7].lap_time_s == pytest.approx(REFERENCES["standing"].time_s, abs=2e-4)
     for one, other in zip(found[:5], without[:5], strict=True):
         np.testing.assert_array_equal(one, other)
-
-
-@pytest.mark.parametrize("length", [1, PADDED_TO + 1, PADDED_TO + 2])
-def test_padding_is_not_seen(length):
-    found = follow_race(np.zeros((length, 3)), TRACK)
-    assert {len(leaf) for leaf in found[:5]} == {length}
-    assert found.passes == () and set(found.gate) == {0} and set(found.laps) == {0}
-    distance = np.linalg.norm(TRACK.gates[0].position)
-    np.testing.assert_allclose(found.gate_distance_m, distance, rtol=1e-6)
 
 
 def straight(start: tuple[float, ...], velocity: tuple[float, ...]) -> np.ndarray:
