@@ -15,8 +15,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from benchmarks import report
-from benchmarks.report import cpu_name as cpu_name
-from benchmarks.report import versions as versions
 
 NUM_ACTIONS = 16  # drawn in advance and used in turn
 L2F_TIME_LIMIT = 500  # steps

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from benchmarks import report
+from benchmarks.optimal.page import write_page, write_pictures
 from benchmarks.optimal.replay import Replay, replay
 from flytrack_env import FlyTrack, ModelParameters, Track, available_tracks, blackbox, load_model, load_track
 from flytrack_env import nominal_parameters as nominal
@@ -136,17 +137,8 @@ def verify(folder: Path, tracks: list[Track]) -> tuple[list[tuple[Reference, str
     return replays, is_good
 
 
-def describe(reference: Reference, flown_by: str, flown: Replay) -> str:
-    """Return one line on a replay."""
-    return (
-        f"{reference.track} {reference.kind} {reference.model_name}: {reference.time_s:.4f} s; {flown_by}: "
-        f"{flown.gates_passed} of {len(reference.gate_times_s)} gates, {flown.time_s:.4f} s, "
-        f"drift {flown.drift_m:.4f} m, {flown.frames_touched} frames touched {' '.join(flown.ended_by)}"
-    )
-
-
 def run(arguments: argparse.Namespace) -> bool:
-    """Find, replay and describe references; return whether all are verified."""
+    """Find references, replay all and write the page; return whether all are verified."""
     model = nominal() if arguments.model is None else load_model(arguments.model)
     name = NOMINAL if arguments.model is None else arguments.model.stem
     tracks = list(map(load_track, arguments.tracks))
@@ -156,12 +148,8 @@ def run(arguments: argparse.Namespace) -> bool:
             save_reference(arguments.out / f"{track.name}_{name}_{kind}.npz", found)
             print(f"{track.name} {kind}: {found.time_s:.4f} s, {found.found['cpu_s']} CPU s", flush=True)
     replays, is_good = verify(arguments.out, tracks)
-    for entry in replays:
-        print(describe(*entry))
+    write_page(arguments.page, replays)
     if arguments.page is not None:
-        from benchmarks.optimal.page import write_page, write_pictures  # matplotlib, for this alone
-
-        write_page(arguments.page, replays)
         write_pictures(arguments.page, [reference for reference, _, _ in replays], tracks)
     return is_good
 

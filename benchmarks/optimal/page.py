@@ -8,8 +8,6 @@ import numpy as np
 from benchmarks import report
 from benchmarks.optimal.replay import Replay
 from flytrack_env.files import write_atomically
-from flytrack_env.pictures import draw_flight, make_flight
-from flytrack_env.pictures.drawing import png_of
 from flytrack_env.references import Reference
 from flytrack_env.state import POSITION, VELOCITY
 from flytrack_env.tracks import Track
@@ -41,6 +39,9 @@ clearance of a gate."""
 
 def write_pictures(page: Path, references: list[Reference], tracks: list[Track]) -> None:
     """Write a picture per track of its flying lap from above, coloured by speed, beside the page."""
+    from flytrack_env.pictures import draw_flight, make_flight
+    from flytrack_env.pictures.drawing import png_of  # matplotlib, needed only here
+
     for track in tracks:
         for found in references:
             if (found.track, found.kind) == (track.name, "flying"):
@@ -79,8 +80,8 @@ def _replay_row(reference: Reference, flown_by: str, flown: Replay) -> tuple[Any
     return (*names, gates, *times, f"{MILLI * flown.drift_m:.2f}", flown.frames_touched)
 
 
-def write_page(path: Path, replays: list[tuple[Reference, str, Replay]]) -> None:
-    """Write the tables of references and their replays, with a picture per track.
+def write_page(path: Path | None, replays: list[tuple[Reference, str, Replay]]) -> None:
+    """Print, and write unless the path is None, the tables of references and their replays.
 
     replays: references, the plants that flew them, and the replays; a reference may occur several times.
     """
@@ -109,7 +110,7 @@ def write_page(path: Path, replays: list[tuple[Reference, str, Replay]]) -> None
         "## Replays",
         REPLAYED,
         report.table(REPLAY_HEADER, (_replay_row(*entry) for entry in replays)),
-        *(f"![{name}]({path.stem}_{name}.png)" for name in tracks),
+        *(f"![{name}]({path.stem}_{name}.png)" for name in tracks if path is not None),
         report.provenance_line(report.provenance()),
     )
     report.write_page(path, text)

@@ -8,6 +8,7 @@ flight is one of the simulator at 100 Hz, exactly.
 """
 
 import dataclasses
+from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 import casadi
@@ -75,24 +76,11 @@ class Task:
         return self.kind == "flying"
 
 
-@dataclasses.dataclass
-class _Constraints:
-    """Expressions with their bounds, in the order in which they were added."""
-
-    expressions: list[Any] = dataclasses.field(default_factory=list)
-    low: list[np.ndarray] = dataclasses.field(default_factory=list)
-    high: list[np.ndarray] = dataclasses.field(default_factory=list)
-
-    def add(self, expression: Any, low: float, high: float) -> None:
-        """Add low <= expression <= high, elementwise."""
-        column = casadi.vec(expression)
-        self.expressions.append(column)
-        self.low.append(np.full(column.numel(), low))
-        self.high.append(np.full(column.numel(), high))
+Limit = tuple[Any, float, float]  # an expression and its bounds, elementwise
 
 
-def _add_gate(found: _Constraints, task: Task, index: int, point: Any, velocity: Any) -> None:
-    """Add that a point is on a gate's plane, within its opening less the drone, flown in its direction."""
+def _gate_limits(task: Task, index: int, point: Any, velocity: Any) -> list[Limit]:
+    """Return that a point is on a gate's plane, within its opening less the drone, flown in its direction."""
     gates = task.course.gates
     forward, left, up = (
         np.array([np.float64(axis[index]) for axis in axes])
@@ -100,10 +88,12 @@ def _add_gate(found: _Constraints, task: Task, index: int, point: Any, velocity:
     )
     offset = point - np.array([np.float64(axis[index]) for axis in gates.centre])
     free = float(gates.half_opening[index]) - task.radius_m - CLEARANCE_M
-    found.add(casadi.dot(forward, offset), 0.0, 0.0)
-    found.add(casadi.dot(left, offset), -free, free)
-    found.add(casadi.dot(up, offset), -free, free)
-    found.add(casadi.dot(forward, velocity), ACROSS_M_S, np.inf)
+    return [
+        (casadi.dot(forward, offset), 0.0, 0.0),
+        (casadi.dot(left, offset), -free, free),
+        (casadi.dot(up, offset), -free, free),
+        (casadi.dot(forward, velocity), ACROSS_M_S, np.inf),
+    ]
 
 
 class Problem:
@@ -123,9 +113,7 @@ class Problem:
         self.steps_s = casadi.MX.sym("d", 1, len(counts))
         self.fractions = casadi.MX.sym("f", 1, len(counts))
         self.short_step = self._short_step()
-        self.limits = _Constraints()
-        self._add_flight()
-        self._add_gates()
+        self.limits = [*self._flight_limits(), *self._gates_limits()]
         self.variables = casadi.vertcat(
             *map(casadi.vec, (self.states, self.commands, self.steps_s, self.fractions))
         )
@@ -143,23 +131,23 @@ class Problem:
         """Return where a part of the state vector stands among the needed places."""
         return [self.needed.index(place) for place in range(STATE_SIZE)[part]]
 
-    def _add_flight(self) -> None:
-        """Add that every node follows from the one before, and that a lap ends as it began."""
+    def _flight_limits(self) -> Iterator[Limit]:
+        """Yield that every node follows from the one before, and that a lap ends as it began."""
         lengths = [casadi.repmat(self.steps_s[i], 1, int(n)) for i, n in enumerate(self.counts)]
         stepped = self.short_step.map(self.num_steps)(
             self.states[:, :-1], self.commands, casadi.horzcat(*lengths)
         )
-        self.limits.add(self.states[:, 1:] - stepped, 0.0, 0.0)
+        yield self.states[:, 1:] - stepped, 0.0, 0.0
         if self.task.is_lap:
             last_step_s = self.fractions[-1] * self.steps_s[-1]
             end = self.short_step(self.states[:, -2], self.commands[:, -1], last_step_s)
             signs = np.ones(len(self.needed))
             signs[self.rows(QUATERNION)] = self.closure
             periodic = [row for row, place in enumerate(self.needed) if place != BATTERY]
-            self.limits.add((self.states[:, 0] - signs * end)[periodic], 0.0, 0.0)
+            yield (self.states[:, 0] - signs * end)[periodic], 0.0, 0.0
 
-    def _add_gates(self) -> None:
-        """Add where and which way every gate is passed."""
+    def _gates_limits(self) -> Iterator[Limit]:
+        """Yield where and in which direction every gate is passed."""
         position, velocity = self.rows(POSITION), self.rows(VELOCITY)
         for index, node in enumerate(np.cumsum(self.counts)):
             before, after = self.states[:, int(node) - 1], self.states[:, int(node)]
@@ -167,7 +155,7 @@ class Problem:
             is_end_of_lap = self.task.is_lap and node == self.num_steps
             if is_end_of_lap:  # it ends where it begins, and that is on the plane
                 between = after = self.states[:, 0]
-            _add_gate(self.limits, self.task, index, between[position], after[velocity])
+            yield from _gate_limits(self.task, index, between[position], after[velocity])
 
     def total_time(self) -> Any:
         """Return the time to the last gate, s, as an expression."""
@@ -203,14 +191,17 @@ class Problem:
 
         is_on_grid: hold the lengths of the guess, and let gates be passed between nodes.
         """
-        program = {"x": self.variables, "f": self._cost(), "g": casadi.vertcat(*self.limits.expressions)}
+        columns = [casadi.vec(expression) for expression, _, _ in self.limits]
+        sizes = [column.numel() for column in columns]
+        program = {"x": self.variables, "f": self._cost(), "g": casadi.vertcat(*columns)}
         solver = casadi.nlpsol("solver", "ipopt", program, options)
         low, high = self._bounds(guess, is_on_grid)
         start = np.concatenate(
             [guess.states[:, self.needed].ravel(), guess.commands.ravel(), guess.steps_s, guess.fractions]
         )
         arguments = {"x0": np.clip(start, low, high), "lbx": low, "ubx": high}
-        arguments |= {"lbg": np.concatenate(self.limits.low), "ubg": np.concatenate(self.limits.high)}
+        arguments |= {"lbg": np.repeat([least for _, least, _ in self.limits], sizes)}
+        arguments |= {"ubg": np.repeat([most for _, _, most in self.limits], sizes)}
         found = solver(**arguments)
         stats = solver.stats()
         return Solution(

@@ -152,7 +152,7 @@ def test_the_command_verifies_and_writes_the_page(
     with pytest.raises(SystemExit) as ended:
         time_optimal.main()
     assert ended.value.code == 0
-    assert capsys.readouterr().out.count("8 of 8 gates") == len(KINDS)
+    assert capsys.readouterr().out.count("8 of 8") == len(KINDS)
     assert page.read_text().count("8 of 8") == len(KINDS)
     assert (tmp_path / "page_flytrack.png").stat().st_size > 10_000
 
