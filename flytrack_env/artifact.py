@@ -7,6 +7,7 @@ from collections.abc import Iterator, Sequence
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jax import export
 from jax.extend import mlir
@@ -55,12 +56,8 @@ def check_signature(exported: export.Exported, sizes: Sequence[int], num_actions
     """Return the number of components of an artifact's state, one of ``sizes``.
 
     Raises:
-        ArtifactError: for another platform, or of another signature.
+        ArtifactError: of another signature.
     """
-    if "cpu" not in exported.platforms:
-        raise ArtifactError(f"platforms: found {_printable(str(exported.platforms))}, expected ('cpu',)")
-    if exported.nr_devices != 1:
-        raise ArtifactError(f"devices: found {exported.nr_devices}, expected 1")
     inputs = [(aval.shape, aval.dtype) for aval in exported.in_avals]
     outputs = [(aval.shape, aval.dtype) for aval in exported.out_avals]
     for size in sizes:
@@ -130,7 +127,7 @@ def check_runs(exported: export.Exported, start: Sequence[float], num_actions: i
 
     def step(state: jax.Array, loops: int = TRIAL_LOOPS) -> jax.Array:
         if loops == 0:
-            return call(exported, state, np.zeros(num_actions, np.float32))
+            return call(exported, state, jnp.zeros(num_actions, jnp.float32))
         return jax.lax.fori_loop(0, 1, lambda _, inner: step(inner, loops - 1), state)
 
     try:

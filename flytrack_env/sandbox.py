@@ -75,9 +75,9 @@ def run(
     if kind == RETURNED and done.returncode == 0:
         return text
     if kind == RAISED:
-        error, message = json.loads(text)
-        if error != MemoryError.__name__:
-            raise SandboxError(message, error)
+        name, message = json.loads(text)
+        if name != MemoryError.__name__:
+            raise SandboxError(message, name)
         raise SandboxError(f"needs more than {limits.memory_bytes / 2**30:g} GiB of memory")
     if done.returncode == -getattr(signal, "SIGXCPU", 0):
         raise SandboxError(f"took more than {limits.cpu_s} s of processor time")

@@ -12,7 +12,6 @@ import numpy as np
 from flytrack_env.messages import quote_value
 from flytrack_sysid.log import CHANNELS, COLUMNS, REQUIRED, FlightLog, LogError
 
-MOST_SEGMENTS = 100_000  # one for each flight
 LARGEST_NORM_ERROR = 1e-2  # of quaternions: estimators drift a little; more is no unit quaternion
 SMALLEST_NORM_ERROR = 1e-12  # below it a norm is 1 up to rounding, and the values stay as they are
 LARGEST_VALUES = 56 * 2**20  # all columns at 1 kHz for half an hour; twice as many float64 are below 1 GiB
@@ -20,8 +19,6 @@ LONGEST_ROW = 2**16  # characters of a CSV file: thousands of columns
 COMMAND_MARGIN = 1e-6  # beyond [-1, 1]: rounding by the program that wrote the log
 LONGEST_NAME = max(map(len, COLUMNS)) + 3  # longer names are similar to none
 LARGEST_SEGMENT = 2**53  # float64 is exact for whole numbers below it
-PWM_LOW_US, PWM_HIGH_US = 800, 2200  # receivers' pulses: 1000 to 2000 us, and a little past the ends
-PERCENT_LOW, PERCENT_HIGH = 10, 100  # a largest command in between looks like percent of full stick
 
 
 class Table(NamedTuple):
@@ -38,6 +35,15 @@ class Table(NamedTuple):
         """Return the error about one cell; rows count from 0, lines from 1."""
         line = "" if self.lines is None else f" (line {self.lines[row]})"
         return LogError(f"{self.source}: row {row}{line}, column {column}: {text}")
+
+    def check(
+        self, is_good: np.ndarray, column: str, expected: str, values: np.ndarray | None = None
+    ) -> None:
+        """Raise LogError about the first row that is not good; values: found there, those of the column."""
+        if not is_good.all():
+            row = int(np.argmin(is_good))
+            found = self.columns[column] if values is None else values
+            raise self.error(row, column, f"found {float(found[row])}, expected {expected}")
 
     def matrix(self, columns: Sequence[str]) -> np.ndarray:
         """Return some of the columns side by side, (num_rows, len(columns))."""
@@ -129,16 +135,23 @@ def log_of_table(table: Table) -> FlightLog:
     Raises:
         LogError: no rows, columns of different lengths, or a value that no log can have, with its place.
     """
-    _check_lengths(table)
+    num_rows = len(table.columns["t"])
     for column, values in table.columns.items():
-        bad = np.flatnonzero(~np.isfinite(values))
-        if len(bad):
-            hint = "leave out the row of a lost sample, or all columns of what was not measured"
-            text = f"found {values[bad[0]]}, expected a finite number; {hint}"
-            raise table.error(bad[0], column, text)
+        if len(values) != num_rows:
+            found = f"found {len(values)} rows, expected {num_rows} as in t"
+            raise LogError(f"{table.source}: column {column}: {found}")
+    if num_rows == 0:
+        raise LogError(f"{table.source}: found no rows, expected at least one")
+    hint = "leave out the row of a lost sample, or all columns of what was not measured"
+    for column, values in table.columns.items():
+        table.check(np.isfinite(values), column, f"a finite number; {hint}")
     segment = _segments(table)
-    _check_time(table, segment)
-    _check_commands(table)
+    is_later = (np.diff(table.columns["t"]) > 0.0) | (segment[1:] != segment[:-1])
+    expected = "a later time than in the row before, or a new segment"
+    table.check(np.concatenate([[True], is_later]), "t", expected)
+    for column in CHANNELS["u"]:
+        is_command = np.abs(table.columns[column]) <= 1.0 + COMMAND_MARGIN
+        table.check(is_command, column, "a command in [-1, 1]")
     channels = {}
     for name, columns in CHANNELS.items():
         if columns[0] in table.columns:
@@ -146,76 +159,22 @@ def log_of_table(table: Table) -> FlightLog:
             for column in columns:
                 del table.columns[column]
     if "q" in channels:
-        channels["q"] = _normalised(table, channels["q"])
+        norm = np.linalg.norm(channels["q"], axis=1)
+        error = np.abs(norm - 1.0)
+        expected = f"a quaternion of norm 1 within {LARGEST_NORM_ERROR:g}"
+        table.check(error <= LARGEST_NORM_ERROR, ", ".join(CHANNELS["q"]), expected, norm)
+        channels["q"] *= np.where(error > SMALLEST_NORM_ERROR, 1.0 / norm, 1.0)[:, None]
     return FlightLog(table.columns["t"], channels, segment, table.source)
-
-
-def _check_lengths(table: Table) -> None:
-    expected = len(table.columns["t"])
-    for column, values in table.columns.items():
-        if len(values) != expected:
-            raise LogError(
-                f"{table.source}: column {column}: found {len(values)} rows, expected {expected} as in t"
-            )
-    if expected == 0:
-        raise LogError(f"{table.source}: found no rows, expected at least one")
 
 
 def _segments(table: Table) -> np.ndarray:
     """Return the segment of each row, (num_rows,) int."""
     values = table.columns.get("segment", np.zeros(len(table.columns["t"])))
-    bad = np.flatnonzero((values != np.round(values)) | (np.abs(values) >= LARGEST_SEGMENT))
-    if len(bad):
-        raise table.error(bad[0], "segment", f"found {values[bad[0]]}, expected a whole number below 2^53")
+    is_whole = (values == np.round(values)) & (np.abs(values) < LARGEST_SEGMENT)
+    table.check(is_whole, "segment", "a whole number below 2^53")
     segment = values.astype(np.int64)
     starts = np.flatnonzero(np.concatenate([[True], segment[1:] != segment[:-1]]))
-    if len(starts) > MOST_SEGMENTS:
-        text = f"found {len(starts)} segments, expected at most {MOST_SEGMENTS}, one for each flight"
-        raise table.error(starts[MOST_SEGMENTS], "segment", text)
-    first_of = np.unique(segment[starts], return_index=True)[1]
-    again = np.setdiff1d(np.arange(len(starts)), first_of)
-    if len(again):
-        row = starts[again[0]]
-        text = f"found {segment[row]} again after other segments, expected each number in one piece"
-        raise table.error(row, "segment", text)
+    is_first = np.ones(len(values), bool)
+    is_first[starts] = np.isin(np.arange(len(starts)), np.unique(segment[starts], return_index=True)[1])
+    table.check(is_first, "segment", "each number in one piece")
     return segment
-
-
-def _check_time(table: Table, segment: np.ndarray) -> None:
-    time = table.columns["t"]
-    bad = np.flatnonzero((np.diff(time) <= 0.0) & (segment[1:] == segment[:-1])) + 1
-    if not len(bad):
-        return
-    row = bad[0]
-    hint = "a duplicate row" if time[row] == time[row - 1] else "rows out of order, or a new segment"
-    text = f"found {time[row]} after {time[row - 1]}, expected a later time within a segment ({hint})"
-    raise table.error(row, "t", text)
-
-
-def _check_commands(table: Table) -> None:
-    for column in CHANNELS["u"]:
-        values = table.columns[column]
-        bad = np.flatnonzero(np.abs(values) > 1.0 + COMMAND_MARGIN)
-        if len(bad):
-            text = f"found {values[bad[0]]:g}, expected a command in [-1, 1]{_command_hint(values)}"
-            raise table.error(bad[0], column, text)
-
-
-def _command_hint(values: np.ndarray) -> str:
-    """Return what unit a column of commands seems to have, as the end of a message."""
-    if values.min() >= PWM_LOW_US and values.max() <= PWM_HIGH_US:
-        return "; these look like PWM pulses in us, of which 1000 to 2000 should become -1 to 1"
-    if PERCENT_LOW <= np.abs(values).max() <= PERCENT_HIGH:
-        return "; these look like percent, of which full stick should become 1"
-    return ""
-
-
-def _normalised(table: Table, quat: np.ndarray) -> np.ndarray:
-    """Return the quaternions, (num_rows, 4), with norm 1."""
-    norm = np.linalg.norm(quat, axis=1)
-    error = np.abs(norm - 1.0)
-    bad = np.flatnonzero(error > LARGEST_NORM_ERROR)
-    if len(bad):
-        text = f"found a quaternion of norm {norm[bad[0]]:.4g}, expected 1 within {LARGEST_NORM_ERROR:g}"
-        raise table.error(bad[0], "q_w, q_x, q_y, q_z", text)
-    return np.where(error > SMALLEST_NORM_ERROR, 1.0 / norm, 1.0)[:, None] * quat

@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flytrack_sysid import log_table
 from flytrack_sysid.log import REQUIRED, LogError
 from flytrack_sysid.log_file import load_log, save_log
 from tests.support.written_logs import NUM_ROWS, SUFFIXES, columns_of, make_log, write
@@ -35,8 +34,6 @@ def no_rows(columns: dict) -> None:
     columns.update({name: values[:0] for name, values in columns.items()})
 
 
-PWM = np.linspace(1000.0, 2000.0, NUM_ROWS)
-PERCENT = np.linspace(-40.0, 100.0, NUM_ROWS)
 # What is done to the columns -> what the message says after the file; {row} with the line in a CSV file.
 BAD_COLUMNS = {
     "unknown": (rename("w_x", "w_roll"), r"column 'w_roll': unknown; .*\(known: t, segment, u_roll, "),
@@ -49,9 +46,9 @@ BAD_COLUMNS = {
     "no rows": (no_rows, "found no rows"),
     "duplicate row": (
         lambda columns: set_cell("t", 2, columns["t"][1])(columns),
-        r"{row 2}, column t: found (\S+) after \1, expected a later time .*\(a duplicate row\)",
+        "{row 2}, column t: found .*, expected a later time than in the row before",
     ),
-    "time runs back": (set_cell("t", 4, -1.0), r"{row 4}, column t: found -1\.0 after .*rows out of order"),
+    "time runs back": (set_cell("t", 4, -1.0), r"{row 4}, column t: found -1\.0, expected a later time"),
     "half a segment": (
         replaced("segment", [0, 0, 0.5, 1, 1, 1]),
         r"{row 2}, column segment: found 0\.5, expected a whole number",
@@ -62,18 +59,16 @@ BAD_COLUMNS = {
     ),
     "torn segment": (
         replaced("segment", [4, 4, 2, 4, 2, 2]),
-        "{row 3}, column segment: found 4 again after other segments",
+        r"{row 3}, column segment: found 4\.0, expected each number in one piece",
     ),
     "quaternion": (
         lambda columns: columns.update({f"q_{axis}": columns[f"q_{axis}"] * 1.02 for axis in "wxyz"}),
-        r"{row 0}, column q_w, q_x, q_y, q_z: found a quaternion of norm 1\.02, expected 1 within 0\.01",
+        r"{row 0}, column q_w, q_x, q_y, q_z: found 1\.0.*, expected a quaternion of norm 1 within 0\.01",
     ),
     "command": (
         set_cell("u_pitch", 1, -1.00001),
         r"{row 1}, column u_pitch: found -1\.00001, expected a command in \[-1, 1\]$",
     ),
-    "pwm": (replaced("u_roll", PWM), "{row 0}, column u_roll: found 1000, .*PWM pulses in us"),
-    "percent": (replaced("u_thrust", PERCENT), "{row 0}, column u_thrust: found -40, .*look like percent"),
 }
 
 
@@ -197,11 +192,3 @@ def test_endless_rows_take_no_memory(tmp_path):
         assert tracemalloc.get_traced_memory()[1] < 2**20
     finally:
         tracemalloc.stop()
-
-
-def test_a_segment_for_every_row_is_refused_at_once(tmp_path):
-    num_rows = log_table.MOST_SEGMENTS + 1
-    columns = {name: np.zeros(num_rows) for name in REQUIRED} | {"segment": np.arange(num_rows)}
-    write(tmp_path / "flight.npz", columns)
-    with pytest.raises(LogError, match="column segment: found 100001 segments, expected at most 100000"):
-        load_log(tmp_path / "flight.npz")
