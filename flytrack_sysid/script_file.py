@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 
 from flytrack_env.files import write_atomically
-from flytrack_env.messages import error_text, quote_name, quote_value
+from flytrack_env.messages import error_text, quote_name
 from flytrack_env.npz_file import NpzError, load_npz
 from flytrack_env.state import ACTION_SIZE, APPLIED_ACTION, QUATERNION, STATE_SIZE
 from flytrack_sysid.envelope import ANY_VOLTAGE, FEWEST_STEPS, LARGEST_SPEED, SCRIPT_HEIGHTS, is_inside
@@ -57,47 +57,33 @@ def check_name(path: str | Path) -> None:
 
 
 def check_script(script: Script, source: str = "script") -> None:
-    """Raise ScriptError unless a script can be flown; the message names source, array and flight."""
+    """Raise ScriptError unless a script can be flown; the message names source, flight and array."""
     kinds, starts, commands = script
-    number = len(kinds)
-    if number == 0:
-        raise ScriptError(f"{source}: kinds: found no flight, expected at least one")
-    if starts.shape != (number, STATE_SIZE):
-        raise ScriptError(f"{source}: starts: found shape {starts.shape}, expected ({number}, {STATE_SIZE})")
-    if commands.ndim != 3 or commands.shape[::2] != (number, ACTION_SIZE) or commands.shape[1] < FEWEST_STEPS:
-        expected = f"({number}, {FEWEST_STEPS} or more, {ACTION_SIZE})"
-        raise ScriptError(f"{source}: commands: found shape {commands.shape}, expected {expected}")
-    for name, values in (("starts", starts), ("commands", commands)):
-        bad = np.argwhere(~np.isfinite(values))
-        if len(bad):
-            place = tuple(bad[0].tolist())
-            raise ScriptError(
-                f"{source}: {name}{list(place)}: found {values[place]}, expected a finite number"
-            )
-    unknown = [kind for kind in kinds if kind not in MANOEUVRES]
-    if unknown:
-        raise ScriptError(
-            f"{source}: kinds: found {quote_value(unknown[0])}, expected one of {', '.join(MANOEUVRES)}"
-        )
-    _check_ranges(starts, commands, source)
+    number, (low, high) = len(kinds), SCRIPT_HEIGHTS
+    is_shaped = starts.shape == (number, STATE_SIZE) and commands.shape[::2] == (number, ACTION_SIZE)
+    if number == 0 or not is_shaped or commands.ndim != 3 or commands.shape[1] < FEWEST_STEPS:
+        found = f"{number} kinds, starts of shape {starts.shape}, commands of shape {commands.shape}"
+        expected = f"(N,), (N, {STATE_SIZE}) and (N, {FEWEST_STEPS} or more, {ACTION_SIZE}), N >= 1"
+        raise ScriptError(f"{source}: found {found}, expected {expected}")
+    norm_error = np.abs(np.linalg.norm(starts[:, QUATERNION], axis=1) - 1.0)
+    envelope = f"at most {LARGEST_SPEED:g} m/s, {low:g} to {high:g} m, and a voltage"
+    checks = {
+        f"kinds: expected one of {', '.join(MANOEUVRES)}": np.isin(kinds, list(MANOEUVRES)),
+        "starts: expected finite numbers": np.isfinite(starts).all(axis=1),
+        "starts: expected an applied action within [-1, 1]": _are_sticks(starts[:, APPLIED_ACTION]),
+        "starts: expected a quaternion of norm 1": norm_error <= LARGEST_NORM_ERROR,
+        f"starts: expected a state within the envelope: {envelope}": is_inside(
+            starts, SCRIPT_HEIGHTS, ANY_VOLTAGE
+        ),
+        "commands: expected numbers within [-1, 1]": _are_sticks(commands).all(axis=1),
+    }
+    for text, is_good in checks.items():
+        if not is_good.all():
+            raise ScriptError(f"{source}: flight {int(np.argmin(is_good))}: {text}")
 
 
-def _check_ranges(starts: np.ndarray, commands: np.ndarray, source: str) -> None:
-    for name, sticks in (("starts (applied action)", starts[:, APPLIED_ACTION]), ("commands", commands)):
-        bad = np.argwhere(np.abs(sticks) > 1.0 + ROUNDING)
-        if len(bad):
-            found = sticks[tuple(bad[0])]
-            raise ScriptError(f"{source}: {name}: found {found:g} in flight {bad[0][0]}, expected -1 to 1")
-    norm = np.linalg.norm(starts[:, QUATERNION], axis=1)
-    for flight in np.flatnonzero(np.abs(norm - 1.0) > LARGEST_NORM_ERROR):
-        found = f"a quaternion of norm {norm[flight]:.4g}"
-        raise ScriptError(f"{source}: starts: found {found} in flight {flight}, expected 1")
-    low, high = SCRIPT_HEIGHTS
-    for flight in np.flatnonzero(~is_inside(starts, SCRIPT_HEIGHTS, ANY_VOLTAGE)):
-        expected = f"at most {LARGEST_SPEED:g} m/s, {low:g} to {high:g} m, a voltage"
-        raise ScriptError(
-            f"{source}: starts: found flight {flight} outside of the envelope, expected {expected}"
-        )
+def _are_sticks(values: np.ndarray) -> np.ndarray:
+    return (np.abs(values) <= 1.0 + ROUNDING).all(axis=-1)  # false for NaN
 
 
 def save_script(path: str | Path, script: Script) -> None:

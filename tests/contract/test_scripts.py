@@ -113,20 +113,18 @@ class Harmful:
 
 
 BAD = {
-    r"starts\[3, 5\]: found nan, expected a finite number": changed("starts", (3, 5), np.nan),
-    r"commands: found 1.5 in flight 2, expected -1 to 1": changed("commands", (2, 7, 0), 1.5),
-    "applied action.: found -2 in flight 0": changed("starts", (0, 19), -2.0),
-    "quaternion of norm 2 in flight 4": changed("starts", (4, 9), np.sqrt(4.0)),
-    "found flight 1 outside of the envelope": changed("starts", (1, 2), 0.01),
-    r"starts: found shape \(8, 20\), expected \(8, 21\)": {"starts": made("headings").starts[:, :20]},
-    r"commands: found shape \(7, 250, 4\), expected \(8, 2 or more, 4\)": {
-        "commands": made("headings").commands[:7]
-    },
-    "kinds: found 'loop', expected one of headings": {"kinds": np.array(["loop"] * 8)},
+    "flight 3: starts: expected finite numbers": changed("starts", (3, 5), np.nan),
+    "flight 1: commands: expected numbers within": changed("commands", (1, 2, 3), np.nan),
+    "flight 2: commands: expected numbers within": changed("commands", (2, 7, 0), 1.5),
+    "flight 0: starts: expected an applied action": changed("starts", (0, 19), -2.0),
+    "flight 4: starts: expected a quaternion of norm 1": changed("starts", (4, 9), np.sqrt(4.0)),
+    "flight 1: starts: expected a state within the envelope": changed("starts", (1, 2), 0.01),
+    r"starts of shape \(8, 20\), .* expected": {"starts": made("headings").starts[:, :20]},
+    r"commands of shape \(7, 250, 4\), expected": {"commands": made("headings").commands[:7]},
+    "flight 0: kinds: expected one of headings": {"kinds": np.array(["loop"] * 8)},
     "kinds, starts: found arrays of <U1": {"kinds": np.array([], "U1")},
     "starts: found an array of <U4": {"starts": np.full((8, 21), "text")},
     "found text with numbers that are no characters": {"kinds": np.full(8, 0x7FFFFFFF, np.int32).view("<U1")},
-    r"kinds: found 'xxx.{0,80}, expected one of headings": {"kinds": np.array(["x" * 5000] * 8)},
     "found arrays of 67110784 bytes or more": {"commands": np.zeros((8, 2**20 + 1, 1), np.int8)},
     "nothing is unpickled": {"starts": np.array([Harmful()] * 8, object)},
     "found arrays commands, kinds, more, starts, expected kinds, starts, commands": {"more": np.zeros(1)},
@@ -149,7 +147,11 @@ def test_other_suffixes_and_scripts_that_cannot_be_flown_are_not_written(tmp_pat
     script = made("headings")
     for name, wrong, message in (
         ("flight.csv", script, r"found suffix '\.csv', expected \.npz"),
-        ("flight.npz", script._replace(commands=script.commands * np.nan), r"commands\[0, 0, 0\]: found nan"),
+        (
+            "flight.npz",
+            script._replace(commands=script.commands * np.nan),
+            "flight 0: commands: expected numbers",
+        ),
     ):
         with pytest.raises(ScriptError, match=message):
             save_script(tmp_path / name, wrong)

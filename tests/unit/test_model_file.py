@@ -140,18 +140,6 @@ def test_bad_values_are_refused(name: str, value: Any, reason: str, tmp_path: Pa
 
 
 @contextmanager
-def full_disk() -> Iterator[None]:
-    """Let every write to a file fail after a few bytes, as on a full disk."""
-    resource = pytest.importorskip("resource")
-    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (10, limits[1]))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
-
-
-@contextmanager
 def failing_rename() -> Iterator[None]:
     """Let ``os.replace`` fail."""
 
@@ -165,7 +153,7 @@ def failing_rename() -> Iterator[None]:
 
 @pytest.mark.parametrize(
     ("trouble", "provenance"),
-    [(full_disk, {}), (failing_rename, {}), (nullcontext, {"not JSON": object()})],
+    [(failing_rename, {}), (nullcontext, {"not JSON": object()})],
 )
 def test_a_failed_write_leaves_the_old_file(trouble: Any, provenance: dict[str, Any], tmp_path: Path) -> None:
     path = tmp_path / "model.json"
