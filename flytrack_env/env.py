@@ -179,7 +179,7 @@ class FlyTrack(EpisodicEnvironment):
         race = start_race(jnp.asarray(gate_index, jnp.int32), params.course)
         return EnvState(plant=self.plant.reset(drone, params.model), race=race, time=jnp.int32(0))
 
-    def settle(self, state: EnvState, params: EnvParams) -> EnvState:
+    def refresh(self, state: EnvState, params: EnvParams) -> EnvState:
         """Return the state with the gates' frames that belong to its gate index."""
         return state._replace(race=look_up_gates(state.race, params.course))
 

@@ -1,8 +1,8 @@
 """Episodes: how an environment's hooks become gymnax's ``reset`` and ``step``, with auto-reset outermost.
 
-An environment, or a wrapper around one, says how an episode begins, goes on and looks
-(``EpisodicEnvironment``'s hooks). ``reset``, ``step`` and ``step_batch`` are made of these here, once.
-They are called on the outermost object only, so that whatever a wrapper keeps is fresh in every episode.
+An environment, or a wrapper around one, implements the hooks of ``EpisodicEnvironment``: how an episode
+begins, advances and is observed. ``reset``, ``step`` and ``step_batch`` are built from them here, once, and
+called on the outermost object only, so that the state of a wrapper is fresh in every episode.
 """
 
 from functools import partial
@@ -35,7 +35,7 @@ def clip_action(action: jax.Array) -> Action:
 
 
 def without_nan(command: Action) -> Action:
-    """Return the command with 0 for what is not a number, so that it cannot poison a state."""
+    """Return the command with NaN replaced by 0, so that it cannot poison a state."""
     return Action(*(jnp.where(jnp.isnan(value), 0.0, value) for value in command))
 
 
@@ -43,7 +43,8 @@ def without_nan(command: Action) -> Action:
 class EpisodicEnvironment(environment.Environment[Any, EnvParams]):  # type: ignore[type-var]
     """An environment for gymnax, made of hooks for one drone; a state is any pytree.
 
-    track: what is flown. plant: what flies. missed_gate: "terminate" or "fly_on". env_id: as registered.
+    track: the course. plant: what moves the drone. missed_gate: "terminate" or "fly_on". env_id: as
+    registered.
     """
 
     _supports_transition_gradients = True
@@ -105,8 +106,8 @@ class EpisodicEnvironment(environment.Environment[Any, EnvParams]):  # type: ign
         """Return whether the episode is cut off, by the time limit, a bool scalar."""
         raise NotImplementedError
 
-    def settle(self, state: Any, params: EnvParams) -> Any:
-        """Return a state that auto-reset has chosen with everything that follows from the rest of it."""
+    def refresh(self, state: Any, params: EnvParams) -> Any:
+        """Return a state that auto-reset selected, with its derived values (gate frames) recomputed."""
         raise NotImplementedError
 
     def check_params(self, params: EnvParams) -> None:
@@ -199,7 +200,7 @@ class EpisodicEnvironment(environment.Environment[Any, EnvParams]):  # type: ign
             jax.tree.map(partial(jnp.where, compute_once(done)), fresh_state, next_state)
         )
         # What follows from the choice (gate frames) is derived after it: a fifth faster than choosing it.
-        next_state = self.settle(next_state, params)
+        next_state = self.refresh(next_state, params)
         observation = self.observe(None, next_state, None, params)
         info = {**info, "terminated": terminated, "truncated": truncated}
         info["final_observation"] = final_observation

@@ -18,8 +18,8 @@ from flytrack_env.state import BATTERY_EMPTY_V, BATTERY_FULL_V
 from flytrack_env.tracks import Course
 from flytrack_env.tracks.track import LARGEST
 
-# Where numbers stay finite, attitudes unit quaternions and observations in their space, whatever is flown;
-# wider than anything that flies. Of effects, their own ranges; of wrappers, what these say.
+# Within these, numbers stay finite, attitudes unit quaternions and observations in their space; wider than
+# anything that flies. Effects and wrappers have ranges of their own.
 RANGES: Mapping[str, Range] = {
     "dt": Range(5e-4, 1.0, "s"),
     "drone_radius": Range(1e-3, 1e3, "m"),
@@ -56,7 +56,7 @@ class EnvParams:
 
     model: the simulated drone. course: the track as arrays. reset: how episodes start. reward: weights.
     dt: s. drone_radius: m. max_steps_in_episode: the time limit, steps. wrappers: the parameters of each
-    wrapper around the environment, by its name; a wrapper's class says what they are.
+    wrapper around the environment, by its name; documented by the wrapper's class.
     """
 
     model: ModelParameters
@@ -68,7 +68,7 @@ class EnvParams:
     max_steps_in_episode: Scalar = 1000
     wrappers: dict[str, Any] = field(default_factory=dict)
 
-    if TYPE_CHECKING:  # chex adds it, and tells no type checker
+    if TYPE_CHECKING:  # chex adds it at run time
 
         def replace(self, **changes: Any) -> Self:
             """Return the parameters with some fields changed."""
@@ -77,8 +77,7 @@ class EnvParams:
     def check(self) -> None:
         """Raise ValueError, naming the field, for values that no episode can be flown with.
 
-        For concrete values, before work begins: under ``jit`` nothing can be refused any more. Any of them
-        may be batched, as ``vmap`` takes them.
+        For concrete values, as nothing can be refused under ``jit``. Any may be batched, as for ``vmap``.
         """
         for name, bounds in RANGES.items():
             value = attrgetter(name)(self)
@@ -97,7 +96,7 @@ class EnvParams:
 
 
 def _check_course(course: Course) -> None:
-    """Raise ValueError for a course of one gate, which a pass would count twice, or numbers that are none."""
+    """Raise ValueError for a course of one gate, whose passes would count twice, or for invalid numbers."""
     num_gates = np.shape(course.gates.half_opening)[-1]
     if num_gates < LEAST_GATES:
         raise ValueError(f"course.gates: found {num_gates}, expected at least {LEAST_GATES}")

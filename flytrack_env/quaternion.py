@@ -18,7 +18,7 @@ Scalar = jax.Array | np.ndarray | np.floating | float
 
 
 class Vec3(NamedTuple):
-    """Three components along x, y, z of the frame that the name of the variable says."""
+    """Three components along x, y, z of the frame in the variable's suffix."""
 
     x: Scalar
     y: Scalar

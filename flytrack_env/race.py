@@ -14,7 +14,7 @@ class Race(NamedTuple):
     """Where the drone stands in the race, scalars.
 
     gate_index: the gate to fly next, in [0, num_gates). gate, next_gate: its flight frame and that of the
-    gate after it, kept because looking them up is the dearest part of a step. gates_passed: in this
+    gate after it, kept because looking them up is the most expensive part of a step. gates_passed: in this
     episode.
     laps: completed, a lap being num_gates gates from wherever the episode began.
     lap_start_s: time of the crossing that began the lap. lap_time_s: the last complete lap, 0 if none.

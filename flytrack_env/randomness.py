@@ -53,7 +53,7 @@ def seeds_of(key: jax.Array, places: jax.Array) -> jax.Array:
 
 
 def next_word(word: jax.Array) -> jax.Array:
-    """Return the word after this one, for draws that are made anew in every step."""
+    """Return the word after this one, for draws that are repeated in every step."""
     return mix(word + jnp.uint32(GOLDEN_RATIO_32))
 
 
@@ -76,7 +76,7 @@ class Draws:
         """Return a float32, standard normal but for a distribution function off by up to 0.001; within 4.5.
 
         The sum of a word's four bytes, stretched by an odd polynomial: noise is drawn in every step, twice,
-        and the inverse distribution function would be dearer than the rest of the observation.
+        and the inverse distribution function would cost more than the rest of the observation.
         """
         word = self.word(name)
         pairs = (word & EVEN_BYTES) + ((word >> 8) & EVEN_BYTES)

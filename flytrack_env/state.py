@@ -36,7 +36,7 @@ BATTERY_EMPTY_V = 22.0
 
 
 class Action(NamedTuple):
-    """Stick positions roll, pitch, yaw, thrust in [-1, 1]; thrust -1 is none and +1 is all there is."""
+    """Stick positions roll, pitch, yaw, thrust in [-1, 1]; thrust from -1 (none) to +1 (full)."""
 
     roll: Scalar
     pitch: Scalar

@@ -55,7 +55,7 @@ def is_battery_empty(drone: Drone) -> jax.Array:
 def find_causes(drone: Drone, course: Course, is_crash: jax.Array, is_missed: jax.Array) -> Causes:
     """Return the causes of termination after a step.
 
-    is_crash, is_missed: what the gate's crossing says, bool scalars.
+    is_crash, is_missed: from the gate's crossing, bool scalars.
     """
     return Causes(
         crash=jnp.asarray(is_crash),

@@ -1,8 +1,8 @@
 """What an effect is: something that the minimal model leaves out, in one file.
 
-A file of this folder has a ``NamedTuple`` of parameters (numbers in SI units unless its range says
-otherwise, each with its **neutral** value as default) and one ``Effect`` that says how they act. A model
-carries the parameters of the effects that it has; the simulator folds them, in the order of
+A file of this folder has a ``NamedTuple`` of parameters (numbers in SI units unless its range has
+another unit, each with its **neutral** value as default) and one ``Effect`` that defines how they act. A
+model carries the parameters of the effects that it has; the simulator folds them, in the order of
 ``flytrack_env.effects.EFFECTS``, at the stages of a step, and then of reading the sensors:
 
 =============  =====================  =================================================  ============
@@ -15,12 +15,12 @@ thrust         scalar, N              collective thrust along body z            
 rates          ``Vec3``, rad/s        body rates of the lagged action                    actuator
 force          ``Vec3``, m/s^2, body  specific force beside thrust; starts at 0          force
 battery        scalar, V              battery voltage after the step                     battery
-gyro           ``Vec3``, rad/s        what the gyro says of the body rates               sensor
+gyro           ``Vec3``, rad/s        what the gyro reads of the body rates              sensor
 accelerometer  ``Vec3``, m/s^2, body  what the accelerometer says of the specific force  sensor
 =============  =====================  =================================================  ============
 
-What the sensors say changes nothing of the flight. They are read after the step, with what effects remember
-then (``flytrack_env.dynamics.read_sensors``); nobody reads them unless asked to.
+Readings do not change the flight. ``flytrack_env.dynamics.read_sensors`` computes them after the step, with
+the memories after it.
 
 A hook takes the effect's parameters, its memory, the value so far and the ``StepContext``, and returns
 the value. At neutral parameters it returns the value bit for bit, so that neutral equals absent.
@@ -83,7 +83,7 @@ class StepContext(NamedTuple):
 class Range(NamedTuple):
     """Where a parameter may lie, and its unit: a bound for files, fits and randomisation.
 
-    Both signs where the equation has them, so that a log that says the opposite of physics can say so.
+    Both signs where the equation allows them, so that a fit can show the opposite of what physics expects.
     """
 
     low: float
@@ -99,8 +99,8 @@ class Effect:
     """One effect; at least one hook is given.
 
     name: as in model files. parameters: the NamedTuple class; its defaults are neutral. ranges: of each
-    parameter. notable: how far from neutral a parameter is worth knowing, a judgement: what is smaller
-    hardly shows in a lap or a reading. equation: LaTeX. source: a publication, or the assumption. command,
+    parameter. notable: the smallest departure from neutral that matters, a judgement: less hardly
+    shows in a lap or a reading. equation: LaTeX. source: a publication, or the assumption. command,
     lag, air, thrust, rates, force, battery, gyro, accelerometer: hooks at these stages.
     most_steps: of parameters that are times, how many steps of time they may last.
     needs: channels that a log has to have to be asked about it: p position, v velocity, q attitude, w gyro,

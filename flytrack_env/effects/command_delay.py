@@ -26,7 +26,7 @@ class PastCommands(NamedTuple):
 
 
 def start(delay: CommandDelay, drone: Drone) -> PastCommands:
-    """Return the memory of an episode that begins: the applied action, as if commanded for long."""
+    """Return the memory of an episode that begins: as if the applied action had been commanded all along."""
     return PastCommands((drone.applied,) * BUFFER_STEPS)
 
 

@@ -28,7 +28,7 @@ class PastReadings(NamedTuple):
 
 
 def start(latency: ImuLatency, drone: Drone) -> PastReadings:
-    """Return the memory of an episode that begins: rates that have been held for long, no forces."""
+    """Return the memory of an episode that begins: rates that have been held all along, no forces."""
     still = Vec3(*(jnp.zeros_like(rate) for rate in drone.rates_b))
     size = BUFFER_STEPS + 1
     return PastReadings((drone.rates_b,) * size, (still,) * size, jnp.ones_like(drone.battery_v, bool))

@@ -1,7 +1,7 @@
 """The environments as Gymnasium environments, single and vectorised (docs/gymnasium.md).
 
-Importing this package registers nothing and compiles nothing; the environments are in ``single`` and
-``vector``, which Gymnasium imports when the first one is made.
+Importing this package registers nothing and compiles nothing; Gymnasium imports ``environments`` when the
+first one is made.
 """
 
 import gymnasium
@@ -20,7 +20,7 @@ def register_with_gymnasium() -> None:
         if env_id not in gymnasium.registry:
             gymnasium.register(
                 env_id,
-                entry_point=f"{__name__}.single:FlyTrackEnv",
-                vector_entry_point=f"{__name__}.vector:FlyTrackVectorEnv",
+                entry_point=f"{__name__}.environments:FlyTrackEnv",
+                vector_entry_point=f"{__name__}.environments:FlyTrackVectorEnv",
                 kwargs={"env_id": env_id},
             )

@@ -10,9 +10,8 @@ import numpy as np
 
 from flytrack_env.env import EnvParams
 from flytrack_env.episodes import EpisodicEnvironment
-from flytrack_env.gymnasium_adapter.columns import Columns
-from flytrack_env.gymnasium_adapter.layout import Layout, Packed
 from flytrack_env.gymnasium_adapter.options import Start
+from flytrack_env.gymnasium_adapter.packing import Columns, Layout, Packed
 from flytrack_env.randomness import seed_of
 from flytrack_env.registration import make
 from flytrack_env.rendering import scene_row
@@ -21,7 +20,7 @@ from flytrack_env.state import BATTERY, STATE_SIZE, unpack
 from flytrack_env.tracks import Track, build_course, load_track
 
 KEY_WORDS = 2  # uint32 words of a random key
-NOT_INFO = ("terminated", "truncated", "final_observation")  # of step_batch's info; returned apart
+NOT_INFO = ("terminated", "truncated", "final_observation")  # of step_batch's info; returned separately
 
 
 def draw_key(generator: np.random.Generator, shape: tuple[int, ...] = ()) -> np.ndarray:
@@ -148,7 +147,8 @@ class Programs:
         )
         final_observations = info["final_observation"]
         kept = {name: value for name, value in info.items() if name not in NOT_INFO}
-        blocks = self.batch_columns.gather(jax.vmap(_grouped)(rewards, terminated, truncated, kept))
+        grouped = jax.vmap(_grouped)(rewards, terminated, truncated, kept)
+        blocks = self.batch_columns.gather(grouped, is_batch=True)
         scenes = jax.vmap(self._scene)(new_states) if has_scenes else None
         packed = self.state_layout.pack_batch(new_states)
         return packed, observations, final_observations, scenes, blocks
@@ -221,7 +221,7 @@ class Simulation:
 
 
 def _check_shapes(params: EnvParams, default: EnvParams) -> None:
-    """Refuse what is no EnvParams, or has leaves of a batch; a course may have any number of gates."""
+    """Raise unless it is an unbatched EnvParams; a course may have any number of gates."""
     if not isinstance(params, EnvParams):
         raise TypeError(f"params: found {type(params).__name__}, expected EnvParams")
     params = params.replace(course=default.course)

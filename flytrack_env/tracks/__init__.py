@@ -1,4 +1,4 @@
-"""Tracks: one data file each, one loader, the geometry of gates, what is feasible, random courses."""
+"""Tracks: data files and their loader, the geometry of gates, feasibility, random courses."""
 
 from flytrack_env.tracks.course import (
     Course,

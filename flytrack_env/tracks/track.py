@@ -1,4 +1,4 @@
-"""Track files: what a course is, read from TOML and checked before anything flies it.
+"""Tracks and their TOML files, checked before anything flies them.
 
 A track file has a ``name``, a ``[start]`` (position, quaternion), ``[bounds]`` (low, high) and one
 ``[[gates]]`` table per gate, in flying order; ``flytrack.toml`` beside this file is the example.
@@ -7,7 +7,6 @@ A track file has a ``name``, a ``[start]`` (position, quaternion), ``[bounds]`` 
 import dataclasses
 import json
 import math
-import re
 from pathlib import Path
 from typing import Any
 
@@ -98,7 +97,7 @@ def save_track(path: str | Path, track: Track) -> None:
     Raises:
         TrackError: a path without ``.toml``, or a track that would not come back as it is: values that no
             track file may have, quaternions that are not units.
-        OSError: what the system says.
+        OSError: the file cannot be written.
     """
     path = Path(path)
     if path.suffix != ".toml":
@@ -155,131 +154,115 @@ def _parse(path: Path, text: str) -> Track:
         data = parse_toml(text)
     except TomlError as error:
         raise TrackError(f"{path}: not a TOML file: {error_text(error)}") from error
-    return _Reader(path, text).track(data)
+    file = _Table(path, text.splitlines(), data, "", {"name", "start", "bounds", "gates"})
+    if not isinstance(data["name"], str) or not data["name"]:
+        raise file.error("name", f"found {quote_value(data['name'])}, expected a non-empty string")
+    if not isinstance(data["gates"], list) or len(data["gates"]) < 2:
+        raise file.error("gates", "expected at least two [[gates]] tables")
+    start = file.inner(data["start"], "[start]", {"position", "quaternion"})
+    bounds = file.inner(data["bounds"], "[bounds]", {"low", "high"})
+    low, high = bounds.numbers("low", 3), bounds.numbers("high", 3)
+    if not all(a < b for a, b in zip(low, high, strict=True)):
+        raise bounds.error("high", f"found {high}, expected more than low, {low}")
+
+    def position(table: _Table) -> tuple[Any, ...]:
+        found = table.numbers("position", 3)
+        if not all(a < p < b for a, p, b in zip(low, found, high, strict=True)):
+            raise table.error("position", f"found {found}, expected inside the bounds {low} to {high}")
+        return found
+
+    fields = {field.name for field in dataclasses.fields(Gate)}
+    tables = [file.inner(gate, "[[gates]]", fields, index) for index, gate in enumerate(data["gates"])]
+    gates = tuple(_gate(table, position(table)) for table in tables)
+    for index, table in enumerate(tables):
+        if gates[index].id in {gate.id for gate in gates[:index]}:
+            raise table.error("id", f"{gates[index].id} is used twice")
+    return Track(data["name"], gates, position(start), start.quaternion(), low, high)
 
 
-class _Reader:
-    """Checks one parsed file and knows where in the text each field stands."""
+@dataclasses.dataclass(frozen=True)
+class _Table:
+    """A table of a parsed file, checked to have its fields and no others; header: as in the file."""
 
-    def __init__(self, path: Path, text: str):
-        self.path = path
-        self.lines = text.splitlines()
+    path: Path
+    lines: list[str]
+    data: dict[str, Any]
+    header: str
+    fields: set[str]
+    index: int = 0
 
-    def line_of(self, header: str, index: int, field: str) -> int:
-        """Return the 1-based line of a field in the index-th table of that header, else its header."""
-        pattern = re.compile(r"^\s*" + re.escape(header))
-        starts = [n for n, line in enumerate(self.lines) if pattern.match(line)] if header else [-1]
-        start = starts[index] if index < len(starts) else 0
+    def __post_init__(self) -> None:
+        if not isinstance(self.data, dict):
+            raise self.error(self.header.strip("[]"), "expected a table")
+        for field in sorted(self.fields - set(self.data)):
+            raise self.error(field, "missing")
+        for field in sorted(set(self.data) - self.fields):
+            raise self.error(field, f"unknown; expected {', '.join(sorted(self.fields))}")
+
+    def inner(self, data: Any, header: str, fields: set[str], index: int = 0) -> "_Table":
+        """Return the index-th table of a header of the same file."""
+        return _Table(self.path, self.lines, data, header, fields, index)
+
+    def _line_of(self, field: str) -> int:
+        """Return the 1-based line of a field, else that of the table's header."""
+        starts = [n for n, line in enumerate(self.lines) if line.lstrip().startswith(self.header)]
+        start = (starts[self.index] if self.index < len(starts) else 0) if self.header else -1
         for number in range(start + 1, len(self.lines)):
-            if self.lines[number].lstrip().startswith("["):
-                break
             line = self.lines[number].lstrip()
+            if line.startswith("["):
+                break
             if line.startswith(field) and line[len(field) :].lstrip().startswith("="):
                 return number + 1
         return max(start, 0) + 1
 
-    def fail(self, header: str, index: int, field: str, reason: str) -> TrackError:
-        where = f"{header}[{index}] " if header == "[[gates]]" else f"{header} " if header else ""
-        line = self.line_of(header, index, field)
-        return TrackError(f"{self.path}, line {line}: {where}{quote_name(field)}: {reason}")
+    def error(self, field: str, reason: str) -> TrackError:
+        """Return the error that names file, line, table and field."""
+        number = f"[{self.index}]" if self.header == "[[gates]]" else ""
+        where = f"{self.header}{number} " if self.header else ""
+        return TrackError(f"{self.path}, line {self._line_of(field)}: {where}{quote_name(field)}: {reason}")
 
-    def table(self, data: dict[str, Any], header: str, index: int, fields: set[str]) -> None:
-        """Check that a table has these fields and no others."""
-        if not isinstance(data, dict):
-            raise self.fail(header, index, header.strip("[]"), "expected a table")
-        for field in sorted(fields - set(data)):
-            raise self.fail(header, index, field, "missing")
-        for field in sorted(set(data) - fields):
-            raise self.fail(header, index, field, f"unknown; expected {', '.join(sorted(fields))}")
-
-    def numbers(
-        self, data: dict[str, Any], header: str, index: int, field: str, size: int
-    ) -> tuple[Any, ...]:
+    def numbers(self, field: str, size: int) -> tuple[Any, ...]:
         """Return a list of that many finite numbers."""
-        value = data[field]
+        value = self.data[field]
         if not isinstance(value, list) or len(value) != size:
-            raise self.fail(header, index, field, f"found {quote_value(value)}, expected {size} numbers")
-        for number in value:
-            if isinstance(number, bool) or not isinstance(number, (int, float)):
-                raise self.fail(header, index, field, f"found {quote_value(number)}, expected a number")
-            if not -LARGEST < number < LARGEST:  # false for NaN too
-                found = number if isinstance(number, float) else f"an integer of {number.bit_length()} bits"
-                reason = f"found {found}, expected a finite number within +-{LARGEST:g}"
-                raise self.fail(header, index, field, reason)
-        return tuple(float(number) for number in value)
+            raise self.error(field, f"found {quote_value(value)}, expected {size} numbers")
+        return tuple(self._finite(field, number) for number in value)
 
-    def quaternion(self, data: dict[str, Any], header: str, index: int) -> tuple[Any, ...]:
+    def number(self, field: str) -> float:
+        """Return a finite number."""
+        return self._finite(field, self.data[field])
+
+    def _finite(self, field: str, number: Any) -> float:
+        if isinstance(number, bool) or not isinstance(number, (int, float)):
+            raise self.error(field, f"found {quote_value(number)}, expected a number")
+        if not -LARGEST < number < LARGEST:  # false for NaN too
+            found = number if isinstance(number, float) else f"an integer of {number.bit_length()} bits"
+            raise self.error(field, f"found {found}, expected a finite number within +-{LARGEST:g}")
+        return float(number)
+
+    def quaternion(self) -> tuple[Any, ...]:
         """Return a unit quaternion, renormalised if its digits were rounded."""
-        value = self.numbers(data, header, index, "quaternion", 4)
+        value = self.numbers("quaternion", 4)
         norm = math.sqrt(sum(q * q for q in value))
         if abs(norm - 1.0) > UNIT_NORM_TOLERANCE:
-            raise self.fail(header, index, "quaternion", f"found norm {norm:.6g}, expected 1")
+            raise self.error("quaternion", f"found norm {norm:.6g}, expected 1")
         return value if abs(norm - 1.0) <= ROUNDING else tuple(q / norm for q in value)
 
-    def gate(self, data: dict[str, Any], index: int) -> Gate:
-        """Return one checked gate."""
-        header = "[[gates]]"
-        fields = {"id", "position", "quaternion", "direction", "opening", "frame"}
-        self.table(data, header, index, fields)
-        if isinstance(data["id"], bool) or not isinstance(data["id"], int):
-            raise self.fail(header, index, "id", f"found {quote_value(data['id'])}, expected an integer")
-        if not -LARGEST_ID < data["id"] < LARGEST_ID:
-            raise self.fail(header, index, "id", f"found {quote_value(data['id'])}, expected less than 2^53")
-        if not isinstance(data["direction"], str) or data["direction"] not in DIRECTIONS:
-            reason = f"found {quote_value(data['direction'])}, expected one of {', '.join(DIRECTIONS)}"
-            raise self.fail(header, index, "direction", reason)
-        for field in ("opening", "frame"):
-            data = {**data, field: self.numbers({field: [data[field]]}, header, index, field, 1)[0]}
-        if data["opening"] <= 0.0:
-            raise self.fail(header, index, "opening", f"found {data['opening']}, expected > 0")
-        if data["frame"] <= data["opening"]:
-            reason = f"found {data['frame']}, expected more than the opening, {data['opening']}"
-            raise self.fail(header, index, "frame", reason)
-        return Gate(
-            id=data["id"],
-            position=self.numbers(data, header, index, "position", 3),
-            quaternion=self.quaternion(data, header, index),
-            direction=DIRECTIONS[data["direction"]],
-            opening=data["opening"],
-            frame=data["frame"],
+
+def _gate(table: _Table, position: tuple[Any, ...]) -> Gate:
+    """Return the gate of a table; raises TrackError."""
+    gate_id, direction = table.data["id"], table.data["direction"]
+    if isinstance(gate_id, bool) or not isinstance(gate_id, int):
+        raise table.error("id", f"found {quote_value(gate_id)}, expected an integer")
+    if not -LARGEST_ID < gate_id < LARGEST_ID:
+        raise table.error("id", f"found {quote_value(gate_id)}, expected less than 2^53")
+    if not isinstance(direction, str) or direction not in DIRECTIONS:
+        raise table.error(
+            "direction", f"found {quote_value(direction)}, expected one of {', '.join(DIRECTIONS)}"
         )
-
-    def track(self, data: dict[str, Any]) -> Track:
-        """Return the checked track."""
-        self.table(data, "", 0, {"name", "start", "bounds", "gates"})
-        if not isinstance(data["name"], str) or not data["name"]:
-            raise self.fail("", 0, "name", f"found {quote_value(data['name'])}, expected a non-empty string")
-        self.table(data["start"], "[start]", 0, {"position", "quaternion"})
-        self.table(data["bounds"], "[bounds]", 0, {"low", "high"})
-        if not isinstance(data["gates"], list) or len(data["gates"]) < 2:
-            raise self.fail("", 0, "gates", "expected at least two [[gates]] tables")
-        gates = tuple(self.gate(gate, index) for index, gate in enumerate(data["gates"]))
-        ids: set[int] = set()
-        for index, gate in enumerate(gates):
-            if gate.id in ids:
-                raise self.fail("[[gates]]", index, "id", f"{gate.id} is used twice")
-            ids.add(gate.id)
-        low = self.numbers(data["bounds"], "[bounds]", 0, "low", 3)
-        high = self.numbers(data["bounds"], "[bounds]", 0, "high", 3)
-        if not all(a < b for a, b in zip(low, high, strict=True)):
-            raise self.fail("[bounds]", 0, "high", f"found {high}, expected more than low, {low}")
-
-        def is_inside(position: tuple[float, ...]) -> bool:
-            return all(a < p < b for a, p, b in zip(low, position, high, strict=True))
-
-        for index, gate in enumerate(gates):
-            if not is_inside(gate.position):
-                reason = f"found {gate.position}, expected inside the bounds {low} to {high}"
-                raise self.fail("[[gates]]", index, "position", reason)
-        start = self.numbers(data["start"], "[start]", 0, "position", 3)
-        if not is_inside(start):
-            reason = f"found {start}, expected inside the bounds {low} to {high}"
-            raise self.fail("[start]", 0, "position", reason)
-        return Track(
-            name=data["name"],
-            gates=gates,
-            start_position=start,
-            start_quaternion=self.quaternion(data["start"], "[start]", 0),
-            bounds_low=low,
-            bounds_high=high,
-        )
+    opening, frame = table.number("opening"), table.number("frame")
+    if opening <= 0.0:
+        raise table.error("opening", f"found {opening}, expected > 0")
+    if frame <= opening:
+        raise table.error("frame", f"found {frame}, expected more than the opening, {opening}")
+    return Gate(gate_id, position, table.quaternion(), DIRECTIONS[direction], opening, frame)

@@ -54,7 +54,7 @@ class ActionDelay(Wrapper):
         check_parameters(self.own_params(params), params.dt)
 
     def begin(self, drone: Drone, gate_index: Any, params: EnvParams, seed: Any = 0) -> ActionDelayState:
-        """Return the state of an episode that begins, as if its applied action were commanded for long."""
+        """Return the state of an episode that begins, its applied action taken for all past commands."""
         inner = self.env.begin(drone, gate_index, params, seed)
         return ActionDelayState(inner, command_delay.start(self.own_params(params), drone))
 

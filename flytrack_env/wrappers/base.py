@@ -1,9 +1,9 @@
-"""What a wrapper is: an environment around an environment, inside of auto-reset.
+"""The base of wrappers: an environment around an environment, inside auto-reset.
 
-gymnax's own wrappers go around a step that has already reset itself, so that what they keep leaks
-into the next episode. Ours change the hooks of ``flytrack_env.episodes.EpisodicEnvironment`` instead:
-each has one state of its own around the inner state, begun when an episode begins. They compose in any
-order that makes sense; one that does not is refused.
+gymnax's own wrappers go around a step that has already reset itself, so that their state leaks into the
+next episode. Ours change the hooks of ``flytrack_env.episodes.EpisodicEnvironment`` instead:
+each has one state of its own around the inner state, created when an episode begins. They compose in any
+order that makes sense; any other is refused.
 """
 
 from typing import Any
@@ -31,7 +31,7 @@ class Wrapper(EpisodicEnvironment):
     and that of its parameters in ``EnvParams.wrappers``; no two wrappers of an environment share one.
 
     Raises:
-        WrapperError: something else than FlyTrack or a wrapper of ours, the same wrapper twice, or one
+        WrapperError: anything but FlyTrack or a wrapper of ours, the same wrapper twice, or one
             that this wrapper refuses.
     """
 
@@ -56,7 +56,7 @@ class Wrapper(EpisodicEnvironment):
     def refusal(self, inside: EpisodicEnvironment) -> str | None:
         """Return why this wrapper may not go around what is inside, however deep; None if it may."""
         if isinstance(inside, Wrapper) and inside.key == self.key:
-            return f"both have the name {self.key!r}, by which their parameters and draws are told apart"
+            return f"both have the name {self.key!r}, which identifies their parameters and draws"
         return None
 
     def own_defaults(self) -> Any:
@@ -121,9 +121,9 @@ class Wrapper(EpisodicEnvironment):
         """Return the inner environment's observation."""
         return self.env.observe_drone(drone, state.inner, params)
 
-    def settle(self, state: Any, params: EnvParams) -> Any:
-        """Return the state with the inner one settled."""
-        return state._replace(inner=self.env.settle(state.inner, params))
+    def refresh(self, state: Any, params: EnvParams) -> Any:
+        """Return the state with the inner one refreshed."""
+        return state._replace(inner=self.env.refresh(state.inner, params))
 
     def is_truncated(self, state: Any, params: EnvParams) -> jax.Array:
         """Return whether the time limit is reached."""

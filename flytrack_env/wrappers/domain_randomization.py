@@ -107,8 +107,8 @@ def _draw(draws: Draws, model: ModelParameters, low: Any, high: Any, factors: tu
 class DomainRandomization(Wrapper):
     """Fly every episode with a model drawn around the given one.
 
-    The ranges are ``params.wrappers["domain_randomization"]``, a ``RandomizationParams``. The policy is not
-    told what was drawn; ``env.model(state, params)`` tells people.
+    The ranges are ``params.wrappers["domain_randomization"]``, a ``RandomizationParams``. The policy does
+    not see the draw; ``env.model(state, params)`` returns it.
 
     Raises:
         WrapperError: as ``Wrapper``, or a plant that has its parameters baked in.
@@ -164,9 +164,9 @@ class DomainRandomization(Wrapper):
         """Return the inner environment's observation, with this episode's model."""
         return self.env.observe_drone(drone, state.inner, self._drawn(state.word, params))
 
-    def settle(self, state: RandomizedState, params: EnvParams) -> RandomizedState:
-        """Return the state with the inner one settled, with this episode's model."""
-        return state._replace(inner=self.env.settle(state.inner, self._drawn(state.word, params)))
+    def refresh(self, state: RandomizedState, params: EnvParams) -> RandomizedState:
+        """Return the state with the inner one refreshed, with this episode's model."""
+        return state._replace(inner=self.env.refresh(state.inner, self._drawn(state.word, params)))
 
     def advance(
         self, state: RandomizedState, command: Action, params: EnvParams

@@ -1,4 +1,4 @@
-"""Sensor noise: the policy sees a drone that is a little elsewhere."""
+"""Sensor noise: the policy sees a slightly displaced drone."""
 
 from collections.abc import Mapping
 from typing import Any, NamedTuple

@@ -1,0 +1,339 @@
+"""The environments behind ``gymnasium.make`` and ``gymnasium.make_vec``: one compiled step each."""
+
+from typing import Any
+
+import gymnasium
+import numpy as np
+from gymnasium.utils import seeding
+from gymnasium.vector import AutoresetMode
+from gymnasium.vector.utils import batch_space
+
+from flytrack_env.env import EnvParams
+from flytrack_env.gymnasium_adapter.options import TRACK, check_names, read_start
+from flytrack_env.gymnasium_adapter.packing import Packed
+from flytrack_env.gymnasium_adapter.simulation import Simulation, draw_key
+from flytrack_env.rendering import FlightLog, make_renderer, open_window
+
+RENDER_MODES, VECTOR_RENDER_MODES = ("human", "rgb_array"), ("rgb_array",)
+SEED_WORDS = 4
+MOST_STEPS = 2**32  # that a uint32 can count
+
+
+def as_float32(actions: Any) -> np.ndarray:
+    """Return actions as an array of float32; what is beyond it is infinite, and clipped as such."""
+    with np.errstate(over="ignore"):
+        return np.asarray(actions, np.float32)
+
+
+class _Adapter:
+    """What the single and the vector environment share: a simulation, its spaces and its pictures."""
+
+    metadata: dict[str, Any]
+    render_mode: str | None
+    _simulation: Simulation
+    _renderer: Any
+    _window: Any
+
+    def _set_up(
+        self, env_id: str, render_mode: str | None, params: EnvParams | None, overrides: dict[str, Any]
+    ) -> tuple[gymnasium.spaces.Box, gymnasium.spaces.Box]:
+        """Make the simulation and what draws it; return the spaces of an observation and an action."""
+        render_modes = self.metadata["render_modes"]
+        if render_mode is not None and render_mode not in render_modes:
+            expected = ", ".join(map(repr, render_modes))
+            raise ValueError(f"render_mode: found {render_mode!r}, expected None, {expected}")
+        self.render_mode = render_mode
+        self._simulation = Simulation(env_id, params, overrides)
+        env, params = self._simulation.env, self._simulation.params
+        self.metadata = {**self.metadata, "render_fps": round(1.0 / float(params.dt))}
+        self._renderer = None if render_mode is None else make_renderer(params.course)
+        return box(env.observation_space(params)), box(env.action_space(params))
+
+    def _begin(self, options: dict[str, Any] | None, draw_words: Any) -> tuple[Packed, Any, Any]:
+        """Return state, observation and scene of episodes that begin as the options of a reset say.
+
+        draw_words: called for the words of their keys once the options are known to be good.
+        """
+        options = check_names(options)
+        simulation = self._simulation
+        if TRACK in options:
+            simulation = simulation.with_track(options[TRACK])
+        start = read_start(options, simulation.params.course)
+        words = draw_words()
+        if simulation is not self._simulation:
+            self._simulation = simulation
+            self._renderer = self._renderer and make_renderer(simulation.params.course)
+        return simulation.begin(words, start)
+
+    def _checked(self, name: str, state: Any, actions: Any, shape: tuple[int, ...] | None) -> np.ndarray:
+        """Return actions as float32, once an episode has begun and if they have that shape."""
+        if state is None:
+            raise gymnasium.error.ResetNeeded("step: found no episode, expected a reset before it")
+        actions = as_float32(actions)
+        if actions.shape != shape:
+            raise ValueError(f"{name}: found shape {actions.shape}, expected {shape}")
+        return actions
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return what a copy needs: it gets a renderer and a window of its own."""
+        return {**self.__dict__, "_renderer": None, "_window": None}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Take over what a copy needs."""
+        self.__dict__.update(state)
+        params = self._simulation.params
+        if self.render_mode is not None:
+            self._renderer = make_renderer(params.course)
+        if self.render_mode == "human":
+            self._window = open_window(float(params.dt))
+
+
+def box(space: Any) -> gymnasium.spaces.Box:
+    """Return a Gymnasium box with the limits of a gymnax one."""
+    low, high = (
+        np.broadcast_to(np.asarray(limit, np.float32), space.shape) for limit in (space.low, space.high)
+    )
+    return gymnasium.spaces.Box(low, high, space.shape, np.float32)
+
+
+class FlyTrackEnv(_Adapter, gymnasium.Env[np.ndarray, np.ndarray]):
+    """One environment of an id, stepped as one compiled function.
+
+    Args:
+        env_id: an id of ``flytrack_env.registration.ENVIRONMENTS``.
+        render_mode: None, "rgb_array" or "human".
+        params: replace the environment's default parameters.
+        overrides: further arguments of ``flytrack_env.make``: track, model, plant, missed_gate, reward.
+
+    Raises:
+        ValueError: what ``flytrack_env.make`` and ``check_params`` refuse, or an unknown render mode.
+        TypeError: params of another type.
+        ImportError: a render mode whose package is not installed.
+    """
+
+    metadata: dict[str, Any] = {"render_modes": list(RENDER_MODES), "render_fps": 100}  # noqa: RUF012  # as Gymnasium declares it
+
+    def __init__(
+        self,
+        env_id: str,
+        render_mode: str | None = None,
+        params: EnvParams | None = None,
+        **overrides: Any,
+    ):
+        self.observation_space, self.action_space = self._set_up(env_id, render_mode, params, overrides)
+        self._state: Any = None
+        step_s = float(self._simulation.params.dt)
+        self._log = FlightLog(step_s)
+        self._window = open_window(step_s) if render_mode == "human" else None
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[np.ndarray, dict[str, Any]]:
+        """Return observation and an empty info of an episode that begins.
+
+        options: position (world, m), quaternion (w, x, y, z, body to world) or yaw_deg, velocity
+        (world, m/s), battery_v, gate_index (to fly first), track; see docs/gymnasium.md.
+
+        Raises:
+            ValueError: an unknown option, or a value that no episode can start with.
+        """
+
+        def draw() -> np.ndarray:
+            super(FlyTrackEnv, self).reset(seed=seed)
+            return draw_key(self.np_random)
+
+        self._state, observation, scene = self._begin(options, draw)
+        self._log = FlightLog(float(self._simulation.params.dt))
+        self._show(scene)
+        return np.array(observation), {}
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        """Return observation, reward, terminated, truncated and info, of Python's own types.
+
+        action: (4,), see docs/environment.md. There is no auto-reset.
+
+        Raises:
+            gymnasium.error.ResetNeeded: no episode has begun.
+            ValueError: an action of another shape.
+        """
+        action = self._checked("action", self._state, action, self.action_space.shape)
+        programs = self._simulation.programs
+        outputs = programs.step(self._state, action, self._simulation.packed_params)
+        self._state, observation, scene, blocks = outputs
+        reward, terminated, truncated, info = programs.columns.plain(blocks)
+        self._show(scene)
+        return np.array(observation), reward, terminated, truncated, info
+
+    def _show(self, scene: Any) -> None:
+        """Log what a picture needs, and show it in the window if there is one."""
+        renderer = self._renderer
+        if renderer is None:
+            return
+        self._log.append(np.asarray(scene))
+        if self._window is not None:
+            self._window.show(lambda: renderer.draw(self._log), is_first=len(self._log.rows) == 1)
+
+    def render(self) -> np.ndarray | None:
+        """Return a picture (540, 960, 3), uint8, in mode "rgb_array"; else None.
+
+        In mode "human" the window has shown every step by itself.
+
+        Raises:
+            gymnasium.error.ResetNeeded: no episode has begun.
+        """
+        if self.render_mode != "rgb_array" or self._renderer is None:
+            return None
+        if self._state is None:
+            raise gymnasium.error.ResetNeeded("render: found no episode, expected a reset before it")
+        return self._renderer.draw(self._log)
+
+    def close(self) -> None:
+        """Close the window, if there is one; more than once is allowed."""
+        if self._window is not None:
+            self._window.close()
+            self._window = None
+
+
+class FlyTrackVectorEnv(_Adapter, gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
+    """Environments of one id side by side; an episode that ends is reset in the same step.
+
+    What ``gymnasium.vector.SyncVectorEnv`` with ``AutoresetMode.SAME_STEP`` returns, in the same types:
+    new, writable arrays in every step.
+
+    Args:
+        env_id: an id of ``flytrack_env.registration.ENVIRONMENTS``.
+        num_envs: how many.
+        render_mode: None or "rgb_array".
+        params: replace the environment's default parameters.
+        overrides: further arguments of ``flytrack_env.make``: track, model, plant, missed_gate, reward.
+
+    Raises:
+        ValueError: what ``flytrack_env.make`` and ``check_params`` refuse, an unknown render mode, or no
+            environments.
+        TypeError: params of another type.
+        ImportError: a render mode without Pillow.
+    """
+
+    metadata: dict[str, Any] = {  # noqa: RUF012  # as Gymnasium declares it
+        "render_modes": list(VECTOR_RENDER_MODES),
+        "render_fps": 100,
+        "autoreset_mode": AutoresetMode.SAME_STEP,
+    }
+
+    def __init__(
+        self,
+        env_id: str,
+        num_envs: int = 1,
+        render_mode: str | None = None,
+        params: EnvParams | None = None,
+        **overrides: Any,
+    ):
+        if not isinstance(num_envs, int) or num_envs < 1:
+            raise ValueError(f"num_envs: found {num_envs!r}, expected an integer of at least 1")
+        self.num_envs = num_envs
+        self.single_observation_space, self.single_action_space = self._set_up(
+            env_id, render_mode, params, overrides
+        )
+        self.observation_space = batch_space(self.single_observation_space, num_envs)
+        self.action_space = batch_space(self.single_action_space, num_envs)
+        self._states: Any = None
+        self._words = np.zeros(0, np.uint32)
+        self._count = 0
+        self._logs: list[FlightLog] = []
+
+    def reset(
+        self,
+        *,
+        seed: int | list[int | None] | None = None,
+        options: dict[str, Any] | None = None,
+    ) -> tuple[np.ndarray, dict[str, Any]]:
+        """Return observations and an empty info of episodes that begin, in all environments.
+
+        seed: of the first environment, the others counting up; or one per environment. An environment's
+        start is that of a single environment with its seed. options: as for the single environment, the
+        same for all.
+
+        Raises:
+            ValueError: an unknown option, a value that no episode can start with, or another number of
+                seeds.
+        """
+        self._states, observations, scenes = self._begin(options, lambda: self._seed(seed))
+        self._words, self._count = draw_key(self.np_random), 0
+        if self._renderer is not None:
+            self._log(np.asarray(scenes), np.ones(self.num_envs, bool))
+        return np.array(observations), {}
+
+    def _seed(self, seed: Any) -> np.ndarray:
+        """Seed the generator and return a key's words per environment."""
+        if seed is None:
+            return draw_key(self.np_random, (self.num_envs,))
+        if isinstance(seed, (int, np.integer)):
+            seeds: list[int | None] = [int(seed) + index for index in range(self.num_envs)]
+        else:
+            seeds = [one if one is None else int(one) for one in seed]
+        if len(seeds) != self.num_envs:
+            raise ValueError(f"seed: found {len(seeds)} seeds, expected one per environment, {self.num_envs}")
+        words = np.stack([draw_key(seeding.np_random(one)[0]) for one in seeds])
+        # The draws after this one depend on all seeds; Gymnasium's generator takes one integer.
+        common = np.random.SeedSequence(words.ravel().tolist()).generate_state(SEED_WORDS)
+        super().reset(seed=int.from_bytes(common.tobytes(), "little"))
+        return words
+
+    def step(
+        self, actions: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
+        """Return observations, rewards, terminations, truncations and infos of a step.
+
+        actions: (num_envs, 4). Where an episode ended, the observation is that of the next one, and infos
+        has ``final_obs`` and ``final_info`` with their masks.
+
+        Raises:
+            gymnasium.error.ResetNeeded: no episode has begun.
+            ValueError: actions of another shape.
+        """
+        actions = self._checked("actions", self._states, actions, self.action_space.shape)
+        programs = self._simulation.programs
+        self._states, observations, final_observations, scenes, blocks = programs.step_batch(
+            self._states,
+            self._words,
+            np.uint32(self._count),
+            actions,
+            self._simulation.packed_params,
+            self._renderer is not None,
+        )
+        self._count = (self._count + 1) % MOST_STEPS
+        columns = programs.batch_columns.batched(blocks)
+        rewards, terminated, truncated, infos, final_info, final_masks = columns
+        done = terminated | truncated
+        if self._renderer is not None:
+            self._log(np.asarray(scenes), done)
+        places = np.flatnonzero(done)
+        if places.size:
+            infos = {} if done.all() else infos
+            final_obs = np.empty(self.num_envs, object)  # filled with None
+            for place, final in zip(places.tolist(), np.asarray(final_observations)[places], strict=True):
+                final_obs[place] = final
+            infos.update(final_obs=final_obs, final_info=final_info, **final_masks)
+        return np.array(observations), rewards, terminated, truncated, infos
+
+    def _log(self, scenes: np.ndarray, has_begun: np.ndarray) -> None:
+        """Log what pictures need, in new logs where episodes began."""
+        step_s = float(self._simulation.params.dt)
+        logs = self._logs or [FlightLog(step_s)] * self.num_envs
+        self._logs = [
+            FlightLog(step_s) if is_new else log for log, is_new in zip(logs, has_begun.tolist(), strict=True)
+        ]
+        for log, scene in zip(self._logs, scenes, strict=True):
+            log.append(scene)
+
+    def render(self) -> tuple[np.ndarray, ...] | None:
+        """Return a picture (540, 960, 3), uint8, per environment in mode "rgb_array"; else None.
+
+        Raises:
+            gymnasium.error.ResetNeeded: no episode has begun.
+        """
+        if self._renderer is None:
+            return None
+        if self._states is None:
+            raise gymnasium.error.ResetNeeded("render: found no episodes, expected a reset before it")
+        return tuple(self._renderer.draw(log) for log in self._logs)
