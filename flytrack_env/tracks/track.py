@@ -180,24 +180,19 @@ def _parse(path: Path, text: str) -> Track:
     return Track(data["name"], gates, position(start), start.quaternion(), low, high)
 
 
-@dataclasses.dataclass(frozen=True)
 class _Table:
     """A table of a parsed file, checked to have its fields and no others; header: as in the file."""
 
-    path: Path
-    lines: list[str]
-    data: dict[str, Any]
-    header: str
-    fields: set[str]
-    index: int = 0
-
-    def __post_init__(self) -> None:
-        if not isinstance(self.data, dict):
-            raise self.error(self.header.strip("[]"), "expected a table")
-        for field in sorted(self.fields - set(self.data)):
+    def __init__(
+        self, path: Path, lines: list[str], data: Any, header: str, fields: set[str], index: int = 0
+    ):
+        self.path, self.lines, self.data, self.header, self.index = path, lines, data, header, index
+        if not isinstance(data, dict):
+            raise self.error(header.strip("[]"), "expected a table")
+        for field in sorted(fields - set(data)):
             raise self.error(field, "missing")
-        for field in sorted(set(self.data) - self.fields):
-            raise self.error(field, f"unknown; expected {', '.join(sorted(self.fields))}")
+        for field in sorted(set(data) - fields):
+            raise self.error(field, f"unknown; expected {', '.join(sorted(fields))}")
 
     def inner(self, data: Any, header: str, fields: set[str], index: int = 0) -> "_Table":
         """Return the index-th table of a header of the same file."""
