@@ -267,21 +267,11 @@ def check_model_name(path: Path) -> None:
 
 
 def fixed_values(pairs: Sequence[str]) -> dict[str, float]:
-    """Return NAME=VALUE pairs as a dictionary.
-
-    Raises:
-        ValueError: no name, or no number.
-    """
-    values = {}
-    for pair in pairs:
-        name, _, text = pair.partition("=")
-        try:
-            values[name.strip()] = float(text)
-        except ValueError as error:
-            raise ValueError(
-                f"--fix {pair}: expected NAME=VALUE with a number, as in tau_yaw=0.05"
-            ) from error
-    return values
+    """Return NAME=VALUE pairs as a dictionary; raises ValueError for a missing name or number."""
+    try:
+        return {name.strip(): float(value) for name, value in (pair.split("=") for pair in pairs)}
+    except ValueError as error:
+        raise ValueError(f"--fix {' '.join(pairs)}: expected NAME=VALUE, as in tau_yaw=0.05") from error
 
 
 def judged_rows(model_path: Path, log: FlightLog) -> tuple[np.ndarray | None, str]:

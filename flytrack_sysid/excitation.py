@@ -17,6 +17,7 @@ Four flights of a kind follow each other, so that the last of every four can be 
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy import signal
 from scipy.spatial.transform import Rotation
 
@@ -85,20 +86,27 @@ def switching(
     return np.repeat(signs * rng.uniform(smallest, 1.0, FLIGHT_STEPS), holds)[:FLIGHT_STEPS]
 
 
+def start_at(
+    attitude: Rotation, hover: float, voltage: float, vel_w: ArrayLike = 0.0, height: float = HEIGHT
+) -> np.ndarray:
+    """Return a start (21,) with the thrust action ``hover``, above the origin; m/s, m, V."""
+    x = np.zeros(STATE_SIZE)
+    x[POSITION], x[VELOCITY] = [0.0, 0.0, height], vel_w
+    x[QUATERNION] = attitude.as_quat(scalar_first=True, canonical=True)
+    x[APPLIED_ACTION] = [0.0, 0.0, 0.0, hover]
+    x[BATTERY] = voltage
+    return x
+
+
 def start_state(
     rng: np.random.Generator, voltage: float, hover: float, tilt_deg: float, speed: float
 ) -> np.ndarray:
     """Return a start (21,) with the thrust action ``hover``, tilted and moving in random directions."""
-    x = np.zeros(STATE_SIZE)
-    x[POSITION] = [0.0, 0.0, HEIGHT]
     side, heading, yaw = rng.uniform(-np.pi, np.pi, 3)
     tilt = Rotation.from_rotvec(np.deg2rad(tilt_deg) * np.array([np.cos(side), np.sin(side), 0.0]))
-    x[QUATERNION] = (tilt * Rotation.from_euler("z", yaw)).as_quat(scalar_first=True, canonical=True)
     climb = rng.uniform(-0.3, 0.3)
-    x[VELOCITY] = speed * np.array([np.cos(heading), np.sin(heading), climb]) / np.hypot(1.0, climb)
-    x[APPLIED_ACTION] = [0.0, 0.0, 0.0, hover]
-    x[BATTERY] = voltage
-    return x
+    vel_w = speed * np.array([np.cos(heading), np.sin(heading), climb]) / np.hypot(1.0, climb)
+    return start_at(tilt * Rotation.from_euler("z", yaw), hover, voltage, vel_w)
 
 
 def _axis_command(axis: int, turn: int, number: int, hover: float, rng: np.random.Generator) -> np.ndarray:

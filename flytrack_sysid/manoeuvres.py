@@ -11,16 +11,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from flytrack_env.dynamics import ModelParameters, collective_thrust
-from flytrack_env.state import (
-    APPLIED_ACTION,
-    BATTERY,
-    BATTERY_EMPTY_V,
-    BATTERY_FULL_V,
-    POSITION,
-    QUATERNION,
-    STATE_SIZE,
-    VELOCITY,
-)
+from flytrack_env.state import BATTERY, BATTERY_EMPTY_V, BATTERY_FULL_V
 from flytrack_sysid.envelope import MIDDLE_V, VOLTAGES
 from flytrack_sysid.excitation import (
     AMPLITUDES,
@@ -34,6 +25,7 @@ from flytrack_sysid.excitation import (
     SLOT_STEPS,
     SLOW_STEPS,
     ScriptedFlight,
+    start_at,
     switching,
     wave,
 )
@@ -78,13 +70,8 @@ def _start(
     height: float = HEIGHT,
 ) -> np.ndarray:
     """Return a start (21,): yawed, then tilted about body x, with the thrust action ``hover``."""
-    x = np.zeros(STATE_SIZE)
-    x[POSITION], x[VELOCITY] = [0.0, 0.0, height], tuple(vel_w)
     attitude = Rotation.from_euler("ZX", [yaw_deg, tilt_deg], degrees=True)
-    x[QUATERNION] = attitude.as_quat(scalar_first=True, canonical=True)
-    x[APPLIED_ACTION] = [0.0, 0.0, 0.0, hover]
-    x[BATTERY] = voltage
-    return x
+    return start_at(attitude, hover, voltage, tuple(vel_w), height)
 
 
 def _swing(hover: float, size: float, rng: np.random.Generator) -> np.ndarray:

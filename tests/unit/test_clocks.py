@@ -2,12 +2,10 @@
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 
-from flytrack_sysid import FlightLog, import_log
+from flytrack_sysid import FlightLog
 from flytrack_sysid.importing import clocks
 from tests.support.made_flight import TIME_S, flight, noisy
-from tests.support.real_logs import CRAZYFLIE, shared
 
 
 @pytest.fixture(scope="module")
@@ -51,20 +49,3 @@ def test_clocks_of_a_drone_at_rest_or_too_short_are_not_compared(truth):
     assert "not compared: correlation" in clocks.align_clocks(rest)[1][0].verdict
     short = clocks.align_clocks(truth.select(slice(500)))[1]
     assert [one.verdict for one in short] == ["not compared: less than 10 s without a gap"] * 3
-
-
-def test_crazyflie_attitude_is_late_by_the_same_on_every_axis():
-    """As a clock would have it, and a filter's lag or a wrong unit would not."""
-    files = sorted(shared(CRAZYFLIE).glob("seed0006*.csv.gz"))
-    log = import_log(files, "csv", "crazyflie_phoenix", align=False).log
-    attitude = Rotation.from_quat(log["q"], scalar_first=True)
-    turned = np.cumsum((attitude[:-1].inv() * attitude[1:]).as_rotvec(), axis=0)
-    found = []
-    for axis in np.eye(3):
-        alone = Rotation.from_rotvec(np.concatenate([np.zeros((1, 3)), turned * axis]))
-        channels = {"q": alone.as_quat(scalar_first=True), "w": log["w"] * axis}
-        found += clocks.align_clocks(FlightLog(log.time, channels, log.segment))[1]
-    mean_s = np.mean([one.offset_s for one in found])
-    assert 0.004 < mean_s < 0.008
-    for one in found:
-        assert abs(one.offset_s - mean_s) < 3.0 * one.sigma_s + 5e-4, one.describe()

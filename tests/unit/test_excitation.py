@@ -3,7 +3,7 @@
 import numpy as np
 
 from flytrack_sysid.collect import collect
-from flytrack_sysid.excitation import AMPLITUDES, FLIGHT_STEPS, KINDS, LEG_SPEEDS, script, switching
+from flytrack_sysid.excitation import AMPLITUDES, KINDS, LEG_SPEEDS, script
 from flytrack_sysid.split import held_out_rows
 from tests.support.handout_plant import HOVER, HandoutPlant
 
@@ -30,16 +30,6 @@ def test_every_kind_comes_in_fours_with_all_amplitudes_and_voltages():
     assert np.abs([flight.command for flight in flights]).max() <= 1.0
     speeds = [np.linalg.norm(flight.start[3:6]) for flight in flights if flight.kind == "leg"]
     np.testing.assert_allclose(speeds, LEG_SPEEDS * 2)
-
-
-def test_switching_holds_30_to_120_ms_and_always_changes_sign():
-    for seed in range(20):
-        command = switching(np.random.default_rng(seed), smallest=0.3)
-        changes = np.flatnonzero(np.diff(command))
-        assert len(command) == FLIGHT_STEPS and np.all((np.abs(command) >= 0.3) & (np.abs(command) <= 1.0))
-        assert np.all(command[changes] * command[changes + 1] < 0.0)
-        holds = np.diff(changes)
-        assert holds.min() >= 3 and holds.max() <= 12
 
 
 def test_held_out_part_has_every_kind_a_clear_step_of_each_axis_and_all_voltages():

@@ -70,26 +70,6 @@ def test_truth_is_found_from_fewer_channels(exact, absent, tolerance):
     assert tau_error(found) < tolerance and map_error(found) < tolerance
 
 
-@pytest.mark.slow
-def test_thrust_is_found_from_the_accelerometer_alone(noisy):
-    lags = {name: TRUTH[name] for name in TAUS[:3]}
-    found = fit(noisy.without("w", "v", "p", "q"), fixed=lags)
-    assert found.intervals["tau_thrust"].value == pytest.approx(TRUTH["tau_thrust"], rel=0.05)
-    assert map_error(found) < 0.02
-    np.testing.assert_array_equal(found.model.tau[:3], np.float32(list(lags.values())))
-
-
-@pytest.mark.slow
-def test_without_voltage_its_influence_is_kept_with_a_warning(exact):
-    start = PLANT.model(thrust_coeffs=np.array([0.0, 0.0, 0.0, 0.0, 0.8, 0.9]), tau=np.full(4, 0.04))
-    found = fit(exact.without("v_bat"), start)
-    assert "c4" not in found.intervals and DRAIN not in found.intervals
-    assert any("v_bat is absent" in warning for warning in found.warnings)
-    np.testing.assert_array_equal(found.model.thrust_coeffs[4:], np.float32([0.8, 0.9]))
-    # 23 V instead of 22 to 24 V leaves an error of up to c4 + c5 volts in single flights.
-    assert tau_error(found) < 0.05 and map_error(found) < 0.05
-
-
 def test_intervals_hold_the_truth(fitted):
     inside = [low <= TRUTH[name] <= high for name, (_, low, high) in fitted.intervals.items()]
     assert sum(inside) >= len(inside) - 2

@@ -95,19 +95,6 @@ def test_setpoints_are_held_and_sensors_interpolated(tmp_path):
     np.testing.assert_allclose(log["p"][:, 0], 1e-6 * STEP_US * np.arange(1, 196), atol=1e-6)
 
 
-def test_older_topics_serve(tmp_path):
-    tables = topics()
-    rates, force = tables.pop("vehicle_angular_velocity")[1], tables.pop("vehicle_acceleration")[1]
-    both = [(*rate, *acceleration[1:]) for rate, acceleration in zip(rates, force, strict=True)]
-    tables["sensor_combined"] = ([("float", "gyro_rad", 3), ("float", "accelerometer_m_s2", 3)], both)
-    thrust = [(*row[:4], 0.75) for row in tables["vehicle_rates_setpoint"][1]]
-    tables["vehicle_rates_setpoint"] = ([*SETPOINT, ("float", "thrust", 0)], thrust)
-    new = import_log(write(tmp_path / "a.ulg", topics()), "ulog").log
-    old = import_log(write(tmp_path / "b.ulg", tables), "ulog").log
-    for name in ("u", "w", "f", "q"):
-        np.testing.assert_array_equal(old[name], new[name])
-
-
 def test_what_a_topic_misses_and_the_ground_are_no_rows(tmp_path):
     tables = topics()
     fields, rows = tables["vehicle_attitude"]

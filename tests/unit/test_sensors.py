@@ -44,21 +44,6 @@ def test_noise_is_as_stated(truth):
     np.testing.assert_allclose(np.linalg.norm(log["q"], axis=1), 1.0, rtol=1e-12)
 
 
-def test_without_noise_only_the_steps_of_numbers_are_left(truth):
-    log = sensors.measure(truth, 0.0, GRAVITY, np.random.default_rng(0))
-    assert len(log) == len(truth)
-    steps = {
-        "w": sensors.GYRO_STEP,
-        "v": sensors.VELOCITY_STEP,
-        "p": sensors.POSITION_STEP,
-        "v_bat": sensors.BATTERY_STEP,
-    }
-    for name, step in steps.items():
-        off = np.abs(log[name] - truth[name])
-        assert 0.4 * step < off.max() <= 0.5001 * step, name
-        np.testing.assert_allclose(log[name] / step, np.round(log[name] / step), atol=1e-6)
-
-
 def test_accelerometer_measures_what_is_not_gravity_in_the_attitude_before(truth):
     force = sensors.specific_force_b(truth, GRAVITY)
     before = rotation(truth["q"][:-1])
