@@ -170,16 +170,16 @@ def answers(log: FlightLog, held_out: np.ndarray) -> tuple[Mapping[str, np.ndarr
 
 
 def velocity_scale(log: FlightLog) -> tuple[float, float]:
-    """Return how far a flight went over what its velocity says, horizontally and upwards, over a second.
+    """Return distances flown in a second over those of the integrated velocity, horizontal and vertical.
 
     The geometric mean of both regressions, as either channel is noisy.
     """
     rows = round(1.0 / float(np.median(np.diff(log.time))))
     one_flight = log.segment[rows:] == log.segment[:-rows]
-    said = np.cumsum(log["v"], axis=0) / rows
-    moved, said = ((values[rows:] - values[:-rows])[one_flight] for values in (log["p"], said))
-    horizontal = np.sum(moved[:, :2] ** 2) / np.sum(said[:, :2] ** 2)
-    upward = np.sum(moved[:, 2] ** 2) / np.sum(said[:, 2] ** 2)
+    integral = np.cumsum(log["v"], axis=0) / rows
+    moved, integral = ((values[rows:] - values[:-rows])[one_flight] for values in (log["p"], integral))
+    horizontal = np.sum(moved[:, :2] ** 2) / np.sum(integral[:, :2] ** 2)
+    upward = np.sum(moved[:, 2] ** 2) / np.sum(integral[:, 2] ** 2)
     return float(np.sqrt(horizontal)), float(np.sqrt(upward))
 
 

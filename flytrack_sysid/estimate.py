@@ -80,7 +80,7 @@ def _counts(problem: Problem) -> np.ndarray:
 class _Search:
     """One round: the least squares problem with given weights, in the free parameters' own scale.
 
-    Time constants are sought by their logarithm, so that none becomes negative.
+    Time constants are searched for by their logarithm, so that none becomes negative.
     """
 
     def __init__(
@@ -97,19 +97,19 @@ class _Search:
         scale = [PRIOR_WEIGHTS.get(name, np.inf) for name in free]
         self.prior_weight = 1.0 / (np.array(scale) * float(start.m) * float(start.g))
 
-    def values(self, sought: np.ndarray) -> np.ndarray:
+    def values(self, params: np.ndarray) -> np.ndarray:
         """Return the free parameters in their own units."""
-        return np.where(self.is_log, np.exp(np.where(self.is_log, sought, 0.0)), sought)
+        return np.where(self.is_log, np.exp(np.where(self.is_log, params, 0.0)), params)
 
-    def residual(self, sought: np.ndarray) -> np.ndarray:
+    def residual(self, params: np.ndarray) -> np.ndarray:
         """Return the weighted residuals of rows that count, and the pull of the prior."""
-        values = self.values(sought)
+        values = self.values(params)
         weighted = np.asarray(_weighted(values, *self.given))[self.counting]
         return np.concatenate([weighted, self.prior_weight * (values - self.centre)])
 
-    def slopes(self, sought: np.ndarray) -> np.ndarray:
+    def slopes(self, params: np.ndarray) -> np.ndarray:
         """Return the derivative of ``residual``."""
-        values = self.values(sought)
+        values = self.values(params)
         slopes = np.asarray(_slopes(values, *self.given))[self.counting]
         chain = np.where(self.is_log, values, 1.0)
         return np.concatenate([slopes, np.diag(self.prior_weight)]) * chain
@@ -120,7 +120,7 @@ class _Search:
         return tuple(name for name, acts in zip(self.free, slopes.any(axis=0), strict=True) if acts)
 
     def run(self, tolerance: float) -> tuple[np.ndarray, np.ndarray]:
-        """Return the numbers found, and their covariance in the scale in which they were sought."""
+        """Return the numbers found, and their covariance in the scale of the search."""
         bounds = np.array([bounds_of(name) for name in self.free])
         bounds[self.is_log] = np.log(bounds[self.is_log])
         start = np.where(self.is_log, np.log(np.abs(self.centre) + LEAST_NOISE), self.centre)
@@ -141,30 +141,30 @@ class _Search:
         if not result.success or not np.isfinite(result.cost):
             raise FitError(f"the fit did not converge: {result.message}")
         if tolerance == TOLERANCES[-1]:
-            result.x = self.finished(result.x, bounds.T)
+            result.x = self.polished(result.x, bounds.T)
         return result.x, self.covariance(result.jac, result.fun)
 
-    def finished(self, sought: np.ndarray, bounds: np.ndarray) -> np.ndarray:
+    def polished(self, params: np.ndarray, bounds: np.ndarray) -> np.ndarray:
         """Return where the slope of the cost, and not only its change, is rounding: full Gauss-Newton steps.
 
         The cost is flat at its least, so that a search which compares costs ends a 1e-8 away from it,
         in a direction that the order of summation decides: another number of threads, another model.
         """
-        left = self.residual(sought)
+        left = self.residual(params)
         for _ in range(LAST_STEPS):
-            slopes = self.slopes(sought)
+            slopes = self.slopes(params)
             size = np.linalg.norm(slopes, axis=0)
             size = np.where(size > 0.0, size, 1.0)
             step = np.linalg.lstsq(slopes / size, -left, rcond=LEAST_INFORMATION)[0] / size
-            moved = np.clip(sought + step, *bounds)
+            moved = np.clip(params + step, *bounds)
             then = self.residual(moved)
             if not then @ then <= (left @ left) * (1.0 + LAST_RISE):
                 break
-            sought, left = moved, then
-        return sought
+            params, left = moved, then
+        return params
 
     def covariance(self, slopes: np.ndarray, left: np.ndarray) -> np.ndarray:
-        """Return the covariance of the sought numbers, widened where residuals of a flight go together.
+        """Return the covariance of the parameters, widened where residuals within a flight are correlated.
 
         That of independent residuals of the noise assumed, in which each standard deviation is raised to
         that of the cluster-robust (sandwich) estimate over pieces of a flight, if that is larger: what
@@ -248,13 +248,13 @@ def estimate(
             widths = {name: channel.counts.shape[1] for name, channel in problem.channels.items()}
             noise = noise or {name: np.full(width, FIRST_NOISE[name]) for name, width in widths.items()}
             search = _acting_search(model, free, problem, noise, may_be_idle=number == 0)
-            sought, covariance = search.run(tolerance)
-            model = with_values(model, dict(zip(search.free, search.values(sought), strict=True)))
+            params, covariance = search.run(tolerance)
+            model = with_values(model, dict(zip(search.free, search.values(params), strict=True)))
             noise = {
                 name: np.maximum(left, LEAST_NOISE) for name, left in channel_noise(model, problem).items()
             }
             report(number + 1, len(TOLERANCES))
-    chain = np.where(search.is_log, np.exp(np.where(search.is_log, sought, 0.0)), 1.0)
+    chain = np.where(search.is_log, np.exp(np.where(search.is_log, params, 0.0)), 1.0)
     still = {
         name: np.sqrt(
             np.sum(channel.measured[:, : channel.counts.shape[1]] ** 2 * channel.counts, axis=0)

@@ -60,14 +60,14 @@ def diagnose(
     held_out: np.ndarray | None = None,
     report: Report = lambda done, stages: None,
 ) -> Diagnosis:
-    """Return what a log says of a model: causes, what is unexplained, what it could not show, errors.
+    """Return what is wrong with a model, from a log: causes, what is unexplained or not identifiable, errors.
 
     log: one or several, taken together. model: the simulator's nominal one if None; causes are differences
     from it. held_out: (num_rows,) bool, rows to judge by and not to learn from; the last of every four blocks
     of at most 5 s if None. report: called with stages done and to do.
 
     Raises:
-        DiagnosisError: a log that says nothing of how the drone turns; ``held_out`` of another shape.
+        DiagnosisError: a log with neither gyro nor attitude; ``held_out`` of another shape.
     """
     started = time.monotonic()
     with jax.enable_x64(True):

@@ -20,7 +20,7 @@ def write_diagnosis(folder: str | Path, diagnosis: Diagnosis, log: FlightLog) ->
     log: what was diagnosed (``diagnose.joined`` of several).
 
     Raises:
-        OSError: what the system says.
+        OSError: a file cannot be written.
     """
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)

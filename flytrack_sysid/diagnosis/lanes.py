@@ -1,8 +1,8 @@
-"""A log cut into lanes of equal length, which a replay flies side by side.
+"""A log cut into lanes of equal length, which are replayed in parallel.
 
-What a step needs of the steps before it (applied action, rates, memories) follows from the commands and is
-forgotten within a second. So what is judged of the log is cut into stretches of five seconds, each led in by
-the second before it, and all stretches are replayed at once: many times fewer steps in a row.
+What a step needs of earlier steps (applied action, rates, memories) follows from the commands and is
+forgotten within a second. So the judged part of the log is cut into lanes of five seconds, each with a
+lead-in of the second before it, and all lanes are replayed at once: many times fewer steps in sequence.
 """
 
 from typing import NamedTuple
@@ -16,10 +16,10 @@ from flytrack_sysid.record import Record, is_applied_certain, make_record, measu
 LEAD_IN_S, LANE_S = 1, 5
 PIECES = LEAD_IN_S + LANE_S  # of a second each, the lead-in first
 FEWEST_ROWS_PER_S = 20
-MOST_ROWS = 30_000  # that are replayed, lead-ins apart: all slopes of them are held at once, some 50 kB a row
+MOST_ROWS = 30_000  # replayed without lead-ins: all of their slopes are in memory at once, some 50 kB a row
 LANES_PADDED_TO = 2  # logs of about the same length share one compiled program
-# Axes of a residual: rotation x, y, z, force x, y, z (all world), battery. Channels of an axis: one that is
-# measured directly, and a level, of which that is the rate of change.
+# Axes of a residual: rotation x, y, z, force x, y, z (all world), battery. Channels of an axis: a direct one,
+# and a level, whose rate of change the direct one measures.
 DIRECT, LEVEL = ("w", "f", None), ("q", "v", "v_bat")
 SIZES = (3, 3, 1)
 AXES = (slice(0, 3), slice(3, 6), slice(6, 7))  # of each side: rotation, force, battery
@@ -31,10 +31,10 @@ class Lanes(NamedTuple):
     """A log in lanes; (rows, lanes, ...), where row k is followed by row k + 1 after ``step_s``.
 
     record: as in ``flytrack_sysid.record``. measured: by channel: w rad/s, f m/s^2 (body); others are in the
-    record. counts: (rows, lanes, NUM_AXES, 2) bool, what is to be explained; the lead-in never is.
+    record. counts: (rows, lanes, NUM_AXES, 2) bool, what is judged; never the lead-in.
     is_joined: (rows, lanes) bool, the row follows the one before it in flight. is_known: (rows, lanes,
-    NUM_AXES) bool, and what led to it is known: no command was lost that still acts. row: (rows, lanes)
-    int, of the record, -1 where there is none. quanta: (2, NUM_AXES), the last digit of what is measured.
+    NUM_AXES) bool, and no lost command still acts there. row: (rows, lanes)
+    int, of the record, -1 where there is none. quanta: (2, NUM_AXES), the last digit of each channel.
     """
 
     record: Record

@@ -1,8 +1,8 @@
-"""What is noise in a residual: white sensors, and a disturbance that wanders.
+"""The noise of residuals: white sensor noise and a wandering disturbance; the filter that whitens them.
 
 Each axis (three of rotation, three of force, one of the battery) has two channels: a direct one, ``w`` or
-``f``, and a level, ``q``, ``v`` or ``v_bat``, of which the direct one is the rate of change. Their residual
-is taken as
+``f``, and a level, ``q``, ``v`` or ``v_bat``, whose rate of change the direct one measures. The model of
+their residuals is
 
     d after = exp(-dt / tau) d + white        disturbance: gusts, vibration, what the model lacks
     e after = e + coupling d dt + white       what the disturbance, and the fed-in attitude, sum up to
@@ -10,8 +10,8 @@ is taken as
     level   = e + white                       sensor noise; e begins unknown
 
 and a Kalman filter turns it into innovations, white and of variance 1. Its gains depend on the noise alone,
-so that it is one linear map for residuals and their slopes. It has no windows: where nothing wanders a level
-counts from the first row to the last, where much does only its increments.
+so that it is one linear map for residuals and their slopes. It needs no windows: where nothing wanders, a
+level counts from the first row to the last; where much wanders, only its increments do.
 """
 
 from typing import Any, NamedTuple
@@ -22,17 +22,17 @@ import numpy as np
 
 from flytrack_sysid.diagnosis.lanes import NUM_AXES, Lanes
 
-# Variance of a level that begins, over that of its noise; its first innovation is nothing.
+# Variance of a level at its first row, over that of its noise: its first innovation is about 0.
 UNKNOWN_START = 1e8
-# No sensor and no step of float32 is better: direct rad/s, m/s^2; level rad, m/s, V.
+# Least noise, by sensors and float32: direct rad/s, m/s^2; level rad, m/s, V.
 FLOORS = np.array([[1e-4] * 3 + [1e-3] * 3 + [1.0], [1e-5] * 3 + [1e-4] * 3 + [1e-4]])
 UNIFORM = 12.0**-0.5  # standard deviation of rounding, over the last digit
-LEAST_SHARE = 1e-3  # of a disturbance and of a wander, against the noise: below, there is none
+LEAST_SHARE = 1e-3  # of a disturbance and of a wander, over the noise: smaller ones are neglected
 TAU_RANGE_S = (0.02, 5.0)
-# The search: damping of its steps, as they fail and as they help; and where it ends.
+# Levenberg damping: at first, its growth after a bad step, its decrease after a good one.
 FIRST_DAMPING, MORE, LESS = 1e-2, 10.0, 0.2
 MOST_ROUNDS = 12
-ENOUGH = 1.0  # of minus twice the log likelihood: what one parameter is off by
+ENOUGH = 1.0  # of minus twice the log likelihood: the error of one parameter
 OUTLIER = 4.0  # innovations beyond count by their size, not its square
 
 
@@ -126,12 +126,17 @@ def step_to(lanes: Lanes) -> np.ndarray:
     return np.concatenate([step_s[:1], step_s[:-1]])
 
 
-def noise_of(sought: jax.Array | np.ndarray) -> Noise:
-    """Return the noise of logarithms and a logit, (6, NUM_AXES)."""
-    direct, level = jnp.exp(sought[0]), jnp.exp(sought[1])
-    disturbance = direct * jnp.exp(sought[3])
+def noise_of(log_noise: jax.Array | np.ndarray) -> Noise:
+    """Return the noise from its logarithms and a logit, (6, NUM_AXES)."""
+    direct, level = jnp.exp(log_noise[0]), jnp.exp(log_noise[1])
+    disturbance = direct * jnp.exp(log_noise[3])
     return Noise(
-        direct, level, level * jnp.exp(sought[2]), disturbance, jnp.exp(sought[4]), jax.nn.sigmoid(sought[5])
+        direct,
+        level,
+        level * jnp.exp(log_noise[2]),
+        disturbance,
+        jnp.exp(log_noise[4]),
+        jax.nn.sigmoid(log_noise[5]),
     )
 
 
@@ -148,9 +153,9 @@ class _Misfit(NamedTuple):
 
 
 def _misfit(
-    sought: jax.Array, step_s: jax.Array, joined: jax.Array, counts: jax.Array, left: jax.Array
+    log_noise: jax.Array, step_s: jax.Array, joined: jax.Array, counts: jax.Array, left: jax.Array
 ) -> _Misfit:
-    gains = make_gains(noise_of(sought), step_s, joined, counts)
+    gains = make_gains(noise_of(log_noise), step_s, joined, counts)
     found = innovations(gains, left, counts)
     size = jnp.abs(found)
     squares = jnp.where(size < OUTLIER, size**2, OUTLIER * (2.0 * size - OUTLIER))
@@ -160,13 +165,15 @@ def _misfit(
 
 
 @jax.jit
-def _misfit_and_slopes(sought: jax.Array, *given: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+def _misfit_and_slopes(log_noise: jax.Array, *given: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Return each axis's misfit (NUM_AXES,), slopes (6, NUM_AXES) and expected curvature (NUM_AXES, 6, 6).
 
     Axes do not depend on each other, so that one difference serves all.
     """
-    shifts = DIFFERENCE * jnp.eye(len(sought))[:, :, None]
-    found = jax.vmap(lambda values: _misfit(values, *given))(jnp.concatenate([sought[None], sought + shifts]))
+    shifts = DIFFERENCE * jnp.eye(len(log_noise))[:, :, None]
+    found = jax.vmap(lambda values: _misfit(values, *given))(
+        jnp.concatenate([log_noise[None], log_noise + shifts])
+    )
 
     def slopes(values: jax.Array) -> jax.Array:
         return (values[1:] - values[0]) / DIFFERENCE
@@ -179,12 +186,12 @@ def _misfit_and_slopes(sought: jax.Array, *given: jax.Array) -> tuple[jax.Array,
 
 
 def floors_of(lanes: Lanes) -> np.ndarray:
-    """Return the least noise of each channel, (2, NUM_AXES): that of its last digit, or of float32."""
+    """Return the least noise of each channel, (2, NUM_AXES): of its last digit, or of float32."""
     return np.maximum(FLOORS, lanes.quanta * UNIFORM)
 
 
 def first_guess(lanes: Lanes, left: np.ndarray) -> np.ndarray:
-    """Return logarithms to start the search from, (6, NUM_AXES), robust against slow residuals."""
+    """Return log noise to start the search from, (6, NUM_AXES), robust against slow residuals."""
     counts, floors = lanes.counts, floors_of(lanes)
     both = counts[1:] & counts[:-1]
     found = np.zeros((6, NUM_AXES))
@@ -198,23 +205,23 @@ def first_guess(lanes: Lanes, left: np.ndarray) -> np.ndarray:
     return found
 
 
-def disturbance_gain(lanes: Lanes, left: np.ndarray, sought: np.ndarray) -> np.ndarray:
-    """Return by axis how much likelier, in minus twice the log, residuals are with the disturbance."""
+def disturbance_gain(lanes: Lanes, left: np.ndarray, log_noise: np.ndarray) -> np.ndarray:
+    """Return by axis by how much the disturbance lowers minus twice the log likelihood of residuals."""
     given = tuple(jnp.asarray(part) for part in (step_to(lanes), lanes.is_known, lanes.counts, left))
-    still = sought.copy()
+    still = log_noise.copy()
     still[3] = np.log(LEAST_SHARE)
-    return np.asarray(_total(still, *given)) - np.asarray(_total(sought, *given))
+    return np.asarray(_total(still, *given)) - np.asarray(_total(log_noise, *given))
 
 
 @jax.jit
-def _total(sought: jax.Array, *given: jax.Array) -> jax.Array:
-    return _misfit(sought, *given).total
+def _total(log_noise: jax.Array, *given: jax.Array) -> jax.Array:
+    return _misfit(log_noise, *given).total
 
 
 def fit_noise(lanes: Lanes, left: np.ndarray, start: np.ndarray | None = None) -> np.ndarray:
     """Return the noise that makes residuals (rows, lanes, NUM_AXES, 2) most likely, as (6, NUM_AXES).
 
-    Damped scoring (Levenberg, with the expected curvature), every axis by itself.
+    Fisher scoring with Levenberg damping, every axis by itself.
     """
     given = tuple(jnp.asarray(part) for part in (step_to(lanes), lanes.is_known, lanes.counts, left))
     low, high = _bounds(lanes)
@@ -245,7 +252,7 @@ def fit_noise(lanes: Lanes, left: np.ndarray, start: np.ndarray | None = None) -
 
 
 def _bounds(lanes: Lanes) -> tuple[np.ndarray, np.ndarray]:
-    """Return the ends of what is searched, (6, NUM_AXES) each, as logarithms and a logit."""
+    """Return the bounds of the search, (6, NUM_AXES) each, as logarithms and a logit."""
     ones = np.ones(NUM_AXES)
     low = [np.log(LEAST_SHARE), np.log(LEAST_SHARE), np.log(TAU_RANGE_S[0]), -5.0]
     high = [np.log(1e3)] * 4 + [np.log(TAU_RANGE_S[1]), 5.0]

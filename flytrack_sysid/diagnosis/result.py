@@ -1,4 +1,4 @@
-"""What a diagnosis says, and the same as the JSON that it is stored as."""
+"""The result of a diagnosis, and its JSON."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -92,11 +92,11 @@ class Errors:
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """What a log says of a model.
+    """What is wrong with a model, according to a log.
 
     verdict: consistent, causes_found, unexplained, or "causes_found+unexplained". error: by model: nominal,
     refitted_base, extended, noise_floor. nominal, base, extended: the models. source, sha256: of the log.
-    noise: by channel and axis, standard deviations of the sensors as found. voltages: the lowest and the
+    noise: by channel and axis, fitted standard deviations of the sensors. voltages: the lowest and the
     highest of the battery that were learnt from, V; None where it was not measured.
     """
 

@@ -22,19 +22,6 @@ def crazyflie():
     return diagnose(found.log, found.nominal_model())
 
 
-def test_the_nominal_crazyflie_is_a_sane_start():
-    files = [shared(CRAZYFLIE) / f"{name}.csv.gz" for name in PARTS]
-    found = import_log(files, "csv", "crazyflie_phoenix")
-    model, voltage = found.nominal_model(), found.log["v_bat"].mean()
-    assert np.deg2rad(np.asarray(model.max_rate)) == pytest.approx(np.pi / 3)
-    assert 0.027 <= float(model.m) <= 0.033
-    stick = np.linspace(-1.0, 1.0, 201)
-    c0, c1, c2, c3, c4, c5 = np.asarray(model.thrust_coeffs, float)
-    thrust = c0 + c1 * stick + c2 * stick**2 + c3 * stick**3 + voltage * (c4 + c5 * stick)
-    weight = float(model.m) * float(model.g)
-    assert thrust[0] < 0.2 * weight and 1.5 * weight < thrust[-1] < 6.0 * weight
-
-
 @pytest.mark.slow
 def test_what_the_nominal_crazyflie_certainly_lacks_is_named(crazyflie):
     assert crazyflie.verdict.startswith("causes_found")

@@ -143,14 +143,3 @@ def test_sensors_that_the_log_lacks_tell_nothing_ahead_either(hover):
     question = Question(blind.linearization, blind.model, "voltage_sag")
     ahead = information_of_manoeuvres(blind.problem, blind.model, blind.linearization, question.columns)
     assert max(question.shares(one)[0] for one in ahead.values()) < 0.01
-
-
-def test_nothing_wanted_nothing_advised(hover):
-    assert advise(hover.problem, hover.model, hover.linearization, {}) == {}
-
-
-def test_there_is_advice_even_where_nothing_would_do(hover, told):
-    """No flight of a drone without drag tells the scale of an accelerometer sideways."""
-    advice = advise(hover.problem, hover.model, hover.linearization, {"accelerometer_scale": ()})
-    question = Question(hover.linearization, hover.model, "accelerometer_scale")
-    assert question.shares(told(advice["accelerometer_scale"]))[0] < 0.01
