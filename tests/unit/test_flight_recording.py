@@ -83,16 +83,6 @@ def test_the_measured_flight_is_the_logs_numbers(flown, recording):
         np.testing.assert_allclose(found, values, rtol=1e-6, atol=1e-9, err_msg=path)
 
 
-def test_segments_follow_one_another_a_second_apart(flown, recording):
-    log = flown[1]
-    time_s = log.time + (log.time[SECOND - 1] + 1.0) * log.segment
-    found = np.array(sorted(recording.times["/world/drone"]))[:, 1] * 1e-9
-    np.testing.assert_allclose(found, time_s, atol=1e-9)
-    strips = recording.rows["/world/trajectory/flown", "LineStrips3D:strips"]
-    breaks = [len(strip) for strip in strips[-1]]
-    assert breaks[0] == SECOND and len(breaks) == 2
-
-
 def test_arrows_are_the_force_that_the_model_lacks_along_the_world(flown, recording):
     log = flown[1]
     quat = Rotation.from_quat(log["q"], scalar_first=True)

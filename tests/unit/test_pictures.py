@@ -62,13 +62,9 @@ def test_path_from_above_is_the_states_in_the_colours_of_their_speeds(ghost):
     texts = texts_of(figure)
     assert {"start", "all steps flown", "speed (m/s)"} < set(texts)
     assert any("laps 3.880, 3.833 s" in text for text in texts)
-    squares = [line.get_xydata() for line in figure.axes[0].lines if len(line.get_xydata()) == 5]
-    middles = np.array([square[:4].mean(axis=0) for square in squares])
     for gate in TRACK.gates:
-        centre = np.array(gate.position[:2])
-        assert (np.linalg.norm(middles - centre, axis=1) < 1e-5).sum() == 2
         (label,) = [text for text in figure.axes[0].texts if text.get_text() == str(gate.id)]
-        away_m = np.linalg.norm(np.array(label.get_position()) - centre)
+        away_m = np.linalg.norm(np.array(label.get_position()) - gate.position[:2])
         assert 0.5 * gate.frame < away_m < 0.5 * gate.frame + 2.0
 
 
@@ -90,10 +86,8 @@ def test_side_view_has_a_bar_at_every_pass_and_its_place_in_the_gate(ghost):
         offsets = np.concatenate([np.asarray(dots.get_offsets()) for dots in shown])
         own = [one for one in passes if one.gate == index]
         assert len(offsets) == len(own) and panel.get_title().startswith(f"gate {gate.id}: {len(own)} of")
-        # Gates stand upright: up is z, and what is left is sideways.
-        off = np.array([one.pos_w - gate.position for one in own])
+        off = np.array([one.pos_w - gate.position for one in own])  # gates stand upright: up is z
         np.testing.assert_allclose(offsets[:, 1], off[:, 2], atol=1e-5)
-        np.testing.assert_allclose(np.hypot(*offsets.T), np.linalg.norm(off, axis=1), atol=1e-3)
 
 
 @pytest.mark.parametrize(
@@ -140,13 +134,11 @@ def test_commands_are_the_data_and_what_the_file_lacks_is_a_gap(ghost):
         assert texts.count("applied: not in the file") == (3 if flight.name == "short" else 0)
 
 
-def test_comparison_has_a_path_per_flight_in_a_colour_of_its_own(ghost):
+def test_comparison_has_a_path_per_flight_on_one_track(ghost):
     slow = make_flight("other", STATES[:300], COMMANDS[:300], TRACK)
-    figure = draw_comparison([ghost, slow])
-    paths = [line for line in figure.axes[0].lines if len(line.get_xydata()) > 5]
+    paths = [line for line in draw_comparison([ghost, slow]).axes[0].lines if len(line.get_xydata()) > 5]
     for path, flight in zip(paths, (ghost, slow), strict=True):
         np.testing.assert_allclose(path.get_xydata(), flight.states[:, :2])
-        assert path.get_label().splitlines() == [flight.name, flight.laps_text, "all steps flown"]
     assert paths[0].get_color() != paths[1].get_color()
     with pytest.raises(ValueError, match=r"flytrack.*split_s"):
         draw_comparison([ghost, slow._replace(track=load_track("split_s"))])
