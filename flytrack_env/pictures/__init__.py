@@ -22,7 +22,6 @@ if TYPE_CHECKING:
 __all__ = [
     "Flight",
     "Meeting",
-    "draw_comparison",
     "draw_flight",
     "make_flight",
     "read_flights",
@@ -40,31 +39,14 @@ def _load(name: str, extra: str, library: str) -> ModuleType:
     return importlib.import_module(f"flytrack_env.{name}")
 
 
-def _figures() -> ModuleType:
-    return _load("pictures.figures", "viz", "matplotlib")
-
-
 def draw_flight(flight: Flight) -> dict[str, "Figure"]:
     """Return a flight's figures by name: top, side, commands.
 
     Raises:
         ImportError: matplotlib is not installed.
     """
-    figures = _figures()
+    figures = _load("pictures.figures", "viz", "matplotlib")
     return {name: getattr(figures, f"draw_{name}")(flight) for name in VIEWS}
-
-
-def draw_comparison(flights: Sequence[Flight]) -> "Figure":
-    """Return flights on one track from above, each in a colour of its own.
-
-    Raises:
-        ImportError: matplotlib is not installed.
-        ValueError: no flights, or flights on several tracks.
-    """
-    tracks = sorted({flight.track.name for flight in flights})
-    if len(tracks) != 1:
-        raise ValueError(f"flights: found tracks {tracks}, expected flights on one")
-    return _figures().draw_comparison(flights)
 
 
 def write_pictures(flights: Sequence[Flight], folder: str | Path) -> list[Path]:
@@ -81,7 +63,7 @@ def write_pictures(flights: Sequence[Flight], folder: str | Path) -> list[Path]:
         f"{flight.name}_{name}": figure for flight in flights for name, figure in draw_flight(flight).items()
     }
     if len(flights) > 1:
-        figures["comparison_top"] = draw_comparison(flights)
+        figures["comparison_top"] = _load("pictures.figures", "viz", "matplotlib").draw_comparison(flights)
     png_of = _load("pictures.drawing", "viz", "matplotlib").png_of
     contents = {Path(folder) / f"{name}.png": png_of(figure) for name, figure in figures.items()}
     for path, content in contents.items():

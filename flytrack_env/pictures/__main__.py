@@ -17,7 +17,9 @@ from flytrack_env.tracks import load_track
 class Settings:
     """Draw rollouts as PNGs, and a lap of each as MP4 or GIF."""
 
-    rollouts: Annotated[tuple[Path, ...], tyro.conf.Positional]
+    rollouts: tyro.conf.Positional[
+        Annotated[tuple[Path, ...], tyro.conf.arg(metavar="ROLLOUT ...", help_behavior_hint="(at least one)")]
+    ]
     """Rollout files (.npy)."""
     out: Path
     """Folder to write to."""

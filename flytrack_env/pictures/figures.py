@@ -72,7 +72,14 @@ def draw_top(flight: Flight) -> Figure:
 
 
 def draw_comparison(flights: Sequence[Flight]) -> Figure:
-    """Return the course from above with a path per flight, all on one track, in a colour of its own."""
+    """Return the course from above with a path per flight, each in a colour of its own.
+
+    Raises:
+        ValueError: flights on several tracks.
+    """
+    tracks = sorted({flight.track.name for flight in flights})
+    if len(tracks) != 1:
+        raise ValueError(f"flights: found tracks {tracks}, expected flights on one")
     texts = [escape(f"{flight.name}\n{flight.laps_text}\n{flight.ended}") for flight in flights]
     longest = max(len(line) for text in texts for line in text.splitlines())
     figure, axes = _course(flights, BESIDE_IN + LETTER_IN * longest)

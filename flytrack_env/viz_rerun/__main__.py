@@ -23,7 +23,9 @@ NO_HINT = "(optional)"  # tyro would print "(default: None)"
 class Settings:
     """Write rollouts as one Rerun recording (without any, a time-optimal flight), or show a recording."""
 
-    rollouts: Annotated[tuple[Path, ...], tyro.conf.Positional] = ()
+    rollouts: tyro.conf.Positional[
+        Annotated[tuple[Path, ...], tyro.conf.arg(metavar="[ROLLOUT ...]", help_behavior_hint=NO_HINT)]
+    ] = ()
     """Rollout files (.npy)."""
     out: Path = Path("rollout.rrd")
     """Recording to write."""
@@ -31,7 +33,9 @@ class Settings:
     """Name of a shipped track, or a track file (.toml)."""
     allow_pickle: bool = False
     """Read pickled rollouts. Unpickling runs whatever code a file holds: allow it for files you trust."""
-    ghost: Annotated[Literal["time_optimal"] | None, tyro.conf.arg(help_behavior_hint=NO_HINT)] = None
+    ghost: Annotated[
+        Literal["time_optimal"] | None, tyro.conf.arg(metavar="time_optimal", help_behavior_hint=NO_HINT)
+    ] = None
     """Fly the time-optimal flight beside them."""
     ghost_model: Literal["nominal", "black_box"] = "nominal"
     """Drone for which the ghost is optimal."""

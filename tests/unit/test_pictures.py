@@ -13,14 +13,13 @@ from matplotlib.figure import Figure
 from flytrack_env.flown_race import Pass
 from flytrack_env.pictures import (
     Flight,
-    draw_comparison,
     draw_flight,
     make_flight,
     write_animation,
     write_video,
 )
 from flytrack_env.pictures.__main__ import main
-from flytrack_env.pictures.figures import draw_commands, draw_side, draw_top
+from flytrack_env.pictures.figures import draw_commands, draw_comparison, draw_side, draw_top
 from flytrack_env.references import ghost_rollout, shipped_references
 from flytrack_env.rollout import save_rollout
 from flytrack_env.tracks import load_track
