@@ -268,14 +268,6 @@ def test_options_set_the_start_of_one_episode(is_vector: bool) -> None:
     assert (abs(following[:, 22] + 0.5) > 1e-3).all()
 
 
-def test_battery_alone_leaves_the_drawn_start_as_it_is() -> None:
-    for env, size in ((gymnasium.make(BASE), ()), (make_vector(), (3,))):
-        drawn = env.reset(seed=4)[0]
-        lowered = env.reset(seed=4, options={"battery_v": 22.25})[0]
-        np.testing.assert_allclose(lowered[..., 22], np.full(size, -0.75), atol=1e-5)
-        np.testing.assert_allclose(np.delete(lowered, 22, -1), np.delete(drawn, 22, -1), atol=1e-5)
-
-
 def test_gate_and_quaternion_options() -> None:
     env = gymnasium.make(BASE)
     gate = load_track("flytrack").gates[3]
@@ -364,14 +356,6 @@ def test_arguments_reach_the_environment(params: EnvParams, row_track: Any) -> N
         gymnasium.make(BASE, params=params.replace(model=params.model._replace(m=np.ones(3))))
 
 
-def test_track_files_are_read_again(row_track: Any, tmp_path: Path) -> None:
-    path = tmp_path / "track.toml"
-    for far in (10.0, 30.0):
-        save_track(path, row_track([0.0, far]))
-        observation, _ = gymnasium.make(BASE, track=str(path)).reset(options={"gate_index": 1})
-        np.testing.assert_allclose(observation[0], -(far + 5.0) / 3.0, atol=1e-4)
-
-
 def test_wrong_use_is_refused() -> None:
     env, vector = gymnasium.make(BASE).unwrapped, make_vector()
     for each in (env, vector):
@@ -406,12 +390,3 @@ def test_actions_beyond_float32_are_clipped_without_a_warning() -> None:
         found = env.step(np.full(env.action_space.shape, -1e300))[0]
         env.reset(seed=0)
         np.testing.assert_array_equal(found, env.step(np.full(env.action_space.shape, -1.0))[0])
-
-
-def test_a_vector_environment_counts_steps_for_ever() -> None:
-    env = make_vector()
-    env.reset(seed=0)
-    env._count = 2**32 - 1
-    for _ in range(2):
-        env.step(np.zeros(env.action_space.shape))
-    assert env._count == 1

@@ -263,11 +263,6 @@ def test_wrong_arguments_say_what_was_expected(
         FlyTrack(**arguments)
 
 
-def test_model_of_an_environment_comes_from_its_argument(params: EnvParams) -> None:
-    model = params.model._replace(m=1.7)
-    assert FlyTrack(model=model).default_params.model.m == 1.7
-
-
 # --- Observation --------------------------------------------------------------------------------
 
 

@@ -23,7 +23,6 @@ from flytrack_env.tracks import (
     hermite_curve,
     load_track,
     sample_way,
-    way_length,
 )
 
 NUM_GATES, RADIUS, HEIGHT = 6, 10.0, 2.0
@@ -122,16 +121,6 @@ BREAKS: dict[str, tuple[Callable[[Track], Track], str, str]] = {
         "bounds",
         "gate 10: frame 0.85 m out of bounds (high x), expected inside",
     ),
-    "frame above": (
-        lambda track: replace(track, bounds_high=(15.0, 15.0, 3.0)),
-        "bounds",
-        "gate 10: frame 0.35 m out of bounds (ceiling), expected inside",
-    ),
-    "path near the floor": (
-        lambda track: replace(track, bounds_low=(-15.0, -15.0, 1.5)),
-        "bounds",
-        "the way from gate 12 to 13: 0.50 m inside the bounds (floor), expected at least 0.65 m",
-    ),
     "below ground": (
         lambda track: change_gate(track, 4, position=(*track.gates[4].position[:2], 1.25)),
         "ground",
@@ -141,16 +130,6 @@ BREAKS: dict[str, tuple[Callable[[Track], Track], str, str]] = {
         lambda track: replace(track, start_position=(RADIUS, 5.0, HEIGHT)),
         "start",
         "start: 180 deg off the direction of flight of gate 10, expected in front of it, at most 60 deg",
-    ),
-    "start too near": (
-        lambda track: replace(track, start_position=(RADIUS, -2.0, HEIGHT)),
-        "start",
-        "start: 2.00 m from gate 10, expected 3 to 40 m",
-    ),
-    "start too far": (
-        lambda track: replace(track, start_position=(RADIUS, -50.0, HEIGHT), bounds_low=(-15.0, -60.0, 0.0)),
-        "start",
-        "start: 50.00 m from gate 10, expected 3 to 40 m",
     ),
     "start behind another gate": (
         lambda track: change_gate(
@@ -164,11 +143,6 @@ BREAKS: dict[str, tuple[Callable[[Track], Track], str, str]] = {
         "start",
         "start: 0.25 m too near the bounds or beyond them (low y)",
     ),
-    "start below ground": (
-        lambda track: replace(track, start_position=(RADIUS, -5.0, -0.5)),
-        "start",
-        "start: 0.50 m too near the bounds or beyond them (floor)",
-    ),
 }
 
 
@@ -181,14 +155,6 @@ def test_every_break_is_found_and_named(case: str) -> None:
 
 def test_every_demand_has_a_break() -> None:
     assert {demand for _, demand, _ in BREAKS.values()} == set(DEMANDS)
-
-
-def test_way_through_the_next_gates_frame_from_behind_is_found() -> None:
-    # A hairpin, flown round the wrong side: the way first meets the plane where the frame is.
-    track = change_gate(ring(), 1, position=(RADIUS, 6.0, HEIGHT), direction=-1.0)
-    track = change_gate(track, 1, quaternion=yaw_of(90.0))
-    texts = [p.text for p in find_problems(track, Limits(max_turn_deg=180.0)) if p.demand == "own gate"]
-    assert any("gate 11: the way from gate 10 to 11 meets it" in text for text in texts), texts
 
 
 def side_by_side() -> Track:
@@ -223,35 +189,12 @@ def test_limits_bind_where_they_say(field: str, kept: float, broken: float, dema
     assert {p.demand for p in find_problems(track, Limits()._replace(**{field: broken}))} == {demand}
 
 
-def test_clearance_is_to_the_floor_and_the_other_gates() -> None:
-    # The way of the ring is 2 m above ground; a frame 1 m away from it is in the path of 1.1 m only.
-    assert find_problems(ring(), Limits(clearance=1.99)) == ()
-    assert {p.demand for p in find_problems(ring(), Limits(clearance=2.01))} == {"bounds"}
-    x, y, _ = point_on_way(ring(), 0, 0.5)
-    track = change_gate(ring(), 3, position=(x, y, HEIGHT + 1.35 + 1.0), quaternion=yaw_of(120.0))
-    for clearance, is_in_path in ((0.95, False), (1.05, True)):
-        demands = {p.demand for p in find_problems(track, Limits(clearance=clearance))}
-        assert ("path" in demands) == is_in_path
-
-
 def test_default_clearances_are_what_starts_need() -> None:
     radius, starts = EnvParams.drone_radius, ResetParams()
     limits = Limits()
     assert limits.drone_radius == radius
     assert limits.clearance == pytest.approx(starts.course_offset + radius)
     assert limits.start_clearance == pytest.approx(starts.start_position_noise + radius)
-
-
-def test_check_sees_a_tilted_gates_lowest_corner() -> None:
-    # Rolled by 45 degrees about its axis of flight: the corner is a diagonal below the centre.
-    yaw = np.array(ring().gates[0].quaternion)
-    c, s = math.cos(math.pi / 8), math.sin(math.pi / 8)
-    rolled = (yaw[0] * c - 0.0, -yaw[3] * s, yaw[0] * s, yaw[3] * c)
-    problems = find_problems(change_gate(ring(), 0, quaternion=rolled, frame=2.9))
-    depth = 1.45 * math.sqrt(2.0) - HEIGHT
-    assert [p.text for p in problems if p.demand == "ground"] == [
-        f"gate 10: bottom of the frame {depth:.2f} m below the ground, expected above"
-    ]
 
 
 def test_hermite_curve_is_scipys() -> None:
@@ -262,10 +205,3 @@ def test_hermite_curve_is_scipys() -> None:
     spline = CubicHermiteSpline([0.0, 1.0], [start, end], [leave, meet])
     np.testing.assert_allclose(np.stack(point, -1), spline(s), atol=1e-12)
     np.testing.assert_allclose(np.stack(tangent, -1), spline(s, 1), atol=1e-12)
-
-
-def test_length_of_the_way_round_a_ring() -> None:
-    # Six arcs of 60 deg, by cubics: Hermite's tangents of the chord's length make them 0.3 % short.
-    length = way_length(build_course(ring()))
-    assert length == pytest.approx(2.0 * math.pi * RADIUS, rel=5e-3)
-    assert way_length(build_course(ring(2.0 * RADIUS))) == pytest.approx(2.0 * length, rel=1e-5)

@@ -42,13 +42,6 @@ def test_identity(leaf: str, transform: str) -> None:
         np.testing.assert_array_equal(np.signbit(result), np.signbit(value))
 
 
-def test_vmap_over_some_leaves_only() -> None:
-    pair = jax.jit(jax.vmap(lambda x, y: compute_once((x, y)), in_axes=(0, None)))
-    x, y = pair(jnp.arange(3.0), jnp.float32(5.0))
-    np.testing.assert_array_equal(x, [0.0, 1.0, 2.0])
-    np.testing.assert_array_equal(y, [5.0, 5.0, 5.0])
-
-
 def plain(x: jax.Array, n: jax.Array) -> jax.Array:
     """Return a function of a real and an integer."""
     return jnp.sin(x) * x**2 + n * x

@@ -83,14 +83,6 @@ GATES = {
 }
 
 
-def test_moving_within_the_plane_is_no_event() -> None:
-    gate = GATES["along x"]
-    start, end = np.array([[0.0, -3.0, 0.0]] * 2), np.array([[0.0, 3.0, 0.0], [0.0, 0.0, 0.0]])
-    crossing = cross(frame_of(gate), to_world(gate, start), to_world(gate, end), RADIUS)
-    assert names(crossing) == ["none", "none"]
-    np.testing.assert_array_equal(crossing.fraction, 1.0)
-
-
 @pytest.mark.parametrize(("y", "event"), [(0.0, "pass"), (1.0, "frame"), (2.0, "miss")])
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 def test_a_point_on_the_plane_is_counted_once(y: float, event: str, sign: float) -> None:
@@ -323,25 +315,6 @@ def test_two_gates_in_one_step_both_count(coasting_envs: Envs, row_track: Row, m
     assert not causes.any().any()
 
 
-@pytest.mark.parametrize(
-    ("y", "vy", "crash", "missed"),
-    [(1.0, 0.0, True, False), (2.0, 0.0, False, True), (0.4, 60.0, True, False)],
-)
-def test_the_second_gate_of_a_step_can_be_touched_too(
-    y: float,
-    vy: float,
-    crash: bool,
-    missed: bool,
-    coasting_envs: Envs,
-    row_track: Row,
-    make_drone: Any,
-) -> None:
-    env = coasting_envs(row_track([0.0, 0.4]), "terminate")
-    _, causes, events = transition_of(env, make_drone((-0.2, y, 2.0), (100.0, vy, 0.0)))
-    assert (bool(causes.crash), bool(causes.missed_gate)) == (crash, missed)
-    assert int(events.num_passed) == (1 if vy else 0)
-
-
 def test_missed_gate_terminates_or_flies_on(coasting_envs: Envs, row_track: Row, make_drone: Any) -> None:
     drone = make_drone((-0.05, 2.0, 2.0), (10.0, 0.0, 0.0))
     for setting, is_ended in (("terminate", True), ("fly_on", False)):
@@ -352,24 +325,6 @@ def test_missed_gate_terminates_or_flies_on(coasting_envs: Envs, row_track: Row,
         assert bool(events.is_miss)
         assert bool(causes.missed_gate) is bool(causes.any()) is is_ended
         assert int(state.race.gate_index) == int(state.race.gates_passed) == 0
-
-
-def test_after_flying_on_the_same_gate_can_be_flown(
-    coasting_envs: Envs, row_track: Row, make_drone: Any
-) -> None:
-    env = coasting_envs(row_track(list(ROW)), "fly_on")
-    params = env.default_params.replace(dt=1.0)
-    step = jax.jit(env.transition)
-    # Past the gate, back around it, through it, and back through it: (x, y), gates passed.
-    legs = [((3.0, 2.0), 0), ((1.0, 3.0), 0), ((1.0, 0.0), 0), ((3.0, 0.0), 1), ((1.0, 0.0), 1)]
-    state = env.begin(make_drone((1.0, 2.0, 2.0)), 0, params)
-    for (x, y), passed in legs:
-        pos_w = env.drone(state).pos_w
-        velocity = pos_w._replace(x=x - pos_w.x, y=y - pos_w.y, z=jnp.float32(0.0))
-        state = state._replace(plant=state.plant._replace(vel_w=velocity))
-        state, _, causes, _ = step(state, jnp.zeros(4), params)
-        assert not bool(causes.any())
-        assert int(state.race.gates_passed) == int(state.race.gate_index) == passed
 
 
 LENGTH = 24  # legs of a path

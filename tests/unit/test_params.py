@@ -89,11 +89,3 @@ def test_batches_are_checked_as_one() -> None:
         with pytest.raises(ValueError, match=name):
             batch.replace(**{name: np.array([0.1, 0.1, wrong])}).check()
     PARAMS.replace(drone_radius=np.array([0.1, 0.2, 0.3])).check()
-
-
-def test_a_single_gate_is_refused_where_an_episode_begins() -> None:
-    """Its pass would be counted twice, as it is the gate after itself."""
-    track = FlyTrack().track
-    env = FlyTrack(track=dataclasses.replace(track, gates=track.gates[:1]))
-    with pytest.raises(ValueError, match=r"course\.gates: found 1"):
-        env.reset(jax.random.key(0))

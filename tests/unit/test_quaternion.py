@@ -74,15 +74,6 @@ def test_from_yaw_tilt_leans_the_thrust_axis_towards_the_heading() -> None:
     np.testing.assert_allclose(matrix, expected.as_matrix(), atol=1e-5)
 
 
-def test_vectors_add_subtract_scale() -> None:
-    a, b = Vec3(1.0, 2.0, 3.0), Vec3(-4.0, 0.5, 2.0)
-    assert a + b == Vec3(-3.0, 2.5, 5.0)
-    assert a - b == Vec3(5.0, 1.5, 1.0)
-    assert a.scale(2.0) == Vec3(2.0, 4.0, 6.0)
-    assert a.dot(b) == 3.0
-    assert tuple(a.cross(b)) == tuple(np.cross(a, b))
-
-
 @pytest.mark.parametrize(
     ("vector", "norm", "gradient"),
     [((0.0, 0.0, 0.0), 0.0, (0.0, 0.0, 0.0)), ((3.0, 0.0, -4.0), 5.0, (0.6, 0.0, -0.8))],

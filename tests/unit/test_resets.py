@@ -160,18 +160,3 @@ def test_share_of_course_starts(sample: Sample) -> None:
     x, _ = sample(course_fraction=share)
     is_on_course = np.linalg.norm(x[:, 3:6], axis=1) > 0.0
     assert is_on_course.mean() == pytest.approx(share, abs=5 * np.sqrt(0.25 / NUM_STARTS))
-
-
-def test_without_noise_every_start_is_the_start_pose(sample: Sample) -> None:
-    x, gate_index = sample(
-        course_fraction=0.0,
-        start_position_noise=0.0,
-        start_height_noise=0.0,
-        start_yaw_noise_deg=0.0,
-        start_tilt_noise_deg=0.0,
-        start_battery_low_v=24.0,
-    )
-    expected = np.zeros(21)
-    expected[[0, 1, 2, 12, 19, 20]] = (18.6, 2.0, 0.1, 1.0, -1.0, 24.0)
-    np.testing.assert_allclose(x, np.tile(expected, (NUM_STARTS, 1)), atol=1e-6)
-    assert not gate_index.any()

@@ -9,7 +9,6 @@ from flytrack_env.tracks import (
     available_tracks,
     build_course,
     load_track,
-    way_length,
 )
 
 HANDOUT_ROWS = np.array(
@@ -92,9 +91,3 @@ def test_split_s_dives_through_the_gate_below_the_one_before() -> None:
     ahead = np.stack(gates.forward, axis=-1)
     np.testing.assert_allclose(ahead[2], [1.0, 0.0, 0.0], atol=1e-5)
     np.testing.assert_allclose(ahead[3], -ahead[2], atol=1e-5)
-
-
-def test_speedway_is_large() -> None:
-    track, usual = load_track("speedway"), load_track("flytrack")
-    assert way_length(build_course(track)) > 3.0 * way_length(build_course(usual))
-    assert all(gate.opening == 2.5 and gate.frame == 4.5 for gate in track.gates)

@@ -385,8 +385,3 @@ def test_an_episode_that_goes_on_does_depend_on_its_past(limited: Any, flight: F
     found = [limited[2](keys, flight.start, np.full((NUM_ENVS, 4), stick))[0][1] for stick in (0.3, -0.3)]
     histories = [np.asarray(state_of(state, "actions").actions[0].roll) for state in found]
     assert not np.array_equal(*histories)
-
-
-def test_final_observation_is_the_next_one_where_the_episode_goes_on(flight: Flight) -> None:
-    goes_on, final = ~ended(flight), np.asarray(flight.info["final_observation"])
-    np.testing.assert_allclose(final[goes_on], np.asarray(flight.observations)[goes_on], atol=1e-6)
