@@ -259,7 +259,12 @@ def _time(fields: Fields) -> Channel:
         raise fields.error("", "expected either column, with its unit, or step_s, of one row")
     if "step_s" in fields:
         step_s = fields.number("step_s", above=0.0)
-        return Channel(fields.name, "t", (), lambda table: np.arange(len(table.lines))[:, None] * step_s)
+
+        def by_row(table: Table) -> np.ndarray:
+            num_rows = len(next(iter(table.columns.values())))
+            return np.arange(num_rows)[:, None] * step_s
+
+        return Channel(fields.name, "t", (), by_row)
     column, scale = fields.text("column"), _scale(fields, "time")
 
     def convert(table: Table) -> np.ndarray:
