@@ -7,7 +7,6 @@ not measured again.
 """
 
 import argparse
-import io
 import json
 import time
 from collections.abc import Callable, Mapping
@@ -19,8 +18,6 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from matplotlib.figure import Figure
-from tqdm import tqdm
 
 import flytrack_env
 from baselines.purejaxrl_ppo import Config
@@ -31,13 +28,14 @@ from baselines.purejaxrl_ppo.ppo import make_network_for, make_ppo
 from baselines.purejaxrl_ppo.race_env import with_model_as_given
 from baselines.purejaxrl_ppo.run import is_due
 from baselines.purejaxrl_ppo.training import make_chunk, training_params, with_strong_types
+from benchmarks import report
 from benchmarks.ablated import InWorldFrame, WithoutEntries
-from benchmarks.report import cpu_name, pin_to_one_core, versions
 from flytrack_env import EnvParams, blackbox, load_model
 from flytrack_env.dynamics import ModelParameters
 from flytrack_env.effects import CommandDelay
 from flytrack_env.episodes import EpisodicEnvironment
 from flytrack_env.files import write_atomically
+from flytrack_env.pictures.drawing import new_figure, png_of
 
 NUM_EPISODES, NUM_LAPS, NUM_STEPS = 256, 3, 2500
 EVALUATION_SEED, PLANTS_SEED = 30_000, 200
@@ -49,9 +47,9 @@ Wrap = Callable[[EpisodicEnvironment], EpisodicEnvironment]
 
 @dataclass(frozen=True)
 class Ablation:
-    """One change of the recipe: settings, id, reward, starts, observation, drone; says: what, in words."""
+    """One change of the recipe: settings, id, reward, starts, observation, drone; change: as text."""
 
-    says: str
+    change: str
     config: Mapping[str, Any] = field(default_factory=dict)
     env_id: str = "FlyTrack-v0"
     reward: Mapping[str, float] = field(default_factory=dict)
@@ -133,7 +131,7 @@ class Contest:
     def train(self, seed: int) -> dict[str, Any]:
         """Return the curve of a seed, and its race in the simulator, on the black box, on drawn drones."""
         runner, curve = self.start(jax.random.key(seed)), []
-        for update in tqdm(range(1, self.config.num_updates + 1), desc=f"seed {seed}"):
+        for update in report.progress(range(1, self.config.num_updates + 1), "update"):
             runner, _ = self.chunk(runner, jnp.int32(1))
             if is_due(update, EVERY, self.config.batch_size) or update == self.config.num_updates:
                 raced = self.in_simulator(runner.train_state.params)
@@ -178,29 +176,26 @@ def _range(values: list[float | None], form: str) -> str:
 
 def table(done: Mapping[tuple[str, int], dict[str, Any]]) -> str:
     """Return a row per ablation, a number per seed, the smallest first."""
-    text = (
-        "| ablation | what is different | simulator | flying lap (s) | black box | flying lap (s) | "
-        "drawn drones |\n"
-        "|---|---|---|---|---|---|---|\n"
-    )
+    header = "ablation | change | simulator | flying lap (s) | black box | flying lap (s) | drawn drones"
+    rows = []
     for name, ablation in ABLATIONS.items():
-        rows = [line for (of, _), line in sorted(done.items()) if of == name]
+        lines = [line for (of, _), line in sorted(done.items()) if of == name]
         cells = []
         for place in ("simulator", "black_box", "drawn"):
-            raced = [row[place] for row in rows if row[place] is not None]
+            raced = [line[place] for line in lines if line[place] is not None]
             cells.append(_range([one["success"] for one in raced], ".1%"))
             if place != "drawn":
                 cells.append(_range([one["flying_lap_s"] for one in raced], ".3f"))
-        if rows:
-            text += f"| {name} | {ablation.says} | {' | '.join(cells)} |\n"
-    return text
+        if lines:
+            rows.append([name, ablation.change, *cells])
+    return report.table(header, rows)
 
 
 def draw(path: Path, done: Mapping[tuple[str, int], dict[str, Any]]) -> None:
     """Write a PNG: the share that finishes 3 laps in the simulator over training, a panel per ablation."""
     names = [name for name in ABLATIONS if any(of == name for of, _ in done)]
     num_rows = -(-len(names) // 4)
-    figure = Figure(figsize=(12, 2.2 * num_rows + 0.6), layout="constrained")
+    figure = new_figure(12, 2.2 * num_rows + 0.6)
     panels = figure.subplots(num_rows, 4, sharex=True, sharey=True, squeeze=False)
     for panel, name in zip(panels.flat, names, strict=False):
         for (of, _), line in sorted(done.items()):
@@ -213,9 +208,7 @@ def draw(path: Path, done: Mapping[tuple[str, int], dict[str, Any]]) -> None:
         panel.set_axis_off()
     figure.supxlabel("environment steps (millions); grey: the recipe as it is")
     figure.supylabel("3 laps in the simulator (%)")
-    content = io.BytesIO()
-    figure.savefig(content, format="png", dpi=110)
-    write_atomically(path, content.getvalue())
+    write_atomically(path, png_of(figure))
 
 
 def main() -> None:
@@ -225,26 +218,28 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=Config.total_timesteps)
     parser.add_argument("--only", nargs="+", choices=ABLATIONS, default=[])
     parser.add_argument("--model", type=Path, default=Path("benchmarks/data/ablations/model.json"))
-    parser.add_argument("--lines", type=Path, default=Path("docs/results/ablations.jsonl"))
-    parser.add_argument("--out", type=Path, default=Path("docs/results/ablations.md"))
+    parser.add_argument("--lines", type=Path, default=report.RESULTS / "ablations.jsonl")
+    parser.add_argument("--out", type=Path, default=report.RESULTS / "ablations.md")
     arguments = parser.parse_args()
-    pinned = pin_to_one_core()
+    pinned = report.pin_to_one_core()
     done = measure(arguments, load_model(arguments.model))
     chart = arguments.out.with_suffix(".png")
     draw(chart, done)
-    text = (
-        "# Ablations: what each part of the recipe is worth\n\n"
-        f"`python -m benchmarks.ablations --seeds {arguments.seeds} --steps {arguments.steps}`: the default "
-        f"recipe ({arguments.steps / 1e6:g} M environment steps) with one thing changed, seeds 0 to "
-        f"{arguments.seeds - 1}. Trained on `{arguments.model}`, which `make demo` (seed 0) identified from "
-        f"the shipped black box. Share of {NUM_EPISODES} noisy starts that finish {NUM_LAPS} laps, and mean "
-        "flying lap: in that simulator, on the black box, on as many drones drawn around the model (drag, "
-        "thrust, wind, delay: `eval_agent.py --plants`). One number per seed, in order of size.\n\n"
-        f"{table(done)}\n![Learning curves]({chart.name})\n\n"
-        f"{cpu_name()}, {pinned}; {', '.join(f'{name} {number}' for name, number in versions().items())}.\n"
+    text = report.page(
+        "Ablations: the worth of each part of the recipe",
+        f"{report.command_line()}: the default recipe ({arguments.steps / 1e6:g} M environment steps) "
+        "with one "
+        f"thing changed, seeds 0 to {arguments.seeds - 1}. Trained on `{arguments.model}`, which `make "
+        "demo` (seed "
+        f"0) identified from the shipped black box. Share of {NUM_EPISODES} noisy starts that finish "
+        f"{NUM_LAPS} "
+        "laps, and mean flying lap: in that simulator, on the black box, on as many drones drawn around the "
+        "model (drag, thrust, wind, delay: `eval_agent.py --plants`). One number per seed, in order of size.",
+        table(done),
+        f"![Learning curves]({chart.name})",
+        f"{pinned.capitalize()}. {report.provenance_line(report.provenance())}",
     )
-    write_atomically(arguments.out, text.encode())
-    print(table(done))
+    report.write_page(arguments.out, text)
 
 
 if __name__ == "__main__":

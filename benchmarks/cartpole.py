@@ -6,8 +6,6 @@ from it are switched off here.
 """
 
 import argparse
-import platform
-from importlib.metadata import version
 from pathlib import Path
 
 import gymnax
@@ -15,7 +13,7 @@ import jax
 import numpy as np
 
 from baselines.purejaxrl_ppo import Config, make_train
-from flytrack_env.files import write_atomically
+from benchmarks import report
 
 TARGET, TOLERANCE = 413.0, 8.0
 CONFIG = Config(
@@ -40,7 +38,7 @@ def main() -> None:
     """Train every seed, print and write the table; exit 1 if the mean misses the target."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seeds", type=int, default=5)
-    parser.add_argument("--table", type=Path, default=Path("docs/results/cartpole.md"))
+    parser.add_argument("--table", type=Path, default=report.RESULTS / "cartpole.md")
     arguments = parser.parse_args()
     env, params = gymnax.make("CartPole-v1")
     train = jax.jit(make_train(env, params, CONFIG))
@@ -50,18 +48,17 @@ def main() -> None:
         areas.append(float(np.mean(metrics["last_return"])))
         print(f"seed {seed}: {areas[-1]:.1f}", flush=True)
     mean = float(np.mean(areas))
-    text = (
-        "# Equivalence to PureJaxRL\n\n"
-        f"`python -m benchmarks.cartpole --seeds {arguments.seeds}` on {platform.machine()}, jax "
-        f"{jax.__version__}, gymnax {version('gymnax')}: CartPole-v1 with PureJaxRL's configuration, our "
-        "differences from it switched off. Mean over all updates of the mean return of every environment's "
-        "last episode.\n\n"
-        "| seed | mean last return |\n|---|---|\n"
-        + "".join(f"| {seed} | {area:.1f} |\n" for seed, area in enumerate(areas))
-        + f"| mean | **{mean:.1f}** |\n\n"
-        f"Aim, what PureJaxRL's own `ppo.py` reaches: {TARGET:g} +- {TOLERANCE:g}.\n"
+    rows = [[str(seed), f"{area:.1f}"] for seed, area in enumerate(areas)]
+    text = report.page(
+        "Equivalence to PureJaxRL",
+        f"{report.command_line()}: CartPole-v1 with PureJaxRL's configuration, our differences from it "
+        "switched "
+        "off. Mean over all updates of the mean return of every environment's last episode.",
+        report.table("seed | mean last return", [*rows, ["mean", f"**{mean:.1f}**"]]),
+        f"Aim, what PureJaxRL's own `ppo.py` reaches: {TARGET:g} +- {TOLERANCE:g}.",
+        report.provenance_line(report.provenance()),
     )
-    write_atomically(arguments.table, text.encode())
+    report.write_page(arguments.table, text)
     if abs(mean - TARGET) > TOLERANCE:
         raise SystemExit(1)
 

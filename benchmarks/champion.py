@@ -12,20 +12,20 @@ from pathlib import Path
 
 from baselines.purejaxrl_ppo import Config, load_checkpoint
 from baselines.purejaxrl_ppo.checkpoint import save_checkpoint
+from baselines.purejaxrl_ppo.evaluate import SHIPPED_BLACK_BOX, EvaluationSettings, evaluate
 from baselines.purejaxrl_ppo.training import Options, train_policy
-from benchmarks.flown import ROOT, evaluate
-from benchmarks.report import cpu_name, versions
+from benchmarks import report
 from flytrack_env.files import fresh_folder, write_atomically
 
-CHAMPION = ROOT / "baselines" / "purejaxrl_ppo" / "champion" / "flytrack.safetensors"
-MODEL = ROOT / "benchmarks" / "data" / "time_optimal" / "black_box.json"
+CHAMPION = report.ROOT / "baselines" / "purejaxrl_ppo" / "champion" / "flytrack.safetensors"
+MODEL = report.ROOT / "benchmarks" / "data" / "time_optimal" / "black_box.json"
 # Fast laps use the width of the openings, so that offsets at a pass cost less than in the default reward; and
 # a policy that explores less while it learns can fly nearer to the frames. Its model is exact: no margin.
 REWARD = {"off_centre": -0.05}
 CONFIG = Config(total_timesteps=160_000_000, min_std=0.02, gate_margin=0.0)
 SEED = 0
 AIM = 1.08  # times the time-optimal flying lap
-FLIGHTS = "--black-box blackbox/acro_step.bin --steps 2500 --episodes 256 --laps 3 --seed 100 --ghost"
+STEPS, EPISODES, LAPS, FLIGHT_SEED = 2500, 256, 3, 100
 
 
 def train(out: Path) -> Path:
@@ -38,19 +38,24 @@ def train(out: Path) -> Path:
 
 def page(text: str, times: float) -> str:
     """Return the page; times: mean flying lap over the optimum."""
-    meta, name = load_checkpoint(CHAMPION).meta, CHAMPION.relative_to(ROOT)
+    meta, name = load_checkpoint(CHAMPION).meta, CHAMPION.relative_to(report.ROOT)
     reward = ", ".join(f"{term} {weight:g}" for term, weight in REWARD.items())
-    return (
-        "# The champion of the FlyTrack course\n\n"
-        f"`python -m benchmarks.champion`: `{name}`, trained from scratch with seed {meta['seed']} for "
-        f"{meta['steps'] / 1e6:.0f} M environment steps ({meta['seconds']:.0f} s) "
-        f"on the model that was identified from the shipped black box (`{MODEL.relative_to(ROOT)}`); unlike "
-        f"the default recipe: reward {reward}, min_std {CONFIG.min_std:g}, gate_margin "
-        f"{CONFIG.gate_margin:g}. Flown on the black box itself, from noisy starts:\n\n"
-        f"`python eval_agent.py --checkpoint {name} {FLIGHTS}`\n\n```\n{text}\n```\n\n"
-        f"Mean flying lap: **{times:.3f} times** the time-optimal lap of that model (aim: at most {AIM:g}). "
-        "The settings were chosen by looking at flights on this black box and this track.\n\n"
-        f"{cpu_name()}; {', '.join(f'{name} {number}' for name, number in versions().items())}.\n"
+    flags = f"--steps {STEPS} --episodes {EPISODES} --laps {LAPS} --seed {FLIGHT_SEED} --ghost"
+    return report.page(
+        "The champion of the FlyTrack course",
+        f"{report.command_line()}: `{name}`, trained from scratch with seed {meta['seed']} for "
+        f"{meta['steps'] / 1e6:.0f} M environment steps ({meta['seconds']:.0f} s) on the model "
+        "identified from the "
+        f"shipped black box (`{MODEL.relative_to(report.ROOT)}`). Unlike the default recipe: reward "
+        f"{reward}, "
+        f"min_std {CONFIG.min_std:g}, gate_margin {CONFIG.gate_margin:g}. On the black box, from noisy "
+        "starts:",
+        f"`python eval_agent.py --checkpoint {name} {flags}`",
+        f"```\n{text}```",
+        f"Mean flying lap: **{times:.3f} times** the time-optimal lap of that model (aim: at most "
+        f"{AIM:g}). The "
+        "settings were chosen by looking at flights on this black box and this track.",
+        report.provenance_line(report.provenance()),
     )
 
 
@@ -59,17 +64,20 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--only-fly", action="store_true", help="fly the shipped champion, train none")
     parser.add_argument("--work", type=Path, default=Path("runs/champion"), help="folder of the training")
-    parser.add_argument("--out", type=Path, default=Path("docs/results/champion.md"))
+    parser.add_argument("--out", type=Path, default=report.RESULTS / "champion.md", help="page to write")
     arguments = parser.parse_args()
     policy = CHAMPION if arguments.only_fly else train(fresh_folder(arguments.work))
-    report, text = evaluate(policy, FLIGHTS)
-    print(text)
-    percent = report["optimal"]["flying_lap_s"]["mean_percent_above"]
+    settings = EvaluationSettings(
+        policy, STEPS, EPISODES, LAPS, black_box=SHIPPED_BLACK_BOX, seed=FLIGHT_SEED, ghost=True
+    )
+    found = evaluate(settings)
+    print(found.text)
+    percent = found.numbers["optimal"]["flying_lap_s"]["mean_percent_above"]
     times = math.inf if percent is None else 1.0 + percent / 100.0
-    if report["success"]["share"] < 1.0 or times > AIM:
+    if found.numbers["success"]["share"] < 1.0 or times > AIM:
         raise SystemExit(1)
     write_atomically(CHAMPION, policy.read_bytes())
-    write_atomically(arguments.out, page(text, times).encode())
+    report.write_page(arguments.out, page(found.text, times))
 
 
 if __name__ == "__main__":

@@ -14,16 +14,12 @@ from baselines.purejaxrl_ppo.evaluate import MAX_FLIGHTS, SHIPPED_BLACK_BOX
 from baselines.purejaxrl_ppo.flights import race_many, start_keys
 from baselines.purejaxrl_ppo.monitor import NUM_LAPS, NUM_STEPS
 from baselines.purejaxrl_ppo.race_env import plant_env, simulated_env, with_model_as_given
-from benchmarks.report import cpu_name, pin_to_one_core, versions
+from benchmarks import report
 from flytrack_env import blackbox
 from flytrack_env.episodes import EpisodicEnvironment
-from flytrack_env.files import write_atomically
 
 AIM_FLIGHTS, AIM_S = 10_000, 30.0
-HEADER = (
-    "| flown by | CPU s | first call, CPU s | steps flown | steps per CPU s | flights complete |\n"
-    "|---|---|---|---|---|---|\n"
-)
+HEADER = "flown by | CPU s | first call, CPU s | steps flown | steps per CPU s | flights complete"
 
 
 class Measured(NamedTuple):
@@ -34,12 +30,10 @@ class Measured(NamedTuple):
     steps: int
     success: float
 
-    def row(self, name: str) -> str:
+    def row(self, name: str) -> list[str]:
         """Return the row of the table."""
-        return (
-            f"| {name} | {self.seconds:.1f} | {self.first_call_s:.1f} | {self.steps:,} | "
-            f"{self.steps / self.seconds:,.0f} | {self.success:.1%} |\n"
-        )
+        steps = (f"{self.steps:,}", f"{self.steps / self.seconds:,.0f}")
+        return [name, f"{self.seconds:.1f}", f"{self.first_call_s:.1f}", *steps, f"{self.success:.1%}"]
 
 
 def measure(env: EpisodicEnvironment, checkpoint: Checkpoint, num_flights: int, seed: int) -> Measured:
@@ -61,12 +55,12 @@ def main() -> None:
     parser.add_argument("--episodes", type=int, default=AIM_FLIGHTS)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--black-box", type=Path, default=SHIPPED_BLACK_BOX)
-    parser.add_argument("--out", type=Path, default=Path("docs/results/evaluation_speed.md"))
+    parser.add_argument("--out", type=Path, default=report.RESULTS / "evaluation_speed.md")
     arguments = parser.parse_args()
     if not 1 <= arguments.episodes <= MAX_FLIGHTS:
         expected = f"expected 1 to {MAX_FLIGHTS}"
         parser.error(f"--episodes: found {arguments.episodes}, {expected}")
-    pinned = pin_to_one_core()
+    pinned = report.pin_to_one_core()
     try:
         checkpoint = load_checkpoint(arguments.checkpoint)
         scenes = {
@@ -75,20 +69,19 @@ def main() -> None:
         }
     except (ValueError, OSError) as error:
         parser.error(str(error))
-    measured, rows = {}, ""
-    for name, env in scenes.items():
-        measured[name] = measure(env, checkpoint, arguments.episodes, arguments.seed)
-        rows += measured[name].row(name)
-        print(rows.splitlines()[-1], flush=True)
-    text = (
-        "# Evaluation speed\n\n"
-        f"`python -m benchmarks.evaluation_speed {arguments.checkpoint} --episodes {arguments.episodes} "
-        f"--seed {arguments.seed}`: {arguments.episodes:,} flights of {NUM_LAPS} laps from noisy starts, at "
-        f"most {NUM_STEPS} steps each, of a {checkpoint.env_id} policy on {checkpoint.track}. "
-        f"Aim: {AIM_FLIGHTS:,} flights in {AIM_S:g} s.\n\n" + HEADER + rows + "\n"
-        f"{cpu_name()}, {pinned}; {', '.join(f'{name} {number}' for name, number in versions().items())}.\n"
+    measured = {
+        name: measure(env, checkpoint, arguments.episodes, arguments.seed) for name, env in scenes.items()
+    }
+    text = report.page(
+        "Evaluation speed",
+        f"{report.command_line()}: {arguments.episodes:,} flights of {NUM_LAPS} laps from noisy starts, "
+        "at most "
+        f"{NUM_STEPS} steps each, of a {checkpoint.env_id} policy on {checkpoint.track}. "
+        f"Aim: {AIM_FLIGHTS:,} flights in {AIM_S:g} s.",
+        report.table(HEADER, [found.row(name) for name, found in measured.items()]),
+        f"{pinned.capitalize()}. {report.provenance_line(report.provenance())}",
     )
-    write_atomically(arguments.out, text.encode())
+    report.write_page(arguments.out, text)
     if max(found.seconds / arguments.episodes for found in measured.values()) > AIM_S / AIM_FLIGHTS:
         raise SystemExit(1)
 

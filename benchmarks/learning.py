@@ -6,7 +6,6 @@ how far from the frames does the policy stay on a plant that it never saw? Write
 """
 
 import argparse
-import os
 import time
 from pathlib import Path
 
@@ -17,17 +16,17 @@ from baselines.purejaxrl_ppo.evaluate import SHIPPED_BLACK_BOX
 from baselines.purejaxrl_ppo.flights import race_many, score, start_keys
 from baselines.purejaxrl_ppo.race_env import plant_env
 from baselines.purejaxrl_ppo.training import train_policy
-from benchmarks.report import cpu_name
+from benchmarks import report
 from demo import NUM_EPISODES, NUM_LAPS, NUM_STEPS, identify
 from flytrack_env import blackbox
 from flytrack_env.episodes import EpisodicEnvironment
-from flytrack_env.files import fresh_folder, write_atomically
+from flytrack_env.files import fresh_folder
 
 TARGET_SUCCESS = 0.95
 THICKER_M = (0.05, 0.10, 0.15, 0.20, 0.25)
 HEADER = (
-    "| seed | success on the black box | margin (m) | gates of 24 | first lap (s) | flying lap (s) | "
-    "training CPU (s) | training wall (s) |\n|---|---|---|---|---|---|---|---|\n"
+    "seed | success on the black box | margin (m) | gates of 24 | first lap (s) | flying lap (s) | "
+    "training CPU (s) | training wall (s)"
 )
 
 
@@ -43,7 +42,7 @@ def margin_of(env: EpisodicEnvironment, checkpoint: Checkpoint, keys: jax.Array)
     return margin
 
 
-def measure_seed(seed: int, black_box: Path, out: Path, config: Config) -> tuple[float, str]:
+def measure_seed(seed: int, black_box: Path, out: Path, config: Config) -> tuple[float, list[str]]:
     """Return the success of one training seed, and its row of the table."""
     started = time.process_time()
     checkpoint, _ = train_policy(out / f"seed{seed}", config, seed, model=out / "model.json")
@@ -51,48 +50,52 @@ def measure_seed(seed: int, black_box: Path, out: Path, config: Config) -> tuple
     env = plant_env(checkpoint, blackbox.load(black_box))
     keys = start_keys(seed, NUM_EPISODES)
     result = score(race_many(env, checkpoint.network, checkpoint.params, keys, NUM_STEPS, NUM_LAPS))
-    row = (
-        f"| {seed} | {result.success:.1%} | {margin_of(env, checkpoint, keys):.2f} | {result.gates:.2f} | "
-        f"{result.first_lap_s:.3f} | {result.flying_lap_s:.3f} | {cpu_seconds:.0f} | "
-        f"{checkpoint.meta['seconds']:.0f} |\n"
-    )
+    times = (f"{result.first_lap_s:.3f}", f"{result.flying_lap_s:.3f}")
+    margin, wall_s = f"{margin_of(env, checkpoint, keys):.2f}", f"{checkpoint.meta['seconds']:.0f}"
+    row = [
+        str(seed),
+        f"{result.success:.1%}",
+        margin,
+        f"{result.gates:.2f}",
+        *times,
+        f"{cpu_seconds:.0f}",
+        wall_s,
+    ]
     return result.success, row
 
 
 def main() -> None:
     """Measure every seed, print and write the table; exit 1 if a seed misses the target."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--seeds", type=int, default=10)
-    parser.add_argument("--black-box", type=Path, default=SHIPPED_BLACK_BOX)
-    parser.add_argument("--out", type=Path, default=Path("runs/learning"))
-    parser.add_argument("--total-timesteps", type=float, default=Config.total_timesteps)
+    parser.add_argument("--seeds", type=int, default=10, help="training seeds")
+    parser.add_argument("--black-box", type=Path, default=SHIPPED_BLACK_BOX, help="file")
+    parser.add_argument("--out", type=Path, default=Path("runs/learning"), help="folder of the trainings")
+    parser.add_argument("--total-timesteps", type=float, default=Config.total_timesteps, help="per training")
     parser.add_argument("--gate-margin", type=float, default=Config.gate_margin, help="m; of the recipe")
-    parser.add_argument("--table", type=Path, default=Path("docs/results/learning.md"))
+    parser.add_argument("--table", type=Path, default=report.RESULTS / "learning.md", help="page to write")
     arguments = parser.parse_args()
     config = Config(total_timesteps=int(arguments.total_timesteps), gate_margin=arguments.gate_margin)
     config.check()
     out = fresh_folder(arguments.out)
     identify(arguments.black_box, out, seed=0)
-    successes, rows = [], []
-    for seed in range(arguments.seeds):
-        success, row = measure_seed(seed, arguments.black_box, out, config)
-        successes.append(success)
-        rows.append(row)
-        print(row, end="", flush=True)
-    reached = sum(success >= TARGET_SUCCESS for success in successes)
-    text = (
-        "# Learning: from black box to race\n\n"
-        f"`python -m benchmarks.learning --seeds {arguments.seeds} "
-        f"--total-timesteps {config.total_timesteps:g} --gate-margin {config.gate_margin:g}` on "
-        f"{cpu_name()}, {len(os.sched_getaffinity(0))} cores, jax {jax.__version__}. CPU seconds include "
-        "compilation. "
-        f"{NUM_EPISODES} noisy starts, {NUM_LAPS} laps; training seeds with at least {TARGET_SUCCESS:.0%}: "
-        f"**{reached} of {len(successes)}**. Margin: by how much thicker, to every side, the drone could be "
-        f"for {TARGET_SUCCESS:.0%} still to finish "
-        f"({', '.join(f'{thicker:g}' for thicker in THICKER_M)} m were tried).\n\n" + HEADER + "".join(rows)
+    results = [
+        measure_seed(seed, arguments.black_box, out, config)
+        for seed in report.progress(range(arguments.seeds), "seed")
+    ]
+    reached = sum(success >= TARGET_SUCCESS for success, _ in results)
+    text = report.page(
+        "Learning: from black box to race",
+        f"{report.command_line()}. CPU seconds include compilation. {NUM_EPISODES} noisy starts, "
+        f"{NUM_LAPS} laps; "
+        f"training seeds with at least {TARGET_SUCCESS:.0%}: **{reached} of {len(results)}**. Margin: "
+        "by how much "
+        f"thicker, to every side, the drone could be for {TARGET_SUCCESS:.0%} still to finish "
+        f"({', '.join(f'{thicker:g}' for thicker in THICKER_M)} m were tried).",
+        report.table(HEADER, [row for _, row in results]),
+        report.provenance_line(report.provenance()),
     )
-    write_atomically(arguments.table, text.encode())
-    if reached < len(successes):
+    report.write_page(arguments.table, text)
+    if reached < len(results):
         raise SystemExit(1)
 
 

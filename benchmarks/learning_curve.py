@@ -1,13 +1,12 @@
 """How fast racing is learnt from scratch: ``python -m benchmarks.learning_curve [--seeds 5]``.
 
-Trains the default recipe, or another by the flags of training, on FlyTrack-v0, one seed after the other, and
-every half a million environment steps flies 256 noisy starts over 3 laps in the simulator. What counts is
-from when on 95 % of them finish and do so at every later evaluation. CPU seconds are those of training
+Trains the default recipe, or that of --config, on FlyTrack-v0, one seed after the other, and every half a
+million environment steps flies 256 noisy starts over 3 laps in the simulator. What counts is from when on
+95 % of them finish and do so at every later evaluation. CPU seconds are those of training
 alone, without compilation and evaluations. Writes a page and a chart.
 """
 
 import argparse
-import io
 import time
 from pathlib import Path
 from typing import NamedTuple
@@ -15,16 +14,15 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from matplotlib.figure import Figure
-from tqdm import tqdm
 
 from baselines.purejaxrl_ppo import Config
-from baselines.purejaxrl_ppo.config import add_flags, settings_of
+from baselines.purejaxrl_ppo.config import settings_in_file
 from baselines.purejaxrl_ppo.flights import race_many, score, start_keys
 from baselines.purejaxrl_ppo.run import is_due
 from baselines.purejaxrl_ppo.training import Trainer
-from benchmarks.report import cpu_name, pin_to_one_core, versions
+from benchmarks import report
 from flytrack_env.files import write_atomically
+from flytrack_env.pictures.drawing import new_figure, png_of
 
 TARGET_SUCCESS = 0.95
 AIM_STEPS, AIM_CPU_S = 8_000_000, 25.0
@@ -32,8 +30,8 @@ EVERY = 500_000  # environment steps
 NUM_EPISODES, NUM_LAPS, NUM_STEPS = 256, 3, 2500
 EVALUATION_SEED = 30_000
 HEADER = (
-    "| seed | 95 % held from (M steps) | CPU s until then | CPU s of the whole run | success at the end | "
-    "first lap (s) | flying lap (s) |\n|---|---|---|---|---|---|---|\n"
+    "seed | 95 % held from (M steps) | CPU s until then | CPU s of the whole run | success at the end | "
+    "first lap (s) | flying lap (s)"
 )
 
 
@@ -60,7 +58,7 @@ def train(trainer: Trainer, seed: int) -> list[Point]:
     runner = trainer.start(jax.random.key(seed))
     trainer.chunk(runner, jnp.int32(0))  # compiles
     points, cpu_s = [], 0.0
-    for update in tqdm(range(1, config.num_updates + 1), desc=f"seed {seed}"):
+    for update in report.progress(range(1, config.num_updates + 1), "update"):
         started_s = time.process_time()
         runner, _ = jax.block_until_ready(trainer.chunk(runner, jnp.int32(1)))
         cpu_s += time.process_time() - started_s
@@ -76,19 +74,17 @@ def held_from(points: list[Point]) -> Point | None:
     return points[first] if first < len(points) else None
 
 
-def row_of(seed: int, points: list[Point]) -> str:
+def row_of(seed: int, points: list[Point]) -> list[str]:
     """Return a seed's row of the table."""
     held, last = held_from(points), points[-1]
     since = ("never", "") if held is None else (f"{held.steps / 1e6:.2f}", f"{held.cpu_s:.1f}")
-    return (
-        f"| {seed} | {since[0]} | {since[1]} | {last.cpu_s:.1f} | {last.success:.1%} | "
-        f"{last.first_lap_s:.3f} | {last.flying_lap_s:.3f} |\n"
-    )
+    laps = (f"{last.first_lap_s:.3f}", f"{last.flying_lap_s:.3f}")
+    return [str(seed), *since, f"{last.cpu_s:.1f}", f"{last.success:.1%}", *laps]
 
 
 def draw(path: Path, curves: dict[int, list[Point]]) -> None:
     """Write a PNG of success and flying lap over environment steps, a line a seed."""
-    figure = Figure(figsize=(8, 6), layout="constrained")
+    figure = new_figure(8, 6)
     upper, lower = figure.subplots(2, 1, sharex=True)
     for seed, points in curves.items():
         steps = np.array([point.steps for point in points]) / 1e6
@@ -98,44 +94,41 @@ def draw(path: Path, curves: dict[int, list[Point]]) -> None:
     upper.set(ylabel=f"{NUM_LAPS} laps completed (%)", title="FlyTrack-v0 from scratch")
     upper.legend()
     lower.set(xlabel="environment steps (millions)", ylabel="mean flying lap (s)")
-    content = io.BytesIO()
-    figure.savefig(content, format="png", dpi=120)
-    write_atomically(path, content.getvalue())
+    write_atomically(path, png_of(figure))
 
 
 def main() -> None:
     """Measure every seed, print and write page and chart; exit 1 if a seed misses the aim."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--seeds", type=int, default=5)
-    parser.add_argument("--out", type=Path, default=Path("docs/results/learning_curve.md"))
-    add_flags(parser)
+    parser.add_argument("--seeds", type=int, default=5, help="training seeds")
+    parser.add_argument("--config", type=Path, help="TOML file of other settings than the default ones")
+    parser.add_argument(
+        "--out", type=Path, default=report.RESULTS / "learning_curve.md", help="page to write"
+    )
     arguments = parser.parse_args()
-    pinned = pin_to_one_core()
-    settings = {"total_timesteps": AIM_STEPS, **settings_of(arguments)}
+    pinned = report.pin_to_one_core()
+    given = {} if arguments.config is None else settings_in_file(arguments.config)
+    settings = {"total_timesteps": AIM_STEPS, **given}
     trainer = Trainer(Config(**settings))
     evaluate(trainer, trainer.start(jax.random.key(0)).train_state.params, 0, 0.0)  # compiles
-    curves, rows = {}, []
-    for seed in range(arguments.seeds):
-        curves[seed] = train(trainer, seed)
-        rows.append(row_of(seed, curves[seed]))
-        print(rows[-1], end="", flush=True)
+    curves = {seed: train(trainer, seed) for seed in range(arguments.seeds)}
     chart = arguments.out.with_suffix(".png")
     draw(chart, curves)
     num_held = sum(held_from(points) is not None for points in curves.values())
-    text = (
-        "# Learning to race from scratch\n\n"
-        f"`python -m benchmarks.learning_curve --seeds {arguments.seeds}` with "
-        f"{', '.join(f'{name} {value:g}' for name, value in settings.items())}, the rest as by default, "
-        f"on FlyTrack-v0. Every {EVERY / 1e6:g} M environment steps {NUM_EPISODES} noisy starts, {NUM_LAPS} "
-        "laps, in the simulator. CPU seconds of training alone, without compilation and evaluations. Seeds "
-        f"that hold {TARGET_SUCCESS:.0%} to the end: **{num_held} of {len(curves)}** (aim: all, in runs "
-        f"of at most {AIM_STEPS / 1e6:g} M steps and {AIM_CPU_S:g} CPU s).\n\n"
-        + HEADER
-        + "".join(rows)
-        + f"\n![curves]({chart.name})\n\n"
-        f"{cpu_name()}, {pinned}; {', '.join(f'{name} {number}' for name, number in versions().items())}.\n"
+    text = report.page(
+        "Learning to race from scratch",
+        f"{report.command_line()} with "
+        f"{', '.join(f'{name} {value:g}' for name, value in settings.items())}, the "
+        f"rest as by default, on FlyTrack-v0. Every {EVERY / 1e6:g} M environment steps {NUM_EPISODES} noisy "
+        f"starts, {NUM_LAPS} laps, in the simulator. CPU seconds of training alone, without compilation and "
+        f"evaluations. Seeds that hold {TARGET_SUCCESS:.0%} to the end: **{num_held} of {len(curves)}** "
+        "(aim: "
+        f"all, in runs of at most {AIM_STEPS / 1e6:g} M steps and {AIM_CPU_S:g} CPU s).",
+        report.table(HEADER, [row_of(seed, points) for seed, points in curves.items()]),
+        f"![curves]({chart.name})",
+        f"{pinned.capitalize()}. {report.provenance_line(report.provenance())}",
     )
-    write_atomically(arguments.out, text.encode())
+    report.write_page(arguments.out, text)
     if num_held < len(curves) or max(points[-1].cpu_s for points in curves.values()) > AIM_CPU_S:
         raise SystemExit(1)
 

@@ -15,8 +15,7 @@ from baselines.purejaxrl_ppo import Config
 from baselines.purejaxrl_ppo.tracking import local_uri
 from baselines.purejaxrl_ppo.train_ppo import DEFAULTS
 from baselines.purejaxrl_ppo.training import Options, Trainer
-from benchmarks.report import cpu_name, pin_to_one_core, versions
-from flytrack_env.files import write_atomically
+from benchmarks import report
 
 AIM_STEPS_PER_S = 400_000
 AIM_COST = 0.1
@@ -37,9 +36,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--total-timesteps", type=float, default=Config.total_timesteps)
     parser.add_argument("--repeats", type=int, default=1)
-    parser.add_argument("--out", type=Path, default=Path("docs/results/training_speed.md"))
+    parser.add_argument("--out", type=Path, default=report.RESULTS / "training_speed.md")
     arguments = parser.parse_args()
-    pinned = pin_to_one_core()
+    pinned = report.pin_to_one_core()
     trainer = Trainer(Config(total_timesteps=int(arguments.total_timesteps)))
     modes = {"alone": Options(), "with everything that is on by default": DEFAULTS}
     rates: dict[str, list[float]] = {name: [] for name in modes}
@@ -48,24 +47,19 @@ def main() -> None:
         for name, options in modes.items():
             rates[name].append(measure(trainer, options, is_tracked=options is DEFAULTS))
             print(f"{name}: {rates[name][-1]:,.0f} steps per CPU s", flush=True)
-    rows = "".join(
-        f"| {name} | {statistics.median(found):,.0f} | {min(found):,.0f} to {max(found):,.0f} |\n"
-        for name, found in rates.items()
-    )
+    rows = [[name, f"{statistics.median(found):,.0f}", report.spread(found)] for name, found in rates.items()]
     alone, watched = (statistics.median(found) for found in rates.values())
-    text = (
-        "# Training speed\n\n"
-        f"`python -m benchmarks.training_speed --repeats {arguments.repeats} --total-timesteps "
-        f"{arguments.total_timesteps:g}`: the default recipe, 2 x 64 network. Environment steps per CPU "
-        "second, end to end; compilation apart.\n\n"
-        "| training | median | lowest to highest |\n|---|---|---|\n" + rows + "\n"
-        f"Checkpoints, evaluations, charts and MLflow, a new store included, cost "
-        f"{1.0 - watched / alone:.1%} (aim: at most {AIM_COST:.0%}). Aim with all of it: "
-        f"{AIM_STEPS_PER_S:,}.\n\n"
-        f"{cpu_name()}, {pinned}; {', '.join(f'{name} {number}' for name, number in versions().items())}.\n"
+    text = report.page(
+        "Training speed",
+        f"{report.command_line()}: the default recipe, 2 x 64 network, {arguments.total_timesteps:g} steps, "
+        f"{arguments.repeats} times. Environment steps per CPU second, end to end, without compilation.",
+        report.table("training | median | lowest to highest", rows),
+        "Checkpoints, evaluations, charts and MLflow, a new store included, cost "
+        f"{1.0 - watched / alone:.1%} "
+        f"(aim: at most {AIM_COST:.0%}). Aim with all of it: {AIM_STEPS_PER_S:,}.",
+        f"{pinned.capitalize()}. {report.provenance_line(report.provenance())}",
     )
-    write_atomically(arguments.out, text.encode())
-    print(text)
+    report.write_page(arguments.out, text)
     if watched < AIM_STEPS_PER_S or 1.0 - watched / alone > AIM_COST:
         raise SystemExit(1)
 

@@ -26,7 +26,7 @@ FORMAT = "flytrack-ppo-3"
 POLICY, TRAINING = "policy.", "training."  # prefixes of the arrays' names
 LARGEST_BYTES = 3 * 2**27
 LARGEST_HEADER_BYTES = 2**23  # the description of a track of ten thousand gates
-MOST_LAYERS, WIDEST = 64, 2**16  # of networks
+WIDEST = 2**16  # layer of a network
 MOST_DIFFERENCES = 12  # in one message
 
 Arrays = dict[str, np.ndarray]
@@ -175,10 +175,8 @@ def save_checkpoint(
     training: named arrays of what else training needs to continue; without, the file is a policy alone.
 
     Raises:
-        CheckpointError: a network that is larger than ``load_checkpoint`` takes.
         OSError: the file cannot be written.
     """
-    _check_network_size(path, config, description["observation_size"])
     meta = {
         "format": FORMAT,
         "package_version": flytrack_env.__version__,
@@ -190,10 +188,6 @@ def save_checkpoint(
     arrays = {name: np.ascontiguousarray(array).reshape(array.shape) for name, array in arrays.items()}
     text = json.dumps(meta)
     content = safetensors.numpy.save(arrays, {"meta": text, "sha256": checksum(text, arrays)})
-    if len(content) > LARGEST_BYTES:
-        raise CheckpointError(
-            f"{path}: found {len(content)} bytes to write, expected at most {LARGEST_BYTES}"
-        )
     write_atomically(path, content)
 
 
@@ -242,22 +236,13 @@ def _read_file(path: Path) -> tuple[dict[str, Any], Arrays]:
     return meta, arrays
 
 
-def _check_network_size(path: str | Path, config: Config, size: Any) -> None:
-    """Raise CheckpointError unless a network is small enough to be traced."""
-    widths = (size, len(config.initial_action), *config.hidden_sizes)
-    if not all(type(width) is int and 1 <= width <= WIDEST for width in widths) or len(widths) > MOST_LAYERS:
-        found = f"observation_size {quote_value(size)} and hidden_sizes {quote_value(config.hidden_sizes)}"
-        raise CheckpointError(
-            f"{path}: found {found}, expected at most {MOST_LAYERS} layers, 1 to {WIDEST} wide"
-        )
-
-
 def _build(path: Path, meta: dict[str, Any], arrays: Arrays) -> Checkpoint:
     """Return the checkpoint of a file's description and arrays, checked against each other."""
     config = Config(**read_settings("config", meta["config"]))
     config.check()
     size = meta["observation_size"]
-    _check_network_size(path, config, size)
+    if not all(type(width) is int and 1 <= width <= WIDEST for width in (size, *config.hidden_sizes)):
+        raise CheckpointError(f"{path}: found a network of widths {quote_value((size, config.hidden_sizes))}")
     for name in ("env_id", "track", "missed_gate"):
         if not isinstance(meta[name], str):
             raise CheckpointError(f"{path}: {name}: found {quote_value(meta[name])}, expected a string")

@@ -1,43 +1,21 @@
 """The position density chart: where evaluation flights spend their time."""
 
-import io
 from pathlib import Path
 
 import matplotlib
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 
 from flytrack_env.files import write_atomically
-from flytrack_env.tracks import Track, build_course
+from flytrack_env.pictures.drawing import draw_gates, label_from_above, png_of
+from flytrack_env.tracks import Track
 
 BIN_M = 0.1
 MARGIN_M = 3.0
-ARROW_M = 1.5
 SAMPLE_MS = 10.0
 LIMITS_MS = (0.1, 100.0)  # a few of many flights, to all of them on one line, lap after lap
 AXES, SCALE = (0.08, 0.06, 0.76, 0.89), (0.86, 0.15, 0.03, 0.7)  # left, bottom, width, height of the figure
-
-
-def draw_gates(axes: Axes, track: Track) -> None:
-    """Draw every gate from above: frame, opening, number in flying order, direction of flight."""
-    gates = build_course(track).gates
-    for index, gate in enumerate(track.gates):
-        centre = np.array(gate.position[:2])
-        forward = np.array([np.asarray(axis)[index] for axis in (gates.forward.x, gates.forward.y)])
-        across = np.array([-forward[1], forward[0]])
-        for edge, width, colour in ((gate.frame, 2, "0.35"), (gate.opening, 4, "tab:red")):
-            ends = np.stack([centre - 0.5 * edge * across, centre + 0.5 * edge * across])
-            axes.plot(*ends.T, color=colour, linewidth=width, solid_capstyle="butt")
-        axes.annotate(
-            "",
-            xy=tuple(centre + ARROW_M * forward),
-            xytext=tuple(centre),
-            arrowprops={"arrowstyle": "->", "color": "tab:red"},
-        )
-        label = centre + (0.5 * gate.frame + 0.7) * across
-        axes.text(label[0], label[1], str(index + 1), color="tab:red", ha="center", va="center")
 
 
 def count_positions(positions: np.ndarray, track: Track) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -73,13 +51,12 @@ def draw_position_density(
     )
     # Plain numbers: what parses the powers of ten keeps, in its exceptions, all that the callers hold.
     figure.colorbar(image, cax=scale, label="time per flight in 0.1 m x 0.1 m (ms)", format="%g")
-    draw_gates(axes, track)
+    draw_gates(axes, track, [0, 1])
+    label_from_above(axes, track)
     axes.plot(*track.start_position[:2], "o", color="white", markersize=5)
     axes.text(track.start_position[0], track.start_position[1] - 0.8, "start", color="white")
     outside = 1.0 - counts.sum() / max(len(positions), 1)
     parts = (track.name, label, f"{outside:.1%} of the time outside the chart" if outside > 0.0 else "")
     axes.set(xlabel="x (m)", ylabel="y (m)", aspect="equal")
     axes.set_title("Position density: " + ", ".join(filter(None, parts)))
-    content = io.BytesIO()
-    figure.savefig(content, format="png", dpi=100)
-    write_atomically(path, content.getvalue())
+    write_atomically(path, png_of(figure, dpi=100))

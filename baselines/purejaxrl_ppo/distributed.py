@@ -7,7 +7,7 @@ gradient step.
 
 import hashlib
 import json
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 from jax.experimental import multihost_utils
@@ -21,56 +21,31 @@ from baselines.purejaxrl_ppo.ppo import Algorithm, Metrics, Runner
 REPLICATED, SHARDED = PartitionSpec(), PartitionSpec(AXIS)
 LAYOUT = Runner(REPLICATED, SHARDED, SHARDED, SHARDED, REPLICATED)  # type: ignore[arg-type]
 HEARTBEAT_TIMEOUT_S = 30  # a process that is silent for longer counts as lost
-FLAGS = "--coordinator, --num-processes, --process-index"
 
 
-class Job(NamedTuple):
-    """How to reach the processes of a training; all None: as SLURM or Open MPI say.
-
-    coordinator: HOST:PORT of the first process. num_processes: their number. process: index of this one.
-    """
-
-    coordinator: str | None = None
-    num_processes: int | None = None
-    process: int | None = None
-
-    def check(self) -> None:
-        """Raise ValueError, naming the flag, unless this is a job."""
-        if self.coordinator is None or self.num_processes is None or self.process is None:
-            if self != Job():
-                raise ValueError(f"--distributed: found some of {FLAGS}, expected all of them or none")
-            return
-        host, _, port = self.coordinator.rpartition(":")
-        if not host or not port.isdecimal():
-            raise ValueError(f"--coordinator: found {self.coordinator!r}, expected HOST:PORT")
-        if self.num_processes < 1:
-            raise ValueError(f"--num-processes: found {self.num_processes}, expected at least 1")
-        if not 0 <= self.process < self.num_processes:
-            raise ValueError(f"--process-index: found {self.process}, expected 0 to {self.num_processes - 1}")
-
-
-def join(job: Job) -> None:
+def join(coordinator: str | None, num_processes: int | None, process: int | None) -> None:
     """Connect to the other processes; a process without a job stays alone with its several devices.
 
     All arrays that exist become unusable: JAX computes once at import, and can be connected only before.
 
+    coordinator: HOST:PORT of the first process. num_processes: their number. process: index of this one. All
+    None: as SLURM or Open MPI say.
+
     Raises:
         ValueError: neither a job nor several devices, or other processes that cannot be reached.
     """
-    job.check()
+    job = (coordinator, num_processes, process)
     clear_backends()
     try:
         jax.distributed.initialize(
             *job, heartbeat_timeout_seconds=HEARTBEAT_TIMEOUT_S, shutdown_timeout_seconds=HEARTBEAT_TIMEOUT_S
         )
-    except ValueError as error:
-        if job != Job() or jax.device_count() == 1:
+    except (ValueError, RuntimeError) as error:
+        if any(part is not None for part in job) or jax.device_count() == 1:
             raise ValueError(
-                f"--distributed: found no job of SLURM or Open MPI, and one device ({error}); expected "
-                f"a job, several devices, or {FLAGS}"
+                f"--distributed: {error}; expected a job of SLURM or Open MPI, several devices, or all of "
+                "--coordinator HOST:PORT, --num-processes, --process-index"
             ) from error
-    except RuntimeError as error:
-        raise ValueError(f"--distributed: {job.coordinator}: {error}") from error
 
 
 def all_devices() -> Mesh:

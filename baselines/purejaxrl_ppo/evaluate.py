@@ -2,7 +2,6 @@
 
 import dataclasses
 import json
-import os
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -110,26 +109,12 @@ class EvaluationSettings:
                 raise ValueError(f"--{name}: found {value}, expected {low} to {high}")
         if self.rrd is not None and not can_record():
             raise ValueError(f"--rrd: {CANNOT_RECORD}")
-        self._check_paths()
-
-    def _check_paths(self) -> None:
-        """Raise ValueError for files that cannot be written or would overwrite another one."""
-        taken = {path.resolve(): "an input" for path in (self.checkpoint, self.black_box) if path is not None}
-        outputs = [
-            ("--out", self.out),
-            ("--ghost", self.ghost_path),
-            ("--rrd", self.rrd),
-            ("--json", self.json),
-        ]
-        for flag, path in outputs:
-            if path is None:
-                continue
-            if path.resolve() in taken:
-                raise ValueError(f"{flag}: found {path}, which is {taken[path.resolve()]}, expected another")
-            taken[path.resolve()] = f"the file of {flag}"
-            nearest = next(folder for folder in path.absolute().parents if folder.exists())
-            if path.is_dir() or not nearest.is_dir() or not os.access(nearest, os.W_OK):
-                raise ValueError(f"{flag}: {path}: cannot be written, expected a file in a writable folder")
+        outputs = (self.out, self.ghost_path, self.rrd, self.json)
+        used = [path.resolve() for path in (self.checkpoint, self.black_box, *outputs) if path is not None]
+        if len(set(used)) < len(used):
+            raise ValueError(
+                "--out, --rrd, --json: found a file that is read or written twice, expected another"
+            )
 
 
 class Scene(NamedTuple):

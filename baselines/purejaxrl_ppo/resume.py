@@ -203,50 +203,33 @@ def load_start(path: Path) -> Start:
     Raises:
         CheckpointError: a file that cannot be used, or a policy alone.
     """
-    checkpoint = load_checkpoint(path)
-    if checkpoint.training is None:
+    start = Start(path, load_checkpoint(path))
+    if start.checkpoint.training is None:
         raise CheckpointError(f"{path}: found a policy alone, expected one with its training")
-    for name, (is_valid, expected) in PROGRESS.items():
-        value = checkpoint.meta.get(name)
-        if not is_valid(value):
-            raise CheckpointError(f"{path}: {name}: found {quote_value(value)}, expected {expected}")
-    steps, batch_size = checkpoint.meta["steps"], checkpoint.config.batch_size
-    if steps % batch_size or steps > checkpoint.config.num_updates * batch_size:
-        raise CheckpointError(
-            f"{path}: steps: found {steps}, expected a multiple of {batch_size}, the steps of an update, "
-            f"and at most {checkpoint.config.num_updates * batch_size}"
-        )
-    return Start(path, checkpoint)
+    _check_meta(start)
+    return start
 
 
 def _is_number(value: Any) -> bool:
     return type(value) in (int, float) and abs(value) <= sys.float_info.max
 
 
-def _is_number_or_none(value: Any) -> bool:
-    return value is None or _is_number(value)
-
-
-def _is_count(value: Any) -> bool:
-    return type(value) is int and 0 <= value < 2**63
-
-
-def _are_rewards(value: Any) -> bool:
-    return isinstance(value, dict) and all(
-        _is_number(weight) for name, weight in value.items() if name.startswith(REWARD)
+def _check_meta(start: Start) -> None:
+    """Raise CheckpointError for fields that are used before the checkpoint is compared with the run."""
+    meta, config = start.checkpoint.meta, start.checkpoint.config
+    counts, numbers = ("steps", "seed"), ("seconds", "success", "best_lap_s")
+    valid = {name: type(meta.get(name)) is int and 0 <= meta[name] < 2**63 for name in counts}
+    valid |= {name: meta.get(name) is None or _is_number(meta[name]) for name in numbers}
+    valid |= {name: isinstance(meta.get(name), dict) for name in ("model", "environment")}
+    valid["environment"] &= valid["environment"] and all(
+        map(_is_number, rewards_of(start.checkpoint).values())
     )
-
-
-# Fields that are used before a checkpoint is compared with the run that continues.
-PROGRESS = {
-    "steps": (_is_count, "a whole number"),
-    "seed": (_is_count, "a whole number"),
-    "seconds": (_is_number, "a number"),
-    "success": (_is_number_or_none, "a number"),
-    "best_lap_s": (_is_number_or_none, "a number"),
-    "model": (lambda value: isinstance(value, dict), "an object"),
-    "environment": (_are_rewards, "an object, with numbers for weights of the reward"),
-}
+    valid["steps"] &= valid["steps"] and meta["steps"] in range(
+        0, config.total_timesteps + 1, config.batch_size
+    )
+    for name, is_valid in valid.items():
+        if not is_valid:
+            raise CheckpointError(f"{start.path}: {name}: found {quote_value(meta.get(name))}")
 
 
 def rewards_of(checkpoint: Checkpoint) -> dict[str, float]:

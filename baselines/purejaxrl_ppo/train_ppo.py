@@ -11,8 +11,8 @@ import jax
 import tyro
 
 from baselines.purejaxrl_ppo.checkpoint import CheckpointError
-from baselines.purejaxrl_ppo.config import Config, Count, read_value, settings_in_file
-from baselines.purejaxrl_ppo.distributed import Job, all_devices, is_first, join
+from baselines.purejaxrl_ppo.config import Config, Count, settings_in_file
+from baselines.purejaxrl_ppo.distributed import all_devices, is_first, join
 from baselines.purejaxrl_ppo.resume import (
     FINAL,
     Start,
@@ -170,20 +170,15 @@ def saved_options(start: Start) -> Options:
     """Return the options that a checkpoint was written with.
 
     Raises:
-        ConfigError: values of another type.
+        CheckpointError: values that are not options.
     """
-    values = start.checkpoint.meta.get("options")
-    where = f"{start.path}: options"
-    if not isinstance(values, dict):
-        return DEFAULTS
-    kinds: dict[str, Any] = {"checkpoint_every": int, "evaluate_every": int, "evaluation_episodes": int}
-    kinds["seeds"] = tuple[int, ...]
-    known = {
-        name: None if values.get(name) is None else read_value(f"{where}.{name}", kind, values[name])
-        for name, kind in kinds.items()
-    }
-    uri = values.get("tracking_uri")
-    return Options(**known | {"seeds": known["seeds"] or ()}, tracking_uri=None if uri is None else str(uri))
+    try:
+        values = start.checkpoint.meta["options"]
+        options = Options(**{**values, "seeds": tuple(map(int, values["seeds"]))})
+        options.check()
+    except (KeyError, TypeError, ValueError) as error:
+        raise CheckpointError(f"{start.path}: options: {error_text(error)}") from error
+    return options
 
 
 def defaults_of(resumed: Resumed) -> Settings:
@@ -212,11 +207,8 @@ def parse(words: Sequence[str]) -> tuple[Settings, Resumed | None]:
         ValueError: a file that cannot be used, or processes that cannot be reached.
     """
     sources, _ = tyro.cli(Sources, args=words, prog=PROG, add_help=False, return_unknown_args=True)
-    job = Job(sources.coordinator, sources.num_processes, sources.process_index)
     if sources.distributed:
-        join(job)
-    elif job != Job():
-        raise ValueError("--coordinator, --num-processes, --process-index: expected --distributed as well")
+        join(sources.coordinator, sources.num_processes, sources.process_index)
     resumed = None if sources.resume is None else find_starts(sources.resume)
     defaults = Settings() if resumed is None else defaults_of(resumed)
     if sources.config is not None:

@@ -151,12 +151,9 @@ def own_start(task: Task) -> Start | None:
 
 
 def group_by_progress(ready: list[Ready]) -> list[list[Ready]]:
-    """Return the runs that can share a loop: as far as each other, stored and evaluated as often."""
-    groups: dict[tuple[int | None, ...], list[Ready]] = {}
-    for one in ready:
-        options = one.run.options
-        groups.setdefault((one.update, options.checkpoint_every, options.evaluate_every), []).append(one)
-    return list(groups.values())
+    """Return the runs that can share a loop: all of them, unless some are further than others."""
+    are_together = len({(one.update, one.run.options._replace(resume=None)) for one in ready}) == 1
+    return [ready] if are_together else [[one] for one in ready]
 
 
 def train_group(trainer: Trainer, group: list[Ready]) -> None:

@@ -17,7 +17,7 @@ import flytrack_env
 from baselines.purejaxrl_ppo import Config, load_checkpoint
 from baselines.purejaxrl_ppo.checkpoint import as_named_arrays
 from baselines.purejaxrl_ppo.collectives import AXIS, Collectives
-from baselines.purejaxrl_ppo.distributed import Job, check_divides, digest
+from baselines.purejaxrl_ppo.distributed import check_divides, digest
 from baselines.purejaxrl_ppo.ppo import Batch, make_network_for, ppo_loss
 from baselines.purejaxrl_ppo.resume import checkpoints_in, newest_intact
 from tests.support.ppo_runs import BATCH, CONFIG
@@ -84,20 +84,6 @@ def test_the_same_values_have_the_same_number_that_devices_can_compare():
     numbers = [digest([{"a": value, "b": Path("x")}]) for value in range(50)]
     assert len(set(numbers)) == 50 and min(numbers) >= 0 and 2**30 < max(numbers) < 2**31
     assert digest([{"b": Path("x"), "a": 0}]) == numbers[0]
-
-
-@pytest.mark.parametrize(
-    ("job", "message"),
-    [
-        (Job("a:1"), "found some of --coordinator, --num-processes, --process-index, expected all"),
-        (Job("a", 2, 0), "found 'a', expected HOST:PORT"),
-        (Job("a:1", 0, 0), "expected at least 1"),
-        (Job("a:1", 2, 2), "found 2, expected 0 to 1"),
-    ],
-)
-def test_what_is_not_a_job_is_refused(job, message):
-    with pytest.raises(ValueError, match=message):
-        job.check()
 
 
 # Whole processes.
@@ -218,6 +204,4 @@ def test_one_device_alone_is_no_job(tmp_path):
         env={**os.environ, "JAX_PLATFORMS": "cpu"},
     )
     assert process.returncode == 2 and not (tmp_path / "x").exists()
-    assert (
-        "train_ppo: error: --distributed: found no job of SLURM or Open MPI, and one device" in process.stderr
-    )
+    assert "expected a job of SLURM or Open MPI, several devices, or all of --coordinator" in process.stderr

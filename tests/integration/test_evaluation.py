@@ -260,10 +260,8 @@ def bad_files(tmp_path_factory: pytest.TempPathFactory) -> Path:
         (["--black-box", "no.bin"], ["no.bin"]),
         (["--track", "nowhere"], ["nowhere", "flytrack"]),
         (["--track", "random.toml", "--ghost"], ["found no 'random", "expected one of", "flytrack_nominal"]),
-        (["--out", "policy.safetensors"], ["--out: found policy.safetensors, which is an input"]),
-        (["--json", "file/report.json"], ["--json", "cannot be written"]),
-        (["--json", "rollout_ghost.npy"], ["--json", "which is the file of --ghost"]),
-        (["--rrd", "."], ["--rrd", "cannot be written"]),
+        (["--out", "policy.safetensors"], ["--out", "read or written twice"]),
+        (["--json", "rollout_ghost.npy"], ["--json", "read or written twice"]),
         (["--checkpoint", "file"], ["file", "not a checkpoint"]),
     ],
 )

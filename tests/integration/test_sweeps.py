@@ -10,7 +10,7 @@ import pytest
 from baselines.purejaxrl_ppo import load_checkpoint
 from baselines.purejaxrl_ppo.config import ConfigError
 from baselines.purejaxrl_ppo.sweeps.__main__ import parse, prepare
-from baselines.purejaxrl_ppo.sweeps.space import for_tune, points_of, read_space
+from baselines.purejaxrl_ppo.sweeps.space import for_tune, read_space
 
 ROOT = Path(__file__).parents[2]
 BATCH = 16 * 24
@@ -28,7 +28,6 @@ def test_a_space_is_read_and_drawn_from(tmp_path):
     text = "[learning_rate]\nloguniform = [1e-4, 1e-2]\n[hidden_sizes]\nchoice = [[8], [64, 64]]\n"
     space = read_space(written(tmp_path, text + "[num_steps]\ngrid_search = [32, 64.0]\n"))
     assert space["hidden_sizes"]["choice"] == [(8,), (64, 64)]
-    assert points_of(space) == 2 and points_of({}) == 1
     drawn = for_tune(space)
     assert drawn["num_steps"] == {"grid_search": [32, 64]}
     rates = [drawn["learning_rate"].sample() for _ in range(100)]
@@ -87,7 +86,6 @@ def test_a_local_sweep(tmp_path):
     )
     assert done.returncode == 0, done.stderr
     assert "best: " in done.stdout and "config/learning_rate" in done.stdout
-    assert "2/2" in done.stderr and "Warning" not in done.stderr
     table = (out / "sweep.csv").read_text()
     assert "evaluation_success" in table.splitlines()[0] and len(table.splitlines()) == 3
     rates = [load_checkpoint(out / f"trial{n}" / "final.safetensors").config.learning_rate for n in (0, 1)]

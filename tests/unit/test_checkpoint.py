@@ -117,8 +117,6 @@ def test_a_file_that_is_too_large_is_not_read(path, params, monkeypatch):
     monkeypatch.setattr(checkpoint_module, "LARGEST_BYTES", 3000)
     with pytest.raises(CheckpointError, match="expected at most 3000"):
         load_checkpoint(path)
-    with pytest.raises(CheckpointError, match=r"found \d+ bytes to write, expected at most 3000"):
-        save_checkpoint(path, params, CONFIG, DESCRIPTION)
 
 
 @pytest.mark.parametrize("kept", [7, 100, 0.5, 0.99])
@@ -143,11 +141,10 @@ def test_every_flipped_bit_is_noticed(path):
     ("name", "value", "reason"),
     [
         ("format", "flytrack-ppo-9", "format: found 'flytrack-ppo-9', expected 'flytrack-ppo-3'"),
-        ("observation_size", 10**12, "found observation_size 1000000000000 and hidden_sizes"),
-        ("observation_size", "5", "found observation_size '5'"),
+        ("observation_size", 10**12, r"found a network of widths \(1000000000000, "),
+        ("observation_size", "5", "found a network of widths"),
         ("config", [1, 2], "config: found .*, expected an object"),
-        ("config", {"hidden_sizes": [8] * 1000}, "expected at most 64 layers"),
-        ("config", {"hidden_sizes": [10**9]}, "expected at most 64 layers, 1 to 65536 wide"),
+        ("config", {"hidden_sizes": [10**9]}, "found a network of widths"),
         ("config", {"learning_rate": 10**400}, "learning_rate: found 1000.*, expected a finite number"),
         ("config", {"num_minibatches": 7}, "num_minibatches: found 7, expected a divisor"),
         ("track", ["x" * 999] * 999, "track: found .{1,200}, expected a string"),

@@ -17,11 +17,10 @@ import ray
 import tyro
 from ray import tune
 from ray.tune import ResultGrid
-from tqdm import tqdm
 
 from baselines.purejaxrl_ppo.config import Config, ConfigError, settings_in_file
 from baselines.purejaxrl_ppo.run import Options
-from baselines.purejaxrl_ppo.sweeps.space import Space, for_tune, points_of, read_space
+from baselines.purejaxrl_ppo.sweeps.space import Space, for_tune, read_space
 from baselines.purejaxrl_ppo.tracking import Tracker, local_uri
 from baselines.purejaxrl_ppo.training import Trainer
 from flytrack_env.files import write_atomically
@@ -76,21 +75,6 @@ class Base(NamedTuple):
     options: Options
 
 
-class Bar(tune.Callback):
-    """Counts the trials that have ended."""
-
-    def __init__(self, number: int):
-        self.bar = tqdm(total=number, unit="trial")
-
-    def on_trial_complete(self, iteration: int, trials: Any, trial: Any, **info: Any) -> None:
-        """Count a trial."""
-        self.bar.update()
-
-    def on_trial_error(self, iteration: int, trials: Any, trial: Any, **info: Any) -> None:
-        """Count a trial that failed."""
-        self.bar.update()
-
-
 def parse(words: list[str]) -> Settings:
     """Return the settings of a command line.
 
@@ -129,11 +113,6 @@ def prepare(settings: Settings) -> tuple[Base, Space]:
     return Base(out, config, settings.seed, settings.env_id, env_arguments, options), space
 
 
-def trial_name(trial: Any) -> str:
-    """Return the folder of a trial: Ray numbers trials at the end of their ids."""
-    return f"trial{int(trial.trial_id.rsplit('_', 1)[-1])}"
-
-
 def run_trial(drawn: dict[str, Any], base: Base) -> None:
     """Train with drawn settings in a process of its own, and report every evaluation to Ray Tune."""
 
@@ -154,7 +133,6 @@ def run_trials(base: Base, space: Space, settings: Settings) -> ResultGrid:
         # JAX warns of any fork; Ray's become other programs at once.
         warnings.filterwarnings("ignore", r"os\.fork\(\) was called", RuntimeWarning)
         ray.init(include_dashboard=False, log_to_driver=False, logging_level=logging.ERROR)
-    bar = Bar(settings.trials * points_of(space))
     try:
         tuner = tune.Tuner(
             tune.with_resources(tune.with_parameters(run_trial, base=base), resources),
@@ -162,13 +140,12 @@ def run_trials(base: Base, space: Space, settings: Settings) -> ResultGrid:
             tune_config=tune.TuneConfig(
                 num_samples=settings.trials,
                 search_alg=tune.search.BasicVariantGenerator(random_state=settings.seed),
-                trial_dirname_creator=trial_name,
+                trial_dirname_creator=lambda trial: f"trial{int(trial.trial_id.rsplit('_', 1)[-1])}",
             ),
-            run_config=tune.RunConfig(name="ray", storage_path=str(base.out), verbose=0, callbacks=[bar]),
+            run_config=tune.RunConfig(name="ray", storage_path=str(base.out), verbose=1),
         )
         return tuner.fit()
     finally:
-        bar.bar.close()
         ray.shutdown()
 
 

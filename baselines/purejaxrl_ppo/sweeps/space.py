@@ -1,7 +1,6 @@
 """The search space of a sweep: a TOML file that defines, for each setting, how Ray Tune draws its values."""
 
 import inspect
-import math
 import typing
 from pathlib import Path
 from typing import Any
@@ -70,8 +69,3 @@ def for_tune(space: Space) -> dict[str, Any]:
         make = getattr(tune, kind)
         parts[name] = make(values) if kind in LISTS else make(*values)
     return parts
-
-
-def points_of(space: Space) -> int:
-    """Return the number of points of a space's grid, 1 without a grid."""
-    return math.prod(len(entry["grid_search"]) for entry in space.values() if "grid_search" in entry)
