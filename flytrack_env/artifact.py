@@ -16,7 +16,6 @@ from jax.interpreters.mlir import make_ir_context
 
 # Custom calls that XLA knows: they annotate values and are gone after compilation.
 HARMLESS_CALLS = ("Sharding", "SPMDFullToShardShape", "SPMDShardToFullShape", "annotate_device_placement")
-COMMUNICATION = ("stablehlo.infeed", "stablehlo.outfeed", "stablehlo.send", "stablehlo.recv")
 LONGEST_TEXT = 500  # characters quoted from a file, or from an error message that it may have written
 MOST_NAMED = 5
 # The compiler recurses into nested loops and calls, and overflows its stack at some depth. A file is tried
@@ -80,36 +79,25 @@ def _operations(operation: Any) -> Iterator[Any]:
         pending += [inner.operation for region in current.regions for block in region for inner in block]
 
 
-def _side_effect(operation: Any, is_trusted: bool) -> str | None:
-    """Return what an operation does beside arithmetic on its inputs, None if nothing."""
-    if operation.name in COMMUNICATION:
-        return str(operation.name)
-    if operation.name != "stablehlo.custom_call":
-        return None
-    target = ir.StringAttr(operation.attributes["call_target_name"]).value
-    is_allowed = "callback" not in target if is_trusted else target in HARMLESS_CALLS
-    return None if is_allowed else f"a call of {target}"
-
-
 def check_pure(content: bytes, exported: export.Exported, is_trusted: bool) -> None:
-    """Raise ArtifactError if an artifact has side effects or calls native code other than its own.
+    """Raise ArtifactError if an artifact calls native code other than its own.
 
     is_trusted: allow native calls, such as those of LAPACK, but no callbacks into Python.
     """
-    effects = [str(effect) for effect in exported.ordered_effects + exported.unordered_effects]
     try:
         with make_ir_context():
             module = mlir.deserialize_portable_artifact(exported.mlir_module_serialized)
-            effects += [
-                effect
+            targets = dict.fromkeys(
+                ir.StringAttr(operation.attributes["call_target_name"]).value
                 for operation in _operations(module.operation)
-                if (effect := _side_effect(operation, is_trusted)) is not None
-            ]
+                if operation.name == "stablehlo.custom_call"
+            )
     except Exception as error:  # the program is parsed here for the first time
         raise _not_readable(content, error) from error
-    if effects:
-        listed = _printable(", ".join(list(dict.fromkeys(effects))[:MOST_NAMED]))
-        raise ArtifactError(f"found {listed}, expected a pure function that calls nothing")
+    refused = [name for name in targets if "callback" in name or not (is_trusted or name in HARMLESS_CALLS)]
+    if refused:
+        listed = _printable(", ".join(refused[:MOST_NAMED]))
+        raise ArtifactError(f"found a call of {listed}, expected a pure function that calls nothing")
 
 
 def call(exported: export.Exported, state: jax.Array, action: jax.Array) -> jax.Array:

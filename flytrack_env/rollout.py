@@ -98,10 +98,8 @@ def load_named_rollouts(
     names = [file.stem for file in files]
     if len(set(names)) < len(names):
         names = [f"{file.resolve().parent.name}_{file.stem}" for file in files]
-    for number, name in enumerate(names):
-        if name in names[:number]:
-            first = files[names.index(name)]
-            raise RolloutError(f"{files[number]}: found the name {name!r}, which {first} has as well")
+    if len(set(names)) < len(names):
+        raise RolloutError(f"found files of the same names: {', '.join(names)}; expected different ones")
     return {name: load_rollout(file, allow_pickle) for name, file in zip(names, files, strict=True)}
 
 

@@ -286,7 +286,7 @@ def test_command_shows_rollouts_beside_the_ghost(tmp_path, capsys):
 @pytest.mark.parametrize(
     ("arguments", "reason"),
     [
-        (["a.npy", "a.npy"], "found the name"),
+        (["a.npy", "a.npy"], "found files of the same names"),
         (["pickled.npy"], "pickled"),
         (["--serve", "absent.rrd"], "absent.rrd: cannot be read"),
         (["a.npy", "--serve", "b.rrd"], "rollouts: found them beside --serve"),
