@@ -4,7 +4,6 @@ import itertools
 import os
 import secrets
 import stat
-from collections.abc import Iterable
 from pathlib import Path
 from typing import BinaryIO
 
@@ -37,41 +36,22 @@ def write_atomically(path: str | Path, content: bytes) -> None:
     """Write a file under a temporary name beside it and rename it; makes missing folders.
 
     Raises:
-        OSError: what the system says; nothing half-written is left.
+        OSError: the path is a folder or a device, or an error of the operating system; nothing is left then.
     """
-    write_together([(path, content)])
-
-
-def write_together(files: Iterable[tuple[str | Path, bytes]]) -> None:
-    """Write files as ``write_atomically``, and rename them one after the other when all are written.
-
-    files: of path and content, read one by one.
-
-    Raises:
-        OSError: what the system says; of files that were not there before, none is left.
-    """
-    renames: list[tuple[Path, Path]] = []
-    new: list[Path] = []
+    path = Path(os.path.realpath(path))  # a link stays one
+    if path.exists() and not path.is_file():
+        raise OSError(f"{path}: found a folder or a device, expected a regular file or a new path")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    # Not tempfile: its files are private to the user, and these are ordinary ones.
+    temporary = path.with_name(f".{path.name}.{secrets.token_hex(8)}")
     try:
-        for name, content in files:
-            path = Path(os.path.realpath(name))  # a link stays one
-            if path.exists() and not path.is_file():
-                raise OSError(f"{path}: found a folder or a device, expected a regular file or a new path")
-            path.parent.mkdir(parents=True, exist_ok=True)
-            # Not tempfile: its files are private to the user, and these are ordinary ones.
-            temporary = path.with_name(f".{path.name}.{secrets.token_hex(8)}")
-            renames.append((temporary, path))
-            with temporary.open("xb") as file:
-                file.write(content)
-                file.flush()
-                os.fsync(file.fileno())  # else a loss of power can leave the new name with no content
-        for temporary, path in renames:
-            is_new = not path.exists()
-            os.replace(temporary, path)
-            new += [path] if is_new else []
+        with temporary.open("xb") as file:
+            file.write(content)
+            file.flush()
+            os.fsync(file.fileno())  # else a loss of power can leave the new name with no content
+        os.replace(temporary, path)
     except BaseException:
-        for path in (*new, *(temporary for temporary, _ in renames)):
-            path.unlink(missing_ok=True)
+        temporary.unlink(missing_ok=True)
         raise
 
 

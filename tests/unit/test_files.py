@@ -1,29 +1,24 @@
-"""Files written together or not at all, and new folders."""
+"""Files written atomically, and new folders."""
 
 import os
 from concurrent.futures import ThreadPoolExecutor
+from unittest.mock import Mock
 
 import pytest
 
-from flytrack_env.files import fresh_folder, write_together
+from flytrack_env.files import fresh_folder, write_atomically
 
 
-def test_files_that_cannot_be_renamed_leave_none_that_is_new(tmp_path, monkeypatch):
-    paths = [tmp_path / name for name in ("old", "new", "last")]
-    paths[0].write_bytes(b"before")
-    replace = os.replace
-
-    def fail(source, target):
-        if target == paths[2]:
-            raise OSError("no more")
-        replace(source, target)
-
+def test_a_failed_write_leaves_the_old_file_and_nothing_else(tmp_path, monkeypatch):
+    path = tmp_path / "new" / "file"
+    write_atomically(path, b"before")
     with monkeypatch.context() as patch, pytest.raises(OSError, match="no more"):
-        patch.setattr(os, "replace", fail)
-        write_together((path, b"after") for path in paths)
-    assert [path.name for path in tmp_path.iterdir()] == ["old"]
-    write_together((path, b"after") for path in paths)
-    assert {path.read_bytes() for path in tmp_path.iterdir()} == {b"after"}
+        patch.setattr(os, "replace", Mock(side_effect=OSError("no more")))
+        write_atomically(path, b"after")
+    assert path.read_bytes() == b"before" and os.listdir(path.parent) == ["file"]
+    (tmp_path / "link").symlink_to(path)
+    write_atomically(tmp_path / "link", b"after")
+    assert path.read_bytes() == b"after" and (tmp_path / "link").is_symlink()
 
 
 def test_fresh_folders_are_new(tmp_path):

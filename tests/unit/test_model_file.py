@@ -1,10 +1,7 @@
 """Model files: written, read, and refused in words."""
 
 import json
-import os
 import re
-from collections.abc import Iterator
-from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -137,29 +134,3 @@ def test_bad_values_are_refused(name: str, value: Any, reason: str, tmp_path: Pa
     expected = rf"^{re.escape(str(path))}: {name}: found .{{1,300}}, expected .*{reason}"
     with pytest.raises(ModelFileError, match=expected):
         load_model(path)
-
-
-@contextmanager
-def failing_rename() -> Iterator[None]:
-    """Let ``os.replace`` fail."""
-
-    def fail(*arguments: Any, **keywords: Any) -> None:
-        raise OSError("not permitted")
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(os, "replace", fail)
-        yield
-
-
-@pytest.mark.parametrize(
-    ("trouble", "provenance"),
-    [(failing_rename, {}), (nullcontext, {"not JSON": object()})],
-)
-def test_a_failed_write_leaves_the_old_file(trouble: Any, provenance: dict[str, Any], tmp_path: Path) -> None:
-    path = tmp_path / "model.json"
-    save_model(path, nominal_parameters(), {})
-    old = path.read_bytes()
-    with pytest.raises((OSError, TypeError)), trouble():
-        save_model(path, nominal_parameters()._replace(m=9.0), provenance)
-    assert path.read_bytes() == old
-    assert [entry.name for entry in tmp_path.iterdir()] == ["model.json"]
