@@ -29,16 +29,15 @@ FLY_EVERY_ID = """
 import gymnasium, gymnax, jax, flytrack_env
 for env_id in flytrack_env.registration.ENVIRONMENTS:
     env, params = gymnax.make(env_id)
-    observation, state = env.reset(jax.random.key(0), params)
-    env.step(jax.random.key(1), state, env.action_space(params).sample(jax.random.key(2)), params)
+    key = jax.random.key(0)
+    env.step(key, env.reset(key, params)[1], env.action_space(params).sample(key), params)
     envs = gymnasium.make_vec(f"flytrack_env:{env_id}", num_envs=3, vectorization_mode="vector_entry_point")
     assert envs.reset(seed=0)[0].shape == envs.step(envs.action_space.sample())[0].shape
 """
 MISSING_EXTRA_IS_NAMED = """
 import importlib
 from pytest import raises
-modules = {"sysid": "flytrack_sysid", "train": "baselines.purejaxrl_ppo", "viz": "flytrack_env.viz_rerun"}
-for extra, module in modules.items():
+for extra, module in (("sysid", "flytrack_sysid"), ("train", "baselines.purejaxrl_ppo")):
     with raises(ImportError, match=rf"pip install 'flytrack\\[{extra}\\]'"):
         importlib.import_module(module)
 """
@@ -58,17 +57,15 @@ save_rollout("flight.npy", *map(np.asarray, ghost_rollout(ghost, 400)))
 RENDER = """
 import gymnasium
 from gymnasium.wrappers import RecordVideo
-film = gymnasium.make("flytrack_env:FlyTrack-v0", render_mode="rgb_array")
-window = gymnasium.make("FlyTrack-v0", render_mode="human")
+film, window = (gymnasium.make("flytrack_env:FlyTrack-v0", render_mode=m) for m in ("rgb_array", "human"))
 for env in (RecordVideo(film, "videos", lambda number: True, video_length=30), window):
     env.reset(seed=0)
-    [env.step(env.action_space.sample()) for _ in range(40)]
+    env.step(env.action_space.sample())
     env.close()
 """
-L2F = "from benchmarks.env_speed import l2f_contestant; l2f_contestant('l2f', 1024, 8).run()"
 SIZES = "--num-envs 16 --num-steps 32 --num-minibatches 4 --total-timesteps 1024 --hidden-sizes 8"
 
-# What each extra is for: modules with their arguments, or code.
+# What each extra is for: modules with their arguments, or code. [bench] compiles for ten minutes, in 4 GB.
 USES = {
     "": (FLY_EVERY_ID, MISSING_EXTRA_IS_NAMED),
     "train": (f"-m baselines.purejaxrl_ppo.train_ppo {SIZES} --out small", LOAD_CHAMPION),
@@ -87,7 +84,7 @@ USES = {
     ),
     "render": (RENDER,),
     "optimal": ("-m benchmarks.time_optimal --tracks speedway --kinds flying --out made",),
-    "bench": (L2F,),  # compiles l2f for ten minutes, in 4 GB
+    "bench": ("from benchmarks.env_speed import l2f_contestant as l2f; l2f('l2f', 1024, 8).run()",),
 }
 WITH_CHECKOUT = ("logs", "optimal", "bench")  # use files that the wheel does not have:
 COPIED = ("benchmarks", "blackbox", "tests", "pyproject.toml")
@@ -111,8 +108,7 @@ def contents(session: nox.Session) -> None:
         in_wheel = {name for name in archive.namelist() if ".dist-info/" not in name}
     with tarfile.open(source) as archive:
         in_source = {entry.name.partition("/")[2] for entry in archive if entry.isfile()}
-    in_packages = {path for path in tracked if path.startswith(PACKAGES)}
-    if difference := in_wheel ^ in_packages:
+    if difference := in_wheel ^ {path for path in tracked if path.startswith(PACKAGES)}:
         session.error(f"{wheel.name}: differs from the repository in {sorted(difference)}")
     if missing := tracked - in_source - {".gitignore", ".ci/run"}:
         session.error(f"{source.name}: lacks {sorted(missing)}")
