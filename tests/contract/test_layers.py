@@ -122,10 +122,6 @@ def test_consumers_use_public_names_of_the_package(path: Path) -> None:
         )
 
 
-# Imports, (importer, imported), that still close a circle; each is to go.
-KNOWN_CIRCLES = [
-    ("benchmarks.diagnosis", "benchmarks.diagnosis_page"),
-]
 REPOSITORY = (PACKAGE, *CONSUMERS)
 
 
@@ -155,14 +151,8 @@ def find_circle(graph: dict[str, set[str]]) -> list[str]:
 
 
 def test_no_modules_import_each_other_in_a_circle() -> None:
-    graph = import_graph()
-    for importer, imported in KNOWN_CIRCLES:
-        graph[importer].discard(imported)
-    circle = find_circle(graph)
+    circle = find_circle(import_graph())
     assert not circle, " -> ".join(circle)
-    for importer, imported in KNOWN_CIRCLES:
-        closed = {**graph, importer: graph[importer] | {imported}}
-        assert find_circle(closed), f"{importer} -> {imported} closes no circle: remove it from KNOWN_CIRCLES"
 
 
 def test_this_test_sees_imports() -> None:
