@@ -197,7 +197,7 @@ def test_scripted_flights_excite_all_effects(scripted: list[FlightLog]) -> None:
         assert log["u"][:, 3].max() > 0.3 and log["u"][:, 3].min() < -0.8
 
 
-def test_other_kinds_of_flights() -> None:
+def test_other_kinds_of_flights_and_crashes() -> None:
     logs = {kind: flown(base(), kind, 30.0) for kind in FLIGHT_KINDS}
     speeds = {kind: np.linalg.norm(log["v"], axis=1) for kind, log in logs.items()}
     assert speeds["hover"].max() < 1.5 < 8.0 < np.median(speeds["race"])
