@@ -122,7 +122,7 @@ def affine_permutation(key: jax.Array, size: int) -> jax.Array:
 
 def ppo_loss(
     network_params: Any,
-    network: ActorCritic,
+    network: Any,  # an ActorCritic; flax types what its ``apply`` returns as a union
     batch: Batch,
     advantage: jax.Array,
     target: jax.Array,
@@ -198,7 +198,7 @@ def make_ppo(env: Any, env_params: Any, config: Config, num_shards: int = 1) -> 
     config.check()
     collectives = Collectives(AXIS if num_shards > 1 else None)
     batch_size = config.batch_size // num_shards
-    network = make_network_for(env, env_params, config)
+    network: Any = make_network_for(env, env_params, config)
     optimizer, schedule = make_optimizer(config), make_schedule(config)
     step_all = choose_step(env, config)
 
