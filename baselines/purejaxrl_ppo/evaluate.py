@@ -284,7 +284,7 @@ def make_numbers(
         "time_lost_s": None,
     }
     if plants is not None:
-        is_complete = outcomes.is_complete().reshape(settings.plants, settings.episodes)
+        is_complete = outcomes.is_complete().reshape(-1, settings.episodes)
         if settings.episodes > 1:  # flights of one plant are not independent
             numbers["success"] |= {"low": None, "high": None}
         numbers["plants"] = plants.summarise(is_complete)

@@ -9,6 +9,7 @@ from flytrack_env.episodes import EpisodicEnvironment
 from flytrack_env.model_file import model_from_json
 from flytrack_env.params import EnvParams
 from flytrack_env.plants import Plant
+from flytrack_env.tracks import Track
 from flytrack_env.wrappers import DomainRandomization, RandomizationParams
 
 MODEL_AS_GIVEN = RandomizationParams(
@@ -23,7 +24,9 @@ MODEL_AS_GIVEN = RandomizationParams(
 )
 
 
-def plant_env(checkpoint: Checkpoint, plant: Plant, track: str | Path | None = None) -> EpisodicEnvironment:
+def plant_env(
+    checkpoint: Checkpoint, plant: Plant, track: str | Path | Track | None = None
+) -> EpisodicEnvironment:
     """Return the checkpoint's environment with a plant (a black box, say) in place of the simulator.
 
     track: name or file; the checkpoint's if None.
@@ -34,7 +37,7 @@ def plant_env(checkpoint: Checkpoint, plant: Plant, track: str | Path | None = N
     return _checked_env(checkpoint, track, plant=plant)
 
 
-def simulated_env(checkpoint: Checkpoint, track: str | Path | None = None) -> EpisodicEnvironment:
+def simulated_env(checkpoint: Checkpoint, track: str | Path | Track | None = None) -> EpisodicEnvironment:
     """Return the checkpoint's environment with the simulator and the model that it was trained on.
 
     Raises:
@@ -47,7 +50,9 @@ def simulated_env(checkpoint: Checkpoint, track: str | Path | None = None) -> Ep
     )
 
 
-def _checked_env(checkpoint: Checkpoint, track: str | Path | None, **arguments: Any) -> EpisodicEnvironment:
+def _checked_env(
+    checkpoint: Checkpoint, track: str | Path | Track | None, **arguments: Any
+) -> EpisodicEnvironment:
     env = flytrack_env.make(
         checkpoint.env_id,
         track=checkpoint.track if track is None else track,

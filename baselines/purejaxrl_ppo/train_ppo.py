@@ -257,7 +257,8 @@ def make_tasks(settings: Settings, resumed: Resumed | None, at_once: int) -> lis
         seeds=tuple(seeds),
     )
     folders = [out if is_single else out / f"seed{seed}" for seed in seeds]
-    return [Task(*task, options, start) for *task, start in zip(folders, seeds, starts, strict=True)]
+    named = zip(folders, seeds, starts, strict=True)
+    return [Task(folder, seed, options, start) for folder, seed, start in named]
 
 
 def make_trainer(settings: Settings, resumed: Resumed | None) -> Trainer:

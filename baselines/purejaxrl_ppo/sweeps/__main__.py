@@ -174,7 +174,7 @@ def run(base: Base, space: Space, settings: Settings) -> ResultGrid:
         shown = [name for name in table if name == METRIC or "lap_s" in name or name.startswith("config/")]
         print(table.sort_values(METRIC, ascending=False)[shown].to_string(index=False))
         best = results.get_best_result(METRIC, "max")
-        print(f"best: {base.out / Path(best.path).name}, success {best.metrics[METRIC]:.1%}")
+        print(f"best: {base.out / Path(best.path).name}, success {(best.metrics or {})[METRIC]:.1%}")
     for error in results.errors:
         print(f"failed: {str(error).strip().splitlines()[-1]}", file=sys.stderr)
     return results
