@@ -213,6 +213,7 @@ def test_vector_seeds() -> None:
         env.reset(seed=[1, 2])
 
 
+@pytest.mark.slow
 def test_another_process_flies_the_same_and_imports_no_viewer() -> None:
     code = f"""
 import json, sys, gymnasium
@@ -282,6 +283,7 @@ def test_gate_and_quaternion_options() -> None:
     assert start[22] == 1.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("is_vector", [False, True])
 def test_a_track_stays_until_another_is_named(is_vector: bool, row_track: Any, tmp_path: Path) -> None:
     path = tmp_path / "row.toml"

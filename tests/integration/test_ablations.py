@@ -38,6 +38,7 @@ def test_entries_are_gone_and_the_others_stay(started):
         WithoutEntries(env, ("wind",))
 
 
+@pytest.mark.slow
 def test_the_world_frame_shows_the_same_in_another_frame(started):
     env, observation, state = started
     world = InWorldFrame(env)
@@ -61,6 +62,7 @@ def test_the_world_frame_shows_the_same_in_another_frame(started):
         )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["world_frame", "no_action", "randomised", "delay_history"])
 def test_every_environment_flies(name):
     ablation = ABLATIONS[name]

@@ -29,6 +29,7 @@ def few(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(simulation, "NUM_STEPS", 40)
 
 
+@pytest.mark.slow
 def test_faults_are_found(few: None) -> None:
     env = Faulty()
     found = simulation.fly(env, jax.random.key(0), env.default_params, False)

@@ -51,6 +51,7 @@ def hosts_listening_on(port: int) -> set[str]:
     return {host for host, found in listening if found == f"{port:04X}"}
 
 
+@pytest.mark.slow
 def test_command_serves_to_this_machine_only_until_it_is_terminated(recording):
     port = serving.bind_port(0)
     command = [sys.executable, "-m", "flytrack_env.viz_rerun", "--serve", recording]

@@ -60,6 +60,7 @@ class Remembering(Simulator):
         return state[0]
 
 
+@pytest.mark.slow
 def test_a_plant_may_remember_arrays_and_forgets_at_the_end():
     env = FlyTrack(plant=Remembering())
     params = env.default_params.replace(max_steps_in_episode=2)

@@ -147,6 +147,7 @@ def test_bad_arguments_are_refused(arguments: dict[str, Any], message: str) -> N
         random_track(**{"key": 0, **arguments})
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("arguments", "demand"),
     [

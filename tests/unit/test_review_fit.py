@@ -17,6 +17,7 @@ def log() -> FlightLog:
     return replace(excited(HandoutPlant()), source="flight.npz")
 
 
+@pytest.mark.slow
 def test_every_refusal_names_the_log(log):
     since_start = log.time - log.time[log.is_start()][np.cumsum(log.is_start()) - 1]
     short = log.select(since_start < SHORT_S)
@@ -24,5 +25,6 @@ def test_every_refusal_names_the_log(log):
         fit(short.without("uprev"))
 
 
+@pytest.mark.slow
 def test_missing_voltage_is_said_with_what_is_taken_instead(log):
     assert "the log as flown at 23 V" in "\n".join(fit(log.without("v_bat")).warnings)

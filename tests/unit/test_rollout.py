@@ -179,6 +179,7 @@ def test_bad_arrays_are_not_written(tmp_path, monkeypatch, states, actions, reas
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.slow
 def test_package_does_without_rerun_and_its_viewer_says_what_to_install():
     script = (
         "import sys, flytrack_env, flytrack_env.rollout; assert 'rerun' not in sys.modules;"

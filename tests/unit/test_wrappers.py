@@ -85,6 +85,7 @@ def test_the_delay_does_what_the_effect_in_the_model_does(quiet_flights: dict[st
     assert np.abs(late.observations - plain.observations).max() > 0.1
 
 
+@pytest.mark.slow
 def test_the_order_of_wrapping_does_not_change_the_flight(flight: Flight) -> None:
     """What is drawn hangs on names."""
     env = wrapped(ALL[5], ALL[3], ALL[1], ALL[0], ALL[2], ALL[4])
