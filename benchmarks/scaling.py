@@ -1,170 +1,141 @@
-"""How cost grows, and what more devices bring: ``python -m benchmarks.scaling [PART ...] [--page PAGE]``.
+"""How the cost of environments and trainings grows: ``python -m benchmarks.scaling [PART ...]``.
 
-Rates are per second of CPU time on one core, or of wall time on an accelerator. The page is written from all
-parts measured so far, which are kept in a JSON file beside it.
+Rates are per second of CPU time on one core, or of wall time on an accelerator.
 """
 
 import argparse
-import json
-import os
-import socket
 import statistics
-import subprocess
-import sys
-import tempfile
 import time
-from concurrent.futures import ProcessPoolExecutor
-from multiprocessing import get_context
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import jax
+import jax.numpy as jnp
+
+import flytrack_env
+from baselines.purejaxrl_ppo import Config
+from baselines.purejaxrl_ppo.training import Trainer
 from benchmarks import report
+from flytrack_env.effects import EFFECTS
+from flytrack_env.tracks import random_track
 
-TABLES = ("environments", "effects", "gates", "training", "networks", "seeds")  # of scaling_rates
-PROCESSES = "processes"
-PARTS = (*TABLES, PROCESSES)
-# Name -> processes, devices of each.
-ARRANGEMENTS = {"one device": (1, 1), "two devices": (1, 2), "two processes": (2, 1), "four devices": (1, 4)}
-EPISODES = 256
-INTRODUCTION = """`python -m benchmarks.scaling`: how cost grows, and what more devices, processes and seeds
-bring. What the figures mean, and how to train on several machines: [scaling](../scaling.md). Rates on a CPU
-are million steps per second of CPU time, of one core; each is the median of five calls. Start: compilation
-and the first call."""
+NUM_ENVS = 4_096
+ARENA_M = (60.0, 80.0)
+STEPS_PER_CALL = 2**20  # long enough to time, short enough to repeat
+REPEATS = 5
 
 
-def measure_table(name: str) -> dict[str, Any]:
-    """Return a table of rates as JSON values; call it in a new process, which it pins to a core."""
-    pinned = report.pin_to_one_core()
-    import jax
-
-    from benchmarks.scaling_rates import TABLES as RATES
-
-    title, values, rate_of = RATES[name]
-    device = report.cpu_name() if jax.default_backend() == "cpu" else jax.devices()[0].device_kind
-    rows = [(value, *rate_of(value)) for value in report.progress(values, name)]
-    return {"title": title, "rows": rows, "device": f"{device}; {pinned}", **report.provenance()}
-
-
-def rate_table(result: dict[str, Any]) -> str:
-    """Return a table of rates in Markdown."""
-    rows = (
-        (f"{value:,}" if isinstance(value, int) else value, f"{rate:.3g}", f"{start_s:.1f}")
-        for value, rate, start_s in result["rows"]
-    )
-    return report.table((result["title"], "million steps per second", "start (s)"), rows)
+def rate(call: Callable[[], Any], num_steps: int) -> tuple[float, float]:
+    """Return the median rate of a call, million steps a second, and the first call's additional time, s."""
+    # CPU time on a CPU, which other processes share
+    clock = time.process_time if jax.default_backend() == "cpu" else time.perf_counter
+    started = time.perf_counter()
+    jax.block_until_ready(call())
+    first_s = time.perf_counter() - started
+    times = []
+    for _ in range(REPEATS):
+        started = clock()
+        jax.block_until_ready(call())
+        times.append(clock() - started)
+    return num_steps / statistics.median(times) / 1e6, max(0.0, first_s - statistics.median(times))
 
 
-def free_port() -> int:
-    """Return a free port."""
-    with socket.socket() as one:
-        one.bind(("127.0.0.1", 0))
-        return int(one.getsockname()[1])
-
-
-def train(out: Path, seed: int, steps: int, processes: int, devices: int) -> float:
-    """Train in several processes of several devices each; return their CPU time, s.
-
-    Raises:
-        RuntimeError: a training failed; the message is its standard error output.
-    """
-    command = [sys.executable, "-m", "baselines.purejaxrl_ppo.train_ppo", "--out", str(out)]
-    command += f"--seed {seed} --total-timesteps {steps} --checkpoint-every 0 --no-tracking".split()
-    command += f"--evaluate-every {steps} --evaluation-episodes {EPISODES}".split()
-    if processes * devices > 1:
-        command.append("--distributed")
-    if processes > 1:
-        command += (
-            f"--coordinator 127.0.0.1:{free_port()} --num-processes {processes} --process-index".split()
-        )
-    xla = f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count={devices}"
-    environment = {**os.environ, "XLA_FLAGS": xla, "JAX_PLATFORMS": "cpu"}
-    streams: dict[str, Any] = {"stdout": subprocess.DEVNULL, "stderr": subprocess.PIPE, "text": True}
-    started = os.times()
-    running = [
-        subprocess.Popen(
-            [*command, str(index)] if processes > 1 else command, cwd=report.ROOT, env=environment, **streams
-        )
-        for index in range(processes)
-    ]
-    for process in running:
-        error = process.communicate()[1]
-        if process.returncode:
-            raise RuntimeError(error)
-    ended = os.times()
-    return ended.children_user + ended.children_system - started.children_user - started.children_system
-
-
-def measure_processes(folder: Path, seeds: int, steps: int) -> dict[str, Any]:
-    """Train every seed in every arrangement; return the results as JSON values."""
-    from baselines.purejaxrl_ppo import load_checkpoint
-
-    rows = []
-    for name, (processes, devices) in ARRANGEMENTS.items():
-        results, cpu_s, started = [], 0.0, time.perf_counter()
-        for seed in range(seeds):
-            out = folder / f"{processes}x{devices}_{seed}"
-            cpu_s += train(out, seed, steps, processes, devices)
-            results.append(load_checkpoint(out / "final.safetensors").meta)
-        row: dict[str, Any] = {"arrangement": name, "cpu_s": cpu_s / seeds}
-        row |= {key: [result[key] for result in results] for key in ("success", "best_lap_s")}
-        rows.append(row | {"wall_s": (time.perf_counter() - started) / seeds})
-    title = "the same training on several devices and in several processes"
-    text = process_table(rows, steps)
-    return {"title": title, "text": text, "device": report.cpu_name(), "rows": rows, **report.provenance()}
-
-
-def process_table(rows: list[dict[str, Any]], steps: int) -> str:
-    """Return a table of what the arrangements learnt, in Markdown."""
-    cells = []
-    for row in rows:
-        success = ", ".join(f"{share:.1%}" for share in row["success"])
-        laps = ", ".join("-" if lap_s is None else f"{lap_s:.2f}" for lap_s in row["best_lap_s"])
-        flown = [lap_s for lap_s in row["best_lap_s"] if lap_s is not None]
-        mean_lap = f"{statistics.mean(flown):.2f}" if flown else "-"
-        means = f"{success}: mean {statistics.mean(row['success']):.1%}", f"{laps}: mean {mean_lap}"
-        cells.append((row["arrangement"], *means, f"{row['cpu_s']:.0f}", f"{row['wall_s']:.0f}"))
-    return (
-        f"`train_ppo --total-timesteps {steps}`: success of {EPISODES} noisy starts in the simulator and "
-        "best lap, by seed; CPU and wall time of a training, including its start.\n\n"
-        + report.table("arrangement | success, by seed | best lap (s), by seed | CPU (s) | wall (s)", cells)
+def environment_rate(env: Any, num_envs: int = NUM_ENVS) -> tuple[float, float]:
+    """Return the rate of stepping a batch with random actions."""
+    length, params = max(1, STEPS_PER_CALL // num_envs), env.default_params
+    _, state = jax.jit(jax.vmap(env.reset, in_axes=(0, None)))(
+        jax.random.split(jax.random.key(0), num_envs), params
     )
 
+    @jax.jit
+    def fly(state: Any, key: jax.Array) -> Any:
+        def one(state: Any, key: jax.Array) -> tuple[Any, jax.Array]:
+            action = jax.random.uniform(key, (num_envs, 4), minval=-1.0)
+            observation, state, reward, *_ = env.step_batch(key, state, action, params)
+            return state, observation.sum() + reward.sum()
 
-def as_page(results: dict[str, Any]) -> str:
-    """Return the page of all parts measured so far."""
-    parts = [INTRODUCTION]
-    for name in PARTS:
-        if name in results:
-            result = results[name]
-            origin = f"{result['device']}."
-            if "commit" in result:
-                origin += f" {report.provenance_line(result)}"
-            parts += [f"## {result['title'].capitalize()}", result.get("text") or rate_table(result), origin]
-    return report.page("Scaling", *parts)
+        return jax.lax.scan(one, state, jax.random.split(key, length))
+
+    return rate(lambda: fly(state, jax.random.key(1)), length * num_envs)
+
+
+def rate_with_effects(number: int) -> tuple[float, float]:
+    """Return the rate of a model with the first effects of the list."""
+    chosen = [effect.parameters() for effect in EFFECTS[:number]]
+    model = flytrack_env.nominal_parameters().with_effects(*chosen)
+    return environment_rate(flytrack_env.make("FlyTrack-v0", model=model))
+
+
+def rate_with_gates(number: int) -> tuple[float, float]:
+    """Return the rate on a random course."""
+    track = random_track(0, num_gates=number, size=ARENA_M)
+    return environment_rate(flytrack_env.make("FlyTrack-v0", track=track))
+
+
+def training_rate(config: Config, num_seeds: int = 1) -> tuple[float, float]:
+    """Return the rate of one update, of one or several seeds trained together."""
+    trainer = Trainer(config)
+    runners = [trainer.start(jax.random.key(seed)) for seed in range(num_seeds)]
+    if num_seeds == 1:
+        return rate(lambda: trainer.chunk(runners[0], jnp.int32(1)), config.batch_size)
+    together = jax.tree.map(lambda *leaves: jnp.stack(leaves), *runners)
+    return rate(lambda: trainer.chunk_of_many(together, jnp.int32(1)), num_seeds * config.batch_size)
+
+
+def training_rate_with_environments(num_envs: int) -> tuple[float, float]:
+    """Return the rate of training with a number of environments, at the recipe's minibatch size."""
+    recipe = Config()
+    minibatches = max(1, recipe.num_minibatches * num_envs // recipe.num_envs)
+    return training_rate(Config(num_envs=num_envs, num_minibatches=minibatches))
+
+
+# Title, values, rate at a value.
+TABLES: dict[str, tuple[str, tuple[int, ...], Callable[[int], tuple[float, float]]]] = {
+    "environments": (
+        "environments",
+        (64, 256, 1_024, 4_096, 16_384, 65_536),
+        lambda number: environment_rate(flytrack_env.make("FlyTrack-v0"), number),
+    ),
+    "effects": ("effects in the model", (0, 1, 2, 4, 8, len(EFFECTS)), rate_with_effects),
+    "gates": ("gates", (4, 8, 16, 24), rate_with_gates),
+    "training": ("environments of a training", (256, 1_024, 4_096, 16_384), training_rate_with_environments),
+    "networks": (
+        "width of both hidden layers",
+        (16, 32, 64, 128, 256),
+        lambda width: training_rate(Config(hidden_sizes=(width, width))),
+    ),
+    "seeds": ("seeds side by side", (1, 2, 4, 8), lambda number: training_rate(Config(), number)),
+}
 
 
 def main() -> None:
-    """Measure the named parts and write the page."""
+    """Measure the named tables, or all, and write the page."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("parts", nargs="*", metavar="PART", help=f"of {', '.join(PARTS)} (default: all)")
-    parser.add_argument("--seeds", type=int, default=3, help="of trainings on several devices")
-    parser.add_argument("--steps", type=int, default=4_000_000, help="of these trainings")
+    parser.add_argument("parts", nargs="*", metavar="PART", help=f"of {', '.join(TABLES)} (default: all)")
     parser.add_argument("--page", type=Path, default=report.RESULTS / "scaling.md", help="page to write")
     arguments = parser.parse_args()
-    unknown = [name for name in arguments.parts if name not in PARTS]
-    if unknown:
-        parser.error(f"found {', '.join(unknown)}, expected parts of {', '.join(PARTS)}")
-    kept = arguments.page.with_suffix(".json")
-    results = json.loads(kept.read_bytes()) if kept.exists() else {}
-    for name in arguments.parts or PARTS:
-        if name == PROCESSES:
-            with tempfile.TemporaryDirectory(prefix="flytrack_scaling_") as folder:
-                results[name] = measure_processes(Path(folder), arguments.seeds, arguments.steps)
-        else:
-            with ProcessPoolExecutor(1, get_context("spawn")) as pool:
-                results[name] = pool.submit(measure_table, name).result()
-        report.write_json(kept, results)
-        report.write_page(arguments.page, as_page(results))
+    if not set(arguments.parts) <= set(TABLES):
+        parser.error(f"found {' '.join(arguments.parts)}, expected parts of {', '.join(TABLES)}")
+    pinned = report.pin_to_one_core()
+    parts = []
+    for title, values, rate_of in (TABLES[name] for name in arguments.parts or TABLES):
+        rows = []
+        for value in report.progress(values, title):
+            speed, start_s = rate_of(value)
+            rows.append((f"{value:,}", f"{speed:.3g}", f"{start_s:.1f}"))
+        table = report.table((title, "million steps per second", "start (s)"), rows)
+        parts += [f"## {title.capitalize()}", table]
+    text = report.page(
+        "Scaling",
+        f"{report.command_line()}: how cost grows with environments, effects, gates, networks and seeds. "
+        "What the figures mean, and how to train on several machines: [scaling](../scaling.md). Rates on a "
+        "CPU are million steps per second of CPU time, of one core; each is the median of five calls. Start: "
+        "compilation and the first call.",
+        *parts,
+        f"{jax.devices()[0].device_kind}, {pinned}. {report.provenance_line(report.provenance())}",
+    )
+    report.write_page(arguments.page, text)
 
 
 if __name__ == "__main__":

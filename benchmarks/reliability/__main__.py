@@ -1,4 +1,4 @@
-"""Reliability: ``python -m benchmarks.reliability simulation|training|files [--share 1]``.
+"""Reliability: ``python -m benchmarks.reliability simulation|files [--share 1]``.
 
 Each part's result is kept in ``docs/results/reliability_<part>.json``; the page is written from all of them.
 ``--share 0.01`` measures a hundredth. Exits with 1 if a promise was broken.
@@ -6,25 +6,12 @@ Each part's result is kept in ``docs/results/reliability_<part>.json``; the page
 
 import argparse
 import json
-import tempfile
 from pathlib import Path
-from typing import Any
 
-from benchmarks.reliability import files, simulation, training
+from benchmarks.reliability import files, simulation
 from benchmarks.report import RESULTS, command_line, page, provenance, provenance_line, write_json, write_page
 
-NUM_STEPS, KILLS, NUM_FILES = 1e8, 10, 1000  # files: of each kind
-PARTS = {"simulation": simulation, "training": training, "files": files}
-
-
-def measure(part: str, share: float) -> dict[str, Any]:
-    """Return the result of a part."""
-    if part == "simulation":
-        return simulation.measure(share * NUM_STEPS)
-    if part == "files":
-        return files.measure(max(round(share * NUM_FILES), 1))
-    with tempfile.TemporaryDirectory() as folder:
-        return training.measure(max(round(share * KILLS), 1), Path(folder))
+PARTS = {"simulation": simulation, "files": files}
 
 
 def page_of(folder: Path) -> str:
@@ -40,19 +27,16 @@ def page_of(folder: Path) -> str:
 
 
 def main() -> None:
-    """Measure a part, or none; write its result and the page."""
+    """Measure a part; write its result and the page."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("part", nargs="?", choices=PARTS, help="none: write the page from kept results")
+    parser.add_argument("part", choices=PARTS)
     parser.add_argument("--share", type=float, default=1.0, help="of the full measurement")
     parser.add_argument("--out", type=Path, default=RESULTS, help="folder of the results")
     arguments = parser.parse_args()
-    is_held = True
-    if arguments.part:
-        result = {**provenance(), "command": command_line(), **measure(arguments.part, arguments.share)}
-        write_json(arguments.out / f"reliability_{arguments.part}.json", result)
-        is_held = result["is_held"]
+    result = {**provenance(), "command": command_line(), **PARTS[arguments.part].measure(arguments.share)}
+    write_json(arguments.out / f"reliability_{arguments.part}.json", result)
     write_page(arguments.out / "reliability.md", page_of(arguments.out))
-    if not is_held:
+    if not result["is_held"]:
         raise SystemExit(f"{arguments.part}: a promise was broken, see the page")
 
 

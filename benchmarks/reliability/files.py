@@ -49,6 +49,7 @@ from flytrack_sysid.log import log_of_states
 from flytrack_sysid.manoeuvres import MANOEUVRES
 
 CPU_S, MEMORY_BYTES = 10.0, 2 * 2**30  # that one file may take; the sandbox's own limits are lower
+NUM_FILES = 1000  # of each kind
 LONGEST_MESSAGE = 2000  # characters
 SLOW_SHARE = 0.05  # of the files, of kinds whose loader starts a process
 TOKENS = (b"nan", b"1e999", b"-1", b"null", b'"', b"\n", b"\0", b"\xff", b",", b"[" * 2000, b"9" * 5000)
@@ -263,8 +264,9 @@ def soak_kind(kind: Kind, num_files: int, folder: Path) -> dict[str, Any]:
     return {**outcomes, "slowest_s": round(slowest_s, 2), "broken": broken}
 
 
-def measure(num_files: int) -> dict[str, Any]:
-    """Return what came of ``num_files`` damaged files of every kind, and the crafted ones."""
+def measure(share: float) -> dict[str, Any]:
+    """Return what came of a share of ``NUM_FILES`` damaged files of every kind, and the crafted ones."""
+    num_files = max(round(share * NUM_FILES), 1)
     sandbox.limit_memory(MEMORY_BYTES)
     with tempfile.TemporaryDirectory() as folder:
         kinds = {name: soak_kind(kind, num_files, Path(folder)) for name, kind in tqdm(KINDS.items())}

@@ -24,6 +24,7 @@ from flytrack_env.tracks import available_tracks, build_course, load_track, rand
 from flytrack_env.wrappers import ActionDelay, ActionHistory, EpisodeStatistics, ObservationNoise
 
 NUM_ENVS, NUM_STEPS = 1024, 1000  # of a flight
+TOTAL_STEPS = 1e8
 HELD_STEPS = 40  # for which some actions stay the same
 UNIT_TOLERANCE = 1e-5  # of a quaternion's norm
 VIOLATIONS = (
@@ -159,13 +160,13 @@ def extreme_environments() -> dict[str, EpisodicEnvironment]:
     return {"extreme, all effects": plain, "extreme, all wrappers": wrapped}
 
 
-def measure(num_steps: float) -> dict[str, Any]:
-    """Return what about ``num_steps`` steps come to, by environment."""
+def measure(share: float) -> dict[str, Any]:
+    """Return what a share of ``TOTAL_STEPS`` comes to, by environment."""
     envs = {env_id: flytrack_env.make(env_id) for env_id in ENVIRONMENTS}
     box = blackbox.load(ROOT / "blackbox" / "acro_step.bin")
     envs["FlyTrack-v0, black box"] = flytrack_env.make("FlyTrack-v0", plant=box)
     tracks = [load_track(name) for name in available_tracks()] + [random_track(seed) for seed in range(2)]
-    flights = max(round(num_steps / (NUM_ENVS * NUM_STEPS) / (len(envs) + 2)), 1)
+    flights = max(round(share * TOTAL_STEPS / (NUM_ENVS * NUM_STEPS) / (len(envs) + 2)), 1)
     counts: dict[str, Counter[str]] = {}
     started_s = time.process_time()
     for name, env in tqdm((envs | extreme_environments()).items(), unit="environment"):

@@ -1,11 +1,11 @@
-"""The soaks of simulation and training: they find planted faults, and a small share of them holds."""
+"""The soak of the simulation: it finds planted faults, and a small share of it holds."""
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from benchmarks.reliability import simulation, training
+from benchmarks.reliability import simulation
 from flytrack_env import FlyTrack
 from flytrack_env.params import RANGES
 
@@ -47,10 +47,3 @@ def test_extremes_hold(few: None, name: str) -> None:
     assert params.model.m.max() == np.float32(RANGES["model.m"].high)
     found = simulation.fly(env, jax.random.key(0), params, True)
     assert found["episodes"] > 0 and not any(found[violation] for violation in simulation.VIOLATIONS)
-
-
-@pytest.mark.slow
-def test_a_killed_training_ends_with_the_same_bits(tmp_path, monkeypatch):
-    monkeypatch.setattr(training, "FLAGS", training.FLAGS.replace("4608000", "153600"))
-    found = training.measure(2, tmp_path)
-    assert found["is_held"] and found["kills"] >= 1, found
