@@ -25,9 +25,9 @@ from baselines.purejaxrl_ppo.evaluate import SHIPPED_BLACK_BOX
 from baselines.purejaxrl_ppo.flights import race_many, score, start_keys
 from baselines.purejaxrl_ppo.plants import draw_plants
 from baselines.purejaxrl_ppo.ppo import make_network_for, make_ppo
+from baselines.purejaxrl_ppo.program import make_chunk, training_params, with_strong_types
 from baselines.purejaxrl_ppo.race_env import with_model_as_given
 from baselines.purejaxrl_ppo.run import is_due
-from baselines.purejaxrl_ppo.training import make_chunk, training_params, with_strong_types
 from benchmarks import report
 from benchmarks.ablated import InWorldFrame, WithoutEntries
 from flytrack_env import EnvParams, blackbox, load_model

@@ -13,7 +13,8 @@ from pathlib import Path
 from baselines.purejaxrl_ppo import Config, load_checkpoint
 from baselines.purejaxrl_ppo.checkpoint import save_checkpoint
 from baselines.purejaxrl_ppo.evaluate import SHIPPED_BLACK_BOX, EvaluationSettings, evaluate
-from baselines.purejaxrl_ppo.training import Options, train_policy
+from baselines.purejaxrl_ppo.run import Options
+from baselines.purejaxrl_ppo.training import train_policy
 from benchmarks import report
 from flytrack_env.files import fresh_folder, write_atomically
 

@@ -12,9 +12,10 @@ import time
 from pathlib import Path
 
 from baselines.purejaxrl_ppo import Config
+from baselines.purejaxrl_ppo.run import Options
 from baselines.purejaxrl_ppo.tracking import local_uri
 from baselines.purejaxrl_ppo.train_ppo import DEFAULTS
-from baselines.purejaxrl_ppo.training import Options, Trainer
+from baselines.purejaxrl_ppo.training import Trainer
 from benchmarks import report
 
 AIM_STEPS_PER_S = 400_000

@@ -66,10 +66,8 @@ class Checkpoint(NamedTuple):
                 f"({self.env_id}), but the environment's have shape {found}"
             )
         if "observation" in self.meta:
-            check_no_differences(
-                "checkpoint",
-                find_differences(self.meta["observation"], observation_layout(env), "observation"),
-            )
+            found, expected = map(by_dotted_name, (self.meta["observation"], observation_layout(env)))
+            check_no_differences("checkpoint: observation", find_differences(found, expected))
 
 
 def observation_layout(env: Any) -> dict[str, Any]:
@@ -82,19 +80,21 @@ def as_json(value: Any) -> Any:
     return json.loads(json.dumps(value))
 
 
-def find_differences(found: Any, expected: Any, where: str) -> list[str]:
-    """Return, field by field, where JSON values differ; ``where`` is their name."""
-    if isinstance(found, dict) and isinstance(expected, dict):
-        pairs = [(f".{quote_name(name)}", name) for name in {**expected, **found}]
-        values = [(label, found.get(name), expected.get(name)) for label, name in pairs]
-    elif isinstance(found, list) and isinstance(expected, list) and len(found) == len(expected):
-        values = [(f"[{i}]", *pair) for i, pair in enumerate(zip(found, expected, strict=True))]
-    elif found == expected:
-        return []
-    else:
-        shown = ["nothing" if value is None else quote_value(value) for value in (found, expected)]
-        return [f"{where}: found {shown[0]}, expected {shown[1]}"]
-    return [line for label, one, other in values for line in find_differences(one, other, where + label)]
+def find_differences(found: dict[str, Any], expected: dict[str, Any], show: Any = quote_value) -> list[str]:
+    """Return a line for each dotted name whose values differ, the shallowest names first."""
+    lines = []
+    for name in sorted({**expected, **found}, key=lambda name: name.count(".")):
+        pair = found.get(name), expected.get(name)
+        if pair[0] != pair[1]:
+            shown = ["nothing" if value is None else show(value) for value in pair]
+            lines.append(f"{quote_name(name)}: found {shown[0]}, expected {shown[1]}")
+    return lines
+
+
+def by_dotted_name(tree: Any) -> dict[str, Any]:
+    """Return the leaves of JSON values or of another tree by their dotted paths."""
+    leaves = jax.tree_util.tree_leaves_with_path(tree)
+    return {jax.tree_util.keystr(path, simple=True, separator="."): leaf for path, leaf in leaves}
 
 
 def check_no_differences(where: Any, lines: list[str]) -> None:
@@ -108,17 +108,11 @@ def _is_key(leaf: Any) -> bool:
     return jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
 
 
-def _name(path: Any) -> str:
-    return jax.tree_util.keystr(path, simple=True, separator=".")
-
-
 def as_named_arrays(tree: Any) -> Arrays:
     """Return the leaves of a tree by their dotted paths, bit for bit; random keys as their integers."""
     return {
-        _name(path): np.asarray(
-            jax.random.key_data(leaf) if isinstance(leaf, jax.Array) and _is_key(leaf) else leaf
-        )
-        for path, leaf in jax.tree_util.tree_leaves_with_path(tree)
+        name: np.asarray(jax.random.key_data(leaf) if isinstance(leaf, jax.Array) and _is_key(leaf) else leaf)
+        for name, leaf in by_dotted_name(tree).items()
     }
 
 
@@ -130,27 +124,20 @@ def from_named_arrays(where: Any, arrays: Arrays, target: Any) -> Any:
     Raises:
         CheckpointError: leaves that are missing, superfluous, or of another shape or type.
     """
-    paths, structure = jax.tree_util.tree_flatten_with_path(target)
-    expected = {
-        _name(path): jax.eval_shape(jax.random.key_data, leaf) if _is_key(leaf) else leaf
-        for path, leaf in paths
-    }
-    found = {name: f"{array.dtype} of shape {array.shape}" for name, array in arrays.items()}
-    wanted = {name: f"{np.dtype(leaf.dtype)} of shape {leaf.shape}" for name, leaf in expected.items()}
-    lines = [
-        f"{quote_name(name)}: found {found.get(name, 'nothing')}, expected {wanted.get(name, 'nothing')}"
-        for name in {**wanted, **found}
-        if found.get(name) != wanted.get(name)
+
+    def describe(array: Any) -> str:
+        array = jax.eval_shape(jax.random.key_data, array) if _is_key(array) else array
+        return f"{np.dtype(array.dtype)} of shape {array.shape}"
+
+    leaves = by_dotted_name(target)
+    found, expected = ({n: describe(leaf) for n, leaf in one.items()} for one in (arrays, leaves))
+    check_no_differences(where, find_differences(found, expected, show=str))
+    values = (jnp.asarray(arrays[name]) for name in leaves)
+    restored = [
+        jax.random.wrap_key_data(value) if _is_key(leaf) else value
+        for value, leaf in zip(values, leaves.values(), strict=True)
     ]
-    check_no_differences(where, lines)
-    leaves = [jnp.asarray(arrays[_name(path)]) for path, _ in paths]
-    return jax.tree.unflatten(
-        structure,
-        [
-            jax.random.wrap_key_data(leaf) if _is_key(target_leaf) else leaf
-            for leaf, (_, target_leaf) in zip(leaves, paths, strict=True)
-        ],
-    )
+    return jax.tree.unflatten(jax.tree.structure(target), restored)
 
 
 def checksum(text: str, arrays: Arrays) -> str:
@@ -199,10 +186,6 @@ def load_checkpoint(path: str | Path) -> Checkpoint:
             network that the file describes.
     """
     path = Path(path)
-    if path.suffix == ".msgpack":
-        raise CheckpointError(
-            f"{path}: found a .msgpack checkpoint of an earlier version, expected {SUFFIX}; train again"
-        )
     meta, arrays = _read_file(path)
     if meta["format"] != FORMAT:
         raise CheckpointError(f"{path}: format: found {quote_value(meta['format'])}, expected {FORMAT!r}")

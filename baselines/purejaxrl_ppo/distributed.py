@@ -10,6 +10,7 @@ import json
 from typing import Any
 
 import jax
+import numpy as np
 from jax.experimental import multihost_utils
 from jax.extend.backend import clear_backends
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
@@ -98,20 +99,13 @@ def whole(runner: Runner, mesh: Mesh) -> Runner:
     return jax.jit(lambda spread: spread, out_shardings=NamedSharding(mesh, REPLICATED))(runner)
 
 
-def check_agree(what: str, value: Any) -> None:
-    """Raise ValueError unless all processes have the same value; all must call this."""
+def check_agree(settings: Any) -> None:
+    """Raise ValueError unless all processes have the same settings, JSON values; all must call this."""
+    text = json.dumps(settings, sort_keys=True, default=str)
     try:
-        multihost_utils.assert_equal(value)
+        multihost_utils.assert_equal(np.frombuffer(hashlib.sha256(text.encode()).digest(), np.uint8))
     except AssertionError as error:
-        raise ValueError(
-            f"{what}: process {jax.process_index()} found another value than process 0"
-        ) from error
-
-
-def digest(values: Any) -> int:
-    """Return a hash of JSON values as an int32 that processes can compare."""
-    text = json.dumps(values, sort_keys=True, default=str)
-    return int.from_bytes(hashlib.sha256(text.encode()).digest()[:4]) >> 1
+        raise ValueError(f"settings: process {jax.process_index()} has others than process 0") from error
 
 
 def wait_for_all(where: str) -> None:

@@ -18,6 +18,7 @@ from baselines.purejaxrl_ppo.checkpoint import (
     CheckpointError,
     as_json,
     as_named_arrays,
+    by_dotted_name,
     check_no_differences,
     find_differences,
     from_named_arrays,
@@ -33,7 +34,6 @@ from flytrack_env.model_file import model_as_json
 FINAL = f"final{SUFFIX}"
 SEED_FOLDER = re.compile(r"seed(\d+)")
 STEP_FILE = re.compile(rf"step_(\d+)\{SUFFIX}")
-HALF_WRITTEN = re.compile(rf"\.(step_\d+|final)\{SUFFIX}\.[0-9a-f]{{16}}")  # as write_atomically names them
 REWARD = "reward."  # prefix of the reward's weights among the environment's parameters
 MUST_FIT = ("env_id", "seed", "missed_gate", "config", "observation", "track_data", "model", "environment")
 
@@ -70,13 +70,6 @@ def seeds_in(folder: Path) -> list[int]:
     """Return the seeds of which a folder holds checkpoints, in seed<N>."""
     matches = [(path, SEED_FOLDER.fullmatch(path.name)) for path in folder.glob("seed*")]
     return sorted(int(match[1]) for path, match in matches if match and checkpoints_in(path))
-
-
-def remove_half_written(folder: Path) -> None:
-    """Remove what a killed process was writing."""
-    for path in folder.glob(f".*{SUFFIX}.*"):
-        if HALF_WRITTEN.fullmatch(path.name):
-            path.unlink(missing_ok=True)
 
 
 def check_free(folder: Path, start: Start | None = None) -> None:
@@ -136,9 +129,7 @@ def describe_machine(num_seeds: int = 1) -> dict[str, Any]:
 def check_same_run(path: Path, checkpoint: Checkpoint, description: dict[str, Any]) -> None:
     """Raise CheckpointError, field by field, unless a checkpoint is of the run described."""
     found = {**checkpoint.meta, "config": as_json(dataclasses.asdict(checkpoint.config))}
-    lines = [
-        line for name in MUST_FIT for line in find_differences(found.get(name), description.get(name), name)
-    ]
+    lines = _differences(found, description, MUST_FIT)
     check_no_differences(path, [*lines, *_machine_differences(checkpoint, description)] if lines else [])
 
 
@@ -151,11 +142,12 @@ def warn_of_other_machine(path: Path, checkpoint: Checkpoint, description: dict[
 
 def _machine_differences(checkpoint: Checkpoint, description: dict[str, Any]) -> list[str]:
     expected = {**description, "package_version": flytrack_env.__version__}
-    return [
-        line
-        for name in ("package_version", "software", "machine")
-        for line in find_differences(checkpoint.meta.get(name), expected[name], name)
-    ]
+    return _differences(checkpoint.meta, expected, ("package_version", "software", "machine"))
+
+
+def _differences(found: dict[str, Any], expected: dict[str, Any], names: tuple[str, ...]) -> list[str]:
+    parts = (({name: one.get(name)} for one in (found, expected)) for name in names)
+    return [line for part in parts for line in find_differences(*map(by_dotted_name, part))]
 
 
 def save_run(path: Path, runner: Runner, config: Config, description: dict[str, Any]) -> None:
@@ -210,26 +202,19 @@ def load_start(path: Path) -> Start:
     return start
 
 
-def _is_number(value: Any) -> bool:
-    return type(value) in (int, float) and abs(value) <= sys.float_info.max
-
-
 def _check_meta(start: Start) -> None:
     """Raise CheckpointError for fields that are used before the checkpoint is compared with the run."""
     meta, config = start.checkpoint.meta, start.checkpoint.config
-    counts, numbers = ("steps", "seed"), ("seconds", "success", "best_lap_s")
-    valid = {name: type(meta.get(name)) is int and 0 <= meta[name] < 2**63 for name in counts}
-    valid |= {name: meta.get(name) is None or _is_number(meta[name]) for name in numbers}
-    valid |= {name: isinstance(meta.get(name), dict) for name in ("model", "environment")}
-    valid["environment"] &= valid["environment"] and all(
-        map(_is_number, rewards_of(start.checkpoint).values())
-    )
-    valid["steps"] &= valid["steps"] and meta["steps"] in range(
-        0, config.total_timesteps + 1, config.batch_size
-    )
-    for name, is_valid in valid.items():
-        if not is_valid:
-            raise CheckpointError(f"{start.path}: {name}: found {quote_value(meta.get(name))}")
+    number = (int, float, type(None))
+    kinds = {"steps": int, "seed": int, "seconds": number, "success": number, "best_lap_s": number}
+    kinds |= {"model": dict, "environment": dict}
+    invalid = [name for name, kind in kinds.items() if not isinstance(meta.get(name), kind)]
+    if not invalid and meta["steps"] not in range(0, config.total_timesteps + 1, config.batch_size):
+        invalid = ["steps"]
+    if not invalid and not all(isinstance(value, float) for value in rewards_of(start.checkpoint).values()):
+        invalid = ["environment"]
+    for name in invalid:
+        raise CheckpointError(f"{start.path}: {name}: found {quote_value(meta.get(name))}")
 
 
 def rewards_of(checkpoint: Checkpoint) -> dict[str, float]:

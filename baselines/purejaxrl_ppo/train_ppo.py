@@ -25,11 +25,9 @@ from baselines.purejaxrl_ppo.resume import (
 )
 from baselines.purejaxrl_ppo.run import Options
 from baselines.purejaxrl_ppo.tracking import SQLITE, local_uri
-from baselines.purejaxrl_ppo.training import Task, Trainer, train_policy
+from baselines.purejaxrl_ppo.training import Task, Trainer
 from flytrack_env.messages import error_text
 from flytrack_env.model_file import model_from_json
-
-__all__ = ["DEFAULTS", "main", "train_policy"]
 
 PROG = "train_ppo"
 MAX_SEED = 2**31
@@ -39,7 +37,7 @@ DEFAULTS = Options(checkpoint_every=1_000_000, evaluate_every=4_000_000)
 LOCAL, OFF = "local", ""  # tracking URIs
 
 
-def parse_rewards(words: list[str]) -> dict[str, float]:
+def parse_rewards(words: Sequence[str]) -> dict[str, float]:
     """Return terms and weights of ``TERM=WEIGHT``.
 
     Raises:
@@ -51,20 +49,8 @@ def parse_rewards(words: list[str]) -> dict[str, float]:
         try:
             rewards[name] = float(weight)
         except ValueError as error:
-            raise ValueError(f"found {word!r}, expected TERM=WEIGHT") from error
+            raise ValueError(f"--reward: found {word!r}, expected TERM=WEIGHT") from error
     return rewards
-
-
-Rewards = Annotated[
-    dict[str, float],
-    tyro.constructors.PrimitiveConstructorSpec(
-        nargs="*",
-        metavar="[TERM=WEIGHT ...]",
-        instance_from_str=parse_rewards,
-        is_instance=lambda value: isinstance(value, dict),
-        str_from_instance=lambda value: [f"{name}={weight:g}" for name, weight in value.items()],
-    ),
-]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -97,8 +83,8 @@ class Settings(Sources):
     """Name of a track, or path of its file."""
     model: Path | None = None
     """Model file; by default the nominal model."""
-    reward: Rewards = dataclasses.field(default_factory=dict)
-    """Weights of reward terms (docs/envs); the others are default."""
+    reward: tuple[str, ...] = ()
+    """Weights of reward terms, TERM=WEIGHT (docs/envs); the others are default."""
     seed: int = 0
     """First seed."""
     num_seeds: int = 1
@@ -268,14 +254,15 @@ def make_trainer(settings: Settings, resumed: Resumed | None) -> Trainer:
         ValueError: settings that cannot be used; the message names the checkpoint that some come from.
     """
     mesh = all_devices() if settings.distributed else None
-    arguments: dict[str, Any] = {"track": settings.track, "reward": settings.reward, "model": settings.model}
+    reward = parse_rewards(settings.reward)
+    arguments: dict[str, Any] = {"track": settings.track, "reward": reward, "model": settings.model}
     if resumed is None:
         return Trainer(settings.hyperparameters, settings.env_id, mesh, **arguments)
     path, checkpoint = resumed.first
     try:
         arguments["model"] = settings.model or model_from_json(checkpoint.meta["model"], "model")
         arguments["missed_gate"] = checkpoint.meta["missed_gate"]
-        arguments["reward"] = rewards_of(checkpoint) | settings.reward
+        arguments["reward"] = rewards_of(checkpoint) | reward
         return Trainer(settings.hyperparameters, settings.env_id, mesh, **arguments)
     except (ValueError, OverflowError, OSError) as error:
         raise CheckpointError(f"{path}: with its settings and the flags: {error_text(error)}") from error
@@ -292,7 +279,8 @@ def make_plan(words: Sequence[str]) -> Plan:
     at_once = 1 if settings.distributed else settings.seeds_at_once or settings.num_seeds
     tasks = make_tasks(settings, resumed, at_once)
     trainer = make_trainer(settings, resumed)
-    return Plan(trainer, trainer.prepare(tasks, min(at_once, len(tasks))), at_once)
+    trainer.check_all(tasks, min(at_once, len(tasks)))
+    return Plan(trainer, tasks, at_once)
 
 
 def run(plan: Plan) -> None:

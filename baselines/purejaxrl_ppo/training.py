@@ -11,34 +11,20 @@ import numpy as np
 
 from baselines.purejaxrl_ppo.checkpoint import Checkpoint
 from baselines.purejaxrl_ppo.config import Config
-from baselines.purejaxrl_ppo.distributed import check_agree, digest, is_first, spread, wait_for_all
+from baselines.purejaxrl_ppo.distributed import check_agree, spread, wait_for_all
 from baselines.purejaxrl_ppo.monitor import ProgressLine
 from baselines.purejaxrl_ppo.ppo import Runner
-from baselines.purejaxrl_ppo.program import Program, make_chunk, training_params, with_strong_types
+from baselines.purejaxrl_ppo.program import Program
 from baselines.purejaxrl_ppo.resume import (
     FINAL,
     Start,
     check_free,
     check_same_run,
     newest_intact,
-    remove_half_written,
     restore_runner,
-    step_file,
     warn_of_other_machine,
 )
 from baselines.purejaxrl_ppo.run import Chunk, DivergedError, Metrics, Options, Run, next_due
-from flytrack_env.files import write_atomically
-
-__all__ = [
-    "DivergedError",
-    "Options",
-    "Task",
-    "Trainer",
-    "make_chunk",
-    "train_policy",
-    "training_params",
-    "with_strong_types",
-]
 
 
 class Task(NamedTuple):
@@ -81,12 +67,11 @@ class Trainer(Program):
             Task(out, seed, options, None if options.resume is None else newest_intact(options.resume))
             for out, seed, options in asked
         ]
-        return self.run(self.prepare(tasks, len(tasks)))
+        self.check_all(tasks, len(tasks))
+        return self.run(tasks)
 
-    def prepare(self, tasks: list[Task], at_once: int) -> list[Task]:
-        """Check tasks, all before anything is written, and return them as they can be run.
-
-        Checkpoints of other folders are copied: a run that is killed continues in its own folder.
+    def check_all(self, tasks: list[Task], at_once: int) -> None:
+        """Check tasks, all before anything is written.
 
         Raises:
             CheckpointError, ValueError: as ``train``.
@@ -100,13 +85,12 @@ class Trainer(Program):
             if self.mesh is not None:
                 shared = {name: value for name, value in description.items() if name != "machine"}
                 start = None if task.start is None else task.start.steps
-                check_agree("settings", digest([task.options.as_json(), start, shared]))
+                check_agree([task.options.as_json(), start, shared])
         if self.mesh is not None:
             wait_for_all("checked")  # before the first process writes what the others would find
-        return [task._replace(start=own_start(task)) for task in tasks]
 
     def run(self, tasks: list[Task]) -> list[tuple[Checkpoint, Metrics]]:
-        """Train prepared tasks; those that are as far as each other side by side.
+        """Train checked tasks; those that are as far as each other side by side.
 
         Raises:
             DivergedError: of the first run that did.
@@ -125,8 +109,6 @@ class Trainer(Program):
     def _load(self, task: Task, num_seeds: int) -> tuple[Run, Ready | None]:
         """Return a run and its state; None where it is complete."""
         description, key = self.describe(task.seed, num_seeds), jax.random.key(task.seed)
-        if is_first():
-            remove_half_written(task.out)
         run = Run(self, task.out, description, task.options, task.start)
         if task.start is None:
             return run, Ready(run, self.start(key), 0)
@@ -138,16 +120,6 @@ class Trainer(Program):
         warn_of_other_machine(*task.start, description)
         runner = restore_runner(task.start, jax.eval_shape(self.start, key))
         return run, Ready(run, runner if self.mesh is None else spread(runner, self.mesh), update)
-
-
-def own_start(task: Task) -> Start | None:
-    """Return where a task continues from, with the checkpoint copied into its folder."""
-    if task.start is None or task.start.path.parent.resolve() == task.out.resolve():
-        return task.start
-    path = task.out / step_file(task.start.steps)
-    if is_first():
-        write_atomically(path, task.start.path.read_bytes())
-    return task.start._replace(path=path)
 
 
 def group_by_progress(ready: list[Ready]) -> list[list[Ready]]:
@@ -204,7 +176,9 @@ def train_chunks(trainer: Trainer, group: list[Ready], line: ProgressLine) -> It
     config, options, update = trainer.config, group[0].run.options, group[0].update
     if update == config.num_updates:
         return
-    advance, split = (trainer.chunk, _single) if len(group) == 1 else (trainer.chunk_of_many, _split)
+    advance, split = (
+        (trainer.chunk, lambda tree: [tree]) if len(group) == 1 else (trainer.chunk_of_many, _split)
+    )
     state = group[0].runner if len(group) == 1 else _stack([one.runner for one in group])
     advance(state, jnp.int32(0))  # compiles
     line.begin()
@@ -239,10 +213,6 @@ def _stack(runners: list[Runner]) -> Runner:
 def _split(tree: Any) -> list[Any]:
     size = jax.tree.leaves(tree)[0].shape[0]
     return [jax.tree.map(lambda leaf, index=index: leaf[index], tree) for index in range(size)]
-
-
-def _single(tree: Any) -> list[Any]:
-    return [tree]
 
 
 def show_progress(line: ProgressLine, runs: list[Run], chunks: list[Chunk], steps: int) -> None:

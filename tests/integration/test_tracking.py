@@ -10,8 +10,7 @@ from urllib.request import urlopen
 import pytest
 
 from baselines.purejaxrl_ppo import load_checkpoint, monitor, tracking
-from baselines.purejaxrl_ppo.run import Run
-from baselines.purejaxrl_ppo.training import Options
+from baselines.purejaxrl_ppo.run import Options, Run
 from flytrack_env.rollout import load_rollout
 from tests.support.ppo_runs import BATCH, DEAD_URI, EVERY_OTHER_UPDATE, SEED, assert_same_end
 

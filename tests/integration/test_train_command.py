@@ -8,8 +8,9 @@ import pytest
 
 from baselines.purejaxrl_ppo import Config, load_checkpoint, tracking, train_ppo
 from baselines.purejaxrl_ppo.checkpoint import save_checkpoint
+from baselines.purejaxrl_ppo.run import DivergedError, Options
 from baselines.purejaxrl_ppo.train_ppo import make_plan, make_tasks, parse
-from baselines.purejaxrl_ppo.training import DivergedError, Options, Trainer
+from baselines.purejaxrl_ppo.training import Trainer
 from tests.support.ppo_runs import BATCH, CONFIG, EVERY_OTHER_UPDATE, SEED, assert_same_end, make_trainer
 
 SEEDS = (SEED, SEED + 1)
@@ -48,7 +49,7 @@ def test_flags_override_the_file_and_the_file_the_defaults(tmp_path):
     assert settings.hyperparameters == expected
     settings, _ = read("--total-timesteps", "4e6", "--hidden-sizes", 8, 8, "--reward", "progress=2")
     assert settings.hyperparameters == Config(4_000_000, hidden_sizes=(8, 8))
-    assert settings.reward == {"progress": 2.0}
+    assert train_ppo.parse_rewards(settings.reward) == {"progress": 2.0}
 
 
 def test_every_flag_has_a_help_text(capsys):
@@ -156,7 +157,6 @@ def test_a_run_continues_in_another_folder(seeds, tmp_path, monkeypatch):
     monkeypatch.setattr(train_ppo, "make_trainer", lambda *_: make_trainer())
     step = seeds / "seed3" / f"step_{2 * BATCH}.safetensors"
     plan = make_plan(["--resume", str(step), "--out", str(tmp_path), "--no-tracking"])
-    assert (tmp_path / step.name).read_bytes() == step.read_bytes()
     train_ppo.run(plan)
     assert_same_end(tmp_path / "final.safetensors", seeds / "seed3" / "final.safetensors")
 

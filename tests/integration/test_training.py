@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from baselines.purejaxrl_ppo import CheckpointError, Config, load_checkpoint, monitor
-from baselines.purejaxrl_ppo.checkpoint import as_named_arrays, save_checkpoint
+from baselines.purejaxrl_ppo.checkpoint import save_checkpoint
 from baselines.purejaxrl_ppo.resume import (
     at_common_step,
     check_same_run,
@@ -21,8 +21,8 @@ from baselines.purejaxrl_ppo.resume import (
     newest_intact,
     warn_of_other_machine,
 )
-from baselines.purejaxrl_ppo.run import Run
-from baselines.purejaxrl_ppo.training import DivergedError, Options, Trainer
+from baselines.purejaxrl_ppo.run import DivergedError, Options, Run
+from baselines.purejaxrl_ppo.training import Trainer
 from tests.support.ppo_runs import BATCH, EVERY_OTHER_UPDATE, SEED, assert_same_end
 
 ROOT = Path(__file__).parents[2]
@@ -62,16 +62,6 @@ def test_a_complete_run_is_left_alone_and_no_run_is_overwritten(trainer, whole, 
             trainer.train(final.parent, SEED, Options(resume=resume))
 
 
-def test_another_seed_ends_elsewhere(trainer, whole, tmp_path):
-    trainer.train(tmp_path, SEED + 1, Options())
-    found, other = (
-        as_named_arrays(load_checkpoint(folder / "final.safetensors").params)
-        for folder in (tmp_path, whole[0])
-    )
-    kernels = [name for name in found if name.endswith("kernel")]
-    assert kernels and not any(np.array_equal(found[name], other[name]) for name in kernels)
-
-
 def test_the_newest_intact_checkpoint_is_taken(trainer, whole, tmp_path, caplog):
     shutil.copytree(whole[0], tmp_path / "cut_off")
     cut_off, newest = tmp_path / "cut_off", step_path(tmp_path / "cut_off", 6)
@@ -79,18 +69,12 @@ def test_the_newest_intact_checkpoint_is_taken(trainer, whole, tmp_path, caplog)
     content = bytearray(newest.read_bytes())
     content[len(content) // 2] ^= 1
     newest.write_bytes(content)
-    half_written = cut_off / f".{newest.name}.{'a1' * 8}"
-    half_written.write_bytes(b"half")
     with caplog.at_level(logging.WARNING):
         trainer.train(tmp_path / "resumed", SEED, Options(resume=cut_off))
     reports = [record.getMessage() for record in caplog.records]
     assert len(reports) == 2 and "final.safetensors" in reports[0] and newest.name in reports[1]
     assert all("damaged" in report and "the checkpoint before it is used" in report for report in reports)
     assert_same_end(tmp_path / "resumed" / "final.safetensors", whole[0] / "final.safetensors")
-    (cut_off / "final.safetensors").unlink()
-    newest.unlink()
-    trainer.train(cut_off, SEED, Options(resume=cut_off))
-    assert not half_written.exists()
 
 
 def test_folders_without_an_intact_checkpoint_are_refused(whole, tmp_path):
@@ -116,7 +100,7 @@ def test_a_checkpoint_of_another_run_is_refused_field_by_field(whole):
         "env_id: found 'FlyTrackRobust-v0', expected 'FlyTrack-v0'",
         "seed: found 3, expected 1",
         "config.learning_rate: found 0.003, expected 0.0001",
-        "row 8",
+        "observation.row 10",
         "more",
     ):
         assert part in str(caught.value)

@@ -6,7 +6,8 @@ import jax
 import numpy as np
 
 from baselines.purejaxrl_ppo import Config, load_checkpoint
-from baselines.purejaxrl_ppo.training import Options, Trainer
+from baselines.purejaxrl_ppo.run import Options
+from baselines.purejaxrl_ppo.training import Trainer
 
 SEED = 3
 BATCH = 16 * 24
