@@ -19,7 +19,6 @@ from flytrack_sysid.validate import NAMES, Validation
 DPI = 150
 WIDTH_IN, EMPTY_HEIGHT_IN = 7.0, 1.2
 BY_AXIS = {"x": BLUE, "y": ORANGE, "z": GREEN}
-STYLES = ("-", "--", ":")
 NUM_BINS = 61
 # Errors beyond are in the histogram's last bins: single rows would otherwise squeeze all others.
 SHOWN_PERCENTILE = 99.5
@@ -52,10 +51,10 @@ def say(axes: Axes, why: str) -> None:
     axes.text(0.5, 0.5, why, ha="center", va="center", color=GREY, transform=axes.transAxes, wrap=True)
 
 
-def _label(panel: Axes, x: str, y: str, num_columns: int = 1) -> None:
+def _label(panel: Axes, x: str, y: str) -> None:
     """Set the labels of a panel, and show its legend."""
     panel.set(xlabel=x, ylabel=y)
-    panel.legend(fontsize="small", frameon=False, ncols=num_columns)
+    panel.legend(fontsize="small", frameon=False)
 
 
 def draw_steps(steps: Sequence[StepResponse]) -> Figure:
@@ -134,11 +133,11 @@ def draw_rollouts(rollouts: Sequence[Rollout]) -> Figure:
 
 
 def draw_thrust(thrust: ThrustError | None) -> Figure:
-    """Draw the thrust error over applied action and voltage, and both curves at three voltages."""
+    """Draw the thrust error over applied action and voltage."""
     if thrust is None:
         return _empty("Thrust", "not judged: it needs v_bat, and f, or a or v with q")
-    figure, panels = _figure("Thrust", 2, 1, 8.0)
-    heat, curves = panels[:, 0]
+    figure, panels = _figure("Thrust", 1, 1, 4.5)
+    heat = panels[0, 0]
     limit = max(float(np.nanmax(np.abs(thrust.mean_n))), np.finfo(float).tiny)
     heat.grid(False)
     heat.set_facecolor("0.9")
@@ -152,12 +151,7 @@ def draw_thrust(thrust: ThrustError | None) -> Figure:
     )
     figure.colorbar(image, ax=heat, label="measured minus modelled (N)")
     heat.set_title("mean error; grey: not flown", fontsize="medium", loc="left")
-    heat.set_ylabel("battery (V)")
-    for colour, style, curve in zip((BLUE, ORANGE, GREEN), STYLES, thrust.curves, strict=True):
-        label = f"{curve.voltage_v:.1f} V"
-        curves.plot(curve.modelled_action, curve.modelled_n, style, color=colour, label=f"model, {label}")
-        curves.plot(curve.measured_action, curve.measured_n, "o", color=colour, label=f"measured, {label}")
-    _label(curves, "applied thrust action (stick, after the lag)", "thrust (N)", num_columns=2)
+    heat.set(xlabel="applied thrust action (stick, after the lag)", ylabel="battery (V)")
     return figure
 
 

@@ -1,6 +1,6 @@
 """Responses to the largest commanded steps of a log, measured and modelled."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -37,15 +37,6 @@ class StepResponse(NamedTuple):
     measured: np.ndarray
     modelled: np.ndarray
     rms: float
-
-    def as_json(self) -> dict[str, Any]:
-        """Return the numbers as JSON values."""
-        names = {"since_step": "since_step_s", "rms": "rms_rad_per_s"}
-        names |= {"measured": "measured_rad_per_s", "modelled": "modelled_rad_per_s"}
-        return {
-            names.get(name, name): value.tolist() if isinstance(value, np.ndarray) else value
-            for name, value in self._asdict().items()
-        }
 
 
 def measured_rates(log: FlightLog, steps: Steps) -> np.ndarray | None:

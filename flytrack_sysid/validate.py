@@ -42,27 +42,32 @@ class Validation(NamedTuple):
     notes: tuple[str, ...]
 
     def as_json(self) -> dict[str, Any]:
-        """Return the numbers as JSON values; what could not be judged is absent, and in the notes."""
+        """Return the numbers as JSON values in SI units, V and, where the names say so, degrees.
+
+        What could not be judged is absent, and in the notes; numbers that are not finite are null.
+        """
         parts = {"thrust": self.thrust, "open_force": self.open_force}
-        return _finite(
+        return _json_of(
             {
                 "rows": self.num_rows,
                 "judged_rows": self.num_judged,
                 "one_step": self.one_step.as_json(),
                 "rollouts": [rollout.as_json() for rollout in self.rollouts],
-                **{name: part.as_json() for name, part in parts.items() if part is not None},
-                "steps": [step.as_json() for step in self.steps],
-                "notes": list(self.notes),
+                **{name: part for name, part in parts.items() if part is not None},
+                "steps": self.steps,
+                "notes": self.notes,
             }
         )
 
 
-def _finite(value: Any) -> Any:
-    """Return JSON values with null for numbers that are not finite: empty bins, a model that diverged."""
+def _json_of(value: Any) -> Any:
+    """Return JSON values, with null for numbers that are not finite: empty bins, a model that diverged."""
+    if hasattr(value, "_asdict"):
+        value = value._asdict()
     if isinstance(value, dict):
-        return {name: _finite(item) for name, item in value.items()}
-    if isinstance(value, list):
-        return [_finite(item) for item in value]
+        return {name: _json_of(item) for name, item in value.items()}
+    if isinstance(value, (tuple, list, np.ndarray)):
+        return [_json_of(item) for item in (value.tolist() if isinstance(value, np.ndarray) else value)]
     return None if isinstance(value, float) and not np.isfinite(value) else value
 
 
@@ -104,7 +109,7 @@ def _forces(
         return None, None, [f"thrust and unexplained force: {why}"]
     notes = []
     if "v_bat" in log:
-        thrust = thrust_error(model, samples, prediction.steps.median)
+        thrust = thrust_error(model, samples)
     else:
         notes.append("thrust by voltage: v_bat is not in the log")
     if samples.source != "v" and "v" in log and "q" in log:

@@ -28,8 +28,7 @@ CAPTIONS = {
     "steps": "Body rates, measured (solid) and of the model flying by itself from 0.1 s before the command.",
     "rollouts": "Errors of the model flying by itself under the logged commands, over all starts.",
     "one_step": "Errors of the step from each measured row to the next; the last bins hold all larger ones.",
-    "thrust": "Mass times specific force along body z. Above: error by applied action and voltage. Below: "
-    "the model at rest (lines) and means of what was flown (dots) in thirds of the range of voltage.",
+    "thrust": "Mass times specific force along body z: mean error by applied action and voltage.",
     "open_force": "Specific force, measured minus modelled. Diamonds above 0: drag that the model lacks.",
 }
 
