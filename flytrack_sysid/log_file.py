@@ -4,23 +4,19 @@ Columns are those of ``flytrack_sysid.log``. An ``.npz`` holds one array of numb
 a header of column names, then one row of numbers, separated by commas, per sample; blank lines are skipped.
 """
 
-import csv
 import io
-from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
 import numpy as np
 
-from flytrack_env.files import open_file, write_atomically
-from flytrack_env.messages import error_text, quote_value
+from flytrack_env.files import write_atomically
+from flytrack_env.messages import error_text
 from flytrack_env.npz_file import NpzError, load_npz
+from flytrack_sysid.csv_file import LARGEST_BYTES, open_csv, read_columns
 from flytrack_sysid.log import CHANNELS, GAP_STEPS, FlightLog, LogError, usual_step
-from flytrack_sysid.log_table import CsvRows, Rows, Table, check_names, log_of_table
+from flytrack_sysid.log_table import Table, check_names, log_of_table
 
-Reader = Callable[[Path], Table]
-Writer = Callable[[dict[str, np.ndarray]], bytes]
-
-LARGEST_BYTES = 512 * 2**20  # in the file, and of all columns as float64
+SUFFIXES = (".npz", ".csv")
 
 
 def load_log(path: str | Path) -> FlightLog:
@@ -34,9 +30,9 @@ def load_log(path: str | Path) -> FlightLog:
             count from 0, lines of a CSV file from 1.
     """
     path = Path(path)
-    read, _ = _format_of(path)
+    check_name(path)
     try:
-        return log_of_table(read(path))
+        return log_of_table(_read_npz(path) if path.suffix.lower() == ".npz" else _read_csv(path))
     except OSError as error:
         raise LogError(f"{path}: cannot be read: {error_text(error)}") from error
 
@@ -52,7 +48,7 @@ def save_log(path: str | Path, log: FlightLog) -> None:
         OSError: what the system says.
     """
     path = Path(path)
-    _, write = _format_of(path)
+    check_name(path)
     columns = {"t": np.asarray(log.time, float)}
     if len(log) and np.any(log.segment != log.segment[0]):
         columns["segment"] = log.segment
@@ -61,12 +57,13 @@ def save_log(path: str | Path, log: FlightLog) -> None:
             columns |= dict(zip(CHANNELS[name], np.asarray(log[name], float).T, strict=True))
     check_names(str(path), list(columns))
     log_of_table(Table(str(path), {name: values.astype(float) for name, values in columns.items()}))
-    write_atomically(path, write(columns))
+    write_atomically(path, _npz_of(columns) if path.suffix.lower() == ".npz" else _csv_of(columns))
 
 
 def check_name(path: str | Path) -> None:
     """Raise LogError for a file that ``save_log`` would refuse by its name, before there is a log."""
-    _format_of(Path(path))
+    if Path(path).suffix.lower() not in SUFFIXES:
+        raise LogError(f"{path}: found suffix {Path(path).suffix!r}, expected {' or '.join(SUFFIXES)}")
 
 
 def gaps_of(log: FlightLog) -> np.ndarray:
@@ -131,62 +128,21 @@ def _read_npz(path: Path) -> Table:
 
 def _read_csv(path: Path) -> Table:
     """Return the columns of a CSV file."""
-    with open_file(path, LARGEST_BYTES) as file:
-        rows = CsvRows(io.TextIOWrapper(file, encoding="utf-8-sig", newline=""))
-        try:
-            header = [name.strip() for name in next(rows, [])]
-            if len(header) == 1 and any(mark in header[0] for mark in ";\t"):
-                found = f"no comma in {quote_value(header[0])}"
-                raise LogError(f"{path}: line 1: found {found}, expected names with commas")
-            check_names(str(path), header)
-            table_rows = Rows(str(path), header)
-            for cells in rows:
-                if cells:
-                    place = f"{path}: row {len(table_rows)} (line {rows.line_num})"
-                    table_rows.add(_numbers(place, header, cells), rows.line_num)
-        except (UnicodeDecodeError, csv.Error) as error:
-            where = f"{path}: near line {rows.line_num + 1}"
-            raise LogError(f"{where}: not a CSV file: {error_text(error)}") from error
-    return table_rows.table()
+    with open_csv(path) as rows:
+        header = [name.strip() for name in next(rows, [])]
+        check_names(str(path), header)
+        return read_columns(path, rows, header, header)
 
 
-def _numbers(place: str, header: list[str], cells: list[str]) -> Iterator[float]:
-    """Yield the numbers in one row of a CSV file."""
-    if len(cells) != len(header):
-        column = f", column {header[len(cells)]}" if len(cells) < len(header) else ""
-        raise LogError(f"{place}{column}: found {len(cells)} cells, expected {len(header)} as in the header")
-    for column, cell in zip(header, cells, strict=True):
-        try:
-            if "_" in cell:  # Python reads 1_000 as a number, other programs do not
-                raise ValueError(cell)
-            yield float(cell)
-        except ValueError:
-            found = quote_value(cell) if cell.strip() else "an empty cell"
-            raise LogError(f"{place}, column {column}: found {found}, expected a number") from None
-
-
-def _write_npz(columns: dict[str, np.ndarray]) -> bytes:
+def _npz_of(columns: dict[str, np.ndarray]) -> bytes:
     """Return an .npz file; numpy dates its members 1980, and stored bytes depend on no zlib."""
     buffer = io.BytesIO()
     np.savez(buffer, allow_pickle=False, **columns)
     return buffer.getvalue()
 
 
-def _write_csv(columns: dict[str, np.ndarray]) -> bytes:
+def _csv_of(columns: dict[str, np.ndarray]) -> bytes:
     """Return a CSV file with the shortest digits that give each float64 back."""
-    rows: Iterable[tuple[float, ...]] = zip(*(values.tolist() for values in columns.values()), strict=True)
+    rows = zip(*(values.tolist() for values in columns.values()), strict=True)
     lines = [",".join(columns), *(",".join(map(repr, row)) for row in rows)]
     return ("\n".join(lines) + "\n").encode()
-
-
-_FORMATS: dict[str, tuple[Reader, Writer]] = {
-    ".npz": (_read_npz, _write_npz),
-    ".csv": (_read_csv, _write_csv),
-}
-
-
-def _format_of(path: Path) -> tuple[Reader, Writer]:
-    """Return the reader and the writer of a file's format."""
-    if path.suffix.lower() not in _FORMATS:
-        raise LogError(f"{path}: found suffix {path.suffix!r}, expected {' or '.join(_FORMATS)}")
-    return _FORMATS[path.suffix.lower()]

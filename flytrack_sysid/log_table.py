@@ -1,11 +1,8 @@
 """Checks of a file's columns on their way to a flight log; every refusal names the place."""
 
-import csv
 import difflib
-import math
-from array import array
-from collections.abc import Iterable, Iterator, Sequence
-from typing import NamedTuple, TextIO
+from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 
@@ -14,8 +11,6 @@ from flytrack_sysid.log import CHANNELS, COLUMNS, REQUIRED, FlightLog, LogError
 
 LARGEST_NORM_ERROR = 1e-2  # of quaternions: estimators drift a little; more is no unit quaternion
 SMALLEST_NORM_ERROR = 1e-12  # below it a norm is 1 up to rounding, and the values stay as they are
-LARGEST_VALUES = 56 * 2**20  # all columns at 1 kHz for half an hour; twice as many float64 are below 1 GiB
-LONGEST_ROW = 2**16  # characters of a CSV file: thousands of columns
 COMMAND_MARGIN = 1e-6  # beyond [-1, 1]: rounding by the program that wrote the log
 LONGEST_NAME = max(map(len, COLUMNS)) + 3  # longer names are similar to none
 LARGEST_SEGMENT = 2**53  # float64 is exact for whole numbers below it
@@ -48,61 +43,6 @@ class Table(NamedTuple):
     def matrix(self, columns: Sequence[str]) -> np.ndarray:
         """Return some of the columns side by side, (num_rows, len(columns))."""
         return np.stack([self.columns[column] for column in columns], axis=1)
-
-
-class CsvRows:
-    """The rows of a CSV file, lists of cells, limited in length: ``csv`` itself reads a whole row at once."""
-
-    def __init__(self, text: TextIO, delimiter: str = ",", most_characters: float = math.inf):
-        self._text, self._most_characters = text, most_characters
-        self._num_characters = self._row_start = 0
-        self._rows = csv.reader(self._lines(), delimiter=delimiter, strict=True)
-
-    def _lines(self) -> Iterator[str]:
-        """Yield the lines of the file; a row may have several."""
-        while line := self._text.readline(LONGEST_ROW):
-            self._num_characters += len(line)
-            if self._num_characters - self._row_start >= LONGEST_ROW:
-                raise csv.Error(f"found a row of {LONGEST_ROW} characters or more, expected fewer")
-            if self._num_characters > self._most_characters:
-                raise csv.Error(f"found more than {self._most_characters} characters, expected at most that")
-            yield line
-
-    def __iter__(self) -> "CsvRows":
-        return self
-
-    def __next__(self) -> list[str]:
-        cells = next(self._rows)
-        self._row_start = self._num_characters
-        return cells
-
-    @property
-    def line_num(self) -> int:
-        """Number of lines read."""
-        return self._rows.line_num
-
-
-class Rows:
-    """Rows of numbers on their way to a table; columns of a text file are known only after its last row."""
-
-    def __init__(self, source: str, names: Sequence[str]):
-        self._source, self._names = source, names
-        self._values, self._lines = array("d"), array("q")
-
-    def __len__(self) -> int:
-        return len(self._lines)
-
-    def add(self, numbers: Iterable[float], line: int) -> None:
-        """Add a row; raises LogError beyond LARGEST_VALUES numbers."""
-        self._lines.append(line)
-        self._values.extend(numbers)
-        if len(self._values) > LARGEST_VALUES:
-            raise LogError(f"{self._source}: found more than {LARGEST_VALUES} numbers, expected at most that")
-
-    def table(self) -> Table:
-        """Return the rows as a table."""
-        columns = np.asarray(self._values).reshape(-1, len(self._names)).T
-        return Table(self._source, dict(zip(self._names, columns, strict=True)), np.asarray(self._lines))
 
 
 def check_names(source: str, names: Sequence[str]) -> None:

@@ -9,8 +9,7 @@ import pytest
 
 from benchmarks.reliability import foreign_logs
 from benchmarks.reliability.files import KINDS, soak_kind
-from flytrack_sysid import LogError, import_log
-from flytrack_sysid.importing import csv_log
+from flytrack_sysid import LogError, csv_file, import_log
 
 SLOW = ("imported CSV, gzip", "black box")  # seconds for the crafted files
 
@@ -59,7 +58,7 @@ def test_a_broken_promise_is_reported(tmp_path: Path) -> None:
 
 
 def test_compressed_logs_are_read_and_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(csv_log, "PACKED_BYTES", 50_000)
+    monkeypatch.setattr(csv_file, "PACKED_BYTES", 50_000)
     text, mapping = foreign_logs.foreign_csv(), tmp_path / "map.toml"
     mapping.write_text(foreign_logs.MAPPING)
     (tmp_path / "a.csv").write_bytes(text)

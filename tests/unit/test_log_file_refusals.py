@@ -41,8 +41,8 @@ BAD_COLUMNS = {
     "no time": (rename("t", "segment"), r"column t: missing; found "),
     "no command": (lambda columns: columns.pop("u_yaw"), "column u_yaw: missing; found t, segment, u_roll"),
     "half a vector": (lambda columns: columns.pop("p_y"), "column p_y: missing; found only p_x, p_z of it"),
-    "nan": (set_cell("v_y", 4, np.nan), "{row 4}, column v_y: found nan, expected a finite number"),
-    "inf": (set_cell("t", 5, -np.inf), "{row 5}, column t: found -inf, expected a finite number"),
+    "nan": (set_cell("v_y", 4, np.nan), "{row 4}, column v_y: found '?nan'?, expected a finite number"),
+    "inf": (set_cell("t", 5, -np.inf), "{row 5}, column t: found '?-inf'?, expected a finite number"),
     "no rows": (no_rows, "found no rows"),
     "duplicate row": (
         lambda columns: set_cell("t", 2, columns["t"][1])(columns),
@@ -121,15 +121,20 @@ BAD_TEXTS = {
     "empty file": ("", "column t: missing; found no column"),
     "header only": (HEADER, "found no rows"),
     "duplicate": (f"{HEADER},v_bat\n", "column v_bat: found 2 times, expected once"),
-    "semicolons": (HEADER.replace(",", ";"), "line 1: found no comma"),
     "short row": (
         f"{HEADER}\n0,0,0,0,0,1\n\n1,0,0,0\n",
-        r"row 1 \(line 4\), column u_thrust: found 4 cells, expected 6 as in the header",
+        r"row 1 \(line 4\): found 4 cells, expected 6 as in the header",
     ),
-    "word": (f"{HEADER}\n0,0,0,on,0,1\n", r"row 0 \(line 2\), column u_yaw: found 'on', expected a number"),
-    "digits": (f"{HEADER}\n1_0,0,0,0,0,1\n", r"row 0 \(line 2\), column t: found '1_0', expected a number"),
+    "word": (
+        f"{HEADER}\n0,0,0,on,0,1\n",
+        r"row 0 \(line 2\), column u_yaw: found 'on', expected a finite number",
+    ),
+    "digits": (
+        f"{HEADER}\n1_0,0,0,0,0,1\n",
+        r"row 0 \(line 2\), column t: found '1_0', expected a finite number",
+    ),
     "empty cell": (f"{HEADER}\n0,0,0,0,0, \n", r"row 0 \(line 2\), column v_bat: found an empty cell"),
-    "open quote": (f'{HEADER}\n"0,0,0,0,0,1\n', "near line 3: not a CSV file"),
+    "open quote": (f'{HEADER}\n"0,0,0,0,0,1\n', "near line 2: not a CSV file"),
     "no text": (b"\xff\xfe\x00", "near line 1: not a CSV file"),
 }
 
@@ -184,7 +189,7 @@ def test_array_that_unpacks_to_more_than_announced_is_not_unpacked(tmp_path, met
 
 
 def test_endless_rows_take_no_memory(tmp_path):
-    (tmp_path / "flight.csv").write_text(HEADER + '\n"' + "1\n" * 2**18)
+    (tmp_path / "flight.csv").write_text(HEADER + "\n" + "1," * 2**18)
     tracemalloc.start()
     try:
         with pytest.raises(LogError, match="not a CSV file: found a row of 65536 characters or more"):
