@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 
 from flytrack_env.files import write_atomically
-from flytrack_env.messages import error_text, quote_name
+from flytrack_env.messages import error_text
 from flytrack_env.npz_file import NpzError, load_npz
 from flytrack_env.state import ACTION_SIZE, APPLIED_ACTION, QUATERNION, STATE_SIZE
 from flytrack_sysid.envelope import ANY_VOLTAGE, FEWEST_STEPS, LARGEST_SPEED, SCRIPT_HEIGHTS, is_inside
@@ -25,9 +25,7 @@ from flytrack_sysid.excitation import ScriptedFlight
 from flytrack_sysid.manoeuvres import MANOEUVRES
 
 SUFFIX = ".npz"
-ARRAYS = ("kinds", "starts", "commands")
 LARGEST_BYTES = 64 * 2**20  # in the file, and as float64: thousands of flights of 2.5 s
-LONGEST_LIST = 200  # characters of names that are not expected
 LARGEST_NORM_ERROR = 1e-3  # of a start's quaternion
 ROUNDING = 1e-6  # of numbers that were float32
 
@@ -48,12 +46,6 @@ def script_of(flights: Iterable[ScriptedFlight]) -> Script:
     """Return the script of flights of equal length."""
     kinds, starts, commands = zip(*flights, strict=True)
     return Script(tuple(kinds), np.stack(starts).astype(float), np.stack(commands).astype(float))
-
-
-def check_name(path: str | Path) -> None:
-    """Raise ScriptError for a file that is not .npz, before there is a script."""
-    if Path(path).suffix.lower() != SUFFIX:
-        raise ScriptError(f"{path}: found suffix {Path(path).suffix!r}, expected {SUFFIX}")
 
 
 def check_script(script: Script, source: str = "script") -> None:
@@ -96,9 +88,14 @@ def save_script(path: str | Path, script: Script) -> None:
     check_name(path)
     check_script(script, str(path))
     buffer = io.BytesIO()
-    arrays = {"kinds": np.array(script.kinds), "starts": script.starts, "commands": script.commands}
-    np.savez(buffer, allow_pickle=False, **arrays)
+    np.savez(buffer, allow_pickle=False, **script._replace(kinds=np.array(script.kinds))._asdict())
     write_atomically(path, buffer.getvalue())
+
+
+def check_name(path: str | Path) -> None:
+    """Raise ScriptError for a file that is not .npz, before there is a script."""
+    if Path(path).suffix.lower() != SUFFIX:
+        raise ScriptError(f"{path}: found suffix {Path(path).suffix!r}, expected {SUFFIX}")
 
 
 def load_script(path: str | Path) -> Script:
@@ -108,21 +105,15 @@ def load_script(path: str | Path) -> Script:
         ScriptError: a file that cannot be read, or no script that can be flown; the message says why.
     """
     check_name(path)
-    path = Path(path)
     try:
-        arrays = load_npz(path, LARGEST_BYTES)
+        arrays = load_npz(Path(path), LARGEST_BYTES)
     except (OSError, NpzError) as error:
         raise ScriptError(f"{path}: not a script, or damaged: {error_text(error)}") from error
-    if sorted(arrays) != sorted(ARRAYS):
-        found = ", ".join(map(quote_name, sorted(arrays)))[:LONGEST_LIST]
-        raise ScriptError(f"{path}: found arrays {found}, expected {', '.join(ARRAYS)}")
-    kinds, starts, commands = (arrays[name] for name in ARRAYS)
-    if kinds.ndim != 1 or kinds.dtype.kind != "U" or starts.ndim != 2 or len(kinds) != len(starts):
-        found = f"arrays of {kinds.dtype}, shape {kinds.shape}, and of shape {starts.shape}"
-        raise ScriptError(f"{path}: kinds, starts: found {found}, expected a name for each start")
-    for name, values in (("starts", starts), ("commands", commands)):
-        if values.dtype.kind not in "iuf":
-            raise ScriptError(f"{path}: {name}: found an array of {values.dtype}, expected numbers")
-    script = Script(tuple(kinds.tolist()), starts.astype(float), commands.astype(float))
+    for name in Script._fields:
+        if name not in arrays or arrays[name].dtype.kind not in ("U" if name == "kinds" else "iuf"):
+            found = f"an array of {arrays[name].dtype}" if name in arrays else "none"
+            raise ScriptError(f"{path}: {name}: found {found}, expected texts of kinds, else numbers")
+    kinds, starts, commands = (arrays[name] for name in Script._fields)
+    script = Script(tuple(kinds.ravel().tolist()), starts.astype(float), commands.astype(float))
     check_script(script, str(path))
     return script
