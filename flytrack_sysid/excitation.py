@@ -1,14 +1,4 @@
-"""Excitation: short flights that excite one axis at a time, from chosen states.
-
-==========  =====================================================================================
-kind        what is flown, each from a different state and voltage
-==========  =====================================================================================
-roll,       chirp then step, or doublet then sine, on this axis alone and about hovering thrust,
-pitch, yaw  at amplitudes from a tenth of the stick to all of it
-thrust      a sine, step, doublet or chirp over the whole stick, then slow switching, near upright
-free        switching commands on all axes, thrust axis up to 80 degrees from the vertical
-leg         3 to 15 m/s in any direction and heading, tilted, with switching yaw and slow thrust
-==========  =====================================================================================
+"""Excitation: short flights that excite one axis at a time, from chosen states (docs/identification.md).
 
 Four flights of a kind follow each other, so that the last of every four can be held out
 (``flytrack_sysid.split``) and every kind is in both parts.

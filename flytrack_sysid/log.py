@@ -1,25 +1,12 @@
 """Flight logs: named columns in SI units, the one form of simulated and measured flight.
 
-================================  =============================================  =======
-column                            quantity                                       unit
-================================  =============================================  =======
-``t``                             time, growing within a segment                 s
-``u_roll u_pitch u_yaw u_thrust`` command, in [-1, 1]                            1
-``segment``                       number of the flight, each in one piece        1
-``p_x p_y p_z``                   position, world                                m
-``v_x v_y v_z``                   velocity, world                                m/s
-``a_x a_y a_z``                   acceleration, world (0 in hover)               m/s^2
-``f_x f_y f_z``                   accelerometer: specific force, body            m/s^2
-``q_w q_x q_y q_z``               orientation, body to world                     1
-``w_x w_y w_z``                   angular velocity, body                         rad/s
-``uprev_roll`` ... ``_thrust``    applied (lagged) action                        1
-``v_bat``                         battery voltage                                V
-================================  =============================================  =======
+docs/identification.md lists columns, units and frames: position ``p``, velocity ``v``, acceleration ``a``
+(0 in hover), world; specific force ``f``, angular velocity ``w``, body; orientation ``q``, (w, x, y, z), body
+to world; command ``u`` and applied action ``uprev`` in [-1, 1]; battery ``v_bat``, V.
 
 Row k holds what was measured at t_k and the command held from t_k to t_k+1. As in the handout's state,
 ``a`` and ``f`` of row k are those of the step that led to t_k, with the attitude before it. ``t`` and the
-commands are always there; other channels may be absent (never zero instead), but only whole ones. Rows
-need not be evenly spaced; a sample that was lost is a missing row.
+commands are always there; other channels may be absent (never zero instead), but only whole ones.
 """
 
 import hashlib

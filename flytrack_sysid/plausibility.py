@@ -1,12 +1,10 @@
 """Plausibility of a log as a flight: units, gravity and signs, stuck columns, too little data.
 
-The motion by one channel is compared with that by another, over windows of 0.1 to 1 s so that noise averages
-out. A unit is called wrong only where both are correlated and differ by about a known factor; where the
-motion is too small to tell, no problem is reported. Of frames, only the direction of ``q`` and the z of
-``f`` are compared.
+The motion by one channel is compared with that by another over windows of 0.1 to 1 s, so that noise averages
+out. Where the motion is too small to tell, no problem is reported.
 """
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -34,14 +32,6 @@ LONG_FALL_S = 5.0  # no drone falls for longer
 LEAST_FORCE_DOWN = 0.5 * GRAVITY  # m/s^2 along -z of the body; drag in a fast climb is less
 UPRIGHT = float(np.cos(np.deg2rad(45.0)))  # cosine of the tilt
 
-RATE_UNITS = {float(np.rad2deg(1.0)): ("w", "deg/s", "rad/s")}
-PLACE_UNITS = {
-    1000.0: ("p", "mm", "m"),
-    100.0: ("p", "cm", "m"),
-    0.01: ("v", "cm/s", "m/s"),
-    0.001: ("v", "mm/s", "m/s"),
-}
-ACCELERATION_UNITS = {1.0 / GRAVITY: ("a", "g", "m/s^2")}
 BATTERY_UNITS = {1000.0: "mV", 100.0: "hundredths of V", 10.0: "tenths of V"}
 
 
@@ -52,15 +42,6 @@ def _is_about(value: float, factor: float) -> bool:
 
 def _columns(*channels: str) -> str:
     return ", ".join(column for channel in channels for column in CHANNELS[channel])
-
-
-def _wrong_unit(slope: float, units: Mapping[float, tuple[str, str, str]], ratio: str) -> list[str]:
-    """Return the problem of a slope that a wrong unit explains; ratio: what the slope is of."""
-    for factor, (channel, unit, expected) in units.items():
-        if _is_about(slope, factor):
-            found = f"found {slope:.3g} for {ratio}, expected 1"
-            return [f"{_columns(channel)}: {found}: this looks like {unit}, not {expected}"]
-    return []
 
 
 def _with_time_in_s(log: FlightLog) -> tuple[FlightLog, list[str]]:
@@ -125,38 +106,29 @@ def _attitude(log: FlightLog) -> Iterator[str]:
 def _rates(log: FlightLog) -> Iterator[str]:
     if "w" not in log:
         return
-    problems = []
     if "q" in log:
         slope = slope_of(log, summed_turns(Rotation.from_quat(log["q"], scalar_first=True)), log["w"])
-        problems = _wrong_unit(slope, RATE_UNITS, f"the rates over those by {_columns('q')}")
-        yield from problems
+        if _is_about(slope, np.rad2deg(1.0)):
+            found = f"found {slope:.3g} for the rates over those by {_columns('q')}, expected 1"
+            yield f"{_columns('w')}: {found}: this looks like deg/s, not rad/s"
+            return
     fast = np.percentile(np.linalg.norm(log["w"], axis=1), FAST_PERCENTILE)
-    if not problems and fast > FASTEST_RATE:
+    if fast > FASTEST_RATE:
         found = f"found a {FAST_PERCENTILE:g}th percentile of {fast:.0f}"
         expected = f"expected at most {FASTEST_RATE:.0f} rad/s, all that gyroscopes measure"
         yield f"{_columns('w')}: {found}, {expected}: this looks like deg/s"
 
 
-def _position(log: FlightLog) -> Iterator[str]:
-    if "p" in log and "v" in log:
-        slope = 1.0 / slope_of(log, log["p"], log["v"])
-        ratio = f"the distance by {_columns('p')} over that by {_columns('v')}"
-        yield from _wrong_unit(slope, PLACE_UNITS, ratio)
-
-
 def _acceleration(log: FlightLog) -> Iterator[str]:
-    """Compare increments less their mean, which contains bias and gravity; then that mean."""
+    """Compare the mean of ``a_z`` with the growth of ``v_z``."""
     if "a" not in log or "v" not in log:
         return
-    slope = slope_of(log, log["v"], log["a"], is_centred=True)
-    problems = _wrong_unit(slope, ACCELERATION_UNITS, f"the accelerations over those by {_columns('v')}")
-    yield from problems
     windows = windows_of(log, WINDOWS_S[-1])
-    if problems or len(windows.starts) == 0:
+    if len(windows.starts) == 0:
         return
     changes = windows.change_of(log["v"]) / windows.durations[:, None]
     offset = float(np.median((windows.mean_of(log, log["a"]) - changes)[:, 2]))
-    if abs(offset - GRAVITY) <= LARGEST_BIAS and (np.isnan(slope) or _is_about(slope, 1.0)):
+    if abs(offset - GRAVITY) <= LARGEST_BIAS:
         found = f"found {offset:.3g} m/s^2 more than v_z changes by, expected 0 in hover"
         yield f"a_z: {found}: gravity looks left in, as an accelerometer measures it"
 
@@ -208,7 +180,7 @@ def _battery(log: FlightLog) -> Iterator[str]:
 
 
 CHECKS: tuple[Callable[[FlightLog], Iterator[str]], ...]
-CHECKS = (_length, _commands, _motion, _attitude, _rates, _position, _acceleration, _force, _battery)
+CHECKS = (_length, _commands, _motion, _attitude, _rates, _acceleration, _force, _battery)
 
 
 def find_problems(log: FlightLog) -> list[str]:

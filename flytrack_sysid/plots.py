@@ -11,17 +11,13 @@ from flytrack_env.pictures import drawing
 from flytrack_env.pictures.drawing import new_figure, plain
 from flytrack_env.scene import BLUE, GREEN, GREY, ORANGE
 from flytrack_sysid.forces import OpenForce, SpeedBin, ThrustError
-from flytrack_sysid.one_step import UNITS, OneStep
 from flytrack_sysid.open_loop import QUANTITIES, Rollout
 from flytrack_sysid.steps import AXES, StepResponse
-from flytrack_sysid.validate import NAMES, Validation
+from flytrack_sysid.validate import Validation
 
 DPI = 150
 WIDTH_IN, EMPTY_HEIGHT_IN = 7.0, 1.2
 BY_AXIS = {"x": BLUE, "y": ORANGE, "z": GREEN}
-NUM_BINS = 61
-# Errors beyond are in the histogram's last bins: single rows would otherwise squeeze all others.
-SHOWN_PERCENTILE = 99.5
 
 
 def png_of(figure: Figure) -> bytes:
@@ -78,40 +74,6 @@ def draw_steps(steps: Sequence[StepResponse]) -> Figure:
         panel.axvline(0.0, color=GREY, linewidth=0.8)
         is_last = axis == AXES[-1]
         _label(panel, "time since the command (ms)" if is_last else "", f"{axis} rate (deg/s)")
-    return figure
-
-
-def _draw_histogram(panel: Axes, values: np.ndarray) -> None:
-    """Draw how often errors are how large, a line per axis; (num_steps, 3)."""
-    limit = max(np.percentile(np.abs(values), SHOWN_PERCENTILE), np.finfo(float).tiny)
-    edges = np.linspace(-limit, limit, NUM_BINS + 1)
-    for (axis, colour), column in zip(BY_AXIS.items(), values.T, strict=True):
-        share = np.histogram(np.clip(column, -limit, limit), edges)[0] / len(column)
-        panel.stairs(100.0 * share, edges, color=colour, label=axis)
-    panel.set_yscale("log")  # a drone that mostly does not turn has nearly all its errors in one bin
-
-
-def draw_one_step(one_step: OneStep) -> Figure:
-    """Draw the histogram of one-step errors of each channel, a line per component."""
-    names = ["p", "v", "q", "w", "f" if "f" in one_step.channels else "a"]
-    title = "One-step errors, measured minus modelled"
-    if not one_step.channels:
-        return _empty(title, "no step is judged")
-    figure, panels = _figure(title, 3, 2, 8.0)
-    panels.flat[-1].set_axis_off()
-    for panel, name in zip(panels.flat, names, strict=False):
-        error = one_step.channels.get(name)
-        if error is None:
-            say(panel, f"{NAMES[name]}: not in the log, or not judged")
-            continue
-        values, unit = error.errors, UNITS[name].replace("^2", "²")
-        if error.turn_deg is not None:
-            values, unit = error.turn_deg, "deg"
-        _draw_histogram(panel, values)
-        nrmse = "" if error.nrmse is None else f", NRMSE {error.nrmse:.2g}"
-        panel.set_title(f"{NAMES[name]}{nrmse}", fontsize="medium", loc="left")
-        panel.ticklabel_format(axis="x", scilimits=(-2, 3))
-        _label(panel, f"error ({unit})", "steps (%)")
     return figure
 
 
@@ -185,7 +147,6 @@ def draw_validation(validation: Validation) -> dict[str, Figure]:
     """Return all figures of a validation by name."""
     return {
         "steps": draw_steps(validation.steps),
-        "one_step": draw_one_step(validation.one_step),
         "rollouts": draw_rollouts(validation.rollouts),
         "thrust": draw_thrust(validation.thrust),
         "open_force": draw_open_force(validation.open_force),

@@ -1,13 +1,4 @@
-"""Scripts: flights to be flown, and the files that hold them.
-
-==========  ==============  ==================================================================
-array       shape           what it is
-==========  ==============  ==================================================================
-kinds       (N,) text       what each flight is, a name of ``flytrack_sysid.manoeuvres``
-starts      (N, 21)         the handout's state at the start of each, within the envelope
-commands    (N, T, 4)       commands in [-1, 1], one per 0.01 s
-==========  ==============  ==================================================================
-"""
+"""Scripts: flights to be flown, and their ``.npz`` files, an array for each field of ``Script``."""
 
 import io
 from collections.abc import Iterable
@@ -35,7 +26,7 @@ class ScriptError(ValueError):
 
 
 class Script(NamedTuple):
-    """Flights to be flown: kinds (N,), starts (N, 21), commands (N, T, 4); float64."""
+    """Flights to be flown: names of manoeuvres (N,), starts (N, 21), commands (N, T, 4) per 0.01 s."""
 
     kinds: tuple[str, ...]
     starts: np.ndarray

@@ -7,7 +7,7 @@ import numpy as np
 from flytrack_env.dynamics import ModelParameters
 from flytrack_sysid.log import FlightLog
 from flytrack_sysid.open_loop import longest_flight
-from flytrack_sysid.prediction import Prediction, Steps, free_flights, runs_of, turn_between
+from flytrack_sysid.prediction import Prediction, free_flights, runs_of
 
 AXES = ("roll", "pitch", "yaw")
 LEAST_JUMP = 0.2
@@ -37,21 +37,6 @@ class StepResponse(NamedTuple):
     measured: np.ndarray
     modelled: np.ndarray
     rms: float
-
-
-def measured_rates(log: FlightLog, steps: Steps) -> np.ndarray | None:
-    """Return the body rates, (num_rows, 3) rad/s: w, else from q; None without either.
-
-    From q: the rate of the step that led to the row, as in the simulator; NaN behind a gap.
-    """
-    if "w" in log:
-        return log["w"]
-    if "q" not in log:
-        return None
-    rates_b = np.full((len(log), 3), np.nan)
-    turn = turn_between(log["q"][:-1], log["q"][1:]) / steps.duration[:-1, None]
-    rates_b[1:] = np.where(steps.is_step[:-1, None], turn, np.nan)
-    return rates_b
 
 
 def _steps_in(time: np.ndarray, command: np.ndarray) -> np.ndarray:
@@ -93,8 +78,7 @@ def step_responses(
     rows: (num_rows,) bool, the judged ones. A step is a jump by at least 0.2 between commands that are
     constant for 0.08 s before and 0.15 s after it.
     """
-    rates_b = measured_rates(log, prediction.steps)
-    if rates_b is None:
+    if "w" not in log:
         return ()
     shown = [
         (axis, *place) for axis in range(len(AXES)) for place in _largest_steps(log, prediction, rows, axis)
@@ -107,7 +91,7 @@ def step_responses(
             axis, first, step, end = shown[len(responses)]
             since = slice(first + 1, end)
             modelled = flown["w"][index, : end - first - 1, axis]
-            measured = rates_b[since, axis]
+            measured = log["w"][since, axis]
             responses.append(
                 StepResponse(
                     axis=AXES[axis],

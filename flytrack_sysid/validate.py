@@ -150,8 +150,8 @@ def validate(model: ModelParameters, log: FlightLog, rows: np.ndarray | None = N
     if not steps:
         notes.append(
             "step responses: no judged command of roll, pitch or yaw jumps by "
-            f"{LEAST_JUMP:g} between {HELD_BEFORE_S:g} s and {HELD_AFTER_S:g} s of constant command, with a "
-            "body rate or attitude measured"
+            f"{LEAST_JUMP:g} between {HELD_BEFORE_S:g} s and {HELD_AFTER_S:g} s of constant command, with "
+            "body rates measured"
         )
     return Validation(
         num_rows=num_rows,

@@ -27,7 +27,6 @@ HEADINGS = {
 CAPTIONS = {
     "steps": "Body rates, measured (solid) and of the model flying by itself from 0.1 s before the command.",
     "rollouts": "Errors of the model flying by itself under the logged commands, over all starts.",
-    "one_step": "Errors of the step from each measured row to the next; the last bins hold all larger ones.",
     "thrust": "Mass times specific force along body z: mean error by applied action and voltage.",
     "open_force": "Specific force, measured minus modelled. Diamonds above 0: drag that the model lacks.",
 }
@@ -133,17 +132,12 @@ def text_of(validation: Validation, model_name: str, log: FlightLog) -> str:
     return "\n\n".join(blocks) + "\n"
 
 
-def json_of(validation: Validation, model_name: str, log: FlightLog) -> dict[str, Any]:
-    """Return a validation as JSON values, with what was judged on what."""
-    return {"model": model_name, "log": log.source, "log_sha256": log.sha256, **validation.as_json()}
-
-
 def html_of(validation: Validation, model_name: str, log: FlightLog, pictures: dict[str, bytes]) -> str:
     """Return a validation as a self-contained page; pictures: PNG files by figure's name."""
     tables = _tables(validation)
     sections = []
     for name, heading in HEADINGS.items():
-        parts: list[Any] = [Picture(pictures[name], CAPTIONS[name])]
+        parts: list[Any] = [Picture(pictures[name], CAPTIONS[name])] if name in pictures else []
         parts += [tables[name]] if name in tables else []
         if name == "one_step":
             parts += [Text(meaning) for meaning in _nrmse_meanings(validation)]
@@ -166,7 +160,8 @@ def write_validation(out: str | Path, validation: Validation, model_name: str, l
         OSError: a file cannot be written.
     """
     pictures = {name: png_of(figure) for name, figure in draw_validation(validation).items()}
-    document = json.dumps(json_of(validation, model_name, log), indent=1, allow_nan=False) + "\n"
+    numbers = {"model": model_name, "log": log.source, "log_sha256": log.sha256, **validation.as_json()}
+    document = json.dumps(numbers, indent=1, allow_nan=False) + "\n"
     files = {
         "validation.json": document.encode(),
         "validation.txt": text_of(validation, model_name, log).encode(),

@@ -48,12 +48,11 @@ def windows_of(log: FlightLog, length_s: float) -> Windows:
     return Windows(starts[keep], ends[keep], durations[keep])
 
 
-def slope_of(log: FlightLog, change: np.ndarray, rate: np.ndarray, is_centred: bool = False) -> float:
+def slope_of(log: FlightLog, change: np.ndarray, rate: np.ndarray) -> float:
     """Return the factor from the change of one quantity to the integral of its rate, nan if none is clear.
 
     change, rate: (num_rows, 3). The ratio of their sizes over windows of that length at which they move
-    most alike: noise in either biases it little where they are highly correlated. is_centred: without the
-    mean of each column, which a bias is in.
+    most alike: noise in either biases it little where they are highly correlated.
     """
     best, slope = LEAST_CORRELATION, np.nan
     for length_s in WINDOWS_S:
@@ -62,8 +61,6 @@ def slope_of(log: FlightLog, change: np.ndarray, rate: np.ndarray, is_centred: b
             continue
         grown = windows.change_of(change) / windows.durations[:, None]
         summed = windows.mean_of(log, rate)
-        if is_centred:
-            grown, summed = grown - grown.mean(axis=0), summed - summed.mean(axis=0)
         size_grown, size_summed = np.linalg.norm(grown), np.linalg.norm(summed)
         if min(size_grown, size_summed) < STILL:
             continue
