@@ -7,7 +7,7 @@ from latex2mathml.converter import convert
 
 from docs.markdown import one_line, render
 from flytrack_env.effects import EFFECTS, Effect
-from flytrack_sysid.diagnosis.evidence import EVIDENCE, After
+from flytrack_sysid.diagnosis.evidence import EVIDENCE
 from flytrack_sysid.diagnosis.traces import REGRESSORS
 
 CHANNELS = {
@@ -18,7 +18,6 @@ CHANNELS = {
     "f": "accelerometer",
     "v_bat": "battery voltage",
 }
-CHANGES = {0: "changes of the {} command", 1: "rising {} commands", -1: "falling {} commands"}
 
 
 def needs_of(effect: Effect) -> str:
@@ -34,14 +33,8 @@ def needs_of(effect: Effect) -> str:
 
 def varied_by(effect: Effect) -> list[str]:
     """Return what a flight has to vary to show the effect."""
-    varied = []
-    for panel in EVIDENCE[effect.name].panels:
-        if isinstance(panel, After):
-            varied.append(CHANGES[panel.only].format(panel.stick))
-        else:
-            label, unit = REGRESSORS[panel.regressor]
-            varied.append(label if unit == "1" else f"{label} ({unit})")
-    return list(dict.fromkeys(varied))
+    varied = [REGRESSORS[panel.regressor] for panel in EVIDENCE[effect.name].panels]
+    return list(dict.fromkeys(label if unit == "1" else f"{label} ({unit})" for label, unit in varied))
 
 
 def arguments(values: Mapping[str, float]) -> str:

@@ -21,7 +21,7 @@ from flytrack_env.plants import Plant
 from flytrack_sysid.collect import CollectError, collect
 from flytrack_sysid.diagnosis import diagnose, joined, write_diagnosis
 from flytrack_sysid.diagnosis import text_of as text_of_diagnosis
-from flytrack_sysid.diagnosis.next_flight import next_flight
+from flytrack_sysid.diagnosis.identifiability import next_flight
 from flytrack_sysid.diagnosis.report import traces_of
 from flytrack_sysid.fit import fit
 from flytrack_sysid.flight_recording import write_flight_recording

@@ -15,11 +15,11 @@ import numpy as np
 
 from benchmarks.hidden.noise import DIGIT, STD
 from flytrack_env.dynamics import ModelParameters
-from flytrack_sysid.diagnosis.candidates import CANDIDATES, Candidate
 from flytrack_sysid.diagnosis.lanes import NUM_AXES, make_lanes
 from flytrack_sysid.diagnosis.model_selection import MOST_RIVALS, ablate
 from flytrack_sysid.diagnosis.noise import fit_noise
 from flytrack_sysid.diagnosis.problem import Problem
+from flytrack_sysid.diagnosis.score_test import CANDIDATES, Candidate
 from flytrack_sysid.diagnosis.search import FittedModel, Held, SearchState, add_effect, score_candidates
 from flytrack_sysid.log import FlightLog
 from flytrack_sysid.parameters import THRUST_COEFFS

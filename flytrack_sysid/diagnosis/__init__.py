@@ -1,7 +1,7 @@
 """What a simulation gets wrong, from a flight log: named causes, what cannot be told apart, what is left."""
 
 from flytrack_sysid.diagnosis.diagnose import DiagnosisError, diagnose, joined
-from flytrack_sysid.diagnosis.files import text_of, write_diagnosis
+from flytrack_sysid.diagnosis.report import text_of, write_diagnosis
 from flytrack_sysid.diagnosis.result import Cause, Diagnosis, Estimated, NotIdentifiable, Unexplained
 
 __all__ = [

@@ -1,65 +1,74 @@
-"""What each cause is in plain words, and the plot that shows it: which residual against what."""
+"""What each cause is in plain words, and the plot that shows it: a residual against a regressor."""
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
+
+import numpy as np
+from matplotlib.figure import Figure
 
 from flytrack_env.dynamics import ModelParameters
 from flytrack_env.effects import ThrustScale
-from flytrack_sysid.diagnosis.candidates import BASE_CAUSES
+from flytrack_sysid.diagnosis.score_test import BASE_CAUSES
+from flytrack_sysid.diagnosis.traces import REGRESSORS, UNITS, Traces
 from flytrack_sysid.parameters import STICKS, names_of, to_vector, with_values
+from flytrack_sysid.plots import BLUE, GREY, ORANGE, say
+
+WIDTH_IN, ROW_IN, LEGEND_IN = 8.0, 2.5, 0.9
+MOST_COLUMNS = 3
+FEWEST_SHOWN = 50  # rows
+NO_DATA = "not in the log, or too little of it"
+NUM_BINS = 15
+SHOWN_PERCENTILES = (0.5, 99.5)  # of the regressor: single rows far out would squeeze all others
+FEWEST_ROWS, FEWEST_PIECES, LEAST_ROWS = 20, 5, 2  # of a bin: wanted, and without which there is no scatter
+BLOCK_S = 1.0  # rows further apart than this count as independent
+FEWEST_BLOCKS = 10  # fewer say too little of their own scatter
+TWO_SIDED_95 = 1.959964  # standard deviations
+# Attitude and velocity are noisy in each row: their change over a piece is known as well as over a step.
+PIECE_S = 0.2
+_TURN_AXES = {"x": "roll", "y": "pitch", "z": "yaw"}
 
 
-class Against(NamedTuple):
-    """A panel: means of a residual by bins of a regressor, names as in ``traces``."""
+class Panel(NamedTuple):
+    """Means of a residual by bins of a regressor, names as in ``traces``."""
 
     residual: str
     regressor: str
-
-
-class After(NamedTuple):
-    """A panel: mean residual after a change of a command. only: 1 where it rises, -1 where it falls."""
-
-    residual: str
-    stick: str
-    only: int = 0
 
 
 class Evidence(NamedTuple):
     """A cause in plain words, its panels, and how they show it."""
 
     words: str
-    panels: tuple[Against | After, ...]
+    panels: tuple[Panel, ...]
     reading: str
 
 
-def _against(residual: str, regressor: str, axes: str = "xyz") -> tuple[Against, ...]:
-    return tuple(Against(f"{residual}_{axis}", f"{regressor}_{axis}") for axis in axes)
+def _by_axis(residual: str, regressor: str, axes: str = "xyz") -> tuple[Panel, ...]:
+    return tuple(Panel(f"{residual}_{axis}", f"{regressor}_{axis}") for axis in axes)
 
 
-def _all_against(residual: str, regressor: str, axes: str = "xyz") -> tuple[Against, ...]:
-    return tuple(Against(f"{residual}_{axis}", regressor) for axis in axes)
+def _each(residual: str, regressor: str, axes: str = "xyz") -> tuple[Panel, ...]:
+    return tuple(Panel(f"{residual}_{axis}", regressor) for axis in axes)
 
 
-_TURNS = (After("rates_x", "roll"), After("rates_y", "pitch"), After("rates_z", "yaw"))
-_LATE = (*_TURNS[:2], After("force_z", "thrust"))
+_TURNS = _by_axis("rates", "spin_up")
+_LATE = (*_TURNS[:2], Panel("force_z", "thrust_change"))
+_LATE_READING = "The error grows with how fast the demand changes: the drone answers earlier or later."
 _BY_STICK = tuple(
-    Against(f"rates_{axis}", f"applied_{stick}") for axis, stick in zip("xyz", STICKS[:3], strict=True)
+    Panel(f"rates_{axis}", f"applied_{stick}") for axis, stick in zip("xyz", STICKS[:3], strict=True)
 )
-_BY_AIRSPEED = _against("force", "airspeed")
-_LATE_READING = (
-    "Averaged over all steps of the command: the error is a kick that dies out once the drone has answered."
-)
-_GYRO = _against("rates", "model_rates") + _against("attitude", "model_rates")
+_BY_AIRSPEED = _by_axis("force", "airspeed")
+_GYRO = _by_axis("rates", "model_rates") + _by_axis("attitude", "model_rates")
 _GYRO_READING = "It shows in the gyro (above) and not in the turn of the attitude (below)."
-_ACCELEROMETER = _against("force", "model_force") + _against("velocity", "model_force")
+_ACCELEROMETER = _by_axis("force", "model_force") + _by_axis("velocity", "model_force")
 _ACCELEROMETER_READING = "It shows in the accelerometer (above) and not in the change of velocity (below)."
 
 EVIDENCE: dict[str, Evidence] = {
     "command_delay": Evidence("all commands act late", _LATE, _LATE_READING),
     "thrust_lag_asymmetry": Evidence(
         "thrust falls faster or slower than it rises",
-        (After("force_z", "thrust", 1), After("force_z", "thrust", -1)),
-        "The error after rising commands differs from that after falling ones.",
+        _LATE[2:],
+        "The slope where thrust rises differs from that where it falls.",
     ),
     "rate_expo": Evidence(
         "the sticks have a cubic curve", _BY_STICK, "The error bends back to nothing at full stick."
@@ -74,43 +83,43 @@ EVIDENCE: dict[str, Evidence] = {
     ),
     "yaw_reaction": Evidence(
         "yaw is kicked when thrust changes",
-        (Against("rates_z", "thrust_change"),),
+        (Panel("rates_z", "thrust_change"),),
         "The yaw rate is off in proportion to how fast the thrust changes.",
     ),
     "motor_imbalance": Evidence(
         "roll and pitch creep with thrust",
-        _all_against("rates", "model_force_z", "xy"),
+        _each("rates", "model_force_z", "xy"),
         "The error of the rate grows with thrust, whatever the sticks do.",
     ),
     "rate_cross_coupling": Evidence(
         "roll and pitch leak into yaw",
-        (Against("rates_z", "model_rates_x"), Against("rates_z", "model_rates_y")),
+        (Panel("rates_z", "model_rates_x"), Panel("rates_z", "model_rates_y")),
         "The yaw rate is off in proportion to the rates about the other axes.",
     ),
     "second_order_rates": Evidence("the rate loop has a second lag", _TURNS, _LATE_READING),
     "rate_slew_limit": Evidence(
         "body rates change no faster than a limit",
-        _against("rates", "spin_up"),
+        _by_axis("rates", "spin_up"),
         "No error at gentle demands; beyond the limit it grows with the demand.",
     ),
     "wind": Evidence(
         "steady wind",
-        _all_against("force_world", "heading"),
+        _each("force_world", "heading"),
         "The push keeps its direction in the world, whatever the heading.",
     ),
     "thrust_scale": Evidence(
         "all thrust is scaled (or the mass differs)",
-        (Against("force_z", "model_force_z"),),
+        (Panel("force_z", "model_force_z"),),
         "The error grows in proportion to thrust.",
     ),
     "translational_lift": Evidence(
         "thrust gained in fast edgewise flight",
-        (Against("force_z", "airspeed_xy"),),
+        (Panel("force_z", "airspeed_xy"),),
         "The error along the thrust axis grows with airspeed in the rotor plane and levels off.",
     ),
     "ground_effect": Evidence(
         "thrust gained near the ground",
-        (Against("force_z", "height"),),
+        (Panel("force_z", "height"),),
         "The error appears only near the ground.",
     ),
     "linear_drag": Evidence(
@@ -123,27 +132,27 @@ EVIDENCE: dict[str, Evidence] = {
     ),
     "rotor_drag": Evidence(
         "rotor drag, in proportion to thrust and airspeed",
-        _against("force", "airspeed", "xy"),
+        _by_axis("force", "airspeed", "xy"),
         "A force against the motion in the rotor plane.",
     ),
     "thrust_tilt": Evidence(
         "the thrust axis leans",
-        _all_against("force", "model_force_z", "xy"),
+        _each("force", "model_force_z", "xy"),
         "A sideways force in proportion to thrust.",
     ),
     "voltage_sag": Evidence(
         "the battery sags under load",
-        (Against("battery", "applied_thrust"),),
+        (Panel("battery", "applied_thrust"),),
         "The voltage falls with thrust and comes back.",
     ),
     "imu_latency": Evidence(
         "gyro and accelerometer are late",
-        (*_TURNS[:2], After("attitude_x", "roll"), After("attitude_y", "pitch")),
+        _by_axis("rates", "spin_up", "xy") + _by_axis("attitude", "spin_up", "xy"),
         "The gyro lags behind (above), as the accelerometer does; the attitude does not (below).",
     ),
     "imu_offset": Evidence(
         "the accelerometer is off the centre of mass",
-        _against("force", "turning"),
+        _by_axis("force", "turning"),
         "The error grows with the square of the body rates.",
     ),
     "accelerometer_scale": Evidence(
@@ -158,12 +167,12 @@ EVIDENCE: dict[str, Evidence] = {
     "tau_thrust": Evidence("the lag of thrust differs", _LATE[2:], _LATE_READING),
     "thrust_curve": Evidence(
         "the thrust curve differs",
-        (Against("force_z", "applied_thrust"),),
+        (Panel("force_z", "applied_thrust"),),
         "The error along the thrust axis follows the thrust action.",
     ),
     "battery_drain": Evidence(
         "the battery drains faster or slower",
-        (Against("battery", "time"),),
+        (Panel("battery", "time"),),
         "The voltage drifts away from the model's, evenly in time.",
     ),
 }
@@ -191,3 +200,141 @@ def words_of(cause: str) -> str:
 def list_words(causes: Sequence[str]) -> str:
     """Return causes in plain words, as a list in a sentence."""
     return "; ".join(words_of(cause) for cause in causes)
+
+
+class Binned(NamedTuple):
+    """Means by bin, (num_bins,) each; only bins with two rows or more. ends95: half of the 95 % interval."""
+
+    at: np.ndarray
+    means: np.ndarray
+    ends95: np.ndarray
+
+
+def bin_edges(regressor: np.ndarray, num_bins: int = NUM_BINS, fewest: int = FEWEST_ROWS) -> np.ndarray:
+    """Return the edges of bins over a regressor, (at most num_bins + 1,).
+
+    Evenly wide, but joined with the next ones where they have fewer than ``fewest`` rows.
+    """
+    low, high = np.percentile(regressor, SHOWN_PERCENTILES)
+    even = np.linspace(low, max(high, low + np.finfo(np.float32).eps), num_bins + 1)
+    edges, rows = [even[0]], 0
+    for count, edge in zip(np.histogram(regressor, even)[0], even[1:], strict=True):
+        rows += int(count)
+        if rows >= fewest:
+            edges.append(edge)
+            rows = 0
+    # What is left over joins the last bin.
+    return even[[0, -1]] if len(edges) == 1 else np.array([*edges[:-1], even[-1]])
+
+
+def binned_means(regressor: np.ndarray, values: np.ndarray, block: np.ndarray, edges: np.ndarray) -> Binned:
+    """Return means of values by bins of a regressor; all (num_rows,), edges (num_bins + 1,).
+
+    block: (num_rows,) int, from 0; rows of one block may be correlated. The interval is from the scatter of
+    sums over blocks (K.-Y. Liang, S. Zeger, 1986); where a bin has few blocks, it is at least that of
+    independent rows.
+    """
+    num_bins = len(edges) - 1
+    number = np.searchsorted(edges, regressor, side="right") - 1
+    inside = (number >= 0) & (number < num_bins)
+    number, values, block = number[inside], values[inside], block[inside]
+    rows = np.bincount(number, minlength=num_bins)
+    some = np.maximum(rows, 1)
+    means = np.bincount(number, values, minlength=num_bins) / some
+    at = np.bincount(number, regressor[inside], minlength=num_bins) / some
+    off = values - means[number]
+    by_row = np.bincount(number, off**2, minlength=num_bins)
+    num_blocks = int(block.max(initial=-1)) + 1
+    cell, cells = number * num_blocks + block, num_bins * num_blocks
+    sums = np.bincount(cell, off, minlength=cells).reshape(num_bins, -1)
+    used = (np.bincount(cell, minlength=cells).reshape(num_bins, -1) > 0).sum(axis=1)
+    by_block = (sums**2).sum(axis=1)
+    variance = np.where(used >= FEWEST_BLOCKS, by_block, np.maximum(by_block, by_row))
+    kept = rows >= LEAST_ROWS
+    return Binned(at[kept], means[kept], (TWO_SIDED_95 * np.sqrt(variance) / some)[kept])
+
+
+def _blocks(traces: Traces, length_s: float) -> np.ndarray:
+    """Return the number of the block of some length that each row is in, (num_rows,) int."""
+    block = traces.slot // max(round(length_s / traces.step_s), 1)
+    return np.unique(block, return_inverse=True)[1]
+
+
+def _in_degrees(unit: str) -> tuple[str, float]:
+    """Return the unit in which one is shown, and the factor to it: turns are shown in degrees."""
+    return (unit.replace("rad/", "deg/"), float(np.rad2deg(1.0))) if unit.startswith("rad/") else (unit, 1.0)
+
+
+def _label(residual: str) -> str:
+    """Return what a residual is of, with its unit."""
+    channel, axis = residual.split("_")[0], residual.split("_")[-1]
+    unit = _in_degrees(UNITS[channel])[0]
+    if channel == "battery":
+        return f"battery voltage ({unit})"
+    source = {"attitude": ", by attitude", "velocity": ", by velocity"}.get(channel, "")
+    if channel in ("rates", "attitude"):
+        return f"{_TURN_AXES[axis]} rate{source} ({unit})"
+    frame = "world " if "world" in residual else ""
+    return f"force {frame}{axis}{source} ({unit})"
+
+
+def _draw_panel(axes: Any, traces: Traces, panel: Panel, without: str, full: str) -> None:
+    channel = panel.residual.split("_")[0]
+    (left, counts), (rest, _) = (traces.column(name, panel.residual) for name in (without, full))
+    label, unit = REGRESSORS[panel.regressor]
+    unit, factor = _in_degrees(unit)
+    scale = _in_degrees(UNITS[channel])[1]
+    columns = [
+        values[counts] for values in (factor * traces.regressors[panel.regressor], scale * left, scale * rest)
+    ]
+    block, fewest = _blocks(traces, BLOCK_S)[counts], FEWEST_ROWS
+    if channel in ("attitude", "velocity"):
+        piece = np.unique(_blocks(traces, PIECE_S)[counts], return_inverse=True)[1]
+        rows, fewest = np.bincount(piece), FEWEST_PIECES
+        *columns, block = [np.bincount(piece, values) / rows for values in (*columns, block)]
+    regressor, left, rest = columns
+    edges = bin_edges(regressor, fewest=fewest)
+    before, explained, after = (
+        binned_means(regressor, values, block.astype(int), edges) for values in (left, left - rest, rest)
+    )
+    axes.axhline(0.0, color=GREY, linewidth=0.8)
+    style: dict[str, Any] = {"markersize": 4, "elinewidth": 1.2, "linestyle": "none", "color": ORANGE}
+    dots = "left without the cause, 95 % interval"
+    axes.errorbar(before.at, before.means, before.ends95, fmt="o", label=dots, zorder=2, **style)
+    axes.plot(before.at, explained.means, "k-", linewidth=1.6, label="explained by the cause", zorder=3)
+    rings: dict[str, Any] = {"mfc": "white", "mec": BLUE, "markersize": 4, "zorder": 4}
+    axes.plot(before.at, after.means, "o", label="left with the cause", **rings)
+    axes.set_xlabel(label if unit == "1" else f"{label} ({unit})", fontsize="small")
+
+
+def draw_cause(cause: str, panels: Sequence[Panel], traces: Traces, without: str, extended: str) -> Figure:
+    """Draw the panels of a cause.
+
+    without, extended: of the models in ``traces``, the extended one without the cause, and with it. The curve
+    is the difference between the predictions of the two.
+    """
+    # Without a sensor, its panel and that of its replacement are the same.
+    panels = list(dict.fromkeys(panel._replace(residual=traces.used(panel.residual)) for panel in panels))
+    columns = min(len(panels), MOST_COLUMNS) if len(panels) % MOST_COLUMNS != 1 else min(len(panels), 2)
+    rows = -(-len(panels) // columns)
+    figure = Figure(figsize=(WIDTH_IN, LEGEND_IN + ROW_IN * rows), layout="constrained")
+    title = words_of(cause)
+    title = title[0].upper() + title[1:]
+    figure.suptitle(title, fontsize="large", fontweight="bold", x=0.01, ha="left")
+    grid = figure.subplots(rows, columns, squeeze=False)
+    for axes, panel in zip(grid.flat, panels, strict=True):
+        axes.spines[["top", "right"]].set_visible(False)
+        axes.grid(color="0.92", linewidth=0.8)
+        axes.set_axisbelow(True)
+        axes.tick_params(labelsize="small")
+        label = _label(panel.residual)
+        if traces.column(extended, panel.residual)[1].sum() < FEWEST_SHOWN:
+            say(axes, f"{label}:\n{NO_DATA}")
+            continue
+        _draw_panel(axes, traces, panel, without, extended)
+        axes.set_title(label, fontsize="small", loc="left")
+    for axes in grid[:, 0]:
+        axes.set_ylabel("measured minus modelled", fontsize="small")
+    entries = max((axes.get_legend_handles_labels() for axes in figure.axes), key=lambda own: len(own[1]))
+    figure.legend(*entries, loc="outside lower center", ncols=3, frameon=False, fontsize="small")
+    return figure

@@ -9,9 +9,15 @@ from scipy import stats
 
 from flytrack_env.dynamics import collective_thrust
 from flytrack_env.effects import BY_NAME
-from flytrack_sysid.diagnosis.candidates import BASE_CAUSES, CANDIDATES
 from flytrack_sysid.diagnosis.problem import Problem
-from flytrack_sysid.diagnosis.score_test import Linearization, inflation_of, solve, threshold
+from flytrack_sysid.diagnosis.score_test import (
+    BASE_CAUSES,
+    CANDIDATES,
+    Linearization,
+    inflation_of,
+    solve,
+    threshold,
+)
 from flytrack_sysid.diagnosis.search import (
     MOST_REFITTED,
     PER_PARAMETER,

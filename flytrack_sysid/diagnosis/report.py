@@ -1,25 +1,21 @@
-"""A diagnosis as one page that is read in two minutes: ``report.html``."""
+"""Writing a diagnosis: ``report.html``, ``diagnosis.json``, the extended model, and a few lines of text."""
 
+import json
 from pathlib import Path
 
 import numpy as np
-from matplotlib.figure import Figure
 
+from flytrack_env import __version__, save_model
 from flytrack_env.dynamics import SECONDS_PER_MINUTE
 from flytrack_env.files import write_atomically
-from flytrack_sysid.diagnosis.evidence import EVIDENCE, list_words, without, words_of
-from flytrack_sysid.diagnosis.figures import (
-    FORCES,
-    RATES,
-    draw_against,
-    draw_cause,
-)
-from flytrack_sysid.diagnosis.result import CAUSES_FOUND, CONSISTENT, Cause, Diagnosis, Estimated
+from flytrack_sysid.diagnosis.evidence import EVIDENCE, draw_cause, list_words, without, words_of
+from flytrack_sysid.diagnosis.result import CAUSES_FOUND, CONSISTENT, TO_LOG, Cause, Diagnosis, Estimated
 from flytrack_sysid.diagnosis.traces import Traces, traces
 from flytrack_sysid.log import FlightLog
 from flytrack_sysid.page import Bullets, Part, Picture, Section, Table, Text, Verdict, page
 from flytrack_sysid.plots import png_of
 
+JSON_NAME, MODEL_NAME, REPORT_NAME = "diagnosis.json", "extended_model.json", "report.html"
 MOST_PICTURED = 6  # causes, those with the largest gain: more pictures nobody reads
 MOST_LISTED = 3  # names in one cell
 NO_BREAK = "\u00a0"  # a space at which lines do not break
@@ -39,10 +35,6 @@ HOW = (
     "z, except where world axes are given; rates are about the body's axes.",
     "Pictures show the whole log, the table of errors the held-out part.",
 )
-CAPTIONS = {
-    "rates": "Means by bins with 95 % intervals. For a model that lacks nothing they are all at 0.",
-    "forces": "The same for the specific force along the body's axes.",
-}
 
 
 def _number(value: float | None) -> str:
@@ -160,30 +152,29 @@ _LESS = "without "
 
 
 def traces_of(diagnosis: Diagnosis, log: FlightLog) -> Traces:
-    """Return the residuals of the three models, and of the extended one less each cause ("without ...")."""
-    models = {"nominal": diagnosis.nominal, "base": diagnosis.base, "extended": diagnosis.extended}
+    """Return the residuals of both models, and of the extended one less each cause ("without ...")."""
+    models = {"nominal": diagnosis.nominal, "extended": diagnosis.extended}
     for cause in diagnosis.causes:
         models[_LESS + cause.effect] = without(diagnosis.extended, diagnosis.nominal, cause.effect)
     return traces(log, models, like="extended")
 
 
-def draw_report(diagnosis: Diagnosis, found: Traces) -> dict[str, Figure]:
-    """Return the figures of a report by name; found: of ``traces_of``."""
-    figures = {
-        "rates": draw_against(found, RATES, "Body rates: residuals, and what they depend on"),
-        "forces": draw_against(found, FORCES, "Specific force: residuals, and what they depend on"),
-    }
+def _evidence_parts(diagnosis: Diagnosis, found: Traces) -> list[Part]:
+    """Return the pictures of the causes that gain most; found: of ``traces_of``."""
+    parts: list[Part] = []
     for cause in sorted(diagnosis.causes, key=lambda cause: -cause.chi2_gain)[:MOST_PICTURED]:
-        panels = EVIDENCE[cause.effect].panels
-        figures[cause.effect] = draw_cause(cause.effect, panels, found, _LESS + cause.effect, "extended")
-    return figures
+        evidence = EVIDENCE[cause.effect]
+        figure = draw_cause(cause.effect, evidence.panels, found, _LESS + cause.effect, "extended")
+        parts.append(Picture(png_of(figure), f"{evidence.reading} ({cause.effect})"))
+    if parts and any(found.used(name) != name for name in ("rates_x", "force_x")):
+        parts.append(Text(DIFFERENCES))
+    return parts
 
 
 def html_of(diagnosis: Diagnosis, log: FlightLog) -> str:
     """Return the report of a diagnosis of a log as a self-contained page."""
     found = traces_of(diagnosis, log)
-    pictures = {name: png_of(figure) for name, figure in draw_report(diagnosis, found).items()}
-    minutes = found.regressors["elapsed"][-1] / SECONDS_PER_MINUTE
+    minutes = found.elapsed_s[-1] / SECONDS_PER_MINUTE
     introduction: list[Part] = [
         verdict_of(diagnosis),
         Text(f"{diagnosis.source}: {len(log)} rows, {minutes:.1f} min. SHA-256 {diagnosis.sha256[:12]}."),
@@ -191,31 +182,58 @@ def html_of(diagnosis: Diagnosis, log: FlightLog) -> str:
     ]
     if diagnosis.warnings:
         introduction.append(Bullets(diagnosis.warnings))
-    evidence: list[Part] = [
-        Picture(png, f"{EVIDENCE[name].reading} ({name})")
-        for name, png in pictures.items()
-        if name in EVIDENCE
-    ]
-    residuals: list[Part] = [Picture(pictures[name], caption) for name, caption in CAPTIONS.items()]
-    if any(found.used(name) != name for name in (RATES[0], FORCES[0])):
-        residuals.append(Text(DIFFERENCES))
+    evidence = _evidence_parts(diagnosis, found)
     sections = [
         Section("Errors before and after", [_errors_table(diagnosis)]),
         *([Section("The evidence, cause by cause", evidence)] if evidence else []),
         Section("What this log could not show, and what to fly", [_limits_part(diagnosis)]),
         Section("What remains unexplained", _unexplained_parts(diagnosis)),
-        Section("Residuals, before and after", residuals),
         Section("How this was done", [Bullets(HOW)]),
     ]
     return page("What the model gets wrong", sections, introduction)
 
 
-def write_report(path: str | Path, diagnosis: Diagnosis, log: FlightLog) -> None:
-    """Write the report of a diagnosis as one HTML file, whole or not at all.
+def write_diagnosis(folder: str | Path, diagnosis: Diagnosis, log: FlightLog) -> list[Path]:
+    """Write a diagnosis into a folder, which is made if need be, and return the files.
 
-    log: the one that was diagnosed.
+    log: what was diagnosed (``diagnose.joined`` of several).
 
     Raises:
-        OSError: the file cannot be written.
+        OSError: a file cannot be written.
     """
-    write_atomically(path, html_of(diagnosis, log).encode())
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    content = diagnosis.as_json()
+    provenance = {
+        "tool": f"flytrack_sysid.diagnose {__version__}",
+        "data": content["data"],
+        "causes": content["causes"],
+        "verdict": diagnosis.verdict,
+    }
+    text = json.dumps(content, indent=2, allow_nan=False) + "\n"
+    write_atomically(folder / JSON_NAME, text.encode())
+    save_model(folder / MODEL_NAME, diagnosis.extended, provenance)
+    write_atomically(folder / REPORT_NAME, html_of(diagnosis, log).encode())
+    return [folder / name for name in (JSON_NAME, MODEL_NAME, REPORT_NAME)]
+
+
+def text_of(diagnosis: Diagnosis) -> str:
+    """Return a diagnosis as a few lines of text."""
+    lines = [f"verdict: {diagnosis.verdict}"]
+    for cause in diagnosis.causes:
+        values = ", ".join(
+            f"{name} {one.value:.4g} ({one.ci95[0]:.4g} to {one.ci95[1]:.4g}) {one.unit}"
+            for name, one in cause.parameters.items()
+        )
+        twins = f"; not told apart from {', '.join(cause.equivalent)}" if cause.equivalent else ""
+        lines.append(f"  {cause.effect}: {values}; held-out gain {cause.heldout_gain:.4g}{twins}")
+    if diagnosis.unexplained.flagged:
+        lines.append(f"unexplained, depends on: {', '.join(diagnosis.unexplained.depends_on)}")
+    for one in diagnosis.not_identifiable:
+        below = f" below {one.smallest:.3g} {one.unit}" if np.isfinite(one.smallest) else ""
+        alike = f", looks like {', '.join(one.confused_with)}" if one.confused_with else ""
+        to_do = one.fly if one.fly.startswith(TO_LOG) else f"fly {one.fly}"
+        is_named = any(one.effect == cause.effect for cause in diagnosis.causes)
+        what = "not told apart by this log" if is_named else "not shown by this log"
+        lines.append(f"{what}: {one.effect}{below}{alike}; {to_do}")
+    return "\n".join([*lines, *diagnosis.warnings])

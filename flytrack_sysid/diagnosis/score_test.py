@@ -12,8 +12,9 @@ from typing import NamedTuple
 import numpy as np
 from scipy import linalg, stats
 
-from flytrack_sysid.diagnosis.candidates import PROBES, Candidate
+from flytrack_env.effects import BY_NAME, EFFECTS, Effect
 from flytrack_sysid.diagnosis.problem import Problem, Slopes, blocks_of, robust_square, robust_weight
+from flytrack_sysid.parameters import DRAIN, TAUS, THRUST_COEFFS
 
 CHANCE = 1e-4  # of a name where there is nothing, for each effect
 # A direction of which the others leave less than this share cannot be told apart from them.
@@ -21,6 +22,55 @@ LEAST_OWN_SHARE = 1e-7
 AT_BOUND = 1e-9
 SAME_SLOPE = 0.1  # relative change of a parameter that is looked for at probes, within which its slope holds
 PROBE_PRIOR = 1e-2  # a step to a probe is known to be less than ten times that
+# Names of causes in the base, and the parameters of each.
+BASE_CAUSES = {**{name: (name,) for name in TAUS}, "thrust_curve": THRUST_COEFFS, "battery_drain": (DRAIN,)}
+BASE_FREE = (*TAUS, *THRUST_COEFFS, DRAIN)
+
+
+class Candidate(NamedTuple):
+    """An effect and one way to look for it.
+
+    fields: ``effect.parameter`` names that are freed. probe: one of them and a value to start from, where
+    there is no slope at neutral.
+    """
+
+    effect: str
+    fields: tuple[str, ...]
+    probe: tuple[str, float] | None = None
+
+    @property
+    def num_priced(self) -> int:
+        """How many of its parameters count against it: not those that only shape what others do."""
+        shapes = [f"{self.effect}.{field}" for field in BY_NAME[self.effect].shapes]
+        return sum(field not in shapes for field in self.fields)
+
+    @property
+    def other_fields(self) -> tuple[str, ...]:
+        """Its fields without that of the probe."""
+        return tuple(field for field in self.fields if self.probe is None or field != self.probe[0])
+
+    def placed_in(self, problem: Problem, vector: np.ndarray) -> np.ndarray:
+        """Return the vector with the probe in place."""
+        vector = vector.copy()
+        if self.probe is not None:
+            vector[problem.names.index(self.probe[0])] = self.probe[1]
+        return vector
+
+
+def candidates_of(effect: Effect) -> list[Candidate]:
+    """Return the ways in which an effect is looked for."""
+    found = []
+    for group in effect.groups or (tuple(effect.ranges),):
+        fields = tuple(f"{effect.name}.{field}" for field in group)
+        probes: list[tuple[str, float] | None] = [
+            (f"{effect.name}.{field}", value) for field in group for value in effect.probes.get(field, ())
+        ]
+        found += [Candidate(effect.name, fields, probe) for probe in probes or [None]]
+    return found
+
+
+CANDIDATES = [candidate for effect in EFFECTS for candidate in candidates_of(effect)]
+PROBES = [candidate for candidate in CANDIDATES if candidate.probe is not None]
 
 
 def threshold(num_parameters: int) -> float:

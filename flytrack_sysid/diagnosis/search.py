@@ -8,9 +8,17 @@ import numpy as np
 
 from flytrack_env.effects import EFFECTS
 from flytrack_sysid.diagnosis import noise as noises
-from flytrack_sysid.diagnosis.candidates import BASE_FREE, CANDIDATES, PROBES, Candidate
 from flytrack_sysid.diagnosis.problem import SMALL_BATCH, Problem
-from flytrack_sysid.diagnosis.score_test import Gain, Linearization, costs_of, threshold
+from flytrack_sysid.diagnosis.score_test import (
+    BASE_FREE,
+    CANDIDATES,
+    PROBES,
+    Candidate,
+    Gain,
+    Linearization,
+    costs_of,
+    threshold,
+)
 from flytrack_sysid.log import FlightLog
 
 PER_PARAMETER = 4.0  # of chi2: what one more parameter has to gain to be preferred to fewer

@@ -52,6 +52,7 @@ class Traces(NamedTuple):
     anything where nothing counts. counts: channel -> (num_rows,) bool, what a fit is made of; all False
     of a channel that the log lacks.
     regressors: (num_rows,) each, in the units of ``REGRESSORS``.
+    elapsed_s: (num_rows,) s, flights one after the other.
     slot: (num_rows,) int, place of a row among evenly spaced ones; a lost row leaves its slot empty, and
     flights are far apart. step_s: between slots.
     attitude: body to world, of the row before: the frame of force and velocity.
@@ -60,6 +61,7 @@ class Traces(NamedTuple):
     residuals: Mapping[str, Mapping[str, np.ndarray]]
     counts: Mapping[str, np.ndarray]
     regressors: Mapping[str, np.ndarray]
+    elapsed_s: np.ndarray
     slot: np.ndarray
     step_s: float
     attitude: Rotation
@@ -86,11 +88,8 @@ class Traces(NamedTuple):
 # Label and unit of each regressor.
 REGRESSORS: dict[str, tuple[str, str]] = {
     "time": ("time since the flight began", "s"),
-    "elapsed": ("time, flights one after the other", "s"),
     **{f"airspeed_{axis}": (f"airspeed along body {axis}", "m/s") for axis in _AXES},
     "airspeed_xy": ("airspeed in the rotor plane", "m/s"),
-    "speed": ("speed", "m/s"),
-    **{f"command_{stick}": (f"{stick} command", "1") for stick in STICKS},
     **{f"applied_{stick}": (f"{stick} action, lagged", "1") for stick in STICKS},
     "thrust_change": ("change of the applied thrust action", "1/s"),
     **{
@@ -106,10 +105,8 @@ REGRESSORS: dict[str, tuple[str, str]] = {
         f"spin_up_{axis}": (f"{name} demanded", "rad/s²")
         for axis, name in zip(_AXES, STICKS[:3], strict=True)
     },
-    **{f"position_{axis}": (f"position {axis}", "m") for axis in "xy"},
     "height": ("height", "m"),
     "heading": ("heading", "deg"),
-    "tilt": ("tilt", "deg"),
 }
 
 
@@ -181,23 +178,17 @@ def _regressors(model: ModelParameters, record: Record, applied: np.ndarray) -> 
     airspeed = attitude.inv().apply(record.vel_w - np.array([wind.v_x, wind.v_y, wind.v_z], float))
     change = np.diff(applied, axis=0, append=applied[-1:]) / record.step_s[:, None]
     change = np.where(np.append(record.begins[1:], True)[:, None], 0.0, change)
-    body_z, body_x = attitude.apply((0.0, 0.0, 1.0)), attitude.apply((1.0, 0.0, 0.0))
+    body_x = attitude.apply((1.0, 0.0, 0.0))
     full_rates = np.deg2rad(np.asarray(model.max_rate, float))
     found = {
         "airspeed_xy": np.hypot(airspeed[:, 0], airspeed[:, 1]),
-        "speed": np.linalg.norm(record.vel_w, axis=1),
         "thrust_change": change[:, 3],
-        "position_x": record.pos_w[:, 0],
-        "position_y": record.pos_w[:, 1],
         "height": record.pos_w[:, 2],
         "heading": np.rad2deg(np.arctan2(body_x[:, 1], body_x[:, 0])),
-        "tilt": np.rad2deg(np.arccos(np.clip(body_z[:, 2], -1.0, 1.0))),
     }
     for index, axis in enumerate(_AXES):
         found[f"airspeed_{axis}"] = airspeed[:, index]
         found[f"spin_up_{axis}"] = change[:, index] * full_rates[index]
-    for index, stick in enumerate(STICKS):
-        found[f"command_{stick}"] = record.command[:, index]
     # Values of a row are those of the step to it, from the row before; the lag acts first in a step.
     found = {name: np.roll(values, 1) for name, values in found.items()}
     return found | {f"applied_{stick}": applied[:, index] for index, stick in enumerate(STICKS)}
@@ -257,11 +248,8 @@ def traces(log: FlightLog, models: Mapping[str, ModelParameters], like: str) -> 
     found = _regressors(base, record, rows.along(applied))
     since = log.time - log.time[log.is_start()][np.cumsum(log.is_start()) - 1]
     step_s = float(np.median(record.step_s))
-    regressors = {
-        "time": since,
-        "elapsed": step_s * rows.kept,
-        **{name: values[rows.kept] for name, values in found.items()},
-    }
+    regressors = {"time": since, **{name: values[rows.kept] for name, values in found.items()}}
     regressors |= _predicted(residuals[like], lanes, rows, record, before, float(base.g))
     slot = np.arange(len(begins)) + BETWEEN_FLIGHTS * np.cumsum(begins)
-    return Traces(residuals, _counts(lanes, rows, record), regressors, slot[rows.kept], step_s, before)
+    counts = _counts(lanes, rows, record)
+    return Traces(residuals, counts, regressors, step_s * rows.kept, slot[rows.kept], step_s, before)

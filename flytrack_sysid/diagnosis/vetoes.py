@@ -19,7 +19,6 @@ from flytrack_sysid.diagnosis.model_selection import (
     without_effect,
 )
 from flytrack_sysid.diagnosis.problem import Problem, blocks_of
-from flytrack_sysid.diagnosis.regressors import constants
 from flytrack_sysid.diagnosis.result import CHANNELS, Unexplained
 from flytrack_sysid.diagnosis.score_test import threshold
 from flytrack_sysid.diagnosis.search import FittedModel, SearchState
@@ -27,6 +26,7 @@ from flytrack_sysid.diagnosis.unexplained import (
     SIDES,
     Dependence,
     SideTest,
+    constants,
     find_unexplained,
     flight_of,
     linearized_residuals,

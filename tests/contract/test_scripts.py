@@ -12,9 +12,8 @@ from flytrack_env.dynamics import collective_thrust, nominal_parameters
 from flytrack_env.state import APPLIED_ACTION, BATTERY
 from flytrack_sysid import collect, load_log
 from flytrack_sysid.cli import main
-from flytrack_sysid.diagnosis.identifiability import LANES_PER_MANOEUVRE
+from flytrack_sysid.diagnosis.identifiability import LANES_PER_MANOEUVRE, next_flight
 from flytrack_sysid.diagnosis.lanes import LANE_S
-from flytrack_sysid.diagnosis.next_flight import next_flight
 from flytrack_sysid.envelope import HEIGHTS, SCRIPT_HEIGHTS
 from flytrack_sysid.excitation import DT_S, FLIGHT_STEPS
 from flytrack_sysid.manoeuvres import FLIGHTS_PER_MANOEUVRE, MANOEUVRES, flights_of, hover_action

@@ -11,14 +11,13 @@ from benchmarks.diagnosis import model_of
 from benchmarks.hidden import draw_base, fly, measure
 from flytrack_env.effects import BY_NAME
 from flytrack_sysid.diagnosis import vetoes
-from flytrack_sysid.diagnosis.candidates import CANDIDATES
 from flytrack_sysid.diagnosis.diagnose import thinning_warning
 from flytrack_sysid.diagnosis.lanes import LANE_S, make_lanes, thinned
 from flytrack_sysid.diagnosis.model_selection import Ablation, is_determined
 from flytrack_sysid.diagnosis.noise import first_guess
 from flytrack_sysid.diagnosis.problem import Problem
 from flytrack_sysid.diagnosis.result import Cause, Errors, Estimated
-from flytrack_sysid.diagnosis.score_test import threshold
+from flytrack_sysid.diagnosis.score_test import CANDIDATES, threshold
 from flytrack_sysid.diagnosis.search import FittedModel, Held, SearchState
 from flytrack_sysid.diagnosis.summary import warnings_of
 from flytrack_sysid.diagnosis.vetoes import HELD_OUT_SHOWN, Selection, is_contradicted, reject
