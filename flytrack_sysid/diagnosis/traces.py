@@ -102,7 +102,7 @@ REGRESSORS: dict[str, tuple[str, str]] = {
         for axis, others in zip(_AXES, ("y, z", "x, z", "x, y"), strict=True)
     },
     **{
-        f"spin_up_{axis}": (f"{name} demanded", "rad/s²")
+        f"spin_up_{axis}": (f"demanded change of the {name} rate", "rad/s²")
         for axis, name in zip(_AXES, STICKS[:3], strict=True)
     },
     "height": ("height", "m"),

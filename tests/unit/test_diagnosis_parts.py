@@ -14,7 +14,7 @@ from flytrack_env.effects import CommandDelay, LinearDrag, SecondOrderRates
 from flytrack_env.effects.command_delay import BUFFER_STEPS
 from flytrack_env.plants import Simulator
 from flytrack_sysid import collect
-from flytrack_sysid.diagnosis import DiagnosisError, diagnose, joined
+from flytrack_sysid.diagnosis import DiagnosisError, diagnose, joined, unexplained
 from flytrack_sysid.diagnosis import noise as noises
 from flytrack_sysid.diagnosis.diagnose import unused_channels
 from flytrack_sysid.diagnosis.lanes import LANE_S, LEAD_IN_S, NUM_AXES, make_lanes, thinned
