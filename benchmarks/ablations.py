@@ -1,9 +1,9 @@
-"""What each part of the recipe is worth: ``python -m benchmarks.ablations [--seeds 3] [--only NAME ...]``.
+"""What each part of the recipe is worth: ``python -m benchmarks.ablations [--seeds 3]``.
 
 Trains PPO with one thing taken out or put in, several seeds each, on the model that ``make demo`` identifies
 from the shipped black box; flies 256 noisy starts over 3 laps in that simulator, on the black box and on
-256 drones drawn around the model. Writes a page and a chart; lines that are there already (``--lines``) are
-not measured again.
+256 drones drawn around the model. Writes a page, a chart and a line per training (ablations.jsonl); trainings
+that have a line already are not repeated.
 """
 
 import argparse
@@ -39,6 +39,9 @@ from flytrack_env.pictures.drawing import new_figure, png_of
 
 NUM_EPISODES, NUM_LAPS, NUM_STEPS = 256, 3, 2500
 EVALUATION_SEED, PLANTS_SEED = 30_000, 200
+PAGE = report.RESULTS / "ablations.md"
+LINES = PAGE.with_suffix(".jsonl")
+MODEL = "benchmarks/data/ablations/model.json"
 EVERY = 2_000_000  # environment steps between points of a curve
 DELAY_S = 0.03
 LONG_EPISODE = 1000  # steps: from the start pose, in 2 s no more than two gates are reached
@@ -150,28 +153,21 @@ class Contest:
         return result
 
 
-def measure(arguments: argparse.Namespace, model: ModelParameters) -> dict[tuple[str, int], dict[str, Any]]:
-    """Return a result per ablation and seed, of the file of lines or measured now and added to it."""
-    text = arguments.lines.read_text() if arguments.lines.exists() else ""
-    lines = [json.loads(line) for line in text.splitlines()]
-    done = {(line["ablation"], line["seed"]): line for line in lines if line["steps"] == arguments.steps}
-    for name in arguments.only or ABLATIONS:
-        missing = [seed for seed in range(arguments.seeds) if (name, seed) not in done]
-        contest = Contest(ABLATIONS[name], model, arguments.steps) if missing else None
+def measure(num_seeds: int, num_steps: int, model: ModelParameters) -> dict[tuple[str, int], dict[str, Any]]:
+    """Return a result per ablation and seed, from ``LINES`` or measured now and added to it."""
+    text = LINES.read_text() if LINES.exists() else ""
+    lines = map(json.loads, text.splitlines())
+    done = {(line["ablation"], line["seed"]): line for line in lines if line["steps"] == num_steps}
+    for name, ablation in ABLATIONS.items():
+        missing = [seed for seed in range(num_seeds) if (name, seed) not in done]
+        contest = Contest(ablation, model, num_steps) if missing else None
         for seed in missing:
             started_s = time.process_time()
-            line = {"ablation": name, "seed": seed, "steps": arguments.steps, **contest.train(seed)}
+            line = {"ablation": name, "seed": seed, "steps": num_steps, **contest.train(seed)}
             done[name, seed] = line | {"cpu_s": round(time.process_time() - started_s, 1)}
             text += json.dumps(done[name, seed], allow_nan=False) + "\n"
-            write_atomically(arguments.lines, text.encode())
+            write_atomically(LINES, text.encode())
     return done
-
-
-def _range(values: list[float | None], form: str) -> str:
-    numbers = sorted(value for value in values if value is not None)
-    if not numbers:
-        return "-"
-    return " ".join(format(value, form) for value in numbers)
 
 
 def table(done: Mapping[tuple[str, int], dict[str, Any]]) -> str:
@@ -179,32 +175,32 @@ def table(done: Mapping[tuple[str, int], dict[str, Any]]) -> str:
     header = "ablation | change | simulator | flying lap (s) | black box | flying lap (s) | drawn drones"
     rows = []
     for name, ablation in ABLATIONS.items():
-        lines = [line for (of, _), line in sorted(done.items()) if of == name]
-        cells = []
-        for place in ("simulator", "black_box", "drawn"):
-            raced = [line[place] for line in lines if line[place] is not None]
-            cells.append(_range([one["success"] for one in raced], ".1%"))
-            if place != "drawn":
-                cells.append(_range([one["flying_lap_s"] for one in raced], ".3f"))
+        lines = [line for (of, _), line in done.items() if of == name]
+
+        def cell(place: str, key: str, form: str, lines: list[dict[str, Any]] = lines) -> str:
+            values = [line[place][key] for line in lines if line[place] and line[place][key] is not None]
+            return " ".join(format(value, form) for value in sorted(values)) or "-"
+
+        places = ("simulator", "black_box")
+        cells = [cell(at, *one) for at in places for one in (("success", ".1%"), ("flying_lap_s", ".3f"))]
         if lines:
-            rows.append([name, ablation.change, *cells])
+            rows.append([name, ablation.change, *cells, cell("drawn", "success", ".1%")])
     return report.table(header, rows)
 
 
 def draw(path: Path, done: Mapping[tuple[str, int], dict[str, Any]]) -> None:
     """Write a PNG: the share that finishes 3 laps in the simulator over training, a panel per ablation."""
-    names = [name for name in ABLATIONS if any(of == name for of, _ in done)]
-    num_rows = -(-len(names) // 4)
+    num_rows = -(-len(ABLATIONS) // 4)
     figure = new_figure(12, 2.2 * num_rows + 0.6)
-    panels = figure.subplots(num_rows, 4, sharex=True, sharey=True, squeeze=False)
-    for panel, name in zip(panels.flat, names, strict=False):
+    panels = figure.subplots(num_rows, 4, sharex=True, sharey=True).flat
+    for panel, name in zip(panels, ABLATIONS, strict=False):
         for (of, _), line in sorted(done.items()):
             if of in (name, "default"):
                 steps, success = np.array(line["curve"]).T
                 style = {"color": "C0"} if of == name else {"color": "0.8", "zorder": 0}
                 panel.plot(steps / 1e6, 100 * success, **style)
         panel.set_title(name, fontsize=10)
-    for panel in panels.flat[len(names) :]:
+    for panel in panels[len(ABLATIONS) :]:
         panel.set_axis_off()
     figure.supxlabel("environment steps (millions); grey: the recipe as it is")
     figure.supylabel("3 laps in the simulator (%)")
@@ -216,30 +212,24 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--steps", type=int, default=Config.total_timesteps)
-    parser.add_argument("--only", nargs="+", choices=ABLATIONS, default=[])
-    parser.add_argument("--model", type=Path, default=Path("benchmarks/data/ablations/model.json"))
-    parser.add_argument("--lines", type=Path, default=report.RESULTS / "ablations.jsonl")
-    parser.add_argument("--out", type=Path, default=report.RESULTS / "ablations.md")
     arguments = parser.parse_args()
     pinned = report.pin_to_one_core()
-    done = measure(arguments, load_model(arguments.model))
-    chart = arguments.out.with_suffix(".png")
+    done = measure(arguments.seeds, arguments.steps, load_model(report.ROOT / MODEL))
+    chart = PAGE.with_suffix(".png")
     draw(chart, done)
     text = report.page(
         "Ablations: the worth of each part of the recipe",
-        f"{report.command_line()}: the default recipe ({arguments.steps / 1e6:g} M environment steps) "
-        "with one "
-        f"thing changed, seeds 0 to {arguments.seeds - 1}. Trained on `{arguments.model}`, which `make "
-        "demo` (seed "
-        f"0) identified from the shipped black box. Share of {NUM_EPISODES} noisy starts that finish "
-        f"{NUM_LAPS} "
-        "laps, and mean flying lap: in that simulator, on the black box, on as many drones drawn around the "
-        "model (drag, thrust, wind, delay: `eval_agent.py --plants`). One number per seed, in order of size.",
+        f"{report.command_line()}: the default recipe ({arguments.steps / 1e6:g} M environment steps) with "
+        f"one thing changed, seeds 0 to {arguments.seeds - 1}. Trained on `{MODEL}`, which `make demo` "
+        f"identified from the shipped black box. Share of {NUM_EPISODES} noisy starts that finish "
+        f"{NUM_LAPS} laps, and mean flying lap: in that simulator, on the black box, on as many drones drawn "
+        "around the model (drag, thrust, wind, delay: `eval_agent.py --plants`). One number per seed, in "
+        "order of size.",
         table(done),
         f"![Learning curves]({chart.name})",
         f"{pinned.capitalize()}. {report.provenance_line(report.provenance())}",
     )
-    report.write_page(arguments.out, text)
+    report.write_page(PAGE, text)
 
 
 if __name__ == "__main__":

@@ -14,12 +14,7 @@ class SameStepVecEnv(VecEnv):
 
     Only infos of ended episodes are passed on, with ``terminal_observation`` and ``TimeLimit.truncated``; the
     others are empty, because a dict per environment and step costs more than the step.
-
-    Args:
-        env: what ``gymnasium.make_vec`` returns.
-
-    Raises:
-        ValueError: an environment that does not reset in the same step.
+    Raises ValueError for an environment that does not reset in the same step.
     """
 
     def __init__(self, env: gymnasium.vector.VectorEnv):

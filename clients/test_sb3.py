@@ -68,9 +68,8 @@ def test_seeds_and_options_reach_the_next_reset_only() -> None:
 
 
 def test_unsupported_environments_and_options_are_refused() -> None:
-    other = gymnasium.make_vec("CartPole-v1", 2, vectorization_mode="sync")
     with pytest.raises(ValueError, match="env: found autoreset_mode"):
-        SameStepVecEnv(other)
+        SameStepVecEnv(gymnasium.make_vec("CartPole-v1", 2, vectorization_mode="sync"))
     envs = make_vec()
     envs.set_options([{"battery_v": 22.5}] + [{}] * (NUM_ENVS - 1))
     with pytest.raises(ValueError, match="options: found"):

@@ -43,10 +43,9 @@ class UnsolvedError(RuntimeError):
 
 
 class Optimum(NamedTuple):
-    """The optimum: flight, steps of each segment, gate times, s, and how it was found."""
+    """The optimum: flight, gate times, s, and how it was found."""
 
     flight: Guess
-    counts: np.ndarray
     gate_times_s: np.ndarray
     found: dict[str, Any]
 
@@ -235,7 +234,6 @@ def find_optimum(task: Task, model: ModelParameters, dt_s: float) -> Optimum:
     flight, counts, starts = search.coarse()
     free, counts = search.fine(flight, counts)
     held, counts_held = search.on_grid(free.flight, counts)
-    gate_times = held.flight.times(counts_held)
     found = {
         "solver": "IPOPT",
         "status": held.status,
@@ -246,4 +244,4 @@ def find_optimum(task: Task, model: ModelParameters, dt_s: float) -> Optimum:
         "free_time_s": float(free.flight.times(counts)[-1]),
         "gate_fractions": held.flight.fractions.tolist(),
     }
-    return Optimum(held.flight, counts_held, gate_times, found)
+    return Optimum(held.flight, held.flight.times(counts_held), found)

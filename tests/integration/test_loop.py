@@ -10,7 +10,6 @@ from baselines.purejaxrl_ppo.evaluate import SHIPPED_BLACK_BOX
 from baselines.purejaxrl_ppo.flights import Score, fly_many
 from baselines.purejaxrl_ppo.race_env import plant_env
 from benchmarks.champion import CHAMPION
-from benchmarks.loop import jobs
 from benchmarks.loop.page import (
     does_matter,
     draw_chart,
@@ -154,17 +153,3 @@ def test_tables_and_chart_show_every_plant():
     assert race_table(results).count("\n") == model_table(results).count("\n") == 3
     assert "| 0 | yes | 10.0% (100.0%), 3.840 s, -4.00 % | 100.0%" in race_table(results)
     assert draw_chart(results).startswith(b"\x89PNG")
-
-
-def test_an_unfinished_job_starts_again_and_a_finished_one_is_kept(tmp_path, monkeypatch):
-    calls = []
-
-    def train(job, out, steps, seed):
-        assert not (out / job / "before").exists()
-        calls.append(job)
-        return {"job": job}
-
-    monkeypatch.setattr(jobs, "train_shared", train)
-    (tmp_path / "nominal" / "before").mkdir(parents=True)
-    first, second = (jobs.run_job("nominal", tmp_path, 1, 0) for _ in range(2))
-    assert first == second and first["job"] == "nominal" and calls == ["nominal"]

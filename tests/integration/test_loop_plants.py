@@ -4,7 +4,7 @@ import jax
 import numpy as np
 import pytest
 
-from benchmarks.hidden import Outside, Truth, draw_base, with_effects
+from benchmarks.hidden import Truth, draw_base, with_effects
 from benchmarks.hidden.plant import Plant, Start
 from benchmarks.loop.plants import EFFECTS, HiddenPlant
 from flytrack_env import nominal_parameters
@@ -47,11 +47,3 @@ def test_the_flight_is_that_in_plain_floats(names):
     np.testing.assert_allclose(found, expected, rtol=2e-4, atol=2e-4)
     if names:
         assert np.abs(expected - flown_in_floats(base, commands)).max() > 1e-3
-
-
-def test_refuses_effects_that_it_does_not_fly():
-    base = draw_base(np.random.default_rng(0))
-    with pytest.raises(ValueError, match="gyro_bias"):
-        HiddenPlant(with_effects(base, ("gyro_bias",), np.random.default_rng(0)))
-    with pytest.raises(ValueError, match="heading"):
-        HiddenPlant(Truth(base.tau, base.coeffs, outside=Outside("heading", ("heading",), "force", 1.0, {})))
