@@ -25,11 +25,7 @@ class ConfigError(ValueError):
 
 
 def parse_count(text: str) -> int:
-    """Return an integer that may be written as 2e7.
-
-    Raises:
-        ValueError: not a whole number.
-    """
+    """Return an integer that may be written as 2e7; raises ValueError for another number."""
     value = float(text)
     if not value.is_integer():
         raise ValueError(f"found {text}, expected a whole number")
@@ -189,11 +185,7 @@ def read_settings(where: str, values: Any) -> dict[str, Any]:
 
 
 def load_toml(path: Path) -> dict[str, Any]:
-    """Return the contents of a TOML file.
-
-    Raises:
-        ConfigError: a file that cannot be read, or is not TOML.
-    """
+    """Return the contents of a TOML file; raises ConfigError if it cannot be read."""
     try:
         return parse_toml(read_text(path))
     except (OSError, UnicodeDecodeError) as error:

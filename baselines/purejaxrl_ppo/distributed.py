@@ -108,11 +108,6 @@ def check_agree(settings: Any) -> None:
         raise ValueError(f"settings: process {jax.process_index()} has others than process 0") from error
 
 
-def wait_for_all(where: str) -> None:
-    """Return when all processes have called this."""
-    multihost_utils.sync_global_devices(where)
-
-
 def is_first() -> bool:
     """Return whether this process writes files and logs: the first, or the only one."""
     return jax.process_index() == 0

@@ -205,11 +205,7 @@ def reference_models(black_box: Path) -> tuple[str, ...]:
 
 
 def make_scene(checkpoint: Checkpoint, settings: EvaluationSettings) -> Scene:
-    """Return what the settings ask to fly.
-
-    Raises:
-        ValueError, OSError: files that cannot be used, or a ghost without a reference.
-    """
+    """Return what the settings ask to fly."""
     if settings.plants is None:
         black_box = settings.black_box or SHIPPED_BLACK_BOX
         env, plants = plant_env(checkpoint, blackbox.load(black_box), settings.track), None

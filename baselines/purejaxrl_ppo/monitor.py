@@ -1,7 +1,7 @@
 """Evaluation flights of a policy while it trains, their files, and the progress line."""
 
 import logging
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -65,28 +65,28 @@ def evaluate_policy(
     is_recorded: also write the first flight as a Rerun recording, if Rerun is installed. What fails is a
     warning; the rest is returned.
     """
-    metrics: dict[str, float] = {}
-    files: list[Path] = []
     flights = None
     with attempt("flying", steps):
         flights = fly_many(env, network, params, EVALUATION_SEED, num_episodes, NUM_STEPS, NUM_LAPS)
-        metrics = evaluation_metrics(outcomes_of(flights, NUM_LAPS, len(env.track.gates)))
     if flights is None:
-        return metrics, files
-    folder = out / "evaluation"
-    rollout, chart = folder / f"rollout_{steps}.npy", folder / f"position_density_{steps}.png"
-    first = jax.tree.map(lambda leaf: leaf[0], flights)
-    with attempt("writing the rollout", steps):
-        save_flight(rollout, first)
-        files.append(rollout)
-    with attempt("drawing the position density", steps):
-        label = f"{steps:,} training steps"
-        draw_position_density(chart, flights.positions(), env.track, num_episodes, label)
-        files.append(chart)
+        return {}, []
+    metrics = evaluation_metrics(outcomes_of(flights, NUM_LAPS, len(env.track.gates)))
+    rollout, chart = (
+        out / "evaluation" / name for name in (f"rollout_{steps}.npy", f"position_density_{steps}.png")
+    )
+    first, recording = jax.tree.map(lambda leaf: leaf[0], flights), rollout.with_suffix(".rrd")
+    density = (chart, flights.positions(), env.track, num_episodes, f"{steps:,} training steps")
+    writers: dict[Path, Callable[[], None]] = {
+        rollout: lambda: save_flight(rollout, first),
+        chart: lambda: draw_position_density(*density),
+    }
     if is_recorded and can_record():
-        with attempt("recording with Rerun", steps):
-            record_flights(rollout.with_suffix(".rrd"), {"policy": first}, env.track, NUM_LAPS)
-            files.append(rollout.with_suffix(".rrd"))
+        writers[recording] = lambda: record_flights(recording, {"policy": first}, env.track, NUM_LAPS)
+    files = []
+    for path, write in writers.items():
+        with attempt(f"writing {path.name}", steps):
+            write()
+            files.append(path)
     return metrics, files
 
 

@@ -54,11 +54,7 @@ def with_strong_types(runner: Runner) -> Runner:
 
 
 def training_params(env: EpisodicEnvironment, config: Config) -> EnvParams:
-    """Return the parameters to train with: short episodes, and a drone that is thicker than in the race.
-
-    Raises:
-        ValueError: a margin that leaves no opening.
-    """
+    """Return the parameters to train with: short episodes, and a drone that is thicker than in the race."""
     params = env.default_params
     params = params.replace(
         max_steps_in_episode=config.episode_steps, drone_radius=params.drone_radius + config.gate_margin

@@ -63,14 +63,6 @@ def describe_flights(report: dict[str, Any]) -> list[str]:
     ]
 
 
-def describe_laps(report: dict[str, Any]) -> list[str]:
-    """Return the lines about lap times."""
-    optimal = report["optimal"] or {"model": ""}
-    return [
-        describe_times(label, report[lap], optimal.get(lap), optimal["model"]) for lap, label in LAPS.items()
-    ]
-
-
 def describe_plants(plants: dict[str, Any]) -> list[str]:
     """Return the lines about drawn plants: success, and how it depends on each quantity."""
     lines = [
@@ -86,15 +78,12 @@ def describe_plants(plants: dict[str, Any]) -> list[str]:
 
 def describe_time_lost(rows: list[dict[str, Any]]) -> list[str]:
     """Return the table of mean time lost to the time-optimal flight on the way to each gate."""
-
-    def column(lap: str, row: dict[str, Any]) -> str:
-        return f"{'-' if row[lap] is None else format(row[lap], '+.3f'):>12}"
-
-    lines = [
-        "lost on the way to each gate, mean of complete laps (s):",
-        "  gate" + "".join(f"{label:>12}" for label in LAPS.values()),
-    ]
-    return lines + [f"  {row['gate']:4}" + "".join(column(lap, row) for lap in LAPS) for row in rows]
+    lines = ["lost on the way to each gate, mean of complete laps (s):"]
+    lines.append("  gate" + "".join(f"{label:>12}" for label in LAPS.values()))
+    for row in rows:
+        cells = ("-" if row[lap] is None else format(row[lap], "+.3f") for lap in LAPS)
+        lines.append(f"  {row['gate']:4}" + "".join(f"{cell:>12}" for cell in cells))
+    return lines
 
 
 def describe_report(report: dict[str, Any]) -> str:
@@ -106,7 +95,9 @@ def describe_report(report: dict[str, Any]) -> str:
     lines = [f"{report['flights']} flights, track {report['track']}: on {where}"]
     if report["success"] is not None:
         lines += describe_flights(report)
-    lines += describe_laps(report)
+    optimal = report["optimal"] or {"model": ""}
+    for lap, label in LAPS.items():
+        lines.append(describe_times(label, report[lap], optimal.get(lap), optimal["model"]))
     if report["plants"] is not None:
         lines += describe_plants(report["plants"])
     if report["time_lost_s"] is not None:

@@ -158,11 +158,7 @@ def save_run(path: Path, runner: Runner, config: Config, description: dict[str, 
 
 
 def restore_runner(start: Start, target: Runner) -> Runner:
-    """Return the state of the training in a checkpoint; ``target``: its shapes and types.
-
-    Raises:
-        CheckpointError: arrays that are not what the training expects, leaf by leaf.
-    """
+    """Return the state of the training in a checkpoint; ``target``: its shapes and types."""
     rest = target._replace(train_state=target.train_state.replace(params=None))
     runner = from_named_arrays(start.path, start.checkpoint.training or {}, rest)
     return runner._replace(train_state=runner.train_state.replace(params=start.checkpoint.params))
@@ -190,11 +186,7 @@ def newest_intact(path: Path) -> Start:
 
 
 def load_start(path: Path) -> Start:
-    """Return a checkpoint that training can continue from.
-
-    Raises:
-        CheckpointError: a file that cannot be used, or a policy alone.
-    """
+    """Return a checkpoint that training can continue from; raises CheckpointError for a policy alone."""
     start = Start(path, load_checkpoint(path))
     if start.checkpoint.training is None:
         raise CheckpointError(f"{path}: found a policy alone, expected one with its training")

@@ -38,11 +38,7 @@ LOCAL, OFF = "local", ""  # tracking URIs
 
 
 def parse_rewards(words: Sequence[str]) -> dict[str, float]:
-    """Return terms and weights of ``TERM=WEIGHT``.
-
-    Raises:
-        ValueError: another form.
-    """
+    """Return terms and weights of ``TERM=WEIGHT``; raises ValueError for another form."""
     rewards = {}
     for word in words:
         name, _, weight = word.partition("=")
@@ -137,11 +133,7 @@ class Plan(NamedTuple):
 
 
 def find_starts(resume: Path) -> Resumed:
-    """Return what there is to resume in a file or folder.
-
-    Raises:
-        CheckpointError: nothing, or a checkpoint that cannot be used.
-    """
+    """Return what there is to resume in a file or folder; raises CheckpointError if nothing is."""
     seeds = seeds_in(resume)
     if not seeds or checkpoints_in(resume):
         start = newest_intact(resume)
@@ -153,11 +145,7 @@ def find_starts(resume: Path) -> Resumed:
 
 
 def saved_options(start: Start) -> Options:
-    """Return the options that a checkpoint was written with.
-
-    Raises:
-        CheckpointError: values that are not options.
-    """
+    """Return the options that a checkpoint was written with; raises CheckpointError if they are none."""
     try:
         values = start.checkpoint.meta["options"]
         options = Options(**{**values, "seeds": tuple(map(int, values["seeds"]))})
@@ -187,11 +175,7 @@ def defaults_of(resumed: Resumed) -> Settings:
 
 
 def parse(words: Sequence[str]) -> tuple[Settings, Resumed | None]:
-    """Return the settings of a command line, and what it resumes; joins the other processes first.
-
-    Raises:
-        ValueError: a file that cannot be used, or processes that cannot be reached.
-    """
+    """Return the settings of a command line, and what it resumes; joins the other processes first."""
     sources, _ = tyro.cli(Sources, args=words, prog=PROG, add_help=False, return_unknown_args=True)
     if sources.distributed:
         join(sources.coordinator, sources.num_processes, sources.process_index)
@@ -215,11 +199,7 @@ def root_folder(settings: Settings) -> Path:
 
 
 def make_tasks(settings: Settings, resumed: Resumed | None, at_once: int) -> list[Task]:
-    """Return one task per seed.
-
-    Raises:
-        ValueError: other seeds than those of a folder that is resumed.
-    """
+    """Return one task per seed; raises ValueError for other seeds than those of a folder that is resumed."""
     seeds = list(range(settings.seed, settings.seed + settings.num_seeds))
     starts: list[Start | None] = [None] * len(seeds)
     is_single = len(seeds) == 1
@@ -248,11 +228,7 @@ def make_tasks(settings: Settings, resumed: Resumed | None, at_once: int) -> lis
 
 
 def make_trainer(settings: Settings, resumed: Resumed | None) -> Trainer:
-    """Return the trainer of a command line.
-
-    Raises:
-        ValueError: settings that cannot be used; the message names the checkpoint that some come from.
-    """
+    """Return the trainer of a command line; errors name the checkpoint that some settings come from."""
     mesh = all_devices() if settings.distributed else None
     reward = parse_rewards(settings.reward)
     arguments: dict[str, Any] = {"track": settings.track, "reward": reward, "model": settings.model}
@@ -269,11 +245,7 @@ def make_trainer(settings: Settings, resumed: Resumed | None) -> Trainer:
 
 
 def make_plan(words: Sequence[str]) -> Plan:
-    """Return the plan of a command line; everything is checked before anything is trained.
-
-    Raises:
-        ValueError, OSError: what cannot be used.
-    """
+    """Return the plan of a command line; everything is checked before anything is trained."""
     settings, resumed = parse(words)
     # With several devices one seed after the other: a seed fills them.
     at_once = 1 if settings.distributed else settings.seeds_at_once or settings.num_seeds

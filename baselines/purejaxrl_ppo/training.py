@@ -8,10 +8,11 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.experimental.multihost_utils import sync_global_devices
 
 from baselines.purejaxrl_ppo.checkpoint import Checkpoint
 from baselines.purejaxrl_ppo.config import Config
-from baselines.purejaxrl_ppo.distributed import check_agree, spread, wait_for_all
+from baselines.purejaxrl_ppo.distributed import check_agree, spread
 from baselines.purejaxrl_ppo.monitor import ProgressLine
 from baselines.purejaxrl_ppo.ppo import Runner
 from baselines.purejaxrl_ppo.program import Program
@@ -71,11 +72,7 @@ class Trainer(Program):
         return self.run(tasks)
 
     def check_all(self, tasks: list[Task], at_once: int) -> None:
-        """Check tasks, all before anything is written.
-
-        Raises:
-            CheckpointError, ValueError: as ``train``.
-        """
+        """Raise CheckpointError or ValueError, as ``train``, before anything is written."""
         for task in tasks:
             task.options.check()
             check_free(task.out, task.start)
@@ -87,14 +84,10 @@ class Trainer(Program):
                 start = None if task.start is None else task.start.steps
                 check_agree([task.options.as_json(), start, shared])
         if self.mesh is not None:
-            wait_for_all("checked")  # before the first process writes what the others would find
+            sync_global_devices("checked")  # before the first process writes what the others would find
 
     def run(self, tasks: list[Task]) -> list[tuple[Checkpoint, Metrics]]:
-        """Train checked tasks; those that are as far as each other side by side.
-
-        Raises:
-            DivergedError: of the first run that did.
-        """
+        """Train checked tasks; those that are as far as each other side by side."""
         runs, ready = [], list[Ready]()
         for task in tasks:
             run, start = self._load(task, len(tasks))
@@ -103,7 +96,7 @@ class Trainer(Program):
         for group in group_by_progress(ready):
             train_group(self, group)
         if self.mesh is not None:
-            wait_for_all("trained")
+            sync_global_devices("trained")
         return [run.result() for run in runs]
 
     def _load(self, task: Task, num_seeds: int) -> tuple[Run, Ready | None]:
@@ -129,12 +122,9 @@ def group_by_progress(ready: list[Ready]) -> list[list[Ready]]:
 
 
 def train_group(trainer: Trainer, group: list[Ready]) -> None:
-    """Train runs of a group side by side to their end, and write their final checkpoints.
+    """Train runs side by side to their end, and write their final checkpoints.
 
-    A run that diverges ends; the others go on.
-
-    Raises:
-        DivergedError: of the first run that did.
+    A run that diverges ends and the others go on; its DivergedError is raised at the end.
     """
     runs, config, update = [one.run for one in group], trainer.config, group[0].update
     runners = [one.runner for one in group]

@@ -64,14 +64,6 @@ def test_the_gradient_of_equal_data_is_that_of_one_device(num_shards):
         )
 
 
-def test_sums_and_means_over_shards_are_those_of_the_whole():
-    values = jax.random.normal(jax.random.key(0), (8, 5)) + 3.0
-    shards = values.reshape(4, 2, 5)
-    for name in ("sum", "mean", "variance"):
-        found = jax.vmap(getattr(Collectives(AXIS), name), axis_name=AXIS)(shards)
-        np.testing.assert_allclose(found, jnp.full(4, getattr(Collectives(), name)(values)), rtol=1e-5)
-
-
 def test_environments_and_minibatches_divide_into_shards():
     mesh = jax.sharding.Mesh(np.array(jax.devices() * 3), (AXIS,))
     with pytest.raises(ValueError, match="num_envs: found 16, expected a multiple of 3 devices"):

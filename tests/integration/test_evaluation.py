@@ -24,8 +24,6 @@ from baselines.purejaxrl_ppo.flights import (
 from baselines.purejaxrl_ppo.plants import draw_plants
 from baselines.purejaxrl_ppo.summary import (
     compare_with_optimum,
-    distribution,
-    share,
     summarise,
     time_lost,
 )
@@ -147,16 +145,6 @@ def test_ghost_is_the_reference_nearest_in_time() -> None:
     expected = [np.interp(offset_s, grid_s, column) for column in flying.states[:, POSITION].T]
     speed = np.linalg.norm(states[at, VELOCITY])
     assert np.linalg.norm(states[at, POSITION] - expected) <= 0.5 * 0.01 * speed * 1.05
-
-
-def test_shares_have_wilsons_interval() -> None:
-    # Closed forms for none of n, z^2 / (n + z^2), and for all of n, n / (n + z^2).
-    squared = 1.959964**2
-    none, whole = share(np.zeros(10, bool)), share(np.ones(256, bool))
-    assert none["low"] == 0.0 and none["high"] == pytest.approx(squared / (10 + squared), rel=1e-5)
-    assert whole["low"] == pytest.approx(256 / (256 + squared), rel=1e-6) and whole["high"] == 1.0
-    times = distribution(np.array([3.0, 1.0, 2.0]))
-    assert times == {"number": 3, "mean": 2.0, "min": 1.0, "q05": 1.1, "q50": 2.0, "q95": 2.9}
 
 
 @pytest.mark.parametrize("flown_by", ["black box", "plants"])

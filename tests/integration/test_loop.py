@@ -23,7 +23,6 @@ from flytrack_env import blackbox, nominal_parameters
 from flytrack_loop import Gap, errors_of
 from flytrack_loop.__main__ import main
 from flytrack_loop.flight_log import log_of_flights
-from flytrack_loop.loop import STREAMS, seeds_of
 from flytrack_loop.stages import measure_gap
 
 
@@ -89,11 +88,6 @@ def test_a_policy_without_laps_has_no_gap():
     crashed, flown = Score(0.0, 1.0, math.nan, math.nan), Score(1.0, 24.0, 4.0, 4.0)
     assert math.isnan(Gap(flown, crashed).lap_percent)
     assert Gap(flown, flown._replace(flying_lap_s=4.04)).lap_percent == pytest.approx(1.0)
-
-
-def test_every_use_of_randomness_has_a_seed_of_its_own():
-    seeds = [seeds_of(seed)[name] for seed in (0, 1) for name in STREAMS]
-    assert len(set(seeds)) == 2 * len(STREAMS)
 
 
 def test_drawn_plants_have_delay_drag_and_thrust_loss_and_follow_the_seed():

@@ -10,7 +10,7 @@ import pytest
 from baselines.purejaxrl_ppo import load_checkpoint
 from baselines.purejaxrl_ppo.config import ConfigError
 from baselines.purejaxrl_ppo.sweeps.__main__ import parse, prepare
-from baselines.purejaxrl_ppo.sweeps.space import for_tune, read_space
+from baselines.purejaxrl_ppo.sweeps.space import read_space
 
 ROOT = Path(__file__).parents[2]
 BATCH = 16 * 24
@@ -26,9 +26,8 @@ def written(folder, text):
 
 def test_a_space_is_read_and_drawn_from(tmp_path):
     text = "[learning_rate]\nloguniform = [1e-4, 1e-2]\n[hidden_sizes]\nchoice = [[8], [64, 64]]\n"
-    space = read_space(written(tmp_path, text + "[num_steps]\ngrid_search = [32, 64.0]\n"))
-    assert space["hidden_sizes"]["choice"] == [(8,), (64, 64)]
-    drawn = for_tune(space)
+    drawn = read_space(written(tmp_path, text + "[num_steps]\ngrid_search = [32, 64.0]\n"))
+    assert drawn["hidden_sizes"].categories == [(8,), (64, 64)]
     assert drawn["num_steps"] == {"grid_search": [32, 64]}
     rates = [drawn["learning_rate"].sample() for _ in range(100)]
     assert 1e-4 <= min(rates) < 1e-3 < max(rates) <= 1e-2
@@ -42,10 +41,8 @@ def test_a_space_is_read_and_drawn_from(tmp_path):
         ("[speed]\nchoice = [1]", "speed: unknown; expected one of total_timesteps"),
         ("learning_rate = 3", "learning_rate: found 3, expected one of choice"),
         ("[learning_rate]\nnormal = [0, 1]", "expected one of choice"),
-        ("[learning_rate]\nuniform = [1]", r"found \[1\], expected lower, upper"),
-        ("[learning_rate]\nuniform = [2, 1]", "expected the smaller one first"),
+        ("[learning_rate]\nuniform = [1]", r"uniform: found \[1.0\]: .*missing"),
         ("[learning_rate]\nchoice = ['a']", "found 'a', expected a finite number"),
-        ("[hidden_sizes]\nuniform = [[8], [9]]", "expected one of choice, grid_search: it is not a number"),
     ],
 )
 def test_a_space_that_cannot_be_used_is_refused(tmp_path, text, message):

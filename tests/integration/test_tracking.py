@@ -2,10 +2,7 @@
 
 import subprocess
 import sys
-import time
 from pathlib import Path
-from urllib.error import URLError
-from urllib.request import urlopen
 
 import pytest
 
@@ -116,35 +113,3 @@ def test_how_a_run_ended_is_recorded(trainer, tmp_path, monkeypatch, error, stat
 def test_mlflow_is_imported_when_it_is_used():
     code = "import sys, baselines.purejaxrl_ppo.train_ppo; sys.exit('mlflow' in sys.modules)"
     subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=True, timeout=120)
-
-
-@pytest.mark.slow
-def test_a_served_store_records_everything(trainer, tmp_path):
-    port = 5713
-    command = f"{sys.executable} -m mlflow server --port {port} --workers 1"
-    store = f"sqlite:///{tmp_path}/server.db"
-    server = subprocess.Popen(
-        [*command.split(), "--backend-store-uri", store, "--artifacts-destination", str(tmp_path)],
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.DEVNULL,
-    )
-    uri = f"http://127.0.0.1:{port}"
-    try:
-        _wait_for(uri)
-        trainer.train(tmp_path / "run", SEED, EVERY_OTHER_UPDATE._replace(tracking_uri=uri))
-        client, run = only_run(uri)
-        assert run.info.status == "FINISHED" and len(history(client, run, "entropy")) == 4
-        assert len(client.list_artifacts(run.info.run_id, "checkpoints")) == 5
-    finally:
-        server.terminate()
-        server.wait(timeout=60)
-
-
-def _wait_for(uri):
-    deadline_s = time.monotonic() + 120
-    while True:
-        try:
-            return urlopen(f"{uri}/health").read()
-        except URLError:
-            assert time.monotonic() < deadline_s, f"{uri}: no server"
-            time.sleep(0.5)

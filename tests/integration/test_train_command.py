@@ -1,6 +1,5 @@
 """The command of the training: its flags, what it resumes, what it refuses, and how it ends."""
 
-import dataclasses
 import shutil
 import sys
 
@@ -50,16 +49,6 @@ def test_flags_override_the_file_and_the_file_the_defaults(tmp_path):
     settings, _ = read("--total-timesteps", "4e6", "--hidden-sizes", 8, 8, "--reward", "progress=2")
     assert settings.hyperparameters == Config(4_000_000, hidden_sizes=(8, 8))
     assert train_ppo.parse_rewards(settings.reward) == {"progress": 2.0}
-
-
-def test_every_flag_has_a_help_text(capsys):
-    with pytest.raises(SystemExit):
-        read("--help")
-    text = capsys.readouterr().out
-    for field in (*dataclasses.fields(Config), *dataclasses.fields(train_ppo.Settings)):
-        if field.name != "hyperparameters":
-            assert f"--{field.name.replace('_', '-')}" in text
-    assert "Adam's step size at the start." in text and "Noisy starts of an evaluation." in text
 
 
 @pytest.mark.parametrize(

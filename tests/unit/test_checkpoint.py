@@ -111,14 +111,6 @@ def test_a_file_that_is_too_large_is_not_read(path, params, monkeypatch):
         load_checkpoint(path)
 
 
-@pytest.mark.parametrize("kept", [7, 100, 0.5, 0.99])
-def test_truncated_files_are_refused(path, kept):
-    content = path.read_bytes()
-    path.write_bytes(content[: kept if isinstance(kept, int) else int(kept * len(content))])
-    with pytest.raises(CheckpointError, match=r"a\.safetensors"):
-        load_checkpoint(path)
-
-
 def test_every_flipped_bit_is_noticed(path):
     whole = path.read_bytes()
     for place in np.random.default_rng(0).integers(0, len(whole), 50):

@@ -18,9 +18,9 @@ import tyro
 from ray import tune
 from ray.tune import ResultGrid
 
-from baselines.purejaxrl_ppo.config import Config, ConfigError, settings_in_file
+from baselines.purejaxrl_ppo.config import Config, ConfigError, load_toml, settings_in_file
 from baselines.purejaxrl_ppo.run import Options
-from baselines.purejaxrl_ppo.sweeps.space import Space, for_tune, read_space
+from baselines.purejaxrl_ppo.sweeps.space import read_space
 from baselines.purejaxrl_ppo.tracking import Tracker, local_uri
 from baselines.purejaxrl_ppo.training import Trainer
 from flytrack_env.files import write_atomically
@@ -76,11 +76,7 @@ class Base(NamedTuple):
 
 
 def parse(words: list[str]) -> Settings:
-    """Return the settings of a command line.
-
-    Raises:
-        ConfigError: a TOML file that cannot be used, or a setting that is both drawn and given.
-    """
+    """Return the settings of a command line."""
     config = (tyro.conf.OmitArgPrefixes,)
     settings = tyro.cli(Settings, args=words, prog=PROG, config=config)
     if settings.config is not None:
@@ -90,12 +86,8 @@ def parse(words: list[str]) -> Settings:
     return settings
 
 
-def prepare(settings: Settings) -> tuple[Base, Space]:
-    """Return what the trials share, and the space; nothing has been written.
-
-    Raises:
-        ValueError: what cannot be used.
-    """
+def prepare(settings: Settings) -> tuple[Base, dict[str, Any]]:
+    """Return what the trials share, and the space; nothing has been written."""
     if settings.trials < 1:
         raise ConfigError(f"--trials: found {settings.trials}, expected at least 1")
     space, out, config = read_space(settings.space), settings.out.resolve(), settings.hyperparameters
@@ -125,7 +117,7 @@ def run_trial(drawn: dict[str, Any], base: Base) -> None:
     trainer.train(out, base.seed, base.options._replace(report=report))
 
 
-def run_trials(base: Base, space: Space, settings: Settings) -> ResultGrid:
+def run_trials(base: Base, space: dict[str, Any], settings: Settings) -> ResultGrid:
     """Run the trials with Ray Tune; return its results."""
     resources = {"cpu": settings.cpus_per_trial, "gpu": settings.gpus_per_trial}
     os.environ.update(QUIET)
@@ -136,7 +128,7 @@ def run_trials(base: Base, space: Space, settings: Settings) -> ResultGrid:
     try:
         tuner = tune.Tuner(
             tune.with_resources(tune.with_parameters(run_trial, base=base), resources),
-            param_space=for_tune(space),
+            param_space=space,
             tune_config=tune.TuneConfig(
                 num_samples=settings.trials,
                 search_alg=tune.search.BasicVariantGenerator(random_state=settings.seed),
@@ -149,12 +141,13 @@ def run_trials(base: Base, space: Space, settings: Settings) -> ResultGrid:
         ray.shutdown()
 
 
-def run(base: Base, space: Space, settings: Settings) -> ResultGrid:
+def run(base: Base, space: dict[str, Any], settings: Settings) -> ResultGrid:
     """Run the sweep as an MLflow run; write and print Ray's table of the results."""
     base.out.mkdir(parents=True, exist_ok=True)
     uri, tracker = base.options.tracking_uri, None
     if uri is not None:
-        params = {"space": space, "trials": settings.trials, "seed": base.seed, "env_id": base.env_id}
+        params = {"space": load_toml(settings.space), "trials": settings.trials, "seed": base.seed}
+        params["env_id"] = base.env_id
         tracker = Tracker(base.out, uri, f"sweep {settings.space.stem}", params)
         tracker.begin()
         base = base._replace(options=base.options._replace(parent_run_id=tracker.run_id or None))
