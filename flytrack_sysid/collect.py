@@ -18,8 +18,18 @@ from flytrack_env.dynamics import nominal_parameters
 from flytrack_env.plants import Plant
 from flytrack_env.state import ACCELERATION, STATE_SIZE, pack, unpack, unpack_action
 from flytrack_sysid import excitation
-from flytrack_sysid.envelope import FEWEST_STEPS, HEIGHTS, MIDDLE_V, SCRIPT_HEIGHTS, is_inside
-from flytrack_sysid.excitation import DT_S, FLIGHT_STEPS, FLIGHTS_PER_KIND, KINDS, start_state
+from flytrack_sysid.excitation import (
+    DT_S,
+    FEWEST_STEPS,
+    FLIGHT_STEPS,
+    FLIGHTS_PER_KIND,
+    HEIGHTS,
+    KINDS,
+    MIDDLE_V,
+    SCRIPT_HEIGHTS,
+    is_inside,
+    start_state,
+)
 from flytrack_sysid.log import FlightLog, log_of_states
 from flytrack_sysid.script_file import Script, check_script, script_of
 from flytrack_sysid.sensors import LOST_ROWS, measure

@@ -13,15 +13,12 @@ from flytrack_sysid.log import FlightLog
 from flytrack_sysid.one_step import predicted_channel
 from flytrack_sysid.prediction import (
     Prediction,
-    columns,
     inputs_that_lack,
     judged_steps,
     specific_force_w,
     to_body,
 )
 
-# Long enough for the noise of velocity to average out, short beside a manoeuvre.
-WINDOW_S = 0.1
 SPEED_EDGES = (0.0, 2.0, 5.0, 10.0, 20.0, np.inf)
 NUM_ACTION_BINS = 10
 NUM_VOLTAGE_BINS = 4
@@ -30,10 +27,10 @@ LEAST_VOLTAGE_RANGE = 0.1
 
 
 class ForceSamples(NamedTuple):
-    """Specific force of judged steps or windows, body frame, (num_samples, 3) m/s^2.
+    """Specific force of judged steps, body frame, (num_samples, 3) m/s^2.
 
-    source: the channel it was measured with, f, a or v; v gives body z only. Others (num_samples,): applied
-    thrust action after the step, V, rows before the steps.
+    source: the channel it was measured with, f or a. Others (num_samples,): applied thrust action after the
+    step, V, rows before the steps.
     """
 
     source: str
@@ -67,47 +64,15 @@ class OpenForce(NamedTuple):
     by_speed: tuple[SpeedBin, ...]
 
 
-def _from_velocity(
-    model: ModelParameters, log: FlightLog, prediction: Prediction, here: np.ndarray
-) -> ForceSamples:
-    """Return samples along body z of the change of velocity over windows that do not overlap."""
-    length = max(1, round(WINDOW_S / prediction.steps.median))
-    run = np.cumsum(np.append(True, np.diff(here) > 1)) if len(here) else here
-    place = np.arange(len(here)) - np.searchsorted(run, run)
-    is_first = place % length == 0
-    whole = is_first & (np.append(run, np.full(length, -1))[length - 1 :][: len(here)] == run)
-    windows = here[whole][:, None] + np.arange(length)
-    rows = windows[:, length // 2]
-    duration = prediction.steps.duration[windows]
-    weights = duration / duration.sum(axis=1, keepdims=True)
-
-    def mean(values: np.ndarray) -> np.ndarray:
-        return np.einsum("wk,wk...->w...", weights, values[windows])
-
-    acc_w = (log["v"][windows[:, -1] + 1] - log["v"][windows[:, 0]]) / duration.sum(axis=1)[:, None]
-    error_w = acc_w - mean(columns(prediction.after.acc_w))
-    axis_w = mean(columns(prediction.before.quat.axes()[2]))
-    axis_w /= np.linalg.norm(axis_w, axis=1, keepdims=True)
-    modelled = np.zeros((len(rows), 3))
-    modelled[:, 2] = mean(predicted_channel("f", prediction, model)[:, 2])
-    measured = modelled.copy()
-    measured[:, 2] += np.sum(axis_w * error_w, axis=1)
-    action, battery_v = map(np.asarray, (prediction.after.applied.thrust, prediction.before.battery_v))
-    return ForceSamples("v", measured, modelled, mean(action), mean(battery_v), rows)
-
-
 def force_samples(
     model: ModelParameters, log: FlightLog, prediction: Prediction, rows: np.ndarray
 ) -> ForceSamples | None:
-    """Return the specific force of judged steps, by f, else a, else v; None without any of them."""
+    """Return the specific force of judged steps, by f, else a; None without both."""
     lacking = inputs_that_lack(model, log)
-    source = next((name for name in ("f", "a", "v") if name in log and not lacking[name]), None)
+    source = next((name for name in ("f", "a") if name in log and not lacking[name]), None)
     here = judged_steps(rows, prediction)
     if source is None or not len(here):
         return None
-    if source == "v":
-        samples = _from_velocity(model, log, prediction, here)
-        return samples if len(samples.rows) else None
     measured = log[source][here + 1]
     if source == "a":
         before = jax.tree.map(lambda leaf: leaf[here], prediction.before)
@@ -125,7 +90,7 @@ def force_samples(
 def open_force(log: FlightLog, prediction: Prediction, samples: ForceSamples) -> OpenForce:
     """Return the specific force that the model does not explain, in all and by speed over ground, m/s^2.
 
-    The log must have v and q, and the samples be of f or a.
+    The log must have v and q.
     """
     error_b = samples.measured_b - samples.modelled_b
     before = jax.tree.map(lambda leaf: leaf[samples.rows], prediction.before)

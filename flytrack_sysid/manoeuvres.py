@@ -12,7 +12,6 @@ from scipy.spatial.transform import Rotation
 
 from flytrack_env.dynamics import ModelParameters, collective_thrust
 from flytrack_env.state import BATTERY, BATTERY_EMPTY_V, BATTERY_FULL_V
-from flytrack_sysid.envelope import MIDDLE_V, VOLTAGES
 from flytrack_sysid.excitation import (
     AMPLITUDES,
     DT_S,
@@ -21,9 +20,11 @@ from flytrack_sysid.excitation import (
     HEIGHT,
     LEG_SPEEDS,
     LEG_SWING,
+    MIDDLE_V,
     RESERVE_V,
     SLOT_STEPS,
     SLOW_STEPS,
+    VOLTAGES,
     ScriptedFlight,
     start_at,
     switching,

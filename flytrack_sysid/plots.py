@@ -97,7 +97,7 @@ def draw_rollouts(rollouts: Sequence[Rollout]) -> Figure:
 def draw_thrust(thrust: ThrustError | None) -> Figure:
     """Draw the thrust error over applied action and voltage."""
     if thrust is None:
-        return _empty("Thrust", "not judged: it needs v_bat, and f, or a or v with q")
+        return _empty("Thrust", "not judged: it needs v_bat, and f, or a with q")
     figure, panels = _figure("Thrust", 1, 1, 4.5)
     heat = panels[0, 0]
     limit = max(float(np.nanmax(np.abs(thrust.mean_n))), np.finfo(float).tiny)

@@ -11,8 +11,14 @@ from flytrack_env.files import write_atomically
 from flytrack_env.messages import error_text
 from flytrack_env.npz_file import NpzError, load_npz
 from flytrack_env.state import ACTION_SIZE, APPLIED_ACTION, QUATERNION, STATE_SIZE
-from flytrack_sysid.envelope import ANY_VOLTAGE, FEWEST_STEPS, LARGEST_SPEED, SCRIPT_HEIGHTS, is_inside
-from flytrack_sysid.excitation import ScriptedFlight
+from flytrack_sysid.excitation import (
+    ANY_VOLTAGE,
+    FEWEST_STEPS,
+    LARGEST_SPEED,
+    SCRIPT_HEIGHTS,
+    ScriptedFlight,
+    is_inside,
+)
 from flytrack_sysid.manoeuvres import MANOEUVRES
 
 SUFFIX = ".npz"

@@ -28,13 +28,13 @@ from flytrack_env.state import (
 )
 from flytrack_env.viz_rerun import Trajectory
 from flytrack_sysid.diagnosis.traces import Traces, traces
-from flytrack_sysid.forces import WINDOW_S
 from flytrack_sysid.log import FlightLog
 from flytrack_sysid.open_loop import longest_flight
 from flytrack_sysid.parameters import with_neutral_effects
 from flytrack_sysid.prediction import Prediction, free_flights, inputs_that_lack, predict
 from flytrack_sysid.record import Filled, fill_gaps
 
+WINDOW_S = 0.1  # of means: long enough for noise to average out, short beside a manoeuvre
 RESTART_S = 1.0  # of free flight: the horizon of the report's first sentence
 AWAY_M = 10.0  # from the measured path: a model that is farther off has diverged
 BETWEEN_S = 1.0  # from the end of a segment to the start of the next

@@ -105,14 +105,14 @@ def _forces(
     thrust = left = None
     samples = force_samples(model, log, prediction, rows)
     if samples is None:
-        why = "no judged step has f, a or v to compare the model with"
+        why = "no judged step has f or a to compare the model with"
         return None, None, [f"thrust and unexplained force: {why}"]
     notes = []
     if "v_bat" in log:
         thrust = thrust_error(model, samples)
     else:
         notes.append("thrust by voltage: v_bat is not in the log")
-    if samples.source != "v" and "v" in log and "q" in log:
+    if "v" in log and "q" in log:
         left = open_force(log, prediction, samples)
     else:
         notes.append("unexplained force by speed: it needs v, q, and a or f")

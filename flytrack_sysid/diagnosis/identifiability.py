@@ -22,8 +22,7 @@ from flytrack_sysid.diagnosis.problem import Problem
 from flytrack_sysid.diagnosis.result import SCHEMA, TO_LOG
 from flytrack_sysid.diagnosis.score_test import CANDIDATES, Candidate, Linearization
 from flytrack_sysid.diagnosis.search import FittedModel, SearchState
-from flytrack_sysid.envelope import ANY_VOLTAGE, SCRIPT_HEIGHTS, VOLTAGES, is_inside
-from flytrack_sysid.excitation import DT_S, FLIGHT_STEPS
+from flytrack_sysid.excitation import ANY_VOLTAGE, DT_S, FLIGHT_STEPS, SCRIPT_HEIGHTS, VOLTAGES, is_inside
 from flytrack_sysid.log import FlightLog, log_of_states
 from flytrack_sysid.manoeuvres import (
     FLIGHTS_PER_MANOEUVRE,

@@ -21,8 +21,7 @@ from scipy.spatial.transform import Rotation
 from flytrack_sysid.importing.resample import interpolate, interpolate_quaternions
 from flytrack_sysid.importing.units import GRAVITY
 from flytrack_sysid.log import GAP_STEPS, FlightLog, usual_step
-from flytrack_sysid.plausibility import summed_turns
-from flytrack_sysid.windows import LEAST_CORRELATION
+from flytrack_sysid.plausibility import LEAST_CORRELATION, summed_turns
 
 LARGEST_OFFSET_S = 0.25  # beyond it, loggers are broken rather than late
 WINDOW_S = 0.1  # long against the noise of a sample, short against manoeuvres

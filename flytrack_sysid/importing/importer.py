@@ -143,19 +143,15 @@ def _count_of(path: Path, wanted: Manifest) -> int:
         raise LogError(f"{where}: expected the name of a file beside the log, not a path")
     try:
         lines = read_at_most(manifest, LARGEST_MANIFEST_BYTES).decode("utf-8-sig").splitlines()
-        table = csv.reader(lines, strict=True)
-        names = next(table, [])
-        for name in (wanted.name_column, wanted.count_column):
-            if name not in names:
-                found = ", ".join(map(quote_name, names[:10]))
-                raise LogError(f"{where}: column {quote_name(name)}: missing; found {found}")
-        rows = (dict(zip(names, row, strict=False)) for row in table)
-        mine = next((row for row in rows if row.get(wanted.name_column) == path.name), {})
+        rows = list(csv.DictReader(lines, strict=True))
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise LogError(f"{where}: cannot be read as a manifest: {error_text(error)}") from error
-    if not mine:
-        raise LogError(f"{where}: column {quote_name(wanted.name_column)}: {path.name}: missing")
-    text = mine.get(wanted.count_column, "")
+    text = next(
+        (row.get(wanted.count_column) for row in rows if row.get(wanted.name_column) == path.name), None
+    )
+    if text is None:
+        columns = f"columns {quote_name(wanted.name_column)} and {quote_name(wanted.count_column)}"
+        raise LogError(f"{where}: {columns}: {path.name}: missing")
     try:
         return int(text)
     except ValueError as error:

@@ -14,8 +14,7 @@ from flytrack_sysid import collect, load_log
 from flytrack_sysid.cli import main
 from flytrack_sysid.diagnosis.identifiability import LANES_PER_MANOEUVRE, next_flight
 from flytrack_sysid.diagnosis.lanes import LANE_S
-from flytrack_sysid.envelope import HEIGHTS, SCRIPT_HEIGHTS
-from flytrack_sysid.excitation import DT_S, FLIGHT_STEPS
+from flytrack_sysid.excitation import DT_S, FLIGHT_STEPS, HEIGHTS, SCRIPT_HEIGHTS
 from flytrack_sysid.manoeuvres import FLIGHTS_PER_MANOEUVRE, MANOEUVRES, flights_of, hover_action
 from flytrack_sysid.script_file import Script, ScriptError, check_script, load_script, save_script, script_of
 from tests.support.handout_plant import HandoutPlant

@@ -8,7 +8,7 @@ import pytest
 from flytrack_env.dynamics import advance
 from flytrack_env.plants import Plant
 from flytrack_sysid import CollectError, collect
-from flytrack_sysid.envelope import HEIGHTS, LARGEST_SPEED
+from flytrack_sysid.excitation import HEIGHTS, LARGEST_SPEED
 from tests.support.handout_plant import GRAVITY, HandoutPlant
 
 

@@ -15,7 +15,6 @@ from flytrack_sysid import FlightLog, cli, save_log
 from flytrack_sysid.diagnosis import Diagnosis
 from flytrack_sysid.diagnosis.result import CONSISTENT, Unexplained
 from flytrack_sysid.flight_recording import write_flight_recording
-from flytrack_sysid.forces import WINDOW_S
 from tests.support.made_flight import TIME_S, flight
 from tests.support.recordings import Recording
 
@@ -87,7 +86,7 @@ def test_arrows_are_the_force_that_the_model_lacks_along_the_world(flown, record
     log = flown[1]
     quat = Rotation.from_quat(log["q"], scalar_first=True)
     drag_w = quat.apply(-np.array(DRAG) * quat.inv().apply(log["v"]))  # of the step after a row
-    half = round(0.5 * WINDOW_S / DT_S)
+    half = round(0.5 * trajectories.WINDOW_S / DT_S)
     entity = "/world/residual/nominal"
     drawn = zip(recording.times[entity], recording.rows[entity, "Arrows3D:vectors"], strict=True)
     steps = sorted(step for (step, _), row in drawn if row)

@@ -141,7 +141,7 @@ def test_rows_are_chosen_and_files_become_segments(folder, tmp_path):
     assert found.log.segment.tolist() == [0] * 40 + [1] * 20
     assert [Path(source).name for source in found.sources] == ["one.csv", "two.csv"]
     (tmp_path / "list.csv").write_text("name,good\none.csv,100\n")
-    with pytest.raises(LogError, match=r"list\.csv: column name: two\.csv: missing"):
+    with pytest.raises(LogError, match=r"list\.csv: columns name and good: two\.csv: missing"):
         import_log([tmp_path / "one.csv", tmp_path / "two.csv"], "csv", tmp_path / "map.toml")
 
 
@@ -211,7 +211,7 @@ def test_missing_and_unmapped_files_are_refused(folder, tmp_path):
             "file,rows\nflight.csv,7x",
             r"m\.csv: flight\.csv: rows: found '7x', expected a whole number",
         ),
-        ("m.csv", "file,rows\nother.csv,7\n", r"m\.csv: column file: flight\.csv: missing"),
+        ("m.csv", "file,rows\nother.csv,7\n", r"m\.csv: columns file and rows: flight\.csv: missing"),
         ("none.csv", "", r"none\.csv: cannot be read as a manifest"),
         ("../m.csv", "", "expected the name of a file beside the log, not a path"),
     ],
