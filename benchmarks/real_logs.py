@@ -147,40 +147,24 @@ it: [real logs](../real_logs.md#diagnoses-of-these-logs). jax {jax}."""
 
 CRAZYFLIE_HEAD = """## Crazyflie 2.1, flown by learned policies
 
-Held out are the flights of policies {policies}: the model is judged on other policies, which command
-differently.
-
-```
-FLIGHTS=../shared/data/{folder}
-flytrack-sysid import $FLIGHTS/seed000{{{learnt}}}_*.csv.gz --format csv \\
-    --map crazyflie_phoenix --out learnt.npz --model-out crazyflie.json
-flytrack-sysid import $FLIGHTS/seed000{{{judged}}}_*.csv.gz --format csv \\
-    --map crazyflie_phoenix --out judged.npz
-flytrack-sysid diagnose learnt.npz --model crazyflie.json --hold-out judged.npz --out report
-```"""
+Learnt from are the flights of policies {learnt}; held out are those of policies {judged}, which command
+differently."""
 
 BETAFLIGHT_HEAD = """## Betaflight quadcopter, one acro flight
 
-`quad.toml`:
+With this mapping, `quad.toml`:
 
 ```toml
-{quad}```
-
-```
-flytrack-sysid import ../shared/data/{folder}/shortLog.BFL --format betaflight \\
-    --map quad.toml --out quad.npz --model-out quad.json
-flytrack-sysid diagnose quad.npz --model quad.json --out report
-```"""
+{quad}```"""
 
 
 def page(flown: Craft, acro: Craft) -> str:
     """Return the page on both crafts."""
-    learnt, judged = ",".join(LEARNT), ",".join(JUDGED)
     parts = [
         HEAD.format(jax=jax.__version__),
-        CRAZYFLIE_HEAD.format(folder=CRAZYFLIE, learnt=learnt, judged=judged, policies=", ".join(JUDGED)),
+        CRAZYFLIE_HEAD.format(learnt=", ".join(LEARNT), judged=", ".join(JUDGED)),
         section(flown),
-        BETAFLIGHT_HEAD.format(folder=BETAFLIGHT, quad=QUAD),
+        BETAFLIGHT_HEAD.format(quad=QUAD),
         section(acro),
     ]
     return "\n\n".join(parts) + "\n"

@@ -11,7 +11,7 @@ from flytrack_env.pictures import drawing
 from flytrack_env.pictures.drawing import new_figure, plain
 from flytrack_env.scene import BLUE, GREEN, GREY, ORANGE
 from flytrack_sysid.forces import OpenForce, SpeedBin, ThrustError
-from flytrack_sysid.open_loop import QUANTITIES, Rollout
+from flytrack_sysid.prediction_errors import QUANTITIES, Rollout
 from flytrack_sysid.steps import AXES, StepResponse
 from flytrack_sysid.validate import Validation
 

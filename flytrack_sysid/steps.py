@@ -6,8 +6,8 @@ import numpy as np
 
 from flytrack_env.dynamics import ModelParameters
 from flytrack_sysid.log import FlightLog
-from flytrack_sysid.open_loop import longest_flight
 from flytrack_sysid.prediction import Prediction, free_flights, runs_of
+from flytrack_sysid.prediction_errors import longest_flight
 
 AXES = ("roll", "pitch", "yaw")
 LEAST_JUMP = 0.2

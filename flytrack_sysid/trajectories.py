@@ -29,9 +29,9 @@ from flytrack_env.state import (
 from flytrack_env.viz_rerun import Trajectory
 from flytrack_sysid.diagnosis.traces import Traces, traces
 from flytrack_sysid.log import FlightLog
-from flytrack_sysid.open_loop import longest_flight
 from flytrack_sysid.parameters import with_neutral_effects
 from flytrack_sysid.prediction import Prediction, free_flights, inputs_that_lack, predict
+from flytrack_sysid.prediction_errors import longest_flight
 from flytrack_sysid.record import Filled, fill_gaps
 
 WINDOW_S = 0.1  # of means: long enough for noise to average out, short beside a manoeuvre

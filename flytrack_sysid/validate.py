@@ -7,9 +7,8 @@ import numpy as np
 from flytrack_env.dynamics import ModelParameters
 from flytrack_sysid.forces import OpenForce, ThrustError, force_samples, open_force, thrust_error
 from flytrack_sysid.log import FlightLog
-from flytrack_sysid.one_step import OneStep, one_step_errors
-from flytrack_sysid.open_loop import Rollout, rollout_errors
 from flytrack_sysid.prediction import Prediction, inputs_that_lack, predict
+from flytrack_sysid.prediction_errors import OneStep, Rollout, one_step_errors, rollout_errors
 from flytrack_sysid.record import BATTERY_UNKNOWN_V, fill_gaps
 from flytrack_sysid.steps import HELD_AFTER_S, HELD_BEFORE_S, LEAST_JUMP, StepResponse, step_responses
 

@@ -1,7 +1,7 @@
 """The result of a diagnosis, and its JSON."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields, is_dataclass
 from typing import Any
 
 import numpy as np
@@ -116,61 +116,34 @@ class Diagnosis:
     warnings: tuple[str, ...] = ()
 
     def as_json(self) -> dict[str, Any]:
-        """Return the content of diagnosis.json."""
+        """Return the content of diagnosis.json: the fields under the names of its schema, six digits."""
+        causes, limits, unexplained = _plain((self.causes, self.not_identifiable, self.unexplained))
+        unexplained["times_sensor_noise"] = unexplained.pop("shares")
+        for cause in causes:
+            cause |= {"lambda": cause.pop("lambda_"), "closest_rival": cause.pop("closest")}
+        for limit in limits:
+            limit["smallest_detectable"] = {"value": limit.pop("smallest"), "unit": limit.pop("unit")}
         return {
             "schema": SCHEMA,
             "verdict": self.verdict,
-            "causes": [_cause(cause) for cause in self.causes],
-            "unexplained": {
-                "flagged": self.unexplained.flagged,
-                "depends_on": list(self.unexplained.depends_on),
-                "times_sensor_noise": {
-                    name: _rounded(share) for name, share in self.unexplained.shares.items()
-                },
-            },
-            "not_identifiable": [
-                {
-                    "effect": one.effect,
-                    "smallest_detectable": {"value": _rounded(one.smallest), "unit": one.unit},
-                    "confused_with": list(one.confused_with),
-                    "fly": one.fly,
-                }
-                for one in self.not_identifiable
-            ],
-            "error": {
-                name: {
-                    "one_step_nrmse": {key: _rounded(value) for key, value in one.one_step_nrmse.items()},
-                    "position_m": {key: _rounded(value) for key, value in one.position_m.items()},
-                }
-                for name, one in self.error.items()
-            },
+            "causes": causes,
+            "unexplained": unexplained,
+            "not_identifiable": limits,
+            "error": _plain(self.error),
             "noise": self.noise,
             "data": {"file": self.source, "sha256": self.sha256, "voltages": self.voltages},
             "warnings": list(self.warnings),
         }
 
 
-def _rounded(value: float) -> float | None:
-    """Return six digits; None for what there is no number of."""
-    return float(f"{value:.6g}") if np.isfinite(value) else None
-
-
-def _cause(cause: Cause) -> dict[str, Any]:
-    return {
-        "effect": cause.effect,
-        "equivalent": list(cause.equivalent),
-        "channel": cause.channel,
-        "parameters": {
-            name: {
-                "value": _rounded(one.value),
-                "ci95": [_rounded(end) for end in one.ci95],
-                "unit": one.unit,
-            }
-            for name, one in cause.parameters.items()
-        },
-        "chi2_gain": _rounded(cause.chi2_gain),
-        "heldout_gain": _rounded(cause.heldout_gain),
-        "lambda": _rounded(cause.lambda_),
-        "lambda_sep": _rounded(cause.lambda_sep),
-        "closest_rival": cause.closest,
-    }
+def _plain(value: Any) -> Any:
+    """Return dataclasses as JSON values: numbers with six digits, None for those that are not finite."""
+    if is_dataclass(value):
+        value = {one.name: getattr(value, one.name) for one in fields(value)}
+    if isinstance(value, Mapping):
+        return {key: _plain(one) for key, one in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(one) for one in value]
+    if isinstance(value, float):
+        return float(f"{value:.6g}") if np.isfinite(value) else None
+    return value

@@ -33,10 +33,10 @@ from flytrack_sysid.diagnosis.score_test import AT_BOUND, Linearization, solve, 
 from flytrack_sysid.diagnosis.search import FittedModel, SearchState
 from flytrack_sysid.diagnosis.vetoes import Selection, held_out_gain, is_base_remainder, is_contradicted
 from flytrack_sysid.log import FlightLog
-from flytrack_sysid.open_loop import rollout_errors
 from flytrack_sysid.parameters import DRAIN, MAX_RATES, THRUST_COEFFS, as_float32, from_vector
 from flytrack_sysid.parameters import unit_of as unit_of_parameter
 from flytrack_sysid.prediction import predict
+from flytrack_sysid.prediction_errors import rollout_errors
 from flytrack_sysid.record import BATTERY_UNKNOWN_V, fill_gaps
 
 TWO_SIDED_95 = 1.959964

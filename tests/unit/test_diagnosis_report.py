@@ -12,10 +12,9 @@ from benchmarks.hidden import draw_base, fly, measure
 from flytrack_env.dynamics import ModelParameters
 from flytrack_env.effects import EFFECTS, AccelerometerBias, CommandDelay, LinearDrag
 from flytrack_sysid.diagnosis.evidence import EVIDENCE, bin_edges, binned_means, draw_cause, without
-from flytrack_sysid.diagnosis.report import html_of, verdict_of, write_diagnosis
+from flytrack_sysid.diagnosis.report import html_of, write_diagnosis
 from flytrack_sysid.diagnosis.result import (
     CAUSES_FOUND,
-    CONSISTENT,
     UNEXPLAINED,
     Cause,
     Diagnosis,
@@ -242,17 +241,6 @@ def test_page_says_all_and_loads_nothing(tmp_path, diagnosis, measured):
 def test_page_of_a_log_of_few_channels(diagnosis, measured):
     text = html_of(diagnosis, measured.without("w", "f", "v_bat"))
     assert "attitude or velocity replace them" in text and text.count("<img") == len(diagnosis.causes)
-
-
-def test_verdicts(diagnosis):
-    assert verdict_of(diagnosis).tone == "open" and "lacks 3 things" in verdict_of(diagnosis).text
-    assert "depends on position" in verdict_of(diagnosis).text
-    alone = replace(diagnosis, verdict=CAUSES_FOUND, causes=diagnosis.causes[:1], unexplained=Unexplained())
-    assert verdict_of(alone).tone == "found" and "one thing: drag" in verdict_of(alone).text
-    nothing = replace(diagnosis, verdict=UNEXPLAINED, causes=())
-    assert verdict_of(nothing).tone == "open" and "no known cause explains it" in verdict_of(nothing).text
-    fine = replace(diagnosis, verdict=CONSISTENT, causes=(), unexplained=Unexplained())
-    assert verdict_of(fine).tone == "good"
 
 
 def test_curve_of_a_cause_goes_through_what_is_left_without_it(flown, measured):

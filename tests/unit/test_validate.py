@@ -14,8 +14,8 @@ from flytrack_env.dynamics import ModelParameters, advance, nominal_parameters
 from flytrack_env.effects import CommandDelay, LinearDrag, QuadraticDrag, start_memories
 from flytrack_env.state import pack, unpack, unpack_action
 from flytrack_sysid.log import FlightLog, log_of_states
-from flytrack_sysid.open_loop import QUANTITIES
 from flytrack_sysid.prediction import columns, predict
+from flytrack_sysid.prediction_errors import QUANTITIES
 from flytrack_sysid.record import LARGEST_DOUBT, fill_gaps
 from flytrack_sysid.split import held_out_rows
 from flytrack_sysid.steps import MOST_PER_AXIS
