@@ -45,17 +45,14 @@ def page(text: str, times: float) -> str:
     return report.page(
         "The champion of the FlyTrack course",
         f"{report.command_line()}: `{name}`, trained from scratch with seed {meta['seed']} for "
-        f"{meta['steps'] / 1e6:.0f} M environment steps ({meta['seconds']:.0f} s) on the model "
-        "identified from the "
-        f"shipped black box (`{MODEL.relative_to(report.ROOT)}`). Unlike the default recipe: reward "
-        f"{reward}, "
-        f"min_std {CONFIG.min_std:g}, gate_margin {CONFIG.gate_margin:g}. On the black box, from noisy "
-        "starts:",
+        f"{meta['steps'] / 1e6:.0f} M environment steps ({meta['seconds']:.0f} s) on the model identified "
+        f"from the shipped black box (`{MODEL.relative_to(report.ROOT)}`). Unlike the default recipe: reward "
+        f"{reward}, min_std {CONFIG.min_std:g}, gate_margin {CONFIG.gate_margin:g}. On the black box, from "
+        "noisy starts:",
         f"`python eval_agent.py --checkpoint {name} {flags}`",
         f"```\n{text}```",
-        f"Mean flying lap: **{times:.3f} times** the time-optimal lap of that model (aim: at most "
-        f"{AIM:g}). The "
-        "settings were chosen by looking at flights on this black box and this track.",
+        f"Mean flying lap: **{times:.3f} times** the time-optimal lap of that model (aim: at most {AIM:g}). "
+        "The settings were chosen by looking at flights on this black box and this track.",
         report.provenance_line(report.provenance()),
     )
 
@@ -64,10 +61,8 @@ def main() -> None:
     """Train, fly, and where the aim is met, ship the policy and write the page; else exit 1."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--only-fly", action="store_true", help="fly the shipped champion, train none")
-    parser.add_argument("--work", type=Path, default=Path("runs/champion"), help="folder of the training")
-    parser.add_argument("--out", type=Path, default=report.RESULTS / "champion.md", help="page to write")
     arguments = parser.parse_args()
-    policy = CHAMPION if arguments.only_fly else train(fresh_folder(arguments.work))
+    policy = CHAMPION if arguments.only_fly else train(fresh_folder(Path("runs/champion")))
     settings = EvaluationSettings(
         policy, STEPS, EPISODES, LAPS, black_box=SHIPPED_BLACK_BOX, seed=FLIGHT_SEED, ghost=True
     )
@@ -78,7 +73,7 @@ def main() -> None:
     if found.numbers["success"]["share"] < 1.0 or times > AIM:
         raise SystemExit(1)
     write_atomically(CHAMPION, policy.read_bytes())
-    report.write_page(arguments.out, page(found.text, times))
+    report.write_page(report.RESULTS / "champion.md", page(found.text, times))
 
 
 if __name__ == "__main__":

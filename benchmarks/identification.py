@@ -3,8 +3,7 @@
 ``python -m benchmarks.identification [--plants 50] [--seed 0]`` writes docs/results/identification_plants.md.
 Every plant has four lags of 0.01 to 0.08 s and a thrust curve of its own, in equations that share nothing
 with the package. It is flown for two minutes and identified from four logs: clean, measured by common
-sensors, the same without accelerometer, and with velocity and attitude only (besides the battery). Every
-fourth block of a log is held out.
+sensors, the same without accelerometer, and with velocity and attitude only (besides the battery).
 """
 
 import argparse
@@ -17,7 +16,7 @@ import numpy as np
 
 from benchmarks import report
 from flytrack_env.state import ACTION_SIZE
-from flytrack_sysid import collect, fit, held_out_rows, validate
+from flytrack_sysid import collect, fit
 from flytrack_sysid.log import FlightLog
 from flytrack_sysid.parameters import TAUS, THRUST_COEFFS
 from flytrack_sysid.sensors import measure
@@ -93,8 +92,8 @@ class Outcome(NamedTuple):
     seconds: float
 
 
-def identify(log: FlightLog, truth: Truth) -> tuple[Outcome, object]:
-    """Return how a fit compares with the truth, and its model."""
+def identify(log: FlightLog, truth: Truth) -> Outcome:
+    """Return how a fit compares with the truth."""
     started = time.process_time()
     found = fit(log)
     seconds = time.process_time() - started
@@ -106,13 +105,12 @@ def identify(log: FlightLog, truth: Truth) -> tuple[Outcome, object]:
         found.intervals[name].low <= value <= found.intervals[name].high for name, value in truths.items()
     ]
     tau_error = np.abs(np.asarray(values.tau) / truth.tau - 1.0).max()
-    return Outcome(tau_error, map_error / (box @ truth.coeffs).max(), np.array(covers), seconds), found.model
+    return Outcome(tau_error, map_error / (box @ truth.coeffs).max(), np.array(covers), seconds)
 
 
-def run(num_plants: int, seed: int) -> tuple[dict[str, list[Outcome]], dict[str, float]]:
-    """Return outcomes by kind of log, and the largest one-step NRMSE of any clean log by channel."""
+def run(num_plants: int, seed: int) -> dict[str, list[Outcome]]:
+    """Return outcomes by kind of log."""
     outcomes: dict[str, list[Outcome]] = {name: [] for name in AIMS}
-    one_step: dict[str, float] = {}
     for number in report.progress(range(num_plants), "plants"):
         rng = np.random.default_rng([seed, number])
         truth = draw_truth(rng)
@@ -121,16 +119,11 @@ def run(num_plants: int, seed: int) -> tuple[dict[str, list[Outcome]], dict[str,
         without = (), ("f",), ("f", "w", "p")
         logs = dict(zip(AIMS, (clean, *(sensors.without(*names) for names in without)), strict=True))
         for name, log in logs.items():
-            outcome, model = identify(log, truth)
-            outcomes[name].append(outcome)
-            if name == "clean":
-                errors = validate(model, log, held_out_rows(log)).one_step.channels
-                for channel, error in errors.items():
-                    one_step[channel] = max(one_step.get(channel, 0.0), error.nrmse)
-    return outcomes, one_step
+            outcomes[name].append(identify(log, truth))
+    return outcomes
 
 
-def as_page(outcomes: dict[str, list[Outcome]], one_step: dict[str, float]) -> str:
+def as_page(outcomes: dict[str, list[Outcome]]) -> str:
     """Return the results as a page in Markdown."""
     rows = []
     for name, found in outcomes.items():
@@ -141,7 +134,6 @@ def as_page(outcomes: dict[str, list[Outcome]], one_step: dict[str, float]) -> s
         cells = [f"{tau.max():.4%}", f"{AIMS[name][0]:.2%}", f"{np.median(tau):.4%}"]
         cells += [f"{thrust.max():.4%}", f"{AIMS[name][1]:.2%}", f"{np.median(thrust):.4%}"]
         rows.append((name, *cells, cover, times))
-    errors = ", ".join(f"{channel} {error:.1e}" for channel, error in one_step.items())
     return report.page(
         "Identification of plants drawn at run time",
         f"{report.command_line()}: two minutes of each plant, three quarters of it fitted, on one core.\n"
@@ -151,21 +143,19 @@ def as_page(outcomes: dict[str, list[Outcome]], one_step: dict[str, float]) -> s
         "Intervals are of the four lags and six coefficients of every plant; the aim is "
         f"{COVERAGE_AIM[0]:.0%} to {COVERAGE_AIM[1]:.0%}. Clean logs\ncontain only rounding, which intervals "
         "of noise do not describe. The largest times include compiling for logs\nof another length.",
-        "Clean logs, held-out part: the largest one-step error of any plant, over the change in a step "
-        f"(p, v, q) or\nthe channel's spread (w, a): {errors}. That is float32 rounding.",
         report.provenance_line(report.provenance()),
     )
 
 
 def main() -> None:
     """Measure and write the page."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--plants", type=int, default=50, help="number of plants")
     parser.add_argument("--seed", type=int, default=0, help="of the plants and logs")
     parser.add_argument("--page", type=Path, default=PAGE, help="page to write")
     arguments = parser.parse_args()
     report.pin_to_one_core()
-    report.write_page(arguments.page, as_page(*run(arguments.plants, arguments.seed)))
+    report.write_page(arguments.page, as_page(run(arguments.plants, arguments.seed)))
 
 
 if __name__ == "__main__":

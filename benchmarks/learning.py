@@ -8,6 +8,7 @@ how far from the frames does the policy stay on a plant that it never saw? Write
 import argparse
 import time
 from pathlib import Path
+from typing import Any
 
 import jax
 
@@ -42,7 +43,7 @@ def margin_of(env: EpisodicEnvironment, checkpoint: Checkpoint, keys: jax.Array)
     return margin
 
 
-def measure_seed(seed: int, black_box: Path, out: Path, config: Config) -> tuple[float, list[str]]:
+def measure_seed(seed: int, black_box: Path, out: Path, config: Config) -> tuple[float, list[Any]]:
     """Return the success of one training seed, and its row of the table."""
     started = time.process_time()
     checkpoint, _ = train_policy(out / f"seed{seed}", config, seed, model=out / "model.json")
@@ -50,18 +51,9 @@ def measure_seed(seed: int, black_box: Path, out: Path, config: Config) -> tuple
     env = plant_env(checkpoint, blackbox.load(black_box))
     keys = start_keys(seed, NUM_EPISODES)
     result = score(race_many(env, checkpoint.network, checkpoint.params, keys, NUM_STEPS, NUM_LAPS))
-    times = (f"{result.first_lap_s:.3f}", f"{result.flying_lap_s:.3f}")
-    margin, wall_s = f"{margin_of(env, checkpoint, keys):.2f}", f"{checkpoint.meta['seconds']:.0f}"
-    row = [
-        str(seed),
-        f"{result.success:.1%}",
-        margin,
-        f"{result.gates:.2f}",
-        *times,
-        f"{cpu_seconds:.0f}",
-        wall_s,
-    ]
-    return result.success, row
+    margin, wall_s = margin_of(env, checkpoint, keys), checkpoint.meta["seconds"]
+    row = [seed, f"{result.success:.1%}", f"{margin:.2f}", f"{result.gates:.2f}", f"{result.first_lap_s:.3f}"]
+    return result.success, [*row, f"{result.flying_lap_s:.3f}", f"{cpu_seconds:.0f}", f"{wall_s:.0f}"]
 
 
 def main() -> None:
@@ -85,11 +77,9 @@ def main() -> None:
     reached = sum(success >= TARGET_SUCCESS for success, _ in results)
     text = report.page(
         "Learning: from black box to race",
-        f"{report.command_line()}. CPU seconds include compilation. {NUM_EPISODES} noisy starts, "
-        f"{NUM_LAPS} laps; "
-        f"training seeds with at least {TARGET_SUCCESS:.0%}: **{reached} of {len(results)}**. Margin: "
-        "by how much "
-        f"thicker, to every side, the drone could be for {TARGET_SUCCESS:.0%} still to finish "
+        f"{report.command_line()}. CPU seconds include compilation. {NUM_EPISODES} noisy starts, {NUM_LAPS} "
+        f"laps; training seeds with at least {TARGET_SUCCESS:.0%}: **{reached} of {len(results)}**. Margin: "
+        f"by how much thicker, to every side, the drone could be for {TARGET_SUCCESS:.0%} still to finish "
         f"({', '.join(f'{thicker:g}' for thicker in THICKER_M)} m were tried).",
         report.table(HEADER, [row for _, row in results]),
         report.provenance_line(report.provenance()),

@@ -12,13 +12,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from matplotlib.figure import Figure
-from tqdm import tqdm
 
 from baselines.purejaxrl_ppo import Config
 from baselines.purejaxrl_ppo.density import draw_position_density
 from baselines.purejaxrl_ppo.flights import fly_many
 from baselines.purejaxrl_ppo.training import Trainer
-from benchmarks.report import RESULTS, ROOT, pin_to_one_core
+from benchmarks.report import RESULTS, ROOT, pin_to_one_core, progress
 from flytrack_env.files import write_atomically
 from flytrack_env.pictures.drawing import png_of
 
@@ -44,7 +43,7 @@ def train(trainer: Trainer, seed: int, folder: Path | None) -> dict[str, np.ndar
     config, rows = trainer.config, []
     stages = {round(steps / config.batch_size): steps for steps in STAGES_STEPS}
     runner = trainer.start(jax.random.key(seed))
-    for update in tqdm(range(1, config.num_updates + 1), desc=f"seed {seed}"):
+    for update in progress(range(1, config.num_updates + 1), f"updates of seed {seed}"):
         runner, metrics = trainer.chunk(runner, jnp.int32(1))
         rows.append({name: float(values[0]) for name, values in metrics.items()})
         if folder is not None and update in stages:

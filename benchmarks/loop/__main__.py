@@ -28,23 +28,19 @@ def run_all(arguments: argparse.Namespace) -> list[dict[str, Any]]:
     for core in cores:
         free_cores.put(core)
     plants = ["shipped", *map(str, range(arguments.plants))]
-    results = []
-    with (
-        ProcessPoolExecutor(len(cores), context, initializer=pin, initargs=(free_cores,)) as pool,
-        tqdm(total=len(SHARED) + len(plants), unit="job") as bar,
-    ):
+    results: dict[str, dict[str, Any]] = {}
+    with ProcessPoolExecutor(len(cores), context, initializer=pin, initargs=(free_cores,)) as pool:
         for jobs in (list(SHARED), plants):  # every plant needs both shared policies
             rest = arguments.out.resolve(), arguments.steps, arguments.seed
             running = {job: pool.submit(run_job, job, *rest) for job in jobs}
-            for job, future in running.items():
+            for job, future in tqdm(running.items(), unit="job"):
                 try:
-                    results.append(future.result())
+                    results[job] = future.result()
                 except Exception as error:
                     tqdm.write(f"{job}: failed, see {arguments.out / job / LOG}: {error}")
                     if job in SHARED:
                         raise SystemExit(1) from None
-                bar.update()
-    return [result for result in results if result["job"] not in SHARED]
+    return [result for job, result in results.items() if job not in SHARED]
 
 
 def main() -> None:

@@ -38,12 +38,6 @@ def gap_percent(one: dict[str, Any]) -> float:
     return math.inf if gap is None else abs(gap)
 
 
-def lap_s(one: dict[str, Any]) -> float:
-    """Return a stage's flying lap on the plant, s; infinite where there was none."""
-    value = one["plant"]["flying_lap_s"]
-    return math.inf if value is None else value
-
-
 def does_matter(result: dict[str, Any]) -> bool:
     """Return whether the hidden effects spoil the race of the minimal model's policy."""
     before = stage(result, "before")
@@ -105,23 +99,21 @@ def verdict(results: list[dict[str, Any]]) -> tuple[str, bool]:
         f"{AIM_GAP_PERCENT:g} % (aim: 9 of 10)"
     )
     text += f"; not on {', '.join(lost)}." if lost else "."
-    return text + summary_of_all(results), len(reached) >= AIM_SHARE * len(matter)
+    return text + (summary_of_all(results) if results else ""), len(reached) >= AIM_SHARE * len(matter)
 
 
 def summary_of_all(results: list[dict[str, Any]]) -> str:
     """Return a sentence on all plants, whether the hidden effects matter or not."""
-    if not results:
-        return ""
     pairs = [(stage(result, "before"), stage(result, "after")) for result in results]
     lowest = min(after["plant"]["success"] for _, after in pairs)
     widest = max(gap_percent(after) for _, after in pairs)
-    shares = [lap_s(after) / lap_s(before) for before, after in pairs if math.isfinite(lap_s(before))]
+    laps = [tuple(one["plant"]["flying_lap_s"] for one in pair) for pair in pairs]
+    shorter = [100.0 * (1.0 - after / before) for before, after in laps if before and after]
     text = f" On all {len(results)}: at least {lowest:.1%} and a lap gap of at most {widest:.2f} %"
-    if shares:
+    if shorter:
         text += (
-            f"; where both fly laps, its flying lap is {100.0 * (1.0 - median(shares)):.1f} % shorter than "
-            f"that of the minimal model's policy (median; {100.0 * (1.0 - max(shares)):+.1f} % to "
-            f"{100.0 * (1.0 - min(shares)):+.1f} %)"
+            f"; where both fly laps, its flying lap is {median(shorter):.1f} % shorter than that of the "
+            f"minimal model's policy (median; {min(shorter):+.1f} % to {max(shorter):+.1f} %)"
         )
     return f"{text}."
 

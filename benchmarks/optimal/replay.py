@@ -10,10 +10,8 @@ import numpy as np
 from flytrack_env import EnvParams, EnvState, FlyTrack, ModelParameters
 from flytrack_env.plants import Plant
 from flytrack_env.quaternion import Vec3
-from flytrack_env.race import Race
 from flytrack_env.references import Reference
 from flytrack_env.state import POSITION, pack, unpack, unpack_action
-from flytrack_env.terminations import Causes
 from flytrack_env.tracks import Track, cross_gate
 
 
@@ -33,22 +31,14 @@ class Replay(NamedTuple):
     frames_touched: int
 
 
-class _Step(NamedTuple):
-    """Outputs of a step: packed state, causes of termination, race."""
-
-    state: jax.Array
-    causes: Causes
-    race: Race
-
-
 @cache
 def _environment(plant: Plant | None) -> tuple[FlyTrack, Any]:
     """Return the environment and its compiled step, shared by all tracks and models of one form."""
     env = FlyTrack(plant=plant)
 
-    def fly(state: EnvState, command: jax.Array, params: EnvParams) -> tuple[EnvState, _Step]:
+    def fly(state: EnvState, command: jax.Array, params: EnvParams) -> tuple[EnvState, Any]:
         after, _, causes, _ = env.transition(state, unpack_action(command), params)
-        return after, _Step(pack(env.drone(after)), causes, env.race(after))
+        return after, (pack(env.drone(after)), causes, env.race(after))
 
     return env, jax.jit(fly)
 
@@ -81,17 +71,17 @@ def replay(reference: Reference, track: Track, plant: Plant | None = None) -> Re
     for command in np.asarray(reference.commands, np.float32):
         state, outputs = step(state, command, params)
         steps.append(outputs)
-    flown = jax.tree.map(lambda *leaves: np.stack(leaves), *steps)
-    is_over = np.any(np.stack(flown.causes), axis=0)
+    packed, causes, races = jax.tree.map(lambda *leaves: np.stack(leaves), *steps)
+    is_over = np.any(np.stack(causes), axis=0)
     last = int(np.argmax(is_over)) if is_over.any() else len(steps) - 1
-    states = np.concatenate([np.asarray(first)[None], flown.state[: last + 1]])
+    states = np.concatenate([np.asarray(first)[None], packed[: last + 1]])
     drift = np.linalg.norm(states[:, POSITION] - reference.states[: last + 2, POSITION], axis=1)
-    race = jax.tree.map(lambda leaf: leaf[last], flown.race)
+    race = jax.tree.map(lambda leaf: leaf[last], races)
     return Replay(
         states=states,
         gates_passed=int(race.gates_passed),
         time_s=float(race.lap_time_s) if int(race.laps) else float("nan"),
-        ended_by=tuple(name for name, cause in flown.causes._asdict().items() if cause[last]),
+        ended_by=tuple(name for name, cause in causes._asdict().items() if cause[last]),
         drift_m=float(drift.max()),
         frames_touched=_frames_touched(states[:, POSITION], params),
     )
