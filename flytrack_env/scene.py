@@ -29,7 +29,6 @@ FRONT_ROTOR: Colour = (255, 70, 70)
 REAR_ROTOR: Colour = (225, 230, 238)
 CAMERA: Colour = (80, 200, 255)
 TEXT: Colour = (235, 239, 245)
-FAINT_TEXT: Colour = (150, 160, 175)
 FLIGHT_COLOURS: tuple[Colour, ...] = (
     (120, 220, 120),
     (90, 160, 255),

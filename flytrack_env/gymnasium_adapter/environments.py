@@ -19,12 +19,6 @@ SEED_WORDS = 4
 MOST_STEPS = 2**32  # that a uint32 can count
 
 
-def as_float32(actions: Any) -> np.ndarray:
-    """Return actions as an array of float32; what is beyond it is infinite, and clipped as such."""
-    with np.errstate(over="ignore"):
-        return np.asarray(actions, np.float32)
-
-
 class _Adapter:
     """What the single and the vector environment share: a simulation, its spaces and its pictures."""
 
@@ -69,7 +63,8 @@ class _Adapter:
         """Return actions as float32, once an episode has begun and if they have that shape."""
         if state is None:
             raise gymnasium.error.ResetNeeded("step: found no episode, expected a reset before it")
-        actions = as_float32(actions)
+        with np.errstate(over="ignore"):  # what is beyond float32 is infinite, and clipped as such
+            actions = np.asarray(actions, np.float32)
         if actions.shape != shape:
             raise ValueError(f"{name}: found shape {actions.shape}, expected {shape}")
         return actions

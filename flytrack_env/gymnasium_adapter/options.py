@@ -70,50 +70,43 @@ def read_start(options: Mapping[str, Any], course: Course) -> Start:
     """
     battery_v = None
     if BATTERY_V in options:
-        battery_v = _number(options, BATTERY_V)
+        battery_v = float(_numbers(options, BATTERY_V, 0))
         if not BATTERY_EMPTY_V < battery_v <= BATTERY_FULL_V:
             expected = f"above {BATTERY_EMPTY_V:g} and up to {BATTERY_FULL_V:g} V"
             raise _error(BATTERY_V, options, expected)
     if not any(name in options for name in POSE_NAMES):
         return Start(None, 0, battery_v)
     drone = np.zeros(STATE_SIZE, np.float32)
-    drone[POSITION] = _position(options, course)
-    drone[QUATERNION] = _quaternion(options, course)
-    if "velocity" in options:
-        drone[VELOCITY] = _velocity(options)
+    drone[POSITION], drone[QUATERNION], drone[VELOCITY] = _pose(options, course)
     drone[APPLIED_ACTION] = STILL_ROTORS
     drone[BATTERY] = BATTERY_FULL_V
     return Start(drone, _gate_index(options, course.num_gates), battery_v)
 
 
-def _position(options: Mapping[str, Any], course: Course) -> np.ndarray:
-    if "position" not in options:
-        return np.array(course.start_pos_w)
-    position = _numbers(options, "position", 3)
-    low, high = np.array(course.bounds_low), np.array(course.bounds_high)
-    if not ((position >= low) & (position <= high)).all():
-        raise _error("position", options, f"within the bounds, {low.tolist()} to {high.tolist()} m")
-    return position
-
-
-def _velocity(options: Mapping[str, Any]) -> np.ndarray:
-    velocity = _numbers(options, "velocity", 3)
-    if not (abs(velocity) <= LARGEST_SPEED).all():
-        raise _error("velocity", options, f"at most {LARGEST_SPEED:g} m/s along every axis")
-    return velocity
-
-
-def _quaternion(options: Mapping[str, Any], course: Course) -> np.ndarray:
+def _pose(options: Mapping[str, Any], course: Course) -> tuple[Any, Any, Any]:
+    """Return position, quaternion and velocity."""
+    position: Any = course.start_pos_w
+    quaternion: Any = course.start_quat
+    velocity: Any = np.zeros(3)
+    if "position" in options:
+        position = _numbers(options, "position", 3)
+        low, high = np.array(course.bounds_low), np.array(course.bounds_high)
+        if not ((position >= low) & (position <= high)).all():
+            raise _error("position", options, f"within the bounds, {low.tolist()} to {high.tolist()} m")
     if "yaw_deg" in options:
-        half = 0.5 * math.radians(_number(options, "yaw_deg"))
-        return np.array([math.cos(half), 0.0, 0.0, math.sin(half)])
-    if "quaternion" not in options:
-        return np.array(course.start_quat)
-    quaternion = _numbers(options, "quaternion", 4)
-    norm = np.linalg.norm(quaternion)
-    if abs(norm - 1.0) > UNIT_NORM_TOLERANCE:
-        raise _error("quaternion", options, f"norm 1 within {UNIT_NORM_TOLERANCE:g}")
-    return quaternion / norm
+        half = 0.5 * math.radians(_numbers(options, "yaw_deg", 0))
+        quaternion = (math.cos(half), 0.0, 0.0, math.sin(half))
+    elif "quaternion" in options:
+        quaternion = _numbers(options, "quaternion", 4)
+        norm = np.linalg.norm(quaternion)
+        if abs(norm - 1.0) > UNIT_NORM_TOLERANCE:
+            raise _error("quaternion", options, f"norm 1 within {UNIT_NORM_TOLERANCE:g}")
+        quaternion = quaternion / norm
+    if "velocity" in options:
+        velocity = _numbers(options, "velocity", 3)
+        if not (abs(velocity) <= LARGEST_SPEED).all():
+            raise _error("velocity", options, f"at most {LARGEST_SPEED:g} m/s along every axis")
+    return position, quaternion, velocity
 
 
 def _gate_index(options: Mapping[str, Any], num_gates: int) -> int:
@@ -122,10 +115,6 @@ def _gate_index(options: Mapping[str, Any], num_gates: int) -> int:
     if not is_integer or not 0 <= index < num_gates:
         raise _error("gate_index", options, f"an integer from 0 to {num_gates - 1}")
     return int(index)
-
-
-def _number(options: Mapping[str, Any], name: str) -> float:
-    return float(_numbers(options, name, 0))
 
 
 def _numbers(options: Mapping[str, Any], name: str, size: int) -> np.ndarray:

@@ -28,10 +28,6 @@ def draw_key(generator: np.random.Generator, shape: tuple[int, ...] = ()) -> np.
     return generator.integers(0, 2**32, (*shape, KEY_WORDS), np.uint32)
 
 
-def _key(words: jax.Array) -> jax.Array:
-    return jax.random.wrap_key_data(words, impl="threefry2x32")
-
-
 def _grouped(reward: jax.Array, terminated: jax.Array, truncated: jax.Array, info: dict[str, Any]) -> Any:
     """Return what a vector environment gives of one environment's step, as ``SyncVectorEnv`` groups it.
 
@@ -72,35 +68,35 @@ class Programs:
     def _scene(self, state: Any) -> jax.Array:
         return scene_row(self.env.drone(state), self.env.race(state))
 
-    def _reset(self, words: jax.Array, params: Packed) -> tuple[Any, jax.Array, jax.Array]:
-        observation, state = self.env.reset(_key(words), self.params_layout.unpack(params))
-        return state, observation, self._scene(state)
-
-    def _begin(
-        self, words: jax.Array, drone: jax.Array, gate_index: Any, params: Packed
-    ) -> tuple[Any, jax.Array, jax.Array]:
-        unpacked = self.params_layout.unpack(params)
-        state = self.env.begin(unpack(drone), gate_index, unpacked, seed_of(_key(words)))
-        return state, self.env.observe(None, state, None, unpacked), self._scene(state)
-
     @partial(jax.jit, static_argnums=0)
     def pack_params(self, params: EnvParams) -> Packed:
         """Return the parameters as the other functions take them."""
         return self.params_layout.pack(params)
 
     @partial(jax.jit, static_argnums=0)
-    def reset(self, words: jax.Array, params: Packed) -> tuple[Packed, jax.Array, jax.Array]:
-        """Return state, observation and scene of an episode that begins as drawn from a key's words."""
-        state, observation, scene = self._reset(words, params)
-        return self.state_layout.pack(state), observation, scene
-
-    @partial(jax.jit, static_argnums=0)
     def begin(
-        self, words: jax.Array, drone: jax.Array, gate_index: Any, params: Packed
+        self, words: jax.Array, start: tuple[Any, ...], params: Packed
     ) -> tuple[Packed, jax.Array, jax.Array]:
-        """Return the same of an episode that begins with a drone (21,) and a gate to fly first."""
-        state, observation, scene = self._begin(words, drone, gate_index, params)
-        return self.state_layout.pack(state), observation, scene
+        """Return state, observation and scene of an episode that begins, or of a batch of them.
+
+        words: of a key, (KEY_WORDS,), or (num_envs, KEY_WORDS) for a batch. start: the drone (21,) and the
+        index of the gate to fly first, of each; empty: drawn.
+        """
+        unpacked = self.params_layout.unpack(params)
+
+        def begin_one(words: jax.Array, *start: Any) -> tuple[Any, jax.Array, jax.Array]:
+            key = jax.random.wrap_key_data(words, impl="threefry2x32")
+            if start:
+                state = self.env.begin(unpack(start[0]), start[1], unpacked, seed_of(key))
+                observation = self.env.observe(None, state, None, unpacked)
+            else:
+                observation, state = self.env.reset(key, unpacked)
+            return state, observation, self._scene(state)
+
+        is_batch = words.ndim > 1
+        states, observations, scenes = (jax.vmap(begin_one) if is_batch else begin_one)(words, *start)
+        pack = self.state_layout.pack_batch if is_batch else self.state_layout.pack
+        return pack(states), observations, scenes
 
     @partial(jax.jit, static_argnums=0)
     def step(self, state: Packed, action: jax.Array, params: Packed) -> tuple[Any, ...]:
@@ -110,21 +106,6 @@ class Programs:
         )
         blocks = self.columns.gather(outcome)
         return self.state_layout.pack(new_state), observation, self._scene(new_state), blocks
-
-    @partial(jax.jit, static_argnums=0)
-    def reset_batch(self, words: jax.Array, params: Packed) -> tuple[Packed, jax.Array, jax.Array]:
-        """Return states, observations and scenes of a batch; words: (num_envs, KEY_WORDS)."""
-        states, observations, scenes = jax.vmap(self._reset, in_axes=(0, None))(words, params)
-        return self.state_layout.pack_batch(states), observations, scenes
-
-    @partial(jax.jit, static_argnums=0)
-    def begin_batch(
-        self, words: jax.Array, drones: jax.Array, gate_indices: jax.Array, params: Packed
-    ) -> tuple[Packed, jax.Array, jax.Array]:
-        """Return the same of episodes that begin with drones (num_envs, 21) and gates (num_envs,)."""
-        begin_all = jax.vmap(self._begin, in_axes=(0, 0, 0, None))
-        states, observations, scenes = begin_all(words, drones, gate_indices, params)
-        return self.state_layout.pack_batch(states), observations, scenes
 
     @partial(jax.jit, static_argnums=(0, 6))
     def step_batch(
@@ -141,7 +122,7 @@ class Programs:
         The auto-resetting step of a batch. words: of one key for all; count: makes it this step's own.
         scenes: (num_envs, SCENE_SIZE) after the auto-reset if they are asked for, else None.
         """
-        key = jax.random.fold_in(_key(words), count)
+        key = jax.random.fold_in(jax.random.wrap_key_data(words, impl="threefry2x32"), count)
         observations, new_states, rewards, terminated, truncated, info = self.env.step_batch(
             key, self.state_layout.unpack_batch(states), actions, self.params_layout.unpack(params)
         )
@@ -154,35 +135,35 @@ class Programs:
         return packed, observations, final_observations, scenes, blocks
 
 
+# By id, missed gates, plant and layout of the parameters: all that a compiled function depends on.
+_PROGRAMS: dict[Any, Programs] = {}
+MOST_PROGRAMS = 16
+
+
 class Simulation:
     """An environment of an id with its parameters. Never changes; copies share what is compiled.
 
-    env_id, overrides: what ``flytrack_env.make`` takes. params: replace the defaults if not None. shared: the
-    environment of another simulation of these, with what it has compiled.
+    env_id, overrides: what ``flytrack_env.make`` takes. params: replace the defaults if not None.
 
     Raises:
         ValueError: what ``flytrack_env.make`` and ``check_params`` refuse, and leaves of another shape.
         TypeError: params of another type.
     """
 
-    def __init__(
-        self,
-        env_id: str,
-        params: EnvParams | None,
-        overrides: dict[str, Any],
-        shared: "Shared | None" = None,
-    ):
+    def __init__(self, env_id: str, params: EnvParams | None, overrides: dict[str, Any]):
         self.env_id, self.overrides = env_id, overrides
-        self._shared = _find_shared(env_id, overrides) if shared is None else shared
-        self.env, programs = self._shared
+        self.env = make(env_id, **overrides)
         self.params = self.env.default_params if params is None else params
         _check_shapes(self.params, self.env.default_params)
         self.env.check_params(self.params)
-        layout = Layout.of(self.params)
-        if layout not in programs:
+        plant = overrides.get("plant")
+        key = env_id, overrides.get("missed_gate"), plant and id(plant), Layout.of(self.params)
+        if key not in _PROGRAMS:
+            if len(_PROGRAMS) == MOST_PROGRAMS:
+                del _PROGRAMS[next(iter(_PROGRAMS))]
             _, state = jax.eval_shape(self.env.reset, jax.random.key(0), self.params)
-            programs[layout] = Programs(self.env, self.params, state)
-        self.programs = programs[layout]
+            _PROGRAMS[key] = Programs(self.env, self.params, state)  # keeps the plant, and so its id
+        self.programs = _PROGRAMS[key]
         self.packed_params = self.programs.pack_params(self.params)
 
     def with_track(self, track: str | Path | Track) -> "Simulation":
@@ -192,26 +173,26 @@ class Simulation:
             TrackError: a track that cannot be read.
         """
         course = build_course(track if isinstance(track, Track) else load_track(track))
-        return Simulation(self.env_id, self.params.replace(course=course), self.overrides, self._shared)
+        return Simulation(self.env_id, self.params.replace(course=course), self.overrides)
 
     def begin(self, words: np.ndarray, start: Start) -> tuple[Packed, jax.Array, jax.Array]:
         """Return packed state, observation and scene of an episode that begins.
 
         words: of a key, (KEY_WORDS,); or (num_envs, KEY_WORDS) for the same of a batch.
         """
-        programs, params, batch = self.programs, self.packed_params, words.shape[:-1]
+        batch = words.shape[:-1]
         if start.drone is None:
-            begun = (programs.reset_batch if batch else programs.reset)(words, params)
+            begun = self.programs.begin(words, (), self.packed_params)
             if start.battery_v is None:
                 return begun
             scenes = np.array(begun[2])
             drones, gate_indices = scenes[..., :STATE_SIZE], scenes[..., GATE_INDEX].astype(np.int32)
         else:
-            drones = np.tile(start.drone, (*batch, 1)) if batch else start.drone.copy()
+            drones = np.tile(start.drone, (*batch, 1))
             gate_indices = np.full(batch, start.gate_index, np.int32)
         if start.battery_v is not None:
             drones[..., BATTERY] = start.battery_v
-        return (programs.begin_batch if batch else programs.begin)(words, drones, gate_indices, params)
+        return self.programs.begin(words, (drones, gate_indices), self.packed_params)
 
     def __deepcopy__(self, memo: dict[int, Any]) -> "Simulation":
         return self
@@ -232,41 +213,3 @@ def _check_shapes(params: EnvParams, default: EnvParams) -> None:
         if np.shape(leaf) != np.shape(expected):
             name = f"params{jax.tree_util.keystr(path)}"
             raise ValueError(f"{name}: found shape {np.shape(leaf)}, expected {np.shape(expected)}")
-
-
-Shared = tuple[EpisodicEnvironment, dict[Layout, Programs]]
-# Environments by what they were made with: the second one of a kind needs no compilation.
-_SHARED: dict[Any, Shared] = {}
-MOST_SHARED = 16
-
-
-def _identity(value: Any) -> Any:
-    """Return something hashable that changes where an argument, a number in it or the file it names does.
-
-    Where there is no such thing, what is returned cannot be hashed.
-    """
-    if isinstance(value, (str, Path)) and Path(value).is_file():
-        status = Path(value).stat()
-        return str(Path(value).resolve()), status.st_mtime_ns, status.st_size
-    leaves, structure = jax.tree.flatten(value)
-    arrays = (isinstance(leaf, (np.ndarray, jax.Array)) for leaf in leaves)
-    known = (
-        (np.shape(leaf), leaf.dtype, np.asarray(leaf).tobytes()) if is_array else (type(leaf), leaf)
-        for leaf, is_array in zip(leaves, arrays, strict=True)
-    )
-    return structure, tuple(known)
-
-
-def _find_shared(env_id: str, overrides: dict[str, Any]) -> Shared:
-    """Return an environment and its programs by their parameters' layout."""
-    try:
-        key = (env_id, frozenset((name, _identity(value)) for name, value in overrides.items()))
-        hash(key)
-    except TypeError:  # a plant that compares its arrays, say
-        return make(env_id, **overrides), {}
-    if key not in _SHARED:
-        env = make(env_id, **overrides)
-        if len(_SHARED) == MOST_SHARED:
-            del _SHARED[next(iter(_SHARED))]
-        _SHARED[key] = env, {}
-    return _SHARED[key]

@@ -14,7 +14,6 @@ from flytrack_env.extras import check_installed
 from flytrack_env.files import write_atomically
 from flytrack_env.pictures.flight import Flight, Meeting, make_flight, read_flights
 from flytrack_env.references import Reference
-from flytrack_env.tracks import build_course
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -95,8 +94,7 @@ def write_animation(flight: Flight, reference: Reference, folder: str | Path) ->
         ValueError: a flight without a complete flying lap.
         OSError: the file cannot be written; nothing half-written is left.
     """
-    laps = _load("pictures.video", "render", "moviepy").laps_to_compare(flight, reference)
-    make_gif = _load("rendering.animation", "render", "PIL").make_gif
     path = Path(folder) / f"{flight.name}.gif"
-    write_atomically(path, make_gif(build_course(flight.track), laps))
+    make_gif = _load("pictures.animation", "render", "moviepy").make_gif
+    write_atomically(path, make_gif(flight, reference))
     return path

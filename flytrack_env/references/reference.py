@@ -16,18 +16,17 @@ import numpy as np
 from flytrack_env.dynamics import ModelParameters
 from flytrack_env.effects import BY_NAME
 from flytrack_env.files import write_atomically
-from flytrack_env.messages import error_text, quote_value
+from flytrack_env.messages import error_text, quote_name, quote_value
 from flytrack_env.model_file import SIZES, model_as_json, model_from_json
-from flytrack_env.npz_file import NpzError, load_npz
+from flytrack_env.npz_file import load_npz
 from flytrack_env.state import ACTION_SIZE, STATE_SIZE
 from flytrack_env.tracks import Track
 
 FOLDER = Path(__file__).parent
 KINDS = ("flying", "standing")
 FILE_VERSION = 1
-ARRAYS = ("states", "commands", "gate_times_s")
 TEXTS = ("track", "track_sha256", "kind", "model_name", "model_sha256")
-NOTES = ("version", *TEXTS, "model", "dt_s", "time_s", "found")
+COPIED = ("track", "track_sha256", "kind", "model_name", "dt_s", "time_s", "found")
 LARGEST_BYTES = 16 * 2**20  # in the file, and unpacked: hours of flight
 LONGEST_S = 3600.0  # of a lap, or of one step
 BEYOND = 1e-6  # of a command beyond full stick: the solver's tolerance
@@ -112,10 +111,9 @@ def save_reference(path: str | Path, reference: Reference) -> None:
     Raises:
         OSError: the file cannot be written.
     """
-    copied = ("track", "track_sha256", "kind", "model_name", "dt_s", "time_s", "found")
     notes = {
         "version": FILE_VERSION,
-        **{name: getattr(reference, name) for name in copied},
+        **{name: getattr(reference, name) for name in COPIED},
         "model_sha256": model_digest(reference.model),
         "model": model_as_json(reference.model),
     }
@@ -131,75 +129,50 @@ def save_reference(path: str | Path, reference: Reference) -> None:
     write_atomically(Path(path), content.getvalue())
 
 
-def _check_arrays(path: Path, data: dict[str, np.ndarray]) -> None:
-    """Raise ReferenceFileError for wrong shapes, numbers that are not finite, or commands beyond [-1, 1]."""
-    num_steps = len(data["commands"]) if data["commands"].ndim else 0
-    shapes = {"states": (num_steps + 1, STATE_SIZE), "commands": (num_steps, ACTION_SIZE)}
+def _check_arrays(data: dict[str, np.ndarray]) -> None:
+    """Raise ValueError for wrong shapes, numbers that are not finite, or commands beyond [-1, 1]."""
+    num_steps = data["commands"].shape[:1]
+    shapes = {
+        "states": (*(size + 1 for size in num_steps), STATE_SIZE),
+        "commands": (*num_steps, ACTION_SIZE),
+        "gate_times_s": data["gate_times_s"].shape[:1],
+    }
     for name, shape in shapes.items():
-        if data[name].shape != shape or num_steps == 0:
-            raise ReferenceFileError(f"{path}: {name}: found shape {data[name].shape}, expected {shape}")
-    for name in ARRAYS:
-        if data[name].dtype.kind != "f" or not np.isfinite(data[name]).all():
-            raise ReferenceFileError(f"{path}: {name}: found something else, expected finite numbers")
-    times_s = data["gate_times_s"]
-    if times_s.ndim != 1 or times_s.size == 0 or (np.diff(times_s, prepend=0.0) < 0.0).any():
-        found = f"{times_s.shape}, {quote_value(times_s.tolist())}"
-        raise ReferenceFileError(f"{path}: gate_times_s: found {found}, expected a row of growing times, s")
+        array = data[name]
+        if array.shape != shape or array.size == 0:
+            raise ValueError(f"{name}: found shape {array.shape}, expected {shape}")
+        if array.dtype.kind != "f" or not np.isfinite(array).all():
+            raise ValueError(f"{name}: found something else, expected finite numbers")
+    if (np.diff(data["gate_times_s"], prepend=0.0) < 0.0).any():
+        raise ValueError(
+            f"gate_times_s: found {quote_value(data['gate_times_s'])}, expected growing times, s"
+        )
     most = np.abs(data["commands"]).max()
     if most > 1.0 + BEYOND:
-        raise ReferenceFileError(f"{path}: commands: found {most:.7g}, expected within [-1, 1]")
+        raise ValueError(f"commands: found {most:.7g}, expected within [-1, 1]")
 
 
-def _read(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-    """Return the arrays and the notes of a reference file; raises ReferenceFileError."""
-    try:
-        data = load_npz(path, LARGEST_BYTES)
-        missing = [name for name in (*ARRAYS, "notes") if name not in data]
-        if missing:
-            raise NpzError(f"{', '.join(missing)}: missing")
-        notes = json.loads(str(data.pop("notes")))
-    except (OSError, ValueError, RecursionError) as error:  # ValueError: NpzError, no text, no JSON
-        raise ReferenceFileError(
-            f"{path}: cannot be read: {error_text(error)}; expected a reference file"
-        ) from error
-    missing = [name for name in NOTES if not isinstance(notes, dict) or name not in notes]
-    if missing:
-        raise ReferenceFileError(f"{path}: notes: {', '.join(missing)}: missing")
-    if notes["version"] != FILE_VERSION:
-        found = quote_value(notes["version"])
-        raise ReferenceFileError(f"{path}: version: found {found}, expected {FILE_VERSION}")
-    _check_notes(path, notes)
-    return data, notes
-
-
-def _check_notes(path: Path, notes: dict[str, Any]) -> None:
-    """Raise ReferenceFileError for notes of wrong types, times that are not positive, or an unknown kind."""
-    kinds = {**dict.fromkeys(TEXTS, (str, "a text")), "found": (dict, "an object")}
-    for name, (kind, expected) in kinds.items():
-        if not isinstance(notes[name], kind):
-            raise ReferenceFileError(f"{path}: {name}: found {quote_value(notes[name])}, expected {expected}")
+def _check_notes(notes: dict[str, Any]) -> None:
+    """Raise ValueError for notes of wrong types, times that are not positive, or an unknown kind."""
+    types = {**dict.fromkeys(TEXTS, str), "found": dict, "dt_s": float, "time_s": float}
+    for name, expected in types.items():
+        if not isinstance(notes[name], expected):
+            raise ValueError(f"{name}: found {quote_value(notes[name])}, expected a {expected.__name__}")
     for name in ("dt_s", "time_s"):
-        found, value = quote_value(notes[name]), notes[name]
-        if type(value) not in (int, float) or not 0.0 < value < LONGEST_S:
-            raise ReferenceFileError(f"{path}: {name}: found {found}, expected seconds above 0")
-    if notes["kind"] not in KINDS:
-        found = quote_value(notes["kind"])
-        raise ReferenceFileError(f"{path}: kind: found {found}, expected one of {', '.join(KINDS)}")
+        if not 0.0 < notes[name] < LONGEST_S:
+            raise ValueError(f"{name}: found {notes[name]}, expected seconds above 0")
+    for name, known in (("version", (FILE_VERSION,)), ("kind", KINDS)):
+        if notes[name] not in known:
+            expected = " or ".join(map(str, known))
+            raise ValueError(f"{name}: found {quote_value(notes[name])}, expected {expected}")
 
 
-def _model_of(path: Path, values: Any) -> ModelParameters:
-    """Return the model of a file's JSON values in float64; raises ReferenceFileError."""
-    try:
-        model_from_json(values, path)  # checks types and ranges
-        base: dict[str, Any] = {name: np.asarray(values["parameters"][name], float) for name in SIZES}
-        effects = values["effects"].items()
-        return ModelParameters(**base).with_effects(
-            *(BY_NAME[name].parameters(**numbers) for name, numbers in effects)
-        )
-    except (AttributeError, KeyError, TypeError, ValueError) as error:
-        raise ReferenceFileError(
-            f"{path}: model: cannot be read: {type(error).__name__}: {error_text(error)}"
-        ) from error
+def _model_of(values: Any, path: Path) -> ModelParameters:
+    """Return the model of a file's JSON values in float64; raises ValueError."""
+    model_from_json(values, path)  # checks types and ranges
+    base: dict[str, Any] = {name: np.asarray(values["parameters"][name], float) for name in SIZES}
+    effects = (BY_NAME[name].parameters(**numbers) for name, numbers in values["effects"].items())
+    return ModelParameters(**base).with_effects(*effects)
 
 
 def load_reference(path: str | Path) -> Reference:
@@ -210,21 +183,28 @@ def load_reference(path: str | Path) -> Reference:
             flight, commands beyond [-1, 1], notes of wrong types, or a model of another digest.
     """
     path = Path(path)
-    data, notes = _read(path)
-    _check_arrays(path, data)
-    model = _model_of(path, notes["model"])
-    if model_digest(model) != notes["model_sha256"]:
-        raise ReferenceFileError(f"{path}: model: found another one than its digest, expected the same")
-    fields = {name: notes[name] for name in ("track", "track_sha256", "kind", "model_name", "found")}
-    return Reference(
-        **fields,
-        model=model,
-        dt_s=float(notes["dt_s"]),
-        time_s=float(notes["time_s"]),
-        states=data["states"].astype(float),
-        commands=np.clip(data["commands"].astype(float), -1.0, 1.0),
-        gate_times_s=data["gate_times_s"].astype(float),
-    )
+    try:
+        data = load_npz(path, LARGEST_BYTES)
+        notes = json.loads(str(data.pop("notes")))
+        _check_notes(notes)
+        _check_arrays(data)
+        model = _model_of(notes["model"], path)
+        if model_digest(model) != notes["model_sha256"]:
+            raise ValueError("model: found another one than its digest, expected the same")
+        return Reference(
+            **{name: notes[name] for name in COPIED},
+            model=model,
+            states=data["states"].astype(float),
+            commands=np.clip(data["commands"].astype(float), -1.0, 1.0),
+            gate_times_s=data["gate_times_s"].astype(float),
+        )
+    except KeyError as error:
+        raise ReferenceFileError(f"{path}: {quote_name(error.args[0])}: missing") from error
+    except (AttributeError, OSError, RecursionError, TypeError, ValueError) as error:
+        # ValueError: NpzError, no JSON, a check; AttributeError and TypeError: JSON of another structure.
+        raise ReferenceFileError(
+            f"{path}: cannot be read: {error_text(error)}; expected a reference file"
+        ) from error
 
 
 def shipped_references(track: Track, model_names: tuple[str, ...]) -> References:

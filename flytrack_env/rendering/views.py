@@ -231,23 +231,17 @@ def draw_outlines(draw: ImageDraw.ImageDraw, camera: Camera, corners_c: np.ndarr
             draw.line(outline + outline[:2], colour, PIXEL)
 
 
-def draw_drone(
-    draw: ImageDraw.ImageDraw,
-    camera: Camera,
-    pos_w: np.ndarray,
-    quaternion: np.ndarray,
-    colours: tuple[Colour, Colour, Colour] = (scene.DRONE, scene.FRONT_ROTOR, scene.REAR_ROTOR),
-    enlargement: float = 1.0,
-) -> None:
-    """Draw arms, rotors and body of a drone, the far rotors first; colours: body, front, rear rotors."""
-    axes_w = enlargement * rotations(quaternion).T
+def draw_drone(draw: ImageDraw.ImageDraw, camera: Camera, pos_w: np.ndarray, quaternion: np.ndarray) -> None:
+    """Draw arms, rotors and body of a drone, the far rotors first."""
+    axes_w = rotations(quaternion).T
     motors_w = pos_w + scene.MOTORS_B @ axes_w
     for line in camera.look(pos_w + scene.ARMS_B @ axes_w):
-        draw.line(camera.polygon(line), colours[0], 4 * PIXEL)
+        draw.line(camera.polygon(line), scene.DRONE, 4 * PIXEL)
     disc_w = scene.ROTOR_M * CIRCLE @ axes_w
-    body_w = pos_w + enlargement * BODY_M * (CIRCLE @ np.stack([camera.axes[0], camera.axes[1], UP_W]))
-    parts = [(motor_w + disc_w, colours[1 + place // 2]) for place, motor_w in enumerate(motors_w)]
-    looked = [(camera.look(points_w), colour) for points_w, colour in [*parts, (body_w, colours[0])]]
+    body_w = pos_w + BODY_M * (CIRCLE @ np.stack([camera.axes[0], camera.axes[1], UP_W]))
+    colours = (scene.FRONT_ROTOR, scene.FRONT_ROTOR, scene.REAR_ROTOR, scene.REAR_ROTOR, scene.DRONE)
+    parts = zip([*(motor_w + disc_w for motor_w in motors_w), body_w], colours, strict=True)
+    looked = [(camera.look(points_w), colour) for points_w, colour in parts]
     for points_c, colour in sorted(looked, key=lambda part: -part[0][:, 2].mean()):
         rim = camera.polygon(points_c)
         if rim:

@@ -382,8 +382,9 @@ def test_arguments_of_numbers_are_compiled_once(overrides: dict[str, Any]) -> No
     for name in ("figure_eight", "flytrack"):  # of as many gates
         env.reset(options={"track": name})
         assert env._simulation.programs is programs and env._simulation.env.track.name == "flytrack"
-    heavier = nominal_parameters()._replace(m=1.1)
-    assert gymnasium.make(BASE, model=heavier).unwrapped._simulation.programs is not programs
+    heavier = gymnasium.make(BASE, model=nominal_parameters()._replace(m=1.1)).unwrapped
+    assert heavier._simulation.programs is programs and heavier._simulation.params.model.m == 1.1
+    assert gymnasium.make(BASE, missed_gate="fly_on").unwrapped._simulation.programs is not programs
 
 
 def test_actions_beyond_float32_are_clipped_without_a_warning() -> None:

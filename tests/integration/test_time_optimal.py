@@ -107,7 +107,7 @@ def rewritten(path: Path, **changes: Any) -> Path:
         ({"states": np.zeros((3, STATE_SIZE))}, r"states: found shape \(3, 21\), expected \(385, 21\)"),
         ({"commands": np.full((384, 4), np.nan)}, "commands: .*finite"),
         ({"version": 2}, "version: found 2, expected 1"),
-        ({"kind": "hovering"}, "kind: found 'hovering', expected one of flying, standing"),
+        ({"kind": "hovering"}, "kind: found 'hovering', expected flying or standing"),
         ({"model_sha256": "0"}, "model: found another"),
         ({"gate_times_s": np.array([object()])}, "cannot be read: .*nothing is unpickled"),
         ({"time_s": -1.0}, "time_s: found -1.0, expected seconds above 0"),

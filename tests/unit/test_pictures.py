@@ -185,12 +185,12 @@ def test_video_shows_the_lap_and_leaves_nothing_where_it_fails(ghost, monkeypatc
 
 def test_animation_shows_the_flying_lap_beside_the_time_optimal_one(tmp_path, ghost, monkeypatch):
     image = pytest.importorskip("PIL.Image")
-    animation = pytest.importorskip("flytrack_env.rendering.animation")
+    animation = pytest.importorskip("flytrack_env.pictures.animation")
     monkeypatch.setattr(animation, "STEPS_PER_FRAME", 60)
     path = write_animation(ghost, REFERENCES["flying"], tmp_path)
     assert path == tmp_path / "ghost.gif" and path.stat().st_size < 900 * 2**10
     with image.open(io.BytesIO(path.read_bytes())) as gif:
-        assert gif.size == (animation.WIDTH, animation.HEIGHT) and gif.n_frames == 8
+        assert gif.size == (480, 300) and gif.n_frames == 8
         gif.seek(7)
         last = np.array(gif.convert("RGB"), int)
     for colour in animation.scene.FLIGHT_COLOURS[0], animation.scene.FLIGHT_COLOURS[2]:
