@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure, SubFigure
-from matplotlib.lines import Line2D
 from matplotlib.patches import Rectangle
 
 from flytrack_env.flown_race import DRONE_RADIUS_M, STEP_S
@@ -23,7 +22,7 @@ from flytrack_env.pictures.drawing import (
     plain,
 )
 from flytrack_env.pictures.flight import PASSED, Flight, Meeting
-from flytrack_env.scene import BLUE, GREEN, GREY, ORANGE, PAPER_COLOURS, PAPER_FRAME, PAPER_OPENING, gates_of
+from flytrack_env.scene import BLUE, GREEN, ORANGE, PAPER_COLOURS, PAPER_FRAME, PAPER_OPENING, gates_of
 from flytrack_env.state import APPLIED_ACTION, BATTERY, POSITION, Action
 from flytrack_env.tracks import Gate, Track, build_course
 
@@ -39,14 +38,13 @@ WIDTHS_IN = (10.0, 24.0)
 METRE_IN, SIDE_IN = 0.05, 3.6  # width of a metre flown; height of the side view
 GATE_IN, GATES_TITLE_IN = 1.25, 0.5
 MOST_LABELLED = 3
-AROUND = 1.12  # of a gate's half frame, or of the farthest meeting
 SECOND_IN, COMMANDS_IN = 0.9, 8.0  # width of a second; height of the commands
-PANEL_HEIGHTS = (1.0, 1.0, 1.0, 1.0, 1.0, 0.7)
-MARKS = {
-    "gate": Line2D([], [], color="0.7", linewidth=0.9, label="gate passed"),
-    "lap": Line2D([], [], color=GREEN, linewidth=1.8, label="lap complete"),
-    "failure": Line2D([], [], color="black", linewidth=1.2, linestyle="--", label="gate touched or missed"),
+MARKS: dict[str, Any] = {
+    "gate passed": {"color": "0.7", "lw": 0.9},
+    "lap complete": {"color": GREEN, "lw": 1.8},
+    "not passed": {"color": "black", "ls": "--"},
 }
+AROUND = 1.12  # of a gate's half frame, or of the farthest meeting
 
 
 def draw_top(flight: Flight) -> Figure:
@@ -56,15 +54,9 @@ def draw_top(flight: Flight) -> Figure:
     lines = draw_path(axes, points, speeds[:-1], HEADROOM * max(float(speeds.max()), 1.0), 2.2)
     failures = np.reshape([one.pos_w[:2] for one in flight.meetings if one.outcome != PASSED], (-1, 2))
     axes.plot(*failures.T, "X", color="black", markersize=8, markeredgecolor="white", zorder=5)
-    marks = [("start", points[0], BLUE, "o"), (escape(flight.ended), points[-1], ORANGE, "X")]
+    marks = (("start", points[0], BLUE, "o"), (escape(flight.ended), points[-1], ORANGE, "X"))
     for text, place, colour, marker in marks:
-        style: dict[str, Any] = {
-            "color": colour,
-            "markersize": 9,
-            "markeredgecolor": "white",
-            "linestyle": "",
-        }
-        axes.plot(*place, marker=marker, label=text, zorder=6, **style)
+        axes.plot(*place, marker, color=colour, markersize=9, markeredgecolor="white", label=text, zorder=6)
     figure.legend(loc="outside lower center", ncols=2, frameon=False)
     axes.set_title(escape(f"{flight.title}\n{flight.laps_text}"), fontsize="medium")
     figure.colorbar(lines, ax=axes, label="speed (m/s)", shrink=0.8)
@@ -212,55 +204,29 @@ def _draw_front(panel: Axes, gate: Gate, meetings: list[Meeting], top: float) ->
 
 
 def draw_commands(flight: Flight) -> Figure:
-    """Return four sticks, commanded against applied, speed and battery; gates passed and laps as marks."""
-    times = flight.times_s
-    # The last step, after the last state, may have met a gate.
-    end_s = max(times[-1], *(one.time_s for one in flight.meetings), STEP_S)
-    width = float(np.clip(SECOND_IN * times[-1], *WIDTHS_IN))
+    """Return four sticks, commanded against applied, speed and battery; gates, laps and failures as lines."""
+    times_s = STEP_S * np.arange(len(flight.states))
+    width = float(np.clip(SECOND_IN * times_s[-1], *WIDTHS_IN))
     figure = new_figure(width, COMMANDS_IN)
-    panels = figure.subplots(len(PANEL_HEIGHTS), 1, sharex=True, height_ratios=PANEL_HEIGHTS)
-    for panel, name, command, applied in zip(
-        panels, Action._fields, flight.commands.T, flight.states[:, APPLIED_ACTION].T, strict=False
-    ):
-        _draw_stick(panel, times, command, applied)
-        panel.set_ylabel(f"{name} stick")
-    panels[4].plot(times, flight.speeds_m_s, color=BLUE)
-    panels[4].set(ylabel="speed (m/s)", ylim=(0.0, None))
-    panels[5].plot(times, flight.states[:, BATTERY], color=BLUE)
-    panels[5].set(ylabel="battery (V)", xlabel="time (s)", xlim=(0.0, end_s))
+    panels = figure.subplots(6, 1, sharex=True)
+    for stick, name in enumerate(Action._fields):
+        # A command holds for a step, from its state on.
+        command, applied = flight.commands[:, stick], flight.states[:, APPLIED_ACTION][:, stick]
+        panels[stick].plot(times_s, command, color=ORANGE, drawstyle="steps-post", label="commanded")
+        panels[stick].plot(times_s, applied, color=BLUE, linewidth=1.6, label="applied")
+        panels[stick].set_ylabel(f"{name} stick")
+    panels[4].plot(times_s, flight.speeds_m_s, color=BLUE)
+    panels[5].plot(times_s, flight.states[:, BATTERY], color=BLUE)
+    panels[4].set_ylabel("speed (m/s)")
+    panels[5].set(ylabel="battery (V)", xlabel="time (s)")
+    marks = [(one.time_s, "lap complete" if one.lap else "gate passed") for one in flight.race.passes]
+    marks += [(one.time_s, "not passed") for one in flight.meetings if one.outcome != PASSED]
     for panel in panels:
-        _mark_events(plain(panel), flight)
-    for one in flight.meetings:
-        text = str(flight.track.gates[one.gate].id) + ("" if one.outcome == PASSED else f"\n{one.outcome}")
-        at = (one.time_s, 1.02)
-        panels[0].annotate(text, at, xycoords=panels[0].get_xaxis_transform(), ha="center", fontsize="small")
-    figure.align_ylabels(panels)
-    sticks = panels[3].get_legend_handles_labels()[0]
-    figure.legend(handles=[*sticks, *MARKS.values()], loc="outside lower center", ncols=5, frameon=False)
+        plain(panel)
+        for time_s, mark in marks:
+            panel.axvline(time_s, label=mark, zorder=0.5, **MARKS[mark])
+    handles, labels = panels[3].get_legend_handles_labels()
+    once = dict(zip(labels, handles, strict=True))
+    figure.legend(once.values(), once.keys(), loc="outside lower center", ncols=5, frameon=False)
     figure.suptitle(escape(f"{flight.title}\n{flight.laps_text}"), fontsize="medium")
     return figure
-
-
-def _draw_stick(panel: Axes, times: np.ndarray, command: np.ndarray, applied: np.ndarray) -> None:
-    """Draw one stick; a command holds for a step, from its state on. NaN is a gap."""
-    panel.plot(times, command, color=ORANGE, linewidth=1.0, drawstyle="steps-post", label="commanded")
-    panel.plot(times, applied, color=BLUE, linewidth=1.6, label="applied")
-    if np.isnan(applied).all():
-        box = {"facecolor": "white", "edgecolor": "none", "alpha": 0.8}
-        panel.text(0.01, 0.08, "applied: not in the file", color=GREY, transform=panel.transAxes, bbox=box)
-    # Commands outside of the sticks' range are shown where they are.
-    reach = max(1.0, float(np.abs(command).max()))
-    panel.set_ylim(-1.08 * reach, 1.08 * reach)
-
-
-def _mark_events(panel: Axes, flight: Flight) -> None:
-    """Draw a line where a gate was passed, a bold one where a lap ended, a dashed one at failures."""
-    marks = [(one.time_s, MARKS["lap" if one.lap else "gate"]) for one in flight.race.passes]
-    marks += [(one.time_s, MARKS["failure"]) for one in flight.meetings if one.outcome != PASSED]
-    for time_s, mark in marks:
-        style: dict[str, Any] = {
-            "color": mark.get_color(),
-            "lw": mark.get_linewidth(),
-            "ls": mark.get_linestyle(),
-        }
-        panel.axvline(time_s, zorder=0.5, **style)

@@ -59,11 +59,6 @@ class Flight(NamedTuple):
         return np.linalg.norm(self.states[:, VELOCITY], axis=1)
 
     @property
-    def times_s(self) -> np.ndarray:
-        """Time of each state since the first one, (T,)."""
-        return STEP_S * np.arange(len(self.states))
-
-    @property
     def lap_times_s(self) -> list[float]:
         """Times of the complete laps, in order."""
         return [one.lap_time_s for one in self.race.passes if one.lap]

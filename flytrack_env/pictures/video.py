@@ -20,7 +20,7 @@ from flytrack_env.tracks import build_course
 STEPS_PER_FRAME = 2
 FRAMES_PER_S = 1.0 / (STEP_S * STEPS_PER_FRAME)
 LONGEST_STEPS = 2000  # of a flight without a lap
-LEAD_IN_STEPS = 100  # flown before the first frame, for the trail and for the camera, which lags
+LEAD_IN_STEPS = 100  # flown before the first frame, for the trail
 
 
 def fastest_flying_lap(flight: Flight) -> tuple[int, int] | None:

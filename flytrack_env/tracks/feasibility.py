@@ -180,16 +180,10 @@ def find_own_gates(geometry: Geometry, limits: Limits) -> Iterator[str]:
             offset, is_forward = geometry.crossings(gate, geometry.way[i, 1:-1])
             is_hit = offset <= geometry.half_frames[gate] + limits.drone_radius
             is_missed = (gate == j) & is_forward & ~is_hit
-            if is_hit.any():
-                yield (
-                    f"gate {geometry.id(gate)}: {way} meets it {offset[is_hit].min():.2f} m off its centre, "
-                    "expected it through the opening only"
-                )
-            if is_missed.any():
-                yield (
-                    f"gate {geometry.id(gate)}: {way} misses it by {offset[is_missed].min():.2f} m from its "
-                    "centre before it comes back, expected it through the opening only"
-                )
+            for how, is_such in (("meets it", is_hit), ("misses it,", is_missed)):
+                if is_such.any():
+                    found = f"{way} {how} {offset[is_such].min():.2f} m off its centre"
+                    yield f"gate {geometry.id(gate)}: {found}, expected it through the opening only"
 
 
 def find_gates_in_path(geometry: Geometry, limits: Limits) -> Iterator[str]:
@@ -223,7 +217,7 @@ def find_touching_frames(geometry: Geometry, limits: Limits) -> Iterator[str]:
 
 
 def find_out_of_bounds(geometry: Geometry, limits: Limits) -> Iterator[str]:
-    """Yield ways too near the bounds, and frames that reach beyond walls or ceiling."""
+    """Yield ways too near the bounds, and frames that reach beyond them."""
     for i, j in geometry.pairs():
         for side, excess in geometry.excesses(geometry.way[i], limits.clearance).items():
             yield (
@@ -231,16 +225,7 @@ def find_out_of_bounds(geometry: Geometry, limits: Limits) -> Iterator[str]:
                 f"inside the bounds ({side}), expected at least {limits.clearance:g} m"
             )
         for side, excess in geometry.excesses(geometry.square(i), 0.0).items():
-            if side != "floor":
-                yield f"gate {geometry.id(i)}: frame {excess:.2f} m out of bounds ({side}), expected inside"
-
-
-def find_below_ground(geometry: Geometry, limits: Limits) -> Iterator[str]:
-    """Yield gates whose frames reach below the floor."""
-    for i in range(len(geometry.centres)):
-        depth = geometry.excesses(geometry.square(i), 0.0).get("floor", 0.0)
-        if depth > 0.0:
-            yield f"gate {geometry.id(i)}: bottom of the frame {depth:.2f} m below the ground, expected above"
+            yield f"gate {geometry.id(i)}: frame {excess:.2f} m out of bounds ({side}), expected inside"
 
 
 def find_bad_start(geometry: Geometry, limits: Limits) -> Iterator[str]:
@@ -280,7 +265,6 @@ CHECKS = {
     "path": find_gates_in_path,
     "frames": find_touching_frames,
     "bounds": find_out_of_bounds,
-    "ground": find_below_ground,
     "start": find_bad_start,
 }
 DEMANDS = tuple(CHECKS)
@@ -291,8 +275,7 @@ def find_problems(track: Track, limits: Limits | None = None) -> tuple[Problem, 
 
     Assumes straight flight from the start to the first gate, and the way of ``sample_way`` from there.
     """
-    geometry = Geometry.of(track)
-    limits = Limits() if limits is None else limits
+    geometry, limits = Geometry.of(track), limits or Limits()
     return tuple(
         Problem(demand, text) for demand, check in CHECKS.items() for text in check(geometry, limits)
     )

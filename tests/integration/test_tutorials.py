@@ -24,7 +24,7 @@ def test_algorithm_improves_its_return(tmp_path: Path, monkeypatch: pytest.Monke
 
 def test_track_is_corrected_and_flown(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     names = run_examples(tutorial("track"), tmp_path, monkeypatch)
-    assert [problem.demand for problem in names["problems"]] == ["ground"]
+    assert [problem.demand for problem in names["problems"]] == ["bounds"]
     assert not find_problems(load_track(tmp_path / "square.toml"))
     states, _ = load_rollout(tmp_path / "square.npy")
     assert len(states) == 100 and states[-1, 2] > states[0, 2] + 0.5

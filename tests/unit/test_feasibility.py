@@ -123,8 +123,8 @@ BREAKS: dict[str, tuple[Callable[[Track], Track], str, str]] = {
     ),
     "below ground": (
         lambda track: change_gate(track, 4, position=(*track.gates[4].position[:2], 1.25)),
-        "ground",
-        "gate 14: bottom of the frame 0.10 m below the ground, expected above",
+        "bounds",
+        "gate 14: frame 0.10 m out of bounds (floor), expected inside",
     ),
     "start behind": (
         lambda track: replace(track, start_position=(RADIUS, 5.0, HEIGHT)),
