@@ -1,11 +1,9 @@
 """The fastest lap of a flight beside the time-optimal one as an animated GIF."""
 
-import io
-
+import imageio.v3 as imageio
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from PIL import Image
 
 from flytrack_env import scene
 from flytrack_env.flown_race import STEP_S
@@ -20,7 +18,6 @@ SIZE_IN, DPI = (6.0, 3.75), 80
 STEPS_PER_FRAME = 6
 LAST_FRAME_MS = 1500
 ELEVATION_DEG, AZIMUTH_DEG, ZOOM = 36.0, 20.0, 1.75
-NUM_COLOURS = 64
 
 
 def make_gif(flight: Flight, reference: Reference) -> bytes:
@@ -66,13 +63,9 @@ def make_gif(flight: Flight, reference: Reference) -> bytes:
             is_over = row >= len(points) - 1
             text.set_text(f"{label}  {time_s:.3f} s" if is_over else f"{label}  {STEP_S * row:.2f} s")
         canvas.draw()
-        frames.append(Image.fromarray(np.array(canvas.buffer_rgba())[..., :3]))
-    palette = frames[-1].quantize(NUM_COLOURS, dither=Image.Dither.NONE)
-    indexed = [frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames]
+        frames.append(np.array(canvas.buffer_rgba())[..., :3])
     durations_ms = [round(1e3 * STEP_S * STEPS_PER_FRAME)] * (len(frames) - 1) + [LAST_FRAME_MS]
-    content = io.BytesIO()
-    indexed[0].save(content, "GIF", save_all=True, append_images=indexed[1:], duration=durations_ms, loop=0)
-    return content.getvalue()
+    return imageio.imwrite("<bytes>", frames, extension=".gif", duration=durations_ms, loop=0)
 
 
 def _rgb(colour: scene.Colour) -> tuple[float, ...]:
