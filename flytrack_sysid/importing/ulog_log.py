@@ -155,7 +155,7 @@ def _samples_of(topic: dict[str, np.ndarray], fields: tuple[str, ...]) -> _Sampl
 
 
 def _attitude(path: Path, samples: _Samples) -> _Samples:
-    """Return the attitude in our frames, without samples of before the estimator runs."""
+    """Return the attitude in our frames, without samples from before the estimator ran."""
     times, quat = samples
     is_unit = abs(np.linalg.norm(quat, axis=1) - 1.0) <= LARGEST_NORM_ERROR
     if not is_unit.any():

@@ -164,8 +164,8 @@ def test_a_diagnosis_asks_for_flights(tmp_path):
     found = next_flight(path, nominal_parameters())
     assert found.reasons == {"headings": ("wind",), "spins": ("gyro_scale", "imu_offset")}
     assert found.script.kinds == ("headings",) * 8 + ("spins",) * 8
-    said = found.describe()
-    assert "spins: to settle gyro_scale, imu_offset" in said and MANOEUVRES["spins"].how in said
+    text = found.describe()
+    assert "spins: to settle gyro_scale, imu_offset" in text and MANOEUVRES["spins"].how in text
 
 
 @pytest.mark.parametrize(

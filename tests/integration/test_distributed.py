@@ -124,8 +124,8 @@ def start(out, *flags, devices=1, number=1, index=0, port=None):
 
 
 def end_of(process):
-    said, errors = process.communicate(timeout=240)
-    return process.returncode, said, errors
+    output, errors = process.communicate(timeout=240)
+    return process.returncode, output, errors
 
 
 def parameters(folder, name="final.safetensors"):
@@ -138,12 +138,12 @@ def test_two_processes_train_as_two_devices(tmp_path):
     devices = start(tmp_path / "devices", *flags, devices=2)
     port = free_port()
     pair = [start(tmp_path / "pair", *flags, number=2, index=i, port=port) for i in (0, 1)]
-    status, said, errors = end_of(devices)
+    status, output, errors = end_of(devices)
     assert status == 0, errors
-    (first, said_first, errors_first), (second, said_second, errors_second) = map(end_of, pair)
+    (first, first_output, errors_first), (second, said_second, errors_second) = map(end_of, pair)
     assert (first, second) == (0, 0), errors_first + errors_second
     # Files are written once, by the first process, and each says as much as one alone.
-    assert "final.safetensors" in said_first and "final.safetensors" in said
+    assert "final.safetensors" in first_output and "final.safetensors" in output
     assert "safetensors" not in said_second
     names = sorted(path.name for path in (tmp_path / "devices").iterdir())
     assert sorted(path.name for path in (tmp_path / "pair").iterdir()) == names

@@ -98,7 +98,7 @@ def test_drawn_plants_have_delay_drag_and_thrust_loss_and_follow_the_seed():
 
 
 def test_the_command_refuses_what_it_cannot_use(tmp_path, capsys):
-    for flags, said in (
+    for flags, message in (
         (["--black-box", str(tmp_path / "none.bin")], "No such file or directory"),
         (["--black-box", str(SHIPPED_BLACK_BOX), "--total-timesteps", "10"], "total_timesteps: found 10"),
         (["--black-box", str(SHIPPED_BLACK_BOX), "--noise", "-1"], "noise: found -1"),
@@ -106,7 +106,7 @@ def test_the_command_refuses_what_it_cannot_use(tmp_path, capsys):
     ):
         with pytest.raises(SystemExit):
             main([*flags, "--out", str(tmp_path / "out")])
-        assert said in capsys.readouterr().err
+        assert message in capsys.readouterr().err
 
 
 def stage(name: str, success: float, gap: float | None, simulator: float = 1.0) -> dict:

@@ -1,4 +1,4 @@
-"""The report of a diagnosis: residuals are what they are said to be, and each cause has its plot."""
+"""The report of a diagnosis: its residuals are right, and each cause has its plot."""
 
 import re
 from dataclasses import replace
@@ -73,13 +73,13 @@ def test_residuals_are_measured_minus_modelled(flown):
     airspeed_b = quat.inv().apply(log["v"])[:-1]
     stick, volt, coeffs = applied[1:, 3], log["v_bat"][:-1, 0], wrong.thrust_coeffs
     thrust = np.polyval(coeffs[3::-1], stick) + volt * (coeffs[4] + stick * coeffs[5])
-    said = np.array([0.0, 0.0, 1.0]) * thrust[:, None] / wrong.m - np.array([0.1, 0.2, 0.0]) * airspeed_b
+    modelled = np.array([0.0, 0.0, 1.0]) * thrust[:, None] / wrong.m - np.array([0.1, 0.2, 0.0]) * airspeed_b
     rates = log["w"] - applied[:, :3] * np.deg2rad(wrong.max_rate)
     later, own = slice(SETTLED, None), found.residuals["wrong"]
     np.testing.assert_allclose(own["rates"][later], rates[later], atol=1e-5)
-    np.testing.assert_allclose(own["force"][later], (log["f"][1:] - said)[SETTLED - 1 :], atol=1e-4)
+    np.testing.assert_allclose(own["force"][later], (log["f"][1:] - modelled)[SETTLED - 1 :], atol=1e-4)
     gravity_w = np.array([0.0, 0.0, wrong.g])
-    moved = quat[:-1].inv().apply(np.diff(log["v"], axis=0) / DT_S + gravity_w) - said
+    moved = quat[:-1].inv().apply(np.diff(log["v"], axis=0) / DT_S + gravity_w) - modelled
     np.testing.assert_allclose(own["velocity"][later], moved[SETTLED - 1 :], atol=1e-3)
     turned = (quat[:-1].inv() * quat[1:]).as_rotvec() / DT_S - applied[1:, :3] * np.deg2rad(wrong.max_rate)
     np.testing.assert_allclose(

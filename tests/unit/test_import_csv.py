@@ -243,8 +243,8 @@ def test_command_writes_log_details_and_model(folder, tmp_path, capsys):
     out, model = tmp_path / "log.npz", tmp_path / "model.json"
     arguments = ["import", folder / "flight.csv", "--format", "csv", "--map", folder / "map.toml"]
     main([str(part) for part in (*arguments, "--out", out, "--model-out", model)])
-    said = capsys.readouterr().out
-    assert "segment 0:" in said and "full stick 700, 600, 500 deg/s; mass 0.5 kg" in said
+    output = capsys.readouterr().out
+    assert "segment 0:" in output and "full stick 700, 600, 500 deg/s; mass 0.5 kg" in output
     details = json.loads((tmp_path / "log.import.json").read_text())
     assert details["sha256"] == load_log(out).sha256
     assert [Path(source).name for source in details["sources"]] == ["flight.csv"]

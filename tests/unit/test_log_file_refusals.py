@@ -1,4 +1,4 @@
-"""Files of logs: everything that is refused, in words, soon, and in little memory."""
+"""Flight log files: every refusal names file and reason, quickly and in little memory."""
 
 import io
 import re

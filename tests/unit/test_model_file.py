@@ -1,4 +1,4 @@
-"""Model files: written, read, and refused in words."""
+"""Model files: written, read, and refused with a clear message."""
 
 import json
 import re
