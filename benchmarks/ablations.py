@@ -127,23 +127,20 @@ class Contest:
         lap_s = result.flying_lap_s
         return {"success": result.success, "flying_lap_s": None if np.isnan(lap_s) else lap_s}
 
-    def in_simulator(self, policy: Any) -> dict[str, float | None]:
-        """Return the race in the simulator, on the model itself."""
-        return self.race(policy, self.env, with_model_as_given(self.env.default_params))
-
     def train(self, seed: int) -> dict[str, Any]:
         """Return the curve of a seed, and its race in the simulator, on the black box, on drawn drones."""
         runner, curve = self.start(jax.random.key(seed)), []
+        params = with_model_as_given(self.env.default_params)
         for update in report.progress(range(1, self.config.num_updates + 1), "update"):
             runner, _ = self.chunk(runner, jnp.int32(1))
             if is_due(update, EVERY, self.config.batch_size) or update == self.config.num_updates:
-                raced = self.in_simulator(runner.train_state.params)
+                raced = self.race(runner.train_state.params, self.env, params)
                 curve.append([update * self.config.batch_size, raced["success"]])
-        policy, params = runner.train_state.params, with_model_as_given(self.env.default_params)
+        policy = runner.train_state.params
         plants = draw_plants(PLANTS_SEED, NUM_EPISODES, self.model)
         result = {
             "curve": curve,
-            "simulator": self.in_simulator(policy),
+            "simulator": raced,  # of the last update
             "drawn": self.race(policy, self.env, params, plants.models),
             "black_box": None,
         }

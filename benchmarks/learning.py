@@ -43,12 +43,12 @@ def margin_of(env: EpisodicEnvironment, checkpoint: Checkpoint, keys: jax.Array)
     return margin
 
 
-def measure_seed(seed: int, black_box: Path, out: Path, config: Config) -> tuple[float, list[Any]]:
+def measure_seed(seed: int, out: Path, config: Config) -> tuple[float, list[Any]]:
     """Return the success of one training seed, and its row of the table."""
     started = time.process_time()
     checkpoint, _ = train_policy(out / f"seed{seed}", config, seed, model=out / "model.json")
     cpu_seconds = time.process_time() - started
-    env = plant_env(checkpoint, blackbox.load(black_box))
+    env = plant_env(checkpoint, blackbox.load(SHIPPED_BLACK_BOX))
     keys = start_keys(seed, NUM_EPISODES)
     result = score(race_many(env, checkpoint.network, checkpoint.params, keys, NUM_STEPS, NUM_LAPS))
     margin, wall_s = margin_of(env, checkpoint, keys), checkpoint.meta["seconds"]
@@ -60,20 +60,15 @@ def main() -> None:
     """Measure every seed, print and write the table; exit 1 if a seed misses the target."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seeds", type=int, default=10, help="training seeds")
-    parser.add_argument("--black-box", type=Path, default=SHIPPED_BLACK_BOX, help="file")
-    parser.add_argument("--out", type=Path, default=Path("runs/learning"), help="folder of the trainings")
     parser.add_argument("--total-timesteps", type=float, default=Config.total_timesteps, help="per training")
     parser.add_argument("--gate-margin", type=float, default=Config.gate_margin, help="m; of the recipe")
     parser.add_argument("--table", type=Path, default=report.RESULTS / "learning.md", help="page to write")
     arguments = parser.parse_args()
     config = Config(total_timesteps=int(arguments.total_timesteps), gate_margin=arguments.gate_margin)
     config.check()
-    out = fresh_folder(arguments.out)
-    identify(arguments.black_box, out, seed=0)
-    results = [
-        measure_seed(seed, arguments.black_box, out, config)
-        for seed in report.progress(range(arguments.seeds), "seed")
-    ]
+    out = fresh_folder(Path("runs/learning"))
+    identify(SHIPPED_BLACK_BOX, out, seed=0)
+    results = [measure_seed(seed, out, config) for seed in report.progress(range(arguments.seeds), "seed")]
     reached = sum(success >= TARGET_SUCCESS for success, _ in results)
     text = report.page(
         "Learning: from black box to race",

@@ -1,4 +1,4 @@
-"""How the cost of environments and trainings grows: ``python -m benchmarks.scaling [PART ...]``.
+"""How the cost of environments and trainings grows: ``python -m benchmarks.scaling``.
 
 Rates are per second of CPU time on one core, or of wall time on an accelerator.
 """
@@ -91,35 +91,32 @@ def training_rate_with_environments(num_envs: int) -> tuple[float, float]:
 
 
 # Title, values, rate at a value.
-TABLES: dict[str, tuple[str, tuple[int, ...], Callable[[int], tuple[float, float]]]] = {
-    "environments": (
+TABLES: tuple[tuple[str, tuple[int, ...], Callable[[int], tuple[float, float]]], ...] = (
+    (
         "environments",
         (64, 256, 1_024, 4_096, 16_384, 65_536),
         lambda number: environment_rate(flytrack_env.make("FlyTrack-v0"), number),
     ),
-    "effects": ("effects in the model", (0, 1, 2, 4, 8, len(EFFECTS)), rate_with_effects),
-    "gates": ("gates", (4, 8, 16, 24), rate_with_gates),
-    "training": ("environments of a training", (256, 1_024, 4_096, 16_384), training_rate_with_environments),
-    "networks": (
+    ("effects in the model", (0, 1, 2, 4, 8, len(EFFECTS)), rate_with_effects),
+    ("gates", (4, 8, 16, 24), rate_with_gates),
+    ("environments of a training", (256, 1_024, 4_096, 16_384), training_rate_with_environments),
+    (
         "width of both hidden layers",
         (16, 32, 64, 128, 256),
         lambda width: training_rate(Config(hidden_sizes=(width, width))),
     ),
-    "seeds": ("seeds side by side", (1, 2, 4, 8), lambda number: training_rate(Config(), number)),
-}
+    ("seeds side by side", (1, 2, 4, 8), lambda number: training_rate(Config(), number)),
+)
 
 
 def main() -> None:
-    """Measure the named tables, or all, and write the page."""
+    """Measure all tables and write the page."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("parts", nargs="*", metavar="PART", help=f"of {', '.join(TABLES)} (default: all)")
     parser.add_argument("--page", type=Path, default=report.RESULTS / "scaling.md", help="page to write")
     arguments = parser.parse_args()
-    if not set(arguments.parts) <= set(TABLES):
-        parser.error(f"found {' '.join(arguments.parts)}, expected parts of {', '.join(TABLES)}")
     pinned = report.pin_to_one_core()
     parts = []
-    for title, values, rate_of in (TABLES[name] for name in arguments.parts or TABLES):
+    for title, values, rate_of in TABLES:
         rows = []
         for value in report.progress(values, title):
             speed, start_s = rate_of(value)

@@ -60,13 +60,12 @@ def main() -> None:
     """Measure every track, print and write the table."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seed", type=int, default=0, help="of training and evaluation")
-    parser.add_argument("--out", type=Path, default=Path("runs/tracks"), help="folder of the trainings")
     parser.add_argument("--total-timesteps", type=float, default=Config.total_timesteps, help="per training")
     parser.add_argument("--table", type=Path, default=report.RESULTS / "tracks.md", help="page to write")
     arguments = parser.parse_args()
     config = Config(total_timesteps=int(arguments.total_timesteps))
     config.check()
-    out = fresh_folder(arguments.out)
+    out = fresh_folder(Path("runs/tracks"))
     tracks: dict[str, str | Path] = {name: name for name in available_tracks()}
     for seed in RANDOM_SEEDS:
         path = out / f"random_{seed}.toml"
