@@ -240,10 +240,9 @@ def fly_many(
     num_episodes: int,
     num_steps: int,
     num_laps: int,
-    params: EnvParams | None = None,
 ) -> Rollout:
     """Return episodes from noisy start poses, leaves (num_episodes, num_steps, ...)."""
-    params = start_pose_params(env.default_params if params is None else params, num_steps)
+    params = start_pose_params(env.default_params, num_steps)
     fly = partial(fly_episode, env, network, policy_params)
     return jax.vmap(lambda key: fly(key, params, num_steps, num_laps))(start_keys(seed, num_episodes))
 

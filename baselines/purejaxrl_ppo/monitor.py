@@ -65,15 +65,14 @@ def evaluate_policy(
     is_recorded: also write the first flight as a Rerun recording, if Rerun is installed. What fails is a
     warning; the rest is returned.
     """
-    flights = None
+    metrics: dict[str, float] = {}
     with attempt("flying", steps):
         flights = fly_many(env, network, params, EVALUATION_SEED, num_episodes, NUM_STEPS, NUM_LAPS)
-    if flights is None:
+        metrics = evaluation_metrics(outcomes_of(flights, NUM_LAPS, len(env.track.gates)))
+    if not metrics:
         return {}, []
-    metrics = evaluation_metrics(outcomes_of(flights, NUM_LAPS, len(env.track.gates)))
-    rollout, chart = (
-        out / "evaluation" / name for name in (f"rollout_{steps}.npy", f"position_density_{steps}.png")
-    )
+    folder = out / "evaluation"
+    rollout, chart = folder / f"rollout_{steps}.npy", folder / f"position_density_{steps}.png"
     first, recording = jax.tree.map(lambda leaf: leaf[0], flights), rollout.with_suffix(".rrd")
     density = (chart, flights.positions(), env.track, num_episodes, f"{steps:,} training steps")
     writers: dict[Path, Callable[[], None]] = {

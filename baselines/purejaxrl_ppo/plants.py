@@ -14,28 +14,23 @@ from flytrack_env.effects import effect_of
 NUM_DRAWS = 7  # drag on three axes, thrust, wind and where it blows, delay
 
 
-class PlantRanges(NamedTuple):
-    """Range of each quantity, drawn uniformly; the defaults are what the robust baseline must tolerate.
-
-    quadratic_drag_per_m: added to the model's, on each body axis independently, 1/m. thrust_scale: factor on
-    its thrust. wind_m_s: horizontal wind speed, in any direction, added to the model's, m/s; it acts through
-    the drag. command_delay_s: added to its delay, s.
-    """
-
-    quadratic_drag_per_m: tuple[float, float] = (0.0, 0.02)
-    thrust_scale: tuple[float, float] = (0.88, 1.05)
-    wind_m_s: tuple[float, float] = (0.0, 3.0)
-    command_delay_s: tuple[float, float] = (0.0, 0.02)
+# Drawn uniformly; what the robust baseline must tolerate. The drag is added to the model's on each body axis
+# independently, the wind from any direction, and the delay; the thrust is multiplied.
+RANGES = {
+    "quadratic_drag_per_m": (0.0, 0.02),
+    "thrust_scale": (0.88, 1.05),
+    "wind_m_s": (0.0, 3.0),
+    "command_delay_s": (0.0, 0.02),
+}
 
 
 class Plants(NamedTuple):
     """Drawn plants.
 
-    models: leaves (num_plants, ...). drawn: values by the names of ``PlantRanges``, (num_plants,) each; of
+    models: leaves (num_plants, ...). drawn: values by the names of ``RANGES``, (num_plants,) each; of
     the drag, the mean of the three axes.
     """
 
-    ranges: PlantRanges
     models: ModelParameters
     drawn: dict[str, np.ndarray]
 
@@ -54,7 +49,7 @@ class Plants(NamedTuple):
         """
         return {
             "success": share(np.asarray(is_complete.all(axis=1))),
-            "ranges": {name: list(bounds) for name, bounds in self.ranges._asdict().items()},
+            "ranges": {name: list(bounds) for name, bounds in RANGES.items()},
             "by_thirds": by_thirds(self.drawn, is_complete),
         }
 
@@ -90,12 +85,7 @@ def _clipped(parameters: Any, **values: jax.Array) -> Any:
     )
 
 
-def draw_plants(
-    seed: int,
-    num_plants: int,
-    model: ModelParameters,
-    ranges: PlantRanges = PlantRanges(),  # noqa: B008, a tuple of constants
-) -> Plants:
+def draw_plants(seed: int, num_plants: int, model: ModelParameters) -> Plants:
     """Return plants around a model (``perturb``); a smaller number returns the first of the same plants."""
     # Row by row, so that the first plants do not depend on how many there are.
     uniform = np.random.default_rng(seed).uniform(size=(num_plants, NUM_DRAWS))
@@ -103,14 +93,14 @@ def draw_plants(
     def draw(columns: Any, bounds: tuple[float, float]) -> np.ndarray:
         return bounds[0] + (bounds[1] - bounds[0]) * uniform[:, columns]
 
-    drag, thrust = draw(slice(0, 3), ranges.quadratic_drag_per_m), draw(3, ranges.thrust_scale)
-    wind, heading_rad = draw(4, ranges.wind_m_s), draw(5, (-np.pi, np.pi))
-    delay = draw(6, ranges.command_delay_s)
+    drag, thrust = draw(slice(0, 3), RANGES["quadratic_drag_per_m"]), draw(3, RANGES["thrust_scale"])
+    wind, heading_rad = draw(4, RANGES["wind_m_s"]), draw(5, (-np.pi, np.pi))
+    delay = draw(6, RANGES["command_delay_s"])
     wind_w = wind[:, None] * np.stack([np.cos(heading_rad), np.sin(heading_rad)], axis=1)
     models = jax.vmap(partial(perturb, model))(drag, thrust, wind_w, delay)
     drawn = (drag.mean(axis=1), thrust, wind, delay)
-    by_name = dict(zip(PlantRanges._fields, drawn, strict=True))
-    return Plants(ranges, jax.tree.map(np.asarray, models), by_name)
+    by_name = dict(zip(RANGES, drawn, strict=True))
+    return Plants(jax.tree.map(np.asarray, models), by_name)
 
 
 def by_thirds(drawn: dict[str, np.ndarray], is_complete: np.ndarray) -> list[dict[str, Any]]:

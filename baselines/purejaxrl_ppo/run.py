@@ -188,10 +188,6 @@ class Run:
         self._checkpoint(FINAL, runner, self.config.num_updates)
         self.status = "FINISHED"
 
-    def interrupt(self) -> None:
-        """Note that the user stopped it, unless it is complete."""
-        self.status = self.status if self.status == "FINISHED" else "KILLED"
-
     def end(self) -> None:
         """Record how it ended."""
         if self.tracker is not None:

@@ -151,7 +151,7 @@ def train_group(trainer: Trainer, group: list[Ready]) -> None:
                 run.complete(runner)
     except KeyboardInterrupt:
         for run in runs:
-            run.interrupt()
+            run.status = run.status if run.status == "FINISHED" else "KILLED"
         raise
     finally:
         line.close()

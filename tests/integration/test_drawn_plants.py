@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from baselines.purejaxrl_ppo.checkpoint import load_checkpoint
-from baselines.purejaxrl_ppo.plants import PlantRanges, by_thirds, draw_plants, perturb
+from baselines.purejaxrl_ppo.plants import RANGES, by_thirds, draw_plants, perturb
 from baselines.purejaxrl_ppo.race_env import simulated_env, with_model_as_given
 from flytrack_env import make, nominal_parameters
 from flytrack_env.effects import CommandDelay, LinearDrag, QuadraticDrag, ThrustScale
@@ -24,7 +24,7 @@ def test_plants_are_drawn_from_the_ranges_around_the_model() -> None:
     known = (LinearDrag(0.4, 0.4, 0.2), CommandDelay(0.03), ThrustScale(0.9), QuadraticDrag(0.01, shared=0.0))
     model = nominal_parameters().with_effects(*known)
     plants = draw_plants(3, 200, model)
-    for name, bounds in PlantRanges()._asdict().items():
+    for name, bounds in RANGES.items():
         drawn = plants.drawn[name]
         assert bounds[0] <= drawn.min() and drawn.max() <= bounds[1] and np.ptp(drawn) > 0.5 * np.ptp(bounds)
     found = plants.models

@@ -62,10 +62,7 @@ class Settings:
 
 
 class Base(NamedTuple):
-    """What the trials of a sweep share.
-
-    config: in which each trial replaces what the space draws. env_arguments: of ``flytrack_env.make``.
-    """
+    """What the trials of a sweep share; each replaces in ``config`` what the space draws."""
 
     out: Path
     config: Config
