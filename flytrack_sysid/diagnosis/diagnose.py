@@ -1,6 +1,5 @@
 """A log and a model in, a diagnosis out: what is wrong, why, how certain that is, and what it gains."""
 
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -27,10 +26,8 @@ from flytrack_sysid.diagnosis.summary import (
     with_lost_causes,
 )
 from flytrack_sysid.diagnosis.vetoes import (
-    Rejection,
     Selection,
     apply_vetoes,
-    contradicted_on_held_out,
     select,
 )
 from flytrack_sysid.log import FlightLog
@@ -69,7 +66,6 @@ def diagnose(
     Raises:
         DiagnosisError: a log with neither gyro nor attitude; ``held_out`` of another shape.
     """
-    started = time.monotonic()
     with jax.enable_x64(True):
         parts = split(log, model, held_out)
         noise = first_guess(parts.train.lanes, parts.train.residuals(parts.train.start[None])[0])
@@ -78,12 +74,12 @@ def diagnose(
         report(1, len(STAGES))
         assert selection.state.problem.noise is not None
         test = parts.test.with_noise(selection.state.problem.noise)
-        selection, rejections = apply_vetoes(selection, test)
+        selection, contradicted = apply_vetoes(selection, test)
         report(2, len(STAGES))
-        found = summarize(selection, rejections, parts._replace(test=test))
+        found = summarize(selection, contradicted, parts._replace(test=test))
         report(3, len(STAGES))
     nominal = nominal_parameters() if model is None else model
-    return replace(found, nominal=nominal, seconds=time.monotonic() - started)
+    return replace(found, nominal=nominal)
 
 
 def split(
@@ -111,13 +107,13 @@ def split(
     return Split(log, out, train, test, tuple(warnings))
 
 
-def summarize(selection: Selection, rejections: Sequence[Rejection], parts: Split) -> Diagnosis:
+def summarize(selection: Selection, contradicted: Sequence[str], parts: Split) -> Diagnosis:
     """Return the diagnosis of a selected model, in float64; the nominal model in float64 stands in it."""
     problem, test, model = selection.state.problem, parts.test, selection.model
     state, linearization = selection.state.linearized(model.vector)
     effects = effect_causes(selection, test, linearization)
     in_base, lost_in_base = base_causes(selection, test, linearization, effects)
-    lost = [one.effect for one in rejections if one.veto == contradicted_on_held_out.__name__] + lost_in_base
+    lost = [*contradicted, *lost_in_base]
     causes = (*effects, *in_base)
     vectors = {
         "nominal": problem.start,
@@ -140,7 +136,6 @@ def summarize(selection: Selection, rejections: Sequence[Rejection], parts: Spli
         voltages=voltages_of(problem.lanes),
         source=Path(parts.log.source).name,
         sha256=parts.log.sha256,
-        seconds=0.0,
         warnings=(*parts.warnings, *warnings_of(problem, model, causes, errors, lost)),
     )
 

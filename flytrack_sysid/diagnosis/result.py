@@ -111,7 +111,6 @@ class Diagnosis:
     noise: Mapping[str, list[float]]
     source: str
     sha256: str
-    seconds: float
     voltages: tuple[float, float] | None = None
     warnings: tuple[str, ...] = ()
 

@@ -69,13 +69,6 @@ class Selection(NamedTuple):
 Veto = Callable[[Selection, Problem], list[str]]
 
 
-class Rejection(NamedTuple):
-    """An effect that a veto has rejected; veto: the function's name."""
-
-    effect: str
-    veto: str
-
-
 def select(state: SearchState, base: FittedModel, model: FittedModel) -> Selection:
     """Return the model with effects swapped, removed, or put in place of base changes where that helps."""
     state, model, ablations = select_effects(state, model)
@@ -98,24 +91,22 @@ def reject(selection: Selection, effects: Sequence[str]) -> Selection:
     return Selection(state, selection.base, model, ablations)
 
 
-def apply_vetoes(
-    selection: Selection, test: Problem, vetoes: Sequence[tuple[Veto, ...]] | None = None
-) -> tuple[Selection, list[Rejection]]:
-    """Return the selection without effects that a veto rejects, and those in the order of rejection.
+def apply_vetoes(selection: Selection, test: Problem) -> tuple[Selection, list[str]]:
+    """Return the selection without effects that a veto rejects, and which ones held-out rows contradict.
 
-    test: held-out rows, with the noise of the selection's problem. vetoes: ``VETOES`` if None.
+    test: held-out rows, with the noise of the selection's problem.
     """
-    rejections: list[Rejection] = []
+    contradicted: list[str] = []
     selection = examined(selection)
     while True:
-        for rules in VETOES if vetoes is None else vetoes:
-            by_effect = {effect: rule.__name__ for rule in rules for effect in rule(selection, test)}
-            if by_effect:
-                rejections += [Rejection(effect, rule) for effect, rule in by_effect.items()]
-                selection = examined(reject(selection, tuple(by_effect)))
+        for rules in VETOES:
+            rejected = tuple(dict.fromkeys(effect for rule in rules for effect in rule(selection, test)))
+            if rejected:
+                contradicted += rejected if contradicted_on_held_out in rules else ()
+                selection = examined(reject(selection, rejected))
                 break
         else:
-            return selection, rejections
+            return selection, contradicted
 
 
 def examined(selection: Selection) -> Selection:

@@ -17,7 +17,7 @@ from flytrack_sysid import collect
 from flytrack_sysid.diagnosis import DiagnosisError, diagnose, joined, unexplained
 from flytrack_sysid.diagnosis import noise as noises
 from flytrack_sysid.diagnosis.diagnose import unused_channels
-from flytrack_sysid.diagnosis.lanes import LANE_S, LEAD_IN_S, NUM_AXES, make_lanes, thinned
+from flytrack_sysid.diagnosis.lanes import LANE_S, LEAD_IN_S, NUM_AXES, make_lanes
 from flytrack_sysid.diagnosis.problem import Problem
 from flytrack_sysid.record import make_record
 from flytrack_sysid.residuals import predict_rows
@@ -228,16 +228,6 @@ def test_delays_end_where_no_older_row_is_remembered(flown):
     problem = Problem.of(lanes, model_of(truth))
     place = problem.names.index("command_delay.delay_s")
     assert problem.high[place] == pytest.approx(BUFFER_STEPS * 0.001, rel=1e-3)
-
-
-def test_of_a_long_log_lanes_are_looked_at_evenly(lanes, monkeypatch):
-    assert thinned(lanes) is lanes
-    monkeypatch.setattr("flytrack_sysid.diagnosis.lanes.MOST_ROWS", 4 * LANE_S * RATE + 10)
-    fewer = thinned(lanes)
-    number = lanes.row.shape[1]
-    np.testing.assert_array_equal(fewer.row, lanes.row[:, np.linspace(0, number - 1, 4).round().astype(int)])
-    assert fewer.counts.shape == (*fewer.row.shape, NUM_AXES, 2) and fewer.quanta is lanes.quanta
-    assert fewer.record.pos_w.shape == (*fewer.row.shape, 3)
 
 
 def test_channels_that_some_logs_lack_are_warned_of(flown):

@@ -212,7 +212,6 @@ def diagnosis(flown, measured):
         noise={"rates": [0.1, 0.1, 0.1]},
         source="<script>flight</script>",
         sha256=measured.sha256,
-        seconds=1.0,
         warnings=("something to know",),
     )
 

@@ -167,7 +167,7 @@ def test_of_a_long_log_rows_are_left_out_but_no_start(monkeypatch, made):
 def found_by_hand(flown, models) -> Diagnosis:
     """Return a diagnosis that names nothing."""
     models = {"nominal": flown[0], "base": flown[0], "extended": models["true"]}
-    rest = {"noise": {}, "source": "log", "sha256": "", "seconds": 0.0}
+    rest = {"noise": {}, "source": "log", "sha256": ""}
     return Diagnosis(CONSISTENT, (), Unexplained(), (), {}, **models, **rest)
 
 
