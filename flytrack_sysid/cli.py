@@ -7,6 +7,7 @@ import importlib
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
+from operator import attrgetter
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -47,24 +48,19 @@ OptionalPath = Annotated[Path | None, arg(metavar="PATH", help_behavior_hint=NO_
 def load_plant(where: str) -> Any:
     """Return the plant in an artifact, or the object that ``module:name`` names.
 
-    Importing a module runs it; the working directory is searched first.
-
     Raises:
-        BlackBoxError: an artifact that cannot be used.
-        CollectError: a module or name that cannot be imported, or is no plant.
+        BlackBoxError, CollectError: an artifact, module or object that cannot be used.
     """
     module, colon, name = where.partition(":")
     if not colon or Path(where).exists():
         return blackbox.load(where)
     sys.path.insert(0, str(Path.cwd()))  # stays there: the module may import later
     try:
-        found: Any = importlib.import_module(module)
-        for part in name.split("."):
-            found = getattr(found, part)
+        found = attrgetter(name)(importlib.import_module(module))
     except Exception as error:  # whatever a user's module raises
         reason = f"{type(error).__name__}: {error}"
         raise CollectError(f"--black-box {where}: cannot be imported: {reason}") from error
-    if not isinstance(found, Plant) and not callable(found):
+    if not callable(found) and not isinstance(found, Plant):
         raise CollectError(
             f"--black-box {where}: found {type(found).__name__}, expected step(x, u) or a plant"
         )
@@ -125,7 +121,7 @@ class Import:
         model = None if self.model_out is None else found.nominal_model()  # before anything is written
         save_log(self.out, found.log)
         found.save_details(written[1])
-        if self.model_out is not None and model is not None:
+        if self.model_out and model:
             provenance = {
                 "nominal": "generic quadcopter, scaled to the craft",
                 "imported_from": [Path(source).name for source in found.sources],
@@ -275,22 +271,21 @@ def fixed_values(pairs: Sequence[str]) -> dict[str, float]:
 
 
 def judged_rows(model_path: Path, log: FlightLog) -> tuple[np.ndarray | None, str]:
-    """Return the rows of a log that a model was not fitted to, (num_rows,) bool, and a note on them.
-
-    None stands for all rows: of a log whose hash is not that of the log which the model was fitted to.
+    """Return the rows of a log that a model was not fitted to, (num_rows,) bool, None for all, and a note.
 
     Raises:
         ModelFileError: a model file whose split cannot be read, or a model fitted to the whole log.
     """
     provenance = load_provenance(model_path)
     data, split = provenance.get("data"), provenance.get("split")
-    if not isinstance(data, dict) or data.get("sha256") != log.sha256:
+    if not isinstance(data, dict) or data.get("sha256") != log.sha256:  # fitted to another log
         return None, f"all rows are judged: {model_path.name} was not fitted to {Path(log.source).name}"
     every = split.get("held_out_every") if isinstance(split, dict) else None
-    if not isinstance(every, int) or isinstance(every, bool) or every < 0 or every == 1:
-        raise ModelFileError(f"{model_path}: split: held_out_every: found {every!r}, expected 0, 2, 3, ...")
-    if every == 0:
-        raise ModelFileError(f"{model_path}: fitted to all of {log.source}; validate it on another log")
+    if not isinstance(every, int) or every < 2:
+        hint = (
+            "fitted to the whole log; validate it on another log" if every == 0 else "expected 0, 2, 3, ..."
+        )
+        raise ModelFileError(f"{model_path}: split: held_out_every: found {every!r}, {hint}")
     return held_out_rows(log, every), f"held-out part: the last of every {every} blocks"
 
 

@@ -1,9 +1,7 @@
 """A flight log as trajectories to record: as measured, and as models fly it. Needs ``flytrack[viz]``.
 
-``measured`` is the log's own numbers. At its drone are the specific forces that models do not explain, means
-over 0.1 s in the world frame: of the accelerometer or of known accelerations, without both of the growth of
-velocity. Every model has a trajectory of its own: it starts at a measured row, flies by itself under the
-logged commands for a second, and starts anew: its path leaves the measured one as fast as it is wrong.
+At the measured drone are the specific forces that models do not explain, means over 0.1 s in the world frame.
+A model flies by itself under the logged commands, and starts anew from a measured row every second.
 """
 
 from collections.abc import Mapping
@@ -59,14 +57,6 @@ class _Timed(NamedTuple):
     log: FlightLog
     time_s: np.ndarray
     every: int
-
-
-class _Piece(NamedTuple):
-    """Free flight from one row: the rows of a log, (n,) int, and the states there, (n, 21)."""
-
-    rows: np.ndarray
-    states: np.ndarray
-    has_diverged: bool
 
 
 def trajectories_of(
@@ -181,16 +171,17 @@ def _starts_and_ends(filled: Filled, prediction: Prediction) -> tuple[np.ndarray
     return np.concatenate(starts), np.concatenate(ends)
 
 
-def _piece(filled: Filled, start: int, end: int, flown: Mapping[str, np.ndarray], every: int) -> _Piece:
-    """Return what is shown of one free flight: measured rows before ``end``, until it diverges.
+def _shown_of(
+    filled: Filled, start: int, end: int, flown: Mapping[str, np.ndarray], every: int
+) -> tuple[np.ndarray, np.ndarray, bool]:
+    """Return rows of the log, (n,) int, a free flight's states there, (n, 21), and whether it diverges.
 
-    flown: p, v, q, w at the rows after the start, (num_steps, size).
+    Measured rows before ``end``, until it diverges. flown: p, v, q, w at the rows after the start.
     """
     rows = start + np.arange(min(end - start, 1 + len(flown["p"])))
     measured = {name: filled.log[name][start : start + 1] for name in FLOWN if name in filled.log}
-    states = np.concatenate(
-        [states_of(measured), states_of({name: flown[name][: len(rows) - 1] for name in FLOWN})]
-    )
+    after = {name: flown[name][: len(rows) - 1] for name in FLOWN}
+    states = np.concatenate([states_of(measured), states_of(after)])
     with np.errstate(over="ignore", invalid="ignore"):
         away_m = np.linalg.norm(states[:, POSITION] - filled.log["p"][rows], axis=1)
     is_finite = np.all([np.isfinite(states[:, place]).all(axis=1) for place in FLOWN.values()], axis=0)
@@ -199,7 +190,7 @@ def _piece(filled: Filled, start: int, end: int, flown: Mapping[str, np.ndarray]
     count = len(rows) if is_near.all() else int(np.argmin(is_near))
     shown = np.flatnonzero(filled.source_row[rows[:count]] >= 0)
     shown = shown[shown % every == 0]
-    return _Piece(filled.source_row[rows[shown]], states[shown], count < len(rows))
+    return filled.source_row[rows[shown]], states[shown], count < len(rows)
 
 
 def _free_flight(timed: _Timed, name: str, model: ModelParameters) -> Trajectory | None:
@@ -210,28 +201,25 @@ def _free_flight(timed: _Timed, name: str, model: ModelParameters) -> Trajectory
     filled = fill_gaps(timed.log)
     prediction = predict(model, filled)
     starts, ends = _starts_and_ends(filled, prediction)
-    pieces: list[_Piece] = []
+    pieces: list[tuple[np.ndarray, np.ndarray, bool]] = []
     for batch, flown in free_flights(model, filled.log, prediction, starts, longest_flight(prediction)):
         own = ends[len(pieces) : len(pieces) + len(batch)]
         for number, (start, end) in enumerate(zip(batch, own, strict=True)):
             one = {channel: values[number] for channel, values in flown.items()}
-            pieces.append(_piece(filled, start, end, one, timed.every))
-    return _joined(timed, name, pieces) if pieces else None
-
-
-def _joined(timed: _Timed, name: str, pieces: list[_Piece]) -> Trajectory:
-    """Return pieces as one trajectory; it begins with the log's first row, so that all have one clock."""
-    if pieces[0].rows[0] > 0:
+            pieces.append(_shown_of(filled, start, end, one, timed.every))
+    if pieces and pieces[0][0][0] > 0:  # begin with the log's first row, so that all have one clock
         first = states_of({channel: timed.log[channel][:1] for channel in FLOWN if channel in timed.log})
-        pieces = [_Piece(np.zeros(1, int), first, False), *pieces]
-    rows = np.concatenate([piece.rows for piece in pieces])
-    num_diverged = sum(piece.has_diverged for piece in pieces)
+        pieces.insert(0, (np.zeros(1, int), first, False))
+    if not pieces:
+        return None
+    rows, states, has_diverged = zip(*pieces, strict=True)
+    all_rows = np.concatenate(rows)
     return Trajectory(
         name=name,
-        states=np.concatenate([piece.states for piece in pieces]),
-        actions=np.full((len(rows), ACTION_SIZE), np.nan),  # those of the log: one line would hide another
-        time_s=timed.time_s[rows],
+        states=np.concatenate(states),
+        actions=np.full((len(all_rows), ACTION_SIZE), np.nan),  # the log's: one line would hide another
+        time_s=timed.time_s[all_rows],
         ended=f"the log ends; anew every {RESTART_S:g} s"
-        + (f"; diverged {num_diverged} times" if num_diverged else ""),
-        restarts=np.concatenate([np.arange(len(piece.rows)) == 0 for piece in pieces]),
+        + (f"; diverged {sum(has_diverged)} times" if any(has_diverged) else ""),
+        restarts=np.concatenate([np.arange(len(own)) == 0 for own in rows]),
     )

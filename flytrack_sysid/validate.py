@@ -124,13 +124,10 @@ def validate(model: ModelParameters, log: FlightLog, rows: np.ndarray | None = N
     rows: (num_rows,) bool, the judged ones (``split.held_out_rows``); all if None. Other rows are used only
     for the applied action and the memories of effects.
 
-    Raises:
-        ValueError: ``rows`` has another shape, or is not of truth values.
     """
     rows = np.ones(len(log), bool) if rows is None else np.asarray(rows)
     if rows.shape != (len(log),) or rows.dtype != bool:
-        found = f"{rows.dtype} of shape {rows.shape}"
-        raise ValueError(f"rows: found {found}, expected bool of shape ({len(log)},)")
+        raise ValueError(f"rows: found {rows.dtype} of shape {rows.shape}, expected bool of ({len(log)},)")
     num_rows, num_judged = len(log), int(rows.sum())
     filled = fill_gaps(log)
     log, rows = filled.log, rows[filled.behind]
@@ -152,13 +149,4 @@ def validate(model: ModelParameters, log: FlightLog, rows: np.ndarray | None = N
             f"{LEAST_JUMP:g} between {HELD_BEFORE_S:g} s and {HELD_AFTER_S:g} s of constant command, with "
             "body rates measured"
         )
-    return Validation(
-        num_rows=num_rows,
-        num_judged=num_judged,
-        one_step=one_step,
-        rollouts=rollouts,
-        thrust=thrust,
-        open_force=left,
-        steps=steps,
-        notes=tuple(notes),
-    )
+    return Validation(num_rows, num_judged, one_step, rollouts, thrust, left, steps, tuple(notes))

@@ -29,7 +29,6 @@ GYRO = tuple(f"gyroADC[{axis}]" for axis in range(3))
 ACCELEROMETER = tuple(f"accSmooth[{axis}]" for axis in range(3))
 BATTERY = "vbatLatest"
 FULL_THROTTLE = 1000.0  # setpoint[3] at full throttle; 0 at none
-LEAST_FULL_CELL_V = 2.0  # a smaller setting was in tenths of V, as old firmware has all voltages
 FINE = 10.0  # units in one deg/s where blackbox_high_resolution is set
 MICROSECOND = UNITS["time"]["us"]
 LARGEST_SETTING = 1e9
@@ -47,9 +46,8 @@ LEAST_REMAINDER = 0.01  # of 1 less the super rate, as the firmware bounds it
 def full_stick_rate(rates_type: str, rc_rate: float, super_rate: float, limit_deg_s: float) -> float:
     """Return the body rate at full stick, deg/s, by Betaflight's rate settings.
 
-    rates_type: of ``RATES_TYPES``. rc_rate, super_rate, limit_deg_s: as in the log's headers ``rc_rates``,
-    ``rates``, ``rate_limits``. Source: ``apply...Rates`` in Betaflight 4.5, src/main/fc/rc.c, where expo
-    plays no part at full stick.
+    rc_rate, super_rate, limit_deg_s: as in the log's headers ``rc_rates``, ``rates``, ``rate_limits``.
+    Source: ``apply...Rates`` in Betaflight 4.5, src/main/fc/rc.c; expo plays no part at full stick.
     """
     remainder = max(1.0 - super_rate / PERCENT, LEAST_REMAINDER)
     rate = rc_rate / PERCENT
@@ -67,13 +65,8 @@ def full_stick_rate(rates_type: str, rc_rate: float, super_rate: float, limit_de
 def read_betaflight(path: Path, mapping: Mapping) -> list[ImportedFlight]:
     """Return the flights in a blackbox file, one per log in it: commands, rates, specific force, voltage.
 
-    Commands are the rate setpoints over the rates at full stick (by the mapping's ``craft.max_rate_deg_s``,
-    else by the rate settings in the log's header), and throttle from none to full as -1 to 1. Rates and
-    force are those that the flight controller works with, filtered by it.
-
-    Raises:
-        LogError: orangebox is not installed; no blackbox file of Betaflight 4, or cut off; a field of the
-            header or of the frames that is missing or out of range. The message names file and field.
+    docs/real_logs.md says what the channels are. Raises LogError for what is no complete blackbox file of
+    Betaflight 4, or lacks a field.
     """
     num_logs = _count_logs(path)
     notes, frames = decode(str(path), "betaflight", path, num_logs)
@@ -165,9 +158,7 @@ def _channels(table: Table, headers: _Headers, full: np.ndarray) -> dict[str, np
         "w": table.matrix(GYRO) * per_unit * PER_DEGREE,
     }
     if BATTERY in table.columns:
-        largest_cell = headers.numbers("vbatcellvoltage", 3)[-1]
-        unit = "cV" if largest_cell * UNITS["voltage"]["cV"] >= LEAST_FULL_CELL_V else "dV"
-        found["v_bat"] = table.matrix([BATTERY]) * UNITS["voltage"][unit]
+        found["v_bat"] = table.matrix([BATTERY]) * UNITS["voltage"]["cV"]
     return found
 
 

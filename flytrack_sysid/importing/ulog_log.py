@@ -66,13 +66,8 @@ class _Samples(NamedTuple):
 def read_ulog(path: Path, mapping: Mapping) -> ImportedFlight:
     """Return the flight in a PX4 log: commands, rates, attitude, and the other channels that it has.
 
-    Commands are the rate setpoints over the rates at full stick (by the mapping's ``craft.max_rate_deg_s``,
-    else by the log's parameters), and the collective thrust setpoint from 0 to 1 as -1 to 1. Quaternions
-    of ``vehicle_attitude`` are FRD to NED.
-
-    Raises:
-        LogError: pyulog is not installed; no ULog, or damaged; no rates, attitude or rate setpoints in it;
-            no time at which all are known. The message names file and topic.
+    docs/real_logs.md says which topics the channels are of. Raises LogError for what is no ULog, or lacks
+    rates, attitude or rate setpoints at any one time.
     """
     samples, parameters, is_damaged = _decode(path)
     craft = mapping.craft

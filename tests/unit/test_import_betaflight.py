@@ -54,12 +54,11 @@ def test_units_and_frames_are_ours(tmp_path):
     assert set(log.channels) == {"u", "w", "f", "v_bat"} and "Betaflight 4.5.1" in found.notes[0]
 
 
-def test_fine_rates_and_old_voltages_are_scaled(tmp_path):
+def test_fine_rates_are_scaled(tmp_path):
     fine = frames() * np.isin(NAMES, ["setpoint[0]", "setpoint[1]", "setpoint[2]"]) * 9 + frames()
     fine += frames() * np.char.startswith(NAMES, "gyro") * 9
-    fine[:, NAMES.index("vbatLatest")] = 241
     plain = import_log(write(tmp_path / "a.bbl", log_with()), "betaflight").log
-    headers = {"blackbox_high_resolution": "1", "vbatcellvoltage": "33,36,43"}
+    headers = {"blackbox_high_resolution": "1"}
     log = import_log(write(tmp_path / "b.bbl", log_with(fine, **headers)), "betaflight").log
     for name in plain.channels:
         np.testing.assert_allclose(log[name], plain[name], atol=1e-12, err_msg=name)
