@@ -46,11 +46,7 @@ OptionalPath = Annotated[Path | None, arg(metavar="PATH", help_behavior_hint=NO_
 
 
 def load_plant(where: str) -> Any:
-    """Return the plant in an artifact, or the object that ``module:name`` names.
-
-    Raises:
-        BlackBoxError, CollectError: an artifact, module or object that cannot be used.
-    """
+    """Return the plant in an artifact, or the object that ``module:name`` names."""
     module, colon, name = where.partition(":")
     if not colon or Path(where).exists():
         return blackbox.load(where)
@@ -273,8 +269,7 @@ def fixed_values(pairs: Sequence[str]) -> dict[str, float]:
 def judged_rows(model_path: Path, log: FlightLog) -> tuple[np.ndarray | None, str]:
     """Return the rows of a log that a model was not fitted to, (num_rows,) bool, None for all, and a note.
 
-    Raises:
-        ModelFileError: a model file whose split cannot be read, or a model fitted to the whole log.
+    Raises ModelFileError for a split that cannot be read, or a model fitted to the whole log.
     """
     provenance = load_provenance(model_path)
     data, split = provenance.get("data"), provenance.get("split")

@@ -99,11 +99,7 @@ def _fly_any(plant: Plant | StepFunction, report: Report) -> Fly:
 
 
 def find_hover(fly: Fly) -> float:
-    """Return the thrust action that holds the weight at 23 V, level and at rest.
-
-    Raises:
-        CollectError: a plant that full thrust does not lift, or that idle thrust does.
-    """
+    """Return the thrust action that holds the weight at 23 V, level and at rest; else raise CollectError."""
     actions = np.linspace(-1.0, 1.0, 41)
     rng = np.random.default_rng(0)
     starts = np.stack([start_state(rng, MIDDLE_V, action, 0.0, 0.0) for action in actions])
@@ -128,16 +124,14 @@ def collect(
     report: Report = lambda done, total: None,
     script: Script | None = None,
 ) -> FlightLog:
-    """Fly the excitation, or a script, on a plant and return the log, a segment per flight.
+    """Fly the excitation, or a script instead, on a plant and return the log, a segment per flight.
 
     plant: a plant, or a function ``(x (21,), u (4,)) -> x (21,)`` of a step of 0.01 s, started from chosen
     states. minutes: of flight before the envelope cuts any, at least 1. noise: 0 logs the state itself, 1
-    what common sensors measure (``flytrack_sysid.sensors``). report: called with the flights done and in
-    all. script: flown instead of the excitation; minutes and the plant's hovering thrust are not used.
+    what common sensors measure (``flytrack_sysid.sensors``). report: called with the flights done and in all.
 
     Raises:
-        CollectError: minutes, seed or noise out of range, a plant that does not fly or returns no state.
-        ScriptError: a script that cannot be flown.
+        CollectError, ScriptError: arguments out of range, or a plant or script that cannot be flown.
     """
     if not FEWEST_MINUTES <= minutes < np.inf:
         raise CollectError(f"minutes: found {minutes}, expected at least {FEWEST_MINUTES:g}")

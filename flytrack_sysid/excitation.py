@@ -55,10 +55,7 @@ def is_inside(
     heights: tuple[float, float] = HEIGHTS,
     voltages: tuple[float, float] = VOLTAGES,
 ) -> np.ndarray:
-    """Return where states (..., 21) are within the envelope; NaN is not.
-
-    heights: lowest and highest, m. voltages: lowest and highest, V.
-    """
+    """Return where states (..., 21) are within the envelope, heights in m, voltages in V; NaN is not."""
     height, battery_v = states[..., POSITION][..., 2], states[..., BATTERY]
     is_slow = np.linalg.norm(states[..., VELOCITY], axis=-1) <= LARGEST_SPEED
     is_charged = (battery_v >= voltages[0]) & (battery_v <= voltages[1])
@@ -91,10 +88,7 @@ def wave(name: str, rng: np.random.Generator) -> np.ndarray:
 def switching(
     rng: np.random.Generator, smallest: float = 1.0, hold_steps: tuple[int, int] = FAST_STEPS
 ) -> np.ndarray:
-    """Return a command that changes sign every so many steps, (FLIGHT_STEPS,).
-
-    Its sizes are drawn between ``smallest`` and 1, how long it is held between ``hold_steps``.
-    """
+    """Return a command that changes sign every so many steps, (FLIGHT_STEPS,), of sizes ``smallest`` to 1."""
     holds = rng.integers(*hold_steps, size=FLIGHT_STEPS, endpoint=True)
     signs = rng.choice([-1.0, 1.0]) * (-1.0) ** np.arange(FLIGHT_STEPS)
     return np.repeat(signs * rng.uniform(smallest, 1.0, FLIGHT_STEPS), holds)[:FLIGHT_STEPS]

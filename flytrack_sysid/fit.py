@@ -206,13 +206,12 @@ def fit(
     """Identify lags, thrust map and battery drain from a log; mass, gravity and full-stick rates are given.
 
     start: initial values, also of what is not estimated; nominal if None. fixed: values of parameters that
-    are not estimated, by name (``tau_yaw``, ``c4``, ``max_rate_roll``, ``m``, ``linear_drag.d_x``, ...).
-    effects: names of effects whose parameters are estimated too. every: which rows are held out
-    (``flytrack_sysid.split``), 0 for none. report: called with the rounds done and in all.
+    are not estimated, by name (``tau_yaw``, ``c4``, ``linear_drag.d_x``, ...). effects: names of effects
+    whose parameters are estimated too. every: which rows are held out (``flytrack_sysid.split``), 0 for none.
+    report: called with the rounds done and in all.
 
     Raises:
-        LogError: an implausible log (``flytrack_sysid.plausibility``).
-        FitError: missing channels or motion, an unknown name, or a fit that diverged.
+        LogError, FitError: an implausible log; missing channels or motion, or a fit that diverged.
     """
     fixed = dict(fixed or {})
     check_plausible(log)

@@ -15,9 +15,6 @@ def write_flight_recording(
 
     models, residuals: as for ``trajectories.trajectories_of``. Where nothing is written, a file of that name
     is removed: it would pass for this log's.
-
-    Raises:
-        OSError: an earlier file that cannot be removed.
     """
     try:
         from flytrack_env.viz_rerun import write_recording

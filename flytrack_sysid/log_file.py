@@ -20,14 +20,10 @@ SUFFIXES = (".npz", ".csv")
 
 
 def load_log(path: str | Path) -> FlightLog:
-    """Return the log in an ``.npz`` or ``.csv`` file; the suffix says which.
+    """Return the log in an ``.npz`` or ``.csv`` file; the suffix says which. Nothing is ever unpickled.
 
-    Columns, units and frames: ``flytrack_sysid.log``. Without a column ``segment``, all rows are one.
-    Quaternions come back with norm 1. Nothing is ever unpickled.
-
-    Raises:
-        LogError: a file that cannot be read, or is no log; the message names file, row and column. Rows
-            count from 0, lines of a CSV file from 1.
+    Without a column ``segment``, all rows are one. Quaternions come back with norm 1. Raises LogError, whose
+    message names file, row and column; rows count from 0, lines of a CSV file from 1.
     """
     path = Path(path)
     check_name(path)
@@ -38,14 +34,10 @@ def load_log(path: str | Path) -> FlightLog:
 
 
 def save_log(path: str | Path, log: FlightLog) -> None:
-    """Write a log to an ``.npz`` or ``.csv`` file; the suffix says which.
+    """Write a log to an ``.npz`` or ``.csv`` file, atomically; the suffix says which.
 
-    Every float64 comes back the same, and the same log gives the same bytes. The column ``segment`` is
-    there only if there is more than one. Written under a temporary name and renamed.
-
-    Raises:
-        LogError: another suffix, or a log that ``load_log`` would refuse.
-        OSError: what the system says.
+    Every float64 comes back the same, and the same log gives the same bytes. Raises LogError for a log that
+    ``load_log`` would refuse, OSError for a file that cannot be written.
     """
     path = Path(path)
     check_name(path)

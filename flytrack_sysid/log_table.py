@@ -67,13 +67,10 @@ def check_names(source: str, names: Sequence[str]) -> None:
 
 
 def log_of_table(table: Table) -> FlightLog:
-    """Return the log that a table holds; a table without segments is one.
+    """Return the log that a table holds, with unit quaternions; a table without segments is one.
 
-    Quaternions are normalised. The names must have passed ``check_names``. Columns are removed from the table
-    as they are copied, so that a large log is not in memory twice.
-
-    Raises:
-        LogError: no rows, columns of different lengths, or a value that no log can have, with its place.
+    The names must have passed ``check_names``. Columns are removed from the table as they are copied, so that
+    a large log is not in memory twice. Raises LogError for a value that no log can have, with its place.
     """
     num_rows = len(table.columns["t"])
     for column, values in table.columns.items():

@@ -10,14 +10,12 @@ from matplotlib.figure import Figure
 from flytrack_env.pictures import drawing
 from flytrack_env.pictures.drawing import new_figure, plain
 from flytrack_env.scene import BLUE, GREEN, GREY, ORANGE
-from flytrack_sysid.forces import OpenForce, SpeedBin, ThrustError
-from flytrack_sysid.prediction_errors import QUANTITIES, Rollout
+from flytrack_sysid.forces import ThrustError
 from flytrack_sysid.steps import AXES, StepResponse
 from flytrack_sysid.validate import Validation
 
 DPI = 150
 WIDTH_IN, EMPTY_HEIGHT_IN = 7.0, 1.2
-BY_AXIS = {"x": BLUE, "y": ORANGE, "z": GREEN}
 
 
 def png_of(figure: Figure) -> bytes:
@@ -77,23 +75,6 @@ def draw_steps(steps: Sequence[StepResponse]) -> Figure:
     return figure
 
 
-def draw_rollouts(rollouts: Sequence[Rollout]) -> Figure:
-    """Draw how the errors of free flight grow with its length."""
-    figure, panels = _figure("Drift of the model in free flight", 2, 2, 6.0)
-    for panel, (name, (_, unit)) in zip(panels.flat, QUANTITIES.items(), strict=True):
-        flown = [rollout for rollout in rollouts if name in rollout.errors]
-        if not flown:
-            say(panel, f"{name}: not in the log,\nor no judged stretch is long enough")
-            continue
-        horizons = [rollout.horizon_s for rollout in flown]
-        errors = [rollout.errors[name] for rollout in flown]
-        panel.plot(horizons, [error.p95 for error in errors], "^--", color=ORANGE, label="95th percentile")
-        panel.plot(horizons, [error.median for error in errors], "o-", color=BLUE, label="median")
-        panel.set(xlim=(0.0, None), ylim=(0.0, None))
-        _label(panel, "length of the flight (s)", f"{name} ({unit})")
-    return figure
-
-
 def draw_thrust(thrust: ThrustError | None) -> Figure:
     """Draw the thrust error over applied action and voltage."""
     if thrust is None:
@@ -117,37 +98,9 @@ def draw_thrust(thrust: ThrustError | None) -> Figure:
     return figure
 
 
-def speed_text(part: SpeedBin) -> str:
-    """Return a range of speeds in m/s as text."""
-    return f"{part.low:g} to {part.high:g}" if np.isfinite(part.high) else f"over {part.low:g}"
-
-
-def draw_open_force(force: OpenForce | None) -> Figure:
-    """Draw the specific force that the model does not explain, by speed."""
-    title = "Force that the model does not explain"
-    if force is None:
-        return _empty(title, "not judged: it needs v, q, and a or f")
-    figure, panels = _figure(title, 1, 1, 4.5)
-    panel = panels[0, 0]
-    place = np.arange(len(force.by_speed))
-    labels = [speed_text(part) for part in force.by_speed]
-    width = 0.2
-    for index, axis in enumerate("xyz"):
-        heights = [part.rms_b[index] for part in force.by_speed]
-        panel.bar(place + (index - 1) * width, heights, width, color=BY_AXIS[axis], label=f"body {axis}, rms")
-    against = [part.mean_against_velocity for part in force.by_speed]
-    panel.plot(place, against, "D", color="black", label="against the flight's direction, mean")
-    panel.axhline(0.0, color=GREY, linewidth=0.8)
-    panel.set_xticks(place, labels)
-    _label(panel, "speed (m/s)", "measured minus modelled (m/s²)")
-    return figure
-
-
 def draw_validation(validation: Validation) -> dict[str, Figure]:
     """Return all figures of a validation by name."""
     return {
         "steps": draw_steps(validation.steps),
-        "rollouts": draw_rollouts(validation.rollouts),
         "thrust": draw_thrust(validation.thrust),
-        "open_force": draw_open_force(validation.open_force),
     }

@@ -78,9 +78,7 @@ def _are_sticks(values: np.ndarray) -> np.ndarray:
 def save_script(path: str | Path, script: Script) -> None:
     """Write a script to an ``.npz`` file, atomically; the same script gives the same bytes.
 
-    Raises:
-        ScriptError: another suffix, or a script that ``load_script`` would refuse.
-        OSError: what the system says.
+    Raises ScriptError for one that ``load_script`` would refuse, OSError for a file that cannot be written.
     """
     check_name(path)
     check_script(script, str(path))
@@ -96,11 +94,7 @@ def check_name(path: str | Path) -> None:
 
 
 def load_script(path: str | Path) -> Script:
-    """Return the script in an ``.npz`` file. Nothing is unpickled.
-
-    Raises:
-        ScriptError: a file that cannot be read, or no script that can be flown; the message says why.
-    """
+    """Return the script in an ``.npz`` file, or raise ScriptError. Nothing is unpickled."""
     check_name(path)
     try:
         arrays = load_npz(Path(path), LARGEST_BYTES)

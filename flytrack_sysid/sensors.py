@@ -21,10 +21,9 @@ LOST_ROWS = 0.02  # share, at level 1
 
 
 def specific_force_b(log: FlightLog, gravity: float) -> np.ndarray:
-    """Return the specific force of the step to each row in the attitude before it, body, m/s^2.
+    """Return the specific force of the step to each row, body axes before it, (num_rows, 3) m/s^2.
 
-    (num_rows, 3); in the first row of a segment, where no step is known, in its own attitude. Needs the
-    channels a and q. gravity: m/s^2.
+    In the first row of a segment, where no step is known, in its own attitude. gravity: m/s^2.
     """
     before = np.arange(len(log)) - np.where(log.is_start(), 0, 1)
     attitude = Rotation.from_quat(log["q"][before], scalar_first=True)

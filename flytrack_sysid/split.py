@@ -32,8 +32,7 @@ def blocks_of(log: FlightLog) -> np.ndarray:
 def held_out_rows(log: FlightLog, every: int = HELD_OUT_EVERY) -> np.ndarray:
     """Return which rows are held out, (num_rows,) bool: the last of every ``every`` blocks; none if 0.
 
-    Raises:
-        ValueError: ``every`` is 1, which leaves nothing, or negative.
+    Raises ValueError for 1, which leaves nothing, and below 0.
     """
     if every == 1 or every < 0:
         raise ValueError(f"every: found {every}, expected 0, 2, 3, ...")

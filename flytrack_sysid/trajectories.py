@@ -65,10 +65,7 @@ def trajectories_of(
     """Return the trajectories of a log: measured, and one of each model that can fly it.
 
     models: by the names to show. residuals: of these models (``traces``), if they are known. Of more than
-    6000 rows every n-th is shown.
-
-    Raises:
-        RecordingError: a log without rows or without attitude.
+    6000 rows every n-th is shown. Raises RecordingError for a log without rows or without attitude.
     """
     if not len(log) or "q" not in log:
         content = f"channels {', '.join(log.channels)}" if len(log) else "no rows"

@@ -11,7 +11,7 @@ from flytrack_env.files import write_atomically
 from flytrack_sysid.forces import OpenForce, ThrustError
 from flytrack_sysid.log import FlightLog
 from flytrack_sysid.page import Bullets, Picture, Section, Table, Text, page
-from flytrack_sysid.plots import draw_validation, png_of, speed_text
+from flytrack_sysid.plots import draw_validation, png_of
 from flytrack_sysid.prediction_errors import NORMALISED_BY, NRMSE_MEANING, QUANTITIES, START_EVERY_S, UNITS
 from flytrack_sysid.validate import NAMES, Validation
 
@@ -25,9 +25,7 @@ HEADINGS = {
 }
 CAPTIONS = {
     "steps": "Body rates, measured (solid) and of the model flying by itself from 0.1 s before the command.",
-    "rollouts": "Errors of the model flying by itself under the logged commands, over all starts.",
     "thrust": "Mass times specific force along body z: mean error by applied action and voltage.",
-    "open_force": "Specific force, measured minus modelled. Diamonds above 0: drag that the model lacks.",
 }
 
 
@@ -76,7 +74,8 @@ def _force_table(force: OpenForce) -> Table:
     rows = []
     for part in force.by_speed:
         numbers = (part.rms, *part.rms_b, part.mean_against_velocity)
-        rows.append([speed_text(part), *(_number(number) for number in numbers), str(part.count)])
+        speed = f"{part.low:g} to {part.high:g}" if np.isfinite(part.high) else f"over {part.low:g}"
+        rows.append([speed, *(_number(number) for number in numbers), str(part.count)])
     caption = f"Specific force not explained, m/s^2, by speed in m/s, measured with {force.source}"
     return Table(["speed", "rms", "x", "y", "z", "drag-like mean", "steps"], rows, caption)
 
@@ -140,23 +139,17 @@ def html_of(validation: Validation, model_name: str, log: FlightLog, pictures: d
         parts += [tables[name]] if name in tables else []
         if name == "one_step":
             parts += [Text(meaning) for meaning in _nrmse_meanings(validation)]
-        sections.append(Section(heading, parts))
+        sections.append(Section(heading, parts or [Text("Not judged; see the notes.")]))
     introduction: list[Any] = [Text(_head(validation, model_name, log))]
     if validation.notes:
-        introduction += [
-            Text("What the log lacks, and what was assumed:"),
-            Bullets(validation.notes),
-        ]
+        introduction += [Text("What the log lacks, and what was assumed:"), Bullets(validation.notes)]
     return page(f"Validation of {model_name}", sections, introduction)
 
 
 def write_validation(out: str | Path, validation: Validation, model_name: str, log: FlightLog) -> list[Path]:
     """Write validation.json, .txt and .html and the figures into a folder; return their paths.
 
-    Everything is computed before the first file is written, each under a temporary name and renamed.
-
-    Raises:
-        OSError: a file cannot be written.
+    Everything is computed before the first file is written.
     """
     pictures = {name: png_of(figure) for name, figure in draw_validation(validation).items()}
     numbers = {"model": model_name, "log": log.source, "log_sha256": log.sha256, **validation.as_json()}

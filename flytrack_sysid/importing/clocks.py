@@ -184,9 +184,8 @@ def align_clocks(log: FlightLog, correct: bool = True) -> tuple[FlightLog, tuple
     """Return a log with its sensors on one clock, and the offset of each pair that can be compared.
 
     Offsets above three standard errors and a tenth of the log's step are corrected by reading the channel
-    later (interpolated along the straight line or the shortest arc); others are only reported, and so are
-    all without ``correct``. Rates, specific force and commands count as one clock: nothing in a log tells
-    them apart.
+    later, interpolated; others, and all without ``correct``, are only reported. Rates, specific force and
+    commands count as one clock.
     """
     aligned, found = log, []
     for channel, reference, needed, sums, rates in PAIRS:

@@ -17,9 +17,7 @@ LONGEST_LIST = 1000  # characters of a header in a message
 def read_csv(path: Path, mapping: Mapping) -> ImportedFlight:
     """Return the flight in a CSV file with a header, by a mapping; SI units and our frames.
 
-    Raises:
-        LogError: a mapping without columns; a file that cannot be read; a missing column; a cell that is no
-            number, or a value that no log can have. The message names file, row, line and column.
+    Raises LogError, whose message names file, row, line and column.
     """
     if not mapping.channels:
         raise LogError(f"{path}: {mapping.source} names no columns; a CSV file needs [time] and [command]")

@@ -30,10 +30,8 @@ def limits_of(num_bytes: int) -> sandbox.ResourceLimits:
 def decode(source: str, format_name: str, path: Path, *rest: Any) -> tuple[Any, list[np.ndarray]]:
     """Return the notes and arrays that a format's decoder (``decoders.py``) finds in a file.
 
-    source: the file, for messages. rest: the decoder's arguments after the path.
-
-    Raises:
-        LogError: its package is not installed, or it cannot decode the file; the message says why.
+    source: the file, for messages. rest: the decoder's arguments after the path. Raises LogError if the
+    package is not installed, or cannot decode the file.
     """
     try:
         check_installed("logs", f"{format_name} logs", PACKAGES[format_name])

@@ -38,10 +38,7 @@ class Craft(NamedTuple):
 
         Assumption: the nominal craft's lags, and its thrust-to-weight ratios at the same fractions of the
         highest voltage: thrust scales with the mass, and a volt counts for more where there are fewer.
-        source: the log or mapping, for messages.
-
-        Raises:
-            LogError: full-stick rates, mass or voltage are unknown.
+        Raises LogError, with ``source``, where full-stick rates, mass or voltage are unknown.
         """
         if self.max_rate_deg_s is None or self.mass_kg is None or self.voltage_v is None:
             name = next(name for name, value in self._asdict().items() if value is None)

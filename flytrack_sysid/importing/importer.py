@@ -47,11 +47,7 @@ class Imported(NamedTuple):
     problems: tuple[str, ...]
 
     def nominal_model(self) -> ModelParameters:
-        """Return the generic quadcopter scaled to this craft: where a fit may start.
-
-        Raises:
-            LogError: full-stick rates, mass or voltage are unknown.
-        """
+        """Return the generic quadcopter scaled to this craft, where a fit may start, or raise LogError."""
         return self.craft.nominal_model(self.log.source)
 
     def describe(self) -> str:
@@ -67,11 +63,7 @@ class Imported(NamedTuple):
         return "\n".join(lines)
 
     def save_details(self, path: str | Path) -> None:
-        """Write what the log itself cannot hold as JSON: sources, craft, clocks, notes, problems.
-
-        Raises:
-            OSError: the file cannot be written.
-        """
+        """Write what the log itself cannot hold as JSON: sources, craft, clocks, notes, problems."""
         document = {
             "sha256": self.log.sha256,
             "sources": self.sources,

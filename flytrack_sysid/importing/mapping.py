@@ -171,9 +171,7 @@ def _bound(above: float) -> str:
 def load_mapping(where: str | Path) -> Mapping:
     """Return the mapping in a TOML file, or the shipped one of that name (without ``.toml``).
 
-    Raises:
-        LogError: a file that cannot be read, or a field that is missing, unknown or out of range; the
-            message names file, table and field, found and expected.
+    Raises LogError, whose message names file, table and field, found and expected.
     """
     path, shipped = Path(where), SHIPPED / f"{where}.toml"
     if not path.exists() and path.name == str(where) and shipped.is_file():

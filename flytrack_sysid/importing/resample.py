@@ -15,7 +15,7 @@ def is_increasing(times: np.ndarray) -> np.ndarray:
 def _brackets(times: np.ndarray, at: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the rows before and after each of the times ``at``, and whether both are near, (num_at,) each.
 
-    times: increasing. Near: at most three usual steps of the channel lie between the two rows.
+    Near: at most three usual steps of the channel lie between the two rows.
     """
     after = np.clip(np.searchsorted(times, at, side="left"), 1, max(len(times) - 1, 1))
     if len(times) < 2:
