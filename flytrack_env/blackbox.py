@@ -33,11 +33,14 @@ from flytrack_env import artifact, sandbox
 from flytrack_env.dynamics import ModelParameters
 from flytrack_env.files import read_at_most
 from flytrack_env.plants import Plant
-from flytrack_env.quaternion import Quaternion, Scalar, Vec3
+from flytrack_env.quaternion import Scalar
 from flytrack_env.sandbox import ResourceLimits, SandboxError
 from flytrack_env.state import (
     ACTION_SIZE,
+    APPLIED_ACTION,
+    BATTERY,
     BATTERY_FULL_V,
+    QUATERNION,
     RATES,
     STATE_SIZE,
     Action,
@@ -68,20 +71,11 @@ class BlackBoxError(ValueError):
     """A black box that cannot be used; the message names file, what was found and expected."""
 
 
-def start_vector() -> jax.Array:
+def start_vector() -> np.ndarray:
     """Return the handout's start state, (21,): all 0 but q = (1, 0, 0, 0), no thrust, 24 V."""
-    zero = Vec3(0.0, 0.0, 0.0)
-    return pack(
-        Drone(
-            pos_w=zero,
-            vel_w=zero,
-            acc_w=zero,
-            quat=Quaternion(1.0, 0.0, 0.0, 0.0),
-            rates_b=zero,
-            applied=Action(0.0, 0.0, 0.0, -1.0),
-            battery_v=BATTERY_FULL_V,
-        )
-    )
+    start = np.zeros(STATE_SIZE, np.float32)
+    start[QUATERNION], start[APPLIED_ACTION], start[BATTERY] = (1, 0, 0, 0), (0, 0, 0, -1), BATTERY_FULL_V
+    return start
 
 
 def _mapped(exported: export.Exported) -> Callable[[jax.Array, jax.Array], jax.Array]:
@@ -169,7 +163,7 @@ class BlackBox(Plant):
 def _check(content: bytes, limits: ResourceLimits | None) -> None:
     """Raise ArtifactError or SandboxError unless a file's bytes are a plant."""
     digest = hashlib.sha256(content).hexdigest()
-    start = np.asarray(start_vector())
+    start = start_vector()
     starts = [start.tolist(), start[_REDUCED].tolist()]
     if limits is None or digest == SHIPPED_SHA256:
         artifact.check(content, starts, ACTION_SIZE, is_trusted=limits is None)
@@ -186,9 +180,8 @@ def load(
 ) -> BlackBox:
     """Return the plant in a file; see the module's description for what a file may hold, and the risks.
 
-    max_rate: deg/s, body rates at full stick, used with 18-component artifacts only. limits: of the trial; a
-    large plant may need more. None: no trial, and calls of native code are allowed; only for files from
-    people whose programs you would run.
+    max_rate: deg/s, body rates at full stick, used with 18-component artifacts only. limits: of the trial.
+    None: no trial, and native calls are allowed; only for files from people whose programs you would run.
 
     Raises:
         BlackBoxError: missing, unreadable, too large, damaged, for another platform, of another signature,

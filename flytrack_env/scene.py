@@ -3,6 +3,7 @@
 from typing import NamedTuple
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from flytrack_env.quaternion import Scalar
 from flytrack_env.tracks import Course
@@ -82,26 +83,19 @@ def squares(centres: np.ndarray, first: np.ndarray, second: np.ndarray, half_edg
 
 def rotations(quaternions: np.ndarray) -> np.ndarray:
     """Return the rotation matrices (..., 3, 3), body to world, of unit quaternions (..., 4), scalar first."""
-    w, x, y, z = np.moveaxis(np.asarray(quaternions, float), -1, 0)
-    rows = (
-        (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
-        (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
-        (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
-    )
-    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+    return Rotation.from_quat(np.roll(quaternions, -1, axis=-1)).as_matrix()
 
 
-def ground_grid(low: np.ndarray, high: np.ndarray, spacing_m: float) -> np.ndarray:
-    """Return the lines of a grid on the floor of a box from low to high, (n, 2, 3), world, m."""
+def ground_grid(low: np.ndarray, high: np.ndarray, spacing_m: float) -> list[np.ndarray]:
+    """Return the lines of a grid in a rectangle from low to high, (2,) each; a line: (2, 2), world, m."""
     lines = []
-    for axis, other in ((0, 1), (1, 0)):
+    for axis in (0, 1):
         first, last = np.ceil(low[axis] / spacing_m), np.floor(high[axis] / spacing_m)
         for place in spacing_m * np.arange(first, last + 1):
-            line = np.full((2, 3), low[2])
+            line = np.array([low, high])
             line[:, axis] = place
-            line[:, other] = low[other], high[other]
             lines.append(line)
-    return np.array(lines).reshape(-1, 2, 3)
+    return lines
 
 
 def _speed_table() -> list[Colour]:

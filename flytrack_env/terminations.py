@@ -5,7 +5,6 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from flytrack_env.quaternion import Vec3
 from flytrack_env.state import BATTERY_EMPTY_V, Drone
 from flytrack_env.tracks import Course
 
@@ -29,38 +28,24 @@ class Causes(NamedTuple):
         return self.crash | self.ground | self.out_of_bounds | self.missed_gate | self.battery_empty
 
 
-def is_below_ground(pos_w: Vec3, course: Course) -> jax.Array:
-    """Return whether a position is below the floor of the bounds, a bool scalar."""
-    return jnp.asarray(pos_w.z < course.bounds_low.z)
+def find_causes(drone: Drone, course: Course, is_crash: jax.Array, is_missed: jax.Array) -> Causes:
+    """Return the causes of termination after a step.
 
-
-def is_out_of_bounds(pos_w: Vec3, course: Course) -> jax.Array:
-    """Return whether a position is beyond the walls or the ceiling, or is not a number; a bool scalar."""
-    low, high = course.bounds_low, course.bounds_high
-    is_inside = (
+    is_crash, is_missed: from the gate's crossing, bool scalars.
+    """
+    pos_w, low, high = drone.pos_w, course.bounds_low, course.bounds_high
+    is_below = jnp.asarray(pos_w.z < low.z)
+    is_inside = (  # not if a coordinate is NaN
         (pos_w.x >= low.x)
         & (pos_w.x <= high.x)
         & (pos_w.y >= low.y)
         & (pos_w.y <= high.y)
         & (pos_w.z <= high.z)
     )
-    return ~jnp.asarray(is_inside)
-
-
-def is_battery_empty(drone: Drone) -> jax.Array:
-    """Return whether the battery is below its valid range, a bool scalar."""
-    return jnp.asarray(drone.battery_v < BATTERY_EMPTY_V)
-
-
-def find_causes(drone: Drone, course: Course, is_crash: jax.Array, is_missed: jax.Array) -> Causes:
-    """Return the causes of termination after a step.
-
-    is_crash, is_missed: from the gate's crossing, bool scalars.
-    """
     return Causes(
         crash=jnp.asarray(is_crash),
-        ground=is_below_ground(drone.pos_w, course),
-        out_of_bounds=is_out_of_bounds(drone.pos_w, course),
+        ground=is_below,
+        out_of_bounds=~jnp.asarray(is_inside),
         missed_gate=jnp.asarray(is_missed),
-        battery_empty=is_battery_empty(drone),
+        battery_empty=jnp.asarray(drone.battery_v < BATTERY_EMPTY_V),
     )

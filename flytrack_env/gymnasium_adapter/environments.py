@@ -94,15 +94,12 @@ def box(space: Any) -> gymnasium.spaces.Box:
 class FlyTrackEnv(_Adapter, gymnasium.Env[np.ndarray, np.ndarray]):
     """One environment of an id, stepped as one compiled function.
 
-    Args:
-        env_id: an id of ``flytrack_env.registration.ENVIRONMENTS``.
-        render_mode: None, "rgb_array" or "human".
-        params: replace the environment's default parameters.
-        overrides: further arguments of ``flytrack_env.make``: track, model, plant, missed_gate, reward.
+    env_id: of ``flytrack_env.registration.ENVIRONMENTS``. render_mode: None, "rgb_array" or "human". params:
+    replace the default parameters. overrides: further arguments of ``flytrack_env.make``: track, model,
+    plant, missed_gate, reward.
 
     Raises:
-        ValueError: what ``flytrack_env.make`` and ``check_params`` refuse, or an unknown render mode.
-        TypeError: params of another type.
+        ValueError, TypeError: what ``flytrack_env.make`` and ``check_params`` refuse, or a render mode.
         ImportError: a render mode whose package is not installed.
     """
 
@@ -195,18 +192,7 @@ class FlyTrackVectorEnv(_Adapter, gymnasium.vector.VectorEnv[np.ndarray, np.ndar
     What ``gymnasium.vector.SyncVectorEnv`` with ``AutoresetMode.SAME_STEP`` returns, in the same types:
     new, writable arrays in every step.
 
-    Args:
-        env_id: an id of ``flytrack_env.registration.ENVIRONMENTS``.
-        num_envs: how many.
-        render_mode: None or "rgb_array".
-        params: replace the environment's default parameters.
-        overrides: further arguments of ``flytrack_env.make``: track, model, plant, missed_gate, reward.
-
-    Raises:
-        ValueError: what ``flytrack_env.make`` and ``check_params`` refuse, an unknown render mode, or no
-            environments.
-        TypeError: params of another type.
-        ImportError: a render mode without Pillow.
+    render_mode: None or "rgb_array". Other arguments and errors are those of ``FlyTrackEnv``.
     """
 
     metadata: dict[str, Any] = {  # noqa: RUF012  # as Gymnasium declares it
@@ -234,7 +220,7 @@ class FlyTrackVectorEnv(_Adapter, gymnasium.vector.VectorEnv[np.ndarray, np.ndar
         self._states: Any = None
         self._words = np.zeros(0, np.uint32)
         self._count = 0
-        self._logs: list[FlightLog] = []
+        self._logs = [FlightLog(1.0)] * num_envs
 
     def reset(
         self,
@@ -313,11 +299,8 @@ class FlyTrackVectorEnv(_Adapter, gymnasium.vector.VectorEnv[np.ndarray, np.ndar
 
     def _log(self, scenes: np.ndarray, has_begun: np.ndarray) -> None:
         """Log what pictures need, in new logs where episodes began."""
-        step_s = float(self._simulation.params.dt)
-        logs = self._logs or [FlightLog(step_s)] * self.num_envs
-        self._logs = [
-            FlightLog(step_s) if is_new else log for log, is_new in zip(logs, has_begun.tolist(), strict=True)
-        ]
+        for place in np.flatnonzero(has_begun):
+            self._logs[place] = FlightLog(float(self._simulation.params.dt))
         for log, scene in zip(self._logs, scenes, strict=True):
             log.append(scene)
 

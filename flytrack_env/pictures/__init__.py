@@ -33,7 +33,6 @@ VIEWS = ("top", "side", "commands")
 
 
 def _load(name: str, extra: str, library: str) -> ModuleType:
-    """Return a module that needs a library of an extra; raises ImportError if that is not installed."""
     check_installed(extra, "pictures of flights" if extra == "viz" else "videos of flights", library)
     return importlib.import_module(f"flytrack_env.{name}")
 
@@ -54,9 +53,8 @@ def write_pictures(flights: Sequence[Flight], folder: str | Path) -> list[Path]:
     Of several flights also ``comparison_top.png``. All are drawn before the first is written.
 
     Raises:
-        ImportError: matplotlib is not installed.
+        ImportError, OSError: matplotlib is not installed, or a file cannot be written.
         ValueError: several flights on several tracks.
-        OSError: a file cannot be written; nothing half-written is left.
     """
     figures = {
         f"{flight.name}_{name}": figure for flight in flights for name, figure in draw_flight(flight).items()
@@ -76,8 +74,7 @@ def write_video(flight: Flight, folder: str | Path) -> Path:
     Else the first lap; without a complete lap the flight, up to 20 s.
 
     Raises:
-        ImportError: moviepy or Pillow is not installed.
-        OSError: the file cannot be written; nothing half-written is left.
+        ImportError, OSError: moviepy or Pillow is not installed, or the file cannot be written.
     """
     path = Path(folder) / f"{flight.name}.mp4"
     _load("pictures.video", "render", "moviepy").write_video(flight, path)
@@ -90,9 +87,8 @@ def write_animation(flight: Flight, reference: Reference, folder: str | Path) ->
     reference: a time-optimal flying lap of the same track.
 
     Raises:
-        ImportError: moviepy or Pillow is not installed.
+        ImportError, OSError: matplotlib or moviepy is not installed, or the file cannot be written.
         ValueError: a flight without a complete flying lap.
-        OSError: the file cannot be written; nothing half-written is left.
     """
     path = Path(folder) / f"{flight.name}.gif"
     make_gif = _load("pictures.animation", "render", "moviepy").make_gif

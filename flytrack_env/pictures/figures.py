@@ -37,7 +37,6 @@ LINES = ("-", "--", ":", "-.")
 WIDTHS_IN = (10.0, 24.0)
 METRE_IN, SIDE_IN = 0.05, 3.6  # width of a metre flown; height of the side view
 GATE_IN, GATES_TITLE_IN = 1.25, 0.5
-MOST_LABELLED = 3
 SECOND_IN, COMMANDS_IN = 0.9, 8.0  # width of a second; height of the commands
 MARKS: dict[str, Any] = {
     "gate passed": {"color": "0.7", "lw": 0.9},
@@ -194,9 +193,6 @@ def _draw_front(panel: Axes, gate: Gate, meetings: list[Meeting], top: float) ->
             [one.speed_m_s for one in shown], marker=marker, edgecolors="black", linewidths=0.6,
             vmin=0.0, vmax=top,
         )  # fmt: skip
-    for one in [one for one in meetings if one.outcome != PASSED][:MOST_LABELLED]:
-        place = (one.right_m, one.up_m)
-        panel.annotate(f"lap {one.lap}", place, (7, 2), textcoords="offset points", fontsize="small")
     reach = AROUND * max([0.5 * gate.frame, *(max(abs(one.right_m), abs(one.up_m)) for one in meetings)])
     num_passed = sum(one.outcome == PASSED for one in meetings)
     panel.set(aspect="equal", xlim=(-reach, reach), ylim=(-reach, reach))

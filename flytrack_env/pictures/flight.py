@@ -22,7 +22,7 @@ class Meeting(NamedTuple):
 
     outcome: PASSED, TOUCHED or MISSED. gate: index in flying order. time_s: since the first state.
     distance_m: flown until then. pos_w: where, (3,), world, m. right_m, up_m: off the gate's centre, as the
-    drone comes to it. speed_m_s: before it. lap: in which, counted from 1.
+    drone comes to it. speed_m_s: before it.
     """
 
     outcome: str
@@ -33,7 +33,6 @@ class Meeting(NamedTuple):
     right_m: float
     up_m: float
     speed_m_s: float
-    lap: int
 
 
 class Flight(NamedTuple):
@@ -131,7 +130,6 @@ def _meetings(
             right_m=float(-off.y),
             up_m=float(off.z),
             speed_m_s=float(np.linalg.norm(states[step, VELOCITY])),
-            lap=int(race.laps[step]) + 1,
         )
 
     return tuple(meeting(*one) for one in sorted(found, key=lambda one: one[2]))

@@ -1,8 +1,7 @@
 """A lap as an MP4, drawn as the Gymnasium environments draw it."""
 
 import itertools
-import os
-import secrets
+import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -10,6 +9,7 @@ import imageio_ffmpeg
 import numpy as np
 from moviepy.video.io.ffmpeg_writer import FFMPEG_VideoWriter
 
+from flytrack_env.files import write_atomically
 from flytrack_env.flown_race import STEP_S
 from flytrack_env.pictures.flight import Flight
 from flytrack_env.rendering import FlightLog, make_renderer
@@ -55,20 +55,11 @@ def scene_rows(flight: Flight) -> np.ndarray:
 
 
 def write_video(flight: Flight, path: Path) -> None:
-    """Write the MP4 under a temporary name and rename it; makes missing folders.
-
-    Raises:
-        OSError: the file cannot be written; nothing half-written is left.
-    """
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.stem}.{secrets.token_hex(8)}.mp4")  # ffmpeg goes by the ending
-    temporary.touch(exist_ok=False)
-    try:
+    """Write the MP4, atomically; raises OSError if it cannot be written."""
+    with tempfile.TemporaryDirectory() as folder:
+        temporary = Path(folder) / path.name
         _encode(flight, shown_rows(flight), temporary)
-        os.replace(temporary, path)
-    except BaseException:
-        temporary.unlink(missing_ok=True)
-        raise
+        write_atomically(path, temporary.read_bytes())
 
 
 def _frames(flight: Flight, rows: range) -> Iterator[np.ndarray]:

@@ -70,7 +70,7 @@ class Renderer:
 
     def _draw_course(self, low: np.ndarray, high: np.ndarray) -> None:
         draw = ImageDraw.Draw(self.empty)
-        for line in ground_grid(low, high, GRID_M * np.ceil((high - low)[:2].max() / WIDE_M)):
+        for line in ground_grid(low[:2], high[:2], GRID_M * np.ceil((high - low)[:2].max() / WIDE_M)):
             draw.line(self._pairs(line), scene.GRID, PIXEL)
         corners = np.array([low[:2], (high[0], low[1]), high[:2], (low[0], high[1]), low[:2]])
         draw.line(self._pairs(corners), scene.BOUNDS, PIXEL)

@@ -135,16 +135,9 @@ def _write(track: Track) -> str:
         f"high = {list(track.bounds_high)}",
     ]
     for gate in track.gates:
-        lines += [
-            "",
-            "[[gates]]",
-            f"id = {gate.id}",
-            f"position = {list(gate.position)}",
-            f"quaternion = {list(gate.quaternion)}",
-            f'direction = "{signs[gate.direction]}"',
-            f"opening = {gate.opening}",
-            f"frame = {gate.frame}",
-        ]
+        values = {**vars(gate), "direction": f'"{signs[gate.direction]}"'}
+        fields = (f"{field} = {list(x) if isinstance(x, tuple) else x}" for field, x in values.items())
+        lines += ["", "[[gates]]", *fields]
     return "\n".join(lines) + "\n"
 
 

@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import rerun as rr
+from scipy.spatial.transform import Rotation
 
 from flytrack_env import scene
 from flytrack_env.flown_race import FlownRace
@@ -76,8 +77,9 @@ def plots_of(trajectory: Trajectory, race: FlownRace | None) -> list[Plot]:
     for column, name in enumerate(Action._fields):
         plots.append(Plot(f"action/{name}", f"{name} action", trajectory.actions[:, column]))
         plots.append(Plot(f"applied/{name}", f"{name} applied", applied[:, column]))
-    angles_deg = _angles_deg(states[:, QUATERNION])
-    for name, values in zip(("roll", "pitch", "yaw"), angles_deg.T, strict=True):
+    attitudes = Rotation.from_quat(np.roll(states[:, QUATERNION], -1, axis=1))
+    angles_deg = np.unwrap(attitudes.as_euler("ZYX", degrees=True), period=360.0, axis=0)
+    for name, values in zip(("yaw", "pitch", "roll"), angles_deg.T, strict=True):
         plots.append(Plot(f"orientation/{name}", f"{name} [deg]", values))
     if race is not None:
         plots.append(Plot("gate_distance", "distance to the next gate [m]", race.gate_distance_m))
@@ -86,15 +88,6 @@ def plots_of(trajectory: Trajectory, race: FlownRace | None) -> list[Plot]:
         size = np.linalg.norm(forces_w, axis=1)
         plots.append(Plot(path, f"force not explained by {name} [m/s²]", size, name))
     return plots
-
-
-def _angles_deg(quaternions: np.ndarray) -> np.ndarray:
-    """Return roll, pitch and yaw of quaternions (T, 4), (T, 3) deg, in the order z, y, x, without jumps."""
-    w, x, y, z = quaternions.T
-    roll = np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
-    pitch = np.arcsin(np.clip(2 * (w * y - z * x), -1.0, 1.0))
-    yaw = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
-    return np.degrees(np.stack([np.unwrap(roll), pitch, np.unwrap(yaw)], axis=1))
 
 
 class Writer:

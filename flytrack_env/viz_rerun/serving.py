@@ -11,7 +11,6 @@ from typing import Any, NoReturn
 
 from rerun.chunk import RrdReader
 
-MAGIC = b"RRF"  # what every recording begins with
 HOST = "127.0.0.1"
 ENDING = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name))
 
@@ -23,13 +22,12 @@ class ServeError(ValueError):
 def check_recording(path: str | Path) -> None:
     """Raise ServeError for a file that is no recording."""
     try:
-        with Path(path).open("rb") as file:
-            found = file.read(len(MAGIC))
-        is_recording = found == MAGIC and len(RrdReader(path).recordings()) > 0
+        with Path(path).open("rb"):  # for the operating system's own message
+            recordings = RrdReader(path).recordings()
     except Exception as error:  # OSError, or whatever the reader raises
         raise ServeError(f"{path}: cannot be read: {error}; expected a recording (.rrd)") from error
-    if not is_recording:
-        raise ServeError(f"{path}: found a file that begins with {found!r}, expected a recording (.rrd)")
+    if not recordings:
+        raise ServeError(f"{path}: found no flights, expected a recording (.rrd)")
 
 
 def bind_port(port: int) -> int:
