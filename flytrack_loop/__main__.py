@@ -5,8 +5,12 @@ again and flies again. Prints before and after; writes logs, models, diagnosis, 
 ``loop.json``.
 """
 
-import argparse
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
+
+import tyro
 
 from baselines.purejaxrl_ppo import Config
 from flytrack_env import blackbox
@@ -15,38 +19,42 @@ from flytrack_loop.loop import Settings, close_loop
 from flytrack_loop.report import describe, write_flights
 
 
-def main(arguments: list[str] | None = None) -> int:
-    """Parse the command line, close the loop, print before and after."""
-    parser = argparse.ArgumentParser(prog="python -m flytrack_loop", description=__doc__)
-    parser.add_argument("--black-box", type=Path, required=True)
-    parser.add_argument("--out", type=Path, help="folder (default: runs/loop_NAME, or the next free one)")
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument(
-        "--total-timesteps", type=float, default=Config.total_timesteps, help="of each training"
-    )
-    defaults = Settings()
-    parser.add_argument("--minutes", type=float, default=defaults.minutes, help="of excitation")
-    parser.add_argument(
-        "--log-seconds", type=float, default=defaults.log_seconds, help="of the policy's flights in the log"
-    )
-    parser.add_argument(
-        "--noise",
-        type=float,
-        default=defaults.noise,
-        help="of the sensors in all logs: 0 none, 1 common ones",
-    )
-    given = parser.parse_args(arguments)
-    settings = Settings(given.minutes, given.log_seconds, given.noise)
-    try:
-        plant = blackbox.load(given.black_box)
-        out = given.out or fresh_folder(Path("runs") / f"loop_{given.black_box.stem}")
-        config = Config(total_timesteps=int(given.total_timesteps))
-        loop = close_loop(plant, out, config, given.seed, settings)
-        files = write_flights(out, loop, plant, given.seed)
-    except (ValueError, OverflowError, OSError) as error:
-        parser.error(str(error))
+@dataclass(frozen=True)
+class Command:
+    """Identify a black box, train, fly, diagnose the flight, extend the model, train and fly again."""
+
+    black_box: Path
+    """The plant (.bin)."""
+    out: Path | None = None
+    """Folder to write to (default: runs/loop_NAME, or the next free name)."""
+    seed: int = 0
+    """Seed of flights and trainings."""
+    total_timesteps: float = Config.total_timesteps
+    """Environment steps of each training."""
+    settings: Settings = field(default_factory=Settings)
+
+
+def _run(command: Command) -> None:
+    """Close the loop and print before and after; raises OSError or ValueError for what cannot be used."""
+    plant = blackbox.load(command.black_box)
+    out = command.out or fresh_folder(Path("runs") / f"loop_{command.black_box.stem}")
+    config = Config(total_timesteps=int(command.total_timesteps))
+    loop = close_loop(plant, out, config, command.seed, command.settings)
+    files = write_flights(out, loop, plant, command.seed)
     print(describe(loop))
     print(f"written: {out}/ with loop.json, diagnosis/report.html, {', '.join(one.name for one in files)}")
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Close the loop from the command line; return the exit status."""
+    command = tyro.cli(
+        Command, args=arguments, prog="python -m flytrack_loop", config=[tyro.conf.OmitArgPrefixes]
+    )
+    try:
+        _run(command)
+    except (OSError, OverflowError, ValueError) as error:
+        print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
+        return 2
     return 0
 
 

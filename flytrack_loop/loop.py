@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -23,16 +24,16 @@ SCHEMA = 1
 STREAMS = ("collect", "train", "race_log", "held_out_log", "evaluation")
 
 
-class Settings(NamedTuple):
-    """What the loop flies and how it is measured.
-
-    minutes: of excitation. log_seconds: of the policy's own flights in the log that is diagnosed. noise: of
-    the sensors in all logs, 0 none, 1 common ones. The policy itself observes the plant's state.
-    """
+@dataclass(frozen=True)
+class Settings:
+    """What the loop flies and how noisy its logs are. The policy itself observes the plant's state."""
 
     minutes: float = 2.0
+    """Minutes of excitation."""
     log_seconds: float = 60.0
+    """Seconds of the policy's own flights in the log that is diagnosed."""
     noise: float = 1.0
+    """Noise of the sensors in all logs: 0 none, 1 that of common sensors."""
 
 
 class Loop(NamedTuple):
@@ -62,7 +63,7 @@ def close_loop(
     out: Path,
     config: Config = Config(),  # noqa: B008, a frozen dataclass
     seed: int = 0,
-    settings: Settings = Settings(),  # noqa: B008, a tuple of constants
+    settings: Settings = Settings(),
     report: Callable[[str], None] = print,
 ) -> Loop:
     """Close the loop on a plant; write logs, models, diagnosis, trainings and ``loop.json`` into ``out``.
