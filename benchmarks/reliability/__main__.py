@@ -1,4 +1,4 @@
-"""Reliability: ``python -m benchmarks.reliability simulation|files [--share 1]``.
+"""Reliability: ``python -m benchmarks.reliability simulation|training|files [--share 1]``.
 
 Each part's result is kept in ``docs/results/reliability_<part>.json``; the page is written from all of them.
 ``--share 0.01`` measures a hundredth. Exits with 1 if a promise was broken.
@@ -8,10 +8,10 @@ import argparse
 import json
 from pathlib import Path
 
-from benchmarks.reliability import files, simulation
+from benchmarks.reliability import files, simulation, training
 from benchmarks.report import RESULTS, command_line, page, provenance, provenance_line, write_json, write_page
 
-PARTS = {"simulation": simulation, "files": files}
+PARTS = {"simulation": simulation, "training": training, "files": files}
 
 
 def page_of(folder: Path) -> str:

@@ -1,0 +1,137 @@
+"""How fast racing is learnt from scratch: ``python -m benchmarks.learning_curve [--seeds 5]``.
+
+Trains the default recipe, or that of --config, on FlyTrack-v0, one seed after the other, and every half a
+million environment steps flies 256 noisy starts over 3 laps in the simulator. What counts is from when on
+95 % of them finish and do so at every later evaluation. CPU seconds are those of training
+alone, without compilation and evaluations. Writes a page and a chart.
+"""
+
+import argparse
+import time
+from pathlib import Path
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from baselines.purejaxrl_ppo import Config
+from baselines.purejaxrl_ppo.config import settings_in_file
+from baselines.purejaxrl_ppo.flights import race_many, score, start_keys
+from baselines.purejaxrl_ppo.run import is_due
+from baselines.purejaxrl_ppo.training import Trainer
+from benchmarks import report
+from flytrack_env.files import write_atomically
+from flytrack_env.pictures.drawing import new_figure, png_of
+
+TARGET_SUCCESS = 0.95
+AIM_STEPS, AIM_CPU_S = 8_000_000, 25.0
+EVERY = 500_000  # environment steps
+NUM_EPISODES, NUM_LAPS, NUM_STEPS = 256, 3, 2500
+EVALUATION_SEED = 30_000
+HEADER = (
+    "seed | 95 % held from (M steps) | CPU s until then | CPU s of the whole run | success at the end | "
+    "first lap (s) | flying lap (s)"
+)
+
+
+class Point(NamedTuple):
+    """One evaluation: environment steps and CPU seconds of training so far, and how it flies."""
+
+    steps: int
+    cpu_s: float
+    success: float
+    first_lap_s: float
+    flying_lap_s: float
+
+
+def evaluate(trainer: Trainer, policy_params: object, steps: int, cpu_s: float) -> Point:
+    """Return how a policy flies noisy starts."""
+    keys = start_keys(EVALUATION_SEED, NUM_EPISODES)
+    result = score(race_many(trainer.env, trainer.network, policy_params, keys, NUM_STEPS, NUM_LAPS))
+    return Point(steps, cpu_s, result.success, result.first_lap_s, result.flying_lap_s)
+
+
+def train(trainer: Trainer, seed: int) -> list[Point]:
+    """Train one seed; return its evaluations."""
+    config = trainer.config
+    runner = trainer.start(jax.random.key(seed))
+    trainer.chunk(runner, jnp.int32(0))  # compiles
+    points, cpu_s = [], 0.0
+    for update in report.progress(range(1, config.num_updates + 1), "update"):
+        started_s = time.process_time()
+        runner, _ = jax.block_until_ready(trainer.chunk(runner, jnp.int32(1)))
+        cpu_s += time.process_time() - started_s
+        if is_due(update, EVERY, config.batch_size) or update == config.num_updates:
+            points.append(evaluate(trainer, runner.train_state.params, update * config.batch_size, cpu_s))
+    return points
+
+
+def held_from(points: list[Point]) -> Point | None:
+    """Return the first evaluation from which on the target is met at every one, to the end; None: never."""
+    missed = [index for index, point in enumerate(points) if point.success < TARGET_SUCCESS]
+    first = missed[-1] + 1 if missed else 0
+    return points[first] if first < len(points) else None
+
+
+def row_of(seed: int, points: list[Point]) -> list[str]:
+    """Return a seed's row of the table."""
+    held, last = held_from(points), points[-1]
+    since = ("never", "") if held is None else (f"{held.steps / 1e6:.2f}", f"{held.cpu_s:.1f}")
+    laps = (f"{last.first_lap_s:.3f}", f"{last.flying_lap_s:.3f}")
+    return [str(seed), *since, f"{last.cpu_s:.1f}", f"{last.success:.1%}", *laps]
+
+
+def draw(path: Path, curves: dict[int, list[Point]]) -> None:
+    """Write a PNG of success and flying lap over environment steps, a line a seed."""
+    figure = new_figure(8, 6)
+    upper, lower = figure.subplots(2, 1, sharex=True)
+    for seed, points in curves.items():
+        steps = np.array([point.steps for point in points]) / 1e6
+        upper.plot(steps, [100 * point.success for point in points], marker="o", label=f"seed {seed}")
+        lower.plot(steps, [point.flying_lap_s for point in points], marker="o")
+    upper.axhline(100 * TARGET_SUCCESS, color="0.5", linestyle=":")
+    upper.set(ylabel=f"{NUM_LAPS} laps completed (%)", title="FlyTrack-v0 from scratch")
+    upper.legend()
+    lower.set(xlabel="environment steps (millions)", ylabel="mean flying lap (s)")
+    write_atomically(path, png_of(figure))
+
+
+def main() -> None:
+    """Measure every seed, print and write page and chart; exit 1 if a seed misses the aim."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--seeds", type=int, default=5, help="training seeds")
+    parser.add_argument("--config", type=Path, help="TOML file of other settings than the default ones")
+    parser.add_argument(
+        "--out", type=Path, default=report.RESULTS / "learning_curve.md", help="page to write"
+    )
+    arguments = parser.parse_args()
+    pinned = report.pin_to_one_core()
+    given = {} if arguments.config is None else settings_in_file(arguments.config)
+    settings = {"total_timesteps": AIM_STEPS, **given}
+    trainer = Trainer(Config(**settings))
+    evaluate(trainer, trainer.start(jax.random.key(0)).train_state.params, 0, 0.0)  # compiles
+    curves = {seed: train(trainer, seed) for seed in range(arguments.seeds)}
+    chart = arguments.out.with_suffix(".png")
+    draw(chart, curves)
+    num_held = sum(held_from(points) is not None for points in curves.values())
+    text = report.page(
+        "Learning to race from scratch",
+        f"{report.command_line()} with "
+        f"{', '.join(f'{name} {value:g}' for name, value in settings.items())}, the "
+        f"rest as by default, on FlyTrack-v0. Every {EVERY / 1e6:g} M environment steps {NUM_EPISODES} noisy "
+        f"starts, {NUM_LAPS} laps, in the simulator. CPU seconds of training alone, without compilation and "
+        f"evaluations. Seeds that hold {TARGET_SUCCESS:.0%} to the end: **{num_held} of {len(curves)}** "
+        "(aim: "
+        f"all, in runs of at most {AIM_STEPS / 1e6:g} M steps and {AIM_CPU_S:g} CPU s).",
+        report.table(HEADER, [row_of(seed, points) for seed, points in curves.items()]),
+        f"![curves]({chart.name})",
+        f"{pinned.capitalize()}. {report.provenance_line(report.provenance())}",
+    )
+    report.write_page(arguments.out, text)
+    if num_held < len(curves) or max(points[-1].cpu_s for points in curves.values()) > AIM_CPU_S:
+        raise SystemExit(1)
+
+
+if __name__ == "__main__":
+    main()
