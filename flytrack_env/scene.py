@@ -19,11 +19,18 @@ PAPER_FRAME, PAPER_OPENING = "0.25", "tab:red"
 BACKGROUND: Colour = (20, 24, 31)
 GRID: Colour = (38, 45, 57)
 BOUNDS: Colour = (66, 76, 92)
+SKY: Colour = (82, 104, 134)
+GROUND: Colour = (34, 40, 48)
+GROUND_GRID: Colour = (58, 67, 80)
+SHADOW: Colour = (14, 17, 22)
 GATE: Colour = (150, 160, 175)
 NEXT_GATE: Colour = (255, 140, 0)
 DRONE: Colour = (255, 255, 255)
+FRONT_ROTOR: Colour = (255, 70, 70)
+REAR_ROTOR: Colour = (225, 230, 238)
 CAMERA: Colour = (80, 200, 255)
 TEXT: Colour = (235, 239, 245)
+FAINT_TEXT: Colour = (150, 160, 175)
 FLIGHT_COLOURS: tuple[Colour, ...] = (
     (120, 220, 120),
     (90, 160, 255),
@@ -37,10 +44,12 @@ SPEED_STOPS = np.array([(70, 110, 255), (60, 200, 240), (80, 220, 110), (250, 21
 FASTEST_M_S = 20.0  # and above: the last of the speed colours
 NUM_SPEED_COLOURS = 64
 
+UP_W = np.array([0.0, 0.0, 1.0])
 SQUARE = ((-1, -1), (1, -1), (1, 1), (-1, 1))  # corners in order around it
 # Body frame, m: x forward, y left, z up. Motors: front left, front right, back left, back right.
 MOTORS_B = np.array([(0.15, 0.09, 0.0), (0.15, -0.09, 0.0), (-0.15, 0.14, 0.0), (-0.15, -0.14, 0.0)])
 ARMS_B = MOTORS_B[[[0, 3], [1, 2]]]
+ROTOR_M = 0.08  # radius
 CAMERA_PITCH_DEG = 40.0  # upwards
 
 
@@ -86,16 +95,17 @@ def rotations(quaternions: np.ndarray) -> np.ndarray:
     return Rotation.from_quat(np.roll(quaternions, -1, axis=-1)).as_matrix()
 
 
-def ground_grid(low: np.ndarray, high: np.ndarray, spacing_m: float) -> list[np.ndarray]:
-    """Return the lines of a grid in a rectangle from low to high, (2,) each; a line: (2, 2), world, m."""
+def ground_grid(low: np.ndarray, high: np.ndarray, spacing_m: float) -> np.ndarray:
+    """Return the lines of a grid on the floor of a box from low to high, (n, 2, 3), world, m."""
     lines = []
-    for axis in (0, 1):
+    for axis, other in ((0, 1), (1, 0)):
         first, last = np.ceil(low[axis] / spacing_m), np.floor(high[axis] / spacing_m)
         for place in spacing_m * np.arange(first, last + 1):
-            line = np.array([low, high])
+            line = np.full((2, 3), low[2])
             line[:, axis] = place
+            line[:, other] = low[other], high[other]
             lines.append(line)
-    return lines
+    return np.array(lines).reshape(-1, 2, 3)
 
 
 def _speed_table() -> list[Colour]:
@@ -111,3 +121,9 @@ def speed_colours(speeds_m_s: np.ndarray) -> list[Colour]:
     """Return the trail's colour at each speed (n,), m/s."""
     places = np.clip(speeds_m_s * (NUM_SPEED_COLOURS / FASTEST_M_S), 0, NUM_SPEED_COLOURS - 1)
     return [SPEED_COLOURS[place] for place in places.astype(int).tolist()]
+
+
+def blend(colour: Colour, other: Colour, share: float) -> Colour:
+    """Return a colour with that share, 0 to 1, of another one."""
+    r, g, b = (round(a + (o - a) * share) for a, o in zip(colour, other, strict=True))
+    return r, g, b

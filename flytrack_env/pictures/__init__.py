@@ -14,6 +14,7 @@ from flytrack_env.extras import check_installed
 from flytrack_env.files import write_atomically
 from flytrack_env.pictures.flight import Flight, Meeting, make_flight, read_flights
 from flytrack_env.references import Reference
+from flytrack_env.tracks import build_course
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -87,10 +88,11 @@ def write_animation(flight: Flight, reference: Reference, folder: str | Path) ->
     reference: a time-optimal flying lap of the same track.
 
     Raises:
-        ImportError, OSError: matplotlib or moviepy is not installed, or the file cannot be written.
+        ImportError, OSError: moviepy or Pillow is not installed, or the file cannot be written.
         ValueError: a flight without a complete flying lap.
     """
+    laps = _load("pictures.video", "render", "moviepy").laps_to_compare(flight, reference)
+    make_gif = _load("rendering.animation", "render", "PIL").make_gif
     path = Path(folder) / f"{flight.name}.gif"
-    make_gif = _load("pictures.animation", "render", "moviepy").make_gif
-    write_atomically(path, make_gif(flight, reference))
+    write_atomically(path, make_gif(build_course(flight.track), laps))
     return path

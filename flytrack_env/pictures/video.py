@@ -1,4 +1,4 @@
-"""A lap as an MP4, drawn as the Gymnasium environments draw it."""
+"""A lap as an MP4, drawn as the Gymnasium environments draw it; and beside the time-optimal one as a GIF."""
 
 import itertools
 import tempfile
@@ -12,15 +12,18 @@ from moviepy.video.io.ffmpeg_writer import FFMPEG_VideoWriter
 from flytrack_env.files import write_atomically
 from flytrack_env.flown_race import STEP_S
 from flytrack_env.pictures.flight import Flight
+from flytrack_env.references import Reference
 from flytrack_env.rendering import FlightLog, make_renderer
+from flytrack_env.rendering.animation import Lap
 from flytrack_env.rendering.flight_log import LAP_START
 from flytrack_env.rendering.views import HEIGHT, WIDTH
+from flytrack_env.scene import FLIGHT_COLOURS
 from flytrack_env.tracks import build_course
 
 STEPS_PER_FRAME = 2
 FRAMES_PER_S = 1.0 / (STEP_S * STEPS_PER_FRAME)
 LONGEST_STEPS = 2000  # of a flight without a lap
-LEAD_IN_STEPS = 100  # flown before the first frame, for the trail
+LEAD_IN_STEPS = 100  # flown before the first frame, for the trail and for the camera, which lags
 
 
 def fastest_flying_lap(flight: Flight) -> tuple[int, int] | None:
@@ -86,3 +89,21 @@ def _encode(flight: Flight, rows: range, path: Path) -> None:
         raise OSError(f"{path}: found a video that cannot be read back, expected an MP4: {error}") from error
     if found != len(rows):
         raise OSError(f"{path}: found {found} frames in the video, expected {len(rows)}")
+
+
+def laps_to_compare(flight: Flight, reference: Reference) -> tuple[Lap, Lap]:
+    """Return a flight's fastest flying lap and the time-optimal one, each from its start on.
+
+    Raises:
+        ValueError: a flight without a complete flying lap.
+    """
+    lap = fastest_flying_lap(flight)
+    if lap is None:
+        raise ValueError(f"{flight.name}: found no complete flying lap, expected one to animate")
+    start, end = (flight.race.passes[place] for place in lap)
+    first = round(start.time_s / STEP_S)  # the state nearest to the crossing
+    own = flight.states[first : first + round(end.lap_time_s / STEP_S) + 1]
+    return (
+        Lap(flight.name, FLIGHT_COLOURS[0], own, end.lap_time_s),
+        Lap("time-optimal", FLIGHT_COLOURS[2], reference.states, reference.time_s),
+    )

@@ -19,7 +19,9 @@ from flytrack_env.tracks import build_course, load_track
 
 pytest.importorskip("PIL", reason="the extra [render] is not installed")
 
-from flytrack_env.rendering.views import HEIGHT, PIXEL, WIDTH, Renderer
+from flytrack_env.rendering.camera import NEAREST_M, Camera
+from flytrack_env.rendering.views import BAR_HEIGHT, HEIGHT, PIXEL, WIDTH, Renderer
+from flytrack_env.rendering.views import TOP_VIEW_WIDTH as SPLIT
 
 BASE = "FlyTrack-v0"
 SHAPE = (HEIGHT, WIDTH, 3)
@@ -63,7 +65,7 @@ def distance_to(picture: np.ndarray, colour: scene.Colour) -> np.ndarray:
 
 def top_view_pixel(renderer: Renderer, position: Any) -> tuple[int, int]:
     """Return row and column of a position, world, on the picture."""
-    x, y = renderer.pixels(np.array(position)) / PIXEL
+    x, y = renderer.top_view.pixels(np.array(position)) / PIXEL
     return round(float(y)), round(float(x))
 
 
@@ -85,24 +87,56 @@ def test_a_trail_drawn_bit_by_bit_is_the_trail_drawn_at_once(renderer: Renderer)
 def test_top_view_shows_trail_drone_and_gates_where_they_are(renderer: Renderer) -> None:
     rows = flight()
     picture = renderer.draw(log_of(rows))
-    # World x is upwards and y to the left on this track.
+    # World x is to the right and y upwards on this track.
     start, gate_1 = top_view_pixel(renderer, (18.6, 2.0)), top_view_pixel(renderer, (6.5, 6.0))
     drone = top_view_pixel(renderer, rows[-1][POSITION])
-    assert start[0] < drone[0] < gate_1[0] and gate_1[1] < start[1]
+    assert gate_1[0] < start[0] and gate_1[1] < drone[1] < start[1] < SPLIT
     assert distance_to(picture[drone], scene.DRONE) < 40
     for share in (0.3, 0.6):
         row = rows[round(share * (len(rows) - 1))]
         pixel = top_view_pixel(renderer, row[POSITION])
         colour = scene.speed_colours(np.array([np.linalg.norm(row[VELOCITY])]))[0]
         assert distance_to(picture[pixel[0] - 1 : pixel[0] + 2, pixel[1]], colour).min() < 40
-    empty = np.array(renderer.empty.reduce(PIXEL))
+    empty = np.array(renderer.top_view.empty.reduce(PIXEL))
     for index, centre in enumerate(scene.gates_of(COURSE).centres):
         row, column = top_view_pixel(renderer, centre)
         around = np.s_[row - 34 : row + 35, column - 34 : column + 35]
         assert (distance_to(empty, scene.GATE) < 30)[around].sum() > 40
         assert (distance_to(empty, scene.TEXT) < 60)[around].sum() >= 5
-        is_next = (distance_to(picture, scene.NEXT_GATE) < 20)[around].sum() > 30
+        is_next = (distance_to(picture[:, :SPLIT], scene.NEXT_GATE) < 20)[around].sum() > 30
         assert is_next is np.bool_(index == 1)
+
+
+def test_chase_view_shows_the_drone_and_the_gate_ahead(renderer: Renderer) -> None:
+    picture = renderer.draw(log_of(flight()[:30]))
+    chase = picture[BAR_HEIGHT:, SPLIT:]
+    gate = np.argwhere(distance_to(chase, scene.NEXT_GATE) < 40)
+    rotors = np.argwhere(distance_to(chase, scene.FRONT_ROTOR) < 40)
+    assert len(gate) > 1000 and len(rotors) > 20
+    middle = 0.5 * (WIDTH - SPLIT)
+    assert abs(rotors[:, 1].mean() - middle) < 20 and abs(gate[:, 1].mean() - middle) < 20
+    assert gate[:, 0].mean() < rotors[:, 0].mean()
+
+
+def test_camera_projects_points_and_clips_what_is_behind_it() -> None:
+    """2 m above the origin, it looks along +x; 200 x 100 pixels."""
+    camera = Camera(np.array([0.0, 0.0, 2.0]), np.array([1.0, 0.0, 0.0]), np.array([100.0, 50.0]), 80.0)
+    ahead, left, above = (10.0, 0.0, 2.0), (10.0, 1.0, 2.0), (10.0, 0.0, 3.0)
+    pixels = camera.pixels(camera.look(np.array([ahead, left, above])))
+    np.testing.assert_allclose(pixels, [(100.0, 50.0), (92.0, 50.0), (100.0, 42.0)], atol=1e-9)
+    assert camera.horizon_px() == 50.0
+    ends = [(10.0, 20.0), (-5.0, 10.0), (10.0, -5.0), (-5.0, -1.0)]
+    lines = [camera.polygon(camera.look(np.array([(a, 0.0, 0.0), (b, 0.0, 0.0)]))) for a, b in ends]
+    nearest = 50.0 + 80.0 * 2.0 / NEAREST_M
+    np.testing.assert_allclose(lines[0], [100.0, 66.0, 100.0, 58.0], atol=1e-9)
+    for line in lines[1:3]:
+        heights = np.reshape(line, (-1, 2))[:, 1]
+        assert (heights.min(), heights.max()) == pytest.approx((66.0, nearest))
+    assert lines[3] == []
+    floor = np.array([(-5.0, -1.0, 0.0), (-5.0, 1.0, 0.0), (10.0, 1.0, 0.0), (10.0, -1.0, 0.0)])
+    corners = np.array(camera.polygon(camera.look(floor))).reshape(-1, 2)
+    np.testing.assert_allclose(sorted(corners[:, 1]), [66.0, 66.0, nearest, nearest], atol=1e-6)
+    assert camera.polygon(camera.look(floor - np.array([20.0, 0.0, 0.0]))) == []
 
 
 def test_single_environment_renders_its_own_flight_and_record_video_every_step(tmp_path: Path) -> None:
