@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -118,7 +118,7 @@ def loop_as_json(loop: Loop, seed: int, config: Config, settings: Settings) -> d
         "schema": SCHEMA,
         "seed": seed,
         "training_steps": config.num_updates * config.batch_size,
-        "settings": settings._asdict(),
+        "settings": asdict(settings),
         "verdict": loop.diagnosis.verdict,
         "causes": [cause.effect for cause in loop.diagnosis.causes],
         "race_log_s": round(float(usual_step(loop.race_log).sum()), 2),

@@ -83,7 +83,7 @@ def save_script(path: str | Path, script: Script) -> None:
     check_name(path)
     check_script(script, str(path))
     buffer = io.BytesIO()
-    np.savez(buffer, allow_pickle=False, **script._replace(kinds=np.array(script.kinds))._asdict())
+    np.savez(buffer, allow_pickle=False, **{**script._asdict(), "kinds": np.array(script.kinds)})
     write_atomically(path, buffer.getvalue())
 
 

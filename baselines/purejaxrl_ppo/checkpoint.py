@@ -199,6 +199,8 @@ def load_checkpoint(path: str | Path) -> Checkpoint:
 
 def _read_file(path: Path) -> tuple[dict[str, Any], Arrays]:
     """Return the description and the arrays in a file, with the checksum verified."""
+    if path.suffix == ".msgpack":
+        raise CheckpointError(f"{path}: found the format of an earlier FlyTrack, expected .safetensors")
     try:
         content = read_at_most(path, LARGEST_BYTES)
     except OSError as error:

@@ -163,8 +163,8 @@ def _check_notes(notes: dict[str, Any]) -> None:
             raise ValueError(f"{name}: found {notes[name]}, expected seconds above 0")
     for name, known in (("version", (FILE_VERSION,)), ("kind", KINDS)):
         if notes[name] not in known:
-            expected = " or ".join(map(str, known))
-            raise ValueError(f"{name}: found {quote_value(notes[name])}, expected {expected}")
+            listed = " or ".join(map(str, known))
+            raise ValueError(f"{name}: found {quote_value(notes[name])}, expected {listed}")
 
 
 def _model_of(values: Any, path: Path) -> ModelParameters:
