@@ -61,12 +61,7 @@ def test_a_command_and_its_flags_exist(command: str) -> None:
 @pytest.mark.parametrize(
     ("command", "message"),
     [
-        (f"{TRAIN} --track nowhere", "nowhere"),
-        (f"{TRAIN} --reward speed=1", "speed"),
-        (f"{TRAIN} --reward progress", "progress"),
-        (f"{TRAIN} --model missing.json", "missing.json"),
         (f"{TRAIN} --total-timesteps 10", "total_timesteps"),
-        (f"{TRAIN} --env-id FlyTrack-v9", "FlyTrack-v9"),
         (f"{EVAL} --checkpoint missing", "missing"),
         ("demo.py --black-box missing.bin", "missing.bin"),
         ("demo.py --total-timesteps 10", "total_timesteps|total-timesteps"),

@@ -180,8 +180,6 @@ steady_rates = jax.jit(start_rates)
     ("parameters", "dt", "expected"),
     [
         (CommandDelay(0.05), 0.01, r"command_delay\.delay_s: found 0.05, expected 0 to 0.04 s$"),
-        (CommandDelay(0.03), 0.005, r"found 0.03, expected 0 to 0.02 s at steps of 0.005 s"),
-        (CommandDelay(-0.01), 0.01, r"found -0.01, expected 0 to 0.04 s"),
         (CommandDelay(np.nan), 0.01, r"found nan, expected 0 to 0.04 s"),
         (ImuLatency(0.03), 0.005, r"imu_latency\.latency_s: found 0.03, expected 0 to 0.02 s at steps"),
     ],

@@ -48,15 +48,6 @@ def test_damaged_and_crafted_files_are_loaded_or_refused(kind: str, tmp_path: Pa
     assert found["broken"] == "" and found["loaded"] >= 1 and found["refused"] >= 1
 
 
-def test_a_broken_promise_is_reported(tmp_path: Path) -> None:
-    kind = KINDS["training settings"]
-    mute = kind._replace(load=lambda path: (_ for _ in ()).throw(kind.error("no name in it")))
-    assert "refused with the message" in soak_kind(mute, 5, tmp_path)["broken"]
-    assert "raised KeyError" in soak_kind(kind._replace(load=lambda path: {}["x"]), 5, tmp_path)["broken"]
-    unpickling = kind._replace(load=lambda path: pickle.loads(b"cbuiltins\nlen\n."))
-    assert "unpickled ['pickle.find_class']" in soak_kind(unpickling, 5, tmp_path)["broken"]
-
-
 def test_compressed_logs_are_read_and_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(csv_file, "PACKED_BYTES", 50_000)
     text, mapping = foreign_logs.foreign_csv(), tmp_path / "map.toml"

@@ -14,7 +14,7 @@ from flytrack_sysid import collect, load_log
 from flytrack_sysid.cli import main
 from flytrack_sysid.diagnosis.identifiability import LANES_PER_MANOEUVRE, next_flight
 from flytrack_sysid.diagnosis.lanes import LANE_S
-from flytrack_sysid.excitation import DT_S, FLIGHT_STEPS, HEIGHTS, SCRIPT_HEIGHTS
+from flytrack_sysid.excitation import DT_S, FLIGHT_STEPS, HEIGHTS
 from flytrack_sysid.manoeuvres import FLIGHTS_PER_MANOEUVRE, MANOEUVRES, flights_of, hover_action
 from flytrack_sysid.script_file import Script, ScriptError, check_script, load_script, save_script, script_of
 from tests.support.handout_plant import HandoutPlant
@@ -35,13 +35,6 @@ def test_every_manoeuvre_can_be_flown_and_says_how():
     assert FLIGHTS_PER_MANOEUVRE * FLIGHT_STEPS * DT_S == LANES_PER_MANOEUVRE * LANE_S
     flights = script.commands.reshape(-1, FLIGHT_STEPS * 4)
     assert len(np.unique(np.hstack([script.starts, flights]), axis=0)) == len(flights), "no flight twice"
-
-
-def test_a_manoeuvre_does_not_depend_on_the_others():
-    alone, among = made("spins"), made()
-    own = np.array(among.kinds) == "spins"
-    np.testing.assert_array_equal(alone.commands, among.commands[own])
-    np.testing.assert_array_equal(alone.starts, among.starts[own])
 
 
 def test_hover_of_a_model():
@@ -78,13 +71,6 @@ def test_voltages_that_cannot_be_are_refused(tmp_path, voltages):
         next_flight(path, nominal_parameters())
 
 
-def test_scripts_go_lower_than_the_excitation():
-    log = collect(HandoutPlant(), script=made("low_passes", "speeds"))
-    assert SCRIPT_HEIGHTS[0] <= log["p"][:, 2].min() < 0.3 < HEIGHTS[0]
-    lengths = np.unique(log.segment, return_counts=True)[1]
-    assert len(lengths) == 16 and np.median(lengths) == FLIGHT_STEPS
-
-
 def test_a_script_comes_back_the_same(tmp_path):
     script = made("speeds", "spins")
     save_script(tmp_path / "flight.npz", script)
@@ -112,7 +98,6 @@ class Harmful:
 
 BAD = {
     "flight 3: starts: expected finite numbers": changed("starts", (3, 5), np.nan),
-    "flight 1: commands: expected numbers within": changed("commands", (1, 2, 3), np.nan),
     "flight 2: commands: expected numbers within": changed("commands", (2, 7, 0), 1.5),
     "flight 0: starts: expected an applied action": changed("starts", (0, 19), -2.0),
     "flight 4: starts: expected a quaternion of norm 1": changed("starts", (4, 9), np.sqrt(4.0)),
@@ -122,7 +107,6 @@ BAD = {
     "flight 0: kinds: expected one of headings": {"kinds": np.array(["loop"] * 8)},
     "found 0 kinds, starts of shape": {"kinds": np.array([], "U1")},
     "starts: found an array of <U4": {"starts": np.full((8, 21), "text")},
-    "found text with numbers that are no characters": {"kinds": np.full(8, 0x7FFFFFFF, np.int32).view("<U1")},
     "found arrays of 67110784 bytes or more": {"commands": np.zeros((8, 2**20 + 1, 1), np.int8)},
     "nothing is unpickled": {"starts": np.array([Harmful()] * 8, object)},
 }
@@ -138,20 +122,6 @@ def test_bad_scripts_are_refused(tmp_path, message):
     path.write_bytes(buffer.getvalue())
     with pytest.raises(ScriptError, match=f"bad.npz: .*{message}"):
         load_script(path)
-
-
-def test_other_suffixes_and_scripts_that_cannot_be_flown_are_not_written(tmp_path):
-    script = made("headings")
-    for name, wrong, message in (
-        ("flight.csv", script, r"found suffix '\.csv', expected \.npz"),
-        (
-            "flight.npz",
-            script._replace(commands=script.commands * np.nan),
-            "flight 0: commands: expected numbers",
-        ),
-    ):
-        with pytest.raises(ScriptError, match=message):
-            save_script(tmp_path / name, wrong)
 
 
 def asked(*pairs: tuple[str, str]) -> dict[str, Any]:
@@ -172,11 +142,9 @@ def test_a_diagnosis_asks_for_flights(tmp_path):
     ("content", "message"),
     [
         ({"schema": 9, "not_identifiable": []}, "schema: found 9, expected 1"),
-        ([], "schema: found 'list'"),
         ({"schema": 1}, "not_identifiable: found NoneType, expected a list"),
         (asked(), "not_identifiable: found nothing that another flight would settle"),
         (asked(("wind", "headings"), ("wind", "loop")), r"not_identifiable\[1\]: fly: found 'loop'"),
-        ({"schema": 1, "not_identifiable": ["wind"]}, r"not_identifiable\[0\]: effect: found None"),
     ],
 )
 def test_what_is_no_diagnosis_is_refused(tmp_path, content, message):

@@ -24,7 +24,6 @@ from flytrack_env.wrappers import (
     NoiseParams,
     ObservationNoise,
     WrapperError,
-    layers_of,
 )
 from tests.support.wrapped_flights import ALL, wrapped
 
@@ -85,32 +84,12 @@ def test_any_three_compose_or_are_refused_with_the_reason() -> None:
                 env.check_params(env.default_params)
 
 
-def test_subclasses_count_as_what_they_are() -> None:
-    louder, longer = (
-        type(name, (base,), {}) for name, base in (("L", ObservationNoise), ("H", ActionHistory))
-    )
-    with pytest.raises(WrapperError, match="L around ObservationNoise: both"):
-        louder(ObservationNoise(FlyTrack()))
-    with pytest.raises(WrapperError, match="ActionDelay around H: the history would hold"):
-        ActionDelay(longer(FlyTrack()))
-
-
 def test_randomising_what_is_baked_in_is_refused() -> None:
     class Baked(Simulator):
         dt = 0.01
 
     with pytest.raises(WrapperError, match="baked in, none can be drawn"):
         DomainRandomization(FlyTrack(plant=Baked()))
-
-
-def test_layers() -> None:
-    env = wrapped(*ALL)
-    assert [layer.env_id for layer in layers_of(env)][-1] == "FlyTrack-v0" and len(layers_of(env)) == 7
-    assert env.track.name == "flytrack" and env.missed_gate == "terminate"
-    smooth = ObservationNoise(FlyTrack()).with_transition_gradients()
-    assert ActionHistory(smooth).transition_gradients_enabled
-    legacy = LegacyStep(ObservationNoise(FlyTrack())).with_transition_gradients()
-    assert isinstance(legacy, LegacyStep) and legacy.transition_gradients_enabled
 
 
 @pytest.mark.parametrize("wrapper", [DomainRandomization, ActionDelay, ObservationNoise])

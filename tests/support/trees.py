@@ -1,6 +1,5 @@
-"""Batches of trees, their comparison, and trees as TOML, for tests."""
+"""Batches of trees and their comparison, for tests."""
 
-import json
 from typing import Any
 
 import jax
@@ -18,16 +17,3 @@ def assert_close(a: Any, b: Any, tolerance: float = 1e-5) -> None:
     assert jax.tree.structure(a) == jax.tree.structure(b)
     for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True):
         np.testing.assert_allclose(x, y, rtol=tolerance, atol=tolerance)
-
-
-def as_toml(tree: dict[str, Any]) -> bytes:
-    """Return a tree as TOML, one line for each name at the top."""
-    return "".join(f"{_toml(name)} = {_toml(value)}\n" for name, value in tree.items()).encode()
-
-
-def _toml(value: Any) -> str:
-    if isinstance(value, dict):
-        return "{" + ", ".join(f"{_toml(name)} = {_toml(one)}" for name, one in value.items()) + "}"
-    if isinstance(value, list):
-        return f"[{', '.join(map(_toml, value))}]"
-    return repr(value) if isinstance(value, float) else json.dumps(value)
