@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from benchmarks.ablated import WORLD, InWorldFrame, WithoutEntries
-from benchmarks.ablations import ABLATIONS, make_env, table, with_delay
+from benchmarks.ablations import ABLATIONS, make_env, with_delay
 from flytrack_env import make, nominal_parameters
 from flytrack_env.quaternion import Vec3
 
@@ -69,14 +69,3 @@ def test_every_environment_flies(name):
     observation, state = env.reset(jax.random.key(0), params)
     observation, _, reward, _, _, _ = env.step(jax.random.key(1), state, jnp.zeros(4), params)
     assert np.isfinite(reward) and env.observation_space(params).contains(observation)
-
-
-def test_the_table_has_a_number_per_seed_the_smallest_first():
-    def line(success, lap_s):
-        raced = {"success": success, "flying_lap_s": lap_s}
-        return {"simulator": raced, "black_box": raced, "drawn": raced}
-
-    done = {("default", 1): line(0.5, None), ("default", 0): line(1.0, 4.25)}
-    row = table(done).splitlines()[-1]
-    cells = "50.0% 100.0% | 4.250 | 50.0% 100.0% | 4.250 | 50.0% 100.0%"
-    assert row == f"| default | the recipe as it is | {cells} |"

@@ -244,12 +244,10 @@ def bad_files(tmp_path_factory: pytest.TempPathFactory) -> Path:
         (["--plants", "2", "--black-box", "any.bin"], ["--plants", "--black-box any.bin", "one of the two"]),
         (["--plants", "2", "--checkpoint", "no_model.safetensors"], ["model", "found none"]),
         (["--steps", "0"], ["--steps: found 0"]),
-        (["--seed", "-1"], ["--seed: found -1"]),
         (["--black-box", "no.bin"], ["no.bin"]),
         (["--track", "nowhere"], ["nowhere", "flytrack"]),
         (["--track", "random.toml", "--ghost"], ["found no 'random", "expected one of", "flytrack_nominal"]),
         (["--out", "policy.safetensors"], ["--out", "read or written twice"]),
-        (["--json", "rollout_ghost.npy"], ["--json", "read or written twice"]),
         (["--checkpoint", "file"], ["file", "not a checkpoint"]),
     ],
 )

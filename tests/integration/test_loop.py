@@ -1,4 +1,4 @@
-"""The loop's parts: the log of a policy's flights, the gap, what the page says of results."""
+"""The loop's parts: the log of a policy's flights, the gap, and refusals."""
 
 import math
 
@@ -10,15 +10,7 @@ from baselines.purejaxrl_ppo.evaluate import SHIPPED_BLACK_BOX
 from baselines.purejaxrl_ppo.flights import Score, fly_many
 from baselines.purejaxrl_ppo.race_env import plant_env
 from benchmarks.champion import CHAMPION
-from benchmarks.loop.page import (
-    does_matter,
-    draw_chart,
-    is_reached,
-    model_table,
-    race_table,
-    verdict,
-)
-from benchmarks.loop.plants import HIDDEN, HiddenPlant, draw_plant
+from benchmarks.loop.plants import HiddenPlant, draw_plant
 from flytrack_env import blackbox, nominal_parameters
 from flytrack_loop import Gap, errors_of
 from flytrack_loop.__main__ import main
@@ -90,13 +82,6 @@ def test_a_policy_without_laps_has_no_gap():
     assert Gap(flown, flown._replace(flying_lap_s=4.04)).lap_percent == pytest.approx(1.0)
 
 
-def test_drawn_plants_have_delay_drag_and_thrust_loss_and_follow_the_seed():
-    names = {name for number in range(len(HIDDEN)) for name in draw_plant(number, 0).effects}
-    assert {"command_delay", "quadratic_drag", "thrust_scale"} <= names
-    assert draw_plant(4, 0) == draw_plant(4, 0) != draw_plant(4, 1)
-    assert len(draw_plant(4, 0).effects) == 3
-
-
 def test_the_command_refuses_what_it_cannot_use(tmp_path, capsys):
     for flags, message in (
         (["--black-box", str(tmp_path / "none.bin")], "No such file or directory"),
@@ -106,43 +91,3 @@ def test_the_command_refuses_what_it_cannot_use(tmp_path, capsys):
     ):
         assert main([*flags, "--out", str(tmp_path / "out")]) == 2
         assert message in capsys.readouterr().err
-
-
-def stage(name: str, success: float, gap: float | None, simulator: float = 1.0) -> dict:
-    raced = {"success": simulator, "gates": 24.0, "first_lap_s": 4.2, "flying_lap_s": 4.0}
-    flown = raced | {"success": success, "flying_lap_s": None if gap is None else 4.0 * (1 + gap / 100)}
-    errors = {"one_step_nrmse": {"v": 0.1, "q": 0.01}, "position_m": {}}
-    return {"name": name, "simulator": raced, "plant": flown, "lap_gap_percent": gap, "errors": errors}
-
-
-def result(before: tuple, after: tuple, base: tuple = (0.0, None), causes=("wind",), job="0") -> dict:
-    stages = [stage("before", *before), stage("after", *after), stage("refitted_base", *base)]
-    stages += [stage("nominal", 0.0, None), stage("randomised", 0.5, 9.0)]
-    return {"job": job, "hidden": "x", "causes": list(causes), "race_log_s": 60.0, "stages": stages}
-
-
-HELPED = result((0.1, -4.0), (1.0, 0.2))
-HARMLESS = result((1.0, 0.5), (1.0, 0.1), job="harmless")
-LOST = result((0.5, 2.0), (0.9, 0.1), job="lost")
-SLOW = result((1.0, 5.0), (1.0, -1.5), job="slow")
-
-
-def test_what_matters_and_what_is_reached():
-    assert [does_matter(one) for one in (HELPED, HARMLESS, LOST, SLOW)] == [True, False, True, True]
-    assert [is_reached(one) for one in (HELPED, HARMLESS, LOST, SLOW)] == [True, True, False, False]
-    assert does_matter(result((1.0, None), (1.0, 0.0)))  # no lap on the plant is no small gap
-
-
-def test_the_verdict_counts_plants_that_matter():
-    text, is_met = verdict([HELPED, HARMLESS, LOST])
-    assert "**1 of 2**" in text and "not on lost" in text and not is_met
-    assert "On all 3: at least 90.0% and a lap gap of at most 0.20 %" in text
-    assert verdict([HELPED, HARMLESS])[1]
-    assert verdict([HELPED] * 9 + [SLOW])[1] and not verdict([HELPED] * 8 + [SLOW])[1]
-
-
-def test_tables_and_chart_show_every_plant():
-    results = [HELPED, LOST]
-    assert race_table(results).count("\n") == model_table(results).count("\n") == 3
-    assert "| 0 | yes | 10.0% (100.0%), 3.840 s, -4.00 % | 100.0%" in race_table(results)
-    assert draw_chart(results).startswith(b"\x89PNG")

@@ -4,7 +4,6 @@ import json
 
 import pytest
 
-from benchmarks.real_logs import main
 from flytrack_sysid import diagnose, import_log
 from tests.support.real_logs import CRAZYFLIE, shared
 
@@ -43,8 +42,3 @@ def test_the_extended_crazyflie_flies_better_where_it_was_not_fitted(crazyflie):
 def test_a_crazyflie_on_its_slow_circle_cannot_show_everything(crazyflie):
     unseen = {one.effect for one in crazyflie.not_identifiable}
     assert {"ground_effect", "translational_lift"} <= unseen  # at 1 m, below 2 m/s
-
-
-def test_without_measured_flights_the_page_is_left_alone(tmp_path):
-    with pytest.raises(SystemExit, match="skipped: no measured flights"):
-        main(["--data", str(tmp_path)])

@@ -1,7 +1,6 @@
 """Time-optimal references: the shipped files, their replays, the loader, and the search."""
 
 import json
-import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -130,22 +129,6 @@ def test_a_saved_reference_comes_back_and_half_of_it_is_refused(tmp_path: Path) 
     for broken in (path, tmp_path / "missing.npz"):
         with pytest.raises(ReferenceFileError, match="cannot be read"):
             load_reference(broken)
-
-
-def test_the_command_verifies_and_writes_the_page(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    for kind in KINDS:
-        shutil.copy(shipped_path("flytrack", kind, "nominal"), tmp_path)
-    page = tmp_path / "page.md"
-    arguments = ["--verify", "--out", str(tmp_path), "--page", str(page)]
-    monkeypatch.setattr("sys.argv", ["time_optimal", *arguments])
-    with pytest.raises(SystemExit) as ended:
-        time_optimal.main()
-    assert ended.value.code == 0
-    assert capsys.readouterr().out.count("8 of 8") == len(KINDS)
-    assert page.read_text().count("8 of 8") == len(KINDS)
-    assert (tmp_path / "page_flytrack.png").stat().st_size > 10_000
 
 
 def test_a_straight_flight_takes_as_long_as_it_has_to(row_track: Callable[[list[float]], Track]) -> None:

@@ -1,13 +1,10 @@
 """MLflow tracking: everything is recorded once, and training goes on without a server."""
 
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 
 from baselines.purejaxrl_ppo import load_checkpoint, monitor, tracking
-from baselines.purejaxrl_ppo.run import Options, Run
 from flytrack_env.rollout import load_rollout
 from tests.support.ppo_runs import BATCH, DEAD_URI, EVERY_OTHER_UPDATE, SEED, assert_same_end
 
@@ -94,22 +91,3 @@ def test_a_server_that_comes_back_gets_what_it_missed(tmp_path, monkeypatch, cap
     assert run.info.status == "FINISHED" and run.data.params["seed"] == "3"
     (report,) = reports_of(caplog)
     assert "ConnectionError: gone" in report
-
-
-@pytest.mark.parametrize(("error", "status"), [(KeyboardInterrupt, "KILLED"), (OSError, "FAILED")])
-def test_how_a_run_ended_is_recorded(trainer, tmp_path, monkeypatch, error, status):
-    def fail(*arguments):
-        raise error
-
-    ends = []
-    monkeypatch.setattr(tracking.Tracker, "_connect", lambda self: None)
-    monkeypatch.setattr(tracking.Tracker, "end", lambda self, status: ends.append(status))
-    monkeypatch.setattr(Run, "_checkpoint", fail)
-    with pytest.raises(error):
-        trainer.train(tmp_path, SEED, Options(tracking_uri=DEAD_URI))
-    assert ends == [status]
-
-
-def test_mlflow_is_imported_when_it_is_used():
-    code = "import sys, baselines.purejaxrl_ppo.train_ppo; sys.exit('mlflow' in sys.modules)"
-    subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=True, timeout=120)
