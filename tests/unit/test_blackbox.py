@@ -12,7 +12,6 @@ from flytrack_env.blackbox import BlackBoxError, load
 from flytrack_env.state import (
     BATTERY,
     POSITION,
-    Action,
     unpack,
     unpack_action,
 )
@@ -160,9 +159,3 @@ def test_environment_flies_the_black_box(black_box, fly_black_box):
         for step in range(3):
             x = fly_black_box(x, actions[index])
             np.testing.assert_allclose(path[step, index], x, rtol=1e-5, atol=1e-4)
-
-
-def test_command_leaves_may_be_python_numbers(black_box):
-    state = black_box.reset(unpack(blackbox.start_vector()), nominal_parameters())
-    after = black_box.step(state, Action(0, 0, 0, -1), 0.01, None)
-    assert after.pos_w.z.dtype == jnp.float32

@@ -14,7 +14,6 @@ from baselines.purejaxrl_ppo import checkpoint as checkpoint_module
 from baselines.purejaxrl_ppo.checkpoint import (
     as_named_arrays,
     checksum,
-    from_named_arrays,
     observation_layout,
     save_checkpoint,
 )
@@ -90,11 +89,9 @@ def test_parameters_that_are_not_the_networks_are_refused(path, params):
     [
         (None, "cannot be read"),
         (b"", "not a checkpoint, or damaged"),
-        (b"\x00" * 100, "not a checkpoint, or damaged"),
         ((2**40).to_bytes(8, "little") + b"{}", "found a header of 1099511627776 bytes, expected at most"),
         (safetensors.numpy.save({"a": np.zeros(3)}), "not a checkpoint, or damaged"),
         (safetensors.numpy.save({}, {"meta": "{}", "sha256": checksum("{}", {})}), "found no description"),
-        (safetensors.numpy.save({}, {"meta": "[" * 9, "sha256": checksum("[" * 9, {})}), "not a checkpoint"),
     ],
 )
 def test_what_is_not_a_checkpoint_is_refused(tmp_path, content, reason):
@@ -126,12 +123,9 @@ def test_every_flipped_bit_is_noticed(path):
     [
         ("format", "flytrack-ppo-9", "format: found 'flytrack-ppo-9', expected 'flytrack-ppo-3'"),
         ("observation_size", 10**12, r"found a network of widths \(1000000000000, "),
-        ("observation_size", "5", "found a network of widths"),
         ("config", [1, 2], "config: found .*, expected an object"),
-        ("config", {"hidden_sizes": [10**9]}, "found a network of widths"),
         ("config", {"learning_rate": 10**400}, "learning_rate: found 1000.*, expected a finite number"),
         ("config", {"num_minibatches": 7}, "num_minibatches: found 7, expected a divisor"),
-        ("track", ["x" * 999] * 999, "track: found .{1,200}, expected a string"),
         ("missed_gate", None, "missed_gate: found None"),
     ],
 )
@@ -141,22 +135,3 @@ def test_descriptions_that_cannot_be_used_are_refused(path, params, name, value,
     write(path, arrays, json.dumps(meta))
     with pytest.raises(CheckpointError, match=rf"a\.safetensors: .*{reason}"):
         load_checkpoint(path)
-
-
-def test_trees_come_back_from_named_arrays_or_are_refused_leaf_by_leaf():
-    tree = {"key": jax.random.key(3), "list": [jnp.arange(3), jnp.float32(2.0)]}
-    target, arrays = jax.eval_shape(lambda: tree), as_named_arrays(tree)
-    found = from_named_arrays("file", arrays, target)
-    assert as_named_arrays(found)["list.0"].tobytes() == arrays["list.0"].tobytes()
-    assert jax.random.key_data(found["key"]).tolist() == jax.random.key_data(tree["key"]).tolist()
-    wrong = {"key": arrays["key"].astype(np.int64), "list.0": arrays["list.0"][:2], "surplus": np.zeros(3)}
-    with pytest.raises(CheckpointError) as caught:
-        from_named_arrays("file", wrong, target)
-    for part in (
-        "file: does not fit: ",
-        "key: found int64 of shape (2,), expected uint32 of shape (2,)",
-        "list.0: found int32 of shape (2,), expected int32 of shape (3,)",
-        "list.1: found nothing, expected float32 of shape ()",
-        "surplus: found float64 of shape (3,), expected nothing",
-    ):
-        assert part in str(caught.value)

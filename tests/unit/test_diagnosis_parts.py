@@ -14,7 +14,7 @@ from flytrack_env.effects import CommandDelay, LinearDrag, SecondOrderRates
 from flytrack_env.effects.command_delay import BUFFER_STEPS
 from flytrack_env.plants import Simulator
 from flytrack_sysid import collect
-from flytrack_sysid.diagnosis import DiagnosisError, diagnose, joined, unexplained
+from flytrack_sysid.diagnosis import DiagnosisError, diagnose, joined
 from flytrack_sysid.diagnosis import noise as noises
 from flytrack_sysid.diagnosis.diagnose import unused_channels
 from flytrack_sysid.diagnosis.lanes import LANE_S, LEAD_IN_S, NUM_AXES, make_lanes
@@ -162,21 +162,6 @@ def test_lanes_agree_with_one_long_replay(flown, lanes):
         # In multiples of the noise; what came before the lead-in is forgotten to a millionth of full stick.
         error = (left[..., axes, channel] - one[lanes.row]) / (DIRECT, LEVEL)[channel][axes]
         assert counts[LEAD_IN_S * RATE].any() and np.abs(error[counts]).max() < 1e-3
-
-
-def test_a_bump_is_about_a_place_on_the_way_and_along_one_axis(flown, lanes):
-    truth, _ = flown
-    flight = unexplained.flown(lanes, np.array(truth.tau))
-    found = unexplained.bumps(flight)
-    assert found.shape[0] % unexplained.BUMP_SIZE == 0
-    for number, feature in enumerate(found):
-        axis = number % unexplained.BUMP_SIZE
-        assert np.all(feature[..., np.arange(3) != axis] == 0.0)
-        size = feature[..., axis]
-        peak = np.unravel_index(np.argmax(np.where(flight.is_counted, size, 0.0)), size.shape)
-        assert size[peak] == pytest.approx(1.0)
-        away = np.linalg.norm(flight.pos_w - flight.pos_w[peak], axis=-1)
-        assert size[away > 4.0 * max(unexplained.BUMP_WIDTHS_M)].max(initial=0.0) < 1e-3
 
 
 def test_the_simulator_leaves_nothing_of_its_own_log():

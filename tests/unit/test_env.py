@@ -250,10 +250,8 @@ def test_actions_of_another_shape_are_refused(
         ({"model": "no/such.json"}, ModelFileError, "no/such.json: cannot be read"),
         ({"plant": "nominal"}, TypeError, r"plant: found str, expected a subclass of plants\.Plant"),
         ({"missed_gate": "ignore"}, ValueError, "missed_gate: found 'ignore', expected one of"),
-        ({"missed_gate": True}, ValueError, "missed_gate: found True, expected one of"),
         ({"reward": {"speed": 1.0}}, ValueError, "reward: found 'speed', expected one of progress"),
         ({"reward": {"progress": "much"}}, ValueError, r"reward\.progress: found 'much', expected a finite"),
-        ({"reward": {"progress": float("nan")}}, ValueError, r"reward\.progress: found nan"),
     ],
 )
 def test_wrong_arguments_say_what_was_expected(

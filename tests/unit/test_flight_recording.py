@@ -62,26 +62,6 @@ def recording(flown, models, tmp_path_factory) -> Recording:
     return Recording(path)
 
 
-def test_the_measured_flight_is_the_logs_numbers(flown, recording):
-    log = flown[1]
-    np.testing.assert_allclose(
-        recording.series("/world/drone", "Transform3D:translation"), log["p"], rtol=1e-6, atol=1e-6
-    )
-    x_first = np.roll(log["q"], -1, axis=1)
-    found = recording.series("/world/drone", "Transform3D:quaternion")
-    np.testing.assert_allclose(found, x_first, atol=1e-6)
-    lines = {
-        "speed": np.linalg.norm(log["v"], axis=1),
-        "angular_speed": np.linalg.norm(log["w"], axis=1),
-        "battery": log["v_bat"][:, 0],
-        "action/thrust": log["u"][:, 3],
-        "applied/roll": np.full(len(log), np.nan),  # not measured
-    }
-    for path, values in lines.items():
-        found = recording.series(f"/plots/{path}", "Scalars:scalars")
-        np.testing.assert_allclose(found, values, rtol=1e-6, atol=1e-9, err_msg=path)
-
-
 def test_arrows_are_the_force_that_the_model_lacks_along_the_world(flown, recording):
     log = flown[1]
     quat = Rotation.from_quat(log["q"], scalar_first=True)

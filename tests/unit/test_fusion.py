@@ -66,20 +66,6 @@ def test_derivatives_pass_through(order: int, differentiate: Any, is_jitted: boo
     np.testing.assert_allclose(result, expected, rtol=1e-6)
 
 
-@pytest.mark.parametrize(
-    "tree",
-    [
-        pytest.param((), id="nothing"),
-        pytest.param({"a": None}, id="no leaves"),
-        pytest.param((np.zeros((0, 3), np.float32),), id="empty leaf"),
-        pytest.param((np.zeros((0,), np.float32), np.ones(2, np.float32)), id="empty leaf first"),
-    ],
-)
-def test_empty_trees_and_leaves(tree: Any) -> None:
-    result = jax.jit(compute_once)(tree)
-    assert jax.tree.structure(result) == jax.tree.structure(tree)
-
-
 def test_random_keys_pass_through() -> None:
     key = jax.random.key(3)
     for tree in ((key,), (jnp.float32(1.0), key)):

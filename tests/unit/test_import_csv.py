@@ -151,7 +151,6 @@ def test_rows_are_chosen_and_files_become_segments(folder, tmp_path):
         ('unit = "cm"', 'unit = "ft"', r"map\.toml: position\.unit: found 'ft', expected one of m, cm, mm"),
         ('column = "ms"', 'column = "us"', r"flight\.csv: column us: found 0 times.*map\.toml: time"),
         ('"ax", "ay", "az"', '"ax", "ay"', r"specific_force\.columns: .*expected 3 different names"),
-        ('order = "xyzw"\n', "", r"attitude\.order: missing, expected one of wxyz, xyzw"),
         ("[time]", "[times]", r"map\.toml: time: missing"),
         ("[battery]", "[batery]", r"map\.toml: batery: unknown; expected one of rows, craft"),
         ("low = [1000", "low = [1600", r"csv: row \d+ \(line \d+\), column ail: found 1\d+.*, expected 1600"),
@@ -160,8 +159,6 @@ def test_rows_are_chosen_and_files_become_segments(folder, tmp_path):
         ('"qx", "qy", "qz", "qw"', '"n", "e", "d", "qw"', r"row 0 \(line 2\), column n, e, d, qw: .*norm"),
         ("[craft]", "[rows]\nfrom_s = 5000\n[craft]", r"map\.toml: rows: none of the 300 rows of .*csv"),
         ("[time]", "[time", r"map\.toml: not a readable TOML file"),
-        ("mass_kg = 0.5", "mass_kg = 1" + "0" * 400, r"craft\.mass_kg: found 1000.*, expected a number"),
-        ("[craft]", "[rows]\nevery = 0\n[craft]", r"rows\.every: .*at least 1"),
     ],
 )
 def test_wrong_mappings_are_refused(folder, tmp_path, old, new, message):
@@ -175,11 +172,7 @@ def test_wrong_mappings_are_refused(folder, tmp_path, old, new, message):
     ("row", "change", "message"),
     [
         (4, lambda cells: [*cells[:3], "", *cells[4:]], r"row 3 \(line 5\), column d: found an empty cell"),
-        (4, lambda cells: [*cells[:3], "x", *cells[4:]], r"row 3 \(line 5\), column d: found 'x'"),
-        (4, lambda cells: [*cells[:3], "nan", *cells[4:]], r"row 3 \(line 5\), column d: found 'nan'"),
-        (4, lambda cells: cells[:5], r"row 3 \(line 5\): found 5 cells, expected 22"),
         (4, lambda cells: ["0", *cells[1:]], r"row 3 \(line 5\), column t: found -5\.0.*later time"),
-        (4, lambda cells: ["," * 2**16], r"near line 5: not a CSV file: found a row of 65536 characters"),
         (0, lambda cells: ["ms", *cells[:-1]], r"column n: found .*|column ms: found 2 times"),
     ],
 )
@@ -211,7 +204,6 @@ def test_missing_and_unmapped_files_are_refused(folder, tmp_path):
             "file,rows\nflight.csv,7x",
             r"m\.csv: flight\.csv: rows: found '7x', expected a whole number",
         ),
-        ("m.csv", "file,rows\nother.csv,7\n", r"m\.csv: columns file and rows: flight\.csv: missing"),
         ("none.csv", "", r"none\.csv: cannot be read as a manifest"),
         ("../m.csv", "", "expected the name of a file beside the log, not a path"),
     ],

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from flytrack_sysid.log import REQUIRED, LogError
-from flytrack_sysid.log_file import load_log, save_log
+from flytrack_sysid.log_file import load_log
 from tests.support.written_logs import NUM_ROWS, SUFFIXES, columns_of, make_log, write
 
 
@@ -37,25 +37,15 @@ def no_rows(columns: dict) -> None:
 # What is done to the columns -> what the message says after the file; {row} with the line in a CSV file.
 BAD_COLUMNS = {
     "unknown": (rename("w_x", "w_roll"), r"column 'w_roll': unknown; .*\(known: t, segment, u_roll, "),
-    "nearest": (rename("v_bat", "V_Batt"), r"column 'V_Batt': unknown; did you mean v_bat\?"),
     "no time": (rename("t", "segment"), r"column t: missing; found "),
     "no command": (lambda columns: columns.pop("u_yaw"), "column u_yaw: missing; found t, segment, u_roll"),
     "half a vector": (lambda columns: columns.pop("p_y"), "column p_y: missing; found only p_x, p_z of it"),
     "nan": (set_cell("v_y", 4, np.nan), "{row 4}, column v_y: found '?nan'?, expected a finite number"),
-    "inf": (set_cell("t", 5, -np.inf), "{row 5}, column t: found '?-inf'?, expected a finite number"),
     "no rows": (no_rows, "found no rows"),
-    "duplicate row": (
-        lambda columns: set_cell("t", 2, columns["t"][1])(columns),
-        "{row 2}, column t: found .*, expected a later time than in the row before",
-    ),
     "time runs back": (set_cell("t", 4, -1.0), r"{row 4}, column t: found -1\.0, expected a later time"),
     "half a segment": (
         replaced("segment", [0, 0, 0.5, 1, 1, 1]),
         r"{row 2}, column segment: found 0\.5, expected a whole number",
-    ),
-    "huge segment": (
-        replaced("segment", [0, 0, 0, 0, 0, 2**53 + 1]),
-        r"{row 5}, column segment: found .*, expected a whole number below 2\^53",
     ),
     "torn segment": (
         replaced("segment", [4, 4, 2, 4, 2, 2]),
@@ -119,7 +109,6 @@ def test_bad_arrays_are_refused(bad, tmp_path):
 HEADER = "t,u_roll,u_pitch,u_yaw,u_thrust,v_bat"
 BAD_TEXTS = {
     "empty file": ("", "column t: missing; found no column"),
-    "header only": (HEADER, "found no rows"),
     "duplicate": (f"{HEADER},v_bat\n", "column v_bat: found 2 times, expected once"),
     "short row": (
         f"{HEADER}\n0,0,0,0,0,1\n\n1,0,0,0\n",
@@ -129,12 +118,7 @@ BAD_TEXTS = {
         f"{HEADER}\n0,0,0,on,0,1\n",
         r"row 0 \(line 2\), column u_yaw: found 'on', expected a finite number",
     ),
-    "digits": (
-        f"{HEADER}\n1_0,0,0,0,0,1\n",
-        r"row 0 \(line 2\), column t: found '1_0', expected a finite number",
-    ),
     "empty cell": (f"{HEADER}\n0,0,0,0,0, \n", r"row 0 \(line 2\), column v_bat: found an empty cell"),
-    "open quote": (f'{HEADER}\n"0,0,0,0,0,1\n', "near line 2: not a CSV file"),
     "no text": (b"\xff\xfe\x00", "near line 1: not a CSV file"),
 }
 
@@ -152,15 +136,6 @@ def test_bad_texts_are_refused(bad, tmp_path):
 def test_other_suffixes_are_refused(name, tmp_path):
     with pytest.raises(LogError, match=f"{name}: found suffix '.*', expected .npz or .csv"):
         load_log(tmp_path / name)
-
-
-def test_column_twice_in_an_archive_is_refused(tmp_path):
-    path = tmp_path / "flight.npz"
-    save_log(path, make_log())
-    with zipfile.ZipFile(path, "a") as archive, pytest.warns(UserWarning, match="Duplicate name"):
-        archive.writestr("t.npy", archive.read("t.npy"))
-    with pytest.raises(LogError, match="t: found twice, expected once"):
-        load_log(path)
 
 
 @pytest.mark.parametrize(
@@ -184,16 +159,5 @@ def test_array_that_unpacks_to_more_than_announced_is_not_unpacked(tmp_path, met
         with pytest.raises(LogError, match=message):
             load_log(tmp_path / "bomb.npz")
         assert tracemalloc.get_traced_memory()[1] < unpacked / 8
-    finally:
-        tracemalloc.stop()
-
-
-def test_endless_rows_take_no_memory(tmp_path):
-    (tmp_path / "flight.csv").write_text(HEADER + "\n" + "1," * 2**18)
-    tracemalloc.start()
-    try:
-        with pytest.raises(LogError, match="not a CSV file: found a row of 65536 characters or more"):
-            load_log(tmp_path / "flight.csv")
-        assert tracemalloc.get_traced_memory()[1] < 2**20
     finally:
         tracemalloc.stop()

@@ -70,25 +70,12 @@ def test_minimal_file_by_hand(tmp_path: Path) -> None:
 BAD_TEXTS = {
     "missing field": (json.dumps({"tau": [1, 1, 1, 1]}), "thrust_coeffs: missing"),
     "empty": ("", "not a JSON file"),
-    "no json": ("tau = 3", "not a JSON file"),
     "deep": ("[" * 100_000, "not a JSON file"),
-    "list": ("[1, 2]", r"found \[1, 2\], expected an object"),
     "newer": (json.dumps({"version": 2, "parameters": FIELDS}), "version: found 2, expected 1"),
-    "parameters as list": (json.dumps({"parameters": [1]}), r"parameters: found \[1\], expected"),
     "unknown field": (json.dumps({**FIELDS, "mass": 1}), "mass: unknown; expected one of tau, "),
-    "too many digits": (MINIMAL.replace('"m": 1,', f'"m": 1{5000 * "0"},'), "not a JSON file"),
-    "effects as list": (json.dumps({**FIELDS, "effects": [1]}), r"effects: found \[1\], expected an object"),
     "unknown effect": (
         json.dumps({**FIELDS, "effects": {"drag": {}}}),
         "effects: drag: unknown; expected one of comm",
-    ),
-    "unknown parameter": (
-        json.dumps({**FIELDS, "effects": {"wind": {"speed": 3}}}),
-        "effects: wind: speed: unknown; expected one of v_x, ",
-    ),
-    "parameter as text": (
-        json.dumps({**FIELDS, "effects": {"wind": {"v_x": "3"}}}),
-        "effects: wind: v_x: found '3', expected -20 to 20 m/s",
     ),
     "parameter out of range": (
         json.dumps({**FIELDS, "effects": {"command_delay": {"delay_s": 0.05}}}),

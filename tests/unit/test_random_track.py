@@ -1,6 +1,5 @@
 """Random courses: feasible, distinct, a function of the key; and what cannot be drawn is refused."""
 
-import math
 from typing import Any
 
 import jax
@@ -134,12 +133,9 @@ def test_arguments_are_kept(
     [
         ({"num_gates": 2}, "num_gates: found 2, expected at least 3"),
         ({"size": (30.0, 10.0)}, r"size: found \(30.0, 10.0\), expected more than 10 m each"),
-        ({"size": (math.nan, 30.0)}, "size: found"),
         ({"heights": (1.0, 3.0)}, r"heights: found \(1.0, 3.0\), expected a range from 1.35 m upwards"),
-        ({"heights": (2.0, math.inf)}, "heights: found"),
         ({"key": -1}, "key: found -1, expected 0 to 4294967295"),
         ({"key": jnp.zeros((3, 2), jnp.uint32)}, r"key: found uint32 of shape \(3, 2\), expected one key"),
-        ({"key": jnp.zeros(2)}, "key: found float32 of shape"),
     ],
 )
 def test_bad_arguments_are_refused(arguments: dict[str, Any], message: str) -> None:

@@ -20,7 +20,7 @@ from flytrack_env.tracks import build_course, load_track
 pytest.importorskip("PIL", reason="the extra [render] is not installed")
 
 from flytrack_env.rendering.camera import NEAREST_M, Camera
-from flytrack_env.rendering.views import BAR_HEIGHT, HEIGHT, PIXEL, WIDTH, Renderer
+from flytrack_env.rendering.views import HEIGHT, PIXEL, WIDTH, Renderer
 from flytrack_env.rendering.views import TOP_VIEW_WIDTH as SPLIT
 
 BASE = "FlyTrack-v0"
@@ -105,17 +105,6 @@ def test_top_view_shows_trail_drone_and_gates_where_they_are(renderer: Renderer)
         assert (distance_to(empty, scene.TEXT) < 60)[around].sum() >= 5
         is_next = (distance_to(picture[:, :SPLIT], scene.NEXT_GATE) < 20)[around].sum() > 30
         assert is_next is np.bool_(index == 1)
-
-
-def test_chase_view_shows_the_drone_and_the_gate_ahead(renderer: Renderer) -> None:
-    picture = renderer.draw(log_of(flight()[:30]))
-    chase = picture[BAR_HEIGHT:, SPLIT:]
-    gate = np.argwhere(distance_to(chase, scene.NEXT_GATE) < 40)
-    rotors = np.argwhere(distance_to(chase, scene.FRONT_ROTOR) < 40)
-    assert len(gate) > 1000 and len(rotors) > 20
-    middle = 0.5 * (WIDTH - SPLIT)
-    assert abs(rotors[:, 1].mean() - middle) < 20 and abs(gate[:, 1].mean() - middle) < 20
-    assert gate[:, 0].mean() < rotors[:, 0].mean()
 
 
 def test_camera_projects_points_and_clips_what_is_behind_it() -> None:

@@ -58,9 +58,7 @@ def rows_with(value: float, width: int = 25) -> bytes:
 
 ROWS = npy_bytes(np.zeros((3, 25)))
 BAD_FILES = {
-    "no bytes": (b"", "cannot be read: ValueError"),
     "text": (b"step,x,y,z\n0,1,2,3\n", "cannot be read: ValueError"),
-    "header cut": (ROWS[:40], "cannot be read: ValueError"),
     "data cut": (ROWS[:-8], "cannot be read: ValueError: .*75"),
     "objects": (npy_bytes(np.array([[None, None]] * 3, object)), "found pickled objects"),
     "text array": (npy_bytes(np.full((3, 25), "a")), "found an array of <U1"),
@@ -68,12 +66,9 @@ BAD_FILES = {
         npy_bytes(np.zeros((3, 23))),
         r"found shape \(3, 23\), expected .*\(T, 25\) or \(T, 22\)",
     ),
-    "one row": (npy_bytes(np.zeros(25)), r"found shape \(25,\)"),
     "no steps": (npy_bytes(np.zeros((0, 25))), r"found shape \(0, 25\), expected .*T >= 1"),
     "nan": (rows_with(np.nan), "found nan at step 1, column 9, expected finite"),
-    "short row with nan": (rows_with(np.nan, 22), "found nan at step 1, column 9"),
     "beyond float32": (rows_with(1e300), "found inf at step 1"),
-    "long doubles": (npy_bytes(np.zeros((3, 25), np.longdouble)), "found an array of float128"),
     "unknown version": (b"\x93NUMPY\x09\x09" + bytes(99), r"found version \(9, 9\)"),
     "names": (npy_bytes(np.zeros(3, [("a" * 900, "<f8")])), "found an array of .{1,250}, exp"),
     "terabytes": (
@@ -139,15 +134,12 @@ class Unreadable:
         return (int, ("no number",))
 
 
-GOOD_PAIR = (np.zeros(21), np.zeros(4))
 BAD_OBJECTS = {
     "no pairs": (np.empty((0, 2), object), "found shapes set"),
     "other state": (
         pairs_of((np.zeros(17), np.zeros(4))),
         r"found shapes {\(\(17,\), \(4,\)\)}, expected pairs",
     ),
-    "two kinds": (pairs_of(GOOD_PAIR, (np.zeros(18), np.zeros(4))), "found shapes .* alike"),
-    "no pair": (pairs_of(GOOD_PAIR, None), "expected pairs of x"),
     "words": (pairs_of(("a", "b")), "expected pairs of x"),
     "nan": (pairs_of((np.full(21, np.nan), np.zeros(4))), "found nan at step 0"),
     "broken": (pairs_of((Unreadable(), 0)), "cannot be read: ValueError"),

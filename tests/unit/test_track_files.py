@@ -1,7 +1,6 @@
 """Track files: what is read and written, and that everything else is refused with file, line and reason."""
 
 import math
-import os
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -17,7 +16,6 @@ from flytrack_env.tracks import (
     Gate,
     Track,
     TrackError,
-    available_tracks,
     build_course,
     load_track,
     save_track,
@@ -74,33 +72,19 @@ POSITION, TURN = "[10.0, 1.0, 1.6]", "[0.0, 0.0, 0.0, 1.0]"
 # What is replaced, by what, the line and the field that the message names, and a part of its reason.
 REFUSALS = {
     "missing name": ('name = "small"\n', "", 1, "name", "missing"),
-    "empty name": ('name = "small"', 'name = ""', 1, "name", "non-empty string"),
     "number as name": ('name = "small"', "name = 3", 1, "name", "non-empty string"),
     "missing start": (START, "", 1, "start", "missing"),
-    "start is no table": (START, "start = 1\n", 3, "start", "table"),
-    "missing gate field": ('direction = "+y"\n', "", 11, "direction", "missing"),
-    "missing last gate's field": ("frame = 2\n", "", 19, "frame", "missing"),
-    "unknown top field": ('name = "small"', 'name = "small"\nlaps = 3', 2, "laps", "unknown"),
-    "unknown start field": ("[1.0, 0.0, 0.0, 0.0]", "[1.0, 0.0, 0.0, 0.0]\nyaw = 0", 6, "yaw", "unknown"),
     "unknown gate field": ("opening = 1\n", "opening = 1\ncolour = 2\n", 25, "colour", "unknown"),
     "string as number": (POSITION, '["a", 1.0, 1.6]', 21, "position", "expected a number"),
-    "bool as number": (POSITION, "[true, 1.0, 1.6]", 21, "position", "expected a number"),
     "number as list": (POSITION, "10.0", 21, "position", "expected 3 numbers"),
-    "list as number": ("frame = 2\n", "frame = [2]\n", 25, "frame", "expected a number"),
     "two coordinates": (POSITION, "[10.0, 1.0]", 21, "position", "expected 3 numbers"),
     "nan position": (POSITION, "[nan, 1.0, 1.6]", 21, "position", "finite"),
-    "huge integer": (POSITION, f"[1{400 * '0'}, 1.0, 1.6]", 21, "position", "finite"),
-    "infinite bounds": ("[15.0, 5.0, 5.0]", "[inf, 5.0, 5.0]", 9, "high", "finite"),
     "long gate quaternion": (TURN, "[0.0, 0.0, 0.5, 1.0]", 22, "quaternion", "norm"),
-    "zero start quaternion": ("[1.0, 0.0, 0.0, 0.0]", "[0.0, 0.0, 0.0, 0.0]", 5, "quaternion", "norm"),
     "wrong direction": ('"-y"', '"y"', 23, "direction", "expected one of"),
-    "number as direction": ('"-y"', "-1", 23, "direction", "expected one of"),
     "zero opening": ("opening = 1\n", "opening = 0\n", 24, "opening", "> 0"),
     "opening equals frame": ("frame = 2\n", "frame = 1\n", 25, "frame", "more than the opening"),
     "duplicate id": ("id = 3", "id = 7", 20, "id", "used twice"),
     "real id": ("id = 3", "id = 3.5", 20, "id", "integer"),
-    "large id": ("id = 3", "id = 9007199254740992", 20, "id", r"expected less than 2^53"),
-    "id of many digits": ("id = 3", "id = 0x" + 5000 * "f", 20, "id", "thousands of digits"),
     "gate outside": (POSITION, "[16.0, 1.0, 1.6]", 21, "position", "inside the bounds"),
     "start outside": ("[-4.0, 0.0, 1.0]", "[-4.0, 0.0, -1.0]", 4, "position", "inside the bounds"),
     "bounds reversed": ("[15.0, 5.0, 5.0]", "[15.0, -6.0, 5.0]", 9, "high", "more than low"),
@@ -133,13 +117,6 @@ def test_refusals_name_file_line_field_and_reason(case: str, tmp_path: Path) -> 
 def test_what_is_no_toml_file_is_refused(text: str | bytes, reason: str, tmp_path: Path) -> None:
     with pytest.raises(TrackError, match=rf"{re.escape(str(tmp_path))}/track\.toml: {reason}"):
         load_text(tmp_path, text)
-
-
-def test_what_is_no_file_is_refused(tmp_path: Path) -> None:
-    os.mkfifo(tmp_path / "pipe.toml")
-    for name in ("pipe.toml", "none.toml"):
-        with pytest.raises(TrackError, match=rf"{name}: cannot be read: "):
-            load_track(tmp_path / name)
 
 
 @pytest.mark.parametrize("name", ["monza", "", "../tracks/flytrack", "FLYTRACK"])
@@ -219,12 +196,6 @@ def test_saved_tracks_are_read_back_equal(
     assert load_track(path) == track
 
 
-@pytest.mark.parametrize("name", available_tracks())
-def test_shipped_tracks_are_saved_and_read_back_equal(name: str, tmp_path: Path) -> None:
-    save_track(tmp_path / "copy.toml", load_track(name))
-    assert load_track(tmp_path / "copy.toml") == load_track(name)
-
-
 def first_gate_with(**fields: Any) -> Track:
     """Return the FlyTrack course with other fields of its first gate."""
     track = load_track("flytrack")
@@ -241,11 +212,7 @@ UNSAVEABLE = {
         lambda: first_gate_with(quaternion=(0.7071, 0.0, 0.0, 0.7071)),
         "gates: would not be read back",
     ),
-    "list": (lambda: replace(load_track("flytrack"), bounds_low=[-2.5, -3.0, 0.0]), "bounds_low: would not"),
     "direction": (lambda: first_gate_with(direction=0.5), "cannot be written: KeyError"),
-    "surrogate": (lambda: replace(load_track("flytrack"), name="\ud800"), "cannot be written: Unicode"),
-    "no name": (lambda: replace(load_track("flytrack"), name=""), "name: found '', expected a non-empty"),
-    "no track": (lambda: "flytrack", "cannot be written: AttributeError"),
 }
 
 

@@ -219,21 +219,13 @@ def test_what_the_model_itself_has_is_drawn_around_it() -> None:
 
 
 BASE = RandomizationParams()
-LATE, UNKNOWN = CommandDelay(0.1), CommandDelay(None)  # type: ignore[arg-type]
+LATE = CommandDelay(0.1)
 REFUSALS: list[tuple[Any, Any, str]] = [
     (
         DomainRandomization,
         BASE._replace(mass_factor_low=1.3),
         r"mass_factor: found a range from 1\.3 to 1\.2",
     ),
-    (DomainRandomization, BASE._replace(lag_factor_low=0.0), r"lag_factor: found a range from 0\.0 to 1\.3"),
-    (DomainRandomization, BASE._replace(mass_factor_high=np.inf), r"mass_factor: found .* to inf, expected"),
-    (
-        DomainRandomization,
-        BASE._replace(mass_factor_low=1e-4),
-        r"expected one within 0\.00099999 to 1000\.01",
-    ),
-    (DomainRandomization, BASE._replace(effect_factor_high=np.inf), r"effect_factor: .* from 0\.8 to inf"),
     (
         DomainRandomization,
         BASE._replace(low=BASE.low[1:]),
@@ -244,23 +236,8 @@ REFUSALS: list[tuple[Any, Any, str]] = [
         BASE._replace(high=(LATE, *BASE.high[1:])),
         r"delay_s: found 0\.1, expected 0 to 0",
     ),
-    (
-        DomainRandomization,
-        BASE._replace(high=(UNKNOWN, *BASE.high[1:])),
-        r"delay_s: found .* from 0\.0 to None",
-    ),
     (ActionDelay, CommandDelay(-0.01), r"delay_s: found -0\.01"),
     (ObservationNoise, NO_NOISE._replace(position_m=-0.1), r"\.position_m: found -0.1, expected finite"),
-    (
-        ObservationNoise,
-        NO_NOISE._replace(attitude_deg=181.0),
-        r"\.attitude_deg: found 181.0, expected finite",
-    ),
-    (
-        ObservationNoise,
-        NO_NOISE._replace(rates_rad_per_s=np.nan),
-        r"rates_rad_per_s: found nan, expected finite",
-    ),
 ]
 
 
