@@ -27,7 +27,7 @@ from flytrack_env.files import write_atomically
 
 PROG = "sweeps"
 METRIC = "evaluation_success"
-QUIET = {"RAY_USAGE_STATS_ENABLED": "0", "RAY_AIR_NEW_OUTPUT": "0", "TUNE_DISABLE_AUTO_CALLBACK_LOGGERS": "1"}
+QUIET = {"RAY_USAGE_STATS_ENABLED": "0", "RAY_AIR_NEW_OUTPUT": "0"}
 
 
 @dataclasses.dataclass(frozen=True)
