@@ -41,6 +41,7 @@ def experience(network, params, size, seed):
     return batch, 3.0 + 2.0 * jax.random.normal(keys[3], (size,)), jax.random.normal(keys[4], (size,))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("num_shards", [2, 4])
 def test_the_gradient_of_equal_data_is_that_of_one_device(num_shards):
     env = flytrack_env.make("FlyTrack-v0")
@@ -180,6 +181,7 @@ def test_a_lost_process_ends_the_job_and_another_number_goes_on(tmp_path):
     assert status == 130 and "found 2, expected 1; continuing, perhaps not bit for bit" in errors
 
 
+@pytest.mark.slow
 def test_one_device_alone_is_no_job(tmp_path):
     command = "-m baselines.purejaxrl_ppo.train_ppo --distributed --out"
     process = subprocess.run(

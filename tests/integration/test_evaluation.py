@@ -147,7 +147,7 @@ def test_ghost_is_the_reference_nearest_in_time() -> None:
     assert np.linalg.norm(states[at, POSITION] - expected) <= 0.5 * 0.01 * speed * 1.05
 
 
-@pytest.mark.parametrize("flown_by", ["black box", "plants"])
+@pytest.mark.parametrize("flown_by", ["black box", pytest.param("plants", marks=pytest.mark.slow)])
 def test_command_flies_many(
     flown_by: str,
     checkpoint_path: Path,

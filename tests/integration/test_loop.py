@@ -69,6 +69,7 @@ def test_errors_are_those_of_the_model(log):
     assert errors.position_m["0.1"] < errors.position_m["1"]
 
 
+@pytest.mark.slow
 def test_the_gap_is_between_the_plant_and_the_simulator_learnt_in(champion):
     lost = draw_plant(2, 0)
     assert set(lost.effects) == {"thrust_scale"} and lost.effects["thrust_scale"]["factor"] < 1.0

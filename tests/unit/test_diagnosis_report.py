@@ -101,6 +101,7 @@ def test_lost_rows_leave_their_slots_empty(flown):
     assert found.regressors["time"][start] == 0.0
 
 
+@pytest.mark.slow
 def test_attitude_stands_in_for_a_gyro(flown):
     base, log = flown
     found = traces(log.without("w", "f"), {"base": base}, like="base")
@@ -215,6 +216,7 @@ def test_page_says_all_and_loads_nothing(tmp_path, diagnosis, measured):
     assert len(text) < 3e6
 
 
+@pytest.mark.slow
 def test_page_of_a_log_of_few_channels(diagnosis, measured):
     text = html_of(diagnosis, measured.without("w", "f", "v_bat"))
     assert "attitude or velocity replace them" in text and text.count("<img") == len(diagnosis.causes)

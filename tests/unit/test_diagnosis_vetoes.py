@@ -108,6 +108,7 @@ def test_true_causes_are_kept_in_noise():
     assert not any(is_contradicted(gain, expected, inflation=1.0) for gain in gains)
 
 
+@pytest.mark.slow
 def test_an_effect_that_could_as_well_be_none_is_not_determined(state):
     problem = state.problem
     for effect, value, expected in (

@@ -117,6 +117,7 @@ def test_a_hovering_log_cannot_tell_wind_from_tilt(hover):
     assert alone > 1.0 > 10.0 * beside
 
 
+@pytest.mark.slow
 def test_what_is_advised_shows_once_it_is_flown(hover, told):
     advice = advise(hover.problem, hover.model, hover.linearization, WANTED)
     assert set(advice) == set(WANTED)
