@@ -77,6 +77,7 @@ USES = {
         "-m flytrack_sysid.cli diagnose data.npz --model model.json --out diagnosis",
     ),
     "logs": ("-m pytest -q -k 'ulog or betaflight' tests/unit",),
+    "bags": ("-m pytest -q -k import_bag tests/unit",),
     "viz": (
         SAVE_GHOST,
         "-m flytrack_env.viz_rerun flight.npy --out flight.rrd",
@@ -86,7 +87,7 @@ USES = {
     "optimal": ("-m benchmarks.time_optimal --tracks speedway --kinds flying --out made",),
     "bench": ("from benchmarks.env_speed import l2f_contestant as l2f; l2f('l2f', 1024, 8).run()",),
 }
-WITH_CHECKOUT = ("logs", "optimal", "bench")  # use files that the wheel does not have:
+WITH_CHECKOUT = ("logs", "bags", "optimal", "bench")  # use files that the wheel does not have:
 COPIED = ("benchmarks", "blackbox", "tests", "pyproject.toml")
 
 
@@ -118,7 +119,7 @@ def contents(session: nox.Session) -> None:
 @nox.parametrize("extra", list(USES), ids=[extra or "core" for extra in USES])
 def wheel(session: nox.Session, extra: str) -> None:
     """Install the wheel with one extra alone, or none, and use what the extra is for."""
-    tools = TEST_TOOLS if extra == "logs" else ("pytest",)
+    tools = TEST_TOOLS if extra in ("logs", "bags") else ("pytest",)
     session.install(f"flytrack{f'[{extra}]' if extra else ''} @ {built()[0].as_uri()}", *tools)
     folder = Path(session.create_tmp())
     for name in COPIED if extra in WITH_CHECKOUT else ():

@@ -1,5 +1,7 @@
 """Whether a change altered the diagnosis: 60 hidden plants whose names and intervals are recorded.
 
+The plants of each row move in the three ways of ``benchmarks.hidden`` in turn.
+
 ``make check-diagnosis`` diagnoses them again and lists every difference: verdict, names, equivalence classes
 and what is unexplained must stay, values and intervals agree to 1e-6. ``--rows one,clean --plants 2`` checks
 a few. A change that means to alter results records them with ``--record``, and its message says why.
@@ -19,7 +21,8 @@ import jax
 import numpy as np
 from tqdm import tqdm
 
-from benchmarks.diagnosis import ROWS, make_log
+from benchmarks.diagnosis import Trial, make_log
+from benchmarks.hidden import MOTIONS
 from benchmarks.report import commit_of_checkout
 from flytrack_env.files import write_atomically
 from flytrack_sysid.diagnosis import Diagnosis, diagnose
@@ -50,7 +53,8 @@ def summarize(found: Diagnosis) -> dict[str, Any]:
 
 def check_plant(case: tuple[str, int]) -> dict[str, Any]:
     """Diagnose one plant of a row."""
-    _, _, log, model, _ = make_log(*case, SEED)
+    row, number = case
+    _, _, log, model, _ = make_log(Trial(row, number, SEED, MOTIONS[number % len(MOTIONS)]))
     return summarize(diagnose(log, model))
 
 
@@ -78,11 +82,11 @@ def main() -> None:
     """Check the diagnosis against its record, or make the record."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--record", action="store_true", help="record all plants instead of checking them")
-    parser.add_argument("--rows", default=",".join(ROWS), help="default: all")
+    parser.add_argument("--rows", default=",".join(STRATA), help="default: all")
     parser.add_argument("--plants", type=int, default=max(STRATA.values()), help="at most, of each row")
     arguments = parser.parse_args()
     if arguments.record:
-        cases = [(row, number) for row in ROWS for number in range(STRATA[row])]
+        cases = [(row, number) for row in STRATA for number in range(STRATA[row])]
         stamp = {"commit": commit_of_checkout(), "date": str(date.today()), "jax": jax.__version__}
         record = {**stamp, "seed": SEED, "plants": run_cases(cases)}
         write_atomically(RECORD, json.dumps(record, indent=1).encode())

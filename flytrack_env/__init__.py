@@ -4,6 +4,7 @@ from flytrack_env.dynamics import ModelParameters, nominal_parameters
 from flytrack_env.env import EnvParams, EnvState, FlyTrack
 from flytrack_env.gymnasium_adapter import register_with_gymnasium
 from flytrack_env.model_file import ModelFileError, load_model, load_provenance, save_model
+from flytrack_env.motion import Motion
 from flytrack_env.registration import make, register_all
 from flytrack_env.tracks import (
     Track,
@@ -26,6 +27,7 @@ __all__ = [
     "FlyTrack",
     "ModelFileError",
     "ModelParameters",
+    "Motion",
     "Track",
     "TrackError",
     "available_tracks",

@@ -1,8 +1,8 @@
 """The simulator's physics: lag, body rates, thrust, rigid-body translation, battery.
 
 The equations are the handout's; effects that a model has beyond them are folded in between
-(``flytrack_env.effects``). ``advance`` states them once, for one drone of scalar leaves; ``step`` is the
-same function on the packed (21,) vector.
+(``flytrack_env.effects``). ``move`` states them once, for one drone of scalar leaves; ``step`` is the
+same function on the packed (21,) vector. How they are integrated over a step is the model's ``Motion``.
 """
 
 from typing import Any, NamedTuple
@@ -14,6 +14,7 @@ import numpy as np
 from flytrack_env import effects
 from flytrack_env.effects import StepContext
 from flytrack_env.fusion import compute_once
+from flytrack_env.motion import Motion
 from flytrack_env.quaternion import Quaternion, Scalar, Vec3
 from flytrack_env.state import ACTION_SIZE, Action, Drone, pack, unpack, unpack_action
 
@@ -28,7 +29,8 @@ class ModelParameters(NamedTuple):
     thrust_coeffs: (6,) N, of 1, u, u^2, u^3, V, u V.
     max_rate: (3,) deg/s, body rate at full stick.
     m: kg. g: m/s^2. battery_drain_v_per_min: V/min. effects: parameters of the effects that the model
-    has, in the order of ``flytrack_env.effects.EFFECTS``; without any, the model is the handout's.
+    has, in the order of ``flytrack_env.effects.EFFECTS``. motion: how it moves within a step, static.
+    Without effects and with the default motion, the model is the handout's.
     """
 
     tau: jax.Array | np.ndarray
@@ -38,6 +40,7 @@ class ModelParameters(NamedTuple):
     g: Scalar
     battery_drain_v_per_min: Scalar = 1.0
     effects: tuple[Any, ...] = ()
+    motion: Motion = Motion.HANDOUT
 
     def with_effects(self, *parameters: Any) -> "ModelParameters":
         """Return the model with effects added, or replaced where it has them.
@@ -106,16 +109,28 @@ def integrate_attitude(quat: Quaternion, rates_b: Vec3, dt: Scalar) -> Quaternio
     return Quaternion(*(q + half_dt * dq for q, dq in zip(quat, turn, strict=True))).normalize()
 
 
+def turn_by(quat: Quaternion, angle_b: Vec3) -> Quaternion:
+    """Return the attitude after a rotation vector, rad, body: the exponential map, to its seventh order.
+
+    For the turn of a step, well below 1 rad; not normalised.
+    """
+    square = angle_b.dot(angle_b)
+    cosine = 1.0 - square * (1.0 / 8.0 - square * (1.0 / 384.0 - square * (1.0 / 46080.0)))
+    share = 0.5 - square * (1.0 / 48.0 - square * (1.0 / 3840.0 - square * (1.0 / 645120.0)))
+    return quat.multiply(Quaternion(cosine, *angle_b.scale(share)))
+
+
 def start_rates(drone: Drone, params: ModelParameters) -> Vec3:
     """Return the steady body rates, rad/s, of a drone's applied action."""
     rates_b = body_rates(drone.applied, params.max_rate)
     if not effects.acts(params.effects, "rates"):
         return rates_b
     applied, axes = drone.applied, drone.quat.axes()
+    # Held this long, the rates settle to the same values under every motion.
     context = StepContext(drone=drone, command=applied, dt=HELD_S, applied=applied, body_axes_w=axes)
     memories = effects.start_memories(params.effects, drone)
     context = _with_thrust(context, params, memories)
-    return effects.fold("rates", params.effects, memories, rates_b, context)
+    return effects.fold_rates(params.effects, memories, rates_b, context, ())[0]
 
 
 def _with_thrust(context: StepContext, params: ModelParameters, memories: tuple[Any, ...]) -> StepContext:
@@ -141,40 +156,181 @@ def _forces(context: StepContext, params: ModelParameters, memories: tuple[Any, 
     return acc_w, beside_b._replace(z=beside_b.z + thrust_acc)
 
 
+class Moved(NamedTuple):
+    """A step: the drone after it, what effects remember then, and what they see of its end."""
+
+    after: Drone
+    memories: tuple[Any, ...]
+    context: StepContext
+
+
 def advance(
     drone: Drone, memories: tuple[Any, ...], command: Action, dt: Scalar, params: ModelParameters
 ) -> tuple[Drone, tuple[Any, ...]]:
     """Return the drone ``dt`` seconds later under a held command, and the memories of its effects.
 
-    The acceleration uses the attitude *before* the step and the thrust of the lagged action
-    *after* it (handout, equations 1 to 4). Commands are not clipped here. memories: as from
-    ``effects.start_memories``.
+    Commands are not clipped here. memories: as from ``effects.start_memories``.
     """
-    context = StepContext(drone=drone, command=command, dt=dt)
+    return move(drone, memories, command, dt, params)[:2]
+
+
+def move(
+    drone: Drone, memories: tuple[Any, ...], command: Action, dt: Scalar, params: ModelParameters
+) -> Moved:
+    """Return the step of ``advance`` with what sensors need (``read_sensors``)."""
+    if params.motion is Motion.CONTINUOUS:
+        return _move_continuously(drone, memories, command, dt, params)
+    return _move_at_once(drone, memories, command, dt, params)
+
+
+def _taus(params: ModelParameters) -> Action:
+    return Action(*(params.tau[i] for i in range(ACTION_SIZE)))
+
+
+def _drained(drone: Drone, elapsed_s: Scalar, params: ModelParameters) -> Scalar:
+    """Return the battery voltage after a time, before what effects add."""
+    return drone.battery_v - params.battery_drain_v_per_min / SECONDS_PER_MINUTE * elapsed_s
+
+
+def _move_at_once(
+    drone: Drone, memories: tuple[Any, ...], command: Action, dt: Scalar, params: ModelParameters
+) -> Moved:
+    """Return the step of a simulator that takes each quantity once.
+
+    The thrust is that of the lagged action *after* the step. The acceleration uses the attitude *before* it
+    (handout, equations 1 to 4), or, semi-implicit, the attitude after it.
+    """
+    context = StepContext(drone=drone, command=command, dt=dt, motion=params.motion)
 
     def fold(stage: str, value: Any) -> Any:  # sees the context of the moment
         return effects.fold(stage, params.effects, memories, value, context)
 
     acting = fold("command", command)
     context = context._replace(acting=acting)
-    tau = fold("lag", Action(*(params.tau[i] for i in range(ACTION_SIZE))))
+    tau = fold("lag", _taus(params))
     applied = compute_once(lag(drone.applied, acting, dt, tau))
     context = context._replace(applied=applied, body_axes_w=compute_once(drone.quat.axes()))
     context = _with_thrust(context, params, memories)
-    rates_b = fold("rates", body_rates(applied, params.max_rate))
+    rates_b = body_rates(applied, params.max_rate)
+    rates_b, inputs = effects.fold_rates(params.effects, memories, rates_b, context, ())
     context = context._replace(rates_b=rates_b)
+    quat = integrate_attitude(drone.quat, rates_b, dt)
+    if params.motion is Motion.SEMI_IMPLICIT:
+        quat = compute_once(quat)
+        context = _with_thrust(context._replace(body_axes_w=compute_once(quat.axes())), params, memories)
     acc_w, force_b = _forces(context, params, memories)
     acc_w, context = compute_once(acc_w), context._replace(force_b=force_b)
     after = Drone(
         pos_w=drone.pos_w + drone.vel_w.scale(dt) + acc_w.scale(0.5 * dt * dt),
         vel_w=drone.vel_w + acc_w.scale(dt),
         acc_w=acc_w,
-        quat=integrate_attitude(drone.quat, rates_b, dt),
+        quat=quat,
         rates_b=rates_b,
         applied=applied,
-        battery_v=fold("battery", drone.battery_v - params.battery_drain_v_per_min / SECONDS_PER_MINUTE * dt),
+        battery_v=fold("battery", _drained(drone, dt, params)),
     )
-    return compute_once(after), effects.remember(params.effects, memories, context)
+    later = effects.remember(params.effects, memories, context, inputs, inputs)
+    return Moved(compute_once(after), later, context)
+
+
+class _Instant(NamedTuple):
+    """A moment within a continuous step, by what follows from the commands alone."""
+
+    applied: Action
+    battery_v: Scalar
+    context: StepContext
+    rate_inputs: tuple[Any, ...]
+
+
+def _lag_within_step(
+    drone: Drone, memories: tuple[Any, ...], command: Action, dt: Scalar, params: ModelParameters
+) -> tuple[_Instant, _Instant, _Instant]:
+    """Return the beginning, middle and end of a step under a held command: lag, body rates, battery.
+
+    The lag is exact for commands held over half a step; of a delayed one, each half has its mean.
+    """
+    beginning = StepContext(drone=drone, command=command, dt=dt, motion=params.motion)
+
+    def acting_in(span: tuple[float, float], applied: Action) -> tuple[Action, Action]:
+        now = beginning._replace(drone=drone._replace(applied=applied), span=span)
+        acting = effects.fold("command", params.effects, memories, command, now)
+        now = now._replace(acting=acting)
+        return acting, effects.fold("lag", params.effects, memories, _taus(params), now)
+
+    def instant(
+        applied: Action, elapsed_s: Scalar, acting: Action, tau: Action, first: tuple[Any, ...] = ()
+    ) -> _Instant:
+        slope = Action(*((to - now) / t for to, now, t in zip(acting, applied, tau, strict=True)))
+        context = beginning._replace(dt=elapsed_s, acting=acting, applied=applied, applied_slope=slope)
+        volts = effects.fold("battery", params.effects, memories, _drained(drone, elapsed_s, params), context)
+        rates_b = body_rates(applied, params.max_rate)
+        if effects.acts(params.effects, "rates"):
+            context = context._replace(body_axes_w=drone.quat.axes())
+            context = _with_thrust(context, params, memories)
+        rates_b, inputs = effects.fold_rates(params.effects, memories, rates_b, context, first)
+        return _Instant(applied, volts, context._replace(rates_b=rates_b), inputs)
+
+    half = 0.5 * dt
+    acting, tau = acting_in((0.0, 0.5), drone.applied)
+    middle = compute_once(lag(drone.applied, acting, half, tau))
+    later, later_tau = acting, tau
+    if effects.acts(params.effects, "command") or effects.acts(params.effects, "lag"):
+        later, later_tau = acting_in((0.5, 1.0), middle)
+    end = compute_once(lag(middle, later, half, later_tau))
+    at_first = instant(drone.applied, 0.0, acting, tau)
+    inputs = at_first.rate_inputs
+    return (
+        at_first,
+        instant(middle, half, later, later_tau, inputs),
+        instant(end, dt, later, later_tau, inputs),
+    )
+
+
+def _move_continuously(
+    drone: Drone, memories: tuple[Any, ...], command: Action, dt: Scalar, params: ModelParameters
+) -> Moved:
+    """Return the step of a drone whose rates and force change within it.
+
+    The attitude turns by the exponential map of the rates' mean, with the first commutator of the Magnus
+    expansion (Iserles et al., Lie-group methods, 2000); the acceleration is Simpson's mean of the forces at
+    the beginning, middle and end, each with the attitude and velocity of its moment.
+    """
+    instants = _lag_within_step(drone, memories, command, dt, params)
+    rates_0, rates_m, rates_1 = (compute_once(one.context.rates_b) for one in instants)
+    # Of the first half, from the parabola through the three rates.
+    angle_m = (rates_0.scale(5.0) + rates_m.scale(8.0) - rates_1).scale(dt / 24.0)
+    angle_1 = (rates_0 + rates_m.scale(4.0) + rates_1).scale(dt / 6.0)
+    angle_1 = angle_1 + rates_0.cross(rates_1).scale(dt * dt / 12.0)
+    quat_m = turn_by(drone.quat, angle_m)
+    quat_1 = compute_once(turn_by(drone.quat, angle_1).normalize())
+
+    def force_at(instant: _Instant, quat: Quaternion, vel_w: Vec3, elapsed_s: Scalar) -> tuple[Vec3, Vec3]:
+        pos_w = drone.pos_w + vel_w.scale(elapsed_s)
+        there = Drone(
+            pos_w, vel_w, drone.acc_w, quat, instant.context.rates_b, instant.applied, instant.battery_v
+        )
+        context = instant.context._replace(drone=there, body_axes_w=compute_once(quat.axes()))
+        return compute_once(_forces(_with_thrust(context, params, memories), params, memories))
+
+    half, vel_w = 0.5 * dt, drone.vel_w
+    acc_0, _ = force_at(instants[0], drone.quat, vel_w, 0.0)
+    acc_m, _ = force_at(instants[1], quat_m, vel_w + acc_0.scale(half), half)
+    acc_1, force_1 = force_at(instants[2], quat_1, vel_w + acc_m.scale(dt), dt)
+    acc_w = compute_once((acc_0 + acc_m.scale(4.0) + acc_1).scale(1.0 / 6.0))
+    after = Drone(
+        pos_w=drone.pos_w + drone.vel_w.scale(dt) + (acc_0 + acc_m.scale(2.0)).scale(dt * dt / 6.0),
+        vel_w=drone.vel_w + acc_w.scale(dt),
+        acc_w=acc_w,
+        quat=quat_1,
+        rates_b=rates_1,
+        applied=instants[2].applied,
+        battery_v=instants[2].battery_v,
+    )
+    turning = (rates_0 - rates_m.scale(4.0) + rates_1.scale(3.0)).scale(1.0 / dt)  # the parabola's slope
+    context = instants[2].context._replace(force_b=force_1, angular_acc_b=turning)
+    inputs = instants[0].rate_inputs, instants[2].rate_inputs
+    later = effects.remember(params.effects, memories, context, *inputs)
+    return Moved(compute_once(after), later, context)
 
 
 class Reading(NamedTuple):
@@ -190,34 +346,26 @@ def read_gyro(drone: Drone, memories: tuple[Any, ...], dt: Scalar, params: Model
     memories: of the effects, up to this drone. dt: s, the step between readings.
     """
     context = StepContext(
-        drone=drone, command=drone.applied, dt=dt, applied=drone.applied, rates_b=drone.rates_b
+        drone=drone,
+        command=drone.applied,
+        dt=dt,
+        motion=params.motion,
+        applied=drone.applied,
+        rates_b=drone.rates_b,
     )
     return effects.fold("gyro", params.effects, memories, drone.rates_b, context)
 
 
-def read_sensors(
-    before: Drone, after: Drone, memories: tuple[Any, ...], dt: Scalar, params: ModelParameters
-) -> Reading:
-    """Return the readings of gyro and accelerometer after a step of ``dt`` seconds.
+def read_sensors(moved: Moved, params: ModelParameters) -> Reading:
+    """Return the readings of gyro and accelerometer after a step.
 
-    The true specific force is that of the step, in the body frame before it, as in ``advance``.
-    memories: of the effects, *after* the step.
+    The true specific force is that of the step, in the body frame whose attitude its force had; of a
+    continuous step that at its end.
     """
-    axes = before.quat.axes()
-    force_w = after.acc_w + Vec3(0.0, 0.0, params.g)
-    force_b = compute_once(Vec3(*(axis.dot(force_w) for axis in axes)))
-    context = StepContext(
-        drone=before,
-        command=after.applied,
-        dt=dt,
-        applied=after.applied,
-        body_axes_w=axes,
-        rates_b=after.rates_b,
-        force_b=force_b,
-    )
+    after, memories, context = moved
     return Reading(
-        rates_b=read_gyro(after, memories, dt, params),
-        force_b=effects.fold("accelerometer", params.effects, memories, force_b, context),
+        rates_b=read_gyro(after, memories, context.dt, params),
+        force_b=effects.fold("accelerometer", params.effects, memories, context.force_b, context),
     )
 
 

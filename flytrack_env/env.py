@@ -9,12 +9,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from flytrack_env.dynamics import ModelParameters, nominal_parameters
-from flytrack_env.effects import acts
+from flytrack_env.effects import acts, delay_steps_of
 from flytrack_env.episodes import EpisodicEnvironment, without_nan
 from flytrack_env.fusion import compute_once
 from flytrack_env.model_file import load_model
 from flytrack_env.observations import OBSERVATION, Entry, observe_race
-from flytrack_env.params import EnvParams
+from flytrack_env.params import DT_S, EnvParams
 from flytrack_env.plants import Plant, Simulator
 from flytrack_env.race import Race, RaceEvents, advance_race, look_up_gates, start_race
 from flytrack_env.resets import ResetParams, sample_start
@@ -63,14 +63,14 @@ class FlyTrack(EpisodicEnvironment):
         if missed_gate not in MISSED_GATE_CHOICES:
             raise ValueError(f"missed_gate: found {missed_gate!r}, expected one of {MISSED_GATE_CHOICES}")
         self.track: Track = track if isinstance(track, Track) else load_track(track)
-        self.plant: Plant = Simulator() if plant is None else plant
-        if not isinstance(self.plant, Plant):
-            raise TypeError(f"plant: found {type(plant).__name__}, expected a subclass of plants.Plant")
         self.missed_gate = missed_gate
         if model is None:
             model = nominal_parameters()
         elif not isinstance(model, ModelParameters):
             model = load_model(model)
+        self.plant: Plant = Simulator(delay_steps_of(model.effects, DT_S)) if plant is None else plant
+        if not isinstance(self.plant, Plant):
+            raise TypeError(f"plant: found {type(plant).__name__}, expected a subclass of plants.Plant")
         self._default_params = EnvParams(
             model=model,
             course=build_course(self.track),
@@ -185,7 +185,7 @@ class FlyTrack(EpisodicEnvironment):
 
     def check_params(self, params: EnvParams) -> None:
         """Raise ValueError for what cannot be flown, or a step of time that the plant does not have."""
-        params.check()
+        params.check(self.plant.delay_steps)
         plant_dt = self.plant.dt
         if plant_dt is not None and not np.allclose(params.dt, plant_dt, rtol=1e-5):
             raise ValueError(f"dt: found {params.dt} s, expected {plant_dt} s, which the plant has baked in")

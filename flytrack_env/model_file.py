@@ -11,6 +11,7 @@ from flytrack_env import effects
 from flytrack_env.dynamics import ModelParameters
 from flytrack_env.files import read_at_most, write_atomically
 from flytrack_env.messages import error_text, quote_name, quote_value
+from flytrack_env.motion import Motion
 
 MODEL_FILE_VERSION = 1
 SIZES = {"tau": 4, "thrust_coeffs": 6, "max_rate": 3, "m": 0, "g": 0, "battery_drain_v_per_min": 0}
@@ -73,6 +74,13 @@ def _read_effect(path: Path, name: str, values: Any) -> Any:
     return effect.parameters(**{field: float(value) for field, value in values.items()})
 
 
+def _read_motion(path: Path, name: Any) -> Motion:
+    values = [motion.value for motion in Motion]
+    if name not in values:
+        raise ModelFileError(f"{path}: motion: found {quote_value(name)}, expected {' or '.join(values)}")
+    return Motion(name)
+
+
 def _read_json(path: Path) -> dict[str, Any]:
     """Return the object in a JSON file."""
     try:
@@ -89,7 +97,8 @@ def load_model(path: str | Path) -> ModelParameters:
 
     The file is a JSON object with ``tau``, ``thrust_coeffs``, ``max_rate``, ``m``, ``g`` and
     ``battery_drain_v_per_min`` at the top or under ``parameters``, units as in ``ModelParameters``; and
-    optionally ``effects``, an object of effects' names (``flytrack_env.effects``) with their parameters.
+    optionally ``effects``, an object of effects' names (``flytrack_env.effects``) with their parameters, and
+    ``motion``, a value of ``Motion``; without it the model moves as the handout's.
 
     Raises:
         ModelFileError: missing file, not JSON, a newer version, a field missing, unknown or out of range.
@@ -118,9 +127,10 @@ def model_from_json(data: dict[str, Any], path: str | Path) -> ModelParameters:
         if name not in values:
             raise ModelFileError(f"{path}: {name}: missing")
     for name in values:
-        _known(str(path), name, (*SIZES, "effects", "version"))
+        _known(str(path), name, (*SIZES, "effects", "motion", "version"))
     by_name = _object(f"{path}: effects", data.get("effects", values.get("effects", {})))
-    base = ModelParameters(**{name: _read_field(path, name, values[name]) for name in SIZES})
+    motion = _read_motion(path, data.get("motion", values.get("motion", Motion.HANDOUT.value)))
+    base = ModelParameters(**{name: _read_field(path, name, values[name]) for name in SIZES}, motion=motion)
     return base.with_effects(*(_read_effect(path, name, by_name[name]) for name in by_name))
 
 
@@ -134,7 +144,7 @@ def load_provenance(path: str | Path) -> dict[str, Any]:
 
 
 def model_as_json(model: ModelParameters) -> dict[str, Any]:
-    """Return a model as JSON values: ``parameters``, ``effects``, and the ``units`` of both."""
+    """Return a model as JSON values: ``parameters``, ``effects``, the ``units`` of both, and ``motion``."""
     by_name = {effects.effect_of(parameters).name: parameters for parameters in model.effects}
     effect_units = {
         name: {field: bounds.unit for field, bounds in effects.BY_NAME[name].ranges.items()}
@@ -147,6 +157,7 @@ def model_as_json(model: ModelParameters) -> dict[str, Any]:
             for name, parameters in by_name.items()
         },
         "units": {**UNITS, **effect_units},
+        "motion": model.motion.value,
     }
 
 

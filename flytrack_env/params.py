@@ -10,7 +10,7 @@ import jax
 import numpy as np
 
 from flytrack_env.dynamics import ModelParameters
-from flytrack_env.effects import ROUNDING, Range, check_parameters
+from flytrack_env.effects import ROUNDING, USUAL_STEPS, Range, check_parameters
 from flytrack_env.quaternion import Scalar
 from flytrack_env.resets import ResetParams
 from flytrack_env.rewards import RewardWeights
@@ -47,6 +47,7 @@ RANGES: Mapping[str, Range] = {
     **{f"reward.{name}": Range(-1e6, 1e6, "1") for name in RewardWeights._fields},
 }
 LEAST_GATES = 2
+DT_S = 0.01  # step of an environment
 UNIT_TOLERANCE = 1e-5  # of a norm
 
 
@@ -63,7 +64,7 @@ class EnvParams:
     course: Course
     reset: ResetParams
     reward: RewardWeights
-    dt: Scalar = 0.01
+    dt: Scalar = DT_S
     drone_radius: Scalar = 0.15
     max_steps_in_episode: Scalar = 1000
     wrappers: dict[str, Any] = field(default_factory=dict)
@@ -74,10 +75,11 @@ class EnvParams:
             """Return the parameters with some fields changed."""
             ...
 
-    def check(self) -> None:
+    def check(self, delay_steps: int = USUAL_STEPS) -> None:
         """Raise ValueError, naming the field, for values that no episode can be flown with.
 
         For concrete values, as nothing can be refused under ``jit``. Any may be batched, as for ``vmap``.
+        delay_steps: that the plant remembers (``flytrack_env.plants``).
         """
         for name, bounds in RANGES.items():
             value = attrgetter(name)(self)
@@ -87,7 +89,7 @@ class EnvParams:
                 expected = f"{bounds.low:g} to {bounds.high:g} {bounds.unit}"
                 raise ValueError(f"{name}: found {value}, expected {expected}")
         for parameters in self.model.effects:
-            check_parameters(parameters, self.dt)
+            check_parameters(parameters, self.dt, delay_steps)
         _check_course(self.course)
         if not np.all(np.asarray(self.course.gates.half_opening) > np.asarray(self.drone_radius)[..., None]):
             raise ValueError(

@@ -9,7 +9,7 @@ from abc import ABC, abstractmethod
 from typing import Any, NamedTuple
 
 from flytrack_env.dynamics import ModelParameters, advance, read_gyro
-from flytrack_env.effects import start_memories
+from flytrack_env.effects import USUAL_STEPS, start_memories
 from flytrack_env.quaternion import Scalar, Vec3
 from flytrack_env.state import Action, Drone
 
@@ -18,10 +18,12 @@ class Plant(ABC):
     """Pure functions for one drone; all of them work under ``jit``, ``vmap`` and ``scan``.
 
     dt: the only time step that the plant can take, s; None if it takes any. A plant with a ``dt`` has its
-    parameters baked in and ignores ``model`` as well.
+    parameters baked in and ignores ``model`` as well. delay_steps: how many commands delays of the model's
+    effects remember.
     """
 
     dt: float | None = None
+    delay_steps: int = USUAL_STEPS
 
     @abstractmethod
     def reset(self, drone: Drone, model: ModelParameters) -> Any:
@@ -50,9 +52,12 @@ class SimulatorState(NamedTuple):
 class Simulator(Plant):
     """The differentiable model: ``flytrack_env.dynamics`` with the model's effects."""
 
+    def __init__(self, delay_steps: int = USUAL_STEPS):
+        self.delay_steps = delay_steps
+
     def reset(self, drone: Drone, model: ModelParameters) -> SimulatorState:
         """Return the drone with fresh memories."""
-        return SimulatorState(drone, start_memories(model.effects, drone))
+        return SimulatorState(drone, start_memories(model.effects, drone, self.delay_steps))
 
     def step(
         self, state: SimulatorState, command: Action, dt: Scalar, model: ModelParameters

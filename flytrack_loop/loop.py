@@ -9,13 +9,13 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from baselines.purejaxrl_ppo import Config
-from flytrack_env import save_model
+from flytrack_env import nominal_parameters, save_model
 from flytrack_env.files import write_atomically
 from flytrack_env.plants import Plant
 from flytrack_loop.flight_log import fly_log
 from flytrack_loop.stages import Stage, errors_of, stage_as_json, train_stage
 from flytrack_sysid import Diagnosis, FlightLog, collect, diagnose, fit, save_log
-from flytrack_sysid.diagnosis import joined, text_of, write_diagnosis
+from flytrack_sysid.diagnosis import joined, motion_of, text_of, write_diagnosis
 from flytrack_sysid.log import usual_step
 from flytrack_sysid.progress import ProgressBar
 
@@ -80,7 +80,9 @@ def close_loop(
     report("1/6 collect and fit the minimal model")
     excitation = collect(plant, settings.minutes, seeds["collect"], settings.noise, ProgressBar("flights"))
     save_log(out / "excitation.npz", excitation)
-    fitted = fit(excitation, report=ProgressBar("rounds"))
+    start = nominal_parameters()
+    start = start._replace(motion=motion_of(excitation, start))
+    fitted = fit(excitation, start, report=ProgressBar("rounds"))
     save_model(out / "minimal.json", fitted.model, fitted.provenance())
 
     report("2/6 train on it")

@@ -15,12 +15,12 @@ import numpy as np
 import tyro
 from tyro.conf import FlagCreatePairsOff, Positional, UseAppendAction, arg, create_mutex_group, subcommand
 
-from flytrack_env import blackbox, load_model, load_provenance, save_model
+from flytrack_env import Motion, blackbox, load_model, load_provenance, save_model
 from flytrack_env.dynamics import nominal_parameters
 from flytrack_env.model_file import ModelFileError
 from flytrack_env.plants import Plant
 from flytrack_sysid.collect import CollectError, collect
-from flytrack_sysid.diagnosis import diagnose, joined, write_diagnosis
+from flytrack_sysid.diagnosis import diagnose, joined, motion_of, write_diagnosis
 from flytrack_sysid.diagnosis import text_of as text_of_diagnosis
 from flytrack_sysid.diagnosis.identifiability import next_flight
 from flytrack_sysid.diagnosis.report import traces_of
@@ -63,6 +63,9 @@ def load_plant(where: str) -> Any:
     return found
 
 
+MotionName = Literal["auto", "handout", "semi_implicit", "continuous"]
+
+
 @dataclass(frozen=True)
 class Collect:
     """Fly an excitation or a script on a plant and write the flight log."""
@@ -96,12 +99,12 @@ class Import:
 
     files: Annotated[Paths, arg(metavar="FILE [FILE ...]", help_behavior_hint="(at least one)")]
     """Logs of one craft."""
-    format: Literal["csv", "ulog", "betaflight"]
+    format: Literal["csv", "ulog", "betaflight", "usd", "bag"]
     """Their format."""
     out: Path
     """The log, .npz or .csv."""
     map: Annotated[str | None, arg(metavar="MAPPING", help_behavior_hint=NO_HINT)] = None
-    """A mapping file, .toml, or the name of a shipped one; CSV needs it."""
+    """A mapping file, .toml, or the name of a shipped one; CSV, uSD logs and bags need it."""
     model_out: OptionalPath = None
     """Also write the nominal model of this craft, .json."""
     keep_clocks: FlagCreatePairsOff[bool] = False
@@ -144,18 +147,24 @@ class Fit:
     """Identify the parameters of this effect too; may be repeated."""
     hold_out_every: int = HELD_OUT_EVERY
     """Hold out the last of every so many blocks; 0: none."""
+    motion: MotionName = "auto"
+    """How the craft moves within a step: as drones do (continuous), or by a simulator's step; auto: what the
+    log shows."""
 
     def run(self) -> None:
         """Fit the model and write it."""
         check_model_name(self.out)  # before the work
         fixed = fixed_values(self.fix)
-        start = None if self.start is None else load_model(self.start)
+        start = nominal_parameters() if self.start is None else load_model(self.start)
         log = load_log(self.log)
+        check_plausible(log)
+        start = start._replace(motion=motion_of(log, start) if self.motion == "auto" else Motion(self.motion))
         found = fit(log, start, fixed, self.effect, self.hold_out_every, ProgressBar("rounds"))
         provenance = found.provenance()
         provenance["started_from"] = "nominal parameters" if self.start is None else Path(self.start).name
         provenance["fixed"] = fixed
         save_model(self.out, found.model, provenance)
+        print(f"motion: {start.motion.value}")
         print(found.describe())
         print_written([self.out])
 
@@ -196,6 +205,9 @@ class Diagnose:
     """The model to diagnose, .json; default: the nominal model."""
     hold_out: Annotated[tuple[Path, ...], arg(metavar="LOG [LOG ...]", help_behavior_hint=NO_HINT)] = ()
     """Logs to judge by and not to learn from; default: the last of every four blocks of the others."""
+    motion: MotionName = "auto"
+    """How the craft moves within a step: as drones do (continuous), or by a simulator's step; auto: what the
+    logs show."""
 
     def run(self) -> None:
         """Diagnose the model; write the report, the extended model and a recording."""
@@ -208,7 +220,8 @@ class Diagnose:
         log = joined(logs)
         held_out = np.arange(len(log)) >= sum(map(len, train)) if test else None
         model = None if self.model is None else load_model(self.model)
-        found = diagnose(logs, model, held_out, ProgressBar("stages"))
+        motion = None if self.motion == "auto" else Motion(self.motion)
+        found = diagnose(logs, model, held_out, ProgressBar("stages"), motion)
         written = write_diagnosis(self.out, found, log)
         print(text_of_diagnosis(found))
         recording = self.out / RECORDING_NAME

@@ -80,7 +80,7 @@ def force_samples(
     return ForceSamples(
         source=source,
         measured_b=measured,
-        modelled_b=predicted_channel("f", prediction, model)[here],
+        modelled_b=predicted_channel("f", prediction)[here],
         action=np.asarray(prediction.after.applied.thrust)[here],
         battery_v=np.asarray(prediction.before.battery_v)[here],
         rows=here,

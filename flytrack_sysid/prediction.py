@@ -12,7 +12,7 @@ from flytrack_env.quaternion import Quaternion, Vec3
 from flytrack_env.state import Action, Drone
 from flytrack_sysid.log import FlightLog, usual_step
 from flytrack_sysid.record import LARGEST_DOUBT, Filled, Record, applied_doubt, record_of, steps_after
-from flytrack_sysid.replay import replay
+from flytrack_sysid.replay import Step, replay
 
 # For effects that remember: what they remembered when a segment began is not known.
 SETTLING_S = 0.5
@@ -39,7 +39,8 @@ class Prediction(NamedTuple):
     """The model's step from every row of a log; leaves of the drones are (num_rows,) float64.
 
     before: the measured state; zeros (upright, 23 V) where the log has no such channel.
-    memories: what the model's effects remember before the step. after: the state at the next row.
+    memories: what the model's effects remember before the step. after: the state at the next row. force_b:
+    (num_rows, 3) m/s^2, specific force of the step.
     is_settled: (num_rows,) bool, applied action and memories no longer depend on how they began.
     applied_from: "log" if it has the applied action, else "lag" of the model.
     """
@@ -47,6 +48,7 @@ class Prediction(NamedTuple):
     before: Drone
     memories: tuple[Any, ...]
     after: Drone
+    force_b: np.ndarray
     steps: Steps
     is_settled: np.ndarray
     applied_from: str
@@ -136,9 +138,13 @@ def in_float64(model: ModelParameters) -> ModelParameters:
 @jax.jit
 def _step_from_every_row(
     record: Record, gyro_b: np.ndarray, model: ModelParameters
-) -> tuple[Drone, tuple[Any, ...], Drone]:
-    """Return the drones and memories before, and the drones after, the steps of all rows."""
-    return replay(model, record, "measured", gyro_b, lambda step, _: (step.before, step.memories, step.after))
+) -> tuple[Drone, tuple[Any, ...], Drone, Vec3]:
+    """Return all rows' steps: drones and memories before, drones after, specific forces."""
+
+    def observe(step: Step, _: None) -> tuple[Any, ...]:
+        return step.before, step.memories, step.after, step.moved.context.force_b
+
+    return replay(model, record, "measured", gyro_b, observe)
 
 
 def _is_settled(model: ModelParameters, filled: Filled, steps: Steps, has_memory: bool) -> np.ndarray:
@@ -165,11 +171,12 @@ def predict(model: ModelParameters, filled: Filled) -> Prediction:
     gyro_b = log["w"] if "w" in log else np.zeros((len(log), 3))
     with jax.enable_x64(True):
         found = _step_from_every_row(record, gyro_b, in_float64(model))
-        before, memories, after = jax.tree.map(np.asarray, found)
+        before, memories, after, force_b = jax.tree.map(np.asarray, found)
     return Prediction(
         before=before,
         memories=memories,
         after=after,
+        force_b=columns(force_b),
         steps=steps,
         is_settled=_is_settled(model, filled, steps, bool(jax.tree.leaves(memories))),
         applied_from="log" if has_applied else "lag",

@@ -13,8 +13,6 @@ from flytrack_sysid.prediction import (
     inputs_that_lack,
     judged_steps,
     runs_of,
-    specific_force_w,
-    to_body,
     turn_between,
 )
 
@@ -92,11 +90,11 @@ class OneStep(NamedTuple):
         return {"steps": self.num_steps, "channels": channels}
 
 
-def predicted_channel(name: str, prediction: Prediction, model: ModelParameters) -> np.ndarray:
+def predicted_channel(name: str, prediction: Prediction) -> np.ndarray:
     """Return what the model predicts of a channel after every row's step, (num_rows, size)."""
     after = prediction.after
     if name == "f":
-        return to_body(prediction.before, specific_force_w(columns(after.acc_w), model))
+        return prediction.force_b
     of = {"p": after.pos_w, "v": after.vel_w, "q": after.quat, "w": after.rates_b, "a": after.acc_w}
     return columns(of[name])
 
@@ -139,9 +137,7 @@ def one_step_errors(
     if not len(here):
         return OneStep(0, {})
     channels = {
-        name: error_of(
-            name, log[name][here], log[name][here + 1], predicted_channel(name, prediction, model)[here]
-        )
+        name: error_of(name, log[name][here], log[name][here + 1], predicted_channel(name, prediction)[here])
         for name in names
     }
     return OneStep(len(here), channels)

@@ -13,8 +13,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from flytrack_env.dynamics import ModelParameters, advance, body_rates, start_rates
-from flytrack_env.effects import start_memories
+from flytrack_env.dynamics import ModelParameters, Moved, body_rates, move, start_rates
+from flytrack_env.effects import MOST_STEPS, start_memories
 from flytrack_env.quaternion import Quaternion, Vec3
 from flytrack_env.state import Action, Drone
 from flytrack_sysid.record import Record
@@ -26,16 +26,20 @@ RateSource = Literal["commanded", "gyro", "measured"]
 
 
 class Step(NamedTuple):
-    """One replayed step: from ``before``, the drone as measured at ``row``, to ``after``, as modelled.
+    """One replayed step: from ``before``, the drone as measured at ``row``, to ``moved.after``, as modelled.
 
-    memories: of the effects, before the step; later_memories: after it.
+    memories: of the effects, before the step.
     """
 
     row: Record
     before: Drone
     memories: tuple[Any, ...]
-    after: Drone
-    later_memories: tuple[Any, ...]
+    moved: Moved
+
+    @property
+    def after(self) -> Drone:
+        """The drone after the step."""
+        return self.moved.after
 
 
 def where_true(condition: jax.Array | np.ndarray, yes: Any, no: Any) -> Any:
@@ -43,7 +47,8 @@ def where_true(condition: jax.Array | np.ndarray, yes: Any, no: Any) -> Any:
     return jax.tree.map(partial(jnp.where, condition), yes, no)
 
 
-def _measured_drone(row: Record, applied: Action, rates_b: Vec3) -> Drone:
+def measured_drone(row: Record, applied: Action, rates_b: Vec3) -> Drone:
+    """Return the drone as measured at a row, with this applied action and these body rates."""
     return Drone(
         pos_w=Vec3(*row.pos_w),
         vel_w=Vec3(*row.vel_w),
@@ -78,17 +83,18 @@ def replay(
         row, gyro, extra = inputs
         applied, rates_b, memories = carry
         applied = where_true(row.begins | row.is_applied_known, Action(*row.applied), applied)
-        before = _measured_drone(row, applied, rates_b)
+        before = measured_drone(row, applied, rates_b)
         initial = initial_rates(row, gyro, before)
         rates_b = initial if rate_source == "measured" else where_true(row.begins, initial, rates_b)
         before = before._replace(rates_b=rates_b)
-        memories = where_true(row.begins, start_memories(model.effects, before), memories)
-        after, later = advance(before, memories, Action(*row.command), row.step_s, model)
-        return (after.applied, after.rates_b, later), observe(
-            Step(row, before, memories, after, later), extra
-        )
+        # As logged, which it is where a flight begins: past commands then depend on no model of a batch.
+        begun = before._replace(applied=Action(*row.applied))
+        memories = where_true(row.begins, start_memories(model.effects, begun, MOST_STEPS), memories)
+        moved = move(before, memories, Action(*row.command), row.step_s, model)
+        later = moved.after.applied, moved.after.rates_b, moved.memories
+        return later, observe(Step(row, before, memories, moved), extra)
 
     first = jax.tree.map(lambda column: column[0], record)
-    drone = _measured_drone(first, Action(*first.applied), Vec3(*jnp.zeros_like(first.vel_w)))
-    start = (drone.applied, drone.rates_b, start_memories(model.effects, drone))
+    drone = measured_drone(first, Action(*first.applied), Vec3(*jnp.zeros_like(first.vel_w)))
+    start = (drone.applied, drone.rates_b, start_memories(model.effects, drone, MOST_STEPS))
     return jax.lax.scan(next_row, start, (record, gyro_b, extras))[1]

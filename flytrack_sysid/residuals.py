@@ -20,8 +20,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from flytrack_env.dynamics import ModelParameters, integrate_attitude
-from flytrack_env.quaternion import Quaternion, Vec3
+from flytrack_env.dynamics import ModelParameters
+from flytrack_env.quaternion import Quaternion
 from flytrack_sysid.log import FlightLog
 from flytrack_sysid.record import Record, is_applied_certain, measured_channels
 from flytrack_sysid.replay import Step, replay, where_true
@@ -124,7 +124,7 @@ def _rotation_between(measured: jax.Array, predicted: jax.Array) -> jax.Array:
 class Predicted(NamedTuple):
     """What the model predicts of the rows, (num_rows, ...), each from the row before; nothing of the first.
 
-    rates_b: (3,) rad/s. force_b: (3,) m/s^2, specific force of the step to the row, attitude before it.
+    rates_b: (3,) rad/s. force_b: (3,) m/s^2, specific force of the step to the row.
     acc_w: (3,) m/s^2, the same with gravity, world. battery_change_v: of the step to the row. quat: (4,),
     integrated from the measured attitude where ``turns_afresh`` was last true.
     """
@@ -143,30 +143,32 @@ def predict_rows(model: ModelParameters, record: Record, turns_afresh: jax.Array
     """
 
     def observe(step: Step, _: None) -> tuple[Any, ...]:
-        force_w = step.after.acc_w + Vec3(0.0, 0.0, model.g)
-        force_b = [axis.dot(force_w) for axis in step.before.quat.axes()]
-        stacked = (jnp.stack(tuple(leaves)) for leaves in (step.after.rates_b, force_b, step.after.acc_w))
+        before = step.before.quat
+        inverse = before._replace(x=-before.x, y=-before.y, z=-before.z)
+        turn = inverse.multiply(step.after.quat)
+        seen = (turn, step.after.rates_b, step.moved.context.force_b, step.after.acc_w)
+        stacked = (jnp.stack(tuple(leaves)) for leaves in seen)
         return *stacked, step.after.battery_v - step.before.battery_v
 
     of_next = replay(model, record, "commanded", None, observe)
-    quat = _integrated(record, Vec3(*of_next[0].T), record.begins | turns_afresh)
+    quat = _integrated(record, Quaternion(*of_next[0].T), record.begins | turns_afresh)
     rates_b, force_b, acc_w, change_v = (
-        jnp.concatenate([jnp.zeros_like(values[:1]), values[:-1]]) for values in of_next
+        jnp.concatenate([jnp.zeros_like(values[:1]), values[:-1]]) for values in of_next[1:]
     )
     return Predicted(rates_b, force_b, acc_w, change_v, quat)
 
 
-def _integrated(record: Record, rates_b: Vec3, is_fresh: jax.Array | np.ndarray) -> jax.Array:
-    """Return the attitude that rates lead to at every row, (num_rows, 4), as measured where it is fresh."""
+def _integrated(record: Record, turns_b: Quaternion, is_fresh: jax.Array | np.ndarray) -> jax.Array:
+    """Return the attitude that turns lead to at every row, (num_rows, 4), as measured where it is fresh."""
 
     def next_row(quat: Quaternion, inputs: tuple[Any, ...]) -> tuple[Quaternion, Quaternion]:
-        measured, rates_b, step_s, is_fresh = inputs
+        measured, turn_b, is_fresh = inputs
         quat = where_true(is_fresh, measured, quat)
-        return integrate_attitude(quat, rates_b, step_s), quat
+        return quat.multiply(turn_b).normalize(), quat
 
     measured = Quaternion(*record.quat.T)
     start = jax.tree.map(lambda column: column[0], measured)
-    found = jax.lax.scan(next_row, start, (measured, rates_b, record.step_s, is_fresh))[1]
+    found = jax.lax.scan(next_row, start, (measured, turns_b, is_fresh))[1]
     return jnp.stack(tuple(found), axis=-1)
 
 

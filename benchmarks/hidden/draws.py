@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from benchmarks.hidden.truth import GRAVITY, Gust, Truth
+from benchmarks.hidden.truth import GRAVITY, STICKS, Gust, Truth
 
 Values = dict[str, float]
 Rng = np.random.Generator
@@ -81,22 +81,38 @@ def _ground(size: float, rng: Rng) -> Values:
     return {"gain": size, "height_m": float(rng.uniform(*GROUND_M))}
 
 
+def _per_axis(suffix: str = "", signs: tuple[float, ...] = (1.0,)) -> Callable[[float, Rng], Values]:
+    """Return a maker of values of one sign: the size on one axis, half of it or more on the others."""
+
+    def make(size: float, rng: Rng) -> Values:
+        shares = rng.uniform(*OTHER_AXES, len(STICKS))
+        shares[rng.integers(len(STICKS))] = rng.choice(signs)
+        shares = np.copysign(shares, shares[np.abs(shares).argmax()])
+        return {name + suffix: float(size * share) for name, share in zip(STICKS, shares, strict=True)}
+
+    return make
+
+
 def _oscillator(size: float, rng: Rng) -> Values:
-    return {"wn": 1.0 / size, "zeta": float(rng.uniform(*ZETA))}
+    values = {}
+    for name, own in _per_axis()(size, rng).items():
+        damping = float(rng.uniform(*ZETA))
+        values |= {f"{name}_s": 2.0 * damping * own, f"{name}_damping": damping}
+    return values
 
 
 # Parameters and signs are the package's where the laws agree.
 EFFECTS: dict[str, EffectRange] = {
     "command_delay": EffectRange(0.0006, 0.02, "s", _positive("delay_s")),
     "thrust_lag_asymmetry": EffectRange(0.25, 1.2, "|ln ratio|", _log_factor("ratio")),
-    "rate_expo": EffectRange(0.006, 0.15, "1", _signed("expo")),
-    "rate_scale": EffectRange(0.005, 0.1, "|ln factor|", _factors("roll", "pitch", "yaw")),
-    "rate_saturation": EffectRange(0.008, 0.2, "share lost at full stick", _positive("lost")),
+    "rate_expo": EffectRange(0.006, 0.15, "1", _per_axis(signs=(-1.0, 1.0))),
+    "rate_scale": EffectRange(0.005, 0.1, "|ln factor|", _factors(*STICKS)),
+    "rate_saturation": EffectRange(0.008, 0.2, "share lost at full stick", _per_axis()),
     "rate_cross_coupling": EffectRange(0.005, 0.08, "1", _direction("from_roll", "from_pitch")),
     "motor_imbalance": EffectRange(0.0006, 0.01, "rad/s per m/s^2", _direction("roll", "pitch")),
     "yaw_reaction": EffectRange(0.003, 0.05, "rad", _signed("angle")),
     "second_order_rates": EffectRange(0.002, 0.025, "s, 1 / wn", _oscillator),
-    "rate_slew_limit": EffectRange(0.0025, 0.03, "s^2/rad", _positive("inverse")),
+    "rate_slew_limit": EffectRange(0.02, 0.25, "s, centre to full stick", _per_axis("_s")),
     "wind": EffectRange(0.12, 1.5, "m/s^2; with drag 6 times that in m/s", _direction("a_x", "a_y", "a_z")),
     "thrust_scale": EffectRange(0.01, 0.2, "|ln factor|", _log_factor("factor")),
     "translational_lift": EffectRange(0.03, 0.4, "share of thrust", _positive("gain")),
@@ -115,6 +131,10 @@ EFFECTS: dict[str, EffectRange] = {
 }
 NAMES = tuple(EFFECTS)
 DRAGS = ("linear_drag", "quadratic_drag", "rotor_drag")
+# What a prop strike, a lost part or a broken motor brings about in flight.
+SUDDEN = ("motor_imbalance", "thrust_scale", "linear_drag", "rate_scale", "thrust_tilt")
+ONSET_SHARE = (0.25, 0.75)  # of the log
+MOST_LATE_S = 0.04  # of motion capture
 AIR_PER_PUSH = 6.0  # m/s of wind per m/s^2 of its size, where there is drag
 # Base parameters, log-uniform or uniform. The thrust curve is given at REFERENCE_V.
 TAU_S = (0.015, 0.07)
@@ -183,6 +203,20 @@ def draw_gust(rng: Rng) -> Gust:
     """Return gusts of 0.3 to 1.5 m/s^2 that last for 0.3 to 3 s; half of them turn the drone as well."""
     rate_std = _log_uniform(*GUST_RATE_STD, rng) if rng.random() < 0.5 else 0.0
     return Gust(_log_uniform(*GUST_STD, rng), _log_uniform(*GUST_S, rng), rate_std)
+
+
+def draw_onset(rng: Rng, seconds: float) -> Truth:
+    """Return a plant with one effect, of the larger half of sizes, that begins within a log."""
+    truth, name = draw_base(rng), str(rng.choice(SUDDEN))
+    drawn = EFFECTS[name]
+    size = _log_uniform(math.sqrt(drawn.low * drawn.high), drawn.high, rng)
+    onset_s = seconds * float(rng.uniform(*ONSET_SHARE))
+    return replace(truth, effects={name: draw_effect(name, rng, size)}, onset_s=onset_s)
+
+
+def draw_late(rng: Rng) -> Truth:
+    """Return a plant without effects whose motion capture is logged up to 40 ms late."""
+    return replace(draw_base(rng), mocap_late_s=float(rng.uniform(0.0, MOST_LATE_S)))
 
 
 class BaseChange(NamedTuple):

@@ -12,41 +12,45 @@ from collections import deque
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from benchmarks.hidden.truth import DT_S
+from benchmarks.hidden.truth import STICKS
 from benchmarks.hidden.vectors import Vector, to_body
 
 Parameters = Mapping[str, float]
 Sticks = tuple[float, float, float, float]
 Hook = Callable[[Any, Any], Any]
-MOST_STEPS = 8  # commands that a delay remembers
 BISECTIONS = 60  # halve an interval down to rounding
 LIFT_SPEED = 8.0  # m/s, airspeed at which translational lift has 1 - 1/e of its gain
 AIR_VELOCITY = ("v_x", "v_y", "v_z")  # of wind, m/s
 
 
-def _command_delay(values: Parameters) -> Hook:
-    """u(t) = u(t - delay_s), averaged over the step."""
-    whole, part = divmod(values["delay_s"] / DT_S, 1.0)
-    late, past = int(whole), deque(maxlen=MOST_STEPS)
+class Delay:
+    """Commands that are held for a step each, and act ``delay_s`` later."""
 
-    def act(plant: Any, sticks: Sticks) -> Sticks:
+    def __init__(self, delay_s: float, step_s: float):
+        whole, self.share = divmod(delay_s / step_s, 1.0)
+        self._past: deque[Sticks] = deque(maxlen=int(whole) + 2)
+
+    def arriving(self, sticks: Sticks) -> tuple[Sticks, Sticks]:
+        """Return what acts in the first ``share`` of the step in which sticks are sent, and in the rest."""
+        past = self._past
         past.appendleft(sticks)
-        newer = past[min(late, len(past) - 1)]
-        older = past[min(late + 1, len(past) - 1)]
-        return tuple((1.0 - part) * new + part * old for new, old in zip(newer, older, strict=True))
+        late = past.maxlen - 2
+        return past[min(late + 1, len(past) - 1)], past[min(late, len(past) - 1)]
 
-    return act
+    def mean(self, sticks: Sticks) -> Sticks:
+        """Return the mean of what acts in the step."""
+        older, newer = self.arriving(sticks)
+        part = self.share
+        return tuple((1.0 - part) * new + part * old for new, old in zip(newer, older, strict=True))
 
 
 def _rate_expo(values: Parameters) -> Hook:
-    """omega *= (1 - expo) + expo u^2, u the lagged stick."""
-    expo = values["expo"]
+    """u *= (1 - expo) + expo u^2, u a rate stick; each axis has its own."""
+    expos = tuple(values[axis] for axis in STICKS)
 
-    def act(plant: Any, rates: Vector) -> Vector:
-        return tuple(
-            rate * (1.0 - expo * (1.0 - stick * stick))
-            for rate, stick in zip(rates, plant.applied[:3], strict=True)
-        )
+    def act(plant: Any, sticks: Sticks) -> Sticks:
+        pairs = zip(sticks, expos, strict=False)
+        return (*(stick * (1.0 - expo * (1.0 - stick * stick)) for stick, expo in pairs), sticks[3])
 
     return act
 
@@ -57,26 +61,28 @@ def _rate_scale(values: Parameters) -> Hook:
     return lambda plant, rates: (roll * rates[0], pitch * rates[1], yaw * rates[2])
 
 
-def _rate_saturation(values: Parameters) -> Hook:
-    """omega = limit tanh(omega / limit), per axis; at full stick the share ``lost`` of it is missing.
-
-    Not the package's law, which mixes a hard limit with a gradual one of another shape.
-    """
+def _bend(lost: float) -> float:
+    """Return the x above 0 at which tanh(x) / x is 1 - lost, by bisection."""
     low, high = 0.0, 1.0
-    # In x = 1 / (limit as a share of full stick): tanh(x) / x falls from 1.
-    while math.tanh(high) / high > 1.0 - values["lost"]:
+    while math.tanh(high) / high > 1.0 - lost:
         high *= 2.0
     for _ in range(BISECTIONS):
         middle = 0.5 * (low + high)
-        is_low = math.tanh(middle) / middle > 1.0 - values["lost"]
+        is_low = math.tanh(middle) / middle > 1.0 - lost
         low, high = (middle, high) if is_low else (low, middle)
-    inverse = high
+    return high
 
-    def act(plant: Any, rates: Vector) -> Vector:
-        return tuple(
-            full / inverse * math.tanh(inverse * rate / full)
-            for rate, full in zip(rates, plant.full_rates, strict=True)
-        )
+
+def _rate_saturation(values: Parameters) -> Hook:
+    """u = limit tanh(u / limit), u a rate stick; each axis lacks its own share of u at full stick.
+
+    Not the package's law, which mixes a hard limit with a gradual one of another shape.
+    """
+    bends = tuple(_bend(values[axis]) for axis in STICKS)
+
+    def act(plant: Any, sticks: Sticks) -> Sticks:
+        pairs = zip(sticks, bends, strict=False)
+        return (*(math.tanh(bend * stick) / bend for stick, bend in pairs), sticks[3])
 
     return act
 
@@ -94,48 +100,61 @@ def _motor_imbalance(values: Parameters) -> Hook:
 
 
 def _yaw_reaction(values: Parameters) -> Hook:
-    """omega_z += angle du/dt, u the lagged thrust action; rad."""
-    gain = values["angle"] / DT_S
-    return lambda plant, rates: (
-        *rates[:2],
-        rates[2] + gain * (plant.applied[3] - plant.applied_before[3]),
-    )
+    """omega_z += angle du/dt, u the lagged thrust stick; rad."""
+    angle = values["angle"]
+    return lambda plant, rates: (*rates[:2], rates[2] + angle * plant.thrust_stick_slope)
 
 
-def _second_order_rates(values: Parameters) -> Hook:
-    """y'' + 2 zeta wn y' + wn^2 y = wn^2 omega: an oscillator, exact for rates held over the step.
+class RateLoop:
+    """y'' / wn^2 + lag_s y' + y = omega, with lag_s = 2 damping / wn: an oscillator per axis.
 
-    wn: rad/s. zeta: not 1. The package has the same law with other parameters: lag_s is 2 zeta / wn,
-    damping is zeta.
+    Exact for rates held over the step. Each axis has its own lag, s, and damping, not 1. rates_b, slopes_b: y
+    and y', rad/s and rad/s^2.
     """
-    natural, damping = values["wn"], values["zeta"]
+
+    def __init__(self, values: Parameters):
+        self._axes = [(values[f"{axis}_damping"], values[f"{axis}_s"]) for axis in STICKS]
+        self._known: dict[float, list[tuple[float, float, float, float]]] = {}
+        self.rates_b: Vector = (0.0, 0.0, 0.0)
+        self.slopes_b: Vector = (0.0, 0.0, 0.0)
+
+    def follow(self, asked_b: Vector, step_s: float) -> Vector:
+        """Return the body rates after a step in which these are asked for."""
+        if step_s not in self._known:
+            self._known[step_s] = [_response(damping, lag_s, step_s) for damping, lag_s in self._axes]
+        axes = zip(self._known[step_s], asked_b, self.rates_b, self.slopes_b, strict=True)
+        after = []
+        for (stay, follow, pull, keep), rate, now, slope in axes:
+            offset = now - rate
+            after.append((rate + stay * offset + follow * slope, pull * offset + keep * slope))
+        self.rates_b, self.slopes_b = zip(*after, strict=True)
+        return self.rates_b
+
+
+def _response(damping: float, lag_s: float, step_s: float) -> tuple[float, float, float, float]:
+    """Return what stays of an offset and of a slope after a step: in the rate, and in its slope."""
+    natural = 2.0 * damping / lag_s
     decay, root = natural * damping, natural * cmath.sqrt(damping * damping - 1.0)
-    shrink = math.exp(-decay * DT_S)
+    shrink = math.exp(-decay * step_s)
     # Both are real, whether the root is (two lags) or not (oscillation).
-    even, odd = cmath.cosh(root * DT_S).real, (cmath.sinh(root * DT_S) / root).real
-    stay, follow = shrink * (even + decay * odd), shrink * odd
-    pull, keep = -natural * natural * shrink * odd, shrink * (even - decay * odd)
-    offset, slope = [0.0, 0.0, 0.0], [0.0, 0.0, 0.0]
-    now = [0.0, 0.0, 0.0]
-
-    def act(plant: Any, rates: Vector) -> Vector:
-        for axis, rate in enumerate(rates):
-            offset[axis] = now[axis] - rate
-            now[axis] = rate + stay * offset[axis] + follow * slope[axis]
-            slope[axis] = pull * offset[axis] + keep * slope[axis]
-        return (now[0], now[1], now[2])
-
-    return act
+    even, odd = cmath.cosh(root * step_s).real, (cmath.sinh(root * step_s) / root).real
+    pull = -natural * natural * shrink * odd
+    return shrink * (even + decay * odd), shrink * odd, pull, shrink * (even - decay * odd)
 
 
 def _rate_slew_limit(values: Parameters) -> Hook:
-    """|omega - omega before| <= dt / inverse, per axis."""
-    most, before = DT_S / values["inverse"], [0.0, 0.0, 0.0]
+    """A rate stick takes a least time from centre to full, s; each axis has its own."""
+    before, times_s = [0.0, 0.0, 0.0], tuple(values[f"{axis}_s"] for axis in STICKS)
 
-    def act(plant: Any, rates: Vector) -> Vector:
-        for axis, rate in enumerate(rates):
-            before[axis] += max(-most, min(most, rate - before[axis]))
-        return (before[0], before[1], before[2])
+    def act(plant: Any, sticks: Sticks) -> Sticks:
+        meant = []
+        for axis, full_s in enumerate(times_s):
+            most = plant.part_s / full_s
+            change = max(-most, min(most, sticks[axis] - before[axis]))
+            # Where time is continuous, what is asked for on the way; a step asks for its end.
+            meant.append(before[axis] + (0.5 * change if plant.is_fine else change))
+            before[axis] += change
+        return (*meant, sticks[3])
 
     return act
 
@@ -205,17 +224,17 @@ def _wind(values: Parameters) -> Hook:
     return lambda plant: to_body(plant.rows, push_w)
 
 
-COMMAND_EFFECTS = {"command_delay": _command_delay}
-# In the order in which they act: first the flight controller, then the frame.
-RATE_EFFECTS = {
+# In the order in which they act: first what a flight controller makes of the sticks, then the frame.
+COMMAND_EFFECTS = {
     "rate_expo": _rate_expo,
-    "rate_scale": _rate_scale,
     "rate_saturation": _rate_saturation,
+    "rate_slew_limit": _rate_slew_limit,
+}
+RATE_EFFECTS = {
+    "rate_scale": _rate_scale,
     "rate_cross_coupling": _rate_cross_coupling,
     "motor_imbalance": _motor_imbalance,
     "yaw_reaction": _yaw_reaction,
-    "second_order_rates": _second_order_rates,
-    "rate_slew_limit": _rate_slew_limit,
 }
 THRUST_EFFECTS = {
     "thrust_scale": _thrust_scale,

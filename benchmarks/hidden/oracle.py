@@ -5,9 +5,8 @@ an effect is then the effect's signature, whatever its law, and minus twice the 
 length. All else is fitted again, each rival in the effect's place too.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
-from itertools import product
 from typing import NamedTuple
 
 import jax
@@ -19,13 +18,12 @@ from flytrack_sysid.diagnosis.lanes import NUM_AXES, make_lanes
 from flytrack_sysid.diagnosis.model_selection import MOST_RIVALS, ablate
 from flytrack_sysid.diagnosis.noise import fit_noise
 from flytrack_sysid.diagnosis.problem import Problem
-from flytrack_sysid.diagnosis.score_test import CANDIDATES, Candidate
+from flytrack_sysid.diagnosis.score_test import CANDIDATES
 from flytrack_sysid.diagnosis.search import FittedModel, Held, SearchState, add_effect, score_candidates
 from flytrack_sysid.log import FlightLog
 from flytrack_sysid.parameters import THRUST_COEFFS
 
-# Attitude noise turns the thrust that is fed in: m/s of velocity in a second, as a random walk.
-WANDER = STD["q"] * 10.0 * np.sqrt(0.01)
+TURNED_MS2 = 10.0  # about the thrust that attitude noise turns
 NO_DISTURBANCE, ANY_TAU, COUPLED = np.log(1e-3), np.log(0.3), 0.0
 
 
@@ -37,11 +35,13 @@ class Known(NamedTuple):
     rival: str
 
 
-def true_noise() -> np.ndarray:
+def true_noise(step_s: float) -> np.ndarray:
     """Return the noise of ``benchmarks.hidden.noise`` as the diagnosis has it, (6, NUM_AXES)."""
+    # Attitude noise turns the thrust that is fed in: m/s of velocity in a second, as a random walk.
+    wandered = STD["q"] * TURNED_MS2 * np.sqrt(step_s)
     direct = np.repeat([STD["w"], STD["f"], 1.0], [3, 3, 1])
     level = np.repeat([STD["q"], STD["v"], DIGIT["v_bat"]], [3, 3, 1])
-    wander = np.repeat([1e-3 * STD["q"], WANDER, 1e-3], [3, 3, 1]) / level
+    wander = np.repeat([1e-3 * STD["q"], wandered, 1e-3], [3, 3, 1]) / level
     rest = np.repeat([[NO_DISTURBANCE], [ANY_TAU], [COUPLED]], NUM_AXES, axis=1)
     return np.stack([np.log(direct), np.log(level), np.log(wander), *rest])
 
@@ -56,7 +56,7 @@ def clean_problem(clean: FlightLog, log: FlightLog, judged: np.ndarray, model: M
     problem = Problem.of(make_lanes(kept, judged, tau, gravity), model)
     measured = Problem.of(make_lanes(log, judged, tau, gravity), model)
     errors = measured.residuals(problem.start[None])[0] - problem.residuals(problem.start[None])[0]
-    noise = true_noise()
+    noise = true_noise(float(np.median(np.diff(clean.time))))
     noise[:, -1] = fit_noise(measured.lanes, errors, noise)[:, -1]
     return problem.with_noise(noise)
 
@@ -64,29 +64,19 @@ def clean_problem(clean: FlightLog, log: FlightLog, judged: np.ndarray, model: M
 def with_all(state: SearchState, effects: Mapping[str, Mapping[str, float]]) -> FittedModel:
     """Return the model with all true effects that fits the clean log best, from the true parameters.
 
-    A law with other parameters than the truth's starts in each way in which it is looked for.
+    Each is looked for in the way that has its true parameters and the fewest others.
     """
-    ways = []
+    chosen = []
     for name, values in effects.items():
         own = [one for one in CANDIDATES if one.effect == name and name != "thrust_scale"]
-        whole = [one for one in own if len(one.fields) == max(len(other.fields) for other in own)]
-        is_known = any(field.split(".")[1] in values for one in whole for field in one.fields)
-        ways.append(whole[:1] if is_known else whole)
-    tried = [_started_with(state, chosen, effects) for chosen in product(*(own for own in ways if own))]
-    return min(tried, key=lambda model: model.cost)
-
-
-def _started_with(
-    state: SearchState, chosen: Sequence[Candidate], effects: Mapping[str, Mapping[str, float]]
-) -> FittedModel:
-    problem = state.problem
-    vector = problem.start.copy()
+        fields = {f"{name}.{field}" for field in values}
+        chosen += sorted(own, key=lambda one: (-len(fields & {*one.fields}), len(one.fields)))[:1]
+    vector = state.problem.start.copy()
     for way in chosen:
-        vector = way.placed_in(problem, vector)
         for field in way.fields:
-            place = problem.names.index(field)
+            place = state.problem.names.index(field)
             vector[place] = effects[way.effect].get(field.split(".")[1], vector[place])
-    return state.fitted(chosen, problem.clipped(vector))
+    return state.fitted(chosen, state.problem.clipped(vector))
 
 
 def _scale_known(state: SearchState, model: FittedModel) -> Known:
@@ -132,16 +122,15 @@ def known(
     return result
 
 
-def removed(
-    clean: FlightLog, model: ModelParameters, base: ModelParameters, extended: ModelParameters
-) -> tuple[float, float]:
+def removed(clean: FlightLog, base: ModelParameters, extended: ModelParameters) -> tuple[float, float]:
     """Return the share of a clean flight's explainable error that an extended model removes, and that error.
 
-    base: refitted, without effects. The error is the rms whitened residual of that, 1 is the noise.
+    base: refitted, without effects, in the same motion. The error is the rms whitened residual of that, 1 is
+    the noise.
     """
     with jax.enable_x64(True):
-        lanes = make_lanes(clean, np.ones(len(clean), bool), np.asarray(model.tau, float), float(model.g))
-        problem = Problem.of(lanes, model)
+        lanes = make_lanes(clean, np.ones(len(clean), bool), np.asarray(base.tau, float), float(base.g))
+        problem = Problem.of(lanes, extended)
         every = [Problem.of(lanes, one).start for one in (base, extended)]
         left = problem.residuals(np.stack(every))
     size = np.array([STD["w"]] * 3 + [STD["f"]] * 3)

@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.hidden.noise import ACCELEROMETER_STD, GYRO_STD
-from benchmarks.hidden.truth import DT_S, Outside, Truth
+from benchmarks.hidden.truth import Outside, Truth
 from benchmarks.hidden.vectors import Vector, norm, scale, to_body
 
 # An amplitude of 1: m/s^2 of forces and of thrust over mass, rad/s of rates.
@@ -52,17 +52,16 @@ class FirstOrderNoise:
     """Independent first-order random processes of standard deviation 1 with a time constant, s."""
 
     def __init__(self, time_constant_s: float, rng: np.random.Generator, count: int = 3):
-        self._keep = math.exp(-DT_S / time_constant_s)
-        self._fresh = math.sqrt(1.0 - self._keep**2)
-        self._rng = rng
-        self._now = tuple(rng.standard_normal(count).tolist())
+        self._time_constant_s, self._rng = time_constant_s, rng
+        self.now = tuple(rng.standard_normal(count).tolist())
 
-    def step(self) -> tuple[float, ...]:
-        """Return the next values, 10 ms later."""
-        fresh = self._rng.standard_normal(len(self._now)).tolist()
-        pairs = zip(self._now, fresh, strict=True)
-        self._now = tuple(self._keep * old + self._fresh * new for old, new in pairs)
-        return self._now
+    def step(self, step_s: float) -> tuple[float, ...]:
+        """Return the next values, a step later."""
+        keep = math.exp(-step_s / self._time_constant_s)
+        size = math.sqrt(1.0 - keep * keep)
+        fresh = self._rng.standard_normal(len(self.now)).tolist()
+        self.now = tuple(keep * old + size * new for old, new in zip(self.now, fresh, strict=True))
+        return self.now
 
 
 def _bump(value: float, middle: float, width: float) -> float:
@@ -105,14 +104,16 @@ def _periodic(shape: Any, plant: Any) -> float:
     return math.sin(2.0 * math.pi * shape["frequency_hz"] * plant.time_s + shape["phase"])
 
 
-def vector_hook(outside: Outside, rng: np.random.Generator) -> Callable[[Any], Vector]:
-    """Return a hook that adds a force, body, m/s^2, or body rates, rad/s."""
+def noise_hook(process: FirstOrderNoise, size: float, channel: str) -> Callable[[Any], Vector]:
+    """Return a hook that adds what a process has now: as a force of the world, or as body rates."""
+    if channel == "rate":
+        return lambda plant: scale(size, process.now)
+    return lambda plant: to_body(plant.rows, scale(size, process.now))
+
+
+def vector_hook(outside: Outside) -> Callable[[Any], Vector]:
+    """Return a hook that adds a force, body, m/s^2, or body rates, rad/s; not of kind "stochastic"."""
     size, shape = outside.amplitude * SCALES[outside.channel], outside.shape
-    if outside.kind == "stochastic":
-        process = FirstOrderNoise(shape["time_constant_s"], rng)
-        if outside.channel == "rate":
-            return lambda plant: scale(size, process.step())
-        return lambda plant: to_body(plant.rows, scale(size, process.step()))
     signal = TABLE[outside.kind][2]
     if outside.kind == "airspeed":
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from benchmarks.hidden.outside import FirstOrderNoise
 from benchmarks.hidden.plans import Moment
-from benchmarks.hidden.truth import DT_S, Truth
+from benchmarks.hidden.truth import DT_S, STICKS, Truth
 from benchmarks.hidden.vectors import Vector, clip_length, norm, rotation, to_body, wrap_angle
 
 # Each gain is a share of the inner loop's, so that no loop is faster than the one inside it.
@@ -24,7 +24,7 @@ MOST_SPEED, MOST_CORRECTION, MOST_LEARNT = 18.0, 4.0, 5.0  # m/s, m/s, m/s^2
 UPRIGHT = 0.3  # cosine of the tilt beyond which the heading is undefined
 TINY, LEAST_SLOPE, CUBE_POWER = 1e-9, 1.0, 3.0  # m/s^2; N per stick; of the thrust curve's last term
 TREMBLE, TREMBLE_S = 0.01, 0.1  # of sticks that are held still, and its time constant, s
-USUAL_TURN = 3.0  # rad/s, change of rates that a slew limit stretches
+USUAL_TURN = 0.25  # of a stick, change that a slew limit stretches
 NEWTON_STEPS = 4  # from the previous stick, which is close
 FIRST_STICK = -0.2
 # Manoeuvres on one stick are cut off where there is no room left to brake, and above a speed.
@@ -40,10 +40,10 @@ class Pilot:
         self._truth = truth
         self._full_rates = tuple(math.radians(rate) for rate in truth.max_rate)
         effects = truth.effects
-        delay = effects.get("command_delay", {}).get("delay_s", 0.0) + DT_S
+        delay = effects.get("command_delay", {}).get("delay_s", 0.0) + max(DT_S, truth.step_s)
         loop = effects.get("second_order_rates", {})
-        ringing = 2.0 / loop["wn"] if loop else 0.0
-        slew = USUAL_TURN * effects.get("rate_slew_limit", {}).get("inverse", 0.0)
+        ringing = max((loop[f"{axis}_s"] / loop[f"{axis}_damping"] for axis in STICKS if loop), default=0.0)
+        slew = USUAL_TURN * max(effects.get("rate_slew_limit", {}).values(), default=0.0)
         slow_fall = max(1.0, effects.get("thrust_lag_asymmetry", {}).get("ratio", 1.0))
         turn_lag = max(truth.tau[:3]) + delay + ringing + slew
         self._attitude = min(QUICKEST_ATTITUDE, ATTITUDE_PER_LAG / turn_lag)
@@ -62,7 +62,7 @@ class Pilot:
         own = tuple(
             stick + TREMBLE * shake
             for stick, shake in zip(
-                self._sticks(plant, force_w, moment.heading), self._tremble.step(), strict=True
+                self._sticks(plant, force_w, moment.heading), self._tremble.step(DT_S), strict=True
             )
         )
         if not is_free:

@@ -1,4 +1,11 @@
-"""The plant: the handout's step in plain floats, with hooks for the hidden effects."""
+"""The plant in plain floats, with hooks for the hidden effects; it moves in one of three ways.
+
+- handout: the handout's step. Rates after the step turn the drone, the force acts in the attitude before it.
+- semi_implicit: the same, but the force acts in the attitude after the step.
+- fine: a differential equation. Delays and lags are exact for held commands; attitude, velocity and position
+  follow by the midpoint rule in parts of 1 ms or less, cut where a delayed command or an instant of a late
+  sensor falls. What the sensors say is true at an instant, not of a step.
+"""
 
 import math
 from typing import NamedTuple
@@ -11,10 +18,12 @@ from benchmarks.hidden.effects import (
     FORCE_EFFECTS,
     RATE_EFFECTS,
     THRUST_EFFECTS,
+    Delay,
+    RateLoop,
     Sticks,
 )
-from benchmarks.hidden.outside import FirstOrderNoise, command_hook, vector_hook
-from benchmarks.hidden.truth import DT_S, Truth
+from benchmarks.hidden.outside import SCALES, FirstOrderNoise, command_hook, noise_hook, vector_hook
+from benchmarks.hidden.truth import Truth
 from benchmarks.hidden.vectors import (
     Quaternion,
     Vector,
@@ -24,9 +33,12 @@ from benchmarks.hidden.vectors import (
     scale,
     to_body,
     to_world,
+    turn,
 )
 
 SECONDS_PER_MINUTE = 60.0
+LONGEST_PART_S = 0.001
+SAME_S = 1e-9  # instants nearer than this are one
 
 
 class Start(NamedTuple):
@@ -38,12 +50,38 @@ class Start(NamedTuple):
     thrust_stick: float
 
 
+class Felt(NamedTuple):
+    """What an inertial sensor feels: specific force, m/s^2; body rates, rad/s; their slopes, rad/s^2."""
+
+    force_b: Vector
+    rates_b: Vector
+    slopes_b: Vector
+
+
+class Tracked(NamedTuple):
+    """What motion capture sees: m, m/s, body to world."""
+
+    pos_w: Vector
+    vel_w: Vector
+    quat: Quaternion
+
+
+class Part(NamedTuple):
+    """A part of a step: has the delayed command arrived before it, does a sensor read at its end?"""
+
+    length_s: float
+    is_new: bool
+    is_felt: bool
+    is_tracked: bool
+
+
 class Plant:
     """A drone in flight; attributes are its state, updated by ``step``.
 
-    pos_w, vel_w, acc_w: m, m/s, m/s^2. quat: body to world; rows: of its matrix, before the step.
-    rates_b: rad/s. force_b: specific force in the attitude before the step, m/s^2. applied: lagged
-    sticks. battery_v: V, under load. thrust_acc: thrust over mass, m/s^2. airspeed_b: m/s. time_s: s.
+    pos_w, vel_w, acc_w: m, m/s, m/s^2. quat: body to world; rows: of the matrix in which the force acted.
+    rates_b: rad/s. force_b: specific force, m/s^2. applied: lagged sticks; thrust_stick_slope: of the last of
+    them, 1/s. battery_v: V, under load. thrust_acc: thrust over mass, m/s^2. airspeed_b: m/s. time_s: s.
+    felt, tracked: what the sensors report of this step; in fine motion, at a late sensor's instant in it.
     """
 
     def __init__(
@@ -53,8 +91,9 @@ class Plant:
         rng: np.random.Generator,
         duration_s: float = 60.0,
         centre_w: Vector = (0.0, 0.0, 0.0),
+        settle_s: float = 0.0,
     ):
-        """duration_s, centre_w: of the flight, for effects outside the list."""
+        """duration_s, centre_w: of the flight, for effects outside the list. settle_s: before its log."""
         self.truth, self.duration_s, self.centre_w = truth, duration_s, centre_w
         self.pos_w, self.vel_w, self.acc_w = start.pos_w, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
         self.quat: Quaternion = (math.cos(0.5 * start.heading), 0.0, 0.0, math.sin(0.5 * start.heading))
@@ -62,88 +101,228 @@ class Plant:
         self.rows = rotation(self.quat)
         self.force_b, self.airspeed_b, self.thrust_acc = (0.0, 0.0, truth.gravity), (0.0, 0.0, 0.0), 0.0
         self.applied: Sticks = (0.0, 0.0, 0.0, start.thrust_stick)
-        self.applied_before = self.applied
+        self.thrust_stick_slope = 0.0
         self.full_rates = tuple(math.radians(rate) for rate in truth.max_rate)
+        self.is_fine, self.part_s = truth.motion == "fine", truth.step_s
         self._sag_v = truth.effects.get("voltage_sag", {}).get("at_full_v", 0.0)
         self._open_v, self.time_s = start.open_v, 0.0
+        self._onset_s = -math.inf if truth.onset_s is None else truth.onset_s + settle_s
         self.battery_v = self._loaded_v()
         self._air_w = tuple(truth.effects.get("wind", {}).get(name, 0.0) for name in AIR_VELOCITY)
+        self._turning_b: Vector = (0.0, 0.0, 0.0)
+        self.felt = Felt(self.force_b, self.rates_b, self.rates_b)
+        self.tracked = Tracked(self.pos_w, self.vel_w, self.quat)
+        asymmetry = truth.effects.get("thrust_lag_asymmetry", {}).get("ratio", 1.0)
+        self._taus = (*truth.tau, asymmetry * truth.tau[3])
         self._hooks(rng)
+        self._parts = self._planned_parts()
+        steps = {truth.step_s, *(0.5 * part.length_s for part in self._parts)}
+        self._shares = {step: tuple(-math.expm1(-step / tau) for tau in self._taus) for step in steps}
 
     def _hooks(self, rng: np.random.Generator) -> None:
         """Collect the hooks of each stage, in the order of its table."""
         effects, outside, gust = self.truth.effects, self.truth.outside, self.truth.gust
 
         def made(makers: dict) -> list:
-            return [make(effects[name]) for name, make in makers.items() if name in effects]
+            return [self._from_onset(make(effects[name])) for name, make in makers.items() if name in effects]
 
         self._command_hooks, self._rate_hooks = made(COMMAND_EFFECTS), made(RATE_EFFECTS)
         self._thrust_hooks, self._force_hooks = made(THRUST_EFFECTS), made(FORCE_EFFECTS)
-        self._turn_hooks = []
+        self._turn_hooks, self._noises = [], []
+        self._delay = Delay(effects.get("command_delay", {}).get("delay_s", 0.0), self.truth.step_s)
+        loop = effects.get("second_order_rates")
+        self._loop = RateLoop(loop) if loop else None
         if outside is not None and outside.kind == "command":
-            self._command_hooks.append(command_hook(outside, self.truth))
+            self._command_hooks.insert(0, command_hook(outside, self.truth))
+        elif outside is not None and outside.kind == "stochastic":
+            size = outside.amplitude * SCALES[outside.channel]
+            self._add_noise(outside.shape["time_constant_s"], size, outside.channel, rng)
         elif outside is not None:
             hooks = self._turn_hooks if outside.channel == "rate" else self._force_hooks
-            hooks.append(vector_hook(outside, rng))
+            hooks.append(vector_hook(outside))
         if gust is not None:
-            air, turns = (FirstOrderNoise(gust.time_constant, rng) for _ in range(2))
-            self._force_hooks.append(
-                lambda plant: to_body(plant.rows, scale(gust.std, air.step())),
-            )
-            if gust.rate_std:
-                self._turn_hooks.append(lambda plant: scale(gust.rate_std, turns.step()))
-        asymmetry = effects.get("thrust_lag_asymmetry", {}).get("ratio", 1.0)
-        self._shares = tuple(-math.expm1(-DT_S / tau) for tau in self.truth.tau)
-        self._falling_share = -math.expm1(-DT_S / (asymmetry * self.truth.tau[3]))
+            self._add_noise(gust.time_constant, gust.std, "force", rng)
+            self._add_noise(gust.time_constant, gust.rate_std, "rate", rng)
+
+    def _add_noise(self, time_constant_s: float, size: float, channel: str, rng: np.random.Generator) -> None:
+        process, is_rate = FirstOrderNoise(time_constant_s, rng), channel == "rate"
+        if size:
+            self._noises.insert(0 if is_rate else len(self._noises), process)
+            (self._turn_hooks if is_rate else self._force_hooks).append(noise_hook(process, size, channel))
+
+    def _from_onset(self, hook):
+        """Return a hook that acts from the onset on."""
+        if self.truth.onset_s is None:
+            return hook
+
+        def act(plant, *value):
+            if plant.time_s >= self._onset_s:
+                return hook(plant, *value)
+            return value[0] if value else (0.0, 0.0, 0.0)
+
+        return act
+
+    def _planned_parts(self) -> list[Part]:
+        """Return the parts of a step of fine motion."""
+        step_s, effects = self.truth.step_s, self.truth.effects
+        arrives_s = self._delay.share * step_s
+        felt_s = step_s - effects.get("imu_latency", {}).get("latency_s", 0.0) % step_s
+        tracked_s = step_s - self.truth.mocap_late_s % step_s
+        parts, begin = [], 0.0
+        for end in sorted({arrives_s, felt_s, tracked_s, step_s}):
+            if end - begin < SAME_S:
+                continue
+            count = math.ceil((end - begin) / LONGEST_PART_S - SAME_S)
+            is_felt, is_tracked = (abs(end - instant) < SAME_S for instant in (felt_s, tracked_s))
+            plain = Part((end - begin) / count, begin > arrives_s - SAME_S, False, False)
+            parts += [plain] * (count - 1) + [plain._replace(is_felt=is_felt, is_tracked=is_tracked)]
+            begin = end
+        return parts
 
     def _loaded_v(self) -> float:
         return self._open_v - self._sag_v * (0.5 + 0.5 * self.applied[3]) ** 2
 
-    def step(self, command: Sticks) -> None:
-        """Fly 10 ms under a command in [-1, 1]."""
+    def step(self, sticks: Sticks) -> None:
+        """Fly from one row of the log to the next under a command in [-1, 1]."""
+        if self.is_fine:
+            self._step_finely(sticks)
+            return
+        step_s = self.truth.step_s
+        self._pass_noise(step_s)
+        self._lag(self._shaped(self._delay.mean(sticks)), step_s)
+        before = self.quat
+        asked = self._asked(before)
+        if self._loop is not None:
+            asked = self._loop.follow(asked, step_s)
+        rates = self._with_turns(asked)
+        self.quat = integrate_attitude(before, rates, step_s)
+        if self.truth.motion == "semi_implicit":
+            self._see(self.quat)
+        self.force_b, self.rates_b = self._force(), rates
+        self._accelerate(step_s)
+        self._pass_time(step_s)
+        self.felt = Felt(self.force_b, rates, (0.0, 0.0, 0.0))
+        self.tracked = Tracked(self.pos_w, self.vel_w, self.quat)
+
+    def _step_finely(self, sticks: Sticks) -> None:
+        older, newer = self._delay.arriving(sticks)
+        for part_s, is_new, is_felt, is_tracked in self._parts:
+            acting = newer if is_new else older
+            begin = self._rates_now(acting) if is_felt else None
+            middle = self._glide(acting, part_s)
+            if begin is not None:
+                self._feel(begin, middle, self._rates_now(acting), part_s)
+            if is_tracked:
+                self.tracked = Tracked(self.pos_w, self.vel_w, self.quat)
+
+    def _feel(self, begin: Vector, middle: Vector, end: Vector, part_s: float) -> None:
+        """Set what an inertial sensor feels now, at the end of a part with these body rates."""
+        if self._loop is not None:
+            slopes = self._loop.slopes_b
+        else:  # of a parabola, at its end
+            slopes = scale(1.0 / part_s, add(add(begin, scale(-4.0, middle)), scale(3.0, end)))
+        self.felt = Felt(self._force(), end, slopes)
+        self.force_b, self.rates_b = self.felt[:2]
+
+    def _glide(self, sticks: Sticks, part_s: float) -> Vector:
+        """Move on by a part of a step, by the midpoint rule; return the body rates in its middle."""
+        half_s, pos_w, vel_w, quat = 0.5 * part_s, self.pos_w, self.vel_w, self.quat
+        self.part_s = part_s
+        self._pass_noise(part_s)
+        sticks = self._shaped(sticks)
+        self._lag(sticks, half_s)
+        self._pass_time(half_s)
+        self.pos_w, self.vel_w = add(pos_w, scale(half_s, vel_w)), add(vel_w, scale(half_s, self.acc_w))
+        rates = self._asked(turn(quat, self._turning_b, half_s))
+        if self._loop is not None:
+            before = self._loop.rates_b
+            rates = scale(0.5, add(before, self._loop.follow(rates, part_s)))
+        self._turning_b = rates = self._with_turns(rates)
+        self.force_b, self.pos_w, self.vel_w = self._force(), pos_w, vel_w
+        self._accelerate(part_s)
+        self.quat = turn(quat, rates, part_s)
+        self._lag(sticks, half_s)
+        self._pass_time(half_s)
+        return rates
+
+    def _rates_now(self, sticks: Sticks) -> Vector:
+        """Return the body rates at this instant, while a command acts."""
+        self._set_slope(sticks)
+        asked = self._asked(self.quat)
+        return self._with_turns(asked if self._loop is None else self._loop.rates_b)
+
+    def _pass_noise(self, step_s: float) -> None:
+        for process in self._noises:
+            process.step(step_s)
+
+    def _pass_time(self, step_s: float) -> None:
+        self._open_v -= self.truth.drain / SECONDS_PER_MINUTE * step_s
+        self.battery_v = self._loaded_v()
+        self.time_s += step_s
+
+    def _shaped(self, sticks: Sticks) -> Sticks:
         for hook in self._command_hooks:
-            command = hook(self, command)
-        self._lag(command)
-        self.rows = rotation(self.quat)
-        self.airspeed_b = to_body(
-            self.rows, tuple(v - w for v, w in zip(self.vel_w, self._air_w, strict=True))
+            sticks = hook(self, sticks)
+        return sticks
+
+    def _lag(self, command: Sticks, step_s: float) -> None:
+        before, (roll, pitch, yaw, rising, falling) = self.applied, self._shares[step_s]
+        last = falling if command[3] < before[3] else rising
+        self.applied = (
+            before[0] + roll * (command[0] - before[0]),
+            before[1] + pitch * (command[1] - before[1]),
+            before[2] + yaw * (command[2] - before[2]),
+            before[3] + last * (command[3] - before[3]),
         )
+        if self.is_fine:
+            self._set_slope(command)
+        else:
+            self.thrust_stick_slope = (self.applied[3] - before[3]) / step_s
+
+    def _set_slope(self, command: Sticks) -> None:
+        """Set how fast the applied thrust stick moves at this instant."""
+        away = command[3] - self.applied[3]
+        self.thrust_stick_slope = away / (self._taus[3] if away >= 0.0 else self._taus[4])
+
+    def _see(self, quat: Quaternion) -> None:
+        """Set what depends on an attitude: airspeed and thrust."""
+        self.rows = rotation(quat)
+        air = self._air_w
+        vel = self.vel_w
+        self.airspeed_b = to_body(self.rows, (vel[0] - air[0], vel[1] - air[1], vel[2] - air[2]))
         thrust = self.truth.thrust(self.applied[3], self.battery_v)
         for hook in self._thrust_hooks:
             thrust = hook(self, thrust)
         self.thrust_acc = thrust / self.truth.mass
-        rates = tuple(full * stick for full, stick in zip(self.full_rates, self.applied, strict=False))
+
+    def _asked(self, quat: Quaternion) -> Vector:
+        """Return the body rates that an inner loop follows, in an attitude."""
+        self._see(quat)
+        full, stick = self.full_rates, self.applied
+        rates = (full[0] * stick[0], full[1] * stick[1], full[2] * stick[2])
         for hook in self._rate_hooks:
             rates = hook(self, rates)
+        return rates
+
+    def _with_turns(self, rates_b: Vector) -> Vector:
         for hook in self._turn_hooks:
-            rates = add(rates, hook(self))
+            rates_b = add(rates_b, hook(self))
+        return rates_b
+
+    def _force(self) -> Vector:
+        """Return the specific force in the attitude that was seen last."""
         force = (0.0, 0.0, self.thrust_acc)
         for hook in self._force_hooks:
             force = add(force, hook(self))
-        self._move(force, rates)
+        return force
 
-    def _lag(self, command: Sticks) -> None:
-        self.applied_before = before = self.applied
-        shares = self._shares
-        last = self._falling_share if command[3] < before[3] else shares[3]
-        self.applied = (
-            before[0] + shares[0] * (command[0] - before[0]),
-            before[1] + shares[1] * (command[1] - before[1]),
-            before[2] + shares[2] * (command[2] - before[2]),
-            before[3] + last * (command[3] - before[3]),
+    def _accelerate(self, step_s: float) -> None:
+        x, y, z = to_world(self.rows, self.force_b)
+        self.acc_w = acc = (x, y, z - self.truth.gravity)
+        (x, y, z), (vx, vy, vz), half = self.pos_w, self.vel_w, 0.5 * step_s * step_s
+        self.pos_w = (
+            x + vx * step_s + acc[0] * half,
+            y + vy * step_s + acc[1] * half,
+            z + vz * step_s + acc[2] * half,
         )
-
-    def _move(self, force_b: Vector, rates_b: Vector) -> None:
-        """Integrate as the handout does: acceleration in the old attitude, rates after the step."""
-        x, y, z = to_world(self.rows, force_b)
-        acc = (x, y, z - self.truth.gravity)
-        half = 0.5 * DT_S * DT_S
-        self.pos_w = tuple(
-            p + v * DT_S + a * half for p, v, a in zip(self.pos_w, self.vel_w, acc, strict=True)
-        )
-        self.vel_w = tuple(v + a * DT_S for v, a in zip(self.vel_w, acc, strict=True))
-        self.quat = integrate_attitude(self.quat, rates_b, DT_S)
-        self.acc_w, self.force_b, self.rates_b = acc, force_b, rates_b
-        self._open_v -= self.truth.drain / SECONDS_PER_MINUTE * DT_S
-        self.battery_v = self._loaded_v()
-        self.time_s += DT_S
+        self.vel_w = (vx + acc[0] * step_s, vy + acc[1] * step_s, vz + acc[2] * step_s)

@@ -4,7 +4,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 GRAVITY = 9.80665  # m/s^2
-DT_S = 0.01  # of a step
+DT_S = 0.01  # of a plan's moments, and between commands
+STICKS = ("roll", "pitch", "yaw")  # those of body rates
+MOTIONS = ("handout", "semi_implicit", "fine")
 
 
 @dataclass(frozen=True)
@@ -40,7 +42,9 @@ class Truth:
     """A plant; the handout's if it has no effects.
 
     tau: s. coeffs: N, of 1, u, u^2, u^3, V, u V. max_rate: deg/s. drain: V/min. mass: kg. gravity: m/s^2.
-    effects: name -> parameter -> value, units as in ``benchmarks.hidden.draws``.
+    effects: name -> parameter -> value, units as in ``benchmarks.hidden.draws``. onset_s: time in the log at
+    which all effects begin; None: before it. motion: of ``MOTIONS``, see ``benchmarks.hidden.plant``. step_s:
+    between rows of the log. mocap_late_s: by which position, velocity and attitude are logged late.
     """
 
     tau: tuple[float, float, float, float]
@@ -52,6 +56,10 @@ class Truth:
     effects: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     outside: Outside | None = None
     gust: Gust | None = None
+    onset_s: float | None = None
+    motion: str = "handout"
+    step_s: float = DT_S
+    mocap_late_s: float = 0.0
 
     def thrust(self, stick: float, battery_v: float) -> float:
         """Return thrust without effects, N, of an applied thrust stick at a voltage."""
@@ -67,7 +75,10 @@ class Truth:
             parts.append(f"outside {out.kind}[{tags}] on {out.channel} x{out.amplitude:.3g}")
         if self.gust is not None:
             parts.append(f"gust({self.gust.std:.3g} m/s^2, {self.gust.time_constant:.3g} s)")
-        return " + ".join(parts) or "no effects"
+        if self.mocap_late_s:
+            parts.append(f"motion capture {1e3 * self.mocap_late_s:.3g} ms late")
+        when = "" if self.onset_s is None else f" from {self.onset_s:.1f} s on"
+        return (" + ".join(parts) or "no effects") + when
 
 
 def _values(values: Mapping[str, float]) -> str:

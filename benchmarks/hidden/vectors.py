@@ -48,6 +48,22 @@ def integrate_attitude(quat: Quaternion, rates_b: Vector, step_s: float) -> Quat
     return (new[0] / norm, new[1] / norm, new[2] / norm, new[3] / norm)
 
 
+def turn(quat: Quaternion, rates_b: Vector, step_s: float) -> Quaternion:
+    """Return the attitude after a time at constant body rates, rad/s, exactly."""
+    x, y, z = rates_b
+    rate = math.sqrt(x * x + y * y + z * z)
+    half = 0.5 * rate * step_s
+    share = math.sin(half) / rate if rate > 0.0 else 0.0
+    cosine, roll, pitch, yaw = math.cos(half), share * x, share * y, share * z
+    w, x, y, z = quat
+    return (
+        w * cosine - x * roll - y * pitch - z * yaw,
+        x * cosine + w * roll + y * yaw - z * pitch,
+        y * cosine + w * pitch - x * yaw + z * roll,
+        z * cosine + w * yaw + x * pitch - y * roll,
+    )
+
+
 def add(first: Vector, second: Vector) -> Vector:
     """Return the sum of two vectors."""
     return (first[0] + second[0], first[1] + second[1], first[2] + second[2])

@@ -6,7 +6,7 @@ import numpy as np
 from scipy import signal
 
 from benchmarks.hidden.noise import ACCELEROMETER_STD, DIGIT, GYRO_STD
-from benchmarks.hidden.truth import DT_S, Truth
+from benchmarks.hidden.truth import Truth
 from flytrack_sysid.log import FlightLog
 
 NUDGE = 1e-3  # of lags, relative
@@ -18,8 +18,8 @@ SCALES = np.array([ACCELEROMETER_STD] * 3 + [GYRO_STD] * 3 + [DIGIT["v_bat"]])
 def _applied(log: FlightLog, tau: np.ndarray) -> np.ndarray:
     """Return the applied action in the step to each row, (num_rows, 4), started at the first command."""
     sticks = np.vstack([log["u"][:1], log["u"][:-1]])
-    columns = []
-    for column, keep in zip(sticks.T, np.exp(-DT_S / tau), strict=True):
+    step_s, columns = log.time[1] - log.time[0], []
+    for column, keep in zip(sticks.T, np.exp(-step_s / tau), strict=True):
         columns.append(signal.lfilter([1.0 - keep], [1.0, -keep], column, zi=[keep * column[0]])[0])
     return np.stack(columns, axis=1)
 

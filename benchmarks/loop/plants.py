@@ -15,7 +15,7 @@ import numpy as np
 
 from benchmarks.hidden import EFFECTS as EFFECT_RANGES
 from benchmarks.hidden import Truth, draw_effect
-from benchmarks.hidden.effects import LIFT_SPEED, MOST_STEPS
+from benchmarks.hidden.effects import LIFT_SPEED
 from benchmarks.hidden.plant import SECONDS_PER_MINUTE
 from benchmarks.hidden.truth import DT_S
 from flytrack_env import nominal_parameters
@@ -49,6 +49,7 @@ LAG_SPREAD, THRUST_SPREAD = 0.2, 0.05  # |ln factor| of the lags, and of the thr
 LARGE = 2.0 / 3.0  # smallest size drawn, as a share of the log range
 # Hidden effects of the first plants: named, or a number of random ones.
 HIDDEN = (("command_delay",), ("quadratic_drag",), ("thrust_scale",), 2, 3)
+MOST_STEPS = 8  # commands that a delay remembers
 LATER = 5  # random effects of all later plants
 
 

@@ -133,11 +133,11 @@ def hostile_gzips(_: bytes) -> list[bytes]:
     return [gzip.compress(b"0," * 2**27, 1), gzip.compress(b"\n" * 2**28, 1), gzip.compress(b"") * 100_000]
 
 
-def import_csv(path: Path) -> Any:
-    """Return the log in a CSV file."""
-    mapping = path.with_name("mapping_of_csv.toml")
-    mapping.write_text(foreign_logs.MAPPING)
-    return import_log(path, "csv", mapping).log
+def import_mapped(path: Path, form: str, content: str) -> Any:
+    """Return the log in a file of a format that needs a mapping."""
+    mapping = path.with_name(f"mapping_of_{form}.toml")
+    mapping.write_text(content)
+    return import_log(path, form, mapping).log
 
 
 LOG = log_of_states([flight()], 0.01)
@@ -147,6 +147,14 @@ npz_log, csv_log = (partial(written, save_log, suffix, LOG) for suffix in (".npz
 rollout = partial(written, save_rollout, ".npy", *flight())
 model = partial(written, save_model, ".json", MODEL, {})
 gzipped = partial(gzip.compress, foreign_logs.foreign_csv(), mtime=0)
+import_csv, import_usd, import_bag = (
+    partial(import_mapped, form=form, content=content)
+    for form, content in (
+        ("csv", foreign_logs.MAPPING),
+        ("usd", foreign_logs.USD_MAPPING),
+        ("bag", foreign_logs.BAG_MAPPING),
+    )
+)
 import_ulog, import_bbl = (partial(import_log, format=form) for form in ("ulog", "betaflight"))
 KINDS = {
     "track": Kind(".toml", track.read_bytes, load_track, TrackError, hostile_texts),
@@ -161,6 +169,8 @@ KINDS = {
     "imported CSV, gzip": Kind(".csv.gz", gzipped, import_csv, LogError, hostile_gzips),
     "imported PX4 log": Kind(".ulg", foreign_logs.ulog, import_ulog, LogError, is_slow=True),
     "imported Betaflight log": Kind(".bbl", foreign_logs.betaflight, import_bbl, LogError, is_slow=True),
+    "imported uSD log": Kind("", foreign_logs.usd, import_usd, LogError),
+    "imported bag": Kind(".mcap", foreign_logs.mcap_bag, import_bag, LogError, is_slow=True),
     "training settings": Kind(".toml", SETTINGS.encode, settings_in_file, ConfigError, hostile_texts),
     "checkpoint": Kind(CHAMPION.suffix, CHAMPION.read_bytes, load_checkpoint, CheckpointError),
     "black box": Kind(".bin", plant, blackbox.load, blackbox.BlackBoxError, is_slow=True),

@@ -1,6 +1,9 @@
-"""Writers of small valid logs in the formats that are imported: PX4, Betaflight, CSV with a mapping."""
+"""Writers of small valid logs in the formats that are imported: PX4, Betaflight, uSD, MCAP, CSV."""
 
+import io
+import json
 import struct
+import zlib
 from pathlib import Path
 from typing import Any
 
@@ -34,6 +37,23 @@ column = "mv"
 scale = 0.001
 [craft]
 max_rate_deg_s = [500, 500, 500]
+"""
+USD_MAPPING = """[command]
+columns = ["roll", "pitch", "yaw", "thrust"]
+[rates]
+columns = ["gyro.x", "gyro.y", "gyro.z"]
+unit = "deg/s"
+frame = "flu"
+[battery]
+column = "pm.vbat"
+unit = "mV"
+"""
+BAG_MAPPING = """[command]
+columns = ["/flight:u[0]", "/flight:u[1]", "/flight:u[2]", "/flight:u[3]"]
+[rates]
+columns = ["/flight:w.x", "/flight:w.y", "/flight:w.z"]
+unit = "rad/s"
+frame = "flu"
 """
 
 
@@ -123,6 +143,55 @@ def blackbox(rows: np.ndarray, names: list[str], headers: dict[str, str]) -> byt
     return text + frames + b"E\xffEnd of log\x00"
 
 
+def usd_log(events: dict[str, tuple[dict[str, str], np.ndarray]], version: int = 2) -> bytes:
+    """Return a Crazyflie's uSD log: of each event its variables, and rows with the time in s first."""
+    stamp, per_s = {1: ("I", 1e3), 2: ("Q", 1e6)}[version]
+    header, records = struct.pack("<BHH", 0xBC, version, len(events)), []
+    for number, (name, (variables, rows)) in enumerate(events.items()):
+        header += struct.pack("<H", number) + name.encode() + b"\0" + struct.pack("<H", len(variables))
+        header += b"".join(f"{variable}({kind})".encode() + b"\0" for variable, kind in variables.items())
+        for time, *row in rows:
+            values = [v if kind in "efd" else int(v) for kind, v in zip(variables.values(), row, strict=True)]
+            content = struct.pack(
+                f"<H{stamp}{''.join(variables.values())}", number, round(time * per_s), *values
+            )
+            records.append((time, content))
+    content = header + b"".join(content for _, content in sorted(records, key=lambda record: record[0]))
+    return content + struct.pack("<I", zlib.crc32(content))
+
+
+def usd() -> bytes:
+    """Return a small uSD log that ``USD_MAPPING`` fits."""
+    variables = {
+        "roll": "f",
+        "pitch": "f",
+        "yaw": "f",
+        "thrust": "f",
+        "gyro.x": "f",
+        "gyro.y": "f",
+        "gyro.z": "h",
+    }
+    rows = np.tile((0.0, 0.5, -0.25, 0.1, 0.3, 10.0, -20.0, 30.0), (NUM_ROWS, 1))
+    rows[:, 0] = 1.0 + 0.01 * np.arange(NUM_ROWS)
+    slow = np.array([[0.9, 3900.0], [1.4, 3800.0]])
+    return usd_log({"fixedFrequency": (variables, rows), "battery": ({"pm.vbat": "H"}, slow)})
+
+
+def mcap_bag() -> bytes:
+    """Return a small MCAP file of JSON messages that ``BAG_MAPPING`` fits."""
+    from mcap.writer import Writer
+
+    file = io.BytesIO()
+    writer = Writer(file)
+    writer.start()
+    channel = writer.register_channel("/flight", "json", writer.register_schema("any", "jsonschema", b"{}"))
+    for row in range(NUM_ROWS):
+        content = {"u": [0.5, -0.25, 0.1, 0.3], "w": {"x": 0.1 * row, "y": 0.0, "z": -0.1}}
+        writer.add_message(channel, row * 10**7, json.dumps(content).encode(), row * 10**7)
+    writer.finish()
+    return file.getvalue()
+
+
 def ulog() -> bytes:
     """Return a small PX4 log."""
     writer = UlogWriter(ULOG_PARAMETERS)
@@ -135,7 +204,7 @@ def betaflight() -> bytes:
     """Return a small Betaflight log."""
     sensors = [f"{sensor}[{axis}]" for sensor in ("gyroADC", "accSmooth") for axis in range(3)]
     names = ["loopIteration", "time", *(f"setpoint[{axis}]" for axis in range(4)), "vbatLatest", *sensors]
-    rows = np.tile((0, 0, 511, -333, 250, 0, 2410, 100, -50, 25, 1024, -512, 2048), (NUM_ROWS, 1))
+    rows = np.tile((0, 0, 511, -333, 250, 300, 2410, 100, -50, 25, 1024, -512, 2048), (NUM_ROWS, 1))
     rows[:, 0], rows[:, 1] = np.arange(NUM_ROWS), 5_000_000 + STEP_US * np.arange(NUM_ROWS)
     return blackbox(rows, names, BLACKBOX_HEADERS)
 

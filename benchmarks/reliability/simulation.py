@@ -14,7 +14,7 @@ from tqdm import tqdm
 import flytrack_env
 from benchmarks.report import ROOT, table
 from flytrack_env import blackbox
-from flytrack_env.effects import EFFECTS, Range, effect_of
+from flytrack_env.effects import EFFECTS, USUAL_STEPS, Range, effect_of
 from flytrack_env.episodes import EpisodicEnvironment
 from flytrack_env.params import RANGES, EnvParams
 from flytrack_env.registration import ENVIRONMENTS
@@ -139,8 +139,10 @@ def draw_extremes(generator: np.random.Generator, params: EnvParams) -> EnvParam
     for parameters in params.model.effects:
         effect, neutral = effect_of(parameters), parameters._asdict()
         values = {field: within(bounds, neutral[field]) for field, bounds in effect.ranges.items()}
-        for field, most in effect.most_steps.items():
-            values[field] = np.minimum(values[field], np.float32(most) * batch.dt)
+        left_s = np.float32(USUAL_STEPS) * batch.dt  # all delays of an effect share what is remembered
+        for field in effect.most_steps:
+            values[field] = np.minimum(values[field], left_s)
+            left_s = left_s - np.maximum(values[field], 0.0)
         effects.append(effect.parameters(**values))
     radius = np.minimum(batch.drone_radius, 0.9 * batch.course.gates.half_opening.min(axis=1))
     return batch.replace(

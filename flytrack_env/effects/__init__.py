@@ -11,7 +11,7 @@ import numpy as np
 from flytrack_env.effects.accelerometer_bias import ACCELEROMETER_BIAS, AccelerometerBias
 from flytrack_env.effects.accelerometer_scale import ACCELEROMETER_SCALE, AccelerometerScale
 from flytrack_env.effects.base import STAGES, Effect, Range, StepContext
-from flytrack_env.effects.command_delay import COMMAND_DELAY, CommandDelay
+from flytrack_env.effects.command_delay import COMMAND_DELAY, MOST_STEPS, USUAL_STEPS, CommandDelay
 from flytrack_env.effects.ground_effect import GROUND_EFFECT, GroundEffect
 from flytrack_env.effects.gyro_bias import GYRO_BIAS, GyroBias
 from flytrack_env.effects.gyro_scale import GYRO_SCALE, GyroScale
@@ -36,19 +36,20 @@ from flytrack_env.effects.wind import WIND, Wind
 from flytrack_env.effects.yaw_reaction import YAW_REACTION, YawReaction
 from flytrack_env.state import Drone
 
-# The order in which effects of one stage are folded, and that of a model's effects. What adds to the rates
+# The order in which effects of one stage are folded, and that of a model's effects. Commands pass as in a
+# flight controller: the link, the stick's curve, its limit, the limit on acceleration. What adds to the rates
 # comes before the loop that remembers them; the latency comes before all that is wrong with its readings.
 EFFECTS: tuple[Effect, ...] = (
     COMMAND_DELAY,
-    THRUST_LAG_ASYMMETRY,
     RATE_EXPO,
-    RATE_SCALE,
     RATE_SATURATION,
+    RATE_SLEW_LIMIT,
+    THRUST_LAG_ASYMMETRY,
+    RATE_SCALE,
     YAW_REACTION,
     MOTOR_IMBALANCE,
     RATE_CROSS_COUPLING,
     SECOND_ORDER_RATES,
-    RATE_SLEW_LIMIT,
     WIND,
     THRUST_SCALE,
     TRANSLATIONAL_LIFT,
@@ -66,6 +67,8 @@ EFFECTS: tuple[Effect, ...] = (
     GYRO_BIAS,
 )
 ROUNDING = 1e-5  # of float32 times
+# Delays that are drawn around those of a model are longer by this factor and so many seconds, at most.
+DRAWN_LONGER, DRAWN_LATER_S = 1.25, 0.02
 BY_NAME = {effect.name: effect for effect in EFFECTS}
 _BY_CLASS = {effect.parameters: effect for effect in EFFECTS}
 
@@ -83,15 +86,18 @@ def effect_of(parameters: Any) -> Effect:
     return effect
 
 
-def check_parameters(parameters: Any, dt: Any) -> None:
+def check_parameters(parameters: Any, dt: Any, delay_steps: int = USUAL_STEPS) -> None:
     """Raise ValueError, naming effect and parameter, for concrete values beyond what the effect can do.
 
-    dt: step of time, s.
+    dt: step of time, s. delay_steps: how many steps are remembered, as in ``start_memories``.
     """
     effect = effect_of(parameters)
     for name, bounds in effect.ranges.items():
         value = np.asarray(getattr(parameters, name))
-        longest = effect.most_steps.get(name, np.inf) * np.asarray(dt, float)
+        longest = np.inf
+        if name in effect.most_steps:  # what the other delays of the effect leave
+            others = lasting_s(parameters) - np.maximum(value, 0.0)
+            longest = delay_steps * np.asarray(dt, float) - others
         high = np.minimum(bounds.high, longest)
         if not np.all((value >= bounds.low) & (value <= high * (1.0 + ROUNDING))):
             reason = f" at steps of {dt} s" if np.any(longest < bounds.high) else ""
@@ -105,10 +111,32 @@ def merge(present: tuple[Any, ...], *added: Any) -> tuple[Any, ...]:
     return tuple(by_name[effect.name] for effect in EFFECTS if effect.name in by_name)
 
 
-def start_memories(effects: tuple[Any, ...], drone: Drone) -> tuple[Any, ...]:
-    """Return what the effects of a model remember when an episode begins; None for most."""
-    starts = ((effect_of(parameters).start, parameters) for parameters in effects)
-    return tuple(start(parameters, drone) if start else None for start, parameters in starts)
+def lasting_s(parameters: Any) -> np.ndarray:
+    """Return the longest that an effect with concrete parameters may delay anything, s: all its delays."""
+    delays = [getattr(parameters, name) for name in effect_of(parameters).most_steps]
+    return np.sum([np.maximum(np.asarray(delay, float), 0.0) for delay in delays], axis=0)
+
+
+def delay_steps_of(effects: tuple[Any, ...], dt: float) -> int:
+    """Return how many steps the delays of a model with concrete parameters need, with room to draw others."""
+    longest_s = max((float(np.max(lasting_s(parameters))) for parameters in effects), default=0.0)
+    needed = np.ceil((DRAWN_LONGER * longest_s + DRAWN_LATER_S) / dt * (1.0 - ROUNDING))
+    return int(np.clip(needed, USUAL_STEPS, MOST_STEPS))
+
+
+def start_memories(effects: tuple[Any, ...], drone: Drone, delay_steps: int = USUAL_STEPS) -> tuple[Any, ...]:
+    """Return what the effects of a model remember when an episode begins; None for most.
+
+    delay_steps: of delays; every step of an episode carries them, so that fewer are faster.
+    """
+
+    def start(parameters: Any) -> Any:
+        effect = effect_of(parameters)
+        if effect.start is None:
+            return None
+        return effect.start(parameters, drone, *([delay_steps] if effect.most_steps else []))
+
+    return tuple(start(parameters) for parameters in effects)
 
 
 def acts(effects: tuple[Any, ...], stage: str) -> bool:
@@ -127,19 +155,50 @@ def fold(
     return value
 
 
-def remember(effects: tuple[Any, ...], memories: tuple[Any, ...], context: StepContext) -> tuple[Any, ...]:
-    """Return what the effects of a model remember after a step."""
-    updates = ((effect_of(parameters).remember, parameters) for parameters in effects)
-    pairs = zip(updates, memories, strict=True)
-    return tuple(
-        update(parameters, memory, context) if update else memory for (update, parameters), memory in pairs
-    )
+def fold_rates(
+    effects: tuple[Any, ...],
+    memories: tuple[Any, ...],
+    rates_b: Any,
+    context: StepContext,
+    first_inputs: tuple[Any, ...],
+) -> tuple[Any, tuple[Any, ...]]:
+    """Return the value of the stage rates as ``fold`` does, and what each effect was given.
+
+    first_inputs: what each was given at the beginning of the step; empty where that is now.
+    """
+    inputs = []
+    for place, (parameters, memory) in enumerate(zip(effects, memories, strict=True)):
+        inputs.append(rates_b)
+        first_b = first_inputs[place] if first_inputs else rates_b
+        rates_b = fold("rates", (parameters,), (memory,), rates_b, context._replace(first_input_b=first_b))
+    return rates_b, tuple(inputs)
+
+
+def remember(
+    effects: tuple[Any, ...],
+    memories: tuple[Any, ...],
+    context: StepContext,
+    first_inputs: tuple[Any, ...],
+    inputs: tuple[Any, ...],
+) -> tuple[Any, ...]:
+    """Return what the effects of a model remember after a step.
+
+    first_inputs, inputs: what each was given at the stage rates, at the beginning and at the end of the step.
+    """
+    found = []
+    for parameters, memory, *given in zip(effects, memories, first_inputs, inputs, strict=True):
+        update = effect_of(parameters).remember
+        seen = context._replace(first_input_b=given[0], input_b=given[1])
+        found.append(update(parameters, memory, seen) if update else memory)
+    return tuple(found)
 
 
 __all__ = [
     "BY_NAME",
     "EFFECTS",
+    "MOST_STEPS",
     "STAGES",
+    "USUAL_STEPS",
     "AccelerometerBias",
     "AccelerometerScale",
     "CommandDelay",
@@ -170,8 +229,10 @@ __all__ = [
     "YawReaction",
     "acts",
     "check_parameters",
+    "delay_steps_of",
     "effect_of",
     "fold",
+    "fold_rates",
     "merge",
     "remember",
     "start_memories",

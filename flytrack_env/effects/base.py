@@ -30,6 +30,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
+from flytrack_env.motion import Motion
 from flytrack_env.quaternion import Scalar, Vec3
 from flytrack_env.state import Action, Drone
 
@@ -52,20 +53,26 @@ NOT_YET: Any = None  # in place of a value that a later stage of the step comput
 class StepContext(NamedTuple):
     """What an effect may look at; a field is ``NOT_YET`` before the stage that fills it.
 
-    drone: before the step. command: as given, before any effect. dt: s. acting: the command after the stage
-    command.
+    drone: before the step. command: as given, before any effect. dt: s. motion: of the model. acting: the
+    command after the stage command.
     applied: the lagged action after the step. body_axes_w: the body's x, y, z axes before the step.
     air_w: after the stage air, m/s. thrust_acc: collective thrust over mass, after the stage thrust, m/s^2.
     rates_b: after the stage rates, rad/s. force_b: specific force of the step, thrust and all else but
     gravity, in the body frame before it, after the stage force, m/s^2.
-    At the stage accelerometer all of these are true values but air_w and thrust_acc, which are None, and the
-    applied action stands for the command. At the stage gyro only dt, applied and rates_b are those of the
-    step; drone is the one after it.
+    At the stage gyro only dt, applied and rates_b are those of the step; drone is the one after it.
+
+    A step of continuous motion folds the stages at several moments; applied, rates_b and force_b are those
+    of the moment, and dt is the time since the beginning of the step at the stages rates and battery.
+    span: shares of the step between which the command acts; the value of the stage command is its mean there.
+    applied_slope: change of the applied action at the moment, 1/s. angular_acc_b: rad/s^2, at the end.
+    first_input_b, input_b: what the effect is given at the stage rates at the beginning of the step, and at
+    its end where it remembers the step, rad/s.
     """
 
     drone: Drone
     command: Action
     dt: Scalar
+    motion: Motion = Motion.HANDOUT
     acting: Action = NOT_YET
     applied: Action = NOT_YET
     body_axes_w: tuple[Vec3, Vec3, Vec3] = NOT_YET
@@ -73,6 +80,11 @@ class StepContext(NamedTuple):
     thrust_acc: Scalar = NOT_YET
     rates_b: Vec3 = NOT_YET
     force_b: Vec3 = NOT_YET
+    span: tuple[float, float] = (0.0, 1.0)
+    applied_slope: Action = NOT_YET
+    angular_acc_b: Vec3 = NOT_YET
+    first_input_b: Vec3 = NOT_YET
+    input_b: Vec3 = NOT_YET
 
     def airspeed_b(self) -> Vec3:
         """Return the velocity through the air, body frame, m/s; from the stage thrust on."""
@@ -102,13 +114,15 @@ class Effect:
     parameter. notable: the smallest departure from neutral that matters, a judgement: less hardly
     shows in a lap or a reading. equation: LaTeX. source: a publication, or the assumption. command,
     lag, air, thrust, rates, force, battery, gyro, accelerometer: hooks at these stages.
-    most_steps: of parameters that are times, how many steps of time they may last.
+    most_steps: of parameters that are delays, how many steps of time each may last.
     needs: channels that a log has to have to be asked about it: p position, v velocity, q attitude, w gyro,
     f accelerometer, v_bat voltage.
-    probes: values at which to look for the effect, of parameters whose slope at neutral is 0 or one-sided.
+    probes: values at which to look for the effect, of parameters whose slope at neutral is 0 or one-sided:
+    first all of the first values, and so on.
     groups: parameters that are looked for together; all of them if empty. shapes: parameters that only shape
     what others do, and do nothing while those are neutral.
-    start: (parameters, drone) -> memory of an episode that begins; no memory if None.
+    start: (parameters, drone) -> memory of an episode that begins; no memory if None. With ``most_steps`` it
+    also takes how many steps to remember.
     remember: (parameters, memory, context) -> memory after a step.
     """
 
@@ -132,7 +146,7 @@ class Effect:
     battery: Hook | None = None
     gyro: Hook | None = None
     accelerometer: Hook | None = None
-    start: Callable[[Any, Drone], Any] | None = None
+    start: Callable[..., Any] | None = None
     remember: Callable[[Any, Any, StepContext], Any] | None = None
 
     @property

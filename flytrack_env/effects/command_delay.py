@@ -1,22 +1,27 @@
 """A pure delay of all commands: radio, flight controller, motor driver."""
 
+from itertools import pairwise
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
 
 from flytrack_env.effects.base import Effect, Range, StepContext
 from flytrack_env.quaternion import Scalar
 from flytrack_env.state import Action, Drone
 
-# Commands remembered: at 100 Hz, delays up to 0.04 s.
-BUFFER_STEPS = 4
+USUAL_STEPS, MOST_STEPS = 4, 12  # commands remembered, by default and at most
+LONGEST_S, LONGEST_STEPS = 0.06, 6  # of each parameter: all of them fit into the longest memory together
 
 
 class CommandDelay(NamedTuple):
-    """Delay, s; need not be whole steps."""
+    """Delay of all commands, s, and how much later yaw and thrust are than that; need not be whole steps.
+
+    A channel is never early: below 0 the sum is 0.
+    """
 
     delay_s: Scalar = 0.0
+    yaw_extra_s: Scalar = 0.0
+    thrust_extra_s: Scalar = 0.0
 
 
 class PastCommands(NamedTuple):
@@ -25,36 +30,49 @@ class PastCommands(NamedTuple):
     commands: tuple[Action, ...]
 
 
-def start(delay: CommandDelay, drone: Drone) -> PastCommands:
-    """Return the memory of an episode that begins: as if the applied action had been commanded all along."""
-    return PastCommands((drone.applied,) * BUFFER_STEPS)
+def start(delay: CommandDelay, drone: Drone, num_steps: int = USUAL_STEPS) -> PastCommands:
+    """Return the memory of an episode that begins: as if the applied action had been commanded all along.
 
-
-def age_weights(delay_s: Scalar, dt: Scalar) -> list[jax.Array]:
-    """Return the share of the present value, of the one a step before, ... in one that is ``delay_s`` late.
-
-    BUFFER_STEPS + 1 shares that sum to 1. A delay of n + f steps, dt s each, is 1 - f parts of the value n
-    steps before and f parts of the one before that. Differentiable, at 0 from above.
+    num_steps: how many commands it holds; longer delays are cut.
     """
-    steps = jnp.minimum(delay_s / dt, float(BUFFER_STEPS))
-    whole = jnp.floor(steps)
-    part = steps - whole
+    return PastCommands((drone.applied,) * num_steps)
 
-    def weight(age: int) -> jax.Array:
-        return jnp.where(whole == age, 1.0 - part, jnp.where(whole == age - 1, part, 0.0))
 
-    return [weight(age) for age in range(BUFFER_STEPS + 1)]
+def dead_times(delay: CommandDelay) -> Action:
+    """Return the delay of each channel, s."""
+
+    def later(extra_s: Scalar) -> Scalar:
+        together = delay.delay_s + extra_s
+        return jnp.where(together < 0.0, 0.0, together)
+
+    return Action(delay.delay_s, delay.delay_s, later(delay.yaw_extra_s), later(delay.thrust_extra_s))
+
+
+def late(
+    values: tuple[Scalar, ...], delay_s: Scalar, dt: Scalar, span: tuple[float, float] = (0.0, 1.0)
+) -> Scalar:
+    """Return the mean over a step of a value that is ``delay_s`` late and was held over each step.
+
+    values: the present one, the one a step of ``dt`` s before, ... A delay of n + f steps is 1 - f parts of
+    the value n steps before and f parts of the one before that; longer delays than values are cut.
+    Differentiable, at 0 from above. span: shares of the step that the mean is over, if not all of it.
+    """
+    steps = delay_s / dt
+    mean = values[0]
+    for age, (later, earlier) in enumerate(pairwise(values)):
+        share = jnp.clip((steps - age - span[0]) / (span[1] - span[0]), 0.0, 1.0)
+        mean = mean + share * (earlier - later)
+    return mean
 
 
 def delayed(delay: CommandDelay, past: PastCommands, command: Action, context: StepContext) -> Action:
-    """Return the command that acts: the mean of what arrives during the step.
-
-    A command is held over its step, so that ``age_weights`` are the shares of the step that each acts.
-    """
-    weights = age_weights(delay.delay_s, context.dt)
+    """Return the command that acts: the mean of what arrives during the span."""
     by_channel = zip(*(command, *past.commands), strict=True)
     return Action(
-        *(sum(w * value for w, value in zip(weights, values, strict=True)) for values in by_channel)
+        *(
+            late(values, delay_s, context.dt, context.span)
+            for values, delay_s in zip(by_channel, dead_times(delay), strict=True)
+        )
     )
 
 
@@ -66,13 +84,23 @@ def remember(delay: CommandDelay, past: PastCommands, context: StepContext) -> P
 COMMAND_DELAY = Effect(
     name="command_delay",
     parameters=CommandDelay,
-    ranges={"delay_s": Range(0.0, 0.04, "s")},
-    notable={"delay_s": 0.005},
-    equation=r"\mathbf{u}(t) \leftarrow \frac{1}{\Delta t} \int_t^{t + \Delta t} \mathbf{u}(s - "
-    r"\text{delay})\, ds",
-    most_steps={"delay_s": BUFFER_STEPS},
-    probes={"delay_s": (0.005, 0.01, 0.02, 0.03)},
-    source="assumption: the same for all four commands, constant within a flight",
+    ranges={
+        "delay_s": Range(0.0, LONGEST_S, "s"),
+        "yaw_extra_s": Range(-LONGEST_S, LONGEST_S, "s"),
+        "thrust_extra_s": Range(-LONGEST_S, LONGEST_S, "s"),
+    },
+    notable=dict.fromkeys(CommandDelay._fields, 0.005),
+    equation=r"u_i(t) \leftarrow \frac{1}{\Delta t} \int_t^{t + \Delta t} u_i(s - \text{delay}_i)\, ds, "
+    r"\quad \text{delay}_i = \max(0, \text{delay} + \text{extra}_i)",
+    source="assumption: constant within a flight; the link comes first, then what the flight controller "
+    "makes of the sticks",
+    most_steps=dict.fromkeys(CommandDelay._fields, LONGEST_STEPS),
+    probes={
+        "delay_s": (0.005, 0.01, 0.02, 0.03, 0.05),
+        "yaw_extra_s": (0.01, 0.01, 0.03, 0.03, 0.05),
+        "thrust_extra_s": (0.01, 0.01, 0.03, 0.03, 0.03),
+    },
+    groups=(("delay_s",), CommandDelay._fields),
     command=delayed,
     start=start,
     remember=remember,

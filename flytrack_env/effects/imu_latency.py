@@ -5,7 +5,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 
 from flytrack_env.effects.base import Effect, Range, StepContext
-from flytrack_env.effects.command_delay import BUFFER_STEPS, age_weights
+from flytrack_env.effects.command_delay import USUAL_STEPS, late
 from flytrack_env.quaternion import Scalar, Vec3
 from flytrack_env.state import Drone
 
@@ -27,18 +27,17 @@ class PastReadings(NamedTuple):
     is_fresh: Scalar
 
 
-def start(latency: ImuLatency, drone: Drone) -> PastReadings:
+def start(latency: ImuLatency, drone: Drone, num_steps: int) -> PastReadings:
     """Return the memory of an episode that begins: rates that have been held all along, no forces."""
     still = Vec3(*(jnp.zeros_like(rate) for rate in drone.rates_b))
-    size = BUFFER_STEPS + 1
+    size = min(num_steps, USUAL_STEPS) + 1
     return PastReadings((drone.rates_b,) * size, (still,) * size, jnp.ones_like(drone.battery_v, bool))
 
 
 def _late(latency: ImuLatency, present: Vec3, readings: tuple[Vec3, ...], context: StepContext) -> Vec3:
     """Return the mean of the readings between which the delayed time lies, by their nearness."""
-    weights = age_weights(latency.latency_s, context.dt)
     by_axis = zip(*(present, *readings[1:]), strict=True)  # the first one remembered is the present one
-    return Vec3(*(sum(w * value for w, value in zip(weights, values, strict=True)) for values in by_axis))
+    return Vec3(*(late(values, latency.latency_s, context.dt) for values in by_axis))
 
 
 def _gyro(latency: ImuLatency, past: PastReadings, rates_b: Vec3, context: StepContext) -> Vec3:
@@ -71,7 +70,7 @@ IMU_LATENCY = Effect(
     equation=r"\boldsymbol{\omega}_\text{measured}(t) = \boldsymbol{\omega}(t - \text{latency}), \quad "
     r"\mathbf{f}_\text{measured}(t) = \mathbf{f}(t - \text{latency})",
     source="assumption: the same for both sensors; what imu_offset adds is not late",
-    most_steps={"latency_s": BUFFER_STEPS},
+    most_steps={"latency_s": USUAL_STEPS},
     probes={"latency_s": (0.005, 0.01, 0.02, 0.03)},
     gyro=_gyro,
     accelerometer=_accelerometer,

@@ -3,27 +3,33 @@
 from typing import NamedTuple
 
 from flytrack_env.effects.base import Effect, Range, StepContext
-from flytrack_env.quaternion import Scalar, Vec3
+from flytrack_env.quaternion import Scalar
+from flytrack_env.state import Action
 
 
 class RateExpo(NamedTuple):
-    """Cubic part of the stick curve, 1."""
+    """Cubic part of the stick curve of each axis, 1."""
 
-    expo: Scalar = 0.0
+    roll: Scalar = 0.0
+    pitch: Scalar = 0.0
+    yaw: Scalar = 0.0
 
 
-def _rates(curve: RateExpo, memory: None, rates_b: Vec3, context: StepContext) -> Vec3:
-    sticks = context.applied[:3]
-    linear = 1.0 - curve.expo
-    return Vec3(*(r * (linear + curve.expo * (u * u)) for r, u in zip(rates_b, sticks, strict=True)))
+def _command(curve: RateExpo, memory: None, sticks: Action, context: StepContext) -> Action:
+    def curved(stick: Scalar, expo: Scalar) -> Scalar:
+        return stick * (1.0 - expo + expo * (stick * stick))
+
+    roll, pitch, yaw = (curved(stick, expo) for stick, expo in zip(sticks[:3], curve, strict=True))
+    return sticks._replace(roll=roll, pitch=pitch, yaw=yaw)
 
 
 RATE_EXPO = Effect(
     name="rate_expo",
     parameters=RateExpo,
-    ranges={"expo": Range(-0.9, 0.9, "1")},
-    notable={"expo": 0.05},
-    equation=r"\omega_i = \omega_{\max,i} \left( (1 - \text{expo})\, u_i + \text{expo}\, u_i^3 \right)",
-    source='the "expo" of radio transmitters; assumption: the same on all axes, behind the lag',
-    rates=_rates,
+    ranges={axis: Range(-0.9, 0.9, "1") for axis in RateExpo._fields},
+    notable={axis: 0.05 for axis in RateExpo._fields},
+    equation=r"u_i \leftarrow (1 - \text{expo}_i)\, u_i + \text{expo}_i\, u_i^3",
+    source='the "expo" of radio transmitters, and of KISS and RaceFlight rates in Betaflight '
+    "(src/main/fc/rc.c): the curve makes the setpoint of the rate loop, before any lag",
+    command=_command,
 )

@@ -5,18 +5,30 @@ from typing import NamedTuple
 import jax.numpy as jnp
 
 from flytrack_env.effects.base import Effect, Range, StepContext
+from flytrack_env.motion import Motion
 from flytrack_env.quaternion import Scalar, Vec3
 from flytrack_env.state import Drone
 
+AXES = ("roll", "pitch", "yaw")
 SHORTEST_S = 1e-5  # a lag below this is none: nothing at 100 Hz shows it
+SHORTEST_STEP_S = 1e-12  # at the beginning of a step nothing has changed yet
 CRITICAL = 1e-6  # of the squared damping about 1: the series is exact to rounding
 
 
 class SecondOrderRates(NamedTuple):
-    """Lag of a rate that changes evenly, s, and damping: below 1 it overshoots."""
+    """Of each axis: lag of a rate that changes evenly, s, and damping: below 1 it overshoots."""
 
-    lag_s: Scalar = 0.0
-    damping: Scalar = 0.7
+    roll_s: Scalar = 0.0
+    pitch_s: Scalar = 0.0
+    yaw_s: Scalar = 0.0
+    roll_damping: Scalar = 0.7
+    pitch_damping: Scalar = 0.7
+    yaw_damping: Scalar = 0.7
+
+    @property
+    def lags_s(self) -> tuple[Scalar, ...]:
+        """The lags of the axes, s."""
+        return tuple(self[:3])
 
 
 class Turning(NamedTuple):
@@ -37,15 +49,21 @@ class _Response(NamedTuple):
 
 def start(loop: SecondOrderRates, drone: Drone) -> Turning:
     """Return the memory of an episode that begins: a rate that has been held."""
-    return Turning(drone.rates_b, Vec3(*(jnp.zeros_like(rate) for rate in drone.rates_b)))
+    still = Vec3(*(jnp.zeros_like(rate) for rate in drone.rates_b))
+    return Turning(drone.rates_b, still)
 
 
-def _response(loop: SecondOrderRates, dt: Scalar) -> _Response:
-    """Return the transition of a held input: the exponential of [[0, 1], [-wn^2, -2 zeta wn]] dt."""
-    is_lag = loop.lag_s > SHORTEST_S
-    frequency = 2.0 * loop.damping / jnp.where(is_lag, loop.lag_s, 1.0)
-    decay = loop.damping * frequency
-    spread = frequency * frequency * (loop.damping * loop.damping - 1.0)
+def _responses(loop: SecondOrderRates, dt: Scalar) -> list[_Response]:
+    """Return the transition of a held input on each axis."""
+    return [_response(*axis, dt) for axis in zip(loop.lags_s, loop[3:], strict=True)]
+
+
+def _response(lag_s: Scalar, damping: Scalar, dt: Scalar) -> _Response:
+    """Return the exponential of [[0, 1], [-wn^2, -2 zeta wn]] dt."""
+    is_lag = lag_s > SHORTEST_S
+    frequency = 2.0 * damping / jnp.where(is_lag, lag_s, 1.0)
+    decay = damping * frequency
+    spread = frequency * frequency * (damping * damping - 1.0)
     size = jnp.sqrt(jnp.maximum(jnp.abs(spread), CRITICAL * frequency * frequency))
     # exp(-decay t) cosh and sinh, apart so that neither overflows; cos and sin where it oscillates.
     slow, fast = jnp.exp(-(decay - size) * dt), jnp.exp(-(decay + size) * dt)
@@ -56,34 +74,67 @@ def _response(loop: SecondOrderRates, dt: Scalar) -> _Response:
     return _Response(*(jnp.where(is_lag, value, 0.0) for value in found))
 
 
+class _Input(NamedTuple):
+    """The input of an axis over a step: where its steady response would be at both ends, and its slope."""
+
+    first: Scalar
+    last: Scalar
+    slope: Scalar
+
+
+def _input(lag_s: Scalar, before: Scalar, now: Scalar, context: StepContext) -> _Input:
+    """Return the input that a step sees: held over a simulator's step, else changing evenly.
+
+    The response to one that changes evenly follows ``lag_s`` behind it.
+    """
+    if context.motion is not Motion.CONTINUOUS:
+        return _Input(now, now, 0.0)
+    slope = (now - before) / jnp.maximum(context.dt, SHORTEST_STEP_S)
+    return _Input(before - lag_s * slope, now - lag_s * slope, slope)
+
+
 def _rates(loop: SecondOrderRates, memory: Turning, rates_b: Vec3, context: StepContext) -> Vec3:
-    left = _response(loop, context.dt)
-    axes = zip(rates_b, memory.rates_b, memory.slopes_b, strict=True)
-    return Vec3(*(new + left.offset * (old - new) + left.offset_of_slope * slope for new, old, slope in axes))
+    def follow(
+        left: _Response, lag_s: Scalar, first: Scalar, new: Scalar, old: Scalar, slope: Scalar
+    ) -> Scalar:
+        given = _input(lag_s, first, new, context)
+        after = given.last + left.offset * (old - given.first) + left.offset_of_slope * (slope - given.slope)
+        return jnp.where(lag_s > SHORTEST_S, after, new)  # without a lag, nothing may change
+
+    responses = _responses(loop, context.dt)
+    axes = zip(responses, loop.lags_s, context.first_input_b, rates_b, *memory, strict=True)
+    return Vec3(*(follow(*axis) for axis in axes))
 
 
 def remember(loop: SecondOrderRates, memory: Turning, context: StepContext) -> Turning:
-    """Return the memory after a step; the input of the step is found back from the rates it led to."""
-    left = _response(loop, context.dt)
+    """Return the memory after a step."""
 
-    def slope_after(rate: Scalar, old: Scalar, slope: Scalar) -> Scalar:
-        held = (rate - left.offset * old - left.offset_of_slope * slope) / (1.0 - left.offset)
-        return left.slope_of_offset * (old - held) + left.slope * slope
+    def slope_after(
+        left: _Response, lag_s: Scalar, first: Scalar, new: Scalar, old: Scalar, slope: Scalar
+    ) -> Scalar:
+        given = _input(lag_s, first, new, context)
+        found = given.slope + left.slope_of_offset * (old - given.first) + left.slope * (slope - given.slope)
+        return jnp.where(lag_s > SHORTEST_S, found, 0.0)
 
-    axes = zip(context.rates_b, memory.rates_b, memory.slopes_b, strict=True)
+    responses = _responses(loop, context.dt)
+    axes = zip(responses, loop.lags_s, context.first_input_b, context.input_b, *memory, strict=True)
     return Turning(context.rates_b, Vec3(*(slope_after(*axis) for axis in axes)))
 
 
 SECOND_ORDER_RATES = Effect(
     name="second_order_rates",
     parameters=SecondOrderRates,
-    ranges={"lag_s": Range(0.0, 0.1, "s"), "damping": Range(0.2, 3.0, "1")},
-    notable={"lag_s": 0.005},
-    equation=r"\frac{\ddot{\omega}}{\omega_n^2} + \text{lag}\, \dot{\omega} + \omega = \omega_\text{stick}, "
-    r"\quad \omega_n = \frac{2\, \text{damping}}{\text{lag}}",
-    source="a second-order servo, exact for an input held over the step; assumption: the same on all axes",
-    probes={"lag_s": (0.003, 0.01, 0.03)},
-    shapes=("damping",),
+    ranges={
+        **{f"{axis}_s": Range(0.0, 0.1, "s") for axis in AXES},
+        **{f"{axis}_damping": Range(0.1, 3.0, "1") for axis in AXES},
+    },
+    notable={f"{axis}_s": 0.005 for axis in AXES},
+    equation=r"\frac{\ddot{\omega}_i}{\omega_{n,i}^2} + \text{lag}_i\, \dot{\omega}_i + \omega_i = "
+    r"\omega_{i,\text{lagged stick}}, \quad \omega_{n,i} = \frac{2\, \text{damping}_i}{\text{lag}_i}",
+    source="a second-order servo, as a rate loop with a PID controller is near its bandwidth; exact for an "
+    "input that is held over the step or changes evenly in it",
+    probes={f"{axis}_s": (0.003, 0.01, 0.03) for axis in AXES},
+    shapes=tuple(f"{axis}_damping" for axis in AXES),
     rates=_rates,
     start=start,
     remember=remember,

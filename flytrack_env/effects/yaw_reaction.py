@@ -3,6 +3,7 @@
 from typing import NamedTuple
 
 from flytrack_env.effects.base import Effect, Range, StepContext
+from flytrack_env.motion import Motion
 from flytrack_env.quaternion import Scalar, Vec3
 
 
@@ -13,7 +14,10 @@ class YawReaction(NamedTuple):
 
 
 def _rates(reaction: YawReaction, memory: None, rates_b: Vec3, context: StepContext) -> Vec3:
-    change = (context.applied.thrust - context.drone.applied.thrust) / context.dt
+    if context.motion is Motion.CONTINUOUS:
+        change = context.applied_slope.thrust
+    else:
+        change = (context.applied.thrust - context.drone.applied.thrust) / context.dt
     return rates_b._replace(z=rates_b.z + reaction.angle * change)
 
 

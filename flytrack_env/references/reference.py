@@ -18,6 +18,7 @@ from flytrack_env.effects import BY_NAME
 from flytrack_env.files import write_atomically
 from flytrack_env.messages import error_text, quote_name, quote_value
 from flytrack_env.model_file import SIZES, model_as_json, model_from_json
+from flytrack_env.motion import Motion
 from flytrack_env.npz_file import load_npz
 from flytrack_env.state import ACTION_SIZE, STATE_SIZE
 from flytrack_env.tracks import Track
@@ -172,7 +173,8 @@ def _model_of(values: Any, path: Path) -> ModelParameters:
     model_from_json(values, path)  # checks types and ranges
     base: dict[str, Any] = {name: np.asarray(values["parameters"][name], float) for name in SIZES}
     effects = (BY_NAME[name].parameters(**numbers) for name, numbers in values["effects"].items())
-    return ModelParameters(**base).with_effects(*effects)
+    motion = Motion(values.get("motion", Motion.HANDOUT.value))
+    return ModelParameters(**base, motion=motion).with_effects(*effects)
 
 
 def load_reference(path: str | Path) -> Reference:

@@ -45,13 +45,13 @@ class RandomizationParams(NamedTuple):
     effect_factor_low: Scalar = 0.8
     effect_factor_high: Scalar = 1.2
     low: tuple[Any, ...] = (
-        CommandDelay(0.0),
+        CommandDelay(0.0, LEFT_ALONE, LEFT_ALONE),
         ThrustScale(0.85),
         Wind(-3.0, -3.0, LEFT_ALONE, a_x=LEFT_ALONE, a_y=LEFT_ALONE, a_z=LEFT_ALONE),
         LinearDrag(0.0, 0.0, 0.0),
     )
     high: tuple[Any, ...] = (
-        CommandDelay(0.02),
+        CommandDelay(0.02, LEFT_ALONE, LEFT_ALONE),
         ThrustScale(1.15),
         Wind(3.0, 3.0, LEFT_ALONE, a_x=LEFT_ALONE, a_y=LEFT_ALONE, a_z=LEFT_ALONE),
         LinearDrag(0.5, 0.5, 0.3),
@@ -137,7 +137,7 @@ class DomainRandomization(Wrapper):
         if not isinstance(ranges, RandomizationParams):
             expected = "RandomizationParams, as in this environment's default_params"
             raise ValueError(f"params.wrappers[{self.key!r}]: found {ranges!r}, expected {expected}")
-        _check_ranges(ranges, params)
+        _check_ranges(ranges, params, self.env.plant.delay_steps)
 
     def model(self, state: RandomizedState, params: EnvParams) -> ModelParameters:
         """Return the model that a state's episode is flown with."""
@@ -178,7 +178,7 @@ class DomainRandomization(Wrapper):
         return RandomizedState(inner, state.word), reward, terminated, info
 
 
-def _check_ranges(ranges: RandomizationParams, params: EnvParams) -> None:
+def _check_ranges(ranges: RandomizationParams, params: EnvParams, delay_steps: int) -> None:
     """Raise ValueError for an empty range, one beyond what can be flown, or effects that do not match."""
     classes = [
         [effect_of(parameters).parameters for parameters in side] for side in (ranges.low, ranges.high)
@@ -196,7 +196,7 @@ def _check_ranges(ranges: RandomizationParams, params: EnvParams) -> None:
     for low, high in zip(ranges.low, ranges.high, strict=True):
         effect = effect_of(low)
         known = {name: value for name, value in high._asdict().items() if value is not None}
-        check_parameters(effect.parameters()._replace(**known), params.dt)
+        check_parameters(effect.parameters()._replace(**known), params.dt, delay_steps)
         for name, bounds in effect.ranges.items():
             pair = getattr(low, name), getattr(high, name)
             if any(end is not None for end in pair):

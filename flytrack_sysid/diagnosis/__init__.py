@@ -1,6 +1,7 @@
 """What a simulation gets wrong, from a flight log: named causes, what cannot be told apart, what is left."""
 
 from flytrack_sysid.diagnosis.diagnose import DiagnosisError, diagnose, joined
+from flytrack_sysid.diagnosis.motion_choice import motion_of
 from flytrack_sysid.diagnosis.report import text_of, write_diagnosis
 from flytrack_sysid.diagnosis.result import Cause, Diagnosis, Estimated, NotIdentifiable, Unexplained
 
@@ -13,6 +14,7 @@ __all__ = [
     "Unexplained",
     "diagnose",
     "joined",
+    "motion_of",
     "text_of",
     "write_diagnosis",
 ]

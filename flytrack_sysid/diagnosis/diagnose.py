@@ -9,21 +9,32 @@ import jax
 import numpy as np
 
 from flytrack_env.dynamics import ModelParameters, nominal_parameters
+from flytrack_env.motion import Motion
 from flytrack_sysid.diagnosis.lanes import Lanes, make_lanes, thinned, voltages_of
+from flytrack_sysid.diagnosis.motion_choice import likeliest_motion
 from flytrack_sysid.diagnosis.noise import first_guess
 from flytrack_sysid.diagnosis.problem import Problem
-from flytrack_sysid.diagnosis.result import Diagnosis
+from flytrack_sysid.diagnosis.refinement import Refined, refine
+from flytrack_sysid.diagnosis.result import Cause, Diagnosis
 from flytrack_sysid.diagnosis.search import SearchState, search
+from flytrack_sysid.diagnosis.size import split_by_size
 from flytrack_sysid.diagnosis.summary import (
     base_causes,
+    changed_parameters,
     effect_causes,
     errors_of,
+    half_responses_of,
     model_of,
     not_identifiable,
+    prediction_of,
+    reduced,
+    refinement_notes,
     sensor_noise,
+    vector_without,
     verdict_of,
     warnings_of,
     with_lost_causes,
+    with_refined_values,
 )
 from flytrack_sysid.diagnosis.vetoes import (
     Selection,
@@ -33,7 +44,7 @@ from flytrack_sysid.diagnosis.vetoes import (
 from flytrack_sysid.log import FlightLog
 from flytrack_sysid.split import HELD_OUT_EVERY, held_out_rows
 
-STAGES = ("search", "vetoes", "summary")
+STAGES = ("search", "vetoes", "refinement", "summary")
 Report = Callable[[int, int], None]
 
 
@@ -56,18 +67,20 @@ def diagnose(
     model: ModelParameters | None = None,
     held_out: np.ndarray | None = None,
     report: Report = lambda done, stages: None,
+    motion: Motion | None = None,
 ) -> Diagnosis:
     """Return what is wrong with a model, from a log: causes, what is unexplained or not identifiable, errors.
 
     log: one or several, taken together. model: the simulator's nominal one if None; causes are differences
     from it. held_out: (num_rows,) bool, rows to judge by and not to learn from; the last of every four blocks
-    of at most 5 s if None. report: called with stages done and to do.
+    of at most 5 s if None. report: called with stages done and to do. motion: how the log moves within a
+    step, whatever the model says; by likelihood if None. Of a real drone it is continuous.
 
     Raises:
         DiagnosisError: a log with neither gyro nor attitude; ``held_out`` of another shape.
     """
     with jax.enable_x64(True):
-        parts = split(log, model, held_out)
+        parts = split(log, model, held_out, motion)
         noise = first_guess(parts.train.lanes, parts.train.residuals(parts.train.start[None])[0])
         state, base, extended = search(SearchState.start(parts.log, parts.train.with_noise(noise)))
         selection = select(state, base, extended)
@@ -76,14 +89,19 @@ def diagnose(
         test = parts.test.with_noise(selection.state.problem.noise)
         selection, contradicted = apply_vetoes(selection, test)
         report(2, len(STAGES))
-        found = summarize(selection, contradicted, parts._replace(test=test))
+        refined = refined_by_prediction(selection, parts)
         report(3, len(STAGES))
+        found = summarize(selection, contradicted, refined, parts._replace(test=test))
+        report(4, len(STAGES))
     nominal = nominal_parameters() if model is None else model
-    return replace(found, nominal=nominal)
+    return replace(found, nominal=nominal._replace(motion=found.extended.motion))
 
 
 def split(
-    log: FlightLog | Sequence[FlightLog], model: ModelParameters | None, held_out: np.ndarray | None
+    log: FlightLog | Sequence[FlightLog],
+    model: ModelParameters | None,
+    held_out: np.ndarray | None,
+    motion: Motion | None,
 ) -> Split:
     """Return a log, or several joined, split into rows to learn from and rows to judge by.
 
@@ -103,40 +121,70 @@ def split(
     every, judged_by = (make_lanes(log, rows, tau, gravity) for rows in (~out, out))
     lanes = thinned(every)
     warnings += thinning_warning(every, lanes)
+    model = model._replace(motion=likeliest_motion(lanes, model) if motion is None else motion)
     train, test = Problem.of(lanes, model), Problem.of(thinned(judged_by), model)
     return Split(log, out, train, test, tuple(warnings))
 
 
-def summarize(selection: Selection, contradicted: Sequence[str], parts: Split) -> Diagnosis:
+def refined_by_prediction(selection: Selection, parts: Split) -> Refined:
+    """Return which effects of a selected model predict held-out flights better than its base does."""
+    state, model = selection.state, selection.model
+    is_explained = not selection.unexplained.flagged
+    vectors = selection.base.vector, model.vector
+    return refine(
+        state.problem,
+        *vectors,
+        model.candidates,
+        state.base_places,
+        parts.log,
+        parts.held_out,
+        is_explained,
+    )
+
+
+def summarize(selection: Selection, contradicted: Sequence[str], refined: Refined, parts: Split) -> Diagnosis:
     """Return the diagnosis of a selected model, in float64; the nominal model in float64 stands in it."""
-    problem, test, model = selection.state.problem, parts.test, selection.model
+    test, selection = parts.test, reduced(selection, refined)
+    problem, model = selection.state.problem, selection.model
     state, linearization = selection.state.linearized(model.vector)
     effects = effect_causes(selection, test, linearization)
     in_base, lost_in_base = base_causes(selection, test, linearization, effects)
     lost = [*contradicted, *lost_in_base]
-    causes = (*effects, *in_base)
+    extended = model if refined.fit is None else model._replace(vector=refined.fit.vector)
+    found = with_refined_values([*effects, *in_base], refined, extended.vector)
+
+    def without(cause: Cause) -> np.ndarray:
+        if refined.fit is None:
+            return vector_without(cause, selection, linearization)
+        return refined.vector_without(cause.effect)
+
+    causes, negligible = split_by_size(found, problem, extended.vector, refined.flight_errors, without)
     vectors = {
         "nominal": problem.start,
         "refitted_base": selection.base.vector,
-        "extended": model.vector,
+        "extended": extended.vector,
     }
-    limits = not_identifiable(state, linearization, model, causes)
-    errors = errors_of(test, vectors, parts.log, parts.held_out)
+    limits = not_identifiable(state, linearization, model, (*causes, *negligible))
+    prediction = prediction_of(refined, vectors)
     rest = with_lost_causes(selection.unexplained, lost)
     return Diagnosis(
         verdict=verdict_of(causes, rest),
         causes=causes,
+        negligible=negligible,
         unexplained=rest,
         not_identifiable=limits,
-        error=errors,
+        error=errors_of(test, vectors, prediction),
         nominal=problem.like,
         base=model_of(problem, selection.base),
-        extended=model_of(problem, model),
+        extended=model_of(problem, extended),
         noise=sensor_noise(problem),
         voltages=voltages_of(problem.lanes),
         source=Path(parts.log.source).name,
         sha256=parts.log.sha256,
-        warnings=(*parts.warnings, *warnings_of(problem, model, causes, errors, lost)),
+        warnings=(*parts.warnings, *warnings_of(problem, causes, lost), *refinement_notes(refined)),
+        prediction=prediction,
+        changed=changed_parameters(linearization, extended, refined),
+        half_response_s=half_responses_of(linearization, model, refined, vectors),
     )
 
 

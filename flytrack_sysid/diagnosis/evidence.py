@@ -36,7 +36,7 @@ class Panel(NamedTuple):
 
 
 class Evidence(NamedTuple):
-    """A cause in plain words, its panels, and how they show it."""
+    """A cause as a noun in plain words, its panels, and how they show it."""
 
     words: str
     panels: tuple[Panel, ...]
@@ -64,41 +64,39 @@ _ACCELEROMETER = _by_axis("force", "model_force") + _by_axis("velocity", "model_
 _ACCELEROMETER_READING = "It shows in the accelerometer (above) and not in the change of velocity (below)."
 
 EVIDENCE: dict[str, Evidence] = {
-    "command_delay": Evidence("all commands act late", _LATE, _LATE_READING),
+    "command_delay": Evidence("delay of all commands", _LATE, _LATE_READING),
     "thrust_lag_asymmetry": Evidence(
-        "thrust falls faster or slower than it rises",
+        "different lags of rising and falling thrust",
         _LATE[2:],
         "The slope where thrust rises differs from that where it falls.",
     ),
-    "rate_expo": Evidence(
-        "the sticks have a cubic curve", _BY_STICK, "The error bends back to nothing at full stick."
-    ),
+    "rate_expo": Evidence("stick expo", _BY_STICK, "The error bends back to nothing at full stick."),
     "rate_scale": Evidence(
-        "maximum body rates differ", _BY_STICK, "The error grows in proportion to the stick."
+        "scale of the body rates", _BY_STICK, "The error grows in proportion to the stick."
     ),
     "rate_saturation": Evidence(
-        "body rates saturate before full stick",
+        "saturation of the body rates",
         _BY_STICK,
         "No error near the centre, a steep rise.",
     ),
     "yaw_reaction": Evidence(
-        "yaw is kicked when thrust changes",
+        "yaw reaction to thrust changes",
         (Panel("rates_z", "thrust_change"),),
         "The yaw rate is off in proportion to how fast the thrust changes.",
     ),
     "motor_imbalance": Evidence(
-        "roll and pitch creep with thrust",
+        "motor imbalance",
         _each("rates", "model_force_z", "xy"),
         "The error of the rate grows with thrust, whatever the sticks do.",
     ),
     "rate_cross_coupling": Evidence(
-        "roll and pitch leak into yaw",
+        "coupling of roll and pitch into yaw",
         (Panel("rates_z", "model_rates_x"), Panel("rates_z", "model_rates_y")),
         "The yaw rate is off in proportion to the rates about the other axes.",
     ),
-    "second_order_rates": Evidence("the rate loop has a second lag", _TURNS, _LATE_READING),
+    "second_order_rates": Evidence("second-order lag of the rate loop", _TURNS, _LATE_READING),
     "rate_slew_limit": Evidence(
-        "body rates change no faster than a limit",
+        "limit on the change of body rates",
         _by_axis("rates", "spin_up"),
         "No error at gentle demands; beyond the limit it grows with the demand.",
     ),
@@ -108,17 +106,17 @@ EVIDENCE: dict[str, Evidence] = {
         "The push keeps its direction in the world, whatever the heading.",
     ),
     "thrust_scale": Evidence(
-        "all thrust is scaled (or the mass differs)",
+        "thrust or your mass",
         (Panel("force_z", "model_force_z"),),
         "The error grows in proportion to thrust.",
     ),
     "translational_lift": Evidence(
-        "thrust gained in fast edgewise flight",
+        "translational lift",
         (Panel("force_z", "airspeed_xy"),),
         "The error along the thrust axis grows with airspeed in the rotor plane and levels off.",
     ),
     "ground_effect": Evidence(
-        "thrust gained near the ground",
+        "ground effect",
         (Panel("force_z", "height"),),
         "The error appears only near the ground.",
     ),
@@ -131,47 +129,45 @@ EVIDENCE: dict[str, Evidence] = {
         "A force against the motion that bends: slow flight hides it.",
     ),
     "rotor_drag": Evidence(
-        "rotor drag, in proportion to thrust and airspeed",
+        "rotor drag",
         _by_axis("force", "airspeed", "xy"),
         "A force against the motion in the rotor plane.",
     ),
     "thrust_tilt": Evidence(
-        "the thrust axis leans",
+        "tilt of the thrust axis",
         _each("force", "model_force_z", "xy"),
         "A sideways force in proportion to thrust.",
     ),
     "voltage_sag": Evidence(
-        "the battery sags under load",
+        "battery sag under load",
         (Panel("battery", "applied_thrust"),),
         "The voltage falls with thrust and comes back.",
     ),
     "imu_latency": Evidence(
-        "gyro and accelerometer are late",
+        "latency of gyro and accelerometer",
         _by_axis("rates", "spin_up", "xy") + _by_axis("attitude", "spin_up", "xy"),
         "The gyro lags behind (above), as the accelerometer does; the attitude does not (below).",
     ),
     "imu_offset": Evidence(
-        "the accelerometer is off the centre of mass",
+        "accelerometer away from the centre of mass",
         _by_axis("force", "turning"),
         "The error grows with the square of the body rates.",
     ),
-    "accelerometer_scale": Evidence(
-        "the accelerometer's scale is off", _ACCELEROMETER, _ACCELEROMETER_READING
-    ),
-    "accelerometer_bias": Evidence("the accelerometer has an offset", _ACCELEROMETER, _ACCELEROMETER_READING),
-    "gyro_scale": Evidence("the gyro's scale is off", _GYRO, _GYRO_READING),
-    "gyro_bias": Evidence("the gyro has an offset", _GYRO, _GYRO_READING),
-    "tau_roll": Evidence("the lag of roll differs", _TURNS[:1], _LATE_READING),
-    "tau_pitch": Evidence("the lag of pitch differs", _TURNS[1:2], _LATE_READING),
-    "tau_yaw": Evidence("the lag of yaw differs", _TURNS[2:], _LATE_READING),
-    "tau_thrust": Evidence("the lag of thrust differs", _LATE[2:], _LATE_READING),
+    "accelerometer_scale": Evidence("scale of the accelerometer", _ACCELEROMETER, _ACCELEROMETER_READING),
+    "accelerometer_bias": Evidence("offset of the accelerometer", _ACCELEROMETER, _ACCELEROMETER_READING),
+    "gyro_scale": Evidence("scale of the gyro", _GYRO, _GYRO_READING),
+    "gyro_bias": Evidence("offset of the gyro", _GYRO, _GYRO_READING),
+    "tau_roll": Evidence("lag of roll", _TURNS[:1], _LATE_READING),
+    "tau_pitch": Evidence("lag of pitch", _TURNS[1:2], _LATE_READING),
+    "tau_yaw": Evidence("lag of yaw", _TURNS[2:], _LATE_READING),
+    "tau_thrust": Evidence("lag of thrust", _LATE[2:], _LATE_READING),
     "thrust_curve": Evidence(
-        "the thrust curve differs",
+        "thrust curve",
         (Panel("force_z", "applied_thrust"),),
         "The error along the thrust axis follows the thrust action.",
     ),
     "battery_drain": Evidence(
-        "the battery drains faster or slower",
+        "battery drain",
         (Panel("battery", "time"),),
         "The voltage drifts away from the model's, evenly in time.",
     ),

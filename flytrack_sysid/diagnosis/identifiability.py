@@ -14,7 +14,7 @@ import jax
 import numpy as np
 
 from flytrack_env.dynamics import ModelParameters
-from flytrack_env.effects import BY_NAME, EFFECTS
+from flytrack_env.effects import BY_NAME, EFFECTS, MOST_STEPS
 from flytrack_env.plants import Simulator
 from flytrack_env.state import pack, unpack, unpack_action
 from flytrack_sysid.diagnosis.lanes import LANE_S, Lanes, make_lanes, voltages_of
@@ -53,9 +53,8 @@ def _typical_candidate(effect: str) -> Candidate:
     ways = [one for one in CANDIDATES if one.effect == effect]
 
     def distance(way: Candidate) -> float:
-        if way.probe is None:
-            return 0.0
-        return float(abs(np.log(way.probe[1] / BY_NAME[effect].notable[way.probe[0].split(".")[1]])))
+        notable = BY_NAME[effect].notable
+        return sum(abs(np.log(one.value / notable[one.field.split(".")[1]])) for one in way.probes)
 
     return min(ways, key=distance)
 
@@ -70,11 +69,10 @@ class Visibility:
         fields = [field for field in way.other_fields if field.split(".")[1] not in shapes]
         self.columns = [linearization.column(field) for field in fields]
         sizes = [notable[field.split(".")[1]] for field in fields]
-        if way.probe is not None:  # its column comes first, in shares of the way to the probe
-            fields = [way.probe[0], *fields]
-            self.columns.insert(0, linearization.probe_column(way))
-            sizes.insert(0, notable[way.probe[0].split(".")[1]] / way.probe[1])
-        self.fields, self.sizes = fields, np.array(sizes)
+        # The columns of probes come first, in shares of the way to them.
+        self.columns = [linearization.probe_column(one) for one in way.probes] + self.columns
+        sizes = [notable[one.field.split(".")[1]] / one.value for one in way.probes] + sizes
+        self.fields, self.sizes = [one.field for one in way.probes] + fields, np.array(sizes)
 
     def noncentralities(self, beside: Sequence[int] = ()) -> np.ndarray:
         """Return the noncentrality of each parameter, all that is free and ``beside`` projected out."""
@@ -143,7 +141,7 @@ def _look_alikes(
 @jax.jit
 def _flown(vector: jax.Array, like: ModelParameters, starts: jax.Array, commands: jax.Array) -> jax.Array:
     """Return the states of flights, (flights, steps, 21), each before its command."""
-    model, simulator = from_vector(vector, like), Simulator()
+    model, simulator = from_vector(vector, like), Simulator(MOST_STEPS)
 
     def step(state: Any, action: jax.Array) -> tuple[Any, jax.Array]:
         return simulator.step(state, unpack_action(action), DT_S, model), pack(simulator.drone(state))

@@ -13,6 +13,7 @@ from flytrack_sysid.diagnosis.problem import Problem
 from flytrack_sysid.diagnosis.score_test import (
     BASE_CAUSES,
     CANDIDATES,
+    Candidate,
     Linearization,
     inflation_of,
     solve,
@@ -46,8 +47,8 @@ class Ablation(NamedTuple):
 
     gain: of chi2 over the model without it, refitted. inflation: of that gain's variance. num_parameters:
     of its parameters, those that the log determines. rivals: effect -> how much worse the model is with that
-    one instead, of chi2; the better ones are refitted, and those are in ``swaps``. without: the model without
-    the effect.
+    one instead, of chi2; the better ones are refitted, and those are in ``swaps``, with the effect itself
+    in another group of its parameters. without: the model without the effect.
     """
 
     gain: float
@@ -83,14 +84,40 @@ def ablate(state: SearchState, model: FittedModel, linearization: Linearization,
     for number, one in enumerate(ranked):
         rival = one.candidate.effect
         rivals[rival] = gain - one.gain.chi2
-        share = PROBE_SHARE if one.candidate.probe is not None else NEAR_SHARE
+        share = PROBE_SHARE if one.candidate.probes else NEAR_SHARE
         if number < MOST_RIVALS and rivals[rival] < max(NEARLY, share * gain):
             swaps[rival] = add_effect(state, nearby, less, one)
             rivals[rival] = swaps[rival].cost - model.cost
+    for other in other_groups(linearization, model, effect):
+        candidates = [other if one.effect == effect else one for one in model.candidates]
+        vector = model.vector.copy()
+        dropped = state.problem.index(sorted({*model.candidate(effect).fields} - {*other.fields}))
+        vector[dropped] = state.problem.start[dropped]
+        swaps[effect] = state.fitted(candidates, vector)
     columns = [linearization.column(field) for field in model.candidate(effect).fields]
     own = linearization.gain(columns, linearization.columns_at(model.places, without=columns))
     inflation, determined = (1.0, 1) if own is None else (own.inflation, own.num_parameters)
     return Ablation(gain, inflation, determined, rivals, swaps, less)
+
+
+def other_groups(linearization: Linearization, model: FittedModel, effect: str) -> list[Candidate]:
+    """Return an effect in groups of its parameters, more or fewer, that are cheaper to first order."""
+    problem, own = linearization.problem, set(model.candidate(effect).fields)
+    result = []
+    for candidate in {one.fields: one for one in CANDIDATES if one.effect == effect}.values():
+        changed = sorted(own.symmetric_difference(candidate.fields))
+        columns = [linearization.column(field) for field in changed]
+        given = linearization.columns_at(model.places, without=columns)
+        price = PER_PARAMETER * len(changed)
+        if own > set(candidate.fields):
+            size = (model.vector - problem.start)[problem.index(changed)]
+            is_cheaper = size @ linearization.projected(columns, given)[0] @ size < price
+        else:
+            gain = linearization.gain(columns, given) if own < set(candidate.fields) else None
+            is_cheaper = gain is not None and gain.robust > price
+        if is_cheaper:
+            result.append(candidate)
+    return result
 
 
 def select_effects(
@@ -166,17 +193,18 @@ class Marginal:
         self.scores = blocks[:, columns] - blocks[:, given] @ share
         self.inflation = inflation_of(self.information, self.scores)
 
-    def half_widths(self) -> np.ndarray:
-        """Return half of each parameter's 95 % interval.
+    def half_widths(self, ways: np.ndarray | None = None) -> np.ndarray:
+        """Return half of each parameter's 95 % interval, or of sums of them, ways (num_sums, parameters).
 
         Its standard deviation is that of the information or, where it is larger, the sandwich estimate from
         the scores of blocks; Student's t for so many blocks.
         """
-        covariance = solve(self.information, np.eye(len(self.information)))
+        ways = np.eye(len(self.information)) if ways is None else ways
+        covariance = solve(self.information, ways.T).T
         used = self.scores[np.abs(self.scores).sum(axis=1) > 0.0]
         number = max(len(used), 2)
         spread = used.T @ used * number / (number - 1)
-        variance = np.maximum(np.diag(covariance), np.diag(covariance @ spread @ covariance))
+        variance = np.maximum(np.diag(covariance @ ways.T), np.diag(covariance @ spread @ covariance.T))
         return np.sqrt(variance) * stats.t.ppf(0.975, number - 1)
 
 
@@ -257,7 +285,7 @@ def _best_instead(
     limit = model.cost + PER_PARAMETER * len(fields)
     best = less if less.cost < limit else None
     for one in score_candidates(state, nearby, less)[:MOST_REFITTED]:
-        if less.cost - one.gain.chi2 > limit + less.cost * HOPELESS and one.candidate.probe is None:
+        if less.cost - one.gain.chi2 > limit + less.cost * HOPELESS and not one.candidate.probes:
             continue
         trial = add_effect(state, nearby, less, one)
         cost = trial.cost + PER_PARAMETER * one.candidate.num_priced

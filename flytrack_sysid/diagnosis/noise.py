@@ -213,6 +213,12 @@ def disturbance_gain(lanes: Lanes, left: np.ndarray, log_noise: np.ndarray) -> n
     return np.asarray(_total(still, *given)) - np.asarray(_total(log_noise, *given))
 
 
+def total_misfit(lanes: Lanes, left: np.ndarray, log_noise: np.ndarray) -> float:
+    """Return minus twice the log likelihood of residuals under a noise."""
+    given = tuple(jnp.asarray(part) for part in (step_to(lanes), lanes.is_known, lanes.counts, left))
+    return float(np.sum(_total(log_noise, *given)))
+
+
 @jax.jit
 def _total(log_noise: jax.Array, *given: jax.Array) -> jax.Array:
     return _misfit(log_noise, *given).total

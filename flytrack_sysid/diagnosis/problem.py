@@ -23,7 +23,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from flytrack_env.dynamics import ModelParameters, read_sensors
-from flytrack_env.effects import BY_NAME, EFFECTS, effect_of
+from flytrack_env.effects import BY_NAME, EFFECTS, Effect, effect_of
 from flytrack_env.quaternion import Quaternion, Vec3
 from flytrack_sysid.diagnosis import noise as noises
 from flytrack_sysid.diagnosis.lanes import LANE_S, Lanes, lead_in_of
@@ -46,8 +46,8 @@ def _turn(measured: Quaternion, predicted: Quaternion) -> Vec3:
 def _of_step(step: Step, next_row: Record, sensed: dict[str, Any], model: ModelParameters) -> jax.Array:
     """Return the residuals of the row after a step, (NUM_AXES, 2); 0 for absent channels."""
     row, before, after = step.row, step.before, step.after
-    axes = before.quat.axes()
-    read = read_sensors(before, after, step.later_memories, row.step_s, model)
+    axes = before.quat.axes()  # the residuals', whatever attitude the sensors' force had
+    read = read_sensors(step.moved, model)
 
     def to_world(vector_b: Vec3) -> Vec3:
         return axes[0].scale(vector_b.x) + axes[1].scale(vector_b.y) + axes[2].scale(vector_b.z)
@@ -129,9 +129,9 @@ class Problem:
     gains: noises.Gains | None = None
 
     @classmethod
-    def of(cls, lanes: Lanes, model: ModelParameters) -> "Problem":
-        """Return the problem of lanes and a nominal model, without a noise."""
-        every = model.with_effects(*(model.effect(effect.name) for effect in EFFECTS))
+    def of(cls, lanes: Lanes, model: ModelParameters, effects: Sequence[Effect] = EFFECTS) -> "Problem":
+        """Return the problem of lanes and a nominal model that may have some effects, without a noise."""
+        every = model.with_effects(*(model.effect(effect.name) for effect in effects))
         like = jax.tree.map(lambda leaf: np.asarray(leaf, float), every)
         names, start = names_of(like), to_vector(like)
         low, high = np.array([bounds_of(name) for name in names]).T

@@ -1,25 +1,42 @@
 """Writing a diagnosis: ``report.html``, ``diagnosis.json``, the extended model, and a few lines of text."""
 
 import json
+from collections import Counter
 from pathlib import Path
 
 import numpy as np
 
 from flytrack_env import __version__, save_model
 from flytrack_env.dynamics import SECONDS_PER_MINUTE
+from flytrack_env.effects import BY_NAME
 from flytrack_env.files import write_atomically
+from flytrack_env.pictures.drawing import new_figure, plain
+from flytrack_env.scene import BLUE, GREEN, GREY, ORANGE
 from flytrack_sysid.diagnosis.evidence import EVIDENCE, draw_cause, list_words, without, words_of
-from flytrack_sysid.diagnosis.result import CAUSES_FOUND, CONSISTENT, TO_LOG, Cause, Diagnosis, Estimated
+from flytrack_sysid.diagnosis.result import (
+    CAUSES_FOUND,
+    CONSISTENT,
+    TO_LOG,
+    Cause,
+    Diagnosis,
+    Estimated,
+    HalfResponse,
+)
 from flytrack_sysid.diagnosis.traces import Traces, traces
 from flytrack_sysid.log import FlightLog
 from flytrack_sysid.page import Bullets, Part, Picture, Section, Table, Text, Verdict, page
-from flytrack_sysid.plots import png_of
+from flytrack_sysid.plots import WIDTH_IN, png_of
 
 JSON_NAME, MODEL_NAME, REPORT_NAME = "diagnosis.json", "extended_model.json", "report.html"
 MOST_PICTURED = 6  # causes, those with the largest gain: more pictures nobody reads
+BARS_HEIGHT_IN = 2.6
 MOST_LISTED = 3  # names in one cell
+LIMITED_S = 1e-3  # by which a step to full stick takes longer where a limit acts
 NO_BREAK = "\u00a0"  # a space at which lines do not break
 HEADLINE_HORIZON = "1"  # s of free flight, whose error the first sentence gives
+WRONG = "has the wrong value of"
+LOG_BARS = 20.0  # times the smallest error: from there on bars would vanish on an even scale
+MOST_LIMITS = 8  # rows of the text's table of what a log could not show
 CHANNEL_WORDS = {"rates": "body rates", "force": "specific force"}
 DIFFERENCES = (
     "The log lacks a gyro or an accelerometer; attitude or velocity replace them, by their change per row."
@@ -51,23 +68,69 @@ def _parameter(name: str, found: Estimated) -> str:
     return text.replace(" ", NO_BREAK)
 
 
+def _plus_minus(cause: Cause) -> str:
+    """Return a cause's values with half of their 95 % intervals."""
+    return ", ".join(
+        f"{name} {one.value:.3g} ± {0.5 * (one.ci95[1] - one.ci95[0]):.2g}{_unit(one.unit)}"
+        for name, one in cause.parameters.items()
+    )
+
+
 def _confused(cause: Cause) -> str:
     if cause.equivalent:
         return f"this log cannot tell it from: {list_words(cause.equivalent[:MOST_LISTED])}"
     return f"no; the closest is: {words_of(cause.closest)}" if cause.closest else "not compared"
 
 
-def _gained(diagnosis: Diagnosis) -> str:
-    """Return what the causes gain over a second of free flight; nothing where that is not known."""
+def _faults(diagnosis: Diagnosis) -> str:
+    """Return what the model lacks, has too much or too little of, or has a wrong value of, as a sentence."""
+    by_fault: dict[str, list[str]] = {}
+    for cause in diagnosis.causes:
+        by_fault.setdefault(fault_of(cause.effect, diagnosis), []).append(words_of(cause.effect))
+    clauses = [
+        " ".join([fault, "; ".join(f"the {name}" if fault == WRONG else name for name in names)])
+        for fault, names in by_fault.items()
+    ]
+    return f"The model {', and it '.join(clauses)}."
+
+
+def fault_of(cause: str, diagnosis: Diagnosis) -> str:
+    """Return the verb that a cause goes with: what the flight shows, against what the model had."""
+    if cause not in BY_NAME or cause.endswith("_scale"):
+        return WRONG
+    neutral = BY_NAME[cause].parameters()
+    had, shown = ([*map(float, model.effect(cause))] for model in (diagnosis.nominal, diagnosis.extended))
+    if had == [*map(float, neutral)]:
+        return "lacks"
+    notable = BY_NAME[cause].notable
+    size_had, size_shown, product = (
+        sum(
+            (one[place] - rest) * (other[place] - rest) / notable[field] ** 2
+            for place, (field, rest) in enumerate(neutral._asdict().items())
+            if field in notable
+        )
+        for one, other in ((had, had), (shown, shown), (had, shown))
+    )
+    if product < 0.0:
+        return WRONG  # the other sign
+    return "has too much" if size_shown < size_had else "has too little"
+
+
+def _gain(diagnosis: Diagnosis) -> str:
+    """Return how much closer the extended model flies, as a sentence; nothing where that is not known."""
 
     def error(model: str) -> float:
         found = diagnosis.error[model].position_m if model in diagnosis.error else {}
         return found.get(HEADLINE_HORIZON, np.nan)
 
-    before, after = error("nominal"), error("extended")
+    before, refitted, after = (error(model) for model in ("nominal", "refitted_base", "extended"))
     if not np.isfinite(before + after):
         return ""
-    return f" The position after 1 s of free flight is off by {after:.2g} m instead of {before:.2g} m."
+    names = ", ".join(cause.effect for cause in diagnosis.causes)
+    share = 100.0 * (1.0 - after / before)
+    text = f"Named {names}: flies {abs(share):.0f} % {'closer' if share >= 0.0 else 'farther off'} after 1 s"
+    alone = f"; refitted without effects, {refitted:.2g} m" if np.isfinite(refitted) else ""
+    return f"{text} ({after:.2g} m instead of {before:.2g} m on held-out flight{alone})."
 
 
 def verdict_of(diagnosis: Diagnosis) -> Verdict:
@@ -78,9 +141,7 @@ def verdict_of(diagnosis: Diagnosis) -> Verdict:
         return Verdict("The log agrees with the model: the residuals look like sensor noise.", "good")
     if not diagnosis.causes:
         return Verdict(f"The model is wrong, and no known cause explains it.{depends}", "open")
-    number = f"{len(diagnosis.causes)} things" if len(diagnosis.causes) > 1 else "one thing"
-    names = list_words([cause.effect for cause in diagnosis.causes])
-    text = f"The model lacks {number}: {names}." + _gained(diagnosis)
+    text = f"{_faults(diagnosis)} {_gain(diagnosis)}".strip()
     if diagnosis.verdict == CAUSES_FOUND:
         return Verdict(text, "found")
     return Verdict(f"{text} Something else remains that no known cause explains.{depends}", "open")
@@ -114,8 +175,55 @@ def _errors_table(diagnosis: Diagnosis) -> Table:
         [f"position after {key} s", "m", *(_number(one.position_m.get(key)) for one in models)]
         for key in flights
     ]
-    caption = "Held-out part. One step: 1 is as bad as predicting the mean; position in free flight, rms."
+    responses = [diagnosis.half_response_s.get(name, {}) for name in diagnosis.error]
+    rows += [
+        [f"time to half response, {stick}", "ms", *(_half_response(one.get(stick)) for one in responses)]
+        for stick in diagnosis.half_response_s.get("extended", {})
+    ]
+    caption = (
+        "Held-out part. One step: 1 is as bad as predicting the mean; position in free flight, rms. Half "
+        "response: of body rate or thrust to a small step of the stick; in brackets, to full stick."
+    )
     return Table(["error", "unit", *(name.replace("_", " ") for name in diagnosis.error)], rows, caption)
+
+
+def _errors_picture(diagnosis: Diagnosis) -> list[Part]:
+    """Return bars of the errors of free flight by horizon and model; none without such flights."""
+    horizons = list(diagnosis.error["extended"].position_m)
+    if not horizons:
+        return []
+    figure = new_figure(WIDTH_IN, BARS_HEIGHT_IN)
+    axes = figure.subplots()
+    models = [(name, one.position_m) for name, one in diagnosis.error.items() if one.position_m]
+    width = 0.8 / len(models)
+    for place, ((name, errors), colour) in enumerate(zip(models, (ORANGE, GREY, BLUE, GREEN), strict=False)):
+        at = np.arange(len(horizons)) + place * width
+        axes.bar(
+            at, [errors[horizon] for horizon in horizons], width, color=colour, label=name.replace("_", " ")
+        )
+    every = [error for _, errors in models for error in errors.values()]
+    if max(every) > LOG_BARS * min(every):
+        axes.set_yscale("log")
+        axes.set_ylim(bottom=0.5 * min(every))  # the smallest bar shows, too
+    axes.set_xticks(
+        np.arange(len(horizons)) + 0.5 * (len(models) - 1) * width, [f"{one} s" for one in horizons]
+    )
+    axes.set_ylabel("position error (m, rms)")
+    plain(axes)
+    axes.legend(frameon=False, fontsize="small", ncols=len(models))
+    caption = "Free flight on the held-out part, by how long it lasts."
+    return [Picture(png_of(figure), caption)]
+
+
+def _half_response(found: HalfResponse | None) -> str:
+    """Return a time with its interval, and that to full stick where it differs; ms."""
+    if found is None or not np.isfinite(found.time):
+        return "-"
+    text = f"{1e3 * found.time:.1f}"
+    if found.ci95 is not None:
+        text += f" ± {1e3 * (found.ci95[1] - found.time):.1f}"
+    differs = abs(found.full_stick - found.time) > LIMITED_S
+    return f"{text} ({1e3 * found.full_stick:.0f})" if differs else text
 
 
 def _limits_part(diagnosis: Diagnosis) -> Part:
@@ -180,11 +288,14 @@ def html_of(diagnosis: Diagnosis, log: FlightLog) -> str:
         Text(f"{diagnosis.source}: {len(log)} rows, {minutes:.1f} min. SHA-256 {diagnosis.sha256[:12]}."),
         _causes_part(diagnosis),
     ]
+    if diagnosis.negligible:
+        listed = "; ".join(f"{words_of(one.effect)} ({_plus_minus(one)})" for one in diagnosis.negligible)
+        introduction.append(Text(f"Seen, but negligible: {listed}."))
     if diagnosis.warnings:
         introduction.append(Bullets(diagnosis.warnings))
     evidence = _evidence_parts(diagnosis, found)
     sections = [
-        Section("Errors before and after", [_errors_table(diagnosis)]),
+        Section("Errors before and after", [*_errors_picture(diagnosis), _errors_table(diagnosis)]),
         *([Section("The evidence, cause by cause", evidence)] if evidence else []),
         Section("What this log could not show, and what to fly", [_limits_part(diagnosis)]),
         Section("What remains unexplained", _unexplained_parts(diagnosis)),
@@ -219,7 +330,7 @@ def write_diagnosis(folder: str | Path, diagnosis: Diagnosis, log: FlightLog) ->
 
 def text_of(diagnosis: Diagnosis) -> str:
     """Return a diagnosis as a few lines of text."""
-    lines = [f"verdict: {diagnosis.verdict}"]
+    lines = [f"verdict: {diagnosis.verdict}", f"motion: {diagnosis.extended.motion.value}"]
     for cause in diagnosis.causes:
         values = ", ".join(
             f"{name} {one.value:.4g} ({one.ci95[0]:.4g} to {one.ci95[1]:.4g}) {one.unit}"
@@ -227,13 +338,36 @@ def text_of(diagnosis: Diagnosis) -> str:
         )
         twins = f"; not told apart from {', '.join(cause.equivalent)}" if cause.equivalent else ""
         lines.append(f"  {cause.effect}: {values}; held-out gain {cause.heldout_gain:.4g}{twins}")
+    for cause in diagnosis.negligible:
+        lines.append(f"negligible: {cause.effect}: {_plus_minus(cause)}")
+    answers = diagnosis.half_response_s.get("extended", {}).items()
+    if answers:
+        times = ", ".join(f"{stick} {_half_response(one)} ms" for stick, one in answers)
+        lines.append(f"time from a stick to half of the response: {times}")
     if diagnosis.unexplained.flagged:
         lines.append(f"unexplained, depends on: {', '.join(diagnosis.unexplained.depends_on)}")
-    for one in diagnosis.not_identifiable:
-        below = f" below {one.smallest:.3g} {one.unit}" if np.isfinite(one.smallest) else ""
-        alike = f", looks like {', '.join(one.confused_with)}" if one.confused_with else ""
-        to_do = one.fly if one.fly.startswith(TO_LOG) else f"fly {one.fly}"
-        is_named = any(one.effect == cause.effect for cause in diagnosis.causes)
-        what = "not told apart by this log" if is_named else "not shown by this log"
-        lines.append(f"{what}: {one.effect}{below}{alike}; {to_do}")
-    return "\n".join([*lines, *diagnosis.warnings])
+    return "\n".join(
+        [*lines, *_limits_text(diagnosis), *diagnosis.warnings, *filter(None, [_closing(diagnosis)])]
+    )
+
+
+def _closing(diagnosis: Diagnosis) -> str:
+    return _gain(diagnosis) if diagnosis.causes else ""
+
+
+def _limits_text(diagnosis: Diagnosis) -> list[str]:
+    """Return what a log could not show as a small table, and the flight that settles most of it."""
+    limits = diagnosis.not_identifiable
+    if not limits:
+        return []
+    rows = [("not shown by this log", "visible from", "looks like")]
+    for one in limits[:MOST_LIMITS]:
+        size = f"{one.smallest:.3g} {one.unit}" if np.isfinite(one.smallest) else "-"
+        rows.append((one.effect, size, ", ".join(one.confused_with[:MOST_LISTED]) or "noise"))
+    widths = [max(len(row[column]) for row in rows) for column in range(2)]
+    lines = [f"{name:<{widths[0]}}  {size:<{widths[1]}}  {alike}".rstrip() for name, size, alike in rows]
+    if len(limits) > MOST_LIMITS:
+        lines.append(f"and {len(limits) - MOST_LIMITS} more, in {REPORT_NAME}")
+    flight, number = Counter(one.fly for one in limits).most_common(1)[0]
+    to_do = flight if flight.startswith(TO_LOG) else f"fly {flight}"
+    return [*lines, f"recommended: {to_do}, which settles {number} of {len(limits)}"]

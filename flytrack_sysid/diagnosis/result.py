@@ -38,6 +38,8 @@ class Cause:
     on the part that was fitted, heldout_gain: on the part held out, of minus twice the log likelihood.
     lambda_: squared size of its signature over the noise, all else that is free taken out. lambda_sep: the
     same with the closest rival taken out too, and closest which that is; base parameters have none.
+    beyond: where a value lies at the end of what is searched, "delay_s at least 0.04 s": the true cause may
+    be beyond the list.
     """
 
     effect: str
@@ -49,6 +51,7 @@ class Cause:
     lambda_: float
     lambda_sep: float
     closest: str = ""
+    beyond: str = ""
 
 
 @dataclass(frozen=True)
@@ -91,13 +94,60 @@ class Errors:
 
 
 @dataclass(frozen=True)
+class Changed:
+    """A parameter whose value in the extended model is not the nominal one.
+
+    name: as in ``flytrack_sysid.parameters``. ci95: not finite where the log does not determine it.
+    is_at_bound: it lies at the end of what is searched.
+    """
+
+    name: str
+    nominal: float
+    value: float
+    ci95: tuple[float, float]
+    unit: str
+    is_at_bound: bool
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """Held-out errors of free flights from measured states, rms, and where they tell anything.
+
+    errors: by model (nominal, refitted_base, extended, placebo; refitted_to_flights, the base alone fitted
+    as the extended model was, where that was done), by quantity with its unit, and by seconds. evidence: by
+    quantity, the horizons, s, at which a model predicts better than the placebo, which knows the state at
+    the start and no commands. removal_costs: by effect, by which share these errors grow without it.
+    """
+
+    errors: Mapping[str, Mapping[str, Mapping[str, float]]] = field(default_factory=dict)
+    evidence: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
+    removal_costs: Mapping[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class HalfResponse:
+    """Time from a step of a stick to half of the response, s: of a small step and of one to full stick.
+
+    ci95: 95 % interval of the small step's; None where the model was not fitted. As in
+    ``flytrack_sysid.response``; not a number where there is no response.
+    """
+
+    time: float
+    full_stick: float
+    ci95: tuple[float, float] | None = None
+
+
+@dataclass(frozen=True)
 class Diagnosis:
     """What is wrong with a model, according to a log.
 
     verdict: consistent, causes_found, unexplained, or "causes_found+unexplained". error: by model: nominal,
-    refitted_base, extended, noise_floor. nominal, base, extended: the models. source, sha256: of the log.
+    refitted_base, extended, noise_floor. nominal, base, extended: the models, with the motion that the log
+    shows. negligible: what is significant and too small to matter. source, sha256: of the log.
     noise: by channel and axis, fitted standard deviations of the sensors. voltages: the lowest and the
-    highest of the battery that were learnt from, V; None where it was not measured.
+    highest of the battery that were learnt from, V; None where it was not measured. prediction: how far ahead
+    the models predict. changed: every parameter of the extended model that is not as in the nominal one.
+    half_response_s: by model (nominal, refitted_base, extended) and by stick.
     """
 
     verdict: str
@@ -113,12 +163,17 @@ class Diagnosis:
     sha256: str
     voltages: tuple[float, float] | None = None
     warnings: tuple[str, ...] = ()
+    negligible: tuple[Cause, ...] = ()
+    prediction: Prediction = Prediction()
+    changed: tuple[Changed, ...] = ()
+    half_response_s: Mapping[str, Mapping[str, HalfResponse]] = field(default_factory=dict)
 
     def as_json(self) -> dict[str, Any]:
         """Return the content of diagnosis.json: the fields under the names of its schema, six digits."""
-        causes, limits, unexplained = _plain((self.causes, self.not_identifiable, self.unexplained))
+        causes, negligible = _plain((self.causes, self.negligible))
+        limits, unexplained = _plain((self.not_identifiable, self.unexplained))
         unexplained["times_sensor_noise"] = unexplained.pop("shares")
-        for cause in causes:
+        for cause in (*causes, *negligible):
             cause |= {"lambda": cause.pop("lambda_"), "closest_rival": cause.pop("closest")}
         for limit in limits:
             limit["smallest_detectable"] = {"value": limit.pop("smallest"), "unit": limit.pop("unit")}
@@ -126,9 +181,14 @@ class Diagnosis:
             "schema": SCHEMA,
             "verdict": self.verdict,
             "causes": causes,
+            "negligible": negligible,
             "unexplained": unexplained,
             "not_identifiable": limits,
+            "motion": self.extended.motion.value,
             "error": _plain(self.error),
+            "prediction": _plain(self.prediction),
+            "changed": _plain(self.changed),
+            "half_response_s": _plain(self.half_response_s),
             "noise": self.noise,
             "data": {"file": self.source, "sha256": self.sha256, "voltages": self.voltages},
             "warnings": list(self.warnings),

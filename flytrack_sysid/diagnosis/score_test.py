@@ -14,7 +14,7 @@ from scipy import linalg, stats
 
 from flytrack_env.effects import BY_NAME, EFFECTS, Effect
 from flytrack_sysid.diagnosis.problem import Problem, Slopes, blocks_of, robust_square, robust_weight
-from flytrack_sysid.parameters import DRAIN, TAUS, THRUST_COEFFS
+from flytrack_sysid.parameters import DRAIN, TAUS, THRUST_COEFFS, bounds_of, neutral_value
 
 CHANCE = 1e-4  # of a name where there is nothing, for each effect
 # A direction of which the others leave less than this share cannot be told apart from them.
@@ -27,16 +27,34 @@ BASE_CAUSES = {**{name: (name,) for name in TAUS}, "thrust_curve": THRUST_COEFFS
 BASE_FREE = (*TAUS, *THRUST_COEFFS, DRAIN)
 
 
+class Probe(NamedTuple):
+    """A parameter, ``effect.parameter``, and a value at which to look for it."""
+
+    field: str
+    value: float
+
+    @property
+    def is_one_way(self) -> bool:
+        """Whether the parameter's range begins at its neutral value."""
+        return bounds_of(self.field).low == neutral_value(self.field)
+
+    def placed_in(self, problem: Problem, vector: np.ndarray) -> np.ndarray:
+        """Return the vector with the probe in place."""
+        vector = vector.copy()
+        vector[problem.names.index(self.field)] = self.value
+        return vector
+
+
 class Candidate(NamedTuple):
     """An effect and one way to look for it.
 
-    fields: ``effect.parameter`` names that are freed. probe: one of them and a value to start from, where
-    there is no slope at neutral.
+    fields: ``effect.parameter`` names that are freed. probes: of some of them, where there is no slope at
+    neutral; each may lie on another share of its way.
     """
 
     effect: str
     fields: tuple[str, ...]
-    probe: tuple[str, float] | None = None
+    probes: tuple[Probe, ...] = ()
 
     @property
     def num_priced(self) -> int:
@@ -46,15 +64,8 @@ class Candidate(NamedTuple):
 
     @property
     def other_fields(self) -> tuple[str, ...]:
-        """Its fields without that of the probe."""
-        return tuple(field for field in self.fields if self.probe is None or field != self.probe[0])
-
-    def placed_in(self, problem: Problem, vector: np.ndarray) -> np.ndarray:
-        """Return the vector with the probe in place."""
-        vector = vector.copy()
-        if self.probe is not None:
-            vector[problem.names.index(self.probe[0])] = self.probe[1]
-        return vector
+        """Its fields without those of the probes."""
+        return tuple(field for field in self.fields if field not in dict(self.probes))
 
 
 def candidates_of(effect: Effect) -> list[Candidate]:
@@ -62,15 +73,18 @@ def candidates_of(effect: Effect) -> list[Candidate]:
     found = []
     for group in effect.groups or (tuple(effect.ranges),):
         fields = tuple(f"{effect.name}.{field}" for field in group)
-        probes: list[tuple[str, float] | None] = [
-            (f"{effect.name}.{field}", value) for field in group for value in effect.probes.get(field, ())
+        probed = [
+            [Probe(f"{effect.name}.{field}", value) for value in effect.probes[field]]
+            for field in group
+            if field in effect.probes
         ]
-        found += [Candidate(effect.name, fields, probe) for probe in probes or [None]]
+        ways = zip(*probed, strict=True) if probed else [()]
+        found += [Candidate(effect.name, fields, probes) for probes in ways]
     return found
 
 
 CANDIDATES = [candidate for effect in EFFECTS for candidate in candidates_of(effect)]
-PROBES = [candidate for candidate in CANDIDATES if candidate.probe is not None]
+PROBES = list(dict.fromkeys(probe for candidate in CANDIDATES for probe in candidate.probes))
 
 
 def threshold(num_parameters: int) -> float:
@@ -106,11 +120,11 @@ class Gain(NamedTuple):
 class Linearization:
     """A model and, to first order, what every column would change: parameters, and ways to probes.
 
-    vector: the model. places: parameters of the first columns. probes: candidates of further ones, whose
-    step is the share of the way to the probe. columns: whitened. The slopes may be those of a nearby model.
+    vector: the model. places: parameters of the first columns. probes: of further ones, whose step is the
+    share of the way to the probe. columns: whitened. The slopes may be those of a nearby model.
     """
 
-    def __init__(self, problem: Problem, slopes: Slopes, probes: Sequence[Candidate] = ()):
+    def __init__(self, problem: Problem, slopes: Slopes, probes: Sequence[Probe] = ()):
         self.problem, self.slopes, self.noise = problem, slopes, problem.noise
         self.places, self.probes = list(slopes.places), list(probes)
         self.prior = np.concatenate(
@@ -152,7 +166,7 @@ class Linearization:
         change = vector - self.slopes.vector
         places = np.array(self.places)
         elsewhere = np.delete(change, places)
-        sloping = self.problem.index(sorted({one.probe[0] for one in PROBES if one.probe is not None}))
+        sloping = self.problem.index(sorted({probe.field for probe in PROBES}))
         size = np.maximum(np.abs(vector), np.abs(self.slopes.vector))
         # Where there was no slope, first order cannot measure the distance.
         if np.any(elsewhere != 0.0) or np.any((np.abs(change) > SAME_SLOPE * size)[sloping]):
@@ -181,13 +195,13 @@ class Linearization:
         return [column for column in columns if column not in without]
 
     def columns_of(self, candidate: Candidate) -> list[int]:
-        """Return a candidate's columns: its probe's, then those of its other parameters."""
-        columns = [self.column(field) for field in candidate.other_fields]
-        return columns if candidate.probe is None else [self.probe_column(candidate), *columns]
+        """Return a candidate's columns: those of its probes, then those of its other parameters."""
+        ways = [self.probe_column(probe) for probe in candidate.probes]
+        return ways + [self.column(field) for field in candidate.other_fields]
 
-    def probe_column(self, candidate: Candidate) -> int:
-        """Return the column of the way to a candidate's probe."""
-        return len(self.places) + self.probes.index(candidate)
+    def probe_column(self, probe: Probe) -> int:
+        """Return the column of the way to a probe."""
+        return len(self.places) + self.probes.index(probe)
 
     def acting(self, columns: Sequence[int]) -> list[int]:
         """Return the columns that change anything."""
@@ -240,6 +254,25 @@ class Linearization:
         whole = np.zeros(len(every))
         whole[[every.index(column) for column in added]] = step
         return Gain(float(score @ step), inflation_of(own, blocks), whole, both[: len(given)], own)
+
+    def gain_of(self, candidate: Candidate, given: Sequence[int]) -> Gain | None:
+        """Return the gain of a candidate; None where others do the same, or no probe lies the right way.
+
+        Parameters that begin at neutral do not move away from their probes; the step of those is 0.
+        """
+        columns, probed = self.columns_of(candidate), [self.probe_column(one) for one in candidate.probes]
+        one_way = {self.probe_column(one) for one in candidate.probes if one.is_one_way}
+        kept = list(columns)
+        while not probed or set(kept) & set(probed):
+            gain = self.gain(kept, given)
+            if gain is None:
+                break
+            steps = dict(zip(kept, gain.step, strict=True))
+            forwards = [column for column in kept if column not in one_way or steps[column] > 0.0]
+            if forwards == kept:
+                return gain._replace(step=np.array([steps.get(column, 0.0) for column in columns]))
+            kept = forwards
+        return None
 
     def _own(self, columns: list[int], given: list[int]) -> list[int]:
         """Return the columns that given ones, or those before them, do not nearly replace."""

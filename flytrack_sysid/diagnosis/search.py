@@ -173,8 +173,8 @@ def score_candidates(state: SearchState, linearization: Linearization, model: Fi
     for candidate in CANDIDATES:
         if candidate.effect in excluded:
             continue
-        gain = linearization.gain(linearization.columns_of(candidate), given)
-        if gain is None or (candidate.probe is not None and gain.step[0] <= 0.0):
+        gain = linearization.gain_of(candidate, given)
+        if gain is None:
             continue
         scored = Scored(candidate, gain)
         if candidate.effect not in best or scored.merit > best[candidate.effect].merit:
@@ -191,27 +191,29 @@ def add_effect(
     """
     problem, (candidate, gain) = state.problem, scored
     candidates = (*model.candidates, candidate)
-    if candidate.probe is None:
+    if not candidate.probes:
         vector = model.vector.copy()
         vector[problem.index(candidate.fields)] += gain.step
         return state.fitted(candidates, problem.clipped(vector), linearization)
     best = state.fitted(candidates, _on_the_way(problem, model, scored))
     if model.cost - best.cost < KEPT_PROMISE * gain.chi2:
-        at_probe = problem.clipped(candidate.placed_in(problem, model.vector))
-        best = min(best, state.fitted(candidates, at_probe), key=lambda one: one.cost)
+        at_probes = model.vector
+        for probe, share in zip(candidate.probes, gain.step, strict=False):
+            at_probes = probe.placed_in(problem, at_probes) if share > 0.0 else at_probes
+        best = min(best, state.fitted(candidates, problem.clipped(at_probes)), key=lambda one: one.cost)
     return best
 
 
 def _on_the_way(problem: Problem, model: FittedModel, scored: Scored) -> np.ndarray:
-    """Return the vector at the share of the way to a probe that explains most, all else moved along."""
+    """Return the vector at the shares of the ways to probes that explain most, all else moved along."""
     candidate, gain = scored
-    assert candidate.probe is not None
     vector = model.vector.copy()
     vector[list(model.places)] += gain.given_step
-    vector[problem.index(candidate.other_fields)] += gain.step[1:]
-    place = problem.names.index(candidate.probe[0])
-    share = np.clip(gain.step[0], *SHARE_OF_WAY)
-    vector[place] += share * (candidate.probe[1] - vector[place])
+    vector[problem.index(candidate.other_fields)] += gain.step[len(candidate.probes) :]
+    for probe, step in zip(candidate.probes, gain.step, strict=False):
+        place = problem.names.index(probe.field)
+        share = np.sign(step) * np.clip(np.abs(step), *SHARE_OF_WAY)
+        vector[place] += share * (probe.value - vector[place])
     return problem.clipped(vector)
 
 

@@ -17,6 +17,7 @@ from flytrack_sysid.diagnosis.model_selection import (
     separation,
 )
 from flytrack_sysid.diagnosis.problem import Problem
+from flytrack_sysid.diagnosis.refinement import Refined, at_bounds, errors_at, table_of
 from flytrack_sysid.diagnosis.result import (
     CAUSES_FOUND,
     CHANNELS,
@@ -24,26 +25,27 @@ from flytrack_sysid.diagnosis.result import (
     TO_LOG,
     UNEXPLAINED,
     Cause,
+    Changed,
     Errors,
     Estimated,
+    HalfResponse,
     NotIdentifiable,
+    Prediction,
     Unexplained,
 )
-from flytrack_sysid.diagnosis.score_test import AT_BOUND, Linearization, solve, threshold
+from flytrack_sysid.diagnosis.score_test import BASE_CAUSES, Linearization, solve, threshold
 from flytrack_sysid.diagnosis.search import FittedModel, SearchState
 from flytrack_sysid.diagnosis.vetoes import Selection, held_out_gain, is_base_remainder, is_contradicted
-from flytrack_sysid.log import FlightLog
-from flytrack_sysid.parameters import DRAIN, MAX_RATES, THRUST_COEFFS, as_float32, from_vector
+from flytrack_sysid.parameters import DRAIN, MAX_RATES, STICKS, THRUST_COEFFS, as_float32, from_vector
 from flytrack_sysid.parameters import unit_of as unit_of_parameter
-from flytrack_sysid.prediction import predict
-from flytrack_sysid.prediction_errors import rollout_errors
-from flytrack_sysid.record import BATTERY_UNKNOWN_V, fill_gaps
+from flytrack_sysid.prediction_windows import HORIZONS_S, QUANTITIES
+from flytrack_sysid.record import BATTERY_UNKNOWN_V
+from flytrack_sysid.response import FULL_STEP, SMALL_STEP, half_responses
 
 TWO_SIDED_95 = 1.959964
 LOOSE = 0.5  # of the prior's width: a parameter that the log knows no better is not determined
 SCALE_TWINS = ("thrust_curve",)  # mass, payload, battery and motors all scale the thrust over the mass
-HORIZONS_S = (0.5, 1.0, 2.0)
-FLIES_WORSE = 1.1  # times the error of free flight
+SLOPE_STEP = 1e-3  # of a parameter's scale, for slopes of times to half response
 STILL = (*MAX_RATES, DRAIN, *THRUST_COEFFS)  # a model where these are 0 does not move
 
 
@@ -61,6 +63,39 @@ def estimates(
         ends = max(value - half, low), min(value + half, high)
         name = field.split(".")[-1]
         result[name] = Estimated(value, (float(ends[0]), float(ends[1])), unit_of_parameter(field))
+    return result
+
+
+def half_responses_of(
+    linearization: Linearization, model: FittedModel, refined: Refined, vectors: Mapping[str, np.ndarray]
+) -> dict[str, dict[str, HalfResponse]]:
+    """Return the times to half response of models by name, by stick.
+
+    The intervals of the extended model are to first order those of all its parameters together.
+    """
+    problem, fit = refined.problem, refined.fit
+    places = list(model.places if fit is None else fit.places)
+    step = SLOPE_STEP * problem.scale[places]
+    step = np.where(vectors["extended"][places] + step > problem.high[places], -step, step)
+    moved = np.repeat(vectors["extended"][None], len(places), axis=0)
+    moved[np.arange(len(places)), places] += step
+    found = half_responses(np.stack([*vectors.values(), *moved]), problem.like, SMALL_STEP)
+    full = half_responses(np.stack(list(vectors.values())), problem.like, FULL_STEP)
+    own = found[list(vectors).index("extended")]
+    slopes = np.nan_to_num((found[len(vectors) :] - own) / step[:, None]).T
+    if fit is None:
+        halves = Marginal(linearization, model, [problem.names[place] for place in places]).half_widths(
+            slopes
+        )
+    else:
+        halves = np.sqrt(np.diag(slopes @ fit.covariance @ slopes.T))
+    result = {}
+    for name, small_s, full_s in zip(vectors, found, full, strict=False):
+        pairs = zip(small_s.tolist(), full_s.tolist(), strict=True)
+        result[name] = dict(zip(STICKS, (HalfResponse(*pair) for pair in pairs), strict=True))
+    for stick, half in zip(STICKS, halves.tolist(), strict=True):
+        one = result["extended"][stick]
+        result["extended"][stick] = replace(one, ci95=(max(one.time - half, 0.0), one.time + half))
     return result
 
 
@@ -137,6 +172,15 @@ def base_causes(
         if not _is_remainder(cause, effects):
             causes.append(_as_thrust_scale(cause, change, problem, model))
     return sorted(causes, key=lambda cause: -cause.chi2_gain), contradicted
+
+
+def vector_without(cause: Cause, selection: Selection, linearization: Linearization) -> np.ndarray:
+    """Return the extended model without one of its causes, the rest fitted again."""
+    if cause.effect in selection.ablations:
+        return selection.ablations[cause.effect].without.vector
+    name = "thrust_curve" if cause.effect == "thrust_scale" else cause.effect
+    places = selection.state.problem.index(BASE_CAUSES[name])
+    return _refitted_to_first_order(selection.state.problem, linearization, selection.model, places)
 
 
 def _refitted_to_first_order(
@@ -248,20 +292,6 @@ def _rms(left: np.ndarray, counts: np.ndarray, is_centred: bool = False) -> np.n
     return np.sqrt(np.where(counts, (left - mean) ** 2, 0.0).sum(axis=(0, 1)) / number)
 
 
-def _free_flight_errors(model: ModelParameters, log: FlightLog, rows: np.ndarray) -> dict[str, float]:
-    """Return rms position errors of free flight, m, by horizon.
-
-    The model has all effects, so that one program flies every one.
-    """
-    filled = fill_gaps(log)
-    found = rollout_errors(model, filled.log, predict(model, filled), rows[filled.behind])
-    return {
-        f"{one.horizon_s:g}": one.errors["position"].rms
-        for one in found
-        if one.horizon_s in HORIZONS_S and "position" in one.errors
-    }
-
-
 def _free_flight_floor(problem: Problem) -> dict[str, float]:
     """Return the position errors of free flight that come from noise in its start alone, m, by horizon."""
     level = np.asarray(problem.fitted_noise.level)
@@ -273,9 +303,7 @@ def _free_flight_floor(problem: Problem) -> dict[str, float]:
     }
 
 
-def errors_of(
-    test: Problem, vectors: Mapping[str, np.ndarray], log: FlightLog, rows: np.ndarray
-) -> dict[str, Errors]:
+def errors_of(test: Problem, vectors: Mapping[str, np.ndarray], prediction: Prediction) -> dict[str, Errors]:
     """Return errors of models on held-out rows, by name, and what the sensors' noise alone would leave.
 
     One-step errors are relative to those of a model that does not move, whose residuals are the measured
@@ -294,25 +322,137 @@ def errors_of(
             for name, own in _by_channel(errors, test).items()
         }
 
-    can_fly = {"p", "v", "q"} <= set(log.channels)
-    result = {}
-    for (name, vector), one in zip(vectors.items(), left[1:], strict=True):
-        flight = _free_flight_errors(from_vector(vector, test.like), log, rows) if can_fly else {}
-        result[name] = Errors(relative(_rms(one, test.counts)), flight)
+    result, flights = {}, prediction.errors
+    for name, one in zip(vectors, left[1:], strict=True):
+        flown = flights.get(name, {}).get("position_m", {})
+        result[name] = Errors(relative(_rms(one, test.counts)), flown)
     noise = test.fitted_noise
     floor = np.stack([np.asarray(noise.direct), np.sqrt(2.0) * np.asarray(noise.level)], axis=-1)
     floor[-1, 1] = noise.level[-1]  # summed up, not a difference of two
-    result["noise_floor"] = Errors(relative(floor), _free_flight_floor(test) if can_fly else {})
+    flown = _free_flight_floor(test) if result["extended"].position_m else {}
+    result["noise_floor"] = Errors(relative(floor), flown)
     return result
 
 
-def warnings_of(
-    problem: Problem,
-    model: FittedModel,
-    causes: Sequence[Cause],
-    errors: Mapping[str, Errors],
-    contradicted: Sequence[str],
-) -> list[str]:
+def reduced(selection: Selection, refined: Refined) -> Selection:
+    """Return the selection with only those effects that a refinement kept; its base alone without any."""
+    model = selection.model
+    if refined.kept == model.candidates:
+        return selection
+    if refined.fit is None:
+        return selection._replace(model=selection.base)
+    return selection._replace(model=model._replace(candidates=refined.kept, places=refined.fit.places))
+
+
+def _is_beyond(refined: Refined, vector: np.ndarray, field: str) -> str:
+    """Return which way a parameter would go if it were searched farther; nothing within its range."""
+    problem = refined.problem
+    if not at_bounds(problem, vector, [field]):
+        return ""
+    place = problem.names.index(field)
+    is_low = vector[place] - problem.low[place] < problem.high[place] - vector[place]
+    unit = unit_of_parameter(field)
+    size = f"{vector[place]:.3g}" + ("" if unit == "1" else f" {unit}")
+    return f"{field.split('.')[-1]} at {'most' if is_low else 'least'} {size}"
+
+
+def _fields_of(cause: Cause) -> list[str]:
+    """Return the names of a cause's parameters in the vector."""
+    prefix = f"{cause.effect}." if cause.effect in BY_NAME else ""
+    return [prefix + name for name in cause.parameters]
+
+
+def with_refined_values(causes: Sequence[Cause], refined: Refined, vector: np.ndarray) -> tuple[Cause, ...]:
+    """Return causes with the values and intervals of a refinement, and which of them are at a bound."""
+    problem, fit = refined.problem, refined.fit
+    half = {} if fit is None else dict(zip(fit.places, fit.half_widths, strict=True))
+    result = []
+    for cause in causes:
+        fields = [one for one in _fields_of(cause) if one in problem.names]
+        values = dict(cause.parameters)
+        for field in fields:
+            place = problem.names.index(field)
+            if place in half:
+                value, low, high = (float(one[place]) for one in (vector, problem.low, problem.high))
+                ends = max(value - half[place], low), min(value + half[place], high)
+                values[field.split(".")[-1]] = Estimated(value, ends, unit_of_parameter(field))
+        if len(fields) == 1 and fit is not None and "." not in fields[0]:
+            low, high = values[fields[0]].ci95
+            if low <= problem.start[problem.names.index(fields[0])] <= high:
+                continue  # a lag that single steps show and flights do not
+        beyond = ", ".join(filter(None, (_is_beyond(refined, vector, field) for field in fields)))
+        result.append(replace(cause, parameters=values, beyond=beyond))
+    return tuple(result)
+
+
+def prediction_of(refined: Refined, vectors: Mapping[str, np.ndarray]) -> Prediction:
+    """Return how far ahead models predict held-out flights; nothing where too few could be judged."""
+    judge = refined.judge
+    if judge is None:
+        return Prediction()
+    models = dict(vectors)
+    if refined.base is not None:
+        models["refitted_to_flights"] = refined.base
+    found = errors_at(refined.problem, np.stack(list(models.values())), judge.windows).rms()
+    errors = {name: table_of(one) for name, one in zip(models, found, strict=True)}
+    errors["placebo"] = table_of(judge.placebo.rms()[0])
+    evidence = {
+        quantity: tuple(float(one) for one in np.array(HORIZONS_S)[judge.matters[:, index]])
+        for index, quantity in enumerate(QUANTITIES)
+        if judge.is_known[:, index].any()
+    }
+    return Prediction(errors, evidence, refined.removal_costs)
+
+
+def changed_parameters(
+    linearization: Linearization, extended: FittedModel, refined: Refined
+) -> tuple[Changed, ...]:
+    """Return every parameter of the extended model whose value differs from the nominal one."""
+    problem, fit, vector = refined.problem, refined.fit, extended.vector
+    places = [place for place in extended.places if abs(vector[place] - problem.start[place]) > 0.0]
+    if fit is not None:
+        widths = dict(zip(fit.places, fit.half_widths, strict=True))
+    else:
+        acting = [place for place in places if linearization.acting([linearization.places.index(place)])]
+        halves = Marginal(linearization, extended, [problem.names[place] for place in acting]).half_widths()
+        widths = dict(zip(acting, halves, strict=True))
+    result = []
+    for place in places:
+        name, value, half = problem.names[place], float(vector[place]), float(widths.get(place, np.inf))
+        bound = bool(at_bounds(problem, vector, [name]))
+        ends, unit = (value - half, value + half), unit_of_parameter(name)
+        result.append(Changed(name, float(problem.start[place]), value, ends, unit, bound))
+    return tuple(result)
+
+
+def refinement_notes(refined: Refined) -> list[str]:
+    """Return what a refinement found out beside values."""
+    judge = refined.judge
+    if judge is None:
+        return []
+    notes = []
+    if refined.removed:
+        names = ", ".join(refined.removed)
+        notes.append(
+            f"not in the extended model: {names}; single steps show them, but held-out flights are "
+            "predicted no better with them, or worse at some horizon"
+        )
+        if not refined.kept:
+            notes.append("no effect predicts held-out flights better: the extended model is the refitted one")
+    silent = [
+        f"{HORIZONS_S[index]:g} s"
+        for index in range(len(HORIZONS_S))
+        if judge.is_known[index].any() and not judge.matters[index].any()
+    ]
+    if silent and refined.fit is not None:
+        notes.append(
+            f"after {', '.join(silent)} a placebo that knows the state at the start and no commands "
+            "predicts these flights as well as the models: nothing is named from there"
+        )
+    return notes
+
+
+def warnings_of(problem: Problem, causes: Sequence[Cause], contradicted: Sequence[str]) -> list[str]:
     """Return what a reader must know before trusting causes or the extended model.
 
     contradicted: names that were rejected because held-out rows contradict them.
@@ -323,9 +463,16 @@ def warnings_of(
             f"{name} gained nothing on the held-out part: it was there for a time only, or never"
             for name in contradicted
         ),
-        *_at_bounds(problem, model, causes),
-        *_flies_worse(errors),
+        *(_at_bound(cause) for cause in causes if cause.beyond),
     ]
+
+
+def _at_bound(cause: Cause) -> str:
+    """Return a warning of a value at the end of its range: the true cause may be another one."""
+    why = "its law may stand in for something else"
+    if cause.effect in BY_NAME and any(name in cause.beyond for name in BY_NAME[cause.effect].most_steps):
+        why = "only so many rows of the log are remembered; import it with fewer rows per second"
+    return f"{cause.effect} is beyond the list: {cause.beyond}, the end of what is searched; {why}"
 
 
 def _voltage_unknown(problem: Problem, causes: Sequence[Cause]) -> list[str]:
@@ -335,43 +482,6 @@ def _voltage_unknown(problem: Problem, causes: Sequence[Cause]) -> list[str]:
         return []
     assumed = f"no voltage was logged and {BATTERY_UNKNOWN_V:g} V were assumed"
     return [f"{assumed}: {thrust[0]} may only be the error of that"]
-
-
-def _at_bounds(problem: Problem, model: FittedModel, causes: Sequence[Cause]) -> list[str]:
-    """Return a warning for each value at the end of its range: the true cause may be another one."""
-    result = []
-    for cause in causes:
-        for name, one in cause.parameters.items():
-            field = f"{cause.effect}.{name}"
-            if field not in problem.names or name in BY_NAME[cause.effect].shapes:
-                continue  # a base parameter, or one that may well be as sharp as it gets
-            place = problem.names.index(field)
-            low, high, value = problem.low[place], problem.high[place], model.vector[place]
-            room = AT_BOUND * max(abs(value), 1.0)
-            if low + room < value < high - room:
-                continue
-            why = "its law may stand in for something else"
-            if name in BY_NAME[cause.effect].most_steps:
-                why = "only so many rows of the log are remembered; import it with fewer rows per second"
-            result.append(
-                f"{field} = {one.value:.3g} is at the end of the searched range ({low:g} to {high:g}): {why}"
-            )
-    return result
-
-
-def _flies_worse(errors: Mapping[str, Errors]) -> list[str]:
-    """Return a warning where the extended model ends up farther off in free flight, held out."""
-    base, extended = errors["refitted_base"].position_m, errors["extended"].position_m
-    worse = [horizon for horizon in extended if extended[horizon] > FLIES_WORSE * base[horizon]]
-    if not worse:
-        return []
-    compared = ", ".join(
-        f"{extended[horizon]:.3g} m against {base[horizon]:.3g} m after {horizon} s" for horizon in worse
-    )
-    return [
-        f"in free flight the extended model ends farther off than the refitted one without effects "
-        f"({compared}, held out): the named causes are right step by step, or stand in for something else"
-    ]
 
 
 def with_lost_causes(rest: Unexplained, contradicted: Sequence[str]) -> Unexplained:

@@ -13,7 +13,7 @@ import numpy as np
 from flytrack_env.files import read_at_most
 from flytrack_env.messages import error_text, quote_name, quote_value
 from flytrack_sysid.importing.decoding import decode
-from flytrack_sysid.importing.flight import ImportedFlight
+from flytrack_sysid.importing.flight import ImportedFlight, not_a_quadcopter, saturation
 from flytrack_sysid.importing.mapping import Mapping
 from flytrack_sysid.importing.resample import is_increasing
 from flytrack_sysid.importing.units import GRAVITY, PER_DEGREE, UNITS
@@ -41,6 +41,8 @@ BETAFLIGHT_RATE_DEG_S = KISS_RATE_DEG_S = 200.0  # at RC rate 1
 TENS = 10.0  # deg/s in one unit of the other types' settings
 QUICK_RATE_DEG_S = 2.0  # per unit of RC rate
 LEAST_REMAINDER = 0.01  # of 1 less the super rate, as the firmware bounds it
+LARGEST_OVERSHOOT = 0.05  # past full stick: smoothing by a Butterworth filter overshoots a step by 4.3 %
+NUM_MOTORS = 4
 
 
 def full_stick_rate(rates_type: str, rc_rate: float, super_rate: float, limit_deg_s: float) -> float:
@@ -65,15 +67,23 @@ def full_stick_rate(rates_type: str, rc_rate: float, super_rate: float, limit_de
 def read_betaflight(path: Path, mapping: Mapping) -> list[ImportedFlight]:
     """Return the flights in a blackbox file, one per log in it: commands, rates, specific force, voltage.
 
-    docs/real_logs.md says what the channels are. Raises LogError for what is no complete blackbox file of
-    Betaflight 4, or lacks a field.
+    docs/real_logs.md says what the channels are. A log that cannot be used is left out, and a note says why.
+    Raises LogError for what is no blackbox file of Betaflight 4, or has no log that can be used.
     """
-    num_logs = _count_logs(path)
-    notes, frames = decode(str(path), "betaflight", path, num_logs)
-    return [
-        _read_log(str(path) if num_logs == 1 else f"{path}, log {number}", headers_and_names, rows, mapping)
-        for number, (headers_and_names, rows) in enumerate(zip(notes, frames, strict=True), start=1)
-    ]
+    complete, left_out = _complete_logs(path)
+    num_logs = len(complete) + len(left_out)
+    decoded, frames = decode(str(path), "betaflight", path, complete)
+    flights = []
+    for number, found, rows in zip(complete, decoded, frames, strict=True):
+        source = str(path) if num_logs == 1 else f"{path}, log {number}"
+        try:
+            flights.append(_read_log(source, found, rows, mapping))
+        except LogError as error:
+            left_out.append(error)
+    if not flights:
+        raise left_out[0]
+    notes = tuple(f"left out: {error}" for error in left_out)
+    return [flights[0]._replace(notes=notes + flights[0].notes), *flights[1:]]
 
 
 def _read_log(source: str, notes: dict[str, Any], frames: np.ndarray, mapping: Mapping) -> ImportedFlight:
@@ -84,25 +94,35 @@ def _read_log(source: str, notes: dict[str, Any], frames: np.ndarray, mapping: M
     revision = str(headers.values.get("Firmware revision", "none"))
     if not revision.startswith(FIRMWARE):
         raise headers.error("Firmware revision", f"found {quote_value(revision)}, expected {FIRMWARE} 4")
-    for name in ("time", *STICKS, *GYRO, *ACCELEROMETER):
+    for name in ("time", *STICKS, *GYRO):
         if name not in names:
             listed = ", ".join(map(quote_name, names))[:LONGEST_LIST]
             raise LogError(f"{source}: field {name}: missing; found {listed}")
+    said = [f"{quote_name(revision)}, {len(frames)} frames"]
+    if notes["num_undecoded"]:
+        said.append(f"{notes['num_undecoded']} frames before the first full one left out")
     columns = dict(zip(names, frames.T, strict=True))
     is_used = is_increasing(columns["time"])
+    if not is_used.all():
+        said.append(f"{np.count_nonzero(~is_used)} frames left out: not later than those before")
     table = Table(source, {name: values[is_used] for name, values in columns.items()})
     craft = mapping.craft
     if craft.max_rate_deg_s is None:
         craft = craft._replace(max_rate_deg_s=headers.full_stick_deg_s())
-    channels = _channels(table, headers, np.array([*(craft.max_rate_deg_s or ()), FULL_THROTTLE]))
+    full = np.array([*(craft.max_rate_deg_s or ()), FULL_THROTTLE])
+    channels = _channels(table, headers)
+    channels["u"], clipped = _commands(table, headers, full)
+    if mapping.rules.motors_as_thrust:
+        channels["u"][:, 3] = _thrust_of_motors(table, headers)
+        clipped.append("thrust command: the mean of the motors")
     found = {"t": (table.columns["time"] - table.columns["time"][0]) * MICROSECOND}
     for name, values in channels.items():
         found |= dict(zip(CHANNELS[name], values.T, strict=True))
-    description: tuple[str, ...] = (f"{source}: {quote_name(revision)}, {len(frames)} frames",)
-    dropped = np.count_nonzero(~is_used)
-    if dropped:
-        description += (f"{source}: {dropped} frames left out: their time was not later than those before",)
-    return ImportedFlight(log_of_table(table._replace(columns=found)), craft, description)
+    said += [*clipped, *_motors(table, headers)]
+    if "f" not in channels:
+        said.append("no accelerometer in the log: nothing is asked of the specific force")
+    log = log_of_table(table._replace(columns=found))
+    return ImportedFlight(log, craft, tuple(f"{source}: {text}" for text in said))
 
 
 class _Headers:
@@ -124,6 +144,10 @@ class _Headers:
             raise self.error(name, f"found {quote_value(value)}, expected {size} numbers of at least 0")
         return [float(one) for one in found]
 
+    def rate_unit_deg_s(self) -> float:
+        """Return the rate that one unit of setpoints and gyroscope means, deg/s."""
+        return 1.0 / FINE if self.numbers("blackbox_high_resolution", 1, [0])[0] > 0 else 1.0
+
     def full_stick_deg_s(self) -> tuple[float, float, float]:
         """Return the rates at full stick of roll, pitch, yaw, deg/s."""
         if "rc_rates" not in self.values:
@@ -140,30 +164,65 @@ class _Headers:
         return roll, pitch, yaw
 
 
-def _channels(table: Table, headers: _Headers, full: np.ndarray) -> dict[str, np.ndarray]:
-    """Return the channels of the log; full: setpoints at full stick, (4,), deg/s and throttle."""
-    is_fine = headers.numbers("blackbox_high_resolution", 1, [0])[0] > 0
-    per_unit = 1.0 / FINE if is_fine else 1.0  # deg/s
+def _commands(table: Table, headers: _Headers, full: np.ndarray) -> tuple[np.ndarray, list[str]]:
+    """Return commands (num_rows, 4) and a note if some are clipped; full: the setpoints at full stick, (4,).
+
+    What is further past full stick than smoothing overshoots is left, for ``log_of_table`` to refuse.
+    """
+    per_unit = headers.rate_unit_deg_s()
     units = np.array([per_unit, per_unit, per_unit, 1.0])
     commands = table.matrix(STICKS) * units / full
     commands[:, 3] = 2.0 * commands[:, 3] - 1.0
+    size = np.abs(commands)
     # Setpoints are whole numbers: half of one past full stick is rounding.
-    is_rounding = np.abs(commands) <= 1.0 + units / 2 / full
-    g_unit = headers.numbers("acc_1G", 1)[0]
-    if g_unit == 0.0:
-        raise headers.error("acc_1G", "found 0, expected what the accelerometer shows at 1 g")
-    found = {
-        "u": np.where(is_rounding, np.clip(commands, -1.0, 1.0), commands),
-        "f": table.matrix(ACCELEROMETER) * GRAVITY / g_unit,
-        "w": table.matrix(GYRO) * per_unit * PER_DEGREE,
-    }
+    is_past = size > 1.0 + units / 2 / full
+    is_overshoot = size <= np.maximum(1.0 + LARGEST_OVERSHOOT, 1.0 + units / 2 / full)
+    clipped = np.where(is_overshoot, np.clip(commands, -1.0, 1.0), commands)
+    num_past = np.count_nonzero(is_past.any(axis=1))
+    if not num_past:
+        return clipped, []
+    most = f"at most {PERCENT * (size[is_past].max() - 1.0):.2g} % past it"
+    return clipped, [f"{num_past} rows clipped to full stick: smoothed setpoints overshoot, {most}"]
+
+
+def _channels(table: Table, headers: _Headers) -> dict[str, np.ndarray]:
+    """Return the sensors' channels of the log."""
+    found = {"w": table.matrix(GYRO) * headers.rate_unit_deg_s() * PER_DEGREE}
+    if all(name in table.columns and np.any(table.columns[name]) for name in ACCELEROMETER):
+        g_unit = headers.numbers("acc_1G", 1)[0]
+        if g_unit == 0.0:
+            raise headers.error("acc_1G", "found 0, expected what the accelerometer shows at 1 g")
+        found["f"] = table.matrix(ACCELEROMETER) * GRAVITY / g_unit
     if BATTERY in table.columns:
         found["v_bat"] = table.matrix([BATTERY]) * UNITS["voltage"]["cV"]
     return found
 
 
-def _count_logs(path: Path) -> int:
-    """Return the number of logs in a blackbox file, all of which must be complete."""
+def _motors(table: Table, headers: _Headers) -> list[str]:
+    """Return notes on the motors: how many there are, and how often one is at its end."""
+    names = [name for name in table.columns if name.startswith("motor[")]
+    if not names:
+        return []
+    notes = [not_a_quadcopter(f"{len(names)} motors")] if len(names) != NUM_MOTORS else []
+    if "motorOutput" in headers.values:
+        highest = headers.numbers("motorOutput", 2)[1]
+        notes.append(saturation(np.max(table.matrix(names), axis=1) >= highest))
+    return notes
+
+
+def _thrust_of_motors(table: Table, headers: _Headers) -> np.ndarray:
+    """Return thrust commands (num_rows,): -1 and 1 are the lower and upper end of the motors' mean."""
+    low, high = headers.numbers("motorOutput", 2)
+    names = [name for name in table.columns if name.startswith("motor[")]
+    if not names or high <= low:
+        raise headers.error(
+            "motorOutput", f"found {low:g}, {high:g} and {len(names)} motors: no outputs to use"
+        )
+    return np.clip(2.0 * (table.matrix(names).mean(axis=1) - low) / (high - low) - 1.0, -1.0, 1.0)
+
+
+def _complete_logs(path: Path) -> tuple[list[int], list[LogError]]:
+    """Return the numbers of the complete logs in a blackbox file, from 1, and what others lack."""
     try:
         content = read_at_most(path, LARGEST_BYTES)
     except OSError as error:
@@ -171,8 +230,14 @@ def _count_logs(path: Path) -> int:
     if not content.startswith(FIRST_BYTES):
         raise LogError(f"{path}: found {content[: len(FIRST_BYTES)]!r} first, expected {FIRST_BYTES!r}")
     logs = content.split(FIRST_BYTES)[1:]
-    for number, log in enumerate(logs, start=1):
-        if END_OF_LOG not in log:
-            found = f"no end-of-log event in {len(log)} bytes"
-            raise LogError(f"{path}: log {number} of {len(logs)}: cut off: found {found}")
-    return len(logs)
+    is_complete = {number: END_OF_LOG in log for number, log in enumerate(logs, start=1)}
+    cut_off = [
+        LogError(
+            f"{path}: log {number} of {len(logs)}: cut off: found no end-of-log event in {len(log)} bytes"
+        )
+        for number, log in enumerate(logs, start=1)
+        if not is_complete[number]
+    ]
+    if len(cut_off) == len(logs):
+        raise cut_off[0]
+    return [number for number in is_complete if is_complete[number]], cut_off

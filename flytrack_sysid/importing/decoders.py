@@ -1,6 +1,6 @@
-"""Decoders of other programs' logs: pyulog and orangebox, run by ``flytrack_env.sandbox``.
+"""Decoders of other programs' logs: pyulog, orangebox, mcap and rosbags, run by ``flytrack_env.sandbox``.
 
-A small file can make either of them run forever or exhaust the memory (an interval of 0; arrays of arrays).
+A small file can make some of them run forever or exhaust the memory (an interval of 0; arrays of arrays).
 This file is imported alone there, so it imports nothing of this package. A decoder takes its arguments, the
 path first, and returns an ``.npz`` of notes (JSON) and arrays.
 """
@@ -10,6 +10,8 @@ import json
 import logging
 import math
 from array import array
+from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -53,22 +55,131 @@ def decode_ulog(arguments: Any, _: bytes) -> bytes:
 def decode_betaflight(arguments: Any, _: bytes) -> bytes:
     """Return the main frames of a blackbox file's logs, (num_frames, num_fields) float64 each.
 
-    arguments: path, number of logs. The notes have each log's ``headers`` and the fields' ``names``.
+    arguments: path, numbers of the logs, from 1. The notes have each log's ``headers``, the fields'
+    ``names`` and ``num_undecoded``: frames before the first full one, changes from a frame that was lost.
     """
     import orangebox
 
-    path, num_logs = arguments
+    path, numbers = arguments
     logging.getLogger("orangebox").setLevel(logging.CRITICAL)  # it warns of events that it does not know
     notes, arrays = [], []
-    for number in range(1, num_logs + 1):
+    for number in numbers:
         parser = orangebox.Parser.load(path, number)
         main = next(fields for kind, fields in parser.reader.field_defs.items() if kind.value == MAIN_FRAME)
         names = [str(field.name) for field in main]
-        values = array("d")
+        values, num_undecoded = array("d"), 0
         for frame in parser.frames():
+            if not values and frame.type.value != MAIN_FRAME:
+                num_undecoded += 1
+                continue
             if len(frame.data) < len(names):
                 raise ValueError(f"found a frame of {len(frame.data)} fields, expected {len(names)}")
             values.extend(frame.data[: len(names)])
-        notes.append({"headers": parser.headers, "names": names})
+        notes.append({"headers": parser.headers, "names": names, "num_undecoded": num_undecoded})
         arrays.append(np.array(values, float).reshape(-1, len(names)))
     return _pack(notes, arrays)
+
+
+def decode_bag(arguments: Any, _: bytes) -> bytes:
+    """Return fields of a bag's topics: a folder of ROS 2, a ``.bag`` of ROS 1, an ``.mcap`` file.
+
+    arguments: path, and the wanted fields by topic, as in ``pose.position.x`` or ``axes[0]``. The arrays are
+    those of each topic found, (num_messages, 1 + num_fields) float64: time, s from the first message, and the
+    fields. The notes have all ``topics`` of the bag; of those ``found`` their name, their ``fields``, and
+    whether they are ``stamped`` by the sender; and the fields that are ``missing``, as [topic, field, type
+    of the messages].
+    """
+    path, wanted = arguments
+    messages = _mcap_messages if Path(path).suffix == ".mcap" else _bag_messages
+    topics: set[str] = set()
+    missing: list[list[str]] = []
+    fields: dict[str, list[str]] = {}
+    is_stamped: dict[str, bool] = {}
+    values: dict[str, array[float]] = {}
+    first_ns = None
+    for topic, kind, time_ns, message in messages(path, list(wanted)):
+        topics.add(topic)
+        if message is None:
+            continue
+        if topic not in fields:
+            values[topic], is_stamped[topic] = array("d"), _stamp_ns(message) > 0
+            fields[topic] = [field for field in wanted[topic] if _is_number(message, field)]
+            missing += [[topic, field, kind] for field in wanted[topic] if field not in fields[topic]]
+        time_ns = _stamp_ns(message) if is_stamped[topic] else time_ns
+        first_ns = time_ns if first_ns is None else first_ns
+        values[topic].append((time_ns - first_ns) * 1e-9)
+        values[topic].extend(float(_part(message, field)) for field in fields[topic])
+    found = [{"topic": name, "fields": fields[name], "is_stamped": is_stamped[name]} for name in fields]
+    arrays = [np.array(values[name], float).reshape(-1, 1 + len(fields[name])) for name in fields]
+    return _pack({"topics": sorted(topics), "found": found, "missing": missing}, arrays)
+
+
+def _bag_messages(path: str, wanted: list[str]) -> Iterator[tuple[str, str, int, Any]]:
+    """Yield topic, type, time of recording, ns, and content of messages; None for unwanted topics."""
+    from rosbags.highlevel import AnyReader
+    from rosbags.typesys import Stores, get_typestore
+
+    with AnyReader([Path(path)], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
+        yield from ((topic, "", 0, None) for topic in reader.topics)
+        connections = [connection for connection in reader.connections if connection.topic in wanted]
+        if connections:  # none would mean all
+            for connection, time_ns, raw in reader.messages(connections):
+                message = reader.deserialize(raw, connection.msgtype)
+                yield connection.topic, connection.msgtype, time_ns, message
+
+
+def _mcap_messages(path: str, wanted: list[str]) -> Iterator[tuple[str, str, int, Any]]:
+    """Yield the same of an MCAP file, whose messages are of ROS 2 or JSON."""
+    from mcap.reader import NonSeekingReader
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+    types = get_typestore(Stores.EMPTY)
+    known: set[int] = set()
+    with open(path, "rb") as file:
+        for schema, channel, message in NonSeekingReader(file).iter_messages():
+            if channel.topic not in wanted:
+                yield channel.topic, "", 0, None
+                continue
+            kind = schema.name if schema else "no type"
+            if channel.message_encoding == "json":
+                content = json.loads(message.data)
+            elif channel.message_encoding == "cdr" and schema and schema.encoding == "ros2msg":
+                if schema.id not in known:
+                    known.add(schema.id)
+                    found = get_types_from_msg(schema.data.decode(), kind)
+                    types.register({name: one for name, one in found.items() if name not in types.fielddefs})
+                content = types.deserialize_cdr(message.data, kind)
+            else:
+                encodings = f"{channel.message_encoding} of {schema.encoding if schema else 'no schema'}"
+                raise ValueError(
+                    f"topic {channel.topic}: found {encodings}, expected cdr of ros2msg, or json"
+                )
+            yield channel.topic, kind, message.log_time, content
+
+
+def _part(message: Any, field: str) -> Any:
+    """Return a part of a message; raises an error where it has none of that name."""
+    for name in field.replace("]", "").replace("[", ".").split("."):
+        if name.isdecimal():
+            message = message[int(name)]
+        else:
+            message = message[name] if isinstance(message, dict) else getattr(message, name)
+    return message
+
+
+def _is_number(message: Any, field: str) -> bool:
+    try:
+        float(_part(message, field))
+    except (AttributeError, KeyError, IndexError, TypeError, ValueError):
+        return False
+    return True
+
+
+def _stamp_ns(message: Any) -> int:
+    """Return when the sender stamped a message, ns, 0 if it did not."""
+    for name in ("nanosec", "nsec"):
+        if _is_number(message, f"header.stamp.{name}"):
+            return int(_part(message, "header.stamp.sec")) * 10**9 + int(
+                _part(message, f"header.stamp.{name}")
+            )
+    return 0

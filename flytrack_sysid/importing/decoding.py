@@ -1,4 +1,4 @@
-"""Decoding PX4 and Betaflight logs with pyulog and orangebox, in a process with limits on time and memory."""
+"""Decoding logs with pyulog, orangebox, mcap and rosbags, in a process with limits on time and memory."""
 
 import io
 import json
@@ -14,8 +14,13 @@ from flytrack_env.npz_file import NpzError, load_npz
 from flytrack_sysid.log import LogError
 
 DECODERS = Path(__file__).with_name("decoders.py")
-PACKAGES = {"ulog": "pyulog", "betaflight": "orangebox"}
-# For every MiB of the file, beyond the usual limits: both decode about 1 MiB per second.
+# Of each format: the extra, what it reads, and its packages.
+PACKAGES = {
+    "ulog": ("logs", "ulog logs", "pyulog"),
+    "betaflight": ("logs", "betaflight logs", "orangebox"),
+    "bag": ("bags", "bags", "mcap", "rosbags"),
+}
+# For every MiB of the file, beyond the usual limits: the slowest decode about 1 MiB per second.
 CPU_S_PER_MIB, BYTES_PER_BYTE = 4, 32
 
 
@@ -34,11 +39,12 @@ def decode(source: str, format_name: str, path: Path, *rest: Any) -> tuple[Any, 
     package is not installed, or cannot decode the file.
     """
     try:
-        check_installed("logs", f"{format_name} logs", PACKAGES[format_name])
+        check_installed(*PACKAGES[format_name])
     except ImportError as error:
         raise LogError(f"{source}: {error}") from error
     try:
-        limits = limits_of(path.stat().st_size)
+        files = [path, *path.glob("*")] if path.is_dir() else [path]
+        limits = limits_of(sum(file.stat().st_size for file in files))
         packed = sandbox.run(DECODERS, f"decode_{format_name}", [str(path.absolute()), *rest], limits=limits)
         notes, *arrays = load_npz(io.BytesIO(packed), limits.memory_bytes).values()
         return json.loads(notes.tobytes()), arrays

@@ -64,3 +64,15 @@ class ImportedFlight(NamedTuple):
     log: FlightLog
     craft: Craft = Craft()
     notes: tuple[str, ...] = ()
+
+
+def not_a_quadcopter(found: str) -> str:
+    """Return the note on a craft that is none."""
+    return (
+        f"found {found}, not a quadcopter: thrust and rates stand for all rotors together, and for no wings"
+    )
+
+
+def saturation(is_at_end: np.ndarray) -> str:
+    """Return the note on how often a motor is at its end, (num_rows,) bool: more cannot be commanded."""
+    return f"a motor at its upper end in {np.mean(is_at_end):.2%} of the rows"

@@ -12,13 +12,16 @@ import numpy as np
 from flytrack_env.dynamics import ModelParameters
 from flytrack_env.files import read_at_most, write_atomically
 from flytrack_env.messages import error_text, quote_name, quote_value
+from flytrack_sysid.importing.bag_log import read_bag
 from flytrack_sysid.importing.betaflight_log import read_betaflight
 from flytrack_sysid.importing.clocks import ClockOffset, align_clocks
 from flytrack_sysid.importing.csv_log import read_csv
 from flytrack_sysid.importing.flight import Craft, ImportedFlight
 from flytrack_sysid.importing.mapping import Manifest, Mapping, load_mapping
+from flytrack_sysid.importing.resample import SLOW_STEP_S
 from flytrack_sysid.importing.ulog_log import read_ulog
-from flytrack_sysid.log import FlightLog, LogError
+from flytrack_sysid.importing.usd_log import read_usd
+from flytrack_sysid.log import FlightLog, LogError, usual_step
 from flytrack_sysid.log_file import describe
 from flytrack_sysid.plausibility import find_problems
 
@@ -26,9 +29,13 @@ READERS = {
     "csv": lambda path, mapping: [read_csv(path, mapping)],
     "ulog": lambda path, mapping: [read_ulog(path, mapping)],
     "betaflight": read_betaflight,
+    "usd": lambda path, mapping: [read_usd(path, mapping)],
+    "bag": lambda path, mapping: [read_bag(path, mapping)],
 }
 FORMATS = tuple(READERS)
 LARGEST_MANIFEST_BYTES = 2**24
+LEAST_THRUST = -0.9  # command: what flies uses more than a twentieth of its thrust at some time
+NOTHING_FLIES = "nothing flies: the thrust command never exceeds 5 % of its range"
 
 
 class Imported(NamedTuple):
@@ -84,9 +91,9 @@ def import_log(
     """Return measured flights as one flight log in SI units and our frames, a segment each.
 
     paths: one file or several. format: of ``FORMATS``. mapping: a mapping file, or the name of a shipped
-    one; CSV needs it, other formats use its ``rows`` and ``craft``. align: correct significant offsets
-    between the sensors' clocks (``flytrack_sysid.importing.clocks``) instead of only reporting them.
-    Voltages that neither files nor mapping state are those of the log, where all are above 0.
+    one; CSV, uSD logs and bags need it, other formats use its ``rows`` and ``craft``. align: correct
+    significant offsets between the sensors' clocks (``flytrack_sysid.importing.clocks``) instead of only
+    reporting them. Voltages that neither files nor mapping state are those of the log, where all are above 0.
 
     Raises:
         LogError: a file that cannot be read or used; the message names file and field, found and expected.
@@ -97,18 +104,38 @@ def import_log(
     if not files:
         raise LogError("found no files to import, expected at least one")
     loaded = Mapping() if mapping is None else load_mapping(mapping)
-    flights, sources = [], []
-    for path in files:
-        for flight in READERS[format](path, loaded):
-            flights.append(flight._replace(log=_used_rows(path, flight.log, loaded)))
-            sources.append(flight.log.source)
+    read = [
+        flight._replace(log=_used_rows(path, flight.log, loaded))
+        for path in files
+        for flight in READERS[format](path, loaded)
+    ]
+    notes = tuple(note for flight in read for note in flight.notes)
+    grounded = [flight for flight in read if _is_grounded(flight.log)]
+    flights = [flight for flight in read if not _is_grounded(flight.log)]
+    reasons = [f"{flight.log.source}: {NOTHING_FLIES}" for flight in grounded]
+    if not flights:
+        raise LogError(reasons[0])
+    notes += tuple(f"left out: {reason}" for reason in reasons)
+    sources = [flight.log.source for flight in flights]
     log = _concatenate([flight.log for flight in flights], sources)
     log, offsets = align_clocks(log, align)
     craft = _common_craft(flights, sources)
     if craft.voltage_v is None and "v_bat" in log and log["v_bat"].min() > 0.0:
         craft = craft._replace(voltage_v=(float(log["v_bat"].min()), float(log["v_bat"].max())))
-    notes = tuple(note for flight in flights for note in flight.notes)
+    notes += _on_rates(log)
     return Imported(log, tuple(sources), craft, offsets, notes, tuple(find_problems(log)))
+
+
+def _is_grounded(log: FlightLog) -> bool:
+    return bool(log["u"][:, 3].max() < LEAST_THRUST)
+
+
+def _on_rates(log: FlightLog) -> tuple[str, ...]:
+    """Return a note if the gyroscope is too slow for a rate loop."""
+    step_s = float(np.median(usual_step(log)))
+    if "w" not in log or step_s <= SLOW_STEP_S:
+        return ()
+    return (f"{log.source}: body rates at {1.0 / step_s:.3g} Hz: too slow for a rate loop's lag or delay",)
 
 
 def _used_rows(path: Path, log: FlightLog, mapping: Mapping) -> FlightLog:
@@ -120,11 +147,25 @@ def _used_rows(path: Path, log: FlightLog, mapping: Mapping) -> FlightLog:
         is_used &= since_start <= rows.to_s
     index = np.arange(len(log))
     is_used &= index % rows.every == 0
+    if rows.above_m is not None:
+        is_used &= _is_airborne(log, rows.above_m, mapping.source)
     if rows.manifest is not None:
         is_used &= index < _count_of(path, rows.manifest)
     if not is_used.any():
         raise LogError(f"{mapping.source}: rows: none of the {len(log)} rows of {path} is left")
     return log.select(is_used)
+
+
+def _is_airborne(log: FlightLog, above_m: float, source: str) -> np.ndarray:
+    """Return the longest stretch of rows that are so much higher than the first row, (num_rows,) bool."""
+    if "p" not in log:
+        raise LogError(
+            f"{source}: rows.above_m: found no position in {log.source}, expected one to tell heights"
+        )
+    is_high = log["p"][:, 2] - log["p"][0, 2] > above_m
+    number = np.cumsum(np.diff(is_high, prepend=False))  # of the stretch, odd ones are high
+    longest = np.argmax(np.bincount(number[is_high])) if is_high.any() else -1
+    return number == longest
 
 
 def _count_of(path: Path, wanted: Manifest) -> int:

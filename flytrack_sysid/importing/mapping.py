@@ -1,7 +1,8 @@
-"""Mapping files: what the columns of a CSV file are, which rows to use, and what is known of the craft.
+"""Mapping files: what the columns of a log are, which rows to use, and what is known of the craft.
 
-TOML. Every table and field is described in docs/real_logs.md; ``rows`` and ``craft`` apply to logs of every
-format.
+TOML. Every table and field is described in docs/real_logs.md; ``rows``, ``craft`` and ``motors.as_thrust``
+apply to logs of every format. Columns are those of a CSV file, variables of a Crazyflie's uSD log, fields of
+topics.
 """
 
 import sys
@@ -15,6 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from flytrack_env.messages import error_text, quote_name, quote_value
 from flytrack_env.toml_file import TomlError, parse_toml, read_text
+from flytrack_sysid.importing.commands import CommandRules
 from flytrack_sysid.importing.flight import Craft
 from flytrack_sysid.importing.units import TURNED, UNITS, quaternion_from, vector_from
 from flytrack_sysid.log import LogError
@@ -38,16 +40,18 @@ T = TypeVar("T")
 
 
 class Channel(NamedTuple):
-    """A channel of the log in a CSV file: where it is from and how it is converted.
+    """A channel of the log in a table of columns: where it is from and how it is converted.
 
-    table: of the mapping, for messages. name: of ``CHANNELS``, or t. columns: of the file. convert: from the
-    file's table to the channel's columns, (num_rows, n), SI units and our frames.
+    table: of the mapping, for messages. name: of ``CHANNELS``, or t, or as in ``commands_of``. columns: of
+    the file. convert: from the file's table to the channel's columns, (num_rows, n), SI units and our frames.
+    is_optional: it is left out where the file has none of the columns.
     """
 
     table: str
     name: str
     columns: tuple[str, ...]
     convert: Callable[[Table], np.ndarray]
+    is_optional: bool = False
 
 
 class Manifest(NamedTuple):
@@ -59,21 +63,26 @@ class Manifest(NamedTuple):
 
 
 class UsedRows(NamedTuple):
-    """Which rows to use: every n-th from ``from_s`` to ``to_s`` after the first; a manifest limits them."""
+    """Which rows to use: every n-th from ``from_s`` to ``to_s`` after the first; a manifest limits them.
+
+    above_m: only the longest stretch of rows that are that much higher than the first.
+    """
 
     every: int = 1
+    above_m: float | None = None
     from_s: float = 0.0
     to_s: float | None = None
     manifest: Manifest | None = None
 
 
 class Mapping(NamedTuple):
-    """A mapping file: ``channels`` and ``delimiter`` are of its CSV tables; no channels if it has none."""
+    """A mapping file: ``channels`` are of its tables of columns; none if it has none."""
 
     source: str = "no mapping"
     rows: UsedRows = UsedRows()
     craft: Craft = Craft()
     channels: tuple[Channel, ...] = ()
+    rules: CommandRules = CommandRules()
     delimiter: str = ","
 
 
@@ -146,13 +155,21 @@ class Fields:
         value = self.take(field, is_valid, f"{size} numbers{_bound(above)}", default)
         return value if value is default else tuple(map(float, value))
 
-    def names(self, field: str, size: int) -> tuple[str, ...]:
-        """Return a tuple of different names."""
+    def names(self, field: str, size: int, default: Any = REQUIRED) -> tuple[str, ...]:
+        """Return a tuple of different names, or the default."""
 
         def is_valid(value: Any) -> bool:
-            return isinstance(value, list) and all(map(_is_text, value)) and len(set(value)) == size
+            return (
+                isinstance(value, list)
+                and all(map(_is_text, value))
+                and len(set(value)) == len(value) == size
+            )
 
-        return tuple(self.take(field, is_valid, f"{size} different names of columns"))
+        return tuple(self.take(field, is_valid, f"{size} different names of columns", default))
+
+    def flag(self, field: str) -> bool:
+        """Return true or false; an absent one is false."""
+        return bool(self.take(field, lambda value: isinstance(value, bool), "true or false", False))
 
 
 def _is_text(value: Any) -> bool:
@@ -173,22 +190,27 @@ def load_mapping(where: str | Path) -> Mapping:
 
     Raises LogError, whose message names file, table and field, found and expected.
     """
-    path, shipped = Path(where), SHIPPED / f"{where}.toml"
-    if not path.exists() and path.name == str(where) and shipped.is_file():
-        path = shipped
+    path, shipped = Path(where), sorted(file.stem for file in SHIPPED.glob("*.toml"))
     if not path.exists():
-        names = ", ".join(sorted(file.stem for file in SHIPPED.glob("*.toml")))
-        raise LogError(f"{path}: found no such mapping file; shipped ones are {names}")
-    try:
-        content = parse_toml(read_text(path))
-    except (OSError, UnicodeDecodeError, TomlError) as error:
-        raise LogError(f"{path}: not a readable TOML file: {error_text(error)}") from error
+        if str(where) not in shipped:
+            names = ", ".join(shipped)
+            raise LogError(f"{path}: found no such mapping file; shipped ones are {names}")
+        path = SHIPPED / f"{where}.toml"
+    content = _load(path)
+    base = content.pop("extends", None)
+    if base is not None:
+        if base not in shipped:
+            found = f"found {quote_value(base)}, expected one of {', '.join(shipped)}"
+            raise LogError(f"{path}: extends: {found}")
+        content = _merged(_load(SHIPPED / f"{base}.toml"), content)
     top = Fields(str(path), "", content)
+    channels, rules = _channels(top)
     mapping = Mapping(
         source=str(path),
         rows=top.table("rows", _rows) or UsedRows(),
         craft=top.table("craft", _craft) or Craft(),
-        channels=_channels(top),
+        channels=channels,
+        rules=rules,
         delimiter=top.take(
             "delimiter", lambda value: _is_text(value) and len(value) == 1, "one character", ","
         ),
@@ -197,17 +219,38 @@ def load_mapping(where: str | Path) -> Mapping:
     return mapping
 
 
-def _channels(top: Fields) -> tuple[Channel, ...]:
-    """Return what the CSV tables say, nothing if there are none."""
+def _load(path: Path) -> dict[str, Any]:
+    """Return the content of a mapping file."""
+    try:
+        return parse_toml(read_text(path))
+    except (OSError, UnicodeDecodeError, TomlError) as error:
+        raise LogError(f"{path}: not a readable TOML file: {error_text(error)}") from error
+
+
+def _merged(base: dict[str, Any], change: dict[str, Any]) -> dict[str, Any]:
+    """Return a mapping's tables with the fields of another one in place of its own."""
+    merged = dict(base)
+    for name, value in change.items():
+        old = merged.get(name)
+        merged[name] = {**old, **value} if isinstance(old, dict) and isinstance(value, dict) else value
+    return merged
+
+
+def _channels(top: Fields) -> tuple[tuple[Channel, ...], CommandRules]:
+    """Return what the tables of columns say, nothing if there are none, and the rules of the commands."""
     found = [top.table("time", _time), top.table("command", _command)]
     for table, (name, dimension, frame) in VECTORS.items():
         found.append(top.table(table, partial(_vector, name=name, dimension=dimension, frame=frame)))
     found += [top.table("attitude", _attitude), top.table("battery", _battery)]
-    channels = tuple(channel for channel in found if channel is not None)
-    for table, channel in zip(("time", "command"), found, strict=False):
-        if channels and channel is None:
-            raise top.error(table, "missing, expected a table: every log has it")
-    return channels
+    found.append(top.table("thrust_command", _thrust_command))
+    motors, rules = top.table("motors", _motors) or ((), CommandRules())
+    attitudes, gain = top.table("attitude_command", _attitude_command) or ((), rules.attitude_gain)
+    torques, rate_gain = top.table("torque_command", _torque_command) or ((), None)
+    present = [channel for channel in found if channel is not None]
+    if any(channel.name == "u" for channel in present) and (attitudes or torques):
+        raise top.error("command", "found together with setpoints of attitude or torque, expected one kind")
+    rules = rules._replace(attitude_gain=gain, rate_gain=rate_gain or rules.rate_gain)
+    return (*present, *attitudes, *torques, *motors), rules
 
 
 def _rows(fields: Fields) -> UsedRows:
@@ -216,6 +259,7 @@ def _rows(fields: Fields) -> UsedRows:
 
     return UsedRows(
         every=fields.take("every", is_step, "a whole number of at least 1, below 2^53", 1),
+        above_m=fields.number("above_m", None, above=0.0),
         from_s=fields.number("from_s", 0.0),
         to_s=fields.number("to_s", None, above=0.0),
         manifest=fields.table(
@@ -282,16 +326,15 @@ def _command(fields: Fields) -> Channel:
     columns = fields.names("columns", NUM_STICKS)
     low = np.array(fields.numbers("low", NUM_STICKS, (-1.0,) * NUM_STICKS))
     high = np.array(fields.numbers("high", NUM_STICKS, (1.0,) * NUM_STICKS))
-    is_clipped = fields.take("clip", lambda value: isinstance(value, bool), "true or false", False)
+    is_clipped = fields.flag("clip")
     if np.any(low == high):
         raise fields.error("high", f"found {high.tolist()}, expected other values than low")
     least, most = np.minimum(low, high), np.maximum(low, high)
 
     def convert(table: Table) -> np.ndarray:
         values = table.matrix(columns)
-        if is_clipped:
-            values = np.clip(values, least, most)
-        for row, stick in np.argwhere((values < least) | (values > most))[:1]:
+        is_past = ((values < least) | (values > most)) & (not is_clipped)  # else ``commands_of`` clips them
+        for row, stick in np.argwhere(is_past)[:1]:
             text = f"found {values[row, stick]:g}, expected {low[stick]:g} to {high[stick]:g} by command.low"
             text += " and command.high; clip = true limits it"
             raise table.error(row, quote_name(columns[stick]), text)
@@ -304,18 +347,106 @@ def _vector(fields: Fields, name: str, dimension: str, frame: str) -> Channel:
     columns = fields.names("columns", NUM_AXES)
     scales = _signed_scales(fields, dimension)
     is_turned = TURNED[frame][fields.choice("frame", TURNED[frame])]
+    is_optional = fields.flag("optional")
+
+    def convert(table: Table) -> np.ndarray:
+        return vector_from(table.matrix(columns) * scales, is_turned)
+
+    return Channel(fields.name, name, columns, convert, is_optional)
+
+
+def _scaled(table: str, name: str, columns: tuple[str, ...], scales: np.ndarray | float) -> Channel:
+    return Channel(table, name, columns, lambda found: found.matrix(columns) * scales)
+
+
+def _attitude_command(fields: Fields) -> tuple[tuple[Channel, ...], tuple[float, ...]]:
+    """Return setpoints of roll, pitch, yaw, the autopilot's own estimate of them, and its gains."""
+    columns, own = fields.names("columns", NUM_AXES), fields.names("own", NUM_AXES, ())
+    scales = _signed_scales(fields, "angle")
+    found = [_scaled(fields.name, "attitude_command", columns, scales)]
+    if own:
+        found.append(_scaled(fields.name, "own_attitude", own, scales))
+    gain = fields.numbers("gain", NUM_AXES, (0.0,) * NUM_AXES)
+    if min(gain) < 0.0:
+        raise fields.error("gain", f"found {list(gain)}, expected 0, to identify it, or more")
+    return tuple(found), gain
+
+
+def _torque_command(fields: Fields) -> tuple[tuple[Channel, ...], tuple[float, ...] | None]:
+    """Return torque setpoints about the body's axes (FLU), the rates they are to reach, and the gains."""
+    columns, reference = fields.names("columns", NUM_AXES), fields.names("reference_rates", NUM_AXES, ())
+    found = [_scaled(fields.name, "torque_command", columns, 1.0)]
+    if reference:
+        found.append(_scaled(fields.name, "reference_rates", reference, 1.0))
+    return tuple(found), _rate_gain(fields)
+
+
+def _rate_gain(fields: Fields) -> tuple[float, ...] | None:
+    """Return the gains of the rate loop, N m per rad/s: stated, or of inertia and lag; None if neither."""
+    gain = fields.numbers("rate_gain", NUM_AXES, None, above=0.0)
+    inertia = fields.numbers("inertia_kg_m2", NUM_AXES, None, above=0.0)
+    lag_s = fields.numbers("lag_s", NUM_AXES, None, above=0.0)
+    if (inertia is None) != (lag_s is None) or (gain is not None and inertia is not None):
+        raise fields.error("", "expected rate_gain, or inertia_kg_m2 with lag_s, or none of them")
+    return gain if inertia is None else tuple(np.array(inertia) / np.array(lag_s))
+
+
+def _thrust_command(fields: Fields) -> Channel:
+    """Return the thrust command, scaled so that ``low`` and ``high`` are -1 and 1."""
+    column, low, high = fields.text("column"), fields.number("low"), fields.number("high")
+    if low == high:
+        raise fields.error("high", f"found {high:g}, expected another value than low")
     return Channel(
-        fields.name, name, columns, lambda table: vector_from(table.matrix(columns) * scales, is_turned)
+        fields.name,
+        "thrust_command",
+        (column,),
+        lambda table: 2 * (table.matrix([column]) - low) / (high - low) - 1,
+    )
+
+
+def _motors(fields: Fields) -> tuple[tuple[Channel, ...], CommandRules]:
+    """Return the motors' outputs, 0 to 1, and what follows from them."""
+    listed = fields.left.get("columns")
+    num_motors = len(listed) if isinstance(listed, list) else 0
+    columns = fields.names("columns", num_motors, ())
+    rows = fields.take(
+        "torque_n_m", lambda value: _is_matrix(value, NUM_AXES, num_motors), "a row an axis", None
+    )
+    rules = CommandRules(
+        motors_as_thrust=fields.flag("as_thrust"),
+        motor_torque=None if rows is None else tuple(tuple(map(float, row)) for row in rows),
+        rate_gain=_rate_gain(fields),
+    )
+    if not columns:
+        return (), rules
+    low, high = fields.number("low"), fields.number("high")
+    if low >= high:
+        raise fields.error("high", f"found {high:g}, expected more than low")
+    convert = lambda table: np.clip((table.matrix(columns) - low) / (high - low), 0.0, 1.0)  # noqa: E731
+    return (Channel(fields.name, "motors", columns, convert),), rules
+
+
+def _is_matrix(value: Any, num_rows: int, num_columns: int) -> bool:
+    is_number = partial(_is_number, above=-LARGEST_NUMBER)
+    return (
+        isinstance(value, list)
+        and len(value) == num_rows
+        and all(
+            isinstance(row, list) and len(row) == num_columns and all(map(is_number, row)) for row in value
+        )
     )
 
 
 def _attitude(fields: Fields) -> Channel:
     """Return the quaternions; Euler angles turn by yaw, then pitch, then roll, about moving axes."""
-    if ("quaternion" in fields) == ("euler" in fields):
-        raise fields.error("", "expected either quaternion, with its order, or euler, with its unit")
+    if sum(name in fields for name in ("quaternion", "euler", "matrix")) != 1:
+        raise fields.error("", "expected quaternion, with its order, or euler, with its unit, or matrix")
     if "euler" in fields:
         columns, order = fields.names("euler", NUM_AXES), "euler"
         scales = _signed_scales(fields, "angle")
+    elif "matrix" in fields:
+        columns, scales = fields.names("matrix", NUM_AXES**2), np.ones(NUM_AXES**2)
+        order = fields.choice("order", ("by_rows", "by_columns"))
     else:
         columns, scales = fields.names("quaternion", NUM_QUATERNION), np.ones(NUM_QUATERNION)
         order = fields.choice("order", ("wxyz", "xyzw"))
@@ -327,6 +458,14 @@ def _attitude(fields: Fields) -> Channel:
         values = table.matrix(columns) * scales
         if order == "euler":
             rotation = Rotation.from_euler("ZYX", values[:, ::-1])
+        elif order.startswith("by_"):
+            matrices = values.reshape(-1, NUM_AXES, NUM_AXES)
+            size = np.linalg.det(matrices)
+            for row in np.flatnonzero(np.abs(size - 1.0) > LARGEST_NORM_ERROR)[:1]:
+                text = f"found a matrix of determinant {size[row]:.4g}, expected 1"
+                raise table.error(row, quote_name(columns[0]), text)
+            rotation = Rotation.from_matrix(matrices)
+            rotation = rotation.inv() if order == "by_columns" else rotation
         else:
             norm = np.linalg.norm(values, axis=1)
             for row in np.flatnonzero(np.abs(norm - 1.0) > LARGEST_NORM_ERROR)[:1]:

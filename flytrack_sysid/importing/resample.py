@@ -1,9 +1,22 @@
 """Samples of several clocks on one time base, without smoothing or filling of gaps."""
 
+from collections.abc import Mapping
+from typing import NamedTuple
+
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
+SLOW_STEP_S = 0.025  # 40 Hz: the lags of a rate loop are 10 to 50 ms
 LONGEST_BRIDGE_STEPS = 3.0  # of a channel's usual step: longer gaps are not interpolated
+SETPOINTS = ("attitude_command", "torque_command", "reference_rates", "thrust_command")
+HELD = ("u", *SETPOINTS, "own_attitude", "motors")
+
+
+class Samples(NamedTuple):
+    """Times, s, increasing, and values (num_rows, n) of a channel."""
+
+    times: np.ndarray
+    values: np.ndarray
 
 
 def is_increasing(times: np.ndarray) -> np.ndarray:
@@ -58,3 +71,33 @@ def hold(times: np.ndarray, values: np.ndarray, at: np.ndarray) -> tuple[np.ndar
     longest = LONGEST_BRIDGE_STEPS * (np.median(np.diff(times)) if len(times) > 1 else np.inf)
     is_known = (last >= 0) & (at - times[np.maximum(last, 0)] <= longest)
     return values[np.maximum(last, 0)], is_known
+
+
+def slow_channels(samples: Mapping[str, Samples]) -> list[str]:
+    """Return a sentence on each channel but the battery that is too slow for a rate loop."""
+    found = []
+    for name, (times, _) in samples.items():
+        step_s = float(np.median(np.diff(times))) if len(times) > 1 else 0.0
+        if step_s > SLOW_STEP_S and name != "v_bat":
+            how = "held" if name in HELD else "interpolated"
+            found.append(
+                f"{name} at {1.0 / step_s:.3g} Hz, {how} in between: faster dynamics do not show in it"
+            )
+    return found
+
+
+def on_one_base(samples: Mapping[str, Samples], base: np.ndarray) -> tuple[dict[str, np.ndarray], np.ndarray]:
+    """Return channels (num_base, n) at the times of the base, and where all are known, (num_base,) bool.
+
+    Commands are held, attitudes interpolated on the arc, others linearly. The battery changes slowly: its
+    ends are held, and gaps do not matter.
+    """
+    channels, is_known = {}, np.ones(len(base), bool)
+    for name, (times, values) in samples.items():
+        if name == "v_bat":
+            channels[name] = np.interp(base, times, values[:, 0])[:, None]
+            continue
+        look_up = hold if name in HELD else interpolate_quaternions if name == "q" else interpolate
+        channels[name], is_there = look_up(times, values, base)
+        is_known &= is_there
+    return channels, is_known

@@ -5,7 +5,6 @@ are held. There are no rows where a topic has a gap of more than three of its us
 """
 
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -13,9 +12,9 @@ from scipy.spatial.transform import Rotation
 from flytrack_env.files import open_file
 from flytrack_env.messages import error_text
 from flytrack_sysid.importing.decoding import decode
-from flytrack_sysid.importing.flight import ImportedFlight
+from flytrack_sysid.importing.flight import ImportedFlight, not_a_quadcopter
 from flytrack_sysid.importing.mapping import Mapping
-from flytrack_sysid.importing.resample import hold, interpolate, interpolate_quaternions, is_increasing
+from flytrack_sysid.importing.resample import Samples, is_increasing, on_one_base, slow_channels
 from flytrack_sysid.importing.units import PER_DEGREE, UNITS, quaternion_from, vector_from
 from flytrack_sysid.log import CHANNELS, LogError
 from flytrack_sysid.log_table import LARGEST_NORM_ERROR, Table, log_of_table
@@ -30,6 +29,20 @@ RATE_PARAMETERS = (
     ("MC_ACRO_Y_MAX", "MC_YAWRATE_MAX"),
 )
 
+
+# Of MAVLink's MAV_TYPE, and of PX4's airframes by thousands of SYS_AUTOSTART.
+VTOL, HEXACOPTER, OCTOCOPTER = "a VTOL", "a hexacopter", "an octocopter"
+AIRFRAMES = {1: "a plane", 4: "a helicopter", 13: HEXACOPTER, 14: OCTOCOPTER, 15: "a tricopter"}
+AIRFRAMES |= dict.fromkeys(range(19, 26), VTOL)
+FRAMES = {
+    6: HEXACOPTER,
+    7: HEXACOPTER,
+    8: OCTOCOPTER,
+    9: OCTOCOPTER,
+    11: HEXACOPTER,
+    12: OCTOCOPTER,
+    13: VTOL,
+}
 
 Source = tuple[str, tuple[str, ...]]  # a topic and its fields, in the order of the channel's columns
 
@@ -56,39 +69,29 @@ REQUIRED = ("w", "u", "q")
 TIMES = ("timestamp", "timestamp_sample")
 
 
-class _Samples(NamedTuple):
-    """Times, us, increasing, and values (num_rows, n) of a channel."""
-
-    times: np.ndarray
-    values: np.ndarray
-
-
 def read_ulog(path: Path, mapping: Mapping) -> ImportedFlight:
     """Return the flight in a PX4 log: commands, rates, attitude, and the other channels that it has.
 
     docs/real_logs.md says which topics the channels are of. Raises LogError for what is no ULog, or lacks
     rates, attitude or rate setpoints at any one time.
     """
+    if mapping.rules.motors_as_thrust:
+        raise LogError(
+            f"{mapping.source}: motors.as_thrust: not read of PX4 logs: actuator outputs are too slow"
+        )
     samples, parameters, is_damaged = _decode(path)
     craft = mapping.craft
     if craft.max_rate_deg_s is None:
         craft = craft._replace(max_rate_deg_s=_full_stick_deg_s(path, parameters))
     base = samples["w"].times
-    channels, is_known = {}, np.ones(len(base), bool)
     commands = _commands(samples["u"].values, np.array(craft.max_rate_deg_s) * PER_DEGREE)
-    channels["u"], is_fresh = hold(samples["u"].times, commands, base)
-    is_known &= is_fresh
-    channels["w"] = vector_from(samples["w"].values, True)
-    channels["q"], is_there = interpolate_quaternions(*_attitude(path, samples["q"]), base)
-    is_known &= is_there
-    for name in ("f", "p", "v"):
+    ours = {"u": Samples(samples["u"].times, commands), "q": _attitude(path, samples["q"])}
+    for name in ("w", "f", "p", "v"):
         if name in samples:
-            times, values = samples[name]
-            channels[name], is_there = interpolate(times, vector_from(values, True), base)
-            is_known &= is_there
-    if "v_bat" in samples:  # changes slowly: its ends are held, and gaps do not matter
-        times, values = samples["v_bat"]
-        channels["v_bat"] = np.interp(base, times, values[:, 0])[:, None]
+            ours[name] = samples[name]._replace(values=vector_from(samples[name].values, True))
+    if "v_bat" in samples:
+        ours["v_bat"] = samples["v_bat"]
+    channels, is_known = on_one_base(ours, base)
     is_flying = np.ones(len(base), bool)
     if "landed" in samples:
         times, landed = samples["landed"]
@@ -97,15 +100,28 @@ def read_ulog(path: Path, mapping: Mapping) -> ImportedFlight:
     if not is_used.any():
         found = f"{is_known.sum()} of {len(base)} samples of the rates with all other topics around them"
         raise LogError(f"{path}: found {found}, {is_flying.sum()} in flight, expected some that are both")
-    columns = {"t": (base[is_used] - base[is_used][0]) * MICROSECOND}
+    columns = {"t": base[is_used] - base[is_used][0]}
     for name, values in channels.items():
         columns |= dict(zip(CHANNELS[name], values[is_used].T, strict=True))
     used = f"{is_used.sum()} of {len(base)} samples of the rates used, {is_flying.sum()} in flight"
-    notes = [f"{path}: {used}"] + [f"{path}: damaged in places; what could be read is used"] * is_damaged
-    return ImportedFlight(log_of_table(Table(str(path), columns)), craft, tuple(notes))
+    said = [used, *["damaged in places; what could be read is used"] * is_damaged, *_airframe(parameters)]
+    notes = tuple(f"{path}: {text}" for text in [*said, *slow_channels(ours)])
+    return ImportedFlight(log_of_table(Table(str(path), columns)), craft, notes)
 
 
-def _decode(path: Path) -> tuple[dict[str, _Samples], dict[str, float], bool]:
+def _airframe(parameters: dict[str, float]) -> list[str]:
+    """Return a note if the log's own parameters say that the craft is no quadcopter."""
+    kind = AIRFRAMES.get(int(parameters.get("MAV_TYPE", 0)))
+    if kind:
+        return [not_a_quadcopter(f"{kind} (MAV_TYPE {parameters['MAV_TYPE']:.0f})")]
+    kind = FRAMES.get(int(parameters.get("SYS_AUTOSTART", 0)) // 1000)
+    if kind:
+        return [not_a_quadcopter(f"{kind} (SYS_AUTOSTART {parameters['SYS_AUTOSTART']:.0f})")]
+    num_rotors = int(parameters.get("CA_ROTOR_COUNT", 0))
+    return [not_a_quadcopter(f"{num_rotors} rotors (CA_ROTOR_COUNT)")] if num_rotors not in (0, 4) else []
+
+
+def _decode(path: Path) -> tuple[dict[str, Samples], dict[str, float], bool]:
     """Return the samples of the log by channel, its parameters, and whether it is damaged in places."""
     try:
         with open_file(path, LARGEST_BYTES) as file:
@@ -135,7 +151,7 @@ def _decode(path: Path) -> tuple[dict[str, _Samples], dict[str, float], bool]:
     return samples, notes["parameters"], notes["is_damaged"]
 
 
-def _samples_of(topic: dict[str, np.ndarray], fields: tuple[str, ...]) -> _Samples | None:
+def _samples_of(topic: dict[str, np.ndarray], fields: tuple[str, ...]) -> Samples | None:
     """Return the finite samples of some fields, None if there are none."""
     if any(field not in topic for field in ("timestamp", *fields)):
         return None
@@ -144,19 +160,19 @@ def _samples_of(topic: dict[str, np.ndarray], fields: tuple[str, ...]) -> _Sampl
     times = times if np.all(times > 0) else topic["timestamp"]
     values = np.stack([topic[field] for field in fields], axis=1)
     is_finite = np.isfinite(values).all(axis=1)
-    times, values = times[is_finite], values[is_finite]
+    times, values = times[is_finite] * MICROSECOND, values[is_finite]
     is_used = is_increasing(times)
-    return _Samples(times[is_used], values[is_used]) if is_used.any() else None
+    return Samples(times[is_used], values[is_used]) if is_used.any() else None
 
 
-def _attitude(path: Path, samples: _Samples) -> _Samples:
+def _attitude(path: Path, samples: Samples) -> Samples:
     """Return the attitude in our frames, without samples from before the estimator ran."""
     times, quat = samples
     is_unit = abs(np.linalg.norm(quat, axis=1) - 1.0) <= LARGEST_NORM_ERROR
     if not is_unit.any():
         raise LogError(f"{path}: topic vehicle_attitude: q: found no unit quaternion, expected norm 1")
     attitude = Rotation.from_quat(quat[is_unit], scalar_first=True)
-    return _Samples(times[is_unit], quaternion_from(attitude, is_body_turned=True, is_world_turned=True))
+    return Samples(times[is_unit], quaternion_from(attitude, is_body_turned=True, is_world_turned=True))
 
 
 def _commands(setpoints: np.ndarray, full_stick: np.ndarray) -> np.ndarray:

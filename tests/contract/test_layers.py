@@ -20,7 +20,7 @@ PACKAGE = "flytrack_env"
 # Low to high. A module imports only from rows above its own here; a package counts as one module.
 LAYERS = (
     {"files", "extras", "fusion", "auto_reset", "sandbox", "artifact", "messages"},
-    {"quaternion", "toml_file", "npz_file"},
+    {"quaternion", "motion", "toml_file", "npz_file"},
     {"state"},
     {"tracks", "randomness"},
     {"effects"},

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from benchmarks.diagnosis import model_of, plant
+from benchmarks.diagnosis import Trial, model_of, plant
 from benchmarks.hidden import Truth, draw_base, draw_outside, fly, measure
 from flytrack_env import load_model
 from flytrack_env.dynamics import nominal_parameters
@@ -40,9 +40,9 @@ def short_flight(truth: Truth, rng: np.random.Generator) -> tuple[Diagnosis, Fli
 
 @pytest.fixture(scope="session")
 def short() -> dict[str, tuple[Diagnosis, FlightLog]]:
-    """Diagnoses of a clean plant, of one with drag, and of one with a force that no list has."""
+    """Diagnoses of plants in fine steps: clean, with drag, and with a force that no list has."""
     rng = np.random.default_rng(3)
-    base = draw_base(rng)
+    base = replace(draw_base(rng), motion="fine")
     plants = {
         "clean": base,
         "drag": replace(base, effects={"linear_drag": DRAG}),
@@ -79,6 +79,7 @@ def check_content(one: Found) -> None:
 def test_a_clean_plant_is_consistent_with_its_model(short) -> None:
     found, _ = short["clean"]
     assert found.causes == () and found.verdict == "consistent" and found.warnings == ()
+    assert found.as_json()["motion"] == "continuous"
 
 
 def test_a_hidden_effect_is_found_and_measured(short) -> None:
@@ -219,6 +220,6 @@ def test_other_base_parameters_are_named_and_measured(found, cases) -> None:
 
 @pytest.mark.slow
 def test_what_another_law_of_lift_leaves_is_not_named() -> None:
-    line = plant("one", 91, seed=1)
+    line = plant(Trial("one", 91, seed=1))
     assert line["effects"] == ["translational_lift"]
     assert [cause["effect"] for cause in line["causes"]] == ["translational_lift"]

@@ -26,7 +26,9 @@ def test_plants_are_drawn_from_the_ranges_around_the_model() -> None:
     found = plants.models
     np.testing.assert_allclose(found.effect("thrust_scale").factor, 0.9 * plants.drawn["thrust_scale"], 1e-6)
     np.testing.assert_allclose(found.effect("linear_drag").d_x, np.float32(0.4))
-    assert found.effect("command_delay").delay_s.max() == np.float32(0.04)  # as late as can be
+    np.testing.assert_allclose(
+        found.effect("command_delay").delay_s, 0.03 + plants.drawn["command_delay_s"], 1e-6
+    )
     quadratic, wind = found.effect("quadratic_drag"), found.effect("wind")
     assert quadratic.k_x.min() >= 0.01 and (quadratic.shared == 0.0).all()
     np.testing.assert_allclose(np.hypot(wind.v_x, wind.v_y), plants.drawn["wind_m_s"], atol=1e-6)

@@ -7,16 +7,16 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from flytrack_env.dynamics import ModelParameters, nominal_parameters, read_sensors
-from flytrack_env.effects import EFFECTS
-from flytrack_env.plants import Simulator
+from flytrack_env.dynamics import ModelParameters, move, nominal_parameters, read_sensors
+from flytrack_env.effects import EFFECTS, MOST_STEPS
+from flytrack_env.plants import Simulator, SimulatorState
 from flytrack_env.state import BATTERY, QUATERNION, Action, Drone, pack, unpack, unpack_action
 
 DT, NUM_STEPS = 0.01, 200
 NOMINAL = nominal_parameters()
 # Neutral effects change no bit (tests/contract/test_effects.py), so that a test may replace any of them.
 ALL_NEUTRAL = NOMINAL.with_effects(*(effect.parameters() for effect in EFFECTS))
-_SIMULATOR = Simulator()
+_SIMULATOR = Simulator(MOST_STEPS)
 
 
 @jax.jit
@@ -24,8 +24,9 @@ def fly(drone: Drone, commands: jax.Array, model: ModelParameters) -> jax.Array:
     """Return the packed states after each command, gyro and accelerometer behind them, (num_steps, 27)."""
 
     def one(state: Any, action: jax.Array) -> tuple[Any, jax.Array]:
-        after = _SIMULATOR.step(state, unpack_action(action), DT, model)
-        reading = read_sensors(state.drone, after.drone, after.memories, DT, model)
+        moved = move(*state, unpack_action(action), DT, model)
+        reading = read_sensors(moved, model)
+        after = SimulatorState(moved.after, moved.memories)
         return after, jnp.concatenate([pack(after.drone), jnp.stack([*reading.rates_b, *reading.force_b])])
 
     return jax.lax.scan(one, _SIMULATOR.reset(drone, model), commands)[1]

@@ -11,7 +11,7 @@ from benchmarks.diagnosis import model_of
 from benchmarks.hidden import draw_base, fly, measure
 from flytrack_env.dynamics import nominal_parameters
 from flytrack_env.effects import CommandDelay, LinearDrag, SecondOrderRates
-from flytrack_env.effects.command_delay import BUFFER_STEPS
+from flytrack_env.effects.command_delay import LONGEST_STEPS
 from flytrack_env.plants import Simulator
 from flytrack_sysid import collect
 from flytrack_sysid.diagnosis import DiagnosisError, diagnose, joined
@@ -140,7 +140,7 @@ def test_lanes_are_only_where_something_is_judged(flown):
 def test_lanes_agree_with_one_long_replay(flown, lanes):
     truth, log = flown
     model = model_of(truth).with_effects(
-        CommandDelay(0.013), SecondOrderRates(0.01), LinearDrag(0.3, 0.3, 0.1)
+        CommandDelay(0.013), SecondOrderRates(0.01, 0.01, 0.01), LinearDrag(0.3, 0.3, 0.1)
     )
     with jax.enable_x64(True):
         problem = Problem.of(lanes, model)
@@ -204,6 +204,9 @@ def test_what_a_given_model_has_too_much_is_taken_out_again(flown):
         assert one.value == pytest.approx(0.0, abs=0.02)
     assert drag.heldout_gain > 0.0 and drag.lambda_ > 100.0
     assert drain.parameters["battery_drain_v_per_min"].value == pytest.approx(truth.drain, rel=0.05)
+    for one, tau in zip(found.half_response_s["extended"].values(), truth.tau, strict=True):
+        half = one.ci95[1] - one.time
+        assert 0.0 < half < 0.05 * tau and abs(one.time - tau * np.log(2.0)) < 1.5 * half
 
 
 def test_delays_end_where_no_older_row_is_remembered(flown):
@@ -212,7 +215,7 @@ def test_delays_end_where_no_older_row_is_remembered(flown):
     lanes = make_lanes(quick, np.ones(len(log), bool), np.array(truth.tau), truth.gravity)
     problem = Problem.of(lanes, model_of(truth))
     place = problem.names.index("command_delay.delay_s")
-    assert problem.high[place] == pytest.approx(BUFFER_STEPS * 0.001, rel=1e-3)
+    assert problem.high[place] == pytest.approx(LONGEST_STEPS * 0.001, rel=1e-3)
 
 
 def test_channels_that_some_logs_lack_are_warned_of(flown):

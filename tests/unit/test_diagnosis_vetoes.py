@@ -16,16 +16,16 @@ from flytrack_sysid.diagnosis.lanes import LANE_S, make_lanes, thinned
 from flytrack_sysid.diagnosis.model_selection import Ablation, is_determined
 from flytrack_sysid.diagnosis.noise import first_guess
 from flytrack_sysid.diagnosis.problem import Problem
-from flytrack_sysid.diagnosis.result import Cause, Errors, Estimated
+from flytrack_sysid.diagnosis.refinement import Refined
+from flytrack_sysid.diagnosis.result import Cause, Estimated
 from flytrack_sysid.diagnosis.score_test import CANDIDATES, threshold
-from flytrack_sysid.diagnosis.search import FittedModel, Held, SearchState
-from flytrack_sysid.diagnosis.summary import warnings_of
+from flytrack_sysid.diagnosis.search import Held, SearchState
+from flytrack_sysid.diagnosis.summary import warnings_of, with_refined_values
 from flytrack_sysid.diagnosis.vetoes import HELD_OUT_SHOWN, Selection, is_contradicted, reject
 from flytrack_sysid.parameters import TAUS
 
 LIFT_GAIN = 20_000.0
 CAUSE = Cause("rate_scale", (), "rates", {}, 100.0, 30.0, 100.0, 90.0)
-AS_GOOD = {"refitted_base": Errors({}, {"1": 0.5}), "extended": Errors({}, {"1": 0.5})}
 
 
 @pytest.fixture(scope="module")
@@ -139,22 +139,13 @@ def test_slopes_serve_again_nearby_and_not_for_an_effect_without_a_slope(state):
     problem = state.problem
     later, first = state.linearized(problem.start)
     limited, lagging = problem.start.copy(), problem.start.copy()
-    limited[problem.names.index("rate_slew_limit.inverse")] = 0.003
+    limited[problem.names.index("rate_slew_limit.roll_s")] = 0.03
     lagging[problem.names.index("tau_roll")] *= 1.0001
     assert first.distance(limited) == np.inf and 0.0 < first.distance(lagging) < 1.0
     assert later.linearized(lagging)[1].slopes is first.slopes
     other = later.linearized(limited)[1]
-    column = other.column("rate_slew_limit.inverse")
+    column = other.column("rate_slew_limit.roll_s")
     assert other.total[column, column] > 1e3 * first.total[column, column]
-
-
-def cause_with(problem: Problem, field: str, value: float) -> tuple[FittedModel, list[Cause]]:
-    """Return a model with one value, and the cause that has it."""
-    vector = problem.start.copy()
-    vector[problem.names.index(field)] = value
-    effect, _, name = field.rpartition(".")
-    parameters = {name: Estimated(value, (value, value), "1")}
-    return FittedModel((), vector, 0.0, ()), [replace(CAUSE, effect=effect or name, parameters=parameters)]
 
 
 @pytest.mark.parametrize(
@@ -162,22 +153,26 @@ def cause_with(problem: Problem, field: str, value: float) -> tuple[FittedModel,
     [
         ("rate_scale.yaw", 0.9, False),
         ("rate_scale.yaw", None, True),
+        ("tau_roll", 0.1, False),
+        ("tau_roll", None, True),
         ("rate_saturation.softness", 0.0, False),  # a limit may well be hard
-        ("tau_roll", 0.1, False),  # the base has no range to end at
     ],
 )
-def test_values_at_the_end_of_their_range_are_warned_of(state, field, value, is_warned_of):
+def test_values_at_the_end_of_their_range_are_beyond_the_list(state, field, value, is_warned_of):
     problem = state.problem
     value = problem.low[problem.names.index(field)] if value is None else value
-    found = warnings_of(problem, *cause_with(problem, field, value), AS_GOOD, [])
-    assert [one.startswith(f"{field} = {value:g} is at the end") for one in found] == [True] * is_warned_of
+    vector = problem.start.copy()
+    vector[problem.names.index(field)] = value
+    effect, _, name = field.rpartition(".")
+    cause = replace(CAUSE, effect=effect or name, parameters={name: Estimated(value, (value, value), "1")})
+    found = with_refined_values([cause], Refined((), None, None, (), {}, problem, None), vector)
+    assert found[0].beyond.startswith(f"{name} at most {value:g}" if is_warned_of else "")
+    warned = [one for one in warnings_of(problem, found, []) if "beyond the list" in one]
+    assert len(warned) == is_warned_of and bool(found[0].beyond) == is_warned_of
 
 
-def test_worse_free_flight_and_lost_causes_are_warned_of(state):
-    model = FittedModel((), state.problem.start, 0.0, ())
-    errors = AS_GOOD | {"extended": Errors({}, {"1": 0.78})}
-    lost, worse = warnings_of(state.problem, model, [], errors, ["wind"])
-    assert "0.78 m against 0.5 m after 1 s" in worse
+def test_lost_causes_are_warned_of(state):
+    (lost,) = warnings_of(state.problem, [], ["wind"])
     assert lost.startswith("wind gained nothing on the held-out part")
 
 

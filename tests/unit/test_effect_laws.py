@@ -37,7 +37,7 @@ from flytrack_env.effects import (
     Wind,
     YawReaction,
 )
-from flytrack_env.effects.command_delay import BUFFER_STEPS
+from flytrack_env.effects.command_delay import LONGEST_STEPS, USUAL_STEPS
 from flytrack_env.effects.translational_lift import HALF_SPEED
 from flytrack_env.env import FlyTrack
 from flytrack_env.observations import OBSERVATION
@@ -145,7 +145,7 @@ def test_thrust_tilt_pushes_sideways_in_proportion_to_thrust() -> None:
 # --- Commands, lags and rates -----------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("steps", range(BUFFER_STEPS + 1))
+@pytest.mark.parametrize("steps", range(LONGEST_STEPS + 1))
 def test_a_delay_of_whole_steps_shifts_the_commands(steps: int) -> None:
     drone, commands = random_drone(2), random_commands(2, 20)
     delayed = flown(CommandDelay(steps * DT), commands, drone)
@@ -187,17 +187,30 @@ def test_rate_scale_scales_rates_only() -> None:
 
 @pytest.mark.parametrize("stick", [-1.0, -0.5, 0.25, 1.0])
 def test_stick_curves_at_rest(stick: float) -> None:
-    at_stick = held(roll=stick), drone_with(applied=(stick, 0.0, 0.0, 0.0))
-    expo = flown(RateExpo(0.4), *at_stick)[0, 13]
+    at_stick = held(120, roll=stick), drone_with(applied=(stick, 0.0, 0.0, 0.0))
+    expo = flown(RateExpo(0.4, 0.0, 0.0), *at_stick)[-1, 13]
     assert expo == pytest.approx(FULL_STICK * (0.6 * stick + 0.4 * stick**3), rel=1e-5)
-    saturated = flown(RateSaturation(0.4, 0.0), *at_stick)[0, 13]
+    saturated = flown(RateSaturation(0.4, 0.0, 0.0, softness=0.0), *at_stick)[-1, 13]
     assert saturated == pytest.approx(FULL_STICK * np.clip(stick, -0.6, 0.6), rel=1e-5)
 
 
-def test_slew_limit_bounds_the_angular_acceleration_and_arrives() -> None:
-    rates = flown(RateSlewLimit(0.01), held(60, pitch=1.0))[:, 14]
-    assert np.diff(rates, prepend=0.0).max() <= DT / 0.01 * (1 + 1e-5)
-    assert rates[-1] == pytest.approx(FULL_STICK, rel=1e-4)
+def test_slew_limits_ramp_what_each_lag_follows() -> None:
+    """Half a stick in 0.15 s of 0.3 s for a full one; the lag of the ramp itself, from rest to rest."""
+    sticks = flown(RateSlewLimit(pitch_s=0.3), held(120, roll=0.5, pitch=0.5))[:, APPLIED_ACTION]
+    ramp = np.minimum(DT * np.arange(1, 121) / 0.3, 0.5)
+    keep = np.exp(-DT / float(NOMINAL.tau[1]))
+    expected = signal.lfilter([1.0 - keep], [1.0, -keep], ramp)
+    np.testing.assert_allclose(sticks[:, 1], expected, atol=1e-5)
+    np.testing.assert_array_equal(sticks[:, 0], flown((), held(120, roll=0.5))[:, APPLIED_ACTION.start])
+
+
+def test_each_channel_has_its_delay_and_none_is_early() -> None:
+    commands = random_commands(3, 20)
+    late = flown(CommandDelay(2 * DT, 3 * DT, -3 * DT), commands)[:, APPLIED_ACTION]
+    plain = flown((), commands)[:, APPLIED_ACTION]
+    np.testing.assert_allclose(late[2:, :2], plain[:-2, :2], atol=1e-5)
+    np.testing.assert_allclose(late[5:, 2], plain[:-5, 2], atol=1e-5)
+    np.testing.assert_allclose(late[:, 3], plain[:, 3], atol=1e-5)
 
 
 @pytest.mark.parametrize("damping", [0.3, 1.0, 2.0])
@@ -209,8 +222,10 @@ def test_rates_obey_the_differential_equation_of_a_second_order(damping: float) 
     slope = np.array([[0.0, 1.0], [-(frequency**2), -2.0 * damping * frequency]])
     servo = (slope, np.array([[0.0], [frequency**2]]), np.array([[1.0, 0.0]]), np.zeros((1, 1)))
     expected = signal.dlsim(signal.cont2discrete(servo, DT, method="zoh"), np.append(plain, plain[-1]))[1]
-    found = flown(SecondOrderRates(lag_s, damping), held(60, roll=0.5))[:, 13]
+    rates = flown(SecondOrderRates(roll_s=lag_s, roll_damping=damping), held(60, roll=0.5, yaw=0.5))
+    found = rates[:, 13]
     np.testing.assert_allclose(found, expected[1:, 0], rtol=2e-4, atol=2e-4)
+    np.testing.assert_array_equal(rates[:, 15], flown((), held(60, yaw=0.5))[:, 15])
     assert (found.max() > 1.02 * plain[-1]) == (damping < 0.7)
 
 
@@ -238,7 +253,7 @@ def test_roll_and_pitch_creep_with_thrust(thrust: float) -> None:
 def test_a_second_lag_does_not_remember_the_imbalance_twice() -> None:
     """Rates that settle at the bias: it goes into the lag, and comes out of it once."""
     commands, drone = held(60, thrust=-0.5), drone_with(applied=(0.0, 0.0, 0.0, -0.5))
-    creeping = flown((MotorImbalance(0.01), SecondOrderRates(0.03, 1.0)), commands, drone)
+    creeping = flown((MotorImbalance(0.01), SecondOrderRates(0.03, roll_damping=1.0)), commands, drone)
     direct = flown(MotorImbalance(0.01), commands, drone)
     assert creeping[0, 13] < 0.5 * direct[0, 13]
     assert creeping[-1, 13] == pytest.approx(direct[-1, 13], rel=1e-3)
@@ -319,13 +334,13 @@ def test_an_arm_in_any_direction_follows_the_rigid_body() -> None:
 def test_late_sensors_read_the_past(steps: float) -> None:
     """Before the flight, the rates are taken to have been those of the start, the force that of its first."""
     flight = Readings(ImuLatency(steps * DT))
-    time = np.arange(-BUFFER_STEPS, 20)
+    time = np.arange(-USUAL_STEPS, 20)
     for found, truth, before in (
         (flight.gyro, flight.rates, flight.start_rates),
         (flight.accelerometer, flight.force, flight.force[0]),
     ):
-        known = np.concatenate([np.tile(before, (BUFFER_STEPS, 1)), truth])
-        then = [np.interp(time[BUFFER_STEPS:] - steps, time, known[:, axis]) for axis in range(3)]
+        known = np.concatenate([np.tile(before, (USUAL_STEPS, 1)), truth])
+        then = [np.interp(time[USUAL_STEPS:] - steps, time, known[:, axis]) for axis in range(3)]
         assert_reads(found, np.stack(then, axis=1))
 
 

@@ -12,6 +12,7 @@ from benchmarks.reliability.foreign_logs import UlogWriter
 from flytrack_env.sandbox import ResourceLimits
 from flytrack_sysid import LogError, import_log
 from flytrack_sysid.importing import decoding
+from tests.support.real_logs import shared
 
 pytest.importorskip("pyulog", reason="pyulog is not installed: pip install 'flytrack[logs]'")
 
@@ -180,3 +181,35 @@ def test_damage_is_noted_and_the_rest_is_read(tmp_path, capsys):
     path.write_bytes(content[: len(content) // 2])
     with pytest.raises(LogError, match=r"a\.ulg: topic vehicle_attitude .*missing or empty"):
         import_log(path, "ulog")
+
+
+@pytest.mark.parametrize(
+    ("parameters", "message"),
+    [
+        ({"MAV_TYPE": 13.0}, "found a hexacopter (MAV_TYPE 13), not a quadcopter"),
+        ({"MAV_TYPE": 22.0}, "found a VTOL (MAV_TYPE 22), not a quadcopter"),
+        ({"SYS_AUTOSTART": 13006.0}, "found a VTOL (SYS_AUTOSTART 13006), not a quadcopter"),
+        (
+            {"MAV_TYPE": 2.0, "SYS_AUTOSTART": 4001.0, "CA_ROTOR_COUNT": 6.0},
+            "found 6 rotors (CA_ROTOR_COUNT)",
+        ),
+        ({"MAV_TYPE": 2.0, "SYS_AUTOSTART": 4001.0, "CA_ROTOR_COUNT": 4.0}, ""),
+    ],
+)
+def test_another_craft_than_a_quadcopter_is_told(tmp_path, parameters, message):
+    said = " ".join(import_log(write(tmp_path / "a.ulg", topics(), PARAMETERS | parameters), "ulog").notes)
+    assert (message in said) if message else ("not a quadcopter" not in said)
+
+
+def test_slow_topics_are_told(tmp_path):
+    tables = topics()
+    slow = TIMES_US[::25]
+    tables["vehicle_angular_velocity"] = ([("float", "xyz", 3)], constant((0.1, 0.2, 0.3), slow))
+    said = " ".join(import_log(write(tmp_path / "a.ulg", tables), "ulog").notes)
+    assert "w at 10 Hz" in said and "body rates at 10 Hz: too slow for a rate loop" in said
+
+
+def test_a_real_hexacopter_is_told():
+    found = import_log(shared("px4_h520") / "3DRFlight_1.ulg", "ulog")
+    said = " ".join(found.notes)
+    assert "found a hexacopter (MAV_TYPE 13), not a quadcopter" in said and "u at 31.2 Hz, held" in said

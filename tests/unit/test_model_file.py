@@ -12,6 +12,7 @@ from flytrack_env.dynamics import ModelParameters, nominal_parameters
 from flytrack_env.effects import CommandDelay, LinearDrag, QuadraticDrag
 from flytrack_env.env import FlyTrack
 from flytrack_env.model_file import ModelFileError, load_model, save_model
+from flytrack_env.motion import Motion
 
 MINIMAL = """{
   "tau": [0.03, 0.04, 0.05, 0.06],
@@ -39,6 +40,7 @@ def assert_same_model(a: ModelParameters, b: ModelParameters) -> None:
         nominal_parameters(),
         nominal_parameters()._replace(m=0.1, g=1.62, battery_drain_v_per_min=0.0),
         nominal_parameters().with_effects(CommandDelay(0.013), LinearDrag(0.1, 0.2, -0.05)),
+        nominal_parameters()._replace(motion=Motion.CONTINUOUS),
         nominal_parameters()._replace(thrust_coeffs=np.float32([0.1, -0.2, 1 / 3, 1e-7, 1e5, 0])),
     ],
 )
@@ -50,7 +52,7 @@ def test_round_trip(model: ModelParameters, tmp_path: Path) -> None:
     assert_same_model(load_model(str(path)), model)
     document = json.loads(path.read_text(encoding="utf-8"))
     assert document["provenance"] == provenance
-    assert set(document["parameters"]) | {"effects"} == set(ModelParameters._fields)
+    assert set(document["parameters"]) | {"effects", "motion"} == set(ModelParameters._fields)
     assert set(document["units"]) == set(document["parameters"]) | set(document["effects"])
 
 
@@ -78,8 +80,8 @@ BAD_TEXTS = {
         "effects: drag: unknown; expected one of comm",
     ),
     "parameter out of range": (
-        json.dumps({**FIELDS, "effects": {"command_delay": {"delay_s": 0.05}}}),
-        "effects: command_delay: delay_s: found 0.05, expected 0 to 0.04 s",
+        json.dumps({**FIELDS, "effects": {"command_delay": {"delay_s": 0.07}}}),
+        "effects: command_delay: delay_s: found 0.07, expected 0 to 0.06 s",
     ),
     "beyond float32": (MINIMAL.replace("[0.03", "[1e39"), "tau: found "),
 }

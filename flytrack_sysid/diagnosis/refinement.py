@@ -1,0 +1,551 @@
+"""Refinement: effects and their values are judged by how far ahead a model predicts, on rows held out.
+
+One-step residuals say what a model lacks; where they leave something unexplained, a law that stands in for
+it may fit every step and yet fly off. So free flights of 0.1 to 2 s are started from measured states
+(multiple shooting), all parameters are fitted to them on the rows that are learnt from, and effects are
+removed that make no held-out flight better, or any horizon worse. A placebo, which predicts from the state
+alone and knows no commands, is fitted beside it: where it predicts as well as the models, the flights
+say nothing about what answers the commands, and nothing is named from there.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import jax
+import numpy as np
+from scipy import stats
+from scipy.spatial.transform import Rotation
+
+from flytrack_env.dynamics import ModelParameters
+from flytrack_env.effects import BY_NAME
+from flytrack_sysid.diagnosis.problem import RELATIVE_STEP, Problem
+from flytrack_sysid.diagnosis.score_test import AT_BOUND, BASE_CAUSES, Candidate, prior_information, solve
+from flytrack_sysid.log import FlightLog
+from flytrack_sysid.parameters import DRAIN, from_vector
+from flytrack_sysid.prediction_windows import (
+    CHUNK,
+    HORIZONS_S,
+    QUANTITIES,
+    UNITS,
+    Windows,
+    chunks_of,
+    make_windows,
+    prediction_errors,
+)
+
+BATCH = 8  # models at once
+SPACING_S, SHORT_SPACING_S = 0.25, 0.05
+MOST_WINDOWS = 3 * CHUNK
+FEWEST_WINDOWS, FEWEST_BLOCKS = 12, 3  # fewer say nothing of a cell
+RIDGE = 0.05  # of the placebo, in units of its regressors' variance
+ALWAYS_FITTED_S = 0.25  # horizons up to this are fitted even where the placebo is as good
+OUTLIER = 3.0  # errors beyond so many of the base's rms count by their size, not its square
+MOST_ROUNDS, REFIT_ROUNDS, LEAST_GAIN = 10, 4, 1e-3  # of a fit, of one without an effect; share of the cost
+NEUTRAL = 1e-3  # of a parameter's scale
+DAMPINGS = np.array([1e-6, 1e-4, 1e-3, 1e-2, 1e-1, 1.0, 10.0, 100.0])[:BATCH]
+# Standard errors over blocks by which an effect has to improve held-out prediction, and by which it may
+# where it is worth so large a share of the error: single steps have shown it already.
+SURE, LIKELY, WORTHWHILE = 2.0, 1.0, 0.02
+SURE_OF_COMMANDS = 1.64  # the same for the better of the models over the placebo, one-sided 95 %
+# Errors over the base's that make a horizon worse: for sure, or by one standard error over blocks. What
+# rounds to 1.00 times is as good.
+WORSE, LIKELY_WORSE = 1.02, 1.005
+# Standard errors by which a horizon has to be worse before a model is doubted whose one-step residuals are
+# noise: with twenty cells, one standard error is always somewhere.
+SURELY_WORSE = 3.0
+
+
+class Tested(NamedTuple):
+    """Errors on windows, measured minus predicted: (models, horizons, windows, quantities, 3)."""
+
+    errors: np.ndarray
+    windows: Windows
+
+    @property
+    def squares(self) -> np.ndarray:
+        """Squared size of the errors, (models, horizons, windows, quantities)."""
+        return np.square(self.errors).sum(axis=-1)
+
+    def rms(self) -> np.ndarray:
+        """Return the rms size of the errors, (models, horizons, quantities); not a number without any."""
+        number = self.windows.counts.sum(axis=1)
+        mean = self.squares.sum(axis=2) / np.maximum(number, 1)
+        return np.where(number > 0, np.sqrt(mean), np.nan)
+
+    def by_block(self, scale: np.ndarray) -> np.ndarray:
+        """Return mean squares over those of ``scale``, (horizons, quantities), (models, blocks, ...)."""
+        number = np.maximum(self.windows.counts.sum(axis=1), 1)
+        relative = self.squares / (np.square(scale) * number)[:, None]
+        _, block = np.unique(self.windows.block, return_inverse=True)
+        result = np.zeros((block.max() + 1, len(self.errors), *scale.shape))
+        np.add.at(result, block, np.moveaxis(relative, 2, 0))
+        return result.swapaxes(0, 1)
+
+
+def sureness(differences: np.ndarray) -> np.ndarray:
+    """Return the sum of differences by block, (blocks, ...), in its standard errors."""
+    number = max(len(differences), 2)
+    centred = differences - differences.mean(axis=0)
+    spread = np.sqrt(np.square(centred).sum(axis=0) * number / (number - 1))
+    return differences.sum(axis=0) / np.maximum(spread, 1e-300)
+
+
+@jax.jit
+def _errors(vectors: jax.Array, like: ModelParameters, windows: Windows) -> jax.Array:
+    return jax.vmap(lambda vector: prediction_errors(from_vector(vector, like), windows))(vectors)
+
+
+def errors_at(problem: Problem, vectors: np.ndarray, windows: Windows) -> Tested:
+    """Return the errors of models, (num_vectors, num_parameters), on windows; one program for all."""
+    parts = []
+    for begin in range(0, len(vectors), BATCH):
+        part = vectors[begin : begin + BATCH]
+        filled = np.concatenate([part, np.repeat(part[-1:], BATCH - len(part), axis=0)])
+        found = [np.asarray(_errors(filled, problem.like, chunk)) for chunk in chunks_of(windows)]
+        parts.append(np.concatenate(found, axis=2)[: len(part), :, : len(windows.start)])
+    errors = np.concatenate(parts)
+    # A model that runs away is as bad as can be, but still a number.
+    errors = np.nan_to_num(np.clip(errors, -1e6, 1e6), nan=1e6)
+    return Tested(errors.reshape(*errors.shape[:-1], len(QUANTITIES), 3), windows)
+
+
+def _regressors(windows: Windows) -> np.ndarray:
+    """Return what the placebo knows, (windows, regressors): the state at the start."""
+    row, record = windows.first_free - 1, windows.record
+    turned = Rotation.from_quat(record.quat[row], scalar_first=True).as_matrix().reshape(-1, 9)
+    return np.concatenate([record.vel_w[row], record.pos_w[row], turned, windows.gyro_b[row]], axis=1)
+
+
+def _changes(windows: Windows) -> np.ndarray:
+    """Return how the state changes up to the horizons, (horizons, windows, quantities, 3)."""
+    row, record = windows.first_free - 1, windows.record
+    start = Rotation.from_quat(record.quat[row], scalar_first=True)
+    found = []
+    for end in windows.ends:
+        turn = start.inv() * Rotation.from_quat(record.quat[end], scalar_first=True)
+        levels = (windows.gyro_b, record.vel_w, record.pos_w)
+        found.append(np.stack([turn.as_rotvec(), *(one[end] - one[row] for one in levels)], axis=1))
+    return np.stack(found)
+
+
+def placebo_errors(learnt: Windows, judged: Windows) -> np.ndarray:
+    """Return the errors of a ridge regression on the state at the start, (1, horizons, windows, ...)."""
+    known, wanted = _regressors(learnt), _changes(learnt)
+    mean, spread = known.mean(axis=0), known.std(axis=0) + 1e-9
+    rows, others = (np.c_[(one - mean) / spread, np.ones(len(one))] for one in (known, _regressors(judged)))
+    measured, errors = _changes(judged), []
+    for index in range(len(HORIZONS_S)):
+        used = learnt.counts[index].any(axis=-1)
+        # Without a window that is so long, it predicts no change, and nothing is judged there.
+        damping = RIDGE * max(used.sum(), 1) * np.diag([*np.ones(len(mean)), 1e-9])
+        target = wanted[index].reshape(len(rows), -1)[used]
+        slopes = np.linalg.solve(rows[used].T @ rows[used] + damping, rows[used].T @ target)
+        predicted = (others @ slopes).reshape(len(others), len(QUANTITIES), 3)
+        left = measured[index] - predicted
+        turns = (Rotation.from_rotvec(one[:, 0]) for one in (predicted, measured[index]))
+        left[:, 0] = (next(turns).inv() * next(turns)).as_rotvec()
+        errors.append(left)
+    return np.where(judged.counts[..., None], np.stack(errors), 0.0)[None]
+
+
+class Fit(NamedTuple):
+    """A model fitted to windows: vector, its free places, and their covariance, for 95 % intervals.
+
+    covariance: (places, places), of which the square roots are halves of intervals.
+    """
+
+    vector: np.ndarray
+    places: tuple[int, ...]
+    covariance: np.ndarray
+
+    @property
+    def half_widths(self) -> np.ndarray:
+        """Half of the 95 % interval of each free place."""
+        return np.sqrt(np.diag(self.covariance))
+
+
+class Target(NamedTuple):
+    """What a fit makes small: errors on windows over a scale, (horizons, quantities); 0 is not fitted."""
+
+    problem: Problem
+    windows: Windows
+    scale: np.ndarray
+    is_fitted: np.ndarray
+
+    def residuals(self, vectors: np.ndarray) -> np.ndarray:
+        """Return relative errors, (num_vectors, windows, numbers)."""
+        weight = np.where(self.is_fitted, 1.0 / self.scale, 0.0)
+        found = errors_at(self.problem, vectors, self.windows).errors * weight[:, None, :, None]
+        return np.moveaxis(found, 2, 1).reshape(len(vectors), len(self.windows.start), -1)
+
+    def cost(self, left: np.ndarray, vectors: np.ndarray) -> np.ndarray:
+        """Return the robust sum of squares and the weak prior of models, (num_vectors,)."""
+        size = np.abs(left)
+        robust = np.where(size < OUTLIER, size**2, OUTLIER * (2.0 * size - OUTLIER)).sum(axis=(1, 2))
+        return robust + np.square(vectors - self.problem.start) @ prior_information(self.problem)
+
+    def fitted(self, vector: np.ndarray, places: Sequence[int], rounds: int) -> Fit:
+        """Return the model of least cost from a vector on, by damped Gauss-Newton with one-sided slopes."""
+        problem, at = self.problem, np.array(places, int)
+        vector = problem.clipped(vector)
+        for number in range(rounds + 1):
+            step = RELATIVE_STEP * problem.scale[at]
+            step = np.where(vector[at] + step > problem.high[at], -step, step)
+            moved = np.repeat(vector[None], len(at) + 1, axis=0)
+            moved[np.arange(1, len(at) + 1), at] += step
+            left = self.residuals(moved)
+            columns = (left[1:] - left[0]) / step[:, None, None]
+            root = np.sqrt(
+                np.where(np.abs(left[0]) > OUTLIER, OUTLIER / np.maximum(np.abs(left[0]), 1e-9), 1)
+            )
+            prior, pull = prior_information(problem)[at], (vector - problem.start)[at]
+            scores = np.einsum("pwn,wn->wp", columns, left[0] * root**2)
+            flat = (columns * root).reshape(len(at), -1)
+            information = flat @ flat.T + np.diag(prior)
+            if number == rounds:
+                break
+            ways = self._ways(vector, at, information, scores.sum(axis=0) + prior * pull)
+            costs = self.cost(self.residuals(ways), ways)
+            cost = self.cost(left[:1], vector[None])[0]
+            best = int(np.argmin(costs))
+            if costs[best] > cost * (1.0 - LEAST_GAIN):
+                break
+            vector = ways[best]
+        return Fit(vector, tuple(places), self._covariance(at, information, scores))
+
+    def _stuck(self, vector: np.ndarray, at: np.ndarray, way: np.ndarray) -> np.ndarray:
+        room = AT_BOUND * np.maximum(np.abs(vector[at]), 1.0)
+        low, high = self.problem.low[at] + room, self.problem.high[at] - room
+        return ((vector[at] <= low) & (way < 0.0)) | ((vector[at] >= high) & (way > 0.0))
+
+    def _ways(
+        self, vector: np.ndarray, at: np.ndarray, information: np.ndarray, gradient: np.ndarray
+    ) -> np.ndarray:
+        """Return the vectors that steps of all dampings lead to; parameters at a bound stay."""
+        found = np.repeat(vector[None], len(DAMPINGS), axis=0)
+        for number, damping in enumerate(DAMPINGS):
+            free, way = np.ones(len(at), bool), np.zeros(len(at))
+            while free.any():
+                inner = information[np.ix_(free, free)]
+                way[:] = 0.0
+                way[free] = -solve(inner + damping * np.diag(np.diag(inner)), gradient[free])
+                stuck = free & self._stuck(vector, at, way)
+                if not stuck.any():
+                    break
+                free &= ~stuck
+            found[number, at] += way * free
+        return self.problem.clipped(found)
+
+    def _covariance(self, at: np.ndarray, information: np.ndarray, scores: np.ndarray) -> np.ndarray:
+        """Return that of 95 % intervals, by the scores of blocks (sandwich); Student's t."""
+        _, block = np.unique(self.windows.block, return_inverse=True)
+        by_block = np.zeros((block.max() + 1, len(at)))
+        np.add.at(by_block, block, scores)
+        inverse = solve(information, np.eye(len(at)))
+        number = max(len(by_block), 2)
+        covariance = inverse @ (by_block.T @ by_block * number / (number - 1)) @ inverse
+        return covariance * stats.t.ppf(0.975, number - 1) ** 2
+
+
+class Judge(NamedTuple):
+    """Held-out windows, the refitted base's errors there and the placebo's; what cells are evidence.
+
+    scale: the base's rms errors, (horizons, quantities). matters: (horizons, quantities) bool, a model that
+    is given the commands predicts better than the placebo.
+    """
+
+    problem: Problem
+    windows: Windows
+    base: Tested
+    placebo: Tested
+    scale: np.ndarray
+    matters: np.ndarray
+
+    @classmethod
+    def of(cls, problem: Problem, learnt: Windows, judged: Windows, base: np.ndarray) -> "Judge":
+        """Return the judge of a base model before anything is known to matter."""
+        tested = errors_at(problem, base[None], judged)
+        placebo = Tested(placebo_errors(learnt, judged), judged)
+        scale = np.maximum(np.nan_to_num(tested.rms()[0], nan=1.0), 1e-9)
+        judge = cls(problem, judged, tested, placebo, scale, np.zeros(scale.shape, bool))
+        return judge.seeing(tested)
+
+    @property
+    def is_known(self) -> np.ndarray:
+        """Where held-out windows are enough to judge by, (horizons, quantities)."""
+        _, block = np.unique(self.windows.block, return_inverse=True)
+        counts = self.windows.counts
+        blocks = np.zeros((block.max() + 1, *self.scale.shape))
+        np.add.at(blocks, block, counts.swapaxes(0, 1))
+        return (counts.sum(axis=1) >= FEWEST_WINDOWS) & ((blocks > 0).sum(axis=0) >= FEWEST_BLOCKS)
+
+    def seeing(self, tested: Tested) -> "Judge":
+        """Return the judge with those cells as evidence, too, in which a model beats the placebo."""
+        lost = self.placebo.by_block(self.scale)[0] - tested.by_block(self.scale)
+        beats = (np.stack([sureness(one) for one in lost]) > SURE_OF_COMMANDS).any(axis=0)
+        return self._replace(matters=self.matters | (beats & self.is_known))
+
+    def is_surely_worse(self, vector: np.ndarray) -> bool:
+        """Return whether a model predicts any horizon worse than the base does, beyond chance."""
+        tested = errors_at(self.problem, vector[None], self.windows)
+        lost = sureness(tested.by_block(self.scale)[0] - self.base.by_block(self.scale)[0])
+        is_larger = tested.rms()[0] > LIKELY_WORSE * self.scale
+        return bool(np.any(self.is_known & is_larger & (lost > SURELY_WORSE)))
+
+    def worst_ratio(self, vector: np.ndarray) -> float:
+        """Return the largest of a model's errors over the base's where it is worse; below 1 where none is."""
+        tested = errors_at(self.problem, vector[None], self.windows)
+        ratio = tested.rms()[0] / self.scale
+        lost = sureness(tested.by_block(self.scale)[0] - self.base.by_block(self.scale)[0])
+        is_worse = (ratio > WORSE) | ((ratio > LIKELY_WORSE) & (lost > LIKELY))
+        return float(np.max(ratio[self.is_known & is_worse], initial=0.0))
+
+    def losses(self, vectors: np.ndarray) -> np.ndarray:
+        """Return mean squares over the base's in cells that are evidence, (models, blocks)."""
+        found = errors_at(self.problem, vectors, self.windows).by_block(self.scale)
+        used = self.matters if self.matters.any() else self.is_known
+        return found[..., used].mean(axis=-1)
+
+
+class Refined(NamedTuple):
+    """The outcome of a refinement.
+
+    kept: the effects of the extended model. fit: the extended model where it was fitted to windows; None
+    where the model from one-step residuals stands. base: the base alone, fitted likewise. removed: effects
+    that held-out prediction does not need or is worse with. without: by kept effect, the model without it,
+    refitted. problem: with the ranges that were searched.
+    """
+
+    kept: tuple[Candidate, ...]
+    fit: Fit | None
+    base: np.ndarray | None
+    removed: tuple[str, ...]
+    without: Mapping[str, np.ndarray]
+    problem: Problem
+    judge: Judge | None
+
+    @property
+    def removal_costs(self) -> dict[str, float]:
+        """By which share the held-out error grows without an effect, all else refitted."""
+        if self.judge is None or self.fit is None or not self.without:
+            return {}
+        losses = self.judge.losses(np.stack([self.fit.vector, *self.without.values()])).sum(axis=1)
+        costs = np.sqrt(losses[1:] / losses[0]) - 1.0
+        return {name: float(cost) for name, cost in zip(self.without, costs, strict=True)}
+
+    def vector_without(self, effect: str) -> np.ndarray:
+        """Return the fitted model without an effect, or with base parameters at their nominal values."""
+        assert self.fit is not None
+        if effect in self.without:
+            return self.without[effect]
+        fields = BASE_CAUSES["thrust_curve" if effect == "thrust_scale" else effect]
+        vector, places = self.fit.vector.copy(), self.problem.index(fields)
+        vector[places] = self.problem.start[places]
+        return vector
+
+    def flight_errors(self, vector: np.ndarray) -> dict[str, float]:
+        """Return the held-out position errors of free flight, m, by seconds; empty where none was judged."""
+        if self.judge is None:
+            return {}
+        return table_of(errors_at(self.problem, vector[None], self.judge.windows).rms()[0]).get(
+            "position_m", {}
+        )
+
+
+def windows_of(log: FlightLog, rows: np.ndarray) -> Windows | None:
+    """Return windows over some rows of a log; None where there are none."""
+    found = make_windows(log, rows, SPACING_S, MOST_WINDOWS)
+    if len(found.start) < CHUNK:  # a chunk costs the same, full or not
+        found = make_windows(log, rows, SHORT_SPACING_S, CHUNK)
+    return found if len(found.start) else None
+
+
+def at_bounds(problem: Problem, vector: np.ndarray, fields: Sequence[str]) -> list[str]:
+    """Return those parameters that are at the end of the range that is searched; shapes may be."""
+    found = []
+    for place in problem.index(fields):
+        effect, _, field = problem.names[place].partition(".")
+        low, high, value = problem.low[place], problem.high[place], vector[place]
+        room = 1e-6 * max(abs(value), 1.0)
+        is_shape = bool(field) and field in BY_NAME[effect].shapes
+        is_neutral = bool(field) and abs(value - problem.start[place]) <= room
+        if not (is_shape or is_neutral) and not low + room < value < high - room:
+            found.append(problem.names[place])
+    return found
+
+
+def widened(problem: Problem, fields: Sequence[str]) -> Problem:
+    """Return the problem with twice the range for some parameters, except for how far rows are remembered.
+
+    What is not negative stays so; what is one-sided stays one-sided.
+    """
+    low, high = problem.low.copy(), problem.high.copy()
+    for name, place in zip(fields, problem.index(fields), strict=True):
+        effect, _, field = name.partition(".")
+        if not field or field in BY_NAME[effect].most_steps:
+            continue
+        width = high[place] - low[place]
+        if low[place] < problem.start[place]:
+            low[place] = low[place] - width if low[place] < 0.0 else 0.2 * low[place]
+        high[place] += width if high[place] > problem.start[place] else 0.0
+    return replace(problem, low=low, high=high)
+
+
+def refine(
+    problem: Problem,
+    base: np.ndarray,
+    extended: np.ndarray,
+    candidates: Sequence[Candidate],
+    base_places: Sequence[int],
+    log: FlightLog,
+    held_out: np.ndarray,
+    is_explained: bool,
+) -> Refined:
+    """Return which effects of a model predict held-out flights better, and their values.
+
+    base, extended: the models from one-step residuals. base_places: its free base parameters. held_out:
+    (num_rows,) bool. is_explained: one-step residuals leave noise only; the model is then the most likely
+    one already, and stands as long as it predicts no horizon worse than the base.
+    """
+    learnt, judged = windows_of(log, ~held_out), windows_of(log, held_out)
+    as_found = Refined(tuple(candidates), None, None, (), {}, problem, None)
+    if learnt is None or judged is None:
+        return as_found
+    judge = Judge.of(problem, learnt, judged, base).seeing(errors_at(problem, extended[None], judged))
+    as_found = as_found._replace(judge=judge)
+    is_at_bound = bool(at_bounds(problem, extended, [name for one in candidates for name in one.fields]))
+    if (
+        not candidates
+        or not judge.is_known.any()
+        or (is_explained and not is_at_bound and not judge.is_surely_worse(extended))
+    ):
+        return as_found
+    found = _Refinement(judge, learnt, base, tuple(base_places), ())
+    seen = found.acting_in(problem, _probed(problem, extended, candidates), candidates)
+    return found._replace(acting=seen).run(extended, as_found)
+
+
+class _Refinement(NamedTuple):
+    """What the steps of a refinement share.
+
+    acting: the effects that change how a model predicts: not those of sensors that windows do not see, whose
+    values stay as they are.
+    """
+
+    judge: Judge
+    learnt: Windows
+    base: np.ndarray
+    base_places: tuple[int, ...]
+    acting: tuple[str, ...]
+
+    def target(self, problem: Problem) -> Target:
+        """Return what is fitted: cells that are evidence, and short horizons."""
+        tested = errors_at(problem, self.base[None], self.learnt)
+        scale = np.maximum(np.nan_to_num(tested.rms()[0], nan=1.0), 1e-9)
+        is_short = (np.array(HORIZONS_S) <= ALWAYS_FITTED_S)[:, None]
+        return Target(problem, self.learnt, scale, self.judge.matters | is_short)
+
+    def places(self, problem: Problem, candidates: Sequence[Candidate]) -> list[int]:
+        """Return the free places that act on the windows."""
+        own = [place for place in self.base_places if problem.names[place] != DRAIN]
+        seen = [one for one in candidates if one.effect in self.acting]
+        return own + [place for one in seen for place in problem.index(one.fields)]
+
+    def acting_in(
+        self, problem: Problem, vector: np.ndarray, candidates: Sequence[Candidate]
+    ) -> tuple[str, ...]:
+        """Return the effects that change how a model predicts."""
+        without = [_neutral(problem, vector, one) for one in candidates]
+        found = errors_at(problem, np.stack([vector, *without]), self.learnt).errors
+        changes = np.abs(found[1:] - found[0]).max(axis=(1, 2, 3, 4))
+        return tuple(one.effect for one, change in zip(candidates, changes, strict=True) if change > 0.0)
+
+    def run(self, extended: np.ndarray, as_found: Refined) -> Refined:
+        """Return the refined model with the effects that held-out prediction needs."""
+        problem, candidates = as_found.problem, as_found.kept
+        target = self.target(problem)
+        places = self.places(problem, candidates)
+        fit = target.fitted(extended, places, MOST_ROUNDS)
+        probed = _probed(problem, fit.vector, candidates)
+        if np.any(probed != fit.vector):  # single steps left a parameter where it has no slope
+            other = target.fitted(probed, places, MOST_ROUNDS)
+            both = np.stack([fit.vector, other.vector])
+            fit = (fit, other)[int(np.argmin(target.cost(target.residuals(both), both)))]
+        stuck = at_bounds(problem, fit.vector, [name for one in candidates for name in one.fields])
+        if stuck:
+            problem = widened(problem, stuck)
+            target = target._replace(problem=problem)
+            fit = target.fitted(fit.vector, fit.places, MOST_ROUNDS)
+        judge = self.judge.seeing(errors_at(problem, fit.vector[None], self.judge.windows))
+        base = target.fitted(self.base, self.places(problem, ()), MOST_ROUNDS).vector
+        found = as_found._replace(fit=fit, base=base, problem=problem, judge=judge)
+        return self._eliminate(found, target)
+
+    def _eliminate(self, found: Refined, target: Target) -> Refined:
+        """Return the model without effects that are not needed, or that make any horizon worse."""
+        assert found.fit is not None and found.judge is not None
+        judge, fit, without = found.judge, found.fit, {}
+        kept = [one for one in found.kept if not _is_neutral(found.problem, fit.vector, one.fields)]
+        removed = [one.effect for one in found.kept if one not in kept]
+        while any(one.effect in self.acting for one in kept):
+            tried = [one for one in kept if one.effect in self.acting]
+            fits = [self._without(target, fit, kept, one) for one in tried]
+            losses = judge.losses(np.stack([fit.vector, *(one.vector for one in fits)]))
+            sure = np.array([sureness(one - losses[0]) for one in losses[1:]])
+            worth = np.sqrt(losses[1:].sum(axis=1) / losses[0].sum()) - 1.0
+            needed = np.where((worth >= WORTHWHILE) & (sure >= LIKELY), np.maximum(sure, SURE), sure)
+            needed[:] = needed if judge.matters.any() else np.inf  # nothing that could tell
+            without = {one.effect: less.vector for one, less in zip(tried, fits, strict=True)}
+            weakest = int(np.argmin(needed))
+            if needed[weakest] >= SURE:
+                if judge.worst_ratio(fit.vector) < 1.0:
+                    break
+                weakest = int(np.argmin([judge.worst_ratio(one.vector) for one in fits]))
+            kept.remove(tried[weakest])
+            removed.append(tried[weakest].effect)
+            places = self.places(target.problem, kept)
+            fit = target.fitted(fits[weakest].vector, places, MOST_ROUNDS)
+        if not kept:
+            return found._replace(kept=(), fit=None, removed=tuple(removed), without={})
+        return found._replace(kept=tuple(kept), fit=fit, removed=tuple(removed), without=without)
+
+    def _without(self, target: Target, fit: Fit, kept: Sequence[Candidate], one: Candidate) -> Fit:
+        vector = _neutral(target.problem, fit.vector, one)
+        rest = [other for other in kept if other is not one]
+        return target.fitted(vector, self.places(target.problem, rest), REFIT_ROUNDS)
+
+
+def _neutral(problem: Problem, vector: np.ndarray, one: Candidate) -> np.ndarray:
+    places, result = problem.index(one.fields), vector.copy()
+    result[places] = problem.start[places]
+    return result
+
+
+def _is_neutral(problem: Problem, vector: np.ndarray, fields: Sequence[str]) -> bool:
+    """Return whether parameters are as in the nominal model, those apart that only shape what others do."""
+    own = [name for name in fields if name.split(".")[1] not in BY_NAME[name.split(".")[0]].shapes]
+    places = problem.index(own)
+    return bool(np.all(np.abs(vector - problem.start)[places] < NEUTRAL * problem.scale[places]))
+
+
+def _probed(problem: Problem, vector: np.ndarray, candidates: Sequence[Candidate]) -> np.ndarray:
+    """Return the vector with parameters that are looked for at probes, and still neutral, at the probes."""
+    result = vector.copy()
+    for probe in (probe for one in candidates for probe in one.probes):
+        if _is_neutral(problem, vector, [probe.field]):
+            result[problem.names.index(probe.field)] = probe.value
+    return result
+
+
+def table_of(tested: np.ndarray) -> dict[str, dict[str, float]]:
+    """Return rms errors, (horizons, quantities), by quantity with its unit and by seconds."""
+    return {
+        f"{quantity}_{UNITS[quantity].replace('/', '_per_')}": {
+            f"{horizon:g}": float(value)
+            for horizon, value in zip(HORIZONS_S, tested[:, index], strict=True)
+            if np.isfinite(value)
+        }
+        for index, quantity in enumerate(QUANTITIES)
+        if np.isfinite(tested[:, index]).any()
+    }

@@ -1,0 +1,59 @@
+"""Bags of topics: MCAP files, bags of ROS 2 and ROS 1, read by mcap and rosbags.
+
+A mapping names the fields: a column is a topic and a field of its messages, as in
+``/imu/data:angular_velocity.x`` or ``/rc:channels[0]``.
+"""
+
+from pathlib import Path
+
+from flytrack_env.messages import quote_name
+from flytrack_sysid.importing.decoding import decode
+from flytrack_sysid.importing.flight import ImportedFlight
+from flytrack_sysid.importing.mapping import Mapping
+from flytrack_sysid.importing.table_flight import LONGEST_LIST, TIMESTAMP, flight_of_topics
+from flytrack_sysid.log import LogError
+from flytrack_sysid.log_table import Table
+
+LARGEST_BYTES = 2**30
+
+
+def read_bag(path: Path, mapping: Mapping) -> ImportedFlight:
+    """Return the flight in a bag, by a mapping of its topics' fields; SI units and our frames.
+
+    Messages are at the times in their headers, else at those of their recording. Raises LogError for what is
+    no bag, or lacks a topic or a field that the mapping names.
+    """
+    wanted: dict[str, list[str]] = {}
+    for channel in mapping.channels:
+        for column in channel.columns:
+            topic, colon, field = column.rpartition(":")
+            if not colon or not topic or not field:
+                expected = "expected topic:field, as in /imu:angular_velocity.x"
+                raise LogError(f"{mapping.source}: {channel.table}: found {quote_name(column)}, {expected}")
+            wanted.setdefault(topic, []).append(field)
+    if not path.exists():
+        raise LogError(f"{path}: cannot be read: no such file or folder")
+    if not (path.is_file() or path.is_dir()) or (path.is_file() and path.stat().st_size > LARGEST_BYTES):
+        raise LogError(
+            f"{path}: cannot be read: expected a folder, or a file of at most {LARGEST_BYTES} bytes"
+        )
+    notes, arrays = decode(str(path), "bag", path, wanted)
+    for topic, field, kind in notes["missing"]:
+        where = f"{path}: topic {quote_name(topic)}: field {quote_name(field)}"
+        raise LogError(f"{where}: not a number in messages of type {quote_name(kind)}")
+    names = [found["topic"] for found in notes["found"]]
+    for topic in wanted:
+        if topic not in names:
+            listed = ", ".join(map(quote_name, notes["topics"]))[:LONGEST_LIST] or "no topics"
+            raise LogError(f"{path}: topic {quote_name(topic)}: no messages; found {listed}")
+    topics, said = [], []
+    for found, rows in zip(notes["found"], arrays, strict=True):
+        columns = [TIMESTAMP, *(f"{found['topic']}:{field}" for field in found["fields"])]
+        topics.append(Table(str(path), dict(zip(columns, rows.T, strict=True))))
+        if not found["is_stamped"]:
+            name = quote_name(found["topic"])
+            said.append(
+                f"{path}: topic {name}: no stamps in its messages: times are those of their recording"
+            )
+    flight = flight_of_topics(str(path), topics, mapping)
+    return flight._replace(notes=(*said, *flight.notes))

@@ -1,0 +1,232 @@
+"""Commands of logs whose autopilot was not given body rates: attitude or torque setpoints, motor outputs.
+
+An attitude controller asks for rates in proportion to the error of the attitude, so these are the rate
+commands. A rate controller asks for a torque in proportion to the error of the rates; the torque over that
+gain, on top of the measured rates, is the rate command. Gains are stated in the mapping, or identified from
+the log.
+"""
+
+from collections.abc import Mapping as Channels
+from typing import NamedTuple
+
+import numpy as np
+from scipy.signal import lfilter
+from scipy.spatial.transform import Rotation
+
+from flytrack_sysid.importing.units import PER_DEGREE
+from flytrack_sysid.log import LogError
+from flytrack_sysid.log_table import COMMAND_MARGIN
+from flytrack_sysid.plausibility import FEWEST_ROWS
+
+AXES = ("roll", "pitch", "yaw")
+FLYING_THRUST = -0.9  # command: with less, it may stand on the ground, where rates do not follow
+# Of the rate loop, while an attitude gain is identified: lags and delays, s.
+LAGS_S, DELAYS_S = (0.0, 0.02, 0.04, 0.06, 0.1, 0.15), (0.0, 0.01, 0.02, 0.03, 0.04)
+LEAST_CORRELATION = 0.7  # of the rates with those of an identified attitude gain
+LEAST_EXPLAINED = 0.9  # of the variance of torques, which a controller computes without noise
+
+
+class CommandRules(NamedTuple):
+    """How commands follow from setpoints of attitude or torque, and from motors.
+
+    attitude_gain: rad/s per rad, of roll, pitch, yaw, 0 to identify it. rate_gain: N m per rad/s, None to
+    identify it. motors_as_thrust: their mean replaces the thrust command. motor_torque: N m about x, y, z by
+    each motor at its upper end, (3, num_motors), None where torques are logged or not known.
+    """
+
+    attitude_gain: tuple[float, ...] = (0.0, 0.0, 0.0)
+    rate_gain: tuple[float, ...] | None = None
+    motors_as_thrust: bool = False
+    motor_torque: tuple[tuple[float, ...], ...] | None = None
+
+
+def commands_of(
+    source: str,
+    time: np.ndarray,
+    channels: Channels[str, np.ndarray],
+    rules: CommandRules,
+    max_rate_deg_s: tuple[float, ...] | None,
+) -> tuple[np.ndarray, tuple[str, ...]]:
+    """Return the commands (num_rows, 4) in [-1, 1] of a flight, and notes on what was assumed and clipped.
+
+    channels: of ``CHANNELS``, and ``attitude_command`` (roll, pitch, yaw, rad), ``own_attitude`` (as the
+    autopilot estimates it), ``torque_command`` (N m), ``reference_rates`` (rad/s), ``thrust_command`` (-1 to
+    1) and ``motors`` (0 to 1), (num_rows, n) each. Raises LogError for what is missing or cannot be
+    identified.
+    """
+    notes: tuple[str, ...] = ()
+    if "motors" in channels:
+        share = np.mean(channels["motors"].max(axis=1) >= 1.0)
+        notes += (f"{source}: a motor at its upper end in {share:.2%} of the rows",)
+    thrust, said = _thrust(source, channels, rules)
+    notes += said
+    if "u" in channels:
+        commands = np.column_stack([channels["u"][:, :3], thrust])
+    else:
+        if max_rate_deg_s is None:
+            raise LogError(
+                f"{source}: craft.max_rate_deg_s: missing in the mapping: which rates are a command of 1?"
+            )
+        rates, said = _rates(source, time, {**channels, "thrust_command": thrust[:, None]}, rules)
+        commands = np.column_stack([rates / (np.array(max_rate_deg_s) * PER_DEGREE), thrust])
+        notes += said
+    is_past = np.any(np.abs(commands) > 1.0 + COMMAND_MARGIN, axis=1)
+    if is_past.any():
+        notes += (f"{source}: commands clipped to [-1, 1] in {is_past.sum()} of {len(is_past)} rows",)
+    return np.clip(commands, -1.0, 1.0), notes
+
+
+def _thrust(
+    source: str, channels: Channels[str, np.ndarray], rules: CommandRules
+) -> tuple[np.ndarray, tuple[str, ...]]:
+    """Return the thrust commands (num_rows,), and notes."""
+    if rules.motors_as_thrust:
+        if "motors" not in channels:
+            raise LogError(f"{source}: motors.as_thrust: found no motor outputs in the log or mapping")
+        return 2.0 * channels["motors"].mean(axis=1) - 1.0, (
+            f"{source}: thrust command: the mean of the motors",
+        )
+    for name, column in (("thrust_command", 0), ("u", 3)):
+        if name in channels:
+            return channels[name][:, column], ()
+    raise LogError(
+        f"{source}: thrust_command: missing in the mapping; motors.as_thrust = true can replace it"
+    )
+
+
+def _rates(
+    source: str, time: np.ndarray, channels: Channels[str, np.ndarray], rules: CommandRules
+) -> tuple[np.ndarray, tuple[str, ...]]:
+    """Return the rate commands (num_rows, 3), rad/s, and a note on the assumption."""
+    if rules.motor_torque is not None and "motors" in channels:
+        channels = {**channels, "torque_command": channels["motors"] @ np.array(rules.motor_torque).T}
+    if "torque_command" in channels:
+        _check_there(source, channels, "w")
+        if rules.rate_gain is None:
+            return _rates_of_the_law(source, time, channels)
+        assumed = "measured rates, and the torque setpoints over the gain of the rate loop"
+        note = f"{source}: rate commands: {assumed}, {_listed(rules.rate_gain)} N m s/rad (given)"
+        return channels["w"] + channels["torque_command"] / np.array(rules.rate_gain), (note,)
+    if "attitude_command" not in channels:
+        raise LogError(f"{source}: found neither rate, attitude nor torque commands in the mapping")
+    errors = _attitude_errors(source, channels)
+    gains, how = rules.attitude_gain, "given"
+    if min(gains) == 0.0:
+        gains, how = _identified_attitude_gain(source, time, channels, errors, gains)
+    note = f"{source}: rate commands: errors of the attitude, times gains of {_listed(gains)} 1/s ({how})"
+    note += "; what else the attitude controller adds is left out"
+    return errors * np.array(gains), (note,)
+
+
+def _check_there(source: str, channels: Channels[str, np.ndarray], *names: str) -> None:
+    for name in names:
+        if name not in channels:
+            raise LogError(f"{source}: {name}: not in the log or its mapping, and rate commands need it")
+
+
+def _listed(values: tuple[float, ...]) -> str:
+    return ", ".join(f"{value:.4g}" for value in values)
+
+
+def _attitude_errors(source: str, channels: Channels[str, np.ndarray]) -> np.ndarray:
+    """Return the setpoints less the attitude, as Euler angles, as common autopilots do, (num_rows, 3) rad."""
+    own = channels.get("own_attitude")
+    if own is None:
+        _check_there(source, channels, "q")
+        own = Rotation.from_quat(channels["q"], scalar_first=True).as_euler("ZYX")[:, ::-1]
+    errors = channels["attitude_command"] - own
+    return np.mod(errors + np.pi, 2.0 * np.pi) - np.pi
+
+
+def _identified_attitude_gain(
+    source: str,
+    time: np.ndarray,
+    channels: Channels[str, np.ndarray],
+    errors: np.ndarray,
+    given: tuple[float, ...],
+) -> tuple[tuple[float, ...], str]:
+    """Return the gain of each axis, rad/s per rad, at which lagged and delayed errors show the rates best."""
+    _check_there(source, channels, "w")
+    if len(time) < FEWEST_ROWS:
+        raise LogError(f"{source}: attitude_command.gain: found {len(time)} rows, too few for it; state it")
+    is_flying = channels["thrust_command"][:, 0] > FLYING_THRUST
+    step_s, gains, correlations = float(np.median(np.diff(time))), [], []
+    for axis, name in enumerate(AXES):
+        if given[axis]:
+            gains.append(given[axis])
+            continue
+        best, gain = 0.0, 0.0
+        rates = channels["w"][is_flying, axis] - channels["w"][is_flying, axis].mean()
+        for delay_s in DELAYS_S:
+            delay = round(delay_s / step_s)
+            late = np.concatenate([np.zeros(delay), errors[: len(errors) - delay, axis]])
+            for lag_s in LAGS_S:
+                decay = np.exp(-step_s / lag_s) if lag_s else 0.0
+                shown = lfilter([1.0 - decay], [1.0, -decay], late)[is_flying]
+                shown = shown - shown.mean()
+                size = np.linalg.norm(shown) * np.linalg.norm(rates)
+                correlation = float(shown @ rates / size) if size else 0.0
+                if correlation > best:
+                    best, gain = correlation, float(shown @ rates / (shown @ shown))
+        if not best >= LEAST_CORRELATION:
+            found = (
+                f"rates correlate with the attitude error by {best:.2f}, expected {LEAST_CORRELATION} or more"
+            )
+            raise LogError(
+                f"{source}: attitude_command.gain: cannot be identified for {name}: {found}; state it"
+            )
+        gains.append(gain)
+        correlations.append(best)
+    names = ", ".join(name for name, gain in zip(AXES, given, strict=True) if not gain)
+    return tuple(gains), f"{names} identified; correlation {_listed(tuple(correlations))}"
+
+
+def _rates_of_the_law(
+    source: str, time: np.ndarray, channels: Channels[str, np.ndarray]
+) -> tuple[np.ndarray, tuple[str, ...]]:
+    """Return the rates (num_rows, 3) that torque setpoints track by the law behind them, and a note.
+
+    Source: Lee, Leok, McClamroch, CDC 2010, with an integral as in Crazyflie's firmware: torque = -KR e
+    - Kw (w - w_reference) - KI integral(e) + constant, which is Kw times the error of the rates from
+    w_reference - KR/Kw e. All factors are identified. Assumption: integral and constant hold against a steady
+    torque, such as that of uneven motors.
+    """
+    if "attitude_command" not in channels:
+        where = f"{source}: torque_command.rate_gain: missing"
+        raise LogError(f"{where}; only with setpoints of attitude it can be identified")
+    errors = _rotation_errors(source, channels)
+    steps = np.diff(time)[:, None] * 0.5 * (errors[1:] + errors[:-1])
+    integrals = np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
+    reference = channels.get("reference_rates", np.zeros_like(errors))
+    rates = channels["w"] - reference
+    ratios, gains, explained = [], [], []
+    for axis, name in enumerate(AXES):
+        torque = channels["torque_command"][:, axis]
+        parts = (errors[:, axis], rates[:, axis], integrals[:, axis], np.ones(len(time)))
+        design = np.stack(parts, axis=1)
+        weights = np.linalg.lstsq(design, torque, rcond=None)[0]
+        share = 1.0 - float(np.var(torque - design @ weights) / np.var(torque)) if np.ptp(torque) else 0.0
+        if not share >= LEAST_EXPLAINED or weights[1] >= 0.0:
+            found = f"attitude and rates explain {share:.0%} of the torque, expected {LEAST_EXPLAINED:.0%}"
+            where = f"{source}: torque_command.rate_gain: cannot be identified for {name}"
+            raise LogError(f"{where}: {found}; state it")
+        ratios.append(float(weights[0] / weights[1]))
+        gains.append(-float(weights[1]))
+        explained.append(f"{share:.1%}")
+    how = f"identified with Kw {_listed(tuple(gains))} N m s/rad; the law explains {', '.join(explained)}"
+    assumed = "reference rates, and attitude errors times KR/Kw of the torque setpoints' law"
+    left_out = "its integral, which holds against steady torques, is left out"
+    note = f"{source}: rate commands: {assumed}, {_listed(tuple(ratios))} 1/s ({how}); {left_out}"
+    return reference - np.array(ratios) * errors, (note,)
+
+
+def _rotation_errors(source: str, channels: Channels[str, np.ndarray]) -> np.ndarray:
+    """Return the attitude less its setpoint as the law has it, about the body's axes, (num_rows, 3)."""
+    own = channels.get("own_attitude")
+    if own is None:
+        _check_there(source, channels, "q")
+        attitude = Rotation.from_quat(channels["q"], scalar_first=True)
+    else:
+        attitude = Rotation.from_euler("ZYX", own[:, ::-1])
+    turn = (Rotation.from_euler("ZYX", channels["attitude_command"][:, ::-1]).inv() * attitude).as_matrix()
+    return 0.5 * (turn - turn.transpose(0, 2, 1))[:, (2, 0, 1), (1, 2, 0)]

@@ -1,0 +1,100 @@
+"""Flights of tables of columns, by a mapping: CSV files, Crazyflie's uSD logs, bags of topics."""
+
+import itertools
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+
+from flytrack_env.messages import quote_name
+from flytrack_sysid.importing.commands import commands_of
+from flytrack_sysid.importing.flight import ImportedFlight
+from flytrack_sysid.importing.mapping import Channel, Mapping
+from flytrack_sysid.importing.resample import Samples, is_increasing, on_one_base, slow_channels
+from flytrack_sysid.log import CHANNELS, LogError
+from flytrack_sysid.log_table import Table, log_of_table
+
+LONGEST_LIST = 1000  # characters of a header in a message
+TIMESTAMP = "timestamp"  # column of a table's own times, s
+BASES = ("w", "q", "p")  # the rows are those of the first that is there
+
+
+def channels_in(source: str, headers: Sequence[Iterable[str]], mapping: Mapping) -> list[tuple[Channel, int]]:
+    """Return the channels that a log has, and the table of each, by the tables' column names.
+
+    Raises LogError for columns that the mapping wants and no table has, or one has several times.
+    """
+    if not mapping.channels:
+        raise LogError(f"{source}: {mapping.source} names no columns; such a file needs [command]")
+    names = [list(header) for header in headers]
+    found = []
+    for channel in mapping.channels:
+        counts = [[header.count(column) for column in channel.columns] for header in names]
+        fitting = [number for number, count in enumerate(counts) if all(one == 1 for one in count)]
+        if fitting:
+            found.append((channel, fitting[0]))
+        elif not (channel.is_optional and not any(map(any, counts))):
+            nearest = max(range(len(counts)), key=lambda number: sum(map(bool, counts[number])), default=None)
+            count = counts[nearest] if nearest is not None else [0] * len(channel.columns)
+            column, times = next((c, n) for c, n in zip(channel.columns, count, strict=True) if n != 1)
+            listed = ", ".join(map(quote_name, dict.fromkeys(itertools.chain(*names))))[:LONGEST_LIST]
+            where = f"{source}: column {quote_name(column)}: found {times} times among {listed}"
+            raise LogError(f"{where}; expected once by {mapping.source}: {channel.table}")
+    return found
+
+
+def flight_of_table(table: Table, mapping: Mapping) -> ImportedFlight:
+    """Return the flight in one table with a column of time; SI units and our frames.
+
+    Raises LogError, whose message names source, row, line and column.
+    """
+    channels = [channel for channel, _ in channels_in(table.source, [table.columns], mapping)]
+    values = {channel.name: channel.convert(table) for channel in channels}
+    if "t" not in values:
+        raise LogError(f"{mapping.source}: time: missing, expected a table: every log has it")
+    return _flight(table, values.pop("t")[:, 0], values, mapping)
+
+
+def flight_of_topics(source: str, topics: Sequence[Table], mapping: Mapping) -> ImportedFlight:
+    """Return the flight in tables that have clocks and rates of their own, each with a column of times.
+
+    Rows are the samples of the body rates, else of the attitude or the position: other sensors are
+    interpolated, commands held. There are no rows where a channel has a gap of more than three of its usual
+    steps.
+    """
+    samples, said = {}, list[str]()
+    for channel, number in channels_in(source, [topic.columns for topic in topics], mapping):
+        topic = topics[number]
+        if channel.name == "t":
+            raise LogError(f"{mapping.source}: time: found a table, expected none: the log has its own times")
+        is_finite = np.isfinite(topic.matrix([TIMESTAMP, *channel.columns])).all(axis=1)
+        if not is_finite.any():
+            raise LogError(f"{source}: {channel.table}: found no row of finite numbers, expected some")
+        if not is_finite.all():
+            said.append(f"{np.sum(~is_finite)} rows of {channel.table} left out: not finite numbers")
+        kept = topic._replace(columns={name: values[is_finite] for name, values in topic.columns.items()})
+        is_used = is_increasing(kept.columns[TIMESTAMP])
+        samples[channel.name] = Samples(kept.columns[TIMESTAMP][is_used], channel.convert(kept)[is_used])
+    base = next((samples[name].times for name in BASES if name in samples), None)
+    if base is None:
+        raise LogError(f"{source}: {mapping.source}: rates: missing; attitude or position may replace them")
+    values, is_known = on_one_base(samples, base)
+    if not is_known.any():
+        raise LogError(f"{source}: found no time at which all channels are known, expected some")
+    values = {name: rows[is_known] for name, rows in values.items()}
+    flight = _flight(Table(source, {}), base[is_known] - base[is_known][0], values, mapping)
+    said += slow_channels(samples)
+    if not is_known.all():
+        said.append(f"{np.sum(~is_known)} of {len(base)} rows left out: not all channels are known there")
+    return flight._replace(notes=(*(f"{source}: {text}" for text in said), *flight.notes))
+
+
+def _flight(
+    table: Table, time: np.ndarray, values: dict[str, np.ndarray], mapping: Mapping
+) -> ImportedFlight:
+    """Return the flight of converted channels."""
+    commands, notes = commands_of(table.source, time, values, mapping.rules, mapping.craft.max_rate_deg_s)
+    found = {"t": time, **dict(zip(CHANNELS["u"], commands.T, strict=True))}
+    for name, columns in CHANNELS.items():
+        if name in values and name != "u":
+            found |= dict(zip(columns, values[name].T, strict=True))
+    return ImportedFlight(log_of_table(table._replace(columns=found)), mapping.craft, notes)

@@ -1,0 +1,156 @@
+"""Multi-step prediction: free flight from measured states, many windows at once, differentiable.
+
+A window begins with a lead-in, in which the measured states are fed in and the commands settle the applied
+action and the memories of effects. Then the model flies by itself under the logged commands.
+"""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from flytrack_env.dynamics import ModelParameters, advance, body_rates, read_gyro
+from flytrack_env.effects import MOST_STEPS, start_memories
+from flytrack_env.quaternion import Quaternion
+from flytrack_env.state import Action, Drone
+from flytrack_sysid.log import FlightLog, usual_step
+from flytrack_sysid.prediction import SETTLING_S
+from flytrack_sysid.record import Record, fill_gaps, record_of
+from flytrack_sysid.replay import measured_drone, where_true
+
+HORIZONS_S = (0.1, 0.25, 0.5, 1.0, 2.0)
+# Quantities of an error, three components each, in this order, and the channels that measure them.
+CHANNEL_OF = {"attitude": "q", "rates": "w", "velocity": "v", "position": "p"}
+QUANTITIES = tuple(CHANNEL_OF)
+UNITS = {"attitude": "rad", "rates": "rad/s", "velocity": "m/s", "position": "m"}
+# Windows come in multiples of so many: logs of one rate share one compiled program.
+CHUNK = 128
+BLOCK_S = 2.0
+NO_TURN = 1e-16  # rad^2
+
+
+class Windows(NamedTuple):
+    """Windows of a log.
+
+    record: (rows, windows, ...), as in ``flytrack_sysid.record``; the lead-in first. is_free: (rows,) bool,
+    the state of this row is the model's. ends: (horizons,) int, rows at the horizons. gyro_b: (rows,
+    windows, 3) rad/s, zeros without a gyro. counts: (horizons, windows, quantities) bool, what is judged.
+    block: (windows,) int, number of the stretch of 2 s that the window starts in. start:
+    (windows,) int, row of the log.
+    """
+
+    record: Record
+    is_free: np.ndarray
+    ends: np.ndarray
+    gyro_b: np.ndarray
+    counts: np.ndarray
+    block: np.ndarray
+    start: np.ndarray
+
+    @property
+    def first_free(self) -> int:
+        """The first row whose state is the model's."""
+        return int(np.argmax(self.is_free))
+
+
+def chunks_of(windows: Windows) -> list[Windows]:
+    """Return the windows in parts of CHUNK, the last filled up with the first one."""
+    number = len(windows.start)
+    index = np.resize(np.arange(number), (-(-number // CHUNK), CHUNK))
+    index[-1, number - CHUNK * (len(index) - 1) :] = 0
+    return [
+        windows._replace(
+            record=Record(*(leaf[:, part] for leaf in windows.record)),
+            gyro_b=windows.gyro_b[:, part],
+            counts=windows.counts[:, part],
+            block=windows.block[part],
+            start=windows.start[part],
+        )
+        for part in index
+    ]
+
+
+def make_windows(log: FlightLog, judged: np.ndarray, every_s: float, most: int) -> Windows:
+    """Return windows over judged rows, (num_rows,) bool, one every so many seconds, ``most`` at most.
+
+    A window counts at the horizons that it reaches within rows that are judged and measured.
+    """
+    filled = fill_gaps(log)
+    step_s = float(np.median(usual_step(filled.log)))
+    lead, ends = round(SETTLING_S / step_s), np.round(np.array(HORIZONS_S) / step_s).astype(int)
+    is_judged = judged[filled.behind] & (filled.source_row >= 0)
+    begins = filled.log.is_start()
+    segment = np.cumsum(begins)
+    run = np.cumsum(begins | np.append(True, np.diff(judged[filled.behind].astype(int)) != 0))
+    first = np.flatnonzero(begins)[segment - 1]
+    rows = np.arange(len(segment))
+    can_start = is_judged & (rows - first >= lead)
+    starts = rows[can_start & ((rows - first - lead) % max(round(every_s / step_s), 1) == 0)]
+    last = np.minimum(starts + ends[:, None], len(rows) - 1)
+    reached = (starts + ends[:, None] < len(rows)) & (run[last] == run[starts]) & is_judged[last]
+    starts, reached = starts[reached.any(axis=0)], reached[:, reached.any(axis=0)]
+    most = len(starts) // CHUNK * CHUNK if CHUNK < len(starts) < most else most
+    if len(starts) > most:
+        kept = np.linspace(0, len(starts) - 1, most).round().astype(int)
+        starts, reached = starts[kept], reached[:, kept]
+    index = np.minimum(starts + np.arange(-lead, ends[-1] + 1)[:, None], len(rows) - 1)
+    has = np.array([name in log for name in CHANNEL_OF.values()])
+    gyro = filled.log["w"] if "w" in log else np.zeros((len(rows), 3))
+    return Windows(
+        record=Record(*(leaf[index] for leaf in record_of(filled))),
+        is_free=np.arange(len(index)) > lead,
+        ends=lead + ends,
+        gyro_b=gyro[index],
+        counts=reached[..., None] & has,
+        block=run[starts] * len(rows) + ((starts - first[starts]) * step_s / BLOCK_S).astype(int),
+        start=filled.behind[starts],
+    )
+
+
+def _turn(measured: Quaternion, predicted: Quaternion) -> jax.Array:
+    """Return the rotation vector from a predicted to a measured attitude, body frame, rad."""
+    inverse = Quaternion(predicted.w, -predicted.x, -predicted.y, -predicted.z)
+    turn = inverse.multiply(measured)
+    sign = jnp.where(turn.w < 0.0, -1.0, 1.0)
+    vector = sign * jnp.stack([turn.x, turn.y, turn.z])
+    square = jnp.sum(vector**2)
+    is_small = square < NO_TURN
+    sine = jnp.sqrt(jnp.where(is_small, 1.0, square))
+    angle = 2.0 * jnp.arctan2(sine, sign * turn.w)
+    return vector * jnp.where(is_small, 2.0, angle / sine)
+
+
+def _fly(model: ModelParameters, record: Record, gyro_b: jax.Array, windows: Windows) -> jax.Array:
+    """Return the errors of one window at its horizons, (horizons, 12)."""
+
+    def one(carry: tuple[Drone, Any], inputs: tuple[Record, Any]) -> tuple[Any, Any]:
+        (flown, memories), (row, is_free) = carry, inputs
+        applied = where_true(row.is_applied_known, Action(*row.applied), flown.applied)
+        drone = where_true(is_free, flown, measured_drone(row, applied, flown.rates_b))
+        after, later = advance(drone, memories, Action(*row.command), row.step_s, model)
+        gyro = read_gyro(after, later, row.step_s, model)
+        return (after, later), (after.pos_w, after.vel_w, after.quat, gyro)
+
+    first = jax.tree.map(lambda leaf: leaf[0], record)
+    applied = Action(*first.applied)
+    start = measured_drone(first, applied, body_rates(applied, model.max_rate))
+    memories = start_memories(model.effects, start, MOST_STEPS)
+    _, flown = jax.lax.scan(one, (start, memories), (record, windows.is_free))
+    pos, vel, quat, gyro = jax.tree.map(lambda leaf: leaf[windows.ends - 1], flown)
+    row, gyro_b = jax.tree.map(lambda leaf: leaf[windows.ends], (record, gyro_b))
+    turn = jax.vmap(_turn)(Quaternion(*row.quat.T), quat)
+    stacked = [jnp.stack(vector, axis=-1) for vector in (gyro, vel, pos)]
+    return jnp.concatenate(
+        [turn, gyro_b - stacked[0], row.vel_w - stacked[1], row.pos_w - stacked[2]], axis=-1
+    )
+
+
+def prediction_errors(model: ModelParameters, windows: Windows) -> jax.Array:
+    """Return measured minus predicted at the horizons: (horizons, windows, 12).
+
+    Turn (rad, body frame), rates (rad/s), velocity (m/s) and position (m), three components each; 0 where
+    nothing is judged.
+    """
+    fly = jax.vmap(lambda record, gyro: _fly(model, record, gyro, windows), in_axes=1, out_axes=1)
+    return jnp.where(jnp.repeat(windows.counts, 3, axis=-1), fly(windows.record, windows.gyro_b), 0.0)

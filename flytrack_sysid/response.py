@@ -1,0 +1,104 @@
+"""Time from a step of a stick to half of the response, per axis: delay, lags and limits in one number."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from flytrack_env.dynamics import HELD_S, ModelParameters, Moved, move, start_rates
+from flytrack_env.effects import CommandDelay, start_memories
+from flytrack_env.effects.command_delay import dead_times
+from flytrack_env.motion import Motion
+from flytrack_env.quaternion import Quaternion, Vec3
+from flytrack_env.state import ACTION_SIZE, Action, Drone
+from flytrack_sysid.parameters import from_vector, to_vector
+from flytrack_sysid.record import BATTERY_UNKNOWN_V
+
+SMALL_STEP, FULL_STEP = 1e-3, 1.0  # of a stick, from its centre; no limit acts on the small one
+STEP_S, WATCHED_S = 1e-3, 1.5
+HALF = 0.5
+HEIGHT_M = 1e3  # far from the ground
+BATCH = 8  # models at once
+
+
+def half_response_s(model: ModelParameters, stick_step: float = SMALL_STEP) -> np.ndarray:
+    """Return the times from a step of roll, pitch, yaw and thrust to half of the steady change, (4,) s.
+
+    Of the body rates and the thrust, as a drone that moves continuously; its sensors' delays are not in them.
+    NaN where the response takes longer than 1.5 s, or there is none. stick_step: from the centre, which for
+    thrust is half a stick.
+    """
+    with jax.enable_x64(True):
+        like = jax.tree.map(lambda leaf: np.asarray(leaf, float), model)
+        return half_responses(to_vector(like)[None], like, stick_step)[0]
+
+
+def half_responses(vectors: np.ndarray, like: ModelParameters, stick_step: float) -> np.ndarray:
+    """Return ``half_response_s`` of models as vectors, (num_models, 4) s; inside ``jax.enable_x64(True)``.
+
+    vectors: (num_models, parameters), in the order of ``parameters.names_of(like)``.
+    """
+    parts = []
+    for begin in range(0, len(vectors), BATCH):
+        part = vectors[begin : begin + BATCH]
+        filled = np.concatenate([part, np.repeat(part[-1:], BATCH - len(part), axis=0)])
+        parts.append(np.asarray(_half_responses(filled, like, stick_step))[: len(part)])
+    return np.concatenate(parts)
+
+
+@jax.jit
+def _half_responses(vectors: jax.Array, like: ModelParameters, stick_step: jax.Array) -> jax.Array:
+    return jax.vmap(lambda vector: _of_model(from_vector(vector, like), stick_step))(vectors)
+
+
+def _of_model(model: ModelParameters, stick_step: jax.Array) -> jax.Array:
+    """Return the times of the four sticks, (4,) s; dead times come before all else and only add."""
+    dead_s = jnp.stack(jnp.broadcast_arrays(*dead_times(model.effect("command_delay"))))
+    others = tuple(one for one in model.effects if not isinstance(one, CommandDelay))
+    prompt = model._replace(effects=others, motion=Motion.CONTINUOUS, battery_drain_v_per_min=0.0)
+    return dead_s + jax.vmap(lambda stick: _of_stick(prompt, stick, stick_step))(jnp.eye(ACTION_SIZE))
+
+
+def _of_stick(model: ModelParameters, stick: jax.Array, stick_step: jax.Array) -> jax.Array:
+    """Return the time of one stick, s, given as a row of the unit matrix, for a drone held in place."""
+    drone = _standing(model)
+    memories, command = start_memories(model.effects, drone), Action(*(stick_step * stick))
+
+    def response(moved: Moved) -> jax.Array:
+        return jnp.stack([*moved.after.rates_b, moved.context.force_b.z]) @ stick
+
+    def step(state: tuple[Drone, tuple[Any, ...]], _: None) -> tuple[Any, jax.Array]:
+        moved = move(*state, command, STEP_S, model)
+        held = drone._replace(rates_b=moved.after.rates_b, applied=moved.after.applied)
+        return (held, moved.memories), response(moved)
+
+    at_once = model._replace(motion=Motion.HANDOUT)
+    before = response(move(drone, memories, drone.applied, HELD_S, at_once))
+    steady = response(move(drone, memories, command, HELD_S, at_once))
+    values = jax.lax.scan(step, (drone, memories), length=round(WATCHED_S / STEP_S))[1]
+    return STEP_S * _first_crossing((values - before) / (steady - before))
+
+
+def _standing(model: ModelParameters) -> Drone:
+    """Return a level drone at rest with all sticks centred, turning as it steadily does."""
+    still, zero = Vec3(*jnp.zeros(3)), jnp.zeros(())
+    drone = Drone(
+        pos_w=Vec3(zero, zero, zero + HEIGHT_M),
+        vel_w=still,
+        acc_w=still,
+        quat=Quaternion(zero + 1.0, zero, zero, zero),
+        rates_b=still,
+        applied=Action(*jnp.zeros(ACTION_SIZE)),
+        battery_v=zero + BATTERY_UNKNOWN_V,
+    )
+    return drone._replace(rates_b=start_rates(drone, model))
+
+
+def _first_crossing(shares: jax.Array) -> jax.Array:
+    """Return after how many steps shares, (num_steps,) from the first step on, pass a half; NaN if never."""
+    shares = jnp.concatenate([jnp.zeros(1), shares])
+    is_past = shares >= HALF
+    place = jnp.argmax(is_past)
+    before, after = shares[place - 1], shares[place]
+    return jnp.where(is_past.any(), place - (after - HALF) / (after - before), jnp.nan)

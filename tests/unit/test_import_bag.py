@@ -1,0 +1,146 @@
+"""Bags written by the libraries and read back: ROS 2 bags, MCAP files of ROS 2 messages and of JSON."""
+
+import dataclasses
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from flytrack_sysid import LogError, import_log
+
+pytest.importorskip("mcap", reason="mcap is not installed: pip install 'flytrack[bags]'")
+pytest.importorskip("rosbags", reason="rosbags is not installed: pip install 'flytrack[bags]'")
+from mcap.writer import Writer as McapWriter
+from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.typesys import Stores, get_typestore
+
+MAPPING = """[command]
+columns = ["/sticks:axes[0]", "/sticks:axes[1]", "/sticks:axes[2]", "/sticks:axes[3]"]
+[rates]
+columns = ["/twist:twist.angular.x", "/twist:twist.angular.y", "/twist:twist.angular.z"]
+unit = "rad/s"
+frame = "flu"
+[position]
+columns = ["/pose:pose.position.x", "/pose:pose.position.y", "/pose:pose.position.z"]
+unit = "m"
+frame = "z_up"
+[attitude]
+quaternion = ["/pose:pose.orientation.x", "/pose:pose.orientation.y",
+              "/pose:pose.orientation.z", "/pose:pose.orientation.w"]
+order = "xyzw"
+body = "flu"
+world = "z_up"
+"""
+KINDS = {
+    "/sticks": ("sensor_msgs/msg/Joy", 20_000_000),
+    "/twist": ("geometry_msgs/msg/TwistStamped", 5_000_000),
+    "/pose": ("geometry_msgs/msg/PoseStamped", 10_000_000),
+}
+START_NS = 1_700_000_000 * 10**9
+RECORDED_LATE_NS = 7_000_000  # the bag's own times; the stamps are right
+TYPES = get_typestore(Stores.ROS2_HUMBLE)
+
+
+def made(kind: str, *values: Any) -> Any:
+    """Return a message, by the short name of its type."""
+    return next(one for name, one in TYPES.types.items() if name.endswith(f"/{kind}"))(*values)
+
+
+def motion(time: Any) -> Rotation:
+    """Return a roll from side to side."""
+    return Rotation.from_rotvec(np.multiply.outer(0.5 * np.sin(time), [1.0, 0.0, 0.0]))
+
+
+def messages() -> list[tuple[int, str, Any]]:
+    """Return stamp, ns, topic and message at 50, 200 and 100 Hz over 5 s, in order of time."""
+    found = []
+    for topic, (_, step_ns) in KINDS.items():
+        for stamp_ns in range(START_NS, START_NS + 5 * 10**9, step_ns):
+            time = (stamp_ns - START_NS) * 1e-9
+            header = made("Header", made("Time", *divmod(stamp_ns, 10**9)), "")
+            if topic == "/sticks":
+                axes = np.array([np.sin(time), 0.0, 0.0, 0.5], np.float32)
+                message = made("Joy", header, axes, np.zeros(0, np.int32))
+            elif topic == "/twist":
+                turn = made("Vector3", 0.5 * np.cos(time), 0.0, 0.0)
+                message = made("TwistStamped", header, made("Twist", made("Vector3", 0.0, 0.0, 0.0), turn))
+            else:
+                place = made("Point", time, 0.0, 1.0)
+                attitude = made("Quaternion", *motion(time).as_quat())
+                message = made("PoseStamped", header, made("Pose", place, attitude))
+            found.append((stamp_ns, topic, message))
+    return sorted(found, key=lambda one: one[0])
+
+
+def write_ros2(folder: Path, storage: str) -> Path:
+    """Write a bag of ROS 2."""
+    with Writer(folder / "bag", version=9, storage_plugin=StoragePlugin[storage]) as writer:
+        topics = {
+            topic: writer.add_connection(topic, kind, typestore=TYPES) for topic, (kind, _) in KINDS.items()
+        }
+        for stamp_ns, topic, message in messages():
+            data = TYPES.serialize_cdr(message, KINDS[topic][0])
+            writer.write(topics[topic], stamp_ns + RECORDED_LATE_NS, data)
+    return folder / "bag"
+
+
+def write_json(folder: Path) -> Path:
+    """Write an MCAP file of JSON, without stamps."""
+    with open(folder / "flight.mcap", "wb") as file:
+        writer = McapWriter(file)
+        writer.start()
+        schema = writer.register_schema("any", "jsonschema", b"{}")
+        topics = {topic: writer.register_channel(topic, "json", schema) for topic in KINDS}
+        for stamp_ns, topic, message in messages():
+            content = {name: part for name, part in dataclasses.asdict(message).items() if name != "header"}
+            data = json.dumps(content, default=np.ndarray.tolist).encode()
+            writer.add_message(topics[topic], stamp_ns, data, stamp_ns)
+        writer.finish()
+    return folder / "flight.mcap"
+
+
+WRITERS = {
+    "ROS 2, SQLite": lambda folder: write_ros2(folder, "SQLITE3"),
+    "ROS 2, MCAP": lambda folder: write_ros2(folder, "MCAP"),
+    "MCAP of ROS 2": lambda folder: next(write_ros2(folder, "MCAP").glob("*.mcap")),
+    "MCAP of JSON": write_json,
+}
+
+
+@pytest.mark.parametrize("kind", WRITERS)
+def test_what_was_written_is_read_back(tmp_path, kind):
+    (tmp_path / "map.toml").write_text(MAPPING)
+    found = import_log(WRITERS[kind](tmp_path), "bag", tmp_path / "map.toml", align=False)
+    log, time = found.log, found.log.time
+    assert len(log) >= 990 and np.diff(time) == pytest.approx(0.005, abs=1e-6)  # the rates' own rows
+    np.testing.assert_allclose(log["w"][:, 0], 0.5 * np.cos(time), atol=1e-6)
+    np.testing.assert_allclose(log["p"][:, 0], time, atol=1e-6)  # interpolated
+    assert (Rotation.from_quat(log["q"], scalar_first=True).inv() * motion(time)).magnitude().max() < 1e-4
+    np.testing.assert_allclose(log["u"][:, 0], np.sin(np.floor(time / 0.02 + 1e-6) * 0.02), atol=1e-6)  # held
+    is_told = any("times are those of their recording" in note for note in found.notes)
+    assert is_told == (kind == "MCAP of JSON") and log["u"][:, 3] == pytest.approx(0.5)
+
+
+def test_what_lacks_a_topic_or_a_field_or_is_no_bag_is_refused(tmp_path):
+    mapping, flight = tmp_path / "map.toml", write_json(tmp_path)
+    (tmp_path / "cut.mcap").write_bytes(flight.read_bytes()[:5000])
+    (tmp_path / "empty").mkdir()
+    for path, old, new, message in (
+        (
+            flight,
+            "/twist:twist.angular.x",
+            "/gyro:x",
+            "topic /gyro: no messages; found /pose, /sticks, /twist",
+        ),
+        (flight, "twist.angular.x", "rate", "topic /twist: field rate: not a number in messages of type any"),
+        (flight, "/sticks:axes[0]", "roll", r"map\.toml: command: found roll, expected topic:field"),
+        (tmp_path / "missing.mcap", "", "", "missing.mcap: cannot be read"),
+        (tmp_path / "cut.mcap", "", "", "cut.mcap: damaged, cannot be decoded"),
+        (tmp_path / "empty", "", "", "empty: damaged, cannot be decoded"),
+    ):
+        mapping.write_text(MAPPING.replace(old, new, 1))
+        with pytest.raises(LogError, match=message):
+            import_log(path, "bag", mapping)

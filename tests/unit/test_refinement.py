@@ -1,0 +1,151 @@
+"""Refinement by prediction: what commands do not explain is told, and no horizon is predicted worse."""
+
+from dataclasses import replace
+
+import jax
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from benchmarks.diagnosis import model_of
+from benchmarks.hidden import draw_base, draw_outside, fly, measure
+from flytrack_sysid.diagnosis.lanes import make_lanes
+from flytrack_sysid.diagnosis.problem import Problem
+from flytrack_sysid.diagnosis.refinement import (
+    Judge,
+    at_bounds,
+    placebo_errors,
+    refine,
+    widened,
+    windows_of,
+)
+from flytrack_sysid.diagnosis.score_test import BASE_FREE, CANDIDATES
+from flytrack_sysid.log import FlightLog
+from flytrack_sysid.parameters import from_vector
+from flytrack_sysid.prediction import predict
+from flytrack_sysid.prediction_errors import rollout_errors
+from flytrack_sysid.record import fill_gaps
+from flytrack_sysid.split import held_out_rows
+
+SECONDS = 40.0
+TRUE_DRAG = {"d_x": 0.4, "d_y": 0.4, "d_z": 0.2}
+DRAG = next(one for one in CANDIDATES if one.effect == "linear_drag")
+BIAS = next(one for one in CANDIDATES if one.effect == "accelerometer_bias")
+CIRCLE_S, RADIUS_M = 4.0, 1.0
+AS_GOOD = 1.02  # windows start elsewhere than the flights of the check
+
+
+def problem_of(truth, log: FlightLog) -> Problem:
+    """Return the problem of a plant's log and its team's model."""
+    lanes = make_lanes(log, ~held_out_rows(log), np.array(truth.tau), truth.gravity)
+    return Problem.of(lanes, model_of(truth))
+
+
+def refined(truth, log: FlightLog, candidates, values):
+    """Return the problem of a plant and its refinement, from given values of effects."""
+    with jax.enable_x64(True):
+        problem = problem_of(truth, log)
+        vector = problem.start.copy()
+        for name, value in values.items():
+            vector[problem.names.index(name)] = value
+        places = problem.index(BASE_FREE)
+        found = refine(
+            problem, problem.start, vector, candidates, places, log, held_out_rows(log), is_explained=False
+        )
+    return problem, found
+
+
+def flown(**changes):
+    """Return a plant and its measured log."""
+    rng = np.random.default_rng(3)
+    truth = replace(draw_base(rng), **changes)
+    return truth, measure(fly(truth, "scripted", SECONDS, rng), "sensors", rng)
+
+
+@pytest.fixture(scope="module")
+def dragged():
+    """A plant with drag, and the refinement of a model with half of it and a bias that no flight shows."""
+    truth, log = flown(effects={"linear_drag": TRUE_DRAG})
+    halved = {f"linear_drag.{name}": 0.5 * value for name, value in TRUE_DRAG.items()}
+    return truth, log, *refined(truth, log, (DRAG, BIAS), halved | {"accelerometer_bias.x": 0.3})
+
+
+def test_values_are_refined_by_flights(dragged):
+    *_, problem, found = dragged
+    assert [one.effect for one in found.kept] == ["linear_drag", "accelerometer_bias"] and not found.removed
+    half_widths = dict(zip(found.fit.places, found.fit.half_widths, strict=True))
+    for name, value in TRUE_DRAG.items():
+        place = problem.names.index(f"linear_drag.{name}")
+        assert abs(found.fit.vector[place] - value) < max(1.5 * half_widths[place], 0.05 * value)
+    assert found.fit.vector[problem.names.index("accelerometer_bias.x")] == 0.3  # no flight shows it
+    assert found.removal_costs["linear_drag"] > 0.1 and "accelerometer_bias" not in found.removal_costs
+    assert found.judge.worst_ratio(found.fit.vector) < 1.0
+
+
+def test_what_no_list_has_makes_no_horizon_worse():
+    """A force by heading, and a drag that stands in for it: graded by free flights of other code."""
+    rng = np.random.default_rng(5)
+    truth, log = flown(outside=draw_outside(rng, "heading", 2.0))
+    stands_in = {f"linear_drag.{name}": 1.0 for name in TRUE_DRAG}
+    problem, found = refined(truth, log, (DRAG,), stands_in)
+    vector = problem.start if found.fit is None else found.fit.vector
+    assert found.kept or found.removed == ("linear_drag",)
+    filled = fill_gaps(log)
+    rows = held_out_rows(log)[filled.behind]
+    models = (from_vector(one, problem.like) for one in (problem.start, vector))
+    base, extended = (rollout_errors(model, filled.log, predict(model, filled), rows) for model in models)
+    for before, after in zip(base, extended, strict=True):
+        assert after.errors["position"].rms <= AS_GOOD * before.errors["position"].rms
+
+
+def circle() -> FlightLog:
+    """Return a level flight on one circle, always the same, whatever the commands say."""
+    rng = np.random.default_rng(7)
+    time = np.arange(0.0, 10.0 * CIRCLE_S, 0.01)
+    phase = 2.0 * np.pi * time / CIRCLE_S
+    speed = 2.0 * np.pi * RADIUS_M / CIRCLE_S
+    zero = np.zeros_like(phase)
+    pos_w = RADIUS_M * np.stack([np.cos(phase), np.sin(phase), zero + 1.0], axis=1)
+    vel_w = speed * np.stack([-np.sin(phase), np.cos(phase), zero], axis=1)
+    quat = Rotation.from_rotvec(phase[:, None] * np.array([0.0, 0.0, 1.0])).as_quat(scalar_first=True)
+    rates_b = np.stack([zero, zero, zero + 2.0 * np.pi / CIRCLE_S], axis=1)
+    commands = np.clip(0.3 * rng.standard_normal((len(time), 4)), -1.0, 1.0)
+    channels = {"u": commands, "p": pos_w, "v": vel_w, "q": quat, "w": rates_b}
+    noisy = {name: values + 1e-3 * rng.standard_normal(values.shape) for name, values in channels.items()}
+    return FlightLog(time, noisy | {"u": commands}, np.zeros(len(time), int))
+
+
+def test_a_path_that_is_known_without_commands_is_no_evidence(dragged):
+    truth, log, *_ = dragged
+    with jax.enable_x64(True):
+        for one, is_evidence in ((circle(), False), (log, True)):
+            problem = problem_of(truth, one)
+            parts = (windows_of(one, rows) for rows in (~held_out_rows(one), held_out_rows(one)))
+            judge = Judge.of(problem, *parts, problem.start)
+            assert judge.is_known[:3].all()
+            assert judge.matters.mean() > 0.5 if is_evidence else not judge.matters.any()
+
+
+def test_flights_too_short_for_a_horizon_are_judged_by_the_shorter_ones():
+    log = circle()
+    short = replace(log, segment=np.arange(len(log)) // 150)  # 1.5 s each
+    learnt, judged = (windows_of(short, rows) for rows in (~held_out_rows(short), held_out_rows(short)))
+    found = placebo_errors(learnt, judged)
+    assert not learnt.counts[-1].any() and np.isfinite(found).all()
+
+
+def test_ranges_are_widened_but_not_beyond_what_is_remembered(dragged):
+    problem = dragged[2]
+    vector = problem.start.copy()
+    fields = [
+        "rate_scale.yaw",
+        "command_delay.delay_s",
+        "motor_imbalance.pitch",
+        "second_order_rates.roll_damping",
+    ]
+    places = problem.index(fields)
+    vector[places] = problem.low[places[0]], problem.high[places[1]], problem.low[places[2]], 0.1
+    assert at_bounds(problem, vector, fields) == fields[:3]  # a loop may well be as little damped
+    wider = widened(problem, fields[:3])
+    assert at_bounds(wider, vector, fields) == [fields[1]]
+    assert 0.0 < wider.low[places[0]] < 0.5 and wider.low[places[2]] < 2.0 * problem.low[places[2]]
