@@ -48,9 +48,10 @@ DAMPINGS = np.array([1e-6, 1e-4, 1e-3, 1e-2, 1e-1, 1.0, 10.0, 100.0])[:BATCH]
 # where it is worth so large a share of the error: single steps have shown it already.
 SURE, LIKELY, WORTHWHILE = 2.0, 1.0, 0.02
 SURE_OF_COMMANDS = 1.64  # the same for the better of the models over the placebo, one-sided 95 %
-# Errors over the base's that make a horizon worse: for sure, or by one standard error over blocks. What
-# rounds to 1.00 times is as good.
-WORSE, LIKELY_WORSE = 1.02, 1.005
+# Errors over the base's that make a horizon worse, and standard errors over blocks by which it then has to
+# be worse: where the commands matter, and where they do not and chance alone moves the error. What rounds to
+# 1.00 times is as good.
+LIKELY_WORSE, WORSE_ANYWHERE = 1.005, 2.0
 # Standard errors by which a horizon has to be worse before a model is doubted whose one-step residuals are
 # noise: with twenty cells, one standard error is always somewhere.
 SURELY_WORSE = 3.0
@@ -298,7 +299,7 @@ class Judge(NamedTuple):
         tested = errors_at(self.problem, vector[None], self.windows)
         ratio = tested.rms()[0] / self.scale
         lost = sureness(tested.by_block(self.scale)[0] - self.base.by_block(self.scale)[0])
-        is_worse = (ratio > WORSE) | ((ratio > LIKELY_WORSE) & (lost > LIKELY))
+        is_worse = (ratio > LIKELY_WORSE) & (lost > np.where(self.matters, LIKELY, WORSE_ANYWHERE))
         return float(np.max(ratio[self.is_known & is_worse], initial=0.0))
 
     def losses(self, vectors: np.ndarray) -> np.ndarray:

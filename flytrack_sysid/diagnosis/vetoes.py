@@ -49,6 +49,9 @@ BASE_REMAINDER = 0.01
 # A name on a side that something unknown disturbs needs so many thresholds; one that keeps less than that
 # share of its noncentrality beside what the unknown depends on stood in for it.
 DISTURBED, KEPT_SHARE = 3.0, 0.1
+# What stands in for something unknown takes up a part of it: a name that explains so many times what the
+# dependences do is no stand-in, and they are the remainder of its law.
+OUTWEIGHS = 30.0
 
 
 class Selection(NamedTuple):
@@ -147,7 +150,8 @@ def find_stand_ins(
     """Return names that stand in for something that no list has.
 
     Their gain is gone beside smooth functions of what the rest depends on (with the constants of those,
-    which a wind, say, would be), or is small where something unknown disturbs the same side.
+    which a wind, say, would be), or is small where something unknown disturbs the same side; unless it
+    outweighs what the dependences explain.
     """
     left, slopes = linearized_residuals(problem, model)
     flight = flight_of(problem, model)
@@ -177,7 +181,8 @@ def find_stand_ins(
             continue  # it acts on neither side: the battery
         own_side = max(by_side, key=lambda side: by_side[side][0])
         least = threshold(one.num_parameters)
-        is_gone = after < max(KEPT_SHARE * before, least)
+        rest_gain = sum(dependence.gain for dependence in dependences if dependence.side == own_side)
+        is_gone = after < least or (after < KEPT_SHARE * before and one.robust < OUTWEIGHS * rest_gain)
         if is_gone or (own_side in disturbed and one.robust < DISTURBED * least):
             result.append(one.name)
     return result

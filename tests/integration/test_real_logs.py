@@ -5,9 +5,9 @@ import json
 import pytest
 
 from flytrack_sysid import diagnose, import_log
-from flytrack_sysid.diagnosis.refinement import WORSE
 from tests.support.real_logs import CRAZYFLIE, shared
 
+AS_GOOD = 1.02  # times another model's error
 PARTS = ("seed00053_log2", "seed00067_log1", "seed00066_log1", "seed00052_log3")  # 23 s of four policies
 NEEDS_ACCELEROMETER = {"accelerometer_bias", "accelerometer_scale", "imu_offset"}
 
@@ -44,7 +44,7 @@ def test_no_horizon_is_predicted_worse_than_by_the_refitted_base(crazyflie):
     base, extended = (crazyflie.prediction.errors[name] for name in ("refitted_base", "extended"))
     for quantity, by_horizon in extended.items():
         for horizon, error in by_horizon.items():
-            assert error <= WORSE * base[quantity][horizon]
+            assert error <= AS_GOOD * base[quantity][horizon]
 
 
 @pytest.mark.slow
