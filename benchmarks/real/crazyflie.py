@@ -137,7 +137,6 @@ def fold(folder: Path, judged: str, seconds: float) -> dict[str, Any]:
     fit = refined.fit
     widths = {} if fit is None else dict(zip(fit.places, fit.half_widths, strict=True))
     return {
-        "commit": commit_of_checkout(),
         "policy": judged,
         "rows": len(learnt),
         "cpu_s": round(cpu_s, 1),
@@ -207,9 +206,10 @@ def main() -> None:
             start = {name: value for name, (value, _) in last["values"].items()}
             write_json(FITS, fits(folder, last["kept"], start))
             return
+        commit = commit_of_checkout()  # before its lines change a file
         wanted = arguments.policies.split(",") if arguments.policies else policies_in(folder)
         for policy in progress(wanted, "policies"):
-            line = fold(folder, policy, arguments.seconds)
+            line = {"commit": commit, **fold(folder, policy, arguments.seconds)}
             with LINES.open("a", encoding="utf-8") as file:
                 file.write(json.dumps(line) + "\n")
 
