@@ -356,6 +356,17 @@ def read_gyro(drone: Drone, memories: tuple[Any, ...], dt: Scalar, params: Model
     return effects.fold("gyro", params.effects, memories, drone.rates_b, context)
 
 
+def sensed(drone: Drone, memories: tuple[Any, ...], dt: Scalar, params: ModelParameters) -> Drone:
+    """Return the drone as its sensors report it: gyro and pose; the rest is true.
+
+    memories: of the effects, up to this drone. dt: s, the step between readings.
+    """
+    pose = effects.Pose(drone.pos_w, drone.vel_w, drone.quat)
+    context = StepContext(drone=drone, command=drone.applied, dt=dt, motion=params.motion)
+    pose = effects.fold("pose", params.effects, memories, pose, context)
+    return drone._replace(**pose._asdict(), rates_b=read_gyro(drone, memories, dt, params))
+
+
 def read_sensors(moved: Moved, params: ModelParameters) -> Reading:
     """Return the readings of gyro and accelerometer after a step.
 

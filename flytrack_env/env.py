@@ -103,11 +103,10 @@ class FlyTrack(EpisodicEnvironment):
     def observe_drone(self, drone: Drone, state: EnvState, params: EnvParams) -> list[jax.Array]:
         """Return the observation before the gate to be flown, float32 scalars.
 
-        Body rates are the gyro's reading where the model has effects on it.
+        Rates and pose are the sensors' where the model has effects on them.
         """
-        if acts(params.model.effects, "gyro"):
-            rates_b = self.plant.read_gyro(state.plant, drone, params.dt, params.model)
-            drone = drone._replace(rates_b=rates_b)
+        if acts(params.model.effects, "gyro") or acts(params.model.effects, "pose"):
+            drone = self.plant.sensed(state.plant, drone, params.dt, params.model)
         return observe_race(drone, state.race.gate, state.race.next_gate)
 
     def is_truncated(self, state: EnvState, params: EnvParams) -> jax.Array:

@@ -8,9 +8,9 @@ state is a pytree of its own, because it may hold more than the drone (a delay b
 from abc import ABC, abstractmethod
 from typing import Any, NamedTuple
 
-from flytrack_env.dynamics import ModelParameters, advance, read_gyro
+from flytrack_env.dynamics import ModelParameters, advance, sensed
 from flytrack_env.effects import USUAL_STEPS, start_memories
-from flytrack_env.quaternion import Scalar, Vec3
+from flytrack_env.quaternion import Scalar
 from flytrack_env.state import Action, Drone
 
 
@@ -37,9 +37,9 @@ class Plant(ABC):
     def drone(self, state: Any) -> Drone:
         """Return the drone of a plant's state."""
 
-    def read_gyro(self, state: Any, drone: Drone, dt: Scalar, model: ModelParameters) -> Vec3:
-        """Return the body rates that the gyro of a drone reads, rad/s: the true ones by default."""
-        return drone.rates_b
+    def sensed(self, state: Any, drone: Drone, dt: Scalar, model: ModelParameters) -> Drone:
+        """Return a drone as gyro and motion capture report it: as it is by default."""
+        return drone
 
 
 class SimulatorState(NamedTuple):
@@ -69,6 +69,6 @@ class Simulator(Plant):
         """Return the drone."""
         return state.drone
 
-    def read_gyro(self, state: SimulatorState, drone: Drone, dt: Scalar, model: ModelParameters) -> Vec3:
-        """Return the body rates that the gyro of a drone reads, rad/s, with the memories of the state."""
-        return read_gyro(drone, state.memories, dt, model)
+    def sensed(self, state: SimulatorState, drone: Drone, dt: Scalar, model: ModelParameters) -> Drone:
+        """Return a drone as gyro and motion capture report it, with the memories of the state."""
+        return sensed(drone, state.memories, dt, model)

@@ -10,7 +10,7 @@ import numpy as np
 
 from flytrack_env.effects.accelerometer_bias import ACCELEROMETER_BIAS, AccelerometerBias
 from flytrack_env.effects.accelerometer_scale import ACCELEROMETER_SCALE, AccelerometerScale
-from flytrack_env.effects.base import STAGES, Effect, Range, StepContext
+from flytrack_env.effects.base import STAGES, Effect, Pose, Range, StepContext
 from flytrack_env.effects.command_delay import COMMAND_DELAY, MOST_STEPS, USUAL_STEPS, CommandDelay
 from flytrack_env.effects.ground_effect import GROUND_EFFECT, GroundEffect
 from flytrack_env.effects.gyro_bias import GYRO_BIAS, GyroBias
@@ -18,6 +18,7 @@ from flytrack_env.effects.gyro_scale import GYRO_SCALE, GyroScale
 from flytrack_env.effects.imu_latency import IMU_LATENCY, ImuLatency
 from flytrack_env.effects.imu_offset import IMU_OFFSET, ImuOffset
 from flytrack_env.effects.linear_drag import LINEAR_DRAG, LinearDrag
+from flytrack_env.effects.mocap_latency import MOCAP_LATENCY, MocapLatency
 from flytrack_env.effects.motor_imbalance import MOTOR_IMBALANCE, MotorImbalance
 from flytrack_env.effects.quadratic_drag import QUADRATIC_DRAG, QuadraticDrag
 from flytrack_env.effects.rate_cross_coupling import RATE_CROSS_COUPLING, RateCrossCoupling
@@ -65,6 +66,7 @@ EFFECTS: tuple[Effect, ...] = (
     ACCELEROMETER_BIAS,
     GYRO_SCALE,
     GYRO_BIAS,
+    MOCAP_LATENCY,
 )
 ROUNDING = 1e-5  # of float32 times
 # Delays that are drawn around those of a model are longer by this factor and so many seconds, at most.
@@ -209,7 +211,9 @@ __all__ = [
     "ImuLatency",
     "ImuOffset",
     "LinearDrag",
+    "MocapLatency",
     "MotorImbalance",
+    "Pose",
     "QuadraticDrag",
     "Range",
     "RateCrossCoupling",

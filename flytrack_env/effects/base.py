@@ -5,22 +5,23 @@ another unit, each with its **neutral** value as default) and one ``Effect`` tha
 model carries the parameters of the effects that it has; the simulator folds them, in the order of
 ``flytrack_env.effects.EFFECTS``, at the stages of a step, and then of reading the sensors:
 
-=============  =====================  =================================================  ============
-stage          value                  what it is                                         acts on
-=============  =====================  =================================================  ============
-command        ``Action``             the command that the rate loop and motors get      command
-lag            ``Action``, s          time constants of the first-order lag              actuator
-air            ``Vec3``, m/s, world   velocity of the air                                force
-thrust         scalar, N              collective thrust along body z                     actuator
-rates          ``Vec3``, rad/s        body rates of the lagged action                    actuator
-force          ``Vec3``, m/s^2, body  specific force beside thrust; starts at 0          force
-battery        scalar, V              battery voltage after the step                     battery
-gyro           ``Vec3``, rad/s        what the gyro reads of the body rates              sensor
-accelerometer  ``Vec3``, m/s^2, body  what the accelerometer says of the specific force  sensor
-=============  =====================  =================================================  ============
+=============  =====================  ====================================================  ========
+stage          value                  what it is                                            acts on
+=============  =====================  ====================================================  ========
+command        ``Action``             the command that the rate loop and motors get         command
+lag            ``Action``, s          time constants of the first-order lag                 actuator
+air            ``Vec3``, m/s, world   velocity of the air                                   force
+thrust         scalar, N              collective thrust along body z                        actuator
+rates          ``Vec3``, rad/s        body rates of the lagged action                       actuator
+force          ``Vec3``, m/s^2, body  specific force beside thrust; starts at 0             force
+battery        scalar, V              battery voltage after the step                        battery
+gyro           ``Vec3``, rad/s        what the gyro reads of the body rates                 sensor
+accelerometer  ``Vec3``, m/s^2, body  what the accelerometer says of the specific force     sensor
+pose           ``Pose``, world        position, velocity and attitude as they are reported  sensor
+=============  =====================  ====================================================  ========
 
-Readings do not change the flight. ``flytrack_env.dynamics.read_sensors`` computes them after the step, with
-the memories after it.
+Readings do not change the flight. ``flytrack_env.dynamics.read_sensors`` and ``sensed`` compute them after
+the step, with the memories after it.
 
 A hook takes the effect's parameters, its memory, the value so far and the ``StepContext``, and returns
 the value. At neutral parameters it returns the value bit for bit, so that neutral equals absent.
@@ -31,7 +32,7 @@ from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 from flytrack_env.motion import Motion
-from flytrack_env.quaternion import Scalar, Vec3
+from flytrack_env.quaternion import Quaternion, Scalar, Vec3
 from flytrack_env.state import Action, Drone
 
 # The stages in the order in which a step passes them, and where an effect that hooks in there acts.
@@ -45,9 +46,18 @@ STAGES = {
     "battery": "battery",
     "gyro": "sensor",
     "accelerometer": "sensor",
+    "pose": "sensor",
 }
 
 NOT_YET: Any = None  # in place of a value that a later stage of the step computes
+
+
+class Pose(NamedTuple):
+    """Position, m, velocity, m/s, and attitude, body to world."""
+
+    pos_w: Vec3
+    vel_w: Vec3
+    quat: Quaternion
 
 
 class StepContext(NamedTuple):
@@ -59,7 +69,7 @@ class StepContext(NamedTuple):
     air_w: after the stage air, m/s. thrust_acc: collective thrust over mass, after the stage thrust, m/s^2.
     rates_b: after the stage rates, rad/s. force_b: specific force of the step, thrust and all else but
     gravity, in the body frame before it, after the stage force, m/s^2.
-    At the stage gyro only dt, applied and rates_b are those of the step; drone is the one after it.
+    At the stages gyro and pose only dt, applied and rates_b are those of the step; drone is the one after it.
 
     A step of continuous motion folds the stages at several moments; applied, rates_b and force_b are those
     of the moment, and dt is the time since the beginning of the step at the stages rates and battery.
@@ -113,7 +123,7 @@ class Effect:
     name: as in model files. parameters: the NamedTuple class; its defaults are neutral. ranges: of each
     parameter. notable: the smallest departure from neutral that matters, a judgement: less hardly
     shows in a lap or a reading. equation: LaTeX. source: a publication, or the assumption. command,
-    lag, air, thrust, rates, force, battery, gyro, accelerometer: hooks at these stages.
+    lag, air, thrust, rates, force, battery, gyro, accelerometer, pose: hooks at these stages.
     most_steps: of parameters that are delays, how many steps of time each may last.
     needs: channels that a log has to have to be asked about it: p position, v velocity, q attitude, w gyro,
     f accelerometer, v_bat voltage.
@@ -146,6 +156,7 @@ class Effect:
     battery: Hook | None = None
     gyro: Hook | None = None
     accelerometer: Hook | None = None
+    pose: Hook | None = None
     start: Callable[..., Any] | None = None
     remember: Callable[[Any, Any, StepContext], Any] | None = None
 

@@ -11,7 +11,9 @@ import numpy as np
 from flytrack_env.dynamics import ModelParameters, nominal_parameters
 from flytrack_env.motion import Motion
 from flytrack_sysid.diagnosis.lanes import Lanes, make_lanes, thinned, voltages_of
-from flytrack_sysid.diagnosis.motion_choice import likeliest_motion
+from flytrack_sysid.diagnosis.late_poses import with_late_poses
+from flytrack_sysid.diagnosis.lateness import judged_as_logged, latency_of, read_poses
+from flytrack_sysid.diagnosis.motion_choice import Moves, how_it_moves
 from flytrack_sysid.diagnosis.noise import first_guess
 from flytrack_sysid.diagnosis.problem import Problem
 from flytrack_sysid.diagnosis.refinement import Refined, refine
@@ -53,12 +55,19 @@ class DiagnosisError(ValueError):
 
 
 class Split(NamedTuple):
-    """A log, its rows held out, (num_rows,) bool, and the problems of learning from and judging by it."""
+    """A log, its rows held out, (num_rows,) bool, and the problems of learning from and judging by it.
 
+    log: with poses in time. logged: as it was, maybe more rows. as_logged: the lanes of both problems with
+    poses as logged; empty where these were in time. moves: how late they were.
+    """
+
+    logged: FlightLog
+    moves: Moves
     log: FlightLog
     held_out: np.ndarray
     train: Problem
     test: Problem
+    as_logged: tuple[Lanes, ...]
     warnings: tuple[str, ...]
 
 
@@ -92,9 +101,14 @@ def diagnose(
         refined = refined_by_prediction(selection, parts)
         report(3, len(STAGES))
         found = summarize(selection, contradicted, refined, parts._replace(test=test))
+        nominal = nominal_parameters() if model is None else model
+        nominal = nominal._replace(motion=found.extended.motion)
+        found = replace(found, nominal=nominal)
+        if parts.as_logged or latency_of(nominal):
+            problems = selection.state.problem, test
+            found = with_late_poses(found, parts.moves, nominal, problems, parts.as_logged)
         report(4, len(STAGES))
-    nominal = nominal_parameters() if model is None else model
-    return replace(found, nominal=nominal._replace(motion=found.extended.motion))
+    return found
 
 
 def split(
@@ -117,13 +131,33 @@ def split(
             f"held_out: found {out.dtype} of shape {out.shape}, expected bool of ({len(log)},)"
         )
     model = nominal_parameters() if model is None else model
-    tau, gravity = np.asarray(model.tau, float), float(model.g)
-    every, judged_by = (make_lanes(log, rows, tau, gravity) for rows in (~out, out))
-    lanes = thinned(every)
-    warnings += thinning_warning(every, lanes)
-    model = model._replace(motion=likeliest_motion(lanes, model) if motion is None else motion)
-    train, test = Problem.of(lanes, model), Problem.of(thinned(judged_by), model)
-    return Split(log, out, train, test, tuple(warnings))
+    with_motion = how_it_moves(log, model, ~out, motion)
+    model = model._replace(motion=with_motion.motion)
+    corrected, is_known = read_poses(log, with_motion.late_s)
+    corrected, out = corrected.select(is_known), out[is_known]
+    every, judged_by = (lanes_of(corrected, rows, model) for rows in (~out, out))
+    warnings += thinning_warning(every, thinned(every))
+    same_rows = log.select(is_known)
+    as_logged = tuple(thinned(lanes_of(same_rows, rows, model)) for rows in (~out, out) if with_motion.late_s)
+    train, test = (
+        problem_of(thinned(lanes), corrected, log, model, with_motion.late_s) for lanes in (every, judged_by)
+    )
+    return Split(log, with_motion, corrected, out, train, test, as_logged, tuple(warnings))
+
+
+def lanes_of(log: FlightLog, rows: np.ndarray, model: ModelParameters) -> Lanes:
+    """Return the lanes of a log of which some rows, (num_rows,) bool, count."""
+    return make_lanes(log, rows, np.asarray(model.tau, float), float(model.g))
+
+
+def problem_of(
+    lanes: Lanes, corrected: FlightLog, logged: FlightLog, model: ModelParameters, late_s: float
+) -> Problem:
+    """Return the problem of lanes of a corrected log, whose poses were logged late."""
+    if not late_s:
+        return Problem.of(lanes, model)
+    lanes, late = judged_as_logged(lanes, corrected, logged, late_s, model.motion)
+    return Problem.of(lanes, model, late=late)
 
 
 def refined_by_prediction(selection: Selection, parts: Split) -> Refined:
@@ -179,8 +213,8 @@ def summarize(selection: Selection, contradicted: Sequence[str], refined: Refine
         extended=model_of(problem, extended),
         noise=sensor_noise(problem),
         voltages=voltages_of(problem.lanes),
-        source=Path(parts.log.source).name,
-        sha256=parts.log.sha256,
+        source=Path(parts.logged.source).name,
+        sha256=parts.logged.sha256,
         warnings=(*parts.warnings, *warnings_of(problem, causes, lost), *refinement_notes(refined)),
         prediction=prediction,
         changed=changed_parameters(linearization, extended, refined),

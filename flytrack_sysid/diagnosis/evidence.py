@@ -148,6 +148,11 @@ EVIDENCE: dict[str, Evidence] = {
         _by_axis("rates", "spin_up", "xy") + _by_axis("attitude", "spin_up", "xy"),
         "The gyro lags behind (above), as the accelerometer does; the attitude does not (below).",
     ),
+    "mocap_latency": Evidence(
+        "latency of motion capture",
+        _by_axis("attitude", "spin_up", "xy") + _by_axis("rates", "spin_up", "xy"),
+        "The attitude lags behind (above), as position and velocity do; the gyro does not (below).",
+    ),
     "imu_offset": Evidence(
         "accelerometer away from the centre of mass",
         _by_axis("force", "turning"),

@@ -1,12 +1,15 @@
-"""Which motion a log shows: a simulator's step, or the continuous motion of a drone.
+"""How a log moves: by which motion, and how late its poses are against its gyro.
 
-Each motion is fitted with the base and the few effects that can pass for half a step of another motion
-(a delay, a latency, drag, scales), on some seconds of the log, and the likelihoods are compared. Unlike
-named effects, motions are not nested, so that a small difference decides; a minute's log tells them apart by
-hundreds to thousands.
+A motion is a simulator's step, or the continuous motion of a drone. Half a step of another motion looks like
+clocks that are half a step apart, so both are chosen together. The correlation of gyro and attitude says how
+late poses are under each motion. Each is fitted so with the base and the few effects that can pass for half
+a step (a delay, drag, scales), on some seconds of the log, the lateness of the likely ones along with it, and
+the likelihoods of what was logged are compared. Unlike named effects, motions are not nested, so that a small
+difference decides.
 """
 
-from collections.abc import Mapping
+from collections.abc import Sequence
+from typing import NamedTuple
 
 import jax
 import numpy as np
@@ -14,41 +17,203 @@ import numpy as np
 from flytrack_env.dynamics import ModelParameters
 from flytrack_env.effects import BY_NAME, Effect
 from flytrack_env.motion import Motion
+from flytrack_sysid.clocks import PAIRS, offset_between
 from flytrack_sysid.diagnosis import noise as noises
 from flytrack_sysid.diagnosis.lanes import Lanes, make_lanes
-from flytrack_sysid.diagnosis.problem import Problem
-from flytrack_sysid.diagnosis.score_test import BASE_FREE
+from flytrack_sysid.diagnosis.lateness import judged_as_logged, read_poses
+from flytrack_sysid.diagnosis.problem import Problem, blocks_of, robust_weight
+from flytrack_sysid.diagnosis.score_test import BASE_FREE, Linearization, solve
 from flytrack_sysid.diagnosis.search import refine
-from flytrack_sysid.log import FlightLog
+from flytrack_sysid.log import FlightLog, usual_step
 
 CLEAR = 10.0  # of minus twice the log likelihood, by which a simulator's step has to win
-MOST_LANES = 4  # evenly spread: twenty seconds decide
+NEAR = 300.0  # of it: within so much of the best, lateness is fitted before one is chosen
+UNDECIDED = 60.0  # of it: while the second best is so near, more of the log is asked
+MOST_LANES = 4  # at a time, evenly spread: twenty seconds decide mostly
+# What a correlation has to say: smaller offsets are within its bias, or its standard errors up to a bound.
+ON_TIME_S, STANDARD_ERRORS, UNCERTAIN_S = 0.7e-3, 3.0, 1.5e-3
+LEAST_S = 0.5e-3  # of a fitted lateness: a smaller one changes nothing
+DIFFERENCE_S, LONGEST_STEP_S = 2e-4, 3e-3  # for slopes; of a step of the fit
+ROUNDS = 2
 LOOK_ALIKES: tuple[Effect, ...] = tuple(
     BY_NAME[name]
-    for name in (
-        "command_delay",
-        "rate_scale",
-        "linear_drag",
-        "imu_latency",
-        "accelerometer_scale",
-        "gyro_scale",
-    )
+    for name in ("command_delay", "rate_scale", "linear_drag", "accelerometer_scale", "gyro_scale")
 )
 
 
-def misfit_of(lanes: Lanes, model: ModelParameters) -> float:
-    """Return minus twice the log likelihood of a log under a model's motion, all else fitted."""
-    problem = Problem.of(lanes, model, LOOK_ALIKES)
-    fields = [f"{effect.name}.{name}" for effect in LOOK_ALIKES for name in effect.ranges]
-    places = problem.index([*BASE_FREE, *fields])
-    vector = problem.start
-    noise = noises.first_guess(lanes, problem.residuals(vector[None])[0])
-    for _ in range(2):  # what is badly fitted passes for noise at first
+class Moves(NamedTuple):
+    """How a log moves. late_s: its poses against its gyro, 0 if on time; sigma_s: its standard error."""
+
+    motion: Motion
+    late_s: float = 0.0
+    sigma_s: float = 0.0
+
+
+class Trial(NamedTuple):
+    """A motion and a lateness, and what was fitted under them."""
+
+    moves: Moves
+    problem: Problem
+    vector: np.ndarray
+
+
+class Seen(NamedTuple):
+    """Rows of a log to learn from, (num_rows,) bool, a model to start from, and the part that is looked at.
+
+    num_parts: of some lanes each.
+    """
+
+    log: FlightLog
+    judged: np.ndarray
+    model: ModelParameters
+    part: int = 0
+    num_parts: int = 1
+
+    def lanes(self, log: FlightLog) -> Lanes:
+        """Return the lanes of this part; in ``log`` poses may be at other times."""
+        lanes = make_lanes(log, self.judged, np.asarray(self.model.tau, float), float(self.model.g))
+        return lanes.selected(np.arange(self.part, lanes.row.shape[1], self.num_parts)[:MOST_LANES])
+
+    def problem(self, moves: Moves) -> Problem:
+        """Return the problem of a log that moves so."""
+        model, log, late_s = self.model._replace(motion=moves.motion), self.log, moves.late_s
+        if not late_s:
+            return Problem.of(self.lanes(log), model, LOOK_ALIKES)
+        in_time = read_poses(log, late_s)[0]
+        lanes, late = judged_as_logged(self.lanes(in_time), in_time, log, late_s, moves.motion)
+        return Problem.of(lanes, model, LOOK_ALIKES, late)
+
+
+def _places(problem: Problem) -> list[int]:
+    return problem.index([*BASE_FREE, *(f"{one.name}.{name}" for one in LOOK_ALIKES for name in one.ranges)])
+
+
+def _fit(seen: Seen, moves: Moves, last: Trial | None = None) -> Trial:
+    """Return a fit, from that of a similar lateness if there is one."""
+    problem = seen.problem(moves)
+    vector = problem.start if last is None else last.vector
+    noise = None if last is None else last.problem.noise
+    if noise is None:
+        noise = noises.first_guess(problem.lanes, problem.residuals(vector[None])[0])
+    for _ in range(2 if last is None else 1):  # what is badly fitted passes for noise at first
         problem = problem.with_noise(noise)
-        vector, _ = refine(problem, vector, places)
-        left = problem.residuals(vector[None])[0]
-        noise = noises.fit_noise(lanes, left, noise)
-    return noises.total_misfit(lanes, left, noise)
+        vector, _ = refine(problem, vector, _places(problem))
+        noise = noises.fit_noise(problem.lanes, problem.residuals(vector[None])[0], noise)
+    return Trial(moves, problem.with_noise(noise), vector)
+
+
+def _with_later_poses(seen: Seen, trial: Trial) -> Moves:
+    """Return the lateness that fits better, all else refitted, to first order."""
+    moves, problem, vector = trial
+    later = seen.problem(moves._replace(late_s=moves.late_s + DIFFERENCE_S))
+    change = (later.residuals(vector[None]) - problem.residuals(vector[None])) / DIFFERENCE_S
+    linearization = Linearization(problem, problem.slopes(vector, _places(problem)))
+    root = np.sqrt(robust_weight(linearization.white))
+    column = problem.whiten(np.where(problem.counts & later.counts, change, 0.0))
+    own, rest = blocks_of(column * root)[:, 0], blocks_of(linearization.columns * root)
+    across = np.einsum("bpn,bn->p", rest, own)
+    share = solve(linearization.total, across)
+    information = float(np.sum(own**2) - across @ share)
+    score = -float(np.sum(own * blocks_of(linearization.white * root))) - float(share @ linearization.score)
+    step_s = np.clip(score / information, -LONGEST_STEP_S, LONGEST_STEP_S)
+    return Moves(moves.motion, moves.late_s + float(step_s), information**-0.5)
+
+
+def _fit_lateness(seen: Seen, trial: Trial, rounds: int = ROUNDS) -> Trial:
+    for _ in range(rounds if trial.moves.late_s else 0):
+        moves = _with_later_poses(seen, trial)
+        trial = _fit(seen, moves, trial)
+    return trial
+
+
+def _misfits(trials: Sequence[Trial]) -> list[float]:
+    """Return minus twice the log likelihoods of the rows that all trials judge."""
+    counts = np.logical_and.reduce([trial.problem.counts for trial in trials])
+    misfits = []
+    for _, problem, vector in trials:
+        lanes, left = problem.lanes._replace(counts=counts), problem.residuals(vector[None])[0]
+        misfits.append(noises.total_misfit(lanes, left, noises.fit_noise(lanes, left, problem.noise)))
+    return misfits
+
+
+def _apparent_lateness(log: FlightLog) -> tuple[float, float] | None:
+    """Return how late poses are by correlation, s, and its standard error; None where it cannot tell."""
+    for _, _, needed, sums, rates in PAIRS[:2]:
+        if all(name in log for name in needed):
+            offset_s, sigma_s, _, reason = offset_between(log, sums(log), rates(log))
+            return None if reason else (offset_s, sigma_s)
+    return None
+
+
+def how_it_moves(
+    log: FlightLog, model: ModelParameters, judged: np.ndarray, motion: Motion | None = None
+) -> Moves:
+    """Return how a log moves, likeliest on judged rows, (num_rows,) bool, in float64.
+
+    model: where the search starts. motion: the only one that is tried, if given. A drone's where the log
+    hardly tells.
+    """
+    motions, apparent = tuple(Motion) if motion is None else (motion,), _apparent_lateness(log)
+    late = {one: Moves(one) for one in motions}
+    if apparent is not None:
+        offset_s, sigma_s = apparent
+        half_s = 0.5 * float(
+            np.median(usual_step(log))
+        )  # rates of a simulator's step are those in its middle
+        is_small = max(ON_TIME_S, min(STANDARD_ERRORS * sigma_s, UNCERTAIN_S))
+        for one in motions:
+            late_s = offset_s if one is Motion.CONTINUOUS else offset_s + half_s
+            if abs(late_s) > is_small:
+                late[one] = Moves(one, late_s, sigma_s)
+    if motion is not None and not late[motion].late_s:
+        return late[motion]
+    seen = Seen(log, judged & _known_around(log, list(late.values())), model)
+    number = seen.lanes(log).row.shape[1]
+    found = _chosen(seen._replace(num_parts=max(number // MOST_LANES, 1)), list(late.values()))
+    is_late = found.late_s > max(LEAST_S, STANDARD_ERRORS * found.sigma_s)
+    return found if is_late else Moves(found.motion)
+
+
+def _known_around(log: FlightLog, moves: Sequence[Moves]) -> np.ndarray:
+    """Return the rows at which poses can be read so much later, or a few steps of a fit more."""
+    room = ROUNDS * LONGEST_STEP_S + DIFFERENCE_S
+    late_s = [one.late_s for one in moves]
+    ends = (min(0.0, min(late_s) - room), max(late_s) + room) if any(late_s) else (0.0,)
+    return np.logical_and.reduce([read_poses(log, end_s)[1] for end_s in ends])
+
+
+def _chosen(seen: Seen, late: Sequence[Moves]) -> Moves:
+    """Return the likeliest of several; those that come near the best are fitted further."""
+    trials = [_fit(seen, moves) for moves in late]
+    misfits = _misfits(trials)
+    trials = [
+        _fit_lateness(seen, trial) if misfit < min(misfits) + NEAR else trial
+        for trial, misfit in zip(trials, misfits, strict=True)
+    ]
+    misfits = _misfits(trials)
+    for part in range(1, seen.num_parts):
+        kept = [place for place, misfit in enumerate(misfits) if misfit < min(misfits) + UNDECIDED]
+        if len(kept) < 2:
+            break
+        other, trials = seen._replace(part=part), [trials[place] for place in kept]
+        again = [_fit_lateness(other, _fit(other, one.moves, one), rounds=1) for one in trials]
+        misfits = list(np.array(misfits)[kept] + _misfits(again))
+        trials = [_both(*pair) for pair in zip(trials, again, strict=True)]
+    best = int(np.argmin(misfits))
+    for trial, misfit in zip(trials, misfits, strict=True):
+        if trial.moves.motion is Motion.CONTINUOUS and misfit - misfits[best] <= CLEAR:
+            return trial.moves
+    return trials[best].moves
+
+
+def _both(first: Trial, second: Trial) -> Trial:
+    """Return the second trial with the lateness that both say."""
+    (motion, one_s, sigma_s), (_, other_s, other_sigma_s) = first.moves, second.moves
+    if not one_s:
+        return second
+    weights = np.array([sigma_s, other_sigma_s]) ** -2.0
+    late_s = float(weights @ [one_s, other_s] / weights.sum())
+    return second._replace(moves=Moves(motion, late_s, float(weights.sum() ** -0.5)))
 
 
 def motion_of(log: FlightLog, model: ModelParameters) -> Motion:
@@ -59,21 +224,4 @@ def motion_of(log: FlightLog, model: ModelParameters) -> Motion:
     if "w" not in log and "q" not in log:
         return model.motion
     with jax.enable_x64(True):
-        lanes = make_lanes(log, np.ones(len(log), bool), np.asarray(model.tau, float), float(model.g))
-        return likeliest_motion(lanes, model)
-
-
-def likeliest_motion(lanes: Lanes, model: ModelParameters) -> Motion:
-    """Return the motion under which a log is likeliest, in float64; a drone's where the log hardly tells."""
-    misfits = motion_misfits(lanes, model)
-    best = min(misfits, key=lambda motion: misfits[motion])
-    is_clear = misfits[Motion.CONTINUOUS] - misfits[best] > CLEAR
-    return best if is_clear else Motion.CONTINUOUS
-
-
-def motion_misfits(lanes: Lanes, model: ModelParameters) -> Mapping[Motion, float]:
-    """Return minus twice the log likelihood of a log by motion, in float64."""
-    number = lanes.row.shape[1]
-    if number > MOST_LANES:
-        lanes = lanes.selected(np.linspace(0, number - 1, MOST_LANES).round().astype(int))
-    return {motion: misfit_of(lanes, model._replace(motion=motion)) for motion in Motion}
+        return how_it_moves(log, model, np.ones(len(log), bool)).motion

@@ -27,10 +27,13 @@ from flytrack_env.effects import BY_NAME, EFFECTS, Effect, effect_of
 from flytrack_env.quaternion import Quaternion, Vec3
 from flytrack_sysid.diagnosis import noise as noises
 from flytrack_sysid.diagnosis.lanes import LANE_S, Lanes, lead_in_of
+from flytrack_sysid.diagnosis.lateness import Late
 from flytrack_sysid.parameters import TAUS, bounds_of, from_vector, names_of, to_vector
 from flytrack_sysid.record import Record
 from flytrack_sysid.replay import Step, replay
 
+# What a replay can show: it is fed with poses, so that how late these are has to be known before.
+REPLAYED = tuple(effect for effect in EFFECTS if effect.pose is None)
 BATCH, SMALL_BATCH = 20, 4
 RELATIVE_STEP = 1e-6  # of a parameter's scale, for slopes
 
@@ -114,7 +117,8 @@ class Problem:
 
     like: the nominal model with every effect, float64. given_effects: those that the nominal model has.
     low, high, scale: of each parameter, its bounds and the size of its steps. noise: (6, NUM_AXES), as of
-    ``noise.fit_noise``, and gains of its filter; None before ``with_noise``.
+    ``noise.fit_noise``, and gains of its filter; None before ``with_noise``. late: of lanes whose poses were
+    corrected.
     """
 
     lanes: Lanes
@@ -127,10 +131,18 @@ class Problem:
     scale: np.ndarray
     noise: np.ndarray | None = None
     gains: noises.Gains | None = None
+    late: Late | None = None
 
     @classmethod
-    def of(cls, lanes: Lanes, model: ModelParameters, effects: Sequence[Effect] = EFFECTS) -> "Problem":
+    def of(
+        cls,
+        lanes: Lanes,
+        model: ModelParameters,
+        effects: Sequence[Effect] = REPLAYED,
+        late: Late | None = None,
+    ) -> "Problem":
         """Return the problem of lanes and a nominal model that may have some effects, without a noise."""
+        model = as_replayed(model)
         every = model.with_effects(*(model.effect(effect.name) for effect in effects))
         like = jax.tree.map(lambda leaf: np.asarray(leaf, float), every)
         names, start = names_of(like), to_vector(like)
@@ -144,6 +156,7 @@ class Problem:
             low=low,
             high=np.minimum(high, _longest(names, lanes)),
             scale=np.array([_scale(name, value) for name, value in zip(names, start, strict=True)]),
+            late=late,
         )
 
     def with_noise(self, noise: np.ndarray) -> "Problem":
@@ -165,7 +178,8 @@ class Problem:
 
     def residuals(self, vectors: np.ndarray) -> np.ndarray:
         """Return residuals of models (num_models, parameters), (num_models, rows, lanes, NUM_AXES, 2)."""
-        return _in_batches(lambda part: _residuals(part, self.like, self.lanes), vectors)
+        found = _in_batches(lambda part: _residuals(part, self.like, self.lanes), vectors)
+        return found if self.late is None else self.late.residuals(found)
 
     def whiten(self, left: np.ndarray, axes: slice = slice(None)) -> np.ndarray:
         """Return residuals (num_models, rows, lanes, NUM_AXES, 2), or those of some axes, as innovations."""
@@ -211,6 +225,11 @@ def _in_batches(program: Callable[[np.ndarray], jax.Array], values: np.ndarray) 
         filled = np.concatenate([part, np.repeat(part[-1:], size - len(part), axis=0)])
         parts.append(np.asarray(program(filled))[: len(part)])
     return np.concatenate(parts)
+
+
+def as_replayed(model: ModelParameters) -> ModelParameters:
+    """Return a model without the effects on poses."""
+    return model._replace(effects=tuple(one for one in model.effects if effect_of(one) in REPLAYED))
 
 
 def _longest(names: Sequence[str], lanes: Lanes) -> np.ndarray:

@@ -12,8 +12,15 @@ from typing import NamedTuple
 import numpy as np
 from scipy import linalg, stats
 
-from flytrack_env.effects import BY_NAME, EFFECTS, Effect
-from flytrack_sysid.diagnosis.problem import Problem, Slopes, blocks_of, robust_square, robust_weight
+from flytrack_env.effects import BY_NAME, Effect
+from flytrack_sysid.diagnosis.problem import (
+    REPLAYED,
+    Problem,
+    Slopes,
+    blocks_of,
+    robust_square,
+    robust_weight,
+)
 from flytrack_sysid.parameters import DRAIN, TAUS, THRUST_COEFFS, bounds_of, neutral_value
 
 CHANCE = 1e-4  # of a name where there is nothing, for each effect
@@ -83,7 +90,7 @@ def candidates_of(effect: Effect) -> list[Candidate]:
     return found
 
 
-CANDIDATES = [candidate for effect in EFFECTS for candidate in candidates_of(effect)]
+CANDIDATES = [candidate for effect in REPLAYED for candidate in candidates_of(effect)]
 PROBES = list(dict.fromkeys(probe for candidate in CANDIDATES for probe in candidate.probes))
 
 

@@ -6,9 +6,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from flytrack_env.effects import EFFECTS
 from flytrack_sysid.diagnosis import noise as noises
-from flytrack_sysid.diagnosis.problem import SMALL_BATCH, Problem
+from flytrack_sysid.diagnosis.problem import REPLAYED, SMALL_BATCH, Problem
 from flytrack_sysid.diagnosis.score_test import (
     BASE_FREE,
     CANDIDATES,
@@ -80,7 +79,7 @@ class SearchState:
     def start(cls, log: FlightLog, problem: Problem) -> "SearchState":
         """Return the state before anything was searched for. problem: of rows of the log, with a noise."""
         channels = {*log.channels, *problem.lanes.measured}
-        lacking = tuple(effect.name for effect in EFFECTS if not set(effect.needs) <= channels)
+        lacking = tuple(effect.name for effect in REPLAYED if not set(effect.needs) <= channels)
         return cls(problem, unobservable=lacking)
 
     @property

@@ -22,10 +22,10 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from flytrack_env.dynamics import ModelParameters, lag
-from flytrack_env.effects import EFFECTS
 from flytrack_env.state import Action
 from flytrack_sysid.diagnosis.lanes import AXES, Lanes, lead_in_of, make_lanes
-from flytrack_sysid.diagnosis.problem import Problem
+from flytrack_sysid.diagnosis.lateness import latency_of, read_poses
+from flytrack_sysid.diagnosis.problem import REPLAYED, Problem, as_replayed
 from flytrack_sysid.diagnosis.result import CHANNELS
 from flytrack_sysid.log import FlightLog
 from flytrack_sysid.parameters import STICKS, to_vector
@@ -220,7 +220,7 @@ def _predicted(
 
 
 def traces(log: FlightLog, models: Mapping[str, ModelParameters], like: str) -> Traces:
-    """Return the residuals of models on all rows of a log.
+    """Return the residuals of models on the rows of a log at which they know the pose, each by its latency.
 
     like: name of the model whose lags, rates and wind make the regressors; a delay of commands does not
     enter. Regressors of a row are those of the step to it: what was flown and commanded in the row before,
@@ -230,13 +230,21 @@ def traces(log: FlightLog, models: Mapping[str, ModelParameters], like: str) -> 
         KeyError: ``like`` is not one of the models.
     """
     base = models[like]
+    logs = {late_s: read_poses(log, late_s) for late_s in map(latency_of, models.values())}
+    is_known = np.logical_and.reduce([known for _, known in logs.values()])
+    in_time = {late_s: moved.select(is_known) for late_s, (moved, _) in logs.items()}
+    log = in_time[latency_of(base)]
     with jax.enable_x64(True):
-        lanes = make_lanes(log, np.ones(len(log), bool), np.asarray(base.tau, float), float(base.g))
-        problem = Problem.of(lanes, base)
-        every = [
-            model.with_effects(*(model.effect(one.name) for one in EFFECTS)) for model in models.values()
-        ]
-        left = problem.residuals(np.array([to_vector(model) for model in every]))
+        by_lateness = {
+            late_s: make_lanes(one, np.ones(len(one), bool), np.asarray(base.tau, float), float(base.g))
+            for late_s, one in in_time.items()
+        }
+        left = []
+        for model in models.values():
+            problem = Problem.of(by_lateness[latency_of(model)], base)
+            every = as_replayed(model).with_effects(*(model.effect(one.name) for one in REPLAYED))
+            left.append(problem.residuals(to_vector(every)[None])[0])
+        lanes = by_lateness[latency_of(base)]
         lagged = _lagged(lanes.record, np.asarray(base.tau, float))
         applied = np.stack([np.asarray(stick) for stick in lagged], axis=-1)
     rows = _rows_of(lanes)

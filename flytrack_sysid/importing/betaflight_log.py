@@ -15,10 +15,10 @@ from flytrack_env.messages import error_text, quote_name, quote_value
 from flytrack_sysid.importing.decoding import decode
 from flytrack_sysid.importing.flight import ImportedFlight, not_a_quadcopter, saturation
 from flytrack_sysid.importing.mapping import Mapping
-from flytrack_sysid.importing.resample import is_increasing
 from flytrack_sysid.importing.units import GRAVITY, PER_DEGREE, UNITS
 from flytrack_sysid.log import CHANNELS, LogError
 from flytrack_sysid.log_table import Table, log_of_table
+from flytrack_sysid.resample import is_increasing
 
 FIRMWARE = "Betaflight"
 LARGEST_BYTES = 2**29  # of a flash chip

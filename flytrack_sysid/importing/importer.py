@@ -12,18 +12,18 @@ import numpy as np
 from flytrack_env.dynamics import ModelParameters
 from flytrack_env.files import read_at_most, write_atomically
 from flytrack_env.messages import error_text, quote_name, quote_value
+from flytrack_sysid.clocks import ClockOffset, align_clocks
 from flytrack_sysid.importing.bag_log import read_bag
 from flytrack_sysid.importing.betaflight_log import read_betaflight
-from flytrack_sysid.importing.clocks import ClockOffset, align_clocks
 from flytrack_sysid.importing.csv_log import read_csv
 from flytrack_sysid.importing.flight import Craft, ImportedFlight
 from flytrack_sysid.importing.mapping import Manifest, Mapping, load_mapping
-from flytrack_sysid.importing.resample import SLOW_STEP_S
 from flytrack_sysid.importing.ulog_log import read_ulog
 from flytrack_sysid.importing.usd_log import read_usd
 from flytrack_sysid.log import FlightLog, LogError, usual_step
 from flytrack_sysid.log_file import describe
 from flytrack_sysid.plausibility import find_problems
+from flytrack_sysid.resample import SLOW_STEP_S
 
 READERS = {
     "csv": lambda path, mapping: [read_csv(path, mapping)],
@@ -92,7 +92,7 @@ def import_log(
 
     paths: one file or several. format: of ``FORMATS``. mapping: a mapping file, or the name of a shipped
     one; CSV, uSD logs and bags need it, other formats use its ``rows`` and ``craft``. align: correct
-    significant offsets between the sensors' clocks (``flytrack_sysid.importing.clocks``) instead of only
+    significant offsets between the sensors' clocks (``flytrack_sysid.clocks``) instead of only
     reporting them. Voltages that neither files nor mapping state are those of the log, where all are above 0.
 
     Raises:

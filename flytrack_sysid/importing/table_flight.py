@@ -9,9 +9,9 @@ from flytrack_env.messages import quote_name
 from flytrack_sysid.importing.commands import commands_of
 from flytrack_sysid.importing.flight import ImportedFlight
 from flytrack_sysid.importing.mapping import Channel, Mapping
-from flytrack_sysid.importing.resample import Samples, is_increasing, on_one_base, slow_channels
 from flytrack_sysid.log import CHANNELS, LogError
 from flytrack_sysid.log_table import Table, log_of_table
+from flytrack_sysid.resample import Samples, is_increasing, on_one_base, slow_channels
 
 LONGEST_LIST = 1000  # characters of a header in a message
 TIMESTAMP = "timestamp"  # column of a table's own times, s

@@ -14,10 +14,10 @@ from flytrack_env.messages import error_text
 from flytrack_sysid.importing.decoding import decode
 from flytrack_sysid.importing.flight import ImportedFlight, not_a_quadcopter
 from flytrack_sysid.importing.mapping import Mapping
-from flytrack_sysid.importing.resample import Samples, is_increasing, on_one_base, slow_channels
 from flytrack_sysid.importing.units import PER_DEGREE, UNITS, quaternion_from, vector_from
 from flytrack_sysid.log import CHANNELS, LogError
 from flytrack_sysid.log_table import LARGEST_NORM_ERROR, Table, log_of_table
+from flytrack_sysid.resample import Samples, is_increasing, on_one_base, slow_channels
 
 LARGEST_BYTES = 2**29  # the decoder may take time and memory in proportion
 FIRST_BYTES = b"ULog\x01\x12\x35"

@@ -91,11 +91,12 @@ def test_probes_show_the_effect(effect: Effect) -> None:
 
 
 # Components of the state and of the sensors' readings after one step that an effect at this stage may change.
-GYRO, ACCELEROMETER = {*range(21, 24)}, {*range(24, 27)}
-FORCE = {*range(0, 9)} | ACCELEROMETER
-CHANGES = {"command": set(range(27)) - {20}, "rates": {*range(9, 16)} | GYRO, "thrust": FORCE, "air": FORCE}
+GYRO, ACCELEROMETER, POSE = {*range(21, 24)}, {*range(24, 27)}, {*range(27, 37)}
+FORCE = {*range(0, 9), *range(27, 33)} | ACCELEROMETER
+TURN = {*range(9, 16), *range(33, 37)} | GYRO
+CHANGES = {"command": set(range(37)) - {20}, "rates": TURN, "thrust": FORCE, "air": FORCE}
 CHANGES |= {"lag": CHANGES["command"], "force": FORCE, "battery": {20}}
-CHANGES |= {"gyro": GYRO, "accelerometer": ACCELEROMETER}
+CHANGES |= {"gyro": GYRO, "accelerometer": ACCELEROMETER, "pose": POSE}
 
 
 @OVER_EFFECTS
@@ -122,7 +123,7 @@ def test_sensor_effects_change_readings_and_never_the_flight() -> None:
 
 @jax.jit
 def final_and_slope(effects: tuple[Any, ...], change: tuple[Any, ...]) -> tuple[jax.Array, jax.Array]:
-    """Return the last row of a short flight, (27,), and its derivative along a change of the parameters."""
+    """Return the last row of a short flight, (37,), and its derivative along a change of the parameters."""
     drone, commands = random_drone(1), 0.9 * random_commands(1, 14)
 
     def final(effects: tuple[Any, ...]) -> jax.Array:

@@ -18,12 +18,14 @@ from benchmarks.hidden import Truth, draw_base, draw_outside, fly, measure
 from flytrack_env import load_model
 from flytrack_env.dynamics import nominal_parameters
 from flytrack_env.effects import BY_NAME, LinearDrag
+from flytrack_env.motion import Motion
 from flytrack_sysid.diagnosis import Diagnosis, DiagnosisError, diagnose, write_diagnosis
 from flytrack_sysid.log import FlightLog
 from flytrack_sysid.split import blocks_of, held_out_rows
 from tests.support.diagnosis_cases import CASES, HELD_OUT_EVERY, SEED, Case, rng_of
 
 SHORT_S, BLOCK_S = 20.0, 5.0  # every other block is held out: both parts share one compiled program
+LATE_S = 0.0164
 DRAG = {"d_x": 0.4, "d_y": 0.4, "d_z": 0.2}
 BROKEN = ("stuck_gyro", "stuck_commands")
 CHANNELS = {"rates", "attitude", "force", "velocity", "battery"}
@@ -40,13 +42,14 @@ def short_flight(truth: Truth, rng: np.random.Generator) -> tuple[Diagnosis, Fli
 
 @pytest.fixture(scope="session")
 def short() -> dict[str, tuple[Diagnosis, FlightLog]]:
-    """Diagnoses of plants in fine steps: clean, with drag, and with a force that no list has."""
+    """Diagnoses of plants in fine steps: clean, with drag, with a force that no list has, with late poses."""
     rng = np.random.default_rng(3)
     base = replace(draw_base(rng), motion="fine")
     plants = {
         "clean": base,
         "drag": replace(base, effects={"linear_drag": DRAG}),
         "outside": replace(base, outside=draw_outside(rng, "heading", 2.0)),
+        "late": replace(base, mocap_late_s=LATE_S),
     }
     return {name: short_flight(truth, rng) for name, truth in plants.items()}
 
@@ -89,13 +92,24 @@ def test_a_hidden_effect_is_found_and_measured(short) -> None:
         assert abs(one.value - DRAG[name]) <= WIDENED * 0.5 * (one.ci95[1] - one.ci95[0])
 
 
+def test_late_motion_capture_is_named_and_corrected(short, tmp_path: Path) -> None:
+    found, log = short["late"]
+    (cause,) = found.causes
+    low, high = cause.parameters["latency_s"].ci95
+    assert cause.effect == "mocap_latency" and cause.heldout_gain > 0.0 and found.verdict == "causes_found"
+    assert abs(cause.parameters["latency_s"].value - LATE_S) < 1e-3 and high - low < 2e-3
+    assert found.extended.motion is Motion.CONTINUOUS
+    write_diagnosis(tmp_path, found, log)
+    assert load_model(tmp_path / "extended_model.json").effect("mocap_latency").latency_s > 0.0
+
+
 def test_what_no_list_has_is_flagged_and_not_named(short) -> None:
     found, _ = short["outside"]
     assert found.causes == () and found.verdict == "unexplained"
     assert "heading" in found.unexplained.depends_on
 
 
-@pytest.mark.parametrize("name", ["clean", "drag", "outside"])
+@pytest.mark.parametrize("name", ["clean", "drag", "outside", "late"])
 def test_a_diagnosis_has_its_content(name, short) -> None:
     found, log = short[name]
     content = json.loads(json.dumps(found.as_json(), allow_nan=False))

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from flytrack_env.dynamics import ModelParameters, move, nominal_parameters, read_sensors
+from flytrack_env.dynamics import ModelParameters, move, nominal_parameters, read_sensors, sensed
 from flytrack_env.effects import EFFECTS, MOST_STEPS
 from flytrack_env.plants import Simulator, SimulatorState
 from flytrack_env.state import BATTERY, QUATERNION, Action, Drone, pack, unpack, unpack_action
@@ -21,13 +21,16 @@ _SIMULATOR = Simulator(MOST_STEPS)
 
 @jax.jit
 def fly(drone: Drone, commands: jax.Array, model: ModelParameters) -> jax.Array:
-    """Return the packed states after each command, gyro and accelerometer behind them, (num_steps, 27)."""
+    """Return the packed states after each command, behind them gyro, accelerometer, pose, (num_steps, 37)."""
 
     def one(state: Any, action: jax.Array) -> tuple[Any, jax.Array]:
         moved = move(*state, unpack_action(action), DT, model)
         reading = read_sensors(moved, model)
         after = SimulatorState(moved.after, moved.memories)
-        return after, jnp.concatenate([pack(after.drone), jnp.stack([*reading.rates_b, *reading.force_b])])
+        seen = sensed(after.drone, after.memories, DT, model)
+        pose = [*seen.pos_w, *seen.vel_w, *seen.quat]
+        readings = jnp.stack([*reading.rates_b, *reading.force_b, *pose])
+        return after, jnp.concatenate([pack(after.drone), readings])
 
     return jax.lax.scan(one, _SIMULATOR.reset(drone, model), commands)[1]
 
@@ -35,7 +38,7 @@ def fly(drone: Drone, commands: jax.Array, model: ModelParameters) -> jax.Array:
 def flown(
     parameters: Any = (), commands: Any = None, drone: Drone | None = None, model: ModelParameters = NOMINAL
 ) -> np.ndarray:
-    """Return a flight, (num_steps, 27), float64, with one effect or a tuple of them."""
+    """Return a flight, (num_steps, 37), float64, with one effect or a tuple of them."""
     effects = parameters if type(parameters) is tuple else (parameters,)
     full = model._replace(effects=ALL_NEUTRAL.effects).with_effects(*effects)
     commands = held(1) if commands is None else np.asarray(commands, np.float32)

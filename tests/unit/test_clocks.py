@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from flytrack_sysid import FlightLog
-from flytrack_sysid.importing import clocks
+from flytrack_sysid import FlightLog, clocks
 from tests.support.made_flight import TIME_S, flight, noisy
 
 

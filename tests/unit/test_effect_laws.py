@@ -20,6 +20,7 @@ from flytrack_env.effects import (
     ImuLatency,
     ImuOffset,
     LinearDrag,
+    MocapLatency,
     MotorImbalance,
     QuadraticDrag,
     RateCrossCoupling,
@@ -342,6 +343,21 @@ def test_late_sensors_read_the_past(steps: float) -> None:
         known = np.concatenate([np.tile(before, (USUAL_STEPS, 1)), truth])
         then = [np.interp(time[USUAL_STEPS:] - steps, time, known[:, axis]) for axis in range(3)]
         assert_reads(found, np.stack(then, axis=1))
+
+
+@pytest.mark.parametrize("steps", [1.0, 3.0, 0.3, 2.6])
+def test_late_poses_are_those_of_the_past(steps: float) -> None:
+    """Before the flight the drone is taken to have been where it starts."""
+    drone, commands = random_drone(3), random_commands(3, 20)
+    found = flown(MocapLatency(steps * DT), commands, drone)
+    start = np.concatenate([drone.pos_w, drone.vel_w, drone.quat])
+    true = np.concatenate([np.tile(start, (5, 1)), found[:, [*range(6), *range(9, 13)]]])
+    rows = np.arange(len(true), dtype=float)
+    then = np.stack([np.interp(rows[5:] - steps, rows, column) for column in true.T], axis=1)
+    then[:, 6:] /= np.linalg.norm(then[:, 6:], axis=1, keepdims=True)
+    signs = np.sign(np.sum(then[:, 6:] * found[:, 33:37], axis=1, keepdims=True))
+    assert_reads(found[:, 27:33], then[:, :6])
+    assert_reads(signs * found[:, 33:37], then[:, 6:])
 
 
 # --- What the environment shows of the gyro ---------------------------------------------------------

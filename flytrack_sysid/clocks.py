@@ -9,7 +9,7 @@ that both are filtered alike; the offset minimises the squared difference (Gauss
 grid), and a jackknife over blocks of 2 s gives its standard error (Efron and Tibshirani 1993, chapter 11).
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from itertools import pairwise
 from typing import NamedTuple
@@ -18,10 +18,9 @@ import numpy as np
 from scipy.interpolate import make_interp_spline
 from scipy.spatial.transform import Rotation
 
-from flytrack_sysid.importing.resample import interpolate, interpolate_quaternions
-from flytrack_sysid.importing.units import GRAVITY
 from flytrack_sysid.log import GAP_STEPS, FlightLog, usual_step
-from flytrack_sysid.plausibility import LEAST_CORRELATION, summed_turns
+from flytrack_sysid.plausibility import GRAVITY, LEAST_CORRELATION, summed_turns
+from flytrack_sysid.resample import interpolate, interpolate_quaternions
 
 LARGEST_OFFSET_S = 0.25  # beyond it, loggers are broken rather than late
 WINDOW_S = 0.1  # long against the noise of a sample, short against manoeuvres
@@ -141,7 +140,7 @@ def _sums(stretches: list[_Stretch], offset_s: float) -> tuple[np.ndarray, np.nd
     return np.concatenate(numerator), np.concatenate(denominator), float(correlation)
 
 
-def _offset(log: FlightLog, sums: np.ndarray, rates: np.ndarray) -> tuple[float, float, float, str]:
+def offset_between(log: FlightLog, sums: np.ndarray, rates: np.ndarray) -> tuple[float, float, float, str]:
     """Return offset, standard error and correlation, or why they are unknown (else empty)."""
     unknown = np.nan, np.nan, np.nan
     stretches = _stretches(log, sums, rates)
@@ -168,16 +167,22 @@ def _offset(log: FlightLog, sums: np.ndarray, rates: np.ndarray) -> tuple[float,
     return offset, sigma, correlation, ""
 
 
-def _shift(log: FlightLog, channel: str, offset_s: float) -> FlightLog:
-    """Return the log with one channel read ``offset_s`` later, without the rows where that is unknown."""
-    values = np.array(log[channel], float)
-    is_known = np.zeros(len(log), bool)
+def read_later(log: FlightLog, channels: Sequence[str], offset_s: float) -> tuple[FlightLog, np.ndarray]:
+    """Return the log with some channels read ``offset_s`` later, and the rows where that is known.
+
+    Interpolated; what is not known, (num_rows,) bool False, is anything.
+    """
+    found, is_known = dict(log.channels), np.ones(len(log), bool)
     bounds = np.append(np.flatnonzero(log.is_start()), len(log))
-    look_up = interpolate_quaternions if channel == "q" else interpolate
-    for start, end in pairwise(bounds):
-        rows = slice(start, end)
-        values[rows], is_known[rows] = look_up(log.time[rows], log[channel][rows], log.time[rows] + offset_s)
-    return replace(log, channels={**log.channels, channel: values}).select(is_known)
+    for channel in channels:
+        values, is_there = np.array(log[channel], float), np.zeros(len(log), bool)
+        look_up = interpolate_quaternions if channel == "q" else interpolate
+        for rows in (slice(start, end) for start, end in pairwise(bounds)):
+            times = log.time[rows]
+            values[rows], is_there[rows] = look_up(times, log[channel][rows], times + offset_s)
+        found[channel] = values
+        is_known &= is_there
+    return replace(log, channels=found), is_known
 
 
 def align_clocks(log: FlightLog, correct: bool = True) -> tuple[FlightLog, tuple[ClockOffset, ...]]:
@@ -191,11 +196,13 @@ def align_clocks(log: FlightLog, correct: bool = True) -> tuple[FlightLog, tuple
     for channel, reference, needed, sums, rates in PAIRS:
         if any(name not in log for name in needed):
             continue
-        offset, sigma, correlation, verdict = _offset(aligned, sums(aligned), rates(aligned))
+        offset, sigma, correlation, verdict = offset_between(aligned, sums(aligned), rates(aligned))
         step = float(np.median(usual_step(aligned)))
         if not verdict and (abs(offset) <= SIGNIFICANT * sigma or abs(offset) <= LEAST_STEPS * step):
             verdict = "not significant, left"
         elif not verdict:
-            aligned, verdict = _shift(aligned, channel, offset), CORRECTED if correct else LEFT
+            shifted, is_known = read_later(aligned, (channel,), offset)
+            aligned = shifted.select(is_known)
+            verdict = CORRECTED if correct else LEFT
         found.append(ClockOffset(channel, reference, offset, sigma, correlation, verdict))
     return aligned if correct else log, tuple(found)

@@ -55,11 +55,10 @@ def interpolate_quaternions(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return quaternions (num_at, 4) on the arc between their neighbours, and where they are known."""
     _, _, is_known = _brackets(times, at)
-    found = np.tile(quat[:1], (len(at), 1))
-    if is_known.any():
-        arcs = Slerp(times, Rotation.from_quat(quat, scalar_first=True))
-        found[is_known] = arcs(at[is_known]).as_quat(scalar_first=True)
-    return found, is_known
+    if len(times) < 2:
+        return np.tile(quat[:1], (len(at), 1)), is_known
+    arcs = Slerp(times, Rotation.from_quat(quat, scalar_first=True))
+    return arcs(np.clip(at, times[0], times[-1])).as_quat(scalar_first=True), is_known
 
 
 def hold(times: np.ndarray, values: np.ndarray, at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

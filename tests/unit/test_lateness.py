@@ -1,0 +1,74 @@
+"""Late poses: residuals of what was logged, and how late poses are, on motion made apart from the replay."""
+
+from dataclasses import replace
+
+import jax
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from flytrack_env.motion import Motion
+from flytrack_sysid import sensors
+from flytrack_sysid.diagnosis.lanes import NUM_AXES, make_lanes
+from flytrack_sysid.diagnosis.lateness import judged_as_logged, read_poses
+from flytrack_sysid.diagnosis.motion_choice import Moves, how_it_moves
+from flytrack_sysid.log import FlightLog
+from tests.support.handout_plant import GRAVITY, HandoutPlant, excited
+from tests.support.made_flight import TIME_S, flight, noisy
+
+LATE_S, TAU = 0.013, np.full(4, 0.03)
+STEPS = 2.4  # by which the plant's poses are late
+
+
+def changes(log: FlightLog) -> np.ndarray:
+    """Return turns, rad, and changes of velocity, m/s, since the row before, world frame, (num_rows, 6)."""
+    quat = Rotation.from_quat(log["q"], scalar_first=True)
+    turns = (quat[1:] * quat[:-1].inv()).as_rotvec()
+    return np.pad(np.concatenate([turns, np.diff(log["v"], axis=0)], axis=1), ((1, 0), (0, 0)))
+
+
+@pytest.mark.parametrize("motion", [Motion.CONTINUOUS, Motion.HANDOUT])
+def test_a_perfect_model_leaves_the_noise_of_the_poses_as_logged(motion: Motion) -> None:
+    """Interpolation, which smooths the corrected poses, leaves no trace."""
+    truth, late = flight(TIME_S), flight(TIME_S, LATE_S, LATE_S, LATE_S)
+    logged = noisy(late, seed=1)
+    corrected, is_known = read_poses(logged, LATE_S)
+    corrected = corrected.select(is_known)
+    lanes = make_lanes(corrected, np.ones(len(corrected), bool), TAU, GRAVITY)
+    lanes, found = judged_as_logged(lanes, corrected, logged, LATE_S, motion)
+    left = np.zeros((1, *lanes.row.shape, NUM_AXES, 2))
+    left[0, ..., :6, 1] = (changes(corrected) - changes(truth)[: len(corrected)])[lanes.row]
+    counts = lanes.counts[..., :6, 1].all(axis=-1)
+    counts[-1] = False  # its next row is that of no lane
+    expected = (changes(logged) - changes(late))[np.minimum(lanes.row + 1, len(logged) - 1)]
+    off = (found.residuals(left)[0, ..., :6, 1] - expected)[counts]
+    assert counts.sum() > 1500 and np.all(off.std(axis=0) < 0.01 * expected[counts].std(axis=0))
+
+
+def late_poses(log: FlightLog) -> FlightLog:
+    """Return a log whose poses are late, linear between rows, without the first rows of each flight."""
+    kept = np.ones(len(log), bool)
+    channels = {name: np.array(values) for name, values in log.channels.items()}
+    for number in np.unique(log.segment):
+        rows = np.flatnonzero(log.segment == number)
+        at = np.arange(len(rows), dtype=float)
+        for name in "pvq":
+            columns = [np.interp(at - STEPS, at, column) for column in log[name][rows].T]
+            channels[name][rows] = np.stack(columns, axis=1)
+        kept[rows[:5]] = False
+    channels["q"] /= np.linalg.norm(channels["q"], axis=1, keepdims=True)
+    return replace(log, channels=channels).select(kept)
+
+
+def test_lateness_is_found_where_there_is_one() -> None:
+    plant = HandoutPlant()
+    truth = excited(plant)
+
+    def found(log: FlightLog) -> Moves:
+        log = sensors.measure(log, 1.0, GRAVITY, np.random.default_rng(2))
+        with jax.enable_x64(True):
+            return how_it_moves(log, plant.model(), np.ones(len(log), bool), Motion.HANDOUT)
+
+    late = found(late_poses(truth))
+    assert 0.0 < late.sigma_s < 1e-3 and abs(late.late_s - 0.01 * STEPS) < 4.0 * late.sigma_s
+    assert found(truth) == Moves(Motion.HANDOUT)
