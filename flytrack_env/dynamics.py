@@ -333,6 +333,21 @@ def _move_continuously(
     return Moved(compute_once(after), later, context)
 
 
+def observe_rates(
+    drone: Drone, memories: tuple[Any, ...], rates_b: Vec3, dt: Scalar, params: ModelParameters
+) -> tuple[Drone, tuple[Any, ...]]:
+    """Return a drone with measured body rates, rad/s, and the memories of its effects.
+
+    A rate loop with a memory takes up how far they are from the model's; where there is none, the applied
+    action does, to first order in what effects make of it. dt: since the last measurement, s.
+    """
+    memories, rest_b = effects.observe(params.effects, memories, rates_b - drone.rates_b, dt)
+    full_stick = body_rates(Action(1.0, 1.0, 1.0, 0.0), params.max_rate)
+    rates = zip(drone.applied, rest_b, full_stick, strict=False)
+    sticks = (stick + rest / full for stick, rest, full in rates)
+    return drone._replace(rates_b=rates_b, applied=Action(*sticks, drone.applied.thrust)), memories
+
+
 class Reading(NamedTuple):
     """What the sensors read after a step: body rates, rad/s, and specific force, m/s^2, body frame."""
 

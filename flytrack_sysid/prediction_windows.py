@@ -1,7 +1,8 @@
 """Multi-step prediction: free flight from measured states, many windows at once, differentiable.
 
-A window begins with a lead-in, in which the measured states are fed in and the commands settle the applied
-action and the memories of effects. Then the model flies by itself under the logged commands.
+A window begins with a lead-in, in which the measured states are fed in, body rates too where there is a gyro,
+and the commands settle the applied action and the memories of effects. Then the model flies by itself under
+the logged commands.
 """
 
 from typing import Any, NamedTuple
@@ -10,9 +11,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from flytrack_env.dynamics import ModelParameters, advance, body_rates, read_gyro
+from flytrack_env.dynamics import ModelParameters, advance, body_rates, observe_rates, read_gyro
 from flytrack_env.effects import MOST_STEPS, start_memories
-from flytrack_env.quaternion import Quaternion
+from flytrack_env.quaternion import Quaternion, Vec3
 from flytrack_env.state import Action, Drone
 from flytrack_sysid.log import FlightLog, usual_step
 from flytrack_sysid.prediction import SETTLING_S
@@ -35,8 +36,8 @@ class Windows(NamedTuple):
 
     record: (rows, windows, ...), as in ``flytrack_sysid.record``; the lead-in first. is_free: (rows,) bool,
     the state of this row is the model's. ends: (horizons,) int, rows at the horizons. gyro_b: (rows,
-    windows, 3) rad/s, zeros without a gyro. counts: (horizons, windows, quantities) bool, what is judged.
-    block: (windows,) int, number of the stretch of 2 s that the window starts in. start:
+    windows, 3) rad/s, zeros without a gyro. has_gyro: bool. counts: (horizons, windows, quantities) bool,
+    what is judged. block: (windows,) int, number of the stretch of 2 s that the window starts in. start:
     (windows,) int, row of the log.
     """
 
@@ -44,6 +45,7 @@ class Windows(NamedTuple):
     is_free: np.ndarray
     ends: np.ndarray
     gyro_b: np.ndarray
+    has_gyro: np.ndarray
     counts: np.ndarray
     block: np.ndarray
     start: np.ndarray
@@ -102,6 +104,7 @@ def make_windows(log: FlightLog, judged: np.ndarray, every_s: float, most: int) 
         is_free=np.arange(len(index)) > lead,
         ends=lead + ends,
         gyro_b=gyro[index],
+        has_gyro=np.array("w" in log),
         counts=reached[..., None] & has,
         block=run[starts] * len(rows) + ((starts - first[starts]) * step_s / BLOCK_S).astype(int),
         start=filled.behind[starts],
@@ -124,10 +127,13 @@ def _turn(measured: Quaternion, predicted: Quaternion) -> jax.Array:
 def _fly(model: ModelParameters, record: Record, gyro_b: jax.Array, windows: Windows) -> jax.Array:
     """Return the errors of one window at its horizons, (horizons, 12)."""
 
-    def one(carry: tuple[Drone, Any], inputs: tuple[Record, Any]) -> tuple[Any, Any]:
-        (flown, memories), (row, is_free) = carry, inputs
+    def one(carry: tuple[Drone, Any], inputs: tuple[Record, Any, Any]) -> tuple[Any, Any]:
+        (flown, memories), (row, is_free, gyro) = carry, inputs
         applied = where_true(row.is_applied_known, Action(*row.applied), flown.applied)
         drone = where_true(is_free, flown, measured_drone(row, applied, flown.rates_b))
+        beside = Vec3(*gyro) - read_gyro(drone, memories, row.step_s, model)
+        seen = observe_rates(drone, memories, drone.rates_b + beside, row.step_s, model)
+        drone, memories = where_true(windows.has_gyro & ~is_free, seen, (drone, memories))
         after, later = advance(drone, memories, Action(*row.command), row.step_s, model)
         gyro = read_gyro(after, later, row.step_s, model)
         return (after, later), (after.pos_w, after.vel_w, after.quat, gyro)
@@ -136,7 +142,7 @@ def _fly(model: ModelParameters, record: Record, gyro_b: jax.Array, windows: Win
     applied = Action(*first.applied)
     start = measured_drone(first, applied, body_rates(applied, model.max_rate))
     memories = start_memories(model.effects, start, MOST_STEPS)
-    _, flown = jax.lax.scan(one, (start, memories), (record, windows.is_free))
+    _, flown = jax.lax.scan(one, (start, memories), (record, windows.is_free, gyro_b))
     pos, vel, quat, gyro = jax.tree.map(lambda leaf: leaf[windows.ends - 1], flown)
     row, gyro_b = jax.tree.map(lambda leaf: leaf[windows.ends], (record, gyro_b))
     turn = jax.vmap(_turn)(Quaternion(*row.quat.T), quat)

@@ -35,6 +35,7 @@ from flytrack_env.effects.translational_lift import TRANSLATIONAL_LIFT, Translat
 from flytrack_env.effects.voltage_sag import VOLTAGE_SAG, VoltageSag
 from flytrack_env.effects.wind import WIND, Wind
 from flytrack_env.effects.yaw_reaction import YAW_REACTION, YawReaction
+from flytrack_env.quaternion import Scalar
 from flytrack_env.state import Drone
 
 # The order in which effects of one stage are folded, and that of a model's effects. Commands pass as in a
@@ -195,6 +196,21 @@ def remember(
     return tuple(found)
 
 
+def observe(
+    effects: tuple[Any, ...], memories: tuple[Any, ...], offset_b: Any, dt: Scalar
+) -> tuple[tuple[Any, ...], Any]:
+    """Return memories that have taken up how far measured body rates are from the model's, and the rest.
+
+    dt: since the last measurement, s.
+    """
+    found = []
+    for parameters, memory in zip(reversed(effects), reversed(memories), strict=True):
+        hook = effect_of(parameters).observe
+        memory, offset_b = hook(parameters, memory, offset_b, dt) if hook else (memory, offset_b)
+        found.append(memory)
+    return tuple(reversed(found)), offset_b
+
+
 __all__ = [
     "BY_NAME",
     "EFFECTS",
@@ -238,6 +254,7 @@ __all__ = [
     "fold",
     "fold_rates",
     "merge",
+    "observe",
     "remember",
     "start_memories",
 ]

@@ -134,6 +134,8 @@ class Effect:
     start: (parameters, drone) -> memory of an episode that begins; no memory if None. With ``most_steps`` it
     also takes how many steps to remember.
     remember: (parameters, memory, context) -> memory after a step.
+    observe: (parameters, memory, offset_b, dt) -> memory that has taken up how far measured body rates are
+    from those of the model, rad/s, and what of that it does not hold. dt: since the last measurement, s.
     """
 
     name: str
@@ -159,6 +161,7 @@ class Effect:
     pose: Hook | None = None
     start: Callable[..., Any] | None = None
     remember: Callable[[Any, Any, StepContext], Any] | None = None
+    observe: Callable[[Any, Any, Vec3, Scalar], tuple[Any, Vec3]] | None = None
 
     @property
     def stages(self) -> tuple[str, ...]:

@@ -12,6 +12,7 @@ from flytrack_env.state import Drone
 AXES = ("roll", "pitch", "yaw")
 SHORTEST_S = 1e-5  # a lag below this is none: nothing at 100 Hz shows it
 SHORTEST_STEP_S = 1e-12  # at the beginning of a step nothing has changed yet
+OBSERVED_SLOPE = 0.6  # of what a step's offset says of the slope; the gyro's noise is in it
 CRITICAL = 1e-6  # of the squared damping about 1: the series is exact to rounding
 
 
@@ -121,6 +122,17 @@ def remember(loop: SecondOrderRates, memory: Turning, context: StepContext) -> T
     return Turning(context.rates_b, Vec3(*(slope_after(*axis) for axis in axes)))
 
 
+def observe(loop: SecondOrderRates, memory: Turning, offset_b: Vec3, dt: Scalar) -> tuple[Turning, Vec3]:
+    """Return the memory with the measured rates, and slopes nearer to theirs (an alpha-beta filter).
+
+    Axes without a lag hold none of the offset.
+    """
+    own = [jnp.where(lag_s > SHORTEST_S, offset, 0.0) for lag_s, offset in zip(loop, offset_b, strict=False)]
+    held_b = Vec3(*own)
+    seen = Turning(memory.rates_b + held_b, memory.slopes_b + held_b.scale(OBSERVED_SLOPE / dt))
+    return seen, offset_b - held_b
+
+
 SECOND_ORDER_RATES = Effect(
     name="second_order_rates",
     parameters=SecondOrderRates,
@@ -138,4 +150,5 @@ SECOND_ORDER_RATES = Effect(
     rates=_rates,
     start=start,
     remember=remember,
+    observe=observe,
 )
