@@ -148,10 +148,12 @@ def plant(trial: Trial) -> dict[str, Any]:
 
 
 def _graded(cause: Any, truth: Truth) -> dict[str, Any]:
-    """Return a cause's name and, by parameter, the true value, the estimate and its interval."""
+    """Return a cause's name, when it acts, and, by parameter, true value, estimate and interval."""
     true = truth.effects.get(cause.effect, {})
+    spans = {"onset_s": cause.onset_s, "end_s": cause.end_s}
     return {
         "effect": cause.effect,
+        **{name: [round(x, 3) for x in (one.value, *one.ci95)] for name, one in spans.items() if one},
         "equivalent": list(cause.equivalent),
         "gain": float(f"{cause.chi2_gain:.4g}"),
         "heldout": float(f"{cause.heldout_gain:.4g}"),

@@ -15,6 +15,14 @@ from flytrack_sysid.diagnosis.late_poses import with_late_poses
 from flytrack_sysid.diagnosis.lateness import judged_as_logged, latency_of, read_poses
 from flytrack_sysid.diagnosis.motion_choice import Moves, how_it_moves
 from flytrack_sysid.diagnosis.noise import first_guess
+from flytrack_sysid.diagnosis.onset import (
+    at_end,
+    ended,
+    first_row_as_at_end,
+    notes_of,
+    spans_of,
+    with_changes,
+)
 from flytrack_sysid.diagnosis.problem import Problem
 from flytrack_sysid.diagnosis.refinement import Refined, refine
 from flytrack_sysid.diagnosis.result import Cause, Diagnosis
@@ -94,8 +102,8 @@ def diagnose(
         state, base, extended = search(SearchState.start(parts.log, parts.train.with_noise(noise)))
         selection = select(state, base, extended)
         report(1, len(STAGES))
-        assert selection.state.problem.noise is not None
-        test = parts.test.with_noise(selection.state.problem.noise)
+        selection = with_changes(selection, parts.test, parts.log)
+        test = held_out_under(selection, parts.test)
         selection, contradicted = apply_vetoes(selection, test)
         report(2, len(STAGES))
         refined = refined_by_prediction(selection, parts)
@@ -160,20 +168,33 @@ def problem_of(
     return Problem.of(lanes, model, late=late)
 
 
+def held_out_under(selection: Selection, test: Problem) -> Problem:
+    """Return the problem of held-out rows with a selection's noise, and its effects when they act."""
+    problem = selection.state.problem
+    assert problem.noise is not None
+    return replace(test.with_noise(problem.noise), windows=problem.windows)
+
+
 def refined_by_prediction(selection: Selection, parts: Split) -> Refined:
-    """Return which effects of a selected model predict held-out flights better than its base does."""
-    state, model = selection.state, selection.model
-    is_explained = not selection.unexplained.flagged
-    vectors = selection.base.vector, model.vector
-    return refine(
+    """Return which effects of a selected model predict held-out flights better than its base does.
+
+    Flights are of the part of the log in which the effects act that do so at its end. Those that ended before
+    are kept.
+    """
+    state, model, gone = selection.state, selection.model, ended(selection)
+    since = np.arange(len(parts.log)) >= first_row_as_at_end(selection, parts.test)
+    refined = refine(
         state.problem,
-        *vectors,
-        model.candidates,
+        selection.base.vector,
+        state.problem.without(model.vector, gone),
+        [one for one in model.candidates if one.effect not in gone],
         state.base_places,
-        parts.log,
-        parts.held_out,
-        is_explained,
+        parts.log.select(since),
+        parts.held_out[since],
+        not selection.unexplained.flagged,
     )
+    kept = tuple(one for one in model.candidates if one in refined.kept or one.effect in gone)
+    return refined._replace(kept=kept)
 
 
 def summarize(selection: Selection, contradicted: Sequence[str], refined: Refined, parts: Split) -> Diagnosis:
@@ -186,6 +207,10 @@ def summarize(selection: Selection, contradicted: Sequence[str], refined: Refine
     lost = [*contradicted, *lost_in_base]
     extended = model if refined.fit is None else model._replace(vector=refined.fit.vector)
     found = with_refined_values([*effects, *in_base], refined, extended.vector)
+    spans = spans_of(selection, parts.test, parts.log)
+    found = tuple(
+        replace(one, **spans[one.effect]._asdict()) if one.effect in spans else one for one in found
+    )
 
     def without(cause: Cause) -> np.ndarray:
         if refined.fit is None:
@@ -198,8 +223,15 @@ def summarize(selection: Selection, contradicted: Sequence[str], refined: Refine
         "refitted_base": selection.base.vector,
         "extended": extended.vector,
     }
+    extended = at_end(selection, extended)
     limits = not_identifiable(state, linearization, model, (*causes, *negligible))
-    prediction = prediction_of(refined, vectors)
+    flying = {**vectors, "extended": extended.vector}
+    prediction = prediction_of(refined, flying)
+    notes = [
+        *warnings_of(problem, causes, lost),
+        *refinement_notes(refined),
+        *notes_of(selection, linearization, parts.log),
+    ]
     rest = with_lost_causes(selection.unexplained, lost)
     return Diagnosis(
         verdict=verdict_of(causes, rest),
@@ -215,10 +247,10 @@ def summarize(selection: Selection, contradicted: Sequence[str], refined: Refine
         voltages=voltages_of(problem.lanes),
         source=Path(parts.logged.source).name,
         sha256=parts.logged.sha256,
-        warnings=(*parts.warnings, *warnings_of(problem, causes, lost), *refinement_notes(refined)),
+        warnings=(*parts.warnings, *notes),
         prediction=prediction,
         changed=changed_parameters(linearization, extended, refined),
-        half_response_s=half_responses_of(linearization, model, refined, vectors),
+        half_response_s=half_responses_of(linearization, model, refined, flying),
     )
 
 

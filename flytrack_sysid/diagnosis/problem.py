@@ -14,6 +14,7 @@ channel   residual of a row                                                     
 ========  ==============================================================================  =======
 """
 
+import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
@@ -99,6 +100,18 @@ def _whitened(left: jax.Array, gains: noises.Gains, counts: jax.Array) -> jax.Ar
 _gains = jax.jit(noises.make_gains)
 
 
+class Window(NamedTuple):
+    """When an effect acts: from a row of the record on, up to another one; else it is as given."""
+
+    effect: str
+    start: int = -1
+    end: int = sys.maxsize
+
+    def acts_at(self, row: np.ndarray) -> np.ndarray:
+        """Return whether the effect acts in the step to rows of the record."""
+        return (row >= self.start) & (row < self.end)
+
+
 class Slopes(NamedTuple):
     """A model's residuals, (rows, lanes, NUM_AXES, 2), and how they change, (num_columns, ...), not whitened.
 
@@ -118,7 +131,7 @@ class Problem:
     like: the nominal model with every effect, float64. given_effects: those that the nominal model has.
     low, high, scale: of each parameter, its bounds and the size of its steps. noise: (6, NUM_AXES), as of
     ``noise.fit_noise``, and gains of its filter; None before ``with_noise``. late: of lanes whose poses were
-    corrected.
+    corrected. windows: of the effects that act for a part of the log only.
     """
 
     lanes: Lanes
@@ -132,6 +145,7 @@ class Problem:
     noise: np.ndarray | None = None
     gains: noises.Gains | None = None
     late: Late | None = None
+    windows: tuple[Window, ...] = ()
 
     @classmethod
     def of(
@@ -177,9 +191,34 @@ class Problem:
         return self.lanes.counts
 
     def residuals(self, vectors: np.ndarray) -> np.ndarray:
-        """Return residuals of models (num_models, parameters), (num_models, rows, lanes, NUM_AXES, 2)."""
-        found = _in_batches(lambda part: _residuals(part, self.like, self.lanes), vectors)
+        """Return residuals of models (num_models, parameters), (num_models, rows, lanes, NUM_AXES, 2).
+
+        Where an effect's window ends, rows come from another replay: nothing of the effect is remembered.
+        """
+
+        found = self._composed(vectors) if self.windows else self._replayed(vectors)
         return found if self.late is None else self.late.residuals(found)
+
+    def _replayed(self, vectors: np.ndarray) -> np.ndarray:
+        return _in_batches(lambda part: _residuals(part, self.like, self.lanes), vectors)
+
+    def _composed(self, vectors: np.ndarray) -> np.ndarray:
+        """Return residuals of models whose effects act within their windows; each row is of a replay."""
+        found = self._replayed(vectors)
+        acts = np.stack([one.acts_at(self.lanes.row) for one in self.windows])
+        for acting in np.unique(acts.reshape(len(acts), -1), axis=1).T:
+            if not acting.all():
+                still = [one.effect for one, is_on in zip(self.windows, acting, strict=True) if not is_on]
+                there = (acts == acting[:, None, None]).all(axis=0)
+                found = np.where(there[..., None, None], self._replayed(self.without(vectors, still)), found)
+        return found
+
+    def without(self, vectors: np.ndarray, effects: Sequence[str]) -> np.ndarray:
+        """Return vectors, (..., parameters), with some effects as in the given model."""
+        places = [place for place, name in enumerate(self.names) if name.split(".")[0] in effects]
+        vectors = vectors.copy()
+        vectors[..., places] = self.start[places]
+        return vectors
 
     def whiten(self, left: np.ndarray, axes: slice = slice(None)) -> np.ndarray:
         """Return residuals (num_models, rows, lanes, NUM_AXES, 2), or those of some axes, as innovations."""

@@ -76,6 +76,19 @@ def _plus_minus(cause: Cause) -> str:
     )
 
 
+def when_of(cause: Cause) -> str:
+    """Return when a cause acts, " from 31.2 ± 0.4 s on"; nothing where it does throughout."""
+
+    def time(found: Estimated) -> str:
+        return f"{found.value:.1f} ± {max(0.5 * (found.ci95[1] - found.ci95[0]), 0.05):.1f} s"
+
+    if cause.onset_s is not None and cause.end_s is not None:
+        return f" from {time(cause.onset_s)} to {time(cause.end_s)}"
+    if cause.onset_s is not None:
+        return f" from {time(cause.onset_s)} on"
+    return "" if cause.end_s is None else f" until {time(cause.end_s)}"
+
+
 def _confused(cause: Cause) -> str:
     if cause.equivalent:
         return f"this log cannot tell it from: {list_words(cause.equivalent[:MOST_LISTED])}"
@@ -86,7 +99,9 @@ def _faults(diagnosis: Diagnosis) -> str:
     """Return what the model lacks, has too much or too little of, or has a wrong value of, as a sentence."""
     by_fault: dict[str, list[str]] = {}
     for cause in diagnosis.causes:
-        by_fault.setdefault(fault_of(cause.effect, diagnosis), []).append(words_of(cause.effect))
+        by_fault.setdefault(fault_of(cause.effect, diagnosis), []).append(
+            words_of(cause.effect) + when_of(cause)
+        )
     clauses = [
         " ".join([fault, "; ".join(f"the {name}" if fault == WRONG else name for name in names)])
         for fault, names in by_fault.items()
@@ -152,7 +167,7 @@ def _causes_part(diagnosis: Diagnosis) -> Part:
         return Text("No cause is named. See below for what this log could not have shown.")
     rows = [
         [
-            f"{words_of(cause.effect)}\n({cause.effect}, in {cause.channel})",
+            f"{words_of(cause.effect)}{when_of(cause)}\n({cause.effect}, in {cause.channel})",
             "\n".join(_parameter(name, found) for name, found in cause.parameters.items()),
             _number(cause.heldout_gain),
             _confused(cause),
@@ -337,7 +352,9 @@ def text_of(diagnosis: Diagnosis) -> str:
             for name, one in cause.parameters.items()
         )
         twins = f"; not told apart from {', '.join(cause.equivalent)}" if cause.equivalent else ""
-        lines.append(f"  {cause.effect}: {values}; held-out gain {cause.heldout_gain:.4g}{twins}")
+        lines.append(
+            f"  {cause.effect}{when_of(cause)}: {values}; held-out gain {cause.heldout_gain:.4g}{twins}"
+        )
     for cause in diagnosis.negligible:
         lines.append(f"negligible: {cause.effect}: {_plus_minus(cause)}")
     answers = diagnosis.half_response_s.get("extended", {}).items()

@@ -39,7 +39,8 @@ class Cause:
     lambda_: squared size of its signature over the noise, all else that is free taken out. lambda_sep: the
     same with the closest rival taken out too, and closest which that is; base parameters have none.
     beyond: where a value lies at the end of what is searched, "delay_s at least 0.04 s": the true cause may
-    be beyond the list.
+    be beyond the list. onset_s, end_s: when it began and ended, in the log's time; None where the log begins
+    and ends with it.
     """
 
     effect: str
@@ -52,6 +53,8 @@ class Cause:
     lambda_sep: float
     closest: str = ""
     beyond: str = ""
+    onset_s: Estimated | None = None
+    end_s: Estimated | None = None
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,416 @@
+"""Causes that begin or end within a log: when, told from constant ones and from slow drift.
+
+The scores of an effect, summed up after each second of the log, say what it would gain if it acted from
+there on only, all else constant (the largest of these is a sup-LM test: D. Andrews, Econometrica 61, 1993).
+Where that is more than chance, the search starts anew with windows: the likely effects act from then on (or
+until then), all others throughout. The new model stands if it explains clearly more than the constant one,
+and held-out rows agree. The time is then found to a row by profile likelihood, on the rows that are held out
+as well: one number more that they decide.
+
+Times are those of one clock. Where a log's time goes back, it is of several flights, and nothing is
+looked for.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+from scipy import optimize, special, stats
+
+from flytrack_sysid.diagnosis import noise as noises
+from flytrack_sysid.diagnosis.lanes import LANE_S, Lanes, lead_in_of
+from flytrack_sysid.diagnosis.problem import Problem, Window, robust_square
+from flytrack_sysid.diagnosis.result import Estimated
+from flytrack_sysid.diagnosis.score_test import CANDIDATES, Candidate, Linearization, inflation_of, solve
+from flytrack_sysid.diagnosis.search import PER_PARAMETER, FittedModel, SearchState, search
+from flytrack_sysid.diagnosis.vetoes import Selection, select
+from flytrack_sysid.log import FlightLog
+
+CHANCE = 1e-5  # of a change for each effect, where nothing changes
+LEAST_S = 2.0  # of the log on each side of a change
+LEAST_SHARE = 0.04  # of the log there
+NEAR, MOST_NEAR = 0.3, 5  # of the largest gain: the search chooses among effects that come so near to it
+CLEAR = 10.0  # of minus twice the log likelihood, by which an end has to be likelier than an onset
+MOST_CHANGES = 3
+ALWAYS, NEVER = Window("").start, Window("").end
+RIDGE = 1e-7  # of a column's own information
+# Of the likelihood ratio of a time of change: its distribution is that of the maximum of a Brownian motion
+# with drift (B. Hansen, Econometrica 68, 2000), not chi2.
+DROP_95 = -2.0 * float(np.log(1.0 - np.sqrt(0.95)))
+# The profile: seconds about the time, and between the times tried, one after the other.
+PROFILES = ((8.0, 0.5), (1.0, 0.05), (0.1, 0.01))
+
+
+def threshold(num_parameters: int, trimmed: float = LEAST_SHARE, chance: float = CHANCE) -> float:
+    """Return the sup-LM gain of chi2 that so many parameters exceed by chance (Andrews 1993, section 5).
+
+    trimmed: share of the log on each side within which no change is looked for. The tail is D. DeLong's
+    (Communications in Statistics 10, 1981).
+    """
+    span = 2.0 * np.log((1.0 - trimmed) / trimmed)
+
+    def excess(size: float) -> float:
+        log_density = 0.5 * (num_parameters * np.log(0.5 * size) - size) - special.gammaln(
+            0.5 * num_parameters
+        )
+        return float(log_density + np.log((1.0 - num_parameters / size) * span + 2.0 / size) - np.log(chance))
+
+    lowest = float(stats.chi2.isf(chance, num_parameters))
+    return float(optimize.brentq(excess, lowest, 10.0 * lowest + 100.0))
+
+
+def windowed_gains(
+    score: np.ndarray, information: np.ndarray, given: Sequence[int], own: Sequence[int], weights: np.ndarray
+) -> np.ndarray:
+    """Return what columns gain, to first order, if they act with a weight in each block, (hypotheses,).
+
+    score, information: (blocks, columns) and (blocks, columns, columns); weights: (hypotheses, blocks).
+    given: the columns that are free throughout.
+    """
+    given, own = list(given), list(own)
+    free = information[:, given][:, :, given].sum(axis=0)
+    across = np.tensordot(weights, information[:, given][:, :, own], axes=1)  # (hypotheses, given, own)
+    alone = np.tensordot(weights**2, information[:, own][:, :, own], axes=1)
+    share = solve(free, np.moveaxis(across, 0, 1).reshape(len(given), -1))
+    share = np.moveaxis(share.reshape(len(given), len(weights), len(own)), 1, 0)
+    left = weights @ score[:, own] - np.einsum("hgo,g->ho", share, score[:, given].sum(axis=0))
+    size = np.maximum(np.diagonal(alone, axis1=1, axis2=2), 1e-300)
+    inner = alone - np.swapaxes(across, 1, 2) @ share
+    inner = inner + RIDGE * size[:, None] * np.eye(len(own))
+    return np.einsum("ho,ho->h", left, np.linalg.solve(inner, left[..., None])[..., 0])
+
+
+class Hypothesis(NamedTuple):
+    """An effect that changes within the log.
+
+    window: when it acts; None where it drifts instead. gain: of chi2 to first order, over its inflation.
+    num_parameters: those that change.
+    """
+
+    candidate: Candidate
+    window: Window | None
+    gain: float
+    num_parameters: int
+
+    @property
+    def row(self) -> int:
+        """The row of the record at which the effect begins or ends."""
+        assert self.window is not None
+        return self.window.start if self.window.start != ALWAYS else self.window.end
+
+    @property
+    def margin(self) -> float:
+        """The gain over the threshold."""
+        return self.gain - threshold(self.num_parameters)
+
+
+class Blocks(NamedTuple):
+    """The seconds of a log: the first row of each, and the rows at which something may begin or end."""
+
+    start: np.ndarray
+    changes: np.ndarray
+
+    @classmethod
+    def of(cls, lanes: Lanes) -> "Blocks":
+        """Return the blocks in the order of ``problem.blocks_of``."""
+        rows = lanes.row[lead_in_of(len(lanes.row)) :]
+        second = len(rows) // LANE_S
+        start = rows[::second].ravel()
+        known = np.sort(start[start >= 0])
+        least = max(LEAST_S, LEAST_SHARE * len(known))
+        changes = known[int(np.ceil(least)) : len(known) - int(np.ceil(least)) + 1]
+        return cls(start, changes)
+
+
+def changes_of(linearization: Linearization, model: FittedModel, lacking: Sequence[str]) -> list[Hypothesis]:
+    """Return how effects would change within the log, the likeliest first, one of each effect.
+
+    linearization: of the model, along everything. lacking: effects that are not looked for.
+    """
+    blocks = Blocks.of(linearization.problem.lanes)
+    if not len(blocks.changes):
+        return []
+    best: dict[str, Hypothesis] = {}
+    for candidate in CANDIDATES:
+        if candidate.effect in lacking:
+            continue
+        if candidate.effect in model.effects and candidate != model.candidate(candidate.effect):
+            continue
+        found = _change_of(linearization, model, candidate, blocks)
+        if found is not None and found.margin > best.get(candidate.effect, found).margin - 1e-12:
+            best[candidate.effect] = found
+    return sorted(best.values(), key=lambda one: -one.margin)
+
+
+def _change_of(
+    linearization: Linearization, model: FittedModel, candidate: Candidate, blocks: Blocks
+) -> Hypothesis | None:
+    """Return the likeliest change of an effect; None where nothing depends on it."""
+    is_named = candidate.effect in model.effects
+    columns = [linearization.column(field) for field in candidate.fields]
+    own = linearization.acting(columns if is_named else linearization.columns_of(candidate))
+    if not own:
+        return None
+    given = linearization.columns_at(model.places)
+    score, information = linearization.score_by_block, linearization.by_block
+    after = (blocks.start >= blocks.changes[:, None]).astype(float)
+    ramp = (blocks.start - blocks.start.min()) / max(np.ptp(blocks.start), 1)
+    ways = {"start": after, "end": 1.0 - after, "drift": ramp[None]}
+    gains = {way: windowed_gains(score, information, given, own, one) for way, one in ways.items()}
+    way = max(gains, key=lambda one: gains[one].max())
+    place = int(np.argmax(gains[way]))
+    inflation = _inflation(score, information, given, own, ways[way][place])
+    row = int(blocks.changes[place]) if way != "drift" else 0
+    window = {"start": Window(candidate.effect, start=row), "end": Window(candidate.effect, end=row)}.get(way)
+    return Hypothesis(candidate, window, float(gains[way][place]) / inflation, len(own))
+
+
+def _inflation(
+    score: np.ndarray, information: np.ndarray, given: Sequence[int], own: Sequence[int], weight: np.ndarray
+) -> float:
+    """Return how much more the scores of blocks vary than information says, with the change put in.
+
+    Arguments as in ``windowed_gains``; weight: (blocks,).
+    """
+    free = information[:, given][:, :, given]
+    across = weight[:, None, None] * information[:, given][:, :, own]
+    alone = weight[:, None, None] ** 2 * information[:, own][:, :, own]
+    share = solve(free.sum(axis=0), across.sum(axis=0))
+    crossed = np.swapaxes(across, 1, 2) @ share
+    by_block = alone - crossed - np.swapaxes(crossed, 1, 2) + share.T @ free @ share
+    inner = by_block.sum(axis=0)
+    left = weight[:, None] * score[:, own] - score[:, given] @ share
+    step = solve(inner + RIDGE * np.diag(np.diag(alone.sum(axis=0))), left.sum(axis=0))
+    return inflation_of(inner, left - by_block @ step)
+
+
+def is_one_flight(log: FlightLog) -> bool:
+    """Return whether a log's time runs on from its first row to its last, as in one flight."""
+    return bool(np.all(np.diff(log.time) > 0.0))
+
+
+class Profile(NamedTuple):
+    """Rows of the record at which a change was tried, and minus twice the log likelihood; sorted by row."""
+
+    rows: np.ndarray
+    costs: np.ndarray
+
+    @property
+    def best(self) -> int:
+        """The likeliest row."""
+        return int(self.rows[np.argmin(self.costs)])
+
+    def ends95(self, inflation: float) -> tuple[int, int]:
+        """Return the 95 % interval: from the last row tried before those that are as likely, to the next."""
+        likely = np.flatnonzero(self.costs < self.costs.min() + DROP_95 * inflation)
+        low, high = max(likely[0] - 1, 0), min(likely[-1] + 1, len(self.rows) - 1)
+        return int(self.rows[low]), int(self.rows[high])
+
+
+def profile_of(problem: Problem, test: Problem, vector: np.ndarray, row: int) -> Profile:
+    """Return how likely it is that what changes at a row changes at others; the vector stays.
+
+    test: of rows held out, which decide as well.
+    """
+    step_s = float(np.median(problem.lanes.record.step_s))
+    assert problem.noise is not None
+    test = replace(test, windows=problem.windows).with_noise(problem.noise)
+    pairs = [(one, *_on_both_sides(one, vector, row)) for one in (problem, test)]
+    known: dict[int, float] = {}
+    for reach_s, every_s in PROFILES:
+        centre = min(known, key=lambda tried: known[tried]) if known else row
+        every = max(round(every_s / step_s), 1)
+        reach = max(round(reach_s / step_s), every)
+        tried = [one for one in range(centre - reach, centre + reach + 1, every) if one not in known]
+        costs = np.zeros(len(tried))
+        for own, before, after in pairs:
+            is_after = own.lanes.row[..., None, None] >= np.array(tried)[:, None, None, None, None]
+            white = own.whiten(np.where(is_after, after, before))
+            costs += [robust_square(one) for one in white]
+        known |= dict(zip(tried, costs.tolist(), strict=True))
+    rows = np.array(sorted(known))
+    return Profile(rows, np.array([known[one] for one in rows.tolist()]))
+
+
+def _on_both_sides(problem: Problem, vector: np.ndarray, row: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return residuals as if what changes at a row changed after the log, and before it."""
+    before, after = (moved(problem, row, to).residuals(vector[None])[0] for to in (NEVER, ALWAYS))
+    return before, after
+
+
+class Span(NamedTuple):
+    """When an effect acts, s of the log's clock: onset and end, with their 95 % intervals; None without."""
+
+    onset_s: Estimated | None
+    end_s: Estimated | None
+
+
+def log_rows(problem: Problem, test: Problem, rows: Sequence[int]) -> np.ndarray:
+    """Return the rows of the log, as fractions, of rows of the record."""
+    own, source = (
+        np.concatenate([part.ravel() for part in pair])
+        for pair in zip(
+            *((one.lanes.row, one.lanes.record.source_row) for one in (problem, test)), strict=True
+        )
+    )
+    known = (own >= 0) & (source >= 0)
+    order = np.argsort(own[known])
+    return np.interp(rows, own[known][order], source[known][order])
+
+
+def spans_of(selection: Selection, test: Problem, log: FlightLog) -> dict[str, Span]:
+    """Return when effects act that do so for a part of a log only, by name."""
+    problem, vector = selection.state.problem, selection.model.vector
+
+    def time_of(effect: str, row: int) -> Estimated | None:
+        if row in (ALWAYS, NEVER):
+            return None
+        ends = profile_of(problem, test, vector, row).ends95(selection.ablations[effect].inflation)
+        places = log_rows(problem, test, (row, *ends))
+        value, low, high = np.interp(places, np.arange(len(log)), log.time).tolist()
+        return Estimated(value, (low, high), "s")
+
+    return {
+        one.effect: Span(time_of(one.effect, one.start), time_of(one.effect, one.end))
+        for one in windows_of(selection)
+    }
+
+
+def windows_of(selection: Selection) -> list[Window]:
+    """Return the windows of a selected model's effects."""
+    return [one for one in selection.state.problem.windows if one.effect in selection.model.effects]
+
+
+def ended(selection: Selection) -> list[str]:
+    """Return the effects that act no longer at the end of the log."""
+    return [one.effect for one in windows_of(selection) if one.end != NEVER]
+
+
+def at_end(selection: Selection, model: FittedModel) -> FittedModel:
+    """Return the model without the effects that act no longer at the end of the log."""
+    gone = ended(selection)
+    candidates = tuple(one for one in model.candidates if one.effect not in gone)
+    vector = selection.state.problem.without(model.vector, gone)
+    return model._replace(candidates=candidates, vector=vector)
+
+
+def first_row_as_at_end(selection: Selection, test: Problem) -> int:
+    """Return the row of the log from which on the effects act that do so at its end."""
+    rows = {row for one in windows_of(selection) for row in (one.start, one.end)} - {ALWAYS, NEVER}
+    return int(np.ceil(log_rows(selection.state.problem, test, [max(rows)])[0])) if rows else 0
+
+
+def notes_of(selection: Selection, linearization: Linearization, log: FlightLog) -> list[str]:
+    """Return what a reader must know of changes within the log; linearization: of the model."""
+    spans, notes = windows_of(selection), []
+    begun = [one.effect for one in spans if one.end == NEVER]
+    if begun:
+        notes.append(f"the extended model has {', '.join(begun)} as at the end of the log, from the start on")
+    gone = ended(selection)
+    if gone:
+        notes.append(f"not in the extended model: {', '.join(gone)}, which ended within the log")
+    lacking = (*selection.state.unobservable, *selection.state.refused)
+    left = changes_of(linearization, selection.model, lacking) if is_one_flight(log) else []
+    if left and left[0].margin > 0.0:
+        how = "drifts" if left[0].window is None else "changes"
+        notes.append(f"{left[0].candidate.effect} {how} within the log: its value is a mean")
+    return notes
+
+
+def moved(problem: Problem, row: int, to: int) -> Problem:
+    """Return the problem with what begins or ends at a row doing so at another one."""
+
+    def at(old: int) -> int:
+        return to if old == row else old
+
+    windows = tuple(one._replace(start=at(one.start), end=at(one.end)) for one in problem.windows)
+    return replace(problem, windows=windows)
+
+
+def with_changes(selection: Selection, test: Problem, log: FlightLog) -> Selection:
+    """Return the selection with effects that begin or end within the log, where that is clearly better.
+
+    test: rows held out. A selection whose effects are constant is returned as it is.
+    """
+    for _ in range(MOST_CHANGES if is_one_flight(log) else 0):
+        later = _with_change(selection, test)
+        if later is None:
+            break
+        selection = later
+    return selection
+
+
+def _with_change(selection: Selection, test: Problem) -> Selection | None:
+    """Return the selection with one change more; None where none is clear."""
+    state, linearization = selection.state.linearized(selection.model.vector)
+    found = changes_of(linearization, selection.model, (*state.unobservable, *state.refused))
+    if not found or found[0].margin < 0.0 or found[0].window is None:
+        return None
+    first, near = found[0], [one for one in found if one.window and one.gain > NEAR * found[0].gain]
+    state, model = _likeliest_side(selection, first, [one.candidate.effect for one in near[:MOST_NEAR]])
+    state, base, model = search(_at_best_row(state, test, model, first.row))
+    named = tuple(one for one in state.problem.windows if one.effect in model.effects)
+    rows = {row for one in named for row in (one.start, one.end)} - {*_rows_of(selection.state.problem)}
+    if not rows - {ALWAYS, NEVER}:
+        return None
+    state = _at_best_row(windowed(state, named), test, model, max(rows - {ALWAYS, NEVER}))
+    later = select(state, base, state.fitted(model.candidates, model.vector))
+    lost = [
+        misfit(later, problem) - misfit(selection, problem) for problem in (selection.state.problem, test)
+    ]
+    price = PER_PARAMETER * (_num_priced(later) - _num_priced(selection))
+    is_better = lost[0] + price < -threshold(first.num_parameters) and lost[1] < 0.0
+    return later if is_better else None
+
+
+def _num_priced(selection: Selection) -> int:
+    return sum(one.num_priced for one in selection.model.candidates)
+
+
+def _rows_of(problem: Problem) -> tuple[int, ...]:
+    return tuple(row for one in problem.windows for row in (one.start, one.end))
+
+
+def misfit(selection: Selection, problem: Problem) -> float:
+    """Return minus twice the log likelihood of the rows of a problem, under a selection and its noise."""
+    state, lanes = selection.state, problem.lanes
+    assert state.problem.noise is not None
+    left = replace(problem, windows=state.problem.windows).residuals(selection.model.vector[None])[0]
+    return noises.total_misfit(lanes, left, state.problem.noise)
+
+
+def windowed(state: SearchState, windows: Sequence[Window]) -> SearchState:
+    """Return the state with these windows."""
+    problem = replace(state.problem, windows=tuple(windows))
+    return replace(state, problem=problem, held=(), linearization=None)
+
+
+def _likeliest_side(
+    selection: Selection, first: Hypothesis, near: Sequence[str]
+) -> tuple[SearchState, FittedModel]:
+    """Return the state in which some effects begin, or end, at the row of a change, and a model of it.
+
+    The model has the change's effect and those that have changed before. Where both sides are as likely, as
+    of a scale of what is fitted besides, the effect begins.
+    """
+    old = {one.effect: one for one in selection.state.problem.windows}
+    kept = [one for one in selection.model.candidates if one.effect in old]
+    candidates = tuple({one.effect: one for one in (*kept, first.candidate)}.values())
+
+    def trial(start: int, end: int) -> tuple[SearchState, FittedModel]:
+        windows = dict(old)
+        for effect in near:
+            own = old.get(effect, Window(effect))
+            windows[effect] = Window(effect, max(start, own.start), min(end, own.end))
+        state = windowed(selection.state, tuple(windows.values()))
+        return state, state.fitted(candidates, selection.base.vector)
+
+    begins, ends = trial(first.row, NEVER), trial(ALWAYS, first.row)
+    return begins if begins[1].cost < ends[1].cost + CLEAR else ends
+
+
+def _at_best_row(state: SearchState, test: Problem, model: FittedModel, row: int) -> SearchState:
+    """Return the state with what begins or ends at a row doing so at the likeliest row."""
+    best = profile_of(state.problem, test, model.vector, row).best
+    return windowed(state, moved(state.problem, row, best).windows)

@@ -1,0 +1,80 @@
+"""The test for effects that begin or end within a log, on made scores, and how times are told."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from flytrack_sysid.diagnosis.onset import DROP_95, Profile, is_one_flight, threshold, windowed_gains
+from flytrack_sysid.diagnosis.report import when_of
+from flytrack_sysid.diagnosis.result import Cause, Estimated
+from flytrack_sysid.log import FlightLog
+
+BLOCKS, ONSET, TRIMMED = 60, 25, 0.1
+GIVEN, OWN = [0, 1], [2, 3]
+AFTER = (np.arange(BLOCKS) >= np.arange(6, 55)[:, None]).astype(float)  # a tenth is left on each side
+
+
+def scores(rng: np.random.Generator, after: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
+    """Return scores and information of blocks with four columns; after: what acts from ONSET on, (4,)."""
+    slopes = rng.standard_normal((BLOCKS, 30, 4)) @ np.array(
+        [[1.0, 0.3, 0.5, 0.0], [0.0, 1.0, 0.0, 0.4], [0.0, 0.0, 1.0, 0.2], [0.0, 0.0, 0.0, 1.0]]
+    )
+    left = rng.standard_normal((BLOCKS, 30))
+    if after is not None:
+        left[ONSET:] += slopes[ONSET:] @ after
+    return np.einsum("brc,br->bc", slopes, left), np.swapaxes(slopes, 1, 2) @ slopes
+
+
+def test_changes_are_found_by_chance_as_rarely_as_the_threshold_says():
+    rng = np.random.default_rng(1)
+    largest = np.array([windowed_gains(*scores(rng), GIVEN, OWN, AFTER).max() for _ in range(600)])
+    share = np.mean(largest > threshold(len(OWN), TRIMMED, chance=0.05))
+    assert 0.015 < share < 0.07  # the tail is that of a change at any instant, not at whole seconds
+    assert threshold(1) > 20.0 and threshold(3) > threshold(1)
+
+
+def test_the_gain_is_largest_where_the_effect_begins():
+    rng = np.random.default_rng(2)
+    found = scores(rng, after=np.array([0.0, 0.0, 0.4, -0.2]))
+    gains = windowed_gains(*found, GIVEN, OWN, AFTER)
+    assert abs(6 + int(gains.argmax()) - ONSET) <= 2
+    assert gains.max() > 2.0 * threshold(len(OWN))
+    constant = windowed_gains(*found, GIVEN, OWN, np.ones((1, BLOCKS)))
+    assert gains.max() > constant[0] + threshold(len(OWN))
+
+
+def test_a_slow_drift_gains_more_as_a_drift_than_as_a_step():
+    rng = np.random.default_rng(3)
+    score, information = scores(rng)
+    ramp = np.arange(BLOCKS) / BLOCKS
+    score += information[:, 2] * ramp[:, None]
+    gains = windowed_gains(score, information, [0, 1, 2], [2], np.concatenate([AFTER, ramp[None]]))
+    assert gains[-1] > gains[:-1].max()
+
+
+def test_the_interval_of_a_time_is_where_the_likelihood_falls():
+    rows = np.arange(100, 200, 10)
+    costs = 1000.0 + 0.01 * (rows - 140.0) ** 2
+    assert Profile(rows, costs).best == 140
+    assert Profile(rows, costs).ends95(1.0) == (110, 170)  # 20 rows off is likely, 30 is not
+    assert Profile(rows, costs).ends95(2.0) == (100, 180)
+    assert pytest.approx(7.35, abs=0.01) == DROP_95
+
+
+def test_only_logs_of_one_clock_can_show_when():
+    channels = {"u": np.zeros((4, 4))}
+    for time, expected in (([0.0, 1.0, 5.0, 6.0], True), ([0.0, 1.0, 0.0, 1.0], False)):
+        assert is_one_flight(FlightLog(np.array(time), channels, np.array([0, 0, 1, 1]))) is expected
+
+
+def test_times_in_words():
+    cause = Cause("motor_imbalance", (), "rates", {}, 1.0, 1.0, 1.0, 1.0)
+    begin, end = (Estimated(at, (at - 0.4, at + 0.4), "s") for at in (31.2, 40.0))
+    spans = ({}, {"onset_s": begin}, {"end_s": end}, {"onset_s": begin, "end_s": end})
+    assert [when_of(replace(cause, **span)) for span in spans] == [
+        "",
+        " from 31.2 ± 0.4 s on",
+        " until 40.0 ± 0.4 s",
+        " from 31.2 ± 0.4 s to 40.0 ± 0.4 s",
+    ]
