@@ -195,7 +195,6 @@ class Problem:
 
         Where an effect's window ends, rows come from another replay: nothing of the effect is remembered.
         """
-
         found = self._composed(vectors) if self.windows else self._replayed(vectors)
         return found if self.late is None else self.late.residuals(found)
 
