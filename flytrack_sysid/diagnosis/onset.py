@@ -313,8 +313,9 @@ def notes_of(selection: Selection, linearization: Linearization, log: FlightLog)
     lacking = (*selection.state.unobservable, *selection.state.refused)
     left = changes_of(linearization, selection.model, lacking) if is_one_flight(log) else []
     if left and left[0].margin > 0.0:
-        how = "drifts" if left[0].window is None else "changes"
-        notes.append(f"{left[0].candidate.effect} {how} within the log: its value is a mean")
+        name, how = left[0].candidate.effect, "drifts" if left[0].window is None else "changes"
+        value = ": its value is a mean" if name in selection.model.effects else ""
+        notes.append(f"{name} {how} within the log{value}")
     return notes
 
 
