@@ -28,6 +28,7 @@ GRID_S = 0.01  # below it, the cost has one minimum: motion of a drone is slower
 ROUNDS = 5  # of Gauss-Newton; it converges in two
 BLOCK_S = 2.0  # errors further apart than this have little in common
 FEWEST_BLOCKS = 5
+SPIKE = 12.0  # times the median deviation from both neighbours: eight standard deviations
 SIGNIFICANT = 3.0  # standard errors
 CORRECTED, LEFT = "corrected", "significant, left as asked"
 LEAST_STEPS = 0.1  # of the log's step: smaller offsets change less than the step itself does
@@ -103,6 +104,18 @@ def _runs(log: FlightLog) -> list[slice]:
     return [slice(start, end) for start, end in pairwise([0, *edges])]
 
 
+def _without_spikes(values: np.ndarray) -> np.ndarray:
+    """Return values (num_rows, n) with lone ones, far from what both neighbours say, put in between these."""
+    between = 0.5 * (values[:-2] + values[2:])
+    off = np.pad(np.abs(values[1:-1] - between), ((1, 1), (0, 0)))
+    usual = np.median(off[1:-1], axis=0)
+    is_peak = (off[1:-1] >= off[:-2]) & (off[1:-1] >= off[2:])
+    is_spike = (is_peak & (off[1:-1] > SPIKE * usual)).any(axis=1, keepdims=True)
+    found = np.array(values)
+    found[1:-1] = np.where(is_spike, between, values[1:-1])
+    return found
+
+
 def _stretches(log: FlightLog, sums: np.ndarray, rates: np.ndarray) -> list[_Stretch]:
     stretches, num_blocks = [], 0
     for rows in _runs(log):
@@ -111,8 +124,8 @@ def _stretches(log: FlightLog, sums: np.ndarray, rates: np.ndarray) -> list[_Str
         starts = time[is_start]
         if len(starts) < 2:
             continue
-        line = make_interp_spline(time, sums[rows], k=1)
-        rate = make_interp_spline(time, rates[rows], k=1)
+        line = make_interp_spline(time, _without_spikes(sums[rows]), k=1)
+        rate = make_interp_spline(time, _without_spikes(rates[rows]), k=1)
         block = ((starts - starts[0]) // BLOCK_S).astype(int) + num_blocks
         num_blocks = block[-1] + 1
         ends = starts + WINDOW_S

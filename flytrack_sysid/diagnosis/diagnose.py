@@ -23,10 +23,12 @@ from flytrack_sysid.diagnosis.onset import (
     spans_of,
     with_changes,
 )
+from flytrack_sysid.diagnosis.outliers import outlier_notes, outliers_of
 from flytrack_sysid.diagnosis.problem import Problem
 from flytrack_sysid.diagnosis.refinement import Refined, refine
 from flytrack_sysid.diagnosis.result import Cause, Diagnosis
 from flytrack_sysid.diagnosis.search import SearchState, search
+from flytrack_sysid.diagnosis.sensor_clocks import on_one_clock
 from flytrack_sysid.diagnosis.size import split_by_size
 from flytrack_sysid.diagnosis.summary import (
     base_causes,
@@ -65,8 +67,8 @@ class DiagnosisError(ValueError):
 class Split(NamedTuple):
     """A log, its rows held out, (num_rows,) bool, and the problems of learning from and judging by it.
 
-    log: with poses in time. logged: as it was, maybe more rows. as_logged: the lanes of both problems with
-    poses as logged; empty where these were in time. moves: how late they were.
+    log: with all clocks together. logged: as it was, maybe more rows. as_logged: the lanes of both problems
+    with poses as logged; empty where these were in time. moves: how late they were.
     """
 
     logged: FlightLog
@@ -138,6 +140,8 @@ def split(
         raise DiagnosisError(
             f"held_out: found {out.dtype} of shape {out.shape}, expected bool of ({len(log)},)"
         )
+    logged, (log, is_kept, notes) = log, on_one_clock(log)
+    warnings, out = [*warnings, *notes], out[is_kept]
     model = nominal_parameters() if model is None else model
     with_motion = how_it_moves(log, model, ~out, motion)
     model = model._replace(motion=with_motion.motion)
@@ -150,7 +154,7 @@ def split(
     train, test = (
         problem_of(thinned(lanes), corrected, log, model, with_motion.late_s) for lanes in (every, judged_by)
     )
-    return Split(log, with_motion, corrected, out, train, test, as_logged, tuple(warnings))
+    return Split(logged, with_motion, corrected, out, train, test, as_logged, tuple(warnings))
 
 
 def lanes_of(log: FlightLog, rows: np.ndarray, model: ModelParameters) -> Lanes:
@@ -227,7 +231,9 @@ def summarize(selection: Selection, contradicted: Sequence[str], refined: Refine
     limits = not_identifiable(state, linearization, model, (*causes, *negligible))
     flying = {**vectors, "extended": extended.vector}
     prediction = prediction_of(refined, flying)
+    outliers = outliers_of((problem, test), vectors["extended"])
     notes = [
+        *outlier_notes(outliers),
         *warnings_of(problem, causes, lost),
         *refinement_notes(refined),
         *notes_of(selection, linearization, parts.log),
@@ -251,6 +257,7 @@ def summarize(selection: Selection, contradicted: Sequence[str], refined: Refine
         prediction=prediction,
         changed=changed_parameters(linearization, extended, refined),
         half_response_s=half_responses_of(linearization, model, refined, flying),
+        outliers=outliers,
     )
 
 

@@ -141,6 +141,14 @@ class HalfResponse:
 
 
 @dataclass(frozen=True)
+class Outliers:
+    """How many rows of a channel are outliers, and of how many."""
+
+    rows: int
+    of: int
+
+
+@dataclass(frozen=True)
 class Diagnosis:
     """What is wrong with a model, according to a log.
 
@@ -150,7 +158,7 @@ class Diagnosis:
     noise: by channel and axis, fitted standard deviations of the sensors. voltages: the lowest and the
     highest of the battery that were learnt from, V; None where it was not measured. prediction: how far ahead
     the models predict. changed: every parameter of the extended model that is not as in the nominal one.
-    half_response_s: by model (nominal, refitted_base, extended) and by stick.
+    half_response_s: by model (nominal, refitted_base, extended) and by stick. outliers: by channel, if any.
     """
 
     verdict: str
@@ -170,6 +178,7 @@ class Diagnosis:
     prediction: Prediction = Prediction()
     changed: tuple[Changed, ...] = ()
     half_response_s: Mapping[str, Mapping[str, HalfResponse]] = field(default_factory=dict)
+    outliers: Mapping[str, Outliers] = field(default_factory=dict)
 
     def as_json(self) -> dict[str, Any]:
         """Return the content of diagnosis.json: the fields under the names of its schema, six digits."""
@@ -193,6 +202,7 @@ class Diagnosis:
             "changed": _plain(self.changed),
             "half_response_s": _plain(self.half_response_s),
             "noise": self.noise,
+            "outliers": _plain(self.outliers),
             "data": {"file": self.source, "sha256": self.sha256, "voltages": self.voltages},
             "warnings": list(self.warnings),
         }

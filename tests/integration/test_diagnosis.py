@@ -25,7 +25,7 @@ from flytrack_sysid.split import blocks_of, held_out_rows
 from tests.support.diagnosis_cases import CASES, HELD_OUT_EVERY, SEED, Case, rng_of
 
 SHORT_S, BLOCK_S = 20.0, 5.0  # every other block is held out: both parts share one compiled program
-LATE_S = 0.0164
+LATE_S, SPIKES = 0.0164, 12
 DRAG = {"d_x": 0.4, "d_y": 0.4, "d_z": 0.2}
 BROKEN = ("stuck_gyro", "stuck_commands")
 CHANNELS = {"rates", "attitude", "force", "velocity", "battery"}
@@ -33,16 +33,17 @@ WIDENED = 1.5  # of 95 % intervals: a correct one misses such a wide one 3 times
 Found = Mapping[str, Any]
 
 
-def short_flight(truth: Truth, rng: np.random.Generator) -> tuple[Diagnosis, FlightLog]:
-    """Return the diagnosis of a short flight of a plant, and its log."""
+def short_flight(truth: Truth, rng: np.random.Generator, spikes: int = 0) -> tuple[Diagnosis, FlightLog]:
+    """Return the diagnosis of a short flight of a plant, and its log; spikes: outliers of its velocity."""
     log = measure(fly(truth, "scripted", SHORT_S, rng), "sensors", rng)
+    log["v"][rng.choice(len(log), spikes, replace=False)] += 2.0
     held_out = np.floor(log.time / BLOCK_S).astype(int) % 2 == 1
     return diagnose(log, model_of(truth), held_out), log
 
 
 @pytest.fixture(scope="session")
 def short() -> dict[str, tuple[Diagnosis, FlightLog]]:
-    """Diagnoses of plants in fine steps: clean, with drag, with a force that no list has, with late poses."""
+    """Diagnoses of plants in fine steps: clean, drag, a force that no list has, late poses and outliers."""
     rng = np.random.default_rng(3)
     base = replace(draw_base(rng), motion="fine")
     plants = {
@@ -51,7 +52,7 @@ def short() -> dict[str, tuple[Diagnosis, FlightLog]]:
         "outside": replace(base, outside=draw_outside(rng, "heading", 2.0)),
         "late": replace(base, mocap_late_s=LATE_S),
     }
-    return {name: short_flight(truth, rng) for name, truth in plants.items()}
+    return {name: short_flight(truth, rng, SPIKES * (name == "late")) for name, truth in plants.items()}
 
 
 def check_content(one: Found) -> None:
@@ -101,6 +102,14 @@ def test_late_motion_capture_is_named_and_corrected(short, tmp_path: Path) -> No
     assert found.extended.motion is Motion.CONTINUOUS
     write_diagnosis(tmp_path, found, log)
     assert load_model(tmp_path / "extended_model.json").effect("mocap_latency").latency_s > 0.0
+
+
+def test_outliers_are_counted_and_told(short) -> None:
+    found, _ = short["late"]
+    assert set(found.outliers) == {"velocity"} and abs(found.outliers["velocity"].rows - SPIKES) <= 2
+    (warning,) = found.warnings
+    assert warning.startswith("outliers") and "rows of velocity" in warning
+    assert short["clean"][0].outliers == {}
 
 
 def test_what_no_list_has_is_flagged_and_not_named(short) -> None:

@@ -25,6 +25,17 @@ def test_clock_offsets_between_sensors_are_found_and_corrected(truth):
         assert np.sqrt(np.mean((aligned[name] - truth[name][rows]) ** 2)) < bound, name
 
 
+def test_outliers_do_not_move_an_offset(truth):
+    log = noisy(flight(TIME_S, 0.023), seed=1)
+    rng = np.random.default_rng(3)
+    for name, size in (("q", 0.2), ("w", 5.0)):
+        rows = rng.choice(len(log), 20, replace=False)
+        log[name][rows] += size * rng.standard_normal((20, log[name].shape[1]))
+    log["q"][:] /= np.linalg.norm(log["q"], axis=1, keepdims=True)
+    found = clocks.align_clocks(log)[1][0]
+    assert abs(found.offset_s - 0.023) < 4.0 * found.sigma_s and found.sigma_s < 1.5e-3
+
+
 def test_standard_errors_are_those_of_other_draws_of_the_noise(truth):
     found = [one for seed in range(4) for one in clocks.align_clocks(noisy(truth, seed))[1]]
     scores = np.array([one.offset_s / one.sigma_s for one in found])

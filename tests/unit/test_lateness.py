@@ -12,6 +12,7 @@ from flytrack_sysid import sensors
 from flytrack_sysid.diagnosis.lanes import NUM_AXES, make_lanes
 from flytrack_sysid.diagnosis.lateness import judged_as_logged, read_poses
 from flytrack_sysid.diagnosis.motion_choice import Moves, how_it_moves
+from flytrack_sysid.diagnosis.sensor_clocks import on_one_clock
 from flytrack_sysid.log import FlightLog
 from tests.support.handout_plant import GRAVITY, HandoutPlant, excited
 from tests.support.made_flight import TIME_S, flight, noisy
@@ -43,6 +44,16 @@ def test_a_perfect_model_leaves_the_noise_of_the_poses_as_logged(motion: Motion)
     expected = (changes(logged) - changes(late))[np.minimum(lanes.row + 1, len(logged) - 1)]
     off = (found.residuals(left)[0, ..., :6, 1] - expected)[counts]
     assert counts.sum() > 1500 and np.all(off.std(axis=0) < 0.01 * expected[counts].std(axis=0))
+
+
+def test_velocity_and_position_come_on_the_clock_of_the_attitude() -> None:
+    truth = flight(TIME_S, LATE_S, LATE_S, LATE_S)
+    for late_s in (0.0, 0.02):
+        logged = noisy(flight(TIME_S, LATE_S, LATE_S + late_s, LATE_S + late_s), seed=1)
+        found, is_kept, notes = on_one_clock(logged)
+        assert len(found) == is_kept.sum() and len(notes) == 2 * (late_s > 0.0), notes
+        for name, bound in (("v", 0.03), ("p", 0.01)):
+            assert np.sqrt(np.mean((found[name] - truth[name][is_kept]) ** 2)) < bound, name
 
 
 def late_poses(log: FlightLog) -> FlightLog:
