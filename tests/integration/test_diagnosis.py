@@ -36,7 +36,7 @@ Found = Mapping[str, Any]
 def short_flight(truth: Truth, rng: np.random.Generator, spikes: int = 0) -> tuple[Diagnosis, FlightLog]:
     """Return the diagnosis of a short flight of a plant, and its log; spikes: outliers of its velocity."""
     log = measure(fly(truth, "scripted", SHORT_S, rng), "sensors", rng)
-    log["v"][rng.choice(len(log), spikes, replace=False)] += 2.0
+    log["v"][rng.choice(len(log), spikes, replace=False)] += rng.normal(0.0, 2.0, (spikes, 3))
     held_out = np.floor(log.time / BLOCK_S).astype(int) % 2 == 1
     return diagnose(log, model_of(truth), held_out), log
 
