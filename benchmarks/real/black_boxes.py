@@ -13,6 +13,7 @@ name        what it is
 """
 
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from typing import NamedTuple
 
 import flax.linen as nn
@@ -30,7 +31,7 @@ from flytrack_sysid.prediction_windows import HORIZONS_S, Windows
 from flytrack_sysid.record import fill_gaps
 from flytrack_sysid.split import held_out_rows
 
-LONG, SHORT, PAST_RATES = 30, 10, 5  # rows of commands and of rates
+LONG_S, PAST_RATES_S, SHORT = 0.3, 0.05, 3  # of commands, of rates; SHORT: which part of the commands
 RIDGE = 1e-3  # in units of the regressors' variance
 WIDTH, EPOCHS, PATIENCE, MINIBATCH, RATE = 16, 200, 15, 256, 3e-3
 GRAVITY = np.array([0.0, 0.0, 9.80665])
@@ -39,7 +40,7 @@ GRAVITY = np.array([0.0, 0.0, 9.80665])
 class Rows(NamedTuple):
     """Rows with enough of a past, and what comes of each; all (num_rows, ...).
 
-    commands: (num_rows, LONG, 4), the latest last. past_rates_b: (num_rows, PAST_RATES, 3). base: rates after
+    commands: (num_rows, past, 4), the latest last. past_rates_b: (num_rows, past, 3). base: rates after
     the step and specific force of the refitted base, body, (num_rows, 6). target: the measured ones.
     """
 
@@ -64,19 +65,35 @@ def base_steps(model: ModelParameters, log: FlightLog) -> np.ndarray:
 def rows_of(log: FlightLog, model: ModelParameters) -> Rows:
     """Return the rows of a log without gaps."""
     step_s, base = float(np.median(usual_step(log))), base_steps(model, log)
+    long, past_rates = _past(step_s)
     starts = np.flatnonzero(log.is_start())
     first = np.repeat(starts, np.diff(np.append(starts, len(log))))
-    now = np.flatnonzero((np.arange(len(log)) - first >= LONG - 1) & np.append(~log.is_start()[1:], False))
+    now = np.flatnonzero((np.arange(len(log)) - first >= long - 1) & np.append(~log.is_start()[1:], False))
     turned = Rotation.from_quat(log["q"][now], scalar_first=True).inv()
     acc_w = (log["v"][now + 1] - log["v"][now]) / step_s
     return Rows(
-        commands=log["u"][now[:, None] + np.arange(1 - LONG, 1)],
-        past_rates_b=log["w"][now[:, None] + np.arange(1 - PAST_RATES, 1)],
+        commands=log["u"][now[:, None] + np.arange(1 - long, 1)],
+        past_rates_b=log["w"][now[:, None] + np.arange(1 - past_rates, 1)],
         vel_b=turned.apply(log["v"][now]),
         base=base[now],
         target=np.c_[log["w"][now + 1], turned.apply(acc_w + GRAVITY)],
         is_held_out=held_out_rows(log)[now],
     )
+
+
+def _past(step_s: float) -> tuple[int, int]:
+    """Return the rows of commands and of rates that are known."""
+    return round(LONG_S / step_s), round(PAST_RATES_S / step_s)
+
+
+def posed(log: FlightLog) -> FlightLog:
+    """Return the log with attitude and velocity; level and at rest where it has none, as rates do not care."""
+    level = {"q": np.tile([1.0, 0.0, 0.0, 0.0], (len(log), 1)), "v": np.zeros((len(log), 3))}
+    return replace(log, channels=level | dict(log.channels))
+
+
+def _latest(rows: Rows) -> np.ndarray:
+    return rows.commands[:, -(rows.commands.shape[1] // SHORT) :]
 
 
 def _flat(values: np.ndarray) -> np.ndarray:
@@ -89,7 +106,7 @@ def _fir(rows: Rows) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _arx(rows: Rows) -> tuple[np.ndarray, np.ndarray]:
-    own = np.c_[_flat(rows.commands[:, -SHORT:]), _flat(rows.past_rates_b)]
+    own = np.c_[_flat(_latest(rows)), _flat(rows.past_rates_b)]
     return own, np.c_[own, rows.vel_b]
 
 
@@ -124,7 +141,7 @@ def network(rows: Rows) -> Answer:
     """Return the base with a network for what it leaves, stopped early by every fourth block."""
 
     def inputs_of(some: Rows) -> np.ndarray:
-        return np.c_[_flat(some.commands[:, -SHORT:]), some.base, some.vel_b]
+        return np.c_[_flat(_latest(some)), some.base, some.vel_b]
 
     known, left = inputs_of(rows), rows.target - rows.base
     mean, spread, size = known.mean(axis=0), known.std(axis=0) + 1e-9, left.std(axis=0)
@@ -168,15 +185,16 @@ def flown(answer: Answer, windows: Windows, base: np.ndarray) -> Tested:
     """Return a black box's errors on windows of a log; base: of ``base_steps``, all rows of the log."""
     record, first = windows.record, windows.first_free - 1
     step_s = float(np.median(record.step_s))
-    past = [windows.gyro_b[first - age] for age in range(PAST_RATES)][::-1]
+    long, past_rates = _past(step_s)
+    past = [windows.gyro_b[first - age] for age in range(past_rates)][::-1]
     turned = Rotation.from_quat(record.quat[first], scalar_first=True)
     vel_w, pos_w = record.vel_w[first], record.pos_w[first]
     seen = []
     for row in range(first, windows.ends[-1]):
         own = np.minimum(windows.start + row - first, len(base) - 1)
         rows = Rows(
-            commands=record.command[row + 1 - LONG : row + 1].swapaxes(0, 1),
-            past_rates_b=np.stack(past[-PAST_RATES:], axis=1),
+            commands=record.command[row + 1 - long : row + 1].swapaxes(0, 1),
+            past_rates_b=np.stack(past[-past_rates:], axis=1),
             vel_b=turned.inv().apply(vel_w),
             base=base[own],
             target=np.zeros((len(own), 6)),

@@ -1,0 +1,59 @@
+"""A Betaflight quadcopter: body rates simulated from setpoints alone, on the second half of an acro flight."""
+
+from pathlib import Path
+
+import jax
+import numpy as np
+
+from benchmarks.real.black_boxes import base_steps, flown, posed, rows_of, trained
+from benchmarks.real.record import Record, diagnosed, imported
+from benchmarks.report import table
+from flytrack_sysid.diagnosis.refinement import windows_of
+from flytrack_sysid.prediction_windows import HORIZONS_S, QUANTITIES
+
+FOLDER, FILE = "bf_gecko", "btfl_002.bbl"
+MAPPING = """[rows]
+every = 4
+
+[craft]
+mass_kg = 0.6  # a guess: the log does not say
+"""
+HORIZON, ASKED_OVER_BASE, ASKED_OVER_ARX = "0.25", 0.8, 1.1
+
+
+def measure(data: Path) -> Record:
+    """Return the diagnosis, learnt from the first half, and the black boxes' errors of rates on the second."""
+    found = imported(data / FOLDER / FILE, "betaflight", MAPPING)
+    held_out = found.log.time > 0.5 * (found.log.time[0] + found.log.time[-1])
+    diagnosis, record = diagnosed(found.log, found.nominal_model(), held_out)
+    log, base = posed(found.log), diagnosis.base._replace(effects=())
+    with jax.enable_x64(True):
+        windows = windows_of(found.log, held_out)
+        assert windows is not None
+        steps, boxes = base_steps(base, log), trained(rows_of(log.select(~held_out), base))
+        for name, answer in boxes.items():
+            rates = flown(answer, windows, steps).rms()[0, :, QUANTITIES.index("rates")]
+            by_horizon = dict(zip(map("{:g}".format, HORIZONS_S), rates.round(6).tolist(), strict=True))
+            record["diagnosis"]["prediction"]["errors"][name] = {"rates_rad_per_s": by_horizon}
+    return record
+
+
+def part(record: Record) -> str:
+    """Return the asked figures, and the errors of all models."""
+    errors = {
+        name: one["rates_rad_per_s"] for name, one in record["diagnosis"]["prediction"]["errors"].items()
+    }
+    rows = [
+        [name.replace("_", " "), *(f"{np.rad2deg(v):.3g}" for v in one.values())]
+        for name, one in errors.items()
+    ]
+    own = errors["extended"][HORIZON]
+    ratios = {other: own / errors[other][HORIZON] for other in ("refitted_base", "arx")}
+    return "\n\n".join(
+        [
+            f"Gyro simulated from setpoints for {HORIZON} s on the second half, which was held out: extended "
+            f"over refitted {ratios['refitted_base']:.2f} (asked: <= {ASKED_OVER_BASE}), over ARX "
+            f"{ratios['arx']:.2f} (asked: <= {ASKED_OVER_ARX}).",
+            table(["body rates, rms, deg/s, after", *(f"{one:g} s" for one in HORIZONS_S)], rows),
+        ]
+    )
