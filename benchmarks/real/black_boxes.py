@@ -87,7 +87,7 @@ def _past(step_s: float) -> tuple[int, int]:
 
 
 def posed(log: FlightLog) -> FlightLog:
-    """Return the log with attitude and velocity; level and at rest where it has none, as rates do not care."""
+    """Return the log with attitude and velocity; level and at rest if it has none."""
     level = {"q": np.tile([1.0, 0.0, 0.0, 0.0], (len(log), 1)), "v": np.zeros((len(log), 3))}
     return replace(log, channels=level | dict(log.channels))
 
@@ -144,7 +144,7 @@ def network(rows: Rows) -> Answer:
         return np.c_[_flat(_latest(some)), some.base, some.vel_b]
 
     known, left = inputs_of(rows), rows.target - rows.base
-    mean, spread, size = known.mean(axis=0), known.std(axis=0) + 1e-9, left.std(axis=0)
+    mean, spread, size = known.mean(axis=0), known.std(axis=0) + 1e-9, left.std(axis=0) + 1e-9
     known, left = ((known - mean) / spread).astype(np.float32), (left / size).astype(np.float32)
     module, chain = _Network(), optax.adam(RATE)
     weights = module.init(jax.random.key(0), known[:1])

@@ -42,8 +42,9 @@ from flytrack_sysid.diagnosis.refinement import (
 )
 from flytrack_sysid.diagnosis.score_test import CANDIDATES
 from flytrack_sysid.diagnosis.search import SearchState
-from flytrack_sysid.parameters import TAUS, THRUST_COEFFS, from_vector
+from flytrack_sysid.parameters import STICKS, TAUS, THRUST_COEFFS, from_vector
 from flytrack_sysid.prediction_windows import make_windows
+from flytrack_sysid.response import SMALL_STEP, half_responses
 
 VARIABLE, FOLDER = "FLYTRACK_SHARED_DATA", "crazyflie_rate_flights"
 LINES = ROOT / "benchmarks" / "data" / "real" / "crazyflie.jsonl"
@@ -166,7 +167,7 @@ def by_flight(results: dict[str, Tested], segment: np.ndarray) -> dict[str, list
 
 
 def fits(folder: Path, structure: Sequence[str], start: dict[str, float]) -> list[dict[str, Any]]:
-    """Return the values of one structure, fitted to the flights of each policy with enough of them."""
+    """Return values of one structure and times to half response, of the flights of each policy alone."""
     result = []
     for policy in progress(policies_in(folder), "policies"):
         log, model = flights(folder, [policy])
@@ -185,7 +186,9 @@ def fits(folder: Path, structure: Sequence[str], start: dict[str, float]) -> lis
         fit = target.fitted(vector, problem.index([*TAUS, *THRUST_COEFFS, *fields]), MOST_ROUNDS)
         pairs = zip(fit.places, fit.half_widths, strict=True)
         values = {problem.names[place]: [float(fit.vector[place]), float(half)] for place, half in pairs}
-        result.append({"policy": policy, "values": values})
+        half_s = half_responses(fit.vector[None], problem.like, SMALL_STEP)[0]
+        times = dict(zip(STICKS, half_s.tolist(), strict=True))
+        result.append({"policy": policy, "values": values, "half_response_s": times})
     return result
 
 

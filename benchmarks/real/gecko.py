@@ -1,4 +1,4 @@
-"""A Betaflight quadcopter: body rates simulated from setpoints alone, on the second half of an acro flight."""
+"""A Betaflight quadcopter: body rates simulated from setpoints, the second half of a flight held out."""
 
 from pathlib import Path
 
@@ -22,7 +22,7 @@ HORIZON, ASKED_OVER_BASE, ASKED_OVER_ARX = "0.25", 0.8, 1.1
 
 
 def measure(data: Path) -> Record:
-    """Return the diagnosis, learnt from the first half, and the black boxes' errors of rates on the second."""
+    """Return the diagnosis, learnt from the first half, and black boxes' errors on the second."""
     found = imported(data / FOLDER / FILE, "betaflight", MAPPING)
     held_out = found.log.time > 0.5 * (found.log.time[0] + found.log.time[-1])
     diagnosis, record = diagnosed(found.log, found.nominal_model(), held_out)

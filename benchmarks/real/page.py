@@ -22,6 +22,7 @@ OTHERS = {
     "placebo": "placebo: the state at the start, no commands",
 }
 AS_GOOD = 1.005  # rounds to 1.00
+WITHIN_MS = 5.0  # times to half response
 Line = dict[str, Any]
 
 
@@ -125,8 +126,13 @@ def fits_part() -> str:
         agree = [abs(a - b) <= first + second for (a, first), (b, second) in combinations(pairs, 2)]
         values = [f"{value:.3g} ± {half:.2g}" for value, half in pairs]
         rows.append([f"`{name}`", *values, f"{sum(agree)} of {len(agree)}"])
+    for stick in fits[0]["half_response_s"]:
+        times_ms = np.array([1e3 * one["half_response_s"][stick] for one in fits])
+        agree = [abs(a - b) <= WITHIN_MS for a, b in combinations(times_ms, 2)]
+        cells = [f"{time:.1f} ms" for time in times_ms]
+        rows.append([f"half response, {stick}", *cells, f"{sum(agree)} of {len(agree)}"])
     heads = [f"policy {one['policy']}" for one in fits]
-    return table(["parameter", *heads, "pairs whose intervals overlap"], rows)
+    return table(["parameter", *heads, f"pairs that overlap (times: within {WITHIN_MS:g} ms)"], rows)
 
 
 def crazyflie_part() -> str:
