@@ -11,6 +11,7 @@ import numpy as np
 
 from benchmarks.report import commit_of_checkout
 from flytrack_env.dynamics import ModelParameters
+from flytrack_env.motion import Motion
 from flytrack_sysid import FlightLog, Imported, diagnose, import_log
 from flytrack_sysid.diagnosis import Diagnosis
 from flytrack_sysid.diagnosis.refinement import Tested
@@ -25,7 +26,7 @@ def diagnosed(
 ) -> tuple[Diagnosis, Record]:
     """Return a log's diagnosis, and a record of it: JSON values, number of rows, CPU time."""
     started = time.process_time()
-    found = diagnose(log, model, held_out)
+    found = diagnose(log, model, held_out, motion=Motion.CONTINUOUS)
     return found, {
         "num_rows": len(log),
         "cpu_s": time.process_time() - started,
