@@ -74,9 +74,9 @@ def part(record: Record) -> str:
             f"Gyro simulated from setpoints for {HORIZON} s on the second half, which was held out: extended "
             f"over refitted {ratios['refitted_base']:.2f} (asked: <= {ASKED_OVER_BASE}), over ARX "
             f"{ratios['arx']:.2f} (asked: <= {ASKED_OVER_ARX}).",
-            "A linear law that knows the setpoints of 0.3 s before and 0.1 s after, fitted to the first half, is "
-            f"off by {np.rad2deg(record['best_linear_rad_per_s']):.3g} deg/s on the second: what is left beyond "
-            "that does not come from the sticks, in a linear way at least.",
+            "A linear law that knows the setpoints from 0.3 s before to 0.1 s after, fitted to the first, "
+            f"is off by {np.rad2deg(record['best_linear_rad_per_s']):.3g} deg/s on the second: what is left "
+            "beyond that does not come from the sticks, in a linear way at least.",
             table(["body rates, rms, deg/s, after", *(f"{one:g} s" for one in HORIZONS_S)], rows),
         ]
     )
