@@ -23,7 +23,7 @@ STYLES: dict[str, dict[str, Any]] = {
 }
 MOST_VALUES = 3  # of a cause, in a sentence
 SPOKEN = (("attitude_rad", "0.25"), ("rates_rad_per_s", "0.25"), ("position_m", "1"))
-WIDTH_IN, HEIGHT_IN = 2.6, 2.9
+WIDTH_IN, HEIGHT_IN = 2.6, 3.2
 
 
 def number(value: float | None, unit: str = "1") -> str:
@@ -112,9 +112,7 @@ def draw(measured: Record) -> Figure | None:
         axes.set_xlabel("seconds of free flight", fontsize="small")
         axes.tick_params(labelsize="small")
     entries = figure.axes[0].get_legend_handles_labels()
-    figure.legend(
-        *entries, loc="outside lower center", ncols=len(entries[1]), frameon=False, fontsize="small"
-    )
+    figure.legend(*entries, loc="outside lower center", ncols=4, frameon=False, fontsize="small")
     return figure
 
 
