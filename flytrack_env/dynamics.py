@@ -343,9 +343,12 @@ def observe_rates(
     """
     memories, rest_b = effects.observe(params.effects, memories, rates_b - drone.rates_b, dt)
     full_stick = body_rates(Action(1.0, 1.0, 1.0, 0.0), params.max_rate)
-    rates = zip(drone.applied, rest_b, full_stick, strict=False)
-    sticks = (stick + rest / full for stick, rest, full in rates)
-    return drone._replace(rates_b=rates_b, applied=Action(*sticks, drone.applied.thrust)), memories
+    applied = drone.applied._replace(
+        roll=drone.applied.roll + rest_b.x / full_stick.x,
+        pitch=drone.applied.pitch + rest_b.y / full_stick.y,
+        yaw=drone.applied.yaw + rest_b.z / full_stick.z,
+    )
+    return drone._replace(rates_b=rates_b, applied=applied), memories
 
 
 class Reading(NamedTuple):

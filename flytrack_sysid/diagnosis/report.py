@@ -143,7 +143,8 @@ def _gain(diagnosis: Diagnosis) -> str:
         return ""
     names = ", ".join(cause.effect for cause in diagnosis.causes)
     share = 100.0 * (1.0 - after / before)
-    text = f"Named {names}: flies {abs(share):.0f} % {'closer' if share >= 0.0 else 'farther off'} after 1 s"
+    change = f"{abs(share):.0f} % {'closer' if share > 0.0 else 'farther off'}"
+    text = f"Named {names}: flies {change if abs(share) >= 0.5 else 'as close'} after 1 s"
     alone = f"; refitted without effects, {refitted:.2g} m" if np.isfinite(refitted) else ""
     return f"{text} ({after:.2g} m instead of {before:.2g} m on held-out flight{alone})."
 
