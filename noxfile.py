@@ -21,6 +21,7 @@ nox.options.error_on_missing_interpreters = False
 
 ROOT = Path(__file__).parent
 PACKAGES = ("baselines", "flytrack_env", "flytrack_loop", "flytrack_sysid")
+CLONE_ONLY = "firmware/"
 HEADLESS = {"JAX_PLATFORMS": "cpu", "MPLBACKEND": "agg", "SDL_VIDEODRIVER": "dummy", "PYTHONPATH": ""}
 TEST_TOOLS = ("pytest>=9", "hypothesis>=6.150", "pillow", "pyulog>=1.2", "orangebox>=0.4,<0.5")
 PLANT = ROOT / "blackbox" / "acro_step.bin"
@@ -101,7 +102,7 @@ def built() -> tuple[Path, Path]:
 
 @nox.session(tags=["wheel"])
 def contents(session: nox.Session) -> None:
-    """The wheel has the packages' files; the source distribution has every tracked file."""
+    """The wheel has the packages' files; the source distribution has every tracked file but firmware/."""
     listed = subprocess.run(["git", "ls-files"], cwd=ROOT, capture_output=True, text=True, check=True)
     tracked = set(listed.stdout.splitlines())
     wheel, source = built()
@@ -111,6 +112,10 @@ def contents(session: nox.Session) -> None:
         in_source = {entry.name.partition("/")[2] for entry in archive if entry.isfile()}
     if difference := in_wheel ^ {path for path in tracked if path.startswith(PACKAGES)}:
         session.error(f"{wheel.name}: differs from the repository in {sorted(difference)}")
+    # The folder with GPL-3 is for clones: it is in no release.
+    if released := {name for name in in_wheel | in_source if name.startswith(CLONE_ONLY)}:
+        session.error(f"found {sorted(released)}, expected nothing of {CLONE_ONLY} in a release")
+    tracked = {path for path in tracked if not path.startswith(CLONE_ONLY)}
     if missing := tracked - in_source - {".gitignore", ".ci/run"}:
         session.error(f"{source.name}: lacks {sorted(missing)}")
 

@@ -41,6 +41,12 @@ class Plant(ABC):
         """Return a drone as gyro and motion capture report it: as it is by default."""
         return drone
 
+    def check_alive(self) -> None:  # noqa: B027, most plants cannot fail
+        """Raise ValueError if a step has failed, since when states are NaN; nothing by default.
+
+        A compiled step cannot raise: who runs some asks this afterwards.
+        """
+
 
 class SimulatorState(NamedTuple):
     """The drone, and memories: what each effect of the model remembers, None for most."""

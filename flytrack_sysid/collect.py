@@ -61,7 +61,9 @@ def _fly_plant(plant: Plant) -> Fly:
 
     def fly(starts: np.ndarray, commands: np.ndarray) -> np.ndarray:
         try:
-            return np.asarray(fly_all(starts, commands))
+            states = np.asarray(fly_all(starts, commands))
+            plant.check_alive()
+            return states
         except Exception as error:  # whatever a user's plant raises
             raise CollectError(f"plant: {type(error).__name__}: {error}") from error
 

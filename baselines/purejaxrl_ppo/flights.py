@@ -244,7 +244,10 @@ def fly_many(
     """Return episodes from noisy start poses, leaves (num_episodes, num_steps, ...)."""
     params = start_pose_params(env.default_params, num_steps)
     fly = partial(fly_episode, env, network, policy_params)
-    return jax.vmap(lambda key: fly(key, params, num_steps, num_laps))(start_keys(seed, num_episodes))
+    flights = jax.vmap(lambda key: fly(key, params, num_steps, num_laps))(start_keys(seed, num_episodes))
+    jax.block_until_ready(flights)
+    env.plant.check_alive()
+    return flights
 
 
 def start_keys(seed: int, num_episodes: int) -> jax.Array:
@@ -333,4 +336,5 @@ def race_many(
         own = jax.tree.map(lambda leaf, rows=rows: leaf[rows], models)
         batch = _race_batch(env, network, policy_params, keys[rows], params, own, num_steps, num_laps)
         parts.append(jax.tree.map(np.asarray, batch))
+        env.plant.check_alive()
     return jax.tree.map(lambda *leaves: np.concatenate(leaves)[:num_flights], *parts)

@@ -43,6 +43,7 @@ CONSUMERS = (
     "flytrack_loop",
     "benchmarks",
     "blackbox",
+    "firmware",
     "clients",
     "eval_agent",
     "demo",

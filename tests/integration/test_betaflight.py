@@ -1,0 +1,251 @@
+"""Betaflight in the loop: built once, then flown, logged, configured and broken."""
+
+import os
+import signal
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+import pytest
+
+pytest.importorskip("firmware", reason="firmware/ is in clones only")
+
+import flytrack_env
+from firmware import Betaflight, Body, FirmwareError, build
+from firmware.checking import check
+from flytrack_env.dynamics import nominal_parameters
+from flytrack_env.state import (
+    ACCELERATION,
+    APPLIED_ACTION,
+    BATTERY,
+    QUATERNION,
+    RATES,
+    pack,
+    unpack,
+    unpack_action,
+)
+from flytrack_sysid import CollectError, collect, import_log, load_log, save_log
+from flytrack_sysid.excitation import start_state
+from tests.support.pages import DOCS, run_examples
+
+pytestmark = [pytest.mark.slow, pytest.mark.firmware]
+
+MODEL = nominal_parameters()
+SETTLE_S = 0.7  # from arming to the first row of a log, and some more
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _is_built() -> None:
+    try:
+        build(lambda line: None)
+    except FirmwareError as error:
+        pytest.skip(f"the firmware cannot be built here: {error}")
+
+
+@pytest.fixture(scope="module")
+def plant() -> Iterator[Betaflight]:
+    """The stock firmware on the default body."""
+    with Betaflight() as flown:
+        yield flown
+
+
+def starts(number: int = 3, volts: float = 23.0) -> np.ndarray:
+    rng = np.random.default_rng(0)
+    found = [start_state(rng, volts, -0.2, tilt_deg=20.0 * row, speed=2.0 * row) for row in range(number)]
+    return np.array(found, np.float32)
+
+
+def sticks(number: int = 3, steps: int = 80) -> np.ndarray:
+    rng = np.random.default_rng(1)
+    return np.repeat(rng.uniform(-1, 1, (number, steps // 8, 4)), 8, axis=1).astype(np.float32)
+
+
+def fly_compiled(plant: Betaflight, rows: np.ndarray, commands: np.ndarray) -> np.ndarray:
+    """Return the states (number, steps, 21) after each command, by the plant's own steps."""
+
+    def fly_one(start: jax.Array, command: jax.Array) -> Any:
+        def step(state: Any, u: jax.Array) -> Any:
+            after = plant.step(state, unpack_action(u), 0.01, MODEL)
+            return after, pack(plant.drone(after))
+
+        return jax.lax.scan(step, plant.reset(unpack(start), MODEL), command)[1]
+
+    return np.asarray(jax.jit(jax.vmap(fly_one))(rows, commands))
+
+
+def num_processes(plant: Betaflight) -> int:
+    """Return how many processes of a plant's group are alive, zombies not counted."""
+    process = plant.firmware.process
+    group = process.pid if process is not None else -1
+    found = 0
+    for path in Path("/proc").glob("[0-9]*/stat"):
+        try:
+            fields = path.read_text().rpartition(")")[2].split()
+        except OSError:
+            continue
+        found += int(fields[2]) == group and fields[0] not in "ZX"
+    return found
+
+
+def test_same_flights_alone_among_others_again_and_of_another_plant(plant):
+    rows, commands = starts(), sticks()
+    first = plant.fly(rows, commands)
+    assert np.isfinite(first).all() and np.abs(first[..., RATES]).max() > 5.0
+    np.testing.assert_array_equal(fly_compiled(plant, rows, commands), first)
+    np.testing.assert_array_equal(plant.fly(rows[1:2], commands[1:2])[0], first[1])
+    with Betaflight() as other:
+        np.testing.assert_array_equal(other.fly(rows[::-1], commands[::-1])[::-1], first)
+
+
+def test_noise_of_the_gyro_is_of_the_seed_and_filtered():
+    body, rows, commands = Body(gyro_noise=0.05), starts(2), np.zeros((2, 40, 4), np.float32)
+    flown = []
+    for seed in (0, 0, 1):
+        with Betaflight(body=body, seed=seed) as plant:
+            flown.append(plant.fly(rows, commands))
+    np.testing.assert_array_equal(flown[0], flown[1])
+    difference = np.abs(flown[0] - flown[2])[..., RATES]
+    assert 0.0 < difference.max() < 0.5
+
+
+def test_thrust_is_that_of_the_body_and_rates_those_of_the_settings(plant):
+    rows = starts(1, volts=23.0)
+    rows[0, QUATERNION] = (1, 0, 0, 0)
+    hold, turn = np.tile(rows[:, APPLIED_ACTION], (1, 20, 1)), np.tile([[[0.5, 0.0, 0.0, -0.2]]], (1, 60, 1))
+    climb = plant.fly(rows, hold.astype(np.float32))[0]
+    command = 0.055 + 0.945 * 0.5 * (1 - 0.2)  # the firmware's idle is 5.5 %
+    expected = plant.body.full_thrust_n * command**2 * (23.0 / 24.0) ** 1.4 - plant.body.gravity
+    assert climb[5, ACCELERATION][2] == pytest.approx(expected, abs=0.05)
+    np.testing.assert_allclose(climb[:, APPLIED_ACTION][:, 3], -0.2, atol=2e-3)
+    rates = plant.fly(rows, turn.astype(np.float32))[0, -1, RATES]
+    assert rates[0] == pytest.approx(np.deg2rad(310.0), rel=0.02) and abs(rates[1:]).max() < 0.1
+
+
+def test_sick_motors_sag_and_settings_show():
+    sick = Body(health=(0.9, 1.0, 1.0, 1.0), resistance_ohm=0.02, full_current_a=80.0)
+    rows, commands = starts(1, volts=24.0), np.tile([[[0.0, 0.0, 0.0, 1.0]]], (1, 60, 1)).astype(np.float32)
+    with Betaflight({"motor_output_limit": 80}, sick) as limited, Betaflight(body=Body()) as healthy:
+        weak, strong = limited.fly(rows, commands)[0], healthy.fly(rows, commands)[0]
+    assert weak[-1, ACCELERATION][2] < 0.8 * strong[-1, ACCELERATION][2]
+    assert strong[-1, BATTERY] - weak[-1, BATTERY] == pytest.approx(0.02 * 80 * 0.8**3, rel=0.15)
+
+
+def test_settings_are_read_back():
+    dump = "feature -AIRMODE\nprofile 1\nset p_roll = 60\nrateprofile 2\nset rates_type = ACTUAL\n"
+    with Betaflight(dump + "set roll_srate = 80\n") as plant:
+        found = [plant.value(name) for name in ("p_roll", "roll_srate", "feature AIRMODE", "nonsense")]
+        assert found == ["60", "80", "OFF", ""] and plant.full_stick_deg_s[0] == 800.0
+        masters = {
+            name: value for (scope, _, name), value in plant.firmware.values.items() if scope == "master"
+        }
+    lines = [
+        f"set {name} = {value}"
+        for name, value in masters.items()
+        if " " not in name and "profile" not in name
+    ]
+    with Betaflight("\n".join(lines)) as again:  # names and values that the firmware itself has
+        assert len(lines) > 200 and again.value("p_roll") == "45"
+
+
+def test_refused_settings_are_named():
+    with pytest.raises(FirmwareError, match=r"the firmware refused roll_srate, p_rol, feature WINGS; skip="):
+        Betaflight({"p_rol": 60, "roll_srate": 10_000, "feature wings": True, "p_pitch": 50})
+    with Betaflight({"p_rol": 60, "p_pitch": 50}, skip=["p_ro*"]) as plant:
+        assert plant.value("p_pitch") == "50"
+
+
+def test_collected_log_and_blackbox_are_the_same_flight(tmp_path):
+    pytest.importorskip("orangebox", reason="orangebox is not installed: pip install 'flytrack[logs]'")
+    body = Body(drain_v_per_min=5.0)
+    with Betaflight({"blackbox_high_resolution": True}, body, blackbox=tmp_path / "box") as plant:
+        log = collect(plant, minutes=1.0, seed=0)
+        directory = plant.firmware.folder
+    assert not directory.exists()
+    save_log(tmp_path / "log.npz", log)
+    again = load_log(tmp_path / "log.npz")
+    np.testing.assert_array_equal(again["w"], log["w"])
+    assert len(log) > 4000 and again.channels.keys() == log.channels.keys()
+    boxes = sorted((tmp_path / "box").iterdir())
+    assert len(boxes) == 24  # of the excitation; the search for hover is too short
+    box = import_log(boxes[0], "betaflight").log
+    flown = log.select(log.segment == 0)
+
+    def seen(channel: str, shift_s: float) -> np.ndarray:
+        return np.stack(
+            [np.interp(flown.time + shift_s, box.time, column) for column in box[channel].T], axis=1
+        )
+
+    # The firmware's log begins where its header is written, while the craft is held and settles.
+    shifts_s = np.arange(0.0, SETTLE_S, 0.0005)
+    errors = [np.sqrt(np.mean((seen("w", shift_s) - flown["w"]) ** 2)) for shift_s in shifts_s]
+    assert min(errors) < 0.05  # rad/s, at up to 10
+    shift_s = shifts_s[int(np.argmin(errors))]
+    wrong = np.abs(seen("u", shift_s + 0.005) - flown["u"])
+    assert np.median(wrong) < 0.02 and np.median(wrong[:, 3]) < 0.01
+    np.testing.assert_allclose(seen("v_bat", shift_s), flown["v_bat"], atol=0.03)
+
+
+def test_environment_flies_it_and_goes_back_no_further_than_a_step(plant):
+    env = flytrack_env.make("FlyTrack-v0", plant=plant)
+    params, key = env.default_params, jax.random.key(0)
+    _, state = env.reset(key, params)
+    act = np.zeros(4, np.float32)
+    states = [state]
+    for _ in range(3):
+        states.append(env.step_env(None, states[-1], act, params)[1])
+    again = env.step_env(None, states[2], act, params)[1]
+    np.testing.assert_array_equal(pack(env.drone(again)), pack(env.drone(states[3])))
+    with Betaflight() as other:
+        lost = other.step(replace_flight(other, rows=starts(1)), unpack_action(act), 0.01, MODEL)
+        assert np.isnan(pack(lost.drone)).all()
+        with pytest.raises(FirmwareError, match="flight 7 has ended"):
+            other.check_alive()
+
+
+def replace_flight(plant: Betaflight, rows: np.ndarray) -> Any:
+    """Return a state of a flight that the plant never began."""
+    return plant.reset(unpack(rows[0]), MODEL)._replace(flight=np.int32(7))
+
+
+def test_a_process_that_dies_or_hangs_is_one_sentence_and_nothing_is_left(monkeypatch):
+    monkeypatch.setattr("firmware.process.LONGEST_ANSWER_S", 2.0)
+    for blow, said in (
+        (signal.SIGKILL, "has ended by itself"),
+        (signal.SIGSTOP, "did not answer within 2 s"),
+    ):
+        with Betaflight() as plant:
+            state = plant.step(
+                plant.reset(unpack(starts(1)[0]), MODEL), unpack_action(np.zeros(4)), 0.01, MODEL
+            )
+            assert num_processes(plant) == 2
+            os.kill(plant._flights[int(state.flight)].link.pid, blow)
+            after = plant.step(state, unpack_action(np.zeros(4)), 0.01, MODEL)
+            assert np.isnan(pack(after.drone)).all()
+            with pytest.raises(CollectError, match=f"the process of a flight {said}"):
+                collect(plant, minutes=1.0)
+            assert plant.firmware.process is None and not plant.firmware.folder.exists()
+
+
+def test_craft_that_cannot_arm_says_why():
+    with (
+        pytest.raises(FirmwareError, match=r"it does not arm: .*THROTTLE"),
+        Betaflight({"min_check": 900}) as plant,
+    ):
+        plant.fly(starts(1), sticks(1))
+
+
+def test_bodies_differ_only_where_they_differ():
+    rows, commands = starts(1), sticks(1)
+    with Betaflight(body=replace(Body(), center_of_mass_m=(0.01, 0.0))) as heavy_nose, Betaflight() as even:
+        a, b = heavy_nose.fly(rows, commands), even.fly(rows, commands)
+    assert np.isfinite(a).all() and not np.array_equal(a, b)
+
+
+def test_page_runs_and_check_is_repeatable(tmp_path, monkeypatch):
+    pytest.importorskip("orangebox", reason="orangebox is not installed: pip install 'flytrack[logs]'")
+    assert "the same twice" in check()
+    names = run_examples((DOCS / "firmware.md").read_text(encoding="utf-8"), tmp_path, monkeypatch)
+    assert len(names["log"]) > 3000 and len(names["flown"]) > 200

