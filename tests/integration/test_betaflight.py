@@ -3,7 +3,6 @@
 import os
 import signal
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -235,13 +234,6 @@ def test_craft_that_cannot_arm_says_why():
         Betaflight({"min_check": 900}) as plant,
     ):
         plant.fly(starts(1), sticks(1))
-
-
-def test_bodies_differ_only_where_they_differ():
-    rows, commands = starts(1), sticks(1)
-    with Betaflight(body=replace(Body(), center_of_mass_m=(0.01, 0.0))) as heavy_nose, Betaflight() as even:
-        a, b = heavy_nose.fly(rows, commands), even.fly(rows, commands)
-    assert np.isfinite(a).all() and not np.array_equal(a, b)
 
 
 def test_page_runs_and_check_is_repeatable(tmp_path, monkeypatch):
