@@ -34,7 +34,7 @@ test: setup
 
 # The rest: statistics, long trainings, every tutorial.
 test-all: setup
-	$(BIN)/python -m pytest --numprocesses 2 --dist loadfile -m slow
+	$(BIN)/python -m pytest --numprocesses 2 --dist loadfile -m slow -rs
 
 # Diagnoses 60 recorded plants again: names must stay and intervals agree to 1e-6; about 8 CPU minutes.
 check-diagnosis: setup
