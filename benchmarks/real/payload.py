@@ -18,7 +18,7 @@ from flytrack_sysid import FlightLog
 from flytrack_sysid.record import BATTERY_UNKNOWN_V
 
 STANDARD, UPGRADED = "cf_lee_standard", "cf_lee_upgraded"
-MAPPING = 'extends = "crazyflie_lee"\n\n[craft]\nmass_kg = {mass_kg}\n'
+MAPPING = 'extends = "crazyflie_lee"\n\n[rows]\nevery = 2\n\n[craft]\nmass_kg = {mass_kg}\n'
 WITHIN = 0.05
 UNWANTED = ("linear_drag", "quadratic_drag", "rotor_drag", "wind")
 
