@@ -54,6 +54,15 @@ def flights(data: Path, names: Sequence[str], mass_kg: float) -> tuple[FlightLog
     return found.log, found.nominal_model()
 
 
+def in_proportion(model: ModelParameters, per_command: float) -> ModelParameters:
+    """Return a model whose thrust is in proportion to the command, which is in N: hover shows no curve.
+
+    per_command: specific force, m/s^2, of a command of one above the lowest.
+    """
+    slope = per_command * float(model.m)
+    return model._replace(thrust_coeffs=np.array([slope, slope, 0.0, 0.0, 0.0, 0.0]))
+
+
 def thrust_of(model: ModelParameters, log: FlightLog) -> float:
     """Return the mean thrust over the mass that a model gives to a log's commands, m/s^2."""
     stick = log["u"][:, 3]
@@ -66,13 +75,14 @@ def measure(data: Path) -> Record:
     records = {}
     for name, pair in PAIRS.items():
         known, nominal = flights(data, pair.known, pair.known_kg)
-        model, of_model = diagnosed(known, nominal)
         judged, _ = flights(data, pair.judged, pair.judged_kg)
-        found, record = diagnosed(judged, model.extended)
         per_command = [np.median(log["f"][:, 2]) / np.median(log["u"][:, 3] + 1.0) for log in (known, judged)]
+        model, of_model = diagnosed(known, in_proportion(nominal, per_command[0]))
+        reference = in_proportion(model.extended, per_command[0])
+        found, record = diagnosed(judged, reference)
         records[name] = record | {
             "model": of_model["diagnosis"]["causes"],
-            "ratio": thrust_of(found.extended, judged) / thrust_of(model.extended, judged),
+            "ratio": thrust_of(found.extended, judged) / thrust_of(reference, judged),
             "force_per_command_ratio": float(per_command[1] / per_command[0]),
         }
     return records

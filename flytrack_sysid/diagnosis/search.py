@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from flytrack_sysid.diagnosis import noise as noises
+from flytrack_sysid.diagnosis.lanes import voltages_of
 from flytrack_sysid.diagnosis.problem import REPLAYED, SMALL_BATCH, Problem
 from flytrack_sysid.diagnosis.score_test import (
     BASE_FREE,
@@ -19,6 +20,7 @@ from flytrack_sysid.diagnosis.score_test import (
     threshold,
 )
 from flytrack_sysid.log import FlightLog
+from flytrack_sysid.parameters import DRAIN
 
 PER_PARAMETER = 4.0  # of chi2: what one more parameter has to gain to be preferred to fewer
 MOST_EFFECTS = 6
@@ -80,7 +82,9 @@ class SearchState:
         """Return the state before anything was searched for. problem: of rows of the log, with a noise."""
         channels = {*log.channels, *problem.lanes.measured}
         lacking = tuple(effect.name for effect in REPLAYED if not set(effect.needs) <= channels)
-        return cls(problem, unobservable=lacking)
+        # The replay's voltage is then assumed at every row; what falls within a step would pass for thrust.
+        held = () if voltages_of(problem.lanes) else (Held(DRAIN, ""),)
+        return cls(problem, unobservable=lacking, held=held)
 
     @property
     def base_places(self) -> list[int]:

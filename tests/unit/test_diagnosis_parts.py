@@ -19,6 +19,8 @@ from flytrack_sysid.diagnosis import noise as noises
 from flytrack_sysid.diagnosis.diagnose import unused_channels
 from flytrack_sysid.diagnosis.lanes import LANE_S, LEAD_IN_S, NUM_AXES, make_lanes
 from flytrack_sysid.diagnosis.problem import Problem
+from flytrack_sysid.diagnosis.search import SearchState
+from flytrack_sysid.parameters import DRAIN
 from flytrack_sysid.record import make_record
 from flytrack_sysid.residuals import predict_rows
 
@@ -236,3 +238,11 @@ def test_logs_are_joined_by_what_they_all_have(flown):
     assert joined([first]) is first
     with pytest.raises(DiagnosisError, match="logs: found none"):
         joined([])
+
+
+@pytest.mark.parametrize("missing", [(), ("v_bat",)])
+def test_the_battery_drains_only_where_its_voltage_was_measured(flown, missing):
+    truth, log = flown[0], flown[1].without(*missing)
+    lanes = make_lanes(log, np.ones(len(log), bool), np.array(truth.tau), truth.gravity)
+    state = SearchState.start(log, Problem.of(lanes, model_of(truth)))
+    assert (state.problem.names.index(DRAIN) in state.base_places) == (not missing)
