@@ -5,7 +5,7 @@ from pathlib import Path
 import jax
 import numpy as np
 
-from benchmarks.real.black_boxes import base_steps, flown, posed, rows_of, trained
+from benchmarks.real.black_boxes import base_steps, flown, linear_ones, posed, rows_of
 from benchmarks.real.record import Record, diagnosed, imported
 from benchmarks.report import table
 from flytrack_sysid import FlightLog
@@ -34,7 +34,7 @@ def measure(data: Path) -> Record:
     with jax.enable_x64(True):
         windows = windows_of(found.log, held_out)
         assert windows is not None
-        steps, boxes = base_steps(base, log), trained(rows_of(log.select(~held_out), base))
+        steps, boxes = base_steps(base, log), linear_ones(rows_of(log.select(~held_out), base))
         for name, answer in boxes.items():
             rates = flown(answer, windows, steps).rms()[0, :, QUANTITIES.index("rates")]
             by_horizon = dict(zip(map("{:g}".format, HORIZONS_S), rates.round(6).tolist(), strict=True))

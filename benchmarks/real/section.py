@@ -63,7 +63,13 @@ def _responses(found: Mapping[str, Mapping[str, Record]]) -> str:
 
     def times(model: str) -> str:
         known = {stick: one["time"] for stick, one in found[model].items() if one["time"] is not None}
-        return ", ".join(f"{stick} {1e3 * time:.0f}" for stick, time in known.items())
+        halves = {
+            stick: (found[model][stick]["ci95"] or [np.nan, time])[1] - time for stick, time in known.items()
+        }
+        return ", ".join(
+            f"{stick} {1e3 * time:.0f}" + (f" ± {1e3 * halves[stick]:.0f}" if halves[stick] else "")
+            for stick, time in known.items()
+        )
 
     return (
         "From a small step of the stick to half of the answer it takes, in ms: "
