@@ -61,15 +61,14 @@ def _responses(found: Mapping[str, Mapping[str, Record]]) -> str:
     if not found:
         return ""
 
+    def time_of(one: Record) -> str:
+        high = (one["ci95"] or (None, None))[1]
+        text = f"{1e3 * one['time']:.0f}"
+        return text if high is None else f"{text} ± {1e3 * (high - one['time']):.0f}"
+
     def times(model: str) -> str:
-        known = {stick: one["time"] for stick, one in found[model].items() if one["time"] is not None}
-        halves = {
-            stick: (found[model][stick]["ci95"] or [np.nan, time])[1] - time for stick, time in known.items()
-        }
-        return ", ".join(
-            f"{stick} {1e3 * time:.0f}" + (f" ± {1e3 * halves[stick]:.0f}" if halves[stick] else "")
-            for stick, time in known.items()
-        )
+        known = {stick: one for stick, one in found[model].items() if one["time"] is not None}
+        return ", ".join(f"{stick} {time_of(one)}" for stick, one in known.items())
 
     return (
         "From a small step of the stick to half of the answer it takes, in ms: "
