@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator
 
 from benchmarks.real.record import Record
 from benchmarks.report import table
@@ -63,8 +64,10 @@ def _responses(found: Mapping[str, Mapping[str, Record]]) -> str:
 
     def time_of(one: Record) -> str:
         high = (one["ci95"] or (None, None))[1]
-        text = f"{1e3 * one['time']:.0f}"
-        return text if high is None else f"{text} ± {1e3 * (high - one['time']):.0f}"
+        half = None if high is None else high - one["time"]
+        if half is not None and half > one["time"]:
+            return "not determined"
+        return f"{1e3 * one['time']:.0f}" + ("" if half is None else f" ± {1e3 * half:.0f}")
 
     def times(model: str) -> str:
         known = {stick: one for stick, one in found[model].items() if one["time"] is not None}
@@ -112,7 +115,9 @@ def draw(measured: Record) -> Figure | None:
                 label = name.replace("_", " ")
                 plain(axes).loglog([*map(float, by_horizon)], values, markersize=3, label=label, **style)
         axes.set_title(f"{key.split('_')[0]} ({unit})", fontsize="small", loc="left")
-        axes.set_xticks([*map(float, by_horizon or {})], [*(by_horizon or {})], minor=False)
+        axes.set_xticks([*map(float, errors["extended"][key])], [*errors["extended"][key]])
+        axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+        axes.yaxis.set_major_formatter("{x:g}")
         axes.minorticks_off()
         axes.set_xlabel("seconds of free flight", fontsize="small")
         axes.tick_params(labelsize="small")
