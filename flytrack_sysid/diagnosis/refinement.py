@@ -340,7 +340,9 @@ class Refined(NamedTuple):
         assert self.fit is not None
         if effect in self.without:
             return self.without[effect]
-        fields = BASE_CAUSES["thrust_curve" if effect == "thrust_scale" else effect]
+        own = [name for name in self.problem.names if name.startswith(f"{effect}.")]  # of a sensor
+        cause = "thrust_curve" if effect == "thrust_scale" else effect
+        fields = BASE_CAUSES[cause] if cause in BASE_CAUSES else own
         vector, places = self.fit.vector.copy(), self.problem.index(fields)
         vector[places] = self.problem.start[places]
         return vector
