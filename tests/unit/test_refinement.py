@@ -78,6 +78,7 @@ def test_values_are_refined_by_flights(dragged):
         place = problem.names.index(f"linear_drag.{name}")
         assert abs(found.fit.vector[place] - value) < max(1.5 * half_widths[place], 0.05 * value)
     assert found.fit.vector[problem.names.index("accelerometer_bias.x")] == 0.3  # no flight shows it
+    assert found.vector_without("accelerometer_bias")[problem.names.index("accelerometer_bias.x")] == 0.0
     assert found.removal_costs["linear_drag"] > 0.1 and "accelerometer_bias" not in found.removal_costs
     assert found.judge.worst_ratio(found.fit.vector) < 1.0
 
