@@ -342,7 +342,7 @@ class Refined(NamedTuple):
             return self.without[effect]
         own = [name for name in self.problem.names if name.startswith(f"{effect}.")]  # of a sensor
         cause = "thrust_curve" if effect == "thrust_scale" else effect
-        fields = BASE_CAUSES[cause] if cause in BASE_CAUSES else own
+        fields = BASE_CAUSES.get(cause, own)
         vector, places = self.fit.vector.copy(), self.problem.index(fields)
         vector[places] = self.problem.start[places]
         return vector
