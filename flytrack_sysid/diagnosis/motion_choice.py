@@ -27,6 +27,8 @@ from flytrack_sysid.diagnosis.search import refine
 from flytrack_sysid.log import FlightLog, usual_step
 
 CLEAR = 10.0  # of minus twice the log likelihood, by which a simulator's step has to win
+# Of it, which poses that are not on time have to gain: effects that are not fitted here change it by so much.
+LATE = 60.0
 NEAR = 300.0  # of it: within so much of the best, lateness is fitted before one is chosen
 UNDECIDED = 60.0  # of it: while the second best is so near, more of the log is asked
 MOST_LANES = 4  # at a time, evenly spread: twenty seconds decide mostly
@@ -37,7 +39,16 @@ DIFFERENCE_S, LONGEST_STEP_S = 2e-4, 3e-3  # for slopes; of a step of the fit
 ROUNDS = 2
 LOOK_ALIKES: tuple[Effect, ...] = tuple(
     BY_NAME[name]
-    for name in ("command_delay", "rate_scale", "linear_drag", "accelerometer_scale", "gyro_scale")
+    for name in (
+        "command_delay",
+        "rate_scale",
+        "linear_drag",
+        "quadratic_drag",
+        "rotor_drag",
+        "wind",
+        "accelerometer_scale",
+        "gyro_scale",
+    )
 )
 
 
@@ -136,6 +147,11 @@ def _misfits(trials: Sequence[Trial]) -> list[float]:
     return misfits
 
 
+def _costs(trials: Sequence[Trial], misfits: Sequence[float]) -> list[float]:
+    """Return the misfits and what it costs not to be on time."""
+    return [misfit + LATE * bool(trial.moves.late_s) for trial, misfit in zip(trials, misfits, strict=True)]
+
+
 def _apparent_lateness(log: FlightLog) -> tuple[float, float] | None:
     """Return how late poses are by correlation, s, and its standard error; None where it cannot tell."""
     for _, _, needed, sums, rates in PAIRS[:2]:
@@ -192,18 +208,19 @@ def _chosen(seen: Seen, late: Sequence[Moves]) -> Moves:
     ]
     misfits = _misfits(trials)
     for part in range(1, seen.num_parts):
-        kept = [place for place, misfit in enumerate(misfits) if misfit < min(misfits) + UNDECIDED]
+        costs = _costs(trials, misfits)
+        kept = [place for place, cost in enumerate(costs) if cost < min(costs) + UNDECIDED]
         if len(kept) < 2:
             break
         other, trials = seen._replace(part=part), [trials[place] for place in kept]
         again = [_fit_lateness(other, _fit(other, one.moves, one), rounds=1) for one in trials]
         misfits = list(np.array(misfits)[kept] + _misfits(again))
         trials = [_both(*pair) for pair in zip(trials, again, strict=True)]
-    best = int(np.argmin(misfits))
-    for trial, misfit in zip(trials, misfits, strict=True):
-        if trial.moves.motion is Motion.CONTINUOUS and misfit - misfits[best] <= CLEAR:
+    costs = _costs(trials, misfits)
+    for trial, cost in zip(trials, costs, strict=True):
+        if trial.moves.motion is Motion.CONTINUOUS and cost <= min(costs) + CLEAR:
             return trial.moves
-    return trials[best].moves
+    return trials[int(np.argmin(costs))].moves
 
 
 def _both(first: Trial, second: Trial) -> Trial:
