@@ -2,8 +2,9 @@
 
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -42,17 +43,23 @@ def short_flight(truth: Truth, rng: np.random.Generator, spikes: int = 0) -> tup
 
 
 @pytest.fixture(scope="session")
-def short() -> dict[str, tuple[Diagnosis, FlightLog]]:
+def short() -> Callable[[str], tuple[Diagnosis, FlightLog]]:
     """Diagnoses of plants in fine steps: clean, drag, a force that no list has, late poses and outliers."""
-    rng = np.random.default_rng(3)
-    base = replace(draw_base(rng), motion="fine")
+    base = replace(draw_base(np.random.default_rng(3)), motion="fine")
+    outside = draw_outside(np.random.default_rng(4), "heading", 2.0)
     plants = {
         "clean": base,
         "drag": replace(base, effects={"linear_drag": DRAG}),
-        "outside": replace(base, outside=draw_outside(rng, "heading", 2.0)),
+        "outside": replace(base, outside=outside),
         "late": replace(base, mocap_late_s=LATE_S),
     }
-    return {name: short_flight(truth, rng, SPIKES * (name == "late")) for name, truth in plants.items()}
+
+    @cache
+    def diagnosis_of(name: str) -> tuple[Diagnosis, FlightLog]:
+        rng = np.random.default_rng([3, list(plants).index(name)])
+        return short_flight(plants[name], rng, SPIKES * (name == "late"))
+
+    return diagnosis_of
 
 
 def check_content(one: Found) -> None:
@@ -81,20 +88,21 @@ def check_content(one: Found) -> None:
 
 
 def test_a_clean_plant_is_consistent_with_its_model(short) -> None:
-    found, _ = short["clean"]
+    found, _ = short("clean")
     assert found.causes == () and found.verdict == "consistent" and found.warnings == ()
     assert found.as_json()["motion"] == "continuous"
 
 
 def test_a_hidden_effect_is_found_and_measured(short) -> None:
-    (cause,) = short["drag"][0].causes
+    (cause,) = short("drag")[0].causes
     assert cause.effect == "linear_drag" and cause.heldout_gain > 0.0 and cause.lambda_ > 100.0
     for name, one in cause.parameters.items():
         assert abs(one.value - DRAG[name]) <= WIDENED * 0.5 * (one.ci95[1] - one.ci95[0])
 
 
+@pytest.mark.slow
 def test_late_motion_capture_is_named_and_corrected(short, tmp_path: Path) -> None:
-    found, log = short["late"]
+    found, log = short("late")
     (cause,) = found.causes
     low, high = cause.parameters["latency_s"].ci95
     assert cause.effect == "mocap_latency" and cause.heldout_gain > 0.0 and found.verdict == "causes_found"
@@ -104,23 +112,27 @@ def test_late_motion_capture_is_named_and_corrected(short, tmp_path: Path) -> No
     assert load_model(tmp_path / "extended_model.json").effect("mocap_latency").latency_s > 0.0
 
 
+@pytest.mark.slow
 def test_outliers_are_counted_and_told(short) -> None:
-    found, _ = short["late"]
+    found, _ = short("late")
     assert set(found.outliers) == {"velocity"} and abs(found.outliers["velocity"].rows - SPIKES) <= 2
     (warning,) = found.warnings
     assert warning.startswith("outliers") and "rows of velocity" in warning
-    assert short["clean"][0].outliers == {}
+    assert short("clean")[0].outliers == {}
 
 
+@pytest.mark.slow
 def test_what_no_list_has_is_flagged_and_not_named(short) -> None:
-    found, _ = short["outside"]
+    found, _ = short("outside")
     assert found.causes == () and found.verdict == "unexplained"
     assert "heading" in found.unexplained.depends_on
 
 
-@pytest.mark.parametrize("name", ["clean", "drag", "outside", "late"])
+@pytest.mark.parametrize(
+    "name", ["clean", "drag", *(pytest.param(name, marks=pytest.mark.slow) for name in ("outside", "late"))]
+)
 def test_a_diagnosis_has_its_content(name, short) -> None:
-    found, log = short[name]
+    found, log = short(name)
     content = json.loads(json.dumps(found.as_json(), allow_nan=False))
     check_content(content)
     assert content["data"]["sha256"] == log.sha256
@@ -129,7 +141,7 @@ def test_a_diagnosis_has_its_content(name, short) -> None:
 
 
 def test_the_extended_model_can_be_flown(short, tmp_path: Path) -> None:
-    found, log = short["drag"]
+    found, log = short("drag")
     write_diagnosis(tmp_path, found, log)
     assert json.loads((tmp_path / "diagnosis.json").read_text()) == json.loads(json.dumps(found.as_json()))
     assert (tmp_path / "report.html").stat().st_size > 0

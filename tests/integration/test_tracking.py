@@ -63,6 +63,7 @@ def test_everything_is_recorded_once_though_the_run_was_cut_off(trainer, tmp_pat
     assert run.info.status == "FINISHED" and history(client, run, "policy_loss") == before
 
 
+@pytest.mark.slow
 def test_a_server_that_is_down_does_not_end_the_training(trainer, whole, tmp_path, caplog):
     trainer.train(tmp_path, SEED, EVERY_OTHER_UPDATE._replace(tracking_uri=DEAD_URI))
     assert_same_end(tmp_path / "final.safetensors", whole[0] / "final.safetensors")

@@ -122,6 +122,7 @@ def test_a_checkpoint_that_cannot_be_resumed_is_named(whole, tmp_path, changes, 
         make_plan(["--resume", str(path), "--no-tracking"])
 
 
+@pytest.mark.slow
 def test_a_folder_of_seeds_is_resumed_with_those_that_had_not_begun(seeds, tmp_path):
     moved = tmp_path / "moved"
     shutil.copytree(seeds, moved)
@@ -139,6 +140,7 @@ def test_a_folder_of_seeds_is_resumed_with_those_that_had_not_begun(seeds, tmp_p
         make_plan(["--resume", str(moved)])
 
 
+@pytest.mark.slow
 def test_a_run_continues_in_another_folder(seeds, tmp_path, monkeypatch):
     monkeypatch.setattr(train_ppo, "make_trainer", lambda *_: make_trainer())
     step = seeds / "seed3" / f"step_{2 * BATCH}.safetensors"

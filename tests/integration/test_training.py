@@ -174,6 +174,7 @@ def test_a_seed_learns_what_it_learns_alone(trainer, together):
             np.testing.assert_allclose(values[0], alone[name][0], rtol=2e-3, atol=2e-5, err_msg=name)
 
 
+@pytest.mark.slow
 def test_seeds_killed_between_their_checkpoints_end_bit_for_bit(trainer, together, tmp_path, monkeypatch):
     write = Run._checkpoint
 
