@@ -28,7 +28,7 @@ from flytrack_sysid.diagnosis.problem import Problem
 from flytrack_sysid.diagnosis.refinement import Refined, refine
 from flytrack_sysid.diagnosis.result import Cause, Diagnosis
 from flytrack_sysid.diagnosis.search import SearchState, search
-from flytrack_sysid.diagnosis.sensor_clocks import on_one_clock
+from flytrack_sysid.diagnosis.sensor_clocks import on_one_clock, with_causal_commands
 from flytrack_sysid.diagnosis.size import split_by_size
 from flytrack_sysid.diagnosis.summary import (
     base_causes,
@@ -143,6 +143,8 @@ def split(
     logged, (log, is_kept, notes) = log, on_one_clock(log)
     warnings, out = [*warnings, *notes], out[is_kept]
     model = nominal_parameters() if model is None else model
+    log, is_kept, notes = with_causal_commands(log, model)
+    warnings, out = [*warnings, *notes], out[is_kept]
     with_motion = how_it_moves(log, model, ~out, motion)
     model = model._replace(motion=with_motion.motion)
     corrected, is_known = read_poses(log, with_motion.late_s)

@@ -1,7 +1,14 @@
-"""Velocity and position on the clock of the attitude, before anything asks how late poses are as a whole."""
+"""Velocity, position and commands on the clock of the gyro, before anything asks how late poses are.
+
+How late the motion follows the commands is the plant's lag, and no clock. But a drone that turns before it is
+told to has commands from a clock that is late.
+"""
+
+from dataclasses import replace
 
 import numpy as np
 
+from flytrack_env.dynamics import ModelParameters
 from flytrack_sysid.clocks import PAIRS, offset_between, read_later
 from flytrack_sysid.log import FlightLog, usual_step
 
@@ -33,3 +40,33 @@ def on_one_clock(log: FlightLog) -> tuple[FlightLog, np.ndarray, list[str]]:
         name = {"v": "velocity", "p": "position"}[channel]
         notes.append(f"the clock of {name} was {1e3 * late_s:.0f} ms late against that of {other}: corrected")
     return (log.select(kept), kept, notes) if notes else (log, kept, [])
+
+
+def with_causal_commands(log: FlightLog, model: ModelParameters) -> tuple[FlightLog, np.ndarray, list[str]]:
+    """Return a log whose commands come before the turns they cause, the rows it still has, and a sentence.
+
+    model: its mean lag of roll and pitch is what remains between commands and turns, in whole rows, where the
+    commands were late.
+    """
+    every = np.ones(len(log), bool)
+    if "w" not in log:
+        return log, every, []
+    step_s = usual_step(log)
+    turns = np.cumsum(log["w"] * step_s[:, None], axis=0)
+    asked = log["u"][:, :3] * np.deg2rad(np.asarray(model.max_rate))
+    lag_s, sigma_s, _, reason = offset_between(log, turns, asked)
+    step_s = float(np.median(step_s))
+    if reason or lag_s >= -(max(STANDARD_ERRORS * sigma_s, LEAST_S) + step_s):
+        return log, every, []
+    late = round((float(np.mean(np.asarray(model.tau)[:2])) - lag_s) / step_s)
+    source = np.arange(len(log)) + late
+    run = np.cumsum(log.is_start())
+    kept = run[np.minimum(source, len(log) - 1)] == run
+    kept &= source < len(log)
+    log = replace(log, channels={**log.channels, "u": log["u"][np.minimum(source, len(log) - 1)]})
+    note = (
+        f"the clock of the commands was about {1e3 * late * step_s:.0f} ms late: the drone turned "
+        f"{-1e3 * lag_s:.0f} ms before it was told to; corrected so that the model's lag remains, which this "
+        "log cannot show"
+    )
+    return log.select(kept), kept, [note]

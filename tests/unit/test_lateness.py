@@ -12,7 +12,7 @@ from flytrack_sysid import sensors
 from flytrack_sysid.diagnosis.lanes import NUM_AXES, make_lanes
 from flytrack_sysid.diagnosis.lateness import judged_as_logged, read_poses
 from flytrack_sysid.diagnosis.motion_choice import Moves, how_it_moves
-from flytrack_sysid.diagnosis.sensor_clocks import on_one_clock
+from flytrack_sysid.diagnosis.sensor_clocks import on_one_clock, with_causal_commands
 from flytrack_sysid.log import FlightLog
 from tests.support.handout_plant import GRAVITY, HandoutPlant, excited
 from tests.support.made_flight import TIME_S, flight, noisy
@@ -54,6 +54,23 @@ def test_velocity_and_position_come_on_the_clock_of_the_attitude() -> None:
         assert len(found) == is_kept.sum() and len(notes) == 2 * (late_s > 0.0), notes
         for name, bound in (("v", 0.03), ("p", 0.01)):
             assert np.sqrt(np.mean((found[name] - truth[name][is_kept]) ** 2)) < bound, name
+
+
+def test_commands_stamped_after_the_turns_they_cause_are_put_before_them() -> None:
+    plant = HandoutPlant()
+    truth = sensors.measure(excited(plant), 1.0, GRAVITY, np.random.default_rng(2))
+    for rows in (0, 3, 20):  # of which 3 are less than the plant's lag
+        starts = np.cumsum(truth.is_start())
+        source = np.maximum(np.arange(len(truth)) - rows, np.searchsorted(starts, starts))
+        late = replace(truth, channels={**truth.channels, "u": truth["u"][source]})
+        found, is_kept, notes = with_causal_commands(late, plant.model())
+        assert len(found) == is_kept.sum() and len(notes) == (rows == 20)
+        if notes:
+            assert "the clock of the commands was about" in notes[0]
+            off = [
+                np.abs(found["u"] - np.roll(truth["u"], -by, axis=0)[is_kept]).mean() for by in range(-4, 5)
+            ]
+            assert min(off) < 0.1 * np.abs(found["u"]).mean()
 
 
 def late_poses(log: FlightLog) -> FlightLog:
