@@ -340,7 +340,10 @@ def reduced(selection: Selection, refined: Refined) -> Selection:
     if refined.kept == model.candidates:
         return selection
     if refined.fit is None:
-        return selection._replace(model=selection.base)
+        state, base = selection.state, selection.base
+        # What an effect that is gone held at nominal is free again, as it was when the base was fitted.
+        held = tuple(one for one in state.held if state.problem.names.index(one.field) not in base.places)
+        return selection._replace(state=replace(state, held=held), model=base)
     return selection._replace(model=model._replace(candidates=refined.kept, places=refined.fit.places))
 
 

@@ -20,6 +20,9 @@ from flytrack_sysid.diagnosis.refinement import (
     windows_of,
 )
 from flytrack_sysid.diagnosis.score_test import BASE_FREE, CANDIDATES
+from flytrack_sysid.diagnosis.search import FittedModel, Held, SearchState
+from flytrack_sysid.diagnosis.summary import reduced
+from flytrack_sysid.diagnosis.vetoes import Selection
 from flytrack_sysid.log import FlightLog
 from flytrack_sysid.parameters import from_vector
 from flytrack_sysid.prediction import predict
@@ -81,6 +84,17 @@ def test_values_are_refined_by_flights(dragged):
     assert found.vector_without("accelerometer_bias")[problem.names.index("accelerometer_bias.x")] == 0.0
     assert found.removal_costs["linear_drag"] > 0.1 and "accelerometer_bias" not in found.removal_costs
     assert found.judge.worst_ratio(found.fit.vector) < 1.0
+
+
+def test_the_base_is_free_where_an_effect_that_held_it_is_gone(dragged):
+    *_, problem, found = dragged
+    base = FittedModel((), problem.start, 1.0, tuple(problem.index(BASE_FREE)))
+    state = SearchState(problem, held=(Held("tau_pitch", "linear_drag"),))
+    places = (*state.base_places, *problem.index(DRAG.fields))
+    selection = Selection(state, base, FittedModel((DRAG,), problem.start, 1.0, places), {})
+    after = reduced(selection, found._replace(kept=(), fit=None))
+    assert after.model is base and not after.state.held
+    assert set(base.places) <= set(after.state.every_place)
 
 
 def test_what_no_list_has_makes_no_horizon_worse():
