@@ -51,19 +51,17 @@ def with_causal_commands(log: FlightLog, model: ModelParameters) -> tuple[Flight
     every = np.ones(len(log), bool)
     if "w" not in log:
         return log, every, []
-    step_s = usual_step(log)
-    turns = np.cumsum(log["w"] * step_s[:, None], axis=0)
+    turns = np.cumsum(log["w"] * usual_step(log)[:, None], axis=0)
     asked = log["u"][:, :3] * np.deg2rad(np.asarray(model.max_rate))
     lag_s, sigma_s, _, reason = offset_between(log, turns, asked)
-    step_s = float(np.median(step_s))
+    step_s = float(np.median(usual_step(log)))
     if reason or lag_s >= -(max(STANDARD_ERRORS * sigma_s, LEAST_S) + step_s):
         return log, every, []
     late = round((float(np.mean(np.asarray(model.tau)[:2])) - lag_s) / step_s)
-    source = np.arange(len(log)) + late
-    run = np.cumsum(log.is_start())
-    kept = run[np.minimum(source, len(log) - 1)] == run
-    kept &= source < len(log)
-    log = replace(log, channels={**log.channels, "u": log["u"][np.minimum(source, len(log) - 1)]})
+    later, run = np.arange(len(log)) + late, np.cumsum(log.is_start())
+    source = np.minimum(later, len(log) - 1)
+    kept = (source == later) & (run[source] == run)
+    log = replace(log, channels={**log.channels, "u": log["u"][source]})
     note = (
         f"the clock of the commands was about {1e3 * late * step_s:.0f} ms late: the drone turned "
         f"{-1e3 * lag_s:.0f} ms before it was told to; corrected so that the model's lag remains, which this "
