@@ -132,10 +132,24 @@ def select_effects(
             model = without_effect(state, model, min(margins, key=lambda name: margins[name]))
             continue
         swaps = [swap for one in ablations.values() for swap in one.swaps.values()]
-        best = min(swaps, key=price, default=model)
+        best = min((*swaps, *with_lags_anew(state, model)), key=price, default=model)
         if price(best) >= price(model) - CLEARLY_CHEAPER:
             return state, model, ablations
         model = best
+
+
+def with_lags_anew(state: SearchState, model: FittedModel) -> list[FittedModel]:
+    """Return the model fitted again from nominal lags if any ended where it is shortest.
+
+    There a lag has no slope that would lead back.
+    """
+    problem, vector = state.problem, model.vector.copy()
+    shortest = [place for place in problem.index(TAUS) if vector[place] <= problem.low[place]]
+    shortest = [place for place in shortest if place in model.places and problem.start[place] > vector[place]]
+    if not shortest:
+        return []
+    vector[shortest] = problem.start[shortest]
+    return [state.fitted(model.candidates, vector)]
 
 
 def price(model: FittedModel) -> float:

@@ -13,7 +13,7 @@ from flytrack_env.effects import BY_NAME
 from flytrack_sysid.diagnosis import vetoes
 from flytrack_sysid.diagnosis.diagnose import thinning_warning
 from flytrack_sysid.diagnosis.lanes import LANE_S, make_lanes, thinned
-from flytrack_sysid.diagnosis.model_selection import Ablation, is_determined
+from flytrack_sysid.diagnosis.model_selection import Ablation, is_determined, with_lags_anew
 from flytrack_sysid.diagnosis.noise import first_guess
 from flytrack_sysid.diagnosis.problem import Problem
 from flytrack_sysid.diagnosis.refinement import Refined
@@ -48,6 +48,16 @@ def ablation(gain: float, num_parameters: int = 1, inflation: float = 1.0) -> Ab
 
 def selection_of(**ablations: Ablation) -> Selection:
     return Selection(None, None, SimpleNamespace(vector=np.zeros(1)), ablations)
+
+
+def test_a_lag_that_ended_where_it_has_no_slope_is_fitted_from_nominal_again(state):
+    problem, fitted = state.problem, state.fitted((), state.problem.start)
+    assert with_lags_anew(state, fitted) == []
+    place, vector = problem.names.index("tau_yaw"), fitted.vector.copy()
+    vector[place] = problem.low[place]
+    (found,) = with_lags_anew(state, fitted._replace(vector=vector))
+    np.testing.assert_allclose(found.vector[place], fitted.vector[place], rtol=0.01)
+    assert found.cost == pytest.approx(fitted.cost, abs=0.1)
 
 
 def test_next_to_nothing_beside_a_larger_law_is_its_remainder():
