@@ -314,7 +314,7 @@ def _move_continuously(
 
     half, vel_w = 0.5 * dt, drone.vel_w
     acc_0, _ = force_at(instants[0], drone.quat, vel_w, 0.0)
-    acc_m, _ = force_at(instants[1], quat_m, vel_w + acc_0.scale(half), half)
+    acc_m, force_m = force_at(instants[1], quat_m, vel_w + acc_0.scale(half), half)
     acc_1, force_1 = force_at(instants[2], quat_1, vel_w + acc_m.scale(dt), dt)
     acc_w = compute_once((acc_0 + acc_m.scale(4.0) + acc_1).scale(1.0 / 6.0))
     after = Drone(
@@ -327,7 +327,9 @@ def _move_continuously(
         battery_v=instants[2].battery_v,
     )
     turning = (rates_0 - rates_m.scale(4.0) + rates_1.scale(3.0)).scale(1.0 / dt)  # the parabola's slope
-    context = instants[2].context._replace(force_b=force_1, angular_acc_b=turning)
+    context = instants[2].context._replace(
+        force_b=force_1, angular_acc_b=turning, middle_rates_b=rates_m, middle_force_b=force_m
+    )
     inputs = instants[0].rate_inputs, instants[2].rate_inputs
     later = effects.remember(params.effects, memories, context, *inputs)
     return Moved(compute_once(after), later, context)

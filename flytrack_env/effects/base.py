@@ -75,6 +75,7 @@ class StepContext(NamedTuple):
     of the moment, and dt is the time since the beginning of the step at the stages rates and battery.
     span: shares of the step between which the command acts; the value of the stage command is its mean there.
     applied_slope: change of the applied action at the moment, 1/s. angular_acc_b: rad/s^2, at the end.
+    middle_rates_b, middle_force_b: as rates_b and force_b, in the middle of the step.
     first_input_b, input_b: what the effect is given at the stage rates at the beginning of the step, and at
     its end where it remembers the step, rad/s.
     """
@@ -93,6 +94,8 @@ class StepContext(NamedTuple):
     span: tuple[float, float] = (0.0, 1.0)
     applied_slope: Action = NOT_YET
     angular_acc_b: Vec3 = NOT_YET
+    middle_rates_b: Vec3 = NOT_YET
+    middle_force_b: Vec3 = NOT_YET
     first_input_b: Vec3 = NOT_YET
     input_b: Vec3 = NOT_YET
 

@@ -1,11 +1,13 @@
 """Gyro and accelerometer that are late: their filters, the bus, the estimator's queue."""
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax.numpy as jnp
 
 from flytrack_env.effects.base import Effect, Range, StepContext
 from flytrack_env.effects.command_delay import USUAL_STEPS, late
+from flytrack_env.motion import Motion
 from flytrack_env.quaternion import Scalar, Vec3
 from flytrack_env.state import Drone
 
@@ -19,11 +21,14 @@ class ImuLatency(NamedTuple):
 class PastReadings(NamedTuple):
     """True body rates, rad/s, and specific forces, m/s^2, body; the present ones first, then the past.
 
-    is_fresh: no step was made yet, and no force is known.
+    rate_bends_b, force_bends_b: how far those in the middle of a continuous step are from the mean of its
+    ends, of the same steps; the last one is not used. is_fresh: no step was made yet, and no force is known.
     """
 
     rates_b: tuple[Vec3, ...]
     forces_b: tuple[Vec3, ...]
+    rate_bends_b: tuple[Vec3, ...]
+    force_bends_b: tuple[Vec3, ...]
     is_fresh: Scalar
 
 
@@ -31,21 +36,32 @@ def start(latency: ImuLatency, drone: Drone, num_steps: int) -> PastReadings:
     """Return the memory of an episode that begins: rates that have been held all along, no forces."""
     still = Vec3(*(jnp.zeros_like(rate) for rate in drone.rates_b))
     size = min(num_steps, USUAL_STEPS) + 1
-    return PastReadings((drone.rates_b,) * size, (still,) * size, jnp.ones_like(drone.battery_v, bool))
+    none = (still,) * size
+    return PastReadings((drone.rates_b,) * size, none, none, none, jnp.ones_like(drone.battery_v, bool))
 
 
-def _late(latency: ImuLatency, present: Vec3, readings: tuple[Vec3, ...], context: StepContext) -> Vec3:
-    """Return the mean of the readings between which the delayed time lies, by their nearness."""
-    by_axis = zip(*(present, *readings[1:]), strict=True)  # the first one remembered is the present one
-    return Vec3(*(late(values, latency.latency_s, context.dt) for values in by_axis))
+def _late(
+    latency: ImuLatency, present: Vec3, past: Sequence[Vec3], bends: Sequence[Vec3], context: StepContext
+) -> Vec3:
+    """Return the reading of the delayed time: on the parabola of its step, a line in a simulator.
+
+    past: the readings with the present ones first, as they were without later effects.
+    """
+    by_axis = zip(*(present, *past[1:]), strict=True)
+    line = Vec3(*(late(values, latency.latency_s, context.dt) for values in by_axis))
+    steps = latency.latency_s / context.dt
+    for age, bend in enumerate(bends[:-1]):
+        share = jnp.clip(steps - age, 0.0, 1.0)
+        line = line + bend.scale(4.0 * share * (1.0 - share))
+    return line
 
 
 def _gyro(latency: ImuLatency, past: PastReadings, rates_b: Vec3, context: StepContext) -> Vec3:
-    return _late(latency, rates_b, past.rates_b, context)
+    return _late(latency, rates_b, past.rates_b, past.rate_bends_b, context)
 
 
 def _accelerometer(latency: ImuLatency, past: PastReadings, force_b: Vec3, context: StepContext) -> Vec3:
-    return _late(latency, force_b, past.forces_b, context)
+    return _late(latency, force_b, past.forces_b, past.force_bends_b, context)
 
 
 def remember(latency: ImuLatency, past: PastReadings, context: StepContext) -> PastReadings:
@@ -55,9 +71,19 @@ def remember(latency: ImuLatency, past: PastReadings, context: StepContext) -> P
         pairs = zip(context.force_b, force_b, strict=True)
         return Vec3(*(jnp.where(past.is_fresh, first, known) for first, known in pairs))
 
+    def bend(first: Vec3, middle: Vec3, last: Vec3) -> Vec3:
+        return middle - (first + last).scale(0.5)
+
+    forces_b = tuple(or_first(force_b) for force_b in past.forces_b[:-1])
+    rate_bend_b = force_bend_b = Vec3(*(jnp.zeros_like(rate) for rate in context.rates_b))
+    if context.motion is Motion.CONTINUOUS:
+        rate_bend_b = bend(past.rates_b[0], context.middle_rates_b, context.rates_b)
+        force_bend_b = bend(forces_b[0], context.middle_force_b, context.force_b)
     return PastReadings(
         rates_b=(context.rates_b, *past.rates_b[:-1]),
-        forces_b=(context.force_b, *(or_first(force_b) for force_b in past.forces_b[:-1])),
+        forces_b=(context.force_b, *forces_b),
+        rate_bends_b=(rate_bend_b, *past.rate_bends_b[:-1]),
+        force_bends_b=(force_bend_b, *past.force_bends_b[:-1]),
         is_fresh=jnp.zeros_like(past.is_fresh),
     )
 

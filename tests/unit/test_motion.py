@@ -9,6 +9,7 @@ from scipy.integrate import solve_ivp
 from flytrack_env.dynamics import ModelParameters, Moved, move, observe_rates, read_sensors
 from flytrack_env.effects import (
     CommandDelay,
+    ImuLatency,
     ImuOffset,
     LinearDrag,
     SecondOrderRates,
@@ -189,6 +190,17 @@ def test_an_accelerometer_off_the_centre_feels_the_turn_of_the_moment():
     turning = (gyro[inside + 1] - gyro[inside - 1]) / 2e-3
     expected = np.cross(gyro[inside], np.cross(gyro[inside], ARM_B)) + np.cross(turning, ARM_B)
     np.testing.assert_allclose((felt - plain)[inside], expected, rtol=1e-3, atol=1e-3)
+
+
+@pytest.mark.parametrize("late_ms", [3, 14])
+def test_late_readings_are_those_of_a_moment_within_a_step(late_ms):
+    """Readings at 100 Hz against those at 1 kHz, of which each is at its moment."""
+    smooth = PLAIN.with_effects(LinearDrag(*DRAG))  # nothing jumps where a command does
+    _, gyro, felt = flown(smooth.with_effects(ImuLatency(1e-3 * late_ms)), 1e-2)
+    _, true_gyro, true_felt = flown(smooth, 1e-3)
+    then = np.arange(3, len(gyro)) * 10 + 9 - late_ms
+    for found, true in ((gyro[3:], true_gyro[then]), (felt[3:], true_felt[then])):
+        assert np.abs(found - true).max() < 0.002 * np.abs(np.diff(true, axis=0)).max()
 
 
 @pytest.mark.parametrize("motion", Motion)
