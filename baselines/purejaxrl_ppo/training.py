@@ -1,7 +1,7 @@
 """Trainings: seeds begun or resumed, checked before anything is written, trained alone or side by side."""
 
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -13,6 +13,7 @@ from jax.experimental.multihost_utils import sync_global_devices
 from baselines.purejaxrl_ppo.checkpoint import Checkpoint
 from baselines.purejaxrl_ppo.config import Config
 from baselines.purejaxrl_ppo.distributed import check_agree, spread
+from baselines.purejaxrl_ppo.interrupts import kept_interrupts
 from baselines.purejaxrl_ppo.monitor import ProgressLine
 from baselines.purejaxrl_ppo.ppo import Runner
 from baselines.purejaxrl_ppo.program import Program
@@ -94,7 +95,8 @@ class Trainer(Program):
             runs.append(run)
             ready += [start] if start is not None else []
         for group in group_by_progress(ready):
-            train_group(self, group)
+            with kept_interrupts() as check_interrupt:
+                train_group(self, group, check_interrupt)
         if self.mesh is not None:
             sync_global_devices("trained")
         return [run.result() for run in runs]
@@ -121,7 +123,7 @@ def group_by_progress(ready: list[Ready]) -> list[list[Ready]]:
     return [ready] if are_together else [[one] for one in ready]
 
 
-def train_group(trainer: Trainer, group: list[Ready]) -> None:
+def train_group(trainer: Trainer, group: list[Ready], check_interrupt: Callable[[], None]) -> None:
     """Train runs side by side to their end, and write their final checkpoints.
 
     A run that diverges ends and the others go on; its DivergedError is raised at the end.
@@ -144,6 +146,7 @@ def train_group(trainer: Trainer, group: list[Ready]) -> None:
                     except DivergedError as error:
                         diverged[run] = error
             show_progress(line, runs, chunks, trainer.steps)
+            check_interrupt()
             if len(diverged) == len(runs):
                 break
         for run, runner in zip(runs, runners, strict=True):

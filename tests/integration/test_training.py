@@ -2,6 +2,7 @@
 
 import logging
 import shutil
+import signal
 import subprocess
 import sys
 import time
@@ -172,6 +173,28 @@ def test_a_seed_learns_what_it_learns_alone(trainer, together):
         alone = trainer.chunk(trainer.start(jax.random.key(seed)), jnp.int32(1))[1]
         for name, values in metrics.items():
             np.testing.assert_allclose(values[0], alone[name][0], rtol=2e-3, atol=2e-5, err_msg=name)
+
+
+class Interrupter:
+    """Ctrl-C in a destructor, where Python drops the exception."""
+
+    def __del__(self):
+        signal.raise_signal(signal.SIGINT)
+
+
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+def test_an_interrupt_that_python_drops_ends_the_run_all_the_same(trainer, tmp_path, monkeypatch):
+    advance = Run.advance
+
+    def interrupted(self, chunk):
+        advance(self, chunk)
+        Interrupter()
+
+    monkeypatch.setattr(Run, "advance", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        trainer.train(tmp_path, SEED, EVERY_OTHER_UPDATE)
+    assert newest_intact(tmp_path)[0] == step_path(tmp_path, 2)
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
 @pytest.mark.slow
