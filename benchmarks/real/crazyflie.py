@@ -2,9 +2,9 @@
 
 ``python -m benchmarks.real.crazyflie [--policies 50,66] [--seconds 30]`` learns from at most so many seconds
 of each other policy, and judges on the left-out flights, which the models never see, beside black boxes
-that are trained on the same rows. The effects in question are those that single steps propose
-(``PROPOSED``; a search for each policy would take hours); which of them stay, and all values, are found
-without the left-out policy. It appends a line of JSON for each policy to
+that are trained on the same rows. The effects in question are those that single steps propose, and drag,
+which every drone has (``PROPOSED``; a search for each policy would take hours); which of them stay, and all
+values, are found without the left-out policy. It appends a line of JSON for each policy to
 benchmarks/data/real/crazyflie.jsonl. ``--fits`` fits one structure to the flights of each policy alone
 instead, to crazyflie_fits.json beside it. ``python -m benchmarks.real_logs`` writes the page.
 """
@@ -49,7 +49,7 @@ from flytrack_sysid.response import SMALL_STEP, half_responses
 VARIABLE, FOLDER = "FLYTRACK_SHARED_DATA", "crazyflie_rate_flights"
 LINES = ROOT / "benchmarks" / "data" / "real" / "crazyflie.jsonl"
 FITS = LINES.with_name("crazyflie_fits.json")
-PROPOSED = ("command_delay", "second_order_rates", "rate_scale", "motor_imbalance")
+PROPOSED = ("command_delay", "second_order_rates", "rate_scale", "motor_imbalance", "linear_drag")
 SECONDS = 10.0  # learnt from of each policy: 100 s in all
 SPACING_S, MOST = 0.25, 10_000
 FEWEST_ROWS = 2000  # of a policy, to fit it alone
