@@ -308,11 +308,13 @@ def _draw_panel(axes: Any, traces: Traces, panel: Panel, without: str, full: str
     axes.set_xlabel(label if unit == "1" else f"{label} ({unit})", fontsize="small")
 
 
-def draw_cause(cause: str, panels: Sequence[Panel], traces: Traces, without: str, extended: str) -> Figure:
+def draw_cause(
+    cause: str, panels: Sequence[Panel], traces: Traces, without: str, extended: str, when: str = ""
+) -> Figure:
     """Draw the panels of a cause.
 
     without, extended: of the models in ``traces``, the extended one without the cause, and with it. The curve
-    is the difference between the predictions of the two.
+    is the difference between the predictions of the two. when: for the title, when the cause acts.
     """
     # Without a sensor, its panel and that of its replacement are the same.
     panels = list(dict.fromkeys(panel._replace(residual=traces.used(panel.residual)) for panel in panels))
@@ -320,7 +322,7 @@ def draw_cause(cause: str, panels: Sequence[Panel], traces: Traces, without: str
     rows = -(-len(panels) // columns)
     figure = Figure(figsize=(WIDTH_IN, LEGEND_IN + ROW_IN * rows), layout="constrained")
     title = words_of(cause)
-    title = title[0].upper() + title[1:]
+    title = title[0].upper() + title[1:] + when
     figure.suptitle(title, fontsize="large", fontweight="bold", x=0.01, ha="left")
     grid = figure.subplots(rows, columns, squeeze=False)
     for axes, panel in zip(grid.flat, panels, strict=True):

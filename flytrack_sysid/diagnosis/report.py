@@ -283,13 +283,25 @@ def traces_of(diagnosis: Diagnosis, log: FlightLog) -> Traces:
     return traces(log, models, like="extended")
 
 
-def _evidence_parts(diagnosis: Diagnosis, found: Traces) -> list[Part]:
-    """Return the pictures of the causes that gain most; found: of ``traces_of``."""
+def while_acting(found: Traces, cause: Cause, start_s: float) -> Traces:
+    """Return traces that count only where a cause acts; start_s: the log's first time."""
+    time = start_s + found.elapsed_s
+    since = -np.inf if cause.onset_s is None else cause.onset_s.value
+    until = np.inf if cause.end_s is None else cause.end_s.value
+    acts = (time >= since) & (time < until)
+    return found._replace(counts={name: counts & acts for name, counts in found.counts.items()})
+
+
+def _evidence_parts(diagnosis: Diagnosis, found: Traces, start_s: float) -> list[Part]:
+    """Return the pictures of the causes that gain most; found: of ``traces_of``; start_s: of the log."""
     parts: list[Part] = []
     for cause in sorted(diagnosis.causes, key=lambda cause: -cause.chi2_gain)[:MOST_PICTURED]:
         evidence = EVIDENCE[cause.effect]
-        figure = draw_cause(cause.effect, evidence.panels, found, _LESS + cause.effect, "extended")
-        parts.append(Picture(png_of(figure), f"{evidence.reading} ({cause.effect})"))
+        acting = while_acting(found, cause, start_s)
+        figure = draw_cause(
+            cause.effect, evidence.panels, acting, _LESS + cause.effect, "extended", when_of(cause)
+        )
+        parts.append(Picture(png_of(figure), f"{evidence.reading} ({cause.effect}{when_of(cause)})"))
     if parts and any(found.used(name) != name for name in ("rates_x", "force_x")):
         parts.append(Text(DIFFERENCES))
     return parts
@@ -309,7 +321,7 @@ def html_of(diagnosis: Diagnosis, log: FlightLog) -> str:
         introduction.append(Text(f"Seen, but negligible: {listed}."))
     if diagnosis.warnings:
         introduction.append(Bullets(diagnosis.warnings))
-    evidence = _evidence_parts(diagnosis, found)
+    evidence = _evidence_parts(diagnosis, found, float(log.time[0]))
     sections = [
         Section("Errors before and after", [*_errors_picture(diagnosis), _errors_table(diagnosis)]),
         *([Section("The evidence, cause by cause", evidence)] if evidence else []),

@@ -12,7 +12,7 @@ from benchmarks.hidden import draw_base, fly, measure
 from flytrack_env.dynamics import ModelParameters
 from flytrack_env.effects import EFFECTS, AccelerometerBias, CommandDelay, LinearDrag
 from flytrack_sysid.diagnosis.evidence import EVIDENCE, bin_edges, binned_means, without
-from flytrack_sysid.diagnosis.report import html_of, write_diagnosis
+from flytrack_sysid.diagnosis.report import html_of, when_of, while_acting, write_diagnosis
 from flytrack_sysid.diagnosis.result import (
     CAUSES_FOUND,
     UNEXPLAINED,
@@ -55,6 +55,22 @@ def lagged(log, tau: np.ndarray) -> np.ndarray:
     for command in log["u"][:-1]:
         found.append(keep * found[-1] + (1.0 - keep) * command)
     return np.array(found)
+
+
+def test_pictures_of_a_cause_that_begins_in_flight_show_the_part_in_which_it_acts(flown):
+    model, log = flown
+    found = traces(log, {"nominal": model}, like="nominal")
+    late = Cause(
+        "linear_drag", (), "velocity", {}, 9.0, 3.0, 9.0, 9.0, onset_s=Estimated(7.0, (6.8, 7.2), "s")
+    )
+    acting = while_acting(found, late, float(log.time[0]))
+    expected = found.elapsed_s >= 7.0 - log.time[0]
+    np.testing.assert_array_equal(acting.counts["rates"], found.counts["rates"] & expected)
+    assert 0.3 < acting.counts["rates"].mean() < 0.5
+    assert when_of(late) == " from 7.0 ± 0.2 s on"
+    ended = replace(late, onset_s=None, end_s=late.onset_s)
+    kept = while_acting(found, ended, float(log.time[0])).counts["rates"]
+    np.testing.assert_array_equal(kept | acting.counts["rates"], found.counts["rates"])
 
 
 def test_residuals_are_measured_minus_modelled(flown):
