@@ -42,6 +42,7 @@ from flytrack_sysid.diagnosis.summary import (
     reduced,
     refinement_notes,
     sensor_noise,
+    stand_in_notes,
     vector_without,
     verdict_of,
     warnings_of,
@@ -238,6 +239,7 @@ def summarize(selection: Selection, contradicted: Sequence[str], refined: Refine
         *outlier_notes(outliers),
         *warnings_of(problem, causes, lost),
         *refinement_notes(refined),
+        *stand_in_notes(selection, flying["extended"]),
         *notes_of(selection, linearization, parts.log),
     ]
     rest = with_lost_causes(selection.unexplained, lost)

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from flytrack_env.dynamics import ModelParameters
+from flytrack_env.dynamics import ModelParameters, collective_thrust
 from flytrack_env.effects import BY_NAME, effect_of
 from flytrack_sysid.diagnosis.identifiability import advise, unit_of, unseen_effects
 from flytrack_sysid.diagnosis.lanes import AXES, voltages_of
@@ -468,6 +468,29 @@ def warnings_of(problem: Problem, causes: Sequence[Cause], contradicted: Sequenc
         ),
         *(_at_bound(cause) for cause in causes if cause.beyond),
     ]
+
+
+def stand_in_notes(selection: Selection, vector: np.ndarray) -> list[str]:
+    """Return base changes that are not named since something unknown may be their cause.
+
+    vector: of the extended model. In hover, a constant push passes for thrust.
+    """
+    problem, notes = selection.state.problem, []
+    for name in (one for one in selection.stand_ins if one in BASE_CAUSES):
+        size = ""
+        if name == "thrust_curve":
+            record, places = problem.lanes.record, problem.index(THRUST_COEFFS)
+            flown = problem.counts.any(axis=(2, 3))
+            before, after = (
+                np.mean(np.asarray(collective_thrust(record.command[..., 3], record.battery_v, own))[flown])
+                for own in (problem.start[places], vector[places])
+            )
+            size = f" (thrust or your mass by {after / before - 1.0:+.1%} in the mean)"
+        notes.append(
+            f"{name} differs in the extended model{size}, but is not named: "
+            "what remains unexplained could pass for it"
+        )
+    return notes
 
 
 def _at_bound(cause: Cause) -> str:

@@ -20,9 +20,9 @@ from flytrack_sysid.diagnosis.refinement import Refined
 from flytrack_sysid.diagnosis.result import Cause, Estimated
 from flytrack_sysid.diagnosis.score_test import CANDIDATES, threshold
 from flytrack_sysid.diagnosis.search import Held, SearchState
-from flytrack_sysid.diagnosis.summary import warnings_of, with_refined_values
+from flytrack_sysid.diagnosis.summary import stand_in_notes, warnings_of, with_refined_values
 from flytrack_sysid.diagnosis.vetoes import HELD_OUT_SHOWN, Selection, is_contradicted, reject
-from flytrack_sysid.parameters import TAUS
+from flytrack_sysid.parameters import TAUS, THRUST_COEFFS
 
 LIFT_GAIN = 20_000.0
 CAUSE = Cause("rate_scale", (), "rates", {}, 100.0, 30.0, 100.0, 90.0)
@@ -58,6 +58,16 @@ def test_a_lag_that_ended_where_it_has_no_slope_is_fitted_from_nominal_again(sta
     (found,) = with_lags_anew(state, fitted._replace(vector=vector))
     np.testing.assert_allclose(found.vector[place], fitted.vector[place], rtol=0.01)
     assert found.cost == pytest.approx(fitted.cost, abs=0.1)
+
+
+def test_what_may_be_something_unknown_is_told_with_its_size_and_not_named(state):
+    problem = state.problem
+    vector = problem.start.copy()
+    vector[problem.index(THRUST_COEFFS)] *= 1.146
+    selection = Selection(state, None, None, {}, stand_ins=("thrust_curve", "wind", "tau_yaw"))
+    thrust, lag = stand_in_notes(selection, vector)
+    assert thrust.startswith("thrust_curve differs") and "thrust or your mass by +14.6% in the mean" in thrust
+    assert lag.startswith("tau_yaw differs in the extended model, but is not named")
 
 
 def test_next_to_nothing_beside_a_larger_law_is_its_remainder():
