@@ -47,7 +47,7 @@ from flytrack_sysid.split import held_out_rows
 
 LINES = ROOT / "docs" / "results" / "diagnosis.jsonl"
 SECONDS = 60.0
-SEED = 22  # no rule was made on it; on 21 the motion's was
+SEED = 23  # no rule was made on it; on 21 and 22 the motion's was
 # How the package calls the plants' motions.
 MOTION_OF = {
     "handout": Motion.HANDOUT,

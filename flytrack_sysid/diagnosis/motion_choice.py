@@ -46,6 +46,7 @@ LOOK_ALIKES: tuple[Effect, ...] = tuple(
         "quadratic_drag",
         "rotor_drag",
         "wind",
+        "thrust_tilt",
         "accelerometer_scale",
         "gyro_scale",
     )
@@ -80,9 +81,16 @@ class Seen(NamedTuple):
     part: int = 0
     num_parts: int = 1
 
+    def in_parts(self) -> "Seen":
+        """Return the first of as many parts as there are, of ``MOST_LANES`` each."""
+        return self._replace(part=0, num_parts=max(self._lanes(self.log).row.shape[1] // MOST_LANES, 1))
+
+    def _lanes(self, log: FlightLog) -> Lanes:
+        return make_lanes(log, self.judged, np.asarray(self.model.tau, float), float(self.model.g))
+
     def lanes(self, log: FlightLog) -> Lanes:
         """Return the lanes of this part; in ``log`` poses may be at other times."""
-        lanes = make_lanes(log, self.judged, np.asarray(self.model.tau, float), float(self.model.g))
+        lanes = self._lanes(log)
         return lanes.selected(np.arange(self.part, lanes.row.shape[1], self.num_parts)[:MOST_LANES])
 
     def problem(self, moves: Moves) -> Problem:
@@ -184,8 +192,7 @@ def how_it_moves(
     if motion is not None and not late[motion].late_s:
         return late[motion]
     seen = Seen(log, judged & _known_around(log, list(late.values())), model)
-    number = seen.lanes(log).row.shape[1]
-    found = _chosen(seen._replace(num_parts=max(number // MOST_LANES, 1)), list(late.values()))
+    found = _chosen(seen.in_parts(), list(late.values()))
     is_late = found.late_s > max(LEAST_S, STANDARD_ERRORS * found.sigma_s)
     return found if is_late else Moves(found.motion)
 
