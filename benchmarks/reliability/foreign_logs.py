@@ -21,40 +21,10 @@ ULOG_TOPICS: dict[str, tuple[list[tuple[str, str, int]], tuple[float, ...]]] = {
     ),
 }
 ULOG_PARAMETERS = {"MC_ACRO_R_MAX": 720.0, "MC_ACRO_P_MAX": 360.0, "MC_ACRO_Y_MAX": 90.0}
-MAPPING = """[time]
-column = "ms"
-unit = "ms"
-[command]
-columns = ["ail", "ele", "rud", "thr"]
-low = [1000, 2000, 2000, 1000]
-high = [2000, 1000, 1000, 2000]
-[rates]
-columns = ["p", "q", "r"]
-unit = "deg/s"
-frame = "frd"
-[battery]
-column = "mv"
-scale = 0.001
-[craft]
-max_rate_deg_s = [500, 500, 500]
-"""
-USD_MAPPING = """[command]
-columns = ["roll", "pitch", "yaw", "thrust"]
-[rates]
-columns = ["gyro.x", "gyro.y", "gyro.z"]
-unit = "deg/s"
-frame = "flu"
-[battery]
-column = "pm.vbat"
-unit = "mV"
-"""
-BAG_MAPPING = """[command]
-columns = ["/flight:u[0]", "/flight:u[1]", "/flight:u[2]", "/flight:u[3]"]
-[rates]
-columns = ["/flight:w.x", "/flight:w.y", "/flight:w.z"]
-unit = "rad/s"
-frame = "flu"
-"""
+MAPPINGS = Path(__file__).with_name("mappings")
+MAPPING = (MAPPINGS / "csv.toml").read_text(encoding="utf-8")
+USD_MAPPING = (MAPPINGS / "usd.toml").read_text(encoding="utf-8")
+BAG_MAPPING = (MAPPINGS / "bag.toml").read_text(encoding="utf-8")
 
 
 class UlogWriter:

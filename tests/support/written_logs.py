@@ -7,8 +7,14 @@ import numpy as np
 
 from flytrack_sysid.log import CHANNELS, FlightLog
 
+MAPPINGS = Path(__file__).with_name("mappings")
 SUFFIXES = (".npz", ".csv")
 NUM_ROWS = 6
+
+
+def read_mapping(name: str) -> str:
+    """Return the text of a mapping of a file that a test writes."""
+    return (MAPPINGS / f"{name}.toml").read_text(encoding="utf-8")
 
 
 def make_log(seed: int = 0, num_rows: int = NUM_ROWS, names: tuple[str, ...] = tuple(CHANNELS)) -> FlightLog:

@@ -10,6 +10,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from flytrack_sysid import LogError, import_log
+from tests.support.written_logs import read_mapping
 
 pytest.importorskip("mcap", reason="mcap is not installed: pip install 'flytrack[bags]'")
 pytest.importorskip("rosbags", reason="rosbags is not installed: pip install 'flytrack[bags]'")
@@ -17,23 +18,7 @@ from mcap.writer import Writer as McapWriter
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
-MAPPING = """[command]
-columns = ["/sticks:axes[0]", "/sticks:axes[1]", "/sticks:axes[2]", "/sticks:axes[3]"]
-[rates]
-columns = ["/twist:twist.angular.x", "/twist:twist.angular.y", "/twist:twist.angular.z"]
-unit = "rad/s"
-frame = "flu"
-[position]
-columns = ["/pose:pose.position.x", "/pose:pose.position.y", "/pose:pose.position.z"]
-unit = "m"
-frame = "z_up"
-[attitude]
-quaternion = ["/pose:pose.orientation.x", "/pose:pose.orientation.y",
-              "/pose:pose.orientation.z", "/pose:pose.orientation.w"]
-order = "xyzw"
-body = "flu"
-world = "z_up"
-"""
+MAPPING = read_mapping("ros_topics")
 KINDS = {
     "/sticks": ("sensor_msgs/msg/Joy", 20_000_000),
     "/twist": ("geometry_msgs/msg/TwistStamped", 5_000_000),

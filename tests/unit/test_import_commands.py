@@ -10,31 +10,10 @@ from scipy.spatial.transform import Rotation
 from flytrack_sysid import LogError, import_log
 from flytrack_sysid.importing import load_mapping
 from flytrack_sysid.importing.mapping import SHIPPED
+from tests.support.written_logs import read_mapping
 
 NUM_ROWS, STEP_S = 1500, 0.01
-MAPPING = """[time]
-column = "t"
-unit = "s"
-[attitude_command]
-columns = ["sr", "sp", "sy"]
-unit = "deg"
-signs = [1, -1, 1]
-[thrust_command]
-column = "pwm"
-low = 0
-high = 65535
-[attitude]
-euler = ["r", "p", "y"]
-unit = "rad"
-body = "flu"
-world = "z_up"
-[rates]
-columns = ["wx", "wy", "wz"]
-unit = "rad/s"
-frame = "flu"
-[craft]
-max_rate_deg_s = [300, 300, 300]
-"""
+MAPPING = read_mapping("angle_setpoints")
 
 
 def flight(gains: tuple[float, float, float] = (6.0, 5.0, 2.0)) -> dict[str, np.ndarray]:

@@ -14,47 +14,12 @@ from flytrack_sysid.cli import main
 from flytrack_sysid.importing.flight import Craft
 from tests.support.made_flight import GRAVITY, TIME_S, flight
 from tests.support.real_logs import CRAZYFLIE, shared
+from tests.support.written_logs import read_mapping
 
 FLIP = np.array([1.0, -1.0, -1.0])
 HEADER = ["ms", "n", "e", "d", "vn", "ve", "vd", "ax", "ay", "az", "p", "q", "r", "qx", "qy", "qz", "qw"]
 HEADER += ["ail", "ele", "rud", "thr", "mv"]
-MAPPING = """
-[time]
-column = "ms"
-unit = "ms"
-[command]
-columns = ["ail", "ele", "rud", "thr"]
-low = [1000, 2000, 2000, 1000]
-high = [2000, 1000, 1000, 2000]
-[position]
-columns = ["n", "e", "d"]
-unit = "cm"
-frame = "ned"
-[velocity]
-columns = ["vn", "ve", "vd"]
-unit = "m/s"
-frame = "ned"
-[specific_force]
-columns = ["ax", "ay", "az"]
-unit = "g"
-frame = "frd"
-[rates]
-columns = ["p", "q", "r"]
-unit = "deg/s"
-frame = "frd"
-[attitude]
-quaternion = ["qx", "qy", "qz", "qw"]
-order = "xyzw"
-body = "frd"
-world = "ned"
-[battery]
-column = "mv"
-unit = "mV"
-[craft]
-max_rate_deg_s = [700, 600, 500]
-mass_kg = 0.5
-voltage_v = [14.0, 16.8]
-"""
+MAPPING = read_mapping("every_unit")
 
 
 @pytest.fixture(scope="module")
