@@ -135,11 +135,7 @@ def figures(by_row: Rows) -> list[tuple[str, str, str]]:
             percent([bool(line["negligible"]) for row in CONTROLS for line in by_row[row]]),
         ),
         ("detected: any name, lambda > 30", "99 %", percent([bool(found(line)) for line, *_ in shown])),
-        (
-            "exact name, lambda > 30 and lambda_sep > 20",
-            "98 %",
-            percent(exact_sets(by_row["one"])),
-        ),
+        ("exact name, lambda > 30 and lambda_sep > 20", "98 %", percent(exact_sets(by_row["one"]))),
         (
             "truth in the reported class, lambda > 30",
             "98 %",

@@ -124,13 +124,7 @@ class FlyTrack(EpisodicEnvironment):
         after = self.plant.drone(plant_state)
         start_time_s = state.time * params.dt
         race, events = advance_race(
-            state.race,
-            before.pos_w,
-            after.pos_w,
-            start_time_s,
-            params.dt,
-            params.course,
-            params.drone_radius,
+            state.race, before.pos_w, after.pos_w, start_time_s, params.dt, params.course, params.drone_radius
         )
         is_missed = events.is_miss & (self.missed_gate == "terminate")
         causes = compute_once(find_causes(after, params.course, events.is_frame | is_nan, is_missed))

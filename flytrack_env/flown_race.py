@@ -60,10 +60,7 @@ class FlownRace(NamedTuple):
 
 
 def follow_race(
-    positions: np.ndarray,
-    track: Track,
-    first_gate: int | None = None,
-    last_vel_w: np.ndarray | None = None,
+    positions: np.ndarray, track: Track, first_gate: int | None = None, last_vel_w: np.ndarray | None = None
 ) -> FlownRace:
     """Return the race of a flight at 100 Hz through these positions, by the rules of ``advance_race``.
 

@@ -14,10 +14,7 @@ from flytrack_env.messages import error_text, quote_name, quote_value
 BOUNDED = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)  # zipfile unpacks these in bounded steps, others at once
 LARGEST_DIRECTORY_BYTES = 2**16  # of an archive's list of members, which zipfile reads at once
 PLAIN_KINDS = "biufU"  # of NumPy's types: booleans, numbers, text
-HEADER_READERS = {
-    (1, 0): np.lib.format.read_array_header_1_0,
-    (2, 0): np.lib.format.read_array_header_2_0,
-}
+HEADER_READERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
 
 
 class NpzError(ValueError):

@@ -76,13 +76,7 @@ def _count_pass(race: Race, is_pass: jax.Array, time_s: Scalar, course: Course) 
 
 
 def advance_race(
-    race: Race,
-    start_w: Vec3,
-    end_w: Vec3,
-    start_time_s: Scalar,
-    dt: Scalar,
-    course: Course,
-    radius: Scalar,
+    race: Race, start_w: Vec3, end_w: Vec3, start_time_s: Scalar, dt: Scalar, course: Course, radius: Scalar
 ) -> tuple[Race, RaceEvents]:
     """Return the race after a step from ``start_w`` to ``end_w``, and what happened.
 

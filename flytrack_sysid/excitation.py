@@ -51,9 +51,7 @@ RESERVE_V = 0.1
 
 
 def is_inside(
-    states: np.ndarray,
-    heights: tuple[float, float] = HEIGHTS,
-    voltages: tuple[float, float] = VOLTAGES,
+    states: np.ndarray, heights: tuple[float, float] = HEIGHTS, voltages: tuple[float, float] = VOLTAGES
 ) -> np.ndarray:
     """Return where states (..., 21) are within the envelope, heights in m, voltages in V; NaN is not."""
     height, battery_v = states[..., POSITION][..., 2], states[..., BATTERY]

@@ -10,13 +10,7 @@ from scipy.stats import binned_statistic_2d
 from flytrack_env.dynamics import ModelParameters
 from flytrack_env.state import BATTERY_EMPTY_V, BATTERY_FULL_V
 from flytrack_sysid.log import FlightLog
-from flytrack_sysid.prediction import (
-    Prediction,
-    inputs_that_lack,
-    judged_steps,
-    specific_force_w,
-    to_body,
-)
+from flytrack_sysid.prediction import Prediction, inputs_that_lack, judged_steps, specific_force_w, to_body
 from flytrack_sysid.prediction_errors import predicted_channel
 
 SPEED_EDGES = (0.0, 2.0, 5.0, 10.0, 20.0, np.inf)

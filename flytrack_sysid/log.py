@@ -16,15 +16,7 @@ from functools import cached_property
 
 import numpy as np
 
-from flytrack_env.state import (
-    ACCELERATION,
-    APPLIED_ACTION,
-    BATTERY,
-    POSITION,
-    QUATERNION,
-    RATES,
-    VELOCITY,
-)
+from flytrack_env.state import ACCELERATION, APPLIED_ACTION, BATTERY, POSITION, QUATERNION, RATES, VELOCITY
 
 _XYZ, _STICKS = ("x", "y", "z"), ("roll", "pitch", "yaw", "thrust")
 CHANNELS: dict[str, tuple[str, ...]] = {

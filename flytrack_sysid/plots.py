@@ -100,7 +100,4 @@ def draw_thrust(thrust: ThrustError | None) -> Figure:
 
 def draw_validation(validation: Validation) -> dict[str, Figure]:
     """Return all figures of a validation by name."""
-    return {
-        "steps": draw_steps(validation.steps),
-        "thrust": draw_thrust(validation.thrust),
-    }
+    return {"steps": draw_steps(validation.steps), "thrust": draw_thrust(validation.thrust)}

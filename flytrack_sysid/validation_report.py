@@ -82,10 +82,7 @@ def _force_table(force: OpenForce) -> Table:
 
 def _tables(validation: Validation) -> dict[str, Table]:
     """Return the tables that have any row, by the figure that they belong to."""
-    tables = {
-        "one_step": _one_step_table(validation),
-        "rollouts": _rollout_table(validation),
-    }
+    tables = {"one_step": _one_step_table(validation), "rollouts": _rollout_table(validation)}
     if validation.thrust is not None:
         tables["thrust"] = _thrust_table(validation.thrust)
     if validation.open_force is not None:

@@ -150,11 +150,7 @@ def checksum(text: str, arrays: Arrays) -> str:
 
 
 def save_checkpoint(
-    path: str | Path,
-    params: Any,
-    config: Config,
-    description: dict[str, Any],
-    training: Arrays | None = None,
+    path: str | Path, params: Any, config: Config, description: dict[str, Any], training: Arrays | None = None
 ) -> None:
     """Write a checkpoint atomically.
 

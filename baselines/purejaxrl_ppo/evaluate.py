@@ -254,11 +254,7 @@ def _fly_first(
 
 
 def make_numbers(
-    scene: Scene,
-    checkpoint: Checkpoint,
-    settings: EvaluationSettings,
-    outcomes: Outcomes,
-    rollout: Rollout,
+    scene: Scene, checkpoint: Checkpoint, settings: EvaluationSettings, outcomes: Outcomes, rollout: Rollout
 ) -> dict[str, Any]:
     """Return the numbers of an evaluation, as JSON values; docs/baseline.md describes each."""
     plants, references = scene.plants, scene.references

@@ -32,9 +32,7 @@ class ActorCritic(nn.Module):
         if self.num_choices:
             return
         self.log_std = self.param(
-            "log_std",
-            nn.initializers.constant(np.log(self.initial_std)),
-            (len(self.initial_action),),
+            "log_std", nn.initializers.constant(np.log(self.initial_std)), (len(self.initial_action),)
         )
 
     def _tower(self, name: str, size: int, last_scale: float) -> nn.Sequential:

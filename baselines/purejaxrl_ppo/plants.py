@@ -66,10 +66,7 @@ def perturb(
     thrust, delay = model.effect("thrust_scale"), model.effect("command_delay")
     return model.with_effects(
         _clipped(
-            drag,
-            k_x=drag.k_x + drag_per_m[0],
-            k_y=drag.k_y + drag_per_m[1],
-            k_z=drag.k_z + drag_per_m[2],
+            drag, k_x=drag.k_x + drag_per_m[0], k_y=drag.k_y + drag_per_m[1], k_z=drag.k_z + drag_per_m[2]
         ),
         _clipped(wind, v_x=wind.v_x + wind_w_m_s[0], v_y=wind.v_y + wind_w_m_s[1]),
         _clipped(thrust, factor=thrust.factor * thrust_scale),

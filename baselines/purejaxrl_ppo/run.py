@@ -90,12 +90,7 @@ class Run:
     """
 
     def __init__(
-        self,
-        program: Program,
-        out: Path,
-        description: dict[str, Any],
-        options: Options,
-        start: Start | None,
+        self, program: Program, out: Path, description: dict[str, Any], options: Options, start: Start | None
     ):
         self.program, self.config, self.out = program, program.config, out
         self.description, self.options, self.start = description, options, start

@@ -22,16 +22,7 @@ from flytrack_env import nominal_parameters
 from flytrack_env.dynamics import ModelParameters
 from flytrack_env.plants import Plant
 from flytrack_env.quaternion import Scalar
-from flytrack_env.state import (
-    APPLIED_ACTION,
-    POSITION,
-    QUATERNION,
-    VELOCITY,
-    Action,
-    Drone,
-    pack,
-    unpack,
-)
+from flytrack_env.state import APPLIED_ACTION, POSITION, QUATERNION, VELOCITY, Action, Drone, pack, unpack
 
 EFFECTS = (
     "command_delay",

@@ -106,11 +106,7 @@ class FlyTrackEnv(_Adapter, gymnasium.Env[np.ndarray, np.ndarray]):
     metadata: dict[str, Any] = {"render_modes": list(RENDER_MODES), "render_fps": 100}  # noqa: RUF012  # as Gymnasium declares it
 
     def __init__(
-        self,
-        env_id: str,
-        render_mode: str | None = None,
-        params: EnvParams | None = None,
-        **overrides: Any,
+        self, env_id: str, render_mode: str | None = None, params: EnvParams | None = None, **overrides: Any
     ):
         self.observation_space, self.action_space = self._set_up(env_id, render_mode, params, overrides)
         self._state: Any = None
@@ -223,10 +219,7 @@ class FlyTrackVectorEnv(_Adapter, gymnasium.vector.VectorEnv[np.ndarray, np.ndar
         self._logs = [FlightLog(1.0)] * num_envs
 
     def reset(
-        self,
-        *,
-        seed: int | list[int | None] | None = None,
-        options: dict[str, Any] | None = None,
+        self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
         """Return observations and an empty info of episodes that begin, in all environments.
 

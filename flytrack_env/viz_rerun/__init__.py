@@ -12,10 +12,4 @@ from flytrack_env.viz_rerun.recording import visualize_state_action_sequence, wr
 from flytrack_env.viz_rerun.serving import ServeError, serve
 from flytrack_env.viz_rerun.trajectory import Trajectory
 
-__all__ = [
-    "ServeError",
-    "Trajectory",
-    "serve",
-    "visualize_state_action_sequence",
-    "write_recording",
-]
+__all__ = ["ServeError", "Trajectory", "serve", "visualize_state_action_sequence", "write_recording"]

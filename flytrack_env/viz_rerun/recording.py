@@ -12,13 +12,7 @@ from flytrack_env.scene import FLIGHT_COLOURS
 from flytrack_env.tracks import Track
 from flytrack_env.viz_rerun.blueprint import make_blueprint
 from flytrack_env.viz_rerun.entities import Writer, log_course, plots_of
-from flytrack_env.viz_rerun.trajectory import (
-    Pairs,
-    Trajectory,
-    checked,
-    track_of_gates,
-    trajectory_of_pairs,
-)
+from flytrack_env.viz_rerun.trajectory import Pairs, Trajectory, checked, track_of_gates, trajectory_of_pairs
 
 APP_ID = "flytrack"
 

@@ -49,11 +49,7 @@ from flytrack_sysid.diagnosis.summary import (
     with_lost_causes,
     with_refined_values,
 )
-from flytrack_sysid.diagnosis.vetoes import (
-    Selection,
-    apply_vetoes,
-    select,
-)
+from flytrack_sysid.diagnosis.vetoes import Selection, apply_vetoes, select
 from flytrack_sysid.log import FlightLog
 from flytrack_sysid.split import HELD_OUT_EVERY, held_out_rows
 
@@ -225,11 +221,7 @@ def summarize(selection: Selection, contradicted: Sequence[str], refined: Refine
         return refined.vector_without(cause.effect)
 
     causes, negligible = split_by_size(found, problem, extended.vector, refined.flight_errors, without)
-    vectors = {
-        "nominal": problem.start,
-        "refitted_base": selection.base.vector,
-        "extended": extended.vector,
-    }
+    vectors = {"nominal": problem.start, "refitted_base": selection.base.vector, "extended": extended.vector}
     extended = at_end(selection, extended)
     limits = not_identifiable(state, linearization, model, (*causes, *negligible))
     flying = {**vectors, "extended": extended.vector}

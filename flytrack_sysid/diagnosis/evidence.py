@@ -75,9 +75,7 @@ EVIDENCE: dict[str, Evidence] = {
         "scale of the body rates", _BY_STICK, "The error grows in proportion to the stick."
     ),
     "rate_saturation": Evidence(
-        "saturation of the body rates",
-        _BY_STICK,
-        "No error near the centre, a steep rise.",
+        "saturation of the body rates", _BY_STICK, "No error near the centre, a steep rise."
     ),
     "yaw_reaction": Evidence(
         "yaw reaction to thrust changes",
@@ -116,9 +114,7 @@ EVIDENCE: dict[str, Evidence] = {
         "The error along the thrust axis grows with airspeed in the rotor plane and levels off.",
     ),
     "ground_effect": Evidence(
-        "ground effect",
-        (Panel("force_z", "height"),),
-        "The error appears only near the ground.",
+        "ground effect", (Panel("force_z", "height"),), "The error appears only near the ground."
     ),
     "linear_drag": Evidence(
         "drag in proportion to airspeed", _BY_AIRSPEED, "A force against the motion, on a straight line."
@@ -129,9 +125,7 @@ EVIDENCE: dict[str, Evidence] = {
         "A force against the motion that bends: slow flight hides it.",
     ),
     "rotor_drag": Evidence(
-        "rotor drag",
-        _by_axis("force", "airspeed", "xy"),
-        "A force against the motion in the rotor plane.",
+        "rotor drag", _by_axis("force", "airspeed", "xy"), "A force against the motion in the rotor plane."
     ),
     "thrust_tilt": Evidence(
         "tilt of the thrust axis",

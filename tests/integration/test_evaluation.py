@@ -22,11 +22,7 @@ from baselines.purejaxrl_ppo.flights import (
     start_keys,
 )
 from baselines.purejaxrl_ppo.plants import draw_plants
-from baselines.purejaxrl_ppo.summary import (
-    compare_with_optimum,
-    summarise,
-    time_lost,
-)
+from baselines.purejaxrl_ppo.summary import compare_with_optimum, summarise, time_lost
 from flytrack_env import FlyTrack, load_track, nominal_parameters, save_track
 from flytrack_env.references import ghost_rollout, shipped_reference, shipped_references
 from flytrack_env.rollout import load_rollout

@@ -15,11 +15,7 @@ import pytest
 
 from baselines.purejaxrl_ppo import CheckpointError, load_checkpoint, monitor
 from baselines.purejaxrl_ppo.checkpoint import save_checkpoint
-from baselines.purejaxrl_ppo.resume import (
-    at_common_step,
-    newest_intact,
-    warn_of_other_machine,
-)
+from baselines.purejaxrl_ppo.resume import at_common_step, newest_intact, warn_of_other_machine
 from baselines.purejaxrl_ppo.run import DivergedError, Options, Run
 from tests.support.ppo_runs import BATCH, EVERY_OTHER_UPDATE, SEED, assert_same_end
 

@@ -11,12 +11,7 @@ from jax import export
 
 from blackbox.plant import PlantParameters
 from flytrack_env import blackbox
-from flytrack_env.state import (
-    APPLIED_ACTION,
-    BATTERY,
-    QUATERNION,
-    VELOCITY,
-)
+from flytrack_env.state import APPLIED_ACTION, BATTERY, QUATERNION, VELOCITY
 
 ROOT = Path(__file__).resolve().parents[2]
 SHIPPED = ROOT / "blackbox" / "acro_step.bin"

@@ -9,12 +9,7 @@ import pytest
 import flytrack_env
 from flytrack_env import blackbox, nominal_parameters
 from flytrack_env.blackbox import BlackBoxError, load
-from flytrack_env.state import (
-    BATTERY,
-    POSITION,
-    unpack,
-    unpack_action,
-)
+from flytrack_env.state import BATTERY, POSITION, unpack, unpack_action
 from tests.support.black_boxes import SHIPPED, random_inputs, write_artifact
 
 # Loading

@@ -17,14 +17,7 @@ from blackbox.build import build, main
 from flytrack_env.blackbox import load
 from flytrack_env.dynamics import ModelParameters
 from flytrack_env.dynamics import step as model_step
-from flytrack_env.state import (
-    ACCELERATION,
-    APPLIED_ACTION,
-    BATTERY,
-    QUATERNION,
-    RATES,
-    VELOCITY,
-)
+from flytrack_env.state import ACCELERATION, APPLIED_ACTION, BATTERY, QUATERNION, RATES, VELOCITY
 from tests.support.black_boxes import AIRLESS, FORBIDDEN, GRAVITY, ROOT, SHIPPED, random_inputs, start
 
 # The plant's own physics

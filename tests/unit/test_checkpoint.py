@@ -11,12 +11,7 @@ import safetensors.numpy
 
 from baselines.purejaxrl_ppo import CheckpointError, Config, load_checkpoint, make_network
 from baselines.purejaxrl_ppo import checkpoint as checkpoint_module
-from baselines.purejaxrl_ppo.checkpoint import (
-    as_named_arrays,
-    checksum,
-    observation_layout,
-    save_checkpoint,
-)
+from baselines.purejaxrl_ppo.checkpoint import as_named_arrays, checksum, observation_layout, save_checkpoint
 from flytrack_env import FlyTrack
 from flytrack_env.observations import OBSERVATION_SIZE
 

@@ -233,13 +233,7 @@ def test_gradients_equal_finite_differences(differentiate: Any) -> None:
     assert set(np.flatnonzero(~np.abs(numeric).any(axis=0)).tolist()) == unused
 
 
-@pytest.mark.parametrize(
-    ("x_shape", "u_shape", "name"),
-    [
-        ((20,), (4,), "x"),
-        ((21,), (3,), "action"),
-    ],
-)
+@pytest.mark.parametrize(("x_shape", "u_shape", "name"), [((20,), (4,), "x"), ((21,), (3,), "action")])
 def test_wrong_shapes_are_refused(x_shape: tuple[int, ...], u_shape: tuple[int, ...], name: str) -> None:
     with pytest.raises(ValueError, match=rf"^{name}: found shape .* expected"):
         step(np.zeros(x_shape), np.zeros(u_shape), 0.01, nominal_parameters())

@@ -182,13 +182,7 @@ def events_in_float64(gate: Gate, start: np.ndarray, end: np.ndarray, radius: fl
     seed=st.integers(0, 2**32 - 1),
 )
 def test_any_segment_meets_any_gate_as_in_the_gates_own_frame(
-    turn: Rotation,
-    centre: Any,
-    direction: float,
-    opening: float,
-    thickness: float,
-    radius: float,
-    seed: int,
+    turn: Rotation, centre: Any, direction: float, opening: float, thickness: float, radius: float, seed: int
 ) -> None:
     gate = gate_of(turn, centre, direction, opening, thickness)
     rng = np.random.default_rng(seed)

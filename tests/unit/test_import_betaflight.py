@@ -102,16 +102,10 @@ def test_rates_at_full_stick_are_the_firmwares(rates_type, rc_rate, super_rate, 
     [
         (b"", r"a\.bbl: found b'' first, expected b'H Product:Blackbox'"),
         (log_with()[:-200], r"a\.bbl: log 1 of 1: cut off: found no end-of-log event in \d+ b"),
-        (
-            log_with(rows=still()),
-            r"a\.bbl: nothing flies: the thrust command never exceeds 5 %",
-        ),
+        (log_with(rows=still()), r"a\.bbl: nothing flies: the thrust command never exceeds 5 %"),
         (log_with().replace(b"encoding:1", b"encoding:77"), r"a\.bbl: damaged, cannot be decoded"),
         (log_with(rows=frames(0)), r"a\.bbl: (found no frames|damaged)"),
-        (
-            log_with(**{"Firmware revision": "INAV 7.1"}),
-            r"Firmware revision: found 'INAV 7\.1', exp",
-        ),
+        (log_with(**{"Firmware revision": "INAV 7.1"}), r"Firmware revision: found 'INAV 7\.1', exp"),
         (log_with(rc_rates=None), r"a\.bbl: header rc_rates: missing, so full stick is unknown"),
         (log_with(acc_1G=None), r"a\.bbl: header acc_1G: found None, expected 1 numbers of at least 0"),
         (log_with(names=[NAMES[0], "\x1b[2J", *NAMES[2:]]), r"field time: missing; found [ -~]+$"),

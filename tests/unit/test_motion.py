@@ -84,12 +84,7 @@ def reference(case: str) -> tuple[np.ndarray, np.ndarray]:
         w, x, yy, z = q
         a, b, c = spin
         turn = 0.5 * np.array(
-            [
-                -x * a - yy * b - z * c,
-                w * a + yy * c - z * b,
-                w * b - x * c + z * a,
-                w * c + x * b - yy * a,
-            ]
+            [-x * a - yy * b - z * c, w * a + yy * c - z * b, w * b - x * c + z * a, w * c + x * b - yy * a]
         )
         acc = rotation(q) @ force(t, vel, q, applied) - np.array([0.0, 0.0, GRAVITY])
         return np.concatenate([vel, acc, turn, lagging, turning, accelerating])

@@ -11,13 +11,7 @@ from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 
 from flytrack_env.flown_race import Pass
-from flytrack_env.pictures import (
-    Flight,
-    draw_flight,
-    make_flight,
-    write_animation,
-    write_video,
-)
+from flytrack_env.pictures import Flight, draw_flight, make_flight, write_animation, write_video
 from flytrack_env.pictures.__main__ import main
 from flytrack_env.pictures.figures import draw_comparison, draw_top
 from flytrack_env.references import ghost_rollout, shipped_references

@@ -11,14 +11,7 @@ from benchmarks.diagnosis import model_of
 from benchmarks.hidden import draw_base, draw_outside, fly, measure
 from flytrack_sysid.diagnosis.lanes import make_lanes
 from flytrack_sysid.diagnosis.problem import Problem
-from flytrack_sysid.diagnosis.refinement import (
-    Judge,
-    at_bounds,
-    placebo_errors,
-    refine,
-    widened,
-    windows_of,
-)
+from flytrack_sysid.diagnosis.refinement import Judge, at_bounds, placebo_errors, refine, widened, windows_of
 from flytrack_sysid.diagnosis.score_test import BASE_FREE, CANDIDATES
 from flytrack_sysid.diagnosis.search import FittedModel, Held, SearchState
 from flytrack_sysid.diagnosis.summary import reduced

@@ -12,14 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from flytrack_env.references import ReferenceFileError, shipped_reference
-from flytrack_env.tracks import (
-    Gate,
-    Track,
-    TrackError,
-    build_course,
-    load_track,
-    save_track,
-)
+from flytrack_env.tracks import Gate, Track, TrackError, build_course, load_track, save_track
 
 VALID = """name = "small"
 

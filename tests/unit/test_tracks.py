@@ -5,11 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from flytrack_env.tracks import (
-    available_tracks,
-    build_course,
-    load_track,
-)
+from flytrack_env.tracks import available_tracks, build_course, load_track
 
 HANDOUT_ROWS = np.array(
     [
