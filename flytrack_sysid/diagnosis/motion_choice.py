@@ -3,7 +3,7 @@
 A motion is a simulator's step, or the continuous motion of a drone. Half a step of another motion looks like
 clocks that are half a step apart, so both are chosen together. The correlation of gyro and attitude says how
 late poses are under each motion. Each is fitted so with the base and the few effects that can pass for half
-a step (a delay, drag, scales), on some seconds of the log, the lateness of the likely ones along with it, and
+a step (delays, drag, scales), on some seconds of the log, the lateness of the likely ones along with it, and
 the likelihoods of what was logged are compared. Unlike named effects, motions are not nested, so that a small
 difference decides.
 """
@@ -49,6 +49,7 @@ LOOK_ALIKES: tuple[Effect, ...] = tuple(
         "thrust_tilt",
         "accelerometer_scale",
         "gyro_scale",
+        "imu_latency",
     )
 )
 
