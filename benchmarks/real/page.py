@@ -31,7 +31,8 @@ def lines_of() -> list[Line]:
     if not LINES.exists():
         return []
     found = [json.loads(text) for text in LINES.read_text(encoding="utf-8").splitlines()]
-    return list(dict(sorted((line["policy"], line) for line in found)).values())
+    last = {line["policy"]: line for line in found}
+    return [last[policy] for policy in sorted(last)]
 
 
 def ratios(line: Line, model: str, other: str = "refitted_base") -> np.ndarray:
