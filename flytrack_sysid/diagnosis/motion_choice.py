@@ -5,7 +5,7 @@ clocks that are half a step apart, so both are chosen together. The correlation 
 late poses are under each motion. Each is fitted so with the base and the few effects that can pass for half
 a step (delays, drag, scales), on some seconds of the log, the lateness of the likely ones along with it, and
 the likelihoods of what was logged are compared. Unlike named effects, motions are not nested, so that a small
-difference decides.
+difference decides. Poses are never early: where they seem to be, gyro and accelerometer are late.
 """
 
 from collections.abc import Sequence
@@ -37,6 +37,7 @@ ON_TIME_S, STANDARD_ERRORS, UNCERTAIN_S = 0.7e-3, 3.0, 1.5e-3
 LEAST_S = 0.5e-3  # of a fitted lateness: a smaller one changes nothing
 DIFFERENCE_S, LONGEST_STEP_S = 2e-4, 3e-3  # for slopes; of a step of the fit
 ROUNDS = 2
+IMU_LATENCY = "imu_latency.latency_s"
 LOOK_ALIKES: tuple[Effect, ...] = tuple(
     BY_NAME[name]
     for name in (
@@ -55,7 +56,10 @@ LOOK_ALIKES: tuple[Effect, ...] = tuple(
 
 
 class Moves(NamedTuple):
-    """How a log moves. late_s: its poses against its gyro, 0 if on time; sigma_s: its standard error."""
+    """How a log moves. late_s: its poses against its gyro, 0 if on time; sigma_s: its standard error.
+
+    While one is chosen, it is negative where the gyro and the accelerometer are late.
+    """
 
     motion: Motion
     late_s: float = 0.0
@@ -97,27 +101,33 @@ class Seen(NamedTuple):
     def problem(self, moves: Moves) -> Problem:
         """Return the problem of a log that moves so."""
         model, log, late_s = self.model._replace(motion=moves.motion), self.log, moves.late_s
-        if not late_s:
+        if late_s <= 0.0:
             return Problem.of(self.lanes(log), model, LOOK_ALIKES)
         in_time = read_poses(log, late_s)[0]
         lanes, late = judged_as_logged(self.lanes(in_time), in_time, log, late_s, moves.motion)
         return Problem.of(lanes, model, LOOK_ALIKES, late)
 
 
-def _places(problem: Problem) -> list[int]:
-    return problem.index([*BASE_FREE, *(f"{one.name}.{name}" for one in LOOK_ALIKES for name in one.ranges)])
+def _places(problem: Problem, moves: Moves) -> list[int]:
+    """Return what is fitted; sensors are late only where poses would be early."""
+    names = [f"{one.name}.{name}" for one in LOOK_ALIKES for name in one.ranges]
+    return problem.index([*BASE_FREE, *(name for name in names if name != IMU_LATENCY or moves.late_s < 0.0)])
 
 
 def _fit(seen: Seen, moves: Moves, last: Trial | None = None) -> Trial:
     """Return a fit, from that of a similar lateness if there is one."""
     problem = seen.problem(moves)
-    vector = problem.start if last is None else last.vector
+    if last is None:
+        vector = problem.start.copy()
+        vector[problem.names.index(IMU_LATENCY)] += max(-moves.late_s, 0.0)
+    else:
+        vector = last.vector
     noise = None if last is None else last.problem.noise
     if noise is None:
         noise = noises.first_guess(problem.lanes, problem.residuals(vector[None])[0])
     for _ in range(2 if last is None else 1):  # what is badly fitted passes for noise at first
         problem = problem.with_noise(noise)
-        vector, _ = refine(problem, vector, _places(problem))
+        vector, _ = refine(problem, problem.clipped(vector), _places(problem, moves))
         noise = noises.fit_noise(problem.lanes, problem.residuals(vector[None])[0], noise)
     return Trial(moves, problem.with_noise(noise), vector)
 
@@ -127,7 +137,7 @@ def _with_later_poses(seen: Seen, trial: Trial) -> Moves:
     moves, problem, vector = trial
     later = seen.problem(moves._replace(late_s=moves.late_s + DIFFERENCE_S))
     change = (later.residuals(vector[None]) - problem.residuals(vector[None])) / DIFFERENCE_S
-    linearization = Linearization(problem, problem.slopes(vector, _places(problem)))
+    linearization = Linearization(problem, problem.slopes(vector, _places(problem, moves)))
     root = np.sqrt(robust_weight(linearization.white))
     column = problem.whiten(np.where(problem.counts & later.counts, change, 0.0))
     own, rest = blocks_of(column * root)[:, 0], blocks_of(linearization.columns * root)
@@ -140,7 +150,7 @@ def _with_later_poses(seen: Seen, trial: Trial) -> Moves:
 
 
 def _fit_lateness(seen: Seen, trial: Trial, rounds: int = ROUNDS) -> Trial:
-    for _ in range(rounds if trial.moves.late_s else 0):
+    for _ in range(rounds if trial.moves.late_s > 0.0 else 0):
         moves = _with_later_poses(seen, trial)
         trial = _fit(seen, moves, trial)
     return trial
@@ -157,7 +167,7 @@ def _misfits(trials: Sequence[Trial]) -> list[float]:
 
 
 def _costs(trials: Sequence[Trial], misfits: Sequence[float]) -> list[float]:
-    """Return the misfits and what it costs not to be on time."""
+    """Return the misfits and what it costs that a sensor is late."""
     return [misfit + LATE * bool(trial.moves.late_s) for trial, misfit in zip(trials, misfits, strict=True)]
 
 
@@ -190,8 +200,8 @@ def how_it_moves(
             late_s = offset_s if one is Motion.CONTINUOUS else offset_s + half_s
             if abs(late_s) > is_small:
                 late[one] = Moves(one, late_s, sigma_s)
-    if motion is not None and not late[motion].late_s:
-        return late[motion]
+    if motion is not None and late[motion].late_s <= 0.0:
+        return Moves(motion)
     seen = Seen(log, judged & _known_around(log, list(late.values())), model)
     found = _chosen(seen.in_parts(), list(late.values()))
     is_late = found.late_s > max(LEAST_S, STANDARD_ERRORS * found.sigma_s)
@@ -199,10 +209,10 @@ def how_it_moves(
 
 
 def _known_around(log: FlightLog, moves: Sequence[Moves]) -> np.ndarray:
-    """Return the rows at which poses can be read so much later, or a few steps of a fit more."""
+    """Return the rows at which poses can be read so much later, or a few steps of a fit more or less."""
     room = ROUNDS * LONGEST_STEP_S + DIFFERENCE_S
-    late_s = [one.late_s for one in moves]
-    ends = (min(0.0, min(late_s) - room), max(late_s) + room) if any(late_s) else (0.0,)
+    late_s = [one.late_s for one in moves if one.late_s > 0.0]
+    ends = (min(0.0, min(late_s) - room), max(late_s) + room) if late_s else (0.0,)
     return np.logical_and.reduce([read_poses(log, end_s)[1] for end_s in ends])
 
 
@@ -234,7 +244,7 @@ def _chosen(seen: Seen, late: Sequence[Moves]) -> Moves:
 def _both(first: Trial, second: Trial) -> Trial:
     """Return the second trial with the lateness that both say."""
     (motion, one_s, sigma_s), (_, other_s, other_sigma_s) = first.moves, second.moves
-    if not one_s:
+    if one_s <= 0.0:
         return second
     weights = np.array([sigma_s, other_sigma_s]) ** -2.0
     late_s = float(weights @ [one_s, other_s] / weights.sum())
