@@ -1,8 +1,9 @@
 """docs/results/diagnosis.md, from the lines that ``benchmarks.diagnosis`` wrote.
 
-``python -m benchmarks.diagnosis_page``
+``python -m benchmarks.diagnosis_page``: the last commit's, and below the figures of earlier ones.
 """
 
+import json
 from collections import Counter
 from collections.abc import Iterable
 from typing import Any
@@ -231,10 +232,25 @@ def misses(by_trial: dict[Trial, Line]) -> str:
     return table("row | flown | truth | lambda, lambda_sep | named", rows)
 
 
+def graded(commit: str | None) -> dict[Trial, Line]:
+    """Return the lines of a commit without a crash, by plant; of the last line's if None."""
+    return {trial: line for trial, line in read_lines(commit).items() if "error" not in line}
+
+
+def earlier(last: str) -> list[str]:
+    """Return the figures of earlier commits, each with a heading, the latest first."""
+    commits = dict.fromkeys(json.loads(text)["commit"] for text in LINES.read_text().splitlines())
+    parts = []
+    for commit in reversed([one for one in commits if one != last]):
+        by_trial = graded(commit)
+        seeds = sorted({line["seed"] for line in by_trial.values()})
+        parts += [f"## Before, at {commit}: seeds {seeds}", figures_of_motions(by_trial)]
+    return parts
+
+
 def as_page() -> str:
     """Return the page."""
-    every = read_lines(None)
-    lines, by_trial = list(every.values()), {key: one for key, one in every.items() if "error" not in one}
+    lines, by_trial = list(read_lines(None).values()), graded(None)
     by_row = {row: [line for trial, line in by_trial.items() if trial.row == row] for row in ROWS}
     head = HEAD.format(
         plants=", ".join(f"{row} {len(by_row[row])}" for row in ROWS),
@@ -266,6 +282,7 @@ def as_page() -> str:
         counted("depends on | plants | found", outside),
         "## Every plant with a name missing or false",
         misses(by_trial),
+        *earlier(lines[-1]["commit"]),
     )
 
 
