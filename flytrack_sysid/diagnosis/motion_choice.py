@@ -150,9 +150,12 @@ def _with_later_poses(seen: Seen, trial: Trial) -> Moves:
 
 
 def _fit_lateness(seen: Seen, trial: Trial, rounds: int = ROUNDS) -> Trial:
-    for _ in range(rounds if trial.moves.late_s > 0.0 else 0):
+    """Return the trial with the lateness of its poses fitted, down to none."""
+    for _ in range(rounds):
+        if trial.moves.late_s <= 0.0:
+            break
         moves = _with_later_poses(seen, trial)
-        trial = _fit(seen, moves, trial)
+        trial = _fit(seen, moves._replace(late_s=max(moves.late_s, 0.0)), trial)
     return trial
 
 

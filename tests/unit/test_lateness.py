@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from flytrack_env.motion import Motion
 from flytrack_sysid import sensors
+from flytrack_sysid.diagnosis import motion_choice
 from flytrack_sysid.diagnosis.lanes import NUM_AXES, make_lanes
 from flytrack_sysid.diagnosis.lateness import judged_as_logged, read_poses
 from flytrack_sysid.diagnosis.motion_choice import MOST_LANES, Moves, Seen, how_it_moves
@@ -73,7 +74,7 @@ def test_commands_stamped_after_the_turns_they_cause_are_put_before_them() -> No
             assert min(off) < 0.1 * np.abs(found["u"]).mean()
 
 
-def late_poses(log: FlightLog) -> FlightLog:
+def late_poses(log: FlightLog, steps: float = STEPS) -> FlightLog:
     """Return a log whose poses are late, linear between rows, without the first rows of each flight."""
     kept = np.ones(len(log), bool)
     channels = {name: np.array(values) for name, values in log.channels.items()}
@@ -81,7 +82,7 @@ def late_poses(log: FlightLog) -> FlightLog:
         rows = np.flatnonzero(log.segment == number)
         at = np.arange(len(rows), dtype=float)
         for name in "pvq":
-            columns = [np.interp(at - STEPS, at, column) for column in log[name][rows].T]
+            columns = [np.interp(at - steps, at, column) for column in log[name][rows].T]
             channels[name][rows] = np.stack(columns, axis=1)
         kept[rows[:5]] = False
     channels["q"] /= np.linalg.norm(channels["q"], axis=1, keepdims=True)
@@ -110,3 +111,15 @@ def test_what_stays_undecided_can_ask_all_of_the_log() -> None:
     assert parts.num_parts == every // MOST_LANES > 1
     rows = [set(parts._replace(part=one).lanes(log).row.ravel()) - {-1} for one in range(parts.num_parts)]
     assert len(set.union(*rows)) > 0.9 * len(log)
+
+
+def test_poses_that_seem_early_are_on_time(monkeypatch) -> None:
+    """Where the correlation says late, their lateness is fitted down to none and no further."""
+    plant, wrong_s, half_step_s = HandoutPlant(), 0.0017, 0.005
+    early = late_poses(excited(plant), steps=-0.05)
+    log = sensors.measure(early, 1.0, GRAVITY, np.random.default_rng(1))
+    says = wrong_s - half_step_s, 3e-4, 1.0, ""
+    monkeypatch.setattr(motion_choice, "offset_between", lambda *_: says)
+    with jax.enable_x64(True):
+        found = how_it_moves(log, plant.model(), np.ones(len(log), bool), Motion.HANDOUT)
+    assert found == Moves(Motion.HANDOUT)
