@@ -123,3 +123,10 @@ def test_poses_that_seem_early_are_on_time(monkeypatch) -> None:
     with jax.enable_x64(True):
         found = how_it_moves(log, plant.model(), np.ones(len(log), bool), Motion.HANDOUT)
     assert found == Moves(Motion.HANDOUT)
+
+
+def test_a_drone_on_time_is_no_simulator_however_little_the_model_explains() -> None:
+    """Commands that have nothing to do with the motion stand for a rate loop that the model lacks."""
+    log = noisy(flight(TIME_S), seed=1)
+    with jax.enable_x64(True):
+        assert how_it_moves(log, HandoutPlant().model(), np.ones(len(log), bool)) == Moves(Motion.CONTINUOUS)
