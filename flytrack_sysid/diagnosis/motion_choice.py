@@ -53,6 +53,7 @@ LOOK_ALIKES: tuple[Effect, ...] = tuple(
         "rotor_drag",
         "wind",
         "thrust_tilt",
+        "translational_lift",
         "accelerometer_scale",
         "gyro_scale",
         "imu_latency",
