@@ -417,23 +417,23 @@ def refine(
         return as_found
     judge = Judge.of(problem, learnt, judged, base).seeing(errors_at(problem, extended[None], judged))
     as_found = as_found._replace(judge=judge)
-    is_at_bound = bool(at_bounds(problem, extended, [name for one in candidates for name in one.fields]))
-    if (
-        not candidates
-        or not judge.is_known.any()
-        or (is_explained and not is_at_bound and not judge.is_surely_worse(extended))
-    ):
+    if not candidates or not judge.is_known.any():
         return as_found
-    found = _Refinement(judge, learnt, base, tuple(base_places), ())
-    seen = found.acting_in(problem, _probed(problem, extended, candidates), candidates)
-    return found._replace(acting=seen).run(extended, as_found)
+    found = _Refinement(judge, learnt, base, tuple(base_places), (), is_explained)
+    found = found._replace(
+        acting=found.acting_in(problem, _probed(problem, extended, candidates), candidates)
+    )
+    is_at_bound = bool(at_bounds(problem, extended, found.fields_of(candidates)))
+    if is_explained and not is_at_bound and not judge.is_surely_worse(extended):
+        return as_found
+    return found.run(extended, as_found)
 
 
 class _Refinement(NamedTuple):
     """What the steps of a refinement share.
 
     acting: the effects that change how a model predicts: not those of sensors that windows do not see, whose
-    values stay as they are.
+    values stay as they are. is_explained: as in ``refine``.
     """
 
     judge: Judge
@@ -441,6 +441,11 @@ class _Refinement(NamedTuple):
     base: np.ndarray
     base_places: tuple[int, ...]
     acting: tuple[str, ...]
+    is_explained: bool
+
+    def fields_of(self, candidates: Sequence[Candidate]) -> list[str]:
+        """Return the parameters of effects that act on the windows."""
+        return [name for one in candidates if one.effect in self.acting for name in one.fields]
 
     def target(self, problem: Problem) -> Target:
         """Return what is fitted: cells that are evidence, and short horizons."""
@@ -452,8 +457,7 @@ class _Refinement(NamedTuple):
     def places(self, problem: Problem, candidates: Sequence[Candidate]) -> list[int]:
         """Return the free places that act on the windows."""
         own = [place for place in self.base_places if problem.names[place] != DRAIN]
-        seen = [one for one in candidates if one.effect in self.acting]
-        return own + [place for one in seen for place in problem.index(one.fields)]
+        return own + problem.index(self.fields_of(candidates))
 
     def acting_in(
         self, problem: Problem, vector: np.ndarray, candidates: Sequence[Candidate]
@@ -475,7 +479,7 @@ class _Refinement(NamedTuple):
             other = target.fitted(probed, places, MOST_ROUNDS)
             both = np.stack([fit.vector, other.vector])
             fit = (fit, other)[int(np.argmin(target.cost(target.residuals(both), both)))]
-        stuck = at_bounds(problem, fit.vector, [name for one in candidates for name in one.fields])
+        stuck = at_bounds(problem, fit.vector, self.fields_of(candidates))
         if stuck:
             problem = widened(problem, stuck)
             target = target._replace(problem=problem)
@@ -500,6 +504,8 @@ class _Refinement(NamedTuple):
             needed = np.where((worth >= WORTHWHILE) & (sure >= LIKELY), np.maximum(sure, SURE), sure)
             needed[:] = needed if judge.matters.any() else np.inf  # nothing that could tell
             without = {one.effect: less.vector for one, less in zip(tried, fits, strict=True)}
+            if self.is_explained and not judge.is_surely_worse(fit.vector):
+                break
             weakest = int(np.argmin(needed))
             if needed[weakest] >= SURE:
                 if judge.worst_ratio(fit.vector) < 1.0:

@@ -236,15 +236,20 @@ def remainder_of_force_law(selection: Selection, test: Problem) -> list[str]:
 
 
 def seen_once(selection: Selection, test: Problem) -> list[str]:
-    """Reject effects that gain barely enough where they were fitted, and nothing on held-out rows."""
+    """Reject effects that gain barely enough where they were fitted, and nothing on held-out rows.
 
-    def is_rejected(one: Ablation) -> bool:
-        if one.robust >= BARELY * threshold(one.num_parameters):
-            return False
+    One that begins or ends in flight has to gain there in any case: a few rows can carry a change.
+    """
+    changing = {one.effect for one in selection.state.problem.windows}
+
+    def is_rejected(effect: str, one: Ablation) -> bool:
         gain, expected = held_out_gain(test, one.without.vector, selection.model.vector)
-        return gain < 0.0 and expected > BARELY_SHOWN
+        if effect in changing:
+            return gain <= 0.0
+        is_clear = one.robust >= BARELY * threshold(one.num_parameters)
+        return not is_clear and gain < 0.0 and expected > BARELY_SHOWN
 
-    return [effect for effect, one in selection.ablations.items() if is_rejected(one)]
+    return [effect for effect, one in selection.ablations.items() if is_rejected(effect, one)]
 
 
 # Rules in one row act together, on the same selection.

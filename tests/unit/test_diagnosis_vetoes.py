@@ -15,7 +15,7 @@ from flytrack_sysid.diagnosis.diagnose import thinning_warning
 from flytrack_sysid.diagnosis.lanes import LANE_S, make_lanes, thinned
 from flytrack_sysid.diagnosis.model_selection import Ablation, is_determined, with_lags_anew
 from flytrack_sysid.diagnosis.noise import first_guess
-from flytrack_sysid.diagnosis.problem import Problem
+from flytrack_sysid.diagnosis.problem import Problem, Window
 from flytrack_sysid.diagnosis.refinement import Refined
 from flytrack_sysid.diagnosis.result import Cause, Estimated
 from flytrack_sysid.diagnosis.score_test import CANDIDATES, threshold
@@ -46,8 +46,9 @@ def ablation(gain: float, num_parameters: int = 1, inflation: float = 1.0) -> Ab
     return Ablation(gain, inflation, num_parameters, {}, {}, without)
 
 
-def selection_of(**ablations: Ablation) -> Selection:
-    return Selection(None, None, SimpleNamespace(vector=np.zeros(1)), ablations)
+def selection_of(*windows: Window, **ablations: Ablation) -> Selection:
+    state = SimpleNamespace(problem=SimpleNamespace(windows=windows))
+    return Selection(state, None, SimpleNamespace(vector=np.zeros(1)), ablations)
 
 
 def test_a_lag_that_ended_where_it_has_no_slope_is_fitted_from_nominal_again(state):
@@ -107,6 +108,13 @@ def test_what_is_barely_seen_has_to_be_seen_again(monkeypatch, thresholds, held_
     inflation = 1.5
     own = ablation(thresholds * threshold(3) * inflation, 3, inflation)
     assert vetoes.seen_once(selection_of(gyro_scale=own), None) == ([] if is_named else ["gyro_scale"])
+
+
+@pytest.mark.parametrize(("held_out", "is_named"), [(0.5, True), (0.0, False), (-0.5, False)])
+def test_what_begins_in_flight_has_to_be_seen_again_however_clear(monkeypatch, held_out, is_named):
+    monkeypatch.setattr(vetoes, "held_out_gain", lambda test, less, full: (held_out, 0.9))
+    selection = selection_of(Window("gyro_scale", start=100), gyro_scale=ablation(1e3, 3))
+    assert vetoes.seen_once(selection, None) == ([] if is_named else ["gyro_scale"])
 
 
 @pytest.mark.parametrize(

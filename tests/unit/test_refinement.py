@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from benchmarks.diagnosis import model_of
 from benchmarks.hidden import draw_base, draw_outside, fly, measure
+from flytrack_env.effects import BY_NAME
 from flytrack_sysid.diagnosis.lanes import make_lanes
 from flytrack_sysid.diagnosis.problem import Problem
 from flytrack_sysid.diagnosis.refinement import Judge, at_bounds, placebo_errors, refine, widened, windows_of
@@ -27,6 +28,8 @@ SECONDS = 40.0
 TRUE_DRAG = {"d_x": 0.4, "d_y": 0.4, "d_z": 0.2}
 DRAG = next(one for one in CANDIDATES if one.effect == "linear_drag")
 BIAS = next(one for one in CANDIDATES if one.effect == "accelerometer_bias")
+SCALE = next(one for one in CANDIDATES if one.effect == "accelerometer_scale")
+COUPLING = next(one for one in CANDIDATES if one.effect == "rate_cross_coupling")
 CIRCLE_S, RADIUS_M = 4.0, 1.0
 AS_GOOD = 1.02  # windows start elsewhere than the flights of the check
 
@@ -37,7 +40,7 @@ def problem_of(truth, log: FlightLog) -> Problem:
     return Problem.of(lanes, model_of(truth))
 
 
-def refined(truth, log: FlightLog, candidates, values):
+def refined(truth, log: FlightLog, candidates, values, is_explained=False):
     """Return the problem of a plant and its refinement, from given values of effects."""
     with jax.enable_x64(True):
         problem = problem_of(truth, log)
@@ -46,7 +49,7 @@ def refined(truth, log: FlightLog, candidates, values):
             vector[problem.names.index(name)] = value
         places = problem.index(BASE_FREE)
         found = refine(
-            problem, problem.start, vector, candidates, places, log, held_out_rows(log), is_explained=False
+            problem, problem.start, vector, candidates, places, log, held_out_rows(log), is_explained
         )
     return problem, found
 
@@ -64,6 +67,18 @@ def dragged():
     truth, log = flown(effects={"linear_drag": TRUE_DRAG})
     halved = {f"linear_drag.{name}": 0.5 * value for name, value in TRUE_DRAG.items()}
     return truth, log, *refined(truth, log, (DRAG, BIAS), halved | {"accelerometer_bias.x": 0.3})
+
+
+def test_what_explains_every_step_stays_though_flights_hardly_show_it(dragged):
+    truth, log, *_ = dragged
+    values = {f"linear_drag.{name}": value for name, value in TRUE_DRAG.items()}
+    weak = values | {"rate_cross_coupling.from_pitch": 1e-4}
+    # Scales of axes that measure next to nothing end anywhere: no flight shows them.
+    _, found = refined(truth, log, (DRAG, SCALE), values | {"accelerometer_scale.x": 0.8}, is_explained=True)
+    assert found.fit is None and found.kept == (DRAG, SCALE)
+    at_bound = weak | {"linear_drag.d_z": BY_NAME["linear_drag"].ranges["d_z"].high}
+    _, found = refined(truth, log, (DRAG, COUPLING), at_bound, is_explained=True)
+    assert found.fit is not None and found.kept == (DRAG, COUPLING) and not found.removed
 
 
 def test_values_are_refined_by_flights(dragged):
