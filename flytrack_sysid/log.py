@@ -31,6 +31,7 @@ REQUIRED = ("t", *CHANNELS["u"])
 COLUMNS = ("t", "segment", *(column for columns in CHANNELS.values() for column in columns))
 GAP_STEPS = 1.5  # of the usual step: what lasts longer lacks a sample; loggers jitter by less
 NOMINAL_STEP_S = 0.01  # of a log without two rows
+BETWEEN_S = 1.0  # from the end of a segment to the start of the next, put on one time line
 _IN_STATE = {
     "p": POSITION,
     "v": VELOCITY,
@@ -101,6 +102,18 @@ def usual_step(log: FlightLog) -> np.ndarray:
     fallback = float(np.median(all_steps)) if len(all_steps) else NOMINAL_STEP_S
     medians = [float(np.median(own)) if len(own) else fallback for own in steps]
     return np.repeat(medians, [len(own) + 1 for own in steps])
+
+
+def time_in_line(log: FlightLog, between_s: np.ndarray | float = BETWEEN_S) -> np.ndarray:
+    """Return the time of rows, (num_rows,) s from 0: segments one after the other.
+
+    between_s: from the end of each segment to the start of the next.
+    """
+    starts = np.flatnonzero(log.is_start())
+    lengths = np.diff(np.append(starts, len(log)))
+    durations_s = log.time[starts + lengths - 1] - log.time[starts]
+    begins_s = np.concatenate([[0.0], np.cumsum(durations_s + between_s)[:-1]])
+    return log.time + np.repeat(begins_s - log.time[starts], lengths)
 
 
 def log_of_states(

@@ -26,7 +26,7 @@ from flytrack_env.state import (
 )
 from flytrack_env.viz_rerun import Trajectory
 from flytrack_sysid.diagnosis.traces import Traces, traces
-from flytrack_sysid.log import FlightLog
+from flytrack_sysid.log import FlightLog, time_in_line
 from flytrack_sysid.parameters import with_neutral_effects
 from flytrack_sysid.prediction import Prediction, free_flights, inputs_that_lack, predict
 from flytrack_sysid.prediction_errors import longest_flight
@@ -35,7 +35,6 @@ from flytrack_sysid.record import Filled, fill_gaps
 WINDOW_S = 0.1  # of means: long enough for noise to average out, short beside a manoeuvre
 RESTART_S = 1.0  # of free flight: the horizon of the report's first sentence
 AWAY_M = 10.0  # from the measured path: a model that is farther off has diverged
-BETWEEN_S = 1.0  # from the end of a segment to the start of the next
 # Of one flight: 1 min at 100 Hz. Its path is most of a recording, and grows with the power 1.5 of its rows.
 MOST_ROWS = 6000
 FLOWN = {"p": POSITION, "v": VELOCITY, "q": QUATERNION, "w": RATES}
@@ -82,15 +81,6 @@ def trajectories_of(
         flown = [_free_flight(timed, name, model) for name, model in models.items()]
         found += [one for one in flown if one is not None]
     return found
-
-
-def time_in_line(log: FlightLog) -> np.ndarray:
-    """Return the time of rows, (num_rows,) s from 0: segments one after the other, a second between them."""
-    starts = np.flatnonzero(log.is_start())
-    lengths = np.diff(np.append(starts, len(log)))
-    durations_s = log.time[starts + lengths - 1] - log.time[starts]
-    begins_s = np.concatenate([[0.0], np.cumsum(durations_s + BETWEEN_S)[:-1]])
-    return log.time + np.repeat(begins_s - log.time[starts], lengths)
 
 
 def position_of(log: FlightLog) -> tuple[np.ndarray, str]:
