@@ -32,7 +32,7 @@ COLUMNS = ("t", "segment", *(column for columns in CHANNELS.values() for column 
 GAP_STEPS = 1.5  # of the usual step: what lasts longer lacks a sample; loggers jitter by less
 NOMINAL_STEP_S = 0.01  # of a log without two rows
 BETWEEN_S = 1.0  # from the end of a segment to the start of the next, put on one time line
-_IN_STATE = {
+IN_STATE = {  # where a channel is in the handout's state
     "p": POSITION,
     "v": VELOCITY,
     "a": ACCELERATION,
@@ -125,7 +125,7 @@ def log_of_states(
     """
     flights = [(np.asarray(states, float), np.asarray(actions, float)) for states, actions in flights]
     states = np.concatenate([states for states, _ in flights])
-    channels = {name: states[:, where] for name, where in _IN_STATE.items()}
+    channels = {name: states[:, where] for name, where in IN_STATE.items()}
     return FlightLog(
         time=np.concatenate([np.arange(len(states)) * dt for states, _ in flights]),
         channels={"u": np.concatenate([actions for _, actions in flights]), **channels},
