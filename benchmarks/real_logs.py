@@ -9,28 +9,26 @@ so and writes nothing.
 
 import argparse
 import json
-import os
 import sys
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
 from benchmarks.real import gecko, nanobench, payload
-from benchmarks.real.crazyflie import LINES
+from benchmarks.real.crazyflie import DATA, FOLDER, LINES, VARIABLE, flights
 from benchmarks.real.page import crazyflie_part
 from benchmarks.real.record import Record, diagnosed, imported
 from benchmarks.real.section import draw, section
-from benchmarks.report import RESULTS, ROOT, write_json
+from benchmarks.report import RESULTS, write_json
 from flytrack_env.files import write_atomically
 from flytrack_env.pictures.drawing import png_of
-from flytrack_sysid import LogError, import_log
+from flytrack_sysid import LogError
 from flytrack_sysid.diagnosis import joined
 
 RESULT = RESULTS / "real_logs_diagnosis.md"
-VARIABLE = "FLYTRACK_SHARED_DATA"
-CRAZYFLIE, BETAFLIGHT = "crazyflie_rate_flights", "betaflight_acro_log"
+BETAFLIGHT = "betaflight_acro_log"
 # Every third policy, by its number, is for judging.
 LEARNT = ("48", "49", "52", "53", "67", "68", "70", "71")
 JUDGED = ("50", "66", "69")
@@ -45,17 +43,7 @@ mass_kg = 0.7  # a guess: the log does not say
 
 def crazyflie(data: Path) -> Record:
     """Return the diagnosis of the Crazyflie's flights; held out are those of some policies."""
-
-    def flights(policies: Iterable[str]) -> tuple:
-        files = [
-            file
-            for policy in policies
-            for file in sorted((data / CRAZYFLIE).glob(f"seed000{policy}_*.csv.gz"))
-        ]
-        found = import_log(files, "csv", "crazyflie_phoenix")
-        return found.log, found.nominal_model()
-
-    (learnt, model), (judged, _) = flights(LEARNT), flights(JUDGED)
+    (learnt, model), (judged, _) = (flights(data / FOLDER, policies) for policies in (LEARNT, JUDGED))
     log = joined([learnt, judged])
     return diagnosed(log, model, np.arange(len(log)) >= len(learnt))[1]
 
@@ -100,7 +88,7 @@ class Craft(NamedTuple):
 CRAFTS = {
     "crazyflie": Craft(
         "Crazyflie 2.1, flown by learned policies: one diagnosis",
-        CRAZYFLIE,
+        FOLDER,
         crazyflie,
         lambda record: DIAGNOSED_HEAD.format(learnt=", ".join(LEARNT), judged=", ".join(JUDGED)),
     ),
@@ -162,16 +150,15 @@ def page() -> tuple[str, dict[str, bytes]]:
 def main(arguments: Sequence[str] | None = None) -> None:
     """Diagnose, or write the page, or say why not."""
     parser = argparse.ArgumentParser(description=__doc__)
-    default = os.environ.get(VARIABLE, ROOT.parent / "shared" / "data")
-    parser.add_argument("--data", type=Path, default=default, help="default: %(default)s")
+    parser.add_argument("--data", type=Path, default=DATA, help="default: %(default)s")
     parser.add_argument("--diagnose", default="", help=f"of {', '.join(CRAFTS)}")
     chosen = parser.parse_args(arguments)
     for name in filter(None, chosen.diagnose.split(",")):
-        folder = Path(chosen.data) / CRAFTS[name].folder
+        folder = chosen.data / CRAFTS[name].folder
         if not folder.is_dir():
             sys.exit(f"skipped: no measured flights at {folder}; --data or {VARIABLE} names their folder")
         try:
-            write_json(kept(name), CRAFTS[name].measure(Path(chosen.data)))
+            write_json(kept(name), CRAFTS[name].measure(chosen.data))
         except LogError as error:
             sys.exit(f"skipped: {error}")
     if not chosen.diagnose:

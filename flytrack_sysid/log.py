@@ -31,7 +31,8 @@ REQUIRED = ("t", *CHANNELS["u"])
 COLUMNS = ("t", "segment", *(column for columns in CHANNELS.values() for column in columns))
 GAP_STEPS = 1.5  # of the usual step: what lasts longer lacks a sample; loggers jitter by less
 NOMINAL_STEP_S = 0.01  # of a log without two rows
-_IN_STATE = {
+BETWEEN_S = 1.0  # from the end of a segment to the start of the next, put on one time line
+IN_STATE = {  # where a channel is in the handout's state
     "p": POSITION,
     "v": VELOCITY,
     "a": ACCELERATION,
@@ -103,6 +104,18 @@ def usual_step(log: FlightLog) -> np.ndarray:
     return np.repeat(medians, [len(own) + 1 for own in steps])
 
 
+def time_in_line(log: FlightLog, between_s: np.ndarray | float = BETWEEN_S) -> np.ndarray:
+    """Return the time of rows, (num_rows,) s from 0: segments one after the other.
+
+    between_s: from the end of each segment to the start of the next.
+    """
+    starts = np.flatnonzero(log.is_start())
+    lengths = np.diff(np.append(starts, len(log)))
+    durations_s = log.time[starts + lengths - 1] - log.time[starts]
+    begins_s = np.concatenate([[0.0], np.cumsum(durations_s + between_s)[:-1]])
+    return log.time + np.repeat(begins_s - log.time[starts], lengths)
+
+
 def log_of_states(
     flights: Iterable[tuple[np.ndarray, np.ndarray]], dt: float, source: str = "flight log"
 ) -> FlightLog:
@@ -112,7 +125,7 @@ def log_of_states(
     """
     flights = [(np.asarray(states, float), np.asarray(actions, float)) for states, actions in flights]
     states = np.concatenate([states for states, _ in flights])
-    channels = {name: states[:, where] for name, where in _IN_STATE.items()}
+    channels = {name: states[:, where] for name, where in IN_STATE.items()}
     return FlightLog(
         time=np.concatenate([np.arange(len(states)) * dt for states, _ in flights]),
         channels={"u": np.concatenate([actions for _, actions in flights]), **channels},

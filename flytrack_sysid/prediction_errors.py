@@ -18,14 +18,7 @@ from flytrack_sysid.prediction import (
 
 UNITS = {"p": "m", "v": "m/s", "q": "1", "w": "rad/s", "a": "m/s^2", "f": "m/s^2"}
 BY_CHANGE, BY_SPREAD = "measured change in one step", "measured channel's spread"
-NORMALISED_BY = {
-    "p": BY_CHANGE,
-    "v": BY_CHANGE,
-    "q": BY_CHANGE,
-    "w": BY_SPREAD,
-    "a": BY_SPREAD,
-    "f": BY_SPREAD,
-}
+NORMALISED_BY = {**dict.fromkeys("pvq", BY_CHANGE), **dict.fromkeys("waf", BY_SPREAD)}
 NRMSE_MEANING = {
     BY_CHANGE: "rmse over the rms of the measured change in one step: 1 is as good as 'nothing changes'",
     BY_SPREAD: "rmse over the standard deviation of the measured channel: 1 is as good as its mean",

@@ -12,8 +12,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
 from flytrack_env.state import ACTION_SIZE
-from flytrack_sysid.log import GAP_STEPS, FlightLog, usual_step
-from flytrack_sysid.split import blocks_of
+from flytrack_sysid.log import GAP_STEPS, FlightLog, time_in_line, usual_step
+from flytrack_sysid.split import blocks_of, cut_evenly
 
 LONGEST_FILLED_S = 0.1  # after a longer gap a new flight begins
 # Without voltage thrust is off by another share in each flight, and the velocity runs away with it.
@@ -107,15 +107,6 @@ def _velocity(log: FlightLog) -> np.ndarray:
     return velocity
 
 
-def _end_to_end(log: FlightLog, usual: np.ndarray) -> FlightLog:
-    """Return the log with its segments one after the other in time."""
-    starts = np.flatnonzero(log.is_start())
-    lengths = np.diff(np.append(starts, len(log)))
-    durations = log.time[starts + lengths - 1] - log.time[starts] + usual[starts]
-    offset = np.concatenate([[0.0], np.cumsum(durations)[:-1]]) - log.time[starts]
-    return FlightLog(log.time + np.repeat(offset, lengths), log.channels, log.segment, log.source)
-
-
 class Filled(NamedTuple):
     """A log with rows added in its gaps, in between their neighbours.
 
@@ -133,7 +124,7 @@ class Filled(NamedTuple):
 def fill_gaps(log: FlightLog) -> Filled:
     """Return a log without gaps."""
     usual = usual_step(log)
-    in_line = _end_to_end(log, usual)
+    in_line = replace(log, time=time_in_line(log, usual[log.is_start()]))
     times, rows, begins = _new_times(in_line, usual)
     measured = rows >= 0
     behind = np.where(measured, rows, -1 - rows)
@@ -177,27 +168,14 @@ def make_record(log: FlightLog) -> Record:
     filled = fill_gaps(log)
     record = record_of(filled)
     longest_s = WINDOW_S if "v_bat" in log else WINDOW_WITHOUT_VOLTAGE_S
-    pieces = _pieces(filled.log.time, record.begins, blocks_of(log)[filled.behind], longest_s)
-    return _padded(record._replace(piece=pieces))
+    is_first = record.begins | np.append(True, np.diff(blocks_of(log)[filled.behind]) != 0)
+    return _padded(record._replace(piece=cut_evenly(filled.log.time, is_first, longest_s)))
 
 
 def steps_after(log: FlightLog) -> np.ndarray:
     """Return the time from each row to the next of its segment, (num_rows,) s; the usual one at the end."""
     steps = np.diff(log.time, append=log.time[-1])
     return np.where(np.append(log.is_start()[1:], True), usual_step(log), steps)
-
-
-def _pieces(times: np.ndarray, begins: np.ndarray, blocks: np.ndarray, longest_s: float) -> np.ndarray:
-    """Return numbers of stretches: blocks of each flight, cut evenly into stretches of at most 2.5 s."""
-    is_first = begins | np.append(True, np.diff(blocks) != 0)
-    number = np.cumsum(is_first) - 1
-    first = np.flatnonzero(is_first)
-    last = np.append(first[1:], len(times)) - 1
-    duration = times[last] - times[first]
-    pieces = np.maximum(1, np.ceil(duration / longest_s - 1e-6)).astype(int)
-    share = (times - times[first][number]) / np.maximum(duration, 1e-9)[number]
-    piece = np.minimum((share * pieces[number]).astype(int), pieces[number] - 1)
-    return (np.cumsum(pieces) - pieces)[number] + piece
 
 
 def _padded(record: Record) -> Record:

@@ -27,7 +27,6 @@ from flytrack_sysid.record import Record, is_applied_certain, measured_channels
 from flytrack_sysid.replay import Step, replay, where_true
 
 CENTRED = ("v", "p", "q", "v_bat")
-TURN_CHANNELS, FORCE_CHANNELS = ("w", "q"), ("f", "v", "p")
 
 
 class Channel(NamedTuple):

@@ -16,17 +16,24 @@ def blocks_of(log: FlightLog) -> np.ndarray:
     of at most an eighth of the log.
     """
     starts = np.flatnonzero(log.is_start())
-    ends = np.append(starts[1:], len(log))
-    durations = log.time[ends - 1] - log.time[starts]
-    longest = min(LONGEST_BLOCK_S, durations.sum() / FEWEST_BLOCKS)
-    block, count = np.zeros(len(log), int), 0
-    for start, end, duration in zip(starts, ends, durations, strict=True):
-        # The tiny part keeps rounding from cutting a segment that just fits.
-        pieces = max(1, int(np.ceil(duration / longest - 1e-6))) if duration > 0 else 1
-        share = (log.time[start:end] - log.time[start]) / max(duration, 1e-9)
-        block[start:end] = count + np.minimum((share * pieces).astype(int), pieces - 1)
-        count += pieces
-    return block
+    durations = log.time[np.append(starts[1:], len(log)) - 1] - log.time[starts]
+    longest_s = min(LONGEST_BLOCK_S, durations.sum() / FEWEST_BLOCKS)
+    return cut_evenly(log.time, log.is_start(), max(longest_s, np.finfo(float).tiny))
+
+
+def cut_evenly(times: np.ndarray, is_first: np.ndarray, longest_s: float) -> np.ndarray:
+    """Return numbers of pieces, (num_rows,) int: stretches cut evenly into pieces of at most so many seconds.
+
+    is_first: (num_rows,) bool, where a stretch begins.
+    """
+    number = np.cumsum(is_first) - 1
+    first = np.flatnonzero(is_first)
+    duration = times[np.append(first[1:], len(times)) - 1] - times[first]
+    # The tiny part keeps rounding from cutting a stretch that just fits.
+    pieces = np.maximum(1, np.ceil(duration / longest_s - 1e-6)).astype(int)
+    share = (times - times[first][number]) / np.maximum(duration, 1e-9)[number]
+    piece = np.minimum((share * pieces[number]).astype(int), pieces[number] - 1)
+    return (np.cumsum(pieces) - pieces)[number] + piece
 
 
 def held_out_rows(log: FlightLog, every: int = HELD_OUT_EVERY) -> np.ndarray:

@@ -13,20 +13,10 @@ import numpy as np
 
 from flytrack_env.dynamics import ModelParameters
 from flytrack_env.effects import BY_NAME
-from flytrack_env.state import (
-    ACCELERATION,
-    ACTION_SIZE,
-    APPLIED_ACTION,
-    BATTERY,
-    POSITION,
-    QUATERNION,
-    RATES,
-    STATE_SIZE,
-    VELOCITY,
-)
+from flytrack_env.state import ACTION_SIZE, POSITION, QUATERNION, STATE_SIZE
 from flytrack_env.viz_rerun import Trajectory
 from flytrack_sysid.diagnosis.traces import Traces, traces
-from flytrack_sysid.log import FlightLog
+from flytrack_sysid.log import IN_STATE, FlightLog, time_in_line
 from flytrack_sysid.parameters import with_neutral_effects
 from flytrack_sysid.prediction import Prediction, free_flights, inputs_that_lack, predict
 from flytrack_sysid.prediction_errors import longest_flight
@@ -35,13 +25,9 @@ from flytrack_sysid.record import Filled, fill_gaps
 WINDOW_S = 0.1  # of means: long enough for noise to average out, short beside a manoeuvre
 RESTART_S = 1.0  # of free flight: the horizon of the report's first sentence
 AWAY_M = 10.0  # from the measured path: a model that is farther off has diverged
-BETWEEN_S = 1.0  # from the end of a segment to the start of the next
 # Of one flight: 1 min at 100 Hz. Its path is most of a recording, and grows with the power 1.5 of its rows.
 MOST_ROWS = 6000
-FLOWN = {"p": POSITION, "v": VELOCITY, "q": QUATERNION, "w": RATES}
-CHANNELS = {
-    **FLOWN, "a": ACCELERATION, "uprev": APPLIED_ACTION, "v_bat": slice(BATTERY, BATTERY + 1)
-}  # fmt: skip
+FLOWN = ("p", "v", "q", "w")  # channels of a free flight
 
 
 class RecordingError(ValueError):
@@ -84,15 +70,6 @@ def trajectories_of(
     return found
 
 
-def time_in_line(log: FlightLog) -> np.ndarray:
-    """Return the time of rows, (num_rows,) s from 0: segments one after the other, a second between them."""
-    starts = np.flatnonzero(log.is_start())
-    lengths = np.diff(np.append(starts, len(log)))
-    durations_s = log.time[starts + lengths - 1] - log.time[starts]
-    begins_s = np.concatenate([[0.0], np.cumsum(durations_s + BETWEEN_S)[:-1]])
-    return log.time + np.repeat(begins_s - log.time[starts], lengths)
-
-
 def position_of(log: FlightLog) -> tuple[np.ndarray, str]:
     """Return positions, (num_rows, 3) m, world, and a remark on their origin, "" where they were measured.
 
@@ -111,8 +88,8 @@ def position_of(log: FlightLog) -> tuple[np.ndarray, str]:
 def states_of(channels: Mapping[str, np.ndarray]) -> np.ndarray:
     """Return channels of a log as states with unit quaternions, (num_rows, 21); NaN where one is absent."""
     states = np.full((len(next(iter(channels.values()))), STATE_SIZE), np.nan)
-    for name in CHANNELS.keys() & channels.keys():
-        states[:, CHANNELS[name]] = channels[name]
+    for name in IN_STATE.keys() & channels.keys():
+        states[:, IN_STATE[name]] = channels[name]
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):  # a model may diverge
         states[:, QUATERNION] /= np.linalg.norm(states[:, QUATERNION], axis=1, keepdims=True)
     return states
@@ -181,7 +158,7 @@ def _shown_of(
     states = np.concatenate([states_of(measured), states_of(after)])
     with np.errstate(over="ignore", invalid="ignore"):
         away_m = np.linalg.norm(states[:, POSITION] - filled.log["p"][rows], axis=1)
-    is_finite = np.all([np.isfinite(states[:, place]).all(axis=1) for place in FLOWN.values()], axis=0)
+    is_finite = np.all([np.isfinite(states[:, IN_STATE[name]]).all(axis=1) for name in FLOWN], axis=0)
     is_near = is_finite & (away_m < AWAY_M)
     is_near[0] = True
     count = len(rows) if is_near.all() else int(np.argmin(is_near))

@@ -197,15 +197,9 @@ def load_start(path: Path) -> Start:
 def _check_meta(start: Start) -> None:
     """Raise CheckpointError for fields that are used before the checkpoint is compared with the run."""
     meta, config = start.checkpoint.meta, start.checkpoint.config
-    number = (int, float, type(None))
-    kinds: dict[str, Any] = {
-        "steps": int,
-        "seed": int,
-        "seconds": number,
-        "success": number,
-        "best_lap_s": number,
-    }
-    kinds |= {"model": dict, "environment": dict}
+    kinds: dict[str, Any] = dict.fromkeys(("steps", "seed"), int)
+    kinds |= dict.fromkeys(("seconds", "success", "best_lap_s"), (int, float, type(None)))
+    kinds |= dict.fromkeys(("model", "environment"), dict)
     invalid = [name for name, kind in kinds.items() if not isinstance(meta.get(name), kind)]
     if not invalid and meta["steps"] not in range(0, config.total_timesteps + 1, config.batch_size):
         invalid = ["steps"]

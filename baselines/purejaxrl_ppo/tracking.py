@@ -79,7 +79,7 @@ class Tracker:
 
     def metrics(self, step: int, values: dict[str, float]) -> None:
         """Record metrics after a number of environment steps; all of a step at once."""
-        self._metrics.append((step, _now_ms(), values))
+        self._metrics.append((step, int(time.time() * 1000), values))
         if time.monotonic() > self._next_s:
             self.flush()
 
@@ -179,7 +179,3 @@ class Tracker:
             path, group = self._files[0]
             self._client.log_artifact(self.run_id, str(path), group)
             del self._files[0]
-
-
-def _now_ms() -> int:
-    return int(time.time() * 1000)

@@ -191,13 +191,6 @@ def parse(words: Sequence[str]) -> tuple[Settings, Resumed | None]:
     return settings, resumed
 
 
-def root_folder(settings: Settings) -> Path:
-    """Return the folder that everything is written to."""
-    if settings.out is not None or settings.resume is None:
-        return settings.out or DEFAULT_OUT
-    return settings.resume if settings.resume.is_dir() else settings.resume.parent
-
-
 def make_tasks(settings: Settings, resumed: Resumed | None, at_once: int) -> list[Task]:
     """Return one task per seed; raises ValueError for other seeds than those of a folder that is resumed."""
     seeds = list(range(settings.seed, settings.seed + settings.num_seeds))
@@ -213,7 +206,7 @@ def make_tasks(settings: Settings, resumed: Resumed | None, at_once: int) -> lis
         starts = list(resumed.starts.values())
         groups = [starts[first : first + at_once] for first in range(0, len(starts), at_once)]
         starts = [start for group in groups for start in at_common_step(group)]
-    out = root_folder(settings)
+    out = settings.out or (DEFAULT_OUT if resumed is None else resumed.folder)
     uri = local_uri(out) if settings.tracking_uri == LOCAL else settings.tracking_uri
     options = Options(
         checkpoint_every=settings.checkpoint_every or None,

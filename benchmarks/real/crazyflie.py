@@ -47,6 +47,7 @@ from flytrack_sysid.prediction_windows import make_windows
 from flytrack_sysid.response import SMALL_STEP, half_responses
 
 VARIABLE, FOLDER = "FLYTRACK_SHARED_DATA", "crazyflie_rate_flights"
+DATA = Path(os.environ.get(VARIABLE, ROOT.parent / "shared" / "data"))
 LINES = ROOT / "benchmarks" / "data" / "real" / "crazyflie.jsonl"
 FITS = LINES.with_name("crazyflie_fits.json")
 PROPOSED = ("command_delay", "second_order_rates", "rate_scale", "motor_imbalance", "linear_drag")
@@ -195,13 +196,12 @@ def fits(folder: Path, structure: Sequence[str], start: dict[str, float]) -> lis
 def main() -> None:
     """Refine and judge for each policy, or fit each policy's flights alone."""
     parser = argparse.ArgumentParser(description=__doc__)
-    default = os.environ.get(VARIABLE, ROOT.parent / "shared" / "data")
-    parser.add_argument("--data", type=Path, default=default, help="default: %(default)s")
+    parser.add_argument("--data", type=Path, default=DATA, help="default: %(default)s")
     parser.add_argument("--policies", default="", help="default: all")
     parser.add_argument("--seconds", type=float, default=SECONDS, help="default: %(default)s")
     parser.add_argument("--fits", action="store_true")
     arguments = parser.parse_args()
-    folder = Path(arguments.data) / FOLDER
+    folder = arguments.data / FOLDER
     LINES.parent.mkdir(parents=True, exist_ok=True)
     with jax.enable_x64(True):
         if arguments.fits:

@@ -55,14 +55,8 @@ def part(record: Record) -> str:
         known = cells[cells > 0.0]
         every.append(known)
         half_s = cells[HORIZONS_S.index(0.5)]
-        rows.append(
-            [
-                name,
-                *(f"{one:.2f}" for one in half_s),
-                f"{known.max():.2f}",
-                f"{np.sum(known > AS_GOOD)} of {len(known)}",
-            ]
-        )
+        worse = f"{np.sum(known > AS_GOOD)} of {len(known)}"
+        rows.append([name, *(f"{one:.2f}" for one in (*half_s, known.max())), worse])
     cells = np.concatenate(every)
     heads = [f"{quantity} after 0.5 s" for quantity in QUANTITIES]
     return "\n\n".join(

@@ -54,26 +54,11 @@ def figures_table(lines: list[Line]) -> str:
     for quantity, horizon, asked in FIGURES:
         cell = _cell(quantity, horizon)
         own = _median(lines, lambda line: ratios(line, "extended"))[cell]
-        boxes = {name: _median(lines, lambda line: ratios(line, name))[cell] for name in BLACK_BOXES}  # noqa: B023
-        best = min(boxes, key=lambda name: boxes[name])
-        others = [f"{boxes[name]:.2f}" for name in BLACK_BOXES]
-        rows.append(
-            [
-                f"{quantity} after {horizon:g} s",
-                f"{own:.2f}",
-                f"<= {asked:.2f}",
-                *others,
-                f"{own / boxes[best]:.2f}",
-            ]
-        )
-    header = [
-        "rms error over the refitted base's, median",
-        "extended",
-        "asked",
-        *BLACK_BOXES,
-        "extended over the best",
-    ]
-    return table(header, rows)
+        boxes = [_median(lines, lambda line: ratios(line, name))[cell] for name in BLACK_BOXES]  # noqa: B023
+        cells = [f"{value:.2f}" for value in (*boxes, own / min(boxes))]
+        rows.append([f"{quantity} after {horizon:g} s", f"{own:.2f}", f"<= {asked:.2f}", *cells])
+    header = ["rms error over the refitted base's, median", "extended", "asked", *BLACK_BOXES]
+    return table([*header, "extended over the best"], rows)
 
 
 def horizons_table(lines: list[Line]) -> str:
@@ -101,17 +86,8 @@ def policies_table(lines: list[Line]) -> str:
         kept = ", ".join(f"`{name}`" for name in line["kept"]) or "none: the refitted base"
         rows.append([line["policy"], kept, *cells, f"{np.nanmax(found):.2f}", worse, f"{line['cpu_s']:.0f}"])
     heads = [f"{quantity} {horizon:g} s" for quantity, horizon, _ in FIGURES]
-    return table(
-        [
-            "left-out policy",
-            "effects that stay",
-            *heads,
-            "largest of all cells",
-            "cells worse, by flight",
-            "CPU s",
-        ],
-        rows,
-    )
+    header = ["left-out policy", "effects that stay", *heads, "largest of all cells"]
+    return table([*header, "cells worse, by flight", "CPU s"], rows)
 
 
 def fits_part() -> str:

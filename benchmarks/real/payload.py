@@ -98,24 +98,11 @@ def part(record: Record) -> str:
         logs = [
             " and ".join(path.rpartition("log")[2] for path in paths) for paths in (pair.known, pair.judged)
         ]
-        rows.append(
-            [
-                name,
-                *logs,
-                f"{ratio:.3f}",
-                f"{pair.true_ratio:.3f}",
-                f"{off:+.1%}",
-                f"{one['force_per_command_ratio']:.3f}",
-                "yes" if "thrust_scale" in names else "no",
-                false,
-            ]
-        )
-    head = [
-        "pair",
-        "model of logs",
-        "diagnosed on",
-        "thrust over mass, found",
-        "by the stated masses",
-        f"off (asked: {WITHIN:.0%})",
-    ]
-    return table([*head, "measured force per command", "`thrust_scale` named", "drag or wind named"], rows)
+        found = [f"{ratio:.3f}", f"{pair.true_ratio:.3f}", f"{off:+.1%}"]
+        is_named = "yes" if "thrust_scale" in names else "no"
+        rows.append([name, *logs, *found, f"{one['force_per_command_ratio']:.3f}", is_named, false])
+    header = (
+        "pair | model of logs | diagnosed on | thrust over mass, found | by the stated masses | "
+        f"off (asked: {WITHIN:.0%}) | measured force per command | `thrust_scale` named | drag or wind named"
+    )
+    return table(header, rows)

@@ -105,13 +105,11 @@ def draw(measured: Record) -> Figure | None:
     keys = list(errors["extended"])
     figure = new_figure(max(WIDTH_IN * len(keys), 2 * WIDTH_IN), HEIGHT_IN)
     for axes, key in zip(figure.subplots(1, len(keys), squeeze=False)[0], keys, strict=True):
+        unit = in_degrees(key, 0.0)[1]
         for name, style in STYLES.items():
             by_horizon = errors.get(name, {}).get(key)
             if by_horizon:
-                values, (_, unit) = (
-                    [in_degrees(key, one)[0] for one in by_horizon.values()],
-                    in_degrees(key, 0.0),
-                )
+                values = [in_degrees(key, one)[0] for one in by_horizon.values()]
                 label = name.replace("_", " ")
                 plain(axes).loglog([*map(float, by_horizon)], values, markersize=3, label=label, **style)
         axes.set_title(f"{key.split('_')[0]} ({unit})", fontsize="small", loc="left")

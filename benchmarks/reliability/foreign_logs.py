@@ -132,15 +132,7 @@ def usd_log(events: dict[str, tuple[dict[str, str], np.ndarray]], version: int =
 
 def usd() -> bytes:
     """Return a small uSD log that ``USD_MAPPING`` fits."""
-    variables = {
-        "roll": "f",
-        "pitch": "f",
-        "yaw": "f",
-        "thrust": "f",
-        "gyro.x": "f",
-        "gyro.y": "f",
-        "gyro.z": "h",
-    }
+    variables = dict.fromkeys(("roll", "pitch", "yaw", "thrust", "gyro.x", "gyro.y"), "f") | {"gyro.z": "h"}
     rows = np.tile((0.0, 0.5, -0.25, 0.1, 0.3, 10.0, -20.0, 30.0), (NUM_ROWS, 1))
     rows[:, 0] = 1.0 + 0.01 * np.arange(NUM_ROWS)
     slow = np.array([[0.9, 3900.0], [1.4, 3800.0]])

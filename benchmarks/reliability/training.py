@@ -16,6 +16,7 @@ import numpy as np
 from tqdm import tqdm
 
 from baselines.purejaxrl_ppo import CheckpointError, load_checkpoint
+from baselines.purejaxrl_ppo.resume import checkpoints_in
 from benchmarks.report import ROOT, table
 
 BATCH, UPDATES, EVERY = 16 * 24, 12_000, 20  # steps of an update; updates; updates between checkpoints
@@ -26,11 +27,6 @@ FLAGS = (
     "--env-id FlyTrackRobust-v0 --num-envs 16 --num-steps 24 --num-minibatches 4 --hidden-sizes 8 --seed 3 "
     f"--evaluate-every 0 --total-timesteps {UPDATES * BATCH} --checkpoint-every {EVERY * BATCH}"
 )
-
-
-def checkpoints_in(folder: Path) -> list[Path]:
-    """Return the checkpoints of a training, complete ones only."""
-    return [path for path in folder.glob("[!.]*") if path.stem == "final" or path.stem.startswith("step_")]
 
 
 def start(folder: Path, out: Path, is_new: bool = True) -> subprocess.Popen[str]:

@@ -24,7 +24,6 @@ DIRECT, LEVEL = ("w", "f", None), ("q", "v", "v_bat")
 SIZES = (3, 3, 1)
 AXES = (slice(0, 3), slice(3, 6), slice(6, 7))  # of each side: rotation, force, battery
 NUM_AXES = sum(SIZES)
-Channels = dict[str, np.ndarray]
 
 
 class Lanes(NamedTuple):
@@ -98,14 +97,6 @@ def _quanta(found: dict[str, np.ndarray]) -> np.ndarray:
     return np.array([np.repeat([smallest(name) for name in names], SIZES) for names in (DIRECT, LEVEL)])
 
 
-def _counting(
-    name: str | None, size: int, allowed: Channels, found: Channels, index: np.ndarray
-) -> np.ndarray:
-    """Return where a channel counts, (rows, lanes, size)."""
-    mask = allowed[name][index] if name is not None and name in found else np.zeros(index.shape, bool)
-    return np.repeat(mask[..., None], size, axis=-1)
-
-
 def make_lanes(log: FlightLog, judged: np.ndarray, tau: np.ndarray, gravity: float) -> Lanes:
     """Return the lanes of a log; only ``judged`` rows of it, (num_rows,) bool, count.
 
@@ -127,21 +118,14 @@ def make_lanes(log: FlightLog, judged: np.ndarray, tau: np.ndarray, gravity: flo
     index = _index(exists[:num_rows], rows_per_second(record))
     is_real = (index >= 0) & (np.arange(len(index)) >= lead_in_of(len(index)))[:, None]
     found = measured_channels(log, record, gravity)
-    counts = np.stack(
-        [
-            np.concatenate(
-                [
-                    _counting(name, size, allowed, found, index)
-                    for name, size in zip(names, SIZES, strict=True)
-                ],
-                axis=-1,
-            )
-            for names in (DIRECT, LEVEL)
-        ],
-        axis=-1,
+    nowhere = np.zeros(len(exists), bool)
+    sides = (
+        np.stack([allowed[name] if name in found else nowhere for name in names], axis=-1)
+        for names in (DIRECT, LEVEL)
     )
+    counts = np.repeat(np.stack([side[index] for side in sides], axis=-1), SIZES, axis=-2)
     counts &= is_real[..., None, None]
-    sensed: Channels = {name: found[name][index] for name in ("w", "f") if name in found}
+    sensed = {name: found[name][index] for name in ("w", "f") if name in found}
     record = Record(*(leaf[index] for leaf in record))
     begins = record.begins | (np.arange(len(index)) == 0)[:, None] | (index < 0)
     certain = np.stack([turns, lifts, np.ones_like(turns)], axis=-1)

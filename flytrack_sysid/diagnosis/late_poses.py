@@ -10,18 +10,12 @@ from flytrack_env.effects import BY_NAME, MocapLatency
 from flytrack_sysid.diagnosis.lanes import Lanes
 from flytrack_sysid.diagnosis.lateness import latency_of
 from flytrack_sysid.diagnosis.motion_choice import STANDARD_ERRORS, Moves
-from flytrack_sysid.diagnosis.problem import REPLAYED, Problem, as_replayed, robust_square
+from flytrack_sysid.diagnosis.problem import Problem, robust_square, vector_of
 from flytrack_sysid.diagnosis.result import Cause, Changed, Diagnosis, Estimated
 from flytrack_sysid.diagnosis.summary import TWO_SIDED_95, verdict_of
-from flytrack_sysid.parameters import to_vector
 
 EFFECT = BY_NAME["mocap_latency"]
 BOUNDS = EFFECT.ranges["latency_s"]
-
-
-def vector_of(model: ModelParameters) -> np.ndarray:
-    """Return a model as a vector of a ``Problem``."""
-    return to_vector(as_replayed(model).with_effects(*(model.effect(one.name) for one in REPLAYED)))
 
 
 def gain_of(problem: Problem, as_logged: Lanes, vector: np.ndarray) -> float:

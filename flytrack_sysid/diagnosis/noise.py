@@ -129,15 +129,8 @@ def step_to(lanes: Lanes) -> np.ndarray:
 def noise_of(log_noise: jax.Array | np.ndarray) -> Noise:
     """Return the noise from its logarithms and a logit, (6, NUM_AXES)."""
     direct, level = jnp.exp(log_noise[0]), jnp.exp(log_noise[1])
-    disturbance = direct * jnp.exp(log_noise[3])
-    return Noise(
-        direct,
-        level,
-        level * jnp.exp(log_noise[2]),
-        disturbance,
-        jnp.exp(log_noise[4]),
-        jax.nn.sigmoid(log_noise[5]),
-    )
+    disturbance, wander = direct * jnp.exp(log_noise[3]), level * jnp.exp(log_noise[2])
+    return Noise(direct, level, wander, disturbance, jnp.exp(log_noise[4]), jax.nn.sigmoid(log_noise[5]))
 
 
 DIFFERENCE = 1e-4  # of logarithms, for slopes

@@ -105,22 +105,16 @@ class Hypothesis(NamedTuple):
         return self.gain - threshold(self.num_parameters)
 
 
-class Blocks(NamedTuple):
-    """The seconds of a log: the first row of each, and the rows at which something may begin or end."""
+def seconds_of(lanes: Lanes) -> tuple[np.ndarray, np.ndarray]:
+    """Return the first row of each second of a log, and the rows at which something may begin or end.
 
-    start: np.ndarray
-    changes: np.ndarray
-
-    @classmethod
-    def of(cls, lanes: Lanes) -> "Blocks":
-        """Return the blocks in the order of ``problem.blocks_of``."""
-        rows = lanes.row[lead_in_of(len(lanes.row)) :]
-        second = len(rows) // LANE_S
-        start = rows[::second].ravel()
-        known = np.sort(start[start >= 0])
-        least = max(LEAST_S, LEAST_SHARE * len(known))
-        changes = known[int(np.ceil(least)) : len(known) - int(np.ceil(least)) + 1]
-        return cls(start, changes)
+    Seconds are in the order of ``problem.blocks_of``.
+    """
+    rows = lanes.row[lead_in_of(len(lanes.row)) :]
+    start = rows[:: len(rows) // LANE_S].ravel()
+    known = np.sort(start[start >= 0])
+    least = int(np.ceil(max(LEAST_S, LEAST_SHARE * len(known))))
+    return start, known[least : len(known) - least + 1]
 
 
 def changes_of(linearization: Linearization, model: FittedModel, lacking: Sequence[str]) -> list[Hypothesis]:
@@ -128,8 +122,8 @@ def changes_of(linearization: Linearization, model: FittedModel, lacking: Sequen
 
     linearization: of the model, along everything. lacking: effects that are not looked for.
     """
-    blocks = Blocks.of(linearization.problem.lanes)
-    if not len(blocks.changes):
+    seconds = seconds_of(linearization.problem.lanes)
+    if not len(seconds[1]):
         return []
     best: dict[str, Hypothesis] = {}
     for candidate in CANDIDATES:
@@ -137,31 +131,31 @@ def changes_of(linearization: Linearization, model: FittedModel, lacking: Sequen
             continue
         if candidate.effect in model.effects and candidate != model.candidate(candidate.effect):
             continue
-        found = _change_of(linearization, model, candidate, blocks)
+        found = _change_of(linearization, model, candidate, seconds)
         if found is not None and found.margin > best.get(candidate.effect, found).margin - 1e-12:
             best[candidate.effect] = found
     return sorted(best.values(), key=lambda one: -one.margin)
 
 
 def _change_of(
-    linearization: Linearization, model: FittedModel, candidate: Candidate, blocks: Blocks
+    linearization: Linearization, model: FittedModel, candidate: Candidate, seconds: tuple[np.ndarray, ...]
 ) -> Hypothesis | None:
-    """Return the likeliest change of an effect; None where nothing depends on it."""
+    """Return the likeliest change of an effect; None where nothing depends on it. seconds: ``seconds_of``."""
     is_named = candidate.effect in model.effects
     columns = [linearization.column(field) for field in candidate.fields]
     own = linearization.acting(columns if is_named else linearization.columns_of(candidate))
     if not own:
         return None
-    given = linearization.columns_at(model.places)
+    given, (start, changes) = linearization.columns_at(model.places), seconds
     score, information = linearization.score_by_block, linearization.by_block
-    after = (blocks.start >= blocks.changes[:, None]).astype(float)
-    ramp = (blocks.start - blocks.start.min()) / max(np.ptp(blocks.start), 1)
+    after = (start >= changes[:, None]).astype(float)
+    ramp = (start - start.min()) / max(np.ptp(start), 1)
     ways = {"start": after, "end": 1.0 - after, "drift": ramp[None]}
     gains = {way: windowed_gains(score, information, given, own, one) for way, one in ways.items()}
     way = max(gains, key=lambda one: gains[one].max())
     place = int(np.argmax(gains[way]))
     inflation = _inflation(score, information, given, own, ways[way][place])
-    row = int(blocks.changes[place]) if way != "drift" else 0
+    row = int(changes[place]) if way != "drift" else 0
     window = {"start": Window(candidate.effect, start=row), "end": Window(candidate.effect, end=row)}.get(way)
     return Hypothesis(candidate, window, float(gains[way][place]) / inflation, len(own))
 

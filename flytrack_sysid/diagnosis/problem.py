@@ -101,15 +101,11 @@ _gains = jax.jit(noises.make_gains)
 
 
 class Window(NamedTuple):
-    """When an effect acts: from a row of the record on, up to another one; else it is as given."""
+    """When an effect acts: in the steps to a row of the record and on, up to another; else it is as given."""
 
     effect: str
     start: int = -1
     end: int = sys.maxsize
-
-    def acts_at(self, row: np.ndarray) -> np.ndarray:
-        """Return whether the effect acts in the step to rows of the record."""
-        return (row >= self.start) & (row < self.end)
 
 
 class Slopes(NamedTuple):
@@ -204,7 +200,8 @@ class Problem:
     def _composed(self, vectors: np.ndarray) -> np.ndarray:
         """Return residuals of models whose effects act within their windows; each row is of a replay."""
         found = self._replayed(vectors)
-        acts = np.stack([one.acts_at(self.lanes.row) for one in self.windows])
+        row = self.lanes.row
+        acts = np.stack([(row >= one.start) & (row < one.end) for one in self.windows])
         for acting in np.unique(acts.reshape(len(acts), -1), axis=1).T:
             if not acting.all():
                 still = [one.effect for one, is_on in zip(self.windows, acting, strict=True) if not is_on]
@@ -268,6 +265,11 @@ def _in_batches(program: Callable[[np.ndarray], jax.Array], values: np.ndarray) 
 def as_replayed(model: ModelParameters) -> ModelParameters:
     """Return a model without the effects on poses."""
     return model._replace(effects=tuple(one for one in model.effects if effect_of(one) in REPLAYED))
+
+
+def vector_of(model: ModelParameters) -> np.ndarray:
+    """Return a model as a vector of a ``Problem``."""
+    return to_vector(as_replayed(model).with_effects(*(model.effect(one.name) for one in REPLAYED)))
 
 
 def _longest(names: Sequence[str], lanes: Lanes) -> np.ndarray:

@@ -376,13 +376,8 @@ def text_of(diagnosis: Diagnosis) -> str:
         lines.append(f"time from a stick to half of the response: {times}")
     if diagnosis.unexplained.flagged:
         lines.append(f"unexplained, depends on: {', '.join(diagnosis.unexplained.depends_on)}")
-    return "\n".join(
-        [*lines, *_limits_text(diagnosis), *diagnosis.warnings, *filter(None, [_closing(diagnosis)])]
-    )
-
-
-def _closing(diagnosis: Diagnosis) -> str:
-    return _gain(diagnosis) if diagnosis.causes else ""
+    closing = _gain(diagnosis) if diagnosis.causes else ""
+    return "\n".join([*lines, *_limits_text(diagnosis), *diagnosis.warnings, *filter(None, [closing])])
 
 
 def _limits_text(diagnosis: Diagnosis) -> list[str]:

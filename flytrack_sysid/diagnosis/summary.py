@@ -359,19 +359,14 @@ def _is_beyond(refined: Refined, vector: np.ndarray, field: str) -> str:
     return f"{field.split('.')[-1]} at {'most' if is_low else 'least'} {size}"
 
 
-def _fields_of(cause: Cause) -> list[str]:
-    """Return the names of a cause's parameters in the vector."""
-    prefix = f"{cause.effect}." if cause.effect in BY_NAME else ""
-    return [prefix + name for name in cause.parameters]
-
-
 def with_refined_values(causes: Sequence[Cause], refined: Refined, vector: np.ndarray) -> tuple[Cause, ...]:
     """Return causes with the values and intervals of a refinement, and which of them are at a bound."""
     problem, fit = refined.problem, refined.fit
     half = {} if fit is None else dict(zip(fit.places, fit.half_widths, strict=True))
     result = []
     for cause in causes:
-        fields = [one for one in _fields_of(cause) if one in problem.names]
+        prefix = f"{cause.effect}." if cause.effect in BY_NAME else ""
+        fields = [prefix + name for name in cause.parameters if prefix + name in problem.names]
         values = dict(cause.parameters)
         for field in fields:
             place = problem.names.index(field)

@@ -25,10 +25,10 @@ from flytrack_env.dynamics import ModelParameters, lag
 from flytrack_env.state import Action
 from flytrack_sysid.diagnosis.lanes import AXES, Lanes, lead_in_of, make_lanes
 from flytrack_sysid.diagnosis.lateness import latency_of, read_poses
-from flytrack_sysid.diagnosis.problem import REPLAYED, Problem, as_replayed
+from flytrack_sysid.diagnosis.problem import Problem, vector_of
 from flytrack_sysid.diagnosis.result import CHANNELS
 from flytrack_sysid.log import FlightLog
-from flytrack_sysid.parameters import STICKS, to_vector
+from flytrack_sysid.parameters import STICKS
 from flytrack_sysid.record import Record
 
 UNITS = {"rates": "rad/s", "attitude": "rad/s", "force": "m/s²", "velocity": "m/s²", "battery": "V"}
@@ -242,8 +242,7 @@ def traces(log: FlightLog, models: Mapping[str, ModelParameters], like: str) -> 
         left = []
         for model in models.values():
             problem = Problem.of(by_lateness[latency_of(model)], base)
-            every = as_replayed(model).with_effects(*(model.effect(one.name) for one in REPLAYED))
-            left.append(problem.residuals(to_vector(every)[None])[0])
+            left.append(problem.residuals(vector_of(model)[None])[0])
         lanes = by_lateness[latency_of(base)]
         lagged = _lagged(lanes.record, np.asarray(base.tau, float))
         applied = np.stack([np.asarray(stick) for stick in lagged], axis=-1)

@@ -410,9 +410,7 @@ def waves_of(problem: Problem, model: FittedModel, lines: Sequence[Line]) -> dic
     result = {}
     for line in lines:
         phase = 2.0 * np.pi * line.frequency_hz * flight.time_s
-        both = np.stack([np.sin(phase), np.cos(phase)])
-        product = both[:, None, ..., None] * body[None]
-        result[line.side] = product.reshape(-1, *product.shape[2:])
+        result[line.side] = _along(np.stack([np.sin(phase), np.cos(phase)]), body)
     return result
 
 

@@ -34,15 +34,7 @@ RATE_PARAMETERS = (
 VTOL, HEXACOPTER, OCTOCOPTER = "a VTOL", "a hexacopter", "an octocopter"
 AIRFRAMES = {1: "a plane", 4: "a helicopter", 13: HEXACOPTER, 14: OCTOCOPTER, 15: "a tricopter"}
 AIRFRAMES |= dict.fromkeys(range(19, 26), VTOL)
-FRAMES = {
-    6: HEXACOPTER,
-    7: HEXACOPTER,
-    8: OCTOCOPTER,
-    9: OCTOCOPTER,
-    11: HEXACOPTER,
-    12: OCTOCOPTER,
-    13: VTOL,
-}
+FRAMES = {**dict.fromkeys((6, 7, 11), HEXACOPTER), **dict.fromkeys((8, 9, 12), OCTOCOPTER), 13: VTOL}
 
 Source = tuple[str, tuple[str, ...]]  # a topic and its fields, in the order of the channel's columns
 
