@@ -10,15 +10,9 @@ import pytest
 from benchmarks.reliability import foreign_logs
 from benchmarks.reliability.files import KINDS, soak_kind
 from flytrack_sysid import LogError, csv_file, import_log
+from tests.support.traps import Trap
 
 SLOW = ("imported CSV, gzip", "black box")  # seconds for the crafted files
-
-
-class Trap:
-    """What an unpickler would run."""
-
-    def __reduce__(self) -> tuple:
-        return (pytest.fail, ("the pickle was read",))
 
 
 @pytest.mark.parametrize("kind", KINDS)

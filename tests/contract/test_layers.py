@@ -156,6 +156,16 @@ def test_no_modules_import_each_other_in_a_circle() -> None:
     assert not circle, " -> ".join(circle)
 
 
+def test_the_black_boxs_plant_is_reached_only_through_its_artifact() -> None:
+    for name in (*REPOSITORY, "docs", "noxfile"):
+        for path in files_of(name):
+            packages = {imported.split(".")[0] for imported, _ in imports_of(path)}
+            if name == "blackbox":
+                assert not any(package.startswith("flytrack") for package in packages), path
+            else:
+                assert "blackbox" not in packages, path
+
+
 def test_this_test_sees_imports() -> None:
     seen = {name for path in MODULES for name, _ in imports_of(path)}
     assert "flytrack_env.dynamics.ModelParameters" in seen and "gymnax" in seen

@@ -307,21 +307,6 @@ def test_scale_then_bias_of_each_sensor() -> None:
     assert_reads(flight.gyro, flight.rates * [0.95, 1.02, 1.1] + [0.05, -0.04, 0.03])
 
 
-def test_an_accelerometer_on_an_arm_feels_the_spin() -> None:
-    """At a constant yaw rate w, on an arm r along x: the centripetal r w^2, inwards."""
-    yaw_rate = np.deg2rad(120.0)
-    spin = (0.0, 0.0, 1.0, -1.0)  # idle, so that the motors' imbalance does nothing
-    spinning = {
-        "commands": np.tile(spin, (5, 1)),
-        "drone": drone_with(applied=spin, rates_b=(0.0, 0.0, yaw_rate)),
-    }
-    for arm, felt in ((0.1, -0.1 * yaw_rate**2), (-0.05, 0.05 * yaw_rate**2)):
-        flight = Readings(ImuOffset(arm), **spinning)
-        assert_reads(flight.accelerometer - flight.force, np.tile([felt, 0.0, 0.0], (5, 1)))
-    along = Readings(ImuOffset(0.0, 0.0, 0.1), **spinning)  # on the axis of rotation: nothing
-    assert_reads(along.accelerometer, along.force)
-
-
 def test_an_arm_in_any_direction_follows_the_rigid_body() -> None:
     arm = np.array([0.05, -0.08, 0.03])
     flight = Readings(ImuOffset(*arm))
@@ -389,7 +374,6 @@ def shown_and_true(env: Any, params: Any, seed: int = 0) -> tuple[np.ndarray, np
     [
         ((GyroBias(0.1, -0.2, 0.3), AccelerometerBias(1.0)), None, 0, (0.1, -0.2, 0.3)),
         ((ImuLatency(DT),), None, 1, (0.0, 0.0, 0.0)),
-        ((AccelerometerBias(1.0), ImuOffset(0.1)), None, 0, (0.0, 0.0, 0.0)),
         ((GyroBias(0.5),), WithoutGyro(), 0, (0.0, 0.0, 0.0)),
     ],
 )

@@ -12,6 +12,7 @@ import pytest
 
 from flytrack_sysid.log import REQUIRED, LogError
 from flytrack_sysid.log_file import load_log
+from tests.support.traps import Trap
 from tests.support.written_logs import NUM_ROWS, SUFFIXES, columns_of, make_log, write
 
 
@@ -81,13 +82,6 @@ def test_full_stick_within_rounding_is_fine(values, tmp_path):
     columns["u_roll"] = values
     write(tmp_path / "flight.npz", columns)
     np.testing.assert_array_equal(load_log(tmp_path / "flight.npz")["u"][:, 0], values)
-
-
-class Trap:
-    """What an unpickler would run."""
-
-    def __reduce__(self) -> tuple:
-        return (pytest.fail, ("the pickle was read",))
 
 
 BAD_ARRAYS = {

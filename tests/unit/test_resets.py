@@ -45,14 +45,6 @@ def on_course(sample: Sample) -> tuple[np.ndarray, np.ndarray]:
     return sample(course_fraction=1.0)
 
 
-def body_axes(x: np.ndarray) -> np.ndarray:
-    """Return the body's x and z axes, (2, N, 3)."""
-    w, a, b, c = x[:, 9:13].T
-    ahead = np.stack([1 - 2 * (b * b + c * c), 2 * (a * b + w * c), 2 * (a * c - w * b)], -1)
-    up = np.stack([2 * (a * c + w * b), 2 * (b * c - w * a), 1 - 2 * (a * a + b * b)], -1)
-    return np.stack([ahead, up])
-
-
 def assert_uniform(values: np.ndarray, low: float, high: float) -> None:
     """Check a uniform distribution by Kolmogorov and Smirnov's test."""
     assert low - 1e-5 <= values.min() and values.max() <= high + 1e-5
@@ -121,7 +113,7 @@ def test_course_starts_have_the_stated_tilt_towards_any_side(
     on_course: tuple[np.ndarray, np.ndarray],
 ) -> None:
     x, _ = on_course
-    _, up = body_axes(x)
+    up = Rotation.from_quat(x[:, 9:13], scalar_first=True).apply([0.0, 0.0, 1.0])
     tilt_deg = np.degrees(np.arccos(np.clip(up[:, 2], -1.0, 1.0)))
     assert_uniform(tilt_deg, 0.0, ResetParams().course_tilt_deg)
     assert_uniform(np.arctan2(up[:, 1], up[:, 0]), -np.pi, np.pi)
@@ -131,7 +123,8 @@ def test_course_starts_have_the_stated_tilt_towards_any_side(
 def test_course_starts_face_along_the_curve(sample: Sample) -> None:
     # The velocity is along the curve up to its sideways part, a share of the speed.
     x, _ = sample(course_fraction=1.0, course_tilt_deg=0.0)
-    ahead, up = body_axes(x)
+    turned = Rotation.from_quat(x[:, 9:13], scalar_first=True)
+    ahead, up = turned.apply([1.0, 0.0, 0.0]), turned.apply([0.0, 0.0, 1.0])
     np.testing.assert_allclose(up[:, 2], 1.0, atol=1e-5)
     moving = np.linalg.norm(x[:, 3:5], axis=1) > 0.1
     cross = ahead[:, 1] * x[:, 3] - ahead[:, 0] * x[:, 4]
