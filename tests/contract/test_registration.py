@@ -22,6 +22,7 @@ from flytrack_env.registration import ENVIRONMENTS, make, register_all
 from flytrack_env.state import Action
 from flytrack_env.wrappers import DomainRandomization, RandomizationParams, layers_of
 from tests.support.coasting import Coasting, drone_at
+from tests.support.slow import slow_but
 from tests.support.trees import assert_close
 
 OVER_IDS = pytest.mark.parametrize("env_id", ENVIRONMENTS)
@@ -77,9 +78,7 @@ def digest(env_id: str) -> str:
     return hashlib.sha256(b"".join(rows)).hexdigest()
 
 
-@pytest.mark.parametrize(
-    "env_id", [pytest.param(each, marks=() if each == FAST else pytest.mark.slow) for each in ENVIRONMENTS]
-)
+@pytest.mark.parametrize("env_id", slow_but([FAST], ENVIRONMENTS))
 def test_identical_seeds_fly_identically_in_another_process(env_id: str) -> None:
     code = f"from tests.contract.test_registration import digest; print(digest({env_id!r}))"
     here = digest(env_id)

@@ -24,6 +24,7 @@ from flytrack_sysid.diagnosis import Diagnosis, DiagnosisError, diagnose, write_
 from flytrack_sysid.log import FlightLog
 from flytrack_sysid.split import blocks_of, held_out_rows
 from tests.support.diagnosis_cases import CASES, HELD_OUT_EVERY, SEED, Case, rng_of
+from tests.support.slow import slow_but
 
 SHORT_S, BLOCK_S = 20.0, 5.0  # every other block is held out: both parts share one compiled program
 LATE_S, SPIKES = 0.0164, 12
@@ -87,6 +88,7 @@ def check_content(one: Found) -> None:
     assert len(one["data"]["sha256"]) == 64
 
 
+@pytest.mark.slow  # of the one with drag, the fast test sees that nothing else is named
 def test_a_clean_plant_is_consistent_with_its_model(short) -> None:
     found, _ = short("clean")
     assert found.causes == () and found.verdict == "consistent" and found.warnings == ()
@@ -128,9 +130,7 @@ def test_what_no_list_has_is_flagged_and_not_named(short) -> None:
     assert "heading" in found.unexplained.depends_on
 
 
-@pytest.mark.parametrize(
-    "name", ["clean", "drag", *(pytest.param(name, marks=pytest.mark.slow) for name in ("outside", "late"))]
-)
+@pytest.mark.parametrize("name", slow_but(["drag"], ["clean", "drag", "outside", "late"]))
 def test_a_diagnosis_has_its_content(name, short) -> None:
     found, log = short(name)
     content = json.loads(json.dumps(found.as_json(), allow_nan=False))

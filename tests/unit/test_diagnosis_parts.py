@@ -166,6 +166,7 @@ def test_lanes_agree_with_one_long_replay(flown, lanes):
         assert counts[LEAD_IN_S * RATE].any() and np.abs(error[counts]).max() < 1e-3
 
 
+@pytest.mark.slow
 def test_the_simulator_leaves_nothing_of_its_own_log():
     log = collect(Simulator(), 1.0, 5)
     log = log.select(log.segment % 3 != 2)

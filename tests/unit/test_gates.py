@@ -56,7 +56,7 @@ def names(crossing: Crossing) -> list[str]:
     return [EVENTS[int(np.argmax([*column, True]))] for column in flags.T]
 
 
-@pytest.mark.parametrize("num_gates", range(2, 12))
+@pytest.mark.parametrize("num_gates", [2, 3, 8, 11])
 def test_gate_lookup_equals_the_table(num_gates: int) -> None:
     rng = np.random.default_rng(num_gates)
     gates = [

@@ -127,6 +127,7 @@ def test_what_is_promised_is_what_collecting_brings(hover, told):
     assert promised["thrust_steps"] > 10.0 * promised["speeds"] > 100.0 * promised["low_passes"]
 
 
+@pytest.mark.slow
 def test_sensors_that_the_log_lacks_tell_nothing_ahead_either(hover):
     blind = logged(hover.log.without("v_bat"))
     question = Question(blind.linearization, blind.model, "voltage_sag")
