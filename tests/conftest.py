@@ -43,12 +43,6 @@ def params(env: FlyTrack) -> EnvParams:
     return env.default_params
 
 
-@pytest.fixture(scope="session")
-def reset_many(env: FlyTrack) -> Callable[..., Any]:
-    """``env.reset`` for a batch of keys, compiled once per batch size."""
-    return jax.jit(jax.vmap(env.reset, in_axes=(0, None)))
-
-
 @pytest.fixture(scope="module")
 def trainer() -> Any:
     """The small trainer of the baseline's tests, compiled once for a process."""

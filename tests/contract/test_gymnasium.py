@@ -304,8 +304,6 @@ def test_arguments_reach_the_environment(params: EnvParams) -> None:
         env = gymnasium.make(BASE, **arguments)
         env.reset(options=beside)
         assert env.step(np.zeros(4))[2] is is_end
-    with pytest.raises(ValueError, match="missed_gate"):
-        gymnasium.make(BASE, missed_gate="sometimes")
     with pytest.raises(TypeError, match="params: found dict, expected EnvParams"):
         gymnasium.make(BASE, params={})
     with pytest.raises(ValueError, match="drone_radius"):

@@ -61,8 +61,6 @@ def test_every_id_takes_a_plant_with_its_parameters_baked_in(env_id: str) -> Non
 
 def test_overrides_reach_the_environment_and_unknown_ids_are_refused() -> None:
     assert gymnax.make("FlyTrack-v0", missed_gate="fly_on")[0].missed_gate == "fly_on"
-    with pytest.raises(ValueError, match="missed_gate"):
-        gymnax.make("FlyTrack-v0", missed_gate="sometimes")
     with pytest.raises(ValueError, match=r"env_id: found 'FlyTrack-v9', expected one of .*FlyTrack-v0"):
         make("FlyTrack-v9")
 

@@ -156,11 +156,9 @@ def test_a_wrong_sign_is_named(noisy):
         fit(scaled(noisy, "w", (-1, 1, 1)))
 
 
-def test_implausible_log_and_split_that_leaves_nothing_are_refused(noisy):
+def test_an_implausible_log_is_refused(noisy):
     with pytest.raises(LogError, match="deg/s"):
         fit(scaled(noisy, "w", (180 / np.pi,) * 3))
-    with pytest.raises(ValueError, match="every: found 1"):
-        fit(noisy, every=1)
 
 
 def test_result_as_text_and_json(fitted):

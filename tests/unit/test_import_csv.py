@@ -116,7 +116,6 @@ def test_rows_are_chosen_and_files_become_segments(folder, tmp_path):
         ('unit = "cm"', 'unit = "ft"', r"map\.toml: position\.unit: found 'ft', expected one of m, cm, mm"),
         ('column = "ms"', 'column = "us"', r"flight\.csv: column us: found 0 times.*map\.toml: time"),
         ('"ax", "ay", "az"', '"ax", "ay"', r"specific_force\.columns: .*expected 3 different names"),
-        ("[time]", "[times]", r"map\.toml: times: unknown; expected one of time, command"),
         ("[battery]", "[batery]", r"map\.toml: batery: unknown; expected one of time, command"),
         ("low = [1000", "low = [1600", r"csv: row \d+ \(line \d+\), column ail: found 1\d+.*, expected 1600"),
         ("mass_kg = 0.5", "mass_kg = -1", r"craft\.mass_kg: found -1, expected a number above 0"),

@@ -1,7 +1,6 @@
 """Where episodes start: facts about the distribution, and the randomness behind it."""
 
 from collections.abc import Callable
-from typing import Any
 
 import jax
 import numpy as np
@@ -11,7 +10,7 @@ from scipy.interpolate import CubicHermiteSpline
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
-from flytrack_env.env import EnvParams
+from flytrack_env.env import EnvParams, FlyTrack
 from flytrack_env.resets import LAST_SEGMENT_FRACTION, SIDEWAYS_FRACTION, ResetParams
 from flytrack_env.state import pack
 from flytrack_env.tracks import Track, load_track
@@ -21,8 +20,10 @@ Sample = Callable[..., tuple[np.ndarray, np.ndarray]]
 
 
 @pytest.fixture(scope="module")
-def sample(params: EnvParams, reset_many: Any) -> Sample:
+def sample(env: FlyTrack, params: EnvParams) -> Sample:
     """A function from fields of ``ResetParams`` to states (N, 21) and gate indices (N,)."""
+
+    reset_many = jax.jit(jax.vmap(env.reset, in_axes=(0, None)))
 
     def draw(**fields: float) -> tuple[np.ndarray, np.ndarray]:
         keys = jax.random.split(jax.random.key(0), NUM_STARTS)
