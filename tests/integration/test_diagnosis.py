@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from benchmarks.diagnosis import Trial, model_of, plant
-from benchmarks.hidden import Truth, draw_base, draw_outside, fly, measure
+from benchmarks.hidden import draw_base, draw_outside, fly, measure
 from flytrack_env import load_model
 from flytrack_env.dynamics import nominal_parameters
 from flytrack_env.effects import BY_NAME, LinearDrag
@@ -35,14 +35,6 @@ WIDENED = 1.5  # of 95 % intervals: a correct one misses such a wide one 3 times
 Found = Mapping[str, Any]
 
 
-def short_flight(truth: Truth, rng: np.random.Generator, spikes: int = 0) -> tuple[Diagnosis, FlightLog]:
-    """Return the diagnosis of a short flight of a plant, and its log; spikes: outliers of its velocity."""
-    log = measure(fly(truth, "scripted", SHORT_S, rng), "sensors", rng)
-    log["v"][rng.choice(len(log), spikes, replace=False)] += rng.normal(0.0, 2.0, (spikes, 3))
-    held_out = np.floor(log.time / BLOCK_S).astype(int) % 2 == 1
-    return diagnose(log, model_of(truth), held_out), log
-
-
 @pytest.fixture(scope="session")
 def short() -> Callable[[str], tuple[Diagnosis, FlightLog]]:
     """Diagnoses of plants in fine steps: clean, drag, a force that no list has, late poses and outliers."""
@@ -57,8 +49,12 @@ def short() -> Callable[[str], tuple[Diagnosis, FlightLog]]:
 
     @cache
     def diagnosis_of(name: str) -> tuple[Diagnosis, FlightLog]:
-        rng = np.random.default_rng([3, list(plants).index(name)])
-        return short_flight(plants[name], rng, SPIKES * (name == "late"))
+        rng, truth = np.random.default_rng([3, list(plants).index(name)]), plants[name]
+        log = measure(fly(truth, "scripted", SHORT_S, rng), "sensors", rng)
+        spikes = SPIKES * (name == "late")
+        log["v"][rng.choice(len(log), spikes, replace=False)] += rng.normal(0.0, 2.0, (spikes, 3))
+        held_out = np.floor(log.time / BLOCK_S).astype(int) % 2 == 1
+        return diagnose(log, model_of(truth), held_out), log
 
     return diagnosis_of
 

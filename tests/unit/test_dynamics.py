@@ -155,12 +155,6 @@ def test_battery_loses_one_volt_per_minute(is_double: bool, tolerance: float) ->
     assert float(x[-1, 20]) == pytest.approx(23.0, abs=tolerance)
 
 
-def numeric_jacobian(function: Any, vector: np.ndarray, width: float = 1e-6) -> np.ndarray:
-    """Return the central-difference Jacobian (M, N) of a function of a vector (N,)."""
-    shifts = width * np.eye(vector.size)
-    return np.stack([(function(vector + s) - function(vector - s)) / (2 * width) for s in shifts], -1)
-
-
 @pytest.mark.parametrize("differentiate", [jax.jacfwd, jax.jacrev])
 def test_gradients_equal_finite_differences(differentiate: Any) -> None:
     with jax.enable_x64(True):
@@ -174,7 +168,8 @@ def test_gradients_equal_finite_differences(differentiate: Any) -> None:
         jacobian = jax.jit(differentiate(packed))
         for x, u in zip(*random_cases(3, seed=5), strict=True):
             vector = np.concatenate([x, u, [0.02], flat])
-            numeric = numeric_jacobian(packed, vector)
+            shifts = 1e-6 * np.eye(vector.size)
+            numeric = np.stack([(packed(vector + s) - packed(vector - s)) / 2e-6 for s in shifts], -1)
             np.testing.assert_allclose(jacobian(vector), numeric, rtol=1e-5, atol=1e-5)
     # Everything matters: no column but those of the old acceleration and rates is zero.
     unused = {*range(6, 9), *range(13, 16)}
