@@ -71,3 +71,11 @@ def fly_black_box(black_box: BlackBox) -> Callable[..., np.ndarray]:
     """One step of the shipped plant, compiled once for the module."""
     step = jax.jit(black_box.step_vector)
     return lambda x, u: np.asarray(step(x, u))
+
+
+@pytest.fixture(scope="session")
+def truth() -> Any:
+    """A made-up flight of 20 s at 100 Hz, all clocks the same."""
+    from tests.support.made_flight import TIME_S, flight
+
+    return flight(TIME_S)

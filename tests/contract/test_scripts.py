@@ -2,7 +2,6 @@
 
 import io
 import json
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,11 +16,11 @@ from flytrack_sysid.diagnosis.lanes import LANE_S
 from flytrack_sysid.excitation import DT_S, FLIGHT_STEPS, HEIGHTS
 from flytrack_sysid.manoeuvres import FLIGHTS_PER_MANOEUVRE, MANOEUVRES, flights_of, hover_action
 from flytrack_sysid.script_file import Script, ScriptError, check_script, load_script, save_script, script_of
+from tests.support.black_boxes import SHIPPED
 from tests.support.handout_plant import HandoutPlant
 from tests.support.traps import Trap
 
 HOVER = hover_action(HandoutPlant().model())
-SHIPPED = Path(__file__).parents[2] / "blackbox" / "acro_step.bin"
 
 
 def made(*names: str) -> Script:

@@ -6,7 +6,6 @@ import socket
 import subprocess
 import sys
 import time
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -20,9 +19,9 @@ from baselines.purejaxrl_ppo.collectives import AXIS, Collectives
 from baselines.purejaxrl_ppo.distributed import check_divides
 from baselines.purejaxrl_ppo.ppo import Batch, make_network_for, ppo_loss
 from baselines.purejaxrl_ppo.resume import checkpoints_in, newest_intact
+from tests.support.pages import ROOT
 from tests.support.ppo_runs import BATCH, CONFIG
 
-ROOT = Path(__file__).parents[2]
 SIZE = 29  # of an observation
 TRAIN = "-m baselines.purejaxrl_ppo.train_ppo"
 SMALL = "--num-envs 16 --num-steps 24 --num-minibatches 4 --hidden-sizes 8 --evaluate-every 0 --no-tracking"

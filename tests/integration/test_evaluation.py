@@ -29,11 +29,11 @@ from flytrack_env.rollout import load_rollout
 from flytrack_env.state import BATTERY, POSITION, VELOCITY
 from flytrack_env.tracks import random_track
 from tests.support.evaluated import FAILS_BELOW_V, Rails, run, write_checkpoint
+from tests.support.pages import ROOT
 from tests.support.recordings import Recording
 from tests.support.slow import slow_but
 from tests.support.trees import assert_close
 
-ROOT = Path(__file__).parents[2]
 NUM_LAPS, NUM_STEPS, NUM_FLIGHTS = 3, 1400, 10
 TOLERANCE_S = 2e-3
 

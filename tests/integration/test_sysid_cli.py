@@ -14,8 +14,8 @@ from flytrack_env.dynamics import nominal_parameters
 from flytrack_sysid import collect, load_log, save_log
 from flytrack_sysid.cli import load_plant, main
 from flytrack_sysid.log import FlightLog
+from tests.support.black_boxes import SHIPPED
 
-SHIPPED = Path(__file__).parents[2] / "blackbox" / "acro_step.bin"
 TAUS = (0.02, 0.05, 0.07, 0.03)
 OTHER = PlantParameters(
     mass=1.0,

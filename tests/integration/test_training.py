@@ -17,10 +17,10 @@ from baselines.purejaxrl_ppo import CheckpointError, load_checkpoint, monitor
 from baselines.purejaxrl_ppo.checkpoint import save_checkpoint
 from baselines.purejaxrl_ppo.resume import at_common_step, newest_intact, warn_of_other_machine
 from baselines.purejaxrl_ppo.run import DivergedError, Options, Run
+from tests.support.pages import ROOT
 from tests.support.ppo_runs import BATCH, EVERY_OTHER_UPDATE, SEED, assert_same_end
 from tests.support.slow import slow_but
 
-ROOT = Path(__file__).parents[2]
 SEEDS = (SEED, SEED + 1, SEED + 2)
 EVALUATED = EVERY_OTHER_UPDATE._replace(evaluate_every=2 * BATCH, evaluation_episodes=2)
 

@@ -22,12 +22,6 @@ HEADER += ["ail", "ele", "rud", "thr", "mv"]
 MAPPING = read_mapping("every_unit")
 
 
-@pytest.fixture(scope="module")
-def truth() -> FlightLog:
-    """A flight of 20 s at 100 Hz, all clocks the same."""
-    return flight(TIME_S)
-
-
 def write_csv(path: Path, log: FlightLog) -> Path:
     """Write a log as others would: NED, FRD, degrees, g, cm, ms, PWM, quaternions x, y, z, w."""
     ned = Rotation.from_quat(log["q"], scalar_first=True).as_quat(scalar_first=True) * [1.0, 1.0, -1.0, -1.0]
