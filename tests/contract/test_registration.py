@@ -26,8 +26,6 @@ from tests.support.slow import slow_but
 from tests.support.trees import assert_close
 
 OVER_IDS = pytest.mark.parametrize("env_id", ENVIRONMENTS)
-# The plain one runs every time: wrappers have fast tests of their own, and each id takes seconds to compile.
-FAST = "FlyTrack-v0"
 
 
 @OVER_IDS
@@ -76,7 +74,8 @@ def digest(env_id: str) -> str:
     return hashlib.sha256(b"".join(rows)).hexdigest()
 
 
-@pytest.mark.parametrize("env_id", slow_but([FAST], ENVIRONMENTS))
+# The plain one runs every time: wrappers have fast tests of their own, and each id takes seconds to compile.
+@pytest.mark.parametrize("env_id", slow_but(["FlyTrack-v0"], ENVIRONMENTS))
 def test_identical_seeds_fly_identically_in_another_process(env_id: str) -> None:
     code = f"from tests.contract.test_registration import digest; print(digest({env_id!r}))"
     here = digest(env_id)
