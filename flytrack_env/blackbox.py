@@ -50,7 +50,6 @@ from flytrack_env.state import (
 )
 
 DT = 0.01  # s, baked into every artifact
-REDUCED_STATE_SIZE = 18
 MAX_FILE_BYTES = 64 * 2**20
 MAX_RATE_DEG_S = (618.0, 618.0, 120.0)
 SHIPPED_SHA256 = "c05e6c001da095b5b0434f7bbc4df90e7d01e548f56eb8e03a615383e383aedd"  # blackbox/acro_step.bin

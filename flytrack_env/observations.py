@@ -9,7 +9,6 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from flytrack_env.fusion import compute_once
 from flytrack_env.quaternion import Scalar
@@ -45,7 +44,6 @@ OBSERVATION = (
     Entry("next_direction", "next gate's direction of flight", 3, "gate", "1", 1.0, 1.0),
 )
 OBSERVATION_SIZE = sum(entry.size for entry in OBSERVATION)
-OBSERVATION_LIMIT = np.concatenate([np.full(entry.size, entry.limit, np.float32) for entry in OBSERVATION])
 
 
 def observe_race(drone: Drone, gate: GateFrame, next_gate: GateFrame) -> list[jax.Array]:

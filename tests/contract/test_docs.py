@@ -13,6 +13,7 @@ from docs.track_pages import gate_rows, track_page
 from flytrack_env.effects import EFFECTS
 from flytrack_env.tracks import DEMANDS, Limits, available_tracks, build_course, load_track, way_length
 from tests.support.pages import BLOCK, DOCS, ROOT, examples, run_examples
+from tests.support.slow import slow_but
 
 PACKAGES = ("flytrack_env", "flytrack_sysid", "flytrack_loop", "baselines")
 REFERENCE = {
@@ -24,11 +25,6 @@ PAGES = [ROOT / "README.md", *sorted(DOCS.rglob("*.md"))]
 FAST = "environment.md"  # one page's examples run in the fast tests
 RUN = ("wrappers.md", "effects.md", "gymnasium.md", "pictures.md", "identification.md", "real_logs.md")
 RUN = (FAST, *RUN, "diagnosis.md", "quick_start.md", "faq.md")
-
-
-def slow_but(first: str, names: tuple[str, ...]) -> list:
-    """Return parameters of a test of which only the first is fast."""
-    return [pytest.param(name, marks=[] if name == first else pytest.mark.slow) for name in names]
 
 
 def test_every_public_package_is_in_the_reference() -> None:
@@ -49,12 +45,12 @@ def test_what_a_page_imports_is_public(path: Path) -> None:
                 assert hasattr(module, alias.name), f"{node.module} has no {alias.name}"
 
 
-@pytest.mark.parametrize("page", slow_but(FAST, RUN))
+@pytest.mark.parametrize("page", slow_but([FAST], RUN))
 def test_examples_run(page: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     run_examples((DOCS / page).read_text(encoding="utf-8"), tmp_path, monkeypatch)
 
 
-@pytest.mark.parametrize("name", slow_but("linear_drag", tuple(effect.name for effect in EFFECTS)))
+@pytest.mark.parametrize("name", slow_but(["linear_drag"], [effect.name for effect in EFFECTS]))
 def test_page_of_an_effect_has_its_parameters_and_python_that_runs(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

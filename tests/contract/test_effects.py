@@ -46,15 +46,19 @@ def inside_ranges(effect: Effect, fraction: float) -> Any:
     return effect.parameters(*values)
 
 
-@OVER_EFFECTS
-def test_neutral_equals_absent_bit_for_bit(effect: Effect) -> None:
-    with_neutral = NOMINAL.with_effects(effect.parameters())
+@pytest.mark.parametrize(
+    "effects",
+    [
+        pytest.param(EFFECTS, id="all"),
+        *(pytest.param((effect,), id=effect.name, marks=pytest.mark.slow) for effect in EFFECTS),
+    ],
+)
+def test_neutral_equals_absent_bit_for_bit(effects: tuple[Effect, ...]) -> None:
+    with_neutral = NOMINAL.with_effects(*(effect.parameters() for effect in effects))
     assert jax.tree.structure(with_neutral) != jax.tree.structure(NOMINAL)
     for seed in range(2):
         drone, commands = random_drone(seed), random_commands(seed, NUM_STEPS)
-        absent = fly(drone, commands, NOMINAL)
-        np.testing.assert_array_equal(fly(drone, commands, with_neutral), absent)
-        np.testing.assert_array_equal(fly(drone, commands, ALL_NEUTRAL), absent)
+        np.testing.assert_array_equal(fly(drone, commands, with_neutral), fly(drone, commands, NOMINAL))
 
 
 @OVER_EFFECTS
@@ -101,24 +105,14 @@ CHANGES |= {"gyro": GYRO, "accelerometer": ACCELEROMETER, "pose": POSE}
 
 @OVER_EFFECTS
 def test_changes_what_its_stages_may_and_nothing_else(effect: Effect) -> None:
-    drone, falling = (
-        random_drone(0)._replace(applied=Action(0.3, -0.2, 0.1, 0.5)),
-        held(roll=0.9, pitch=-0.8, yaw=0.7, thrust=-0.5),
-    )
+    drone = random_drone(0)._replace(applied=Action(0.3, -0.2, 0.1, 0.5))
+    # What sensors read never changes the flight; other effects change more in later steps.
+    falling = held(30 if effect.acts_on == ("sensor",) else 1, roll=0.9, pitch=-0.8, yaw=0.7, thrust=-0.5)
     difference = flown(inside_ranges(effect, 0.8), falling, drone) != flown((), falling, drone)
-    changed = set(np.flatnonzero(difference[0]).tolist())
+    changed = set(np.flatnonzero(difference.any(axis=0)).tolist())
     allowed = set().union(*(CHANGES[stage] for stage in effect.stages))
     assert changed, "nothing changes; moving air does nothing without drag: it takes another hook"
     assert changed <= allowed
-
-
-def test_sensor_effects_change_readings_and_never_the_flight() -> None:
-    sensing = [effect for effect in EFFECTS if "sensor" in effect.acts_on]
-    assert sensing and all(effect.acts_on == ("sensor",) for effect in sensing)
-    active = tuple(inside_ranges(effect, 0.8) for effect in sensing)
-    found, plain = (flown(each, random_commands(0, 30), random_drone(0)) for each in (active, ()))
-    np.testing.assert_array_equal(found[:, :21], plain[:, :21])
-    assert (found[:, 21:] != plain[:, 21:]).all(axis=0).all()
 
 
 @jax.jit

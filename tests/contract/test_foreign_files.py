@@ -10,15 +10,10 @@ import pytest
 from benchmarks.reliability import foreign_logs
 from benchmarks.reliability.files import KINDS, soak_kind
 from flytrack_sysid import LogError, csv_file, import_log
+from tests.support.slow import slow_but
+from tests.support.traps import Trap
 
-SLOW = ("imported CSV, gzip", "black box")  # seconds for the crafted files
-
-
-class Trap:
-    """What an unpickler would run."""
-
-    def __reduce__(self) -> tuple:
-        return (pytest.fail, ("the pickle was read",))
+SLOW = {"imported CSV, gzip", "black box"}  # seconds for the crafted files
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -40,9 +35,7 @@ def test_what_is_no_such_file_is_refused(kind: str, tmp_path: Path, monkeypatch:
             KINDS[kind].load(path)
 
 
-@pytest.mark.parametrize(
-    "kind", [pytest.param(kind, marks=pytest.mark.slow) if kind in SLOW else kind for kind in KINDS]
-)
+@pytest.mark.parametrize("kind", slow_but(KINDS.keys() - SLOW, KINDS))
 def test_damaged_and_crafted_files_are_loaded_or_refused(kind: str, tmp_path: Path) -> None:
     found = soak_kind(KINDS[kind], 60, tmp_path)
     assert found["broken"] == "" and found["loaded"] >= 1 and found["refused"] >= 1

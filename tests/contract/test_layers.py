@@ -142,18 +142,21 @@ def import_graph() -> dict[str, set[str]]:
     }
 
 
-def find_circle(graph: dict[str, set[str]]) -> list[str]:
-    """Return the modules of a circle of imports, the first one at the end again; empty if there is none."""
-    try:
-        TopologicalSorter(graph).prepare()
-    except CycleError as error:
-        return list(reversed(error.args[1]))
-    return []
-
-
 def test_no_modules_import_each_other_in_a_circle() -> None:
-    circle = find_circle(import_graph())
-    assert not circle, " -> ".join(circle)
+    try:
+        TopologicalSorter(import_graph()).prepare()
+    except CycleError as error:
+        pytest.fail(" -> ".join(reversed(error.args[1])))
+
+
+def test_the_black_boxs_plant_is_reached_only_through_its_artifact() -> None:
+    for name in (*REPOSITORY, "docs", "noxfile"):
+        for path in files_of(name):
+            packages = {imported.split(".")[0] for imported, _ in imports_of(path)}
+            if name == "blackbox":
+                assert not any(package.startswith("flytrack") for package in packages), path
+            else:
+                assert "blackbox" not in packages, path
 
 
 def test_this_test_sees_imports() -> None:

@@ -2,7 +2,6 @@
 
 import io
 import json
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,10 +16,11 @@ from flytrack_sysid.diagnosis.lanes import LANE_S
 from flytrack_sysid.excitation import DT_S, FLIGHT_STEPS, HEIGHTS
 from flytrack_sysid.manoeuvres import FLIGHTS_PER_MANOEUVRE, MANOEUVRES, flights_of, hover_action
 from flytrack_sysid.script_file import Script, ScriptError, check_script, load_script, save_script, script_of
+from tests.support.black_boxes import SHIPPED
 from tests.support.handout_plant import HandoutPlant
+from tests.support.traps import Trap
 
 HOVER = hover_action(HandoutPlant().model())
-SHIPPED = Path(__file__).parents[2] / "blackbox" / "acro_step.bin"
 
 
 def made(*names: str) -> Script:
@@ -89,13 +89,6 @@ def changed(name: str, place: Any, value: float) -> dict[str, Any]:
     return {name: values}
 
 
-class Harmful:
-    """Something that only a pickle can bring back."""
-
-    def __reduce__(self) -> tuple:
-        return (pytest.fail, ("a pickle was read",))
-
-
 BAD = {
     "flight 3: starts: expected finite numbers": changed("starts", (3, 5), np.nan),
     "flight 2: commands: expected numbers within": changed("commands", (2, 7, 0), 1.5),
@@ -108,7 +101,7 @@ BAD = {
     "found 0 kinds, starts of shape": {"kinds": np.array([], "U1")},
     "starts: found an array of <U4": {"starts": np.full((8, 21), "text")},
     "found arrays of 67110784 bytes or more": {"commands": np.zeros((8, 2**20 + 1, 1), np.int8)},
-    "nothing is unpickled": {"starts": np.array([Harmful()] * 8, object)},
+    "nothing is unpickled": {"starts": np.array([Trap()] * 8, object)},
 }
 
 

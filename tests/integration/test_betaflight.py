@@ -198,15 +198,11 @@ def test_environment_flies_it_and_goes_back_no_further_than_a_step(plant):
     again = env.step_env(None, states[2], act, params)[1]
     np.testing.assert_array_equal(pack(env.drone(again)), pack(env.drone(states[3])))
     with Betaflight() as other:
-        lost = other.step(replace_flight(other, rows=starts(1)), unpack_action(act), 0.01, MODEL)
+        never_begun = other.reset(unpack(starts(1)[0]), MODEL)._replace(flight=np.int32(7))
+        lost = other.step(never_begun, unpack_action(act), 0.01, MODEL)
         assert np.isnan(pack(lost.drone)).all()
         with pytest.raises(FirmwareError, match="flight 7 has ended"):
             other.check_alive()
-
-
-def replace_flight(plant: Betaflight, rows: np.ndarray) -> Any:
-    """Return a state of a flight that the plant never began."""
-    return plant.reset(unpack(rows[0]), MODEL)._replace(flight=np.int32(7))
 
 
 def test_a_process_that_dies_or_hangs_is_one_sentence_and_nothing_is_left(monkeypatch):

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from benchmarks.diagnosis import Trial, model_of, plant
-from benchmarks.hidden import Truth, draw_base, draw_outside, fly, measure
+from benchmarks.hidden import draw_base, draw_outside, fly, measure
 from flytrack_env import load_model
 from flytrack_env.dynamics import nominal_parameters
 from flytrack_env.effects import BY_NAME, LinearDrag
@@ -24,6 +24,7 @@ from flytrack_sysid.diagnosis import Diagnosis, DiagnosisError, diagnose, write_
 from flytrack_sysid.log import FlightLog
 from flytrack_sysid.split import blocks_of, held_out_rows
 from tests.support.diagnosis_cases import CASES, HELD_OUT_EVERY, SEED, Case, rng_of
+from tests.support.slow import slow_but
 
 SHORT_S, BLOCK_S = 20.0, 5.0  # every other block is held out: both parts share one compiled program
 LATE_S, SPIKES = 0.0164, 12
@@ -32,14 +33,6 @@ BROKEN = ("stuck_gyro", "stuck_commands")
 CHANNELS = {"rates", "attitude", "force", "velocity", "battery"}
 WIDENED = 1.5  # of 95 % intervals: a correct one misses such a wide one 3 times in a thousand
 Found = Mapping[str, Any]
-
-
-def short_flight(truth: Truth, rng: np.random.Generator, spikes: int = 0) -> tuple[Diagnosis, FlightLog]:
-    """Return the diagnosis of a short flight of a plant, and its log; spikes: outliers of its velocity."""
-    log = measure(fly(truth, "scripted", SHORT_S, rng), "sensors", rng)
-    log["v"][rng.choice(len(log), spikes, replace=False)] += rng.normal(0.0, 2.0, (spikes, 3))
-    held_out = np.floor(log.time / BLOCK_S).astype(int) % 2 == 1
-    return diagnose(log, model_of(truth), held_out), log
 
 
 @pytest.fixture(scope="session")
@@ -56,8 +49,12 @@ def short() -> Callable[[str], tuple[Diagnosis, FlightLog]]:
 
     @cache
     def diagnosis_of(name: str) -> tuple[Diagnosis, FlightLog]:
-        rng = np.random.default_rng([3, list(plants).index(name)])
-        return short_flight(plants[name], rng, SPIKES * (name == "late"))
+        rng, truth = np.random.default_rng([3, list(plants).index(name)]), plants[name]
+        log = measure(fly(truth, "scripted", SHORT_S, rng), "sensors", rng)
+        spikes = SPIKES * (name == "late")
+        log["v"][rng.choice(len(log), spikes, replace=False)] += rng.normal(0.0, 2.0, (spikes, 3))
+        held_out = np.floor(log.time / BLOCK_S).astype(int) % 2 == 1
+        return diagnose(log, model_of(truth), held_out), log
 
     return diagnosis_of
 
@@ -87,6 +84,7 @@ def check_content(one: Found) -> None:
     assert len(one["data"]["sha256"]) == 64
 
 
+@pytest.mark.slow  # of the one with drag, the fast test sees that nothing else is named
 def test_a_clean_plant_is_consistent_with_its_model(short) -> None:
     found, _ = short("clean")
     assert found.causes == () and found.verdict == "consistent" and found.warnings == ()
@@ -128,9 +126,7 @@ def test_what_no_list_has_is_flagged_and_not_named(short) -> None:
     assert "heading" in found.unexplained.depends_on
 
 
-@pytest.mark.parametrize(
-    "name", ["clean", "drag", *(pytest.param(name, marks=pytest.mark.slow) for name in ("outside", "late"))]
-)
+@pytest.mark.parametrize("name", slow_but(["drag"], ["clean", "drag", "outside", "late"]))
 def test_a_diagnosis_has_its_content(name, short) -> None:
     found, log = short(name)
     content = json.loads(json.dumps(found.as_json(), allow_nan=False))

@@ -6,7 +6,6 @@ import socket
 import subprocess
 import sys
 import time
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -20,10 +19,11 @@ from baselines.purejaxrl_ppo.collectives import AXIS, Collectives
 from baselines.purejaxrl_ppo.distributed import check_divides
 from baselines.purejaxrl_ppo.ppo import Batch, make_network_for, ppo_loss
 from baselines.purejaxrl_ppo.resume import checkpoints_in, newest_intact
+from tests.support.pages import ROOT
 from tests.support.ppo_runs import BATCH, CONFIG
 
-ROOT = Path(__file__).parents[2]
 SIZE = 29  # of an observation
+TRAIN = "-m baselines.purejaxrl_ppo.train_ppo"
 SMALL = "--num-envs 16 --num-steps 24 --num-minibatches 4 --hidden-sizes 8 --evaluate-every 0 --no-tracking"
 
 
@@ -101,16 +101,7 @@ def start(out, *flags, devices=1, number=1, index=0, port=None):
             *("--coordinator", f"127.0.0.1:{port}"),
             *("--num-processes", number, "--process-index", index),
         ]
-    command = [
-        sys.executable,
-        "-m",
-        "baselines.purejaxrl_ppo.train_ppo",
-        "--out",
-        out,
-        *SMALL.split(),
-        *job,
-        *flags,
-    ]
+    command = [sys.executable, *TRAIN.split(), "--out", out, *SMALL.split(), *job, *flags]
     xla = f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count={devices}"
     process = subprocess.Popen(
         [*map(str, command)],
@@ -183,13 +174,6 @@ def test_a_lost_process_ends_the_job_and_another_number_goes_on(tmp_path):
 
 @pytest.mark.slow
 def test_one_device_alone_is_no_job(tmp_path):
-    command = "-m baselines.purejaxrl_ppo.train_ppo --distributed --out"
-    process = subprocess.run(
-        [sys.executable, *command.split(), tmp_path / "x"],
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-        env={**os.environ, "JAX_PLATFORMS": "cpu"},
-    )
-    assert process.returncode == 2 and not (tmp_path / "x").exists()
-    assert "expected a job of SLURM or Open MPI, several devices, or all of --coordinator" in process.stderr
+    status, _, errors = end_of(start(tmp_path / "x", "--distributed"))
+    assert status == 2 and not (tmp_path / "x").exists()
+    assert "expected a job of SLURM or Open MPI, several devices, or all of --coordinator" in errors

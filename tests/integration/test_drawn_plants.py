@@ -2,7 +2,6 @@
 
 from pathlib import Path
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -14,6 +13,7 @@ from flytrack_env.effects import CommandDelay, LinearDrag, QuadraticDrag, Thrust
 from flytrack_env.wrappers import DomainRandomization
 from flytrack_env.wrappers.domain_randomization import sample_model
 from tests.support.evaluated import write_checkpoint
+from tests.support.trees import assert_close
 
 
 def test_plants_are_drawn_from_the_ranges_around_the_model() -> None:
@@ -57,9 +57,6 @@ def test_ids_that_draw_models_fly_the_one_that_is_given(tmp_path: Path) -> None:
     ranges, given = params.wrappers[DomainRandomization.key], env.default_params.model
     found = sample_model(jnp.uint32(5), given, ranges)
     assert type(found.effects[0]) is LinearDrag and len(found.effects) == 1
-    for a, b in zip(
-        jax.tree.leaves(found._replace(tau=np.stack(found.tau))), jax.tree.leaves(given), strict=True
-    ):
-        np.testing.assert_allclose(a, b, rtol=1e-6)
+    assert_close(found._replace(tau=np.stack(found.tau)), given, 1e-6)
     plain = make("FlyTrackNoisy-v0").default_params
     assert with_model_as_given(plain) is plain

@@ -29,9 +29,11 @@ from flytrack_env.rollout import load_rollout
 from flytrack_env.state import BATTERY, POSITION, VELOCITY
 from flytrack_env.tracks import random_track
 from tests.support.evaluated import FAILS_BELOW_V, Rails, run, write_checkpoint
+from tests.support.pages import ROOT
 from tests.support.recordings import Recording
+from tests.support.slow import slow_but
+from tests.support.trees import assert_close
 
-ROOT = Path(__file__).parents[2]
 NUM_LAPS, NUM_STEPS, NUM_FLIGHTS = 3, 1400, 10
 TOLERANCE_S = 2e-3
 
@@ -73,12 +75,6 @@ def paces(flights: Rollout) -> np.ndarray:
     return np.where(battery_v < FAILS_BELOW_V, 0.0, Rails.pace(battery_v))
 
 
-def assert_same(found: Outcomes, expected: Outcomes) -> None:
-    for name, values in expected._asdict().items():
-        for a, b in zip(jax.tree.leaves(getattr(found, name)), jax.tree.leaves(values), strict=True):
-            np.testing.assert_allclose(a, b, atol=1e-5, err_msg=name)
-
-
 def test_lap_times_are_those_of_the_rails(raced: Outcomes, paces: np.ndarray) -> None:
     is_good = paces > 0.0
     assert 0 < is_good.sum() < NUM_FLIGHTS  # else this test would see one kind only
@@ -95,7 +91,7 @@ def test_lap_times_are_those_of_the_rails(raced: Outcomes, paces: np.ndarray) ->
 
 def test_every_step_kept_or_not_is_the_same_flight(flights: Rollout, raced: Outcomes) -> None:
     assert NUM_FLIGHTS % 4
-    assert_same(raced, outcomes_of(flights, NUM_LAPS, 8))
+    assert_close(raced, outcomes_of(flights, NUM_LAPS, 8))
 
 
 def test_time_lost_adds_up_to_the_lap(raced: Outcomes, paces: np.ndarray) -> None:
@@ -143,7 +139,7 @@ def test_ghost_is_the_reference_nearest_in_time() -> None:
     assert np.linalg.norm(states[at, POSITION] - expected) <= 0.5 * 0.01 * speed * 1.05
 
 
-@pytest.mark.parametrize("flown_by", ["black box", pytest.param("plants", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("flown_by", slow_but(["black box"], ["black box", "plants"]))
 def test_command_flies_many(
     flown_by: str,
     checkpoint_path: Path,
@@ -171,7 +167,7 @@ def test_command_flies_many(
     assert len(load_rollout(report["ghost"])[0]) == len(states)
     if flown_by == "plants":
         single = outcomes_of(jax.tree.map(lambda leaf: leaf[None], rollout), 3, 7)
-        assert_same(jax.tree.map(lambda leaf: leaf[:1], outcomes), single)
+        assert_close(jax.tree.map(lambda leaf: leaf[:1], outcomes), single)
         assert "in the simulator, not on a black box" in text and report["black_box"] is None
         assert report["optimal"]["model"] == "nominal" and report["success"]["low"] is None
         assert report["plants"]["success"]["of"] == 3 and len(report["plants"]["by_thirds"]) == 12

@@ -30,6 +30,7 @@ from benchmarks.hidden.plant import Plant, Start
 from benchmarks.hidden.truth import STICKS
 from flytrack_sysid.log import FlightLog
 from tests.support.handout_plant import HandoutPlant
+from tests.support.slow import slow_but
 
 START = Start((1.0, -2.0, 6.0), 0.7, 23.8, -0.2)
 MINUTE_S = 60.0
@@ -137,7 +138,7 @@ def test_a_flight_controller_shapes_the_sticks_before_the_lag(motion: str) -> No
     np.testing.assert_allclose(plant.applied[:3], expected, rtol=1e-4)
 
 
-@pytest.mark.parametrize("damping", [0.3, 1.6])
+@pytest.mark.parametrize("damping", slow_but([0.3], [0.3, 1.6]))
 def test_second_order_rates_obey_their_differential_equation(damping: float) -> None:
     """Against small explicit steps of y'' = wn^2 (omega - y) - 2 zeta wn y'."""
     finer, natural = 2000, np.array([40.0, 50.0, 60.0])
@@ -166,13 +167,13 @@ def difficult(number: int) -> Truth:
     return replace(draw_base(rng), effects=effects)
 
 
-SLOW = [pytest.param(number, marks=pytest.mark.slow) for number in range(10, 60)]
+FAST, MINUTES_FROM = 3, 10  # each sort of plant once; the later ones fly for a minute
 
 
-@pytest.mark.parametrize("number", [*range(10), *SLOW])
+@pytest.mark.parametrize("number", slow_but(range(FAST), range(60)))
 def test_flights_stay_in_the_envelope(number: int) -> None:
     kind = list(FLIGHT_KINDS)[number % len(FLIGHT_KINDS)]
-    log = flown(difficult(number), kind, MINUTE_S if number >= 10 else 20.0, number)
+    log = flown(difficult(number), kind, MINUTE_S if number >= MINUTES_FROM else 20.0, number)
     assert all(np.isfinite(values).all() for values in log.channels.values())
     assert log["p"][:, 2].min() >= 0.1 and np.linalg.norm(log["v"], axis=1).max() <= 20.0
     assert np.abs(log["u"]).max() <= 1.0
@@ -242,7 +243,7 @@ def test_the_accelerometer_feels_gusts() -> None:
         assert 0.04 < np.std(log["w"][:, 2]) < 0.08
 
 
-@pytest.mark.parametrize("kind", OUTSIDE_KINDS)
+@pytest.mark.parametrize("kind", slow_but(OUTSIDE_KINDS[:1], OUTSIDE_KINDS))
 def test_effects_outside_the_list_have_their_amplitude(kind: str) -> None:
     outside = draw_outside(np.random.default_rng([0, 5]), kind, 2.0)
     log = flown(replace(base(), outside=outside), seed=0)

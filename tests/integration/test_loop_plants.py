@@ -10,6 +10,7 @@ from benchmarks.loop.plants import EFFECTS, HiddenPlant
 from flytrack_env import nominal_parameters
 from flytrack_env.quaternion import Quaternion, Vec3
 from flytrack_env.state import Action, Drone, pack
+from tests.support.slow import slow_but
 
 STEPS = 120
 START = Start((1.0, -2.0, 3.0), 0.7, 23.5, -0.3)
@@ -37,7 +38,7 @@ def flown_in_jax(truth: Truth, commands: np.ndarray) -> np.ndarray:
     return np.asarray(jax.lax.scan(step, plant.reset(drone, nominal_parameters()), commands)[1])
 
 
-@pytest.mark.parametrize("names", [(), EFFECTS, *((name,) for name in EFFECTS)])
+@pytest.mark.parametrize("names", slow_but([(), EFFECTS], [(), EFFECTS, *((name,) for name in EFFECTS)]))
 def test_the_flight_is_that_in_plain_floats(names):
     rng = np.random.default_rng(len(names))
     base = draw_base(rng)

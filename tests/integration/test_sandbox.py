@@ -142,11 +142,15 @@ def nested(x: jax.Array, u: jax.Array) -> jax.Array:
 @pytest.mark.parametrize(
     ("step", "message"),
     [
-        (endless, "took more than 1 s of processor time"),
-        (greedy, "does not run on the CPU .*Out of memory|needs more than 1 GiB|crashed"),
+        pytest.param(endless, "took more than 1 s of processor time", marks=pytest.mark.slow),
+        pytest.param(
+            greedy,
+            "does not run on the CPU .*Out of memory|needs more than 1 GiB|crashed",
+            marks=pytest.mark.slow,
+        ),
         (solving, r"found a call of lapack_\w+, expected a pure function that calls nothing"),
         (calling, "found a call of my callback, expected a pure function that calls nothing"),
-        (nested, r"crashed the process that it was tried in \(SIGSEGV\)"),
+        pytest.param(nested, r"crashed the process that it was tried in \(SIGSEGV\)", marks=pytest.mark.slow),
     ],
 )
 def test_hostile_black_boxes_are_refused(step: Callable[..., Any], message: str, tmp_path: Path) -> None:

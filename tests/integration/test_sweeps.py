@@ -3,7 +3,6 @@
 import os
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 
@@ -11,8 +10,8 @@ from baselines.purejaxrl_ppo import load_checkpoint
 from baselines.purejaxrl_ppo.config import ConfigError
 from baselines.purejaxrl_ppo.sweeps.__main__ import parse, prepare
 from baselines.purejaxrl_ppo.sweeps.space import read_space
+from tests.support.pages import ROOT
 
-ROOT = Path(__file__).parents[2]
 BATCH = 16 * 24
 SMALL = ("--num-envs", 16, "--num-steps", 24, "--num-minibatches", 4, "--hidden-sizes", 8)
 GRID = "[learning_rate]\ngrid_search = [1e-3, 2e-3]\n"

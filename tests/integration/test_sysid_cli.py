@@ -14,8 +14,8 @@ from flytrack_env.dynamics import nominal_parameters
 from flytrack_sysid import collect, load_log, save_log
 from flytrack_sysid.cli import load_plant, main
 from flytrack_sysid.log import FlightLog
+from tests.support.black_boxes import SHIPPED
 
-SHIPPED = Path(__file__).parents[2] / "blackbox" / "acro_step.bin"
 TAUS = (0.02, 0.05, 0.07, 0.03)
 OTHER = PlantParameters(
     mass=1.0,
@@ -32,23 +32,19 @@ OTHER = PlantParameters(
 )
 
 
+def run(*arguments: object) -> None:
+    main([str(argument) for argument in arguments])
+
+
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory) -> Path:
     """A folder in which the command has collected, fitted and validated another plant than the shipped."""
     out = tmp_path_factory.mktemp("sysid")
     build(OTHER, out / "other.bin")
-    collect = ["collect", "--black-box", out / "other.bin", "--out", out / "data.npz", "--minutes", "1"]
-    for arguments in (
-        collect,
-        ["fit", out / "data.npz", "--out", out / "model.json"],
-        ["validate", out / "model.json", out / "data.npz", "--out", out / "report"],
-    ):
-        main([str(argument) for argument in arguments])
+    run("collect", "--black-box", out / "other.bin", "--out", out / "data.npz", "--minutes", "1")
+    run("fit", out / "data.npz", "--out", out / "model.json")
+    run("validate", out / "model.json", out / "data.npz", "--out", out / "report")
     return out
-
-
-def run(*arguments: object) -> None:
-    main([str(argument) for argument in arguments])
 
 
 def refused(capsys, *arguments: object) -> str:

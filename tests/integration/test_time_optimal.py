@@ -1,7 +1,6 @@
 """Time-optimal references: the shipped files, their replays, the loader, and the search."""
 
 import json
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +10,7 @@ import pytest
 
 from benchmarks import time_optimal
 from benchmarks.optimal.replay import replay
-from flytrack_env import Track, available_tracks, load_track, nominal_parameters
+from flytrack_env import available_tracks, load_track, nominal_parameters
 from flytrack_env.dynamics import step
 from flytrack_env.effects import EFFECTS
 from flytrack_env.references import (
@@ -27,6 +26,7 @@ from flytrack_env.references import (
 )
 from flytrack_env.state import BATTERY, POSITION, QUATERNION, STATE_SIZE, VELOCITY
 from flytrack_env.tracks import build_course
+from tests.support.coasting import track_of_row
 
 SHIPPED = sorted(FOLDER.glob("*.npz"))
 RADIUS_M = 0.15
@@ -64,9 +64,10 @@ def test_every_track_has_its_references() -> None:
         shipped_reference("nowhere")
 
 
-# A program per number of gates and model: one track of them in every run.
+# A program per number of gates and model: one of them in every run.
+FAST = "flytrack_nominal"
 REPLAYED = [
-    pytest.param(path, id=path.stem, marks=[] if path.stem.startswith("flytrack_") else pytest.mark.slow)
+    pytest.param(path, id=path.stem, marks=[] if path.stem.startswith(FAST) else pytest.mark.slow)
     for path in SHIPPED
 ]
 
@@ -131,7 +132,7 @@ def test_a_saved_reference_comes_back_and_half_of_it_is_refused(tmp_path: Path) 
             load_reference(broken)
 
 
-def test_a_straight_flight_takes_as_long_as_it_has_to(row_track: Callable[[list[float]], Track]) -> None:
+def test_a_straight_flight_takes_as_long_as_it_has_to() -> None:
     pytest.importorskip("casadi")
     from benchmarks.optimal.problem import Task
     from benchmarks.optimal.solve import find_optimum
@@ -139,7 +140,7 @@ def test_a_straight_flight_takes_as_long_as_it_has_to(row_track: Callable[[list[
     acceleration, distance = 20.0, 12.0
     thrust = np.array([acceleration, 0.0, 0.0, 0.0, 0.0, 0.0])  # N, on 1 kg, whatever the stick
     model = nominal_parameters()._replace(thrust_coeffs=thrust, g=0.0)
-    track = row_track([0.5 * distance, distance])
+    track = track_of_row([0.5 * distance, distance])
     start = time_optimal.start_state(track, 24.0)
     start[POSITION], start[QUATERNION] = (0.0, 0.0, 2.0), (0.5**0.5, 0.0, 0.5**0.5, 0.0)  # body z is ahead
     found = find_optimum(Task("standing", build_course(track), RADIUS_M, start), model, 0.01)

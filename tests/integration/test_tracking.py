@@ -1,14 +1,12 @@
 """MLflow tracking: everything is recorded once, and training goes on without a server."""
 
-from pathlib import Path
-
 import pytest
 
 from baselines.purejaxrl_ppo import load_checkpoint, monitor, tracking
 from flytrack_env.rollout import load_rollout
+from tests.support.pages import ROOT
 from tests.support.ppo_runs import BATCH, DEAD_URI, EVERY_OTHER_UPDATE, SEED, assert_same_end
 
-ROOT = Path(__file__).parents[2]
 METRICS = {"episode_return", "policy_loss", "explained_variance", "episode_gates_passed", "gate_distance_m"}
 METRICS |= {"episode_crash", "evaluation_success", "evaluation_ended_time_limit", "steps_per_second"}
 

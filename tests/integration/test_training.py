@@ -17,9 +17,10 @@ from baselines.purejaxrl_ppo import CheckpointError, load_checkpoint, monitor
 from baselines.purejaxrl_ppo.checkpoint import save_checkpoint
 from baselines.purejaxrl_ppo.resume import at_common_step, newest_intact, warn_of_other_machine
 from baselines.purejaxrl_ppo.run import DivergedError, Options, Run
+from tests.support.pages import ROOT
 from tests.support.ppo_runs import BATCH, EVERY_OTHER_UPDATE, SEED, assert_same_end
+from tests.support.slow import slow_but
 
-ROOT = Path(__file__).parents[2]
 SEEDS = (SEED, SEED + 1, SEED + 2)
 EVALUATED = EVERY_OTHER_UPDATE._replace(evaluate_every=2 * BATCH, evaluation_episodes=2)
 
@@ -36,7 +37,7 @@ def test_checkpoints_are_written_at_the_steps_asked_for(whole):
         assert any(part in name for name in training), part
 
 
-@pytest.mark.parametrize("updates", [0, 2, 6])
+@pytest.mark.parametrize("updates", slow_but([2], [0, 2, 6]))
 def test_a_resumed_run_ends_bit_for_bit(trainer, whole, tmp_path, updates):
     options = EVERY_OTHER_UPDATE._replace(resume=step_path(whole[0], updates))
     _, metrics = trainer.train(tmp_path, SEED, options)
@@ -123,7 +124,7 @@ def test_a_diverged_run_ends_at_once_and_no_checkpoint_has_it(trainer, tmp_path,
     assert newest_intact(tmp_path).path == last_good
 
 
-@pytest.mark.parametrize("broken", ["fly_many", "draw_position_density"])
+@pytest.mark.parametrize("broken", slow_but(["fly_many"], ["fly_many", "draw_position_density"]))
 def test_an_evaluation_that_fails_does_not_end_the_training(trainer, tmp_path, monkeypatch, caplog, broken):
     def fail(*arguments):
         raise RuntimeError("out of paint\nand more")

@@ -16,7 +16,8 @@ HOVER = -0.25  # about what holds the weight of ``HandoutPlant``
 class HandoutPlant:
     """A plant ``step(x, u)`` with parameters that no tool is told; one state or many at once.
 
-    tau: s. coeffs: N. max_rate: deg/s. drain: V/min. drag_b: 1/s, linear drag along the body's axes.
+    tau: s. coeffs: N on 1 kg. max_rate: deg/s. drain: V/min. drag_b: 1/s, linear drag along the body's axes.
+    gravity: m/s^2.
     """
 
     tau: tuple[float, ...] = (0.021, 0.034, 0.057, 0.045)
@@ -25,11 +26,12 @@ class HandoutPlant:
     drain: float = 1.0
     drag_b: tuple[float, ...] = (0.0, 0.0, 0.0)
     dt: float = 0.01
+    gravity: float = GRAVITY
 
     def model(self, **changes: object) -> ModelParameters:
         """Return what a fit without effects should find, with some fields replaced."""
         found = ModelParameters(
-            np.array(self.tau), np.array(self.coeffs), np.array(self.max_rate), 1.0, GRAVITY, self.drain
+            np.array(self.tau), np.array(self.coeffs), np.array(self.max_rate), 1.0, self.gravity, self.drain
         )
         return found._replace(**changes)
 
@@ -51,7 +53,7 @@ class HandoutPlant:
         speed_b = np.einsum("...ji,...j->...i", body_to_world, v)
         force_b = -np.array(self.drag_b) * speed_b
         force_b[..., 2] += thrust
-        a = np.einsum("...ij,...j->...i", body_to_world, force_b) - [0.0, 0.0, GRAVITY]
+        a = np.einsum("...ij,...j->...i", body_to_world, force_b) - [0.0, 0.0, self.gravity]
         return np.concatenate(
             [
                 p + v * dt + 0.5 * a * dt**2,

@@ -7,12 +7,6 @@ import numpy as np
 import pytest
 
 
-def rotate(quaternion: np.ndarray, vector: np.ndarray) -> np.ndarray:
-    """Return a vector rotated by a quaternion (w, x, y, z), by cross products."""
-    w, axis = quaternion[0], np.asarray(quaternion[1:])
-    return vector + 2 * w * np.cross(axis, vector) + 2 * np.cross(axis, np.cross(axis, vector))
-
-
 def make_sequence(steps: int) -> list[tuple[np.ndarray, np.ndarray]]:
     """Return a random flight as pairs of state (21,) and action (4,), float32."""
     rng = np.random.default_rng(7)

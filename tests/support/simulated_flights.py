@@ -20,14 +20,14 @@ _SIMULATOR = Simulator(MOST_STEPS)
 
 
 @jax.jit
-def fly(drone: Drone, commands: jax.Array, model: ModelParameters) -> jax.Array:
+def fly(drone: Drone, commands: jax.Array, model: ModelParameters, dt: float = DT) -> jax.Array:
     """Return the packed states after each command, behind them gyro, accelerometer, pose, (num_steps, 37)."""
 
     def one(state: Any, action: jax.Array) -> tuple[Any, jax.Array]:
-        moved = move(*state, unpack_action(action), DT, model)
+        moved = move(*state, unpack_action(action), dt, model)
         reading = read_sensors(moved, model)
         after = SimulatorState(moved.after, moved.memories)
-        seen = sensed(after.drone, after.memories, DT, model)
+        seen = sensed(after.drone, after.memories, dt, model)
         pose = [*seen.pos_w, *seen.vel_w, *seen.quat]
         readings = jnp.stack([*reading.rates_b, *reading.force_b, *pose])
         return after, jnp.concatenate([pack(after.drone), readings])

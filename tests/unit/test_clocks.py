@@ -1,16 +1,9 @@
 """Offsets between sensors' clocks: found, corrected, and never made of the plant's lag."""
 
 import numpy as np
-import pytest
 
 from flytrack_sysid import FlightLog, clocks
 from tests.support.made_flight import TIME_S, flight, noisy
-
-
-@pytest.fixture(scope="module")
-def truth() -> FlightLog:
-    """A flight of 20 s at 100 Hz, all clocks the same."""
-    return flight(TIME_S)
 
 
 def test_clock_offsets_between_sensors_are_found_and_corrected(truth):

@@ -9,11 +9,8 @@ from scipy.spatial.transform import Rotation
 
 from benchmarks.diagnosis import model_of
 from benchmarks.hidden import draw_base, fly, measure
-from flytrack_env.dynamics import nominal_parameters
 from flytrack_env.effects import CommandDelay, LinearDrag, SecondOrderRates
 from flytrack_env.effects.command_delay import LONGEST_STEPS
-from flytrack_env.plants import Simulator
-from flytrack_sysid import collect
 from flytrack_sysid.diagnosis import DiagnosisError, diagnose, joined
 from flytrack_sysid.diagnosis import noise as noises
 from flytrack_sysid.diagnosis.diagnose import unused_channels
@@ -164,20 +161,6 @@ def test_lanes_agree_with_one_long_replay(flown, lanes):
         # In multiples of the noise; what came before the lead-in is forgotten to a millionth of full stick.
         error = (left[..., axes, channel] - one[lanes.row]) / (DIRECT, LEVEL)[channel][axes]
         assert counts[LEAD_IN_S * RATE].any() and np.abs(error[counts]).max() < 1e-3
-
-
-def test_the_simulator_leaves_nothing_of_its_own_log():
-    log = collect(Simulator(), 1.0, 5)
-    log = log.select(log.segment % 3 != 2)
-    model = nominal_parameters()
-    with jax.enable_x64(True):
-        found = make_lanes(log, np.ones(len(log), bool), np.asarray(model.tau, float), float(model.g))
-        problem = Problem.of(found, model)
-        left = problem.residuals(problem.start[None])[0]
-    # The log is in float32: positions of 60 m, speeds of 20 m/s, 24 V.
-    largest = np.where(found.counts, np.abs(left), 0.0).max(axis=(0, 1))
-    assert np.all(largest[:3] < 2e-5) and np.all(largest[3:6, 0] < 1e-3) and np.all(largest[3:6, 1] < 2e-5)
-    assert largest[BATTERY, 1] < 5e-6
 
 
 def test_a_log_without_turns_is_refused(flown):

@@ -1,4 +1,4 @@
-"""The simulator against the handout's equations, written a second time in NumPy."""
+"""The simulator against the handout's equations, written a second time in NumPy, and what follows."""
 
 from itertools import pairwise
 from typing import Any
@@ -10,6 +10,7 @@ import pytest
 from jax.flatten_util import ravel_pytree
 
 from flytrack_env.dynamics import ModelParameters, collective_thrust, nominal_parameters, step
+from tests.support.handout_plant import HandoutPlant
 
 START = np.array([0, 0, 0, 0, 0, 0, 0, 0, 0, 1, 0, 0, 0, 0, 0, 0, 0, 0, 0, -1, 24], float)
 DTS = (0.0005, 0.002, 0.01, 0.05)
@@ -27,33 +28,6 @@ def double_parameters(**fields: Any) -> ModelParameters:
         battery_drain_v_per_min=1.3,
     )
     return uneven._replace(**fields)
-
-
-def handout_step(x: np.ndarray, u: np.ndarray, dt: float, params: ModelParameters) -> np.ndarray:
-    """Return the next state (21,) by the four equations of the handout's task 1, in float64."""
-    position, velocity, q, u_prev, volt = x[0:3], x[3:6], x[9:13], x[16:20], x[20]
-    u_eff = u_prev + (1.0 - np.exp(-dt / params.tau)) * (u - u_prev)
-    omega = np.radians(params.max_rate * u_eff[0:3])
-    left = np.array(
-        [
-            [q[0], -q[1], -q[2], -q[3]],
-            [q[1], q[0], -q[3], q[2]],
-            [q[2], q[3], q[0], -q[1]],
-            [q[3], -q[2], q[1], q[0]],
-        ]
-    )
-    q_next = q + 0.5 * dt * left @ np.concatenate([[0.0], omega])
-    q_next /= np.linalg.norm(q_next)
-    t = u_eff[3]
-    thrust = np.dot(params.thrust_coeffs, [1.0, t, t**2, t**3, volt, t * volt])
-    vector = q[1:]
-    up = np.array([0.0, 0.0, 1.0])
-    axis = up + 2.0 * np.cross(vector, np.cross(vector, up) + q[0] * up)  # Rodrigues, not a matrix
-    acceleration = axis * thrust / params.m - np.array([0.0, 0.0, params.g])
-    v_next = velocity + acceleration * dt
-    p_next = position + velocity * dt + 0.5 * acceleration * dt**2
-    drained = volt - params.battery_drain_v_per_min / 60.0 * dt
-    return np.concatenate([p_next, v_next, acceleration, q_next, omega, u_eff, [drained]])
 
 
 def random_cases(count: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
@@ -96,34 +70,19 @@ def test_nominal_drone_has_no_thrust_at_minus_one_and_the_stated_maximum() -> No
 def test_agrees_with_the_handouts_equations(dt: float) -> None:
     params = double_parameters()
     x, u = random_cases(NUM_CASES)
-    expected = np.stack([handout_step(*case, dt, params) for case in zip(x, u, strict=True)])
+    plant = HandoutPlant(
+        params.tau,
+        params.thrust_coeffs / params.m,
+        params.max_rate,
+        params.battery_drain_v_per_min,
+        gravity=params.g,
+    )
+    expected = plant(x, u, dt)
     with jax.enable_x64(True):
         np.testing.assert_allclose(step_all(x, u, dt, params), expected, rtol=1e-12, atol=1e-12)
     single = step_all(jnp.asarray(x), jnp.asarray(u), dt, params)
     assert single.dtype == jnp.float32
     np.testing.assert_allclose(single, expected, rtol=2e-5, atol=2e-5)
-
-
-def test_free_fall() -> None:
-    params = double_parameters(thrust_coeffs=np.zeros(6))
-    with jax.enable_x64(True):
-        x = fly(random_cases(1)[0][0], np.zeros((100, 4)), 0.01, params)
-    np.testing.assert_allclose(x[:, 6:9], np.tile([0.0, 0.0, -params.g], (100, 1)), atol=1e-12)
-    fallen = x[-1] - x[0]
-    np.testing.assert_allclose(fallen[3:6], [0.0, 0.0, -params.g * 0.99], atol=1e-12)
-
-
-@pytest.mark.parametrize("volt", [22.0, 23.0, 24.0])
-def test_hover_keeps_the_velocity(volt: float) -> None:
-    model = nominal_parameters()._replace(battery_drain_v_per_min=0.0)
-    c = model.thrust_coeffs.astype(float)
-    roots = np.roots([c[3], c[2], c[1] + c[5] * volt, c[0] + c[4] * volt - model.m * model.g])
-    hover = next(float(r.real) for r in roots if abs(r.imag) < 1e-9 and -1.0 < r.real < 1.0)
-    start = START.copy()
-    start[3:6], start[19], start[20] = (1.0, -2.0, 0.5), hover, volt
-    x = fly(start.astype(np.float32), np.tile([0.0, 0.0, 0.0, hover], (200, 1)), 0.01, model)
-    np.testing.assert_allclose(x[:, 6:9], 0.0, atol=5e-6)
-    np.testing.assert_allclose(x[-1, 3:6], [1.0, -2.0, 0.5], atol=2e-5)
 
 
 def test_quaternion_stays_unit_over_ten_thousand_random_steps() -> None:
@@ -188,29 +147,12 @@ def test_translation_is_exact_for_a_constant_acceleration(num_steps: int) -> Non
     np.testing.assert_allclose(x[0:3], position, atol=1e-10)
 
 
-@pytest.mark.parametrize("dt", [1e-4, 0.01, 0.3, 10.0])
-def test_lag_of_two_half_steps_is_that_of_one(dt: float) -> None:
-    params = double_parameters()
-    x, u = (array[0] for array in random_cases(1))
-    with jax.enable_x64(True):
-        whole = fly(x, u[None], dt, params)[-1]
-        halves = fly(x, np.stack([u, u]), dt / 2, params)[-1]
-    np.testing.assert_allclose(halves[16:20], whole[16:20], atol=1e-14)
-    assert not np.allclose(whole[16:20], x[16:20], atol=1e-6)
-
-
 @pytest.mark.parametrize(("is_double", "tolerance"), [(True, 1e-9), (False, 0.01)])
 def test_battery_loses_one_volt_per_minute(is_double: bool, tolerance: float) -> None:
     with jax.enable_x64(is_double):
         start = jnp.asarray(START, float if is_double else jnp.float32)
         x = fly(start, jnp.zeros((6000, 4), start.dtype), 0.01, nominal_parameters())
     assert float(x[-1, 20]) == pytest.approx(23.0, abs=tolerance)
-
-
-def numeric_jacobian(function: Any, vector: np.ndarray, width: float = 1e-6) -> np.ndarray:
-    """Return the central-difference Jacobian (M, N) of a function of a vector (N,)."""
-    shifts = width * np.eye(vector.size)
-    return np.stack([(function(vector + s) - function(vector - s)) / (2 * width) for s in shifts], -1)
 
 
 @pytest.mark.parametrize("differentiate", [jax.jacfwd, jax.jacrev])
@@ -226,7 +168,8 @@ def test_gradients_equal_finite_differences(differentiate: Any) -> None:
         jacobian = jax.jit(differentiate(packed))
         for x, u in zip(*random_cases(3, seed=5), strict=True):
             vector = np.concatenate([x, u, [0.02], flat])
-            numeric = numeric_jacobian(packed, vector)
+            shifts = 1e-6 * np.eye(vector.size)
+            numeric = np.stack([(packed(vector + s) - packed(vector - s)) / 2e-6 for s in shifts], -1)
             np.testing.assert_allclose(jacobian(vector), numeric, rtol=1e-5, atol=1e-5)
     # Everything matters: no column but those of the old acceleration and rates is zero.
     unused = {*range(6, 9), *range(13, 16)}

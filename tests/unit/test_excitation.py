@@ -10,12 +10,8 @@ from tests.support.handout_plant import HOVER, HandoutPlant
 STICKS = ("roll", "pitch", "yaw", "thrust")
 
 
-def flown(num_flights: int = 48, seed: int = 0) -> list:
-    return script(num_flights, HOVER, np.random.default_rng(seed))
-
-
 def test_every_kind_comes_in_fours_with_all_amplitudes_and_voltages():
-    flights = flown()
+    flights = script(48, HOVER, np.random.default_rng(0))
     assert [flight.kind for flight in flights] == [kind for kind in KINDS for _ in range(4)] * 2
     for kind in KINDS:
         own = [flight for flight in flights if flight.kind == kind]

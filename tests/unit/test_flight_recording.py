@@ -144,15 +144,11 @@ def test_of_a_long_log_rows_are_left_out_but_no_start(monkeypatch, made):
     assert np.flatnonzero(shown.restarts).tolist() == [0, 75] and "1 row in 4" in shown.ended
 
 
-def found_by_hand(flown, models) -> Diagnosis:
-    """Return a diagnosis that names nothing."""
-    models = {"nominal": flown[0], "base": flown[0], "extended": models["true"]}
-    rest = {"noise": {}, "source": "log", "sha256": ""}
-    return Diagnosis(CONSISTENT, (), Unexplained(), (), {}, **models, **rest)
-
-
 def test_diagnose_writes_the_recording_or_says_why_not(flown, models, tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(cli, "diagnose", lambda *_: found_by_hand(flown, models))  # the rest is the real one
+    shown = {"nominal": flown[0], "base": flown[0], "extended": models["true"]}
+    rest = {"noise": {}, "source": "log", "sha256": ""}
+    found = Diagnosis(CONSISTENT, (), Unexplained(), (), {}, **shown, **rest)  # which names nothing
+    monkeypatch.setattr(cli, "diagnose", lambda *_: found)  # the rest is the real one
     monkeypatch.setattr(cli, "write_diagnosis", lambda folder, *_: [folder / "diagnosis.json"])
     save_log(tmp_path / "log.npz", flown[1])
     save_log(tmp_path / "turns.npz", flown[1].without("q"))

@@ -103,7 +103,6 @@ def test_only_the_longest_stretch_in_the_air_is_used(tmp_path):
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        ("[thrust_command]", "[spare]", r"map\.toml: spare: unknown; expected one of time, command"),
         ("max_rate_deg_s = [300, 300, 300]", "", r"craft\.max_rate_deg_s: missing in the mapping"),
         ('columns = ["sr", "sp", "sy"]', "", r"attitude_command\.columns: missing"),
         ("signs", "gain = [1, -1, 1]\nsigns", r"attitude_command\.gain: found .*, expected 0, to identify"),

@@ -12,17 +12,12 @@ from flytrack_sysid.diagnosis.score_test import Linearization
 BLOCKS, FREE = 45, ("given", "first", "second")
 
 
-def linearization_of(scores: np.ndarray, information: np.ndarray) -> Linearization:
-    """Return a linearization along three parameters, of scores of seconds (BLOCKS, 3) and information."""
-    found = object.__new__(Linearization)
-    found.places, found.total, found.score_by_block = [0, 1, 2], information, scores
-    found.problem = SimpleNamespace(names=FREE)
-    return found
-
-
 def half_widths(scores: np.ndarray, information: np.ndarray) -> np.ndarray:
-    model = SimpleNamespace(places=(0, 1, 2))
-    return Marginal(linearization_of(scores, information), model, FREE[1:]).half_widths()
+    """Return half widths of intervals, of scores of seconds (BLOCKS, 3) and information along parameters."""
+    seen = object.__new__(Linearization)
+    seen.places, seen.total, seen.score_by_block = [0, 1, 2], information, scores
+    seen.problem = SimpleNamespace(names=FREE)
+    return Marginal(seen, SimpleNamespace(places=(0, 1, 2)), FREE[1:]).half_widths()
 
 
 @pytest.fixture

@@ -113,6 +113,7 @@ def test_what_stays_undecided_can_ask_all_of_the_log() -> None:
     assert len(set.union(*rows)) > 0.9 * len(log)
 
 
+@pytest.mark.slow
 def test_poses_that_seem_early_are_on_time(monkeypatch) -> None:
     """Where the correlation says late, their lateness is fitted down to none and no further."""
     plant, wrong_s, half_step_s = HandoutPlant(), 0.0017, 0.005
@@ -125,6 +126,7 @@ def test_poses_that_seem_early_are_on_time(monkeypatch) -> None:
     assert found == Moves(Motion.HANDOUT)
 
 
+@pytest.mark.slow
 def test_a_drone_on_time_is_no_simulator_however_little_the_model_explains() -> None:
     """Commands that have nothing to do with the motion stand for a rate loop that the model lacks."""
     log = noisy(flight(TIME_S), seed=1)

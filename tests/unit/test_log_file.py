@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from flytrack_sysid.log import CHANNELS, COLUMNS, FlightLog, LogError
+from flytrack_sysid.log import CHANNELS, FlightLog, LogError
 from flytrack_sysid.log_file import describe, gaps_of, load_log, save_log
 from tests.support.written_logs import NUM_ROWS, SUFFIXES, assert_same_log, columns_of, make_log, write
 
@@ -126,7 +126,3 @@ def test_description_says_what_is_in_a_log():
         "channels: u; absent: p, v, a, f, q, w, uprev, v_bat",
         "commands: u_roll -0.1 to -0.1; u_pitch 0.1 to 0.1; u_yaw 0 to 0; u_thrust -1 to -1",
     ]
-
-
-def test_every_column_has_a_place():
-    assert set(columns_of(make_log())) == set(COLUMNS)

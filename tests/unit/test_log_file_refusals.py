@@ -12,6 +12,7 @@ import pytest
 
 from flytrack_sysid.log import REQUIRED, LogError
 from flytrack_sysid.log_file import load_log
+from tests.support.traps import Trap
 from tests.support.written_logs import NUM_ROWS, SUFFIXES, columns_of, make_log, write
 
 
@@ -30,10 +31,6 @@ def replaced(column: str, values: Any) -> Callable[[dict], None]:
     return lambda columns: columns.update({column: np.asarray(values)})
 
 
-def no_rows(columns: dict) -> None:
-    columns.update({name: values[:0] for name, values in columns.items()})
-
-
 # What is done to the columns -> what the message says after the file; {row} with the line in a CSV file.
 BAD_COLUMNS = {
     "unknown": (rename("w_x", "w_roll"), r"column 'w_roll': unknown; .*\(known: t, segment, u_roll, "),
@@ -41,7 +38,10 @@ BAD_COLUMNS = {
     "no command": (lambda columns: columns.pop("u_yaw"), "column u_yaw: missing; found t, segment, u_roll"),
     "half a vector": (lambda columns: columns.pop("p_y"), "column p_y: missing; found only p_x, p_z of it"),
     "nan": (set_cell("v_y", 4, np.nan), "{row 4}, column v_y: found '?nan'?, expected a finite number"),
-    "no rows": (no_rows, "found no rows"),
+    "no rows": (
+        lambda columns: columns.update({n: values[:0] for n, values in columns.items()}),
+        "found no rows",
+    ),
     "time runs back": (set_cell("t", 4, -1.0), r"{row 4}, column t: found -1\.0, expected a later time"),
     "half a segment": (
         replaced("segment", [0, 0, 0.5, 1, 1, 1]),
@@ -81,13 +81,6 @@ def test_full_stick_within_rounding_is_fine(values, tmp_path):
     columns["u_roll"] = values
     write(tmp_path / "flight.npz", columns)
     np.testing.assert_array_equal(load_log(tmp_path / "flight.npz")["u"][:, 0], values)
-
-
-class Trap:
-    """What an unpickler would run."""
-
-    def __reduce__(self) -> tuple:
-        return (pytest.fail, ("the pickle was read",))
 
 
 BAD_ARRAYS = {

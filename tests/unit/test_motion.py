@@ -1,12 +1,14 @@
 """How a model moves within a step: continuous motion against SciPy's integrator and its own limit."""
 
+from functools import cache
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from flytrack_env.dynamics import ModelParameters, Moved, move, observe_rates, read_sensors
+from flytrack_env.dynamics import ModelParameters, move, observe_rates
 from flytrack_env.effects import (
     CommandDelay,
     ImuLatency,
@@ -18,7 +20,9 @@ from flytrack_env.effects import (
 )
 from flytrack_env.motion import Motion
 from flytrack_env.quaternion import Vec3
-from flytrack_env.state import Action, Drone, pack, unpack, unpack_action
+from flytrack_env.state import Action, Drone, unpack
+from tests.support.handout_plant import rotation
+from tests.support.simulated_flights import fly
 
 MASS, GRAVITY, DRAIN = 1.2, 9.81, 1.3
 TAU = np.array([0.03, 0.05, 0.08, 0.04])
@@ -45,17 +49,9 @@ def held_commands() -> np.ndarray:
 def flown(model: ModelParameters, dt: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return states (num_steps, 21), gyro and accelerometer readings (num_steps, 3) at steps of ``dt``."""
     commands = np.repeat(held_commands(), round(COMMAND_S / dt), axis=0)
-
-    def one(state: tuple, command: jax.Array) -> tuple[tuple, tuple]:
-        moved: Moved = move(*state, unpack_action(command), dt, model)
-        reading = read_sensors(moved, model)
-        seen = pack(moved.after), jnp.stack(tuple(reading.rates_b)), jnp.stack(tuple(reading.force_b))
-        return (moved.after, moved.memories), seen
-
     with jax.enable_x64(True):
-        drone = started(model)
-        memories = start_memories(model.effects, drone)
-        return tuple(map(np.asarray, jax.jit(lambda c: jax.lax.scan(one, (drone, memories), c)[1])(commands)))
+        rows = np.asarray(fly(started(model), commands, model, dt))
+    return rows[:, :21], rows[:, 21:24], rows[:, 24:27]
 
 
 def started(model: ModelParameters) -> Drone:
@@ -65,6 +61,7 @@ def started(model: ModelParameters) -> Drone:
     return unpack(jnp.asarray(state))
 
 
+@cache
 def reference(case: str) -> tuple[np.ndarray, np.ndarray]:
     """Return position, velocity, attitude, rates at every 20 ms by SciPy, and specific forces, body.
 
@@ -108,13 +105,6 @@ def reference(case: str) -> tuple[np.ndarray, np.ndarray]:
         rows.append(y[:10])
         forces.append(force(now, y[3:6], y[6:10] / np.linalg.norm(y[6:10]), y[10:14]))
     return np.array(rows), np.array(forces)
-
-
-def rotation(q: np.ndarray) -> np.ndarray:
-    """Return the matrix of a unit quaternion, body to world."""
-    w, v = q[0], q[1:]
-    cross = np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
-    return np.eye(3) + 2.0 * w * cross + 2.0 * cross @ cross
 
 
 def errors(model: ModelParameters, dt: float, case: str) -> np.ndarray:

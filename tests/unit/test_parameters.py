@@ -22,15 +22,10 @@ from flytrack_sysid.parameters import (
 ALL = tuple(effect.name for effect in EFFECTS)
 
 
-def numbered(effects: tuple[str, ...]):
-    """Return a model whose numbers are 1, 2, 3, ... in the order of their names."""
-    model = with_neutral_effects(nominal_parameters(), effects)
-    return with_values(model, {name: index + 1.0 for index, name in enumerate(names_of(model))})
-
-
 @pytest.mark.parametrize("effects", [(), ("linear_drag",), ALL, ALL[::-1]])
 def test_vector_and_names_round_trip(effects):
-    model = numbered(effects)
+    model = with_neutral_effects(nominal_parameters(), effects)
+    model = with_values(model, {name: index + 1.0 for index, name in enumerate(names_of(model))})
     vector = to_vector(model)
     np.testing.assert_array_equal(vector, np.arange(1.0, len(names_of(model)) + 1))
     assert names_of(model)[: len(BASE)] == BASE

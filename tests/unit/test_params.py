@@ -16,11 +16,6 @@ from flytrack_env.plants import Simulator
 PARAMS = FlyTrack().default_params
 
 
-def test_drone_wider_than_an_opening():
-    with pytest.raises(ValueError, match=r"drone_radius: found 0\.75"):
-        PARAMS.replace(drone_radius=0.75).check()
-
-
 def test_reset_refuses_another_step_than_the_plant_has():
     class OneStep(Simulator):
         dt = 0.02

@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 import pytest
 from matplotlib.collections import LineCollection
-from matplotlib.figure import Figure
 
 from flytrack_env.flown_race import Pass
 from flytrack_env.pictures import Flight, draw_flight, make_flight, write_animation, write_video
@@ -39,10 +38,6 @@ def straight(right_m: float, up_m: float) -> Flight:
     return make_flight("straight", states, np.zeros((30, 4), np.float32), TRACK)
 
 
-def texts_of(figure: Figure) -> list[str]:
-    return [text.get_text() for text in figure.findobj(lambda artist: hasattr(artist, "get_text"))]
-
-
 def test_path_from_above_is_the_states_in_the_colours_of_their_speeds(ghost):
     figure = draw_top(ghost)
     (path,) = [found for found in figure.axes[0].collections if isinstance(found, LineCollection)]
@@ -52,7 +47,7 @@ def test_path_from_above_is_the_states_in_the_colours_of_their_speeds(ghost):
     speeds = np.linalg.norm(STATES[:, 3:6], axis=1)
     np.testing.assert_allclose(path.get_array(), speeds[:-1], rtol=1e-6)
     assert path.norm.vmin == 0.0 and path.norm.vmax > speeds.max()
-    texts = texts_of(figure)
+    texts = [text.get_text() for text in figure.findobj(lambda artist: hasattr(artist, "get_text"))]
     assert {"start", "all steps flown", "speed (m/s)"} < set(texts)
     assert any("laps 3.880, 3.833 s" in text for text in texts)
     for gate in TRACK.gates:

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterator
 from functools import cache
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import numpy as np
@@ -46,18 +46,6 @@ EXPECTED = {
 }
 
 
-class Drone(Simulator):
-    """The simulator, which flies the nominal model whatever it is asked for."""
-
-    def reset(self, drone: Any, model: Any) -> Any:
-        """Return the drone with nothing remembered."""
-        return super().reset(drone, MODEL)
-
-    def step(self, state: Any, command: Any, dt: Any, model: Any) -> Any:
-        """Return the next state of the nominal model."""
-        return super().step(state, command, dt, MODEL)
-
-
 class Logged(NamedTuple):
     """A log, its problem, the model that is right, and its linearization."""
 
@@ -92,14 +80,14 @@ def in_float64() -> Iterator[None]:
 def hover() -> Logged:
     """Twenty seconds of hover, the nose in one direction."""
     first = flights_of(["headings"], hover_action(MODEL))[0]
-    return logged(collect(Drone(), script=script_of([first] * 8)).without("uprev"))
+    return logged(collect(Simulator(), script=script_of([first] * 8)).without("uprev"))
 
 
 @pytest.fixture(scope="module")
 def told() -> Callable[[str], np.ndarray]:
     """What a manoeuvre tells of everything once it is collected, with other commands than foreseen."""
     script = script_of(flights_of(MANOEUVRES, hover_action(MODEL), seed=1))
-    log = collect(Drone(), script=script).without("uprev")
+    log = collect(Simulator(), script=script).without("uprev")
     kinds = np.array(script.kinds)[log.segment]
 
     @cache
@@ -139,6 +127,7 @@ def test_what_is_promised_is_what_collecting_brings(hover, told):
     assert promised["thrust_steps"] > 10.0 * promised["speeds"] > 100.0 * promised["low_passes"]
 
 
+@pytest.mark.slow
 def test_sensors_that_the_log_lacks_tell_nothing_ahead_either(hover):
     blind = logged(hover.log.without("v_bat"))
     question = Question(blind.linearization, blind.model, "voltage_sag")

@@ -92,8 +92,8 @@ def train(env, params=None, **changes):
     return make_network_for(env, params, config), runner.train_state.params
 
 
-def train_value(terminates: bool, **changes) -> float:
-    network, params = train(Probe(terminates), **changes)
+def train_value(**changes) -> float:
+    network, params = train(Probe(terminates=False), **changes)
     return float(network.apply(params, jnp.zeros(2), method="value"))
 
 
@@ -103,17 +103,13 @@ VALUE_OF_EIGHT = np.mean([(1 - 0.9**left) / (1 - 0.9) for left in range(1, 9)])
 
 def test_value_bootstraps_through_truncation():
     # The clock is hidden, so a constant reward of 1 has one value: 1 / (1 - gamma) if it never ends.
-    assert train_value(terminates=False) == pytest.approx(10.0, rel=0.05)
+    assert train_value() == pytest.approx(10.0, rel=0.05)
 
 
 def test_with_all_differences_off_truncation_is_termination():
     switches = ("bootstrap_at_truncation", "batched_step", "affine_shuffle", "anneal_every_gradient")
-    found = train_value(terminates=False, min_std=0.0, **dict.fromkeys(switches, False))
+    found = train_value(min_std=0.0, **dict.fromkeys(switches, False))
     assert found == pytest.approx(VALUE_OF_EIGHT, rel=0.1)
-
-
-def test_value_stops_at_termination():
-    assert train_value(terminates=True) == pytest.approx(VALUE_OF_EIGHT, rel=0.1)
 
 
 def test_delayed_reward_is_discounted_back():

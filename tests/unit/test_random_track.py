@@ -41,16 +41,7 @@ def test_only_feasible_courses_are_drawn_and_all_differ(drawn: list[Track]) -> N
     assert len({track.gates for track in drawn}) == len({track.name for track in drawn}) == NUM_SEEDS
 
 
-def cross_all(gates: Any, starts: jax.Array, ends: jax.Array) -> Any:
-    """Return how every segment (N, M, 3) of every way meets every gate: leaves (N, M, num_gates)."""
-
-    def meet(start: jax.Array, end: jax.Array) -> Any:
-        return jax.vmap(lambda gate: cross_gate(gate, Vec3(*start), Vec3(*end), DRONE_RADIUS))(gates)
-
-    return jax.vmap(jax.vmap(meet))(starts, ends)
-
-
-CROSS_ALL = jax.jit(cross_all)
+CROSS = jax.jit(cross_gate)
 
 
 def count_events(track: Track) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -59,7 +50,9 @@ def count_events(track: Track) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     way = sample_way(course, NUM_SAMPLES).astype(np.float32)
     # From just behind a gate to just behind the next one.
     points = np.concatenate([way[:, 1:], np.roll(way, -1, axis=0)[:, 1:BEYOND]], axis=1)
-    crossing = CROSS_ALL(course.gates, points[:, :-1], points[:, 1:])
+    # Every segment of every way against every gate: (N, M, 1) against (num_gates,).
+    starts, ends = (Vec3(*np.moveaxis(part[:, :, None], -1, 0)) for part in (points[:, :-1], points[:, 1:]))
+    crossing = CROSS(course.gates, starts, ends, DRONE_RADIUS)
     events = (crossing.is_pass, crossing.is_frame, crossing.is_miss)
     return tuple(np.asarray(event).sum(axis=1) for event in events)
 

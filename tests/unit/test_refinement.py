@@ -105,6 +105,7 @@ def test_the_base_is_free_where_an_effect_that_held_it_is_gone(dragged):
     assert set(base.places) <= set(after.state.every_place)
 
 
+@pytest.mark.slow  # the first test sees that a refinement makes none worse
 def test_what_no_list_has_makes_no_horizon_worse():
     """A force by heading, and a drag that stands in for it: graded by free flights of other code."""
     rng = np.random.default_rng(5)

@@ -1,7 +1,6 @@
 """Where episodes start: facts about the distribution, and the randomness behind it."""
 
 from collections.abc import Callable
-from typing import Any
 
 import jax
 import numpy as np
@@ -11,7 +10,7 @@ from scipy.interpolate import CubicHermiteSpline
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
-from flytrack_env.env import EnvParams
+from flytrack_env.env import EnvParams, FlyTrack
 from flytrack_env.resets import LAST_SEGMENT_FRACTION, SIDEWAYS_FRACTION, ResetParams
 from flytrack_env.state import pack
 from flytrack_env.tracks import Track, load_track
@@ -21,8 +20,10 @@ Sample = Callable[..., tuple[np.ndarray, np.ndarray]]
 
 
 @pytest.fixture(scope="module")
-def sample(params: EnvParams, reset_many: Any) -> Sample:
+def sample(env: FlyTrack, params: EnvParams) -> Sample:
     """A function from fields of ``ResetParams`` to states (N, 21) and gate indices (N,)."""
+
+    reset_many = jax.jit(jax.vmap(env.reset, in_axes=(0, None)))
 
     def draw(**fields: float) -> tuple[np.ndarray, np.ndarray]:
         keys = jax.random.split(jax.random.key(0), NUM_STARTS)
@@ -43,14 +44,6 @@ def at_pose(sample: Sample) -> tuple[np.ndarray, np.ndarray]:
 def on_course(sample: Sample) -> tuple[np.ndarray, np.ndarray]:
     """Starts along the course only."""
     return sample(course_fraction=1.0)
-
-
-def body_axes(x: np.ndarray) -> np.ndarray:
-    """Return the body's x and z axes, (2, N, 3)."""
-    w, a, b, c = x[:, 9:13].T
-    ahead = np.stack([1 - 2 * (b * b + c * c), 2 * (a * b + w * c), 2 * (a * c - w * b)], -1)
-    up = np.stack([2 * (a * c + w * b), 2 * (b * c - w * a), 1 - 2 * (a * a + b * b)], -1)
-    return np.stack([ahead, up])
 
 
 def assert_uniform(values: np.ndarray, low: float, high: float) -> None:
@@ -121,7 +114,7 @@ def test_course_starts_have_the_stated_tilt_towards_any_side(
     on_course: tuple[np.ndarray, np.ndarray],
 ) -> None:
     x, _ = on_course
-    _, up = body_axes(x)
+    up = Rotation.from_quat(x[:, 9:13], scalar_first=True).apply([0.0, 0.0, 1.0])
     tilt_deg = np.degrees(np.arccos(np.clip(up[:, 2], -1.0, 1.0)))
     assert_uniform(tilt_deg, 0.0, ResetParams().course_tilt_deg)
     assert_uniform(np.arctan2(up[:, 1], up[:, 0]), -np.pi, np.pi)
@@ -131,7 +124,8 @@ def test_course_starts_have_the_stated_tilt_towards_any_side(
 def test_course_starts_face_along_the_curve(sample: Sample) -> None:
     # The velocity is along the curve up to its sideways part, a share of the speed.
     x, _ = sample(course_fraction=1.0, course_tilt_deg=0.0)
-    ahead, up = body_axes(x)
+    turned = Rotation.from_quat(x[:, 9:13], scalar_first=True)
+    ahead, up = turned.apply([1.0, 0.0, 0.0]), turned.apply([0.0, 0.0, 1.0])
     np.testing.assert_allclose(up[:, 2], 1.0, atol=1e-5)
     moving = np.linalg.norm(x[:, 3:5], axis=1) > 0.1
     cross = ahead[:, 1] * x[:, 3] - ahead[:, 0] * x[:, 4]

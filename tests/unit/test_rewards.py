@@ -1,6 +1,5 @@
 """Every reward term by hand, and their weighted sum."""
 
-from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -13,25 +12,19 @@ from flytrack_env.env import EnvParams, FlyTrack
 from flytrack_env.quaternion import Vec3
 from flytrack_env.rewards import TERMS, RewardWeights, Transition, total_reward
 from flytrack_env.state import Action
+from tests.support.coasting import coasting_env, drone_at
 
-MakeTransition = Callable[..., Transition]
 
-
-@pytest.fixture
-def make_transition(make_drone: Any) -> MakeTransition:
-    """A function that returns a still transition 5 m before a gate, with some parts replaced."""
-
-    def make(before: Any = None, after: Any = None, **fields: Any) -> Transition:
-        still = {
-            "gate_centre_w": Vec3(*map(jnp.float32, (1.0, 2.0, 3.0))),
-            "num_passed": jnp.int32(0),
-            "offset": jnp.float32(0.5),
-            "is_terminated": jnp.asarray(False),
-        }
-        drones = [make_drone(**{"position": (-4.0, 2.0, 3.0), **(d or {})}) for d in (before, after)]
-        return Transition(*drones, **{**still, **fields})
-
-    return make
+def make_transition(before: Any = None, after: Any = None, **fields: Any) -> Transition:
+    """Return a still transition 5 m before a gate, with some parts replaced."""
+    still = {
+        "gate_centre_w": Vec3(*map(jnp.float32, (1.0, 2.0, 3.0))),
+        "num_passed": jnp.int32(0),
+        "offset": jnp.float32(0.5),
+        "is_terminated": jnp.asarray(False),
+    }
+    drones = [drone_at(**{"position": (-4.0, 2.0, 3.0), **(d or {})}) for d in (before, after)]
+    return Transition(*drones, **{**still, **fields})
 
 
 PASSED = {"num_passed": jnp.int32(1)}
@@ -60,7 +53,7 @@ CASES = [
 
 
 @pytest.mark.parametrize(("name", "parts", "expected"), CASES)
-def test_term(name: str, parts: dict[str, Any], expected: float, make_transition: MakeTransition) -> None:
+def test_term(name: str, parts: dict[str, Any], expected: float) -> None:
     value = getattr(rewards, name)(make_transition(**parts))
     assert float(value) == pytest.approx(expected, abs=1e-5)
 
@@ -72,7 +65,7 @@ def test_every_weight_is_named_after_a_term_and_every_term_is_tested() -> None:
     assert set(RewardWeights._field_defaults) == set(names)
 
 
-def test_total_is_the_weighted_sum(make_transition: MakeTransition) -> None:
+def test_total_is_the_weighted_sum() -> None:
     transition = make_transition(
         after={
             "position": (-3.0, 2.5, 3.0),
@@ -98,7 +91,7 @@ def test_weights_that_are_given_replace_the_defaults() -> None:
     assert FlyTrack(reward={}).default_params.reward == RewardWeights()
 
 
-def test_gradient_is_finite_at_the_gates_centre(make_transition: MakeTransition) -> None:
+def test_gradient_is_finite_at_the_gates_centre() -> None:
     at_centre = {"position": (1.0, 2.0, 3.0)}
 
     def reward(x: jax.Array) -> jax.Array:
@@ -118,15 +111,13 @@ def test_gradient_is_finite_at_the_gates_centre(make_transition: MakeTransition)
         (2.0, {"gate_pass": 0, "off_centre": 0.0, "termination": 1}),
     ],
 )
-def test_environment_hands_its_transition_to_the_terms(
-    y: float, expected: dict[str, Any], coasting_envs: Any, row_track: Any, make_drone: Any
-) -> None:
-    env: FlyTrack = coasting_envs(row_track([0.0, 10.0]), "terminate")
+def test_environment_hands_its_transition_to_the_terms(y: float, expected: dict[str, Any]) -> None:
+    env = coasting_env(0.0, 10.0)
     transition = jax.jit(env.transition)
     for name, value in expected.items():
         only = RewardWeights(**{field: float(field == name) for field in RewardWeights._fields})
         params: EnvParams = env.default_params.replace(reward=only)
-        state = env.begin(make_drone((-0.9, y, 2.0), (100.0, 0.0, 0.0)), 0, params)
+        state = env.begin(drone_at((-0.9, y, 2.0), (100.0, 0.0, 0.0)), 0, params)
         reward = float(transition(state, jnp.zeros(4), params)[1])
         if name == "progress":  # towards the gate that was flown to, 0.9 m before and 0.1 m behind
             value = np.hypot(0.9, y) - np.hypot(0.1, y)

@@ -13,7 +13,7 @@ from flytrack_env.references import ghost_rollout, shipped_references
 from flytrack_env.rollout import save_rollout
 from flytrack_env.state import BATTERY, POSITION, QUATERNION, Action
 from flytrack_env.tracks import build_course, load_track
-from tests.support.recordings import Recording, make_sequence, rotate
+from tests.support.recordings import Recording, make_sequence
 
 rr = pytest.importorskip("rerun", reason="rerun-sdk is not installed (extra flytrack[viz])")
 viz = importlib.import_module("flytrack_env.viz_rerun")
@@ -33,12 +33,6 @@ def record(folder: Path, sequence, gates=GATES, **options) -> Recording:
     viz.visualize_state_action_sequence(sequence, gates, str(path), **options)
     assert list(folder.iterdir()) == [path]
     return Recording(path)
-
-
-def write(folder: Path, flight, track=TRACK) -> Recording:
-    """Return the recording of one flight."""
-    viz.write_recording(folder / "flight.rrd", [flight], track)
-    return Recording(folder / "flight.rrd")
 
 
 def aside(shift: float) -> np.ndarray:
@@ -102,7 +96,7 @@ def test_gate_centres_and_squares_are_in_the_world(handout):
         np.testing.assert_array_equal(strips[:, 0], strips[:, 4])
         for gate, strip in zip(GATES, strips, strict=True):
             local = [0.5 * edge * np.array([x, 0.0, z]) for x in (-1, 1) for z in (-1, 1)]
-            corners = [gate[1:4] + rotate(gate[4:8], corner) for corner in local]
+            corners = gate[1:4] + Rotation.from_quat(gate[4:8], scalar_first=True).apply(local)
             distances = np.linalg.norm(strip[:4, None] - corners, axis=2)
             assert distances.min(axis=0).max() < 1e-5  # every corner is there
             assert np.linalg.norm(np.diff(strip, axis=0), axis=1) == pytest.approx(edge, abs=1e-5)
@@ -228,7 +222,9 @@ def test_path_begins_anew_where_a_flight_does_and_times_of_a_log_are_kept(tmp_pa
     restarts = np.zeros(STEPS, bool)
     restarts[[0, 200, 201]] = True
     time_s = 7.0 + np.cumsum(np.random.default_rng(1).uniform(0.002, 0.02, STEPS))
-    found = write(tmp_path, viz.Trajectory("pieces", STATES, ACTIONS, time_s=time_s, restarts=restarts))
+    pieces = viz.Trajectory("pieces", STATES, ACTIONS, time_s=time_s, restarts=restarts)
+    viz.write_recording(tmp_path / "flight.rrd", [pieces], TRACK)
+    found = Recording(tmp_path / "flight.rrd")
     flown = found.rows["/world/trajectory/flown", "LineStrips3D:strips"][-1]
     assert [len(strip) for strip in flown] == [200, 1, 442 - 201]
     seconds = [nanoseconds * 1e-9 for _, nanoseconds in sorted(found.times["/world/drone"])]

@@ -22,6 +22,7 @@ from flytrack_env.wrappers import (
     RandomizationParams,
 )
 from flytrack_env.wrappers.domain_randomization import sample_model
+from tests.support.coasting import drone_at
 from tests.support.trees import stack
 from tests.support.wrapped_flights import ALL, NUM_ENVS, Flight, arrays, fly, resets_of, steps_of, wrapped
 
@@ -35,13 +36,6 @@ def same_model(delay_s: float = 0.0) -> RandomizationParams:
     still = Wind(0.0, 0.0, None, None, None, None)
     ends = (CommandDelay(delay_s, None, None), ThrustScale(1.0), still, LinearDrag(0.0, 0.0, 0.0))
     return RandomizationParams(1.0, 1.0, 1.0, 1.0, low=ends, high=ends)
-
-
-def state_of(state: Any, field: str) -> Any:
-    """Return the state of the outermost wrapper that has a field of that name."""
-    while not hasattr(state, field):
-        state = state.inner
-    return state
 
 
 @pytest.fixture(scope="module")
@@ -291,9 +285,7 @@ def with_time(steps: int, path: Any, leaf: jax.Array) -> jax.Array:
     return jnp.int32(steps) if getattr(path[-1], "name", "") == "time" else leaf
 
 
-def test_after_every_kind_of_end_an_episode_begins_as_if_nothing_had_been(
-    limited: Any, make_drone: Any
-) -> None:
+def test_after_every_kind_of_end_an_episode_begins_as_if_nothing_had_been(limited: Any) -> None:
     """The state after an end is that of a reset with the same key, in every leaf of every wrapper."""
     env, params, both = limited
     states, actions = [], []
@@ -301,7 +293,7 @@ def test_after_every_kind_of_end_an_episode_begins_as_if_nothing_had_been(
         drone, action = list(ENDS.values())[i % len(ENDS)]
         drone, applied = dict(drone), jax.tree.map(jnp.float32, Action(0.5, -0.5, 0.4, 0.3))
         steps = drone.pop("steps", 0)
-        state = env.begin(make_drone(**drone, applied=applied), 0, params, jnp.uint32(i))
+        state = env.begin(drone_at(**drone, applied=applied), 0, params, jnp.uint32(i))
         states.append(jax.tree_util.tree_map_with_path(partial(with_time, steps), state))
         actions.append(action)
     keys = jax.random.split(jax.random.key(7), NUM_ENVS)
@@ -355,11 +347,3 @@ def test_what_begins_depends_on_nothing_of_what_ended(limited: Any, flight: Flig
         for clean, after in zip(*found, strict=True):
             np.testing.assert_array_equal(np.asarray(clean), np.asarray(after))
             assert np.isfinite(np.asarray(after)).all()
-
-
-def test_an_episode_that_goes_on_does_depend_on_its_past(limited: Any, flight: Flight) -> None:
-    """So that the test above can see what survives."""
-    keys = jax.random.split(jax.random.key(1), NUM_ENVS)
-    found = [limited[2](keys, flight.start, np.full((NUM_ENVS, 4), stick))[0][1] for stick in (0.3, -0.3)]
-    histories = [np.asarray(state_of(state, "actions").actions[0].roll) for state in found]
-    assert not np.array_equal(*histories)

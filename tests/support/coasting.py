@@ -1,0 +1,61 @@
+"""Drones, rows of gates, and a plant that flies straight on through them."""
+
+from functools import cache
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from flytrack_env.dynamics import ModelParameters
+from flytrack_env.env import FlyTrack
+from flytrack_env.plants import Plant
+from flytrack_env.quaternion import Quaternion, Scalar, Vec3
+from flytrack_env.state import Action, Drone
+from flytrack_env.tracks import Gate, Track
+
+FACING_X = (0.5**0.5, 0.0, 0.0, -(0.5**0.5))  # yaw -90 degrees: the gate's local +y is world +x
+
+
+class Coasting(Plant):
+    """A plant that flies straight on at constant velocity, whatever the command."""
+
+    def reset(self, drone: Drone, model: ModelParameters) -> Drone:
+        """Return the drone."""
+        return drone
+
+    def step(self, state: Drone, command: Action, dt: Scalar, model: ModelParameters) -> Drone:
+        """Return the drone moved along its velocity."""
+        return state._replace(pos_w=state.pos_w + state.vel_w.scale(dt))
+
+    def drone(self, state: Drone) -> Drone:
+        """Return the drone."""
+        return state
+
+
+def drone_at(
+    position: Any, velocity: Any = (0.0, 0.0, 0.0), quat: Any = (1.0, 0.0, 0.0, 0.0), **fields: Any
+) -> Drone:
+    """Return a drone of float32 leaves; ``fields`` replace the other parts of its state."""
+    drone = Drone(
+        pos_w=Vec3(*position),
+        vel_w=Vec3(*velocity),
+        acc_w=Vec3(0.0, 0.0, 0.0),
+        quat=Quaternion(*quat),
+        rates_b=Vec3(0.0, 0.0, 0.0),
+        applied=Action(0.0, 0.0, 0.0, 0.0),
+        battery_v=23.5,
+    )
+    return jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32), drone._replace(**fields))
+
+
+def track_of_row(distances: list[float]) -> Track:
+    """Return a track of gates in a row along +x at these x, flown towards +x."""
+    gates = tuple(Gate(i, (x, 0.0, 2.0), FACING_X, 1.0, 1.5, 2.7) for i, x in enumerate(distances))
+    low, high = (min(distances) - 100.0, -50.0, 0.0), (max(distances) + 100.0, 50.0, 50.0)
+    return Track("row", gates, (min(distances) - 5.0, 0.0, 2.0), (1.0, 0.0, 0.0, 0.0), low, high)
+
+
+@cache
+def coasting_env(*distances: float) -> FlyTrack:
+    """Return the environment of a drone that coasts along a row of gates."""
+    return FlyTrack(track=track_of_row(list(distances)), plant=Coasting())
