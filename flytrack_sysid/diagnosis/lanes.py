@@ -125,7 +125,7 @@ def make_lanes(log: FlightLog, judged: np.ndarray, tau: np.ndarray, gravity: flo
     )
     counts = np.repeat(np.stack([side[index] for side in sides], axis=-1), SIZES, axis=-2)
     counts &= is_real[..., None, None]
-    sensed = {name: found[name][index] for name in ("w", "f") if name in found}
+    sensed: dict[str, np.ndarray] = {name: found[name][index] for name in ("w", "f") if name in found}
     record = Record(*(leaf[index] for leaf in record))
     begins = record.begins | (np.arange(len(index)) == 0)[:, None] | (index < 0)
     certain = np.stack([turns, lifts, np.ones_like(turns)], axis=-1)
