@@ -1,8 +1,8 @@
 """Multi-step prediction: free flight from measured states, many windows at once, differentiable.
 
-A window begins with a lead-in, in which the measured states are fed in, body rates too where there is a gyro,
-and the commands settle the applied action and the memories of effects. Then the model flies by itself under
-the logged commands.
+A window begins with a lead-in, in which the measured states are fed in, body rates too where there is a gyro
+(as it read them, by the model's latency, later), and the commands settle the applied action and the memories
+of effects. Then the model flies by itself under the logged commands.
 """
 
 from typing import Any, NamedTuple
@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from flytrack_env.dynamics import ModelParameters, advance, body_rates, observe_rates, read_gyro
-from flytrack_env.effects import MOST_STEPS, start_memories
+from flytrack_env.effects import MOST_STEPS, ImuLatency, start_memories
 from flytrack_env.quaternion import Quaternion, Vec3
 from flytrack_env.state import Action, Drone
 from flytrack_sysid.log import FlightLog, usual_step
@@ -124,6 +124,24 @@ def _turn(measured: Quaternion, predicted: Quaternion) -> jax.Array:
     return vector * jnp.where(is_small, 2.0, angle / sine)
 
 
+def _gyro_in_time(
+    gyro_b: jax.Array, step_s: Any, model: ModelParameters
+) -> tuple[jax.Array, ModelParameters]:
+    """Return what the gyro read of each row's own time, and the model of a gyro that is not late.
+
+    Rates that were corrected by late readings would be corrected again until those arrive, and diverge.
+    """
+    late = [one for one in model.effects if isinstance(one, ImuLatency)]
+    if not late:
+        return gyro_b, model
+    latency_s = late[0].latency_s
+    row = jnp.arange(len(gyro_b)) + latency_s / step_s
+    before = jnp.clip(jnp.floor(row).astype(int), 0, len(gyro_b) - 2)
+    share = jnp.clip(row - before, 0.0, 1.0)[:, None]
+    read = gyro_b[before] + share * (gyro_b[before + 1] - gyro_b[before])
+    return read, model.with_effects(ImuLatency(jnp.zeros_like(latency_s)))
+
+
 def _fly(model: ModelParameters, record: Record, gyro_b: jax.Array, windows: Windows) -> jax.Array:
     """Return the errors of one window at its horizons, (horizons, 12)."""
 
@@ -131,18 +149,19 @@ def _fly(model: ModelParameters, record: Record, gyro_b: jax.Array, windows: Win
         (flown, memories), (row, is_free, gyro) = carry, inputs
         applied = where_true(row.is_applied_known, Action(*row.applied), flown.applied)
         drone = where_true(is_free, flown, measured_drone(row, applied, flown.rates_b))
-        beside = Vec3(*gyro) - read_gyro(drone, memories, row.step_s, model)
+        beside = Vec3(*gyro) - read_gyro(drone, memories, row.step_s, in_time)
         seen = observe_rates(drone, memories, drone.rates_b + beside, row.step_s, model)
         drone, memories = where_true(windows.has_gyro & ~is_free, seen, (drone, memories))
         after, later = advance(drone, memories, Action(*row.command), row.step_s, model)
         gyro = read_gyro(after, later, row.step_s, model)
         return (after, later), (after.pos_w, after.vel_w, after.quat, gyro)
 
+    read_b, in_time = _gyro_in_time(gyro_b, record.step_s, model)
     first = jax.tree.map(lambda leaf: leaf[0], record)
     applied = Action(*first.applied)
     start = measured_drone(first, applied, body_rates(applied, model.max_rate))
     memories = start_memories(model.effects, start, MOST_STEPS)
-    _, flown = jax.lax.scan(one, (start, memories), (record, windows.is_free, gyro_b))
+    _, flown = jax.lax.scan(one, (start, memories), (record, windows.is_free, read_b))
     pos, vel, quat, gyro = jax.tree.map(lambda leaf: leaf[windows.ends - 1], flown)
     row, gyro_b = jax.tree.map(lambda leaf: leaf[windows.ends], (record, gyro_b))
     turn = jax.vmap(_turn)(Quaternion(*row.quat.T), quat)

@@ -12,7 +12,15 @@ from benchmarks.hidden import draw_base, draw_outside, fly, measure
 from flytrack_env.effects import BY_NAME
 from flytrack_sysid.diagnosis.lanes import make_lanes
 from flytrack_sysid.diagnosis.problem import Problem
-from flytrack_sysid.diagnosis.refinement import Judge, at_bounds, placebo_errors, refine, widened, windows_of
+from flytrack_sysid.diagnosis.refinement import (
+    Judge,
+    at_bounds,
+    errors_at,
+    placebo_errors,
+    refine,
+    widened,
+    windows_of,
+)
 from flytrack_sysid.diagnosis.score_test import BASE_FREE, CANDIDATES
 from flytrack_sysid.diagnosis.search import FittedModel, Held, SearchState
 from flytrack_sysid.diagnosis.summary import reduced
@@ -21,6 +29,7 @@ from flytrack_sysid.log import FlightLog
 from flytrack_sysid.parameters import from_vector
 from flytrack_sysid.prediction import predict
 from flytrack_sysid.prediction_errors import rollout_errors
+from flytrack_sysid.prediction_windows import QUANTITIES
 from flytrack_sysid.record import fill_gaps
 from flytrack_sysid.split import held_out_rows
 
@@ -103,6 +112,19 @@ def test_the_base_is_free_where_an_effect_that_held_it_is_gone(dragged):
     after = reduced(selection, found._replace(kept=(), fit=None))
     assert after.model is base and not after.state.held
     assert set(base.places) <= set(after.state.every_place)
+
+
+@pytest.mark.parametrize("step_s", [0.01, 0.005])
+def test_a_late_gyro_starts_flights_at_the_rates_of_their_time(step_s):
+    """However many steps late: a rate that is corrected by a late reading is corrected until that arrives."""
+    truth, log = flown(effects={"imu_latency": {"latency_s": 3.7 * step_s}}, step_s=step_s)
+    with jax.enable_x64(True):
+        problem, windows = problem_of(truth, log), windows_of(log, held_out_rows(log))
+        late = problem.start.copy()
+        late[problem.names.index("imu_latency.latency_s")] = 3.7 * step_s
+        base, own = errors_at(problem, np.stack([problem.start, late]), windows).rms()
+    rates = QUANTITIES.index("rates")
+    assert np.all(own <= 1.05 * base) and np.all(own[:4, rates] < 0.8 * base[:4, rates])
 
 
 @pytest.mark.slow  # the first test sees that a refinement makes none worse
