@@ -49,9 +49,10 @@ def paragraph(measured: Record) -> str:
 def _values(found: Record) -> str:
     texts = []
     for cause in found["causes"]:
+        told = cause["parameters"]
+        told = {name: one for name, one in told.items() if name == "mean_factor"} or told
         values = [
-            f"{name.replace('_', ' ')} {number(one['value'], one['unit'])}"
-            for name, one in cause["parameters"].items()
+            f"{name.replace('_', ' ')} {number(one['value'], one['unit'])}" for name, one in told.items()
         ]
         if len(values) <= MOST_VALUES:
             texts.append(f"{words_of(cause['effect'])}: {', '.join(values)}")
@@ -127,12 +128,12 @@ def draw(measured: Record) -> Figure | None:
 def causes_table(found: Record) -> str:
     """Return the causes with intervals, gains and what they may be confused with."""
     rows = []
-    for cause in found["causes"]:
+    for cause in (*found["causes"], *found.get("beyond_the_list", ())):
         values = "<br>".join(
             f"{name} {number(one['value'], one['unit'])} ({' to '.join(map(number, one['ci95']))})"
             for name, one in cause["parameters"].items()
         )
-        values += f"<br>**beyond the list: {cause['beyond']}**" if cause["beyond"] else ""
+        values += f"<br>**not named; beyond the list: {cause['beyond']}**" if cause["beyond"] else ""
         rival = cause["closest_rival"]
         against = f"no (closest: {rival})" if rival else "not tried"
         gains = (cause["chi2_gain"], cause["heldout_gain"], cause["lambda"], cause["lambda_sep"])

@@ -34,6 +34,7 @@ from flytrack_sysid.diagnosis.summary import (
     base_causes,
     changed_parameters,
     effect_causes,
+    effects_at_end,
     errors_of,
     half_responses_of,
     model_of,
@@ -41,6 +42,7 @@ from flytrack_sysid.diagnosis.summary import (
     prediction_of,
     reduced,
     refinement_notes,
+    refusal_note,
     sensor_noise,
     stand_in_notes,
     vector_without,
@@ -49,7 +51,7 @@ from flytrack_sysid.diagnosis.summary import (
     with_lost_causes,
     with_refined_values,
 )
-from flytrack_sysid.diagnosis.vetoes import Selection, apply_vetoes, select
+from flytrack_sysid.diagnosis.vetoes import Selection, apply_vetoes, reject, select
 from flytrack_sysid.log import FlightLog
 from flytrack_sysid.split import HELD_OUT_EVERY, held_out_rows
 
@@ -105,9 +107,10 @@ def diagnose(
         test = held_out_under(selection, parts.test)
         selection, contradicted = apply_vetoes(selection, test)
         report(2, len(STAGES))
-        refined = refined_by_prediction(selection, parts)
+        selection, refined, at_end, lost = refined_within_range(selection, test, parts)
         report(3, len(STAGES))
-        found = summarize(selection, contradicted, refined, parts._replace(test=test))
+        parts = parts._replace(test=test, warnings=(*parts.warnings, *at_end))
+        found = summarize(selection, [*contradicted, *lost], refined, parts)
         nominal = nominal_parameters() if model is None else model
         nominal = nominal._replace(motion=found.extended.motion)
         found = replace(found, nominal=nominal)
@@ -178,6 +181,26 @@ def held_out_under(selection: Selection, test: Problem) -> Problem:
     return replace(test.with_noise(problem.noise), windows=problem.windows)
 
 
+def refined_within_range(
+    selection: Selection, test: Problem, parts: Split
+) -> tuple[Selection, Refined, list[str], list[str]]:
+    """Return a selection and its refinement, without effects that end where the search does.
+
+    A law that fits best beyond anything known stands in for another one, and bends the values of the rest.
+    Also returned: a warning of each such effect, and names that held-out rows contradict.
+    """
+    at_end: list[str] = []
+    contradicted: list[str] = []
+    while True:
+        refined = refined_by_prediction(selection, parts)
+        stuck = effects_at_end(selection, refined)
+        if not stuck:
+            return selection, refined, at_end, contradicted
+        at_end += [refusal_note(effect, where) for effect, where in stuck.items()]
+        selection, lost = apply_vetoes(reject(selection, tuple(stuck)), test)
+        contradicted += lost
+
+
 def refined_by_prediction(selection: Selection, parts: Split) -> Refined:
     """Return which effects of a selected model predict held-out flights better than its base does.
 
@@ -220,25 +243,29 @@ def summarize(selection: Selection, contradicted: Sequence[str], refined: Refine
             return vector_without(cause, selection, linearization)
         return refined.vector_without(cause.effect)
 
-    causes, negligible = split_by_size(found, problem, extended.vector, refined.flight_errors, without)
+    found, negligible = split_by_size(found, problem, extended.vector, refined.flight_errors, without)
+    causes, beyond = (
+        tuple(one for one in found if bool(one.beyond) is is_at_end) for is_at_end in (False, True)
+    )
     vectors = {"nominal": problem.start, "refitted_base": selection.base.vector, "extended": extended.vector}
     extended = at_end(selection, extended)
-    limits = not_identifiable(state, linearization, model, (*causes, *negligible))
+    limits = not_identifiable(state, linearization, model, (*found, *negligible))
     flying = {**vectors, "extended": extended.vector}
     prediction = prediction_of(refined, flying)
     outliers = outliers_of((problem, test), vectors["extended"])
     notes = [
         *outlier_notes(outliers),
-        *warnings_of(problem, causes, lost),
+        *warnings_of(problem, found, lost),
         *refinement_notes(refined),
         *stand_in_notes(selection, flying["extended"]),
         *notes_of(selection, linearization, parts.log),
     ]
     rest = with_lost_causes(selection.unexplained, lost)
     return Diagnosis(
-        verdict=verdict_of(causes, rest),
+        verdict=verdict_of(causes, rest, beyond),
         causes=causes,
         negligible=negligible,
+        beyond=beyond,
         unexplained=rest,
         not_identifiable=limits,
         error=errors_of(test, vectors, prediction),

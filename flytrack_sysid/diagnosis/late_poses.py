@@ -69,5 +69,8 @@ def with_late_poses(
     found = replace(found, changed=(*found.changed, changed))
     if abs(late_s - before_s) < EFFECT.notable["latency_s"]:
         return replace(found, negligible=(cause, *found.negligible))
-    causes = (cause, *found.causes)
-    return replace(found, causes=causes, verdict=verdict_of(causes, found.unexplained))
+    if cause.beyond:
+        found = replace(found, beyond=(cause, *found.beyond))
+    else:
+        found = replace(found, causes=(cause, *found.causes))
+    return replace(found, verdict=verdict_of(found.causes, found.unexplained, found.beyond))

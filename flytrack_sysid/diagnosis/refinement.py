@@ -348,12 +348,15 @@ class Refined(NamedTuple):
         return vector
 
     def flight_errors(self, vector: np.ndarray) -> dict[str, float]:
-        """Return the held-out position errors of free flight, m, by seconds; empty where none was judged."""
+        """Return the held-out errors of free flight by seconds; empty where none was judged.
+
+        Of position, or of what the log has instead: attitude, or else rates.
+        """
         if self.judge is None:
             return {}
-        return table_of(errors_at(self.problem, vector[None], self.judge.windows).rms()[0]).get(
-            "position_m", {}
-        )
+        found = table_of(errors_at(self.problem, vector[None], self.judge.windows).rms()[0])
+        keys = (f"{name}_{UNITS[name].replace('/', '_per_')}" for name in ("position", "attitude", "rates"))
+        return next((found[key] for key in keys if key in found), {})
 
 
 def windows_of(log: FlightLog, rows: np.ndarray) -> Windows | None:
@@ -515,8 +518,8 @@ class _Refinement(NamedTuple):
             removed.append(tried[weakest].effect)
             places = self.places(target.problem, kept)
             fit = target.fitted(fits[weakest].vector, places, MOST_ROUNDS)
-        if not kept:
-            return found._replace(kept=(), fit=None, removed=tuple(removed), without={})
+        if not any(one.effect in self.acting for one in kept):  # the base as single steps have it stands
+            return found._replace(kept=tuple(kept), fit=None, removed=tuple(removed), without={})
         return found._replace(kept=tuple(kept), fit=fit, removed=tuple(removed), without=without)
 
     def _without(self, target: Target, fit: Fit, kept: Sequence[Candidate], one: Candidate) -> Fit:

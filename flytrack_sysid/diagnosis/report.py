@@ -33,6 +33,7 @@ BARS_HEIGHT_IN = 2.6
 MOST_LISTED = 3  # names in one cell
 LIMITED_S = 1e-3  # by which a step to full stick takes longer where a limit acts
 NO_BREAK = "\u00a0"  # a space at which lines do not break
+AS_CLOSE, LEAST_SHARE = "as close", 0.5  # % of an error: what changes by less has not changed
 HEADLINE_HORIZON = "1"  # s of free flight, whose error the first sentence gives
 WRONG = "has the wrong value of"
 LOG_BARS = 20.0  # times the smallest error: from there on bars would vanish on an even scale
@@ -142,11 +143,32 @@ def _gain(diagnosis: Diagnosis) -> str:
     if not np.isfinite(before + after):
         return ""
     names = ", ".join(cause.effect for cause in diagnosis.causes)
+    text = f"Named {names}: flies {_closer(before, after)} after 1 s"
+    details = [f"{after:.2g} m instead of {before:.2g} m on held-out flight"]
+    if np.isfinite(refitted):
+        by_effects = _closer(refitted, after)
+        others = (
+            "no effect adds to that" if by_effects == AS_CLOSE else f"with effects {by_effects} than that"
+        )
+        details.append(f"refitted without effects, {refitted:.2g} m: {others}")
+    blind = diagnosis.prediction.errors.get("placebo", {}).get("position_m", {}).get(HEADLINE_HORIZON, np.inf)
+    if blind <= after:
+        details.append(f"a guess that ignores the commands, {blind:.2g} m")
+    return f"{text} ({'; '.join(details)})."
+
+
+def _closer(before: float, after: float) -> str:
+    """Return by how much an error fell, "13 % closer"."""
     share = 100.0 * (1.0 - after / before)
-    change = f"{abs(share):.0f} % {'closer' if share > 0.0 else 'farther off'}"
-    text = f"Named {names}: flies {change if abs(share) >= 0.5 else 'as close'} after 1 s"
-    alone = f"; refitted without effects, {refitted:.2g} m" if np.isfinite(refitted) else ""
-    return f"{text} ({after:.2g} m instead of {before:.2g} m on held-out flight{alone})."
+    if abs(share) < LEAST_SHARE:
+        return AS_CLOSE
+    return f"{abs(share):.0f} % {'closer' if share > 0.0 else 'farther off'}"
+
+
+def _beyond(diagnosis: Diagnosis) -> str:
+    """Return what has a value at the end of what is searched, as a sentence; nothing without any."""
+    listed = "; ".join(f"{words_of(cause.effect)} ({cause.beyond})" for cause in diagnosis.beyond)
+    return f"Beyond the list, so that its cause may be another: {listed}." if listed else ""
 
 
 def verdict_of(diagnosis: Diagnosis) -> Verdict:
@@ -155,12 +177,14 @@ def verdict_of(diagnosis: Diagnosis) -> Verdict:
     depends = f" It depends on {', '.join(left.depends_on)}." if left.depends_on else ""
     if diagnosis.verdict == CONSISTENT:
         return Verdict("The log agrees with the model: the residuals look like sensor noise.", "good")
+    beyond = _beyond(diagnosis)
     if not diagnosis.causes:
-        return Verdict(f"The model is wrong, and no known cause explains it.{depends}", "open")
-    text = f"{_faults(diagnosis)} {_gain(diagnosis)}".strip()
-    if diagnosis.verdict == CAUSES_FOUND:
-        return Verdict(text, "found")
-    return Verdict(f"{text} Something else remains that no known cause explains.{depends}", "open")
+        text = f"The model is wrong, and no known cause explains it.{depends}"
+        return Verdict(" ".join(filter(None, [text, beyond])), "open")
+    parts = [_faults(diagnosis), _gain(diagnosis), beyond]
+    if left.flagged:
+        parts.append(f"Something else remains that no known cause explains.{depends}")
+    return Verdict(" ".join(filter(None, parts)), "found" if diagnosis.verdict == CAUSES_FOUND else "open")
 
 
 def _causes_part(diagnosis: Diagnosis) -> Part:

@@ -154,11 +154,12 @@ class Diagnosis:
 
     verdict: consistent, causes_found, unexplained, or "causes_found+unexplained". error: by model: nominal,
     refitted_base, extended, noise_floor. nominal, base, extended: the models, with the motion that the log
-    shows. negligible: what is significant and too small to matter. source, sha256: of the log.
-    noise: by channel and axis, fitted standard deviations of the sensors. voltages: the lowest and the
-    highest of the battery that were learnt from, V; None where it was not measured. prediction: how far ahead
-    the models predict. changed: every parameter of the extended model that is not as in the nominal one.
-    half_response_s: by model (nominal, refitted_base, extended) and by stick. outliers: by channel, if any.
+    shows. negligible: what is significant and too small to matter. beyond: what has a value at the end of
+    what is searched, so that it is not named. source, sha256: of the log. noise: by channel and axis, fitted
+    standard deviations of the sensors. voltages: the lowest and the highest of the battery that were learnt
+    from, V; None where it was not measured. prediction: how far ahead the models predict. changed: every
+    parameter of the extended model that is not as in the nominal one. half_response_s: by model (nominal,
+    refitted_base, extended) and by stick. outliers: by channel, if any.
     """
 
     verdict: str
@@ -175,6 +176,7 @@ class Diagnosis:
     voltages: tuple[float, float] | None = None
     warnings: tuple[str, ...] = ()
     negligible: tuple[Cause, ...] = ()
+    beyond: tuple[Cause, ...] = ()
     prediction: Prediction = Prediction()
     changed: tuple[Changed, ...] = ()
     half_response_s: Mapping[str, Mapping[str, HalfResponse]] = field(default_factory=dict)
@@ -182,10 +184,10 @@ class Diagnosis:
 
     def as_json(self) -> dict[str, Any]:
         """Return the content of diagnosis.json: the fields under the names of its schema, six digits."""
-        causes, negligible = _plain((self.causes, self.negligible))
+        causes, negligible, beyond = _plain((self.causes, self.negligible, self.beyond))
         limits, unexplained = _plain((self.not_identifiable, self.unexplained))
         unexplained["times_sensor_noise"] = unexplained.pop("shares")
-        for cause in (*causes, *negligible):
+        for cause in (*causes, *negligible, *beyond):
             cause |= {"lambda": cause.pop("lambda_"), "closest_rival": cause.pop("closest")}
         for limit in limits:
             limit["smallest_detectable"] = {"value": limit.pop("smallest"), "unit": limit.pop("unit")}
@@ -194,6 +196,7 @@ class Diagnosis:
             "verdict": self.verdict,
             "causes": causes,
             "negligible": negligible,
+            "beyond_the_list": beyond,
             "unexplained": unexplained,
             "not_identifiable": limits,
             "motion": self.extended.motion.value,

@@ -63,7 +63,34 @@ def estimates(
         ends = max(value - half, low), min(value + half, high)
         name = field.split(".")[-1]
         result[name] = Estimated(value, (float(ends[0]), float(ends[1])), unit_of_parameter(field))
+    if tuple(fields) == THRUST_COEFFS:
+        half = Marginal(linearization, model, fields).half_widths(mean_thrust(problem)[None])
+        result |= mean_factor(problem, model.vector, float(half[0]))
     return result
+
+
+def mean_thrust(problem: Problem) -> np.ndarray:
+    """Return the mean thrust of the rows that are judged, N, per unit of each thrust coefficient, (6,)."""
+    record, flown = problem.lanes.record, problem.counts.any(axis=(2, 3))
+    return np.array(
+        [
+            np.mean(np.asarray(collective_thrust(record.command[..., 3], record.battery_v, coeffs))[flown])
+            for coeffs in np.eye(len(THRUST_COEFFS))
+        ]
+    )
+
+
+def mean_factor(problem: Problem, vector: np.ndarray, half_n: float) -> dict[str, Estimated]:
+    """Return how much more thrust there is in the mean than the nominal model has: coefficients tell nobody.
+
+    half_n: half of the 95 % interval of the mean thrust, N. Empty where the nominal one has none.
+    """
+    places, slopes = problem.index(THRUST_COEFFS), mean_thrust(problem)
+    before, after = (float(slopes @ own[places]) for own in (problem.start, vector))
+    if before <= 0.0:
+        return {}
+    factor, half = after / before, half_n / before
+    return {"mean_factor": Estimated(factor, (factor - half, factor + half), "1")}
 
 
 def half_responses_of(
@@ -238,13 +265,14 @@ def not_identifiable(
     return tuple(result)
 
 
-def verdict_of(causes: Sequence[Cause], rest: Unexplained) -> str:
-    """Return the verdict, as in ``Diagnosis``."""
-    if causes and rest.flagged:
+def verdict_of(causes: Sequence[Cause], rest: Unexplained, beyond: Sequence[Cause]) -> str:
+    """Return the verdict, as in ``Diagnosis``; what is beyond the list is explained by no known cause."""
+    is_open = rest.flagged or bool(beyond)
+    if causes and is_open:
         return f"{CAUSES_FOUND}+{UNEXPLAINED}"
     if causes:
         return CAUSES_FOUND
-    return UNEXPLAINED if rest.flagged else CONSISTENT
+    return UNEXPLAINED if is_open else CONSISTENT
 
 
 def model_of(problem: Problem, model: FittedModel) -> ModelParameters:
@@ -335,21 +363,30 @@ def errors_of(test: Problem, vectors: Mapping[str, np.ndarray], prediction: Pred
 
 
 def reduced(selection: Selection, refined: Refined) -> Selection:
-    """Return the selection with only those effects that a refinement kept; its base alone without any."""
-    model = selection.model
-    if refined.kept == model.candidates:
+    """Return the selection with only those effects that a refinement kept; its base alone without any.
+
+    Effects of sensors that held-out flights do not see stay unless the base fitted beside them flies worse.
+    """
+    model, judge = selection.model, refined.judge
+    if refined.fit is not None:
+        if refined.kept == model.candidates:
+            return selection
+        return selection._replace(model=model._replace(candidates=refined.kept, places=refined.fit.places))
+    is_whole = bool(model.candidates) and refined.kept == model.candidates
+    if is_whole and (judge is None or not judge.is_surely_worse(model.vector)):
         return selection
-    if refined.fit is None:
-        state, base = selection.state, selection.base
-        # What an effect that is gone held at nominal is free again, as it was when the base was fitted.
-        held = tuple(one for one in state.held if state.problem.names.index(one.field) not in base.places)
-        return selection._replace(state=replace(state, held=held), model=base)
-    return selection._replace(model=model._replace(candidates=refined.kept, places=refined.fit.places))
+    state, model = selection.state, selection.base
+    # What an effect that is gone held at nominal is free again, as it was when the base was fitted.
+    held = tuple(one for one in state.held if state.problem.names.index(one.field) not in model.places)
+    state = replace(state, held=held)
+    if refined.kept:
+        tried = state.fitted(refined.kept, model.vector)
+        model = model if judge is not None and judge.worst_ratio(tried.vector) >= 1.0 else tried
+    return selection._replace(state=state, model=model)
 
 
-def _is_beyond(refined: Refined, vector: np.ndarray, field: str) -> str:
+def _is_beyond(problem: Problem, vector: np.ndarray, field: str) -> str:
     """Return which way a parameter would go if it were searched farther; nothing within its range."""
-    problem = refined.problem
     if not at_bounds(problem, vector, [field]):
         return ""
     place = problem.names.index(field)
@@ -357,6 +394,41 @@ def _is_beyond(refined: Refined, vector: np.ndarray, field: str) -> str:
     unit = unit_of_parameter(field)
     size = f"{vector[place]:.3g}" + ("" if unit == "1" else f" {unit}")
     return f"{field.split('.')[-1]} at {'most' if is_low else 'least'} {size}"
+
+
+def effects_at_end(selection: Selection, refined: Refined) -> dict[str, str]:
+    """Return effects with a value at the end of what is searched, each with which way it would go.
+
+    Left out are values that the log does not determine, which end anywhere, and delays that end at how many
+    rows are remembered: their law holds.
+    """
+    problem, model = selection.state.problem, selection.model
+    searched, vector = problem, model.vector
+    if refined.fit is not None:
+        searched, vector = refined.problem, refined.fit.vector
+    result = {}
+    for one in refined.kept:
+        steps = [f"{one.effect}.{field}" for field in BY_NAME[one.effect].most_steps]
+        stuck = [field for field in at_bounds(searched, vector, one.fields) if field not in steps]
+        if not stuck:
+            continue
+        marginal = Marginal(selection.state.linearized(model.vector)[1], model, one.fields)
+        widths = dict(zip(one.fields, marginal.half_widths(), strict=True))
+        ranges = dict(zip(problem.names, problem.high - problem.low, strict=True))
+        where = [
+            _is_beyond(searched, vector, field) for field in stuck if widths[field] < LOOSE * ranges[field]
+        ]
+        if where:
+            result[one.effect] = ", ".join(where)
+    return result
+
+
+def refusal_note(effect: str, where: str) -> str:
+    """Return a warning of an effect that was refused for ending where the search does."""
+    return (
+        f"{effect} would fit best with {where}, the end of what is searched: the cause is beyond the "
+        f"list, and {effect} is not in the extended model"
+    )
 
 
 def with_refined_values(causes: Sequence[Cause], refined: Refined, vector: np.ndarray) -> tuple[Cause, ...]:
@@ -374,11 +446,16 @@ def with_refined_values(causes: Sequence[Cause], refined: Refined, vector: np.nd
                 value, low, high = (float(one[place]) for one in (vector, problem.low, problem.high))
                 ends = max(value - half[place], low), min(value + half[place], high)
                 values[field.split(".")[-1]] = Estimated(value, ends, unit_of_parameter(field))
+        if "mean_factor" in values and fit is not None:
+            own = [fit.places.index(place) for place in problem.index(THRUST_COEFFS)]
+            slopes = mean_thrust(problem)
+            half_n = float(np.sqrt(slopes @ fit.covariance[np.ix_(own, own)] @ slopes))
+            values |= mean_factor(problem, vector, half_n)
         if len(fields) == 1 and fit is not None and "." not in fields[0]:
             low, high = values[fields[0]].ci95
             if low <= problem.start[problem.names.index(fields[0])] <= high:
                 continue  # a lag that single steps show and flights do not
-        beyond = ", ".join(filter(None, (_is_beyond(refined, vector, field) for field in fields)))
+        beyond = ", ".join(filter(None, (_is_beyond(problem, vector, field) for field in fields)))
         result.append(replace(cause, parameters=values, beyond=beyond))
     return tuple(result)
 
@@ -474,13 +551,8 @@ def stand_in_notes(selection: Selection, vector: np.ndarray) -> list[str]:
     for name in (one for one in selection.stand_ins if one in BASE_CAUSES):
         size = ""
         if name == "thrust_curve":
-            record, places = problem.lanes.record, problem.index(THRUST_COEFFS)
-            flown = problem.counts.any(axis=(2, 3))
-            before, after = (
-                np.mean(np.asarray(collective_thrust(record.command[..., 3], record.battery_v, own))[flown])
-                for own in (problem.start[places], vector[places])
-            )
-            size = f" (thrust or your mass by {after / before - 1.0:+.1%} in the mean)"
+            for factor in mean_factor(problem, vector, 0.0).values():
+                size = f" (thrust or your mass by {factor.value - 1.0:+.1%} in the mean)"
         notes.append(
             f"{name} differs in the extended model{size}, but is not named: "
             "what remains unexplained could pass for it"

@@ -11,6 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from flytrack_env.effects import BY_NAME
+from flytrack_sysid.diagnosis.lanes import AXES
 from flytrack_sysid.diagnosis.model_selection import (
     Ablation,
     base_changes,
@@ -20,7 +21,7 @@ from flytrack_sysid.diagnosis.model_selection import (
 )
 from flytrack_sysid.diagnosis.problem import Problem, blocks_of
 from flytrack_sysid.diagnosis.result import CHANNELS, Unexplained
-from flytrack_sysid.diagnosis.score_test import threshold
+from flytrack_sysid.diagnosis.score_test import BASE_CAUSES, threshold
 from flytrack_sysid.diagnosis.search import FittedModel, SearchState
 from flytrack_sysid.diagnosis.unexplained import (
     SIDES,
@@ -32,11 +33,14 @@ from flytrack_sysid.diagnosis.unexplained import (
     linearized_residuals,
     whitened,
 )
+from flytrack_sysid.record import Record
 
 # Held-out rows contradict a cause where it gains so many standard deviations less than it would if it were
 # there, and less than that share of its size is there: laws are not exact where they are flown harder.
 HELD_OUT_SIGMAS, HELD_OUT_SHARE = 4.0, 0.35
 HELD_OUT_SHOWN = 20.0  # of chi2: held-out rows that would show less contradict nothing
+# Commands rest that have changed by no more than that share of the largest for so long.
+REST_S, REST_SHARE = 0.1, 0.1
 # A choice among many effects finds what fits the noise of one log: an effect that gains less than so many
 # thresholds has to gain on held-out rows, too, if they would show that much chi2 of it.
 BARELY, BARELY_SHOWN = 2.0, 1.0
@@ -48,7 +52,8 @@ FORCE_REMAINDER = 0.0025
 BASE_REMAINDER = 0.01
 # A name on a side that something unknown disturbs needs so many thresholds; one that keeps less than that
 # share of its noncentrality beside what the unknown depends on stood in for it.
-DISTURBED, KEPT_SHARE = 3.0, 0.1
+# Base changes, which absorb remainders easily, need more.
+DISTURBED, DISTURBED_BASE, KEPT_SHARE = 3.0, 10.0, 0.1
 # What stands in for something unknown takes up a part of it: a name that explains so many times what the
 # dependences do is no stand-in, and they are the remainder of its law.
 OUTWEIGHS = 30.0
@@ -183,7 +188,8 @@ def find_stand_ins(
         least = threshold(one.num_parameters)
         rest_gain = sum(dependence.gain for dependence in dependences if dependence.side == own_side)
         is_gone = after < least or (after < KEPT_SHARE * before and one.robust < OUTWEIGHS * rest_gain)
-        if is_gone or (own_side in disturbed and one.robust < DISTURBED * least):
+        needed = least * (DISTURBED_BASE if one.name in BASE_CAUSES else DISTURBED)
+        if is_gone or (own_side in disturbed and one.robust < needed):
             result.append(one.name)
     return result
 
@@ -222,6 +228,49 @@ def contradicted_on_held_out(selection: Selection, test: Problem) -> list[str]:
     return [effect for effect, one in selection.ablations.items() if is_rejected(one)]
 
 
+def rests(record: Record) -> np.ndarray:
+    """Return where the rate commands have rested for a while, (rows, lanes) bool; record: in lanes."""
+    sticks = record.command[..., :3]
+    rows = max(round(REST_S / float(np.median(record.step_s))), 1)
+    before = np.pad(sticks, ((rows, 0), (0, 0), (0, 0)), mode="edge")
+    moved = np.ptp(np.lib.stride_tricks.sliding_window_view(before, rows + 1, axis=0), axis=-1)
+    return np.asarray(moved.max(axis=-1) <= REST_SHARE * np.abs(sticks).max(axis=-1))
+
+
+def contradicted_at_rest(selection: Selection, test: Problem) -> list[str]:
+    """Reject laws of rotation without memory that do not hold while the commands rest, each or all together.
+
+    What is there in transients only is dynamics that no list has: feedforward, say, turns faster than asked
+    for on the way to full stick, as a scale and a saturation would, and not while the stick stays there.
+    """
+    state, model = selection.state, selection.model
+    laws = [name for name in selection.ablations if _is_law_of_rotation(name)]
+    if not laws:
+        return []
+    at_rest = rests(state.problem.lanes.record)
+
+    def is_rejected(without: np.ndarray, inflation: float) -> bool:
+        white = state.problem.whitened_residuals(without, model.vector)
+        less, full = white[:, at_rest][..., AXES[0], :]
+        gain, expected = float(np.sum(less**2) - np.sum(full**2)), float(np.sum((less - full) ** 2))
+        return is_contradicted(gain, expected, inflation)
+
+    ablations = [selection.ablations[name] for name in laws]
+    alone = [is_rejected(one.without.vector, one.inflation) for one in ablations]
+    if any(alone) or len(laws) < 2:
+        return [name for name, is_false in zip(laws, alone, strict=True) if is_false]
+    without = model
+    for name in laws:  # a scale needs the saturation that undoes it, and the other way round
+        without = without_effect(state, without, name)
+    return laws if is_rejected(without.vector, max(one.inflation for one in ablations)) else []
+
+
+def _is_law_of_rotation(effect: str) -> bool:
+    """Return whether an effect turns commands into rates, or rates into readings, and remembers nothing."""
+    one = BY_NAME[effect]
+    return one.start is None and bool(one.stages) and {*one.stages} <= {"command", "rates", "gyro"}
+
+
 def _is_force_law(effect: str) -> bool:
     """Return whether an effect is a law of a force, which may be wrong in form; a scale of thrust is not."""
     one = BY_NAME[effect]
@@ -256,6 +305,7 @@ def seen_once(selection: Selection, test: Problem) -> list[str]:
 VETOES: tuple[tuple[Veto, ...], ...] = (
     (stands_in_for_unknown,),
     (contradicted_on_held_out,),
+    (contradicted_at_rest,),
     (remainder_of_force_law, seen_once),
 )
 

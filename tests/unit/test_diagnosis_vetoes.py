@@ -19,8 +19,8 @@ from flytrack_sysid.diagnosis.problem import Problem, Window
 from flytrack_sysid.diagnosis.refinement import Refined
 from flytrack_sysid.diagnosis.result import Cause, Estimated
 from flytrack_sysid.diagnosis.score_test import CANDIDATES, threshold
-from flytrack_sysid.diagnosis.search import Held, SearchState
-from flytrack_sysid.diagnosis.summary import stand_in_notes, warnings_of, with_refined_values
+from flytrack_sysid.diagnosis.search import FittedModel, Held, SearchState
+from flytrack_sysid.diagnosis.summary import effects_at_end, stand_in_notes, warnings_of, with_refined_values
 from flytrack_sysid.diagnosis.vetoes import HELD_OUT_SHOWN, Selection, is_contradicted, reject
 from flytrack_sysid.parameters import TAUS, THRUST_COEFFS
 
@@ -197,6 +197,62 @@ def test_values_at_the_end_of_their_range_are_beyond_the_list(state, field, valu
     assert found[0].beyond.startswith(f"{name} at most {value:g}" if is_warned_of else "")
     warned = [one for one in warnings_of(problem, found, []) if "beyond the list" in one]
     assert len(warned) == is_warned_of and bool(found[0].beyond) == is_warned_of
+
+
+@pytest.mark.parametrize(
+    ("field", "is_refused"),
+    [
+        ("gyro_scale.x", True),
+        ("command_delay.delay_s", False),  # its law holds: so many rows are remembered
+        ("ground_effect.gain", False),  # no ground was near
+        ("tau_roll", False),  # a base that cannot be left out
+    ],
+)
+def test_only_an_effect_whose_law_ends_where_the_search_does_is_refused(state, field, is_refused):
+    problem, effect = state.problem, field.partition(".")[0]
+    vector = problem.start.copy()
+    vector[problem.names.index(field)] = problem.high[problem.names.index(field)]
+    kept = tuple(one for one in CANDIDATES if one.effect == effect and field in one.fields)[:1]
+    places = (*state.base_places, *(place for one in kept for place in problem.index(one.fields)))
+    selection = Selection(state, None, FittedModel(kept, vector, 0.0, places), {})
+    found = effects_at_end(selection, Refined(kept, None, None, (), {}, problem, None))
+    assert set(found) == ({effect} if is_refused else set())
+    assert all(where.startswith("x at least") for where in found.values())
+
+
+@pytest.mark.parametrize(("effect", "is_law"), [("rate_scale", True), ("command_delay", False)])
+def test_a_law_without_memory_has_to_hold_while_commands_rest(state, effect, is_law):
+    """A scale of rates that nobody flew is contradicted there; one that was flown is not, nor a delay."""
+    problem = state.problem
+    vector = problem.start.copy()
+    field, size = {"rate_scale": ("roll", 0.1), "command_delay": ("delay_s", 0.02)}[effect]
+    vector[problem.names.index(f"{effect}.{field}")] += size
+    for less, full, is_false in ((problem.start, vector, True), (vector, problem.start, False)):
+        own = Ablation(1e4, 1.0, 1, {}, {}, SimpleNamespace(vector=less))
+        found = Selection(state, None, SimpleNamespace(vector=full), {effect: own})
+        assert vetoes.contradicted_at_rest(found, None) == ([effect] if is_false and is_law else [])
+
+
+def test_laws_that_undo_each_other_are_contradicted_together(state):
+    """A scale and a saturation of rates: one without the other is worse than both, and neither was flown."""
+    problem, laws = state.problem, {"rate_scale": 1.25, "rate_saturation": 0.2}
+    ways = tuple({one.effect: one for one in CANDIDATES if one.effect in laws}.values())
+    both = problem.start.copy()
+    for axis in ("roll", "pitch", "yaw"):
+        both[problem.index([f"{name}.{axis}" for name in laws])] = [*laws.values()]
+    model = FittedModel(ways, both, 0.0, tuple(state.base_places))
+    far = SimpleNamespace(vector=np.where(both == problem.start, both, 1.5 * both - 0.5 * problem.start))
+    needed = {name: Ablation(1e4, 1.0, 1, {}, {}, far) for name in laws}
+    assert vetoes.contradicted_at_rest(Selection(state, None, model, needed), None) == [*laws]
+
+
+def test_commands_rest_some_time_after_they_moved():
+    sticks = np.zeros((100, 1, 4))
+    sticks[30:, 0, 0], sticks[:, 0, 3] = 0.8, np.linspace(-1.0, 1.0, 100)  # thrust may move
+    record = SimpleNamespace(command=sticks, step_s=np.full((100, 1), 0.01))
+    found = vetoes.rests(record)[:, 0]
+    again = 30 + round(vetoes.REST_S / 0.01)
+    assert found[:30].all() and not found[30:again].any() and found[again:].all()
 
 
 def test_lost_causes_are_warned_of(state):
