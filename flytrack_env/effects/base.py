@@ -133,7 +133,8 @@ class Effect:
     probes: values at which to look for the effect, of parameters whose slope at neutral is 0 or one-sided:
     first all of the first values, and so on.
     groups: parameters that are looked for together; all of them if empty. shapes: parameters that only shape
-    what others do, and do nothing while those are neutral.
+    what others do, and do nothing while those are neutral. follows_sticks: it is a law of the rate sticks
+    without memory, which does nothing while they are centred.
     start: (parameters, drone) -> memory of an episode that begins; no memory if None. With ``most_steps`` it
     also takes how many steps to remember.
     remember: (parameters, memory, context) -> memory after a step.
@@ -152,6 +153,7 @@ class Effect:
     probes: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
     groups: tuple[tuple[str, ...], ...] = ()
     shapes: tuple[str, ...] = ()
+    follows_sticks: bool = False
     command: Hook | None = None
     lag: Hook | None = None
     air: Hook | None = None

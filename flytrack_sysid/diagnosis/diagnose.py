@@ -45,6 +45,7 @@ from flytrack_sysid.diagnosis.summary import (
     refusal_note,
     sensor_noise,
     stand_in_notes,
+    unseen_at_rest_notes,
     vector_without,
     verdict_of,
     warnings_of,
@@ -258,6 +259,7 @@ def summarize(selection: Selection, contradicted: Sequence[str], refined: Refine
         *warnings_of(problem, found, lost),
         *refinement_notes(refined),
         *stand_in_notes(selection, flying["extended"]),
+        *unseen_at_rest_notes(selection),
         *notes_of(selection, linearization, parts.log),
     ]
     rest = with_lost_causes(selection.unexplained, lost)

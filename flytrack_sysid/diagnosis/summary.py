@@ -10,6 +10,7 @@ from flytrack_env.effects import BY_NAME, effect_of
 from flytrack_sysid.diagnosis.identifiability import advise, unit_of, unseen_effects
 from flytrack_sysid.diagnosis.lanes import AXES, voltages_of
 from flytrack_sysid.diagnosis.model_selection import (
+    EQUIVALENT,
     BaseChange,
     Marginal,
     base_changes,
@@ -35,7 +36,13 @@ from flytrack_sysid.diagnosis.result import (
 )
 from flytrack_sysid.diagnosis.score_test import BASE_CAUSES, Linearization, solve, threshold
 from flytrack_sysid.diagnosis.search import FittedModel, SearchState
-from flytrack_sysid.diagnosis.vetoes import Selection, held_out_gain, is_base_remainder, is_contradicted
+from flytrack_sysid.diagnosis.vetoes import (
+    Selection,
+    held_out_gain,
+    is_base_remainder,
+    is_contradicted,
+    turns_unexplained,
+)
 from flytrack_sysid.parameters import DRAIN, MAX_RATES, STICKS, THRUST_COEFFS, as_float32, from_vector
 from flytrack_sysid.parameters import unit_of as unit_of_parameter
 from flytrack_sysid.prediction_windows import HORIZONS_S, QUANTITIES
@@ -150,10 +157,13 @@ def effect_causes(selection: Selection, test: Problem, linearization: Linearizat
         # Refitted where that was worth it, else to first order.
         rivals = {name: min(ablation.rivals.get(name, size), size) for name, size in own.beside.items()}
         closest = min(rivals, key=lambda name: rivals[name], default="")
+        alike = equivalents(ablation, own)
+        if closest and rivals[closest] < EQUIVALENT and closest not in alike:
+            alike = (*alike, closest)  # beside it, the effect is not seen
         causes.append(
             Cause(
                 effect=one.effect,
-                equivalent=equivalents(ablation, own),
+                equivalent=alike,
                 channel=channel_of(problem, less, model.vector),
                 parameters=estimates(problem, linearization, model, one.fields),
                 chi2_gain=ablation.gain,
@@ -558,6 +568,17 @@ def stand_in_notes(selection: Selection, vector: np.ndarray) -> list[str]:
             "what remains unexplained could pass for it"
         )
     return notes
+
+
+def unseen_at_rest_notes(selection: Selection) -> list[str]:
+    """Return laws of the sticks that were refused where something of the rotation is unexplained."""
+    names = ", ".join(name for name in selection.state.refused if BY_NAME[name].follows_sticks)
+    if not names or not turns_unexplained(selection):
+        return []
+    return [
+        f"{names}: not named, since dynamics of the rate loop that no list has would look the same while "
+        "sticks move; fly stick_amplitudes, and hold each stick for a second"
+    ]
 
 
 def _at_bound(cause: Cause) -> str:

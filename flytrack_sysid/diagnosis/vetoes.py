@@ -40,7 +40,7 @@ from flytrack_sysid.record import Record
 HELD_OUT_SIGMAS, HELD_OUT_SHARE = 4.0, 0.35
 HELD_OUT_SHOWN = 20.0  # of chi2: held-out rows that would show less contradict nothing
 # Commands rest that have changed by no more than that share of the largest for so long.
-REST_S, REST_SHARE = 0.1, 0.1
+REST_S, REST_SHARE = 0.1, 0.05
 # A choice among many effects finds what fits the noise of one log: an effect that gains less than so many
 # thresholds has to gain on held-out rows, too, if they would show that much chi2 of it.
 BARELY, BARELY_SHOWN = 2.0, 1.0
@@ -237,38 +237,40 @@ def rests(record: Record) -> np.ndarray:
     return np.asarray(moved.max(axis=-1) <= REST_SHARE * np.abs(sticks).max(axis=-1))
 
 
-def contradicted_at_rest(selection: Selection, test: Problem) -> list[str]:
-    """Reject laws of rotation without memory that do not hold while the commands rest, each or all together.
+def not_seen_at_rest(selection: Selection, test: Problem) -> list[str]:
+    """Reject laws of the sticks that do not hold while those rest, each or all together.
 
     What is there in transients only is dynamics that no list has: feedforward, say, turns faster than asked
     for on the way to full stick, as a scale and a saturation would, and not while the stick stays there.
+    Where turns are left unexplained, laws that this log never shows at rest are rejected, too.
     """
     state, model = selection.state, selection.model
-    laws = [name for name in selection.ablations if _is_law_of_rotation(name)]
+    laws = [name for name in selection.ablations if BY_NAME[name].follows_sticks]
     if not laws:
         return []
     at_rest = rests(state.problem.lanes.record)
 
-    def is_rejected(without: np.ndarray, inflation: float) -> bool:
+    def seen(without: np.ndarray) -> tuple[float, float]:
         white = state.problem.whitened_residuals(without, model.vector)
         less, full = white[:, at_rest][..., AXES[0], :]
-        gain, expected = float(np.sum(less**2) - np.sum(full**2)), float(np.sum((less - full) ** 2))
-        return is_contradicted(gain, expected, inflation)
+        return float(np.sum(less**2) - np.sum(full**2)), float(np.sum((less - full) ** 2))
 
     ablations = [selection.ablations[name] for name in laws]
-    alone = [is_rejected(one.without.vector, one.inflation) for one in ablations]
-    if any(alone) or len(laws) < 2:
+    alone = [is_contradicted(*seen(one.without.vector), one.inflation) for one in ablations]
+    if any(alone):
         return [name for name, is_false in zip(laws, alone, strict=True) if is_false]
-    without = model
-    for name in laws:  # a scale needs the saturation that undoes it, and the other way round
+    without = ablations[0].without
+    for name in laws[1:]:  # a scale needs the saturation that undoes it, and the other way round
         without = without_effect(state, without, name)
-    return laws if is_rejected(without.vector, max(one.inflation for one in ablations)) else []
+    gain, expected = seen(without.vector)
+    inflation = max(one.inflation for one in ablations)
+    is_unseen = expected < HELD_OUT_SHOWN * inflation and turns_unexplained(selection)
+    return laws if is_unseen or is_contradicted(gain, expected, inflation) else []
 
 
-def _is_law_of_rotation(effect: str) -> bool:
-    """Return whether an effect turns commands into rates, or rates into readings, and remembers nothing."""
-    one = BY_NAME[effect]
-    return one.start is None and bool(one.stages) and {*one.stages} <= {"command", "rates", "gyro"}
+def turns_unexplained(selection: Selection) -> bool:
+    """Return whether a selection leaves something of the rotation unexplained."""
+    return any(name.startswith("rate:") for name in selection.unexplained.shares)
 
 
 def _is_force_law(effect: str) -> bool:
@@ -305,7 +307,7 @@ def seen_once(selection: Selection, test: Problem) -> list[str]:
 VETOES: tuple[tuple[Veto, ...], ...] = (
     (stands_in_for_unknown,),
     (contradicted_on_held_out,),
-    (contradicted_at_rest,),
+    (not_seen_at_rest,),
     (remainder_of_force_law, seen_once),
 )
 

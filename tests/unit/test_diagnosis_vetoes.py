@@ -17,10 +17,16 @@ from flytrack_sysid.diagnosis.model_selection import Ablation, is_determined, wi
 from flytrack_sysid.diagnosis.noise import first_guess
 from flytrack_sysid.diagnosis.problem import Problem, Window
 from flytrack_sysid.diagnosis.refinement import Refined
-from flytrack_sysid.diagnosis.result import Cause, Estimated
+from flytrack_sysid.diagnosis.result import Cause, Estimated, Unexplained
 from flytrack_sysid.diagnosis.score_test import CANDIDATES, threshold
 from flytrack_sysid.diagnosis.search import FittedModel, Held, SearchState
-from flytrack_sysid.diagnosis.summary import effects_at_end, stand_in_notes, warnings_of, with_refined_values
+from flytrack_sysid.diagnosis.summary import (
+    effects_at_end,
+    stand_in_notes,
+    unseen_at_rest_notes,
+    warnings_of,
+    with_refined_values,
+)
 from flytrack_sysid.diagnosis.vetoes import HELD_OUT_SHOWN, Selection, is_contradicted, reject
 from flytrack_sysid.parameters import TAUS, THRUST_COEFFS
 
@@ -225,25 +231,44 @@ def test_a_law_without_memory_has_to_hold_while_commands_rest(state, effect, is_
     """A scale of rates that nobody flew is contradicted there; one that was flown is not, nor a delay."""
     problem = state.problem
     vector = problem.start.copy()
-    field, size = {"rate_scale": ("roll", 0.1), "command_delay": ("delay_s", 0.02)}[effect]
+    field, size = {"rate_scale": ("roll", 0.3), "command_delay": ("delay_s", 0.02)}[effect]
     vector[problem.names.index(f"{effect}.{field}")] += size
     for less, full, is_false in ((problem.start, vector, True), (vector, problem.start, False)):
         own = Ablation(1e4, 1.0, 1, {}, {}, SimpleNamespace(vector=less))
         found = Selection(state, None, SimpleNamespace(vector=full), {effect: own})
-        assert vetoes.contradicted_at_rest(found, None) == ([effect] if is_false and is_law else [])
+        assert vetoes.not_seen_at_rest(found, None) == ([effect] if is_false and is_law else [])
+
+
+def test_what_only_transients_show_is_no_law_where_turns_are_unexplained(state):
+    vector = state.problem.start.copy()
+    vector[state.problem.names.index("rate_scale.roll")] += 0.001
+    own = Ablation(1e4, 1.0, 1, {}, {}, SimpleNamespace(vector=state.problem.start))
+    found = Selection(state, None, SimpleNamespace(vector=vector), {"rate_scale": own})
+    assert vetoes.not_seen_at_rest(found, None) == [] == unseen_at_rest_notes(found)
+    for side, is_rejected in (("force", False), ("rate", True)):
+        left = found._replace(unexplained=Unexplained(True, ("stochastic",), {f"{side}: stochastic": 9.0}))
+        assert vetoes.not_seen_at_rest(left, None) == (["rate_scale"] if is_rejected else [])
+        refused = left._replace(state=replace(state, refused=("wind", "rate_scale")))
+        notes = unseen_at_rest_notes(refused)
+        assert len(notes) == is_rejected and all(one.startswith("rate_scale: ") for one in notes)
 
 
 def test_laws_that_undo_each_other_are_contradicted_together(state):
     """A scale and a saturation of rates: one without the other is worse than both, and neither was flown."""
     problem, laws = state.problem, {"rate_scale": 1.25, "rate_saturation": 0.2}
-    ways = tuple({one.effect: one for one in CANDIDATES if one.effect in laws}.values())
+    ways = {one.effect: one for one in CANDIDATES if one.effect in laws}
+    places = {name: problem.index([f"{name}.{axis}" for axis in ("roll", "pitch", "yaw")]) for name in laws}
     both = problem.start.copy()
-    for axis in ("roll", "pitch", "yaw"):
-        both[problem.index([f"{name}.{axis}" for name in laws])] = [*laws.values()]
-    model = FittedModel(ways, both, 0.0, tuple(state.base_places))
-    far = SimpleNamespace(vector=np.where(both == problem.start, both, 1.5 * both - 0.5 * problem.start))
-    needed = {name: Ablation(1e4, 1.0, 1, {}, {}, far) for name in laws}
-    assert vetoes.contradicted_at_rest(Selection(state, None, model, needed), None) == [*laws]
+    for name, value in laws.items():
+        both[places[name]] = value
+    needed = {}
+    for name in laws:
+        less = both.copy()
+        less[places[name]] = problem.start[places[name]]
+        rest = tuple(way for effect, way in ways.items() if effect != name)
+        needed[name] = Ablation(1e4, 1.0, 1, {}, {}, FittedModel(rest, less, 0.0, tuple(state.base_places)))
+    model = FittedModel(tuple(ways.values()), both, 0.0, tuple(state.base_places))
+    assert vetoes.not_seen_at_rest(Selection(state, None, model, needed), None) == [*laws]
 
 
 def test_commands_rest_some_time_after_they_moved():
