@@ -100,9 +100,10 @@ def _faults(diagnosis: Diagnosis) -> str:
     """Return what the model lacks, has too much or too little of, or has a wrong value of, as a sentence."""
     by_fault: dict[str, list[str]] = {}
     for cause in diagnosis.causes:
-        by_fault.setdefault(fault_of(cause.effect, diagnosis), []).append(
-            words_of(cause.effect) + when_of(cause)
-        )
+        alike = () if cause.effect == "thrust_scale" else cause.equivalent[:MOST_LISTED]
+        others = f" (or {' or '.join(map(words_of, alike))})" if alike else ""
+        name = words_of(cause.effect) + when_of(cause) + others
+        by_fault.setdefault(fault_of(cause.effect, diagnosis), []).append(name)
     clauses = [
         " ".join([fault, "; ".join(f"the {name}" if fault == WRONG else name for name in names)])
         for fault, names in by_fault.items()

@@ -41,6 +41,7 @@ from flytrack_sysid.diagnosis.vetoes import (
     held_out_gain,
     is_base_remainder,
     is_contradicted,
+    is_force_law,
     turns_unexplained,
 )
 from flytrack_sysid.parameters import DRAIN, MAX_RATES, STICKS, THRUST_COEFFS, as_float32, from_vector
@@ -147,7 +148,10 @@ def channel_of(problem: Problem, less: np.ndarray, full: np.ndarray) -> str:
 
 
 def effect_causes(selection: Selection, test: Problem, linearization: Linearization) -> list[Cause]:
-    """Return the effects of a model as causes, those that explain most first."""
+    """Return the effects of a model as causes, those that explain most first.
+
+    A force may as well be one of the laws whose channels the log lacks.
+    """
     problem, model = selection.state.problem, selection.model
     causes = []
     for one in model.candidates:
@@ -160,11 +164,14 @@ def effect_causes(selection: Selection, test: Problem, linearization: Linearizat
         alike = equivalents(ablation, own)
         if closest and rivals[closest] < EQUIVALENT and closest not in alike:
             alike = (*alike, closest)  # beside it, the effect is not seen
+        channel = channel_of(problem, less, model.vector)
+        if channel in CHANNELS[1]:
+            alike += tuple(name for name in selection.state.unobservable if is_force_law(name))
         causes.append(
             Cause(
                 effect=one.effect,
                 equivalent=alike,
-                channel=channel_of(problem, less, model.vector),
+                channel=channel,
                 parameters=estimates(problem, linearization, model, one.fields),
                 chi2_gain=ablation.gain,
                 heldout_gain=held_out_gain(test, less, model.vector)[0],

@@ -273,7 +273,7 @@ def turns_unexplained(selection: Selection) -> bool:
     return any(name.startswith("rate:") for name in selection.unexplained.shares)
 
 
-def _is_force_law(effect: str) -> bool:
+def is_force_law(effect: str) -> bool:
     """Return whether an effect is a law of a force, which may be wrong in form; a scale of thrust is not."""
     one = BY_NAME[effect]
     acts = one.thrust is not None or one.air is not None or one.force is not None
@@ -282,7 +282,7 @@ def _is_force_law(effect: str) -> bool:
 
 def remainder_of_force_law(selection: Selection, test: Problem) -> list[str]:
     """Reject laws of a force that explain next to nothing beside another one."""
-    gains = {effect: one.gain for effect, one in selection.ablations.items() if _is_force_law(effect)}
+    gains = {effect: one.gain for effect, one in selection.ablations.items() if is_force_law(effect)}
     return [effect for effect, gain in gains.items() if gain < FORCE_REMAINDER * max(gains.values())]
 
 

@@ -16,6 +16,7 @@ from flytrack_sysid.diagnosis import noise as noises
 from flytrack_sysid.diagnosis.diagnose import unused_channels
 from flytrack_sysid.diagnosis.lanes import LANE_S, LEAD_IN_S, NUM_AXES, make_lanes
 from flytrack_sysid.diagnosis.problem import Problem
+from flytrack_sysid.diagnosis.report import verdict_of
 from flytrack_sysid.diagnosis.search import SearchState
 from flytrack_sysid.parameters import DRAIN
 from flytrack_sysid.record import make_record
@@ -229,3 +230,15 @@ def test_the_battery_drains_only_where_its_voltage_was_measured(flown, missing):
     lanes = make_lanes(log, np.ones(len(log), bool), np.array(truth.tau), truth.gravity)
     state = SearchState.start(log, Problem.of(lanes, model_of(truth)))
     assert (state.problem.names.index(DRAIN) in state.base_places) == (not missing)
+
+
+@pytest.mark.slow
+def test_a_force_may_be_a_law_whose_channels_the_log_lacks():
+    """Without velocity and attitude, drag of forward flight would look like a thrust that is tilted."""
+    rng = np.random.default_rng(4)
+    truth = replace(draw_base(rng), effects={"thrust_tilt": {"towards_x": 0.1, "towards_y": 0.0}})
+    log = measure(fly(truth, "scripted", 20.0, rng), "sensors", rng)
+    blind = diagnose(log.without("p", "v", "q"), model_of(truth))
+    (cause,) = blind.causes
+    assert cause.effect == "thrust_tilt" and {"linear_drag", "wind"} <= {*cause.equivalent}
+    assert "tilt of the thrust axis (or " in verdict_of(blind).text
