@@ -46,6 +46,7 @@ def summarize(found: Diagnosis) -> dict[str, Any]:
             }
             for cause in found.causes
         },
+        "beyond_the_list": sorted(cause.effect for cause in found.beyond),
         "unexplained": sorted(found.unexplained.depends_on),
         "not_identifiable": sorted(one.effect for one in found.not_identifiable),
     }

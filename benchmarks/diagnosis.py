@@ -121,6 +121,7 @@ def plant(trial: Trial) -> dict[str, Any]:
         "is_motion_right": found.extended.motion is MOTION_OF[truth.motion],
         "causes": [_graded(cause, truth) for cause in found.causes],
         "negligible": [_graded(cause, truth) for cause in found.negligible],
+        "beyond_the_list": [cause.effect for cause in found.beyond],
         "unexplained": {name: round(size, 3) for name, size in found.unexplained.shares.items()},
         "not_identifiable": [one.effect for one in found.not_identifiable],
         "cpu_s": round(seconds, 2),

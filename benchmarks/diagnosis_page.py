@@ -122,7 +122,9 @@ def figures(by_row: Rows) -> list[tuple[str, str, str]]:
     sizes = [len(one) for line in by_row["one"] for one in classes(line)]
     outside = [line for line in by_row["outside"] if line["visible"] >= VISIBLE]
     seconds = [line["cpu_s"] for lines in by_row.values() for line in lines]
-    controls = {row: [bool(named(line)) for line in by_row[row]] for row in CONTROLS}
+    controls = {
+        row: [bool(named(line) or line.get("beyond_the_list")) for line in by_row[row]] for row in CONTROLS
+    }
     return [
         (
             "any name on plants without an effect",

@@ -1,6 +1,6 @@
 """A log and a model in, a diagnosis out: what is wrong, why, how certain that is, and what it gains."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
@@ -25,6 +25,7 @@ from flytrack_sysid.diagnosis.onset import (
 )
 from flytrack_sysid.diagnosis.outliers import outlier_notes, outliers_of
 from flytrack_sysid.diagnosis.problem import Problem
+from flytrack_sysid.diagnosis.reduction import reduced
 from flytrack_sysid.diagnosis.refinement import Refined, refine
 from flytrack_sysid.diagnosis.result import Cause, Diagnosis
 from flytrack_sysid.diagnosis.search import SearchState, search
@@ -32,17 +33,15 @@ from flytrack_sysid.diagnosis.sensor_clocks import on_one_clock, with_causal_com
 from flytrack_sysid.diagnosis.size import split_by_size
 from flytrack_sysid.diagnosis.summary import (
     base_causes,
+    causes_at_end,
     changed_parameters,
     effect_causes,
-    effects_at_end,
     errors_of,
     half_responses_of,
     model_of,
     not_identifiable,
     prediction_of,
-    reduced,
     refinement_notes,
-    refusal_note,
     sensor_noise,
     stand_in_notes,
     unseen_at_rest_notes,
@@ -52,7 +51,14 @@ from flytrack_sysid.diagnosis.summary import (
     with_lost_causes,
     with_refined_values,
 )
-from flytrack_sysid.diagnosis.vetoes import Selection, apply_vetoes, reject, select
+from flytrack_sysid.diagnosis.vetoes import (
+    Selection,
+    Veto,
+    apply_vetoes,
+    contradicted_on_held_out,
+    reject,
+    select,
+)
 from flytrack_sysid.log import FlightLog
 from flytrack_sysid.split import HELD_OUT_EVERY, held_out_rows
 
@@ -106,12 +112,11 @@ def diagnose(
         report(1, len(STAGES))
         selection = with_changes(selection, parts.test, parts.log)
         test = held_out_under(selection, parts.test)
-        selection, contradicted = apply_vetoes(selection, test)
+        selection, rejected = apply_vetoes(selection, test)
         report(2, len(STAGES))
-        selection, refined, at_end, lost = refined_within_range(selection, test, parts)
+        judged = refined_within_range(Judged(selection, rejected), test, parts)
         report(3, len(STAGES))
-        parts = parts._replace(test=test, warnings=(*parts.warnings, *at_end))
-        found = summarize(selection, [*contradicted, *lost], refined, parts)
+        found = summarize(judged, parts._replace(test=test))
         nominal = nominal_parameters() if model is None else model
         nominal = nominal._replace(motion=found.extended.motion)
         found = replace(found, nominal=nominal)
@@ -182,24 +187,31 @@ def held_out_under(selection: Selection, test: Problem) -> Problem:
     return replace(test.with_noise(problem.noise), windows=problem.windows)
 
 
-def refined_within_range(
-    selection: Selection, test: Problem, parts: Split
-) -> tuple[Selection, Refined, list[str], list[str]]:
+class Judged(NamedTuple):
+    """A selection after its vetoes: the veto of each effect that is gone, and how it was refined.
+
+    refused: effects that are gone since they fit best at the end of what is searched.
+    """
+
+    selection: Selection
+    rejected: Mapping[str, Veto]
+    refined: Refined | None = None
+    refused: tuple[Cause, ...] = ()
+
+
+def refined_within_range(judged: Judged, test: Problem, parts: Split) -> Judged:
     """Return a selection and its refinement, without effects that end where the search does.
 
     A law that fits best beyond anything known stands in for another one, and bends the values of the rest.
-    Also returned: a warning of each such effect, and names that held-out rows contradict.
     """
-    at_end: list[str] = []
-    contradicted: list[str] = []
     while True:
+        selection = judged.selection
         refined = refined_by_prediction(selection, parts)
-        stuck = effects_at_end(selection, refined)
+        stuck = causes_at_end(selection, refined, test)
         if not stuck:
-            return selection, refined, at_end, contradicted
-        at_end += [refusal_note(effect, where) for effect, where in stuck.items()]
-        selection, lost = apply_vetoes(reject(selection, tuple(stuck)), test)
-        contradicted += lost
+            return judged._replace(refined=refined)
+        selection, rejected = apply_vetoes(reject(selection, [one.effect for one in stuck]), test)
+        judged = Judged(selection, {**judged.rejected, **rejected}, refused=(*judged.refused, *stuck))
 
 
 def refined_by_prediction(selection: Selection, parts: Split) -> Refined:
@@ -224,13 +236,16 @@ def refined_by_prediction(selection: Selection, parts: Split) -> Refined:
     return refined._replace(kept=kept)
 
 
-def summarize(selection: Selection, contradicted: Sequence[str], refined: Refined, parts: Split) -> Diagnosis:
-    """Return the diagnosis of a selected model, in float64; the nominal model in float64 stands in it."""
-    test, selection = parts.test, reduced(selection, refined)
+def summarize(judged: Judged, parts: Split) -> Diagnosis:
+    """Return the diagnosis of a refined model, in float64; the nominal model in float64 stands in it."""
+    test, refined = parts.test, judged.refined
+    assert refined is not None, "refined_within_range comes first"
+    selection = reduced(judged.selection, refined)
     problem, model = selection.state.problem, selection.model
     state, linearization = selection.state.linearized(model.vector)
     effects = effect_causes(selection, test, linearization)
     in_base, lost_in_base = base_causes(selection, test, linearization, effects)
+    contradicted = [name for name, veto in judged.rejected.items() if veto is contradicted_on_held_out]
     lost = [*contradicted, *lost_in_base]
     extended = model if refined.fit is None else model._replace(vector=refined.fit.vector)
     found = with_refined_values([*effects, *in_base], refined, extended.vector)
@@ -245,9 +260,8 @@ def summarize(selection: Selection, contradicted: Sequence[str], refined: Refine
         return refined.vector_without(cause.effect)
 
     found, negligible = split_by_size(found, problem, extended.vector, refined.flight_errors, without)
-    causes, beyond = (
-        tuple(one for one in found if bool(one.beyond) is is_at_end) for is_at_end in (False, True)
-    )
+    causes = tuple(one for one in found if not one.beyond)
+    beyond = (*judged.refused, *(one for one in found if one.beyond))
     vectors = {"nominal": problem.start, "refitted_base": selection.base.vector, "extended": extended.vector}
     extended = at_end(selection, extended)
     limits = not_identifiable(state, linearization, model, (*found, *negligible))
@@ -256,10 +270,10 @@ def summarize(selection: Selection, contradicted: Sequence[str], refined: Refine
     outliers = outliers_of((problem, test), vectors["extended"])
     notes = [
         *outlier_notes(outliers),
-        *warnings_of(problem, found, lost),
-        *refinement_notes(refined),
+        *warnings_of(problem, (*causes, *beyond), lost),
+        *refinement_notes(refined, selection.model),
         *stand_in_notes(selection, flying["extended"]),
-        *unseen_at_rest_notes(selection),
+        *unseen_at_rest_notes(judged.rejected),
         *notes_of(selection, linearization, parts.log),
     ]
     rest = with_lost_causes(selection.unexplained, lost)

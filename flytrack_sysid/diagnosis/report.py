@@ -33,7 +33,7 @@ BARS_HEIGHT_IN = 2.6
 MOST_LISTED = 3  # names in one cell
 LIMITED_S = 1e-3  # by which a step to full stick takes longer where a limit acts
 NO_BREAK = "\u00a0"  # a space at which lines do not break
-AS_CLOSE, LEAST_SHARE = "as close", 0.5  # % of an error: what changes by less has not changed
+AS_CLOSE, LEAST_SHARE = "no closer", 0.5  # % of an error: what changes by less has not changed
 HEADLINE_HORIZON = "1"  # s of free flight, whose error the first sentence gives
 WRONG = "has the wrong value of"
 LOG_BARS = 20.0  # times the smallest error: from there on bars would vanish on an even scale
@@ -148,10 +148,10 @@ def _gain(diagnosis: Diagnosis) -> str:
     details = [f"{after:.2g} m instead of {before:.2g} m on held-out flight"]
     if np.isfinite(refitted):
         by_effects = _closer(refitted, after)
-        others = (
-            "no effect adds to that" if by_effects == AS_CLOSE else f"with effects {by_effects} than that"
+        gain = (
+            "no effect adds to that" if by_effects == AS_CLOSE else f"with its effects it flies {by_effects}"
         )
-        details.append(f"refitted without effects, {refitted:.2g} m: {others}")
+        details.append(f"{refitted:.2g} m when only refitted; {gain}")
     blind = diagnosis.prediction.errors.get("placebo", {}).get("position_m", {}).get(HEADLINE_HORIZON, np.inf)
     if blind <= after:
         details.append(f"a guess that ignores the commands, {blind:.2g} m")
@@ -287,7 +287,8 @@ def _limits_part(diagnosis: Diagnosis) -> Part:
 def _unexplained_parts(diagnosis: Diagnosis) -> list[Part]:
     left = diagnosis.unexplained
     if not left.flagged:
-        return [Text("Nothing: the residuals of the extended model are noise.")]
+        beyond = _beyond(diagnosis)
+        return [Text(f"Nothing more. {beyond}" if beyond else "Nothing: the residuals are noise.")]
     what = ", ".join(left.depends_on) or "nothing that is known"
     parts: list[Part] = [Text(f"What is left is more than noise. It depends on: {what}.")]
     if left.shares:
@@ -393,6 +394,8 @@ def text_of(diagnosis: Diagnosis) -> str:
         lines.append(
             f"  {cause.effect}{when_of(cause)}: {values}; held-out gain {cause.heldout_gain:.4g}{twins}"
         )
+    for cause in diagnosis.beyond:
+        lines.append(f"beyond the list: {cause.effect}: {cause.beyond}")
     for cause in diagnosis.negligible:
         lines.append(f"negligible: {cause.effect}: {_plus_minus(cause)}")
     answers = diagnosis.half_response_s.get("extended", {}).items()

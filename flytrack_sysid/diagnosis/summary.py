@@ -10,7 +10,6 @@ from flytrack_env.effects import BY_NAME, effect_of
 from flytrack_sysid.diagnosis.identifiability import advise, unit_of, unseen_effects
 from flytrack_sysid.diagnosis.lanes import AXES, voltages_of
 from flytrack_sysid.diagnosis.model_selection import (
-    EQUIVALENT,
     BaseChange,
     Marginal,
     base_changes,
@@ -38,11 +37,12 @@ from flytrack_sysid.diagnosis.score_test import BASE_CAUSES, Linearization, solv
 from flytrack_sysid.diagnosis.search import FittedModel, SearchState
 from flytrack_sysid.diagnosis.vetoes import (
     Selection,
+    Veto,
     held_out_gain,
     is_base_remainder,
     is_contradicted,
     is_force_law,
-    turns_unexplained,
+    not_seen_at_rest,
 )
 from flytrack_sysid.parameters import DRAIN, MAX_RATES, STICKS, THRUST_COEFFS, as_float32, from_vector
 from flytrack_sysid.parameters import unit_of as unit_of_parameter
@@ -150,7 +150,7 @@ def channel_of(problem: Problem, less: np.ndarray, full: np.ndarray) -> str:
 def effect_causes(selection: Selection, test: Problem, linearization: Linearization) -> list[Cause]:
     """Return the effects of a model as causes, those that explain most first.
 
-    A force may as well be one of the laws whose channels the log lacks.
+    A force may as well be one of the laws of velocity or attitude where the log lacks these.
     """
     problem, model = selection.state.problem, selection.model
     causes = []
@@ -162,11 +162,9 @@ def effect_causes(selection: Selection, test: Problem, linearization: Linearizat
         rivals = {name: min(ablation.rivals.get(name, size), size) for name, size in own.beside.items()}
         closest = min(rivals, key=lambda name: rivals[name], default="")
         alike = equivalents(ablation, own)
-        if closest and rivals[closest] < EQUIVALENT and closest not in alike:
-            alike = (*alike, closest)  # beside it, the effect is not seen
         channel = channel_of(problem, less, model.vector)
         if channel in CHANNELS[1]:
-            alike += tuple(name for name in selection.state.unobservable if is_force_law(name))
+            alike += tuple(name for name in selection.state.unobservable if _is_law_of_motion(name))
         causes.append(
             Cause(
                 effect=one.effect,
@@ -183,6 +181,11 @@ def effect_causes(selection: Selection, test: Problem, linearization: Linearizat
     # A scale of thrust that was found in place of a thrust curve may be a remainder, too.
     kept = [cause for cause in causes if cause.effect != "thrust_scale" or not _is_remainder(cause, causes)]
     return sorted(kept, key=lambda cause: -cause.chi2_gain)
+
+
+def _is_law_of_motion(effect: str) -> bool:
+    """Return whether an effect is a force that velocity or attitude would show."""
+    return is_force_law(effect) and not {"v", "q"}.isdisjoint(BY_NAME[effect].needs)
 
 
 def _is_remainder(cause: Cause, others: Sequence[Cause]) -> bool:
@@ -268,8 +271,8 @@ def not_identifiable(
     twins: dict[str, tuple[str, ...]] = {}
     for cause in causes:
         if cause.effect in BY_NAME and cause.equivalent and cause.effect != "thrust_scale":
-            twins[cause.effect] = cause.equivalent
-            twins |= {name: (cause.effect,) for name in cause.equivalent}
+            twins[cause.effect] = (*twins.get(cause.effect, ()), *cause.equivalent)
+            twins |= {name: (*twins.get(name, ()), cause.effect) for name in cause.equivalent}
     wanted = {name: limit.look_alikes for name, limit in limits.items()} | twins
     flights = {name: TO_LOG + " and ".join(BY_NAME[name].needs) for name in state.unobservable}
     asked = {name: alike for name, alike in wanted.items() if name not in state.unobservable}
@@ -379,29 +382,6 @@ def errors_of(test: Problem, vectors: Mapping[str, np.ndarray], prediction: Pred
     return result
 
 
-def reduced(selection: Selection, refined: Refined) -> Selection:
-    """Return the selection with only those effects that a refinement kept; its base alone without any.
-
-    Effects of sensors that held-out flights do not see stay unless the base fitted beside them flies worse.
-    """
-    model, judge = selection.model, refined.judge
-    if refined.fit is not None:
-        if refined.kept == model.candidates:
-            return selection
-        return selection._replace(model=model._replace(candidates=refined.kept, places=refined.fit.places))
-    is_whole = bool(model.candidates) and refined.kept == model.candidates
-    if is_whole and (judge is None or not judge.is_surely_worse(model.vector)):
-        return selection
-    state, model = selection.state, selection.base
-    # What an effect that is gone held at nominal is free again, as it was when the base was fitted.
-    held = tuple(one for one in state.held if state.problem.names.index(one.field) not in model.places)
-    state = replace(state, held=held)
-    if refined.kept:
-        tried = state.fitted(refined.kept, model.vector)
-        model = model if judge is not None and judge.worst_ratio(tried.vector) >= 1.0 else tried
-    return selection._replace(state=state, model=model)
-
-
 def _is_beyond(problem: Problem, vector: np.ndarray, field: str) -> str:
     """Return which way a parameter would go if it were searched farther; nothing within its range."""
     if not at_bounds(problem, vector, [field]):
@@ -413,8 +393,8 @@ def _is_beyond(problem: Problem, vector: np.ndarray, field: str) -> str:
     return f"{field.split('.')[-1]} at {'most' if is_low else 'least'} {size}"
 
 
-def effects_at_end(selection: Selection, refined: Refined) -> dict[str, str]:
-    """Return effects with a value at the end of what is searched, each with which way it would go.
+def causes_at_end(selection: Selection, refined: Refined, test: Problem) -> tuple[Cause, ...]:
+    """Return effects with a value at the end of what is searched, as causes that say which way it would go.
 
     Left out are values that the log does not determine, which end anywhere, and delays that end at how many
     rows are remembered: their law holds.
@@ -423,29 +403,26 @@ def effects_at_end(selection: Selection, refined: Refined) -> dict[str, str]:
     searched, vector = problem, model.vector
     if refined.fit is not None:
         searched, vector = refined.problem, refined.fit.vector
-    result = {}
+    ranges = dict(zip(problem.names, problem.high - problem.low, strict=True))
+    stuck: dict[str, str] = {}
     for one in refined.kept:
         steps = [f"{one.effect}.{field}" for field in BY_NAME[one.effect].most_steps]
-        stuck = [field for field in at_bounds(searched, vector, one.fields) if field not in steps]
-        if not stuck:
+        fields = [field for field in at_bounds(searched, vector, one.fields) if field not in steps]
+        if not fields:
             continue
         marginal = Marginal(selection.state.linearized(model.vector)[1], model, one.fields)
         widths = dict(zip(one.fields, marginal.half_widths(), strict=True))
-        ranges = dict(zip(problem.names, problem.high - problem.low, strict=True))
         where = [
-            _is_beyond(searched, vector, field) for field in stuck if widths[field] < LOOSE * ranges[field]
+            _is_beyond(searched, vector, field) for field in fields if widths[field] < LOOSE * ranges[field]
         ]
         if where:
-            result[one.effect] = ", ".join(where)
-    return result
-
-
-def refusal_note(effect: str, where: str) -> str:
-    """Return a warning of an effect that was refused for ending where the search does."""
-    return (
-        f"{effect} would fit best with {where}, the end of what is searched: the cause is beyond the "
-        f"list, and {effect} is not in the extended model"
-    )
+            stuck[one.effect] = ", ".join(where)
+    if not stuck:
+        return ()
+    state, linearization = selection.state.linearized(model.vector)
+    causes = effect_causes(selection._replace(state=state), test, linearization)
+    refused = with_refined_values([one for one in causes if one.effect in stuck], refined, vector)
+    return tuple(replace(one, beyond=stuck[one.effect]) for one in refused)
 
 
 def with_refined_values(causes: Sequence[Cause], refined: Refined, vector: np.ndarray) -> tuple[Cause, ...]:
@@ -517,19 +494,20 @@ def changed_parameters(
     return tuple(result)
 
 
-def refinement_notes(refined: Refined) -> list[str]:
-    """Return what a refinement found out beside values."""
+def refinement_notes(refined: Refined, model: FittedModel) -> list[str]:
+    """Return what a refinement found out beside values; model: what is left of the selected one."""
     judge = refined.judge
     if judge is None:
         return []
     notes = []
-    if refined.removed:
-        names = ", ".join(refined.removed)
+    removed = [*refined.removed, *(one.effect for one in refined.kept if one not in model.candidates)]
+    if removed:
+        names = ", ".join(removed)
         notes.append(
             f"not in the extended model: {names}; single steps show them, but held-out flights are "
             "predicted no better with them, or worse at some horizon"
         )
-        if not refined.kept:
+        if refined.fit is None:
             notes.append("no effect predicts held-out flights better: the extended model is the refitted one")
     silent = [
         f"{HORIZONS_S[index]:g} s"
@@ -577,10 +555,10 @@ def stand_in_notes(selection: Selection, vector: np.ndarray) -> list[str]:
     return notes
 
 
-def unseen_at_rest_notes(selection: Selection) -> list[str]:
-    """Return laws of the sticks that were refused where something of the rotation is unexplained."""
-    names = ", ".join(name for name in selection.state.refused if BY_NAME[name].follows_sticks)
-    if not names or not turns_unexplained(selection):
+def unseen_at_rest_notes(rejected: Mapping[str, Veto]) -> list[str]:
+    """Return laws of the sticks that were rejected for what they do while those rest."""
+    names = ", ".join(name for name, veto in rejected.items() if veto is not_seen_at_rest)
+    if not names:
         return []
     return [
         f"{names}: not named, since dynamics of the rate loop that no list has would look the same while "
@@ -591,6 +569,8 @@ def unseen_at_rest_notes(selection: Selection) -> list[str]:
 def _at_bound(cause: Cause) -> str:
     """Return a warning of a value at the end of its range: the true cause may be another one."""
     why = "its law may stand in for something else"
+    if cause.effect in BY_NAME:
+        why += ", and is not in the extended model"
     if cause.effect in BY_NAME and any(name in cause.beyond for name in BY_NAME[cause.effect].most_steps):
         why = "only so many rows of the log are remembered; import it with fewer rows per second"
     return f"{cause.effect} is beyond the list: {cause.beyond}, the end of what is searched; {why}"

@@ -39,7 +39,7 @@ from flytrack_sysid.record import Record
 # there, and less than that share of its size is there: laws are not exact where they are flown harder.
 HELD_OUT_SIGMAS, HELD_OUT_SHARE = 4.0, 0.35
 HELD_OUT_SHOWN = 20.0  # of chi2: held-out rows that would show less contradict nothing
-# Commands rest that have changed by no more than that share of the largest for so long.
+# Commands are at rest if they changed by no more than this share of the largest stick for this long.
 REST_S, REST_SHARE = 0.1, 0.05
 # A choice among many effects finds what fits the noise of one log: an effect that gains less than so many
 # thresholds has to gain on held-out rows, too, if they would show that much chi2 of it.
@@ -99,22 +99,22 @@ def reject(selection: Selection, effects: Sequence[str]) -> Selection:
     return Selection(state, selection.base, model, ablations)
 
 
-def apply_vetoes(selection: Selection, test: Problem) -> tuple[Selection, list[str]]:
-    """Return the selection without effects that a veto rejects, and which ones held-out rows contradict.
+def apply_vetoes(selection: Selection, test: Problem) -> tuple[Selection, dict[str, Veto]]:
+    """Return the selection without effects that a veto rejects, and the veto of each.
 
     test: held-out rows, with the noise of the selection's problem.
     """
-    contradicted: list[str] = []
+    vetoed: dict[str, Veto] = {}
     selection = examined(selection)
     while True:
         for rules in VETOES:
-            rejected = tuple(dict.fromkeys(effect for rule in rules for effect in rule(selection, test)))
+            rejected = {effect: rule for rule in rules for effect in rule(selection, test)}
             if rejected:
-                contradicted += rejected if contradicted_on_held_out in rules else ()
-                selection = examined(reject(selection, rejected))
+                vetoed |= rejected
+                selection = examined(reject(selection, tuple(rejected)))
                 break
         else:
-            return selection, contradicted
+            return selection, vetoed
 
 
 def examined(selection: Selection) -> Selection:
@@ -246,6 +246,8 @@ def not_seen_at_rest(selection: Selection, test: Problem) -> list[str]:
     """
     state, model = selection.state, selection.model
     laws = [name for name in selection.ablations if BY_NAME[name].follows_sticks]
+    if state.problem.counts[..., AXES[0], 1].any():  # attitude tells a gyro from any rate loop
+        laws = [name for name in laws if BY_NAME[name].gyro is None]
     if not laws:
         return []
     at_rest = rests(state.problem.lanes.record)

@@ -21,7 +21,7 @@ from flytrack_sysid.diagnosis.result import Cause, Estimated, Unexplained
 from flytrack_sysid.diagnosis.score_test import CANDIDATES, threshold
 from flytrack_sysid.diagnosis.search import FittedModel, Held, SearchState
 from flytrack_sysid.diagnosis.summary import (
-    effects_at_end,
+    causes_at_end,
     stand_in_notes,
     unseen_at_rest_notes,
     warnings_of,
@@ -211,19 +211,20 @@ def test_values_at_the_end_of_their_range_are_beyond_the_list(state, field, valu
         ("gyro_scale.x", True),
         ("command_delay.delay_s", False),  # its law holds: so many rows are remembered
         ("ground_effect.gain", False),  # no ground was near
-        ("tau_roll", False),  # a base that cannot be left out
     ],
 )
 def test_only_an_effect_whose_law_ends_where_the_search_does_is_refused(state, field, is_refused):
     problem, effect = state.problem, field.partition(".")[0]
     vector = problem.start.copy()
     vector[problem.names.index(field)] = problem.high[problem.names.index(field)]
-    kept = tuple(one for one in CANDIDATES if one.effect == effect and field in one.fields)[:1]
-    places = (*state.base_places, *(place for one in kept for place in problem.index(one.fields)))
-    selection = Selection(state, None, FittedModel(kept, vector, 0.0, places), {})
-    found = effects_at_end(selection, Refined(kept, None, None, (), {}, problem, None))
-    assert set(found) == ({effect} if is_refused else set())
-    assert all(where.startswith("x at least") for where in found.values())
+    way = next(one for one in CANDIDATES if one.effect == effect and field in one.fields)
+    base = FittedModel((), problem.start, 0.0, tuple(state.base_places))
+    model = FittedModel((way,), vector, 0.0, (*state.base_places, *problem.index(way.fields)))
+    selection = Selection(state, base, model, {effect: Ablation(1e4, 1.0, 1, {}, {}, base)})
+    refined = Refined((way,), None, None, (), {}, problem, None)
+    found = causes_at_end(selection, refined, problem)
+    assert [one.effect for one in found] == ([effect] if is_refused else [])
+    assert all(one.beyond.startswith("x at least 1.2") and "x" in one.parameters for one in found)
 
 
 @pytest.mark.parametrize(("effect", "is_law"), [("rate_scale", True), ("command_delay", False)])
@@ -244,13 +245,26 @@ def test_what_only_transients_show_is_no_law_where_turns_are_unexplained(state):
     vector[state.problem.names.index("rate_scale.roll")] += 0.001
     own = Ablation(1e4, 1.0, 1, {}, {}, SimpleNamespace(vector=state.problem.start))
     found = Selection(state, None, SimpleNamespace(vector=vector), {"rate_scale": own})
-    assert vetoes.not_seen_at_rest(found, None) == [] == unseen_at_rest_notes(found)
+    assert vetoes.not_seen_at_rest(found, None) == []
     for side, is_rejected in (("force", False), ("rate", True)):
         left = found._replace(unexplained=Unexplained(True, ("stochastic",), {f"{side}: stochastic": 9.0}))
         assert vetoes.not_seen_at_rest(left, None) == (["rate_scale"] if is_rejected else [])
-        refused = left._replace(state=replace(state, refused=("wind", "rate_scale")))
-        notes = unseen_at_rest_notes(refused)
-        assert len(notes) == is_rejected and all(one.startswith("rate_scale: ") for one in notes)
+    (note,) = unseen_at_rest_notes({"wind": vetoes.seen_once, "rate_scale": vetoes.not_seen_at_rest})
+    assert note.startswith("rate_scale: ") and unseen_at_rest_notes({"wind": vetoes.seen_once}) == []
+
+
+def test_attitude_tells_a_gyro_from_a_rate_loop(state):
+    """A scale of the gyro shows in every turn, whatever the sticks do; a scale of the rates may not."""
+    vector = state.problem.start.copy()
+    vector[state.problem.names.index("gyro_scale.x")] += 0.001
+    own = Ablation(1e4, 1.0, 1, {}, {}, SimpleNamespace(vector=state.problem.start))
+    left = Unexplained(True, ("stochastic",), {"rate: stochastic": 9.0})
+    blind = state.problem.counts & (np.arange(2) == 0)  # direct channels only
+    for counts, is_rejected in ((state.problem.counts, False), (blind, True)):
+        lanes = state.problem.lanes._replace(counts=counts)
+        seen = replace(state, problem=replace(state.problem, lanes=lanes))
+        found = Selection(seen, None, SimpleNamespace(vector=vector), {"gyro_scale": own}, left)
+        assert vetoes.not_seen_at_rest(found, None) == (["gyro_scale"] if is_rejected else [])
 
 
 def test_laws_that_undo_each_other_are_contradicted_together(state):
@@ -268,6 +282,8 @@ def test_laws_that_undo_each_other_are_contradicted_together(state):
         rest = tuple(way for effect, way in ways.items() if effect != name)
         needed[name] = Ablation(1e4, 1.0, 1, {}, {}, FittedModel(rest, less, 0.0, tuple(state.base_places)))
     model = FittedModel(tuple(ways.values()), both, 0.0, tuple(state.base_places))
+    for name in laws:  # alone, neither is
+        assert vetoes.not_seen_at_rest(Selection(state, None, model, {name: needed[name]}), None) == []
     assert vetoes.not_seen_at_rest(Selection(state, None, model, needed), None) == [*laws]
 
 

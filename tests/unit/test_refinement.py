@@ -11,7 +11,9 @@ from benchmarks.diagnosis import model_of
 from benchmarks.hidden import draw_base, draw_outside, fly, measure
 from flytrack_env.effects import BY_NAME
 from flytrack_sysid.diagnosis.lanes import make_lanes
+from flytrack_sysid.diagnosis.noise import first_guess
 from flytrack_sysid.diagnosis.problem import Problem
+from flytrack_sysid.diagnosis.reduction import reduced
 from flytrack_sysid.diagnosis.refinement import (
     Judge,
     at_bounds,
@@ -23,7 +25,6 @@ from flytrack_sysid.diagnosis.refinement import (
 )
 from flytrack_sysid.diagnosis.score_test import BASE_FREE, CANDIDATES
 from flytrack_sysid.diagnosis.search import FittedModel, Held, SearchState
-from flytrack_sysid.diagnosis.summary import reduced
 from flytrack_sysid.diagnosis.vetoes import Selection
 from flytrack_sysid.log import FlightLog
 from flytrack_sysid.parameters import from_vector
@@ -112,6 +113,23 @@ def test_the_base_is_free_where_an_effect_that_held_it_is_gone(dragged):
     after = reduced(selection, found._replace(kept=(), fit=None))
     assert after.model is base and not after.state.held
     assert set(base.places) <= set(after.state.every_place)
+
+
+def test_a_sensor_that_flights_do_not_see_stays_unless_its_base_flies_worse(dragged):
+    """Single steps decide about it; a base that was bent beside it would make the extension worse."""
+    _, log, problem, found = dragged
+    with jax.enable_x64(True):
+        noise = first_guess(problem.lanes, problem.residuals(problem.start[None])[0])
+        state = SearchState(problem.with_noise(noise))
+        base = state.fitted((), problem.start)
+        model = state.fitted((DRAG, BIAS), base.vector)
+        judge = Judge.of(problem, windows_of(log, ~held_out_rows(log)), found.judge.windows, base.vector)
+        selection = Selection(state, base, model, {})
+        kept = found._replace(kept=(BIAS,), fit=None, judge=judge)
+        stays = reduced(selection, kept)
+        assert stays.model.candidates == (BIAS,) and set(stays.ablations) == {"accelerometer_bias"}
+        bent = judge._replace(scale=1e-3 * judge.scale)
+        assert reduced(selection, kept._replace(judge=bent)).model is base
 
 
 @pytest.mark.parametrize("step_s", [0.01, 0.005])
