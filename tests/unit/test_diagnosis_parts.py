@@ -242,3 +242,18 @@ def test_a_force_may_be_a_law_whose_channels_the_log_lacks():
     (cause,) = blind.causes
     assert cause.effect == "thrust_tilt" and {"linear_drag", "wind"} <= {*cause.equivalent}
     assert "tilt of the thrust axis (or " in verdict_of(blind).text
+
+
+@pytest.mark.slow
+def test_a_sensor_farther_off_than_any_on_the_list_is_told_and_not_named():
+    rng = np.random.default_rng(6)
+    truth = draw_base(rng)
+    log = measure(fly(truth, "scripted", 20.0, rng), "sensors", rng)
+    off = log["f"] + np.array([2.5, 0.0, 0.0])
+    found = diagnose(replace(log, channels={**log.channels, "f": off}), model_of(truth))
+    (cause,) = found.beyond
+    assert found.causes == () and found.verdict == "unexplained" and not found.unexplained.flagged
+    assert cause.effect == "accelerometer_bias" and cause.beyond == "x at least 2 m/s^2"
+    assert float(found.extended.effect("accelerometer_bias").x) == 0.0
+    (warning,) = (one for one in found.warnings if "beyond the list" in one)
+    assert warning.endswith("and is not in the extended model")
