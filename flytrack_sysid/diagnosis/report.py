@@ -147,11 +147,8 @@ def _gain(diagnosis: Diagnosis) -> str:
     text = f"Named {names}: flies {_closer(before, after)} after 1 s"
     details = [f"{after:.2g} m instead of {before:.2g} m on held-out flight"]
     if np.isfinite(refitted):
-        by_effects = _closer(refitted, after)
-        gain = (
-            "no effect adds to that" if by_effects == AS_CLOSE else f"with its effects it flies {by_effects}"
-        )
-        details.append(f"{refitted:.2g} m when only refitted; {gain}")
+        as_good = ": no effect adds to that" if _closer(refitted, after) == AS_CLOSE else ""
+        details.append(f"{refitted:.2g} m when only refitted{as_good}")
     blind = diagnosis.prediction.errors.get("placebo", {}).get("position_m", {}).get(HEADLINE_HORIZON, np.inf)
     if blind <= after:
         details.append(f"a guess that ignores the commands, {blind:.2g} m")
