@@ -435,11 +435,14 @@ def with_refined_values(causes: Sequence[Cause], refined: Refined, vector: np.nd
         fields = [prefix + name for name in cause.parameters if prefix + name in problem.names]
         values = dict(cause.parameters)
         for field in fields:
-            place = problem.names.index(field)
-            if place in half:
+            place, name = problem.names.index(field), field.split(".")[-1]
+            if half.get(place) == 0.0 and len(values) > 1:
+                del values[name]  # no flight depends on it
+            elif place in half:
                 value, low, high = (float(one[place]) for one in (vector, problem.low, problem.high))
                 ends = max(value - half[place], low), min(value + half[place], high)
-                values[field.split(".")[-1]] = Estimated(value, ends, unit_of_parameter(field))
+                values[name] = Estimated(value, ends, unit_of_parameter(field))
+        fields = [field for field in fields if field.split(".")[-1] in values]
         if "mean_factor" in values and fit is not None:
             own = [fit.places.index(place) for place in problem.index(THRUST_COEFFS)]
             slopes = mean_thrust(problem)

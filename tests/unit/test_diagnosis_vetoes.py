@@ -16,7 +16,7 @@ from flytrack_sysid.diagnosis.lanes import LANE_S, make_lanes, thinned
 from flytrack_sysid.diagnosis.model_selection import Ablation, is_determined, with_lags_anew
 from flytrack_sysid.diagnosis.noise import first_guess
 from flytrack_sysid.diagnosis.problem import Problem, Window
-from flytrack_sysid.diagnosis.refinement import Refined
+from flytrack_sysid.diagnosis.refinement import Fit, Refined
 from flytrack_sysid.diagnosis.result import Cause, Estimated, Unexplained
 from flytrack_sysid.diagnosis.score_test import CANDIDATES, threshold
 from flytrack_sysid.diagnosis.search import FittedModel, Held, SearchState
@@ -203,6 +203,17 @@ def test_values_at_the_end_of_their_range_are_beyond_the_list(state, field, valu
     assert found[0].beyond.startswith(f"{name} at most {value:g}" if is_warned_of else "")
     warned = [one for one in warnings_of(problem, found, []) if "beyond the list" in one]
     assert len(warned) == is_warned_of and bool(found[0].beyond) == is_warned_of
+
+
+def test_a_value_that_no_flight_depends_on_is_not_told(state):
+    """A yaw that is ahead of the others by more than their delay is not: it is in time, whatever the value."""
+    problem, names = state.problem, ("delay_s", "yaw_extra_s")
+    places = tuple(problem.index([f"command_delay.{name}" for name in names]))
+    fit = Fit(problem.start, places, np.diag([1e-6, 0.0]))
+    told = {name: Estimated(0.01, (0.0, 0.02), "s") for name in names}
+    cause = replace(CAUSE, effect="command_delay", parameters=told)
+    (found,) = with_refined_values([cause], Refined((), fit, None, (), {}, problem, None), problem.start)
+    assert list(found.parameters) == ["delay_s"] and found.parameters["delay_s"].ci95 == (0.0, 0.001)
 
 
 @pytest.mark.parametrize(
