@@ -206,7 +206,7 @@ def test_values_at_the_end_of_their_range_are_beyond_the_list(state, field, valu
 
 
 def test_a_value_that_no_flight_depends_on_is_not_told(state):
-    """A yaw that is ahead of the others by more than their delay is not: it is in time, whatever the value."""
+    """A yaw that is ahead of the others by more than their delay is in time, whatever the value."""
     problem, names = state.problem, ("delay_s", "yaw_extra_s")
     places = tuple(problem.index([f"command_delay.{name}" for name in names]))
     fit = Fit(problem.start, places, np.diag([1e-6, 0.0]))
