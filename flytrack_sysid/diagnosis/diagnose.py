@@ -277,8 +277,9 @@ def summarize(judged: Judged, parts: Split) -> Diagnosis:
         *notes_of(selection, linearization, parts.log),
     ]
     rest = with_lost_causes(selection.unexplained, lost)
+    rest = replace(rest, flagged=rest.flagged or bool(beyond))
     return Diagnosis(
-        verdict=verdict_of(causes, rest, beyond),
+        verdict=verdict_of(causes, rest),
         causes=causes,
         negligible=negligible,
         beyond=beyond,

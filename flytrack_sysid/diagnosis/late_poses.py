@@ -70,7 +70,8 @@ def with_late_poses(
     if abs(late_s - before_s) < EFFECT.notable["latency_s"]:
         return replace(found, negligible=(cause, *found.negligible))
     if cause.beyond:
-        found = replace(found, beyond=(cause, *found.beyond))
+        rest = replace(found.unexplained, flagged=True)
+        found = replace(found, beyond=(cause, *found.beyond), unexplained=rest)
     else:
         found = replace(found, causes=(cause, *found.causes))
-    return replace(found, verdict=verdict_of(found.causes, found.unexplained, found.beyond))
+    return replace(found, verdict=verdict_of(found.causes, found.unexplained))

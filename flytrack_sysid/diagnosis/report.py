@@ -180,7 +180,7 @@ def verdict_of(diagnosis: Diagnosis) -> Verdict:
         text = f"The model is wrong, and no known cause explains it.{depends}"
         return Verdict(" ".join(filter(None, [text, beyond])), "open")
     parts = [_faults(diagnosis), _gain(diagnosis), beyond]
-    if left.flagged:
+    if left.depends_on:
         parts.append(f"Something else remains that no known cause explains.{depends}")
     return Verdict(" ".join(filter(None, parts)), "found" if diagnosis.verdict == CAUSES_FOUND else "open")
 
@@ -283,10 +283,10 @@ def _limits_part(diagnosis: Diagnosis) -> Part:
 
 def _unexplained_parts(diagnosis: Diagnosis) -> list[Part]:
     left = diagnosis.unexplained
-    if not left.flagged:
+    if not left.depends_on:
         beyond = _beyond(diagnosis)
         return [Text(f"Nothing more. {beyond}" if beyond else "Nothing: the residuals are noise.")]
-    what = ", ".join(left.depends_on) or "nothing that is known"
+    what = ", ".join(left.depends_on)
     parts: list[Part] = [Text(f"What is left is more than noise. It depends on: {what}.")]
     if left.shares:
         shares = [[name, _number(share)] for name, share in left.shares.items()]
@@ -399,7 +399,7 @@ def text_of(diagnosis: Diagnosis) -> str:
     if answers:
         times = ", ".join(f"{stick} {_half_response(one)} ms" for stick, one in answers)
         lines.append(f"time from a stick to half of the response: {times}")
-    if diagnosis.unexplained.flagged:
+    if diagnosis.unexplained.depends_on:
         lines.append(f"unexplained, depends on: {', '.join(diagnosis.unexplained.depends_on)}")
     closing = _gain(diagnosis) if diagnosis.causes else ""
     return "\n".join([*lines, *_limits_text(diagnosis), *diagnosis.warnings, *filter(None, [closing])])

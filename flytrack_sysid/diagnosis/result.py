@@ -61,7 +61,8 @@ class Cause:
 class Unexplained:
     """What no known cause explains.
 
-    depends_on: position, time, heading, airspeed, attitude, command, "periodic at F Hz", stochastic.
+    flagged: something is left, or has a value beyond the list. depends_on: what is left varies with position,
+    time, heading, airspeed, attitude, command, "periodic at F Hz" or is stochastic.
     shares: of each, how many times the sensor noise it is (rms), by "channel: dependence".
     """
 

@@ -285,14 +285,13 @@ def not_identifiable(
     return tuple(result)
 
 
-def verdict_of(causes: Sequence[Cause], rest: Unexplained, beyond: Sequence[Cause]) -> str:
-    """Return the verdict, as in ``Diagnosis``; what is beyond the list is explained by no known cause."""
-    is_open = rest.flagged or bool(beyond)
-    if causes and is_open:
+def verdict_of(causes: Sequence[Cause], rest: Unexplained) -> str:
+    """Return the verdict, as in ``Diagnosis``."""
+    if causes and rest.flagged:
         return f"{CAUSES_FOUND}+{UNEXPLAINED}"
     if causes:
         return CAUSES_FOUND
-    return UNEXPLAINED if is_open else CONSISTENT
+    return UNEXPLAINED if rest.flagged else CONSISTENT
 
 
 def model_of(problem: Problem, model: FittedModel) -> ModelParameters:

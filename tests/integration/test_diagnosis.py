@@ -65,7 +65,7 @@ def check_content(one: Found) -> None:
     assert one["verdict"] in ("consistent", "causes_found", "unexplained", "causes_found+unexplained")
     assert ("causes_found" in one["verdict"]) == bool(one["causes"])
     assert ("unexplained" in one["verdict"]) == one["unexplained"]["flagged"]
-    assert one["unexplained"]["flagged"] == bool(one["unexplained"]["depends_on"])
+    assert one["unexplained"]["flagged"] == bool(one["unexplained"]["depends_on"] or one["beyond_the_list"])
     for cause in one["causes"]:
         assert cause["parameters"], f"{cause['effect']} has no size"
         assert cause["channel"] in CHANNELS

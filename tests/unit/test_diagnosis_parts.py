@@ -252,7 +252,7 @@ def test_a_sensor_farther_off_than_any_on_the_list_is_told_and_not_named():
     off = log["f"] + np.array([2.5, 0.0, 0.0])
     found = diagnose(replace(log, channels={**log.channels, "f": off}), model_of(truth))
     (cause,) = found.beyond
-    assert found.causes == () and found.verdict == "unexplained" and not found.unexplained.flagged
+    assert found.causes == () and found.verdict == "unexplained" and found.unexplained.depends_on == ()
     assert cause.effect == "accelerometer_bias" and cause.beyond == "x at least 2 m/s^2"
     assert float(found.extended.effect("accelerometer_bias").x) == 0.0
     (warning,) = (one for one in found.warnings if "beyond the list" in one)

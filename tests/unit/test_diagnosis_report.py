@@ -268,8 +268,8 @@ def test_what_is_beyond_the_list_is_told_and_not_named(diagnosis):
     assert "lag of roll (tau_roll at most 0.001 s)" in verdict_of(alone).text
     (stored,) = alone.as_json()["beyond_the_list"]
     assert stored["effect"] == "tau_roll" and alone.as_json()["causes"] == []
-    assert summary.verdict_of((), Unexplained(), (at_end,)) == UNEXPLAINED
-    assert summary.verdict_of((drag,), Unexplained(), (at_end,)) == f"{CAUSES_FOUND}+{UNEXPLAINED}"
+    assert summary.verdict_of((), Unexplained(flagged=True)) == UNEXPLAINED
+    assert summary.verdict_of((drag,), Unexplained(flagged=True)) == f"{CAUSES_FOUND}+{UNEXPLAINED}"
 
 
 @pytest.mark.slow
