@@ -39,6 +39,7 @@ from flytrack_sysid.record import Record
 # there, and less than that share of its size is there: laws are not exact where they are flown harder.
 HELD_OUT_SIGMAS, HELD_OUT_SHARE = 4.0, 0.35
 HELD_OUT_SHOWN = 20.0  # of chi2: held-out rows that would show less contradict nothing
+LOSS_SIGMAS = 2.5  # instead, where held-out rows are likelier without the cause
 # Commands are at rest if they changed by no more than this share of the largest stick for this long.
 REST_S, REST_SHARE = 0.1, 0.05
 # A choice among many effects finds what fits the noise of one log: an effect that gains less than so many
@@ -211,9 +212,11 @@ def is_contradicted(gain: float, expected: float, inflation: float) -> bool:
 
     expected: the gain if it were; its spread is that of a chi2 about it.
     """
+    spread = 2.0 * np.sqrt(expected * inflation)
+    if gain < 0.0 and expected > HELD_OUT_SHOWN:
+        return bool(gain < expected - LOSS_SIGMAS * spread)
     if expected < HELD_OUT_SHOWN * inflation:
         return False
-    spread = 2.0 * np.sqrt(expected * inflation)
     share = 0.5 * (1.0 + gain / expected)
     return bool(gain < expected - HELD_OUT_SIGMAS * spread and share < HELD_OUT_SHARE)
 

@@ -133,7 +133,15 @@ def test_what_held_out_rows_hardly_show_is_contradicted(share, contradicted):
 
 def test_held_out_rows_that_would_not_show_an_effect_contradict_nothing():
     assert not is_contradicted(-100.0, 0.9 * HELD_OUT_SHOWN, inflation=1.0)
-    assert not is_contradicted(-100.0, 1.5 * HELD_OUT_SHOWN, inflation=2.0)
+    assert not is_contradicted(0.0, 1.5 * HELD_OUT_SHOWN, inflation=2.0)
+
+
+def test_a_cause_that_held_out_rows_are_likelier_without_is_contradicted():
+    expected, inflation = 2.7 * HELD_OUT_SHOWN, 4.0
+    absent = expected - 2.5 * 2.0 * (expected * inflation) ** 0.5
+    assert absent < 0.0
+    assert is_contradicted(absent - 1.0, expected, inflation)
+    assert not is_contradicted(absent + 1.0, expected, inflation)
 
 
 def test_true_causes_are_kept_in_noise():
