@@ -110,11 +110,10 @@ def diagnose(
         state, base, extended = search(SearchState.start(parts.log, parts.train.with_noise(noise)))
         selection = select(state, base, extended)
         report(1, len(STAGES))
-        selection = with_changes(selection, parts.test, parts.log)
-        test = held_out_under(selection, parts.test)
-        selection, rejected = apply_vetoes(selection, test)
+        judged = judged_in_time(selection, parts)
+        selection, test = judged.selection, held_out_under(judged.selection, parts.test)
         report(2, len(STAGES))
-        judged = refined_within_range(Judged(selection, rejected), test, parts)
+        judged = refined_within_range(judged, test, parts)
         report(3, len(STAGES))
         found = summarize(judged, parts._replace(test=test))
         nominal = nominal_parameters() if model is None else model
@@ -197,6 +196,22 @@ class Judged(NamedTuple):
     rejected: Mapping[str, Veto]
     refined: Refined | None = None
     refused: tuple[Cause, ...] = ()
+
+
+def judged_in_time(selection: Selection, parts: Split) -> Judged:
+    """Return a selection with its changes within the log, after its vetoes.
+
+    A change may hide behind an effect that held-out rows contradict, so it is looked for again without that.
+    """
+    selection = with_changes(selection, parts.test, parts.log)
+    selection, rejected = apply_vetoes(selection, held_out_under(selection, parts.test))
+    if contradicted_on_held_out in rejected.values():
+        later = with_changes(selection, parts.test, parts.log)
+        if later is not selection:
+            selection, again = apply_vetoes(later, held_out_under(later, parts.test))
+            rejected = {name: one for name, one in rejected.items() if one is not contradicted_on_held_out}
+            rejected |= again
+    return Judged(selection, rejected)
 
 
 def refined_within_range(judged: Judged, test: Problem, parts: Split) -> Judged:

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from benchmarks.diagnosis import model_of
+from benchmarks.diagnosis import Trial, make_log, model_of
 from benchmarks.hidden import Truth, draw_base, fly, measure
 from flytrack_sysid import diagnose
 from flytrack_sysid.diagnosis import text_of
@@ -54,3 +54,15 @@ def test_a_cause_that_ends_in_flight_is_not_in_the_extended_model():
     assert cause.end_s.value == pytest.approx(0.5 * SECONDS, abs=0.5)
     assert found.extended.effects == ()
     assert any("ended within the log" in warning for warning in found.warnings)
+
+
+@pytest.mark.slow
+def test_a_loss_of_thrust_is_told_from_a_thrust_curve_that_depends_on_voltage():
+    """The battery drains all the while, and a wandering disturbance takes what a curve leaves of the step."""
+    truth, _, log, model, _ = make_log(Trial("onset", 0, 28, "fine", 100))
+    (cause,) = diagnose(log, model).causes
+    assert cause.effect == "thrust_scale"
+    assert cause.onset_s.value == pytest.approx(truth.onset_s, abs=0.5)
+    assert cause.parameters["factor"].value == pytest.approx(
+        truth.effects["thrust_scale"]["factor"], abs=0.005
+    )
