@@ -47,7 +47,7 @@ from flytrack_sysid.split import held_out_rows
 
 LINES = ROOT / "docs" / "results" / "diagnosis.jsonl"
 SECONDS = 60.0
-SEED = 28  # no rule was made on it; on 21 to 27 some were
+SEED = 29  # no rule was made on it; on 21 to 28 some were
 # How the package calls the plants' motions.
 MOTION_OF = {"handout": Motion.HANDOUT, "semi_implicit": Motion.SEMI_IMPLICIT, "fine": Motion.CONTINUOUS}
 AMPLITUDES = (0.5, 3.0)  # of effects outside the list, times the noise

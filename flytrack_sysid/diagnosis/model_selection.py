@@ -101,19 +101,23 @@ def ablate(state: SearchState, model: FittedModel, linearization: Linearization,
 
 
 def other_groups(linearization: Linearization, model: FittedModel, effect: str) -> list[Candidate]:
-    """Return an effect in groups of its parameters, more or fewer, that are cheaper to first order."""
+    """Return an effect in groups of its parameters, more, fewer or others, that to first order are cheaper.
+
+    Others may be: they gain something beside the effect's own.
+    """
     problem, own = linearization.problem, set(model.candidate(effect).fields)
     result = []
     for candidate in {one.fields: one for one in CANDIDATES if one.effect == effect}.values():
-        changed = sorted(own.symmetric_difference(candidate.fields))
+        more = {*candidate.fields} - own
+        changed = sorted(more or own - {*candidate.fields})
         columns = [linearization.column(field) for field in changed]
         given = linearization.columns_at(model.places, without=columns)
         price = PER_PARAMETER * len(changed)
-        if own > set(candidate.fields):
+        if not more:
             size = (model.vector - problem.start)[problem.index(changed)]
             is_cheaper = size @ linearization.projected(columns, given)[0] @ size < price
         else:
-            gain = linearization.gain(columns, given) if own < set(candidate.fields) else None
+            gain = linearization.gain(columns, given)
             is_cheaper = gain is not None and gain.robust > price
         if is_cheaper:
             result.append(candidate)

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from benchmarks.diagnosis import model_of
-from benchmarks.hidden import draw_base, fly, measure
+from benchmarks.hidden import Truth, draw_base, fly, measure
 from flytrack_env.effects import BY_NAME
 from flytrack_sysid.diagnosis import vetoes
 from flytrack_sysid.diagnosis.diagnose import thinning_warning
 from flytrack_sysid.diagnosis.lanes import LANE_S, make_lanes, thinned
-from flytrack_sysid.diagnosis.model_selection import Ablation, is_determined, with_lags_anew
+from flytrack_sysid.diagnosis.model_selection import Ablation, is_determined, select_effects, with_lags_anew
 from flytrack_sysid.diagnosis.noise import first_guess
 from flytrack_sysid.diagnosis.problem import Problem, Window
 from flytrack_sysid.diagnosis.refinement import Fit, Refined
@@ -38,13 +38,17 @@ CAUSE = Cause("rate_scale", (), "rates", {}, 100.0, 30.0, 100.0, 90.0)
 def state():
     """The state of a search in twenty seconds of flight without effects."""
     rng = np.random.default_rng(3)
-    truth = draw_base(rng)
-    log = measure(fly(truth, "scripted", 20.0, rng), "sensors", rng)  # high up: no ground near
     with jax.enable_x64(True):
-        lanes = make_lanes(log, np.ones(len(log), bool), np.array(truth.tau), truth.gravity)
-        problem = Problem.of(lanes, model_of(truth))
-        noise = first_guess(lanes, problem.residuals(problem.start[None])[0])
-        yield SearchState.start(log, problem.with_noise(noise))
+        yield state_of(draw_base(rng), rng)
+
+
+def state_of(truth: Truth, rng: np.random.Generator) -> SearchState:
+    """Return the state of a search in twenty seconds of a plant's flight."""
+    log = measure(fly(truth, "scripted", 20.0, rng), "sensors", rng)  # high up: no ground near
+    lanes = make_lanes(log, np.ones(len(log), bool), np.array(truth.tau), truth.gravity)
+    problem = Problem.of(lanes, model_of(truth))
+    noise = first_guess(lanes, problem.residuals(problem.start[None])[0])
+    return SearchState.start(log, problem.with_noise(noise))
 
 
 def ablation(gain: float, num_parameters: int = 1, inflation: float = 1.0) -> Ablation:
@@ -163,6 +167,22 @@ def test_an_effect_that_could_as_well_be_none_is_not_determined(state):
         vector = found.vector.copy()
         vector[problem.index(way.fields)] = value
         assert is_determined(state, found._replace(vector=vector), way.fields)[1] is expected
+
+
+@pytest.mark.slow
+def test_a_push_becomes_a_moving_air_where_there_is_drag():
+    """Axes differ in their drag, so that air which moves does not push as a constant force does."""
+    effects = {
+        "linear_drag": {"d_x": 0.1, "d_y": 0.3, "d_z": 0.05},
+        "wind": {"v_x": -3.0, "v_y": 2.0, "v_z": -4.0},
+    }
+    rng = np.random.default_rng(3)
+    with jax.enable_x64(True):
+        state = state_of(replace(draw_base(rng), effects=effects), rng)
+        drag = next(one for one in CANDIDATES if one.effect == "linear_drag")
+        push = next(one for one in CANDIDATES if "wind.a_x" in one.fields)
+        _, model, _ = select_effects(state, state.fitted((drag, push), state.problem.start))
+    assert model.candidate("wind").fields == ("wind.v_x", "wind.v_y", "wind.v_z")
 
 
 def test_base_parameters_held_for_an_effect_are_free_without_it(state):
