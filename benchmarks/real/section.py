@@ -128,7 +128,7 @@ def draw(measured: Record) -> Figure | None:
 def causes_table(found: Record) -> str:
     """Return the causes with intervals, gains and what they may be confused with."""
     rows = []
-    for cause in (*found["causes"], *found.get("beyond_the_list", ())):
+    for cause in (*found["causes"], *found["beyond_the_list"]):
         values = "<br>".join(
             f"{name} {number(one['value'], one['unit'])} ({' to '.join(map(number, one['ci95']))})"
             for name, one in cause["parameters"].items()
