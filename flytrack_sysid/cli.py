@@ -24,7 +24,7 @@ from flytrack_sysid.diagnosis import diagnose, joined, motion_of, write_diagnosi
 from flytrack_sysid.diagnosis import text_of as text_of_diagnosis
 from flytrack_sysid.diagnosis.identifiability import next_flight
 from flytrack_sysid.diagnosis.report import traces_of
-from flytrack_sysid.fit import fit
+from flytrack_sysid.fit import fit, what_is_fitted
 from flytrack_sysid.flight_recording import write_flight_recording
 from flytrack_sysid.importing import import_log
 from flytrack_sysid.log import FlightLog
@@ -157,7 +157,7 @@ class Fit:
         fixed = fixed_values(self.fix)
         start = nominal_parameters() if self.start is None else load_model(self.start)
         log = load_log(self.log)
-        check_plausible(log)
+        what_is_fitted(log, start, fixed, self.effect, self.hold_out_every)  # refuses before the work
         start = start._replace(motion=motion_of(log, start) if self.motion == "auto" else Motion(self.motion))
         found = fit(log, start, fixed, self.effect, self.hold_out_every, ProgressBar("rounds"))
         provenance = found.provenance()

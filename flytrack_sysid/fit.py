@@ -195,6 +195,31 @@ def _warnings(
     return found
 
 
+def what_is_fitted(
+    log: FlightLog,
+    start: ModelParameters | None = None,
+    fixed: Mapping[str, float] | None = None,
+    effects: Iterable[str] = (),
+    every: int = HELD_OUT_EVERY,
+) -> tuple[ModelParameters, tuple[str, ...], np.ndarray]:
+    """Return the model that a fit starts from, the names of what it estimates and the rows that it sees.
+
+    Arguments and what is raised are those of ``fit``, which calls this before any work.
+    """
+    check_plausible(log)
+    fixed = dict(fixed or {})
+    try:
+        model = with_neutral_effects(nominal_parameters() if start is None else start, effects)
+    except KeyError as error:
+        raise FitError(f"effects: {error.args[0]}: no effect of that name") from error
+    free = _free_names(model, log, fixed)
+    model = with_values(model, fixed)
+    judged = ~held_out_rows(log, every)
+    _check_data(log, judged, free)
+    _check_response(log, model)
+    return model, free, judged
+
+
 def fit(
     log: FlightLog,
     start: ModelParameters | None = None,
@@ -213,17 +238,7 @@ def fit(
     Raises:
         LogError, FitError: an implausible log; missing channels or motion, or a fit that diverged.
     """
-    fixed = dict(fixed or {})
-    check_plausible(log)
-    try:
-        model = with_neutral_effects(nominal_parameters() if start is None else start, effects)
-    except KeyError as error:
-        raise FitError(f"effects: {error.args[0]}: no effect of that name") from error
-    free = _free_names(model, log, fixed)
-    model = with_values(model, fixed)
-    judged = ~held_out_rows(log, every)
-    _check_data(log, judged, free)
-    _check_response(log, model)
+    model, free, judged = what_is_fitted(log, start, fixed, effects, every)
     try:
         result = estimate(log, judged, model, free, report)
     except FitError as error:

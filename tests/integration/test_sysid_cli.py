@@ -11,7 +11,7 @@ from blackbox.build import build
 from blackbox.plant import PlantParameters
 from flytrack_env import load_model, load_provenance, save_model
 from flytrack_env.dynamics import nominal_parameters
-from flytrack_sysid import collect, load_log, save_log
+from flytrack_sysid import cli, collect, load_log, save_log
 from flytrack_sysid.cli import load_plant, main
 from flytrack_sysid.log import FlightLog
 from tests.support.black_boxes import SHIPPED
@@ -155,7 +155,8 @@ def with_rates_in_degrees(log: FlightLog) -> FlightLog:
         (lambda log: log, ["--out", "data.npz"], "data.npz: found suffix '.npz', expected .json"),
     ],
 )
-def test_fit_and_validate_refuse(folder, capsys, tmp_path, change, options, message):
+def test_fit_and_validate_refuse(folder, capsys, tmp_path, monkeypatch, change, options, message):
+    monkeypatch.setattr(cli, "motion_of", pytest.fail)  # half a minute of work
     save_log(tmp_path / "log.npz", change(load_log(folder / "data.npz")))
     out = [] if "--out" in options else ["--out", tmp_path / "model.json"]
     assert message in refused(capsys, "fit", tmp_path / "log.npz", *out, *options)
