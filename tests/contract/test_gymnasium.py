@@ -23,6 +23,7 @@ from flytrack_env.env import EnvParams, FlyTrack
 from flytrack_env.registration import ENVIRONMENTS
 from flytrack_env.tracks import load_track, save_track
 from tests.support.coasting import track_of_row
+from tests.support.slow import slow_but
 
 BASE = "FlyTrack-v0"
 
@@ -54,7 +55,7 @@ def still(params: EnvParams) -> EnvParams:
 # --- Registration and the protocol --------------------------------------------------------------
 
 
-@pytest.mark.parametrize("env_id", IDS)
+@pytest.mark.parametrize("env_id", slow_but(["FlyTrack-v0", "FlyTrackRobust-v0"], IDS))
 def test_checker_of_gymnasium_gives_no_warning(env_id: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
     is_renderable = all(find_spec(package) for package in ("PIL", "pygame"))

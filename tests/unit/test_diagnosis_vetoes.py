@@ -61,6 +61,7 @@ def selection_of(*windows: Window, **ablations: Ablation) -> Selection:
     return Selection(state, None, SimpleNamespace(vector=np.zeros(1)), ablations)
 
 
+@pytest.mark.slow
 def test_a_lag_that_ended_where_it_has_no_slope_is_fitted_from_nominal_again(state):
     problem, fitted = state.problem, state.fitted((), state.problem.start)
     assert with_lags_anew(state, fitted) == []

@@ -128,8 +128,8 @@ def errors(model: ModelParameters, dt: float, case: str) -> np.ndarray:
 @pytest.mark.parametrize(
     ("case", "most", "least_order"),
     [
-        ("drag", (1e-5, 5e-5, 5e-6, 2e-4), 3.0),
-        ("loop", (1e-3, 3e-3, 1e-3, 2e-3), 3.0),
+        pytest.param("drag", (1e-5, 5e-5, 5e-6, 2e-4), 3.0, marks=pytest.mark.slow),
+        pytest.param("loop", (1e-3, 3e-3, 1e-3, 2e-3), 3.0, marks=pytest.mark.slow),
         ("delay", (3e-4, 1.5e-3, 1e-3, 0.05), 1.0),
     ],
 )

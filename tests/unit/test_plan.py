@@ -116,6 +116,7 @@ def test_what_is_advised_shows_once_it_is_flown(hover, told):
         assert before < 1.0 <= after, f"{effect}: {before} before and {after} after {advice[effect]}"
 
 
+@pytest.mark.slow
 def test_what_is_promised_is_what_collecting_brings(hover, told):
     """Each manoeuvre gets its own lanes: others would promise something else by orders of magnitude."""
     question = Question(hover.linearization, hover.model, "yaw_reaction")

@@ -12,6 +12,7 @@ from benchmarks.real.black_boxes import _arx, base_steps, flown, linear, posed, 
 from flytrack_env.dynamics import nominal_parameters
 from flytrack_sysid import FlightLog
 from flytrack_sysid.prediction_windows import QUANTITIES, make_windows
+from tests.support.slow import slow_but
 
 STEP_S, LAG_S, GAIN = 0.01, 0.05, 10.0
 
@@ -53,7 +54,7 @@ def test_fits_of_one_drone_agree_where_intervals_overlap_and_times_are_within_5_
     }
 
 
-@pytest.mark.parametrize("name", real_logs.CRAFTS)
+@pytest.mark.parametrize("name", slow_but(["crazyflie"], real_logs.CRAFTS))
 def test_every_record_gives_a_section_with_a_paragraph_and_its_picture(name):
     if not real_logs.kept(name).exists():
         pytest.skip(f"no record of {name}")

@@ -115,6 +115,7 @@ def test_the_base_is_free_where_an_effect_that_held_it_is_gone(dragged):
     assert set(base.places) <= set(after.state.every_place)
 
 
+@pytest.mark.slow
 def test_a_sensor_that_flights_do_not_see_stays_unless_its_base_flies_worse(dragged):
     """Single steps decide about it; a base that was bent beside it would make the extension worse."""
     _, log, problem, found = dragged
