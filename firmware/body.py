@@ -1,20 +1,25 @@
 """The quadcopter's body in numbers: what ``body.c`` moves, and the truth that a diagnosis is graded on."""
 
 import dataclasses
+import json
 import math
 import struct
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from firmware.errors import FirmwareError
+from flytrack_env.files import read_at_most
+from flytrack_env.messages import error_text, quote_name, quote_value
 
 STEP_S = 125e-6  # of body.c
 MOTORS = ("rear right", "front right", "rear left", "front left")  # Betaflight's order
 STRONGEST_HEALTH = 1.5
 LARGEST_TILT_RAD = 0.3
 LARGEST_NUMBER = 1e6
+LARGEST_BYTES = 2**20  # of a body's file
 
 
 @dataclass(frozen=True)
@@ -151,3 +156,27 @@ class Body:
             *(self.resistance_ohm, self.full_current_a, self.gyro_noise, self.acc_noise),
         ]
         return struct.pack(f"={len(numbers)}d", *numbers)
+
+
+def read_body(path: Path) -> Body:
+    """Return the body in a file: a JSON object of fields of ``Body``; the rest are its defaults.
+
+    Raises:
+        FirmwareError: no such object, an unknown field or an impossible number; names the file and field.
+        OSError: a file that cannot be read.
+    """
+    try:
+        values = json.loads(read_at_most(path, LARGEST_BYTES))
+    except ValueError as error:
+        raise FirmwareError(f"{path}: found no JSON: {error_text(error)}") from error
+    if not isinstance(values, dict):
+        raise FirmwareError(f"{path}: found {quote_value(values)}, expected an object of fields of Body")
+    names = [field.name for field in dataclasses.fields(Body)]
+    unknown = next((name for name in values if name not in names), None)
+    if unknown is not None:
+        raise FirmwareError(f"{path}: {quote_name(unknown)}: unknown, expected of {', '.join(names)}")
+    try:
+        fields: dict[str, Any] = {name: tuple(v) if isinstance(v, list) else v for name, v in values.items()}
+        return Body(**fields)
+    except (FirmwareError, TypeError) as error:
+        raise FirmwareError(f"{path}: {error_text(error)}") from error

@@ -27,9 +27,10 @@ from firmware.building import find_executable
 from firmware.errors import FirmwareError
 from firmware.process import AT_REST, BODY, FLY, START, START_STATE, Firmware, Reply
 from firmware.settings import settings_of
-from flytrack_env.dynamics import ModelParameters
+from flytrack_env.dynamics import ModelParameters, nominal_parameters
 from flytrack_env.files import fresh_folder
 from flytrack_env.messages import error_text
+from flytrack_env.motion import Motion
 from flytrack_env.plants import Plant
 from flytrack_env.quaternion import Scalar
 from flytrack_env.state import (
@@ -176,6 +177,11 @@ class Betaflight(Plant):
     def value(self, name: str) -> str:
         """Return the value of a setting as the firmware has it, '' for a name that it does not have."""
         return self.firmware.value(name)
+
+    def nominal_model(self) -> ModelParameters:
+        """Return the model to fit from: the nominal one at these rates of full stick, moving as drones do."""
+        full = np.array(self.full_stick_deg_s, np.float32)
+        return nominal_parameters()._replace(max_rate=full, motion=Motion.CONTINUOUS)
 
     def reset(self, drone: Drone, model: ModelParameters) -> FirmwareState:
         """Return the state of a flight that has not begun; ``model`` is not used."""

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from baselines.purejaxrl_ppo import Config
-from flytrack_env import nominal_parameters, save_model
+from flytrack_env import ModelParameters, nominal_parameters, save_model
 from flytrack_env.files import write_atomically
 from flytrack_env.plants import Plant
 from flytrack_loop.flight_log import fly_log
@@ -65,11 +65,13 @@ def close_loop(
     seed: int = 0,
     settings: Settings = Settings(),
     report: Callable[[str], None] = print,
+    start: ModelParameters | None = None,
 ) -> Loop:
     """Close the loop on a plant; write logs, models, diagnosis, trainings and ``loop.json`` into ``out``.
 
     plant: a black box, or any ``flytrack_env.plants.Plant``. config: of both
-    trainings. report: called with a line per step.
+    trainings. report: called with a line per step. start: the model to fit from, and how it moves; the
+    nominal one, moving as fits the log, if None.
 
     Raises:
         ValueError: a plant that does not fly, settings that cannot be used, ``out`` with another run in it.
@@ -80,8 +82,10 @@ def close_loop(
     report("1/6 collect and fit the minimal model")
     excitation = collect(plant, settings.minutes, seeds["collect"], settings.noise, ProgressBar("flights"))
     save_log(out / "excitation.npz", excitation)
-    start = nominal_parameters()
-    start = start._replace(motion=motion_of(excitation, start))
+    motion = None if start is None else start.motion
+    if start is None:
+        start = nominal_parameters()
+        start = start._replace(motion=motion_of(excitation, start))
     fitted = fit(excitation, start, report=ProgressBar("rounds"))
     save_model(out / "minimal.json", fitted.model, fitted.provenance())
 
@@ -98,7 +102,7 @@ def close_loop(
 
     report("4/6 diagnose the flight, extend the model")
     logs = [race_log, excitation]
-    found = diagnose(logs, fitted.model, report=ProgressBar("stages"))
+    found = diagnose(logs, fitted.model, report=ProgressBar("stages"), motion=motion)
     write_diagnosis(out / "diagnosis", found, joined(logs))
     report(text_of(found))
     if found.causes or found.beyond:

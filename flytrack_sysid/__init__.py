@@ -5,7 +5,7 @@ from flytrack_env.extras import check_installed
 check_installed("sysid", "identification and diagnosis", "scipy", "matplotlib", "tqdm")
 
 from flytrack_sysid.collect import CollectError, collect
-from flytrack_sysid.diagnosis import Diagnosis, DiagnosisError, diagnose
+from flytrack_sysid.diagnosis import Diagnosis, DiagnosisError, diagnose, diagnose_change
 from flytrack_sysid.estimate import FitError
 from flytrack_sysid.fit import Fit, fit
 from flytrack_sysid.importing import Imported, import_log
@@ -29,6 +29,7 @@ __all__ = [
     "Validation",
     "collect",
     "diagnose",
+    "diagnose_change",
     "fit",
     "held_out_rows",
     "import_log",

@@ -20,7 +20,7 @@ from flytrack_env.dynamics import nominal_parameters
 from flytrack_env.model_file import ModelFileError
 from flytrack_env.plants import Plant
 from flytrack_sysid.collect import CollectError, collect
-from flytrack_sysid.diagnosis import diagnose, joined, motion_of, write_diagnosis
+from flytrack_sysid.diagnosis import diagnose, diagnose_change, joined, motion_of, write_diagnosis
 from flytrack_sysid.diagnosis import text_of as text_of_diagnosis
 from flytrack_sysid.diagnosis.identifiability import next_flight
 from flytrack_sysid.diagnosis.report import traces_of
@@ -205,6 +205,8 @@ class Diagnose:
     """The model to diagnose, .json; default: the nominal model."""
     hold_out: Annotated[tuple[Path, ...], arg(metavar="LOG [LOG ...]", help_behavior_hint=NO_HINT)] = ()
     """Logs to judge by and not to learn from; default: the last of every four blocks of the others."""
+    before: Annotated[tuple[Path, ...], arg(metavar="LOG [LOG ...]", help_behavior_hint=NO_HINT)] = ()
+    """Logs of the craft as the model knows it: causes are then only what has changed since."""
     motion: MotionName = "auto"
     """How the craft moves within a step: as drones do (continuous), or by a simulator's step; auto: what the
     logs show."""
@@ -214,14 +216,15 @@ class Diagnose:
         if not self.logs:
             raise ValueError("LOG: found none, expected at least one flight log")
         train, test = [load_log(path) for path in self.logs], [load_log(path) for path in self.hold_out]
-        logs = [*train, *test]
-        for one in logs:
+        logs, before = [*train, *test], [load_log(path) for path in self.before]
+        for one in (*logs, *before):
             check_plausible(one)
         log = joined(logs)
         held_out = np.arange(len(log)) >= sum(map(len, train)) if test else None
         model = None if self.model is None else load_model(self.model)
         motion = None if self.motion == "auto" else Motion(self.motion)
-        found = diagnose(logs, model, held_out, ProgressBar("stages"), motion)
+        rest = (model, held_out, ProgressBar("stages"), motion)
+        found = diagnose_change(logs, before, *rest) if before else diagnose(logs, *rest)
         written = write_diagnosis(self.out, found, log)
         print(text_of_diagnosis(found))
         recording = self.out / RECORDING_NAME

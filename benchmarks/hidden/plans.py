@@ -38,14 +38,8 @@ LOW_M, SINK_M, SINK_S, SETTLE_S = (0.15, 1.0), 0.7, 0.8, 0.7  # the last metre i
 LOWER_M, SLOWER = 0.2, 0.9  # changes of low heights and of speeds per repeated attempt
 YAW_TURN = (1.2, math.pi)  # rad
 # Kinds of flights.
-HOVER_M, RACE_M = (1.5, 8.0), (1.5, 5.0)  # heights
+HOVER_M = (1.5, 8.0)  # heights
 CORRECTION_M, CORRECTION_S = 0.25, 0.8  # of small moves in a hover
-RACE_SPEEDS = (7.0, 16.0)  # m/s
-WAYPOINTS_M = 25.0  # their spread, horizontally
-MOST_SIDEWAYS = 13.0  # m/s^2, of a race's turns
-RACE_SPEEDING_UP, RACE_CLIMB = 6.0, 1.5  # m/s^2, m/s
-TURN_GAIN, SLOWEST_TURN = 3.0, 3.0  # 1/s; m/s, below which turns are no quicker
-NEAR_S, CHASE_S = 0.3, (3.0, 6.0)  # to a waypoint that counts as met; how long one is flown at
 BEGIN_S, STILL_S = 0.5, (2.0, 4.5)  # of hover before something begins, and between moves
 START_SPREAD_M = 5.0
 HIGHER_M = 1.5  # per repeated attempt, for kinds that are flown low throughout
@@ -278,30 +272,8 @@ def _hover(sketch: Sketch, seconds: float) -> None:
             sketch.add(speed)
 
 
-def _race(sketch: Sketch, seconds: float) -> None:
-    """Steer towards waypoints at limited turn rates; take the next when one is near or out of time."""
-    rng = sketch.rng
-    slower = SLOWER**sketch.caution
-    way, speed, waypoint, wanted, left = sketch.heading, 0.0, None, 0.0, 0
-    while len(sketch) * DT_S < seconds:
-        if waypoint is None or left == 0 or math.dist(waypoint[:2], sketch.pos_w[:2]) < speed * NEAR_S:
-            place = rng.normal(0.0, WAYPOINTS_M, 2).clip(-2.0 * WAYPOINTS_M, 2.0 * WAYPOINTS_M)
-            height = HIGHER_M * sketch.caution + rng.uniform(*RACE_M)
-            waypoint, wanted = (*place.tolist(), height), slower * rng.uniform(*RACE_SPEEDS)
-            left = steps_of(rng.uniform(*CHASE_S))
-        left -= 1
-        x, y, z = (there - here for there, here in zip(waypoint, sketch.pos_w, strict=True))
-        speed += max(-RACE_SPEEDING_UP * DT_S, min(RACE_SPEEDING_UP * DT_S, wanted - speed))
-        turn = slower * MOST_SIDEWAYS / max(speed, SLOWEST_TURN)
-        error = wrap_angle(math.atan2(y, x) - way)
-        change = max(-turn, min(turn, TURN_GAIN * error)) * DT_S
-        way += change
-        sketch.add((speed * math.cos(way), speed * math.sin(way), max(-RACE_CLIMB, min(RACE_CLIMB, z))), way)
-
-
 FLIGHT_KINDS: dict[str, tuple[tuple[float, float], Callable[[Sketch, float], None]]] = {
     "scripted": (HIGH_M, _scripted),
-    "race": (RACE_M, _race),
     "hover": (HOVER_M, _hover),
 }
 

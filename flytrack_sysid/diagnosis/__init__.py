@@ -1,5 +1,6 @@
 """What a simulation gets wrong, from a flight log: named causes, what cannot be told apart, what is left."""
 
+from flytrack_sysid.diagnosis.before import diagnose_change
 from flytrack_sysid.diagnosis.diagnose import DiagnosisError, diagnose, joined
 from flytrack_sysid.diagnosis.motion_choice import motion_of
 from flytrack_sysid.diagnosis.report import text_of, write_diagnosis
@@ -13,6 +14,7 @@ __all__ = [
     "NotIdentifiable",
     "Unexplained",
     "diagnose",
+    "diagnose_change",
     "joined",
     "motion_of",
     "text_of",

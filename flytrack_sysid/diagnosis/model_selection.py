@@ -211,6 +211,10 @@ class Marginal:
         self.scores = blocks[:, columns] - blocks[:, given] @ share
         self.inflation = inflation_of(self.information, self.scores)
 
+    def covariance(self) -> np.ndarray:
+        """Return the parameters' covariance: that of the information, as much larger as seconds disagree."""
+        return self.inflation * solve(self.information, np.eye(len(self.information)))
+
     def half_widths(self, ways: np.ndarray | None = None) -> np.ndarray:
         """Return half of each parameter's 95 % interval, or of sums of them, ways (num_sums, parameters).
 

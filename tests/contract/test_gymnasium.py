@@ -18,10 +18,9 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from gymnasium.wrappers import TimeLimit
 
 import flytrack_env
-from flytrack_env.dynamics import nominal_parameters
 from flytrack_env.env import EnvParams, FlyTrack
 from flytrack_env.registration import ENVIRONMENTS
-from flytrack_env.tracks import load_track, save_track
+from flytrack_env.tracks import save_track
 from tests.support.coasting import track_of_row
 from tests.support.slow import slow_but
 
@@ -235,20 +234,6 @@ def test_options_set_the_start_of_one_episode(is_vector: bool) -> None:
     assert (abs(following[:, 22] + 0.5) > 1e-3).all()
 
 
-def test_gate_and_quaternion_options() -> None:
-    env = gymnasium.make(BASE)
-    gate = load_track("flytrack").gates[3]
-    options = {"gate_index": 3, "position": gate.position, "quaternion": (0.0, 0.0, 0.0, 1.0)}
-    observation, _ = env.reset(options=options)
-    np.testing.assert_allclose(observation[:3], 0.0, atol=1e-6)
-    # Gate 3 is flown towards +y; the drone faces -x, which is to the left.
-    np.testing.assert_allclose(observation[6:15], [0, -1, 0, 1, 0, 0, 0, 0, 1], atol=1e-5)
-    start = env.reset(options={"gate_index": 0})[0]
-    np.testing.assert_allclose(start[:3], [-6.1 / 3, 0.0, -1.25 / 3], atol=1e-5)
-    np.testing.assert_allclose(start[3:6], 0.0, atol=1e-6)
-    assert start[22] == 1.0
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("is_vector", [False, True])
 def test_a_track_stays_until_another_is_named(is_vector: bool, tmp_path: Path) -> None:
@@ -326,17 +311,3 @@ def test_wrong_use_is_refused() -> None:
             type(each)(BASE, render_mode="ansi")
     with pytest.raises(ValueError, match="num_envs: found 0"):
         make_vector(num_envs=0)
-
-
-@pytest.mark.parametrize("overrides", [{"model": nominal_parameters()}, {"reward": {"gate_pass": 2.0}}])
-def test_arguments_of_numbers_are_compiled_once(overrides: dict[str, Any]) -> None:
-    """Also where a track is named in every reset, which compiled anew as often."""
-    env, again = (gymnasium.make(BASE, **overrides).unwrapped for _ in range(2))
-    programs = env._simulation.programs
-    assert again._simulation.programs is programs
-    for name in ("figure_eight", "flytrack"):  # of as many gates
-        env.reset(options={"track": name})
-        assert env._simulation.programs is programs and env._simulation.env.track.name == "flytrack"
-    heavier = gymnasium.make(BASE, model=nominal_parameters()._replace(m=1.1)).unwrapped
-    assert heavier._simulation.programs is programs and heavier._simulation.params.model.m == 1.1
-    assert gymnasium.make(BASE, missed_gate="fly_on").unwrapped._simulation.programs is not programs

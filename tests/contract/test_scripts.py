@@ -7,8 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flytrack_env.dynamics import collective_thrust, nominal_parameters
-from flytrack_env.state import APPLIED_ACTION, BATTERY
+from flytrack_env.dynamics import nominal_parameters
 from flytrack_sysid import collect, load_log
 from flytrack_sysid.cli import main
 from flytrack_sysid.diagnosis.identifiability import LANES_PER_MANOEUVRE, next_flight
@@ -45,30 +44,6 @@ def test_hover_of_a_model():
     assert hover_action(model._replace(thrust_coeffs=np.full(6, 20.0) * (np.arange(6) == 0))) == -1.0, (
         "any does"
     )
-
-
-def test_flights_of_a_small_craft_are_at_its_voltages(tmp_path):
-    voltages, model = (3.2, 4.1), nominal_parameters()
-    small = model._replace(thrust_coeffs=np.array([0.0, 4.0, 0.0, 0.0, 2.7, 0.0]))  # of the volts alone
-    hover = hover_action(small, voltages)
-    thrust_n = float(collective_thrust(hover, 0.5 * sum(voltages), small.thrust_coeffs))
-    assert thrust_n == pytest.approx(float(small.m) * float(small.g), rel=1e-3)
-    assert hover_action(small) != pytest.approx(hover, abs=0.1)
-    path = tmp_path / "diagnosis.json"
-    path.write_text(json.dumps(asked(("wind", "voltages")) | {"data": {"voltages": voltages}}))
-    script = next_flight(path, small).script
-    assert script.starts[:, BATTERY].max() == pytest.approx(4.1) and script.starts[:, BATTERY].min() > 3.2
-    np.testing.assert_allclose(script.starts[:, APPLIED_ACTION][:, 3], hover)
-    save_script(tmp_path / "flight.npz", script)
-    assert load_script(tmp_path / "flight.npz").kinds == script.kinds
-
-
-@pytest.mark.parametrize("voltages", [[3.0], [4.0, 3.0], ["a", "b"], [0.0, 4.0], "3 V"])
-def test_voltages_that_cannot_be_are_refused(tmp_path, voltages):
-    path = tmp_path / "diagnosis.json"
-    path.write_text(json.dumps(asked(("wind", "voltages")) | {"data": {"voltages": voltages}}))
-    with pytest.raises(ScriptError, match=r"diagnosis.json: data: voltages: found .* expected the lowest"):
-        next_flight(path, nominal_parameters())
 
 
 def test_a_script_comes_back_the_same(tmp_path):

@@ -26,7 +26,7 @@ from flytrack_env.state import (
     unpack,
     unpack_action,
 )
-from flytrack_sysid import CollectError, collect, import_log, load_log, save_log
+from flytrack_sysid import CollectError, collect, diagnose_change, fit, import_log, load_log, save_log
 from flytrack_sysid.excitation import start_state
 from tests.support.pages import DOCS, run_examples
 
@@ -237,3 +237,17 @@ def test_page_runs_and_check_is_repeatable(tmp_path, monkeypatch):
     assert "the same twice" in check()
     names = run_examples((DOCS / "firmware.md").read_text(encoding="utf-8"), tmp_path, monkeypatch)
     assert len(names["log"]) > 3000 and len(names["flown"]) > 200
+
+
+def test_what_was_changed_is_named_and_a_matched_set_up_has_no_name() -> None:
+    logs = {}
+    for name, body in (("before", Body()), ("same", Body()), ("draggy", Body(linear_drag=(0.3, 0.3, 0.1)))):
+        with Betaflight(body=body) as flown:
+            logs[name], model = collect(flown, 1.0, len(logs), 1.0), flown.nominal_model()
+    known = fit(logs["before"], model).model
+    same, draggy = (
+        diagnose_change(logs[name], logs["before"], known, motion=known.motion) for name in ("same", "draggy")
+    )
+    assert same.causes == ()
+    (cause,) = draggy.causes
+    assert cause.effect == "linear_drag" and cause.parameters["d_x"].value == pytest.approx(0.3, abs=0.06)

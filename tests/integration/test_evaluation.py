@@ -22,7 +22,6 @@ from baselines.purejaxrl_ppo.flights import (
     start_keys,
 )
 from baselines.purejaxrl_ppo.plants import draw_plants
-from baselines.purejaxrl_ppo.summary import compare_with_optimum, summarise, time_lost
 from flytrack_env import FlyTrack, load_track, nominal_parameters, save_track
 from flytrack_env.references import ghost_rollout, shipped_reference, shipped_references
 from flytrack_env.rollout import load_rollout
@@ -92,34 +91,6 @@ def test_lap_times_are_those_of_the_rails(raced: Outcomes, paces: np.ndarray) ->
 def test_every_step_kept_or_not_is_the_same_flight(flights: Rollout, raced: Outcomes) -> None:
     assert NUM_FLIGHTS % 4
     assert_close(raced, outcomes_of(flights, NUM_LAPS, 8))
-
-
-def test_time_lost_adds_up_to_the_lap(raced: Outcomes, paces: np.ndarray) -> None:
-    references = shipped_references(load_track("flytrack"), ("nominal",))
-    slow = paces[paces > 0.0].mean() - 1.0
-    compared = compare_with_optimum(summarise(raced, is_limited=True), references)
-    assert compared["model"] == "nominal"
-    for lap, kind in (("first_lap_s", "standing"), ("flying_lap_s", "flying")):
-        lost = [row[lap] for row in time_lost(raced, references)]
-        reference = references[kind]
-        np.testing.assert_allclose(lost, slow * np.diff(reference.gate_times_s, prepend=0.0), atol=2e-3)
-        assert sum(lost) == pytest.approx(slow * reference.time_s, abs=TOLERANCE_S)
-        assert compared[lap]["mean_percent_above"] == pytest.approx(100.0 * slow, abs=0.1)
-        assert 0.0 <= compared[lap]["min_percent_above"] < compared[lap]["mean_percent_above"]
-
-
-def test_no_laps_are_no_numbers() -> None:
-    references = shipped_references(load_track("split_s"), ("black_box", "nominal"))
-    never = np.full((2, 3), np.nan), np.full((2, 21), np.nan)
-    causes = flights_module.Causes(
-        *(np.array([True, False]) if i == 0 else np.zeros(2, bool) for i in range(5))
-    )
-    nothing = Outcomes(np.array([5, 9]), np.array([0, 1]), np.zeros(2, int), *never, causes)
-    summary = summarise(nothing, is_limited=True)
-    assert summary["first_lap_s"]["mean"] is None and summary["ended"]["time_limit"] == 1
-    rows = time_lost(nothing, references)
-    assert len(rows) == 7 and rows[0] == {"gate": 1, "first_lap_s": None, "flying_lap_s": None}
-    json.dumps([summary, rows, compare_with_optimum(summary, references)], allow_nan=False)
 
 
 def test_ghost_is_the_reference_nearest_in_time() -> None:

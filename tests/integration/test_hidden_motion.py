@@ -114,29 +114,6 @@ def test_fine_motion_obeys_the_differential_equations(monkeypatch: pytest.Monkey
     assert all(found[name] > 3.0 * halved[name] for name in COLUMNS), (found, halved)
 
 
-def test_slopes_of_rates_without_a_second_order_loop() -> None:
-    own = truth(yaw_reaction={"angle": 0.05})
-    drone = Plant(own, START, np.random.default_rng(0))
-    for sticks in commands()[:35].tolist():
-        drone.step(tuple(sticks))
-        away, tau = np.array(sticks) - drone.applied, np.array(own.tau)
-        expected = (np.radians([*own.max_rate, 0.0]) * away / tau)[:3]
-        expected[2] -= 0.05 * away[3] / tau[3] ** 2
-        np.testing.assert_allclose(drone.felt.slopes_b, expected, rtol=2e-3, atol=1e-6)
-
-
-def test_other_rates_of_the_log_show_the_same_flight() -> None:
-    """The drone does not know how often it is logged: rows of 100 Hz are every fifth of 500 Hz."""
-    own = truth(**EFFECTS)
-    slow, fast = (
-        fly(replace(own, step_s=step_s), "scripted", 3.0, np.random.default_rng(1))
-        for step_s in (0.01, 0.002)
-    )
-    assert len(fast) == 5 * len(slow) == 1500
-    for name in "upvfwq":
-        np.testing.assert_allclose(fast[name][::5], slow[name], atol=2e-3, err_msg=name)
-
-
 @pytest.mark.parametrize("motion", MOTIONS)
 def test_late_motion_capture_and_effects_that_begin_in_the_log(motion: str) -> None:
     def log(own: Truth) -> FlightLog:

@@ -89,6 +89,8 @@ def test_the_command_refuses_what_it_cannot_use(tmp_path, capsys):
         (["--black-box", str(SHIPPED_BLACK_BOX), "--total-timesteps", "10"], "total_timesteps: found 10"),
         (["--black-box", str(SHIPPED_BLACK_BOX), "--noise", "-1"], "noise: found -1"),
         (["--black-box", str(SHIPPED_BLACK_BOX), "--minutes", "0"], "minutes: found 0"),
+        ([], "expected one of --black-box FILE and --plant betaflight"),
+        (["--black-box", str(SHIPPED_BLACK_BOX), "--body", "x"], "expected with --plant betaflight only"),
     ):
         assert main([*flags, "--out", str(tmp_path / "out")]) == 2
         assert message in capsys.readouterr().err

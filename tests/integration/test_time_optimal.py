@@ -25,8 +25,6 @@ from flytrack_env.references import (
     track_digest,
 )
 from flytrack_env.state import BATTERY, POSITION, QUATERNION, STATE_SIZE, VELOCITY
-from flytrack_env.tracks import build_course
-from tests.support.coasting import track_of_row
 
 SHIPPED = sorted(FOLDER.glob("*.npz"))
 RADIUS_M = 0.15
@@ -130,22 +128,6 @@ def test_a_saved_reference_comes_back_and_half_of_it_is_refused(tmp_path: Path) 
     for broken in (path, tmp_path / "missing.npz"):
         with pytest.raises(ReferenceFileError, match="cannot be read"):
             load_reference(broken)
-
-
-def test_a_straight_flight_takes_as_long_as_it_has_to() -> None:
-    pytest.importorskip("casadi")
-    from benchmarks.optimal.problem import Task
-    from benchmarks.optimal.solve import find_optimum
-
-    acceleration, distance = 20.0, 12.0
-    thrust = np.array([acceleration, 0.0, 0.0, 0.0, 0.0, 0.0])  # N, on 1 kg, whatever the stick
-    model = nominal_parameters()._replace(thrust_coeffs=thrust, g=0.0)
-    track = track_of_row([0.5 * distance, distance])
-    start = time_optimal.start_state(track, 24.0)
-    start[POSITION], start[QUATERNION] = (0.0, 0.0, 2.0), (0.5**0.5, 0.0, 0.5**0.5, 0.0)  # body z is ahead
-    found = find_optimum(Task("standing", build_course(track), RADIUS_M, start), model, 0.01)
-    expected = np.sqrt(2.0 * np.array([0.5, 1.0]) * distance / acceleration)
-    np.testing.assert_allclose(found.gate_times_s, expected, atol=1e-4)
 
 
 @pytest.mark.slow

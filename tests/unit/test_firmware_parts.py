@@ -8,7 +8,7 @@ import pytest
 
 pytest.importorskip("firmware", reason="firmware/ is in clones only")
 
-from firmware import Body, FirmwareError
+from firmware import Body, FirmwareError, read_body
 from firmware.__main__ import main
 from firmware.building import HERE, NAME, build, cache_folder, find_executable
 from firmware.settings import (
@@ -20,6 +20,7 @@ from firmware.settings import (
     value_of,
     values_of,
 )
+from flytrack_loop.__main__ import main as close_loop
 
 DUMP = """# version
 # Betaflight / STM32F405 4.5.1
@@ -151,6 +152,27 @@ def test_missing_tools_and_other_files_are_one_sentence(tmp_path, monkeypatch, c
     said = capsys.readouterr().err
     assert "gcc is not installed" in said and said.count("\n") == 1
     assert not [path for path in cache_folder().parent.iterdir()]
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ("{", "body.json: found no JSON"),
+        ("[1]", r"body.json: found \[1\], expected an object of fields of Body"),
+        ('{"mass": 1}', "body.json: mass: unknown, expected of mass_kg, gravity"),
+        ('{"mass_kg": -1}', "body.json: body: mass_kg: found -1, expected more than 0"),
+        ('{"mass_kg": "heavy"}', "body.json: body: mass_kg: found heavy, expected a finite number"),
+    ],
+)
+def test_a_body_file_that_cannot_be_used_is_named(tmp_path, capsys, content, message):
+    file = tmp_path / "body.json"
+    file.write_text(content)
+    with pytest.raises(FirmwareError, match=message):
+        read_body(file)
+    assert close_loop(["--plant", "betaflight", "--body", str(file), "--out", str(tmp_path / "out")]) == 2
+    assert "body.json" in capsys.readouterr().err and not (tmp_path / "out").exists()
+    file.write_text('{"mass_kg": 0.9, "health": [0.9, 1, 1, 1]}')
+    assert read_body(file) == Body(mass_kg=0.9, health=(0.9, 1, 1, 1))
 
 
 def test_what_is_built_already_is_left_alone(tmp_path, monkeypatch):

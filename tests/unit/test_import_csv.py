@@ -61,22 +61,6 @@ def test_units_and_frames_come_out_ours(folder, truth):
     assert found.craft == Craft((700.0, 600.0, 500.0), 0.5, (14.0, 16.8)) and found.problems == ()
 
 
-def test_euler_angles_of_aerospace_are_ours(tmp_path):
-    """Nose east and 30 degrees up, then rolled right by 20: by hand from the picture."""
-    rows = ["t,r,p,y,a,e,u,h", *(f"{0.01 * row},20,30,90,0,0,0,{row % 2}" for row in range(5))]
-    (tmp_path / "a.csv").write_text("\n".join(rows))
-    (tmp_path / "map.toml").write_text(
-        '[time]\ncolumn = "t"\nunit = "s"\n[command]\ncolumns = ["a", "e", "u", "h"]\n'
-        '[attitude]\neuler = ["r", "p", "y"]\nunit = "deg"\nbody = "frd"\nworld = "ned"\n'
-    )
-    log = import_log(tmp_path / "a.csv", "csv", tmp_path / "map.toml").log
-    axes_w = Rotation.from_quat(log["q"][0], scalar_first=True).as_matrix()
-    tilt, roll = np.deg2rad(30.0), np.deg2rad(20.0)
-    np.testing.assert_allclose(axes_w[:, 0], [0.0, -np.cos(tilt), np.sin(tilt)], atol=1e-9)  # nose
-    assert axes_w[2, 1] == pytest.approx(np.sin(roll) * np.cos(tilt))  # left side up
-    assert axes_w[2, 2] == pytest.approx(np.cos(roll) * np.cos(tilt))
-
-
 def test_world_to_body_is_inverted(folder, tmp_path):
     (tmp_path / "map.toml").write_text(
         MAPPING.replace('order = "xyzw"', 'order = "xyzw"\ndirection = "world_to_body"')

@@ -12,7 +12,7 @@ from flytrack_sysid import sensors
 from flytrack_sysid.diagnosis import motion_choice
 from flytrack_sysid.diagnosis.lanes import NUM_AXES, make_lanes
 from flytrack_sysid.diagnosis.lateness import judged_as_logged, read_poses
-from flytrack_sysid.diagnosis.motion_choice import MOST_LANES, Moves, Seen, how_it_moves
+from flytrack_sysid.diagnosis.motion_choice import Moves, how_it_moves
 from flytrack_sysid.diagnosis.sensor_clocks import on_one_clock, with_causal_commands
 from flytrack_sysid.log import FlightLog
 from tests.support.handout_plant import GRAVITY, HandoutPlant, excited
@@ -101,16 +101,6 @@ def test_lateness_is_found_where_there_is_one() -> None:
     late = found(late_poses(truth))
     assert 0.0 < late.sigma_s < 1e-3 and abs(late.late_s - 0.01 * STEPS) < 4.0 * late.sigma_s
     assert found(truth) == Moves(Motion.HANDOUT)
-
-
-def test_what_stays_undecided_can_ask_all_of_the_log() -> None:
-    plant = HandoutPlant()
-    log = excited(plant)
-    every = make_lanes(log, np.ones(len(log), bool), np.asarray(plant.model().tau), GRAVITY).row.shape[1]
-    parts = Seen(log, np.ones(len(log), bool), plant.model()).in_parts()
-    assert parts.num_parts == every // MOST_LANES > 1
-    rows = [set(parts._replace(part=one).lanes(log).row.ravel()) - {-1} for one in range(parts.num_parts)]
-    assert len(set.union(*rows)) > 0.9 * len(log)
 
 
 @pytest.mark.slow

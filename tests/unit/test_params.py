@@ -72,15 +72,3 @@ def test_courses_that_cannot_be_flown() -> None:
     for wrong, reason in cases:
         with pytest.raises(ValueError, match=reason):
             PARAMS.replace(course=wrong).check()
-
-
-def test_batches_are_checked_as_one() -> None:
-    def repeated(leaf: Any) -> np.ndarray:
-        return np.repeat(np.asarray(leaf)[None], 3, axis=0)
-
-    batch = jax.tree.map(repeated, PARAMS)
-    batch.check()
-    for name, wrong in (("drone_radius", 0.8), ("dt", 0.0)):
-        with pytest.raises(ValueError, match=name):
-            batch.replace(**{name: np.array([0.1, 0.1, wrong])}).check()
-    PARAMS.replace(drone_radius=np.array([0.1, 0.2, 0.3])).check()

@@ -9,10 +9,9 @@ import numpy as np
 import pytest
 from matplotlib.collections import LineCollection
 
-from flytrack_env.flown_race import Pass
 from flytrack_env.pictures import Flight, draw_flight, make_flight, write_animation, write_video
 from flytrack_env.pictures.__main__ import main
-from flytrack_env.pictures.figures import draw_comparison, draw_top
+from flytrack_env.pictures.figures import draw_top
 from flytrack_env.references import ghost_rollout, shipped_references
 from flytrack_env.rollout import save_rollout
 from flytrack_env.tracks import load_track
@@ -54,48 +53,6 @@ def test_path_from_above_is_the_states_in_the_colours_of_their_speeds(ghost):
         (label,) = [text for text in figure.axes[0].texts if text.get_text() == str(gate.id)]
         away_m = np.linalg.norm(np.array(label.get_position()) - gate.position[:2])
         assert 0.5 * gate.frame < away_m < 0.5 * gate.frame + 2.0
-
-
-@pytest.mark.parametrize(
-    ("right_m", "up_m", "outcome"),
-    [(0.3, -0.35, "passed"), (-1.0, 0.2, "frame touched"), (1.6, 0.1, "missed")],
-)
-def test_meetings_say_how_and_where_a_gate_was_met(right_m: float, up_m: float, outcome: str) -> None:
-    flight = straight(right_m, up_m)
-    (met,) = flight.meetings
-    assert (met.outcome, met.gate) == (outcome, 0)
-    assert (met.right_m, met.up_m) == pytest.approx((right_m, up_m), abs=1e-5)
-    assert (met.time_s, met.distance_m) == pytest.approx((0.145, 1.45), abs=1e-5)
-    assert met.speed_m_s == pytest.approx(10.0)
-    crosses = [line for line in draw_top(flight).axes[0].lines if line.get_color() == "black"]
-    places = [place for line in crosses for place in line.get_xydata().tolist()]
-    assert places == ([] if outcome == "passed" else [pytest.approx(met.pos_w[:2].tolist())])
-
-
-def test_comparison_has_a_path_per_flight_on_one_track(ghost):
-    slow = make_flight("other", STATES[:300], COMMANDS[:300], TRACK)
-    paths = [line for line in draw_comparison([ghost, slow]).axes[0].lines if len(line.get_xydata()) > 5]
-    for path, flight in zip(paths, (ghost, slow), strict=True):
-        np.testing.assert_allclose(path.get_xydata(), flight.states[:, :2])
-    assert paths[0].get_color() != paths[1].get_color()
-    with pytest.raises(ValueError, match=r"flytrack.*split_s"):
-        draw_comparison([ghost, slow._replace(track=load_track("split_s"))])
-
-
-def test_video_shows_the_fastest_flying_lap_else_the_first_else_the_flight(ghost):
-    video = pytest.importorskip("flytrack_env.pictures.video")
-
-    def shown(num_steps: int, *laps: tuple[int, float]) -> range:
-        passes = tuple(
-            Pass(row, 0.01 * row, 7, np.zeros(3), lap, time_s) for lap, (row, time_s) in enumerate(laps, 1)
-        )
-        race = ghost.race._replace(passes=passes)
-        return video.shown_rows(ghost._replace(race=race, states=np.zeros((num_steps + 1, 21))))
-
-    assert shown(2000, (390, 3.7), (790, 4.0), (1180, 3.8), (1570, 3.9)) == range(790, 1181, 2)
-    assert shown(2000, (390, 3.7), (791, 4.0)) == range(390, 793, 2)  # an odd number of steps: one more
-    assert shown(600, (390, 3.7)) == range(0, 391, 2)
-    assert shown(2500) == range(0, 2001, 2)
 
 
 def test_video_shows_the_lap_and_leaves_nothing_where_it_fails(ghost, monkeypatch, tmp_path):

@@ -117,18 +117,6 @@ def test_what_is_advised_shows_once_it_is_flown(hover, told):
 
 
 @pytest.mark.slow
-def test_what_is_promised_is_what_collecting_brings(hover, told):
-    """Each manoeuvre gets its own lanes: others would promise something else by orders of magnitude."""
-    question = Question(hover.linearization, hover.model, "yaw_reaction")
-    ahead = information_of_manoeuvres(hover.problem, hover.model, hover.linearization, question.columns)
-    assert list(ahead) == list(MANOEUVRES)
-    promised = {name: question.shares(one)[0] for name, one in ahead.items()}
-    for name in ("low_passes", "speeds", "thrust_steps"):
-        assert promised[name] == pytest.approx(question.shares(told(name))[0], rel=0.5), name
-    assert promised["thrust_steps"] > 10.0 * promised["speeds"] > 100.0 * promised["low_passes"]
-
-
-@pytest.mark.slow
 def test_sensors_that_the_log_lacks_tell_nothing_ahead_either(hover):
     blind = logged(hover.log.without("v_bat"))
     question = Question(blind.linearization, blind.model, "voltage_sag")

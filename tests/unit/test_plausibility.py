@@ -93,24 +93,6 @@ def test_drone_that_stands_while_commands_move(logs, measured):
     assert f": {named}: found the same values in every row" in problem
 
 
-def test_no_unit_is_guessed_where_nothing_moves(logs):
-    log, rng = logs["noisy"], np.random.default_rng(5)
-    noise = {name: 0.1 * rng.standard_normal((len(log), 3)) for name in ("w", "a", "f", "v", "p")}
-    still = replace(log, channels={**log.channels, **noise, "f": noise["f"] + UPWARDS})
-    still = constant("q", [1.0, 0.0, 0.0, 0.0])(still)
-    assert find_problems(still) == []
-
-
-def test_free_fall_is_no_force_in_g(logs):
-    """With little thrust an accelerometer shows about 1 m/s^2; the velocity distinguishes that from 1 g."""
-    log, rng = logs["clean"], np.random.default_rng(6)
-    log = replace(log, time=0.01 * np.arange(len(log)), segment=np.zeros(len(log), int))
-    force = rng.normal([0.0, 0.0, 1.0], 0.1, (len(log), 3))
-    velocity = np.cumsum(0.01 * (force - UPWARDS), axis=0)
-    assert find_problems(replace(log, channels={"u": log["u"], "f": force, "v": velocity})) == []
-    assert "looks like g" in find_problems(replace(log, channels={"u": log["u"], "f": force}))[0]
-
-
 def test_batteries_of_one_to_fourteen_cells_raise_no_problem(logs):
     for volts in (3.0, 16.8, 60.0):
         assert find_problems(constant("v_bat", [volts])(logs["clean"])) == []

@@ -9,16 +9,14 @@ from gymnax.environments import environment, spaces
 
 from baselines.purejaxrl_ppo import Config, make_network, make_train
 from baselines.purejaxrl_ppo.collectives import Collectives
-from baselines.purejaxrl_ppo.metrics import summarise_episodes, summarise_race, summarise_updates
+from baselines.purejaxrl_ppo.metrics import summarise_episodes
 from baselines.purejaxrl_ppo.ppo import (
     Batch,
     affine_permutation,
     generalized_advantages,
     make_network_for,
-    make_schedule,
     ppo_loss,
 )
-from baselines.purejaxrl_ppo.run import is_due, next_due
 
 
 @struct.dataclass
@@ -138,16 +136,6 @@ def test_rewarded_choice_is_learnt():
     assert float(value) == pytest.approx(1.0, abs=0.05)
 
 
-@pytest.mark.parametrize("every_gradient", [True, False])
-def test_the_step_size_falls_linearly(every_gradient):
-    config = tiny(anneal_every_gradient=every_gradient, final_learning_rate_fraction=0.1)
-    schedule, per_update = make_schedule(config), config.gradients_per_update
-    for count in (0, 1, per_update, 5 * per_update + 3):
-        done = count / per_update if every_gradient else count // per_update
-        expected = config.learning_rate * (1 - 0.9 * done / config.num_updates)
-        assert float(schedule(count)) == pytest.approx(expected, rel=1e-5)
-
-
 def test_gae_equals_the_definition():
     rng = np.random.default_rng(0)
     reward, value = rng.normal(size=(2, 6, 3))
@@ -207,49 +195,6 @@ def test_episodes_are_averaged_over_those_that_ended():
     assert summary["episode_return"] == 2.0
     assert summary["episode_laps"] == 3.0
     assert summary["episodes_ended"] == 2
-
-
-def test_lap_times_are_averaged_over_the_laps():
-    log = {
-        "lap_completed": jnp.array([[True, False], [False, True]]),
-        "lap_time_s": jnp.array([[4.0, 9.0], [9.0, 5.0]]),
-        "gate_distance_m": jnp.array([[1.0, 2.0], [3.0, 6.0]]),
-    }
-    assert summarise_race(log, Collectives()) == {
-        "laps_completed": 2,
-        "lap_time_s": 4.5,
-        "gate_distance_m": 3.0,
-    }
-    assert summarise_race({"done": log["lap_completed"]}, Collectives()) == {}
-
-
-def test_means_over_updates_are_weighted_by_what_they_are_means_of():
-    metrics = {
-        "episodes_ended": np.array([1, 3]),
-        "laps_completed": np.array([0, 0]),
-        "episode_return": np.array([2.0, 6.0]),
-        "lap_time_s": np.array([0.0, 0.0]),
-        "entropy": np.array([1.0, 2.0]),
-    }
-    expected = {"episodes_ended": 4, "laps_completed": 0, "episode_return": 5.0, "entropy": 1.5}
-    assert summarise_updates(metrics) == expected
-
-
-@pytest.mark.parametrize(("every", "batch_size"), [(1, 7), (7, 7), (10, 7), (100, 7), (13, 64)])
-def test_intervals_hit_every_multiple_once(every, batch_size):
-    due = [n for n in range(1, 200) if n * batch_size // every > (n - 1) * batch_size // every]
-    assert [n for n in range(1, 200) if is_due(n, every, batch_size)] == due
-    for start in range(150):
-        assert next_due(start, every, batch_size) == min(n for n in due if n > start)
-    assert next_due(3, None, batch_size) == float("inf") and not is_due(3, None, batch_size)
-
-
-def test_std_has_a_floor():
-    config = tiny(initial_std=1e-4, min_std=0.05)
-    network = make_network(config)
-    params = network.init(jax.random.key(0), jnp.zeros((1, 2)))
-    policy = network.apply(params, jnp.zeros((1, 2)), method="policy")
-    np.testing.assert_allclose(policy.stddev(), 0.05, rtol=1e-6)
 
 
 def test_an_initial_action_of_another_length_is_refused():

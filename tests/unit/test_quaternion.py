@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from flytrack_env.quaternion import Quaternion, Vec3, half_angle
+from flytrack_env.quaternion import Quaternion, Vec3
 
 NUM_CASES = 500
 
@@ -54,13 +54,6 @@ def test_multiply_is_the_composition_of_rotations(quats: np.ndarray) -> None:
 def test_normalize_gives_the_same_direction_at_unit_norm(quats: np.ndarray, factor: float) -> None:
     unit = np.stack(Quaternion(*columns(factor * quats)).normalize(), -1)
     np.testing.assert_allclose(unit, quats, atol=1e-6)
-
-
-def test_half_angle_is_within_a_millionth() -> None:
-    angle = np.linspace(-np.pi, np.pi, 100_001)
-    cosine, sine = half_angle(jnp.asarray(angle))
-    np.testing.assert_allclose(cosine, np.cos(angle / 2), atol=1e-6)
-    np.testing.assert_allclose(sine, np.sin(angle / 2), atol=1e-6)
 
 
 def test_from_yaw_tilt_leans_the_thrust_axis_towards_the_heading() -> None:

@@ -6,8 +6,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from flytrack_env.quaternion import Vec3
 from flytrack_env.tracks import (
@@ -95,30 +93,6 @@ def test_course_of_a_seed_stays_the_same() -> None:
     assert track.name == "random_0_0"
     assert [gate.position for gate in track.gates[:2]] == [(9.61, 6.56, 2.42), (24.36, 5.44, 3.64)]
     assert track.start_position == (7.26, 12.08, 0.1)
-
-
-@settings(max_examples=15, deadline=None)
-@given(
-    seed=st.integers(0, 2**32 - 1),
-    num_gates=st.integers(3, 12),
-    size=st.tuples(st.floats(40.0, 60.0), st.floats(40.0, 60.0)),
-    heights=st.tuples(st.floats(1.35, 3.0), st.floats(3.0, 6.0)),
-    spacing=st.floats(5.0, 7.0),
-)
-def test_arguments_are_kept(
-    seed: int, num_gates: int, size: tuple[float, float], heights: tuple[float, float], spacing: float
-) -> None:
-    limits = Limits(min_spacing=spacing)
-    track = random_track(seed, num_gates, size, heights, limits)
-    assert find_problems(track, limits) == ()
-    assert [gate.id for gate in track.gates] == list(range(num_gates))
-    centres = track.rows()[:, 1:4]
-    assert (centres[:, :2] >= 4.99).all() and (centres[:, :2] <= np.array(size) - 4.99).all()
-    assert centres[:, 2].min() >= heights[0] - 0.01 and centres[:, 2].max() <= heights[1] + 0.01
-    assert (track.bounds_low, track.bounds_high[:2]) == ((0.0, 0.0, 0.0), size)
-    apart = np.linalg.norm(centres[:, None, :2] - centres[None, :, :2], axis=-1)
-    assert apart[~np.eye(num_gates, dtype=bool)].min() >= spacing
-    assert_flies_through(track)
 
 
 @pytest.mark.parametrize(

@@ -99,16 +99,6 @@ def test_draws_are_uniform_and_uncorrelated(source: str) -> None:
     assert np.abs(lagged).max() < 4.5 / np.sqrt(NUM_WORDS)
 
 
-@pytest.mark.parametrize("count", [1, 3, 8])
-def test_index_is_even_over_its_range(count: int) -> None:
-    words = seeds_of(jax.random.key(2), jnp.arange(NUM_WORDS))
-    indices = jax.vmap(lambda word: Draws(word).index("gate", count))(words)
-    assert indices.dtype == jnp.int32
-    counts = np.bincount(np.asarray(indices), minlength=count)
-    assert len(counts) == count
-    assert count == 1 or stats.chisquare(counts).pvalue > 1e-4
-
-
 def test_legacy_keys_are_as_good_as_typed_ones() -> None:
     for seed in range(16):
         assert int(seed_of(jax.random.key(seed))) == int(seed_of(jax.random.PRNGKey(seed)))

@@ -89,19 +89,6 @@ def test_windows_are_at_most_so_long_and_within_blocks():
             assert own.sum() > 60
 
 
-def test_velocity_from_positions_stays_within_flights():
-    """The next flight begins elsewhere, right after or at the very time of the last row."""
-    log = excited(HandoutPlant(), flights=4)
-    elsewhere = np.repeat(np.arange(4.0), 250)[:, None] * [100.0, -50.0, 20.0]
-    for gap in (0.01, 0.0):
-        time = log.time + np.repeat(np.arange(4) * (2.49 + gap), 250)
-        moved = replace(log, time=time, channels={**log.channels, "p": log["p"] + elsewhere})
-        found = make_record(moved.without("v")).vel_w[:1000]
-        np.testing.assert_allclose(found, log["v"], atol=0.5)
-    np.testing.assert_array_equal(make_record(log.without("v", "p")).vel_w, 0.0)
-    assert np.all(make_record(joined(ramp(rows=1), ramp(rows=2)).without("v")).vel_w == 0.0)
-
-
 def test_doubt_is_forgotten_with_the_lag():
     """Against the variance of a lag driven by a command of which one value is random."""
     rows, lost = 40, 10

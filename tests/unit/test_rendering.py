@@ -69,21 +69,6 @@ def top_view_pixel(renderer: Renderer, position: Any) -> tuple[int, int]:
     return round(float(y)), round(float(x))
 
 
-def test_a_trail_drawn_bit_by_bit_is_the_trail_drawn_at_once(renderer: Renderer) -> None:
-    growing, other = FlightLog(0.01), FlightLog(0.01)
-    for index, row in enumerate(flight(300)):  # longer than the log's first buffer
-        growing.append(row)
-        if index % 60 == 0:
-            other.append(row + np.float32(0.1))
-            renderer.draw(growing)
-            renderer.draw(other)  # another flight in between
-    picture = renderer.draw(growing)
-    assert picture.shape == SHAPE and picture.dtype == np.uint8 and picture.flags.writeable
-    np.testing.assert_array_equal(picture, make_renderer(COURSE).draw(log_of(flight(300))))
-    with pytest.raises(ValueError, match="log: found no rows"):
-        renderer.draw(FlightLog(0.01))
-
-
 def test_top_view_shows_trail_drone_and_gates_where_they_are(renderer: Renderer) -> None:
     rows = flight()
     picture = renderer.draw(log_of(rows))

@@ -65,26 +65,6 @@ def test_every_weight_is_named_after_a_term_and_every_term_is_tested() -> None:
     assert set(RewardWeights._field_defaults) == set(names)
 
 
-def test_total_is_the_weighted_sum() -> None:
-    transition = make_transition(
-        after={
-            "position": (-3.0, 2.5, 3.0),
-            "rates_b": Vec3(1.0, 0.5, 0.2),
-            "applied": Action(0.1, 0.2, 0.3, 0.4),
-        },
-        num_passed=jnp.int32(1),
-        is_terminated=jnp.asarray(True),
-    )
-    values = {term.__name__: float(term(transition)) for term in TERMS}
-    assert all(values.values()), "a zero term would not test its weight"
-    for name, value in values.items():
-        only = RewardWeights(**{field: float(field == name) for field in RewardWeights._fields})
-        assert float(total_reward(transition, only)) == pytest.approx(value, rel=1e-6)
-    weights = RewardWeights(*np.linspace(-1.0, 2.0, len(TERMS)).tolist())
-    expected = sum(getattr(weights, name) * value for name, value in values.items())
-    assert float(total_reward(transition, weights)) == pytest.approx(expected, rel=1e-5)
-
-
 def test_weights_that_are_given_replace_the_defaults() -> None:
     weights = FlyTrack(reward={"off_centre": -0.5, "gate_pass": 2}).default_params.reward
     assert weights == RewardWeights(off_centre=-0.5, gate_pass=2.0)

@@ -75,33 +75,6 @@ def test_handouts_function_records_the_numbers_that_it_is_given(handout):
     assert handout.app_id == "test_app" and handout.timelines == {"step", "sim_time"}
 
 
-def test_trajectory_at_a_step_is_the_path_up_to_it(handout):
-    positions = np.array([x[0:3] for x, _ in make_sequence(100)])
-    for step in range(1, 100):
-        flown = handout.latest_strip("/world/trajectory/flown", step)
-        recent = handout.latest_strip("/world/trajectory/recent", step)
-        # The two meet in one point, so that the line has no hole.
-        path = recent if flown is None else flown + recent[1:]
-        assert flown is None or flown[-1] == recent[0]
-        np.testing.assert_array_equal(path, positions[: step + 1])
-
-
-def test_gate_centres_and_squares_are_in_the_world(handout):
-    centres = handout.once("/world/gates/centre", "Points3D:positions")
-    np.testing.assert_allclose(centres, GATES[:, 1:4], atol=1e-6)
-    labels = handout.once("/world/gates/centre", "Points3D:labels").tolist()
-    assert labels == [f"gate {i}" for i in (0, 1, 2, 3, 4, 8, 9, 10)]
-    for name, edge in (("outer", 2.7), ("inner", 1.5)):
-        strips = handout.once(f"/world/gates/{name}", "LineStrips3D:strips")
-        np.testing.assert_array_equal(strips[:, 0], strips[:, 4])
-        for gate, strip in zip(GATES, strips, strict=True):
-            local = [0.5 * edge * np.array([x, 0.0, z]) for x in (-1, 1) for z in (-1, 1)]
-            corners = gate[1:4] + Rotation.from_quat(gate[4:8], scalar_first=True).apply(local)
-            distances = np.linalg.norm(strip[:4, None] - corners, axis=2)
-            assert distances.min(axis=0).max() < 1e-5  # every corner is there
-            assert np.linalg.norm(np.diff(strip, axis=0), axis=1) == pytest.approx(edge, abs=1e-5)
-
-
 @pytest.mark.parametrize("is_back", [False, True])
 def test_gates_alone_are_flown_as_the_flight_passes_them(tmp_path, is_back):
     """The handout's rows do not tell the direction of flight."""
@@ -216,20 +189,6 @@ def test_passes_laps_events_and_table_are_the_races(recording):
     assert recording.rows[f"/events/{SECOND}", "TextLog:text"][-1] == ["plant / 2: ended: battery"]
     (table,) = recording.once("/about", "TextDocument:text")
     assert f"| policy | all steps flown | 4.49 | {len(RACE.passes)} | {lap.lap_time_s:.3f} |" in table
-
-
-def test_path_begins_anew_where_a_flight_does_and_times_of_a_log_are_kept(tmp_path):
-    restarts = np.zeros(STEPS, bool)
-    restarts[[0, 200, 201]] = True
-    time_s = 7.0 + np.cumsum(np.random.default_rng(1).uniform(0.002, 0.02, STEPS))
-    pieces = viz.Trajectory("pieces", STATES, ACTIONS, time_s=time_s, restarts=restarts)
-    viz.write_recording(tmp_path / "flight.rrd", [pieces], TRACK)
-    found = Recording(tmp_path / "flight.rrd")
-    flown = found.rows["/world/trajectory/flown", "LineStrips3D:strips"][-1]
-    assert [len(strip) for strip in flown] == [200, 1, 442 - 201]
-    seconds = [nanoseconds * 1e-9 for _, nanoseconds in sorted(found.times["/world/drone"])]
-    np.testing.assert_allclose(seconds, time_s - time_s[0], atol=1e-9)
-    assert ("/plots/gate_distance", "Scalars:scalars") not in found.rows  # races are flown at 100 Hz
 
 
 def test_command_shows_rollouts_beside_the_ghost(tmp_path, capsys):

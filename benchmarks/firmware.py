@@ -1,0 +1,282 @@
+"""How well changes of real firmware and its body are named, given the log and the model of before.
+
+``python -m benchmarks.firmware [--matched 2] [--single 2] [--pairs 6] [--champion 256]`` flies Betaflight
+(docs/firmware.md), makes a model of a nominal set-up from its log, changes a setting or the body, and shows
+``diagnose_change`` the model and the logs before and after. It appends a line each to
+docs/results/firmware.jsonl, and writes tables of this commit's lines between the marks of
+docs/results/firmware.md.
+"""
+
+import argparse
+import json
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from baselines.purejaxrl_ppo import load_checkpoint
+from benchmarks.champion import CHAMPION
+from benchmarks.report import (
+    RESULTS,
+    commit_of_checkout,
+    percent,
+    progress,
+    provenance,
+    provenance_line,
+    table,
+)
+from firmware import Betaflight, Body
+from flytrack_env.files import write_atomically
+from flytrack_loop.stages import measure_gap
+from flytrack_sysid import Diagnosis, FlightLog, collect, diagnose, diagnose_change
+from flytrack_sysid.manoeuvres import flights_of, hover_action
+from flytrack_sysid.script_file import script_of
+
+LINES, PAGE = RESULTS / "firmware.jsonl", RESULTS / "firmware.md"
+MARKS = "<!-- benchmarks.firmware -->", "<!-- end -->"
+ROWS = ("matched", "single", "pair")
+SEED = 31  # no rule was made on it
+PLAIN = {"anti_gravity_gain": 0, "rc_smoothing": "OFF", "f_roll": 0, "f_pitch": 0, "f_yaw": 0}
+SETUPS: dict[str, Mapping[str, Any]] = {"stock": {}, "plain": PLAIN}
+GENTLE = ("headings", "speeds", "thrust_steps")
+AXES = ("roll", "pitch")
+RESPONSE = ("tau_roll", "tau_pitch", "second_order_rates", "rate_slew_limit", "command_delay")
+THRUST = ("thrust_curve", "thrust_scale")
+Rng = np.random.Generator
+
+
+class Kind(NamedTuple):
+    """Something that changes: how it is drawn, its names, and others that fly alike.
+
+    draw: of settings and fields of the body.
+    """
+
+    draw: Callable[[Rng], tuple[dict[str, Any], dict[str, Any]]]
+    names: tuple[str, ...]
+    alike: tuple[str, ...] = ()
+
+
+def _both(rng: Rng, factor: tuple[float, float], **stock: float) -> dict[str, Any]:
+    """Return settings of roll and pitch, all times one factor."""
+    times = rng.uniform(*factor)
+    return {
+        f"{name}_{axis}": round(times * value) for name, value in stock.items() for axis in ("roll", "pitch")
+    }
+
+
+def _rates(rng: Rng, center: tuple[float, float], full: tuple[float, float]) -> dict[str, Any]:
+    most = round(rng.uniform(*full))
+    least = round(rng.uniform(*center) * most)
+    return {
+        f"{axis}_{name}": value
+        for axis in ("roll", "pitch")
+        for name, value in (("rc_rate", least), ("srate", most))
+    }
+
+
+KINDS = {
+    "expo": Kind(lambda rng: (_rates(rng, (0.35, 0.65), (62, 62)), {}), ("rate_expo",)),
+    "rates": Kind(lambda rng: (_rates(rng, (1, 1), (70, 85)), {}), ("rate_scale",), ("gyro_scale",)),
+    "P and D term": Kind(lambda rng: (_both(rng, (0.4, 0.65), p=45, d=30), {}), RESPONSE),
+    "filters": Kind(lambda rng: ({"gyro_lpf1_static_hz": int(rng.uniform(30, 60))}, {}), RESPONSE),
+    "thrust linearisation": Kind(lambda rng: ({"thrust_linear": int(rng.uniform(60, 120))}, {}), THRUST),
+    "motor output limit": Kind(lambda rng: ({"motor_output_limit": int(rng.uniform(70, 88))}, {}), THRUST),
+    "a weak motor": Kind(
+        lambda rng: (
+            {},
+            {"health": tuple(rng.permutation([rng.uniform(0.7, 0.85), 1.0, 1.0, 1.0]).tolist())},
+        ),
+        ("motor_imbalance",),
+        THRUST,
+    ),
+    "drag": Kind(
+        lambda rng: ({}, {"linear_drag": (*[float(rng.uniform(0.15, 0.4))] * 2, 0.1)}),
+        ("linear_drag",),
+        ("rotor_drag", "quadratic_drag"),
+    ),
+    "sag": Kind(
+        lambda rng: ({}, {"resistance_ohm": float(rng.uniform(0.012, 0.03))}), ("voltage_sag",), THRUST
+    ),
+    "mass": Kind(lambda rng: ({}, {"mass_kg": float(rng.uniform(1.1, 1.35))}), THRUST),
+    "thrust curve": Kind(lambda rng: ({}, {"linear": float(rng.uniform(0.3, 0.7))}), THRUST),
+    "bent thrust": Kind(
+        lambda rng: ({}, {"thrust_tilt_rad": (float(rng.choice([-1, 1]) * rng.uniform(0.04, 0.08)), 0.0)}),
+        ("thrust_tilt",),
+    ),
+    "centre of mass": Kind(
+        lambda rng: ({}, {"center_of_mass_m": (float(rng.uniform(0.01, 0.02)), 0.0)}),
+        ("motor_imbalance",),
+        THRUST,
+    ),
+}
+
+
+class Trial(NamedTuple):
+    """One flown set-up: its row (matched, single, pair), nominal set-up, excitation, what changed, number."""
+
+    row: str
+    setup: str
+    flown: str
+    kinds: tuple[str, ...]
+    number: int
+
+
+class Known(NamedTuple):
+    """The nominal set-up as its team knows it: the log before, and the model made from it."""
+
+    log: FlightLog
+    model: Any
+
+
+def fly(settings: Mapping[str, Any], body: Body, flown: str, seed: int) -> tuple[FlightLog, Any]:
+    """Return a noisy log of a minute, and the model to fit from."""
+    with Betaflight(settings, body) as plant:
+        model = plant.nominal_model()
+        script = None
+        if flown == "gentle":
+            script = script_of(flights_of(GENTLE, hover_action(model), seed))
+        return collect(plant, 1.0, seed, 1.0, script=script), model
+
+
+def know(setup: str, flown: str, seed: int) -> Known:
+    """Return what is known of a nominal set-up after it was flown and diagnosed."""
+    log, start = fly(SETUPS[setup], Body(), flown, seed)
+    return Known(log, diagnose(log, start, motion=start.motion).extended)
+
+
+def graded(trial: Trial, known: Known, seed: int) -> dict[str, Any]:
+    """Fly a changed set-up and return how its diagnosis did."""
+    rng = np.random.default_rng([seed, trial.number, *(list(KINDS).index(kind) for kind in trial.kinds)])
+    settings, body = dict(SETUPS[trial.setup]), Body()
+    for kind in trial.kinds:
+        own, fields = KINDS[kind].draw(rng)
+        settings, body = settings | own, replace(body, **fields)
+    log, _ = fly(settings, body, trial.flown, seed + 1000 + trial.number)
+    started = time.process_time()
+    found = diagnose_change(log, known.log, known.model, motion=known.model.motion)
+    names = [one.effect for one in found.causes]
+    return {
+        "settings": settings,
+        "body": {name: value for name, value in vars(body).items() if value != getattr(Body(), name)},
+        "verdict": found.verdict,
+        "found": {
+            one.effect: {k: [v.value, *v.ci95] for k, v in one.parameters.items()} for one in found.causes
+        },
+        "negligible": [one.effect for one in found.negligible],
+        **grade(trial.kinds, names),
+        "error": error_ratios(found),
+        "cpu_s": round(time.process_time() - started, 1),
+    }
+
+
+def grade(kinds: tuple[str, ...], names: list[str]) -> dict[str, bool]:
+    """Return whether the names are exactly those of what changed, in its classes, and whether one is false.
+
+    Each change has at least one of its names, and each name belongs to a change.
+    """
+    exact = [set(KINDS[kind].names) for kind in kinds]
+    alike = [own | set(KINDS[kind].alike) for own, kind in zip(exact, kinds, strict=True)]
+
+    def fits(classes: list[set[str]]) -> bool:
+        return all(own & set(names) for own in classes) and set(names) <= set().union(*classes)
+
+    return {
+        "is_exact": fits(exact),
+        "is_in_class": fits(alike),
+        "is_false": not set(names) <= set().union(*alike),
+    }
+
+
+def error_ratios(found: Diagnosis) -> dict[str, float]:
+    """Return held-out position errors of the extended model over those of the refitted one, by horizon."""
+    errors = {name: one.get("position_m", {}) for name, one in found.prediction.errors.items()}
+    base = errors.get("refitted_base", {})
+    return {horizon: round(errors["extended"][horizon] / size, 4) for horizon, size in base.items() if size}
+
+
+def append(path: Path, commit: str, line: dict[str, Any]) -> None:
+    """Append a line to a file of lines, with the commit that it was measured at."""
+    with path.open("a", encoding="utf-8") as file:
+        file.write(json.dumps({"commit": commit, **line}, default=str) + "\n")
+
+
+def champion_line(episodes: int, seed: int) -> dict[str, Any]:
+    """Return the race of the shipped champion, which knows nothing of the firmware."""
+    with Betaflight() as plant:
+        gap = measure_gap(load_checkpoint(CHAMPION), plant, seed, episodes)
+    return {"row": "champion", "episodes": episodes, **gap.plant._asdict()}
+
+
+def tables(lines: list[dict[str, Any]]) -> str:
+    """Return the results as tables in Markdown."""
+    by_row = {row: [line for line in lines if line["row"] == row] for row in ROWS}
+    rows = [["matched set-up: any name", percent([bool(line["found"]) for line in by_row["matched"]])]]
+    for row in ROWS[1:]:
+        for figure in ("is_exact", "is_in_class", "is_false"):
+            flags = [line[figure] for line in by_row[row]]
+            rows.append([f"{row}: {figure[3:].replace('_', ' ')}", percent(flags)])
+    named = [line["error"] for row in ROWS[1:] for line in by_row[row] if line["found"] and line["error"]]
+    if named:
+        worst, last = [max(one.values()) for one in named], [one["1"] for one in named if "1" in one]
+        rows.append(["extended over refitted: largest at any horizon", f"{max(worst):.3f}"])
+        rows.append(["extended over refitted after 1 s: median", f"{np.median(last):.3f}"])
+    seconds = [line["cpu_s"] for some in by_row.values() for line in some]
+    rows.append(["CPU s of a diagnosis: median", f"{np.median(seconds):.0f}"])
+    parts = [table("figure | value", rows)]
+    cells = []
+    for kind, own in KINDS.items():
+        some = [line for line in by_row["single"] if line["kinds"] == [kind]]
+        said = sorted({" + ".join(line["found"]) or "nothing" for line in some})
+        flags = [line["is_in_class"] for line in some]
+        cells.append([kind, ", ".join(own.names), percent(flags), "; ".join(said)])
+    parts.append(table("changed | its names | in class | what was named", cells))
+    for line in lines:
+        if line["row"] == "champion":
+            share = f"{line['success']:.1%} of {line['episodes']} starts finish 3 laps"
+            parts.append(
+                f"The shipped champion, blind: {share}; {line['gates']:.1f} of 24 gates in the mean."
+            )
+    return "\n\n".join(parts)
+
+
+def main() -> None:
+    """Fly, diagnose, and write the lines and the tables."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--matched", type=int, default=2, help="flights of each set-up and excitation")
+    parser.add_argument("--single", type=int, default=2, help="draws of each kind of change")
+    parser.add_argument("--pairs", type=int, default=6, help="set-ups with two changes")
+    parser.add_argument("--champion", type=int, default=256, help="starts of the champion; 0: none")
+    parser.add_argument("--seed", type=int, default=SEED)
+    parser.add_argument("--lines", type=Path, default=LINES, help="default: %(default)s")
+    asked = parser.parse_args()
+    rng = np.random.default_rng([asked.seed, 7])
+    trials = [
+        Trial("matched", setup, flown, (), number)
+        for setup in SETUPS
+        for flown in ("full", "gentle")
+        for number in range(asked.matched)
+    ]
+    sets = [(kind,) for kind in KINDS for _ in range(asked.single)]
+    sets += [tuple(rng.choice(list(KINDS), 2, replace=False).tolist()) for _ in range(asked.pairs)]
+    trials += [Trial(ROWS[len(own)], "stock", "full", own, 10 + number) for number, own in enumerate(sets)]
+    commit = commit_of_checkout()
+    if asked.champion:
+        append(asked.lines, commit, champion_line(asked.champion, asked.seed))
+    known: dict[tuple[str, str], Known] = {}
+    for trial in progress(trials, "set-ups"):
+        key = trial.setup, trial.flown
+        known[key] = known.get(key) or know(*key, asked.seed)
+        append(asked.lines, commit, {**trial._asdict(), **graded(trial, known[key], asked.seed)})
+    lines = [json.loads(text) for text in asked.lines.read_text(encoding="utf-8").splitlines()]
+    lines = [line for line in lines if line["commit"] == commit]
+    text = PAGE.read_text(encoding="utf-8")
+    before, after = text.split(MARKS[0])[0], text.split(MARKS[1])[1]
+    own = f"{tables(lines)}\n\nSeed {asked.seed}. {provenance_line(provenance('scipy'))}"
+    write_atomically(PAGE, f"{before}{MARKS[0]}\n\n{own}\n\n{MARKS[1]}{after}".encode())
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,313 @@
+"""Before and after: of all that a model lacks, only what has changed since an earlier log is named.
+
+No model of a real drone is complete. What it lacks is in the log before and in the log after alike, and
+laws that stand in for it are found in both. So each law is fitted to either log, beside the same others, and
+names a change where the estimates differ by more than both are uncertain, and by a size that matters.
+Uncertainty is judged from how much seconds of a log disagree, which counts what the model lacks.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import jax
+import numpy as np
+from scipy import signal
+
+from flytrack_env.dynamics import ModelParameters, nominal_parameters
+from flytrack_env.effects import BY_NAME
+from flytrack_env.motion import Motion
+from flytrack_sysid.diagnosis import noise as noises
+from flytrack_sysid.diagnosis.diagnose import (
+    Judged,
+    Split,
+    held_out_under,
+    refined_within_range,
+    split,
+    summarize,
+)
+from flytrack_sysid.diagnosis.model_selection import EQUIVALENT, Marginal, ablate
+from flytrack_sysid.diagnosis.problem import Problem
+from flytrack_sysid.diagnosis.result import Cause, Diagnosis, Estimated, Unexplained
+from flytrack_sysid.diagnosis.score_test import (
+    BASE_CAUSES,
+    CANDIDATES,
+    Candidate,
+    Linearization,
+    inflation_of,
+    solve,
+    threshold,
+)
+from flytrack_sysid.diagnosis.search import (
+    CLOSE,
+    MOST_REFITTED,
+    PER_PARAMETER,
+    FittedModel,
+    Scored,
+    SearchState,
+    add_effect,
+    saturated_residuals,
+)
+from flytrack_sysid.diagnosis.size import is_notable
+from flytrack_sysid.diagnosis.summary import mean_factor, mean_thrust, verdict_of
+from flytrack_sysid.diagnosis.unexplained import find_unexplained
+from flytrack_sysid.diagnosis.vetoes import Selection
+from flytrack_sysid.log import FlightLog
+from flytrack_sysid.parameters import THRUST_COEFFS
+
+MOST_EFFECTS = 4
+# Sticks that are farther from where they were lately, in sum; the time constant of lately, and for how long
+# what follows does not count.
+JUMP, JUMP_S, AFTERMATH_S = 0.5, 0.05, 0.2
+WORSE = 1.5  # times what was left unexplained before: so much more is new
+Logs = FlightLog | Sequence[FlightLog]
+
+
+class Change(NamedTuple):
+    """How far parameters are from those before, half of the 95 % intervals of that, and its chi2."""
+
+    size: np.ndarray
+    half: np.ndarray
+    chi2: float
+
+
+class Estimate(NamedTuple):
+    """A model fitted to one log, by likelihood; base: the same without effects."""
+
+    state: SearchState
+    base: FittedModel
+    model: FittedModel
+    linearization: Linearization
+
+    @classmethod
+    def of(cls, parts: Split) -> "Estimate":
+        """Return the refitted base, with the noise that it leaves."""
+        problem = parts.train
+        noise = noises.first_guess(problem.lanes, problem.residuals(problem.start[None])[0])
+        state = SearchState.start(parts.log, problem.with_noise(noise))
+        base = state.fitted((), problem.start)
+        state, linearization = state.linearized(base.vector)
+        left = saturated_residuals(state.problem, linearization)
+        state = state.with_noise(noises.fit_noise(problem.lanes, left))
+        base = state.fitted((), base.vector)
+        state, linearization = state.linearized(base.vector)
+        return cls(state, base, base, linearization)
+
+    def with_effect(self, candidate: Candidate) -> "Estimate":
+        """Return the estimate with an effect more."""
+        line, model = self.linearization, self.model
+        gain = line.gain_of(candidate, line.columns_at(model.places))
+        if gain is None:
+            fitted = self.state.fitted((*model.candidates, candidate), model.vector)
+        else:
+            fitted = add_effect(self.state, line, model, Scored(candidate, gain))
+        state, linearization = self.state.linearized(fitted.vector)
+        return Estimate(state, self.base, fitted, linearization)
+
+    def step(self, columns: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
+        """Return to first order the step along columns beside the model, and its covariance.
+
+        The covariance is as much larger than the information's inverse as seconds disagree after the step.
+        """
+        line, given = self.linearization, self.linearization.columns_at(self.model.places)
+        columns = list(columns)
+        information, share = line.projected(columns, given)
+        step = solve(information, line.score[columns] - share.T @ line.score[given])
+        inner = solve(line.total[np.ix_(given, given)], line.score[given])
+        places = given + columns
+        both = np.concatenate([inner - share @ step, step])
+        blocks = line.score_by_block[:, places] - line.by_block[:, places][:, :, places] @ both
+        blocks = blocks[:, len(given) :] - blocks[:, : len(given)] @ share
+        covariance = inflation_of(information, blocks) * solve(information, np.eye(len(columns)))
+        return step, covariance
+
+
+def diagnose_change(
+    after: Logs,
+    before: Logs,
+    model: ModelParameters | None = None,
+    held_out: np.ndarray | None = None,
+    report: Callable[[int, int], None] = lambda done, stages: None,
+    motion: Motion | None = None,
+) -> Diagnosis:
+    """Return the diagnosis of a log, in which causes are what changed since a log before.
+
+    before: of the same craft, as the model knows it. The rest as in ``diagnose``. Values of causes are those
+    of the model, changed as the estimates changed. What the model lacks in both logs is in the extended
+    model's other parameters, and is no cause; unexplained is only what was not so before.
+
+    Raises:
+        DiagnosisError: as ``diagnose``, of either log.
+    """
+    model = nominal_parameters() if model is None else model
+    with jax.enable_x64(True):
+        parts = calm(split(after, model, held_out, motion))
+        later = Estimate.of(parts)
+        earlier = Estimate.of(calm(split(before, model, None, parts.moves.motion)))
+        alike: dict[str, tuple[str, ...]] = {}
+        report(1, 3)
+        while len(later.model.candidates) < MOST_EFFECTS:
+            change = next_change(later, earlier)
+            if change is None:
+                break
+            candidate, alike[change[0].effect] = change
+            later, earlier = later.with_effect(candidate), earlier.with_effect(candidate)
+        report(2, 3)
+        selection = selection_of(later, earlier)
+        test = held_out_under(selection, parts.test)
+        judged = refined_within_range(Judged(selection, {}), test, parts)
+        found = summarize(judged, parts._replace(test=test))
+        causes = tuple(one for cause in found.causes for one in changed_cause(cause, later, earlier))
+        report(3, 3)
+    causes = tuple(replace(one, equivalent=alike.get(one.effect, ())) for one in causes)
+    named = {one.effect for one in causes}
+    same = [one.effect for one in found.causes if one.effect not in named]
+    return replace(
+        found,
+        nominal=model._replace(motion=found.extended.motion),
+        verdict=verdict_of(causes, found.unexplained),
+        causes=causes,
+        warnings=(*found.warnings, *(f"{name}: as in the log before, so no change" for name in same)),
+    )
+
+
+def calm(parts: Split) -> Split:
+    """Return a split in which only rows count before which the sticks did not jump.
+
+    Where they do, motors end, and how a controller shares what there is among the axes no law here has.
+    """
+    return parts._replace(train=_calm(parts.train), test=_calm(parts.test))
+
+
+def _calm(problem: Problem) -> Problem:
+    record, counts = problem.lanes.record, problem.lanes.counts
+    step_s = float(np.median(record.step_s))
+    keep = np.exp(-step_s / JUMP_S)
+    sticks = record.command[..., :3]
+    lagged = signal.lfilter([1.0 - keep], [1.0, -keep], sticks, axis=0)
+    is_jump = np.abs(sticks - lagged).sum(axis=-1) > JUMP
+    rows = max(round(AFTERMATH_S / step_s), 1)
+    follows = signal.lfilter(np.ones(rows), [1.0], is_jump.astype(float), axis=0) > 0.5
+    quiet = counts & ~follows[..., None, None]
+    quiet[..., -1, :] = counts[..., -1, :]  # a battery does not mind
+    return replace(problem, lanes=problem.lanes._replace(counts=quiet))
+
+
+def next_change(later: Estimate, earlier: Estimate) -> tuple[Candidate, tuple[str, ...]] | None:
+    """Return the effect whose change explains the log after best, and others that do so nearly as well.
+
+    To first order first; those that come near are refitted. None where none changed enough.
+    """
+    scored = [(change_merit(one, later, earlier), one) for one in CANDIDATES]
+    ranked = sorted((pair for pair in scored if pair[0] > 0.0), key=lambda pair: -pair[0])
+    near: dict[str, Candidate] = {}
+    for merit, candidate in ranked:
+        if merit > CLOSE * ranked[0][0] and len(near) < MOST_REFITTED:
+            near.setdefault(candidate.effect, candidate)
+    costs = {}
+    for one in near.values():
+        price = PER_PARAMETER * len(one.fields)
+        costs[one] = price + (later.with_effect(one).model.cost if len(near) > 1 else 0.0)
+    if not costs:
+        return None
+    best = min(costs, key=lambda one: costs[one])
+    close = [one.effect for one, cost in costs.items() if one != best and cost < costs[best] + EQUIVALENT]
+    return best, tuple(close)
+
+
+def change_merit(candidate: Candidate, later: Estimate, earlier: Estimate) -> float:
+    """Return the chi2 of an effect's change less a price for each parameter; 0 where it is not named.
+
+    A change shows between the logs, and in the log after against the model.
+    """
+    both = later, earlier
+    if any(candidate.effect in (*one.model.effects, *one.state.unobservable) for one in both):
+        return 0.0
+    ways = [one.linearization.columns_of(candidate) for one in both]
+    if any(len(one.linearization.acting(way)) < len(way) for one, way in zip(both, ways, strict=True)):
+        return 0.0
+    (step, covariance), (step_before, covariance_before) = later.step(ways[0]), earlier.step(ways[1])
+    change = step - step_before
+    # What the model does not have at all cannot become less.
+    if any(probe.is_one_way and share <= 0.0 for probe, share in zip(candidate.probes, step, strict=False)):
+        return 0.0
+    chi2 = min(change @ solve(covariance + covariance_before, change), step @ solve(covariance, step))
+    if chi2 < threshold(len(change)) or not is_large(candidate, change, later):
+        return 0.0
+    return float(chi2) - PER_PARAMETER * len(change)
+
+
+def is_large(candidate: Candidate, change: np.ndarray, later: Estimate) -> bool:
+    """Return whether a change, of shares of the ways to probes and of other parameters, is notable."""
+    problem = later.state.problem
+    ways = [probe.value - problem.start[problem.index([probe.field])[0]] for probe in candidate.probes]
+    sizes = np.concatenate([np.array(ways), np.ones(len(candidate.other_fields))]) * change
+    fields = [*(probe.field for probe in candidate.probes), *candidate.other_fields]
+    notable = BY_NAME[candidate.effect].notable
+    sized = dict(zip((field.split(".")[1] for field in fields), np.abs(sizes), strict=True))
+    return any(sized.get(name, 0.0) >= least for name, least in notable.items())
+
+
+def selection_of(later: Estimate, earlier: Estimate) -> Selection:
+    """Return the model of the log after as selected, with what is unexplained in it alone."""
+    state, model = later.state, later.model
+    ablations = {name: ablate(state, model, later.linearization, name) for name in sorted(model.effects)}
+    ablations = {one.effect: ablations[one.effect] for one in model.candidates}
+    rest, past = (
+        find_unexplained(one.state.problem, one.model, one.base.vector)[0] for one in (later, earlier)
+    )
+    return Selection(state, later.base, model, ablations, newly_unexplained(rest, past))
+
+
+def change_between(later: Estimate, earlier: Estimate, fields: Sequence[str]) -> Change:
+    """Return how parameters of both models changed."""
+    places = later.state.problem.index(fields)
+    size = later.model.vector[places] - earlier.model.vector[places]
+    margins = [Marginal(one.linearization, one.model, fields) for one in (later, earlier)]
+    half = np.hypot(*(one.half_widths() for one in margins))
+    covariance = margins[0].covariance() + margins[1].covariance()
+    return Change(size, half, float(size @ solve(covariance, size)))
+
+
+def changed_cause(cause: Cause, later: Estimate, earlier: Estimate) -> list[Cause]:
+    """Return a cause with the values that it changed to; nothing where it is as it was before."""
+    problem, name = later.state.problem, cause.effect
+    effect = [one for one in later.model.candidates if one.effect == name]
+    base = THRUST_COEFFS if name == "thrust_scale" else BASE_CAUSES.get(name, ())
+    fields = effect[0].fields if effect else base
+    change = change_between(later, earlier, fields)
+    places, vector = problem.index(fields), problem.start.copy()
+    vector[places] += change.size
+    factor = mean_thrust_change(later, earlier, vector) if tuple(fields) == THRUST_COEFFS else {}
+    is_clear = np.any(np.abs(change.size) > change.half) and change.chi2 > threshold(len(fields))
+    is_clear |= any(not one.ci95[0] <= 1.0 <= one.ci95[1] for one in factor.values())
+    if not is_clear or not is_notable(name, problem, vector):
+        return []
+    values = {}
+    for field, place, half in zip(fields, places, change.half, strict=True):
+        key, value = field.split(".")[-1], float(vector[place])
+        if key in cause.parameters:
+            values[key] = Estimated(
+                value, (value - float(half), value + float(half)), cause.parameters[key].unit
+            )
+    if factor:
+        values |= {"factor": factor["mean_factor"]} if name == "thrust_scale" else factor
+    return [replace(cause, parameters=values)]
+
+
+def mean_thrust_change(later: Estimate, earlier: Estimate, vector: np.ndarray) -> dict[str, Estimated]:
+    """Return by which factor the mean thrust changed, with its interval; vector: a model changed so."""
+    problem = later.state.problem
+    margins = [Marginal(one.linearization, one.model, THRUST_COEFFS) for one in (later, earlier)]
+    half_n = float(np.hypot(*(one.half_widths(mean_thrust(problem)[None])[0] for one in margins)))
+    return mean_factor(problem, vector, half_n)
+
+
+def newly_unexplained(after: Unexplained, before: Unexplained) -> Unexplained:
+    """Return what is left unexplained after, and was not, or much less, before."""
+    most = max(before.shares.values(), default=0.0)
+    shares = {
+        name: size for name, size in after.shares.items() if size > WORSE * before.shares.get(name, most)
+    }
+    names = tuple(dict.fromkeys(name.split(": ", 1)[1] for name in shares))
+    return Unexplained(bool(shares), names, shares)
