@@ -95,17 +95,6 @@ def test_vector_environment_of_every_id_resets_in_the_same_step(env_id: str) -> 
     assert (infos["final_obs"][1] != observations[1]).any()
 
 
-def test_step_returns_python_types() -> None:
-    env = gymnasium.make(BASE)
-    env.reset(seed=0)
-    observation, reward, terminated, truncated, info = env.step(np.zeros(4))
-    assert observation.dtype == np.float32 and observation.flags.writeable
-    assert type(reward) is float and type(terminated) is bool and type(truncated) is bool
-    assert set(info) >= CAUSES and not {"final_observation", "terminated", "truncated"} & set(info)
-    assert all(type(info[name]) is bool for name in (*CAUSES, "lap_completed"))
-    assert type(info["laps"]) is int and type(info["lap_time_s"]) is float
-
-
 def test_single_environment_agrees_with_gymnax(env: FlyTrack, still: EnvParams) -> None:
     key, (_, state) = jax.random.key(0), env.reset(jax.random.key(0), still)
     single = gymnasium.make(BASE, params=still)

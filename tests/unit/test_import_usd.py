@@ -113,9 +113,3 @@ def test_torques_become_the_rates_that_the_controller_tracks(tmp_path):
     )
     stated = "[torque_command]\ninertia_kg_m2 = [1e-5, 1e-5, 2e-5]\nlag_s = [0.01, 0.01, 0.01]\n"
     assert "0.001, 0.001, 0.002 N m s/rad (given)" in " ".join(read(tmp_path, content, LEE + stated).notes)
-
-
-@pytest.mark.parametrize("damage", [{"kw_sign": -1.0}, {"noise": 0.1}])
-def test_torques_that_no_law_explains_have_no_gain(tmp_path, damage):
-    with pytest.raises(LogError, match=r"rate_gain: cannot be identified for roll: .*; state it"):
-        read(tmp_path, lee_log(**damage)[0], LEE)

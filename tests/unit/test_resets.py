@@ -113,19 +113,6 @@ def test_course_starts_have_the_stated_tilt_towards_any_side(
     np.testing.assert_allclose(np.linalg.norm(x[:, 9:13], axis=1), 1.0, atol=1e-5)
 
 
-def test_course_starts_have_the_stated_sticks_rates_and_battery(
-    params: EnvParams, on_course: tuple[np.ndarray, np.ndarray]
-) -> None:
-    x, _ = on_course
-    ranges = ResetParams()
-    for axis in range(3):
-        assert_uniform(x[:, 16 + axis], -ranges.course_stick, ranges.course_stick)
-    rates = x[:, 16:19] * np.radians(np.asarray(params.model.max_rate, float))
-    np.testing.assert_allclose(x[:, 13:16], rates, rtol=1e-5, atol=1e-6)
-    assert_uniform(x[:, 19], ranges.course_thrust_low, ranges.course_thrust_high)
-    assert_uniform(x[:, 20], ranges.course_battery_low_v, 24.0)
-
-
 def test_share_of_course_starts(sample: Sample) -> None:
     share = 0.2
     x, _ = sample(course_fraction=share)
