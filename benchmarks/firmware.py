@@ -3,7 +3,7 @@
 ``python -m benchmarks.firmware [--matched 2] [--single 2] [--pairs 6] [--champion 256]`` flies Betaflight
 (docs/firmware.md), makes a model of a nominal set-up from its log, changes a setting or the body, and shows
 ``diagnose_change`` the model and the logs before and after. It appends a line each to
-docs/results/firmware.jsonl, and writes tables of this commit's lines between the marks of
+docs/results/firmware.jsonl, and writes tables of the last commit's lines between the marks of
 docs/results/firmware.md.
 """
 
@@ -271,10 +271,11 @@ def main() -> None:
         known[key] = known.get(key) or know(*key, asked.seed)
         append(asked.lines, commit, {**trial._asdict(), **graded(trial, known[key], asked.seed)})
     lines = [json.loads(text) for text in asked.lines.read_text(encoding="utf-8").splitlines()]
-    lines = [line for line in lines if line["commit"] == commit]
+    lines = [line for line in lines if line["commit"] == lines[-1]["commit"]]
     text = PAGE.read_text(encoding="utf-8")
     before, after = text.split(MARKS[0])[0], text.split(MARKS[1])[1]
-    own = f"{tables(lines)}\n\nSeed {asked.seed}. {provenance_line(provenance('scipy'))}"
+    record = provenance("scipy") | {"commit": lines[-1]["commit"]}
+    own = f"{tables(lines)}\n\nSeed {asked.seed}. {provenance_line(record)}"
     write_atomically(PAGE, f"{before}{MARKS[0]}\n\n{own}\n\n{MARKS[1]}{after}".encode())
 
 
