@@ -260,7 +260,8 @@ def main() -> None:
         for number in range(asked.matched)
     ]
     sets = [(kind,) for kind in KINDS for _ in range(asked.single)]
-    sets += [tuple(rng.choice(list(KINDS), 2, replace=False).tolist()) for _ in range(asked.pairs)]
+    apart = [kind for kind in KINDS if kind != "expo"]  # it is made of the settings of the rates
+    sets += [tuple(rng.choice(apart, 2, replace=False).tolist()) for _ in range(asked.pairs)]
     trials += [Trial(ROWS[len(own)], "stock", "full", own, 10 + number) for number, own in enumerate(sets)]
     commit = commit_of_checkout()
     if asked.champion:

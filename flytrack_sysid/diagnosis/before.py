@@ -49,7 +49,7 @@ from flytrack_sysid.diagnosis.search import (
     saturated_residuals,
 )
 from flytrack_sysid.diagnosis.size import is_notable
-from flytrack_sysid.diagnosis.summary import mean_factor, mean_thrust, verdict_of
+from flytrack_sysid.diagnosis.summary import effect_causes, mean_factor, mean_thrust, verdict_of
 from flytrack_sysid.diagnosis.unexplained import find_unexplained
 from flytrack_sysid.diagnosis.vetoes import Selection
 from flytrack_sysid.log import FlightLog
@@ -157,17 +157,20 @@ def diagnose_change(
         test = held_out_under(selection, parts.test)
         judged = refined_within_range(Judged(selection, {}), test, parts)
         found = summarize(judged, parts._replace(test=test))
-        causes = tuple(one for cause in found.causes for one in changed_cause(cause, later, earlier))
+        # A change is named by its steps and size; the extended model has it only if flights gain by it.
+        effects = effect_causes(selection, test, later.linearization)
+        base = [one for one in found.causes if one.effect not in later.model.effects]
+        named = [*effects, *base]
+        causes = tuple(one for cause in named for one in changed_cause(cause, later, earlier))
         report(3, 3)
     causes = tuple(replace(one, equivalent=alike.get(one.effect, ())) for one in causes)
-    named = {one.effect for one in causes}
-    same = [one.effect for one in found.causes if one.effect not in named]
+    same = {one.effect for one in named} - {one.effect for one in causes}
     return replace(
         found,
         nominal=model._replace(motion=found.extended.motion),
         verdict=verdict_of(causes, found.unexplained),
         causes=causes,
-        warnings=(*found.warnings, *(f"{name}: as in the log before, so no change" for name in same)),
+        warnings=(*found.warnings, *(f"{name}: as in the log before, so no change" for name in sorted(same))),
     )
 
 
