@@ -47,7 +47,7 @@ from flytrack_env.state import (
     pack,
     unpack,
 )
-from flytrack_sysid.importing.betaflight_log import full_stick_rate
+from flytrack_sysid.importing.betaflight_rates import full_stick_rate, stick_curve
 
 DT_S = 0.01
 STEP_US = 10_000
@@ -179,9 +179,11 @@ class Betaflight(Plant):
         return self.firmware.value(name)
 
     def nominal_model(self) -> ModelParameters:
-        """Return the model to fit from: the nominal one at these rates of full stick, moving as drones do."""
+        """Return the model to fit from: the nominal one with the craft's rates, moving as drones do."""
         full = np.array(self.full_stick_deg_s, np.float32)
-        return nominal_parameters()._replace(max_rate=full, motion=Motion.CONTINUOUS)
+        curve = stick_curve(self.value("rates_type"), _rates(self.firmware, "rc_rate", "srate", "expo"))
+        model = nominal_parameters()._replace(max_rate=full, motion=Motion.CONTINUOUS)
+        return model if curve is None else model.with_effects(curve)
 
     def reset(self, drone: Drone, model: ModelParameters) -> FirmwareState:
         """Return the state of a flight that has not begun; ``model`` is not used."""
@@ -333,10 +335,13 @@ def _at_rest(body: Body) -> Body:
     return replace(body, gyro_noise=0.0, acc_noise=0.0)
 
 
+def _rates(firmware: Firmware, *names: str) -> list[tuple[float, ...]]:
+    """Return rate settings of roll, pitch and yaw."""
+    axes = ("roll", "pitch", "yaw")
+    return [tuple(float(firmware.value(f"{axis}_{name}")) for name in names) for axis in axes]
+
+
 def _full_stick(firmware: Firmware) -> tuple[float, ...]:
     """Return the rates at full stick of roll, pitch, yaw by the firmware's own settings, deg/s."""
-    rates = firmware.value("rates_type")
-    names = [
-        [f"{axis}_{name}" for name in ("rc_rate", "srate", "rate_limit")] for axis in ("roll", "pitch", "yaw")
-    ]
-    return tuple(full_stick_rate(rates, *(float(firmware.value(name)) for name in axis)) for axis in names)
+    rates, axes = firmware.value("rates_type"), _rates(firmware, "rc_rate", "srate", "rate_limit")
+    return tuple(full_stick_rate(rates, *axis) for axis in axes)

@@ -10,6 +10,7 @@ from scipy import signal
 
 from flytrack_env import __version__
 from flytrack_env.dynamics import ModelParameters, collective_thrust, nominal_parameters
+from flytrack_env.effects import BY_NAME
 from flytrack_env.state import BATTERY_EMPTY_V, BATTERY_FULL_V
 from flytrack_sysid.estimate import Estimate, FitError, estimate
 from flytrack_sysid.log import CHANNELS, FlightLog, usual_step
@@ -128,7 +129,8 @@ def _free_names(model: ModelParameters, log: FlightLog, fixed: Mapping[str, floa
         low, high = bounds_of(name)
         if not (np.isfinite(value) and low <= value <= high):
             raise FitError(f"fixed: {name}: found {value}, expected {low:g} to {high:g} {unit_of(name)}")
-    wanted = [*TAUS, *THRUST_COEFFS, DRAIN, *(name for name in names if "." in name)]
+    of_effects = [name for name in names if "." in name and not BY_NAME[name.split(".")[0]].is_setting]
+    wanted = [*TAUS, *THRUST_COEFFS, DRAIN, *of_effects]
     if "v_bat" not in log:
         wanted = [name for name in wanted if name not in (*THRUST_COEFFS[4:], DRAIN)]
     return tuple(name for name in wanted if name not in fixed)

@@ -86,6 +86,7 @@ BLACKBOX_HEADERS = {
     "vbatref": "2485",
     "vbatcellvoltage": "330,360,430",
     "rc_rates": "220,100,50",
+    "rc_expo": "10,0,0",
     "rates": "0,70,80",
     "rate_limits": "1998,1998,1998",
     "rates_type": "0",

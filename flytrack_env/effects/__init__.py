@@ -10,7 +10,9 @@ import numpy as np
 
 from flytrack_env.effects.accelerometer_bias import ACCELEROMETER_BIAS, AccelerometerBias
 from flytrack_env.effects.accelerometer_scale import ACCELEROMETER_SCALE, AccelerometerScale
+from flytrack_env.effects.actual_rates import ACTUAL_RATES, ActualRates
 from flytrack_env.effects.base import STAGES, Effect, Pose, Range, StepContext
+from flytrack_env.effects.betaflight_rates import BETAFLIGHT_RATES, BetaflightRates
 from flytrack_env.effects.command_delay import COMMAND_DELAY, MOST_STEPS, USUAL_STEPS, CommandDelay
 from flytrack_env.effects.ground_effect import GROUND_EFFECT, GroundEffect
 from flytrack_env.effects.gyro_bias import GYRO_BIAS, GyroBias
@@ -21,6 +23,7 @@ from flytrack_env.effects.linear_drag import LINEAR_DRAG, LinearDrag
 from flytrack_env.effects.mocap_latency import MOCAP_LATENCY, MocapLatency
 from flytrack_env.effects.motor_imbalance import MOTOR_IMBALANCE, MotorImbalance
 from flytrack_env.effects.quadratic_drag import QUADRATIC_DRAG, QuadraticDrag
+from flytrack_env.effects.quick_rates import QUICK_RATES, QuickRates
 from flytrack_env.effects.rate_cross_coupling import RATE_CROSS_COUPLING, RateCrossCoupling
 from flytrack_env.effects.rate_expo import RATE_EXPO, RateExpo
 from flytrack_env.effects.rate_saturation import RATE_SATURATION, RateSaturation
@@ -43,6 +46,9 @@ from flytrack_env.state import Drone
 # comes before the loop that remembers them; the latency comes before all that is wrong with its readings.
 EFFECTS: tuple[Effect, ...] = (
     COMMAND_DELAY,
+    ACTUAL_RATES,
+    BETAFLIGHT_RATES,
+    QUICK_RATES,
     RATE_EXPO,
     RATE_SATURATION,
     RATE_SLEW_LIMIT,
@@ -219,6 +225,8 @@ __all__ = [
     "USUAL_STEPS",
     "AccelerometerBias",
     "AccelerometerScale",
+    "ActualRates",
+    "BetaflightRates",
     "CommandDelay",
     "Effect",
     "GroundEffect",
@@ -231,6 +239,7 @@ __all__ = [
     "MotorImbalance",
     "Pose",
     "QuadraticDrag",
+    "QuickRates",
     "Range",
     "RateCrossCoupling",
     "RateExpo",

@@ -27,7 +27,7 @@ A hook takes the effect's parameters, its memory, the value so far and the ``Ste
 the value. At neutral parameters it returns the value bit for bit, so that neutral equals absent.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
@@ -119,6 +119,12 @@ class Range(NamedTuple):
 Hook = Callable[[Any, Any, Any, StepContext], Any]
 
 
+def on_rate_sticks(curve: Callable[..., Scalar], sticks: Action, *parameters: Sequence[Scalar]) -> Action:
+    """Return the command with a curve on each rate stick; parameters: its other arguments, by axis each."""
+    roll, pitch, yaw = map(curve, sticks[:3], *parameters)
+    return sticks._replace(roll=roll, pitch=pitch, yaw=yaw)
+
+
 @dataclass(frozen=True)
 class Effect:
     """One effect; at least one hook is given.
@@ -134,7 +140,8 @@ class Effect:
     first all of the first values, and so on.
     groups: parameters that are looked for together; all of them if empty. shapes: parameters that only shape
     what others do, and do nothing while those are neutral. follows_sticks: it is a law of the rate sticks
-    without memory, which does nothing while they are centred.
+    without memory, which does nothing while they are centred. is_setting: its numbers are known, as settings
+    of the craft: no fit frees them and no log is searched for them.
     start: (parameters, drone) -> memory of an episode that begins; no memory if None. With ``most_steps`` it
     also takes how many steps to remember.
     remember: (parameters, memory, context) -> memory after a step.
@@ -154,6 +161,7 @@ class Effect:
     groups: tuple[tuple[str, ...], ...] = ()
     shapes: tuple[str, ...] = ()
     follows_sticks: bool = False
+    is_setting: bool = False
     command: Hook | None = None
     lag: Hook | None = None
     air: Hook | None = None

@@ -2,7 +2,7 @@
 
 from typing import NamedTuple
 
-from flytrack_env.effects.base import Effect, Range, StepContext
+from flytrack_env.effects.base import Effect, Range, StepContext, on_rate_sticks
 from flytrack_env.quaternion import Scalar
 from flytrack_env.state import Action
 
@@ -15,12 +15,12 @@ class RateExpo(NamedTuple):
     yaw: Scalar = 0.0
 
 
-def _command(curve: RateExpo, memory: None, sticks: Action, context: StepContext) -> Action:
-    def curved(stick: Scalar, expo: Scalar) -> Scalar:
-        return stick * (1.0 - expo + expo * (stick * stick))
+def _curve(stick: Scalar, expo: Scalar) -> Scalar:
+    return stick * (1.0 - expo + expo * (stick * stick))
 
-    roll, pitch, yaw = (curved(stick, expo) for stick, expo in zip(sticks[:3], curve, strict=True))
-    return sticks._replace(roll=roll, pitch=pitch, yaw=yaw)
+
+def _command(curve: RateExpo, memory: None, sticks: Action, context: StepContext) -> Action:
+    return on_rate_sticks(_curve, sticks, curve)
 
 
 RATE_EXPO = Effect(

@@ -70,6 +70,10 @@ EVIDENCE: dict[str, Evidence] = {
         _LATE[2:],
         "The slope where thrust rises differs from that where it falls.",
     ),
+    **{
+        f"{name}_rates": Evidence(f"{label} rates", _BY_STICK, "The error vanishes at centre and full stick.")
+        for name, label in (("actual", "Actual"), ("betaflight", "Betaflight's own"), ("quick", "Quick"))
+    },
     "rate_expo": Evidence("stick expo", _BY_STICK, "The error bends back to nothing at full stick."),
     "rate_scale": Evidence(
         "scale of the body rates", _BY_STICK, "The error grows in proportion to the stick."

@@ -18,7 +18,7 @@ from flytrack_env.effects import BY_NAME, MOST_STEPS
 from flytrack_env.plants import Simulator
 from flytrack_env.state import pack, unpack, unpack_action
 from flytrack_sysid.diagnosis.lanes import LANE_S, Lanes, make_lanes, voltages_of
-from flytrack_sysid.diagnosis.problem import REPLAYED, Problem
+from flytrack_sysid.diagnosis.problem import SEARCHED, Problem
 from flytrack_sysid.diagnosis.result import SCHEMA, TO_LOG
 from flytrack_sysid.diagnosis.score_test import CANDIDATES, Candidate, Linearization
 from flytrack_sysid.diagnosis.search import FittedModel, SearchState
@@ -103,7 +103,7 @@ def unseen_effects(state: SearchState, linearization: Linearization, model: Fitt
     """Return effects that the log could not have shown, and how large they would have to be."""
     given = linearization.columns_at(model.places)
     result: dict[str, Limit] = {}
-    for effect in (one.name for one in REPLAYED):
+    for effect in (one.name for one in SEARCHED):
         if effect in model.effects or effect in BASE_ONLY:
             continue
         if effect in state.unobservable:
@@ -129,7 +129,7 @@ def _look_alikes(
     """Return effects beside which this one hardly shows any more."""
     sizes = visible.noncentralities()
     result = []
-    for other in REPLAYED:
+    for other in SEARCHED:
         if other.name in (visible.effect, *BASE_ONLY, *state.unobservable):
             continue
         beside = visible.noncentralities(Visibility(linearization, given, other.name).columns)

@@ -35,6 +35,7 @@ from flytrack_sysid.replay import Step, replay
 
 # What a replay can show: it is fed with poses, so that how late these are has to be known before.
 REPLAYED = tuple(effect for effect in EFFECTS if effect.pose is None)
+SEARCHED = tuple(effect for effect in REPLAYED if not effect.is_setting)
 BATCH, SMALL_BATCH = 20, 4
 RELATIVE_STEP = 1e-6  # of a parameter's scale, for slopes
 

@@ -14,7 +14,7 @@ from scipy import linalg, stats
 
 from flytrack_env.effects import BY_NAME, Effect
 from flytrack_sysid.diagnosis.problem import (
-    REPLAYED,
+    SEARCHED,
     Problem,
     Slopes,
     blocks_of,
@@ -90,7 +90,7 @@ def candidates_of(effect: Effect) -> list[Candidate]:
     return found
 
 
-CANDIDATES = [candidate for effect in REPLAYED for candidate in candidates_of(effect)]
+CANDIDATES = [candidate for effect in SEARCHED for candidate in candidates_of(effect)]
 PROBES = list(dict.fromkeys(probe for candidate in CANDIDATES for probe in candidate.probes))
 
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from flytrack_sysid.diagnosis import noise as noises
 from flytrack_sysid.diagnosis.lanes import voltages_of
-from flytrack_sysid.diagnosis.problem import REPLAYED, SMALL_BATCH, Problem
+from flytrack_sysid.diagnosis.problem import SEARCHED, SMALL_BATCH, Problem
 from flytrack_sysid.diagnosis.score_test import (
     BASE_FREE,
     CANDIDATES,
@@ -81,7 +81,7 @@ class SearchState:
     def start(cls, log: FlightLog, problem: Problem) -> "SearchState":
         """Return the state before anything was searched for. problem: of rows of the log, with a noise."""
         channels = {*log.channels, *problem.lanes.measured}
-        lacking = tuple(effect.name for effect in REPLAYED if not set(effect.needs) <= channels)
+        lacking = tuple(effect.name for effect in SEARCHED if not set(effect.needs) <= channels)
         # The replay's voltage is then assumed at every row; what falls within a step would pass for thrust.
         held = () if voltages_of(problem.lanes) else (Held(DRAIN, ""),)
         return cls(problem, unobservable=lacking, held=held)

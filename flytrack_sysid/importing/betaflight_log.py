@@ -5,13 +5,16 @@ positive yaw is to the left. docs/real_logs.md says how that was checked on a re
 attitude or velocity in these logs.
 """
 
+import json
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from flytrack_env.effects import effect_of
 from flytrack_env.files import read_at_most
 from flytrack_env.messages import error_text, quote_name, quote_value
+from flytrack_sysid.importing.betaflight_rates import RATES_TYPES, full_stick_rate, stick_curve
 from flytrack_sysid.importing.decoding import decode
 from flytrack_sysid.importing.flight import ImportedFlight, not_a_quadcopter, saturation
 from flytrack_sysid.importing.mapping import Mapping
@@ -33,35 +36,9 @@ FINE = 10.0  # units in one deg/s where blackbox_high_resolution is set
 MICROSECOND = UNITS["time"]["us"]
 LARGEST_SETTING = 1e9
 LONGEST_LIST = 1000  # characters of names of fields in a message
-# Of Betaflight 4, src/main/fc/rc.c and controlrate_profile.h.
-RATES_TYPES = ("BETAFLIGHT", "RACEFLIGHT", "KISS", "ACTUAL", "QUICK")
 PERCENT = 100.0
-STEEP_RC_RATE, STEEP_SLOPE = 2.0, 14.54  # above this RC rate, the curve gets steeper
-BETAFLIGHT_RATE_DEG_S = KISS_RATE_DEG_S = 200.0  # at RC rate 1
-TENS = 10.0  # deg/s in one unit of the other types' settings
-QUICK_RATE_DEG_S = 2.0  # per unit of RC rate
-LEAST_REMAINDER = 0.01  # of 1 less the super rate, as the firmware bounds it
 LARGEST_OVERSHOOT = 0.05  # past full stick: smoothing by a Butterworth filter overshoots a step by 4.3 %
 NUM_MOTORS = 4
-
-
-def full_stick_rate(rates_type: str, rc_rate: float, super_rate: float, limit_deg_s: float) -> float:
-    """Return the body rate at full stick, deg/s, by Betaflight's rate settings.
-
-    rc_rate, super_rate, limit_deg_s: as in the log's headers ``rc_rates``, ``rates``, ``rate_limits``.
-    Source: ``apply...Rates`` in Betaflight 4.5, src/main/fc/rc.c; expo plays no part at full stick.
-    """
-    remainder = max(1.0 - super_rate / PERCENT, LEAST_REMAINDER)
-    rate = rc_rate / PERCENT
-    steep = rate + STEEP_SLOPE * max(rate - STEEP_RC_RATE, 0.0)
-    at_full_stick = {
-        "BETAFLIGHT": BETAFLIGHT_RATE_DEG_S * steep / remainder,
-        "RACEFLIGHT": TENS * rc_rate * (1.0 + super_rate / PERCENT),
-        "KISS": KISS_RATE_DEG_S * rate / remainder,
-        "ACTUAL": TENS * max(super_rate, rc_rate),
-        "QUICK": max(TENS * super_rate, QUICK_RATE_DEG_S * rc_rate),
-    }
-    return min(at_full_stick[rates_type], limit_deg_s)
 
 
 def read_betaflight(path: Path, mapping: Mapping) -> list[ImportedFlight]:
@@ -121,6 +98,7 @@ def _read_log(source: str, notes: dict[str, Any], frames: np.ndarray, mapping: M
     said += [*clipped, *_motors(table, headers)]
     if "f" not in channels:
         said.append("no accelerometer in the log: nothing is asked of the specific force")
+    said += headers.stick_curve()
     log = log_of_table(table._replace(columns=found))
     return ImportedFlight(log, craft, tuple(f"{source}: {text}" for text in said))
 
@@ -153,15 +131,31 @@ class _Headers:
         if "rc_rates" not in self.values:
             hint = "a mapping can state craft.max_rate_deg_s"
             raise self.error("rc_rates", f"missing, so full stick is unknown; {hint}")
-        number = int(self.numbers("rates_type", 1)[0])
-        if number >= len(RATES_TYPES):
-            raise self.error("rates_type", f"found {number}, expected below {len(RATES_TYPES)}")
         settings = [self.numbers(name, 3) for name in ("rc_rates", "rates", "rate_limits")]
-        axes = zip(*settings, strict=True)
-        roll, pitch, yaw = rates = tuple(full_stick_rate(RATES_TYPES[number], *axis) for axis in axes)
+        axes, rates_type = zip(*settings, strict=True), self.rates_type()
+        roll, pitch, yaw = rates = tuple(full_stick_rate(rates_type, *axis) for axis in axes)
         if min(rates) <= 0.0:
             raise self.error("rc_rates, rates, rate_limits", f"found full stick at {rates} deg/s")
         return roll, pitch, yaw
+
+    def rates_type(self) -> str:
+        """Return which rates the sticks have."""
+        number = int(self.numbers("rates_type", 1)[0])
+        if number >= len(RATES_TYPES):
+            raise self.error("rates_type", f"found {number}, expected below {len(RATES_TYPES)}")
+        return RATES_TYPES[number]
+
+    def stick_curve(self) -> list[str]:
+        """Return a note on the curve between a pilot's sticks and the setpoints, which the commands are."""
+        if not {"rc_rates", "rc_expo"} <= self.values.keys():
+            return []
+        settings = [self.numbers(name, 3) for name in ("rc_rates", "rates", "rc_expo")]
+        curve = stick_curve(self.rates_type(), list(zip(*settings, strict=True)))
+        if curve is None:
+            return []
+        numbers = json.dumps({name: round(value, 4) for name, value in curve._asdict().items() if value})
+        name = effect_of(curve).name
+        return [f"commands are setpoints; for a pilot's sticks a model needs the effect {name}: {numbers}"]
 
 
 def _commands(table: Table, headers: _Headers, full: np.ndarray) -> tuple[np.ndarray, list[str]]:

@@ -5,7 +5,6 @@ import importlib
 import pickle
 import warnings
 from importlib.util import find_spec
-from pathlib import Path
 from typing import Any
 
 import gymnasium
@@ -20,7 +19,6 @@ from gymnasium.wrappers import TimeLimit
 import flytrack_env
 from flytrack_env.env import EnvParams, FlyTrack
 from flytrack_env.registration import ENVIRONMENTS
-from flytrack_env.tracks import save_track
 from tests.support.coasting import track_of_row
 from tests.support.slow import slow_but
 
@@ -221,25 +219,6 @@ def test_options_set_the_start_of_one_episode(is_vector: bool) -> None:
     )
     following = np.atleast_2d(env.reset()[0])
     assert (abs(following[:, 22] + 0.5) > 1e-3).all()
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("is_vector", [False, True])
-def test_a_track_stays_until_another_is_named(is_vector: bool, tmp_path: Path) -> None:
-    path = tmp_path / "row.toml"
-    num_gates = 8 if is_vector else 3  # another number of gates compiles anew
-    save_track(path, track_of_row([10.0 * index for index in range(num_gates)]))
-    env = make_vector() if is_vector else gymnasium.make(BASE)
-    at_start = {"gate_index": 0}
-    home = np.atleast_2d(env.reset(options=at_start)[0])
-    for options in ({"track": path} | at_start, at_start):
-        observation = np.atleast_2d(env.reset(options=options)[0])
-        np.testing.assert_allclose(observation[:, :3], [[-5 / 3, 0.0, 0.0]] * len(observation), atol=1e-5)
-    action = np.zeros((3, 4)) if is_vector else np.zeros(4)
-    distance = env.step(action)[4]["gate_distance_m"]
-    np.testing.assert_allclose(distance, 5.0, atol=0.1)
-    back = np.atleast_2d(env.reset(options={"track": "flytrack"} | at_start)[0])
-    np.testing.assert_array_equal(back, home)
 
 
 @pytest.mark.parametrize(

@@ -16,12 +16,14 @@ import flytrack_env
 from firmware import Betaflight, Body, FirmwareError, build
 from firmware.checking import check
 from flytrack_env.dynamics import nominal_parameters
+from flytrack_env.effects import effect_of
 from flytrack_env.state import (
     ACCELERATION,
     APPLIED_ACTION,
     BATTERY,
     QUATERNION,
     RATES,
+    Action,
     pack,
     unpack,
     unpack_action,
@@ -130,6 +132,22 @@ def test_sick_motors_sag_and_settings_show():
         weak, strong = limited.fly(rows, commands)[0], healthy.fly(rows, commands)[0]
     assert weak[-1, ACCELERATION][2] < 0.8 * strong[-1, ACCELERATION][2]
     assert strong[-1, BATTERY] - weak[-1, BATTERY] == pytest.approx(0.02 * 80 * 0.8**3, rel=0.15)
+
+
+@pytest.mark.parametrize(
+    ("rates_type", "rc_rate", "rate", "expo"),
+    [("ACTUAL", 7, 67, 30), ("BETAFLIGHT", 100, 70, 40), ("QUICK", 90, 67, 30)],
+)
+def test_a_held_stick_turns_as_the_models_curve_says(rates_type, rc_rate, rate, expo):
+    rates = {"rates_type": rates_type, "roll_rc_rate": rc_rate, "roll_srate": rate, "roll_expo": expo}
+    held = np.zeros((3, 60, 4), np.float32)
+    held[:, :, 0] = np.array([[0.3], [-0.6], [0.9]])
+    with Betaflight(rates) as curved:
+        model, flown = curved.nominal_model(), curved.fly(starts(3), held)
+    curve = model.effects[0]
+    bent = [effect_of(curve).command(curve, None, Action(*u), None).roll for u in held[:, 0]]
+    expected = np.deg2rad(model.max_rate[0]) * np.array(bent)
+    np.testing.assert_allclose(flown[:, 40:, RATES][..., 0].mean(axis=1), expected, rtol=0.01, atol=0.01)
 
 
 def test_settings_are_read_back():

@@ -8,61 +8,19 @@ import sys
 import time
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
-import flytrack_env
 from baselines.purejaxrl_ppo import Config, load_checkpoint
 from baselines.purejaxrl_ppo.checkpoint import as_named_arrays
-from baselines.purejaxrl_ppo.collectives import AXIS, Collectives
+from baselines.purejaxrl_ppo.collectives import AXIS
 from baselines.purejaxrl_ppo.distributed import check_divides
-from baselines.purejaxrl_ppo.ppo import Batch, make_network_for, ppo_loss
 from baselines.purejaxrl_ppo.resume import checkpoints_in, newest_intact
 from tests.support.pages import ROOT
 from tests.support.ppo_runs import BATCH, CONFIG
 
-SIZE = 29  # of an observation
 TRAIN = "-m baselines.purejaxrl_ppo.train_ppo"
 SMALL = "--num-envs 16 --num-steps 24 --num-minibatches 4 --hidden-sizes 8 --evaluate-every 0 --no-tracking"
-
-
-# The update.
-
-
-def experience(network, params, size, seed):
-    """Return what a policy did in ``size`` drawn observations, with drawn advantages and targets."""
-    keys = jax.random.split(jax.random.key(seed), 6)
-    observation = jax.random.normal(keys[0], (size, SIZE))
-    policy, value = network.apply(params, observation)
-    action, log_prob = policy.sample_and_log_prob(seed=keys[1])
-    noise = 0.3 * jax.random.normal(keys[2], (2, size))
-    batch = Batch(observation, action, log_prob + noise[0], value + noise[1], value, jnp.zeros(size, bool))
-    return batch, 3.0 + 2.0 * jax.random.normal(keys[3], (size,)), jax.random.normal(keys[4], (size,))
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("num_shards", [2, 4])
-def test_the_gradient_of_equal_data_is_that_of_one_device(num_shards):
-    env = flytrack_env.make("FlyTrack-v0")
-    network = make_network_for(env, env.default_params, CONFIG)
-    params = network.init(jax.random.key(0), jnp.zeros((1, SIZE)))
-    data = experience(network, params, 64, seed=1)
-    gradient = jax.grad(ppo_loss, has_aux=True)
-    whole, parts = jax.jit(lambda *data: gradient(params, network, *data, CONFIG))(*data)
-    collectives = Collectives(AXIS)
-
-    def of_shard(batch, advantage, target):
-        return collectives.average(gradient(params, network, batch, advantage, target, CONFIG, collectives))
-
-    shards = jax.tree.map(lambda leaf: leaf.reshape(num_shards, -1, *leaf.shape[1:]), data)
-    found = jax.jit(jax.vmap(of_shard, axis_name=AXIS))(*shards)
-    for one in range(num_shards):
-        jax.tree.map(
-            lambda got, want: np.testing.assert_allclose(got, want, rtol=1e-4, atol=1e-6),
-            jax.tree.map(lambda leaf, one=one: leaf[one], found),
-            (whole, parts),
-        )
 
 
 def test_environments_and_minibatches_divide_into_shards():

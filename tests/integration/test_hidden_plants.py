@@ -9,7 +9,6 @@ from benchmarks.hidden import (
     EFFECTS,
     MOTIONS,
     NAMES,
-    OUTSIDE_KINDS,
     Gust,
     Truth,
     draw_base,
@@ -147,22 +146,6 @@ def test_second_order_rates_obey_their_differential_equation(damping: float) -> 
             bend = natural**2 * (target - rate) - 2.0 * damping * natural * slope
             rate, slope = rate + slope * 0.01 / finer, slope + bend * 0.01 / finer
         np.testing.assert_allclose(own, rate, atol=5e-3)
-
-
-def difficult(number: int) -> Truth:
-    """Return a plant with several random effects, one of the largest, or something outside the list."""
-    rng = np.random.default_rng([number, 9])
-    if number % 3 == 0:
-        return replace(draw_truth(rng, 4), gust=draw_gust(rng))
-    if number % 3 == 1:
-        outside = draw_outside(rng, OUTSIDE_KINDS[number // 3 % len(OUTSIDE_KINDS)], 3.0)
-        return replace(draw_base(rng), outside=outside, gust=draw_gust(rng))
-    names = [str(name) for name in rng.choice(list(EFFECTS), 3, replace=False)]
-    effects = {name: draw_effect(name, rng, EFFECTS[name].high, has_drag=True) for name in names}
-    return replace(draw_base(rng), effects=effects)
-
-
-FAST, MINUTES_FROM = 3, 10  # each sort of plant once; the later ones fly for a minute
 
 
 @pytest.fixture(scope="module")

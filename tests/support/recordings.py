@@ -57,9 +57,3 @@ class Recording:
         rows = [row for _, row in sorted(found, key=lambda pair: pair[0]) if row]
         assert {len(row) for row in rows} == {1}
         return np.array(rows)[:, 0]
-
-    def latest_strip(self, entity: str, step: int) -> list | None:
-        """Return the line strip that a viewer shows at a step."""
-        strips = self.rows[entity, "LineStrips3D:strips"]
-        known = [(at, i) for i, (at, _) in enumerate(self.times[entity]) if at <= step]
-        return strips[max(known)[1]][0] if known else None

@@ -8,8 +8,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from benchmarks.reliability.foreign_logs import BLACKBOX_HEADERS, blackbox
+from flytrack_env.effects import effect_of
+from flytrack_env.state import Action
 from flytrack_sysid import LogError, import_log
-from flytrack_sysid.importing.betaflight_log import full_stick_rate
+from flytrack_sysid.importing.betaflight_rates import full_stick_rate, stick_curve
 from tests.support.real_logs import BETAFLIGHT, shared
 
 pytest.importorskip("orangebox", reason="orangebox is not installed: pip install 'flytrack[logs]'")
@@ -58,6 +60,7 @@ def test_units_and_frames_are_ours(tmp_path):
     np.testing.assert_allclose(log["w"][0], np.deg2rad([100.0, -50.0, 25.0]))
     np.testing.assert_allclose(log["f"][0], [0.5 * GRAVITY, -0.25 * GRAVITY, GRAVITY])
     assert log["v_bat"][0] == pytest.approx(24.1)
+    assert 'the effect betaflight_rates: {"pitch": 0.7, "yaw": 0.8, "roll_expo": 0.1}' in str(found.notes)
     assert set(log.channels) == {"u", "w", "f", "v_bat"} and "Betaflight 4.5.1" in found.notes[0]
 
 
@@ -95,6 +98,34 @@ def test_logs_of_one_file_become_segments_and_lost_frames_no_rows(tmp_path):
 )
 def test_rates_at_full_stick_are_the_firmwares(rates_type, rc_rate, super_rate, expected_deg_s):
     assert full_stick_rate(rates_type, rc_rate, super_rate, 1998.0) == pytest.approx(expected_deg_s)
+
+
+def of_firmware(rates_type: str, stick: float, rc_rate: float, rate: float, expo: float) -> float:
+    """Return the setpoint, deg/s, as the firmware computes it."""
+    size, expo = abs(stick), expo / 100
+    if rates_type == "ACTUAL":
+        late = size * (stick**5 * expo + stick * (1 - expo))
+        return stick * 10 * rc_rate + max(0, 10 * rate - 10 * rc_rate) * late
+    if rates_type == "QUICK":
+        slope, most = 2 * rc_rate, max(10 * rate, 2 * rc_rate)
+        factor = (most / slope - 1) / (most / slope)
+        return stick * slope / (1 - (size**3 * expo + size * (1 - expo)) * factor)
+    curved = stick * size**3 * expo + stick * (1 - expo)
+    return 200 * rc_rate / 100 * curved / min(max(1 - size * rate / 100, 0.01), 1)
+
+
+@pytest.mark.parametrize("rates_type", ["ACTUAL", "BETAFLIGHT", "QUICK"])
+def test_stick_curves_are_the_firmwares(rates_type):
+    axes = [(30, 67, 40), (70, 70, 0), (100, 40, 100)]
+    curve, sticks = stick_curve(rates_type, axes), np.linspace(-1, 1, 21)
+    full = [full_stick_rate(rates_type, rc, rate, 1998.0) for rc, rate, _ in axes]
+    for stick in sticks:
+        bent = effect_of(curve).command(curve, None, Action(stick, stick, stick, 0.3), None)
+        expected = [of_firmware(rates_type, stick, *axis) for axis in axes]
+        np.testing.assert_allclose(bent[:3], np.divide(expected, full), atol=1e-6)
+        assert bent.thrust == 0.3
+    straight = {"ACTUAL": 62, "BETAFLIGHT": 0, "QUICK": 12}[rates_type]
+    assert stick_curve(rates_type, [(62, straight, 0)] * 3) is None
 
 
 @pytest.mark.parametrize(

@@ -183,24 +183,6 @@ def test_damage_is_noted_and_the_rest_is_read(tmp_path, capsys):
         import_log(path, "ulog")
 
 
-@pytest.mark.parametrize(
-    ("parameters", "message"),
-    [
-        ({"MAV_TYPE": 13.0}, "found a hexacopter (MAV_TYPE 13), not a quadcopter"),
-        ({"MAV_TYPE": 22.0}, "found a VTOL (MAV_TYPE 22), not a quadcopter"),
-        ({"SYS_AUTOSTART": 13006.0}, "found a VTOL (SYS_AUTOSTART 13006), not a quadcopter"),
-        (
-            {"MAV_TYPE": 2.0, "SYS_AUTOSTART": 4001.0, "CA_ROTOR_COUNT": 6.0},
-            "found 6 rotors (CA_ROTOR_COUNT)",
-        ),
-        ({"MAV_TYPE": 2.0, "SYS_AUTOSTART": 4001.0, "CA_ROTOR_COUNT": 4.0}, ""),
-    ],
-)
-def test_another_craft_than_a_quadcopter_is_told(tmp_path, parameters, message):
-    said = " ".join(import_log(write(tmp_path / "a.ulg", topics(), PARAMETERS | parameters), "ulog").notes)
-    assert (message in said) if message else ("not a quadcopter" not in said)
-
-
 def test_slow_topics_are_told(tmp_path):
     tables = topics()
     slow = TIMES_US[::25]

@@ -101,28 +101,3 @@ def test_gaps_are_long_steps_within_a_segment():
     steady = FlightLog(np.arange(200) * 0.01 + jitter, {"u": np.zeros((200, 4))}, np.zeros(200, int))
     assert len(gaps_of(steady)) == 0
     assert "gaps: none" in describe(steady)
-
-
-def test_description_says_what_is_in_a_log():
-    log = make_log(num_rows=8, names=("p", "v", "v_bat"))
-    time = np.array([0.0, 0.01, 0.02, 0.03, 0.5, 0.51, 0.55, 0.56])
-    log = replace(log, time=time, source="flight.csv")
-    log["v"][:] = 0.0
-    log["v"][3] = [0.0, -3.0, 4.0]
-    log["p"][:, 2] = np.arange(8) - 2
-    log["v_bat"][:, 0] = np.linspace(16.5, 14.0, 8)
-    log["u"][:] = np.outer(np.linspace(0.0, 1.0, 8), [0.5, -0.25, 0.0, 1.0])
-    log["u"][0] = [-0.1, 0.1, 0.0, -1.0]
-    assert describe(log).splitlines() == [
-        "flight.csv: 8 rows, 2 segments, 0.09 s",
-        "sample interval: 0.01 s (median), 100 Hz",
-        "gaps: 1, longest 0.04 s, after row 5",
-        "channels: p, v, v_bat, u; absent: a, f, q, w, uprev",
-        "commands: u_roll -0.1 to 0.5; u_pitch -0.25 to 0.1; u_yaw 0 to 0; u_thrust -1 to 1",
-        "speed up to 5 m/s; height -2 to 5 m; voltage 14 to 16.5 V",
-    ]
-    assert describe(log.without("p", "v", "v_bat").select(slice(1))).splitlines() == [
-        "flight.csv: 1 rows, 1 segments, 0.00 s",
-        "channels: u; absent: p, v, a, f, q, w, uprev, v_bat",
-        "commands: u_roll -0.1 to -0.1; u_pitch 0.1 to 0.1; u_yaw 0 to 0; u_thrust -1 to -1",
-    ]

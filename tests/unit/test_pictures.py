@@ -7,11 +7,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from matplotlib.collections import LineCollection
 
 from flytrack_env.pictures import Flight, draw_flight, make_flight, write_animation, write_video
 from flytrack_env.pictures.__main__ import main
-from flytrack_env.pictures.figures import draw_top
 from flytrack_env.references import ghost_rollout, shipped_references
 from flytrack_env.rollout import save_rollout
 from flytrack_env.tracks import load_track
@@ -35,24 +33,6 @@ def straight(right_m: float, up_m: float) -> Flight:
     states[:, 1:3] = y + right_m, z + up_m  # towards -x, +y is to the right
     states[:, 3], states[:, 9], states[:, 20] = -10.0, 1.0, 24.0
     return make_flight("straight", states, np.zeros((30, 4), np.float32), TRACK)
-
-
-def test_path_from_above_is_the_states_in_the_colours_of_their_speeds(ghost):
-    figure = draw_top(ghost)
-    (path,) = [found for found in figure.axes[0].collections if isinstance(found, LineCollection)]
-    segments = np.array(path.get_segments())
-    np.testing.assert_allclose(segments[:, 0], STATES[:-1, :2], atol=1e-6)
-    np.testing.assert_allclose(segments[:, 1], STATES[1:, :2], atol=1e-6)
-    speeds = np.linalg.norm(STATES[:, 3:6], axis=1)
-    np.testing.assert_allclose(path.get_array(), speeds[:-1], rtol=1e-6)
-    assert path.norm.vmin == 0.0 and path.norm.vmax > speeds.max()
-    texts = [text.get_text() for text in figure.findobj(lambda artist: hasattr(artist, "get_text"))]
-    assert {"start", "all steps flown", "speed (m/s)"} < set(texts)
-    assert any("laps 3.880, 3.833 s" in text for text in texts)
-    for gate in TRACK.gates:
-        (label,) = [text for text in figure.axes[0].texts if text.get_text() == str(gate.id)]
-        away_m = np.linalg.norm(np.array(label.get_position()) - gate.position[:2])
-        assert 0.5 * gate.frame < away_m < 0.5 * gate.frame + 2.0
 
 
 def test_video_shows_the_lap_and_leaves_nothing_where_it_fails(ghost, monkeypatch, tmp_path):

@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from flytrack_sysid.log import FlightLog
-from flytrack_sysid.record import PADDED_TO, WINDOW_S, applied_doubt, fill_gaps, make_record
+from flytrack_sysid.record import PADDED_TO, WINDOW_S, fill_gaps, make_record
 from flytrack_sysid.split import blocks_of
 from tests.support.handout_plant import HandoutPlant, excited
 
@@ -87,23 +87,3 @@ def test_windows_are_at_most_so_long_and_within_blocks():
             own = piece == number
             assert len(np.unique(block[own])) == 1 and np.ptp(case.time[own]) <= WINDOW_S
             assert own.sum() > 60
-
-
-def test_doubt_is_forgotten_with_the_lag():
-    """Against the variance of a lag driven by a command of which one value is random."""
-    rows, lost = 40, 10
-    step_s = np.random.default_rng(0).uniform(0.005, 0.015, rows)
-    tau = np.array([0.02, 0.03, 0.06, 0.04])
-    doubt, begins, known = np.zeros((rows, 4)), np.zeros(rows, bool), np.zeros(rows, bool)
-    doubt[lost], begins[0], known[0] = 0.3, True, True
-    found = applied_doubt(step_s, doubt, begins, known, tau)
-    since = np.cumsum(step_s) - step_s - (step_s[: lost + 1].sum())
-    expected = 0.3 * (1.0 - np.exp(-step_s[lost] / tau)) * np.exp(-since[:, None] / tau)
-    np.testing.assert_array_equal(found[: lost + 1], 0.0)
-    np.testing.assert_allclose(found[lost + 1 :], expected[lost + 1 :], rtol=1e-9)
-    # At the start nothing is known, until a measurement of the applied action ends that.
-    known[0], known[30] = False, True
-    found = applied_doubt(step_s, 0.0 * doubt, begins, known, tau)
-    elapsed = (np.cumsum(step_s) - step_s)[:, None]
-    np.testing.assert_allclose(found[:30], np.exp(-elapsed / tau)[:30], rtol=1e-9)
-    np.testing.assert_array_equal(found[30:], 0.0)

@@ -19,7 +19,6 @@ from flytrack_env.tracks import build_course, load_track
 
 pytest.importorskip("PIL", reason="the extra [render] is not installed")
 
-from flytrack_env.rendering.camera import NEAREST_M, Camera
 from flytrack_env.rendering.views import HEIGHT, PIXEL, WIDTH, Renderer
 from flytrack_env.rendering.views import TOP_VIEW_WIDTH as SPLIT
 
@@ -90,27 +89,6 @@ def test_top_view_shows_trail_drone_and_gates_where_they_are(renderer: Renderer)
         assert (distance_to(empty, scene.TEXT) < 60)[around].sum() >= 5
         is_next = (distance_to(picture[:, :SPLIT], scene.NEXT_GATE) < 20)[around].sum() > 30
         assert is_next is np.bool_(index == 1)
-
-
-def test_camera_projects_points_and_clips_what_is_behind_it() -> None:
-    """2 m above the origin, it looks along +x; 200 x 100 pixels."""
-    camera = Camera(np.array([0.0, 0.0, 2.0]), np.array([1.0, 0.0, 0.0]), np.array([100.0, 50.0]), 80.0)
-    ahead, left, above = (10.0, 0.0, 2.0), (10.0, 1.0, 2.0), (10.0, 0.0, 3.0)
-    pixels = camera.pixels(camera.look(np.array([ahead, left, above])))
-    np.testing.assert_allclose(pixels, [(100.0, 50.0), (92.0, 50.0), (100.0, 42.0)], atol=1e-9)
-    assert camera.horizon_px() == 50.0
-    ends = [(10.0, 20.0), (-5.0, 10.0), (10.0, -5.0), (-5.0, -1.0)]
-    lines = [camera.polygon(camera.look(np.array([(a, 0.0, 0.0), (b, 0.0, 0.0)]))) for a, b in ends]
-    nearest = 50.0 + 80.0 * 2.0 / NEAREST_M
-    np.testing.assert_allclose(lines[0], [100.0, 66.0, 100.0, 58.0], atol=1e-9)
-    for line in lines[1:3]:
-        heights = np.reshape(line, (-1, 2))[:, 1]
-        assert (heights.min(), heights.max()) == pytest.approx((66.0, nearest))
-    assert lines[3] == []
-    floor = np.array([(-5.0, -1.0, 0.0), (-5.0, 1.0, 0.0), (10.0, 1.0, 0.0), (10.0, -1.0, 0.0)])
-    corners = np.array(camera.polygon(camera.look(floor))).reshape(-1, 2)
-    np.testing.assert_allclose(sorted(corners[:, 1]), [66.0, 66.0, nearest, nearest], atol=1e-6)
-    assert camera.polygon(camera.look(floor - np.array([20.0, 0.0, 0.0]))) == []
 
 
 def test_single_environment_renders_its_own_flight_and_record_video_every_step(tmp_path: Path) -> None:

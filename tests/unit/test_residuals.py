@@ -96,28 +96,6 @@ def test_what_is_wrong_shows_in_its_channels_alone(log, changes, shows_in):
             assert value < 1e-9, name
 
 
-def test_what_windows_begin_with_is_taken_out(log):
-    """A constant offset of v and v_bat, offset and slope of p, a constant turn of q in the world."""
-    problem = problem_of(log)
-    window = problem.channels["v"].window
-    offsets = np.random.default_rng(0).normal(size=(window.max() + 1, 3))
-    turns = Rotation.from_rotvec(0.3 * np.random.default_rng(1).normal(size=(window.max() + 1, 3)))
-    window_q = problem.channels["q"].window
-    attitude = turns[window_q] * Rotation.from_quat(problem.record.quat, scalar_first=True)
-    channels = dict(problem.channels)
-    for name, values in (("v", offsets[window]), ("v_bat", 1.7)):
-        channels[name] = channels[name]._replace(measured=channels[name].measured + values)
-    channels["q"] = channels["q"]._replace(measured=attitude.as_quat(scalar_first=True))
-    assert max(largest(left(PLANT.model(), problem._replace(channels=channels))).values()) < 1e-8
-
-    problem = problem_of(log.without("v"))
-    place = problem.channels["p"]
-    time = np.cumsum(problem.record.step_s)[:, None]
-    moved = place.measured + offsets[place.window] + 3.0 * time * offsets[::-1][place.window]
-    problem = problem._replace(channels={"p": place._replace(measured=moved)})
-    assert largest(left(PLANT.model(), problem))["p"] < 1e-8
-
-
 def test_turning_the_world_about_the_vertical_changes_nothing(log):
     """Everything measured in the world frame is turned by 70 degrees, with a model that is wrong."""
     turn = Rotation.from_euler("z", 70.0, degrees=True)

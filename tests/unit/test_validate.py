@@ -1,7 +1,6 @@
 """Validation finds no error in the truth, and puts other models' errors where they belong."""
 
 import json
-import re
 from dataclasses import replace
 
 import jax
@@ -149,25 +148,6 @@ def test_thrust_is_measured_with_an_accelerometer_without_an_acceleration(exact,
     wrong = validate(TRUTH._replace(thrust_coeffs=coeffs), measured)
     assert wrong.thrust.total_mean_n == pytest.approx(1.5, rel=0.02)
     assert set(wrong.one_step.channels) == {"p", "v", "q", "w", "f"}
-
-
-@pytest.mark.parametrize(
-    ("missing", "judged", "note"),
-    [
-        (("v",), {"q", "w", "a"}, r"position \(p\): not judged; v is not in the log"),
-        (("w",), {"p", "v", "q", "a"}, r"body rates \(w\): not in the log"),
-        (("q",), {"w"}, r"velocity \(v\): not judged; q is not in the log"),
-        (("q", "w"), set(), "step responses: no judged command"),
-    ],
-)
-def test_missing_channels_are_noted_and_give_no_number(log, missing, judged, note):
-    validation = validate(TRUTH, log.without(*missing))
-    assert set(validation.one_step.channels) == judged
-    assert any(re.search(note, one) for one in validation.notes), validation.notes
-    numbers = json.loads(json.dumps(validation.as_json(), allow_nan=False))
-    assert set(numbers["one_step"]["channels"]) == judged
-    assert max([0.0, *nrmse(validation).values()]) < 1e-6
-    assert all(error.p95 < 1e-5 for rollout in validation.rollouts for error in rollout.errors.values())
 
 
 def test_without_voltage_a_middle_one_is_assumed(log):

@@ -6,12 +6,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 
 from flytrack_env.flown_race import follow_race
 from flytrack_env.references import ghost_rollout, shipped_references
 from flytrack_env.rollout import save_rollout
-from flytrack_env.state import BATTERY, POSITION, QUATERNION, Action
+from flytrack_env.state import POSITION, Action
 from flytrack_env.tracks import build_course, load_track
 from tests.support.recordings import Recording, make_sequence
 
@@ -149,29 +148,6 @@ def test_failures_to_write_keep_the_old_recording(tmp_path, monkeypatch):
     with pytest.raises(ValueError, match="RERUN: found it turned off"):
         viz.visualize_state_action_sequence(make_sequence(3), GATES, str(path))
     assert list(tmp_path.iterdir()) == [path] and path.read_bytes() == b"old"
-
-
-def test_every_flight_has_its_own_numbers_on_one_time_line(recording):
-    for entity, states in (("/world/drone", STATES), (f"/world/{SECOND}/drone", aside(0.2)[:300])):
-        found = recording.series(entity, "Transform3D:translation")
-        np.testing.assert_allclose(found, states[:, POSITION], rtol=1e-6)
-        steps = np.arange(len(states)).tolist()
-        assert sorted(recording.times[entity]) == [(step, step * 10_000_000) for step in steps]
-    expected = {
-        "battery": STATES[:, BATTERY],
-        "gate_distance": RACE.gate_distance_m,
-        **{f"applied/{name}": STATES[:, 16 + i] for i, name in enumerate(Action._fields)},
-    }
-    for path, values in expected.items():
-        found = recording.series(f"/plots/{path}", "Scalars:scalars")
-        np.testing.assert_allclose(found, values, rtol=1e-6, err_msg=path)
-    roll, pitch, yaw = (
-        recording.series(f"/plots/orientation/{name}", "Scalars:scalars") for name in ("roll", "pitch", "yaw")
-    )
-    made = Rotation.from_euler("ZYX", np.column_stack([yaw, pitch, roll]), degrees=True)
-    given = Rotation.from_quat(STATES[:, QUATERNION], scalar_first=True)
-    assert (made.inv() * given).magnitude().max() < 1e-5
-    assert max(np.abs(np.diff(angle)).max() for angle in (roll, pitch, yaw)) < 180.0  # no jumps
 
 
 def test_passes_laps_events_and_table_are_the_races(recording):
