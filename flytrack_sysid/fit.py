@@ -209,11 +209,13 @@ def what_is_fitted(
     Arguments and what is raised are those of ``fit``, which calls this before any work.
     """
     check_plausible(log)
-    fixed = dict(fixed or {})
+    fixed, effects = dict(fixed or {}), tuple(effects)
     try:
         model = with_neutral_effects(nominal_parameters() if start is None else start, effects)
     except KeyError as error:
         raise FitError(f"effects: {error.args[0]}: no effect of that name") from error
+    for name in (name for name in effects if BY_NAME[name].is_setting):
+        raise FitError(f"effects: {name}: known from settings and not fitted; start from a model that has it")
     free = _free_names(model, log, fixed)
     model = with_values(model, fixed)
     judged = ~held_out_rows(log, every)

@@ -138,6 +138,7 @@ REFUSED = {
     "no rates": (lambda log: log.without("w", "q"), {}, "w and q are absent"),
     "no force": (lambda log: log.without("f", "v", "p"), {}, "thrust needs f, or q with one of a, v and p"),
     "unknown name": (lambda log: log, {"fixed": {"tau_jaw": 0.1}}, "fixed: tau_jaw: unknown; expected"),
+    "a setting": (lambda log: log, {"effects": ("quick_rates",)}, "quick_rates: known from settings and not"),
     "unknown effect": (lambda log: log, {"effects": ("rag",)}, "effects: rag: no effect of that name"),
     "nothing left": (lambda log: log, {"fixed": EVERYTHING}, "fixed: found every parameter"),
     "no time constant": (lambda log: log, {"fixed": {"tau_yaw": 0.0}}, "tau_yaw: found 0.0, expected 0.001"),
