@@ -14,6 +14,7 @@ channel   residual                                                              
 Centring takes out what a window began with, which is measured with noise like the rest.
 """
 
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -27,6 +28,7 @@ from flytrack_sysid.record import Record, is_applied_certain, measured_channels
 from flytrack_sysid.replay import Step, replay, where_true
 
 CENTRED = ("v", "p", "q", "v_bat")
+ROWS_PADDED_TO, SIDES_PADDED_TO, MOST_PADDING = 64, 8, 3
 
 
 class Channel(NamedTuple):
@@ -40,12 +42,20 @@ class Channel(NamedTuple):
     window: np.ndarray
 
 
+class Sides(NamedTuple):
+    """Flights side by side: (longest, num_flights) rows of the record, and each row's place in that, flat."""
+
+    rows: np.ndarray
+    place: np.ndarray
+
+
 class Problem(NamedTuple):
     """A record with what was measured in it; counts are 0 where a row is not to be judged."""
 
     record: Record
     turns_afresh: np.ndarray
     channels: dict[str, Channel]
+    flights: Sides
 
 
 def make_problem(log: FlightLog, record: Record, judged: np.ndarray, model: ModelParameters) -> Problem:
@@ -76,7 +86,28 @@ def make_problem(log: FlightLog, record: Record, judged: np.ndarray, model: Mode
         width = 3 if name == "q" else values.shape[1]
         counts = np.broadcast_to(allowed[name], (len(values), width)).astype(float)
         channels[name] = Channel(values, counts, windows.get(name, flight))
-    return Problem(record, turns_afresh, channels)
+    return Problem(record, turns_afresh, channels, _side_by_side(record))
+
+
+def _side_by_side(record: Record) -> Sides:
+    """Return the flights of a record side by side, or all rows in one column if that is shorter.
+
+    Columns are padded to round numbers, so that logs of about the same flights share a program.
+    """
+    num_rows = len(record.begins)
+    end = 1 + int(np.flatnonzero(record.source_row >= 0)[-1])
+    first = np.union1d(0, np.flatnonzero(record.begins[:end]))
+    lengths = np.diff(np.append(first, end))
+    longest = -(-int(lengths.max()) // ROWS_PADDED_TO) * ROWS_PADDED_TO
+    num = -(-len(first) // SIDES_PADDED_TO) * SIDES_PADDED_TO
+    if longest * num > MOST_PADDING * num_rows:
+        return Sides(np.arange(num_rows)[:, None], np.arange(num_rows))
+    starts = np.append(first, np.repeat(num_rows - 1, num - len(first)))
+    rows = np.minimum(starts + np.arange(longest)[:, None], num_rows - 1)
+    within = np.arange(end) - np.repeat(first, lengths)
+    place = np.zeros(num_rows, int)
+    place[:end] = within * num + np.repeat(np.arange(len(first)), lengths)
+    return Sides(rows, place)
 
 
 def _windows(record: Record, is_certain: Any) -> tuple[np.ndarray, np.ndarray]:
@@ -135,12 +166,25 @@ class Predicted(NamedTuple):
     quat: jax.Array
 
 
-def predict_rows(model: ModelParameters, record: Record, turns_afresh: jax.Array | np.ndarray) -> Predicted:
+def predict_rows(
+    model: ModelParameters, record: Record, turns_afresh: jax.Array | np.ndarray, flights: Sides | None = None
+) -> Predicted:
     """Return what a model predicts of every row; differentiable in the model.
 
-    turns_afresh: (num_rows,) bool, where the attitude is taken from the log again.
+    turns_afresh: (num_rows,) bool, where the attitude is taken from the log again. flights: of the record,
+    replayed side by side; one after the other if None.
     """
+    if flights is None:
+        return _predict_column(model, record, turns_afresh)
+    given = record, jnp.asarray(turns_afresh)
+    columns = jax.tree.map(lambda leaf: leaf[flights.rows], given)
+    found = jax.vmap(partial(_predict_column, model), in_axes=1, out_axes=1)(*columns)
+    return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:])[flights.place], found)
 
+
+def _predict_column(
+    model: ModelParameters, record: Record, turns_afresh: jax.Array | np.ndarray
+) -> Predicted:
     def observe(step: Step, _: None) -> tuple[Any, ...]:
         before = step.before.quat
         inverse = before._replace(x=-before.x, y=-before.y, z=-before.z)
@@ -193,7 +237,7 @@ def _raw(name: str, channel: Channel, predicted: Predicted, record: Record) -> j
 def residuals(model: ModelParameters, problem: Problem) -> dict[str, jax.Array]:
     """Return the residuals of each channel, (num_rows, components); 0 where a row does not count."""
     record = jax.tree.map(jnp.asarray, problem.record)
-    predicted = predict_rows(model, record, problem.turns_afresh)
+    predicted = predict_rows(model, record, problem.turns_afresh, problem.flights)
     time = jnp.cumsum(record.step_s)
     found = {}
     for name, channel in problem.channels.items():
