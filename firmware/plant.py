@@ -47,6 +47,7 @@ from flytrack_env.state import (
     pack,
     unpack,
 )
+from flytrack_sysid.importing.betaflight_loop import rate_loop
 from flytrack_sysid.importing.betaflight_rates import full_stick_rate, stick_curve
 
 DT_S = 0.01
@@ -179,11 +180,12 @@ class Betaflight(Plant):
         return self.firmware.value(name)
 
     def nominal_model(self) -> ModelParameters:
-        """Return the model to fit from: the nominal one with the craft's rates, moving as drones do."""
+        """Return the model to fit from: the nominal one with the craft's settings, moving as drones do."""
         full = np.array(self.full_stick_deg_s, np.float32)
         curve = stick_curve(self.value("rates_type"), _rates(self.firmware, "rc_rate", "srate", "expo"))
         model = nominal_parameters()._replace(max_rate=full, motion=Motion.CONTINUOUS)
-        return model if curve is None else model.with_effects(curve)
+        loop = rate_loop(self.value, 1.0 / DT_S)
+        return model.with_effects(*(one for one in (curve, loop) if one is not None))
 
     def reset(self, drone: Drone, model: ModelParameters) -> FirmwareState:
         """Return the state of a flight that has not begun; ``model`` is not used."""

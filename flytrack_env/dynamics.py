@@ -17,6 +17,7 @@ from flytrack_env.fusion import compute_once
 from flytrack_env.motion import Motion
 from flytrack_env.quaternion import Quaternion, Scalar, Vec3
 from flytrack_env.state import ACTION_SIZE, Action, Drone, pack, unpack, unpack_action
+from flytrack_env.thrust import collective_thrust
 
 SECONDS_PER_MINUTE = 60.0
 HELD_S = 1e6  # s, long enough for lags and limits of the rates to settle, to float32's rounding
@@ -73,16 +74,6 @@ def nominal_parameters() -> ModelParameters:
         m=1.0,
         g=9.80665,
     )
-
-
-def collective_thrust(thrust_action: Scalar, battery_v: Scalar, coeffs: jax.Array | np.ndarray) -> Scalar:
-    """Return the thrust in N along body z for a lagged thrust action and a battery voltage.
-
-    ``coeffs`` has shape (6,); handout, task 1, equation 3.
-    """
-    u, volt = thrust_action, battery_v
-    polynomial = coeffs[0] + u * (coeffs[1] + u * (coeffs[2] + u * coeffs[3]))
-    return polynomial + volt * (coeffs[4] + u * coeffs[5])
 
 
 def lag(applied: Action, command: Action, dt: Scalar, tau: Any) -> Action:
@@ -187,6 +178,33 @@ def _taus(params: ModelParameters) -> Action:
     return Action(*(params.tau[i] for i in range(ACTION_SIZE)))
 
 
+def _beginning(drone: Drone, command: Action, dt: Scalar, params: ModelParameters) -> StepContext:
+    """Return the context of a step that begins."""
+    return StepContext(
+        drone=drone,
+        command=command,
+        dt=dt,
+        motion=params.motion,
+        full_stick_b=body_rates(Action(1.0, 1.0, 1.0, 0.0), params.max_rate),
+        thrust_coeffs=params.thrust_coeffs,
+    )
+
+
+def _applied(
+    drone: Drone,
+    memories: tuple[Any, ...],
+    dt: Scalar,
+    tau: Action,
+    params: ModelParameters,
+    context: StepContext,
+) -> tuple[Action, tuple[Any, ...]]:
+    """Return the action that is applied after a time, and the memories of what takes the lag's place."""
+    lagged = lag(drone.applied, context.acting, dt, tau)
+    if not effects.acts(params.effects, "respond"):
+        return compute_once(lagged), memories
+    return compute_once(effects.respond(params.effects, memories, lagged, context))
+
+
 def _drained(drone: Drone, elapsed_s: Scalar, params: ModelParameters) -> Scalar:
     """Return the battery voltage after a time, before what effects add."""
     return drone.battery_v - params.battery_drain_v_per_min / SECONDS_PER_MINUTE * elapsed_s
@@ -200,7 +218,7 @@ def _move_at_once(
     The thrust is that of the lagged action *after* the step. The acceleration uses the attitude *before* it
     (handout, equations 1 to 4), or, semi-implicit, the attitude after it.
     """
-    context = StepContext(drone=drone, command=command, dt=dt, motion=params.motion)
+    context = _beginning(drone, command, dt, params)
 
     def fold(stage: str, value: Any) -> Any:  # sees the context of the moment
         return effects.fold(stage, params.effects, memories, value, context)
@@ -208,7 +226,7 @@ def _move_at_once(
     acting = fold("command", command)
     context = context._replace(acting=acting)
     tau = fold("lag", _taus(params))
-    applied = compute_once(lag(drone.applied, acting, dt, tau))
+    applied, memories = _applied(drone, memories, dt, tau, params, context)
     context = context._replace(applied=applied, body_axes_w=compute_once(drone.quat.axes()))
     context = _with_thrust(context, params, memories)
     rates_b = body_rates(applied, params.max_rate)
@@ -244,18 +262,22 @@ class _Instant(NamedTuple):
 
 def _lag_within_step(
     drone: Drone, memories: tuple[Any, ...], command: Action, dt: Scalar, params: ModelParameters
-) -> tuple[_Instant, _Instant, _Instant]:
+) -> tuple[tuple[_Instant, _Instant, _Instant], tuple[Any, ...]]:
     """Return the beginning, middle and end of a step under a held command: lag, body rates, battery.
 
-    The lag is exact for commands held over half a step; of a delayed one, each half has its mean.
+    The lag is exact for commands held over half a step; of a delayed one, each half has its mean. The
+    memories are those of what takes the lag's place.
     """
-    beginning = StepContext(drone=drone, command=command, dt=dt, motion=params.motion)
+    beginning = _beginning(drone, command, dt, params)
 
-    def acting_in(span: tuple[float, float], applied: Action) -> tuple[Action, Action]:
+    def after_half(
+        span: tuple[float, float], applied: Action, memories: tuple[Any, ...]
+    ) -> tuple[Action, tuple[Any, ...], Action, Action]:
         now = beginning._replace(drone=drone._replace(applied=applied), span=span)
         acting = effects.fold("command", params.effects, memories, command, now)
         now = now._replace(acting=acting)
-        return acting, effects.fold("lag", params.effects, memories, _taus(params), now)
+        tau = effects.fold("lag", params.effects, memories, _taus(params), now)
+        return *_applied(now.drone, memories, 0.5 * dt, tau, params, now), acting, tau
 
     def instant(
         applied: Action, elapsed_s: Scalar, acting: Action, tau: Action, first: tuple[Any, ...] = ()
@@ -271,19 +293,16 @@ def _lag_within_step(
         return _Instant(applied, volts, context._replace(rates_b=rates_b), inputs)
 
     half = 0.5 * dt
-    acting, tau = acting_in((0.0, 0.5), drone.applied)
-    middle = compute_once(lag(drone.applied, acting, half, tau))
-    later, later_tau = acting, tau
-    if effects.acts(params.effects, "command") or effects.acts(params.effects, "lag"):
-        later, later_tau = acting_in((0.5, 1.0), middle)
-    end = compute_once(lag(middle, later, half, later_tau))
+    middle, response, acting, tau = after_half((0.0, 0.5), drone.applied, memories)
+    end, response, later, later_tau = after_half((0.5, 1.0), middle, response)
     at_first = instant(drone.applied, 0.0, acting, tau)
     inputs = at_first.rate_inputs
-    return (
+    found = (
         at_first,
         instant(middle, half, later, later_tau, inputs),
         instant(end, dt, later, later_tau, inputs),
     )
+    return found, response
 
 
 def _move_continuously(
@@ -295,7 +314,7 @@ def _move_continuously(
     expansion (Iserles et al., Lie-group methods, 2000); the acceleration is Simpson's mean of the forces at
     the beginning, middle and end, each with the attitude and velocity of its moment.
     """
-    instants = _lag_within_step(drone, memories, command, dt, params)
+    instants, response = _lag_within_step(drone, memories, command, dt, params)
     rates_0, rates_m, rates_1 = (compute_once(one.context.rates_b) for one in instants)
     # Of the first half, from the parabola through the three rates.
     angle_m = (rates_0.scale(5.0) + rates_m.scale(8.0) - rates_1).scale(dt / 24.0)
@@ -331,7 +350,7 @@ def _move_continuously(
         force_b=force_1, angular_acc_b=turning, middle_rates_b=rates_m, middle_force_b=force_m
     )
     inputs = instants[0].rate_inputs, instants[2].rate_inputs
-    later = effects.remember(params.effects, memories, context, *inputs)
+    later = effects.remember(params.effects, response, context, *inputs)
     return Moved(compute_once(after), later, context)
 
 

@@ -6,12 +6,15 @@ chain was compiled fifty times over (measured: 13 times slower). ``lax.optimizat
 removed before fusion and does not help. A conditional does: what goes into it is computed once.
 """
 
-from typing import TypeVar
+from collections.abc import Callable
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
-from jax.extend.core import Primitive
+from jax.extend.core import ClosedJaxpr, Primitive, jaxpr_as_fun
 from jax.interpreters import ad, batching, mlir
+from jax.interpreters.partial_eval import dce_jaxpr
+from jaxlib.mlir import ir
 
 Tree = TypeVar("Tree")
 
@@ -65,3 +68,97 @@ batching.primitive_batchers[_compute_once_p] = _batch
 ad.primitive_jvps[_compute_once_p] = _jvp
 mlir.register_lowering(_compute_once_p, lambda ctx, *leaves: list(leaves))
 mlir.register_lowering(_compute_once_p, mlir.lower_fun(_fence, multiple_results=True), platform="cpu")
+
+
+_one_kernel_p = Primitive("flytrack_one_kernel")
+_one_kernel_p.multiple_results = True
+
+# What XLA's CPU compiler can put into one function; anything else (a gather, a product of matrices, a
+# call of a library) keeps a kernel of its own.
+SIMPLE = frozenset(
+    """
+    abs add add_any and broadcast_in_dim bitcast_convert_type ceil clamp concatenate
+    convert_element_type copy cos custom_jvp_call div dynamic_slice dynamic_update_slice eq exp
+    floor flytrack_compute_once ge gt integer_pow iota is_finite jit le log logistic lt max min mul
+    ne neg not or pad pjit population_count pow scan reduce_and reduce_max reduce_min reduce_or
+    reduce_sum rem reshape round rsqrt select_n shift_left shift_right_arithmetic
+    shift_right_logical sign sin slice sqrt square squeeze stop_gradient stack sub tanh transpose
+    while xor flytrack_one_kernel
+    """.split()  # noqa: SIM905, a table
+)
+ATTRIBUTES = {"xla_cpu_small_call": "true", "inlineable": "false"}
+
+
+def is_simple(jaxpr: Any) -> bool:
+    """Return whether a (closed) jaxpr holds nothing but operations of ``SIMPLE``."""
+    jaxpr = getattr(jaxpr, "jaxpr", jaxpr)
+    inner = [value for eqn in jaxpr.eqns for value in eqn.params.values()]
+    return all(eqn.primitive.name in SIMPLE for eqn in jaxpr.eqns) and all(
+        is_simple(value) for value in inner if hasattr(value, "eqns") or hasattr(value, "jaxpr")
+    )
+
+
+def one_kernel(function: Callable[..., Tree]) -> Callable[..., Tree]:
+    """Return the same function of pytrees, on the CPU compiled as one kernel if it is made of ``SIMPLE``."""
+
+    def wrapped(*args: Any) -> Tree:
+        leaves, structure = jax.tree.flatten(args)
+
+        def flat(*leaves: Any) -> Any:
+            return function(*jax.tree.unflatten(structure, leaves))
+
+        closed, shapes = jax.make_jaxpr(flat, return_shape=True)(*leaves)
+        if is_simple(closed):
+            # XLA's compiler of such a call fails on an argument that nothing reads.
+            jaxpr, is_used = dce_jaxpr(closed.jaxpr, [True] * len(closed.jaxpr.outvars))
+            used = [leaf for leaf, used in zip(leaves, is_used, strict=True) if used]
+            results = _one_kernel_p.bind(*used, jaxpr=ClosedJaxpr(jaxpr, closed.consts))
+        else:
+            results = jaxpr_as_fun(closed)(*leaves)
+        return jax.tree.unflatten(jax.tree.structure(shapes), results)
+
+    return wrapped
+
+
+def _batch_kernel(args, dims, *, jaxpr):  # type: ignore[no-untyped-def]
+    results = one_kernel(jax.vmap(jaxpr_as_fun(jaxpr), in_axes=dims))(*args)
+    return results, [0] * len(results)
+
+
+def _jvp_kernel(primals, tangents, *, jaxpr):  # type: ignore[no-untyped-def]
+    moves = [type(tangent) is not ad.Zero for tangent in tangents]
+    directions = [tangent for tangent, does in zip(tangents, moves, strict=True) if does]
+
+    def derivative(primals: Any, directions: Any) -> Any:
+        def of_moving(*moving: Any) -> Any:
+            given = iter(moving)
+            return jaxpr_as_fun(jaxpr)(
+                *(next(given) if does else still for does, still in zip(moves, primals, strict=True))
+            )
+
+        moving = [one for one, does in zip(primals, moves, strict=True) if does]
+        return jax.jvp(of_moving, moving, directions)[1]
+
+    # Apart, since a batch of directions has one result.
+    return _one_kernel_p.bind(*primals, jaxpr=jaxpr), one_kernel(derivative)(list(primals), directions)
+
+
+def _lower_kernel(ctx, *args, jaxpr):  # type: ignore[no-untyped-def]
+    results = mlir.lower_fun(jax.jit(jaxpr_as_fun(jaxpr)), multiple_results=True)(ctx, *args)
+    call = results[0].owner
+    call.attributes["mhlo.frontend_attributes"] = ir.DictAttr.get(
+        {name: ir.StringAttr.get(value) for name, value in ATTRIBUTES.items()}
+    )
+    return results
+
+
+def _inline_kernel(*leaves: Any, jaxpr: Any) -> Any:
+    return jaxpr_as_fun(jaxpr)(*leaves)
+
+
+_one_kernel_p.def_impl(lambda *leaves, jaxpr: jax.jit(jaxpr_as_fun(jaxpr))(*leaves))
+_one_kernel_p.def_abstract_eval(lambda *avals, jaxpr: list(jaxpr.out_avals))
+batching.primitive_batchers[_one_kernel_p] = _batch_kernel
+ad.primitive_jvps[_one_kernel_p] = _jvp_kernel
+mlir.register_lowering(_one_kernel_p, mlir.lower_fun(_inline_kernel, multiple_results=True))
+mlir.register_lowering(_one_kernel_p, _lower_kernel, platform="cpu")

@@ -20,6 +20,7 @@ from flytrack_sysid.parameters import (
     TAUS,
     THRUST_COEFFS,
     as_float32,
+    base_of,
     bounds_of,
     from_vector,
     names_of,
@@ -130,7 +131,7 @@ def _free_names(model: ModelParameters, log: FlightLog, fixed: Mapping[str, floa
         if not (np.isfinite(value) and low <= value <= high):
             raise FitError(f"fixed: {name}: found {value}, expected {low:g} to {high:g} {unit_of(name)}")
     of_effects = [name for name in names if "." in name and not BY_NAME[name.split(".")[0]].is_setting]
-    wanted = [*TAUS, *THRUST_COEFFS, DRAIN, *of_effects]
+    wanted = [*base_of(model), *of_effects]
     if "v_bat" not in log:
         wanted = [name for name in wanted if name not in (*THRUST_COEFFS[4:], DRAIN)]
     return tuple(name for name in wanted if name not in fixed)

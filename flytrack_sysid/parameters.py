@@ -45,6 +45,14 @@ def names_of(model: ModelParameters) -> tuple[str, ...]:
     return (*BASE, *(f"{effect}.{field}" for effect, fields in of_effects for field in fields))
 
 
+def base_of(model: ModelParameters) -> tuple[str, ...]:
+    """Return what every fit frees: lags, unless an effect takes their place, thrust map, drain, the craft."""
+    every = [effect_of(parameters) for parameters in model.effects]
+    taus = () if any(effect.respond for effect in every) else TAUS
+    craft = [f"{effect.name}.{field}" for effect in every for field in effect.fitted]
+    return (*taus, *THRUST_COEFFS, DRAIN, *craft)
+
+
 def unit_of(name: str) -> str:
     """Return the unit of a parameter."""
     effect, _, field = name.partition(".")

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from flytrack_env.dynamics import HELD_S, ModelParameters, Moved, move, start_rates
-from flytrack_env.effects import CommandDelay, start_memories
+from flytrack_env.effects import CommandDelay, acts, start_memories
 from flytrack_env.effects.command_delay import dead_times
 from flytrack_env.motion import Motion
 from flytrack_env.quaternion import Quaternion, Vec3
@@ -17,6 +17,7 @@ from flytrack_sysid.record import BATTERY_UNKNOWN_V
 
 SMALL_STEP, FULL_STEP = 1e-3, 1.0  # of a stick, from its centre; no limit acts on the small one
 STEP_S, WATCHED_S = 1e-3, 1.5
+FRAME_S = 0.01  # of a loop that is fed by frames of a receiver, in place of the step
 HALF = 0.5
 HEIGHT_M = 1e3  # far from the ground
 BATCH = 8  # models at once
@@ -63,21 +64,26 @@ def _of_model(model: ModelParameters, stick_step: jax.Array) -> jax.Array:
 def _of_stick(model: ModelParameters, stick: jax.Array, stick_step: jax.Array) -> jax.Array:
     """Return the time of one stick, s, given as a row of the unit matrix, for a drone held in place."""
     drone = _standing(model)
+    has_loop = acts(model.effects, "respond")
+    step_s = FRAME_S if has_loop else STEP_S
     memories, command = start_memories(model.effects, drone), Action(*(stick_step * stick))
 
     def response(moved: Moved) -> jax.Array:
         return jnp.stack([*moved.after.rates_b, moved.context.force_b.z]) @ stick
 
     def step(state: tuple[Drone, tuple[Any, ...]], _: None) -> tuple[Any, jax.Array]:
-        moved = move(*state, command, STEP_S, model)
+        moved = move(*state, command, step_s, model)
         held = drone._replace(rates_b=moved.after.rates_b, applied=moved.after.applied)
         return (held, moved.memories), response(moved)
 
     at_once = model._replace(motion=Motion.HANDOUT)
-    before = response(move(drone, memories, drone.applied, HELD_S, at_once))
-    steady = response(move(drone, memories, command, HELD_S, at_once))
-    values = jax.lax.scan(step, (drone, memories), length=round(WATCHED_S / STEP_S))[1]
-    return STEP_S * _first_crossing((values - before) / (steady - before))
+    values = jax.lax.scan(step, (drone, memories), length=round(WATCHED_S / step_s))[1]
+    before, steady = (
+        response(move(drone, memories, held, STEP_S if has_loop else HELD_S, at_once))
+        for held in (drone.applied, command)
+    )
+    steady = values[-1] if has_loop else steady
+    return step_s * _first_crossing((values - before) / (steady - before))
 
 
 def _standing(model: ModelParameters) -> Drone:

@@ -12,6 +12,7 @@ from flytrack_env.effects.accelerometer_bias import ACCELEROMETER_BIAS, Accelero
 from flytrack_env.effects.accelerometer_scale import ACCELEROMETER_SCALE, AccelerometerScale
 from flytrack_env.effects.actual_rates import ACTUAL_RATES, ActualRates
 from flytrack_env.effects.base import STAGES, Effect, Pose, Range, StepContext
+from flytrack_env.effects.betaflight_loop import BETAFLIGHT_LOOP, BetaflightLoop
 from flytrack_env.effects.betaflight_rates import BETAFLIGHT_RATES, BetaflightRates
 from flytrack_env.effects.command_delay import COMMAND_DELAY, MOST_STEPS, USUAL_STEPS, CommandDelay
 from flytrack_env.effects.ground_effect import GROUND_EFFECT, GroundEffect
@@ -53,6 +54,7 @@ EFFECTS: tuple[Effect, ...] = (
     RATE_SATURATION,
     RATE_SLEW_LIMIT,
     THRUST_LAG_ASYMMETRY,
+    BETAFLIGHT_LOOP,
     RATE_SCALE,
     YAW_REACTION,
     MOTOR_IMBALANCE,
@@ -164,6 +166,18 @@ def fold(
     return value
 
 
+def respond(
+    effects: tuple[Any, ...], memories: tuple[Any, ...], lagged: Any, context: StepContext
+) -> tuple[Any, tuple[Any, ...]]:
+    """Return the applied action at the end of a span of the step, and the memories of what makes it."""
+    found = list(memories)
+    for place, parameters in enumerate(effects):
+        hook = effect_of(parameters).respond
+        if hook is not None:
+            lagged, found[place] = hook(parameters, memories[place], lagged, context)
+    return lagged, tuple(found)
+
+
 def fold_rates(
     effects: tuple[Any, ...],
     memories: tuple[Any, ...],
@@ -226,6 +240,7 @@ __all__ = [
     "AccelerometerBias",
     "AccelerometerScale",
     "ActualRates",
+    "BetaflightLoop",
     "BetaflightRates",
     "CommandDelay",
     "Effect",
@@ -265,5 +280,6 @@ __all__ = [
     "merge",
     "observe",
     "remember",
+    "respond",
     "start_memories",
 ]

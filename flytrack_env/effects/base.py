@@ -10,6 +10,7 @@ stage          value                  what it is                                
 =============  =====================  ====================================================  ========
 command        ``Action``             the command that the rate loop and motors get         command
 lag            ``Action``, s          time constants of the first-order lag                 actuator
+respond        ``Action``             the applied action, in place of the lagged one        actuator
 air            ``Vec3``, m/s, world   velocity of the air                                   force
 thrust         scalar, N              collective thrust along body z                        actuator
 rates          ``Vec3``, rad/s        body rates of the lagged action                       actuator
@@ -39,6 +40,7 @@ from flytrack_env.state import Action, Drone
 STAGES = {
     "command": "command",
     "lag": "actuator",
+    "respond": "actuator",
     "air": "force",
     "thrust": "actuator",
     "rates": "actuator",
@@ -64,7 +66,8 @@ class StepContext(NamedTuple):
     """What an effect may look at; a field is ``NOT_YET`` before the stage that fills it.
 
     drone: before the step. command: as given, before any effect. dt: s. motion: of the model. acting: the
-    command after the stage command.
+    command after the stage command. full_stick_b: body rates of full sticks, rad/s.
+    thrust_coeffs: of the model's thrust map.
     applied: the lagged action after the step. body_axes_w: the body's x, y, z axes before the step.
     air_w: after the stage air, m/s. thrust_acc: collective thrust over mass, after the stage thrust, m/s^2.
     rates_b: after the stage rates, rad/s. force_b: specific force of the step, thrust and all else but
@@ -85,6 +88,8 @@ class StepContext(NamedTuple):
     dt: Scalar
     motion: Motion = Motion.HANDOUT
     acting: Action = NOT_YET
+    full_stick_b: Vec3 = NOT_YET
+    thrust_coeffs: Any = NOT_YET
     applied: Action = NOT_YET
     body_axes_w: tuple[Vec3, Vec3, Vec3] = NOT_YET
     air_w: Vec3 = NOT_YET
@@ -140,8 +145,9 @@ class Effect:
     first all of the first values, and so on.
     groups: parameters that are looked for together; all of them if empty. shapes: parameters that only shape
     what others do, and do nothing while those are neutral. follows_sticks: it is a law of the rate sticks
-    without memory, which does nothing while they are centred. is_setting: its numbers are known, as settings
-    of the craft: no fit frees them and no log is searched for them.
+    without memory, which does nothing while they are centred. is_setting: it comes with the settings of a
+    craft: a model has it from the start or not at all, and fits free only its ``fitted`` numbers.
+    respond: (parameters, memory, lagged action, context) -> applied action and memory at the end of the span.
     start: (parameters, drone) -> memory of an episode that begins; no memory if None. With ``most_steps`` it
     also takes how many steps to remember.
     remember: (parameters, memory, context) -> memory after a step.
@@ -162,8 +168,10 @@ class Effect:
     shapes: tuple[str, ...] = ()
     follows_sticks: bool = False
     is_setting: bool = False
+    fitted: tuple[str, ...] = ()
     command: Hook | None = None
     lag: Hook | None = None
+    respond: Hook | None = None
     air: Hook | None = None
     thrust: Hook | None = None
     rates: Hook | None = None

@@ -15,7 +15,7 @@ import numpy as np
 from scipy import signal
 
 from flytrack_env.dynamics import ModelParameters, nominal_parameters
-from flytrack_env.effects import BY_NAME
+from flytrack_env.effects import BY_NAME, acts
 from flytrack_env.motion import Motion
 from flytrack_sysid.diagnosis import noise as noises
 from flytrack_sysid.diagnosis.diagnose import (
@@ -31,9 +31,9 @@ from flytrack_sysid.diagnosis.problem import Problem
 from flytrack_sysid.diagnosis.result import Cause, Diagnosis, Estimated, Unexplained
 from flytrack_sysid.diagnosis.score_test import (
     BASE_CAUSES,
-    CANDIDATES,
     Candidate,
     Linearization,
+    candidates_for,
     inflation_of,
     solve,
     threshold,
@@ -177,8 +177,10 @@ def diagnose_change(
 def calm(parts: Split) -> Split:
     """Return a split in which only rows count before which the sticks did not jump.
 
-    Where they do, motors end, and how a controller shares what there is among the axes no law here has.
+    Where they do, motors end, and how a controller shares what there is among the axes only a loop says.
     """
+    if acts(parts.train.like.effects, "respond"):
+        return parts
     return parts._replace(train=_calm(parts.train), test=_calm(parts.test))
 
 
@@ -201,7 +203,7 @@ def next_change(later: Estimate, earlier: Estimate) -> tuple[Candidate, tuple[st
 
     To first order first; those that come near are refitted. None where none changed enough.
     """
-    scored = [(change_merit(one, later, earlier), one) for one in CANDIDATES]
+    scored = [(change_merit(one, later, earlier), one) for one in candidates_for(later.state.problem)]
     ranked = sorted((pair for pair in scored if pair[0] > 0.0), key=lambda pair: -pair[0])
     near: dict[str, Candidate] = {}
     for merit, candidate in ranked:

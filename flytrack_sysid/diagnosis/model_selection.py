@@ -12,9 +12,9 @@ from flytrack_env.effects import BY_NAME
 from flytrack_sysid.diagnosis.problem import Problem
 from flytrack_sysid.diagnosis.score_test import (
     BASE_CAUSES,
-    CANDIDATES,
     Candidate,
     Linearization,
+    candidates_for,
     inflation_of,
     solve,
     threshold,
@@ -107,7 +107,7 @@ def other_groups(linearization: Linearization, model: FittedModel, effect: str) 
     """
     problem, own = linearization.problem, set(model.candidate(effect).fields)
     result = []
-    for candidate in {one.fields: one for one in CANDIDATES if one.effect == effect}.values():
+    for candidate in {one.fields: one for one in candidates_for(problem) if one.effect == effect}.values():
         more = {*candidate.fields} - own
         changed = sorted(more or own - {*candidate.fields})
         columns = [linearization.column(field) for field in changed]
@@ -182,7 +182,7 @@ def separation(problem: Problem, linearization: Linearization, model: FittedMode
         return float(size @ linearization.projected(columns, others)[0] @ size)
 
     rivals: dict[str, float] = {}
-    for candidate in CANDIDATES:
+    for candidate in candidates_for(problem):
         if candidate.effect not in model.effects:
             left = beside(given + linearization.acting(linearization.columns_of(candidate)))
             rivals[candidate.effect] = min(left, rivals.get(candidate.effect, np.inf))
@@ -254,9 +254,11 @@ def base_change(
     state: SearchState, linearization: Linearization, model: FittedModel, fields: Sequence[str]
 ) -> BaseChange | None:
     """Return how the log contradicts nominal values of base parameters; None where it does not, or hardly."""
-    problem, held = state.problem, {one.field for one in state.held}
+    problem, free = state.problem, set(state.base_places)
     acting = [
-        field for field in fields if field not in held and linearization.acting([linearization.column(field)])
+        field
+        for field, place in zip(fields, problem.index(fields), strict=True)
+        if place in free and linearization.acting([linearization.column(field)])
     ]
     if not acting or _is_immaterial(problem, fields, model):
         return None

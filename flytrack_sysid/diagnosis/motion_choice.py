@@ -27,9 +27,10 @@ from flytrack_sysid.diagnosis import noise as noises
 from flytrack_sysid.diagnosis.lanes import Lanes, make_lanes
 from flytrack_sysid.diagnosis.lateness import judged_as_logged, read_poses
 from flytrack_sysid.diagnosis.problem import Problem, blocks_of, robust_weight
-from flytrack_sysid.diagnosis.score_test import BASE_FREE, Linearization, solve
+from flytrack_sysid.diagnosis.score_test import Linearization, solve
 from flytrack_sysid.diagnosis.search import refine
 from flytrack_sysid.log import FlightLog, usual_step
+from flytrack_sysid.parameters import base_of
 
 CLEAR = 10.0  # of minus twice the log likelihood, by which a simulator's step has to win
 # Of it, which poses that are not on time have to gain: effects that are not fitted here change it by so much.
@@ -117,7 +118,9 @@ class Seen(NamedTuple):
 def _places(problem: Problem, moves: Moves) -> list[int]:
     """Return what is fitted; sensors are late only where poses would be early."""
     names = [f"{one.name}.{name}" for one in LOOK_ALIKES for name in one.ranges]
-    return problem.index([*BASE_FREE, *(name for name in names if name != IMU_LATENCY or moves.late_s < 0.0)])
+    return problem.index(
+        [*base_of(problem.like), *(name for name in names if name != IMU_LATENCY or moves.late_s < 0.0)]
+    )
 
 
 def _fit(seen: Seen, moves: Moves, last: Trial | None = None) -> Trial:

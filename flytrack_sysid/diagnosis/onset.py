@@ -22,7 +22,7 @@ from flytrack_sysid.diagnosis import noise as noises
 from flytrack_sysid.diagnosis.lanes import LANE_S, Lanes, lead_in_of
 from flytrack_sysid.diagnosis.problem import Problem, Window, robust_square
 from flytrack_sysid.diagnosis.result import Estimated
-from flytrack_sysid.diagnosis.score_test import CANDIDATES, Candidate, Linearization, inflation_of, solve
+from flytrack_sysid.diagnosis.score_test import Candidate, Linearization, candidates_for, inflation_of, solve
 from flytrack_sysid.diagnosis.search import PER_PARAMETER, FittedModel, SearchState, search
 from flytrack_sysid.diagnosis.vetoes import Selection, select
 from flytrack_sysid.log import FlightLog
@@ -126,7 +126,7 @@ def changes_of(linearization: Linearization, model: FittedModel, lacking: Sequen
     if not len(seconds[1]):
         return []
     best: dict[str, Hypothesis] = {}
-    for candidate in CANDIDATES:
+    for candidate in candidates_for(linearization.problem):
         if candidate.effect in lacking:
             continue
         if candidate.effect in model.effects and candidate != model.candidate(candidate.effect):

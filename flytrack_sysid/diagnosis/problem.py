@@ -33,9 +33,9 @@ from flytrack_sysid.parameters import TAUS, bounds_of, from_vector, names_of, to
 from flytrack_sysid.record import Record
 from flytrack_sysid.replay import Step, replay
 
-# What a replay can show: it is fed with poses, so that how late these are has to be known before.
-REPLAYED = tuple(effect for effect in EFFECTS if effect.pose is None)
-SEARCHED = tuple(effect for effect in REPLAYED if not effect.is_setting)
+# What a replay can show, whatever the craft: it is fed with poses, so that how late these are has to be known
+# before.
+SEARCHED = tuple(effect for effect in EFFECTS if effect.pose is None and not effect.is_setting)
 BATCH, SMALL_BATCH = 20, 4
 RELATIVE_STEP = 1e-6  # of a parameter's scale, for slopes
 
@@ -149,7 +149,7 @@ class Problem:
         cls,
         lanes: Lanes,
         model: ModelParameters,
-        effects: Sequence[Effect] = REPLAYED,
+        effects: Sequence[Effect] = SEARCHED,
         late: Late | None = None,
     ) -> "Problem":
         """Return the problem of lanes and a nominal model that may have some effects, without a noise."""
@@ -265,12 +265,12 @@ def _in_batches(program: Callable[[np.ndarray], jax.Array], values: np.ndarray) 
 
 def as_replayed(model: ModelParameters) -> ModelParameters:
     """Return a model without the effects on poses."""
-    return model._replace(effects=tuple(one for one in model.effects if effect_of(one) in REPLAYED))
+    return model._replace(effects=tuple(one for one in model.effects if effect_of(one).pose is None))
 
 
 def vector_of(model: ModelParameters) -> np.ndarray:
     """Return a model as a vector of a ``Problem``."""
-    return to_vector(as_replayed(model).with_effects(*(model.effect(one.name) for one in REPLAYED)))
+    return to_vector(as_replayed(model).with_effects(*(model.effect(one.name) for one in SEARCHED)))
 
 
 def _longest(names: Sequence[str], lanes: Lanes) -> np.ndarray:
@@ -300,8 +300,8 @@ def robust_weight(white: np.ndarray) -> np.ndarray:
 def robust_square(white: np.ndarray) -> float:
     """Return the sum of squares of innovations, outliers counted by their size."""
     size = np.abs(white)
-    beyond = noises.OUTLIER * (2.0 * size - noises.OUTLIER)
-    return float(np.where(size < noises.OUTLIER, size**2, beyond).sum())
+    inside = np.minimum(size, noises.OUTLIER)
+    return float((inside * (2.0 * size - inside)).sum())
 
 
 def blocks_of(values: np.ndarray) -> np.ndarray:

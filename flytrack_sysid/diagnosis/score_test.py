@@ -31,7 +31,6 @@ SAME_SLOPE = 0.1  # relative change of a parameter that is looked for at probes,
 PROBE_PRIOR = 1e-2  # a step to a probe is known to be less than ten times that
 # Names of causes in the base, and the parameters of each.
 BASE_CAUSES = {**{name: (name,) for name in TAUS}, "thrust_curve": THRUST_COEFFS, "battery_drain": (DRAIN,)}
-BASE_FREE = (*TAUS, *THRUST_COEFFS, DRAIN)
 
 
 class Probe(NamedTuple):
@@ -91,7 +90,17 @@ def candidates_of(effect: Effect) -> list[Candidate]:
 
 
 CANDIDATES = [candidate for effect in SEARCHED for candidate in candidates_of(effect)]
-PROBES = list(dict.fromkeys(probe for candidate in CANDIDATES for probe in candidate.probes))
+
+
+def candidates_for(problem: Problem) -> list[Candidate]:
+    """Return the ways to look for effects: of the list, and what settings of the craft may be changed."""
+    given = [BY_NAME[name] for name in problem.given_effects if BY_NAME[name].is_setting]
+    return [*CANDIDATES, *(one for effect in given if effect.groups for one in candidates_of(effect))]
+
+
+def probes_for(problem: Problem) -> list[Probe]:
+    """Return the values at which effects are looked for."""
+    return list(dict.fromkeys(probe for one in candidates_for(problem) for probe in one.probes))
 
 
 def threshold(num_parameters: int) -> float:
@@ -173,7 +182,7 @@ class Linearization:
         change = vector - self.slopes.vector
         places = np.array(self.places)
         elsewhere = np.delete(change, places)
-        sloping = self.problem.index(sorted({probe.field for probe in PROBES}))
+        sloping = self.problem.index(sorted({probe.field for probe in self.probes}))
         size = np.maximum(np.abs(vector), np.abs(self.slopes.vector))
         # Where there was no slope, first order cannot measure the distance.
         if np.any(elsewhere != 0.0) or np.any((np.abs(change) > SAME_SLOPE * size)[sloping]):

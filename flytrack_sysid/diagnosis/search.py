@@ -10,17 +10,16 @@ from flytrack_sysid.diagnosis import noise as noises
 from flytrack_sysid.diagnosis.lanes import voltages_of
 from flytrack_sysid.diagnosis.problem import SEARCHED, SMALL_BATCH, Problem
 from flytrack_sysid.diagnosis.score_test import (
-    BASE_FREE,
-    CANDIDATES,
-    PROBES,
     Candidate,
     Gain,
     Linearization,
+    candidates_for,
     costs_of,
+    probes_for,
     threshold,
 )
 from flytrack_sysid.log import FlightLog
-from flytrack_sysid.parameters import DRAIN
+from flytrack_sysid.parameters import DRAIN, base_of
 
 PER_PARAMETER = 4.0  # of chi2: what one more parameter has to gain to be preferred to fewer
 MOST_EFFECTS = 6
@@ -90,12 +89,14 @@ class SearchState:
     def base_places(self) -> list[int]:
         """The places of the free base parameters."""
         held = {one.field for one in self.held}
-        return self.problem.index([name for name in BASE_FREE if name not in held])
+        return self.problem.index([name for name in base_of(self.problem.like) if name not in held])
 
     @property
     def every_place(self) -> list[int]:
         """The places that may become free: the base, and all parameters of all effects."""
-        return self.base_places + [place for place, name in enumerate(self.problem.names) if "." in name]
+        base, fields = self.base_places, [one.fields for one in candidates_for(self.problem)]
+        others = {place for some in fields for place in self.problem.index(some)} - {*base}
+        return base + sorted(others)
 
     def with_noise(self, noise: np.ndarray) -> "SearchState":
         """Return the state with another noise, (6, NUM_AXES)."""
@@ -106,11 +107,12 @@ class SearchState:
         problem, last = self.problem, self.linearization
         if last is not None and last.places == self.every_place and last.distance(vector) < STALE:
             if last.noise is not problem.noise:
-                last = Linearization(problem, last.slopes, PROBES)
+                last = Linearization(problem, last.slopes, last.probes)
             found = last.moved(vector)
         else:
-            others = problem.clipped(np.array([probe.placed_in(problem, vector) for probe in PROBES]))
-            found = Linearization(problem, problem.slopes(vector, self.every_place, others), PROBES)
+            probes = probes_for(problem)
+            others = problem.clipped(np.array([probe.placed_in(problem, vector) for probe in probes]))
+            found = Linearization(problem, problem.slopes(vector, self.every_place, others), probes)
         return replace(self, linearization=found), found
 
     def fitted(
@@ -173,7 +175,7 @@ def score_candidates(state: SearchState, linearization: Linearization, model: Fi
     given = linearization.columns_at(model.places)
     excluded = {*model.effects, *state.unobservable, *state.refused}
     best: dict[str, Scored] = {}
-    for candidate in CANDIDATES:
+    for candidate in candidates_for(state.problem):
         if candidate.effect in excluded:
             continue
         gain = linearization.gain_of(candidate, given)

@@ -13,6 +13,7 @@ from flytrack_env import effects
 from flytrack_env.dynamics import start_rates, step
 from flytrack_env.effects import (
     EFFECTS,
+    BetaflightLoop,
     CommandDelay,
     Effect,
     ImuLatency,
@@ -39,9 +40,17 @@ from tests.support.simulated_flights import (
 OVER_EFFECTS = pytest.mark.parametrize("effect", EFFECTS, ids=lambda effect: effect.name)
 
 
+# A loop is unstable towards the ends of its ranges, and nothing of it acts without a craft.
+RACER = BetaflightLoop(
+    20.0, 21.0, 2.0, 2.0, 0.02, 0.5, d_yaw=5.0, d_max_yaw=8.0, thrust_linear=20.0, throttle_boost=10.0
+)
+
+
 def inside_ranges(effect: Effect, fraction: float) -> Any:
     """Return parameters that lie that far from neutral towards the upper end of their ranges."""
     neutral = effect.parameters()
+    if effect.respond is not None and fraction > 0.0:
+        return RACER
     values = (n + fraction * (r.high - n) for n, r in zip(neutral, effect.ranges.values(), strict=True))
     return effect.parameters(*values)
 
@@ -66,7 +75,7 @@ def test_declaration_is_consistent(effect: Effect) -> None:
     neutral = effect.parameters()
     assert tuple(effect.ranges) == neutral._fields
     assert effect.stages and effect.equation and effect.source
-    assert (effect.start is None) == (effect.remember is None)
+    assert (effect.start is None) == (effect.remember is None and effect.respond is None)
     assert set(effect.notable) == set(effect.ranges) - set(effect.shapes)
     for name, bounds in effect.ranges.items():
         value = getattr(neutral, name)
@@ -90,8 +99,8 @@ def test_probes_show_the_effect(effect: Effect) -> None:
     plain = flown((), full_stick, drone)
     for name, values in effect.probes.items():
         for value in values:
-            probed = effect.parameters()._replace(**{name: value})
-            assert not np.array_equal(flown(probed, full_stick, drone), plain)
+            start = effect.parameters() if effect.respond is None else RACER
+            assert not np.array_equal(flown(start._replace(**{name: value}), full_stick, drone), plain)
 
 
 # Components of the state and of the sensors' readings after one step that an effect at this stage may change.
@@ -99,7 +108,7 @@ GYRO, ACCELEROMETER, POSE = {*range(21, 24)}, {*range(24, 27)}, {*range(27, 37)}
 FORCE = {*range(0, 9), *range(27, 33)} | ACCELEROMETER
 TURN = {*range(9, 16), *range(33, 37)} | GYRO
 CHANGES = {"command": set(range(37)) - {20}, "rates": TURN, "thrust": FORCE, "air": FORCE}
-CHANGES |= {"lag": CHANGES["command"], "force": FORCE, "battery": {20}}
+CHANGES |= {"lag": CHANGES["command"], "respond": CHANGES["command"], "force": FORCE, "battery": {20}}
 CHANGES |= {"gyro": GYRO, "accelerometer": ACCELEROMETER, "pose": POSE}
 
 
@@ -144,12 +153,13 @@ def test_gradients_are_finite_and_right(effect: Effect, fraction: float) -> None
         tangent = only(effect, name)
         here, slope = map(np.asarray, final_and_slope(parameters, tangent))
         assert np.isfinite(slope).all()
-        if fraction == 0.0 and effect.probes:
+        if fraction == 0.0 and (effect.probes or effect.respond):
             continue  # no slope there, or not the same on both sides
         if fraction == 0.0 and name in effect.shapes:
             assert not slope.any()
             continue
-        change = 2e-3 * (bounds.high - bounds.low)
+        size = bounds.high - bounds.low if effect.respond is None else getattr(RACER, name)
+        change = 2e-3 * size
         shift = jax.tree.map(partial(jnp.multiply, change), tangent)
         moved = jax.tree.map(jnp.add, parameters, shift)
         measured = (np.asarray(final_and_slope(moved, tangent)[0]) - here) / change

@@ -21,7 +21,7 @@ PACKAGE = "flytrack_env"
 LAYERS = (
     {"files", "extras", "fusion", "auto_reset", "sandbox", "artifact", "messages"},
     {"quaternion", "motion", "toml_file", "npz_file"},
-    {"state"},
+    {"state", "thrust"},
     {"tracks", "randomness"},
     {"effects"},
     {"dynamics"},

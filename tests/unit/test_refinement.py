@@ -23,11 +23,11 @@ from flytrack_sysid.diagnosis.refinement import (
     widened,
     windows_of,
 )
-from flytrack_sysid.diagnosis.score_test import BASE_FREE, CANDIDATES
+from flytrack_sysid.diagnosis.score_test import CANDIDATES
 from flytrack_sysid.diagnosis.search import FittedModel, Held, SearchState
 from flytrack_sysid.diagnosis.vetoes import Selection
 from flytrack_sysid.log import FlightLog
-from flytrack_sysid.parameters import from_vector
+from flytrack_sysid.parameters import base_of, from_vector
 from flytrack_sysid.prediction import predict
 from flytrack_sysid.prediction_errors import rollout_errors
 from flytrack_sysid.prediction_windows import QUANTITIES
@@ -57,7 +57,7 @@ def refined(truth, log: FlightLog, candidates, values, is_explained=False):
         vector = problem.start.copy()
         for name, value in values.items():
             vector[problem.names.index(name)] = value
-        places = problem.index(BASE_FREE)
+        places = problem.index(base_of(problem.like))
         found = refine(
             problem, problem.start, vector, candidates, places, log, held_out_rows(log), is_explained
         )
@@ -106,7 +106,7 @@ def test_values_are_refined_by_flights(dragged):
 
 def test_the_base_is_free_where_an_effect_that_held_it_is_gone(dragged):
     *_, problem, found = dragged
-    base = FittedModel((), problem.start, 1.0, tuple(problem.index(BASE_FREE)))
+    base = FittedModel((), problem.start, 1.0, tuple(problem.index(base_of(problem.like))))
     state = SearchState(problem, held=(Held("tau_pitch", "linear_drag"),))
     places = (*state.base_places, *problem.index(DRAG.fields))
     selection = Selection(state, base, FittedModel((DRAG,), problem.start, 1.0, places), {})
