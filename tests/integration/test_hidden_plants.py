@@ -21,10 +21,8 @@ from benchmarks.hidden import (
 )
 from benchmarks.hidden.noise import COLOURS, LOST_ROWS, STD
 from benchmarks.hidden.plant import Plant, Start
-from benchmarks.hidden.truth import STICKS
 from flytrack_sysid.log import FlightLog
 from tests.support.handout_plant import HandoutPlant
-from tests.support.slow import slow_but
 
 START = Start((1.0, -2.0, 6.0), 0.7, 23.8, -0.2)
 MINUTE_S = 60.0
@@ -130,22 +128,6 @@ def test_a_flight_controller_shapes_the_sticks_before_the_lag(motion: str) -> No
     late_s = tau if motion == "fine" else 0.01 / np.expm1(0.01 / tau)  # a step asks for its end
     expected = (0.18 + late_s * np.expm1(-0.18 / tau)) / times_s
     np.testing.assert_allclose(plant.applied[:3], expected, rtol=1e-4)
-
-
-@pytest.mark.parametrize("damping", slow_but([0.3], [0.3, 1.6]))
-def test_second_order_rates_obey_their_differential_equation(damping: float) -> None:
-    """Against small explicit steps of y'' = wn^2 (omega - y) - 2 zeta wn y'."""
-    finer, natural = 2000, np.array([40.0, 50.0, 60.0])
-    asked = open_loop(base(), 40)["w"]
-    loop = {f"{axis}_s": 2.0 * damping / own for axis, own in zip(STICKS, natural.tolist(), strict=True)}
-    loop |= {f"{axis}_damping": damping for axis in STICKS}
-    found = open_loop(base(second_order_rates=loop), 40)["w"]
-    rate, slope = np.zeros(3), np.zeros(3)
-    for target, own in zip(asked, found, strict=True):
-        for _ in range(finer):
-            bend = natural**2 * (target - rate) - 2.0 * damping * natural * slope
-            rate, slope = rate + slope * 0.01 / finer, slope + bend * 0.01 / finer
-        np.testing.assert_allclose(own, rate, atol=5e-3)
 
 
 @pytest.fixture(scope="module")

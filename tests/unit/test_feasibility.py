@@ -5,12 +5,9 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
-import numpy as np
 import pytest
-from scipy.interpolate import CubicHermiteSpline
 
 from flytrack_env.params import EnvParams
-from flytrack_env.quaternion import Vec3
 from flytrack_env.resets import ResetParams
 from flytrack_env.tracks import (
     DEMANDS,
@@ -20,7 +17,6 @@ from flytrack_env.tracks import (
     available_tracks,
     build_course,
     find_problems,
-    hermite_curve,
     load_track,
     sample_way,
 )
@@ -179,13 +175,3 @@ def test_default_clearances_are_what_starts_need() -> None:
     assert limits.drone_radius == radius
     assert limits.clearance == pytest.approx(starts.course_offset + radius)
     assert limits.start_clearance == pytest.approx(starts.start_position_noise + radius)
-
-
-def test_hermite_curve_is_scipys() -> None:
-    rng = np.random.default_rng(0)
-    start, leave, end, meet = rng.normal(size=(4, 3))
-    s = np.linspace(0.0, 1.0, 7)
-    point, tangent = hermite_curve(Vec3(*start), Vec3(*leave), Vec3(*end), Vec3(*meet), s)
-    spline = CubicHermiteSpline([0.0, 1.0], [start, end], [leave, meet])
-    np.testing.assert_allclose(np.stack(point, -1), spline(s), atol=1e-12)
-    np.testing.assert_allclose(np.stack(tangent, -1), spline(s, 1), atol=1e-12)
