@@ -35,9 +35,8 @@ from benchmarks.hidden import (
     draw_truth,
     fly,
     measure,
-    signal_to_noise,
 )
-from benchmarks.hidden.oracle import known, removed
+from benchmarks.hidden.oracle import known, removed, signal_to_noise
 from benchmarks.report import ROOT, commit_of_checkout
 from flytrack_env.dynamics import ModelParameters
 from flytrack_env.motion import Motion

@@ -12,7 +12,7 @@ import numpy as np
 
 from benchmarks.diagnosis import LINES, ROWS, Trial, read_lines
 from benchmarks.hidden import MOTIONS
-from benchmarks.report import page, percent, table, write_page
+from benchmarks.report import fill_page, percent, table
 
 Line = dict[str, Any]
 Rows = dict[str, list[Line]]
@@ -24,20 +24,6 @@ OTHER_LAW = ("translational_lift", "rate_saturation", "ground_effect")
 USUAL_RATE, CLOCK, CLOCK_WITHIN_S = 100, "mocap_latency", 0.002
 ONSET_WITHIN_S = 1.0
 VISIBLE = 10.0  # standard deviations of an effect outside the list: it was there, and flown
-HEAD = """\
-Written by `python -m benchmarks.diagnosis_page` from the lines that `python -m benchmarks.diagnosis` wrote
-to docs/results/diagnosis.jsonl, a line a plant. Plants: {plants}; crashed: {crashed}.
-Seeds {seeds}; measured at {commits}; {machines}.
-
-Every plant is flown for 60 s (benchmarks/hidden: other equations than the simulator's, some of another
-form) in three motions: by the handout's step; the same with the force in the attitude after the step
-(semi_implicit); and as a differential equation in parts of 1 ms or less (fine), as real drones move, where
-sensors say what is true at an instant. It is measured: gyro 0.1 rad/s, accelerometer 1.5 m/s^2, velocity
-0.05 m/s, attitude 0.5 degrees, quantised, 2 % of rows lost. The diagnosis sees the log and the model without
-the hidden effects; a quarter of the log is held out. `lambda` is what the other three quarters could show of
-an effect, `lambda_sep` what is left of it beside its closest rival, both from the truth
-(benchmarks/hidden/oracle.py). True effects that are listed as negligible count as found. An effect outside
-the list counts where it changes its channel by {visible:g} standard deviations or more over the log."""
 
 
 def named(line: Line) -> list[str]:
@@ -250,43 +236,32 @@ def earlier(last: str) -> list[str]:
     return parts
 
 
-def as_page() -> str:
-    """Return the page."""
+def main() -> None:
+    """Write the page."""
     lines, by_trial = list(read_lines(None).values()), graded(None)
     by_row = {row: [line for trial, line in by_trial.items() if trial.row == row] for row in ROWS}
-    head = HEAD.format(
+    singles = [(line["effects"][0], " + ".join(sorted(named(line))) or "none") for line in by_row["one"]]
+    outside = []
+    for line in by_row["outside"]:
+        if line["visible"] >= VISIBLE:
+            seen = {name.split(": ")[1].split(" at ")[0] for name in line["unexplained"]}
+            outside.append((line["depends_on"], " + ".join(sorted(seen)) or "none"))
+    fill_page(
+        LINES.with_suffix(".md"),
+        "diagnosis",
         plants=", ".join(f"{row} {len(by_row[row])}" for row in ROWS),
         crashed=len(lines) - len(by_trial),
         seeds=sorted({line["seed"] for line in lines}),
         commits=", ".join(sorted({f"{line['commit']} of {line['date']}" for line in lines})),
         machines="; ".join(sorted({line["machine"] for line in lines})),
         visible=VISIBLE,
-    )
-    singles = [(line["effects"][0], " + ".join(sorted(named(line))) or "none") for line in by_row["one"]]
-    outside = [
-        (
-            line["depends_on"],
-            " + ".join(sorted({name.split(": ")[1].split(" at ")[0] for name in line["unexplained"]}))
-            or "none",
-        )
-        for line in by_row["outside"]
-        if line["visible"] >= VISIBLE
-    ]
-    return page(
-        "How well hidden effects are named",
-        head,
-        figures_of_motions(by_trial),
-        "## Other rates of the log",
-        figures_of_rates(by_trial),
-        "## Single effects",
-        counted("truth | plants | named", singles),
-        "## Effects outside the list",
-        counted("depends on | plants | found", outside),
-        "## Every plant with a name missing or false",
-        misses(by_trial),
-        *earlier(lines[-1]["commit"]),
+        figures=figures_of_motions(by_trial),
+        rates=figures_of_rates(by_trial),
+        singles=counted("truth | plants | named", singles),
+        outside=counted("depends on | plants | found", outside),
+        misses="\n\n".join([misses(by_trial), *earlier(lines[-1]["commit"])]),
     )
 
 
 if __name__ == "__main__":
-    write_page(LINES.with_suffix(".md"), as_page())
+    main()

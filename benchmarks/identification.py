@@ -123,8 +123,8 @@ def run(num_plants: int, seed: int) -> dict[str, list[Outcome]]:
     return outcomes
 
 
-def as_page(outcomes: dict[str, list[Outcome]]) -> str:
-    """Return the results as a page in Markdown."""
+def rows_of(outcomes: dict[str, list[Outcome]]) -> list[tuple[str, ...]]:
+    """Return a row of the table per kind of log."""
     rows = []
     for name, found in outcomes.items():
         tau, thrust = np.array([[one.tau_error, one.map_error] for one in found]).T
@@ -134,17 +134,7 @@ def as_page(outcomes: dict[str, list[Outcome]]) -> str:
         cells = [f"{tau.max():.4%}", f"{AIMS[name][0]:.2%}", f"{np.median(tau):.4%}"]
         cells += [f"{thrust.max():.4%}", f"{AIMS[name][1]:.2%}", f"{np.median(thrust):.4%}"]
         rows.append((name, *cells, cover, times))
-    return report.page(
-        "Identification of plants drawn at run time",
-        f"{report.command_line()}: two minutes of each plant, three quarters of it fitted, on one core.\n"
-        "Sensors: gyro 0.1 rad/s, accelerometer 1.5 m/s^2, velocity 0.05 m/s, attitude 0.5 degrees,\n"
-        "quantised, 2 % of rows lost, no applied action (`flytrack_sysid/sensors.py`).",
-        report.table(HEADER, rows),
-        "Intervals are of the four lags and six coefficients of every plant; the aim is "
-        f"{COVERAGE_AIM[0]:.0%} to {COVERAGE_AIM[1]:.0%}. Clean logs\ncontain only rounding, which intervals "
-        "of noise do not describe. The largest times include compiling for logs\nof another length.",
-        report.provenance_line(report.provenance()),
-    )
+    return rows
 
 
 def main() -> None:
@@ -155,7 +145,8 @@ def main() -> None:
     parser.add_argument("--page", type=Path, default=PAGE, help="page to write")
     arguments = parser.parse_args()
     report.pin_to_one_core()
-    report.write_page(arguments.page, as_page(run(arguments.plants, arguments.seed)))
+    table = report.table(HEADER, rows_of(run(arguments.plants, arguments.seed)))
+    report.fill_page(arguments.page, "identification", table=table, aim=COVERAGE_AIM)
 
 
 if __name__ == "__main__":

@@ -75,16 +75,8 @@ def main() -> None:
     for name, track in tracks.items():
         rows.append(measure_track(name, track, arguments.seed, out, config))
         print(*rows[-1], sep=", ", flush=True)
-    text = report.page(
-        "Racing on every track",
-        f"{report.command_line()}: one policy per track, trained with the shipped recipe for "
-        f"{config.total_timesteps:,} steps on the nominal model and flown in the same simulator from "
-        f"{NUM_EPISODES} noisy starts, {NUM_LAPS} laps. Length: of the path on which episodes start. "
-        "First lap: from standstill at the start to the last gate.",
-        report.table(HEADER, rows),
-        report.provenance_line(report.provenance()),
-    )
-    report.write_page(arguments.table, text)
+    counts = {"steps": config.total_timesteps, "episodes": NUM_EPISODES, "laps": NUM_LAPS}
+    report.fill_page(arguments.table, "tracks", table=report.table(HEADER, rows), **counts)
 
 
 if __name__ == "__main__":

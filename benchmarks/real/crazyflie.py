@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from benchmarks.real.black_boxes import base_steps, flown, rows_of, trained
+from benchmarks.real.black_boxes import base_steps, flown, linear_ones, network, rows_of
 from benchmarks.report import ROOT, commit_of_checkout, progress, write_json
 from flytrack_env.dynamics import ModelParameters
 from flytrack_env.motion import Motion
@@ -133,7 +133,8 @@ def fold(folder: Path, judged: str, seconds: float) -> dict[str, Any]:
     results = {name: Tested(one[None], windows) for name, one in zip(vectors, errors, strict=True)}
     base = from_vector(found.base, problem.like)._replace(effects=())
     rows, steps = rows_of(learnt, base), base_steps(base, own)
-    results |= {name: flown(one, windows, steps) for name, one in trained(rows).items()}
+    boxes = {**linear_ones(rows), "network": network(rows)}
+    results |= {name: flown(one, windows, steps) for name, one in boxes.items()}
     known = make_windows(learnt, np.ones(len(learnt), bool), SPACING_S, MOST)
     results["placebo"] = Tested(placebo_errors(known, windows), windows)
     fit = refined.fit
