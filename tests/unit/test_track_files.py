@@ -3,8 +3,6 @@
 import math
 import re
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -43,14 +41,14 @@ frame = 2
 SECOND_GATE = VALID[VALID.index("[[gates]]\nid = 3") :]
 
 
-def load_text(folder: Path, text: str | bytes) -> Track:
+def load_text(folder, text):
     """Return the track of a file's content."""
     path = folder / "track.toml"
     path.write_bytes(text if isinstance(text, bytes) else text.encode())
     return load_track(path)
 
 
-def test_valid_file_is_read(tmp_path: Path) -> None:
+def test_valid_file_is_read(tmp_path):
     for end in ("\n", "\r\n"):
         track = load_text(tmp_path, VALID.replace("\n", end))
         assert load_track(str(tmp_path / "track.toml")) == track
@@ -86,7 +84,7 @@ REFUSALS = {
 
 
 @pytest.mark.parametrize("case", REFUSALS)
-def test_refusals_name_file_line_field_and_reason(case: str, tmp_path: Path) -> None:
+def test_refusals_name_file_line_field_and_reason(case, tmp_path):
     old, new, line, field, reason = REFUSALS[case]
     assert VALID.count(old) == 1, "the replaced text must be unique"
     with pytest.raises(TrackError) as caught:
@@ -107,19 +105,19 @@ def test_refusals_name_file_line_field_and_reason(case: str, tmp_path: Path) -> 
         (b" " * 2**20, "cannot be read: found 1048576 bytes"),
     ],
 )
-def test_what_is_no_toml_file_is_refused(text: str | bytes, reason: str, tmp_path: Path) -> None:
+def test_what_is_no_toml_file_is_refused(text, reason, tmp_path):
     with pytest.raises(TrackError, match=rf"{re.escape(str(tmp_path))}/track\.toml: {reason}"):
         load_text(tmp_path, text)
 
 
 @pytest.mark.parametrize("name", ["monza", "", "../tracks/flytrack", "FLYTRACK"])
-def test_unknown_name_lists_the_shipped_ones(name: str) -> None:
+def test_unknown_name_lists_the_shipped_ones(name):
     with pytest.raises(TrackError, match=rf"track: found '{name}', expected one of .*flytrack"):
         load_track(name)
 
 
 @pytest.mark.parametrize("name", ["../references/flytrack", "x" * 300, "a\0b"])
-def test_a_tracks_name_leads_to_no_other_file(name: str) -> None:
+def test_a_tracks_name_leads_to_no_other_file(name):
     with pytest.raises(ReferenceFileError, match=r"reference: found no .{1,60}, expected one of"):
         shipped_reference(name)
 
@@ -130,9 +128,7 @@ def test_a_tracks_name_leads_to_no_other_file(name: str) -> None:
     length=st.integers(0, 40),
     put=st.binary(max_size=20) | st.sampled_from([b"nan", b"1e400", b"true", b"[]", b"{}", b'""', b"-1"]),
 )
-def test_random_damage_is_a_refusal_or_a_track_that_can_be_flown(
-    start: int, length: int, put: bytes, tmp_path_factory: pytest.TempPathFactory
-) -> None:
+def test_random_damage_is_a_refusal_or_a_track_that_can_be_flown(start, length, put, tmp_path_factory):
     folder, content = tmp_path_factory.getbasetemp(), VALID.encode()
     try:
         track = load_text(folder, content[:start] + put + content[start + length :])
@@ -146,20 +142,20 @@ def test_random_damage_is_a_refusal_or_a_track_that_can_be_flown(
     assert load_track(folder / "track.toml") == track
 
 
-def reals(low: float, high: float) -> st.SearchStrategy[float]:
+def reals(low, high):
     """Return finite floats of a range, open at both ends."""
     return st.floats(low, high, exclude_min=True, exclude_max=True)
 
 
 @st.composite
-def quaternions(draw: st.DrawFn) -> tuple[float, ...]:
+def quaternions(draw):
     """Draw a unit quaternion."""
     vector = draw(st.tuples(*[reals(-1.0, 1.0)] * 4).filter(lambda q: math.hypot(*q) > 0.1))
     return tuple(value / math.hypot(*vector) for value in vector)
 
 
 @st.composite
-def tracks(draw: st.DrawFn) -> Track:
+def tracks(draw):
     """Draw a track that the loader must accept."""
     low = draw(st.tuples(*[reals(-100.0, 0.0)] * 3))
     high = draw(st.tuples(*[reals(1.0, 100.0)] * 3))
@@ -176,9 +172,7 @@ def tracks(draw: st.DrawFn) -> Track:
 
 @settings(max_examples=50, deadline=None)
 @given(track=tracks(), name=st.text(min_size=1))
-def test_saved_tracks_are_read_back_equal(
-    track: Track, name: str, tmp_path_factory: pytest.TempPathFactory
-) -> None:
+def test_saved_tracks_are_read_back_equal(track, name, tmp_path_factory):
     path = tmp_path_factory.getbasetemp() / "saved.toml"
     try:
         name.encode()
@@ -189,7 +183,7 @@ def test_saved_tracks_are_read_back_equal(
     assert load_track(path) == track
 
 
-def first_gate_with(**fields: Any) -> Track:
+def first_gate_with(**fields):
     """Return the FlyTrack course with other fields of its first gate."""
     track = load_track("flytrack")
     return replace(track, gates=(replace(track.gates[0], **fields), *track.gates[1:]))
@@ -210,7 +204,7 @@ UNSAVEABLE = {
 
 
 @pytest.mark.parametrize("case", UNSAVEABLE)
-def test_what_would_not_come_back_is_not_saved(case: str, tmp_path: Path) -> None:
+def test_what_would_not_come_back_is_not_saved(case, tmp_path):
     build, reason = UNSAVEABLE[case]
     path = tmp_path / "saved.toml"
     with pytest.raises(TrackError, match=rf"{re.escape(str(path))}.*{re.escape(reason)}"):
@@ -218,6 +212,6 @@ def test_what_would_not_come_back_is_not_saved(case: str, tmp_path: Path) -> Non
     assert not list(tmp_path.iterdir())
 
 
-def test_tracks_are_saved_under_a_name_that_can_be_loaded(tmp_path: Path) -> None:
+def test_tracks_are_saved_under_a_name_that_can_be_loaded(tmp_path):
     with pytest.raises(TrackError, match=r"path: found '.*track.json', expected one that ends in .toml"):
         save_track(tmp_path / "track.json", load_track("flytrack"))
