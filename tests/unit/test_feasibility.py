@@ -7,19 +7,9 @@ from typing import Any
 
 import pytest
 
+from flytrack_env import tracks
 from flytrack_env.params import EnvParams
 from flytrack_env.resets import ResetParams
-from flytrack_env.tracks import (
-    DEMANDS,
-    Gate,
-    Limits,
-    Track,
-    available_tracks,
-    build_course,
-    find_problems,
-    load_track,
-    sample_way,
-)
 
 NUM_GATES, RADIUS, HEIGHT = 6, 10.0, 2.0
 
@@ -30,58 +20,58 @@ def yaw_of(heading_deg: float) -> tuple[float, float, float, float]:
     return (math.cos(half), 0.0, 0.0, math.sin(half))
 
 
-def ring(radius: float = RADIUS, num_gates: int = NUM_GATES) -> Track:
+def ring(radius: float = RADIUS, num_gates: int = NUM_GATES) -> tracks.Track:
     """Return gates on a circle, flown anticlockwise, gate 0 at (radius, 0); starts 5 m before it."""
     gates = []
     for i in range(num_gates):
         angle = 2.0 * math.pi * i / num_gates
         centre = (radius * math.cos(angle), radius * math.sin(angle), HEIGHT)
-        gates.append(Gate(10 + i, centre, yaw_of(math.degrees(angle) + 90.0), 1.0, 1.5, 2.7))
+        gates.append(tracks.Gate(10 + i, centre, yaw_of(math.degrees(angle) + 90.0), 1.0, 1.5, 2.7))
     wall = radius + 5.0
-    return Track(
+    return tracks.Track(
         "ring", tuple(gates), (radius, -5.0, 0.1), yaw_of(180.0), (-wall, -wall, 0.0), (wall, wall, 7.0)
     )
 
 
-def change_gate(track: Track, index: int, **fields: Any) -> Track:
+def change_gate(track: tracks.Track, index: int, **fields: Any) -> tracks.Track:
     """Return a track with other fields of one gate."""
     gates = list(track.gates)
     gates[index] = replace(gates[index], **fields)
     return replace(track, gates=tuple(gates))
 
 
-def point_on_way(track: Track, way: int, share: float) -> tuple[float, ...]:
+def point_on_way(track: tracks.Track, way: int, share: float) -> tuple[float, ...]:
     """Return a point between two gates."""
-    samples = sample_way(build_course(track), 1001)[way]
+    samples = tracks.sample_way(tracks.build_course(track), 1001)[way]
     return tuple(samples[round(1000 * share)].tolist())
 
 
 def test_unbroken_ring_is_feasible() -> None:
-    assert find_problems(ring()) == ()
+    assert tracks.find_problems(ring()) == ()
 
 
-@pytest.mark.parametrize("name", available_tracks())
+@pytest.mark.parametrize("name", tracks.available_tracks())
 def test_shipped_tracks_are_feasible(name: str) -> None:
-    assert find_problems(load_track(name)) == ()
+    assert tracks.find_problems(tracks.load_track(name)) == ()
 
 
-def near_gate(track: Track) -> Track:
+def near_gate(track: tracks.Track) -> tracks.Track:
     """Gate 11 moves to 3 m behind gate 10."""
     return change_gate(track, 1, position=(RADIUS, 3.0, HEIGHT))
 
 
-def gate_in_path(track: Track) -> Track:
+def gate_in_path(track: tracks.Track) -> tracks.Track:
     """Gate 13 moves into the way from gate 10 to 11, and stands across it."""
     return change_gate(track, 3, position=point_on_way(track, 0, 0.505), quaternion=yaw_of(120.0))
 
 
-def touching_gate(track: Track) -> Track:
+def touching_gate(track: tracks.Track) -> tracks.Track:
     """Gate 13 moves beside gate 10: no path, but their frames are 0.2 m apart."""
     return change_gate(track, 3, position=(RADIUS + 2.9, 0.0, HEIGHT), quaternion=track.gates[0].quaternion)
 
 
 # What breaks the ring, the demand that it breaks, and what the message says of it.
-BREAKS: dict[str, tuple[Callable[[Track], Track], str, str]] = {
+BREAKS: dict[str, tuple[Callable[[tracks.Track], tracks.Track], str, str]] = {
     "small opening": (
         lambda track: change_gate(track, 2, opening=0.5),
         "opening",
@@ -142,12 +132,12 @@ BREAKS: dict[str, tuple[Callable[[Track], Track], str, str]] = {
 @pytest.mark.parametrize("case", BREAKS)
 def test_every_break_is_found_and_named(case: str) -> None:
     breaking, demand, text = BREAKS[case]
-    problems = find_problems(breaking(ring()))
+    problems = tracks.find_problems(breaking(ring()))
     assert [p for p in problems if p.demand == demand and p.text.startswith(text)], problems
 
 
 def test_every_demand_has_a_break() -> None:
-    assert {demand for _, demand, _ in BREAKS.values()} == set(DEMANDS)
+    assert {demand for _, demand, _ in BREAKS.values()} == set(tracks.DEMANDS)
 
 
 # Field, the value that the FlyTrack course just keeps, the one that it breaks, and the demand.
@@ -164,14 +154,16 @@ EDGES = [
 
 @pytest.mark.parametrize(("field", "kept", "broken", "demand"), EDGES)
 def test_limits_bind_where_they_say(field: str, kept: float, broken: float, demand: str) -> None:
-    track = load_track("flytrack")
-    assert find_problems(track, Limits()._replace(**{field: kept})) == ()
-    assert {p.demand for p in find_problems(track, Limits()._replace(**{field: broken}))} == {demand}
+    track = tracks.load_track("flytrack")
+    assert tracks.find_problems(track, tracks.Limits()._replace(**{field: kept})) == ()
+    assert {p.demand for p in tracks.find_problems(track, tracks.Limits()._replace(**{field: broken}))} == {
+        demand
+    }
 
 
 def test_default_clearances_are_what_starts_need() -> None:
     radius, starts = EnvParams.drone_radius, ResetParams()
-    limits = Limits()
+    limits = tracks.Limits()
     assert limits.drone_radius == radius
     assert limits.clearance == pytest.approx(starts.course_offset + radius)
     assert limits.start_clearance == pytest.approx(starts.start_position_noise + radius)
