@@ -12,7 +12,7 @@ from benchmarks.hidden import draw_base, fly, measure
 from flytrack_env.dynamics import ModelParameters
 from flytrack_env.effects import EFFECTS, AccelerometerBias, CommandDelay, LinearDrag
 from flytrack_sysid.diagnosis import report, summary
-from flytrack_sysid.diagnosis.evidence import EVIDENCE, bin_edges, binned_means, without
+from flytrack_sysid.diagnosis.evidence import EVIDENCE, without
 from flytrack_sysid.diagnosis.result import (
     CAUSES_FOUND,
     UNEXPLAINED,
@@ -268,15 +268,3 @@ def test_what_is_beyond_the_list_is_told_and_not_named(diagnosis):
 def test_page_of_a_log_of_few_channels(diagnosis, measured):
     text = report.html_of(diagnosis, measured.without("w", "f", "v_bat"))
     assert "attitude or velocity replace them" in text and text.count("<img") == 1 + len(diagnosis.causes)
-
-
-def test_intervals_of_bins_allow_for_correlated_rows():
-    rng = np.random.default_rng(7)
-    block = np.repeat(np.arange(200), 50)
-    values = np.repeat(rng.standard_normal(200), 50) + rng.standard_normal(10_000)
-    regressor = rng.random(10_000)
-    edges = bin_edges(regressor)
-    found = binned_means(regressor, values, block, edges)
-    alone = binned_means(regressor, values, np.arange(10_000), edges)
-    assert len(found.at) == 15 and np.all(found.ends95 > 1.3 * alone.ends95)
-    np.testing.assert_allclose(alone.ends95, 1.96 * np.sqrt(2.0 / (10_000 / 15)), rtol=0.25)
