@@ -8,15 +8,11 @@ from benchmarks.reliability import simulation
 from flytrack_env.params import RANGES
 
 
-@pytest.fixture
-def few(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(simulation, "NUM_ENVS", 64)
-    monkeypatch.setattr(simulation, "NUM_STEPS", 40)
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("name", simulation.extreme_environments())
-def test_extremes_hold(few: None, name: str) -> None:
+def test_extremes_hold(monkeypatch: pytest.MonkeyPatch, name: str) -> None:
+    monkeypatch.setattr(simulation, "NUM_ENVS", 64)
+    monkeypatch.setattr(simulation, "NUM_STEPS", 40)
     env = simulation.extreme_environments()[name]
     params = simulation.draw_extremes(np.random.default_rng(0), env.default_params)
     env.check_params(params)

@@ -3,6 +3,7 @@
 import math
 import re
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,32 +13,7 @@ from hypothesis import strategies as st
 from flytrack_env.references import ReferenceFileError, shipped_reference
 from flytrack_env.tracks import Gate, Track, TrackError, build_course, load_track, save_track
 
-VALID = """name = "small"
-
-[start]
-position = [-4.0, 0.0, 1.0]
-quaternion = [1.0, 0.0, 0.0, 0.0]
-
-[bounds]
-low = [-5.0, -5.0, 0.0]
-high = [15.0, 5.0, 5.0]
-
-[[gates]]
-id = 7
-position = [0.0, 0.0, 1.5]
-quaternion = [0.707107, 0.0, 0.0, -0.707107]
-direction = "+y"
-opening = 1.5
-frame = 2.7
-
-[[gates]]
-id = 3
-position = [10.0, 1.0, 1.6]
-quaternion = [0.0, 0.0, 0.0, 1.0]
-direction = "-y"
-opening = 1
-frame = 2
-"""
+VALID = (Path(__file__).parents[1] / "support" / "small_track.toml").read_text(encoding="utf-8")
 SECOND_GATE = VALID[VALID.index("[[gates]]\nid = 3") :]
 
 
