@@ -46,13 +46,14 @@ def is_exact(line: Line) -> bool:
     return sorted(cause["effect"] for cause in found(line)) == sorted(line["effects"])
 
 
+def is_clear(line: Line) -> bool:
+    """Return whether all effects of a plant are shown and separable."""
+    sizes = [line["known"].get(effect, (0.0, 0.0)) for effect in line["effects"]]
+    return all(size[0] > SHOWN and size[1] > SEPARATE for size in sizes)
+
+
 def exact_sets(lines: Iterable[Line]) -> list[bool]:
     """Return, of plants all of whose effects are shown and separable, whether exactly they are named."""
-
-    def is_clear(line: Line) -> bool:
-        sizes = [line["known"].get(effect, (0.0, 0.0)) for effect in line["effects"]]
-        return all(size[0] > SHOWN and size[1] > SEPARATE for size in sizes)
-
     return [is_exact(line) for line in lines if is_clear(line)]
 
 
@@ -72,24 +73,16 @@ def percentiles(values: list[float], *which: int, unit: str = "") -> str:
     return ", ".join(f"{np.percentile(values, q):.1f}{unit}" for q in which) if values else "none"
 
 
-def clocks(lines: Iterable[Line]) -> list[bool]:
+def is_clock_right(line: Line) -> bool:
     """Return whether a late motion capture is found within 2 ms, and nothing else is named."""
-
-    def is_right(line: Line) -> bool:
-        true_s, found_s = line["late_s"]
-        return set(named(line)) <= {CLOCK} and abs(found_s - true_s) <= CLOCK_WITHIN_S
-
-    return [is_right(line) for line in lines]
+    true_s, found_s = line["late_s"]
+    return set(named(line)) <= {CLOCK} and abs(found_s - true_s) <= CLOCK_WITHIN_S
 
 
-def onsets(lines: Iterable[Line]) -> list[bool]:
+def is_onset_right(line: Line) -> bool:
     """Return whether exactly the effect that begins in flight is found, and its onset within a second."""
-
-    def is_right(line: Line) -> bool:
-        times = [cause.get("onset_s", [np.inf])[0] for cause in found(line)]
-        return is_exact(line) and all(abs(one - line["onset"]) <= ONSET_WITHIN_S for one in times)
-
-    return [is_right(line) for line in lines]
+    times = [cause.get("onset_s", [np.inf])[0] for cause in found(line)]
+    return is_exact(line) and all(abs(one - line["onset"]) <= ONSET_WITHIN_S for one in times)
 
 
 def is_time_told(line: Line) -> bool:
@@ -107,68 +100,44 @@ def figures(by_row: Rows) -> list[tuple[str, str, str]]:
     removed = [100.0 * line["removed"][0] for line in hiding if line["removed"][1] >= NOTABLE]
     sizes = [len(one) for line in by_row["one"] for one in classes(line)]
     outside = [line for line in by_row["outside"] if line["visible"] >= VISIBLE]
-    seconds = [line["cpu_s"] for lines in by_row.values() for line in lines]
+    every = [line for lines in by_row.values() for line in lines]
     controls = {
         row: [bool(named(line) or line.get("beyond_the_list")) for line in by_row[row]] for row in CONTROLS
     }
+    any_name = [flag for flags in controls.values() for flag in flags]
+    small = [bool(line["negligible"]) for row in CONTROLS for line in by_row[row]]
+    in_class = [any(effect in names for names in classes(line)) for line, effect, _ in shown]
+    silent = [not found(line) for line, _, size in one if size[0] < HIDDEN]
+    told = [any(line["depends_on"] in name for name in line["unexplained"]) for line in outside]
+    begun = [is_time_told(line) for row in ROWS if row != "onset" for line in by_row[row]]
+    gone = f"{percentiles(removed, 50, 10, unit=' %')} of {len(removed)}"
+    late, sudden = map(is_clock_right, by_row["clock"]), map(is_onset_right, by_row["onset"])
     return [
-        (
-            "any name on plants without an effect",
-            "at most 1 %",
-            percent([flag for flags in controls.values() for flag in flags]),
-        ),
+        ("any name on plants without an effect", "at most 1 %", percent(any_name)),
         *((f"the same, {row}", "", percent(flags)) for row, flags in controls.items()),
-        (
-            "something negligible on them",
-            "",
-            percent([bool(line["negligible"]) for row in CONTROLS for line in by_row[row]]),
-        ),
+        ("something negligible on them", "", percent(small)),
         ("detected: any name, lambda > 30", "99 %", percent([bool(found(line)) for line, *_ in shown])),
         ("exact name, lambda > 30 and lambda_sep > 20", "98 %", percent(exact_sets(by_row["one"]))),
-        (
-            "truth in the reported class, lambda > 30",
-            "98 %",
-            percent([any(effect in names for names in classes(line)) for line, effect, _ in shown]),
-        ),
+        ("truth in the reported class, lambda > 30", "98 %", percent(in_class)),
         ("mean size of a class", "at most 1.5", f"{np.mean(sizes):.2f}" if sizes else "none"),
-        ("silent, lambda < 8", "", percent([not found(line) for line, _, size in one if size[0] < HIDDEN])),
+        ("silent, lambda < 8", "", percent(silent)),
         ("exact set of 2, each separable", "95 %", percent(exact_sets(by_row["two"]))),
         ("exact set of 3, each separable", "90 %", percent(exact_sets(by_row["three"]))),
-        (
-            "explainable error removed on a new flight: median, tenth percentile",
-            "99 %, 95 %",
-            f"{percentiles(removed, 50, 10, unit=' %')} of {len(removed)}",
-        ),
+        ("explainable error removed on a new flight: median, tenth percentile", "99 %, 95 %", gone),
         ("95 % intervals cover the truth", "92 to 98 %", percent(covered(same_law))),
         ("the same, beside an effect of another law", "", percent(covered(other_law))),
         ("outside the list: flagged", "95 %", percent([bool(line["unexplained"]) for line in outside])),
-        (
-            "outside the list: dependence named",
-            "80 %",
-            percent([any(line["depends_on"] in name for name in line["unexplained"]) for line in outside]),
-        ),
+        ("outside the list: dependence named", "80 %", percent(told)),
         ("outside the list: false name", "at most 5 %", percent([bool(named(line)) for line in outside])),
+        ("motion capture 0 to 40 ms late: within 2 ms, no other name", "95 %", percent([*late])),
+        ("effect that begins in flight: exact name, onset within 1 s", "90 %", percent([*sudden])),
+        ("others: an onset or end told", "", percent(begun)),
+        ("motion recognised", "", percent([line["is_motion_right"] for line in every])),
         (
-            "motion capture 0 to 40 ms late: within 2 ms, no other name",
-            "95 %",
-            percent(clocks(by_row["clock"])),
+            "CPU seconds a log: median, 95th percentile",
+            "8, 15",
+            percentiles([one["cpu_s"] for one in every], 50, 95),
         ),
-        (
-            "effect that begins in flight: exact name, onset within 1 s",
-            "90 %",
-            percent(onsets(by_row["onset"])),
-        ),
-        (
-            "others: an onset or end told",
-            "",
-            percent([is_time_told(line) for row in ROWS if row != "onset" for line in by_row[row]]),
-        ),
-        (
-            "motion recognised",
-            "",
-            percent([line["is_motion_right"] for lines in by_row.values() for line in lines]),
-        ),
-        ("CPU seconds a log: median, 95th percentile", "8, 15", percentiles(seconds, 50, 95)),
     ]
 
 
