@@ -214,12 +214,6 @@ def _spread(values: np.ndarray, channel_name: str, problem: Problem) -> np.ndarr
     return np.sqrt(np.sum(values**2, axis=0) / np.maximum(count, 1.0))
 
 
-def channel_noise(model: ModelParameters, problem: Problem) -> dict[str, np.ndarray]:
-    """Return the rms of what a model leaves of each channel, per component."""
-    found = jax.jit(residuals)(model, problem)
-    return {name: _spread(np.asarray(values), name, problem) for name, values in found.items()}
-
-
 def estimate(
     log: FlightLog,
     judged: np.ndarray,
@@ -245,8 +239,9 @@ def estimate(
             search = _acting_search(model, free, problem, noise, may_be_idle=number == 0)
             params, covariance = search.run(tolerance)
             model = parameters.with_values(model, dict(zip(search.free, search.values(params), strict=True)))
-            noise = {
-                name: np.maximum(left, LEAST_NOISE) for name, left in channel_noise(model, problem).items()
+            noise = {  # the rms of what the model leaves
+                name: np.maximum(_spread(np.asarray(left), name, problem), LEAST_NOISE)
+                for name, left in jax.jit(residuals)(model, problem).items()
             }
             report(number + 1, len(TOLERANCES))
     chain = np.where(search.is_log, np.exp(np.where(search.is_log, params, 0.0)), 1.0)

@@ -1,6 +1,7 @@
 """The command flytrack-sysid: from a plant to a model and its report, and its refusals."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import gymnax
@@ -12,7 +13,6 @@ from flytrack_env import load_model, load_provenance, save_model
 from flytrack_env.dynamics import nominal_parameters
 from flytrack_sysid import cli, collect, load_log, save_log
 from flytrack_sysid.cli import load_plant, main
-from flytrack_sysid.log import FlightLog
 from tests.support.black_boxes import AIRLESS, SHIPPED
 
 TAUS = (0.02, 0.05, 0.07, 0.03)
@@ -127,14 +127,10 @@ def test_collect_refuses(capsys, tmp_path, monkeypatch, plant, options, message)
     assert {path.name for path in tmp_path.iterdir()} <= {"my_robot.py", "__pycache__"}
 
 
-def with_rates_in_degrees(log: FlightLog) -> FlightLog:
-    return FlightLog(log.time, {**log.channels, "w": np.rad2deg(log["w"])}, log.segment)
-
-
 @pytest.mark.parametrize(
     ("change", "options", "message"),
     [
-        (with_rates_in_degrees, [], "deg/s"),
+        (lambda log: replace(log, channels={**log.channels, "w": np.rad2deg(log["w"])}), [], "deg/s"),
         (lambda log: log.select(slice(50)), [], "too short"),
         (lambda log: log, ["--fix", "tau_yaw"], "NAME=VALUE"),
         (lambda log: log, ["--effect", "magic"], "magic"),
