@@ -86,38 +86,31 @@ def _low_passes(number: int, hover: float, rng: np.random.Generator) -> tuple[np
 
 def _thrust(number: int, hover: float, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     command = np.zeros((excitation.FLIGHT_STEPS, 4))
-    command[:, 3] = (
-        excitation.switching(rng, 0.5, excitation.SLOW_STEPS) if number % 2 else excitation.switching(rng)
-    )
+    command[:, 3] = excitation.switching(rng, *((0.5, excitation.SLOW_STEPS) if number % 2 else ()))
     return _start(hover, STARTS_V[number]), command
 
 
 def _tilted(number: int, hover: float, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     tilt_deg = TILTS_DEG[number // 2] * (-1.0) ** number
-    return _start(hover, STARTS_V[number], 90.0 * rng.integers(4), tilt_deg), _swing(
-        hover, excitation.LEG_SWING, rng
-    )
+    start = _start(hover, STARTS_V[number], 90.0 * rng.integers(4), tilt_deg)
+    return start, _swing(hover, excitation.LEG_SWING, rng)
 
 
 def _amplitudes(number: int, hover: float, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     """Return roll, then pitch at one amplitude, or yaw, then all axes."""
-    command, slots = (
-        _swing(hover, HOVER_SWING, rng),
-        (slice(excitation.SLOT_STEPS), slice(excitation.SLOT_STEPS, excitation.FLIGHT_STEPS)),
-    )
+    command = _swing(hover, HOVER_SWING, rng)
+    slots = slice(excitation.SLOT_STEPS), slice(excitation.SLOT_STEPS, excitation.FLIGHT_STEPS)
     for slot, axes in zip(slots, ((2,), (0, 1, 2)) if number % 2 else ((0,), (1,)), strict=True):
         for axis in axes:
-            command[slot, axis] = excitation.AMPLITUDES[number // 2] * excitation.wave(
-                "sine" if len(axes) > 1 else "doublet", rng
-            )
+            wave = excitation.wave("sine" if len(axes) > 1 else "doublet", rng)
+            command[slot, axis] = excitation.AMPLITUDES[number // 2] * wave
     return _start(hover, STARTS_V[number]), command
 
 
 def _switching(number: int, hover: float, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     command = [excitation.switching(rng, hold_steps=QUICK_STEPS) for _ in range(4)]
-    return _start(hover, STARTS_V[number]), excitation.FREE_AMPLITUDES[number // 2] * np.stack(
-        command, axis=1
-    )
+    size = excitation.FREE_AMPLITUDES[number // 2]
+    return _start(hover, STARTS_V[number]), size * np.stack(command, axis=1)
 
 
 def _spins(number: int, hover: float, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:

@@ -45,9 +45,8 @@ def check_script(script: Script, source: str = "script") -> None:
     is_shaped = starts.shape == (number, STATE_SIZE) and commands.shape[::2] == (number, ACTION_SIZE)
     if number == 0 or not is_shaped or commands.ndim != 3 or commands.shape[1] < excitation.FEWEST_STEPS:
         found = f"{number} kinds, starts of shape {starts.shape}, commands of shape {commands.shape}"
-        expected = (
-            f"(N,), (N, {STATE_SIZE}) and (N, {excitation.FEWEST_STEPS} or more, {ACTION_SIZE}), N >= 1"
-        )
+        fewest = f"{excitation.FEWEST_STEPS} or more"
+        expected = f"(N,), (N, {STATE_SIZE}) and (N, {fewest}, {ACTION_SIZE}), N >= 1"
         raise ScriptError(f"{source}: found {found}, expected {expected}")
     norm_error = np.abs(np.linalg.norm(starts[:, QUATERNION], axis=1) - 1.0)
     envelope = f"at most {excitation.LARGEST_SPEED:g} m/s, {low:g} to {high:g} m, and a voltage"

@@ -98,11 +98,8 @@ def first_guess(task: Task, counts: np.ndarray, speed_m_s: float, heading_rad: f
     if task.is_lap:
         velocity[0] = velocity[-1] = 0.5 * (velocity[0] + velocity[-1])
     states = np.zeros((len(times), layout.STATE_SIZE))
-    states[:, layout.POSITION], states[:, layout.VELOCITY], states[:, layout.ACCELERATION] = (
-        positions,
-        velocity,
-        acceleration,
-    )
+    states[:, layout.POSITION], states[:, layout.VELOCITY] = positions, velocity
+    states[:, layout.ACCELERATION] = acceleration
     states[:, layout.QUATERNION] = _attitudes(acceleration + GRAVITY, velocity, heading_rad)
     states[:, layout.BATTERY] = task.start[layout.BATTERY]
     if not task.is_lap:

@@ -150,12 +150,10 @@ def by_flight(results: dict[str, refinement.Tested], segment: np.ndarray) -> dic
     ratios = {}
     for number in np.unique(segment):
         part = segment == number
-        base, extended = (
-            refinement.Tested(
-                one.errors[:, :, part], one.windows._replace(counts=one.windows.counts[:, part])
-            ).rms()[0]
-            for one in (results["refitted_base"], results["extended"])
-        )
+        windows = results["extended"].windows
+        own = windows._replace(counts=windows.counts[:, part])
+        tested = (results[name].errors[:, :, part] for name in ("refitted_base", "extended"))
+        base, extended = (refinement.Tested(errors, own).rms()[0] for errors in tested)
         ratios[str(number)] = np.nan_to_num(extended / base, nan=0.0).round(4).tolist()  # 0: no window
     return ratios
 

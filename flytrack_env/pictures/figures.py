@@ -41,9 +41,8 @@ def draw_top(flight: Flight) -> Figure:
     """Return the course from above, the path coloured by speed, lap times in the title."""
     figure, axes = _course([flight], BESIDE_IN)
     points, speeds = flight.states[:, POSITION][:, :2], flight.speeds_m_s
-    lines = drawing.draw_path(
-        axes, points, speeds[:-1], drawing.HEADROOM * max(float(speeds.max()), 1.0), 2.2
-    )
+    top = drawing.HEADROOM * max(float(speeds.max()), 1.0)
+    lines = drawing.draw_path(axes, points, speeds[:-1], top, 2.2)
     failures = np.reshape([one.pos_w[:2] for one in flight.meetings if one.outcome != PASSED], (-1, 2))
     axes.plot(*failures.T, "X", color="black", markersize=8, markeredgecolor="white", zorder=5)
     marks = (("start", points[0], BLUE, "o"), (drawing.escape(flight.ended), points[-1], ORANGE, "X"))
