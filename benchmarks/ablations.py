@@ -13,7 +13,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -29,13 +29,15 @@ from baselines.purejaxrl_ppo.program import make_chunk, training_params, with_st
 from baselines.purejaxrl_ppo.race_env import with_model_as_given
 from baselines.purejaxrl_ppo.run import is_due
 from benchmarks import report
-from benchmarks.ablated import InWorldFrame, WithoutEntries
 from flytrack_env import EnvParams, blackbox, load_model
 from flytrack_env.dynamics import ModelParameters
 from flytrack_env.effects import CommandDelay
 from flytrack_env.episodes import EpisodicEnvironment
 from flytrack_env.files import write_atomically
+from flytrack_env.observations import BATTERY_MIDDLE_V, OBSERVATION, Entry
 from flytrack_env.pictures.drawing import new_figure, png_of
+from flytrack_env.state import Action, Drone
+from flytrack_env.wrappers import Wrapper
 
 NUM_EPISODES, NUM_LAPS, NUM_STEPS = 256, 3, 2500
 EVALUATION_SEED, PLANTS_SEED = 30_000, 200
@@ -46,6 +48,103 @@ EVERY = 2_000_000  # environment steps between points of a curve
 DELAY_S = 0.03
 LONG_EPISODE = 1000  # steps: from the start pose, in 2 s no more than two gates are reached
 Wrap = Callable[[EpisodicEnvironment], EpisodicEnvironment]
+
+
+GATE_FRAME = {entry.key: entry for entry in OBSERVATION}
+
+
+def _in_world(key: str) -> Entry:
+    """Return an entry of the observation, as it is called in the world's frame."""
+    entry = GATE_FRAME[key]
+    return entry._replace(name=entry.name.replace("body to gate", "body to world"), frame="world")
+
+
+# The course spans 25 m and 35 m, hence the scale of the position; all else is scaled as in the gate's frame.
+WORLD = (
+    Entry("position", "position", 3, "world", "m", 10.0, 10.0),
+    _in_world("velocity"),
+    _in_world("attitude"),
+    GATE_FRAME["rates"],
+    GATE_FRAME["applied"],
+    GATE_FRAME["battery"],
+    Entry("gate", "gate's centre relative to the drone", 3, "world", "m", 3.0, 30.0),
+    Entry("direction", "gate's direction of flight", 3, "world", "1", 1.0, 1.0),
+    _in_world("next_gate"),
+    _in_world("next_direction"),
+)
+
+
+class Shown(NamedTuple):
+    """The inner state and nothing else."""
+
+    inner: Any
+
+
+class OtherObservation(Wrapper):
+    """A wrapper that changes only what is shown."""
+
+    def begin(self, drone: Drone, gate_index: Any, params: EnvParams, seed: Any = 0) -> Shown:
+        """Return the inner state of an episode that begins."""
+        return Shown(self.env.begin(drone, gate_index, params, seed))
+
+    def advance(
+        self, state: Shown, command: Action, params: EnvParams
+    ) -> tuple[Shown, jax.Array, jax.Array, dict[str, Any]]:
+        """Return the outcome of the inner environment."""
+        inner, *outcome = self.env.advance(state.inner, command, params)
+        return Shown(inner), *outcome
+
+
+class WithoutEntries(OtherObservation):
+    """Show zeros in place of some entries of the observation."""
+
+    key = "without_entries"
+
+    def __init__(self, env: EpisodicEnvironment, keys: tuple[str, ...]):
+        super().__init__(env)
+        self.keys = keys
+
+    def observe_drone(self, drone: Drone, state: Any, params: EnvParams) -> list[jax.Array]:
+        """Return the inner observation with zeros where the entries were."""
+        values = self.env.observe_drone(drone, state.inner, params)
+        hidden = [entry.key in self.keys for entry in self.observation_table for _ in range(entry.size)]
+        return [
+            jnp.zeros_like(value) if is_hidden else value
+            for value, is_hidden in zip(values, hidden, strict=True)
+        ]
+
+
+class InWorldFrame(OtherObservation):
+    """Show everything in the world's frame, the same quantities as in the gate's."""
+
+    key = "in_world_frame"
+
+    @property
+    def observation_table(self) -> tuple[Entry, ...]:
+        """The rows of ``WORLD``."""
+        return WORLD
+
+    def observe_drone(self, drone: Drone, state: Any, params: EnvParams) -> list[jax.Array]:
+        """Return the observation; gates as the race of the state has them."""
+        race = self.race(state)
+        body_axes = drone.quat.axes()
+        quantities: list[tuple[Any, ...]] = [
+            drone.pos_w,
+            drone.vel_w,
+            tuple(component for row in zip(*body_axes, strict=True) for component in row),
+            drone.rates_b,
+            drone.applied,
+            (drone.battery_v - BATTERY_MIDDLE_V,),
+            race.gate.centre - drone.pos_w,
+            race.gate.forward,
+            race.next_gate.centre - race.gate.centre,
+            race.next_gate.forward,
+        ]
+        return [
+            jnp.clip(value * (1.0 / entry.scale), -entry.limit, entry.limit)
+            for entry, group in zip(WORLD, quantities, strict=True)
+            for value in group
+        ]
 
 
 @dataclass(frozen=True)
@@ -214,19 +313,18 @@ def main() -> None:
     done = measure(arguments.seeds, arguments.steps, load_model(report.ROOT / MODEL))
     chart = PAGE.with_suffix(".png")
     draw(chart, done)
-    text = report.page(
-        "Ablations: the worth of each part of the recipe",
-        f"{report.command_line()}: the default recipe ({arguments.steps / 1e6:g} M environment steps) with "
-        f"one thing changed, seeds 0 to {arguments.seeds - 1}. Trained on `{MODEL}`, which `make demo` "
-        f"identified from the shipped black box. Share of {NUM_EPISODES} noisy starts that finish "
-        f"{NUM_LAPS} laps, and mean flying lap: in that simulator, on the black box, on as many drones drawn "
-        "around the model (drag, thrust, wind, delay: `eval_agent.py --plants`). One number per seed, in "
-        "order of size.",
-        table(done),
-        f"![Learning curves]({chart.name})",
-        f"{pinned.capitalize()}. {report.provenance_line(report.provenance())}",
+    report.fill_page(
+        PAGE,
+        "ablations",
+        table=table(done),
+        millions=arguments.steps / 1e6,
+        last_seed=arguments.seeds - 1,
+        model=MODEL,
+        episodes=NUM_EPISODES,
+        laps=NUM_LAPS,
+        chart=chart.name,
+        pinned=pinned.capitalize(),
     )
-    report.write_page(PAGE, text)
 
 
 if __name__ == "__main__":

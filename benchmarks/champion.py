@@ -37,26 +37,6 @@ def train(out: Path) -> Path:
     return out / CHAMPION.name
 
 
-def page(text: str, times: float) -> str:
-    """Return the page; times: mean flying lap over the optimum."""
-    meta, name = load_checkpoint(CHAMPION).meta, CHAMPION.relative_to(report.ROOT)
-    reward = ", ".join(f"{term} {weight:g}" for term, weight in REWARD.items())
-    flags = f"--steps {STEPS} --episodes {EPISODES} --laps {LAPS} --seed {FLIGHT_SEED} --ghost"
-    return report.page(
-        "The champion of the FlyTrack course",
-        f"{report.command_line()}: `{name}`, trained from scratch with seed {meta['seed']} for "
-        f"{meta['steps'] / 1e6:.0f} M environment steps ({meta['seconds']:.0f} s) on the model identified "
-        f"from the shipped black box (`{MODEL.relative_to(report.ROOT)}`). Unlike the default recipe: reward "
-        f"{reward}, min_std {CONFIG.min_std:g}, gate_margin {CONFIG.gate_margin:g}. On the black box, from "
-        "noisy starts:",
-        f"`python eval_agent.py --checkpoint {name} {flags}`",
-        f"```\n{text}```",
-        f"Mean flying lap: **{times:.3f} times** the time-optimal lap of that model (aim: at most {AIM:g}). "
-        "The settings were chosen by looking at flights on this black box and this track.",
-        report.provenance_line(report.provenance()),
-    )
-
-
 def main() -> None:
     """Train, fly, and where the aim is met, ship the policy and write the page; else exit 1."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -73,7 +53,21 @@ def main() -> None:
     if found.numbers["success"]["share"] < 1.0 or times > AIM:
         raise SystemExit(1)
     write_atomically(CHAMPION, policy.read_bytes())
-    report.write_page(report.RESULTS / "champion.md", page(found.text, times))
+    meta = load_checkpoint(CHAMPION).meta
+    report.fill_page(
+        report.RESULTS / "champion.md",
+        "champion",
+        name=CHAMPION.relative_to(report.ROOT),
+        meta=meta,
+        millions=meta["steps"] / 1e6,
+        model=MODEL.relative_to(report.ROOT),
+        reward=", ".join(f"{term} {weight:g}" for term, weight in REWARD.items()),
+        config=CONFIG,
+        settings=settings,
+        text=found.text,
+        times=times,
+        aim=AIM,
+    )
 
 
 if __name__ == "__main__":

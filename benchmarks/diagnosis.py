@@ -24,20 +24,8 @@ import jax
 import numpy as np
 from tqdm import tqdm
 
-from benchmarks.hidden import (
-    MOTIONS,
-    Truth,
-    draw_base,
-    draw_gust,
-    draw_late,
-    draw_onset,
-    draw_outside,
-    draw_truth,
-    fly,
-    measure,
-    signal_to_noise,
-)
-from benchmarks.hidden.oracle import known, removed
+from benchmarks import hidden
+from benchmarks.hidden.oracle import known, removed, signal_to_noise
 from benchmarks.report import ROOT, commit_of_checkout
 from flytrack_env.dynamics import ModelParameters
 from flytrack_env.motion import Motion
@@ -64,27 +52,30 @@ class Trial(NamedTuple):
     rate: int = 100
 
 
-def _outside(rng: Rng) -> Truth:
+def _outside(rng: Rng) -> hidden.Truth:
     low, high = np.log(AMPLITUDES)
-    return replace(draw_base(rng), outside=draw_outside(rng, amplitude=float(np.exp(rng.uniform(low, high)))))
+    return replace(
+        hidden.draw_base(rng),
+        outside=hidden.draw_outside(rng, amplitude=float(np.exp(rng.uniform(low, high)))),
+    )
 
 
 # Row -> how a truth is drawn, and the sensors' noise.
-ROWS: dict[str, tuple[Callable[[Rng], Truth], str]] = {
-    "clean": (draw_base, "sensors"),
-    "heavy": (draw_base, "heavy"),
-    "coloured": (draw_base, "coloured"),
-    "gusts": (lambda rng: replace(draw_base(rng), gust=draw_gust(rng)), "sensors"),
-    "one": (lambda rng: draw_truth(rng, 1), "sensors"),
-    "two": (lambda rng: draw_truth(rng, 2), "sensors"),
-    "three": (lambda rng: draw_truth(rng, 3), "sensors"),
+ROWS: dict[str, tuple[Callable[[Rng], hidden.Truth], str]] = {
+    "clean": (hidden.draw_base, "sensors"),
+    "heavy": (hidden.draw_base, "heavy"),
+    "coloured": (hidden.draw_base, "coloured"),
+    "gusts": (lambda rng: replace(hidden.draw_base(rng), gust=hidden.draw_gust(rng)), "sensors"),
+    "one": (lambda rng: hidden.draw_truth(rng, 1), "sensors"),
+    "two": (lambda rng: hidden.draw_truth(rng, 2), "sensors"),
+    "three": (lambda rng: hidden.draw_truth(rng, 3), "sensors"),
     "outside": (_outside, "sensors"),
-    "clock": (draw_late, "sensors"),
-    "onset": (lambda rng: draw_onset(rng, SECONDS), "sensors"),
+    "clock": (hidden.draw_late, "sensors"),
+    "onset": (lambda rng: hidden.draw_onset(rng, SECONDS), "sensors"),
 }
 
 
-def model_of(truth: Truth) -> ModelParameters:
+def model_of(truth: hidden.Truth) -> ModelParameters:
     """Return the base of a plant: what its team believes in. How the plant moves they do not know."""
     return ModelParameters(
         tau=np.array(truth.tau, np.float32),
@@ -96,7 +87,7 @@ def model_of(truth: Truth) -> ModelParameters:
     )
 
 
-def make_log(trial: Trial) -> tuple[Truth, FlightLog, FlightLog, ModelParameters, Rng]:
+def make_log(trial: Trial) -> tuple[hidden.Truth, FlightLog, FlightLog, ModelParameters, Rng]:
     """Return a plant, its flight without and with noise, its team's model, and the generator that drew it.
 
     The plant's parameters do not depend on its motion and the log's rate.
@@ -104,8 +95,8 @@ def make_log(trial: Trial) -> tuple[Truth, FlightLog, FlightLog, ModelParameters
     draw, noise = ROWS[trial.row]
     rng = np.random.default_rng([trial.seed, trial.number, list(ROWS).index(trial.row)])
     truth = replace(draw(rng), motion=trial.motion, step_s=1.0 / trial.rate)
-    clean = fly(truth, "scripted", SECONDS, rng)
-    return truth, clean, measure(clean, noise, rng), model_of(truth), rng
+    clean = hidden.fly(truth, "scripted", SECONDS, rng)
+    return truth, clean, hidden.measure(clean, noise, rng), model_of(truth), rng
 
 
 def plant(trial: Trial) -> dict[str, Any]:
@@ -144,7 +135,7 @@ def plant(trial: Trial) -> dict[str, Any]:
     return line
 
 
-def _graded(cause: Any, truth: Truth) -> dict[str, Any]:
+def _graded(cause: Any, truth: hidden.Truth) -> dict[str, Any]:
     """Return a cause's name, when it acts, and, by parameter, true value, estimate and interval."""
     true = truth.effects.get(cause.effect, {})
     spans = {"onset_s": cause.onset_s, "end_s": cause.end_s}
@@ -162,9 +153,9 @@ def _graded(cause: Any, truth: Truth) -> dict[str, Any]:
     }
 
 
-def _removed(truth: Truth, found: Diagnosis, rng: Rng) -> list[float]:
+def _removed(truth: hidden.Truth, found: Diagnosis, rng: Rng) -> list[float]:
     """Return the share of explainable error that is removed on a new flight, and its size in noise."""
-    new = fly(truth, "scripted", SECONDS, rng)
+    new = hidden.fly(truth, "scripted", SECONDS, rng)
     share, size = removed(new, found.base, found.extended)
     return [round(share, 4), round(size, 4)]
 
@@ -202,7 +193,7 @@ def main() -> None:
     parser.add_argument("--plants", type=int, default=200, help="of each row; default: %(default)s")
     parser.add_argument("--first", type=int, default=0, help="number of the first plant")
     parser.add_argument("--rows", default=",".join(ROWS), help="default: all")
-    parser.add_argument("--motion", default=",".join(MOTIONS), help="default: %(default)s")
+    parser.add_argument("--motion", default=",".join(hidden.MOTIONS), help="default: %(default)s")
     parser.add_argument("--rate", default="100", help="rows per second of the log; default: %(default)s")
     parser.add_argument("--seed", type=int, default=SEED, help="default: %(default)s")
     parser.add_argument("--lines", type=Path, default=LINES, help="file to append to; default: %(default)s")

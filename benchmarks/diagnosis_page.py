@@ -12,7 +12,7 @@ import numpy as np
 
 from benchmarks.diagnosis import LINES, ROWS, Trial, read_lines
 from benchmarks.hidden import MOTIONS
-from benchmarks.report import page, percent, table, write_page
+from benchmarks.report import fill_page, percent, table
 
 Line = dict[str, Any]
 Rows = dict[str, list[Line]]
@@ -24,20 +24,6 @@ OTHER_LAW = ("translational_lift", "rate_saturation", "ground_effect")
 USUAL_RATE, CLOCK, CLOCK_WITHIN_S = 100, "mocap_latency", 0.002
 ONSET_WITHIN_S = 1.0
 VISIBLE = 10.0  # standard deviations of an effect outside the list: it was there, and flown
-HEAD = """\
-Written by `python -m benchmarks.diagnosis_page` from the lines that `python -m benchmarks.diagnosis` wrote
-to docs/results/diagnosis.jsonl, a line a plant. Plants: {plants}; crashed: {crashed}.
-Seeds {seeds}; measured at {commits}; {machines}.
-
-Every plant is flown for 60 s (benchmarks/hidden: other equations than the simulator's, some of another
-form) in three motions: by the handout's step; the same with the force in the attitude after the step
-(semi_implicit); and as a differential equation in parts of 1 ms or less (fine), as real drones move, where
-sensors say what is true at an instant. It is measured: gyro 0.1 rad/s, accelerometer 1.5 m/s^2, velocity
-0.05 m/s, attitude 0.5 degrees, quantised, 2 % of rows lost. The diagnosis sees the log and the model without
-the hidden effects; a quarter of the log is held out. `lambda` is what the other three quarters could show of
-an effect, `lambda_sep` what is left of it beside its closest rival, both from the truth
-(benchmarks/hidden/oracle.py). True effects that are listed as negligible count as found. An effect outside
-the list counts where it changes its channel by {visible:g} standard deviations or more over the log."""
 
 
 def named(line: Line) -> list[str]:
@@ -60,13 +46,14 @@ def is_exact(line: Line) -> bool:
     return sorted(cause["effect"] for cause in found(line)) == sorted(line["effects"])
 
 
+def is_clear(line: Line) -> bool:
+    """Return whether all effects of a plant are shown and separable."""
+    sizes = [line["known"].get(effect, (0.0, 0.0)) for effect in line["effects"]]
+    return all(size[0] > SHOWN and size[1] > SEPARATE for size in sizes)
+
+
 def exact_sets(lines: Iterable[Line]) -> list[bool]:
     """Return, of plants all of whose effects are shown and separable, whether exactly they are named."""
-
-    def is_clear(line: Line) -> bool:
-        sizes = [line["known"].get(effect, (0.0, 0.0)) for effect in line["effects"]]
-        return all(size[0] > SHOWN and size[1] > SEPARATE for size in sizes)
-
     return [is_exact(line) for line in lines if is_clear(line)]
 
 
@@ -86,24 +73,16 @@ def percentiles(values: list[float], *which: int, unit: str = "") -> str:
     return ", ".join(f"{np.percentile(values, q):.1f}{unit}" for q in which) if values else "none"
 
 
-def clocks(lines: Iterable[Line]) -> list[bool]:
+def is_clock_right(line: Line) -> bool:
     """Return whether a late motion capture is found within 2 ms, and nothing else is named."""
-
-    def is_right(line: Line) -> bool:
-        true_s, found_s = line["late_s"]
-        return set(named(line)) <= {CLOCK} and abs(found_s - true_s) <= CLOCK_WITHIN_S
-
-    return [is_right(line) for line in lines]
+    true_s, found_s = line["late_s"]
+    return set(named(line)) <= {CLOCK} and abs(found_s - true_s) <= CLOCK_WITHIN_S
 
 
-def onsets(lines: Iterable[Line]) -> list[bool]:
+def is_onset_right(line: Line) -> bool:
     """Return whether exactly the effect that begins in flight is found, and its onset within a second."""
-
-    def is_right(line: Line) -> bool:
-        times = [cause.get("onset_s", [np.inf])[0] for cause in found(line)]
-        return is_exact(line) and all(abs(one - line["onset"]) <= ONSET_WITHIN_S for one in times)
-
-    return [is_right(line) for line in lines]
+    times = [cause.get("onset_s", [np.inf])[0] for cause in found(line)]
+    return is_exact(line) and all(abs(one - line["onset"]) <= ONSET_WITHIN_S for one in times)
 
 
 def is_time_told(line: Line) -> bool:
@@ -121,68 +100,44 @@ def figures(by_row: Rows) -> list[tuple[str, str, str]]:
     removed = [100.0 * line["removed"][0] for line in hiding if line["removed"][1] >= NOTABLE]
     sizes = [len(one) for line in by_row["one"] for one in classes(line)]
     outside = [line for line in by_row["outside"] if line["visible"] >= VISIBLE]
-    seconds = [line["cpu_s"] for lines in by_row.values() for line in lines]
+    every = [line for lines in by_row.values() for line in lines]
     controls = {
         row: [bool(named(line) or line.get("beyond_the_list")) for line in by_row[row]] for row in CONTROLS
     }
+    any_name = [flag for flags in controls.values() for flag in flags]
+    small = [bool(line["negligible"]) for row in CONTROLS for line in by_row[row]]
+    in_class = [any(effect in names for names in classes(line)) for line, effect, _ in shown]
+    silent = [not found(line) for line, _, size in one if size[0] < HIDDEN]
+    told = [any(line["depends_on"] in name for name in line["unexplained"]) for line in outside]
+    begun = [is_time_told(line) for row in ROWS if row != "onset" for line in by_row[row]]
+    gone = f"{percentiles(removed, 50, 10, unit=' %')} of {len(removed)}"
+    late, sudden = map(is_clock_right, by_row["clock"]), map(is_onset_right, by_row["onset"])
     return [
-        (
-            "any name on plants without an effect",
-            "at most 1 %",
-            percent([flag for flags in controls.values() for flag in flags]),
-        ),
+        ("any name on plants without an effect", "at most 1 %", percent(any_name)),
         *((f"the same, {row}", "", percent(flags)) for row, flags in controls.items()),
-        (
-            "something negligible on them",
-            "",
-            percent([bool(line["negligible"]) for row in CONTROLS for line in by_row[row]]),
-        ),
+        ("something negligible on them", "", percent(small)),
         ("detected: any name, lambda > 30", "99 %", percent([bool(found(line)) for line, *_ in shown])),
         ("exact name, lambda > 30 and lambda_sep > 20", "98 %", percent(exact_sets(by_row["one"]))),
-        (
-            "truth in the reported class, lambda > 30",
-            "98 %",
-            percent([any(effect in names for names in classes(line)) for line, effect, _ in shown]),
-        ),
+        ("truth in the reported class, lambda > 30", "98 %", percent(in_class)),
         ("mean size of a class", "at most 1.5", f"{np.mean(sizes):.2f}" if sizes else "none"),
-        ("silent, lambda < 8", "", percent([not found(line) for line, _, size in one if size[0] < HIDDEN])),
+        ("silent, lambda < 8", "", percent(silent)),
         ("exact set of 2, each separable", "95 %", percent(exact_sets(by_row["two"]))),
         ("exact set of 3, each separable", "90 %", percent(exact_sets(by_row["three"]))),
-        (
-            "explainable error removed on a new flight: median, tenth percentile",
-            "99 %, 95 %",
-            f"{percentiles(removed, 50, 10, unit=' %')} of {len(removed)}",
-        ),
+        ("explainable error removed on a new flight: median, tenth percentile", "99 %, 95 %", gone),
         ("95 % intervals cover the truth", "92 to 98 %", percent(covered(same_law))),
         ("the same, beside an effect of another law", "", percent(covered(other_law))),
         ("outside the list: flagged", "95 %", percent([bool(line["unexplained"]) for line in outside])),
-        (
-            "outside the list: dependence named",
-            "80 %",
-            percent([any(line["depends_on"] in name for name in line["unexplained"]) for line in outside]),
-        ),
+        ("outside the list: dependence named", "80 %", percent(told)),
         ("outside the list: false name", "at most 5 %", percent([bool(named(line)) for line in outside])),
+        ("motion capture 0 to 40 ms late: within 2 ms, no other name", "95 %", percent([*late])),
+        ("effect that begins in flight: exact name, onset within 1 s", "90 %", percent([*sudden])),
+        ("others: an onset or end told", "", percent(begun)),
+        ("motion recognised", "", percent([line["is_motion_right"] for line in every])),
         (
-            "motion capture 0 to 40 ms late: within 2 ms, no other name",
-            "95 %",
-            percent(clocks(by_row["clock"])),
+            "CPU seconds a log: median, 95th percentile",
+            "8, 15",
+            percentiles([one["cpu_s"] for one in every], 50, 95),
         ),
-        (
-            "effect that begins in flight: exact name, onset within 1 s",
-            "90 %",
-            percent(onsets(by_row["onset"])),
-        ),
-        (
-            "others: an onset or end told",
-            "",
-            percent([is_time_told(line) for row in ROWS if row != "onset" for line in by_row[row]]),
-        ),
-        (
-            "motion recognised",
-            "",
-            percent([line["is_motion_right"] for lines in by_row.values() for line in lines]),
-        ),
-        ("CPU seconds a log: median, 95th percentile", "8, 15", percentiles(seconds, 50, 95)),
     ]
 
 
@@ -250,43 +205,32 @@ def earlier(last: str) -> list[str]:
     return parts
 
 
-def as_page() -> str:
-    """Return the page."""
+def main() -> None:
+    """Write the page."""
     lines, by_trial = list(read_lines(None).values()), graded(None)
     by_row = {row: [line for trial, line in by_trial.items() if trial.row == row] for row in ROWS}
-    head = HEAD.format(
+    singles = [(line["effects"][0], " + ".join(sorted(named(line))) or "none") for line in by_row["one"]]
+    outside = []
+    for line in by_row["outside"]:
+        if line["visible"] >= VISIBLE:
+            seen = {name.split(": ")[1].split(" at ")[0] for name in line["unexplained"]}
+            outside.append((line["depends_on"], " + ".join(sorted(seen)) or "none"))
+    fill_page(
+        LINES.with_suffix(".md"),
+        "diagnosis",
         plants=", ".join(f"{row} {len(by_row[row])}" for row in ROWS),
         crashed=len(lines) - len(by_trial),
         seeds=sorted({line["seed"] for line in lines}),
         commits=", ".join(sorted({f"{line['commit']} of {line['date']}" for line in lines})),
         machines="; ".join(sorted({line["machine"] for line in lines})),
         visible=VISIBLE,
-    )
-    singles = [(line["effects"][0], " + ".join(sorted(named(line))) or "none") for line in by_row["one"]]
-    outside = [
-        (
-            line["depends_on"],
-            " + ".join(sorted({name.split(": ")[1].split(" at ")[0] for name in line["unexplained"]}))
-            or "none",
-        )
-        for line in by_row["outside"]
-        if line["visible"] >= VISIBLE
-    ]
-    return page(
-        "How well hidden effects are named",
-        head,
-        figures_of_motions(by_trial),
-        "## Other rates of the log",
-        figures_of_rates(by_trial),
-        "## Single effects",
-        counted("truth | plants | named", singles),
-        "## Effects outside the list",
-        counted("depends on | plants | found", outside),
-        "## Every plant with a name missing or false",
-        misses(by_trial),
-        *earlier(lines[-1]["commit"]),
+        figures=figures_of_motions(by_trial),
+        rates=figures_of_rates(by_trial),
+        singles=counted("truth | plants | named", singles),
+        outside=counted("depends on | plants | found", outside),
+        misses="\n\n".join([misses(by_trial), *earlier(lines[-1]["commit"])]),
     )
 
 
 if __name__ == "__main__":
-    write_page(LINES.with_suffix(".md"), as_page())
+    main()

@@ -160,15 +160,16 @@ def main() -> None:
         if peer in rates
     )
     costs = ((name, f"{median_ratio(rates, PLAIN, name):.2f}", f"{MOST_COSTLY:g}") for name in VARIANTS)
-    text = report.page(
-        "Environment speed",
-        f"{report.command_line()}; what limits it: docs/speed.md.",
-        report.table("environment | million steps per CPU second, median | lowest to highest", speeds),
-        report.table("ratio | measured | target", targets),
-        report.table("variant | cost over the plain step | at most", costs),
-        f"{arguments.repeats} rounds, {core}. {report.provenance_line(report.provenance('l2f'))}",
+    report.fill_page(
+        arguments.out,
+        "env_speed",
+        ["l2f"],
+        speeds=report.table("environment | million steps per CPU second, median | lowest to highest", speeds),
+        targets=report.table("ratio | measured | target", targets),
+        costs=report.table("variant | cost over the plain step | at most", costs),
+        repeats=arguments.repeats,
+        core=core,
     )
-    report.write_page(arguments.out, text)
 
 
 if __name__ == "__main__":

@@ -61,13 +61,9 @@ def main() -> None:
         (name, f"{statistics.median(values):,.3g}", report.spread(values, ",.3g"), f"{AIMS[name]:g}")
         for name, values in rates.items()
     ]
-    text = report.page(
-        "Speed through Gymnasium",
-        f"{report.command_line()}; how to use it: docs/gymnasium.md.",
-        report.table("what | million steps per CPU s, median | lowest to highest | aim", rows),
-        f"{arguments.repeats} rounds, {core}. {report.provenance_line(report.provenance('gymnasium'))}",
-    )
-    report.write_page(arguments.out, text)
+    table = report.table("what | million steps per CPU s, median | lowest to highest | aim", rows)
+    counts = {"repeats": arguments.repeats, "core": core}
+    report.fill_page(arguments.out, "gymnasium_speed", ["gymnasium"], table=table, **counts)
 
 
 if __name__ == "__main__":

@@ -2,19 +2,20 @@
 
 ``python -m benchmarks.identification [--plants 50] [--seed 0]`` writes docs/results/identification_plants.md.
 Every plant has four lags of 0.01 to 0.08 s and a thrust curve of its own, in equations that share nothing
-with the package. It is flown for two minutes and identified from four logs: clean, measured by common
+with the simulator. It is flown for two minutes and identified from four logs: clean, measured by common
 sensors, the same without accelerometer, and with velocity and attitude only (besides the battery).
 """
 
 import argparse
 import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
 from benchmarks import report
+from benchmarks.hidden import Truth
+from benchmarks.loop.plants import HiddenPlant
 from flytrack_env.state import ACTION_SIZE
 from flytrack_sysid import collect, fit
 from flytrack_sysid.log import FlightLog
@@ -22,9 +23,7 @@ from flytrack_sysid.parameters import TAUS, THRUST_COEFFS
 from flytrack_sysid.sensors import measure
 
 PAGE = report.RESULTS / "identification_plants.md"
-DT_S, GRAVITY = 0.01, 9.80665
 TAU_RANGE_S = (0.01, 0.08)
-FULL_STICK = np.deg2rad([618.0, 618.0, 120.0])
 MINUTES = 2.0
 # Aims for each kind of log: largest error of a lag, and of the thrust map over full thrust.
 AIMS = {
@@ -40,47 +39,19 @@ HEADER = (
 COVERAGE_AIM = (0.90, 0.99)
 
 
-class Truth(NamedTuple):
-    """A plant: lags (4,) s, and thrust coefficients (6,) N of 1, u, u^2, u^3, V, u V."""
-
-    tau: np.ndarray
-    coeffs: np.ndarray
-
-
 def draw_truth(rng: np.random.Generator) -> Truth:
     """Return a plant whose thrust grows from about 0 at idle to 2 to 5 times its weight."""
     low, quadratic, cubic = rng.uniform(-9.0, -6.0), rng.uniform(1.0, 5.0), rng.uniform(-1.0, 1.0)
     per_volt, idle = rng.uniform(0.7, 1.2), rng.uniform(0.0, 1.0)
     # (1 + u) (low + quadratic u + cubic u^2 + per_volt V) + idle
     coeffs = [low + idle, low + quadratic, quadratic + cubic, cubic, per_volt, per_volt]
-    return Truth(rng.uniform(*TAU_RANGE_S, ACTION_SIZE), np.array(coeffs))
+    return Truth(tuple(rng.uniform(*TAU_RANGE_S, ACTION_SIZE)), tuple(coeffs))
 
 
 def terms(action: np.ndarray, battery_v: np.ndarray) -> np.ndarray:
     """Return 1, u, u^2, u^3, V, u V; (..., 6)."""
     columns = (np.ones_like(action), action, action**2, action**3, battery_v, action * battery_v)
     return np.stack(columns, axis=-1)
-
-
-def step_of(truth: Truth) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
-    """Return the plant as a function of the handout's vectors (21,), (4,) -> (21,) float32."""
-    keep = np.exp(-DT_S / truth.tau)
-
-    def step(x: np.ndarray, u: np.ndarray) -> np.ndarray:
-        x = np.asarray(x, float)
-        applied = u + (x[16:20] - u) * keep
-        p, q, r = FULL_STICK * applied[:3]
-        spin = np.array([[0, -p, -q, -r], [p, 0, r, -q], [q, -r, 0, p], [r, q, -p, 0]])
-        quat = x[9:13] + 0.5 * DT_S * spin @ x[9:13]
-        w, i, j, k = x[9:13]
-        axis = np.array([2 * (i * k + w * j), 2 * (j * k - w * i), 1 - 2 * (i * i + j * j)])
-        acc = axis * (terms(applied[3], x[20]) @ truth.coeffs) - np.array([0.0, 0.0, GRAVITY])
-        pos = x[0:3] + DT_S * x[3:6] + 0.5 * DT_S**2 * acc
-        vel = x[3:6] + DT_S * acc
-        quat, rates, battery_v = quat / np.linalg.norm(quat), [p, q, r], [x[20] - DT_S / 60.0]
-        return np.concatenate([pos, vel, acc, quat, rates, applied, battery_v]).astype(np.float32)
-
-    return step
 
 
 class Outcome(NamedTuple):
@@ -114,8 +85,8 @@ def run(num_plants: int, seed: int) -> dict[str, list[Outcome]]:
     for number in report.progress(range(num_plants), "plants"):
         rng = np.random.default_rng([seed, number])
         truth = draw_truth(rng)
-        clean = collect(step_of(truth), MINUTES, seed=number)
-        sensors = measure(clean, 1.0, GRAVITY, rng)
+        clean = collect(HiddenPlant(truth), MINUTES, seed=number)
+        sensors = measure(clean, 1.0, truth.gravity, rng)
         without = (), ("f",), ("f", "w", "p")
         logs = dict(zip(AIMS, (clean, *(sensors.without(*names) for names in without)), strict=True))
         for name, log in logs.items():
@@ -123,8 +94,8 @@ def run(num_plants: int, seed: int) -> dict[str, list[Outcome]]:
     return outcomes
 
 
-def as_page(outcomes: dict[str, list[Outcome]]) -> str:
-    """Return the results as a page in Markdown."""
+def rows_of(outcomes: dict[str, list[Outcome]]) -> list[tuple[str, ...]]:
+    """Return a row of the table per kind of log."""
     rows = []
     for name, found in outcomes.items():
         tau, thrust = np.array([[one.tau_error, one.map_error] for one in found]).T
@@ -134,17 +105,7 @@ def as_page(outcomes: dict[str, list[Outcome]]) -> str:
         cells = [f"{tau.max():.4%}", f"{AIMS[name][0]:.2%}", f"{np.median(tau):.4%}"]
         cells += [f"{thrust.max():.4%}", f"{AIMS[name][1]:.2%}", f"{np.median(thrust):.4%}"]
         rows.append((name, *cells, cover, times))
-    return report.page(
-        "Identification of plants drawn at run time",
-        f"{report.command_line()}: two minutes of each plant, three quarters of it fitted, on one core.\n"
-        "Sensors: gyro 0.1 rad/s, accelerometer 1.5 m/s^2, velocity 0.05 m/s, attitude 0.5 degrees,\n"
-        "quantised, 2 % of rows lost, no applied action (`flytrack_sysid/sensors.py`).",
-        report.table(HEADER, rows),
-        "Intervals are of the four lags and six coefficients of every plant; the aim is "
-        f"{COVERAGE_AIM[0]:.0%} to {COVERAGE_AIM[1]:.0%}. Clean logs\ncontain only rounding, which intervals "
-        "of noise do not describe. The largest times include compiling for logs\nof another length.",
-        report.provenance_line(report.provenance()),
-    )
+    return rows
 
 
 def main() -> None:
@@ -155,7 +116,8 @@ def main() -> None:
     parser.add_argument("--page", type=Path, default=PAGE, help="page to write")
     arguments = parser.parse_args()
     report.pin_to_one_core()
-    report.write_page(arguments.page, as_page(run(arguments.plants, arguments.seed)))
+    table = report.table(HEADER, rows_of(run(arguments.plants, arguments.seed)))
+    report.fill_page(arguments.page, "identification", table=table, aim=COVERAGE_AIM)
 
 
 if __name__ == "__main__":

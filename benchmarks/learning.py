@@ -70,16 +70,17 @@ def main() -> None:
     identify(SHIPPED_BLACK_BOX, out, seed=0)
     results = [measure_seed(seed, out, config) for seed in report.progress(range(arguments.seeds), "seed")]
     reached = sum(success >= TARGET_SUCCESS for success, _ in results)
-    text = report.page(
-        "Learning: from black box to race",
-        f"{report.command_line()}. CPU seconds include compilation. {NUM_EPISODES} noisy starts, {NUM_LAPS} "
-        f"laps; training seeds with at least {TARGET_SUCCESS:.0%}: **{reached} of {len(results)}**. Margin: "
-        f"by how much thicker, to every side, the drone could be for {TARGET_SUCCESS:.0%} still to finish "
-        f"({', '.join(f'{thicker:g}' for thicker in THICKER_M)} m were tried).",
-        report.table(HEADER, [row for _, row in results]),
-        report.provenance_line(report.provenance()),
+    report.fill_page(
+        arguments.table,
+        "learning",
+        table=report.table(HEADER, [row for _, row in results]),
+        episodes=NUM_EPISODES,
+        laps=NUM_LAPS,
+        target=TARGET_SUCCESS,
+        reached=reached,
+        seeds=len(results),
+        thicker=", ".join(f"{thicker:g}" for thicker in THICKER_M),
     )
-    report.write_page(arguments.table, text)
     if reached < len(results):
         raise SystemExit(1)
 

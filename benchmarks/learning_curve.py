@@ -115,20 +115,22 @@ def main() -> None:
     chart = arguments.out.with_suffix(".png")
     draw(chart, curves)
     num_held = sum(held_from(points) is not None for points in curves.values())
-    text = report.page(
-        "Learning to race from scratch",
-        f"{report.command_line()} with "
-        f"{', '.join(f'{name} {value:g}' for name, value in settings.items())}, the "
-        f"rest as by default, on FlyTrack-v0. Every {EVERY / 1e6:g} M environment steps {NUM_EPISODES} noisy "
-        f"starts, {NUM_LAPS} laps, in the simulator. CPU seconds of training alone, without compilation and "
-        f"evaluations. Seeds that hold {TARGET_SUCCESS:.0%} to the end: **{num_held} of {len(curves)}** "
-        "(aim: "
-        f"all, in runs of at most {AIM_STEPS / 1e6:g} M steps and {AIM_CPU_S:g} CPU s).",
-        report.table(HEADER, [row_of(seed, points) for seed, points in curves.items()]),
-        f"![curves]({chart.name})",
-        f"{pinned.capitalize()}. {report.provenance_line(report.provenance())}",
+    report.fill_page(
+        arguments.out,
+        "learning_curve",
+        settings=", ".join(f"{name} {value:g}" for name, value in settings.items()),
+        every=EVERY / 1e6,
+        episodes=NUM_EPISODES,
+        laps=NUM_LAPS,
+        target=TARGET_SUCCESS,
+        held=num_held,
+        seeds=len(curves),
+        aim_steps=AIM_STEPS / 1e6,
+        aim_s=AIM_CPU_S,
+        table=report.table(HEADER, [row_of(seed, points) for seed, points in curves.items()]),
+        chart=chart.name,
+        pinned=pinned.capitalize(),
     )
-    report.write_page(arguments.out, text)
     if num_held < len(curves) or max(points[-1].cpu_s for points in curves.values()) > AIM_CPU_S:
         raise SystemExit(1)
 

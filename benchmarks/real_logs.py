@@ -21,7 +21,7 @@ from benchmarks.real.crazyflie import DATA, FOLDER, LINES, VARIABLE, flights
 from benchmarks.real.page import crazyflie_part
 from benchmarks.real.record import Record, diagnosed, imported
 from benchmarks.real.section import draw, section
-from benchmarks.report import RESULTS, write_json
+from benchmarks.report import RESULTS, ROOT, write_json
 from flytrack_env.files import write_atomically
 from flytrack_env.pictures.drawing import png_of
 from flytrack_sysid import LogError
@@ -53,14 +53,6 @@ def betaflight(data: Path) -> Record:
     found = imported(data / BETAFLIGHT / "shortLog.BFL", "betaflight", QUAD)
     return diagnosed(found.log, found.nominal_model())[1]
 
-
-HEAD = """# The diagnosis on measured flights
-
-Written by `python -m benchmarks.real_logs` from the records in `benchmarks/data/real`; do not edit. The
-flights were measured by others and are not part of this repository: they are read from `../shared/data`, or
-the folder that `FLYTRACK_SHARED_DATA` names ([real logs](../real_logs.md)). How to read this page:
-[the diagnosis](../diagnosis.md); how far to trust it:
-[real logs](../real_logs.md#diagnoses-of-these-logs)."""
 
 DIAGNOSED_HEAD = """Learnt from are the flights of policies {learnt}; held out are those of policies {judged},
 which command differently."""
@@ -131,7 +123,8 @@ def kept(craft: str) -> Path:
 
 def page() -> tuple[str, dict[str, bytes]]:
     """Return the page on what is on record, and its pictures by file."""
-    parts, pictures = [HEAD, "## Crazyflie 2.1, flown by learned policies", crazyflie_part()], {}
+    head = (ROOT / "benchmarks" / "pages" / "real_logs.md").read_text(encoding="utf-8").strip()
+    parts, pictures = [head, "## Crazyflie 2.1, flown by learned policies", crazyflie_part()], {}
     for name, craft in CRAFTS.items():
         parts.append(f"## {craft.title}")
         if not kept(name).exists():

@@ -115,6 +115,16 @@ def page(title: str, *parts: str) -> str:
     return "\n\n".join([f"# {title}", *(part.strip("\n") for part in parts)]) + "\n"
 
 
+def fill_page(path: Path | None, name: str, packages: Sequence[str] = (), **values: Any) -> None:
+    """Print a page and write it atomically: a template of ``benchmarks/pages`` with values filled in.
+
+    ``{command}`` and ``{provenance}`` need not be given. packages: as for ``provenance``.
+    """
+    template = (ROOT / "benchmarks" / "pages" / f"{name}.md").read_text(encoding="utf-8")
+    values = {"command": command_line(), "provenance": provenance_line(provenance(*packages)), **values}
+    write_page(path, template.format(**values))
+
+
 def write_page(path: Path | None, text: str) -> None:
     """Print a page and write it atomically; path: None to print only."""
     print(text, end="", flush=True)

@@ -123,16 +123,8 @@ def main() -> None:
             rows.append((f"{value:,}", f"{speed:.3g}", f"{start_s:.1f}"))
         table = report.table((title, "million steps per second", "start (s)"), rows)
         parts += [f"## {title.capitalize()}", table]
-    text = report.page(
-        "Scaling",
-        f"{report.command_line()}: how cost grows with environments, effects, gates, networks and seeds. "
-        "What the figures mean, and how to train on several machines: [scaling](../scaling.md). Rates on a "
-        "CPU are million steps per second of CPU time, of one core; each is the median of five calls. Start: "
-        "compilation and the first call.",
-        *parts,
-        f"{jax.devices()[0].device_kind}, {pinned}. {report.provenance_line(report.provenance())}",
-    )
-    report.write_page(arguments.page, text)
+    tables, device = "\n\n".join(parts), jax.devices()[0].device_kind
+    report.fill_page(arguments.page, "scaling", tables=tables, device=device, pinned=pinned)
 
 
 if __name__ == "__main__":

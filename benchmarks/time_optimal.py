@@ -17,6 +17,7 @@ from benchmarks.optimal.page import write_page, write_pictures
 from benchmarks.optimal.replay import Replay, replay
 from flytrack_env import FlyTrack, ModelParameters, Track, available_tracks, blackbox, load_model, load_track
 from flytrack_env import nominal_parameters as nominal
+from flytrack_env import state as layout
 from flytrack_env.dynamics import SECONDS_PER_MINUTE, step
 from flytrack_env.references import (
     FOLDER,
@@ -28,15 +29,6 @@ from flytrack_env.references import (
     track_digest,
 )
 from flytrack_env.resets import STILL_THRUST
-from flytrack_env.state import (
-    ACTION_SIZE,
-    APPLIED_ACTION,
-    BATTERY,
-    BATTERY_FULL_V,
-    POSITION,
-    QUATERNION,
-    STATE_SIZE,
-)
 
 SHIPPED_BLACK_BOX = Path(__file__).parents[1] / "blackbox" / "acro_step.bin"
 NOMINAL, BLACK_BOX = "nominal", "black_box"
@@ -45,9 +37,9 @@ LARGEST_ERROR_S = 1e-3  # s, of the replay's time
 
 def start_state(track: Track, battery_v: float) -> np.ndarray:
     """Return the state at rest at the start pose, rotors still, (21,)."""
-    state = np.zeros(STATE_SIZE)
-    state[POSITION], state[QUATERNION] = track.start_position, track.start_quaternion
-    state[APPLIED_ACTION][-1], state[BATTERY] = STILL_THRUST, battery_v
+    state = np.zeros(layout.STATE_SIZE)
+    state[layout.POSITION], state[layout.QUATERNION] = track.start_position, track.start_quaternion
+    state[layout.APPLIED_ACTION][-1], state[layout.BATTERY] = STILL_THRUST, battery_v
     return state
 
 
@@ -58,8 +50,8 @@ def drained_in_float32(model: ModelParameters, start: np.ndarray, dt_s: float) -
     same way: millimetres on a path, after seconds. start: (21,), the state at which rounding is measured.
     """
     rounded = jax.tree.map(lambda leaf: np.asarray(leaf, np.float32), model._replace(effects=()))
-    after = step(jnp.asarray(start, jnp.float32), jnp.zeros(ACTION_SIZE), np.float32(dt_s), rounded)
-    drained_v = float(np.float32(start[BATTERY])) - float(after[BATTERY])
+    after = step(jnp.asarray(start, jnp.float32), jnp.zeros(layout.ACTION_SIZE), np.float32(dt_s), rounded)
+    drained_v = float(np.float32(start[layout.BATTERY])) - float(after[layout.BATTERY])
     return model._replace(battery_drain_v_per_min=drained_v / dt_s * SECONDS_PER_MINUTE)
 
 
@@ -76,14 +68,14 @@ def optimise(track: Track, kind: str, model: ModelParameters, model_name: str) -
 
     env = FlyTrack(track=track, model=model)
     params = env.default_params
-    dt_s, start = float(params.dt), start_state(track, BATTERY_FULL_V)
+    dt_s, start = float(params.dt), start_state(track, layout.BATTERY_FULL_V)
     task = Task(kind, params.course, float(params.drone_radius), start)
     optimum = find_optimum(task, drained_in_float32(model, start, dt_s), dt_s)
     about = {
         "command": report.command_line(),
         "casadi": casadi.__version__,
         "jax": jax.__version__,
-        "battery_v": BATTERY_FULL_V,
+        "battery_v": layout.BATTERY_FULL_V,
         "drone_radius_m": task.radius_m,
         "clearance_m": CLEARANCE_M,
         "smoothing_s": SMOOTHING_S,

@@ -12,7 +12,7 @@ import numpy as np
 
 import flytrack_env
 from baselines.purejaxrl_ppo import Config
-from baselines.purejaxrl_ppo.flights import Outcomes, fly_many, outcomes_of, score
+from baselines.purejaxrl_ppo.flights import fly_many, outcomes_of, score
 from baselines.purejaxrl_ppo.training import train_policy
 from benchmarks import report
 from flytrack_env.files import fresh_folder
@@ -26,11 +26,6 @@ HEADER = (
     "track | gates | length (m) | success | gates passed | first lap (s) | flying lap (s) | "
     "highest speed (m/s) | ended early by"
 )
-
-
-def describe_ends(outcomes: Outcomes) -> str:
-    """Return the causes that ended episodes before the last lap, with their counts."""
-    return ", ".join(f"{name} {end.sum()}" for name, end in outcomes.ends().items() if end.any()) or "-"
 
 
 def measure_track(name: str, track: str | Path, seed: int, out: Path, config: Config) -> tuple[str, ...]:
@@ -52,7 +47,7 @@ def measure_track(name: str, track: str | Path, seed: int, out: Path, config: Co
         f"{result.first_lap_s:.3f}",
         f"{result.flying_lap_s:.3f}",
         f"{np.linalg.norm(velocities, axis=1).max():.1f}",
-        describe_ends(outcomes),
+        ", ".join(f"{name} {end.sum()}" for name, end in outcomes.ends().items() if end.any()) or "-",
     )
 
 
@@ -75,16 +70,8 @@ def main() -> None:
     for name, track in tracks.items():
         rows.append(measure_track(name, track, arguments.seed, out, config))
         print(*rows[-1], sep=", ", flush=True)
-    text = report.page(
-        "Racing on every track",
-        f"{report.command_line()}: one policy per track, trained with the shipped recipe for "
-        f"{config.total_timesteps:,} steps on the nominal model and flown in the same simulator from "
-        f"{NUM_EPISODES} noisy starts, {NUM_LAPS} laps. Length: of the path on which episodes start. "
-        "First lap: from standstill at the start to the last gate.",
-        report.table(HEADER, rows),
-        report.provenance_line(report.provenance()),
-    )
-    report.write_page(arguments.table, text)
+    counts = {"steps": config.total_timesteps, "episodes": NUM_EPISODES, "laps": NUM_LAPS}
+    report.fill_page(arguments.table, "tracks", table=report.table(HEADER, rows), **counts)
 
 
 if __name__ == "__main__":

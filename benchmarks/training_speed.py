@@ -49,17 +49,17 @@ def main() -> None:
             print(f"{name}: {rates[name][-1]:,.0f} steps per CPU s", flush=True)
     rows = [[name, f"{statistics.median(found):,.0f}", report.spread(found)] for name, found in rates.items()]
     alone, watched = (statistics.median(found) for found in rates.values())
-    text = report.page(
-        "Training speed",
-        f"{report.command_line()}: the default recipe, 2 x 64 network, {arguments.total_timesteps:g} steps, "
-        f"{arguments.repeats} times. Environment steps per CPU second, end to end, without compilation.",
-        report.table("training | median | lowest to highest", rows),
-        f"Checkpoints, evaluations, charts and MLflow, a new store included, cost "
-        f"{1.0 - watched / alone:.1%} (aim: at most {AIM_COST:.0%}). "
-        f"Aim with all of it: {AIM_STEPS_PER_S:,}.",
-        f"{pinned.capitalize()}. {report.provenance_line(report.provenance())}",
+    report.fill_page(
+        report.RESULTS / "training_speed.md",
+        "training_speed",
+        table=report.table("training | median | lowest to highest", rows),
+        steps=arguments.total_timesteps,
+        repeats=arguments.repeats,
+        cost=1.0 - watched / alone,
+        aim_cost=AIM_COST,
+        aim=AIM_STEPS_PER_S,
+        pinned=pinned.capitalize(),
     )
-    report.write_page(report.RESULTS / "training_speed.md", text)
     if watched < AIM_STEPS_PER_S or 1.0 - watched / alone > AIM_COST:
         raise SystemExit(1)
 

@@ -40,15 +40,8 @@ def main() -> None:
         f"gained by **{reached[name]} of {arguments.seeds}** seeds"
         for name, client in CLIENTS.items()
     )
-    text = report.page(
-        "Clients: training by code of others",
-        f"{report.command_line()}. Means over the episodes of an evaluation before training and one after it "
-        "([what is trained](../clients.md)); times include compilation.",
-        margins,
-        report.table(HEADER, rows),
-        report.provenance_line(report.provenance(*CLIENTS, "torch", "gymnasium")),
-    )
-    report.write_page(report.RESULTS / "clients.md", text)
+    table, packages = report.table(HEADER, rows), [*CLIENTS, "torch", "gymnasium"]
+    report.fill_page(report.RESULTS / "clients.md", "clients", packages, margins=margins, table=table)
     if min(reached.values()) < arguments.seeds:
         raise SystemExit(1)
 

@@ -9,16 +9,8 @@ import numpy as np
 from scipy import optimize
 
 from flytrack_env.dynamics import ModelParameters
+from flytrack_sysid import parameters
 from flytrack_sysid.log import FlightLog
-from flytrack_sysid.parameters import (
-    TAUS,
-    THRUST_COEFFS,
-    bounds_of,
-    from_vector,
-    names_of,
-    to_vector,
-    with_values,
-)
 from flytrack_sysid.record import make_record
 from flytrack_sysid.residuals import CENTRED, Problem, make_problem, residuals
 
@@ -33,7 +25,10 @@ LAST_RISE = 1e-10  # of the cost, which rounding may add to such a step
 LAST_STEPS = 3  # from an error of 1e-8, where the cost is flat to rounding, to that of the slopes
 # How far thrust coefficients may lie from where the search starts, in weights of the drone (per volt for
 # the last two): weak enough to move nothing that the data determine, and it keeps the rest finite.
-PRIOR_WEIGHTS = {**dict.fromkeys(THRUST_COEFFS[:4], 10.0), **dict.fromkeys(THRUST_COEFFS[4:], 1.0)}
+PRIOR_WEIGHTS = {
+    **dict.fromkeys(parameters.THRUST_COEFFS[:4], 10.0),
+    **dict.fromkeys(parameters.THRUST_COEFFS[4:], 1.0),
+}
 
 
 class FitError(ValueError):
@@ -66,7 +61,7 @@ def _weighted(
     weights: dict[str, jax.Array],
 ) -> jax.Array:
     """Return all residuals times their weights, flat, with ``values`` in these places of the vector."""
-    found = residuals(from_vector(vector.at[where].set(values), like), problem)
+    found = residuals(parameters.from_vector(vector.at[where].set(values), like), problem)
     return jnp.concatenate([(found[name] * weights[name]).ravel() for name in sorted(found)])
 
 
@@ -87,12 +82,12 @@ class _Search:
         self, start: ModelParameters, free: tuple[str, ...], problem: Problem, noise: dict[str, np.ndarray]
     ):
         self.free, self.problem = free, problem
-        names = names_of(start)
+        names = parameters.names_of(start)
         where = np.array([names.index(name) for name in free])
-        vector = to_vector(start)
+        vector = parameters.to_vector(start)
         self.given = where, vector, start, problem, {name: 1.0 / sigma for name, sigma in noise.items()}
         self.centre = vector[where]
-        self.is_log = np.array([name in TAUS for name in free])
+        self.is_log = np.array([name in parameters.TAUS for name in free])
         self.counting = _counts(problem)
         scale = [PRIOR_WEIGHTS.get(name, np.inf) for name in free]
         self.prior_weight = 1.0 / (np.array(scale) * float(start.m) * float(start.g))
@@ -121,7 +116,7 @@ class _Search:
 
     def run(self, tolerance: float) -> tuple[np.ndarray, np.ndarray]:
         """Return the numbers found, and their covariance in the scale of the search."""
-        bounds = np.array([bounds_of(name) for name in self.free])
+        bounds = np.array([parameters.bounds_of(name) for name in self.free])
         bounds[self.is_log] = np.log(bounds[self.is_log])
         start = np.where(self.is_log, np.log(np.abs(self.centre) + LEAST_NOISE), self.centre)
         try:
@@ -219,12 +214,6 @@ def _spread(values: np.ndarray, channel_name: str, problem: Problem) -> np.ndarr
     return np.sqrt(np.sum(values**2, axis=0) / np.maximum(count, 1.0))
 
 
-def channel_noise(model: ModelParameters, problem: Problem) -> dict[str, np.ndarray]:
-    """Return the rms of what a model leaves of each channel, per component."""
-    found = jax.jit(residuals)(model, problem)
-    return {name: _spread(np.asarray(values), name, problem) for name, values in found.items()}
-
-
 def estimate(
     log: FlightLog,
     judged: np.ndarray,
@@ -249,9 +238,10 @@ def estimate(
             noise = noise or {name: np.full(width, FIRST_NOISE[name]) for name, width in widths.items()}
             search = _acting_search(model, free, problem, noise, may_be_idle=number == 0)
             params, covariance = search.run(tolerance)
-            model = with_values(model, dict(zip(search.free, search.values(params), strict=True)))
-            noise = {
-                name: np.maximum(left, LEAST_NOISE) for name, left in channel_noise(model, problem).items()
+            model = parameters.with_values(model, dict(zip(search.free, search.values(params), strict=True)))
+            noise = {  # the rms of what the model leaves
+                name: np.maximum(_spread(np.asarray(left), name, problem), LEAST_NOISE)
+                for name, left in jax.jit(residuals)(model, problem).items()
             }
             report(number + 1, len(TOLERANCES))
     chain = np.where(search.is_log, np.exp(np.where(search.is_log, params, 0.0)), 1.0)

@@ -11,24 +11,15 @@ from numpy.typing import ArrayLike
 from scipy import signal
 from scipy.spatial.transform import Rotation
 
-from flytrack_env.state import (
-    APPLIED_ACTION,
-    BATTERY,
-    BATTERY_EMPTY_V,
-    BATTERY_FULL_V,
-    POSITION,
-    QUATERNION,
-    STATE_SIZE,
-    VELOCITY,
-)
+from flytrack_env import state as layout
 
 # The envelope of collected flights.
 LARGEST_SPEED = 20.0  # m/s
 HEIGHTS = (10.0, 110.0)  # m
 SCRIPT_HEIGHTS = (0.1, 110.0)  # m, of a script, which may want flights close to the ground
-VOLTAGES = (BATTERY_EMPTY_V, BATTERY_FULL_V)
+VOLTAGES = (layout.BATTERY_EMPTY_V, layout.BATTERY_FULL_V)
 ANY_VOLTAGE = (0.0, np.inf)  # of other craft
-MIDDLE_V = 0.5 * (BATTERY_EMPTY_V + BATTERY_FULL_V)
+MIDDLE_V = 0.5 * (layout.BATTERY_EMPTY_V + layout.BATTERY_FULL_V)
 FEWEST_STEPS = 2  # of a flight; a shorter one shows no step
 
 DT_S = 0.01
@@ -54,8 +45,8 @@ def is_inside(
     states: np.ndarray, heights: tuple[float, float] = HEIGHTS, voltages: tuple[float, float] = VOLTAGES
 ) -> np.ndarray:
     """Return where states (..., 21) are within the envelope, heights in m, voltages in V; NaN is not."""
-    height, battery_v = states[..., POSITION][..., 2], states[..., BATTERY]
-    is_slow = np.linalg.norm(states[..., VELOCITY], axis=-1) <= LARGEST_SPEED
+    height, battery_v = states[..., layout.POSITION][..., 2], states[..., layout.BATTERY]
+    is_slow = np.linalg.norm(states[..., layout.VELOCITY], axis=-1) <= LARGEST_SPEED
     is_charged = (battery_v >= voltages[0]) & (battery_v <= voltages[1])
     return is_slow & is_charged & (height >= heights[0]) & (height <= heights[1])
 
@@ -96,11 +87,11 @@ def start_at(
     attitude: Rotation, hover: float, voltage: float, vel_w: ArrayLike = 0.0, height: float = HEIGHT
 ) -> np.ndarray:
     """Return a start (21,) with the thrust action ``hover``, above the origin; m/s, m, V."""
-    x = np.zeros(STATE_SIZE)
-    x[POSITION], x[VELOCITY] = [0.0, 0.0, height], vel_w
-    x[QUATERNION] = attitude.as_quat(scalar_first=True, canonical=True)
-    x[APPLIED_ACTION] = [0.0, 0.0, 0.0, hover]
-    x[BATTERY] = voltage
+    x = np.zeros(layout.STATE_SIZE)
+    x[layout.POSITION], x[layout.VELOCITY] = [0.0, 0.0, height], vel_w
+    x[layout.QUATERNION] = attitude.as_quat(scalar_first=True, canonical=True)
+    x[layout.APPLIED_ACTION] = [0.0, 0.0, 0.0, hover]
+    x[layout.BATTERY] = voltage
     return x
 
 
@@ -159,9 +150,9 @@ def _voltages(kind: str, turns: int, rng: np.random.Generator) -> np.ndarray:
     order, except for the last of every four, which may be held out: these are spread over the range by turn
     and kind.
     """
-    lowest, count = BATTERY_EMPTY_V + RESERVE_V, turns * FLIGHTS_PER_KIND
+    lowest, count = layout.BATTERY_EMPTY_V + RESERVE_V, turns * FLIGHTS_PER_KIND
     share = 0.5 - 0.5 * np.cos(np.pi * np.arange(count) / (count - 1))
-    levels = lowest + share * (BATTERY_FULL_V - lowest)
+    levels = lowest + share * (layout.BATTERY_FULL_V - lowest)
     last = np.arange(turns) * FLIGHTS_PER_KIND + KINDS.index(kind) % FLIGHTS_PER_KIND
     others = rng.permutation(np.delete(levels, last)).reshape(turns, FLIGHTS_PER_KIND - 1)
     return np.column_stack([others, rng.permutation(levels[last])])

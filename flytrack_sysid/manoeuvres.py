@@ -12,29 +12,12 @@ from scipy.spatial.transform import Rotation
 
 from flytrack_env.dynamics import ModelParameters, collective_thrust
 from flytrack_env.state import BATTERY, BATTERY_EMPTY_V, BATTERY_FULL_V
-from flytrack_sysid.excitation import (
-    AMPLITUDES,
-    DT_S,
-    FLIGHT_STEPS,
-    FREE_AMPLITUDES,
-    HEIGHT,
-    LEG_SPEEDS,
-    LEG_SWING,
-    MIDDLE_V,
-    RESERVE_V,
-    SLOT_STEPS,
-    SLOW_STEPS,
-    VOLTAGES,
-    ScriptedFlight,
-    start_at,
-    switching,
-    wave,
-)
+from flytrack_sysid import excitation
 
 # All manoeuvres have the same length to be comparable. Even: two flights fill a lane of a diagnosis.
 FLIGHTS_PER_MANOEUVRE = 8
-SECONDS_PER_MANOEUVRE = FLIGHTS_PER_MANOEUVRE * FLIGHT_STEPS * DT_S
-STARTS_V = np.linspace(BATTERY_EMPTY_V + RESERVE_V, BATTERY_FULL_V, FLIGHTS_PER_MANOEUVRE)
+SECONDS_PER_MANOEUVRE = FLIGHTS_PER_MANOEUVRE * excitation.FLIGHT_STEPS * excitation.DT_S
+STARTS_V = np.linspace(BATTERY_EMPTY_V + excitation.RESERVE_V, BATTERY_FULL_V, FLIGHTS_PER_MANOEUVRE)
 SWING_HZ = 1.0  # of a thrust that oscillates about hovering
 HOVER_SWING = 0.05  # of the stick: no pilot holds it still
 VOLTAGE_SWING = 0.5
@@ -44,7 +27,7 @@ LOW_SPEED = 2.0  # m/s, of every other low pass
 TILTS_DEG = (20.0, 40.0, 60.0, 80.0)
 QUICK_STEPS = (1, 6)  # how long fast switching is held
 # m/s upwards at the start of flips, whose thrust lifts nothing on average: half of what a flight loses.
-FLIP_CLIMB = 0.5 * 9.8 * FLIGHT_STEPS * DT_S
+FLIP_CLIMB = 0.5 * 9.8 * excitation.FLIGHT_STEPS * excitation.DT_S
 SPIN_STICKS = (
     *((sign, 0.0, 0.0) for sign in (1.0, -1.0)),
     *((0.0, sign, 0.0) for sign in (1.0, -1.0)),
@@ -64,21 +47,21 @@ class Manoeuvre(NamedTuple):
 
 def _start(
     hover: float,
-    voltage: float = MIDDLE_V,
+    voltage: float = excitation.MIDDLE_V,
     yaw_deg: float = 0.0,
     tilt_deg: float = 0.0,
     vel_w: Iterable[float] = (0.0, 0.0, 0.0),
-    height: float = HEIGHT,
+    height: float = excitation.HEIGHT,
 ) -> np.ndarray:
     """Return a start (21,): yawed, then tilted about body x, with the thrust action ``hover``."""
     attitude = Rotation.from_euler("ZX", [yaw_deg, tilt_deg], degrees=True)
-    return start_at(attitude, hover, voltage, tuple(vel_w), height)
+    return excitation.start_at(attitude, hover, voltage, tuple(vel_w), height)
 
 
 def _swing(hover: float, size: float, rng: np.random.Generator) -> np.ndarray:
     """Return centred sticks and a thrust that oscillates slowly about hovering, (FLIGHT_STEPS, 4)."""
-    command = np.zeros((FLIGHT_STEPS, 4))
-    time = np.arange(FLIGHT_STEPS) * DT_S
+    command = np.zeros((excitation.FLIGHT_STEPS, 4))
+    time = np.arange(excitation.FLIGHT_STEPS) * excitation.DT_S
     command[:, 3] = hover + size * np.sin(2 * np.pi * SWING_HZ * time + rng.uniform(0, 2 * np.pi))
     return command
 
@@ -89,11 +72,11 @@ def _headings(number: int, hover: float, rng: np.random.Generator) -> tuple[np.n
 
 def _speeds(number: int, hover: float, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     """Return a leg along x or, every other, along y of the body; climbing and sinking by pairs."""
-    speed, yaw_deg = LEG_SPEEDS[number // 2], 90.0 * rng.integers(4)
+    speed, yaw_deg = excitation.LEG_SPEEDS[number // 2], 90.0 * rng.integers(4)
     course = np.deg2rad(yaw_deg + 90.0 * (number % 2))
     climb = STEEPNESS * (-1.0) ** (number // 2)
     vel_w = speed * np.array([np.cos(course), np.sin(course), climb]) / np.hypot(1.0, climb)
-    return _start(hover, STARTS_V[number], yaw_deg, vel_w=vel_w), _swing(hover, LEG_SWING, rng)
+    return _start(hover, STARTS_V[number], yaw_deg, vel_w=vel_w), _swing(hover, excitation.LEG_SWING, rng)
 
 
 def _low_passes(number: int, hover: float, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
@@ -102,28 +85,32 @@ def _low_passes(number: int, hover: float, rng: np.random.Generator) -> tuple[np
 
 
 def _thrust(number: int, hover: float, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    command = np.zeros((FLIGHT_STEPS, 4))
-    command[:, 3] = switching(rng, 0.5, SLOW_STEPS) if number % 2 else switching(rng)
+    command = np.zeros((excitation.FLIGHT_STEPS, 4))
+    command[:, 3] = excitation.switching(rng, *((0.5, excitation.SLOW_STEPS) if number % 2 else ()))
     return _start(hover, STARTS_V[number]), command
 
 
 def _tilted(number: int, hover: float, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     tilt_deg = TILTS_DEG[number // 2] * (-1.0) ** number
-    return _start(hover, STARTS_V[number], 90.0 * rng.integers(4), tilt_deg), _swing(hover, LEG_SWING, rng)
+    start = _start(hover, STARTS_V[number], 90.0 * rng.integers(4), tilt_deg)
+    return start, _swing(hover, excitation.LEG_SWING, rng)
 
 
 def _amplitudes(number: int, hover: float, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     """Return roll, then pitch at one amplitude, or yaw, then all axes."""
-    command, slots = _swing(hover, HOVER_SWING, rng), (slice(SLOT_STEPS), slice(SLOT_STEPS, FLIGHT_STEPS))
+    command = _swing(hover, HOVER_SWING, rng)
+    slots = slice(excitation.SLOT_STEPS), slice(excitation.SLOT_STEPS, excitation.FLIGHT_STEPS)
     for slot, axes in zip(slots, ((2,), (0, 1, 2)) if number % 2 else ((0,), (1,)), strict=True):
         for axis in axes:
-            command[slot, axis] = AMPLITUDES[number // 2] * wave("sine" if len(axes) > 1 else "doublet", rng)
+            wave = excitation.wave("sine" if len(axes) > 1 else "doublet", rng)
+            command[slot, axis] = excitation.AMPLITUDES[number // 2] * wave
     return _start(hover, STARTS_V[number]), command
 
 
 def _switching(number: int, hover: float, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    command = [switching(rng, hold_steps=QUICK_STEPS) for _ in range(4)]
-    return _start(hover, STARTS_V[number]), FREE_AMPLITUDES[number // 2] * np.stack(command, axis=1)
+    command = [excitation.switching(rng, hold_steps=QUICK_STEPS) for _ in range(4)]
+    size = excitation.FREE_AMPLITUDES[number // 2]
+    return _start(hover, STARTS_V[number]), size * np.stack(command, axis=1)
 
 
 def _spins(number: int, hover: float, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
@@ -165,7 +152,7 @@ MANOEUVRES = {
 }
 
 
-def hover_action(model: ModelParameters, voltages: tuple[float, float] = VOLTAGES) -> float:
+def hover_action(model: ModelParameters, voltages: tuple[float, float] = excitation.VOLTAGES) -> float:
     """Return the thrust action at which a model's thrust curve holds its weight, half-way between voltages.
 
     The nearest end of the stick if none does. Effects are ignored: they matter little to where a flight
@@ -183,8 +170,8 @@ def hover_action(model: ModelParameters, voltages: tuple[float, float] = VOLTAGE
 
 
 def flights_of(
-    names: Iterable[str], hover: float, seed: int = 0, voltages: tuple[float, float] = VOLTAGES
-) -> list[ScriptedFlight]:
+    names: Iterable[str], hover: float, seed: int = 0, voltages: tuple[float, float] = excitation.VOLTAGES
+) -> list[excitation.ScriptedFlight]:
     """Return the flights of manoeuvres, eight of each, in the order of the names.
 
     hover: the thrust action that holds the weight. A manoeuvre's flights do not depend on the other names.
@@ -199,6 +186,6 @@ def flights_of(
         rng = np.random.default_rng([seed, list(MANOEUVRES).index(name)])
         for number in range(FLIGHTS_PER_MANOEUVRE):
             start, command = manoeuvre.flight(number, hover, rng)
-            start[BATTERY] = np.interp(start[BATTERY], VOLTAGES, voltages)
-            flights.append(ScriptedFlight(name, start, np.clip(command, -1.0, 1.0)))
+            start[BATTERY] = np.interp(start[BATTERY], excitation.VOLTAGES, voltages)
+            flights.append(excitation.ScriptedFlight(name, start, np.clip(command, -1.0, 1.0)))
     return flights

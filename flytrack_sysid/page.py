@@ -3,33 +3,10 @@
 import base64
 from collections.abc import Sequence
 from html import escape
+from pathlib import Path
 from typing import NamedTuple
 
-_STYLE = """
-:root { --ink: #1b1f24; --soft: #59636e; --line: #d5dae0; --paper: #ffffff; --note: #f4f6f8; }
-@media (prefers-color-scheme: dark) {
-  :root { --ink: #e6e9ec; --soft: #a3adb8; --line: #3a424b; --paper: #14181c; --note: #1e242a; }
-}
-* { box-sizing: border-box; }
-body { margin: 0 auto; max-width: 52rem; padding: 1rem; color: var(--ink); background: var(--paper);
-  font: 1rem/1.5 system-ui, sans-serif; overflow-wrap: break-word; }
-h1 { font-size: 1.6rem; line-height: 1.2; margin: 0.5rem 0; }
-h2 { font-size: 1.2rem; margin: 2rem 0 0.5rem; padding-top: 0.75rem; border-top: 1px solid var(--line); }
-ul { background: var(--note); border-left: 3px solid var(--soft); margin: 1rem 0;
-  padding: 0.5rem 1rem 0.5rem 2rem; }
-.scroll { overflow-x: auto; }
-table { border-collapse: collapse; margin: 0.5rem 0; font-variant-numeric: tabular-nums; }
-caption, figcaption { text-align: left; color: var(--soft); font-size: 0.9rem; padding: 0.25rem 0; }
-th, td { text-align: right; padding: 0.3rem 0.75rem; border-bottom: 1px solid var(--line);
-  white-space: nowrap; }
-th:first-child, td:first-child { text-align: left; padding-left: 0; }
-.wrap td, .wrap th { white-space: pre-line; text-align: left; vertical-align: top; }
-.verdict { margin: 1rem 0; padding: 0.75rem 1rem; border-left: 6px solid var(--soft); border-radius: 4px;
-  background: var(--note); font-size: 1.15rem; }
-.good { border-color: #009E73; } .found { border-color: #0072B2; } .open { border-color: #D55E00; }
-figure { margin: 1rem 0; }
-img { width: 100%; height: auto; background: #ffffff; border-radius: 4px; }
-"""
+_STYLE = "\n" + Path(__file__).with_name("page.css").read_text(encoding="utf-8")
 
 
 class Text(NamedTuple):

@@ -9,10 +9,11 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from scipy.spatial.transform import Rotation, Slerp
+from scipy.spatial.transform import Rotation
 
 from flytrack_env.state import ACTION_SIZE
 from flytrack_sysid.log import GAP_STEPS, FlightLog, time_in_line, usual_step
+from flytrack_sysid.resample import interpolate, interpolate_quaternions
 from flytrack_sysid.split import blocks_of, cut_evenly
 
 LONGEST_FILLED_S = 0.1  # after a longer gap a new flight begins
@@ -83,18 +84,6 @@ def _doubts(log: FlightLog, pieces: np.ndarray) -> np.ndarray:
     return 0.5 * np.abs(change - expected)
 
 
-def _between(times: np.ndarray, log: FlightLog, values: np.ndarray) -> np.ndarray:
-    """Return values at other times, linear in between; times of segments are laid end to end."""
-    return np.stack([np.interp(times, log.time, column) for column in values.T], axis=1)
-
-
-def _quaternions(times: np.ndarray, log: FlightLog) -> np.ndarray:
-    if len(log) == 1:
-        return log["q"].copy()
-    rotations = Slerp(log.time, Rotation.from_quat(log["q"], scalar_first=True))
-    return rotations(times).as_quat(scalar_first=True)
-
-
 def _velocity(log: FlightLog) -> np.ndarray:
     """Return the velocity, or what positions say of it; 0 without either."""
     if "v" in log:
@@ -129,12 +118,11 @@ def fill_gaps(log: FlightLog) -> Filled:
     measured = rows >= 0
     behind = np.where(measured, rows, -1 - rows)
     pieces = np.bincount(behind, minlength=len(log))
-    channels = {
-        name: _quaternions(times, in_line) if name == "q" else _between(times, in_line, values)
-        for name, values in log.channels.items()
-    }
-    for name, values in channels.items():
-        values[measured] = log[name][rows[measured]]
+    channels = {}
+    for name, values in log.channels.items():
+        between = interpolate_quaternions if name == "q" else interpolate
+        channels[name], _ = between(in_line.time, values, times)
+        channels[name][measured] = values[rows[measured]]
     filled = replace(
         log, time=times - (in_line.time - log.time)[behind], channels=channels, segment=np.cumsum(begins) - 1
     )

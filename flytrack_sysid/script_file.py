@@ -11,14 +11,7 @@ from flytrack_env.files import write_atomically
 from flytrack_env.messages import error_text
 from flytrack_env.npz_file import NpzError, load_npz
 from flytrack_env.state import ACTION_SIZE, APPLIED_ACTION, QUATERNION, STATE_SIZE
-from flytrack_sysid.excitation import (
-    ANY_VOLTAGE,
-    FEWEST_STEPS,
-    LARGEST_SPEED,
-    SCRIPT_HEIGHTS,
-    ScriptedFlight,
-    is_inside,
-)
+from flytrack_sysid import excitation
 from flytrack_sysid.manoeuvres import MANOEUVRES
 
 SUFFIX = ".npz"
@@ -39,7 +32,7 @@ class Script(NamedTuple):
     commands: np.ndarray
 
 
-def script_of(flights: Iterable[ScriptedFlight]) -> Script:
+def script_of(flights: Iterable[excitation.ScriptedFlight]) -> Script:
     """Return the script of flights of equal length."""
     kinds, starts, commands = zip(*flights, strict=True)
     return Script(tuple(kinds), np.stack(starts).astype(float), np.stack(commands).astype(float))
@@ -48,21 +41,22 @@ def script_of(flights: Iterable[ScriptedFlight]) -> Script:
 def check_script(script: Script, source: str = "script") -> None:
     """Raise ScriptError unless a script can be flown; the message names source, flight and array."""
     kinds, starts, commands = script
-    number, (low, high) = len(kinds), SCRIPT_HEIGHTS
+    number, (low, high) = len(kinds), excitation.SCRIPT_HEIGHTS
     is_shaped = starts.shape == (number, STATE_SIZE) and commands.shape[::2] == (number, ACTION_SIZE)
-    if number == 0 or not is_shaped or commands.ndim != 3 or commands.shape[1] < FEWEST_STEPS:
+    if number == 0 or not is_shaped or commands.ndim != 3 or commands.shape[1] < excitation.FEWEST_STEPS:
         found = f"{number} kinds, starts of shape {starts.shape}, commands of shape {commands.shape}"
-        expected = f"(N,), (N, {STATE_SIZE}) and (N, {FEWEST_STEPS} or more, {ACTION_SIZE}), N >= 1"
+        fewest = f"{excitation.FEWEST_STEPS} or more"
+        expected = f"(N,), (N, {STATE_SIZE}) and (N, {fewest}, {ACTION_SIZE}), N >= 1"
         raise ScriptError(f"{source}: found {found}, expected {expected}")
     norm_error = np.abs(np.linalg.norm(starts[:, QUATERNION], axis=1) - 1.0)
-    envelope = f"at most {LARGEST_SPEED:g} m/s, {low:g} to {high:g} m, and a voltage"
+    envelope = f"at most {excitation.LARGEST_SPEED:g} m/s, {low:g} to {high:g} m, and a voltage"
     checks = {
         f"kinds: expected one of {', '.join(MANOEUVRES)}": np.isin(kinds, list(MANOEUVRES)),
         "starts: expected finite numbers": np.isfinite(starts).all(axis=1),
         "starts: expected an applied action within [-1, 1]": _are_sticks(starts[:, APPLIED_ACTION]),
         "starts: expected a quaternion of norm 1": norm_error <= LARGEST_NORM_ERROR,
-        f"starts: expected a state within the envelope: {envelope}": is_inside(
-            starts, SCRIPT_HEIGHTS, ANY_VOLTAGE
+        f"starts: expected a state within the envelope: {envelope}": excitation.is_inside(
+            starts, excitation.SCRIPT_HEIGHTS, excitation.ANY_VOLTAGE
         ),
         "commands: expected numbers within [-1, 1]": _are_sticks(commands).all(axis=1),
     }

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.experimental.multihost_utils import sync_global_devices
 
+from baselines.purejaxrl_ppo import resume
 from baselines.purejaxrl_ppo.checkpoint import Checkpoint
 from baselines.purejaxrl_ppo.config import Config
 from baselines.purejaxrl_ppo.distributed import check_agree, spread
@@ -17,15 +18,6 @@ from baselines.purejaxrl_ppo.interrupts import kept_interrupts
 from baselines.purejaxrl_ppo.monitor import ProgressLine
 from baselines.purejaxrl_ppo.ppo import Runner
 from baselines.purejaxrl_ppo.program import Program
-from baselines.purejaxrl_ppo.resume import (
-    FINAL,
-    Start,
-    check_free,
-    check_same_run,
-    newest_intact,
-    restore_runner,
-    warn_of_other_machine,
-)
 from baselines.purejaxrl_ppo.run import Chunk, DivergedError, Metrics, Options, Run, next_due
 
 
@@ -35,7 +27,7 @@ class Task(NamedTuple):
     out: Path
     seed: int
     options: Options
-    start: Start | None = None
+    start: resume.Start | None = None
 
 
 class Ready(NamedTuple):
@@ -66,7 +58,7 @@ class Trainer(Program):
     def train_all(self, asked: list[tuple[Path, int, Options]]) -> list[tuple[Checkpoint, Metrics]]:
         """Train seeds side by side, in one program: as ``train``, for each folder, seed and options."""
         tasks = [
-            Task(out, seed, options, None if options.resume is None else newest_intact(options.resume))
+            Task(out, seed, options, None if options.resume is None else resume.newest_intact(options.resume))
             for out, seed, options in asked
         ]
         self.check_all(tasks, len(tasks))
@@ -76,10 +68,10 @@ class Trainer(Program):
         """Raise CheckpointError or ValueError, as ``train``, before anything is written."""
         for task in tasks:
             task.options.check()
-            check_free(task.out, task.start)
+            resume.check_free(task.out, task.start)
             description = self.describe(task.seed, at_once)
             if task.start is not None:
-                check_same_run(*task.start, description)
+                resume.check_same_run(*task.start, description)
             if self.mesh is not None:
                 shared = {name: value for name, value in description.items() if name != "machine"}
                 start = None if task.start is None else task.start.steps
@@ -109,11 +101,11 @@ class Trainer(Program):
             return run, Ready(run, self.start(key), 0)
         self.steps = task.start.steps
         update = self.steps // self.config.batch_size
-        if update == self.config.num_updates and task.start.path.name == FINAL:
+        if update == self.config.num_updates and task.start.path.name == resume.FINAL:
             run.finish_tracking()
             return run, None
-        warn_of_other_machine(*task.start, description)
-        runner = restore_runner(task.start, jax.eval_shape(self.start, key))
+        resume.warn_of_other_machine(*task.start, description)
+        runner = resume.restore_runner(task.start, jax.eval_shape(self.start, key))
         return run, Ready(run, runner if self.mesh is None else spread(runner, self.mesh), update)
 
 

@@ -19,35 +19,6 @@ from benchmarks.hidden.draws import (
     with_effects,
 )
 from benchmarks.hidden.flights import CrashError, fly
-from benchmarks.hidden.noise import NOISE_KINDS, measure
-from benchmarks.hidden.outside import KINDS as OUTSIDE_KINDS
+from benchmarks.hidden.noise import measure
 from benchmarks.hidden.outside import draw_outside
-from benchmarks.hidden.plans import FLIGHT_KINDS
 from benchmarks.hidden.truth import MOTIONS, Gust, Outside, Truth
-from benchmarks.hidden.visibility import signal_to_noise
-
-__all__ = [
-    "CHANGES",
-    "EFFECTS",
-    "FLIGHT_KINDS",
-    "MOTIONS",
-    "NAMES",
-    "NOISE_KINDS",
-    "OUTSIDE_KINDS",
-    "CrashError",
-    "Gust",
-    "Outside",
-    "Truth",
-    "draw_base",
-    "draw_change",
-    "draw_effect",
-    "draw_gust",
-    "draw_late",
-    "draw_onset",
-    "draw_outside",
-    "draw_truth",
-    "fly",
-    "measure",
-    "signal_to_noise",
-    "with_effects",
-]

@@ -13,26 +13,15 @@ from scipy.spatial.transform import Rotation
 
 from flytrack_sysid.log import FlightLog
 
-GYRO_STD = 0.1  # rad/s
-ACCELEROMETER_STD = 1.5  # m/s^2
-VELOCITY_STD = 0.05  # m/s
-POSITION_STD = 0.01  # m
-ATTITUDE_STD = np.deg2rad(0.5)  # rad, about each body axis
-STD = {
-    "p": POSITION_STD,
-    "v": VELOCITY_STD,
-    "f": ACCELEROMETER_STD,
-    "q": ATTITUDE_STD,
-    "w": GYRO_STD,
-    "v_bat": 0.0,
-}
+STD = {"p": 0.01, "v": 0.05, "f": 1.5, "q": np.deg2rad(0.5), "w": 0.1, "v_bat": 0.0}  # SI; q: about each axis
 # Resolution of a logged number: m, m/s, m/s^2, 1, rad/s, V; 16 bits over 32 g and 4000 deg/s.
+BITS = 2**16
 DIGIT = {
     "p": 1e-3,
     "v": 1e-3,
-    "f": 32.0 * 9.80665 / 2**16,
+    "f": 32.0 * 9.80665 / BITS,
     "q": 1e-4,
-    "w": np.deg2rad(4000.0) / 2**16,
+    "w": np.deg2rad(4000.0) / BITS,
     "v_bat": 1e-2,
 }
 LOST_ROWS = 0.02  # share

@@ -22,12 +22,12 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.hidden.noise import ACCELEROMETER_STD, GYRO_STD
+from benchmarks.hidden.noise import STD
 from benchmarks.hidden.truth import Outside, Truth
 from benchmarks.hidden.vectors import Vector, norm, scale, to_body
 
 # An amplitude of 1: m/s^2 of forces and of thrust over mass, rad/s of rates.
-SCALES = {"force": ACCELEROMETER_STD, "thrust": ACCELEROMETER_STD, "rate": GYRO_STD}
+SCALES = {"force": STD["f"], "thrust": STD["f"], "rate": STD["w"]}
 SMALLEST, LARGEST = 0.3, 3.0  # amplitudes that are drawn
 HEADING_ORDERS = (2, 3)
 CIRCLE = np.linspace(-np.pi, np.pi, 3601)  # rad, headings at which the maximum is searched

@@ -3,12 +3,12 @@
 A plan does not depend on the plant, so where it leads is known before the flight. Its kinds:
 
 - scripted: everything: legs of 0 to 18 m/s, low passes, waves on one stick, flips, thrust steps;
-- race: fast through waypoints, the nose ahead, no deliberate manoeuvres;
 - hover: one place, one heading, small corrections.
 """
 
 import math
 from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -208,24 +208,16 @@ def low_pass(sketch: Sketch) -> None:
     sketch.wait(AFTER_LOW_S)
 
 
-Block = Callable[[Sketch], None]
+def fast(sketch: Sketch, low: float, high: float) -> None:
+    """Append a leg of a speed between two, m/s."""
+    rng = sketch.rng
+    speed = SLOWER**sketch.caution * rng.uniform(low, high)
+    leg(sketch, speed, rng.uniform(*HIGH_HOLD_S), rng.normal(0.0, HIGH_TURNING))
 
 
-def _fast(low: float, high: float) -> Block:
-    def block(sketch: Sketch) -> None:
-        rng = sketch.rng
-        speed = SLOWER**sketch.caution * rng.uniform(low, high)
-        leg(sketch, speed, rng.uniform(*HIGH_HOLD_S), rng.normal(0.0, HIGH_TURNING))
-
-    return block
-
-
-def _yaw_turn(sketch: Sketch) -> None:
+def yaw_turn(sketch: Sketch) -> None:
+    """Append a turn of the nose."""
     sketch.turn_to(sketch.heading + sketch.rng.choice([-1.0, 1.0]) * sketch.rng.uniform(*YAW_TURN))
-
-
-def _on_axis(axis: int, amplitude: float) -> Block:
-    return lambda sketch: manoeuvre(sketch, axis, amplitude)
 
 
 def cycle(sketch: Sketch) -> None:
@@ -234,15 +226,13 @@ def cycle(sketch: Sketch) -> None:
     waves = [(axis, float(rng.choice(row))) for axis in range(3) for row in AMPLITUDES]
     first, last = HIGH_SPEEDS
     middle = 0.5 * (first + last)
-    blocks: list[Block] = [
-        *(_on_axis(*one) for one in waves),
-        _fast(middle, last),
-        _fast(first, middle),
-        _fast(first, last),
-        thrust_steps,
-        thrust_steps,
-        flip,
-        _yaw_turn,
+    blocks: list[Callable[[Sketch], None]] = [
+        *(partial(manoeuvre, axis=axis, amplitude=size) for axis, size in waves),
+        *(
+            partial(fast, low=low, high=high)
+            for low, high in ((middle, last), (first, middle), (first, last))
+        ),
+        *(thrust_steps, thrust_steps, flip, yaw_turn),
     ]
     blocks = [blocks[number] for number in rng.permutation(len(blocks))]
     half = len(blocks) // 2

@@ -140,39 +140,14 @@ def draw_chart(results: list[dict[str, Any]]) -> bytes:
     return png_of(figure, DPI)
 
 
-PAGE = """Every policy: {millions:g} M environment steps of the default recipe, one training seed; 256
-perturbed starts x 3 laps. Logs with common sensor noise; the policies observe the plant's state. The
-diagnosis was given flights of the minimal model's policy, and the excitation to which the minimal model was
-fitted.
-
-{verdict}
-
-![Success and lap gap by plant and policy]({chart})
-
-## The race
-
-Success on the plant (in the simulator in which the policy was trained), mean flying lap on the plant, and by
-how much it is longer than in the simulator. Lap times are of completed laps.
-
-{race}
-
-## The models
-
-On held-out flights of the minimal model's policy from other starts: minimal / refitted base / extended.
-Velocity and attitude: error of one step over the measured change, including sensor noise. Free flight: median
-error of position. Log: length of the diagnosed flights.
-
-{models}
-
-{cpu_min:.1f} CPU min on these plants."""
-
-
 def write_page(path: Path, results: list[dict[str, Any]], steps: int) -> bool:
     """Write the page and its chart; return whether the aim is met."""
     text, is_met = verdict(results)
     chart = path.with_suffix(".png")
     write_atomically(chart, draw_chart(results))
-    body = PAGE.format(
+    report.fill_page(
+        path,
+        "loop",
         millions=steps / 1e6,
         verdict=text,
         chart=chart.name,
@@ -180,7 +155,4 @@ def write_page(path: Path, results: list[dict[str, Any]], steps: int) -> bool:
         models=model_table(results),
         cpu_min=sum(result["cpu_s"] for result in results) / 60.0,
     )
-    origin = report.provenance_line(report.provenance())
-    title = "The loop: does the diagnosis make better policies?"
-    report.write_page(path, report.page(title, report.command_line(), body, origin))
     return is_met

@@ -23,18 +23,6 @@ REPLAY_HEADER = (
     "frames touched"
 )
 AGREE_SHARE = 1e-3  # of the time: starts this near the best found about the same flight
-EXPLAINED = f"""A flying lap goes from the last gate's plane to itself and ends as it began, except for the
-battery. A standing start goes from rest at the start pose, rotors still, through every gate once. Both are in
-steps of 0.01 s with held commands: the simulator's own equations at its own rate, traced from its code. *Free
-times*: with free segment times and gates at nodes; where that differs little, the grid costs little. *Starts
-agree*: of the searches on coarse grids, those within {AGREE_SHARE:.1%} of the best. These are local optima:
-nothing proves that no better one exists. The model `nominal` is the simulator's own; `black_box` is what the
-README's commands `collect`, `fit` and `diagnose` made of the shipped black box
-(`benchmarks/data/time_optimal/black_box.json`)."""
-REPLAYED = """The stored commands, open loop, in the environment at 100 Hz (float32), which judges which gates
-were passed and when. *Drift*: largest distance from the stored path. *Frames touched*: of all gates, not only
-of the next. On the black box itself no feedback corrects the model's errors: the drift soon exceeds the
-clearance of a gate."""
 
 
 def write_pictures(page: Path, references: list[Reference], tracks: list[Track]) -> None:
@@ -94,23 +82,19 @@ def write_page(path: Path | None, replays: list[tuple[Reference, str, Replay]]) 
 
     commands = sorted({note["command"].strip("`") for note in notes})
     tracks = sorted({reference.track for reference in references})
-    settings = (
-        f"Found with {each('casadi {casadi}, jax {jax}')} on {each('{machine}')}, one core. Battery at the "
-        f"start: {each('{battery_v:g} V')}. Gates are passed {each('{clearance_m:g} m')} inside what the "
-        f"environment allows a drone of radius {each('{drone_radius_m:g} m')}. Squared changes of commands "
-        f"cost {each('{smoothing_s:g} s')} each, so that commands do not chatter."
+    pictures = [f"![{name}]({path.stem}_{name}.png)\n\n" for name in tracks if path is not None]
+    report.fill_page(
+        path,
+        "time_optimal",
+        commands="\n".join(f"- `{line}`" for line in commands),
+        agree=AGREE_SHARE,
+        packages_found=each("casadi {casadi}, jax {jax}"),
+        machine=each("{machine}"),
+        battery=each("{battery_v:g} V"),
+        clearance=each("{clearance_m:g} m"),
+        radius=each("{drone_radius_m:g} m"),
+        smoothing=each("{smoothing_s:g} s"),
+        optima=report.table(HEADER, map(_optimum_row, references)),
+        replays=report.table(REPLAY_HEADER, (_replay_row(*entry) for entry in replays)),
+        pictures="".join(pictures),
     )
-    text = report.page(
-        "Time-optimal flights",
-        f"{report.command_line()} wrote this page. The flights were found by",
-        "\n".join(f"- `{line}`" for line in commands),
-        EXPLAINED,
-        settings,
-        report.table(HEADER, map(_optimum_row, references)),
-        "## Replays",
-        REPLAYED,
-        report.table(REPLAY_HEADER, (_replay_row(*entry) for entry in replays)),
-        *(f"![{name}]({path.stem}_{name}.png)" for name in tracks if path is not None),
-        report.provenance_line(report.provenance()),
-    )
-    report.write_page(path, text)

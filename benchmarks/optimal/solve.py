@@ -7,18 +7,9 @@ import numpy as np
 
 from benchmarks.optimal.problem import FRACTION_EDGE, Guess, Problem, Solution, Task
 from benchmarks.optimal.symbolic import needed_states, step_function
+from flytrack_env import state as layout
 from flytrack_env.dynamics import ModelParameters
 from flytrack_env.quaternion import Quaternion, Vec3
-from flytrack_env.state import (
-    ACCELERATION,
-    ACTION_SIZE,
-    APPLIED_ACTION,
-    BATTERY,
-    POSITION,
-    QUATERNION,
-    STATE_SIZE,
-    VELOCITY,
-)
 from flytrack_env.tracks import hermite_curve, sample_way
 
 PATH_POINTS = 400  # per segment
@@ -54,7 +45,7 @@ def _paths(task: Task) -> np.ndarray:
     """Return points of the path to every gate, (num_gates, PATH_POINTS, 3), m."""
     ways = np.roll(sample_way(task.course, PATH_POINTS), 1, axis=0)
     if not task.is_lap:
-        gates, position = task.course.gates, task.start[POSITION]
+        gates, position = task.course.gates, task.start[layout.POSITION]
         centre = np.array([np.float64(axis[0]) for axis in gates.centre])
         forward = np.array([np.float64(axis[0]) for axis in gates.forward])
         chord = centre - position
@@ -106,16 +97,17 @@ def first_guess(task: Task, counts: np.ndarray, speed_m_s: float, heading_rad: f
     acceleration = np.gradient(velocity, times, axis=0)
     if task.is_lap:
         velocity[0] = velocity[-1] = 0.5 * (velocity[0] + velocity[-1])
-    states = np.zeros((len(times), STATE_SIZE))
-    states[:, POSITION], states[:, VELOCITY], states[:, ACCELERATION] = positions, velocity, acceleration
-    states[:, QUATERNION] = _attitudes(acceleration + GRAVITY, velocity, heading_rad)
-    states[:, BATTERY] = task.start[BATTERY]
+    states = np.zeros((len(times), layout.STATE_SIZE))
+    states[:, layout.POSITION], states[:, layout.VELOCITY] = positions, velocity
+    states[:, layout.ACCELERATION] = acceleration
+    states[:, layout.QUATERNION] = _attitudes(acceleration + GRAVITY, velocity, heading_rad)
+    states[:, layout.BATTERY] = task.start[layout.BATTERY]
     if not task.is_lap:
         states[0] = task.start
-        if states[0, QUATERNION] @ states[1, QUATERNION] < 0.0:
-            states[1:, QUATERNION] *= -1.0
-    states[1:, APPLIED_ACTION] = 0.0
-    commands = np.zeros((len(times) - 1, ACTION_SIZE))
+        if states[0, layout.QUATERNION] @ states[1, layout.QUATERNION] < 0.0:
+            states[1:, layout.QUATERNION] *= -1.0
+    states[1:, layout.APPLIED_ACTION] = 0.0
+    commands = np.zeros((len(times) - 1, layout.ACTION_SIZE))
     return Guess(states, commands, steps_s, np.ones(len(counts)))
 
 
@@ -125,7 +117,7 @@ def resample(flight: Guess, counts: np.ndarray, new_counts: np.ndarray) -> Guess
     steps_s = flight.steps_s * counts / new_counts
     new = np.concatenate([[0.0], np.cumsum(np.repeat(steps_s, new_counts))])
     states = np.stack([np.interp(new, old, column) for column in flight.states.T], axis=1)
-    states[:, QUATERNION] /= np.linalg.norm(states[:, QUATERNION], axis=1, keepdims=True)
+    states[:, layout.QUATERNION] /= np.linalg.norm(states[:, layout.QUATERNION], axis=1, keepdims=True)
     middles = 0.5 * (new[:-1] + new[1:])
     held = np.clip(np.searchsorted(old, middles, side="right") - 1, 0, len(flight.commands) - 1)
     return Guess(states, flight.commands[held], steps_s, flight.fractions)

@@ -28,11 +28,6 @@ def _identity(value: Any) -> Any:
     return value
 
 
-def _select(which: Any, *cases: Any) -> Any:
-    off, on = cases
-    return casadi.if_else(which, on, off)
-
-
 OPERATIONS: dict[str, Callable[..., Any]] = {
     "add": operator.add,
     "add_any": operator.add,
@@ -61,7 +56,7 @@ OPERATIONS: dict[str, Callable[..., Any]] = {
     "and": casadi.logic_and,
     "or": casadi.logic_or,
     "not": casadi.logic_not,
-    "select_n": _select,
+    "select_n": lambda which, off, on: casadi.if_else(which, on, off),
     "convert_element_type": _identity,
     "broadcast_in_dim": _identity,
     "reshape": _identity,

@@ -176,11 +176,6 @@ def network(rows: Rows) -> Answer:
     return answer
 
 
-def trained(rows: Rows) -> Mapping[str, Answer]:
-    """Return the black boxes by name."""
-    return {**linear_ones(rows), "network": network(rows)}
-
-
 def linear_ones(rows: Rows) -> Mapping[str, Answer]:
     """Return the linear black boxes by name; of logs with rates alone, too."""
     return {"fir": linear(rows, _fir), "arx": linear(rows, _arx)}

@@ -20,26 +20,16 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from benchmarks.real.black_boxes import base_steps, flown, rows_of, trained
+from benchmarks.real.black_boxes import base_steps, flown, linear_ones, network, rows_of
 from benchmarks.report import ROOT, commit_of_checkout, progress, write_json
 from flytrack_env.dynamics import ModelParameters
 from flytrack_env.motion import Motion
 from flytrack_sysid import FlightLog, import_log
-from flytrack_sysid.diagnosis import joined
+from flytrack_sysid.diagnosis import joined, refinement
 from flytrack_sysid.diagnosis.diagnose import split
 from flytrack_sysid.diagnosis.lanes import make_lanes, thinned
 from flytrack_sysid.diagnosis.noise import first_guess, fit_noise
 from flytrack_sysid.diagnosis.problem import Problem
-from flytrack_sysid.diagnosis.refinement import (
-    MOST_ROUNDS,
-    Refined,
-    Target,
-    Tested,
-    errors_at,
-    placebo_errors,
-    refine,
-    windows_of,
-)
 from flytrack_sysid.diagnosis.score_test import CANDIDATES
 from flytrack_sysid.diagnosis.search import SearchState
 from flytrack_sysid.parameters import STICKS, TAUS, THRUST_COEFFS, from_vector
@@ -79,7 +69,7 @@ class Models(NamedTuple):
 
     problem: Problem
     base: np.ndarray
-    refined: Refined
+    refined: refinement.Refined
 
     @property
     def extended(self) -> np.ndarray:
@@ -103,7 +93,7 @@ def models_of(learnt: FlightLog, nominal: ModelParameters) -> Models:
     model = state.fitted(candidates, vector)
     state = state.with_noise(fit_noise(problem.lanes, problem.residuals(model.vector[None])[0]))
     base, model = state.fitted((), base.vector), state.fitted(candidates, model.vector)
-    refined = refine(
+    refined = refinement.refine(
         problem,
         base.vector,
         model.vector,
@@ -129,13 +119,14 @@ def fold(folder: Path, judged: str, seconds: float) -> dict[str, Any]:
     vectors = {"refitted_base": found.base, "extended": found.extended}
     if refined.base is not None:
         vectors["refitted_to_flights"] = refined.base
-    errors = errors_at(refined.problem, np.stack(list(vectors.values())), windows).errors
-    results = {name: Tested(one[None], windows) for name, one in zip(vectors, errors, strict=True)}
+    errors = refinement.errors_at(refined.problem, np.stack(list(vectors.values())), windows).errors
+    results = {name: refinement.Tested(one[None], windows) for name, one in zip(vectors, errors, strict=True)}
     base = from_vector(found.base, problem.like)._replace(effects=())
     rows, steps = rows_of(learnt, base), base_steps(base, own)
-    results |= {name: flown(one, windows, steps) for name, one in trained(rows).items()}
+    boxes = {**linear_ones(rows), "network": network(rows)}
+    results |= {name: flown(one, windows, steps) for name, one in boxes.items()}
     known = make_windows(learnt, np.ones(len(learnt), bool), SPACING_S, MOST)
-    results["placebo"] = Tested(placebo_errors(known, windows), windows)
+    results["placebo"] = refinement.Tested(refinement.placebo_errors(known, windows), windows)
     fit = refined.fit
     widths = {} if fit is None else dict(zip(fit.places, fit.half_widths, strict=True))
     return {
@@ -154,15 +145,15 @@ def fold(folder: Path, judged: str, seconds: float) -> dict[str, Any]:
     }
 
 
-def by_flight(results: dict[str, Tested], segment: np.ndarray) -> dict[str, list[list[float]]]:
+def by_flight(results: dict[str, refinement.Tested], segment: np.ndarray) -> dict[str, list[list[float]]]:
     """Return the extended model's errors over the base's, (horizons, quantities), by flight."""
     ratios = {}
     for number in np.unique(segment):
         part = segment == number
-        base, extended = (
-            Tested(one.errors[:, :, part], one.windows._replace(counts=one.windows.counts[:, part])).rms()[0]
-            for one in (results["refitted_base"], results["extended"])
-        )
+        windows = results["extended"].windows
+        own = windows._replace(counts=windows.counts[:, part])
+        tested = (results[name].errors[:, :, part] for name in ("refitted_base", "extended"))
+        base, extended = (refinement.Tested(errors, own).rms()[0] for errors in tested)
         ratios[str(number)] = np.nan_to_num(extended / base, nan=0.0).round(4).tolist()  # 0: no window
     return ratios
 
@@ -175,16 +166,16 @@ def fits(folder: Path, structure: Sequence[str], start: dict[str, float]) -> lis
         every = np.ones(len(log), bool)
         if len(log) < FEWEST_ROWS:
             continue
-        windows = windows_of(log, every)
+        windows = refinement.windows_of(log, every)
         assert windows is not None
         lanes = thinned(make_lanes(log, every, np.asarray(model.tau, float), float(model.g)))
         problem = Problem.of(lanes, model)
         vector = problem.start.copy()
         vector[problem.index(list(start))] = list(start.values())
-        scale = errors_at(problem, vector[None], windows).rms()[0]
-        target = Target(problem, windows, scale, np.ones(scale.shape, bool))
+        scale = refinement.errors_at(problem, vector[None], windows).rms()[0]
+        target = refinement.Target(problem, windows, scale, np.ones(scale.shape, bool))
         fields = [name for name in problem.names if name.partition(".")[0] in structure]
-        fit = target.fitted(vector, problem.index([*TAUS, *THRUST_COEFFS, *fields]), MOST_ROUNDS)
+        fit = target.fitted(vector, problem.index([*TAUS, *THRUST_COEFFS, *fields]), refinement.MOST_ROUNDS)
         pairs = zip(fit.places, fit.half_widths, strict=True)
         values = {problem.names[place]: [float(fit.vector[place]), float(half)] for place, half in pairs}
         half_s = half_responses(fit.vector[None], problem.like, SMALL_STEP)[0]

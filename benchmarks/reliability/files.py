@@ -23,6 +23,7 @@ from hypothesis import strategies as st
 from jax import export
 from tqdm import tqdm
 
+import flytrack_sysid as sysid
 from baselines.purejaxrl_ppo import CheckpointError, load_checkpoint
 from baselines.purejaxrl_ppo.config import ConfigError, settings_in_file
 from benchmarks.reliability import foreign_logs
@@ -34,16 +35,6 @@ from flytrack_env.model_file import save_model
 from flytrack_env.references import ReferenceFileError, load_reference, shipped_path
 from flytrack_env.rollout import RolloutError, load_rollout, save_rollout
 from flytrack_env.tracks.track import TRACK_FOLDER
-from flytrack_sysid import (
-    LogError,
-    Script,
-    ScriptError,
-    import_log,
-    load_log,
-    load_script,
-    save_log,
-    save_script,
-)
 from flytrack_sysid.importing import load_mapping
 from flytrack_sysid.log import log_of_states
 from flytrack_sysid.manoeuvres import MANOEUVRES
@@ -89,7 +80,9 @@ def flight() -> tuple[np.ndarray, np.ndarray]:
 def script() -> bytes:
     """Return a script of two flights."""
     states, actions = flight()
-    return written(save_script, ".npz", Script(tuple(MANOEUVRES)[:2], states[:2], np.stack([actions] * 2)))
+    return written(
+        sysid.save_script, ".npz", sysid.Script(tuple(MANOEUVRES)[:2], states[:2], np.stack([actions] * 2))
+    )
 
 
 def plant() -> bytes:
@@ -137,13 +130,13 @@ def import_mapped(path: Path, form: str, content: str) -> Any:
     """Return the log in a file of a format that needs a mapping."""
     mapping = path.with_name(f"mapping_of_{form}.toml")
     mapping.write_text(content)
-    return import_log(path, form, mapping).log
+    return sysid.import_log(path, form, mapping).log
 
 
 LOG = log_of_states([flight()], 0.01)
 MODEL = nominal_parameters().with_effects(QuadraticDrag(0.1, 0.1, 0.2))
 track, reference = TRACK_FOLDER / "flytrack.toml", shipped_path("flytrack", "flying", "nominal")
-npz_log, csv_log = (partial(written, save_log, suffix, LOG) for suffix in (".npz", ".csv"))
+npz_log, csv_log = (partial(written, sysid.save_log, suffix, LOG) for suffix in (".npz", ".csv"))
 rollout = partial(written, save_rollout, ".npy", *flight())
 model = partial(written, save_model, ".json", MODEL, {})
 gzipped = partial(gzip.compress, foreign_logs.foreign_csv(), mtime=0)
@@ -155,22 +148,24 @@ import_csv, import_usd, import_bag = (
         ("bag", foreign_logs.BAG_MAPPING),
     )
 )
-import_ulog, import_bbl = (partial(import_log, format=form) for form in ("ulog", "betaflight"))
+import_ulog, import_bbl = (partial(sysid.import_log, format=form) for form in ("ulog", "betaflight"))
 KINDS = {
     "track": Kind(".toml", track.read_bytes, load_track, TrackError, hostile_texts),
     "model": Kind(".json", model, load_model, ModelFileError, hostile_texts),
     "rollout": Kind(".npy", rollout, load_rollout, RolloutError, hostile_rollouts),
-    "flight log, .npz": Kind(".npz", npz_log, load_log, LogError, hostile_arrays),
-    "flight log, .csv": Kind(".csv", csv_log, load_log, LogError, hostile_texts),
-    "script": Kind(".npz", script, load_script, ScriptError, hostile_arrays),
+    "flight log, .npz": Kind(".npz", npz_log, sysid.load_log, sysid.LogError, hostile_arrays),
+    "flight log, .csv": Kind(".csv", csv_log, sysid.load_log, sysid.LogError, hostile_texts),
+    "script": Kind(".npz", script, sysid.load_script, sysid.ScriptError, hostile_arrays),
     "reference": Kind(".npz", reference.read_bytes, load_reference, ReferenceFileError, hostile_arrays),
-    "import mapping": Kind(".toml", foreign_logs.MAPPING.encode, load_mapping, LogError, hostile_texts),
-    "imported CSV": Kind(".csv", foreign_logs.foreign_csv, import_csv, LogError, hostile_texts),
-    "imported CSV, gzip": Kind(".csv.gz", gzipped, import_csv, LogError, hostile_gzips),
-    "imported PX4 log": Kind(".ulg", foreign_logs.ulog, import_ulog, LogError, is_slow=True),
-    "imported Betaflight log": Kind(".bbl", foreign_logs.betaflight, import_bbl, LogError, is_slow=True),
-    "imported uSD log": Kind("", foreign_logs.usd, import_usd, LogError),
-    "imported bag": Kind(".mcap", foreign_logs.mcap_bag, import_bag, LogError, is_slow=True),
+    "import mapping": Kind(".toml", foreign_logs.MAPPING.encode, load_mapping, sysid.LogError, hostile_texts),
+    "imported CSV": Kind(".csv", foreign_logs.foreign_csv, import_csv, sysid.LogError, hostile_texts),
+    "imported CSV, gzip": Kind(".csv.gz", gzipped, import_csv, sysid.LogError, hostile_gzips),
+    "imported PX4 log": Kind(".ulg", foreign_logs.ulog, import_ulog, sysid.LogError, is_slow=True),
+    "imported Betaflight log": Kind(
+        ".bbl", foreign_logs.betaflight, import_bbl, sysid.LogError, is_slow=True
+    ),
+    "imported uSD log": Kind("", foreign_logs.usd, import_usd, sysid.LogError),
+    "imported bag": Kind(".mcap", foreign_logs.mcap_bag, import_bag, sysid.LogError, is_slow=True),
     "training settings": Kind(".toml", SETTINGS.encode, settings_in_file, ConfigError, hostile_texts),
     "checkpoint": Kind(CHAMPION.suffix, CHAMPION.read_bytes, load_checkpoint, CheckpointError),
     "black box": Kind(".bin", plant, blackbox.load, blackbox.BlackBoxError, is_slow=True),

@@ -7,17 +7,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from flytrack_env import state as layout
 from flytrack_env.params import RANGES
-from flytrack_env.state import (
-    APPLIED_ACTION,
-    BATTERY,
-    BATTERY_EMPTY_V,
-    BATTERY_FULL_V,
-    POSITION,
-    QUATERNION,
-    STATE_SIZE,
-    VELOCITY,
-)
 from flytrack_env.tracks import Course, Track
 
 TRACK, BATTERY_V = "track", "battery_v"
@@ -71,15 +62,15 @@ def read_start(options: Mapping[str, Any], course: Course) -> Start:
     battery_v = None
     if BATTERY_V in options:
         battery_v = float(_numbers(options, BATTERY_V, 0))
-        if not BATTERY_EMPTY_V < battery_v <= BATTERY_FULL_V:
-            expected = f"above {BATTERY_EMPTY_V:g} and up to {BATTERY_FULL_V:g} V"
+        if not layout.BATTERY_EMPTY_V < battery_v <= layout.BATTERY_FULL_V:
+            expected = f"above {layout.BATTERY_EMPTY_V:g} and up to {layout.BATTERY_FULL_V:g} V"
             raise _error(BATTERY_V, options, expected)
     if not any(name in options for name in POSE_NAMES):
         return Start(None, 0, battery_v)
-    drone = np.zeros(STATE_SIZE, np.float32)
-    drone[POSITION], drone[QUATERNION], drone[VELOCITY] = _pose(options, course)
-    drone[APPLIED_ACTION] = STILL_ROTORS
-    drone[BATTERY] = BATTERY_FULL_V
+    drone = np.zeros(layout.STATE_SIZE, np.float32)
+    drone[layout.POSITION], drone[layout.QUATERNION], drone[layout.VELOCITY] = _pose(options, course)
+    drone[layout.APPLIED_ACTION] = STILL_ROTORS
+    drone[layout.BATTERY] = layout.BATTERY_FULL_V
     return Start(drone, _gate_index(options, course.num_gates), battery_v)
 
 

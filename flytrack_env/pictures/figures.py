@@ -11,16 +11,7 @@ from matplotlib.figure import Figure, SubFigure
 from matplotlib.patches import Rectangle
 
 from flytrack_env.flown_race import DRONE_RADIUS_M, STEP_S
-from flytrack_env.pictures.drawing import (
-    HEADROOM,
-    LETTER_IN,
-    draw_gates,
-    draw_path,
-    escape,
-    label_from_above,
-    new_figure,
-    plain,
-)
+from flytrack_env.pictures import drawing
 from flytrack_env.pictures.flight import PASSED, Flight, Meeting
 from flytrack_env.scene import BLUE, GREEN, ORANGE, PAPER_COLOURS, PAPER_FRAME, PAPER_OPENING, gates_of
 from flytrack_env.state import APPLIED_ACTION, BATTERY, POSITION, Action
@@ -50,14 +41,15 @@ def draw_top(flight: Flight) -> Figure:
     """Return the course from above, the path coloured by speed, lap times in the title."""
     figure, axes = _course([flight], BESIDE_IN)
     points, speeds = flight.states[:, POSITION][:, :2], flight.speeds_m_s
-    lines = draw_path(axes, points, speeds[:-1], HEADROOM * max(float(speeds.max()), 1.0), 2.2)
+    top = drawing.HEADROOM * max(float(speeds.max()), 1.0)
+    lines = drawing.draw_path(axes, points, speeds[:-1], top, 2.2)
     failures = np.reshape([one.pos_w[:2] for one in flight.meetings if one.outcome != PASSED], (-1, 2))
     axes.plot(*failures.T, "X", color="black", markersize=8, markeredgecolor="white", zorder=5)
-    marks = (("start", points[0], BLUE, "o"), (escape(flight.ended), points[-1], ORANGE, "X"))
+    marks = (("start", points[0], BLUE, "o"), (drawing.escape(flight.ended), points[-1], ORANGE, "X"))
     for text, place, colour, marker in marks:
         axes.plot(*place, marker, color=colour, markersize=9, markeredgecolor="white", label=text, zorder=6)
     figure.legend(loc="outside lower center", ncols=2, frameon=False)
-    axes.set_title(escape(f"{flight.title}\n{flight.laps_text}"), fontsize="medium")
+    axes.set_title(drawing.escape(f"{flight.title}\n{flight.laps_text}"), fontsize="medium")
     figure.colorbar(lines, ax=axes, label="speed (m/s)", shrink=0.8)
     return figure
 
@@ -71,16 +63,16 @@ def draw_comparison(flights: Sequence[Flight]) -> Figure:
     tracks = sorted({flight.track.name for flight in flights})
     if len(tracks) != 1:
         raise ValueError(f"flights: found tracks {tracks}, expected flights on one")
-    texts = [escape(f"{flight.name}\n{flight.laps_text}\n{flight.ended}") for flight in flights]
+    texts = [drawing.escape(f"{flight.name}\n{flight.laps_text}\n{flight.ended}") for flight in flights]
     longest = max(len(line) for text in texts for line in text.splitlines())
-    figure, axes = _course(flights, BESIDE_IN + LETTER_IN * longest)
+    figure, axes = _course(flights, BESIDE_IN + drawing.LETTER_IN * longest)
     styles = itertools.cycle(itertools.product(LINES, PAPER_COLOURS))
     for flight, text, (line, colour) in zip(flights, texts, styles, strict=False):
         points = flight.states[:, POSITION][:, :2]
         axes.plot(*points.T, line, color=colour, linewidth=1.5, label=text)
         axes.plot(*points[0], "o", color=colour, markeredgecolor="white", zorder=6)
         axes.plot(*points[-1], "X", color=colour, markersize=9, markeredgecolor="white", zorder=6)
-    axes.set_title(escape(f"{len(flights)} flights on {flights[0].track.name}"), fontsize="medium")
+    axes.set_title(drawing.escape(f"{len(flights)} flights on {flights[0].track.name}"), fontsize="medium")
     figure.legend(loc="outside right upper", frameon=False, fontsize="small", labelspacing=1.0)
     return figure
 
@@ -94,11 +86,11 @@ def _course(flights: Sequence[Flight], beside_in: float) -> tuple[Figure, Axes]:
     margin = MARGIN_SHARE * (high - low).max()
     low, high = low - margin, high + margin
     width, height = PANEL_IN * np.maximum((high - low) / (high - low).max(), NARROWEST)
-    figure = new_figure(width + beside_in, height + TITLE_IN)
+    figure = drawing.new_figure(width + beside_in, height + TITLE_IN)
     axes = figure.add_subplot()
     axes.add_patch(Rectangle(ends[0], *(ends[1] - ends[0]), fill=False, edgecolor="0.6", linestyle="--"))
-    draw_gates(axes, track, TOP_VIEW)
-    label_from_above(axes, track)
+    drawing.draw_gates(axes, track, TOP_VIEW)
+    drawing.label_from_above(axes, track)
     axes.set(aspect="equal", xlim=(low[0], high[0]), ylim=(low[1], high[1]), xlabel="x (m)", ylabel="y (m)")
     return figure, axes
 
@@ -109,21 +101,21 @@ def draw_side(flight: Flight) -> Figure:
     num_rows = math.ceil(len(flight.track.gates) * GATE_IN / width)
     num_columns = math.ceil(len(flight.track.gates) / num_rows)
     gates_in = num_rows * (GATE_IN + 0.3) + GATES_TITLE_IN
-    figure = new_figure(width, SIDE_IN + gates_in)
+    figure = drawing.new_figure(width, SIDE_IN + gates_in)
     upper, lower = figure.subfigures(2, 1, squeeze=False, height_ratios=(SIDE_IN, gates_in)).ravel()
-    top = HEADROOM * max(float(flight.speeds_m_s.max()), 1.0)
+    top = drawing.HEADROOM * max(float(flight.speeds_m_s.max()), 1.0)
     _draw_height(upper, flight, top)
     _draw_fronts(lower, flight, top, (num_rows, num_columns))
-    figure.suptitle(escape(f"{flight.title}\n{flight.laps_text}"), fontsize="medium")
+    figure.suptitle(drawing.escape(f"{flight.title}\n{flight.laps_text}"), fontsize="medium")
     return figure
 
 
 def _draw_height(figure: SubFigure, flight: Flight, top: float) -> None:
     """Draw the path's height, and a bar for every gate where its plane was met."""
-    axes = plain(figure.add_subplot())
+    axes = drawing.plain(figure.add_subplot())
     heights_m = flight.states[:, POSITION][:, 2]
     points = np.stack([flight.distances_m, heights_m], axis=1)
-    lines = draw_path(axes, points, flight.speeds_m_s[:-1], top, 2.4)
+    lines = drawing.draw_path(axes, points, flight.speeds_m_s[:-1], top, 2.4)
     lines.set_zorder(4)
     half_heights_m = _half_heights_m(flight.track)
     for meeting in flight.meetings:
@@ -203,7 +195,7 @@ def draw_commands(flight: Flight) -> Figure:
     """Return four sticks, commanded against applied, speed and battery; gates, laps and failures as lines."""
     times_s = STEP_S * np.arange(len(flight.states))
     width = float(np.clip(SECOND_IN * times_s[-1], *WIDTHS_IN))
-    figure = new_figure(width, COMMANDS_IN)
+    figure = drawing.new_figure(width, COMMANDS_IN)
     panels = figure.subplots(6, 1, sharex=True)
     for stick, name in enumerate(Action._fields):
         # A command holds for a step, from its state on.
@@ -218,11 +210,11 @@ def draw_commands(flight: Flight) -> Figure:
     marks = [(one.time_s, "lap complete" if one.lap else "gate passed") for one in flight.race.passes]
     marks += [(one.time_s, "not passed") for one in flight.meetings if one.outcome != PASSED]
     for panel in panels:
-        plain(panel)
+        drawing.plain(panel)
         for time_s, mark in marks:
             panel.axvline(time_s, label=mark, zorder=0.5, **MARKS[mark])
     handles, labels = panels[3].get_legend_handles_labels()
     once = dict(zip(labels, handles, strict=True))
     figure.legend(once.values(), once.keys(), loc="outside lower center", ncols=5, frameon=False)
-    figure.suptitle(escape(f"{flight.title}\n{flight.laps_text}"), fontsize="medium")
+    figure.suptitle(drawing.escape(f"{flight.title}\n{flight.laps_text}"), fontsize="medium")
     return figure

@@ -15,27 +15,17 @@ from gymnax.wrappers import LogWrapper
 from flytrack_env import FlyTrack, wrappers
 from flytrack_env.observations import OBSERVATION_SIZE
 from flytrack_env.plants import Simulator
-from flytrack_env.wrappers import (
-    ActionDelay,
-    ActionHistory,
-    DomainRandomization,
-    EpisodeStatistics,
-    LegacyStep,
-    NoiseParams,
-    ObservationNoise,
-    WrapperError,
-)
 from tests.support.wrapped_flights import ALL, wrapped
 
 # Every public wrapper, both kinds of history among them, and one of gymnax's.
 MAKERS: dict[str, Any] = {
-    "noise": ObservationNoise,
-    "commanded": partial(ActionHistory, length=2),
-    "applied": partial(ActionHistory, length=1, kind="applied"),
-    "delay": ActionDelay,
-    "randomization": DomainRandomization,
-    "statistics": EpisodeStatistics,
-    "legacy": LegacyStep,
+    "noise": wrappers.ObservationNoise,
+    "commanded": partial(wrappers.ActionHistory, length=2),
+    "applied": partial(wrappers.ActionHistory, length=1, kind="applied"),
+    "delay": wrappers.ActionDelay,
+    "randomization": wrappers.DomainRandomization,
+    "statistics": wrappers.EpisodeStatistics,
+    "legacy": wrappers.LegacyStep,
     "log": LogWrapper,
 }
 OTHER_STEP = ("legacy", "log")
@@ -69,7 +59,7 @@ def test_any_three_compose_or_are_refused_with_the_reason() -> None:
         for index, name in enumerate(order):
             reasons = reasons_against(name, order[:index])
             if reasons:
-                with pytest.raises(WrapperError) as caught:
+                with pytest.raises(wrappers.WrapperError) as caught:
                     MAKERS[name](env)
                 assert any(re.search(reason, str(caught.value)) for reason in reasons), order
                 break
@@ -88,18 +78,20 @@ def test_randomising_what_is_baked_in_is_refused() -> None:
     class Baked(Simulator):
         dt = 0.01
 
-    with pytest.raises(WrapperError, match="baked in, none can be drawn"):
-        DomainRandomization(FlyTrack(plant=Baked()))
+    with pytest.raises(wrappers.WrapperError, match="baked in, none can be drawn"):
+        wrappers.DomainRandomization(FlyTrack(plant=Baked()))
 
 
-@pytest.mark.parametrize("wrapper", [DomainRandomization, ActionDelay, ObservationNoise])
+@pytest.mark.parametrize(
+    "wrapper", [wrappers.DomainRandomization, wrappers.ActionDelay, wrappers.ObservationNoise]
+)
 def test_parameters_of_another_environment_are_refused(wrapper: Any) -> None:
     env, others = wrapped(wrapper), FlyTrack().default_params
     with pytest.raises(ValueError, match=rf"params\.wrappers: found \[\], expected \['{env.key}'\]"):
         env.reset(jax.random.key(0), others)
     with pytest.raises(ValueError, match=rf"params\.wrappers: found \[\], expected '{env.key}' among them"):
         env.own_params(others)
-    unknown = others.replace(wrappers={env.key: env.own_defaults(), "nois": NoiseParams()})
+    unknown = others.replace(wrappers={env.key: env.own_defaults(), "nois": wrappers.NoiseParams()})
     with pytest.raises(ValueError, match=r"params\.wrappers: found \[.*'nois'.*\], expected"):
         env.reset(jax.random.key(0), unknown)
 
@@ -109,7 +101,7 @@ def test_resets_and_steps_can_be_traced_and_gymnaxs_wrappers_go_around() -> None
     params = jax.tree.map(jnp.asarray, env.default_params)
     observation, state = jax.eval_shape(lambda key: env.reset(key, params), key)
     assert jax.tree.structure(jax.eval_shape(env.reset, key)[1]) == jax.tree.structure(state)
-    for outer, num_values in ((LogWrapper(env), 6), (LegacyStep(env), 5)):
+    for outer, num_values in ((LogWrapper(env), 6), (wrappers.LegacyStep(env), 5)):
         _, state = jax.eval_shape(outer.reset, key, params)
         outputs = jax.eval_shape(outer.step, key, state, jnp.zeros(4), params)
         assert len(outputs) == num_values and outputs[0].shape == observation.shape
@@ -126,7 +118,7 @@ class SixValues:
 
 @pytest.mark.parametrize("clone", [copy.copy, copy.deepcopy, lambda one: pickle.loads(pickle.dumps(one))])
 def test_legacy_step_joins_the_flags_and_survives_copies(clone: Any) -> None:
-    env = clone(LegacyStep(SixValues()))
+    env = clone(wrappers.LegacyStep(SixValues()))
     _, _, reward, done, info = env.step(None, 3.0, jnp.array([-1.0, 0.5, 2.0]))
     assert float(reward) == 3.0 and env.name == "six"
     assert done.tolist() == [False, True, True] and info["truncated"].tolist() == [False, False, True]

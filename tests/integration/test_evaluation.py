@@ -2,8 +2,6 @@
 
 import importlib.util
 import json
-from pathlib import Path
-from typing import Any
 
 import jax
 import numpy as np
@@ -11,16 +9,8 @@ import pytest
 
 from baselines.purejaxrl_ppo import evaluate
 from baselines.purejaxrl_ppo import flights as flights_module
-from baselines.purejaxrl_ppo.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
-from baselines.purejaxrl_ppo.flights import (
-    Outcomes,
-    Rollout,
-    fly_many,
-    outcomes_of,
-    race_many,
-    score,
-    start_keys,
-)
+from baselines.purejaxrl_ppo.checkpoint import load_checkpoint, save_checkpoint
+from baselines.purejaxrl_ppo.flights import fly_many, outcomes_of, race_many, score, start_keys
 from baselines.purejaxrl_ppo.plants import draw_plants
 from flytrack_env import FlyTrack, load_track, nominal_parameters, save_track
 from flytrack_env.references import ghost_rollout, shipped_reference, shipped_references
@@ -38,28 +28,28 @@ TOLERANCE_S = 2e-3
 
 
 @pytest.fixture(scope="module")
-def checkpoint_path(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def checkpoint_path(tmp_path_factory):
     return write_checkpoint(tmp_path_factory.mktemp("checkpoint") / "policy.safetensors")
 
 
 @pytest.fixture(scope="module")
-def checkpoint(checkpoint_path: Path) -> Checkpoint:
+def checkpoint(checkpoint_path):
     return load_checkpoint(checkpoint_path)
 
 
 @pytest.fixture(scope="module")
-def on_rails() -> FlyTrack:
+def on_rails():
     return FlyTrack(plant=Rails())
 
 
 @pytest.fixture(scope="module")
-def flights(on_rails: FlyTrack, checkpoint: Checkpoint) -> Rollout:
+def flights(on_rails, checkpoint):
     policy = (checkpoint.network, checkpoint.params)
     return fly_many(on_rails, *policy, 0, NUM_FLIGHTS, NUM_STEPS, NUM_LAPS)
 
 
 @pytest.fixture(scope="module")
-def raced(on_rails: FlyTrack, checkpoint: Checkpoint) -> Outcomes:
+def raced(on_rails, checkpoint):
     """The same flights, in batches, the last one not full."""
     policy = (checkpoint.network, checkpoint.params)
     with pytest.MonkeyPatch.context() as patched:
@@ -68,13 +58,13 @@ def raced(on_rails: FlyTrack, checkpoint: Checkpoint) -> Outcomes:
 
 
 @pytest.fixture(scope="module")
-def paces(flights: Rollout) -> np.ndarray:
+def paces(flights):
     """How slow each flight on rails is; 0 where it falls."""
     battery_v = np.asarray(flights.states)[:, 0, BATTERY]
     return np.where(battery_v < FAILS_BELOW_V, 0.0, Rails.pace(battery_v))
 
 
-def test_lap_times_are_those_of_the_rails(raced: Outcomes, paces: np.ndarray) -> None:
+def test_lap_times_are_those_of_the_rails(raced, paces):
     is_good = paces > 0.0
     assert 0 < is_good.sum() < NUM_FLIGHTS  # else this test would see one kind only
     np.testing.assert_array_equal(raced.is_complete(), is_good)
@@ -88,12 +78,12 @@ def test_lap_times_are_those_of_the_rails(raced: Outcomes, paces: np.ndarray) ->
     assert score(raced).success == is_good.mean()
 
 
-def test_every_step_kept_or_not_is_the_same_flight(flights: Rollout, raced: Outcomes) -> None:
+def test_every_step_kept_or_not_is_the_same_flight(flights, raced):
     assert NUM_FLIGHTS % 4
     assert_close(raced, outcomes_of(flights, NUM_LAPS, 8))
 
 
-def test_ghost_is_the_reference_nearest_in_time() -> None:
+def test_ghost_is_the_reference_nearest_in_time():
     references = shipped_references(load_track("flytrack"), ("black_box",))
     standing, flying = references["standing"], references["flying"]
     assert standing.model_name == "black_box"
@@ -111,14 +101,7 @@ def test_ghost_is_the_reference_nearest_in_time() -> None:
 
 
 @pytest.mark.parametrize("flown_by", slow_but(["black box"], ["black box", "plants"]))
-def test_command_flies_many(
-    flown_by: str,
-    checkpoint_path: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-    flights: Rollout,
-) -> None:
+def test_command_flies_many(flown_by, checkpoint_path, tmp_path, monkeypatch, capsys, flights):
     flown = []
     fly_scene = evaluate.fly_scene
     monkeypatch.setattr(evaluate, "fly_scene", lambda *a: flown.append(fly_scene(*a)) or flown[0])
@@ -148,7 +131,7 @@ def test_command_flies_many(
         assert report["success"]["high"] == pytest.approx(0.390334, abs=1e-5)  # Wilson's, of none of 6
 
 
-def keys_of(value: Any) -> set[str]:
+def keys_of(value):
     """Return every name of JSON values, however deep."""
     if isinstance(value, dict):
         return set(value) | {name for part in value.values() for name in keys_of(part)}
@@ -156,13 +139,8 @@ def keys_of(value: Any) -> set[str]:
 
 
 def test_a_single_flight_as_json_and_docs_name_every_key(
-    checkpoint_path: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-    flights: Rollout,
-    raced: Outcomes,
-) -> None:
+    checkpoint_path, tmp_path, monkeypatch, capsys, flights, raced
+):
     index = int(np.argmax(raced.is_complete()))
     monkeypatch.setattr(evaluate, "_fly_first", lambda *_: jax.tree.map(lambda leaf: leaf[index], flights))
     out, file = tmp_path / "flight.npy", tmp_path / "report.json"
@@ -188,7 +166,7 @@ def test_a_single_flight_as_json_and_docs_name_every_key(
 
 
 @pytest.fixture(scope="module")
-def bad_files(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def bad_files(tmp_path_factory):
     """A folder of a policy without its model, and of tracks without a reference."""
     folder = tmp_path_factory.mktemp("bad")
     old = load_checkpoint(write_checkpoint(folder / "policy.safetensors"))
@@ -214,13 +192,7 @@ def bad_files(tmp_path_factory: pytest.TempPathFactory) -> Path:
         (["--checkpoint", "file"], ["file", "not a checkpoint"]),
     ],
 )
-def test_command_refuses_before_it_flies(
-    arguments: list[str],
-    messages: list[str],
-    bad_files: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_command_refuses_before_it_flies(arguments, messages, bad_files, monkeypatch, capsys):
     monkeypatch.chdir(bad_files)
     monkeypatch.setattr(evaluate, "can_record", lambda: True)
     monkeypatch.setattr(evaluate, "fly_scene", lambda *_: pytest.fail("it flew"))

@@ -5,42 +5,27 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from benchmarks.hidden import (
-    EFFECTS,
-    MOTIONS,
-    NAMES,
-    Gust,
-    Truth,
-    draw_base,
-    draw_effect,
-    draw_gust,
-    draw_outside,
-    draw_truth,
-    fly,
-    measure,
-)
+from benchmarks import hidden
 from benchmarks.hidden.noise import COLOURS, LOST_ROWS, STD
 from benchmarks.hidden.plant import Plant, Start
-from benchmarks.hidden.truth import STICKS
 from flytrack_sysid.log import FlightLog
 from tests.support.handout_plant import HandoutPlant
-from tests.support.slow import slow_but
 
 START = Start((1.0, -2.0, 6.0), 0.7, 23.8, -0.2)
 MINUTE_S = 60.0
 # Effect -> what it changes of the plant: force f, rates w, battery b; effects of sensors change nothing.
-RATE_EFFECTS = [name for name in NAMES if name.startswith(("rate_", "second_", "yaw_", "motor_"))]
-SENSOR_EFFECTS = [name for name in NAMES if name.startswith(("accelerometer_", "gyro_", "imu_"))]
-PLANT_EFFECTS = dict.fromkeys(NAMES, "f") | dict.fromkeys(SENSOR_EFFECTS, "")
+RATE_EFFECTS = [name for name in hidden.NAMES if name.startswith(("rate_", "second_", "yaw_", "motor_"))]
+SENSOR_EFFECTS = [name for name in hidden.NAMES if name.startswith(("accelerometer_", "gyro_", "imu_"))]
+PLANT_EFFECTS = dict.fromkeys(hidden.NAMES, "f") | dict.fromkeys(SENSOR_EFFECTS, "")
 PLANT_EFFECTS |= dict.fromkeys(RATE_EFFECTS, "w") | {"command_delay": "fw", "voltage_sag": "fb"}
 
 
-def base(**effects: dict[str, float]) -> Truth:
-    return replace(draw_base(np.random.default_rng(3)), effects=effects)
+def base(**effects: dict[str, float]) -> hidden.Truth:
+    return replace(hidden.draw_base(np.random.default_rng(3)), effects=effects)
 
 
-def flown(truth: Truth, kind: str = "scripted", seconds: float = MINUTE_S, seed: int = 1) -> FlightLog:
-    return fly(truth, kind, seconds, np.random.default_rng(seed))
+def flown(truth: hidden.Truth, kind: str = "scripted", seconds: float = MINUTE_S, seed: int = 1) -> FlightLog:
+    return hidden.fly(truth, kind, seconds, np.random.default_rng(seed))
 
 
 def state_of(plant: Plant) -> np.ndarray:
@@ -49,7 +34,7 @@ def state_of(plant: Plant) -> np.ndarray:
     return np.concatenate([*own, [plant.battery_v]])
 
 
-def open_loop(truth: Truth, count: int = 150, start: Start = START) -> dict[str, np.ndarray]:
+def open_loop(truth: hidden.Truth, count: int = 150, start: Start = START) -> dict[str, np.ndarray]:
     """Return channels of a plant flown by random steps of the sticks."""
     sticks = np.random.default_rng(4).uniform(-1.0, 1.0, (16, 4)) * [0.5, 0.5, 1.0, 1.0]
     plant, rows = Plant(truth, start, np.random.default_rng(5)), []
@@ -69,9 +54,9 @@ def test_without_effects_it_is_the_handouts_plant() -> None:
         np.testing.assert_allclose(own, state, rtol=1e-12, atol=1e-12)
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", hidden.NAMES)
 def test_each_effect_changes_its_channels_of_the_plant(name: str) -> None:
-    values = draw_effect(name, np.random.default_rng(8), EFFECTS[name].high)
+    values = hidden.draw_effect(name, np.random.default_rng(8), hidden.EFFECTS[name].high)
     low = START._replace(pos_w=(0.0, 0.0, 0.3))
     own, plain = open_loop(base(**{name: values}), 60, low), open_loop(base(), 60, low)
     assert {key for key in "fwb" if np.abs(own[key] - plain[key]).max() > 1e-6} == set(
@@ -110,7 +95,7 @@ def test_equations_of_the_rate_loop() -> None:
     np.testing.assert_allclose(late[120:], 0.5 * (plain[:-3] + plain[1:-2])[117:], atol=1e-5)
 
 
-@pytest.mark.parametrize("motion", MOTIONS)
+@pytest.mark.parametrize("motion", hidden.MOTIONS)
 def test_a_flight_controller_shapes_the_sticks_before_the_lag(motion: str) -> None:
     def settled(stick: float, **effects: dict[str, float]) -> np.ndarray:
         plant = Plant(replace(base(**effects), motion=motion), START, np.random.default_rng(0))
@@ -132,36 +117,22 @@ def test_a_flight_controller_shapes_the_sticks_before_the_lag(motion: str) -> No
     np.testing.assert_allclose(plant.applied[:3], expected, rtol=1e-4)
 
 
-@pytest.mark.parametrize("damping", slow_but([0.3], [0.3, 1.6]))
-def test_second_order_rates_obey_their_differential_equation(damping: float) -> None:
-    """Against small explicit steps of y'' = wn^2 (omega - y) - 2 zeta wn y'."""
-    finer, natural = 2000, np.array([40.0, 50.0, 60.0])
-    asked = open_loop(base(), 40)["w"]
-    loop = {f"{axis}_s": 2.0 * damping / own for axis, own in zip(STICKS, natural.tolist(), strict=True)}
-    loop |= {f"{axis}_damping": damping for axis in STICKS}
-    found = open_loop(base(second_order_rates=loop), 40)["w"]
-    rate, slope = np.zeros(3), np.zeros(3)
-    for target, own in zip(asked, found, strict=True):
-        for _ in range(finer):
-            bend = natural**2 * (target - rate) - 2.0 * damping * natural * slope
-            rate, slope = rate + slope * 0.01 / finer, slope + bend * 0.01 / finer
-        np.testing.assert_allclose(own, rate, atol=5e-3)
-
-
 @pytest.fixture(scope="module")
 def scripted() -> list[FlightLog]:
-    return [flown(draw_base(np.random.default_rng(seed)), seed=seed) for seed in range(2)]
+    return [flown(hidden.draw_base(np.random.default_rng(seed)), seed=seed) for seed in range(2)]
 
 
 def test_the_same_seed_gives_the_same_plant_and_log() -> None:
     def log(seed: int) -> FlightLog:
         rng = np.random.default_rng(seed)
-        truth = replace(draw_truth(rng, 3), gust=draw_gust(rng), outside=draw_outside(rng))
-        return measure(fly(truth, "scripted", 5.0, rng), "coloured", rng)
+        truth = replace(
+            hidden.draw_truth(rng, 3), gust=hidden.draw_gust(rng), outside=hidden.draw_outside(rng)
+        )
+        return hidden.measure(hidden.fly(truth, "scripted", 5.0, rng), "coloured", rng)
 
     assert log(1).sha256 == log(1).sha256 != log(2).sha256
     # Recorded diagnoses name plants by seed and number.
-    effects = draw_truth(np.random.default_rng([2, 7]), 2).effects
+    effects = hidden.draw_truth(np.random.default_rng([2, 7]), 2).effects
     assert list(effects) == ["quadratic_drag", "rate_scale"]
     assert effects["rate_scale"]["yaw"] == pytest.approx(0.969037, abs=1e-6)
 
@@ -169,7 +140,7 @@ def test_the_same_seed_gives_the_same_plant_and_log() -> None:
 @pytest.mark.parametrize("noise", ["sensors", "heavy", "coloured"])
 def test_noise_has_its_standard_deviation_tails_and_colour(noise: str, scripted: list[FlightLog]) -> None:
     clean = scripted[0]
-    logs = [measure(clean, noise, np.random.default_rng(seed)) for seed in range(8)]
+    logs = [hidden.measure(clean, noise, np.random.default_rng(seed)) for seed in range(8)]
     rows = [np.searchsorted(clean.time, log.time - 1e-9) for log in logs]
     assert np.mean([len(log) for log in logs]) / len(clean) == pytest.approx(1.0 - LOST_ROWS, abs=0.003)
     for name in "pvfw":
@@ -185,7 +156,7 @@ def test_noise_has_its_standard_deviation_tails_and_colour(noise: str, scripted:
 
 def test_the_accelerometer_feels_gusts() -> None:
     for std in (0.3, 1.5):
-        log = flown(replace(base(), gust=Gust(std, 0.3, 0.05)), "hover")
+        log = flown(replace(base(), gust=hidden.Gust(std, 0.3, 0.05)), "hover")
         # The pilot fights them with thrust, which has no part in body x and y.
         assert np.std(log["f"][:, :2]) == pytest.approx(std, rel=0.15)
         assert 0.04 < np.std(log["w"][:, 2]) < 0.08

@@ -1,6 +1,7 @@
 """The command flytrack-sysid: from a plant to a model and its report, and its refusals."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import gymnax
@@ -8,28 +9,15 @@ import numpy as np
 import pytest
 
 from blackbox.build import build
-from blackbox.plant import PlantParameters
 from flytrack_env import load_model, load_provenance, save_model
 from flytrack_env.dynamics import nominal_parameters
 from flytrack_sysid import cli, collect, load_log, save_log
 from flytrack_sysid.cli import load_plant, main
-from flytrack_sysid.log import FlightLog
-from tests.support.black_boxes import SHIPPED
+from tests.support.black_boxes import AIRLESS, SHIPPED
 
 TAUS = (0.02, 0.05, 0.07, 0.03)
-OTHER = PlantParameters(
-    mass=1.0,
-    gravity=9.80665,
-    battery_drain=1.0,
-    lag=TAUS,
-    max_rate=(618.0, 618.0, 120.0),
-    thrust=(-7.0, -3.0, 3.0, -1.0, 0.9, 0.9),
-    body_drag=(0.0, 0.0, 0.0),
-    rotor_drag=0.0,
-    translational_lift=0.0,
-    translational_speed=1.0,
-    ground_radius=0.0,
-)
+THRUST = (-7.0, -3.0, 3.0, -1.0, 0.9, 0.9)
+OTHER = AIRLESS._replace(mass=1.0, lag=TAUS, max_rate=(618.0, 618.0, 120.0), thrust=THRUST)
 
 
 def run(*arguments: object) -> None:
@@ -139,14 +127,10 @@ def test_collect_refuses(capsys, tmp_path, monkeypatch, plant, options, message)
     assert {path.name for path in tmp_path.iterdir()} <= {"my_robot.py", "__pycache__"}
 
 
-def with_rates_in_degrees(log: FlightLog) -> FlightLog:
-    return FlightLog(log.time, {**log.channels, "w": np.rad2deg(log["w"])}, log.segment)
-
-
 @pytest.mark.parametrize(
     ("change", "options", "message"),
     [
-        (with_rates_in_degrees, [], "deg/s"),
+        (lambda log: replace(log, channels={**log.channels, "w": np.rad2deg(log["w"])}), [], "deg/s"),
         (lambda log: log.select(slice(50)), [], "too short"),
         (lambda log: log, ["--fix", "tau_yaw"], "NAME=VALUE"),
         (lambda log: log, ["--effect", "magic"], "magic"),

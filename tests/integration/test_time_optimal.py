@@ -10,23 +10,12 @@ import pytest
 
 from benchmarks import time_optimal
 from benchmarks.optimal.replay import replay
-from flytrack_env import available_tracks, load_track, nominal_parameters
+from flytrack_env import available_tracks, load_track, nominal_parameters, references
 from flytrack_env.dynamics import step
 from flytrack_env.effects import EFFECTS
-from flytrack_env.references import (
-    FOLDER,
-    KINDS,
-    ReferenceFileError,
-    load_reference,
-    model_digest,
-    save_reference,
-    shipped_path,
-    shipped_reference,
-    track_digest,
-)
 from flytrack_env.state import BATTERY, POSITION, QUATERNION, STATE_SIZE, VELOCITY
 
-SHIPPED = sorted(FOLDER.glob("*.npz"))
+SHIPPED = sorted(references.FOLDER.glob("*.npz"))
 RADIUS_M = 0.15
 EXACT = 1e-6  # of the simulator in float64
 
@@ -53,13 +42,17 @@ def test_the_symbolic_step_is_the_simulators() -> None:
 
 
 def test_every_track_has_its_references() -> None:
-    wanted = {shipped_path(track, kind, "nominal") for track in available_tracks() for kind in KINDS}
+    wanted = {
+        references.shipped_path(track, kind, "nominal")
+        for track in available_tracks()
+        for kind in references.KINDS
+    }
     assert wanted <= set(SHIPPED)
-    nominal = shipped_reference("flytrack", "flying")
-    assert model_digest(nominal.model) == model_digest(nominal_parameters())
+    nominal = references.shipped_reference("flytrack", "flying")
+    assert references.model_digest(nominal.model) == references.model_digest(nominal_parameters())
     assert nominal.percent_above(1.08 * nominal.time_s) == pytest.approx(8.0)
-    with pytest.raises(ReferenceFileError, match="flytrack_nominal_flying"):
-        shipped_reference("nowhere")
+    with pytest.raises(references.ReferenceFileError, match="flytrack_nominal_flying"):
+        references.shipped_reference("nowhere")
 
 
 # A program per number of gates and model: one of them in every run.
@@ -72,10 +65,10 @@ REPLAYED = [
 
 @pytest.mark.parametrize("path", REPLAYED)
 def test_its_commands_fly_in_the_simulator(path: Path) -> None:
-    found = load_reference(path)
+    found = references.load_reference(path)
     track = load_track(found.track)
     assert path.stem == f"{found.track}_{found.model_name}_{found.kind}"
-    assert found.track_sha256 == track_digest(track) and found.found["status"] == "Solve_Succeeded"
+    assert found.track_sha256 == references.track_digest(track) and found.found["status"] == "Solve_Succeeded"
     flown = replay(found, track)
     assert time_optimal.is_verified(found, flown)
     assert flown.time_s == pytest.approx(found.time_s, abs=1e-4)
@@ -90,7 +83,7 @@ def test_its_commands_fly_in_the_simulator(path: Path) -> None:
 
 def rewritten(path: Path, **changes: Any) -> Path:
     """Write the flying lap of the FlyTrack course with arrays or notes replaced."""
-    with np.load(shipped_path("flytrack", "flying", "nominal")) as file:
+    with np.load(references.shipped_path("flytrack", "flying", "nominal")) as file:
         data = dict(file)
     notes = json.loads(str(data["notes"]))
     for name, value in changes.items():
@@ -113,28 +106,28 @@ def rewritten(path: Path, **changes: Any) -> Path:
 )
 def test_a_damaged_file_is_refused(changes: dict[str, Any], reason: str, tmp_path: Path) -> None:
     path = rewritten(tmp_path / "lap.npz", **changes)
-    with pytest.raises(ReferenceFileError, match=f"lap.npz.*{reason}"):
-        load_reference(path)
+    with pytest.raises(references.ReferenceFileError, match=f"lap.npz.*{reason}"):
+        references.load_reference(path)
 
 
 def test_a_saved_reference_comes_back_and_half_of_it_is_refused(tmp_path: Path) -> None:
-    found, path = shipped_reference("flytrack", "flying"), tmp_path / "lap.npz"
-    save_reference(path, found)
-    again = load_reference(path)
+    found, path = references.shipped_reference("flytrack", "flying"), tmp_path / "lap.npz"
+    references.save_reference(path, found)
+    again = references.load_reference(path)
     np.testing.assert_array_equal(again.states, found.states)
     np.testing.assert_array_equal(again.commands, found.commands)
     assert (again.time_s, again.found) == (found.time_s, found.found)
     path.write_bytes(path.read_bytes()[:1000])
     for broken in (path, tmp_path / "missing.npz"):
-        with pytest.raises(ReferenceFileError, match="cannot be read"):
-            load_reference(broken)
+        with pytest.raises(references.ReferenceFileError, match="cannot be read"):
+            references.load_reference(broken)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", references.KINDS)
 def test_the_solver_finds_the_shipped_time_again(kind: str) -> None:
     pytest.importorskip("casadi")
-    shipped = shipped_reference("flytrack", kind)
+    shipped = references.shipped_reference("flytrack", kind)
     again = time_optimal.optimise(load_track("flytrack"), kind, shipped.model, "nominal")
     assert again.time_s == pytest.approx(shipped.time_s, rel=1e-4)
     assert time_optimal.is_verified(again, replay(again, load_track("flytrack")))

@@ -3,10 +3,6 @@
 import logging
 import shutil
 import signal
-import subprocess
-import sys
-import time
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -17,7 +13,7 @@ from baselines.purejaxrl_ppo import CheckpointError, load_checkpoint, monitor
 from baselines.purejaxrl_ppo.checkpoint import save_checkpoint
 from baselines.purejaxrl_ppo.resume import at_common_step, newest_intact, warn_of_other_machine
 from baselines.purejaxrl_ppo.run import DivergedError, Options, Run
-from tests.support.pages import ROOT
+from benchmarks.reliability import training as killed
 from tests.support.ppo_runs import BATCH, EVERY_OTHER_UPDATE, SEED, assert_same_end
 from tests.support.slow import slow_but
 
@@ -221,33 +217,9 @@ def test_seeds_killed_between_their_checkpoints_end_bit_for_bit(trainer, togethe
         assert_same_end(folder / "final.safetensors", together[0] / folder.name / "final.safetensors")
 
 
-def command_line(out: Path, *arguments: str) -> list[str]:
-    settings = f"--num-envs 16 --num-steps 64 --total-timesteps {300 * 1024} --hidden-sizes 8 --seed 5"
-    watching = f"--checkpoint-every {10 * 1024} --evaluate-every 0 --no-tracking --out {out}"
-    train = "-m baselines.purejaxrl_ppo.train_ppo"
-    return [sys.executable, *train.split(), *settings.split(), *watching.split(), *arguments]
-
-
 @pytest.mark.slow
-def test_a_run_killed_at_any_moment_ends_in_the_same_bits(tmp_path):
-    whole, killed = tmp_path / "whole", tmp_path / "killed"
-    subprocess.run(command_line(whole), cwd=ROOT, check=True, capture_output=True, timeout=600)
-    rng = np.random.default_rng()
-    resume, kills = [], 0
-    while not (killed / "final.safetensors").exists():
-        process = subprocess.Popen(
-            command_line(killed, *resume), cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
-        )
-        before = set(killed.glob("step_*.safetensors"))
-        deadline_s = time.monotonic() + 300
-        while set(killed.glob("step_*.safetensors")) == before and process.poll() is None:
-            assert time.monotonic() < deadline_s
-            time.sleep(0.01)
-        if kills < 4:
-            time.sleep(float(rng.uniform(0.0, 0.3)))
-            process.kill()
-            kills += 1
-        process.wait(timeout=600)
-        resume = ["--resume", str(killed)]
-    assert kills == 4
-    assert_same_end(killed / "final.safetensors", whole / "final.safetensors")
+def test_a_run_killed_at_any_moment_ends_in_the_same_bits(tmp_path, monkeypatch):
+    shorter = killed.FLAGS.replace(str(killed.UPDATES * killed.BATCH), str(1500 * killed.BATCH))
+    monkeypatch.setattr(killed, "FLAGS", shorter)
+    found = killed.kill_and_resume(3, tmp_path)
+    assert found["is_held"] and found["kills"] == 3

@@ -7,17 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from benchmarks.hidden import (
-    CHANGES,
-    EFFECTS,
-    Truth,
-    draw_base,
-    draw_change,
-    draw_effect,
-    draw_outside,
-    fly,
-    measure,
-)
+from benchmarks import hidden
 from flytrack_env.plants import Simulator
 from flytrack_sysid import collect
 from flytrack_sysid.log import FlightLog
@@ -34,8 +24,8 @@ Rng = np.random.Generator
 class Case(NamedTuple):
     """A plant, what its team believes in, and its measured log."""
 
-    truth: Truth
-    believed: Truth
+    truth: hidden.Truth
+    believed: hidden.Truth
     log: FlightLog
 
 
@@ -44,23 +34,23 @@ def rng_of(name: str, seed: int = SEED) -> Rng:
     return np.random.default_rng([seed, *name.encode()])
 
 
-def _flown(truth: Truth, rng: Rng, kind: str = "scripted") -> Case:
-    return Case(truth, truth, measure(fly(truth, kind, SECONDS, rng), "sensors", rng))
+def _flown(truth: hidden.Truth, rng: Rng, kind: str = "scripted") -> Case:
+    return Case(truth, truth, hidden.measure(hidden.fly(truth, kind, SECONDS, rng), "sensors", rng))
 
 
 def _signed(rng: Rng, sign: float = 1.0) -> Case:
     """Return a plant with a large signed effect, or its mirror image; both are drawn and flown alike."""
-    truth, name = draw_base(rng), str(rng.choice(list(SIGNED)))
-    values = draw_effect(name, rng, EFFECTS[name].high)
+    truth, name = hidden.draw_base(rng), str(rng.choice(list(SIGNED)))
+    values = hidden.draw_effect(name, rng, hidden.EFFECTS[name].high)
     effects = {name: {field: sign * value for field, value in values.items()}}
     return _flown(replace(truth, effects=effects), rng)
 
 
 def _in_training_only(rng: Rng) -> Case:
     """Return a plant with drag that is absent from the last of every four segments."""
-    still = draw_base(rng)
-    dragged = replace(still, effects={"linear_drag": draw_effect("linear_drag", rng, 0.4)})
-    parts = [fly(truth, "scripted", SECONDS, rng) for truth in (dragged, still)]
+    still = hidden.draw_base(rng)
+    dragged = replace(still, effects={"linear_drag": hidden.draw_effect("linear_drag", rng, 0.4)})
+    parts = [hidden.fly(truth, "scripted", SECONDS, rng) for truth in (dragged, still)]
     rows = np.arange(len(parts[0]))
     segment = rows // SEGMENT_ROWS
     is_still = segment % HELD_OUT_EVERY == HELD_OUT_EVERY - 1
@@ -69,40 +59,40 @@ def _in_training_only(rng: Rng) -> Case:
         for name, values in parts[0].channels.items()
     }
     clean = FlightLog(parts[0].time, channels, segment).select(segment < len(rows) // SEGMENT_ROWS)
-    return Case(still, still, measure(clean, "sensors", rng))
+    return Case(still, still, hidden.measure(clean, "sensors", rng))
 
 
 def _wind_in_hover(rng: Rng) -> Case:
-    truth = draw_base(rng)
+    truth = hidden.draw_base(rng)
     way = rng.uniform(-np.pi, np.pi)
     wind = {"a_x": HOVER_WIND * float(np.cos(way)), "a_y": HOVER_WIND * float(np.sin(way)), "a_z": 0.0}
     return _flown(replace(truth, effects={"wind": wind}), rng, kind="hover")
 
 
 def _thermal(rng: Rng) -> Case:
-    truth = replace(draw_base(rng), outside=draw_outside(rng, "position", OUTSIDE_AMPLITUDE))
+    truth = replace(hidden.draw_base(rng), outside=hidden.draw_outside(rng, "position", OUTSIDE_AMPLITUDE))
     return _flown(truth, rng)
 
 
 def _changed(name: str, rng: Rng) -> Case:
     """Return a plant of which the team believes an older base, flown as it is now."""
-    believed = draw_base(rng)
-    low, high = CHANGES[name].low, CHANGES[name].high
+    believed = hidden.draw_base(rng)
+    low, high = hidden.CHANGES[name].low, hidden.CHANGES[name].high
     size = float(np.exp(rng.uniform(np.log(low * high) / 2.0, np.log(high))))
-    return _flown(draw_change(believed, name, rng, size), rng)._replace(believed=believed)
+    return _flown(hidden.draw_change(believed, name, rng, size), rng)._replace(believed=believed)
 
 
 def _simulated(rng: Rng) -> Case:
     """Return flights of the simulator itself, without noise; all kinds, as many rows as the other logs."""
     log = collect(Simulator(), 1.0, int(rng.integers(2**31)))
     log = log.select(log.segment % 3 != 2)
-    nominal = Truth((0.03,) * 4, (0.0,) * 6)  # not looked at: the model is the simulator's own
+    nominal = hidden.Truth((0.03,) * 4, (0.0,) * 6)  # not looked at: the model is the simulator's own
     return Case(nominal, nominal, log)
 
 
 def _broken(rng: Rng, channel: str, value: float) -> Case:
     """Return a flight with one channel stuck at a value from the first row to the last."""
-    case = _flown(draw_base(rng), rng)
+    case = _flown(hidden.draw_base(rng), rng)
     stuck = np.full_like(case.log[channel], value)
     return case._replace(log=replace(case.log, channels={**case.log.channels, channel: stuck}))
 

@@ -3,6 +3,7 @@
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from flytrack_env.dynamics import ModelParameters
 from flytrack_sysid.excitation import script
@@ -70,13 +71,8 @@ class HandoutPlant:
 
 def rotation(quat: np.ndarray) -> np.ndarray:
     """Return rotation matrices, body to world, (..., 3, 3)."""
-    w, i, j, k = np.moveaxis(quat, -1, 0)
-    rows = [
-        [1 - 2 * (j * j + k * k), 2 * (i * j - k * w), 2 * (i * k + j * w)],
-        [2 * (i * j + k * w), 1 - 2 * (i * i + k * k), 2 * (j * k - i * w)],
-        [2 * (i * k - j * w), 2 * (j * k + i * w), 1 - 2 * (i * i + j * j)],
-    ]
-    return np.moveaxis(np.array(rows), (0, 1), (-2, -1))
+    matrices = Rotation.from_quat(quat.reshape(-1, 4), scalar_first=True).as_matrix()
+    return matrices.reshape(*quat.shape[:-1], 3, 3)
 
 
 def fly(plant: HandoutPlant, starts: np.ndarray, commands: np.ndarray, steps_s: np.ndarray) -> FlightLog:

@@ -11,16 +11,8 @@ from benchmarks.diagnosis import model_of
 from benchmarks.hidden import draw_base, fly, measure
 from flytrack_env.dynamics import ModelParameters
 from flytrack_env.effects import EFFECTS, AccelerometerBias, CommandDelay, LinearDrag
-from flytrack_sysid.diagnosis import summary
-from flytrack_sysid.diagnosis.evidence import EVIDENCE, bin_edges, binned_means, without
-from flytrack_sysid.diagnosis.report import (
-    html_of,
-    text_of,
-    verdict_of,
-    when_of,
-    while_acting,
-    write_diagnosis,
-)
+from flytrack_sysid.diagnosis import report, summary
+from flytrack_sysid.diagnosis.evidence import EVIDENCE, without
 from flytrack_sysid.diagnosis.result import (
     CAUSES_FOUND,
     UNEXPLAINED,
@@ -72,13 +64,13 @@ def test_pictures_of_a_cause_that_begins_in_flight_show_the_part_in_which_it_act
     late = Cause(
         "linear_drag", (), "velocity", {}, 9.0, 3.0, 9.0, 9.0, onset_s=Estimated(7.0, (6.8, 7.2), "s")
     )
-    acting = while_acting(found, late, float(log.time[0]))
+    acting = report.while_acting(found, late, float(log.time[0]))
     expected = found.elapsed_s >= 7.0 - log.time[0]
     np.testing.assert_array_equal(acting.counts["rates"], found.counts["rates"] & expected)
     assert 0.3 < acting.counts["rates"].mean() < 0.5
-    assert when_of(late) == " from 7.0 ± 0.2 s on"
+    assert report.when_of(late) == " from 7.0 ± 0.2 s on"
     ended = replace(late, onset_s=None, end_s=late.onset_s)
-    kept = while_acting(found, ended, float(log.time[0])).counts["rates"]
+    kept = report.while_acting(found, ended, float(log.time[0])).counts["rates"]
     np.testing.assert_array_equal(kept | acting.counts["rates"], found.counts["rates"])
 
 
@@ -223,7 +215,7 @@ def diagnosis(flown, measured):
 
 
 def test_page_says_all_and_loads_nothing(tmp_path, diagnosis, measured):
-    write_diagnosis(tmp_path, diagnosis, measured)
+    report.write_diagnosis(tmp_path, diagnosis, measured)
     text = (tmp_path / "report.html").read_text(encoding="utf-8")
     for words in (
         *(cause.effect for cause in diagnosis.causes),
@@ -251,7 +243,7 @@ def test_what_refitting_alone_or_a_guess_reaches_is_no_gain_of_effects(diagnosis
     found = replace(diagnosis, error={**errors, "extended": Errors({}, {"1": 0.403})}, prediction=blind)
     assert (
         "0.4 m when only refitted: no effect adds to that; a guess that ignores the commands, 0.27 m)"
-        in text_of(found)
+        in report.text_of(found)
     )
 
 
@@ -259,13 +251,13 @@ def test_what_is_beyond_the_list_is_told_and_not_named(diagnosis):
     drag, lag, _ = diagnosis.causes
     at_end = replace(lag, beyond="tau_roll at most 0.001 s")
     found = replace(diagnosis, causes=(drag,), beyond=(at_end,))
-    text = verdict_of(found).text
+    text = report.verdict_of(found).text
     assert text.startswith("The model lacks drag in proportion to airspeed. Named linear_drag: flies")
     assert (
         "Beyond the list, so that its cause may be another: lag of roll (tau_roll at most 0.001 s)." in text
     )
     alone = replace(found, causes=(), unexplained=Unexplained())
-    assert "lag of roll (tau_roll at most 0.001 s)" in verdict_of(alone).text
+    assert "lag of roll (tau_roll at most 0.001 s)" in report.verdict_of(alone).text
     (stored,) = alone.as_json()["beyond_the_list"]
     assert stored["effect"] == "tau_roll" and alone.as_json()["causes"] == []
     assert summary.verdict_of((), Unexplained(flagged=True)) == UNEXPLAINED
@@ -274,17 +266,5 @@ def test_what_is_beyond_the_list_is_told_and_not_named(diagnosis):
 
 @pytest.mark.slow
 def test_page_of_a_log_of_few_channels(diagnosis, measured):
-    text = html_of(diagnosis, measured.without("w", "f", "v_bat"))
+    text = report.html_of(diagnosis, measured.without("w", "f", "v_bat"))
     assert "attitude or velocity replace them" in text and text.count("<img") == 1 + len(diagnosis.causes)
-
-
-def test_intervals_of_bins_allow_for_correlated_rows():
-    rng = np.random.default_rng(7)
-    block = np.repeat(np.arange(200), 50)
-    values = np.repeat(rng.standard_normal(200), 50) + rng.standard_normal(10_000)
-    regressor = rng.random(10_000)
-    edges = bin_edges(regressor)
-    found = binned_means(regressor, values, block, edges)
-    alone = binned_means(regressor, values, np.arange(10_000), edges)
-    assert len(found.at) == 15 and np.all(found.ends95 > 1.3 * alone.ends95)
-    np.testing.assert_allclose(alone.ends95, 1.96 * np.sqrt(2.0 / (10_000 / 15)), rtol=0.25)

@@ -130,23 +130,6 @@ def test_halving_the_time_step_divides_the_error(error: Any, applied: float, rat
         assert coarse / fine == pytest.approx(ratio, rel=0.05)
 
 
-@pytest.mark.parametrize("num_steps", [1, 2, 7, 50])
-def test_translation_is_exact_for_a_constant_acceleration(num_steps: int) -> None:
-    params = double_parameters(thrust_coeffs=np.array([15.0, 0, 0, 0, 0, 0]))
-    start = START.copy()
-    start[0:6] = (1.0, 2.0, 3.0, -4.0, 5.0, 6.0)
-    half = np.deg2rad(40.0) / 2.0
-    start[9:13] = (np.cos(half), 0.0, np.sin(half), 0.0)
-    with jax.enable_x64(True):
-        x = fly(start, np.zeros((num_steps, 4)), 0.5 / num_steps, params)[-1]
-    tilt = np.array([np.sin(2 * half), 0.0, np.cos(2 * half)])
-    acceleration = tilt * 15.0 / params.m - np.array([0.0, 0.0, params.g])
-    velocity = start[3:6] + 0.5 * acceleration
-    np.testing.assert_allclose(x[3:6], velocity, atol=1e-10)
-    position = start[0:3] + 0.5 * start[3:6] + 0.125 * acceleration
-    np.testing.assert_allclose(x[0:3], position, atol=1e-10)
-
-
 @pytest.mark.parametrize(("is_double", "tolerance"), [(True, 1e-9), (False, 0.01)])
 def test_battery_loses_one_volt_per_minute(is_double: bool, tolerance: float) -> None:
     with jax.enable_x64(is_double):

@@ -1,7 +1,6 @@
 """The environment as a gymnax client sees it: the protocol, ends of episodes, actions, observations."""
 
 from pathlib import Path
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -9,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from flytrack_env.env import EnvParams, FlyTrack
+from flytrack_env.env import FlyTrack
 from flytrack_env.episodes import clip_action
 from flytrack_env.model_file import ModelFileError
 from flytrack_env.observations import OBSERVATION, OBSERVATION_SIZE
@@ -17,14 +16,14 @@ from flytrack_env.state import Action, pack
 from flytrack_env.tracks import TrackError, load_track
 from tests.support.coasting import drone_at
 from tests.support.trees import assert_close, stack
-from tests.support.wrapped_flights import NUM_ENVS, Flight, arrays, fly, steps_of
+from tests.support.wrapped_flights import NUM_ENVS, arrays, fly, steps_of
 
 CAUSES = ("crash", "ground", "out_of_bounds", "missed_gate", "battery_empty")
 RACE = {"gates_passed", "laps", "lap_completed", "lap_time_s", "gate_distance_m"}
 
 
 @pytest.fixture(scope="module")
-def flight(env: FlyTrack) -> Flight:
+def flight(env):
     """300 random steps of 16 drones, extreme sticks among them."""
     actions = np.random.default_rng(0).uniform(-1.0, 1.0, (300, NUM_ENVS, 4)).astype(np.float32)
     actions[:, :4] = np.sign(actions[0, :4])
@@ -33,14 +32,14 @@ def flight(env: FlyTrack) -> Flight:
     return fly(env, actions=actions)
 
 
-def ended(flight: Flight) -> np.ndarray:
+def ended(flight):
     return np.asarray(flight.terminated | flight.truncated)
 
 
 # --- The protocol -------------------------------------------------------------------------------
 
 
-def test_step_returns_values_of_the_stated_types(flight: Flight) -> None:
+def test_step_returns_values_of_the_stated_types(flight):
     shape = flight.rewards.shape
     for observation in (flight.observations, flight.info["final_observation"]):
         assert observation.shape == (*shape, OBSERVATION_SIZE) and observation.dtype == jnp.float32
@@ -51,7 +50,7 @@ def test_step_returns_values_of_the_stated_types(flight: Flight) -> None:
         assert (before.shape, before.dtype) == (after.shape[1:], after.dtype)
 
 
-def test_default_parameters_are_used_when_none_are_given(env: FlyTrack, flight: Flight) -> None:
+def test_default_parameters_are_used_when_none_are_given(env, flight):
     """Without ``jit``, which changes nothing either."""
     key, action = jax.random.key(3), np.full(4, 0.3, np.float32)
     keys, states = jnp.stack([key] * NUM_ENVS), flight.start
@@ -61,9 +60,7 @@ def test_default_parameters_are_used_when_none_are_given(env: FlyTrack, flight: 
     assert_close(found, jax.tree.map(lambda leaf: leaf[0], expected), 1e-5)
 
 
-def test_spaces_are_finite_and_contain_every_observation(
-    env: FlyTrack, params: EnvParams, flight: Flight
-) -> None:
+def test_spaces_are_finite_and_contain_every_observation(env, params, flight):
     space, actions = env.observation_space(params), env.action_space(params)
     assert space.shape == (OBSERVATION_SIZE,) and actions.shape == (4,) and env.num_actions == 4
     assert np.isfinite(space.low).all() and np.isfinite(space.high).all()
@@ -72,13 +69,13 @@ def test_spaces_are_finite_and_contain_every_observation(
         assert ((array >= np.asarray(space.low)) & (array <= np.asarray(space.high))).all()
 
 
-def test_flights_end_in_many_ways_and_stay_finite(flight: Flight) -> None:
+def test_flights_end_in_many_ways_and_stay_finite(flight):
     assert flight.terminated.sum() > 30
     assert sum(flight.info[cause].any() for cause in CAUSES) >= 3 and flight.info["gates_passed"].max() >= 1
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves((flight.states, flight.rewards)))
 
 
-def test_auto_reset_leaves_nothing_behind(flight: Flight) -> None:
+def test_auto_reset_leaves_nothing_behind(flight):
     done, race = ended(flight), flight.states.race
     for leaf in (flight.states.time, race.gates_passed, race.laps, race.lap_start_s, race.lap_time_s):
         assert not leaf[done].any()
@@ -87,7 +84,7 @@ def test_auto_reset_leaves_nothing_behind(flight: Flight) -> None:
     assert (flight.observations[done] != final[done]).any(axis=1).all()
 
 
-def test_info_belongs_to_the_step_not_to_the_reset(env: FlyTrack, flight: Flight) -> None:
+def test_info_belongs_to_the_step_not_to_the_reset(env, flight):
     done, states, info = ended(flight), flight.states, flight.info
     np.testing.assert_array_equal(np.stack([info[cause] for cause in CAUSES]).any(axis=0), flight.terminated)
     np.testing.assert_array_equal(info["terminated"], flight.terminated)
@@ -99,7 +96,7 @@ def test_info_belongs_to_the_step_not_to_the_reset(env: FlyTrack, flight: Flight
     np.testing.assert_allclose(info["gate_distance_m"][~done], distance[~done], atol=1e-4)
 
 
-def test_parameters_can_differ_between_environments(env: FlyTrack, params: EnvParams) -> None:
+def test_parameters_can_differ_between_environments(env, params):
     masses = jnp.array([0.5, 1.0, 2.0])
     batched = params.replace(model=params.model._replace(m=masses))
     axes = jax.tree.map(lambda _: None, params).replace(
@@ -146,7 +143,7 @@ BATCHES = [list(ENDS)[:NUM_ENVS], list(ENDS)[NUM_ENVS:]]
 
 
 @pytest.fixture(scope="module")
-def ends(env: FlyTrack) -> list[tuple[Any, ...]]:
+def ends(env):
     """One step, alone and as a batch, of every row of ``ENDS`` from a race that has gone on for a while."""
     params, results = arrays(env.default_params), []
     keys = jax.random.split(jax.random.key(7), NUM_ENVS)
@@ -167,7 +164,7 @@ def ends(env: FlyTrack) -> list[tuple[Any, ...]]:
 
 
 @pytest.mark.parametrize("name", ENDS)
-def test_every_end_has_its_own_cause_and_flags(name: str, ends: list[tuple[Any, ...]]) -> None:
+def test_every_end_has_its_own_cause_and_flags(name, ends):
     batch = int(name in BATCHES[1])
     row = BATCHES[batch].index(name)
     *_, causes, is_truncated = ENDS[name]
@@ -176,9 +173,7 @@ def test_every_end_has_its_own_cause_and_flags(name: str, ends: list[tuple[Any, 
         assert bool(terminated[row]) is bool(causes) and bool(truncated[row]) is is_truncated
 
 
-def test_batch_step_ends_the_same_episodes_and_resets_them_apart(
-    env: FlyTrack, params: EnvParams, ends: list[tuple[Any, ...]]
-) -> None:
+def test_batch_step_ends_the_same_episodes_and_resets_them_apart(env, params, ends):
     single, batch = ends[0]
     assert_close(batch[2:], single[2:], 2e-5)
     done = np.asarray(batch[3] | batch[4])
@@ -197,7 +192,7 @@ def test_batch_step_ends_the_same_episodes_and_resets_them_apart(
 # --- Actions ------------------------------------------------------------------------------------
 
 
-def test_actions_beyond_the_range_are_clipped(env: FlyTrack, flight: Flight) -> None:
+def test_actions_beyond_the_range_are_clipped(env, flight):
     corners = np.resize(np.array([[1, -1, 1, 1], [-1, 1, -1, -1]], np.float32), (NUM_ENVS, 4))
     factors = np.resize(np.array([1.001, 7.0, 1e30, np.inf], np.float32).repeat(2), NUM_ENVS)[:, None]
     keys = jax.random.split(jax.random.key(11), NUM_ENVS)
@@ -209,14 +204,12 @@ def test_actions_beyond_the_range_are_clipped(env: FlyTrack, flight: Flight) -> 
     assert_close(found, expected, 0.0)
 
 
-def test_integer_actions_are_as_good_as_real_ones() -> None:
+def test_integer_actions_are_as_good_as_real_ones():
     assert clip_action(jnp.array([3, 0, -2, 1])) == clip_action(jnp.array([1.0, 0.0, -1.0, 1.0]))
 
 
 @pytest.mark.parametrize("shape", [(), (3,), (5,), (4, 1), (1, 4)])
-def test_actions_of_another_shape_are_refused(
-    shape: tuple[int, ...], env: FlyTrack, params: EnvParams
-) -> None:
+def test_actions_of_another_shape_are_refused(shape, env, params):
     state = env.begin(drone_at((15.0, 2.0, 1.35)), 0, params)
     for step, key in ((env.step, jax.random.key(0)), (env.step_env, None)):
         with pytest.raises(ValueError, match=r"action: found shape .*expected \(4,\)"):
@@ -240,9 +233,7 @@ def test_actions_of_another_shape_are_refused(
         ({"reward": {"progress": "much"}}, ValueError, r"reward\.progress: found 'much', expected a finite"),
     ],
 )
-def test_wrong_arguments_say_what_was_expected(
-    arguments: dict[str, Any], error: type[Exception], message: str
-) -> None:
+def test_wrong_arguments_say_what_was_expected(arguments, error, message):
     with pytest.raises(error, match=message):
         FlyTrack(**arguments)
 
@@ -250,7 +241,7 @@ def test_wrong_arguments_say_what_was_expected(
 # --- Observation --------------------------------------------------------------------------------
 
 
-def expected_observation(x: np.ndarray, gate_index: int) -> np.ndarray:
+def expected_observation(x, gate_index):
     """Return the observation of a state (21,) before a gate, from the track's data, in NumPy."""
     track = load_track("flytrack")
     gates = [track.gates[(gate_index + i) % len(track.gates)] for i in (0, 1)]
@@ -273,7 +264,7 @@ def expected_observation(x: np.ndarray, gate_index: int) -> np.ndarray:
     return np.concatenate([np.clip(np.array(q) / e.scale, -e.limit, e.limit) for e, q in rows])
 
 
-def test_observation_index_by_index(flight: Flight) -> None:
+def test_observation_index_by_index(flight):
     assert [entry.size for entry in OBSERVATION] == [3, 3, 9, 3, 4, 1, 3, 3]
     rows = np.flatnonzero(np.arange(flight.rewards.size) % 7 == 0)
     observed, drones, gates = jax.tree.map(
@@ -286,7 +277,7 @@ def test_observation_index_by_index(flight: Flight) -> None:
     np.testing.assert_allclose(observed, expected, atol=2e-5)
 
 
-def test_observation_is_clipped_to_its_range(env: FlyTrack, params: EnvParams) -> None:
+def test_observation_is_clipped_to_its_range(env, params):
     drone = drone_at((1e6, -1e6, 0.0), (1e5, 0.0, 0.0), applied=Action(2.0, -2.0, 0.0, 0.0), battery_v=30.0)
     observation = env.observe(None, env.begin(drone, 0, params), None, params)
     assert env.observation_space(params).contains(observation)

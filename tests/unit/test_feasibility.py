@@ -1,29 +1,14 @@
 """The check of a course's geometry: the shipped ones pass, and every way of breaking one is found."""
 
 import math
-from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
-import numpy as np
 import pytest
-from scipy.interpolate import CubicHermiteSpline
 
+from flytrack_env import tracks
 from flytrack_env.params import EnvParams
-from flytrack_env.quaternion import Vec3
 from flytrack_env.resets import ResetParams
-from flytrack_env.tracks import (
-    DEMANDS,
-    Gate,
-    Limits,
-    Track,
-    available_tracks,
-    build_course,
-    find_problems,
-    hermite_curve,
-    load_track,
-    sample_way,
-)
 
 NUM_GATES, RADIUS, HEIGHT = 6, 10.0, 2.0
 
@@ -34,124 +19,92 @@ def yaw_of(heading_deg: float) -> tuple[float, float, float, float]:
     return (math.cos(half), 0.0, 0.0, math.sin(half))
 
 
-def ring(radius: float = RADIUS, num_gates: int = NUM_GATES) -> Track:
+def ring(radius: float = RADIUS, num_gates: int = NUM_GATES) -> tracks.Track:
     """Return gates on a circle, flown anticlockwise, gate 0 at (radius, 0); starts 5 m before it."""
     gates = []
     for i in range(num_gates):
         angle = 2.0 * math.pi * i / num_gates
         centre = (radius * math.cos(angle), radius * math.sin(angle), HEIGHT)
-        gates.append(Gate(10 + i, centre, yaw_of(math.degrees(angle) + 90.0), 1.0, 1.5, 2.7))
+        gates.append(tracks.Gate(10 + i, centre, yaw_of(math.degrees(angle) + 90.0), 1.0, 1.5, 2.7))
     wall = radius + 5.0
-    return Track(
+    return tracks.Track(
         "ring", tuple(gates), (radius, -5.0, 0.1), yaw_of(180.0), (-wall, -wall, 0.0), (wall, wall, 7.0)
     )
 
 
-def change_gate(track: Track, index: int, **fields: Any) -> Track:
-    """Return a track with other fields of one gate."""
-    gates = list(track.gates)
+def changed(index: int, **fields: Any) -> tracks.Track:
+    """Return the ring with other fields of one gate."""
+    gates = list(RING.gates)
     gates[index] = replace(gates[index], **fields)
-    return replace(track, gates=tuple(gates))
+    return replace(RING, gates=tuple(gates))
 
 
-def point_on_way(track: Track, way: int, share: float) -> tuple[float, ...]:
-    """Return a point between two gates."""
-    samples = sample_way(build_course(track), 1001)[way]
-    return tuple(samples[round(1000 * share)].tolist())
+RING = ring()
+ALIKE = {"quaternion": RING.gates[0].quaternion}  # flown the same way as gate 10
+ON_WAY = tuple(tracks.sample_way(tracks.build_course(RING), 1001)[0][505].tolist())  # from gate 10 to 11
 
 
 def test_unbroken_ring_is_feasible() -> None:
-    assert find_problems(ring()) == ()
+    assert tracks.find_problems(RING) == ()
 
 
-@pytest.mark.parametrize("name", available_tracks())
+@pytest.mark.parametrize("name", tracks.available_tracks())
 def test_shipped_tracks_are_feasible(name: str) -> None:
-    assert find_problems(load_track(name)) == ()
+    assert tracks.find_problems(tracks.load_track(name)) == ()
 
 
-def near_gate(track: Track) -> Track:
-    """Gate 11 moves to 3 m behind gate 10."""
-    return change_gate(track, 1, position=(RADIUS, 3.0, HEIGHT))
-
-
-def gate_in_path(track: Track) -> Track:
-    """Gate 13 moves into the way from gate 10 to 11, and stands across it."""
-    return change_gate(track, 3, position=point_on_way(track, 0, 0.505), quaternion=yaw_of(120.0))
-
-
-def touching_gate(track: Track) -> Track:
-    """Gate 13 moves beside gate 10: no path, but their frames are 0.2 m apart."""
-    return change_gate(track, 3, position=(RADIUS + 2.9, 0.0, HEIGHT), quaternion=track.gates[0].quaternion)
-
-
-# What breaks the ring, the demand that it breaks, and what the message says of it.
-BREAKS: dict[str, tuple[Callable[[Track], Track], str, str]] = {
-    "small opening": (
-        lambda track: change_gate(track, 2, opening=0.5),
-        "opening",
-        "gate 12: opening of 0.5 m, expected at least 0.6 m",
+# What the message says of a break of the ring, the course, and the demand that it breaks.
+BREAKS = {
+    "gate 12: opening of 0.5 m, expected at least 0.6 m": (changed(2, opening=0.5), "opening"),
+    "gates 10 and 11: 3.00 m apart, expected 5 to 40 m": (
+        changed(1, position=(RADIUS, 3, HEIGHT)),
+        "spacing",
     ),
-    "too near": (near_gate, "spacing", "gates 10 and 11: 3.00 m apart, expected 5 to 40 m"),
-    "too far": (lambda track: ring(41.0), "spacing", "gates 15 and 10: 41.00 m apart, expected 5 to 40 m"),
-    "reversed: to": (
-        lambda track: change_gate(track, 2, direction=-1.0),
-        "turn",
-        "gate 12: 150 deg between its direction of flight and the straight way to gate 13, expected at "
-        "most 100 deg",
-    ),
-    "next gate from behind": (
-        lambda track: change_gate(track, 2, direction=-1.0),
-        "own gate",
-        "gate 12: the way from gate 11 to 12 ",
-    ),
+    "gates 15 and 10: 41.00 m apart, expected 5 to 40 m": (ring(41.0), "spacing"),
+    "gate 12: 150 deg between its direction of flight and the straight way to gate 13, expected at most 100 "
+    "deg": (changed(2, direction=-1.0), "turn"),
+    "gate 12: the way from gate 11 to 12 ": (changed(2, direction=-1.0), "own gate"),  # from behind
     # 8 m beside gate 10, 0.3 m ahead, and flown the same way: its plane is crossed at once, far to the side.
-    "past the next gate": (
-        lambda track: change_gate(
-            track, 1, position=(RADIUS - 8.0, 0.3, HEIGHT), quaternion=track.gates[0].quaternion
-        ),
+    "gate 11: the way from gate 10 to 11 misses it": (
+        changed(1, position=(RADIUS - 8.0, 0.3, HEIGHT), **ALIKE),
         "own gate",
-        "gate 11: the way from gate 10 to 11 misses it",
     ),
-    "in the path": (
-        gate_in_path,
+    "gate 13: 0.00 m from the way from gate 10 to 11, expected at least 0.65 m": (
+        changed(3, position=ON_WAY, quaternion=yaw_of(120.0)),  # across it
         "path",
-        "gate 13: 0.00 m from the way from gate 10 to 11, expected at least 0.65 m",
     ),
-    "touching": (touching_gate, "frames", "gates 10 and 13: frames 0.20 m apart, expected at least 0.65 m"),
-    "frame outside": (
-        lambda track: replace(track, bounds_high=(10.5, 15.0, 7.0)),
+    "gates 10 and 13: frames 0.20 m apart, expected at least 0.65 m": (
+        changed(3, position=(RADIUS + 2.9, 0.0, HEIGHT), **ALIKE),
+        "frames",
+    ),
+    "gate 10: frame 0.85 m out of bounds (high x), expected inside": (
+        replace(RING, bounds_high=(10.5, 15.0, 7.0)),
         "bounds",
-        "gate 10: frame 0.85 m out of bounds (high x), expected inside",
     ),
-    "start behind": (
-        lambda track: replace(track, start_position=(RADIUS, 5.0, HEIGHT)),
+    "start: 180 deg off the direction of flight of gate 10, expected in front of it, at most 60 deg": (
+        replace(RING, start_position=(RADIUS, 5.0, HEIGHT)),
         "start",
-        "start: 180 deg off the direction of flight of gate 10, expected in front of it, at most 60 deg",
     ),
-    "start behind another gate": (
-        lambda track: change_gate(
-            track, 3, position=(RADIUS + 1.0, -2.5, HEIGHT), quaternion=track.gates[0].quaternion
-        ),
+    "start: gate 13 is 0.00 m from the straight way to gate 10, expected at least 0.65 m": (
+        changed(3, position=(RADIUS + 1.0, -2.5, HEIGHT), **ALIKE),
         "start",
-        "start: gate 13 is 0.00 m from the straight way to gate 10, expected at least 0.65 m",
     ),
-    "start at the wall": (
-        lambda track: replace(track, bounds_low=(-15.0, -5.2, 0.0)),
+    "start: 0.25 m too near the bounds or beyond them (low y)": (
+        replace(RING, bounds_low=(-15.0, -5.2, 0.0)),
         "start",
-        "start: 0.25 m too near the bounds or beyond them (low y)",
     ),
 }
 
 
-@pytest.mark.parametrize("case", BREAKS)
-def test_every_break_is_found_and_named(case: str) -> None:
-    breaking, demand, text = BREAKS[case]
-    problems = find_problems(breaking(ring()))
+@pytest.mark.parametrize("text", BREAKS)
+def test_every_break_is_found_and_named(text: str) -> None:
+    track, demand = BREAKS[text]
+    problems = tracks.find_problems(track)
     assert [p for p in problems if p.demand == demand and p.text.startswith(text)], problems
 
 
 def test_every_demand_has_a_break() -> None:
-    assert {demand for _, demand, _ in BREAKS.values()} == set(DEMANDS)
+    assert {demand for _, demand in BREAKS.values()} == set(tracks.DEMANDS)
 
 
 # Field, the value that the FlyTrack course just keeps, the one that it breaks, and the demand.
@@ -168,24 +121,15 @@ EDGES = [
 
 @pytest.mark.parametrize(("field", "kept", "broken", "demand"), EDGES)
 def test_limits_bind_where_they_say(field: str, kept: float, broken: float, demand: str) -> None:
-    track = load_track("flytrack")
-    assert find_problems(track, Limits()._replace(**{field: kept})) == ()
-    assert {p.demand for p in find_problems(track, Limits()._replace(**{field: broken}))} == {demand}
+    track = tracks.load_track("flytrack")
+    assert tracks.find_problems(track, tracks.Limits()._replace(**{field: kept})) == ()
+    found = tracks.find_problems(track, tracks.Limits()._replace(**{field: broken}))
+    assert {problem.demand for problem in found} == {demand}
 
 
 def test_default_clearances_are_what_starts_need() -> None:
     radius, starts = EnvParams.drone_radius, ResetParams()
-    limits = Limits()
+    limits = tracks.Limits()
     assert limits.drone_radius == radius
     assert limits.clearance == pytest.approx(starts.course_offset + radius)
     assert limits.start_clearance == pytest.approx(starts.start_position_noise + radius)
-
-
-def test_hermite_curve_is_scipys() -> None:
-    rng = np.random.default_rng(0)
-    start, leave, end, meet = rng.normal(size=(4, 3))
-    s = np.linspace(0.0, 1.0, 7)
-    point, tangent = hermite_curve(Vec3(*start), Vec3(*leave), Vec3(*end), Vec3(*meet), s)
-    spline = CubicHermiteSpline([0.0, 1.0], [start, end], [leave, meet])
-    np.testing.assert_allclose(np.stack(point, -1), spline(s), atol=1e-12)
-    np.testing.assert_allclose(np.stack(tangent, -1), spline(s, 1), atol=1e-12)

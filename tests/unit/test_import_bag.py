@@ -114,12 +114,7 @@ def test_what_lacks_a_topic_or_a_field_or_is_no_bag_is_refused(tmp_path):
     (tmp_path / "cut.mcap").write_bytes(flight.read_bytes()[:5000])
     (tmp_path / "empty").mkdir()
     for path, old, new, message in (
-        (
-            flight,
-            "/twist:twist.angular.x",
-            "/gyro:x",
-            "topic /gyro: no messages; found /pose, /sticks, /twist",
-        ),
+        (flight, "/twist:twist.angular.x", "/gyro:x", "topic /gyro: no messages; found /pose, /sticks, /tw"),
         (flight, "twist.angular.x", "rate", "topic /twist: field rate: not a number in messages of type any"),
         (flight, "/sticks:axes[0]", "roll", r"map\.toml: command: found roll, expected topic:field"),
         (tmp_path / "missing.mcap", "", "", "missing.mcap: cannot be read"),

@@ -92,10 +92,8 @@ def test_motors_replace_the_thrust_command_and_show_saturation(tmp_path):
 def test_only_the_longest_stretch_in_the_air_is_used(tmp_path):
     height = np.repeat([0.0, 1.0, 0.0, 1.0, 0.0], 300)
     height[700:720] = 1.0  # a hop
-    place = (
-        '[position]\ncolumns = ["zero", "zero2", "z"]\nunit = "m"\nframe = "z_up"\n[rows]\nabove_m = 0.2\n'
-    )
-    columns = {**flight(), "zero": 0 * height, "zero2": 0 * height, "z": height}
+    place = '[position]\ncolumns = ["n", "e", "h"]\nunit = "m"\nframe = "z_up"\n[rows]\nabove_m = 0.2\n'
+    columns = {**flight(), "n": 0 * height, "e": 0 * height, "h": height}
     log = read(tmp_path, MAPPING.replace("signs", "gain = [6, 5, 2]\nsigns") + place, columns).log
     assert len(log) == 300 and log.time[[0, -1]] == pytest.approx([3.0, 5.99])
 

@@ -60,25 +60,19 @@ def test_a_cut_off_or_damaged_log_is_read_to_its_end(tmp_path):
     assert "the checksum is wrong" in read(tmp_path, bytes(content)).notes[0]
 
 
-@pytest.mark.parametrize(
-    ("content", "message"),
-    [
-        (b"", r"log00: found b'' first, expected b'\\xbc'"),
-        (usd()[:40], r"log00: damaged header"),
-        (b"\xbc\x03" + usd()[2:], r"log00: damaged header: found version 3, expected one of 1, 2"),
-        (
-            usd().replace(b"gyro.x(f)", b"gyro.x(s)"),
-            r"damaged header: found variable gyro\.x\(s\), expected name",
-        ),
-        (
-            usd().replace(b"gyro.x(f)", b"gyro.q(f)"),
-            r"column gyro\.x: found 0 times among .*map\.toml: rates",
-        ),
-    ],
-)
-def test_what_is_no_such_log_is_refused(tmp_path, content, message):
+REFUSALS = {
+    r"log00: found b'' first, expected b'\\xbc'": b"",
+    r"log00: damaged header": usd()[:40],
+    r"log00: damaged header: found version 3, expected one of 1, 2": b"\xbc\x03" + usd()[2:],
+    r"damaged header: found variable gyro\.x\(s\), expected name": usd().replace(b"x(f)", b"x(s)"),
+    r"column gyro\.x: found 0 times among .*map\.toml: rates": usd().replace(b"gyro.x(f)", b"gyro.q(f)"),
+}
+
+
+@pytest.mark.parametrize("message", REFUSALS)
+def test_what_is_no_such_log_is_refused(tmp_path, message):
     with pytest.raises(LogError, match=message):
-        read(tmp_path, content)
+        read(tmp_path, REFUSALS[message])
 
 
 def lee_log(kw_sign: float = 1.0, noise: float = 0.0) -> tuple[bytes, np.ndarray]:

@@ -14,16 +14,13 @@ from flytrack_env.env import FlyTrack
 from flytrack_env.model_file import ModelFileError, load_model, save_model
 from flytrack_env.motion import Motion
 
-MINIMAL = """{
-  "tau": [0.03, 0.04, 0.05, 0.06],
-  "thrust_coeffs": [1, 2, 3, 4, 5, 6],
-  "max_rate": [618.0, 618.0, 120.0],
-  "m": 1,
-  "g": 9.80665,
-  "battery_drain_v_per_min": 1.0
+FIELDS = {
+    "tau": [0.03, 0.04, 0.05, 0.06],
+    "thrust_coeffs": [1, 2, 3, 4, 5, 6],
+    "max_rate": [618.0, 618.0, 120.0],
 }
-"""
-FIELDS = json.loads(MINIMAL)
+FIELDS |= {"m": 1, "g": 9.80665, "battery_drain_v_per_min": 1.0}
+MINIMAL = json.dumps(FIELDS)
 
 
 def assert_same_model(a: ModelParameters, b: ModelParameters) -> None:
@@ -70,28 +67,23 @@ def test_minimal_file_by_hand(tmp_path: Path) -> None:
 
 
 BAD_TEXTS = {
-    "missing field": (json.dumps({"tau": [1, 1, 1, 1]}), "thrust_coeffs: missing"),
-    "empty": ("", "not a JSON file"),
-    "deep": ("[" * 100_000, "not a JSON file"),
-    "newer": (json.dumps({"version": 2, "parameters": FIELDS}), "version: found 2, expected 1"),
-    "unknown field": (json.dumps({**FIELDS, "mass": 1}), "mass: unknown; expected one of tau, "),
-    "unknown effect": (
-        json.dumps({**FIELDS, "effects": {"drag": {}}}),
-        "effects: drag: unknown; expected one of comm",
+    "thrust_coeffs: missing": json.dumps({"tau": [1, 1, 1, 1]}),
+    "not a JSON file": "",
+    "not a JSON file.*": "[" * 100_000,
+    "version: found 2, expected 1": json.dumps({"version": 2, "parameters": FIELDS}),
+    "mass: unknown; expected one of tau, ": json.dumps({**FIELDS, "mass": 1}),
+    "effects: drag: unknown; expected one of comm": json.dumps({**FIELDS, "effects": {"drag": {}}}),
+    "effects: command_delay: delay_s: found 0.07, expected 0 to 0.06 s": json.dumps(
+        {**FIELDS, "effects": {"command_delay": {"delay_s": 0.07}}}
     ),
-    "parameter out of range": (
-        json.dumps({**FIELDS, "effects": {"command_delay": {"delay_s": 0.07}}}),
-        "effects: command_delay: delay_s: found 0.07, expected 0 to 0.06 s",
-    ),
-    "beyond float32": (MINIMAL.replace("[0.03", "[1e39"), "tau: found "),
+    "tau: found ": MINIMAL.replace("[0.03", "[1e39"),  # beyond float32
 }
 
 
-@pytest.mark.parametrize("case", BAD_TEXTS)
-def test_bad_files_are_refused(case: str, tmp_path: Path) -> None:
-    text, reason = BAD_TEXTS[case]
+@pytest.mark.parametrize("reason", BAD_TEXTS)
+def test_bad_files_are_refused(reason: str, tmp_path: Path) -> None:
     path = tmp_path / "model.json"
-    path.write_text(text, encoding="utf-8")
+    path.write_text(BAD_TEXTS[reason], encoding="utf-8")
     with pytest.raises(ModelFileError, match=rf"^{re.escape(str(path))}: {reason}"):
         load_model(path)
 

@@ -31,10 +31,6 @@ def constant(channel: str, values: list[float]) -> Change:
     return lambda log: replace(log, channels={**log.channels, channel: np.tile(values, (len(log), 1))})
 
 
-def with_gravity(log: FlightLog) -> FlightLog:
-    return replace(log, channels={**log.channels, "a": log["a"] + UPWARDS})
-
-
 def columns(channel: str) -> str:
     return ", ".join(CHANNELS[channel])
 
@@ -49,7 +45,11 @@ WRONG = {
     "v_bat in tenths": (scaled("v_bat", 10.0), "v_bat", "looks like tenths of V$"),
     "f in g": (scaled("f", 1 / GRAVITY), columns("f"), "looks like g$"),
     "f with z down": (scaled("f", [1.0, -1.0, -1.0]), "f_z", "pointed down"),
-    "a with gravity": (with_gravity, "a_z", "gravity looks left in"),
+    "a with gravity": (
+        lambda log: replace(log, channels={**log.channels, "a": log["a"] + UPWARDS}),
+        "a_z",
+        "gravity looks left in",
+    ),
     "commands stuck": (constant("u", [0.0] * 4), columns("u"), "look stuck"),
     "too few seconds": (lambda log: log.select(log.time < 0.06), "t", r"found \d+ rows and \d\.\d+ s, "),
     "too few rows": (lambda log: log.select(slice(0, FEWEST_ROWS - 1)), "t", "found 99 rows"),

@@ -7,16 +7,9 @@ import pytest
 from flax import struct
 from gymnax.environments import environment, spaces
 
-from baselines.purejaxrl_ppo import Config, make_network, make_train
+from baselines.purejaxrl_ppo import Config, make_network, make_train, ppo
 from baselines.purejaxrl_ppo.collectives import Collectives
 from baselines.purejaxrl_ppo.metrics import summarise_episodes
-from baselines.purejaxrl_ppo.ppo import (
-    Batch,
-    affine_permutation,
-    generalized_advantages,
-    make_network_for,
-    ppo_loss,
-)
 
 
 @struct.dataclass
@@ -87,7 +80,7 @@ def train(env, params=None, **changes):
     # Compiling takes all of the time, so that optimising does not pay.
     train = jax.jit(make_train(env, params, config), compiler_options={"xla_backend_optimization_level": 0})
     runner, _ = train(jax.random.key(0))
-    return make_network_for(env, params, config), runner.train_state.params
+    return ppo.make_network_for(env, params, config), runner.train_state.params
 
 
 def train_value(**changes) -> float:
@@ -141,8 +134,8 @@ def test_gae_equals_the_definition():
     reward, value = rng.normal(size=(2, 6, 3))
     done = rng.random((6, 3)) < 0.3
     last_value, gamma, lam = rng.normal(size=3), 0.97, 0.9
-    batch = Batch(None, None, None, jnp.asarray(value), jnp.asarray(reward), jnp.asarray(done))
-    found = generalized_advantages(batch, jnp.asarray(last_value), gamma, lam)
+    batch = ppo.Batch(None, None, None, jnp.asarray(value), jnp.asarray(reward), jnp.asarray(done))
+    found = ppo.generalized_advantages(batch, jnp.asarray(last_value), gamma, lam)
     next_value = np.concatenate([value[1:], last_value[None]])
     delta = reward + gamma * next_value * ~done - value
     for env in range(3):
@@ -158,9 +151,9 @@ def test_gae_equals_the_definition():
 
 @pytest.mark.parametrize("size", [64, 4096, 96])
 def test_affine_permutation_is_a_permutation(size):
-    first = affine_permutation(jax.random.key(0), size)
+    first = ppo.affine_permutation(jax.random.key(0), size)
     np.testing.assert_array_equal(np.sort(first), np.arange(size))
-    assert not np.array_equal(first, affine_permutation(jax.random.key(1), size))
+    assert not np.array_equal(first, ppo.affine_permutation(jax.random.key(1), size))
 
 
 def test_loss_at_the_old_policy():
@@ -170,9 +163,9 @@ def test_loss_at_the_old_policy():
     params = network.init(jax.random.key(1), observation)
     policy, value = network.apply(params, observation)
     action = policy.sample(seed=jax.random.key(2))
-    batch = Batch(observation, action, policy.log_prob(action), value, None, None)
+    batch = ppo.Batch(observation, action, policy.log_prob(action), value, None, None)
     advantage, target = jax.random.normal(jax.random.key(3), (2, 32))
-    loss, parts = ppo_loss(params, network, batch, advantage, target, config)
+    loss, parts = ppo.ppo_loss(params, network, batch, advantage, target, config)
     parts = {name: float(part) for name, part in parts.items()}
     # At ratio 1 the objective is the mean normalised advantage, 0; the gaussian's entropy is known.
     assert parts["policy_loss"] == pytest.approx(0.0, abs=1e-5)

@@ -1,7 +1,5 @@
 """Vectors and quaternions against SciPy's rotations."""
 
-from collections.abc import Callable
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -14,35 +12,35 @@ NUM_CASES = 500
 
 
 @pytest.fixture(scope="module")
-def quats() -> np.ndarray:
+def quats():
     """Random unit quaternions (N, 4), w first, with the half turns and the identity among them."""
     quats = np.random.default_rng(0).normal(size=(NUM_CASES, 4))
     quats[:4] = np.eye(4)
     return quats / np.linalg.norm(quats, axis=1, keepdims=True)
 
 
-def rotations(quats: np.ndarray) -> Rotation:
+def rotations(quats):
     """Return SciPy's rotations of quaternions (N, 4), w first."""
     return Rotation.from_quat(quats, scalar_first=True)
 
 
-def columns(array: np.ndarray) -> tuple[jax.Array, ...]:
+def columns(array):
     """Return the columns of an array (N, K) as K arrays (N,)."""
     return tuple(jnp.asarray(array[:, i]) for i in range(array.shape[1]))
 
 
-def test_axes_are_the_columns_of_the_rotation_matrix(quats: np.ndarray) -> None:
+def test_axes_are_the_columns_of_the_rotation_matrix(quats):
     axes = np.stack([np.stack(axis, -1) for axis in Quaternion(*columns(quats)).axes()], axis=-1)
     np.testing.assert_allclose(axes, rotations(quats).as_matrix(), atol=1e-6)
 
 
-def test_rotate_agrees_with_scipy(quats: np.ndarray) -> None:
+def test_rotate_agrees_with_scipy(quats):
     vectors = np.random.default_rng(1).normal(size=(NUM_CASES, 3))
     rotated = np.stack(Quaternion(*columns(quats)).rotate(Vec3(*columns(vectors))), -1)
     np.testing.assert_allclose(rotated, rotations(quats).apply(vectors), atol=5e-6)
 
 
-def test_multiply_is_the_composition_of_rotations(quats: np.ndarray) -> None:
+def test_multiply_is_the_composition_of_rotations(quats):
     others = np.roll(quats, 7, axis=0)
     product = np.stack(Quaternion(*columns(quats)).multiply(Quaternion(*columns(others))), -1)
     expected = (rotations(quats) * rotations(others)).as_quat(scalar_first=True)
@@ -51,12 +49,12 @@ def test_multiply_is_the_composition_of_rotations(quats: np.ndarray) -> None:
 
 
 @pytest.mark.parametrize("factor", [1e-3, 0.5, 1.0, 300.0])
-def test_normalize_gives_the_same_direction_at_unit_norm(quats: np.ndarray, factor: float) -> None:
+def test_normalize_gives_the_same_direction_at_unit_norm(quats, factor):
     unit = np.stack(Quaternion(*columns(factor * quats)).normalize(), -1)
     np.testing.assert_allclose(unit, quats, atol=1e-6)
 
 
-def test_from_yaw_tilt_leans_the_thrust_axis_towards_the_heading() -> None:
+def test_from_yaw_tilt_leans_the_thrust_axis_towards_the_heading():
     rng = np.random.default_rng(2)
     yaw, heading = rng.uniform(-np.pi, np.pi, (2, NUM_CASES))
     tilt = rng.uniform(0.0, np.pi, NUM_CASES)
@@ -72,11 +70,6 @@ def test_from_yaw_tilt_leans_the_thrust_axis_towards_the_heading() -> None:
     [((0.0, 0.0, 0.0), 0.0, (0.0, 0.0, 0.0)), ((3.0, 0.0, -4.0), 5.0, (0.6, 0.0, -0.8))],
 )
 @pytest.mark.parametrize("differentiate", [jax.grad, jax.jacfwd])
-def test_norm_has_a_gradient_everywhere(
-    vector: tuple[float, ...],
-    norm: float,
-    gradient: tuple[float, ...],
-    differentiate: Callable[..., Callable[[Vec3], Vec3]],
-) -> None:
+def test_norm_has_a_gradient_everywhere(vector, norm, gradient, differentiate):
     assert float(Vec3(*vector).norm()) == pytest.approx(norm)
     np.testing.assert_allclose(np.stack(differentiate(Vec3.norm)(Vec3(*vector))), gradient)

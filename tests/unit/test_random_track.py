@@ -7,20 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from flytrack_env import tracks
 from flytrack_env.quaternion import Vec3
-from flytrack_env.tracks import (
-    DEMANDS,
-    Limits,
-    Track,
-    TrackError,
-    available_tracks,
-    build_course,
-    cross_gate,
-    find_problems,
-    load_track,
-    random_track,
-    sample_way,
-)
 
 NUM_SEEDS = 40
 NUM_SAMPLES = 100
@@ -29,23 +17,23 @@ BEYOND = 3  # samples of the next way: enough to be through the gate at the end 
 
 
 @pytest.fixture(scope="module")
-def drawn() -> list[Track]:
+def drawn() -> list[tracks.Track]:
     """Courses of the first seeds."""
-    return [random_track(seed) for seed in range(NUM_SEEDS)]
+    return [tracks.random_track(seed) for seed in range(NUM_SEEDS)]
 
 
-def test_only_feasible_courses_are_drawn_and_all_differ(drawn: list[Track]) -> None:
-    assert all(find_problems(track) == () for track in drawn)
+def test_only_feasible_courses_are_drawn_and_all_differ(drawn: list[tracks.Track]) -> None:
+    assert all(tracks.find_problems(track) == () for track in drawn)
     assert len({track.gates for track in drawn}) == len({track.name for track in drawn}) == NUM_SEEDS
 
 
-CROSS = jax.jit(cross_gate)
+CROSS = jax.jit(tracks.cross_gate)
 
 
-def count_events(track: Track) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def count_events(track: tracks.Track) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return passes, frames and misses, (way, gate) each, of flying the way by the race's own geometry."""
-    course = build_course(track)
-    way = sample_way(course, NUM_SAMPLES).astype(np.float32)
+    course = tracks.build_course(track)
+    way = tracks.sample_way(course, NUM_SAMPLES).astype(np.float32)
     # From just behind a gate to just behind the next one.
     points = np.concatenate([way[:, 1:], np.roll(way, -1, axis=0)[:, 1:BEYOND]], axis=1)
     # Every segment of every way against every gate: (N, M, 1) against (num_gates,).
@@ -55,7 +43,7 @@ def count_events(track: Track) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return tuple(np.asarray(event).sum(axis=1) for event in events)
 
 
-def assert_flies_through(track: Track) -> None:
+def assert_flies_through(track: tracks.Track) -> None:
     """Check that the way passes its next gate once, misses it never, and touches no gate at all."""
     passes, frames, misses = count_events(track)
     next_gate = np.roll(np.eye(len(track.gates), dtype=int), 1, axis=1)
@@ -63,33 +51,33 @@ def assert_flies_through(track: Track) -> None:
     assert not frames.any() and not (misses * next_gate).any(), track.name
 
 
-def test_way_passes_every_gate_in_turn_by_the_races_geometry(drawn: list[Track]) -> None:
+def test_way_passes_every_gate_in_turn_by_the_races_geometry(drawn: list[tracks.Track]) -> None:
     for track in drawn:
         assert_flies_through(track)
 
 
-@pytest.mark.parametrize("name", available_tracks())
+@pytest.mark.parametrize("name", tracks.available_tracks())
 def test_way_of_shipped_tracks_passes_every_gate_in_turn(name: str) -> None:
-    assert_flies_through(load_track(name))
+    assert_flies_through(tracks.load_track(name))
 
 
-def test_course_is_a_function_of_the_key(drawn: list[Track]) -> None:
+def test_course_is_a_function_of_the_key(drawn: list[tracks.Track]) -> None:
     for seed in range(10):
         same = (
-            random_track(seed),
-            random_track(jax.random.key(seed)),
-            random_track(jax.random.PRNGKey(seed)),
+            tracks.random_track(seed),
+            tracks.random_track(jax.random.key(seed)),
+            tracks.random_track(jax.random.PRNGKey(seed)),
         )
         assert all(track == drawn[seed] for track in same)
     keys = jax.random.split(jax.random.key(0), 3)
-    assert len({random_track(key).gates for key in keys}) == 3
-    assert random_track(np.int64(4)) == drawn[4]
-    assert random_track(2**32 - 1) == random_track(jax.random.key(np.uint32(2**32 - 1)))
+    assert len({tracks.random_track(key).gates for key in keys}) == 3
+    assert tracks.random_track(np.int64(4)) == drawn[4]
+    assert tracks.random_track(2**32 - 1) == tracks.random_track(jax.random.key(np.uint32(2**32 - 1)))
 
 
 def test_course_of_a_seed_stays_the_same() -> None:
     # Whoever publishes a seed publishes a course: a change of the drawing is a change of behaviour.
-    track = random_track(0)
+    track = tracks.random_track(0)
     assert track.name == "random_0_0"
     assert [gate.position for gate in track.gates[:2]] == [(9.61, 6.56, 2.42), (24.36, 5.44, 3.64)]
     assert track.start_position == (7.26, 12.08, 0.1)
@@ -106,8 +94,8 @@ def test_course_of_a_seed_stays_the_same() -> None:
     ],
 )
 def test_bad_arguments_are_refused(arguments: dict[str, Any], message: str) -> None:
-    with pytest.raises(TrackError, match=message):
-        random_track(**{"key": 0, **arguments})
+    with pytest.raises(tracks.TrackError, match=message):
+        tracks.random_track(**{"key": 0, **arguments})
 
 
 @pytest.mark.slow
@@ -115,11 +103,11 @@ def test_bad_arguments_are_refused(arguments: dict[str, Any], message: str) -> N
     ("arguments", "demand"),
     [
         ({"num_gates": 60}, "spacing"),
-        ({"limits": Limits(max_turn_deg=1.0)}, "turn"),
-        ({"limits": Limits(min_start_distance=20.0)}, "start"),
+        ({"limits": tracks.Limits(max_turn_deg=1.0)}, "turn"),
+        ({"limits": tracks.Limits(min_start_distance=20.0)}, "start"),
     ],
 )
 def test_demands_that_cannot_be_met_are_named(arguments: dict[str, Any], demand: str) -> None:
-    assert demand in DEMANDS
-    with pytest.raises(TrackError, match=rf"in 300 attempts; .* most often: {demand} \(\d+ times\)"):
-        random_track(0, **arguments)
+    assert demand in tracks.DEMANDS
+    with pytest.raises(tracks.TrackError, match=rf"in 300 attempts; .* most often: {demand} \(\d+ times\)"):
+        tracks.random_track(0, **arguments)

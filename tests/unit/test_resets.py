@@ -1,7 +1,5 @@
 """Where episodes start: facts about the distribution, and the randomness behind it."""
 
-from collections.abc import Callable
-
 import jax
 import numpy as np
 import pytest
@@ -16,11 +14,10 @@ from flytrack_env.state import pack
 from flytrack_env.tracks import Track, load_track
 
 NUM_STARTS = 4096
-Sample = Callable[..., tuple[np.ndarray, np.ndarray]]
 
 
 @pytest.fixture(scope="module")
-def sample(env: FlyTrack, params: EnvParams) -> Sample:
+def sample(env: FlyTrack, params: EnvParams):
     """A function from fields of ``ResetParams`` to states (N, 21) and gate indices (N,)."""
 
     reset_many = jax.jit(jax.vmap(env.reset, in_axes=(0, None)))
@@ -34,26 +31,14 @@ def sample(env: FlyTrack, params: EnvParams) -> Sample:
     return draw
 
 
-@pytest.fixture(scope="module")
-def at_pose(sample: Sample) -> tuple[np.ndarray, np.ndarray]:
-    """Starts at the start pose only."""
-    return sample(course_fraction=0.0)
-
-
-@pytest.fixture(scope="module")
-def on_course(sample: Sample) -> tuple[np.ndarray, np.ndarray]:
-    """Starts along the course only."""
-    return sample(course_fraction=1.0)
-
-
 def assert_uniform(values: np.ndarray, low: float, high: float) -> None:
     """Check a uniform distribution by Kolmogorov and Smirnov's test."""
     assert low - 1e-5 <= values.min() and values.max() <= high + 1e-5
     assert stats.kstest((values - low) / (high - low), "uniform").pvalue > 1e-4
 
 
-def test_start_pose_is_at_rest_before_gate_zero(at_pose: tuple[np.ndarray, np.ndarray]) -> None:
-    x, gate_index = at_pose
+def test_start_pose_is_at_rest_before_gate_zero(sample) -> None:
+    x, gate_index = sample(course_fraction=0.0)
     noise = ResetParams()
     assert not gate_index.any()
     offset = x[:, 0:3] - load_track("flytrack").start_position
@@ -82,7 +67,7 @@ def course_curves(track: Track) -> list[CubicHermiteSpline]:
     return curves
 
 
-def test_course_starts_lie_along_the_curves_between_the_gates(sample: Sample) -> None:
+def test_course_starts_lie_along_the_curves_between_the_gates(sample) -> None:
     x, gate_index = sample(course_fraction=1.0, course_offset=0.0)
     counts = np.bincount(gate_index, minlength=8)
     assert stats.chisquare(counts).pvalue > 1e-4
@@ -102,10 +87,8 @@ def test_course_starts_lie_along_the_curves_between_the_gates(sample: Sample) ->
     assert_uniform(fractions / (LAST_SEGMENT_FRACTION + 1e-3), 0.0, 1.0)
 
 
-def test_course_starts_have_the_stated_tilt_towards_any_side(
-    on_course: tuple[np.ndarray, np.ndarray],
-) -> None:
-    x, _ = on_course
+def test_course_starts_have_the_stated_tilt_towards_any_side(sample) -> None:
+    x, _ = sample(course_fraction=1.0)
     up = Rotation.from_quat(x[:, 9:13], scalar_first=True).apply([0.0, 0.0, 1.0])
     tilt_deg = np.degrees(np.arccos(np.clip(up[:, 2], -1.0, 1.0)))
     assert_uniform(tilt_deg, 0.0, ResetParams().course_tilt_deg)
@@ -113,7 +96,7 @@ def test_course_starts_have_the_stated_tilt_towards_any_side(
     np.testing.assert_allclose(np.linalg.norm(x[:, 9:13], axis=1), 1.0, atol=1e-5)
 
 
-def test_share_of_course_starts(sample: Sample) -> None:
+def test_share_of_course_starts(sample) -> None:
     share = 0.2
     x, _ = sample(course_fraction=share)
     is_on_course = np.linalg.norm(x[:, 3:6], axis=1) > 0.0

@@ -48,32 +48,27 @@ def rows_with(value: float, width: int = 25) -> bytes:
 
 ROWS = npy_bytes(np.zeros((3, 25)))
 BAD_FILES = {
-    "text": (b"step,x,y,z\n0,1,2,3\n", "cannot be read: ValueError"),
-    "data cut": (ROWS[:-8], "cannot be read: ValueError: .*75"),
-    "objects": (npy_bytes(np.array([[None, None]] * 3, object)), "found pickled objects"),
-    "text array": (npy_bytes(np.full((3, 25), "a")), "found an array of <U1"),
-    "other layout": (
-        npy_bytes(np.zeros((3, 23))),
-        r"found shape \(3, 23\), expected .*\(T, 25\) or \(T, 22\)",
+    "cannot be read: ValueError": b"step,x,y,z\n0,1,2,3\n",
+    "cannot be read: ValueError: .*75": ROWS[:-8],
+    "found pickled objects": npy_bytes(np.array([[None, None]] * 3, object)),
+    "found an array of <U1": npy_bytes(np.full((3, 25), "a")),
+    r"found shape \(3, 23\), expected .*\(T, 25\) or \(T, 22\)": npy_bytes(np.zeros((3, 23))),
+    r"found shape \(0, 25\), expected .*T >= 1": npy_bytes(np.zeros((0, 25))),
+    "found nan at step 1, column 9, expected finite": rows_with(np.nan),
+    "found inf at step 1": rows_with(1e300),  # beyond float32
+    r"found version \(9, 9\)": b"\x93NUMPY\x09\x09" + bytes(99),
+    "found an array of .{1,250}, exp": npy_bytes(np.zeros(3, [("a" * 900, "<f8")])),
+    "found 3000000000000 steps, expected at most": ROWS.replace(
+        b"(3, 25), }" + b" " * 12, b"(3000000000000, 25), }"
     ),
-    "no steps": (npy_bytes(np.zeros((0, 25))), r"found shape \(0, 25\), expected .*T >= 1"),
-    "nan": (rows_with(np.nan), "found nan at step 1, column 9, expected finite"),
-    "beyond float32": (rows_with(1e300), "found inf at step 1"),
-    "unknown version": (b"\x93NUMPY\x09\x09" + bytes(99), r"found version \(9, 9\)"),
-    "names": (npy_bytes(np.zeros(3, [("a" * 900, "<f8")])), "found an array of .{1,250}, exp"),
-    "terabytes": (
-        ROWS.replace(b"(3, 25), }" + b" " * 12, b"(3000000000000, 25), }"),
-        "found 3000000000000 steps, expected at most",
-    ),
-    "long header": (b"\x93NUMPY\x02\x00\xff\xff\xff\x7f{'descr'" + bytes(200), "cannot be read: ValueError"),
+    "cannot be read: ValueError.*": b"\x93NUMPY\x02\x00\xff\xff\xff\x7f{'descr'" + bytes(200),  # 2 GB
 }
 
 
-@pytest.mark.parametrize("case", BAD_FILES)
-def test_bad_files_are_refused_before_memory_is_allocated(tmp_path, case):
-    content, reason = BAD_FILES[case]
+@pytest.mark.parametrize("reason", BAD_FILES)
+def test_bad_files_are_refused_before_memory_is_allocated(tmp_path, reason):
     path = tmp_path / "flight.npy"
-    path.write_bytes(content)
+    path.write_bytes(BAD_FILES[reason])
     tracemalloc.start()
     try:
         with pytest.raises(RolloutError, match=reason) as caught:
@@ -125,21 +120,17 @@ class Unreadable:
 
 
 BAD_OBJECTS = {
-    "no pairs": (np.empty((0, 2), object), "found shapes set"),
-    "other state": (
-        pairs_of((np.zeros(17), np.zeros(4))),
-        r"found shapes {\(\(17,\), \(4,\)\)}, expected pairs",
-    ),
-    "words": (pairs_of(("a", "b")), "expected pairs of x"),
-    "nan": (pairs_of((np.full(21, np.nan), np.zeros(4))), "found nan at step 0"),
-    "broken": (pairs_of((Unreadable(), 0)), "cannot be read: ValueError"),
+    "found shapes set": np.empty((0, 2), object),
+    r"found shapes {\(\(17,\), \(4,\)\)}, expected pairs": pairs_of((np.zeros(17), np.zeros(4))),
+    "expected pairs of x": pairs_of(("a", "b")),
+    "found nan at step 0": pairs_of((np.full(21, np.nan), np.zeros(4))),
+    "cannot be read: ValueError": pairs_of((Unreadable(), 0)),
 }
 
 
-@pytest.mark.parametrize("case", BAD_OBJECTS)
-def test_bad_pickled_objects_are_refused(tmp_path, case):
-    content, reason = BAD_OBJECTS[case]
-    np.save(tmp_path / "flight.npy", content, allow_pickle=True)
+@pytest.mark.parametrize("reason", BAD_OBJECTS)
+def test_bad_pickled_objects_are_refused(tmp_path, reason):
+    np.save(tmp_path / "flight.npy", BAD_OBJECTS[reason], allow_pickle=True)
     with pytest.raises(RolloutError, match=reason):
         load_rollout(tmp_path / "flight.npy", allow_pickle=True)
 
