@@ -31,10 +31,12 @@ from benchmarks.report import (
 )
 from firmware import Betaflight, Body
 from flytrack_env.dynamics import nominal_parameters
+from flytrack_env.effects import BY_NAME
 from flytrack_env.files import write_atomically
 from flytrack_env.state import POSITION
 from flytrack_loop.stages import measure_gap
 from flytrack_sysid import Diagnosis, FlightLog, collect, diagnose, diagnose_change
+from flytrack_sysid.diagnosis import Cause
 from flytrack_sysid.excitation import script
 from flytrack_sysid.manoeuvres import flights_of, hover_action
 from flytrack_sysid.script_file import script_of
@@ -54,7 +56,8 @@ SETUPS: dict[str, Mapping[str, Any]] = {"stock": {}, "plain": PLAIN, "curved": O
 GENTLE = ("headings", "speeds", "thrust_steps")
 FLIGHTS, SECOND = 24, 100  # rows
 NOTABLE = 0.02  # of the way flown in a second: a change that moves the craft less does not matter
-RESPONSE = ("tau_roll", "tau_pitch", "second_order_rates", "rate_slew_limit", "command_delay")
+GAINS, FILTER, MOTORS = (f"betaflight_loop.{group[0]}" for group in BY_NAME["betaflight_loop"].groups)
+RESPONSE = ("second_order_rates", "rate_slew_limit", "command_delay", GAINS, FILTER)
 THRUST = ("thrust_curve", "thrust_scale")
 Rng = np.random.Generator
 
@@ -91,10 +94,11 @@ def _rates(rng: Rng, center: tuple[float, float], full: tuple[float, float]) -> 
 KINDS = {
     "expo": Kind(lambda rng: (_rates(rng, (0.35, 0.65), (62, 62)), {}), ("rate_expo",)),
     "rates": Kind(lambda rng: (_rates(rng, (1, 1), (70, 85)), {}), ("rate_scale",), ("gyro_scale",)),
-    "P and D term": Kind(lambda rng: (_both(rng, (0.4, 0.65), p=45, d=30), {}), RESPONSE),
+    "P and D term": Kind(lambda rng: (_both(rng, (0.4, 0.65), p=45, d=30), {}), (GAINS,), RESPONSE),
     "filters": Kind(
         # A dynamic filter would take the static one's place.
         lambda rng: ({"gyro_lpf1_dyn_min_hz": 0, "gyro_lpf1_static_hz": int(rng.uniform(25, 50))}, {}),
+        (FILTER,),
         RESPONSE,
     ),
     "thrust linearisation": Kind(lambda rng: ({"thrust_linear": int(rng.uniform(60, 120))}, {}), THRUST),
@@ -104,8 +108,8 @@ KINDS = {
             {},
             {"health": tuple(rng.permutation([rng.uniform(0.7, 0.85), 1.0, 1.0, 1.0]).tolist())},
         ),
-        ("motor_imbalance",),
-        THRUST,
+        (MOTORS,),
+        ("motor_imbalance", *THRUST),
     ),
     "drag": Kind(
         lambda rng: ({}, {"linear_drag": (*[float(rng.uniform(0.15, 0.4))] * 2, 0.1)}),
@@ -123,7 +127,7 @@ KINDS = {
     ),
     "centre of mass": Kind(
         lambda rng: ({}, {"center_of_mass_m": (float(rng.uniform(0.01, 0.02)), 0.0)}),
-        ("motor_imbalance",),
+        ("motor_imbalance", MOTORS),
         THRUST,
     ),
 }
@@ -184,20 +188,29 @@ def graded(trial: Trial, known: Known, seed: int) -> dict[str, Any]:
     apart = np.linalg.norm(places(settings, body, seed) - known.places_m, axis=1)
     started = time.process_time()
     found = diagnose_change(log, known.log, known.model, motion=known.model.motion)
-    names = [one.effect for one in found.causes]
+    names = [name_of(one) for one in found.causes]
     return {
         "settings": settings,
         "body": {name: value for name, value in vars(body).items() if value != getattr(Body(), name)},
         "apart": round(float(np.median(apart / np.linalg.norm(known.places_m, axis=1))), 4),
         "verdict": found.verdict,
         "found": {
-            one.effect: {k: [v.value, *v.ci95] for k, v in one.parameters.items()} for one in found.causes
+            name_of(one): {k: [v.value, *v.ci95] for k, v in one.parameters.items()} for one in found.causes
         },
         "negligible": [one.effect for one in found.negligible],
         **grade(trial.kinds, names),
         "error": error_ratios(found),
         "cpu_s": round(time.process_time() - started, 1),
     }
+
+
+def name_of(cause: Cause) -> str:
+    """Return the name of a cause, of the loop with the first of the settings that changed together."""
+    return (
+        f"{cause.effect}.{next(iter(cause.parameters))}"
+        if cause.effect == "betaflight_loop"
+        else cause.effect
+    )
 
 
 def grade(kinds: tuple[str, ...], names: list[str]) -> dict[str, bool]:

@@ -45,7 +45,8 @@ def arguments(values: Mapping[str, float]) -> str:
 def effect_page(effect: Effect) -> str:
     """Return the page of an effect."""
     neutral = effect.parameters()._asdict()
-    names = effect.groups[-1] if effect.groups else effect.notable
+    shown = effect.fitted or (effect.groups[-1] if effect.groups else effect.notable)
+    names = [name for name in shown if name in effect.notable]
     high = {name: neutral[name] + effect.notable[name] for name in names}
     return render(
         "effect",

@@ -80,8 +80,8 @@ SIMPLE = frozenset(
     abs add add_any and broadcast_in_dim bitcast_convert_type ceil clamp concatenate
     convert_element_type copy cos custom_jvp_call div dynamic_slice dynamic_update_slice eq exp
     floor flytrack_compute_once ge gt integer_pow iota is_finite jit le log logistic lt max min mul
-    ne neg not or pad pjit population_count pow scan reduce_and reduce_max reduce_min reduce_or
-    reduce_sum rem reshape round rsqrt select_n shift_left shift_right_arithmetic
+    ne neg not or pad pjit population_count pow scan
+    rem reshape round rsqrt select_n shift_left shift_right_arithmetic
     shift_right_logical sign sin slice sqrt square squeeze stop_gradient stack sub tanh transpose
     while xor flytrack_one_kernel
     """.split()  # noqa: SIM905, a table
@@ -140,7 +140,7 @@ def _jvp_kernel(primals, tangents, *, jaxpr):  # type: ignore[no-untyped-def]
         return jax.jvp(of_moving, moving, directions)[1]
 
     # Apart, since a batch of directions has one result.
-    return _one_kernel_p.bind(*primals, jaxpr=jaxpr), one_kernel(derivative)(list(primals), directions)
+    return _one_kernel_p.bind(*primals, jaxpr=jaxpr), derivative(list(primals), directions)
 
 
 def _lower_kernel(ctx, *args, jaxpr):  # type: ignore[no-untyped-def]

@@ -1,5 +1,6 @@
 """Betaflight's rate loop with its mixer and four motors: how sticks become body rates and thrust."""
 
+from functools import reduce
 from typing import Any, NamedTuple
 
 import jax
@@ -188,6 +189,11 @@ def _action_of(share: Scalar, loop: BetaflightLoop) -> Scalar:
     return 2.0 * (share - loop.idle) / (1.0 - loop.idle) - 1.0
 
 
+def _like(constants: np.ndarray, value: jax.Array) -> jax.Array:
+    """Return constants in the precision of a value: a compiled kernel keeps the one that it was traced in."""
+    return jnp.asarray(constants, value.dtype)
+
+
 def _lowpass(stages: tuple[Scalar, ...], target: Scalar, cutoff_hz: Scalar, dt: Scalar) -> tuple[Scalar, ...]:
     """Return the stages of a low pass after a held target: exact; its cutoff is that of all stages."""
     correction = 1.0 / (2.0 ** (1.0 / len(stages)) - 1.0) ** 0.5
@@ -298,6 +304,7 @@ def _controlled(
 ) -> tuple[Axes, jax.Array]:
     """Return the axes a substep later, and what they ask of the mixer, (3,)."""
     axes, frames = state.loop.axes, state.loop.frames
+    limits, factors = _like(SUM_LIMITS, state.rates), _like(I_FACTORS, state.rates)
     setpoint = _lowpass(axes.setpoint, frames.setpoint, loop.sticks_hz, 0.5 * dt)[-1]
     feedforward = _lowpass(axes.feedforward, frames.feedforward, loop.sticks_hz, 0.5 * dt)[-1]
     gyro = _filtered_gyro(loop, axes.gyro, state.rates, level, dt)
@@ -307,16 +314,14 @@ def _controlled(
     relax = _lowpass((axes.relax,), setpoint, loop.iterm_relax_cutoff, dt)[0]
     halted = jnp.maximum(1.0 - jnp.abs(setpoint - relax) / RELAX_DEG_S, 0.0)
     own_boost = jnp.where(IS_YAW, 0.0, boost)
-    gain = (I_SCALE * I_FACTORS * loop.axes("i") + ANTI_GRAVITY_I * own_boost) * jnp.where(
-        IS_YAW, 1.0, halted
-    )
-    limit = I_SHARE * SUM_LIMITS
-    integral = jnp.clip(axes.integral + gain * error * dt, -limit, limit)
+    gain = (I_SCALE * factors * loop.axes("i") + ANTI_GRAVITY_I * own_boost) * jnp.where(IS_YAW, 1.0, halted)
+    most = I_SHARE * limits
+    integral = jnp.clip(axes.integral + gain * error * dt, -most, most)
     p_hz = jnp.where(IS_YAW, loop.yaw_lowpass_hz, NONE_HZ)
     p_term = _lowpass((axes.p,), P_SCALE * loop.axes("p") * error, p_hz, dt)[0]
     calm = jnp.maximum(jnp.abs(setpoint) / ANTI_GRAVITY_DEG_S, 1.0)
     asked = p_term * (1.0 + ANTI_GRAVITY_P * own_boost / calm) + integral + damping.term
-    asked = jnp.clip(asked + F_SCALE * loop.axes("f") * feedforward, -SUM_LIMITS, SUM_LIMITS)
+    asked = jnp.clip(asked + F_SCALE * loop.axes("f") * feedforward, -limits, limits)
     later = Axes(
         _lowpass(axes.setpoint, frames.setpoint, loop.sticks_hz, dt),
         _lowpass(axes.feedforward, frames.feedforward, loop.sticks_hz, dt),
@@ -335,8 +340,8 @@ def _mixed(loop: BetaflightLoop, asked: jax.Array, throttle: Throttle, level: Sc
     level = jnp.clip(level + boost * (level - throttle.slow), 0.0, 1.0)
     linear = loop.thrust_linear / PERCENT
     level = level / (1.0 + (linear - 0.5 * linear * linear) * (1.0 - level) ** 2)
-    mix = (asked[:, None] * SIGNS).sum(axis=0)
-    high, low = jnp.maximum(mix.max(), 0.0), jnp.minimum(mix.min(), 0.0)
+    mix = sum(one * signs for one, signs in zip(asked, _like(SIGNS, asked), strict=True))
+    high, low = reduce(jnp.maximum, mix, 0.0), reduce(jnp.minimum, mix, 0.0)
     fits = 1.0 / jnp.maximum(high - low, 1.0)
     outputs = jnp.clip(level, -low * fits, 1.0 - high * fits) + fits * mix
     bent = outputs * (1.0 + linear * (1.0 - outputs) ** 2)
@@ -351,10 +356,12 @@ def _turned(
     thrust_map: its coefficients and the battery's voltage.
     """
     coeffs, battery_v = thrust_map
-    speeds = jnp.stack([motors, state.loop.motors])
-    thrusts = 0.25 * collective_thrust(_action_of(speeds, loop), battery_v, coeffs).mean(axis=0)
-    torques = (SIGNS * loop.health * thrusts).sum(axis=1)
-    spun = loop.yaw_spin * (SIGNS[2] * (motors - state.loop.motors)).sum()
+    both, signs = (motors, state.loop.motors), _like(SIGNS, motors)
+    thrusts = sum(collective_thrust(_action_of(speeds, loop), battery_v, coeffs) for speeds in both)
+    thrusts = 0.125 * loop.health * thrusts  # of a motor, the mean of the substep
+    # Sum by sum: XLA makes a product of matrices of a reduction, which no kernel has.
+    torques = sum(thrusts[motor] * signs[:, motor] for motor in range(4))
+    spun = loop.yaw_spin * sum((both[0] - both[1])[motor] * signs[2, motor] for motor in range(4))
     x, y, z = (PER_DEGREE * state.rates[axis] for axis in range(3))
     turning = loop.precession * z * jnp.stack([-y, x, jnp.zeros_like(x)])
     return state.rates + (dt * (loop.arms * torques + turning) + jnp.where(IS_YAW, spun, 0.0)) / PER_DEGREE
@@ -389,7 +396,7 @@ def _respond(loop: BetaflightLoop, memory: Loop, lagged: Action, context: StepCo
     rates = full * jnp.stack(context.drone.applied[:3])
     moved = substeps(Turn(rates, memory), loop, acting.thrust, thrust_map, context.dt / NUM_SUBSTEPS)
     sticks = moved.rates / jnp.where(full, full, 1.0)
-    share = jnp.sqrt((loop.health * moved.loop.motors**2).mean())
+    share = jnp.sqrt(sum(loop.health * moved.loop.motors**2) / 4.0)
     found = Action(*(sticks[axis] for axis in range(3)), _action_of(share, loop))
     is_there = (loop.roll_arm > 0.0) & (loop.pitch_arm > 0.0)
     return Action(*(jnp.where(is_there, *pair) for pair in zip(found, lagged, strict=True))), moved.loop

@@ -97,6 +97,7 @@ EVIDENCE: dict[str, Evidence] = {
         "The yaw rate is off in proportion to the rates about the other axes.",
     ),
     "second_order_rates": Evidence("second-order lag of the rate loop", _TURNS, _LATE_READING),
+    "betaflight_loop": Evidence("gains, filters or motors of Betaflight's loop", _TURNS, _LATE_READING),
     "rate_slew_limit": Evidence(
         "limit on the change of body rates",
         _by_axis("rates", "spin_up"),
