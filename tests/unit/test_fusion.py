@@ -1,5 +1,6 @@
-"""``compute_once`` is the identity, whatever is done to it."""
+"""``compute_once`` is the identity and ``one_kernel`` the same function, whatever is done to them."""
 
+from functools import partial
 from typing import Any
 
 import jax
@@ -7,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from flytrack_env.fusion import compute_once
+from flytrack_env.fusion import compute_once, one_kernel
 
 LEAVES = {
     "float": np.array([1.5, -0.0, np.inf, -np.inf, np.nan], np.float32),
@@ -71,3 +72,35 @@ def test_random_keys_pass_through() -> None:
     for tree in ((key,), (jnp.float32(1.0), key)):
         result = jax.jit(compute_once)(tree)
         assert jax.random.key_data(result[-1]).tolist() == jax.random.key_data(key).tolist()
+
+
+def swung(x: jax.Array, steps: jax.Array, unread: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Return what a loop of simple operations makes of numbers; the last one is not read."""
+    return jax.lax.fori_loop(0, 3, lambda _, y: jnp.where(y > 0.3, jnp.sin(y), y * steps), x), x + 1.0
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_one_kernel_is_the_same_function_and_prunes_what_it_does_not_read(dtype: Any) -> None:
+    with jax.enable_x64(dtype is np.float64):
+        given = (np.linspace(-2.0, 2.0, 12, dtype=dtype), dtype(1.5), np.zeros(3, dtype))
+        tangents = (np.ones(12, dtype), dtype(0.5), np.ones(3, dtype))
+        for transform in (
+            lambda f: f,
+            lambda f: jax.vmap(f, in_axes=(0, None, None)),
+            lambda f: lambda *args: jax.jvp(f, args, tangents),
+            lambda f: jax.grad(lambda *args: f(*args)[0].sum(), argnums=(0, 1)),
+        ):
+            found, expected = (jax.jit(transform(f))(*given) for f in (one_kernel(swung), swung))
+            jax.tree.map(partial(np.testing.assert_allclose, rtol=1e-6), found, expected)
+            assert jax.tree.leaves(found)[0].dtype == dtype
+
+
+def test_what_is_no_simple_operation_stays_outside_of_one_kernel() -> None:
+    def product(x: jax.Array) -> jax.Array:
+        return x @ x
+
+    matrix = jnp.eye(3)
+    text = jax.jit(one_kernel(product)).lower(matrix).as_text()
+    assert "xla_cpu_small_call" not in text
+    assert "xla_cpu_small_call" in jax.jit(one_kernel(jnp.sin)).lower(matrix).as_text()
+    np.testing.assert_array_equal(jax.jit(one_kernel(product))(matrix), matrix)
