@@ -10,7 +10,7 @@ docs/results/firmware.md.
 import argparse
 import json
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -56,7 +56,7 @@ SETUPS: dict[str, Mapping[str, Any]] = {"stock": {}, "plain": PLAIN, "curved": O
 GENTLE = ("headings", "speeds", "thrust_steps")
 FLIGHTS, SECOND = 24, 100  # rows
 NOTABLE = 0.02  # of the way flown in a second: a change that moves the craft less does not matter
-GAINS, FILTER, MOTORS = (f"betaflight_loop.{group[0]}" for group in BY_NAME["betaflight_loop"].groups)
+GAINS, FILTER, *MOTORS = (f"betaflight_loop.{one[0]}" for one in BY_NAME["betaflight_loop"].groups[:6])
 RESPONSE = ("second_order_rates", "rate_slew_limit", "command_delay", GAINS, FILTER)
 THRUST = ("thrust_curve", "thrust_scale")
 Rng = np.random.Generator
@@ -108,8 +108,8 @@ KINDS = {
             {},
             {"health": tuple(rng.permutation([rng.uniform(0.7, 0.85), 1.0, 1.0, 1.0]).tolist())},
         ),
-        (MOTORS,),
-        ("motor_imbalance", *THRUST),
+        (),  # the motor that is drawn: see ``names_of``
+        ("motor_imbalance", *MOTORS, *THRUST),
     ),
     "drag": Kind(
         lambda rng: ({}, {"linear_drag": (*[float(rng.uniform(0.15, 0.4))] * 2, 0.1)}),
@@ -127,7 +127,7 @@ KINDS = {
     ),
     "centre of mass": Kind(
         lambda rng: ({}, {"center_of_mass_m": (float(rng.uniform(0.01, 0.02)), 0.0)}),
-        ("motor_imbalance", MOTORS),
+        ("motor_imbalance", *MOTORS),
         THRUST,
     ),
 }
@@ -198,7 +198,7 @@ def graded(trial: Trial, known: Known, seed: int) -> dict[str, Any]:
             name_of(one): {k: [v.value, *v.ci95] for k, v in one.parameters.items()} for one in found.causes
         },
         "negligible": [one.effect for one in found.negligible],
-        **grade(trial.kinds, names),
+        **grade([names_of(kind, body) for kind in trial.kinds], names),
         "error": error_ratios(found),
         "cpu_s": round(time.process_time() - started, 1),
     }
@@ -213,17 +213,22 @@ def name_of(cause: Cause) -> str:
     )
 
 
-def grade(kinds: tuple[str, ...], names: list[str]) -> dict[str, bool]:
+def names_of(kind: str, body: Body) -> tuple[set[str], set[str]]:
+    """Return the names of a change, and those with others that fly alike."""
+    exact = set(KINDS[kind].names) or {MOTORS[int(np.argmin(body.health))]}
+    return exact, exact | set(KINDS[kind].alike)
+
+
+def grade(changes: Sequence[tuple[set[str], set[str]]], names: list[str]) -> dict[str, bool]:
     """Return whether the names are exactly those of what changed, in its classes, and whether one is false.
 
-    Each change has at least one of its names, and each name belongs to a change.
+    changes: as of ``names_of``. Each has at least one of its names, and each name belongs to a change.
     """
-    exact = [set(KINDS[kind].names) for kind in kinds]
-    alike = [own | set(KINDS[kind].alike) for own, kind in zip(exact, kinds, strict=True)]
 
-    def fits(classes: list[set[str]]) -> bool:
+    def fits(classes: Sequence[set[str]]) -> bool:
         return all(own & set(names) for own in classes) and set(names) <= set().union(*classes)
 
+    exact, alike = ([change[side] for change in changes] for side in (0, 1))
     return {
         "is_exact": fits(exact),
         "is_in_class": fits(alike),
@@ -274,7 +279,7 @@ def tables(lines: list[dict[str, Any]]) -> str:
         said = sorted({" + ".join(line["found"]) or "nothing" for line in some})
         flags = [line["is_in_class"] for line in some]
         sizes = spread([100.0 * line["apart"] for line in some], ".1f") if some else ""
-        cells.append([kind, sizes, ", ".join(own.names), percent(flags), "; ".join(said)])
+        cells.append([kind, sizes, ", ".join(own.names) or "that motor", percent(flags), "; ".join(said)])
     parts.append(table("changed | flies apart, % | its names | in class | what was named", cells))
     for line in lines:
         if line["row"] == "champion":

@@ -111,7 +111,8 @@ def one_kernel(function: Callable[..., Tree]) -> Callable[..., Tree]:
         if is_simple(closed):
             # XLA's compiler of such a call fails on an argument that nothing reads.
             jaxpr, is_used = dce_jaxpr(closed.jaxpr, [True] * len(closed.jaxpr.outvars))
-            used = [leaf for leaf, used in zip(leaves, is_used, strict=True) if used]
+            # It fails on a constant, too, which the fence hides.
+            used = compute_once([leaf for leaf, used in zip(leaves, is_used, strict=True) if used])
             results = _one_kernel_p.bind(*used, jaxpr=ClosedJaxpr(jaxpr, closed.consts))
         else:
             results = jaxpr_as_fun(closed)(*leaves)

@@ -1,7 +1,7 @@
 """Betaflight's rate loop with its mixer and four motors: how sticks become body rates and thrust."""
 
 from functools import reduce
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -164,10 +164,27 @@ class Loop(NamedTuple):
 
 
 class Turn(NamedTuple):
-    """What a substep moves: body rates, (3,) deg/s, and what the loop remembers."""
+    """What a substep moves: body rates, (3,) deg/s, and what the loop remembers but for frames."""
 
     rates: jax.Array
-    loop: Loop
+    axes: Axes
+    throttle: Throttle
+    motors: jax.Array
+
+
+class Given(NamedTuple):
+    """What substeps under one frame share: setpoints and feedforward of it, (3,) each, the throttle, 0 to 1.
+
+    thrust_coeffs, battery_v: of the thrust map. dt: of a substep, s.
+    """
+
+    loop: BetaflightLoop
+    setpoint: jax.Array
+    feedforward: jax.Array
+    throttle: Scalar
+    thrust_coeffs: tuple[Scalar, ...]
+    battery_v: Scalar
+    dt: Scalar
 
 
 def start(loop: BetaflightLoop, drone: Drone) -> Loop:
@@ -299,22 +316,20 @@ def _damped(
     return Damping(term, (first, second), d_range, d_boost)
 
 
-def _controlled(
-    loop: BetaflightLoop, state: Turn, level: Scalar, boost: Scalar, dt: Scalar
-) -> tuple[Axes, jax.Array]:
+def _controlled(state: Turn, given: Given, level: Scalar, boost: Scalar) -> tuple[Axes, jax.Array]:
     """Return the axes a substep later, and what they ask of the mixer, (3,)."""
-    axes, frames = state.loop.axes, state.loop.frames
+    axes, loop, dt = state.axes, given.loop, given.dt
     limits, factors = _like(SUM_LIMITS, state.rates), _like(I_FACTORS, state.rates)
-    setpoint = _lowpass(axes.setpoint, frames.setpoint, loop.sticks_hz, 0.5 * dt)[-1]
-    feedforward = _lowpass(axes.feedforward, frames.feedforward, loop.sticks_hz, 0.5 * dt)[-1]
+    setpoint = _lowpass(axes.setpoint, given.setpoint, loop.sticks_hz, 0.5 * dt)[-1]
+    feedforward = _lowpass(axes.feedforward, given.feedforward, loop.sticks_hz, 0.5 * dt)[-1]
     gyro = _filtered_gyro(loop, axes.gyro, state.rates, level, dt)
     error = setpoint - gyro
     damping = _damped(loop, axes, gyro, feedforward, level, dt)
     # The integral halts while the setpoint changes fast, and grows faster while the throttle does.
     relax = _lowpass((axes.relax,), setpoint, loop.iterm_relax_cutoff, dt)[0]
-    halted = jnp.maximum(1.0 - jnp.abs(setpoint - relax) / RELAX_DEG_S, 0.0)
+    halted = jnp.where(IS_YAW, 1.0, jnp.maximum(1.0 - jnp.abs(setpoint - relax) / RELAX_DEG_S, 0.0))
     own_boost = jnp.where(IS_YAW, 0.0, boost)
-    gain = (I_SCALE * factors * loop.axes("i") + ANTI_GRAVITY_I * own_boost) * jnp.where(IS_YAW, 1.0, halted)
+    gain = (I_SCALE * factors * loop.axes("i") + ANTI_GRAVITY_I * own_boost) * halted
     most = I_SHARE * limits
     integral = jnp.clip(axes.integral + gain * error * dt, -most, most)
     p_hz = jnp.where(IS_YAW, loop.yaw_lowpass_hz, NONE_HZ)
@@ -323,8 +338,8 @@ def _controlled(
     asked = p_term * (1.0 + ANTI_GRAVITY_P * own_boost / calm) + integral + damping.term
     asked = jnp.clip(asked + F_SCALE * loop.axes("f") * feedforward, -limits, limits)
     later = Axes(
-        _lowpass(axes.setpoint, frames.setpoint, loop.sticks_hz, dt),
-        _lowpass(axes.feedforward, frames.feedforward, loop.sticks_hz, dt),
+        _lowpass(axes.setpoint, given.setpoint, loop.sticks_hz, dt),
+        _lowpass(axes.feedforward, given.feedforward, loop.sticks_hz, dt),
         gyro,
         *damping[1:],
         relax,
@@ -348,58 +363,61 @@ def _mixed(loop: BetaflightLoop, asked: jax.Array, throttle: Throttle, level: Sc
     return loop.idle + (1.0 - loop.idle) * jnp.clip(bent, 0.0, 1.0)
 
 
-def _turned(
-    loop: BetaflightLoop, state: Turn, motors: jax.Array, thrust_map: tuple[Any, Scalar], dt: Scalar
-) -> jax.Array:
-    """Return the body rates a substep later, deg/s, at whose end motors are as fast as given.
-
-    thrust_map: its coefficients and the battery's voltage.
-    """
-    coeffs, battery_v = thrust_map
-    both, signs = (motors, state.loop.motors), _like(SIGNS, motors)
-    thrusts = sum(collective_thrust(_action_of(speeds, loop), battery_v, coeffs) for speeds in both)
+def _turned(state: Turn, given: Given, motors: jax.Array) -> jax.Array:
+    """Return the body rates a substep later, deg/s, at whose end motors are as fast as given."""
+    loop, both, signs = given.loop, (motors, state.motors), _like(SIGNS, motors)
+    thrusts = sum(
+        collective_thrust(_action_of(speeds, loop), given.battery_v, given.thrust_coeffs) for speeds in both
+    )
     thrusts = 0.125 * loop.health * thrusts  # of a motor, the mean of the substep
     # Sum by sum: XLA makes a product of matrices of a reduction, which no kernel has.
     torques = sum(thrusts[motor] * signs[:, motor] for motor in range(4))
     spun = loop.yaw_spin * sum((both[0] - both[1])[motor] * signs[2, motor] for motor in range(4))
     x, y, z = (PER_DEGREE * state.rates[axis] for axis in range(3))
     turning = loop.precession * z * jnp.stack([-y, x, jnp.zeros_like(x)])
-    return state.rates + (dt * (loop.arms * torques + turning) + jnp.where(IS_YAW, spun, 0.0)) / PER_DEGREE
+    change = given.dt * (loop.arms * torques + turning) + jnp.where(IS_YAW, spun, 0.0)
+    return state.rates + change / PER_DEGREE
 
 
-def _substep(
-    state: Turn, loop: BetaflightLoop, thrust_stick: Scalar, thrust_map: tuple[Any, Scalar], dt: Scalar
-) -> Turn:
+def _substep(state: Turn, given: Given) -> Turn:
     """Return the state a substep later under the same frames."""
-    now = state.loop
-    throttle, level, boost = _throttled(loop, now.throttle, 0.5 * (thrust_stick + 1.0), dt)
-    axes, asked = _controlled(loop, state, level, boost, dt)
+    loop, dt = given.loop, given.dt
+    throttle, level, boost = _throttled(loop, state.throttle, given.throttle, dt)
+    axes, asked = _controlled(state, given, level, boost)
     follow = 1.0 - jnp.exp(-dt / loop.motor_s)
-    motors = now.motors + follow * (_mixed(loop, asked, throttle, level) - now.motors)
-    return Turn(_turned(loop, state, motors, thrust_map, dt), Loop(now.frames, axes, throttle, motors))
+    motors = state.motors + follow * (_mixed(loop, asked, throttle, level) - state.motors)
+    return Turn(_turned(state, given, motors), axes, throttle, motors)
 
 
 def _respond(loop: BetaflightLoop, memory: Loop, lagged: Action, context: StepContext) -> tuple[Action, Loop]:
     """Return the applied action and the memory at the end of a span of the step, in which a command acts."""
     begin, end = context.span
     num_substeps = round(NUM_SUBSTEPS * (end - begin))
-    full, acting = jnp.stack(context.full_stick_b) / PER_DEGREE, context.acting
+    full, acting, frames = jnp.stack(context.full_stick_b) / PER_DEGREE, context.acting, memory.frames
     if begin == 0.0:  # a frame of the receiver comes with the step
-        sticks = jnp.stack(acting[:3])
-        memory = memory._replace(frames=_received(loop, memory.frames, sticks, full, context.dt))
-    thrust_map = tuple(context.thrust_coeffs[place] for place in range(6)), context.drone.battery_v
+        frames = _received(loop, frames, jnp.stack(acting[:3]), full, context.dt)
+    given = Given(
+        loop,
+        frames.setpoint,
+        frames.feedforward,
+        0.5 * (acting.thrust + 1.0),
+        tuple(context.thrust_coeffs[place] for place in range(6)),
+        context.drone.battery_v,
+        context.dt / NUM_SUBSTEPS,
+    )
 
     @one_kernel
-    def substeps(state: Turn, *given: Any) -> Turn:
-        return jax.lax.fori_loop(0, num_substeps, lambda _, state: _substep(state, *given), state)
+    def substeps(state: Turn, given: Given) -> Turn:
+        return jax.lax.fori_loop(0, num_substeps, lambda _, state: _substep(state, given), state)
 
     rates = full * jnp.stack(context.drone.applied[:3])
-    moved = substeps(Turn(rates, memory), loop, acting.thrust, thrust_map, context.dt / NUM_SUBSTEPS)
+    moved = substeps(Turn(rates, *memory[1:]), given)
     sticks = moved.rates / jnp.where(full, full, 1.0)
-    share = jnp.sqrt(sum(loop.health * moved.loop.motors**2) / 4.0)
+    share = jnp.sqrt(sum(loop.health * moved.motors**2) / 4.0)
     found = Action(*(sticks[axis] for axis in range(3)), _action_of(share, loop))
     is_there = (loop.roll_arm > 0.0) & (loop.pitch_arm > 0.0)
-    return Action(*(jnp.where(is_there, *pair) for pair in zip(found, lagged, strict=True))), moved.loop
+    applied = Action(*(jnp.where(is_there, *pair) for pair in zip(found, lagged, strict=True)))
+    return applied, Loop(frames, *moved[1:])
 
 
 def observe(loop: BetaflightLoop, memory: Loop, offset_b: Vec3, dt: Scalar) -> tuple[Loop, Vec3]:
@@ -441,7 +459,8 @@ BETAFLIGHT_LOOP = Effect(
     },
     notable=NOTABLE,
     shapes=tuple(name for name in BetaflightLoop._fields if name not in NOTABLE),
-    groups=(GAINS, (FILTER,), MOTORS),
+    # A weak motor, or all of one side; all four are the thrust map.
+    groups=(GAINS, (FILTER,), *((motor,) for motor in MOTORS), MOTORS[:2], MOTORS[::2]),
     probes={FILTER: (40.0,)},
     is_setting=True,
     fitted=CRAFT,
