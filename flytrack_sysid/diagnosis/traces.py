@@ -25,7 +25,7 @@ from flytrack_env.dynamics import ModelParameters, lag
 from flytrack_env.state import Action
 from flytrack_sysid.diagnosis.lanes import AXES, Lanes, lead_in_of, make_lanes
 from flytrack_sysid.diagnosis.lateness import latency_of, read_poses
-from flytrack_sysid.diagnosis.problem import Problem, vector_of
+from flytrack_sysid.diagnosis.problem import Problem
 from flytrack_sysid.diagnosis.result import CHANNELS
 from flytrack_sysid.log import FlightLog
 from flytrack_sysid.parameters import STICKS
@@ -241,8 +241,8 @@ def traces(log: FlightLog, models: Mapping[str, ModelParameters], like: str) -> 
         }
         left = []
         for model in models.values():
-            problem = Problem.of(by_lateness[latency_of(model)], base)
-            left.append(problem.residuals(vector_of(model)[None])[0])
+            problem = Problem.of(by_lateness[latency_of(model)], model._replace(motion=base.motion))
+            left.append(problem.residuals(problem.start[None])[0])
         lanes = by_lateness[latency_of(base)]
         lagged = _lagged(lanes.record, np.asarray(base.tau, float))
         applied = np.stack([np.asarray(stick) for stick in lagged], axis=-1)

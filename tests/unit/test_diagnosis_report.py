@@ -140,6 +140,8 @@ def shown(model: ModelParameters, cause: str) -> ModelParameters:
         values = dict(zip(names_of(model), to_vector(model), strict=True))
         return with_values(model, {name: 1.4 * values[name] for name in BASE_CAUSES[cause]})
     effect = next(effect for effect in EFFECTS if effect.name == cause)
+    if effect.respond is not None:  # far from neutral, no loop is stable
+        return model.with_effects(effect.parameters(20.0, 20.0, 2.0, 2.0))
     return model.with_effects(
         effect.parameters(**{name: 0.9 * one.high for name, one in effect.ranges.items()})
     )
