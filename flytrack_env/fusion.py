@@ -11,6 +11,7 @@ from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
+from jax.dtypes import float0
 from jax.extend.core import ClosedJaxpr, Primitive, jaxpr_as_fun
 from jax.interpreters import ad, batching, mlir
 from jax.interpreters.partial_eval import dce_jaxpr
@@ -59,13 +60,22 @@ def _batch(leaves, axes):  # type: ignore[no-untyped-def]
 
 
 def _jvp(primals, tangents):  # type: ignore[no-untyped-def]
-    return _compute_once_p.bind(*primals), list(tangents)
+    # Derivatives are shared as values are. Of integers there are none.
+    moves = [i for i, one in enumerate(tangents) if type(one) is not ad.Zero and one.dtype != float0]
+    fenced = _compute_once_p.bind(*(tangents[i] for i in moves)) if moves else []
+    found = dict(zip(moves, fenced, strict=True))
+    return _compute_once_p.bind(*primals), [found.get(i, one) for i, one in enumerate(tangents)]
+
+
+def _transpose(cotangents, *leaves):  # type: ignore[no-untyped-def]
+    return cotangents
 
 
 _compute_once_p.def_impl(lambda *leaves: list(leaves))
 _compute_once_p.def_abstract_eval(lambda *avals: list(avals))
 batching.primitive_batchers[_compute_once_p] = _batch
 ad.primitive_jvps[_compute_once_p] = _jvp
+ad.primitive_transposes[_compute_once_p] = _transpose
 mlir.register_lowering(_compute_once_p, lambda ctx, *leaves: list(leaves))
 mlir.register_lowering(_compute_once_p, mlir.lower_fun(_fence, multiple_results=True), platform="cpu")
 
