@@ -163,13 +163,10 @@ def _lower_kernel(ctx, *args, jaxpr):  # type: ignore[no-untyped-def]
     return results
 
 
-def _inline_kernel(*leaves: Any, jaxpr: Any) -> Any:
-    return jaxpr_as_fun(jaxpr)(*leaves)
-
-
+_inlined = mlir.lower_fun(lambda *leaves, jaxpr: jaxpr_as_fun(jaxpr)(*leaves), multiple_results=True)
 _one_kernel_p.def_impl(lambda *leaves, jaxpr: jax.jit(jaxpr_as_fun(jaxpr))(*leaves))
 _one_kernel_p.def_abstract_eval(lambda *avals, jaxpr: list(jaxpr.out_avals))
 batching.primitive_batchers[_one_kernel_p] = _batch_kernel
 ad.primitive_jvps[_one_kernel_p] = _jvp_kernel
-mlir.register_lowering(_one_kernel_p, mlir.lower_fun(_inline_kernel, multiple_results=True))
+mlir.register_lowering(_one_kernel_p, _inlined)
 mlir.register_lowering(_one_kernel_p, _lower_kernel, platform="cpu")

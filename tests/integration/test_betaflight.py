@@ -17,17 +17,7 @@ from firmware import Betaflight, Body, FirmwareError, build
 from firmware.checking import check
 from flytrack_env.dynamics import ModelParameters, move, nominal_parameters
 from flytrack_env.effects import BetaflightLoop, effect_of, start_memories
-from flytrack_env.state import (
-    ACCELERATION,
-    APPLIED_ACTION,
-    BATTERY,
-    QUATERNION,
-    RATES,
-    Action,
-    pack,
-    unpack,
-    unpack_action,
-)
+from flytrack_env.state import ACCELERATION, BATTERY, RATES, Action, pack, unpack, unpack_action
 from flytrack_sysid import CollectError, collect, diagnose_change, import_log, load_log, save_log
 from flytrack_sysid.excitation import script, start_state
 from flytrack_sysid.manoeuvres import hover_action
@@ -112,19 +102,6 @@ def test_noise_of_the_gyro_is_of_the_seed_and_filtered():
     np.testing.assert_array_equal(flown[0], flown[1])
     difference = np.abs(flown[0] - flown[2])[..., RATES]
     assert 0.0 < difference.max() < 0.5
-
-
-def test_thrust_is_that_of_the_body_and_rates_those_of_the_settings(plant):
-    rows = starts(1, volts=23.0)
-    rows[0, QUATERNION] = (1, 0, 0, 0)
-    hold, turn = np.tile(rows[:, APPLIED_ACTION], (1, 20, 1)), np.tile([[[0.5, 0.0, 0.0, -0.2]]], (1, 60, 1))
-    climb = plant.fly(rows, hold.astype(np.float32))[0]
-    command = 0.055 + 0.945 * 0.5 * (1 - 0.2)  # the firmware's idle is 5.5 %
-    expected = plant.body.full_thrust_n * command**2 * (23.0 / 24.0) ** 1.4 - plant.body.gravity
-    assert climb[5, ACCELERATION][2] == pytest.approx(expected, abs=0.05)
-    np.testing.assert_allclose(climb[:, APPLIED_ACTION][:, 3], -0.2, atol=2e-3)
-    rates = plant.fly(rows, turn.astype(np.float32))[0, -1, RATES]
-    assert rates[0] == pytest.approx(np.deg2rad(310.0), rel=0.02) and abs(rates[1:]).max() < 0.1
 
 
 def test_sick_motors_sag_and_settings_show():
