@@ -115,7 +115,7 @@ def page(title: str, *parts: str) -> str:
     return "\n\n".join([f"# {title}", *(part.strip("\n") for part in parts)]) + "\n"
 
 
-def fill_page(path: Path | None, name: str, packages: Sequence[str] = (), **values: Any) -> None:
+def fill_page(path: Path | None, name: str, /, packages: Sequence[str] = (), **values: Any) -> None:
     """Print a page and write it atomically: a template of ``benchmarks/pages`` with values filled in.
 
     ``{command}`` and ``{provenance}`` need not be given. packages: as for ``provenance``.

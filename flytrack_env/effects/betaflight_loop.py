@@ -1,7 +1,7 @@
 """Betaflight's rate loop with its mixer and four motors: how sticks become body rates and thrust."""
 
 from functools import reduce
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -13,6 +13,7 @@ from flytrack_env.quaternion import Scalar, Vec3
 from flytrack_env.state import Action, Drone
 from flytrack_env.thrust import collective_thrust
 
+Array = Any  # of the axes, (3,), or the motors, (4,)
 NUM_SUBSTEPS = 10  # of a step: 1 ms at 100 Hz
 # What a stronger motor turns, in the firmware's order of motors: left rotors roll to the right, rear rotors
 # pitch down. An axis a row.
@@ -91,17 +92,17 @@ class BetaflightLoop(NamedTuple):
     thrust_linear: Scalar = 0.0
     motor_idle: Scalar = 550.0
 
-    def axes(self, name: str) -> jax.Array:
+    def axes(self, name: str) -> Array:
         """Return a setting of roll, pitch and yaw, (3,)."""
         return jnp.stack([getattr(self, f"{name}_{axis}") for axis in ("roll", "pitch", "yaw")])
 
     @property
-    def arms(self) -> jax.Array:
+    def arms(self) -> Array:
         """The arms of the axes, (3,)."""
         return jnp.stack([self.roll_arm, self.pitch_arm, self.yaw_arm])
 
     @property
-    def health(self) -> jax.Array:
+    def health(self) -> Array:
         """Of the motors, (4,)."""
         return jnp.stack([self.rear_right, self.front_right, self.rear_left, self.front_left])
 
@@ -118,28 +119,28 @@ class Frames(NamedTuple):
     frame. moved: by how much the stick did, us. was_still: 1 if it did not.
     """
 
-    stick: jax.Array
-    setpoint: jax.Array
-    speed: jax.Array
-    speed_change: jax.Array
-    moved: jax.Array
-    was_still: jax.Array
-    hold: jax.Array
-    feedforward: jax.Array
+    stick: Array
+    setpoint: Array
+    speed: Array
+    speed_change: Array
+    moved: Array
+    was_still: Array
+    hold: Array
+    feedforward: Array
 
 
 class Axes(NamedTuple):
     """Filters (tuples: of several stages) and integrals, (3,) each; deg/s, and units of the mixer."""
 
-    setpoint: tuple[jax.Array, ...]
-    feedforward: tuple[jax.Array, ...]
-    gyro: jax.Array
-    dterm: tuple[jax.Array, ...]
-    d_range: tuple[jax.Array, ...]
-    d_boost: tuple[jax.Array, ...]
-    relax: jax.Array
-    p: jax.Array
-    integral: jax.Array
+    setpoint: tuple[Array, ...]
+    feedforward: tuple[Array, ...]
+    gyro: Array
+    dterm: tuple[Array, ...]
+    d_range: tuple[Array, ...]
+    d_boost: tuple[Array, ...]
+    relax: Array
+    p: Array
+    integral: Array
 
 
 class Throttle(NamedTuple):
@@ -160,16 +161,16 @@ class Loop(NamedTuple):
     frames: Frames
     axes: Axes
     throttle: Throttle
-    motors: jax.Array
+    motors: Array
 
 
 class Turn(NamedTuple):
     """What a substep moves: body rates, (3,) deg/s, and what the loop remembers but for frames."""
 
-    rates: jax.Array
+    rates: Array
     axes: Axes
     throttle: Throttle
-    motors: jax.Array
+    motors: Array
 
 
 class Given(NamedTuple):
@@ -179,8 +180,8 @@ class Given(NamedTuple):
     """
 
     loop: BetaflightLoop
-    setpoint: jax.Array
-    feedforward: jax.Array
+    setpoint: Array
+    feedforward: Array
     throttle: Scalar
     thrust_coeffs: tuple[Scalar, ...]
     battery_v: Scalar
@@ -206,7 +207,7 @@ def _action_of(share: Scalar, loop: BetaflightLoop) -> Scalar:
     return 2.0 * (share - loop.idle) / (1.0 - loop.idle) - 1.0
 
 
-def _like(constants: np.ndarray, value: jax.Array) -> jax.Array:
+def _like(constants: np.ndarray, value: Array) -> Array:
     """Return constants in the precision of a value: a compiled kernel keeps the one that it was traced in."""
     return jnp.asarray(constants, value.dtype)
 
@@ -219,7 +220,8 @@ def _lowpass(stages: tuple[Scalar, ...], target: Scalar, cutoff_hz: Scalar, dt: 
     fade, found = jnp.exp(-turns), []
     offsets = [stage - target for stage in stages]
     for place in range(len(stages)):
-        share, left = 1.0, 0.0
+        share: Scalar = 1.0
+        left: Scalar = 0.0
         for back in range(place + 1):
             left = left + share * offsets[place - back]
             share = share * turns / (back + 1)
@@ -227,7 +229,7 @@ def _lowpass(stages: tuple[Scalar, ...], target: Scalar, cutoff_hz: Scalar, dt: 
     return tuple(found)
 
 
-def _received(loop: BetaflightLoop, frames: Frames, stick: jax.Array, full: jax.Array, dt: Scalar) -> Frames:
+def _received(loop: BetaflightLoop, frames: Frames, stick: Array, full: Array, dt: Scalar) -> Frames:
     """Return the frames after another; full: rates at full stick, (3,) deg/s. dt: since the last, s."""
     setpoint, reach = stick * full, jnp.abs(full)
     change = setpoint - frames.setpoint
@@ -275,9 +277,7 @@ def _cutoff(low: Scalar, high: Scalar, level: Scalar) -> Scalar:
     return low + (high - low) * level * (1.0 + FILTER_EXPO * (1.0 - level))
 
 
-def _filtered_gyro(
-    loop: BetaflightLoop, gyro: jax.Array, rates: jax.Array, level: Scalar, dt: Scalar
-) -> jax.Array:
+def _filtered_gyro(loop: BetaflightLoop, gyro: Array, rates: Array, level: Scalar, dt: Scalar) -> Array:
     """Return the gyro behind both filters, as one lag; half a substep of delay is in the substep."""
 
     def lag_s(cutoff_hz: Scalar) -> Scalar:
@@ -291,14 +291,14 @@ def _filtered_gyro(
 class Damping(NamedTuple):
     """The D term and its filters."""
 
-    term: jax.Array
-    dterm: tuple[jax.Array, ...]
-    d_range: tuple[jax.Array, ...]
-    d_boost: tuple[jax.Array, ...]
+    term: Array
+    dterm: tuple[Array, ...]
+    d_range: tuple[Array, ...]
+    d_boost: tuple[Array, ...]
 
 
 def _damped(
-    loop: BetaflightLoop, axes: Axes, gyro: jax.Array, feedforward: jax.Array, level: Scalar, dt: Scalar
+    loop: BetaflightLoop, axes: Axes, gyro: Array, feedforward: Array, level: Scalar, dt: Scalar
 ) -> Damping:
     """Return the D term: of the gyro, behind two filters, and more of it where the craft or a stick jerks."""
     d, d_max = loop.axes("d"), loop.axes("d_max")
@@ -316,7 +316,7 @@ def _damped(
     return Damping(term, (first, second), d_range, d_boost)
 
 
-def _controlled(state: Turn, given: Given, level: Scalar, boost: Scalar) -> tuple[Axes, jax.Array]:
+def _controlled(state: Turn, given: Given, level: Scalar, boost: Scalar) -> tuple[Axes, Array]:
     """Return the axes a substep later, and what they ask of the mixer, (3,)."""
     axes, loop, dt = state.axes, given.loop, given.dt
     limits, factors = _like(SUM_LIMITS, state.rates), _like(I_FACTORS, state.rates)
@@ -349,21 +349,22 @@ def _controlled(state: Turn, given: Given, level: Scalar, boost: Scalar) -> tupl
     return later, asked
 
 
-def _mixed(loop: BetaflightLoop, asked: jax.Array, throttle: Throttle, level: Scalar) -> jax.Array:
+def _mixed(loop: BetaflightLoop, asked: Array, throttle: Throttle, level: Scalar) -> Array:
     """Return the motors' commands, (4,) shares of full: what the axes ask for comes before the throttle."""
     boost = loop.throttle_boost * BOOST_SCALE
     level = jnp.clip(level + boost * (level - throttle.slow), 0.0, 1.0)
     linear = loop.thrust_linear / PERCENT
     level = level / (1.0 + (linear - 0.5 * linear * linear) * (1.0 - level) ** 2)
     mix = sum(one * signs for one, signs in zip(asked, _like(SIGNS, asked), strict=True))
-    high, low = reduce(jnp.maximum, mix, 0.0), reduce(jnp.minimum, mix, 0.0)
+    none = jnp.zeros_like(level)
+    high, low = reduce(jnp.maximum, mix, none), reduce(jnp.minimum, mix, none)
     fits = 1.0 / jnp.maximum(high - low, 1.0)
     outputs = jnp.clip(level, -low * fits, 1.0 - high * fits) + fits * mix
     bent = outputs * (1.0 + linear * (1.0 - outputs) ** 2)
     return loop.idle + (1.0 - loop.idle) * jnp.clip(bent, 0.0, 1.0)
 
 
-def _turned(state: Turn, given: Given, motors: jax.Array) -> jax.Array:
+def _turned(state: Turn, given: Given, motors: Array) -> Array:
     """Return the body rates a substep later, deg/s, at whose end motors are as fast as given."""
     loop, both, signs = given.loop, (motors, state.motors), _like(SIGNS, motors)
     thrusts = sum(
@@ -414,7 +415,7 @@ def _respond(loop: BetaflightLoop, memory: Loop, lagged: Action, context: StepCo
     moved = substeps(Turn(rates, *memory[1:]), given)
     sticks = moved.rates / jnp.where(full, full, 1.0)
     share = jnp.sqrt(sum(loop.health * moved.motors**2) / 4.0)
-    found = Action(*(sticks[axis] for axis in range(3)), _action_of(share, loop))
+    found = Action(sticks[0], sticks[1], sticks[2], _action_of(share, loop))
     is_there = (loop.roll_arm > 0.0) & (loop.pitch_arm > 0.0)
     applied = Action(*(jnp.where(is_there, *pair) for pair in zip(found, lagged, strict=True)))
     return applied, Loop(frames, *moved[1:])
