@@ -56,8 +56,8 @@ SETUPS: dict[str, Mapping[str, Any]] = {"stock": {}, "plain": PLAIN, "curved": O
 GENTLE = ("headings", "speeds", "thrust_steps")
 FLIGHTS, SECOND = 24, 100  # rows
 NOTABLE = 0.02  # of the way flown in a second: a change that moves the craft less does not matter
-GAINS, FILTER, *MOTORS = (f"betaflight_loop.{one[0]}" for one in BY_NAME["betaflight_loop"].groups[:6])
-RESPONSE = ("second_order_rates", "rate_slew_limit", "command_delay", GAINS, FILTER)
+GAINS, LATE, *MOTORS = (f"betaflight_loop.{one[0]}" for one in BY_NAME["betaflight_loop"].groups[:6])
+RESPONSE = ("second_order_rates", "rate_slew_limit", "command_delay", GAINS, LATE)
 THRUST = ("thrust_curve", "thrust_scale")
 Rng = np.random.Generator
 
@@ -98,7 +98,7 @@ KINDS = {
     "filters": Kind(
         # A dynamic filter would take the static one's place.
         lambda rng: ({"gyro_lpf1_dyn_min_hz": 0, "gyro_lpf1_static_hz": int(rng.uniform(25, 50))}, {}),
-        (FILTER,),
+        (LATE,),
         RESPONSE,
     ),
     "thrust linearisation": Kind(lambda rng: ({"thrust_linear": int(rng.uniform(60, 120))}, {}), THRUST),

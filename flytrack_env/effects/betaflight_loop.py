@@ -45,7 +45,8 @@ class BetaflightLoop(NamedTuple):
     roll_arm, pitch_arm, yaw_arm: angular acceleration for a newton of one motor, 1/(kg m). yaw_spin: change
     of the yaw rate when one motor starts, rad/s. motor_s: lag of the motors. precession: (I_z - I_y) / I_x.
     rear_right, front_right, rear_left, front_left: thrust of a motor as a share of what it should be.
-    sticks_hz, throttle_hz: cutoffs of the receiver's smoothing. A cutoff of 0 is no filter.
+    gyro_late_s: lag of the gyro beyond that of its filters' settings. sticks_hz, throttle_hz: cutoffs of the
+    receiver's smoothing. A cutoff of 0 is no filter.
     """
 
     roll_arm: Scalar = 0.0
@@ -58,6 +59,7 @@ class BetaflightLoop(NamedTuple):
     front_right: Scalar = 1.0
     rear_left: Scalar = 1.0
     front_left: Scalar = 1.0
+    gyro_late_s: Scalar = 0.0
     p_roll: Scalar = 45.0
     p_pitch: Scalar = 47.0
     p_yaw: Scalar = 45.0
@@ -284,7 +286,8 @@ def _filtered_gyro(loop: BetaflightLoop, gyro: Array, rates: Array, level: Scala
         return 1.0 / (2.0 * jnp.pi * jnp.where(cutoff_hz > 0.0, cutoff_hz, NONE_HZ))
 
     first = lag_s(_cutoff(loop.gyro_lpf1_dyn_min_hz, loop.gyro_lpf1_dyn_max_hz, level))
-    lag = jnp.maximum(first + lag_s(loop.gyro_lpf2_static_hz) - 0.5 * dt, lag_s(NONE_HZ))
+    lag = first + lag_s(loop.gyro_lpf2_static_hz) + loop.gyro_late_s - 0.5 * dt
+    lag = jnp.maximum(lag, lag_s(NONE_HZ))
     return gyro + (1.0 - jnp.exp(-dt / lag)) * (rates - gyro)
 
 
@@ -429,12 +432,12 @@ def observe(loop: BetaflightLoop, memory: Loop, offset_b: Vec3, dt: Scalar) -> t
 
 
 CRAFT, MOTORS = BetaflightLoop._fields[:6], BetaflightLoop._fields[6:10]
-GAINS, FILTER = ("p_roll", "p_pitch", "d_roll", "d_pitch"), "gyro_lpf2_static_hz"
+GAINS, LATE = ("p_roll", "p_pitch", "d_roll", "d_pitch"), "gyro_late_s"
 NOTABLE = {
     **dict.fromkeys(CRAFT[:2], 5.0),
     **dict.fromkeys(MOTORS, 0.05),
     **dict.fromkeys(GAINS, 8.0),
-    FILTER: 200.0,
+    LATE: 0.001,
 }
 CUTOFF, GAIN, ARM = Range(0.0, 4000.0, "Hz"), Range(0.0, 250.0, "1"), Range(0.0, 1e4, "1/(kg m)")
 BETAFLIGHT_LOOP = Effect(
@@ -446,9 +449,9 @@ BETAFLIGHT_LOOP = Effect(
         "motor_s": Range(0.001, 0.2, "s"),
         "precession": Range(-1.0, 1.0, "1"),
         **dict.fromkeys(MOTORS, Range(0.0, 1.5, "1")),
-        **dict.fromkeys(BetaflightLoop._fields[10:25], GAIN),
-        **dict.fromkeys(BetaflightLoop._fields[25:35], CUTOFF),
-        FILTER: Range(10.0, 4000.0, "Hz"),  # fits pass no gap between a low cutoff and none
+        LATE: Range(-0.01, 0.03, "s"),
+        **dict.fromkeys(BetaflightLoop._fields[11:26], GAIN),
+        **dict.fromkeys(BetaflightLoop._fields[26:36], CUTOFF),
         "tpa_rate": Range(0.0, 100.0, "%"),
         "tpa_breakpoint": Range(1000.0, 1990.0, "us"),
         "anti_gravity_gain": GAIN,
@@ -461,8 +464,7 @@ BETAFLIGHT_LOOP = Effect(
     notable=NOTABLE,
     shapes=tuple(name for name in BetaflightLoop._fields if name not in NOTABLE),
     # A weak motor, or all of one side; all four are the thrust map.
-    groups=(GAINS, (FILTER,), *((motor,) for motor in MOTORS), MOTORS[:2], MOTORS[::2]),
-    probes={FILTER: (40.0,)},
+    groups=(GAINS, (LATE,), *((motor,) for motor in MOTORS), MOTORS[:2], MOTORS[::2]),
     is_setting=True,
     fitted=CRAFT,
     equation=r"c = \text{mix}\left(u_t, P e + I \int e\, dt - D \dot{\omega} + F \dot{u}\right), \quad "

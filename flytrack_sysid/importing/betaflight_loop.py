@@ -17,9 +17,8 @@ ASSUMED = {
 }
 # A racer of 5 inch, before anything was fitted.
 GENERIC = BetaflightLoop(20.0, 20.0, 2.0, 2.0, 0.02, 0.5)
-NUM_OF_CRAFT = 10  # fields
+NUM_OF_CRAFT = 11  # fields
 LEAST_SMOOTHING_HZ, SMOOTHING, TENTHS = 15, 1.5, 10.0
-OPEN_HZ = 4000.0  # of the gyro's second filter, which may be off
 
 
 def rate_loop(value: Callable[[str], str], frames_hz: float) -> BetaflightLoop | None:
@@ -36,7 +35,6 @@ def rate_loop(value: Callable[[str], str], frames_hz: float) -> BetaflightLoop |
         if not found[f"{stem}_dyn_min_hz"]:  # then the filter does not follow throttle
             cutoff_hz = float(value(f"{stem}_static_hz"))
             found |= {f"{stem}_dyn_min_hz": cutoff_hz, f"{stem}_dyn_max_hz": cutoff_hz}
-    found["gyro_lpf2_static_hz"] = found["gyro_lpf2_static_hz"] or OPEN_HZ
     if value("iterm_relax") == "OFF":
         found["iterm_relax_cutoff"] = 0.0
     found["sticks_hz"] = _smoothing(value, "setpoint", "rc_smoothing_auto_factor", frames_hz)

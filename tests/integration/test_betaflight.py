@@ -277,7 +277,7 @@ def test_what_was_changed_is_named_and_a_matched_set_up_has_no_name() -> None:
     logs = {}
     for name, body in (("before", Body()), ("same", Body()), ("weak", Body(health=(1.0, 0.85, 1.0, 1.0)))):
         with Betaflight(body=body) as flown:
-            logs[name], model = collect(flown, 0.5, len(logs), 1.0), known_model(flown)
+            logs[name], model = collect(flown, 1.0, len(logs), 1.0), known_model(flown)
     same, weak = (
         diagnose_change(logs[name], logs["before"], model, motion=model.motion) for name in ("same", "weak")
     )

@@ -54,7 +54,7 @@ def test_motors_that_end_trade_thrust_for_rates_and_airmode_adds_it() -> None:
     ("change", "shows"),
     [
         ({"p_roll": 22.0, "d_roll": 15.0}, lambda one, other: one < other),  # slower
-        ({"gyro_lpf2_static_hz": 40.0}, lambda one, other: one > other),  # later, so it overshoots
+        ({"gyro_late_s": 0.004}, lambda one, other: one > other),  # later, so it overshoots
         ({"anti_gravity_gain": 0.0}, lambda one, other: one != other),
         ({"sticks_hz": 0.0, "f_roll": 0.0}, lambda one, other: one != other),
     ],
