@@ -377,10 +377,13 @@ def _turned(state: Turn, given: Given, motors: Array) -> Array:
     # Sum by sum: XLA makes a product of matrices of a reduction, which no kernel has.
     torques = sum(thrusts[motor] * signs[:, motor] for motor in range(4))
     spun = loop.yaw_spin * sum((both[0] - both[1])[motor] * signs[2, motor] for motor in range(4))
-    x, y, z = (PER_DEGREE * state.rates[axis] for axis in range(3))
-    turning = loop.precession * z * jnp.stack([-y, x, jnp.zeros_like(x)])
-    change = given.dt * (loop.arms * torques + turning) + jnp.where(IS_YAW, spun, 0.0)
-    return state.rates + change / PER_DEGREE
+    x, y, z = state.rates
+    # The midpoint rule turns roll and pitch by an angle; Euler's would feed a fast yaw until it overflows.
+    half = 0.5 * given.dt * loop.precession * PER_DEGREE * z
+    turned = jnp.stack([x - half * (2.0 * y + half * x), y + half * (2.0 * x - half * y)]) / (1.0 + half * half)
+    rates = jnp.concatenate([turned, z[None]])
+    change = given.dt * loop.arms * torques + jnp.where(IS_YAW, spun, 0.0)
+    return rates + change / PER_DEGREE
 
 
 def _substep(state: Turn, given: Given) -> Turn:
