@@ -37,6 +37,7 @@ from flytrack_env.state import POSITION
 from flytrack_loop.stages import measure_gap
 from flytrack_sysid import Diagnosis, FlightLog, collect, diagnose, diagnose_change
 from flytrack_sysid.diagnosis import Cause
+from flytrack_sysid.diagnosis.score_test import Candidate
 from flytrack_sysid.excitation import script
 from flytrack_sysid.manoeuvres import flights_of, hover_action
 from flytrack_sysid.script_file import script_of
@@ -188,29 +189,26 @@ def graded(trial: Trial, known: Known, seed: int) -> dict[str, Any]:
     apart = np.linalg.norm(places(settings, body, seed) - known.places_m, axis=1)
     started = time.process_time()
     found = diagnose_change(log, known.log, known.model, motion=known.model.motion)
-    names = [name_of(one) for one in found.causes]
+    named = {name: values for one in found.causes for name, values in by_name(one).items()}
     return {
         "settings": settings,
         "body": {name: value for name, value in vars(body).items() if value != getattr(Body(), name)},
         "apart": round(float(np.median(apart / np.linalg.norm(known.places_m, axis=1))), 4),
         "verdict": found.verdict,
-        "found": {
-            name_of(one): {k: [v.value, *v.ci95] for k, v in one.parameters.items()} for one in found.causes
-        },
+        "found": {k: {p: [v.value, *v.ci95] for p, v in own.items()} for k, own in named.items()},
         "negligible": [one.effect for one in found.negligible],
-        **grade([names_of(kind, body) for kind in trial.kinds], names),
+        **grade([names_of(kind, body) for kind in trial.kinds], [*named]),
         "error": error_ratios(found),
         "cpu_s": round(time.process_time() - started, 1),
     }
 
 
-def name_of(cause: Cause) -> str:
-    """Return the name of a cause, of the loop with the first of the settings that changed together."""
-    return (
-        f"{cause.effect}.{next(iter(cause.parameters))}"
-        if cause.effect == "betaflight_loop"
-        else cause.effect
-    )
+def by_name(cause: Cause) -> dict[str, Mapping[str, Any]]:
+    """Return a cause's parameters by name; of the loop, by the first of the settings that change together."""
+    if cause.effect != "betaflight_loop":
+        return {cause.effect: cause.parameters}
+    groups = Candidate(cause.effect, tuple(f"{cause.effect}.{name}" for name in cause.parameters)).groups
+    return {own[0]: {field: cause.parameters[field.split(".")[1]] for field in own} for own in groups}
 
 
 def names_of(kind: str, body: Body) -> tuple[set[str], set[str]]:

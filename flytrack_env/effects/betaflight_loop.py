@@ -380,7 +380,9 @@ def _turned(state: Turn, given: Given, motors: Array) -> Array:
     x, y, z = state.rates
     # The midpoint rule turns roll and pitch by an angle; Euler's would feed a fast yaw until it overflows.
     half = 0.5 * given.dt * loop.precession * PER_DEGREE * z
-    turned = jnp.stack([x - half * (2.0 * y + half * x), y + half * (2.0 * x - half * y)]) / (1.0 + half * half)
+    turned = jnp.stack([x - half * (2.0 * y + half * x), y + half * (2.0 * x - half * y)]) / (
+        1.0 + half * half
+    )
     rates = jnp.concatenate([turned, z[None]])
     change = given.dt * loop.arms * torques + jnp.where(IS_YAW, spun, 0.0)
     return rates + change / PER_DEGREE

@@ -98,7 +98,7 @@ class Estimate(NamedTuple):
         line, model = self.linearization, self.model
         gain = line.gain_of(candidate, line.columns_at(model.places))
         if gain is None:
-            fitted = self.state.fitted((*model.candidates, candidate), model.vector)
+            fitted = self.state.fitted(model.joined_by(candidate), model.vector)
         else:
             fitted = add_effect(self.state, line, model, Scored(candidate, gain))
         state, linearization = self.state.linearized(fitted.vector)
@@ -226,7 +226,7 @@ def change_merit(candidate: Candidate, later: Estimate, earlier: Estimate) -> fl
     A change shows between the logs, and in the log after against the model.
     """
     both = later, earlier
-    if any(candidate.effect in (*one.model.effects, *one.state.unobservable) for one in both):
+    if candidate.effect in later.state.unobservable or not all(one.model.lacks(candidate) for one in both):
         return 0.0
     ways = [one.linearization.columns_of(candidate) for one in both]
     if any(len(one.linearization.acting(way)) < len(way) for one, way in zip(both, ways, strict=True)):
@@ -275,11 +275,23 @@ def change_between(later: Estimate, earlier: Estimate, fields: Sequence[str]) ->
 
 
 def changed_cause(cause: Cause, later: Estimate, earlier: Estimate) -> list[Cause]:
-    """Return a cause with the values that it changed to; nothing where it is as it was before."""
+    """Return a cause with the values that it changed to; nothing where it is as it was before.
+
+    Of a loop's settings, those that changed.
+    """
+    effect = [one for one in later.model.candidates if one.effect == cause.effect]
+    base = THRUST_COEFFS if cause.effect == "thrust_scale" else BASE_CAUSES.get(cause.effect, ())
+    values: dict[str, Estimated] = {}
+    for fields in effect[0].groups if effect else [base]:
+        values |= changed_values(cause, fields, later, earlier)
+    return [replace(cause, parameters=values)] if values else []
+
+
+def changed_values(
+    cause: Cause, fields: Sequence[str], later: Estimate, earlier: Estimate
+) -> dict[str, Estimated]:
+    """Return the values that a cause's parameters changed to; none where they are as they were before."""
     problem, name = later.state.problem, cause.effect
-    effect = [one for one in later.model.candidates if one.effect == name]
-    base = THRUST_COEFFS if name == "thrust_scale" else BASE_CAUSES.get(name, ())
-    fields = effect[0].fields if effect else base
     change = change_between(later, earlier, fields)
     places, vector = problem.index(fields), problem.start.copy()
     vector[places] += change.size
@@ -287,7 +299,7 @@ def changed_cause(cause: Cause, later: Estimate, earlier: Estimate) -> list[Caus
     is_clear = np.any(np.abs(change.size) > change.half) and change.chi2 > threshold(len(fields))
     is_clear |= any(not one.ci95[0] <= 1.0 <= one.ci95[1] for one in factor.values())
     if not is_clear or not is_notable(name, problem, vector):
-        return []
+        return {}
     values = {}
     for field, place, half in zip(fields, places, change.half, strict=True):
         key, value = field.split(".")[-1], float(vector[place])
@@ -297,7 +309,7 @@ def changed_cause(cause: Cause, later: Estimate, earlier: Estimate) -> list[Caus
             )
     if factor:
         values |= {"factor": factor["mean_factor"]} if name == "thrust_scale" else factor
-    return [replace(cause, parameters=values)]
+    return values
 
 
 def mean_thrust_change(later: Estimate, earlier: Estimate, vector: np.ndarray) -> dict[str, Estimated]:

@@ -93,7 +93,7 @@ def ablate(state: SearchState, model: FittedModel, linearization: Linearization,
         vector = model.vector.copy()
         dropped = state.problem.index(sorted({*model.candidate(effect).fields} - {*other.fields}))
         vector[dropped] = state.problem.start[dropped]
-        swaps[effect] = state.fitted(candidates, vector)
+        swaps[effect] = min(state.fitted(candidates, vector), swaps.get(effect, model), key=price)
     columns = [linearization.column(field) for field in model.candidate(effect).fields]
     own = linearization.gain(columns, linearization.columns_at(model.places, without=columns))
     inflation, determined = (1.0, 1) if own is None else (own.inflation, own.num_parameters)
@@ -105,9 +105,12 @@ def other_groups(linearization: Linearization, model: FittedModel, effect: str) 
 
     Others may be: they gain something beside the effect's own.
     """
-    problem, own = linearization.problem, set(model.candidate(effect).fields)
-    result = []
-    for candidate in {one.fields: one for one in candidates_for(problem) if one.effect == effect}.values():
+    problem, now = linearization.problem, model.candidate(effect)
+    own, result = set(now.fields), []
+    ways = {one.fields: one for one in candidates_for(problem) if one.effect == effect}
+    less = [tuple(field for field in now.fields if field not in group) for group in now.groups]
+    ways |= {fields: now._replace(fields=fields) for fields in less if fields}
+    for candidate in ways.values():
         more = {*candidate.fields} - own
         changed = sorted(more or own - {*candidate.fields})
         columns = [linearization.column(field) for field in changed]
@@ -318,7 +321,7 @@ def _best_instead(
             best, limit = (trial, cost) if determined else (best, limit)
     if best is None:
         return replace(state, held=held), None
-    effect = "".join(best.effects - model.effects)
+    effect = "".join(one.effect for one in best.candidates if one not in model.candidates)
     return replace(state, held=(*held, *(Held(field, effect) for field in fields))), best
 
 

@@ -69,6 +69,14 @@ class Candidate(NamedTuple):
         return sum(field not in shapes for field in self.fields)
 
     @property
+    def groups(self) -> list[tuple[str, ...]]:
+        """Its fields by what changes together: several groups of an effect whose settings are independent."""
+        fields = set(self.fields)
+        own = [one.fields for one in candidates_of(BY_NAME[self.effect]) if fields.issuperset(one.fields)]
+        largest = [one for one in own if not any(set(one) < set(other) for other in own)]
+        return largest if BY_NAME[self.effect].is_setting else [self.fields]
+
+    @property
     def other_fields(self) -> tuple[str, ...]:
         """Its fields without those of the probes."""
         return tuple(field for field in self.fields if field not in dict(self.probes))

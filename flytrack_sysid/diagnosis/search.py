@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from flytrack_env.effects import BY_NAME
 from flytrack_sysid.diagnosis import noise as noises
 from flytrack_sysid.diagnosis.lanes import voltages_of
 from flytrack_sysid.diagnosis.problem import SEARCHED, SMALL_BATCH, Problem
@@ -52,6 +53,19 @@ class FittedModel(NamedTuple):
     def candidate(self, effect: str) -> Candidate:
         """Return the way in which an effect of the model was found."""
         return next(one for one in self.candidates if one.effect == effect)
+
+    def lacks(self, candidate: Candidate) -> bool:
+        """Return whether an effect may be added: the model does not have it, or only other settings of it."""
+        own = next((one for one in self.candidates if one.effect == candidate.effect), None)
+        is_setting = BY_NAME[candidate.effect].is_setting
+        return own is None or (is_setting and not {*own.fields} & {*candidate.fields})
+
+    def joined_by(self, candidate: Candidate) -> tuple[Candidate, ...]:
+        """Return the effects with one more, or with more settings of one."""
+        own = [one for one in self.candidates if one.effect == candidate.effect]
+        fields = tuple(field for one in (*own, candidate) for field in one.fields)
+        rest = [one for one in self.candidates if one not in own]
+        return (*rest, candidate._replace(fields=fields))
 
 
 class Held(NamedTuple):
@@ -171,12 +185,12 @@ class Scored(NamedTuple):
 
 
 def score_candidates(state: SearchState, linearization: Linearization, model: FittedModel) -> list[Scored]:
-    """Return all effects that a model does not have, by merit to first order, one way of each."""
+    """Return all effects that a model lacks, by merit to first order, one way of each."""
     given = linearization.columns_at(model.places)
-    excluded = {*model.effects, *state.unobservable, *state.refused}
+    excluded = {*state.unobservable, *state.refused}
     best: dict[str, Scored] = {}
     for candidate in candidates_for(state.problem):
-        if candidate.effect in excluded:
+        if candidate.effect in excluded or not model.lacks(candidate):
             continue
         gain = linearization.gain_of(candidate, given)
         if gain is None:
@@ -195,7 +209,7 @@ def add_effect(
     An effect that is looked for at a probe also starts there, if it came to much less than promised.
     """
     problem, (candidate, gain) = state.problem, scored
-    candidates = (*model.candidates, candidate)
+    candidates = model.joined_by(candidate)
     if not candidate.probes:
         vector = model.vector.copy()
         vector[problem.index(candidate.fields)] += gain.step
