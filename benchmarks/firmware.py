@@ -57,7 +57,7 @@ SETUPS: dict[str, Mapping[str, Any]] = {"stock": {}, "plain": PLAIN, "curved": O
 GENTLE = ("headings", "speeds", "thrust_steps")
 FLIGHTS, SECOND = 24, 100  # rows
 NOTABLE = 0.02  # of the way flown in a second: a change that moves the craft less does not matter
-GAINS, LATE, *MOTORS = (f"betaflight_loop.{one[0]}" for one in BY_NAME["betaflight_loop"].groups[:6])
+GAINS, LATE, CENTER, *MOTORS = (f"betaflight_loop.{one[0]}" for one in BY_NAME["betaflight_loop"].groups[:7])
 RESPONSE = ("second_order_rates", "rate_slew_limit", "command_delay", GAINS, LATE)
 THRUST = ("thrust_curve", "thrust_scale")
 Rng = np.random.Generator
@@ -128,8 +128,8 @@ KINDS = {
     ),
     "centre of mass": Kind(
         lambda rng: ({}, {"center_of_mass_m": (float(rng.uniform(0.01, 0.02)), 0.0)}),
-        ("motor_imbalance", *MOTORS),
-        THRUST,
+        (CENTER,),
+        ("motor_imbalance", *MOTORS, *THRUST),
     ),
 }
 

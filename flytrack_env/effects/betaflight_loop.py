@@ -45,8 +45,9 @@ class BetaflightLoop(NamedTuple):
     roll_arm, pitch_arm, yaw_arm: angular acceleration for a newton of one motor, 1/(kg m). yaw_spin: change
     of the yaw rate when one motor starts, rad/s. motor_s: lag of the motors. precession: (I_z - I_y) / I_x.
     rear_right, front_right, rear_left, front_left: thrust of a motor as a share of what it should be.
-    gyro_late_s: lag of the gyro beyond that of its filters' settings. sticks_hz, throttle_hz: cutoffs of the
-    receiver's smoothing. A cutoff of 0 is no filter.
+    center_x, center_y: where the centre of mass is ahead and left of the motors' middle, as a share of the
+    motors' own distance from it. gyro_late_s: lag of the gyro beyond that of its filters' settings.
+    sticks_hz, throttle_hz: cutoffs of the receiver's smoothing. A cutoff of 0 is no filter.
     """
 
     roll_arm: Scalar = 0.0
@@ -59,6 +60,8 @@ class BetaflightLoop(NamedTuple):
     front_right: Scalar = 1.0
     rear_left: Scalar = 1.0
     front_left: Scalar = 1.0
+    center_x: Scalar = 0.0
+    center_y: Scalar = 0.0
     gyro_late_s: Scalar = 0.0
     p_roll: Scalar = 45.0
     p_pitch: Scalar = 47.0
@@ -375,7 +378,8 @@ def _turned(state: Turn, given: Given, motors: Array) -> Array:
     )
     thrusts = 0.125 * loop.health * thrusts  # of a motor, the mean of the substep
     # Sum by sum: XLA makes a product of matrices of a reduction, which no kernel has.
-    torques = sum(thrusts[motor] * signs[:, motor] for motor in range(4))
+    levers = jnp.stack([-loop.center_y, loop.center_x, jnp.zeros_like(loop.center_x)])
+    torques = sum(thrusts[motor] * (signs[:, motor] + levers) for motor in range(4))
     spun = loop.yaw_spin * sum((both[0] - both[1])[motor] * signs[2, motor] for motor in range(4))
     x, y, z = state.rates
     # The midpoint rule turns roll and pitch by an angle; Euler's would feed a fast yaw until it overflows.
@@ -437,10 +441,11 @@ def observe(loop: BetaflightLoop, memory: Loop, offset_b: Vec3, dt: Scalar) -> t
 
 
 CRAFT, MOTORS = BetaflightLoop._fields[:6], BetaflightLoop._fields[6:10]
-GAINS, LATE = ("p_roll", "p_pitch", "d_roll", "d_pitch"), "gyro_late_s"
+CENTER, GAINS, LATE = ("center_x", "center_y"), ("p_roll", "p_pitch", "d_roll", "d_pitch"), "gyro_late_s"
 NOTABLE = {
     **dict.fromkeys(CRAFT[:2], 5.0),
     **dict.fromkeys(MOTORS, 0.05),
+    **dict.fromkeys(CENTER, 0.02),
     **dict.fromkeys(GAINS, 8.0),
     LATE: 0.001,
 }
@@ -454,9 +459,10 @@ BETAFLIGHT_LOOP = Effect(
         "motor_s": Range(0.001, 0.2, "s"),
         "precession": Range(-1.0, 1.0, "1"),
         **dict.fromkeys(MOTORS, Range(0.0, 1.5, "1")),
+        **dict.fromkeys(CENTER, Range(-0.8, 0.8, "1")),
         LATE: Range(-0.01, 0.03, "s"),
-        **dict.fromkeys(BetaflightLoop._fields[11:26], GAIN),
-        **dict.fromkeys(BetaflightLoop._fields[26:36], CUTOFF),
+        **dict.fromkeys(BetaflightLoop._fields[13:28], GAIN),
+        **dict.fromkeys(BetaflightLoop._fields[28:38], CUTOFF),
         "tpa_rate": Range(0.0, 100.0, "%"),
         "tpa_breakpoint": Range(1000.0, 1990.0, "us"),
         "anti_gravity_gain": GAIN,
@@ -468,8 +474,8 @@ BETAFLIGHT_LOOP = Effect(
     },
     notable=NOTABLE,
     shapes=tuple(name for name in BetaflightLoop._fields if name not in NOTABLE),
-    # A weak motor, or all of one side; all four are the thrust map.
-    groups=(GAINS, (LATE,), *((motor,) for motor in MOTORS), MOTORS[:2], MOTORS[::2]),
+    # A weak motor, or those of a side or a diagonal; all four are the thrust map.
+    groups=(GAINS, (LATE,), CENTER, *((motor,) for motor in MOTORS), MOTORS[:2], MOTORS[::2], MOTORS[::3]),
     is_setting=True,
     fitted=CRAFT,
     equation=r"c = \text{mix}\left(u_t, P e + I \int e\, dt - D \dot{\omega} + F \dot{u}\right), \quad "

@@ -39,9 +39,9 @@ from flytrack_sysid.diagnosis.score_test import (
     threshold,
 )
 from flytrack_sysid.diagnosis.search import (
-    CLOSE,
     MOST_REFITTED,
     PER_PARAMETER,
+    PROMISING,
     FittedModel,
     Scored,
     SearchState,
@@ -150,8 +150,8 @@ def diagnose_change(
             change = next_change(later, earlier)
             if change is None:
                 break
-            candidate, alike[change[0].effect] = change
-            later, earlier = later.with_effect(candidate), earlier.with_effect(candidate)
+            best, alike[change[0].candidate.effect] = change
+            later, earlier = best.later, best.earlier
         report(2, 3)
         selection = selection_of(later, earlier)
         test = held_out_under(selection, parts.test)
@@ -198,30 +198,46 @@ def _calm(problem: Problem) -> Problem:
     return replace(problem, lanes=problem.lanes._replace(counts=quiet))
 
 
-def next_change(later: Estimate, earlier: Estimate) -> tuple[Candidate, tuple[str, ...]] | None:
-    """Return the effect whose change explains the log after best, and others that do so nearly as well.
+class Changed(NamedTuple):
+    """Both estimates with an effect more; merit: of chi2, what only the log after gains, less a price."""
 
-    To first order first; those that come near are refitted. None where none changed enough.
+    candidate: Candidate
+    later: Estimate
+    earlier: Estimate
+    merit: float
+
+
+def next_change(later: Estimate, earlier: Estimate) -> tuple[Changed, tuple[str, ...]] | None:
+    """Return the effect whose change explains the logs best, and others that do so nearly as well.
+
+    Those that are promising to first order are refitted. None where none changed enough.
     """
-    scored = [(change_merit(one, later, earlier), one) for one in candidates_for(later.state.problem)]
-    ranked = sorted((pair for pair in scored if pair[0] > 0.0), key=lambda pair: -pair[0])
-    near: dict[str, Candidate] = {}
-    for merit, candidate in ranked:
-        if merit > CLOSE * ranked[0][0] and len(near) < MOST_REFITTED:
-            near.setdefault(candidate.effect, candidate)
-    costs = {}
-    for one in near.values():
-        price = PER_PARAMETER * len(one.fields)
-        costs[one] = price + (later.with_effect(one).model.cost if len(near) > 1 else 0.0)
-    if not costs:
+    promise = {one: promise_of(one, later, earlier) for one in candidates_for(later.state.problem)}
+    ways: dict[tuple[str, ...], Candidate] = {}
+    for one in sorted((one for one in promise if promise[one] > 0.0), key=lambda one: -promise[one]):
+        ways.setdefault(one.fields, one)
+    refitted = [(one, later.with_effect(one)) for one in [*ways.values()][:MOST_REFITTED]]
+    worth = {
+        one: later.model.cost - more.model.cost - PER_PARAMETER * len(one.fields) for one, more in refitted
+    }
+    found: list[Changed] = []
+    for one, more in sorted(refitted, key=lambda pair: -worth[pair[0]]):
+        best = max((own.merit for own in found), default=0.0)
+        if worth[one] <= max(best - EQUIVALENT, 0.0):  # what the log before gains only takes from it
+            break
+        less = earlier.with_effect(one)
+        merit = worth[one] - (earlier.model.cost - less.model.cost)
+        if merit > 0.0 and change_between(more, less, one.fields).chi2 > threshold(len(one.fields)):
+            found.append(Changed(one, more, less, merit))
+    if not found:
         return None
-    best = min(costs, key=lambda one: costs[one])
-    close = [one.effect for one, cost in costs.items() if one != best and cost < costs[best] + EQUIVALENT]
-    return best, tuple(close)
+    best_one = max(found, key=lambda own: own.merit)
+    close = {own.candidate.effect for own in found if own.merit > best_one.merit - EQUIVALENT}
+    return best_one, tuple(sorted(close - {best_one.candidate.effect}))
 
 
-def change_merit(candidate: Candidate, later: Estimate, earlier: Estimate) -> float:
-    """Return the chi2 of an effect's change less a price for each parameter; 0 where it is not named.
+def promise_of(candidate: Candidate, later: Estimate, earlier: Estimate) -> float:
+    """Return what an effect explains of the log after to first order; 0 where its change is not promising.
 
     A change shows between the logs, and in the log after against the model.
     """
@@ -237,9 +253,10 @@ def change_merit(candidate: Candidate, later: Estimate, earlier: Estimate) -> fl
     if any(probe.is_one_way and share <= 0.0 for probe, share in zip(candidate.probes, step, strict=False)):
         return 0.0
     chi2 = min(change @ solve(covariance + covariance_before, change), step @ solve(covariance, step))
-    if chi2 < threshold(len(change)) or not is_large(candidate, change, later):
+    if chi2 < PROMISING * threshold(len(change)) or not is_large(candidate, change, later):
         return 0.0
-    return float(chi2) - PER_PARAMETER * len(change)
+    gain = later.linearization.gain_of(candidate, later.linearization.columns_at(later.model.places))
+    return gain.chi2 if gain is not None else 0.0
 
 
 def is_large(candidate: Candidate, change: np.ndarray, later: Estimate) -> bool:

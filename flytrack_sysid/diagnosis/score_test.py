@@ -76,6 +76,13 @@ class Candidate(NamedTuple):
         largest = [one for one in own if not any(set(one) < set(other) for other in own)]
         return largest if BY_NAME[self.effect].is_setting else [self.fields]
 
+    def excludes(self, other: "Candidate") -> bool:
+        """Return whether a model has either: ways of one effect, but for settings that no group connects."""
+        if self.effect != other.effect or not BY_NAME[self.effect].is_setting:
+            return self.effect == other.effect
+        own, theirs = {*self.fields}, {*other.fields}
+        return any(own & family and theirs & family for family in families_of(BY_NAME[self.effect]))
+
     @property
     def other_fields(self) -> tuple[str, ...]:
         """Its fields without those of the probes."""
@@ -95,6 +102,16 @@ def candidates_of(effect: Effect) -> list[Candidate]:
         ways = zip(*probed, strict=True) if probed else [()]
         found += [Candidate(effect.name, fields, probes) for probes in ways]
     return found
+
+
+def families_of(effect: Effect) -> list[set[str]]:
+    """Return the parameters that groups connect: one weak motor, say, or another, or two."""
+    families: list[set[str]] = []
+    for candidate in candidates_of(effect):
+        family = {*candidate.fields}
+        family |= set().union(*(one for one in families if one & family))
+        families = [*(one for one in families if not one & family), family]
+    return families
 
 
 CANDIDATES = [candidate for effect in SEARCHED for candidate in candidates_of(effect)]

@@ -6,7 +6,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from flytrack_env.effects import BY_NAME
 from flytrack_sysid.diagnosis import noise as noises
 from flytrack_sysid.diagnosis.lanes import voltages_of
 from flytrack_sysid.diagnosis.problem import SEARCHED, SMALL_BATCH, Problem
@@ -56,9 +55,7 @@ class FittedModel(NamedTuple):
 
     def lacks(self, candidate: Candidate) -> bool:
         """Return whether an effect may be added: the model does not have it, or only other settings of it."""
-        own = next((one for one in self.candidates if one.effect == candidate.effect), None)
-        is_setting = BY_NAME[candidate.effect].is_setting
-        return own is None or (is_setting and not {*own.fields} & {*candidate.fields})
+        return not any(one.excludes(candidate) for one in self.candidates)
 
     def joined_by(self, candidate: Candidate) -> tuple[Candidate, ...]:
         """Return the effects with one more, or with more settings of one."""

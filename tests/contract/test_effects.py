@@ -48,6 +48,8 @@ RACER = BetaflightLoop(
     2.0,
     0.02,
     0.5,
+    center_x=0.05,
+    center_y=0.05,
     gyro_late_s=0.002,
     d_yaw=5.0,
     d_max_yaw=8.0,
