@@ -1,4 +1,4 @@
-"""Environment steps per second of process CPU time on one core, next to Pendulum and to l2f.
+"""Environment steps per second of process CPU time on one core, beside Pendulum and l2f; also by Gymnasium.
 
 ``python -m benchmarks.env_speed [--repeats 7] [--out PAGE]`` prints a table and writes it. Keys and actions
 are drawn before the clock starts; every output of a step is kept, so that nothing of it can be optimised
@@ -27,7 +27,7 @@ VARIANTS = {
 }
 MOST_COSTLY = 1.5  # a variant's step over the plain one's
 # Our rate, the peer's, the ratio to reach.
-TARGETS = ((PLAIN, L2F_SMALL, 3.0), (BATCH, L2F_LARGE, 8.0))
+TARGETS = ((PLAIN, L2F_SMALL, 6.0), (BATCH, L2F_LARGE, 10.0))
 
 
 class Contestant(NamedTuple):
@@ -108,6 +108,28 @@ def l2f_contestant(name: str, num_envs: int, length: int) -> Contestant:
     return Contestant(name, length * num_envs / 1e6, run)
 
 
+def gymnasium_contestant(num_envs: int, length: int) -> Contestant:
+    """Return steps through Gymnasium, NumPy in and out: of a vector environment, or of a single one."""
+    import gymnasium
+    import numpy as np
+
+    id_, shape = "flytrack_env:FlyTrack-v0", (NUM_ACTIONS, num_envs, 4)
+    actions = np.random.default_rng(0).uniform(-1.0, 1.0, shape).astype(np.float32)
+    if num_envs > 1:
+        env = gymnasium.make_vec(id_, num_envs=num_envs, vectorization_mode="vector_entry_point")
+    else:
+        env, actions = gymnasium.make(id_), actions[:, 0]
+    env.reset(seed=0)
+
+    def run() -> None:
+        for i in range(length):
+            _, _, terminated, truncated, _ = env.step(actions[i % NUM_ACTIONS])
+            if num_envs == 1 and (terminated or truncated):
+                env.reset()
+
+    return Contestant(f"Gymnasium, {num_envs:,}", num_envs * length / 1e6, run)
+
+
 def contestants() -> list[Contestant]:
     """Return all contestants, l2f only where it is installed."""
     entries = [
@@ -115,6 +137,8 @@ def contestants() -> list[Contestant]:
         jax_contestant(PLAIN, "FlyTrack-v0", 1024, 200, is_batch=False),
         jax_contestant(BATCH, "FlyTrack-v0", 4096, 200, is_batch=True),
         *(jax_contestant(name, env_id, 1024, 200, is_batch=False) for name, env_id in VARIANTS.items()),
+        gymnasium_contestant(1024, 200),
+        gymnasium_contestant(1, 2000),
     ]
     try:
         entries += [l2f_contestant(L2F_SMALL, 1024, 200), l2f_contestant(L2F_LARGE, 4096, 50)]
@@ -151,7 +175,7 @@ def main() -> None:
     core = report.pin_to_one_core()
     rates = measure(contestants(), arguments.repeats)
     speeds = (
-        (name, f"{statistics.median(found):.2f}", report.spread(found, ".2f"))
+        (name, f"{statistics.median(found):.3g}", report.spread(found, ".3g"))
         for name, found in rates.items()
     )
     targets = (
@@ -163,7 +187,7 @@ def main() -> None:
     report.fill_page(
         arguments.out,
         "env_speed",
-        ["l2f"],
+        ["l2f", "gymnasium"],
         speeds=report.table("environment | million steps per CPU second, median | lowest to highest", speeds),
         targets=report.table("ratio | measured | target", targets),
         costs=report.table("variant | cost over the plain step | at most", costs),

@@ -1,74 +1,199 @@
 """Auto-reset of a batch of which, as a rule, few episodes end in the same step.
 
-Sampling, observing and selecting a start for every environment cost almost as much as the step. So
-only as many starts are sampled as a step is likely to need, and they are scattered to the environments
-that ended. Each start goes to one environment at most: environments stay independent of each other.
+Sampling, observing and selecting a start for every environment cost almost as much as the step. So under
+``vmap`` only as many starts are sampled as a step is likely to need, and they are put in the place of the
+environments that ended. Each environment starts as it would alone.
 """
 
 from collections.abc import Callable
 from functools import partial
-from typing import Any, TypeVar
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jax.custom_batching import custom_vmap
 
-Tree = TypeVar("Tree")
+from flytrack_env.fusion import compute_once, has_kernels
+
+Begin = Callable[[jax.Array, Any], tuple[list[jax.Array], Any]]
 
 # Starts per round. Random actions end 1 episode in 70 per step, so that one round is the rule.
 ONE_IN = 32
 SPARE = 8
-ROW = 64
+WORD = 32  # bits
 
 
-def find_ended(ended: jax.Array, count: int) -> jax.Array:
-    """Return the indices of the first ``count`` true elements of a vector, then its length.
+class Ended(NamedTuple):
+    """A step before auto-reset: whether the episode ended, the observation row by row, and the state.
 
-    The same as ``jnp.nonzero`` with a size, at a third of its cost on the CPU: the running count is a
-    product with a triangle of ones within rows of 64 (exact), and a short sum over the rows.
+    seed: random word, uint32, of the episode that may begin. Scalars, or of a batch (num_envs,).
     """
-    rows = jnp.pad(ended, (0, -ended.shape[0] % ROW)).reshape(-1, ROW).astype(jnp.float32)
-    in_row = rows @ jnp.triu(jnp.ones((ROW, ROW), jnp.float32))
-    totals = in_row[:, -1]
-    running = (in_row + (jnp.cumsum(totals) - totals)[:, None]).reshape(-1)
-    found = jnp.searchsorted(running, jnp.arange(1, count + 1, dtype=jnp.float32))
-    return jnp.minimum(found, ended.shape[0])
+
+    done: jax.Array
+    rows: list[jax.Array]
+    state: Any
+    seed: jax.Array
 
 
-Sample = Callable[[jax.Array, Any], Tree]
+class Reset(NamedTuple):
+    """A step after auto-reset: observation, that before the reset, and state; arrays (size,)."""
+
+    observation: jax.Array
+    final_observation: jax.Array
+    state: Any
+
+
+def reset_if_ended(begin: Begin, step: Ended, params: Any) -> Reset:
+    """Return the start ``begin(seed, params)``, rows and state, if an episode ended, else what there is.
+
+    Of one environment. Under ``vmap`` starts are sampled only for those that ended, as long as all share the
+    parameters.
+    """
+    batch = reset_ended(begin, jax.tree.map(lambda leaf: leaf[None], step), params)
+    return jax.tree.map(lambda leaf: leaf[0], batch)
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
-def reset_ended(sample: Sample[Tree], ended: jax.Array, olds: Tree, inputs: Any) -> Tree:
-    """Return ``olds`` with a fresh start in the place of each environment that ended.
+def reset_ended(begin: Begin, steps: Ended, params: Any) -> Reset:
+    """Do the same for a batch with the same parameters; leaves (num_envs, ...)."""
 
-    sample: returns the starts of some environments, leaves (count, ...), from their indices (count,)
-    and ``inputs``. ended: (num_envs,). olds: leaves (num_envs, ...).
-    """
-    num_envs = ended.shape[0]
-    count = min(num_envs, num_envs // ONE_IN + SPARE)
+    @custom_vmap
+    def reset(steps: Ended, params: Any) -> Reset:
+        in_rounds = _reset_all if len(steps.done) == 1 else _reset_in_rounds
+        return in_rounds(begin, steps, params)
 
-    def is_pending(carry: tuple[jax.Array, Tree]) -> jax.Array:
-        return carry[0].any()
+    @reset.def_vmap
+    def reset_batch(size: int, is_batched: Any, steps: Ended, params: Any) -> Any:
+        is_own, is_param = is_batched
+        own = jax.tree.map(partial(_broadcast, size), is_own, steps)
+        if any(jax.tree.leaves(is_param)):
+            axes = jax.tree.map(lambda one: 0 if one else None, is_param)
+            found = jax.vmap(partial(_reset_all, begin), in_axes=(0, axes))(own, params)
+        else:  # a batch of batches, as one
+            flat = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), own)
+            found = reset_ended(begin, flat, params)
+            found = jax.tree.map(lambda leaf: leaf.reshape(size, -1, *leaf.shape[1:]), found)
+        return found, jax.tree.map(lambda _: True, found)
 
-    def reset_some(carry: tuple[jax.Array, Tree]) -> tuple[jax.Array, Tree]:
-        pending, states = carry
-        places = find_ended(pending, count)  # an index beyond the end is dropped
-        put = partial(jax.tree.map, lambda old, new: old.at[places].set(new, mode="drop"))
-        return pending.at[places].set(False, mode="drop"), put(states, sample(places, inputs))
+    return reset(steps, params)
 
-    # A conditional would copy every leaf in each of its branches, which cost more than the reset.
-    return jax.lax.while_loop(is_pending, reset_some, (ended, olds))[1]
+
+def _broadcast(size: int, is_batched: bool, leaf: jax.Array) -> jax.Array:
+    return leaf if is_batched else jnp.broadcast_to(leaf, (size, *leaf.shape))
 
 
 @reset_ended.defjvp
-def _reset_ended_jvp(sample, primals, tangents):  # type: ignore[no-untyped-def]
+def _reset_ended_jvp(begin, primals, tangents):  # type: ignore[no-untyped-def]
     """Differentiate the same function without its loop, which has no reverse mode."""
-    ended, olds, inputs = primals
+    return jax.jvp(partial(_reset_all, begin), primals, tangents)
 
-    def reset(olds: Tree, inputs: Any) -> Tree:
-        def choose(start: jax.Array, old: jax.Array) -> jax.Array:
-            return jnp.where(ended.reshape((-1,) + (1,) * (old.ndim - 1)), start, old)
 
-        return jax.tree.map(choose, sample(jnp.arange(ended.shape[0]), inputs), olds)
+def _reset_all(begin: Begin, steps: Ended, params: Any) -> Reset:
+    """Return the same, with a start sampled for every environment."""
 
-    return jax.jvp(reset, (olds, inputs), tangents[1:])
+    def choose(old: jax.Array, start: jax.Array) -> jax.Array:
+        return jnp.where(steps.done.reshape(-1, *[1] * (old.ndim - 1)), start, old)
+
+    starts = jax.vmap(begin, in_axes=(0, None))(steps.seed, params)
+    rows, states = jax.tree.map(choose, (steps.rows, steps.state), starts)
+    return Reset(jnp.stack(rows).T, jnp.stack(steps.rows).T, states)
+
+
+def _reset_in_rounds(begin: Begin, steps: Ended, params: Any) -> Reset:
+    """Return the same, with no more starts sampled at once than a step is likely to need."""
+    num_envs = len(steps.done)
+    count = min(num_envs, num_envs // ONE_IN + SPARE)
+    # One after the other is cheapest within one kernel, and slow where each operation is a kernel.
+    find, take, put = (_scan, _take_each, _put_each) if has_kernels() else (_search, _gather, _scatter)
+
+    def reset_some(carry: Any) -> Any:
+        places, pending, columns, states = carry
+        rows, begun = jax.vmap(begin, in_axes=(0, None))(take(steps.seed, places), params)
+        news = compute_once((jnp.zeros(count, bool), jnp.stack(rows), begun))
+        pending, columns, states = put((pending, columns, states), news, places)
+        return find(pending, count), pending, columns, states
+
+    # A column for each environment: each row is contiguous. A conditional would copy every leaf in each of
+    # its branches, which cost more than the reset.
+    finals = jnp.stack(steps.rows)
+    start = find(steps.done, count), steps.done, finals, steps.state
+    found = jax.lax.while_loop(lambda carry: carry[0][0] < num_envs, reset_some, start)
+    return Reset(found[2].T, finals.T, found[3])
+
+
+def _search(ended: jax.Array, count: int) -> jax.Array:
+    """Return the indices of the first ``count`` true elements of a vector, then its length."""
+    return jnp.nonzero(ended, size=count, fill_value=ended.shape[0])[0]
+
+
+def _gather(values: jax.Array, places: jax.Array) -> jax.Array:
+    return values.at[places].get(mode="clip")
+
+
+def _scatter(olds: Any, news: Any, places: jax.Array) -> Any:
+    """Return flags, columns and states with the starts in their places; those beyond the end are dropped."""
+
+    def put(old: jax.Array, new: jax.Array) -> jax.Array:
+        return old.at[places].set(new, mode="drop")
+
+    columns = olds[1].at[:, places].set(news[1], mode="drop")
+    return put(olds[0], news[0]), columns, jax.tree.map(put, olds[2], news[2])
+
+
+def _scan(ended: jax.Array, count: int) -> jax.Array:
+    """Do the same as ``_search``, bit by bit of words."""
+    size = ended.shape[0]
+    bits = jnp.pad(ended, (0, -size % WORD)).reshape(-1, WORD).astype(jnp.uint32)
+    words, half = bits << jnp.arange(WORD, dtype=jnp.uint32), WORD // 2
+    while half:  # a reduction would be no simple operation
+        words, half = compute_once(words[:, :half] | words[:, half:]), half // 2
+    words = words[:, 0]
+    last = words.shape[0] - 1
+
+    def next_bit(carry: Any) -> Any:
+        index, word, found, places = carry
+        is_one, lowest = word != 0, word & (~word + 1)
+        bit = jax.lax.population_count(lowest - 1).astype(jnp.int32)
+        # Without a bit, what is written is written over.
+        place = jnp.where(is_one, index * WORD + bit, size)
+        places = jax.lax.dynamic_update_index_in_dim(places, place, found, 0)
+        word = jnp.where(is_one, word ^ lowest, _at(words, jnp.minimum(index + 1, last)))
+        return jnp.where(is_one, index, index + 1), word, found + is_one, places
+
+    start = (jnp.int32(0), words[0], jnp.int32(0), jnp.full(count, size, jnp.int32))
+    return jax.lax.while_loop(lambda carry: (carry[0] <= last) & (carry[2] < count), next_bit, start)[3]
+
+
+def _at(values: jax.Array, index: Any) -> jax.Array:
+    return jax.lax.dynamic_index_in_dim(values, index, keepdims=False)
+
+
+def _take_each(values: jax.Array, places: jax.Array) -> jax.Array:
+    """Do the same as ``_gather``, one after the other."""
+
+    def take(number: Any, found: jax.Array) -> jax.Array:
+        value = _at(values, jnp.minimum(_at(places, number), values.shape[0] - 1))
+        return jax.lax.dynamic_update_index_in_dim(found, value, number, 0)
+
+    return jax.lax.fori_loop(0, places.shape[0], take, jnp.zeros(places.shape, values.dtype))
+
+
+def _put_each(olds: Any, news: Any, places: jax.Array) -> Any:
+    """Do the same as ``_scatter``, one after the other; places beyond the end come last."""
+    size, last = len(olds[0]), len(places) - 1
+
+    def put(carry: Any) -> Any:
+        number, (flags, columns, states) = carry
+        place = _at(places, number)
+
+        def put_one(old: jax.Array, new: jax.Array, axis: int = 0) -> jax.Array:
+            one = jax.lax.dynamic_index_in_dim(new, number, axis, keepdims=False)
+            return jax.lax.dynamic_update_index_in_dim(old, one, place, axis)
+
+        columns = put_one(columns, news[1], axis=1)
+        return number + 1, (put_one(flags, news[0]), columns, jax.tree.map(put_one, states, news[2]))
+
+    def is_left(carry: Any) -> jax.Array:
+        return (carry[0] <= last) & (_at(places, jnp.minimum(carry[0], last)) < size)
+
+    return jax.lax.while_loop(is_left, put, (jnp.int32(0), olds))[1]

@@ -16,7 +16,7 @@ from flytrack_env.model_file import load_model
 from flytrack_env.observations import OBSERVATION, Entry, observe_race
 from flytrack_env.params import DT_S, EnvParams
 from flytrack_env.plants import Plant, Simulator
-from flytrack_env.race import Race, RaceEvents, advance_race, look_up_gates, start_race
+from flytrack_env.race import Race, RaceEvents, advance_race, start_race
 from flytrack_env.resets import ResetParams, sample_start
 from flytrack_env.rewards import Transition, make_weights, total_reward
 from flytrack_env.state import Action, Drone
@@ -171,10 +171,6 @@ class FlyTrack(EpisodicEnvironment):
         del seed
         race = start_race(jnp.asarray(gate_index, jnp.int32), params.course)
         return EnvState(plant=self.plant.reset(drone, params.model), race=race, time=jnp.int32(0))
-
-    def refresh(self, state: EnvState, params: EnvParams) -> EnvState:
-        """Return the state with the gates' frames that belong to its gate index."""
-        return state._replace(race=look_up_gates(state.race, params.course))
 
     def check_params(self, params: EnvParams) -> None:
         """Raise ValueError for what cannot be flown, or a step of time that the plant does not have."""

@@ -13,9 +13,9 @@ import jax.numpy as jnp
 import numpy as np
 from gymnax.environments import environment, spaces
 
-from flytrack_env.auto_reset import reset_ended
+from flytrack_env.auto_reset import Ended, reset_if_ended
 from flytrack_env.dynamics import ModelParameters
-from flytrack_env.fusion import compute_once
+from flytrack_env.fusion import compute_once, one_kernel
 from flytrack_env.observations import Entry
 from flytrack_env.params import EnvParams
 from flytrack_env.plants import Plant
@@ -106,10 +106,6 @@ class EpisodicEnvironment(environment.Environment[Any, EnvParams]):  # type: ign
         """Return whether the episode is cut off, by the time limit, a bool scalar."""
         raise NotImplementedError
 
-    def refresh(self, state: Any, params: EnvParams) -> Any:
-        """Return a state that auto-reset selected, with its derived values (gate frames) recomputed."""
-        raise NotImplementedError
-
     def check_params(self, params: EnvParams) -> None:
         """Raise ValueError, naming the field, for concrete values that cannot be flown."""
         raise NotImplementedError
@@ -149,10 +145,8 @@ class EpisodicEnvironment(environment.Environment[Any, EnvParams]):  # type: ign
         action: (4,). The observation is (size,) float32; reward and terminated are scalars. key is unused.
         """
         del key
-        next_state, reward, terminated, info = self.advance(state, clip_action(action), params)
-        observation = self.observe(None, next_state, action, params)
-        observation, next_state = self._apply_transition_gradient_policy(observation, next_state)
-        return observation, next_state, reward, terminated, info
+        rows, next_state, reward, flags, info = one_kernel(self._step_env)(state, clip_action(action), params)
+        return jnp.stack(rows), next_state, reward, flags["terminated"], info
 
     def reset(  # type: ignore[override]  # gymnax's is compiled; this one checks, then calls it
         self, key: jax.Array, params: EnvParams | None = None
@@ -176,12 +170,13 @@ class EpisodicEnvironment(environment.Environment[Any, EnvParams]):  # type: ign
 
     def reset_env(self, key: jax.Array, params: EnvParams) -> tuple[jax.Array, Any]:
         """Return observation, (size,) float32, and state of an episode that begins; nothing is checked."""
-        state = self._begin_from(seed_of(key), params)
-        return self.observe(None, state, None, params), state
+        rows, state = self._begin_from(seed_of(key), params)
+        return jnp.stack(rows), state
 
-    def _begin_from(self, seed: jax.Array, params: EnvParams) -> Any:
-        """Return the state of an episode that begins, from one random word."""
-        return self.begin(*self.sample_start(seed, params), params, seed)
+    def _begin_from(self, seed: jax.Array, params: EnvParams) -> tuple[list[jax.Array], Any]:
+        """Return observation, row by row, and state of an episode that begins, from one random word."""
+        state = self.begin(*self.sample_start(seed, params), params, seed)
+        return self.observe_drone(self.drone(state), state, params), state
 
     @partial(jax.jit, static_argnames=("self",))
     def step(self, key: jax.Array, state: Any, action: jax.Array, params: EnvParams | None = None) -> Step:
@@ -192,27 +187,22 @@ class EpisodicEnvironment(environment.Environment[Any, EnvParams]):  # type: ign
         """
         if params is None:
             params = self.default_params
-        final_observation, next_state, reward, terminated, info = self.step_env(None, state, action, params)
-        truncated = self.is_truncated(next_state, params)
-        done = terminated | truncated
-        fresh_state = self._begin_from(seed_of(key), params)
-        next_state = compute_once(
-            jax.tree.map(partial(jnp.where, compute_once(done)), fresh_state, next_state)
-        )
-        # What follows from the choice (gate frames) is derived after it: a fifth faster than choosing it.
-        next_state = self.refresh(next_state, params)
-        observation = self.observe(None, next_state, None, params)
-        info = {**info, "terminated": terminated, "truncated": truncated}
-        info["final_observation"] = final_observation
-        return observation, next_state, reward, terminated, truncated, info
+        return self._step_from(seed_of(key), state, action, params)
 
-    def _sample_starts(self, places: jax.Array, inputs: tuple[jax.Array, EnvParams]) -> tuple[jax.Array, Any]:
-        """Return observations and states of episodes that begin in some environments of a batch."""
-        key, params = inputs
-        begin_all = jax.vmap(self._begin_from, in_axes=(0, None))
-        states = begin_all(seeds_of(key, places), params)
-        observe_all = jax.vmap(self.observe, in_axes=(None, 0, None, None))
-        return observe_all(None, states, None, params), states
+    def _step_env(self, state: Any, command: Action, params: EnvParams) -> tuple[Any, ...]:
+        """Return observation, row by row, state, reward, flags and info of a step without auto-reset."""
+        next_state, reward, terminated, info = self.advance(state, command, params)
+        rows = self.observe_drone(self.drone(next_state), next_state, params)
+        rows, next_state = self._apply_transition_gradient_policy(rows, next_state)
+        flags = {"terminated": terminated, "truncated": self.is_truncated(next_state, params)}
+        return rows, next_state, reward, flags, info
+
+    def _step(self, seed: jax.Array, state: Any, command: Action, params: EnvParams) -> tuple[Any, ...]:
+        """Return what ``reset_if_ended`` does, reward, flags and info of a step with auto-reset."""
+        rows, next_state, reward, flags, info = self._step_env(state, command, params)
+        done = compute_once(flags["terminated"] | flags["truncated"])
+        ended = Ended(done, rows, next_state, seed)
+        return reset_if_ended(self._begin_from, ended, params), reward, flags, info
 
     @partial(jax.jit, static_argnames=("self",))
     def step_batch(self, key: jax.Array, states: Any, actions: jax.Array, params: EnvParams) -> Step:
@@ -221,12 +211,10 @@ class EpisodicEnvironment(environment.Environment[Any, EnvParams]):  # type: ign
         states: leaves (num_envs,). actions: (num_envs, 4). params: the same for all. Same results as
         ``vmap(step)`` up to the random draws: starts are sampled only in steps where an episode ended.
         """
-        step_all = jax.vmap(self.step_env, in_axes=(None, 0, 0, None))
-        final_observations, next_states, rewards, terminated, info = step_all(None, states, actions, params)
-        truncated = jax.vmap(self.is_truncated, in_axes=(0, None))(next_states, params)
-        observations, next_states = reset_ended(
-            self._sample_starts, terminated | truncated, (final_observations, next_states), (key, params)
-        )
-        info = {**info, "terminated": terminated, "truncated": truncated}
-        info["final_observation"] = final_observations
-        return observations, next_states, rewards, terminated, truncated, info
+        seeds = seeds_of(seed_of(key), jnp.arange(actions.shape[0]))
+        return jax.vmap(self._step_from, in_axes=(0, 0, 0, None))(seeds, states, actions, params)
+
+    def _step_from(self, seed: jax.Array, state: Any, action: jax.Array, params: EnvParams) -> Step:
+        found, reward, flags, info = one_kernel(self._step)(seed, state, clip_action(action), params)
+        info = {**info, **flags, "final_observation": found.final_observation}
+        return found.observation, found.state, reward, flags["terminated"], flags["truncated"], info

@@ -6,15 +6,17 @@ chain was compiled fifty times over (measured: 13 times slower). ``lax.optimizat
 removed before fusion and does not help. A conditional does: what goes into it is computed once.
 """
 
+import os
 from collections.abc import Callable
 from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
+from jax import core
 from jax.dtypes import float0
 from jax.extend.core import ClosedJaxpr, Primitive, jaxpr_as_fun
 from jax.interpreters import ad, batching, mlir
-from jax.interpreters.partial_eval import dce_jaxpr
+from jax.interpreters.partial_eval import dce_jaxpr, dce_rules
 from jaxlib.mlir import ir
 
 Tree = TypeVar("Tree")
@@ -71,11 +73,18 @@ def _transpose(cotangents, *leaves):  # type: ignore[no-untyped-def]
     return cotangents
 
 
+def _prune(is_used, equation):  # type: ignore[no-untyped-def]
+    used = [i for i, one in enumerate(is_used) if one]
+    invars, outvars = ([variables[i] for i in used] for variables in (equation.invars, equation.outvars))
+    return list(is_used), equation.replace(invars=invars, outvars=outvars) if used else None
+
+
 _compute_once_p.def_impl(lambda *leaves: list(leaves))
 _compute_once_p.def_abstract_eval(lambda *avals: list(avals))
 batching.primitive_batchers[_compute_once_p] = _batch
 ad.primitive_jvps[_compute_once_p] = _jvp
 ad.primitive_transposes[_compute_once_p] = _transpose
+dce_rules[_compute_once_p] = _prune
 mlir.register_lowering(_compute_once_p, lambda ctx, *leaves: list(leaves))
 mlir.register_lowering(_compute_once_p, mlir.lower_fun(_fence, multiple_results=True), platform="cpu")
 
@@ -88,15 +97,22 @@ _one_kernel_p.multiple_results = True
 SIMPLE = frozenset(
     """
     abs add add_any and broadcast_in_dim bitcast_convert_type ceil clamp concatenate
-    convert_element_type copy cos custom_jvp_call div dynamic_slice dynamic_update_slice eq exp
-    floor flytrack_compute_once ge gt integer_pow iota is_finite jit le log logistic lt max min mul
-    ne neg not or pad pjit population_count pow scan
+    convert_element_type copy cos custom_jvp_call custom_vmap_call div dynamic_slice
+    dynamic_update_slice eq exp floor flytrack_compute_once ge gt integer_pow iota is_finite jit
+    le log logistic lt max min mul ne neg not or pad pjit population_count pow scan
     rem reshape round rsqrt select_n shift_left shift_right_arithmetic
     shift_right_logical sign sin slice sqrt square squeeze stop_gradient stack sub tanh transpose
     while xor flytrack_one_kernel
     """.split()  # noqa: SIM905, a table
 )
+MOST_FENCED = 64  # elements
+SWITCH = "FLYTRACK_ONE_KERNEL"  # environment variable: 0 compiles without
 ATTRIBUTES = {"xla_cpu_small_call": "true", "inlineable": "false"}
+
+
+def has_kernels() -> bool:
+    """Return whether what is compiled now can be one kernel: on the CPU, unless switched off."""
+    return os.environ.get(SWITCH, "1") != "0" and jax.default_backend() == "cpu"
 
 
 def is_simple(jaxpr: Any) -> bool:
@@ -109,9 +125,14 @@ def is_simple(jaxpr: Any) -> bool:
 
 
 def one_kernel(function: Callable[..., Tree]) -> Callable[..., Tree]:
-    """Return the same function of pytrees, on the CPU compiled as one kernel if it is made of ``SIMPLE``."""
+    """Return the same function of pytrees, on the CPU compiled as one kernel if it is made of ``SIMPLE``.
+
+    Elsewhere, and with 0 in the environment variable of ``SWITCH``, the function itself.
+    """
 
     def wrapped(*args: Any) -> Tree:
+        if not has_kernels():
+            return function(*args)
         leaves, structure = jax.tree.flatten(args)
 
         def flat(*leaves: Any) -> Any:
@@ -121,8 +142,7 @@ def one_kernel(function: Callable[..., Tree]) -> Callable[..., Tree]:
         if is_simple(closed):
             # XLA's compiler of such a call fails on an argument that nothing reads.
             jaxpr, is_used = dce_jaxpr(closed.jaxpr, [True] * len(closed.jaxpr.outvars))
-            # It fails on a constant, too, which the fence hides.
-            used = compute_once([leaf for leaf, used in zip(leaves, is_used, strict=True) if used])
+            used = [leaf for leaf, used in zip(leaves, is_used, strict=True) if used]
             results = _one_kernel_p.bind(*used, jaxpr=ClosedJaxpr(jaxpr, closed.consts))
         else:
             results = jaxpr_as_fun(closed)(*leaves)
@@ -132,8 +152,9 @@ def one_kernel(function: Callable[..., Tree]) -> Callable[..., Tree]:
 
 
 def _batch_kernel(args, dims, *, jaxpr):  # type: ignore[no-untyped-def]
-    results = one_kernel(jax.vmap(jaxpr_as_fun(jaxpr), in_axes=dims))(*args)
-    return results, [0] * len(results)
+    # The batch is the last axis, so that each component of a vector is contiguous.
+    axes = [aval.ndim for aval in jaxpr.out_avals]
+    return one_kernel(jax.vmap(jaxpr_as_fun(jaxpr), in_axes=dims, out_axes=axes))(*args), axes
 
 
 def _jvp_kernel(primals, tangents, *, jaxpr):  # type: ignore[no-untyped-def]
@@ -155,7 +176,23 @@ def _jvp_kernel(primals, tangents, *, jaxpr):  # type: ignore[no-untyped-def]
 
 
 def _lower_kernel(ctx, *args, jaxpr):  # type: ignore[no-untyped-def]
-    results = mlir.lower_fun(jax.jit(jaxpr_as_fun(jaxpr)), multiple_results=True)(ctx, *args)
+    # XLA's compiler of such a call aborts on an argument that nothing reads, and simplifies reads away that
+    # JAX sees; it does on some constants, too. So one more result reads something of each argument, and what
+    # is small, as parameters are, is fenced.
+    small = [i for i, aval in enumerate(ctx.avals_in) if aval.size <= MOST_FENCED]
+    if small:
+        avals, args = [ctx.avals_in[i] for i in small], list(args)
+        fence = mlir.lower_fun(_fence, multiple_results=True)
+        fenced = fence(ctx.replace(avals_in=avals, avals_out=avals), *(args[i] for i in small))
+        for i, one in zip(small, fenced, strict=True):
+            args[i] = one
+
+    def reading(*leaves: jax.Array) -> list[jax.Array]:
+        read = [leaf.ravel()[0].astype(jnp.float32) for leaf in leaves]
+        return [*jaxpr_as_fun(jaxpr)(*leaves), sum(read, jnp.float32(0.0))]
+
+    calling = ctx.replace(avals_out=[*ctx.avals_out, core.ShapedArray((), jnp.float32)])
+    *results, _ = mlir.lower_fun(jax.jit(reading), multiple_results=True)(calling, *args)
     call = results[0].owner
     call.attributes["mhlo.frontend_attributes"] = ir.DictAttr.get(
         {name: ir.StringAttr.get(value) for name, value in ATTRIBUTES.items()}

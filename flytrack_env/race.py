@@ -55,7 +55,7 @@ def start_race(gate_index: jax.Array, course: Course) -> Race:
     )
 
 
-def look_up_gates(race: Race, course: Course) -> Race:
+def _with_gates(race: Race, course: Course) -> Race:
     """Return the race with the flight frames that belong to its gate index."""
     following = course.next_index(race.gate_index)
     return race._replace(gate=course.gate(race.gate_index), next_gate=course.gate(following))
@@ -100,4 +100,4 @@ def advance_race(
         is_miss=first.is_miss | (first.is_pass & second.is_miss),
         offset=jnp.where(is_second, jnp.maximum(first.offset, second.offset), first.offset),
     )
-    return compute_once((look_up_gates(after, course), events))
+    return compute_once((_with_gates(after, course), events))

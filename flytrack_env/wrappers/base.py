@@ -121,10 +121,6 @@ class Wrapper(EpisodicEnvironment):
         """Return the inner environment's observation."""
         return self.env.observe_drone(drone, state.inner, params)
 
-    def refresh(self, state: Any, params: EnvParams) -> Any:
-        """Return the state with the inner one refreshed."""
-        return state._replace(inner=self.env.refresh(state.inner, params))
-
     def is_truncated(self, state: Any, params: EnvParams) -> jax.Array:
         """Return whether the time limit is reached."""
         return self.env.is_truncated(state.inner, params)

@@ -164,10 +164,6 @@ class DomainRandomization(Wrapper):
         """Return the inner environment's observation, with this episode's model."""
         return self.env.observe_drone(drone, state.inner, self._drawn(state.word, params))
 
-    def refresh(self, state: RandomizedState, params: EnvParams) -> RandomizedState:
-        """Return the state with the inner one refreshed, with this episode's model."""
-        return state._replace(inner=self.env.refresh(state.inner, self._drawn(state.word, params)))
-
     def advance(
         self, state: RandomizedState, command: Action, params: EnvParams
     ) -> tuple[RandomizedState, jax.Array, jax.Array, dict[str, Any]]:

@@ -104,3 +104,18 @@ def test_what_is_no_simple_operation_stays_outside_of_one_kernel() -> None:
     assert "xla_cpu_small_call" not in text
     assert "xla_cpu_small_call" in jax.jit(one_kernel(jnp.sin)).lower(matrix).as_text()
     np.testing.assert_array_equal(jax.jit(one_kernel(product))(matrix), matrix)
+
+
+def test_what_only_xla_finds_unread_and_constants_abort_no_process() -> None:
+    def found(x: jax.Array, unread: jax.Array, *parameters: jax.Array) -> jax.Array:
+        chosen = jnp.where(jnp.zeros((), bool), unread, parameters[0])
+        return jax.lax.fori_loop(0, 3, lambda _, y: jnp.sin(y) * parameters[1] + chosen, x)
+
+    x, one, two = np.linspace(0.0, 1.0, 1000, dtype=np.float32), np.float32(1.0), np.float32(2.0)
+    for own, unread in ((x, x), (x[:3], one)):
+        expected = jax.jit(found)(own, unread, one, two, two)
+        np.testing.assert_allclose(
+            jax.jit(one_kernel(found))(own, unread, one, two, two), expected, rtol=1e-5
+        )
+        constant = jax.jit(lambda own=own, unread=unread: one_kernel(found)(own, unread, one, two, two))()
+        np.testing.assert_allclose(constant, expected, rtol=1e-5)

@@ -73,7 +73,7 @@ NUM_WORDS = 20_000
 WORDS = {
     "of keys": lambda: jax.vmap(seed_of)(jax.random.split(jax.random.key(0), NUM_WORDS)),
     "of counted keys": lambda: jax.vmap(lambda i: seed_of(jax.random.key(i)))(jnp.arange(NUM_WORDS)),
-    "of one key": lambda: seeds_of(jax.random.key(0), jnp.arange(NUM_WORDS)),
+    "of one key": lambda: seeds_of(seed_of(jax.random.key(0)), jnp.arange(NUM_WORDS)),
     "of a counter": lambda: jnp.arange(NUM_WORDS, dtype=jnp.uint32),
 }
 

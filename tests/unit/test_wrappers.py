@@ -267,15 +267,14 @@ ENDS: dict[str, Any] = {
 
 @pytest.fixture(scope="module")
 def limited() -> tuple[Any, Any, Any]:
-    """The environment in every wrapper, its parameters, and a function that steps a batch both ways."""
+    """The environment in every wrapper, its parameters, and a function that steps a batch."""
     env = wrapped(*ALL)
     params = arrays(env.default_params.replace(max_steps_in_episode=LIMIT))
 
-    def both(keys: jax.Array, states: Any, actions: Any) -> tuple[Any, Any]:
-        actions = jnp.asarray(actions, jnp.float32)
-        return steps_of(env)(keys, states, actions, params), env.step_batch(keys[0], states, actions, params)
+    def step(keys: jax.Array, states: Any, actions: Any) -> Any:
+        return steps_of(env)(keys, states, jnp.asarray(actions, jnp.float32), params)
 
-    return env, params, both
+    return env, params, step
 
 
 def with_time(steps: int, path: Any, leaf: jax.Array) -> jax.Array:
@@ -285,7 +284,7 @@ def with_time(steps: int, path: Any, leaf: jax.Array) -> jax.Array:
 
 def test_after_every_kind_of_end_an_episode_begins_as_if_nothing_had_been(limited: Any) -> None:
     """The state after an end is that of a reset with the same key, in every leaf of every wrapper."""
-    env, params, both = limited
+    env, params, step = limited
     states, actions = [], []
     for i in range(NUM_ENVS):
         drone, action = list(ENDS.values())[i % len(ENDS)]
@@ -295,12 +294,12 @@ def test_after_every_kind_of_end_an_episode_begins_as_if_nothing_had_been(limite
         states.append(jax.tree_util.tree_map_with_path(partial(with_time, steps), state))
         actions.append(action)
     keys = jax.random.split(jax.random.key(7), NUM_ENVS)
-    one, batch = both(keys, stack(states), np.array(actions))
+    one = step(keys, stack(states), np.array(actions))
+    _, _, _, terminated, truncated, info = one
     for i in range(NUM_ENVS):
         end = list(ENDS)[i % len(ENDS)]
-        for _, _, _, terminated, truncated, info in (one, batch):
-            assert bool(truncated[i]) == (end == "truncated") and bool(terminated[i]) != bool(truncated[i])
-            assert end == "truncated" or bool(info["crash" if end == "nan" else end][i])
+        assert bool(truncated[i]) == (end == "truncated") and bool(terminated[i]) != bool(truncated[i])
+        assert end == "truncated" or bool(info["crash" if end == "nan" else end][i])
     fresh = resets_of(env)(keys, params)
     for found, expected in zip(jax.tree.leaves(one[:2]), jax.tree.leaves(fresh), strict=True):
         np.testing.assert_allclose(found, expected, atol=1e-5)
@@ -308,9 +307,8 @@ def test_after_every_kind_of_end_an_episode_begins_as_if_nothing_had_been(limite
     assert np.isfinite(last).all() and (last != np.asarray(one[0])).any(axis=1).all()
     # What is no number is remembered as 0, and the rest of the action clipped.
     np.testing.assert_allclose(last[list(ENDS).index("nan"), SIZE + 4 : SIZE + 8], [0.0, 1.0, -1.0, 0.5])
-    starts = np.stack(jax.tree.leaves(env.drone(batch[1]).pos_w), -1)
+    starts = np.stack(jax.tree.leaves(env.drone(one[1]).pos_w), -1)
     assert len(np.unique(starts, axis=0)) == NUM_ENVS
-    np.testing.assert_array_equal(batch[1].episode_length, 0)
 
 
 def poisoned(states: Any, poison: str, rng: np.random.Generator) -> Any:
@@ -333,15 +331,15 @@ def poisoned(states: Any, poison: str, rng: np.random.Generator) -> Any:
 @pytest.mark.parametrize("poison", ["nan", "infinite", "huge", "random"])
 def test_what_begins_depends_on_nothing_of_what_ended(limited: Any, flight: Flight, poison: str) -> None:
     """Bit for bit: the same key, another past, another last action, in every wrapper at once."""
-    _, _, both = limited
+    _, _, step = limited
     rng, states = np.random.default_rng(0), flight.start
     for seed in range(3):
         keys, found = jax.random.split(jax.random.key(seed), NUM_ENVS), []
         for past in ("zero", poison):
             actions = rng.choice([0.3, 1.0, np.inf, np.nan], (NUM_ENVS, 4))
-            outputs = both(keys, poisoned(states, past, rng), actions)
-            assert all(np.asarray(output[4]).all() for output in outputs)
-            found.append(jax.tree.leaves([output[:2] for output in outputs]))
+            output = step(keys, poisoned(states, past, rng), actions)
+            assert np.asarray(output[4]).all()
+            found.append(jax.tree.leaves(output[:2]))
         for clean, after in zip(*found, strict=True):
             np.testing.assert_array_equal(np.asarray(clean), np.asarray(after))
             assert np.isfinite(np.asarray(after)).all()
