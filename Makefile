@@ -9,7 +9,7 @@ CLIENTS := .venv-clients
 CLIENTS_STAMP := $(CLIENTS)/.locked
 CHECK_PYTHON = $(PYTHON) -c 'import sys; v = sys.version_info; sys.exit(v < (3, 11) and f"Python 3.11 or newer is needed, found {v.major}.{v.minor}; try PYTHON=python3.11")'
 
-.PHONY: setup demo loop test test-all check-diagnosis test-clients docs lint lock dist check-wheel check-versions clean
+.PHONY: setup demo loop test test-all test-clients docs lint lock dist check-wheel check-versions clean
 
 setup: $(STAMP)
 
@@ -35,10 +35,6 @@ test: setup
 # The rest: statistics, long trainings, every tutorial.
 test-all: setup
 	$(BIN)/python -m pytest --numprocesses 2 --dist loadfile -m slow -rs
-
-# Diagnoses 60 recorded plants again: names must stay and intervals agree to 1e-6; about 8 CPU minutes.
-check-diagnosis: setup
-	$(BIN)/python -m benchmarks.check_diagnosis
 
 # With dependencies: what the clients need beyond the lock file is in their requirements.
 $(CLIENTS_STAMP): requirements.lock clients/requirements.txt pyproject.toml

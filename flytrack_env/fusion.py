@@ -180,19 +180,19 @@ def _lower_kernel(ctx, *args, jaxpr):  # type: ignore[no-untyped-def]
     # JAX sees; it does on some constants, too. So one more result reads something of each argument, and what
     # is small, as parameters are, is fenced.
     small = [i for i, aval in enumerate(ctx.avals_in) if aval.size <= MOST_FENCED]
+    given = dict(enumerate(args))
     if small:
-        avals, args = [ctx.avals_in[i] for i in small], list(args)
+        avals = [ctx.avals_in[i] for i in small]
         fence = mlir.lower_fun(_fence, multiple_results=True)
-        fenced = fence(ctx.replace(avals_in=avals, avals_out=avals), *(args[i] for i in small))
-        for i, one in zip(small, fenced, strict=True):
-            args[i] = one
+        fenced = fence(ctx.replace(avals_in=avals, avals_out=avals), *(given[i] for i in small))
+        given |= dict(zip(small, fenced, strict=True))
 
     def reading(*leaves: jax.Array) -> list[jax.Array]:
         read = [leaf.ravel()[0].astype(jnp.float32) for leaf in leaves]
         return [*jaxpr_as_fun(jaxpr)(*leaves), sum(read, jnp.float32(0.0))]
 
     calling = ctx.replace(avals_out=[*ctx.avals_out, core.ShapedArray((), jnp.float32)])
-    *results, _ = mlir.lower_fun(jax.jit(reading), multiple_results=True)(calling, *args)
+    *results, _ = mlir.lower_fun(jax.jit(reading), multiple_results=True)(calling, *given.values())
     call = results[0].owner
     call.attributes["mhlo.frontend_attributes"] = ir.DictAttr.get(
         {name: ir.StringAttr.get(value) for name, value in ATTRIBUTES.items()}

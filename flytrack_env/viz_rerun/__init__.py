@@ -9,7 +9,6 @@ from flytrack_env.extras import check_installed
 check_installed("viz", "recordings", "rerun")
 
 from flytrack_env.viz_rerun.recording import visualize_state_action_sequence, write_recording
-from flytrack_env.viz_rerun.serving import ServeError, serve
 from flytrack_env.viz_rerun.trajectory import Trajectory
 
-__all__ = ["ServeError", "Trajectory", "serve", "visualize_state_action_sequence", "write_recording"]
+__all__ = ["Trajectory", "visualize_state_action_sequence", "write_recording"]

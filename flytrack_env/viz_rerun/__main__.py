@@ -12,7 +12,6 @@ from flytrack_env.references import ghost_rollout, shipped_references
 from flytrack_env.rollout import load_named_rollouts
 from flytrack_env.tracks import load_track
 from flytrack_env.viz_rerun.recording import write_recording
-from flytrack_env.viz_rerun.serving import serve
 from flytrack_env.viz_rerun.trajectory import Trajectory
 
 DEMO_STEPS = 1200
@@ -21,7 +20,7 @@ NO_HINT = "(optional)"  # tyro would print "(default: None)"
 
 @dataclass(frozen=True)
 class Settings:
-    """Write rollouts as one Rerun recording (without any, a time-optimal flight), or show a recording."""
+    """Write rollouts as one Rerun recording; without any, a time-optimal flight."""
 
     rollouts: tyro.conf.Positional[
         Annotated[tuple[Path, ...], tyro.conf.arg(metavar="[ROLLOUT ...]", help_behavior_hint=NO_HINT)]
@@ -39,12 +38,6 @@ class Settings:
     """Fly the time-optimal flight beside them."""
     ghost_model: Literal["nominal", "black_box"] = "nominal"
     """Drone for which the ghost is optimal."""
-    serve: Annotated[Path | None, tyro.conf.arg(metavar="RRD", help_behavior_hint=NO_HINT)] = None
-    """Show this recording in the web viewer instead, to this machine only."""
-    port: int = 9090
-    """Port of the web viewer."""
-    no_browser: bool = False
-    """Serve without opening a browser."""
 
 
 def write(settings: Settings) -> None:
@@ -64,7 +57,7 @@ def write(settings: Settings) -> None:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Write or serve a recording from the command line; return the exit status."""
+    """Write a recording from the command line; return the exit status."""
     settings = tyro.cli(
         Settings,
         args=arguments,
@@ -72,12 +65,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         config=[tyro.conf.FlagCreatePairsOff],
     )
     try:
-        if settings.serve is None:
-            write(settings)
-        elif settings.rollouts:
-            raise ValueError("rollouts: found them beside --serve, expected one or the other")
-        else:
-            serve(settings.serve, settings.port, not settings.no_browser)
+        write(settings)
     except ValueError as error:
         print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
         return 2

@@ -188,8 +188,6 @@ def test_command_shows_rollouts_beside_the_ghost(tmp_path, capsys):
     [
         (["a.npy", "a.npy"], "found files of the same names"),
         (["pickled.npy"], "pickled"),
-        (["--serve", "absent.rrd"], "absent.rrd: cannot be read"),
-        (["a.npy", "--serve", "b.rrd"], "rollouts: found them beside --serve"),
         (["a.npy", "--out", "a.npy"], "--out: found a.npy, which is read"),
     ],
 )
