@@ -20,7 +20,7 @@ from flytrack_env.state import pack, unpack, unpack_action
 from flytrack_sysid.diagnosis.lanes import LANE_S, Lanes, make_lanes, voltages_of
 from flytrack_sysid.diagnosis.problem import SEARCHED, Problem
 from flytrack_sysid.diagnosis.result import SCHEMA, TO_LOG
-from flytrack_sysid.diagnosis.score_test import CANDIDATES, Candidate, Linearization
+from flytrack_sysid.diagnosis.score_test import Candidate, Linearization, candidates_of
 from flytrack_sysid.diagnosis.search import FittedModel, SearchState
 from flytrack_sysid.excitation import ANY_VOLTAGE, DT_S, FLIGHT_STEPS, SCRIPT_HEIGHTS, VOLTAGES, is_inside
 from flytrack_sysid.log import FlightLog, log_of_states
@@ -50,13 +50,12 @@ PLENTY = 30.0  # shares: thirty times what shows an effect
 
 def _typical_candidate(effect: str) -> Candidate:
     """Return the way to look for an effect that is nearest to its notable size."""
-    ways = [one for one in CANDIDATES if one.effect == effect]
 
     def distance(way: Candidate) -> float:
         notable = BY_NAME[effect].notable
         return sum(abs(np.log(one.value / notable[one.field.split(".")[1]])) for one in way.probes)
 
-    return min(ways, key=distance)
+    return min(candidates_of(BY_NAME[effect]), key=distance)
 
 
 class Visibility:

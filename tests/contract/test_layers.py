@@ -19,7 +19,8 @@ PACKAGE = "flytrack_env"
 
 # Low to high. A module imports only from rows above its own here; a package counts as one module.
 LAYERS = (
-    {"files", "extras", "fusion", "auto_reset", "sandbox", "artifact", "messages"},
+    {"files", "extras", "fusion", "sandbox", "artifact", "messages"},
+    {"auto_reset"},
     {"quaternion", "motion", "toml_file", "npz_file"},
     {"state", "thrust"},
     {"tracks", "randomness"},
