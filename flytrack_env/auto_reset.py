@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 from jax.custom_batching import custom_vmap
 
-from flytrack_env.fusion import compute_once, has_kernels
+from flytrack_env.fusion import compute_once, has_kernels, is_in_kernel, one_kernel
 
 Begin = Callable[[jax.Array, Any], tuple[list[jax.Array], Any]]
 
@@ -104,19 +104,22 @@ def _reset_in_rounds(begin: Begin, steps: Ended, params: Any) -> Reset:
     num_envs = len(steps.done)
     count = min(num_envs, num_envs // ONE_IN + SPARE)
     # One after the other is cheapest within one kernel, and slow where each operation is a kernel.
-    find, take, put = (_scan, _take_each, _put_each) if has_kernels() else (_search, _gather, _scatter)
+    search, take, put = (_scan, _take_each, _put_each) if has_kernels() else (_search, _gather, _scatter)
+    find: Callable[..., jax.Array] = partial(search, count=count)
+    if not is_in_kernel():
+        find, take, put = one_kernel(find), one_kernel(take), one_kernel(put)
 
     def reset_some(carry: Any) -> Any:
         places, pending, columns, states = carry
         rows, begun = jax.vmap(begin, in_axes=(0, None))(take(steps.seed, places), params)
         news = compute_once((jnp.zeros(count, bool), jnp.stack(rows), begun))
         pending, columns, states = put((pending, columns, states), news, places)
-        return find(pending, count), pending, columns, states
+        return find(pending), pending, columns, states
 
     # A column for each environment: each row is contiguous. A conditional would copy every leaf in each of
     # its branches, which cost more than the reset.
     finals = jnp.stack(steps.rows)
-    start = find(steps.done, count), steps.done, finals, steps.state
+    start = find(steps.done), steps.done, finals, steps.state
     found = jax.lax.while_loop(lambda carry: carry[0][0] < num_envs, reset_some, start)
     return Reset(found[2].T, finals.T, found[3])
 

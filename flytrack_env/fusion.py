@@ -8,6 +8,7 @@ removed before fusion and does not help. A conditional does: what goes into it i
 
 import os
 from collections.abc import Callable
+from contextvars import ContextVar
 from typing import Any, TypeVar
 
 import jax
@@ -110,6 +111,14 @@ SWITCH = "FLYTRACK_ONE_KERNEL"  # environment variable: 0 compiles without
 ATTRIBUTES = {"xla_cpu_small_call": "true", "inlineable": "false"}
 
 
+_in_kernel = ContextVar("in_kernel", default=False)
+
+
+def is_in_kernel() -> bool:
+    """Return whether what is traced now is to be part of a kernel."""
+    return _in_kernel.get()
+
+
 def has_kernels() -> bool:
     """Return whether what is compiled now can be one kernel: on the CPU, unless switched off."""
     return os.environ.get(SWITCH, "1") != "0" and jax.default_backend() == "cpu"
@@ -131,14 +140,18 @@ def one_kernel(function: Callable[..., Tree]) -> Callable[..., Tree]:
     """
 
     def wrapped(*args: Any) -> Tree:
-        if not has_kernels():
-            return function(*args)
         leaves, structure = jax.tree.flatten(args)
+        if not has_kernels() or not all(_is_number(jnp.asarray(leaf)) for leaf in leaves):
+            return function(*args)
 
         def flat(*leaves: Any) -> Any:
             return function(*jax.tree.unflatten(structure, leaves))
 
-        closed, shapes = jax.make_jaxpr(flat, return_shape=True)(*leaves)
+        token = _in_kernel.set(True)
+        try:
+            closed, shapes = jax.make_jaxpr(flat, return_shape=True)(*leaves)
+        finally:
+            _in_kernel.reset(token)
         if is_simple(closed):
             # XLA's compiler of such a call fails on an argument that nothing reads.
             jaxpr, is_used = dce_jaxpr(closed.jaxpr, [True] * len(closed.jaxpr.outvars))
@@ -179,7 +192,7 @@ def _lower_kernel(ctx, *args, jaxpr):  # type: ignore[no-untyped-def]
     # XLA's compiler of such a call aborts on an argument that nothing reads, and simplifies reads away that
     # JAX sees; it does on some constants, too. So one more result reads something of each argument, and what
     # is small, as parameters are, is fenced.
-    small = [i for i, aval in enumerate(ctx.avals_in) if aval.size <= MOST_FENCED]
+    small = [i for i, aval in enumerate(ctx.avals_in) if 0 < aval.size <= MOST_FENCED]
     given = dict(enumerate(args))
     if small:
         avals = [ctx.avals_in[i] for i in small]
@@ -188,7 +201,7 @@ def _lower_kernel(ctx, *args, jaxpr):  # type: ignore[no-untyped-def]
         given |= dict(zip(small, fenced, strict=True))
 
     def reading(*leaves: jax.Array) -> list[jax.Array]:
-        read = [leaf.ravel()[0].astype(jnp.float32) for leaf in leaves]
+        read = [leaf.ravel()[0].astype(jnp.float32) for leaf in leaves if leaf.size]
         return [*jaxpr_as_fun(jaxpr)(*leaves), sum(read, jnp.float32(0.0))]
 
     calling = ctx.replace(avals_out=[*ctx.avals_out, core.ShapedArray((), jnp.float32)])
