@@ -59,27 +59,21 @@ def reset_ended(begin: Begin, steps: Ended, params: Any) -> Reset:
 
     @custom_vmap
     def reset(steps: Ended, params: Any) -> Reset:
-        in_rounds = _reset_all if len(steps.done) == 1 else _reset_in_rounds
-        return in_rounds(begin, steps, params)
+        return (_reset_all if len(steps.done) == 1 else _reset_in_rounds)(begin, steps, params)
 
     @reset.def_vmap
     def reset_batch(size: int, is_batched: Any, steps: Ended, params: Any) -> Any:
-        is_own, is_param = is_batched
-        own = jax.tree.map(partial(_broadcast, size), is_own, steps)
-        if any(jax.tree.leaves(is_param)):
-            axes = jax.tree.map(lambda one: 0 if one else None, is_param)
-            found = jax.vmap(partial(_reset_all, begin), in_axes=(0, axes))(own, params)
+        axes = jax.tree.map(lambda one: 0 if one else None, is_batched)
+        if any(jax.tree.leaves(is_batched[1])):
+            found = jax.vmap(partial(_reset_all, begin), tuple(axes), axis_size=size)(steps, params)
         else:  # a batch of batches, as one
+            own = jax.vmap(lambda step: step, (axes[0],), axis_size=size)(steps)
             flat = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), own)
             found = reset_ended(begin, flat, params)
             found = jax.tree.map(lambda leaf: leaf.reshape(size, -1, *leaf.shape[1:]), found)
         return found, jax.tree.map(lambda _: True, found)
 
     return reset(steps, params)
-
-
-def _broadcast(size: int, is_batched: bool, leaf: jax.Array) -> jax.Array:
-    return leaf if is_batched else jnp.broadcast_to(leaf, (size, *leaf.shape))
 
 
 @reset_ended.defjvp
@@ -104,7 +98,7 @@ def _reset_in_rounds(begin: Begin, steps: Ended, params: Any) -> Reset:
     num_envs = len(steps.done)
     count = min(num_envs, num_envs // ONE_IN + SPARE)
     # One after the other is cheapest within one kernel, and slow where each operation is a kernel.
-    search, take, put = (_scan, _take_each, _put_each) if has_kernels() else (_search, _gather, _scatter)
+    search, take, put = (_scan, _take_each, _put_each) if has_kernels() else (_search, _take, _scatter)
     find: Callable[..., jax.Array] = partial(search, count=count)
     if not is_in_kernel():
         find, take, put = one_kernel(find), one_kernel(take), one_kernel(put)
@@ -124,13 +118,12 @@ def _reset_in_rounds(begin: Begin, steps: Ended, params: Any) -> Reset:
     return Reset(found[2].T, finals.T, found[3])
 
 
+_take = partial(jnp.take, mode="clip")
+
+
 def _search(ended: jax.Array, count: int) -> jax.Array:
     """Return the indices of the first ``count`` true elements of a vector, then its length."""
     return jnp.nonzero(ended, size=count, fill_value=ended.shape[0])[0]
-
-
-def _gather(values: jax.Array, places: jax.Array) -> jax.Array:
-    return values.at[places].get(mode="clip")
 
 
 def _scatter(olds: Any, news: Any, places: jax.Array) -> Any:
@@ -172,7 +165,7 @@ def _at(values: jax.Array, index: Any) -> jax.Array:
 
 
 def _take_each(values: jax.Array, places: jax.Array) -> jax.Array:
-    """Do the same as ``_gather``, one after the other."""
+    """Do the same as ``_take``, one after the other."""
 
     def take(number: Any, found: jax.Array) -> jax.Array:
         value = _at(values, jnp.minimum(_at(places, number), values.shape[0] - 1))

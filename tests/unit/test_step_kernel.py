@@ -20,11 +20,10 @@ NUM_ENVS, NUM_STEPS = 40, 6
 
 
 def with_effects(*names: str, motion: Motion = Motion.HANDOUT) -> Any:
-    """Return an environment whose model has these effects, half-way into their ranges."""
+    """Return an environment whose model has these effects, a third into their ranges."""
     effects = [inside_ranges(effect, 0.3) for effect in EFFECTS if effect.name in names]
-    return flytrack_env.make(
-        "FlyTrack-v0", model=nominal_parameters()._replace(motion=motion).with_effects(*effects)
-    )
+    model = nominal_parameters()._replace(motion=motion).with_effects(*effects)
+    return flytrack_env.make("FlyTrack-v0", model=model)
 
 
 EVERY = [effect.name for effect in EFFECTS]
@@ -33,7 +32,6 @@ VARIANTS = {
     "all wrappers": lambda: flytrack_env.make("FlyTrackRobust-v0", missed_gate="fly_on"),
     "another track": lambda: flytrack_env.make("FlyTrack-v0", track=random_track(3)),
     "all effects, continuous": lambda: with_effects(*EVERY, motion=Motion.CONTINUOUS),
-    "semi-implicit": lambda: with_effects(motion=Motion.SEMI_IMPLICIT),
 }
 
 
@@ -53,7 +51,6 @@ def flown(env: Any, is_constant: bool) -> Any:
 
 
 def check(monkeypatch: pytest.MonkeyPatch, make: Any) -> None:
-    """Compare the steps of an environment with and without kernels."""
     with_kernel = flown(make(), is_constant=True)
     monkeypatch.setenv(SWITCH, "0")
     without = flown(make(), is_constant=False)
