@@ -15,7 +15,8 @@ from jax.custom_batching import custom_vmap
 
 from flytrack_env.fusion import compute_once, has_kernels, is_in_kernel, one_kernel
 
-Begin = Callable[[jax.Array, Any], tuple[list[jax.Array], Any]]
+Shown = tuple[list[jax.Array], Any]  # observation, row by row, and state
+Begin = Callable[[jax.Array, Any], Shown]
 
 # Starts per round. Random actions end 1 episode in 70 per step, so that one round is the rule.
 ONE_IN = 32
@@ -24,27 +25,18 @@ WORD = 32  # bits
 
 
 class Ended(NamedTuple):
-    """A step before auto-reset: whether the episode ended, the observation row by row, and the state.
+    """A step before auto-reset: whether the episode ended, and observation, row by row, and state.
 
     seed: random word, uint32, of the episode that may begin. Scalars, or of a batch (num_envs,).
     """
 
     done: jax.Array
-    rows: list[jax.Array]
-    state: Any
+    shown: Shown
     seed: jax.Array
 
 
-class Reset(NamedTuple):
-    """A step after auto-reset: observation, that before the reset, and state; arrays (size,)."""
-
-    observation: jax.Array
-    final_observation: jax.Array
-    state: Any
-
-
-def reset_if_ended(begin: Begin, step: Ended, params: Any) -> Reset:
-    """Return the start ``begin(seed, params)``, rows and state, if an episode ended, else what there is.
+def reset_if_ended(begin: Begin, step: Ended, params: Any) -> Shown:
+    """Return the start ``begin(seed, params)`` if an episode ended, else what there is.
 
     Of one environment. Under ``vmap`` starts are sampled only for those that ended, as long as all share the
     parameters.
@@ -54,11 +46,11 @@ def reset_if_ended(begin: Begin, step: Ended, params: Any) -> Reset:
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
-def reset_ended(begin: Begin, steps: Ended, params: Any) -> Reset:
+def reset_ended(begin: Begin, steps: Ended, params: Any) -> Shown:
     """Do the same for a batch with the same parameters; leaves (num_envs, ...)."""
 
     @custom_vmap
-    def reset(steps: Ended, params: Any) -> Reset:
+    def reset(steps: Ended, params: Any) -> Shown:
         return (_reset_all if len(steps.done) == 1 else _reset_in_rounds)(begin, steps, params)
 
     @reset.def_vmap
@@ -82,18 +74,16 @@ def _reset_ended_jvp(begin, primals, tangents):  # type: ignore[no-untyped-def]
     return jax.jvp(partial(_reset_all, begin), primals, tangents)
 
 
-def _reset_all(begin: Begin, steps: Ended, params: Any) -> Reset:
+def _reset_all(begin: Begin, steps: Ended, params: Any) -> Shown:
     """Return the same, with a start sampled for every environment."""
 
     def choose(old: jax.Array, start: jax.Array) -> jax.Array:
         return jnp.where(steps.done.reshape(-1, *[1] * (old.ndim - 1)), start, old)
 
-    starts = jax.vmap(begin, in_axes=(0, None))(steps.seed, params)
-    rows, states = jax.tree.map(choose, (steps.rows, steps.state), starts)
-    return Reset(jnp.stack(rows).T, jnp.stack(steps.rows).T, states)
+    return jax.tree.map(choose, steps.shown, jax.vmap(begin, in_axes=(0, None))(steps.seed, params))
 
 
-def _reset_in_rounds(begin: Begin, steps: Ended, params: Any) -> Reset:
+def _reset_in_rounds(begin: Begin, steps: Ended, params: Any) -> Shown:
     """Return the same, with no more starts sampled at once than a step is likely to need."""
     num_envs = len(steps.done)
     count = min(num_envs, num_envs // ONE_IN + SPARE)
@@ -104,18 +94,15 @@ def _reset_in_rounds(begin: Begin, steps: Ended, params: Any) -> Reset:
         find, take, put = one_kernel(find), one_kernel(take), one_kernel(put)
 
     def reset_some(carry: Any) -> Any:
-        places, pending, columns, states = carry
-        rows, begun = jax.vmap(begin, in_axes=(0, None))(take(steps.seed, places), params)
-        news = compute_once((jnp.zeros(count, bool), jnp.stack(rows), begun))
-        pending, columns, states = put((pending, columns, states), news, places)
-        return find(pending), pending, columns, states
+        places, pending, shown = carry
+        starts = jax.vmap(begin, in_axes=(0, None))(take(steps.seed, places), params)
+        news = compute_once((jnp.zeros(count, bool), starts))
+        pending, shown = put((pending, shown), news, places)
+        return find(pending), pending, shown
 
-    # A column for each environment: each row is contiguous. A conditional would copy every leaf in each of
-    # its branches, which cost more than the reset.
-    finals = jnp.stack(steps.rows)
-    start = find(steps.done), steps.done, finals, steps.state
-    found = jax.lax.while_loop(lambda carry: carry[0][0] < num_envs, reset_some, start)
-    return Reset(found[2].T, finals.T, found[3])
+    # A conditional would copy every leaf in each of its branches, which cost more than the reset.
+    start = find(steps.done), steps.done, steps.shown
+    return jax.lax.while_loop(lambda carry: carry[0][0] < num_envs, reset_some, start)[2]
 
 
 _take = partial(jnp.take, mode="clip")
@@ -127,13 +114,8 @@ def _search(ended: jax.Array, count: int) -> jax.Array:
 
 
 def _scatter(olds: Any, news: Any, places: jax.Array) -> Any:
-    """Return flags, columns and states with the starts in their places; those beyond the end are dropped."""
-
-    def put(old: jax.Array, new: jax.Array) -> jax.Array:
-        return old.at[places].set(new, mode="drop")
-
-    columns = olds[1].at[:, places].set(news[1], mode="drop")
-    return put(olds[0], news[0]), columns, jax.tree.map(put, olds[2], news[2])
+    """Return ``olds`` with the starts in their places; those beyond the end are dropped."""
+    return jax.tree.map(lambda old, new: old.at[places].set(new, mode="drop"), olds, news)
 
 
 def _scan(ended: jax.Array, count: int) -> jax.Array:
@@ -179,15 +161,13 @@ def _put_each(olds: Any, news: Any, places: jax.Array) -> Any:
     size, last = len(olds[0]), len(places) - 1
 
     def put(carry: Any) -> Any:
-        number, (flags, columns, states) = carry
+        number, olds = carry
         place = _at(places, number)
 
-        def put_one(old: jax.Array, new: jax.Array, axis: int = 0) -> jax.Array:
-            one = jax.lax.dynamic_index_in_dim(new, number, axis, keepdims=False)
-            return jax.lax.dynamic_update_index_in_dim(old, one, place, axis)
+        def put_one(old: jax.Array, new: jax.Array) -> jax.Array:
+            return jax.lax.dynamic_update_index_in_dim(old, _at(new, number), place, 0)
 
-        columns = put_one(columns, news[1], axis=1)
-        return number + 1, (put_one(flags, news[0]), columns, jax.tree.map(put_one, states, news[2]))
+        return number + 1, jax.tree.map(put_one, olds, news)
 
     def is_left(carry: Any) -> jax.Array:
         return (carry[0] <= last) & (_at(places, jnp.minimum(carry[0], last)) < size)

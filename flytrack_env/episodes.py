@@ -198,11 +198,12 @@ class EpisodicEnvironment(environment.Environment[Any, EnvParams]):  # type: ign
         return rows, next_state, reward, flags, info
 
     def _step(self, seed: jax.Array, state: Any, command: Action, params: EnvParams) -> tuple[Any, ...]:
-        """Return what ``reset_if_ended`` does, reward, flags and info of a step with auto-reset."""
-        rows, next_state, reward, flags, info = self._step_env(state, command, params)
+        """Return observation and that before the reset, row by row, state, reward, flags and info."""
+        final_rows, next_state, reward, flags, info = self._step_env(state, command, params)
         done = compute_once(flags["terminated"] | flags["truncated"])
-        ended = Ended(done, rows, next_state, seed)
-        return reset_if_ended(self._begin_from, ended, params), reward, flags, info
+        ended = Ended(done, (final_rows, next_state), seed)
+        rows, next_state = reset_if_ended(self._begin_from, ended, params)
+        return rows, final_rows, next_state, reward, flags, info
 
     @partial(jax.jit, static_argnames=("self",))
     def step_batch(self, key: jax.Array, states: Any, actions: jax.Array, params: EnvParams) -> Step:
@@ -215,6 +216,7 @@ class EpisodicEnvironment(environment.Environment[Any, EnvParams]):  # type: ign
         return jax.vmap(self._step_from, in_axes=(0, 0, 0, None))(seeds, states, actions, params)
 
     def _step_from(self, seed: jax.Array, state: Any, action: jax.Array, params: EnvParams) -> Step:
-        found, reward, flags, info = one_kernel(self._step)(seed, state, clip_action(action), params)
-        info = {**info, **flags, "final_observation": found.final_observation}
-        return found.observation, found.state, reward, flags["terminated"], flags["truncated"], info
+        found = one_kernel(self._step)(seed, state, clip_action(action), params)
+        rows, final_rows, state, reward, flags, info = found
+        info = {**info, **flags, "final_observation": jnp.stack(final_rows)}
+        return jnp.stack(rows), state, reward, flags["terminated"], flags["truncated"], info
