@@ -31,6 +31,8 @@ VARIANTS = {
     "plain": lambda: flytrack_env.make("FlyTrack-v0"),
     "all wrappers": lambda: flytrack_env.make("FlyTrackRobust-v0", missed_gate="fly_on"),
     "another track": lambda: flytrack_env.make("FlyTrack-v0", track=random_track(3)),
+    "semi-implicit": lambda: with_effects(motion=Motion.SEMI_IMPLICIT),
+    "all effects": lambda: with_effects(*EVERY),
     "all effects, continuous": lambda: with_effects(*EVERY, motion=Motion.CONTINUOUS),
 }
 
@@ -64,12 +66,6 @@ def check(monkeypatch: pytest.MonkeyPatch, make: Any) -> None:
 )
 def test_the_kernel_is_the_same_step(monkeypatch: pytest.MonkeyPatch, name: str) -> None:
     check(monkeypatch, VARIANTS[name])
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("effect", EVERY)
-def test_the_kernel_of_each_effect_is_the_same_step(monkeypatch: pytest.MonkeyPatch, effect: str) -> None:
-    check(monkeypatch, partial(with_effects, effect))
 
 
 @pytest.mark.parametrize("name", ["plain", "all wrappers", "all effects, continuous"])
