@@ -441,6 +441,7 @@ def observe(loop: BetaflightLoop, memory: Loop, offset_b: Vec3, dt: Scalar) -> t
 
 
 CRAFT, MOTORS = BetaflightLoop._fields[:6], BetaflightLoop._fields[6:10]
+SETTINGS = BetaflightLoop._fields[BetaflightLoop._fields.index("p_roll") :]
 CENTER, GAINS, LATE = ("center_x", "center_y"), ("p_roll", "p_pitch", "d_roll", "d_pitch"), "gyro_late_s"
 NOTABLE = {
     **dict.fromkeys(CRAFT[:2], 5.0),
@@ -461,8 +462,8 @@ BETAFLIGHT_LOOP = Effect(
         **dict.fromkeys(MOTORS, Range(0.0, 1.5, "1")),
         **dict.fromkeys(CENTER, Range(-0.8, 0.8, "1")),
         LATE: Range(-0.01, 0.03, "s"),
-        **dict.fromkeys(BetaflightLoop._fields[13:28], GAIN),
-        **dict.fromkeys(BetaflightLoop._fields[28:38], CUTOFF),
+        **dict.fromkeys(SETTINGS[:15], GAIN),
+        **dict.fromkeys(SETTINGS[15:25], CUTOFF),
         "tpa_rate": Range(0.0, 100.0, "%"),
         "tpa_breakpoint": Range(1000.0, 1990.0, "us"),
         "anti_gravity_gain": GAIN,

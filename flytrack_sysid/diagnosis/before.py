@@ -198,8 +198,8 @@ def _calm(problem: Problem) -> Problem:
     return replace(problem, lanes=problem.lanes._replace(counts=quiet))
 
 
-class Changed(NamedTuple):
-    """Both estimates with an effect more; merit: of chi2, what only the log after gains, less a price."""
+class Refit(NamedTuple):
+    """Both logs refitted with one more effect; merit: the chi2 that only the log after gains, less a price."""
 
     candidate: Candidate
     later: Estimate
@@ -207,7 +207,7 @@ class Changed(NamedTuple):
     merit: float
 
 
-def next_change(later: Estimate, earlier: Estimate) -> tuple[Changed, tuple[str, ...]] | None:
+def next_change(later: Estimate, earlier: Estimate) -> tuple[Refit, tuple[str, ...]] | None:
     """Return the effect whose change explains the logs best, and others that do so nearly as well.
 
     Those that are promising to first order are refitted. None where none changed enough.
@@ -220,7 +220,7 @@ def next_change(later: Estimate, earlier: Estimate) -> tuple[Changed, tuple[str,
     worth = {
         one: later.model.cost - more.model.cost - PER_PARAMETER * len(one.fields) for one, more in refitted
     }
-    found: list[Changed] = []
+    found: list[Refit] = []
     for one, more in sorted(refitted, key=lambda pair: -worth[pair[0]]):
         best = max((own.merit for own in found), default=0.0)
         if worth[one] <= max(best - EQUIVALENT, 0.0):  # what the log before gains only takes from it
@@ -228,7 +228,7 @@ def next_change(later: Estimate, earlier: Estimate) -> tuple[Changed, tuple[str,
         less = earlier.with_effect(one)
         merit = worth[one] - (earlier.model.cost - less.model.cost)
         if merit > 0.0 and change_between(more, less, one.fields).chi2 > threshold(len(one.fields)):
-            found.append(Changed(one, more, less, merit))
+            found.append(Refit(one, more, less, merit))
     if not found:
         return None
     best_one = max(found, key=lambda own: own.merit)

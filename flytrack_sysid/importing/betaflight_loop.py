@@ -17,7 +17,7 @@ ASSUMED = {
 }
 # A racer of 5 inch, before anything was fitted.
 GENERIC = BetaflightLoop(20.0, 20.0, 2.0, 2.0, 0.02, 0.5)
-NUM_OF_CRAFT = 11  # fields
+SETTINGS = BetaflightLoop._fields[BetaflightLoop._fields.index("p_roll") :]  # before them: the craft
 LEAST_SMOOTHING_HZ, SMOOTHING, TENTHS = 15, 1.5, 10.0
 
 
@@ -29,8 +29,7 @@ def rate_loop(value: Callable[[str], str], frames_hz: float) -> BetaflightLoop |
     """
     if any(value(name) not in ("", expected) for name, expected in ASSUMED.items()):
         return None
-    names = BetaflightLoop._fields[NUM_OF_CRAFT:]
-    found = {name: float(value(name)) for name in names if value(name)}
+    found = {name: float(value(name)) for name in SETTINGS if value(name)}
     for stem in ("gyro_lpf1", "dterm_lpf1"):
         if not found[f"{stem}_dyn_min_hz"]:  # then the filter does not follow throttle
             cutoff_hz = float(value(f"{stem}_static_hz"))
