@@ -199,7 +199,7 @@ def _calm(problem: Problem) -> Problem:
 
 
 class Refit(NamedTuple):
-    """Both logs refitted with one more effect; merit: the chi2 that only the log after gains, less a price."""
+    """Both logs refitted with one more effect; merit: chi2 that only the log after gains, less a price."""
 
     candidate: Candidate
     later: Estimate
