@@ -74,4 +74,4 @@ check-versions: setup
 	$(BIN)/nox --tags versions
 
 clean:
-	rm -rf $(VENV) $(CLIENTS) .nox .jax_cache site build dist *.egg-info
+	rm -rf $(VENV) $(CLIENTS) .nox site build dist *.egg-info

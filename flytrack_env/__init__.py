@@ -1,5 +1,6 @@
 """FlyTrack: a drone-racing environment in JAX. Importing it registers its ids with gymnax."""
 
+from flytrack_env.compile_cache import keep_compiled_programs
 from flytrack_env.dynamics import ModelParameters, nominal_parameters
 from flytrack_env.env import EnvParams, EnvState, FlyTrack
 from flytrack_env.gymnasium_adapter import register_with_gymnasium
@@ -16,6 +17,7 @@ from flytrack_env.tracks import (
     save_track,
 )
 
+keep_compiled_programs()
 register_all()
 register_with_gymnasium()
 

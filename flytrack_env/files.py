@@ -8,6 +8,11 @@ from pathlib import Path
 from typing import BinaryIO
 
 
+def user_cache_folder() -> Path:
+    """Return FlyTrack's folder for what can be made again; RuntimeError where a user has no home."""
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "flytrack"
+
+
 def open_file(path: Path, most_bytes: int) -> BinaryIO:
     """Return a file opened for reading.
 

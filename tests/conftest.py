@@ -13,9 +13,6 @@ from flytrack_env.blackbox import BlackBox
 from flytrack_env.blackbox import load as load_black_box
 from flytrack_env.env import EnvParams, FlyTrack
 from tests.support.black_boxes import SHIPPED
-from tests.support.compiled_programs import share_compiled_programs
-
-share_compiled_programs()
 
 MEMORY_MAPS, MOST_MEMORY_MAPS = Path("/proc/self/maps"), 25_000
 

@@ -20,7 +20,7 @@ PACKAGE = "flytrack_env"
 # Low to high. A module imports only from rows above its own here; a package counts as one module.
 LAYERS = (
     {"files", "extras", "fusion", "sandbox", "artifact", "messages"},
-    {"auto_reset"},
+    {"auto_reset", "compile_cache"},
     {"quaternion", "motion", "toml_file", "npz_file"},
     {"state", "thrust"},
     {"tracks", "randomness"},

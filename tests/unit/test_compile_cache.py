@@ -1,0 +1,73 @@
+"""Compiled programs are kept for the next process, in a folder of the user's, where the user lets us."""
+
+import os
+import subprocess
+import sys
+from types import SimpleNamespace
+
+import pytest
+
+from flytrack_env import compile_cache
+
+STEP = """
+import jax, gymnax, flytrack_env
+env, params = gymnax.make("FlyTrack-v0")
+_, state = env.reset(jax.random.key(0), params)
+hits = []
+jax.monitoring.register_event_listener(lambda name, **_: hits.append(name) if name.endswith("/cache_hits") else None)
+env.step(jax.random.key(1), state, jax.numpy.zeros(4), params)
+print(len(hits))
+"""
+
+
+@pytest.fixture
+def config(monkeypatch, tmp_path):
+    """JAX's settings as the module sees them, without a folder; the user's cache is a temporary folder."""
+    settings = SimpleNamespace(jax_compilation_cache_dir=None)
+    settings.update = lambda name, value: setattr(settings, name, value)
+    monkeypatch.setattr(compile_cache.jax, "config", settings)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.delenv(compile_cache.SWITCH, raising=False)
+    return settings
+
+
+def test_the_next_process_compiles_nothing_that_is_slow(tmp_path):
+    kept = {name: value for name, value in os.environ.items() if not name.startswith("JAX_")}
+    environment = kept | {"XDG_CACHE_HOME": str(tmp_path), "JAX_PLATFORMS": "cpu"}
+    command = [sys.executable, "-c", STEP]
+    runs = [subprocess.run(command, env=environment, capture_output=True, check=True) for _ in range(2)]
+    assert [int(run.stdout) for run in runs] == [0, 1], runs
+
+
+def test_a_folder_of_the_user_stands(config):
+    config.jax_compilation_cache_dir = "mine"
+    compile_cache.keep_compiled_programs()
+    assert vars(config).keys() == {"jax_compilation_cache_dir", "update"}
+    assert config.jax_compilation_cache_dir == "mine"
+
+
+def test_it_can_be_switched_off(config, monkeypatch, tmp_path):
+    monkeypatch.setenv(compile_cache.SWITCH, "0")
+    compile_cache.keep_compiled_programs()
+    assert config.jax_compilation_cache_dir is None
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_folder_that_cannot_be_made_is_no_error(config, tmp_path):
+    (tmp_path / "flytrack").write_text("a file")
+    compile_cache.keep_compiled_programs()
+    assert config.jax_compilation_cache_dir is None
+
+
+def test_a_folder_that_has_grown_too_large_is_begun_afresh(config, monkeypatch):
+    compile_cache.keep_compiled_programs()
+    folder = compile_cache.Path(config.jax_compilation_cache_dir)
+    (folder / "old").write_bytes(b"12345")
+    config.jax_compilation_cache_dir = None
+    compile_cache.keep_compiled_programs()
+    assert (folder / "old").exists()
+    monkeypatch.setattr(compile_cache, "LARGEST_BYTES", 4)
+    config.jax_compilation_cache_dir = None
+    compile_cache.keep_compiled_programs()
+    assert config.jax_compilation_cache_dir == str(folder)
+    assert not (folder / "old").exists()
