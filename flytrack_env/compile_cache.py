@@ -20,7 +20,8 @@ def keep_compiled_programs() -> None:
 
     Does nothing where JAX has a folder already, where ``FLYTRACK_COMPILE_CACHE`` is 0, or where the folder
     cannot be written. There is one folder per kind of processor, since a program uses what its processor has;
-    one that has grown beyond 1 GiB is begun afresh. JAX's key of a program is its code, JAX's version and flags.
+    one that has grown beyond 1 GiB is begun afresh. JAX's key of a program is its code, JAX's version and its
+    flags.
     """
     if os.environ.get(SWITCH, "1") == "0" or jax.config.jax_compilation_cache_dir is not None:
         return

@@ -14,7 +14,10 @@ import jax, gymnax, flytrack_env
 env, params = gymnax.make("FlyTrack-v0")
 _, state = env.reset(jax.random.key(0), params)
 hits = []
-jax.monitoring.register_event_listener(lambda name, **_: hits.append(name) if name.endswith("/cache_hits") else None)
+def listen(name, **_):
+    if name.endswith("/cache_hits"):
+        hits.append(name)
+jax.monitoring.register_event_listener(listen)
 env.step(jax.random.key(1), state, jax.numpy.zeros(4), params)
 print(len(hits))
 """
