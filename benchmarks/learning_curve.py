@@ -1,6 +1,6 @@
 """How fast racing is learnt from scratch: ``python -m benchmarks.learning_curve [--seeds 5]``.
 
-Trains the default recipe, or that of --config, on FlyTrack-v0, one seed after the other, and every half a
+Trains a short recipe, or that of --config, on FlyTrack-v0, one seed after the other, and every quarter of a
 million environment steps flies 256 noisy starts over 3 laps in the simulator. What counts is from when on
 95 % of them finish and do so at every later evaluation. CPU seconds are those of training
 alone, without compilation and evaluations. Writes a page and a chart.
@@ -25,8 +25,10 @@ from flytrack_env.files import write_atomically
 from flytrack_env.pictures.drawing import new_figure, png_of
 
 TARGET_SUCCESS = 0.95
-AIM_STEPS, AIM_CPU_S = 8_000_000, 25.0
-EVERY = 500_000  # environment steps
+AIM_STEPS = 3_000_000
+# Half as many steps per update as by default: it learns to finish sooner, and to be fast later.
+SHORT = {"total_timesteps": 4_000_000, "num_steps": 32, "num_minibatches": 32}
+EVERY = 250_000  # environment steps
 NUM_EPISODES, NUM_LAPS, NUM_STEPS = 256, 3, 2500
 EVALUATION_SEED = 30_000
 HEADER = (
@@ -101,20 +103,20 @@ def main() -> None:
     """Measure every seed, print and write page and chart; exit 1 if a seed misses the aim."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seeds", type=int, default=5, help="training seeds")
-    parser.add_argument("--config", type=Path, help="TOML file of other settings than the default ones")
+    parser.add_argument("--config", type=Path, help="TOML file of settings, in place of the short recipe")
     parser.add_argument(
         "--out", type=Path, default=report.RESULTS / "learning_curve.md", help="page to write"
     )
     arguments = parser.parse_args()
     pinned = report.pin_to_one_core()
-    given = {} if arguments.config is None else settings_in_file(arguments.config)
-    settings = {"total_timesteps": AIM_STEPS, **given}
+    settings = SHORT if arguments.config is None else settings_in_file(arguments.config)
     trainer = Trainer(Config(**settings))
     evaluate(trainer, trainer.start(jax.random.key(0)).train_state.params, 0, 0.0)  # compiles
     curves = {seed: train(trainer, seed) for seed in range(arguments.seeds)}
     chart = arguments.out.with_suffix(".png")
     draw(chart, curves)
-    num_held = sum(held_from(points) is not None for points in curves.values())
+    held = [held_from(points) for points in curves.values()]
+    num_held = sum(point is not None and point.steps <= AIM_STEPS for point in held)
     report.fill_page(
         arguments.out,
         "learning_curve",
@@ -126,12 +128,11 @@ def main() -> None:
         held=num_held,
         seeds=len(curves),
         aim_steps=AIM_STEPS / 1e6,
-        aim_s=AIM_CPU_S,
         table=report.table(HEADER, [row_of(seed, points) for seed, points in curves.items()]),
         chart=chart.name,
         pinned=pinned.capitalize(),
     )
-    if num_held < len(curves) or max(points[-1].cpu_s for points in curves.values()) > AIM_CPU_S:
+    if num_held < len(curves):
         raise SystemExit(1)
 
 

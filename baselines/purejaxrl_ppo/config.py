@@ -50,7 +50,7 @@ class Config:
 
     total_timesteps: Count = 20_000_000
     """Environment steps over all environments; rounded down to whole updates."""
-    num_envs: int = 1024
+    num_envs: int = 512
     """Environments stepped side by side."""
     num_steps: int = 64
     """Steps of every environment per update."""

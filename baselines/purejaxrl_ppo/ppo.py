@@ -7,7 +7,7 @@ for each, and the setting (``config.py``) that switches it off:
   that the time limit cut off, because the race would have gone on (``bootstrap_at_truncation = false``).
 - Environments are stepped as a batch where they offer ``step_batch``, which is faster
   (``batched_step = false``: one by one under ``vmap``).
-- Minibatches come from an affine permutation, i -> a i + b mod n, because sorting 65,536 keys per epoch
+- Minibatches come from an affine permutation, i -> a i + b mod n, because sorting all keys of an epoch
   costs as much as the environments (``affine_shuffle = false``).
 - The standard deviation has a floor, so that exploration cannot die out early, and starts at 0.5, because
   random full stick crashes at once (``min_std = 0``, ``initial_std = 1``).
