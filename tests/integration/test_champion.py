@@ -8,12 +8,13 @@ from baselines.purejaxrl_ppo import load_checkpoint
 from baselines.purejaxrl_ppo.evaluate import SHIPPED_BLACK_BOX
 from baselines.purejaxrl_ppo.flights import race_many, score, start_keys
 from baselines.purejaxrl_ppo.race_env import plant_env
-from benchmarks.champion import AIM, CHAMPION, MODEL
+from benchmarks.champion import CHAMPION, MODEL
 from flytrack_env import blackbox, load_model
 from flytrack_env.model_file import model_from_json
 from flytrack_env.references import model_digest, shipped_reference
 
 MOST_BYTES = 100_000
+MOST_TIMES = 1.05  # the optimum; what is aimed at is in benchmarks/champion.py
 NUM_FLIGHTS, NUM_STEPS, NUM_LAPS = 32, 2500, 3
 
 
@@ -24,7 +25,7 @@ def test_champion_races_on_the_black_box_near_the_optimum():
     result = score(race_many(env, champion.network, champion.params, keys, NUM_STEPS, NUM_LAPS))
     optimum = shipped_reference("flytrack", "flying", "black_box")
     assert result.success == 1.0
-    assert optimum.time_s < result.flying_lap_s <= AIM * optimum.time_s
+    assert optimum.time_s < result.flying_lap_s <= MOST_TIMES * optimum.time_s
 
 
 def test_champion_is_a_small_policy_of_the_model_of_its_reference():
