@@ -70,7 +70,6 @@ SIZES = "--num-envs 16 --num-steps 32 --num-minibatches 4 --total-timesteps 1024
 USES = {
     "": (FLY_EVERY_ID, MISSING_EXTRA_IS_NAMED),
     "train": (f"-m baselines.purejaxrl_ppo.train_ppo {SIZES} --out small", LOAD_CHAMPION),
-    "sweep": (f"-m baselines.purejaxrl_ppo.sweeps space.toml {SIZES} --out sweep",),
     "sysid": (
         f"-m flytrack_sysid.cli collect --black-box {PLANT} --minutes 1 --out data.npz",
         "-m flytrack_sysid.cli fit data.npz --out model.json",
@@ -130,7 +129,6 @@ def wheel(session: nox.Session, extra: str) -> None:
     for name in COPIED if extra in WITH_CHECKOUT else ():
         copy = shutil.copytree if (ROOT / name).is_dir() else shutil.copy2
         copy(ROOT / name, folder / name)
-    (folder / "space.toml").write_text("[learning_rate]\ngrid_search = [1e-3, 2e-3]\n")
     with session.chdir(folder):
         for use in USES[extra]:
             arguments = shlex.split(use) if use.startswith("-m ") else ["-c", use]

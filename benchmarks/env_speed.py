@@ -1,6 +1,7 @@
 """Environment steps per second of process CPU time on one core, beside Pendulum and l2f; also by Gymnasium.
 
-``python -m benchmarks.env_speed [--repeats 7] [--out PAGE]`` prints a table and writes it. Keys and actions
+``python -m benchmarks.env_speed [--repeats 7] [--out PAGE]`` prints a table and writes it; with ``--effects``
+that of the step's cost with each effect, and with each motion. Keys and actions
 are drawn before the clock starts; every output of a step is kept, so that nothing of it can be optimised
 away. The contestants take turns, because machines drift: compare ratios of one run, not rates of two runs.
 """
@@ -39,13 +40,15 @@ class Contestant(NamedTuple):
     clock: Callable[[], float] = time.process_time
 
 
-def jax_contestant(name: str, env_id: str, num_envs: int, length: int, is_batch: bool) -> Contestant:
-    """Return a scan of ``length`` steps of a gymnax environment, all outputs in the carry."""
+def jax_contestant(
+    name: str, env_id: str, num_envs: int, length: int, is_batch: bool, model: Any = None
+) -> Contestant:
+    """Return a scan of ``length`` steps of a gymnax environment, all outputs in the carry; model: FlyTrack's."""
     import gymnax
     import jax
 
     import_module("flytrack_env")  # registers the id
-    env, params = gymnax.make(env_id)
+    env, params = gymnax.make(env_id, **({} if model is None else {"model": model}))
     step = env.step_batch if is_batch else jax.vmap(env.step, in_axes=(0, 0, 0, None))
     reset = jax.jit(jax.vmap(env.reset, in_axes=(0, None)))
     keys = jax.random.split(jax.random.key(0), (length,) if is_batch else (length, num_envs))
@@ -147,6 +150,35 @@ def contestants() -> list[Contestant]:
     return entries
 
 
+def with_effects() -> dict[str, Any]:
+    """Return models with one effect each, 30 % into its ranges, and with each motion.
+
+    Without effects that take the place of the lag: what they cost is the steps of their own loop.
+    """
+    from flytrack_env import Motion, nominal_parameters
+    from flytrack_env.effects import EFFECTS
+
+    nominal = nominal_parameters()
+    models = {f"motion {motion.name.lower()}": nominal._replace(motion=motion) for motion in Motion}
+    for effect in EFFECTS:
+        if effect.respond is None:
+            ends = zip(effect.parameters(), effect.ranges.values(), strict=True)
+            values = [neutral + 0.3 * (extent.high - neutral) for neutral, extent in ends]
+            models[effect.name] = nominal.with_effects(effect.parameters(*values))
+    return models
+
+
+def effect_costs(repeats: int) -> str:
+    """Return a table of the step's cost with each effect or motion, over the plain step in turns with it."""
+    plain, rows = jax_contestant(PLAIN, "FlyTrack-v0", 1024, 200, is_batch=False), []
+    for name, model in report.progress(with_effects().items(), "model"):
+        entry = jax_contestant(name, "FlyTrack-v0", 1024, 200, is_batch=False, model=model)
+        rates = measure([plain, entry], repeats, warm_up=1)
+        costs = [a / b for a, b in zip(rates[PLAIN], rates[name], strict=True)]
+        rows.append([name, f"{statistics.median(costs):.2f}", report.spread(costs, ".2f")])
+    return report.table("model | cost over the plain step, median | lowest to highest", rows)
+
+
 def measure(entries: list[Contestant], repeats: int, warm_up: int = 3) -> dict[str, list[float]]:
     """Return the rates of each contestant, amount per second of its clock, all taking turns."""
     for entry in entries:
@@ -171,8 +203,15 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--repeats", type=int, default=7, help="rounds, at least 5 for figures to publish")
     parser.add_argument("--out", type=Path, help="path of the page (.md)")
+    parser.add_argument("--effects", action="store_true", help="measure the cost of each effect instead")
     arguments = parser.parse_args()
     core = report.pin_to_one_core()
+    if arguments.effects:
+        where = f"{arguments.repeats} rounds, {core}. {report.provenance_line(report.provenance())}"
+        told = f"{report.command_line()}: `vmap(step)` of 1,024 environments; aim: at most {MOST_COSTLY:g}."
+        text = report.page("What an effect costs", told, effect_costs(arguments.repeats), where)
+        report.write_page(arguments.out, text)
+        return
     rates = measure(contestants(), arguments.repeats)
     speeds = (
         (name, f"{statistics.median(found):.3g}", report.spread(found, ".3g"))
