@@ -43,7 +43,7 @@ class Contestant(NamedTuple):
 def jax_contestant(
     name: str, env_id: str, num_envs: int, length: int, is_batch: bool, model: Any = None
 ) -> Contestant:
-    """Return a scan of ``length`` steps of a gymnax environment, all outputs in the carry; model: FlyTrack's."""
+    """Return a scan of ``length`` steps of a gymnax environment, all outputs in the carry; with a model."""
     import gymnax
     import jax
 

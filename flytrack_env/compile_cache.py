@@ -12,7 +12,7 @@ from flytrack_env.files import user_cache_folder
 
 SWITCH = "FLYTRACK_COMPILE_CACHE"  # environment variable: 0 keeps nothing
 LARGEST_BYTES = 2**30  # every change of a program leaves its predecessor behind
-LEAST_S = "jax_persistent_cache_min_compile_time_secs"
+FOLDER, LEAST_S = "jax_compilation_cache_dir", "jax_persistent_cache_min_compile_time_secs"
 
 
 def keep_compiled_programs() -> None:
@@ -23,7 +23,7 @@ def keep_compiled_programs() -> None:
     one that has grown beyond 1 GiB is begun afresh. JAX's key of a program is its code, JAX's version and its
     flags.
     """
-    if os.environ.get(SWITCH, "1") == "0" or jax.config.jax_compilation_cache_dir is not None:
+    if os.environ.get(SWITCH, "1") == "0" or getattr(jax.config, FOLDER) is not None:
         return
     try:
         folder = user_cache_folder() / "compiled" / _processor()
@@ -33,7 +33,7 @@ def keep_compiled_programs() -> None:
     except (OSError, RuntimeError):  # no home, or a file that another process removes
         return
     if os.access(folder.parent, os.W_OK):
-        jax.config.update("jax_compilation_cache_dir", str(folder))
+        jax.config.update(FOLDER, str(folder))
         if LEAST_S.upper() not in os.environ:
             jax.config.update(LEAST_S, 0.3)
 
