@@ -94,7 +94,7 @@ def main() -> None:
         changes=", ".join(f"{name} {value:g}" for name, value in CHANGES.items()),
         settings=best.settings,
         table=report.table(HEADER, map(row_of, flown)),
-        text=best.text,
+        text=best.text.replace(f"{report.ROOT}/", ""),
         times=times,
         aim=AIM,
     )
