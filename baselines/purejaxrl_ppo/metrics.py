@@ -4,41 +4,39 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from baselines.purejaxrl_ppo.collectives import Collectives
-
 # Counts are summed over updates; means are weighted by them.
 EPISODE_COUNT, LAP_COUNT = "episodes_ended", "laps_completed"
 NOT_PER_EPISODE = ("done", "last_return", "lap_time_s")  # a lap time is zero at the end of most episodes
 
 
-def summarise_episodes(log: dict[str, jax.Array], collectives: Collectives) -> dict[str, jax.Array]:
+def summarise_episodes(log: dict[str, jax.Array]) -> dict[str, jax.Array]:
     """Return how many episodes ended in an update, and means over them, 0 if none did.
 
     ``log`` holds (num_steps, num_envs) arrays: done, episode_return and the environment's info.
     """
     done = log["done"]
-    num_ended = collectives.sum(done)
+    num_ended = done.sum()
     summary = {EPISODE_COUNT: num_ended}
     for name, values in log.items():
         if name not in NOT_PER_EPISODE:
             name = name if name.startswith("episode_") else f"episode_{name}"
-            summary[name] = collectives.sum(jnp.where(done, values, 0)) / jnp.maximum(num_ended, 1)
+            summary[name] = jnp.where(done, values, 0).sum() / jnp.maximum(num_ended, 1)
     return summary
 
 
-def summarise_race(log: dict[str, jax.Array], collectives: Collectives) -> dict[str, jax.Array]:
+def summarise_race(log: dict[str, jax.Array]) -> dict[str, jax.Array]:
     """Return laps and mean gate distance of an update; nothing for an environment without a race.
 
     laps_completed: their number. lap_time_s: mean, 0 without a lap. gate_distance_m: mean over all steps.
     """
     if "lap_completed" not in log:
         return {}
-    num_completed = collectives.sum(log["lap_completed"])
-    total_s = collectives.sum(jnp.where(log["lap_completed"], log["lap_time_s"], 0.0))
+    num_completed = log["lap_completed"].sum()
+    total_s = jnp.where(log["lap_completed"], log["lap_time_s"], 0.0).sum()
     return {
         LAP_COUNT: num_completed,
         "lap_time_s": total_s / jnp.maximum(num_completed, 1),
-        "gate_distance_m": collectives.mean(log["gate_distance_m"]),
+        "gate_distance_m": log["gate_distance_m"].mean(),
     }
 
 

@@ -11,7 +11,6 @@ import numpy as np
 from tqdm import tqdm
 
 from baselines.purejaxrl_ppo.density import draw_position_density
-from baselines.purejaxrl_ppo.distributed import is_first
 from baselines.purejaxrl_ppo.flights import Outcomes, fly_many, outcomes_of, save_flight, score
 from baselines.purejaxrl_ppo.networks import ActorCritic
 from baselines.purejaxrl_ppo.recording import can_record, record_flights
@@ -93,9 +92,7 @@ class ProgressLine:
     """One line: steps, rate, time left, mean return of the last episodes, success, best lap so far."""
 
     def __init__(self, total: int, done: int):
-        self._bar = tqdm(
-            total=total, initial=done, unit="step", unit_scale=True, desc="compile", disable=not is_first()
-        )
+        self._bar = tqdm(total=total, initial=done, unit="step", unit_scale=True, desc="compile")
 
     def begin(self) -> None:
         """Start the clock, now that everything is compiled."""

@@ -86,18 +86,28 @@ def draw_plants(seed: int, num_plants: int, model: ModelParameters) -> Plants:
     """Return plants around a model (``perturb``); a smaller number returns the first of the same plants."""
     # Row by row, so that the first plants do not depend on how many there are.
     uniform = np.random.default_rng(seed).uniform(size=(num_plants, NUM_DRAWS))
+    models, drawn = jax.vmap(partial(plant_of, model=model))(uniform)
+    return Plants(jax.tree.map(np.asarray, models), {name: np.asarray(one) for name, one in drawn.items()})
 
-    def draw(columns: Any, bounds: tuple[float, float]) -> np.ndarray:
-        return bounds[0] + (bounds[1] - bounds[0]) * uniform[:, columns]
+
+def draw_model(key: jax.Array, model: ModelParameters) -> ModelParameters:
+    """Return the model of a plant drawn around a model, as ``draw_plants`` draws them."""
+    return plant_of(jax.random.uniform(key, (NUM_DRAWS,)), model)[0]
+
+
+def plant_of(uniform: Any, model: ModelParameters) -> tuple[ModelParameters, dict[str, jax.Array]]:
+    """Return a plant and what of it is drawn, by the names of ``RANGES``; uniform: (NUM_DRAWS,), 0 to 1."""
+
+    def draw(columns: Any, bounds: tuple[float, float]) -> jax.Array:
+        return bounds[0] + (bounds[1] - bounds[0]) * uniform[columns]
 
     drag, thrust = draw(slice(0, 3), RANGES["quadratic_drag_per_m"]), draw(3, RANGES["thrust_scale"])
     wind, heading_rad = draw(4, RANGES["wind_m_s"]), draw(5, (-np.pi, np.pi))
     delay = draw(6, RANGES["command_delay_s"])
-    wind_w = wind[:, None] * np.stack([np.cos(heading_rad), np.sin(heading_rad)], axis=1)
-    models = jax.vmap(partial(perturb, model))(drag, thrust, wind_w, delay)
-    drawn = (drag.mean(axis=1), thrust, wind, delay)
-    by_name = dict(zip(RANGES, drawn, strict=True))
-    return Plants(jax.tree.map(np.asarray, models), by_name)
+    wind_w = wind * jnp.stack([jnp.cos(heading_rad), jnp.sin(heading_rad)])
+    return perturb(model, drag, thrust, wind_w, delay), dict(
+        zip(RANGES, (drag.mean(), thrust, wind, delay), strict=True)
+    )
 
 
 def by_thirds(drawn: dict[str, np.ndarray], is_complete: np.ndarray) -> list[dict[str, Any]]:

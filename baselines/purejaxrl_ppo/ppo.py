@@ -17,7 +17,6 @@ for each, and the setting (``config.py``) that switches it off:
   last updates still learn (``anneal_every_gradient = false``, ``final_learning_rate_fraction = 0``).
 - One update is a function of its own (``Algorithm``), so that a run can be logged, stored and resumed
   between updates; ``make_train`` is PureJaxRL's: one ``jit``, a ``scan`` over updates.
-- An update may see one shard of the environments, its gradients averaged over all (``distributed.py``).
 """
 
 from collections.abc import Callable
@@ -30,7 +29,6 @@ import optax
 from flax.training.train_state import TrainState
 from gymnax.environments import spaces
 
-from baselines.purejaxrl_ppo.collectives import AXIS, Collectives
 from baselines.purejaxrl_ppo.config import Config
 from baselines.purejaxrl_ppo.metrics import summarise_episodes, summarise_race
 from baselines.purejaxrl_ppo.networks import ActorCritic, make_network
@@ -127,9 +125,8 @@ def ppo_loss(
     advantage: jax.Array,
     target: jax.Array,
     config: Config,
-    collectives: Collectives = Collectives(),  # noqa: B008, a tuple
 ) -> tuple[jax.Array, Metrics]:
-    """Return the clipped objective plus clipped value loss of this device's experience, and its parts."""
+    """Return the clipped objective plus clipped value loss of a minibatch, and its parts."""
     policy, value = network.apply(network_params, batch.observation)
     log_prob = policy.log_prob(batch.action)
     value_clipped = batch.value + jnp.clip(value - batch.value, -config.clip_eps, config.clip_eps)
@@ -138,8 +135,8 @@ def ppo_loss(
 
     log_ratio = log_prob - batch.log_prob
     ratio = jnp.exp(log_ratio)
-    advantage_std = jnp.sqrt(collectives.variance(advantage))
-    advantage = (advantage - collectives.mean(advantage)) / (advantage_std + 1e-8)
+    advantage_std = jnp.sqrt(jnp.var(advantage))
+    advantage = (advantage - advantage.mean()) / (advantage_std + 1e-8)
     clipped_ratio = jnp.clip(ratio, 1.0 - config.clip_eps, 1.0 + config.clip_eps)
     policy_loss = -jnp.minimum(ratio * advantage, clipped_ratio * advantage).mean()
     entropy = policy.entropy().mean()
@@ -187,17 +184,13 @@ def make_network_for(env: Any, env_params: Any, config: Config) -> ActorCritic:
     return make_network(config)
 
 
-def make_ppo(env: Any, env_params: Any, config: Config, num_shards: int = 1) -> Algorithm:
+def make_ppo(env: Any, env_params: Any, config: Config) -> Algorithm:
     """Return PPO on a gymnax environment with its parameters.
-
-    num_shards: of the environments; with more than one, an update is of one shard, under the axis ``AXIS``.
 
     Raises:
         ValueError: a configuration that cannot be trained with.
     """
     config.check()
-    collectives = Collectives(AXIS if num_shards > 1 else None)
-    batch_size = config.batch_size // num_shards
     network: Any = make_network_for(env, env_params, config)
     optimizer, schedule = make_optimizer(config), make_schedule(config)
     step_all = choose_step(env, config)
@@ -239,16 +232,14 @@ def make_ppo(env: Any, env_params: Any, config: Config, num_shards: int = 1) -> 
 
     def update_minibatch(train_state: TrainState, minibatch: tuple[Any, ...]) -> tuple[TrainState, Metrics]:
         gradient = jax.grad(ppo_loss, has_aux=True)
-        grads, parts = collectives.average(
-            gradient(train_state.params, network, *minibatch, config, collectives)
-        )
+        grads, parts = gradient(train_state.params, network, *minibatch, config)
         return train_state.apply_gradients(grads=grads), parts
 
     def update_epoch(
         train_state: TrainState, key: jax.Array, data: tuple[Any, ...]
     ) -> tuple[TrainState, Metrics]:
         permutation = affine_permutation if config.affine_shuffle else jax.random.permutation
-        order = permutation(key, batch_size)
+        order = permutation(key, config.batch_size)
         shuffled = jax.tree.map(lambda leaf: leaf[order], data)
         minibatches = jax.tree.map(
             lambda leaf: leaf.reshape(config.num_minibatches, -1, *leaf.shape[1:]), shuffled
@@ -260,7 +251,7 @@ def make_ppo(env: Any, env_params: Any, config: Config, num_shards: int = 1) -> 
         last_value: Any = network.apply(runner.train_state.params, runner.observation, method="value")
         advantage = generalized_advantages(batch, last_value, config.gamma, config.gae_lambda)
         target = advantage + batch.value
-        flatten = partial(jax.tree.map, lambda leaf: leaf.reshape(batch_size, *leaf.shape[2:]))
+        flatten = partial(jax.tree.map, lambda leaf: leaf.reshape(config.batch_size, *leaf.shape[2:]))
         data = flatten((batch, advantage, target))
         key, *epoch_keys = jax.random.split(runner.key, config.update_epochs + 1)
         train_state, parts = jax.lax.scan(
@@ -269,12 +260,11 @@ def make_ppo(env: Any, env_params: Any, config: Config, num_shards: int = 1) -> 
             jnp.stack(epoch_keys),
         )
         metrics = {
-            **summarise_episodes(log, collectives),
-            **summarise_race(log, collectives),
+            **summarise_episodes(log),
+            **summarise_race(log),
             **jax.tree.map(jnp.mean, parts),
-            "last_return": collectives.mean(log["last_return"]),
-            "explained_variance": 1.0
-            - collectives.variance(target - batch.value) / collectives.variance(target),
+            "last_return": log["last_return"].mean(),
+            "explained_variance": 1.0 - jnp.var(target - batch.value) / jnp.var(target),
             "learning_rate": jnp.asarray(schedule(runner.train_state.step)),
         }
         return runner._replace(train_state=train_state, key=key), metrics

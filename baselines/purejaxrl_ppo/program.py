@@ -10,12 +10,9 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
-from jax.sharding import Mesh
 
 import flytrack_env
 from baselines.purejaxrl_ppo.config import Config
-from baselines.purejaxrl_ppo.distributed import check_divides, on_devices, whole
 from baselines.purejaxrl_ppo.ppo import Algorithm, Runner, make_network_for, make_ppo
 from baselines.purejaxrl_ppo.resume import describe_run
 from flytrack_env.episodes import EpisodicEnvironment
@@ -84,42 +81,25 @@ class Program:
     same for stacked runners of several seeds. most: updates of a chunk.
 
     Args:
-        config: checked here. env_id, env_arguments: of ``flytrack_env.make``. mesh: of the devices that the
-            environments are spread over (``distributed.all_devices``); None: one device.
+        config: checked here. env_id, env_arguments: of ``flytrack_env.make``.
 
     Raises:
         ValueError: settings, id, track or model that cannot be used.
     """
 
-    def __init__(
-        self, config: Config, env_id: str = "FlyTrack-v0", mesh: Mesh | None = None, **env_arguments: Any
-    ):
+    def __init__(self, config: Config, env_id: str = "FlyTrack-v0", **env_arguments: Any):
         self.config, self.env_id = config, env_id
-        self.mesh = mesh if mesh is not None and mesh.size > 1 else None
         self.track = track_reference(env_arguments.get("track", "flytrack"))
         self.env = flytrack_env.make(env_id, **env_arguments)
         config.check()
         self.env.check_params(self.env.default_params)
         params = training_params(self.env, config)
-        if self.mesh is None:
-            ppo = make_ppo(self.env, params, config)
-        else:
-            check_divides(config, self.mesh)
-            ppo = on_devices(make_ppo(self.env, params, config, self.mesh.size), self.mesh)
+        ppo = make_ppo(self.env, params, config)
         self.network = make_network_for(self.env, params, config)
         self.most = max(1, CHUNK_STEPS // config.batch_size)
         self.start = jax.jit(lambda key: with_strong_types(ppo.start(key)))
         self.chunk = make_chunk(ppo, self.most)
         self.chunk_of_many = jax.jit(jax.vmap(self.chunk, in_axes=(0, None)))
-
-    def gather(self, runner: Runner) -> Runner:
-        """Return the state so that this process can read it; with several devices all processes must call."""
-        return runner if self.mesh is None else whole(runner, self.mesh)
-
-    def local_policy(self, runner: Runner) -> Any:
-        """Return the network's parameters so that this process alone can compute with them."""
-        params = runner.train_state.params
-        return params if self.mesh is None else jax.tree.map(np.asarray, params)
 
     def describe(self, seed: int, num_seeds: int = 1) -> dict[str, Any]:
         """Return the description of a seed's run that its checkpoints hold (``describe_run``)."""

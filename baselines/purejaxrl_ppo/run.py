@@ -10,7 +10,6 @@ import numpy as np
 
 import flytrack_env
 from baselines.purejaxrl_ppo.checkpoint import Checkpoint, as_named_arrays, load_checkpoint
-from baselines.purejaxrl_ppo.distributed import is_first
 from baselines.purejaxrl_ppo.metrics import summarise_updates
 from baselines.purejaxrl_ppo.monitor import evaluate_policy
 from baselines.purejaxrl_ppo.ppo import Runner
@@ -85,8 +84,8 @@ class Chunk(NamedTuple):
 class Run:
     """One seed's training under way, and the files and the MLflow run that it writes.
 
-    Of several processes only the first writes. rows: metrics of the chunks. success, best_lap_s: of the last
-    evaluation, and the shortest flying lap of all; None before the first.
+    rows: metrics of the chunks. success, best_lap_s: of the last evaluation, and the shortest flying lap of
+    all; None before the first.
     """
 
     def __init__(
@@ -100,18 +99,16 @@ class Run:
         self.best_lap_s: float | None = before.get("best_lap_s")
         self.last_good = None if start is None else start.path
         self.status, self.rows = "FAILED", list[Metrics]()
-        self.is_first = is_first()
         self.tracker: Tracker | None = None
-        if self.is_first:
-            out.mkdir(parents=True, exist_ok=True)
-            if start is None:
-                (out / RUN_FILE).unlink(missing_ok=True)
-            if options.tracking_uri is not None:
-                # Parameters are the whole description but the observation's table.
-                params = {name: value for name, value in description.items() if name != "observation"}
-                params["package_version"] = flytrack_env.__version__
-                name = f"{program.env_id} {Path(program.track).stem} seed {description['seed']}"
-                self.tracker = Tracker(out, options.tracking_uri, name, params, options.parent_run_id)
+        out.mkdir(parents=True, exist_ok=True)
+        if start is None:
+            (out / RUN_FILE).unlink(missing_ok=True)
+        if options.tracking_uri is not None:
+            # Parameters are the whole description but the observation's table.
+            params = {name: value for name, value in description.items() if name != "observation"}
+            params["package_version"] = flytrack_env.__version__
+            name = f"{program.env_id} {Path(program.track).stem} seed {description['seed']}"
+            self.tracker = Tracker(out, options.tracking_uri, name, params, options.parent_run_id)
 
     def begin(self, runner: Runner, update: int) -> None:
         """Begin or continue the MLflow run, and write the checkpoint of the untrained policy."""
@@ -142,7 +139,7 @@ class Run:
         values = {**summarise_updates(chunk.metrics), "steps_per_second": chunk.steps_per_second}
         broken = find_not_finite(chunk)
         is_evaluated = is_last or is_due(update, options.evaluate_every, config.batch_size)
-        if self.is_first and options.evaluate_every and is_evaluated and not broken:
+        if options.evaluate_every and is_evaluated and not broken:
             values |= self._evaluate(chunk.runner, steps, is_last)
         if self.tracker is not None:
             self.tracker.metrics(steps, values)
@@ -161,7 +158,7 @@ class Run:
 
     def _evaluate(self, runner: Runner, steps: int, is_last: bool) -> dict[str, float]:
         """Fly and draw the policy as it is; return the metrics, few where it could not be flown."""
-        params, num_episodes = self.program.local_policy(runner), self.options.evaluation_episodes
+        params, num_episodes = runner.train_state.params, self.options.evaluation_episodes
         metrics, files = evaluate_policy(
             self.program.env, self.program.network, params, num_episodes, self.out, steps, is_recorded=is_last
         )
@@ -194,9 +191,7 @@ class Run:
         return load_checkpoint(self.out / FINAL), metrics
 
     def _checkpoint(self, name: str, runner: Runner, update: int) -> None:
-        path, runner = self.out / name, self.program.gather(runner)
-        if not self.is_first:
-            return
+        path = self.out / name
         progress = {
             "steps": update * self.config.batch_size,
             "seconds": round(time.perf_counter() - self.started_s, 1),

@@ -1,18 +1,15 @@
 """Train PPO on a FlyTrack environment: ``python -m baselines.purejaxrl_ppo.train_ppo`` (docs/baseline.md)."""
 
 import dataclasses
-import os
 import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple, NoReturn
 
-import jax
 import tyro
 
 from baselines.purejaxrl_ppo.checkpoint import CheckpointError
 from baselines.purejaxrl_ppo.config import Config, Count, settings_in_file
-from baselines.purejaxrl_ppo.distributed import all_devices, is_first, join
 from baselines.purejaxrl_ppo.resume import (
     FINAL,
     Start,
@@ -58,15 +55,6 @@ class Sources:
     resume: Path | None = None
     """Continue from a checkpoint, from a folder's newest intact one, or with all seeds in a folder of
     seed<N>. What is not given is as it was."""
-    distributed: bool = False
-    """Spread the environments over all devices, of this process or of all processes of a job of SLURM or Open
-    MPI; elsewhere the next three flags say where the processes meet. All must see the same folder."""
-    coordinator: str | None = None
-    """HOST:PORT of the first process."""
-    num_processes: int | None = None
-    """Number of processes."""
-    process_index: int | None = None
-    """Which of them this is, from 0."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -175,10 +163,8 @@ def defaults_of(resumed: Resumed) -> Settings:
 
 
 def parse(words: Sequence[str]) -> tuple[Settings, Resumed | None]:
-    """Return the settings of a command line, and what it resumes; joins the other processes first."""
+    """Return the settings of a command line, and what it resumes."""
     sources, _ = tyro.cli(Sources, args=words, prog=PROG, add_help=False, return_unknown_args=True)
-    if sources.distributed:
-        join(sources.coordinator, sources.num_processes, sources.process_index)
     resumed = None if sources.resume is None else find_starts(sources.resume)
     defaults = Settings() if resumed is None else defaults_of(resumed)
     if sources.config is not None:
@@ -222,17 +208,16 @@ def make_tasks(settings: Settings, resumed: Resumed | None, at_once: int) -> lis
 
 def make_trainer(settings: Settings, resumed: Resumed | None) -> Trainer:
     """Return the trainer of a command line; errors name the checkpoint that some settings come from."""
-    mesh = all_devices() if settings.distributed else None
     reward = parse_rewards(settings.reward)
     arguments: dict[str, Any] = {"track": settings.track, "reward": reward, "model": settings.model}
     if resumed is None:
-        return Trainer(settings.hyperparameters, settings.env_id, mesh, **arguments)
+        return Trainer(settings.hyperparameters, settings.env_id, **arguments)
     path, checkpoint = resumed.first
     try:
         arguments["model"] = settings.model or model_from_json(checkpoint.meta["model"], "model")
         arguments["missed_gate"] = checkpoint.meta["missed_gate"]
         arguments["reward"] = rewards_of(checkpoint) | reward
-        return Trainer(settings.hyperparameters, settings.env_id, mesh, **arguments)
+        return Trainer(settings.hyperparameters, settings.env_id, **arguments)
     except (ValueError, OverflowError, OSError) as error:
         raise CheckpointError(f"{path}: with its settings and the flags: {error_text(error)}") from error
 
@@ -240,8 +225,7 @@ def make_trainer(settings: Settings, resumed: Resumed | None) -> Trainer:
 def make_plan(words: Sequence[str]) -> Plan:
     """Return the plan of a command line; everything is checked before anything is trained."""
     settings, resumed = parse(words)
-    # With several devices one seed after the other: a seed fills them.
-    at_once = 1 if settings.distributed else settings.seeds_at_once or settings.num_seeds
+    at_once = settings.seeds_at_once or settings.num_seeds
     tasks = make_tasks(settings, resumed, at_once)
     trainer = make_trainer(settings, resumed)
     trainer.check_all(tasks, min(at_once, len(tasks)))
@@ -251,14 +235,13 @@ def make_plan(words: Sequence[str]) -> Plan:
 def run(plan: Plan) -> None:
     """Train every seed; print where it continues from and where its checkpoint is."""
     for task in plan.tasks:
-        if task.start is not None and is_first():
+        if task.start is not None:
             print(f"seed {task.seed}: from step {task.start.steps}, {task.start.path}")
     for first in range(0, len(plan.tasks), plan.at_once):
         tasks = plan.tasks[first : first + plan.at_once]
         for task, (checkpoint, _) in zip(tasks, plan.trainer.run(tasks), strict=True):
             meta = checkpoint.meta
-            if is_first():
-                print(f"seed {task.seed}: {meta['steps']} steps in {meta['seconds']} s: {task.out / FINAL}")
+            print(f"seed {task.seed}: {meta['steps']} steps in {meta['seconds']} s: {task.out / FINAL}")
 
 
 def stopped_text(plan: Plan) -> str:
@@ -271,10 +254,8 @@ def stopped_text(plan: Plan) -> str:
 
 
 def leave(status: int, text: str) -> NoReturn:
-    """Exit with a message; one of several processes at once, because the others would wait for it."""
-    print(text, file=sys.stderr, flush=True)
-    if jax.process_count() > 1:
-        os._exit(status)
+    """Exit with a message."""
+    print(text, file=sys.stderr)
     raise SystemExit(status)
 
 
@@ -291,12 +272,6 @@ def main() -> None:
         leave(INTERRUPTED, stopped_text(plan))
     except (ValueError, OSError) as found:
         leave(1, f"{error} {found}")
-    except jax.errors.JaxRuntimeError as found:
-        if jax.process_count() == 1:
-            raise
-        reason = (str(found).splitlines() or [""])[0]
-        process = f"process {jax.process_index()} of {jax.process_count()}"
-        leave(1, f"{error} {process} has lost another ({reason}); {stopped_text(plan)}")
 
 
 if __name__ == "__main__":

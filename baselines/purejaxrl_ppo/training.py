@@ -8,12 +8,10 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.experimental.multihost_utils import sync_global_devices
 
 from baselines.purejaxrl_ppo import resume
 from baselines.purejaxrl_ppo.checkpoint import Checkpoint
 from baselines.purejaxrl_ppo.config import Config
-from baselines.purejaxrl_ppo.distributed import check_agree, spread
 from baselines.purejaxrl_ppo.interrupts import kept_interrupts
 from baselines.purejaxrl_ppo.monitor import ProgressLine
 from baselines.purejaxrl_ppo.ppo import Runner
@@ -72,12 +70,6 @@ class Trainer(Program):
             description = self.describe(task.seed, at_once)
             if task.start is not None:
                 resume.check_same_run(*task.start, description)
-            if self.mesh is not None:
-                shared = {name: value for name, value in description.items() if name != "machine"}
-                start = None if task.start is None else task.start.steps
-                check_agree([task.options.as_json(), start, shared])
-        if self.mesh is not None:
-            sync_global_devices("checked")  # before the first process writes what the others would find
 
     def run(self, tasks: list[Task]) -> list[tuple[Checkpoint, Metrics]]:
         """Train checked tasks; those that are as far as each other side by side."""
@@ -89,8 +81,6 @@ class Trainer(Program):
         for group in group_by_progress(ready):
             with kept_interrupts() as check_interrupt:
                 train_group(self, group, check_interrupt)
-        if self.mesh is not None:
-            sync_global_devices("trained")
         return [run.result() for run in runs]
 
     def _load(self, task: Task, num_seeds: int) -> tuple[Run, Ready | None]:
@@ -106,7 +96,7 @@ class Trainer(Program):
             return run, None
         resume.warn_of_other_machine(*task.start, description)
         runner = resume.restore_runner(task.start, jax.eval_shape(self.start, key))
-        return run, Ready(run, runner if self.mesh is None else spread(runner, self.mesh), update)
+        return run, Ready(run, runner, update)
 
 
 def group_by_progress(ready: list[Ready]) -> list[list[Ready]]:
