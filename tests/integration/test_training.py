@@ -1,8 +1,12 @@
 """Training runs: cut off and resumed, damaged, diverged, watched, side by side; the bits stay the same."""
 
 import logging
+import random
 import shutil
 import signal
+import subprocess
+import sys
+import time
 
 import jax
 import jax.numpy as jnp
@@ -11,9 +15,14 @@ import pytest
 
 from baselines.purejaxrl_ppo import CheckpointError, load_checkpoint, monitor
 from baselines.purejaxrl_ppo.checkpoint import save_checkpoint
-from baselines.purejaxrl_ppo.resume import at_common_step, newest_intact, warn_of_other_machine
+from baselines.purejaxrl_ppo.resume import (
+    at_common_step,
+    checkpoints_in,
+    newest_intact,
+    warn_of_other_machine,
+)
 from baselines.purejaxrl_ppo.run import DivergedError, Options, Run
-from benchmarks.reliability import training as killed
+from tests.support.pages import ROOT
 from tests.support.ppo_runs import BATCH, EVERY_OTHER_UPDATE, SEED, assert_same_end
 from tests.support.slow import slow_but
 
@@ -217,9 +226,31 @@ def test_seeds_killed_between_their_checkpoints_end_bit_for_bit(trainer, togethe
         assert_same_end(folder / "final.safetensors", together[0] / folder.name / "final.safetensors")
 
 
+def start(out, *flags):
+    """Start a training in a process of its own."""
+    command = [sys.executable, "-m", "baselines.purejaxrl_ppo.train_ppo", "--out", str(out), *flags]
+    return subprocess.Popen(command, cwd=ROOT)
+
+
 @pytest.mark.slow
 def test_a_run_killed_at_any_moment_ends_in_the_same_bits(tmp_path, monkeypatch):
-    shorter = killed.FLAGS.replace(str(killed.UPDATES * killed.BATCH), str(1500 * killed.BATCH))
-    monkeypatch.setattr(killed, "FLAGS", shorter)
-    found = killed.kill_and_resume(3, tmp_path)
-    assert found["is_held"] and found["kills"] == 3
+    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", str(tmp_path / "compiled"))
+    flags = (
+        "--env-id FlyTrackRobust-v0 --num-envs 16 --num-steps 24 --num-minibatches 4 --hidden-sizes 8 "
+        f"--evaluate-every 0 --total-timesteps {1500 * BATCH} --checkpoint-every {20 * BATCH} --seed {SEED}"
+    ).split()
+    rng, whole, out = random.Random(0), tmp_path / "whole", tmp_path / "killed"
+    assert start(whole, *flags).wait() == 0
+    process = start(out, *flags)
+    for _ in range(3):
+        known = set(checkpoints_in(out))
+        while process.poll() is None and set(checkpoints_in(out)) == known:
+            time.sleep(0.001)
+        time.sleep(rng.uniform(0.0, 0.5))
+        process.kill()
+        assert process.wait() == -signal.SIGKILL
+        for path in known.union(checkpoints_in(out)):
+            load_checkpoint(path)
+        process = start(out, "--resume", str(out))
+    assert process.wait() == 0
+    assert_same_end(out / "final.safetensors", whole / "final.safetensors")
