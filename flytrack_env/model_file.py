@@ -65,13 +65,19 @@ def _read_field(path: Path, name: str, value: Any) -> Any:
 def _read_effect(path: Path, name: str, values: Any) -> Any:
     """Return the parameters of one effect; those that are not in the file are neutral."""
     effect = effects.BY_NAME[_known(f"{path}: effects", name, effects.BY_NAME)]
-    where = f"{path}: effects: {name}"
-    for field, value in _object(where, values).items():
+    where, static = f"{path}: effects: {name}", {}
+    values = dict(_object(where, values))
+    if effect.static and effect.static in values and effect.read is not None:
+        try:
+            static[effect.static] = effect.read(values.pop(effect.static))
+        except ValueError as error:
+            raise ModelFileError(f"{where}: {error}") from error
+    for field, value in values.items():
         bounds = effect.ranges[_known(where, field, effect.ranges)]
         if not _is_number(value, bounds.low, bounds.high):
             expected = f"{bounds.low:g} to {bounds.high:g} {bounds.unit}"
             raise ModelFileError(f"{where}: {field}: found {quote_value(value)}, expected {expected}")
-    return effect.parameters(**{field: float(value) for field, value in values.items()})
+    return effect.parameters(**{field: float(value) for field, value in values.items()}, **static)
 
 
 def _read_motion(path: Path, name: Any) -> Motion:
@@ -152,13 +158,18 @@ def model_as_json(model: ModelParameters) -> dict[str, Any]:
     }
     return {
         "parameters": {name: np.asarray(getattr(model, name), float).tolist() for name in SIZES},
-        "effects": {
-            name: {field: float(value) for field, value in parameters._asdict().items()}
-            for name, parameters in by_name.items()
-        },
+        "effects": {name: _effect_as_json(name, parameters) for name, parameters in by_name.items()},
         "units": {**UNITS, **effect_units},
         "motion": model.motion.value,
     }
+
+
+def _effect_as_json(name: str, parameters: Any) -> dict[str, Any]:
+    effect = effects.BY_NAME[name]
+    values: dict[str, Any] = {field: float(getattr(parameters, field)) for field in effect.ranges}
+    if effect.written is not None:
+        values[effect.static] = effect.written(getattr(parameters, effect.static))
+    return values
 
 
 def save_model(path: str | Path, model: ModelParameters, provenance: dict[str, Any]) -> None:

@@ -105,7 +105,7 @@ def close_loop(
     found = diagnose(logs, fitted.model, report=ProgressBar("stages"), motion=motion)
     write_diagnosis(out / "diagnosis", found, joined(logs))
     report(text_of(found))
-    if found.causes or found.beyond:
+    if found.causes or found.beyond or found.learned is not None:
         report("5/6 train on the extended model")
         after = train_stage("after", found.extended, *rest, held_out)
     else:

@@ -41,8 +41,8 @@ UNBOUNDED = Bounds(-np.inf, np.inf)
 
 def names_of(model: ModelParameters) -> tuple[str, ...]:
     """Return the names of all numbers in a model: the base, then ``effect.parameter``."""
-    of_effects = ((effect_of(parameters).name, parameters._fields) for parameters in model.effects)
-    return (*BASE, *(f"{effect}.{field}" for effect, fields in of_effects for field in fields))
+    every = [effect_of(parameters) for parameters in model.effects]
+    return (*BASE, *(f"{effect.name}.{field}" for effect in every for field in effect.ranges))
 
 
 def base_of(model: ModelParameters) -> tuple[str, ...]:

@@ -37,7 +37,8 @@ class Record(NamedTuple):
     is_applied_known: (num_rows,) bool, ``applied`` was measured here. applied: (num_rows, 4).
     pos_w, vel_w: (num_rows, 3). quat: (num_rows, 4). battery_v: (num_rows,). Where a channel is absent:
     0, upright, 23 V.
-    piece: (num_rows,) int, numbers of stretches of at most 2.5 s, none across blocks.
+    piece: (num_rows,) int, numbers of stretches of at most 2.5 s, none across blocks. time_s: (num_rows,) s,
+    since the log began, of several each.
     """
 
     source_row: np.ndarray
@@ -52,6 +53,7 @@ class Record(NamedTuple):
     quat: np.ndarray
     battery_v: np.ndarray
     piece: np.ndarray
+    time_s: np.ndarray
 
 
 def _new_times(log: FlightLog, usual: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -134,6 +136,7 @@ def record_of(filled: Filled) -> Record:
     """Return a log without gaps as a record, without padding and in one piece."""
     log, begins = filled.log, filled.log.is_start()
     zeros = np.zeros((len(log), 3))
+    is_first_row = np.append(True, np.diff(log.time) < 0.0)  # of several logs as one
     after_gap = np.append(False, filled.source_row[:-1] < 0) & (filled.source_row >= 0)
     return Record(
         source_row=filled.source_row,
@@ -148,6 +151,7 @@ def record_of(filled: Filled) -> Record:
         quat=log["q"] if "q" in log else np.tile(UPRIGHT, (len(log), 1)),
         battery_v=log["v_bat"][:, 0] if "v_bat" in log else zeros[:, 0] + BATTERY_UNKNOWN_V,
         piece=np.zeros(len(log), int),
+        time_s=log.time - log.time[np.flatnonzero(is_first_row)][np.cumsum(is_first_row) - 1],
     )
 
 

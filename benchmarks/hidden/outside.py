@@ -11,6 +11,10 @@ attitude       a bump about one angle of tilt                      thrust lost
 command        a dead zone about one stick position, or backlash   stick of one axis
 periodic       a sine of 0.5 to 20 Hz                              force in the body, or body rates
 stochastic     strong gusts                                        force in the world, or body rates
+flapping       blades that flap: pitch with forward airspeed       body rates
+cable          a cable that pulls to one side, by heading          force in the world
+heating        motors that heat up with the square of thrust       thrust lost
+payload        a load on a string that swings                      force in the world
 =============  ==================================================  =======================================
 
 Waves in the heading begin at order 2: a steady wind, which the list has, is of order 1 in the body.
@@ -23,7 +27,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.hidden.noise import STD
-from benchmarks.hidden.truth import Outside, Truth
+from benchmarks.hidden.truth import GRAVITY, Outside, Truth
 from benchmarks.hidden.vectors import Vector, norm, scale, to_body
 
 # An amplitude of 1: m/s^2 of forces and of thrust over mass, rad/s of rates.
@@ -46,6 +50,8 @@ STEP_WIDTH_SHARE, HUMP_WIDTH_SHARE = (0.005, 0.05), (0.05, 0.15)
 SPEED_MS, SPEED_WIDTH_MS = (4.0, 11.0), (0.7, 1.5)
 TILT_DEG, TILT_WIDTH_DEG = (12.0, 40.0), (4.0, 10.0)
 STICK, FREQUENCY_HZ, GUST_S = (-0.5, 0.5), (0.5, 20.0), (0.05, 0.5)
+USUAL_SPEED_MS, DAMPING = 5.0, 0.4
+WARMING_S, STRING_M = (10.0, 30.0), (0.3, 1.0)
 
 
 class FirstOrderNoise:
@@ -104,6 +110,35 @@ def _periodic(shape: Any, plant: Any) -> float:
     return math.sin(2.0 * math.pi * shape["frequency_hz"] * plant.time_s + shape["phase"])
 
 
+def _flapping(shape: Any, plant: Any) -> float:
+    return plant.airspeed_b[0] / USUAL_SPEED_MS
+
+
+def _cable(shape: Any, plant: Any) -> float:
+    return math.cos(math.atan2(plant.rows[1][0], plant.rows[0][0]) + shape["phase"])
+
+
+def _heating(shape: Any, plant: Any) -> float:
+    """Return half of a temperature that follows the square of the thrust; it is kept in the plant."""
+    now, last, warmth = plant.time_s, *getattr(plant, "heat", (plant.time_s, 0.0))
+    warmth += -math.expm1(-(now - last) / shape["warming_s"]) * ((plant.thrust_acc / GRAVITY) ** 2 - warmth)
+    plant.heat = now, warmth
+    return 0.5 * warmth
+
+
+def _payload(plant: Any, shape: Any) -> Vector:
+    """Return how far a pendulum with the drone's acceleration is off, world, over its usual swing."""
+    now, last, off, speed = plant.time_s, *getattr(plant, "swing", (plant.time_s, (0.0,) * 3, (0.0,) * 3))
+    step_s, stiffness = now - last, GRAVITY / shape["string_m"]
+    pull = tuple(
+        -acc - stiffness * x - DAMPING * v for acc, x, v in zip(plant.acc_w, off, speed, strict=True)
+    )
+    speed = tuple(v + step_s * a for v, a in zip(speed, pull, strict=True))
+    off = tuple(x + step_s * v for x, v in zip(off, speed, strict=True))
+    plant.swing = now, off, speed
+    return scale(1.0 / shape["string_m"], (off[0], off[1], 0.0))
+
+
 def noise_hook(process: FirstOrderNoise, size: float, channel: str) -> Callable[[Any], Vector]:
     """Return a hook that adds what a process has now: as a force of the world, or as body rates."""
     if channel == "rate":
@@ -122,8 +157,10 @@ def vector_hook(outside: Outside) -> Callable[[Any], Vector]:
             return scale(-size * signal(shape, plant) / speed, plant.airspeed_b)
 
         return against
+    if outside.kind == "payload":
+        return lambda plant: to_body(plant.rows, scale(size, _payload(plant, shape)))
     direction = (shape["x"], shape["y"], shape["z"])
-    if outside.kind == "position":
+    if outside.kind in ("position", "cable"):
         return lambda plant: to_body(plant.rows, scale(size * signal(shape, plant), direction))
     return lambda plant: scale(size * signal(shape, plant), direction)
 
@@ -212,6 +249,10 @@ def _draw_stochastic(rng: Rng) -> ChannelAndShape:
     return ("force" if rng.random() < 0.5 else "rate"), {"time_constant_s": rng.uniform(*GUST_S)}
 
 
+def _draw_cable(rng: Rng) -> ChannelAndShape:
+    return "force", {"phase": rng.uniform(-math.pi, math.pi), **_random_direction(rng)}
+
+
 # Kind -> what it is a function of, its draw, and its signal where it has one.
 TABLE: dict[str, tuple[str, Callable[[Rng], ChannelAndShape], Callable[[Any, Any], float] | None]] = {
     "position": ("position", _draw_position, _position),
@@ -224,6 +265,17 @@ TABLE: dict[str, tuple[str, Callable[[Rng], ChannelAndShape], Callable[[Any, Any
     "stochastic": ("chance", _draw_stochastic, None),
 }
 KINDS = tuple(TABLE)
+# Drawn by name only: laws that a learner may find (benchmarks.beyond).
+TABLE |= {
+    "flapping": (
+        "airspeed",
+        lambda rng: ("rate", {"x": 0.0, "y": float(rng.choice([-1.0, 1.0])), "z": 0.0}),
+        _flapping,
+    ),
+    "cable": ("heading", _draw_cable, _cable),
+    "heating": ("time", lambda rng: ("thrust", DOWN | {"warming_s": rng.uniform(*WARMING_S)}), _heating),
+    "payload": ("airspeed", lambda rng: ("force", {"string_m": rng.uniform(*STRING_M)}), None),
+}
 
 
 def draw_outside(rng: Rng, kind: str | None = None, amplitude: float | None = None) -> Outside:

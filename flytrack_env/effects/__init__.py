@@ -11,7 +11,7 @@ import numpy as np
 from flytrack_env.effects.accelerometer_bias import ACCELEROMETER_BIAS, AccelerometerBias
 from flytrack_env.effects.accelerometer_scale import ACCELEROMETER_SCALE, AccelerometerScale
 from flytrack_env.effects.actual_rates import ACTUAL_RATES, ActualRates
-from flytrack_env.effects.base import STAGES, Effect, Pose, Range, StepContext
+from flytrack_env.effects.base import STAGES, Effect, FlightTime, Pose, Range, StepContext
 from flytrack_env.effects.betaflight_loop import BETAFLIGHT_LOOP, BetaflightLoop
 from flytrack_env.effects.betaflight_rates import BETAFLIGHT_RATES, BetaflightRates
 from flytrack_env.effects.command_delay import COMMAND_DELAY, MOST_STEPS, USUAL_STEPS, CommandDelay
@@ -20,6 +20,8 @@ from flytrack_env.effects.gyro_bias import GYRO_BIAS, GyroBias
 from flytrack_env.effects.gyro_scale import GYRO_SCALE, GyroScale
 from flytrack_env.effects.imu_latency import IMU_LATENCY, ImuLatency
 from flytrack_env.effects.imu_offset import IMU_OFFSET, ImuOffset
+from flytrack_env.effects.learned_law import LEARNED_LAW, LearnedLaw
+from flytrack_env.effects.learned_residual import LEARNED_RESIDUAL, LearnedResidual
 from flytrack_env.effects.linear_drag import LINEAR_DRAG, LinearDrag
 from flytrack_env.effects.mocap_latency import MOCAP_LATENCY, MocapLatency
 from flytrack_env.effects.motor_imbalance import MOTOR_IMBALANCE, MotorImbalance
@@ -77,11 +79,14 @@ EFFECTS: tuple[Effect, ...] = (
     GYRO_BIAS,
     MOCAP_LATENCY,
 )
+# Without a law of their own: what a log has shown beyond all of these.
+LEARNED: tuple[Effect, ...] = (LEARNED_LAW, LEARNED_RESIDUAL)
+ORDER = (*EFFECTS, *LEARNED)
 ROUNDING = 1e-5  # of float32 times
 # Delays that are drawn around those of a model are longer by this factor and so many seconds, at most.
 DRAWN_LONGER, DRAWN_LATER_S = 1.25, 0.02
-BY_NAME = {effect.name: effect for effect in EFFECTS}
-_BY_CLASS = {effect.parameters: effect for effect in EFFECTS}
+BY_NAME = {effect.name: effect for effect in ORDER}
+_BY_CLASS = {effect.parameters: effect for effect in ORDER}
 
 
 def effect_of(parameters: Any) -> Effect:
@@ -92,7 +97,7 @@ def effect_of(parameters: Any) -> Effect:
     """
     effect = _BY_CLASS.get(type(parameters))
     if effect is None:
-        names = ", ".join(effect.parameters.__name__ for effect in EFFECTS)
+        names = ", ".join(effect.parameters.__name__ for effect in ORDER)
         raise TypeError(f"effect: found {type(parameters).__name__}, expected one of {names}")
     return effect
 
@@ -117,9 +122,9 @@ def check_parameters(parameters: Any, dt: Any, delay_steps: int = USUAL_STEPS) -
 
 
 def merge(present: tuple[Any, ...], *added: Any) -> tuple[Any, ...]:
-    """Return parameters of effects in the order of ``EFFECTS``; what is added replaces its like."""
+    """Return parameters of effects in the order of ``ORDER``; what is added replaces its like."""
     by_name = {effect_of(parameters).name: parameters for parameters in (*present, *added)}
-    return tuple(by_name[effect.name] for effect in EFFECTS if effect.name in by_name)
+    return tuple(by_name[effect.name] for effect in ORDER if effect.name in by_name)
 
 
 def lasting_s(parameters: Any) -> np.ndarray:
@@ -148,6 +153,11 @@ def start_memories(effects: tuple[Any, ...], drone: Drone, delay_steps: int = US
         return effect.start(parameters, drone, *([delay_steps] if effect.most_steps else []))
 
     return tuple(start(parameters) for parameters in effects)
+
+
+def at_time(memories: tuple[Any, ...], time_s: Scalar) -> tuple[Any, ...]:
+    """Return memories of effects at a time since the flight began, s."""
+    return tuple(FlightTime(time_s) if isinstance(one, FlightTime) else one for one in memories)
 
 
 def acts(effects: tuple[Any, ...], stage: str) -> bool:
@@ -234,6 +244,7 @@ def observe(
 __all__ = [
     "BY_NAME",
     "EFFECTS",
+    "LEARNED",
     "MOST_STEPS",
     "STAGES",
     "USUAL_STEPS",
@@ -249,6 +260,8 @@ __all__ = [
     "GyroScale",
     "ImuLatency",
     "ImuOffset",
+    "LearnedLaw",
+    "LearnedResidual",
     "LinearDrag",
     "MocapLatency",
     "MotorImbalance",
@@ -272,6 +285,7 @@ __all__ = [
     "Wind",
     "YawReaction",
     "acts",
+    "at_time",
     "check_parameters",
     "delay_steps_of",
     "effect_of",

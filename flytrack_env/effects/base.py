@@ -32,6 +32,8 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
+import jax.numpy as jnp
+
 from flytrack_env.motion import Motion
 from flytrack_env.quaternion import Quaternion, Scalar, Vec3
 from flytrack_env.state import Action, Drone
@@ -60,6 +62,17 @@ class Pose(NamedTuple):
     pos_w: Vec3
     vel_w: Vec3
     quat: Quaternion
+
+
+class FlightTime(NamedTuple):
+    """The memory of an effect that needs the time since the flight began, s; a replay of a log sets it."""
+
+    time_s: Scalar
+
+
+def start_of_flight(drone: Drone) -> FlightTime:
+    """Return the time at which a flight begins."""
+    return FlightTime(jnp.zeros_like(jnp.asarray(drone.battery_v)))
 
 
 class StepContext(NamedTuple):
@@ -153,6 +166,8 @@ class Effect:
     remember: (parameters, memory, context) -> memory after a step.
     observe: (parameters, memory, offset_b, dt) -> memory that has taken up how far measured body rates are
     from those of the model, rad/s, and what of that it does not hold. dt: since the last measurement, s.
+    static: the field that is no number but a structure, the last; written: its JSON values; read: from those,
+    raising ValueError that begins with the field. Such an effect is learnt, not looked for.
     """
 
     name: str
@@ -183,6 +198,9 @@ class Effect:
     start: Callable[..., Any] | None = None
     remember: Callable[[Any, Any, StepContext], Any] | None = None
     observe: Callable[[Any, Any, Vec3, Scalar], tuple[Any, Vec3]] | None = None
+    static: str = ""
+    written: Callable[[Any], Any] | None = None
+    read: Callable[[Any], Any] | None = None
 
     @property
     def stages(self) -> tuple[str, ...]:

@@ -35,7 +35,8 @@ class RandomizationParams(NamedTuple):
     1 / thrust_scale. lag_factor_*: of each of its four time constants. low, high: parameters of effects
     (``flytrack_env.effects``), the same effects in both; None leaves a parameter alone.
     effect_factor_*: of what the model itself has of these effects. An effect that was identified is known:
-    its departure from neutral is scaled, instead of drawn from low to high.
+    its departure from neutral is scaled, instead of drawn from low to high; but what was learnt, of which
+    ``spread`` is drawn, in standard errors.
     """
 
     mass_factor_low: Scalar = 0.8
@@ -91,10 +92,10 @@ def _draw(draws: Draws, model: ModelParameters, low: Any, high: Any, factors: tu
     known, neutral = model.effect(effect.name), effect.parameters()
     values = {}
     for field, lowest in low._asdict().items():
-        if lowest is None:
+        if lowest is None or field == effect.static:
             continue
         name = f"{effect.name}.{field}"
-        if type(low) in present:
+        if type(low) in present and not effect.static:
             departure = getattr(known, field) - getattr(neutral, field)
             value = getattr(neutral, field) + departure * draws.uniform(name, *factors)
             bounds = effect.ranges[field]
@@ -191,7 +192,7 @@ def _check_ranges(ranges: RandomizationParams, params: EnvParams, delay_steps: i
     ]
     for low, high in zip(ranges.low, ranges.high, strict=True):
         effect = effect_of(low)
-        known = {name: value for name, value in high._asdict().items() if value is not None}
+        known = {name: getattr(high, name) for name in effect.ranges if getattr(high, name) is not None}
         check_parameters(effect.parameters()._replace(**known), params.dt, delay_steps)
         for name, bounds in effect.ranges.items():
             pair = getattr(low, name), getattr(high, name)

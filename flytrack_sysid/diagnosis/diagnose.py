@@ -10,9 +10,11 @@ import numpy as np
 
 from flytrack_env.dynamics import ModelParameters, nominal_parameters
 from flytrack_env.motion import Motion
+from flytrack_sysid.diagnosis.beyond import with_learned
 from flytrack_sysid.diagnosis.lanes import Lanes, make_lanes, thinned, voltages_of
 from flytrack_sysid.diagnosis.late_poses import with_late_poses
 from flytrack_sysid.diagnosis.lateness import judged_as_logged, latency_of, read_poses
+from flytrack_sysid.diagnosis.learned import find_learned
 from flytrack_sysid.diagnosis.motion_choice import Moves, how_it_moves
 from flytrack_sysid.diagnosis.noise import first_guess
 from flytrack_sysid.diagnosis.onset import (
@@ -279,6 +281,13 @@ def summarize(judged: Judged, parts: Split) -> Diagnosis:
     beyond = (*judged.refused, *(one for one in found if one.beyond))
     vectors = {"nominal": problem.start, "refitted_base": selection.base.vector, "extended": extended.vector}
     extended = at_end(selection, extended)
+    learned = None
+    # A law that acts for a part of the log is not looked for beside an effect that does.
+    if selection.unexplained.shares and extended.effects.isdisjoint(one.effect for one in problem.windows):
+        always, always_held = (replace(one, windows=()) for one in (problem, test))
+        found_more = find_learned(always, always_held, extended, selection.base.vector, refined.judge)
+        if found_more is not None:
+            learned, extended = found_more[0], extended._replace(vector=found_more[1])
     limits = not_identifiable(state, linearization, model, (*found, *negligible))
     flying = {**vectors, "extended": extended.vector}
     prediction = prediction_of(refined, flying)
@@ -303,7 +312,7 @@ def summarize(judged: Judged, parts: Split) -> Diagnosis:
         error=errors_of(test, vectors, prediction),
         nominal=problem.like,
         base=model_of(problem, selection.base),
-        extended=model_of(problem, extended),
+        extended=with_learned(model_of(problem, extended), learned),
         noise=sensor_noise(problem),
         voltages=voltages_of(problem.lanes),
         source=Path(parts.logged.source).name,
@@ -313,6 +322,7 @@ def summarize(judged: Judged, parts: Split) -> Diagnosis:
         changed=changed_parameters(linearization, extended, refined),
         half_response_s=half_responses_of(linearization, model, refined, flying),
         outliers=outliers,
+        learned=learned,
     )
 
 

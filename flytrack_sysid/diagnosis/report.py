@@ -12,7 +12,7 @@ from flytrack_env.effects import BY_NAME
 from flytrack_env.files import write_atomically
 from flytrack_env.pictures.drawing import new_figure, plain
 from flytrack_env.scene import BLUE, GREEN, GREY, ORANGE
-from flytrack_sysid.diagnosis.evidence import EVIDENCE, draw_cause, list_words, without, words_of
+from flytrack_sysid.diagnosis.evidence import EVIDENCE, Panel, draw_cause, list_words, without, words_of
 from flytrack_sysid.diagnosis.result import (
     CAUSES_FOUND,
     CONSISTENT,
@@ -169,6 +169,17 @@ def _beyond(diagnosis: Diagnosis) -> str:
     return f"Beyond the list, so that its cause may be another: {listed}." if listed else ""
 
 
+def _learned(diagnosis: Diagnosis) -> str:
+    """Return what was learnt beyond the list, as a sentence; nothing without any."""
+    if diagnosis.learned is None:
+        return ""
+    kinds = [
+        *(["a law"] if diagnosis.learned.law.terms else []),
+        *(["a residual"] if diagnosis.learned.networks.networks else []),
+    ]
+    return f"The extended model has {' and '.join(kinds)} for it, learnt from this log."
+
+
 def verdict_of(diagnosis: Diagnosis) -> Verdict:
     """Return the verdict in a sentence or two."""
     left = diagnosis.unexplained
@@ -178,10 +189,11 @@ def verdict_of(diagnosis: Diagnosis) -> Verdict:
     beyond = _beyond(diagnosis)
     if not diagnosis.causes:
         text = f"The model is wrong, and no known cause explains it.{depends}"
-        return Verdict(" ".join(filter(None, [text, beyond])), "open")
+        return Verdict(" ".join(filter(None, [text, beyond, _learned(diagnosis)])), "open")
     parts = [_faults(diagnosis), _gain(diagnosis), beyond]
     if left.depends_on:
         parts.append(f"Something else remains that no known cause explains.{depends}")
+    parts.append(_learned(diagnosis))
     return Verdict(" ".join(filter(None, parts)), "found" if diagnosis.verdict == CAUSES_FOUND else "open")
 
 
@@ -295,7 +307,21 @@ def _unexplained_parts(diagnosis: Diagnosis) -> list[Part]:
     return parts
 
 
-_LESS = "without "
+def _learned_parts(diagnosis: Diagnosis, found: Traces) -> list[Part]:
+    """Return the formulas of what was learnt, and what is left without and with it."""
+    learned = diagnosis.learned
+    if learned is None:
+        return []
+    panels = [Panel(*one) for one in learned.drawn()][:MOST_PICTURED]
+    figure = draw_cause("what was learnt", panels, found, _LESS + LEARNT, "extended")
+    return [Bullets(learned.text().splitlines()), Picture(png_of(figure), LEARNT_READING)]
+
+
+_LESS, LEARNT = "without ", "what was learnt"
+LEARNT_READING = (
+    "Orange: what the extended model leaves without it, nothing else refitted. The line is what was learnt. "
+    "It holds in the ranges that were flown; a residual adds nothing outside them."
+)
 
 
 def traces_of(diagnosis: Diagnosis, log: FlightLog) -> Traces:
@@ -303,6 +329,10 @@ def traces_of(diagnosis: Diagnosis, log: FlightLog) -> Traces:
     models = {"nominal": diagnosis.nominal, "extended": diagnosis.extended}
     for cause in diagnosis.causes:
         models[_LESS + cause.effect] = without(diagnosis.extended, diagnosis.nominal, cause.effect)
+    if diagnosis.learned is not None:
+        gone = tuple(map(type, diagnosis.learned.effects))
+        kept = tuple(one for one in diagnosis.extended.effects if type(one) not in gone)
+        models[_LESS + LEARNT] = diagnosis.extended._replace(effects=kept)
     return traces(log, models, like="extended")
 
 
@@ -349,7 +379,7 @@ def html_of(diagnosis: Diagnosis, log: FlightLog) -> str:
         Section("Errors before and after", [*_errors_picture(diagnosis), _errors_table(diagnosis)]),
         *([Section("The evidence, cause by cause", evidence)] if evidence else []),
         Section("What this log could not show, and what to fly", [_limits_part(diagnosis)]),
-        Section("What remains unexplained", _unexplained_parts(diagnosis)),
+        Section("What remains unexplained", _unexplained_parts(diagnosis) + _learned_parts(diagnosis, found)),
         Section("How this was done", [Bullets(HOW)]),
     ]
     return page("What the model gets wrong", sections, introduction)
@@ -401,6 +431,8 @@ def text_of(diagnosis: Diagnosis) -> str:
         lines.append(f"time from a stick to half of the response: {times}")
     if diagnosis.unexplained.depends_on:
         lines.append(f"unexplained, depends on: {', '.join(diagnosis.unexplained.depends_on)}")
+    if diagnosis.learned is not None:
+        lines += [f"learnt: {line}" for line in diagnosis.learned.text().splitlines()]
     closing = _gain(diagnosis) if diagnosis.causes else ""
     return "\n".join([*lines, *_limits_text(diagnosis), *diagnosis.warnings, *filter(None, [closing])])
 

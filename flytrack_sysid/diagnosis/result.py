@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from flytrack_env.dynamics import ModelParameters
+from flytrack_sysid.diagnosis.beyond import Learned
 
 SCHEMA = 1
 TO_LOG = "log "  # what comes instead of a manoeuvre where a channel is missing
@@ -159,7 +160,8 @@ class Diagnosis:
     what is searched, so that it is not named. source, sha256: of the log. noise: by channel and axis, fitted
     standard deviations of the sensors. voltages: the lowest and the highest of the battery that were learnt
     from, V; None where it was not measured. prediction: how far ahead the models predict. changed: every
-    parameter of the extended model that is not as in the nominal one. half_response_s: by model (nominal,
+    parameter of the extended model that is not as in the nominal one. learned: a law or a residual for what
+    is unexplained, part of the extended model. half_response_s: by model (nominal,
     refitted_base, extended) and by stick. outliers: by channel, if any.
     """
 
@@ -182,6 +184,7 @@ class Diagnosis:
     changed: tuple[Changed, ...] = ()
     half_response_s: Mapping[str, Mapping[str, HalfResponse]] = field(default_factory=dict)
     outliers: Mapping[str, Outliers] = field(default_factory=dict)
+    learned: Learned | None = None
 
     def as_json(self) -> dict[str, Any]:
         """Return the content of diagnosis.json: the fields under the names of its schema, six digits."""
@@ -202,6 +205,7 @@ class Diagnosis:
             "not_identifiable": limits,
             "motion": self.extended.motion.value,
             "error": _plain(self.error),
+            "learned": None if self.learned is None else _plain(self.learned.as_json()),
             "prediction": _plain(self.prediction),
             "changed": _plain(self.changed),
             "half_response_s": _plain(self.half_response_s),

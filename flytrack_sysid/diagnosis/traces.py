@@ -107,6 +107,8 @@ REGRESSORS: dict[str, tuple[str, str]] = {
     },
     "height": ("height", "m"),
     "heading": ("heading", "deg"),
+    "tilt": ("tilt", "deg"),
+    "voltage": ("battery voltage", "V"),
 }
 
 
@@ -185,6 +187,8 @@ def _regressors(model: ModelParameters, record: Record, applied: np.ndarray) -> 
         "thrust_change": change[:, 3],
         "height": record.pos_w[:, 2],
         "heading": np.rad2deg(np.arctan2(body_x[:, 1], body_x[:, 0])),
+        "tilt": np.rad2deg(np.arccos(np.clip(attitude.apply((0.0, 0.0, 1.0))[:, 2], -1.0, 1.0))),
+        "voltage": record.battery_v,
     }
     for index, axis in enumerate(_AXES):
         found[f"airspeed_{axis}"] = airspeed[:, index]

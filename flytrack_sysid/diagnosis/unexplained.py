@@ -214,7 +214,7 @@ class SideTest(NamedTuple):
         """Return the test with more columns that are free already."""
         return self._replace(given=np.concatenate([self.given, *columns], axis=1))
 
-    def _projected(self, columns: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    def projected(self, columns: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Return shares of given columns in others, information and score with those projected out.
 
         Last, the step along the given columns alone.
@@ -231,7 +231,7 @@ class SideTest(NamedTuple):
 
     def gain(self, columns: np.ndarray) -> tuple[float, float, np.ndarray]:
         """Return chi2 of features besides what is given, its inflation, and their coefficients."""
-        share, own, score, alone = self._projected(columns)
+        share, own, score, alone = self.projected(columns)
         own += np.eye(len(own))  # a weak prior: features of size 1
         step = solve(own, score)
         given = alone - share @ step
@@ -241,14 +241,14 @@ class SideTest(NamedTuple):
 
     def best_group(self, columns: np.ndarray, size: int) -> int:
         """Return which group of so many consecutive features explains most by itself."""
-        _, own, score, _ = self._projected(columns)
+        _, own, score, _ = self.projected(columns)
         inner = [slice(start, start + size) for start in range(0, len(score) - size + 1, size)]
         chi2 = [score[part] @ solve(own[part, part] + np.eye(size), score[part]) for part in inner]
         return int(np.argmax(chi2))
 
     def noncentrality(self, columns: np.ndarray, size: np.ndarray) -> float:
         """Return the squared signature of slopes at a size, fitted again beside what is given."""
-        _, own, score, _ = self._projected(columns)
+        _, own, score, _ = self.projected(columns)
         again = size - solve(own, score)
         return float(again @ own @ again)
 

@@ -13,6 +13,7 @@ from flytrack_env import effects
 from flytrack_env.dynamics import start_rates, step
 from flytrack_env.effects import (
     EFFECTS,
+    LEARNED,
     BetaflightLoop,
     CommandDelay,
     Effect,
@@ -100,9 +101,10 @@ def test_declaration_is_consistent(effect: Effect) -> None:
 
 
 def test_every_file_of_the_folder_is_in_the_list() -> None:
-    files = {path.stem for path in Path(effects.__path__[0]).glob("*.py")} - {"__init__", "base"}
-    assert files == {effect.name for effect in EFFECTS} == set(effects.BY_NAME)
-    assert len(files) == len(EFFECTS)
+    files = {path.stem for path in Path(effects.__path__[0]).glob("*.py")} - {"__init__", "base", "grammar"}
+    every = (*EFFECTS, *LEARNED)
+    assert files == {effect.name for effect in every} == set(effects.BY_NAME)
+    assert len(files) == len(every)
 
 
 @OVER_EFFECTS

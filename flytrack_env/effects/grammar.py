@@ -1,0 +1,429 @@
+"""The grammar of laws that were learnt from a log: numbers and a fixed vocabulary, nothing is code.
+
+A law is a sum of terms, up to three on force and three on rate. A term is a vector in a frame times one or
+two factors; a factor is a shape of a quantity, ``bump(airspeed; 7, 1.2)``. Shapes and quantities are the
+tables below. A law is a static part of a model: what is compiled computes its terms only.
+"""
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from flytrack_env.effects.base import Effect, FlightTime, Range, StepContext, start_of_flight
+from flytrack_env.messages import quote_value
+from flytrack_env.quaternion import Scalar, Vec3
+from flytrack_env.state import Action
+
+TINY_SPEED = 0.3  # m/s: slower flight has no direction
+MOST_TERMS, MOST_FACTORS = 6, 2
+ACTS, FRAMES = ("force", "rate"), ("body", "world", "air")
+LARGEST = 1e6  # of any number in a law
+XYZ = 3
+
+
+class Moment(NamedTuple):
+    """What a law may look at, scalars or arrays of one shape; units and frames as in ``StepContext``.
+
+    time_s: since the start of the flight.
+    """
+
+    pos_w: Vec3
+    rates_b: Vec3
+    body_axes_w: tuple[Vec3, Vec3, Vec3]
+    airspeed_b: Vec3
+    applied: Action
+    thrust_acc: Scalar
+    battery_v: Scalar
+    time_s: Scalar
+
+
+def moment_of(context: StepContext, time_s: Scalar) -> Moment:
+    """Return what a law may look at, of the context of the stages rates and force."""
+    drone = context.drone
+    return Moment(
+        drone.pos_w,
+        drone.rates_b,
+        context.body_axes_w,
+        context.airspeed_b(),
+        context.applied,
+        context.thrust_acc,
+        drone.battery_v,
+        time_s,
+    )
+
+
+class Quantity(NamedTuple):
+    """A quantity of a moment: its unit, and the lowest and highest that a drone in flight can have."""
+
+    unit: str
+    low: float
+    high: float
+    of: Callable[[Moment], Scalar]
+
+
+def _tilt(moment: Moment) -> Scalar:
+    # The chord of the angle: no inverse cosine, whose slope is infinite at level flight.
+    upright = jnp.clip(moment.body_axes_w[2].z, -1.0, 1.0)
+    return _root(2.0 * (1.0 - upright))
+
+
+def _heading(moment: Moment) -> tuple[Scalar, Scalar]:
+    """Return cosine and sine of the heading; 0 where the nose points straight up or down."""
+    nose = moment.body_axes_w[0]
+    flat = jnp.maximum(_root(nose.x * nose.x + nose.y * nose.y), 1e-6)
+    return nose.x / flat, nose.y / flat
+
+
+def _root(square: Scalar) -> Scalar:
+    is_positive = square > 0.0
+    return jnp.where(is_positive, jnp.sqrt(jnp.where(is_positive, square, 1.0)), 0.0)
+
+
+QUANTITIES: dict[str, Quantity] = {
+    "airspeed": Quantity("m/s", 0.0, 60.0, lambda m: m.airspeed_b.norm()),
+    "airspeed_x": Quantity("m/s", -60.0, 60.0, lambda m: m.airspeed_b.x),
+    "airspeed_y": Quantity("m/s", -60.0, 60.0, lambda m: m.airspeed_b.y),
+    "airspeed_z": Quantity("m/s", -60.0, 60.0, lambda m: m.airspeed_b.z),
+    "edgewise": Quantity(
+        "m/s", 0.0, 60.0, lambda m: _root(m.airspeed_b.x * m.airspeed_b.x + m.airspeed_b.y * m.airspeed_b.y)
+    ),
+    "thrust": Quantity("m/s^2", 0.0, 100.0, lambda m: jnp.maximum(m.thrust_acc, 0.0)),
+    "rate_x": Quantity("rad/s", -40.0, 40.0, lambda m: m.rates_b.x),
+    "rate_y": Quantity("rad/s", -40.0, 40.0, lambda m: m.rates_b.y),
+    "rate_z": Quantity("rad/s", -40.0, 40.0, lambda m: m.rates_b.z),
+    "roll": Quantity("1", -1.0, 1.0, lambda m: m.applied.roll),
+    "pitch": Quantity("1", -1.0, 1.0, lambda m: m.applied.pitch),
+    "yaw": Quantity("1", -1.0, 1.0, lambda m: m.applied.yaw),
+    "throttle": Quantity("1", -1.0, 1.0, lambda m: m.applied.thrust),
+    "tilt": Quantity("rad", 0.0, 2.0, _tilt),
+    "height": Quantity("m", -1000.0, 1000.0, lambda m: m.pos_w.z),
+    "x": Quantity("m", -1000.0, 1000.0, lambda m: m.pos_w.x),
+    "y": Quantity("m", -1000.0, 1000.0, lambda m: m.pos_w.y),
+    "voltage": Quantity("V", 0.0, 60.0, lambda m: m.battery_v),
+    "time": Quantity("s", 0.0, 3600.0, lambda m: m.time_s),
+    "heading_cosine": Quantity("1", -1.0, 1.0, lambda m: _heading(m)[0]),
+    "heading_sine": Quantity("1", -1.0, 1.0, lambda m: _heading(m)[1]),
+}
+
+
+def _bump(value: Scalar, middle: float, width: float) -> Scalar:
+    off = (value - middle) * (1.0 / width)
+    return jnp.exp(-0.5 * off * off)
+
+
+def _power(value: Scalar, exponent: float, offset: float) -> Scalar:
+    base = value + offset
+    if exponent == 0.5:
+        return _root(base)
+    if exponent == 1.5:
+        return base * _root(base)
+    return base ** int(exponent) if exponent > 0 else 1.0 / base ** int(-exponent)
+
+
+def _wave(moment: Moment, order: float, phase: float) -> Scalar:
+    """Return cos(order * heading + phase), from the heading's cosine and sine."""
+    cosine, sine = _heading(moment)
+    real, imaginary = jnp.ones_like(cosine), jnp.zeros_like(cosine)
+    for _ in range(int(order)):
+        real, imaginary = real * cosine - imaginary * sine, imaginary * cosine + real * sine
+    return math.cos(phase) * real - math.sin(phase) * imaginary
+
+
+def _place(moment: Moment, x: float, y: float, z: float, radius: float) -> Scalar:
+    off = moment.pos_w - Vec3(x, y, z)
+    return jnp.exp(off.dot(off) * (-0.5 / radius**2))
+
+
+class Shape(NamedTuple):
+    """A shape: the names of its numbers, the words of its formula, the quantities that have it, and itself.
+
+    positive: numbers that must be above 0. of_moment: it takes the moment in place of the quantity's value,
+    since its quantity is a direction or a place.
+    """
+
+    numbers: tuple[str, ...]
+    words: str
+    quantities: tuple[str, ...]
+    at: Callable[..., Scalar]
+    positive: tuple[str, ...] = ()
+    of_moment: bool = False
+
+
+SCALARS = tuple(QUANTITIES)
+EXPONENTS = (-2.0, -1.0, 0.5, 1.0, 1.5, 2.0, 3.0)
+SHAPES: dict[str, Shape] = {
+    "power": Shape(("exponent", "offset"), "({q} + {offset})^{exponent}", SCALARS, _power),
+    "bump": Shape(("middle", "width"), "bump({q}; {middle}, {width})", SCALARS, _bump, ("width",)),
+    "step": Shape(
+        ("middle", "width"),
+        "step({q}; {middle}, {width})",
+        SCALARS,
+        lambda value, middle, width: 0.5 + 0.5 * jnp.tanh((value - middle) * (1.0 / width)),
+        ("width",),
+    ),
+    "saturation": Shape(
+        ("scale",),
+        "(1 - exp(-{q}/{scale}))",
+        ("time",),
+        lambda value, scale: 1.0 - jnp.exp(value * (-1.0 / scale)),
+        ("scale",),
+    ),
+    "wave": Shape(
+        ("order", "phase"), "cos({order} {q} + {phase})", ("heading",), _wave, ("order",), of_moment=True
+    ),
+    "place": Shape(
+        ("x", "y", "z", "radius"),
+        "bump({q}; {x}, {y}, {z}; {radius})",
+        ("position",),
+        _place,
+        ("radius",),
+        of_moment=True,
+    ),
+}
+
+
+@dataclass(frozen=True)
+class Factor:
+    """A shape of a quantity; numbers: those of the shape."""
+
+    quantity: str
+    shape: str
+    numbers: tuple[float, ...]
+
+    def at(self, moment: Moment) -> Scalar:
+        """Return its value."""
+        shape = SHAPES[self.shape]
+        given = moment if shape.of_moment else QUANTITIES[self.quantity].of(moment)
+        return shape.at(given, *self.numbers)
+
+    def text(self) -> str:
+        """Return its formula."""
+        shape = SHAPES[self.shape]
+        named = {name: f"{value:.4g}" for name, value in zip(shape.numbers, self.numbers, strict=True)}
+        if self.shape == "power":
+            base = self.quantity if self.numbers[1] == 0.0 else f"({self.quantity} + {named['offset']})"
+            return base if self.numbers[0] == 1.0 else f"{base}^{named['exponent']}"
+        return shape.words.format(q=self.quantity, **named)
+
+
+@dataclass(frozen=True)
+class Term:
+    """A vector times factors.
+
+    acts: "force", m/s^2 of specific force, or "rate", rad/s of body rates. frame: of the vector: body, world,
+    or air, of which the first component alone is along the direction of flight through the air. coefficients,
+    standard_errors: three each.
+    """
+
+    acts: str
+    frame: str
+    factors: tuple[Factor, ...]
+    coefficients: tuple[float, ...]
+    standard_errors: tuple[float, ...]
+
+    def basis(self, moment: Moment) -> tuple[Vec3, ...]:
+        """Return the unit vectors of the coefficients, body frame."""
+        unit = tuple(Vec3(*row) for row in np.eye(XYZ).tolist())
+        if self.frame == "body":
+            return unit
+        if self.frame == "world":
+            return tuple(Vec3(*(axis.dot(one) for axis in moment.body_axes_w)) for one in unit)
+        speed = jnp.maximum(moment.airspeed_b.norm(), TINY_SPEED)
+        return (moment.airspeed_b.scale(1.0 / speed),)
+
+    def signal(self, moment: Moment) -> Scalar:
+        """Return the product of its factors."""
+        return math.prod((factor.at(moment) for factor in self.factors[1:]), start=self.factors[0].at(moment))
+
+    def at(self, moment: Moment, spread: Scalar) -> Vec3:
+        """Return its vector, body frame; spread: by how many standard errors each coefficient is larger."""
+        signal, total = self.signal(moment), Vec3(0.0, 0.0, 0.0)
+        for place, one in enumerate(self.basis(moment)):
+            if self.coefficients[place] or self.standard_errors[place]:
+                size = self.coefficients[place] + spread * self.standard_errors[place]
+                total = total + one.scale(size * signal)
+        return total
+
+    def text(self) -> str:
+        """Return its formula, with the standard errors of its coefficients."""
+        number = 1 if self.frame == "air" else XYZ
+        values = ", ".join(f"{value:.3g}" for value in self.coefficients[:number])
+        return f"{self.acts} ({self.frame}) += ({values}) {' '.join(one.text() for one in self.factors)}"
+
+
+@jax.tree_util.register_static
+@dataclass(frozen=True)
+class Law:
+    """A sum of terms; a pytree without leaves, so that each law compiles its own program."""
+
+    terms: tuple[Term, ...] = ()
+
+    @property
+    def parts(self) -> tuple[Term, ...]:
+        """What acts on force or rate, each by itself."""
+        return self.terms
+
+    def uses(self, quantity: str) -> bool:
+        """Return whether any term looks at a quantity."""
+        return any(one.quantity == quantity for term in self.terms for one in term.factors)
+
+    def text(self) -> str:
+        """Return its formula, a line a term."""
+        return "\n".join(term.text() for term in self.terms)
+
+    def as_json(self) -> list[dict[str, Any]]:
+        """Return the terms as JSON values."""
+        return [
+            {
+                "acts": term.acts,
+                "frame": term.frame,
+                "coefficients": list(term.coefficients),
+                "standard_errors": list(term.standard_errors),
+                "factors": [
+                    {
+                        "quantity": one.quantity,
+                        "shape": one.shape,
+                        **dict(zip(SHAPES[one.shape].numbers, one.numbers, strict=True)),
+                    }
+                    for one in term.factors
+                ],
+            }
+            for term in self.terms
+        ]
+
+
+def learned_effect(static: str, read: Callable[[Any], Any], **declared: Any) -> Effect:
+    """Return the effect of something learnt, whose parameters are ``scale``, ``spread`` and a structure.
+
+    static: name of the structure; it has ``parts``, each with ``acts`` and ``at(moment, spread)``, ``uses``
+    and ``as_json``. read: from JSON values. declared: what else there is to an effect.
+    """
+
+    def added(parameters: Any, acts: str, flight: Any, value_b: Vec3, context: StepContext) -> Vec3:
+        parts = [one for one in getattr(parameters, static).parts if one.acts == acts]
+        if not parts:
+            return value_b
+        moment = moment_of(context, 0.0 if flight is None else flight.time_s)
+        for one in parts:
+            value_b = value_b + one.at(moment, parameters.spread).scale(parameters.scale)
+        return value_b
+
+    return Effect(
+        ranges={"scale": Range(-2.0, 2.0, "1"), "spread": Range(-3.0, 3.0, "1")},
+        notable={"scale": 0.05},
+        shapes=("spread",),
+        needs=("q",),
+        force=lambda parameters, flight, value, context: added(parameters, "force", flight, value, context),
+        rates=lambda parameters, flight, value, context: added(parameters, "rate", flight, value, context),
+        start=lambda parameters, drone: (
+            start_of_flight(drone) if getattr(parameters, static).uses("time") else None
+        ),
+        remember=lambda parameters, flight, context: (
+            None if flight is None else FlightTime(flight.time_s + context.dt)
+        ),
+        static=static,
+        written=lambda structure: structure.as_json(),
+        read=read,
+        **declared,
+    )
+
+
+def law_from_json(values: Any) -> Law:
+    """Return the law in JSON values of ``Law.as_json``.
+
+    Raises:
+        ValueError: what is not in the grammar, numbers that are not finite, a pole within the envelope; the
+            message begins with the field.
+    """
+    terms = listed("terms", values, MOST_TERMS)
+    return Law(tuple(_term(f"terms[{place}]", one) for place, one in enumerate(terms)))
+
+
+def listed(where: str, value: Any, most: int) -> list[Any]:
+    """Return a value that must be a list of 1 to ``most``; where: the field, for the ValueError."""
+    if not isinstance(value, list) or not 1 <= len(value) <= most:
+        raise ValueError(f"{where}: found {quote_value(value)}, expected a list of 1 to {most}")
+    return value
+
+
+def fields_of(where: str, value: Any, names: tuple[str, ...]) -> Mapping[str, Any]:
+    """Return a value that must be an object with exactly these fields."""
+    if not isinstance(value, dict) or set(value) != set(names):
+        found = sorted(value) if isinstance(value, dict) else value
+        raise ValueError(f"{where}: found {quote_value(found)}, expected exactly {', '.join(names)}")
+    return value
+
+
+def chosen(where: str, value: Any, choices: Any) -> str:
+    """Return a value that must be one of some names."""
+    if not isinstance(value, str) or value not in choices:
+        raise ValueError(f"{where}: found {quote_value(value)}, expected one of {', '.join(choices)}")
+    return value
+
+
+def number(where: str, value: Any) -> float:
+    """Return a value that must be a finite number of at most LARGEST."""
+    is_number = isinstance(value, (int, float)) and not isinstance(value, bool)
+    if not is_number or not abs(value) <= LARGEST:
+        raise ValueError(f"{where}: found {quote_value(value)}, expected a number of at most {LARGEST:g}")
+    return float(value)
+
+
+def _term(where: str, value: Any) -> Term:
+    names = ("acts", "frame", "coefficients", "standard_errors", "factors")
+    fields = fields_of(where, value, names)
+    numbers = []
+    for name in ("coefficients", "standard_errors"):
+        own = listed(f"{where}.{name}", fields[name], XYZ)
+        if len(own) != XYZ:
+            raise ValueError(f"{where}.{name}: found {len(own)} numbers, expected {XYZ}")
+        numbers.append(tuple(number(f"{where}.{name}", one) for one in own))
+    if min(numbers[1]) < 0.0:
+        raise ValueError(f"{where}.standard_errors: found {quote_value(numbers[1])}, expected 0 or more")
+    frame = chosen(f"{where}.frame", fields["frame"], FRAMES)
+    if frame == "air" and any(numbers[0][1:]):
+        raise ValueError(
+            f"{where}.coefficients: found {numbers[0]}, expected only the first in the frame air"
+        )
+    factors = listed(f"{where}.factors", fields["factors"], MOST_FACTORS)
+    return Term(
+        chosen(f"{where}.acts", fields["acts"], ACTS),
+        frame,
+        tuple(_factor(f"{where}.factors[{place}]", one) for place, one in enumerate(factors)),
+        *numbers,
+    )
+
+
+def _factor(where: str, value: Any) -> Factor:
+    name = chosen(f"{where}.shape", value.get("shape") if isinstance(value, dict) else value, SHAPES)
+    shape = SHAPES[name]
+    fields = fields_of(where, value, ("quantity", "shape", *shape.numbers))
+    quantity = chosen(f"{where}.quantity", fields["quantity"], shape.quantities)
+    numbers = tuple(number(f"{where}.{one}", fields[one]) for one in shape.numbers)
+    by_name = dict(zip(shape.numbers, numbers, strict=True))
+    for one in shape.positive:
+        if not by_name[one] > 0.0:
+            raise ValueError(f"{where}.{one}: found {by_name[one]:g}, expected more than 0")
+    if name == "wave" and by_name["order"] not in (1.0, 2.0, 3.0, 4.0):
+        raise ValueError(f"{where}.order: found {by_name['order']:g}, expected 1, 2, 3 or 4")
+    if name == "power":
+        _check_power(where, quantity, by_name["exponent"], by_name["offset"])
+    return Factor(quantity, name, numbers)
+
+
+def _check_power(where: str, quantity: str, exponent: float, offset: float) -> None:
+    """Raise ValueError for an exponent beyond the list, or a pole where a drone can fly."""
+    if exponent not in EXPONENTS:
+        expected = ", ".join(f"{one:g}" for one in EXPONENTS)
+        raise ValueError(f"{where}.exponent: found {exponent:g}, expected one of {expected}")
+    low, high = QUANTITIES[quantity].low + offset, QUANTITIES[quantity].high + offset
+    if exponent < 0.0 and low <= 0.0 <= high:
+        raise ValueError(
+            f"{where}.offset: found a pole at {quantity} = {0.0 - offset:g} {QUANTITIES[quantity].unit}, "
+            f"expected none between {QUANTITIES[quantity].low:g} and {QUANTITIES[quantity].high:g}"
+        )

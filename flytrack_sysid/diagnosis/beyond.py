@@ -1,0 +1,128 @@
+"""What was learnt beyond the list of effects: a law, a residual, their words and JSON."""
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from flytrack_env.dynamics import ModelParameters
+from flytrack_env.effects import LearnedLaw, LearnedResidual
+from flytrack_env.effects.grammar import Law, Term
+from flytrack_env.effects.learned_residual import Networks
+
+# What a law may be, by the quantity that says most.
+MAY_BE = {
+    "position": "a thermal or a draught at that place",
+    "time": "something that warms up, wears or comes loose",
+    "heading": "a cable, or a field that the sensors feel",
+    "airspeed": "drag of a body or a resonance that the list has no law for",
+    "airspeed_x": "blades that flap, or pressure off the centre of mass",
+    "airspeed_y": "blades that flap, or pressure off the centre of mass",
+    "airspeed_z": "inflow through the rotors",
+    "edgewise": "thrust that changes with the advance ratio",
+    "thrust": "a motor or rotor law that the list does not have",
+    "tilt": "air that recirculates, or a load that shifts",
+    "height": "air that changes with height",
+    "voltage": "a motor law that the list does not have",
+    "rate_x": "gyroscopic or inertial coupling",
+    "rate_y": "gyroscopic or inertial coupling",
+    "rate_z": "gyroscopic or inertial coupling",
+    "roll": "a stick's curve that the list does not have",
+    "pitch": "a stick's curve that the list does not have",
+    "yaw": "a stick's curve that the list does not have",
+    "throttle": "a motor or rotor law that the list does not have",
+}
+LAST = ("thrust", "throttle", "airspeed")  # say least of a product
+# What to draw a quantity as, by the names of ``traces.REGRESSORS``; others as time.
+DRAWN_AS = {
+    "airspeed": "airspeed_xy",
+    "edgewise": "airspeed_xy",
+    "thrust": "model_force_z",
+    "throttle": "applied_thrust",
+    "heading_cosine": "heading",
+    "heading_sine": "heading",
+    **{f"airspeed_{axis}": f"airspeed_{axis}" for axis in "xyz"},
+    **{f"rate_{axis}": f"model_rates_{axis}" for axis in "xyz"},
+    **{stick: f"applied_{stick}" for stick in ("roll", "pitch", "yaw")},
+    **{name: name for name in ("heading", "height", "tilt", "voltage")},
+}
+
+
+@dataclass(frozen=True)
+class Learned:
+    """What was learnt beyond the list.
+
+    law, networks: may be empty. gains, held_out_gains: of minus twice the log likelihood, by side. rivals: of
+    laws, by side.
+    """
+
+    law: Law
+    networks: Networks
+    gains: Mapping[str, float]
+    held_out_gains: Mapping[str, float]
+    rivals: Mapping[str, tuple[str, ...]]
+
+    @property
+    def effects(self) -> tuple[Any, ...]:
+        """The parameters of what was learnt, as effects of a model."""
+        found: list[Any] = [LearnedLaw(1.0, 0.0, self.law)] if self.law.terms else []
+        return (*found, *([LearnedResidual(1.0, 0.0, self.networks)] if self.networks.networks else []))
+
+    def drawn(self) -> list[tuple[str, str]]:
+        """Return which residual to draw over which regressor, names as in ``traces``."""
+        found = []
+        for term in self.law.terms:
+            axis = "xyz"[max(range(len(term.coefficients)), key=lambda place: abs(term.coefficients[place]))]
+            found.append((_column(term.acts, term.frame, axis), _least(one.quantity for one in term.factors)))
+        for network in self.networks.networks:
+            sizes = [sum(map(abs, row)) for row in network.outputs]
+            column = _column(network.acts, network.frame, "xyz"[sizes.index(max(sizes))])
+            found += [(column, one.quantity) for one in network.inputs]
+        return list(dict.fromkeys((column, DRAWN_AS.get(name, "time")) for column, name in found))
+
+    def text(self) -> str:
+        """Return the formulas, and what the laws may be, a line each."""
+        lines = [f"{term.text()}: may be {may_be(term)}" for term in self.law.terms]
+        return "\n".join([*lines, *self.networks.text().splitlines()])
+
+    def as_json(self) -> dict[str, Any]:
+        """Return JSON values."""
+        return {
+            "law": [
+                {"formula": term.text(), "may_be": may_be(term), **one}
+                for term, one in zip(self.law.terms, self.law.as_json(), strict=True)
+            ],
+            "residual": [
+                {
+                    "acts": one.acts,
+                    "inputs": [each._asdict() for each in one.inputs],
+                    "half_width_90": list(one.half_width_90),
+                }
+                for one in self.networks.networks
+            ],
+            "chi2_gain": dict(self.gains),
+            "heldout_gain": dict(self.held_out_gains),
+            "rivals": {name: list(one) for name, one in self.rivals.items()},
+        }
+
+
+def may_be(term: Term) -> str:
+    """Return what a term may be, physically."""
+    return MAY_BE[_least(one.quantity for one in term.factors)]
+
+
+def _least(quantities: Iterable[str]) -> str:
+    """Return the quantity that says most."""
+    return min(quantities, key=_says_little)
+
+
+def _column(acts: str, frame: str, axis: str) -> str:
+    return f"{'rates' if acts == 'rate' else 'force'}_{'world_' if frame == 'world' else ''}{axis}"
+
+
+def _says_little(quantity: str) -> int:
+    return 1 + LAST.index(quantity) if quantity in LAST else 0
+
+
+def with_learned(model: ModelParameters, learned: Learned | None) -> ModelParameters:
+    """Return a model with what was learnt."""
+    return model if learned is None else model.with_effects(*learned.effects)

@@ -1,0 +1,399 @@
+"""A law for what no effect of the list explains: sparse regression over terms that make physical sense.
+
+Every candidate is a term of ``flytrack_env.effects.grammar``: a product of shapes of quantities times a free
+vector. All are scored beside what the model may change (as the diagnosis scores effects: whitened, robust,
+by blocks of a second), the best are refined in the numbers of their shapes, and the one that gains most
+per number is added, up to three. A term has to gain on held-out rows, too.
+"""
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from scipy import optimize, stats
+
+from flytrack_env.dynamics import collective_thrust
+from flytrack_env.effects.grammar import QUANTITIES, XYZ, Factor, Moment, Term
+from flytrack_env.quaternion import Vec3
+from flytrack_env.state import Action
+from flytrack_sysid.diagnosis.problem import Problem, blocks_of, robust_square
+from flytrack_sysid.diagnosis.score_test import inflation_of, solve
+from flytrack_sysid.diagnosis.search import FittedModel
+from flytrack_sysid.diagnosis.unexplained import (
+    BUMP_PLACES,
+    BUMP_WIDTHS_M,
+    SIDES,
+    Flown,
+    SideTest,
+    flight_of,
+    linearized_residuals,
+    whitened,
+)
+from flytrack_sysid.parameters import MAX_RATES, from_vector
+
+CHANCE = 1e-7  # of a term where nothing is left
+PER_COEFFICIENT, PER_NUMBER = 4.0, 8.0  # of chi2: what each has to gain to be preferred to fewer
+MOST_REFINED, REFINEMENTS = 5, 60  # terms a round whose shapes are refined, and evaluations of each
+MOST_TERMS = 3  # of one side
+LEAST_SHARE = 0.04  # of what the terms before gain: the least of one more
+LEAST_SIGMAS = 3.0  # of a coefficient that stays
+HELD_OUT_SHARE = 0.6  # of the gain on held-out rows that a law would have there if it were right
+
+
+def moment_of_flight(problem: Problem, vector: np.ndarray, flight: Flown) -> Moment:
+    """Return what a law may look at, at the beginning of the step to each row, arrays (rows, lanes)."""
+    model, record = from_vector(vector, problem.like), problem.lanes.record
+    wind = model.effect("wind")
+    air_w = np.array([float(wind.v_x), float(wind.v_y), float(wind.v_z)])
+    rotation = flight.body_to_world
+    airspeed_b = np.einsum("rlji,rlj->rli", rotation, flight.vel_w - air_w)
+    volts = np.concatenate([record.battery_v[:1], record.battery_v[:-1]])
+    thrust = collective_thrust(flight.applied[..., 3], volts, model.thrust_coeffs)
+    full = np.radians(vector[problem.index(MAX_RATES)])
+    rates_b = flight.applied[..., :XYZ] * full
+    if "w" in problem.lanes.measured:
+        gyro = problem.lanes.measured["w"]
+        rates_b = np.concatenate([gyro[:1], gyro[:-1]])
+
+    def vec(values: np.ndarray) -> Vec3:
+        return Vec3(*np.moveaxis(values, -1, 0))
+
+    return Moment(
+        pos_w=vec(flight.pos_w),
+        rates_b=vec(rates_b),
+        body_axes_w=(vec(rotation[..., 0]), vec(rotation[..., 1]), vec(rotation[..., 2])),
+        airspeed_b=vec(airspeed_b),
+        applied=Action(*np.moveaxis(flight.applied, -1, 0)),
+        thrust_acc=np.asarray(thrust) / float(model.m),
+        battery_v=volts,
+        time_s=np.concatenate([record.time_s[:1], record.time_s[:-1]]),
+    )
+
+
+def features_of(term: Term, moment: Moment, rotation: np.ndarray) -> np.ndarray:
+    """Return what unit coefficients of a term add, world frame, (coefficients, rows, lanes, 3)."""
+    signal = jnp.broadcast_to(term.signal(moment), np.shape(moment.time_s))
+    columns = []
+    for unit in term.basis(moment):
+        body = jnp.stack([jnp.broadcast_to(part, signal.shape) for part in unit], axis=-1)
+        columns.append(np.einsum("rlij,rlj->rli", rotation, np.asarray(body * signal[..., None])))
+    return np.stack(columns)
+
+
+class Side(NamedTuple):
+    """One side of a problem and a model: what is left, and what its free numbers may change there.
+
+    acting: the places of the model's vector that the columns in ``test`` belong to.
+    """
+
+    name: str
+    problem: Problem
+    vector: np.ndarray
+    moment: Moment
+    flight: Flown
+    test: SideTest
+    acting: tuple[int, ...]
+
+    @classmethod
+    def of(cls, name: str, problem: Problem, model: FittedModel) -> "Side":
+        """Return a side ("rate" or "force") of a problem and a model."""
+        white, slopes = linearized_residuals(problem, model)
+        flight = flight_of(problem, model)
+        squared = np.square(slopes).sum(axis=(1, 2, 4))
+        own = squared[:, SIDES[name]].sum(axis=1)
+        # Where a number shows mostly on another side, that side has fitted it.
+        is_own = (own > 0.0) & (own >= 0.5 * squared.sum(axis=1))
+        acting = tuple(place for place, does in zip(model.places, is_own, strict=True) if does)
+        moment = moment_of_flight(problem, model.vector, flight)
+        test = SideTest.of(name, white, slopes[is_own])
+        return cls(name, problem, model.vector, moment, flight, test, acting)
+
+    @classmethod
+    def unfitted(cls, name: str, problem: Problem, model: FittedModel) -> "Side":
+        """Return a side of a problem without a noise, which can tell moments and residuals only."""
+        flight = flight_of(problem, model)
+        nothing = np.zeros((0, 0, 0))
+        moment = moment_of_flight(problem, model.vector, flight)
+        return cls(name, problem, model.vector, moment, flight, SideTest(nothing, nothing, nothing), ())
+
+    def white(self, term: Term) -> np.ndarray:
+        """Return a term's unit coefficients as innovations, (coefficients, rows, lanes, 3, 2)."""
+        features = features_of(term, self.moment, self.flight.body_to_world)
+        return whitened(self.problem, features, self.name)
+
+    def columns(self, term: Term) -> np.ndarray:
+        """Return a term's unit coefficients, weighted, by blocks of a second."""
+        return blocks_of(self.white(term) * self.test.root)
+
+    def spread(self, quantity: str) -> np.ndarray:
+        """Return the values of a quantity in the rows that count."""
+        of = QUANTITIES[quantity].of(self.moment)
+        return np.asarray(jnp.broadcast_to(of, self.flight.time_s.shape))[self.flight.is_counted]
+
+
+def power(quantity: str, exponent: float = 1.0) -> Factor:
+    """Return a power of a quantity."""
+    return Factor(quantity, "power", (exponent, 0.0))
+
+
+def _local(side: Side, quantity: str, shapes: Sequence[str], number: int) -> Iterator[Factor]:
+    """Return bumps or steps of two widths at places along a quantity's range."""
+    low, high = np.quantile(side.spread(quantity), [0.02, 0.98])
+    if high - low < 1e-9:
+        return
+    for middle in np.linspace(low, high, number + 2)[1:-1]:
+        for shape in shapes:
+            for share in (0.5, 1.2):
+                yield Factor(quantity, shape, (float(middle), float(share * (high - low) / (number + 1))))
+
+
+def factors_of(side: Side) -> Iterator[tuple[str, tuple[Factor, ...]]]:
+    """Return frames and factors that are tried."""
+    airspeeds = ("airspeed_x", "airspeed_y", "airspeed_z", "edgewise", "airspeed")
+    for quantity in airspeeds:
+        yield from (("body", (power(quantity, exponent),)) for exponent in (1.0, 2.0, 3.0))
+        yield from (("body", (power("thrust", one), power(quantity))) for one in (0.5, 1.0))
+        yield "body", (power("thrust"), power(quantity, 2.0))
+    for quantity in ("rate_x", "rate_y", "rate_z"):
+        yield from (("body", (power(quantity, exponent),)) for exponent in (1.0, 2.0))
+        yield from (("body", (power(quantity), power(other))) for other in airspeeds[:3])
+    yield "body", (power("rate_x"), power("rate_y"))
+    yield "body", (power("rate_x"), power("rate_z"))
+    yield "body", (power("rate_y"), power("rate_z"))
+    for quantity in ("roll", "pitch", "yaw", "throttle"):
+        yield from (("body", (power(quantity, exponent),)) for exponent in (2.0, 3.0))
+        yield from (("body", (one,)) for one in _local(side, quantity, ("bump", "step"), 5))
+    # Not of the voltage by itself: within one flight it falls as time goes on.
+    yield "body", (power("thrust"), power("voltage"))
+    for quantity in ("tilt", "height"):
+        yield from (("body", (power(quantity, exponent),)) for exponent in (1.0, 2.0))
+        yield from (("body", (one,)) for one in _local(side, quantity, ("bump",), 6))
+        yield "body", (power("thrust"), power(quantity))
+    span = float(np.ptp(side.spread("time")))
+    saturations = [Factor("time", "saturation", (share * span,)) for share in (0.1, 0.3, 1.0)]
+    for one in (power("time"), *saturations, *_local(side, "time", ("bump", "step"), 8)):
+        yield "body", (one,)
+        yield "body", (power("thrust"), one)
+    frames = ("body", "world") if side.name == "force" else ("body",)
+    for order in (1.0, 2.0, 3.0, 4.0):
+        for phase in np.linspace(0.0, math.pi, 4, endpoint=False):
+            yield from ((frame, (Factor("heading", "wave", (order, float(phase))),)) for frame in frames)
+    if side.name == "force":
+        for one in (power("airspeed", 2.0), power("airspeed", 3.0), *_local(side, "airspeed", ("bump",), 8)):
+            yield "air", (one,)
+        where = side.flight.pos_w[side.flight.is_counted]
+        for place in where[np.linspace(0, len(where) - 1, 2 * BUMP_PLACES + 1).astype(int)[1::2]].tolist():
+            for width in BUMP_WIDTHS_M:
+                yield "world", (Factor("position", "place", (*place, width)),)
+
+
+class Trial(NamedTuple):
+    """A term without coefficients, its gain less a price for its numbers, and that gain alone."""
+
+    term: Term
+    merit: float
+    gain: float
+
+
+def bare(side: Side, frame: str, factors: tuple[Factor, ...]) -> Term:
+    """Return a term whose coefficients are not known yet."""
+    return Term(side.name, frame, factors, (0.0,) * XYZ, (0.0,) * XYZ)
+
+
+def num_shaped(term: Term) -> int:
+    """Return how many numbers of its shapes a term may choose."""
+    return sum(len(one.numbers) for one in term.factors if one.shape != "power")
+
+
+def tried(side: Side, test: SideTest, term: Term) -> Trial:
+    """Return the gain of a term beside what is given; nothing where it hardly differs from that."""
+    columns = side.columns(term)
+    if not np.isfinite(columns).all() or not np.abs(columns).max() > 0.0:
+        return Trial(term, -np.inf, 0.0)
+    chi2, inflation, _ = test.gain(columns)
+    price = PER_COEFFICIENT * columns.shape[1] + PER_NUMBER * num_shaped(term)
+    return Trial(term, chi2 / inflation - price, chi2 / inflation)
+
+
+def refined(side: Side, test: SideTest, start: Trial) -> Trial:
+    """Return a term with the numbers of its shapes where it gains most."""
+    if not num_shaped(start.term):
+        return start
+    numbers = np.concatenate([one.numbers for one in start.term.factors])
+    is_free = np.concatenate([np.full(len(one.numbers), one.shape != "power") for one in start.term.factors])
+    is_free &= ~np.isin(np.arange(len(numbers)), _fixed(start.term))
+    steps = np.maximum(0.2 * np.abs(numbers), 0.1)[is_free]
+    best = start
+
+    def cost(change: np.ndarray) -> float:
+        nonlocal best
+        values = numbers.copy()
+        values[is_free] += change * steps
+        term = _with_numbers(start.term, values)
+        if term is None:
+            return 0.0
+        found = tried(side, test, term)
+        best = max(best, found, key=lambda one: one.merit)
+        return -found.merit
+
+    simplex = np.concatenate([np.zeros((1, len(steps))), np.eye(len(steps))])
+    options = {"maxfev": REFINEMENTS, "initial_simplex": simplex, "xatol": 0.02, "fatol": 0.5}
+    optimize.minimize(cost, np.zeros(len(steps)), method="Nelder-Mead", options=options)
+    return best
+
+
+def _fixed(term: Term) -> list[int]:
+    """Return the places of numbers that are whole, in the order of all numbers of a term's factors."""
+    place, fixed = 0, []
+    for one in term.factors:
+        fixed += [place] if one.shape == "wave" else []
+        place += len(one.numbers)
+    return fixed
+
+
+def _with_numbers(term: Term, values: np.ndarray) -> Term | None:
+    """Return a term with other numbers; None where one would have no width."""
+    factors, place = [], 0
+    for one in term.factors:
+        numbers = tuple(values[place : place + len(one.numbers)].tolist())
+        place += len(one.numbers)
+        widths = {"bump": 1, "step": 1, "place": 3, "saturation": 0}
+        if one.shape in widths and not numbers[widths[one.shape]] > 1e-3:
+            return None
+        factors.append(replace(one, numbers=numbers))
+    return replace(term, factors=tuple(factors))
+
+
+class Found(NamedTuple):
+    """A law of one side and what it is worth.
+
+    vector: of the model with what the law changes in its free numbers. gain: on rows that were learnt from,
+    held_out_gain on others, of minus twice the log likelihood; expected: there, if it were right. rivals:
+    other terms in place of the first that gain within 10 of it, as formulas.
+    """
+
+    terms: tuple[Term, ...]
+    vector: np.ndarray
+    gain: float
+    held_out_gain: float
+    expected: float
+    rivals: tuple[str, ...]
+
+
+class Solved(NamedTuple):
+    """Coefficients of columns and their standard errors, the model's vector with them, and the gain."""
+
+    step: np.ndarray
+    errors: np.ndarray
+    vector: np.ndarray
+    gain: float
+
+
+def solved(side: Side, columns: np.ndarray) -> Solved:
+    """Return columns' coefficients beside what the model may change."""
+    share, own, score, alone = side.test.projected(columns)
+    own = own + np.eye(len(own))  # a weak prior: features of size 1
+    step = solve(own, score)
+    given = alone - share @ step
+    after = side.test.rest - np.einsum("bfn,f->bn", columns, step)
+    after -= np.einsum("bgn,g->bn", side.test.given, given)
+    blocks = np.einsum("bfn,bn->bf", columns, after) - np.einsum("bgn,bn->bg", side.test.given, after) @ share
+    covariance = np.linalg.pinv(own) * inflation_of(own, blocks)
+    vector = side.vector.copy()
+    vector[list(side.acting)] -= given
+    errors = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    return Solved(step, errors, side.problem.clipped(vector), float(score @ step))
+
+
+def fitted(side: Side, terms: Sequence[Term]) -> tuple[tuple[Term, ...], Solved]:
+    """Return terms with the coefficients that are clear, fitted together, and the model beside them."""
+    columns = [side.columns(term) for term in terms]
+    sizes = [one.shape[1] for one in columns]
+    joined = np.concatenate(columns, axis=1)
+    kept = np.ones(joined.shape[1], bool)
+    while True:
+        found = solved(side, joined[:, kept])
+        sigmas = np.abs(found.step) / np.maximum(found.errors, 1e-300)
+        if sigmas.min() >= LEAST_SIGMAS or kept.sum() == 1:
+            break
+        kept[np.flatnonzero(kept)[int(np.argmin(sigmas))]] = False
+    coefficients, errors = np.zeros(len(kept)), np.zeros(len(kept))
+    coefficients[kept], errors[kept] = found.step, found.errors
+    result, place = [], 0
+    for term, size in zip(terms, sizes, strict=True):
+        own = slice(place, place + size)
+        padded = [np.pad(values[own], (0, XYZ - size)).tolist() for values in (coefficients, errors)]
+        if any(padded[0]):
+            result.append(replace(term, coefficients=tuple(padded[0]), standard_errors=tuple(padded[1])))
+        place += size
+    return tuple(result), found
+
+
+def added(side: Side, terms: Sequence[Term]) -> np.ndarray:
+    """Return what terms with coefficients add, whitened, (rows, lanes, 3, 2)."""
+    total = np.zeros((*side.flight.time_s.shape, XYZ, 2))
+    for term in terms:
+        white = side.white(term)
+        total = total + np.tensordot(np.array(term.coefficients[: len(white)]), white, axes=1)
+    return total
+
+
+def held_out(side: Side, held: Side, terms: Sequence[Term], vector: np.ndarray) -> tuple[float, float]:
+    """Return what terms gain on held-out rows, and what they would if they were right there."""
+    axes = SIDES[side.name]
+    less, moved = held.problem.whitened_residuals(side.vector, vector)
+    full = moved[..., axes, :] - added(held, terms)
+    gain = robust_square(less[..., axes, :]) - robust_square(full)
+    return gain, float(np.sum((less[..., axes, :] - full) ** 2))
+
+
+def find_law(side: Side, held: Side) -> Found | None:
+    """Return the law of a side that rows learnt from and held-out rows agree on; None without one."""
+    pool = [bare(side, *one) for one in factors_of(side)]
+    terms: list[Term] = []
+    best: Found | None = None
+    rivals: tuple[str, ...] = ()
+    test = side.test
+    while len(terms) < MOST_TERMS:
+        trials = sorted((tried(side, test, term) for term in pool), key=lambda one: -one.merit)
+        trials = _of_different_kinds(trials)[:MOST_REFINED]
+        trials = sorted((refined(side, test, one) for one in trials), key=lambda one: -one.merit)
+        first = trials[0]
+        width = side.columns(first.term).shape[1] + num_shaped(first.term)
+        if first.gain < stats.chi2.isf(CHANCE / len(pool), width):
+            break
+        if not terms:
+            rivals = tuple(_kind(one.term) for one in trials[1:] if one.merit > first.merit - 10.0)
+        now, model = fitted(side, [*terms, first.term])
+        gain, expected = held_out(side, held, now, model.vector)
+        if gain < HELD_OUT_SHARE * expected:
+            break
+        if best is not None and (
+            model.gain < (1.0 + LEAST_SHARE) * best.gain
+            or gain < best.held_out_gain
+            or len(now) <= len(terms)
+        ):
+            break
+        best = Found(now, model.vector, model.gain, gain, expected, rivals)
+        terms = list(now)
+        test = side.test.given_also(*(side.columns(term) for term in terms))
+    return best
+
+
+def _kind(term: Term) -> str:
+    return f"{term.frame}: " + " ".join(f"{one.shape} of {one.quantity}" for one in term.factors)
+
+
+def _of_different_kinds(trials: Sequence[Trial]) -> list[Trial]:
+    """Return the best trial of each frame, quantities and shapes."""
+    found: dict[tuple[str, tuple[tuple[str, ...], ...]], Trial] = {}
+    for one in trials:
+        exponents = tuple(
+            (each.quantity, each.shape, str(each.numbers[0]) if each.shape in ("power", "wave") else "")
+            for each in one.term.factors
+        )
+        found.setdefault((one.term.frame, exponents), one)
+    return list(found.values())

@@ -1,0 +1,114 @@
+"""Beyond the list: where a diagnosis leaves something unexplained, a law for it, or else a residual.
+
+Of each side (rate, force) that depends on something, a law is searched; it is proposed where it explains
+nearly all that smooth functions of everything would. Else networks of what the side depends on are
+fitted. Either has to predict held-out flights no worse, at any horizon where these tell anything.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from flytrack_env.effects.grammar import Law, Term
+from flytrack_env.effects.learned_residual import Network, Networks
+from flytrack_sysid.diagnosis.beyond import Learned
+from flytrack_sysid.diagnosis.law_search import Found, Side, find_law
+from flytrack_sysid.diagnosis.problem import Problem
+from flytrack_sysid.diagnosis.refinement import LIKELY_WORSE, Judge, errors_at, sureness
+from flytrack_sysid.diagnosis.residual_fit import Residual, fit_residual
+from flytrack_sysid.diagnosis.search import FittedModel
+from flytrack_sysid.diagnosis.unexplained import (
+    Dependence,
+    find_dependences,
+    find_lines,
+    stochastic_shares,
+    waves_of,
+)
+
+LEAST_SHARE = 0.15  # of the sensor's noise, rms: less is not learnt
+LAW_SHARE = 0.75  # of what smooth functions of everything explain: the least that a law explains
+WORSE_SIGMAS = 1.0  # by which no horizon may be worse
+
+
+def find_learned(
+    problem: Problem, test: Problem, model: FittedModel, base: np.ndarray, judge: Judge | None
+) -> tuple[Learned, np.ndarray] | None:
+    """Return what can be learnt of what a model leaves, and the model's vector beside it; None if nothing.
+
+    problem, test: of rows to learn from and of others. base: vector of the refitted model without effects.
+    judge: of free flights on held-out rows; None without any.
+    """
+    waves = waves_of(problem, model, find_lines(problem, model))
+    dependences = find_dependences(problem, model, base, waves)
+    terms: list[Term] = []
+    networks: list[Network] = []
+    found: dict[str, Found | Residual] = {}
+    # What wanders may be a law whose variable smooth functions of everything do not have.
+    wandering = [] if dependences else list(stochastic_shares(problem, model))
+    for name in dict.fromkeys([*(one.side for one in dependences), *wandering]):
+        own = [one for one in dependences if one.side == name]
+        if own and max(one.share for one in own) < LEAST_SHARE:
+            continue
+        one = _learnt(Side.of(name, problem, model), Side.of(name, test, model), own)
+        if one is None:
+            continue
+        added = (one.terms, ()) if isinstance(one, Found) else ((), (one.network,))
+        if not _predicts(problem, judge, model.vector, one.vector, (terms, networks), added):
+            continue
+        terms, networks = [*terms, *added[0]], [*networks, *added[1]]
+        found[name], model = one, model._replace(vector=one.vector)
+    if not found:
+        return None
+    learned = Learned(
+        Law(tuple(terms)),
+        Networks(tuple(networks)),
+        {name: one.gain for name, one in found.items()},
+        {name: one.held_out_gain for name, one in found.items()},
+        {name: one.rivals for name, one in found.items() if isinstance(one, Found)},
+    )
+    return learned, model.vector
+
+
+def _learnt(side: Side, held: Side, dependences: Sequence[Dependence]) -> Found | Residual | None:
+    """Return a law that explains nearly all of what is left on a side, or else a residual."""
+    law = find_law(side, held)
+    flexible = sum(one.gain for one in dependences)
+    if law is not None and law.gain >= LAW_SHARE * flexible:
+        return law
+    if not dependences:
+        return None
+    return fit_residual(side, held, [one.name for one in dependences])
+
+
+def _effects(terms: Sequence[Term], networks: Sequence[Network]) -> tuple[Any, ...]:
+    return Learned(Law(tuple(terms)), Networks(tuple(networks)), {}, {}, {}).effects
+
+
+def _predicts(
+    problem: Problem,
+    judge: Judge | None,
+    before: np.ndarray,
+    after: np.ndarray,
+    had: tuple[Sequence[Term], Sequence[Network]],
+    added: tuple[Sequence[Term], Sequence[Network]],
+) -> bool:
+    """Return whether held-out flights are predicted no worse with what was learnt, and better in all."""
+    both = _effects([*had[0], *added[0]], [*had[1], *added[1]])
+    uses_time = any(part.uses("time") for one in both for part in one if isinstance(part, Law | Networks))
+    if judge is None or uses_time:
+        return True
+    tested = [
+        errors_at(
+            replace(problem, like=problem.like.with_effects(*effects)),
+            np.append(vector, [1.0, 0.0] * len(effects))[None],
+            judge.windows,
+        )
+        for vector, effects in ((before, _effects(*had)), (after, both))
+    ]
+    scale = np.maximum(np.nan_to_num(tested[0].rms()[0], nan=1.0), 1e-9)
+    ratio = tested[1].rms()[0] / scale
+    lost = sureness(tested[1].by_block(scale)[0] - tested[0].by_block(scale)[0])
+    is_worse = judge.is_known & (ratio > LIKELY_WORSE) & (lost > WORSE_SIGMAS)
+    return not is_worse.any() and float(np.mean(ratio[judge.is_known] ** 2)) < 1.0

@@ -1,0 +1,204 @@
+"""What was learnt from a log as effects: their values, their files, and what is refused."""
+
+import copy
+import json
+import math
+import re
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from flytrack_env import make
+from flytrack_env.effects import LearnedLaw, LearnedResidual
+from flytrack_env.effects.grammar import QUANTITIES, SHAPES, Factor, Law, Term
+from flytrack_env.effects.learned_residual import Input, Network, Networks
+from flytrack_env.model_file import ModelFileError, load_model, save_model
+from flytrack_env.params import EnvParams
+from flytrack_env.state import Action
+from flytrack_env.wrappers import DomainRandomization, RandomizationParams
+from tests.support.simulated_flights import NOMINAL, drone_with, flown, held
+
+NO = (0.0, 0.0, 0.0)
+DRAG = Term("force", "air", (Factor("airspeed", "bump", (4.0, 1.0)),), (-2.0, 0.0, 0.0), (0.1, 0.0, 0.0))
+FLAP = Term(
+    "rate",
+    "body",
+    (Factor("thrust", "power", (1.0, 0.0)), Factor("airspeed_x", "power", (1.0, 0.0))),
+    (0.0, 0.01, 0.0),
+    NO,
+)
+WARM = Term("force", "world", (Factor("time", "saturation", (0.05,)),), (0.0, 0.0, 3.0), NO)
+LAW = Law((DRAG, FLAP, WARM))
+NETWORK = Network(
+    "force",
+    "body",
+    (Input("airspeed_x", -5.0, 5.0), Input("height", 0.0, 4.0)),
+    ((1.0, 0.5, 0.2), (-0.5, 2.0, 0.0)),
+    ((1.0, 2.0, 3.0), (0.5, 0.0, -1.0), (0.0, 0.0, 0.0)),
+    ((0.1, 0.0, 0.0), (0.0, 0.0, 0.0), (0.0, 0.0, 0.2)),
+    (0.3, 0.3, 0.3),
+)
+NETWORKS = Networks((NETWORK,))
+
+
+def acceleration(effects: Any, **state: Any) -> np.ndarray:
+    """Return what effects add to the acceleration of one step, world frame."""
+    drone = drone_with(**state)
+    return (flown(effects, held(), drone) - flown((), held(), drone))[0, 6:9]
+
+
+def test_a_term_along_the_air_brakes_as_its_formula_says() -> None:
+    found = acceleration(LearnedLaw(1.0, 0.0, Law((DRAG,))), vel_w=(3.0, 0.0, 0.0))
+    np.testing.assert_allclose(found, [-2.0 * math.exp(-0.5), 0.0, 0.0], atol=1e-4)
+    more = acceleration(LearnedLaw(1.0, 1.0, Law((DRAG,))), vel_w=(3.0, 0.0, 0.0))
+    np.testing.assert_allclose(more, found * 1.9 / 2.0, atol=1e-4)
+    half = acceleration(LearnedLaw(0.5, 0.0, Law((DRAG,))), vel_w=(3.0, 0.0, 0.0))
+    np.testing.assert_allclose(half, 0.5 * found, atol=1e-4)
+
+
+def test_a_product_turns_the_drone() -> None:
+    drone = drone_with(vel_w=(3.0, 0.0, 0.0))
+    plain, law = (flown(one, held(), drone)[0] for one in ((), LearnedLaw(1.0, 0.0, Law((FLAP,)))))
+    thrust = plain[8] + NOMINAL.g
+    np.testing.assert_allclose(law[13:16] - plain[13:16], [0.0, 0.01 * thrust * 3.0, 0.0], rtol=1e-4)
+
+
+def test_time_since_the_start_acts() -> None:
+    flight = flown(LearnedLaw(1.0, 0.0, Law((WARM,))), held(20)) - flown((), held(20))
+    expected = 3.0 * (1.0 - np.exp(-0.01 * np.arange(20) / 0.05))
+    np.testing.assert_allclose(flight[:, 8], expected, atol=2e-3)
+
+
+def test_a_network_adds_its_outputs_and_nothing_outside_its_range() -> None:
+    effect = LearnedResidual(1.0, 0.0, NETWORKS)
+    found = acceleration(effect, vel_w=(2.5, 0.0, 0.0), pos_w=(0.0, 0.0, 2.0))
+    units = np.array([math.tanh(0.5 + 0.2), math.tanh(-0.25), 1.0])
+    np.testing.assert_allclose(found, np.array(NETWORK.outputs) @ units, atol=1e-4)
+    assert not acceleration(effect, vel_w=(6.0, 0.0, 0.0), pos_w=(0.0, 0.0, 2.0)).any()
+    assert not acceleration(effect, vel_w=(2.5, 0.0, 0.0), pos_w=(0.0, 0.0, 5.0)).any()
+
+
+def test_neutral_and_empty_are_absent() -> None:
+    plain = flown((), held(5))
+    for effect in (LearnedLaw(0.0, 0.0, LAW), LearnedLaw(1.0), LearnedResidual(0.0, 0.0, NETWORKS)):
+        np.testing.assert_array_equal(flown(effect, held(5)), plain)
+
+
+def extended() -> Any:
+    """Return the nominal model with a law and a residual."""
+    return NOMINAL.with_effects(LearnedLaw(1.0, 0.0, LAW), LearnedResidual(1.0, 0.5, NETWORKS))
+
+
+def test_files_keep_what_was_learnt(tmp_path: Path) -> None:
+    path = tmp_path / "extended_model.json"
+    save_model(path, extended(), {})
+    assert load_model(path).effects == extended().effects
+    assert hash(load_model(path).effects[0].law) == hash(LAW)
+
+
+def test_the_environment_flies_it_and_has_gradients() -> None:
+    env = make("FlyTrack-v0", model=extended())
+    keys = jax.random.split(jax.random.key(0), 16)
+    _, states = jax.vmap(env.reset, (0, None))(keys, env.default_params)
+    step = jax.jit(jax.vmap(env.step, (0, 0, 0, None)))
+    observations = step(keys, states, jnp.zeros((16, 4)), env.default_params)[0]
+    assert np.isfinite(observations).all()
+
+    def speed(scale: Any) -> jax.Array:
+        model = env.default_params.model.with_effects(LearnedLaw(scale, 0.0, LAW))
+        params = env.default_params.replace(model=model)
+
+        def after(state: Any) -> jax.Array:
+            return env.drone(env.advance(state, Action(0.0, 0.0, 0.0, 0.0), params)[0]).vel_w.norm()
+
+        return jax.vmap(after)(states).sum()
+
+    slope = jax.grad(speed)(1.0)
+    assert np.isfinite(slope) and slope != 0.0
+
+
+def test_its_spread_can_be_drawn() -> None:
+    env = DomainRandomization(make("FlyTrack-v0", model=extended()))
+    ends = [(LearnedLaw(None, size, LAW),) for size in (-1.0, 1.0)]
+    ranges = RandomizationParams(low=ends[0], high=ends[1])
+    params: EnvParams = env.default_params.replace(wrappers={DomainRandomization.key: ranges})
+    env.check_params(params)
+    states = [env.reset(jax.random.key(seed), params)[1] for seed in range(8)]
+    spreads = [float(env.model(state, params).effect("learned_law").spread) for state in states]
+    assert min(spreads) < -0.2 and max(spreads) > 0.2
+    assert all(float(env.model(state, params).effect("learned_law").scale) == 1.0 for state in states)
+
+
+def test_every_quantity_has_a_value_and_every_shape_a_formula() -> None:
+    law = Law(
+        tuple(
+            Term("force", "body", (Factor(name, "power", (1.0, 0.0)),), (0.1, 0.1, 0.1), NO)
+            for name in QUANTITIES
+        )
+    )
+    assert np.isfinite(acceleration(LearnedLaw(1.0, 0.0, law), vel_w=(1.0, 2.0, 3.0))).all()
+    for name, shape in SHAPES.items():
+        numbers = tuple(float(place + 1) for place in range(len(shape.numbers)))
+        assert shape.quantities[0] in Factor(shape.quantities[0], name, numbers).text()
+
+
+REFUSED = [
+    (("terms", 0, "acts"), "torque", r"terms\[0\]\.acts: found 'torque', expected one of force, rate"),
+    (("terms", 0, "frame"), "gate", r"frame: found 'gate', expected one of body, world, air"),
+    (("terms", 0, "coefficients"), [1.0, math.nan, 0.0], "coefficients: found nan, expected a number"),
+    (("terms", 0, "coefficients"), [1.0, 2.0, 0.0], "expected only the first in the frame air"),
+    (("terms", 0, "coefficients"), [1.0], "coefficients: found 1 numbers, expected 3"),
+    (("terms", 0, "standard_errors"), [-1.0, 0.0, 0.0], "standard_errors: .*expected 0 or more"),
+    (("terms", 0, "factors"), [], "factors: found .*expected a list of 1 to 2"),
+    (("terms", 0, "factors", 0, "shape"), "eval('1')", "shape: found .*expected one of power, bump"),
+    (("terms", 0, "factors", 0, "quantity"), "mood", "quantity: found 'mood', expected one of airspeed"),
+    (("terms", 0, "factors", 0, "width"), 0.0, "width: found 0, expected more than 0"),
+    (("terms", 1, "factors", 0, "exponent"), 7.0, "exponent: found 7, expected one of -2, -1"),
+    (("terms", 1, "factors", 1, "exponent"), -1.0, r"found a pole at airspeed_x = 0 m/s, expected none"),
+    (("terms",), [], "terms: found .*expected a list of 1 to 6"),
+]
+
+
+def refused(tmp_path: Path, effect: str, static: str, where: tuple[Any, ...], value: Any) -> str:
+    """Return the message with which a model file is refused after one value was replaced."""
+    path = tmp_path / "model.json"
+    save_model(path, extended(), {})
+    document = json.loads(path.read_text())
+    at: Any = document["effects"][effect]
+    keys = (static, *where[1:])
+    for key in keys[:-1]:
+        at = at[key]
+    at[keys[-1]] = copy.deepcopy(value)
+    path.write_text(json.dumps(document))
+    with pytest.raises(ModelFileError) as error:
+        load_model(path)
+    assert str(error.value).startswith(f"{path}: effects: {effect}: ")
+    return str(error.value)
+
+
+@pytest.mark.parametrize(("where", "value", "expected"), REFUSED)
+def test_what_is_not_in_the_grammar_is_refused(
+    tmp_path: Path, where: tuple[Any, ...], value: Any, expected: str
+) -> None:
+    assert re.search(expected, refused(tmp_path, "learned_law", "law", where, value))
+
+
+@pytest.mark.parametrize(
+    ("where", "value", "expected"),
+    [
+        (("networks", 0, "hidden"), [[1.0, 2.0]], "hidden: found another shape, expected 1 rows of 3"),
+        (("networks", 0, "outputs"), [[1.0] * 3] * 2, "outputs: found another shape, expected 3 rows of 3"),
+        (("networks", 0, "hidden", 0, 0), math.inf, "hidden: found inf, expected a number"),
+        (("networks", 0, "inputs", 0, "low"), 5.0, "expected one with a width"),
+        (("networks", 0, "inputs", 0, "quantity"), "mood", "quantity: found 'mood'"),
+        (("networks", 0, "activation"), "relu", "expected exactly acts, frame, inputs"),
+    ],
+)
+def test_networks_of_other_shapes_are_refused(
+    tmp_path: Path, where: tuple[Any, ...], value: Any, expected: str
+) -> None:
+    assert expected in refused(tmp_path, "learned_residual", "networks", where, value)
