@@ -34,7 +34,6 @@ MAY_BE = {
 LAST = ("thrust", "throttle", "airspeed")  # say least of a product
 # What to draw a quantity as, by the names of ``traces.REGRESSORS``; others as time.
 DRAWN_AS = {
-    "airspeed": "airspeed_xy",
     "edgewise": "airspeed_xy",
     "thrust": "model_force_z",
     "throttle": "applied_thrust",
@@ -43,7 +42,7 @@ DRAWN_AS = {
     **{f"airspeed_{axis}": f"airspeed_{axis}" for axis in "xyz"},
     **{f"rate_{axis}": f"model_rates_{axis}" for axis in "xyz"},
     **{stick: f"applied_{stick}" for stick in ("roll", "pitch", "yaw")},
-    **{name: name for name in ("heading", "height", "tilt", "voltage")},
+    **{name: name for name in ("airspeed", "heading", "height", "tilt", "voltage")},
 }
 
 
@@ -116,6 +115,8 @@ def _least(quantities: Iterable[str]) -> str:
 
 
 def _column(acts: str, frame: str, axis: str) -> str:
+    if frame == "air":
+        return "force_along"
     return f"{'rates' if acts == 'rate' else 'force'}_{'world_' if frame == 'world' else ''}{axis}"
 
 

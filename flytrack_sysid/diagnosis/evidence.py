@@ -274,6 +274,8 @@ def _label(residual: str) -> str:
     source = {"attitude": ", by attitude", "velocity": ", by velocity"}.get(channel, "")
     if channel in ("rates", "attitude"):
         return f"{_TURN_AXES[axis]} rate{source} ({unit})"
+    if axis == "along":
+        return f"force along the direction of flight{source} ({unit})"
     frame = "world " if "world" in residual else ""
     return f"force {frame}{axis}{source} ({unit})"
 

@@ -36,6 +36,7 @@ from flytrack_sysid.parameters import MAX_RATES, from_vector
 
 CHANCE = 1e-7  # of a term where nothing is left
 PER_COEFFICIENT, PER_NUMBER = 4.0, 8.0  # of chi2: what each has to gain to be preferred to fewer
+MOST_TRIED_AGAIN = 100  # terms, beside the first one found
 MOST_REFINED, REFINEMENTS = 5, 60  # terms a round whose shapes are refined, and evaluations of each
 MOST_TERMS = 3  # of one side
 LEAST_SHARE = 0.04  # of what the terms before gain: the least of one more
@@ -353,17 +354,19 @@ def held_out(side: Side, held: Side, terms: Sequence[Term], vector: np.ndarray) 
 def find_law(side: Side, held: Side) -> Found | None:
     """Return the law of a side that rows learnt from and held-out rows agree on; None without one."""
     pool = [bare(side, *one) for one in factors_of(side)]
+    number = len(pool)
     terms: list[Term] = []
     best: Found | None = None
     rivals: tuple[str, ...] = ()
     test = side.test
     while len(terms) < MOST_TERMS:
         trials = sorted((tried(side, test, term) for term in pool), key=lambda one: -one.merit)
+        pool = [one.term for one in trials[:MOST_TRIED_AGAIN]]
         trials = _of_different_kinds(trials)[:MOST_REFINED]
         trials = sorted((refined(side, test, one) for one in trials), key=lambda one: -one.merit)
         first = trials[0]
         width = side.columns(first.term).shape[1] + num_shaped(first.term)
-        if first.gain < stats.chi2.isf(CHANCE / len(pool), width):
+        if first.gain < stats.chi2.isf(CHANCE / number, width):
             break
         if not terms:
             rivals = tuple(_kind(one.term) for one in trials[1:] if one.merit > first.merit - 10.0)

@@ -1,12 +1,13 @@
 """What is left where no law is found: an ensemble of small networks of what it depends on.
 
-A random layer of hyperbolic tangents of the quantities, and linear outputs: so the whitened, robust score
-test of the diagnosis gives the weights beside all that the model may change. How much they are shrunk is
-decided on folds of blocks, the ensemble is a bootstrap over blocks, and the interval of a measured row is
-conformal: the share of held-out rows that it has to hold.
+Hyperbolic tangents of the quantities, the best of many random ones, and linear outputs: so the whitened,
+robust score test of the diagnosis gives the weights beside all that the model may change. How much they are
+shrunk is decided on folds of blocks, the ensemble is a bootstrap over blocks, and the interval of a measured
+row is conformal: the share of held-out rows that it has to hold.
 """
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -18,7 +19,8 @@ from flytrack_sysid.diagnosis.problem import blocks_of, robust_square
 from flytrack_sysid.diagnosis.score_test import solve
 from flytrack_sysid.diagnosis.unexplained import SIDES, whitened
 
-HIDDEN, MEMBERS, FOLDS = 20, 16, 4
+HIDDEN, POOL, MEMBERS, FOLDS = 24, 160, 16, 4
+STEEPEST = 8.0  # of a tangent, over the range of its inputs
 SHRINKAGES = np.array([1.0, 10.0, 100.0, 1e3, 1e4])  # prior information about each weight
 COVERED = 0.9
 FEWEST_ROWS = 50  # of which an interval can be told
@@ -28,7 +30,7 @@ INPUTS = {
     "position": ("x", "y", "height"),
     "time": ("time",),
     "heading": ("heading_cosine", "heading_sine"),
-    "airspeed": ("airspeed_x", "airspeed_y", "airspeed_z"),
+    "airspeed": ("airspeed", "airspeed_x", "airspeed_y", "airspeed_z"),
     "attitude": ("tilt",),
 }
 STICKS = {"rate": ("roll", "pitch", "yaw"), "force": ("throttle",)}
@@ -74,6 +76,38 @@ def _features(side: Side, network: Network) -> np.ndarray:
     return np.concatenate(parts)
 
 
+def _random_units(rng: np.random.Generator, number: int) -> tuple[tuple[float, ...], ...]:
+    """Return tangents of so many inputs in random directions, gentle and steep, each about a random place."""
+    ways = rng.normal(size=(POOL, number))
+    steep = np.exp(rng.uniform(0.0, np.log(STEEPEST), size=(POOL, 1)))
+    weights = steep * ways / np.linalg.norm(ways, axis=1, keepdims=True)
+    places = rng.uniform(-1.0, 1.0, size=(POOL, number))
+    return _rows(np.concatenate([weights, -(weights * places).sum(axis=1, keepdims=True)], axis=1))
+
+
+def _best_units(side: Side, network: Network) -> tuple[tuple[float, ...], ...]:
+    """Return the units that explain most, one after the other, beside what the model may change."""
+    white = whitened(side.problem, _features(side, network), side.name)
+    number = len(network.hidden) + 1
+    columns = blocks_of(white * side.test.root)
+    by_axis = columns.reshape(len(columns), XYZ, number, -1)
+    columns = np.moveaxis(by_axis, 2, 1).reshape(columns.shape)  # the axes of a unit in a row
+    _, own, score, _ = side.test.projected(columns)
+    own = own + np.eye(len(own))
+    parts = [slice(XYZ * unit, XYZ * (unit + 1)) for unit in range(number)]
+    chosen = [number - 1]  # the constant is there anyway
+    while True:
+        part = parts[chosen[-1]]
+        share = solve(own[part, part], own[part])
+        own, score = own - own[:, part] @ share + 1e-9 * np.eye(len(own)), score - share.T @ score[part]
+        if len(chosen) == HIDDEN + 1:
+            break
+        gains = [score[one] @ solve(own[one, one] + np.eye(XYZ), score[one]) for one in parts]
+        gains = [-np.inf if unit in chosen else gain for unit, gain in enumerate(gains)]
+        chosen.append(int(np.argmax(gains)))
+    return tuple(network.hidden[unit] for unit in chosen[1:])
+
+
 class _Blocks(NamedTuple):
     """By block of a second: information about weights and given numbers, and their score."""
 
@@ -110,11 +144,10 @@ def fit_residual(side: Side, held: Side, names: Sequence[str], seed: int = 0) ->
     if not inputs:
         return None
     rng = np.random.default_rng(seed)
-    weights = rng.normal(scale=1.5 / np.sqrt(len(inputs)), size=(HIDDEN, len(inputs)))
-    hidden = np.concatenate([weights, rng.uniform(-1.5, 1.5, size=(HIDDEN, 1))], axis=1)
     frame = "world" if side.name == "force" and any(name in IN_WORLD for name in names) else "body"
     none = ((0.0,) * (HIDDEN + 1),) * XYZ
-    network = Network(side.name, frame, inputs, _rows(hidden), none, none, (0.0,) * XYZ)
+    network = Network(side.name, frame, inputs, _random_units(rng, len(inputs)), none, none, (0.0,) * XYZ)
+    network = replace(network, hidden=_best_units(side, network))
     white = whitened(side.problem, _features(side, network), side.name)
     blocks = _blocks(side, blocks_of(white * side.test.root))
     numbers, members = _ensemble(blocks, rng)
@@ -163,15 +196,7 @@ def _rows(values: np.ndarray) -> tuple[tuple[float, ...], ...]:
 def network_with(network: Network, mean: np.ndarray, deviation: np.ndarray) -> Network:
     """Return a network with outputs, (3 * units,) each."""
     shape = (XYZ, HIDDEN + 1)
-    return Network(
-        network.acts,
-        network.frame,
-        network.inputs,
-        network.hidden,
-        _rows(mean.reshape(shape)),
-        _rows(deviation.reshape(shape)),
-        network.half_width_90,
-    )
+    return replace(network, outputs=_rows(mean.reshape(shape)), deviations=_rows(deviation.reshape(shape)))
 
 
 def _held_out(held: Side, side: Side, vector: np.ndarray, added: np.ndarray) -> tuple[float, float]:
@@ -207,15 +232,7 @@ def _with_interval(held: Side, network: Network, vector: np.ndarray) -> Network:
         size = np.sort(np.abs(left[..., axis][counts[..., axis]]))
         place = int(np.ceil(COVERED * (len(size) + 1))) - 1
         widths.append(float(size[min(place, len(size) - 1)]) if len(size) >= FEWEST_ROWS else 0.0)
-    return Network(
-        network.acts,
-        network.frame,
-        network.inputs,
-        network.hidden,
-        network.outputs,
-        network.deviations,
-        tuple(widths),
-    )
+    return replace(network, half_width_90=tuple(widths))
 
 
 def is_within_range(side: Side, network: Network) -> np.ndarray:

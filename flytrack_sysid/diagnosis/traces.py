@@ -76,10 +76,15 @@ class Traces(NamedTuple):
     def column(self, model: str, name: str) -> tuple[np.ndarray, np.ndarray]:
         """Return one component of a residual and where it counts, both (num_rows,).
 
-        name: ``rates_x``, ``force_world_z``, ``battery``, ...; what is ``used`` for it.
+        name: ``rates_x``, ``force_world_z``, ``force_along`` (the direction of flight through the air),
+        ``battery``, ...; what is ``used`` for it.
         """
         channel, *rest = self.used(name).split("_")
         values = self.residuals[model][channel]
+        if "along" in rest:
+            airspeed = np.stack([self.regressors[f"airspeed_{axis}"] for axis in _AXES], axis=-1)
+            speed = np.maximum(np.linalg.norm(airspeed, axis=-1, keepdims=True), 1e-6)
+            return (values * airspeed / speed).sum(axis=-1), self.counts[channel]
         if "world" in rest:
             values = self.attitude.apply(values)
         return values[:, _AXES.index(rest[-1]) if rest else 0], self.counts[channel]
@@ -89,6 +94,7 @@ class Traces(NamedTuple):
 REGRESSORS: dict[str, tuple[str, str]] = {
     "time": ("time since the flight began", "s"),
     **{f"airspeed_{axis}": (f"airspeed along body {axis}", "m/s") for axis in _AXES},
+    "airspeed": ("airspeed", "m/s"),
     "airspeed_xy": ("airspeed in the rotor plane", "m/s"),
     **{f"applied_{stick}": (f"{stick} action, lagged", "1") for stick in STICKS},
     "thrust_change": ("change of the applied thrust action", "1/s"),
@@ -183,6 +189,7 @@ def _regressors(model: ModelParameters, record: Record, applied: np.ndarray) -> 
     body_x = attitude.apply((1.0, 0.0, 0.0))
     full_rates = np.deg2rad(np.asarray(model.max_rate, float))
     found = {
+        "airspeed": np.linalg.norm(airspeed, axis=1),
         "airspeed_xy": np.hypot(airspeed[:, 0], airspeed[:, 1]),
         "thrust_change": change[:, 3],
         "height": record.pos_w[:, 2],

@@ -1,0 +1,66 @@
+"""What a diagnosis learns beyond its list: a law with its numbers, else a residual, else nothing."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from benchmarks import hidden
+from benchmarks.beyond import covered
+from benchmarks.diagnosis import model_of
+from benchmarks.hidden.oracle import removed
+from flytrack_env.model_file import load_model
+from flytrack_sysid.diagnosis import Diagnosis, diagnose, learned, text_of, write_diagnosis
+from flytrack_sysid.log import FlightLog
+
+SECONDS = 60.0
+BUMP_MS, WIDTH_MS = 6.0, 1.0
+
+
+def flights(seed: int) -> tuple[hidden.Truth, FlightLog, FlightLog]:
+    """Return a plant whose drag peaks at one airspeed, a measured flight of it and a clean one."""
+    rng = np.random.default_rng(seed)
+    outside = hidden.Outside(
+        "airspeed", ("airspeed",), "force", 2.0, {"speed_ms": BUMP_MS, "width_ms": WIDTH_MS}
+    )
+    truth = replace(hidden.draw_base(rng), outside=outside, motion="fine")
+    log = hidden.measure(hidden.fly(truth, "scripted", SECONDS, rng), "sensors", rng)
+    return truth, log, hidden.fly(truth, "scripted", SECONDS, rng)
+
+
+def share_removed(found: Diagnosis, clean: FlightLog) -> float:
+    """Return the share of the explainable error that what was learnt removes on a clean flight."""
+    assert found.learned is not None
+    neutral = (one._replace(scale=0.0) for one in found.learned.effects)
+    return removed(clean, found.base.with_effects(*neutral), found.extended)[0]
+
+
+@pytest.mark.slow
+def test_a_law_is_found_with_its_numbers(tmp_path: Path) -> None:
+    truth, log, clean = flights(71)
+    found = diagnose(log, model_of(truth))
+    assert found.verdict == "unexplained" and found.learned is not None
+    (term,) = found.learned.law.terms
+    assert (term.acts, term.frame) == ("force", "air")
+    (factor,) = term.factors
+    assert (factor.quantity, factor.shape) == ("airspeed", "bump")
+    np.testing.assert_allclose(factor.numbers, [BUMP_MS, WIDTH_MS], rtol=0.1)
+    assert share_removed(found, clean) > 0.9
+    assert "learnt: force (air) += (" in text_of(found)
+    _, model, report = write_diagnosis(tmp_path, found, log)
+    assert load_model(model).effects == found.extended.effects
+    assert "What was learnt" in report.read_text() or "bump(airspeed" in report.read_text()
+
+
+@pytest.mark.slow
+def test_a_residual_takes_the_place_of_a_law(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(learned, "find_law", lambda side, held: None)
+    truth, log, clean = flights(72)
+    found = diagnose(log, model_of(truth))
+    assert found.learned is not None and not found.learned.law.terms
+    (network,) = found.learned.networks.networks
+    assert {one.quantity for one in network.inputs} >= {"airspeed", "airspeed_x", "airspeed_y"}
+    assert share_removed(found, clean) > 0.7
+    inside, of = covered(found, hidden.measure(clean, "sensors", np.random.default_rng(0)))["force"]
+    assert of > 10_000 and 0.86 < inside / of < 0.94
