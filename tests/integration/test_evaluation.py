@@ -1,4 +1,4 @@
-"""Evaluation: single flights and many agree, known lap times, report, ghost, and refusals."""
+"""Evaluation: single flights and many agree, known lap times, report, and refusals."""
 
 import importlib.util
 import json
@@ -12,10 +12,10 @@ from baselines.purejaxrl_ppo import flights as flights_module
 from baselines.purejaxrl_ppo.checkpoint import load_checkpoint, save_checkpoint
 from baselines.purejaxrl_ppo.flights import fly_many, outcomes_of, race_many, score, start_keys
 from baselines.purejaxrl_ppo.plants import draw_plants
-from flytrack_env import FlyTrack, load_track, nominal_parameters, save_track
-from flytrack_env.references import ghost_rollout, shipped_reference, shipped_references
+from flytrack_env import FlyTrack, nominal_parameters, save_track
+from flytrack_env.references import shipped_reference
 from flytrack_env.rollout import load_rollout
-from flytrack_env.state import BATTERY, POSITION, VELOCITY
+from flytrack_env.state import BATTERY, POSITION
 from flytrack_env.tracks import random_track
 from tests.support.evaluated import FAILS_BELOW_V, Rails, run, write_checkpoint
 from tests.support.pages import ROOT
@@ -81,23 +81,6 @@ def test_lap_times_are_those_of_the_rails(raced, paces):
 def test_every_step_kept_or_not_is_the_same_flight(flights, raced):
     assert NUM_FLIGHTS % 4
     assert_close(raced, outcomes_of(flights, NUM_LAPS, 8))
-
-
-def test_ghost_is_the_reference_nearest_in_time():
-    references = shipped_references(load_track("flytrack"), ("black_box",))
-    standing, flying = references["standing"], references["flying"]
-    assert standing.model_name == "black_box"
-    states, commands = ghost_rollout(references, 1200)
-    assert states.shape == (1200, 21) and commands.shape == (1200, 4)
-    np.testing.assert_array_equal(states[:300], standing.states[:300])
-    np.testing.assert_array_equal(commands[:300], standing.commands[:300])
-    # The second flying lap, a third of its time in.
-    at = round((standing.time_s + 4.0 / 3.0 * flying.time_s) / 0.01)
-    offset_s = at * 0.01 - standing.time_s - flying.time_s
-    grid_s = 0.01 * np.arange(len(flying.states))
-    expected = [np.interp(offset_s, grid_s, column) for column in flying.states[:, POSITION].T]
-    speed = np.linalg.norm(states[at, VELOCITY])
-    assert np.linalg.norm(states[at, POSITION] - expected) <= 0.5 * 0.01 * speed * 1.05
 
 
 @pytest.mark.parametrize("flown_by", slow_but(["black box"], ["black box", "plants"]))

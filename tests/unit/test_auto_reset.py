@@ -7,11 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from flytrack_env import FlyTrack
 from flytrack_env.auto_reset import Ended, reset_if_ended
-from flytrack_env.dynamics import advance
 from flytrack_env.fusion import SWITCH, one_kernel
-from flytrack_env.plants import Simulator
 
 
 def begin(seed, offset):
@@ -67,30 +64,3 @@ def test_gradient_flows_through_what_did_not_end():
         return (found**2).sum()
 
     np.testing.assert_allclose(jax.grad(total)(jnp.array([3.0, 4.0, 5.0])), [0.0, 8.0, 0.0])
-
-
-class Remembering(Simulator):
-    """A plant whose state has an array beside the drone: the last three commanded thrusts."""
-
-    def reset(self, drone, model):
-        return drone, jnp.zeros(3)
-
-    def step(self, state, command, dt, model):
-        drone, memory = state
-        memory = jnp.append(memory[1:], command.thrust)
-        return advance(drone, (), command, dt, model)[0], memory
-
-    def drone(self, state):
-        return state[0]
-
-
-@pytest.mark.slow
-def test_a_plant_may_remember_arrays_and_forgets_at_the_end():
-    env = FlyTrack(plant=Remembering())
-    params = env.default_params.replace(max_steps_in_episode=2)
-    keys = jax.random.split(jax.random.key(0), 4)
-    _, states = jax.vmap(env.reset, in_axes=(0, None))(keys, params)
-    actions = jnp.full((4, 4), -0.25)
-    for expected in ([0.0, 0.0, -0.25], [0.0, 0.0, 0.0]):
-        _, states, *_ = env.step_batch(keys[0], states, actions, params)
-        np.testing.assert_allclose(states.plant[1], np.tile(expected, (4, 1)))

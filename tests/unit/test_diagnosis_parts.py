@@ -1,6 +1,7 @@
-"""Parts of the diagnosis: its noise filter, its lanes, and what it does with logs that say too little."""
+"""Parts of the diagnosis: its noise filter, its lanes, what it tells, and logs that say too little."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import jax
 import numpy as np
@@ -10,15 +11,19 @@ from scipy.spatial.transform import Rotation
 from benchmarks.diagnosis import model_of
 from benchmarks.hidden import draw_base, fly, measure
 from flytrack_env.effects import CommandDelay, LinearDrag, SecondOrderRates
-from flytrack_env.effects.command_delay import LONGEST_STEPS
-from flytrack_sysid.diagnosis import DiagnosisError, diagnose, joined
+from flytrack_sysid.diagnosis import DiagnosisError, diagnose, joined, vetoes
 from flytrack_sysid.diagnosis import noise as noises
-from flytrack_sysid.diagnosis.diagnose import unused_channels
-from flytrack_sysid.diagnosis.lanes import LANE_S, LEAD_IN_S, NUM_AXES, make_lanes
+from flytrack_sysid.diagnosis.diagnose import thinning_warning, unused_channels
+from flytrack_sysid.diagnosis.lanes import LANE_S, LEAD_IN_S, NUM_AXES, make_lanes, thinned
+from flytrack_sysid.diagnosis.model_selection import Ablation
 from flytrack_sysid.diagnosis.problem import Problem
+from flytrack_sysid.diagnosis.refinement import Fit, Refined
 from flytrack_sysid.diagnosis.report import verdict_of
+from flytrack_sysid.diagnosis.result import Cause, Estimated
 from flytrack_sysid.diagnosis.search import SearchState
-from flytrack_sysid.parameters import DRAIN
+from flytrack_sysid.diagnosis.summary import stand_in_notes, warnings_of, with_refined_values
+from flytrack_sysid.diagnosis.vetoes import Selection
+from flytrack_sysid.parameters import THRUST_COEFFS
 from flytrack_sysid.record import make_record
 from flytrack_sysid.residuals import predict_rows
 
@@ -30,6 +35,7 @@ DIRECT = np.repeat([0.1, 1.5, 1.0], [3, 3, 1])
 LEVEL = np.repeat([0.01, 0.05, 0.01], [3, 3, 1])
 DISTURBANCE = np.repeat([0.1, 1.5, 1e-3], [3, 3, 1])
 WANDER, TAU_S = 0.1 * LEVEL, 0.3
+CAUSE = Cause("rate_scale", (), "rates", {}, 100.0, 30.0, 100.0, 90.0)
 
 
 @pytest.fixture(scope="module")
@@ -45,6 +51,16 @@ def lanes(flown):
     """All rows of that log."""
     truth, log = flown
     return make_lanes(log, np.ones(len(log), bool), np.array(truth.tau), truth.gravity)
+
+
+@pytest.fixture(scope="module")
+def state(flown, lanes):
+    """The state of a search in that log."""
+    truth, log = flown
+    with jax.enable_x64(True):
+        problem = Problem.of(lanes, model_of(truth))
+        noise = noises.first_guess(lanes, problem.residuals(problem.start[None])[0])
+        yield SearchState.start(log, problem.with_noise(noise))
 
 
 @pytest.fixture(scope="module")
@@ -105,19 +121,6 @@ def test_the_noise_of_residuals_is_found_again(lanes, disturbed):
     np.testing.assert_allclose(found.disturbance[moving], DISTURBANCE[moving], rtol=0.3)
     np.testing.assert_allclose(np.log(found.tau[moving] / TAU_S), 0.0, atol=np.log(2.0))
     assert np.all(found.coupling[moving] > 0.6)
-
-
-def test_lanes_hold_every_row_once_behind_what_leads_in(flown, lanes):
-    _, log = flown
-    record = make_record(log)
-    own = lanes.row[LEAD_IN_S * RATE :].T.ravel()
-    np.testing.assert_array_equal(own[own >= 0], np.arange(1 + np.flatnonzero(record.source_row >= 0)[-1]))
-    np.testing.assert_array_equal(lanes.row[: LEAD_IN_S * RATE, 1:], lanes.row[LANE_S * RATE :, :-1])
-    assert not lanes.counts[: LEAD_IN_S * RATE].any()
-    measured = np.append(record.source_row, -1)[lanes.row] >= 0
-    assert (
-        not lanes.counts[~measured].any() and lanes.counts[measured & (lanes.row > 0)][:, 0, 1].mean() > 0.4
-    )
 
 
 def test_lanes_are_only_where_something_is_judged(flown):
@@ -195,15 +198,6 @@ def test_what_a_given_model_has_too_much_is_taken_out_again(flown):
         assert 0.0 < half < 0.05 * tau and abs(one.time - tau * np.log(2.0)) < 1.5 * half
 
 
-def test_delays_end_where_no_older_row_is_remembered(flown):
-    truth, log = flown
-    quick = replace(log, time=0.1 * log.time)  # 1 kHz
-    lanes = make_lanes(quick, np.ones(len(log), bool), np.array(truth.tau), truth.gravity)
-    problem = Problem.of(lanes, model_of(truth))
-    place = problem.names.index("command_delay.delay_s")
-    assert problem.high[place] == pytest.approx(LONGEST_STEPS * 0.001, rel=1e-3)
-
-
 def test_channels_that_some_logs_lack_are_warned_of(flown):
     first = replace(flown[1].select(slice(0, 30)), source="folder/a.npz")
     second = replace(flown[1].select(slice(30, 50)).without("f"), source="b.npz")
@@ -222,14 +216,6 @@ def test_logs_are_joined_by_what_they_all_have(flown):
     assert joined([first]) is first
     with pytest.raises(DiagnosisError, match="logs: found none"):
         joined([])
-
-
-@pytest.mark.parametrize("missing", [(), ("v_bat",)])
-def test_the_battery_drains_only_where_its_voltage_was_measured(flown, missing):
-    truth, log = flown[0], flown[1].without(*missing)
-    lanes = make_lanes(log, np.ones(len(log), bool), np.array(truth.tau), truth.gravity)
-    state = SearchState.start(log, Problem.of(lanes, model_of(truth)))
-    assert (state.problem.names.index(DRAIN) in state.base_places) == (not missing)
 
 
 @pytest.mark.slow
@@ -257,3 +243,79 @@ def test_a_sensor_farther_off_than_any_on_the_list_is_told_and_not_named():
     assert float(found.extended.effect("accelerometer_bias").x) == 0.0
     (warning,) = (one for one in found.warnings if "beyond the list" in one)
     assert warning.endswith("and is not in the extended model")
+
+
+def test_what_may_be_something_unknown_is_told_with_its_size_and_not_named(state):
+    problem = state.problem
+    vector = problem.start.copy()
+    vector[problem.index(THRUST_COEFFS)] *= 1.146
+    selection = Selection(state, None, None, {}, stand_ins=("thrust_curve", "wind", "tau_yaw"))
+    thrust, lag = stand_in_notes(selection, vector)
+    assert thrust.startswith("thrust_curve differs") and "thrust or your mass by +14.6% in the mean" in thrust
+    assert lag.startswith("tau_yaw differs in the extended model, but is not named")
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "is_warned_of"),
+    [
+        ("rate_scale.yaw", 0.9, False),
+        ("rate_scale.yaw", None, True),
+        ("tau_roll", 0.1, False),
+        ("tau_roll", None, True),
+        ("rate_saturation.softness", 0.0, False),  # a limit may well be hard
+    ],
+)
+def test_values_at_the_end_of_their_range_are_beyond_the_list(state, field, value, is_warned_of):
+    problem = state.problem
+    value = problem.low[problem.names.index(field)] if value is None else value
+    vector = problem.start.copy()
+    vector[problem.names.index(field)] = value
+    effect, _, name = field.rpartition(".")
+    cause = replace(CAUSE, effect=effect or name, parameters={name: Estimated(value, (value, value), "1")})
+    found = with_refined_values([cause], Refined((), None, None, (), {}, problem, None), vector)
+    assert found[0].beyond.startswith(f"{name} at most {value:g}" if is_warned_of else "")
+    warned = [one for one in warnings_of(problem, found, []) if "beyond the list" in one]
+    assert len(warned) == is_warned_of and bool(found[0].beyond) == is_warned_of
+
+
+def test_a_value_that_no_flight_depends_on_is_not_told(state):
+    """A yaw that is ahead of the others by more than their delay is in time, whatever the value."""
+    problem, names = state.problem, ("delay_s", "yaw_extra_s")
+    places = tuple(problem.index([f"command_delay.{name}" for name in names]))
+    fit = Fit(problem.start, places, np.diag([1e-6, 0.0]))
+    told = {name: Estimated(0.01, (0.0, 0.02), "s") for name in names}
+    cause = replace(CAUSE, effect="command_delay", parameters=told)
+    (found,) = with_refined_values([cause], Refined((), fit, None, (), {}, problem, None), problem.start)
+    assert list(found.parameters) == ["delay_s"] and found.parameters["delay_s"].ci95 == (0.0, 0.001)
+
+
+@pytest.mark.parametrize(("effect", "is_law"), [("rate_scale", True), ("command_delay", False)])
+def test_a_law_without_memory_has_to_hold_while_commands_rest(state, effect, is_law):
+    """A scale of rates that nobody flew is contradicted there; one that was flown is not, nor a delay."""
+    problem = state.problem
+    vector = problem.start.copy()
+    field, size = {"rate_scale": ("roll", 0.3), "command_delay": ("delay_s", 0.02)}[effect]
+    vector[problem.names.index(f"{effect}.{field}")] += size
+    for less, full, is_false in ((problem.start, vector, True), (vector, problem.start, False)):
+        own = Ablation(1e4, 1.0, 1, {}, {}, SimpleNamespace(vector=less))
+        found = Selection(state, None, SimpleNamespace(vector=full), {effect: own})
+        assert vetoes.not_seen_at_rest(found, None) == ([effect] if is_false and is_law else [])
+
+
+def test_lost_causes_are_warned_of(state):
+    (lost,) = warnings_of(state.problem, [], ["wind"])
+    assert lost.startswith("wind gained nothing on the held-out part")
+
+
+def test_a_long_log_is_thinned_with_a_warning_that_counts_judged_rows(state, monkeypatch):
+    """Lanes also hold rows that are not judged: those must not make up for judged rows that are lost."""
+    lanes = state.problem.lanes
+    half = lanes.counts & (np.arange(len(lanes.row)) % 2 == 0)[:, None, None, None]
+    every = lanes._replace(counts=half)
+    assert thinned(every) is every and thinning_warning(every, every) == []
+    monkeypatch.setattr("flytrack_sysid.diagnosis.lanes.MOST_ROWS", 4 * LANE_S * 100 + 10)
+    (warning,) = thinning_warning(every, thinned(every))
+    kept, number = thinned(every).num_judged, every.num_judged
+    assert kept < 0.8 * number and warning.startswith(f"only {kept} of {number} rows were learnt from")
+    in_lanes = int((thinned(every).row[100:] >= 0).sum())
+    assert in_lanes >= number  # as many rows as are judged: counting those would have hidden the loss

@@ -10,9 +10,9 @@ from scipy.spatial.transform import Rotation
 from benchmarks.diagnosis import model_of
 from benchmarks.hidden import draw_base, fly, measure
 from flytrack_env.dynamics import ModelParameters
-from flytrack_env.effects import EFFECTS, AccelerometerBias, CommandDelay, LinearDrag
+from flytrack_env.effects import EFFECTS, AccelerometerBias, LinearDrag
 from flytrack_sysid.diagnosis import report, summary
-from flytrack_sysid.diagnosis.evidence import EVIDENCE, without
+from flytrack_sysid.diagnosis.evidence import EVIDENCE
 from flytrack_sysid.diagnosis.result import (
     CAUSES_FOUND,
     UNEXPLAINED,
@@ -26,7 +26,7 @@ from flytrack_sysid.diagnosis.result import (
     Unexplained,
 )
 from flytrack_sysid.diagnosis.score_test import BASE_CAUSES
-from flytrack_sysid.diagnosis.traces import BETWEEN_FLIGHTS, REGRESSORS, traces
+from flytrack_sysid.diagnosis.traces import REGRESSORS, traces
 from flytrack_sysid.parameters import names_of, to_vector, with_values
 
 SECONDS, DT_S = 12.0, 0.01
@@ -104,36 +104,6 @@ def test_residuals_are_measured_minus_modelled(flown):
         assert np.abs(found.residuals["right"][name][later]).max() < 1e-3
 
 
-def test_lost_rows_leave_their_slots_empty(flown):
-    base, log = flown
-    kept = np.ones(len(log), bool)
-    kept[[400, 401, 700]] = False
-    parts = log.select(kept)
-    parts = replace(parts, segment=(parts.time > 9.0).astype(int))
-    found = traces(parts, {"base": base}, like="base")
-    gaps = np.diff(found.slot)
-    assert gaps[399] == 3 and gaps[697] == 2 and (gaps > BETWEEN_FLIGHTS).sum() == 1
-    assert not found.counts["velocity"][[0, 400, 698]].any() and found.counts["velocity"][401]
-    start = int(np.flatnonzero(gaps > BETWEEN_FLIGHTS)[0]) + 1
-    assert not found.counts["force"][start] and found.residuals["base"]["battery"][start] == 0.0
-    assert found.regressors["time"][start] == 0.0
-
-
-@pytest.mark.slow
-def test_attitude_stands_in_for_a_gyro(flown):
-    base, log = flown
-    found = traces(log.without("w", "f"), {"base": base}, like="base")
-    assert found.used("rates_y") == "attitude_y" and found.used("force_world_x") == "velocity_world_x"
-    assert found.used("battery") == "battery"
-    np.testing.assert_array_equal(
-        found.column("base", "rates_y")[0], found.residuals["base"]["attitude"][:, 1]
-    )
-    with_gyro = traces(log, {"base": base}, like="base")
-    for name in ("model_rates_x", "model_rates_z"):
-        apart = found.regressors[name][SETTLED:] - with_gyro.regressors[name][SETTLED:]
-        assert np.abs(apart).max() < 0.05
-
-
 def shown(model: ModelParameters, cause: str) -> ModelParameters:
     """Return the model with a cause, far from neutral."""
     if cause in BASE_CAUSES:
@@ -165,16 +135,6 @@ def test_every_cause_has_a_plot_in_which_it_shows(flown):
             (less, counts), (full, _) = (found.column(name, panel.residual) for name in ("without", cause))
             explained.append(np.abs(full - less)[counts].max() / sizes[panel.residual.split("_")[0]])
         assert max(explained) > 1.0, cause
-
-
-def test_a_model_without_a_cause(flown):
-    base = flown[0]
-    extended = base._replace(tau=2.0 * base.tau).with_effects(DRAG, CommandDelay(0.01))
-    less = without(extended, base, "linear_drag")
-    assert less.effect("linear_drag") == LinearDrag() and less.effect("command_delay").delay_s == 0.01
-    less = without(extended, base, "tau_pitch")
-    np.testing.assert_allclose(less.tau, base.tau * [2.0, 1.0, 2.0, 2.0])
-    np.testing.assert_array_equal(to_vector(without(less, base, "thrust_curve")), to_vector(less))
 
 
 @pytest.fixture(scope="module")

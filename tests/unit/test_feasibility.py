@@ -107,24 +107,9 @@ def test_every_demand_has_a_break() -> None:
     assert {demand for _, demand in BREAKS.values()} == set(tracks.DEMANDS)
 
 
-# Field, the value that the FlyTrack course just keeps, the one that it breaks, and the demand.
-EDGES = [
-    ("min_spacing", 7.21, 7.22, "spacing"),
-    ("max_spacing", 13.61, 13.60, "spacing"),
-    ("max_turn_deg", 60.2, 60.1, "turn"),
-    ("min_start_distance", 6.22, 6.23, "start"),
-    ("max_start_turn_deg", 11.6, 11.5, "start"),
-    ("start_clearance", 5.0, 5.01, "start"),
-    ("min_opening", 1.5, 1.51, "opening"),
-]
-
-
-@pytest.mark.parametrize(("field", "kept", "broken", "demand"), EDGES)
-def test_limits_bind_where_they_say(field: str, kept: float, broken: float, demand: str) -> None:
-    track = tracks.load_track("flytrack")
-    assert tracks.find_problems(track, tracks.Limits()._replace(**{field: kept})) == ()
-    found = tracks.find_problems(track, tracks.Limits()._replace(**{field: broken}))
-    assert {problem.demand for problem in found} == {demand}
+def test_limits_of_ones_own_replace_the_defaults() -> None:
+    found = tracks.find_problems(RING, tracks.Limits(min_opening=1.51))
+    assert len(found) == NUM_GATES and {problem.demand for problem in found} == {"opening"}
 
 
 def test_default_clearances_are_what_starts_need() -> None:

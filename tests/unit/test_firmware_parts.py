@@ -3,7 +3,6 @@
 import shutil
 from dataclasses import replace
 
-import numpy as np
 import pytest
 
 pytest.importorskip("firmware", reason="firmware/ is in clones only")
@@ -119,14 +118,6 @@ def test_what_the_firmware_did_not_keep_is_named():
 def test_impossible_bodies_are_refused_by_name(field, value):
     with pytest.raises(FirmwareError, match=f"body: {field}: found"):
         replace(Body(), **{field: value})
-
-
-@pytest.mark.parametrize("linear", [0.0, 0.4, 1.0])
-def test_steady_motors_have_the_command_that_made_them(linear):
-    body, command, volts = Body(linear=linear), 0.37, 22.5
-    share = (linear * command + (1 - linear) * command**2) * (volts / body.full_v) ** body.volt_exponent
-    speeds = np.full(4, np.sqrt(share))
-    assert body.command_of(speeds, np.array(volts)) == pytest.approx(command, rel=1e-12)
 
 
 def test_body_is_packed_as_its_header_counts_it():

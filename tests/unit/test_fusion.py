@@ -43,37 +43,6 @@ def test_identity(leaf: str, transform: str) -> None:
         np.testing.assert_array_equal(np.signbit(result), np.signbit(value))
 
 
-def plain(x: jax.Array, n: jax.Array) -> jax.Array:
-    """Return a function of a real and an integer."""
-    return jnp.sin(x) * x**2 + n * x
-
-
-def fenced(x: jax.Array, n: jax.Array) -> jax.Array:
-    """Return the same with boundaries inside."""
-    x, n, _ = compute_once((x, n, x > 0))
-    return compute_once(jnp.sin(x)) * x**2 + n * compute_once(x)
-
-
-@pytest.mark.parametrize("order", [1, 2])
-@pytest.mark.parametrize("differentiate", [jax.grad, jax.jacfwd, jax.jacrev])
-@pytest.mark.parametrize("is_jitted", [False, True])
-def test_derivatives_pass_through(order: int, differentiate: Any, is_jitted: bool) -> None:
-    functions = []
-    for function in (plain, fenced):
-        for _ in range(order):
-            function = differentiate(function)
-        functions.append(jax.jit(function) if is_jitted else function)
-    expected, result = (function(jnp.float32(0.7), jnp.int32(3)) for function in functions)
-    np.testing.assert_allclose(result, expected, rtol=1e-6)
-
-
-def test_random_keys_pass_through() -> None:
-    key = jax.random.key(3)
-    for tree in ((key,), (jnp.float32(1.0), key)):
-        result = jax.jit(compute_once)(tree)
-        assert jax.random.key_data(result[-1]).tolist() == jax.random.key_data(key).tolist()
-
-
 def swung(x: jax.Array, steps: jax.Array, unread: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Return what a loop of simple operations makes of numbers; the last one is not read."""
     return jax.lax.fori_loop(0, 3, lambda _, y: jnp.where(y > 0.3, jnp.sin(y), y * steps), x), x + 1.0

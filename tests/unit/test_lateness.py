@@ -1,50 +1,21 @@
-"""Late poses: residuals of what was logged, and how late poses are, on motion made apart from the replay."""
+"""Late poses: how late they are, and clocks that disagree, on motion made apart from the replay."""
 
 from dataclasses import replace
 
 import jax
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 
 from flytrack_env.motion import Motion
 from flytrack_sysid import sensors
-from flytrack_sysid.diagnosis import motion_choice
-from flytrack_sysid.diagnosis.lanes import NUM_AXES, make_lanes
-from flytrack_sysid.diagnosis.lateness import judged_as_logged, read_poses
 from flytrack_sysid.diagnosis.motion_choice import Moves, how_it_moves
 from flytrack_sysid.diagnosis.sensor_clocks import on_one_clock, with_causal_commands
 from flytrack_sysid.log import FlightLog
 from tests.support.handout_plant import GRAVITY, HandoutPlant, excited
 from tests.support.made_flight import TIME_S, flight, noisy
 
-LATE_S, TAU = 0.013, np.full(4, 0.03)
+LATE_S = 0.013
 STEPS = 2.4  # by which the plant's poses are late
-
-
-def changes(log: FlightLog) -> np.ndarray:
-    """Return turns, rad, and changes of velocity, m/s, since the row before, world frame, (num_rows, 6)."""
-    quat = Rotation.from_quat(log["q"], scalar_first=True)
-    turns = (quat[1:] * quat[:-1].inv()).as_rotvec()
-    return np.pad(np.concatenate([turns, np.diff(log["v"], axis=0)], axis=1), ((1, 0), (0, 0)))
-
-
-@pytest.mark.parametrize("motion", [Motion.CONTINUOUS, Motion.HANDOUT])
-def test_a_perfect_model_leaves_the_noise_of_the_poses_as_logged(motion: Motion) -> None:
-    """Interpolation, which smooths the corrected poses, leaves no trace."""
-    truth, late = flight(TIME_S), flight(TIME_S, LATE_S, LATE_S, LATE_S)
-    logged = noisy(late, seed=1)
-    corrected, is_known = read_poses(logged, LATE_S)
-    corrected = corrected.select(is_known)
-    lanes = make_lanes(corrected, np.ones(len(corrected), bool), TAU, GRAVITY)
-    lanes, found = judged_as_logged(lanes, corrected, logged, LATE_S, motion)
-    left = np.zeros((1, *lanes.row.shape, NUM_AXES, 2))
-    left[0, ..., :6, 1] = (changes(corrected) - changes(truth)[: len(corrected)])[lanes.row]
-    counts = lanes.counts[..., :6, 1].all(axis=-1)
-    counts[-1] = False  # its next row is that of no lane
-    expected = (changes(logged) - changes(late))[np.minimum(lanes.row + 1, len(logged) - 1)]
-    off = (found.residuals(left)[0, ..., :6, 1] - expected)[counts]
-    assert counts.sum() > 1500 and np.all(off.std(axis=0) < 0.01 * expected[counts].std(axis=0))
 
 
 def test_velocity_and_position_come_on_the_clock_of_the_attitude() -> None:
@@ -101,19 +72,6 @@ def test_lateness_is_found_where_there_is_one() -> None:
     late = found(late_poses(truth))
     assert 0.0 < late.sigma_s < 1e-3 and abs(late.late_s - 0.01 * STEPS) < 4.0 * late.sigma_s
     assert found(truth) == Moves(Motion.HANDOUT)
-
-
-@pytest.mark.slow
-def test_poses_that_seem_early_are_on_time(monkeypatch) -> None:
-    """Where the correlation says late, their lateness is fitted down to none and no further."""
-    plant, wrong_s, half_step_s = HandoutPlant(), 0.0017, 0.005
-    early = late_poses(excited(plant), steps=-0.05)
-    log = sensors.measure(early, 1.0, GRAVITY, np.random.default_rng(1))
-    says = wrong_s - half_step_s, 3e-4, 1.0, ""
-    monkeypatch.setattr(motion_choice, "offset_between", lambda *_: says)
-    with jax.enable_x64(True):
-        found = how_it_moves(log, plant.model(), np.ones(len(log), bool), Motion.HANDOUT)
-    assert found == Moves(Motion.HANDOUT)
 
 
 @pytest.mark.slow

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from flytrack_env.dynamics import ModelParameters, move, observe_rates
+from flytrack_env.dynamics import ModelParameters, move
 from flytrack_env.effects import (
     CommandDelay,
     ImuLatency,
@@ -16,10 +16,8 @@ from flytrack_env.effects import (
     LinearDrag,
     SecondOrderRates,
     YawReaction,
-    start_memories,
 )
 from flytrack_env.motion import Motion
-from flytrack_env.quaternion import Vec3
 from flytrack_env.state import Action, Drone, unpack
 from tests.support.handout_plant import rotation
 from tests.support.simulated_flights import fly
@@ -201,14 +199,3 @@ def test_a_step_is_differentiable_and_batched(motion):
         before = jax.vmap(height, (None, 0))(jnp.asarray(TAU), sticks)
         slopes, expected = np.asarray(slopes[:, 3]), np.asarray((moved - before) / 1e-6)
     np.testing.assert_allclose(slopes, expected, rtol=1e-3)
-
-
-@pytest.mark.parametrize("effects", [(), (SecondOrderRates(0.02, 0.02, 0.0, 0.3, 0.3),)])
-def test_a_flight_goes_on_from_measured_rates(effects):
-    model = PLAIN.with_effects(*effects)
-    drone = started(model)
-    measured = Vec3(drone.rates_b.x + 0.5, drone.rates_b.y - 0.3, drone.rates_b.z + 0.1)
-    memories = start_memories(model.effects, drone)
-    seen, later = observe_rates(drone, memories, measured, 0.01, model)
-    after = move(seen, later, seen.applied, 1e-6, model).after
-    np.testing.assert_allclose(np.array(after.rates_b), np.array(measured), atol=1e-4)

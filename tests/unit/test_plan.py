@@ -11,7 +11,7 @@ import pytest
 from flytrack_env.dynamics import nominal_parameters
 from flytrack_env.plants import Simulator
 from flytrack_sysid import FlightLog, collect
-from flytrack_sysid.diagnosis.identifiability import Question, advise, information_of_manoeuvres
+from flytrack_sysid.diagnosis.identifiability import Question, advise
 from flytrack_sysid.diagnosis.lanes import make_lanes
 from flytrack_sysid.diagnosis.problem import Problem
 from flytrack_sysid.diagnosis.score_test import Linearization
@@ -114,11 +114,3 @@ def test_what_is_advised_shows_once_it_is_flown(hover, told):
         assert advice[effect] in EXPECTED[effect], effect
         before, after = question.shares()[0], question.shares(told(advice[effect]))[0]
         assert before < 1.0 <= after, f"{effect}: {before} before and {after} after {advice[effect]}"
-
-
-@pytest.mark.slow
-def test_sensors_that_the_log_lacks_tell_nothing_ahead_either(hover):
-    blind = logged(hover.log.without("v_bat"))
-    question = Question(blind.linearization, blind.model, "voltage_sag")
-    ahead = information_of_manoeuvres(blind.problem, blind.model, blind.linearization, question.columns)
-    assert max(question.shares(one)[0] for one in ahead.values()) < 0.01

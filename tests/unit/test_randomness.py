@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from flytrack_env.randomness import BYTES_DEVIATION, NORMAL, Draws, next_word, seed_of, seeds_of
+from flytrack_env.randomness import Draws, next_word, seed_of, seeds_of
 
 NUM_DRAWS = 1_000_000
 
@@ -17,29 +17,6 @@ def normals() -> dict[str, np.ndarray]:
     words = jax.random.bits(jax.random.key(0), (NUM_DRAWS,))
     draw = jax.jit(jax.vmap(lambda word, name: Draws(word).normal(name), in_axes=(0, None)), static_argnums=1)
     return {name: np.asarray(draw(words, name), float) for name in ("position_0", "rates_2")}
-
-
-def exact_distribution() -> tuple[np.ndarray, np.ndarray]:
-    """Return every value that a normal draw can have, and the probability of each."""
-    byte = np.full(256, 1.0 / 256.0)
-    pair = np.convolve(byte, byte)
-    probability = np.convolve(pair, pair)
-    centred = (np.arange(len(probability)) - 510.0) / BYTES_DEVIATION
-    return centred, probability
-
-
-def test_the_polynomial_is_the_fit_that_it_is_said_to_be() -> None:
-    centred, probability = exact_distribution()
-    quantile = stats.norm.ppf(np.cumsum(probability) - 0.5 * probability)
-    powers = np.stack([centred, centred**3, centred**5], axis=1)
-    weight = np.sqrt(probability)
-    fitted = np.linalg.lstsq(powers * weight[:, None], quantile * weight, rcond=None)[0]
-    fitted /= np.sqrt(probability @ (powers @ fitted) ** 2)  # to unit variance
-    np.testing.assert_allclose(NORMAL, fitted, rtol=2e-4)
-    value = powers @ NORMAL
-    assert (np.diff(value) > 0.0).all() and value[-1] < 4.5
-    middle = np.cumsum(probability) - 0.5 * probability
-    assert np.abs(stats.norm.cdf(value) - middle).max() < 1e-3
 
 
 @pytest.mark.parametrize("name", ["position_0", "rates_2"])

@@ -1,4 +1,4 @@
-"""The truth leaves nothing of any channel, and what is wrong shows where it should and nowhere else."""
+"""The truth leaves nothing of any channel; neither the heading nor held-out rows matter."""
 
 from dataclasses import replace
 
@@ -68,32 +68,6 @@ def test_truth_leaves_nothing_of_any_channel(log, absent, expected):
 def test_truth_leaves_nothing_at_other_steps(shape):
     problem = problem_of(excited(PLANT, **shape))
     assert max(largest(left(PLANT.model(), problem)).values()) < 1e-9
-
-
-def changed(index: int, vector: tuple[float, ...], factor: float) -> np.ndarray:
-    return np.where(np.arange(len(vector)) == index, factor * np.array(vector), vector)
-
-
-@pytest.mark.parametrize(
-    ("changes", "shows_in"),
-    [
-        ({"tau": changed(0, PLANT.tau, 1.2)}, {"w": 0.1, "q": 0.01}),
-        ({"tau": changed(2, PLANT.tau, 1.2)}, {"w": 0.05, "q": 0.002}),
-        ({"tau": changed(3, PLANT.tau, 1.2)}, {"f": 0.5, "v": 0.02}),
-        ({"thrust_coeffs": changed(2, PLANT.coeffs, 1.2)}, {"f": 0.5, "v": 0.02}),
-        ({"thrust_coeffs": changed(5, PLANT.coeffs, 1.02)}, {"f": 0.1, "v": 0.02}),
-        ({"max_rate": np.array([618.0, 700.0, 120.0])}, {"w": 0.5, "q": 0.01}),
-        ({"battery_drain_v_per_min": 1.2}, {"v_bat": 0.002}),
-        ({"effects": (LinearDrag(0.1, 0.1, 0.1),)}, {"f": 0.5, "v": 0.02}),
-    ],
-)
-def test_what_is_wrong_shows_in_its_channels_alone(log, changes, shows_in):
-    found = largest(left(PLANT.model(**changes), problem_of(log)))
-    for name, value in found.items():
-        if name in shows_in:
-            assert value > shows_in[name], name
-        else:
-            assert value < 1e-9, name
 
 
 def test_turning_the_world_about_the_vertical_changes_nothing(log):
