@@ -342,11 +342,14 @@ def added(side: Side, terms: Sequence[Term]) -> np.ndarray:
     return total
 
 
-def held_out(side: Side, held: Side, terms: Sequence[Term], vector: np.ndarray) -> tuple[float, float]:
-    """Return what terms gain on held-out rows, and what they would if they were right there."""
+def held_out(side: Side, held: Side, learnt: np.ndarray, vector: np.ndarray) -> tuple[float, float]:
+    """Return what something learnt gains on held-out rows, and what it would if it were right there.
+
+    learnt: what it adds there, whitened. vector: of the model beside it.
+    """
     axes = SIDES[side.name]
     less, moved = held.problem.whitened_residuals(side.vector, vector)
-    full = moved[..., axes, :] - added(held, terms)
+    full = moved[..., axes, :] - learnt
     gain = robust_square(less[..., axes, :]) - robust_square(full)
     return gain, float(np.sum((less[..., axes, :] - full) ** 2))
 
@@ -371,7 +374,7 @@ def find_law(side: Side, held: Side) -> Found | None:
         if not terms:
             rivals = tuple(_kind(one.term) for one in trials[1:] if one.merit > first.merit - 10.0)
         now, model = fitted(side, [*terms, first.term])
-        gain, expected = held_out(side, held, now, model.vector)
+        gain, expected = held_out(side, held, added(held, now), model.vector)
         if gain < HELD_OUT_SHARE * expected:
             break
         if best is not None and (

@@ -27,6 +27,7 @@ from flytrack_sysid.diagnosis.unexplained import (
     waves_of,
 )
 
+MOST_ROWS = 12_000  # with their lead-ins: two minutes at 100 Hz
 LEAST_SHARE = 0.15  # of the sensor's noise, rms: less is not learnt
 LAW_SHARE = 0.75  # of what smooth functions of everything explain: the least that a law explains
 WORSE_SIGMAS = 1.0  # by which no horizon may be worse
@@ -40,6 +41,7 @@ def find_learned(
     problem, test: of rows to learn from and of others. base: vector of the refitted model without effects.
     judge: of free flights on held-out rows; None without any.
     """
+    problem, test = thinned_problem(problem), thinned_problem(test)
     waves = waves_of(problem, model, find_lines(problem, model))
     dependences = find_dependences(problem, model, base, waves)
     terms: list[Term] = []
@@ -69,6 +71,16 @@ def find_learned(
         {name: one.rivals for name, one in found.items() if isinstance(one, Found)},
     )
     return learned, model.vector
+
+
+def thinned_problem(problem: Problem) -> Problem:
+    """Return a problem of fewer lanes, evenly spread, where a log is long: hundreds of terms are tried."""
+    rows, number = problem.lanes.row.shape
+    most = max(MOST_ROWS // rows, 2)
+    if number <= most or problem.late is not None or problem.noise is None:
+        return problem
+    lanes = problem.lanes.selected(np.linspace(0, number - 1, most).round().astype(int))
+    return replace(problem, lanes=lanes).with_noise(problem.noise)
 
 
 def _learnt(side: Side, held: Side, dependences: Sequence[Dependence]) -> Found | Residual | None:

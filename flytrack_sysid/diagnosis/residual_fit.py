@@ -14,8 +14,8 @@ import numpy as np
 
 from flytrack_env.effects.grammar import XYZ, Factor, Term
 from flytrack_env.effects.learned_residual import Input, Network
-from flytrack_sysid.diagnosis.law_search import Side, power
-from flytrack_sysid.diagnosis.problem import blocks_of, robust_square
+from flytrack_sysid.diagnosis.law_search import Side, held_out, power
+from flytrack_sysid.diagnosis.problem import blocks_of
 from flytrack_sysid.diagnosis.score_test import solve
 from flytrack_sysid.diagnosis.unexplained import SIDES, whitened
 
@@ -158,7 +158,7 @@ def fit_residual(side: Side, held: Side, names: Sequence[str], seed: int = 0) ->
     deviation = _main_spread(members[:, blocks.num_given :])
     network = network_with(network, mean, deviation)
     held_white = whitened(held.problem, _features(held, network), side.name)
-    gain, expected = _held_out(held, side, vector, np.tensordot(mean, held_white, axes=1))
+    gain, expected = held_out(side, held, np.tensordot(mean, held_white, axes=1), vector)
     if gain <= 0.0:
         return None
     network = _with_interval(held, network, vector)
@@ -197,14 +197,6 @@ def network_with(network: Network, mean: np.ndarray, deviation: np.ndarray) -> N
     """Return a network with outputs, (3 * units,) each."""
     shape = (XYZ, HIDDEN + 1)
     return replace(network, outputs=_rows(mean.reshape(shape)), deviations=_rows(deviation.reshape(shape)))
-
-
-def _held_out(held: Side, side: Side, vector: np.ndarray, added: np.ndarray) -> tuple[float, float]:
-    axes = SIDES[side.name]
-    less, moved = held.problem.whitened_residuals(side.vector, vector)
-    full = moved[..., axes, :] - added
-    gain = robust_square(less[..., axes, :]) - robust_square(full)
-    return gain, float(np.sum((less[..., axes, :] - full) ** 2))
 
 
 def direct_residuals(held: Side, vector: np.ndarray, network: Network) -> tuple[np.ndarray, np.ndarray]:
