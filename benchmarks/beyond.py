@@ -139,7 +139,10 @@ def figures(lines: Sequence[dict[str, Any]]) -> list[tuple[str, str, str]]:
     seen = [line for line in laws if line["unexplained"]]
     found = [line for line in laws if line["law"]]
     controls = {row: [line for line in lines if line["row"] == row] for row in ("clean", "listed")}
-    removed_shares = [100.0 * line["removed"][0] for line in laws if "removed" in line]
+    # A thermal is elsewhere on every flight, so that a new one says nothing of it.
+    removed_shares = [
+        100.0 * one["removed"][0] for one in laws if "removed" in one and one["row"] != "position"
+    ]
     intervals = [counts for line in lines for counts in line.get("covered", {}).values()]
     inside, of = (sum(one[place] for one in intervals) for place in range(2))
     share = f"{100.0 * inside / of:.1f} % of {of}" if of else "none"
