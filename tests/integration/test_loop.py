@@ -36,11 +36,11 @@ def flights(champion, shipped):
 
 @pytest.fixture(scope="module")
 def log(flights):
-    return log_of_flights(flights, 0.01, 3, 12.0, 0.0)
+    return log_of_flights(flights, 0.01, 3, 11.0, 0.0)
 
 
 def test_the_log_is_what_the_plant_did(log, shipped):
-    assert 12.0 <= len(log) * 0.01 < 12.0 + 4.5
+    assert 11.0 <= len(log) * 0.01 < 11.0 + 4.5
     row = 200
     state = np.concatenate([log[name][row] for name in ("p", "v", "a", "q", "w")])
     state = np.concatenate([state, log["uprev"][row], log["v_bat"][row]]).astype(np.float32)
@@ -51,9 +51,9 @@ def test_the_log_is_what_the_plant_did(log, shipped):
 
 def test_the_log_has_a_segment_per_flight_and_is_noisy_on_request(log, flights):
     starts = log["p"][log.is_start()]
-    assert len(starts) == len(np.unique(log.segment)) == 3  # of four that were flown: 12 s are enough
+    assert len(starts) == len(np.unique(log.segment)) == 3  # of four that were flown: 11 s are enough
     assert np.ptp(starts[:, 0]) > 0.01  # each flight from a start of its own
-    noisy = log_of_flights(flights, 0.01, 3, 12.0, 1.0)
+    noisy = log_of_flights(flights, 0.01, 3, 11.0, 1.0)
     assert "uprev" not in noisy and "f" in noisy and len(noisy) < len(log)
 
 
