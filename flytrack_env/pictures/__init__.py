@@ -1,7 +1,7 @@
-"""Recorded flights as PNG, MP4 and GIF files, without a viewer and without a display.
+"""Recorded flights as PNG and GIF files, without a viewer and without a display.
 
 ``python -m flytrack_env.pictures`` draws rollout files. Needs the extra ``flytrack[viz]``, and
-``flytrack[render]`` for videos and animations; importing this package does not.
+``flytrack[render]`` for animations; importing this package does not.
 """
 
 import importlib
@@ -27,14 +27,13 @@ __all__ = [
     "read_flights",
     "write_animation",
     "write_pictures",
-    "write_video",
 ]
 
 VIEWS = ("top", "side", "commands")
 
 
 def _load(name: str, extra: str, library: str) -> ModuleType:
-    check_installed(extra, "pictures of flights" if extra == "viz" else "videos of flights", library)
+    check_installed(extra, "pictures of flights" if extra == "viz" else "animations of flights", library)
     return importlib.import_module(f"flytrack_env.{name}")
 
 
@@ -69,30 +68,17 @@ def write_pictures(flights: Sequence[Flight], folder: str | Path) -> list[Path]:
     return list(contents)
 
 
-def write_video(flight: Flight, folder: str | Path) -> Path:
-    """Write ``NAME.mp4``, the fastest flying lap at the speed at which it was flown; return its path.
-
-    Else the first lap; without a complete lap the flight, up to 20 s.
-
-    Raises:
-        ImportError, OSError: moviepy or Pillow is not installed, or the file cannot be written.
-    """
-    path = Path(folder) / f"{flight.name}.mp4"
-    _load("pictures.video", "render", "moviepy").write_video(flight, path)
-    return path
-
-
 def write_animation(flight: Flight, reference: Reference, folder: str | Path) -> Path:
     """Write ``NAME.gif``, the fastest flying lap beside the time-optimal one; return its path.
 
     reference: a time-optimal flying lap of the same track.
 
     Raises:
-        ImportError, OSError: moviepy or Pillow is not installed, or the file cannot be written.
+        ImportError, OSError: Pillow is not installed, or the file cannot be written.
         ValueError: a flight without a complete flying lap.
     """
-    laps = _load("pictures.video", "render", "moviepy").laps_to_compare(flight, reference)
     make_gif = _load("rendering.animation", "render", "PIL").make_gif
+    laps = _load("pictures.laps", "render", "PIL").laps_to_compare(flight, reference)
     path = Path(folder) / f"{flight.name}.gif"
     write_atomically(path, make_gif(build_course(flight.track), laps))
     return path

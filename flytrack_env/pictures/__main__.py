@@ -8,14 +8,14 @@ from typing import Annotated, Literal
 
 import tyro
 
-from flytrack_env.pictures import read_flights, write_animation, write_pictures, write_video
+from flytrack_env.pictures import read_flights, write_animation, write_pictures
 from flytrack_env.references import shipped_reference
 from flytrack_env.tracks import load_track
 
 
 @dataclass(frozen=True)
 class Settings:
-    """Draw rollouts as PNGs, and a lap of each as MP4 or GIF."""
+    """Draw rollouts as PNGs, and a lap of each as GIF."""
 
     rollouts: tyro.conf.Positional[
         Annotated[tuple[Path, ...], tyro.conf.arg(metavar="ROLLOUT ...", help_behavior_hint="(at least one)")]
@@ -27,8 +27,6 @@ class Settings:
     """Name of a shipped track, or a track file (.toml)."""
     allow_pickle: bool = False
     """Read pickled rollouts. Unpickling runs whatever code a file holds: allow it for files you trust."""
-    video: bool = False
-    """Also write a lap of each as MP4."""
     animation: bool = False
     """Also write the fastest flying lap of each beside the time-optimal one as GIF."""
     ghost_model: Literal["nominal", "black_box"] = "nominal"
@@ -46,8 +44,6 @@ def _draw(settings: Settings) -> None:
     track = load_track(settings.track)
     flights = read_flights(settings.rollouts, track, settings.allow_pickle)
     paths = write_pictures(flights, folder)
-    if settings.video:
-        paths += [write_video(flight, folder) for flight in flights]
     if settings.animation:
         reference = shipped_reference(track.name, "flying", settings.ghost_model)
         paths += [write_animation(flight, reference, folder) for flight in flights]

@@ -1,14 +1,13 @@
-"""Pictures and videos of recorded flights: what is drawn is what was flown."""
+"""Pictures of recorded flights: what is drawn is what was flown."""
 
 import io
 import sys
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 
-from flytrack_env.pictures import Flight, draw_flight, make_flight, write_animation, write_video
+from flytrack_env.pictures import Flight, draw_flight, make_flight, write_animation
 from flytrack_env.pictures.__main__ import main
 from flytrack_env.references import ghost_rollout, shipped_references
 from flytrack_env.rollout import save_rollout
@@ -33,30 +32,6 @@ def straight(right_m: float, up_m: float) -> Flight:
     states[:, 1:3] = y + right_m, z + up_m  # towards -x, +y is to the right
     states[:, 3], states[:, 9], states[:, 20] = -10.0, 1.0, 24.0
     return make_flight("straight", states, np.zeros((30, 4), np.float32), TRACK)
-
-
-def test_video_shows_the_lap_and_leaves_nothing_where_it_fails(ghost, monkeypatch, tmp_path):
-    video = pytest.importorskip("flytrack_env.pictures.video")
-    rows, drawn = video.shown_rows(ghost), []
-
-    class Recorder:
-        def draw(self, log: Any) -> np.ndarray:
-            drawn.append((log.rows[-1].copy(), log.time_s - log.rows[-1, 23]))
-            return np.full((540, 960, 3), len(drawn) % 256, np.uint8)
-
-    monkeypatch.setattr(video, "make_renderer", lambda course: Recorder())
-    path = write_video(ghost, tmp_path / "new")
-    assert path == tmp_path / "new" / "ghost.mp4" and [*path.parent.iterdir()] == [path]
-    frames, seconds = video.imageio_ffmpeg.count_frames_and_secs(str(path))
-    assert frames == len(rows) and seconds == pytest.approx(0.02 * frames, abs=0.02)
-    np.testing.assert_array_equal(np.array([row for row, _ in drawn])[:, :21], STATES[rows])
-    # The lap time in the picture: since the crossing that began the lap, though the log begins later.
-    assert max(since_s for _, since_s in drawn[1:]) == pytest.approx(3.833, abs=0.02)
-    monkeypatch.setattr(Recorder, "draw", lambda self, log: 1 / 0)
-    old = path.read_bytes()
-    with pytest.raises(ZeroDivisionError):
-        write_video(ghost, tmp_path / "new")
-    assert [*path.parent.iterdir()] == [path] and path.read_bytes() == old
 
 
 def test_animation_shows_the_flying_lap_beside_the_time_optimal_one(tmp_path, ghost, monkeypatch):
@@ -107,10 +82,11 @@ def test_what_cannot_be_drawn_is_refused_in_one_line_and_nothing_is_written(tmp_
         assert {*tmp_path.rglob("*")} == before
 
 
-@pytest.mark.parametrize(("library", "extra"), [("matplotlib", "viz"), ("moviepy", "render")])
+@pytest.mark.parametrize(("library", "extra"), [("matplotlib", "viz"), ("PIL", "render")])
 def test_missing_library_is_named_with_its_extra(
     library: str, extra: str, ghost: Flight, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, library, None)
     with pytest.raises(ImportError, match=rf"{library}.*flytrack\[{extra}\]"):
-        draw_flight(ghost) if library == "matplotlib" else write_video(ghost, tmp_path)
+        reference = REFERENCES["flying"]
+        draw_flight(ghost) if library == "matplotlib" else write_animation(ghost, reference, tmp_path)
