@@ -36,7 +36,7 @@ def straight(right_m: float, up_m: float) -> Flight:
 
 def test_animation_shows_the_flying_lap_beside_the_time_optimal_one(tmp_path, ghost, monkeypatch):
     image = pytest.importorskip("PIL.Image")
-    animation = pytest.importorskip("flytrack_env.pictures.animation")
+    animation = pytest.importorskip("flytrack_env.rendering.animation")
     monkeypatch.setattr(animation, "STEPS_PER_FRAME", 60)
     path = write_animation(ghost, REFERENCES["flying"], tmp_path)
     assert path == tmp_path / "ghost.gif" and path.stat().st_size < 900 * 2**10
@@ -82,11 +82,11 @@ def test_what_cannot_be_drawn_is_refused_in_one_line_and_nothing_is_written(tmp_
         assert {*tmp_path.rglob("*")} == before
 
 
-@pytest.mark.parametrize(("library", "extra"), [("matplotlib", "viz"), ("PIL", "render")])
+@pytest.mark.parametrize(("library", "extra"), [("matplotlib", "viz"), ("Pillow", "render")])
 def test_missing_library_is_named_with_its_extra(
     library: str, extra: str, ghost: Flight, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setitem(sys.modules, library, None)
+    monkeypatch.setitem(sys.modules, {"Pillow": "PIL"}.get(library, library), None)
     with pytest.raises(ImportError, match=rf"{library}.*flytrack\[{extra}\]"):
         reference = REFERENCES["flying"]
         draw_flight(ghost) if library == "matplotlib" else write_animation(ghost, reference, tmp_path)
