@@ -187,23 +187,12 @@ def write_page() -> None:
         for line in sorted(good, key=lambda line: (line["row"], line["number"]))
         if line["row"] in RIGHT or line["law"] or line["residual"]
     ]
-    by_kind = [
-        (
-            kind,
-            len(own),
-            sum(one.get("is_form", False) for one in own),
-            sum(bool(one["residual"]) for one in own),
-        )
-        for kind in RIGHT
-        if (own := [line for line in good if line["row"] == kind])
-    ]
     report.fill_page(
         LINES.with_suffix(".md"),
         "beyond",
         commit=lines[-1]["commit"],
         crashed=len(lines) - len(good),
         figures=report.table("figure | asked | measured", figures(good)),
-        kinds=report.table("law | plants | variable and form right | residual", by_kind),
         plants=report.table("kind | truth | learnt | left unexplained by the list", rows),
         seed=SEED,
     )

@@ -174,13 +174,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--names", nargs="+", choices=RECIPES, default=list(RECIPES))
     parser.add_argument("--seeds", type=int, nargs="+", default=range(5))
-    parser.add_argument("--train-only", action="store_true", help="train and polish, no flights and no page")
     asked = parser.parse_args()
-    if asked.train_only:
-        for name in asked.names:
-            for seed in asked.seeds:
-                train(name, seed)
-        return
     sections = [section_of(name, list(asked.seeds)) for name in asked.names]
     report.fill_page(
         report.RESULTS / "champion.md",

@@ -23,12 +23,8 @@ MAY_BE = {
     "tilt": "air that recirculates, or a load that shifts",
     "height": "air that changes with height",
     "voltage": "a motor law that the list does not have",
-    "rate_x": "gyroscopic or inertial coupling",
-    "rate_y": "gyroscopic or inertial coupling",
-    "rate_z": "gyroscopic or inertial coupling",
-    "roll": "a stick's curve that the list does not have",
-    "pitch": "a stick's curve that the list does not have",
-    "yaw": "a stick's curve that the list does not have",
+    **dict.fromkeys(("rate_x", "rate_y", "rate_z"), "gyroscopic or inertial coupling"),
+    **dict.fromkeys(("roll", "pitch", "yaw"), "a stick's curve that the list does not have"),
     "throttle": "a motor or rotor law that the list does not have",
 }
 LAST = ("thrust", "throttle", "airspeed")  # say least of a product
