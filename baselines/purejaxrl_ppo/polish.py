@@ -50,11 +50,10 @@ class Settings(NamedTuple):
 
 
 class Flown(NamedTuple):
-    """What a flight came to: mean time of its gates, s, gates passed, the largest offset, the penalty."""
+    """What a flight came to: mean time of its gates, s, gates passed, the penalty."""
 
     time_s: jax.Array
     gates: jax.Array
-    offset: jax.Array
     penalty: jax.Array
 
 
@@ -90,7 +89,6 @@ def fly(
         flown = Flown(
             time_s=flown.time_s + jnp.where(counts, (index + crossing.fraction) * params.dt, 0.0) / last_gate,
             gates=flown.gates + counts,
-            offset=jnp.maximum(flown.offset, offset),
             # Linear far out: one lost flight must not outweigh all that race.
             penalty=flown.penalty + jnp.where(beyond < FAR, beyond * beyond, FAR * (2.0 * beyond - FAR)),
         )
@@ -103,7 +101,7 @@ def fly(
 
     observation, state = env.reset_env(key, params)
     zero = jnp.float32(0.0)
-    start = (observation, state, jnp.asarray(True), Flown(zero, jnp.int32(0), zero, zero))
+    start = (observation, state, jnp.asarray(True), Flown(zero, jnp.int32(0), zero))
     num_steps = round(settings.laps * settings.slowest_lap_s / float(env.default_params.dt))
     return jax.lax.scan(jax.checkpoint(step), start, jnp.arange(num_steps))[0][3]
 
