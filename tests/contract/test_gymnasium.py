@@ -4,6 +4,7 @@ import copy
 import importlib
 import pickle
 import warnings
+from functools import partial
 from importlib.util import find_spec
 from typing import Any
 
@@ -26,7 +27,6 @@ BASE = "FlyTrack-v0"
 
 IDS = sorted(ENVIRONMENTS)
 CRASH = np.full(4, np.nan, np.float32)  # an action that ends the episode
-CAUSES = {"crash", "ground", "out_of_bounds", "missed_gate", "battery_empty"}
 
 
 def make_vector(env_id: str = BASE, num_envs: int = 3, **arguments: Any) -> Any:
@@ -66,8 +66,7 @@ def test_checker_of_gymnasium_gives_no_warning(env_id: str, monkeypatch: pytest.
 def test_ids_are_registered_once_and_without_a_second_time_limit(env_id: str) -> None:
     before = gymnasium.spec(env_id)
     importlib.reload(flytrack_env)
-    assert gymnasium.spec(env_id) is before
-    assert before.max_episode_steps is None
+    assert gymnasium.spec(env_id) is before and before.max_episode_steps is None
     env = gymnasium.make(f"flytrack_env:{env_id}")
     while isinstance(env, gymnasium.Wrapper):
         assert not isinstance(env, TimeLimit)
@@ -85,8 +84,7 @@ def test_vector_environment_of_every_id_resets_in_the_same_step(env_id: str) -> 
     np.testing.assert_allclose(observations[1], gymnasium.make(env_id).reset(seed=4)[0], atol=1e-6)
     actions = np.stack([np.zeros(4), CRASH, np.zeros(4)])
     observations, rewards, terminated, truncated, infos = env.step(actions)
-    assert observations in env.observation_space
-    assert rewards.shape == (3,) and not truncated.any()
+    assert observations in env.observation_space and rewards.shape == (3,) and not truncated.any()
     np.testing.assert_array_equal(terminated, infos["_final_obs"])
     assert terminated[1] and infos["final_info"]["crash"][1]
     assert infos["final_obs"][1] in env.single_observation_space
@@ -128,9 +126,8 @@ def assert_same(a: Any, b: Any) -> None:
 
 def test_vector_environment_returns_what_gymnasiums_own_does(still: EnvParams) -> None:
     ours = make_vector(params=still)
-    theirs = SyncVectorEnv(
-        [lambda: gymnasium.make(BASE, params=still)] * 3, autoreset_mode=AutoresetMode.SAME_STEP
-    )
+    make = partial(gymnasium.make, BASE, params=still)
+    theirs = SyncVectorEnv([make] * 3, autoreset_mode=AutoresetMode.SAME_STEP)
     assert ours.metadata["autoreset_mode"] is AutoresetMode.SAME_STEP
     assert ours.observation_space == theirs.observation_space
     assert ours.action_space == theirs.action_space
@@ -138,10 +135,8 @@ def test_vector_environment_returns_what_gymnasiums_own_does(still: EnvParams) -
     rng, num_ended = np.random.default_rng(1), []
     for index in range(16):
         actions = rng.uniform(-1.0, 1.0, (3, 4)).astype(np.float32)
-        if index in (3, 6):
-            actions[index // 3 :] = CRASH  # some of them, and then more
-        if index == 9:
-            actions[:] = CRASH  # all of them: a step without an info of an episode that goes on
+        # Two of them, one, and all: a step without an info of an episode that goes on.
+        actions[{3: 1, 6: 2, 9: 0}.get(index, 3) :] = CRASH
         results = ours.step(actions), theirs.step(actions)
         for a, b in zip(*results, strict=True):
             assert_same(a, b)
@@ -157,18 +152,17 @@ def test_same_seed_same_flight() -> None:
     first = fly(env, seed=11)
     np.testing.assert_array_equal(first, fly(other, seed=11))
     following = env.reset()[0]
-    assert (following != first[0]).any()
     np.testing.assert_array_equal(following, other.reset()[0])
+    assert (following != first[0]).any()
     assert (fly(env, seed=12)[0] != first[0]).any()
 
 
 def test_vector_seeds() -> None:
     env, single = make_vector(), gymnasium.make(BASE)
+    seeds, crash = [20, 21, 22], np.tile(CRASH, (3, 1))
     observations, _ = env.reset(seed=20)
-    np.testing.assert_array_equal(observations, env.reset(seed=[20, 21, 22])[0])
-    starts = [single.reset(seed=seed)[0] for seed in (20, 21, 22)]
-    np.testing.assert_allclose(observations, starts, atol=1e-6)
-    crash = np.tile(CRASH, (3, 1))
+    np.testing.assert_array_equal(observations, env.reset(seed=seeds)[0])
+    np.testing.assert_allclose(observations, [single.reset(seed=seed)[0] for seed in seeds], atol=1e-6)
     env.reset(seed=20)
     after = env.step(crash)[0]
     env.reset(seed=20)
@@ -208,15 +202,8 @@ def test_options_set_the_start_of_one_episode(is_vector: bool) -> None:
     env = make_vector() if is_vector else gymnasium.make(BASE)
     observation = np.atleast_2d(env.reset(seed=0, options=POSE)[0])
     # Gate 0 at (12.5, 2, 1.35) is flown towards -x.
-    np.testing.assert_allclose(
-        observation[:, :3], [[-2.5 / 3, -0.5 / 3, -0.15 / 3]] * len(observation), atol=1e-5
-    )
-    np.testing.assert_allclose(observation[:, 3:6], [[9 / 5, 0.0, 1 / 5]] * len(observation), atol=1e-5)
-    np.testing.assert_allclose(observation[:, 6:15], [np.eye(3).ravel()] * len(observation), atol=1e-5)
-    np.testing.assert_allclose(observation[:, 15:18], 0.0, atol=1e-6)
-    np.testing.assert_allclose(
-        observation[:, 18:23], [[0.0, 0.0, 0.0, -1.0, -0.5]] * len(observation), atol=1e-5
-    )
+    expected = [-2.5 / 3, -0.5 / 3, -0.15 / 3, 9 / 5, 0.0, 1 / 5, *np.eye(3).ravel(), *[0.0] * 6, -1.0, -0.5]
+    np.testing.assert_allclose(observation[:, :23], [expected] * len(observation), atol=1e-5)
     following = np.atleast_2d(env.reset()[0])
     assert (abs(following[:, 22] + 0.5) > 1e-3).all()
 
@@ -251,8 +238,7 @@ def test_bad_options_are_refused_and_change_nothing(options: Any, message: str) 
 
 
 def test_arguments_reach_the_environment(params: EnvParams) -> None:
-    # Past the plane of a gate, outside its frame.
-    beside = {"position": (-0.05, 4.0, 2.0), "velocity": (10.0, 0.0, 0.0)}
+    beside = {"position": (-0.05, 4.0, 2.0), "velocity": (10.0, 0.0, 0.0)}  # past a gate, outside its frame
     beside["track"] = track_of_row([10.0 * index for index in range(8)])
     for arguments, is_end in (({"missed_gate": "fly_on"}, False), ({}, True)):
         env = gymnasium.make(BASE, **arguments)

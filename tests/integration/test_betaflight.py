@@ -134,14 +134,10 @@ def test_settings_are_read_back():
     with Betaflight(dump + "set roll_srate = 80\n") as plant:
         found = [plant.value(name) for name in ("p_roll", "roll_srate", "feature AIRMODE", "nonsense")]
         assert found == ["60", "80", "OFF", ""] and plant.full_stick_deg_s[0] == 800.0
-        masters = {
-            name: value for (scope, _, name), value in plant.firmware.values.items() if scope == "master"
-        }
-    lines = [
-        f"set {name} = {value}"
-        for name, value in masters.items()
-        if " " not in name and "profile" not in name
-    ]
+        values = plant.firmware.values
+    masters = {name: value for (scope, _, name), value in values.items() if scope == "master"}
+    names = [name for name in masters if " " not in name and "profile" not in name]
+    lines = [f"set {name} = {masters[name]}" for name in names]
     with Betaflight("\n".join(lines)) as again:  # names and values that the firmware itself has
         assert len(lines) > 200 and again.value("p_roll") == "45"
 
@@ -170,9 +166,8 @@ def test_collected_log_and_blackbox_are_the_same_flight(tmp_path):
     flown = log.select(log.segment == 0)
 
     def seen(channel: str, shift_s: float) -> np.ndarray:
-        return np.stack(
-            [np.interp(flown.time + shift_s, box.time, column) for column in box[channel].T], axis=1
-        )
+        time = flown.time + shift_s
+        return np.stack([np.interp(time, box.time, column) for column in box[channel].T], axis=1)
 
     # The firmware's log begins where its header is written, while the craft is held and settles.
     shifts_s = np.arange(0.0, SETTLE_S, 0.0005)
@@ -204,17 +199,14 @@ def test_environment_flies_it_and_goes_back_no_further_than_a_step(plant):
 
 def test_a_process_that_dies_or_hangs_is_one_sentence_and_nothing_is_left(monkeypatch):
     monkeypatch.setattr("firmware.process.LONGEST_ANSWER_S", 2.0)
-    for blow, said in (
-        (signal.SIGKILL, "has ended by itself"),
-        (signal.SIGSTOP, "did not answer within 2 s"),
-    ):
+    arguments = unpack_action(np.zeros(4)), 0.01, MODEL
+    blows = {signal.SIGKILL: "has ended by itself", signal.SIGSTOP: "did not answer within 2 s"}
+    for blow, said in blows.items():
         with Betaflight() as plant:
-            state = plant.step(
-                plant.reset(unpack(starts(1)[0]), MODEL), unpack_action(np.zeros(4)), 0.01, MODEL
-            )
+            state = plant.step(plant.reset(unpack(starts(1)[0]), MODEL), *arguments)
             assert num_processes(plant) == 2
             os.kill(plant._flights[int(state.flight)].link.pid, blow)
-            after = plant.step(state, unpack_action(np.zeros(4)), 0.01, MODEL)
+            after = plant.step(state, *arguments)
             assert np.isnan(pack(after.drone)).all()
             with pytest.raises(CollectError, match=f"the process of a flight {said}"):
                 collect(plant, minutes=1.0)
@@ -278,10 +270,8 @@ def test_what_was_changed_is_named_and_a_matched_set_up_has_no_name() -> None:
     for name, body in (("before", Body()), ("same", Body()), ("weak", Body(health=(1.0, 0.85, 1.0, 1.0)))):
         with Betaflight(body=body) as flown:
             logs[name], model = collect(flown, 1.0, len(logs), 1.0), known_model(flown)
-    same, weak = (
-        diagnose_change(logs[name], logs["before"], model, motion=model.motion) for name in ("same", "weak")
-    )
-    assert same.causes == ()
-    (cause,) = weak.causes
+    before = logs["before"]
+    assert diagnose_change(logs["same"], before, model, motion=model.motion).causes == ()
+    (cause,) = diagnose_change(logs["weak"], before, model, motion=model.motion).causes
     assert cause.effect == "betaflight_loop"
     assert cause.parameters["front_right"].value == pytest.approx(0.85, abs=0.03)

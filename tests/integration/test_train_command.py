@@ -13,14 +13,15 @@ from baselines.purejaxrl_ppo.training import Trainer
 from tests.support.ppo_runs import BATCH, CONFIG, EVERY_OTHER_UPDATE, SEED, assert_same_end, make_trainer
 
 SEEDS = (SEED, SEED + 1)
+RESUME = ("--no-tracking", "--resume", "WHOLE")  # a run that is complete
 
 
 def read(*arguments):
     return parse([*map(str, arguments)])
 
 
-def tasks_of(*arguments, at_once=1):
-    return make_tasks(*read(*arguments), at_once)
+def tasks_of(*arguments):
+    return make_tasks(*read(*arguments), 1)
 
 
 def call(monkeypatch, *arguments):
@@ -64,11 +65,15 @@ def test_flags_override_the_file_and_the_file_the_defaults(tmp_path):
         (["--num-seeds", "0"], "--num-seeds: found 0"),
         (["--config", "missing.toml"], "missing.toml: cannot be read"),
         (["--resume", "missing"], "missing: cannot be read"),
+        ([*RESUME, "--learning-rate", "0.1"], "config.learning_rate: found 0.003, expected 0.1\n"),
+        ([*RESUME, "--track", "split_s"], "track_data.name: found 'flytrack', expected 'split_s'"),
+        ([*RESUME, "--num-seeds", "2"], "leave out --seed and --num-seeds"),
     ],
 )
-def test_what_cannot_be_used_is_refused_before_any_work(tmp_path, monkeypatch, capsys, arguments, message):
+def test_what_cannot_be_used_is_refused(whole, tmp_path, monkeypatch, capsys, arguments, message):
     monkeypatch.chdir(tmp_path)
-    assert call(monkeypatch, *arguments, "--out", "out") == 2
+    found = [whole[0] if one == "WHOLE" else one for one in arguments]
+    assert call(monkeypatch, *found, "--out", "out") == 2
     assert message in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
 
@@ -80,29 +85,12 @@ def test_resuming_takes_from_the_checkpoint_what_is_not_given(whole, tmp_path):
     assert (task.seed, task.out, task.start.path) == (SEED, whole[0], whole[0] / "final.safetensors")
     assert task.options == EVERY_OTHER_UPDATE._replace(seeds=(SEED,))
     uri = tracking.local_uri(tmp_path)
-    (task,) = tasks_of(
-        "--resume", whole[0], "--checkpoint-every", 0, "--tracking-uri", "local", "--out", tmp_path
-    )
+    elsewhere = ("--tracking-uri", "local", "--out", tmp_path)
+    (task,) = tasks_of("--resume", whole[0], "--checkpoint-every", 0, *elsewhere)
     assert task.options == Options(tracking_uri=uri, seeds=(SEED,)) and task.out == tmp_path
-    checkpoint = resumed.first.checkpoint
-    checkpoint.meta["environment"]["reward.off_centre"] = -0.25
+    resumed.first.checkpoint.meta["environment"]["reward.off_centre"] = -0.25
     found = train_ppo.make_trainer(settings, resumed)
     assert found.env.default_params.reward.off_centre == -0.25
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (["--learning-rate", "0.1"], "config.learning_rate: found 0.003, expected 0.1\n"),
-        (["--track", "split_s"], "track_data.name: found 'flytrack', expected 'split_s'"),
-        (["--num-seeds", "2"], "leave out --seed and --num-seeds"),
-    ],
-)
-def test_resuming_with_other_settings_is_refused(whole, tmp_path, arguments, message, monkeypatch, capsys):
-    common = ["--resume", whole[0], "--no-tracking", "--out", tmp_path / "out"]
-    assert call(monkeypatch, *common, *arguments) == 2
-    assert message in capsys.readouterr().err
-    assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.parametrize(
@@ -159,10 +147,9 @@ def test_exit_codes_and_messages(tmp_path, monkeypatch, capsys):
 
     monkeypatch.setattr(Trainer, "run", stop)
     monkeypatch.setattr(train_ppo, "make_trainer", lambda *_: make_trainer())
-    error = DivergedError("training diverged")
+    error, out = DivergedError("training diverged"), tmp_path / "out"
     assert call(monkeypatch, "--out", tmp_path, "--no-tracking") == 1
     assert capsys.readouterr().err == "train_ppo: error: training diverged\n"
     error = KeyboardInterrupt
-    out = tmp_path / "out"
     assert call(monkeypatch, "--out", out, "--num-seeds", 2) == 130
     assert capsys.readouterr().err == f"stopped at 40 steps; continue with --resume {out}\n"

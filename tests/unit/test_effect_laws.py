@@ -141,27 +141,23 @@ def test_a_delay_within_a_step_is_the_mean_of_what_arrives() -> None:
 
 def test_thrust_falls_with_another_lag_than_it_rises() -> None:
     tau, ratio = float(NOMINAL.tau[3]), 2.0
-    rising, falling = (
-        flown(effects.ThrustLagAsymmetry(ratio), held(5, thrust=to))[:, 19] for to in (1.0, -1.0)
-    )
+    lag = effects.ThrustLagAsymmetry(ratio)
+    rising, falling = (flown(lag, held(5, thrust=to))[:, 19] for to in (1.0, -1.0))
     time = DT * np.arange(1, 6)
     np.testing.assert_allclose(rising, 1 - np.exp(-time / tau), rtol=1e-5)
     np.testing.assert_allclose(falling, np.exp(-time / (ratio * tau)) - 1, rtol=1e-5)
-
-
-def test_a_late_command_falls_when_it_arrives() -> None:
     commands = np.concatenate([held(20, thrust=0.6), held(20, thrust=-0.6)])
-    late = flown((effects.CommandDelay(2 * DT), effects.ThrustLagAsymmetry(2.0)), commands)[:, 19]
-    np.testing.assert_allclose(late[2:], flown(effects.ThrustLagAsymmetry(2.0), commands)[:-2, 19], atol=1e-6)
+    late = flown((effects.CommandDelay(2 * DT), lag), commands)[:, 19]  # falls when the command arrives
+    np.testing.assert_allclose(late[2:], flown(lag, commands)[:-2, 19], atol=1e-6)
 
 
-def test_rate_scale_scales_rates_only() -> None:
-    scaled, plain = (
-        flown(each, random_commands(0, 1), random_drone(0))[0]
-        for each in (effects.RateScale(0.9, 1.1, 1.2), ())
-    )
-    np.testing.assert_allclose(scaled[RATES], plain[RATES] * [0.9, 1.1, 1.2], rtol=1e-6)
-    np.testing.assert_array_equal(scaled[APPLIED_ACTION], plain[APPLIED_ACTION])
+def test_rates_are_scaled_and_those_of_roll_and_pitch_leak_into_yaw() -> None:
+    models = effects.RateScale(0.9, 1.1, 1.2), effects.RateCrossCoupling(0.1, -0.2), ()
+    scaled, leaking, plain = (flown(each, random_commands(0, 20), random_drone(0)) for each in models)
+    np.testing.assert_allclose(scaled[:, RATES], plain[:, RATES] * [0.9, 1.1, 1.2], rtol=1e-6)
+    np.testing.assert_array_equal(scaled[:, APPLIED_ACTION], plain[:, APPLIED_ACTION])
+    np.testing.assert_array_equal(leaking[:, RATES][:, :2], plain[:, RATES][:, :2])
+    np.testing.assert_allclose(leaking[:, RATES][:, 2], plain[:, RATES] @ [0.1, -0.2, 1.0], rtol=1e-5)
 
 
 @pytest.mark.parametrize("stick", [-1.0, -0.5, 0.25, 1.0])
@@ -214,13 +210,6 @@ def test_yaw_turns_by_an_angle_for_each_change_of_thrust() -> None:
     assert np.abs(yaw_rate[-10:]).max() < 1e-3
 
 
-def test_roll_and_pitch_rates_leak_into_yaw() -> None:
-    commands = held(20, roll=0.5, pitch=-0.4, yaw=0.3)
-    rates, plain = (flown(each, commands)[:, RATES] for each in (effects.RateCrossCoupling(0.1, -0.2), ()))
-    np.testing.assert_array_equal(rates[:, :2], plain[:, :2])
-    np.testing.assert_allclose(rates[:, 2], plain @ [0.1, -0.2, 1.0], rtol=1e-5)
-
-
 @pytest.mark.parametrize("thrust", [-0.5, 0.0, 0.8])
 def test_roll_and_pitch_creep_with_thrust(thrust: float) -> None:
     drone = drone_with(applied=(0.0, 0.0, 0.0, thrust))
@@ -231,11 +220,10 @@ def test_roll_and_pitch_creep_with_thrust(thrust: float) -> None:
 
 def test_a_second_lag_does_not_remember_the_imbalance_twice() -> None:
     """Rates that settle at the bias: it goes into the lag, and comes out of it once."""
-    commands, drone = held(60, thrust=-0.5), drone_with(applied=(0.0, 0.0, 0.0, -0.5))
-    creeping = flown(
-        (effects.MotorImbalance(0.01), effects.SecondOrderRates(0.03, roll_damping=1.0)), commands, drone
-    )
-    direct = flown(effects.MotorImbalance(0.01), commands, drone)
+    imbalance = effects.MotorImbalance(0.01)
+    flight = held(60, thrust=-0.5), drone_with(applied=(0.0, 0.0, 0.0, -0.5))
+    creeping = flown((imbalance, effects.SecondOrderRates(0.03, roll_damping=1.0)), *flight)
+    direct = flown(imbalance, *flight)
     assert creeping[0, 13] < 0.5 * direct[0, 13]
     assert creeping[-1, 13] == pytest.approx(direct[-1, 13], rel=1e-3)
 
@@ -257,10 +245,9 @@ DISTURBED = (effects.LinearDrag(0.3, 0.2, 0.1), effects.Wind(3.0), effects.Motor
 class Readings:
     """Truth and readings of rates, rad/s, and specific force, m/s^2, body, of a flight, (num_steps, 3)."""
 
-    def __init__(self, *parameters: Any, commands: Any = None, drone: Any = None):
-        drone = random_drone(0) if drone is None else drone
-        commands = random_commands(0, 20) if commands is None else commands
-        rows = flown((*DISTURBED, *parameters), commands, drone)
+    def __init__(self, *parameters: Any):
+        drone = random_drone(0)
+        rows = flown((*DISTURBED, *parameters), random_commands(0, 20), drone)
         self.start_rates, self.rates = np.stack(drone.rates_b), rows[:, RATES]
         attitudes = np.concatenate([np.stack(drone.quat)[None], rows[:-1, QUATERNION]])
         to_body = Rotation.from_quat(attitudes, scalar_first=True).inv()
@@ -272,14 +259,11 @@ def assert_reads(found: np.ndarray, expected: np.ndarray) -> None:
     np.testing.assert_allclose(found, expected, rtol=2e-5, atol=2e-4)
 
 
-def test_perfect_sensors_read_the_truth() -> None:
+def test_perfect_sensors_read_the_truth_and_others_its_scale_then_bias() -> None:
     flight = Readings()
     np.testing.assert_array_equal(flight.gyro, flight.rates)
     assert_reads(flight.accelerometer, flight.force)
     assert np.abs(flight.force[:, :2]).max() > 0.5  # drag is felt, gravity is not
-
-
-def test_scale_then_bias_of_each_sensor() -> None:
     biases = effects.AccelerometerBias(0.3, -0.2, 0.1), effects.GyroBias(0.05, -0.04, 0.03)
     scales = effects.AccelerometerScale(1.1, 0.9, 1.05), effects.GyroScale(0.95, 1.02, 1.1)
     flight = Readings(*biases, *scales)
@@ -288,7 +272,7 @@ def test_scale_then_bias_of_each_sensor() -> None:
 
 
 def test_an_arm_in_any_direction_follows_the_rigid_body() -> None:
-    arm = np.array([0.05, -0.08, 0.03])
+    arm = 0.05, -0.08, 0.03
     flight = Readings(effects.ImuOffset(*arm))
     before = np.concatenate([flight.start_rates[None], flight.rates[:-1]])
     mean, change = 0.5 * (before + flight.rates), (flight.rates - before) / DT
@@ -296,18 +280,19 @@ def test_an_arm_in_any_direction_follows_the_rigid_body() -> None:
     assert_reads(flight.accelerometer, flight.force + felt)
 
 
+def past(truth: np.ndarray, before: np.ndarray, steps: float) -> np.ndarray:
+    """Return the rows of so many steps ago; before the flight, there was one that stayed."""
+    known = np.concatenate([np.tile(before, (USUAL_STEPS, 1)), truth])
+    rows = np.arange(len(known))
+    return np.stack([np.interp(rows[USUAL_STEPS:] - steps, rows, column) for column in known.T], axis=1)
+
+
 @pytest.mark.parametrize("steps", [0.0, 1.0, 2.0, 4.0, 0.3, 2.6])
 def test_late_sensors_read_the_past(steps: float) -> None:
     """Before the flight, the rates are taken to have been those of the start, the force that of its first."""
     flight = Readings(effects.ImuLatency(steps * DT))
-    time = np.arange(-USUAL_STEPS, 20)
-    for found, truth, before in (
-        (flight.gyro, flight.rates, flight.start_rates),
-        (flight.accelerometer, flight.force, flight.force[0]),
-    ):
-        known = np.concatenate([np.tile(before, (USUAL_STEPS, 1)), truth])
-        then = [np.interp(time[USUAL_STEPS:] - steps, time, known[:, axis]) for axis in range(3)]
-        assert_reads(found, np.stack(then, axis=1))
+    assert_reads(flight.gyro, past(flight.rates, flight.start_rates, steps))
+    assert_reads(flight.accelerometer, past(flight.force, flight.force[0], steps))
 
 
 @pytest.mark.parametrize("steps", [1.0, 3.0, 0.3, 2.6])
@@ -316,9 +301,7 @@ def test_late_poses_are_those_of_the_past(steps: float) -> None:
     drone, commands = random_drone(3), random_commands(3, 20)
     found = flown(effects.MocapLatency(steps * DT), commands, drone)
     start = np.concatenate([drone.pos_w, drone.vel_w, drone.quat])
-    true = np.concatenate([np.tile(start, (5, 1)), found[:, [*range(6), *range(9, 13)]]])
-    rows = np.arange(len(true), dtype=float)
-    then = np.stack([np.interp(rows[5:] - steps, rows, column) for column in true.T], axis=1)
+    then = past(found[:, [*range(6), *range(9, 13)]], start, steps)
     then[:, 6:] /= np.linalg.norm(then[:, 6:], axis=1, keepdims=True)
     signs = np.sign(np.sum(then[:, 6:] * found[:, 33:37], axis=1, keepdims=True))
     assert_reads(found[:, 27:33], then[:, :6])
@@ -337,16 +320,16 @@ class WithoutGyro(Plant):
     reset, step, drone = Simulator.reset, Simulator.step, Simulator.drone
 
 
-def shown_and_true(env: Any, params: Any, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+def shown_and_true(env: Any, params: Any) -> tuple[np.ndarray, np.ndarray]:
     """Return the rates that observations show and the true ones, (4, 3) rad/s, from a start on."""
     step = jax.jit(env.step_env)
-    state = env.begin(drone_with(rates_b=(0.5, -0.3, 0.2)), 0, params, jnp.uint32(seed))
-    rows = [(env.observe(None, state, None, params)[SHOWN] * GYRO_SCALE, np.stack(env.drone(state).rates_b))]
+    state = env.begin(drone_with(rates_b=(0.5, -0.3, 0.2)), 0, params, jnp.uint32(0))
+    shown, true = [env.observe(None, state, None, params)[SHOWN]], [np.stack(env.drone(state).rates_b)]
     for _ in range(3):
         observation, state, *_ = step(None, state, jnp.array([0.2, -0.1, 0.3, 0.0]), params)
-        rows.append((observation[SHOWN] * GYRO_SCALE, np.stack(env.drone(state).rates_b)))
-    shown, true = zip(*rows, strict=True)
-    return np.stack(shown), np.stack(true)
+        shown.append(observation[SHOWN])
+        true.append(np.stack(env.drone(state).rates_b))
+    return np.stack(shown) * GYRO_SCALE, np.stack(true)
 
 
 @pytest.mark.parametrize(

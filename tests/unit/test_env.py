@@ -36,6 +36,13 @@ def ended(flight):
     return np.asarray(flight.terminated | flight.truncated)
 
 
+def assert_begun(done, states):
+    """Assert that ended episodes have begun again, with nothing counted yet."""
+    race = states.race
+    for leaf in (states.time, race.gates_passed, race.laps, race.lap_start_s, race.lap_time_s):
+        assert not np.asarray(leaf)[done].any()
+
+
 # --- The protocol -------------------------------------------------------------------------------
 
 
@@ -60,26 +67,21 @@ def test_default_parameters_are_used_when_none_are_given(env, flight):
     assert_close(found, jax.tree.map(lambda leaf: leaf[0], expected), 1e-5)
 
 
-def test_spaces_are_finite_and_contain_every_observation(env, params, flight):
+def test_spaces_contain_every_observation_of_flights_that_end_in_many_ways(env, params, flight):
     space, actions = env.observation_space(params), env.action_space(params)
     assert space.shape == (OBSERVATION_SIZE,) and actions.shape == (4,) and env.num_actions == 4
     assert np.isfinite(space.low).all() and np.isfinite(space.high).all()
     assert actions.contains(actions.sample(jax.random.key(0)))
     for array in (flight.observations, flight.info["final_observation"]):
         assert ((array >= np.asarray(space.low)) & (array <= np.asarray(space.high))).all()
-
-
-def test_flights_end_in_many_ways_and_stay_finite(flight):
     assert flight.terminated.sum() > 30
     assert sum(flight.info[cause].any() for cause in CAUSES) >= 3 and flight.info["gates_passed"].max() >= 1
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves((flight.states, flight.rewards)))
 
 
 def test_auto_reset_leaves_nothing_behind(flight):
-    done, race = ended(flight), flight.states.race
-    for leaf in (flight.states.time, race.gates_passed, race.laps, race.lap_start_s, race.lap_time_s):
-        assert not leaf[done].any()
-    final = flight.info["final_observation"]
+    done, final = ended(flight), flight.info["final_observation"]
+    assert_begun(done, flight.states)
     np.testing.assert_array_equal(flight.observations[~done], final[~done])
     assert (flight.observations[done] != final[done]).any(axis=1).all()
 
@@ -99,9 +101,8 @@ def test_info_belongs_to_the_step_not_to_the_reset(env, flight):
 def test_parameters_can_differ_between_environments(env, params):
     masses = jnp.array([0.5, 1.0, 2.0])
     batched = params.replace(model=params.model._replace(m=masses))
-    axes = jax.tree.map(lambda _: None, params).replace(
-        model=jax.tree.map(lambda _: None, params.model)._replace(m=0)
-    )
+    none = jax.tree.map(lambda _: None, params)
+    axes = none.replace(model=none.model._replace(m=0))
     tilted = drone_at((15.0, 2.0, 1.35), quat=(0.9, 0.3, 0.3, 0.1))
     state = env.begin(tilted, 0, params)
     step = jax.jit(jax.vmap(env.step_env, in_axes=(None, None, None, axes)))
@@ -147,17 +148,13 @@ def ends(env):
     """One step of a batch with every row of ``ENDS``, from a race that has gone on for a while."""
     params, results = arrays(env.default_params), []
     for names in BATCHES:
-        states, actions = [], []
-        for name in np.resize(names, NUM_ENVS):
-            position, velocity, fields, time, action, _, _ = ENDS[name]
+        states, rows = [], [ENDS[name] for name in np.resize(names, NUM_ENVS)]
+        for position, velocity, fields, time, *_ in rows:
             state = env.begin(drone_at(position, velocity, **fields), 0, params)
-            race = state.race._replace(
-                gates_passed=jnp.int32(8), laps=jnp.int32(1), lap_start_s=jnp.float32(0.7)
-            )
-            states.append(state._replace(race=race, time=jnp.int32(time)))
-            actions.append(action)
-        states, actions = stack(states), jnp.array(actions, jnp.float32)
-        results.append(env.step_batch(jax.random.key(8), states, actions, params))
+            counted = {"gates_passed": jnp.int32(8), "laps": jnp.int32(1), "lap_start_s": jnp.float32(0.7)}
+            states.append(state._replace(race=state.race._replace(**counted), time=jnp.int32(time)))
+        actions = jnp.array([row[4] for row in rows], jnp.float32)
+        results.append(env.step_batch(jax.random.key(8), stack(states), actions, params))
     return results
 
 
@@ -173,9 +170,8 @@ def test_every_end_has_its_own_cause_and_flags(name, ends):
 
 def test_batch_step_resets_episodes_apart(env, params, ends):
     observation, state, _, terminated, truncated, _ = ends[0]
-    done, race = np.asarray(terminated | truncated), state.race
-    for leaf in (state.time, race.gates_passed, race.laps, race.lap_start_s, race.lap_time_s):
-        assert not np.asarray(leaf)[done].any()
+    done = np.asarray(terminated | truncated)
+    assert_begun(done, state)
     starts = np.stack([np.asarray(leaf)[done] for leaf in env.drone(state).pos_w], -1)
     assert len(np.unique(starts, axis=0)) == done.sum()
     expected = jax.jit(jax.vmap(env.observe, in_axes=(None, 0, None, None)))(None, state, None, params)
@@ -185,19 +181,12 @@ def test_batch_step_resets_episodes_apart(env, params, ends):
 # --- Actions ------------------------------------------------------------------------------------
 
 
-def test_actions_beyond_the_range_are_clipped(env, flight):
+def test_actions_beyond_the_range_are_clipped_and_integers_are_as_good(env, flight):
     corners = np.resize(np.array([[1, -1, 1, 1], [-1, 1, -1, -1]], np.float32), (NUM_ENVS, 4))
     factors = np.resize(np.array([1.001, 7.0, 1e30, np.inf], np.float32).repeat(2), NUM_ENVS)[:, None]
-    keys = jax.random.split(jax.random.key(11), NUM_ENVS)
-    arguments = keys, flight.start
-    found, expected = (
-        steps_of(env)(*arguments, jnp.asarray(actions), arrays(env.default_params))
-        for actions in (corners * factors, corners)
-    )
-    assert_close(found, expected, 0.0)
-
-
-def test_integer_actions_are_as_good_as_real_ones():
+    keys, params = jax.random.split(jax.random.key(11), NUM_ENVS), arrays(env.default_params)
+    both = jnp.asarray(corners * factors), jnp.asarray(corners)
+    assert_close(*(steps_of(env)(keys, flight.start, actions, params) for actions in both), 0.0)
     assert clip_action(jnp.array([3, 0, -2, 1])) == clip_action(jnp.array([1.0, 0.0, -1.0, 1.0]))
 
 

@@ -16,17 +16,16 @@ NUM_ROWS, STEP_S = 1500, 0.01
 MAPPING = read_mapping("angle_setpoints")
 
 
-def flight(gains: tuple[float, float, float] = (6.0, 5.0, 2.0)) -> dict[str, np.ndarray]:
-    """Return columns of a drone whose rates follow attitude errors times gains with a lag of 40 ms."""
+def flight() -> dict[str, np.ndarray]:
+    """Return columns of a drone whose rates follow attitude errors times 6, 5, 2 with a lag of 40 ms."""
     rng = np.random.default_rng(0)
     wanted = np.repeat(0.25 * rng.normal(size=(NUM_ROWS // 30, 3)), 30, axis=0)
     angles, rates = np.zeros((NUM_ROWS, 3)), np.zeros((NUM_ROWS, 3))
     for row in range(1, NUM_ROWS):
-        asked = np.array(gains) * (wanted[row - 1] - angles[row - 1])
+        asked = np.array([6.0, 5.0, 2.0]) * (wanted[row - 1] - angles[row - 1])
         rates[row] = rates[row - 1] + (asked - rates[row - 1]) * STEP_S / 0.04
         angles[row] = angles[row - 1] + STEP_S * rates[row]
-    setpoints = np.rad2deg(wanted) * [1, -1, 1]
-    pwm = np.full(NUM_ROWS, 40_000.0)
+    setpoints, pwm = np.rad2deg(wanted) * [1, -1, 1], np.full(NUM_ROWS, 40_000.0)
     motors = {f"m{number}": pwm + 1000.0 * number for number in range(4)}
     motors["m3"][:15] = 65535.0
     return {
@@ -56,8 +55,7 @@ def test_attitude_setpoints_become_rates_by_given_gains(tmp_path):
         expected = np.clip((6.0, 5.0)[axis] * error / np.deg2rad(300.0), -1.0, 1.0)
         np.testing.assert_allclose(found.log["u"][:, axis], expected, atol=1e-6)
     assert found.log["u"][:, 3] == pytest.approx(2 * 40_000 / 65535 - 1)
-    said = " ".join(found.notes)
-    assert "times gains of 6, 5, 2 1/s (given)" in said
+    assert "times gains of 6, 5, 2 1/s (given)" in " ".join(found.notes)
     filtered = lfilter([0.25], [1.0, -0.75], found.log["u"][:-1, 0]) * np.deg2rad(300.0)
     assert np.corrcoef(filtered, found.log["w"][1:, 0])[0, 1] > 0.99
 
@@ -66,8 +64,7 @@ def test_attitude_gains_are_identified_or_asked_for(tmp_path):
     note = next(note for note in read(tmp_path, MAPPING).notes if "times gains" in note)
     gains = [float(text) for text in note.partition("gains of ")[2].split(" 1/s")[0].split(", ")]
     assert gains == pytest.approx([6.0, 5.0, 2.0], rel=0.1) and "roll, pitch, yaw identified" in note
-    noise = np.random.default_rng(1).normal(size=NUM_ROWS)
-    columns = {**flight(), "wz": noise}
+    columns = {**flight(), "wz": np.random.default_rng(1).normal(size=NUM_ROWS)}
     with pytest.raises(LogError, match=r"attitude_command\.gain: cannot be identified for yaw: .*; state it"):
         read(tmp_path, MAPPING, columns)
     some = read(tmp_path, MAPPING.replace("signs", "gain = [0, 0, 2]\nsigns"), columns)
@@ -121,9 +118,8 @@ def test_clipped_commands_are_counted(tmp_path):
     rows = np.zeros((4, 5))
     rows[:, 0], rows[1:, 4], rows[2, 1] = 0.01 * np.arange(4), 0.5, -1.25
     table = dict(zip("tabcd", rows.T, strict=True))
-    found = read(
-        tmp_path, '[time]\ncolumn="t"\nunit="s"\n[command]\ncolumns=["a","b","c","d"]\nclip=true\n', table
-    )
+    clipped = '[time]\ncolumn="t"\nunit="s"\n[command]\ncolumns=["a","b","c","d"]\nclip=true\n'
+    found = read(tmp_path, clipped, table)
     assert found.log["u"][2, 0] == -1.0
     assert "commands clipped to [-1, 1] in 1 of 4 rows" in found.notes[0]
 

@@ -16,13 +16,8 @@ from tests.support.real_logs import shared
 
 pytest.importorskip("pyulog", reason="pyulog is not installed: pip install 'flytrack[logs]'")
 
-PARAMETERS = {
-    "MC_ACRO_R_MAX": 720.0,
-    "MC_ROLLRATE_MAX": 220.0,
-    "MC_ACRO_P_MAX": 360.0,
-    "MC_ACRO_Y_MAX": 90.0,
-    "MC_YAWRATE_MAX": 180.0,
-}
+PARAMETERS = {"MC_ACRO_R_MAX": 720.0, "MC_ROLLRATE_MAX": 220.0, "MC_ACRO_P_MAX": 360.0}
+PARAMETERS |= {"MC_ACRO_Y_MAX": 90.0, "MC_YAWRATE_MAX": 180.0}
 STEP_US = 4000
 TIMES_US = 1_000_000 + STEP_US * np.arange(200)
 EAST = (np.sqrt(0.5), 0.0, 0.0, np.sqrt(0.5))  # NED, FRD: nose east
@@ -40,16 +35,13 @@ def topics() -> dict[str, tuple[list, list]]:
     """Return the topics of a log of a drone with its nose east, turning, pulling up; fields and rows."""
     slow = TIMES_US[::5]
     place = constant((1.0, 2.0, -3.0, 4.0, 5.0, -6.0), slow)
-    half_full = (float(np.deg2rad(360.0)), float(np.deg2rad(90.0)), float(np.deg2rad(-45.0)))
+    setpoints = constant((*np.deg2rad([360.0, 90.0, -45.0]), 0.0, 0.0, -0.75), slow)  # half of the full stick
     return {
         "vehicle_angular_velocity": ([("float", "xyz", 3)], constant((0.1, 0.2, 0.3))),
         "vehicle_acceleration": ([("float", "xyz", 3)], constant((0.5, 0.25, -9.75))),
         "vehicle_attitude": ([("float", "q", 4)], constant(EAST, slow)),
         "vehicle_local_position": ([*XYZ, *VXYZ], place),
-        "vehicle_rates_setpoint": (
-            [*SETPOINT, ("float", "thrust_body", 3)],
-            constant((*half_full, 0.0, 0.0, -0.75), slow),
-        ),
+        "vehicle_rates_setpoint": ([*SETPOINT, ("float", "thrust_body", 3)], setpoints),
         "battery_status": ([("float", "voltage_v", 0)], constant((16.25,), TIMES_US[::100])),
     }
 
@@ -64,8 +56,7 @@ def write(path: Path, tables: dict[str, tuple[list, list]], parameters: Any = No
 
 def test_frames_and_units_are_ours(tmp_path):
     found = import_log(write(tmp_path / "a.ulg", topics()), "ulog")
-    log = found.log
-    first = {name: values[0] for name, values in log.channels.items()}
+    first = {name: values[0] for name, values in found.log.channels.items()}
     np.testing.assert_allclose(first["w"], [0.1, -0.2, -0.3], atol=1e-6)
     np.testing.assert_allclose(first["f"], [0.5, -0.25, 9.75], atol=1e-6)
     np.testing.assert_allclose(first["p"], [1.0, -2.0, 3.0], atol=1e-6)  # north, west, up
@@ -77,7 +68,7 @@ def test_frames_and_units_are_ours(tmp_path):
     np.testing.assert_allclose(first["u"], [0.5, -0.25, 0.25, 0.5], atol=1e-6)
     assert first["v_bat"] == pytest.approx([16.25])
     assert found.craft.max_rate_deg_s == pytest.approx((720.0, 360.0, 180.0))
-    assert log.time[0] == 0.0 and np.diff(log.time) == pytest.approx(1e-6 * STEP_US)
+    assert found.log.time[0] == 0.0 and np.diff(found.log.time) == pytest.approx(1e-6 * STEP_US)
 
 
 def test_setpoints_are_held_and_sensors_interpolated(tmp_path):
@@ -110,10 +101,9 @@ def test_what_a_topic_misses_and_the_ground_are_no_rows(tmp_path):
 
 @pytest.mark.parametrize("pitch_max", [None, np.nan])
 def test_unknown_full_stick_is_refused_unless_the_mapping_states_it(tmp_path, pitch_max):
-    parameters = {**PARAMETERS, "MC_ACRO_P_MAX": pitch_max}
-    path = write(
-        tmp_path / "a.ulg", topics(), {n: value for n, value in parameters.items() if value is not None}
-    )
+    parameters = PARAMETERS | {"MC_ACRO_P_MAX": pitch_max}
+    known = {name: value for name, value in parameters.items() if value is not None}
+    path = write(tmp_path / "a.ulg", topics(), known)
     with pytest.raises(LogError, match=r"a\.ulg: parameter MC_ACRO_P_MAX or MC_PITCHRATE_MAX: missing"):
         import_log(path, "ulog")
     mapping = tmp_path / "craft.toml"

@@ -25,34 +25,12 @@ SHAPE = (HEIGHT, WIDTH, 3)
 COURSE = build_course(load_track("flytrack"))
 
 
-@pytest.fixture(scope="module")
-def renderer():
-    """What draws on the default course."""
-    return make_renderer(COURSE)
-
-
-def row_at(position, gate_index=0, velocity=(-10.0, 0.0, 0.0)):
+def row_at(position, gate_index, velocity):
     """Return a row of a drone that faces gate 0, level."""
     row = np.zeros(SCENE_SIZE, np.float32)
     row[POSITION], row[VELOCITY], row[QUATERNION] = position, velocity, (0.0, 0.0, 0.0, 1.0)
     row[BATTERY], row[GATE_INDEX] = 23.5, gate_index
     return row
-
-
-def log_of(rows):
-    """Return a log of rows at 100 Hz."""
-    log = FlightLog(0.01)
-    for row in rows:
-        log.append(row)
-    return log
-
-
-def flight(num_steps=60):
-    """Return rows from the start pose through gate 0, ever faster."""
-    return [
-        row_at((18.6 - 9.0 * share, 2.0, 0.3 + share), int(share > 0.7), (-20.0 * share, 0.0, 0.0))
-        for share in np.linspace(0.0, 1.0, num_steps)
-    ]
 
 
 def distance_to(picture, colour):
@@ -66,9 +44,14 @@ def top_view_pixel(renderer, position):
     return round(float(y)), round(float(x))
 
 
-def test_top_view_shows_trail_drone_and_the_next_gate_where_they_are(renderer):
-    rows = flight()
-    picture = renderer.draw(log_of(rows))
+def test_top_view_shows_trail_drone_and_the_next_gate_where_they_are():
+    renderer = make_renderer(COURSE)
+    rows, log = [], FlightLog(0.01)  # from the start pose through gate 0, ever faster
+    for share in np.linspace(0.0, 1.0, 60):
+        position, velocity = (18.6 - 9.0 * share, 2.0, 0.3 + share), (-20.0 * share, 0.0, 0.0)
+        rows.append(row_at(position, int(share > 0.7), velocity))
+        log.append(rows[-1])
+    picture = renderer.draw(log)
     assert distance_to(picture[top_view_pixel(renderer, rows[-1][POSITION])], scene.DRONE) < 40
     for row in (rows[18], rows[35]):
         line, column = top_view_pixel(renderer, row[POSITION])
@@ -76,9 +59,8 @@ def test_top_view_shows_trail_drone_and_the_next_gate_where_they_are(renderer):
         assert distance_to(picture[line - 1 : line + 2, column], colour).min() < 40
     for index, centre in enumerate(scene.gates_of(COURSE).centres):
         line, column = top_view_pixel(renderer, centre)
-        around = distance_to(picture[:, :SPLIT], scene.NEXT_GATE)[
-            line - 34 : line + 35, column - 34 : column + 35
-        ]
+        beside = slice(line - 34, line + 35), slice(column - 34, column + 35)
+        around = distance_to(picture[:, :SPLIT], scene.NEXT_GATE)[beside]
         assert ((around < 20).sum() > 30) == (index == 1)
 
 

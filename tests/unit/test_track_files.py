@@ -86,16 +86,13 @@ def test_what_is_no_toml_file_is_refused(text, reason, tmp_path):
         load_text(tmp_path, text)
 
 
-@pytest.mark.parametrize("name", ["monza", "", "../tracks/flytrack", "FLYTRACK"])
-def test_unknown_name_lists_the_shipped_ones(name):
-    with pytest.raises(TrackError, match=rf"track: found '{name}', expected one of .*flytrack"):
-        load_track(name)
-
-
-@pytest.mark.parametrize("name", ["../references/flytrack", "x" * 300, "a\0b"])
-def test_a_tracks_name_leads_to_no_other_file(name):
-    with pytest.raises(ReferenceFileError, match=r"reference: found no .{1,60}, expected one of"):
-        shipped_reference(name)
+def test_unknown_names_are_refused_with_the_shipped_ones_and_lead_to_no_other_file():
+    for name in ("monza", "", "../tracks/flytrack", "FLYTRACK"):
+        with pytest.raises(TrackError, match=rf"track: found '{name}', expected one of .*flytrack"):
+            load_track(name)
+    for name in ("../references/flytrack", "x" * 300, "a\0b"):
+        with pytest.raises(ReferenceFileError, match=r"reference: found no .{1,60}, expected one of"):
+            shipped_reference(name)
 
 
 @settings(max_examples=200, deadline=None)
@@ -139,22 +136,16 @@ def tracks(draw):
     ids = draw(st.lists(st.integers(0, 99), min_size=2, max_size=6, unique=True))
     gates = []
     for gate_id in ids:
-        opening = draw(reals(0.1, 3.0))
+        opening, sign = draw(reals(0.1, 3.0)), draw(st.sampled_from([-1.0, 1.0]))
         frame = draw(reals(opening, 5.0))
-        sign = draw(st.sampled_from([-1.0, 1.0]))
         gates.append(Gate(gate_id, draw(inside), draw(quaternions()), sign, opening, frame))
     return Track("any", tuple(gates), draw(inside), draw(quaternions()), low, high)
 
 
 @settings(max_examples=50, deadline=None)
-@given(track=tracks(), name=st.text(min_size=1))
+@given(track=tracks(), name=st.text(st.characters(codec="utf-8"), min_size=1))
 def test_saved_tracks_are_read_back_equal(track, name, tmp_path_factory):
-    path = tmp_path_factory.getbasetemp() / "saved.toml"
-    try:
-        name.encode()
-    except UnicodeEncodeError:
-        name = "any"
-    track = replace(track, name=name)
+    path, track = tmp_path_factory.getbasetemp() / "saved.toml", replace(track, name=name)
     save_track(path, track)
     assert load_track(path) == track
 
@@ -173,9 +164,6 @@ def test_what_would_not_come_back_is_not_saved(reason, tmp_path):
     gates = (replace(track.gates[0], **UNSAVEABLE[reason]), *track.gates[1:])
     with pytest.raises(TrackError, match=rf"{re.escape(str(path))}.*{re.escape(reason)}"):
         save_track(path, replace(track, gates=gates))
-    assert not list(tmp_path.iterdir())
-
-
-def test_tracks_are_saved_under_a_name_that_can_be_loaded(tmp_path):
     with pytest.raises(TrackError, match=r"path: found '.*track.json', expected one that ends in .toml"):
-        save_track(tmp_path / "track.json", load_track("flytrack"))
+        save_track(tmp_path / "track.json", track)
+    assert not list(tmp_path.iterdir())

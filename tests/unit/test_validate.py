@@ -27,7 +27,6 @@ NUM_ROWS = 300
 HOVER = -0.25
 TRUTH = nominal_parameters()._replace(tau=np.array([0.02, 0.03, 0.06, 0.045], np.float32))
 DRAG = LinearDrag(0.3, 0.3, 0.3)
-DELAY = CommandDelay(0.024)
 
 
 def scripts() -> tuple[np.ndarray, np.ndarray]:
@@ -86,12 +85,11 @@ def test_truth_has_no_error(exact):
 
 
 def test_the_largest_steps_are_found(exact):
-    found = {axis: [step for step in exact.steps if step.axis == axis] for axis in ("roll", "pitch", "yaw")}
-    assert all(len(steps) == MOST_PER_AXIS for steps in found.values())
-    for axis, steps in found.items():
-        first = steps[0]
+    for segment, axis in enumerate(("roll", "pitch", "yaw")):
+        first, *others = [step for step in exact.steps if step.axis == axis]
+        assert len(others) + 1 == MOST_PER_AXIS
         assert (first.command_before, first.command_after) == (0.4, -0.4)
-        assert first.time_s == pytest.approx(1.0) and first.segment == ["roll", "pitch", "yaw"].index(axis)
+        assert first.time_s == pytest.approx(1.0) and first.segment == segment
         assert first.since_step[0] == pytest.approx(-0.09) and first.since_step[-1] == pytest.approx(0.4)
 
 
@@ -129,7 +127,7 @@ def test_drag_shows_in_the_force_by_speed():
 
 @pytest.mark.slow
 def test_delay_is_flown_with_its_memory():
-    delayed = TRUTH.with_effects(DELAY)
+    delayed = TRUTH.with_effects(CommandDelay(0.024))
     log = fly(delayed)
     for known in (validate(delayed, log), validate(delayed, log.without("uprev"))):
         assert max(nrmse(known).values()) < 1e-6
@@ -144,7 +142,7 @@ def test_thrust_is_measured_with_an_accelerometer_without_an_acceleration(exact,
     measured = replace(log, channels=channels)
     same = validate(TRUTH, measured)
     assert exact.thrust.source == "a" and same.thrust.source == "f" and same.thrust.total_rms_n < 1e-5
-    coeffs = TRUTH.thrust_coeffs - np.array([1.5, 0.0, 0.0, 0.0, 0.0, 0.0])
+    coeffs = TRUTH.thrust_coeffs - 1.5 * np.eye(6)[0]
     wrong = validate(TRUTH._replace(thrust_coeffs=coeffs), measured)
     assert wrong.thrust.total_mean_n == pytest.approx(1.5, rel=0.02)
     assert set(wrong.one_step.channels) == {"p", "v", "q", "w", "f"}

@@ -34,38 +34,25 @@ def record(folder: Path, sequence, gates=GATES, **options) -> Recording:
     return Recording(path)
 
 
-def aside(shift: float) -> np.ndarray:
-    """Return the states of a flight beside the time-optimal one."""
-    states = STATES.copy()
-    states[:, POSITION] += (0.0, shift, 0.0)
-    return states
-
-
 @pytest.fixture(scope="module")
 def recording(tmp_path_factory) -> Recording:
     """Two flights on one time line; the second has its own end and is shorter."""
-    second = viz.Trajectory("plant / 2", aside(0.2)[:300], ACTIONS[:300], ended="battery")
+    aside = STATES[:300] + 0.2 * np.eye(21, dtype=STATES.dtype)[1]  # to the side of the first
+    second = viz.Trajectory("plant / 2", aside, ACTIONS[:300], ended="battery")
     path = tmp_path_factory.mktemp("viz") / "two.rrd"
     viz.write_recording(path, [viz.Trajectory("policy", STATES, ACTIONS), second], TRACK)
     return Recording(path)
 
 
-@pytest.fixture(scope="module")
-def handout(tmp_path_factory) -> Recording:
-    """The handout's function on a random flight."""
-    return record(tmp_path_factory.mktemp("viz"), make_sequence(100), app_id="test_app")
-
-
-def test_handouts_function_records_the_numbers_that_it_is_given(handout):
+def test_handouts_function_records_the_numbers_that_it_is_given(tmp_path):
+    handout = record(tmp_path, make_sequence(100), app_id="test_app")
     x, u = (np.array(part, float) for part in zip(*make_sequence(100), strict=True))
     np.testing.assert_array_equal(handout.series("/world/drone", "Transform3D:translation"), x[:, 0:3])
     rotation = handout.series("/world/drone", "Transform3D:quaternion")
     np.testing.assert_allclose(rotation, x[:, [10, 11, 12, 9]], atol=1e-6)  # scalar last
-    expected = {
-        "speed": np.linalg.norm(x[:, 3:6], axis=1),
-        "angular_speed": np.linalg.norm(x[:, 13:16], axis=1),
-        **{f"action/{name}": u[:, column] for column, name in enumerate(Action._fields)},
-    }
+    speeds = np.linalg.norm(x[:, 3:6], axis=1), np.linalg.norm(x[:, 13:16], axis=1)
+    expected = dict(zip([f"action/{name}" for name in Action._fields], u.T, strict=True))
+    expected |= dict(zip(("speed", "angular_speed"), speeds, strict=True))
     grid = [(step, step * 10_000_000) for step in range(100)]
     for path, values in expected.items():
         found = handout.series(f"/plots/{path}", "Scalars:scalars")
@@ -103,17 +90,21 @@ def test_nan_outside_the_pose_is_a_gap_and_rounded_quaternions_are_normalised(tm
     np.testing.assert_allclose(rotation, np.full(4, 0.5), atol=1e-7)
 
 
-BAD_INPUT = [
-    ([], GATES, "sequence: found no pairs"),
-    (with_state(1, np.nan), GATES, r"sequence: states\[2\]: found position.*expected finite"),
-    (with_state(slice(9, 13), 0), GATES, r"sequence: states\[2\]: found quaternion norm 0"),
-    ([(np.zeros(17), np.zeros(4))], GATES, r"sequence: states: found shape \(1, 17\)"),
-    (make_sequence(3), np.zeros((3, 7)), r"gates: found shape \(3, 7\), expected \(N, >=8\)"),
-    (make_sequence(3), np.array([[0.0, 1e35, 0, 0, 1, 0, 0, 0]]), r"gates\[0\]: found pos.*within float32"),
-]
-
-
-@pytest.mark.parametrize(("sequence", "gates", "reason"), BAD_INPUT)
+@pytest.mark.parametrize(
+    ("sequence", "gates", "reason"),
+    [
+        ([], GATES, "sequence: found no pairs"),
+        (with_state(1, np.nan), GATES, r"sequence: states\[2\]: found position.*expected finite"),
+        (with_state(slice(9, 13), 0), GATES, r"sequence: states\[2\]: found quaternion norm 0"),
+        ([(np.zeros(17), np.zeros(4))], GATES, r"sequence: states: found shape \(1, 17\)"),
+        (make_sequence(3), np.zeros((3, 7)), r"gates: found shape \(3, 7\), expected \(N, >=8\)"),
+        (
+            make_sequence(3),
+            np.array([[0.0, 1e35, 0, 0, 1, 0, 0, 0]]),
+            r"gates\[0\]: found pos.*within float32",
+        ),
+    ],
+)
 def test_bad_input_is_refused_and_leaves_no_file(tmp_path, sequence, gates, reason):
     with pytest.raises(ValueError, match=reason):
         viz.visualize_state_action_sequence(sequence, gates, str(tmp_path / "flight.rrd"))
