@@ -4,6 +4,8 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+
 from flytrack_env.dynamics import ModelParameters
 from flytrack_env.effects import LearnedLaw, LearnedResidual
 from flytrack_env.effects.grammar import Law, Term
@@ -61,6 +63,11 @@ class Learned:
         """The parameters of what was learnt, as effects of a model."""
         found: list[Any] = [LearnedLaw(1.0, 0.0, self.law)] if self.law.terms else []
         return (*found, *([LearnedResidual(1.0, 0.0, self.networks)] if self.networks.networks else []))
+
+    def beside(self, vector: np.ndarray, is_on: bool = True) -> np.ndarray:
+        """Return a vector of ``Problem.with_learned(self.effects)``, with what was learnt or without it."""
+        scales = [leaf for one in self.effects for leaf in (float(is_on), float(one.spread))]
+        return np.append(vector, scales)
 
     def drawn(self) -> list[tuple[str, str]]:
         """Return which residual to draw over which regressor, names as in ``traces``."""
@@ -123,3 +130,15 @@ def _says_little(quantity: str) -> int:
 def with_learned(model: ModelParameters, learned: Learned | None) -> ModelParameters:
     """Return a model with what was learnt."""
     return model if learned is None else model.with_effects(*learned.effects)
+
+
+def with_and_without(
+    learned: Learned, vectors: Mapping[str, np.ndarray], change: np.ndarray
+) -> dict[str, np.ndarray]:
+    """Return vectors by model of ``Problem.with_learned``, with an extended one without what was learnt.
+
+    change: of the extended model's other parameters, fitted beside what was learnt.
+    """
+    without = {**vectors, "without_learned": vectors["extended"]}
+    found = {name: learned.beside(vector, is_on=False) for name, vector in without.items()}
+    return {**found, "extended": learned.beside(vectors["extended"] + change)}

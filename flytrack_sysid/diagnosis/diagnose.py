@@ -10,7 +10,7 @@ import numpy as np
 
 from flytrack_env.dynamics import ModelParameters, nominal_parameters
 from flytrack_env.motion import Motion
-from flytrack_sysid.diagnosis.beyond import with_learned
+from flytrack_sysid.diagnosis.beyond import with_and_without, with_learned
 from flytrack_sysid.diagnosis.lanes import Lanes, make_lanes, thinned, voltages_of
 from flytrack_sysid.diagnosis.late_poses import with_late_poses
 from flytrack_sysid.diagnosis.lateness import judged_as_logged, latency_of, read_poses
@@ -280,18 +280,21 @@ def summarize(judged: Judged, parts: Split) -> Diagnosis:
     causes = tuple(one for one in found if not one.beyond)
     beyond = (*judged.refused, *(one for one in found if one.beyond))
     vectors = {"nominal": problem.start, "refitted_base": selection.base.vector, "extended": extended.vector}
+    outliers = outliers_of((problem, test), extended.vector)
     extended = at_end(selection, extended)
-    learned = None
+    flying = {**vectors, "extended": extended.vector}
+    learned, judged_by = None, (test, refined)
     # A law that acts for a part of the log is not looked for beside an effect that does.
     if selection.unexplained.shares and extended.effects.isdisjoint(one.effect for one in problem.windows):
         always, always_held = (replace(one, windows=()) for one in (problem, test))
-        found_more = find_learned(always, always_held, extended, selection.base.vector, refined.judge)
-        if found_more is not None:
-            learned, extended = found_more[0], extended._replace(vector=found_more[1])
+        learned, vector = find_learned(always, always_held, extended, selection.base.vector, refined.judge)
+    if learned is not None:
+        change = vector - extended.vector
+        vectors, flying = (with_and_without(learned, one, change) for one in (vectors, flying))
+        extended = extended._replace(vector=vector)
+        judged_by = test.with_learned(learned.effects), refined.with_learned(learned.effects)
     limits = not_identifiable(state, linearization, model, (*found, *negligible))
-    flying = {**vectors, "extended": extended.vector}
-    prediction = prediction_of(refined, flying)
-    outliers = outliers_of((problem, test), vectors["extended"])
+    prediction = prediction_of(judged_by[1], flying)
     notes = [
         *outlier_notes(outliers),
         *warnings_of(problem, (*causes, *beyond), lost),
@@ -309,7 +312,7 @@ def summarize(judged: Judged, parts: Split) -> Diagnosis:
         beyond=beyond,
         unexplained=rest,
         not_identifiable=limits,
-        error=errors_of(test, vectors, prediction),
+        error=errors_of(judged_by[0], vectors, prediction),
         nominal=problem.like,
         base=model_of(problem, selection.base),
         extended=with_learned(model_of(problem, extended), learned),
@@ -320,7 +323,7 @@ def summarize(judged: Judged, parts: Split) -> Diagnosis:
         warnings=(*parts.warnings, *notes),
         prediction=prediction,
         changed=changed_parameters(linearization, extended, refined),
-        half_response_s=half_responses_of(linearization, model, refined, flying),
+        half_response_s=half_responses_of(linearization, model, judged_by[1], flying),
         outliers=outliers,
         learned=learned,
     )

@@ -7,7 +7,6 @@ fitted. Either has to predict held-out flights no worse, at any horizon where th
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
@@ -35,8 +34,8 @@ WORSE_SIGMAS = 1.0  # by which no horizon may be worse
 
 def find_learned(
     problem: Problem, test: Problem, model: FittedModel, base: np.ndarray, judge: Judge | None
-) -> tuple[Learned, np.ndarray] | None:
-    """Return what can be learnt of what a model leaves, and the model's vector beside it; None if nothing.
+) -> tuple[Learned | None, np.ndarray]:
+    """Return what can be learnt of what a model leaves, None if nothing, and the model's vector beside it.
 
     problem, test: of rows to learn from and of others. base: vector of the refitted model without effects.
     judge: of free flights on held-out rows; None without any.
@@ -62,7 +61,7 @@ def find_learned(
         terms, networks = [*terms, *added[0]], [*networks, *added[1]]
         found[name], model = one, model._replace(vector=one.vector)
     if not found:
-        return None
+        return None, model.vector
     learned = Learned(
         Law(tuple(terms)),
         Networks(tuple(networks)),
@@ -94,8 +93,8 @@ def _learnt(side: Side, held: Side, dependences: Sequence[Dependence]) -> Found 
     return fit_residual(side, held, [one.name for one in dependences])
 
 
-def _effects(terms: Sequence[Term], networks: Sequence[Network]) -> tuple[Any, ...]:
-    return Learned(Law(tuple(terms)), Networks(tuple(networks)), {}, {}, {}).effects
+def _of_parts(terms: Sequence[Term], networks: Sequence[Network]) -> Learned:
+    return Learned(Law(tuple(terms)), Networks(tuple(networks)), {}, {}, {})
 
 
 def _predicts(
@@ -107,17 +106,12 @@ def _predicts(
     added: tuple[Sequence[Term], Sequence[Network]],
 ) -> bool:
     """Return whether held-out flights are predicted no worse with what was learnt, and better in all."""
-    both = _effects([*had[0], *added[0]], [*had[1], *added[1]])
-    uses_time = any(part.uses("time") for one in both for part in one if isinstance(part, Law | Networks))
-    if judge is None or uses_time:
+    both = _of_parts([*had[0], *added[0]], [*had[1], *added[1]])
+    if judge is None or both.law.uses("time") or both.networks.uses("time"):
         return True
     tested = [
-        errors_at(
-            replace(problem, like=problem.like.with_effects(*effects)),
-            np.append(vector, [1.0, 0.0] * len(effects))[None],
-            judge.windows,
-        )
-        for vector, effects in ((before, _effects(*had)), (after, both))
+        errors_at(problem.with_learned(one.effects), one.beside(vector)[None], judge.windows)
+        for vector, one in ((before, _of_parts(*had)), (after, both))
     ]
     scale = np.maximum(np.nan_to_num(tested[0].rms()[0], nan=1.0), 1e-9)
     ratio = tested[1].rms()[0] / scale

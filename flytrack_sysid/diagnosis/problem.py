@@ -176,6 +176,25 @@ class Problem:
         gains = _gains(noises.noise_of(noise), noises.step_to(lanes), lanes.is_known, lanes.counts)
         return replace(self, noise=noise, gains=gains)
 
+    def with_learned(self, learned: Sequence[Any]) -> "Problem":
+        """Return the problem of vectors that end with the numbers of learned effects.
+
+        learned: parameters of effects, whose scales count as 0 at the start.
+        """
+        still = (one._replace(scale=0.0) for one in learned)
+        like = jax.tree.map(lambda leaf: np.asarray(leaf, float), self.like.with_effects(*still))
+        names, start = names_of(like), to_vector(like)
+        low, high = np.array([bounds_of(name) for name in names[len(self.names) :]]).reshape(-1, 2).T
+        return replace(
+            self,
+            like=like,
+            names=names,
+            start=start,
+            low=np.append(self.low, low),
+            high=np.append(self.high, high),
+            scale=np.append(self.scale, np.ones(len(low))),
+        )
+
     @property
     def fitted_noise(self) -> noises.Noise:
         """The noise in the sensors' units."""

@@ -10,7 +10,7 @@ say nothing about what answers the commands, and nothing is named from there.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -325,6 +325,12 @@ class Refined(NamedTuple):
     without: Mapping[str, np.ndarray]
     problem: Problem
     judge: Judge | None
+
+    def with_learned(self, learned: Sequence[Any]) -> "Refined":
+        """Return the same of the problem with learned effects, its base without them."""
+        problem = self.problem.with_learned(learned)
+        own = problem.start[len(self.problem.start) :]
+        return self._replace(problem=problem, base=None if self.base is None else np.append(self.base, own))
 
     @property
     def removal_costs(self) -> dict[str, float]:

@@ -237,6 +237,15 @@ def _errors_table(diagnosis: Diagnosis) -> Table:
     return Table(["error", "unit", *(name.replace("_", " ") for name in diagnosis.error)], rows, caption)
 
 
+BARS = {
+    "nominal": ORANGE,
+    "refitted_base": GREY,
+    "extended": BLUE,
+    "without_learned": "lightsteelblue",
+    "noise_floor": GREEN,
+}
+
+
 def _errors_picture(diagnosis: Diagnosis) -> list[Part]:
     """Return bars of the errors of free flight by horizon and model; none without such flights."""
     horizons = list(diagnosis.error["extended"].position_m)
@@ -246,11 +255,9 @@ def _errors_picture(diagnosis: Diagnosis) -> list[Part]:
     axes = figure.subplots()
     models = [(name, one.position_m) for name, one in diagnosis.error.items() if one.position_m]
     width = 0.8 / len(models)
-    for place, ((name, errors), colour) in enumerate(zip(models, (ORANGE, GREY, BLUE, GREEN), strict=False)):
-        at = np.arange(len(horizons)) + place * width
-        axes.bar(
-            at, [errors[horizon] for horizon in horizons], width, color=colour, label=name.replace("_", " ")
-        )
+    for place, (name, errors) in enumerate(models):
+        at, heights = np.arange(len(horizons)) + place * width, [errors[horizon] for horizon in horizons]
+        axes.bar(at, heights, width, color=BARS[name], label=name.replace("_", " "))
     every = [error for _, errors in models for error in errors.values()]
     if max(every) > LOG_BARS * min(every):
         axes.set_yscale("log")

@@ -119,9 +119,10 @@ class Prediction:
     """Held-out errors of free flights from measured states, rms, and where they tell anything.
 
     errors: by model (nominal, refitted_base, extended, placebo; refitted_to_flights, the base alone fitted
-    as the extended model was, where that was done), by quantity with its unit, and by seconds. evidence: by
-    quantity, the horizons, s, at which a model predicts better than the placebo, which knows the state at
-    the start and no commands. removal_costs: by effect, by which share these errors grow without it.
+    as the extended model was, where that was done; without_learned, the extended model without what was
+    learnt beyond the list), by quantity with its unit, and by seconds. evidence: by quantity, the horizons,
+    s, at which a model predicts better than the placebo, which knows the state at the start and no commands.
+    removal_costs: by effect, by which share these errors grow without it.
     """
 
     errors: Mapping[str, Mapping[str, Mapping[str, float]]] = field(default_factory=dict)
@@ -155,14 +156,14 @@ class Diagnosis:
     """What is wrong with a model, according to a log.
 
     verdict: consistent, causes_found, unexplained, or "causes_found+unexplained". error: by model: nominal,
-    refitted_base, extended, noise_floor. nominal, base, extended: the models, with the motion that the log
-    shows. negligible: what is significant and too small to matter. beyond: what has a value at the end of
-    what is searched, so that it is not named. source, sha256: of the log. noise: by channel and axis, fitted
-    standard deviations of the sensors. voltages: the lowest and the highest of the battery that were learnt
-    from, V; None where it was not measured. prediction: how far ahead the models predict. changed: every
-    parameter of the extended model that is not as in the nominal one. learned: a law or a residual for what
-    is unexplained, part of the extended model. half_response_s: by model (nominal,
-    refitted_base, extended) and by stick. outliers: by channel, if any.
+    refitted_base, extended, noise_floor, and without_learned as in ``Prediction``. nominal, base, extended:
+    the models, with the motion that the log shows. negligible: what is significant and too small to matter.
+    beyond: what has a value at the end of what is searched, so that it is not named. source, sha256: of the
+    log. noise: by channel and axis, fitted standard deviations of the sensors. voltages: the lowest and the
+    highest of the battery that were learnt from, V; None where it was not measured. prediction: how far
+    ahead the models predict. changed: every parameter of the extended model that is not as in the nominal
+    one. learned: a law or a residual for what is unexplained, part of the extended model. half_response_s:
+    by model (nominal, refitted_base, extended) and by stick. outliers: by channel, if any.
     """
 
     verdict: str

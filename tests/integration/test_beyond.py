@@ -47,6 +47,9 @@ def test_a_law_is_found_with_its_numbers(tmp_path: Path) -> None:
     assert (factor.quantity, factor.shape) == ("airspeed", "bump")
     np.testing.assert_allclose(factor.numbers, [BUMP_MS, WIDTH_MS], rtol=0.1)
     assert share_removed(found, clean) > 0.9
+    without, with_law = (found.prediction.errors[name] for name in ("without_learned", "extended"))
+    for horizon in ("0.5", "1", "2"):
+        assert with_law["velocity_m_per_s"][horizon] < 0.9 * without["velocity_m_per_s"][horizon]
     assert "learnt: force (air) += (" in text_of(found)
     _, model, report = write_diagnosis(tmp_path, found, log)
     assert load_model(model).effects == found.extended.effects
