@@ -31,7 +31,7 @@ from flytrack_sysid.diagnosis.search import FittedModel
 from flytrack_sysid.log import FlightLog
 
 LINES = report.RESULTS / "beyond.jsonl"
-SEED, SECONDS = 41, 60.0  # seed 7 was looked at while rules were made
+SEED, SECONDS = 43, 60.0  # rules were looked at on seeds 7 and 41
 AMPLITUDES = (1.0, 3.0)  # times the noise of the sensor in the law's channel
 # Kind of law -> quantities, and shapes, that are right.
 RIGHT: dict[str, tuple[set[str], set[str]]] = {
