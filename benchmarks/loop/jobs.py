@@ -1,6 +1,7 @@
 """The jobs of the loop's benchmark, each on one core: policies that need no plant, and one job per plant.
 
-A job is ``nominal`` or ``randomised`` (shared policies), ``shipped``, or the number of a hidden plant. JAX is
+A job is ``nominal`` or ``randomised`` (shared policies), ``shipped``, the number of a hidden plant, or
+``law_`` and that of a plant with a law outside the package's list. JAX is
 imported by the jobs only, because its threads stay on the core to which ``pin`` has moved the process.
 """
 
@@ -17,6 +18,7 @@ from benchmarks.report import write_json
 
 SHARED = {"nominal": "FlyTrack-v0", "randomised": "FlyTrackRandomized-v0"}
 RESULT, LOG = "result.json", "log.txt"
+LAW = "law_"
 
 
 def pin(free_cores: Any) -> None:
@@ -61,12 +63,15 @@ def train_shared(job: str, out: Path, steps: int, seed: int) -> dict[str, Any]:
 def make_plant(job: str, seed: int) -> tuple[Any, str]:
     """Return the plant of a job, and its hidden effects as text."""
     from baselines.purejaxrl_ppo.evaluate import SHIPPED_BLACK_BOX
-    from benchmarks.loop.plants import HiddenPlant, draw_plant
+    from benchmarks.loop.plants import HiddenPlant, draw_plant, draw_plant_with_law
     from flytrack_env import blackbox
 
     if job == "shipped":
         return blackbox.load(SHIPPED_BLACK_BOX), "the shipped black box"
-    truth = draw_plant(int(job), seed)
+    if job.startswith(LAW):
+        truth = draw_plant_with_law(int(job.removeprefix(LAW)), seed)
+    else:
+        truth = draw_plant(int(job), seed)
     return HiddenPlant(truth), truth.text()
 
 

@@ -14,10 +14,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from benchmarks.hidden import EFFECTS as EFFECT_RANGES
-from benchmarks.hidden import Truth, draw_effect
+from benchmarks.hidden import Truth, draw_effect, draw_outside
 from benchmarks.hidden.effects import LIFT_SPEED
 from benchmarks.hidden.plant import SECONDS_PER_MINUTE
 from benchmarks.hidden.truth import DT_S
+from benchmarks.loop.outside import SIGNALS, push_of
 from flytrack_env import nominal_parameters
 from flytrack_env.dynamics import ModelParameters
 from flytrack_env.plants import Plant
@@ -40,6 +41,7 @@ LAG_SPREAD, THRUST_SPREAD = 0.2, 0.05  # |ln factor| of the lags, and of the thr
 LARGE = 2.0 / 3.0  # smallest size drawn, as a share of the log range
 # Hidden effects of the first plants: named, or a number of random ones.
 HIDDEN = (("command_delay",), ("quadratic_drag",), ("thrust_scale",), 2, 3)
+LAW_AMPLITUDES = (1.0, 3.0)  # times the sensor's noise, as in benchmarks.beyond
 MOST_STEPS = 8  # commands that a delay remembers
 LATER = 5  # random effects of all later plants
 
@@ -57,7 +59,10 @@ class HiddenState(NamedTuple):
 
 
 class HiddenPlant(Plant):
-    """A plant that flies a ``Truth`` with effects of ``EFFECTS``; its state is a ``HiddenState``."""
+    """A plant that flies a ``Truth`` with effects of ``EFFECTS`` and a law of ``outside.SIGNALS``, if any.
+
+    Its state is a ``HiddenState``.
+    """
 
     dt = DT_S
 
@@ -96,8 +101,11 @@ class HiddenPlant(Plant):
         airspeed_b = x[VELOCITY] @ to_world
         thrust_acc = self._thrust_acc(applied[3], x[20], airspeed_b)
         gravity_w = jnp.array([0.0, 0.0, self.truth.gravity], jnp.float32)
-        acc_w = to_world @ self._force_b(airspeed_b, thrust_acc) - gravity_w
-        rates_b = self._rates_b(applied)
+        force_b, rates_b = self._force_b(airspeed_b, thrust_acc), self._rates_b(applied)
+        if self.truth.outside is not None:
+            force, rates = push_of(self.truth.outside, x[POSITION], to_world, airspeed_b)
+            force_b, rates_b = force_b + force, rates_b + rates
+        acc_w = to_world @ force_b - gravity_w
         open_v = state.open_v - self.truth.drain * DT_S / SECONDS_PER_MINUTE
         after = [
             x[POSITION] + x[VELOCITY] * DT_S + acc_w * (0.5 * DT_S * DT_S),
@@ -207,3 +215,11 @@ def draw_plant(number: int, seed: int) -> Truth:
         hidden = tuple(str(name) for name in rng.choice(EFFECTS, size=hidden, replace=False))
     base = draw_base(rng)
     return replace(base, effects={name: _draw_values(name, rng) for name in hidden})
+
+
+def draw_plant_with_law(number: int, seed: int) -> Truth:
+    """Return a plant by its number, from 0, with a law outside the package's list; kinds take turns."""
+    rng = np.random.default_rng([seed, number, len(SIGNALS)])
+    kind, (low, high) = tuple(SIGNALS)[number % len(SIGNALS)], np.log(LAW_AMPLITUDES)
+    outside = draw_outside(rng, kind, math.exp(rng.uniform(low, high)))
+    return replace(draw_base(rng), outside=outside)

@@ -1,12 +1,15 @@
 """The hidden plants of the loop fly as those in plain floats on which the diagnosis is graded."""
 
+from dataclasses import replace
+
 import jax
 import numpy as np
 import pytest
 
 from benchmarks.hidden import Truth, draw_base, with_effects
 from benchmarks.hidden.plant import Plant, Start
-from benchmarks.loop.plants import EFFECTS, HiddenPlant
+from benchmarks.loop.outside import SIGNALS
+from benchmarks.loop.plants import EFFECTS, HiddenPlant, draw_plant_with_law
 from flytrack_env import nominal_parameters
 from flytrack_env.quaternion import Quaternion, Vec3
 from flytrack_env.state import Action, Drone, pack
@@ -48,3 +51,13 @@ def test_the_flight_is_that_in_plain_floats(names):
     np.testing.assert_allclose(found, expected, rtol=2e-4, atol=2e-4)
     if names:
         assert np.abs(expected - flown_in_floats(base, commands)).max() > 1e-3
+
+
+@pytest.mark.parametrize("number", range(len(SIGNALS)), ids=SIGNALS)
+def test_a_law_outside_the_list_acts_as_in_plain_floats(number):
+    truth = draw_plant_with_law(number, seed=1)
+    rng = np.random.default_rng(number)
+    commands = np.repeat(rng.uniform(-1.0, 1.0, (STEPS // 4, 4)), 4, axis=0).astype(np.float32)
+    expected, found = flown_in_floats(truth, commands), flown_in_jax(truth, commands)
+    np.testing.assert_allclose(found, expected, rtol=2e-4, atol=2e-4)
+    assert np.abs(expected - flown_in_floats(replace(truth, outside=None), commands)).max() > 1e-3
