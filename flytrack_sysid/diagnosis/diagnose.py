@@ -39,6 +39,7 @@ from flytrack_sysid.diagnosis.summary import (
     changed_parameters,
     effect_causes,
     errors_of,
+    given_learned_notes,
     half_responses_of,
     model_of,
     not_identifiable,
@@ -284,8 +285,10 @@ def summarize(judged: Judged, parts: Split) -> Diagnosis:
     extended = at_end(selection, extended)
     flying = {**vectors, "extended": extended.vector}
     learned, judged_by = None, (test, refined)
-    # A law that acts for a part of the log is not looked for beside an effect that does.
-    if selection.unexplained.shares and extended.effects.isdisjoint(one.effect for one in problem.windows):
+    # A law that acts for a part of the log is not looked for beside an effect that does, nor one beside
+    # another that the given model has.
+    others = (one.effect for one in problem.windows)
+    if selection.unexplained.shares and extended.effects.isdisjoint(others) and not problem.given_learned:
         always, always_held = (replace(one, windows=()) for one in (problem, test))
         learned, vector = find_learned(always, always_held, extended, selection.base.vector, refined.judge)
     if learned is not None:
@@ -300,6 +303,7 @@ def summarize(judged: Judged, parts: Split) -> Diagnosis:
         *warnings_of(problem, (*causes, *beyond), lost),
         *refinement_notes(refined, selection.model),
         *stand_in_notes(selection, flying["extended"]),
+        *given_learned_notes(problem, selection.unexplained),
         *unseen_at_rest_notes(judged.rejected),
         *notes_of(selection, linearization, parts.log),
     ]

@@ -24,7 +24,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from flytrack_env.dynamics import ModelParameters, read_sensors
-from flytrack_env.effects import BY_NAME, EFFECTS, Effect, effect_of
+from flytrack_env.effects import BY_NAME, EFFECTS, LEARNED, Effect, effect_of
 from flytrack_env.quaternion import Quaternion, Vec3
 from flytrack_sysid.diagnosis import noise as noises
 from flytrack_sysid.diagnosis.lanes import LANE_S, Lanes, lead_in_of
@@ -200,6 +200,12 @@ class Problem:
         """The noise in the sensors' units."""
         assert self.noise is not None, "with_noise comes first"
         return noises.noise_of(self.noise)
+
+    @property
+    def given_learned(self) -> tuple[str, ...]:
+        """What was learnt beyond the list in the nominal model, from another log."""
+        learned = [effect.name for effect in LEARNED]
+        return tuple(name for name in self.given_effects if name in learned)
 
     @property
     def counts(self) -> np.ndarray:

@@ -557,6 +557,17 @@ def stand_in_notes(selection: Selection, vector: np.ndarray) -> list[str]:
     return notes
 
 
+def given_learned_notes(problem: Problem, rest: Unexplained) -> list[str]:
+    """Return that nothing is learnt beside what the nominal model has learnt from another log."""
+    if not problem.given_learned or not rest.shares:
+        return []
+    names = ", ".join(problem.given_learned)
+    return [
+        f"the model has {names} from another log: nothing is learnt beside that; diagnose the model without "
+        "it to learn from this log"
+    ]
+
+
 def unseen_at_rest_notes(rejected: Mapping[str, Veto]) -> list[str]:
     """Return laws of the sticks that were rejected for what they do while those rest."""
     names = ", ".join(name for name, veto in rejected.items() if veto is not_seen_at_rest)

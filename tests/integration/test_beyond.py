@@ -10,6 +10,8 @@ from benchmarks import hidden
 from benchmarks.beyond import covered
 from benchmarks.diagnosis import model_of
 from benchmarks.hidden.oracle import removed
+from flytrack_env.effects import LearnedLaw
+from flytrack_env.effects.grammar import Factor, Law, Term
 from flytrack_env.model_file import load_model
 from flytrack_sysid.diagnosis import Diagnosis, diagnose, learned, text_of, write_diagnosis
 from flytrack_sysid.log import FlightLog
@@ -54,6 +56,15 @@ def test_a_law_is_found_with_its_numbers(tmp_path: Path) -> None:
     _, model, report = write_diagnosis(tmp_path, found, log)
     assert load_model(model).effects == found.extended.effects
     assert "What was learnt" in report.read_text() or "bump(airspeed" in report.read_text()
+
+
+@pytest.mark.slow
+def test_nothing_is_learnt_beside_a_law_of_another_log() -> None:
+    truth, log, _ = flights(71)
+    too_small = Term("force", "air", (Factor("airspeed", "bump", (BUMP_MS, WIDTH_MS)),), (-0.1,), (0.0,))
+    found = diagnose(log, model_of(truth).with_effects(LearnedLaw(1.0, 0.0, Law((too_small,)))))
+    assert found.verdict == "unexplained" and found.learned is None
+    assert any("learned_law from another log" in warning for warning in found.warnings)
 
 
 @pytest.mark.slow

@@ -110,6 +110,22 @@ def test_delayed_reward_is_discounted_back():
     np.testing.assert_allclose(network.apply(params, clock, method="value"), [0.81, 0.9, 1.0], atol=0.04)
 
 
+def test_memory_tells_what_no_observation_shows():
+    # The same with the clock hidden: the steps have to be counted, from 0 again after every reset.
+    env = Probe(True, reward=lambda time, action, length: time == length - 1)
+    network, params = train(env, ProbeParams(max_steps_in_episode=3), memory_size=8)
+    unseen, first = jnp.zeros((1, 6, 2)), network.first_memory((1, 6))
+    done = jnp.array([[False, False, True] * 2])
+    values = network.apply(params, first, unseen, done, method="unroll")[1][0]
+    np.testing.assert_allclose(values, [0.81, 0.9, 1.0] * 2, atol=0.04)
+    memory = network.first_memory()
+    for value in values[:3]:
+        np.testing.assert_allclose(
+            network.apply(params, memory, unseen[0, 0], method="value_of"), value, atol=1e-5
+        )
+        memory, _ = network.act(params, memory, unseen[0, 0])
+
+
 def test_rewarded_action_is_learnt():
     # Reward 1 - (u - 0.4)^2 on one step: the best mean is 0.4, its value 1 less the variance.
     env = Probe(True, reward=lambda time, action, length: 1.0 - (action - 0.4) ** 2)
@@ -133,7 +149,7 @@ def test_gae_equals_the_definition():
     reward, value = rng.normal(size=(2, 6, 3))
     done = rng.random((6, 3)) < 0.3
     last_value, gamma, lam = rng.normal(size=3), 0.97, 0.9
-    batch = ppo.Batch(None, None, None, jnp.asarray(value), jnp.asarray(reward), jnp.asarray(done))
+    batch = ppo.Batch((), None, None, None, jnp.asarray(value), jnp.asarray(reward), jnp.asarray(done))
     found = ppo.generalized_advantages(batch, jnp.asarray(last_value), gamma, lam)
     next_value = np.concatenate([value[1:], last_value[None]])
     delta = reward + gamma * next_value * ~done - value
