@@ -16,7 +16,7 @@ from flytrack_env.toml_file import TomlError, parse_toml, read_text
 COUNTS = ("num_envs", "num_steps", "episode_steps", "update_epochs", "num_minibatches")
 SHARES = ("final_learning_rate_fraction", "gamma", "gae_lambda")
 POSITIVE = ("learning_rate", "adam_eps", "clip_eps", "max_grad_norm", "initial_std")
-NOT_NEGATIVE = ("entropy_coef", "value_coef", "min_std", "gate_margin")
+NOT_NEGATIVE = ("entropy_coef", "value_coef", "min_std", "gate_margin", "memory_size")
 LARGEST = sys.float_info.max  # integers in a file are unbounded
 
 
@@ -85,6 +85,9 @@ class Config:
     """Global norm to which gradients are clipped."""
     hidden_sizes: tuple[int, ...] = (64, 64)
     """Widths of the hidden layers, tanh, of actor and critic each."""
+    memory_size: int = 0
+    """Width of a gated recurrent unit whose memory of the episode the layers see beside the observation; 0:
+    none. A policy that remembers can adapt to the drone that it flies."""
     initial_std: float = 0.5
     """Standard deviation of the actions at the start; it does not depend on the state. PureJaxRL: 1."""
     min_std: float = 0.05
@@ -129,10 +132,11 @@ class Config:
                 f"total_timesteps: found {self.total_timesteps}, expected at least one update of "
                 f"{self.batch_size} steps (num_envs x num_steps)"
             )
-        if self.batch_size % self.num_minibatches:
+        rows, what = (self.num_envs, "environments") if self.memory_size else (self.batch_size, "steps")
+        if rows % self.num_minibatches:
             raise ConfigError(
-                f"num_minibatches: found {self.num_minibatches}, expected a divisor of the "
-                f"{self.batch_size} steps of an update"
+                f"num_minibatches: found {self.num_minibatches}, expected a divisor of the {rows} {what} of "
+                "an update"
             )
 
     def _check_range(self, names: tuple[str, ...], is_valid: Callable[[Any], bool], expected: str) -> None:

@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from baselines.purejaxrl_ppo.networks import ActorCritic
+from baselines.purejaxrl_ppo.networks import ActorCritic, Memory
 from flytrack_env.dynamics import ModelParameters
 from flytrack_env.env import EnvParams
 from flytrack_env.episodes import EpisodicEnvironment
@@ -162,21 +162,20 @@ def start_pose_params(params: EnvParams, num_steps: int) -> EnvParams:
     return params.replace(reset=params.reset._replace(course_fraction=0.0), max_steps_in_episode=num_steps)
 
 
-Step = Callable[[jax.Array, Any, jax.Array], tuple[jax.Array, Any, jax.Array, Rollout]]
+Step = Callable[..., tuple[Any, ...]]
 
 
 def make_step(
     env: EpisodicEnvironment, network: ActorCritic, policy_params: Any, params: EnvParams, num_laps: Any
 ) -> Step:
-    """Return ``step(observation, state, index)``: one step of the mean action.
+    """Return ``step(memory, observation, state, index)``: one step of the mean action.
 
-    It returns the next observation and state, whether the flight is over, and the step as a ``Rollout``
-    without its axis of steps. index: of the step, from 0.
+    It returns the next memory, observation and state, whether the flight is over, and the step as a
+    ``Rollout`` without its axis of steps. index: of the step, from 0.
     """
 
-    def step(observation: jax.Array, state: Any, index: jax.Array) -> tuple[Any, ...]:
-        policy: Any = network.apply(policy_params, observation, method="policy")
-        action = jnp.clip(policy.mode(), -1.0, 1.0)
+    def step(memory: Memory, observation: jax.Array, state: Any, index: jax.Array) -> tuple[Any, ...]:
+        memory, action = network.act(policy_params, memory, observation)
         next_observation, next_state, _, terminated, info = env.step_env(None, state, action, params)
         before, race = env.drone(state), env.race(state)
         after = env.drone(next_state)
@@ -193,7 +192,7 @@ def make_step(
             gate_time_s=jnp.where(is_pass, (index + fraction) * params.dt, 0.0),
             causes=Causes(*(info[name] for name in Causes._fields)),
         )
-        return next_observation, next_state, terminated | (info["laps"] >= num_laps), flown
+        return memory, next_observation, next_state, terminated | (info["laps"] >= num_laps), flown
 
     return step
 
@@ -211,9 +210,10 @@ def fly_episode(
     """Return one episode of the mean action, from a reset to its end or to ``num_laps`` laps."""
     step = make_step(env, network, policy_params, params, num_laps)
 
-    def advance(carry: tuple[jax.Array, Any, jax.Array], index: jax.Array) -> tuple[Any, ...]:
-        observation, state, is_flying = carry
-        next_observation, next_state, is_over, flown = step(observation, state, index)
+    def advance(carry: tuple[Any, ...], index: jax.Array) -> tuple[Any, ...]:
+        *now, is_flying = carry
+        *after, is_over, flown = step(*now, index)
+        state = now[-1]
         race = env.race(state)
         padded = flown._replace(
             is_flying=is_flying,
@@ -224,11 +224,9 @@ def fly_episode(
             causes=Causes(*(cause & is_flying for cause in flown.causes)),
         )
         keep = partial(jax.tree.map, partial(jnp.where, is_flying))
-        observation, state = keep((next_observation, next_state), (observation, state))
-        return (observation, state, is_flying & ~is_over), padded
+        return (*keep(tuple(after), tuple(now)), is_flying & ~is_over), padded
 
-    observation, state = env.reset(key, params)
-    start = (observation, state, jnp.asarray(True))
+    start = (network.first_memory(), *env.reset(key, params), jnp.asarray(True))
     return jax.lax.scan(advance, start, jnp.arange(num_steps))[1]
 
 
@@ -293,9 +291,9 @@ def _race_batch(
             return ~is_over & (outcome.steps < num_steps)
 
         def advance(carry: tuple[Any, ...]) -> tuple[Any, ...]:
-            observation, state, _, outcome = carry
-            observation, state, is_over, flown = step(observation, state, outcome.steps)
-            return observation, state, is_over, _update_outcome(outcome, flown)
+            *now, _, outcome = carry
+            *after, is_over, flown = step(*now, outcome.steps)
+            return *after, is_over, _update_outcome(outcome, flown)
 
         nothing = Outcomes(
             steps=zero,
@@ -306,7 +304,8 @@ def _race_batch(
             causes=Causes(*(never for _ in Causes._fields)),
         )
         # Under vmap the loop runs until no flight is left, and flights that are over stay as they are.
-        return jax.lax.while_loop(is_flying, advance, (*env.reset(key, own), never, nothing))[-1]
+        start = (network.first_memory(), *env.reset(key, own), never, nothing)
+        return jax.lax.while_loop(is_flying, advance, start)[-1]
 
     return jax.vmap(race)(keys, models)
 

@@ -1,5 +1,6 @@
 """Actor and critic: separate tanh networks, orthogonal initialisation, state-independent deviation."""
 
+import functools
 from collections.abc import Sequence
 from typing import Any
 
@@ -10,6 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from baselines.purejaxrl_ppo.config import Config
+
+Memory = Any  # what a policy remembers of an episode, a pytree; () of one that remembers nothing
 
 
 class ActorCritic(nn.Module):
@@ -58,13 +61,114 @@ class ActorCritic(nn.Module):
         """Return policy and value."""
         return self.policy(observation), self.value(observation)
 
+    @nn.nowrap
+    def first_memory(self, batch_shape: tuple[int, ...] = ()) -> Memory:
+        """Return what is remembered at the start of an episode: nothing."""
+        del batch_shape
+        return ()
+
+    def step(self, memory: Memory, observation: jax.Array) -> tuple[Memory, distrax.Distribution, jax.Array]:
+        """Return the memory after a step, policy and value."""
+        return memory, *self(observation)
+
+    def value_of(self, memory: Memory, observation: jax.Array) -> jax.Array:
+        """Return the value of an observation after what is remembered."""
+        del memory
+        return self.value(observation)
+
+    def unroll(
+        self, memory: Memory, observation: jax.Array, done: jax.Array
+    ) -> tuple[distrax.Distribution, jax.Array]:
+        """Return policy and value of steps in any order."""
+        del memory, done
+        return self(observation)
+
+    @nn.nowrap
+    def act(self, params: Any, memory: Memory, observation: jax.Array) -> tuple[Memory, jax.Array]:
+        """Return the memory after a step, and the mean action, in [-1, 1]."""
+        found: Any = self.apply(params, memory, observation, method="step")
+        return found[0], jnp.clip(found[1].mode(), -1.0, 1.0)
+
+
+class _Gru(nn.Module):
+    """A gated recurrent unit over steps that forgets where an episode ends (K. Cho et al., arXiv 1406.1078).
+
+    size: of its memory.
+    """
+
+    size: int
+
+    @nn.compact
+    def __call__(self, memory: jax.Array, step: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+        """Return the memory after a step: for the next one, and before a reset."""
+        observation, done = step
+        memory, _ = nn.GRUCell(self.size)(memory, observation)
+        return jnp.where(done[..., None], 0.0, memory), memory
+
+
+class RecurrentActorCritic(ActorCritic):
+    """Policy and value of an observation and of what a recurrent unit remembers of the episode.
+
+    memory_size: width of that memory.
+    """
+
+    memory_size: int = 0
+
+    def setup(self) -> None:
+        """Declare the layers."""
+        super().setup()
+        over_steps = nn.scan(
+            _Gru, variable_broadcast="params", split_rngs={"params": False}, in_axes=1, out_axes=1
+        )
+        self.gru = over_steps(self.memory_size)
+
+    def __call__(self, observation: jax.Array) -> tuple[distrax.Distribution, jax.Array]:
+        """Return policy and value of first observations of episodes."""
+        return self.step(self.first_memory(observation.shape[:-1]), observation)[1:]
+
+    @nn.nowrap
+    def first_memory(self, batch_shape: tuple[int, ...] = ()) -> Memory:
+        """Return what is remembered at the start of an episode, (*batch_shape, memory_size)."""
+        return jnp.zeros((*batch_shape, self.memory_size))
+
+    def step(self, memory: Memory, observation: jax.Array) -> tuple[Memory, distrax.Distribution, jax.Array]:
+        """Return the memory after a step, policy and value."""
+        memory, known = self._remember(memory, observation)
+        return memory, self.policy(known), self.value(known)
+
+    def value_of(self, memory: Memory, observation: jax.Array) -> jax.Array:
+        """Return the value of an observation after what is remembered."""
+        return self.value(self._remember(memory, observation)[1])
+
+    def unroll(
+        self, memory: Memory, observation: jax.Array, done: jax.Array
+    ) -> tuple[distrax.Distribution, jax.Array]:
+        """Return policy and value of steps in their order, (num_envs, num_steps).
+
+        memory: (num_envs, num_steps, memory_size), of which the first counts. done: an episode ends after it.
+        """
+        remembered = self.gru(memory[:, 0], (observation, done))[1]
+        known = jnp.concatenate([observation, remembered], axis=-1)
+        return self.policy(known), self.value(known)
+
+    def _remember(self, memory: Memory, observation: jax.Array) -> tuple[Memory, jax.Array]:
+        """Return the memory after a step, and what is known in it."""
+        rows = observation.reshape(-1, 1, observation.shape[-1])
+        never = jnp.zeros(rows.shape[:2], bool)
+        after = self.gru(memory.reshape(len(rows), -1), (rows, never))[0].reshape(memory.shape)
+        return after, jnp.concatenate([observation, after], axis=-1)
+
 
 def make_network(config: Config, num_choices: int = 0) -> ActorCritic:
     """Return the network that a configuration describes; num_choices: of discrete actions, if they are."""
-    return ActorCritic(
+    kind: Any = ActorCritic
+    if config.memory_size:
+        kind = functools.partial(RecurrentActorCritic, memory_size=config.memory_size)
+    found: ActorCritic = kind(
         hidden_sizes=config.hidden_sizes,
         initial_action=config.initial_action,
         initial_std=config.initial_std,
         min_std=config.min_std,
         num_choices=num_choices,
     )
+    return found

@@ -75,9 +75,8 @@ def fly(
     last_gate = settings.laps * params.course.num_gates
 
     def step(carry: tuple[Any, ...], index: jax.Array) -> tuple[Any, None]:
-        observation, state, is_flying, flown = carry
-        policy: Any = network.apply(policy_params, observation, method="policy")
-        action = jnp.clip(policy.mode(), -1.0, 1.0)
+        memory, observation, state, is_flying, flown = carry
+        remembered, action = network.act(policy_params, memory, observation)
         state = decayed(state, settings.gradient_decay)
         race, before = env.race(state), env.drone(state)
         next_state, _, is_over, _ = env.advance(state, Action(*action), params)
@@ -96,14 +95,14 @@ def fly(
         is_flying = is_flying & ~is_over
         keep = partial(jax.tree.map, partial(jnp.where, is_flying))
         seen = jnp.stack(env.observe_drone(after, next_state, params))
-        observation, state = keep((seen, next_state), (observation, state))
-        return (observation, state, is_flying, flown), None
+        kept = keep((remembered, seen, next_state), (memory, observation, state))
+        return (*kept, is_flying, flown), None
 
-    observation, state = env.reset_env(key, params)
     zero = jnp.float32(0.0)
-    start = (observation, state, jnp.asarray(True), Flown(zero, jnp.int32(0), zero))
+    nothing = Flown(zero, jnp.int32(0), zero)
+    start = (network.first_memory(), *env.reset_env(key, params), jnp.asarray(True), nothing)
     num_steps = round(settings.laps * settings.slowest_lap_s / float(env.default_params.dt))
-    return jax.lax.scan(jax.checkpoint(step), start, jnp.arange(num_steps))[0][3]
+    return jax.lax.scan(jax.checkpoint(step), start, jnp.arange(num_steps))[0][-1]
 
 
 def decayed(tree: Any, share: float) -> Any:

@@ -15,12 +15,12 @@ for each, and the setting (``config.py``) that switches it off:
   (``initial_action`` of zeros).
 - The step size falls with every gradient step, which is optax's own schedule, and not to 0, so that the
   last updates still learn (``anneal_every_gradient = false``, ``final_learning_rate_fraction = 0``).
+- The network may remember (``memory_size = 0``: it does not), so that it can adapt to the drone it flies.
 - One update is a function of its own (``Algorithm``), so that a run can be logged, stored and resumed
   between updates; ``make_train`` is PureJaxRL's: one ``jit``, a ``scan`` over updates.
 """
 
 from collections.abc import Callable
-from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -31,14 +31,18 @@ from gymnax.environments import spaces
 
 from baselines.purejaxrl_ppo.config import Config
 from baselines.purejaxrl_ppo.metrics import summarise_episodes, summarise_race
-from baselines.purejaxrl_ppo.networks import ActorCritic, make_network
+from baselines.purejaxrl_ppo.networks import ActorCritic, Memory, make_network
 
 Metrics = dict[str, jax.Array]
 
 
 class Batch(NamedTuple):
-    """One update's experience; leaves (num_steps, num_envs, ...)."""
+    """One update's experience; leaves (num_steps, num_envs, ...).
 
+    memory: before the step.
+    """
+
+    memory: Memory
     observation: jax.Array
     action: jax.Array
     log_prob: jax.Array
@@ -60,6 +64,7 @@ class Runner(NamedTuple):
 
     train_state: TrainState
     env_state: Any
+    memory: Memory
     observation: jax.Array
     episodes: Episodes
     key: jax.Array
@@ -127,7 +132,9 @@ def ppo_loss(
     config: Config,
 ) -> tuple[jax.Array, Metrics]:
     """Return the clipped objective plus clipped value loss of a minibatch, and its parts."""
-    policy, value = network.apply(network_params, batch.observation)
+    policy, value = network.apply(
+        network_params, batch.memory, batch.observation, batch.done, method="unroll"
+    )
     log_prob = policy.log_prob(batch.action)
     value_clipped = batch.value + jnp.clip(value - batch.value, -config.clip_eps, config.clip_eps)
     value_error = jnp.maximum((value - target) ** 2, (value_clipped - target) ** 2)
@@ -194,10 +201,19 @@ def make_ppo(env: Any, env_params: Any, config: Config) -> Algorithm:
     network: Any = make_network_for(env, env_params, config)
     optimizer, schedule = make_optimizer(config), make_schedule(config)
     step_all = choose_step(env, config)
+    # What minibatches are drawn from: steps, or whole environments where the order of their steps matters.
+    num_rows = config.num_envs if config.memory_size else config.batch_size
+
+    def as_rows(leaf: jax.Array) -> jax.Array:
+        if config.memory_size:
+            return leaf.swapaxes(0, 1)
+        return leaf.reshape(config.batch_size, *leaf.shape[2:])
 
     def collect_step(runner: Runner, _: None) -> tuple[Runner, tuple[Batch, dict[str, jax.Array]]]:
         key, key_action, key_step = jax.random.split(runner.key, 3)
-        policy, value = network.apply(runner.train_state.params, runner.observation)
+        memory, policy, value = network.apply(
+            runner.train_state.params, runner.memory, runner.observation, method="step"
+        )
         action, log_prob = policy.sample_and_log_prob(seed=key_action)
         observation, env_state, reward, terminated, truncated, info = step_all(
             key_step, runner.env_state, action, env_params
@@ -209,11 +225,13 @@ def make_ppo(env: Any, env_params: Any, config: Config) -> Algorithm:
             # Few steps see a truncation, so that its value is rarely worth computing.
             final_value = jax.lax.cond(
                 truncated.any(),
-                lambda: network.apply(runner.train_state.params, info["final_observation"], method="value"),
+                lambda: network.apply(
+                    runner.train_state.params, memory, info["final_observation"], method="value_of"
+                ),
                 lambda: jnp.zeros_like(value),
             )
             reward = reward + config.gamma * final_value * (truncated & ~terminated)
-        batch = Batch(runner.observation, action, log_prob, value, reward, done)
+        batch = Batch(runner.memory, runner.observation, action, log_prob, value, reward, done)
         log = {
             **{name: leaf for name, leaf in info.items() if leaf.shape == done.shape},
             "done": done,
@@ -224,6 +242,7 @@ def make_ppo(env: Any, env_params: Any, config: Config) -> Algorithm:
         }
         runner = runner._replace(
             env_state=env_state,
+            memory=jax.tree.map(lambda leaf: jnp.where(done[:, None], 0.0, leaf), memory),
             observation=observation,
             episodes=Episodes(jnp.where(done, 0.0, total), jnp.where(done, 0, length), last_return),
             key=key,
@@ -239,7 +258,7 @@ def make_ppo(env: Any, env_params: Any, config: Config) -> Algorithm:
         train_state: TrainState, key: jax.Array, data: tuple[Any, ...]
     ) -> tuple[TrainState, Metrics]:
         permutation = affine_permutation if config.affine_shuffle else jax.random.permutation
-        order = permutation(key, config.batch_size)
+        order = permutation(key, num_rows)
         shuffled = jax.tree.map(lambda leaf: leaf[order], data)
         minibatches = jax.tree.map(
             lambda leaf: leaf.reshape(config.num_minibatches, -1, *leaf.shape[1:]), shuffled
@@ -248,11 +267,12 @@ def make_ppo(env: Any, env_params: Any, config: Config) -> Algorithm:
 
     def update(runner: Runner) -> tuple[Runner, Metrics]:
         runner, (batch, log) = jax.lax.scan(collect_step, runner, None, config.num_steps)
-        last_value: Any = network.apply(runner.train_state.params, runner.observation, method="value")
+        last_value: Any = network.apply(
+            runner.train_state.params, runner.memory, runner.observation, method="value_of"
+        )
         advantage = generalized_advantages(batch, last_value, config.gamma, config.gae_lambda)
         target = advantage + batch.value
-        flatten = partial(jax.tree.map, lambda leaf: leaf.reshape(config.batch_size, *leaf.shape[2:]))
-        data = flatten((batch, advantage, target))
+        data = jax.tree.map(as_rows, (batch, advantage, target))
         key, *epoch_keys = jax.random.split(runner.key, config.update_epochs + 1)
         train_state, parts = jax.lax.scan(
             lambda train_state, key: update_epoch(train_state, key, data),
@@ -278,6 +298,7 @@ def make_ppo(env: Any, env_params: Any, config: Config) -> Algorithm:
         return Runner(
             train_state=TrainState.create(apply_fn=network.apply, params=params, tx=optimizer),
             env_state=env_state,
+            memory=network.first_memory((config.num_envs,)),
             observation=observation,
             episodes=Episodes(nothing, nothing.astype(jnp.int32), nothing),
             key=key,
