@@ -66,7 +66,7 @@ for env in (RecordVideo(film, "videos", lambda number: True, video_length=30), w
 """
 SIZES = "--num-envs 16 --num-steps 32 --num-minibatches 4 --total-timesteps 1024 --hidden-sizes 8"
 
-# What each extra is for: modules with their arguments, or code. [bench] compiles for ten minutes, in 4 GB.
+# What each extra is for: modules with their arguments, or code. [speed] compiles for ten minutes, in 4 GB.
 USES = {
     "": (FLY_EVERY_ID, MISSING_EXTRA_IS_NAMED),
     "train": (f"-m baselines.purejaxrl_ppo.train_ppo {SIZES} --out small", LOAD_CHAMPION),
@@ -85,9 +85,9 @@ USES = {
     ),
     "render": (RENDER,),
     "optimal": ("-m benchmarks.time_optimal --tracks speedway --kinds flying --out made",),
-    "bench": ("from benchmarks.env_speed import l2f_contestant as l2f; l2f('l2f', 1024, 8).run()",),
+    "speed": ("from benchmarks.env_speed import l2f_contestant as l2f; l2f('l2f', 1024, 8).run()",),
 }
-WITH_CHECKOUT = ("logs", "bags", "optimal", "bench")  # use files that the wheel does not have:
+WITH_CHECKOUT = ("logs", "bags", "optimal", "speed")  # use files that the wheel does not have:
 COPIED = ("benchmarks", "blackbox", "tests", "pyproject.toml")
 
 

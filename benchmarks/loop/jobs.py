@@ -63,7 +63,7 @@ def train_shared(job: str, out: Path, steps: int, seed: int) -> dict[str, Any]:
 def make_plant(job: str, seed: int) -> tuple[Any, str]:
     """Return the plant of a job, and its hidden effects as text."""
     from baselines.purejaxrl_ppo.evaluate import SHIPPED_BLACK_BOX
-    from benchmarks.loop.plants import HiddenPlant, draw_plant, draw_plant_with_law
+    from benchmarks.loop.plants import draw_plant, draw_plant_with_law, plant_of
     from flytrack_env import blackbox
 
     if job == "shipped":
@@ -72,7 +72,7 @@ def make_plant(job: str, seed: int) -> tuple[Any, str]:
         truth = draw_plant_with_law(int(job.removeprefix(LAW)), seed)
     else:
         truth = draw_plant(int(job), seed)
-    return HiddenPlant(truth), truth.text()
+    return plant_of(truth), truth.text()
 
 
 def measure_plant(job: str, out: Path, steps: int, seed: int) -> dict[str, Any]:

@@ -42,6 +42,7 @@ CONSUMERS = (
     "flytrack_sysid",
     "baselines",
     "flytrack_loop",
+    "flytrack_bench",
     "benchmarks",
     "blackbox",
     "firmware",

@@ -10,7 +10,7 @@ from baselines.purejaxrl_ppo.evaluate import SHIPPED_BLACK_BOX
 from baselines.purejaxrl_ppo.flights import Score, fly_many
 from baselines.purejaxrl_ppo.race_env import plant_env
 from benchmarks.champion import CHAMPION
-from benchmarks.loop.plants import HiddenPlant, draw_plant
+from benchmarks.loop.plants import draw_plant, plant_of
 from flytrack_env import blackbox, nominal_parameters
 from flytrack_loop import Gap, errors_of
 from flytrack_loop.__main__ import main
@@ -73,7 +73,7 @@ def test_errors_are_those_of_the_model(log):
 def test_the_gap_is_between_the_plant_and_the_simulator_learnt_in(champion):
     lost = draw_plant(2, 0)
     assert set(lost.effects) == {"thrust_scale"} and lost.effects["thrust_scale"]["factor"] < 1.0
-    gap = measure_gap(champion, HiddenPlant(lost), seed=1, episodes=8)
+    gap = measure_gap(champion, plant_of(lost), seed=1, episodes=8)
     assert gap.simulator.success == 1.0 > gap.plant.success
 
 

@@ -9,7 +9,7 @@ import pytest
 from benchmarks.hidden import Truth, draw_base, with_effects
 from benchmarks.hidden.plant import Plant, Start
 from benchmarks.loop.outside import SIGNALS
-from benchmarks.loop.plants import EFFECTS, HiddenPlant, draw_plant_with_law
+from benchmarks.loop.plants import EFFECTS, draw_plant_with_law, plant_of
 from flytrack_env import nominal_parameters
 from flytrack_env.quaternion import Quaternion, Vec3
 from flytrack_env.state import Action, Drone, pack
@@ -29,7 +29,7 @@ def flown_in_floats(truth: Truth, commands: np.ndarray) -> np.ndarray:
 
 
 def flown_in_jax(truth: Truth, commands: np.ndarray) -> np.ndarray:
-    plant, zero = HiddenPlant(truth), Vec3(0.0, 0.0, 0.0)
+    plant, zero = plant_of(truth), Vec3(0.0, 0.0, 0.0)
     sag_v = truth.effects.get("voltage_sag", {}).get("at_full_v", 0.0) * 0.35**2
     quat = Quaternion(np.cos(0.35), 0.0, 0.0, np.sin(0.35))
     drone = Drone(Vec3(*START.pos_w), zero, zero, quat, zero, Action(0.0, 0.0, 0.0, -0.3), 23.5 - sag_v)

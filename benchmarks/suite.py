@@ -1,0 +1,109 @@
+"""The suite of ``flytrack_bench``: ``python -m benchmarks.suite [--draw] [--page]``.
+
+``--draw`` draws the tracks and hidden plants of suite v1 from its seed and writes them; a test compares them
+with those that are shipped. ``--page`` writes docs/benchmark.md of the results in docs/results/suite, which
+``python -m flytrack_bench`` wrote.
+"""
+
+import argparse
+import dataclasses
+import json
+from pathlib import Path
+from typing import Any
+
+from benchmarks import report
+from benchmarks.loop.plants import craft_of, draw_plant
+from flytrack_bench.suite import FOLDER, craft_as_json, digest_of
+from flytrack_env import load_track, random_track, save_track
+from flytrack_env.references import shipped_reference, track_digest
+
+SEED, START_SEED = 2026, 7
+TRACK_SEEDS = {"random_1": 101, "random_2": 102, "random_3": 103}
+# python -m benchmarks.time_optimal --tracks flytrack_bench/suites/v1/random_{1,2,3}.toml --kinds flying
+OPTIMAL_S = {"random_1": 4.4545, "random_2": 6.2877, "random_3": 5.8095}
+PLANTS = range(3, 11)  # of ``draw_plant``: two, three and five effects each
+RESULTS = report.RESULTS / "suite"
+PAGE = report.ROOT / "docs" / "benchmark.md"
+
+
+def draw(folder: Path) -> None:
+    """Write suite v1 into a folder: its tracks and its file."""
+    for name, seed in TRACK_SEEDS.items():
+        save_track(folder / "v1" / f"{name}.toml", dataclasses.replace(random_track(seed), name=name))
+    own = {name: (f"v1/{name}.toml", load_track(folder / "v1" / f"{name}.toml")) for name in TRACK_SEEDS}
+    flytrack, optimal_s = load_track("flytrack"), shipped_reference("flytrack").time_s
+    tasks = [_task("flytrack", "flytrack", flytrack, optimal_s, None)]
+    tasks += [_task(name, file, track, OPTIMAL_S[name], None) for name, (file, track) in own.items()]
+    for place, number in enumerate(PLANTS):
+        craft = craft_as_json(craft_of(draw_plant(number, SEED)))
+        tasks.append(_task(f"plant_{place + 1}", "flytrack", flytrack, optimal_s, craft))
+    content: dict[str, Any] = {
+        "name": "v1",
+        "seed": START_SEED,
+        "starts": 256,
+        "laps": 3,
+        "steps": 2500,
+        "tasks": tasks,
+    }
+    report.write_json(folder / "v1.json", {"digest": digest_of(content), **content})
+
+
+def _task(name: str, file: str, track: Any, optimal_s: float, craft: Any) -> dict[str, Any]:
+    return {
+        "id": name,
+        "track": file,
+        "track_sha256": track_digest(track),
+        "optimal_lap_s": round(optimal_s, 6),
+        "craft": craft,
+    }
+
+
+def row(path: Path) -> list[str]:
+    """Return an entry's row of the table."""
+    found = json.loads(path.read_text(encoding="utf-8"))
+    flown = found["tasks"]
+
+    def mean(ids: list[str], name: str) -> str:
+        values = [one[name] for task in ids for one in flown.get(task, ()) if one[name] is not None]
+        if not values:
+            return "-"
+        share = sum(values) / len(values)
+        return f"{share:.1%}" if name == "success" else f"{share:.3f}"
+
+    groups = (["flytrack"], list(TRACK_SEEDS), [f"plant_{place + 1}" for place in range(len(PLANTS))])
+    cells = [f"{mean(ids, 'success')}, {mean(ids, 'over_optimal')}" for ids in groups]
+    score = found["summary"]["score"]
+    interval = "" if score["ci95"] is None else " ({:.3f} to {:.3f})".format(*score["ci95"])
+    return [
+        f"[{path.stem}](results/suite/{path.name})",
+        found["regime"],
+        str(len(found["policies"])),
+        *cells,
+        f"{score['interquartile_mean']:.3f}{interval}" if len(flown) > len(PLANTS) else "-",
+    ]
+
+
+def write_page() -> None:
+    """Write the page of all results."""
+    header = (
+        "entry | regime | seeds | FlyTrack course | random tracks | hidden plants | "
+        "interquartile mean of the score"
+    )
+    rows = [row(path) for path in sorted(RESULTS.glob("*.json"))]
+    report.fill_page(PAGE, "benchmark", results=report.table(header, rows))
+
+
+def main() -> None:
+    """Draw the suite, or write the page."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--draw", action="store_true", help="write the suite's files")
+    parser.add_argument("--page", action="store_true", help="write docs/benchmark.md")
+    asked = parser.parse_args()
+    if asked.draw:
+        draw(FOLDER)
+    if asked.page:
+        write_page()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,5 @@
+"""``python -m flytrack_bench``: the command without ``flytrack``."""
+
+from flytrack_bench.cli import main
+
+main()

@@ -1,0 +1,120 @@
+"""Fly a policy through a frozen suite of tasks, and write a result that others can verify."""
+
+import hashlib
+import json
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import tyro
+from tyro.conf import FlagCreatePairsOff, arg
+
+from flytrack_bench.policies import PolicyError, find_object, load_policy
+from flytrack_bench.results import differences, run
+from flytrack_bench.suite import Suite, SuiteError, load_suite
+from flytrack_env.files import read_at_most, write_atomically
+from flytrack_env.messages import error_text
+from flytrack_sysid.progress import ProgressBar
+
+MOST_BYTES = 2**24
+VERIFIED = 3  # tasks of a result that are flown again
+
+
+@dataclass(frozen=True)
+class Flags:
+    """What is flown."""
+
+    policy: Annotated[tuple[str, ...], arg(metavar="CHECKPOINT|MODULE:NAME [...]")]
+    """The policy, one for each training seed: checkpoints, or functions of the observation that return four
+    sticks."""
+    out: Path | None = None
+    """The result, .json; default: it is printed only."""
+    suite: str = "v1"
+    """Name of a shipped suite, or a suite's file."""
+    tasks: tuple[str, ...] = ()
+    """Ids of the tasks to fly; default: all, or with --adapt all hidden plants."""
+    adapt: Annotated[str | None, arg(metavar="MODULE:NAME")] = None
+    """A function that makes a policy for each plant, given `flytrack_bench.Data`."""
+    data_seconds: float = 30.0
+    """Seconds of flight that --adapt may log of each plant."""
+    verify: Path | None = None
+    """A result to verify: some of its tasks are flown again with this policy."""
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Fly as the command line says; exit 1 where a result is not confirmed, 2 for what cannot be used."""
+    config = (FlagCreatePairsOff,)
+    flags = tyro.cli(Flags, prog="flytrack bench", description=__doc__, args=arguments, config=config)
+    try:
+        is_good = verify(flags) if flags.verify is not None else bench(flags)
+    except (ValueError, OSError) as error:
+        print(f"flytrack bench: error: {error}", file=sys.stderr)
+        raise SystemExit(2) from error
+    raise SystemExit(0 if is_good else 1)
+
+
+def fly(flags: Flags, suite: Suite, ids: tuple[str, ...]) -> dict[str, Any]:
+    """Return the result of the policies on some tasks."""
+    policies = [load_policy(one) for one in flags.policy]
+    tasks, adapt = suite.chosen(ids), None if flags.adapt is None else find_object(flags.adapt)
+    if adapt is not None and not ids:
+        tasks = tuple(task for task in tasks if task.craft is not None)
+    return run(suite, policies, tasks, flags.data_seconds, adapt, ProgressBar("flights"))
+
+
+def bench(flags: Flags) -> bool:
+    """Fly the tasks, print and write the result."""
+    if flags.out is not None and flags.out.exists():
+        raise ValueError(f"--out: {flags.out} exists already; remove it, or give another file")
+    found = fly(flags, load_suite(flags.suite), flags.tasks)
+    print(text_of(found))
+    if flags.out is not None:
+        write_atomically(flags.out, (json.dumps(found, indent=1) + "\n").encode())
+        print(f"written: {flags.out}")
+    return True
+
+
+def verify(flags: Flags) -> bool:
+    """Fly some tasks of a result again, and say whether they confirm it."""
+    assert flags.verify is not None
+    suite, content = load_suite(flags.suite), read_at_most(flags.verify, MOST_BYTES)
+    try:
+        found = json.loads(content)
+        ids, digest, hashes = (
+            list(found["tasks"]),
+            found["digest"],
+            [one["sha256"] for one in found["policies"]],
+        )
+    except (KeyError, TypeError, ValueError) as error:
+        raise SuiteError(f"{flags.verify}: not a result: {error_text(error)}") from error
+    if digest != suite.digest:
+        raise SuiteError(f"{flags.verify}: digest: found {digest}, expected {suite.digest} of {suite.name}")
+    if hashes != [load_policy(one).sha256 for one in flags.policy]:
+        raise PolicyError(f"{flags.verify}: policies: found others than --policy names")
+    rng = np.random.default_rng(int(hashlib.sha256(content).hexdigest(), 16))
+    chosen = tuple(str(one) for one in rng.permutation(ids)[:VERIFIED])
+    lines = differences(found, fly(flags, suite, chosen))
+    print("\n".join(lines) or f"confirmed on {', '.join(chosen)}")
+    return not lines
+
+
+def text_of(found: dict[str, Any]) -> str:
+    """Return a result as a table, the means over policies, and its summary."""
+    lines = [f"{'task':12} {'success':>8} {'lap':>8} {'over optimal':>13}"]
+    for task, ones in found["tasks"].items():
+        laps = [one["flying_lap_s"] for one in ones if one["flying_lap_s"] is not None]
+        ratios = [one["over_optimal"] for one in ones if one["over_optimal"] is not None]
+        lap = f"{np.mean(laps):.3f} s" if laps else "-"
+        ratio = f"{np.mean(ratios):.3f}" if ratios else "-"
+        lines.append(f"{task:12} {np.mean([one['success'] for one in ones]):8.1%} {lap:>8} {ratio:>13}")
+    for name, one in found["summary"].items():
+        interval = "" if one["ci95"] is None else " ({:.3f} to {:.3f})".format(*one["ci95"])
+        lines.append(f"{name}: interquartile mean {one['interquartile_mean']:.3f}{interval}")
+    return "\n".join(lines)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,117 @@
+"""Running a suite: every task flown, and what a result file says of it."""
+
+import time
+from collections.abc import Callable, Sequence
+from importlib.metadata import version
+from typing import Any
+
+import numpy as np
+from scipy import stats
+
+from baselines.purejaxrl_ppo.flights import race_many, score, start_keys
+from baselines.purejaxrl_ppo.race_env import with_model_as_given
+from flytrack_bench.data import Data
+from flytrack_bench.policies import Policy
+from flytrack_bench.suite import Suite, Task
+
+SCHEMA = 1
+DRAWS, COVERED = 2000, 0.95  # of the bootstrap
+QUARTER = 0.25
+# By which a result may differ on another machine: share of starts, share of a lap time.
+SAME_SUCCESS, SAME_LAP = 0.02, 0.005
+Adapt = Callable[[Data], Policy]
+Report = Callable[[int, int], None]
+
+
+def fly_task(task: Task, suite: Suite, policy: Policy) -> dict[str, float | None]:
+    """Return how a policy does on a task: success, mean lap times, s, and its score.
+
+    The score is the share of starts that finish times the time-optimal lap over the mean flying lap.
+    """
+    env = policy.env(task.plant, task.track)
+    params = with_model_as_given(env.default_params)
+    keys = start_keys(suite.seed, suite.starts)
+    found = score(race_many(env, policy.network, policy.params, keys, suite.steps, suite.laps, params))
+    ratio = found.flying_lap_s / task.optimal_lap_s
+    return {
+        "success": round(found.success, 6),
+        "first_lap_s": _number(found.first_lap_s),
+        "flying_lap_s": _number(found.flying_lap_s),
+        "over_optimal": _number(ratio),
+        "score": _number(found.success / ratio if found.success else 0.0),
+    }
+
+
+def _number(value: float) -> float | None:
+    return round(float(value), 6) if np.isfinite(value) else None
+
+
+def run(
+    suite: Suite,
+    policies: Sequence[Policy],
+    tasks: Sequence[Task],
+    seconds: float = 0.0,
+    adapt: Adapt | None = None,
+    report: Report = lambda done, total: None,
+) -> dict[str, Any]:
+    """Return the result of policies, one a training seed, on tasks, as JSON values.
+
+    seconds, adapt: with so much data of each task, a policy is made in place of ``policies``, which then name
+    the entry only. report: called with flights done and to do.
+    """
+    started_s, total = time.process_time(), len(tasks) * len(policies)
+    flown: dict[str, list[dict[str, Any]]] = {}
+    for place, task in enumerate(tasks):
+        flown[task.id] = []
+        for number, policy in enumerate(policies):
+            own = policy if adapt is None else adapt(Data(task, suite, seconds))
+            flown[task.id].append(fly_task(task, suite, own))
+            report(place * len(policies) + number + 1, total)
+    return {
+        "schema": SCHEMA,
+        "suite": suite.name,
+        "digest": suite.digest,
+        "regime": "zero-shot" if adapt is None else f"{seconds:g} s of data",
+        "policies": [
+            {"name": one.name, "sha256": one.sha256, "training": one.training()} for one in policies
+        ],
+        "tasks": flown,
+        "summary": {name: summary(flown, name) for name in ("success", "score")},
+        "versions": {name: version(name) for name in ("flytrack", "jax", "jaxlib")},
+        "cpu_s": round(time.process_time() - started_s, 1),
+    }
+
+
+def summary(flown: dict[str, list[dict[str, Any]]], name: str) -> dict[str, Any]:
+    """Return the interquartile mean of a figure over tasks and seeds, and its 95 % interval.
+
+    The interval is of a bootstrap that draws seeds again within each task (R. Agarwal et al., "Deep
+    reinforcement learning at the edge of the statistical precipice", 2021); null of fewer than two seeds.
+    """
+    values = np.array([[one[name] for one in ones] for ones in flown.values()])
+    interval = None
+    if values.shape[1] > 1:
+        drawn = np.random.default_rng(0).integers(values.shape[1], size=(DRAWS, *values.shape))
+        means = [
+            stats.trim_mean(np.take_along_axis(values, one, axis=1), QUARTER, axis=None) for one in drawn
+        ]
+        tail = 0.5 * (1.0 - COVERED)
+        interval = [round(float(one), 6) for one in np.quantile(means, (tail, 1.0 - tail))]
+    return {
+        "interquartile_mean": round(float(stats.trim_mean(values, QUARTER, axis=None)), 6),
+        "ci95": interval,
+    }
+
+
+def differences(found: dict[str, Any], again: dict[str, Any]) -> list[str]:
+    """Return in what tasks of another run a result is not confirmed, a line each."""
+    lines = []
+    for task, ones in again["tasks"].items():
+        for number, (one, other) in enumerate(zip(found["tasks"][task], ones, strict=True)):
+            laps = one["flying_lap_s"], other["flying_lap_s"]
+            is_same_lap = laps[0] == laps[1] or (
+                None not in laps and abs(laps[1] / laps[0] - 1.0) <= SAME_LAP
+            )
+            if abs(one["success"] - other["success"]) > SAME_SUCCESS or not is_same_lap:
+                lines.append(f"{task}, policy {number}: found {other}, the file says {one}")
+    return lines

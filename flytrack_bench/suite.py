@@ -1,0 +1,115 @@
+"""Suites: frozen tasks in a JSON file, with a digest that shows a change of any of them."""
+
+import hashlib
+import json
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any
+
+from flytrack_bench.plants import Craft, HiddenPlant
+from flytrack_env import Track, TrackError, load_track
+from flytrack_env.files import read_at_most
+from flytrack_env.messages import error_text
+from flytrack_env.plants import Plant, Simulator
+from flytrack_env.references import track_digest
+
+FOLDER = Path(__file__).parent / "suites"
+MOST_BYTES = 2**20
+
+
+class SuiteError(ValueError):
+    """A suite that cannot be used; the message names file and field, what was found and expected."""
+
+
+@dataclass(frozen=True)
+class Task:
+    """A course and what flies it.
+
+    craft: of a hidden plant; None: the simulator's nominal drone. optimal_lap_s: the nominal drone's
+    time-optimal flying lap, by which lap times are divided.
+    """
+
+    id: str
+    track: Track
+    craft: Craft | None
+    optimal_lap_s: float
+
+    @property
+    def plant(self) -> Plant:
+        """What moves the drone."""
+        return Simulator() if self.craft is None else HiddenPlant(self.craft)
+
+
+@dataclass(frozen=True)
+class Suite:
+    """Tasks; each is flown from so many perturbed starts, for so many laps and at most so many steps."""
+
+    name: str
+    digest: str
+    seed: int
+    starts: int
+    laps: int
+    steps: int
+    tasks: tuple[Task, ...]
+
+    def chosen(self, ids: tuple[str, ...]) -> tuple[Task, ...]:
+        """Return tasks by their ids, all without any; raises SuiteError for an unknown one."""
+        known = {task.id: task for task in self.tasks}
+        for one in ids:
+            if one not in known:
+                raise SuiteError(f"tasks: found {one!r}, expected some of {', '.join(known)}")
+        return tuple(known[one] for one in ids or known)
+
+
+def available_suites() -> tuple[str, ...]:
+    """Return the names of the shipped suites."""
+    return tuple(sorted(path.stem for path in FOLDER.glob("*.json")))
+
+
+def digest_of(content: dict[str, Any]) -> str:
+    """Return the digest of a suite's JSON values but for its own, hexadecimal."""
+    rest = {name: value for name, value in content.items() if name != "digest"}
+    return hashlib.sha256(json.dumps(rest, sort_keys=True).encode()).hexdigest()
+
+
+def load_suite(name_or_path: str | Path) -> Suite:
+    """Return a shipped suite by name, or that of a ``.json`` file.
+
+    Raises:
+        SuiteError: an unknown name, a file that cannot be read, or one that was changed since it was written.
+    """
+    path = Path(name_or_path)
+    if path.suffix != ".json":
+        path = FOLDER / f"{name_or_path}.json"
+        if str(name_or_path) not in available_suites():
+            known = ", ".join(available_suites())
+            raise SuiteError(f"suite: found {str(name_or_path)!r}, expected one of {known}, or a .json file")
+    try:
+        content = json.loads(read_at_most(path, MOST_BYTES))
+        if digest_of(content) != content["digest"]:
+            raise ValueError("digest: does not belong to the content, so that the file was changed")
+        tasks = tuple(_task(path, one) for one in content["tasks"])
+        numbers = {name: int(content[name]) for name in ("seed", "starts", "laps", "steps")}
+        return Suite(content["name"], content["digest"], tasks=tasks, **numbers)
+    except OSError as error:
+        raise SuiteError(f"{path}: cannot be read: {error_text(error)}") from error
+    except (KeyError, TypeError, ValueError, RecursionError) as error:
+        raise SuiteError(f"{path}: not a suite, or changed: {error_text(error)}") from error
+
+
+def _task(path: Path, one: dict[str, Any]) -> Task:
+    name = one["track"]
+    track = load_track(path.parent / name if name.endswith(".toml") else name)
+    if track_digest(track) != one["track_sha256"]:
+        raise TrackError(f"{name}: the track was changed")
+    craft = None if one["craft"] is None else Craft(**{name: _frozen(v) for name, v in one["craft"].items()})
+    return Task(one["id"], track, craft, float(one["optimal_lap_s"]))
+
+
+def _frozen(value: Any) -> Any:
+    return tuple(value) if isinstance(value, list) else value
+
+
+def craft_as_json(craft: Craft) -> dict[str, Any]:
+    """Return a craft as JSON values."""
+    return {one.name: getattr(craft, one.name) for one in fields(Craft)}

@@ -1,0 +1,117 @@
+"""The benchmark protocol: frozen tasks, results that repeat, and what is refused."""
+
+import json
+from pathlib import Path
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from benchmarks import suite as drawn
+from flytrack_bench import Data, DataError, load_policy, load_suite, results, run
+from flytrack_bench.cli import main
+from flytrack_bench.policies import Function, Policy
+from flytrack_bench.suite import FOLDER, digest_of
+from flytrack_env.tracks import TrackError
+
+CENTRED = "tests.integration.test_bench:hover"
+
+
+def hover(observation):
+    """Sticks centred, thrust about that of hovering."""
+    return jnp.array([0.0, 0.0, 0.0, -0.2]) + 0.0 * observation[:4]
+
+
+def three(observation):
+    return observation[:3]
+
+
+@pytest.fixture
+def small(tmp_path) -> Path:
+    """The file of a suite of two tasks with two starts each."""
+    content = json.loads((FOLDER / "v1.json").read_text())
+    content |= {"starts": 2, "steps": 60, "tasks": [content["tasks"][0], content["tasks"][-1]]}
+    content["digest"] = digest_of(content)
+    path = tmp_path / "small.json"
+    path.write_text(json.dumps(content))
+    return path
+
+
+def test_the_suite_is_what_its_seed_draws(tmp_path):
+    drawn.draw(tmp_path)
+    for path in (Path("v1.json"), *(Path("v1") / f"{name}.toml" for name in drawn.TRACK_SEEDS)):
+        assert (tmp_path / path).read_text() == (FOLDER / path).read_text()
+    suite = load_suite("v1")
+    assert sum(task.craft is not None for task in suite.tasks) == 8 and len(suite.tasks) == 12
+
+
+def test_a_result_repeats_and_is_verified_and_a_forged_one_is_not(small, tmp_path, capsys):
+    out, flags = tmp_path / "result.json", ["--policy", CENTRED, "--suite", str(small)]
+    main_exits(0, [*flags, "--out", str(out)])
+    found = json.loads(out.read_text())
+    suite = load_suite(small)
+    again = run(suite, [load_policy(CENTRED)], suite.tasks)
+    assert {**found, "cpu_s": 0} == json.loads(json.dumps({**again, "cpu_s": 0}))
+    assert all(one["success"] == 0.0 for ones in found["tasks"].values() for one in ones)
+    main_exits(0, [*flags, "--verify", str(out)])
+    found["tasks"]["flytrack"][0] |= {"success": 1.0, "flying_lap_s": 3.9}
+    out.write_text(json.dumps(found))
+    main_exits(1, [*flags, "--verify", str(out)])
+    assert "flytrack, policy 0" in capsys.readouterr().out
+    main_exits(2, [*flags, "--out", str(out)])  # never overwritten
+
+
+def main_exits(code: int, arguments: list[str]) -> None:
+    with pytest.raises(SystemExit) as error:
+        main(arguments)
+    assert error.value.code == code
+
+
+@pytest.mark.parametrize(
+    ("flags", "message"),
+    [
+        (["--policy", CENTRED, "--suite", "v0"], "expected one of v1"),
+        (["--policy", CENTRED, "--tasks", "plant_9"], "expected some of flytrack, random_1"),
+        (["--policy", "tests.integration.test_bench:three"], "shape (3,), expected (4,)"),
+        (["--policy", "tests.integration.test_bench:absent"], "AttributeError"),
+        (["--policy", "nothing.safetensors"], "nothing.safetensors: cannot be read"),
+        (["--policy", CENTRED, "--verify", str(FOLDER / "v1.json")], "not a result"),
+    ],
+)
+def test_what_cannot_be_used_is_named(flags, message, capsys):
+    main_exits(2, flags)
+    assert message in capsys.readouterr().err
+
+
+def test_a_changed_suite_is_refused(small, monkeypatch):
+    content = json.loads(small.read_text()) | {"starts": 1}
+    small.write_text(json.dumps(content))
+    with pytest.raises(ValueError, match="digest"):
+        load_suite(small)
+    content["tasks"][0]["track"] = "speedway"
+    content["digest"] = digest_of(content)
+    small.write_text(json.dumps(content))
+    with pytest.raises((ValueError, TrackError), match="the track was changed"):
+        load_suite(small)
+
+
+def test_no_more_data_is_flown_than_allowed(small):
+    suite = load_suite(small)
+    data = Data(suite.tasks[1], suite, seconds=1.0)
+    policy = Policy("hover", Function(hover), None, None, "")
+    log = data.fly(policy, 0.6)
+    assert 55 <= len(log) <= 60 and log.time.max() < 0.6  # some rows are lost, as sensors lose them
+    with pytest.raises(DataError, match=r"found 0.6, expected at most the 0.4 s left"):
+        data.fly(policy, 0.6)
+
+
+def test_the_interval_covers_the_spread_of_seeds():
+    flown = {str(task): [{"score": value} for value in row] for task, row in enumerate(SPREAD)}
+    found = results.summary(flown, "score")
+    assert found["interquartile_mean"] == pytest.approx(np.sort(SPREAD, axis=None)[3:9].mean(), abs=1e-6)
+    low, high = found["ci95"]
+    assert low < found["interquartile_mean"] < high and 0.02 < high - low < 0.2
+    assert results.summary({"one": [{"score": 0.5}]}, "score")["ci95"] is None
+
+
+SPREAD = np.array([[0.1, 0.2, 0.15], [0.5, 0.55, 0.6], [0.5, 0.4, 0.45], [0.9, 1.0, 0.95]])
