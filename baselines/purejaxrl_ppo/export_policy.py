@@ -5,7 +5,7 @@ Noise of sensors and drawn models are of the environment, and no part of it.
 """
 
 from itertools import count, takewhile
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -15,6 +15,7 @@ import flytrack_env
 from baselines.purejaxrl_ppo.checkpoint import Checkpoint, CheckpointError
 from baselines.purejaxrl_ppo.race_env import simulated_env
 from flytrack_env.observations import BATTERY_MIDDLE_V, OBSERVATION, Entry, observe_race
+from flytrack_env.params import EnvParams
 from flytrack_env.state import STATE_SIZE, unpack
 
 OF_NEXT_GATE = ("next_gate", "next_direction")  # the last entries of OBSERVATION, which no state changes
@@ -85,54 +86,41 @@ def policy_of(checkpoint: Checkpoint, name: str, track: str | None = None) -> Ex
             "actions after those of FlyTrack-v0"
         )
     params = env.default_params
+    sizes = [entry.size for entry in OF_DRONE]
     rate = f"{1.0 / params.dt:g} commands a second"
+    words = {
+        "last_gate": len(env.track.gates) - 1,
+        "track": env.track.name,
+        "num_actions": len(past),
+        "kind": past[0].key.rpartition("_")[0] if past else "",
+        "full_stick": ", ".join(f"{value:.0f}" for value in params.model.max_rate),
+    }
     return ExportedPolicy(
         **_gates(params),
-        **_rows(),
+        offsets=np.repeat([BATTERY_MIDDLE_V if entry.key == "battery" else 0.0 for entry in OF_DRONE], sizes),
+        factors=np.repeat([1.0 / entry.scale for entry in OF_DRONE], sizes),
+        limits=np.repeat([entry.limit for entry in OF_DRONE], sizes),
         past=past,
         layers=_layers(checkpoint),
         blend=1.0 - np.exp(-params.dt / np.asarray(params.model.tau, float)),
-        about=f"FlyTrack policy of {name} for the track {env.track.name}, {rate}. "
-        f"Written by FlyTrack {flytrack_env.__version__}.",
-        meanings={
-            key: text.format(
-                last_gate=len(env.track.gates) - 1,
-                track=env.track.name,
-                num_actions=len(past),
-                kind=past[0].key.rpartition("_")[0] if past else "",
-                full_stick=", ".join(f"{rate:.0f}" for rate in params.model.max_rate),
-            )
-            for key, text in SENTENCES.items()
-            if past or key != "past"
-        },
+        about=f"FlyTrack {flytrack_env.__version__}: policy of {name}, track {env.track.name}, {rate}.",
+        meanings={key: text.format(**words) for key, text in SENTENCES.items() if past or key != "past"},
     )
 
 
-def _gates(params: Any) -> dict[str, np.ndarray]:
+def _gates(params: EnvParams) -> dict[str, np.ndarray]:
     """Return the fields that depend on the gates."""
     gates = jax.tree.map(lambda leaf: np.asarray(leaf, float), params.course.gates)
     following = jax.tree.map(lambda leaf: np.roll(leaf, -1, axis=0), gates)
     with jax.enable_x64(True):
         anywhere = unpack(jnp.zeros(STATE_SIZE))
         rows = jax.vmap(lambda *pair: jnp.stack(observe_race(anywhere, *pair)))(gates, following)
-        rows = np.asarray(rows)[:, sum(entry.size for entry in OF_DRONE) :]
     axes = [np.stack(axis, axis=-1) for axis in (gates.forward, gates.left(), gates.up)]
     return {
         "centres": np.stack(gates.centre, axis=-1),
         "frames": np.stack(axes, axis=1),
         "free": gates.half_opening - params.drone_radius,
-        "next_rows": rows,
-    }
-
-
-def _rows() -> dict[str, np.ndarray]:
-    """Return the fields that say how the drone's quantities become observations."""
-    sizes = [entry.size for entry in OF_DRONE]
-    offsets = [BATTERY_MIDDLE_V if entry.key == "battery" else 0.0 for entry in OF_DRONE]
-    return {
-        "offsets": np.repeat(offsets, sizes),
-        "factors": np.repeat([1.0 / entry.scale for entry in OF_DRONE], sizes),
-        "limits": np.repeat([entry.limit for entry in OF_DRONE], sizes),
+        "next_rows": np.asarray(rows)[:, sum(entry.size for entry in OF_DRONE) :],
     }
 
 
@@ -140,6 +128,8 @@ def _layers(checkpoint: Checkpoint) -> tuple[tuple[np.ndarray, np.ndarray], ...]
     """Return the actor's layers, with the initial action in the last bias."""
     tower = checkpoint.params["params"]["actor_tower"]
     names = takewhile(tower.__contains__, (f"layers_{2 * i}" for i in count()))  # tanh has the odd numbers
-    layers = [tuple(np.asarray(tower[name][part], float) for part in ("kernel", "bias")) for name in names]
+    layers = [
+        (np.asarray(tower[name]["kernel"], float), np.asarray(tower[name]["bias"], float)) for name in names
+    ]
     kernel, bias = layers[-1]
     return (*layers[:-1], (kernel, bias + checkpoint.config.initial_action))

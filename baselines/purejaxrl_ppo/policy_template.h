@@ -80,6 +80,12 @@ static inline void flytrack_layer(const float *kernel, const float *bias, int in
     }
 }
 
+static inline void flytrack_tanh(int size, float *values) {
+    for (int i = 0; i < size; i++) {
+        values[i] = tanhf(values[i]);
+    }
+}
+
 /* Write what the network sees: the observation of FlyTrack$past_in_words. */
 static inline void flytrack_observe(const float state[FLYTRACK_STATE], int gate,$past_parameter
                                     float observation[FLYTRACK_OBSERVATION]) {
