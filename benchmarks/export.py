@@ -35,8 +35,8 @@ DRIVER = report.ROOT / "benchmarks" / "export_driver.c"
 FLAGS = "-std=c99 -pedantic -Wall -Wextra -Werror -Wconversion -O2 -shared -fPIC"
 SEED, FLIGHTS, BEYOND, REPEATS, SINGLE = 100, 256, 1.2, 5, 20_000
 HEADER = (
-    "file | bytes | in flight, from the evaluator | from float64 | in the box, from the evaluator | from float64 | "
-    "µs a step"
+    "file | bytes | in flight, from the evaluator | from float64 | "
+    "in the box, from the evaluator | from float64 | µs a step"
 )
 Act = Callable[[np.ndarray, np.ndarray], np.ndarray]
 
@@ -192,8 +192,9 @@ def section_of(name: str, num_inputs: int, folder: Path) -> str:
         [
             f"## {name}",
             f"Black box, {FLIGHTS} noisy starts, {LAPS} laps: {python.is_complete().sum()} finish with the "
-            f"evaluator's policy, {flown.finished.sum()} with the compiled one, which counts the gates itself; "
-            f"{same} end alike. Mean flight: {python.steps.mean():.2f} and {flown.steps.mean():.2f} steps.",
+            f"evaluator's policy, {flown.finished.sum()} with the compiled one, which counts the gates "
+            f"itself; {same} end alike. Mean flight: {python.steps.mean():.2f} and "
+            f"{flown.steps.mean():.2f} steps.",
             f"Largest difference of an action over {len(flown.states):,} states of these flights and "
             f"{len(box[1]):,} of the box:",
             report.table(HEADER, rows),

@@ -9,14 +9,12 @@ $meanings
 
 #include <math.h>
 
-enum {
-    FLYTRACK_STATE = $state_size,
-    FLYTRACK_GATES = $num_gates,
-    FLYTRACK_PAST = $num_past,
-    FLYTRACK_OF_DRONE = $num_of_drone,
-    FLYTRACK_OBSERVATION = $num_observation,
-    FLYTRACK_ACTION = $num_actions
-};
+#define FLYTRACK_STATE $state_size
+#define FLYTRACK_GATES $num_gates
+#define FLYTRACK_PAST $num_past
+#define FLYTRACK_OF_DRONE $num_of_drone
+#define FLYTRACK_OBSERVATION $num_observation
+#define FLYTRACK_ACTION $num_actions
 
 /* A gate's centre, world, m, and its axes forward (the direction of flight), left and up in the world. */
 static const float flytrack_centre[FLYTRACK_GATES * 3] = {
