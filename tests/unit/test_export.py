@@ -24,7 +24,7 @@ LARGEST_C, LARGEST_ONNX, LARGEST_LAG = 1e-5, 1e-5, 1e-6
 # Environment id, track, hidden layers, and whether the ONNX file is float64 inside.
 CASES = {
     "perfect sensors": ("FlyTrack-v0", "flytrack", (8, 5), False),
-    "a track with tilted gates": ("FlyTrack-v0", "split_s", (6,), True),
+    "another track": ("FlyTrack-v0", "split_s", (6,), True),
     "noise and earlier actions": ("FlyTrackRobust-v0", "figure_eight", (8,), False),
 }
 
