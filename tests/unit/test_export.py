@@ -20,7 +20,7 @@ from flytrack_env.state import Action, unpack, unpack_action
 from flytrack_env.wrappers import NoiseParams, ObservationNoise
 
 SEED, COUNT = 5, 200
-LARGEST_C, LARGEST_ONNX, LARGEST_LAG = 1e-5, 1e-5, 1e-6
+LARGEST, LARGEST_LAG = 1e-5, 1e-6
 # Environment id, track, hidden layers, and whether the ONNX file is float64 inside.
 CASES = {
     "perfect sensors": ("FlyTrack-v0", "flytrack", (8, 5), False),
@@ -62,30 +62,30 @@ def acted(env, checkpoint):
 
 @pytest.mark.parametrize("case", CASES)
 def test_exported_policies_act_as_the_python_one(case, tmp_path, capsys):
+    *told, is_float64 = CASES[case]
+    env, checkpoint = write_checkpoint(tmp_path / "a.safetensors", *told)
+    states, gates, past, actions = acted(env, checkpoint)
+    assert np.ptp(actions, axis=0).min() > 0.01, "actions that differ"
+
+    header = tmp_path / "policy.h"
+    header.write_text("old")
+    main([str(tmp_path / "a.safetensors"), "--c", str(header)])
+    assert f"{header}: {header.stat().st_size} bytes" in capsys.readouterr().out
+    if shutil.which("gcc") is not None:
+        compiled = CompiledPolicy(header)
+        np.testing.assert_allclose(compiled.act(states, gates, past), actions, rtol=0.0, atol=LARGEST)
+        assert np.isnan(compiled.act(states * np.nan, gates, past)).all()
+
     pytest.importorskip("onnx", reason="onnx is not installed (extra flytrack[export])")
     onnxruntime = pytest.importorskip(
         "onnxruntime", reason="onnxruntime is not installed (extra flytrack[dev])"
     )
-    *told, is_float64 = CASES[case]
-    env, checkpoint = write_checkpoint(tmp_path / "a.safetensors", *told)
-    onnx_file, header = tmp_path / "policy.onnx", tmp_path / "policy.h"
-    header.write_text("old")
-    words = [tmp_path / "a.safetensors", "--onnx", onnx_file, "--c", header, *["--float64"] * is_float64]
-    main([str(word) for word in words])
-    assert f"{header}: {header.stat().st_size} bytes" in capsys.readouterr().out
-    states, gates, past, actions = acted(env, checkpoint)
-    assert np.ptp(actions, axis=0).min() > 0.01, "actions that differ"
-
-    session = onnxruntime.InferenceSession(onnx_file)
+    path = str(tmp_path / "policy.onnx")
+    main([str(tmp_path / "a.safetensors"), "--onnx", path, *["--float64"] * is_float64])
+    session = onnxruntime.InferenceSession(path)
     inputs = {"state": states, "gate": gates, "past": past}
     found = session.run(None, {one.name: inputs[one.name] for one in session.get_inputs()})[0]
-    np.testing.assert_allclose(found, actions, rtol=0.0, atol=LARGEST_ONNX)
-
-    if shutil.which("gcc") is None:
-        pytest.skip("gcc is not installed: the header is not compiled")
-    compiled = CompiledPolicy(header)
-    np.testing.assert_allclose(compiled.act(states, gates, past), actions, rtol=0.0, atol=LARGEST_C)
-    assert np.isnan(compiled.act(states * np.nan, gates, past)).all()
+    np.testing.assert_allclose(found, actions, rtol=0.0, atol=LARGEST)
 
 
 @pytest.mark.skipif(shutil.which("gcc") is None, reason="gcc is not installed")
