@@ -24,6 +24,7 @@ PACKAGES = ("baselines", "flytrack_env", "flytrack_loop", "flytrack_sysid")
 CLONE_ONLY = "firmware/"
 HEADLESS = {"JAX_PLATFORMS": "cpu", "MPLBACKEND": "agg", "SDL_VIDEODRIVER": "dummy", "PYTHONPATH": ""}
 TEST_TOOLS = ("pytest>=9", "hypothesis>=6.150", "pillow", "pyulog>=1.2", "orangebox>=0.4,<0.5")
+CHAMPION = ROOT / "baselines" / "purejaxrl_ppo" / "champion" / "flytrack.safetensors"
 PLANT = ROOT / "blackbox" / "acro_step.bin"
 
 FLY_EVERY_ID = """
@@ -84,6 +85,7 @@ USES = {
         "-m flytrack_env.pictures flight.npy --out pictures",
     ),
     "render": (RENDER,),
+    "export": (f"-m baselines.purejaxrl_ppo.export {CHAMPION} --onnx policy.onnx --c policy.h",),
     "optimal": ("-m benchmarks.time_optimal --tracks speedway --kinds flying --out made",),
     "speed": ("from benchmarks.env_speed import l2f_contestant as l2f; l2f('l2f', 1024, 8).run()",),
 }

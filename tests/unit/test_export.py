@@ -1,0 +1,131 @@
+"""Exported policies act as observation and network do, and what cannot be exported is told."""
+
+import shutil
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from baselines.purejaxrl_ppo import Config, load_checkpoint, make_network
+from baselines.purejaxrl_ppo import export_policy as export_policy_module
+from baselines.purejaxrl_ppo.checkpoint import save_checkpoint
+from baselines.purejaxrl_ppo.export import main
+from baselines.purejaxrl_ppo.export_policy import policy_of
+from baselines.purejaxrl_ppo.resume import describe_run
+from benchmarks.export import CompiledPolicy, states_in_box
+from flytrack_env import make
+from flytrack_env.dynamics import lag
+from flytrack_env.state import Action, unpack, unpack_action
+from flytrack_env.wrappers import NoiseParams, ObservationNoise
+
+SEED, COUNT = 5, 200
+LARGEST, LARGEST_LAG = 1e-5, 1e-6
+# Environment id, track, hidden layers, and whether the ONNX file is float64 inside.
+CASES = {
+    "perfect sensors": ("FlyTrack-v0", "flytrack", (8, 5), False),
+    "another track": ("FlyTrack-v0", "split_s", (6,), True),
+    "noise and earlier actions": ("FlyTrackRobust-v0", "figure_eight", (8,), False),
+}
+
+
+def write_checkpoint(path, env_id, track, hidden_sizes):
+    env, config = make(env_id, track=track), Config(hidden_sizes=hidden_sizes)
+    size = env.observation_space().shape[0]
+    params = make_network(config).init(jax.random.key(SEED), jnp.zeros((1, size)))
+    params = jax.tree.map(
+        lambda leaf: leaf + 0.1 * jnp.cos(jnp.arange(leaf.size)).reshape(leaf.shape), params
+    )
+    save_checkpoint(path, params, config, describe_run(env, env_id, track, config, SEED))
+    return env, load_checkpoint(path)
+
+
+def acted(env, checkpoint):
+    """Return states, gates, earlier actions and what the policy does with the environment's observation."""
+    params = env.default_params
+    if ObservationNoise.key in params.wrappers:
+        none = NoiseParams(*np.zeros(len(NoiseParams._fields)))
+        params = params.replace(wrappers={**params.wrappers, ObservationNoise.key: none})
+    policy = policy_of(checkpoint, "a.safetensors")
+    past = np.random.default_rng(SEED).uniform(-1.0, 1.0, (COUNT, len(policy.past), 4)).astype(np.float32)
+
+    def act(state, gate, past):
+        begun = env.begin(unpack(state), gate, params)
+        if policy.past:
+            begun = begun._replace(actions=tuple(map(unpack_action, past)))
+        observation = env.observe(None, begun, None, params)
+        return jnp.clip(checkpoint.network.apply(checkpoint.params, observation)[0].mode(), -1.0, 1.0)
+
+    states, gates = states_in_box(policy, COUNT)
+    return states, gates, past.reshape(COUNT, -1), np.asarray(jax.jit(jax.vmap(act))(states, gates, past))
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_exported_policies_act_as_the_python_one(case, tmp_path, capsys):
+    *told, is_float64 = CASES[case]
+    env, checkpoint = write_checkpoint(tmp_path / "a.safetensors", *told)
+    states, gates, past, actions = acted(env, checkpoint)
+    assert np.ptp(actions, axis=0).min() > 0.01, "actions that differ"
+
+    header = tmp_path / "policy.h"
+    header.write_text("old")
+    main([str(tmp_path / "a.safetensors"), "--c", str(header)])
+    assert f"{header}: {header.stat().st_size} bytes" in capsys.readouterr().out
+    if shutil.which("gcc") is not None:
+        compiled = CompiledPolicy(header)
+        np.testing.assert_allclose(compiled.act(states, gates, past), actions, rtol=0.0, atol=LARGEST)
+        assert np.isnan(compiled.act(states * np.nan, gates, past)).all()
+
+    pytest.importorskip("onnx", reason="onnx is not installed (extra flytrack[export])")
+    onnxruntime = pytest.importorskip(
+        "onnxruntime", reason="onnxruntime is not installed (extra flytrack[dev])"
+    )
+    path = str(tmp_path / "policy.onnx")
+    main([str(tmp_path / "a.safetensors"), "--onnx", path, *["--float64"] * is_float64])
+    session = onnxruntime.InferenceSession(path)
+    inputs = {"state": states, "gate": gates, "past": past}
+    found = session.run(None, {one.name: inputs[one.name] for one in session.get_inputs()})[0]
+    np.testing.assert_allclose(found, actions, rtol=0.0, atol=LARGEST)
+
+
+@pytest.mark.skipif(shutil.which("gcc") is None, reason="gcc is not installed")
+def test_a_header_counts_gates_and_lags_as_the_environment_does(tmp_path):
+    env, _ = write_checkpoint(tmp_path / "a.safetensors", "FlyTrack-v0", "split_s", (4,))
+    main([str(tmp_path / "a.safetensors"), "--c", str(tmp_path / "policy.h")])
+    compiled, gates = CompiledPolicy(tmp_path / "policy.h"), env.default_params.course.gates
+    centres, forward, up = (np.stack(axis, axis=-1) for axis in (gates.centre, gates.forward, gates.up))
+    count = np.arange(len(centres))
+    for ahead, aside, is_pass in ((1.0, 0.0, True), (1.0, 0.5, True), (1.0, 0.7, False), (-1.0, 0.0, False)):
+        ends = [np.zeros((len(count), 21)) for _ in range(2)]
+        for end, sign in zip(ends, (-ahead, ahead), strict=True):
+            end[:, :3] = centres + sign * forward + aside * up
+        np.testing.assert_array_equal(compiled.next_gates(*ends, count), (count + is_pass) % len(count))
+    action, applied = np.array([1.0, -1.0, 0.5, 0.2]), np.array([0.0, 0.3, -0.5, 1.0])
+    wanted = lag(unpack_action(applied), Action(*action), 0.01, env.default_params.model.tau)
+    np.testing.assert_allclose(compiled.lag(action, applied), wanted, atol=LARGEST_LAG)
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ([], "--onnx, --c: found neither"),
+        (["--c", "a.safetensors"], "read or written twice"),
+        (["--c", "policy.h", "--float64"], "--float64: found no --onnx"),
+        (["--c", "folder"], "folder: found a folder or a device, expected a regular file"),
+        (["--c", "policy.h", "--track", "nowhere"], "nowhere"),
+        (["--c", "policy.h", "unknown rows"], "a.safetensors: observation: found commanded_0, "),
+    ],
+)
+def test_what_cannot_be_exported_is_told(words, message, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    write_checkpoint(tmp_path / "a.safetensors", "FlyTrackActionHistory-v0", "flytrack", (4,))
+    before = (tmp_path / "a.safetensors").read_bytes()
+    (tmp_path / "folder").mkdir()
+    if words[-1:] == ["unknown rows"]:
+        monkeypatch.setattr(export_policy_module, "KINDS_OF_PAST", ("applied",))
+        words = words[:-1]
+    with pytest.raises(SystemExit) as stopped:
+        main(["a.safetensors", *words])
+    assert stopped.value.code == 2 and message in capsys.readouterr().err
+    assert (tmp_path / "a.safetensors").read_bytes() == before
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.safetensors", "folder"]
