@@ -74,13 +74,13 @@ def policy_of(checkpoint: Checkpoint, name: str, track: str | None = None) -> Ex
     """Return the policy of a checkpoint on a track, by default its own; name: of the checkpoint's file.
 
     Raises:
-        CheckpointError, TrackError: a checkpoint that does not fit its environment, whose policy remembers, or
-            whose observation has rows that cannot be exported; a track that cannot be used.
+        CheckpointError, TrackError: a checkpoint that does not fit its environment, whose policy remembers,
+            or whose observation has rows that cannot be exported; a track that cannot be used.
     """
     if checkpoint.config.memory_size:
         raise CheckpointError(
-            f"{name}: memory_size: found {checkpoint.config.memory_size}, expected 0: no policy that remembers "
-            "can be exported yet"
+            f"{name}: memory_size: found {checkpoint.config.memory_size}, expected 0: no policy that "
+            "remembers can be exported yet"
         )
     env = simulated_env(checkpoint, track)
     past = env.observation_table[len(OBSERVATION) :]
