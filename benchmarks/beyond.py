@@ -31,6 +31,7 @@ from flytrack_sysid.diagnosis.search import FittedModel
 from flytrack_sysid.log import FlightLog
 
 LINES = report.RESULTS / "beyond.jsonl"
+REAL = report.ROOT / "benchmarks" / "data" / "real"  # `python -m benchmarks.real_logs --diagnose`
 SEED, SECONDS = 43, 60.0  # rules were looked at on seeds 7 and 41
 AMPLITUDES = (1.0, 3.0)  # times the noise of the sensor in the law's channel
 # Kind of law -> quantities, and shapes, that are right.
@@ -171,8 +172,44 @@ def figures(lines: Sequence[dict[str, Any]]) -> list[tuple[str, str, str]]:
     ]
 
 
+def diagnoses_of(record: Any) -> list[dict[str, Any]]:
+    """Return the diagnoses anywhere in a record of measured flights."""
+    if isinstance(record, list):
+        return [found for one in record for found in diagnoses_of(one)]
+    if not isinstance(record, dict):
+        return []
+    if "diagnosis" in record:
+        return [record["diagnosis"]]
+    return [found for one in record.values() for found in diagnoses_of(one)]
+
+
+def real_rows() -> list[tuple[str, str, str, str]]:
+    """Return, by diagnosis of measured flights, what was learnt and what it does to errors of free flight.
+
+    Errors are of velocity and position on held-out rows, over those of the extended model without it.
+    """
+    rows = []
+    for path in sorted(REAL.glob("*_diagnosis.json")):
+        for number, found in enumerate(diagnoses_of(json.loads(path.read_text()))):
+            name = f"{path.stem.removesuffix('_diagnosis')} {number + 1}"
+            learned, errors = found.get("learned"), found["prediction"]["errors"]
+            if learned is None:
+                rows.append((name, "nothing", "-", "-"))
+                continue
+            formulas = [one["formula"] for one in learned["law"]]
+            formulas += [f"residual on {one['acts']}" for one in learned["residual"]]
+            ratios = [
+                errors["extended"][quantity][horizon] / before
+                for quantity, by_horizon in errors["without_learned"].items()
+                if quantity.split("_")[0] in ("velocity", "position")
+                for horizon, before in by_horizon.items()
+            ]
+            rows.append((name, "; ".join(formulas), f"{np.median(ratios):.2f}", f"{max(ratios):.2f}"))
+    return rows
+
+
 def write_page() -> None:
-    """Write the page of the last commit's lines."""
+    """Write the page of the last commit's lines, and of the records of measured flights."""
     every = read()
     lines = [line for line in every if line["commit"] == every[-1]["commit"]]
     good = [line for line in lines if "error" not in line]
@@ -193,6 +230,7 @@ def write_page() -> None:
         commit=lines[-1]["commit"],
         crashed=len(lines) - len(good),
         figures=report.table("figure | asked | measured", figures(good)),
+        real=report.table("flights | learnt | error over the one without, median | largest", real_rows()),
         plants=report.table("kind | truth | learnt | left unexplained by the list", rows),
         seed=SEED,
     )

@@ -18,9 +18,23 @@ RUN_FILE = "mlflow_run.json"
 SQLITE = "sqlite:///"
 LOCAL_STORE = "mlflow.db"
 LOCAL_ARTIFACTS = "mlflow_artifacts"
+LOCAL_PAGE = "http://127.0.0.1:5000"  # of `mlflow ui`
 EXPERIMENT = "flytrack"
 PARENT_TAG = "mlflow.parentRunId"  # by which MLflow shows a run below another
-EVERY_STEP = "learning_rate"  # a metric that is recorded at every step
+# Groups in which MLflow shows metrics; all others are of the race.
+GROUPS = {
+    "ppo": (
+        "policy_loss",
+        "value_loss",
+        "entropy",
+        "approx_kl",
+        "clip_fraction",
+        "explained_variance",
+        "learning_rate",
+    ),
+    "time": ("steps_per_second",),
+}
+EVERY_STEP = "ppo/learning_rate"  # a metric that is recorded at every step
 SEND_EVERY_S = 5.0  # a transaction of the store costs as much as hundreds of values in it
 RETRY_EVERY_S = 60.0
 STEPS_AT_ONCE = 16
@@ -39,6 +53,12 @@ logger = logging.getLogger(__name__)
 def local_uri(folder: Path) -> str:
     """Return the address of the SQLite store in a folder."""
     return f"{SQLITE}{(folder / LOCAL_STORE).resolve()}"
+
+
+def grouped(name: str) -> str:
+    """Return a metric's name in MLflow: group/name."""
+    group = next((group for group, names in GROUPS.items() if name in names), "race")
+    return f"{group}/{name}"
 
 
 def flatten(values: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, str]]:
@@ -67,7 +87,7 @@ class Tracker:
         self._folder, self._uri, self._name, self._params = folder, uri, name, params
         self._tags = {} if parent_run_id is None else {PARENT_TAG: parent_run_id}
         self._client: Any = None
-        self.run_id = ""
+        self.run_id = self._experiment_id = ""
         self._last_step = -1  # that the store has
         self._metrics: list[tuple[int, int, dict[str, float]]] = []  # step, time in ms, values
         self._files: list[tuple[Path, str]] = []
@@ -76,6 +96,14 @@ class Tracker:
     def begin(self) -> None:
         """Create the MLflow run, or continue that of the folder."""
         self._attempt(self._connect)
+
+    @property
+    def address(self) -> str:
+        """Where the run is shown: its page on a server, or how to serve a local store and then its page."""
+        page = f"/#/experiments/{self._experiment_id}/runs/{self.run_id}"
+        if self._uri.startswith("http"):
+            return self._uri.rstrip("/") + page
+        return f"{LOCAL_PAGE}{page} after `mlflow ui --backend-store-uri {self._uri}`"
 
     def metrics(self, step: int, values: dict[str, float]) -> None:
         """Record metrics after a number of environment steps; all of a step at once."""
@@ -96,6 +124,8 @@ class Tracker:
         self._retry_s = 0.0
         self.flush()
         self._attempt(lambda: self._client.set_terminated(self.run_id, status))
+        if self.run_id:
+            print(f"MLflow: {self.address}")
         if self._metrics or self._files:
             logger.warning("tracking: %s: %d steps were not recorded", self._uri, len(self._metrics))
 
@@ -132,7 +162,8 @@ class Tracker:
             client.update_run(run_id, status="RUNNING")
             history = client.get_metric_history(run_id, EVERY_STEP)
             self._last_step = max((metric.step for metric in history), default=-1)
-        self._client = client
+        self._client, self._experiment_id = client, client.get_run(self.run_id).info.experiment_id
+        print(f"MLflow: {self.address}")
 
     def _read_run_id(self) -> str | None:
         path = self._folder / RUN_FILE
@@ -167,7 +198,7 @@ class Tracker:
             self._connect()
         while self._metrics:
             metrics = [
-                Metric(name, value, time_ms, step)
+                Metric(grouped(name), value, time_ms, step)
                 for step, time_ms, values in self._metrics[:STEPS_AT_ONCE]
                 if step > self._last_step
                 for name, value in values.items()

@@ -7,8 +7,9 @@ from flytrack_env.rollout import load_rollout
 from tests.support.pages import ROOT
 from tests.support.ppo_runs import BATCH, DEAD_URI, EVERY_OTHER_UPDATE, SEED, assert_same_end
 
-METRICS = {"episode_return", "policy_loss", "explained_variance", "episode_gates_passed", "gate_distance_m"}
-METRICS |= {"episode_crash", "evaluation_success", "evaluation_ended_time_limit", "steps_per_second"}
+METRICS = {"race/episode_return", "ppo/policy_loss", "ppo/explained_variance", "race/episode_gates_passed"}
+METRICS |= {"race/episode_crash", "race/evaluation_success", "race/evaluation_ended_time_limit"}
+METRICS |= {"race/gate_distance_m", "ppo/learning_rate", "time/steps_per_second"}
 
 pytestmark = pytest.mark.filterwarnings("default")  # deprecations in MLflow's own dependencies
 
@@ -30,12 +31,14 @@ def reports_of(caplog):
     return [record.getMessage() for record in caplog.records if record.name == tracking.__name__]
 
 
-def test_everything_is_recorded_once_though_the_run_was_cut_off(trainer, tmp_path, monkeypatch):
+def test_everything_is_recorded_once_though_the_run_was_cut_off(trainer, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(monitor, "NUM_STEPS", 20)
     uri = tracking.local_uri(tmp_path)
     options = EVERY_OTHER_UPDATE._replace(evaluate_every=4 * BATCH, evaluation_episodes=2, tracking_uri=uri)
     trainer.train(tmp_path, SEED, options)
     client, run = only_run(uri)
+    page = f"http://127.0.0.1:5000/#/experiments/{run.info.experiment_id}/runs/{run.info.run_id}"
+    assert capsys.readouterr().out.count(f"MLflow: {page} after `mlflow ui") == 2  # at the start and the end
     description = load_checkpoint(tmp_path / "final.safetensors").meta
     for part in ("config", "environment", "model"):
         for name, text in tracking.flatten({part: description[part]}):
@@ -44,9 +47,9 @@ def test_everything_is_recorded_once_though_the_run_was_cut_off(trainer, tmp_pat
     page = (ROOT / "docs" / "baseline.md").read_text(encoding="utf-8")
     assert set(run.data.metrics) >= METRICS
     assert {name for name in run.data.metrics if f"`{name}`" not in page} == set()
-    before = history(client, run, "policy_loss")
+    before = history(client, run, "ppo/policy_loss")
     assert [step for step, _ in before] == [2 * BATCH, 4 * BATCH, 6 * BATCH, 7 * BATCH]
-    assert [step for step, _ in history(client, run, "evaluation_success")] == [4 * BATCH, 7 * BATCH]
+    assert [step for step, _ in history(client, run, "race/evaluation_success")] == [4 * BATCH, 7 * BATCH]
     names = {file.path for file in client.list_artifacts(run.info.run_id, "evaluation")}
     assert {f"evaluation/position_density_{7 * BATCH}.png", f"evaluation/rollout_{4 * BATCH}.npy"} <= names
     assert len(client.list_artifacts(run.info.run_id, "checkpoints")) == 5
@@ -58,7 +61,7 @@ def test_everything_is_recorded_once_though_the_run_was_cut_off(trainer, tmp_pat
         (tmp_path / name).unlink()
     trainer.train(tmp_path, SEED, options._replace(resume=tmp_path))
     client, run = only_run(uri)
-    assert run.info.status == "FINISHED" and history(client, run, "policy_loss") == before
+    assert run.info.status == "FINISHED" and history(client, run, "ppo/policy_loss") == before
 
 
 @pytest.mark.slow
@@ -82,7 +85,7 @@ def test_a_server_that_comes_back_gets_what_it_missed(tmp_path, monkeypatch, cap
     tracker._connect = fail
     tracker.begin()
     for step in (1, 2):
-        tracker.metrics(step, {tracking.EVERY_STEP: 0.5 * step})
+        tracker.metrics(step, {"learning_rate": 0.5 * step})
     tracker._connect = connect
     tracker.end("FINISHED")
     client, run = only_run(uri)
