@@ -31,7 +31,7 @@ def problem_of(truth, log: FlightLog) -> Problem:
     return Problem.of(lanes, model_of(truth))
 
 
-def refined(truth, log: FlightLog, candidates, values, is_explained=False):
+def refined(truth, log: FlightLog, candidates, values):
     """Return the problem of a plant and its refinement, from given values of effects."""
     with jax.enable_x64(True):
         problem = problem_of(truth, log)
@@ -39,9 +39,7 @@ def refined(truth, log: FlightLog, candidates, values, is_explained=False):
         for name, value in values.items():
             vector[problem.names.index(name)] = value
         places = problem.index(base_of(problem.like))
-        found = refine(
-            problem, problem.start, vector, candidates, places, log, held_out_rows(log), is_explained
-        )
+        found = refine(problem, problem.start, vector, candidates, places, log, held_out_rows(log), False)
     return problem, found
 
 

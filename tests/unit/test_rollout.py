@@ -38,8 +38,8 @@ def npy_bytes(array: np.ndarray) -> bytes:
     return content.getvalue()
 
 
-def rows_with(value: float, width: int = 25) -> bytes:
-    rows = np.zeros((3, width))
+def rows_with(value: float) -> bytes:
+    rows = np.zeros((3, 25))
     rows[1, 9] = value
     return npy_bytes(rows)
 
