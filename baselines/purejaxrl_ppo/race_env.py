@@ -12,16 +12,7 @@ from flytrack_env.plants import Plant
 from flytrack_env.tracks import Track
 from flytrack_env.wrappers import DomainRandomization, RandomizationParams
 
-MODEL_AS_GIVEN = RandomizationParams(
-    mass_factor_low=1.0,
-    mass_factor_high=1.0,
-    lag_factor_low=1.0,
-    lag_factor_high=1.0,
-    effect_factor_low=1.0,
-    effect_factor_high=1.0,
-    low=(),
-    high=(),
-)
+MODEL_AS_GIVEN = RandomizationParams(1.0, 1.0, 1.0, 1.0, 1.0, 1.0, low=(), high=())  # all factors are 1
 
 
 def plant_env(

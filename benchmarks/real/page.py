@@ -35,9 +35,9 @@ def lines_of() -> list[Line]:
     return [last[policy] for policy in sorted(last)]
 
 
-def ratios(line: Line, model: str, other: str = "refitted_base") -> np.ndarray:
-    """Return a model's rms errors over another's, (horizons, quantities)."""
-    return np.array(line["rms"][model]) / np.array(line["rms"][other])
+def ratios(line: Line, model: str) -> np.ndarray:
+    """Return a model's rms errors over the refitted base's, (horizons, quantities)."""
+    return np.array(line["rms"][model]) / np.array(line["rms"]["refitted_base"])
 
 
 def _cell(quantity: str, horizon_s: float) -> tuple[int, int]:

@@ -2,8 +2,8 @@
 
 from typing import NamedTuple
 
-from flytrack_env.effects.base import Effect, Range, StepContext
-from flytrack_env.quaternion import Scalar, Vec3
+from flytrack_env.effects.base import Effect, Range, shifted
+from flytrack_env.quaternion import Scalar
 
 
 class AccelerometerBias(NamedTuple):
@@ -14,10 +14,6 @@ class AccelerometerBias(NamedTuple):
     z: Scalar = 0.0
 
 
-def _accelerometer(bias: AccelerometerBias, memory: None, force_b: Vec3, context: StepContext) -> Vec3:
-    return force_b + Vec3(*bias)
-
-
 ACCELEROMETER_BIAS = Effect(
     name="accelerometer_bias",
     parameters=AccelerometerBias,
@@ -26,5 +22,5 @@ ACCELEROMETER_BIAS = Effect(
     needs=("f",),
     equation=r"\mathbf{f}_\text{measured} = \mathbf{f} + (x, y, z)^\top",
     source="assumption: constant within a flight",
-    accelerometer=_accelerometer,
+    accelerometer=shifted,
 )

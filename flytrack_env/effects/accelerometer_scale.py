@@ -2,8 +2,8 @@
 
 from typing import NamedTuple
 
-from flytrack_env.effects.base import Effect, Range, StepContext
-from flytrack_env.quaternion import Scalar, Vec3
+from flytrack_env.effects.base import Effect, Range, scaled
+from flytrack_env.quaternion import Scalar
 
 
 class AccelerometerScale(NamedTuple):
@@ -14,10 +14,6 @@ class AccelerometerScale(NamedTuple):
     z: Scalar = 1.0
 
 
-def _accelerometer(scale: AccelerometerScale, memory: None, force_b: Vec3, context: StepContext) -> Vec3:
-    return Vec3(scale.x * force_b.x, scale.y * force_b.y, scale.z * force_b.z)
-
-
 ACCELEROMETER_SCALE = Effect(
     name="accelerometer_scale",
     parameters=AccelerometerScale,
@@ -26,5 +22,5 @@ ACCELEROMETER_SCALE = Effect(
     needs=("f",),
     equation=r"\mathbf{f}_\text{measured} = \operatorname{diag}(x, y, z)\, \mathbf{f}",
     source="assumption: linear up to the largest force, no leak between the axes",
-    accelerometer=_accelerometer,
+    accelerometer=scaled,
 )

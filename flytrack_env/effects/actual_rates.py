@@ -4,9 +4,8 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 
-from flytrack_env.effects.base import Effect, Range, StepContext, on_rate_sticks
+from flytrack_env.effects.base import Effect, Range, on_rate_sticks
 from flytrack_env.quaternion import Scalar
-from flytrack_env.state import Action
 
 
 class ActualRates(NamedTuple):
@@ -26,10 +25,6 @@ def _curve(stick: Scalar, bend: Scalar, expo: Scalar) -> Scalar:
     return stick * (1.0 - bend * (1.0 - late))
 
 
-def _command(rates: ActualRates, memory: None, sticks: Action, context: StepContext) -> Action:
-    return on_rate_sticks(_curve, sticks, rates[:3], rates[3:])
-
-
 ACTUAL_RATES = Effect(
     name="actual_rates",
     parameters=ActualRates,
@@ -40,5 +35,5 @@ ACTUAL_RATES = Effect(
     is_setting=True,
     equation=r"u_i \leftarrow u_i \left( 1 - b_i + b_i |u_i| \left( e_i u_i^4 + 1 - e_i \right) \right)",
     source="applyActualRates in Betaflight 4.6, src/main/fc/rc.c, over the rate at full stick",
-    command=_command,
+    command=on_rate_sticks(_curve),
 )

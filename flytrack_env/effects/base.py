@@ -28,7 +28,7 @@ A hook takes the effect's parameters, its memory, the value so far and the ``Ste
 the value. At neutral parameters it returns the value bit for bit, so that neutral equals absent.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
@@ -137,10 +137,25 @@ class Range(NamedTuple):
 Hook = Callable[[Any, Any, Any, StepContext], Any]
 
 
-def on_rate_sticks(curve: Callable[..., Scalar], sticks: Action, *parameters: Sequence[Scalar]) -> Action:
-    """Return the command with a curve on each rate stick; parameters: its other arguments, by axis each."""
-    roll, pitch, yaw = map(curve, sticks[:3], *parameters)
-    return sticks._replace(roll=roll, pitch=pitch, yaw=yaw)
+def on_rate_sticks(curve: Callable[..., Scalar]) -> Hook:
+    """Return the hook of a curve on each rate stick; parameters: its other arguments, of three axes each."""
+
+    def command(parameters: Any, memory: None, sticks: Action, context: StepContext) -> Action:
+        thirds = (parameters[start : start + 3] for start in range(0, len(parameters), 3))
+        roll, pitch, yaw = map(curve, sticks[:3], *thirds)
+        return sticks._replace(roll=roll, pitch=pitch, yaw=yaw)
+
+    return command
+
+
+def scaled(factors: Any, memory: None, vector: Vec3, context: StepContext) -> Vec3:
+    """Return a vector with a factor on each axis: the hook of an effect whose parameters these are."""
+    return Vec3(*(factor * part for factor, part in zip(factors, vector, strict=True)))
+
+
+def shifted(offsets: Any, memory: None, vector: Vec3, context: StepContext) -> Vec3:
+    """Return a vector with an offset on each axis: the hook of an effect whose parameters these are."""
+    return vector + Vec3(*offsets)
 
 
 @dataclass(frozen=True)

@@ -4,9 +4,8 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 
-from flytrack_env.effects.base import Effect, Range, StepContext, on_rate_sticks
+from flytrack_env.effects.base import Effect, Range, on_rate_sticks
 from flytrack_env.quaternion import Scalar
-from flytrack_env.state import Action
 
 
 class BetaflightRates(NamedTuple):
@@ -26,10 +25,6 @@ def _curve(stick: Scalar, super_rate: Scalar, expo: Scalar) -> Scalar:
     return stick * (curved * ((1.0 - super_rate) / (1.0 - super_rate * size)))
 
 
-def _command(rates: BetaflightRates, memory: None, sticks: Action, context: StepContext) -> Action:
-    return on_rate_sticks(_curve, sticks, rates[:3], rates[3:])
-
-
 BETAFLIGHT_RATES = Effect(
     name="betaflight_rates",
     parameters=BetaflightRates,
@@ -39,5 +34,5 @@ BETAFLIGHT_RATES = Effect(
     is_setting=True,
     equation=r"u_i \leftarrow u_i \left( 1 - e_i + e_i |u_i|^3 \right) \frac{1 - s_i}{1 - s_i |u_i|}",
     source="applyBetaflightRates in Betaflight 4.6, src/main/fc/rc.c, over the rate at full stick",
-    command=_command,
+    command=on_rate_sticks(_curve),
 )

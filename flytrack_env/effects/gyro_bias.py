@@ -2,8 +2,8 @@
 
 from typing import NamedTuple
 
-from flytrack_env.effects.base import Effect, Range, StepContext
-from flytrack_env.quaternion import Scalar, Vec3
+from flytrack_env.effects.base import Effect, Range, shifted
+from flytrack_env.quaternion import Scalar
 
 
 class GyroBias(NamedTuple):
@@ -14,10 +14,6 @@ class GyroBias(NamedTuple):
     z: Scalar = 0.0
 
 
-def _gyro(bias: GyroBias, memory: None, rates_b: Vec3, context: StepContext) -> Vec3:
-    return rates_b + Vec3(*bias)
-
-
 GYRO_BIAS = Effect(
     name="gyro_bias",
     parameters=GyroBias,
@@ -26,5 +22,5 @@ GYRO_BIAS = Effect(
     needs=("w",),
     equation=r"\boldsymbol{\omega}_\text{measured} = \boldsymbol{\omega} + (x, y, z)^\top",
     source="assumption: constant within a flight; the rate loop flies by the true rates",
-    gyro=_gyro,
+    gyro=shifted,
 )

@@ -2,8 +2,8 @@
 
 from typing import NamedTuple
 
-from flytrack_env.effects.base import Effect, Range, StepContext
-from flytrack_env.quaternion import Scalar, Vec3
+from flytrack_env.effects.base import Effect, Range, scaled
+from flytrack_env.quaternion import Scalar
 
 
 class GyroScale(NamedTuple):
@@ -12,10 +12,6 @@ class GyroScale(NamedTuple):
     x: Scalar = 1.0
     y: Scalar = 1.0
     z: Scalar = 1.0
-
-
-def _gyro(scale: GyroScale, memory: None, rates_b: Vec3, context: StepContext) -> Vec3:
-    return Vec3(scale.x * rates_b.x, scale.y * rates_b.y, scale.z * rates_b.z)
 
 
 GYRO_SCALE = Effect(
@@ -27,5 +23,5 @@ GYRO_SCALE = Effect(
     needs=("w",),
     equation=r"\boldsymbol{\omega}_\text{measured} = \operatorname{diag}(x, y, z)\, \boldsymbol{\omega}",
     source="assumption: linear up to the fastest turn, no leak between the axes",
-    gyro=_gyro,
+    gyro=scaled,
 )

@@ -4,9 +4,8 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 
-from flytrack_env.effects.base import Effect, Range, StepContext, on_rate_sticks
+from flytrack_env.effects.base import Effect, Range, on_rate_sticks
 from flytrack_env.quaternion import Scalar
-from flytrack_env.state import Action
 
 
 class QuickRates(NamedTuple):
@@ -26,10 +25,6 @@ def _curve(stick: Scalar, bend: Scalar, expo: Scalar) -> Scalar:
     return stick * ((1.0 - bend) / (1.0 - bend * late))
 
 
-def _command(rates: QuickRates, memory: None, sticks: Action, context: StepContext) -> Action:
-    return on_rate_sticks(_curve, sticks, rates[:3], rates[3:])
-
-
 QUICK_RATES = Effect(
     name="quick_rates",
     parameters=QuickRates,
@@ -40,5 +35,5 @@ QUICK_RATES = Effect(
     is_setting=True,
     equation=r"u_i \leftarrow u_i \frac{1 - b_i}{1 - b_i \left( e_i |u_i|^3 + (1 - e_i) |u_i| \right)}",
     source="applyQuickRates in Betaflight 4.6, src/main/fc/rc.c, over the rate at full stick",
-    command=_command,
+    command=on_rate_sticks(_curve),
 )

@@ -2,9 +2,8 @@
 
 from typing import NamedTuple
 
-from flytrack_env.effects.base import Effect, Range, StepContext, on_rate_sticks
+from flytrack_env.effects.base import Effect, Range, on_rate_sticks
 from flytrack_env.quaternion import Scalar
-from flytrack_env.state import Action
 
 
 class RateExpo(NamedTuple):
@@ -19,10 +18,6 @@ def _curve(stick: Scalar, expo: Scalar) -> Scalar:
     return stick * (1.0 - expo + expo * (stick * stick))
 
 
-def _command(curve: RateExpo, memory: None, sticks: Action, context: StepContext) -> Action:
-    return on_rate_sticks(_curve, sticks, curve)
-
-
 RATE_EXPO = Effect(
     name="rate_expo",
     parameters=RateExpo,
@@ -32,5 +27,5 @@ RATE_EXPO = Effect(
     equation=r"u_i \leftarrow (1 - \text{expo}_i)\, u_i + \text{expo}_i\, u_i^3",
     source='the "expo" of radio transmitters, and of KISS and RaceFlight rates in Betaflight '
     "(src/main/fc/rc.c): the curve makes the setpoint of the rate loop, before any lag",
-    command=_command,
+    command=on_rate_sticks(_curve),
 )

@@ -2,8 +2,8 @@
 
 from typing import NamedTuple
 
-from flytrack_env.effects.base import Effect, Range, StepContext
-from flytrack_env.quaternion import Scalar, Vec3
+from flytrack_env.effects.base import Effect, Range, scaled
+from flytrack_env.quaternion import Scalar
 
 
 class RateScale(NamedTuple):
@@ -12,10 +12,6 @@ class RateScale(NamedTuple):
     roll: Scalar = 1.0
     pitch: Scalar = 1.0
     yaw: Scalar = 1.0
-
-
-def _rates(scale: RateScale, memory: None, rates_b: Vec3, context: StepContext) -> Vec3:
-    return Vec3(scale.roll * rates_b.x, scale.pitch * rates_b.y, scale.yaw * rates_b.z)
 
 
 RATE_SCALE = Effect(
@@ -27,5 +23,5 @@ RATE_SCALE = Effect(
     equation=r"\boldsymbol{\omega} \leftarrow \operatorname{diag}(\text{roll}, \text{pitch}, \text{yaw})\, "
     r"\boldsymbol{\omega}",
     source="assumption: the stick's curve stays linear",
-    rates=_rates,
+    rates=scaled,
 )

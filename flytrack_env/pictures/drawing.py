@@ -37,10 +37,10 @@ def plain(axes: Axes) -> Axes:
     return axes
 
 
-def png_of(figure: Figure, dpi: int = DPI, metadata: dict[str, str] | None = None) -> bytes:
-    """Return a figure as a PNG file; metadata: the texts that it carries."""
+def png_of(figure: Figure, dpi: int = DPI) -> bytes:
+    """Return a figure as a PNG file, without a note of the software that drew it."""
     content = io.BytesIO()
-    figure.savefig(content, format="png", dpi=dpi, metadata={"Software": None, **(metadata or {})})
+    figure.savefig(content, format="png", dpi=dpi, metadata={"Software": None})
     return content.getvalue()
 
 

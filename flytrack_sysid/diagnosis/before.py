@@ -321,9 +321,7 @@ def changed_values(
     for field, place, half in zip(fields, places, change.half, strict=True):
         key, value = field.split(".")[-1], float(vector[place])
         if key in cause.parameters:
-            values[key] = Estimated(
-                value, (value - float(half), value + float(half)), cause.parameters[key].unit
-            )
+            values[key] = Estimated.around(value, float(half), cause.parameters[key].unit)
     if factor:
         values |= {"factor": factor["mean_factor"]} if name == "thrust_scale" else factor
     return values

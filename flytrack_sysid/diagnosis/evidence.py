@@ -210,13 +210,13 @@ class Binned(NamedTuple):
     ends95: np.ndarray
 
 
-def bin_edges(regressor: np.ndarray, num_bins: int = NUM_BINS, fewest: int = FEWEST_ROWS) -> np.ndarray:
-    """Return the edges of bins over a regressor, (at most num_bins + 1,).
+def bin_edges(regressor: np.ndarray, fewest: int = FEWEST_ROWS) -> np.ndarray:
+    """Return the edges of bins over a regressor, (at most NUM_BINS + 1,).
 
     Evenly wide, but joined with the next ones where they have fewer than ``fewest`` rows.
     """
     low, high = np.percentile(regressor, SHOWN_PERCENTILES)
-    even = np.linspace(low, max(high, low + np.finfo(np.float32).eps), num_bins + 1)
+    even = np.linspace(low, max(high, low + np.finfo(np.float32).eps), NUM_BINS + 1)
     edges, rows = [even[0]], 0
     for count, edge in zip(np.histogram(regressor, even)[0], even[1:], strict=True):
         rows += int(count)

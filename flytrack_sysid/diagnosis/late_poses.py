@@ -48,8 +48,8 @@ def with_late_poses(
     base = found.base.with_effects(MocapLatency(np.float32(before_s)))
     extended = found.extended.with_effects(MocapLatency(np.float32(late_s)))
     found = replace(found, base=base, extended=extended)
-    half_s = TWO_SIDED_95 * sigma_s
-    ends = max(late_s - half_s, BOUNDS.low), late_s + half_s
+    name, unit = "mocap_latency.latency_s", BOUNDS.unit
+    latency = Estimated.around(late_s, TWO_SIDED_95 * sigma_s, unit, BOUNDS.low)
     if abs(late_s - before_s) <= STANDARD_ERRORS * sigma_s:
         return found
     gains = [gain_of(*pair, vector_of(extended)) for pair in zip(problems, logged, strict=True)]
@@ -58,14 +58,14 @@ def with_late_poses(
         effect=EFFECT.name,
         equivalent=(),
         channel="attitude",
-        parameters={"latency_s": Estimated(late_s, ends, BOUNDS.unit)},
+        parameters={"latency_s": latency},
         chi2_gain=gains[0],
         heldout_gain=gains[1],
         lambda_=size,
         lambda_sep=size,
         beyond=f"latency_s at least {late_s:.3g} s" if moves.late_s > BOUNDS.high else "",
     )
-    changed = Changed("mocap_latency.latency_s", before_s, late_s, ends, BOUNDS.unit, bool(cause.beyond))
+    changed = Changed(name, before_s, late_s, latency.ci95, unit, bool(cause.beyond))
     found = replace(found, changed=(*found.changed, changed))
     if abs(late_s - before_s) < EFFECT.notable["latency_s"]:
         return replace(found, negligible=(cause, *found.negligible))

@@ -346,10 +346,14 @@ def _with_change(selection: Selection, test: Problem) -> Selection | None:
     state, model = _likeliest_side(selection, first, [one.candidate.effect for one in near[:MOST_NEAR]])
     state, base, model = search(_at_best_row(state, test, model, first.row))
     named = tuple(one for one in state.problem.windows if one.effect in model.effects)
-    rows = {row for one in named for row in (one.start, one.end)} - {*_rows_of(selection.state.problem)}
-    if not rows - {ALWAYS, NEVER}:
+    now, before = (
+        {row for one in windows for row in (one.start, one.end)}
+        for windows in (named, selection.state.problem.windows)
+    )
+    rows = now - before - {ALWAYS, NEVER}
+    if not rows:
         return None
-    state = _at_best_row(windowed(state, named), test, model, max(rows - {ALWAYS, NEVER}))
+    state = _at_best_row(windowed(state, named), test, model, max(rows))
     later = select(state, base, state.fitted(model.candidates, model.vector))
     lost = [
         misfit(later, problem) - misfit(selection, problem) for problem in (selection.state.problem, test)
@@ -361,10 +365,6 @@ def _with_change(selection: Selection, test: Problem) -> Selection | None:
 
 def _num_priced(selection: Selection) -> int:
     return sum(one.num_priced for one in selection.model.candidates)
-
-
-def _rows_of(problem: Problem) -> tuple[int, ...]:
-    return tuple(row for one in problem.windows for row in (one.start, one.end))
 
 
 def misfit(selection: Selection, problem: Problem) -> float:

@@ -72,7 +72,7 @@ def _parameter(name: str, found: Estimated) -> str:
 def _plus_minus(cause: Cause) -> str:
     """Return a cause's values with half of their 95 % intervals."""
     return ", ".join(
-        f"{name} {one.value:.3g} ± {0.5 * (one.ci95[1] - one.ci95[0]):.2g}{_unit(one.unit)}"
+        f"{name} {one.value:.3g} ± {one.half_width:.2g}{_unit(one.unit)}"
         for name, one in cause.parameters.items()
     )
 
@@ -81,7 +81,7 @@ def when_of(cause: Cause) -> str:
     """Return when a cause acts, " from 31.2 ± 0.4 s on"; nothing where it does throughout."""
 
     def time(found: Estimated) -> str:
-        return f"{found.value:.1f} ± {max(0.5 * (found.ci95[1] - found.ci95[0]), 0.05):.1f} s"
+        return f"{found.value:.1f} ± {max(found.half_width, 0.05):.1f} s"
 
     if cause.onset_s is not None and cause.end_s is not None:
         return f" from {time(cause.onset_s)} to {time(cause.end_s)}"

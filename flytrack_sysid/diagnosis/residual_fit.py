@@ -135,15 +135,15 @@ def _blocks(side: Side, columns: np.ndarray) -> _Blocks:
     return _Blocks(information, score, side.test.given.shape[1])
 
 
-def fit_residual(side: Side, held: Side, names: Sequence[str], seed: int = 0) -> Residual | None:
+def fit_residual(side: Side, held: Side, names: Sequence[str]) -> Residual | None:
     """Return the ensemble of what a side depends on; None where held-out rows do not gain from it.
 
-    names: of dependences. seed: of the random layer and the bootstrap.
+    names: of dependences.
     """
     inputs = inputs_of(side, names)
     if not inputs:
         return None
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)  # of the random layer and the bootstrap
     frame = "world" if side.name == "force" and any(name in IN_WORLD for name in names) else "body"
     none = ((0.0,) * (HIDDEN + 1),) * XYZ
     network = Network(side.name, frame, inputs, _random_units(rng, len(inputs)), none, none, (0.0,) * XYZ)

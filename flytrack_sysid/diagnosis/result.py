@@ -28,6 +28,18 @@ class Estimated:
     ci95: tuple[float, float]
     unit: str
 
+    @classmethod
+    def around(
+        cls, value: float, half: float, unit: str, low: float = -np.inf, high: float = np.inf
+    ) -> "Estimated":
+        """Return a value with an interval of so much to both sides, cut at the ends of its range."""
+        return cls(value, (max(value - half, low), min(value + half, high)), unit)
+
+    @property
+    def half_width(self) -> float:
+        """Half of the interval."""
+        return 0.5 * (self.ci95[1] - self.ci95[0])
+
 
 @dataclass(frozen=True)
 class Cause:

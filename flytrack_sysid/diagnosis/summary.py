@@ -68,9 +68,8 @@ def estimates(
         value, low, high = (float(one[place]) for one in (model.vector, problem.low, problem.high))
         if "." in field and half > LOOSE * (high - low) and half > least:
             continue
-        ends = max(value - half, low), min(value + half, high)
-        name = field.split(".")[-1]
-        result[name] = Estimated(value, (float(ends[0]), float(ends[1])), unit_of_parameter(field))
+        name, unit = field.split(".")[-1], unit_of_parameter(field)
+        result[name] = Estimated.around(value, float(half), unit, low, high)
     if tuple(fields) == THRUST_COEFFS:
         half = Marginal(linearization, model, fields).half_widths(mean_thrust(problem)[None])
         result |= mean_factor(problem, model.vector, float(half[0]))
@@ -97,8 +96,7 @@ def mean_factor(problem: Problem, vector: np.ndarray, half_n: float) -> dict[str
     before, after = (float(slopes @ own[places]) for own in (problem.start, vector))
     if before <= 0.0:
         return {}
-    factor, half = after / before, half_n / before
-    return {"mean_factor": Estimated(factor, (factor - half, factor + half), "1")}
+    return {"mean_factor": Estimated.around(after / before, half_n / before, "1")}
 
 
 def half_responses_of(
@@ -164,7 +162,11 @@ def effect_causes(selection: Selection, test: Problem, linearization: Linearizat
         alike = equivalents(ablation, own)
         channel = channel_of(problem, less, model.vector)
         if channel in CHANNELS[1]:
-            alike += tuple(name for name in selection.state.unobservable if _is_law_of_motion(name))
+            alike += tuple(
+                name
+                for name in selection.state.unobservable
+                if is_force_law(name) and not {"v", "q"}.isdisjoint(BY_NAME[name].needs)
+            )
         causes.append(
             Cause(
                 effect=one.effect,
@@ -181,11 +183,6 @@ def effect_causes(selection: Selection, test: Problem, linearization: Linearizat
     # A scale of thrust that was found in place of a thrust curve may be a remainder, too.
     kept = [cause for cause in causes if cause.effect != "thrust_scale" or not _is_remainder(cause, causes)]
     return sorted(kept, key=lambda cause: -cause.chi2_gain)
-
-
-def _is_law_of_motion(effect: str) -> bool:
-    """Return whether an effect is a force that velocity or attitude would show."""
-    return is_force_law(effect) and not {"v", "q"}.isdisjoint(BY_NAME[effect].needs)
 
 
 def _is_remainder(cause: Cause, others: Sequence[Cause]) -> bool:
@@ -259,7 +256,7 @@ def _as_thrust_scale(cause: Cause, change: BaseChange, problem: Problem, model: 
     if rest @ information @ rest / change.marginal.inflation > threshold(len(values) - 1):
         return cause
     half = TWO_SIDED_95 * float(np.sqrt(change.marginal.inflation / known))
-    scale = {"factor": Estimated(factor, (factor - half, factor + half), "1")}
+    scale = {"factor": Estimated.around(factor, half, "1")}
     return replace(cause, effect="thrust_scale", equivalent=SCALE_TWINS, parameters=scale)
 
 
@@ -439,8 +436,7 @@ def with_refined_values(causes: Sequence[Cause], refined: Refined, vector: np.nd
                 del values[name]  # no flight depends on it
             elif place in half:
                 value, low, high = (float(one[place]) for one in (vector, problem.low, problem.high))
-                ends = max(value - half[place], low), min(value + half[place], high)
-                values[name] = Estimated(value, ends, unit_of_parameter(field))
+                values[name] = Estimated.around(value, half[place], unit_of_parameter(field), low, high)
         fields = [field for field in fields if field.split(".")[-1] in values]
         if "mean_factor" in values and fit is not None:
             own = [fit.places.index(place) for place in problem.index(THRUST_COEFFS)]

@@ -42,21 +42,8 @@ OVER_EFFECTS = pytest.mark.parametrize("effect", EFFECTS, ids=lambda effect: eff
 
 
 # A loop is unstable towards the ends of its ranges, and nothing of it acts without a craft.
-RACER = BetaflightLoop(
-    20.0,
-    21.0,
-    2.0,
-    2.0,
-    0.02,
-    0.5,
-    center_x=0.05,
-    center_y=0.05,
-    gyro_late_s=0.002,
-    d_yaw=5.0,
-    d_max_yaw=8.0,
-    thrust_linear=20.0,
-    throttle_boost=10.0,
-)
+SHOWING = {"center_x": 0.05, "center_y": 0.05, "gyro_late_s": 0.002, "d_yaw": 5.0, "d_max_yaw": 8.0}
+RACER = BetaflightLoop(20.0, 21.0, 2.0, 2.0, 0.02, 0.5, **SHOWING, thrust_linear=20.0, throttle_boost=10.0)
 
 
 def inside_ranges(effect: Effect, fraction: float) -> Any:

@@ -17,7 +17,6 @@ from flytrack_sysid.manoeuvres import FLIGHTS_PER_MANOEUVRE, MANOEUVRES, flights
 from flytrack_sysid.script_file import Script, ScriptError, check_script, load_script, save_script, script_of
 from tests.support.black_boxes import SHIPPED
 from tests.support.handout_plant import HandoutPlant
-from tests.support.traps import Trap
 
 HOVER = hover_action(HandoutPlant().model())
 
@@ -75,8 +74,6 @@ BAD = {
     "flight 0: kinds: expected one of headings": {"kinds": np.array(["loop"] * 8)},
     "found 0 kinds, starts of shape": {"kinds": np.array([], "U1")},
     "starts: found an array of <U4": {"starts": np.full((8, 21), "text")},
-    "found arrays of 67110784 bytes or more": {"commands": np.zeros((8, 2**20 + 1, 1), np.int8)},
-    "nothing is unpickled": {"starts": np.array([Trap()] * 8, object)},
 }
 
 

@@ -95,7 +95,7 @@ def test_a_hidden_effect_is_found_and_measured(short) -> None:
     (cause,) = short("drag")[0].causes
     assert cause.effect == "linear_drag" and cause.heldout_gain > 0.0 and cause.lambda_ > 100.0
     for name, one in cause.parameters.items():
-        assert abs(one.value - DRAG[name]) <= WIDENED * 0.5 * (one.ci95[1] - one.ci95[0])
+        assert abs(one.value - DRAG[name]) <= WIDENED * one.half_width
 
 
 @pytest.mark.slow

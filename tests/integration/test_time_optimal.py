@@ -100,7 +100,6 @@ def rewritten(path: Path, **changes: Any) -> Path:
         ({"version": 2}, "version: found 2, expected 1"),
         ({"kind": "hovering"}, "kind: found 'hovering', expected flying or standing"),
         ({"model_sha256": "0"}, "model: found another"),
-        ({"gate_times_s": np.array([object()])}, "cannot be read: .*nothing is unpickled"),
         ({"time_s": -1.0}, "time_s: found -1.0, expected seconds above 0"),
     ],
 )
@@ -110,17 +109,13 @@ def test_a_damaged_file_is_refused(changes: dict[str, Any], reason: str, tmp_pat
         references.load_reference(path)
 
 
-def test_a_saved_reference_comes_back_and_half_of_it_is_refused(tmp_path: Path) -> None:
+def test_a_saved_reference_comes_back(tmp_path: Path) -> None:
     found, path = references.shipped_reference("flytrack", "flying"), tmp_path / "lap.npz"
     references.save_reference(path, found)
     again = references.load_reference(path)
     np.testing.assert_array_equal(again.states, found.states)
     np.testing.assert_array_equal(again.commands, found.commands)
     assert (again.time_s, again.found) == (found.time_s, found.found)
-    path.write_bytes(path.read_bytes()[:1000])
-    for broken in (path, tmp_path / "missing.npz"):
-        with pytest.raises(references.ReferenceFileError, match="cannot be read"):
-            references.load_reference(broken)
 
 
 @pytest.mark.slow

@@ -10,7 +10,7 @@ from baselines.purejaxrl_ppo.checkpoint import save_checkpoint
 from baselines.purejaxrl_ppo.run import DivergedError, Options
 from baselines.purejaxrl_ppo.train_ppo import make_plan, make_tasks, parse
 from baselines.purejaxrl_ppo.training import Trainer
-from tests.support.ppo_runs import BATCH, CONFIG, EVERY_OTHER_UPDATE, SEED, assert_same_end, make_trainer
+from tests.support.ppo_runs import CONFIG, EVERY_OTHER_UPDATE, SEED, make_trainer
 
 SEEDS = (SEED, SEED + 1)
 RESUME = ("--no-tracking", "--resume", "WHOLE")  # a run that is complete
@@ -126,15 +126,6 @@ def test_a_folder_of_seeds_is_resumed_with_those_that_had_not_begun(seeds, tmp_p
     shutil.copytree(moved / "seed3", moved / "seed4")
     with pytest.raises(ValueError, match=r"seed4.*: does not fit: seed: found 3, expected 4"):
         make_plan(["--resume", str(moved)])
-
-
-@pytest.mark.slow
-def test_a_run_continues_in_another_folder(seeds, tmp_path, monkeypatch):
-    monkeypatch.setattr(train_ppo, "make_trainer", lambda *_: make_trainer())
-    step = seeds / "seed3" / f"step_{2 * BATCH}.safetensors"
-    plan = make_plan(["--resume", str(step), "--out", str(tmp_path), "--no-tracking"])
-    train_ppo.run(plan)
-    assert_same_end(tmp_path / "final.safetensors", seeds / "seed3" / "final.safetensors")
 
 
 def test_exit_codes_and_messages(tmp_path, monkeypatch, capsys):

@@ -3,15 +3,15 @@
 from functools import cache
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 
 from flytrack_env.dynamics import ModelParameters
 from flytrack_env.env import FlyTrack
 from flytrack_env.plants import Plant
-from flytrack_env.quaternion import Quaternion, Scalar, Vec3
+from flytrack_env.quaternion import Scalar
 from flytrack_env.state import Action, Drone
 from flytrack_env.tracks import Gate, Track
+from tests.support.simulated_flights import drone_with
 
 FACING_X = (0.5**0.5, 0.0, 0.0, -(0.5**0.5))  # yaw -90 degrees: the gate's local +y is world +x
 
@@ -33,19 +33,15 @@ class Coasting(Plant):
 
 
 def drone_at(
-    position: Any, velocity: Any = (0.0, 0.0, 0.0), quat: Any = (1.0, 0.0, 0.0, 0.0), **fields: Any
+    position: Any,
+    velocity: Any = (0.0, 0.0, 0.0),
+    quat: Any = (1.0, 0.0, 0.0, 0.0),
+    battery_v: float = 23.5,
+    **fields: Any,
 ) -> Drone:
     """Return a drone of float32 leaves; ``fields`` replace the other parts of its state."""
-    drone = Drone(
-        pos_w=Vec3(*position),
-        vel_w=Vec3(*velocity),
-        acc_w=Vec3(0.0, 0.0, 0.0),
-        quat=Quaternion(*quat),
-        rates_b=Vec3(0.0, 0.0, 0.0),
-        applied=Action(0.0, 0.0, 0.0, 0.0),
-        battery_v=23.5,
-    )
-    return jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32), drone._replace(**fields))
+    drone = drone_with(pos_w=position, vel_w=velocity, quat=quat, **fields)
+    return drone._replace(battery_v=jnp.float32(battery_v))
 
 
 def track_of_row(distances: list[float]) -> Track:

@@ -29,9 +29,9 @@ class Case(NamedTuple):
     log: FlightLog
 
 
-def rng_of(name: str, seed: int = SEED) -> Rng:
+def rng_of(name: str) -> Rng:
     """Return the random numbers of a case."""
-    return np.random.default_rng([seed, *name.encode()])
+    return np.random.default_rng([SEED, *name.encode()])
 
 
 def _flown(truth: hidden.Truth, rng: Rng, kind: str = "scripted") -> Case:
@@ -69,11 +69,6 @@ def _wind_in_hover(rng: Rng) -> Case:
     return _flown(replace(truth, effects={"wind": wind}), rng, kind="hover")
 
 
-def _thermal(rng: Rng) -> Case:
-    truth = replace(hidden.draw_base(rng), outside=hidden.draw_outside(rng, "position", OUTSIDE_AMPLITUDE))
-    return _flown(truth, rng)
-
-
 def _changed(name: str, rng: Rng) -> Case:
     """Return a plant of which the team believes an older base, flown as it is now."""
     believed = hidden.draw_base(rng)
@@ -102,7 +97,9 @@ CASES: Mapping[str, Callable[[Rng], Case]] = {
     "mirrored": lambda rng: _signed(rng_of("signed"), -1.0),
     "training_only": _in_training_only,
     "wind_in_hover": _wind_in_hover,
-    "thermal": _thermal,
+    "thermal": lambda rng: _flown(
+        replace(hidden.draw_base(rng), outside=hidden.draw_outside(rng, "position", OUTSIDE_AMPLITUDE)), rng
+    ),
     "tau": lambda rng: _changed("tau", rng),
     "mass": lambda rng: _changed("mass", rng),
     "simulated": _simulated,

@@ -78,8 +78,9 @@ class Rails(Plant):
         return state.drone
 
 
-def write_checkpoint(path: Path, env_id: str = "FlyTrackRandomized-v0") -> Path:
+def write_checkpoint(path: Path) -> Path:
     """Write a policy that has learned nothing, with all that a checkpoint tells."""
+    env_id = "FlyTrackRandomized-v0"
     env = make(env_id, model=nominal_parameters().with_effects(LinearDrag(0.3, 0.3, 0.1)))
     config = Config(hidden_sizes=(8,))
     size = env.observation_space().shape[0]

@@ -86,23 +86,16 @@ def fly(plant: HandoutPlant, starts: np.ndarray, commands: np.ndarray, steps_s: 
 
 
 def excited(
-    plant: HandoutPlant,
-    flights: int = 24,
-    skip: int = 1,
-    repeat: int = 1,
-    jitter: float = 0.0,
-    thrust: tuple[float, float] = (-1.0, 1.0),
+    plant: HandoutPlant, flights: int = 24, skip: int = 1, repeat: int = 1, jitter: float = 0.0
 ) -> FlightLog:
     """Return the log of the excitation on a plant, float64, without noise.
 
     skip, repeat: of commands, for steps of 0.01 s times skip over repeat. jitter: of steps, relative.
-    thrust: what its command is clipped to.
     """
     rng = np.random.default_rng(5)
     planned = script(flights, HOVER, rng)
     starts = np.stack([flight.start for flight in planned])
     commands = np.stack([flight.command for flight in planned])[:, ::skip].repeat(repeat, axis=1)
-    commands[..., 3] = np.clip(commands[..., 3], *thrust)
     step_s = 0.01 * skip / repeat
     steps_s = step_s * (1.0 + rng.uniform(-jitter, jitter, commands.shape[1]))
     return fly(replace(plant, dt=step_s), starts, commands, steps_s)

@@ -82,8 +82,6 @@ def test_parameters_that_are_not_the_networks_are_refused(path, params):
 @pytest.mark.parametrize(
     ("content", "reason"),
     [
-        (None, "cannot be read"),
-        (b"", "not a checkpoint, or damaged"),
         ((2**40).to_bytes(8, "little") + b"{}", "found a header of 1099511627776 bytes, expected at most"),
         (safetensors.numpy.save({"a": np.zeros(3)}), "not a checkpoint, or damaged"),
         (safetensors.numpy.save({}, {"meta": "{}", "sha256": checksum("{}", {})}), "found no description"),
@@ -91,15 +89,8 @@ def test_parameters_that_are_not_the_networks_are_refused(path, params):
 )
 def test_what_is_not_a_checkpoint_is_refused(tmp_path, content, reason):
     path = tmp_path / "c.safetensors"
-    if content is not None:
-        path.write_bytes(content)
+    path.write_bytes(content)
     with pytest.raises(CheckpointError, match=rf"c\.safetensors: .*{reason}"):
-        load_checkpoint(path)
-
-
-def test_a_file_that_is_too_large_is_not_read(path, params, monkeypatch):
-    monkeypatch.setattr(checkpoint_module, "LARGEST_BYTES", 3000)
-    with pytest.raises(CheckpointError, match="expected at most 3000"):
         load_checkpoint(path)
 
 

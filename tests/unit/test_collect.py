@@ -5,30 +5,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from flytrack_env.dynamics import advance
-from flytrack_env.plants import Plant
+from flytrack_env.dynamics import nominal_parameters
+from flytrack_env.plants import Simulator
 from flytrack_sysid import CollectError, collect
 from flytrack_sysid.excitation import HEIGHTS, LARGEST_SPEED
 from tests.support.handout_plant import GRAVITY, HandoutPlant
 
 
-class Simulated(Plant):
-    """The simulator with the handout plant's parameters, as a plant."""
-
-    def reset(self, drone, model):
-        return drone
-
-    def step(self, state, command, dt, model):
-        return advance(state, (), command, dt, HandoutPlant().model())[0]
-
-    def drone(self, state):
-        return state
-
-
 def test_plant_and_function_of_the_same_equations_give_the_same_log():
-    plant = collect(Simulated(), minutes=1.0, seed=2)
-    done = []
-    function = collect(HandoutPlant(), minutes=1.0, seed=2, report=lambda *counts: done.append(counts))
+    own, done = nominal_parameters(), []
+    same = HandoutPlant(own.tau, own.thrust_coeffs, own.max_rate, own.battery_drain_v_per_min)
+    plant = collect(Simulator(), minutes=1.0, seed=2)
+    function = collect(same, minutes=1.0, seed=2, report=lambda *counts: done.append(counts))
     assert done == [(number + 1, 24) for number in range(24)]
     np.testing.assert_array_equal(plant.segment, function.segment)
     np.testing.assert_array_equal(plant.time, function.time)

@@ -49,17 +49,14 @@ def test_a_folder_of_the_user_stands(config):
     assert config.jax_compilation_cache_dir == "mine"
 
 
-def test_it_can_be_switched_off(config, monkeypatch, tmp_path):
-    monkeypatch.setenv(compile_cache.SWITCH, "0")
-    compile_cache.keep_compiled_programs()
-    assert config.jax_compilation_cache_dir is None
-    assert not list(tmp_path.iterdir())
-
-
-def test_a_folder_that_cannot_be_made_is_no_error(config, tmp_path):
+def test_a_folder_that_cannot_be_made_or_is_not_wanted_is_not_used(config, monkeypatch, tmp_path):
     (tmp_path / "flytrack").write_text("a file")
     compile_cache.keep_compiled_programs()
     assert config.jax_compilation_cache_dir is None
+    (tmp_path / "flytrack").unlink()
+    monkeypatch.setenv(compile_cache.SWITCH, "0")
+    compile_cache.keep_compiled_programs()
+    assert config.jax_compilation_cache_dir is None and not list(tmp_path.iterdir())
 
 
 def test_a_folder_that_has_grown_too_large_is_begun_afresh(config, monkeypatch):

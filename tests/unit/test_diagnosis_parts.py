@@ -80,12 +80,6 @@ def disturbed(lanes):
     return series[lanes.row] * lanes.is_joined[..., None, None]
 
 
-def true_noise() -> noises.Noise:
-    """Return the noise that those residuals have."""
-    ones = np.ones(NUM_AXES)
-    return noises.Noise(DIRECT, LEVEL, WANDER, DISTURBANCE, TAU_S * ones, ones)
-
-
 def whitened(lanes, left, noise: noises.Noise) -> np.ndarray:
     """Return innovations; not a number where nothing counts."""
     with jax.enable_x64(True):
@@ -102,7 +96,9 @@ def correlation(first: np.ndarray, second: np.ndarray) -> np.ndarray:
 
 
 def test_innovations_are_white_and_of_variance_one(lanes, disturbed):
-    found = whitened(lanes, disturbed, true_noise())
+    ones = np.ones(NUM_AXES)
+    noise = noises.Noise(DIRECT, LEVEL, WANDER, DISTURBANCE, TAU_S * ones, ones)  # that they were made of
+    found = whitened(lanes, disturbed, noise)
     counting = lanes.counts.any(axis=(0, 1))
     assert counting.sum() == 2 * NUM_AXES - 1
     sigmas = 5.0 / np.sqrt(lanes.counts.sum(axis=(0, 1))[counting])

@@ -140,36 +140,30 @@ ENDS = {
     "frame at time limit": ((12.55, 3.0, 1.35), FAST, {}, 999, ZERO, {"crash"}, True),
     "pass at time limit": (IN_FRONT, FAST, {}, 999, ZERO, set(), True),
 }
-BATCHES = [list(ENDS)[:NUM_ENVS], list(ENDS)[NUM_ENVS:]]
 
 
 @pytest.fixture(scope="module")
 def ends(env):
     """One step of a batch with every row of ``ENDS``, from a race that has gone on for a while."""
-    params, results = arrays(env.default_params), []
-    for names in BATCHES:
-        states, rows = [], [ENDS[name] for name in np.resize(names, NUM_ENVS)]
-        for position, velocity, fields, time, *_ in rows:
-            state = env.begin(drone_at(position, velocity, **fields), 0, params)
-            counted = {"gates_passed": jnp.int32(8), "laps": jnp.int32(1), "lap_start_s": jnp.float32(0.7)}
-            states.append(state._replace(race=state.race._replace(**counted), time=jnp.int32(time)))
-        actions = jnp.array([row[4] for row in rows], jnp.float32)
-        results.append(env.step_batch(jax.random.key(8), stack(states), actions, params))
-    return results
+    params, states = arrays(env.default_params), []
+    counted = {"gates_passed": jnp.int32(8), "laps": jnp.int32(1), "lap_start_s": jnp.float32(0.7)}
+    for position, velocity, fields, time, *_ in ENDS.values():
+        state = env.begin(drone_at(position, velocity, **fields), 0, params)
+        states.append(state._replace(race=state.race._replace(**counted), time=jnp.int32(time)))
+    actions = jnp.array([row[4] for row in ENDS.values()], jnp.float32)
+    return env.step_batch(jax.random.key(8), stack(states), actions, params)
 
 
 @pytest.mark.parametrize("name", ENDS)
 def test_every_end_has_its_own_cause_and_flags(name, ends):
-    batch = int(name in BATCHES[1])
-    row = BATCHES[batch].index(name)
-    *_, causes, is_truncated = ENDS[name]
-    _, _, _, terminated, truncated, info = ends[batch]
+    row, (*_, causes, is_truncated) = list(ENDS).index(name), ENDS[name]
+    _, _, _, terminated, truncated, info = ends
     assert {cause for cause in CAUSES if bool(info[cause][row])} == causes
     assert bool(terminated[row]) is bool(causes) and bool(truncated[row]) is is_truncated
 
 
 def test_batch_step_resets_episodes_apart(env, params, ends):
-    observation, state, _, terminated, truncated, _ = ends[0]
+    observation, state, _, terminated, truncated, _ = ends
     done = np.asarray(terminated | truncated)
     assert_begun(done, state)
     starts = np.stack([np.asarray(leaf)[done] for leaf in env.drone(state).pos_w], -1)

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from benchmarks.diagnosis import model_of
 from benchmarks.hidden import draw_base, fly, measure
 from flytrack_env.dynamics import ModelParameters
 from flytrack_env.effects import LinearDrag
@@ -34,10 +35,8 @@ def flown() -> tuple[ModelParameters, FlightLog]:
     rng = np.random.default_rng(5)
     truth = replace(draw_base(rng), effects={"linear_drag": DRAG._asdict()})
     log = measure(fly(truth, "scripted", SECONDS, rng), "none", rng)
-    leaves = (np.array(truth.tau), np.array(truth.coeffs), np.array(truth.max_rate))
-    model = ModelParameters(*leaves, truth.mass, truth.gravity, truth.drain)
     segment = (np.arange(len(log)) >= SECOND).astype(int)
-    return model, replace(log, time=log.time - segment * log.time[SECOND], segment=segment)
+    return model_of(truth), replace(log, time=log.time - segment * log.time[SECOND], segment=segment)
 
 
 @pytest.fixture(scope="module")

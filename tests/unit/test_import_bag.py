@@ -109,17 +109,12 @@ def test_what_was_written_is_read_back(tmp_path, kind):
     assert is_told == (kind == "MCAP of JSON") and log["u"][:, 3] == pytest.approx(0.5)
 
 
-def test_what_lacks_a_topic_or_a_field_or_is_no_bag_is_refused(tmp_path):
+def test_what_lacks_a_topic_or_a_field_is_refused(tmp_path):
     mapping, flight = tmp_path / "map.toml", write_json(tmp_path)
-    (tmp_path / "cut.mcap").write_bytes(flight.read_bytes()[:5000])
-    (tmp_path / "empty").mkdir()
     for path, old, new, message in (
         (flight, "/twist:twist.angular.x", "/gyro:x", "topic /gyro: no messages; found /pose, /sticks, /tw"),
         (flight, "twist.angular.x", "rate", "topic /twist: field rate: not a number in messages of type any"),
         (flight, "/sticks:axes[0]", "roll", r"map\.toml: command: found roll, expected topic:field"),
-        (tmp_path / "missing.mcap", "", "", "missing.mcap: cannot be read"),
-        (tmp_path / "cut.mcap", "", "", "cut.mcap: damaged, cannot be decoded"),
-        (tmp_path / "empty", "", "", "empty: damaged, cannot be decoded"),
     ):
         mapping.write_text(MAPPING.replace(old, new, 1))
         with pytest.raises(LogError, match=message):

@@ -126,7 +126,6 @@ def test_wrong_cells_are_refused(folder, tmp_path, row, change, message):
 
 def test_missing_and_unmapped_files_are_refused(folder, tmp_path):
     for path, format_name, mapping, message in (
-        (tmp_path / "no.csv", "csv", folder / "map.toml", r"no\.csv: cannot be read"),
         (folder / "flight.csv", "csv", tmp_path / "no.toml", r"no\.toml: found no such .*crazyflie_phoenix"),
         (folder / "flight.csv", "csv", None, r"flight\.csv: no mapping names no columns"),
         (folder / "flight.csv", "mat", None, "format: found 'mat'"),

@@ -62,7 +62,6 @@ def test_a_cut_off_or_damaged_log_is_read_to_its_end(tmp_path):
 
 REFUSALS = {
     r"log00: found b'' first, expected b'\\xbc'": b"",
-    r"log00: damaged header": usd()[:40],
     r"log00: damaged header: found version 3, expected one of 1, 2": b"\xbc\x03" + usd()[2:],
     r"damaged header: found variable gyro\.x\(s\), expected name": usd().replace(b"x(f)", b"x(s)"),
     r"column gyro\.x: found 0 times among .*map\.toml: rates": usd().replace(b"gyro.x(f)", b"gyro.q(f)"),
@@ -75,7 +74,7 @@ def test_what_is_no_such_log_is_refused(tmp_path, message):
         read(tmp_path, REFUSALS[message])
 
 
-def lee_log(kw_sign: float = 1.0, noise: float = 0.0) -> tuple[bytes, np.ndarray]:
+def lee_log() -> tuple[bytes, np.ndarray]:
     """Return a log whose torques follow the law, 10 s at 250 Hz, and the rates it asks for, rad/s."""
     time = 1.0 + 0.004 * np.arange(2500)
     phases = np.array([0.0, 1.0, 2.0])
@@ -86,8 +85,7 @@ def lee_log(kw_sign: float = 1.0, noise: float = 0.0) -> tuple[bytes, np.ndarray
     errors = np.stack([skew[:, 2, 1], skew[:, 0, 2], skew[:, 1, 0]], axis=1)
     kr, kw, ki = (np.array(GAINS[name]) for name in ("KR", "Kw", "KI"))
     asked = reference - kr / kw * errors
-    torque = kw_sign * kw * (asked - rates) - ki * (np.cumsum(errors, axis=0) - 0.5 * errors) * 0.004
-    torque += noise * np.random.default_rng(1).normal(size=torque.shape)
+    torque = kw * (asked - rates) - ki * (np.cumsum(errors, axis=0) - 0.5 * errors) * 0.004
     names = [f"ctrlLee.{vector}{axis}" for vector in VECTORS for axis in "xyz"] + ["ctrlLee.thrustSI"]
     names += [f"stateEstimateZ.{axis}" for axis in ("x", "y", "z", "vx", "vy", "vz")]
     rows = np.column_stack([time, angles, wanted, rates, reference, torque, 0.35 + 0 * time, *[0 * time] * 6])

@@ -7,10 +7,10 @@ from flytrack_sysid.log import FlightLog
 from flytrack_sysid.split import blocks_of, held_out_rows
 
 
-def log_of(*durations_s: float, step_s: float = 0.01) -> FlightLog:
+def log_of(*durations_s: float) -> FlightLog:
     """Return a log of flights that last so long; one row for 0."""
-    lengths = [round(duration / step_s) + 1 for duration in durations_s]
-    time = np.concatenate([np.arange(length) * step_s for length in lengths])
+    lengths = [round(duration / 0.01) + 1 for duration in durations_s]
+    time = np.concatenate([np.arange(length) * 0.01 for length in lengths])
     return FlightLog(time, {"u": np.zeros((len(time), 4))}, np.repeat(np.arange(len(lengths)), lengths))
 
 

@@ -52,20 +52,16 @@ def flown(env: Any, is_constant: bool) -> Any:
     return jax.block_until_ready(run())
 
 
-def check(monkeypatch: pytest.MonkeyPatch, make: Any) -> None:
-    with_kernel = flown(make(), is_constant=True)
-    monkeypatch.setenv(SWITCH, "0")
-    without = flown(make(), is_constant=False)
-    for found, expected in zip(*map(jax.tree.leaves, (with_kernel, without)), strict=True):
-        size = max(float(np.abs(expected).max()), 1.0)
-        np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-5 * size)
-
-
 @pytest.mark.parametrize(
     "name", ["plain", *(pytest.param(name, marks=pytest.mark.slow) for name in [*VARIANTS][1:])]
 )
 def test_the_kernel_is_the_same_step(monkeypatch: pytest.MonkeyPatch, name: str) -> None:
-    check(monkeypatch, VARIANTS[name])
+    with_kernel = flown(VARIANTS[name](), is_constant=True)
+    monkeypatch.setenv(SWITCH, "0")
+    without = flown(VARIANTS[name](), is_constant=False)
+    for found, expected in zip(*map(jax.tree.leaves, (with_kernel, without)), strict=True):
+        size = max(float(np.abs(expected).max()), 1.0)
+        np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-5 * size)
 
 
 @pytest.mark.parametrize("name", ["plain", "all wrappers", "all effects, continuous"])

@@ -5,13 +5,12 @@ import re
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from flytrack_env.references import ReferenceFileError, shipped_reference
-from flytrack_env.tracks import Gate, Track, TrackError, build_course, load_track, save_track
+from flytrack_env.tracks import Gate, Track, TrackError, load_track, save_track
 
 VALID = (Path(__file__).parents[1] / "support" / "small_track.toml").read_text(encoding="utf-8")
 SECOND_GATE = VALID[VALID.index("[[gates]]\nid = 3") :]
@@ -76,8 +75,6 @@ def test_refusals_name_file_line_field_and_reason(case, tmp_path):
         ("name = \n", "not a TOML file: .*line 1"),
         (VALID.replace("id = 3", "id = "), "not a TOML file: .*line 20"),
         (VALID + "frame = 3\n", "not a TOML file: .*(frame|overwrite)"),
-        ("a" + ".a" * 2**16 + " = 1\n", "not a TOML file: "),
-        (b"\xff\xfe\x00", "cannot be read: "),
         (b" " * 2**20, "cannot be read: found 1048576 bytes"),
     ],
 )
@@ -93,26 +90,6 @@ def test_unknown_names_are_refused_with_the_shipped_ones_and_lead_to_no_other_fi
     for name in ("../references/flytrack", "x" * 300, "a\0b"):
         with pytest.raises(ReferenceFileError, match=r"reference: found no .{1,60}, expected one of"):
             shipped_reference(name)
-
-
-@settings(max_examples=200, deadline=None)
-@given(
-    start=st.integers(0, len(VALID)),
-    length=st.integers(0, 40),
-    put=st.binary(max_size=20) | st.sampled_from([b"nan", b"1e400", b"true", b"[]", b"{}", b'""', b"-1"]),
-)
-def test_random_damage_is_a_refusal_or_a_track_that_can_be_flown(start, length, put, tmp_path_factory):
-    folder, content = tmp_path_factory.getbasetemp(), VALID.encode()
-    try:
-        track = load_text(folder, content[:start] + put + content[start + length :])
-    except TrackError as error:
-        assert str(folder) in str(error) and len(str(error)) < 2000 and str(error).isprintable()
-        return
-    course = build_course(track)
-    assert all(np.isfinite(leaf).all() for leaf in (*course.gates.centre, *course.bounds_high))
-    assert all(math.isclose(math.hypot(*gate.quaternion), 1.0) for gate in track.gates)
-    save_track(folder / "track.toml", track)
-    assert load_track(folder / "track.toml") == track
 
 
 def reals(low, high):
