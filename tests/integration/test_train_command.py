@@ -1,7 +1,6 @@
 """The command of the training: its flags, what it resumes, what it refuses, and how it ends."""
 
 import shutil
-import sys
 
 import pytest
 
@@ -26,9 +25,8 @@ def tasks_of(*arguments):
 
 def call(monkeypatch, *arguments):
     """Run the command; return its exit code."""
-    monkeypatch.setattr(sys, "argv", ["train_ppo", *map(str, arguments)])
     with pytest.raises(SystemExit) as caught:
-        train_ppo.main()
+        train_ppo.main([*map(str, arguments)])
     return caught.value.code
 
 
@@ -140,7 +138,7 @@ def test_exit_codes_and_messages(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(train_ppo, "make_trainer", lambda *_: make_trainer())
     error, out = DivergedError("training diverged"), tmp_path / "out"
     assert call(monkeypatch, "--out", tmp_path, "--no-tracking") == 1
-    assert capsys.readouterr().err == "train_ppo: error: training diverged\n"
+    assert capsys.readouterr().err == "flytrack train: error: training diverged\n"
     error = KeyboardInterrupt
     assert call(monkeypatch, "--out", out, "--num-seeds", 2) == 130
     assert capsys.readouterr().err == f"stopped at 40 steps; continue with --resume {out}\n"
