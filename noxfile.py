@@ -21,13 +21,6 @@ nox.options.error_on_missing_interpreters = False
 
 ROOT = Path(__file__).parent
 PACKAGES = ("baselines/", *(f"flytrack{name}/" for name in ("", "_bench", "_env", "_loop", "_sysid")))
-    "baselines/",
-    "flytrack/",
-    "flytrack_bench/",
-    "flytrack_env/",
-    "flytrack_loop/",
-    "flytrack_sysid/",
-)
 CLONE_ONLY = "firmware/"
 HEADLESS = {"JAX_PLATFORMS": "cpu", "MPLBACKEND": "agg", "SDL_VIDEODRIVER": "dummy", "PYTHONPATH": ""}
 TEST_TOOLS = ("pytest>=9", "hypothesis>=6.150", "pillow", "pyulog>=1.2", "orangebox>=0.4,<0.5")

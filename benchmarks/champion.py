@@ -162,7 +162,7 @@ def section_of(name: str, seeds: list[int]) -> tuple[str, bool]:
         f"{polished}. Shipped: seed {best.found.checkpoint.meta['seed']}. Aim: at most {recipe.aim:g} times "
         f"the time-optimal flying lap, at least {recipe.success:.0%} of {FLIGHTS} flights finish.",
         report.table(HEADER, [row_of(seed, *pair) for seed, pair in zip(seeds, flown, strict=True)]),
-        f"`python eval_agent.py --checkpoint {path} --steps {STEPS} {asked} --laps {LAPS} "
+        f"`flytrack eval --checkpoint {path} --steps {STEPS} {asked} --laps {LAPS} "
         f"--seed {FLIGHT_SEED} --ghost`:",
         "```\n" + best.found.text.replace(f"{report.ROOT}/", "") + "```",
     ]
