@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 
 from tyro.conf import Positional, UseAppendAction, arg, create_mutex_group
 
-NO_HINT = "(optional)"  # tyro would print "(default: None)"
+NO_HINT = "(optional)"  # tyro would print {None}|PATH and (default: None)
 EXCITATION_OR_SCRIPT = create_mutex_group(required=False)
 Paths = Positional[tuple[Path, ...]]
 OptionalPath = Annotated[Path | None, arg(metavar="PATH", help_behavior_hint=NO_HINT)]

@@ -5,13 +5,13 @@ import json
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
 import tyro
 from tyro.conf import FlagCreatePairsOff, arg
 
+from baselines.purejaxrl_ppo.config import OPTIONAL, OptionalPath
 from flytrack_bench.policies import PolicyError, find_object, load_policy
 from flytrack_bench.results import differences, run
 from flytrack_bench.suite import Suite, SuiteError, load_suite
@@ -30,17 +30,17 @@ class Flags:
     policy: Annotated[tuple[str, ...], arg(metavar="CHECKPOINT|MODULE:NAME [...]")]
     """The policy, one for each training seed: checkpoints, or functions of the observation that return four
     sticks."""
-    out: Path | None = None
+    out: OptionalPath = None
     """The result, .json; default: it is printed only."""
     suite: str = "v1"
     """Name of a shipped suite, or a suite's file."""
     tasks: tuple[str, ...] = ()
     """Ids of the tasks to fly; default: all, or with --adapt all hidden plants."""
-    adapt: Annotated[str | None, arg(metavar="MODULE:NAME")] = None
+    adapt: Annotated[str | None, arg(metavar="MODULE:NAME", help_behavior_hint=OPTIONAL)] = None
     """A function that makes a policy for each plant, given `flytrack_bench.Data`."""
     data_seconds: float = 30.0
     """Seconds of flight that --adapt may log of each plant."""
-    verify: Path | None = None
+    verify: OptionalPath = None
     """A result to verify: some of its tasks are flown again with this policy."""
 
 

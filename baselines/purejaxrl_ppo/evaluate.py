@@ -10,6 +10,7 @@ import numpy as np
 
 import flytrack_env
 from baselines.purejaxrl_ppo.checkpoint import Checkpoint, load_checkpoint
+from baselines.purejaxrl_ppo.config import OptionalInt, OptionalName, OptionalPath
 from baselines.purejaxrl_ppo.flights import (
     Outcomes,
     Rollout,
@@ -59,24 +60,24 @@ class EvaluationSettings:
     """Time limit of a flight; at 100 Hz, 2000 steps are 20 s."""
     episodes: int = 1
     """Noisy starts, on each plant."""
-    laps: int | None = None
+    laps: OptionalInt = None
     """Laps to complete; by default 3, and no limit for a single flight."""
-    plants: int | None = None
+    plants: OptionalInt = None
     """Fly so many simulated plants, drawn around the checkpoint's model, instead of a black box."""
-    black_box: Path | None = None
+    black_box: OptionalPath = None
     """File of the black box; by default the shipped one."""
-    track: str | None = None
+    track: OptionalName = None
     """Name or file of a track; by default the checkpoint's."""
     seed: int = 0
     """Seed of the noisy starts and of the plants."""
     ghost: bool = False
     """Compare with the time-optimal flight, and write it beside the rollout."""
-    out: Path | None = None
+    out: OptionalPath = None
     """Rollout of the first flight, rows [x 21 | u 4]; by default runs/eval/rollout.npy, or that of the next
     free folder."""
-    rrd: Path | None = None
+    rrd: OptionalPath = None
     """Write a Rerun recording of the first flight."""
-    json: Path | None = None
+    json: OptionalPath = None
     """Write the report as JSON."""
 
     @property

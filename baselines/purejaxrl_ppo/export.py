@@ -12,6 +12,7 @@ from typing import Annotated
 import tyro
 
 from baselines.purejaxrl_ppo.checkpoint import load_checkpoint
+from baselines.purejaxrl_ppo.config import OptionalName, OptionalPath
 from baselines.purejaxrl_ppo.export_c import c_of
 from baselines.purejaxrl_ppo.export_onnx import onnx_of
 from baselines.purejaxrl_ppo.export_policy import policy_of
@@ -26,11 +27,11 @@ class ExportSettings:
 
     checkpoint: tyro.conf.Positional[Path]
     """Checkpoint of a training: final.safetensors."""
-    onnx: Path | None = None
+    onnx: OptionalPath = None
     """Write an ONNX file."""
-    c: Path | None = None
+    c: OptionalPath = None
     """Write a C99 header."""
-    track: str | None = None
+    track: OptionalName = None
     """Name or file of the track whose gates are built in; by default the checkpoint's."""
     float64: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Compute in float64 inside the ONNX file: it rounds less, but not every runtime can."""

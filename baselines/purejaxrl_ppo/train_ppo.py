@@ -9,7 +9,7 @@ from typing import Annotated, Any, NamedTuple, NoReturn
 import tyro
 
 from baselines.purejaxrl_ppo.checkpoint import CheckpointError
-from baselines.purejaxrl_ppo.config import Config, Count, settings_in_file
+from baselines.purejaxrl_ppo.config import Config, Count, OptionalInt, OptionalPath, settings_in_file
 from baselines.purejaxrl_ppo.resume import (
     FINAL,
     Start,
@@ -50,9 +50,9 @@ def parse_rewards(words: Sequence[str]) -> dict[str, float]:
 class Sources:
     """What decides the defaults of all other settings, and is read before them."""
 
-    config: Path | None = None
+    config: OptionalPath = None
     """TOML file of hyperparameters; flags override it."""
-    resume: Path | None = None
+    resume: OptionalPath = None
     """Continue from a checkpoint, from a folder's newest intact one, or with all seeds in a folder of
     seed<N>. What is not given is as it was."""
 
@@ -65,7 +65,7 @@ class Settings(Sources):
     """Id of the environment."""
     track: str = "flytrack"
     """Name of a track, or path of its file."""
-    model: Path | None = None
+    model: OptionalPath = None
     """Model file; by default the nominal model."""
     reward: tuple[str, ...] = ()
     """Weights of reward terms, TERM=WEIGHT (docs/envs); the others are default."""
@@ -73,9 +73,9 @@ class Settings(Sources):
     """First seed."""
     num_seeds: int = 1
     """Train so many seeds, each in OUT/seed<N>."""
-    seeds_at_once: int | None = None
+    seeds_at_once: OptionalInt = None
     """So many of them side by side in one program; by default all. On a CPU, 1 is fastest."""
-    out: Path | None = None
+    out: OptionalPath = None
     """Folder; by default runs/train, or that of --resume."""
     checkpoint_every: Count = DEFAULTS.checkpoint_every or 0
     """Write step_<N>.safetensors every so many environment steps; 0: only at the end."""
