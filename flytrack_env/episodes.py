@@ -120,8 +120,8 @@ class EpisodicEnvironment(environment.Environment[Any, EnvParams]):  # type: ign
 
     def __repr__(self) -> str:
         effects = ", ".join(effect_of(one).name for one in self.default_params.model.effects) or "none"
-        size, plant = self.observation_space().shape[0], type(self.plant).__name__
-        return f"<{self.env_id}: track {self.track.name}, plant {plant}, effects {effects}, observation size {size}>"
+        track, plant, size = self.track.name, type(self.plant).__name__, self.observation_space().shape[0]
+        return f"<{self.env_id}: track {track}, plant {plant}, effects {effects}, observation size {size}>"
 
     @property
     def num_actions(self) -> int:
