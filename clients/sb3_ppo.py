@@ -17,8 +17,7 @@ RETURN_MARGIN, GATE_MARGIN = 10.0, 4.0  # 0.4 of the worst of five seeds: docs/r
 
 def make_envs(num_envs: int) -> VecMonitor:
     """Return environments side by side for Stable-Baselines3, with its log of returns."""
-    env_id, mode = "flytrack_env:FlyTrack-v0", "vector_entry_point"
-    envs = gymnasium.make_vec(env_id, num_envs, vectorization_mode=mode)
+    envs = gymnasium.make_vec("flytrack_env:FlyTrack-v0", num_envs, autoreset_mode="SameStep")
     return VecMonitor(SameStepVecEnv(envs))
 
 

@@ -6,7 +6,7 @@ compiled step, the numbers of a picture; ``FlightLog`` collects such rows; ``mak
 
 from typing import TYPE_CHECKING
 
-from flytrack_env.extras import check_installed
+from flytrack_env.extras import check_installed, is_installed
 from flytrack_env.rendering.flight_log import SCENE_SIZE, FlightLog, scene_row
 from flytrack_env.tracks import Course
 
@@ -14,7 +14,12 @@ if TYPE_CHECKING:
     from flytrack_env.rendering.views import Renderer
     from flytrack_env.rendering.window import Window
 
-__all__ = ["SCENE_SIZE", "FlightLog", "make_renderer", "open_window", "scene_row"]
+__all__ = ["SCENE_SIZE", "FlightLog", "can_render", "make_renderer", "open_window", "scene_row"]
+
+
+def can_render(mode: str) -> bool:
+    """Return whether what a render mode, "rgb_array" or "human", needs is installed."""
+    return is_installed("PIL") and (mode != "human" or is_installed("pygame"))
 
 
 def make_renderer(course: Course) -> "Renderer":
