@@ -20,12 +20,11 @@ nox.options.sessions = ["lint", "docs"]
 nox.options.error_on_missing_interpreters = False
 
 ROOT = Path(__file__).parent
-PACKAGES = ("baselines", "flytrack_env", "flytrack_loop", "flytrack_sysid")
+PACKAGES = ("baselines/", *(f"flytrack{name}/" for name in ("", "_bench", "_env", "_loop", "_sysid")))
 CLONE_ONLY = "firmware/"
 HEADLESS = {"JAX_PLATFORMS": "cpu", "MPLBACKEND": "agg", "SDL_VIDEODRIVER": "dummy", "PYTHONPATH": ""}
 TEST_TOOLS = ("pytest>=9", "hypothesis>=6.150", "pillow", "pyulog>=1.2", "orangebox>=0.4,<0.5")
 CHAMPION = ROOT / "baselines" / "purejaxrl_ppo" / "champion" / "flytrack.safetensors"
-PLANT = ROOT / "blackbox" / "acro_step.bin"
 
 FLY_EVERY_ID = """
 import gymnasium, gymnax, jax, flytrack_env
@@ -67,26 +66,33 @@ for env in (RecordVideo(film, "videos", lambda number: True, video_length=30), w
 """
 SIZES = "--num-envs 16 --num-steps 32 --num-minibatches 4 --total-timesteps 1024 --hidden-sizes 8"
 
-# What each extra is for: modules with their arguments, or code. [speed] compiles for ten minutes, in 4 GB.
+# What each extra is for: commands, or code. [speed] compiles for ten minutes, in 4 GB.
 USES = {
-    "": (FLY_EVERY_ID, MISSING_EXTRA_IS_NAMED),
-    "train": (f"-m baselines.purejaxrl_ppo.train_ppo {SIZES} --out small", LOAD_CHAMPION),
+    "": (
+        FLY_EVERY_ID,
+        MISSING_EXTRA_IS_NAMED,
+        "flytrack --help",
+        "flytrack demo --help",
+        "flytrack train --help",
+    ),
+    "train": (
+        f"flytrack train {SIZES} --out small",
+        "flytrack demo --quick",
+        f"flytrack eval --checkpoint {CHAMPION} --steps 300",
+        LOAD_CHAMPION,
+    ),
     "sysid": (
-        f"-m flytrack_sysid.cli collect --black-box {PLANT} --minutes 1 --out data.npz",
-        "-m flytrack_sysid.cli fit data.npz --out model.json",
-        "-m flytrack_sysid.cli validate model.json data.npz --out report",
-        "-m flytrack_sysid.cli diagnose data.npz --model model.json --out diagnosis",
+        "flytrack collect --minutes 1 --out data.npz",
+        "flytrack fit data.npz --out model.json",
+        "flytrack validate model.json data.npz --out report",
+        "flytrack diagnose data.npz --model model.json --out diagnosis",
     ),
-    "logs": ("-m pytest -q -k 'ulog or betaflight' tests/unit",),
-    "bags": ("-m pytest -q -k import_bag tests/unit",),
-    "viz": (
-        SAVE_GHOST,
-        "-m flytrack_env.viz_rerun flight.npy --out flight.rrd",
-        "-m flytrack_env.pictures flight.npy --out pictures",
-    ),
+    "logs": ("python -m pytest -q -k 'ulog or betaflight' tests/unit",),
+    "bags": ("python -m pytest -q -k import_bag tests/unit",),
+    "viz": (SAVE_GHOST, "flytrack show flight.npy"),
     "render": (RENDER,),
-    "export": (f"-m baselines.purejaxrl_ppo.export {CHAMPION} --onnx policy.onnx --c policy.h",),
-    "optimal": ("-m benchmarks.time_optimal --tracks speedway --kinds flying --out made",),
+    "export": (f"flytrack export {CHAMPION} --onnx policy.onnx --c policy.h",),
+    "optimal": ("python -m benchmarks.time_optimal --tracks speedway --kinds flying --out made",),
     "speed": ("from benchmarks.env_speed import l2f_contestant as l2f; l2f('l2f', 1024, 8).run()",),
 }
 WITH_CHECKOUT = ("logs", "bags", "optimal", "speed")  # use files that the wheel does not have:
@@ -133,8 +139,8 @@ def wheel(session: nox.Session, extra: str) -> None:
         copy(ROOT / name, folder / name)
     with session.chdir(folder):
         for use in USES[extra]:
-            arguments = shlex.split(use) if use.startswith("-m ") else ["-c", use]
-            session.run("python", *arguments, env=HEADLESS)
+            is_command = use.startswith(("flytrack ", "python "))
+            session.run(*(shlex.split(use) if is_command else ("python", "-c", use)), env=HEADLESS)
 
 
 @nox.session(tags=["versions"], python=["3.11", "3.12", "3.13"])

@@ -19,13 +19,14 @@ import jax.numpy as jnp
 import flytrack_env
 from baselines.purejaxrl_ppo import Config, load_checkpoint
 from baselines.purejaxrl_ppo.checkpoint import save_checkpoint
-from baselines.purejaxrl_ppo.evaluate import SHIPPED_BLACK_BOX, EvaluationSettings, Report, evaluate
+from baselines.purejaxrl_ppo.evaluate import EvaluationSettings, Report, evaluate
 from baselines.purejaxrl_ppo.plants import draw_model
 from baselines.purejaxrl_ppo.polish import Settings, polish
 from baselines.purejaxrl_ppo.training import train_policy
 from benchmarks import report
+from flytrack_env import blackbox
 from flytrack_env.files import write_atomically
-from flytrack_sysid.progress import ProgressBar
+from flytrack_env.progress import ProgressBar
 
 FOLDER = report.ROOT / "baselines" / "purejaxrl_ppo" / "champion"
 CHAMPION = FOLDER / "flytrack.safetensors"
@@ -104,7 +105,7 @@ class Flown(NamedTuple):
 def fly(policy: Path, recipe: Recipe) -> Flown:
     """Return the flights of a policy: on the black box, or one on each drawn plant."""
     episodes, plants = (1, FLIGHTS) if recipe.is_robust else (FLIGHTS, None)
-    black_box = None if recipe.is_robust else SHIPPED_BLACK_BOX
+    black_box = None if recipe.is_robust else blackbox.SHIPPED
     settings = EvaluationSettings(
         policy, STEPS, episodes, LAPS, plants=plants, black_box=black_box, seed=FLIGHT_SEED, ghost=True
     )
@@ -161,7 +162,7 @@ def section_of(name: str, seeds: list[int]) -> tuple[str, bool]:
         f"{polished}. Shipped: seed {best.found.checkpoint.meta['seed']}. Aim: at most {recipe.aim:g} times "
         f"the time-optimal flying lap, at least {recipe.success:.0%} of {FLIGHTS} flights finish.",
         report.table(HEADER, [row_of(seed, *pair) for seed, pair in zip(seeds, flown, strict=True)]),
-        f"`python eval_agent.py --checkpoint {path} --steps {STEPS} {asked} --laps {LAPS} "
+        f"`flytrack eval --checkpoint {path} --steps {STEPS} {asked} --laps {LAPS} "
         f"--seed {FLIGHT_SEED} --ghost`:",
         "```\n" + best.found.text.replace(f"{report.ROOT}/", "") + "```",
     ]

@@ -2,7 +2,7 @@
 
 ``--draw`` draws the tracks and hidden plants of suite v1 from its seed and writes them; a test compares them
 with those that are shipped. ``--page`` writes docs/benchmark.md of the results in docs/results/suite, which
-``python -m flytrack_bench`` wrote.
+``flytrack bench`` wrote.
 """
 
 import argparse

@@ -30,7 +30,6 @@ from flytrack_env.references import (
 )
 from flytrack_env.resets import STILL_THRUST
 
-SHIPPED_BLACK_BOX = Path(__file__).parents[1] / "blackbox" / "acro_step.bin"
 NOMINAL, BLACK_BOX = "nominal", "black_box"
 LARGEST_ERROR_S = 1e-3  # s, of the replay's time
 
@@ -111,7 +110,7 @@ def verify(folder: Path, tracks: list[Track]) -> tuple[list[tuple[Reference, str
     Raises:
         ReferenceFileError, TrackError: a file that cannot be used, or no references.
     """
-    plant = blackbox.load(SHIPPED_BLACK_BOX)
+    plant = blackbox.load(blackbox.SHIPPED)
     replays, is_good = [], True
     references = list(map(load_reference, folder.glob("*.npz")))
     if not references:

@@ -1,4 +1,4 @@
-"""Build and try the firmware: ``python -m firmware build [--sdist FILE]``, ``python -m firmware check``."""
+"""Build and try the firmware: ``flytrack firmware build [--sdist FILE]``, ``flytrack firmware check``."""
 
 import argparse
 import sys
@@ -13,7 +13,7 @@ from firmware.errors import FirmwareError
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Do as the command line says; return the exit status."""
-    parser = argparse.ArgumentParser(prog="python -m firmware", description="Betaflight in the loop.")
+    parser = argparse.ArgumentParser(prog="flytrack firmware", description="Betaflight in the loop.")
     commands = parser.add_subparsers(required=True, dest="command")
     commands.add_parser("check", help="fly a fixed set of flights twice: their hash, and the speed")
     command = commands.add_parser("build", help="download by hash and compile, in the user's cache folder")
@@ -25,7 +25,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         else:
             build(partial(print, flush=True), asked.sdist)
     except (FirmwareError, OSError) as error:
-        print(f"error: {error}", file=sys.stderr)
+        print(f"flytrack firmware: error: {error}", file=sys.stderr)
         return 2
     return 0
 

@@ -66,7 +66,7 @@ def find_executable() -> Path:
     """Return the firmware's program; FirmwareError if it is not built."""
     path = cache_folder() / NAME
     if not path.is_file():
-        raise FirmwareError("firmware: not built; build it by `python -m firmware build`")
+        raise FirmwareError("firmware: not built; build it by `flytrack firmware build`")
     return path
 
 

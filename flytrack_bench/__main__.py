@@ -1,4 +1,4 @@
-"""``python -m flytrack_bench``: the command without ``flytrack``."""
+"""``flytrack bench``: the command without ``flytrack``."""
 
 from flytrack_bench.cli import main
 

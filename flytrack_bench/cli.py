@@ -17,7 +17,7 @@ from flytrack_bench.results import differences, run
 from flytrack_bench.suite import Suite, SuiteError, load_suite
 from flytrack_env.files import read_at_most, write_atomically
 from flytrack_env.messages import error_text
-from flytrack_sysid.progress import ProgressBar
+from flytrack_env.progress import ProgressBar
 
 MOST_BYTES = 2**24
 VERIFIED = 3  # tasks of a result that are flown again

@@ -52,7 +52,8 @@ from flytrack_env.state import (
 DT = 0.01  # s, baked into every artifact
 MAX_FILE_BYTES = 64 * 2**20
 MAX_RATE_DEG_S = (618.0, 618.0, 120.0)
-SHIPPED_SHA256 = "c05e6c001da095b5b0434f7bbc4df90e7d01e548f56eb8e03a615383e383aedd"  # blackbox/acro_step.bin
+SHIPPED = Path(__file__).with_name("acro_step.bin")  # in the repository a link to blackbox/acro_step.bin
+SHIPPED_SHA256 = "c05e6c001da095b5b0434f7bbc4df90e7d01e548f56eb8e03a615383e383aedd"
 
 # Components of the handout's 21 that an 18-component artifact has: all but the rate actions.
 _REDUCED = np.r_[0:16, 19:21]

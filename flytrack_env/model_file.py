@@ -129,6 +129,10 @@ def model_from_json(data: dict[str, Any], path: str | Path) -> ModelParameters:
             f"{path}: version: found {quote_value(version)}, expected {MODEL_FILE_VERSION}{why}"
         )
     values = _object(f"{path}: parameters", data.get("parameters", data))
+    if not SIZES.keys() & values.keys():
+        fields = ", ".join(map(quote_name, [*data][:4])) or "nothing"
+        expected = "a model file, as `flytrack fit` and `flytrack diagnose` write it"
+        raise ModelFileError(f"{path}: found other JSON ({fields}), expected {expected}")
     for name in SIZES:
         if name not in values:
             raise ModelFileError(f"{path}: {name}: missing")

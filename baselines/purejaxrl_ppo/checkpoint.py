@@ -182,6 +182,11 @@ def load_checkpoint(path: str | Path) -> Checkpoint:
             network that the file describes.
     """
     path = Path(path)
+    if path.is_dir():
+        found = ", ".join(sorted(file.name for file in path.glob(f"*{SUFFIX}"))) or "none is in it"
+        raise CheckpointError(
+            f"{path}: found a folder, expected a checkpoint file, as {path}/final{SUFFIX}: {found}"
+        )
     meta, arrays = _read_file(path)
     if meta["format"] != FORMAT:
         raise CheckpointError(f"{path}: format: found {quote_value(meta['format'])}, expected {FORMAT!r}")

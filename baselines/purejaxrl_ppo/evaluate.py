@@ -27,7 +27,8 @@ from baselines.purejaxrl_ppo.report import describe_flight, describe_report
 from baselines.purejaxrl_ppo.summary import compare_with_optimum, summarise, time_lost
 from flytrack_env import EnvParams, blackbox
 from flytrack_env.episodes import EpisodicEnvironment
-from flytrack_env.files import write_atomically
+from flytrack_env.files import fresh_folder, write_atomically
+from flytrack_env.progress import ProgressBar
 from flytrack_env.references import (
     ReferenceFileError,
     References,
@@ -37,8 +38,8 @@ from flytrack_env.references import (
 )
 from flytrack_env.rollout import save_rollout
 
-SHIPPED_BLACK_BOX = Path(__file__).parents[2] / "blackbox" / "acro_step.bin"  # in a checkout
 SCHEMA = 1
+DEFAULT_OUT = Path("runs/eval")
 DEFAULT_LAPS = 3
 MAX_SEED = 2**31
 MAX_STEPS = 1_000_000  # hours: the battery is empty after minutes
@@ -50,7 +51,7 @@ BLACK_BOX_MODELS, NOMINAL_MODELS = ("black_box", "nominal"), ("nominal",)
 
 @dataclasses.dataclass(frozen=True)
 class EvaluationSettings:
-    """What is flown, and what is written; the fields are the flags of ``eval_agent.py``."""
+    """What is flown, and what is written; the fields are the flags of ``flytrack eval``."""
 
     checkpoint: Path
     """Checkpoint of a training: final.safetensors."""
@@ -67,11 +68,12 @@ class EvaluationSettings:
     track: str | None = None
     """Name or file of a track; by default the checkpoint's."""
     seed: int = 0
-    """Of the noisy starts and of the plants."""
+    """Seed of the noisy starts and of the plants."""
     ghost: bool = False
     """Compare with the time-optimal flight, and write it beside the rollout."""
-    out: Path = Path("rollout.npy")
-    """Rollout of the first flight, rows [x 21 | u 4]."""
+    out: Path | None = None
+    """Rollout of the first flight, rows [x 21 | u 4]; by default runs/eval/rollout.npy, or that of the next
+    free folder."""
     rrd: Path | None = None
     """Write a Rerun recording of the first flight."""
     json: Path | None = None
@@ -86,11 +88,6 @@ class EvaluationSettings:
     def num_laps(self) -> int | None:
         """Laps to complete; None: no limit."""
         return DEFAULT_LAPS if self.laps is None and not self.is_single else self.laps
-
-    @property
-    def ghost_path(self) -> Path:
-        """Where the time-optimal flight is written."""
-        return self.out.with_name(f"{self.out.stem}_ghost.npy")
 
     def check(self) -> None:
         """Raise ValueError, naming the flag, for settings that cannot be used."""
@@ -109,12 +106,18 @@ class EvaluationSettings:
                 raise ValueError(f"--{name}: found {value}, expected {low} to {high}")
         if self.rrd is not None and not can_record():
             raise ValueError(f"--rrd: {CANNOT_RECORD}")
-        outputs = (self.out, self.ghost_path, self.rrd, self.json)
-        used = [path.resolve() for path in (self.checkpoint, self.black_box, *outputs) if path is not None]
+        ghost = None if self.out is None else ghost_path(self.out)
+        paths = (self.checkpoint, self.black_box, self.out, ghost, self.rrd, self.json)
+        used = [path.resolve() for path in paths if path is not None]
         if len(set(used)) < len(used):
             raise ValueError(
                 "--out, --rrd, --json: found a file that is read or written twice, expected another"
             )
+
+
+def ghost_path(rollout: Path) -> Path:
+    """Return where the time-optimal flight beside a rollout is written."""
+    return rollout.with_name(f"{rollout.stem}_ghost.npy")
 
 
 class Scene(NamedTuple):
@@ -151,18 +154,22 @@ class Report(NamedTuple):
         Raises:
             OSError, ValueError: a file that cannot be written.
         """
-        settings = self.settings
-        save_flight(settings.out, self.rollout)
-        lines = [f"rollout: {settings.out}"]
+        settings, ghost = self.settings, None
+        rollout = settings.out or fresh_folder(DEFAULT_OUT) / "rollout.npy"
+        save_flight(rollout, self.rollout)
+        lines = [f"rollout: {rollout}"]
         if settings.ghost and self.scene.references is not None:
             num_steps = int(np.sum(self.rollout.is_flying))
-            save_rollout(settings.ghost_path, *ghost_rollout(self.scene.references, num_steps))
-            lines.append(f"ghost: {settings.ghost_path}")
+            ghost = ghost_path(rollout)
+            save_rollout(ghost, *ghost_rollout(self.scene.references, num_steps))
+            lines.append(f"ghost: {ghost}")
         if settings.rrd is not None:
-            names = ", ".join(self.record(settings.rrd, with_ghost=settings.ghost))
-            lines.append(f"recording: {settings.rrd}, {names}: {settings.rrd.stat().st_size} bytes")
+            shown = ", ".join(self.record(settings.rrd, with_ghost=settings.ghost))
+            lines.append(f"recording: {settings.rrd}, {shown}: {settings.rrd.stat().st_size} bytes")
         if settings.json is not None:
-            content = json.dumps(self.numbers, indent=2, allow_nan=False) + "\n"
+            files = {"rollout": rollout, "ghost": ghost, "recording": settings.rrd}
+            names = {name: None if path is None else str(path) for name, path in files.items()}
+            content = json.dumps(self.numbers | names, indent=2, allow_nan=False) + "\n"
             write_atomically(settings.json, content.encode())
             lines.append(f"json: {settings.json}")
         return lines
@@ -200,14 +207,14 @@ def evaluate(settings: EvaluationSettings) -> Report:
 
 def reference_models(black_box: Path) -> tuple[str, ...]:
     """Return the models whose time-optimal flights a black box is compared with, in order of preference."""
-    is_shipped = SHIPPED_BLACK_BOX.exists() and black_box.read_bytes() == SHIPPED_BLACK_BOX.read_bytes()
+    is_shipped = black_box.read_bytes() == blackbox.SHIPPED.read_bytes()
     return BLACK_BOX_MODELS if is_shipped else NOMINAL_MODELS
 
 
 def make_scene(checkpoint: Checkpoint, settings: EvaluationSettings) -> Scene:
     """Return what the settings ask to fly."""
     if settings.plants is None:
-        black_box = settings.black_box or SHIPPED_BLACK_BOX
+        black_box = settings.black_box or blackbox.SHIPPED
         env, plants = plant_env(checkpoint, blackbox.load(black_box), settings.track), None
         models = reference_models(black_box)
     else:
@@ -236,7 +243,8 @@ def fly_scene(scene: Scene, checkpoint: Checkpoint, settings: EvaluationSettings
     models = None if plants is None else plants.repeated(settings.episodes)
     num_laps = settings.num_laps or settings.steps
     policy = (checkpoint.network, checkpoint.params)
-    return race_many(env, *policy, _keys(settings), settings.steps, num_laps, params, models), rollout
+    keys, report = _keys(settings), ProgressBar("flights")
+    return race_many(env, *policy, keys, settings.steps, num_laps, params, models, report), rollout
 
 
 def _keys(settings: EvaluationSettings) -> jax.Array:
@@ -265,7 +273,7 @@ def make_numbers(
         "env_id": checkpoint.env_id,
         "track": scene.env.track.name,
         "gates_per_lap": len(scene.env.track.gates),
-        "black_box": None if plants is not None else str(settings.black_box or SHIPPED_BLACK_BOX),
+        "black_box": None if plants is not None else str(settings.black_box or blackbox.SHIPPED),
         "seed": settings.seed,
         "steps_limit": settings.steps,
         "laps": settings.num_laps,
@@ -290,6 +298,4 @@ def make_numbers(
         "lap_times_s": rollout.lap_times().tolist(),
         "ended": rollout.end_reason(settings.num_laps),
     }
-    files = {"rollout": settings.out, "ghost": settings.ghost_path if settings.ghost else None}
-    files["recording"] = settings.rrd
-    return numbers | {name: None if path is None else str(path) for name, path in files.items()}
+    return numbers

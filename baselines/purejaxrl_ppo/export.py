@@ -1,4 +1,4 @@
-"""Write a policy for the drone itself: ``python -m baselines.purejaxrl_ppo.export CHECKPOINT --c policy.h``.
+"""Write a policy for the drone itself: ``flytrack export CHECKPOINT --c policy.h``.
 
 The files take the drone's state and the gate to fly, and give the stick commands (docs/export.md).
 """
@@ -17,7 +17,7 @@ from baselines.purejaxrl_ppo.export_onnx import onnx_of
 from baselines.purejaxrl_ppo.export_policy import policy_of
 from flytrack_env.files import write_atomically
 
-PROG = "export"
+PROG = "flytrack export"
 
 
 @dataclasses.dataclass(frozen=True)

@@ -319,11 +319,13 @@ def race_many(
     num_laps: int,
     params: EnvParams | None = None,
     models: ModelParameters | None = None,
+    report: Callable[[int, int], None] | None = None,
 ) -> Outcomes:
     """Return the outcomes of flights from noisy start poses, one per key, as NumPy arrays.
 
     num_steps: time limit of each. params: of the environment, its default if None. models: a simulated
-    drone for each flight, leaves (num_flights, ...); None: that of the parameters, or a black box.
+    drone for each flight, leaves (num_flights, ...); None: that of the parameters, or a black box. report:
+    called with the flights flown and all of them.
     """
     params = start_pose_params(env.default_params if params is None else params, num_steps)
     num_flights = len(keys)
@@ -336,4 +338,6 @@ def race_many(
         batch = _race_batch(env, network, policy_params, keys[rows], params, own, num_steps, num_laps)
         parts.append(jax.tree.map(np.asarray, batch))
         env.plant.check_alive()
+        if report is not None:
+            report(min(first + size, num_flights), num_flights)
     return jax.tree.map(lambda *leaves: np.concatenate(leaves)[:num_flights], *parts)

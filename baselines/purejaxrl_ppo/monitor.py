@@ -8,12 +8,12 @@ from typing import Any
 
 import jax
 import numpy as np
-from tqdm import tqdm
 
 from baselines.purejaxrl_ppo.density import draw_position_density
 from baselines.purejaxrl_ppo.flights import Outcomes, fly_many, outcomes_of, save_flight, score
 from baselines.purejaxrl_ppo.networks import ActorCritic
 from baselines.purejaxrl_ppo.recording import can_record, record_flights
+from flytrack_env.progress import progress_bar
 
 NUM_LAPS = 3
 NUM_STEPS = 2500  # 25 s at 100 Hz: three laps of the slowest shipped track, flown by a beginner
@@ -92,7 +92,7 @@ class ProgressLine:
     """One line: steps, rate, time left, mean return of the last episodes, success, best lap so far."""
 
     def __init__(self, total: int, done: int):
-        self._bar = tqdm(total=total, initial=done, unit="step", unit_scale=True, desc="compile")
+        self._bar = progress_bar("steps", total=total, initial=done, unit_scale=True, desc="compile")
 
     def begin(self) -> None:
         """Start the clock, now that everything is compiled."""

@@ -1,4 +1,4 @@
-"""Train PPO on a FlyTrack environment: ``python -m baselines.purejaxrl_ppo.train_ppo`` (docs/baseline.md)."""
+"""Train PPO on a FlyTrack environment: ``flytrack train`` (docs/baseline.md)."""
 
 import dataclasses
 import sys
@@ -26,7 +26,7 @@ from baselines.purejaxrl_ppo.training import Task, Trainer
 from flytrack_env.messages import error_text
 from flytrack_env.model_file import model_from_json
 
-PROG = "train_ppo"
+PROG = "flytrack train"
 MAX_SEED = 2**31
 INTERRUPTED = 130  # what shells return for a command that Ctrl-C ended
 DEFAULT_OUT = Path("runs/train")
@@ -259,11 +259,11 @@ def leave(status: int, text: str) -> NoReturn:
     raise SystemExit(status)
 
 
-def main() -> None:
+def main(arguments: Sequence[str] | None = None) -> None:
     """Train as the command line says."""
     error = f"{PROG}: error:"
     try:
-        plan = make_plan(sys.argv[1:])
+        plan = make_plan(sys.argv[1:] if arguments is None else arguments)
     except (ValueError, OverflowError, OSError) as found:
         leave(2, f"{error} {found}")
     try:

@@ -62,12 +62,11 @@ def train_shared(job: str, out: Path, steps: int, seed: int) -> dict[str, Any]:
 
 def make_plant(job: str, seed: int) -> tuple[Any, str]:
     """Return the plant of a job, and its hidden effects as text."""
-    from baselines.purejaxrl_ppo.evaluate import SHIPPED_BLACK_BOX
     from benchmarks.loop.plants import draw_plant, draw_plant_with_law, plant_of
     from flytrack_env import blackbox
 
     if job == "shipped":
-        return blackbox.load(SHIPPED_BLACK_BOX), "the shipped black box"
+        return blackbox.load(blackbox.SHIPPED), "the shipped black box"
     if job.startswith(LAW):
         truth = draw_plant_with_law(int(job.removeprefix(LAW)), seed)
     else:

@@ -1,6 +1,6 @@
 """Recorded flights as PNG and GIF files, without a viewer and without a display.
 
-``python -m flytrack_env.pictures`` draws rollout files. Needs the extra ``flytrack[viz]``, and
+``flytrack show`` draws rollout files. Needs the extra ``flytrack[viz]``, and
 ``flytrack[render]`` for animations; importing this package does not.
 """
 

@@ -1,74 +1,135 @@
-"""The commands that README and quick start name have these flags, and refuse bad values in one line."""
+"""The command ``flytrack``: flags in the docs exist, every flag has its help, a missing extra is named."""
 
 import contextlib
 import io
 import re
-import runpy
 import shlex
+import subprocess
 import sys
-import warnings
+import time
 from functools import cache
+from pathlib import Path
 
 import pytest
 
-from flytrack_sysid.cli import main as sysid_main
+from flytrack.cli import COMMANDS, SHELLS, main
+from flytrack.flags import Fit
+from flytrack_sysid.split import HELD_OUT_EVERY
 from tests.support.pages import ROOT, commands
+from tests.support.slow import slow_but
 
 PAGES = ("README.md", "docs/quick_start.md")
-COMMANDS = sorted({line for page in PAGES for line in commands((ROOT / page).read_text(encoding="utf-8"))})
-
-
-def run(arguments: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
-    """Run a module (-m), a script, or flytrack-sysid in this process, in the repository's folder."""
-    monkeypatch.chdir(ROOT)
-    program, *rest = arguments[1:] if arguments[0] == "-m" else arguments
-    monkeypatch.setattr(sys, "argv", [program, *rest])
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RuntimeWarning)  # runpy: the module is imported already
-        if program == "flytrack-sysid":
-            sysid_main()
-        elif arguments[0] == "-m":
-            runpy.run_module(program, run_name="__main__")
-        else:
-            runpy.run_path(str(ROOT / program), run_name="__main__")
+LINES = sorted({line for page in PAGES for line in commands((ROOT / page).read_text(encoding="utf-8"))})
+# A flag, what it takes, and its help: two spaces or a new line part them.
+ENTRY = re.compile(r"^ *((?:-\w, )?--[a-z].*?)(?: {2,}|\n)(.*?)(?=^ *(?:-\w, )?--[a-z]|\Z)", re.M | re.S)
+WITHOUT = """
+import sys
+from importlib.machinery import PathFinder
+find = PathFinder.find_spec
+blocked = set(sys.argv.pop(1).split(","))
+PathFinder.find_spec = lambda name, *more: None if name.split(".")[0] in blocked else find(name, *more)
+from flytrack.cli import main
+main(sys.argv[1:])
+"""
 
 
 @cache
 def help_of(*arguments: str) -> str:
-    """Return what a command prints when it is asked for help."""
+    """Return what a command prints when it is asked for help, without the boxes."""
     text = io.StringIO()
     with pytest.MonkeyPatch.context() as monkeypatch, contextlib.redirect_stdout(text):
         monkeypatch.setenv("COLUMNS", "200")
-        with pytest.raises(SystemExit) as stopped:
-            run([*arguments, "--help"], monkeypatch)
-    assert stopped.value.code == 0
-    return text.getvalue()
+        with contextlib.suppress(SystemExit):  # argparse and tyro exit with 0
+            main([*arguments, "--help"])
+    return re.sub(r"[│╭╮╰╯─]", "", text.getvalue())
 
 
-@pytest.mark.parametrize("command", COMMANDS)
-def test_a_command_and_its_flags_exist(command: str) -> None:
-    words = shlex.split(command)
+@pytest.mark.parametrize("line", LINES)
+def test_a_command_of_the_docs_and_its_flags_exist(line: str) -> None:
+    words = shlex.split(line)
     if words[0] == "make":
         assert re.search(rf"^{words[1]}:", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE)
-    elif words[0] != "mlflow":
-        words = words[1:] if words[0] == "python" else words
-        text = help_of(*words[: 1 if words[0].endswith(".py") else 2])
+    elif words[0] == "flytrack" and words[1] in COMMANDS:
         flags = [word for word in words if word.startswith("--")]
+        text = help_of(words[1])
         assert all(re.search(rf"{flag}\b", text) for flag in flags), text
+    else:
+        assert words[0] in ("mlflow", "rerun", "flytrack"), line
+
+
+@pytest.mark.parametrize("name", [*COMMANDS, "", "firmware build"])
+def test_every_flag_says_what_it_does(name: str) -> None:
+    entries = ENTRY.findall(help_of(*name.split()))
+    bare = [flag for flag, text in entries if not re.search(r"[a-z]{2}", re.sub(r"\([^()]*\)", "", text))]
+    assert not bare, bare
+    assert entries or name in ("firmware", "fly") or "cannot be shown" in help_of(name)
+
+
+@pytest.mark.parametrize(
+    "name",
+    slow_but(["demo", "train", "collect"], [name for name, command in COMMANDS.items() if command.extra]),
+)
+def test_without_its_extra_a_command_helps_and_says_what_to_install(name: str, tmp_path: Path) -> None:
+    def run(*words: str) -> subprocess.CompletedProcess[str]:
+        blocked = "tqdm,matplotlib,rerun,optax,distrax,onnx,safetensors,mlflow"
+        command = [sys.executable, "-c", WITHOUT, blocked, name, *words]
+        env = {"PYTHONPATH": str(ROOT), "PATH": "", "HOME": str(tmp_path), "JAX_PLATFORMS": "cpu"}
+        return subprocess.run(command, cwd=tmp_path, env=env, capture_output=True, text=True)
+
+    command, shown = COMMANDS[name], run("--help")
+    assert shown.returncode == 0 and not shown.stderr
+    assert command.summary in shown.stdout
+    is_absent = "not in this version" in shown.stdout
+    assert is_absent or f"pip install 'flytrack[{command.extra}]'" in shown.stdout
+    if name in ("collect", "demo"):
+        assert "--seed INT" in shown.stdout
+    words = {"fit": ["log", "--out", "o"], "validate": ["m", "l", "--out", "o"], "plan": ["d", "--out", "o"]}
+    words |= {"collect": ["--out", "o"], "diagnose": ["log", "--out", "o"]}
+    words |= {"import": ["f", "--format", "csv", "--out", "o"]}
+    ended = run(*words.get(name, []))
+    assert ended.returncode == 2 and ended.stderr.count("\n") == 1 and not any(tmp_path.glob("o*"))
+    how = "not in this version" if is_absent else f"pip install 'flytrack[{command.extra}]'"
+    assert ended.stderr.startswith(f"flytrack {name}: error: ") and how in ended.stderr
+
+
+def test_the_list_of_commands_is_quick_and_the_version_that_of_the_package(capsys) -> None:
+    started = time.perf_counter()
+    code = "import sys; from flytrack.cli import main\ntry: main(['--help'])\nfinally: print([*sys.modules])"
+    shown = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True).stdout
+    assert time.perf_counter() - started < 5.0  # 0.1 s, on a machine that does nothing else
+    assert all(f"\n    {name} " in shown and command.summary in shown for name, command in COMMANDS.items())
+    assert "'argparse'" in shown and not re.search(r"'(jax|numpy|tyro)'", shown)
+    with pytest.raises(SystemExit, match="2"):
+        main(["land"])
+    refusal = capsys.readouterr().err
+    assert all(name in refusal for name in ("land", *COMMANDS))
+    assert Fit(Path(), Path()).hold_out_every == HELD_OUT_EVERY
+
+
+@pytest.mark.parametrize("shell", SHELLS)
+def test_shells_complete_commands_and_flags(shell: str, capsys) -> None:
+    with contextlib.suppress(SystemExit):
+        main(["--print-completion", shell])
+    script = capsys.readouterr().out
+    assert all(word in script for word in (*COMMANDS, "--noise", "total-timesteps")), script[:2000]
 
 
 @pytest.mark.parametrize(
     ("command", "message"),
     [
-        ("eval_agent.py --steps 5 --checkpoint missing", "missing"),
-        ("demo.py --black-box missing.bin", "missing.bin"),
-        ("demo.py --total-timesteps 10", "total_timesteps|total-timesteps"),
+        ("eval --steps 5 --checkpoint missing", "missing"),
+        ("eval --steps 5 --checkpoint baselines/purejaxrl_ppo/champion", "found a folder.*flytrack.safe"),
+        ("demo --black-box missing.bin", "missing.bin"),
+        ("demo --total-timesteps 10", "total_timesteps"),
+        ("train --model benchmarks/data/real/gecko_diagnosis.json", r"other JSON \(.*expected a model file"),
+        ("train --model docs", "docs: cannot be read: found a folder"),
     ],
 )
 def test_a_bad_value_ends_a_command_before_any_work(command, message, tmp_path, monkeypatch, capsys) -> None:
+    monkeypatch.chdir(ROOT)
     out = tmp_path / "out"
-    with pytest.raises(SystemExit) as stopped:
-        run([*shlex.split(command), "--out", str(out)], monkeypatch)
+    with pytest.raises(SystemExit, match="2"):
+        main([*shlex.split(command), "--out", str(out)])
     errors = capsys.readouterr().err
-    assert stopped.value.code == 2 and re.search(message, errors) and "Traceback" not in errors
+    assert re.search(message, errors) and errors.count("\n") == 1, errors
     assert not any(out.glob("*"))

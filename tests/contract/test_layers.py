@@ -19,7 +19,7 @@ PACKAGE = "flytrack_env"
 
 # Low to high. A module imports only from rows above its own here; a package counts as one module.
 LAYERS = (
-    {"files", "extras", "fusion", "sandbox", "artifact", "messages"},
+    {"files", "extras", "fusion", "sandbox", "artifact", "messages", "progress"},
     {"auto_reset", "compile_cache"},
     {"quaternion", "motion", "toml_file", "npz_file"},
     {"state", "thrust"},
@@ -43,6 +43,7 @@ CONSUMERS = (
     "baselines",
     "flytrack_loop",
     "flytrack_bench",
+    "flytrack",
     "benchmarks",
     "blackbox",
     "firmware",

@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from flytrack.cli import main
 from flytrack_env.dynamics import nominal_parameters
 from flytrack_sysid import collect, load_log
-from flytrack_sysid.cli import main
 from flytrack_sysid.diagnosis.identifiability import LANES_PER_MANOEUVRE, next_flight
 from flytrack_sysid.diagnosis.lanes import LANE_S
 from flytrack_sysid.excitation import DT_S, FLIGHT_STEPS, HEIGHTS

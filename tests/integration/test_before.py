@@ -8,10 +8,10 @@ import pytest
 
 from benchmarks.diagnosis import model_of
 from benchmarks.hidden import draw_base, draw_outside, fly, measure
+from flytrack.cli import main
 from flytrack_env import save_model
 from flytrack_env.motion import Motion
 from flytrack_sysid import diagnose_change, save_log
-from flytrack_sysid.cli import main
 
 SECONDS = 30.0
 DRAG = {"d_x": 0.4, "d_y": 0.4, "d_z": 0.2}

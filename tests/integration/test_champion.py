@@ -5,7 +5,6 @@ from pathlib import Path
 
 import baselines.purejaxrl_ppo
 from baselines.purejaxrl_ppo import load_checkpoint
-from baselines.purejaxrl_ppo.evaluate import SHIPPED_BLACK_BOX
 from baselines.purejaxrl_ppo.flights import race_many, score, start_keys
 from baselines.purejaxrl_ppo.plants import draw_plants
 from baselines.purejaxrl_ppo.race_env import plant_env
@@ -22,7 +21,7 @@ NUM_FLIGHTS, NUM_STEPS, NUM_LAPS = 32, 2500, 3
 
 def test_champion_races_on_the_black_box_near_the_optimum():
     champion = load_checkpoint(CHAMPION)
-    env = plant_env(champion, blackbox.load(SHIPPED_BLACK_BOX))
+    env = plant_env(champion, blackbox.load(blackbox.SHIPPED))
     keys = start_keys(7, NUM_FLIGHTS)
     result = score(race_many(env, champion.network, champion.params, keys, NUM_STEPS, NUM_LAPS))
     optimum = shipped_reference("flytrack", "flying", "black_box")

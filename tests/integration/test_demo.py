@@ -3,18 +3,14 @@
 import contextlib
 import io
 import json
-import sys
-from functools import partial
 from pathlib import Path
 
 import jax
 import numpy as np
 import pytest
 
-import demo
-import eval_agent
-from baselines.purejaxrl_ppo import Config
 from baselines.purejaxrl_ppo.density import count_positions, draw_position_density
+from flytrack.cli import main
 from flytrack_env import blackbox, load_model, load_track
 from flytrack_env.rollout import load_rollout
 from tests.support.black_boxes import SHIPPED
@@ -24,35 +20,30 @@ CHAMPION = next((ROOT / "baselines" / "purejaxrl_ppo" / "champion").glob("flytra
 
 
 @pytest.mark.slow
-def test_demo_writes_everything(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_demo_writes_everything(tmp_path: Path) -> None:
     pytest.importorskip("rerun")
     out, text = tmp_path / "demo", io.StringIO()
-    monkeypatch.setattr(demo, "NUM_STEPS", 100)
-    monkeypatch.setattr(demo, "NUM_EPISODES", 4)
-    monkeypatch.setattr(demo, "collect", partial(demo.collect, minutes=1.0))
-    arguments = ["demo.py", "--out", str(out), "--total-timesteps", str(Config().batch_size)]
-    monkeypatch.setattr(sys, "argv", arguments)
+    arguments = ["demo", "--quick", "--out", str(out)]
     with contextlib.redirect_stdout(text):
-        demo.main()
+        main(arguments)
     names = {"model.json", "position_density.png", "rollout.npy", "rollout.rrd", "summary.json"}
     names |= {"rollout_top.png", "rollout_side.png", "rollout_commands.png", "flight_log.npz"}
     assert names <= {path.name for path in out.iterdir()} and list(out.glob("final.*"))
     summary = json.loads((out / "summary.json").read_text())
-    assert summary["noisy_starts"]["episodes"] == 4
+    assert summary["noisy_starts"]["episodes"] == 16
     assert load_model(out / "model.json").tau.shape == (4,)
     assert "noisy starts finish 3 laps" in text.getvalue()
     with pytest.raises(SystemExit):
-        demo.main()  # it does not overwrite a run
+        main(arguments)  # it does not overwrite a run
 
 
 @pytest.mark.slow
-def test_eval_agent_writes_the_flight_of_the_black_box(tmp_path: Path, monkeypatch) -> None:
-    out = tmp_path / "rollout.npy"
-    arguments = ["eval_agent.py", "--checkpoint", str(CHAMPION), "--steps", "50", "--out", str(out)]
-    monkeypatch.setattr(sys, "argv", arguments)
-    monkeypatch.chdir(ROOT)
-    eval_agent.main()
-    states, actions = load_rollout(out)
+def test_eval_writes_the_flight_of_the_black_box_and_overwrites_no_other(tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    for _ in range(2):
+        main(["eval", "--checkpoint", str(CHAMPION), "--steps", "50"])
+    assert {path.name for path in (tmp_path / "runs").iterdir()} == {"eval", "eval_2"}
+    states, actions = load_rollout(tmp_path / "runs/eval_2/rollout.npy")
     assert len(states) == 50
     step = jax.jit(blackbox.load(SHIPPED).step_vector)
     for before, action, after in zip(states[:-1], actions[:-1], states[1:], strict=True):

@@ -93,7 +93,7 @@ def test_command_flies_many(flown_by, checkpoint_path, tmp_path, monkeypatch, ca
     out, file = tmp_path / "flight.npy", tmp_path / "new" / "report.json"
     more = ["--episodes", 2, "--plants", 3] if flown_by == "plants" else ["--episodes", 6, "--laps", 1]
     where = ["--checkpoint", checkpoint_path, "--out", out, "--json", file]
-    run(monkeypatch, *where, "--steps", 120, "--track", "split_s", "--ghost", *more)
+    run(*where, "--steps", 120, "--track", "split_s", "--ghost", *more)
     outcomes, rollout = flown[0]
     report, text = json.loads(file.read_text()), capsys.readouterr().out
     assert report["schema"] == 1 and report["flights"] == 6 and report["track"] == "split_s"
@@ -131,7 +131,7 @@ def test_a_single_flight_as_json_and_docs_name_every_key(
     recording = tmp_path / "flight.rrd"
     if importlib.util.find_spec("rerun") is not None:
         where += ["--rrd", recording]
-    run(monkeypatch, *where)
+    run(*where)
     text, report = capsys.readouterr().out, json.loads(file.read_text())
     if report["recording"] is not None:
         assert report["recording"] == str(recording)
@@ -180,7 +180,7 @@ def test_command_refuses_before_it_flies(arguments, messages, bad_files, monkeyp
     monkeypatch.setattr(evaluate, "can_record", lambda: True)
     monkeypatch.setattr(evaluate, "fly_scene", lambda *_: pytest.fail("it flew"))
     with pytest.raises(SystemExit) as ended:
-        run(monkeypatch, "--checkpoint", "policy.safetensors", "--steps", "5", *arguments)
+        run("--checkpoint", "policy.safetensors", "--steps", "5", *arguments)
     error = capsys.readouterr().err
     assert ended.value.code == 2 and all(message in error for message in messages), error
     assert not (bad_files / "rollout.npy").exists()

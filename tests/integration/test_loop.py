@@ -6,14 +6,13 @@ import numpy as np
 import pytest
 
 from baselines.purejaxrl_ppo import load_checkpoint
-from baselines.purejaxrl_ppo.evaluate import SHIPPED_BLACK_BOX
 from baselines.purejaxrl_ppo.flights import Score, fly_many
 from baselines.purejaxrl_ppo.race_env import plant_env
 from benchmarks.champion import CHAMPION
 from benchmarks.loop.plants import draw_plant, plant_of
+from flytrack.cli import main
 from flytrack_env import blackbox, nominal_parameters
 from flytrack_loop import Gap, errors_of
-from flytrack_loop.__main__ import main
 from flytrack_loop.flight_log import log_of_flights
 from flytrack_loop.stages import measure_gap
 
@@ -25,7 +24,7 @@ def champion():
 
 @pytest.fixture(scope="module")
 def shipped():
-    return blackbox.load(SHIPPED_BLACK_BOX)
+    return blackbox.load(blackbox.SHIPPED)
 
 
 @pytest.fixture(scope="module")
@@ -86,11 +85,12 @@ def test_a_policy_without_laps_has_no_gap():
 def test_the_command_refuses_what_it_cannot_use(tmp_path, capsys):
     for flags, message in (
         (["--black-box", str(tmp_path / "none.bin")], "No such file or directory"),
-        (["--black-box", str(SHIPPED_BLACK_BOX), "--total-timesteps", "10"], "total_timesteps: found 10"),
-        (["--black-box", str(SHIPPED_BLACK_BOX), "--noise", "-1"], "noise: found -1"),
-        (["--black-box", str(SHIPPED_BLACK_BOX), "--minutes", "0"], "minutes: found 0"),
-        ([], "expected one of --black-box FILE and --plant betaflight"),
-        (["--black-box", str(SHIPPED_BLACK_BOX), "--body", "x"], "expected with --plant betaflight only"),
+        (["--black-box", str(blackbox.SHIPPED), "--total-timesteps", "10"], "total_timesteps: found 10"),
+        (["--black-box", str(blackbox.SHIPPED), "--noise", "-1"], "noise: found -1"),
+        (["--black-box", str(blackbox.SHIPPED), "--minutes", "0"], "minutes: found 0"),
+        (["--black-box", "any.bin", "--plant", "betaflight"], "--plant: found --black-box as well"),
+        (["--black-box", str(blackbox.SHIPPED), "--body", "x"], "expected with --plant betaflight only"),
     ):
-        assert main([*flags, "--out", str(tmp_path / "out")]) == 2
+        with pytest.raises(SystemExit, match="2"):
+            main(["loop", *flags, "--out", str(tmp_path / "out")])
         assert message in capsys.readouterr().err

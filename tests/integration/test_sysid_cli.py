@@ -1,4 +1,4 @@
-"""The command flytrack-sysid: from a plant to a model and its report, and its refusals."""
+"""The commands of the identification: from a plant to a model and its report, and their refusals."""
 
 import json
 from dataclasses import replace
@@ -9,10 +9,12 @@ import numpy as np
 import pytest
 
 from blackbox.build import build
+from flytrack import identification
+from flytrack.cli import main
+from flytrack.identification import load_plant
 from flytrack_env import load_model, load_provenance, save_model
 from flytrack_env.dynamics import nominal_parameters
-from flytrack_sysid import cli, collect, load_log, save_log
-from flytrack_sysid.cli import load_plant, main
+from flytrack_sysid import collect, load_log, save_log
 from tests.support.black_boxes import AIRLESS, SHIPPED
 
 TAUS = (0.02, 0.05, 0.07, 0.03)
@@ -21,7 +23,7 @@ OTHER = AIRLESS._replace(mass=1.0, lag=TAUS, max_rate=(618.0, 618.0, 120.0), thr
 
 
 def run(*arguments: object) -> None:
-    main([str(argument) for argument in arguments])
+    main([*map(str, arguments)])
 
 
 @pytest.fixture(scope="module")
@@ -140,7 +142,7 @@ def test_collect_refuses(capsys, tmp_path, monkeypatch, plant, options, message)
     ],
 )
 def test_fit_and_validate_refuse(folder, capsys, tmp_path, monkeypatch, change, options, message):
-    monkeypatch.setattr(cli, "motion_of", pytest.fail)  # half a minute of work
+    monkeypatch.setattr(identification, "motion_of", pytest.fail)  # half a minute of work
     save_log(tmp_path / "log.npz", change(load_log(folder / "data.npz")))
     out = [] if "--out" in options else ["--out", tmp_path / "model.json"]
     assert message in refused(capsys, "fit", tmp_path / "log.npz", *out, *options)

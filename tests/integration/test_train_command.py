@@ -1,7 +1,6 @@
 """The command of the training: its flags, what it resumes, what it refuses, and how it ends."""
 
 import shutil
-import sys
 
 import pytest
 
@@ -24,11 +23,10 @@ def tasks_of(*arguments):
     return make_tasks(*read(*arguments), 1)
 
 
-def call(monkeypatch, *arguments):
+def call(*arguments):
     """Run the command; return its exit code."""
-    monkeypatch.setattr(sys, "argv", ["train_ppo", *map(str, arguments)])
     with pytest.raises(SystemExit) as caught:
-        train_ppo.main()
+        train_ppo.main([*map(str, arguments)])
     return caught.value.code
 
 
@@ -73,7 +71,7 @@ def test_flags_override_the_file_and_the_file_the_defaults(tmp_path):
 def test_what_cannot_be_used_is_refused(whole, tmp_path, monkeypatch, capsys, arguments, message):
     monkeypatch.chdir(tmp_path)
     found = [whole[0] if one == "WHOLE" else one for one in arguments]
-    assert call(monkeypatch, *found, "--out", "out") == 2
+    assert call(*found, "--out", "out") == 2
     assert message in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
 
@@ -139,8 +137,8 @@ def test_exit_codes_and_messages(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(Trainer, "run", stop)
     monkeypatch.setattr(train_ppo, "make_trainer", lambda *_: make_trainer())
     error, out = DivergedError("training diverged"), tmp_path / "out"
-    assert call(monkeypatch, "--out", tmp_path, "--no-tracking") == 1
-    assert capsys.readouterr().err == "train_ppo: error: training diverged\n"
+    assert call("--out", tmp_path, "--no-tracking") == 1
+    assert capsys.readouterr().err == "flytrack train: error: training diverged\n"
     error = KeyboardInterrupt
-    assert call(monkeypatch, "--out", out, "--num-seeds", 2) == 130
+    assert call("--out", out, "--num-seeds", 2) == 130
     assert capsys.readouterr().err == f"stopped at 40 steps; continue with --resume {out}\n"

@@ -1,18 +1,16 @@
 """What evaluations are tested with: a plant on rails, a policy that has learned nothing, the command."""
 
-import sys
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import pytest
 
-import eval_agent
 from baselines.purejaxrl_ppo import Config
 from baselines.purejaxrl_ppo.checkpoint import save_checkpoint
 from baselines.purejaxrl_ppo.networks import make_network
 from baselines.purejaxrl_ppo.resume import describe_run
+from flytrack.cli import main
 from flytrack_env import make, nominal_parameters
 from flytrack_env.dynamics import ModelParameters
 from flytrack_env.effects import LinearDrag
@@ -89,6 +87,5 @@ def write_checkpoint(path: Path) -> Path:
     return path
 
 
-def run(monkeypatch: pytest.MonkeyPatch, *arguments: Any) -> None:
-    monkeypatch.setattr(sys, "argv", ["eval_agent.py", *map(str, arguments)])
-    eval_agent.main()
+def run(*arguments: Any) -> None:
+    main(["eval", *map(str, arguments)])

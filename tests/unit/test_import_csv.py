@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from flytrack.cli import main
 from flytrack_env import load_model, nominal_parameters
 from flytrack_sysid import FlightLog, LogError, import_log, load_log
-from flytrack_sysid.cli import main
 from flytrack_sysid.importing.flight import Craft
 from tests.support.made_flight import GRAVITY, TIME_S, flight
 from tests.support.real_logs import CRAZYFLIE, shared

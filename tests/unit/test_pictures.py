@@ -8,9 +8,7 @@ import numpy as np
 import pytest
 
 from flytrack_env.pictures import Flight, draw_flight, make_flight, write_animation
-from flytrack_env.pictures.__main__ import main
 from flytrack_env.references import ghost_rollout, shipped_references
-from flytrack_env.rollout import save_rollout
 from flytrack_env.tracks import load_track
 
 TRACK = load_track("flytrack")
@@ -48,38 +46,6 @@ def test_animation_shows_the_flying_lap_beside_the_time_optimal_one(tmp_path, gh
         assert (np.abs(last - colour).max(axis=-1) < 40).sum() > 50
     with pytest.raises(ValueError, match="straight: found no complete flying lap"):
         write_animation(straight(0.3, 0.0), REFERENCES["flying"], tmp_path)
-
-
-def test_command_draws_every_rollout_and_tells_same_names_apart(tmp_path, capsys):
-    save_rollout(tmp_path / "a" / "rollout.npy", STATES[:30], COMMANDS[:30])
-    (tmp_path / "b").mkdir()  # one row without the applied roll, pitch and yaw
-    short = np.concatenate([STATES[:1, :16], STATES[:1, 19:], COMMANDS[:1]], axis=1)
-    np.save(tmp_path / "b" / "rollout.npy", short)
-    paths = [str(tmp_path / folder / "rollout.npy") for folder in "ab"]
-    assert main([*paths, "--out", str(tmp_path / "out")]) == 0
-    views = [f"{name}_rollout_{view}.png" for name in "ab" for view in ("top", "side", "commands")]
-    written = {path.name: path.read_bytes() for path in (tmp_path / "out").iterdir()}
-    assert set(written) == {*views, "comparison_top.png"}
-    assert all(content.startswith(b"\x89PNG") for content in written.values())
-    lines = capsys.readouterr().out.splitlines()
-    assert [Path(line.split(":")[0]).name for line in lines] == [*views, "comparison_top.png"]
-
-
-def test_what_cannot_be_drawn_is_refused_in_one_line_and_nothing_is_written(tmp_path, capsys):
-    good = tmp_path / "good.npy"
-    save_rollout(good, STATES[:3], COMMANDS[:3])
-    np.save(tmp_path / "pickled.npy", np.array([{}], object), allow_pickle=True)
-    before, out = {*tmp_path.rglob("*")}, tmp_path / "out"
-    for files, folder, more, reason in (
-        (["missing.npy"], out, [], "missing.npy: cannot be read"),
-        (["pickled.npy"], out, [], "pickle"),
-        (["good.npy"], out, ["--track", "nowhere"], "nowhere"),
-        (["good.npy"], good / "below", [], "expected a folder"),
-    ):
-        status = main([*(str(tmp_path / name) for name in files), "--out", str(folder), *more])
-        (line,) = capsys.readouterr().err.splitlines()
-        assert status == 2 and line.startswith("error: ") and reason in line, line
-        assert {*tmp_path.rglob("*")} == before
 
 
 @pytest.mark.parametrize(("library", "extra"), [("matplotlib", "viz"), ("Pillow", "render")])

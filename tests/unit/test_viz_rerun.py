@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from flytrack.cli import main
 from flytrack_env.flown_race import follow_race
 from flytrack_env.references import ghost_rollout, shipped_references
 from flytrack_env.rollout import save_rollout
@@ -16,7 +17,6 @@ from tests.support.recordings import Recording, make_sequence
 
 rr = pytest.importorskip("rerun", reason="rerun-sdk is not installed (extra flytrack[viz])")
 viz = importlib.import_module("flytrack_env.viz_rerun")
-command = importlib.import_module("flytrack_env.viz_rerun.__main__")
 
 TRACK = load_track("flytrack")
 GATES = TRACK.rows()
@@ -162,10 +162,15 @@ def test_command_shows_rollouts_beside_the_ghost(tmp_path, capsys):
     for folder in ("a", "b"):
         (tmp_path / folder).mkdir()
         save_rollout(tmp_path / folder / "flight.npy", STATES[:20], ACTIONS[:20])
-    out = tmp_path / "both.rrd"
     files = [str(tmp_path / folder / "flight.npy") for folder in ("a", "b")]
-    assert command.main([*files, "--out", str(out), "--ghost", "time_optimal"]) == 0
-    assert capsys.readouterr().out == f"{out}: 20 steps, {out.stat().st_size} bytes\n"
+    main(["show", *files, "--out", str(tmp_path / "out"), "--ghost"])
+    said, out = capsys.readouterr().out.splitlines(), tmp_path / "out/flights.rrd"
+    assert said[0] == "shown: a_flight, b_flight, time-optimal, 20 steps on flytrack"
+    assert said[1] == f"{out}: {out.stat().st_size} bytes"
+    views = [f"{name}_flight_{view}.png" for name in "ab" for view in ("top", "side", "commands")]
+    pictures = [*views, "comparison_top.png"]
+    assert [Path(line.split(":")[0]).name for line in said[2:]] == pictures
+    assert all((tmp_path / "out" / name).read_bytes().startswith(b"\x89PNG") for name in pictures)
     found = Recording(out)
     (table,) = found.once("/about", "TextDocument:text")
     names = [line.split("|")[1].strip() for line in table.splitlines()[2:]]
@@ -179,18 +184,23 @@ def test_command_shows_rollouts_beside_the_ghost(tmp_path, capsys):
     [
         (["a.npy", "a.npy"], "found files of the same names"),
         (["pickled.npy"], "pickled"),
-        (["a.npy", "--out", "a.npy"], "--out: found a.npy, which is read"),
+        (["missing.npy"], "missing.npy: cannot be read"),
+        (["good.npy", "--track", "nowhere"], "nowhere"),
+        (["good.npy", "--out", "good.npy/below"], "expected a folder"),
     ],
 )
 def test_command_refuses_in_one_line(tmp_path, capsys, monkeypatch, arguments, reason):
     monkeypatch.chdir(tmp_path)
+    save_rollout(tmp_path / "good.npy", STATES[:3], ACTIONS[:3])
     pairs = np.empty((30, 2), object)
     for step, pair in enumerate(make_sequence(30)):
         pairs[step] = pair
     np.save("pickled.npy", pairs, allow_pickle=True)
-    assert command.main(arguments) == 2
+    with pytest.raises(SystemExit, match="2"):
+        main(["show", *arguments])
     error = capsys.readouterr().err
-    assert reason in error and error.startswith("error: ") and error.count("\n") == 1
-    assert not Path("rollout.rrd").exists()
+    assert reason in error and error.startswith("flytrack show: error: ") and error.count("\n") == 1
+    assert not Path("runs").exists()
     if arguments == ["pickled.npy"]:
-        assert command.main([*arguments, "--allow-pickle"]) == 0
+        main(["show", *arguments, "--allow-pickle"])
+        assert Path("runs/show/flights.rrd").exists()

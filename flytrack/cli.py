@@ -1,0 +1,219 @@
+"""``flytrack COMMAND``: one command for all that FlyTrack does.
+
+Nothing of a command is imported before it is called, so that ``flytrack --help`` is quick and needs no extra.
+``flytrack COMMAND --help`` needs none either: it names the extra.
+"""
+
+import argparse
+import dataclasses
+import importlib
+import sys
+from collections.abc import Callable, Sequence
+from importlib.metadata import version
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Annotated, Any, NamedTuple, NoReturn, Union
+
+PROG = "flytrack"
+SHELLS = ("bash", "zsh", "fish")
+REFUSED, STOPPED = 2, 130  # exit statuses; 130 is what shells return for a command that Ctrl-C ended
+CLONE = Path(__file__).parents[1]
+PPO = "baselines.purejaxrl_ppo"
+
+
+class Command(NamedTuple):
+    """A command; ``run`` and ``flags`` are written ``module:name``.
+
+    summary: one line. extra: that it needs. run: called with the flags, or with words if it ``reads_words``:
+    those after the command's name. flags: their dataclass; None where ``run`` has none.
+    """
+
+    summary: str
+    extra: str | None
+    run: str
+    flags: str | None
+    reads_words: bool = False
+
+
+def _identify(name: str, summary: str) -> Command:
+    run = f"flytrack.identification:run_{name}"
+    return Command(summary, "sysid", run, f"flytrack.flags:{name.capitalize()}")
+
+
+COMMANDS = {
+    "demo": Command(
+        "Identify the shipped black box, train, fly on it",
+        "train",
+        "flytrack.demo:run_demo",
+        "flytrack.flags:Demo",
+    ),
+    "train": Command(
+        "Train a policy with PPO",
+        "train",
+        f"{PPO}.train_ppo:main",
+        f"{PPO}.train_ppo:Settings",
+        reads_words=True,
+    ),
+    "eval": Command(
+        "Fly a checkpoint on a black box or on drawn plants",
+        "train",
+        "flytrack.evaluation:run_evaluation",
+        f"{PPO}.evaluate:EvaluationSettings",
+    ),
+    "show": Command(
+        "Write rollouts as a recording and pictures", "viz", "flytrack.show:run_show", "flytrack.flags:Show"
+    ),
+    "collect": _identify("collect", "Fly an excitation or a script on a plant"),
+    "fit": _identify("fit", "Identify a model from a flight log"),
+    "validate": _identify("validate", "Judge a model on flight that it was not fitted to"),
+    "diagnose": _identify("diagnose", "Name what a model gets wrong, and extend it"),
+    "plan": _identify("plan", "Plan flights that settle what a log left open"),
+    "import": _identify("import", "Convert logs of real flights into a flight log"),
+    "loop": Command(
+        "Train, fly, diagnose, extend the model, train again",
+        "train",
+        "flytrack.loop:run_loop",
+        "flytrack.loop:Loop",
+    ),
+    "firmware": Command(
+        "Build and check Betaflight in the loop, in a clone", None, "firmware.__main__:main", None, True
+    ),
+    "export": Command(
+        "Write a policy as ONNX or C", "export", f"{PPO}.export:main", f"{PPO}.export:ExportSettings", True
+    ),
+    "bench": Command(
+        "Fly a policy through a frozen suite of tasks",
+        "bench",
+        "flytrack_bench.cli:main",
+        "flytrack_bench.cli:Flags",
+        True,
+    ),
+    "fly": Command("Fly yourself", "fly", "flytrack_fly.cli:main", None, True),
+}
+
+
+class NotInstalledError(Exception):
+    """A command that is not here; the message says what is missing and, if it can be, how to install it."""
+
+
+def load(name: str, target: str) -> Any:
+    """Return what a command's ``module:name`` names.
+
+    Raises:
+        NotInstalledError: the module, or a package of the command's extra, is not installed.
+    """
+    module, _, attribute = target.partition(":")
+    try:
+        return getattr(importlib.import_module(module), attribute)
+    except ImportError as error:
+        missing, extra = error.name or "", COMMANDS[name].extra
+        if module == missing or module.startswith(f"{missing}."):
+            where = "in clones of the repository only" if missing == "firmware" else "not in this version"
+            raise NotInstalledError(f"this command is {where}") from error
+        if extra is None or not missing or find_spec(missing.partition(".")[0]) is not None:
+            raise  # an error of the module, and not of the installation
+        text = f"needs {missing}, which is not installed: {how_to_install(extra)}"
+        raise NotInstalledError(text) from error
+
+
+def how_to_install(extra: str) -> str:
+    """Return the line that installs an extra."""
+    return f"pip install 'flytrack[{extra}]'"
+
+
+def describe(command: Command) -> str:
+    """Return what stands above the flags of a command."""
+    needed = f"\n\nNeeds the extra {command.extra}: {how_to_install(command.extra)}" if command.extra else ""
+    return f"{command.summary}.{needed}"
+
+
+def leave(name: str, status: int, text: object) -> NoReturn:
+    """Exit with one line about a command."""
+    print(f"{PROG} {name}: {' '.join(str(text).split())}", file=sys.stderr)
+    raise SystemExit(status)
+
+
+def call(name: str, words: Sequence[str]) -> None:
+    """Run a command; what it refuses ends with one line and exit status 2."""
+    command = COMMANDS[name]
+    if (CLONE / "firmware").is_dir() and str(CLONE) not in sys.path:
+        sys.path.append(str(CLONE))  # an editable installation finds only what a wheel has
+    try:
+        asked = words if command.reads_words else read_flags(name, words)
+        run: Callable[[Any], int | None] = load(name, command.run)
+    except NotInstalledError as error:
+        if not {"-h", "--help"} & set(words):
+            leave(name, REFUSED, f"error: {error}")
+        print(f"usage: {PROG} {name} [OPTIONS]\n\n{describe(command)}\n\nIts flags cannot be shown: {error}")
+        return
+    try:
+        status = run(asked)
+    except (ImportError, ValueError, OverflowError, OSError) as error:
+        leave(name, REFUSED, f"error: {error}")
+    except KeyboardInterrupt:
+        leave(name, STOPPED, "stopped")
+    if status:
+        raise SystemExit(status)
+
+
+def read_flags(name: str, words: Sequence[str]) -> Any:
+    """Return the flags of a command line as an instance of their dataclass."""
+    import tyro
+
+    command = COMMANDS[name]
+    assert command.flags is not None
+    config = (tyro.conf.FlagCreatePairsOff, tyro.conf.OmitArgPrefixes)
+    flags, text = load(name, command.flags), describe(command)
+    return tyro.cli(flags, args=words, prog=f"{PROG} {name}", description=text, config=config)
+
+
+def print_completion(shell: str) -> None:
+    """Print a shell's script that completes commands and flags; without its extra, the command alone."""
+    import tyro
+
+    def flags_of(name: str) -> Any:
+        try:
+            flags = load(name, COMMANDS[name].flags or ":")
+        except (NotInstalledError, ValueError):
+            flags = dataclasses.make_dataclass(name, [])
+        return Annotated[flags, tyro.conf.subcommand(name, description=COMMANDS[name].summary)]
+
+    config = (tyro.conf.FlagCreatePairsOff, tyro.conf.OmitArgPrefixes)
+    script = ["--tyro-print-completion", shell]
+    of_all: Any = Union[tuple(map(flags_of, COMMANDS))]  # noqa: UP007, made of a list
+    tyro.cli(of_all, args=script, prog=PROG, config=config)
+
+
+def make_parser() -> argparse.ArgumentParser:
+    """Return the parser of a line without a known command."""
+    parser = argparse.ArgumentParser(
+        prog=PROG,
+        description="A drone-racing environment that tells you what your simulator gets wrong.",
+        epilog="flytrack COMMAND --help shows a command's flags and the extra that it needs.",
+    )
+    parser.add_argument("--version", action="version", version=f"{PROG} {version(PROG)}")
+    text = "print the script that makes a shell complete commands and flags"
+    parser.add_argument("--print-completion", choices=SHELLS, help=text)
+    commands = parser.add_subparsers(metavar="COMMAND", title="commands")
+    for name, command in COMMANDS.items():
+        commands.add_parser(name, help=command.summary, add_help=False)
+    return parser
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run a command line; one without a command prints the commands, and exits with 2."""
+    words = list(sys.argv[1:] if arguments is None else arguments)
+    if words and words[0] in COMMANDS:
+        call(words[0], words[1:])
+        return
+    parser = make_parser()
+    asked = parser.parse_args(words)
+    if asked.print_completion:
+        print_completion(asked.print_completion)
+    else:
+        parser.print_help(sys.stderr)
+        raise SystemExit(REFUSED)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,156 @@
+"""The flags of ``flytrack``'s commands: dataclasses that need no extra, so that ``--help`` shows them.
+
+Those of ``train``, ``eval`` and ``loop`` are where their defaults are, in packages that need one.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+from tyro.conf import Positional, UseAppendAction, arg, create_mutex_group
+
+NO_HINT = "(optional)"  # tyro would print "(default: None)"
+EXCITATION_OR_SCRIPT = create_mutex_group(required=False)
+Paths = Positional[tuple[Path, ...]]
+OptionalPath = Annotated[Path | None, arg(metavar="PATH", help_behavior_hint=NO_HINT)]
+SomeLogs = Annotated[tuple[Path, ...], arg(metavar="LOG [LOG ...]", help_behavior_hint=NO_HINT)]
+MotionName = Literal["auto", "handout", "semi_implicit", "continuous"]
+
+
+@dataclass(frozen=True)
+class Demo:
+    """Flags of ``flytrack demo``."""
+
+    black_box: OptionalPath = None
+    """The plant, an acro_step.bin; default: the shipped one."""
+    out: OptionalPath = None
+    """Folder to write to; default: runs/demo, or the next free name."""
+    seed: int = 0
+    """Seed of flights and training."""
+    total_timesteps: Annotated[float | None, arg(metavar="FLOAT", help_behavior_hint=NO_HINT)] = None
+    """Environment steps of the training; default: those of `flytrack train`."""
+    quick: bool = False
+    """Every step once, each as short as it can be, to see that all works: the policy learns nothing."""
+
+
+@dataclass(frozen=True)
+class Show:
+    """Flags of ``flytrack show``."""
+
+    rollouts: Annotated[Paths, arg(metavar="[ROLLOUT ...]", help_behavior_hint=NO_HINT)] = ()
+    """Rollout files (.npy); without any, a time-optimal flight is shown."""
+    out: OptionalPath = None
+    """Folder to write to; default: runs/show, or the next free name."""
+    track: str = "flytrack"
+    """Name of a shipped track, or a track file (.toml)."""
+    allow_pickle: bool = False
+    """Read pickled rollouts. Unpickling runs whatever code a file holds: allow it for files you trust."""
+    ghost: bool = False
+    """Fly the time-optimal flight beside them in the recording."""
+    ghost_model: Literal["nominal", "black_box"] = "nominal"
+    """Drone for which the time-optimal flight is optimal."""
+    animation: bool = False
+    """Also write the fastest flying lap of each beside the time-optimal one as GIF."""
+
+
+@dataclass(frozen=True)
+class Collect:
+    """Flags of ``flytrack collect``."""
+
+    out: Path
+    """The log, .npz or .csv."""
+    black_box: Annotated[str | None, arg(metavar="PLANT", help_behavior_hint=NO_HINT)] = None
+    """The plant: an acro_step.bin, or module:name of a function step(x, u) or of a plant; default: the
+    shipped black box."""
+    minutes: Annotated[float, EXCITATION_OR_SCRIPT] = 2.0
+    """Duration of the excitation, at least 1."""
+    script: Annotated[OptionalPath, EXCITATION_OR_SCRIPT] = None
+    """A script to fly instead, .npz, as `flytrack plan` writes it."""
+    seed: int = 0
+    """Seed of the excitation and of the noise."""
+    noise: float = 0.0
+    """0 logs the state itself, 1 what common sensors measure; other levels scale their noise."""
+
+
+@dataclass(frozen=True)
+class Import:
+    """Flags of ``flytrack import``."""
+
+    files: Annotated[Paths, arg(metavar="FILE [FILE ...]", help_behavior_hint="(at least one)")]
+    """Logs of one craft."""
+    format: Literal["csv", "ulog", "betaflight", "usd", "bag"]
+    """Their format."""
+    out: Path
+    """The log, .npz or .csv."""
+    map: Annotated[str | None, arg(metavar="MAPPING", help_behavior_hint=NO_HINT)] = None
+    """A mapping file, .toml, or the name of a shipped one; CSV, uSD logs and bags need it."""
+    model_out: OptionalPath = None
+    """Also write the nominal model of this craft, .json."""
+    keep_clocks: bool = False
+    """Report offsets between the sensors' clocks without correcting them."""
+
+
+@dataclass(frozen=True)
+class Fit:
+    """Flags of ``flytrack fit``."""
+
+    log: Positional[Path]
+    """The flight log."""
+    out: Path
+    """The model, .json."""
+    fix: UseAppendAction[Annotated[tuple[str, ...], arg(metavar="NAME=VALUE")]] = ()
+    """Hold a parameter at a value; may be repeated."""
+    start: Annotated[str | None, arg(name="from", metavar="MODEL", help_behavior_hint=NO_HINT)] = None
+    """Start from the values of this model; default: the nominal model."""
+    effect: UseAppendAction[Annotated[tuple[str, ...], arg(metavar="NAME")]] = ()
+    """Identify the parameters of this effect too; may be repeated."""
+    hold_out_every: int = 4
+    """Hold out the last of every so many blocks; 0: none."""
+    motion: MotionName = "auto"
+    """How the craft moves within a step: as drones do (continuous), or by a simulator's step; auto: what the
+    log shows."""
+
+
+@dataclass(frozen=True)
+class Validate:
+    """Flags of ``flytrack validate``."""
+
+    model: Positional[Path]
+    """The model, .json."""
+    log: Positional[Path]
+    """The flight log."""
+    out: Path
+    """The folder of the report."""
+
+
+@dataclass(frozen=True)
+class Diagnose:
+    """Flags of ``flytrack diagnose``."""
+
+    logs: Annotated[Paths, arg(metavar="LOG [LOG ...]", help_behavior_hint="(at least one)")]
+    """Flight logs to learn from."""
+    out: Path
+    """The folder of the report."""
+    model: OptionalPath = None
+    """The model to diagnose, .json; default: the nominal model."""
+    hold_out: SomeLogs = ()
+    """Logs to judge by and not to learn from; default: the last of every four blocks of the others."""
+    before: SomeLogs = ()
+    """Logs of the craft as the model knows it: causes are then only what has changed since."""
+    motion: MotionName = "auto"
+    """How the craft moves within a step: as drones do (continuous), or by a simulator's step; auto: what the
+    logs show."""
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Flags of ``flytrack plan``."""
+
+    diagnosis: Positional[Path]
+    """The diagnosis, diagnosis.json."""
+    out: Path
+    """The script, .npz, for `flytrack collect --script`."""
+    model: OptionalPath = None
+    """The model whose hovering thrust the flights start with, .json; default: the nominal model."""
+    seed: int = 0
+    """Seed of the flights."""

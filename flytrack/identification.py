@@ -1,0 +1,188 @@
+"""What ``flytrack``'s commands from ``collect`` to ``plan``, and ``import``, do with their flags."""
+
+import importlib
+import sys
+from collections.abc import Sequence
+from operator import attrgetter
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from flytrack.flags import Collect, Diagnose, Fit, Import, Plan, Validate
+from flytrack_env import Motion, blackbox, load_model, load_provenance, save_model
+from flytrack_env.dynamics import nominal_parameters
+from flytrack_env.model_file import ModelFileError
+from flytrack_env.plants import Plant
+from flytrack_env.progress import ProgressBar
+from flytrack_sysid.collect import CollectError, collect
+from flytrack_sysid.diagnosis import diagnose, diagnose_change, joined, motion_of, write_diagnosis
+from flytrack_sysid.diagnosis import text_of as text_of_diagnosis
+from flytrack_sysid.diagnosis.identifiability import next_flight
+from flytrack_sysid.diagnosis.report import traces_of
+from flytrack_sysid.fit import fit, what_is_fitted
+from flytrack_sysid.flight_recording import write_flight_recording
+from flytrack_sysid.importing import import_log
+from flytrack_sysid.log import FlightLog
+from flytrack_sysid.log_file import check_name, describe, load_log, save_log
+from flytrack_sysid.plausibility import check_plausible
+from flytrack_sysid.script_file import check_name as check_script_name
+from flytrack_sysid.script_file import load_script, save_script
+from flytrack_sysid.split import held_out_rows
+from flytrack_sysid.validate import validate
+from flytrack_sysid.validation_report import text_of, write_validation
+
+RECORDING_NAME = "flight.rrd"
+
+
+def load_plant(where: str) -> Any:
+    """Return the plant in an artifact, or the object that ``module:name`` names."""
+    module, colon, name = where.partition(":")
+    if not colon or Path(where).exists():
+        return blackbox.load(where)
+    sys.path.insert(0, str(Path.cwd()))  # stays there: the module may import later
+    try:
+        found = attrgetter(name)(importlib.import_module(module))
+    except Exception as error:  # whatever a user's module raises
+        reason = f"{type(error).__name__}: {error}"
+        raise CollectError(f"--black-box {where}: cannot be imported: {reason}") from error
+    if not callable(found) and not isinstance(found, Plant):
+        raise CollectError(
+            f"--black-box {where}: found {type(found).__name__}, expected step(x, u) or a plant"
+        )
+    return found
+
+
+def run_collect(flags: Collect) -> None:
+    """Fly, and write the log."""
+    check_name(flags.out)
+    script = None if flags.script is None else load_script(flags.script)
+    plant = load_plant(flags.black_box or str(blackbox.SHIPPED))
+    log = collect(plant, flags.minutes, flags.seed, flags.noise, ProgressBar("flights"), script)
+    save_log(flags.out, log)
+    print(f"flown: {flags.black_box or 'the shipped black box'}")
+    print(describe(load_log(flags.out)))
+    print_written([flags.out])
+
+
+def run_import(flags: Import) -> None:
+    """Read the logs, and write them as one with its details beside it."""
+    check_name(flags.out)
+    if flags.model_out is not None:
+        check_model_name(flags.model_out)
+    found = import_log(flags.files, flags.format, flags.map, not flags.keep_clocks)
+    written = [flags.out, flags.out.with_suffix(".import.json")]
+    model = None if flags.model_out is None else found.nominal_model()  # before anything is written
+    save_log(flags.out, found.log)
+    found.save_details(written[1])
+    if flags.model_out and model:
+        provenance = {
+            "nominal": "generic quadcopter, scaled to the craft",
+            "imported_from": [Path(source).name for source in found.sources],
+        }
+        save_model(flags.model_out, model, provenance)
+        written.append(flags.model_out)
+    print(found.describe())
+    print_written(written)
+
+
+def run_fit(flags: Fit) -> None:
+    """Fit the model and write it."""
+    check_model_name(flags.out)  # before the work
+    fixed = fixed_values(flags.fix)
+    start = nominal_parameters() if flags.start is None else load_model(flags.start)
+    log = load_log(flags.log)
+    what_is_fitted(log, start, fixed, flags.effect, flags.hold_out_every)  # refuses before the work
+    start = start._replace(motion=motion_of(log, start) if flags.motion == "auto" else Motion(flags.motion))
+    found = fit(log, start, fixed, flags.effect, flags.hold_out_every, ProgressBar("rounds"))
+    provenance = found.provenance()
+    provenance["started_from"] = "nominal parameters" if flags.start is None else Path(flags.start).name
+    provenance["fixed"] = fixed
+    save_model(flags.out, found.model, provenance)
+    print(f"motion: {start.motion.value}")
+    print(found.describe())
+    print_written([flags.out])
+
+
+def run_validate(flags: Validate) -> None:
+    """Validate the model and write the report."""
+    model = load_model(flags.model)
+    log = load_log(flags.log)
+    check_plausible(log)
+    rows, note = judged_rows(flags.model, log)
+    found = validate(model, log, rows)
+    found = found._replace(notes=(note, *found.notes))
+    written = write_validation(flags.out, found, flags.model.name, log)
+    print(text_of(found, flags.model.name, log))
+    print_written(written)
+
+
+def run_diagnose(flags: Diagnose) -> None:
+    """Diagnose the model; write the report, the extended model and a recording."""
+    if not flags.logs:
+        raise ValueError("LOG: found none, expected at least one flight log")
+    train, test = [load_log(path) for path in flags.logs], [load_log(path) for path in flags.hold_out]
+    logs, before = [*train, *test], [load_log(path) for path in flags.before]
+    for one in (*logs, *before):
+        check_plausible(one)
+    log = joined(logs)
+    held_out = np.arange(len(log)) >= sum(map(len, train)) if test else None
+    model = None if flags.model is None else load_model(flags.model)
+    motion = None if flags.motion == "auto" else Motion(flags.motion)
+    rest = (model, held_out, ProgressBar("stages"), motion)
+    found = diagnose_change(logs, before, *rest) if before else diagnose(logs, *rest)
+    written = write_diagnosis(flags.out, found, log)
+    print(text_of_diagnosis(found))
+    recording = flags.out / RECORDING_NAME
+    models = {"nominal": found.nominal, "extended": found.extended}
+    reason = write_flight_recording(recording, log, models, traces_of(found, log))
+    print_written([*written, *[recording] * (not reason)])
+    if reason:
+        print(f"{recording}: left out: {reason}")
+
+
+def run_plan(flags: Plan) -> None:
+    """Plan the flights, write their script and print what they are for."""
+    check_script_name(flags.out)
+    model = nominal_parameters() if flags.model is None else load_model(flags.model)
+    found = next_flight(flags.diagnosis, model, flags.seed)
+    save_script(flags.out, found.script)
+    print(found.describe())
+    print_written([flags.out])
+
+
+def check_model_name(path: Path) -> None:
+    """Raise ModelFileError for a model file that is not .json, lest a log is overwritten."""
+    if path.suffix != ".json":
+        raise ModelFileError(f"{path}: found suffix {path.suffix!r}, expected .json")
+
+
+def fixed_values(pairs: Sequence[str]) -> dict[str, float]:
+    """Return NAME=VALUE pairs as a dictionary; raises ValueError for a missing name or number."""
+    try:
+        return {name.strip(): float(value) for name, value in (pair.split("=") for pair in pairs)}
+    except ValueError as error:
+        raise ValueError(f"--fix {' '.join(pairs)}: expected NAME=VALUE, as in tau_yaw=0.05") from error
+
+
+def judged_rows(model_path: Path, log: FlightLog) -> tuple[np.ndarray | None, str]:
+    """Return the rows of a log that a model was not fitted to, (num_rows,) bool, None for all, and a note.
+
+    Raises ModelFileError for a split that cannot be read, or a model fitted to the whole log.
+    """
+    provenance = load_provenance(model_path)
+    data, split = provenance.get("data"), provenance.get("split")
+    if not isinstance(data, dict) or data.get("sha256") != log.sha256:  # fitted to another log
+        return None, f"all rows are judged: {model_path.name} was not fitted to {Path(log.source).name}"
+    every = split.get("held_out_every") if isinstance(split, dict) else None
+    if not isinstance(every, int) or every < 2:
+        hint = (
+            "fitted to the whole log; validate it on another log" if every == 0 else "expected 0, 2, 3, ..."
+        )
+        raise ModelFileError(f"{model_path}: split: held_out_every: found {every!r}, {hint}")
+    return held_out_rows(log, every), f"held-out part: the last of every {every} blocks"
+
+
+def print_written(paths: Sequence[Path]) -> None:
+    """Print which files were written."""
+    print(f"written: {', '.join(map(str, paths))}")

@@ -1,0 +1,48 @@
+"""What ``flytrack show`` does with its flags."""
+
+from pathlib import Path
+
+from flytrack.flags import Show
+from flytrack_env.files import fresh_folder
+from flytrack_env.pictures import read_flights, write_animation, write_pictures
+from flytrack_env.references import ghost_rollout, shipped_reference, shipped_references
+from flytrack_env.rollout import load_named_rollouts
+from flytrack_env.tracks import load_track
+from flytrack_env.viz_rerun.recording import write_recording
+from flytrack_env.viz_rerun.trajectory import Trajectory
+
+DEFAULT_OUT = Path("runs/show")
+RECORDING = "flights.rrd"
+GHOST_STEPS = 1200  # without rollouts
+
+
+def run_show(flags: Show) -> None:
+    """Write a recording of all flights, and pictures of each.
+
+    Raises:
+        ImportError, OSError, ValueError: what cannot be read, shown or written.
+    """
+    track = load_track(flags.track)
+    rollouts = load_named_rollouts(flags.rollouts, flags.allow_pickle)
+    recorded = [Trajectory(name, *rollout) for name, rollout in rollouts.items()]
+    flights = read_flights(flags.rollouts, track, flags.allow_pickle)
+    num_steps = max((len(one.states) for one in recorded), default=GHOST_STEPS)
+    if flags.ghost or not recorded:
+        references = shipped_references(track, (flags.ghost_model,))
+        recorded.append(Trajectory("time-optimal", *ghost_rollout(references, num_steps)))
+    optimal = shipped_reference(track.name, "flying", flags.ghost_model) if flags.animation else None
+    if flags.out is not None:
+        found = next(path for path in (flags.out, *flags.out.parents) if path.exists())
+        if not found.is_dir():
+            raise NotADirectoryError(
+                f"--out {flags.out}: found a file, {found}, expected a folder or a new path"
+            )
+    folder = flags.out or fresh_folder(DEFAULT_OUT)
+    folder.mkdir(parents=True, exist_ok=True)
+    write_recording(folder / RECORDING, recorded, track)
+    paths = [folder / RECORDING, *write_pictures(flights, folder)]
+    if optimal is not None:
+        paths += [write_animation(flight, optimal, folder) for flight in flights]
+    print(f"shown: {', '.join(one.name for one in recorded)}, {num_steps} steps on {track.name}")
+    for path in paths:
+        print(f"{path}: {path.stat().st_size} bytes")
