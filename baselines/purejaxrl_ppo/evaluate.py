@@ -283,7 +283,9 @@ def make_numbers(
     if references is not None:
         numbers["optimal"] = compare_with_optimum(numbers, references)
         if settings.ghost:
-            numbers["time_lost_s"] = time_lost(outcomes, references)
+            numbers["time_lost_s"] = time_lost(
+                outcomes, references, [gate.id for gate in scene.env.track.gates]
+            )
     numbers["first_flight"] = {
         "steps": int(np.sum(rollout.is_flying)),
         "gates": int(np.max(rollout.gates_passed)),
