@@ -29,9 +29,12 @@ def error_text(error: BaseException) -> str:
 
 
 def check_keywords(found: Iterable[str], expected: Sequence[str]) -> None:
-    """Raise TypeError for a keyword that a call does not have, with the one that may be meant."""
+    """Raise TypeError for a keyword that ``make`` does not have, with the one that may be meant.
+
+    In Python's own words, by which TorchRL finds out what an environment takes.
+    """
     for name in found:
         if name not in expected:
             close = difflib.get_close_matches(name, expected, n=1)
-            meant = f"{close[0]!r}" if close else f"one of {', '.join(expected)}"
-            raise TypeError(f"make: found the argument {quote_name(name)!r}, expected {meant}")
+            hint = f"did you mean {close[0]!r}?" if close else f"expected one of {', '.join(expected)}"
+            raise TypeError(f"make() got an unexpected keyword argument {quote_name(name)!r}; {hint}")

@@ -16,7 +16,7 @@ from flytrack_env.gymnasium_adapter.packing import Packed
 from flytrack_env.gymnasium_adapter.simulation import Simulation, draw_key
 from flytrack_env.messages import check_keywords
 from flytrack_env.registration import ARGUMENTS
-from flytrack_env.rendering import FlightLog, can_render, make_renderer, open_window
+from flytrack_env.rendering import FlightLog, can_render, open_window
 
 RENDER_MODES, VECTOR_RENDER_MODES = ("human", "rgb_array"), ("rgb_array",)
 AUTORESET_MODES = AutoresetMode.NEXT_STEP.value, AutoresetMode.SAME_STEP.value
@@ -47,7 +47,7 @@ class _Adapter:
         # The class announces every mode, so that asking for one that is missing says how to install it.
         modes = [mode for mode in render_modes if can_render(mode)]
         self.metadata = self.metadata | {"render_modes": modes, "render_fps": round(1.0 / float(params.dt))}
-        self._renderer = None if render_mode is None else make_renderer(params.course)
+        self._renderer = None if render_mode is None else self._simulation.make_renderer()
         return box(env.observation_space(params)), box(env.action_space(params))
 
     def _begin(self, options: dict[str, Any] | None, draw_words: Any) -> tuple[Packed, Any, Any]:
@@ -63,7 +63,7 @@ class _Adapter:
         words = draw_words()
         if simulation is not self._simulation:
             self._simulation = simulation
-            self._renderer = self._renderer and make_renderer(simulation.params.course)
+            self._renderer = self._renderer and simulation.make_renderer()
         return simulation.begin(words, start)
 
     def _checked(self, name: str, state: Any, actions: Any, shape: tuple[int, ...] | None) -> np.ndarray:
@@ -85,7 +85,7 @@ class _Adapter:
         self.__dict__.update(state)
         params = self._simulation.params
         if self.render_mode is not None:
-            self._renderer = make_renderer(params.course)
+            self._renderer = self._simulation.make_renderer()
         if self.render_mode == "human":
             self._window = open_window(float(params.dt))
 

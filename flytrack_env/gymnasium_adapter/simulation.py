@@ -14,7 +14,7 @@ from flytrack_env.gymnasium_adapter.options import Start
 from flytrack_env.gymnasium_adapter.packing import Columns, Layout, Packed
 from flytrack_env.randomness import seed_of
 from flytrack_env.registration import make
-from flytrack_env.rendering import scene_row
+from flytrack_env.rendering import make_renderer, scene_row
 from flytrack_env.rendering.flight_log import GATE_INDEX
 from flytrack_env.state import BATTERY, STATE_SIZE, unpack
 from flytrack_env.tracks import Track, build_course, load_track
@@ -184,8 +184,16 @@ class Simulation:
         Raises:
             TrackError: a track that cannot be read.
         """
-        course = build_course(track if isinstance(track, Track) else load_track(track))
-        return Simulation(self.env_id, self.params.replace(course=course), self.overrides)
+        track = track if isinstance(track, Track) else load_track(track)
+        params = self.params.replace(course=build_course(track))
+        return Simulation(self.env_id, params, {**self.overrides, "track": track})
+
+    def make_renderer(self) -> Any:
+        """Return what draws flights, with the ids of the track's gates, or indices on any other course."""
+        course, own = self.params.course, self.env.default_params.course
+        is_own = jax.tree.all(jax.tree.map(np.array_equal, course, own))
+        ids = [gate.id for gate in self.env.track.gates]
+        return make_renderer(course, ids if is_own else range(course.num_gates))
 
     def begin(self, words: np.ndarray, start: Start) -> tuple[Packed, jax.Array, jax.Array]:
         """Return packed state, observation and scene of an episode that begins.

@@ -4,6 +4,7 @@ Needs the extra ``flytrack[render]``; importing this package does not. ``scene_r
 compiled step, the numbers of a picture; ``FlightLog`` collects such rows; ``make_renderer`` draws them.
 """
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from flytrack_env.extras import check_installed, is_installed
@@ -22,8 +23,8 @@ def can_render(mode: str) -> bool:
     return is_installed("PIL") and (mode != "human" or is_installed("pygame"))
 
 
-def make_renderer(course: Course) -> "Renderer":
-    """Return what draws flights on a course.
+def make_renderer(course: Course, gate_ids: Sequence[int]) -> "Renderer":
+    """Return what draws flights on a course whose gates have these numbers.
 
     Raises:
         ImportError: Pillow is not installed; the message says how to install it.
@@ -31,7 +32,7 @@ def make_renderer(course: Course) -> "Renderer":
     check_installed("render", "pictures", "PIL")
     from flytrack_env.rendering.views import Renderer
 
-    return Renderer(course)
+    return Renderer(course, gate_ids)
 
 
 def open_window(step_s: float) -> "Window":

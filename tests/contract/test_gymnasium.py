@@ -79,22 +79,6 @@ def test_ids_are_registered_once_and_without_a_second_time_limit(env_id: str) ->
     assert np.isfinite(env.observation_space.low).all() and np.isfinite(env.observation_space.high).all()
 
 
-@pytest.mark.slow  # of the plain one, the fast test compares every number with those of Gymnasium's own
-@pytest.mark.parametrize("env_id", IDS)
-def test_vector_environment_of_every_id_resets_in_the_same_step(env_id: str) -> None:
-    env = make_vector(env_id, autoreset_mode=AutoresetMode.SAME_STEP)
-    observations, infos = env.reset(seed=3)
-    assert infos == {} and observations in env.observation_space
-    np.testing.assert_allclose(observations[1], gymnasium.make(env_id).reset(seed=4)[0], atol=1e-6)
-    actions = np.stack([np.zeros(4), CRASH, np.zeros(4)])
-    observations, rewards, terminated, truncated, infos = env.step(actions)
-    assert observations in env.observation_space and rewards.shape == (3,) and not truncated.any()
-    np.testing.assert_array_equal(terminated, infos["_final_obs"])
-    assert terminated[1] and infos["final_info"]["crash"][1]
-    assert infos["final_obs"][1] in env.single_observation_space
-    assert (infos["final_obs"][1] != observations[1]).any()
-
-
 def test_single_environment_agrees_with_gymnax(env: FlyTrack, still: EnvParams) -> None:
     key, (_, state) = jax.random.key(0), env.reset(jax.random.key(0), still)
     single = gymnasium.make(BASE, params=still)
