@@ -5,7 +5,7 @@ flies every plant for a minute (benchmarks.hidden), shows the diagnosis the log 
 hidden effects, and grades the result by what the log could show (benchmarks.hidden.oracle). It appends a line
 a plant to docs/results/diagnosis.jsonl, with the commit and versions it was measured at, and skips plants
 that have a line of the same commit. ``python -m benchmarks.diagnosis_page`` writes the page of the last
-commit's lines, ``benchmarks.check_diagnosis`` checks whether a change altered results.
+commit's lines.
 """
 
 import argparse
