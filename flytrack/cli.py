@@ -5,8 +5,10 @@ Nothing of a command is imported before it is called, so that ``flytrack --help`
 """
 
 import argparse
+import contextlib
 import dataclasses
 import importlib
+import io
 import sys
 from collections.abc import Callable, Sequence
 from importlib.metadata import version
@@ -111,7 +113,7 @@ def load(name: str, target: str) -> Any:
             raise NotInstalledError(f"this command is {where}") from error
         if extra is None or not missing or find_spec(missing.partition(".")[0]) is not None:
             raise  # an error of the module, and not of the installation
-        text = f"needs {missing}, which is not installed: {how_to_install(extra)}"
+        text = f"needs the extra {extra}, of which {missing} is not installed: {how_to_install(extra)}"
         raise NotInstalledError(text) from error
 
 
@@ -180,7 +182,11 @@ def print_completion(shell: str) -> None:
     config = (tyro.conf.FlagCreatePairsOff, tyro.conf.OmitArgPrefixes)
     script = ["--tyro-print-completion", shell]
     of_all: Any = Union[tuple(map(flags_of, COMMANDS))]  # noqa: UP007, made of a list
-    tyro.cli(of_all, args=script, prog=PROG, config=config)
+    text = io.StringIO()
+    with contextlib.redirect_stdout(text), contextlib.suppress(SystemExit):
+        tyro.cli(of_all, args=script, prog=PROG, config=config)
+    for line in text.getvalue().splitlines():  # shells read an end of line in a help as that of a word
+        print(line.replace("\\n", " ") if line.startswith("COMPLETION_SPEC = ") else line)
 
 
 def make_parser() -> argparse.ArgumentParser:

@@ -46,7 +46,10 @@ def identify(black_box: Path, out: Path, seed: int, minutes: float) -> dict[str,
     flown = collect(blackbox.load(black_box), minutes, seed, report=ProgressBar("flights"))
     save_log(out / "flight_log.npz", flown)
     log = load_log(out / "flight_log.npz")
-    fits = {"minimal": fit(log), "with_drag": fit(log, effects=("linear_drag",))}
+    fits = {
+        "minimal": fit(log, report=ProgressBar("rounds")),
+        "with_drag": fit(log, effects=("linear_drag",), report=ProgressBar("rounds")),
+    }
     save_model(out / "model.json", fits["with_drag"].model, fits["with_drag"].provenance())
     rows = held_out_rows(log)
     return {name: validate(found.model, log, rows) for name, found in fits.items()}

@@ -40,6 +40,7 @@ class Loop:
     total_timesteps: float = Config.total_timesteps
     """Environment steps of each training."""
     settings: Settings = field(default_factory=Settings)
+    """Of the flights."""
 
 
 @contextmanager

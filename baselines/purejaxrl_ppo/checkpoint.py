@@ -183,10 +183,8 @@ def load_checkpoint(path: str | Path) -> Checkpoint:
     """
     path = Path(path)
     if path.is_dir():
-        found = ", ".join(sorted(file.name for file in path.glob(f"*{SUFFIX}"))) or "none is in it"
-        raise CheckpointError(
-            f"{path}: found a folder, expected a checkpoint file, as {path}/final{SUFFIX}: {found}"
-        )
+        files = ", ".join(sorted(file.name for file in path.glob(f"*{SUFFIX}"))) or "there is none"
+        raise CheckpointError(f"{path}: found a folder, expected a checkpoint file in it: {files}")
     meta, arrays = _read_file(path)
     if meta["format"] != FORMAT:
         raise CheckpointError(f"{path}: format: found {quote_value(meta['format'])}, expected {FORMAT!r}")

@@ -88,6 +88,7 @@ class Settings(Sources):
     no_tracking: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Do not use MLflow."""
     hyperparameters: Config = Config()  # noqa: RUF009, frozen
+    """Of PPO."""
 
     def check(self) -> None:
         """Raise ValueError, naming the flag, for numbers out of range."""

@@ -108,10 +108,11 @@ def test_the_list_of_commands_is_quick_and_the_version_that_of_the_package(capsy
 
 @pytest.mark.parametrize("shell", SHELLS)
 def test_shells_complete_commands_and_flags(shell: str, capsys) -> None:
-    with contextlib.suppress(SystemExit):
-        main(["--print-completion", shell])
+    main(["--print-completion", shell])
     script = capsys.readouterr().out
     assert all(word in script for word in (*COMMANDS, "--noise", "total-timesteps")), script[:2000]
+    (spec,) = [line for line in script.splitlines() if line.startswith("COMPLETION_SPEC = ")]
+    assert "\\n" not in spec
 
 
 @pytest.mark.parametrize(
