@@ -20,7 +20,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from baselines.purejaxrl_ppo import Checkpoint, load_checkpoint
-from baselines.purejaxrl_ppo.evaluate import SHIPPED_BLACK_BOX
 from baselines.purejaxrl_ppo.export import ExportSettings, export
 from baselines.purejaxrl_ppo.export_policy import ExportedPolicy, policy_of
 from baselines.purejaxrl_ppo.flights import race_many, start_keys, start_pose_params
@@ -169,7 +168,7 @@ def section_of(name: str, num_inputs: int, folder: Path) -> str:
     export(ExportSettings(path, single, header))
     export(ExportSettings(path, double, float64=True))
     checkpoint, compiled = load_checkpoint(path), CompiledPolicy(header)
-    env = plant_env(checkpoint, blackbox.load(SHIPPED_BLACK_BOX))
+    env = plant_env(checkpoint, blackbox.load(blackbox.SHIPPED))
     flown = race(compiled, env)
     python = race_many(env, checkpoint.network, checkpoint.params, start_keys(SEED, FLIGHTS), STEPS, LAPS)
     same = int(np.sum(flown.finished == python.is_complete()))
