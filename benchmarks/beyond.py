@@ -22,6 +22,7 @@ from tqdm import tqdm
 from benchmarks import hidden, report
 from benchmarks.diagnosis import model_of
 from benchmarks.hidden.oracle import removed
+from benchmarks.real.section import formulas_of
 from flytrack_sysid.diagnosis import Diagnosis, diagnose
 from flytrack_sysid.diagnosis.lanes import make_lanes
 from flytrack_sysid.diagnosis.law_search import Side
@@ -192,12 +193,14 @@ def real_rows() -> list[tuple[str, str, str, str]]:
     for path in sorted(REAL.glob("*_diagnosis.json")):
         for number, found in enumerate(diagnoses_of(json.loads(path.read_text()))):
             name = f"{path.stem.removesuffix('_diagnosis')} {number + 1}"
-            learned, errors = found.get("learned"), found["prediction"]["errors"]
+            if "learned" not in found:
+                rows.append((name, "not diagnosed since laws are learnt", "-", "-"))
+                continue
+            learned, errors = found["learned"], found["prediction"]["errors"]
             if learned is None:
                 rows.append((name, "nothing", "-", "-"))
                 continue
-            formulas = [one["formula"] for one in learned["law"]]
-            formulas += [f"residual on {one['acts']}" for one in learned["residual"]]
+            formulas = formulas_of(learned)
             ratios = [
                 errors["extended"][quantity][horizon] / before
                 for quantity, by_horizon in errors["without_learned"].items()

@@ -111,7 +111,7 @@ def l2f_contestant(name: str, num_envs: int, length: int) -> Contestant:
     return Contestant(name, length * num_envs / 1e6, run)
 
 
-def gymnasium_contestant(num_envs: int, length: int) -> Contestant:
+def gymnasium_contestant(num_envs: int, length: int, autoreset_mode: str = "SameStep") -> Contestant:
     """Return steps through Gymnasium, NumPy in and out: of a vector environment, or of a single one."""
     import gymnasium
     import numpy as np
@@ -119,7 +119,7 @@ def gymnasium_contestant(num_envs: int, length: int) -> Contestant:
     id_, shape = "flytrack_env:FlyTrack-v0", (NUM_ACTIONS, num_envs, 4)
     actions = np.random.default_rng(0).uniform(-1.0, 1.0, shape).astype(np.float32)
     if num_envs > 1:
-        env = gymnasium.make_vec(id_, num_envs=num_envs, vectorization_mode="vector_entry_point")
+        env = gymnasium.make_vec(id_, num_envs=num_envs, autoreset_mode=autoreset_mode)
     else:
         env, actions = gymnasium.make(id_), actions[:, 0]
     env.reset(seed=0)
@@ -130,7 +130,8 @@ def gymnasium_contestant(num_envs: int, length: int) -> Contestant:
             if num_envs == 1 and (terminated or truncated):
                 env.reset()
 
-    return Contestant(f"Gymnasium, {num_envs:,}", num_envs * length / 1e6, run)
+    mode = f", {autoreset_mode}" if num_envs > 1 else ""
+    return Contestant(f"Gymnasium, {num_envs:,}{mode}", num_envs * length / 1e6, run)
 
 
 def contestants() -> list[Contestant]:
@@ -141,6 +142,7 @@ def contestants() -> list[Contestant]:
         jax_contestant(BATCH, "FlyTrack-v0", 4096, 200, is_batch=True),
         *(jax_contestant(name, env_id, 1024, 200, is_batch=False) for name, env_id in VARIANTS.items()),
         gymnasium_contestant(1024, 200),
+        gymnasium_contestant(1024, 200, "NextStep"),
         gymnasium_contestant(1, 2000),
     ]
     try:

@@ -33,7 +33,7 @@ tell("step")
 VECTOR = """
 import gymnasium, numpy, flytrack_env
 started = time.perf_counter()
-envs = gymnasium.make_vec("FlyTrack-v0", num_envs=256, vectorization_mode="vector_entry_point")
+envs = gymnasium.make_vec("FlyTrack-v0", num_envs=256, autoreset_mode="SameStep")
 envs.reset(seed=0)
 tell("vector_reset")
 envs.step(numpy.zeros((256, 4), numpy.float32))

@@ -5,6 +5,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 EVALUATION_SEED = 1234  # the same starts before and after training, and for every client
 NUM_FLIGHTS = 256
@@ -51,3 +52,15 @@ def mean_gates(
 
     keys = jax.random.split(jax.random.key(EVALUATION_SEED), NUM_FLIGHTS)
     return float(jax.jit(jax.vmap(fly))(keys).mean())
+
+
+def outcome_of(done: Any, returns: Any, gates: Any) -> Outcome:
+    """Return the mean results of the episodes that ended in the first and in the last tenth of a training.
+
+    Of every step, (num_updates, ...): whether an episode ended, and its return and gates where it did.
+    """
+    done, returns, gates = map(np.asarray, (done, returns, gates))
+    tenth = max(1, len(done) // 10)
+    parts = slice(tenth), slice(-tenth, None)
+    means = [float(values[part][done[part]].mean()) for values in (returns, gates) for part in parts]
+    return Outcome(*means)

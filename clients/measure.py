@@ -7,9 +7,10 @@ import argparse
 import time
 
 from benchmarks import report
-from clients import evosax_es, rejax_ppo, sb3_ppo
+from clients import cleanrl_loop, evosax_es, rejax_ppo, sb3_ppo, sbx_ppo
 
-CLIENTS = {"rejax": rejax_ppo, "stable-baselines3": sb3_ppo, "evosax": evosax_es}
+CLIENTS = {"rejax": rejax_ppo, "stable-baselines3": sb3_ppo, "sbx-rl": sbx_ppo, "evosax": evosax_es}
+CLIENTS["gymnasium"] = cleanrl_loop  # a loop of one's own, with Gymnasium's wrappers
 HEADER = "client | seed | return before | return after | gates before | gates after | wall (s) | CPU (s)"
 
 
@@ -40,7 +41,7 @@ def main() -> None:
         f"gained by **{reached[name]} of {arguments.seeds}** seeds"
         for name, client in CLIENTS.items()
     )
-    table, packages = report.table(HEADER, rows), [*CLIENTS, "torch", "gymnasium"]
+    table, packages = report.table(HEADER, rows), [*CLIENTS, "torch"]
     report.fill_page(report.RESULTS / "clients.md", "clients", packages, margins=margins, table=table)
     if min(reached.values()) < arguments.seeds:
         raise SystemExit(1)

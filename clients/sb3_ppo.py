@@ -17,15 +17,14 @@ RETURN_MARGIN, GATE_MARGIN = 10.0, 4.0  # 0.4 of the worst of five seeds: docs/r
 
 def make_envs(num_envs: int) -> VecMonitor:
     """Return environments side by side for Stable-Baselines3, with its log of returns."""
-    env_id, mode = "flytrack_env:FlyTrack-v0", "vector_entry_point"
-    envs = gymnasium.make_vec(env_id, num_envs, vectorization_mode=mode)
+    envs = gymnasium.make_vec("flytrack_env:FlyTrack-v0", num_envs, autoreset_mode="SameStep")
     return VecMonitor(SameStepVecEnv(envs))
 
 
-def make_ppo(seed: int) -> PPO:
-    """Return Stable-Baselines3's PPO for FlyTrack-v0, not trained yet."""
+def make_ppo(seed: int, algorithm: type = PPO) -> Any:
+    """Return Stable-Baselines3's PPO, or sbx's, for FlyTrack-v0, not trained yet."""
     torch.set_num_threads(1)  # more threads compete with those of JAX
-    model = PPO(
+    model = algorithm(
         "MlpPolicy",
         make_envs(256),
         n_steps=64,
@@ -38,7 +37,7 @@ def make_ppo(seed: int) -> PPO:
     return model
 
 
-def evaluate(model: PPO) -> tuple[float, float]:
+def evaluate(model: Any) -> tuple[float, float]:
     """Return the mean return and gates of an episode, by Stable-Baselines3 on the same starts."""
     gates = []
 
@@ -52,9 +51,9 @@ def evaluate(model: PPO) -> tuple[float, float]:
     return float(mean_return), float(np.mean(gates))
 
 
-def measure(seed: int) -> Outcome:
+def measure(seed: int, algorithm: type = PPO) -> Outcome:
     """Train and return the evaluations before and after."""
-    model = make_ppo(seed)
+    model = make_ppo(seed, algorithm)
     return_before, gates_before = evaluate(model)
     model.learn(1_000_000)
     return_after, gates_after = evaluate(model)

@@ -16,7 +16,7 @@ NUM_ENVS, MAX_STEPS = 16, 80
 def make_vec() -> SameStepVecEnv:
     """Return a few environments with episodes so short that some are truncated."""
     params = gymnax.make("FlyTrack-v0")[1].replace(max_steps_in_episode=MAX_STEPS)
-    settings = {"vectorization_mode": "vector_entry_point", "params": params}
+    settings = {"autoreset_mode": "SameStep", "params": params}
     return SameStepVecEnv(gymnasium.make_vec("flytrack_env:FlyTrack-v0", NUM_ENVS, **settings))
 
 

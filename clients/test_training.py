@@ -3,11 +3,14 @@
 from types import ModuleType
 from typing import Any
 
+import gymnasium
 import jax
 import numpy as np
 import pytest
+from torchrl.envs import GymEnv, GymWrapper
 
-from clients import evosax_es, rejax_ppo, sb3_ppo
+from clients import evosax_es, rejax_ppo
+from clients.measure import CLIENTS
 from flytrack_env.registration import ENVIRONMENTS
 
 POPULATION_SIZE = 16
@@ -15,10 +18,18 @@ POPULATION_SIZE = 16
 every_id = pytest.mark.parametrize("env_id", sorted(ENVIRONMENTS))
 
 
-@pytest.mark.parametrize("client", [rejax_ppo, sb3_ppo, evosax_es], ids=lambda client: client.__name__)
+@pytest.mark.parametrize("client", CLIENTS.values(), ids=CLIENTS)
 def test_training_gains_its_margins(client: ModuleType) -> None:
     outcome = client.measure(seed=0)
     assert outcome.has_gained(client.RETURN_MARGIN, client.GATE_MARGIN), outcome
+
+
+def test_torchrl_wraps_single_and_vector_environments() -> None:
+    envs = gymnasium.make_vec("flytrack_env:FlyTrack-v0", 8, autoreset_mode="SameStep")
+    for env, shape in ((GymEnv("FlyTrack-v0"), (300,)), (GymWrapper(envs), (8, 300))):
+        flown = env.rollout(300, break_when_any_done=False)
+        assert flown["next", "done"].any() and flown["next", "observation"].isfinite().all()
+        assert flown.shape == shape
 
 
 @every_id

@@ -90,7 +90,6 @@ COMMANDS = {
         "flytrack_bench.cli:Flags",
         True,
     ),
-    "fly": Command("Fly yourself", "fly", "flytrack_fly.cli:main", None, True),
 }
 
 

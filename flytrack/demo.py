@@ -56,19 +56,11 @@ def identify(black_box: Path, out: Path, seed: int, minutes: float) -> dict[str,
 
 
 def describe_identification(validations: dict[str, Validation]) -> None:
-    """Print one-step errors on held-out data, and the force that each model leaves open."""
+    """Print one-step errors on held-out data."""
     minimal, extended = validations["minimal"], validations["with_drag"]
     print("    one-step MSE on held-out data          minimal   with linear drag")
     for name, error in minimal.one_step.channels.items():
         print(f"      {NAMES[name]:36} {error.mse:9.3g} {extended.one_step.channels[name].mse:9.3g}")
-    if minimal.open_force is None or extended.open_force is None:
-        return
-    print("    open, not explained: specific force, rms in m/s^2, by speed")
-    for before, after in zip(minimal.open_force.by_speed, extended.open_force.by_speed, strict=True):
-        speeds = (
-            f"{before.low:g} to {before.high:g} m/s" if before.high < np.inf else f"over {before.low:g} m/s"
-        )
-        print(f"      {speeds:36} {before.rms:9.3f} {after.rms:9.3f}")
 
 
 def run_demo(flags: Demo) -> None:

@@ -15,12 +15,13 @@ from gymnax.environments import environment, spaces
 
 from flytrack_env.auto_reset import Ended, reset_if_ended
 from flytrack_env.dynamics import ModelParameters
+from flytrack_env.effects import effect_of
 from flytrack_env.fusion import compute_once, one_kernel
 from flytrack_env.observations import Entry
 from flytrack_env.params import EnvParams
 from flytrack_env.plants import Plant
 from flytrack_env.race import Race
-from flytrack_env.randomness import seed_of, seeds_of
+from flytrack_env.randomness import check_key, seed_of, seeds_of
 from flytrack_env.state import ACTION_SIZE, Action, Drone, unpack_action
 from flytrack_env.tracks import Track
 
@@ -117,6 +118,11 @@ class EpisodicEnvironment(environment.Environment[Any, EnvParams]):  # type: ign
         """The registered id."""
         return self.env_id
 
+    def __repr__(self) -> str:
+        effects = ", ".join(effect_of(one).name for one in self.default_params.model.effects) or "none"
+        track, plant, size = self.track.name, type(self.plant).__name__, self.observation_space().shape[0]
+        return f"<{self.env_id}: track {track}, plant {plant}, effects {effects}, observation size {size}>"
+
     @property
     def num_actions(self) -> int:
         """Number of components of an action."""
@@ -154,9 +160,11 @@ class EpisodicEnvironment(environment.Environment[Any, EnvParams]):  # type: ign
         """Return observation, (size,) float32, and state of an episode that begins.
 
         Raises:
+            TypeError: a key that is none, or more than one.
             ValueError: parameters of another environment's wrappers; or that no episode can be flown with,
                 where their values are known (not while they are traced).
         """
+        check_key(key)
         if params is None:
             params = self.default_params
         expected = sorted(self.default_params.wrappers)
@@ -197,26 +205,45 @@ class EpisodicEnvironment(environment.Environment[Any, EnvParams]):  # type: ign
         flags = {"terminated": terminated, "truncated": self.is_truncated(next_state, params)}
         return rows, next_state, reward, flags, info
 
-    def _step(self, seed: jax.Array, state: Any, command: Action, params: EnvParams) -> tuple[Any, ...]:
+    def _step(
+        self, seed: jax.Array, state: Any, command: Action, params: EnvParams, has_ended: Any
+    ) -> tuple[Any, ...]:
         """Return observation and that before the reset, row by row, state, reward, flags and info."""
         final_rows, next_state, reward, flags, info = self._step_env(state, command, params)
-        done = compute_once(flags["terminated"] | flags["truncated"])
-        ended = Ended(done, (final_rows, next_state), seed)
+        if has_ended is None:
+            done = flags["terminated"] | flags["truncated"]
+        else:
+            done, reward = has_ended, jnp.where(has_ended, 0.0, reward)
+            flags = {name: flag & ~has_ended for name, flag in flags.items()}
+        ended = Ended(compute_once(done), (final_rows, next_state), seed)
         rows, next_state = reset_if_ended(self._begin_from, ended, params)
         return rows, final_rows, next_state, reward, flags, info
 
     @partial(jax.jit, static_argnames=("self",))
-    def step_batch(self, key: jax.Array, states: Any, actions: jax.Array, params: EnvParams) -> Step:
+    def step_batch(
+        self,
+        key: jax.Array,
+        states: Any,
+        actions: jax.Array,
+        params: EnvParams,
+        has_ended: jax.Array | None = None,
+    ) -> Step:
         """``step`` for a whole batch with one key, faster than ``vmap(step)``.
 
         states: leaves (num_envs,). actions: (num_envs, 4). params: the same for all. Same results as
         ``vmap(step)`` up to the random draws: starts are sampled only in steps where an episode ended.
+
+        has_ended: None, or (num_envs,) bool to reset one step late: an environment whose episode ended in the
+        step before is reset instead of stepped, with a reward of 0, both flags False and a meaningless info.
         """
         seeds = seeds_of(seed_of(key), jnp.arange(actions.shape[0]))
-        return jax.vmap(self._step_from, in_axes=(0, 0, 0, None))(seeds, states, actions, params)
+        step = jax.vmap(self._step_from, in_axes=(0, 0, 0, None, 0))
+        return step(seeds, states, actions, params, has_ended)
 
-    def _step_from(self, seed: jax.Array, state: Any, action: jax.Array, params: EnvParams) -> Step:
-        found = one_kernel(self._step)(seed, state, clip_action(action), params)
+    def _step_from(
+        self, seed: jax.Array, state: Any, action: jax.Array, params: EnvParams, has_ended: Any = None
+    ) -> Step:
+        found = one_kernel(self._step)(seed, state, clip_action(action), params, has_ended)
         rows, final_rows, state, reward, flags, info = found
         info = {**info, **flags, "final_observation": jnp.stack(final_rows)}
         return jnp.stack(rows), state, reward, flags["terminated"], flags["truncated"], info

@@ -3,6 +3,19 @@
 from importlib.util import find_spec
 
 PACKAGES = {"PIL": "Pillow", "pygame": "pygame-ce", "rerun": "rerun-sdk"}  # where the module's name differs
+OLDEST_GYMNAX = 1
+
+
+def is_installed(module: str) -> bool:
+    """Return whether a module is there to be imported; does not import it."""
+    return find_spec(module) is not None
+
+
+def check_gymnax(found: str) -> None:
+    """Raise ImportError if this version of gymnax has no step of six values."""
+    if int(found.partition(".")[0]) < OLDEST_GYMNAX:
+        how = f"pip install 'gymnax>={OLDEST_GYMNAX}'"
+        raise ImportError(f"gymnax: found version {found}, expected {OLDEST_GYMNAX}.0 or newer: {how}")
 
 
 def check_installed(extra: str, who: str, *modules: str) -> None:
@@ -14,7 +27,7 @@ def check_installed(extra: str, who: str, *modules: str) -> None:
         ImportError: a module is not installed; the message names its package and the extra.
     """
     for module in modules:
-        if find_spec(module) is None:
+        if not is_installed(module):
             package = PACKAGES.get(module, module)
             how = f"pip install 'flytrack[{extra}]'"
             raise ImportError(f"{who} need {package}, which is not installed: {how}", name=module)

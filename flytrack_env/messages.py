@@ -1,6 +1,8 @@
 """Untrusted values in error messages: short, printable, on one line."""
 
+import difflib
 import reprlib
+from collections.abc import Iterable, Sequence
 
 LONGEST_NAME = 60  # characters
 LONGEST_TEXT = 300
@@ -24,3 +26,15 @@ def error_text(error: BaseException) -> str:
     """Return an exception's message on one line, shortened; it may quote the file's content."""
     text = " ".join(str(error).split())[:LONGEST_TEXT]
     return text if text.isprintable() else ascii(text)[1:-1]
+
+
+def check_keywords(found: Iterable[str], expected: Sequence[str]) -> None:
+    """Raise TypeError for a keyword that ``make`` does not have, with the one that may be meant.
+
+    In Python's own words, by which TorchRL finds out what an environment takes.
+    """
+    for name in found:
+        if name not in expected:
+            close = difflib.get_close_matches(name, expected, n=1)
+            hint = f"did you mean {close[0]!r}?" if close else f"expected one of {', '.join(expected)}"
+            raise TypeError(f"make() got an unexpected keyword argument {quote_name(name)!r}; {hint}")

@@ -7,11 +7,13 @@ drawing more than a few dozen numbers per word.
 """
 
 import zlib
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 
 from flytrack_env.fusion import compute_once
+from flytrack_env.messages import quote_value
 from flytrack_env.quaternion import Scalar
 
 UNIFORM_BITS = 24  # the mantissa of a float32
@@ -30,6 +32,22 @@ def mix(word: jax.Array) -> jax.Array:
     word = (word ^ (word >> 16)) * jnp.uint32(0x7FEB352D)
     word = (word ^ (word >> 15)) * jnp.uint32(0x846CA68B)
     return word ^ (word >> 16)
+
+
+def check_key(key: Any) -> None:
+    """Raise TypeError unless this is one JAX key (typed, or the legacy array of words), traced or not."""
+    dtype = getattr(key, "dtype", None)
+    if dtype is not None and jnp.issubdtype(dtype, jax.dtypes.prng_key):
+        num_axes = 0
+    elif dtype == jnp.uint32 and key.ndim:
+        num_axes = 1
+    else:
+        raise TypeError(f"key: found {quote_value(key)}, expected a key of JAX, such as jax.random.key(0)")
+    if key.ndim != num_axes:
+        keys = key.shape[: key.ndim - num_axes]
+        raise TypeError(
+            f"key: found keys of shape {keys}, expected one key; for a batch: jax.vmap(env.reset)"
+        )
 
 
 def seed_of(key: jax.Array) -> jax.Array:

@@ -1,5 +1,6 @@
 """The table of environment ids, and their registration with gymnax."""
 
+import inspect
 from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any, NamedTuple
@@ -9,6 +10,7 @@ from gymnax.registration import registered_envs
 
 from flytrack_env.env import FlyTrack
 from flytrack_env.episodes import EpisodicEnvironment
+from flytrack_env.messages import check_keywords
 from flytrack_env.wrappers import ActionHistory, DomainRandomization, ObservationNoise
 
 
@@ -20,6 +22,7 @@ class Variant(NamedTuple):
     wrappers: tuple[Callable[[EpisodicEnvironment], EpisodicEnvironment], ...] = ()
 
 
+ARGUMENTS = tuple(inspect.signature(FlyTrack).parameters)  # of make, by name
 HISTORY = partial(ActionHistory, length=3)
 
 ENVIRONMENTS: dict[str, Variant] = {
@@ -46,9 +49,11 @@ def make(env_id: str, **overrides: Any) -> EpisodicEnvironment:
 
     Raises:
         ValueError: unknown id.
+        TypeError: unknown argument.
     """
     if env_id not in ENVIRONMENTS:
         raise ValueError(f"env_id: found {env_id!r}, expected one of {', '.join(ENVIRONMENTS)}")
+    check_keywords(overrides, ARGUMENTS)
     variant = ENVIRONMENTS[env_id]
     env: EpisodicEnvironment = FlyTrack(**{**variant.arguments, **overrides})
     for wrapper in variant.wrappers:

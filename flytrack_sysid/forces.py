@@ -1,6 +1,5 @@
-"""The specific force that a model does not explain: by speed, and as thrust by applied action and voltage."""
+"""The error of a model's thrust, by applied action and voltage."""
 
-from itertools import pairwise
 from typing import NamedTuple
 
 import jax
@@ -13,7 +12,6 @@ from flytrack_sysid.log import FlightLog
 from flytrack_sysid.prediction import Prediction, inputs_that_lack, judged_steps, specific_force_w, to_body
 from flytrack_sysid.prediction_errors import predicted_channel
 
-SPEED_EDGES = (0.0, 2.0, 5.0, 10.0, 20.0, np.inf)
 NUM_ACTION_BINS = 10
 NUM_VOLTAGE_BINS = 4
 # V; a pack that never changes its voltage still gets a bin.
@@ -24,7 +22,7 @@ class ForceSamples(NamedTuple):
     """Specific force of judged steps, body frame, (num_samples, 3) m/s^2.
 
     source: the channel it was measured with, f or a. Others (num_samples,): applied thrust action after the
-    step, V, rows before the steps.
+    step, V.
     """
 
     source: str
@@ -32,30 +30,6 @@ class ForceSamples(NamedTuple):
     modelled_b: np.ndarray
     action: np.ndarray
     battery_v: np.ndarray
-    rows: np.ndarray
-
-
-class SpeedBin(NamedTuple):
-    """Unexplained force at speeds from low to high, m/s (inf: no limit); rms of norm and body axes, m/s^2.
-
-    mean_against_velocity: its mean component against the direction of flight: drag that the model lacks.
-    """
-
-    low: float
-    high: float
-    count: int  # type: ignore[assignment]  # hides tuple.count
-    rms: float
-    rms_b: tuple[float, float, float]
-    mean_against_velocity: float
-
-
-class OpenForce(NamedTuple):
-    """Specific force, measured minus modelled, body axes, m/s^2."""
-
-    source: str
-    mean_b: tuple[float, float, float]
-    rms_b: tuple[float, float, float]
-    by_speed: tuple[SpeedBin, ...]
 
 
 def force_samples(
@@ -77,40 +51,6 @@ def force_samples(
         modelled_b=predicted_channel("f", prediction)[here],
         action=np.asarray(prediction.after.applied.thrust)[here],
         battery_v=np.asarray(prediction.before.battery_v)[here],
-        rows=here,
-    )
-
-
-def open_force(log: FlightLog, prediction: Prediction, samples: ForceSamples) -> OpenForce:
-    """Return the specific force that the model does not explain, in all and by speed over ground, m/s^2.
-
-    The log must have v and q.
-    """
-    error_b = samples.measured_b - samples.modelled_b
-    before = jax.tree.map(lambda leaf: leaf[samples.rows], prediction.before)
-    vel_b = to_body(before, log["v"][samples.rows])
-    speed = np.linalg.norm(vel_b, axis=1)
-    against = -np.sum(error_b * vel_b, axis=1) / np.maximum(speed, np.finfo(float).tiny)
-    bins = []
-    for low, high in pairwise(SPEED_EDGES):
-        is_in = (speed >= low) & (speed < high)
-        if is_in.any():
-            squared = np.mean(error_b[is_in] ** 2, axis=0)
-            bins.append(
-                SpeedBin(
-                    low=low,
-                    high=high,
-                    count=int(is_in.sum()),
-                    rms=float(np.sqrt(squared.sum())),
-                    rms_b=tuple(np.sqrt(squared).tolist()),
-                    mean_against_velocity=float(np.mean(against[is_in])),
-                )
-            )
-    return OpenForce(
-        source=samples.source,
-        mean_b=tuple(np.mean(error_b, axis=0).tolist()),
-        rms_b=tuple(np.sqrt(np.mean(error_b**2, axis=0)).tolist()),
-        by_speed=tuple(bins),
     )
 
 

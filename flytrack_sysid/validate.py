@@ -1,11 +1,11 @@
-"""Validation: how well a model predicts a flight log, and the forces that it does not explain."""
+"""Validation: how well a model predicts a flight log."""
 
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from flytrack_env.dynamics import ModelParameters
-from flytrack_sysid.forces import OpenForce, ThrustError, force_samples, open_force, thrust_error
+from flytrack_sysid.forces import ThrustError, force_samples, thrust_error
 from flytrack_sysid.log import FlightLog
 from flytrack_sysid.prediction import Prediction, inputs_that_lack, predict
 from flytrack_sysid.prediction_errors import OneStep, Rollout, one_step_errors, rollout_errors
@@ -28,7 +28,7 @@ class Validation(NamedTuple):
     num_rows, num_judged: rows of the log, and those that were judged. one_step: errors of single steps.
     rollouts: errors of free flight, by its length. steps: responses to commanded steps.
     notes: sentences on what could not be judged and why, and on what was assumed.
-    thrust, open_force: None where the log has no measurement of them.
+    thrust: None where the log has no measurement of it.
     """
 
     num_rows: int
@@ -36,7 +36,6 @@ class Validation(NamedTuple):
     one_step: OneStep
     rollouts: tuple[Rollout, ...]
     thrust: ThrustError | None
-    open_force: OpenForce | None
     steps: tuple[StepResponse, ...]
     notes: tuple[str, ...]
 
@@ -45,14 +44,13 @@ class Validation(NamedTuple):
 
         What could not be judged is absent, and in the notes; numbers that are not finite are null.
         """
-        parts = {"thrust": self.thrust, "open_force": self.open_force}
         return _json_of(
             {
                 "rows": self.num_rows,
                 "judged_rows": self.num_judged,
                 "one_step": self.one_step.as_json(),
                 "rollouts": [rollout.as_json() for rollout in self.rollouts],
-                **{name: part for name, part in parts.items() if part is not None},
+                **({} if self.thrust is None else {"thrust": self.thrust}),
                 "steps": self.steps,
                 "notes": self.notes,
             }
@@ -97,27 +95,6 @@ def _notes_of(model: ModelParameters, log: FlightLog, prediction: Prediction) ->
     return notes
 
 
-def _forces(
-    model: ModelParameters, log: FlightLog, prediction: Prediction, rows: np.ndarray
-) -> tuple[ThrustError | None, OpenForce | None, list[str]]:
-    """Return the error of thrust, the unexplained force, and notes on what of them cannot be judged."""
-    thrust = left = None
-    samples = force_samples(model, log, prediction, rows)
-    if samples is None:
-        why = "no judged step has f or a to compare the model with"
-        return None, None, [f"thrust and unexplained force: {why}"]
-    notes = []
-    if "v_bat" in log:
-        thrust = thrust_error(model, samples)
-    else:
-        notes.append("thrust by voltage: v_bat is not in the log")
-    if "v" in log and "q" in log:
-        left = open_force(log, prediction, samples)
-    else:
-        notes.append("unexplained force by speed: it needs v, q, and a or f")
-    return thrust, left, notes
-
-
 def validate(model: ModelParameters, log: FlightLog, rows: np.ndarray | None = None) -> Validation:
     """Return the errors of a model on a log, from the measured states under the logged commands.
 
@@ -140,8 +117,13 @@ def validate(model: ModelParameters, log: FlightLog, rows: np.ndarray | None = N
     too_long = [f"{rollout.horizon_s:g} s" for rollout in rollouts if not rollout.num_starts]
     if too_long:
         notes.append(f"free flight of {', '.join(too_long)}: no judged stretch is that long")
-    thrust, left, force_notes = _forces(model, log, prediction, rows)
-    notes += force_notes
+    samples, thrust = force_samples(model, log, prediction, rows), None
+    if samples is None:
+        notes.append("thrust: no judged step has f or a to compare the model with")
+    elif "v_bat" not in log:
+        notes.append("thrust by voltage: v_bat is not in the log")
+    else:
+        thrust = thrust_error(model, samples)
     steps = step_responses(model, log, prediction, rows)
     if not steps:
         notes.append(
@@ -149,4 +131,4 @@ def validate(model: ModelParameters, log: FlightLog, rows: np.ndarray | None = N
             f"{LEAST_JUMP:g} between {HELD_BEFORE_S:g} s and {HELD_AFTER_S:g} s of constant command, with "
             "body rates measured"
         )
-    return Validation(num_rows, num_judged, one_step, rollouts, thrust, left, steps, tuple(notes))
+    return Validation(num_rows, num_judged, one_step, rollouts, thrust, steps, tuple(notes))

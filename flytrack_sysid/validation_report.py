@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from flytrack_env.files import write_atomically
-from flytrack_sysid.forces import OpenForce, ThrustError
+from flytrack_sysid.forces import ThrustError
 from flytrack_sysid.log import FlightLog
 from flytrack_sysid.page import Bullets, Picture, Section, Table, Text, page
 from flytrack_sysid.plots import draw_validation, png_of
@@ -21,7 +21,6 @@ HEADINGS = {
     "rollouts": "Free flight",
     "one_step": "One step",
     "thrust": "Thrust by command and voltage",
-    "open_force": "Unexplained force by speed",
 }
 CAPTIONS = {
     "steps": "Body rates, measured (solid) and of the model flying by itself from 0.1 s before the command.",
@@ -70,23 +69,11 @@ def _thrust_table(thrust: ThrustError) -> Table:
     return Table(["V", *(f"{middle:+.1f}" for middle in middles)], rows, caption)
 
 
-def _force_table(force: OpenForce) -> Table:
-    rows = []
-    for part in force.by_speed:
-        numbers = (part.rms, *part.rms_b, part.mean_against_velocity)
-        speed = f"{part.low:g} to {part.high:g}" if np.isfinite(part.high) else f"over {part.low:g}"
-        rows.append([speed, *(_number(number) for number in numbers), str(part.count)])
-    caption = f"Specific force not explained, m/s^2, by speed in m/s, measured with {force.source}"
-    return Table(["speed", "rms", "x", "y", "z", "drag-like mean", "steps"], rows, caption)
-
-
 def _tables(validation: Validation) -> dict[str, Table]:
     """Return the tables that have any row, by the figure that they belong to."""
     tables = {"one_step": _one_step_table(validation), "rollouts": _rollout_table(validation)}
     if validation.thrust is not None:
         tables["thrust"] = _thrust_table(validation.thrust)
-    if validation.open_force is not None:
-        tables["open_force"] = _force_table(validation.open_force)
     return {name: table for name, table in tables.items() if table.rows}
 
 

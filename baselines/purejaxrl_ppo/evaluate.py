@@ -292,7 +292,8 @@ def make_numbers(
     if references is not None:
         numbers["optimal"] = compare_with_optimum(numbers, references)
         if settings.ghost:
-            numbers["time_lost_s"] = time_lost(outcomes, references)
+            gate_ids = [gate.id for gate in scene.env.track.gates]
+            numbers["time_lost_s"] = time_lost(outcomes, references, gate_ids)
     numbers["first_flight"] = {
         "steps": int(np.sum(rollout.is_flying)),
         "gates": int(np.max(rollout.gates_passed)),

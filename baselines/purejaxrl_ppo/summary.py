@@ -83,8 +83,8 @@ def compare_with_optimum(summary: dict[str, Any], references: References) -> dic
     return comparison
 
 
-def time_lost(outcomes: Outcomes, references: References) -> list[dict[str, Any]]:
-    """Return the mean time lost on the way to each gate, s, as JSON values: one row per gate.
+def time_lost(outcomes: Outcomes, references: References, gate_ids: list[int]) -> list[dict[str, Any]]:
+    """Return the mean time lost on the way to each gate, s, as JSON values: one row per gate, with its id.
 
     Only complete laps count, so that the rows add up to mean lap time minus optimum; None without any.
     """
@@ -101,4 +101,5 @@ def time_lost(outcomes: Outcomes, references: References) -> list[dict[str, Any]
         optimal = np.diff(references[LAPS[name]].gate_times_s, prepend=0.0)
         lost[name] = (own.mean(axis=0) - optimal).tolist() if len(own) else [None] * num_gates
     columns = zip(*lost.values(), strict=True)
-    return [{"gate": gate + 1, **dict(zip(LAPS, values, strict=True))} for gate, values in enumerate(columns)]
+    rows = zip(gate_ids, columns, strict=True)
+    return [{"gate": gate, **dict(zip(LAPS, values, strict=True))} for gate, values in rows]

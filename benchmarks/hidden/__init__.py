@@ -1,16 +1,14 @@
 """Plants with hidden effects, for grading the diagnosis, in equations that share nothing with the package.
 
-``draw_base``, ``draw_effect``, ``draw_truth``, ``draw_outside``, ``draw_gust``, ``draw_onset``, ``draw_late``
-and ``draw_change`` draw a ``Truth``; its ``motion`` and ``step_s`` say how it moves and is logged; ``fly``
+``draw_base``, ``draw_effect``, ``draw_truth``, ``draw_outside``, ``draw_gust``, ``draw_onset`` and
+``draw_late`` draw a ``Truth``; its ``motion`` and ``step_s`` say how it moves and is logged; ``fly``
 flies it; ``measure`` turns the clean log into what sensors would have logged.
 """
 
 from benchmarks.hidden.draws import (
-    CHANGES,
     EFFECTS,
     NAMES,
     draw_base,
-    draw_change,
     draw_effect,
     draw_gust,
     draw_late,

@@ -176,10 +176,18 @@ def changed_table(found: Record) -> str:
     return table("parameter | nominal | extended | 95 % interval", rows)
 
 
+def formulas_of(learned: Record) -> list[str]:
+    """Return what was learnt beyond the list: the formulas of laws, and what residuals act on."""
+    return [one["formula"] for one in learned["law"]] + [
+        f"residual on {one['acts']} of {', '.join(each['quantity'] for each in one['inputs'])}"
+        for one in learned["residual"]
+    ]
+
+
 def section(measured: Record, picture: str) -> str:
     """Return what was found in one diagnosis; picture: the file of ``draw``."""
     found = measured["diagnosis"]
-    left = found["unexplained"]["times_sensor_noise"]
+    left, learned = found["unexplained"]["times_sensor_noise"], found.get("learned")
     shares = ", ".join(f"{name} ({number(share)} times the sensor's noise)" for name, share in left.items())
     small = ", ".join(f"`{cause['effect']}`" for cause in found["negligible"])
     cost = f"{measured['cpu_s']:.0f} CPU s, compilation included; commit {measured['commit']}"
@@ -193,6 +201,7 @@ def section(measured: Record, picture: str) -> str:
         "Every parameter that changed:",
         changed_table(found),
         f"Unexplained: {shares or 'nothing'}.",
+        f"Learnt beyond the list: {'; '.join(formulas_of(learned))}." if learned else "",
         *found["warnings"],
     ]
     return "\n\n".join(filter(None, parts))

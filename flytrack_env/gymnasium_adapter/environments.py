@@ -1,20 +1,25 @@
 """The environments behind ``gymnasium.make`` and ``gymnasium.make_vec``: one compiled step each."""
 
+import multiprocessing
+import sys
 from typing import Any
 
 import gymnasium
 import numpy as np
 from gymnasium.utils import seeding
-from gymnasium.vector import AutoresetMode
+from gymnasium.vector import AsyncVectorEnv, AutoresetMode
 from gymnasium.vector.utils import batch_space
 
 from flytrack_env.env import EnvParams
 from flytrack_env.gymnasium_adapter.options import TRACK, check_names, read_start
 from flytrack_env.gymnasium_adapter.packing import Packed
 from flytrack_env.gymnasium_adapter.simulation import Simulation, draw_key
-from flytrack_env.rendering import FlightLog, make_renderer, open_window
+from flytrack_env.messages import check_keywords
+from flytrack_env.registration import ARGUMENTS
+from flytrack_env.rendering import FlightLog, can_render, open_window
 
 RENDER_MODES, VECTOR_RENDER_MODES = ("human", "rgb_array"), ("rgb_array",)
+AUTORESET_MODES = AutoresetMode.NEXT_STEP.value, AutoresetMode.SAME_STEP.value
 SEED_WORDS = 4
 MOST_STEPS = 2**32  # that a uint32 can count
 
@@ -39,8 +44,10 @@ class _Adapter:
         self.render_mode = render_mode
         self._simulation = Simulation(env_id, params, overrides)
         env, params = self._simulation.env, self._simulation.params
-        self.metadata = {**self.metadata, "render_fps": round(1.0 / float(params.dt))}
-        self._renderer = None if render_mode is None else make_renderer(params.course)
+        # The class announces every mode, so that asking for one that is missing says how to install it.
+        modes = [mode for mode in render_modes if can_render(mode)]
+        self.metadata = self.metadata | {"render_modes": modes, "render_fps": round(1.0 / float(params.dt))}
+        self._renderer = None if render_mode is None else self._simulation.make_renderer()
         return box(env.observation_space(params)), box(env.action_space(params))
 
     def _begin(self, options: dict[str, Any] | None, draw_words: Any) -> tuple[Packed, Any, Any]:
@@ -56,7 +63,7 @@ class _Adapter:
         words = draw_words()
         if simulation is not self._simulation:
             self._simulation = simulation
-            self._renderer = self._renderer and make_renderer(simulation.params.course)
+            self._renderer = self._renderer and simulation.make_renderer()
         return simulation.begin(words, start)
 
     def _checked(self, name: str, state: Any, actions: Any, shape: tuple[int, ...] | None) -> np.ndarray:
@@ -78,9 +85,26 @@ class _Adapter:
         self.__dict__.update(state)
         params = self._simulation.params
         if self.render_mode is not None:
-            self._renderer = make_renderer(params.course)
+            self._renderer = self._simulation.make_renderer()
         if self.render_mode == "human":
             self._window = open_window(float(params.dt))
+
+
+def _refuse_fork() -> None:
+    """Raise if an ``AsyncVectorEnv`` that is going to fork makes the environment: its workers would hang.
+
+    It makes a first environment in this process, and gives the environment no other sign of itself.
+    """
+    frame = sys._getframe()
+    while frame := frame.f_back:  # type: ignore[assignment]  # None ends the loop
+        maker = frame.f_locals.get("self")
+        if isinstance(maker, AsyncVectorEnv) and "env_fns" in frame.f_locals:
+            if (maker.context or multiprocessing.get_start_method()) == "fork":
+                raise RuntimeError(
+                    "vectorization_mode: found 'async', whose forked processes hang because JAX has threads; "
+                    "use 'vector_entry_point', which is faster, or pass vector_kwargs={'context': 'spawn'}"
+                )
+            return
 
 
 def box(space: Any) -> gymnasium.spaces.Box:
@@ -101,6 +125,7 @@ class FlyTrackEnv(_Adapter, gymnasium.Env[np.ndarray, np.ndarray]):
     Raises:
         ValueError, TypeError: what ``flytrack_env.make`` and ``check_params`` refuse, or a render mode.
         ImportError: a render mode whose package is not installed.
+        RuntimeError: made by an ``AsyncVectorEnv`` whose processes are forked.
     """
 
     metadata: dict[str, Any] = {"render_modes": list(RENDER_MODES), "render_fps": 100}  # noqa: RUF012  # as Gymnasium declares it
@@ -108,6 +133,8 @@ class FlyTrackEnv(_Adapter, gymnasium.Env[np.ndarray, np.ndarray]):
     def __init__(
         self, env_id: str, render_mode: str | None = None, params: EnvParams | None = None, **overrides: Any
     ):
+        _refuse_fork()
+        check_keywords(overrides, ("render_mode", "params", *ARGUMENTS))
         self.observation_space, self.action_space = self._set_up(env_id, render_mode, params, overrides)
         self._state: Any = None
         step_s = float(self._simulation.params.dt)
@@ -183,18 +210,19 @@ class FlyTrackEnv(_Adapter, gymnasium.Env[np.ndarray, np.ndarray]):
 
 
 class FlyTrackVectorEnv(_Adapter, gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
-    """Environments of one id side by side; an episode that ends is reset in the same step.
+    """Environments of one id side by side, each reset by itself after its episode ended.
 
-    What ``gymnasium.vector.SyncVectorEnv`` with ``AutoresetMode.SAME_STEP`` returns, in the same types:
-    new, writable arrays in every step.
+    What ``gymnasium.vector.SyncVectorEnv`` returns in the same autoreset mode, in the same types: new,
+    writable arrays in every step.
 
-    render_mode: None or "rgb_array". Other arguments and errors are those of ``FlyTrackEnv``.
+    render_mode: None or "rgb_array". autoreset_mode: ``AutoresetMode.NEXT_STEP`` or ``SAME_STEP``, or its
+    value. Other arguments and errors are those of ``FlyTrackEnv``.
     """
 
     metadata: dict[str, Any] = {  # noqa: RUF012  # as Gymnasium declares it
         "render_modes": list(VECTOR_RENDER_MODES),
         "render_fps": 100,
-        "autoreset_mode": AutoresetMode.SAME_STEP,
+        "autoreset_mode": AutoresetMode.NEXT_STEP,
     }
 
     def __init__(
@@ -203,19 +231,28 @@ class FlyTrackVectorEnv(_Adapter, gymnasium.vector.VectorEnv[np.ndarray, np.ndar
         num_envs: int = 1,
         render_mode: str | None = None,
         params: EnvParams | None = None,
+        autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
         **overrides: Any,
     ):
+        check_keywords(overrides, ("num_envs", "render_mode", "params", "autoreset_mode", *ARGUMENTS))
+        mode = getattr(autoreset_mode, "value", autoreset_mode)
+        if mode not in AUTORESET_MODES:
+            expected = " or ".join(map(repr, AUTORESET_MODES))
+            raise ValueError(f"autoreset_mode: found {mode!r}, expected {expected}")
         if not isinstance(num_envs, int) or num_envs < 1:
             raise ValueError(f"num_envs: found {num_envs!r}, expected an integer of at least 1")
         self.num_envs = num_envs
         self.single_observation_space, self.single_action_space = self._set_up(
             env_id, render_mode, params, overrides
         )
+        self.autoreset_mode = AutoresetMode(mode)  # where TorchRL looks for it
+        self.metadata["autoreset_mode"] = self.autoreset_mode
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
         self._states: Any = None
         self._words = np.zeros(0, np.uint32)
         self._count = 0
+        self._has_ended: np.ndarray | None = None  # in the step before, in mode NEXT_STEP
         self._logs = [FlightLog(1.0)] * num_envs
 
     def reset(
@@ -233,8 +270,9 @@ class FlyTrackVectorEnv(_Adapter, gymnasium.vector.VectorEnv[np.ndarray, np.ndar
         """
         self._states, observations, scenes = self._begin(options, lambda: self._seed(seed))
         self._words, self._count = draw_key(self.np_random), 0
-        if self._renderer is not None:
-            self._log(np.asarray(scenes), np.ones(self.num_envs, bool))
+        if self.autoreset_mode is AutoresetMode.NEXT_STEP:
+            self._has_ended = np.zeros(self.num_envs, bool)
+        self._log(scenes, np.ones(self.num_envs, bool))
         return np.array(observations), {}
 
     def _seed(self, seed: Any) -> np.ndarray:
@@ -258,43 +296,49 @@ class FlyTrackVectorEnv(_Adapter, gymnasium.vector.VectorEnv[np.ndarray, np.ndar
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         """Return observations, rewards, terminations, truncations and infos of a step.
 
-        actions: (num_envs, 4). Where an episode ended, the observation is that of the next one, and infos
-        has ``final_obs`` and ``final_info`` with their masks.
+        actions: (num_envs, 4). With ``NEXT_STEP``, where an episode ended in the step before, the action is
+        ignored, and the observation is the first one of the next episode, with a reward of 0, no flag and no
+        info. With ``SAME_STEP``, where an episode ends, the observation is the first one of the next episode,
+        and infos has ``final_obs`` and ``final_info`` with their masks.
 
         Raises:
             gymnasium.error.ResetNeeded: no episode has begun.
             ValueError: actions of another shape.
         """
         actions = self._checked("actions", self._states, actions, self.action_space.shape)
-        programs = self._simulation.programs
+        programs, has_ended = self._simulation.programs, self._has_ended
         self._states, observations, final_observations, scenes, blocks = programs.step_batch(
             self._states,
             self._words,
             np.uint32(self._count),
             actions,
             self._simulation.packed_params,
+            has_ended,
             self._renderer is not None,
         )
         self._count = (self._count + 1) % MOST_STEPS
-        columns = programs.batch_columns.batched(blocks)
+        columns = programs.columns_of(has_ended).batched(blocks)
         rewards, terminated, truncated, infos, final_info, final_masks = columns
         done = terminated | truncated
-        if self._renderer is not None:
-            self._log(np.asarray(scenes), done)
-        places = np.flatnonzero(done)
-        if places.size:
-            infos = {} if done.all() else infos
+        self._log(scenes, done if has_ended is None else has_ended)
+        if has_ended is not None:
+            self._has_ended = done
+            infos = {} if has_ended.all() else infos
+        elif done.any():
+            places, infos = np.flatnonzero(done), {} if done.all() else infos
             final_obs = np.empty(self.num_envs, object)  # filled with None
             for place, final in zip(places.tolist(), np.asarray(final_observations)[places], strict=True):
                 final_obs[place] = final
             infos.update(final_obs=final_obs, final_info=final_info, **final_masks)
         return np.array(observations), rewards, terminated, truncated, infos
 
-    def _log(self, scenes: np.ndarray, has_begun: np.ndarray) -> None:
-        """Log what pictures need, in new logs where episodes began."""
+    def _log(self, scenes: Any, has_begun: np.ndarray) -> None:
+        """Log what pictures need, if there are any, in new logs where episodes began."""
+        if self._renderer is None:
+            return
         for place in np.flatnonzero(has_begun):
             self._logs[place] = FlightLog(float(self._simulation.params.dt))
-        for log, scene in zip(self._logs, scenes, strict=True):
+        for log, scene in zip(self._logs, np.asarray(scenes), strict=True):
             log.append(scene)
 
     def render(self) -> tuple[np.ndarray, ...] | None:

@@ -14,7 +14,7 @@ from flytrack_env.gymnasium_adapter.options import Start
 from flytrack_env.gymnasium_adapter.packing import Columns, Layout, Packed
 from flytrack_env.randomness import seed_of
 from flytrack_env.registration import make
-from flytrack_env.rendering import scene_row
+from flytrack_env.rendering import make_renderer, scene_row
 from flytrack_env.rendering.flight_log import GATE_INDEX
 from flytrack_env.state import BATTERY, STATE_SIZE, unpack
 from flytrack_env.tracks import Track, build_course, load_track
@@ -28,18 +28,23 @@ def draw_key(generator: np.random.Generator, shape: tuple[int, ...] = ()) -> np.
     return generator.integers(0, 2**32, (*shape, KEY_WORDS), np.uint32)
 
 
-def _grouped(reward: jax.Array, terminated: jax.Array, truncated: jax.Array, info: dict[str, Any]) -> Any:
+def _grouped(
+    reward: jax.Array, terminated: jax.Array, truncated: jax.Array, info: dict[str, Any], has_ended: Any
+) -> Any:
     """Return what a vector environment gives of one environment's step, as ``SyncVectorEnv`` groups it.
 
     Reward, flags, the infos of an episode that goes on, the final infos of one that ended, and the masks
     of the latter. A mask says where the value of its name, less the underscore, is given; elsewhere it is 0.
+    has_ended: None; or whether this is the reset after an end, which has no infos, and then nothing is final.
     """
-    done = terminated | truncated
 
     def masked(mask: jax.Array) -> dict[str, jax.Array]:
         values = {name: jnp.where(mask, value, jnp.zeros_like(value)) for name, value in info.items()}
         return values | {f"_{name}": mask for name in info}
 
+    if has_ended is not None:
+        return reward, terminated, truncated, masked(~has_ended), {}, {}
+    done = terminated | truncated
     final_masks = {"_final_obs": done, "_final_info": done}
     return reward, terminated, truncated, masked(~done), masked(done), final_masks
 
@@ -56,7 +61,8 @@ class Programs:
         action = jax.ShapeDtypeStruct(env.action_space(params).shape, jnp.float32)
         outcome = jax.eval_shape(partial(self._outcome, params=params), state, action)[2]
         self.columns = Columns(outcome)
-        self.batch_columns = Columns(jax.eval_shape(_grouped, *outcome))
+        self.same_step_columns = Columns(jax.eval_shape(_grouped, *outcome, None))
+        self.next_step_columns = Columns(jax.eval_shape(_grouped, *outcome, outcome[1]))
 
     def _outcome(
         self, state: Any, action: jax.Array, params: EnvParams
@@ -107,7 +113,11 @@ class Programs:
         blocks = self.columns.gather(outcome)
         return self.state_layout.pack(new_state), observation, self._scene(new_state), blocks
 
-    @partial(jax.jit, static_argnums=(0, 6))
+    def columns_of(self, has_ended: Any) -> Columns:
+        """Return the columns of ``step_batch``."""
+        return self.same_step_columns if has_ended is None else self.next_step_columns
+
+    @partial(jax.jit, static_argnums=(0, 7))
     def step_batch(
         self,
         states: Packed,
@@ -115,21 +125,23 @@ class Programs:
         count: Any,
         actions: jax.Array,
         params: Packed,
+        has_ended: jax.Array | None,
         has_scenes: bool,
     ) -> tuple[Any, ...]:
-        """Return states, observations, final observations, scenes, and the blocks of ``batch_columns``.
+        """Return states, observations, final observations, scenes, and the blocks of ``columns_of``.
 
         The auto-resetting step of a batch. words: of one key for all; count: makes it this step's own.
+        has_ended: None to reset in this step, or (num_envs,) bool for those that ended in the step before.
         scenes: (num_envs, SCENE_SIZE) after the auto-reset if they are asked for, else None.
         """
         key = jax.random.fold_in(jax.random.wrap_key_data(words, impl="threefry2x32"), count)
-        observations, new_states, rewards, terminated, truncated, info = self.env.step_batch(
-            key, self.state_layout.unpack_batch(states), actions, self.params_layout.unpack(params)
-        )
-        final_observations = info["final_observation"]
+        unpacked = self.state_layout.unpack_batch(states), actions, self.params_layout.unpack(params)
+        step = self.env.step_batch(key, *unpacked, has_ended)
+        observations, new_states, rewards, terminated, truncated, info = step
+        final_observations = info["final_observation"] if has_ended is None else None
         kept = {name: value for name, value in info.items() if name not in NOT_INFO}
-        grouped = jax.vmap(_grouped)(rewards, terminated, truncated, kept)
-        blocks = self.batch_columns.gather(grouped, is_batch=True)
+        grouped = jax.vmap(_grouped)(rewards, terminated, truncated, kept, has_ended)
+        blocks = self.columns_of(has_ended).gather(grouped, is_batch=True)
         scenes = jax.vmap(self._scene)(new_states) if has_scenes else None
         packed = self.state_layout.pack_batch(new_states)
         return packed, observations, final_observations, scenes, blocks
@@ -172,8 +184,16 @@ class Simulation:
         Raises:
             TrackError: a track that cannot be read.
         """
-        course = build_course(track if isinstance(track, Track) else load_track(track))
-        return Simulation(self.env_id, self.params.replace(course=course), self.overrides)
+        track = track if isinstance(track, Track) else load_track(track)
+        params = self.params.replace(course=build_course(track))
+        return Simulation(self.env_id, params, {**self.overrides, "track": track})
+
+    def make_renderer(self) -> Any:
+        """Return what draws flights, with the ids of the track's gates, or indices on any other course."""
+        course, own = self.params.course, self.env.default_params.course
+        is_own = jax.tree.all(jax.tree.map(np.array_equal, course, own))
+        ids = [gate.id for gate in self.env.track.gates]
+        return make_renderer(course, ids if is_own else range(course.num_gates))
 
     def begin(self, words: np.ndarray, start: Start) -> tuple[Packed, jax.Array, jax.Array]:
         """Return packed state, observation and scene of an episode that begins.

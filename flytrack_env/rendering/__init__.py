@@ -4,9 +4,10 @@ Needs the extra ``flytrack[render]``; importing this package does not. ``scene_r
 compiled step, the numbers of a picture; ``FlightLog`` collects such rows; ``make_renderer`` draws them.
 """
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from flytrack_env.extras import check_installed
+from flytrack_env.extras import check_installed, is_installed
 from flytrack_env.rendering.flight_log import SCENE_SIZE, FlightLog, scene_row
 from flytrack_env.tracks import Course
 
@@ -14,11 +15,16 @@ if TYPE_CHECKING:
     from flytrack_env.rendering.views import Renderer
     from flytrack_env.rendering.window import Window
 
-__all__ = ["SCENE_SIZE", "FlightLog", "make_renderer", "open_window", "scene_row"]
+__all__ = ["SCENE_SIZE", "FlightLog", "can_render", "make_renderer", "open_window", "scene_row"]
 
 
-def make_renderer(course: Course) -> "Renderer":
-    """Return what draws flights on a course.
+def can_render(mode: str) -> bool:
+    """Return whether what a render mode, "rgb_array" or "human", needs is installed."""
+    return is_installed("PIL") and (mode != "human" or is_installed("pygame"))
+
+
+def make_renderer(course: Course, gate_ids: Sequence[int]) -> "Renderer":
+    """Return what draws flights on a course whose gates have these numbers.
 
     Raises:
         ImportError: Pillow is not installed; the message says how to install it.
@@ -26,7 +32,7 @@ def make_renderer(course: Course) -> "Renderer":
     check_installed("render", "pictures", "PIL")
     from flytrack_env.rendering.views import Renderer
 
-    return Renderer(course)
+    return Renderer(course, gate_ids)
 
 
 def open_window(step_s: float) -> "Window":

@@ -1,5 +1,6 @@
 """One picture of a flight: the course from above, the flight from behind the drone, and a line of text."""
 
+from collections.abc import Sequence
 from functools import cache
 from weakref import WeakKeyDictionary
 
@@ -56,7 +57,7 @@ class TopView:
     width, height: pixels of its part of the canvas.
     """
 
-    def __init__(self, course: Course, gates: Gates, width: int, height: int):
+    def __init__(self, course: Course, gates: Gates, gate_ids: Sequence[int], width: int, height: int):
         self.gates = gates
         low, high = (np.array(corner, float) for corner in (course.bounds_low, course.bounds_high))
         self._fit(low[:2], high[:2], width, height)
@@ -64,7 +65,7 @@ class TopView:
         self.pixel_m = PIXEL / self.scale
         self.enlargement = max(1.0, SMALLEST_GATE * self.pixel_m / (2.0 * self.half_edges_m.min()))
         self.empty = Image.new("RGB", (width, height), scene.BACKGROUND)
-        self._draw_course(low, high)
+        self._draw_course(low, high, gate_ids)
         # The trail of each flight that was drawn, and how many of its rows are in it.
         self.trails: WeakKeyDictionary[FlightLog, tuple[Image.Image, int]] = WeakKeyDictionary()
 
@@ -86,7 +87,7 @@ class TopView:
     def _pairs(self, points_w: np.ndarray) -> list[tuple[float, float]]:
         return [(x, y) for x, y in self.pixels(points_w).tolist()]
 
-    def _draw_course(self, low: np.ndarray, high: np.ndarray) -> None:
+    def _draw_course(self, low: np.ndarray, high: np.ndarray, gate_ids: Sequence[int]) -> None:
         draw = ImageDraw.Draw(self.empty)
         for line in ground_grid(low, high, GRID_M * np.ceil((high - low)[:2].max() / WIDE_M)):
             draw.line(self._pairs(line), scene.GRID, PIXEL)
@@ -98,7 +99,7 @@ class TopView:
             outwards = left if left @ (centre - 0.5 * (low + high))[:2] >= 0.0 else -left
             distance = self.enlargement * self.half_edges_m[index] + LABEL_DISTANCE * self.pixel_m
             (place,) = self._pairs((centre[:2] + distance * outwards)[None])
-            draw.text(place, str(index), scene.TEXT, font(13 * PIXEL), anchor="mm")
+            draw.text(place, str(gate_ids[index]), scene.TEXT, font(13 * PIXEL), anchor="mm")
 
     def _draw_gate(self, draw: ImageDraw.ImageDraw, index: int, colour: Colour) -> None:
         """Draw a gate as a bar with a gap where its opening is, and an arrow in its direction of flight."""
@@ -260,10 +261,10 @@ class Renderer:
     A flight that was drawn before costs only what was flown since: its trail is kept as long as its log.
     """
 
-    def __init__(self, course: Course):
+    def __init__(self, course: Course, gate_ids: Sequence[int]):
         width, height, split = PIXEL * WIDTH, PIXEL * HEIGHT, PIXEL * TOP_VIEW_WIDTH
-        gates = gates_of(course)
-        self.top_view = TopView(course, gates, split, height)
+        gates, self.gate_ids = gates_of(course), gate_ids
+        self.top_view = TopView(course, gates, gate_ids, split, height)
         self.chase_view = ChaseView(course, gates, split, width - split, height)
         self.canvas = Image.new("RGB", (width, height))
 
@@ -286,7 +287,7 @@ class Renderer:
         row = log.rows[-1].astype(float)
         texts = (
             f"lap {row[LAPS] + 1:.0f}",
-            f"next gate {row[GATE_INDEX]:.0f}",
+            f"next gate {self.gate_ids[int(row[GATE_INDEX])]}",
             f"{np.linalg.norm(row[VELOCITY]):.1f} m/s",
             f"{row[BATTERY]:.2f} V",
             f"lap time {log.time_s - row[LAP_START]:.2f} s",

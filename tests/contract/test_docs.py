@@ -15,7 +15,7 @@ from flytrack_env.tracks import DEMANDS, Limits, available_tracks, build_course,
 from tests.support.pages import BLOCK, DOCS, ROOT, examples, run_examples
 from tests.support.slow import slow_but
 
-PACKAGES = ("flytrack_env", "flytrack_sysid", "flytrack_loop", "baselines")
+PACKAGES = ("flytrack_env", "flytrack_sysid", "flytrack_loop", "flytrack_bench", "baselines")
 REFERENCE = {
     module
     for path in (DOCS / "api").glob("*.md")

@@ -7,6 +7,7 @@ import sys
 from collections.abc import Callable
 from typing import Any
 
+import gymnasium
 import gymnax
 import jax
 import jax.numpy as jnp
@@ -15,9 +16,10 @@ import pytest
 from gymnax.registration import registered_envs
 
 import flytrack_env
-from flytrack_env.dynamics import collective_thrust
+from flytrack_env.dynamics import collective_thrust, nominal_parameters
 from flytrack_env.effects import CommandDelay, ThrustScale
 from flytrack_env.env import EnvParams, EnvState, FlyTrack
+from flytrack_env.extras import check_gymnax
 from flytrack_env.registration import ENVIRONMENTS, make, register_all
 from flytrack_env.state import Action
 from flytrack_env.wrappers import DomainRandomization, RandomizationParams, layers_of
@@ -57,10 +59,35 @@ def test_every_id_takes_a_plant_with_its_parameters_baked_in(env_id: str) -> Non
     assert not any(isinstance(layer, DomainRandomization) for layer in layers_of(env))
 
 
-def test_overrides_reach_the_environment_and_unknown_ids_are_refused() -> None:
-    assert gymnax.make("FlyTrack-v0", missed_gate="fly_on")[0].missed_gate == "fly_on"
-    with pytest.raises(ValueError, match=r"env_id: found 'FlyTrack-v9', expected one of .*FlyTrack-v0"):
-        make("FlyTrack-v9")
+def test_overrides_reach_the_environment_which_says_what_it_is() -> None:
+    env = gymnax.make("FlyTrackNoisy-v0", missed_gate="fly_on", track="split_s")[0]
+    assert env.missed_gate == "fly_on"
+    assert repr(env) == (
+        "<FlyTrackNoisy-v0: track split_s, plant Simulator, effects none, observation size 29>"
+    )
+    stronger = nominal_parameters().with_effects(ThrustScale(1.1))
+    assert "effects thrust_scale, " in repr(make("FlyTrack-v0", model=stronger))
+
+
+WRONG_CALLS = {
+    "env_id: found 'FlyTrack-v9', expected one of .*FlyTrack-v0": lambda: make("FlyTrack-v9"),
+    "argument 'trak'; did you mean 'track'": lambda: gymnax.make("FlyTrack-v0", trak="split_s"),
+    "argument 'wind'; expected one of track, .*reward": lambda: make("FlyTrack-v0", wind=3),
+    "argument 'rende'; did you mean 'render_mode'": lambda: gymnasium.make("FlyTrack-v0", rende="human"),
+    "argument 'reset_mode'; did you mean 'autoreset_mode'": lambda: gymnasium.make_vec(
+        "FlyTrack-v0", reset_mode=1
+    ),
+    "key: found 0, expected a key of JAX, such as jax.random.key": lambda: make("FlyTrack-v0").reset(0),
+    "key: found Array.*, expected a key of JAX": lambda: make("FlyTrack-v0").reset(jnp.zeros(2)),
+    "key: found keys of shape .1,.*jax.vmap": lambda: make("FlyTrack-v0").reset(jax.random.key(0)[None]),
+    "gymnax: found version 0.0.9, expected 1.0 or newer: pip install": lambda: check_gymnax("0.0.9"),
+}
+
+
+@pytest.mark.parametrize("message", WRONG_CALLS)
+def test_wrong_calls_are_refused_in_a_sentence_that_says_what_to_do(message: str) -> None:
+    with pytest.raises((ValueError, TypeError, ImportError), match=message):
+        WRONG_CALLS[message]()
 
 
 def digest(env_id: str) -> str:

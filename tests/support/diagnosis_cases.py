@@ -69,12 +69,27 @@ def _wind_in_hover(rng: Rng) -> Case:
     return _flown(replace(truth, effects={"wind": wind}), rng, kind="hover")
 
 
-def _changed(name: str, rng: Rng) -> Case:
-    """Return a plant of which the team believes an older base, flown as it is now."""
+def _thermal(rng: Rng) -> Case:
+    truth = replace(hidden.draw_base(rng), outside=hidden.draw_outside(rng, "position", OUTSIDE_AMPLITUDE))
+    return _flown(truth, rng)
+
+
+def _changed(field: str, low: float, high: float, rng: Rng) -> Case:
+    """Return a plant of which the team believes an older base, flown as it is now.
+
+    low, high: range of the largest |ln factor| of the field's values; the upper half is drawn from.
+    """
     believed = hidden.draw_base(rng)
-    low, high = hidden.CHANGES[name].low, hidden.CHANGES[name].high
     size = float(np.exp(rng.uniform(np.log(low * high) / 2.0, np.log(high))))
-    return _flown(hidden.draw_change(believed, name, rng, size), rng)._replace(believed=believed)
+    values = np.atleast_1d(getattr(believed, field))
+    shares = rng.uniform(0.5, 1.0, len(values))
+    shares[rng.integers(len(values))] = 1.0
+    changed = [
+        float(value * np.exp(size * share * rng.choice([-1.0, 1.0])))
+        for value, share in zip(values, shares, strict=True)
+    ]
+    now = replace(believed, **{field: tuple(changed) if len(changed) > 1 else changed[0]})
+    return _flown(now, rng)._replace(believed=believed)
 
 
 def _simulated(rng: Rng) -> Case:
@@ -97,11 +112,9 @@ CASES: Mapping[str, Callable[[Rng], Case]] = {
     "mirrored": lambda rng: _signed(rng_of("signed"), -1.0),
     "training_only": _in_training_only,
     "wind_in_hover": _wind_in_hover,
-    "thermal": lambda rng: _flown(
-        replace(hidden.draw_base(rng), outside=hidden.draw_outside(rng, "position", OUTSIDE_AMPLITUDE)), rng
-    ),
-    "tau": lambda rng: _changed("tau", rng),
-    "mass": lambda rng: _changed("mass", rng),
+    "thermal": _thermal,
+    "tau": lambda rng: _changed("tau", 0.05, 0.6, rng),
+    "mass": lambda rng: _changed("mass", 0.01, 0.2, rng),
     "simulated": _simulated,
     "stuck_gyro": lambda rng: _broken(rng, "w", 0.0),
     "stuck_commands": lambda rng: _broken(rng, "u", -0.3),

@@ -10,9 +10,11 @@ from scipy.spatial.transform import Rotation
 
 from benchmarks.diagnosis import model_of
 from benchmarks.hidden import draw_base, fly, measure
+from flytrack import identification
+from flytrack.cli import main
 from flytrack_env.dynamics import ModelParameters
 from flytrack_env.effects import LinearDrag
-from flytrack_sysid import FlightLog, cli, save_log
+from flytrack_sysid import FlightLog, save_log
 from flytrack_sysid.diagnosis import Diagnosis
 from flytrack_sysid.diagnosis.result import CONSISTENT, Unexplained
 from flytrack_sysid.flight_recording import write_flight_recording
@@ -147,15 +149,15 @@ def test_diagnose_writes_the_recording_or_says_why_not(flown, models, tmp_path, 
     shown = {"nominal": flown[0], "base": flown[0], "extended": models["true"]}
     rest = {"noise": {}, "source": "log", "sha256": ""}
     found = Diagnosis(CONSISTENT, (), Unexplained(), (), {}, **shown, **rest)  # which names nothing
-    monkeypatch.setattr(cli, "diagnose", lambda *_: found)  # the rest is the real one
-    monkeypatch.setattr(cli, "write_diagnosis", lambda folder, *_: [folder / "diagnosis.json"])
+    monkeypatch.setattr(identification, "diagnose", lambda *_: found)  # the rest is the real one
+    monkeypatch.setattr(identification, "write_diagnosis", lambda folder, *_: [folder / "diagnosis.json"])
     save_log(tmp_path / "log.npz", flown[1])
     save_log(tmp_path / "turns.npz", flown[1].without("q"))
     out = tmp_path / "out"
     path = out / "flight.rrd"
 
     def diagnosed(name: str) -> str:
-        cli.main(["diagnose", str(tmp_path / name), "--out", str(out)])
+        main(["diagnose", str(tmp_path / name), "--out", str(out)])
         return capsys.readouterr().out
 
     assert f"written: {out / 'diagnosis.json'}, {path}\n" in diagnosed("log.npz")

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from benchmarks.reliability.foreign_logs import BLACKBOX_HEADERS, blackbox
 from flytrack_env.effects import effect_of
 from flytrack_env.state import Action
 from flytrack_sysid import LogError, import_log
 from flytrack_sysid.importing.betaflight_rates import full_stick_rate, stick_curve
+from tests.support.foreign_logs import BLACKBOX_HEADERS, blackbox
 from tests.support.real_logs import BETAFLIGHT, shared
 
 pytest.importorskip("orangebox", reason="orangebox is not installed: pip install 'flytrack[logs]'")

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from benchmarks.reliability.foreign_logs import UlogWriter
 from flytrack_env.sandbox import ResourceLimits
 from flytrack_sysid import LogError, import_log
 from flytrack_sysid.importing import decoding
+from tests.support.foreign_logs import UlogWriter
 from tests.support.real_logs import shared
 
 pytest.importorskip("pyulog", reason="pyulog is not installed: pip install 'flytrack[logs]'")

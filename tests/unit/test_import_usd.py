@@ -6,9 +6,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from benchmarks.reliability.foreign_logs import USD_MAPPING, usd, usd_log
 from flytrack_sysid import LogError, import_log
+from tests.support.foreign_logs import usd, usd_log
+from tests.support.written_logs import read_mapping
 
+USD_MAPPING = read_mapping("usd")
 GAINS = {"KR": (0.009, 0.008, 0.007), "Kw": (0.00125, 0.001, 0.0025), "KI": (0.05, 0.04, 0.0)}
 LEE = 'extends = "crazyflie_lee"\n'
 VECTORS = ("rpy", "rpyd", "omega", "omegar", "torque")

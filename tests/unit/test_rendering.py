@@ -45,7 +45,7 @@ def top_view_pixel(renderer, position):
 
 
 def test_top_view_shows_trail_drone_and_the_next_gate_where_they_are():
-    renderer = make_renderer(COURSE)
+    renderer = make_renderer(COURSE, range(COURSE.num_gates))
     rows, log = [], FlightLog(0.01)  # from the start pose through gate 0, ever faster
     for share in np.linspace(0.0, 1.0, 60):
         position, velocity = (18.6 - 9.0 * share, 2.0, 0.3 + share), (-20.0 * share, 0.0, 0.0)
@@ -62,6 +62,13 @@ def test_top_view_shows_trail_drone_and_the_next_gate_where_they_are():
         beside = slice(line - 34, line + 35), slice(column - 34, column + 35)
         around = distance_to(picture[:, :SPLIT], scene.NEXT_GATE)[beside]
         assert ((around < 20).sum() > 30) == (index == 1)
+
+
+def test_gates_have_the_ids_of_the_track_file():
+    env = gymnasium.make(BASE, render_mode="rgb_array").unwrapped
+    for track, ids in (("flytrack", [0, 1, 2, 3, 4, 8, 9, 10]), ("split_s", list(range(7)))):
+        env.reset(options={"track": track})
+        assert list(env._renderer.gate_ids) == ids
 
 
 def test_single_environment_renders_its_own_flight_and_record_video_every_step(tmp_path):

@@ -1,6 +1,5 @@
 """Writers of small valid logs in the formats that are imported: PX4, Betaflight, uSD, MCAP, CSV."""
 
-import io
 import json
 import struct
 import zlib
@@ -21,10 +20,6 @@ ULOG_TOPICS: dict[str, tuple[list[tuple[str, str, int]], tuple[float, ...]]] = {
     ),
 }
 ULOG_PARAMETERS = {"MC_ACRO_R_MAX": 720.0, "MC_ACRO_P_MAX": 360.0, "MC_ACRO_Y_MAX": 90.0}
-MAPPINGS = Path(__file__).with_name("mappings")
-MAPPING = (MAPPINGS / "csv.toml").read_text(encoding="utf-8")
-USD_MAPPING = (MAPPINGS / "usd.toml").read_text(encoding="utf-8")
-BAG_MAPPING = (MAPPINGS / "bag.toml").read_text(encoding="utf-8")
 
 
 class UlogWriter:
@@ -132,7 +127,7 @@ def usd_log(events: dict[str, tuple[dict[str, str], np.ndarray]], version: int =
 
 
 def usd() -> bytes:
-    """Return a small uSD log that ``USD_MAPPING`` fits."""
+    """Return a small uSD log that the mapping "usd" fits."""
     variables = dict.fromkeys(("roll", "pitch", "yaw", "thrust", "gyro.x", "gyro.y"), "f") | {"gyro.z": "h"}
     rows = np.tile((0.0, 0.5, -0.25, 0.1, 0.3, 10.0, -20.0, 30.0), (NUM_ROWS, 1))
     rows[:, 0] = 1.0 + 0.01 * np.arange(NUM_ROWS)
@@ -140,19 +135,20 @@ def usd() -> bytes:
     return usd_log({"fixedFrequency": (variables, rows), "battery": ({"pm.vbat": "H"}, slow)})
 
 
-def mcap_bag() -> bytes:
-    """Return a small MCAP file of JSON messages that ``BAG_MAPPING`` fits."""
+def save_bag(path: Path) -> None:
+    """Write a small MCAP file of JSON messages that the mapping "bag" fits."""
     from mcap.writer import Writer
 
-    file = io.BytesIO()
-    writer = Writer(file)
-    writer.start()
-    channel = writer.register_channel("/flight", "json", writer.register_schema("any", "jsonschema", b"{}"))
-    for row in range(NUM_ROWS):
-        content = {"u": [0.5, -0.25, 0.1, 0.3], "w": {"x": 0.1 * row, "y": 0.0, "z": -0.1}}
-        writer.add_message(channel, row * 10**7, json.dumps(content).encode(), row * 10**7)
-    writer.finish()
-    return file.getvalue()
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        channel = writer.register_channel(
+            "/flight", "json", writer.register_schema("any", "jsonschema", b"{}")
+        )
+        for row in range(NUM_ROWS):
+            content = {"u": [0.5, -0.25, 0.1, 0.3], "w": {"x": 0.1 * row, "y": 0.0, "z": -0.1}}
+            writer.add_message(channel, row * 10**7, json.dumps(content).encode(), row * 10**7)
+        writer.finish()
 
 
 def ulog() -> bytes:
@@ -173,7 +169,7 @@ def betaflight() -> bytes:
 
 
 def foreign_csv() -> bytes:
-    """Return a small CSV log that ``MAPPING`` fits."""
+    """Return a small CSV log that the mapping "csv" fits."""
     names = ["ms", "ail", "ele", "rud", "thr", "p", "q", "r", "mv"]
     rows = np.random.default_rng(3).normal(size=(NUM_ROWS, len(names)))
     rows[:, 0], rows[:, 1:5], rows[:, -1] = 10.0 * np.arange(NUM_ROWS), 1500.0, 16_000.0

@@ -1,1 +1,0 @@
-"""What FlyTrack withstands, measured: ``python -m benchmarks.reliability``."""
