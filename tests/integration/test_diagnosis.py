@@ -77,7 +77,8 @@ def check_content(one: Found) -> None:
     for limit in one["not_identifiable"]:
         assert limit["effect"] in BY_NAME and limit["smallest_detectable"]["unit"]
         assert set(limit["confused_with"]) <= set(BY_NAME) - {limit["effect"]}
-    assert set(one["error"]) == {"nominal", "refitted_base", "extended", "noise_floor"}
+    judged = {"nominal", "refitted_base", "extended", "noise_floor"}
+    assert set(one["error"]) == judged | ({"without_learned"} if one["learned"] else set())
     for errors in one["error"].values():
         assert errors["one_step_nrmse"] and set(errors["one_step_nrmse"]) <= CHANNELS
         assert all(value > 0.0 for value in errors["one_step_nrmse"].values())
