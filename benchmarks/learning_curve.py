@@ -18,8 +18,7 @@ import numpy as np
 from baselines.purejaxrl_ppo import Config
 from baselines.purejaxrl_ppo.config import settings_in_file
 from baselines.purejaxrl_ppo.flights import race_many, score, start_keys
-from baselines.purejaxrl_ppo.run import is_due
-from baselines.purejaxrl_ppo.training import Trainer
+from baselines.purejaxrl_ppo.training import Trainer, is_due
 from benchmarks import report
 from flytrack_env.files import write_atomically
 from flytrack_env.pictures.drawing import new_figure, png_of

@@ -15,10 +15,9 @@ import jax
 import jax.numpy as jnp
 
 from baselines.purejaxrl_ppo import Config
-from baselines.purejaxrl_ppo.run import Options
 from baselines.purejaxrl_ppo.tracking import local_uri
 from baselines.purejaxrl_ppo.train_ppo import DEFAULTS
-from baselines.purejaxrl_ppo.training import Trainer
+from baselines.purejaxrl_ppo.training import Options, Trainer
 from benchmarks import report
 
 AIM_STEPS_PER_S = 800_000
@@ -55,7 +54,7 @@ def measure(trainer: Trainer, options: Options, is_tracked: bool) -> float:
     """Return the environment steps per CPU second of one run."""
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder)
-        uri = local_uri(out) if is_tracked else None
+        uri = local_uri(out) if is_tracked else ""
         started_s = time.process_time()
         checkpoint, _ = trainer.train(out, 0, options._replace(tracking_uri=uri))
         return checkpoint.meta["steps"] / (time.process_time() - started_s)

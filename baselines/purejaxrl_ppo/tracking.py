@@ -20,25 +20,18 @@ LOCAL_STORE = "mlflow.db"
 LOCAL_ARTIFACTS = "mlflow_artifacts"
 LOCAL_PAGE = "http://127.0.0.1:5000"  # of `mlflow ui`
 EXPERIMENT = "flytrack"
-PARENT_TAG = "mlflow.parentRunId"  # by which MLflow shows a run below another
 # Groups in which MLflow shows metrics; all others are of the race.
 GROUPS = {
     "ppo": (
-        "policy_loss",
-        "value_loss",
-        "entropy",
-        "approx_kl",
-        "clip_fraction",
-        "explained_variance",
-        "learning_rate",
+        *("policy_loss", "value_loss", "entropy", "approx_kl", "clip_fraction"),
+        *("explained_variance", "learning_rate"),
     ),
     "time": ("steps_per_second",),
 }
 EVERY_STEP = "ppo/learning_rate"  # a metric that is recorded at every step
 SEND_EVERY_S = 5.0  # a transaction of the store costs as much as hundreds of values in it
 RETRY_EVERY_S = 60.0
-STEPS_AT_ONCE = 16
-PARAMS_AT_ONCE = 100  # MLflow's limit
+STEPS_AT_ONCE = 16  # their metrics are one transaction: a step is in the store as a whole or not at all
 LONGEST_PARAM = 6000
 # A server that is down should cost seconds, where MLflow's own settings are minutes; and no telemetry.
 SETTINGS = {
@@ -53,6 +46,11 @@ logger = logging.getLogger(__name__)
 def local_uri(folder: Path) -> str:
     """Return the address of the SQLite store in a folder."""
     return f"{SQLITE}{(folder / LOCAL_STORE).resolve()}"
+
+
+def has_moved(uri: str) -> bool:
+    """Return whether a store is an SQLite file that is not where it was."""
+    return uri.startswith(SQLITE) and not Path(uri.removeprefix(SQLITE)).exists()
 
 
 def grouped(name: str) -> str:
@@ -72,20 +70,16 @@ def flatten(values: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, str
 
 
 class Tracker:
-    """The MLflow run of a training.
+    """The MLflow run of a training; without a store, nothing is recorded.
 
     A store that cannot be reached is a warning: values are kept in memory and sent when it is back.
 
     Args:
-        folder: of the run. uri: of the store. name: of the MLflow run. params: nested JSON values.
-        parent_run_id: of the MLflow run that this is a part of, if any.
+        folder: of the run. uri: of the store, "" for none. name: of the MLflow run. params: JSON values.
     """
 
-    def __init__(
-        self, folder: Path, uri: str, name: str, params: dict[str, Any], parent_run_id: str | None = None
-    ):
+    def __init__(self, folder: Path, uri: str, name: str, params: dict[str, Any]):
         self._folder, self._uri, self._name, self._params = folder, uri, name, params
-        self._tags = {} if parent_run_id is None else {PARENT_TAG: parent_run_id}
         self._client: Any = None
         self.run_id = self._experiment_id = ""
         self._last_step = -1  # that the store has
@@ -107,13 +101,15 @@ class Tracker:
 
     def metrics(self, step: int, values: dict[str, float]) -> None:
         """Record metrics after a number of environment steps; all of a step at once."""
-        self._metrics.append((step, int(time.time() * 1000), values))
+        if self._uri:
+            self._metrics.append((step, int(time.time() * 1000), values))
         if time.monotonic() > self._next_s:
             self.flush()
 
     def file(self, path: Path, group: str) -> None:
         """Record a file; group: folder of the artifacts."""
-        self._files.append((path, group))
+        if self._uri:
+            self._files.append((path, group))
 
     def flush(self) -> None:
         """Send all that is pending: before a checkpoint, because a resumed run does not repeat it."""
@@ -130,7 +126,7 @@ class Tracker:
             logger.warning("tracking: %s: %d steps were not recorded", self._uri, len(self._metrics))
 
     def _attempt(self, send: Callable[[], None]) -> None:
-        if time.monotonic() < self._retry_s:
+        if not self._uri or time.monotonic() < self._retry_s:
             return
         try:
             send()
@@ -151,16 +147,14 @@ class Tracker:
         for name in ("mlflow", "alembic"):
             logging.getLogger(name).setLevel(logging.WARNING)
         client = MlflowClient(tracking_uri=self._uri)
-        run_id = self._read_run_id()
-        if run_id is None:
-            self.run_id = self._create_run(client)
-            write_atomically(
-                self._folder / RUN_FILE, json.dumps({"uri": self._uri, "run_id": self.run_id}).encode()
-            )
+        known = self._read_run_id()
+        self.run_id = known or self._create_run(client)
+        if known is None:
+            content = json.dumps({"uri": self._uri, "run_id": self.run_id})
+            write_atomically(self._folder / RUN_FILE, content.encode())
         else:
-            self.run_id = run_id
-            client.update_run(run_id, status="RUNNING")
-            history = client.get_metric_history(run_id, EVERY_STEP)
+            client.update_run(known, status="RUNNING")
+            history = client.get_metric_history(known, EVERY_STEP)
             self._last_step = max((metric.step for metric in history), default=-1)
         self._client, self._experiment_id = client, client.get_run(self.run_id).info.experiment_id
         print(f"MLflow: {self.address}")
@@ -170,9 +164,7 @@ class Tracker:
         if not path.exists():
             return None
         known = json.loads(path.read_bytes())
-        uri = known["uri"]
-        has_moved = uri.startswith(SQLITE) and not Path(uri.removeprefix(SQLITE)).exists()
-        return known["run_id"] if uri == self._uri or has_moved else None
+        return known["run_id"] if known["uri"] == self._uri or has_moved(known["uri"]) else None
 
     def _create_run(self, client: Any) -> str:
         from mlflow.entities import Param
@@ -185,10 +177,8 @@ class Tracker:
             store = Path(self._uri.removeprefix(SQLITE)).resolve()
             location = (store.parent / LOCAL_ARTIFACTS).as_uri() if self._uri.startswith(SQLITE) else None
             experiment_id = client.create_experiment(EXPERIMENT, artifact_location=location)
-        run_id = client.create_run(experiment_id, run_name=self._name, tags=self._tags).info.run_id
-        params = [Param(name, text) for name, text in flatten(self._params)]
-        for first in range(0, len(params), PARAMS_AT_ONCE):
-            client.log_batch(run_id, params=params[first : first + PARAMS_AT_ONCE])
+        run_id: str = client.create_run(experiment_id, run_name=self._name).info.run_id
+        client.log_batch(run_id, params=[Param(*pair) for pair in flatten(self._params)])
         return run_id
 
     def _send(self) -> None:
@@ -203,8 +193,7 @@ class Tracker:
                 if step > self._last_step
                 for name, value in values.items()
             ]
-            if metrics:
-                self._client.log_batch(self.run_id, metrics=metrics)
+            self._client.log_batch(self.run_id, metrics=metrics)
             del self._metrics[:STEPS_AT_ONCE]
         while self._files:
             path, group = self._files[0]

@@ -9,7 +9,7 @@ from typing import Annotated, Any, NamedTuple, NoReturn
 import tyro
 
 from baselines.purejaxrl_ppo.checkpoint import CheckpointError
-from baselines.purejaxrl_ppo.config import Config, Count, OptionalInt, OptionalPath, settings_in_file
+from baselines.purejaxrl_ppo.config import Config, OptionalInt, OptionalPath, settings_in_file
 from baselines.purejaxrl_ppo.resume import (
     FINAL,
     Start,
@@ -20,9 +20,8 @@ from baselines.purejaxrl_ppo.resume import (
     seeds_in,
     seeds_side_by_side,
 )
-from baselines.purejaxrl_ppo.run import Options
-from baselines.purejaxrl_ppo.tracking import SQLITE, local_uri
-from baselines.purejaxrl_ppo.training import Task, Trainer
+from baselines.purejaxrl_ppo.tracking import has_moved, local_uri
+from baselines.purejaxrl_ppo.training import Options, Run, Task, Trainer
 from flytrack_env.messages import error_text
 from flytrack_env.model_file import model_from_json
 
@@ -30,8 +29,8 @@ PROG = "flytrack train"
 MAX_SEED = 2**31
 INTERRUPTED = 130  # what shells return for a command that Ctrl-C ended
 DEFAULT_OUT = Path("runs/train")
-DEFAULTS = Options(checkpoint_every=1_000_000, evaluate_every=4_000_000)
-LOCAL, OFF = "local", ""  # tracking URIs
+LOCAL = "local"  # tracking URI
+DEFAULTS = Options(checkpoint_every=1_000_000, evaluate_every=4_000_000, tracking_uri=LOCAL)
 
 
 def parse_rewards(words: Sequence[str]) -> dict[str, float]:
@@ -77,16 +76,10 @@ class Settings(Sources):
     """So many of them side by side in one program; by default all. On a CPU, 1 is fastest."""
     out: OptionalPath = None
     """Folder; by default runs/train, or that of --resume."""
-    checkpoint_every: Count = DEFAULTS.checkpoint_every or 0
-    """Write step_<N>.safetensors every so many environment steps; 0: only at the end."""
-    evaluate_every: Count = DEFAULTS.evaluate_every or 0
-    """Fly and draw the policy every so many environment steps; 0: never."""
-    evaluation_episodes: int = DEFAULTS.evaluation_episodes
-    """Noisy starts of an evaluation."""
-    tracking_uri: str = LOCAL
-    """MLflow store; local: an SQLite file in OUT."""
     no_tracking: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Do not use MLflow."""
+    run: Options = DEFAULTS
+    """What is done beside training."""
     hyperparameters: Config = Config()  # noqa: RUF009, frozen
     """Of PPO."""
 
@@ -114,11 +107,15 @@ class Resumed(NamedTuple):
 
 
 class Plan(NamedTuple):
-    """A checked command: the trainer, one task per seed, and how many train side by side."""
+    """A checked command: the trainer, and the runs, those that train side by side together."""
 
     trainer: Trainer
-    tasks: list[Task]
-    at_once: int
+    groups: list[list[Run]]
+
+    @property
+    def runs(self) -> list[Run]:
+        """All runs."""
+        return [run for group in self.groups for run in group]
 
 
 def find_starts(resume: Path) -> Resumed:
@@ -136,10 +133,11 @@ def find_starts(resume: Path) -> Resumed:
 def saved_options(start: Start) -> Options:
     """Return the options that a checkpoint was written with; raises CheckpointError if they are none."""
     try:
-        values = start.checkpoint.meta["options"]
+        found = start.checkpoint.meta["options"].items()
+        values = {name: value for name, value in found if value is not None}
         options = Options(**{**values, "seeds": tuple(map(int, values["seeds"]))})
         options.check()
-    except (KeyError, TypeError, ValueError) as error:
+    except (AttributeError, KeyError, TypeError, ValueError) as error:
         raise CheckpointError(f"{start.path}: options: {error_text(error)}") from error
     return options
 
@@ -147,18 +145,14 @@ def saved_options(start: Start) -> Options:
 def defaults_of(resumed: Resumed) -> Settings:
     """Return the settings of the run that is resumed, which flags override."""
     start, options = resumed.first, saved_options(resumed.first)
-    uri = options.tracking_uri or OFF
-    has_moved = uri.startswith(SQLITE) and not Path(uri.removeprefix(SQLITE)).exists()
+    uri = LOCAL if has_moved(options.tracking_uri) else options.tracking_uri
     return Settings(
         env_id=start.checkpoint.env_id,
         track=start.checkpoint.track,
         seed=min(resumed.starts),
         num_seeds=len(resumed.starts),
         seeds_at_once=seeds_side_by_side(start.checkpoint),
-        checkpoint_every=options.checkpoint_every or 0,
-        evaluate_every=options.evaluate_every or 0,
-        evaluation_episodes=options.evaluation_episodes,
-        tracking_uri=LOCAL if has_moved else uri,
+        run=options._replace(tracking_uri=uri),
         hyperparameters=start.checkpoint.config,
     )
 
@@ -178,33 +172,36 @@ def parse(words: Sequence[str]) -> tuple[Settings, Resumed | None]:
     return settings, resumed
 
 
-def make_tasks(settings: Settings, resumed: Resumed | None, at_once: int) -> list[Task]:
-    """Return one task per seed; raises ValueError for other seeds than those of a folder that is resumed."""
+def make_tasks(settings: Settings, resumed: Resumed | None) -> list[list[Task]]:
+    """Return a task per seed, those that train side by side together.
+
+    Raises:
+        ValueError: other seeds than those of a folder that is resumed.
+    """
     seeds = list(range(settings.seed, settings.seed + settings.num_seeds))
     starts: list[Start | None] = [None] * len(seeds)
     is_single = len(seeds) == 1
     if resumed is not None:
-        is_single, known = resumed.is_single, list(resumed.starts)
+        is_single, known, starts = resumed.is_single, list(resumed.starts), list(resumed.starts.values())
         if not is_single and seeds[0] == known[0] and len(seeds) == len(known):
             seeds = known
         elif not is_single or len(seeds) > 1:
             found = f"seeds {seeds}, but {resumed.folder} holds {known}"
             raise ValueError(f"--resume: found {found}; leave out --seed and --num-seeds")
-        starts = list(resumed.starts.values())
-        groups = [starts[first : first + at_once] for first in range(0, len(starts), at_once)]
-        starts = [start for group in groups for start in at_common_step(group)]
     out = settings.out or (DEFAULT_OUT if resumed is None else resumed.folder)
-    uri = local_uri(out) if settings.tracking_uri == LOCAL else settings.tracking_uri
-    options = Options(
-        checkpoint_every=settings.checkpoint_every or None,
-        evaluate_every=settings.evaluate_every or None,
-        evaluation_episodes=settings.evaluation_episodes,
-        tracking_uri=None if settings.no_tracking or uri == OFF else uri,
-        seeds=tuple(seeds),
+    uri = local_uri(out) if settings.run.tracking_uri == LOCAL else settings.run.tracking_uri
+    options = settings.run._replace(
+        tracking_uri="" if settings.no_tracking else uri, resume=None, seeds=tuple(seeds)
     )
-    folders = [out if is_single else out / f"seed{seed}" for seed in seeds]
-    named = zip(folders, seeds, starts, strict=True)
-    return [Task(folder, seed, options, start) for folder, seed, start in named]
+    at_once = settings.seeds_at_once or len(seeds)
+    groups = []
+    for first in range(0, len(seeds), at_once):
+        own = slice(first, first + at_once)
+        pairs = zip(seeds[own], at_common_step(starts[own]), strict=True)
+        groups.append(
+            [Task(out if is_single else out / f"seed{seed}", seed, options, start) for seed, start in pairs]
+        )
+    return groups
 
 
 def make_trainer(settings: Settings, resumed: Resumed | None) -> Trainer:
@@ -226,31 +223,28 @@ def make_trainer(settings: Settings, resumed: Resumed | None) -> Trainer:
 def make_plan(words: Sequence[str]) -> Plan:
     """Return the plan of a command line; everything is checked before anything is trained."""
     settings, resumed = parse(words)
-    at_once = settings.seeds_at_once or settings.num_seeds
-    tasks = make_tasks(settings, resumed, at_once)
+    groups = make_tasks(settings, resumed)
     trainer = make_trainer(settings, resumed)
-    trainer.check_all(tasks, min(at_once, len(tasks)))
-    return Plan(trainer, tasks, at_once)
+    return Plan(trainer, [trainer.prepare(tasks) for tasks in groups])
 
 
 def run(plan: Plan) -> None:
     """Train every seed; print where it continues from and where its checkpoint is."""
-    for task in plan.tasks:
-        if task.start is not None:
-            print(f"seed {task.seed}: from step {task.start.steps}, {task.start.path}")
-    for first in range(0, len(plan.tasks), plan.at_once):
-        tasks = plan.tasks[first : first + plan.at_once]
-        for task, (checkpoint, _) in zip(tasks, plan.trainer.run(tasks), strict=True):
+    for one in plan.runs:
+        if one.start is not None:
+            print(f"seed {one.seed}: from step {one.steps}, {one.start.path}")
+    for group in plan.groups:
+        for one, (checkpoint, _) in zip(group, plan.trainer.run(group), strict=True):
             meta = checkpoint.meta
-            print(f"seed {task.seed}: {meta['steps']} steps in {meta['seconds']} s: {task.out / FINAL}")
+            print(f"seed {one.seed}: {meta['steps']} steps in {meta['seconds']} s: {one.out / FINAL}")
 
 
 def stopped_text(plan: Plan) -> str:
     """Return the message for a training that was stopped."""
-    folder = plan.tasks[0].out
-    folder = folder if len(plan.tasks) == 1 else folder.parent
-    if any(checkpoints_in(task.out) for task in plan.tasks):
-        return f"stopped at {plan.trainer.steps} steps; continue with --resume {folder}"
+    folder, *others = (one.out for one in plan.runs)
+    if any(checkpoints_in(out) for out in (folder, *others)):
+        where = folder.parent if others else folder
+        return f"stopped at {plan.trainer.steps} steps; continue with --resume {where}"
     return f"stopped at {plan.trainer.steps} steps, before the first checkpoint"
 
 

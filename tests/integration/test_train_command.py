@@ -6,9 +6,8 @@ import pytest
 
 from baselines.purejaxrl_ppo import Config, load_checkpoint, tracking, train_ppo
 from baselines.purejaxrl_ppo.checkpoint import save_checkpoint
-from baselines.purejaxrl_ppo.run import DivergedError, Options
 from baselines.purejaxrl_ppo.train_ppo import make_plan, make_tasks, parse
-from baselines.purejaxrl_ppo.training import Trainer
+from baselines.purejaxrl_ppo.training import DivergedError, Options, Trainer
 from tests.support.ppo_runs import CONFIG, EVERY_OTHER_UPDATE, SEED, make_trainer
 
 SEEDS = (SEED, SEED + 1)
@@ -20,7 +19,7 @@ def read(*arguments):
 
 
 def tasks_of(*arguments):
-    return make_tasks(*read(*arguments), 1)
+    return [task for group in make_tasks(*read(*arguments)) for task in group]
 
 
 def call(*arguments):
@@ -79,7 +78,7 @@ def test_what_cannot_be_used_is_refused(whole, tmp_path, monkeypatch, capsys, ar
 def test_resuming_takes_from_the_checkpoint_what_is_not_given(whole, tmp_path):
     settings, resumed = read("--resume", whole[0])
     assert settings.hyperparameters == CONFIG and settings.env_id == "FlyTrackRobust-v0"
-    (task,) = make_tasks(settings, resumed, 1)
+    ((task,),) = make_tasks(settings, resumed)
     assert (task.seed, task.out, task.start.path) == (SEED, whole[0], whole[0] / "final.safetensors")
     assert task.options == EVERY_OTHER_UPDATE._replace(seeds=(SEED,))
     uri = tracking.local_uri(tmp_path)
@@ -127,11 +126,11 @@ def test_a_folder_of_seeds_is_resumed_with_those_that_had_not_begun(seeds, tmp_p
 
 
 def test_exit_codes_and_messages(tmp_path, monkeypatch, capsys):
-    def stop(self, tasks):
+    def stop(self, runs):
         self.steps = 40
         if error is KeyboardInterrupt:
-            (tasks[0].out).mkdir(parents=True)
-            (tasks[0].out / "step_0.safetensors").touch()
+            (runs[0].out).mkdir(parents=True)
+            (runs[0].out / "step_0.safetensors").touch()
         raise error
 
     monkeypatch.setattr(Trainer, "run", stop)

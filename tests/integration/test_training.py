@@ -21,7 +21,7 @@ from baselines.purejaxrl_ppo.resume import (
     newest_intact,
     warn_of_other_machine,
 )
-from baselines.purejaxrl_ppo.run import DivergedError, Options, Run
+from baselines.purejaxrl_ppo.training import DivergedError, Options, Run
 from tests.support.pages import ROOT
 from tests.support.ppo_runs import BATCH, EVERY_OTHER_UPDATE, SEED, assert_same_end
 from tests.support.slow import slow_but
@@ -96,11 +96,11 @@ def test_folders_without_an_intact_checkpoint_are_refused(whole, tmp_path):
         ({"machine": {"threads": 1000}}, "machine.threads: found 1000"),
     ],
 )
-def test_another_machine_or_software_is_a_warning(trainer, whole, caplog, change, message):
+def test_another_machine_or_software_is_a_warning(whole, caplog, change, message):
     path, checkpoint = newest_intact(whole[0])
-    warn_of_other_machine(path, checkpoint, trainer.describe(SEED))
+    warn_of_other_machine(path, checkpoint, checkpoint.meta)
     assert caplog.text == ""
-    warn_of_other_machine(path, checkpoint._replace(meta=checkpoint.meta | change), trainer.describe(SEED))
+    warn_of_other_machine(path, checkpoint._replace(meta=checkpoint.meta | change), checkpoint.meta)
     assert message in caplog.text and "perhaps not bit for bit" in caplog.text
 
 
@@ -149,7 +149,7 @@ def test_the_best_lap_survives_a_resume(trainer, tmp_path, monkeypatch):
         steps_evaluated.append(steps // BATCH)
         return {"evaluation_success": 1.0, "evaluation_best_lap_s": 8.0 + steps / BATCH}, []
 
-    monkeypatch.setattr("baselines.purejaxrl_ppo.run.evaluate_policy", evaluate_policy)
+    monkeypatch.setattr("baselines.purejaxrl_ppo.training.evaluate_policy", evaluate_policy)
     trainer.train(tmp_path, SEED, EVALUATED)
     for path in (tmp_path / "final.safetensors", step_path(tmp_path, 6)):
         path.unlink()
@@ -188,8 +188,8 @@ class Interrupter:
 def test_an_interrupt_that_python_drops_ends_the_run_all_the_same(trainer, tmp_path, monkeypatch):
     advance = Run.advance
 
-    def interrupted(self, chunk):
-        advance(self, chunk)
+    def interrupted(self, *result):
+        advance(self, *result)
         Interrupter()
 
     monkeypatch.setattr(Run, "advance", interrupted)
@@ -203,10 +203,10 @@ def test_an_interrupt_that_python_drops_ends_the_run_all_the_same(trainer, tmp_p
 def test_seeds_killed_between_their_checkpoints_end_bit_for_bit(trainer, together, tmp_path, monkeypatch):
     write = Run._checkpoint
 
-    def die(self, name, runner, update):
-        if update == 4 and self.description["seed"] == SEEDS[1]:
+    def die(self, name):
+        if self.update == 4 and self.seed == SEEDS[1]:
             raise KeyboardInterrupt
-        write(self, name, runner, update)
+        write(self, name)
 
     with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
         patch.setattr(Run, "_checkpoint", die)

@@ -6,8 +6,7 @@ import jax
 import numpy as np
 
 from baselines.purejaxrl_ppo import Config, load_checkpoint
-from baselines.purejaxrl_ppo.run import Options
-from baselines.purejaxrl_ppo.training import Trainer
+from baselines.purejaxrl_ppo.training import Options, Trainer
 
 SEED = 3
 BATCH = 16 * 24

@@ -7,7 +7,7 @@ import pytest
 
 from baselines.purejaxrl_ppo import Config
 from baselines.purejaxrl_ppo.config import ConfigError, read_settings, settings_in_file
-from baselines.purejaxrl_ppo.program import training_params
+from baselines.purejaxrl_ppo.training import training_params
 from flytrack_env import make
 
 
