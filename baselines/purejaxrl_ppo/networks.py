@@ -1,6 +1,5 @@
 """Actor and critic: separate tanh networks, orthogonal initialisation, state-independent deviation."""
 
-import functools
 from collections.abc import Sequence
 from typing import Any
 
@@ -13,81 +12,6 @@ import numpy as np
 from baselines.purejaxrl_ppo.config import Config
 
 Memory = Any  # what a policy remembers of an episode, a pytree; () of one that remembers nothing
-
-
-class ActorCritic(nn.Module):
-    """Policy and value of an observation.
-
-    hidden_sizes, initial_action, initial_std, min_std: as in ``Config``. num_choices: number of discrete
-    actions; 0 for continuous ones.
-    """
-
-    hidden_sizes: Sequence[int]
-    initial_action: Sequence[float]
-    initial_std: float
-    min_std: float
-    num_choices: int = 0
-
-    def setup(self) -> None:
-        """Declare the layers."""
-        self.actor = self._tower("actor", self.num_choices or len(self.initial_action), 0.01)
-        self.critic = self._tower("critic", 1, 1.0)
-        if self.num_choices:
-            return
-        self.log_std = self.param(
-            "log_std", nn.initializers.constant(np.log(self.initial_std)), (len(self.initial_action),)
-        )
-
-    def _tower(self, name: str, size: int, last_scale: float) -> nn.Sequential:
-        layers: list[Any] = []
-        for width in self.hidden_sizes:
-            layers += [nn.Dense(width, kernel_init=nn.initializers.orthogonal(np.sqrt(2))), nn.tanh]
-        layers.append(nn.Dense(size, kernel_init=nn.initializers.orthogonal(last_scale)))
-        return nn.Sequential(layers, name=f"{name}_tower")
-
-    def policy(self, observation: jax.Array) -> distrax.Distribution:
-        """Return the distribution over actions, batch shape as the observation's."""
-        if self.num_choices:
-            return distrax.Categorical(logits=self.actor(observation))
-        mean = self.actor(observation) + jnp.asarray(self.initial_action)
-        std = jnp.maximum(jnp.exp(self.log_std), self.min_std)
-        return distrax.MultivariateNormalDiag(mean, jnp.broadcast_to(std, mean.shape))
-
-    def value(self, observation: jax.Array) -> jax.Array:
-        """Return the value, batch shape as the observation's."""
-        return self.critic(observation).squeeze(-1)
-
-    def __call__(self, observation: jax.Array) -> tuple[distrax.Distribution, jax.Array]:
-        """Return policy and value."""
-        return self.policy(observation), self.value(observation)
-
-    @nn.nowrap
-    def first_memory(self, batch_shape: tuple[int, ...] = ()) -> Memory:
-        """Return what is remembered at the start of an episode: nothing."""
-        del batch_shape
-        return ()
-
-    def step(self, memory: Memory, observation: jax.Array) -> tuple[Memory, distrax.Distribution, jax.Array]:
-        """Return the memory after a step, policy and value."""
-        return memory, *self(observation)
-
-    def value_of(self, memory: Memory, observation: jax.Array) -> jax.Array:
-        """Return the value of an observation after what is remembered."""
-        del memory
-        return self.value(observation)
-
-    def unroll(
-        self, memory: Memory, observation: jax.Array, done: jax.Array
-    ) -> tuple[distrax.Distribution, jax.Array]:
-        """Return policy and value of steps in any order."""
-        del memory, done
-        return self(observation)
-
-    @nn.nowrap
-    def act(self, params: Any, memory: Memory, observation: jax.Array) -> tuple[Memory, jax.Array]:
-        """Return the memory after a step, and the mean action, in [-1, 1]."""
-        found: Any = self.apply(params, memory, observation, method="step")
-        return found[0], jnp.clip(found[1].mode(), -1.0, 1.0)
 
 
 class _Gru(nn.Module):
@@ -106,21 +30,51 @@ class _Gru(nn.Module):
         return jnp.where(done[..., None], 0.0, memory), memory
 
 
-class RecurrentActorCritic(ActorCritic):
-    """Policy and value of an observation and of what a recurrent unit remembers of the episode.
+class ActorCritic(nn.Module):
+    """Policy and value of what is known: an observation, and what is remembered of the episode, if anything.
 
-    memory_size: width of that memory.
+    hidden_sizes, initial_action, initial_std, min_std, memory_size: as in ``Config``. num_choices: number of
+    discrete actions; 0 for continuous ones.
     """
 
+    hidden_sizes: Sequence[int]
+    initial_action: Sequence[float]
+    initial_std: float
+    min_std: float
+    num_choices: int = 0
     memory_size: int = 0
 
     def setup(self) -> None:
         """Declare the layers."""
-        super().setup()
-        over_steps = nn.scan(
-            _Gru, variable_broadcast="params", split_rngs={"params": False}, in_axes=1, out_axes=1
-        )
-        self.gru = over_steps(self.memory_size)
+        self.actor = self._tower("actor", self.num_choices or len(self.initial_action), 0.01)
+        self.critic = self._tower("critic", 1, 1.0)
+        if not self.num_choices:
+            start = nn.initializers.constant(np.log(self.initial_std))
+            self.log_std = self.param("log_std", start, (len(self.initial_action),))
+        if self.memory_size:
+            over_steps = nn.scan(
+                _Gru, variable_broadcast="params", split_rngs={"params": False}, in_axes=1, out_axes=1
+            )
+            self.gru = over_steps(self.memory_size)
+
+    def _tower(self, name: str, size: int, last_scale: float) -> nn.Sequential:
+        layers: list[Any] = []
+        for width in self.hidden_sizes:
+            layers += [nn.Dense(width, kernel_init=nn.initializers.orthogonal(np.sqrt(2))), nn.tanh]
+        layers.append(nn.Dense(size, kernel_init=nn.initializers.orthogonal(last_scale)))
+        return nn.Sequential(layers, name=f"{name}_tower")
+
+    def policy(self, known: jax.Array) -> distrax.Distribution:
+        """Return the distribution over actions, batch shape as that of what is known."""
+        if self.num_choices:
+            return distrax.Categorical(logits=self.actor(known))
+        mean = self.actor(known) + jnp.asarray(self.initial_action)
+        std = jnp.maximum(jnp.exp(self.log_std), self.min_std)
+        return distrax.MultivariateNormalDiag(mean, jnp.broadcast_to(std, mean.shape))
+
+    def value(self, known: jax.Array) -> jax.Array:
+        """Return the value, batch shape as that of what is known."""
+        return self.critic(known).squeeze(-1)
 
     def __call__(self, observation: jax.Array) -> tuple[distrax.Distribution, jax.Array]:
         """Return policy and value of first observations of episodes."""
@@ -128,8 +82,8 @@ class RecurrentActorCritic(ActorCritic):
 
     @nn.nowrap
     def first_memory(self, batch_shape: tuple[int, ...] = ()) -> Memory:
-        """Return what is remembered at the start of an episode, (*batch_shape, memory_size)."""
-        return jnp.zeros((*batch_shape, self.memory_size))
+        """Return what is remembered at the start of an episode, (*batch_shape, memory_size); or ()."""
+        return jnp.zeros((*batch_shape, self.memory_size)) if self.memory_size else ()
 
     def step(self, memory: Memory, observation: jax.Array) -> tuple[Memory, distrax.Distribution, jax.Array]:
         """Return the memory after a step, policy and value."""
@@ -143,32 +97,39 @@ class RecurrentActorCritic(ActorCritic):
     def unroll(
         self, memory: Memory, observation: jax.Array, done: jax.Array
     ) -> tuple[distrax.Distribution, jax.Array]:
-        """Return policy and value of steps in their order, (num_envs, num_steps).
+        """Return policy and value of steps: in any order, or with a memory in their order.
 
-        memory: (num_envs, num_steps, memory_size), of which the first counts. done: an episode ends after it.
+        memory: (num_envs, num_steps, memory_size), of which the first counts. observation, done: (num_envs,
+        num_steps, ...) then. done: an episode ends after it.
         """
-        remembered = self.gru(memory[:, 0], (observation, done))[1]
-        known = jnp.concatenate([observation, remembered], axis=-1)
-        return self.policy(known), self.value(known)
+        if self.memory_size:
+            remembered = self.gru(memory[:, 0], (observation, done))[1]
+            observation = jnp.concatenate([observation, remembered], axis=-1)
+        return self.policy(observation), self.value(observation)
 
     def _remember(self, memory: Memory, observation: jax.Array) -> tuple[Memory, jax.Array]:
         """Return the memory after a step, and what is known in it."""
+        if not self.memory_size:
+            return memory, observation
         rows = observation.reshape(-1, 1, observation.shape[-1])
         never = jnp.zeros(rows.shape[:2], bool)
         after = self.gru(memory.reshape(len(rows), -1), (rows, never))[0].reshape(memory.shape)
         return after, jnp.concatenate([observation, after], axis=-1)
 
+    @nn.nowrap
+    def act(self, params: Any, memory: Memory, observation: jax.Array) -> tuple[Memory, jax.Array]:
+        """Return the memory after a step, and the mean action, in [-1, 1]."""
+        found: Any = self.apply(params, memory, observation, method="step")
+        return found[0], jnp.clip(found[1].mode(), -1.0, 1.0)
+
 
 def make_network(config: Config, num_choices: int = 0) -> ActorCritic:
     """Return the network that a configuration describes; num_choices: of discrete actions, if they are."""
-    kind: Any = ActorCritic
-    if config.memory_size:
-        kind = functools.partial(RecurrentActorCritic, memory_size=config.memory_size)
-    found: ActorCritic = kind(
+    return ActorCritic(
         hidden_sizes=config.hidden_sizes,
         initial_action=config.initial_action,
         initial_std=config.initial_std,
         min_std=config.min_std,
         num_choices=num_choices,
+        memory_size=config.memory_size,
     )
-    return found
