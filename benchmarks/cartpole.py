@@ -5,8 +5,6 @@ compared. The aim is what PureJaxRL's own ``ppo.py`` reaches, unmodified, over f
 from it are switched off here.
 """
 
-import argparse
-
 import gymnax
 import jax
 import numpy as np
@@ -33,15 +31,12 @@ CONFIG = Config(
 )
 
 
-def main() -> None:
+def main(seeds: int = 5) -> None:
     """Train every seed, print and write the table; exit 1 if the mean misses the target."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--seeds", type=int, default=5)
-    arguments = parser.parse_args()
     env, params = gymnax.make("CartPole-v1")
     train = jax.jit(make_train(env, params, CONFIG))
     areas = []
-    for seed in range(arguments.seeds):
+    for seed in range(seeds):
         _, metrics = train(jax.random.key(seed))
         areas.append(float(np.mean(metrics["last_return"])))
         print(f"seed {seed}: {areas[-1]:.1f}", flush=True)
@@ -56,4 +51,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    report.command(main)

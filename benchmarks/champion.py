@@ -7,11 +7,10 @@ those that finish often enough is shipped in baselines/purejaxrl_ppo/champion; a
 time-optimal flight.
 """
 
-import argparse
 import time
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -170,13 +169,12 @@ def section_of(name: str, seeds: list[int]) -> tuple[str, bool]:
     return "\n\n".join(lines), is_met
 
 
-def main() -> None:
+def main(
+    names: tuple[Literal["flytrack", "robust"], ...] = ("flytrack", "robust"),
+    seeds: tuple[int, ...] = (0, 1, 2, 3, 4),
+) -> None:
     """Train, fly, ship the fastest and write the page; exit 1 where an aim is missed."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--names", nargs="+", choices=RECIPES, default=list(RECIPES))
-    parser.add_argument("--seeds", type=int, nargs="+", default=range(5))
-    asked = parser.parse_args()
-    sections = [section_of(name, list(asked.seeds)) for name in asked.names]
+    sections = [section_of(name, list(seeds)) for name in names]
     report.fill_page(
         report.RESULTS / "champion.md",
         "champion",
@@ -189,4 +187,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    report.command(main)

@@ -8,8 +8,6 @@ that have a line of the same commit. ``python -m benchmarks.diagnosis_page`` wri
 commit's lines.
 """
 
-import argparse
-import json
 import os
 import platform
 import time
@@ -22,18 +20,17 @@ from typing import Any, NamedTuple
 
 import jax
 import numpy as np
-from tqdm import tqdm
 
 from benchmarks import hidden
 from benchmarks.hidden.oracle import known, removed, signal_to_noise
-from benchmarks.report import ROOT, commit_of_checkout
+from benchmarks.report import RESULTS, append_line, command, commit_of_checkout, lines_of_commit, progress
 from flytrack_env.dynamics import ModelParameters
 from flytrack_env.motion import Motion
 from flytrack_sysid.diagnosis import Diagnosis, diagnose
 from flytrack_sysid.log import FlightLog
 from flytrack_sysid.split import held_out_rows
 
-LINES = ROOT / "docs" / "results" / "diagnosis.jsonl"
+LINES = RESULTS / "diagnosis.jsonl"
 SECONDS = 60.0
 SEED = 29  # no rule was made on it; on 21 to 28 some were
 # How the package calls the plants' motions.
@@ -162,14 +159,7 @@ def _removed(truth: hidden.Truth, found: Diagnosis, rng: Rng) -> list[float]:
 
 def read_lines(commit: str | None, path: Path = LINES) -> dict[Trial, dict[str, Any]]:
     """Return the lines of a commit by plant; of the last line's if None."""
-    if not path.exists():
-        return {}
-    # What a kill has cut off has no end of line.
-    whole = [text for text in path.read_text().splitlines(keepends=True) if text.endswith("\n")]
-    lines = [json.loads(text) for text in whole]
-    commit = lines[-1]["commit"] if commit is None and lines else commit
-    kept = [line for line in lines if line["commit"] == commit]
-    return {Trial(*(line[name] for name in Trial._fields)): line for line in kept}
+    return {Trial(*(line[name] for name in Trial._fields)): line for line in lines_of_commit(path, commit)}
 
 
 def run(trials: list[Trial], path: Path) -> None:
@@ -177,36 +167,32 @@ def run(trials: list[Trial], path: Path) -> None:
     commit = commit_of_checkout()
     done = read_lines(commit, path)
     machine = f"{platform.machine()}, {os.cpu_count()} cores, jax {jax.__version__}"
-    for trial in tqdm([one for one in trials if one not in done], unit=" plants", disable=None):
+    for trial in progress([one for one in trials if one not in done], "plants"):
         line = {**trial._asdict(), "commit": commit, "date": str(date.today()), "machine": machine}
         try:
             line |= plant(trial)
         except Exception as error:  # a crash is a result too, and the others go on
             line["error"] = f"{type(error).__name__}: {error}"
-        with path.open("a") as file:
-            file.write(json.dumps(line) + "\n")
+        append_line(path, line)
 
 
-def main() -> None:
-    """Diagnose the plants of some rows."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--plants", type=int, default=200, help="of each row; default: %(default)s")
-    parser.add_argument("--first", type=int, default=0, help="number of the first plant")
-    parser.add_argument("--rows", default=",".join(ROWS), help="default: all")
-    parser.add_argument("--motion", default=",".join(hidden.MOTIONS), help="default: %(default)s")
-    parser.add_argument("--rate", default="100", help="rows per second of the log; default: %(default)s")
-    parser.add_argument("--seed", type=int, default=SEED, help="default: %(default)s")
-    parser.add_argument("--lines", type=Path, default=LINES, help="file to append to; default: %(default)s")
-    arguments = parser.parse_args()
-    every = product(
-        range(arguments.first, arguments.plants),
-        arguments.rows.split(","),
-        arguments.motion.split(","),
-        map(int, arguments.rate.split(",")),
-    )
-    trials = [Trial(row, number, arguments.seed, motion, rate) for number, row, motion, rate in every]
-    run(trials, arguments.lines)
+def main(
+    plants: int = 200,
+    first: int = 0,
+    rows: str = ",".join(ROWS),
+    motion: str = ",".join(hidden.MOTIONS),
+    rate: str = "100",
+    seed: int = SEED,
+    lines: Path = LINES,
+) -> None:
+    """Diagnose plants.
+
+    plants: of each row, up to this number; first: from this one on. rate: rows per second of the log. lines:
+    file to append to.
+    """
+    every = product(range(first, plants), rows.split(","), motion.split(","), map(int, rate.split(",")))
+    run([Trial(row, number, seed, moved, one_rate) for number, row, moved, one_rate in every], lines)
 
 
 if __name__ == "__main__":
-    main()
+    command(main)

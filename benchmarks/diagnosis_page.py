@@ -3,7 +3,6 @@
 ``python -m benchmarks.diagnosis_page``: the last commit's, and below the figures of earlier ones.
 """
 
-import json
 from collections import Counter
 from collections.abc import Iterable
 from typing import Any
@@ -12,7 +11,7 @@ import numpy as np
 
 from benchmarks.diagnosis import LINES, ROWS, Trial, read_lines
 from benchmarks.hidden import MOTIONS
-from benchmarks.report import fill_page, percent, table
+from benchmarks.report import fill_page, lines_in, percent, table
 
 Line = dict[str, Any]
 Rows = dict[str, list[Line]]
@@ -196,7 +195,7 @@ def graded(commit: str | None) -> dict[Trial, Line]:
 
 def earlier(last: str) -> list[str]:
     """Return the figures of earlier commits, each with a heading, the latest first."""
-    commits = dict.fromkeys(json.loads(text)["commit"] for text in LINES.read_text().splitlines())
+    commits = dict.fromkeys(line["commit"] for line in lines_in(LINES))
     parts = []
     for commit in reversed([one for one in commits if one != last]):
         by_trial = graded(commit)

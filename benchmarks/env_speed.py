@@ -6,7 +6,6 @@ are drawn before the clock starts; every output of a step is kept, so that nothi
 away. The contestants take turns, because machines drift: compare ratios of one run, not rates of two runs.
 """
 
-import argparse
 import statistics
 import time
 from collections.abc import Callable
@@ -200,21 +199,19 @@ def median_ratio(rates: dict[str, list[float]], name: str, peer: str) -> float:
     return statistics.median(a / b for a, b in zip(rates[name], rates[peer], strict=True))
 
 
-def main() -> None:
-    """Measure, print and write."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--repeats", type=int, default=7, help="rounds, at least 5 for figures to publish")
-    parser.add_argument("--out", type=Path, help="path of the page (.md)")
-    parser.add_argument("--effects", action="store_true", help="measure the cost of each effect instead")
-    arguments = parser.parse_args()
+def main(repeats: int = 7, out: Path | None = None, effects: bool = False) -> None:
+    """Measure, print and write.
+
+    repeats: rounds, at least 5 for figures to publish. out: page. effects: measure the cost of each instead.
+    """
     core = report.pin_to_one_core()
-    if arguments.effects:
-        where = f"{arguments.repeats} rounds, {core}. {report.provenance_line(report.provenance())}"
+    if effects:
+        where = f"{repeats} rounds, {core}. {report.provenance_line(report.provenance())}"
         told = f"{report.command_line()}: `vmap(step)` of 1,024 environments; aim: at most {MOST_COSTLY:g}."
-        text = report.page("What an effect costs", told, effect_costs(arguments.repeats), where)
-        report.write_page(arguments.out, text)
+        text = report.page("What an effect costs", told, effect_costs(repeats), where)
+        report.write_page(out, text)
         return
-    rates = measure(contestants(), arguments.repeats)
+    rates = measure(contestants(), repeats)
     speeds = (
         (name, f"{statistics.median(found):.3g}", report.spread(found, ".3g"))
         for name, found in rates.items()
@@ -226,16 +223,16 @@ def main() -> None:
     )
     costs = ((name, f"{median_ratio(rates, PLAIN, name):.2f}", f"{MOST_COSTLY:g}") for name in VARIANTS)
     report.fill_page(
-        arguments.out,
+        out,
         "env_speed",
         ["l2f", "gymnasium"],
         speeds=report.table("environment | million steps per CPU second, median | lowest to highest", speeds),
         targets=report.table("ratio | measured | target", targets),
         costs=report.table("variant | cost over the plain step | at most", costs),
-        repeats=arguments.repeats,
+        repeats=repeats,
         core=core,
     )
 
 
 if __name__ == "__main__":
-    main()
+    report.command(main)

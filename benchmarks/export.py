@@ -4,7 +4,6 @@ The compiled header of each champion flies the black box and counts the gates it
 and evaluator act on the states of those flights and on states whose observations fill the box.
 """
 
-import argparse
 import ctypes
 import os
 import statistics
@@ -201,17 +200,15 @@ def section_of(name: str, num_inputs: int, folder: Path) -> str:
     )
 
 
-def main() -> None:
-    """Export, fly, compare and write the page."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--inputs", type=int, default=1_000_000, help="compared; default: %(default)s")
-    num_inputs, load, core = parser.parse_args().inputs, os.getloadavg()[0], report.pin_to_one_core()
+def main(inputs: int = 1_000_000) -> None:
+    """Export, fly, compare ``inputs`` states and write the page."""
+    load, core = os.getloadavg()[0], report.pin_to_one_core()
     with tempfile.TemporaryDirectory() as folder:
-        sections = [section_of(name, num_inputs, Path(folder)) for name in ("flytrack", "robust")]
+        sections = [section_of(name, inputs, Path(folder)) for name in ("flytrack", "robust")]
     values = {"core": core, "load": f"{load:.1f}", "cores": os.cpu_count(), "flags": FLAGS}
     path, packages = report.RESULTS / "export.md", ("onnx", "onnxruntime")
     report.fill_page(path, "export", packages=packages, sections="\n\n".join(sections), **values)
 
 
 if __name__ == "__main__":
-    main()
+    report.command(main)

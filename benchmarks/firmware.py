@@ -7,8 +7,6 @@ docs/results/firmware.jsonl, and writes tables of the last commit's lines betwee
 docs/results/firmware.md.
 """
 
-import argparse
-import json
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
@@ -21,7 +19,10 @@ from baselines.purejaxrl_ppo import load_checkpoint
 from benchmarks.champion import CHAMPION
 from benchmarks.report import (
     RESULTS,
+    append_line,
+    command,
     commit_of_checkout,
+    lines_of_commit,
     percent,
     progress,
     provenance,
@@ -241,12 +242,6 @@ def error_ratios(found: Diagnosis) -> dict[str, float]:
     return {horizon: round(errors["extended"][horizon] / size, 4) for horizon, size in base.items() if size}
 
 
-def append(path: Path, commit: str, line: dict[str, Any]) -> None:
-    """Append a line to a file of lines, with the commit that it was measured at."""
-    with path.open("a", encoding="utf-8") as file:
-        file.write(json.dumps({"commit": commit, **line}, default=str) + "\n")
-
-
 def champion_line(episodes: int, seed: int) -> dict[str, Any]:
     """Return the race of the shipped champion, which knows nothing of the firmware."""
     with Betaflight() as plant:
@@ -288,43 +283,45 @@ def tables(lines: list[dict[str, Any]]) -> str:
     return "\n\n".join(parts)
 
 
-def main() -> None:
-    """Fly, diagnose, and write the lines and the tables."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--matched", type=int, default=2, help="flights of each set-up and excitation")
-    parser.add_argument("--single", type=int, default=4, help="draws of each kind of change")
-    parser.add_argument("--pairs", type=int, default=8, help="set-ups with two changes")
-    parser.add_argument("--champion", type=int, default=256, help="starts of the champion; 0: none")
-    parser.add_argument("--seed", type=int, default=SEED)
-    parser.add_argument("--lines", type=Path, default=LINES, help="default: %(default)s")
-    asked = parser.parse_args()
-    rng = np.random.default_rng([asked.seed, 7])
+def main(
+    matched: int = 2,
+    single: int = 4,
+    pairs: int = 8,
+    champion: int = 256,
+    seed: int = SEED,
+    lines: Path = LINES,
+) -> None:
+    """Fly, diagnose, and write the lines and the tables.
+
+    matched: flights of each set-up and excitation. single: draws of each kind of change. pairs: set-ups with
+    two changes. champion: starts of it, 0 for none. lines: file to append to.
+    """
+    rng = np.random.default_rng([seed, 7])
     trials = [
         Trial("matched", setup, flown, (), number)
         for setup in SETUPS
         for flown in ("full", "gentle")
-        for number in range(asked.matched)
+        for number in range(matched)
     ]
-    sets = [(kind,) for kind in KINDS for _ in range(asked.single)]
+    sets = [(kind,) for kind in KINDS for _ in range(single)]
     apart = [kind for kind in KINDS if kind != "expo"]  # it is made of the settings of the rates
-    sets += [tuple(rng.choice(apart, 2, replace=False).tolist()) for _ in range(asked.pairs)]
+    sets += [tuple(rng.choice(apart, 2, replace=False).tolist()) for _ in range(pairs)]
     trials += [Trial(ROWS[len(own)], "stock", "full", own, 10 + number) for number, own in enumerate(sets)]
     commit = commit_of_checkout()
-    if asked.champion:
-        append(asked.lines, commit, champion_line(asked.champion, asked.seed))
+    if champion:
+        append_line(lines, {"commit": commit, **champion_line(champion, seed)})
     known: dict[tuple[str, str], Known] = {}
     for trial in progress(trials, "set-ups"):
         key = trial.setup, trial.flown
-        known[key] = known.get(key) or know(*key, asked.seed)
-        append(asked.lines, commit, {**trial._asdict(), **graded(trial, known[key], asked.seed)})
-    lines = [json.loads(text) for text in asked.lines.read_text(encoding="utf-8").splitlines()]
-    lines = [line for line in lines if line["commit"] == lines[-1]["commit"]]
+        known[key] = known.get(key) or know(*key, seed)
+        append_line(lines, {"commit": commit, **trial._asdict(), **graded(trial, known[key], seed)})
+    found = lines_of_commit(lines)
     text = PAGE.read_text(encoding="utf-8")
     before, after = text.split(MARKS[0])[0], text.split(MARKS[1])[1]
-    record = provenance("scipy") | {"commit": lines[-1]["commit"]}
-    own = f"{tables(lines)}\n\nSeed {asked.seed}. {provenance_line(record)}"
+    record = provenance("scipy") | {"commit": found[-1]["commit"]}
+    own = f"{tables(found)}\n\nSeed {seed}. {provenance_line(record)}"
     write_atomically(PAGE, f"{before}{MARKS[0]}\n\n{own}\n\n{MARKS[1]}{after}".encode())
 
 
 if __name__ == "__main__":
-    main()
+    command(main)

@@ -4,7 +4,6 @@ Fresh processes make an environment, reset and step it, alone and as a Gymnasium
 folder for compiled programs, then with what the run before has left there. Wall time, without imports.
 """
 
-import argparse
 import os
 import statistics
 import subprocess
@@ -51,11 +50,9 @@ def start(code: str, cache: str) -> Times:
     return {name: float(seconds) for name, seconds in map(str.split, told.splitlines())}
 
 
-def main() -> None:
+def main(repeats: int = 3) -> None:
     """Measure, print and write the page."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--repeats", type=int, default=3)
-    repeats, core = parser.parse_args().repeats, report.pin_to_one_core()
+    core = report.pin_to_one_core()
     first: list[Times] = []
     second: list[Times] = []
     for _ in report.progress(range(repeats), "round"):
@@ -75,4 +72,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    report.command(main)

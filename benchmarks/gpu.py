@@ -6,11 +6,9 @@ Environment steps with random actions, observations and resets included, compila
 measures small sizes without a page.
 """
 
-import argparse
 import statistics
 import time
-from collections.abc import Callable
-from typing import Any
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -18,7 +16,7 @@ import jax.numpy as jnp
 from baselines.purejaxrl_ppo import Config
 from baselines.purejaxrl_ppo.training import Trainer
 from benchmarks import report
-from benchmarks.env_speed import jax_contestant
+from benchmarks.env_speed import Contestant, jax_contestant, measure
 from benchmarks.learning_curve import held_from, train
 
 IDS = ("FlyTrack-v0", "FlyTrackRobust-v0", "Pendulum-v1")
@@ -27,21 +25,15 @@ REPEATS, LENGTH = 5, 64  # calls, and steps of each
 PAGE = report.RESULTS / "gpu.md"
 
 
-def seconds(call: Callable[[], Any]) -> float:
-    """Return the median time of a call that was compiled before."""
-    jax.block_until_ready(call())
-    times = []
-    for _ in range(REPEATS):
-        started = time.perf_counter()
-        jax.block_until_ready(call())
-        times.append(time.perf_counter() - started)
-    return statistics.median(times)
+def rate_of(entry: Contestant) -> float:
+    """Return the median rate of a contestant, amount per second."""
+    found = measure([entry._replace(clock=time.perf_counter)], REPEATS, warm_up=1)
+    return statistics.median(found[entry.name])
 
 
 def decisions_per_s(env_id: str, num_envs: int) -> float:
     """Return the rate of environment steps; each has its observation and, where it ended, its reset."""
-    entry = jax_contestant(env_id, env_id, num_envs, LENGTH, is_batch=False)
-    return 1e6 * entry.amount / seconds(entry.run)
+    return 1e6 * rate_of(jax_contestant(env_id, env_id, num_envs, LENGTH, is_batch=False))
 
 
 def environments(most: int) -> str:
@@ -59,8 +51,9 @@ def trainings(config: Config) -> str:
     for number in SEEDS:
         runners = [trainer.start(jax.random.key(seed)) for seed in range(number)]
         together = jax.tree.map(lambda *leaves: jnp.stack(leaves), *runners)
-        taken_s = seconds(lambda together=together: trainer.chunk_of_many(together, jnp.int32(1)))
-        rows.append([number, f"{number * config.batch_size / taken_s:.3g}"])
+        update = partial(trainer.chunk_of_many, together, jnp.int32(1))
+        entry = Contestant("", number * config.batch_size, lambda run=update: jax.block_until_ready(run()))
+        rows.append([number, f"{rate_of(entry):.3g}"])
     return report.table("seeds side by side | training steps/s, all together", rows)
 
 
@@ -73,20 +66,18 @@ def time_to_race(config: Config) -> str:
     )
 
 
-def main() -> None:
-    """Measure, and write the page where there is an accelerator."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--most", type=int, default=20, help="the most environments, as a power of 2")
-    parser.add_argument("--steps", type=int, default=8_000_000, help="of the training")
-    parser.add_argument("--cpu", action="store_true", help="try it on a CPU: prints, writes nothing")
-    asked = parser.parse_args()
-    path, parts = (None if asked.cpu else PAGE), ["Not measured."]
-    if asked.cpu or jax.default_backend() != "cpu":
-        config = Config(total_timesteps=asked.steps)
-        parts = [environments(asked.most), trainings(config), time_to_race(config)]
+def main(most: int = 20, steps: int = 8_000_000, cpu: bool = False) -> None:
+    """Measure, and write the page where there is an accelerator.
+
+    most: environments, as a power of 2. steps: of the training. cpu: print what a CPU does, write nothing.
+    """
+    path, parts = (None if cpu else PAGE), ["Not measured."]
+    if cpu or jax.default_backend() != "cpu":
+        config = Config(total_timesteps=steps)
+        parts = [environments(most), trainings(config), time_to_race(config)]
         parts.append(f"{jax.devices()[0].device_kind}. {report.provenance_line(report.provenance())}")
     report.write_page(path, report.page("On a GPU", f"{report.command_line()}.", *parts))
 
 
 if __name__ == "__main__":
-    main()
+    report.command(main)

@@ -6,7 +6,6 @@ million environment steps flies 256 noisy starts over 3 laps in the simulator. W
 alone, without compilation and evaluations. Writes a page and a chart.
 """
 
-import argparse
 import time
 from pathlib import Path
 from typing import NamedTuple
@@ -98,26 +97,24 @@ def draw(path: Path, curves: dict[int, list[Point]]) -> None:
     write_atomically(path, png_of(figure))
 
 
-def main() -> None:
-    """Measure every seed, print and write page and chart; exit 1 if a seed misses the aim."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--seeds", type=int, default=5, help="training seeds")
-    parser.add_argument("--config", type=Path, help="TOML file of settings, in place of the short recipe")
-    parser.add_argument(
-        "--out", type=Path, default=report.RESULTS / "learning_curve.md", help="page to write"
-    )
-    arguments = parser.parse_args()
+def main(
+    seeds: int = 5, config: Path | None = None, out: Path = report.RESULTS / "learning_curve.md"
+) -> None:
+    """Measure every seed, print and write page and chart; exit 1 if a seed misses the aim.
+
+    seeds: how many. config: TOML file of settings, in place of the short recipe. out: page to write.
+    """
     pinned = report.pin_to_one_core()
-    settings = SHORT if arguments.config is None else settings_in_file(arguments.config)
+    settings = SHORT if config is None else settings_in_file(config)
     trainer = Trainer(Config(**settings))
     evaluate(trainer, trainer.start(jax.random.key(0)).train_state.params, 0, 0.0)  # compiles
-    curves = {seed: train(trainer, seed) for seed in range(arguments.seeds)}
-    chart = arguments.out.with_suffix(".png")
+    curves = {seed: train(trainer, seed) for seed in range(seeds)}
+    chart = out.with_suffix(".png")
     draw(chart, curves)
     held = [held_from(points) for points in curves.values()]
     num_held = sum(point is not None and point.steps <= AIM_STEPS for point in held)
     report.fill_page(
-        arguments.out,
+        out,
         "learning_curve",
         settings=", ".join(f"{name} {value:g}" for name, value in settings.items()),
         every=EVERY / 1e6,
@@ -136,4 +133,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    report.command(main)

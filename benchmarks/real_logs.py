@@ -7,10 +7,9 @@ docs/results/real_logs_diagnosis.md and its pictures are made of the records the
 so and writes nothing.
 """
 
-import argparse
 import json
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
@@ -21,7 +20,7 @@ from benchmarks.real.crazyflie import DATA, FOLDER, LINES, VARIABLE, flights
 from benchmarks.real.page import crazyflie_part
 from benchmarks.real.record import Record, diagnosed, imported
 from benchmarks.real.section import draw, section
-from benchmarks.report import RESULTS, ROOT, write_json
+from benchmarks.report import RESULTS, ROOT, command, write_json
 from flytrack_env.files import write_atomically
 from flytrack_env.pictures.drawing import png_of
 from flytrack_sysid import LogError
@@ -140,21 +139,17 @@ def page() -> tuple[str, dict[str, bytes]]:
     return "\n\n".join(part for part in parts if part) + "\n", pictures
 
 
-def main(arguments: Sequence[str] | None = None) -> None:
+def main(data: Path = DATA, diagnose: str = "") -> None:
     """Diagnose, or write the page, or say why not."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--data", type=Path, default=DATA, help="default: %(default)s")
-    parser.add_argument("--diagnose", default="", help=f"of {', '.join(CRAFTS)}")
-    chosen = parser.parse_args(arguments)
-    for name in filter(None, chosen.diagnose.split(",")):
-        folder = chosen.data / CRAFTS[name].folder
+    for name in filter(None, diagnose.split(",")):
+        folder = data / CRAFTS[name].folder
         if not folder.is_dir():
             sys.exit(f"skipped: no measured flights at {folder}; --data or {VARIABLE} names their folder")
         try:
-            write_json(kept(name), CRAFTS[name].measure(chosen.data))
+            write_json(kept(name), CRAFTS[name].measure(data))
         except LogError as error:
             sys.exit(f"skipped: {error}")
-    if not chosen.diagnose:
+    if not diagnose:
         text, pictures = page()
         for file, content in {RESULT.name: text.encode(), **pictures}.items():
             write_atomically(RESULT.with_name(file), content)
@@ -162,4 +157,4 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 if __name__ == "__main__":
-    main()
+    command(main)

@@ -9,18 +9,25 @@ import platform
 import shlex
 import subprocess
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from datetime import date
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, TypeVar
 
+import tyro
 from tqdm import tqdm
 
 Item = TypeVar("Item")
 ROOT = Path(__file__).parent.parent
 RESULTS = ROOT / "docs" / "results"
 PACKAGES = ("jax", "jaxlib", "gymnax", "numpy")
+
+
+def command(main: Callable[..., None]) -> None:
+    """Call a benchmark's ``main`` with the flags of the command line, which are its arguments."""
+    text = f"{sys.modules['__main__'].__doc__}\n{main.__doc__}"
+    tyro.cli(main, description=text, config=(tyro.conf.FlagCreatePairsOff,))
 
 
 def pin_to_one_core() -> str:
@@ -135,6 +142,26 @@ def write_page(path: Path | None, text: str) -> None:
 def write_json(path: Path, value: Any) -> None:
     """Write JSON values atomically, indented."""
     _write(path, json.dumps(value, indent=1) + "\n")
+
+
+def append_line(path: Path, line: dict[str, Any]) -> None:
+    """Append JSON values to a file as a line."""
+    with path.open("a", encoding="utf-8") as file:
+        file.write(json.dumps(line, default=str) + "\n")
+
+
+def lines_in(path: Path) -> list[dict[str, Any]]:
+    """Return the lines of JSON in a file, none if there is no file."""
+    text = path.read_text(encoding="utf-8") if path.exists() else ""
+    # What a kill has cut off has no end of line.
+    return [json.loads(line) for line in text.splitlines(keepends=True) if line.endswith("\n")]
+
+
+def lines_of_commit(path: Path, commit: str | None = None) -> list[dict[str, Any]]:
+    """Return the lines in a file that were measured at a commit; None: at that of the last line."""
+    lines = lines_in(path)
+    commit = lines[-1]["commit"] if commit is None and lines else commit
+    return [line for line in lines if line["commit"] == commit]
 
 
 def _write(path: Path, text: str) -> None:

@@ -5,7 +5,6 @@ with those that are shipped. ``--page`` writes docs/benchmark.md of the results 
 ``flytrack bench`` wrote.
 """
 
-import argparse
 import dataclasses
 import json
 from pathlib import Path
@@ -26,7 +25,7 @@ RESULTS = report.RESULTS / "suite"
 PAGE = report.ROOT / "docs" / "benchmark.md"
 
 
-def draw(folder: Path) -> None:
+def draw_suite(folder: Path) -> None:
     """Write suite v1 into a folder: its tracks and its file."""
     for name, seed in TRACK_SEEDS.items():
         save_track(folder / "v1" / f"{name}.toml", dataclasses.replace(random_track(seed), name=name))
@@ -93,17 +92,13 @@ def write_page() -> None:
     report.fill_page(PAGE, "benchmark", results=report.table(header, rows))
 
 
-def main() -> None:
-    """Draw the suite, or write the page."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--draw", action="store_true", help="write the suite's files")
-    parser.add_argument("--page", action="store_true", help="write docs/benchmark.md")
-    asked = parser.parse_args()
-    if asked.draw:
-        draw(FOLDER)
-    if asked.page:
+def main(draw: bool = False, page: bool = False) -> None:
+    """Write the suite's files, or docs/benchmark.md."""
+    if draw:
+        draw_suite(FOLDER)
+    if page:
         write_page()
 
 
 if __name__ == "__main__":
-    main()
+    report.command(main)

@@ -5,8 +5,9 @@ simulator and writes docs/results/time_optimal.md. With ``--verify`` it only rep
 needs no solver. In Python: ``flytrack_env.references.shipped_reference("flytrack", "flying").time_s``.
 """
 
-import argparse
+import sys
 from pathlib import Path
+from typing import Literal
 
 import jax
 import jax.numpy as jnp
@@ -21,7 +22,6 @@ from flytrack_env import state as layout
 from flytrack_env.dynamics import SECONDS_PER_MINUTE, step
 from flytrack_env.references import (
     FOLDER,
-    KINDS,
     Reference,
     ReferenceFileError,
     load_reference,
@@ -101,7 +101,7 @@ def is_verified(reference: Reference, flown: Replay) -> bool:
     return is_whole and flown.frames_touched == 0 and abs(flown.time_s - reference.time_s) <= LARGEST_ERROR_S
 
 
-def verify(folder: Path, tracks: list[Track]) -> tuple[list[tuple[Reference, str, Replay]], bool]:
+def verified(folder: Path, tracks: list[Track]) -> tuple[list[tuple[Reference, str, Replay]], bool]:
     """Return a folder's references with their replays, and whether those in the reference's model are right.
 
     References of the model ``black_box`` are flown on the shipped black box as well. tracks: where references
@@ -128,42 +128,43 @@ def verify(folder: Path, tracks: list[Track]) -> tuple[list[tuple[Reference, str
     return replays, is_good
 
 
-def run(arguments: argparse.Namespace) -> bool:
-    """Find references, replay all and write the page; return whether all are verified."""
-    model = nominal() if arguments.model is None else load_model(arguments.model)
-    name = NOMINAL if arguments.model is None else arguments.model.stem
-    tracks = list(map(load_track, arguments.tracks))
-    for track in [] if arguments.verify else tracks:
-        for kind in arguments.kinds:
-            found = optimise(track, kind, model, name)
-            save_reference(arguments.out / f"{track.name}_{name}_{kind}.npz", found)
+def find_all(tracks: list[Track], kinds: tuple[str, ...], model: Path | None, folder: Path) -> None:
+    """Find references and write them into a folder."""
+    parameters, name = (nominal(), NOMINAL) if model is None else (load_model(model), model.stem)
+    for track in tracks:
+        for kind in kinds:
+            found = optimise(track, kind, parameters, name)
+            save_reference(folder / f"{track.name}_{name}_{kind}.npz", found)
             print(f"{track.name} {kind}: {found.time_s:.4f} s, {found.found['cpu_s']} CPU s", flush=True)
-    replays, is_good = verify(arguments.out, tracks)
-    write_page(arguments.page, replays)
-    if arguments.page is not None:
-        write_pictures(arguments.page, [reference for reference, _, _ in replays], tracks)
-    return is_good
 
 
-def main() -> None:
-    """Parse the command line; exit 1 if a replay is not as it should be."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    shipped = list(available_tracks())
-    parser.add_argument("--tracks", nargs="+", default=shipped, metavar="NAME_OR_FILE", help="default: all")
-    parser.add_argument("--kinds", nargs="+", default=list(KINDS), choices=KINDS, help="default: both")
-    parser.add_argument("--model", type=Path, help="model file; default: the simulator's nominal model")
-    parser.add_argument("--verify", action="store_true", help="only replay existing references")
-    parser.add_argument("--out", type=Path, default=FOLDER, help="folder of the references")
-    parser.add_argument("--page", type=Path, help="page to write, with pictures beside it")
-    arguments = parser.parse_args()
+def main(
+    tracks: tuple[str, ...] = tuple(available_tracks()),
+    kinds: tuple[Literal["flying", "standing"], ...] = ("flying", "standing"),
+    model: Path | None = None,
+    verify: bool = False,
+    out: Path = FOLDER,
+    page: Path | None = None,
+) -> None:
+    """Find references, replay all and write the page; exit 1 if a replay is not as it should be.
+
+    tracks: names or files. model: file; by default the simulator's nominal model. verify: only replay
+    existing references. out: their folder. page: to write, with pictures beside it.
+    """
     try:
-        is_good = run(arguments)
+        known = list(map(load_track, tracks))
+        if not verify:
+            find_all(known, kinds, model, out)
+        replays, is_good = verified(out, known)
+        write_page(page, replays)
+        if page is not None:
+            write_pictures(page, [reference for reference, _, _ in replays], known)
     except ImportError as error:
-        parser.error(f"{error}; pip install .[optimal]")
+        sys.exit(f"error: {error}; pip install .[optimal]")
     except (ValueError, OSError, RuntimeError) as error:
-        parser.error(str(error))
+        sys.exit(f"error: {error}")
     raise SystemExit(0 if is_good else 1)
 
 
 if __name__ == "__main__":
-    main()
+    report.command(main)

@@ -5,7 +5,6 @@ Trains the default recipe for a number of steps, alone and with all that the com
 time. Compilation and imports happen before: a first run, which is not counted, does them.
 """
 
-import argparse
 import statistics
 import tempfile
 import time
@@ -60,18 +59,14 @@ def measure(trainer: Trainer, options: Options, is_tracked: bool) -> float:
         return checkpoint.meta["steps"] / (time.process_time() - started_s)
 
 
-def main() -> None:
+def main(total_timesteps: float = Config.total_timesteps, repeats: int = 1) -> None:
     """Measure in turns, print and write the table; exit 1 if an aim is missed."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--total-timesteps", type=float, default=Config.total_timesteps)
-    parser.add_argument("--repeats", type=int, default=1)
-    arguments = parser.parse_args()
     pinned = report.pin_to_one_core()
-    trainer = Trainer(Config(total_timesteps=int(arguments.total_timesteps)))
+    trainer = Trainer(Config(total_timesteps=int(total_timesteps)))
     modes = {"alone": Options(), "with everything that is on by default": DEFAULTS}
     rates: dict[str, list[float]] = {name: [] for name in modes}
     measure(trainer, DEFAULTS, is_tracked=True)  # compiles and imports all that is used
-    for _ in range(arguments.repeats):
+    for _ in range(repeats):
         for name, options in modes.items():
             rates[name].append(measure(trainer, options, is_tracked=options is DEFAULTS))
             print(f"{name}: {rates[name][-1]:,.0f} steps per CPU s", flush=True)
@@ -81,8 +76,8 @@ def main() -> None:
         report.RESULTS / "training_speed.md",
         "training_speed",
         table=report.table("training | median | lowest to highest", rows),
-        steps=arguments.total_timesteps,
-        repeats=arguments.repeats,
+        steps=total_timesteps,
+        repeats=repeats,
         cost=1.0 - watched / alone,
         aim_cost=AIM_COST,
         aim=AIM_STEPS_PER_S,
@@ -94,4 +89,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    report.command(main)

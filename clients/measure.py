@@ -3,7 +3,6 @@
 Runs the training of ``make test-clients`` for several seeds and writes a table of all of them.
 """
 
-import argparse
 import time
 
 from benchmarks import report
@@ -24,28 +23,25 @@ def measure_seed(name: str, seed: int) -> tuple[bool, tuple[str, ...]]:
     return outcome.has_gained(client.RETURN_MARGIN, client.GATE_MARGIN), cells
 
 
-def main() -> None:
-    """Measure every client with every seed, print and write the table; exit 1 if one misses a margin."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--seeds", type=int, default=5, help="number of trainings of each client")
-    arguments = parser.parse_args()
+def main(seeds: int = 5) -> None:
+    """Measure every client with so many seeds, print and write the table; exit 1 if one misses a margin."""
     reached, rows = dict.fromkeys(CLIENTS, 0), []
     for name in CLIENTS:
-        for seed in range(arguments.seeds):
+        for seed in range(seeds):
             is_reached, row = measure_seed(name, seed)
             reached[name] += is_reached
             rows.append(row)
             print(*row, sep=", ", flush=True)
     margins = "\n".join(
         f"- {name}: margins {client.RETURN_MARGIN:g} in return and {client.GATE_MARGIN:g} in gates, "
-        f"gained by **{reached[name]} of {arguments.seeds}** seeds"
+        f"gained by **{reached[name]} of {seeds}** seeds"
         for name, client in CLIENTS.items()
     )
     table, packages = report.table(HEADER, rows), [*CLIENTS, "torch"]
     report.fill_page(report.RESULTS / "clients.md", "clients", packages, margins=margins, table=table)
-    if min(reached.values()) < arguments.seeds:
+    if min(reached.values()) < seeds:
         raise SystemExit(1)
 
 
 if __name__ == "__main__":
-    main()
+    report.command(main)

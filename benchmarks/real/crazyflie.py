@@ -9,8 +9,6 @@ benchmarks/data/real/crazyflie.jsonl. ``--fits`` fits one structure to the fligh
 instead, to crazyflie_fits.json beside it. ``python -m benchmarks.real_logs`` writes the page.
 """
 
-import argparse
-import json
 import os
 import time
 from collections.abc import Sequence
@@ -21,7 +19,7 @@ import jax
 import numpy as np
 
 from benchmarks.real.black_boxes import base_steps, flown, linear_ones, network, rows_of
-from benchmarks.report import ROOT, commit_of_checkout, progress, write_json
+from benchmarks.report import ROOT, append_line, command, commit_of_checkout, lines_in, progress, write_json
 from flytrack_env.dynamics import ModelParameters
 from flytrack_env.motion import Motion
 from flytrack_sysid import FlightLog, import_log
@@ -158,7 +156,7 @@ def by_flight(results: dict[str, refinement.Tested], segment: np.ndarray) -> dic
     return ratios
 
 
-def fits(folder: Path, structure: Sequence[str], start: dict[str, float]) -> list[dict[str, Any]]:
+def fits_of(folder: Path, structure: Sequence[str], start: dict[str, float]) -> list[dict[str, Any]]:
     """Return values of one structure and times to half response, of the flights of each policy alone."""
     result = []
     for policy in progress(policies_in(folder), "policies"):
@@ -184,29 +182,21 @@ def fits(folder: Path, structure: Sequence[str], start: dict[str, float]) -> lis
     return result
 
 
-def main() -> None:
-    """Refine and judge for each policy, or fit each policy's flights alone."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--data", type=Path, default=DATA, help="default: %(default)s")
-    parser.add_argument("--policies", default="", help="default: all")
-    parser.add_argument("--seconds", type=float, default=SECONDS, help="default: %(default)s")
-    parser.add_argument("--fits", action="store_true")
-    arguments = parser.parse_args()
-    folder = arguments.data / FOLDER
+def main(data: Path = DATA, policies: str = "", seconds: float = SECONDS, fits: bool = False) -> None:
+    """Refine and judge for each policy, all by default, or fit each policy's flights alone."""
+    folder = data / FOLDER
     LINES.parent.mkdir(parents=True, exist_ok=True)
     with jax.enable_x64(True):
-        if arguments.fits:
-            last = json.loads(LINES.read_text(encoding="utf-8").splitlines()[-1])
+        if fits:
+            last = lines_in(LINES)[-1]
             start = {name: value for name, (value, _) in last["values"].items()}
-            write_json(FITS, fits(folder, last["kept"], start))
+            write_json(FITS, fits_of(folder, last["kept"], start))
             return
         commit = commit_of_checkout()  # before its lines change a file
-        wanted = arguments.policies.split(",") if arguments.policies else policies_in(folder)
+        wanted = policies.split(",") if policies else policies_in(folder)
         for policy in progress(wanted, "policies"):
-            line = {"commit": commit, **fold(folder, policy, arguments.seconds)}
-            with LINES.open("a", encoding="utf-8") as file:
-                file.write(json.dumps(line) + "\n")
+            append_line(LINES, {"commit": commit, **fold(folder, policy, seconds)})
 
 
 if __name__ == "__main__":
-    main()
+    command(main)

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.real.crazyflie import FITS, LINES
-from benchmarks.report import table
+from benchmarks.report import lines_in, table
 from flytrack_sysid.prediction_windows import HORIZONS_S, QUANTITIES
 
 FIGURES = (("attitude", 0.1, 0.70), ("attitude", 0.25, 0.83), ("position", 0.5, 0.80))
@@ -28,10 +28,7 @@ Line = dict[str, Any]
 
 def lines_of() -> list[Line]:
     """Return the last line of each policy, by policy; none where nothing was measured."""
-    if not LINES.exists():
-        return []
-    found = [json.loads(text) for text in LINES.read_text(encoding="utf-8").splitlines()]
-    last = {line["policy"]: line for line in found}
+    last = {line["policy"]: line for line in lines_in(LINES)}
     return [last[policy] for policy in sorted(last)]
 
 

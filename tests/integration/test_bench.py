@@ -38,7 +38,7 @@ def small(tmp_path) -> Path:
 
 
 def test_the_suite_is_what_its_seed_draws(tmp_path):
-    drawn.draw(tmp_path)
+    drawn.draw_suite(tmp_path)
     for path in (Path("v1.json"), *(Path("v1") / f"{name}.toml" for name in drawn.TRACK_SEEDS)):
         assert (tmp_path / path).read_text() == (FOLDER / path).read_text()
     suite = load_suite("v1")
