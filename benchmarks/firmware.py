@@ -16,20 +16,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from baselines.purejaxrl_ppo import load_checkpoint
+from benchmarks import report
 from benchmarks.champion import CHAMPION
-from benchmarks.report import (
-    RESULTS,
-    append_line,
-    command,
-    commit_of_checkout,
-    lines_of_commit,
-    percent,
-    progress,
-    provenance,
-    provenance_line,
-    spread,
-    table,
-)
 from firmware import Betaflight, Body
 from flytrack_env.dynamics import nominal_parameters
 from flytrack_env.effects import BY_NAME
@@ -43,7 +31,7 @@ from flytrack_sysid.excitation import script
 from flytrack_sysid.manoeuvres import flights_of, hover_action
 from flytrack_sysid.script_file import script_of
 
-LINES, PAGE = RESULTS / "firmware.jsonl", RESULTS / "firmware.md"
+LINES, PAGE = report.RESULTS / "firmware.jsonl", report.RESULTS / "firmware.md"
 MARKS = "<!-- benchmarks.firmware -->", "<!-- end -->"
 ROWS = ("matched", "single", "pair")
 SEED = 35  # no rule was made on it
@@ -252,12 +240,12 @@ def champion_line(episodes: int, seed: int) -> dict[str, Any]:
 def tables(lines: list[dict[str, Any]]) -> str:
     """Return the results as tables in Markdown."""
     by_row = {row: [line for line in lines if line["row"] == row] for row in ROWS}
-    rows = [["matched set-up: any name", percent([bool(line["found"]) for line in by_row["matched"]])]]
+    rows = [["matched set-up: any name", report.percent([bool(line["found"]) for line in by_row["matched"]])]]
     for row in ROWS[1:]:
         some = [line for line in by_row[row] if line["apart"] >= NOTABLE]
         for figure in ("is_exact", "is_in_class", "is_false"):
             flags = [line[figure] for line in some]
-            rows.append([f"{row} that matters: {figure[3:].replace('_', ' ')}", percent(flags)])
+            rows.append([f"{row} that matters: {figure[3:].replace('_', ' ')}", report.percent(flags)])
     named = [line["error"] for row in ROWS[1:] for line in by_row[row] if line["found"] and line["error"]]
     if named:
         worst, last = [max(one.values()) for one in named], [one["1"] for one in named if "1" in one]
@@ -265,15 +253,17 @@ def tables(lines: list[dict[str, Any]]) -> str:
         rows.append(["extended over refitted after 1 s: median", f"{np.median(last):.3f}"])
     seconds = [line["cpu_s"] for some in by_row.values() for line in some]
     rows.append(["CPU s of a diagnosis: median", f"{np.median(seconds):.0f}"])
-    parts = [table("figure | value", rows)]
+    parts = [report.table("figure | value", rows)]
     cells = []
     for kind, own in KINDS.items():
         some = [line for line in by_row["single"] if line["kinds"] == [kind]]
         said = sorted({" + ".join(line["found"]) or "nothing" for line in some})
         flags = [line["is_in_class"] for line in some]
-        sizes = spread([100.0 * line["apart"] for line in some], ".1f") if some else ""
-        cells.append([kind, sizes, ", ".join(own.names) or "that motor", percent(flags), "; ".join(said)])
-    parts.append(table("changed | flies apart, % | its names | in class | what was named", cells))
+        sizes = report.spread([100.0 * line["apart"] for line in some], ".1f") if some else ""
+        cells.append(
+            [kind, sizes, ", ".join(own.names) or "that motor", report.percent(flags), "; ".join(said)]
+        )
+    parts.append(report.table("changed | flies apart, % | its names | in class | what was named", cells))
     for line in lines:
         if line["row"] == "champion":
             share = f"{line['success']:.1%} of {line['episodes']} starts finish 3 laps"
@@ -307,21 +297,21 @@ def main(
     apart = [kind for kind in KINDS if kind != "expo"]  # it is made of the settings of the rates
     sets += [tuple(rng.choice(apart, 2, replace=False).tolist()) for _ in range(pairs)]
     trials += [Trial(ROWS[len(own)], "stock", "full", own, 10 + number) for number, own in enumerate(sets)]
-    commit = commit_of_checkout()
+    commit = report.commit_of_checkout()
     if champion:
-        append_line(lines, {"commit": commit, **champion_line(champion, seed)})
+        report.append_line(lines, {"commit": commit, **champion_line(champion, seed)})
     known: dict[tuple[str, str], Known] = {}
-    for trial in progress(trials, "set-ups"):
+    for trial in report.progress(trials, "set-ups"):
         key = trial.setup, trial.flown
         known[key] = known.get(key) or know(*key, seed)
-        append_line(lines, {"commit": commit, **trial._asdict(), **graded(trial, known[key], seed)})
-    found = lines_of_commit(lines)
+        report.append_line(lines, {"commit": commit, **trial._asdict(), **graded(trial, known[key], seed)})
+    found = report.lines_of_commit(lines)
     text = PAGE.read_text(encoding="utf-8")
     before, after = text.split(MARKS[0])[0], text.split(MARKS[1])[1]
-    record = provenance("scipy") | {"commit": found[-1]["commit"]}
-    own = f"{tables(found)}\n\nSeed {seed}. {provenance_line(record)}"
+    record = report.provenance("scipy") | {"commit": found[-1]["commit"]}
+    own = f"{tables(found)}\n\nSeed {seed}. {report.provenance_line(record)}"
     write_atomically(PAGE, f"{before}{MARKS[0]}\n\n{own}\n\n{MARKS[1]}{after}".encode())
 
 
 if __name__ == "__main__":
-    command(main)
+    report.command(main)

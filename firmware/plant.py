@@ -27,26 +27,14 @@ from firmware.building import find_executable
 from firmware.errors import FirmwareError
 from firmware.process import AT_REST, BODY, FLY, START, START_STATE, Firmware, Reply
 from firmware.settings import settings_of
+from flytrack_env import state as layout
 from flytrack_env.dynamics import ModelParameters, nominal_parameters
 from flytrack_env.files import fresh_folder
 from flytrack_env.messages import error_text
 from flytrack_env.motion import Motion
 from flytrack_env.plants import Plant
 from flytrack_env.quaternion import Scalar
-from flytrack_env.state import (
-    ACCELERATION,
-    APPLIED_ACTION,
-    BATTERY,
-    POSITION,
-    QUATERNION,
-    RATES,
-    STATE_SIZE,
-    VELOCITY,
-    Action,
-    Drone,
-    pack,
-    unpack,
-)
+from flytrack_env.state import STATE_SIZE, Action, Drone, pack, unpack
 from flytrack_sysid.importing.betaflight_loop import rate_loop
 from flytrack_sysid.importing.betaflight_rates import full_stick_rate, stick_curve
 
@@ -95,16 +83,18 @@ class _Flight:
         """Arm, let motors and filters settle where the start is, and let go."""
         digest = hashlib.sha256(struct.pack("=q", plant.seed) + start.tobytes()).digest()
         noise = int.from_bytes(digest[:8], "little")
-        place, turn = (*start[POSITION], *start[VELOCITY]), start[QUATERNION]
+        place, turn = (*start[layout.POSITION], *start[layout.VELOCITY]), start[layout.QUATERNION]
         at = [*place, *turn / np.linalg.norm(turn)]
         reply = self.link.call(FLY, duration_us=ARM_US, rc=_sticks(np.zeros(4), AT_REST[2]), is_held=True)
         if not reply.is_armed:
             raise FirmwareError(f"firmware: it does not arm: {reply.text.strip() or 'no reason given'}")
         self.link.call(BODY, payload=self.body.pack(plant.firmware.is_reversed))
-        self.link.call(START, payload=START_STATE.pack(*at, 0.0, 0.0, 0.0, start[BATTERY], noise))
-        held = np.array([0.0, 0.0, 0.0, start[APPLIED_ACTION][3]])
+        self.link.call(START, payload=START_STATE.pack(*at, 0.0, 0.0, 0.0, start[layout.BATTERY], noise))
+        held = np.array([0.0, 0.0, 0.0, start[layout.APPLIED_ACTION][3]])
         self.link.call(FLY, duration_us=SETTLE_US, rc=_sticks(held), is_held=True)
-        self.link.call(START, payload=START_STATE.pack(*at, *start[RATES], start[BATTERY], noise))
+        self.link.call(
+            START, payload=START_STATE.pack(*at, *start[layout.RATES], start[layout.BATTERY], noise)
+        )
 
     def land(self, box: Path | None) -> None:
         """End the flight; box: folder for its blackbox log, which the firmware ends after disarming."""
@@ -323,13 +313,21 @@ class Betaflight(Plant):
         """Return the handout's state (21,) float32 of a reply."""
         numbers = reply.numbers
         row = np.empty(STATE_SIZE)
-        row[POSITION], row[VELOCITY], row[ACCELERATION] = numbers[:3], numbers[3:6], numbers[6:9]
-        row[QUATERNION], row[RATES], row[BATTERY] = numbers[9:13], numbers[13:16], numbers[20]
+        row[layout.POSITION], row[layout.VELOCITY], row[layout.ACCELERATION] = (
+            numbers[:3],
+            numbers[3:6],
+            numbers[6:9],
+        )
+        row[layout.QUATERNION], row[layout.RATES], row[layout.BATTERY] = (
+            numbers[9:13],
+            numbers[13:16],
+            numbers[20],
+        )
         command = self.body.command_of(numbers[16:20], numbers[20])
         low, high = (reply.motor_range - LOWEST_PULSE_US) / PULSE_RANGE_US
         thrust = 2.0 * (command - low) / (high - low) - 1.0
-        row[APPLIED_ACTION] = [*row[RATES] / np.deg2rad(self.full_stick_deg_s), thrust]
-        row[APPLIED_ACTION] = np.clip(row[APPLIED_ACTION], -1.0, 1.0)
+        row[layout.APPLIED_ACTION] = [*row[layout.RATES] / np.deg2rad(self.full_stick_deg_s), thrust]
+        row[layout.APPLIED_ACTION] = np.clip(row[layout.APPLIED_ACTION], -1.0, 1.0)
         return row.astype(np.float32)
 
 

@@ -32,16 +32,7 @@ LINE_US, BOOT_US = 15_000, 2_000_000
 READY_US = 6_000_000  # until it may be armed
 DUMP_US = 400_000
 LONGEST_ANSWER_S = 60.0  # of the clock, for at most 6 s of the firmware's, which take 0.1
-AT_REST = (
-    1500.0,
-    1500.0,
-    950.0,
-    1500.0,
-    1000.0,
-    1000.0,
-    1000.0,
-    1000.0,
-)  # us, AETR and switches; below min_check
+AT_REST = (1500.0, 1500.0, 950.0, 1500.0, *[1000.0] * 4)  # us, AETR and switches; below min_check
 PROMPT = "# "
 
 

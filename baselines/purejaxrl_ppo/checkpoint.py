@@ -7,6 +7,7 @@ description and a SHA-256 checksum of description and arrays. Nothing in it is e
 import dataclasses
 import hashlib
 import json
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -66,8 +67,8 @@ class Checkpoint(NamedTuple):
                 f"({self.env_id}), but the environment's have shape {found}"
             )
         if "observation" in self.meta:
-            found, expected = map(by_dotted_name, (self.meta["observation"], observation_layout(env)))
-            check_no_differences("checkpoint: observation", find_differences(found, expected))
+            lines = find_differences(self.meta["observation"], observation_layout(env))
+            check_no_differences("checkpoint: observation", lines)
 
 
 def observation_layout(env: Any) -> dict[str, Any]:
@@ -80,9 +81,9 @@ def as_json(value: Any) -> Any:
     return json.loads(json.dumps(value))
 
 
-def find_differences(found: dict[str, Any], expected: dict[str, Any], show: Any = quote_value) -> list[str]:
-    """Return a line for each dotted name whose values differ, the shallowest names first."""
-    lines = []
+def find_differences(found: Any, expected: Any, show: Any = quote_value) -> list[str]:
+    """Return a line for each leaf of two trees, by its dotted name, that differs, the shallowest first."""
+    lines, found, expected = [], by_dotted_name(found), by_dotted_name(expected)
     for name in sorted({**expected, **found}, key=lambda name: name.count(".")):
         pair = found.get(name), expected.get(name)
         if pair[0] != pair[1]:
@@ -102,6 +103,13 @@ def check_no_differences(where: Any, lines: list[str]) -> None:
     if lines:
         more = [f"and {len(lines) - MOST_DIFFERENCES} more"] if len(lines) > MOST_DIFFERENCES else []
         raise CheckpointError(f"{where}: does not fit: " + "; ".join(lines[:MOST_DIFFERENCES] + more))
+
+
+def check_kinds(where: Any, meta: dict[str, Any], kinds: Mapping[str, Any]) -> None:
+    """Raise CheckpointError unless the fields of a description are of these types; ``where`` is the file."""
+    for name, kind in kinds.items():
+        if not isinstance(meta.get(name), kind):
+            raise CheckpointError(f"{where}: {name}: found {quote_value(meta.get(name))}")
 
 
 def _is_key(leaf: Any) -> bool:
@@ -170,8 +178,7 @@ def save_checkpoint(
     arrays |= {TRAINING + name: array for name, array in (training or {}).items()}
     arrays = {name: np.ascontiguousarray(array).reshape(array.shape) for name, array in arrays.items()}
     text = json.dumps(meta)
-    content = safetensors.numpy.save(arrays, {"meta": text, "sha256": checksum(text, arrays)})
-    write_atomically(path, content)
+    write_atomically(path, safetensors.numpy.save(arrays, {"meta": text, "sha256": checksum(text, arrays)}))
 
 
 def load_checkpoint(path: str | Path) -> Checkpoint:
@@ -185,11 +192,8 @@ def load_checkpoint(path: str | Path) -> Checkpoint:
     if path.is_dir():
         files = ", ".join(sorted(file.name for file in path.glob(f"*{SUFFIX}"))) or "there is none"
         raise CheckpointError(f"{path}: found a folder, expected a checkpoint file in it: {files}")
-    meta, arrays = _read_file(path)
-    if meta["format"] != FORMAT:
-        raise CheckpointError(f"{path}: format: found {quote_value(meta['format'])}, expected {FORMAT!r}")
     try:
-        return _build(path, meta, arrays)
+        return _build(path, *_read_file(path))
     except CheckpointError:
         raise
     except (KeyError, TypeError, ValueError) as error:
@@ -222,14 +226,14 @@ def _read_file(path: Path) -> tuple[dict[str, Any], Arrays]:
 
 def _build(path: Path, meta: dict[str, Any], arrays: Arrays) -> Checkpoint:
     """Return the checkpoint of a file's description and arrays, checked against each other."""
+    if meta["format"] != FORMAT:
+        raise CheckpointError(f"{path}: format: found {quote_value(meta['format'])}, expected {FORMAT!r}")
     config = Config(**read_settings("config", meta["config"]))
     config.check()
     size = meta["observation_size"]
     if not all(type(width) is int and 1 <= width <= WIDEST for width in (size, *config.hidden_sizes)):
         raise CheckpointError(f"{path}: found a network of widths {quote_value((size, config.hidden_sizes))}")
-    for name in ("env_id", "track", "missed_gate"):
-        if not isinstance(meta[name], str):
-            raise CheckpointError(f"{path}: {name}: found {quote_value(meta[name])}, expected a string")
+    check_kinds(path, meta, dict.fromkeys(("env_id", "track", "missed_gate"), str))
     observation = jax.ShapeDtypeStruct((1, size), jnp.float32)
     target = jax.eval_shape(make_network(config).init, jax.random.key(0), observation)
     policy, training = (

@@ -9,18 +9,10 @@ import jax
 import numpy as np
 
 import flytrack_env
+from baselines.purejaxrl_ppo import flights as flying
 from baselines.purejaxrl_ppo.checkpoint import Checkpoint, load_checkpoint
 from baselines.purejaxrl_ppo.config import OptionalInt, OptionalName, OptionalPath
-from baselines.purejaxrl_ppo.flights import (
-    Outcomes,
-    Rollout,
-    fly_episode,
-    outcomes_of,
-    race_many,
-    save_flight,
-    start_keys,
-    start_pose_params,
-)
+from baselines.purejaxrl_ppo.flights import Outcomes, Rollout
 from baselines.purejaxrl_ppo.plants import Plants, draw_plants
 from baselines.purejaxrl_ppo.race_env import plant_env, simulated_env, with_model_as_given
 from baselines.purejaxrl_ppo.recording import CANNOT_RECORD, can_record, record_flights
@@ -157,7 +149,7 @@ class Report(NamedTuple):
         """
         settings, ghost = self.settings, None
         rollout = settings.out or fresh_folder(DEFAULT_OUT) / "rollout.npy"
-        save_flight(rollout, self.rollout)
+        flying.save_flight(rollout, self.rollout)
         lines = [f"rollout: {rollout}"]
         if settings.ghost and self.scene.references is not None:
             num_steps = int(np.sum(self.rollout.is_flying))
@@ -240,16 +232,16 @@ def fly_scene(scene: Scene, checkpoint: Checkpoint, settings: EvaluationSettings
     rollout = _fly_first(env, first, checkpoint, settings)
     if settings.is_single:
         one = jax.tree.map(lambda leaf: leaf[None], rollout)
-        return outcomes_of(one, settings.laps or settings.steps, len(env.track.gates)), rollout
+        return flying.outcomes_of(one, settings.laps or settings.steps, len(env.track.gates)), rollout
     models = None if plants is None else plants.repeated(settings.episodes)
     num_laps = settings.num_laps or settings.steps
     policy = (checkpoint.network, checkpoint.params)
     keys, report = _keys(settings), ProgressBar("flights")
-    return race_many(env, *policy, keys, settings.steps, num_laps, params, models, report), rollout
+    return flying.race_many(env, *policy, keys, settings.steps, num_laps, params, models, report), rollout
 
 
 def _keys(settings: EvaluationSettings) -> jax.Array:
-    return start_keys(settings.seed, settings.episodes * (settings.plants or 1))
+    return flying.start_keys(settings.seed, settings.episodes * (settings.plants or 1))
 
 
 def _fly_first(
@@ -257,9 +249,9 @@ def _fly_first(
 ) -> Rollout:
     """Return the first flight of an evaluation in an environment."""
     key = jax.random.key(settings.seed) if settings.is_single else _keys(settings)[0]
-    policy, params = (checkpoint.network, checkpoint.params), start_pose_params(params, settings.steps)
+    policy, params = (checkpoint.network, checkpoint.params), flying.start_pose_params(params, settings.steps)
     num_laps = settings.num_laps or settings.steps
-    return fly_episode(env, *policy, key, params, settings.steps, num_laps)
+    return flying.fly_episode(env, *policy, key, params, settings.steps, num_laps)
 
 
 def make_numbers(

@@ -18,7 +18,7 @@ from baselines.purejaxrl_ppo.checkpoint import (
     CheckpointError,
     as_json,
     as_named_arrays,
-    by_dotted_name,
+    check_kinds,
     check_no_differences,
     find_differences,
     from_named_arrays,
@@ -28,7 +28,6 @@ from baselines.purejaxrl_ppo.checkpoint import (
 )
 from baselines.purejaxrl_ppo.config import Config
 from baselines.purejaxrl_ppo.ppo import Runner
-from flytrack_env.messages import quote_value
 from flytrack_env.model_file import model_as_json
 
 FINAL = f"final{SUFFIX}"
@@ -36,6 +35,13 @@ SEED_FOLDER = re.compile(r"seed(\d+)")
 STEP_FILE = re.compile(rf"step_(\d+)\{SUFFIX}")
 REWARD = "reward."  # prefix of the reward's weights among the environment's parameters
 MUST_FIT = ("env_id", "seed", "missed_gate", "config", "observation", "track_data", "model", "environment")
+
+# What is used before a checkpoint is compared with the run.
+FIELDS: dict[str, Any] = {
+    **dict.fromkeys(("steps", "seed"), int),
+    **dict.fromkeys(("seconds", "success", "best_lap_s"), (int, float, type(None))),
+    **dict.fromkeys(("model", "environment"), dict),
+}
 
 logger = logging.getLogger(__name__)
 
@@ -88,10 +94,19 @@ def describe_run(
     """Return the description of a run, as JSON values, that its checkpoints hold.
 
     num_seeds: that train side by side. track: its name or path; gates and bounds are under ``track_data``.
-    environment: the other parameters (rewards, starts, time step, wrappers) by their paths.
+    environment: the other parameters (rewards, starts, time step, wrappers) by their paths. machine: what
+    decides the last bits of a result: XLA splits sums by the number of its threads, which are the cores that
+    this process may use, or NPROC, its own setting.
     """
     params = env.default_params
     others = as_named_arrays(params.replace(model=None, course=None))
+    machine = {
+        "backend": jax.default_backend(),
+        "devices": jax.device_count(),
+        "threads": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
+        "NPROC": os.environ.get("NPROC"),
+        **({"seeds": num_seeds} if num_seeds > 1 else {}),
+    }
     return as_json(
         {
             "env_id": env_id,
@@ -105,25 +120,9 @@ def describe_run(
             "environment": {name: values.tolist() for name, values in others.items()},
             "config": dataclasses.asdict(config),
             "software": {"jax": jax.__version__},
-            "machine": describe_machine(num_seeds),
+            "machine": machine,
         }
     )
-
-
-def describe_machine(num_seeds: int = 1) -> dict[str, Any]:
-    """Return what decides the last bits of a result: XLA splits sums by the number of its threads.
-
-    threads: cores that this process may use. NPROC: XLA's own setting of that number, if any. seeds: that
-    train side by side in one program, if several.
-    """
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    return {
-        "backend": jax.default_backend(),
-        "devices": jax.device_count(),
-        "threads": cores,
-        "NPROC": os.environ.get("NPROC"),
-        **({"seeds": num_seeds} if num_seeds > 1 else {}),
-    }
 
 
 def check_same_run(path: Path, checkpoint: Checkpoint, description: dict[str, Any]) -> None:
@@ -146,8 +145,8 @@ def _machine_differences(checkpoint: Checkpoint, description: dict[str, Any]) ->
 
 
 def _differences(found: dict[str, Any], expected: dict[str, Any], names: tuple[str, ...]) -> list[str]:
-    parts = (({name: one.get(name)} for one in (found, expected)) for name in names)
-    return [line for part in parts for line in find_differences(*map(by_dotted_name, part))]
+    pairs = (({name: one.get(name)} for one in (found, expected)) for name in names)
+    return [line for pair in pairs for line in find_differences(*pair)]
 
 
 def save_run(path: Path, runner: Runner, config: Config, description: dict[str, Any]) -> None:
@@ -186,27 +185,21 @@ def newest_intact(path: Path) -> Start:
 
 
 def load_start(path: Path) -> Start:
-    """Return a checkpoint that training can continue from; raises CheckpointError for a policy alone."""
+    """Return a checkpoint that training can continue from.
+
+    Raises:
+        CheckpointError: a policy alone, or fields that are used before they are compared with the run.
+    """
     start = Start(path, load_checkpoint(path))
+    meta, config = start.checkpoint.meta, start.checkpoint.config
     if start.checkpoint.training is None:
         raise CheckpointError(f"{path}: found a policy alone, expected one with its training")
-    _check_meta(start)
+    check_kinds(path, meta, FIELDS)
+    if meta["steps"] not in range(0, config.total_timesteps + 1, config.batch_size):
+        raise CheckpointError(f"{path}: steps: found {meta['steps']}")
+    rewards = rewards_of(start.checkpoint)
+    check_kinds(f"{path}: environment", rewards, dict.fromkeys(rewards, float))
     return start
-
-
-def _check_meta(start: Start) -> None:
-    """Raise CheckpointError for fields that are used before the checkpoint is compared with the run."""
-    meta, config = start.checkpoint.meta, start.checkpoint.config
-    kinds: dict[str, Any] = dict.fromkeys(("steps", "seed"), int)
-    kinds |= dict.fromkeys(("seconds", "success", "best_lap_s"), (int, float, type(None)))
-    kinds |= dict.fromkeys(("model", "environment"), dict)
-    invalid = [name for name, kind in kinds.items() if not isinstance(meta.get(name), kind)]
-    if not invalid and meta["steps"] not in range(0, config.total_timesteps + 1, config.batch_size):
-        invalid = ["steps"]
-    if not invalid and not all(isinstance(value, float) for value in rewards_of(start.checkpoint).values()):
-        invalid = ["environment"]
-    for name in invalid:
-        raise CheckpointError(f"{start.path}: {name}: found {quote_value(meta.get(name))}")
 
 
 def rewards_of(checkpoint: Checkpoint) -> dict[str, float]:

@@ -8,18 +8,10 @@ from typing import Annotated, Any, NamedTuple, NoReturn
 
 import tyro
 
+from baselines.purejaxrl_ppo import resume as runs
 from baselines.purejaxrl_ppo.checkpoint import CheckpointError
 from baselines.purejaxrl_ppo.config import Config, OptionalInt, OptionalPath, settings_in_file
-from baselines.purejaxrl_ppo.resume import (
-    FINAL,
-    Start,
-    at_common_step,
-    checkpoints_in,
-    newest_intact,
-    rewards_of,
-    seeds_in,
-    seeds_side_by_side,
-)
+from baselines.purejaxrl_ppo.resume import FINAL, Start
 from baselines.purejaxrl_ppo.tracking import has_moved, local_uri
 from baselines.purejaxrl_ppo.training import Options, Run, Task, Trainer
 from flytrack_env.messages import error_text
@@ -120,12 +112,12 @@ class Plan(NamedTuple):
 
 def find_starts(resume: Path) -> Resumed:
     """Return what there is to resume in a file or folder; raises CheckpointError if nothing is."""
-    seeds = seeds_in(resume)
-    if not seeds or checkpoints_in(resume):
-        start = newest_intact(resume)
+    seeds = runs.seeds_in(resume)
+    if not seeds or runs.checkpoints_in(resume):
+        start = runs.newest_intact(resume)
         folder = resume if resume.is_dir() else resume.parent
         return Resumed(folder, {start.checkpoint.meta["seed"]: start}, is_single=True)
-    found = {seed: newest_intact(resume / f"seed{seed}") for seed in seeds}
+    found = {seed: runs.newest_intact(resume / f"seed{seed}") for seed in seeds}
     seeds = sorted({*seeds, *saved_options(next(iter(found.values()))).seeds})
     return Resumed(resume, {seed: found.get(seed) for seed in seeds}, is_single=False)
 
@@ -151,7 +143,7 @@ def defaults_of(resumed: Resumed) -> Settings:
         track=start.checkpoint.track,
         seed=min(resumed.starts),
         num_seeds=len(resumed.starts),
-        seeds_at_once=seeds_side_by_side(start.checkpoint),
+        seeds_at_once=runs.seeds_side_by_side(start.checkpoint),
         run=options._replace(tracking_uri=uri),
         hyperparameters=start.checkpoint.config,
     )
@@ -197,7 +189,7 @@ def make_tasks(settings: Settings, resumed: Resumed | None) -> list[list[Task]]:
     groups = []
     for first in range(0, len(seeds), at_once):
         own = slice(first, first + at_once)
-        pairs = zip(seeds[own], at_common_step(starts[own]), strict=True)
+        pairs = zip(seeds[own], runs.at_common_step(starts[own]), strict=True)
         groups.append(
             [Task(out if is_single else out / f"seed{seed}", seed, options, start) for seed, start in pairs]
         )
@@ -214,7 +206,7 @@ def make_trainer(settings: Settings, resumed: Resumed | None) -> Trainer:
     try:
         arguments["model"] = settings.model or model_from_json(checkpoint.meta["model"], "model")
         arguments["missed_gate"] = checkpoint.meta["missed_gate"]
-        arguments["reward"] = rewards_of(checkpoint) | reward
+        arguments["reward"] = runs.rewards_of(checkpoint) | reward
         return Trainer(settings.hyperparameters, settings.env_id, **arguments)
     except (ValueError, OverflowError, OSError) as error:
         raise CheckpointError(f"{path}: with its settings and the flags: {error_text(error)}") from error
@@ -242,7 +234,7 @@ def run(plan: Plan) -> None:
 def stopped_text(plan: Plan) -> str:
     """Return the message for a training that was stopped."""
     folder, *others = (one.out for one in plan.runs)
-    if any(checkpoints_in(out) for out in (folder, *others)):
+    if any(runs.checkpoints_in(out) for out in (folder, *others)):
         where = folder.parent if others else folder
         return f"stopped at {plan.trainer.steps} steps; continue with --resume {where}"
     return f"stopped at {plan.trainer.steps} steps, before the first checkpoint"

@@ -93,7 +93,7 @@ def test_resuming_takes_from_the_checkpoint_what_is_not_given(whole, tmp_path):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"environment": {"reward.gate_pass": "a lot"}}, "environment: found"),
+        ({"environment": {"reward.gate_pass": "a lot"}}, "environment: gate_pass: found 'a lot'"),
         ({"env_id": "Hover-v0"}, "with its settings and the flags: env_id: found 'Hover-v0'"),
         ({"options": {"evaluate_every": "often"}}, "options: .*"),
         ({"steps": 5}, "steps: found 5"),
