@@ -19,8 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from baselines.purejaxrl_ppo import Checkpoint, load_checkpoint
-from baselines.purejaxrl_ppo.export import ExportSettings, export
-from baselines.purejaxrl_ppo.export_policy import ExportedPolicy, policy_of
+from baselines.purejaxrl_ppo.export import ExportedPolicy, ExportSettings, export, policy_of
 from baselines.purejaxrl_ppo.flights import race_many, start_keys, start_pose_params
 from baselines.purejaxrl_ppo.race_env import plant_env
 from benchmarks import report

@@ -97,7 +97,7 @@ def run_demo(flags: Demo) -> None:
     report = evaluate(settings)
     report.write()
     print(report.text)
-    env = report.scene.env
+    env = report.env
     flights = fly_many(
         env, checkpoint.network, checkpoint.params, seed, size.num_episodes, size.num_steps, NUM_LAPS
     )

@@ -3,21 +3,20 @@
 import dataclasses
 import json
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import numpy as np
 
 import flytrack_env
 from baselines.purejaxrl_ppo import flights as flying
-from baselines.purejaxrl_ppo.checkpoint import Checkpoint, load_checkpoint
+from baselines.purejaxrl_ppo import report as words
+from baselines.purejaxrl_ppo.checkpoint import load_checkpoint
 from baselines.purejaxrl_ppo.config import OptionalInt, OptionalName, OptionalPath
 from baselines.purejaxrl_ppo.flights import Outcomes, Rollout
 from baselines.purejaxrl_ppo.plants import Plants, draw_plants
 from baselines.purejaxrl_ppo.race_env import plant_env, simulated_env, with_model_as_given
 from baselines.purejaxrl_ppo.recording import CANNOT_RECORD, can_record, record_flights
-from baselines.purejaxrl_ppo.report import describe_flight, describe_report
-from baselines.purejaxrl_ppo.summary import compare_with_optimum, summarise, time_lost
 from flytrack_env import EnvParams, blackbox
 from flytrack_env.episodes import EpisodicEnvironment
 from flytrack_env.files import fresh_folder, write_atomically
@@ -113,32 +112,110 @@ def ghost_path(rollout: Path) -> Path:
     return rollout.with_name(f"{rollout.stem}_ghost.npy")
 
 
-class Scene(NamedTuple):
-    """What is flown: environment, its parameters, drawn plants (None: a black box), references if any."""
+class Report:
+    """An evaluation of a checkpoint, as settings ask for it.
 
-    env: EpisodicEnvironment
-    params: EnvParams
-    plants: Plants | None
-    references: References | None
+    env, params, plants, references: what is flown; plants None: a black box; references None: there are none.
+    rollout: the first flight step by step. numbers: as JSON values; docs/baseline.md describes each.
+    """
 
-
-class Report(NamedTuple):
-    """An evaluation: ``numbers`` as JSON values (docs/baseline.md), and the first flight step by step."""
-
-    settings: EvaluationSettings
-    checkpoint: Checkpoint
-    scene: Scene
     rollout: Rollout
     numbers: dict[str, Any]
+
+    def __init__(self, settings: EvaluationSettings):
+        """Raise ValueError or OSError for settings or files that cannot be used; nothing is flown yet."""
+        settings.check()
+        self.settings, self.checkpoint = settings, load_checkpoint(settings.checkpoint)
+        self.plants: Plants | None = None
+        if settings.plants is None:
+            black_box = settings.black_box or blackbox.SHIPPED
+            self.env = plant_env(self.checkpoint, blackbox.load(black_box), settings.track)
+            is_shipped = black_box.read_bytes() == blackbox.SHIPPED.read_bytes()
+        else:
+            self.env = simulated_env(self.checkpoint, settings.track)
+            model = self.env.default_params.model
+            self.plants = draw_plants(settings.seed, settings.plants, model)
+            is_shipped = is_model_of(self.env.track.name, BLACK_BOX_MODELS[0], model)
+        self.params = with_model_as_given(self.env.default_params)
+        models = BLACK_BOX_MODELS if is_shipped else NOMINAL_MODELS
+        self.references: References | None = None
+        try:
+            self.references = shipped_references(self.env.track, models)
+        except ReferenceFileError:
+            if settings.ghost:
+                raise
+
+    def fly(self) -> Outcomes:
+        """Fly, and return the outcomes of all flights."""
+        settings, plants = self.settings, self.plants
+        first = self.params if plants is None else self.params.replace(model=plants.model(0))
+        self.rollout = self._fly_first(self.env, first)
+        num_laps = settings.num_laps or settings.steps
+        if settings.is_single:
+            one = jax.tree.map(lambda leaf: leaf[None], self.rollout)
+            return flying.outcomes_of(one, num_laps, len(self.env.track.gates))
+        models = None if plants is None else plants.repeated(settings.episodes)
+        policy, flown = (self.checkpoint.network, self.checkpoint.params), (settings.steps, num_laps)
+        report = ProgressBar("flights")
+        return flying.race_many(self.env, *policy, self._keys(), *flown, self.params, models, report)
+
+    def _keys(self) -> jax.Array:
+        return flying.start_keys(self.settings.seed, self.settings.episodes * (self.settings.plants or 1))
+
+    def _fly_first(self, env: EpisodicEnvironment, params: EnvParams) -> Rollout:
+        """Return the first flight of the evaluation in an environment."""
+        settings = self.settings
+        key = jax.random.key(settings.seed) if settings.is_single else self._keys()[0]
+        params = flying.start_pose_params(params, settings.steps)
+        policy, num_laps = (self.checkpoint.network, self.checkpoint.params), settings.num_laps
+        return flying.fly_episode(env, *policy, key, params, settings.steps, num_laps or settings.steps)
+
+    def count(self, outcomes: Outcomes) -> None:
+        """Set the numbers of the evaluation."""
+        settings, plants, references = self.settings, self.plants, self.references
+        numbers: dict[str, Any] = {
+            "schema": SCHEMA,
+            "package_version": flytrack_env.__version__,
+            "checkpoint": str(settings.checkpoint),
+            "env_id": self.checkpoint.env_id,
+            "track": self.env.track.name,
+            "gates_per_lap": len(self.env.track.gates),
+            "black_box": None if plants is not None else str(settings.black_box or blackbox.SHIPPED),
+            "seed": settings.seed,
+            "steps_limit": settings.steps,
+            "laps": settings.num_laps,
+            "episodes": settings.episodes,
+            **words.summarise(outcomes, is_limited=settings.num_laps is not None),
+            "plants": None,
+            "optimal": None,
+            "time_lost_s": None,
+            "first_flight": {
+                "steps": int(np.sum(self.rollout.is_flying)),
+                "gates": int(np.max(self.rollout.gates_passed)),
+                "lap_times_s": self.rollout.lap_times().tolist(),
+                "ended": self.rollout.end_reason(settings.num_laps),
+            },
+        }
+        if plants is not None:
+            is_complete = outcomes.is_complete().reshape(-1, settings.episodes)
+            if settings.episodes > 1:  # flights of one plant are not independent
+                numbers["success"] |= {"low": None, "high": None}
+            numbers["plants"] = plants.summarise(is_complete)
+        if references is not None:
+            numbers["optimal"] = words.compare_with_optimum(numbers, references)
+            if settings.ghost:
+                gate_ids = [gate.id for gate in self.env.track.gates]
+                numbers["time_lost_s"] = words.time_lost(outcomes, references, gate_ids)
+        self.numbers = numbers
 
     @property
     def text(self) -> str:
         """The report for a terminal."""
         settings, text = self.settings, ""
         if settings.is_single:
-            text += describe_flight(self.rollout, float(self.scene.params.dt), settings.num_laps)
+            text += words.describe_flight(self.numbers["first_flight"], float(self.params.dt))
         if settings.num_laps is not None or settings.ghost:
-            text += describe_report(self.numbers)
+            text += words.describe_report(self.numbers)
         return text
 
     def write(self) -> list[str]:
@@ -151,10 +228,9 @@ class Report(NamedTuple):
         rollout = settings.out or fresh_folder(DEFAULT_OUT) / "rollout.npy"
         flying.save_flight(rollout, self.rollout)
         lines = [f"rollout: {rollout}"]
-        if settings.ghost and self.scene.references is not None:
-            num_steps = int(np.sum(self.rollout.is_flying))
+        if settings.ghost and self.references is not None:
             ghost = ghost_path(rollout)
-            save_rollout(ghost, *ghost_rollout(self.scene.references, num_steps))
+            save_rollout(ghost, *ghost_rollout(self.references, self.numbers["first_flight"]["steps"]))
             lines.append(f"ghost: {ghost}")
         if settings.rrd is not None:
             shown = ", ".join(self.record(settings.rrd, with_ghost=settings.ghost))
@@ -173,14 +249,13 @@ class Report(NamedTuple):
         Beside it is the flight from the same start in the simulator with the model that the policy was
         trained on: it shows what that simulator gets wrong. with_ghost: the time-optimal flight as well.
         """
-        env, _, plants, references = self.scene
-        flights = {"black box" if plants is None else "first plant": self.rollout}
+        flights = {"black box" if self.plants is None else "first plant": self.rollout}
         if "model" in self.checkpoint.meta:
-            simulator = simulated_env(self.checkpoint, env.track)
+            simulator = simulated_env(self.checkpoint, self.env.track)
             params = with_model_as_given(simulator.default_params)
-            flights["simulator"] = _fly_first(simulator, params, self.checkpoint, self.settings)
-        ghost = references if with_ghost else None
-        record_flights(path, flights, env.track, self.settings.num_laps, ghost)
+            flights["simulator"] = self._fly_first(simulator, params)
+        ghost = self.references if with_ghost else None
+        record_flights(path, flights, self.env.track, self.settings.num_laps, ghost)
         return [*flights, *(["time-optimal"] if ghost is not None else [])]
 
 
@@ -190,106 +265,6 @@ def evaluate(settings: EvaluationSettings) -> Report:
     Raises:
         ValueError, OSError: settings or files that cannot be used, before anything is flown.
     """
-    settings.check()
-    checkpoint = load_checkpoint(settings.checkpoint)
-    scene = make_scene(checkpoint, settings)
-    outcomes, rollout = fly_scene(scene, checkpoint, settings)
-    numbers = make_numbers(scene, checkpoint, settings, outcomes, rollout)
-    return Report(settings, checkpoint, scene, rollout, numbers)
-
-
-def reference_models(black_box: Path) -> tuple[str, ...]:
-    """Return the models whose time-optimal flights a black box is compared with, in order of preference."""
-    is_shipped = black_box.read_bytes() == blackbox.SHIPPED.read_bytes()
-    return BLACK_BOX_MODELS if is_shipped else NOMINAL_MODELS
-
-
-def make_scene(checkpoint: Checkpoint, settings: EvaluationSettings) -> Scene:
-    """Return what the settings ask to fly."""
-    if settings.plants is None:
-        black_box = settings.black_box or blackbox.SHIPPED
-        env, plants = plant_env(checkpoint, blackbox.load(black_box), settings.track), None
-        models = reference_models(black_box)
-    else:
-        env = simulated_env(checkpoint, settings.track)
-        model = env.default_params.model
-        plants = draw_plants(settings.seed, settings.plants, model)
-        is_shipped = is_model_of(env.track.name, BLACK_BOX_MODELS[0], model)
-        models = BLACK_BOX_MODELS if is_shipped else NOMINAL_MODELS
-    try:
-        references = shipped_references(env.track, models)
-    except ReferenceFileError:
-        if settings.ghost:
-            raise
-        references = None
-    return Scene(env, with_model_as_given(env.default_params), plants, references)
-
-
-def fly_scene(scene: Scene, checkpoint: Checkpoint, settings: EvaluationSettings) -> tuple[Outcomes, Rollout]:
-    """Return the outcomes of all flights, and the first flight step by step."""
-    env, params, plants, _ = scene
-    first = params if plants is None else params.replace(model=plants.model(0))
-    rollout = _fly_first(env, first, checkpoint, settings)
-    if settings.is_single:
-        one = jax.tree.map(lambda leaf: leaf[None], rollout)
-        return flying.outcomes_of(one, settings.laps or settings.steps, len(env.track.gates)), rollout
-    models = None if plants is None else plants.repeated(settings.episodes)
-    num_laps = settings.num_laps or settings.steps
-    policy = (checkpoint.network, checkpoint.params)
-    keys, report = _keys(settings), ProgressBar("flights")
-    return flying.race_many(env, *policy, keys, settings.steps, num_laps, params, models, report), rollout
-
-
-def _keys(settings: EvaluationSettings) -> jax.Array:
-    return flying.start_keys(settings.seed, settings.episodes * (settings.plants or 1))
-
-
-def _fly_first(
-    env: EpisodicEnvironment, params: EnvParams, checkpoint: Checkpoint, settings: EvaluationSettings
-) -> Rollout:
-    """Return the first flight of an evaluation in an environment."""
-    key = jax.random.key(settings.seed) if settings.is_single else _keys(settings)[0]
-    policy, params = (checkpoint.network, checkpoint.params), flying.start_pose_params(params, settings.steps)
-    num_laps = settings.num_laps or settings.steps
-    return flying.fly_episode(env, *policy, key, params, settings.steps, num_laps)
-
-
-def make_numbers(
-    scene: Scene, checkpoint: Checkpoint, settings: EvaluationSettings, outcomes: Outcomes, rollout: Rollout
-) -> dict[str, Any]:
-    """Return the numbers of an evaluation, as JSON values; docs/baseline.md describes each."""
-    plants, references = scene.plants, scene.references
-    numbers: dict[str, Any] = {
-        "schema": SCHEMA,
-        "package_version": flytrack_env.__version__,
-        "checkpoint": str(settings.checkpoint),
-        "env_id": checkpoint.env_id,
-        "track": scene.env.track.name,
-        "gates_per_lap": len(scene.env.track.gates),
-        "black_box": None if plants is not None else str(settings.black_box or blackbox.SHIPPED),
-        "seed": settings.seed,
-        "steps_limit": settings.steps,
-        "laps": settings.num_laps,
-        "episodes": settings.episodes,
-        **summarise(outcomes, is_limited=settings.num_laps is not None),
-        "plants": None,
-        "optimal": None,
-        "time_lost_s": None,
-    }
-    if plants is not None:
-        is_complete = outcomes.is_complete().reshape(-1, settings.episodes)
-        if settings.episodes > 1:  # flights of one plant are not independent
-            numbers["success"] |= {"low": None, "high": None}
-        numbers["plants"] = plants.summarise(is_complete)
-    if references is not None:
-        numbers["optimal"] = compare_with_optimum(numbers, references)
-        if settings.ghost:
-            gate_ids = [gate.id for gate in scene.env.track.gates]
-            numbers["time_lost_s"] = time_lost(outcomes, references, gate_ids)
-    numbers["first_flight"] = {
-        "steps": int(np.sum(rollout.is_flying)),
-        "gates": int(np.max(rollout.gates_passed)),
-        "lap_times_s": rollout.lap_times().tolist(),
-        "ended": rollout.end_reason(settings.num_laps),
-    }
-    return numbers
+    report = Report(settings)
+    report.count(report.fly())
+    return report

@@ -1,24 +1,261 @@
 """Write a policy for the drone itself: ``flytrack export CHECKPOINT --c policy.h``.
 
-The files take the drone's state and the gate to fly, and give the stick commands (docs/export.md).
+The files take the drone's state and the gate to fly, and give the stick commands (docs/export.md), as the
+evaluator computes them: observation before the gate, network, mean action, clipped to [-1, 1]. Noise of
+sensors and drawn models are of the environment, and no part of it. ``policy_template.h`` is the text of a C99
+header without dependencies, ``policy_template.onnxtxt`` that of an ONNX graph for any number of drones.
 """
 
 import dataclasses
 import sys
+import textwrap
 from collections.abc import Sequence
+from itertools import count, takewhile
 from pathlib import Path
-from typing import Annotated
+from string import Template
+from typing import Annotated, NamedTuple
 
+import jax
+import jax.numpy as jnp
+import numpy as np
 import tyro
 
-from baselines.purejaxrl_ppo.checkpoint import load_checkpoint
+import flytrack_env
+from baselines.purejaxrl_ppo.checkpoint import Checkpoint, CheckpointError, load_checkpoint
 from baselines.purejaxrl_ppo.config import OptionalName, OptionalPath
-from baselines.purejaxrl_ppo.export_c import c_of
-from baselines.purejaxrl_ppo.export_onnx import onnx_of
-from baselines.purejaxrl_ppo.export_policy import policy_of
+from baselines.purejaxrl_ppo.race_env import simulated_env
+from flytrack_env.extras import check_installed
 from flytrack_env.files import write_atomically
+from flytrack_env.observations import BATTERY_MIDDLE_V, OBSERVATION, Entry, observe_race
+from flytrack_env.params import EnvParams
+from flytrack_env.quaternion import Quaternion
+from flytrack_env.state import ACTION_SIZE, STATE_SIZE, unpack
 
 PROG = "flytrack export"
+FOLDER = Path(__file__).parent  # of the templates
+FLOAT32, FLOAT64 = 1, 11  # ONNX's numbers of types
+WIDTH = 110
+NAMES = ("centres", "frames", "free", "next_rows", "offsets", "factors", "limits", "blend")
+PAST = {  # what a policy that reads earlier actions has besides
+    "past_in_words": ", and the earlier actions",
+    "past_parameter": " const float past[FLYTRACK_PAST],",
+    "past_argument": " past,",
+    "past_rows": """
+    for (int i = 0; i < FLYTRACK_PAST; i++) {
+        observation[FLYTRACK_OF_DRONE + 6 + i] = past[i];
+    }""",
+}
+OF_NEXT_GATE = ("next_gate", "next_direction")  # the last entries of OBSERVATION, which no state changes
+OF_DRONE = tuple(entry for entry in OBSERVATION if entry.key not in OF_NEXT_GATE)
+KINDS_OF_PAST = ("commanded", "applied")
+SENTENCES = {
+    "state": (
+        "0:3 position, world, m; 3:6 velocity, world, m/s; 6:9 acceleration, not read; 9:13 attitude, "
+        "quaternion w, x, y, z of norm 1, body to world; 13:16 angular velocity, body, rad/s; 16:20 applied "
+        "action, that is the command after the drone's lag: roll, pitch, yaw, thrust; 20 battery, V. World: "
+        "the track's, z up. Body: x forward, y left, z up."
+    ),
+    "gate": "index of the gate to fly, 0 to {last_gate}, in the order of the track {track}.",
+    "past": (
+        "the last {num_actions} {kind} actions, the latest first, each roll, pitch, yaw, thrust in [-1, 1]; "
+        "at the start of a flight all of them are the applied action."
+    ),
+    "action": (
+        "roll, pitch, yaw, thrust in [-1, 1]. Full stick asks for {full_stick} deg/s about body x, y, z; "
+        "thrust is -1 for none and 1 for full."
+    ),
+}
+
+
+class ExportedPolicy(NamedTuple):
+    """A policy as arrays, float64, and what its files say about it.
+
+    centres: (gates, 3), world, m. frames: (gates, 3, 3), rows forward, left, up, world. free: (gates,), m,
+    half of the opening less the drone's radius. next_rows: (gates, 6), the observation of the gate after.
+    offsets, factors, limits: (23,), of the rows before these: clip((quantity - offset) * factor, +-limit).
+    past: the entries of earlier actions, behind them. layers: kernel (inputs, outputs) and bias, tanh
+    between. blend: (4,), how much of the way to the command the lags of the checkpoint's model go in a step.
+    about: sentences. meanings: of inputs and output, by name.
+    """
+
+    centres: np.ndarray
+    frames: np.ndarray
+    free: np.ndarray
+    next_rows: np.ndarray
+    offsets: np.ndarray
+    factors: np.ndarray
+    limits: np.ndarray
+    past: tuple[Entry, ...]
+    layers: tuple[tuple[np.ndarray, np.ndarray], ...]
+    blend: np.ndarray
+    about: str
+    meanings: dict[str, str]
+
+    @property
+    def num_past(self) -> int:
+        """How many numbers of earlier actions it reads."""
+        return sum(entry.size for entry in self.past)
+
+
+def policy_of(checkpoint: Checkpoint, name: str, track: str | None = None) -> ExportedPolicy:
+    """Return the policy of a checkpoint on a track, by default its own; name: of the checkpoint's file.
+
+    Raises:
+        CheckpointError, TrackError: a checkpoint that does not fit its environment, whose policy remembers,
+            or whose observation has rows that cannot be exported; a track that cannot be used.
+    """
+    if checkpoint.config.memory_size:
+        raise CheckpointError(
+            f"{name}: memory_size: found {checkpoint.config.memory_size}, expected 0: no policy that "
+            "remembers can be exported yet"
+        )
+    env = simulated_env(checkpoint, track)
+    past = env.observation_table[len(OBSERVATION) :]
+    unknown = [entry.key for entry in past if entry.key.rpartition("_")[0] not in KINDS_OF_PAST]
+    if unknown:
+        raise CheckpointError(
+            f"{name}: observation: found {', '.join(unknown)}, expected rows of {' or '.join(KINDS_OF_PAST)} "
+            "actions after those of FlyTrack-v0"
+        )
+    params = env.default_params
+    sizes = [entry.size for entry in OF_DRONE]
+    rate = f"{1.0 / params.dt:g} commands a second"
+    words = {
+        "last_gate": len(env.track.gates) - 1,
+        "track": env.track.name,
+        "num_actions": len(past),
+        "kind": past[0].key.rpartition("_")[0] if past else "",
+        "full_stick": ", ".join(f"{value:.0f}" for value in params.model.max_rate),
+    }
+    return ExportedPolicy(
+        **_gates(params),
+        offsets=np.repeat([BATTERY_MIDDLE_V if entry.key == "battery" else 0.0 for entry in OF_DRONE], sizes),
+        factors=np.repeat([1.0 / entry.scale for entry in OF_DRONE], sizes),
+        limits=np.repeat([entry.limit for entry in OF_DRONE], sizes),
+        past=past,
+        layers=_layers(checkpoint),
+        blend=1.0 - np.exp(-params.dt / np.asarray(params.model.tau, float)),
+        about=f"FlyTrack {flytrack_env.__version__}: policy of {name}, track {env.track.name}, {rate}.",
+        meanings={key: text.format(**words) for key, text in SENTENCES.items() if past or key != "past"},
+    )
+
+
+def _gates(params: EnvParams) -> dict[str, np.ndarray]:
+    """Return the fields that depend on the gates."""
+    gates = jax.tree.map(lambda leaf: np.asarray(leaf, float), params.course.gates)
+    following = jax.tree.map(lambda leaf: np.roll(leaf, -1, axis=0), gates)
+    with jax.enable_x64(True):
+        anywhere = unpack(jnp.zeros(STATE_SIZE))
+        rows = jax.vmap(lambda *pair: jnp.stack(observe_race(anywhere, *pair)))(gates, following)
+    axes = [np.stack(axis, axis=-1) for axis in (gates.forward, gates.left(), gates.up)]
+    return {
+        "centres": np.stack(gates.centre, axis=-1),
+        "frames": np.stack(axes, axis=1),
+        "free": gates.half_opening - params.drone_radius,
+        "next_rows": np.asarray(rows)[:, sum(entry.size for entry in OF_DRONE) :],
+    }
+
+
+def _layers(checkpoint: Checkpoint) -> tuple[tuple[np.ndarray, np.ndarray], ...]:
+    """Return the actor's layers, with the initial action in the last bias."""
+    tower = checkpoint.params["params"]["actor_tower"]
+    names = takewhile(tower.__contains__, (f"layers_{2 * i}" for i in count()))  # tanh has the odd numbers
+    layers = [
+        (np.asarray(tower[name]["kernel"], float), np.asarray(tower[name]["bias"], float)) for name in names
+    ]
+    kernel, bias = layers[-1]
+    return (*layers[:-1], (kernel, bias + checkpoint.config.initial_action))
+
+
+def c_of(policy: ExportedPolicy) -> bytes:
+    """Return the content of the header."""
+    tables, calls = [], []
+    for i, (kernel, bias) in enumerate(policy.layers):
+        inputs, outputs = kernel.shape
+        for name, size, array in (("kernel", f"{outputs} * {inputs}", kernel.T), ("bias", outputs, bias)):
+            tables.append(f"static const float flytrack_{name}_{i}[{size}] = {{\n{_numbers(array)}\n}};")
+        arguments = f"flytrack_kernel_{i}, flytrack_bias_{i}, {inputs}, {outputs}, layer_{i}, layer_{i + 1}"
+        calls += [f"float layer_{i + 1}[{outputs}];", f"flytrack_layer({arguments});"]
+        calls.append(f"flytrack_tanh({outputs}, layer_{i + 1});")
+    text = Template((FOLDER / "policy_template.h").read_text(encoding="utf-8")).substitute(
+        {name: _numbers(getattr(policy, name)) for name in NAMES},
+        **(PAST if policy.past else dict.fromkeys(PAST, "")),
+        about=_comment(policy.about).removeprefix(" * "),
+        meanings="\n".join(" *\n" + _comment(f"{name}: {text}") for name, text in policy.meanings.items()),
+        state_size=STATE_SIZE,
+        num_gates=len(policy.centres),
+        num_past=policy.num_past,
+        num_of_drone=policy.limits.size,
+        num_observation=policy.layers[0][0].shape[0],
+        num_actions=ACTION_SIZE,
+        layers="\n".join(tables),
+        network="\n".join("    " + call for call in calls[:-1]),  # no tanh behind the last layer
+        last=f"layer_{len(policy.layers)}",
+    )
+    return text.encode()
+
+
+def _numbers(array: np.ndarray) -> str:
+    """Return numbers as lines of C, each the shortest decimal that is the same float32."""
+    words = [str(number) + "f," for number in array.astype(np.float32).ravel()]
+    return textwrap.fill(" ".join(words), WIDTH, initial_indent="    ", subsequent_indent="    ")
+
+
+def _comment(text: str) -> str:
+    """Return text as lines inside a comment, which nothing in it can end."""
+    return textwrap.fill(text.replace("*/", "* /"), WIDTH, initial_indent=" * ", subsequent_indent=" * ")
+
+
+def onnx_of(policy: ExportedPolicy, is_float64: bool = False) -> bytes:
+    """Return the content of an ONNX file; is_float64: the arithmetic between float32 inputs and action.
+
+    Raises:
+        ImportError: onnx is not installed.
+    """
+    check_installed("export", "ONNX files", "onnx")
+    import onnx
+
+    real = FLOAT64 if is_float64 else FLOAT32
+    names = ("centres", "frames", "next_rows", "offsets", "factors", "limits")
+    arrays = {name: getattr(policy, name) for name in names}
+    arrays |= {"rotation_of_products": rotation_of_products(), "identity": np.eye(3).ravel()}
+    arrays["highest"] = np.array(1.0)
+    lines = [f"real_past = Cast <to = {real}> (past)"] if policy.past else []
+    lines += [f"layer_0 = Concat <axis = 1> (clipped, next_gate{', real_past' if policy.past else ''})"]
+    for i, (kernel, bias) in enumerate(policy.layers):
+        arrays |= {f"kernel_{i}": kernel, f"bias_{i}": bias}
+        lines.append(f"sum_{i} = Gemm (layer_{i}, kernel_{i}, bias_{i})")
+        lines.append(f"layer_{i + 1} = Tanh (sum_{i})")
+    text = Template((FOLDER / "policy_template.onnxtxt").read_text(encoding="utf-8")).substitute(
+        state_size=STATE_SIZE,
+        num_actions=ACTION_SIZE,
+        past_input=f", float[drones, {policy.num_past}] past" if policy.past else "",
+        network="\n".join("  " + line for line in lines[:-1]),  # no tanh behind the last layer
+        last=f"sum_{len(policy.layers) - 1}",
+        real=real,
+    )
+    model = onnx.parser.parse_model(text)
+    dtype = np.float64 if is_float64 else np.float32
+    tensors = (onnx.numpy_helper.from_array(array.astype(dtype), name) for name, array in arrays.items())
+    model.graph.initializer.extend(tensors)
+    model.producer_name, model.doc_string = "flytrack", policy.about
+    for value in (*model.graph.input, *model.graph.output):
+        value.doc_string = policy.meanings[value.name]
+    onnx.checker.check_model(model, full_check=True)
+    return bytes(model.SerializeToString(deterministic=True))
+
+
+def rotation_of_products() -> np.ndarray:
+    """Return the matrix (16, 9) from products q_i q_j to a rotation matrix, row by row, less the identity.
+
+    A quadratic form's coefficient of q_i q_j and of q_j q_i is half of Q(e_i + e_j) - Q(e_i) - Q(e_j).
+    """
+
+    def form(quaternion: np.ndarray) -> np.ndarray:
+        return np.array(Quaternion(*quaternion).axes()).T.ravel() - np.eye(3).ravel()
+
+    units = np.eye(4)
+    return np.array([0.5 * (form(a + b) - form(a) - form(b)) for a in units for b in units])
 
 
 @dataclasses.dataclass(frozen=True)

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from baselines.purejaxrl_ppo.summary import share
+from baselines.purejaxrl_ppo.report import share
 from flytrack_env.dynamics import ModelParameters
 from flytrack_env.effects import effect_of
 

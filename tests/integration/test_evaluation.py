@@ -86,15 +86,17 @@ def test_every_step_kept_or_not_is_the_same_flight(flights, raced):
 @pytest.mark.parametrize("flown_by", slow_but(["black box"], ["black box", "plants"]))
 def test_command_flies_many(flown_by, checkpoint_path, tmp_path, monkeypatch, capsys, flights):
     flown = []
-    fly_scene = evaluate.fly_scene
-    monkeypatch.setattr(evaluate, "fly_scene", lambda *a: flown.append(fly_scene(*a)) or flown[0])
+    fly = evaluate.Report.fly
+    monkeypatch.setattr(evaluate.Report, "fly", lambda self: flown.extend([fly(self), self]) or flown[0])
     if flown_by == "black box":  # one program less to compile: single flights are those of test_commands
-        monkeypatch.setattr(evaluate, "_fly_first", lambda *_: jax.tree.map(lambda leaf: leaf[0], flights))
+        monkeypatch.setattr(
+            evaluate.Report, "_fly_first", lambda *_: jax.tree.map(lambda leaf: leaf[0], flights)
+        )
     out, file = tmp_path / "flight.npy", tmp_path / "new" / "report.json"
     more = ["--episodes", 2, "--plants", 3] if flown_by == "plants" else ["--episodes", 6, "--laps", 1]
     where = ["--checkpoint", checkpoint_path, "--out", out, "--json", file]
     run(*where, "--steps", 120, "--track", "split_s", "--ghost", *more)
-    outcomes, rollout = flown[0]
+    outcomes, rollout = flown[0], flown[1].rollout
     report, text = json.loads(file.read_text()), capsys.readouterr().out
     assert report["schema"] == 1 and report["flights"] == 6 and report["track"] == "split_s"
     assert report["steps"] == outcomes.steps.sum() and report["success"]["of"] == 6
@@ -125,7 +127,9 @@ def test_a_single_flight_as_json_and_docs_name_every_key(
     checkpoint_path, tmp_path, monkeypatch, capsys, flights, raced
 ):
     index = int(np.argmax(raced.is_complete()))
-    monkeypatch.setattr(evaluate, "_fly_first", lambda *_: jax.tree.map(lambda leaf: leaf[index], flights))
+    monkeypatch.setattr(
+        evaluate.Report, "_fly_first", lambda *_: jax.tree.map(lambda leaf: leaf[index], flights)
+    )
     out, file = tmp_path / "flight.npy", tmp_path / "report.json"
     where = ["--checkpoint", checkpoint_path, "--out", out, "--json", file, "--steps", NUM_STEPS]
     recording = tmp_path / "flight.rrd"
@@ -178,7 +182,7 @@ def bad_files(tmp_path_factory):
 def test_command_refuses_before_it_flies(arguments, messages, bad_files, monkeypatch, capsys):
     monkeypatch.chdir(bad_files)
     monkeypatch.setattr(evaluate, "can_record", lambda: True)
-    monkeypatch.setattr(evaluate, "fly_scene", lambda *_: pytest.fail("it flew"))
+    monkeypatch.setattr(evaluate.Report, "fly", lambda _: pytest.fail("it flew"))
     with pytest.raises(SystemExit) as ended:
         run("--checkpoint", "policy.safetensors", "--steps", "5", *arguments)
     error = capsys.readouterr().err

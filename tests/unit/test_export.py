@@ -7,11 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from baselines.purejaxrl_ppo import Config, load_checkpoint, make_network
-from baselines.purejaxrl_ppo import export_policy as export_policy_module
+from baselines.purejaxrl_ppo import Config, export, load_checkpoint, make_network
 from baselines.purejaxrl_ppo.checkpoint import save_checkpoint
-from baselines.purejaxrl_ppo.export import main
-from baselines.purejaxrl_ppo.export_policy import policy_of
+from baselines.purejaxrl_ppo.export import main, policy_of
 from baselines.purejaxrl_ppo.resume import describe_run
 from benchmarks.export import CompiledPolicy, states_in_box
 from flytrack_env import make
@@ -122,7 +120,7 @@ def test_what_cannot_be_exported_is_told(words, message, tmp_path, monkeypatch, 
     before = (tmp_path / "a.safetensors").read_bytes()
     (tmp_path / "folder").mkdir()
     if words[-1:] == ["unknown rows"]:
-        monkeypatch.setattr(export_policy_module, "KINDS_OF_PAST", ("applied",))
+        monkeypatch.setattr(export, "KINDS_OF_PAST", ("applied",))
         words = words[:-1]
     with pytest.raises(SystemExit) as stopped:
         main(["a.safetensors", *words])
