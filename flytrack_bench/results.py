@@ -1,4 +1,4 @@
-"""Running a suite: every task flown, and what a result file says of it."""
+"""Running a suite: every task flown, with data to adapt to it if asked, and what a result file says of it."""
 
 import time
 from collections.abc import Callable, Sequence
@@ -8,19 +8,56 @@ from typing import Any
 import numpy as np
 from scipy import stats
 
-from baselines.purejaxrl_ppo.flights import race_many, score, start_keys
+from baselines.purejaxrl_ppo.flights import fly_many, race_many, score, start_keys
 from baselines.purejaxrl_ppo.race_env import with_model_as_given
-from flytrack_bench.data import Data
 from flytrack_bench.policies import Policy
 from flytrack_bench.suite import Suite, Task
+from flytrack_loop.flight_log import BATCH, log_of_flights
+from flytrack_sysid import FlightLog
 
 SCHEMA = 1
 DRAWS, COVERED = 2000, 0.95  # of the bootstrap
 QUARTER = 0.25
 # By which a result may differ on another machine: share of starts, share of a lap time.
 SAME_SUCCESS, SAME_LAP = 0.02, 0.005
-Adapt = Callable[[Data], Policy]
+NOISE = 1.0  # of common sensors
+LONGEST_S = 25.0  # of one flight
 Report = Callable[[int, int], None]
+
+
+class DataError(ValueError):
+    """More data than a regime allows."""
+
+
+class Data:
+    """Flights on a task's plant, as common sensors log them; seconds_left counts down.
+
+    task: what will be flown. Its plant is hidden: an honest entry looks at the logs alone.
+    """
+
+    def __init__(self, task: Task, suite: Suite, seconds: float):
+        """seconds: of flight that may be logged in all."""
+        self.task, self.seconds_left, self._seed = task, seconds, suite.seed
+
+    def fly(self, policy: Policy, seconds: float) -> FlightLog:
+        """Return the log of a policy's flights on the plant, from perturbed starts.
+
+        Raises:
+            DataError: more seconds than are left. ValueError: a policy that crashes at once.
+        """
+        if seconds > self.seconds_left + 1e-9:
+            raise DataError(f"seconds: found {seconds:g}, expected at most the {self.seconds_left:g} s left")
+        self.seconds_left -= seconds
+        self._seed += 1
+        env = policy.env(self.task.plant, self.task.track)
+        step_s = float(env.default_params.dt)
+        steps = round(min(seconds, LONGEST_S) / step_s)
+        flights = fly_many(env, policy.network, policy.params, self._seed, BATCH, steps, num_laps=steps)
+        log = log_of_flights(flights, step_s, self._seed, seconds, NOISE)
+        return log.select(np.arange(len(log)) < round(seconds / step_s))
+
+
+Adapt = Callable[[Data], Policy]
 
 
 def fly_task(task: Task, suite: Suite, policy: Policy) -> dict[str, float | None]:
