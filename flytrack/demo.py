@@ -9,11 +9,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from baselines.purejaxrl_ppo import Config
-from baselines.purejaxrl_ppo.density import draw_position_density
+from baselines.purejaxrl_ppo.checkpoint import FINAL, checkpoints_in
 from baselines.purejaxrl_ppo.evaluate import EvaluationSettings, evaluate
-from baselines.purejaxrl_ppo.flights import fly_many, outcomes_of, score
-from baselines.purejaxrl_ppo.recording import CANNOT_RECORD, can_record
-from baselines.purejaxrl_ppo.resume import FINAL, checkpoints_in
+from baselines.purejaxrl_ppo.flights import CANNOT_RECORD, can_record, fly_many, outcomes_of, score
+from baselines.purejaxrl_ppo.monitor import draw_position_density
 from baselines.purejaxrl_ppo.training import train_policy
 from flytrack.flags import Demo
 from flytrack_env import blackbox, save_model

@@ -5,9 +5,15 @@ from pathlib import Path
 import jax
 import numpy as np
 
-from baselines.purejaxrl_ppo.flights import Rollout, fly_episode, save_flight, start_pose_params
+from baselines.purejaxrl_ppo.flights import (
+    Rollout,
+    can_record,
+    fly_episode,
+    record_flights,
+    save_flight,
+    start_pose_params,
+)
 from baselines.purejaxrl_ppo.race_env import plant_env, simulated_env, with_model_as_given
-from baselines.purejaxrl_ppo.recording import can_record, record_flights
 from flytrack_env import load_track
 from flytrack_env.episodes import EpisodicEnvironment
 from flytrack_env.pictures import read_flights, write_pictures

@@ -1,11 +1,13 @@
 """Flying a policy from noisy start poses: rollouts, their outcomes and their score.
 
 ``fly_episode`` and ``fly_many`` keep every step; ``race_many`` keeps the outcomes only, flies no step beyond
-the last flight's end, and is for thousands of flights. Both are made of the same step.
+the last flight's end, and is for thousands of flights. Both are made of the same step. Rerun is imported when
+a recording is written.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import partial
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -17,11 +19,13 @@ from baselines.purejaxrl_ppo.networks import ActorCritic, Memory
 from flytrack_env.dynamics import ModelParameters
 from flytrack_env.env import EnvParams
 from flytrack_env.episodes import EpisodicEnvironment
+from flytrack_env.references import References, ghost_rollout
 from flytrack_env.rollout import save_rollout
 from flytrack_env.state import POSITION, pack
 from flytrack_env.terminations import Causes
-from flytrack_env.tracks import cross_gate
+from flytrack_env.tracks import Track, cross_gate
 
+CANNOT_RECORD = "found no rerun-sdk, or RERUN turned off; expected pip install 'flytrack[viz]', RERUN unset"
 BATCH = 1024  # flights side by side: more exceed a core's cache, fewer leave its vector units idle
 
 
@@ -141,6 +145,44 @@ def save_flight(path: Path, rollout: Rollout) -> None:
     """Write the steps of one rollout that were flown as a rollout file."""
     is_flying = np.asarray(rollout.is_flying)
     save_rollout(path, np.asarray(rollout.states)[is_flying], np.asarray(rollout.actions)[is_flying])
+
+
+def can_record() -> bool:
+    """Return whether Rerun is installed, and not turned off by its environment variable."""
+    if find_spec("rerun") is None:
+        return False
+    import rerun
+
+    return rerun.is_enabled(rerun.RecordingStream("flytrack_probe"))
+
+
+def record_flights(
+    path: Path,
+    flights: Mapping[str, Rollout],
+    track: Track,
+    num_laps: int | None = None,
+    references: References | None = None,
+) -> None:
+    """Write flights by name on one timeline as a Rerun recording; the first is in the foreground.
+
+    num_laps: laps to complete, if limited. references: the time-optimal flights of the track, shown as ghost.
+
+    Raises:
+        ImportError: Rerun is not installed; the message says how to install it.
+        ValueError: a path that cannot be written.
+    """
+    from flytrack_env.viz_rerun import Trajectory, write_recording
+
+    shown = []
+    for name, flight in flights.items():
+        is_flying = np.asarray(flight.is_flying)
+        states, actions = (np.asarray(part)[is_flying] for part in (flight.states, flight.actions))
+        ended = flight.end_reason(num_laps).replace("_", " ")
+        shown.append(Trajectory(name, states, actions, ended=ended))
+    if references is not None:
+        longest = max(len(one.states) for one in shown)
+        shown.append(Trajectory("time-optimal", *ghost_rollout(references, longest)))
+    write_recording(path, shown, track)
 
 
 def score(outcomes: Outcomes) -> Score:

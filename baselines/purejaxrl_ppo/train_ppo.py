@@ -8,10 +8,9 @@ from typing import Annotated, Any, NamedTuple, NoReturn
 
 import tyro
 
-from baselines.purejaxrl_ppo import resume as runs
-from baselines.purejaxrl_ppo.checkpoint import CheckpointError
+from baselines.purejaxrl_ppo import checkpoint as files
+from baselines.purejaxrl_ppo.checkpoint import FINAL, CheckpointError, Start
 from baselines.purejaxrl_ppo.config import Config, OptionalInt, OptionalPath, settings_in_file
-from baselines.purejaxrl_ppo.resume import FINAL, Start
 from baselines.purejaxrl_ppo.tracking import has_moved, local_uri
 from baselines.purejaxrl_ppo.training import Options, Run, Task, Trainer
 from flytrack_env.messages import error_text
@@ -112,12 +111,12 @@ class Plan(NamedTuple):
 
 def find_starts(resume: Path) -> Resumed:
     """Return what there is to resume in a file or folder; raises CheckpointError if nothing is."""
-    seeds = runs.seeds_in(resume)
-    if not seeds or runs.checkpoints_in(resume):
-        start = runs.newest_intact(resume)
+    seeds = files.seeds_in(resume)
+    if not seeds or files.checkpoints_in(resume):
+        start = files.newest_intact(resume)
         folder = resume if resume.is_dir() else resume.parent
         return Resumed(folder, {start.checkpoint.meta["seed"]: start}, is_single=True)
-    found = {seed: runs.newest_intact(resume / f"seed{seed}") for seed in seeds}
+    found = {seed: files.newest_intact(resume / f"seed{seed}") for seed in seeds}
     seeds = sorted({*seeds, *saved_options(next(iter(found.values()))).seeds})
     return Resumed(resume, {seed: found.get(seed) for seed in seeds}, is_single=False)
 
@@ -143,7 +142,7 @@ def defaults_of(resumed: Resumed) -> Settings:
         track=start.checkpoint.track,
         seed=min(resumed.starts),
         num_seeds=len(resumed.starts),
-        seeds_at_once=runs.seeds_side_by_side(start.checkpoint),
+        seeds_at_once=files.seeds_side_by_side(start.checkpoint),
         run=options._replace(tracking_uri=uri),
         hyperparameters=start.checkpoint.config,
     )
@@ -189,7 +188,7 @@ def make_tasks(settings: Settings, resumed: Resumed | None) -> list[list[Task]]:
     groups = []
     for first in range(0, len(seeds), at_once):
         own = slice(first, first + at_once)
-        pairs = zip(seeds[own], runs.at_common_step(starts[own]), strict=True)
+        pairs = zip(seeds[own], files.at_common_step(starts[own]), strict=True)
         groups.append(
             [Task(out if is_single else out / f"seed{seed}", seed, options, start) for seed, start in pairs]
         )
@@ -206,7 +205,7 @@ def make_trainer(settings: Settings, resumed: Resumed | None) -> Trainer:
     try:
         arguments["model"] = settings.model or model_from_json(checkpoint.meta["model"], "model")
         arguments["missed_gate"] = checkpoint.meta["missed_gate"]
-        arguments["reward"] = runs.rewards_of(checkpoint) | reward
+        arguments["reward"] = files.rewards_of(checkpoint) | reward
         return Trainer(settings.hyperparameters, settings.env_id, **arguments)
     except (ValueError, OverflowError, OSError) as error:
         raise CheckpointError(f"{path}: with its settings and the flags: {error_text(error)}") from error
@@ -234,7 +233,7 @@ def run(plan: Plan) -> None:
 def stopped_text(plan: Plan) -> str:
     """Return the message for a training that was stopped."""
     folder, *others = (one.out for one in plan.runs)
-    if any(runs.checkpoints_in(out) for out in (folder, *others)):
+    if any(files.checkpoints_in(out) for out in (folder, *others)):
         where = folder.parent if others else folder
         return f"stopped at {plan.trainer.steps} steps; continue with --resume {where}"
     return f"stopped at {plan.trainer.steps} steps, before the first checkpoint"

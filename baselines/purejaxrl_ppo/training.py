@@ -4,9 +4,13 @@ Updates run in chunks. Neither their length nor where a run was cut off and resu
 result: the compiled program is one update in a loop whose length is an argument.
 """
 
+import signal
+import threading
 import time
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from types import FrameType
 from typing import Any, NamedTuple
 
 import jax
@@ -15,10 +19,9 @@ import numpy as np
 from tyro.conf import Suppress
 
 import flytrack_env
-from baselines.purejaxrl_ppo import resume
-from baselines.purejaxrl_ppo.checkpoint import Checkpoint, as_named_arrays, load_checkpoint
+from baselines.purejaxrl_ppo import checkpoint as files
+from baselines.purejaxrl_ppo.checkpoint import Checkpoint, Start
 from baselines.purejaxrl_ppo.config import Config, Count
-from baselines.purejaxrl_ppo.interrupts import kept_interrupts
 from baselines.purejaxrl_ppo.metrics import summarise_updates
 from baselines.purejaxrl_ppo.monitor import ProgressLine, evaluate_policy
 from baselines.purejaxrl_ppo.ppo import Algorithm, Runner, make_network_for, make_ppo
@@ -66,7 +69,7 @@ class Task(NamedTuple):
     out: Path
     seed: int
     options: Options
-    start: resume.Start | None = None
+    start: Start | None = None
 
 
 def next_due(update: int, every: int, batch_size: int) -> float:
@@ -177,7 +180,7 @@ class Trainer:
     def train_all(self, asked: list[tuple[Path, int, Options]]) -> list[tuple[Checkpoint, Metrics]]:
         """Train seeds side by side, in one program: as ``train``, for each folder, seed and options."""
         tasks = [
-            Task(out, seed, options, None if options.resume is None else resume.newest_intact(options.resume))
+            Task(out, seed, options, None if options.resume is None else files.newest_intact(options.resume))
             for out, seed, options in asked
         ]
         return self.run(self.prepare(tasks))
@@ -187,9 +190,9 @@ class Trainer:
         runs = [Run(self, task, len(tasks)) for task in tasks]
         for run in runs:
             run.options.check()
-            resume.check_free(run.out, run.start)
+            files.check_free(run.out, run.start)
             if run.start is not None:
-                resume.check_same_run(*run.start, run.description)
+                files.check_same_run(*run.start, run.description)
         return runs
 
     def run(self, runs: list["Run"]) -> list[tuple[Checkpoint, Metrics]]:
@@ -224,7 +227,7 @@ class Run:
         self.error: DivergedError | None = None
         self.status, self.rows = "FAILED", list[Metrics]()
         env_id, track = trainer.env_id, trainer.track
-        self.description = resume.describe_run(trainer.env, env_id, track, self.config, self.seed, num_seeds)
+        self.description = files.describe_run(trainer.env, env_id, track, self.config, self.seed, num_seeds)
         # Parameters are the whole description but the observation's table.
         params = {name: value for name, value in self.description.items() if name != "observation"}
         params["package_version"] = flytrack_env.__version__
@@ -245,20 +248,20 @@ class Run:
             (self.out / RUN_FILE).unlink(missing_ok=True)
             self.runner = self.trainer.start(key)
             return True
-        if self.update == self.config.num_updates and self.start.path.name == resume.FINAL:
+        if self.update == self.config.num_updates and self.start.path.name == files.FINAL:
             if is_tracked:  # it may have been killed before its end was recorded
                 self._begin_tracking()
                 self.tracker.end("FINISHED")
             return False
-        resume.warn_of_other_machine(*self.start, self.description)
-        self.runner = resume.restore_runner(self.start, jax.eval_shape(self.trainer.start, key))
+        files.warn_of_other_machine(*self.start, self.description)
+        self.runner = files.restore_runner(self.start, jax.eval_shape(self.trainer.start, key))
         return True
 
     def begin(self) -> None:
         """Begin or continue the MLflow run, and write the checkpoint of the untrained policy."""
         self._begin_tracking()
         if self.options.checkpoint_every and self.update == 0:
-            self._checkpoint(resume.step_file(0))
+            self._checkpoint(files.step_file(0))
 
     def _begin_tracking(self) -> None:
         self.tracker.begin()
@@ -288,7 +291,7 @@ class Run:
                 f"{self.config.learning_rate:g})"
             )
         elif not is_last and self._is_due(options.checkpoint_every):
-            self._checkpoint(resume.step_file(self.steps))
+            self._checkpoint(files.step_file(self.steps))
 
     def _is_due(self, every: int) -> bool:
         return is_due(self.update, every, self.config.batch_size)
@@ -310,13 +313,13 @@ class Run:
 
     def complete(self) -> None:
         """Write the final checkpoint."""
-        self._checkpoint(resume.FINAL)
+        self._checkpoint(files.FINAL)
         self.status = "FINISHED"
 
     def result(self) -> tuple[Checkpoint, Metrics]:
         """Return the final checkpoint, and the metrics of every update made here."""
         metrics = jax.tree.map(lambda *parts: np.concatenate(parts), *self.rows) if self.rows else {}
-        return load_checkpoint(self.out / resume.FINAL), metrics
+        return files.load_checkpoint(self.out / files.FINAL), metrics
 
     def _checkpoint(self, name: str) -> None:
         path = self.out / name
@@ -328,7 +331,7 @@ class Run:
             "options": {name: value for name, value in self.options._asdict().items() if name != "resume"},
         }
         self.tracker.flush()
-        resume.save_run(path, self.runner, self.config, {**self.description, **progress})
+        files.save_run(path, self.runner, self.config, {**self.description, **progress})
         self.last_good = path
         self.tracker.file(path, "checkpoints")
 
@@ -336,8 +339,37 @@ class Run:
 def find_not_finite(metrics: Metrics, policy_params: Any) -> list[str]:
     """Return the names of metrics and parameters that are not finite, and should be."""
     arrays = {name: row for name, row in metrics.items() if name != MAY_BE_UNDEFINED}
-    arrays |= as_named_arrays(policy_params)
+    arrays |= files.as_named_arrays(policy_params)
     return [name for name, array in arrays.items() if not np.isfinite(array).all()]
+
+
+@contextmanager
+def kept_interrupts() -> Iterator[Callable[[], None]]:
+    """Raise KeyboardInterrupt at once, as ever, and again from the function given, if that was lost.
+
+    Python drops an exception that is raised in a destructor or a collector's hook.
+
+    Nothing is changed where signals cannot be handled: in a thread, or where the caller ignores them.
+    """
+    is_interrupted = threading.Event()
+
+    def interrupt(number: int, frame: FrameType | None) -> None:
+        is_interrupted.set()
+        raise KeyboardInterrupt
+
+    def check() -> None:
+        if is_interrupted.is_set():
+            raise KeyboardInterrupt
+
+    is_main = threading.current_thread() is threading.main_thread()
+    if not is_main or signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
+        yield check
+        return
+    signal.signal(signal.SIGINT, interrupt)
+    try:
+        yield check
+    finally:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 def train_group(trainer: Trainer, runs: list[Run], check_interrupt: Callable[[], None]) -> None:

@@ -9,7 +9,7 @@ import jax
 import numpy as np
 import pytest
 
-from baselines.purejaxrl_ppo.density import count_positions, draw_position_density
+from baselines.purejaxrl_ppo.monitor import count_positions, draw_position_density
 from flytrack.cli import main
 from flytrack_env import blackbox, load_model, load_track
 from flytrack_env.rollout import load_rollout

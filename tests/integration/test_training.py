@@ -14,11 +14,11 @@ import numpy as np
 import pytest
 
 from baselines.purejaxrl_ppo import CheckpointError, load_checkpoint, monitor
-from baselines.purejaxrl_ppo.checkpoint import save_checkpoint
-from baselines.purejaxrl_ppo.resume import (
+from baselines.purejaxrl_ppo.checkpoint import (
     at_common_step,
     checkpoints_in,
     newest_intact,
+    save_checkpoint,
     warn_of_other_machine,
 )
 from baselines.purejaxrl_ppo.training import DivergedError, Options, Run

@@ -7,9 +7,8 @@ import jax
 import jax.numpy as jnp
 
 from baselines.purejaxrl_ppo import Config
-from baselines.purejaxrl_ppo.checkpoint import save_checkpoint
+from baselines.purejaxrl_ppo.checkpoint import describe_run, save_checkpoint
 from baselines.purejaxrl_ppo.networks import make_network
-from baselines.purejaxrl_ppo.resume import describe_run
 from flytrack.cli import main
 from flytrack_env import make, nominal_parameters
 from flytrack_env.dynamics import ModelParameters

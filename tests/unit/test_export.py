@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 
 from baselines.purejaxrl_ppo import Config, export, load_checkpoint, make_network
-from baselines.purejaxrl_ppo.checkpoint import save_checkpoint
+from baselines.purejaxrl_ppo.checkpoint import describe_run, save_checkpoint
 from baselines.purejaxrl_ppo.export import main, policy_of
-from baselines.purejaxrl_ppo.resume import describe_run
 from benchmarks.export import CompiledPolicy, states_in_box
 from flytrack_env import make
 from flytrack_env.dynamics import lag
