@@ -16,8 +16,7 @@ from typing import NamedTuple
 import numpy as np
 
 from benchmarks.real import gecko, nanobench, payload
-from benchmarks.real.crazyflie import DATA, FOLDER, LINES, VARIABLE, flights
-from benchmarks.real.page import crazyflie_part
+from benchmarks.real.crazyflie import DATA, FOLDER, LINES, VARIABLE, crazyflie_part, flights
 from benchmarks.real.record import Record, diagnosed, imported
 from benchmarks.real.section import draw, section
 from benchmarks.report import RESULTS, ROOT, command, write_json

@@ -73,8 +73,7 @@ def optimise(track: Track, kind: str, model: ModelParameters, model_name: str) -
     """
     import casadi  # an extra, needed only here
 
-    from benchmarks.optimal.problem import CLEARANCE_M, SMOOTHING_S, Task
-    from benchmarks.optimal.solve import find_optimum
+    from benchmarks.optimal.solve import CLEARANCE_M, SMOOTHING_S, Task, find_optimum
 
     env = FlyTrack(track=track, model=model)
     params = env.default_params

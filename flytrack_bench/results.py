@@ -12,7 +12,7 @@ from baselines.purejaxrl_ppo.flights import fly_many, race_many, score, start_ke
 from baselines.purejaxrl_ppo.race_env import with_model_as_given
 from flytrack_bench.policies import Policy
 from flytrack_bench.suite import Suite, Task
-from flytrack_loop.flight_log import BATCH, log_of_flights
+from flytrack_loop.stages import BATCH, log_of_flights
 from flytrack_sysid import FlightLog
 
 SCHEMA = 1

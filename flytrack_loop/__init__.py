@@ -1,8 +1,7 @@
 """From what a simulation gets wrong to a better policy: fly, diagnose it, extend, retrain, fly again."""
 
-from flytrack_loop.flight_log import fly_log
 from flytrack_loop.loop import Loop, Settings, close_loop
-from flytrack_loop.stages import Errors, Gap, Stage, errors_of, race, train_stage
+from flytrack_loop.stages import Errors, Gap, Stage, errors_of, fly_log, race, train_stage
 
 __all__ = [
     "Errors",

@@ -13,8 +13,7 @@ from flytrack_env import ModelParameters, nominal_parameters, save_model
 from flytrack_env.files import write_atomically
 from flytrack_env.plants import Plant
 from flytrack_env.progress import ProgressBar
-from flytrack_loop.flight_log import fly_log
-from flytrack_loop.stages import Stage, errors_of, stage_as_json, train_stage
+from flytrack_loop.stages import Stage, errors_of, fly_log, stage_as_json, train_stage
 from flytrack_sysid import Diagnosis, FlightLog, collect, diagnose, fit, save_log
 from flytrack_sysid.diagnosis import joined, motion_of, text_of, write_diagnosis
 from flytrack_sysid.log import usual_step

@@ -9,17 +9,20 @@ benchmarks/data/real/crazyflie.jsonl. ``--fits`` fits one structure to the fligh
 instead, to crazyflie_fits.json beside it. ``python -m benchmarks.real_logs`` writes the page.
 """
 
+import json
 import os
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from itertools import combinations
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 
+from benchmarks import report
 from benchmarks.real.black_boxes import base_steps, flown, linear_ones, network, rows_of
-from benchmarks.report import ROOT, append_line, command, commit_of_checkout, lines_in, progress, write_json
+from benchmarks.report import ROOT, table
 from flytrack_env.dynamics import ModelParameters
 from flytrack_env.motion import Motion
 from flytrack_sysid import FlightLog, import_log
@@ -31,7 +34,7 @@ from flytrack_sysid.diagnosis.problem import Problem
 from flytrack_sysid.diagnosis.score_test import CANDIDATES
 from flytrack_sysid.diagnosis.search import SearchState
 from flytrack_sysid.parameters import STICKS, TAUS, THRUST_COEFFS, from_vector
-from flytrack_sysid.prediction_windows import make_windows
+from flytrack_sysid.prediction_windows import HORIZONS_S, QUANTITIES, make_windows
 from flytrack_sysid.response import SMALL_STEP, half_responses
 
 VARIABLE, FOLDER = "FLYTRACK_SHARED_DATA", "crazyflie_rate_flights"
@@ -43,6 +46,19 @@ SECONDS = 10.0  # learnt from of each policy: 100 s in all
 SPACING_S, MOST = 0.25, 10_000
 FEWEST_ROWS = 2000  # of a policy, to fit it alone
 MAPPING = "crazyflie_phoenix"
+FIGURES = (("attitude", 0.1, 0.70), ("attitude", 0.25, 0.83), ("position", 0.5, 0.80))
+BLACK_BOXES = {
+    "fir": "FIR, linear in the commands of 0.3 s",
+    "arx": "ARX, linear in commands and its own rates",
+    "network": "network on top of the refitted base",
+}
+OTHERS = {
+    "refitted_to_flights": "the base alone, fitted to flights too",
+    "placebo": "placebo: the state at the start, no commands",
+}
+AS_GOOD = 1.005  # rounds to 1.00
+WITHIN_MS = 5.0  # times to half response
+Line = dict[str, Any]
 
 
 def policies_in(folder: Path) -> list[str]:
@@ -159,7 +175,7 @@ def by_flight(results: dict[str, refinement.Tested], segment: np.ndarray) -> dic
 def fits_of(folder: Path, structure: Sequence[str], start: dict[str, float]) -> list[dict[str, Any]]:
     """Return values of one structure and times to half response, of the flights of each policy alone."""
     result = []
-    for policy in progress(policies_in(folder), "policies"):
+    for policy in report.progress(policies_in(folder), "policies"):
         log, model = flights(folder, [policy])
         every = np.ones(len(log), bool)
         if len(log) < FEWEST_ROWS:
@@ -182,21 +198,132 @@ def fits_of(folder: Path, structure: Sequence[str], start: dict[str, float]) -> 
     return result
 
 
+# Its part of the page
+
+
+def lines_of() -> list[Line]:
+    """Return the last line of each policy, by policy; none where nothing was measured."""
+    last = {line["policy"]: line for line in report.lines_in(LINES)}
+    return [last[policy] for policy in sorted(last)]
+
+
+def ratios(line: Line, model: str) -> np.ndarray:
+    """Return a model's rms errors over the refitted base's, (horizons, quantities)."""
+    return np.array(line["rms"][model]) / np.array(line["rms"]["refitted_base"])
+
+
+def _cell(quantity: str, horizon_s: float) -> tuple[int, int]:
+    return HORIZONS_S.index(horizon_s), QUANTITIES.index(quantity)
+
+
+def _median(lines: list[Line], value: Callable[[Line], np.ndarray]) -> np.ndarray:
+    return np.median(np.stack([value(line) for line in lines]), axis=0)
+
+
+def figures_table(lines: list[Line]) -> str:
+    """Return the asked figures: medians over policies, and the same over the best black box."""
+    rows = []
+    for quantity, horizon, asked in FIGURES:
+        cell = _cell(quantity, horizon)
+        own = _median(lines, lambda line: ratios(line, "extended"))[cell]
+        boxes = [_median(lines, lambda line: ratios(line, name))[cell] for name in BLACK_BOXES]  # noqa: B023
+        cells = [f"{value:.2f}" for value in (*boxes, own / min(boxes))]
+        rows.append([f"{quantity} after {horizon:g} s", f"{own:.2f}", f"<= {asked:.2f}", *cells])
+    header = ["rms error over the refitted base's, median", "extended", "asked", *BLACK_BOXES]
+    return table([*header, "extended over the best"], rows)
+
+
+def horizons_table(lines: list[Line]) -> str:
+    """Return the medians over policies at all horizons, of all models."""
+    names = {"extended": "extended model", **OTHERS, **BLACK_BOXES}
+    rows = []
+    for quantity in QUANTITIES:
+        for name, words in names.items():
+            found = [line for line in lines if name in line["rms"]]
+            if found:
+                middle = _median(found, lambda line: ratios(line, name))[:, QUANTITIES.index(quantity)]  # noqa: B023
+                rows.append([quantity, words, *(f"{value:.2f}" for value in middle)])
+    return table(["error of", "model", *(f"{horizon:g} s" for horizon in HORIZONS_S)], rows)
+
+
+def policies_table(lines: list[Line]) -> str:
+    """Return what stayed in the model of each fold, and how the left-out policy is predicted."""
+    rows = []
+    for line in lines:
+        found = ratios(line, "extended")
+        flights = np.concatenate([np.ravel(one) for one in line["by_flight"].values()])
+        flights = flights[flights > 0.0]
+        cells = [f"{found[_cell(quantity, horizon)]:.2f}" for quantity, horizon, _ in FIGURES]
+        worse = f"{np.sum(flights > AS_GOOD)} of {len(flights)}"
+        kept = ", ".join(f"`{name}`" for name in line["kept"]) or "none: the refitted base"
+        rows.append([line["policy"], kept, *cells, f"{np.nanmax(found):.2f}", worse, f"{line['cpu_s']:.0f}"])
+    heads = [f"{quantity} {horizon:g} s" for quantity, horizon, _ in FIGURES]
+    header = ["left-out policy", "effects that stay", *heads, "largest of all cells"]
+    return table([*header, "cells worse, by flight", "CPU s"], rows)
+
+
+def fits_part() -> str:
+    """Return the values of one structure fitted to the flights of each policy, and whether they agree."""
+    if not FITS.exists():
+        return ""
+    fits = json.loads(FITS.read_text(encoding="utf-8"))
+    rows = []
+    for name in fits[0]["values"]:
+        if "." not in name and not name.startswith("tau"):
+            continue
+        pairs = [one["values"][name] for one in fits]
+        agree = [abs(a - b) <= first + second for (a, first), (b, second) in combinations(pairs, 2)]
+        values = [f"{value:.3g} ± {half:.2g}" for value, half in pairs]
+        rows.append([f"`{name}`", *values, f"{sum(agree)} of {len(agree)}"])
+    for stick in fits[0]["half_response_s"]:
+        times_ms = np.array([1e3 * one["half_response_s"][stick] for one in fits])
+        agree = [abs(a - b) <= WITHIN_MS for a, b in combinations(times_ms, 2)]
+        cells = [f"{time:.1f} ms" for time in times_ms]
+        rows.append([f"half response, {stick}", *cells, f"{sum(agree)} of {len(agree)}"])
+    heads = [f"policy {one['policy']}" for one in fits]
+    return table(["parameter", *heads, f"pairs that overlap (times: within {WITHIN_MS:g} ms)"], rows)
+
+
+def crazyflie_part() -> str:
+    """Return the part of the page; nothing where nothing was measured."""
+    lines = lines_of()
+    if not lines:
+        return ""
+    num_flights = sum(len(line["by_flight"]) for line in lines)
+    parts = [
+        "### Policies left out",
+        f"{len(lines)} policies, {num_flights} flights; each is judged by models that were learnt from the "
+        "others (`python -m benchmarks.real.crazyflie`). Free flights start from measured states every "
+        "0.25 s. Numbers are errors over those of the refitted base, the model that a user gets without any "
+        "effect: below 1 is better.",
+        figures_table(lines),
+        horizons_table(lines),
+        policies_table(lines),
+    ]
+    fitted = fits_part()
+    if fitted:
+        parts += [
+            "One structure fitted to the flights of each policy alone (`--fits`), 95 % intervals:",
+            fitted,
+        ]
+    return "\n\n".join(parts)
+
+
 def main(data: Path = DATA, policies: str = "", seconds: float = SECONDS, fits: bool = False) -> None:
     """Refine and judge for each policy, all by default, or fit each policy's flights alone."""
     folder = data / FOLDER
     LINES.parent.mkdir(parents=True, exist_ok=True)
     with jax.enable_x64(True):
         if fits:
-            last = lines_in(LINES)[-1]
+            last = report.lines_in(LINES)[-1]
             start = {name: value for name, (value, _) in last["values"].items()}
-            write_json(FITS, fits_of(folder, last["kept"], start))
+            report.write_json(FITS, fits_of(folder, last["kept"], start))
             return
-        commit = commit_of_checkout()  # before its lines change a file
+        commit = report.commit_of_checkout()  # before its lines change a file
         wanted = policies.split(",") if policies else policies_in(folder)
-        for policy in progress(wanted, "policies"):
-            append_line(LINES, {"commit": commit, **fold(folder, policy, seconds)})
+        for policy in report.progress(wanted, "policies"):
+            report.append_line(LINES, {"commit": commit, **fold(folder, policy, seconds)})
 
 
 if __name__ == "__main__":
-    command(main)
+    report.command(main)

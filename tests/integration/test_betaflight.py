@@ -14,7 +14,7 @@ pytest.importorskip("firmware", reason="firmware/ is in clones only")
 
 import flytrack_env
 from firmware import Betaflight, Body, FirmwareError, build
-from firmware.checking import check
+from firmware.__main__ import check
 from flytrack_env.dynamics import ModelParameters, move, nominal_parameters
 from flytrack_env.effects import BetaflightLoop, effect_of, start_memories
 from flytrack_env.state import ACCELERATION, BATTERY, RATES, Action, pack, unpack, unpack_action

@@ -13,8 +13,7 @@ from benchmarks.loop.plants import draw_plant, plant_of
 from flytrack.cli import main
 from flytrack_env import blackbox, nominal_parameters
 from flytrack_loop import Gap, errors_of
-from flytrack_loop.flight_log import log_of_flights
-from flytrack_loop.stages import measure_gap
+from flytrack_loop.stages import log_of_flights, measure_gap
 
 
 @pytest.fixture(scope="module")
