@@ -3,6 +3,7 @@
 import dataclasses
 import sys
 from collections.abc import Sequence
+from itertools import chain
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple, NoReturn
 
@@ -97,16 +98,7 @@ class Resumed(NamedTuple):
         return next(start for start in self.starts.values() if start is not None)
 
 
-class Plan(NamedTuple):
-    """A checked command: the trainer, and the runs, those that train side by side together."""
-
-    trainer: Trainer
-    groups: list[list[Run]]
-
-    @property
-    def runs(self) -> list[Run]:
-        """All runs."""
-        return [run for group in self.groups for run in group]
+Plan = tuple[Trainer, list[list[Run]]]  # the runs that train side by side together
 
 
 def find_starts(resume: Path) -> Resumed:
@@ -216,27 +208,29 @@ def make_plan(words: Sequence[str]) -> Plan:
     settings, resumed = parse(words)
     groups = make_tasks(settings, resumed)
     trainer = make_trainer(settings, resumed)
-    return Plan(trainer, [trainer.prepare(tasks) for tasks in groups])
+    return trainer, [trainer.prepare(tasks) for tasks in groups]
 
 
 def run(plan: Plan) -> None:
     """Train every seed; print where it continues from and where its checkpoint is."""
-    for one in plan.runs:
+    trainer, groups = plan
+    for one in chain(*groups):
         if one.start is not None:
             print(f"seed {one.seed}: from step {one.steps}, {one.start.path}")
-    for group in plan.groups:
-        for one, (checkpoint, _) in zip(group, plan.trainer.run(group), strict=True):
+    for group in groups:
+        for one, (checkpoint, _) in zip(group, trainer.run(group), strict=True):
             meta = checkpoint.meta
             print(f"seed {one.seed}: {meta['steps']} steps in {meta['seconds']} s: {one.out / FINAL}")
 
 
 def stopped_text(plan: Plan) -> str:
     """Return the message for a training that was stopped."""
-    folder, *others = (one.out for one in plan.runs)
+    trainer, groups = plan
+    folder, *others = (one.out for one in chain(*groups))
     if any(files.checkpoints_in(out) for out in (folder, *others)):
         where = folder.parent if others else folder
-        return f"stopped at {plan.trainer.steps} steps; continue with --resume {where}"
-    return f"stopped at {plan.trainer.steps} steps, before the first checkpoint"
+        return f"stopped at {trainer.steps} steps; continue with --resume {where}"
+    return f"stopped at {trainer.steps} steps, before the first checkpoint"
 
 
 def leave(status: int, text: str) -> NoReturn:

@@ -9,6 +9,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from types import FrameType
 from typing import Any, NamedTuple
@@ -104,16 +105,6 @@ def make_chunk(ppo: Algorithm, most: int) -> Callable[[Runner, jax.Array], tuple
     return jax.jit(chunk)
 
 
-def with_strong_types(runner: Runner) -> Runner:
-    """Return the state with JAX's weak types made strong, as they come from a file: one program for both."""
-
-    def strong(leaf: Any) -> jax.Array:
-        leaf = jnp.asarray(leaf)
-        return leaf if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key) else jnp.asarray(leaf, leaf.dtype)
-
-    return jax.tree.map(strong, runner)
-
-
 def training_params(env: EpisodicEnvironment, config: Config) -> EnvParams:
     """Return the parameters to train with: short episodes, and a drone that is thicker than in the race."""
     params = env.default_params
@@ -161,7 +152,9 @@ class Trainer:
         ppo = make_ppo(self.env, params, config)
         self.network = make_network_for(self.env, params, config)
         self.most = max(1, CHUNK_STEPS // config.batch_size)
-        self.start = jax.jit(lambda key: with_strong_types(ppo.start(key)))
+        # Weak types become strong ones, as they come from a file: one program for both.
+        strong = partial(jax.tree.map, lambda leaf: jnp.asarray(leaf).astype(jnp.asarray(leaf).dtype))
+        self.start = jax.jit(lambda key: strong(ppo.start(key)))
         self.chunk = make_chunk(ppo, self.most)
         self.chunk_of_many = jax.jit(jax.vmap(self.chunk, in_axes=(0, None)))
 
