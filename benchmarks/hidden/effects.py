@@ -12,13 +12,15 @@ from collections import deque
 from collections.abc import Callable, Mapping
 from typing import Any
 
+from scipy.optimize import brentq
+
 from benchmarks.hidden.truth import STICKS
 from benchmarks.hidden.vectors import Vector, to_body
 
 Parameters = Mapping[str, float]
 Sticks = tuple[float, float, float, float]
 Hook = Callable[[Any, Any], Any]
-BISECTIONS = 60  # halve an interval down to rounding
+TINY, LARGE = 1e-3, 1e3  # between which the bend of a saturation is searched
 LIFT_SPEED = 8.0  # m/s, airspeed at which translational lift has 1 - 1/e of its gain
 AIR_VELOCITY = ("v_x", "v_y", "v_z")  # of wind, m/s
 
@@ -61,24 +63,14 @@ def _rate_scale(values: Parameters) -> Hook:
     return lambda plant, rates: (roll * rates[0], pitch * rates[1], yaw * rates[2])
 
 
-def _bend(lost: float) -> float:
-    """Return the x above 0 at which tanh(x) / x is 1 - lost, by bisection."""
-    low, high = 0.0, 1.0
-    while math.tanh(high) / high > 1.0 - lost:
-        high *= 2.0
-    for _ in range(BISECTIONS):
-        middle = 0.5 * (low + high)
-        is_low = math.tanh(middle) / middle > 1.0 - lost
-        low, high = (middle, high) if is_low else (low, middle)
-    return high
-
-
 def _rate_saturation(values: Parameters) -> Hook:
     """u = limit tanh(u / limit), u a rate stick; each axis lacks its own share of u at full stick.
 
     Not the package's law, which mixes a hard limit with a gradual one of another shape.
     """
-    bends = tuple(_bend(values[axis]) for axis in STICKS)
+    # At a bend x, tanh(x) / x is what is left.
+    left = (1.0 - values[axis] for axis in STICKS)
+    bends = [brentq(lambda x, share: math.tanh(x) - share * x, TINY, LARGE, share) for share in left]
 
     def act(plant: Any, sticks: Sticks) -> Sticks:
         pairs = zip(sticks, bends, strict=False)

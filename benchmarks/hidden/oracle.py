@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import jax
 import numpy as np
-from scipy import signal
+from scipy import optimize, signal
 
 from benchmarks.hidden.noise import DIGIT, STD
 from benchmarks.hidden.plant import SECONDS_PER_MINUTE
@@ -28,7 +28,6 @@ from flytrack_sysid.parameters import THRUST_COEFFS
 
 TURNED_MS2 = 10.0  # about the thrust that attitude noise turns
 NO_DISTURBANCE, ANY_TAU, COUPLED = np.log(1e-3), np.log(0.3), 0.0
-NUDGE = 1e-3  # of lags, relative
 FIRST_ROW = 100  # before it, lags depend on commands from before the log
 SCALES = np.array([STD["f"]] * 3 + [STD["w"]] * 3 + [DIGIT["v_bat"]])
 
@@ -148,42 +147,21 @@ def removed(clean: FlightLog, base: ModelParameters, extended: ModelParameters) 
 # How visible an effect outside the list is, which has no law to fit
 
 
-def _applied(log: FlightLog, tau: np.ndarray) -> np.ndarray:
-    """Return the applied action in the step to each row, (num_rows, 4), started at the first command."""
-    sticks = np.vstack([log["u"][:1], log["u"][:-1]])
-    step_s, columns = log.time[1] - log.time[0], []
+def _expected(truth: Truth, log: FlightLog, tau: np.ndarray, coeffs: np.ndarray) -> np.ndarray:
+    """Return specific force, body rates and voltage of the plant without effects, (num_rows, 7).
+
+    tau, coeffs: lags, s, from the first command on, and coefficients of thrust, in place of the truth's.
+    """
+    sticks, step_s, applied = np.vstack([log["u"][:1], log["u"][:-1]]), log.time[1] - log.time[0], []
     for column, keep in zip(sticks.T, np.exp(-step_s / tau), strict=True):
-        columns.append(signal.lfilter([1.0 - keep], [1.0, -keep], column, zi=[keep * column[0]])[0])
-    return np.stack(columns, axis=1)
-
-
-def _terms(log: FlightLog, stick: np.ndarray) -> np.ndarray:
-    """Return what the coefficients of thrust multiply, (num_rows, 6)."""
-    volt = np.concatenate([log["v_bat"][:1, 0], log["v_bat"][:-1, 0]])
-    return np.stack([stick**0, stick, stick**2, stick**3, volt, stick * volt], axis=1)
-
-
-def _expected(truth: Truth, log: FlightLog, tau: np.ndarray) -> np.ndarray:
-    """Return specific force, body rates and voltage of the plant without effects, (num_rows, 7)."""
-    applied = _applied(log, tau)
+        applied.append(signal.lfilter([1.0 - keep], [1.0, -keep], column, zi=[keep * column[0]])[0])
+    stick, volt = applied[3], np.concatenate([log["v_bat"][:1, 0], log["v_bat"][:-1, 0]])
     expected = np.zeros((len(log), len(SCALES)))
-    expected[:, 2] = _terms(log, applied[:, 3]) @ np.array(truth.coeffs) / truth.mass
-    expected[:, 3:6] = np.radians(truth.max_rate) * applied[:, :3]
+    terms = np.stack([stick**0, stick, stick**2, stick**3, volt, stick * volt])
+    expected[:, 2] = coeffs @ terms / truth.mass
+    expected[:, 3:6] = np.radians(truth.max_rate) * np.stack(applied[:3], axis=1)
     expected[:, 6] = log["v_bat"][0, 0] - truth.drain / SECONDS_PER_MINUTE * log.time
     return expected
-
-
-def _jacobian(truth: Truth, log: FlightLog) -> np.ndarray:
-    """Return derivatives by the lags and the thrust coefficients, (columns, num_rows, 7)."""
-    tau = np.array(truth.tau)
-    plain, slopes = _expected(truth, log, tau), []
-    for axis in range(len(tau)):
-        other = np.where(np.arange(len(tau)) == axis, tau * (1.0 + NUDGE), tau)
-        slopes.append((_expected(truth, log, other) - plain) / NUDGE)
-    for term in _terms(log, _applied(log, tau)[:, 3]).T:
-        slopes.append(np.zeros_like(plain))
-        slopes[-1][:, 2] = term
-    return np.stack(slopes)
 
 
 def signal_to_noise(truth: Truth, log: FlightLog) -> float:
@@ -194,8 +172,11 @@ def signal_to_noise(truth: Truth, log: FlightLog) -> float:
     knows their shape. Position, velocity and attitude are not used and would show more of some effects.
     Only what other lags and another thrust curve cannot explain counts. log: clean, from ``fly``.
     """
-    missing = np.column_stack([log["f"], log["w"], log["v_bat"]]) - _expected(truth, log, np.array(truth.tau))
-    missing = (missing / SCALES)[FIRST_ROW:].ravel()
-    design = (_jacobian(truth, log) / SCALES)[:, FIRST_ROW:].reshape(-1, len(missing)).T
-    missing = missing - design @ np.linalg.lstsq(design, missing, rcond=None)[0]
-    return float(np.sqrt(missing @ missing))
+    measured = np.column_stack([log["f"], log["w"], log["v_bat"]])
+
+    def missing(change: np.ndarray) -> np.ndarray:
+        tau, coeffs = truth.tau * np.exp(change[:4]), truth.coeffs + change[4:]
+        return ((measured - _expected(truth, log, tau, coeffs)) / SCALES)[FIRST_ROW:].ravel()
+
+    fit = optimize.least_squares(missing, np.zeros(10), method="lm")
+    return float(np.sqrt(2.0 * fit.cost))

@@ -341,10 +341,9 @@ def first_guess(task: Task, counts: np.ndarray, speed_m_s: float, heading_rad: f
     return Guess(states, commands, steps_s, np.ones(len(counts)))
 
 
-def resample(flight: Guess, counts: np.ndarray, new_counts: np.ndarray) -> Guess:
-    """Return a flight resampled to other numbers of steps of each segment, over the same times."""
+def resample(flight: Guess, counts: np.ndarray, new_counts: np.ndarray, steps_s: np.ndarray) -> Guess:
+    """Return a flight resampled to other numbers and lengths of steps of each segment."""
     old = np.concatenate([[0.0], np.cumsum(np.repeat(flight.steps_s, counts))])
-    steps_s = flight.steps_s * counts / new_counts
     new = np.concatenate([[0.0], np.cumsum(np.repeat(steps_s, new_counts))])
     states = np.stack([np.interp(new, old, column) for column in flight.states.T], axis=1)
     states[:, layout.QUATERNION] /= np.linalg.norm(states[:, layout.QUATERNION], axis=1, keepdims=True)
@@ -388,7 +387,8 @@ class _Search:
     def fine(self, flight: Guess, counts: np.ndarray) -> tuple[Solution, np.ndarray]:
         """Return the optimum with free segment times, steps of about ``dt_s``."""
         new_counts = np.round(counts * flight.steps_s / self.dt_s).astype(int)
-        found = self.solve(resample(flight, counts, new_counts), new_counts, False, FINE)
+        guess = resample(flight, counts, new_counts, flight.steps_s * counts / new_counts)
+        found = self.solve(guess, new_counts, False, FINE)
         if not found.is_solved:
             raise UnsolvedError(f"{self.task.kind}: free segment times: {found.status}")
         return found, new_counts
@@ -399,7 +399,8 @@ class _Search:
         Gates at an end of their step move to the next one, as long as that is new and can be solved.
         """
         nodes = np.ceil(flight.times(counts) / self.dt_s).astype(int)
-        guess = _held(flight, counts, nodes, self.dt_s)
+        guess = resample(flight, counts, np.diff(nodes, prepend=0), np.full(len(nodes), self.dt_s))
+        guess = guess._replace(fractions=flight.times(counts) / self.dt_s - (nodes - 1))
         seen: dict[tuple[int, ...], tuple[float, Solution, np.ndarray]] = {}
         while tuple(nodes) not in seen and len(seen) < MOST_SHIFTS:
             steps = np.diff(nodes, prepend=0)
@@ -414,16 +415,6 @@ class _Search:
             raise UnsolvedError(f"{self.task.kind}: steps of {self.dt_s} s: {found.status}")
         _, best, steps = min(seen.values(), key=lambda entry: entry[0])
         return best, steps
-
-
-def _held(flight: Guess, counts: np.ndarray, nodes: np.ndarray, dt_s: float) -> Guess:
-    """Return a flight of free segment times resampled to steps of dt_s, segments ending at these nodes."""
-    old = np.concatenate([[0.0], np.cumsum(np.repeat(flight.steps_s, counts))])
-    new = dt_s * np.arange(nodes[-1] + 1)
-    states = np.stack([np.interp(new, old, column) for column in flight.states.T], axis=1)
-    held = np.clip(np.searchsorted(old, new[:-1] + 0.5 * dt_s, side="right") - 1, 0, len(flight.commands) - 1)
-    fractions = flight.times(counts) / dt_s - (nodes - 1)
-    return Guess(states, flight.commands[held], np.full(len(counts), dt_s), fractions)
 
 
 def _shifts(fractions: np.ndarray) -> np.ndarray:
