@@ -2,8 +2,7 @@
 
 import numpy as np
 
-from benchmarks.hidden.pilot import Pilot
-from benchmarks.hidden.plans import Moment, plan
+from benchmarks.hidden.pilot import Moment, Pilot, plan
 from benchmarks.hidden.plant import SAME_S, Plant, Start
 from benchmarks.hidden.truth import DT_S, Truth
 from benchmarks.hidden.vectors import Vector
