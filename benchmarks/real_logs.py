@@ -17,8 +17,7 @@ import numpy as np
 
 from benchmarks.real import gecko, nanobench, payload
 from benchmarks.real.crazyflie import DATA, FOLDER, LINES, VARIABLE, crazyflie_part, flights
-from benchmarks.real.record import Record, diagnosed, imported
-from benchmarks.real.section import draw, section
+from benchmarks.real.section import Record, diagnosed, draw, imported, section
 from benchmarks.report import RESULTS, ROOT, command, write_json
 from flytrack_env.files import write_atomically
 from flytrack_env.pictures.drawing import png_of

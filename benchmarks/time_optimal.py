@@ -6,29 +6,28 @@ needs no solver. In Python: ``flytrack_env.references.shipped_reference("flytrac
 """
 
 import sys
+from functools import cache
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+import flytrack_env
 from benchmarks import report
-from benchmarks.optimal.replay import Replay, replay
-from flytrack_env import FlyTrack, ModelParameters, Track, available_tracks, blackbox, load_model, load_track
+from flytrack_env import EnvParams, EnvState, FlyTrack, ModelParameters, Track, blackbox
 from flytrack_env import nominal_parameters as nominal
+from flytrack_env import references as files
 from flytrack_env import state as layout
 from flytrack_env.dynamics import SECONDS_PER_MINUTE, step
 from flytrack_env.files import write_atomically
-from flytrack_env.references import (
-    FOLDER,
-    Reference,
-    ReferenceFileError,
-    load_reference,
-    save_reference,
-    track_digest,
-)
+from flytrack_env.plants import Plant
+from flytrack_env.quaternion import Vec3
+from flytrack_env.references import Reference
 from flytrack_env.resets import STILL_THRUST
+from flytrack_env.state import pack, unpack, unpack_action
+from flytrack_env.tracks import cross_gate
 
 NOMINAL, BLACK_BOX = "nominal", "black_box"
 LARGEST_ERROR_S = 1e-3  # s, of the replay's time
@@ -92,7 +91,7 @@ def optimise(track: Track, kind: str, model: ModelParameters, model_name: str) -
     }
     return Reference(
         track=track.name,
-        track_sha256=track_digest(track),
+        track_sha256=files.track_digest(track),
         kind=kind,
         model_name=model_name,
         model=model,
@@ -102,6 +101,78 @@ def optimise(track: Track, kind: str, model: ModelParameters, model_name: str) -
         commands=optimum.flight.commands,
         gate_times_s=optimum.gate_times_s,
         found=optimum.found | about,
+    )
+
+
+class Replay(NamedTuple):
+    """The outcome of a reference's commands.
+
+    states: (N + 1, 21), float32. gates_passed: in order, by the environment. time_s: to the last gate as the
+    environment interpolates it, NaN if it was not passed. ended_by: causes of termination. drift_m: largest
+    distance from the reference. frames_touched: of all gates, also those that were not next.
+    """
+
+    states: np.ndarray
+    gates_passed: int
+    time_s: float
+    ended_by: tuple[str, ...]
+    drift_m: float
+    frames_touched: int
+
+
+@cache
+def _environment(plant: Plant | None) -> tuple[FlyTrack, Any]:
+    """Return the environment and its compiled step, shared by all tracks and models of one form."""
+    env = FlyTrack(plant=plant)
+
+    def fly(state: EnvState, command: jax.Array, params: EnvParams) -> tuple[EnvState, Any]:
+        after, _, causes, _ = env.transition(state, unpack_action(command), params)
+        return after, (pack(env.drone(after)), causes, env.race(after))
+
+    return env, jax.jit(fly)
+
+
+def _params(track: Track, model: ModelParameters, dt_s: float) -> EnvParams:
+    model = jax.tree.map(lambda leaf: np.asarray(leaf, np.float32), model)
+    params = FlyTrack(track=track, model=model).default_params.replace(dt=dt_s)
+    return jax.device_put(params)  # once, not in every step
+
+
+def _frames_touched(positions: np.ndarray, params: EnvParams) -> int:
+    """Return the number of gates whose frames the lines between positions, (N, 3), touch."""
+    lines = (
+        Vec3(*(jnp.asarray(axis)[:, None] for axis in ends.T)) for ends in (positions[:-1], positions[1:])
+    )
+    crossing = cross_gate(params.course.gates, *lines, params.drone_radius)
+    return int(np.asarray(crossing.is_frame).any(axis=0).sum())
+
+
+def replay(reference: Reference, track: Track, plant: Plant | None = None) -> Replay:
+    """Return how a reference's commands fly, open loop, as judged by the environment.
+
+    The environment is that of ``FlyTrack-v0`` with the reference's model, float32, or with another plant,
+    such as a black box; the flight ends at the first cause of termination.
+    """
+    env, step = _environment(plant)
+    params = _params(track, reference.model, reference.dt_s)
+    first = jnp.asarray(reference.states[0], jnp.float32)
+    state, steps = env.begin(unpack(first), 0, params), []
+    for command in np.asarray(reference.commands, np.float32):
+        state, outputs = step(state, command, params)
+        steps.append(outputs)
+    packed, causes, races = jax.tree.map(lambda *leaves: np.stack(leaves), *steps)
+    is_over = np.any(np.stack(causes), axis=0)
+    last = int(np.argmax(is_over)) if is_over.any() else len(steps) - 1
+    states = np.concatenate([np.asarray(first)[None], packed[: last + 1]])
+    drift = np.linalg.norm(states[:, layout.POSITION] - reference.states[: last + 2, layout.POSITION], axis=1)
+    race = jax.tree.map(lambda leaf: leaf[last], races)
+    return Replay(
+        states=states,
+        gates_passed=int(race.gates_passed),
+        time_s=float(race.lap_time_s) if int(race.laps) else float("nan"),
+        ended_by=tuple(name for name, cause in causes._asdict().items() if cause[last]),
+        drift_m=float(drift.max()),
+        frames_touched=_frames_touched(states[:, layout.POSITION], params),
     )
 
 
@@ -118,20 +189,20 @@ def verified(folder: Path, tracks: list[Track]) -> tuple[list[tuple[Reference, s
     may be of tracks that are not shipped.
 
     Raises:
-        ReferenceFileError, TrackError: a file that cannot be used, or no references.
+        files.ReferenceFileError, TrackError: a file that cannot be used, or no references.
     """
     plant = blackbox.load(blackbox.SHIPPED)
     replays, is_good = [], True
-    references = list(map(load_reference, folder.glob("*.npz")))
+    references = list(map(files.load_reference, folder.glob("*.npz")))
     if not references:
-        raise ReferenceFileError(f"{folder}: found no .npz, expected references")
+        raise files.ReferenceFileError(f"{folder}: found no .npz, expected references")
     known = {track.name: track for track in tracks}
     for reference in sorted(
         references, key=lambda found: (found.model_name != NOMINAL, found.track, found.kind)
     ):
-        track = known.get(reference.track) or load_track(reference.track)
+        track = known.get(reference.track) or flytrack_env.load_track(reference.track)
         flown = replay(reference, track)
-        is_good &= is_verified(reference, flown) and track_digest(track) == reference.track_sha256
+        is_good &= is_verified(reference, flown) and files.track_digest(track) == reference.track_sha256
         replays.append((reference, "simulator", flown))
         if reference.model_name == BLACK_BOX:
             replays.append((reference, "black box", replay(reference, track, plant)))
@@ -215,20 +286,20 @@ def write_page(path: Path | None, replays: list[tuple[Reference, str, Replay]]) 
 
 def find_all(tracks: list[Track], kinds: tuple[str, ...], model: Path | None, folder: Path) -> None:
     """Find references and write them into a folder."""
-    parameters, name = (nominal(), NOMINAL) if model is None else (load_model(model), model.stem)
+    parameters, name = (nominal(), NOMINAL) if model is None else (flytrack_env.load_model(model), model.stem)
     for track in tracks:
         for kind in kinds:
             found = optimise(track, kind, parameters, name)
-            save_reference(folder / f"{track.name}_{name}_{kind}.npz", found)
+            files.save_reference(folder / f"{track.name}_{name}_{kind}.npz", found)
             print(f"{track.name} {kind}: {found.time_s:.4f} s, {found.found['cpu_s']} CPU s", flush=True)
 
 
 def main(
-    tracks: tuple[str, ...] = tuple(available_tracks()),
+    tracks: tuple[str, ...] = tuple(flytrack_env.available_tracks()),
     kinds: tuple[Literal["flying", "standing"], ...] = ("flying", "standing"),
     model: Path | None = None,
     verify: bool = False,
-    out: Path = FOLDER,
+    out: Path = files.FOLDER,
     page: Path | None = None,
 ) -> None:
     """Find references, replay all and write the page; exit 1 if a replay is not as it should be.
@@ -237,7 +308,7 @@ def main(
     existing references. out: their folder. page: to write, with pictures beside it.
     """
     try:
-        known = list(map(load_track, tracks))
+        known = list(map(flytrack_env.load_track, tracks))
         if not verify:
             find_all(known, kinds, model, out)
         replays, is_good = verified(out, known)

@@ -6,7 +6,7 @@ import jax
 import numpy as np
 
 from benchmarks.real.black_boxes import base_steps, flown, linear_ones, posed, rows_of
-from benchmarks.real.record import Record, diagnosed, imported
+from benchmarks.real.section import Record, diagnosed, imported
 from benchmarks.report import table
 from flytrack_sysid import FlightLog
 from flytrack_sysid.diagnosis.refinement import windows_of

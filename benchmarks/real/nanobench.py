@@ -10,7 +10,7 @@ import jax
 import numpy as np
 
 from benchmarks.real.crazyflie import by_flight
-from benchmarks.real.record import Record, diagnosed, tested
+from benchmarks.real.section import Record, diagnosed, tested
 from benchmarks.report import table
 from flytrack_sysid import import_log
 from flytrack_sysid.prediction_windows import HORIZONS_S, QUANTITIES, make_windows

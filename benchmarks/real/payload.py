@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from benchmarks.real.record import Record, diagnosed, imported
+from benchmarks.real.section import Record, diagnosed, imported
 from benchmarks.report import table
 from flytrack_env.dynamics import ModelParameters, collective_thrust
 from flytrack_sysid import FlightLog

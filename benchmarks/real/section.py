@@ -1,18 +1,29 @@
-"""A diagnosis of a measured flight on a page: a paragraph that a pilot understands, a picture, tables."""
+"""A diagnosis of a measured flight: its record, and on a page a paragraph for pilots, a picture, tables."""
 
-from collections.abc import Mapping
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
+import jax
 import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator
 
-from benchmarks.real.record import Record
-from benchmarks.report import table
+from benchmarks.report import commit_of_checkout, table
+from flytrack_env.dynamics import ModelParameters
+from flytrack_env.motion import Motion
 from flytrack_env.pictures.drawing import new_figure, plain
 from flytrack_env.scene import BLUE, GREEN, GREY, ORANGE
+from flytrack_sysid import FlightLog, Imported, diagnose, import_log
+from flytrack_sysid.diagnosis import Diagnosis
 from flytrack_sysid.diagnosis.evidence import words_of
+from flytrack_sysid.diagnosis.refinement import Tested
+from flytrack_sysid.diagnosis.report import verdict_of
+from flytrack_sysid.prediction_windows import QUANTITIES, Windows, chunks_of, prediction_errors
 
+Record = dict[str, Any]
 STYLES: dict[str, dict[str, Any]] = {
     "nominal": {"color": ORANGE, "marker": "o"},
     "refitted_base": {"color": GREY, "marker": "o"},
@@ -25,6 +36,41 @@ STYLES: dict[str, dict[str, Any]] = {
 MOST_VALUES = 3  # of a cause, in a sentence
 SPOKEN = (("attitude_rad", "0.25"), ("rates_rad_per_s", "0.25"), ("position_m", "1"))
 WIDTH_IN, HEIGHT_IN = 2.6, 3.2
+
+
+def diagnosed(
+    log: FlightLog, model: ModelParameters, held_out: np.ndarray | None = None
+) -> tuple[Diagnosis, Record]:
+    """Return a log's diagnosis, and a record of it: JSON values, number of rows, CPU time."""
+    started = time.process_time()
+    found = diagnose(log, model, held_out, motion=Motion.CONTINUOUS)
+    return found, {
+        "num_rows": len(log),
+        "cpu_s": time.process_time() - started,
+        "jax": jax.__version__,
+        "commit": commit_of_checkout(),
+        "sentence": verdict_of(found).text,
+        "diagnosis": found.as_json(),
+    }
+
+
+def imported(files: Path | Sequence[Path], kind: str, mapping: str) -> Imported:
+    """Return logs imported with a mapping that is given as text."""
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "mapping.toml"
+        path.write_text(mapping, encoding="utf-8")
+        return import_log(files, kind, path)
+
+
+_errors = jax.jit(prediction_errors)
+
+
+def tested(model: ModelParameters, windows: Windows) -> Tested:
+    """Return a model's errors on windows; inside ``jax.enable_x64(True)``."""
+    model = jax.tree.map(lambda leaf: np.asarray(leaf, float), model)
+    parts = [np.asarray(_errors(model, chunk)) for chunk in chunks_of(windows)]
+    errors = np.concatenate(parts, axis=1)[:, : len(windows.start)]
+    return Tested(errors.reshape(1, *errors.shape[:-1], len(QUANTITIES), 3), windows)
 
 
 def number(value: float | None, unit: str = "1") -> str:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from benchmarks import time_optimal
-from benchmarks.optimal.replay import replay
+from benchmarks.time_optimal import replay
 from flytrack_env import available_tracks, load_track, nominal_parameters, references
 from flytrack_env.dynamics import step
 from flytrack_env.effects import EFFECTS
