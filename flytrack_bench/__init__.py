@@ -6,6 +6,7 @@ check_installed("bench", "benchmarks", "safetensors", "optax", "distrax", "scipy
 
 from flytrack_bench.policies import Policy, PolicyError, load_policy
 from flytrack_bench.results import Data, DataError, differences, run
+from flytrack_bench.retrain import diagnose_and_retrain
 from flytrack_bench.suite import Suite, SuiteError, Task, load_suite
 
 __all__ = [
@@ -16,6 +17,7 @@ __all__ = [
     "Suite",
     "SuiteError",
     "Task",
+    "diagnose_and_retrain",
     "differences",
     "load_policy",
     "load_suite",

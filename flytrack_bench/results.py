@@ -57,7 +57,7 @@ class Data:
         return log.select(np.arange(len(log)) < round(seconds / step_s))
 
 
-Adapt = Callable[[Data], Policy]
+Adapt = Callable[[Data, Policy], Policy]
 
 
 def fly_task(task: Task, suite: Suite, policy: Policy) -> dict[str, float | None]:
@@ -93,15 +93,15 @@ def run(
 ) -> dict[str, Any]:
     """Return the result of policies, one a training seed, on tasks, as JSON values.
 
-    seconds, adapt: with so much data of each task, a policy is made in place of ``policies``, which then name
-    the entry only. report: called with flights done and to do.
+    seconds, adapt: with so much data of each task, each policy is replaced by what is made of it. report:
+    called with flights done and to do.
     """
     started_s, total = time.process_time(), len(tasks) * len(policies)
     flown: dict[str, list[dict[str, Any]]] = {}
     for place, task in enumerate(tasks):
         flown[task.id] = []
         for number, policy in enumerate(policies):
-            own = policy if adapt is None else adapt(Data(task, suite, seconds))
+            own = policy if adapt is None else adapt(Data(task, suite, seconds), policy)
             flown[task.id].append(fly_task(task, suite, own))
             report(place * len(policies) + number + 1, total)
     return {

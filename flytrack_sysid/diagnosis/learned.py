@@ -13,7 +13,7 @@ import numpy as np
 from flytrack_env.effects.grammar import Law, Term
 from flytrack_env.effects.learned_residual import Network, Networks
 from flytrack_sysid.diagnosis.beyond import Learned
-from flytrack_sysid.diagnosis.law_search import Found, Side, find_law
+from flytrack_sysid.diagnosis.law_search import LEAST_TOLD, Found, Side, find_law
 from flytrack_sysid.diagnosis.problem import Problem
 from flytrack_sysid.diagnosis.refinement import LIKELY_WORSE, Judge, errors_at, sureness
 from flytrack_sysid.diagnosis.residual_fit import Residual, fit_residual
@@ -56,7 +56,8 @@ def find_learned(
         if one is None:
             continue
         added = (one.terms, ()) if isinstance(one, Found) else ((), (one.network,))
-        if not _predicts(problem, judge, model.vector, one.vector, (terms, networks), added):
+        is_told = one.expected >= LEAST_TOLD
+        if not _predicts(problem, judge, model.vector, one.vector, (terms, networks), added, is_told):
             continue
         terms, networks = [*terms, *added[0]], [*networks, *added[1]]
         found[name], model = one, model._replace(vector=one.vector)
@@ -104,8 +105,12 @@ def _predicts(
     after: np.ndarray,
     had: tuple[Sequence[Term], Sequence[Network]],
     added: tuple[Sequence[Term], Sequence[Network]],
+    is_told: bool,
 ) -> bool:
-    """Return whether held-out flights are predicted no worse with what was learnt, and better in all."""
+    """Return whether held-out flights are predicted no worse with what was learnt, and better in all.
+
+    is_told: whether it acts in them at all.
+    """
     both = _of_parts([*had[0], *added[0]], [*had[1], *added[1]])
     if judge is None or both.law.uses("time") or both.networks.uses("time"):
         return True
@@ -117,4 +122,5 @@ def _predicts(
     ratio = tested[1].rms()[0] / scale
     lost = sureness(tested[1].by_block(scale)[0] - tested[0].by_block(scale)[0])
     is_worse = judge.is_known & (ratio > LIKELY_WORSE) & (lost > WORSE_SIGMAS)
-    return not is_worse.any() and float(np.mean(ratio[judge.is_known] ** 2)) < 1.0
+    is_better = float(np.mean(ratio[judge.is_known] ** 2)) < 1.0
+    return not is_worse.any() and (is_better or not is_told)

@@ -190,6 +190,24 @@ class Feature(NamedTuple):
     tries: int = 1
 
 
+class SideFit(NamedTuple):
+    """Features fitted on one side: coefficients, standard errors, and the step of what is given beside them.
+
+    chi2: gained. inflation: how much more scores vary than information says.
+    """
+
+    step: np.ndarray
+    errors: np.ndarray
+    given: np.ndarray
+    chi2: float
+    inflation: float
+
+    @property
+    def gain(self) -> float:
+        """Return chi2 over its inflation."""
+        return self.chi2 / self.inflation
+
+
 class SideTest(NamedTuple):
     """Score test on the axes of one side, rotation or force; all by blocks of a second.
 
@@ -214,6 +232,10 @@ class SideTest(NamedTuple):
         """Return the test with more columns that are free already."""
         return self._replace(given=np.concatenate([self.given, *columns], axis=1))
 
+    def of_blocks(self, is_kept: np.ndarray) -> "SideTest":
+        """Return the test on some blocks, (blocks,) bool."""
+        return self._replace(rest=self.rest[is_kept], given=self.given[is_kept])
+
     def projected(self, columns: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Return shares of given columns in others, information and score with those projected out.
 
@@ -229,15 +251,26 @@ class SideTest(NamedTuple):
         score = np.einsum("bfn,bn->f", columns, self.rest, optimize=True) - share.T @ given
         return share, own, score, solve(inner, given)
 
-    def gain(self, columns: np.ndarray) -> tuple[float, float, np.ndarray]:
-        """Return chi2 of features besides what is given, its inflation, and their coefficients."""
+    def fit(self, columns: np.ndarray, least_own: float = 0.0) -> SideFit:
+        """Return features fitted besides what is given.
+
+        least_own: columns with less information of their own, beyond what is given, stay 0. Where a feature
+        nearly is what is given, it only moves the model's forces to another instant of the step.
+        """
         share, own, score, alone = self.projected(columns)
+        total = np.einsum("bfn,bfn->f", columns, columns, optimize=True)
+        is_own = np.diag(own) >= least_own * total
+        share, score, columns = share[:, is_own], score[is_own], columns[:, is_own]
+        own = own[np.ix_(is_own, is_own)]
         own += np.eye(len(own))  # a weak prior: features of size 1
         step = solve(own, score)
         given = alone - share @ step
         after = self.rest - np.einsum("bfn,f->bn", columns, step) - np.einsum("bgn,g->bn", self.given, given)
         blocks = np.einsum("bfn,bn->bf", columns, after) - np.einsum("bgn,bn->bg", self.given, after) @ share
-        return float(score @ step), inflation_of(own, blocks), step
+        inflation = inflation_of(own, blocks) if is_own.any() else 1.0
+        fit = SideFit(np.zeros(len(is_own)), np.zeros(len(is_own)), given, float(score @ step), inflation)
+        fit.step[is_own], fit.errors[is_own] = step, np.sqrt(np.diag(np.linalg.pinv(own)) * inflation)
+        return fit
 
     def best_group(self, columns: np.ndarray, size: int) -> int:
         """Return which group of so many consecutive features explains most by itself."""
@@ -348,11 +381,11 @@ def _greedy(
         for one in (*smooth, *([] if places is None else [_best_bump(test, places)])):
             if any(one.name == earlier.name for earlier in result):
                 continue
-            chi2, inflation, step = test.gain(one.columns)
-            number, size = one.columns.shape[1], _rms(one.features_w, step, flight.is_counted)
-            if chi2 / inflation < stats.chi2.isf(CHANCE / one.tries, number) or size < least:
+            fit = test.fit(one.columns)
+            number, size = one.columns.shape[1], _rms(one.features_w, fit.step, flight.is_counted)
+            if fit.gain < stats.chi2.isf(CHANCE / one.tries, number) or size < least:
                 continue
-            gain = chi2 / inflation - 2.0 * number
+            gain = fit.gain - 2.0 * number
             if best is None or gain > best.gain:
                 best = Dependence(one.name, side, gain, size / noise, one.columns)
         if best is None:

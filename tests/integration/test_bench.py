@@ -7,8 +7,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from baselines.purejaxrl_ppo import load_checkpoint
 from benchmarks import suite as drawn
-from flytrack_bench import Data, DataError, load_policy, load_suite, results, run
+from benchmarks.champion import CHAMPION
+from flytrack_bench import Data, DataError, load_policy, load_suite, results, retrain, run
 from flytrack_bench.cli import main
 from flytrack_bench.policies import Function, Policy
 from flytrack_bench.suite import FOLDER, digest_of
@@ -115,3 +117,21 @@ def test_the_interval_covers_the_spread_of_seeds():
 
 
 SPREAD = np.array([[0.1, 0.2, 0.15], [0.5, 0.55, 0.6], [0.5, 0.4, 0.45], [0.9, 1.0, 0.95]])
+
+
+@pytest.mark.slow
+def test_a_policy_is_trained_again_on_the_model_of_the_plant_that_was_diagnosed(small, monkeypatch):
+    suite, champion = load_suite(small), load_policy(str(CHAMPION))
+    trained = []
+
+    def train(out, config, seed, model):
+        trained.append(model)
+        return load_checkpoint(CHAMPION), {}
+
+    monkeypatch.setattr(retrain, "train_policy", train)
+    task = suite.tasks[1]
+    data = Data(task, suite, seconds=20.0)
+    found = retrain.diagnose_and_retrain(data, champion)
+    assert data.seconds_left == 0.0 and found.checkpoint is not None
+    (model,) = trained
+    np.testing.assert_allclose(model.tau[:3], task.craft.tau[:3], atol=0.005)

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks import hidden
+from benchmarks import beyond, hidden
 from benchmarks.beyond import covered
 from benchmarks.diagnosis import model_of
 from benchmarks.hidden.oracle import removed
@@ -78,3 +78,12 @@ def test_a_residual_takes_the_place_of_a_law(monkeypatch: pytest.MonkeyPatch) ->
     assert share_removed(found, clean) > 0.7
     inside, of = covered(found, hidden.measure(clean, "sensors", np.random.default_rng(0)))["force"]
     assert of > 10_000 and 0.86 < inside / of < 0.94
+
+
+@pytest.mark.slow
+def test_a_thermal_that_held_out_rows_do_not_pass_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
+    """On this plant, another motion seemed likelier before the search."""
+    monkeypatch.setattr(beyond, "SEED", 43)
+    line = beyond.plant("position", 0)
+    assert (line["motion"], line["found_motion"]) == ("handout", "handout")
+    assert line["is_form"] and len(line["law"]) == 1 and not line["causes"]
