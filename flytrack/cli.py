@@ -81,14 +81,13 @@ COMMANDS = {
         "Build and check Betaflight in the loop, in a clone", None, "firmware.__main__:main", None, True
     ),
     "export": Command(
-        "Write a policy as ONNX or C", "export", f"{PPO}.export:main", f"{PPO}.export:ExportSettings", True
+        "Write a policy as ONNX or C", "export", f"{PPO}.export:run_export", f"{PPO}.export:ExportSettings"
     ),
     "bench": Command(
         "Fly a policy through a frozen suite of tasks",
         "bench",
-        "flytrack_bench.cli:main",
+        "flytrack_bench.cli:run_bench",
         "flytrack_bench.cli:Flags",
-        True,
     ),
 }
 

@@ -2,14 +2,11 @@
 
 import hashlib
 import json
-import sys
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any
 
 import numpy as np
-import tyro
-from tyro.conf import FlagCreatePairsOff, arg
+from tyro.conf import arg
 
 from baselines.purejaxrl_ppo.config import OPTIONAL, OptionalPath
 from flytrack_bench.policies import PolicyError, find_object, load_policy
@@ -45,16 +42,9 @@ class Flags:
     """A result to verify: some of its tasks are flown again with this policy."""
 
 
-def main(arguments: Sequence[str] | None = None) -> None:
-    """Fly as the command line says; exit 1 where a result is not confirmed, 2 for what cannot be used."""
-    config = (FlagCreatePairsOff,)
-    flags = tyro.cli(Flags, prog="flytrack bench", description=__doc__, args=arguments, config=config)
-    try:
-        is_good = verify(flags) if flags.verify is not None else bench(flags)
-    except (ValueError, OSError) as error:
-        print(f"flytrack bench: error: {error}", file=sys.stderr)
-        raise SystemExit(2) from error
-    raise SystemExit(0 if is_good else 1)
+def run_bench(flags: Flags) -> int:
+    """Fly as the flags say; return the exit status, 1 where a result is not confirmed."""
+    return 0 if (bench(flags) if flags.verify is None else verify(flags)) else 1
 
 
 def fly(flags: Flags, suite: Suite, ids: tuple[str, ...]) -> dict[str, Any]:
@@ -115,7 +105,3 @@ def text_of(found: dict[str, Any]) -> str:
         interval = "" if one["ci95"] is None else " ({:.3f} to {:.3f})".format(*one["ci95"])
         lines.append(f"{name}: interquartile mean {one['interquartile_mean']:.3f}{interval}")
     return "\n".join(lines)
-
-
-if __name__ == "__main__":
-    main()

@@ -7,13 +7,11 @@ header without dependencies, ``policy_template.onnxtxt`` that of an ONNX graph f
 """
 
 import dataclasses
-import sys
 import textwrap
-from collections.abc import Sequence
 from itertools import count, takewhile
 from pathlib import Path
 from string import Template
-from typing import Annotated, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -31,7 +29,6 @@ from flytrack_env.params import EnvParams
 from flytrack_env.quaternion import Quaternion
 from flytrack_env.state import ACTION_SIZE, STATE_SIZE, unpack
 
-PROG = "flytrack export"
 FOLDER = Path(__file__).parent  # of the templates
 FLOAT32, FLOAT64 = 1, 11  # ONNX's numbers of types
 WIDTH = 110
@@ -270,7 +267,7 @@ class ExportSettings:
     """Write a C99 header."""
     track: OptionalName = None
     """Name or file of the track whose gates are built in; by default the checkpoint's."""
-    float64: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    float64: bool = False
     """Compute in float64 inside the ONNX file: it rounds less, but not every runtime can."""
 
     def check(self) -> None:
@@ -302,16 +299,7 @@ def export(settings: ExportSettings) -> list[Path]:
     return list(contents)
 
 
-def main(arguments: Sequence[str] | None = None) -> None:
-    """Export as the command line says, and print what was written."""
-    settings = tyro.cli(ExportSettings, args=arguments, prog=PROG)
-    try:
-        for path in export(settings):
-            print(f"{path}: {path.stat().st_size} bytes")
-    except (ImportError, ValueError, OSError) as error:
-        print(f"{PROG}: error: {error}", file=sys.stderr)
-        raise SystemExit(2) from error
-
-
-if __name__ == "__main__":
-    main()
+def run_export(settings: ExportSettings) -> None:
+    """Export, and print what was written."""
+    for path in export(settings):
+        print(f"{path}: {path.stat().st_size} bytes")

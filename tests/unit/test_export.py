@@ -9,8 +9,9 @@ import pytest
 
 from baselines.purejaxrl_ppo import Config, export, load_checkpoint, make_network
 from baselines.purejaxrl_ppo.checkpoint import describe_run, save_checkpoint
-from baselines.purejaxrl_ppo.export import main, policy_of
+from baselines.purejaxrl_ppo.export import policy_of
 from benchmarks.export import CompiledPolicy, states_in_box
+from flytrack.cli import main
 from flytrack_env import make
 from flytrack_env.dynamics import lag
 from flytrack_env.state import Action, unpack, unpack_action
@@ -66,7 +67,7 @@ def test_exported_policies_act_as_the_python_one(case, tmp_path, capsys):
 
     header = tmp_path / "policy.h"
     header.write_text("old")
-    main([str(tmp_path / "a.safetensors"), "--c", str(header)])
+    main(["export", str(tmp_path / "a.safetensors"), "--c", str(header)])
     assert f"{header}: {header.stat().st_size} bytes" in capsys.readouterr().out
     if shutil.which("gcc") is not None:
         compiled = CompiledPolicy(header)
@@ -78,7 +79,7 @@ def test_exported_policies_act_as_the_python_one(case, tmp_path, capsys):
         "onnxruntime", reason="onnxruntime is not installed (extra flytrack[dev])"
     )
     path = str(tmp_path / "policy.onnx")
-    main([str(tmp_path / "a.safetensors"), "--onnx", path, *["--float64"] * is_float64])
+    main(["export", str(tmp_path / "a.safetensors"), "--onnx", path, *["--float64"] * is_float64])
     session = onnxruntime.InferenceSession(path)
     inputs = {"state": states, "gate": gates, "past": past}
     found = session.run(None, {one.name: inputs[one.name] for one in session.get_inputs()})[0]
@@ -88,7 +89,7 @@ def test_exported_policies_act_as_the_python_one(case, tmp_path, capsys):
 @pytest.mark.skipif(shutil.which("gcc") is None, reason="gcc is not installed")
 def test_a_header_counts_gates_and_lags_as_the_environment_does(tmp_path):
     env, _ = write_checkpoint(tmp_path / "a.safetensors", "FlyTrack-v0", "split_s", (4,))
-    main([str(tmp_path / "a.safetensors"), "--c", str(tmp_path / "policy.h")])
+    main(["export", str(tmp_path / "a.safetensors"), "--c", str(tmp_path / "policy.h")])
     compiled, gates = CompiledPolicy(tmp_path / "policy.h"), env.default_params.course.gates
     centres, forward, up = (np.stack(axis, axis=-1) for axis in (gates.centre, gates.forward, gates.up))
     count = np.arange(len(centres))
@@ -122,7 +123,7 @@ def test_what_cannot_be_exported_is_told(words, message, tmp_path, monkeypatch, 
         monkeypatch.setattr(export, "KINDS_OF_PAST", ("applied",))
         words = words[:-1]
     with pytest.raises(SystemExit) as stopped:
-        main(["a.safetensors", *words])
+        main(["export", "a.safetensors", *words])
     assert stopped.value.code == 2 and message in capsys.readouterr().err
     assert (tmp_path / "a.safetensors").read_bytes() == before
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a.safetensors", "folder"]

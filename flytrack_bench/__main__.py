@@ -1,5 +1,0 @@
-"""``flytrack bench``: the command without ``flytrack``."""
-
-from flytrack_bench.cli import main
-
-main()
