@@ -6,10 +6,17 @@ Runs the training of ``make test-clients`` for several seeds and writes a table 
 import time
 
 from benchmarks import report
-from clients import cleanrl_loop, evosax_es, rejax_ppo, sb3_ppo, sbx_ppo
+from clients import cleanrl_loop, evosax_es, purejaxrl_loop, rejax_ppo, sb3_ppo, sbx_ppo, torchrl_ppo
 
-CLIENTS = {"rejax": rejax_ppo, "stable-baselines3": sb3_ppo, "sbx-rl": sbx_ppo, "evosax": evosax_es}
-CLIENTS["gymnasium"] = cleanrl_loop  # a loop of one's own, with Gymnasium's wrappers
+CLIENTS = {
+    "rejax": rejax_ppo,
+    "stable-baselines3": sb3_ppo,
+    "sbx-rl": sbx_ppo,
+    "torchrl": torchrl_ppo,
+    "evosax": evosax_es,
+    "gymnasium": cleanrl_loop,  # a loop of one's own, with Gymnasium's wrappers
+    "gymnax": purejaxrl_loop,  # a compiled loop, with gymnax's wrapper
+}
 HEADER = "client | seed | return before | return after | gates before | gates after | wall (s) | CPU (s)"
 
 
