@@ -65,7 +65,8 @@ class Checkpoint(NamedTuple):
 
     params: of the network. config: of the training. env_id, track: what it was trained on.
     observation_size: of its input. meta: the whole description as stored. training: named arrays of the
-    rest of the training's state (optimiser, environments, random keys); None for a policy alone.
+    rest of the training's state (optimiser, environments, random keys); None for a policy alone. path: of its
+    file.
     """
 
     params: Any
@@ -75,6 +76,12 @@ class Checkpoint(NamedTuple):
     observation_size: int
     meta: dict[str, Any]
     training: Arrays | None = None
+    path: Path = Path()
+
+    @property
+    def steps(self) -> int:
+        """Environment steps of training so far."""
+        return int(self.meta["steps"])
 
     @property
     def network(self) -> ActorCritic:
@@ -267,19 +274,7 @@ def _build(path: Path, meta: dict[str, Any], arrays: Arrays) -> Checkpoint:
         if not np.isfinite(array).all():
             raise CheckpointError(f"{path}: {quote_name(name)}: found values that are not finite")
     params = from_named_arrays(path, policy, target)
-    return Checkpoint(params, config, meta["env_id"], meta["track"], size, meta, training or None)
-
-
-class Start(NamedTuple):
-    """A checkpoint to continue from, and its path."""
-
-    path: Path
-    checkpoint: Checkpoint
-
-    @property
-    def steps(self) -> int:
-        """Environment steps of training so far."""
-        return self.checkpoint.meta["steps"]
+    return Checkpoint(params, config, meta["env_id"], meta["track"], size, meta, training or None, path)
 
 
 def step_file(steps: int) -> str:
@@ -302,7 +297,7 @@ def seeds_in(folder: Path) -> list[int]:
     return sorted(int(match[1]) for path, match in matches if match and checkpoints_in(path))
 
 
-def check_free(folder: Path, start: Start | None = None) -> None:
+def check_free(folder: Path, start: Checkpoint | None = None) -> None:
     """Raise ValueError if a folder holds a run that is not the one to continue."""
     is_own = start is not None and start.path.parent.resolve() == folder.resolve()
     if not is_own and (checkpoints_in(folder) or seeds_in(folder)):
@@ -349,18 +344,19 @@ def describe_run(
     )
 
 
-def check_same_run(path: Path, checkpoint: Checkpoint, description: dict[str, Any]) -> None:
+def check_same_run(checkpoint: Checkpoint, description: dict[str, Any]) -> None:
     """Raise CheckpointError, field by field, unless a checkpoint is of the run described."""
     found = {**checkpoint.meta, "config": as_json(dataclasses.asdict(checkpoint.config))}
     lines = _differences(found, description, MUST_FIT)
-    check_no_differences(path, [*lines, *_machine_differences(checkpoint, description)] if lines else [])
+    more = _machine_differences(checkpoint, description) if lines else []
+    check_no_differences(checkpoint.path, [*lines, *more])
 
 
-def warn_of_other_machine(path: Path, checkpoint: Checkpoint, description: dict[str, Any]) -> None:
+def warn_of_other_machine(checkpoint: Checkpoint, description: dict[str, Any]) -> None:
     """Warn if software or machine differ from the checkpoint's: results may differ in the last bits."""
     lines = _machine_differences(checkpoint, description)
     if lines:
-        logger.warning("%s: %s; continuing, perhaps not bit for bit", path, "; ".join(lines))
+        logger.warning("%s: %s; continuing, perhaps not bit for bit", checkpoint.path, "; ".join(lines))
 
 
 def _machine_differences(checkpoint: Checkpoint, description: dict[str, Any]) -> list[str]:
@@ -380,14 +376,14 @@ def save_run(path: Path, runner: Runner, config: Config, description: dict[str, 
     save_checkpoint(path, state.params, config, description, as_named_arrays(rest))
 
 
-def restore_runner(start: Start, target: Runner) -> Runner:
+def restore_runner(start: Checkpoint, target: Runner) -> Runner:
     """Return the state of the training in a checkpoint; ``target``: its shapes and types."""
     rest = target._replace(train_state=target.train_state.replace(params=None))
-    runner = from_named_arrays(start.path, start.checkpoint.training or {}, rest)
-    return runner._replace(train_state=runner.train_state.replace(params=start.checkpoint.params))
+    runner = from_named_arrays(start.path, start.training or {}, rest)
+    return runner._replace(train_state=runner.train_state.replace(params=start.params))
 
 
-def newest_intact(path: Path) -> Start:
+def newest_intact(path: Path) -> Checkpoint:
     """Return the checkpoint in a file, or the newest intact one in a folder.
 
     Raises:
@@ -408,20 +404,19 @@ def newest_intact(path: Path) -> Start:
     return load_start(oldest)
 
 
-def load_start(path: Path) -> Start:
+def load_start(path: Path) -> Checkpoint:
     """Return a checkpoint that training can continue from.
 
     Raises:
         CheckpointError: a policy alone, or fields that are used before they are compared with the run.
     """
-    start = Start(path, load_checkpoint(path))
-    meta, config = start.checkpoint.meta, start.checkpoint.config
-    if start.checkpoint.training is None:
+    start = load_checkpoint(path)
+    if start.training is None:
         raise CheckpointError(f"{path}: found a policy alone, expected one with its training")
-    check_kinds(path, meta, FIELDS)
-    if meta["steps"] not in range(0, config.total_timesteps + 1, config.batch_size):
-        raise CheckpointError(f"{path}: steps: found {meta['steps']}")
-    rewards = rewards_of(start.checkpoint)
+    check_kinds(path, start.meta, FIELDS)
+    if start.steps not in range(0, start.config.total_timesteps + 1, start.config.batch_size):
+        raise CheckpointError(f"{path}: steps: found {start.steps}")
+    rewards = rewards_of(start)
     check_kinds(f"{path}: environment", rewards, dict.fromkeys(rewards, float))
     return start
 
@@ -439,7 +434,7 @@ def seeds_side_by_side(checkpoint: Checkpoint) -> int:
     return number if isinstance(number, int) and number > 0 else 1
 
 
-def at_common_step(starts: list[Start | None]) -> list[Start | None]:
+def at_common_step(starts: list[Checkpoint | None]) -> list[Checkpoint | None]:
     """Return where seeds continue that trained side by side: at the last step that all have stored.
 
     A kill between their checkpoints leaves some ahead, and trained alone they would end in other bits.
@@ -447,7 +442,7 @@ def at_common_step(starts: list[Start | None]) -> list[Start | None]:
     """
     found = [start for start in starts if start is not None]
     steps = min((start.steps for start in found), default=math.inf)
-    are_together = all(seeds_side_by_side(start.checkpoint) == len(starts) == len(found) for start in found)
+    are_together = all(seeds_side_by_side(start) == len(starts) == len(found) for start in found)
     if not are_together or all(start.steps == steps for start in found):
         return starts
     try:

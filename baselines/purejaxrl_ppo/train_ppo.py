@@ -10,7 +10,7 @@ from typing import Annotated, Any, NamedTuple, NoReturn
 import tyro
 
 from baselines.purejaxrl_ppo import checkpoint as files
-from baselines.purejaxrl_ppo.checkpoint import FINAL, CheckpointError, Start
+from baselines.purejaxrl_ppo.checkpoint import FINAL, Checkpoint, CheckpointError
 from baselines.purejaxrl_ppo.config import Config, OptionalInt, OptionalPath, settings_in_file
 from baselines.purejaxrl_ppo.tracking import has_moved, local_uri
 from baselines.purejaxrl_ppo.training import Options, Run, Task, Trainer
@@ -89,11 +89,11 @@ class Resumed(NamedTuple):
     """What ``--resume`` found: the folder, and per seed where it continues (None: it has not begun)."""
 
     folder: Path
-    starts: dict[int, Start | None]
+    starts: dict[int, Checkpoint | None]
     is_single: bool
 
     @property
-    def first(self) -> Start:
+    def first(self) -> Checkpoint:
         """The first checkpoint found."""
         return next(start for start in self.starts.values() if start is not None)
 
@@ -107,16 +107,16 @@ def find_starts(resume: Path) -> Resumed:
     if not seeds or files.checkpoints_in(resume):
         start = files.newest_intact(resume)
         folder = resume if resume.is_dir() else resume.parent
-        return Resumed(folder, {start.checkpoint.meta["seed"]: start}, is_single=True)
+        return Resumed(folder, {start.meta["seed"]: start}, is_single=True)
     found = {seed: files.newest_intact(resume / f"seed{seed}") for seed in seeds}
     seeds = sorted({*seeds, *saved_options(next(iter(found.values()))).seeds})
     return Resumed(resume, {seed: found.get(seed) for seed in seeds}, is_single=False)
 
 
-def saved_options(start: Start) -> Options:
+def saved_options(start: Checkpoint) -> Options:
     """Return the options that a checkpoint was written with; raises CheckpointError if they are none."""
     try:
-        found = start.checkpoint.meta["options"].items()
+        found = start.meta["options"].items()
         values = {name: value for name, value in found if value is not None}
         options = Options(**{**values, "seeds": tuple(map(int, values["seeds"]))})
         options.check()
@@ -130,13 +130,13 @@ def defaults_of(resumed: Resumed) -> Settings:
     start, options = resumed.first, saved_options(resumed.first)
     uri = LOCAL if has_moved(options.tracking_uri) else options.tracking_uri
     return Settings(
-        env_id=start.checkpoint.env_id,
-        track=start.checkpoint.track,
+        env_id=start.env_id,
+        track=start.track,
         seed=min(resumed.starts),
         num_seeds=len(resumed.starts),
-        seeds_at_once=files.seeds_side_by_side(start.checkpoint),
+        seeds_at_once=files.seeds_side_by_side(start),
         run=options._replace(tracking_uri=uri),
-        hyperparameters=start.checkpoint.config,
+        hyperparameters=start.config,
     )
 
 
@@ -162,7 +162,7 @@ def make_tasks(settings: Settings, resumed: Resumed | None) -> list[list[Task]]:
         ValueError: other seeds than those of a folder that is resumed.
     """
     seeds = list(range(settings.seed, settings.seed + settings.num_seeds))
-    starts: list[Start | None] = [None] * len(seeds)
+    starts: list[Checkpoint | None] = [None] * len(seeds)
     is_single = len(seeds) == 1
     if resumed is not None:
         is_single, known, starts = resumed.is_single, list(resumed.starts), list(resumed.starts.values())
@@ -193,14 +193,15 @@ def make_trainer(settings: Settings, resumed: Resumed | None) -> Trainer:
     arguments: dict[str, Any] = {"track": settings.track, "reward": reward, "model": settings.model}
     if resumed is None:
         return Trainer(settings.hyperparameters, settings.env_id, **arguments)
-    path, checkpoint = resumed.first
+    checkpoint = resumed.first
     try:
         arguments["model"] = settings.model or model_from_json(checkpoint.meta["model"], "model")
         arguments["missed_gate"] = checkpoint.meta["missed_gate"]
         arguments["reward"] = files.rewards_of(checkpoint) | reward
         return Trainer(settings.hyperparameters, settings.env_id, **arguments)
     except (ValueError, OverflowError, OSError) as error:
-        raise CheckpointError(f"{path}: with its settings and the flags: {error_text(error)}") from error
+        text = f"{checkpoint.path}: with its settings and the flags: {error_text(error)}"
+        raise CheckpointError(text) from error
 
 
 def make_plan(words: Sequence[str]) -> Plan:

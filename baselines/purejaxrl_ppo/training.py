@@ -21,7 +21,7 @@ from tyro.conf import Suppress
 
 import flytrack_env
 from baselines.purejaxrl_ppo import checkpoint as files
-from baselines.purejaxrl_ppo.checkpoint import Checkpoint, Start
+from baselines.purejaxrl_ppo.checkpoint import Checkpoint
 from baselines.purejaxrl_ppo.config import Config, Count
 from baselines.purejaxrl_ppo.metrics import summarise_updates
 from baselines.purejaxrl_ppo.monitor import ProgressLine, evaluate_policy
@@ -70,7 +70,7 @@ class Task(NamedTuple):
     out: Path
     seed: int
     options: Options
-    start: Start | None = None
+    start: Checkpoint | None = None
 
 
 def next_due(update: int, every: int, batch_size: int) -> float:
@@ -185,7 +185,7 @@ class Trainer:
             run.options.check()
             files.check_free(run.out, run.start)
             if run.start is not None:
-                files.check_same_run(*run.start, run.description)
+                files.check_same_run(run.start, run.description)
         return runs
 
     def run(self, runs: list["Run"]) -> list[tuple[Checkpoint, Metrics]]:
@@ -211,7 +211,7 @@ class Run:
         """num_seeds: that train side by side, this one among them."""
         self.trainer, self.config = trainer, trainer.config
         self.out, self.seed, self.options, self.start = task
-        before = {} if self.start is None else self.start.checkpoint.meta
+        before = {} if self.start is None else self.start.meta
         self.update = before.get("steps", 0) // self.config.batch_size
         self.seconds_before = before.get("seconds", 0.0)
         self.success: float | None = before.get("success")
@@ -246,7 +246,7 @@ class Run:
                 self._begin_tracking()
                 self.tracker.end("FINISHED")
             return False
-        files.warn_of_other_machine(*self.start, self.description)
+        files.warn_of_other_machine(self.start, self.description)
         self.runner = files.restore_runner(self.start, jax.eval_shape(self.trainer.start, key))
         return True
 
@@ -292,10 +292,10 @@ class Run:
     def _evaluate(self, is_last: bool) -> dict[str, float]:
         """Fly and draw the policy as it is; return the metrics, few where it could not be flown."""
         policy = self.trainer.env, self.trainer.network, self.runner.train_state.params
-        metrics, files = evaluate_policy(
+        metrics, written = evaluate_policy(
             *policy, self.options.evaluation_episodes, self.out, self.steps, is_recorded=is_last
         )
-        for path in files:
+        for path in written:
             self.tracker.file(path, "evaluation")
         self.success = metrics.get("evaluation_success", self.success)
         laps_s = (self.best_lap_s, metrics.get("evaluation_best_lap_s"))

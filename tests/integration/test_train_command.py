@@ -85,7 +85,7 @@ def test_resuming_takes_from_the_checkpoint_what_is_not_given(whole, tmp_path):
     elsewhere = ("--tracking-uri", "local", "--out", tmp_path)
     (task,) = tasks_of("--resume", whole[0], "--checkpoint-every", 0, *elsewhere)
     assert task.options == Options(tracking_uri=uri, seeds=(SEED,)) and task.out == tmp_path
-    resumed.first.checkpoint.meta["environment"]["reward.off_centre"] = -0.25
+    resumed.first.meta["environment"]["reward.off_centre"] = -0.25
     found = train_ppo.make_trainer(settings, resumed)
     assert found.env.default_params.reward.off_centre == -0.25
 

@@ -97,10 +97,10 @@ def test_folders_without_an_intact_checkpoint_are_refused(whole, tmp_path):
     ],
 )
 def test_another_machine_or_software_is_a_warning(whole, caplog, change, message):
-    path, checkpoint = newest_intact(whole[0])
-    warn_of_other_machine(path, checkpoint, checkpoint.meta)
+    checkpoint = newest_intact(whole[0])
+    warn_of_other_machine(checkpoint, checkpoint.meta)
     assert caplog.text == ""
-    warn_of_other_machine(path, checkpoint._replace(meta=checkpoint.meta | change), checkpoint.meta)
+    warn_of_other_machine(checkpoint._replace(meta=checkpoint.meta | change), checkpoint.meta)
     assert message in caplog.text and "perhaps not bit for bit" in caplog.text
 
 
@@ -195,7 +195,7 @@ def test_an_interrupt_that_python_drops_ends_the_run_all_the_same(trainer, tmp_p
     monkeypatch.setattr(Run, "advance", interrupted)
     with pytest.raises(KeyboardInterrupt):
         trainer.train(tmp_path, SEED, EVERY_OTHER_UPDATE)
-    assert newest_intact(tmp_path)[0] == step_path(tmp_path, 2)
+    assert newest_intact(tmp_path).path == step_path(tmp_path, 2)
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
