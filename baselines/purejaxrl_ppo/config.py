@@ -195,20 +195,15 @@ def read_settings(where: str, values: Any) -> dict[str, Any]:
     return {name: read_value(f"{where}: {name}", FIELD_TYPES[name], value) for name, value in values.items()}
 
 
-def load_toml(path: Path) -> dict[str, Any]:
-    """Return the contents of a TOML file; raises ConfigError if it cannot be read."""
-    try:
-        return parse_toml(read_text(path))
-    except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path}: cannot be read: {error_text(error)}") from error
-    except TomlError as error:
-        raise ConfigError(f"{path}: not a TOML file: {error_text(error)}") from error
-
-
 def settings_in_file(path: Path) -> dict[str, Any]:
     """Return the fields of ``Config`` that a TOML file sets.
 
     Raises:
         ConfigError: a file that cannot be read, an unknown key, or a value of another type.
     """
-    return read_settings(str(path), load_toml(path))
+    try:
+        return read_settings(str(path), parse_toml(read_text(path)))
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path}: cannot be read: {error_text(error)}") from error
+    except TomlError as error:
+        raise ConfigError(f"{path}: not a TOML file: {error_text(error)}") from error

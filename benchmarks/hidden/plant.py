@@ -71,12 +71,10 @@ class Delay:
 def _rate_expo(values: Parameters) -> Hook:
     """u *= (1 - expo) + expo u^2, u a rate stick; each axis has its own."""
     expos = tuple(values[axis] for axis in STICKS)
-
-    def act(plant: Any, sticks: Sticks) -> Sticks:
-        pairs = zip(sticks, expos, strict=False)
-        return (*(stick * (1.0 - expo * (1.0 - stick * stick)) for stick, expo in pairs), sticks[3])
-
-    return act
+    return lambda plant, sticks: (
+        *(u * (1.0 - expo * (1.0 - u * u)) for u, expo in zip(sticks, expos, strict=False)),
+        sticks[3],
+    )
 
 
 def _rate_scale(values: Parameters) -> Hook:
@@ -93,12 +91,10 @@ def _rate_saturation(values: Parameters) -> Hook:
     # At a bend x, tanh(x) / x is what is left.
     left = (1.0 - values[axis] for axis in STICKS)
     bends = [brentq(lambda x, share: math.tanh(x) - share * x, TINY, LARGE, share) for share in left]
-
-    def act(plant: Any, sticks: Sticks) -> Sticks:
-        pairs = zip(sticks, bends, strict=False)
-        return (*(math.tanh(bend * stick) / bend for stick, bend in pairs), sticks[3])
-
-    return act
+    return lambda plant, sticks: (
+        *(math.tanh(bend * u) / bend for u, bend in zip(sticks, bends, strict=False)),
+        sticks[3],
+    )
 
 
 def _rate_cross_coupling(values: Parameters) -> Hook:
