@@ -168,15 +168,7 @@ class Trainer:
             ValueError: ``out`` holds another run.
             DivergedError: numbers that are not finite.
         """
-        return self.train_all([(out, seed, options)])[0]
-
-    def train_all(self, asked: list[tuple[Path, int, Options]]) -> list[tuple[Checkpoint, Metrics]]:
-        """Train seeds side by side, in one program: as ``train``, for each folder, seed and options."""
-        tasks = [
-            Task(out, seed, options, None if options.resume is None else files.newest_intact(options.resume))
-            for out, seed, options in asked
-        ]
-        return self.run(self.prepare(tasks))
+        return self.run(self.prepare([Task(out, seed, options)]))[0]
 
     def prepare(self, tasks: list[Task]) -> list["Run"]:
         """Return the runs of seeds that train side by side; raises as ``train``, and nothing is written."""
@@ -211,6 +203,8 @@ class Run:
         """num_seeds: that train side by side, this one among them."""
         self.trainer, self.config = trainer, trainer.config
         self.out, self.seed, self.options, self.start = task
+        if self.start is None and self.options.resume is not None:
+            self.start = files.newest_intact(self.options.resume)
         before = {} if self.start is None else self.start.meta
         self.update = before.get("steps", 0) // self.config.batch_size
         self.seconds_before = before.get("seconds", 0.0)

@@ -21,7 +21,7 @@ from baselines.purejaxrl_ppo.checkpoint import (
     save_checkpoint,
     warn_of_other_machine,
 )
-from baselines.purejaxrl_ppo.training import DivergedError, Options, Run
+from baselines.purejaxrl_ppo.training import DivergedError, Options, Run, Task
 from tests.support.pages import ROOT
 from tests.support.ppo_runs import BATCH, EVERY_OTHER_UPDATE, SEED, assert_same_end
 from tests.support.slow import slow_but
@@ -159,13 +159,13 @@ def test_the_best_lap_survives_a_resume(trainer, tmp_path, monkeypatch):
 
 
 def asked_for(root, options=EVERY_OTHER_UPDATE):
-    return [(root / f"seed{seed}", seed, options) for seed in SEEDS]
+    return [Task(root / f"seed{seed}", seed, options) for seed in SEEDS]
 
 
 @pytest.fixture(scope="module")
 def together(trainer, tmp_path_factory):
     root = tmp_path_factory.mktemp("together")
-    return root, trainer.train_all(asked_for(root))
+    return root, trainer.run(trainer.prepare(asked_for(root)))
 
 
 def test_a_seed_learns_what_it_learns_alone(trainer, together):
@@ -210,19 +210,14 @@ def test_seeds_killed_between_their_checkpoints_end_bit_for_bit(trainer, togethe
 
     with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
         patch.setattr(Run, "_checkpoint", die)
-        trainer.train_all(asked_for(tmp_path))
-    starts = [newest_intact(folder) for folder, _, _ in asked_for(tmp_path)]
+        trainer.run(trainer.prepare(asked_for(tmp_path)))
+    starts = [newest_intact(folder) for folder, *_ in asked_for(tmp_path)]
     assert [start.steps // BATCH for start in starts] == [4, 2, 2]
     starts = at_common_step(starts)
     assert [start.steps // BATCH for start in starts] == [2, 2, 2]
-    asked = asked_for(tmp_path)
-    trainer.train_all(
-        [
-            (out, seed, options._replace(resume=start.path))
-            for (out, seed, options), start in zip(asked, starts, strict=True)
-        ]
-    )
-    for folder, _, _ in asked:
+    asked = [task._replace(start=start) for task, start in zip(asked_for(tmp_path), starts, strict=True)]
+    trainer.run(trainer.prepare(asked))
+    for folder, *_ in asked:
         assert_same_end(folder / "final.safetensors", together[0] / folder.name / "final.safetensors")
 
 
