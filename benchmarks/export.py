@@ -164,7 +164,7 @@ def section_of(name: str, num_inputs: int, folder: Path) -> str:
     checkpoint, compiled = load_checkpoint(path), CompiledPolicy(header)
     env = plant_env(checkpoint, blackbox.load(blackbox.SHIPPED))
     flown = race(compiled, env)
-    python = race_many(env, checkpoint.network, checkpoint.params, start_keys(SEED, FLIGHTS), STEPS, LAPS)
+    python = race_many(env, checkpoint.policy, start_keys(SEED, FLIGHTS), STEPS, LAPS)
     same = int(np.sum(flown.finished == python.is_complete()))
     box = states_in_box(policy_of(checkpoint, path.name), num_inputs - len(flown.states))
     usual, exact = evaluator(checkpoint, env), evaluator(checkpoint, env, is_float64=True)

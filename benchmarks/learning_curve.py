@@ -17,6 +17,7 @@ import numpy as np
 from baselines.purejaxrl_ppo import Config
 from baselines.purejaxrl_ppo.config import settings_in_file
 from baselines.purejaxrl_ppo.flights import race_many, score, start_keys
+from baselines.purejaxrl_ppo.networks import Policy
 from baselines.purejaxrl_ppo.training import Trainer, is_due
 from benchmarks import report
 from flytrack_env.files import write_atomically
@@ -48,7 +49,8 @@ class Point(NamedTuple):
 def evaluate(trainer: Trainer, policy_params: object, steps: int, cpu_s: float) -> Point:
     """Return how a policy flies noisy starts."""
     keys = start_keys(EVALUATION_SEED, NUM_EPISODES)
-    result = score(race_many(trainer.env, trainer.network, policy_params, keys, NUM_STEPS, NUM_LAPS))
+    policy = Policy(trainer.network, policy_params)
+    result = score(race_many(trainer.env, policy, keys, NUM_STEPS, NUM_LAPS))
     return Point(steps, cpu_s, result.success, result.first_lap_s, result.flying_lap_s)
 
 

@@ -97,9 +97,8 @@ def run_demo(flags: Demo) -> None:
     report.write()
     print(report.text)
     env = report.env
-    flights = fly_many(
-        env, checkpoint.network, checkpoint.params, seed, size.num_episodes, size.num_steps, NUM_LAPS
-    )
+    flown = (seed, size.num_episodes, size.num_steps, NUM_LAPS)
+    flights = fly_many(env, checkpoint.policy, *flown)
     result = score(outcomes_of(flights, NUM_LAPS, len(env.track.gates)))
 
     summary: dict[str, Any] = {

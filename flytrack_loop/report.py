@@ -55,8 +55,7 @@ def describe(loop: Loop) -> str:
 def fly_one(stage: Stage, env: EpisodicEnvironment, seed: int) -> Rollout:
     """Return one flight of a stage's policy from a noisy start."""
     params = start_pose_params(with_model_as_given(env.default_params), NUM_STEPS)
-    policy = (stage.checkpoint.network, stage.checkpoint.params)
-    return fly_episode(env, *policy, jax.random.key(seed), params, NUM_STEPS, NUM_LAPS)
+    return fly_episode(env, stage.checkpoint.policy, jax.random.key(seed), params, NUM_STEPS, NUM_LAPS)
 
 
 def write_flights(out: Path, loop: Loop, plant: Plant, seed: int) -> list[Path]:

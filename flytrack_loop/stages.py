@@ -76,8 +76,7 @@ def errors_of(model: ModelParameters, log: FlightLog) -> Errors:
 def race(checkpoint: Checkpoint, env: EpisodicEnvironment, seed: int, episodes: int = NUM_EPISODES) -> Score:
     """Return how a policy races from perturbed starts: share that finishes 3 laps, mean lap times."""
     keys, params = start_keys(seed, episodes), with_model_as_given(env.default_params)
-    policy = (checkpoint.network, checkpoint.params)
-    return score(race_many(env, *policy, keys, NUM_STEPS, NUM_LAPS, params))
+    return score(race_many(env, checkpoint.policy, keys, NUM_STEPS, NUM_LAPS, params))
 
 
 def measure_gap(checkpoint: Checkpoint, plant: Plant, seed: int, episodes: int = NUM_EPISODES) -> Gap:
@@ -107,7 +106,7 @@ def fly_log(
         ValueError: no flight lasts half a second.
     """
     env = plant_env(checkpoint, plant)
-    flights = fly_many(env, checkpoint.network, checkpoint.params, seed, BATCH, num_steps, num_laps)
+    flights = fly_many(env, checkpoint.policy, seed, BATCH, num_steps, num_laps)
     return log_of_flights(flights, float(env.default_params.dt), seed, seconds, noise)
 
 

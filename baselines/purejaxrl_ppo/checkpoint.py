@@ -25,7 +25,7 @@ import safetensors.numpy
 
 import flytrack_env
 from baselines.purejaxrl_ppo.config import Config, read_settings
-from baselines.purejaxrl_ppo.networks import ActorCritic, make_network
+from baselines.purejaxrl_ppo.networks import ActorCritic, Policy, make_network
 from baselines.purejaxrl_ppo.ppo import Runner
 from flytrack_env.files import read_at_most, write_atomically
 from flytrack_env.messages import error_text, quote_name, quote_value
@@ -87,6 +87,11 @@ class Checkpoint(NamedTuple):
     def network(self) -> ActorCritic:
         """The network that the parameters belong to."""
         return make_network(self.config)
+
+    @property
+    def policy(self) -> Policy:
+        """What flies."""
+        return Policy(self.network, self.params)
 
     def check_fits(self, env: Any) -> None:
         """Raise CheckpointError unless the policy's input is this environment's observation, row by row."""

@@ -154,9 +154,8 @@ class Report:
             one = jax.tree.map(lambda leaf: leaf[None], self.rollout)
             return flying.outcomes_of(one, num_laps, len(self.env.track.gates))
         models = None if plants is None else plants.repeated(settings.episodes)
-        policy, flown = (self.checkpoint.network, self.checkpoint.params), (settings.steps, num_laps)
-        report = ProgressBar("flights")
-        return flying.race_many(self.env, *policy, self._keys(), *flown, self.params, models, report)
+        rest = (settings.steps, num_laps, self.params, models, ProgressBar("flights"))
+        return flying.race_many(self.env, self.checkpoint.policy, self._keys(), *rest)
 
     def _keys(self) -> jax.Array:
         return flying.start_keys(self.settings.seed, self.settings.episodes * (self.settings.plants or 1))
@@ -166,8 +165,8 @@ class Report:
         settings = self.settings
         key = jax.random.key(settings.seed) if settings.is_single else self._keys()[0]
         params = flying.start_pose_params(params, settings.steps)
-        policy, num_laps = (self.checkpoint.network, self.checkpoint.params), settings.num_laps
-        return flying.fly_episode(env, *policy, key, params, settings.steps, num_laps or settings.steps)
+        num_laps = settings.num_laps or settings.steps
+        return flying.fly_episode(env, self.checkpoint.policy, key, params, settings.steps, num_laps)
 
     def count(self, outcomes: Outcomes) -> None:
         """Set the numbers of the evaluation."""

@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from baselines.purejaxrl_ppo.networks import ActorCritic, Memory
+from baselines.purejaxrl_ppo.networks import Memory, Policy
 from flytrack_env.dynamics import ModelParameters
 from flytrack_env.env import EnvParams
 from flytrack_env.episodes import EpisodicEnvironment
@@ -207,9 +207,7 @@ def start_pose_params(params: EnvParams, num_steps: int) -> EnvParams:
 Step = Callable[..., tuple[Any, ...]]
 
 
-def make_step(
-    env: EpisodicEnvironment, network: ActorCritic, policy_params: Any, params: EnvParams, num_laps: Any
-) -> Step:
+def make_step(env: EpisodicEnvironment, policy: Policy, params: EnvParams, num_laps: Any) -> Step:
     """Return ``step(memory, observation, state, index)``: one step of the mean action.
 
     It returns the next memory, observation and state, whether the flight is over, and the step as a
@@ -217,7 +215,7 @@ def make_step(
     """
 
     def step(memory: Memory, observation: jax.Array, state: Any, index: jax.Array) -> tuple[Any, ...]:
-        memory, action = network.act(policy_params, memory, observation)
+        memory, action = policy.network.act(policy.params, memory, observation)
         next_observation, next_state, _, terminated, info = env.step_env(None, state, action, params)
         before, race = env.drone(state), env.race(state)
         after = env.drone(next_state)
@@ -239,18 +237,12 @@ def make_step(
     return step
 
 
-@partial(jax.jit, static_argnames=("env", "network", "num_steps"))
+@partial(jax.jit, static_argnames=("env", "num_steps"))
 def fly_episode(
-    env: EpisodicEnvironment,
-    network: ActorCritic,
-    policy_params: Any,
-    key: jax.Array,
-    params: EnvParams,
-    num_steps: int,
-    num_laps: int,
+    env: EpisodicEnvironment, policy: Policy, key: jax.Array, params: EnvParams, num_steps: int, num_laps: int
 ) -> Rollout:
     """Return one episode of the mean action, from a reset to its end or to ``num_laps`` laps."""
-    step = make_step(env, network, policy_params, params, num_laps)
+    step = make_step(env, policy, params, num_laps)
 
     def advance(carry: tuple[Any, ...], index: jax.Array) -> tuple[Any, ...]:
         *now, is_flying = carry
@@ -268,22 +260,16 @@ def fly_episode(
         keep = partial(jax.tree.map, partial(jnp.where, is_flying))
         return (*keep(tuple(after), tuple(now)), is_flying & ~is_over), padded
 
-    start = (network.first_memory(), *env.reset(key, params), jnp.asarray(True))
+    start = (policy.network.first_memory(), *env.reset(key, params), jnp.asarray(True))
     return jax.lax.scan(advance, start, jnp.arange(num_steps))[1]
 
 
 def fly_many(
-    env: EpisodicEnvironment,
-    network: ActorCritic,
-    policy_params: Any,
-    seed: int,
-    num_episodes: int,
-    num_steps: int,
-    num_laps: int,
+    env: EpisodicEnvironment, policy: Policy, seed: int, num_episodes: int, num_steps: int, num_laps: int
 ) -> Rollout:
     """Return episodes from noisy start poses, leaves (num_episodes, num_steps, ...)."""
     params = start_pose_params(env.default_params, num_steps)
-    fly = partial(fly_episode, env, network, policy_params)
+    fly = partial(fly_episode, env, policy)
     flights = jax.vmap(lambda key: fly(key, params, num_steps, num_laps))(start_keys(seed, num_episodes))
     jax.block_until_ready(flights)
     env.plant.check_alive()
@@ -310,11 +296,10 @@ def _update_outcome(outcome: Outcomes, flown: Rollout) -> Outcomes:
     )
 
 
-@partial(jax.jit, static_argnames=("env", "network", "num_laps"))
+@partial(jax.jit, static_argnames=("env", "num_laps"))
 def _race_batch(
     env: EpisodicEnvironment,
-    network: ActorCritic,
-    policy_params: Any,
+    policy: Policy,
     keys: jax.Array,
     params: EnvParams,
     models: ModelParameters | None,
@@ -326,7 +311,7 @@ def _race_batch(
 
     def race(key: jax.Array, model: ModelParameters | None) -> Outcomes:
         own = params if model is None else params.replace(model=model)
-        step = make_step(env, network, policy_params, own, num_laps)
+        step = make_step(env, policy, own, num_laps)
 
         def is_flying(carry: tuple[Any, ...]) -> jax.Array:
             *_, is_over, outcome = carry
@@ -346,7 +331,7 @@ def _race_batch(
             causes=Causes(*(never for _ in Causes._fields)),
         )
         # Under vmap the loop runs until no flight is left, and flights that are over stay as they are.
-        start = (network.first_memory(), *env.reset(key, own), never, nothing)
+        start = (policy.network.first_memory(), *env.reset(key, own), never, nothing)
         return jax.lax.while_loop(is_flying, advance, start)[-1]
 
     return jax.vmap(race)(keys, models)
@@ -354,8 +339,7 @@ def _race_batch(
 
 def race_many(
     env: EpisodicEnvironment,
-    network: ActorCritic,
-    policy_params: Any,
+    policy: Policy,
     keys: jax.Array,
     num_steps: int,
     num_laps: int,
@@ -377,7 +361,7 @@ def race_many(
         # The last batch is filled up with its last flight.
         rows = np.minimum(np.arange(first, first + size), num_flights - 1)
         own = jax.tree.map(lambda leaf, rows=rows: leaf[rows], models)
-        batch = _race_batch(env, network, policy_params, keys[rows], params, own, num_steps, num_laps)
+        batch = _race_batch(env, policy, keys[rows], params, own, num_steps, num_laps)
         parts.append(jax.tree.map(np.asarray, batch))
         env.plant.check_alive()
         if report is not None:

@@ -21,7 +21,7 @@ from baselines.purejaxrl_ppo.flights import (
     save_flight,
     score,
 )
-from baselines.purejaxrl_ppo.networks import ActorCritic
+from baselines.purejaxrl_ppo.networks import Policy
 from flytrack_env.files import write_atomically
 from flytrack_env.pictures.drawing import draw_gates, label_from_above, png_of
 from flytrack_env.progress import progress_bar
@@ -67,13 +67,7 @@ def attempt(what: str, steps: int) -> Iterator[None]:
 
 
 def evaluate_policy(
-    env: Any,
-    network: ActorCritic,
-    params: Any,
-    num_episodes: int,
-    out: Path,
-    steps: int,
-    is_recorded: bool = False,
+    env: Any, policy: Policy, num_episodes: int, out: Path, steps: int, is_recorded: bool = False
 ) -> tuple[dict[str, float], list[Path]]:
     """Fly noisy starts; write the first flight and the position density of all; return metrics and files.
 
@@ -83,7 +77,7 @@ def evaluate_policy(
     """
     metrics: dict[str, float] = {}
     with attempt("flying", steps):
-        flights = fly_many(env, network, params, EVALUATION_SEED, num_episodes, NUM_STEPS, NUM_LAPS)
+        flights = fly_many(env, policy, EVALUATION_SEED, num_episodes, NUM_STEPS, NUM_LAPS)
         metrics = evaluation_metrics(outcomes_of(flights, NUM_LAPS, len(env.track.gates)))
     if not metrics:
         return {}, []

@@ -8,6 +8,7 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 import numpy as np
+from flax import struct
 
 from baselines.purejaxrl_ppo.config import Config
 
@@ -121,6 +122,14 @@ class ActorCritic(nn.Module):
         """Return the memory after a step, and the mean action, in [-1, 1]."""
         found: Any = self.apply(params, memory, observation, method="step")
         return found[0], jnp.clip(found[1].mode(), -1.0, 1.0)
+
+
+@struct.dataclass
+class Policy:
+    """A network, with ``first_memory()`` and ``act(params, memory, observation)``, and its parameters."""
+
+    network: Any = struct.field(pytree_node=False)
+    params: Any
 
 
 def make_network(config: Config, num_choices: int = 0) -> ActorCritic:

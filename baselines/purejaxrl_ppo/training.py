@@ -25,6 +25,7 @@ from baselines.purejaxrl_ppo.checkpoint import Checkpoint
 from baselines.purejaxrl_ppo.config import Config, Count
 from baselines.purejaxrl_ppo.metrics import summarise_updates
 from baselines.purejaxrl_ppo.monitor import ProgressLine, evaluate_policy
+from baselines.purejaxrl_ppo.networks import Policy
 from baselines.purejaxrl_ppo.ppo import Algorithm, Runner, make_network_for, make_ppo
 from baselines.purejaxrl_ppo.tracking import RUN_FILE, Tracker
 from flytrack_env.episodes import EpisodicEnvironment
@@ -285,10 +286,9 @@ class Run:
 
     def _evaluate(self, is_last: bool) -> dict[str, float]:
         """Fly and draw the policy as it is; return the metrics, few where it could not be flown."""
-        policy = self.trainer.env, self.trainer.network, self.runner.train_state.params
-        metrics, written = evaluate_policy(
-            *policy, self.options.evaluation_episodes, self.out, self.steps, is_recorded=is_last
-        )
+        policy = Policy(self.trainer.network, self.runner.train_state.params)
+        num_episodes, rest = self.options.evaluation_episodes, (self.out, self.steps)
+        metrics, written = evaluate_policy(self.trainer.env, policy, num_episodes, *rest, is_recorded=is_last)
         for path in written:
             self.tracker.file(path, "evaluation")
         self.success = metrics.get("evaluation_success", self.success)

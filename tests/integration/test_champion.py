@@ -11,6 +11,7 @@ import pytest
 import baselines.purejaxrl_ppo
 from baselines.purejaxrl_ppo import load_checkpoint
 from baselines.purejaxrl_ppo.flights import race_many, score, start_keys
+from baselines.purejaxrl_ppo.networks import Policy
 from baselines.purejaxrl_ppo.plants import draw_plants
 from baselines.purejaxrl_ppo.polish import Settings, decayed, polish
 from baselines.purejaxrl_ppo.race_env import plant_env, simulated_env
@@ -31,7 +32,7 @@ def test_champion_races_on_the_black_box_near_the_optimum():
     champion = load_checkpoint(CHAMPION)
     env = plant_env(champion, blackbox.load(blackbox.SHIPPED))
     keys = start_keys(7, NUM_FLIGHTS)
-    result = score(race_many(env, champion.network, champion.params, keys, NUM_STEPS, NUM_LAPS))
+    result = score(race_many(env, champion.policy, keys, NUM_STEPS, NUM_LAPS))
     optimum = shipped_reference("flytrack", "flying", "black_box")
     assert result.success == 1.0
     assert optimum.time_s < result.flying_lap_s <= MOST_TIMES * optimum.time_s
@@ -42,7 +43,7 @@ def test_robust_champion_races_on_plants_that_it_has_not_met():
     model = load_model(MODEL)
     env = make("FlyTrack-v0", model=model)
     keys, plants = start_keys(8, NUM_FLIGHTS), draw_plants(8, NUM_FLIGHTS, model)
-    flown = race_many(env, champion.network, champion.params, keys, NUM_STEPS, NUM_LAPS, models=plants.models)
+    flown = race_many(env, champion.policy, keys, NUM_STEPS, NUM_LAPS, models=plants.models)
     result = score(flown)
     optimum = shipped_reference("flytrack", "flying", "black_box")
     assert result.success >= LEAST_ROBUST
@@ -66,7 +67,7 @@ def test_champion_is_part_of_the_package():
 
 def first_lap_s(env, network, params):
     """Return the mean first lap; not a number unless every flight finishes it."""
-    result = score(race_many(env, network, params, start_keys(5, 32), 700, 1))
+    result = score(race_many(env, Policy(network, params), start_keys(5, 32), 700, 1))
     return result.first_lap_s if result.success == 1.0 else np.nan
 
 

@@ -44,17 +44,15 @@ def on_rails():
 
 @pytest.fixture(scope="module")
 def flights(on_rails, checkpoint):
-    policy = (checkpoint.network, checkpoint.params)
-    return fly_many(on_rails, *policy, 0, NUM_FLIGHTS, NUM_STEPS, NUM_LAPS)
+    return fly_many(on_rails, checkpoint.policy, 0, NUM_FLIGHTS, NUM_STEPS, NUM_LAPS)
 
 
 @pytest.fixture(scope="module")
 def raced(on_rails, checkpoint):
     """The same flights, in batches, the last one not full."""
-    policy = (checkpoint.network, checkpoint.params)
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr(flights_module, "BATCH", 4)
-        return race_many(on_rails, *policy, start_keys(0, NUM_FLIGHTS), NUM_STEPS, NUM_LAPS)
+        return race_many(on_rails, checkpoint.policy, start_keys(0, NUM_FLIGHTS), NUM_STEPS, NUM_LAPS)
 
 
 @pytest.fixture(scope="module")

@@ -29,7 +29,7 @@ def shipped():
 @pytest.fixture(scope="module")
 def flights(champion, shipped):
     env = plant_env(champion, shipped)
-    return fly_many(env, champion.network, champion.params, 3, 4, 450, 1)
+    return fly_many(env, champion.policy, 3, 4, 450, 1)
 
 
 @pytest.fixture(scope="module")

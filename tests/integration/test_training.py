@@ -145,7 +145,7 @@ def test_an_evaluation_that_fails_does_not_end_the_training(trainer, tmp_path, m
 def test_the_best_lap_survives_a_resume(trainer, tmp_path, monkeypatch):
     steps_evaluated = []
 
-    def evaluate_policy(env, network, params, num_episodes, out, steps, is_recorded=False):
+    def evaluate_policy(env, policy, num_episodes, out, steps, is_recorded=False):
         steps_evaluated.append(steps // BATCH)
         return {"evaluation_success": 1.0, "evaluation_best_lap_s": 8.0 + steps / BATCH}, []
 
