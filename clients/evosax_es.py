@@ -37,8 +37,8 @@ def evaluate(problem: GymnaxProblem, network: Any, problem_state: Any) -> tuple[
     return float(returns[0]), mean_gates(act, problem.env, problem.env_params, num_steps)
 
 
-def measure(seed: int) -> Outcome:
-    """Evolve networks and return the evaluations of the strategy's mean before and after."""
+def evolve(seed: int, num_generations: int = 200) -> tuple[GymnaxProblem, Any, Any]:
+    """Return the problem, the variables of the strategy's mean, and how observations are normalised."""
     problem = make_problem()
     key, init_key = jax.random.split(jax.random.key(seed))
     solution = problem.sample(init_key)
@@ -46,11 +46,16 @@ def measure(seed: int) -> Outcome:
     strategy = Open_ES(64, solution, optimizer=optax.adam(0.05), std_schedule=std_schedule)
     params = strategy.default_params
     state, problem_state = strategy.init(init_key, solution, params), problem.init(init_key)
-    return_before, gates_before = evaluate(problem, strategy.get_mean(state), problem_state)
-    for _ in range(200):
+    for _ in range(num_generations):
         key, ask_key, eval_key, tell_key = jax.random.split(key, 4)
         population, state = strategy.ask(ask_key, state, params)
         fitness, problem_state, _ = problem.eval(eval_key, population, problem_state)
         state, _ = strategy.tell(tell_key, population, -fitness, state, params)
-    return_after, gates_after = evaluate(problem, strategy.get_mean(state), problem_state)
+    return problem, strategy.get_mean(state), problem_state
+
+
+def measure(seed: int) -> Outcome:
+    """Evolve networks and return the evaluations of the strategy's mean before and after."""
+    return_before, gates_before = evaluate(*evolve(seed, num_generations=0))
+    return_after, gates_after = evaluate(*evolve(seed))
     return Outcome(return_before, return_after, gates_before, gates_after)

@@ -7,6 +7,7 @@ import pytest
 from stable_baselines3 import PPO
 from stable_baselines3.common.env_checker import check_env
 
+from clients import entries, sb3_ppo
 from clients.sb3_vec_env import SameStepVecEnv
 from flytrack_env.registration import ENVIRONMENTS
 
@@ -76,3 +77,10 @@ def test_unsupported_environments_and_options_are_refused() -> None:
         envs.reset()
     with pytest.raises(NotImplementedError, match="env_method"):
         envs.env_method("step")
+
+
+def test_the_entry_of_the_benchmark_flies_what_was_trained() -> None:
+    model = sb3_ppo.make_ppo(seed=1)
+    observations = np.random.default_rng(0).normal(size=(16, 29)).astype(np.float32)
+    expected, _ = model.predict(observations, deterministic=True)
+    np.testing.assert_allclose(np.clip(entries.act_of(model)(observations), -1, 1), expected, atol=1e-6)
