@@ -72,7 +72,7 @@ def optimise(track: Track, kind: str, model: ModelParameters, model_name: str) -
     """
     import casadi  # an extra, needed only here
 
-    from benchmarks.optimal.solve import CLEARANCE_M, SMOOTHING_S, Task, find_optimum
+    from benchmarks.optimal import CLEARANCE_M, SMOOTHING_S, Task, find_optimum
 
     env = FlyTrack(track=track, model=model)
     params = env.default_params

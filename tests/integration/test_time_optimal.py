@@ -21,7 +21,7 @@ EXACT = 1e-6  # of the simulator in float64
 
 
 def test_the_symbolic_step_is_the_simulators() -> None:
-    symbolic = pytest.importorskip("benchmarks.optimal.symbolic", exc_type=ImportError)
+    symbolic = pytest.importorskip("benchmarks.optimal", exc_type=ImportError)
     rng, model = np.random.default_rng(0), nominal_parameters()
     for effect in EFFECTS:
         if effect.start is None:  # no memory

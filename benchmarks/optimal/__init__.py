@@ -1,1 +1,0 @@
-"""Finding, replaying and reporting time-optimal laps."""
