@@ -12,9 +12,8 @@ import baselines.purejaxrl_ppo
 from baselines.purejaxrl_ppo import load_checkpoint
 from baselines.purejaxrl_ppo.flights import race_many, score, start_keys
 from baselines.purejaxrl_ppo.networks import Policy
-from baselines.purejaxrl_ppo.plants import draw_plants
 from baselines.purejaxrl_ppo.polish import Settings, decayed, polish
-from baselines.purejaxrl_ppo.race_env import plant_env, simulated_env
+from baselines.purejaxrl_ppo.race_env import draw_plants, plant_env, simulated_env
 from benchmarks.champion import CHAMPION, FOLDER, MODEL
 from flytrack_env import blackbox, load_model, make
 from flytrack_env.model_file import model_from_json

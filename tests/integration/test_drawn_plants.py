@@ -6,8 +6,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from baselines.purejaxrl_ppo.checkpoint import load_checkpoint
-from baselines.purejaxrl_ppo.plants import RANGES, by_thirds, draw_plants
-from baselines.purejaxrl_ppo.race_env import simulated_env, with_model_as_given
+from baselines.purejaxrl_ppo.race_env import (
+    RANGES,
+    by_thirds,
+    draw_plants,
+    simulated_env,
+    with_model_as_given,
+)
 from flytrack_env import make, nominal_parameters
 from flytrack_env.effects import CommandDelay, LinearDrag, QuadraticDrag, ThrustScale
 from flytrack_env.wrappers import DomainRandomization

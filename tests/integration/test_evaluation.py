@@ -11,7 +11,7 @@ from baselines.purejaxrl_ppo import evaluate
 from baselines.purejaxrl_ppo import flights as flights_module
 from baselines.purejaxrl_ppo.checkpoint import load_checkpoint, save_checkpoint
 from baselines.purejaxrl_ppo.flights import fly_many, outcomes_of, race_many, score, start_keys
-from baselines.purejaxrl_ppo.plants import draw_plants
+from baselines.purejaxrl_ppo.race_env import draw_plants
 from flytrack_env import FlyTrack, nominal_parameters, save_track
 from flytrack_env.references import shipped_reference
 from flytrack_env.rollout import load_rollout
