@@ -1,22 +1,25 @@
-"""Evaluation: single flights and many agree, known lap times, report, and refusals."""
+"""Evaluation: single flights and many agree, known lap times, drawn plants, report, and refusals."""
 
 import importlib.util
 import json
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from baselines.purejaxrl_ppo import evaluate
+from baselines.purejaxrl_ppo import evaluate, race_env
 from baselines.purejaxrl_ppo import flights as flights_module
 from baselines.purejaxrl_ppo.checkpoint import load_checkpoint, save_checkpoint
 from baselines.purejaxrl_ppo.flights import fly_many, outcomes_of, race_many, score, start_keys
-from baselines.purejaxrl_ppo.race_env import draw_plants
-from flytrack_env import FlyTrack, nominal_parameters, save_track
+from flytrack_env import FlyTrack, make, nominal_parameters, save_track
+from flytrack_env.effects import CommandDelay, LinearDrag, QuadraticDrag, ThrustScale
 from flytrack_env.references import shipped_reference
 from flytrack_env.rollout import load_rollout
 from flytrack_env.state import BATTERY, POSITION
 from flytrack_env.tracks import random_track
+from flytrack_env.wrappers import DomainRandomization
+from flytrack_env.wrappers.domain_randomization import sample_model
 from tests.support.evaluated import FAILS_BELOW_V, Rails, run, write_checkpoint
 from tests.support.pages import ROOT
 from tests.support.recordings import Recording
@@ -107,7 +110,7 @@ def test_command_flies_many(flown_by, checkpoint_path, tmp_path, monkeypatch, ca
         assert_close(jax.tree.map(lambda leaf: leaf[:1], outcomes), single)
         assert "in the simulator, not on a black box" in text and report["black_box"] is None
         assert report["optimal"]["model"] == "nominal" and report["success"]["low"] is None
-        assert report["plants"]["success"]["of"] == 3 and len(report["plants"]["by_thirds"]) == 12
+        assert report["plants"]["success"]["of"] == 3 and len(report["plants"]["race_env.by_thirds"]) == 12
         assert len(set(outcomes.steps[::2].tolist())) > 1  # the plants differ
     else:
         assert report["optimal"]["model"] == "black_box" and report["plants"] is None
@@ -144,7 +147,7 @@ def test_a_single_flight_as_json_and_docs_name_every_key(
     assert "interval" not in text and report["success"] is None and report["ghost"] is None
     np.testing.assert_allclose(report["first_flight"]["lap_times_s"], raced.lap_times_s[index], atol=1e-5)
     assert [line.split(":")[0] for line in text.splitlines()][:4] == ["flown", "gates", "lap times", "ended"]
-    plants = draw_plants(0, 3, nominal_parameters()).summarise(np.ones((3, 1), bool))
+    plants = race_env.draw_plants(0, 3, nominal_parameters()).summarise(np.ones((3, 1), bool))
     text = (ROOT / "docs" / "baseline.md").read_text()
     missing = {name for name in keys_of({**report, "plants": plants}) if f"`{name}`" not in text}
     assert not missing
@@ -186,3 +189,49 @@ def test_command_refuses_before_it_flies(arguments, messages, bad_files, monkeyp
     error = capsys.readouterr().err
     assert ended.value.code == 2 and all(message in error for message in messages), error
     assert not (bad_files / "rollout.npy").exists()
+
+
+def test_plants_are_drawn_from_the_ranges_around_the_model():
+    known = (LinearDrag(0.4, 0.4, 0.2), CommandDelay(0.03), ThrustScale(0.9), QuadraticDrag(0.01, shared=0.0))
+    model = nominal_parameters().with_effects(*known)
+    plants = race_env.draw_plants(3, 200, model)
+    for name, bounds in race_env.RANGES.items():
+        drawn = plants.drawn[name]
+        assert bounds[0] <= drawn.min() and drawn.max() <= bounds[1] and np.ptp(drawn) > 0.5 * np.ptp(bounds)
+    found = plants.models
+    np.testing.assert_allclose(found.effect("thrust_scale").factor, 0.9 * plants.drawn["thrust_scale"], 1e-6)
+    np.testing.assert_allclose(found.effect("linear_drag").d_x, np.float32(0.4))
+    np.testing.assert_allclose(
+        found.effect("command_delay").delay_s, 0.03 + plants.drawn["command_delay_s"], 1e-6
+    )
+    quadratic, wind = found.effect("quadratic_drag"), found.effect("wind")
+    assert quadratic.k_x.min() >= 0.01 and (quadratic.shared == 0.0).all()
+    np.testing.assert_allclose(np.hypot(wind.v_x, wind.v_y), plants.drawn["wind_m_s"], atol=1e-6)
+    assert (wind.v_x < 0).any() and (wind.v_y < 0).any() and not np.any(wind.v_z)
+    fewer = race_env.draw_plants(3, 5, model)
+    np.testing.assert_array_equal(fewer.models.effect("wind").v_x, wind.v_x[:5])
+    assert not np.array_equal(race_env.draw_plants(4, 5, model).drawn["wind_m_s"], fewer.drawn["wind_m_s"])
+
+
+def test_what_breaks_the_policy_shows_in_its_thirds():
+    drawn = race_env.draw_plants(0, 90, nominal_parameters()).drawn
+    is_good = drawn["command_delay_s"] < np.quantile(drawn["command_delay_s"], 2.0 / 3.0)
+    rows = race_env.by_thirds(drawn, np.stack([is_good, np.ones(90, bool)], axis=1))
+    shares = {name: [r["plants"]["share"] for r in rows if r["quantity"] == name] for name in drawn}
+    assert shares["command_delay_s"] == [1.0, 1.0, 0.0]
+    assert all(min(shares[name]) > 0.3 for name in set(drawn) - {"command_delay_s"})
+    assert {row["flights_share"] for row in rows if row["quantity"] == "command_delay_s"} == {1.0, 0.5}
+    assert len(race_env.by_thirds(drawn, np.ones((90, 1), bool))) == 12
+    assert len(race_env.by_thirds({"wind_m_s": np.ones(1)}, np.ones((1, 1), bool))) == 1
+
+
+def test_ids_that_draw_models_fly_the_one_that_is_given(checkpoint):
+    env = race_env.simulated_env(checkpoint)
+    params = race_env.with_model_as_given(env.default_params)
+    env.check_params(params)
+    ranges, given = params.wrappers[DomainRandomization.key], env.default_params.model
+    found = sample_model(jnp.uint32(5), given, ranges)
+    assert type(found.effects[0]) is LinearDrag and len(found.effects) == 1
+    assert_close(found._replace(tau=np.stack(found.tau)), given, 1e-6)
+    plain = make("FlyTrackNoisy-v0").default_params
+    assert race_env.with_model_as_given(plain) is plain
