@@ -124,9 +124,7 @@ def train(name: str, seed: int) -> tuple[Path, Path]:
         model = jax.tree.map(jnp.asarray, env.default_params.model)
         draw = partial(draw_model, model=model) if recipe.is_robust else None
         started_s = time.perf_counter()
-        policy = polish(
-            env, trained.network, trained.params, seed, recipe.settings, draw, ProgressBar("updates")
-        )
+        policy = polish(env, trained.policy, seed, recipe.settings, draw, ProgressBar("updates"))
         seconds = time.perf_counter() - started_s
         notes = {"polished": {"seed": seed, "seconds": seconds, **recipe.settings._asdict()}}
         save_checkpoint(after, policy, trained.config, {**trained.meta, **notes})

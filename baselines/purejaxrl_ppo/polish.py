@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import optax
 
 from baselines.purejaxrl_ppo.flights import start_pose_params
-from baselines.purejaxrl_ppo.networks import ActorCritic
+from baselines.purejaxrl_ppo.networks import Policy
 from flytrack_env.dynamics import ModelParameters
 from flytrack_env.episodes import EpisodicEnvironment
 from flytrack_env.params import EnvParams
@@ -58,12 +58,7 @@ class Flown(NamedTuple):
 
 
 def fly(
-    env: EpisodicEnvironment,
-    network: ActorCritic,
-    policy_params: Any,
-    key: jax.Array,
-    params: EnvParams,
-    settings: Settings,
+    env: EpisodicEnvironment, policy: Policy, key: jax.Array, params: EnvParams, settings: Settings
 ) -> Flown:
     """Return a flight of the mean action, differentiable in the policy; it stands still once it is over."""
     gates = params.course.gates
@@ -76,7 +71,7 @@ def fly(
 
     def step(carry: tuple[Any, ...], index: jax.Array) -> tuple[Any, None]:
         memory, observation, state, is_flying, flown = carry
-        remembered, action = network.act(policy_params, memory, observation)
+        remembered, action = policy.network.act(policy.params, memory, observation)
         state = decayed(state, settings.gradient_decay)
         race, before = env.race(state), env.drone(state)
         next_state, _, is_over, _ = env.advance(state, Action(*action), params)
@@ -100,7 +95,7 @@ def fly(
 
     zero = jnp.float32(0.0)
     nothing = Flown(zero, jnp.int32(0), zero)
-    start = (network.first_memory(), *env.reset_env(key, params), jnp.asarray(True), nothing)
+    start = (policy.network.first_memory(), *env.reset_env(key, params), jnp.asarray(True), nothing)
     num_steps = round(settings.laps * settings.slowest_lap_s / float(env.default_params.dt))
     return jax.lax.scan(jax.checkpoint(step), start, jnp.arange(num_steps))[0][-1]
 
@@ -122,8 +117,7 @@ DrawModel = Callable[[jax.Array], ModelParameters]
 
 def polish(
     env: EpisodicEnvironment,
-    network: ActorCritic,
-    policy_params: Any,
+    policy: Policy,
     seed: int,
     settings: Settings = Settings(),  # noqa: B008, a tuple of constants
     draw_model: DrawModel | None = None,
@@ -146,7 +140,7 @@ def polish(
         def flight(key: jax.Array) -> Flown:
             of_model, of_start = jax.random.split(key)
             own = params if draw_model is None else params.replace(model=draw_model(of_model))
-            return fly(env, network, policy_params, of_start, own, settings)
+            return fly(env, Policy(policy.network, policy_params), of_start, own, settings)
 
         flown = jax.vmap(flight)(keys)
         is_complete = flown.gates >= last_gate
@@ -162,7 +156,7 @@ def polish(
         change, optimiser_state = optimiser.update(gradient, optimiser_state)
         return optax.apply_updates(policy_params, change), optimiser_state, number
 
-    policy_params = jax.tree.map(jnp.array, policy_params)  # the caller's stay, though updates donate
+    policy_params = jax.tree.map(jnp.array, policy.params)  # the caller's stay, though updates donate
     optimiser_state = optimiser.init(policy_params)
     keys = jax.random.split(jax.random.key(seed), settings.updates)
     for done, key in enumerate(keys, start=1):

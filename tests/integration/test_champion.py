@@ -75,7 +75,9 @@ def test_a_policy_gets_faster_and_is_not_changed_itself():
     env, reports = simulated_env(champion), []
     slower = jax.tree.map(lambda leaf: leaf * (1.0 - OFF), champion.params)
     kept = jax.tree.map(np.array, slower)
-    found = polish(env, champion.network, slower, 0, SHORT, report=lambda *counts: reports.append(counts))
+    found = polish(
+        env, Policy(champion.network, slower), 0, SHORT, report=lambda *counts: reports.append(counts)
+    )
     before, after = (first_lap_s(env, champion.network, params) for params in (slower, found))
     assert after < before - 0.005
     jax.tree.map(np.testing.assert_array_equal, slower, kept)
@@ -86,7 +88,7 @@ def test_a_policy_that_does_not_race_is_refused():
     champion = load_checkpoint(CHAMPION)
     lost = jax.tree.map(jnp.zeros_like, champion.params)
     with pytest.raises(ValueError, match=r"found none of 8 flights that passed 8 gates within 4\.6 s"):
-        polish(simulated_env(champion), champion.network, lost, 0, SHORT)
+        polish(simulated_env(champion), Policy(champion.network, lost), 0, SHORT)
 
 
 def test_a_decayed_state_is_the_same_with_less_gradient():
