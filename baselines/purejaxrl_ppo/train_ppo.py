@@ -118,6 +118,7 @@ def saved_options(start: Checkpoint) -> Options:
     try:
         found = start.meta["options"].items()
         values = {name: value for name, value in found if value is not None}
+        values["tracking_uri"] = str(values.get("tracking_uri", ""))
         options = Options(**{**values, "seeds": tuple(map(int, values["seeds"]))})
         options.check()
     except (AttributeError, KeyError, TypeError, ValueError) as error:
