@@ -40,6 +40,7 @@ PER_COEFFICIENT, PER_NUMBER = 4.0, 8.0  # of chi2: what each has to gain to be p
 MOST_TRIED_AGAIN = 100  # terms, beside the first one found
 MOST_REFINED, REFINEMENTS = 5, 60  # terms a round whose shapes are refined, and evaluations of each
 MOST_TERMS = 3  # of one side
+MOST_STARTS = 3  # first terms from which a law is searched
 LEAST_SHARE = 0.04  # of what the terms before gain: the least of one more
 LEAST_OWN = 0.01  # of a column's information: what is not within the reach of the model's free numbers
 LEAST_SIGMAS = 3.0  # of a coefficient that stays
@@ -212,14 +213,23 @@ def num_shaped(term: Term) -> int:
     return sum(len(one.numbers) for one in term.factors if one.shape != "power")
 
 
+def num_numbers(side: Side, term: Term) -> int:
+    """Return how many numbers a term may choose: coefficients, and those of its shapes."""
+    return len(term.basis(side.moment)) + num_shaped(term)
+
+
+def price_of(side: Side, term: Term) -> float:
+    """Return what a term has to gain to be preferred to nothing."""
+    return PER_COEFFICIENT * len(term.basis(side.moment)) + PER_NUMBER * num_shaped(term)
+
+
 def tried(side: Side, test: SideTest, term: Term) -> Trial:
     """Return the gain of a term beside what is given; nothing where it hardly differs from that."""
     columns = side.columns(term)
     if not np.isfinite(columns).all() or not np.abs(columns).max() > 0.0:
         return Trial(term, -np.inf, 0.0)
     gain = test.fit(columns, LEAST_OWN).gain
-    price = PER_COEFFICIENT * columns.shape[1] + PER_NUMBER * num_shaped(term)
-    return Trial(term, gain - price, gain)
+    return Trial(term, gain - price_of(side, term), gain)
 
 
 def refined(side: Side, test: SideTest, start: Trial) -> Trial:
@@ -366,24 +376,41 @@ def half_told(side: Side, terms: Sequence[Term]) -> tuple[float, float]:
 
 
 def find_law(side: Side, held: Side) -> Found | None:
-    """Return the law of a side that rows learnt from and held-out rows agree on; None without one."""
+    """Return the law of a side that rows learnt from and held-out rows agree on; None without one.
+
+    Searched from the best first terms of several quantities, since of a sum each may gain less than one bump.
+    """
     pool = [bare(side, *one) for one in factors_of(side)]
-    number = len(pool)
+    firsts, ranked = best_of(side, side.test, pool)
+    limit = stats.chi2.isf(CHANCE / len(pool), [num_numbers(side, one.term) for one in firsts])
+    clear = [one for one, least in zip(firsts, limit, strict=True) if one.gain >= least]
+    rivals = tuple(_kind(one.term) for one in firsts[1:] if one.merit > firsts[0].merit - 10.0)
+    by_quantity: dict[str, Trial] = {}
+    for one in clear:
+        by_quantity.setdefault(one.term.factors[-1].quantity, one)
+    starts = list(by_quantity.values())[:MOST_STARTS]
+    laws = [grown(side, held, one, ranked[:MOST_TRIED_AGAIN], len(pool)) for one in starts]
+    found = [one._replace(rivals=rivals) for one in laws if one is not None]
+    return max(
+        found, key=lambda one: one.gain - sum(price_of(side, term) for term in one.terms), default=None
+    )
+
+
+def best_of(side: Side, test: SideTest, pool: Sequence[Term]) -> tuple[list[Trial], list[Term]]:
+    """Return the best terms of different kinds, refined, the best first, and the pool in that order."""
+    trials = sorted((tried(side, test, term) for term in pool), key=lambda one: -one.merit)
+    best = [refined(side, test, one) for one in _of_different_kinds(trials)[:MOST_REFINED]]
+    return sorted(best, key=lambda one: -one.merit), [one.term for one in trials]
+
+
+def grown(side: Side, held: Side, first: Trial, pool: Sequence[Term], number: int) -> Found | None:
+    """Return the law that begins with a term, to which others of a pool are added while they gain.
+
+    number: of terms among which they are chosen.
+    """
     terms: list[Term] = []
     best: Found | None = None
-    rivals: tuple[str, ...] = ()
-    test = side.test
     while len(terms) < MOST_TERMS:
-        trials = sorted((tried(side, test, term) for term in pool), key=lambda one: -one.merit)
-        pool = [one.term for one in trials[:MOST_TRIED_AGAIN]]
-        trials = _of_different_kinds(trials)[:MOST_REFINED]
-        trials = sorted((refined(side, test, one) for one in trials), key=lambda one: -one.merit)
-        first = trials[0]
-        width = side.columns(first.term).shape[1] + num_shaped(first.term)
-        if first.gain < stats.chi2.isf((CHANCE_OF_MORE if terms else CHANCE) / number, width):
-            break
-        if not terms:
-            rivals = tuple(_kind(one.term) for one in trials[1:] if one.merit > first.merit - 10.0)
         now, fit = fitted(side, refined_together(side, [*terms, first.term]))
         if len(now) <= len(terms) or (best is not None and fit.chi2 < (1.0 + LEAST_SHARE) * best.gain):
             break
@@ -394,9 +421,12 @@ def find_law(side: Side, held: Side) -> Found | None:
         told = (gain, expected) if expected >= LEAST_TOLD else half_told(side, now)
         # One wave of a sum of two may fail on held-out rows where both do not.
         if told[0] >= HELD_OUT_SHARE * told[1]:
-            best = Found(now, vector, fit.chi2, gain, expected, rivals)
+            best = Found(now, vector, fit.chi2, gain, expected, ())
         terms = list(now)
         test = side.test.given_also(*(side.columns(term) for term in terms))
+        (first, *_), _ = best_of(side, test, pool)
+        if first.gain < stats.chi2.isf(CHANCE_OF_MORE / number, num_numbers(side, first.term)):
+            break
     return best
 
 

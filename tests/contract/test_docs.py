@@ -1,4 +1,4 @@
-"""The documentation agrees with the code: API reference, generated pages, tables, examples."""
+"""The documentation agrees with the code: API reference, generated pages, examples."""
 
 import ast
 import importlib
@@ -11,7 +11,7 @@ import pytest
 from docs.effect_pages import effect_page
 from docs.track_pages import gate_rows, track_page
 from flytrack_env.effects import EFFECTS
-from flytrack_env.tracks import DEMANDS, Limits, available_tracks, build_course, load_track, way_length
+from flytrack_env.tracks import available_tracks, build_course, load_track
 from tests.support.pages import BLOCK, DOCS, ROOT, examples, run_examples
 from tests.support.slow import slow_but
 
@@ -68,32 +68,3 @@ def test_page_of_a_track_has_the_headings_of_its_gates(name: str) -> None:
     headings = np.deg2rad([heading_deg for _, _, heading_deg, _ in gate_rows(track)])
     np.testing.assert_allclose(forward, np.stack([np.cos(headings), np.sin(headings)], -1), atol=1e-5)
     assert BLOCK.search(track_page(name)) and (DOCS / "tracks" / f"{name}.png").is_file()
-
-
-def test_table_of_tracks_is_that_of_the_files() -> None:
-    text = (DOCS / "tracks.md").read_text(encoding="utf-8")
-    rows = {
-        name: cells.split(" | ")[:4] for name, cells in re.findall(r"^\| `(\w+)` \| (.*) \|$", text, re.M)
-    }
-    expected = {}
-    for name in available_tracks():
-        track = load_track(name)
-        heights = [gate.position[2] for gate in track.gates]
-        length = f"{way_length(build_course(track)):.1f}"
-        sizes = [str(len(track.gates)), f"{track.gates[0].opening:g}", length]
-        expected[name] = [*sizes, f"{min(heights):g} to {max(heights):g}"]
-    assert rows == expected
-
-
-def test_documented_limits_are_the_checks() -> None:
-    text = (DOCS / "tracks.md").read_text(encoding="utf-8")
-    rows = dict(re.findall(r"^\| ([a-z ]+) \| (.*) \|$", text[text.index("| demand |") :], re.M)[1:])
-    limits = Limits()
-    numbers = {
-        "opening": f"{limits.min_opening:g} m",
-        "spacing": f"{limits.min_spacing:g} to {limits.max_spacing:g} m",
-        "turn": f"{limits.max_turn_deg:g} deg",
-        "path": f"{limits.clearance:g} m",
-        "start": f"{limits.min_start_distance:g} to {limits.max_spacing:g} m",
-    }
-    assert tuple(rows) == DEMANDS and all(number in rows[demand] for demand, number in numbers.items())

@@ -1,18 +1,10 @@
-"""Imports point downwards and form no circle; classes that look alike cannot be confused."""
+"""Imports point downwards and form no circle."""
 
 import ast
-import dataclasses
-import importlib
-import itertools
-import pkgutil
-import types
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
-import jax
 import pytest
-
-import flytrack_env
 
 ROOT = Path(__file__).parents[2]
 PACKAGE = "flytrack_env"
@@ -166,34 +158,3 @@ def test_this_test_sees_imports() -> None:
     seen = {name for path in MODULES for name, _ in imports_of(path)}
     assert "flytrack_env.dynamics.ModelParameters" in seen and "gymnax" in seen
     assert len(CONSUMER_FILES) > 0
-
-
-def tree_classes() -> list[type]:
-    """Return every class of the package whose instances are pytrees with leaves of their own."""
-    found = {}
-    for info in pkgutil.walk_packages(flytrack_env.__path__, f"{PACKAGE}."):
-        if info.name.split(".")[1] in ONLY_IN.values():
-            continue
-        for value in vars(importlib.import_module(info.name)).values():
-            is_class = isinstance(value, type) and not isinstance(value, types.GenericAlias)
-            if is_class and value.__module__.startswith(PACKAGE):
-                is_record = hasattr(value, "_fields") or dataclasses.is_dataclass(value)
-                if is_record and not jax.tree_util.treedef_is_leaf(jax.tree.structure(filled(value))):
-                    found[f"{value.__module__}.{value.__qualname__}"] = value
-    return list(found.values())
-
-
-def filled(record: type) -> object:
-    """Return an instance with a number in every field."""
-    if hasattr(record, "_fields"):
-        return record(*[0.0] * len(record._fields))
-    return record(**{field.name: 0.0 for field in dataclasses.fields(record) if field.init})
-
-
-def test_look_alike_classes_have_different_tree_definitions() -> None:
-    classes = tree_classes()
-    names = {record.__name__ for record in classes}
-    assert {"ModelParameters", "EnvParams", "EnvState", "Drone", "Race", "Course"} <= names
-    for a, b in itertools.combinations(classes, 2):
-        definitions = jax.tree.structure(filled(a)), jax.tree.structure(filled(b))
-        assert definitions[0] != definitions[1], f"{a.__qualname__} and {b.__qualname__}"

@@ -1,14 +1,10 @@
 """The shipped champion, near the time-optimal lap on the black box; polishing makes such a policy faster."""
 
-import tomllib
-from pathlib import Path
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-import baselines.purejaxrl_ppo
 from baselines.purejaxrl_ppo import load_checkpoint
 from baselines.purejaxrl_ppo.flights import race_many, score, start_keys
 from baselines.purejaxrl_ppo.networks import Policy
@@ -55,13 +51,6 @@ def test_champion_is_a_small_policy_of_the_model_of_its_reference():
     model = model_from_json(champion.meta["model"], "champion")
     assert model_digest(model) == model_digest(load_model(MODEL))
     assert model_digest(model) == model_digest(shipped_reference("flytrack", "flying", "black_box").model)
-
-
-def test_champion_is_part_of_the_package():
-    pyproject = tomllib.loads((Path(__file__).parents[2] / "pyproject.toml").read_text())
-    package = Path(baselines.purejaxrl_ppo.__file__).parent
-    patterns = pyproject["tool"]["setuptools"]["package-data"]["baselines.purejaxrl_ppo"]
-    assert CHAMPION in [path for pattern in patterns for path in package.glob(pattern)]
 
 
 def first_lap_s(env, network, params):

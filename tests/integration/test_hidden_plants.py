@@ -318,23 +318,23 @@ def flown_in_jax(truth: hidden.Truth, commands: np.ndarray) -> np.ndarray:
     return np.asarray(jax.lax.scan(step, plant.reset(drone, nominal_parameters()), commands)[1])
 
 
+def check_flight(truth: hidden.Truth, without: hidden.Truth | None, rng: np.random.Generator) -> None:
+    """Compare both flights; that without what is tested, if any, has to differ."""
+    commands = np.repeat(rng.uniform(-1.0, 1.0, (LOOP_STEPS // 4, 4)), 4, axis=0).astype(np.float32)
+    expected, found = flown_in_floats(truth, commands), flown_in_jax(truth, commands)
+    np.testing.assert_allclose(found, expected, rtol=2e-4, atol=2e-4)
+    assert without is None or np.abs(expected - flown_in_floats(without, commands)).max() > 1e-3
+
+
 @pytest.mark.parametrize("names", slow_but([(), EFFECTS], [(), EFFECTS, *((name,) for name in EFFECTS)]))
 def test_the_flight_is_that_in_plain_floats(names):
     rng = np.random.default_rng(len(names))
     base = hidden.draw_base(rng)
     truth = hidden.with_effects(base, tuple(names), rng)
-    commands = np.repeat(rng.uniform(-1.0, 1.0, (LOOP_STEPS // 4, 4)), 4, axis=0).astype(np.float32)
-    expected, found = flown_in_floats(truth, commands), flown_in_jax(truth, commands)
-    np.testing.assert_allclose(found, expected, rtol=2e-4, atol=2e-4)
-    if names:
-        assert np.abs(expected - flown_in_floats(base, commands)).max() > 1e-3
+    check_flight(truth, base if names else None, rng)
 
 
 @pytest.mark.parametrize("number", range(len(SIGNALS)), ids=SIGNALS)
 def test_a_law_outside_the_list_acts_as_in_plain_floats(number):
     truth = draw_plant_with_law(number, seed=1)
-    rng = np.random.default_rng(number)
-    commands = np.repeat(rng.uniform(-1.0, 1.0, (LOOP_STEPS // 4, 4)), 4, axis=0).astype(np.float32)
-    expected, found = flown_in_floats(truth, commands), flown_in_jax(truth, commands)
-    np.testing.assert_allclose(found, expected, rtol=2e-4, atol=2e-4)
-    assert np.abs(expected - flown_in_floats(replace(truth, outside=None), commands)).max() > 1e-3
+    check_flight(truth, replace(truth, outside=None), np.random.default_rng(number))

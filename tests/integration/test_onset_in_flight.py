@@ -53,6 +53,7 @@ def test_a_cause_that_ends_in_flight_is_not_in_the_extended_model():
     assert cause.effect == "motor_imbalance" and cause.onset_s is None
     assert cause.end_s.value == pytest.approx(0.5 * SECONDS, abs=0.5)
     assert found.extended.effects == ()
+    assert f"motor_imbalance until {cause.end_s.value:.1f} ± " in text_of(found)
     assert any("ended within the log" in warning for warning in found.warnings)
 
 

@@ -9,17 +9,7 @@ from typing import Any
 import numpy as np
 
 ULOG_TYPES = {"uint64_t": "Q", "float": "f", "bool": "?", "uint8_t": "B"}
-NUM_ROWS, STEP_US = 30, 10_000
-FLOAT = "float"
-ULOG_TOPICS: dict[str, tuple[list[tuple[str, str, int]], tuple[float, ...]]] = {
-    "vehicle_angular_velocity": ([(FLOAT, "xyz", 3)], (0.1, 0.2, 0.3)),
-    "vehicle_attitude": ([(FLOAT, "q", 4)], (0.8, 0.0, 0.0, 0.6)),
-    "vehicle_rates_setpoint": (
-        [(FLOAT, "roll", 0), (FLOAT, "pitch", 0), (FLOAT, "yaw", 0), (FLOAT, "thrust_body", 3)],
-        (0.5, 0.25, -0.25, 0.0, 0.0, -0.5),
-    ),
-}
-ULOG_PARAMETERS = {"MC_ACRO_R_MAX": 720.0, "MC_ACRO_P_MAX": 360.0, "MC_ACRO_Y_MAX": 90.0}
+NUM_ROWS = 30
 
 
 class UlogWriter:
@@ -57,10 +47,35 @@ class UlogWriter:
         """Return the file."""
         return b"ULog\x01\x12\x35" + struct.pack("<BQ", 1, 0) + self.definitions + self.data
 
-    def write(self, path: Path) -> Path:
-        """Write the file and return its path."""
-        path.write_bytes(self.content())
-        return path
+
+PARAMETERS = {"MC_ACRO_R_MAX": 720.0, "MC_ROLLRATE_MAX": 220.0, "MC_ACRO_P_MAX": 360.0}
+PARAMETERS |= {"MC_ACRO_Y_MAX": 90.0, "MC_YAWRATE_MAX": 180.0}
+STEP_US = 4000
+TIMES_US = 1_000_000 + STEP_US * np.arange(200)
+EAST = (np.sqrt(0.5), 0.0, 0.0, np.sqrt(0.5))  # NED, FRD: nose east
+XYZ = [("float", "x", 0), ("float", "y", 0), ("float", "z", 0)]
+VXYZ = [("float", "vx", 0), ("float", "vy", 0), ("float", "vz", 0)]
+SETPOINT = [("float", "roll", 0), ("float", "pitch", 0), ("float", "yaw", 0)]
+
+
+def constant(values: tuple[float, ...], times: np.ndarray = TIMES_US) -> list[tuple[Any, ...]]:
+    """Return rows of the same values."""
+    return [(int(time), *values) for time in times]
+
+
+def topics() -> dict[str, tuple[list, list]]:
+    """Return the topics of a log of a drone with its nose east, turning, pulling up; fields and rows."""
+    slow = TIMES_US[::5]
+    place = constant((1.0, 2.0, -3.0, 4.0, 5.0, -6.0), slow)
+    setpoints = constant((*np.deg2rad([360.0, 90.0, -45.0]), 0.0, 0.0, -0.75), slow)  # half of the full stick
+    return {
+        "vehicle_angular_velocity": ([("float", "xyz", 3)], constant((0.1, 0.2, 0.3))),
+        "vehicle_acceleration": ([("float", "xyz", 3)], constant((0.5, 0.25, -9.75))),
+        "vehicle_attitude": ([("float", "q", 4)], constant(EAST, slow)),
+        "vehicle_local_position": ([*XYZ, *VXYZ], place),
+        "vehicle_rates_setpoint": ([*SETPOINT, ("float", "thrust_body", 3)], setpoints),
+        "battery_status": ([("float", "voltage_v", 0)], constant((16.25,), TIMES_US[::100])),
+    }
 
 
 def _variable_bytes(value: int, is_signed: bool) -> bytes:
@@ -109,6 +124,18 @@ def blackbox(rows: np.ndarray, names: list[str], headers: dict[str, str]) -> byt
     return text + frames + b"E\xffEnd of log\x00"
 
 
+BLACKBOX_NAMES = ["loopIteration", "time", *(f"setpoint[{axis}]" for axis in range(4)), "vbatLatest"]
+BLACKBOX_NAMES += [f"{sensor}[{axis}]" for sensor in ("gyroADC", "accSmooth") for axis in range(3)]
+
+
+def blackbox_frames(num_rows: int = 200) -> np.ndarray:
+    """Return frames of a steady turn, the throttle rising, at 2 kHz."""
+    row = [0, 0, 511, -333, 250, 0, 2410, 100, -50, 25, 1024, -512, 2048]
+    found, count = np.tile(row, (num_rows, 1)), np.arange(num_rows)
+    found[:, 0], found[:, 1], found[:, 5] = count, 5_000_000 + 500 * count, np.linspace(0, 1000, num_rows)
+    return found
+
+
 def usd_log(events: dict[str, tuple[dict[str, str], np.ndarray]], version: int = 2) -> bytes:
     """Return a Crazyflie's uSD log: of each event its variables, and rows with the time in s first."""
     stamp, per_s = {1: ("I", 1e3), 2: ("Q", 1e6)}[version]
@@ -151,21 +178,17 @@ def save_bag(path: Path) -> None:
         writer.finish()
 
 
-def ulog() -> bytes:
-    """Return a small PX4 log."""
-    writer = UlogWriter(ULOG_PARAMETERS)
-    for name, (fields, values) in ULOG_TOPICS.items():
-        writer.add(name, fields, [(10**6 + STEP_US * row, *values) for row in range(NUM_ROWS)])
+def ulog(tables: dict[str, tuple[list, list]] | None = None, parameters: Any = PARAMETERS) -> bytes:
+    """Return a PX4 log of topics: of a small one unless they are given."""
+    writer = UlogWriter(parameters)
+    for name, (fields, rows) in (topics() if tables is None else tables).items():
+        writer.add(name, fields, rows)
     return writer.content()
 
 
 def betaflight() -> bytes:
     """Return a small Betaflight log."""
-    sensors = [f"{sensor}[{axis}]" for sensor in ("gyroADC", "accSmooth") for axis in range(3)]
-    names = ["loopIteration", "time", *(f"setpoint[{axis}]" for axis in range(4)), "vbatLatest", *sensors]
-    rows = np.tile((0, 0, 511, -333, 250, 300, 2410, 100, -50, 25, 1024, -512, 2048), (NUM_ROWS, 1))
-    rows[:, 0], rows[:, 1] = np.arange(NUM_ROWS), 5_000_000 + STEP_US * np.arange(NUM_ROWS)
-    return blackbox(rows, names, BLACKBOX_HEADERS)
+    return blackbox(blackbox_frames(NUM_ROWS), BLACKBOX_NAMES, BLACKBOX_HEADERS)
 
 
 def foreign_csv() -> bytes:

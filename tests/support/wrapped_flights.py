@@ -35,6 +35,11 @@ class Flight(NamedTuple):
     truncated: Any
     info: Any
 
+    @property
+    def ended(self) -> np.ndarray:
+        """Whether each step ended its episode."""
+        return np.asarray(self.terminated | self.truncated)
+
 
 @cache
 def wrapped(*wrappers: Any) -> Any:

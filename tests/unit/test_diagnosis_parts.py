@@ -194,17 +194,12 @@ def test_what_a_given_model_has_too_much_is_taken_out_again(flown):
         assert 0.0 < half < 0.05 * tau and abs(one.time - tau * np.log(2.0)) < 1.5 * half
 
 
-def test_channels_that_some_logs_lack_are_warned_of(flown):
-    first = replace(flown[1].select(slice(0, 30)), source="folder/a.npz")
-    second = replace(flown[1].select(slice(30, 50)).without("f"), source="b.npz")
-    assert unused_channels([first, second]) == ["channel f is not used: b.npz has none"]
-    assert unused_channels([first, first]) == []
-
-
-def test_logs_are_joined_by_what_they_all_have(flown):
+def test_logs_are_joined_by_what_they_all_have_with_a_warning(flown):
     first = replace(flown[1].select(slice(0, 30)), source="folder/a.npz")
     segments = np.repeat([4, 7], 10)
     second = replace(flown[1].select(slice(30, 50)).without("f"), segment=segments, source="b.npz")
+    assert unused_channels([first, second]) == ["channel f is not used: b.npz has none"]
+    assert unused_channels([first, first]) == []
     both = joined([first, second])
     assert sorted(both.channels) == sorted(set(first.channels) - {"f"}) and both.source == "a.npz + b.npz"
     np.testing.assert_array_equal(both.segment, np.repeat([0, 1, 2], [30, 10, 10]))
@@ -296,11 +291,6 @@ def test_a_law_without_memory_has_to_hold_while_commands_rest(state, effect, is_
         own = Ablation(1e4, 1.0, 1, {}, {}, SimpleNamespace(vector=less))
         found = Selection(state, None, SimpleNamespace(vector=full), {effect: own})
         assert vetoes.not_seen_at_rest(found, None) == ([effect] if is_false and is_law else [])
-
-
-def test_lost_causes_are_warned_of(state):
-    (lost,) = warnings_of(state.problem, [], ["wind"])
-    assert lost.startswith("wind gained nothing on the held-out part")
 
 
 def test_a_long_log_is_thinned_with_a_warning_that_counts_judged_rows(state, monkeypatch):

@@ -32,10 +32,6 @@ def flight(env):
     return fly(env, actions=actions)
 
 
-def ended(flight):
-    return np.asarray(flight.terminated | flight.truncated)
-
-
 def assert_begun(done, states):
     """Assert that ended episodes have begun again, with nothing counted yet."""
     race = states.race
@@ -79,15 +75,8 @@ def test_spaces_contain_every_observation_of_flights_that_end_in_many_ways(env, 
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves((flight.states, flight.rewards)))
 
 
-def test_auto_reset_leaves_nothing_behind(flight):
-    done, final = ended(flight), flight.info["final_observation"]
-    assert_begun(done, flight.states)
-    np.testing.assert_array_equal(flight.observations[~done], final[~done])
-    assert (flight.observations[done] != final[done]).any(axis=1).all()
-
-
 def test_info_belongs_to_the_step_not_to_the_reset(env, flight):
-    done, states, info = ended(flight), flight.states, flight.info
+    done, states, info = flight.ended, flight.states, flight.info
     np.testing.assert_array_equal(np.stack([info[cause] for cause in CAUSES]).any(axis=0), flight.terminated)
     np.testing.assert_array_equal(info["terminated"], flight.terminated)
     np.testing.assert_array_equal(info["truncated"], flight.truncated)

@@ -1,10 +1,11 @@
 """The excitation moves one thing at a time, over all amplitudes and voltages, the same for the same seed."""
 
 import numpy as np
+import pytest
 
 from flytrack_sysid.collect import collect
 from flytrack_sysid.excitation import AMPLITUDES, KINDS, LEG_SPEEDS, script
-from flytrack_sysid.split import held_out_rows
+from flytrack_sysid.split import blocks_of, held_out_rows
 from tests.support.handout_plant import HOVER, HandoutPlant
 
 STICKS = ("roll", "pitch", "yaw", "thrust")
@@ -31,6 +32,12 @@ def test_every_kind_comes_in_fours_with_all_amplitudes_and_voltages():
 def test_held_out_part_has_every_kind_a_clear_step_of_each_axis_and_all_voltages():
     log = collect(HandoutPlant(), minutes=1.0, seed=1)
     out = held_out_rows(log)
+    np.testing.assert_array_equal(out, blocks_of(log) % 4 == 3)
+    np.testing.assert_array_equal(held_out_rows(log, 2), blocks_of(log) % 2 == 1)
+    assert not held_out_rows(log, 0).any()
+    for every in (1, -4):
+        with pytest.raises(ValueError, match=f"every: found {every}"):
+            held_out_rows(log, every)
     assert {KINDS[number // 4 % len(KINDS)] for number in log.segment[out]} == set(KINDS)
     for part in (out, ~out):
         volts = log["v_bat"][part]

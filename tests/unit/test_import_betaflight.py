@@ -12,23 +12,14 @@ from flytrack_env.state import Action
 from flytrack_sysid import LogError, import_log
 from flytrack_sysid.importing.betaflight_rates import full_stick_rate, stick_curve
 from tests.support.foreign_logs import BLACKBOX_HEADERS, blackbox
+from tests.support.foreign_logs import BLACKBOX_NAMES as NAMES
+from tests.support.foreign_logs import blackbox_frames as frames
 from tests.support.real_logs import BETAFLIGHT, shared
 
 pytest.importorskip("orangebox", reason="orangebox is not installed: pip install 'flytrack[logs]'")
 
 GRAVITY = 9.80665
-NAMES = ["loopIteration", "time", *(f"setpoint[{axis}]" for axis in range(4)), "vbatLatest"]
-NAMES += [f"gyroADC[{axis}]" for axis in range(3)] + [f"accSmooth[{axis}]" for axis in range(3)]
 FULL_STICK = (1021.6, 200.0 / 0.3, 500.0)  # of the headers: 5.108 x 200; 200 / (1 - 0.7); 100 / (1 - 0.8)
-
-
-def frames(num_rows: int = 200) -> np.ndarray:
-    """Return frames of a steady turn, the throttle rising."""
-    time = 5_000_000 + 500 * np.arange(num_rows)
-    row = [0, 0, 511, -333, 250, 0, 2410, 100, -50, 25, 1024, -512, 2048]
-    found = np.tile(row, (num_rows, 1))
-    found[:, 0], found[:, 1], found[:, 5] = np.arange(num_rows), time, np.linspace(0, 1000, num_rows)
-    return found
 
 
 def still() -> np.ndarray:

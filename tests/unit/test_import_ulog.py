@@ -11,47 +11,26 @@ from scipy.spatial.transform import Rotation
 from flytrack_env.sandbox import ResourceLimits
 from flytrack_sysid import LogError, import_log
 from flytrack_sysid.importing import decoding
-from tests.support.foreign_logs import UlogWriter
+from tests.support.foreign_logs import (
+    PARAMETERS,
+    STEP_US,
+    TIMES_US,
+    VXYZ,
+    XYZ,
+    UlogWriter,
+    constant,
+    topics,
+    ulog,
+)
 from tests.support.real_logs import shared
 
 pytest.importorskip("pyulog", reason="pyulog is not installed: pip install 'flytrack[logs]'")
 
-PARAMETERS = {"MC_ACRO_R_MAX": 720.0, "MC_ROLLRATE_MAX": 220.0, "MC_ACRO_P_MAX": 360.0}
-PARAMETERS |= {"MC_ACRO_Y_MAX": 90.0, "MC_YAWRATE_MAX": 180.0}
-STEP_US = 4000
-TIMES_US = 1_000_000 + STEP_US * np.arange(200)
-EAST = (np.sqrt(0.5), 0.0, 0.0, np.sqrt(0.5))  # NED, FRD: nose east
-XYZ = [("float", "x", 0), ("float", "y", 0), ("float", "z", 0)]
-VXYZ = [("float", "vx", 0), ("float", "vy", 0), ("float", "vz", 0)]
-SETPOINT = [("float", "roll", 0), ("float", "pitch", 0), ("float", "yaw", 0)]
 
-
-def constant(values: tuple[float, ...], times: np.ndarray = TIMES_US) -> list[tuple[Any, ...]]:
-    """Return rows of the same values."""
-    return [(int(time), *values) for time in times]
-
-
-def topics() -> dict[str, tuple[list, list]]:
-    """Return the topics of a log of a drone with its nose east, turning, pulling up; fields and rows."""
-    slow = TIMES_US[::5]
-    place = constant((1.0, 2.0, -3.0, 4.0, 5.0, -6.0), slow)
-    setpoints = constant((*np.deg2rad([360.0, 90.0, -45.0]), 0.0, 0.0, -0.75), slow)  # half of the full stick
-    return {
-        "vehicle_angular_velocity": ([("float", "xyz", 3)], constant((0.1, 0.2, 0.3))),
-        "vehicle_acceleration": ([("float", "xyz", 3)], constant((0.5, 0.25, -9.75))),
-        "vehicle_attitude": ([("float", "q", 4)], constant(EAST, slow)),
-        "vehicle_local_position": ([*XYZ, *VXYZ], place),
-        "vehicle_rates_setpoint": ([*SETPOINT, ("float", "thrust_body", 3)], setpoints),
-        "battery_status": ([("float", "voltage_v", 0)], constant((16.25,), TIMES_US[::100])),
-    }
-
-
-def write(path: Path, tables: dict[str, tuple[list, list]], parameters: Any = None) -> Path:
+def write(path: Path, tables: dict[str, tuple[list, list]], parameters: Any = PARAMETERS) -> Path:
     """Write topics to a ULog file."""
-    writer = UlogWriter(PARAMETERS if parameters is None else parameters)
-    for name, (fields, rows) in tables.items():
-        writer.add(name, fields, rows)
-    return writer.write(path)
+    path.write_bytes(ulog(tables, parameters))
+    return path
 
 
 def test_frames_and_units_are_ours(tmp_path):

@@ -1,12 +1,8 @@
-"""The test for effects that begin or end within a log, on made scores, and how times are told."""
-
-from dataclasses import replace
+"""The test for effects that begin or end within a log, on made scores."""
 
 import numpy as np
 
 from flytrack_sysid.diagnosis.onset import is_one_flight, threshold, windowed_gains
-from flytrack_sysid.diagnosis.report import when_of
-from flytrack_sysid.diagnosis.result import Cause, Estimated
 from flytrack_sysid.log import FlightLog
 
 BLOCKS, TRIMMED = 60, 0.1
@@ -44,15 +40,3 @@ def test_only_logs_of_one_clock_can_show_when():
     channels = {"u": np.zeros((4, 4))}
     for time, expected in (([0.0, 1.0, 5.0, 6.0], True), ([0.0, 1.0, 0.0, 1.0], False)):
         assert is_one_flight(FlightLog(np.array(time), channels, np.array([0, 0, 1, 1]))) is expected
-
-
-def test_times_in_words():
-    cause = Cause("motor_imbalance", (), "rates", {}, 1.0, 1.0, 1.0, 1.0)
-    begin, end = (Estimated(at, (at - 0.4, at + 0.4), "s") for at in (31.2, 40.0))
-    spans = ({}, {"onset_s": begin}, {"end_s": end}, {"onset_s": begin, "end_s": end})
-    assert [when_of(replace(cause, **span)) for span in spans] == [
-        "",
-        " from 31.2 ± 0.4 s on",
-        " until 40.0 ± 0.4 s",
-        " from 31.2 ± 0.4 s to 40.0 ± 0.4 s",
-    ]

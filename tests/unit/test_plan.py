@@ -33,17 +33,6 @@ WANTED = {
     "yaw_reaction": (),
     "gyro_scale": ("rate_scale",),
 }
-EXPECTED = {
-    "wind": {"headings", "thrust_tilted", "spins"},
-    "thrust_tilt": {"headings"},
-    "ground_effect": {"low_passes"},
-    "rate_saturation": {"stick_amplitudes", "spins"},
-    "rate_expo": {"stick_amplitudes", "fast_switching"},
-    "imu_offset": {"spins", "fast_switching"},
-    "linear_drag": {"speeds"},
-    "yaw_reaction": {"thrust_steps"},
-    "gyro_scale": {"spins", "stick_amplitudes"},
-}
 
 
 class Logged(NamedTuple):
@@ -111,6 +100,5 @@ def test_what_is_advised_shows_once_it_is_flown(hover, told):
     assert set(advice) == set(WANTED)
     for effect, alike in WANTED.items():
         question = Question(hover.linearization, hover.model, effect, alike)
-        assert advice[effect] in EXPECTED[effect], effect
         before, after = question.shares()[0], question.shares(told(advice[effect]))[0]
         assert before < 1.0 <= after, f"{effect}: {before} before and {after} after {advice[effect]}"

@@ -24,36 +24,29 @@ class ProbeParams:
 class Probe(environment.Environment):
     """Reward 1 each step; ends every 8 steps, by truncation or by termination; the clock is hidden.
 
-    Variants: is_clock_seen; reward(time, action, length); num_choices of discrete actions.
+    Variants: reward(time, action, length); num_choices of discrete actions.
     """
 
-    def __init__(
-        self, terminates, is_clock_seen=False, reward=lambda time, action, length: 1.0, num_choices=0
-    ):
+    def __init__(self, terminates, reward=lambda time, action, length: 1.0, num_choices=0):
         super().__init__()
-        self.terminates, self.is_clock_seen = terminates, is_clock_seen
-        self.reward, self.num_choices = reward, num_choices
+        self.terminates, self.reward, self.num_choices = terminates, reward, num_choices
 
     @property
     def default_params(self):
         return ProbeParams()
-
-    def look(self, state):
-        return jnp.array([1.0, 0.0]) * state.time * self.is_clock_seen
 
     def step_env(self, key, state, action, params):
         reward = jnp.asarray(self.reward(state.time, action, params.max_steps_in_episode), float)
         state = ProbeState(time=state.time + 1)
         at_end = state.time >= params.max_steps_in_episode
         terminated = at_end if self.terminates else jnp.asarray(False)
-        return self.look(state), state, reward.reshape(()), terminated, {}
+        return jnp.zeros(2), state, reward.reshape(()), terminated, {}
 
     def is_truncated(self, state, params):
         return (state.time >= params.max_steps_in_episode) & (not self.terminates)
 
     def reset_env(self, key, params):
-        state = ProbeState(time=jnp.int32(0))
-        return self.look(state), state
+        return jnp.zeros(2), ProbeState(time=jnp.int32(0))
 
     def action_space(self, params):
         return spaces.Discrete(self.num_choices) if self.num_choices else spaces.Box(-1.0, 1.0, (1,))
@@ -102,16 +95,8 @@ def test_with_all_differences_off_truncation_is_termination():
     assert found == pytest.approx(VALUE_OF_EIGHT, rel=0.1)
 
 
-def test_delayed_reward_is_discounted_back():
-    # Reward 1 on the last of three steps, and the clock is seen: values 0.81, 0.9, 1.
-    env = Probe(True, is_clock_seen=True, reward=lambda time, action, length: time == length - 1)
-    network, params = train(env, ProbeParams(max_steps_in_episode=3))
-    clock = jnp.array([[0.0, 0.0], [1.0, 0.0], [2.0, 0.0]])
-    np.testing.assert_allclose(network.apply(params, clock, method="value"), [0.81, 0.9, 1.0], atol=0.04)
-
-
 def test_memory_tells_what_no_observation_shows():
-    # The same with the clock hidden: the steps have to be counted, from 0 again after every reset.
+    # Reward 1 on the last of three steps, to be counted, from 0 again after every reset: values 0.81, 0.9, 1.
     env = Probe(True, reward=lambda time, action, length: time == length - 1)
     network, params = train(env, ProbeParams(max_steps_in_episode=3), memory_size=8)
     unseen, first = jnp.zeros((1, 6, 2)), network.first_memory((1, 6))

@@ -1,6 +1,5 @@
 """Vectors and quaternions against SciPy's rotations."""
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -57,13 +56,3 @@ def test_from_yaw_tilt_leans_the_thrust_axis_towards_the_heading():
     result = Quaternion.from_yaw_tilt(*map(jnp.asarray, (yaw, tilt, heading)))
     matrix = np.stack([np.stack(axis, -1) for axis in result.axes()], axis=-1)
     np.testing.assert_allclose(matrix, expected.as_matrix(), atol=1e-5)
-
-
-@pytest.mark.parametrize(
-    ("vector", "norm", "gradient"),
-    [((0.0, 0.0, 0.0), 0.0, (0.0, 0.0, 0.0)), ((3.0, 0.0, -4.0), 5.0, (0.6, 0.0, -0.8))],
-)
-@pytest.mark.parametrize("differentiate", [jax.grad, jax.jacfwd])
-def test_norm_has_a_gradient_everywhere(vector, norm, gradient, differentiate):
-    assert float(Vec3(*vector).norm()) == pytest.approx(norm)
-    np.testing.assert_allclose(np.stack(differentiate(Vec3.norm)(Vec3(*vector))), gradient)

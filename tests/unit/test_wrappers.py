@@ -60,16 +60,12 @@ def quiet_flights() -> dict[str, Flight]:
     }
 
 
-def ended(flight: Flight) -> np.ndarray:
-    return np.asarray(flight.terminated | flight.truncated)
-
-
 def test_neutral_wrappers_fly_as_none_and_the_delay_as_effect(quiet_flights: dict[str, Flight]) -> None:
     plain, found = fly(wrapped()), quiet_flights["neither"]
     np.testing.assert_allclose(found.observations[..., :SIZE], plain.observations, atol=1e-4)
     np.testing.assert_allclose(found.rewards, plain.rewards, atol=1e-4)
-    np.testing.assert_array_equal(ended(found), ended(plain))
-    assert ended(plain).any()
+    np.testing.assert_array_equal(found.ended, plain.ended)
+    assert plain.ended.any()
     late = quiet_flights["effect"]
     np.testing.assert_allclose(late.observations, quiet_flights["wrapper"].observations, atol=2e-4)
     np.testing.assert_array_equal(late.terminated, quiet_flights["wrapper"].terminated)
@@ -82,7 +78,7 @@ def test_the_order_of_wrapping_does_not_change_the_flight(flight: Flight) -> Non
     env = wrapped(ALL[5], ALL[3], ALL[1], ALL[0], ALL[2], ALL[4])
     other = fly(env, env.default_params.replace(max_steps_in_episode=50))
     np.testing.assert_allclose(other.observations, flight.observations, atol=5e-4)
-    np.testing.assert_array_equal(ended(other), ended(flight))
+    np.testing.assert_array_equal(other.ended, flight.ended)
 
 
 # --- Each wrapper -----------------------------------------------------------------------------------
@@ -90,12 +86,12 @@ def test_the_order_of_wrapping_does_not_change_the_flight(flight: Flight) -> Non
 
 def test_statistics_are_those_of_the_episode(flight: Flight) -> None:
     total, length = np.zeros(NUM_ENVS), np.zeros(NUM_ENVS, int)
-    for i, is_end in enumerate(ended(flight)):
+    for i, is_end in enumerate(flight.ended):
         total, length = total + np.asarray(flight.rewards[i], float), length + 1
         np.testing.assert_allclose(flight.info["episode_return"][i], total, atol=1e-4)
         np.testing.assert_array_equal(flight.info["episode_length"][i], length)
         total, length = np.where(is_end, 0.0, total), np.where(is_end, 0, length)
-    assert ended(flight).any() and flight.truncated.any()
+    assert flight.ended.any() and flight.truncated.any()
 
 
 def test_commands_are_remembered_the_latest_first_within_the_episode(flight: Flight) -> None:
@@ -105,7 +101,7 @@ def test_commands_are_remembered_the_latest_first_within_the_episode(flight: Fli
     first = np.asarray(flight.first)
     expected = np.repeat(first[:, None, 18:22], 3, axis=1)
     np.testing.assert_array_equal(first[:, SIZE + 4 :].reshape(-1, 3, 4), expected)
-    for i, is_end in enumerate(ended(flight)):
+    for i, is_end in enumerate(flight.ended):
         shifted = np.concatenate([np.asarray(flight.actions[i])[:, None], expected[:, :-1]], axis=1)
         expected = np.where(is_end[:, None, None], np.repeat(applied[i][:, None], 3, axis=1), shifted)
         np.testing.assert_allclose(three[i].reshape(-1, 3, 4), expected, atol=1e-6)
@@ -115,7 +111,7 @@ def test_a_model_and_the_noise_hold_for_their_episode_and_their_step(flight: Fli
     states = jax.tree.map(
         lambda *leaves: np.concatenate([leaves[0][None], leaves[1]]), flight.start, flight.states
     )
-    env, is_end = wrapped(*ALL), ended(flight)
+    env, is_end = wrapped(*ALL), flight.ended
     noise = env.env.env  # inside the statistics and the history of commands
     assert isinstance(noise, ObservationNoise)
     words = {"noise": states.inner.inner.word, "model": states.inner.inner.inner.inner.inner.word}
