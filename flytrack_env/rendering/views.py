@@ -1,6 +1,7 @@
 """One picture of a flight: the course from above, the flight from behind the drone, and a line of text."""
 
-from functools import cache
+from collections.abc import Callable
+from functools import cache, partial
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -37,9 +38,11 @@ LOWEST_M = 0.25  # of the camera above the floor
 LOOK_AHEAD_M = 5.0
 AIM_BEYOND_M = 3.0  # beyond the gate's centre, so that the view does not swing round as a gate is passed
 SWING_STEPS = 25.0  # time constant with which the camera follows its aim
+HEADING_STEPS = 8.0  # and the nose
 MEMORY_STEPS, TRAIL_STEPS = 100, 150
 CHASE_GRID_M = 2.0
 BODY_M, SHADOW_M = 0.05, 0.2
+GHOST_COLOURS = (scene.CAMERA, scene.blend(scene.CAMERA, scene.DRONE, 0.5), scene.CAMERA)
 ANGLES = np.linspace(0.0, 2.0 * np.pi, 14, endpoint=False)
 CIRCLE = np.stack([np.cos(ANGLES), np.sin(ANGLES), np.zeros(14)], axis=-1)
 
@@ -113,18 +116,23 @@ class TopView:
         draw.line(self._pairs(np.array([centre, base])), colour, PIXEL)
         draw.polygon(self._pairs(np.array([centre + arrow, base + across, base - across])), colour)
 
-    def draw(self, canvas: Image.Image, log: FlightLog) -> None:
-        """Draw the log's last row, and the trail of all of them, at the canvas's left."""
+    def draw(self, canvas: Image.Image, log: FlightLog, ghost: np.ndarray | None = None) -> None:
+        """Draw the log's last row, the trail of all of them and a ghost (21,), at the canvas's left."""
         canvas.paste(self._extend_trail(log), (0, 0))
         draw = ImageDraw.Draw(canvas)
         row = log.rows[-1].astype(float)
         self._draw_gate(draw, int(row[GATE_INDEX]), scene.NEXT_GATE)
-        nose = rotations(row[QUATERNION])[:2, 0] @ self.axes.T
+        if ghost is not None:
+            self._draw_arrow(draw, ghost, GHOST_COLOURS[0])
+        self._draw_arrow(draw, row, scene.DRONE)
+
+    def _draw_arrow(self, draw: ImageDraw.ImageDraw, state: np.ndarray, colour: Colour) -> None:
+        nose = rotations(state[QUATERNION])[:2, 0] @ self.axes.T
         angle = np.arctan2(nose[1], nose[0])
         turn = np.array([(np.cos(angle), np.sin(angle)), (-np.sin(angle), np.cos(angle))])
-        shape = DRONE_LENGTH * PIXEL * ARROWHEAD @ turn + self.pixels(row[POSITION])
+        shape = DRONE_LENGTH * PIXEL * ARROWHEAD @ turn + self.pixels(state[POSITION])
         outline = [(x, y) for x, y in shape.tolist()]
-        draw.polygon(outline, scene.DRONE, outline=scene.BACKGROUND, width=PIXEL)
+        draw.polygon(outline, colour, outline=scene.BACKGROUND, width=PIXEL)
 
     def _extend_trail(self, log: FlightLog) -> Image.Image:
         """Return the course with the trail; only what was flown since the last picture is drawn."""
@@ -154,16 +162,23 @@ class ChaseView:
         self.floor_m = low[2]
         self.grid_w = ground_grid(low, high, CHASE_GRID_M)
 
-    def camera(self, rows: np.ndarray) -> Camera:
-        """Return the camera behind the drone of the last row, looking towards the next gate.
+    def camera(self, rows: np.ndarray, follows_nose: bool = False) -> Camera:
+        """Return the camera behind the drone of the last row, looking towards the next gate, or ahead.
 
         It follows slowly: its direction is the mean over the last rows, the latest weighing most.
         """
         recent = rows[-MEMORY_STEPS:].astype(float)
         index = recent[:, GATE_INDEX].astype(int)
-        to_aim_w = self.gates.centres[index] + AIM_BEYOND_M * self.gates.forward[index] - recent[:, POSITION]
-        to_aim_w /= np.maximum(np.linalg.norm(to_aim_w, axis=1, keepdims=True), 1e-6)
-        weights = np.exp(np.arange(1 - len(to_aim_w), 1) / SWING_STEPS)
+        if follows_nose:
+            # The heading is the turn about the vertical before any tilt: rolls and loops leave it alone.
+            w, _, _, z = recent[:, QUATERNION].T
+            to_aim_w = np.stack([w * w - z * z, 2.0 * w * z, 0.0 * w], axis=-1)
+        else:
+            aims_w = self.gates.centres[index] + AIM_BEYOND_M * self.gates.forward[index]
+            to_aim_w = aims_w - recent[:, POSITION]
+            to_aim_w /= np.maximum(np.linalg.norm(to_aim_w, axis=1, keepdims=True), 1e-6)
+        steps = HEADING_STEPS if follows_nose else SWING_STEPS
+        weights = np.exp(np.arange(1 - len(to_aim_w), 1) / steps)
         direction = unit(weights @ to_aim_w, self.gates.forward[index[-1]])
         # Half the slope, so that the horizon stays in sight.
         direction = unit(direction * np.array([1.0, 1.0, 0.5]), np.array([1.0, 0.0, 0.0]))
@@ -173,10 +188,12 @@ class ChaseView:
         forward = unit(drone_w + LOOK_AHEAD_M * direction - eye_w, direction)
         return Camera(eye_w, forward, self.centre_px, self.focal_px)
 
-    def draw(self, canvas: Image.Image, log: FlightLog) -> None:
-        """Draw the view of the log's last row."""
+    def draw(
+        self, canvas: Image.Image, log: FlightLog, ghost: np.ndarray | None = None, follows_nose: bool = False
+    ) -> None:
+        """Draw the view of the log's last row, and a ghost (21,) in it; ``camera`` describes the rest."""
         row = log.rows[-1].astype(float)
-        camera = self.camera(log.rows)
+        camera = self.camera(log.rows, follows_nose)
         picture = Image.new("RGB", (self.width, self.height), scene.SKY)
         draw = ImageDraw.Draw(picture)
         horizon = max(camera.horizon_px(), 0.0)
@@ -184,17 +201,21 @@ class ChaseView:
             draw.rectangle([0, horizon, self.width, self.height], scene.GROUND)
         self._draw_ground(draw, camera, row[POSITION])
         distances_m = np.linalg.norm(self.gates.centres - camera.eye_w, axis=1)
-        is_beyond = distances_m > np.linalg.norm(row[POSITION] - camera.eye_w)
+        drone_m = float(np.linalg.norm(row[POSITION] - camera.eye_w))
         corners_c, colours = camera.look(self.corners_w), [scene.GATE] * len(self.corners_w)
         colours[int(row[GATE_INDEX])] = scene.NEXT_GATE
-        order = np.argsort(-distances_m)
-        for index in order[is_beyond[order]]:
-            draw_gate(draw, camera, corners_c[index], colours[index])
-        self._draw_trail(draw, camera, log.rows)
-        draw_drone(draw, camera, row[POSITION], row[QUATERNION])
-        for index in order[~is_beyond[order]]:
-            # An outline only, so that the drone is seen through it.
-            draw_outlines(draw, camera, corners_c[index], colours[index])
+        things: list[tuple[float, Callable[[], None]]] = []
+        for distance_m, corners, colour in zip(distances_m.tolist(), corners_c, colours, strict=True):
+            # Before the drone, an outline only, so that the drone is seen through it.
+            draw_it = draw_gate if distance_m > drone_m else draw_outlines
+            things.append((distance_m, partial(draw_it, draw, camera, corners, colour)))
+        things.append((drone_m, partial(self._draw_trail, draw, camera, log.rows)))
+        things.append((drone_m, partial(draw_drone, draw, camera, row[POSITION], row[QUATERNION])))
+        if ghost is not None:
+            shown = partial(draw_drone, draw, camera, ghost[POSITION], ghost[QUATERNION], GHOST_COLOURS)
+            things.append((float(np.linalg.norm(ghost[POSITION] - camera.eye_w)), shown))
+        for _, draw_thing in sorted(things, key=lambda thing: -thing[0]):
+            draw_thing()
         canvas.paste(picture, (self.left, 0))
 
     def _draw_ground(self, draw: ImageDraw.ImageDraw, camera: Camera, drone_w: np.ndarray) -> None:
@@ -267,18 +288,26 @@ class Renderer:
         self.chase_view = ChaseView(course, gates, split, width - split, height)
         self.canvas = Image.new("RGB", (width, height))
 
-    def draw(self, log: FlightLog) -> np.ndarray:
+    def draw(
+        self, log: FlightLog, ghost: np.ndarray | None = None, follows_nose: bool = False, notes: str = ""
+    ) -> np.ndarray:
         """Return a picture of the log's last row and the way there, (540, 960, 3), uint8.
+
+        ghost: state (21,) of a second drone to show. follows_nose: whether the camera looks where the drone's
+        nose points, as a pilot needs it, and not to the next gate. notes: lines of text on the chase view.
 
         Raises:
             ValueError: an empty log.
         """
         if len(log.rows) == 0:
             raise ValueError("log: found no rows, expected at least one")
-        self.top_view.draw(self.canvas, log)
-        self.chase_view.draw(self.canvas, log)
+        self.top_view.draw(self.canvas, log, ghost)
+        self.chase_view.draw(self.canvas, log, ghost, follows_nose)
         picture = self.canvas.reduce(PIXEL)
-        self._write(ImageDraw.Draw(picture), log)
+        draw = ImageDraw.Draw(picture)
+        self._write(draw, log)
+        place = (TOP_VIEW_WIDTH + COLUMNS[0], BAR_HEIGHT + TEXT_TOP)
+        draw.multiline_text(place, notes, scene.TEXT, font(TEXT_SIZE), spacing=6)
         return np.array(picture)
 
     def _write(self, draw: ImageDraw.ImageDraw, log: FlightLog) -> None:
