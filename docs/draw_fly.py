@@ -1,4 +1,4 @@
-"""Draw what a pilot sees, docs/fly.png: ``python -m docs.draw_fly``. The champion's commands are the pilot's."""
+"""Draw what a pilot sees, docs/fly.png: ``python -m docs.draw_fly``; the champion is the pilot."""
 
 import io
 from pathlib import Path

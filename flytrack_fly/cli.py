@@ -11,6 +11,8 @@ import tyro
 
 from flytrack_env import load_model, load_track
 from flytrack_env.extras import check_installed
+from flytrack_env.flown_race import STEP_S
+from flytrack_env.rendering import open_window
 from flytrack_env.rollout import save_rollout
 from flytrack_fly.ghost import Kind, make_ghost
 from flytrack_fly.session import Flight, Session
@@ -43,14 +45,15 @@ def _fly(settings: Settings) -> list[str]:
     track = load_track(settings.track)
     model = None if settings.model is None else load_model(settings.model)
     check_installed("fly", "flights by hand", "pygame", "PIL")
-    from flytrack_fly.window import Controls, Window, play
+    window = open_window(STEP_S, must_be_seen=True)
+    from flytrack_fly.play import Controls, play, tick_of_clock
 
-    window, controls = Window(), Controls(settings.controls)
+    controls = Controls(settings.controls)
     print("compiling ...", file=sys.stderr)
     ghost, model = make_ghost(settings.ghost, track, model)
     session = Session(track, model, ghost)
     try:
-        play(session, controls, window)
+        play(session, controls, window.put, tick_of_clock())
     finally:  # after an interrupt, too
         lines = save(session.flights, settings.out)
     return lines

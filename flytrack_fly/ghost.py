@@ -1,45 +1,33 @@
 """The flight that a pilot flies against: a lap from standstill, then flying laps, at any time."""
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Literal, NamedTuple
 
 import jax
 import numpy as np
+from scipy.interpolate import make_interp_spline
 
 from flytrack_env import ModelParameters, Track, make, nominal_parameters
 from flytrack_env.flown_race import STEP_S, follow_race
 from flytrack_env.model_file import model_from_json
 from flytrack_env.params import EnvParams
-from flytrack_env.references import KINDS, Reference, ReferenceFileError, is_model_of, shipped_references
+from flytrack_env.references import KINDS, ReferenceFileError, is_model_of, shipped_references
 from flytrack_env.resets import ResetParams
-from flytrack_env.state import BATTERY_FULL_V, POSITION, QUATERNION, VELOCITY
+from flytrack_env.state import BATTERY_FULL_V, POSITION, VELOCITY
 
 Kind = Literal["reference", "champion", "none"]
 CHAMPION = "champion/flytrack.safetensors"  # in baselines.purejaxrl_ppo
+CHAMPION_NEEDS = "expected 2 or more: fly on its own track, flytrack, without --model"
 MOST_STEPS, NUM_LAPS = 6000, 3  # of the champion's flight
 STILL_START = ResetParams(0.0, 0.0, 0.0, 0.0, 0.0, BATTERY_FULL_V)  # no noise, and never on the course
 
 
 class GhostLap(NamedTuple):
-    """A lap: states (N, 21) every ``STEP_S``, the time of the first, and times of the gates (num_gates,).
+    """A lap: its states (21,) at any time, and the times of its gates (num_gates,); s since it began."""
 
-    Times are in s since the lap began; the last gate's is the lap time.
-    """
-
-    states: np.ndarray
-    first_s: float
+    state_at: Callable[[float], np.ndarray]
     gate_times_s: np.ndarray
-
-    def state_at(self, time_s: float) -> np.ndarray:
-        """Return the state (21,) at a time, linear between samples; beyond an end, that end's."""
-        place = np.clip((time_s - self.first_s) / STEP_S, 0.0, len(self.states) - 1.0)
-        index = min(int(place), len(self.states) - 2)
-        before, after = self.states[index], self.states[index + 1].copy()
-        if before[QUATERNION] @ after[QUATERNION] < 0.0:
-            after[QUATERNION] *= -1.0  # the same attitude, on the near side
-        state: np.ndarray = before + (place - index) * (after - before)
-        state[QUATERNION] /= np.linalg.norm(state[QUATERNION])
-        return state
 
 
 class Ghost(NamedTuple):
@@ -55,10 +43,15 @@ class Ghost(NamedTuple):
 
     def state_at(self, laps: int, time_s: float) -> np.ndarray:
         """Return the state (21,) so many s after the pilot's lap began; through with a lap, it flies on."""
-        lap_time_s = self.lap(laps).gate_times_s[-1]
-        if time_s < lap_time_s:
+        beyond_s = time_s - self.lap(laps).gate_times_s[-1]
+        if beyond_s < 0.0:
             return self.lap(laps).state_at(time_s)
-        return self.flying.state_at((time_s - lap_time_s) % self.flying.gate_times_s[-1])
+        return self.flying.state_at(beyond_s % self.flying.gate_times_s[-1])
+
+
+def _lap(states: np.ndarray, first_s: float, gate_times_s: np.ndarray) -> GhostLap:
+    """Return the lap of states (N, 21), the first of them at a time since the lap began, s."""
+    return GhostLap(make_interp_spline(first_s + STEP_S * np.arange(len(states)), states, k=1), gate_times_s)
 
 
 def still_start(params: EnvParams, num_steps: int) -> EnvParams:
@@ -77,13 +70,10 @@ def make_ghost(
     """
     if kind == "champion":
         states, _, model = fly_champion(track, model)
-        first, *flying = cut_laps(states, track) or [None]
-        if not flying:
-            raise ValueError(
-                f"--ghost champion: it flies no two laps of {track.name} with this model, expected its own: "
-                "flytrack, without --model"
-            )
-        return Ghost("champion", first, min(flying, key=lambda lap: float(lap.gate_times_s[-1]))), model
+        laps = cut_laps(states, track)
+        if len(laps) < 2:
+            raise ValueError(f"--ghost champion: {len(laps)} laps of {track.name}, {CHAMPION_NEEDS}")
+        return Ghost(kind, laps[0], min(laps[1:], key=lambda lap: float(lap.gate_times_s[-1]))), model
     model = model or nominal_parameters()
     if kind == "none":
         return None, model
@@ -92,12 +82,11 @@ def make_ghost(
         references = shipped_references(track, (name,))
     except ReferenceFileError as error:
         raise ValueError(f"--ghost reference: {error}; --ghost none flies without one") from error
-    flying, standing = (_lap_of(references[kind]) for kind in KINDS)
+    flying, standing = (
+        _lap(one.states, 0.0, np.append(one.gate_times_s[:-1], one.time_s))
+        for one in (references[kind] for kind in KINDS)
+    )
     return Ghost("time-optimal", standing, flying), model
-
-
-def _lap_of(reference: Reference) -> GhostLap:
-    return GhostLap(reference.states, 0.0, np.append(reference.gate_times_s[:-1], reference.time_s))
 
 
 def fly_champion(
@@ -130,5 +119,5 @@ def cut_laps(states: np.ndarray, track: Track) -> list[GhostLap]:
     for first in range(0, len(passes) - num_gates + 1, num_gates):
         begin_s, gates_s = times_s[first], times_s[first + 1 : first + num_gates + 1]
         row, end = int(begin_s / STEP_S), int(gates_s[-1] / STEP_S) + 2
-        laps.append(GhostLap(states[row:end], row * STEP_S - begin_s, gates_s - begin_s))
+        laps.append(_lap(states[row:end], row * STEP_S - begin_s, gates_s - begin_s))
     return laps

@@ -14,7 +14,7 @@ from flytrack_env import ModelParameters
 from flytrack_env.thrust import collective_thrust
 
 NAMES = ("roll", "pitch", "yaw", "throttle")
-KEY_REACH = np.array([0.4, 0.4, 1.0, 0.4])  # where a held key takes a stick; Shift takes it all the way
+KEY_REACH = np.array([0.4, 0.4, 1.0, 0.25])  # where a held key takes a stick; Shift takes it all the way
 OUT_PER_S, BACK_PER_S = 3.0, 6.0  # speeds of a stick that keys move, outwards and to the middle
 THRUST_ACTIONS = np.linspace(-1.0, 1.0, 201)
 
@@ -64,12 +64,9 @@ def move_by_keys(sticks: np.ndarray, pulls: np.ndarray, is_full: bool, dt_s: flo
 
 def hover_thrust(model: ModelParameters, battery_v: float) -> float:
     """Return the thrust command that carries the model's weight, by its thrust curve; 1 if none does."""
-    coeffs, weight_n = np.asarray(model.thrust_coeffs, float), float(model.m) * float(model.g)
-    thrusts_n = np.asarray(collective_thrust(THRUST_ACTIONS, battery_v, coeffs))
-    if thrusts_n.max() < weight_n:
-        return 1.0
-    first = max(int((thrusts_n >= weight_n).argmax()), 1)
-    return float(np.interp(weight_n, thrusts_n[first - 1 : first + 1], THRUST_ACTIONS[first - 1 : first + 1]))
+    thrusts_n = collective_thrust(THRUST_ACTIONS, battery_v, np.asarray(model.thrust_coeffs, float))
+    rising_n = np.maximum.accumulate(np.asarray(thrusts_n))  # a fitted curve may dip at its lower end
+    return float(np.interp(float(model.m) * float(model.g), rising_n, THRUST_ACTIONS))
 
 
 def command_of(sticks: np.ndarray, hover: float) -> np.ndarray:

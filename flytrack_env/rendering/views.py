@@ -1,7 +1,6 @@
 """One picture of a flight: the course from above, the flight from behind the drone, and a line of text."""
 
-from collections.abc import Callable
-from functools import cache, partial
+from functools import cache
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -42,6 +41,7 @@ HEADING_STEPS = 8.0  # and the nose
 MEMORY_STEPS, TRAIL_STEPS = 100, 150
 CHASE_GRID_M = 2.0
 BODY_M, SHADOW_M = 0.05, 0.2
+DRONE_COLOURS = (scene.DRONE, scene.FRONT_ROTOR, scene.REAR_ROTOR)
 GHOST_COLOURS = (scene.CAMERA, scene.blend(scene.CAMERA, scene.DRONE, 0.5), scene.CAMERA)
 ANGLES = np.linspace(0.0, 2.0 * np.pi, 14, endpoint=False)
 CIRCLE = np.stack([np.cos(ANGLES), np.sin(ANGLES), np.zeros(14)], axis=-1)
@@ -116,7 +116,7 @@ class TopView:
         draw.line(self._pairs(np.array([centre, base])), colour, PIXEL)
         draw.polygon(self._pairs(np.array([centre + arrow, base + across, base - across])), colour)
 
-    def draw(self, canvas: Image.Image, log: FlightLog, ghost: np.ndarray | None = None) -> None:
+    def draw(self, canvas: Image.Image, log: FlightLog, ghost: np.ndarray | None) -> None:
         """Draw the log's last row, the trail of all of them and a ghost (21,), at the canvas's left."""
         canvas.paste(self._extend_trail(log), (0, 0))
         draw = ImageDraw.Draw(canvas)
@@ -169,16 +169,13 @@ class ChaseView:
         """
         recent = rows[-MEMORY_STEPS:].astype(float)
         index = recent[:, GATE_INDEX].astype(int)
+        to_aim_w = self.gates.centres[index] + AIM_BEYOND_M * self.gates.forward[index] - recent[:, POSITION]
+        to_aim_w /= np.maximum(np.linalg.norm(to_aim_w, axis=1, keepdims=True), 1e-6)
         if follows_nose:
             # The heading is the turn about the vertical before any tilt: rolls and loops leave it alone.
             w, _, _, z = recent[:, QUATERNION].T
             to_aim_w = np.stack([w * w - z * z, 2.0 * w * z, 0.0 * w], axis=-1)
-        else:
-            aims_w = self.gates.centres[index] + AIM_BEYOND_M * self.gates.forward[index]
-            to_aim_w = aims_w - recent[:, POSITION]
-            to_aim_w /= np.maximum(np.linalg.norm(to_aim_w, axis=1, keepdims=True), 1e-6)
-        steps = HEADING_STEPS if follows_nose else SWING_STEPS
-        weights = np.exp(np.arange(1 - len(to_aim_w), 1) / steps)
+        weights = np.exp(np.arange(1 - len(to_aim_w), 1) / (HEADING_STEPS if follows_nose else SWING_STEPS))
         direction = unit(weights @ to_aim_w, self.gates.forward[index[-1]])
         # Half the slope, so that the horizon stays in sight.
         direction = unit(direction * np.array([1.0, 1.0, 0.5]), np.array([1.0, 0.0, 0.0]))
@@ -201,21 +198,19 @@ class ChaseView:
             draw.rectangle([0, horizon, self.width, self.height], scene.GROUND)
         self._draw_ground(draw, camera, row[POSITION])
         distances_m = np.linalg.norm(self.gates.centres - camera.eye_w, axis=1)
-        drone_m = float(np.linalg.norm(row[POSITION] - camera.eye_w))
+        is_beyond = distances_m > np.linalg.norm(row[POSITION] - camera.eye_w)
         corners_c, colours = camera.look(self.corners_w), [scene.GATE] * len(self.corners_w)
         colours[int(row[GATE_INDEX])] = scene.NEXT_GATE
-        things: list[tuple[float, Callable[[], None]]] = []
-        for distance_m, corners, colour in zip(distances_m.tolist(), corners_c, colours, strict=True):
-            # Before the drone, an outline only, so that the drone is seen through it.
-            draw_it = draw_gate if distance_m > drone_m else draw_outlines
-            things.append((distance_m, partial(draw_it, draw, camera, corners, colour)))
-        things.append((drone_m, partial(self._draw_trail, draw, camera, log.rows)))
-        things.append((drone_m, partial(draw_drone, draw, camera, row[POSITION], row[QUATERNION])))
-        if ghost is not None:
-            shown = partial(draw_drone, draw, camera, ghost[POSITION], ghost[QUATERNION], GHOST_COLOURS)
-            things.append((float(np.linalg.norm(ghost[POSITION] - camera.eye_w)), shown))
-        for _, draw_thing in sorted(things, key=lambda thing: -thing[0]):
-            draw_thing()
+        order = np.argsort(-distances_m)
+        for index in order[is_beyond[order]]:
+            draw_gate(draw, camera, corners_c[index], colours[index])
+        self._draw_trail(draw, camera, log.rows)
+        drones = [*([] if ghost is None else [(ghost, GHOST_COLOURS)]), (row, DRONE_COLOURS)]
+        for state, shades in sorted(drones, key=lambda one: -float(camera.look(one[0][POSITION])[2])):
+            draw_drone(draw, camera, state[POSITION], state[QUATERNION], shades)
+        for index in order[~is_beyond[order]]:
+            # An outline only, so that the drone is seen through it.
+            draw_outlines(draw, camera, corners_c[index], colours[index])
         canvas.paste(picture, (self.left, 0))
 
     def _draw_ground(self, draw: ImageDraw.ImageDraw, camera: Camera, drone_w: np.ndarray) -> None:
@@ -257,7 +252,7 @@ def draw_drone(
     camera: Camera,
     pos_w: np.ndarray,
     quaternion: np.ndarray,
-    colours: tuple[Colour, Colour, Colour] = (scene.DRONE, scene.FRONT_ROTOR, scene.REAR_ROTOR),
+    colours: tuple[Colour, Colour, Colour] = DRONE_COLOURS,
     enlargement: float = 1.0,
 ) -> None:
     """Draw arms, rotors and body of a drone, the far rotors first; colours: body, front, rear rotors."""

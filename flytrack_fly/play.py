@@ -1,12 +1,9 @@
-"""The window, the keyboard and the gamepad, through pygame."""
+"""The keyboard, the gamepad and the loop of pictures and steps, through pygame."""
 
-import os
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-
-os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
-
 import pygame
 
 from flytrack_env.rendering import make_renderer
@@ -14,8 +11,6 @@ from flytrack_fly.session import Session, steps_due
 from flytrack_fly.sticks import NAMES, Gamepad, move_by_keys
 
 PICTURES_PER_S = 60
-UNSEEN = ("offscreen", "dummy")  # what SDL takes by itself where there is no display
-DRIVER = "SDL_VIDEODRIVER"
 # Which stick a key pulls, and where to.
 KEYS = {
     **{pygame.K_RIGHT: (0, 1.0), pygame.K_LEFT: (0, -1.0), pygame.K_UP: (1, 1.0), pygame.K_DOWN: (1, -1.0)},
@@ -86,44 +81,18 @@ def _open(gamepad: Gamepad, number: int) -> "pygame.joystick.JoystickType":
     return joystick
 
 
-class Window:
-    """A window of the size of a picture, which can be enlarged; it opens with the first picture.
+def play(
+    session: Session, controls: Controls, show: Callable[[np.ndarray], None], tick: Callable[[], float]
+) -> None:
+    """Let a pilot fly in real time until he quits.
 
-    Raises:
-        OSError: there is no display.
+    show: shows a picture. tick: waits until the next one is due; returns the time since the last one, s.
     """
-
-    def __init__(self) -> None:
-        why = "none"
-        try:
-            pygame.display.init()
-            is_seen = DRIVER in os.environ or pygame.display.get_driver() not in UNSEEN
-        except pygame.error as error:
-            is_seen, why = False, str(error)
-        if not is_seen:
-            raise OSError(f"display: found {why}, expected a screen (DISPLAY or WAYLAND_DISPLAY)")
-        self._clock = pygame.time.Clock()
-
-    def tick(self) -> float:
-        """Wait until the next picture is due; return the time since the last one, s."""
-        return 1e-3 * self._clock.tick(PICTURES_PER_S)
-
-    def show(self, picture: np.ndarray) -> None:
-        """Show a picture (height, width, 3), uint8."""
-        size = (picture.shape[1], picture.shape[0])
-        flags = pygame.SCALED | pygame.RESIZABLE
-        screen = pygame.display.get_surface() or pygame.display.set_mode(size, flags)
-        screen.blit(pygame.image.frombuffer(picture.tobytes(), size, "RGB"), (0, 0))
-        pygame.display.flip()
-
-
-def play(session: Session, controls: Controls, window: Window) -> None:
-    """Let a pilot fly in real time until he quits."""
     renderer, behind_s = make_renderer(session.params.course), 0.0
     while not controls.is_over:
         notes = session.notes() + (HELP if controls.shows_help else "")
-        window.show(renderer.draw(session.now.log, session.ghost_state(), follows_nose=True, notes=notes))
-        steps, behind_s = steps_due(behind_s, window.tick(), session.step_s)
+        show(renderer.draw(session.now.log, session.ghost_state(), follows_nose=True, notes=notes))
+        steps, behind_s = steps_due(behind_s, tick(), session.step_s)
         for event in pygame.event.get():
             controls.take(event)
         if controls.is_restart:
@@ -131,3 +100,9 @@ def play(session: Session, controls: Controls, window: Window) -> None:
             controls.is_restart = False
         for _ in range(steps):
             session.advance(controls.sticks(session.step_s))
+
+
+def tick_of_clock() -> Callable[[], float]:
+    """Return what waits for the next of ``PICTURES_PER_S`` pictures."""
+    clock = pygame.time.Clock()
+    return lambda: 1e-3 * clock.tick(PICTURES_PER_S)
