@@ -2,6 +2,7 @@
 
 import sys
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from itertools import chain, count
 from pathlib import Path
@@ -53,8 +54,9 @@ def _fly(settings: Settings) -> list[str]:
     ghost, model = make_ghost(settings.ghost, track, model)
     session = Session(track, model, ghost)
     try:
-        play(session, controls, window.put, tick_of_clock())
-    finally:  # after an interrupt, too
+        with suppress(KeyboardInterrupt):  # quits, too
+            play(session, controls, window.put, tick_of_clock())
+    finally:  # whatever happened
         lines = save(session.flights, settings.out)
     return lines
 
