@@ -20,7 +20,7 @@ nox.options.sessions = ["lint", "docs"]
 nox.options.error_on_missing_interpreters = False
 
 ROOT = Path(__file__).parent
-PACKAGES = ("baselines/", *(f"flytrack{name}/" for name in ("", "_bench", "_env", "_loop", "_sysid")))
+PACKAGES = ("baselines/", *(f"flytrack{name}/" for name in ("", "_bench", "_env", "_fly", "_loop", "_sysid")))
 CLONE_ONLY = "firmware/"
 HEADLESS = {"JAX_PLATFORMS": "cpu", "MPLBACKEND": "agg", "SDL_VIDEODRIVER": "dummy", "PYTHONPATH": ""}
 TEST_TOOLS = ("pytest>=9", "hypothesis>=6.150", "pillow", "pyulog>=1.2", "orangebox>=0.4,<0.5")
@@ -64,6 +64,13 @@ for env in (RecordVideo(film, "videos", lambda number: True, video_length=30), w
     env.step(env.action_space.sample())
     env.close()
 """
+FLY_BY_HAND = """
+import pygame
+from flytrack.cli import main
+pygame.display.init()
+pygame.event.post(pygame.event.Event(pygame.QUIT))
+main(["fly"])
+"""
 SIZES = "--num-envs 16 --num-steps 32 --num-minibatches 4 --total-timesteps 1024 --hidden-sizes 8"
 
 # What each extra is for: commands, or code. [speed] compiles for ten minutes, in 4 GB.
@@ -91,6 +98,7 @@ USES = {
     "bags": ("python -m pytest -q -k import_bag tests/unit",),
     "viz": (SAVE_GHOST, "flytrack show flight.npy"),
     "render": (RENDER,),
+    "fly": (FLY_BY_HAND,),
     "export": (f"flytrack export {CHAMPION} --onnx policy.onnx --c policy.h",),
     "optimal": ("python -m benchmarks.time_optimal --tracks speedway --kinds flying --out made",),
     "speed": ("from benchmarks.env_speed import l2f_contestant as l2f; l2f('l2f', 1024, 8).run()",),

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from latex2mathml.converter import convert
 
 from docs.markdown import one_line, render
+from docs.page_pictures import NUM_NOTABLE
 from flytrack_env.effects import EFFECTS, Effect
 from flytrack_sysid.diagnosis.evidence import EVIDENCE
 from flytrack_sysid.diagnosis.traces import REGRESSORS
@@ -50,6 +51,7 @@ def effect_page(effect: Effect) -> str:
     high = {name: neutral[name] + effect.notable[name] for name in names}
     return render(
         "effect",
+        picture_size=f"{NUM_NOTABLE:g}",
         effect=effect,
         about=one_line(inspect.getdoc(inspect.getmodule(effect.parameters))),
         law=convert(effect.equation, display="block"),

@@ -74,6 +74,7 @@ def env_page(env_id: str) -> str:
         summary=ENVIRONMENTS[env_id].summary,
         params=params,
         layers=[layer_of(layer) for layer in reversed(layers_of(env)) if isinstance(layer, Wrapper)],
+        is_randomised="domain_randomization" in (params.wrappers or {}),
         size=observation.size,
         observation=observation_rows(env),
         terms={term.__name__: sentence(term.__doc__) for term in TERMS},

@@ -11,8 +11,10 @@ from pathlib import Path
 
 from docs.effect_pages import effect_page, effects_table
 from docs.env_pages import env_page
+from docs.page_pictures import draw_effect, draw_env
 from docs.track_pages import track_page
 from flytrack_env.effects import EFFECTS
+from flytrack_env.pictures import drawing
 from flytrack_env.registration import ENVIRONMENTS
 from flytrack_env.tracks import available_tracks
 
@@ -36,6 +38,13 @@ def generated_pages() -> dict[str, str]:
         **{f"effects/{effect.name}.md": effect_page(effect) for effect in EFFECTS},
         **{f"tracks/{name}.md": track_page(name) for name in available_tracks()},
     }
+
+
+def pictures() -> dict[str, bytes]:
+    """Return the PNGs of those pages, by their path on the site."""
+    figures = {f"envs/{env_id}.png": draw_env(env_id) for env_id in ENVIRONMENTS}
+    figures |= {f"effects/{effect.name}.png": draw_effect(effect) for effect in EFFECTS}
+    return {path: drawing.png_of(figure) for path, figure in figures.items()}
 
 
 def appendices() -> dict[str, str]:
@@ -80,6 +89,9 @@ def write() -> None:
     for path, text in site_pages().items():
         with mkdocs_gen_files.open(path, "w") as file:
             file.write(text)
+    for path, content in pictures().items():
+        with mkdocs_gen_files.open(path, "wb") as picture:
+            picture.write(content)
 
 
 if __name__ == "<run_path>":  # as mkdocs-gen-files runs it

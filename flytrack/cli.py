@@ -65,6 +65,9 @@ COMMANDS = {
     "show": Command(
         "Write rollouts as a recording and pictures", "viz", "flytrack.show:run_show", "flytrack.flags:Show"
     ),
+    "fly": Command(
+        "Fly by keyboard or gamepad against a ghost", "fly", "flytrack.fly:run_fly", "flytrack.fly:Fly"
+    ),
     "collect": _identify("collect", "Fly an excitation or a script on a plant"),
     "fit": _identify("fit", "Identify a model from a flight log"),
     "validate": _identify("validate", "Judge a model on flight that it was not fitted to"),

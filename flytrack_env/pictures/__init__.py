@@ -80,5 +80,6 @@ def write_animation(flight: Flight, reference: Reference, folder: str | Path) ->
     make_gif = _load("rendering.animation", "render", "PIL").make_gif
     laps = _load("pictures.laps", "render", "PIL").laps_to_compare(flight, reference)
     path = Path(folder) / f"{flight.name}.gif"
-    write_atomically(path, make_gif(build_course(flight.track), laps))
+    gate_ids = [gate.id for gate in flight.track.gates]
+    write_atomically(path, make_gif(build_course(flight.track), gate_ids, laps))
     return path

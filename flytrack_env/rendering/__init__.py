@@ -35,13 +35,14 @@ def make_renderer(course: Course, gate_ids: Sequence[int]) -> "Renderer":
     return Renderer(course, gate_ids)
 
 
-def open_window(step_s: float) -> "Window":
+def open_window(step_s: float, must_be_seen: bool = False) -> "Window":
     """Return a window that shows pictures of a flight in real time, a step every ``step_s`` s.
 
     Raises:
         ImportError: pygame is not installed; the message says how to install it.
+        OSError: there is no display, and the window ``must_be_seen``.
     """
     check_installed("render", "windows", "pygame")
     from flytrack_env.rendering.window import Window
 
-    return Window(step_s)
+    return Window(step_s, must_be_seen)

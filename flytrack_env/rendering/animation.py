@@ -14,9 +14,9 @@ from flytrack_env.scene import Colour, gates_of, ground_grid
 from flytrack_env.state import POSITION, QUATERNION
 from flytrack_env.tracks import Course
 
-WIDTH, HEIGHT = 480, 300  # pixels
-MARGIN = 14
-HEADER = 26  # for the lap times
+WIDTH, HEIGHT = 840, 480  # pixels
+MARGIN = 24
+HEADER = 44  # for the lap times
 STEPS_PER_FRAME = 6  # of 0.01 s; GIFs count in 10 ms
 LAST_FRAME_MS = 1500
 AZIMUTH_DEG, ELEVATION_DEG = 20.0, 36.0  # of the eye: from the course's broad side, and above the ground
@@ -25,7 +25,7 @@ DRONE_ENLARGEMENT = 5.0
 GRID_M = 5.0
 RECENT_STEPS = 50  # of the path that are bright
 GATE_COLOUR = scene.blend(scene.NEXT_GATE, scene.BACKGROUND, 0.25)
-TEXT_SIZE = 14
+TEXT_SIZE, GATE_TEXT_SIZE = 22, 16
 NUM_COLOURS = 128
 
 
@@ -42,9 +42,9 @@ class Lap(NamedTuple):
         return self.states[min(row, len(self.states) - 1)].astype(float)
 
 
-def make_gif(course: Course, laps: Sequence[Lap]) -> bytes:
-    """Return laps as an animated GIF, 480 x 300 pixels, at the speed at which they were flown."""
-    view = FixedView(course, laps)
+def make_gif(course: Course, gate_ids: Sequence[int], laps: Sequence[Lap]) -> bytes:
+    """Return laps as an animated GIF, 840 x 480 pixels, at the speed at which they were flown."""
+    view = FixedView(course, gate_ids, laps)
     last = max(len(lap.states) for lap in laps) - 1
     rows = [*range(0, last, STEPS_PER_FRAME), last]
     frames = [view.draw(laps, row) for row in rows]
@@ -61,8 +61,8 @@ def make_gif(course: Course, laps: Sequence[Lap]) -> bytes:
 class FixedView:
     """Draws laps on a course that is seen from a fixed point: the eye is far off, so that all of it fits."""
 
-    def __init__(self, course: Course, laps: Sequence[Lap]):
-        self.gates = gates_of(course)
+    def __init__(self, course: Course, gate_ids: Sequence[int], laps: Sequence[Lap]):
+        self.gates, self.gate_ids = gates_of(course), gate_ids
         low, high = (np.array(corner, float) for corner in (course.bounds_low, course.bounds_high))
         paths_w = np.concatenate([lap.states[:, POSITION] for lap in laps])
         shown_w = np.concatenate([self.gates.outer.reshape(-1, 3), paths_w])
@@ -98,13 +98,17 @@ class FixedView:
         gates_c = self.camera.look(np.concatenate([self.gates.outer, self.gates.inner], axis=1))
         for index in np.argsort(-gates_c[:, :, 2].mean(axis=1)):
             draw_gate(draw, self.camera, gates_c[index], GATE_COLOUR)
+            corners_px = self.camera.pixels(gates_c[index])
+            place = (float(corners_px[:, 0].mean()), float(corners_px[:, 1].min()) - 4 * PIXEL)
+            text = str(self.gate_ids[index])
+            draw.text(place, text, scene.TEXT, font(GATE_TEXT_SIZE * PIXEL), anchor="ms")
         for lap in laps:
             path_w = lap.states[: max(row, 1) + 1, POSITION].astype(float)
             dim = scene.blend(lap.colour, scene.GROUND, 0.45)
             shadow_w = np.where([True, True, False], path_w, self.floor_w[0])
             draw.line(self._pixels(shadow_w), scene.SHADOW, PIXEL)
-            draw.line(self._pixels(path_w), dim, 2 * PIXEL, joint="curve")
-            draw.line(self._pixels(path_w[-RECENT_STEPS:]), lap.colour, 3 * PIXEL, joint="curve")
+            draw.line(self._pixels(path_w), dim, 3 * PIXEL, joint="curve")
+            draw.line(self._pixels(path_w[-RECENT_STEPS:]), lap.colour, 5 * PIXEL, joint="curve")
         for lap in laps:
             state, rotors = lap.at(row), scene.blend(lap.colour, scene.TEXT, 0.6)
             colours = (lap.colour, rotors, lap.colour)
@@ -122,7 +126,7 @@ class FixedView:
         for lap in laps:
             is_over = row >= len(lap.states) - 1
             text = f"{lap.time_s:.3f} s" if is_over else f"{0.01 * row:.2f} s"
-            draw.text((left, 6), lap.label, lap.colour, font(TEXT_SIZE))
+            draw.text((left, 10), lap.label, lap.colour, font(TEXT_SIZE))
             indent = draw.textlength(lap.label, font(TEXT_SIZE)) + 10
-            draw.text((left + indent, 6), text, scene.TEXT if is_over else scene.FAINT_TEXT, font(TEXT_SIZE))
+            draw.text((left + indent, 10), text, scene.TEXT if is_over else scene.FAINT_TEXT, font(TEXT_SIZE))
             left += WIDTH // 2

@@ -38,9 +38,12 @@ LOWEST_M = 0.25  # of the camera above the floor
 LOOK_AHEAD_M = 5.0
 AIM_BEYOND_M = 3.0  # beyond the gate's centre, so that the view does not swing round as a gate is passed
 SWING_STEPS = 25.0  # time constant with which the camera follows its aim
+HEADING_STEPS = 8.0  # and the nose
 MEMORY_STEPS, TRAIL_STEPS = 100, 150
 CHASE_GRID_M = 2.0
 BODY_M, SHADOW_M = 0.05, 0.2
+DRONE_COLOURS = (scene.DRONE, scene.FRONT_ROTOR, scene.REAR_ROTOR)
+GHOST_COLOURS = (scene.CAMERA, scene.blend(scene.CAMERA, scene.DRONE, 0.5), scene.CAMERA)
 ANGLES = np.linspace(0.0, 2.0 * np.pi, 14, endpoint=False)
 CIRCLE = np.stack([np.cos(ANGLES), np.sin(ANGLES), np.zeros(14)], axis=-1)
 
@@ -114,18 +117,23 @@ class TopView:
         draw.line(self._pairs(np.array([centre, base])), colour, PIXEL)
         draw.polygon(self._pairs(np.array([centre + arrow, base + across, base - across])), colour)
 
-    def draw(self, canvas: Image.Image, log: FlightLog) -> None:
-        """Draw the log's last row, and the trail of all of them, at the canvas's left."""
+    def draw(self, canvas: Image.Image, log: FlightLog, ghost: np.ndarray | None) -> None:
+        """Draw the log's last row, the trail of all of them and a ghost (21,), at the canvas's left."""
         canvas.paste(self._extend_trail(log), (0, 0))
         draw = ImageDraw.Draw(canvas)
         row = log.rows[-1].astype(float)
         self._draw_gate(draw, int(row[GATE_INDEX]), scene.NEXT_GATE)
-        nose = rotations(row[QUATERNION])[:2, 0] @ self.axes.T
+        if ghost is not None:
+            self._draw_arrow(draw, ghost, GHOST_COLOURS[0])
+        self._draw_arrow(draw, row, scene.DRONE)
+
+    def _draw_arrow(self, draw: ImageDraw.ImageDraw, state: np.ndarray, colour: Colour) -> None:
+        nose = rotations(state[QUATERNION])[:2, 0] @ self.axes.T
         angle = np.arctan2(nose[1], nose[0])
         turn = np.array([(np.cos(angle), np.sin(angle)), (-np.sin(angle), np.cos(angle))])
-        shape = DRONE_LENGTH * PIXEL * ARROWHEAD @ turn + self.pixels(row[POSITION])
+        shape = DRONE_LENGTH * PIXEL * ARROWHEAD @ turn + self.pixels(state[POSITION])
         outline = [(x, y) for x, y in shape.tolist()]
-        draw.polygon(outline, scene.DRONE, outline=scene.BACKGROUND, width=PIXEL)
+        draw.polygon(outline, colour, outline=scene.BACKGROUND, width=PIXEL)
 
     def _extend_trail(self, log: FlightLog) -> Image.Image:
         """Return the course with the trail; only what was flown since the last picture is drawn."""
@@ -155,8 +163,8 @@ class ChaseView:
         self.floor_m = low[2]
         self.grid_w = ground_grid(low, high, CHASE_GRID_M)
 
-    def camera(self, rows: np.ndarray) -> Camera:
-        """Return the camera behind the drone of the last row, looking towards the next gate.
+    def camera(self, rows: np.ndarray, follows_nose: bool = False) -> Camera:
+        """Return the camera behind the drone of the last row, looking towards the next gate, or ahead.
 
         It follows slowly: its direction is the mean over the last rows, the latest weighing most.
         """
@@ -164,7 +172,11 @@ class ChaseView:
         index = recent[:, GATE_INDEX].astype(int)
         to_aim_w = self.gates.centres[index] + AIM_BEYOND_M * self.gates.forward[index] - recent[:, POSITION]
         to_aim_w /= np.maximum(np.linalg.norm(to_aim_w, axis=1, keepdims=True), 1e-6)
-        weights = np.exp(np.arange(1 - len(to_aim_w), 1) / SWING_STEPS)
+        if follows_nose:
+            # The heading is the turn about the vertical before any tilt: rolls and loops leave it alone.
+            w, _, _, z = recent[:, QUATERNION].T
+            to_aim_w = np.stack([w * w - z * z, 2.0 * w * z, 0.0 * w], axis=-1)
+        weights = np.exp(np.arange(1 - len(to_aim_w), 1) / (HEADING_STEPS if follows_nose else SWING_STEPS))
         direction = unit(weights @ to_aim_w, self.gates.forward[index[-1]])
         # Half the slope, so that the horizon stays in sight.
         direction = unit(direction * np.array([1.0, 1.0, 0.5]), np.array([1.0, 0.0, 0.0]))
@@ -174,10 +186,12 @@ class ChaseView:
         forward = unit(drone_w + LOOK_AHEAD_M * direction - eye_w, direction)
         return Camera(eye_w, forward, self.centre_px, self.focal_px)
 
-    def draw(self, canvas: Image.Image, log: FlightLog) -> None:
-        """Draw the view of the log's last row."""
+    def draw(
+        self, canvas: Image.Image, log: FlightLog, ghost: np.ndarray | None = None, follows_nose: bool = False
+    ) -> None:
+        """Draw the view of the log's last row, and a ghost (21,) in it; ``camera`` describes the rest."""
         row = log.rows[-1].astype(float)
-        camera = self.camera(log.rows)
+        camera = self.camera(log.rows, follows_nose)
         picture = Image.new("RGB", (self.width, self.height), scene.SKY)
         draw = ImageDraw.Draw(picture)
         horizon = max(camera.horizon_px(), 0.0)
@@ -192,7 +206,9 @@ class ChaseView:
         for index in order[is_beyond[order]]:
             draw_gate(draw, camera, corners_c[index], colours[index])
         self._draw_trail(draw, camera, log.rows)
-        draw_drone(draw, camera, row[POSITION], row[QUATERNION])
+        drones = [*([] if ghost is None else [(ghost, GHOST_COLOURS)]), (row, DRONE_COLOURS)]
+        for state, shades in sorted(drones, key=lambda one: -float(camera.look(one[0][POSITION])[2])):
+            draw_drone(draw, camera, state[POSITION], state[QUATERNION], shades)
         for index in order[~is_beyond[order]]:
             # An outline only, so that the drone is seen through it.
             draw_outlines(draw, camera, corners_c[index], colours[index])
@@ -237,7 +253,7 @@ def draw_drone(
     camera: Camera,
     pos_w: np.ndarray,
     quaternion: np.ndarray,
-    colours: tuple[Colour, Colour, Colour] = (scene.DRONE, scene.FRONT_ROTOR, scene.REAR_ROTOR),
+    colours: tuple[Colour, Colour, Colour] = DRONE_COLOURS,
     enlargement: float = 1.0,
 ) -> None:
     """Draw arms, rotors and body of a drone, the far rotors first; colours: body, front, rear rotors."""
@@ -268,18 +284,26 @@ class Renderer:
         self.chase_view = ChaseView(course, gates, split, width - split, height)
         self.canvas = Image.new("RGB", (width, height))
 
-    def draw(self, log: FlightLog) -> np.ndarray:
+    def draw(
+        self, log: FlightLog, ghost: np.ndarray | None = None, follows_nose: bool = False, notes: str = ""
+    ) -> np.ndarray:
         """Return a picture of the log's last row and the way there, (540, 960, 3), uint8.
+
+        ghost: state (21,) of a second drone to show. follows_nose: whether the camera looks where the drone's
+        nose points, as a pilot needs it, and not to the next gate. notes: lines of text on the chase view.
 
         Raises:
             ValueError: an empty log.
         """
         if len(log.rows) == 0:
             raise ValueError("log: found no rows, expected at least one")
-        self.top_view.draw(self.canvas, log)
-        self.chase_view.draw(self.canvas, log)
+        self.top_view.draw(self.canvas, log, ghost)
+        self.chase_view.draw(self.canvas, log, ghost, follows_nose)
         picture = self.canvas.reduce(PIXEL)
-        self._write(ImageDraw.Draw(picture), log)
+        draw = ImageDraw.Draw(picture)
+        self._write(draw, log)
+        place = (TOP_VIEW_WIDTH + COLUMNS[0], BAR_HEIGHT + TEXT_TOP)
+        draw.multiline_text(place, notes, scene.TEXT, font(TEXT_SIZE), spacing=6)
         return np.array(picture)
 
     def _write(self, draw: ImageDraw.ImageDraw, log: FlightLog) -> None:

@@ -20,8 +20,8 @@ SCALED_FORCE = 0.1  # m of an arrow per m/s^2
 DIM = 0.6  # of the commanded action's line beside the applied one's
 THIN, THICK = 1.0, 2.0
 # On the screen, so that they are seen from the other end of the course.
-PATH_RADIUS, PASS_RADIUS, LAP_RADIUS, ARROW_RADIUS = (
-    float(np.asarray(rr.Radius.ui_points(points))) for points in (1.5, 3.5, 5.0, 2.5)
+PATH_RADIUS, PASS_RADIUS, LAP_RADIUS, ARROW_RADIUS, DRONE_RADIUS = (
+    float(np.asarray(rr.Radius.ui_points(points))) for points in (1.5, 3.5, 5.0, 2.5, 6.0)
 )
 
 
@@ -34,6 +34,11 @@ class Plot(NamedTuple):
     model: str = ""
 
 
+def centres_of(track: Track | None) -> np.ndarray:
+    """Return the centres of a track's gates, (num_gates, 3), world, m."""
+    return np.reshape([gate.position for gate in track.gates] if track else [], (-1, 3))
+
+
 def log_course(recording: rr.RecordingStream, track: Track | None) -> None:
     """Log the axes, the gates (centre, frame, opening, direction of flight) and the bounds, once."""
 
@@ -44,14 +49,24 @@ def log_course(recording: rr.RecordingStream, track: Track | None) -> None:
     if track is None:
         return
     style: Any = {"colors": scene.NEXT_GATE}
-    positions = np.reshape([gate.position for gate in track.gates], (-1, 3))
+    positions = centres_of(track)
     names = [f"gate {gate.id}" for gate in track.gates]
     log("world/gates/centre", rr.Points3D(positions, labels=names, radii=0.05, **style))
     if track.gates:
         gates = gates_of(build_course(track))
-        for name, corners in (("outer", gates.outer), ("inner", gates.inner)):
-            closed = np.concatenate([corners, corners[:, :1]], axis=1)
-            log(f"world/gates/{name}", rr.LineStrips3D(closed, radii=0.02, **style))
+        # Between the corners of frame and opening there are four plates of two triangles.
+        corners = np.concatenate([gates.outer, gates.inner], axis=1)
+        plates = np.array(
+            [((k, (k + 1) % 4, k + 4), ((k + 1) % 4, (k + 1) % 4 + 4, k + 4)) for k in range(4)]
+        )
+        firsts = 8 * np.arange(len(corners))[:, None, None]
+        triangles = (firsts + plates.reshape(1, -1, 3)).reshape(-1, 3)
+        points = corners.reshape(-1, 3)
+        colours = np.tile(scene.NEXT_GATE, (len(points), 1))
+        log(
+            "world/gates/frame",
+            rr.Mesh3D(vertex_positions=points, triangle_indices=triangles, vertex_colors=colours),
+        )
         forward = DIRECTION_M * gates.forward
         log("world/gates/direction", rr.Arrows3D(vectors=forward, origins=positions, radii=0.02, **style))
     low, high = np.array(track.bounds_low), np.array(track.bounds_high)
@@ -146,8 +161,11 @@ class Writer:
         drone, colour = f"{self.world}/drone", self.colours[self.trajectory.name]
         pitch = math.radians(scene.CAMERA_PITCH_DEG)
         ray_b = CAMERA_RAY_M * np.array([math.cos(pitch), 0.0, math.sin(pitch)])
-        self._log(f"{drone}/motors", rr.Points3D(scene.MOTORS_B, radii=0.03, colors=colour))
-        self._log(f"{drone}/arms", rr.LineStrips3D(scene.ARMS_B, radii=0.01, colors=colour))
+        self._log(f"{drone}/motors", rr.Points3D(scene.MOTORS_B, radii=0.06, colors=colour))
+        self._log(f"{drone}/arms", rr.LineStrips3D(scene.ARMS_B, radii=0.025, colors=colour))
+        # On the screen, so that the drone is seen from the other end of the course.
+        body = rr.Points3D([(0.0, 0.0, 0.0)], radii=DRONE_RADIUS, colors=colour)
+        self._log(f"{drone}/body", body)
         ray = rr.Arrows3D(vectors=[ray_b], origins=[(0.0, 0.0, 0.0)], colors=scene.CAMERA)
         self._log(f"{drone}/camera", ray)
         for name in ("flown", "recent"):

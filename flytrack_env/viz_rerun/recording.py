@@ -10,8 +10,8 @@ from flytrack_env.files import write_atomically
 from flytrack_env.flown_race import FlownRace
 from flytrack_env.scene import FLIGHT_COLOURS
 from flytrack_env.tracks import Track
-from flytrack_env.viz_rerun.blueprint import make_blueprint
-from flytrack_env.viz_rerun.entities import Writer, log_course, plots_of
+from flytrack_env.viz_rerun.blueprint import KEY, make_blueprint
+from flytrack_env.viz_rerun.entities import Writer, centres_of, log_course, plots_of
 from flytrack_env.viz_rerun.trajectory import Pairs, Trajectory, checked, track_of_gates, trajectory_of_pairs
 
 APP_ID = "flytrack"
@@ -75,8 +75,15 @@ def _record(flights: Sequence[Trajectory], track: Track | None, app_id: str) -> 
     plots[1:] = [[plot for plot in own if np.isfinite(plot.values).any()] for own in plots[1:]]
     ends = [flight.reason_ended(track, race) for flight, race in zip(flights, races, strict=True)]
     memory = recording.memory_recording()
-    recording.send_blueprint(make_blueprint(writers, {plot.path for own in plots for plot in own}))
+    recording.send_blueprint(
+        make_blueprint(writers, {plot.path for own in plots for plot in own}, centres_of(track), len(colours))
+    )
     log_course(recording, track)
+    places = [(0.0, float(place)) for place in range(len(colours))]
+    key = rr.Points2D(
+        places, labels=list(colours), colors=list(colours.values()), radii=0.1, show_labels=True
+    )
+    recording.log(KEY, key, static=True, strict=True)
     about = rr.TextDocument(_describe(flights, races, ends), media_type=rr.MediaType.MARKDOWN)
     recording.log("about", about, static=True, strict=True)
     for writer, own, race, ended in zip(writers, plots, races, ends, strict=True):
@@ -100,10 +107,10 @@ def _events(
 
 def _describe(flights: Sequence[Trajectory], races: Sequence[FlownRace | None], ends: Sequence[str]) -> str:
     """Return a table of the flights, Markdown."""
-    lines = ["| flight | ended | time (s) | gates | laps (s) |", "|---|---|---|---|---|"]
+    lines = ["| flight | laps (s) | time (s) | gates | ended |", "|---|---|---|---|---|"]
     for flight, race, ended in zip(flights, races, ends, strict=True):
         passes = () if race is None else race.passes
         laps = ", ".join(f"{each.lap_time_s:.3f}" for each in passes if each.lap) or "-"
         duration_s = flight.time_ns[-1] * 1e-9
-        lines.append(f"| {flight.name} | {ended} | {duration_s:.2f} | {len(passes)} | {laps} |")
+        lines.append(f"| {flight.name} | {laps} | {duration_s:.2f} | {len(passes)} | {ended} |")
     return "\n".join(lines)

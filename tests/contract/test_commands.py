@@ -71,7 +71,7 @@ def test_every_flag_says_what_it_does(name: str) -> None:
 )
 def test_without_its_extra_a_command_helps_and_says_what_to_install(name: str, tmp_path: Path) -> None:
     def run(*words: str) -> subprocess.CompletedProcess[str]:
-        blocked = "tqdm,matplotlib,rerun,optax,distrax,onnx,safetensors,mlflow"
+        blocked = "tqdm,matplotlib,rerun,optax,distrax,onnx,safetensors,mlflow,pygame"
         command = [sys.executable, "-c", WITHOUT, blocked, name, *words]
         env = {"PYTHONPATH": str(ROOT), "PATH": "", "HOME": str(tmp_path), "JAX_PLATFORMS": "cpu"}
         return subprocess.run(command, cwd=tmp_path, env=env, capture_output=True, text=True)

@@ -39,7 +39,7 @@ def test_animation_shows_the_flying_lap_beside_the_time_optimal_one(tmp_path, gh
     path = write_animation(ghost, REFERENCES["flying"], tmp_path)
     assert path == tmp_path / "ghost.gif" and path.stat().st_size < 900 * 2**10
     with image.open(io.BytesIO(path.read_bytes())) as gif:
-        assert gif.size == (480, 300) and gif.n_frames == 8
+        assert gif.size == (840, 480) and gif.n_frames == 8
         gif.seek(7)
         last = np.array(gif.convert("RGB"), int)
     for colour in animation.scene.FLIGHT_COLOURS[0], animation.scene.FLIGHT_COLOURS[2]:

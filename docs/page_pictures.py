@@ -1,0 +1,114 @@
+"""The pictures of the effects' and the environments' pages, drawn when the site is built."""
+
+from functools import cache
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from matplotlib.figure import Figure
+
+import flytrack_env
+from flytrack_env import ModelParameters, load_track, nominal_parameters
+from flytrack_env.dynamics import move, read_sensors, sensed
+from flytrack_env.effects import Effect, start_memories
+from flytrack_env.flown_race import STEP_S
+from flytrack_env.pictures import drawing
+from flytrack_env.references import shipped_reference
+from flytrack_env.scene import BLUE, GREEN, ORANGE
+from flytrack_env.state import unpack, unpack_action
+
+FLIGHT = shipped_reference("flytrack", "standing", "nominal")
+NUM_STEPS, NUM_NOTABLE = 150, 3.0  # of the flight; sizes of an effect from which on it matters
+SMALLEST = 0.1  # half a panel's height, in its unit: less is none
+NUM_EPISODES, EPISODE_STEPS = 40, 130
+PANELS = (
+    "turns, by the gyro (deg/s)",
+    "force, by the accelerometer (m/s²)",
+    "velocity (m/s)",
+    "position (m)",
+)
+
+
+def strong(effect: Effect) -> dict[str, float]:
+    """Return ``NUM_NOTABLE`` times what matters of each parameter, within its range."""
+    neutral = effect.parameters()._asdict()
+    sizes = {name: neutral[name] + NUM_NOTABLE * step for name, step in effect.notable.items()}
+    ranges = effect.ranges
+    return {name: float(np.clip(size, ranges[name].low, ranges[name].high)) for name, size in sizes.items()}
+
+
+def measured(model: ModelParameters) -> np.ndarray:
+    """Return what the sensors of a model say on the flight, (NUM_STEPS, 4, 3), in the order of ``PANELS``."""
+
+    def fly(state, command):  # type: ignore[no-untyped-def]
+        moved = move(*state, unpack_action(command), STEP_S, model)
+        drone, memories, _ = moved
+        reading, seen = read_sensors(moved, model), sensed(drone, memories, STEP_S, model)
+        rows = (*(jnp.rad2deg(rate) for rate in reading.rates_b), *reading.force_b, *seen.vel_w, *seen.pos_w)
+        return (drone, memories), jnp.stack([jnp.asarray(value, jnp.float32) for value in rows])
+
+    drone = jax.tree.map(jnp.float32, unpack(jnp.asarray(FLIGHT.states[0], jnp.float32)))
+    start = (drone, start_memories(model.effects, drone))
+    rows = jax.jit(lambda commands: jax.lax.scan(fly, start, commands)[1])(
+        jnp.asarray(FLIGHT.commands[:NUM_STEPS], jnp.float32)
+    )
+    return np.asarray(rows).reshape(NUM_STEPS, 4, 3)
+
+
+@cache
+def without() -> np.ndarray:
+    """Return what the sensors of the nominal drone say: of any effect that is neutral, the same."""
+    return measured(nominal_parameters())
+
+
+def draw_effect(effect: Effect) -> Figure:
+    """Return by how much an effect changes what is measured on a flight with given commands."""
+    model, neutral = nominal_parameters(), effect.parameters()
+    parameters = neutral._replace(**strong(effect))
+    differences = measured(model.with_effects(parameters)) - without()
+    figure = drawing.new_figure(8.0, 4.6)
+    times_s = STEP_S * np.arange(1, NUM_STEPS + 1)
+    for axes, title, values in zip(
+        figure.subplots(2, 2, sharex=True).flat, PANELS, differences.swapaxes(0, 1), strict=True
+    ):
+        drawing.plain(axes).set_title(title, fontsize="medium", loc="left")
+        for axis, colour, line in zip("xyz", (ORANGE, BLUE, GREEN), values.T, strict=True):
+            axes.plot(times_s, line, color=colour, linewidth=2.0, label=axis)
+        most = max(float(np.abs(values).max()), SMALLEST)
+        axes.set_ylim(-1.15 * most, 1.15 * most)
+    for axes in figure.axes[2:]:
+        axes.set_xlabel("time (s)")
+    figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="outside right upper", frameon=False)
+    figure.suptitle(f"with {effect.name} minus without, same commands", fontweight="bold")
+    return figure
+
+
+def draw_env(env_id: str) -> Figure:
+    """Return many episodes' drones from above, from standing starts and with the same commands."""
+    env = flytrack_env.make(env_id)
+    params = env.default_params
+    params = params.replace(reset=params.reset._replace(course_fraction=0.0))
+    commands = jnp.asarray(FLIGHT.commands[:EPISODE_STEPS], jnp.float32)
+
+    def fly(key: jax.Array) -> jax.Array:
+        start = env.reset(key, params)[1]
+
+        def step(state, command):  # type: ignore[no-untyped-def]
+            after = env.step_env(key, state, command, params)[1]
+            return after, jnp.stack(env.drone(after).pos_w)
+
+        return jax.lax.scan(step, start, commands)[1]
+
+    paths = np.asarray(jax.jit(jax.vmap(fly))(jax.random.split(jax.random.key(0), NUM_EPISODES)))
+    track, view = load_track("flytrack"), [0, 1]
+    figure = drawing.new_figure(8.0, 5.0)
+    axes = drawing.plain(figure.subplots())
+    for path in paths:
+        axes.plot(*path[:, view].T, color=BLUE, linewidth=1.0, alpha=0.6)
+        axes.plot(*path[-1, view], "o", color=BLUE, markersize=4)
+    drawing.draw_gates(axes, track, view)
+    drawing.label_from_above(axes, track)
+    axes.set(aspect="equal", xlabel="x (m)", ylabel="y (m)")
+    seconds = EPISODE_STEPS * STEP_S
+    axes.set_title(f"{NUM_EPISODES} episodes of {env_id}, the same commands for {seconds:.1f} s")
+    return figure
