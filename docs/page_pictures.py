@@ -19,7 +19,9 @@ from flytrack_env.state import unpack, unpack_action
 
 FLIGHT = shipped_reference("flytrack", "standing", "nominal")
 NUM_STEPS, NUM_NOTABLE = 150, 3.0  # of the flight; sizes of an effect from which on it matters
-SMALLEST = 0.1  # half a panel's height, in its unit: less is none
+PULSE_STEPS, PULSE = 25, 0.8  # the time-optimal throttle is always full, and hides what its changes do
+SMALLEST = 0.01  # in a panel's unit: less is none
+WIDTHS = (5.0, 3.0, 1.5)  # of lines: where they lie on each other, all are seen
 NUM_EPISODES, EPISODE_STEPS = 40, 130
 PANELS = (
     "turns, by the gyro (deg/s)",
@@ -49,9 +51,9 @@ def measured(model: ModelParameters) -> np.ndarray:
 
     drone = jax.tree.map(jnp.float32, unpack(jnp.asarray(FLIGHT.states[0], jnp.float32)))
     start = (drone, start_memories(model.effects, drone))
-    rows = jax.jit(lambda commands: jax.lax.scan(fly, start, commands)[1])(
-        jnp.asarray(FLIGHT.commands[:NUM_STEPS], jnp.float32)
-    )
+    commands = np.array(FLIGHT.commands[:NUM_STEPS], np.float32)
+    commands[np.arange(NUM_STEPS) // PULSE_STEPS % 2 == 1, 3] -= PULSE
+    rows = jax.jit(lambda commands: jax.lax.scan(fly, start, commands)[1])(commands)
     return np.asarray(rows).reshape(NUM_STEPS, 4, 3)
 
 
@@ -71,15 +73,19 @@ def draw_effect(effect: Effect) -> Figure:
     for axes, title, values in zip(
         figure.subplots(2, 2, sharex=True).flat, PANELS, differences.swapaxes(0, 1), strict=True
     ):
+        most = float(np.abs(values).max())
+        if most < SMALLEST:
+            title = f"{title}: unchanged"
         drawing.plain(axes).set_title(title, fontsize="medium", loc="left")
-        for axis, colour, line in zip("xyz", (ORANGE, BLUE, GREEN), values.T, strict=True):
-            axes.plot(times_s, line, color=colour, linewidth=2.0, label=axis)
-        most = max(float(np.abs(values).max()), SMALLEST)
-        axes.set_ylim(-1.15 * most, 1.15 * most)
+        for axis, colour, width, line in zip("xyz", (ORANGE, BLUE, GREEN), WIDTHS, values.T, strict=True):
+            axes.plot(times_s, line, color=colour, linewidth=width, label=axis)
+        reach = 1.15 * most if most >= SMALLEST else 1.0
+        axes.set_ylim(-reach, reach)
     for axes in figure.axes[2:]:
         axes.set_xlabel("time (s)")
-    figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="outside right upper", frameon=False)
-    figure.suptitle(f"with {effect.name} minus without, same commands", fontweight="bold")
+    axes_names = figure.axes[0].get_legend_handles_labels()
+    figure.legend(*axes_names, loc="outside lower center", ncols=3, frameon=False)
+    figure.suptitle(f"A flight with {effect.name} minus one without, same commands", fontweight="bold")
     return figure
 
 
