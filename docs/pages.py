@@ -5,6 +5,7 @@ They are the pages that the code determines (environment ids, effects, tracks), 
 they are rewritten to the pages of the site. A link to a source file that has no page becomes plain text.
 """
 
+import json
 import posixpath
 import re
 from pathlib import Path
@@ -53,6 +54,18 @@ def appendices() -> dict[str, str]:
     return {"effects.md": effects_table(), "environment.md": f"\n## Every id in detail\n\n{ids}"}
 
 
+def notebook_page(name: str) -> str:
+    """Return the Markdown of a notebook in ``docs/notebooks``, its code in blocks."""
+    path = ROOT / "docs" / "notebooks" / f"{name}.ipynb"
+    cells = json.loads(path.read_text(encoding="utf-8"))["cells"]
+    texts = ["".join(cell["source"]) for cell in cells]
+    blocks = [
+        f"```python\n{text}\n```" if cell["cell_type"] == "code" else text
+        for cell, text in zip(cells, texts, strict=True)
+    ]
+    return "\n\n".join([*blocks, f"This page as a [notebook]({path.name}).\n"])
+
+
 def with_links(markdown: str, path: str, page: str) -> str:
     """Return the Markdown of a file of the repository with its links as ``page`` of the site needs them."""
 
@@ -75,6 +88,8 @@ def site_pages() -> dict[str, str]:
     sources |= {path: ROOT / path for path in COPIED}
     appended = appendices()
     pages = generated_pages()
+    for notebook in (ROOT / "docs" / "notebooks").glob("*.ipynb"):
+        pages[f"notebooks/{notebook.stem}.md"] = notebook_page(notebook.stem)
     for path, file in sources.items():
         page = PAGES_OF_SOURCES.get(path, path.removeprefix("docs/"))
         text = with_links(file.read_text(encoding="utf-8"), path, page)

@@ -1,9 +1,12 @@
 """The tutorials run as they are written, and end where they say."""
 
+import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
+from docs.pages import notebook_page
 from flytrack_env import find_problems, load_model, load_track
 from flytrack_env.rollout import load_rollout
 from tests.support.pages import DOCS, examples, run_examples
@@ -55,3 +58,13 @@ def test_better_policy(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert loop.after.errors.position_m["0.5"] < loop.before.errors.position_m["0.5"]
     files = {path.name for path in (tmp_path / "loop").iterdir()}
     assert {"loop.json", "comparison_top.png", "after_plant.npy", "race.npz", "history"} <= files
+
+
+def test_notebook(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def shown(path: str = "", filename: str = "") -> int:
+        return Path(path or filename).stat().st_size
+
+    display = SimpleNamespace(Image=shown, HTML=shown)  # of Jupyter, which the tests do without
+    monkeypatch.setitem(sys.modules, "IPython.display", display)
+    run_examples(notebook_page("quick_start"), tmp_path, monkeypatch)
+    assert load_model(tmp_path / "runs" / "diagnosis" / "extended_model.json").effect("rotor_drag")
