@@ -105,8 +105,8 @@ def fly_champion(
     champion = baseline.load_checkpoint(Path(baseline.__file__).parent / CHAMPION)
     model = model or model_from_json(champion.meta["model"], "checkpoint: model")
     env = make(champion.env_id, track=track, model=model)
-    params, policy = still_start(env.default_params, MOST_STEPS), (champion.network, champion.params)
-    flown = fly_episode(env, *policy, jax.random.key(0), params, MOST_STEPS, NUM_LAPS)
+    params = still_start(env.default_params, MOST_STEPS)
+    flown = fly_episode(env, champion.policy, jax.random.key(0), params, MOST_STEPS, NUM_LAPS)
     count = int(np.sum(flown.is_flying))
     return np.asarray(flown.states, float)[:count], np.asarray(flown.actions)[:count], model
 
