@@ -110,7 +110,7 @@ def test_command_flies_many(flown_by, checkpoint_path, tmp_path, monkeypatch, ca
         assert_close(jax.tree.map(lambda leaf: leaf[:1], outcomes), single)
         assert "in the simulator, not on a black box" in text and report["black_box"] is None
         assert report["optimal"]["model"] == "nominal" and report["success"]["low"] is None
-        assert report["plants"]["success"]["of"] == 3 and len(report["plants"]["race_env.by_thirds"]) == 12
+        assert report["plants"]["success"]["of"] == 3 and len(report["plants"]["by_thirds"]) == 12
         assert len(set(outcomes.steps[::2].tolist())) > 1  # the plants differ
     else:
         assert report["optimal"]["model"] == "black_box" and report["plants"] is None
