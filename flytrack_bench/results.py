@@ -9,7 +9,7 @@ import numpy as np
 from scipy import stats
 
 from baselines.purejaxrl_ppo.flights import fly_many, race_many, score, start_keys
-from baselines.purejaxrl_ppo.networks import Policy as Flown
+from baselines.purejaxrl_ppo.networks import Policy as NetworkPolicy
 from baselines.purejaxrl_ppo.race_env import with_model_as_given
 from flytrack_bench.policies import Policy
 from flytrack_bench.suite import Suite, Task
@@ -53,7 +53,7 @@ class Data:
         env = policy.env(self.task.plant, self.task.track)
         step_s = float(env.default_params.dt)
         steps = round(min(seconds, LONGEST_S) / step_s)
-        flights = fly_many(env, Flown(policy.network, policy.params), self._seed, BATCH, steps, steps)
+        flights = fly_many(env, NetworkPolicy(policy.network, policy.params), self._seed, BATCH, steps, steps)
         log = log_of_flights(flights, step_s, self._seed, seconds, NOISE)
         return log.select(np.arange(len(log)) < round(seconds / step_s))
 
@@ -69,7 +69,9 @@ def fly_task(task: Task, suite: Suite, policy: Policy) -> dict[str, float | None
     env = policy.env(task.plant, task.track)
     params = with_model_as_given(env.default_params)
     keys = start_keys(suite.seed, suite.starts)
-    found = score(race_many(env, Flown(policy.network, policy.params), keys, suite.steps, suite.laps, params))
+    found = score(
+        race_many(env, NetworkPolicy(policy.network, policy.params), keys, suite.steps, suite.laps, params)
+    )
     ratio = found.flying_lap_s / task.optimal_lap_s
     return {
         "success": round(found.success, 6),

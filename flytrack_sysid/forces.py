@@ -2,15 +2,15 @@
 
 from typing import NamedTuple
 
-import jax
 import numpy as np
 from scipy.stats import binned_statistic_2d
 
 from flytrack_env.dynamics import ModelParameters
 from flytrack_env.state import BATTERY_EMPTY_V, BATTERY_FULL_V
 from flytrack_sysid.log import FlightLog
-from flytrack_sysid.prediction import Prediction, inputs_that_lack, judged_steps, specific_force_w, to_body
+from flytrack_sysid.prediction import Prediction, inputs_that_lack, judged_steps
 from flytrack_sysid.prediction_errors import predicted_channel
+from flytrack_sysid.sensors import specific_force_b
 
 NUM_ACTION_BINS = 10
 NUM_VOLTAGE_BINS = 4
@@ -41,13 +41,10 @@ def force_samples(
     here = judged_steps(rows, prediction)
     if source is None or not len(here):
         return None
-    measured = log[source][here + 1]
-    if source == "a":
-        before = jax.tree.map(lambda leaf: leaf[here], prediction.before)
-        measured = to_body(before, specific_force_w(measured, model))
+    measured = log["f"] if source == "f" else specific_force_b(log, float(model.g))
     return ForceSamples(
         source=source,
-        measured_b=measured,
+        measured_b=measured[here + 1],
         modelled_b=predicted_channel("f", prediction)[here],
         action=np.asarray(prediction.after.applied.thrust)[here],
         battery_v=np.asarray(prediction.before.battery_v)[here],

@@ -1,6 +1,5 @@
 """What a model predicts of a flight log, in float64: one step from every row, and free flight from some."""
 
-from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 import jax
@@ -8,31 +7,18 @@ import numpy as np
 
 from flytrack_env.dynamics import ModelParameters, advance
 from flytrack_env.effects import acts
-from flytrack_env.quaternion import Quaternion, Vec3
+from flytrack_env.quaternion import Vec3
 from flytrack_env.state import Action, Drone
-from flytrack_sysid.log import FlightLog, usual_step
-from flytrack_sysid.record import LARGEST_DOUBT, Filled, Record, applied_doubt, record_of, steps_after
+from flytrack_sysid.log import CHANNELS, FlightLog, usual_step
+from flytrack_sysid.record import Filled, Record, is_applied_certain, record_of
 from flytrack_sysid.replay import Step, replay
 
 # For effects that remember: what they remembered when a segment began is not known.
 SETTLING_S = 0.5
 # Free flights at once: bounds the memory that they need, and compiles one size.
 BATCH = 128
-
-
-class Steps(NamedTuple):
-    """How the rows of a log without gaps follow one another.
-
-    duration: (num_rows,) s, to the next row; the median step where no row follows. median: s.
-    is_step: (num_rows,) bool, a row of the same segment follows. is_measured: (num_rows,) bool, the row
-    was logged; False where it fills a gap. since_start: (num_rows,) s, since the segment began.
-    """
-
-    duration: np.ndarray
-    median: float
-    is_step: np.ndarray
-    is_measured: np.ndarray
-    since_start: np.ndarray
+LONGEST_S = 2.0  # of free flight: shorter ones share its program
+FLOWN = ("p", "v", "q", "w")  # channels of a free flight
 
 
 class Prediction(NamedTuple):
@@ -40,36 +26,27 @@ class Prediction(NamedTuple):
 
     before: the measured state; zeros (upright, 23 V) where the log has no such channel.
     memories: what the model's effects remember before the step. after: the state at the next row. force_b:
-    (num_rows, 3) m/s^2, specific force of the step.
+    (num_rows, 3) m/s^2, specific force of the step. record: of the rows. step_s: the usual one.
     is_settled: (num_rows,) bool, applied action and memories no longer depend on how they began.
-    applied_from: "log" if it has the applied action, else "lag" of the model.
     """
 
     before: Drone
     memories: tuple[Any, ...]
     after: Drone
     force_b: np.ndarray
-    steps: Steps
+    record: Record
+    step_s: float
     is_settled: np.ndarray
-    applied_from: str
+
+    @property
+    def is_measured(self) -> np.ndarray:
+        """Which rows were logged, (num_rows,) bool; others fill a gap."""
+        return self.record.source_row >= 0
 
 
-def steps_of(filled: Filled) -> Steps:
-    """Return how the rows of a log whose gaps are filled follow one another."""
-    log = filled.log
-    starts = log.is_start()
-    return Steps(
-        duration=steps_after(log),
-        median=float(np.median(usual_step(log))),
-        is_step=np.append(~starts[1:], False),
-        is_measured=filled.source_row >= 0,
-        since_start=log.time - log.time[starts][np.cumsum(starts) - 1],
-    )
-
-
-def runs_of(rows: np.ndarray, steps: Steps) -> list[tuple[int, int]]:
-    """Return the runs of judged rows, as first row and end; rows: (num_rows,) bool."""
-    follows = np.append(False, rows[1:] & rows[:-1] & steps.is_step[:-1])[: len(rows)]
+def runs_of(rows: np.ndarray, record: Record) -> list[tuple[int, int]]:
+    """Return the runs of judged rows within a flight, as first row and end; rows: (num_rows,) bool."""
+    follows = np.append(False, rows[1:] & rows[:-1] & ~record.begins[1:])[: len(rows)]
     starts = np.flatnonzero(rows & ~follows)
     ends = np.flatnonzero(rows & ~np.append(follows[1:], False)[: len(rows)]) + 1
     return list(zip(starts.tolist(), ends.tolist(), strict=True))
@@ -77,21 +54,9 @@ def runs_of(rows: np.ndarray, steps: Steps) -> list[tuple[int, int]]:
 
 def judged_steps(rows: np.ndarray, prediction: Prediction) -> np.ndarray:
     """Return the rows whose step to the next is judged, ascending; rows: (num_rows,) bool."""
-    steps = prediction.steps
-    exists = rows & steps.is_measured
-    both = exists & np.append(exists[1:], False)[: len(rows)]
-    return np.flatnonzero(both & steps.is_step & prediction.is_settled)
-
-
-def turn_between(quats: np.ndarray, others: np.ndarray) -> np.ndarray:
-    """Return the rotation vectors, body frame, rad, that turn (..., 4) attitudes into others; (..., 3)."""
-    inverse = Quaternion(quats[..., 0], *(-quats[..., axis] for axis in (1, 2, 3)))
-    turn = columns(inverse.multiply(Quaternion(*np.moveaxis(others, -1, 0))))
-    turn = np.where(turn[..., :1] < 0.0, -turn, turn)
-    sine = np.linalg.norm(turn[..., 1:], axis=-1, keepdims=True)
-    angle = 2.0 * np.arctan2(sine, turn[..., :1])
-    # The limit of angle over sine; a unit quaternion's cosine is 1 there.
-    return turn[..., 1:] * np.divide(angle, sine, out=np.full_like(sine, 2.0), where=sine > 0.0)
+    exists = rows & prediction.is_measured
+    is_followed = np.append(exists[1:] & ~prediction.record.begins[1:], False)[: len(rows)]
+    return np.flatnonzero(exists & is_followed & prediction.is_settled)
 
 
 def inputs_that_lack(model: ModelParameters, log: FlightLog) -> dict[str, tuple[str, ...]]:
@@ -119,17 +84,6 @@ def columns(vector: Any) -> np.ndarray:
     return np.stack([np.asarray(leaf) for leaf in vector], axis=-1)
 
 
-def to_body(drone: Drone, vectors_w: np.ndarray) -> np.ndarray:
-    """Return world-frame vectors in the body frames of drones; (num_rows, 3), leaves (num_rows,)."""
-    world = Vec3(*vectors_w.T)
-    return np.stack([axis.dot(world) for axis in drone.quat.axes()], axis=-1)
-
-
-def specific_force_w(acc_w: np.ndarray, model: ModelParameters) -> np.ndarray:
-    """Return the specific force of accelerations, (num_rows, 3) m/s^2, world frame."""
-    return acc_w + np.array([0.0, 0.0, float(model.g)])
-
-
 def in_float64(model: ModelParameters) -> ModelParameters:
     """Return the same model with leaves of float64."""
     return jax.tree.map(lambda leaf: np.asarray(leaf, float), model)
@@ -147,40 +101,23 @@ def _step_from_every_row(
     return replay(model, record, "measured", gyro_b, observe)
 
 
-def _is_settled(model: ModelParameters, filled: Filled, steps: Steps, has_memory: bool) -> np.ndarray:
-    """Return where applied action and memories no longer depend on what is not known of the past."""
-    begins = filled.log.is_start()
-    if "uprev" in filled.log:
-        is_known: Any = np.ones(len(filled.log), bool)
-    else:
-        tau = np.asarray(model.tau, float)
-        doubt = applied_doubt(steps.duration, filled.command_doubt, begins, np.zeros_like(begins), tau)
-        is_known = (doubt < LARGEST_DOUBT).all(axis=1)
-    return is_known & ((steps.since_start >= SETTLING_S) | (not has_memory))
-
-
 def predict(model: ModelParameters, filled: Filled) -> Prediction:
     """Return the model's step from every row of a log, from the measured state under the logged command.
 
     The applied action is the log's; without it, it follows the commands from the segment's start on.
     """
-    log, steps = filled.log, steps_of(filled)
-    has_applied = "uprev" in log
-    record = record_of(filled)
-    record = record._replace(is_applied_known=np.full(len(log), has_applied))
+    log = filled.log
+    record = record_of(filled)._replace(is_applied_known=np.full(len(log), "uprev" in log))
     gyro_b = log["w"] if "w" in log else np.zeros((len(log), 3))
     with jax.enable_x64(True):
         found = _step_from_every_row(record, gyro_b, in_float64(model))
         before, memories, after, force_b = jax.tree.map(np.asarray, found)
-    return Prediction(
-        before=before,
-        memories=memories,
-        after=after,
-        force_b=columns(force_b),
-        steps=steps,
-        is_settled=_is_settled(model, filled, steps, bool(jax.tree.leaves(memories))),
-        applied_from="log" if has_applied else "lag",
-    )
+    is_settled = np.all(is_applied_certain(record, np.asarray(model.tau, float)), axis=1)
+    if jax.tree.leaves(memories):
+        since_start = log.time - log.time[record.begins][np.cumsum(record.begins) - 1]
+        is_settled = is_settled & (since_start >= SETTLING_S)
+    step_s = float(np.median(usual_step(log)))
+    return Prediction(before, memories, after, columns(force_b), record, step_s, is_settled)
 
 
 @jax.jit
@@ -200,21 +137,24 @@ def _fly(
 
 
 def free_flights(
-    model: ModelParameters, log: FlightLog, prediction: Prediction, starts: np.ndarray, num_steps: int
-) -> Iterator[tuple[np.ndarray, dict[str, np.ndarray]]]:
-    """Yield flights of the model by itself from measured rows under the logged commands, in batches.
+    model: ModelParameters, log: FlightLog, prediction: Prediction, starts: np.ndarray, seen: np.ndarray
+) -> dict[str, np.ndarray]:
+    """Return flights of the model by itself from measured rows under the logged commands: p, v, q, w.
 
-    starts: (num_starts,) rows. Yields their rows (BATCH,) at most, and p, v, q, w at the ``num_steps``
-    rows after each, (num_rows, num_steps, size), units of the log; beyond the log's end the last command
-    is held.
+    starts: (num_starts,) rows. seen: (num_starts, num_seen) later rows, at which it returns them,
+    (num_starts, num_seen, size), units of the log; beyond the log's end the last command is held.
     """
+    after = seen - starts[:, None] - 1
+    num_steps = max(int(np.ceil(LONGEST_S / prediction.step_s)), 1 + after.max(initial=0))
+    found = {name: np.empty((*seen.shape, len(CHANNELS[name]))) for name in FLOWN}
     for begin in range(0, len(starts), BATCH):
-        batch = starts[begin : begin + BATCH]
-        filled = np.resize(batch, BATCH)
+        filled = np.resize(starts[begin : begin + BATCH], BATCH)
         rows = np.minimum(filled + np.arange(num_steps)[:, None], len(log) - 1)
         with jax.enable_x64(True):
             first = jax.tree.map(lambda leaf: leaf[filled], (prediction.before, prediction.memories))  # noqa: B023
             commands = Action(*(column[rows] for column in log["u"].T))
-            flown = _fly(first, commands, prediction.steps.duration[rows], in_float64(model))
-            flown = {name: columns(leaves) for name, leaves in flown.items()}
-        yield batch, {name: values.swapaxes(0, 1)[: len(batch)] for name, values in flown.items()}
+            flown = _fly(first, commands, prediction.record.step_s[rows], in_float64(model))
+        at = after[begin : begin + BATCH]
+        for name, leaves in flown.items():
+            found[name][begin : begin + BATCH] = columns(leaves)[at, np.arange(len(at))[:, None]]
+    return found

@@ -3,17 +3,18 @@
 from typing import Any, NamedTuple
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from flytrack_env.dynamics import ModelParameters
 from flytrack_sysid.log import CHANNELS, FlightLog
 from flytrack_sysid.prediction import (
+    LONGEST_S,
     Prediction,
     columns,
     free_flights,
     inputs_that_lack,
     judged_steps,
     runs_of,
-    turn_between,
 )
 
 UNITS = {"p": "m", "v": "m/s", "q": "1", "w": "rad/s", "a": "m/s^2", "f": "m/s^2"}
@@ -24,7 +25,7 @@ NRMSE_MEANING = {
     BY_SPREAD: "rmse over the standard deviation of the measured channel: 1 is as good as its mean",
 }
 # Free flight.
-HORIZONS_S = (0.1, 0.5, 1.0, 2.0)
+HORIZONS_S = (0.1, 0.5, 1.0, LONGEST_S)
 START_EVERY_S = 0.25
 # Channel of each error, and its unit.
 QUANTITIES = {
@@ -90,6 +91,12 @@ def predicted_channel(name: str, prediction: Prediction) -> np.ndarray:
         return prediction.force_b
     of = {"p": after.pos_w, "v": after.vel_w, "q": after.quat, "w": after.rates_b, "a": after.acc_w}
     return columns(of[name])
+
+
+def turn_between(quats: np.ndarray, others: np.ndarray) -> np.ndarray:
+    """Return the rotation vectors, body frame, rad, that turn (num, 4) attitudes into others; (num, 3)."""
+    first, second = (Rotation.from_quat(values, scalar_first=True) for values in (quats, others))
+    return (first.inv() * second).as_rotvec()
 
 
 def error_of(name: str, before: np.ndarray, measured: np.ndarray, predicted: np.ndarray) -> ChannelError:
@@ -168,26 +175,21 @@ def _starts_and_ends(
     An end is the row nearest to its horizon; -1 where the judged run ends before.
     """
     starts, ends = [], []
-    half_step = 0.5 * prediction.steps.median
-    for first, end in runs_of(rows, prediction.steps):
+    half_step = 0.5 * prediction.step_s
+    for first, end in runs_of(rows, prediction.record):
         time, is_settled = log.time[first:end], prediction.is_settled[first:end]
         if not is_settled.any():
             continue
         wanted = np.arange(time[np.argmax(is_settled)], time[-1], START_EVERY_S)
         begin = np.searchsorted(time, wanted - half_step)
-        begin = begin[prediction.steps.is_measured[first + begin]]
+        begin = begin[prediction.is_measured[first + begin]]
         reached = np.searchsorted(time, time[begin, None] + np.array(HORIZONS_S) - half_step)
         last = np.minimum(first + reached, len(log) - 1)
         starts.append(first + begin)
-        ends.append(np.where((reached < len(time)) & prediction.steps.is_measured[last], last, -1))
+        ends.append(np.where((reached < len(time)) & prediction.is_measured[last], last, -1))
     if not starts:
         return np.zeros(0, int), np.zeros((0, len(HORIZONS_S)), int)
     return np.concatenate(starts), np.concatenate(ends)
-
-
-def longest_flight(prediction: Prediction) -> int:
-    """Return the number of steps that free flights are padded to: the longest horizon."""
-    return int(np.ceil(HORIZONS_S[-1] / prediction.steps.median))
 
 
 def _distance(channel: str, measured: np.ndarray, flown: np.ndarray) -> np.ndarray:
@@ -198,10 +200,8 @@ def _distance(channel: str, measured: np.ndarray, flown: np.ndarray) -> np.ndarr
 
 
 def _spread(distances: np.ndarray) -> Spread:
-    with np.errstate(over="ignore", invalid="ignore"):
-        rms = float(np.sqrt(np.mean(distances**2)))
-        median, high = np.percentile(distances, [50.0, HIGH_PERCENTILE]).tolist()
-    return Spread(median, rms, high)
+    median, high = np.percentile(distances, [50.0, HIGH_PERCENTILE]).tolist()
+    return Spread(median, float(np.sqrt(np.mean(distances**2))), high)
 
 
 def rollout_errors(
@@ -215,23 +215,16 @@ def rollout_errors(
     judged = [name for name, (channel, _) in QUANTITIES.items() if channel in log and not lacking[channel]]
     starts, ends = _starts_and_ends(log, prediction, rows)
     starts, ends = starts[(ends >= 0).any(axis=1)], ends[(ends >= 0).any(axis=1)]
-    num_steps = max([longest_flight(prediction), *(ends - starts[:, None]).max(axis=1, initial=0)])
-    found: dict[tuple[int, str], list[np.ndarray]] = {}
-    done = 0
-    for batch, flown in free_flights(model, log, prediction, starts, num_steps):
-        for index in range(len(HORIZONS_S)):
-            last = ends[done : done + len(batch), index]
-            reaches = np.flatnonzero(last >= 0)
-            for name in judged:
-                channel = QUANTITIES[name][0]
-                at_end = flown[channel][reaches, last[reaches] - batch[reaches] - 1]
-                with np.errstate(over="ignore", invalid="ignore"):  # a model may run away
-                    distances = _distance(channel, log[channel][last[reaches]], at_end)
-                found.setdefault((index, name), []).append(distances)
-        done += len(batch)
+    is_reached = ends >= 0
+    flown = free_flights(model, log, prediction, starts, np.where(is_reached, ends, starts[:, None] + 1))
     rollouts = []
     for index, horizon_s in enumerate(HORIZONS_S):
-        count = int(np.sum(ends[:, index] >= 0))
-        errors = {name: _spread(np.concatenate(found[index, name])) for name in judged} if count else {}
-        rollouts.append(Rollout(horizon_s, count, errors))
+        reaches = is_reached[:, index]
+        errors = {}
+        for name in judged if reaches.any() else ():
+            channel = QUANTITIES[name][0]
+            with np.errstate(over="ignore", invalid="ignore"):  # a model may run away
+                measured, at_end = log[channel][ends[reaches, index]], flown[channel][reaches, index]
+                errors[name] = _spread(_distance(channel, measured, at_end))
+        rollouts.append(Rollout(horizon_s, int(reaches.sum()), errors))
     return tuple(rollouts)

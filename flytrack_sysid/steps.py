@@ -7,7 +7,6 @@ import numpy as np
 from flytrack_env.dynamics import ModelParameters
 from flytrack_sysid.log import FlightLog
 from flytrack_sysid.prediction import Prediction, free_flights, runs_of
-from flytrack_sysid.prediction_errors import longest_flight
 
 AXES = ("roll", "pitch", "yaw")
 LEAST_JUMP = 0.2
@@ -57,7 +56,7 @@ def _largest_steps(
     """Return the largest steps of an axis: first row shown, row of the step, end of the rows shown."""
     found = []
     command = log["u"][:, axis]
-    for start, end in runs_of(rows, prediction.steps):
+    for start, end in runs_of(rows, prediction.record):
         time = log.time[start:end]
         for step in _steps_in(time, command[start:end]).tolist():
             at = time[step]
@@ -83,27 +82,25 @@ def step_responses(
     shown = [
         (axis, *place) for axis in range(len(AXES)) for place in _largest_steps(log, prediction, rows, axis)
     ]
-    firsts = np.array([first for _, first, _, _ in shown], int)
-    num_steps = max([longest_flight(prediction), *(end - first - 1 for _, first, _, end in shown)])
-    responses: list[StepResponse] = []
-    for batch, flown in free_flights(model, log, prediction, firsts, num_steps):
-        for index in range(len(batch)):
-            axis, first, step, end = shown[len(responses)]
-            since = slice(first + 1, end)
-            modelled = flown["w"][index, : end - first - 1, axis]
-            measured = log["w"][since, axis]
-            responses.append(
-                StepResponse(
-                    axis=AXES[axis],
-                    segment=int(log.segment[step]),
-                    time_s=float(log.time[step]),
-                    command_before=float(log["u"][step - 1, axis]) + 0.0,  # no -0
-                    command_after=float(log["u"][step, axis]) + 0.0,
-                    since_step=log.time[since] - log.time[step],
-                    command=log["u"][since, axis],
-                    measured=measured,
-                    modelled=modelled,
-                    rms=float(np.sqrt(np.mean((measured - modelled) ** 2))),
-                )
+    firsts, ends = np.array([(first, end) for _, first, _, end in shown], int).reshape(-1, 2).T
+    since_first = np.arange(1, np.max(ends - firsts, initial=1))
+    flown = free_flights(model, log, prediction, firsts, firsts[:, None] + since_first)
+    responses = []
+    for (axis, first, step, end), rates in zip(shown, flown["w"], strict=True):
+        since = slice(first + 1, end)
+        measured, modelled = log["w"][since, axis], rates[: end - first - 1, axis]
+        responses.append(
+            StepResponse(
+                axis=AXES[axis],
+                segment=int(log.segment[step]),
+                time_s=float(log.time[step]),
+                command_before=float(log["u"][step - 1, axis]) + 0.0,  # no -0
+                command_after=float(log["u"][step, axis]) + 0.0,
+                since_step=log.time[since] - log.time[step],
+                command=log["u"][since, axis],
+                measured=measured,
+                modelled=modelled,
+                rms=float(np.sqrt(np.mean((measured - modelled) ** 2))),
             )
+        )
     return tuple(responses)

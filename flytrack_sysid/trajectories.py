@@ -18,8 +18,7 @@ from flytrack_env.viz_rerun import Trajectory
 from flytrack_sysid.diagnosis.traces import Traces, traces
 from flytrack_sysid.log import IN_STATE, FlightLog, time_in_line
 from flytrack_sysid.parameters import with_neutral_effects
-from flytrack_sysid.prediction import Prediction, free_flights, inputs_that_lack, predict
-from flytrack_sysid.prediction_errors import longest_flight
+from flytrack_sysid.prediction import FLOWN, LONGEST_S, Prediction, free_flights, inputs_that_lack, predict
 from flytrack_sysid.record import Filled, fill_gaps
 
 WINDOW_S = 0.1  # of means: long enough for noise to average out, short beside a manoeuvre
@@ -27,7 +26,6 @@ RESTART_S = 1.0  # of free flight: the horizon of the report's first sentence
 AWAY_M = 10.0  # from the measured path: a model that is farther off has diverged
 # Of one flight: 1 min at 100 Hz. Its path is most of a recording, and grows with the power 1.5 of its rows.
 MOST_ROWS = 6000
-FLOWN = ("p", "v", "q", "w")  # channels of a free flight
 
 
 class RecordingError(ValueError):
@@ -131,8 +129,8 @@ def _measured(timed: _Timed, name: str, residuals_w: Mapping[str, np.ndarray]) -
 
 def _starts_and_ends(filled: Filled, prediction: Prediction) -> tuple[np.ndarray, np.ndarray]:
     """Return the rows that free flights start from, one a second, and those where the next one takes over."""
-    log, can_start = filled.log, prediction.is_settled & prediction.steps.is_measured
-    half_step = 0.5 * prediction.steps.median
+    log, can_start = filled.log, prediction.is_settled & prediction.is_measured
+    half_step = 0.5 * prediction.step_s
     edges = np.append(np.flatnonzero(log.is_start()), len(log))
     starts, ends = [np.zeros(0, int)], [np.zeros(0, int)]
     for first, end in pairwise(edges):
@@ -175,12 +173,12 @@ def _free_flight(timed: _Timed, name: str, model: ModelParameters) -> Trajectory
     filled = fill_gaps(timed.log)
     prediction = predict(model, filled)
     starts, ends = _starts_and_ends(filled, prediction)
-    pieces: list[tuple[np.ndarray, np.ndarray, bool]] = []
-    for batch, flown in free_flights(model, filled.log, prediction, starts, longest_flight(prediction)):
-        own = ends[len(pieces) : len(pieces) + len(batch)]
-        for number, (start, end) in enumerate(zip(batch, own, strict=True)):
-            one = {channel: values[number] for channel, values in flown.items()}
-            pieces.append(_shown_of(filled, start, end, one, timed.every))
+    since_start = np.arange(1, 1 + int(np.ceil(LONGEST_S / prediction.step_s)))
+    flown = free_flights(model, filled.log, prediction, starts, starts[:, None] + since_start)
+    pieces = []
+    for number, (start, end) in enumerate(zip(starts, ends, strict=True)):
+        one = {channel: values[number] for channel, values in flown.items()}
+        pieces.append(_shown_of(filled, start, end, one, timed.every))
     if pieces and pieces[0][0][0] > 0:  # begin with the log's first row, so that all have one clock
         first = states_of({channel: timed.log[channel][:1] for channel in FLOWN if channel in timed.log})
         pieces.insert(0, (np.zeros(1, int), first, False))

@@ -81,7 +81,7 @@ def _notes_of(model: ModelParameters, log: FlightLog, prediction: Prediction) ->
         notes.append("acceleration (a) and specific force (f): not in the log")
     if "v_bat" not in log and np.any(np.asarray(model.thrust_coeffs)[4:]):
         notes.append(f"battery (v_bat): not in the log; {BATTERY_UNKNOWN_V:g} V is assumed for thrust")
-    if prediction.applied_from == "lag":
+    if "uprev" not in log:
         notes.append(
             "applied action (uprev): not in the log; computed from the commands by the model's own lags, as "
             "if the first command of a segment had been held before"

@@ -109,13 +109,13 @@ def diagnose(
     """
     with jax.enable_x64(True):
         parts = split(log, model, held_out, motion)
-        selection = selected(parts)
+        selection = select_model(parts)
         # Drones, and who is late, are told by their clocks; two simulator's steps only by what they leave.
         if motion is None and not parts.moves.late_s and parts.moves.motion is not Motion.CONTINUOUS:
             likelier = likelier_motion(selection.state.problem, selection.model.vector)
             if likelier is not parts.moves.motion:
                 parts = split(log, model, held_out, likelier)
-                selection = selected(parts)
+                selection = select_model(parts)
         report(1, len(STAGES))
         judged = judged_in_time(selection, parts)
         selection, test = judged.selection, held_out_under(judged.selection, parts.test)
@@ -133,7 +133,7 @@ def diagnose(
     return found
 
 
-def selected(parts: Split) -> Selection:
+def select_model(parts: Split) -> Selection:
     """Return the model that is selected from the rows to learn from."""
     noise = first_guess(parts.train.lanes, parts.train.residuals(parts.train.start[None])[0])
     return select(*search(SearchState.start(parts.log, parts.train.with_noise(noise))))

@@ -45,7 +45,7 @@ LEAST_SHARE = 0.04  # of what the terms before gain: the least of one more
 LEAST_OWN = 0.01  # of a column's information: what is not within the reach of the model's free numbers
 LEAST_SIGMAS = 3.0  # of a coefficient that stays
 HELD_OUT_SHARE = 0.6  # of the gain on held-out rows that a law would have there if it were right
-LEAST_TOLD = 10.0  # of that: less and held-out rows say nothing of a law
+LEAST_EXPECTED = 10.0  # of that gain: with less, held-out rows say nothing of a law
 
 
 def moment_of_flight(problem: Problem, vector: np.ndarray, flight: Flown) -> Moment:
@@ -203,7 +203,7 @@ class Trial(NamedTuple):
     gain: float
 
 
-def bare(side: Side, frame: str, factors: tuple[Factor, ...]) -> Term:
+def bare_term(side: Side, frame: str, factors: tuple[Factor, ...]) -> Term:
     """Return a term whose coefficients are not known yet."""
     return Term(side.name, frame, factors, (0.0,) * XYZ, (0.0,) * XYZ)
 
@@ -223,7 +223,7 @@ def price_of(side: Side, term: Term) -> float:
     return PER_COEFFICIENT * len(term.basis(side.moment)) + PER_NUMBER * num_shaped(term)
 
 
-def tried(side: Side, test: SideTest, term: Term) -> Trial:
+def score_term(side: Side, test: SideTest, term: Term) -> Trial:
     """Return the gain of a term beside what is given; nothing where it hardly differs from that."""
     columns = side.columns(term)
     if not np.isfinite(columns).all() or not np.abs(columns).max() > 0.0:
@@ -232,7 +232,7 @@ def tried(side: Side, test: SideTest, term: Term) -> Trial:
     return Trial(term, gain - price_of(side, term), gain)
 
 
-def refined(side: Side, test: SideTest, start: Trial) -> Trial:
+def refine_shapes(side: Side, test: SideTest, start: Trial) -> Trial:
     """Return a term with the numbers of its shapes where it gains most."""
     if not num_shaped(start.term):
         return start
@@ -249,7 +249,7 @@ def refined(side: Side, test: SideTest, start: Trial) -> Trial:
         term = _with_numbers(start.term, values)
         if term is None:
             return 0.0
-        found = tried(side, test, term)
+        found = score_term(side, test, term)
         best = max(best, found, key=lambda one: one.merit)
         return -found.merit
 
@@ -259,13 +259,13 @@ def refined(side: Side, test: SideTest, start: Trial) -> Trial:
     return best
 
 
-def refined_together(side: Side, terms: Sequence[Term]) -> list[Term]:
+def refine_jointly(side: Side, terms: Sequence[Term]) -> list[Term]:
     """Return terms with the numbers of each one's shapes where it gains most beside the others."""
     result = list(terms)
     for place, term in enumerate(terms[:-1]):
         others = [side.columns(one) for one in (*result[:place], *result[place + 1 :])]
         test = side.test.given_also(*others)
-        result[place] = refined(side, test, tried(side, test, term)).term
+        result[place] = refine_shapes(side, test, score_term(side, test, term)).term
     return result
 
 
@@ -307,14 +307,14 @@ class Found(NamedTuple):
     rivals: tuple[str, ...]
 
 
-def vector_beside(side: Side, fit: SideFit) -> np.ndarray:
+def vector_with(side: Side, fit: SideFit) -> np.ndarray:
     """Return the model's vector beside features that were fitted."""
     vector = side.vector.copy()
     vector[list(side.acting)] -= fit.given
     return side.problem.clipped(vector)
 
 
-def fitted(side: Side, terms: Sequence[Term]) -> tuple[tuple[Term, ...], SideFit]:
+def fit_terms(side: Side, terms: Sequence[Term]) -> tuple[tuple[Term, ...], SideFit]:
     """Return terms with the coefficients that are clear, fitted together."""
     columns = [side.columns(term) for term in terms]
     sizes = [one.shape[1] for one in columns]
@@ -338,7 +338,7 @@ def fitted(side: Side, terms: Sequence[Term]) -> tuple[tuple[Term, ...], SideFit
     return tuple(result), fit
 
 
-def added(side: Side, terms: Sequence[Term]) -> np.ndarray:
+def contribution_of(side: Side, terms: Sequence[Term]) -> np.ndarray:
     """Return what terms with coefficients add, whitened, (rows, lanes, 3, 2)."""
     total = np.zeros((*side.flight.time_s.shape, XYZ, 2))
     for term in terms:
@@ -359,8 +359,8 @@ def held_out(side: Side, held: Side, learnt: np.ndarray, vector: np.ndarray) -> 
     return gain, float(np.sum((less[..., axes, :] - full) ** 2))
 
 
-def half_told(side: Side, terms: Sequence[Term]) -> tuple[float, float]:
-    """Return what coefficients from each half of the blocks gain on the other, and would if they were right.
+def cross_validate(side: Side, terms: Sequence[Term]) -> tuple[float, float]:
+    """Return what coefficients fitted to each half of the blocks gain on the other, and should if right.
 
     For a law that does not act in held-out rows, such as a thermal that they do not pass.
     """
@@ -378,9 +378,9 @@ def half_told(side: Side, terms: Sequence[Term]) -> tuple[float, float]:
 def find_law(side: Side, held: Side) -> Found | None:
     """Return the law of a side that rows learnt from and held-out rows agree on; None without one.
 
-    Searched from the best first terms of several quantities, since of a sum each may gain less than one bump.
+    The search starts from the best terms of several quantities: each wave of a sum may gain less than a bump.
     """
-    pool = [bare(side, *one) for one in factors_of(side)]
+    pool = [bare_term(side, *one) for one in factors_of(side)]
     firsts, ranked = best_of(side, side.test, pool)
     limit = stats.chi2.isf(CHANCE / len(pool), [num_numbers(side, one.term) for one in firsts])
     clear = [one for one, least in zip(firsts, limit, strict=True) if one.gain >= least]
@@ -389,7 +389,7 @@ def find_law(side: Side, held: Side) -> Found | None:
     for one in clear:
         by_quantity.setdefault(one.term.factors[-1].quantity, one)
     starts = list(by_quantity.values())[:MOST_STARTS]
-    laws = [grown(side, held, one, ranked[:MOST_TRIED_AGAIN], len(pool)) for one in starts]
+    laws = [grow_law(side, held, one, ranked, len(pool)) for one in starts]
     found = [one._replace(rivals=rivals) for one in laws if one is not None]
     return max(
         found, key=lambda one: one.gain - sum(price_of(side, term) for term in one.terms), default=None
@@ -398,8 +398,8 @@ def find_law(side: Side, held: Side) -> Found | None:
 
 def best_of(side: Side, test: SideTest, pool: Sequence[Term]) -> tuple[list[Trial], list[Term]]:
     """Return the best terms of different kinds, refined, the best first, and the pool in that order."""
-    trials = sorted((tried(side, test, term) for term in pool), key=lambda one: -one.merit)
-    best = [refined(side, test, one) for one in _of_different_kinds(trials)[:MOST_REFINED]]
+    trials = sorted((score_term(side, test, term) for term in pool), key=lambda one: -one.merit)
+    best = [refine_shapes(side, test, one) for one in _of_different_kinds(trials)[:MOST_REFINED]]
     return sorted(best, key=lambda one: -one.merit), [one.term for one in trials]
 
 
@@ -408,30 +408,30 @@ def uses_time(term: Term) -> bool:
     return any(one.quantity == "time" for one in term.factors)
 
 
-def grown(side: Side, held: Side, first: Trial, pool: Sequence[Term], number: int) -> Found | None:
+def grow_law(side: Side, held: Side, first: Trial, pool: Sequence[Term], number: int) -> Found | None:
     """Return the law that begins with a term, to which others of a pool are added while they gain.
 
     number: of terms among which they are chosen.
     """
     terms: list[Term] = []
     best: Found | None = None
-    if not uses_time(
-        first.term
-    ):  # free flight on held-out rows, which cannot judge what uses time, judges it
-        pool = [term for term in pool if not uses_time(term)]
-    while len(terms) < MOST_TERMS:
-        now, fit = fitted(side, refined_together(side, [*terms, first.term]))
+    # Free flight on held-out rows cannot judge what looks at the time: a law does in all terms or in none.
+    pool = [term for term in pool if uses_time(term) == uses_time(first.term)][:MOST_TRIED_AGAIN]
+    while True:
+        now, fit = fit_terms(side, refine_jointly(side, [*terms, first.term]))
         if len(now) <= len(terms) or (best is not None and fit.chi2 < (1.0 + LEAST_SHARE) * best.gain):
             break
-        vector = vector_beside(side, fit)
-        gain, expected = held_out(side, held, added(held, now), vector)
+        vector = vector_with(side, fit)
+        gain, expected = held_out(side, held, contribution_of(held, now), vector)
         if best is not None and gain < best.held_out_gain:
             break
-        told = (gain, expected) if expected >= LEAST_TOLD else half_told(side, now)
+        judged_by = (gain, expected) if expected >= LEAST_EXPECTED else cross_validate(side, now)
         # One wave of a sum of two may fail on held-out rows where both do not.
-        if told[0] >= HELD_OUT_SHARE * told[1]:
+        if judged_by[0] >= HELD_OUT_SHARE * judged_by[1]:
             best = Found(now, vector, fit.chi2, gain, expected, ())
         terms = list(now)
+        if len(terms) == MOST_TERMS:
+            break
         test = side.test.given_also(*(side.columns(term) for term in terms))
         (first, *_), _ = best_of(side, test, pool)
         if first.gain < stats.chi2.isf(CHANCE_OF_MORE / number, num_numbers(side, first.term)):

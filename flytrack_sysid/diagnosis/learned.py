@@ -13,7 +13,7 @@ import numpy as np
 from flytrack_env.effects.grammar import Law, Term
 from flytrack_env.effects.learned_residual import Network, Networks
 from flytrack_sysid.diagnosis.beyond import Learned
-from flytrack_sysid.diagnosis.law_search import LEAST_TOLD, Found, Side, find_law
+from flytrack_sysid.diagnosis.law_search import LEAST_EXPECTED, Found, Side, find_law, uses_time
 from flytrack_sysid.diagnosis.problem import Problem
 from flytrack_sysid.diagnosis.refinement import LIKELY_WORSE, Judge, errors_at, sureness
 from flytrack_sysid.diagnosis.residual_fit import Residual, fit_residual
@@ -56,8 +56,8 @@ def find_learned(
         if one is None:
             continue
         added = (one.terms, ()) if isinstance(one, Found) else ((), (one.network,))
-        is_told = one.expected >= LEAST_TOLD
-        if not _predicts(problem, judge, model.vector, one.vector, (terms, networks), added, is_told):
+        acts_there = one.expected >= LEAST_EXPECTED
+        if not _predicts(problem, judge, model.vector, one.vector, (terms, networks), added, acts_there):
             continue
         terms, networks = [*terms, *added[0]], [*networks, *added[1]]
         found[name], model = one, model._replace(vector=one.vector)
@@ -105,22 +105,26 @@ def _predicts(
     after: np.ndarray,
     had: tuple[Sequence[Term], Sequence[Network]],
     added: tuple[Sequence[Term], Sequence[Network]],
-    is_told: bool,
+    acts_there: bool,
 ) -> bool:
     """Return whether held-out flights are predicted no worse with what was learnt, and better in all.
 
-    is_told: whether it acts in them at all.
+    acts_there: whether it acts in them enough to be judged. What looks at the time is left out: free flight
+    begins at any time.
     """
-    both = _of_parts([*had[0], *added[0]], [*had[1], *added[1]])
-    if judge is None or both.law.uses("time") or both.networks.uses("time"):
+    new = _of_parts(*added)
+    if judge is None or new.law.uses("time") or new.networks.uses("time"):
         return True
+    terms = [one for one in had[0] if not uses_time(one)]
+    networks = [one for one in had[1] if not Networks((one,)).uses("time")]
+    old, both = _of_parts(terms, networks), _of_parts([*terms, *added[0]], [*networks, *added[1]])
     tested = [
         errors_at(problem.with_learned(one.effects), one.beside(vector)[None], judge.windows)
-        for vector, one in ((before, _of_parts(*had)), (after, both))
+        for vector, one in ((before, old), (after, both))
     ]
     scale = np.maximum(np.nan_to_num(tested[0].rms()[0], nan=1.0), 1e-9)
     ratio = tested[1].rms()[0] / scale
     lost = sureness(tested[1].by_block(scale)[0] - tested[0].by_block(scale)[0])
     is_worse = judge.is_known & (ratio > LIKELY_WORSE) & (lost > WORSE_SIGMAS)
     is_better = float(np.mean(ratio[judge.is_known] ** 2)) < 1.0
-    return not is_worse.any() and (is_better or not is_told)
+    return not is_worse.any() and (is_better or not acts_there)
