@@ -33,7 +33,7 @@ from flytrack_sysid.log import FlightLog
 
 LINES = report.RESULTS / "beyond.jsonl"
 REAL = report.ROOT / "benchmarks" / "data" / "real"  # `python -m benchmarks.real_logs --diagnose`
-SEED, SECONDS = 53, 60.0  # rules were looked at on seeds 7, 41, 43 and 47
+SEED, SECONDS = 59, 60.0  # rules were looked at on seeds 7, 41, 43, 47 and 53
 AMPLITUDES = (1.0, 3.0)  # times the noise of the sensor in the law's channel
 # Kind of law -> quantities, and shapes, that are right.
 RIGHT: dict[str, tuple[set[str], set[str]]] = {

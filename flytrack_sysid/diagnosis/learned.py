@@ -27,7 +27,7 @@ from flytrack_sysid.diagnosis.unexplained import (
 )
 
 MOST_ROWS = 12_000  # with their lead-ins: two minutes at 100 Hz
-LEAST_SHARE = 0.15  # of the sensor's noise, rms: less is not learnt
+LEAST_SHARE, LEAST_RESIDUAL_SHARE = 0.08, 0.15  # of the sensor's noise, rms: less is not learnt
 LAW_SHARE = 0.75  # of what smooth functions of everything explain: the least that a law explains
 WORSE_SIGMAS = 1.0  # by which no horizon may be worse
 
@@ -89,7 +89,7 @@ def _learnt(side: Side, held: Side, dependences: Sequence[Dependence]) -> Found 
     flexible = sum(one.gain for one in dependences)
     if law is not None and law.gain >= LAW_SHARE * flexible:
         return law
-    if not dependences:
+    if not dependences or max(one.share for one in dependences) < LEAST_RESIDUAL_SHARE:
         return None
     return fit_residual(side, held, [one.name for one in dependences])
 
