@@ -129,6 +129,7 @@ def draw_chart(results: list[dict[str, Any]]) -> bytes:
         success.plot(where, [100.0 * one["plant"]["success"] for one in stages], **style)
         gap.plot(where, [min(gap_percent(one), LARGEST_GAP_PERCENT) for one in stages], **style)
     success.set_ylabel("finish 3 laps on the plant (%)")
+    success.set_ylim(top=101.0)
     gap.set_ylabel(f"|lap gap| (%), {LARGEST_GAP_PERCENT:g}: more, or no lap")
     gap.axhline(1.0, color="0.7", linewidth=1.0)
     success.axhline(95.0, color="0.7", linewidth=1.0)
