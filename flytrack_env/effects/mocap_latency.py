@@ -18,10 +18,7 @@ class MocapLatency(NamedTuple):
     latency_s: Scalar = 0.0
 
 
-class PastPoses(NamedTuple):
-    """True poses before the present one, the latest first."""
-
-    poses: tuple[Pose, ...]
+PastPoses = tuple[Pose, ...]  # true ones before the present one, the latest first
 
 
 def _of(drone: Drone) -> Pose:
@@ -30,7 +27,7 @@ def _of(drone: Drone) -> Pose:
 
 def start(latency: MocapLatency, drone: Drone, num_steps: int) -> PastPoses:
     """Return the memory of an episode that begins: as if the drone had been there all along."""
-    return PastPoses((_of(drone),) * num_steps)
+    return (_of(drone),) * num_steps
 
 
 def _same_sign(quat: Quaternion, like: Quaternion) -> Quaternion:
@@ -41,7 +38,7 @@ def _same_sign(quat: Quaternion, like: Quaternion) -> Quaternion:
 
 def _pose(latency: MocapLatency, past: PastPoses, pose: Pose, context: StepContext) -> Pose:
     """Return the mean of the poses between which the delayed time lies, by their nearness."""
-    poses = (pose, *(one._replace(quat=_same_sign(one.quat, pose.quat)) for one in past.poses))
+    poses = (pose, *(one._replace(quat=_same_sign(one.quat, pose.quat)) for one in past))
 
     def mean(*vectors: tuple[Scalar, ...]) -> list[Scalar]:
         return [late(parts, latency.latency_s, context.dt) for parts in zip(*vectors, strict=True)]
@@ -54,7 +51,7 @@ def _pose(latency: MocapLatency, past: PastPoses, pose: Pose, context: StepConte
 
 def remember(latency: MocapLatency, past: PastPoses, context: StepContext) -> PastPoses:
     """Return the memory after a step."""
-    return PastPoses((_of(context.drone), *past.poses[:-1]))
+    return (_of(context.drone), *past[:-1])
 
 
 MOCAP_LATENCY = Effect(

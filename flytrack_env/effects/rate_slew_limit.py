@@ -23,17 +23,12 @@ class RateSlewLimit(NamedTuple):
     yaw_s: Scalar = 0.0
 
 
-class Setpoint(NamedTuple):
-    """The sticks that the rate loop follows at the end of a step."""
-
-    roll: Scalar
-    pitch: Scalar
-    yaw: Scalar
+Setpoint = tuple[Scalar, Scalar, Scalar]  # the rate sticks that the loop follows at the end of a step
 
 
 def start(limit: RateSlewLimit, drone: Drone) -> Setpoint:
     """Return the memory of an episode that begins: the setpoint has arrived."""
-    return Setpoint(*drone.applied[:3])
+    return drone.applied[:3]
 
 
 def _command(limit: RateSlewLimit, setpoint: Setpoint, sticks: Action, context: StepContext) -> Action:
@@ -62,9 +57,9 @@ def _command(limit: RateSlewLimit, setpoint: Setpoint, sticks: Action, context: 
 def remember(limit: RateSlewLimit, setpoint: Setpoint, context: StepContext) -> Setpoint:
     """Return the memory after a step; nothing changes the sticks behind this effect."""
     if context.motion is not Motion.CONTINUOUS:
-        return Setpoint(*context.acting[:3])
-    axes = zip(context.acting[:3], setpoint, limit, strict=True)
-    return Setpoint(*(_end_of(*axis, context.dt) for axis in axes))
+        return context.acting[:3]
+    roll, pitch, yaw = zip(context.acting[:3], setpoint, limit, strict=True)
+    return _end_of(*roll, context.dt), _end_of(*pitch, context.dt), _end_of(*yaw, context.dt)
 
 
 def _end_of(mean: Scalar, before: Scalar, full_s: Scalar, dt: Scalar) -> Scalar:

@@ -26,11 +26,6 @@ class SecondOrderRates(NamedTuple):
     pitch_damping: Scalar = 0.7
     yaw_damping: Scalar = 0.7
 
-    @property
-    def lags_s(self) -> tuple[Scalar, ...]:
-        """The lags of the axes, s."""
-        return tuple(self[:3])
-
 
 class Turning(NamedTuple):
     """Body rates, rad/s, and their slopes, rad/s^2."""
@@ -52,11 +47,6 @@ def start(loop: SecondOrderRates, drone: Drone) -> Turning:
     """Return the memory of an episode that begins: a rate that has been held."""
     still = Vec3(*(jnp.zeros_like(rate) for rate in drone.rates_b))
     return Turning(drone.rates_b, still)
-
-
-def _responses(loop: SecondOrderRates, dt: Scalar) -> list[_Response]:
-    """Return the transition of a held input on each axis."""
-    return [_response(*axis, dt) for axis in zip(loop.lags_s, loop[3:], strict=True)]
 
 
 def _response(lag_s: Scalar, damping: Scalar, dt: Scalar) -> _Response:
@@ -94,32 +84,31 @@ def _input(lag_s: Scalar, before: Scalar, now: Scalar, context: StepContext) -> 
     return _Input(before - lag_s * slope, now - lag_s * slope, slope)
 
 
-def _rates(loop: SecondOrderRates, memory: Turning, rates_b: Vec3, context: StepContext) -> Vec3:
-    def follow(
-        left: _Response, lag_s: Scalar, first: Scalar, new: Scalar, old: Scalar, slope: Scalar
-    ) -> Scalar:
-        given = _input(lag_s, first, new, context)
-        after = given.last + left.offset * (old - given.first) + left.offset_of_slope * (slope - given.slope)
-        return jnp.where(lag_s > SHORTEST_S, after, new)  # without a lag, nothing may change
+def _turned(loop: SecondOrderRates, memory: Turning, inputs_b: Vec3, context: StepContext) -> Turning:
+    """Return rates and slopes after the step, at whose end the loop is given these inputs."""
 
-    responses = _responses(loop, context.dt)
-    axes = zip(responses, loop.lags_s, context.first_input_b, rates_b, *memory, strict=True)
-    return Vec3(*(follow(*axis) for axis in axes))
+    def follow(
+        lag_s: Scalar, damping: Scalar, first: Scalar, new: Scalar, old: Scalar, slope: Scalar
+    ) -> tuple[Scalar, Scalar]:
+        left, given = _response(lag_s, damping, context.dt), _input(lag_s, first, new, context)
+        offset, change, is_lag = old - given.first, slope - given.slope, lag_s > SHORTEST_S
+        after = given.last + left.offset * offset + left.offset_of_slope * change
+        slope_after = given.slope + left.slope_of_offset * offset + left.slope * change
+        # Without a lag, nothing may change.
+        return jnp.where(is_lag, after, new), jnp.where(is_lag, slope_after, 0.0)
+
+    axes = zip(loop[:3], loop[3:], context.first_input_b, inputs_b, *memory, strict=True)
+    rates_b, slopes_b = zip(*(follow(*axis) for axis in axes), strict=True)
+    return Turning(Vec3(*rates_b), Vec3(*slopes_b))
+
+
+def _rates(loop: SecondOrderRates, memory: Turning, rates_b: Vec3, context: StepContext) -> Vec3:
+    return _turned(loop, memory, rates_b, context).rates_b
 
 
 def remember(loop: SecondOrderRates, memory: Turning, context: StepContext) -> Turning:
     """Return the memory after a step."""
-
-    def slope_after(
-        left: _Response, lag_s: Scalar, first: Scalar, new: Scalar, old: Scalar, slope: Scalar
-    ) -> Scalar:
-        given = _input(lag_s, first, new, context)
-        found = given.slope + left.slope_of_offset * (old - given.first) + left.slope * (slope - given.slope)
-        return jnp.where(lag_s > SHORTEST_S, found, 0.0)
-
-    responses = _responses(loop, context.dt)
-    axes = zip(responses, loop.lags_s, context.first_input_b, context.input_b, *memory, strict=True)
-    return Turning(context.rates_b, Vec3(*(slope_after(*axis) for axis in axes)))
+    return Turning(context.rates_b, _turned(loop, memory, context.input_b, context).slopes_b)
 
 
 def observe(loop: SecondOrderRates, memory: Turning, offset_b: Vec3, dt: Scalar) -> tuple[Turning, Vec3]:
