@@ -14,10 +14,8 @@ from flytrack_env.dynamics import ModelParameters
 from flytrack_env.episodes import EpisodicEnvironment
 from flytrack_env.observations import Entry
 from flytrack_env.params import EnvParams
-from flytrack_env.plants import Plant
 from flytrack_env.race import Race
 from flytrack_env.state import Drone
-from flytrack_env.tracks import Track
 
 
 class WrapperError(ValueError):
@@ -51,6 +49,7 @@ class Wrapper(EpisodicEnvironment):
                 raise WrapperError(f"{name} around {type(inside).__name__}: {reason}")
         self._transition_gradients_enabled = env.transition_gradients_enabled
         self.env = env
+        self.track, self.plant, self.missed_gate = env.track, env.plant, env.missed_gate
         self.env_id = f"{name}({env.env_id})"
 
     def refusal(self, inside: EpisodicEnvironment) -> str | None:
@@ -73,21 +72,6 @@ class Wrapper(EpisodicEnvironment):
             found = sorted(params.wrappers)
             raise ValueError(f"params.wrappers: found {found}, expected {self.key!r} among them")
         return params.wrappers[self.key]
-
-    @property
-    def track(self) -> Track:  # type: ignore[override]
-        """What is flown."""
-        return self.env.track
-
-    @property
-    def plant(self) -> Plant:  # type: ignore[override]
-        """What flies."""
-        return self.env.plant
-
-    @property
-    def missed_gate(self) -> str:  # type: ignore[override]
-        """What a missed gate does."""
-        return self.env.missed_gate
 
     @property
     def default_params(self) -> EnvParams:  # type: ignore[override]  # of gymnax: see EpisodicEnvironment
