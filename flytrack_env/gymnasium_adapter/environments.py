@@ -66,7 +66,7 @@ class _Adapter:
         if simulation is not self._simulation:
             self._simulation = simulation
             self._renderer = self._renderer and simulation.make_renderer()
-        return simulation.begin(words, start)
+        return simulation.begin(words, *start)
 
     def _checked(self, name: str, state: Any, actions: Any, shape: tuple[int, ...] | None) -> np.ndarray:
         """Return actions as float32, once an episode has begun and if they have that shape."""
