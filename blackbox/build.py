@@ -47,8 +47,12 @@ def serialize(parameters: PlantParameters) -> bytes:
     return bytes(dataclasses.replace(exported, mlir_module_serialized=module).serialize())
 
 
-def write_atomically(path: Path, content: bytes) -> None:
-    """Write a file under a temporary name and rename it, so that no half-written file is left."""
+def build(parameters: PlantParameters, path: str | Path) -> Path:
+    """Write the artifact of a plant with any parameters, and return its path.
+
+    It is written under a temporary name and renamed, so that no half-written file is left.
+    """
+    path, content = Path(path), serialize(parameters)
     path.parent.mkdir(parents=True, exist_ok=True)
     handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
     try:
@@ -59,12 +63,6 @@ def write_atomically(path: Path, content: bytes) -> None:
     except BaseException:
         os.unlink(temporary)
         raise
-
-
-def build(parameters: PlantParameters, path: str | Path) -> Path:
-    """Write the artifact of a plant with any parameters, atomically, and return its path."""
-    path = Path(path)
-    write_atomically(path, serialize(parameters))
     return path
 
 

@@ -4,9 +4,8 @@ The Python here and ``body.c`` are under Apache-2.0. ``lockstep.c``, and the pro
 build`` makes, are under GPL-3.0-or-later (``firmware/LICENSE``); it runs in processes of its own.
 """
 
-from firmware.body import Body, read_body
+from firmware.body import Body, FirmwareError, read_body
 from firmware.building import build
-from firmware.errors import FirmwareError
 from firmware.plant import Betaflight, FirmwareState
 
 __all__ = ["Betaflight", "Body", "FirmwareError", "FirmwareState", "build", "read_body"]

@@ -10,9 +10,8 @@ from pathlib import Path
 
 import numpy as np
 
-from firmware.body import Body
+from firmware.body import Body, FirmwareError
 from firmware.building import build
-from firmware.errors import FirmwareError
 from firmware.plant import DT_S, Betaflight
 from flytrack_env.state import APPLIED_ACTION, BATTERY, POSITION, QUATERNION, STATE_SIZE
 

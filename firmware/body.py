@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 
-from firmware.errors import FirmwareError
 from flytrack_env.files import read_at_most
 from flytrack_env.messages import error_text, quote_name, quote_value
 
@@ -20,6 +19,10 @@ STRONGEST_HEALTH = 1.5
 LARGEST_TILT_RAD = 0.3
 LARGEST_NUMBER = 1e6
 LARGEST_BYTES = 2**20  # of a body's file
+
+
+class FirmwareError(ValueError):
+    """Firmware that cannot be built, configured or flown; the message is one sentence that names what."""
 
 
 @dataclass(frozen=True)

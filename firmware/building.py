@@ -13,7 +13,7 @@ import tempfile
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from firmware.errors import FirmwareError
+from firmware.body import FirmwareError
 from flytrack_env.files import user_cache_folder
 from flytrack_env.messages import error_text
 
@@ -127,7 +127,9 @@ def _build_in(folder: Path, say: Say, sdist: Path | None) -> Path:
     for name in ("lockstep.c", "body.h"):
         shutil.copy2(HERE / name, source / SIMULATOR)
     say("3/3 compile")
-    _run(["gcc", *BODY_FLAGS, "-c", str(HERE / "body.c"), "-o", "body.o"], source)
+    done = _process(["gcc", *BODY_FLAGS, "-c", str(HERE / "body.c"), "-o", "body.o"], source, COMPILE_S)
+    if done.returncode:
+        raise _compiler_error(done.stderr.splitlines())
     _make(source, say)
     return source / BUILT
 
@@ -182,12 +184,6 @@ def _process(
         )
     except subprocess.TimeoutExpired as error:
         raise FirmwareError(f"{command[0]}: did not end within {limit_s:g} s") from error
-
-
-def _run(command: Sequence[str], folder: Path) -> None:
-    done = _process(command, folder, COMPILE_S)
-    if done.returncode:
-        raise _compiler_error(done.stderr.splitlines())
 
 
 def _compiler_error(lines: Sequence[str]) -> FirmwareError:

@@ -22,9 +22,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from firmware.body import Body
+from firmware.body import Body, FirmwareError
 from firmware.building import find_executable
-from firmware.errors import FirmwareError
 from firmware.process import AT_REST, BODY, FLY, START, START_STATE, Firmware, Reply
 from firmware.settings import settings_of
 from flytrack_env import state as layout
@@ -147,7 +146,8 @@ class Betaflight(Plant):
         self._numbers, self._lock = itertools.count(1), threading.Lock()
         self._failure: FirmwareError | None = None
         self._finalizer = weakref.finalize(self, self.firmware.close)
-        self.full_stick_deg_s = _full_stick(self.firmware)
+        rates, axes = self.value("rates_type"), _rates(self.firmware, "rc_rate", "srate", "rate_limit")
+        self.full_stick_deg_s = tuple(full_stick_rate(rates, *axis) for axis in axes)
 
     def __enter__(self) -> "Betaflight":
         return self
@@ -180,7 +180,6 @@ class Betaflight(Plant):
 
     def reset(self, drone: Drone, model: ModelParameters) -> FirmwareState:
         """Return the state of a flight that has not begun; ``model`` is not used."""
-        del model
         floats = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32), drone)
         return FirmwareState(floats, jnp.int32(0), jnp.int32(0))
 
@@ -188,22 +187,9 @@ class Betaflight(Plant):
         self, state: FirmwareState, command: Action, dt: Scalar, model: ModelParameters
     ) -> FirmwareState:
         """Return the state 0.01 s later; ``dt`` and ``model`` are not used."""
-        del dt, model
         u = jnp.stack([jnp.asarray(value, jnp.float32) for value in command])
-        shapes = (
-            jax.ShapeDtypeStruct((STATE_SIZE,), jnp.float32),
-            jax.ShapeDtypeStruct((), jnp.int32),
-            jax.ShapeDtypeStruct((), jnp.int32),
-        )
-        row, flight, step = jax.pure_callback(
-            self._step_rows,
-            shapes,
-            pack(state.drone),
-            state.flight,
-            state.step,
-            u,
-            vmap_method="broadcast_all",
-        )
+        rows = pack(state.drone), state.flight, state.step
+        row, flight, step = jax.pure_callback(self._step_rows, rows, *rows, u, vmap_method="broadcast_all")
         return FirmwareState(unpack(row), flight, step)
 
     def drone(self, state: FirmwareState) -> Drone:
@@ -310,24 +296,13 @@ class Betaflight(Plant):
         flight.land(self.box)
 
     def _row(self, reply: Reply) -> np.ndarray:
-        """Return the handout's state (21,) float32 of a reply."""
-        numbers = reply.numbers
-        row = np.empty(STATE_SIZE)
-        row[layout.POSITION], row[layout.VELOCITY], row[layout.ACCELERATION] = (
-            numbers[:3],
-            numbers[3:6],
-            numbers[6:9],
-        )
-        row[layout.QUATERNION], row[layout.RATES], row[layout.BATTERY] = (
-            numbers[9:13],
-            numbers[13:16],
-            numbers[20],
-        )
-        command = self.body.command_of(numbers[16:20], numbers[20])
+        """Return the handout's state (21,) float32 of a reply that has the motors' speeds for the action."""
+        row = reply.numbers.copy()
+        command = self.body.command_of(row[layout.APPLIED_ACTION], row[layout.BATTERY])
         low, high = (reply.motor_range - LOWEST_PULSE_US) / PULSE_RANGE_US
         thrust = 2.0 * (command - low) / (high - low) - 1.0
-        row[layout.APPLIED_ACTION] = [*row[layout.RATES] / np.deg2rad(self.full_stick_deg_s), thrust]
-        row[layout.APPLIED_ACTION] = np.clip(row[layout.APPLIED_ACTION], -1.0, 1.0)
+        sticks = row[layout.RATES] / np.deg2rad(self.full_stick_deg_s)
+        row[layout.APPLIED_ACTION] = np.clip([*sticks, thrust], -1.0, 1.0)
         return row.astype(np.float32)
 
 
@@ -335,9 +310,3 @@ def _rates(firmware: Firmware, *names: str) -> list[tuple[float, ...]]:
     """Return rate settings of roll, pitch and yaw."""
     axes = ("roll", "pitch", "yaw")
     return [tuple(float(firmware.value(f"{axis}_{name}")) for name in names) for axis in axes]
-
-
-def _full_stick(firmware: Firmware) -> tuple[float, ...]:
-    """Return the rates at full stick of roll, pitch, yaw by the firmware's own settings, deg/s."""
-    rates, axes = firmware.value("rates_type"), _rates(firmware, "rc_rate", "srate", "rate_limit")
-    return tuple(full_stick_rate(rates, *axis) for axis in axes)

@@ -17,13 +17,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from firmware.body import Body
-from firmware.errors import FirmwareError
+from firmware.body import Body, FirmwareError
 from firmware.settings import Setting, check_read_back, configure, value_of, values_of
 
 CLI, BODY, START, FLY, FORK = range(5)
 REQUEST = struct.Struct("=5I8f")
-REPLY = struct.Struct("=3I6f4x21d")
+REPLY = struct.Struct("=3I16x2f4x21d")  # without the motors' pulses
 START_STATE = struct.Struct("=14dQ")
 LARGEST_PID = 2**31 - 1  # a fork that failed has -1, unsigned
 ARMED = 1  # of the firmware's armingFlags
@@ -39,15 +38,14 @@ PROMPT = "# "
 class Reply(NamedTuple):
     """What a process answers.
 
-    is_armed. pid: of a copy. text: of the command line, or why it does not arm. motors: (4,) us. motor_range:
-    (2,), what the mixer may ask for, us. numbers: (21,): position, velocity, acceleration, quaternion, rates,
+    is_armed. pid: of a copy. text: of the command line, or why it does not arm. motor_range: (2,), what
+    the mixer may ask for, us. numbers: (21,): position, velocity, acceleration, quaternion, rates,
     motor speeds, V under load.
     """
 
     is_armed: bool
     pid: int
     text: str
-    motors: np.ndarray
     motor_range: np.ndarray
     numbers: np.ndarray
 
@@ -85,7 +83,7 @@ class Link:
         arming, pid, num_bytes = fields[:3]
         text = self._read(num_bytes).decode(errors="replace")
         numbers = np.array(fields[3:])
-        return Reply(bool(arming & ARMED), pid, text, numbers[:4], numbers[4:6], numbers[6:])
+        return Reply(bool(arming & ARMED), pid, text, numbers[:2], numbers[2:])
 
     def call(self, kind: int, **arguments: object) -> Reply:
         """Ask and return the answer."""
@@ -141,7 +139,7 @@ class Firmware:
             self.is_reversed = self.value("yaw_motors_reversed") == "ON"
             self._start()
             self.link.call(BODY, payload=body.pack(self.is_reversed))
-            self._place(body)
+            self.link.call(START, payload=START_STATE.pack(*[0.0] * 6, 1.0, *[0.0] * 6, body.full_v, 1))
             self.link.call(FLY, duration_us=READY_US, is_held=True)
         except BaseException:
             self.close()
@@ -172,7 +170,9 @@ class Firmware:
         self._start()
         self._open_command_line()
         configure(settings, self._type)
-        self._save()
+        self.link.ask(CLI, duration_us=BOOT_US, payload=b"save\r\n")
+        with contextlib.suppress(FirmwareError):
+            self.link.answer()  # the firmware ends, to be started again
         self._start()
         self._open_command_line()
         dump = self._type("dump all", DUMP_US)
@@ -190,15 +190,6 @@ class Firmware:
         if not answer.endswith(PROMPT):
             raise FirmwareError(f"firmware: its command line did not finish {line!r}")
         return answer
-
-    def _save(self) -> None:
-        """Save, upon which the firmware ends, to be started again."""
-        self.link.ask(CLI, duration_us=BOOT_US, payload=b"save\r\n")
-        with contextlib.suppress(FirmwareError):
-            self.link.answer()
-
-    def _place(self, body: Body) -> None:
-        self.link.call(START, payload=START_STATE.pack(*[0.0] * 6, 1.0, *[0.0] * 6, body.full_v, 1))
 
     def _start(self) -> None:
         self._stop()

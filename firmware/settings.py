@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Mapping
 from fnmatch import fnmatch
 from typing import NamedTuple
 
-from firmware.errors import FirmwareError
+from firmware.body import FirmwareError
 from flytrack_env.messages import quote_name
 
 # Where a dict says nothing: full sticks of 620, 620 and 120 deg/s, close to FlyTrack's drones.
@@ -114,24 +114,23 @@ def settings_of(given: str | Mapping[str, object], skip: Iterable[str] = ()) -> 
     if isinstance(given, str):
         made = parse_dump(given)
     else:
-        values = {str(name).strip().lower(): _text(value) for name, value in given.items()}
+        values = {_name(str(name)): _text(value) for name, value in given.items()}
         for name in REQUIRED.keys() & values.keys():
             if values[name].upper() != REQUIRED[name]:
                 expected = f"expected {REQUIRED[name]}, which the plant needs"
                 raise FirmwareError(f"settings: {name}: found {values[name]}, {expected}")
-        names = [
-            name if not name.startswith("feature ") else f"feature {name[8:].upper()}" for name in values
-        ]
-        made = [
-            Setting(name, value, 0, 0)
-            for name, value in (DEFAULTS | dict(zip(names, values.values(), strict=True))).items()
-        ]
+        made = [Setting(name, value, 0, 0) for name, value in (DEFAULTS | values).items()]
     skipped = tuple(skip)
     made = [
         one for one in made if one.name not in REQUIRED and not any(fnmatch(one.name, p) for p in skipped)
     ]
     last = made[-1] if made else Setting("", "", 0, 0)
     return [*made, *(last._replace(name=name, value=value) for name, value in REQUIRED.items())]
+
+
+def _name(text: str) -> str:
+    name = text.strip().lower()
+    return f"feature {name[8:].upper()}" if name.startswith("feature ") else name
 
 
 def _text(value: object) -> str:

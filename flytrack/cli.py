@@ -37,18 +37,14 @@ class Command(NamedTuple):
     reads_words: bool = False
 
 
-def _identify(name: str, summary: str) -> Command:
-    run = f"flytrack.identification:run_{name}"
-    return Command(summary, "sysid", run, f"flytrack.flags:{name.capitalize()}")
+def _own(name: str, extra: str, module: str, flags: str, summary: str) -> Command:
+    """Return a command of this package; module, flags: where what runs it and its flags are."""
+    return Command(summary, extra, f"flytrack.{module}:run_{name}", f"flytrack.{flags}:{name.capitalize()}")
 
 
+IDENTIFICATION = ("sysid", "identification", "flags")
 COMMANDS = {
-    "demo": Command(
-        "Identify the shipped black box, train, fly on it",
-        "train",
-        "flytrack.demo:run_demo",
-        "flytrack.flags:Demo",
-    ),
+    "demo": _own("demo", "train", "demo", "flags", "Identify the shipped black box, train, fly on it"),
     "train": Command(
         "Train a policy with PPO",
         "train",
@@ -59,27 +55,18 @@ COMMANDS = {
     "eval": Command(
         "Fly a checkpoint on a black box or on drawn plants",
         "train",
-        "flytrack.evaluation:run_evaluation",
+        f"{PPO}.evaluate:run_evaluation",
         f"{PPO}.evaluate:EvaluationSettings",
     ),
-    "show": Command(
-        "Write rollouts as a recording and pictures", "viz", "flytrack.show:run_show", "flytrack.flags:Show"
-    ),
-    "fly": Command(
-        "Fly by keyboard or gamepad against a ghost", "fly", "flytrack.fly:run_fly", "flytrack.fly:Fly"
-    ),
-    "collect": _identify("collect", "Fly an excitation or a script on a plant"),
-    "fit": _identify("fit", "Identify a model from a flight log"),
-    "validate": _identify("validate", "Judge a model on flight that it was not fitted to"),
-    "diagnose": _identify("diagnose", "Name what a model gets wrong, and extend it"),
-    "plan": _identify("plan", "Plan flights that settle what a log left open"),
-    "import": _identify("import", "Convert logs of real flights into a flight log"),
-    "loop": Command(
-        "Train, fly, diagnose, extend the model, train again",
-        "train",
-        "flytrack.loop:run_loop",
-        "flytrack.loop:Loop",
-    ),
+    "show": _own("show", "viz", "show", "flags", "Write rollouts as a recording and pictures"),
+    "fly": _own("fly", "fly", "fly", "fly", "Fly by keyboard or gamepad against a ghost"),
+    "collect": _own("collect", *IDENTIFICATION, "Fly an excitation or a script on a plant"),
+    "fit": _own("fit", *IDENTIFICATION, "Identify a model from a flight log"),
+    "validate": _own("validate", *IDENTIFICATION, "Judge a model on flight that it was not fitted to"),
+    "diagnose": _own("diagnose", *IDENTIFICATION, "Name what a model gets wrong, and extend it"),
+    "plan": _own("plan", *IDENTIFICATION, "Plan flights that settle what a log left open"),
+    "import": _own("import", *IDENTIFICATION, "Convert logs of real flights into a flight log"),
+    "loop": _own("loop", "train", "loop", "loop", "Train, fly, diagnose, extend the model, train again"),
     "firmware": Command(
         "Build and check Betaflight in the loop, in a clone", None, "firmware.__main__:main", None, True
     ),
@@ -220,7 +207,3 @@ def main(arguments: Sequence[str] | None = None) -> None:
     else:
         parser.print_help(sys.stderr)
         raise SystemExit(REFUSED)
-
-
-if __name__ == "__main__":
-    main()

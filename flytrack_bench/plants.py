@@ -67,7 +67,6 @@ class HiddenPlant(Plant):
 
     def reset(self, drone: Drone, model: ModelParameters) -> HiddenState:
         """Return the plant with a drone in it, nothing remembered; ``model`` is not used."""
-        del model
         x = pack(jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32), drone))
         open_v = jnp.asarray(drone.battery_v + self._sag_v(drone.applied.thrust), jnp.float32)
         return HiddenState(x, open_v, jnp.zeros((MOST_STEPS, 4), jnp.float32), jnp.int32(0))
@@ -78,7 +77,6 @@ class HiddenPlant(Plant):
 
     def step(self, state: HiddenState, command: Action, dt: Scalar, model: ModelParameters) -> HiddenState:
         """Return the plant 0.01 s later under a held command in [-1, 1]; ``dt``, ``model`` are not used."""
-        del dt, model
         newest = jnp.clip(jnp.stack([jnp.asarray(stick, jnp.float32) for stick in command]), -1.0, 1.0)
         past = jnp.concatenate([newest[None], state.past[:-1]])
         num_past = jnp.minimum(state.num_past + 1, MOST_STEPS)
@@ -108,7 +106,6 @@ class HiddenPlant(Plant):
         self, pos_w: jax.Array, to_world: jax.Array, airspeed_b: jax.Array
     ) -> tuple[jax.Array, jax.Array]:
         """Return what else adds to specific force, (3,) m/s^2, and body rates, (3,) rad/s: nothing."""
-        del pos_w, to_world, airspeed_b
         return jnp.zeros(3, jnp.float32), jnp.zeros(3, jnp.float32)
 
     def _delayed(self, past: jax.Array, num_past: jax.Array) -> jax.Array:

@@ -38,7 +38,6 @@ class Function:
 
     def act(self, params: Any, memory: Any, observation: jax.Array) -> tuple[Any, jax.Array]:
         """Return the memory after a step, and the action, in [-1, 1]."""
-        del params
         return memory, jnp.clip(self.function(observation), -1.0, 1.0)
 
 

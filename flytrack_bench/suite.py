@@ -2,7 +2,7 @@
 
 import hashlib
 import json
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -61,11 +61,6 @@ class Suite:
         return tuple(known[one] for one in ids or known)
 
 
-def available_suites() -> tuple[str, ...]:
-    """Return the names of the shipped suites."""
-    return tuple(sorted(path.stem for path in FOLDER.glob("*.json")))
-
-
 def digest_of(content: dict[str, Any]) -> str:
     """Return the digest of a suite's JSON values but for its own, hexadecimal."""
     rest = {name: value for name, value in content.items() if name != "digest"}
@@ -81,9 +76,10 @@ def load_suite(name_or_path: str | Path) -> Suite:
     path = Path(name_or_path)
     if path.suffix != ".json":
         path = FOLDER / f"{name_or_path}.json"
-        if str(name_or_path) not in available_suites():
-            known = ", ".join(available_suites())
-            raise SuiteError(f"suite: found {str(name_or_path)!r}, expected one of {known}, or a .json file")
+        known = sorted(shipped.stem for shipped in FOLDER.glob("*.json"))
+        if str(name_or_path) not in known:
+            expected = f"one of {', '.join(known)}, or a .json file"
+            raise SuiteError(f"suite: found {str(name_or_path)!r}, expected {expected}")
     try:
         content = json.loads(read_at_most(path, MOST_BYTES))
         if digest_of(content) != content["digest"]:
@@ -102,14 +98,13 @@ def _task(path: Path, one: dict[str, Any]) -> Task:
     track = load_track(path.parent / name if name.endswith(".toml") else name)
     if track_digest(track) != one["track_sha256"]:
         raise TrackError(f"{name}: the track was changed")
-    craft = None if one["craft"] is None else Craft(**{name: _frozen(v) for name, v in one["craft"].items()})
+    numbers: Any = one["craft"]
+    if numbers is not None:
+        numbers = {name: tuple(v) if isinstance(v, list) else v for name, v in numbers.items()}
+    craft = None if numbers is None else Craft(**numbers)
     return Task(one["id"], track, craft, float(one["optimal_lap_s"]))
-
-
-def _frozen(value: Any) -> Any:
-    return tuple(value) if isinstance(value, list) else value
 
 
 def craft_as_json(craft: Craft) -> dict[str, Any]:
     """Return a craft as JSON values."""
-    return {one.name: getattr(craft, one.name) for one in fields(Craft)}
+    return dict(vars(craft))

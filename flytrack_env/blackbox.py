@@ -139,7 +139,6 @@ class BlackBox(Plant):
 
     def reset(self, drone: Drone, model: ModelParameters) -> Drone:
         """Return the drone with its leaves as float32, as a step returns them; ``model`` is not used."""
-        del model
         return jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32), drone)
 
     def step(self, state: Drone, command: Action, dt: Scalar, model: ModelParameters) -> Drone:
@@ -149,7 +148,6 @@ class BlackBox(Plant):
             ValueError: another ``dt`` than 0.01 s. Inside ``jit`` its value is not known here,
                 and the step is 0.01 s long whatever the caller asks for.
         """
-        del model
         if not isinstance(dt, jax.core.Tracer) and not math.isclose(float(dt), DT, rel_tol=1e-5):
             raise ValueError(f"dt: found {dt} s, expected {DT} s, which {self.path} has baked in")
         u = jnp.stack([jnp.asarray(value, jnp.float32) for value in command])

@@ -16,7 +16,7 @@ from flytrack_env.quaternion import Vec3
 from flytrack_env.race import Race, RaceEvents, advance_race, start_race
 from flytrack_env.state import POSITION, VELOCITY, unpack
 from flytrack_env.terminations import Causes, find_causes
-from flytrack_env.tracks import Course, GateFrame, Track, build_course, cross_gate
+from flytrack_env.tracks import Course, Track, build_course, cross_gate
 
 STEP_S = float(EnvParams.dt)
 DRONE_RADIUS_M = float(EnvParams.drone_radius)
@@ -145,11 +145,8 @@ def _causes(last: jax.Array, course: Course, is_frame: jax.Array, is_miss: jax.A
 
 @jax.jit
 def _passed(positions: jax.Array, course: Course) -> jax.Array:
-    def passes(gate: GateFrame, start_w: jax.Array, end_w: jax.Array) -> jax.Array:
-        return cross_gate(gate, Vec3(*start_w), Vec3(*end_w), DRONE_RADIUS_M).is_pass
-
-    of_gates = jax.vmap(passes, in_axes=(0, None, None))
-    return jax.vmap(of_gates, in_axes=(None, 0, 0))(course.gates, positions[:-1], positions[1:])
+    starts, ends = (Vec3(*rows.T[..., None]) for rows in (positions[:-1], positions[1:]))
+    return cross_gate(course.gates, starts, ends, DRONE_RADIUS_M).is_pass
 
 
 @jax.jit

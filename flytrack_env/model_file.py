@@ -50,7 +50,7 @@ def _known(where: str, name: str, names: Iterable[str]) -> str:
     return name
 
 
-def _read_field(path: Path, name: str, value: Any) -> Any:
+def _read_field(path: Path, name: str, value: Any, dtype: Any) -> Any:
     size = SIZES[name]
     values = value if isinstance(value, list) else [value]
     is_right_shape = isinstance(value, list) == (size > 0) and len(values) == max(size, 1)
@@ -59,7 +59,7 @@ def _read_field(path: Path, name: str, value: Any) -> Any:
         raise ModelFileError(f"{path}: {name}: found {quote_value(value)}, expected {expected} (float32)")
     if name in MUST_BE_POSITIVE and min(map(np.float32, values)) <= 0.0:  # 1e-50 is 0 in float32
         raise ModelFileError(f"{path}: {name}: found {quote_value(value)}, expected > 0")
-    return np.array(value, np.float32) if size else float(value)
+    return np.array(value, dtype) if size else float(value)
 
 
 def _read_effect(path: Path, name: str, values: Any) -> Any:
@@ -112,10 +112,10 @@ def load_model(path: str | Path) -> ModelParameters:
     return model_from_json(_read_json(Path(path)), path)
 
 
-def model_from_json(data: dict[str, Any], path: str | Path) -> ModelParameters:
+def model_from_json(data: dict[str, Any], path: str | Path, dtype: Any = np.float32) -> ModelParameters:
     """Return the parameters in the JSON values of a model file, or of ``model_as_json``.
 
-    path: where they come from, for messages.
+    path: where they come from, for messages. dtype: of the arrays.
 
     Raises:
         ModelFileError: a newer version, a field missing, unknown or out of range.
@@ -140,7 +140,8 @@ def model_from_json(data: dict[str, Any], path: str | Path) -> ModelParameters:
         _known(str(path), name, (*SIZES, "effects", "motion", "version"))
     by_name = _object(f"{path}: effects", data.get("effects", values.get("effects", {})))
     motion = _read_motion(path, data.get("motion", values.get("motion", Motion.HANDOUT.value)))
-    base = ModelParameters(**{name: _read_field(path, name, values[name]) for name in SIZES}, motion=motion)
+    read = {name: _read_field(path, name, values[name], dtype) for name in SIZES}
+    base = ModelParameters(**read, motion=motion)
     return base.with_effects(*(_read_effect(path, name, by_name[name]) for name in by_name))
 
 

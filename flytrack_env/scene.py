@@ -108,19 +108,12 @@ def ground_grid(low: np.ndarray, high: np.ndarray, spacing_m: float) -> np.ndarr
     return np.array(lines).reshape(-1, 2, 3)
 
 
-def _speed_table() -> list[Colour]:
-    places = np.linspace(0.0, len(SPEED_STOPS) - 1.0, NUM_SPEED_COLOURS)
-    channels = [np.interp(places, np.arange(len(SPEED_STOPS)), channel) for channel in SPEED_STOPS.T]
-    return [(int(r), int(g), int(b)) for r, g, b in zip(*channels, strict=True)]
-
-
-SPEED_COLOURS = _speed_table()
-
-
 def speed_colours(speeds_m_s: np.ndarray) -> list[Colour]:
     """Return the trail's colour at each speed (n,), m/s."""
-    places = np.clip(speeds_m_s * (NUM_SPEED_COLOURS / FASTEST_M_S), 0, NUM_SPEED_COLOURS - 1)
-    return [SPEED_COLOURS[place] for place in places.astype(int).tolist()]
+    steps = np.clip(speeds_m_s * (NUM_SPEED_COLOURS / FASTEST_M_S), 0, NUM_SPEED_COLOURS - 1).astype(int)
+    places = np.linspace(0.0, len(SPEED_STOPS) - 1.0, NUM_SPEED_COLOURS)[steps]
+    channels = [np.interp(places, np.arange(len(SPEED_STOPS)), channel) for channel in SPEED_STOPS.T]
+    return [(int(r), int(g), int(b)) for r, g, b in zip(*channels, strict=True)]
 
 
 def blend(colour: Colour, other: Colour, share: float) -> Colour:

@@ -88,25 +88,19 @@ def measure_gap(checkpoint: Checkpoint, plant: Plant, seed: int, episodes: int =
 
 
 def fly_log(
-    plant: Plant,
-    checkpoint: Checkpoint,
-    seed: int,
-    seconds: float = 60.0,
-    noise: float = 0.0,
-    num_laps: int = 3,
-    num_steps: int = 2500,
+    plant: Plant, checkpoint: Checkpoint, seed: int, seconds: float = 60.0, noise: float = 0.0
 ) -> FlightLog:
     """Return the log of a policy's flights on a plant, from noisy starts, a segment per flight.
 
     seconds: flights are added until the log is that long, or there were 16 of them. noise: 0 logs states as
-    they are, 1 as common sensors would (``flytrack_sysid.sensors``). num_laps, num_steps: what ends a flight
-    beside a crash.
+    they are, 1 as common sensors would (``flytrack_sysid.sensors``). Three laps end a flight, or 25 s, or a
+    crash.
 
     Raises:
         ValueError: no flight lasts half a second.
     """
     env = plant_env(checkpoint, plant)
-    flights = fly_many(env, checkpoint.policy, seed, BATCH, num_steps, num_laps)
+    flights = fly_many(env, checkpoint.policy, seed, BATCH, NUM_STEPS, NUM_LAPS)
     return log_of_flights(flights, float(env.default_params.dt), seed, seconds, noise)
 
 
@@ -162,20 +156,21 @@ def judge(
     return Stage(name, model, checkpoint, gap, None if held_out is None else errors_of(model, held_out))
 
 
+def rounded(value: float) -> float | None:
+    """Return a number as JSON has it, null where there is none."""
+    return round(float(value), 6) if np.isfinite(value) else None
+
+
 def stage_as_json(stage: Stage) -> dict[str, Any]:
     """Return what was measured of a stage as JSON values; null where there is no number."""
-
-    def number(value: float) -> float | None:
-        return round(float(value), 6) if np.isfinite(value) else None
-
     sides = {"simulator": stage.gap.simulator, "plant": stage.gap.plant}
     return {
         "name": stage.name,
-        **{side: {key: number(v) for key, v in one._asdict().items()} for side, one in sides.items()},
-        "lap_gap_percent": number(stage.gap.lap_percent),
-        "errors": None
-        if stage.errors is None
-        else {
-            kind: {k: number(v) for k, v in values.items()} for kind, values in stage.errors._asdict().items()
+        **{side: {key: rounded(v) for key, v in one._asdict().items()} for side, one in sides.items()},
+        "lap_gap_percent": rounded(stage.gap.lap_percent),
+        "errors": stage.errors
+        and {
+            kind: {k: rounded(v) for k, v in values.items()}
+            for kind, values in stage.errors._asdict().items()
         },
     }

@@ -271,3 +271,10 @@ def evaluate(settings: EvaluationSettings) -> Report:
     report = Report(settings)
     report.count(report.fly())
     return report
+
+
+def run_evaluation(settings: EvaluationSettings) -> None:
+    """Do what ``flytrack eval`` does: fly a checkpoint, print the report and write the files."""
+    report = evaluate(settings)
+    print(report.text, end="")
+    print("\n".join(report.write()))

@@ -294,19 +294,13 @@ def _filtered_gyro(loop: BetaflightLoop, gyro: Array, rates: Array, level: Scala
     return gyro + (1.0 - jnp.exp(-dt / lag)) * (rates - gyro)
 
 
-class Damping(NamedTuple):
-    """The D term and its filters."""
-
-    term: Array
-    dterm: tuple[Array, ...]
-    d_range: tuple[Array, ...]
-    d_boost: tuple[Array, ...]
-
-
 def _damped(
     loop: BetaflightLoop, axes: Axes, gyro: Array, feedforward: Array, level: Scalar, dt: Scalar
-) -> Damping:
-    """Return the D term: of the gyro, behind two filters, and more of it where the craft or a stick jerks."""
+) -> tuple[Array, tuple[Any, Any, Any]]:
+    """Return the D term: of the gyro, behind two filters, and more of it where the craft or a stick jerks.
+
+    And its filters afterwards: ``dterm``, ``d_range`` and ``d_boost``.
+    """
     d, d_max = loop.axes("d"), loop.axes("d_max")
     cutoff_hz = _cutoff(loop.dterm_lpf1_dyn_min_hz, loop.dterm_lpf1_dyn_max_hz, level)
     first = _lowpass(axes.dterm[:1], gyro, cutoff_hz, dt)[0]
@@ -319,7 +313,7 @@ def _damped(
     breakpoint = (loop.tpa_breakpoint - 1e3) * 1e-3
     less = loop.tpa_rate / PERCENT / (1.0 - breakpoint) * jnp.maximum(level - breakpoint, 0.0)
     term = D_SCALE * d * slope * jnp.minimum(d_boost[-1], most) * (1.0 - less)
-    return Damping(term, (first, second), d_range, d_boost)
+    return term, ((first, second), d_range, d_boost)
 
 
 def _controlled(state: Turn, given: Given, level: Scalar, boost: Scalar) -> tuple[Axes, Array]:
@@ -330,7 +324,7 @@ def _controlled(state: Turn, given: Given, level: Scalar, boost: Scalar) -> tupl
     feedforward = _lowpass(axes.feedforward, given.feedforward, loop.sticks_hz, 0.5 * dt)[-1]
     gyro = _filtered_gyro(loop, axes.gyro, state.rates, level, dt)
     error = setpoint - gyro
-    damping = _damped(loop, axes, gyro, feedforward, level, dt)
+    damping, filters = _damped(loop, axes, gyro, feedforward, level, dt)
     # The integral halts while the setpoint changes fast, and grows faster while the throttle does.
     relax = _lowpass((axes.relax,), setpoint, loop.iterm_relax_cutoff, dt)[0]
     halted = jnp.where(IS_YAW, 1.0, jnp.maximum(1.0 - jnp.abs(setpoint - relax) / RELAX_DEG_S, 0.0))
@@ -341,13 +335,13 @@ def _controlled(state: Turn, given: Given, level: Scalar, boost: Scalar) -> tupl
     p_hz = jnp.where(IS_YAW, loop.yaw_lowpass_hz, NONE_HZ)
     p_term = _lowpass((axes.p,), P_SCALE * loop.axes("p") * error, p_hz, dt)[0]
     calm = jnp.maximum(jnp.abs(setpoint) / ANTI_GRAVITY_DEG_S, 1.0)
-    asked = p_term * (1.0 + ANTI_GRAVITY_P * own_boost / calm) + integral + damping.term
+    asked = p_term * (1.0 + ANTI_GRAVITY_P * own_boost / calm) + integral + damping
     asked = jnp.clip(asked + F_SCALE * loop.axes("f") * feedforward, -limits, limits)
     later = Axes(
         _lowpass(axes.setpoint, given.setpoint, loop.sticks_hz, dt),
         _lowpass(axes.feedforward, given.feedforward, loop.sticks_hz, dt),
         gyro,
-        *damping[1:],
+        *filters,
         relax,
         p_term,
         integral,
@@ -452,7 +446,6 @@ NOTABLE = {
 }
 CUTOFF, GAIN, ARM = Range(0.0, 4000.0, "Hz"), Range(0.0, 250.0, "1"), Range(0.0, 1e4, "1/(kg m)")
 BETAFLIGHT_LOOP = Effect(
-    name="betaflight_loop",
     parameters=BetaflightLoop,
     ranges={
         **dict.fromkeys(CRAFT[:3], ARM),

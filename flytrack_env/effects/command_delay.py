@@ -24,10 +24,7 @@ class CommandDelay(NamedTuple):
     thrust_extra_s: Scalar = 0.0
 
 
-class PastCommands(NamedTuple):
-    """The commands before the present one, the latest first."""
-
-    commands: tuple[Action, ...]
+PastCommands = tuple[Action, ...]  # those before the present one, the latest first
 
 
 def start(delay: CommandDelay, drone: Drone, num_steps: int = USUAL_STEPS) -> PastCommands:
@@ -35,7 +32,7 @@ def start(delay: CommandDelay, drone: Drone, num_steps: int = USUAL_STEPS) -> Pa
 
     num_steps: how many commands it holds; longer delays are cut.
     """
-    return PastCommands((drone.applied,) * num_steps)
+    return (drone.applied,) * num_steps
 
 
 def dead_times(delay: CommandDelay) -> Action:
@@ -67,7 +64,7 @@ def late(
 
 def delayed(delay: CommandDelay, past: PastCommands, command: Action, context: StepContext) -> Action:
     """Return the command that acts: the mean of what arrives during the span."""
-    by_channel = zip(*(command, *past.commands), strict=True)
+    by_channel = zip(*(command, *past), strict=True)
     return Action(
         *(
             late(values, delay_s, context.dt, context.span)
@@ -78,11 +75,10 @@ def delayed(delay: CommandDelay, past: PastCommands, command: Action, context: S
 
 def remember(delay: CommandDelay, past: PastCommands, context: StepContext) -> PastCommands:
     """Return the memory after a step."""
-    return PastCommands((context.command, *past.commands[:-1]))
+    return (context.command, *past[:-1])
 
 
 COMMAND_DELAY = Effect(
-    name="command_delay",
     parameters=CommandDelay,
     ranges={
         "delay_s": Range(0.0, LONGEST_S, "s"),

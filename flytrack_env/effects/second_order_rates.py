@@ -26,11 +26,6 @@ class SecondOrderRates(NamedTuple):
     pitch_damping: Scalar = 0.7
     yaw_damping: Scalar = 0.7
 
-    @property
-    def lags_s(self) -> tuple[Scalar, ...]:
-        """The lags of the axes, s."""
-        return tuple(self[:3])
-
 
 class Turning(NamedTuple):
     """Body rates, rad/s, and their slopes, rad/s^2."""
@@ -39,28 +34,17 @@ class Turning(NamedTuple):
     slopes_b: Vec3
 
 
-class _Response(NamedTuple):
-    """What remains after a step of an offset from the input and of a slope, in offset and in slope."""
-
-    offset: Scalar
-    offset_of_slope: Scalar
-    slope_of_offset: Scalar
-    slope: Scalar
-
-
 def start(loop: SecondOrderRates, drone: Drone) -> Turning:
     """Return the memory of an episode that begins: a rate that has been held."""
     still = Vec3(*(jnp.zeros_like(rate) for rate in drone.rates_b))
     return Turning(drone.rates_b, still)
 
 
-def _responses(loop: SecondOrderRates, dt: Scalar) -> list[_Response]:
-    """Return the transition of a held input on each axis."""
-    return [_response(*axis, dt) for axis in zip(loop.lags_s, loop[3:], strict=True)]
+def _response(lag_s: Scalar, damping: Scalar, dt: Scalar) -> list[Scalar]:
+    """Return the exponential of [[0, 1], [-wn^2, -2 zeta wn]] dt, row by row.
 
-
-def _response(lag_s: Scalar, damping: Scalar, dt: Scalar) -> _Response:
-    """Return the exponential of [[0, 1], [-wn^2, -2 zeta wn]] dt."""
+    It is what remains after a step of an offset from the input and of a slope, in offset and in slope.
+    """
     is_lag = lag_s > SHORTEST_S
     frequency = 2.0 * damping / jnp.where(is_lag, lag_s, 1.0)
     decay = damping * frequency
@@ -72,54 +56,46 @@ def _response(lag_s: Scalar, damping: Scalar, dt: Scalar) -> _Response:
     even = jnp.where(spread > 0.0, 0.5 * (slow + fast), fade * jnp.cos(size * dt))
     odd = jnp.where(spread > 0.0, 0.5 * (slow - fast), fade * jnp.sin(size * dt)) / size
     found = (even + decay * odd, odd, -frequency * frequency * odd, even - decay * odd)
-    return _Response(*(jnp.where(is_lag, value, 0.0) for value in found))
+    return [jnp.where(is_lag, value, 0.0) for value in found]
 
 
-class _Input(NamedTuple):
-    """The input of an axis over a step: where its steady response would be at both ends, and its slope."""
+def _input(lag_s: Scalar, before: Scalar, now: Scalar, context: StepContext) -> tuple[Scalar, Scalar, Scalar]:
+    """Return the steady response to a step's input at both ends of the step, and its slope.
 
-    first: Scalar
-    last: Scalar
-    slope: Scalar
-
-
-def _input(lag_s: Scalar, before: Scalar, now: Scalar, context: StepContext) -> _Input:
-    """Return the input that a step sees: held over a simulator's step, else changing evenly.
-
-    The response to one that changes evenly follows ``lag_s`` behind it.
+    The input is held over a simulator's step, else it changes evenly, with the response ``lag_s`` behind.
     """
     if context.motion is not Motion.CONTINUOUS:
-        return _Input(now, now, 0.0)
+        return now, now, 0.0
     slope = (now - before) / jnp.maximum(context.dt, SHORTEST_STEP_S)
-    return _Input(before - lag_s * slope, now - lag_s * slope, slope)
+    return before - lag_s * slope, now - lag_s * slope, slope
+
+
+def _turned(loop: SecondOrderRates, memory: Turning, inputs_b: Vec3, context: StepContext) -> Turning:
+    """Return rates and slopes after the step, at whose end the loop is given these inputs."""
+
+    def follow(
+        lag_s: Scalar, damping: Scalar, first: Scalar, new: Scalar, old: Scalar, slope: Scalar
+    ) -> tuple[Scalar, Scalar]:
+        kept, kept_of_slope, slope_of_offset, kept_slope = _response(lag_s, damping, context.dt)
+        begin, end, even_slope = _input(lag_s, first, new, context)
+        offset, change, is_lag = old - begin, slope - even_slope, lag_s > SHORTEST_S
+        after = end + kept * offset + kept_of_slope * change
+        slope_after = even_slope + slope_of_offset * offset + kept_slope * change
+        # Without a lag, nothing may change.
+        return jnp.where(is_lag, after, new), jnp.where(is_lag, slope_after, 0.0)
+
+    axes = zip(loop[:3], loop[3:], context.first_input_b, inputs_b, *memory, strict=True)
+    rates_b, slopes_b = zip(*(follow(*axis) for axis in axes), strict=True)
+    return Turning(Vec3(*rates_b), Vec3(*slopes_b))
 
 
 def _rates(loop: SecondOrderRates, memory: Turning, rates_b: Vec3, context: StepContext) -> Vec3:
-    def follow(
-        left: _Response, lag_s: Scalar, first: Scalar, new: Scalar, old: Scalar, slope: Scalar
-    ) -> Scalar:
-        given = _input(lag_s, first, new, context)
-        after = given.last + left.offset * (old - given.first) + left.offset_of_slope * (slope - given.slope)
-        return jnp.where(lag_s > SHORTEST_S, after, new)  # without a lag, nothing may change
-
-    responses = _responses(loop, context.dt)
-    axes = zip(responses, loop.lags_s, context.first_input_b, rates_b, *memory, strict=True)
-    return Vec3(*(follow(*axis) for axis in axes))
+    return _turned(loop, memory, rates_b, context).rates_b
 
 
 def remember(loop: SecondOrderRates, memory: Turning, context: StepContext) -> Turning:
     """Return the memory after a step."""
-
-    def slope_after(
-        left: _Response, lag_s: Scalar, first: Scalar, new: Scalar, old: Scalar, slope: Scalar
-    ) -> Scalar:
-        given = _input(lag_s, first, new, context)
-        found = given.slope + left.slope_of_offset * (old - given.first) + left.slope * (slope - given.slope)
-        return jnp.where(lag_s > SHORTEST_S, found, 0.0)
-
-    responses = _responses(loop, context.dt)
-    axes = zip(responses, loop.lags_s, context.first_input_b, context.input_b, *memory, strict=True)
-    return Turning(context.rates_b, Vec3(*(slope_after(*axis) for axis in axes)))
+    return Turning(context.rates_b, _turned(loop, memory, context.input_b, context).slopes_b)
 
 
 def observe(loop: SecondOrderRates, memory: Turning, offset_b: Vec3, dt: Scalar) -> tuple[Turning, Vec3]:
@@ -134,7 +110,6 @@ def observe(loop: SecondOrderRates, memory: Turning, offset_b: Vec3, dt: Scalar)
 
 
 SECOND_ORDER_RATES = Effect(
-    name="second_order_rates",
     parameters=SecondOrderRates,
     ranges={
         **{f"{axis}_s": Range(0.0, 0.1, "s") for axis in AXES},

@@ -9,6 +9,7 @@ import numpy as np
 from gymnasium.utils import seeding
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode
 from gymnasium.vector.utils import batch_space
+from gymnax.environments.spaces import gymnax_space_to_gym_space
 
 from flytrack_env.env import EnvParams
 from flytrack_env.gymnasium_adapter.options import TRACK, check_names, read_start
@@ -35,7 +36,7 @@ class _Adapter:
 
     def _set_up(
         self, env_id: str, render_mode: str | None, params: EnvParams | None, overrides: dict[str, Any]
-    ) -> tuple[gymnasium.spaces.Box, gymnasium.spaces.Box]:
+    ) -> tuple[Any, ...]:
         """Make the simulation and what draws it; return the spaces of an observation and an action."""
         render_modes = self.metadata["render_modes"]
         if render_mode is not None and render_mode not in render_modes:
@@ -48,7 +49,8 @@ class _Adapter:
         modes = [mode for mode in render_modes if can_render(mode)]
         self.metadata = self.metadata | {"render_modes": modes, "render_fps": round(1.0 / float(params.dt))}
         self._renderer = None if render_mode is None else self._simulation.make_renderer()
-        return box(env.observation_space(params)), box(env.action_space(params))
+        spaces = env.observation_space(params), env.action_space(params)
+        return tuple(map(gymnax_space_to_gym_space, spaces))
 
     def _begin(self, options: dict[str, Any] | None, draw_words: Any) -> tuple[Packed, Any, Any]:
         """Return state, observation and scene of episodes that begin as the options of a reset say.
@@ -64,7 +66,7 @@ class _Adapter:
         if simulation is not self._simulation:
             self._simulation = simulation
             self._renderer = self._renderer and simulation.make_renderer()
-        return simulation.begin(words, start)
+        return simulation.begin(words, *start)
 
     def _checked(self, name: str, state: Any, actions: Any, shape: tuple[int, ...] | None) -> np.ndarray:
         """Return actions as float32, once an episode has begun and if they have that shape."""
@@ -105,14 +107,6 @@ def _refuse_fork() -> None:
                     "use 'vector_entry_point', which is faster, or pass vector_kwargs={'context': 'spawn'}"
                 )
             return
-
-
-def box(space: Any) -> gymnasium.spaces.Box:
-    """Return a Gymnasium box with the limits of a gymnax one."""
-    low, high = (
-        np.broadcast_to(np.asarray(limit, np.float32), space.shape) for limit in (space.low, space.high)
-    )
-    return gymnasium.spaces.Box(low, high, space.shape, np.float32)
 
 
 class FlyTrackEnv(_Adapter, gymnasium.Env[np.ndarray, np.ndarray]):

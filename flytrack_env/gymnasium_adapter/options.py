@@ -3,7 +3,7 @@
 import math
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -18,18 +18,6 @@ UNIT_NORM_TOLERANCE = 1e-3
 LARGEST_SPEED = RANGES["reset.course_speed"].high
 LARGEST = float(np.finfo(np.float32).max)
 STILL_ROTORS = (0.0, 0.0, 0.0, -1.0)
-
-
-class Start(NamedTuple):
-    """Where an episode starts; all of it None: as drawn.
-
-    drone: (21,), laid out as in ``flytrack_env.state``, and gate_index: instead of a drawn start.
-    battery_v: instead of the start's own.
-    """
-
-    drone: np.ndarray | None
-    gate_index: int
-    battery_v: float | None
 
 
 def check_names(options: Mapping[str, Any] | None) -> dict[str, Any]:
@@ -53,8 +41,11 @@ def check_names(options: Mapping[str, Any] | None) -> dict[str, Any]:
     return dict(options)
 
 
-def read_start(options: Mapping[str, Any], course: Course) -> Start:
-    """Return the start that checked options ask for on a course.
+def read_start(options: Mapping[str, Any], course: Course) -> tuple[np.ndarray | None, int, float | None]:
+    """Return the start that checked options ask for on a course: drone, gate to fly first, battery, V.
+
+    The drone is (21,), laid out as in ``flytrack_env.state``, and with the gate's index instead of a drawn
+    start, and the battery instead of the start's own; None is as drawn.
 
     Raises:
         ValueError: a value that no episode can start with; it names option, found and expected.
@@ -66,12 +57,12 @@ def read_start(options: Mapping[str, Any], course: Course) -> Start:
             expected = f"above {layout.BATTERY_EMPTY_V:g} and up to {layout.BATTERY_FULL_V:g} V"
             raise _error(BATTERY_V, options, expected)
     if not any(name in options for name in POSE_NAMES):
-        return Start(None, 0, battery_v)
+        return None, 0, battery_v
     drone = np.zeros(layout.STATE_SIZE, np.float32)
     drone[layout.POSITION], drone[layout.QUATERNION], drone[layout.VELOCITY] = _pose(options, course)
     drone[layout.APPLIED_ACTION] = STILL_ROTORS
     drone[layout.BATTERY] = layout.BATTERY_FULL_V
-    return Start(drone, _gate_index(options, course.num_gates), battery_v)
+    return drone, _gate_index(options, course.num_gates), battery_v
 
 
 def _pose(options: Mapping[str, Any], course: Course) -> tuple[Any, Any, Any]:

@@ -10,7 +10,6 @@ import numpy as np
 
 from flytrack_env.env import EnvParams
 from flytrack_env.episodes import EpisodicEnvironment
-from flytrack_env.gymnasium_adapter.options import Start
 from flytrack_env.gymnasium_adapter.packing import Columns, Layout, Packed
 from flytrack_env.randomness import seed_of
 from flytrack_env.registration import make
@@ -195,23 +194,26 @@ class Simulation:
         ids = [gate.id for gate in self.env.track.gates]
         return make_renderer(course, ids if is_own else range(course.num_gates))
 
-    def begin(self, words: np.ndarray, start: Start) -> tuple[Packed, jax.Array, jax.Array]:
+    def begin(
+        self, words: np.ndarray, drone: np.ndarray | None, gate_index: int, battery_v: float | None
+    ) -> tuple[Packed, jax.Array, jax.Array]:
         """Return packed state, observation and scene of an episode that begins.
 
-        words: of a key, (KEY_WORDS,); or (num_envs, KEY_WORDS) for the same of a batch.
+        words: of a key, (KEY_WORDS,); or (num_envs, KEY_WORDS) for the same of a batch. The rest is as from
+        ``options.read_start``.
         """
         batch = words.shape[:-1]
-        if start.drone is None:
+        if drone is None:
             begun = self.programs.begin(words, (), self.packed_params)
-            if start.battery_v is None:
+            if battery_v is None:
                 return begun
             scenes = np.array(begun[2])
             drones, gate_indices = scenes[..., :STATE_SIZE], scenes[..., GATE_INDEX].astype(np.int32)
         else:
-            drones = np.tile(start.drone, (*batch, 1))
-            gate_indices = np.full(batch, start.gate_index, np.int32)
-        if start.battery_v is not None:
-            drones[..., BATTERY] = start.battery_v
+            drones = np.tile(drone, (*batch, 1))
+            gate_indices = np.full(batch, gate_index, np.int32)
+        if battery_v is not None:
+            drones[..., BATTERY] = battery_v
         return self.programs.begin(words, (drones, gate_indices), self.packed_params)
 
     def __deepcopy__(self, memo: dict[int, Any]) -> "Simulation":

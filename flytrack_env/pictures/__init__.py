@@ -4,16 +4,16 @@
 ``flytrack[render]`` for animations; importing this package does not.
 """
 
-import importlib
 from collections.abc import Sequence
 from pathlib import Path
-from types import ModuleType
 from typing import TYPE_CHECKING
 
 from flytrack_env.extras import check_installed
 from flytrack_env.files import write_atomically
+from flytrack_env.flown_race import STEP_S
 from flytrack_env.pictures.flight import Flight, Meeting, make_flight, read_flights
 from flytrack_env.references import Reference
+from flytrack_env.scene import FLIGHT_COLOURS
 from flytrack_env.tracks import build_course
 
 if TYPE_CHECKING:
@@ -29,13 +29,6 @@ __all__ = [
     "write_pictures",
 ]
 
-VIEWS = ("top", "side", "commands")
-
-
-def _load(name: str, extra: str, library: str) -> ModuleType:
-    check_installed(extra, "pictures of flights" if extra == "viz" else "animations of flights", library)
-    return importlib.import_module(f"flytrack_env.{name}")
-
 
 def draw_flight(flight: Flight) -> dict[str, "Figure"]:
     """Return a flight's figures by name: top, side, commands.
@@ -43,8 +36,11 @@ def draw_flight(flight: Flight) -> dict[str, "Figure"]:
     Raises:
         ImportError: matplotlib is not installed.
     """
-    figures = _load("pictures.figures", "viz", "matplotlib")
-    return {name: getattr(figures, f"draw_{name}")(flight) for name in VIEWS}
+    check_installed("viz", "pictures of flights", "matplotlib")
+    from flytrack_env.pictures import figures
+
+    draw = {"top": figures.draw_top, "side": figures.draw_side, "commands": figures.draw_commands}
+    return {name: draw_view(flight) for name, draw_view in draw.items()}
 
 
 def write_pictures(flights: Sequence[Flight], folder: str | Path) -> list[Path]:
@@ -56,12 +52,15 @@ def write_pictures(flights: Sequence[Flight], folder: str | Path) -> list[Path]:
         ImportError, OSError: matplotlib is not installed, or a file cannot be written.
         ValueError: several flights on several tracks.
     """
+    check_installed("viz", "pictures of flights", "matplotlib")
+    from flytrack_env.pictures.drawing import png_of
+    from flytrack_env.pictures.figures import draw_comparison
+
     figures = {
         f"{flight.name}_{name}": figure for flight in flights for name, figure in draw_flight(flight).items()
     }
     if len(flights) > 1:
-        figures["comparison_top"] = _load("pictures.figures", "viz", "matplotlib").draw_comparison(flights)
-    png_of = _load("pictures.drawing", "viz", "matplotlib").png_of
+        figures["comparison_top"] = draw_comparison(flights)
     contents = {Path(folder) / f"{name}.png": png_of(figure) for name, figure in figures.items()}
     for path, content in contents.items():
         write_atomically(path, content)
@@ -77,8 +76,18 @@ def write_animation(flight: Flight, reference: Reference, folder: str | Path) ->
         ImportError, OSError: Pillow is not installed, or the file cannot be written.
         ValueError: a flight without a complete flying lap.
     """
-    make_gif = _load("rendering.animation", "render", "PIL").make_gif
-    laps = _load("pictures.laps", "render", "PIL").laps_to_compare(flight, reference)
+    check_installed("render", "animations of flights", "PIL")
+    from flytrack_env.rendering.animation import Lap, make_gif
+
+    if flight.fastest_flying_lap is None:
+        raise ValueError(f"{flight.name}: found no complete flying lap, expected one to animate")
+    start, end = flight.fastest_flying_lap
+    first = round(start.time_s / STEP_S)  # the state nearest to the crossing
+    own = flight.states[first : first + round(end.lap_time_s / STEP_S) + 1]
+    laps = (
+        Lap(flight.name, FLIGHT_COLOURS[0], own, end.lap_time_s),
+        Lap("time-optimal", FLIGHT_COLOURS[2], reference.states, reference.time_s),
+    )
     path = Path(folder) / f"{flight.name}.gif"
     gate_ids = [gate.id for gate in flight.track.gates]
     write_atomically(path, make_gif(build_course(flight.track), gate_ids, laps))

@@ -1,5 +1,6 @@
 """A recorded flight with what follows from it: the race, every meeting with a gate, why it ended."""
 
+import itertools
 from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -7,7 +8,7 @@ from typing import NamedTuple
 import jax
 import numpy as np
 
-from flytrack_env.flown_race import DRONE_RADIUS_M, STEP_S, FlownRace, follow_race, why_ended
+from flytrack_env.flown_race import DRONE_RADIUS_M, STEP_S, FlownRace, Pass, follow_race, why_ended
 from flytrack_env.quaternion import Vec3
 from flytrack_env.rollout import load_named_rollouts
 from flytrack_env.state import POSITION, VELOCITY
@@ -61,6 +62,12 @@ class Flight(NamedTuple):
     def lap_times_s(self) -> list[float]:
         """Times of the complete laps, in order."""
         return [one.lap_time_s for one in self.race.passes if one.lap]
+
+    @property
+    def fastest_flying_lap(self) -> tuple[Pass, Pass] | None:
+        """The passes that begin and end the fastest flying lap; None if there is none."""
+        ends = [one for one in self.race.passes if one.lap]
+        return min(itertools.pairwise(ends), key=lambda lap: lap[1].lap_time_s, default=None)
 
     @property
     def title(self) -> str:

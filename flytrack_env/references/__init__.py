@@ -15,11 +15,9 @@ from typing import Any
 import numpy as np
 
 from flytrack_env.dynamics import ModelParameters
-from flytrack_env.effects import BY_NAME
 from flytrack_env.files import write_atomically
 from flytrack_env.messages import error_text, quote_name, quote_value
-from flytrack_env.model_file import SIZES, model_as_json, model_from_json
-from flytrack_env.motion import Motion
+from flytrack_env.model_file import model_as_json, model_from_json
 from flytrack_env.npz_file import load_npz
 from flytrack_env.state import ACTION_SIZE, STATE_SIZE
 from flytrack_env.tracks import Track
@@ -186,15 +184,6 @@ def _check_notes(notes: dict[str, Any]) -> None:
             raise ValueError(f"{name}: found {quote_value(notes[name])}, expected {listed}")
 
 
-def _model_of(values: Any, path: Path) -> ModelParameters:
-    """Return the model of a file's JSON values in float64; raises ValueError."""
-    model_from_json(values, path)  # checks types and ranges
-    base: dict[str, Any] = {name: np.asarray(values["parameters"][name], float) for name in SIZES}
-    effects = (BY_NAME[name].parameters(**numbers) for name, numbers in values["effects"].items())
-    motion = Motion(values.get("motion", Motion.HANDOUT.value))
-    return ModelParameters(**base, motion=motion).with_effects(*effects)
-
-
 def load_reference(path: str | Path) -> Reference:
     """Return the reference in a file.
 
@@ -208,7 +197,7 @@ def load_reference(path: str | Path) -> Reference:
         notes = json.loads(str(data.pop("notes")))
         _check_notes(notes)
         _check_arrays(data)
-        model = _model_of(notes["model"], path)
+        model = model_from_json(notes["model"], path, float)
         if model_digest(model) != notes["model_sha256"]:
             raise ValueError("model: found another one than its digest, expected the same")
         return Reference(

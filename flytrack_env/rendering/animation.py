@@ -37,10 +37,6 @@ class Lap(NamedTuple):
     states: np.ndarray
     time_s: float
 
-    def at(self, row: int) -> np.ndarray:
-        """Return the state at a row, or the last one, (21,)."""
-        return self.states[min(row, len(self.states) - 1)].astype(float)
-
 
 def make_gif(course: Course, gate_ids: Sequence[int], laps: Sequence[Lap]) -> bytes:
     """Return laps as an animated GIF, 840 x 480 pixels, at the speed at which they were flown."""
@@ -110,8 +106,8 @@ class FixedView:
             draw.line(self._pixels(path_w), dim, 3 * PIXEL, joint="curve")
             draw.line(self._pixels(path_w[-RECENT_STEPS:]), lap.colour, 5 * PIXEL, joint="curve")
         for lap in laps:
-            state, rotors = lap.at(row), scene.blend(lap.colour, scene.TEXT, 0.6)
-            colours = (lap.colour, rotors, lap.colour)
+            state = lap.states[min(row, len(lap.states) - 1)].astype(float)
+            colours = (lap.colour, scene.blend(lap.colour, scene.TEXT, 0.6), lap.colour)
             draw_drone(draw, self.camera, state[POSITION], state[QUATERNION], colours, DRONE_ENLARGEMENT)
         picture = canvas.reduce(PIXEL)
         self._write(ImageDraw.Draw(picture), laps, row)

@@ -133,11 +133,8 @@ def cross_gate(gate: GateFrame, start_w: Vec3, end_w: Vec3, radius: Scalar) -> C
 def build_course(track: Track) -> Course:
     """Return a track as arrays, float32: the gates' flight frames, start pose and bounds."""
 
-    def column(rows: Sequence[tuple[float, ...]], index: int) -> np.ndarray:
-        return np.array([row[index] for row in rows], np.float32)
-
     def vectors(rows: Sequence[tuple[float, ...]]) -> Vec3:
-        return Vec3(*(column(rows, index) for index in range(3)))
+        return Vec3(*np.array(rows, np.float32).reshape(-1, 3).T)
 
     forward, up = [], []
     for gate in track.gates:
@@ -150,8 +147,8 @@ def build_course(track: Track) -> Course:
             centre=vectors([gate.position for gate in track.gates]),
             forward=vectors(forward),
             up=vectors(up),
-            half_opening=column([(0.5 * gate.opening,) for gate in track.gates], 0),
-            half_frame=column([(0.5 * gate.frame,) for gate in track.gates], 0),
+            half_opening=np.array([0.5 * gate.opening for gate in track.gates], np.float32),
+            half_frame=np.array([0.5 * gate.frame for gate in track.gates], np.float32),
         ),
         start_pos_w=Vec3(*map(np.float32, track.start_position)),
         start_quat=Quaternion(*map(np.float32, track.start_quaternion)),

@@ -1,7 +1,7 @@
 """What a recording shows: checked trajectories with the race that each flew, and gates as a track."""
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from functools import cached_property
 
 import numpy as np
@@ -14,8 +14,6 @@ GATE_OUTER_M, GATE_INNER_M = 2.7, 1.5
 GATE_COLUMNS = 8
 UNIT_NORM_TOLERANCE = 1e-3
 LARGEST_M = 1e30  # Rerun stores float32, where larger numbers are infinite
-
-Pairs = Sequence[tuple[np.ndarray, np.ndarray]]
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -87,20 +85,6 @@ def checked(trajectory: Trajectory) -> Trajectory:
         raise ValueError(f"{trajectory.name}: time_s: found times that do not grow, expected growing ones")
     _normalise_poses(f"{trajectory.name}: states", states, POSITION, QUATERNION)
     return dataclasses.replace(trajectory, states=states, actions=actions)
-
-
-def trajectory_of_pairs(sequence: Pairs, name: str) -> Trajectory:
-    """Return the trajectory of pairs of state (21,) and action (4,).
-
-    Raises:
-        ValueError: no pairs, or wrong shapes.
-    """
-    try:
-        states, actions = (np.array(part, float) for part in zip(*sequence, strict=True))
-    except (TypeError, ValueError) as error:
-        expected = f"(x ({STATE_SIZE},), u ({ACTION_SIZE},))"
-        raise ValueError(f"{name}: found no pairs of numbers ({error}), expected {expected}") from error
-    return Trajectory(name, states, actions)
 
 
 def track_of_gates(gates: np.ndarray, positions: np.ndarray) -> Track:
