@@ -1,33 +1,46 @@
 """Effects beyond the minimal model: the one explicit, ordered list, and how a model uses it.
 
 The simulator folds them, the fit and the diagnosis free their parameters, domain randomisation draws
-them, the documentation lists them. A new effect is an ``Effect`` in a file here and a line in ``EFFECTS``.
+them, the documentation lists them. A new effect is a file here and a line in ``EFFECTS``.
 """
 
 from typing import Any
 
 import numpy as np
 
-from flytrack_env.effects import air, imu, rates, sticks, thrust
-from flytrack_env.effects.air import LinearDrag, QuadraticDrag, RotorDrag, TranslationalLift, Wind
+from flytrack_env.effects.accelerometer_bias import ACCELEROMETER_BIAS, AccelerometerBias
+from flytrack_env.effects.accelerometer_scale import ACCELEROMETER_SCALE, AccelerometerScale
+from flytrack_env.effects.actual_rates import ACTUAL_RATES, ActualRates
 from flytrack_env.effects.base import STAGES, Effect, FlightTime, Pose, Range, StepContext
 from flytrack_env.effects.betaflight_loop import BETAFLIGHT_LOOP, BetaflightLoop
+from flytrack_env.effects.betaflight_rates import BETAFLIGHT_RATES, BetaflightRates
 from flytrack_env.effects.command_delay import COMMAND_DELAY, MOST_STEPS, USUAL_STEPS, CommandDelay
-from flytrack_env.effects.grammar import LEARNED_LAW, LearnedLaw
-from flytrack_env.effects.imu import AccelerometerBias, AccelerometerScale, GyroBias, GyroScale, ImuOffset
-from flytrack_env.effects.latency import IMU_LATENCY, MOCAP_LATENCY, ImuLatency, MocapLatency
+from flytrack_env.effects.ground_effect import GROUND_EFFECT, GroundEffect
+from flytrack_env.effects.gyro_bias import GYRO_BIAS, GyroBias
+from flytrack_env.effects.gyro_scale import GYRO_SCALE, GyroScale
+from flytrack_env.effects.imu_latency import IMU_LATENCY, ImuLatency
+from flytrack_env.effects.imu_offset import IMU_OFFSET, ImuOffset
+from flytrack_env.effects.learned_law import LEARNED_LAW, LearnedLaw
 from flytrack_env.effects.learned_residual import LEARNED_RESIDUAL, LearnedResidual
-from flytrack_env.effects.rates import MotorImbalance, RateCrossCoupling, RateScale, YawReaction
+from flytrack_env.effects.linear_drag import LINEAR_DRAG, LinearDrag
+from flytrack_env.effects.mocap_latency import MOCAP_LATENCY, MocapLatency
+from flytrack_env.effects.motor_imbalance import MOTOR_IMBALANCE, MotorImbalance
+from flytrack_env.effects.quadratic_drag import QUADRATIC_DRAG, QuadraticDrag
+from flytrack_env.effects.quick_rates import QUICK_RATES, QuickRates
+from flytrack_env.effects.rate_cross_coupling import RATE_CROSS_COUPLING, RateCrossCoupling
+from flytrack_env.effects.rate_expo import RATE_EXPO, RateExpo
+from flytrack_env.effects.rate_saturation import RATE_SATURATION, RateSaturation
+from flytrack_env.effects.rate_scale import RATE_SCALE, RateScale
+from flytrack_env.effects.rate_slew_limit import RATE_SLEW_LIMIT, RateSlewLimit
+from flytrack_env.effects.rotor_drag import ROTOR_DRAG, RotorDrag
 from flytrack_env.effects.second_order_rates import SECOND_ORDER_RATES, SecondOrderRates
-from flytrack_env.effects.sticks import (
-    ActualRates,
-    BetaflightRates,
-    QuickRates,
-    RateExpo,
-    RateSaturation,
-    RateSlewLimit,
-)
-from flytrack_env.effects.thrust import GroundEffect, ThrustLagAsymmetry, ThrustScale, ThrustTilt, VoltageSag
+from flytrack_env.effects.thrust_lag_asymmetry import THRUST_LAG_ASYMMETRY, ThrustLagAsymmetry
+from flytrack_env.effects.thrust_scale import THRUST_SCALE, ThrustScale
+from flytrack_env.effects.thrust_tilt import THRUST_TILT, ThrustTilt
+from flytrack_env.effects.translational_lift import TRANSLATIONAL_LIFT, TranslationalLift
+from flytrack_env.effects.voltage_sag import VOLTAGE_SAG, VoltageSag
+from flytrack_env.effects.wind import WIND, Wind
+from flytrack_env.effects.yaw_reaction import YAW_REACTION, YawReaction
 from flytrack_env.quaternion import Scalar
 from flytrack_env.state import Drone
 
@@ -36,34 +49,34 @@ from flytrack_env.state import Drone
 # comes before the loop that remembers them; the latency comes before all that is wrong with its readings.
 EFFECTS: tuple[Effect, ...] = (
     COMMAND_DELAY,
-    sticks.ACTUAL_RATES,
-    sticks.BETAFLIGHT_RATES,
-    sticks.QUICK_RATES,
-    sticks.RATE_EXPO,
-    sticks.RATE_SATURATION,
-    sticks.RATE_SLEW_LIMIT,
-    thrust.THRUST_LAG_ASYMMETRY,
+    ACTUAL_RATES,
+    BETAFLIGHT_RATES,
+    QUICK_RATES,
+    RATE_EXPO,
+    RATE_SATURATION,
+    RATE_SLEW_LIMIT,
+    THRUST_LAG_ASYMMETRY,
     BETAFLIGHT_LOOP,
-    rates.RATE_SCALE,
-    rates.YAW_REACTION,
-    rates.MOTOR_IMBALANCE,
-    rates.RATE_CROSS_COUPLING,
+    RATE_SCALE,
+    YAW_REACTION,
+    MOTOR_IMBALANCE,
+    RATE_CROSS_COUPLING,
     SECOND_ORDER_RATES,
-    air.WIND,
-    thrust.THRUST_SCALE,
-    air.TRANSLATIONAL_LIFT,
-    thrust.GROUND_EFFECT,
-    air.LINEAR_DRAG,
-    air.QUADRATIC_DRAG,
-    air.ROTOR_DRAG,
-    thrust.THRUST_TILT,
-    thrust.VOLTAGE_SAG,
+    WIND,
+    THRUST_SCALE,
+    TRANSLATIONAL_LIFT,
+    GROUND_EFFECT,
+    LINEAR_DRAG,
+    QUADRATIC_DRAG,
+    ROTOR_DRAG,
+    THRUST_TILT,
+    VOLTAGE_SAG,
     IMU_LATENCY,
-    imu.IMU_OFFSET,
-    imu.ACCELEROMETER_SCALE,
-    imu.ACCELEROMETER_BIAS,
-    imu.GYRO_SCALE,
-    imu.GYRO_BIAS,
+    IMU_OFFSET,
+    ACCELEROMETER_SCALE,
+    ACCELEROMETER_BIAS,
+    GYRO_SCALE,
+    GYRO_BIAS,
     MOCAP_LATENCY,
 )
 # Without a law of their own: what a log has shown beyond all of these.

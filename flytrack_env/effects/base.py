@@ -1,9 +1,9 @@
-"""What an effect is: something that the minimal model leaves out.
+"""What an effect is: something that the minimal model leaves out, in one file.
 
-Effects of a kind share a file of this folder. Each has a ``NamedTuple`` of parameters (numbers in SI units
-unless its range has another unit, each with its **neutral** value as default) and one ``Effect`` that defines
-how they act. A model carries the parameters of the effects that it has; the simulator folds them, in the
-order of ``flytrack_env.effects.EFFECTS``, at the stages of a step, and then of reading the sensors:
+A file of this folder has a ``NamedTuple`` of parameters (numbers in SI units unless its range has
+another unit, each with its **neutral** value as default) and one ``Effect`` that defines how they act. A
+model carries the parameters of the effects that it has; the simulator folds them, in the order of
+``flytrack_env.effects.EFFECTS``, at the stages of a step, and then of reading the sensors:
 
 =============  =====================  ====================================================  ========
 stage          value                  what it is                                            acts on
@@ -28,7 +28,6 @@ A hook takes the effect's parameters, its memory, the value so far and the ``Ste
 the value. At neutral parameters it returns the value bit for bit, so that neutral equals absent.
 """
 
-import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
@@ -138,6 +137,17 @@ class Range(NamedTuple):
 Hook = Callable[[Any, Any, Any, StepContext], Any]
 
 
+def on_rate_sticks(curve: Callable[..., Scalar]) -> Hook:
+    """Return the hook of a curve on each rate stick; parameters: its other arguments, of three axes each."""
+
+    def command(parameters: Any, memory: None, sticks: Action, context: StepContext) -> Action:
+        thirds = (parameters[start : start + 3] for start in range(0, len(parameters), 3))
+        roll, pitch, yaw = map(curve, sticks[:3], *thirds)
+        return sticks._replace(roll=roll, pitch=pitch, yaw=yaw)
+
+    return command
+
+
 def scaled(factors: Any, memory: None, vector: Vec3, context: StepContext) -> Vec3:
     """Return a vector with a factor on each axis: the hook of an effect whose parameters these are."""
     return Vec3(*(factor * part for factor, part in zip(factors, vector, strict=True)))
@@ -152,10 +162,9 @@ def shifted(offsets: Any, memory: None, vector: Vec3, context: StepContext) -> V
 class Effect:
     """One effect; at least one hook is given.
 
-    parameters: the NamedTuple class, after which it is called; its defaults are neutral. about: what it is,
-    in words; empty where the docstring of its file says it. ranges: of each parameter. notable: the smallest
-    departure from neutral that matters, a judgement: less hardly shows in a lap or a reading.
-    equation: LaTeX. source: a publication, or the assumption. command,
+    name: as in model files. parameters: the NamedTuple class; its defaults are neutral. ranges: of each
+    parameter. notable: the smallest departure from neutral that matters, a judgement: less hardly
+    shows in a lap or a reading. equation: LaTeX. source: a publication, or the assumption. command,
     lag, air, thrust, rates, force, battery, gyro, accelerometer, pose: hooks at these stages.
     most_steps: of parameters that are delays, how many steps of time each may last.
     needs: channels that a log has to have to be asked about it: p position, v velocity, q attitude, w gyro,
@@ -176,6 +185,7 @@ class Effect:
     raising ValueError that begins with the field. Such an effect is learnt, not looked for.
     """
 
+    name: str
     parameters: Any
     ranges: Mapping[str, Range]
     notable: Mapping[str, float]
@@ -204,14 +214,8 @@ class Effect:
     remember: Callable[[Any, Any, StepContext], Any] | None = None
     observe: Callable[[Any, Any, Vec3, Scalar], tuple[Any, Vec3]] | None = None
     static: str = ""
-    about: str = ""
     written: Callable[[Any], Any] | None = None
     read: Callable[[Any], Any] | None = None
-
-    @property
-    def name(self) -> str:
-        """Its name in model files: that of the class of its parameters, in lower case with underscores."""
-        return re.sub(r"\B(?=[A-Z])", "_", self.parameters.__name__).lower()
 
     @property
     def stages(self) -> tuple[str, ...]:

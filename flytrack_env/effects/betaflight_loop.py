@@ -446,6 +446,7 @@ NOTABLE = {
 }
 CUTOFF, GAIN, ARM = Range(0.0, 4000.0, "Hz"), Range(0.0, 250.0, "1"), Range(0.0, 1e4, "1/(kg m)")
 BETAFLIGHT_LOOP = Effect(
+    name="betaflight_loop",
     parameters=BetaflightLoop,
     ranges={
         **dict.fromkeys(CRAFT[:3], ARM),

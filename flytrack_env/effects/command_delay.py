@@ -79,6 +79,7 @@ def remember(delay: CommandDelay, past: PastCommands, context: StepContext) -> P
 
 
 COMMAND_DELAY = Effect(
+    name="command_delay",
     parameters=CommandDelay,
     ranges={
         "delay_s": Range(0.0, LONGEST_S, "s"),

@@ -427,24 +427,3 @@ def _check_power(where: str, quantity: str, exponent: float, offset: float) -> N
             f"{where}.offset: found a pole at {quantity} = {0.0 - offset:g} {QUANTITIES[quantity].unit}, "
             f"expected none between {QUANTITIES[quantity].low:g} and {QUANTITIES[quantity].high:g}"
         )
-
-
-class LearnedLaw(NamedTuple):
-    """A law, its share that acts, 1 as learnt, and by how many standard errors its coefficients are larger.
-
-    law: static. Draw ``spread`` from -1 to 1, say, to fly what the log cannot tell.
-    """
-
-    scale: Scalar = 0.0
-    spread: Scalar = 0.0
-    law: Law = Law()
-
-
-LEARNED_LAW = learned_effect(
-    "law",
-    law_from_json,
-    parameters=LearnedLaw,
-    equation=r"\mathbf{f}_b \leftarrow \mathbf{f}_b + s \sum_k \mathbf{c}_k\, g_k h_k",
-    source="the log that it was learnt from; sums of products of given functions: S. Brunton et al., "
-    '"Discovering governing equations from data by sparse identification", 2016',
-)

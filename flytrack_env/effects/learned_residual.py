@@ -177,6 +177,7 @@ class LearnedResidual(NamedTuple):
 LEARNED_RESIDUAL = learned_effect(
     "networks",
     networks_from_json,
+    name="learned_residual",
     parameters=LearnedResidual,
     equation=r"\mathbf{f}_b \leftarrow \mathbf{f}_b + s\, (W_2 \tanh(W_1 \mathbf{z} + \mathbf{b}_1) "
     r"+ \mathbf{b}_2)",

@@ -34,17 +34,23 @@ class Turning(NamedTuple):
     slopes_b: Vec3
 
 
+class _Response(NamedTuple):
+    """What remains after a step of an offset from the input and of a slope, in offset and in slope."""
+
+    offset: Scalar
+    offset_of_slope: Scalar
+    slope_of_offset: Scalar
+    slope: Scalar
+
+
 def start(loop: SecondOrderRates, drone: Drone) -> Turning:
     """Return the memory of an episode that begins: a rate that has been held."""
     still = Vec3(*(jnp.zeros_like(rate) for rate in drone.rates_b))
     return Turning(drone.rates_b, still)
 
 
-def _response(lag_s: Scalar, damping: Scalar, dt: Scalar) -> list[Scalar]:
-    """Return the exponential of [[0, 1], [-wn^2, -2 zeta wn]] dt, row by row.
-
-    It is what remains after a step of an offset from the input and of a slope, in offset and in slope.
-    """
+def _response(lag_s: Scalar, damping: Scalar, dt: Scalar) -> _Response:
+    """Return the exponential of [[0, 1], [-wn^2, -2 zeta wn]] dt."""
     is_lag = lag_s > SHORTEST_S
     frequency = 2.0 * damping / jnp.where(is_lag, lag_s, 1.0)
     decay = damping * frequency
@@ -56,18 +62,26 @@ def _response(lag_s: Scalar, damping: Scalar, dt: Scalar) -> list[Scalar]:
     even = jnp.where(spread > 0.0, 0.5 * (slow + fast), fade * jnp.cos(size * dt))
     odd = jnp.where(spread > 0.0, 0.5 * (slow - fast), fade * jnp.sin(size * dt)) / size
     found = (even + decay * odd, odd, -frequency * frequency * odd, even - decay * odd)
-    return [jnp.where(is_lag, value, 0.0) for value in found]
+    return _Response(*(jnp.where(is_lag, value, 0.0) for value in found))
 
 
-def _input(lag_s: Scalar, before: Scalar, now: Scalar, context: StepContext) -> tuple[Scalar, Scalar, Scalar]:
-    """Return the steady response to a step's input at both ends of the step, and its slope.
+class _Input(NamedTuple):
+    """The input of an axis over a step: where its steady response would be at both ends, and its slope."""
 
-    The input is held over a simulator's step, else it changes evenly, with the response ``lag_s`` behind.
+    first: Scalar
+    last: Scalar
+    slope: Scalar
+
+
+def _input(lag_s: Scalar, before: Scalar, now: Scalar, context: StepContext) -> _Input:
+    """Return the input that a step sees: held over a simulator's step, else changing evenly.
+
+    The response to one that changes evenly follows ``lag_s`` behind it.
     """
     if context.motion is not Motion.CONTINUOUS:
-        return now, now, 0.0
+        return _Input(now, now, 0.0)
     slope = (now - before) / jnp.maximum(context.dt, SHORTEST_STEP_S)
-    return before - lag_s * slope, now - lag_s * slope, slope
+    return _Input(before - lag_s * slope, now - lag_s * slope, slope)
 
 
 def _turned(loop: SecondOrderRates, memory: Turning, inputs_b: Vec3, context: StepContext) -> Turning:
@@ -76,11 +90,10 @@ def _turned(loop: SecondOrderRates, memory: Turning, inputs_b: Vec3, context: St
     def follow(
         lag_s: Scalar, damping: Scalar, first: Scalar, new: Scalar, old: Scalar, slope: Scalar
     ) -> tuple[Scalar, Scalar]:
-        kept, kept_of_slope, slope_of_offset, kept_slope = _response(lag_s, damping, context.dt)
-        begin, end, even_slope = _input(lag_s, first, new, context)
-        offset, change, is_lag = old - begin, slope - even_slope, lag_s > SHORTEST_S
-        after = end + kept * offset + kept_of_slope * change
-        slope_after = even_slope + slope_of_offset * offset + kept_slope * change
+        left, given = _response(lag_s, damping, context.dt), _input(lag_s, first, new, context)
+        offset, change, is_lag = old - given.first, slope - given.slope, lag_s > SHORTEST_S
+        after = given.last + left.offset * offset + left.offset_of_slope * change
+        slope_after = given.slope + left.slope_of_offset * offset + left.slope * change
         # Without a lag, nothing may change.
         return jnp.where(is_lag, after, new), jnp.where(is_lag, slope_after, 0.0)
 
@@ -110,6 +123,7 @@ def observe(loop: SecondOrderRates, memory: Turning, offset_b: Vec3, dt: Scalar)
 
 
 SECOND_ORDER_RATES = Effect(
+    name="second_order_rates",
     parameters=SecondOrderRates,
     ranges={
         **{f"{axis}_s": Range(0.0, 0.1, "s") for axis in AXES},

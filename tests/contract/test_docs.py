@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from docs.page_texts import effect_page, gate_rows, track_page
+from docs.effect_pages import effect_page
+from docs.track_pages import gate_rows, track_page
 from flytrack_env.effects import EFFECTS
 from flytrack_env.tracks import available_tracks, build_course, load_track
 from tests.support.pages import BLOCK, DOCS, ROOT, examples, run_examples

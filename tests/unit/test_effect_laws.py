@@ -11,8 +11,8 @@ from scipy.spatial.transform import Rotation
 
 from flytrack_env import effects
 from flytrack_env.dynamics import nominal_parameters
-from flytrack_env.effects.air import HALF_SPEED
 from flytrack_env.effects.command_delay import LONGEST_STEPS, USUAL_STEPS
+from flytrack_env.effects.translational_lift import HALF_SPEED
 from flytrack_env.env import FlyTrack
 from flytrack_env.observations import OBSERVATION
 from flytrack_env.plants import Plant, Simulator

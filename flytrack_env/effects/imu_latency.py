@@ -1,14 +1,14 @@
-"""What sensors report late: readings of gyro and accelerometer, and poses."""
+"""Gyro and accelerometer that are late: their filters, the bus, the estimator's queue."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax.numpy as jnp
 
-from flytrack_env.effects.base import Effect, Pose, Range, StepContext
-from flytrack_env.effects.command_delay import MOST_STEPS, USUAL_STEPS, late
+from flytrack_env.effects.base import Effect, Range, StepContext
+from flytrack_env.effects.command_delay import USUAL_STEPS, late
 from flytrack_env.motion import Motion
-from flytrack_env.quaternion import Quaternion, Scalar, Vec3
+from flytrack_env.quaternion import Scalar, Vec3
 from flytrack_env.state import Drone
 
 
@@ -32,7 +32,7 @@ class PastReadings(NamedTuple):
     is_fresh: Scalar
 
 
-def _start_readings(latency: ImuLatency, drone: Drone, num_steps: int) -> PastReadings:
+def start(latency: ImuLatency, drone: Drone, num_steps: int) -> PastReadings:
     """Return the memory of an episode that begins: rates that have been held all along, no forces."""
     still = Vec3(*(jnp.zeros_like(rate) for rate in drone.rates_b))
     size = min(num_steps, USUAL_STEPS) + 1
@@ -64,7 +64,7 @@ def _accelerometer(latency: ImuLatency, past: PastReadings, force_b: Vec3, conte
     return _late(latency, force_b, past.forces_b, past.force_bends_b, context)
 
 
-def _after_reading(latency: ImuLatency, past: PastReadings, context: StepContext) -> PastReadings:
+def remember(latency: ImuLatency, past: PastReadings, context: StepContext) -> PastReadings:
     """Return the memory after a step; before the first, the force is taken to have been that of the first."""
 
     def or_first(force_b: Vec3) -> Vec3:
@@ -89,8 +89,8 @@ def _after_reading(latency: ImuLatency, past: PastReadings, context: StepContext
 
 
 IMU_LATENCY = Effect(
+    name="imu_latency",
     parameters=ImuLatency,
-    about="Gyro and accelerometer that are late: their filters, the bus, the estimator's queue.",
     ranges={"latency_s": Range(0.0, 0.04, "s")},
     notable={"latency_s": 0.003},
     equation=r"\boldsymbol{\omega}_\text{measured}(t) = \boldsymbol{\omega}(t - \text{latency}), \quad "
@@ -100,66 +100,6 @@ IMU_LATENCY = Effect(
     probes={"latency_s": (0.005, 0.01, 0.02, 0.03)},
     gyro=_gyro,
     accelerometer=_accelerometer,
-    start=_start_readings,
-    remember=_after_reading,
-)
-
-
-class MocapLatency(NamedTuple):
-    """Delay of position, velocity and attitude, s; need not be whole steps."""
-
-    latency_s: Scalar = 0.0
-
-
-PastPoses = tuple[Pose, ...]  # true ones before the present one, the latest first
-
-
-def _of(drone: Drone) -> Pose:
-    return Pose(drone.pos_w, drone.vel_w, drone.quat)
-
-
-def _start_poses(latency: MocapLatency, drone: Drone, num_steps: int) -> PastPoses:
-    """Return the memory of an episode that begins: as if the drone had been there all along."""
-    return (_of(drone),) * num_steps
-
-
-def _same_sign(quat: Quaternion, like: Quaternion) -> Quaternion:
-    """Return q or -q, which are one attitude: the one nearer to another."""
-    sign = jnp.where(sum(a * b for a, b in zip(quat, like, strict=True)) < 0.0, -1.0, 1.0)
-    return Quaternion(*(sign * part for part in quat))
-
-
-def _pose(latency: MocapLatency, past: PastPoses, pose: Pose, context: StepContext) -> Pose:
-    """Return the mean of the poses between which the delayed time lies, by their nearness."""
-    poses = (pose, *(one._replace(quat=_same_sign(one.quat, pose.quat)) for one in past))
-
-    def mean(*vectors: tuple[Scalar, ...]) -> list[Scalar]:
-        return [late(parts, latency.latency_s, context.dt) for parts in zip(*vectors, strict=True)]
-
-    pos_w, vel_w, quat = (mean(*vectors) for vectors in zip(*poses, strict=True))
-    is_late = jnp.asarray(latency.latency_s) > 0.0
-    pairs = zip(Quaternion(*quat).normalize(), pose.quat, strict=True)
-    return Pose(Vec3(*pos_w), Vec3(*vel_w), Quaternion(*(jnp.where(is_late, *pair) for pair in pairs)))
-
-
-def _after_pose(latency: MocapLatency, past: PastPoses, context: StepContext) -> PastPoses:
-    """Return the memory after a step."""
-    return (_of(context.drone), *past[:-1])
-
-
-MOCAP_LATENCY = Effect(
-    parameters=MocapLatency,
-    about="Poses that are late: motion capture, its network, an estimator of position, velocity and "
-    "attitude.",
-    ranges={"latency_s": Range(0.0, 0.12, "s")},
-    notable={"latency_s": 0.002},
-    equation=r"(\mathbf{p}, \mathbf{v}, \mathbf{q})_\text{measured}(t) = "
-    r"(\mathbf{p}, \mathbf{v}, \mathbf{q})(t - \text{latency})",
-    source="assumption: the same for all three, linear between steps",
-    most_steps={"latency_s": MOST_STEPS},
-    needs=("q", "w"),
-    probes={"latency_s": (0.005, 0.01, 0.02, 0.03)},
-    pose=_pose,
-    start=_start_poses,
-    remember=_after_pose,
+    start=start,
+    remember=remember,
 )

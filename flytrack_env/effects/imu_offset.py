@@ -1,0 +1,42 @@
+"""An accelerometer away from the centre of mass, which turns show a force."""
+
+from typing import NamedTuple
+
+from flytrack_env.effects.base import Effect, Range, StepContext
+from flytrack_env.motion import Motion
+from flytrack_env.quaternion import Scalar, Vec3
+
+
+class ImuOffset(NamedTuple):
+    """Where the accelerometer is, from the centre of mass along body x, y, z, m."""
+
+    x: Scalar = 0.0
+    y: Scalar = 0.0
+    z: Scalar = 0.0
+
+
+def _accelerometer(offset: ImuOffset, memory: None, force_b: Vec3, context: StepContext) -> Vec3:
+    """Return the reading with the rates at the end of a continuous step, else with the mean ones.
+
+    The change of rates from one step to the next is centred there.
+    """
+    arm_b, before = Vec3(*offset), context.drone.rates_b
+    if context.motion is Motion.CONTINUOUS:
+        rates_b, angular_acc_b = context.rates_b, context.angular_acc_b
+    else:
+        rates_b = (before + context.rates_b).scale(0.5)
+        angular_acc_b = (context.rates_b - before).scale(1.0 / context.dt)
+    return force_b + (rates_b.cross(rates_b.cross(arm_b)) + angular_acc_b.cross(arm_b))
+
+
+IMU_OFFSET = Effect(
+    name="imu_offset",
+    parameters=ImuOffset,
+    ranges={axis: Range(-0.2, 0.2, "m") for axis in ImuOffset._fields},
+    notable={"x": 0.02, "y": 0.02, "z": 0.02},
+    needs=("f",),
+    equation=r"\mathbf{f}_\text{measured} = \mathbf{f} + \boldsymbol{\omega} \times (\boldsymbol{\omega} "
+    r"\times \mathbf{r}) + \dot{\boldsymbol{\omega}} \times \mathbf{r}",
+    source="acceleration of a point of a rigid body; assumption: rates change evenly within the step",
+    accelerometer=_accelerometer,
+)

@@ -1,0 +1,32 @@
+"""A yaw rate that is kicked when the thrust changes: propellers that spin up turn the frame the other way."""
+
+from typing import NamedTuple
+
+from flytrack_env.effects.base import Effect, Range, StepContext
+from flytrack_env.motion import Motion
+from flytrack_env.quaternion import Scalar, Vec3
+
+
+class YawReaction(NamedTuple):
+    """Yaw angle by which a change of the applied thrust action by 1 turns the drone, rad."""
+
+    angle: Scalar = 0.0
+
+
+def _rates(reaction: YawReaction, memory: None, rates_b: Vec3, context: StepContext) -> Vec3:
+    if context.motion is Motion.CONTINUOUS:
+        change = context.applied_slope.thrust
+    else:
+        change = (context.applied.thrust - context.drone.applied.thrust) / context.dt
+    return rates_b._replace(z=rates_b.z + reaction.angle * change)
+
+
+YAW_REACTION = Effect(
+    name="yaw_reaction",
+    parameters=YawReaction,
+    ranges={"angle": Range(-0.2, 0.2, "rad")},
+    notable={"angle": 0.02},
+    equation=r"\omega_z \leftarrow \omega_z + \text{angle}\, \frac{du}{dt}",
+    source="assumption: unequal spin-up of the two directions of rotation, in proportion to its speed",
+    rates=_rates,
+)
