@@ -20,8 +20,7 @@ from benchmarks.hidden.plant import Plant, Start
 from benchmarks.loop.outside import SIGNALS
 from benchmarks.loop.plants import EFFECTS, draw_plant_with_law, plant_of
 from flytrack_env import nominal_parameters
-from flytrack_env.quaternion import Quaternion, Vec3
-from flytrack_env.state import BATTERY, Action, Drone, pack
+from flytrack_env.state import BATTERY, Action, pack, unpack
 from flytrack_sysid.log import FlightLog
 from tests.support.handout_plant import HandoutPlant
 from tests.support.hidden_flights import LOW_START, flown_in_floats, random_sticks, state_of
@@ -272,16 +271,13 @@ def test_late_motion_capture_and_effects_that_begin_in_the_log(motion: str) -> N
 
 
 def flown_in_jax(truth: hidden.Truth, commands: np.ndarray) -> np.ndarray:
-    plant, zero = plant_of(truth), Vec3(0.0, 0.0, 0.0)
-    sag_v = truth.effects.get("voltage_sag", {}).get("at_full_v", 0.0) * 0.35**2
-    quat = Quaternion(np.cos(0.35), 0.0, 0.0, np.sin(0.35))
-    drone = Drone(Vec3(*LOW_START.pos_w), zero, zero, quat, zero, Action(0.0, 0.0, 0.0, -0.3), 23.5 - sag_v)
+    plant, start = plant_of(truth), state_of(Plant(truth, LOW_START, np.random.default_rng(0)))
 
     def step(state, command):
         state = plant.step(state, Action(*command), 0.01, nominal_parameters())
         return state, pack(plant.drone(state))
 
-    return np.asarray(jax.lax.scan(step, plant.reset(drone, nominal_parameters()), commands)[1])
+    return np.asarray(jax.lax.scan(step, plant.reset(unpack(start), nominal_parameters()), commands)[1])
 
 
 def check_flight(truth: hidden.Truth, without: hidden.Truth | None, rng: np.random.Generator) -> None:

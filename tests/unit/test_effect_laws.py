@@ -51,9 +51,11 @@ CHOSEN = {
 }
 
 
-@pytest.mark.parametrize("names", [*((name,) for name in SAME_LAWS), TOGETHER])
+@pytest.mark.parametrize(
+    "names", [*(pytest.param((name,), id=name) for name in SAME_LAWS), pytest.param(TOGETHER, id="together")]
+)
 def test_laws_are_those_of_hidden_plants_in_plain_floats(names: tuple[str, ...]) -> None:
-    """Alone and together; their equations in turn are those of SciPy (tests/integration)."""
+    """Alone and together; their equations are checked in tests/integration/test_hidden_plants.py."""
     rng = np.random.default_rng(8)
     drawn = {name: hidden.draw_effect(name, rng, hidden.EFFECTS[name].high) for name in names}
     values = {name: CHOSEN.get(name, own) for name, own in drawn.items()}
