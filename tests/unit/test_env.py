@@ -16,7 +16,7 @@ from flytrack_env.state import Action, pack
 from flytrack_env.tracks import TrackError, load_track
 from tests.support.coasting import drone_at
 from tests.support.trees import assert_close, stack
-from tests.support.wrapped_flights import NUM_ENVS, arrays, fly, steps_of
+from tests.support.wrapped_flights import ENDS, NUM_ENVS, arrays, before_ends, fly, steps_of
 
 CAUSES = ("crash", "ground", "out_of_bounds", "missed_gate", "battery_empty")
 RACE = {"gates_passed", "laps", "lap_completed", "lap_time_s", "gate_distance_m"}
@@ -102,45 +102,15 @@ def test_parameters_can_differ_between_environments(env, params):
 
 # --- Ends of episodes ---------------------------------------------------------------------------
 
-# Position, velocity, extra fields of the drone, steps already flown, action; causes; truncated.
-IN_FRONT = (12.55, 2.0, 1.35)
-FREE, FAST = (15.0, 2.0, 1.35), (-10.0, 0.0, 0.0)
-ZERO = (0.0, 0.0, 0.0, 0.0)
-NAN = float("nan")
-ENDS = {
-    "flies on": (FREE, FAST, {}, 100, ZERO, set(), False),
-    "passes": (IN_FRONT, FAST, {}, 100, ZERO, set(), False),
-    "frame": ((12.55, 3.0, 1.35), FAST, {}, 100, ZERO, {"crash"}, False),
-    "frame above": ((12.55, 2.0, 2.4), FAST, {}, 100, ZERO, {"crash"}, False),
-    "missed": ((12.55, 4.0, 1.35), FAST, {}, 100, ZERO, {"missed_gate"}, False),
-    "ground": ((15.0, 2.0, 0.01), (0.0, 0.0, -5.0), {}, 100, ZERO, {"ground"}, False),
-    "wall +x": ((25.49, 2.0, 1.0), (5.0, 0.0, 0.0), {}, 100, ZERO, {"out_of_bounds"}, False),
-    "wall -x": ((-2.49, 9.0, 1.0), (-5.0, 0.0, 0.0), {}, 100, ZERO, {"out_of_bounds"}, False),
-    "wall +y": ((15.0, 34.99, 1.0), (0.0, 5.0, 0.0), {}, 100, ZERO, {"out_of_bounds"}, False),
-    "wall -y": ((15.0, -2.99, 1.0), (0.0, -5.0, 0.0), {}, 100, ZERO, {"out_of_bounds"}, False),
-    "ceiling": ((15.0, 2.0, 6.34), (0.0, 0.0, 5.0), {}, 100, ZERO, {"out_of_bounds"}, False),
-    "corner": ((25.49, 2.0, 0.01), (9.0, 0, -9.0), {}, 100, ZERO, {"ground", "out_of_bounds"}, False),
-    "battery": (FREE, FAST, {"battery_v": 22.0001}, 9, ZERO, {"battery_empty"}, False),
-    "low battery": (FREE, FAST, {"battery_v": 22.01}, 9, ZERO, set(), False),
-    "nan roll": (FREE, FAST, {}, 100, (NAN, 0.0, 0.0, 0.0), {"crash"}, False),
-    "nan thrust": (FREE, FAST, {}, 100, (0.0, 0.0, 0.0, NAN), {"crash"}, False),
-    "time limit": (FREE, FAST, {}, 999, ZERO, set(), True),
-    "one before": (FREE, FAST, {}, 998, ZERO, set(), False),
-    "frame at time limit": ((12.55, 3.0, 1.35), FAST, {}, 999, ZERO, {"crash"}, True),
-    "pass at time limit": (IN_FRONT, FAST, {}, 999, ZERO, set(), True),
-}
-
 
 @pytest.fixture(scope="module")
 def ends(env):
     """One step of a batch with every row of ``ENDS``, from a race that has gone on for a while."""
-    params, states = arrays(env.default_params), []
+    params = arrays(env.default_params)
     counted = {"gates_passed": jnp.int32(8), "laps": jnp.int32(1), "lap_start_s": jnp.float32(0.7)}
-    for position, velocity, fields, time, *_ in ENDS.values():
-        state = env.begin(drone_at(position, velocity, **fields), 0, params)
-        states.append(state._replace(race=state.race._replace(**counted), time=jnp.int32(time)))
-    actions = jnp.array([row[4] for row in ENDS.values()], jnp.float32)
-    return env.step_batch(jax.random.key(8), stack(states), actions, params)
+    states, actions = before_ends(env, params, ENDS.values())
+    begun = [state._replace(race=state.race._replace(**counted)) for state in states]
+    return env.step_batch(jax.random.key(8), stack(begun), actions, params)
 
 
 @pytest.mark.parametrize("name", ENDS)
