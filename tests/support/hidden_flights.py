@@ -1,15 +1,24 @@
-"""Hidden plants flown by given commands, in plain floats: what the package's equations are compared with."""
+"""Flights of hidden plants: scripted ones as logs, and in plain floats by given commands, to compare with."""
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
-from benchmarks.hidden import Truth
+from benchmarks.hidden import Truth, draw_base, fly, measure
 from benchmarks.hidden.plant import Plant, Start
+from flytrack_sysid.log import FlightLog
 
 LOW_START = Start((1.0, -2.0, 3.0), 0.7, 23.5, -0.3)
 # The state as the handout has it; what is tracked and what is felt of each step.
 COLUMNS = {"x": 21, "p": 3, "v": 3, "q": 4, "f": 3, "w": 3, "slope": 3}
+
+
+def scripted(seed: int, seconds: float, noise: str = "sensors", **changes: Any) -> tuple[Truth, FlightLog]:
+    """Return a plant of a seed, with some fields replaced, and the measured log of its flight."""
+    rng = np.random.default_rng(seed)
+    truth = replace(draw_base(rng), **changes)
+    return truth, measure(fly(truth, "scripted", seconds, rng), noise, rng)
 
 
 def state_of(plant: Plant) -> np.ndarray:

@@ -9,7 +9,6 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from benchmarks.diagnosis import model_of
-from benchmarks.hidden import draw_base, fly, measure
 from flytrack_env.effects import CommandDelay, LinearDrag, SecondOrderRates
 from flytrack_sysid.diagnosis import DiagnosisError, diagnose, joined, vetoes
 from flytrack_sysid.diagnosis import noise as noises
@@ -26,6 +25,7 @@ from flytrack_sysid.diagnosis.vetoes import Selection
 from flytrack_sysid.parameters import THRUST_COEFFS
 from flytrack_sysid.record import make_record
 from flytrack_sysid.residuals import predict_rows
+from tests.support.hidden_flights import scripted
 
 SECONDS, DT_S = 40.0, 0.01
 RATE = 100  # rows a second
@@ -41,9 +41,7 @@ CAUSE = Cause("rate_scale", (), "rates", {}, 100.0, 30.0, 100.0, 90.0)
 @pytest.fixture(scope="module")
 def flown():
     """A hidden plant without effects, and what its sensors log."""
-    rng = np.random.default_rng(3)
-    truth = draw_base(rng)
-    return truth, measure(fly(truth, "scripted", SECONDS, rng), "sensors", rng)
+    return scripted(3, SECONDS)
 
 
 @pytest.fixture(scope="module")
@@ -212,9 +210,7 @@ def test_logs_are_joined_by_what_they_all_have_with_a_warning(flown):
 @pytest.mark.slow
 def test_a_force_may_be_a_law_whose_channels_the_log_lacks():
     """Without velocity and attitude, drag of forward flight would look like a thrust that is tilted."""
-    rng = np.random.default_rng(4)
-    truth = replace(draw_base(rng), effects={"thrust_tilt": {"towards_x": 0.1, "towards_y": 0.0}})
-    log = measure(fly(truth, "scripted", 20.0, rng), "sensors", rng)
+    truth, log = scripted(4, 20.0, effects={"thrust_tilt": {"towards_x": 0.1, "towards_y": 0.0}})
     blind = diagnose(log.without("p", "v", "q"), model_of(truth))
     (cause,) = blind.causes
     assert cause.effect == "thrust_tilt" and {"linear_drag", "wind"} <= {*cause.equivalent}
@@ -223,9 +219,7 @@ def test_a_force_may_be_a_law_whose_channels_the_log_lacks():
 
 @pytest.mark.slow
 def test_a_sensor_farther_off_than_any_on_the_list_is_told_and_not_named():
-    rng = np.random.default_rng(6)
-    truth = draw_base(rng)
-    log = measure(fly(truth, "scripted", 20.0, rng), "sensors", rng)
+    truth, log = scripted(6, 20.0)
     off = log["f"] + np.array([2.5, 0.0, 0.0])
     found = diagnose(replace(log, channels={**log.channels, "f": off}), model_of(truth))
     (cause,) = found.beyond

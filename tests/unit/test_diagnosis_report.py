@@ -8,7 +8,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from benchmarks.diagnosis import model_of
-from benchmarks.hidden import draw_base, fly, measure
+from benchmarks.hidden import measure
 from flytrack_env.dynamics import ModelParameters
 from flytrack_env.effects import EFFECTS, AccelerometerBias, LinearDrag
 from flytrack_sysid.diagnosis import report, summary
@@ -28,6 +28,7 @@ from flytrack_sysid.diagnosis.result import (
 from flytrack_sysid.diagnosis.score_test import BASE_CAUSES
 from flytrack_sysid.diagnosis.traces import REGRESSORS, traces
 from flytrack_sysid.parameters import names_of, to_vector, with_values
+from tests.support.hidden_flights import scripted
 
 SECONDS, DT_S = 12.0, 0.01
 SETTLED = 150  # rows until a start is forgotten
@@ -37,16 +38,14 @@ DRAG = LinearDrag(0.3, 0.4, 0.1)
 @pytest.fixture(scope="module")
 def flown():
     """A hidden plant with drag, and the clean log of its flight."""
-    rng = np.random.default_rng(5)
-    truth = replace(draw_base(rng), effects={"linear_drag": DRAG._asdict()})
-    return model_of(truth), measure(fly(truth, "scripted", SECONDS, rng), "none", rng)
+    truth, log = scripted(5, SECONDS, "none", effects={"linear_drag": DRAG._asdict()})
+    return model_of(truth), log
 
 
 @pytest.fixture(scope="module")
 def measured(flown):
     """The same log as sensors would have written it."""
-    rng = np.random.default_rng(6)
-    return measure(flown[1], "sensors", rng)
+    return measure(flown[1], "sensors", np.random.default_rng(6))
 
 
 def lagged(log, tau: np.ndarray) -> np.ndarray:

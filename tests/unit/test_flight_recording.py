@@ -9,7 +9,6 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from benchmarks.diagnosis import model_of
-from benchmarks.hidden import draw_base, fly, measure
 from flytrack import identification
 from flytrack.cli import main
 from flytrack_env.dynamics import ModelParameters
@@ -18,6 +17,7 @@ from flytrack_sysid import FlightLog, save_log
 from flytrack_sysid.diagnosis import Diagnosis
 from flytrack_sysid.diagnosis.result import CONSISTENT, Unexplained
 from flytrack_sysid.flight_recording import write_flight_recording
+from tests.support.hidden_flights import scripted
 from tests.support.made_flight import TIME_S, flight
 from tests.support.recordings import Recording
 
@@ -34,9 +34,7 @@ SCALED_FORCE = 0.1  # m of an arrow for 1 m/s^2
 @pytest.fixture(scope="module")
 def flown() -> tuple[ModelParameters, FlightLog]:
     """A plant with drag, as a model without it, and the log of two flights, each with a clock from 0 on."""
-    rng = np.random.default_rng(5)
-    truth = replace(draw_base(rng), effects={"linear_drag": DRAG._asdict()})
-    log = measure(fly(truth, "scripted", SECONDS, rng), "none", rng)
+    truth, log = scripted(5, SECONDS, "none", effects={"linear_drag": DRAG._asdict()})
     segment = (np.arange(len(log)) >= SECOND).astype(int)
     return model_of(truth), replace(log, time=log.time - segment * log.time[SECOND], segment=segment)
 

@@ -15,6 +15,7 @@ from flytrack_env.fusion import ATTRIBUTES, SWITCH
 from flytrack_env.motion import Motion
 from flytrack_env.tracks import random_track
 from tests.contract.test_effects import inside_ranges
+from tests.support.slow import slow_but
 
 NUM_ENVS, NUM_STEPS = 40, 6
 
@@ -52,9 +53,7 @@ def flown(env: Any, is_constant: bool) -> Any:
     return jax.block_until_ready(run())
 
 
-@pytest.mark.parametrize(
-    "name", ["plain", *(pytest.param(name, marks=pytest.mark.slow) for name in [*VARIANTS][1:])]
-)
+@pytest.mark.parametrize("name", slow_but(["plain"], VARIANTS))
 def test_the_kernel_is_the_same_step(monkeypatch: pytest.MonkeyPatch, name: str) -> None:
     with_kernel = flown(VARIANTS[name](), is_constant=True)
     monkeypatch.setenv(SWITCH, "0")
