@@ -7,7 +7,7 @@ on, in JAX, fly as those in plain floats.
 from dataclasses import replace
 from itertools import pairwise
 
-import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
@@ -20,10 +20,11 @@ from benchmarks.hidden.plant import Plant, Start
 from benchmarks.loop.outside import SIGNALS
 from benchmarks.loop.plants import EFFECTS, draw_plant_with_law, plant_of
 from flytrack_env import nominal_parameters
-from flytrack_env.state import BATTERY, Action, pack, unpack
+from flytrack_env.state import BATTERY
 from flytrack_sysid.log import FlightLog
 from tests.support.handout_plant import HandoutPlant
 from tests.support.hidden_flights import LOW_START, flown_in_floats, random_sticks, state_of
+from tests.support.simulated_flights import flown_by
 from tests.support.slow import slow_but
 
 START = Start((1.0, -2.0, 6.0), 0.7, 23.8, -0.2)
@@ -270,20 +271,12 @@ def test_late_motion_capture_and_effects_that_begin_in_the_log(motion: str) -> N
     assert with_onset.time[np.argmax(begun)] == pytest.approx(sudden.onset_s, abs=0.02)
 
 
-def flown_in_jax(truth: hidden.Truth, commands: np.ndarray) -> np.ndarray:
-    plant, start = plant_of(truth), state_of(Plant(truth, LOW_START, np.random.default_rng(0)))
-
-    def step(state, command):
-        state = plant.step(state, Action(*command), 0.01, nominal_parameters())
-        return state, pack(plant.drone(state))
-
-    return np.asarray(jax.lax.scan(step, plant.reset(unpack(start), nominal_parameters()), commands)[1])
-
-
 def check_flight(truth: hidden.Truth, without: hidden.Truth | None, rng: np.random.Generator) -> None:
     """Compare both flights; that without what is tested, if any, has to differ."""
     commands = np.repeat(rng.uniform(-1.0, 1.0, (LOOP_STEPS // 4, 4)), 4, axis=0).astype(np.float32)
-    expected, found = flown_in_floats(truth, commands)["x"], flown_in_jax(truth, commands)
+    expected = flown_in_floats(truth, commands)["x"]
+    start = jnp.asarray(state_of(Plant(truth, LOW_START, rng)), jnp.float32)
+    found = flown_by(plant_of(truth), nominal_parameters(), start, commands)
     np.testing.assert_allclose(found, expected, rtol=2e-4, atol=2e-4)
     assert without is None or np.abs(expected - flown_in_floats(without, commands)["x"]).max() > 1e-3
 

@@ -153,15 +153,11 @@ def test_fit_and_validate_refuse(folder, capsys, tmp_path, monkeypatch, change, 
 
 
 @pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"split": {"held_out_every": "x"}}, "held_out_every: found 'x'"),
-        ({"split": {"held_out_every": 0}}, "validate it on another log"),
-    ],
+    ("every", "message"), [("x", "held_out_every: found 'x'"), (0, "validate it on another log")]
 )
-def test_validate_refuses_model_files(folder, capsys, tmp_path, change, message):
+def test_validate_refuses_model_files(folder, capsys, tmp_path, every, message):
     document = json.loads((folder / "model.json").read_text())
-    (document["provenance"] if "split" in change else document).update(change)
+    document["provenance"]["split"] = {"held_out_every": every}
     path = tmp_path / "changed.json"
     path.write_text(json.dumps(document))
     assert message in refused(capsys, "validate", path, folder / "data.npz", "--out", tmp_path / "report")

@@ -6,12 +6,14 @@ import jax
 import numpy as np
 import pytest
 
+from benchmarks.diagnosis import model_of
 from flytrack_env.motion import Motion
 from flytrack_sysid import clocks, sensors
 from flytrack_sysid.diagnosis.motion_choice import Moves, how_it_moves
 from flytrack_sysid.diagnosis.sensor_clocks import on_one_clock, with_causal_commands
 from flytrack_sysid.log import FlightLog
 from tests.support.handout_plant import GRAVITY, HandoutPlant, excited
+from tests.support.hidden_flights import scripted
 from tests.support.made_flight import TIME_S, flight, noisy
 
 
@@ -60,7 +62,7 @@ def test_clocks_of_a_drone_at_rest_or_too_short_are_not_compared(truth):
 
 
 LATE_S = 0.013
-STEPS = 2.4  # by which the plant's poses are late
+SECONDS, POSE_LATE_S = 40.0, 0.024  # of a hidden plant
 
 
 def test_velocity_and_position_come_on_the_clock_of_the_attitude() -> None:
@@ -90,33 +92,15 @@ def test_commands_stamped_after_the_turns_they_cause_are_put_before_them() -> No
             assert min(off) < 0.1 * np.abs(found["u"]).mean()
 
 
-def late_poses(log: FlightLog, steps: float = STEPS) -> FlightLog:
-    """Return a log whose poses are late, linear between rows, without the first rows of each flight."""
-    kept = np.ones(len(log), bool)
-    channels = {name: np.array(values) for name, values in log.channels.items()}
-    for number in np.unique(log.segment):
-        rows = np.flatnonzero(log.segment == number)
-        at = np.arange(len(rows), dtype=float)
-        for name in "pvq":
-            columns = [np.interp(at - steps, at, column) for column in log[name][rows].T]
-            channels[name][rows] = np.stack(columns, axis=1)
-        kept[rows[:5]] = False
-    channels["q"] /= np.linalg.norm(channels["q"], axis=1, keepdims=True)
-    return replace(log, channels=channels).select(kept)
-
-
 def test_lateness_is_found_where_there_is_one() -> None:
-    plant = HandoutPlant()
-    truth = excited(plant)
-
-    def found(log: FlightLog) -> Moves:
-        log = sensors.measure(log, 1.0, GRAVITY, np.random.default_rng(2))
+    def found(late_s: float) -> Moves:
+        truth, log = scripted(3, SECONDS, mocap_late_s=late_s)
         with jax.enable_x64(True):
-            return how_it_moves(log, plant.model(), np.ones(len(log), bool), Motion.HANDOUT)
+            return how_it_moves(log, model_of(truth), np.ones(len(log), bool), Motion.HANDOUT)
 
-    late = found(late_poses(truth))
-    assert 0.0 < late.sigma_s < 1e-3 and abs(late.late_s - 0.01 * STEPS) < 4.0 * late.sigma_s
-    assert found(truth) == Moves(Motion.HANDOUT)
+    late = found(POSE_LATE_S)
+    assert 0.0 < late.sigma_s < 1e-3 and abs(late.late_s - POSE_LATE_S) < 4.0 * late.sigma_s
+    assert found(0.0) == Moves(Motion.HANDOUT)
 
 
 @pytest.mark.slow

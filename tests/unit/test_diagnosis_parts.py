@@ -6,6 +6,7 @@ from types import SimpleNamespace
 import jax
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
 from benchmarks.diagnosis import model_of
@@ -67,10 +68,7 @@ def disturbed(lanes):
     rng, keep = np.random.default_rng(4), np.exp(-DT_S / TAU_S)
     count = 1 + int(lanes.row.max())
     fresh = rng.standard_normal((count, NUM_AXES))
-    acting = [fresh[0]]
-    for row in fresh[1:]:
-        acting.append(keep * acting[-1] + np.sqrt(1.0 - keep**2) * row)
-    acting = DISTURBANCE * np.array(acting)
+    acting = DISTURBANCE * lfilter([np.sqrt(1.0 - keep**2)], [1.0, -keep], fresh, axis=0)
     walk = WANDER * np.sqrt(DT_S) * rng.standard_normal((count, NUM_AXES))
     level = np.cumsum(acting * DT_S + walk, axis=0) + LEVEL * rng.standard_normal((count, NUM_AXES))
     direct = acting + DIRECT * rng.standard_normal((count, NUM_AXES))

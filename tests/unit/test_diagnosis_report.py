@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
 from benchmarks.diagnosis import model_of
@@ -50,11 +51,8 @@ def measured(flown):
 
 def lagged(log, tau: np.ndarray) -> np.ndarray:
     """Return the commands of an evenly spaced log behind first-order lags, (num_rows, 4)."""
-    keep = np.exp(-DT_S / tau)
-    found = [log["u"][0]]
-    for command in log["u"][:-1]:
-        found.append(keep * found[-1] + (1.0 - keep) * command)
-    return np.array(found)
+    columns = zip(np.exp(-DT_S / tau), log["u"].T, strict=True)
+    return np.stack([lfilter([0.0, 1.0 - keep], [1.0, -keep], u) for keep, u in columns], axis=1)
 
 
 def test_pictures_of_a_cause_that_begins_in_flight_show_the_part_in_which_it_acts(flown):
