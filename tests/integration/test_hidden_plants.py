@@ -20,7 +20,6 @@ from benchmarks.hidden.plant import Plant, Start
 from benchmarks.loop.outside import SIGNALS
 from benchmarks.loop.plants import EFFECTS, draw_plant_with_law, plant_of
 from flytrack_env import nominal_parameters
-from flytrack_env.state import BATTERY
 from flytrack_sysid.log import FlightLog
 from tests.support.handout_plant import HandoutPlant
 from tests.support.hidden_flights import LOW_START, flown_in_floats, random_sticks, state_of
@@ -47,11 +46,6 @@ MOVING_EFFECTS = {
 # A thousandth of the sensors' noise or less (slopes: of 140 rad/s^2, times an arm of 0.06 m).
 FINE_ERRORS = {"p": 1e-4, "v": 1e-4, "q": 5e-5, "f": 1e-3, "w": 1e-3, "slope": 0.1}
 MINUTE_S = 60.0
-# Effect -> what it changes of the plant: force f, rates w, battery b; effects of sensors change nothing.
-RATE_EFFECTS = [name for name in hidden.NAMES if name.startswith(("rate_", "second_", "yaw_", "motor_"))]
-SENSOR_EFFECTS = [name for name in hidden.NAMES if name.startswith(("accelerometer_", "gyro_", "imu_"))]
-PLANT_EFFECTS = dict.fromkeys(hidden.NAMES, "f") | dict.fromkeys(SENSOR_EFFECTS, "")
-PLANT_EFFECTS |= dict.fromkeys(RATE_EFFECTS, "w") | {"command_delay": "fw", "voltage_sag": "fb"}
 
 
 def base(**effects: dict[str, float]) -> hidden.Truth:
@@ -76,14 +70,11 @@ def test_without_effects_it_is_the_handouts_plant() -> None:
         np.testing.assert_allclose(own, state, rtol=1e-12, atol=1e-12)
 
 
-@pytest.mark.parametrize("name", hidden.NAMES)
-def test_each_effect_changes_its_channels_of_the_plant(name: str) -> None:
-    values = hidden.draw_effect(name, np.random.default_rng(8), hidden.EFFECTS[name].high)
+def test_ground_effect_fades_with_the_height() -> None:
+    """Near the ground; the laws that the package has, too, are compared in tests/unit/test_effect_laws.py."""
     low = START._replace(pos_w=(0.0, 0.0, 0.3))
-    own, plain = open_loop(base(**{name: values}), 60, low), open_loop(base(), 60, low)
-    change = {key: np.abs(own[key] - plain[key]).max() for key in "fw"}
-    change["b"] = np.abs(own["x"] - plain["x"])[:, BATTERY].max()
-    assert {key for key, size in change.items() if size > 1e-6} == set(PLANT_EFFECTS[name])
+    own = open_loop(base(ground_effect={"gain": 0.5, "height_m": 0.3}), 1, low)["f"]
+    np.testing.assert_allclose(own, open_loop(base(), 1, low)["f"] * [1.0, 1.0, 1.0 + 0.5 * np.exp(-1.0)])
 
 
 def test_equations_of_the_sensors() -> None:
