@@ -23,6 +23,7 @@ from flytrack_env.wrappers.domain_randomization import sample_model
 from tests.support.evaluated import FAILS_BELOW_V, Rails, run, write_checkpoint
 from tests.support.pages import ROOT
 from tests.support.recordings import Recording
+from tests.support.refusals import refused
 from tests.support.slow import slow_but
 from tests.support.trees import assert_close
 
@@ -184,10 +185,8 @@ def test_command_refuses_before_it_flies(arguments, messages, bad_files, monkeyp
     monkeypatch.chdir(bad_files)
     monkeypatch.setattr(evaluate, "can_record", lambda: True)
     monkeypatch.setattr(evaluate.Report, "fly", lambda _: pytest.fail("it flew"))
-    with pytest.raises(SystemExit) as ended:
-        run("--checkpoint", "policy.safetensors", "--steps", "5", *arguments)
-    error = capsys.readouterr().err
-    assert ended.value.code == 2 and all(message in error for message in messages), error
+    error = refused(capsys, "eval", "--checkpoint", "policy.safetensors", "--steps", "5", *arguments)
+    assert all(message in error for message in messages), error
     assert not (bad_files / "rollout.npy").exists()
 
 

@@ -16,6 +16,7 @@ from flytrack_env.dynamics import lag
 from flytrack_env.state import Action, unpack, unpack_action
 from flytrack_env.wrappers import NoiseParams, ObservationNoise
 from tests.support.evaluated import write_checkpoint
+from tests.support.refusals import refused
 
 SEED, COUNT = 5, 200
 LARGEST, LARGEST_LAG = 1e-5, 1e-6
@@ -113,8 +114,6 @@ def test_what_cannot_be_exported_is_told(words, message, tmp_path, monkeypatch, 
     if words[-1:] == ["unknown rows"]:
         monkeypatch.setattr(export, "KINDS_OF_PAST", ("applied",))
         words = words[:-1]
-    with pytest.raises(SystemExit) as stopped:
-        main(["export", "a.safetensors", *words])
-    assert stopped.value.code == 2 and message in capsys.readouterr().err
+    assert message in refused(capsys, "export", "a.safetensors", *words)
     assert (tmp_path / "a.safetensors").read_bytes() == before
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a.safetensors", "folder"]
