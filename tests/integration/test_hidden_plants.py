@@ -174,10 +174,6 @@ def test_the_accelerometer_feels_gusts() -> None:
         assert 0.04 < np.std(log["w"][:, 2]) < 0.08
 
 
-def moving(**effects: dict[str, float]) -> hidden.Truth:
-    return replace(hidden.draw_base(np.random.default_rng(3)), motion="fine", effects=effects)
-
-
 def derivative(
     own: hidden.Truth, time_s: float, x: np.ndarray, stick: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -228,7 +224,7 @@ def integrated(own: hidden.Truth) -> dict[str, np.ndarray]:
 
 
 def test_fine_motion_obeys_the_differential_equations(monkeypatch: pytest.MonkeyPatch) -> None:
-    own = replace(moving(**MOVING_EFFECTS), mocap_late_s=MOCAP_S)
+    own = replace(base(**MOVING_EFFECTS), motion="fine", mocap_late_s=MOCAP_S)
     exact = integrated(own)
 
     def errors() -> dict[str, float]:

@@ -17,7 +17,6 @@ from flytrack_env.state import BATTERY, POSITION, QUATERNION, STATE_SIZE, VELOCI
 from tests.support.slow import slow_but
 
 SHIPPED = sorted(references.FOLDER.glob("*.npz"))
-RADIUS_M = 0.15
 EXACT = 1e-6  # of the simulator in float64
 
 

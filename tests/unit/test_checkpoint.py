@@ -35,12 +35,6 @@ def path(tmp_path, params):
     return tmp_path / "a.safetensors"
 
 
-def write(path, arrays, text):
-    """Write a file with a checksum that fits."""
-    metadata = {"meta": text, "sha256": checksum(text, arrays)}
-    path.write_bytes(safetensors.numpy.save(arrays, metadata))
-
-
 def test_round_trip(path, params):
     checkpoint = load_checkpoint(path)
     jax.tree.map(np.testing.assert_array_equal, checkpoint.params, params)
@@ -109,6 +103,8 @@ def test_descriptions_that_cannot_be_used_are_refused(path, params, name, value,
     if name == "factor":
         arrays = {key: np.float32(value) * array for key, array in arrays.items()}
     meta = {"format": checkpoint_module.FORMAT, "config": {"hidden_sizes": [8]}, **DESCRIPTION, name: value}
-    write(path, arrays, json.dumps(meta))
+    text = json.dumps(meta)
+    metadata = {"meta": text, "sha256": checksum(text, arrays)}  # one that fits
+    path.write_bytes(safetensors.numpy.save(arrays, metadata))
     with pytest.raises(CheckpointError, match=rf"a\.safetensors: .*{reason}"):
         load_checkpoint(path)

@@ -76,15 +76,6 @@ def disturbed(lanes):
     return series[lanes.row] * lanes.is_joined[..., None, None]
 
 
-def whitened(lanes, left, noise: noises.Noise) -> np.ndarray:
-    """Return innovations; not a number where nothing counts."""
-    with jax.enable_x64(True):
-        gains = noises.make_gains(noise, noises.step_to(lanes), lanes.is_known, lanes.counts)
-        found = np.array(noises.innovations(gains, left, lanes.counts))
-    found[~lanes.counts] = np.nan
-    return found
-
-
 def correlation(first: np.ndarray, second: np.ndarray) -> np.ndarray:
     """Return the mean product over rows and lanes where both are there; 0 where none are."""
     product = first * second
@@ -94,7 +85,10 @@ def correlation(first: np.ndarray, second: np.ndarray) -> np.ndarray:
 def test_innovations_are_white_and_of_variance_one(lanes, disturbed):
     ones = np.ones(NUM_AXES)
     noise = noises.Noise(DIRECT, LEVEL, WANDER, DISTURBANCE, TAU_S * ones, ones)  # that they were made of
-    found = whitened(lanes, disturbed, noise)
+    with jax.enable_x64(True):
+        gains = noises.make_gains(noise, noises.step_to(lanes), lanes.is_known, lanes.counts)
+        found = np.array(noises.innovations(gains, disturbed, lanes.counts))
+    found[~lanes.counts] = np.nan
     counting = lanes.counts.any(axis=(0, 1))
     assert counting.sum() == 2 * NUM_AXES - 1
     sigmas = 5.0 / np.sqrt(lanes.counts.sum(axis=(0, 1))[counting])

@@ -29,6 +29,7 @@ from flytrack_sysid.diagnosis.result import (
 from flytrack_sysid.diagnosis.score_test import BASE_CAUSES
 from flytrack_sysid.diagnosis.traces import REGRESSORS, traces
 from flytrack_sysid.parameters import names_of, to_vector, with_values
+from tests.contract.test_effects import inside_ranges
 from tests.support.hidden_flights import scripted
 
 SECONDS, DT_S = 12.0, 0.01
@@ -47,12 +48,6 @@ def flown():
 def measured(flown):
     """The same log as sensors would have written it."""
     return measure(flown[1], "sensors", np.random.default_rng(6))
-
-
-def lagged(log, tau: np.ndarray) -> np.ndarray:
-    """Return the commands of an evenly spaced log behind first-order lags, (num_rows, 4)."""
-    columns = zip(np.exp(-DT_S / tau), log["u"].T, strict=True)
-    return np.stack([lfilter([0.0, 1.0 - keep], [1.0, -keep], u) for keep, u in columns], axis=1)
 
 
 def test_pictures_of_a_cause_that_begins_in_flight_show_the_part_in_which_it_acts(flown):
@@ -76,7 +71,8 @@ def test_residuals_are_measured_minus_modelled(flown):
         LinearDrag(0.1, 0.2, 0.0)
     )
     found = traces(log, {"right": base.with_effects(DRAG), "wrong": wrong}, like="wrong")
-    applied = lagged(log, wrong.tau)
+    columns = zip(np.exp(-DT_S / wrong.tau), log["u"].T, strict=True)
+    applied = np.stack([lfilter([0.0, 1.0 - keep], [1.0, -keep], u) for keep, u in columns], axis=1)
     quat = Rotation.from_quat(log["q"], scalar_first=True)
     airspeed_b = quat.inv().apply(log["v"])[:-1]
     stick, volt, coeffs = applied[1:, 3], log["v_bat"][:-1, 0], wrong.thrust_coeffs
@@ -106,11 +102,7 @@ def shown(model: ModelParameters, cause: str) -> ModelParameters:
         values = dict(zip(names_of(model), to_vector(model), strict=True))
         return with_values(model, {name: 1.4 * values[name] for name in BASE_CAUSES[cause]})
     effect = next(effect for effect in EFFECTS if effect.name == cause)
-    if effect.respond is not None:  # far from neutral, no loop is stable
-        return model.with_effects(effect.parameters(20.0, 20.0, 2.0, 2.0))
-    return model.with_effects(
-        effect.parameters(**{name: 0.9 * one.high for name, one in effect.ranges.items()})
-    )
+    return model.with_effects(inside_ranges(effect, 0.9))
 
 
 def test_every_cause_has_a_plot_in_which_it_shows(flown):

@@ -217,18 +217,6 @@ class WithoutGyro(Plant):
     reset, step, drone = Simulator.reset, Simulator.step, Simulator.drone
 
 
-def shown_and_true(env: Any, params: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Return the rates that observations show and the true ones, (4, 3) rad/s, from a start on."""
-    step = jax.jit(env.step_env)
-    state = env.begin(drone_with(rates_b=(0.5, -0.3, 0.2)), 0, params, jnp.uint32(0))
-    shown, true = [env.observe(None, state, None, params)[SHOWN]], [np.stack(env.drone(state).rates_b)]
-    for _ in range(3):
-        observation, state, *_ = step(None, state, jnp.array([0.2, -0.1, 0.3, 0.0]), params)
-        shown.append(observation[SHOWN])
-        true.append(np.stack(env.drone(state).rates_b))
-    return np.stack(shown) * GYRO_SCALE, np.stack(true)
-
-
 @pytest.mark.parametrize(
     ("parameters", "plant", "lateness", "bias"),
     [
@@ -241,7 +229,13 @@ def test_the_observation_shows_the_gyro_of_the_plant(
     parameters: tuple[Any, ...], plant: Plant | None, lateness: int, bias: tuple[float, ...]
 ) -> None:
     env = FlyTrack(model=nominal_parameters().with_effects(*parameters), plant=plant)
-    shown, true = shown_and_true(env, env.default_params)
-    rows = np.maximum(np.arange(4) - lateness, 0)
-    np.testing.assert_allclose(shown, true[rows] + bias, atol=1e-5)
+    params, step = env.default_params, jax.jit(env.step_env)
+    state = env.begin(drone_with(rates_b=(0.5, -0.3, 0.2)), 0, params, jnp.uint32(0))
+    shown, true = [env.observe(None, state, None, params)[SHOWN]], [np.stack(env.drone(state).rates_b)]
+    for _ in range(3):
+        observation, state, *_ = step(None, state, jnp.array([0.2, -0.1, 0.3, 0.0]), params)
+        shown.append(observation[SHOWN])
+        true.append(np.stack(env.drone(state).rates_b))
+    expected = np.stack(true)[np.maximum(np.arange(4) - lateness, 0)] + bias
+    np.testing.assert_allclose(np.stack(shown) * GYRO_SCALE, expected, atol=1e-5)
     assert np.abs(np.diff(true, axis=0)).min() > 1e-3

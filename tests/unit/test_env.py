@@ -31,13 +31,6 @@ def flight(env):
     return fly(env, actions=actions)
 
 
-def assert_begun(done, states):
-    """Assert that ended episodes have begun again, with nothing counted yet."""
-    race = states.race
-    for leaf in (states.time, race.gates_passed, race.laps, race.lap_start_s, race.lap_time_s):
-        assert not np.asarray(leaf)[done].any()
-
-
 # --- The protocol -------------------------------------------------------------------------------
 
 
@@ -112,7 +105,9 @@ def test_every_end_has_its_own_cause_and_flags(name, ends):
 def test_batch_step_resets_episodes_apart(env, params, ends):
     observation, state, _, terminated, truncated, _ = ends
     done = np.asarray(terminated | truncated)
-    assert_begun(done, state)
+    race = state.race
+    for leaf in (state.time, race.gates_passed, race.laps, race.lap_start_s, race.lap_time_s):
+        assert not np.asarray(leaf)[done].any()  # begun again, with nothing counted yet
     starts = np.stack([np.asarray(leaf)[done] for leaf in env.drone(state).pos_w], -1)
     assert len(np.unique(starts, axis=0)) == done.sum()
     expected = jax.jit(jax.vmap(env.observe, in_axes=(None, 0, None, None)))(None, state, None, params)

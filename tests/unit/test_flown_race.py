@@ -94,14 +94,6 @@ def test_step_after_the_last_state_is_extrapolated():
         np.testing.assert_array_equal(one, other)
 
 
-def straight(start: tuple[float, ...], velocity: tuple[float, ...]) -> np.ndarray:
-    """Return the states (T, 21) of a flight along a line, 5 s."""
-    states, _ = ghost_rollout(REFERENCES, 500)
-    states[:, VELOCITY] = velocity
-    states[:, POSITION] = start + 0.01 * np.arange(500)[:, None] * np.array(velocity)
-    return states
-
-
 ENDS = {  # the first gate, at (12.5, 2, 1.35), is flown towards -x
     "ground": ((15.0, 2.0, 1.35), (0.0, 0.0, -2.0)),
     "out of bounds": ((15.0, 2.0, 1.35), (0.0, 0.0, 20.0)),
@@ -113,7 +105,9 @@ ENDS = {  # the first gate, at (12.5, 2, 1.35), is flown towards -x
 @pytest.mark.parametrize("end", ENDS)
 def test_end_is_the_environments(end):
     """The last state before the environment ends a flight shows why."""
-    states = straight(*ENDS[end])
+    (start, velocity), (states, _) = ENDS[end], ghost_rollout(REFERENCES, 500)
+    states[:, VELOCITY] = velocity
+    states[:, POSITION] = start + 0.01 * np.arange(500)[:, None] * np.array(velocity)
     _, causes = fly_recorded(states, 0)
     last = int(np.argmax(np.any(list(causes), axis=0)))
     names = [name.replace("_", " ") for name, happened in causes._asdict().items() if happened[last]]

@@ -22,6 +22,8 @@ from flytrack_sysid.script_file import script_of
 MODEL = nominal_parameters()
 GYRO, FORCE, ATTITUDE, VELOCITY, VOLTAGE = 0.1, 1.5, 0.009, 0.05, 0.01  # rad/s, m/s^2, rad, m/s, V
 LITTLE, SHORT_S = 0.05, 0.3  # what wanders, over the sensors' noise, and how long it lasts
+DIRECT, LEVEL = [GYRO] * 3 + [FORCE] * 3 + [1.0], [ATTITUDE] * 3 + [VELOCITY] * 3 + [VOLTAGE]
+NOISE = np.log([DIRECT, LEVEL, [LITTLE] * 7, [LITTLE] * 7, [SHORT_S] * 7, [1.0] * 7])  # as a problem has it
 WANTED = {
     "wind": ("thrust_tilt", "accelerometer_bias"),
     "thrust_tilt": ("wind",),
@@ -36,26 +38,18 @@ WANTED = {
 
 
 class Logged(NamedTuple):
-    """A log, its problem, the model that is right, and its linearization."""
+    """The problem of a log, the model that is right, and its linearization."""
 
-    log: FlightLog
     problem: Problem
     model: FittedModel
     linearization: Linearization
 
 
-def noise_of_sensors() -> np.ndarray:
-    """Return common sensors as a problem has its noise, (6, 7)."""
-    direct, level = [GYRO] * 3 + [FORCE] * 3 + [1.0], [ATTITUDE] * 3 + [VELOCITY] * 3 + [VOLTAGE]
-    rest = np.repeat(np.array([LITTLE, LITTLE, SHORT_S]), 7).reshape(3, 7)
-    return np.concatenate([np.log([direct, level]), np.log(rest), np.zeros((1, 7))])
-
-
 def logged(log: FlightLog) -> Logged:
     lanes = make_lanes(log, np.ones(len(log), bool), np.asarray(MODEL.tau, float), MODEL.g)
-    state = SearchState(Problem.of(lanes, MODEL).with_noise(noise_of_sensors()))
+    state = SearchState(Problem.of(lanes, MODEL).with_noise(NOISE))
     model = FittedModel((), state.problem.start, 0.0, tuple(state.base_places))
-    return Logged(log, state.problem, model, state.linearized(model.vector)[1])
+    return Logged(state.problem, model, state.linearized(model.vector)[1])
 
 
 @pytest.fixture(scope="module", autouse=True)

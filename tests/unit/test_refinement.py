@@ -29,24 +29,19 @@ def problem_of(truth, log: FlightLog) -> Problem:
     return Problem.of(lanes, model_of(truth))
 
 
-def refined(truth, log: FlightLog, candidates, values):
-    """Return the problem of a plant and its refinement, from given values of effects."""
-    with jax.enable_x64(True):
-        problem = problem_of(truth, log)
-        vector = problem.start.copy()
-        for name, value in values.items():
-            vector[problem.names.index(name)] = value
-        places = problem.index(base_of(problem.like))
-        found = refine(problem, problem.start, vector, candidates, places, log, held_out_rows(log), False)
-    return problem, found
-
-
 @pytest.fixture(scope="module")
 def dragged():
     """A plant with drag, and the refinement of a model with half of it and a bias that no flight shows."""
     truth, log = scripted(3, SECONDS, effects={"linear_drag": TRUE_DRAG})
-    halved = {f"linear_drag.{name}": 0.5 * value for name, value in TRUE_DRAG.items()}
-    return truth, log, *refined(truth, log, (DRAG, BIAS), halved | {"accelerometer_bias.x": 0.3})
+    values = {f"linear_drag.{name}": 0.5 * value for name, value in TRUE_DRAG.items()}
+    with jax.enable_x64(True):
+        problem = problem_of(truth, log)
+        vector = problem.start.copy()
+        for name, value in (values | {"accelerometer_bias.x": 0.3}).items():
+            vector[problem.names.index(name)] = value
+        places = problem.index(base_of(problem.like))
+        found = refine(problem, problem.start, vector, (DRAG, BIAS), places, log, held_out_rows(log), False)
+    return truth, log, problem, found
 
 
 def test_values_are_refined_by_flights(dragged):
