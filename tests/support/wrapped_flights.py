@@ -118,8 +118,8 @@ ENDS = {
 }
 
 
-def before_ends(env: Any, params: Any, ends: Iterable[Any], **fields: Any) -> tuple[list[Any], jax.Array]:
-    """Return states a step before each of some ``ENDS``, and the actions of that step."""
+def before_ends(env: Any, params: Any, ends: Iterable[Any], **fields: Any) -> tuple[Any, jax.Array]:
+    """Return a batch of states a step before each of some ``ENDS``, and the actions of that step."""
 
     def with_time(steps: int, path: Any, leaf: jax.Array) -> jax.Array:
         return jnp.int32(steps) if getattr(path[-1], "name", "") == "time" else leaf
@@ -130,4 +130,5 @@ def before_ends(env: Any, params: Any, ends: Iterable[Any], **fields: Any) -> tu
         state = env.begin(drone, 0, params, jnp.uint32(len(states)))
         states.append(jax.tree_util.tree_map_with_path(partial(with_time, time), state))
         actions.append(action)
-    return states, jnp.array(actions, jnp.float32)
+    batch = jax.tree.map(lambda *leaves: jnp.stack(leaves), *states)
+    return batch, jnp.array(actions, jnp.float32)

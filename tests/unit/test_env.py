@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -15,7 +16,6 @@ from flytrack_env.observations import OBSERVATION, OBSERVATION_SIZE
 from flytrack_env.state import Action, pack
 from flytrack_env.tracks import TrackError, load_track
 from tests.support.coasting import drone_at
-from tests.support.trees import assert_close, stack
 from tests.support.wrapped_flights import ENDS, NUM_ENVS, arrays, before_ends, fly, steps_of
 
 CAUSES = ("crash", "ground", "out_of_bounds", "missed_gate", "battery_empty")
@@ -41,7 +41,8 @@ def test_default_parameters_are_used_when_none_are_given(env, flight):
     expected = steps_of(env)(keys, states, np.tile(action, (NUM_ENVS, 1)), arrays(env.default_params))
     with jax.disable_jit():
         found = env.step(key, jax.tree.map(lambda leaf: leaf[0], states), action)
-    assert_close(found, jax.tree.map(lambda leaf: leaf[0], expected), 1e-5)
+    expected = jax.tree.map(lambda leaf: leaf[0], expected)
+    chex.assert_trees_all_close(found, expected, rtol=1e-5, atol=1e-5)
 
 
 def test_spaces_contain_every_observation_of_flights_that_end_in_many_ways(env, params, flight):
@@ -88,10 +89,11 @@ def test_parameters_can_differ_between_environments(env, params):
 def ends(env):
     """One step of a batch with every row of ``ENDS``, from a race that has gone on for a while."""
     params = arrays(env.default_params)
-    counted = {"gates_passed": jnp.int32(8), "laps": jnp.int32(1), "lap_start_s": jnp.float32(0.7)}
+    counted = {"gates_passed": jnp.full(len(ENDS), 8), "laps": jnp.full(len(ENDS), 1)}
+    counted["lap_start_s"] = jnp.full(len(ENDS), 0.7)
     states, actions = before_ends(env, params, ENDS.values())
-    begun = [state._replace(race=state.race._replace(**counted)) for state in states]
-    return env.step_batch(jax.random.key(8), stack(begun), actions, params)
+    begun = states._replace(race=states.race._replace(**counted))
+    return env.step_batch(jax.random.key(8), begun, actions, params)
 
 
 @pytest.mark.parametrize("name", ENDS)
@@ -122,7 +124,7 @@ def test_actions_beyond_the_range_are_clipped_and_integers_are_as_good(env, flig
     factors = np.resize(np.array([1.001, 7.0, 1e30, np.inf], np.float32).repeat(2), NUM_ENVS)[:, None]
     keys, params = jax.random.split(jax.random.key(11), NUM_ENVS), arrays(env.default_params)
     both = jnp.asarray(corners * factors), jnp.asarray(corners)
-    assert_close(*(steps_of(env)(keys, flight.start, actions, params) for actions in both), 0.0)
+    chex.assert_trees_all_equal(*(steps_of(env)(keys, flight.start, actions, params) for actions in both))
     assert clip_action(jnp.array([3, 0, -2, 1])) == clip_action(jnp.array([1.0, 0.0, -1.0, 1.0]))
 
 
@@ -133,7 +135,8 @@ def test_actions_of_another_shape_are_refused(shape, env, params):
         with pytest.raises(ValueError, match=r"action: found shape .*expected \(4,\)"):
             step(key, state, jnp.zeros(shape), params)
     with pytest.raises(ValueError):
-        env.step_batch(jax.random.key(0), stack([state] * 2), jnp.zeros((2, 3)), params)
+        two = jax.tree.map(lambda leaf: jnp.stack([leaf] * 2), state)
+        env.step_batch(jax.random.key(0), two, jnp.zeros((2, 3)), params)
 
 
 # --- Construction -------------------------------------------------------------------------------

@@ -53,16 +53,10 @@ def flights(flown, models) -> dict:
     return {one.name: one for one in trajectories.trajectories_of(flown[1], models)}
 
 
-@pytest.fixture(scope="module")
-def recording(flown, models, tmp_path_factory) -> Recording:
-    """The recording of both models that stay, read back."""
-    path = tmp_path_factory.mktemp("recording") / "flight.rrd"
-    assert write_flight_recording(path, flown[1], {name: models[name] for name in ("nominal", "true")}) == ""
-    return Recording(path)
-
-
-def test_arrows_are_the_force_that_the_model_lacks_along_the_world(flown, recording):
-    log = flown[1]
+def test_arrows_are_the_force_that_the_model_lacks_along_the_world(flown, models, tmp_path):
+    log, path = flown[1], tmp_path / "flight.rrd"
+    assert write_flight_recording(path, log, {name: models[name] for name in ("nominal", "true")}) == ""
+    recording = Recording(path)
     quat = Rotation.from_quat(log["q"], scalar_first=True)
     drag_w = quat.apply(-np.array(DRAG) * quat.inv().apply(log["v"]))  # of the step after a row
     half = round(0.5 * trajectories.WINDOW_S / DT_S)

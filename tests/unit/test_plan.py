@@ -1,6 +1,6 @@
 """What to fly next: manoeuvres that show what a hovering log could not, once they are flown."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from functools import cache
 from typing import NamedTuple
 
@@ -66,20 +66,6 @@ def hover() -> Logged:
     return logged(collect(Simulator(), script=script_of([first] * 8)).without("uprev"))
 
 
-@pytest.fixture(scope="module")
-def told() -> Callable[[str], np.ndarray]:
-    """What a manoeuvre tells of everything once it is collected, with other commands than foreseen."""
-    script = script_of(flights_of(MANOEUVRES, hover_action(MODEL), seed=1))
-    log = collect(Simulator(), script=script).without("uprev")
-    kinds = np.array(script.kinds)[log.segment]
-
-    @cache
-    def told_by(name: str) -> np.ndarray:
-        return logged(log.select(kinds == name)).linearization.by_block.sum(axis=0)
-
-    return told_by
-
-
 def test_a_hovering_log_cannot_tell_wind_from_tilt(hover):
     alone, beside = (
         Question(hover.linearization, hover.model, "thrust_tilt", alike).shares()[0]
@@ -89,7 +75,16 @@ def test_a_hovering_log_cannot_tell_wind_from_tilt(hover):
 
 
 @pytest.mark.slow
-def test_what_is_advised_shows_once_it_is_flown(hover, told):
+def test_what_is_advised_shows_once_it_is_flown(hover):
+    """In flights that are collected with other commands than foreseen."""
+    script = script_of(flights_of(MANOEUVRES, hover_action(MODEL), seed=1))
+    log = collect(Simulator(), script=script).without("uprev")
+    kinds = np.array(script.kinds)[log.segment]
+
+    @cache
+    def told(name: str) -> np.ndarray:
+        return logged(log.select(kinds == name)).linearization.by_block.sum(axis=0)
+
     advice = advise(hover.problem, hover.model, hover.linearization, WANTED)
     assert set(advice) == set(WANTED)
     for effect, alike in WANTED.items():

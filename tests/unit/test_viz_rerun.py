@@ -35,16 +35,6 @@ def record(folder: Path, sequence, gates=GATES, **options) -> Recording:
     return Recording(path)
 
 
-@pytest.fixture(scope="module")
-def recording(tmp_path_factory) -> Recording:
-    """Two flights on one time line; the second has its own end and is shorter."""
-    aside = STATES[:300] + 0.2 * np.eye(21, dtype=STATES.dtype)[1]  # to the side of the first
-    second = viz.Trajectory("plant / 2", aside, ACTIONS[:300], ended="battery")
-    path = tmp_path_factory.mktemp("viz") / "two.rrd"
-    viz.write_recording(path, [viz.Trajectory("policy", STATES, ACTIONS), second], TRACK)
-    return Recording(path)
-
-
 def test_handouts_function_records_the_numbers_that_it_is_given(tmp_path):
     handout = record(tmp_path, make_sequence(100), app_id="test_app")
     x, u = (np.array(part, float) for part in zip(*make_sequence(100), strict=True))
@@ -142,7 +132,12 @@ def test_failures_to_write_keep_the_old_recording(tmp_path, monkeypatch):
     assert list(tmp_path.iterdir()) == [path] and path.read_bytes() == b"old"
 
 
-def test_passes_laps_events_and_table_are_the_races(recording):
+def test_passes_laps_events_and_table_are_the_races(tmp_path):
+    """Of two flights on one time line; the second has its own end and is shorter."""
+    aside = STATES[:300] + 0.2 * np.eye(21, dtype=STATES.dtype)[1]  # to the side of the first
+    second = viz.Trajectory("plant / 2", aside, ACTIONS[:300], ended="battery")
+    viz.write_recording(tmp_path / "two.rrd", [viz.Trajectory("policy", STATES, ACTIONS), second], TRACK)
+    recording = Recording(tmp_path / "two.rrd")
     rows = recording.rows["/world/passes", "Points3D:positions"]
     assert [step for step, _ in recording.times["/world/passes"]] == [one.row for one in RACE.passes]
     for count, points in enumerate(rows, start=1):

@@ -21,7 +21,6 @@ from flytrack_env.wrappers import (
     RandomizationParams,
 )
 from flytrack_env.wrappers.domain_randomization import sample_model
-from tests.support.trees import stack
 from tests.support.wrapped_flights import (
     ALL,
     ENDS,
@@ -252,7 +251,7 @@ def test_after_every_kind_of_end_an_episode_begins_as_if_nothing_had_been() -> N
     assert len(ends) == NUM_ENVS
     states, actions = before_ends(env, params, ends.values(), applied=applied)
     keys = jax.random.split(jax.random.key(7), NUM_ENVS)
-    observation, after, _, terminated, truncated, info = step(keys, stack(states), actions)
+    observation, after, _, terminated, truncated, info = step(keys, states, actions)
     for row, (*_, causes, is_truncated) in enumerate(ends.values()):
         assert bool(truncated[row]) is is_truncated and bool(terminated[row]) is bool(causes)
         assert all(bool(info[cause][row]) for cause in causes)
