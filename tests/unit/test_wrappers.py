@@ -2,6 +2,7 @@
 
 from typing import Any
 
+import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -255,9 +256,7 @@ def test_after_every_kind_of_end_an_episode_begins_as_if_nothing_had_been() -> N
     for row, (*_, causes, is_truncated) in enumerate(ends.values()):
         assert bool(truncated[row]) is is_truncated and bool(terminated[row]) is bool(causes)
         assert all(bool(info[cause][row]) for cause in causes)
-    fresh = resets_of(env)(keys, params)
-    for found, expected in zip(*map(jax.tree.leaves, ((observation, after), fresh)), strict=True):
-        np.testing.assert_allclose(found, expected, atol=1e-5)
+    chex.assert_trees_all_close((observation, after), resets_of(env)(keys, params), atol=1e-5)
     last = np.asarray(info["final_observation"])
     assert np.isfinite(last).all() and (last != np.asarray(observation)).any(axis=1).all()
     # What is no number is remembered as 0, and the rest of the action clipped.
