@@ -15,10 +15,9 @@ from flytrack_env.model_file import ModelFileError
 from flytrack_env.observations import OBSERVATION, OBSERVATION_SIZE
 from flytrack_env.state import Action, pack
 from flytrack_env.tracks import TrackError, load_track
+from tests.contract.test_registration import CAUSES, RACE
 from tests.support.coasting import drone_at
 from tests.support.wrapped_flights import ENDS, NUM_ENVS, arrays, before_ends, fly, steps_of
-
-CAUSES = ("crash", "ground", "out_of_bounds", "missed_gate", "battery_empty")
 
 
 @pytest.fixture(scope="module")
@@ -59,6 +58,7 @@ def test_spaces_contain_every_observation_of_flights_that_end_in_many_ways(env, 
 
 def test_info_belongs_to_the_step_not_to_the_reset(env, flight):
     done, states, info = flight.ended, flight.states, flight.info
+    assert set(info) == {*CAUSES, *RACE, "terminated", "truncated", "final_observation"}
     np.testing.assert_array_equal(np.stack([info[cause] for cause in CAUSES]).any(axis=0), flight.terminated)
     np.testing.assert_array_equal(info["terminated"], flight.terminated)
     np.testing.assert_array_equal(info["truncated"], flight.truncated)
