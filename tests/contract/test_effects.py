@@ -19,7 +19,6 @@ from flytrack_env.effects import (
     Effect,
     ImuLatency,
     LinearDrag,
-    RotorDrag,
     ThrustScale,
     Wind,
     check_parameters,
@@ -217,13 +216,3 @@ def test_what_is_no_effect_is_refused() -> None:
 def test_the_packed_step_refuses_a_memory() -> None:
     with pytest.raises(ValueError, match=r"params\.effects: found one with a memory, expected none"):
         step(pack(drone_with()), jnp.zeros(4), DT, NOMINAL.with_effects(CommandDelay(0.0)))
-
-
-def test_thrust_is_scaled_before_rotor_drag_sees_it() -> None:
-    """Half the thrust is half the rotor drag: the stages are passed in their order."""
-    drone = drone_with(vel_w=(4.0, 0.0, 0.0))
-    push = [
-        flown(parameters, held(), drone)[0, 6]
-        for parameters in (RotorDrag(0.05), (RotorDrag(0.05), ThrustScale(0.5)))
-    ]
-    assert push[1] == pytest.approx(0.5 * push[0], rel=1e-5) and push[0] < -0.1

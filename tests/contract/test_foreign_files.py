@@ -117,14 +117,11 @@ def save_log(path: Path) -> None:
     sysid.save_log(path, log_of_states([(STATES, ACTIONS)], 0.01))
 
 
-def save_drag(path: Path) -> None:
-    """Write a model that has an effect."""
-    save_model(path, nominal_parameters().with_effects(QuadraticDrag(0.1, 0.1, 0.2)), {})
-
-
 TRACK = (TRACK_FOLDER / "flytrack.toml").read_bytes()
 REFERENCE = shipped_path("flytrack", "flying", "nominal").read_bytes()
 CSV = foreign_logs.foreign_csv()
+DRAGGED = nominal_parameters().with_effects(QuadraticDrag(0.1, 0.1, 0.2))
+save_drag = partial(save_model, model=DRAGGED, provenance={})
 load_csv, load_usd, load_bag = (partial(import_mapped, form=form) for form in ("csv", "usd", "bag"))
 load_ulog, load_blackbox = (partial(import_log, format=form) for form in ("ulog", "betaflight"))
 KINDS = {

@@ -6,7 +6,8 @@ from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).parents[2]
+from tests.support.pages import ROOT
+
 PACKAGE = "flytrack_env"
 
 # Low to high. A module imports only from rows above its own here; a package counts as one module.

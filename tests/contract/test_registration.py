@@ -26,6 +26,8 @@ from flytrack_env.wrappers import DomainRandomization, RandomizationParams, laye
 from tests.support.coasting import Coasting, drone_at
 from tests.support.slow import slow_but
 
+CAUSES = ("crash", "ground", "out_of_bounds", "missed_gate", "battery_empty")
+RACE = ("gates_passed", "laps", "lap_completed", "lap_time_s", "gate_distance_m")
 OVER_IDS = pytest.mark.parametrize("env_id", ENVIRONMENTS)
 
 
@@ -39,12 +41,16 @@ def test_every_id_follows_gymnaxs_protocol(env_id: str) -> None:
     assert jax.tree.structure(first_params) == jax.tree.structure(params)
     assert env.name == env_id
     key = jax.random.key(0)
-    observation, state = jax.eval_shape(env.reset, key, params)
+    begun = jax.eval_shape(env.reset, key, params)
     action = jax.eval_shape(env.action_space(params).sample, key)
-    outputs = jax.eval_shape(env.step, key, state, action, params)
-    assert len(outputs) == 6
-    assert outputs[0].shape == observation.shape == env.observation_space(params).shape
-    assert jax.tree.structure(outputs[1]) == jax.tree.structure(state)
+    observation, state, reward, terminated, truncated, info = jax.eval_shape(
+        env.step, key, begun[1], action, params
+    )
+    assert (observation, state) == begun and info["final_observation"] == observation
+    assert (observation.shape, observation.dtype) == (env.observation_space(params).shape, np.float32)
+    assert reward == jax.ShapeDtypeStruct((), np.float32)
+    assert terminated == truncated == jax.ShapeDtypeStruct((), bool)
+    assert {*CAUSES, *RACE, "terminated", "truncated"} < info.keys()
 
 
 @OVER_IDS

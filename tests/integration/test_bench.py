@@ -15,6 +15,7 @@ from flytrack_bench import Data, DataError, load_policy, load_suite, results, re
 from flytrack_bench.policies import Function, Policy
 from flytrack_bench.suite import FOLDER, digest_of
 from flytrack_env.tracks import TrackError
+from tests.support.refusals import refused
 
 CENTRED = "tests.integration.test_bench:hover"
 
@@ -48,28 +49,20 @@ def test_the_suite_is_what_its_seed_draws(tmp_path):
 
 
 def test_a_result_repeats_and_is_verified_and_a_forged_one_is_not(small, tmp_path, capsys):
-    out, flags = tmp_path / "result.json", ["--policy", CENTRED, "--suite", str(small)]
-    main_exits(0, [*flags, "--out", str(out)])
+    out, command = tmp_path / "result.json", ["bench", "--policy", CENTRED, "--suite", str(small)]
+    main([*command, "--out", str(out)])
     found = json.loads(out.read_text())
     suite = load_suite(small)
     again = run(suite, [load_policy(CENTRED)], suite.tasks)
     assert {**found, "cpu_s": 0} == json.loads(json.dumps({**again, "cpu_s": 0}))
     assert all(one["success"] == 0.0 for ones in found["tasks"].values() for one in ones)
-    main_exits(0, [*flags, "--verify", str(out)])
+    main([*command, "--verify", str(out)])
     found["tasks"]["flytrack"][0] |= {"success": 1.0, "flying_lap_s": 3.9}
     out.write_text(json.dumps(found))
-    main_exits(1, [*flags, "--verify", str(out)])
+    with pytest.raises(SystemExit, match="1"):
+        main([*command, "--verify", str(out)])
     assert "flytrack, policy 0" in capsys.readouterr().out
-    main_exits(2, [*flags, "--out", str(out)])  # never overwritten
-
-
-def main_exits(code: int, arguments: list[str]) -> None:
-    found: object = 0
-    try:
-        main(["bench", *arguments])
-    except SystemExit as error:
-        found = error.code
-    assert found == code
+    refused(capsys, *command, "--out", out)  # never overwritten
 
 
 @pytest.mark.parametrize(
@@ -84,8 +77,7 @@ def main_exits(code: int, arguments: list[str]) -> None:
     ],
 )
 def test_what_cannot_be_used_is_named(flags, message, capsys):
-    main_exits(2, flags)
-    assert message in capsys.readouterr().err
+    assert message in refused(capsys, "bench", *flags)
 
 
 def test_a_changed_suite_is_refused(small, monkeypatch):

@@ -3,6 +3,7 @@
 import os
 import signal
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,14 +16,16 @@ pytest.importorskip("firmware", reason="firmware/ is in clones only")
 import flytrack_env
 from firmware import Betaflight, Body, FirmwareError, build
 from firmware.__main__ import check
-from flytrack_env.dynamics import ModelParameters, move, nominal_parameters
-from flytrack_env.effects import BetaflightLoop, effect_of, start_memories
+from flytrack_env.dynamics import ModelParameters, nominal_parameters
+from flytrack_env.effects import BetaflightLoop, effect_of
+from flytrack_env.plants import Plant, Simulator
 from flytrack_env.state import ACCELERATION, BATTERY, RATES, Action, pack, unpack, unpack_action
 from flytrack_sysid import CollectError, collect, diagnose_change, import_log, load_log, save_log
 from flytrack_sysid.excitation import script, start_state
 from flytrack_sysid.manoeuvres import hover_action
 from flytrack_sysid.script_file import script_of
 from tests.support.pages import DOCS, run_examples
+from tests.support.simulated_flights import flown_by
 
 pytestmark = [pytest.mark.slow, pytest.mark.firmware]
 
@@ -56,17 +59,9 @@ def sticks(number: int = 3, steps: int = 80) -> np.ndarray:
     return np.repeat(rng.uniform(-1, 1, (number, steps // 8, 4)), 8, axis=1).astype(np.float32)
 
 
-def fly_compiled(plant: Betaflight, rows: np.ndarray, commands: np.ndarray) -> np.ndarray:
+def fly_compiled(plant: Plant, rows: np.ndarray, commands: np.ndarray, model: Any = MODEL) -> np.ndarray:
     """Return the states (number, steps, 21) after each command, by the plant's own steps."""
-
-    def fly_one(start: jax.Array, command: jax.Array) -> Any:
-        def step(state: Any, u: jax.Array) -> Any:
-            after = plant.step(state, unpack_action(u), 0.01, MODEL)
-            return after, pack(plant.drone(after))
-
-        return jax.lax.scan(step, plant.reset(unpack(start), MODEL), command)[1]
-
-    return np.asarray(jax.jit(jax.vmap(fly_one))(rows, commands))
+    return np.asarray(jax.jit(jax.vmap(partial(flown_by, plant, model)))(rows, commands))
 
 
 def num_processes(plant: Betaflight) -> int:
@@ -248,17 +243,7 @@ def test_loop_with_the_numbers_of_the_body_flies_as_the_firmware_does(plant):
     model = known_model(plant)
     flown = script_of(script(24, hover_action(nominal_parameters()), np.random.default_rng(3)))
     expected = plant.fly(flown.starts, flown.commands)
-
-    def fly_one(start: jax.Array, commands: jax.Array) -> jax.Array:
-        drone = unpack(start)
-
-        def step(state: Any, u: jax.Array) -> Any:
-            moved = move(*state, unpack_action(u), 0.01, model)
-            return (moved.after, moved.memories), pack(moved.after)
-
-        return jax.lax.scan(step, (drone, start_memories(model.effects, drone)), commands)[1]
-
-    found = np.asarray(jax.jit(jax.vmap(fly_one))(flown.starts, flown.commands))
+    found = fly_compiled(Simulator(), flown.starts, flown.commands, model)
     off = np.sqrt(np.mean((found - expected) ** 2, axis=(0, 1))) / expected.std(axis=(0, 1))
     assert off[RATES].max() < 0.04 and off[ACCELERATION].max() < 0.08  # measured 0.03, 0.05
     away = np.linalg.norm((found - expected)[:, 99, :3], axis=-1)

@@ -10,13 +10,11 @@ import numpy as np
 import pytest
 
 from baselines.purejaxrl_ppo.monitor import count_positions, draw_position_density
+from benchmarks.champion import CHAMPION
 from flytrack.cli import main
 from flytrack_env import blackbox, load_model, load_track
 from flytrack_env.rollout import load_rollout
 from tests.support.black_boxes import SHIPPED
-from tests.support.pages import ROOT
-
-CHAMPION = next((ROOT / "baselines" / "purejaxrl_ppo" / "champion").glob("flytrack.*"))
 
 
 @pytest.mark.slow

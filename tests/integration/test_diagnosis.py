@@ -209,21 +209,15 @@ def _wind_in_hover(rng: Rng) -> Case:
     return _flown(replace(truth, effects={"wind": wind}), rng, kind="hover")
 
 
-def _changed(field: str, low: float, high: float, rng: Rng) -> Case:
+def _changed(field: str, size: float, rng: Rng) -> Case:
     """Return a plant of which the team believes an older base, flown as it is now.
 
-    low, high: range of the largest |ln factor| of the field's values; the upper half is drawn from.
+    size: |ln factor| of the field's values is at most that, and at least half of it.
     """
     believed = draw_base(rng)
-    size = float(np.exp(rng.uniform(np.log(low * high) / 2.0, np.log(high))))
-    values = np.atleast_1d(getattr(believed, field))
-    shares = rng.uniform(0.5, 1.0, len(values))
-    shares[rng.integers(len(values))] = 1.0
-    changed = [
-        float(value * np.exp(size * share * rng.choice([-1.0, 1.0])))
-        for value, share in zip(values, shares, strict=True)
-    ]
-    now = replace(believed, **{field: tuple(changed) if len(changed) > 1 else changed[0]})
+    values = np.array(getattr(believed, field))
+    shares = rng.uniform(0.5, 1.0, values.shape) * rng.choice([-1.0, 1.0], values.shape)
+    now = replace(believed, **{field: (values * np.exp(size * shares)).tolist()})
     return _flown(now, rng)._replace(believed=believed)
 
 
@@ -248,8 +242,8 @@ CASES: Mapping[str, Callable[[Rng], Case]] = {
     "training_only": _in_training_only,
     "wind_in_hover": _wind_in_hover,
     "thermal": lambda rng: _flown(replace(draw_base(rng), outside=draw_outside(rng, "position", 2.0)), rng),
-    "tau": lambda rng: _changed("tau", 0.05, 0.6, rng),
-    "mass": lambda rng: _changed("mass", 0.01, 0.2, rng),
+    "tau": lambda rng: _changed("tau", 0.6, rng),
+    "mass": lambda rng: _changed("mass", 0.2, rng),
     "simulated": _simulated,
     "stuck_gyro": lambda rng: _broken(rng, "w", 0.0),
     "stuck_commands": lambda rng: _broken(rng, "u", -0.3),

@@ -3,6 +3,7 @@
 import importlib.util
 import json
 
+import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -23,8 +24,8 @@ from flytrack_env.wrappers.domain_randomization import sample_model
 from tests.support.evaluated import FAILS_BELOW_V, Rails, run, write_checkpoint
 from tests.support.pages import ROOT
 from tests.support.recordings import Recording
+from tests.support.refusals import refused
 from tests.support.slow import slow_but
-from tests.support.trees import assert_close
 
 NUM_LAPS, NUM_STEPS, NUM_FLIGHTS = 3, 1400, 10
 TOLERANCE_S = 2e-3
@@ -58,14 +59,9 @@ def raced(on_rails, checkpoint):
         return race_many(on_rails, checkpoint.policy, start_keys(0, NUM_FLIGHTS), NUM_STEPS, NUM_LAPS)
 
 
-@pytest.fixture(scope="module")
-def paces(flights):
-    """How slow each flight on rails is; 0 where it falls."""
+def test_lap_times_are_those_of_the_rails(flights, raced):
     battery_v = np.asarray(flights.states)[:, 0, BATTERY]
-    return np.where(battery_v < FAILS_BELOW_V, 0.0, Rails.pace(battery_v))
-
-
-def test_lap_times_are_those_of_the_rails(raced, paces):
+    paces = np.where(battery_v < FAILS_BELOW_V, 0.0, Rails.pace(battery_v))  # 0 where a flight falls
     is_good = paces > 0.0
     assert 0 < is_good.sum() < NUM_FLIGHTS  # else this test would see one kind only
     np.testing.assert_array_equal(raced.is_complete(), is_good)
@@ -81,7 +77,7 @@ def test_lap_times_are_those_of_the_rails(raced, paces):
 
 def test_every_step_kept_or_not_is_the_same_flight(flights, raced):
     assert NUM_FLIGHTS % 4
-    assert_close(raced, outcomes_of(flights, NUM_LAPS, 8))
+    chex.assert_trees_all_close(raced, outcomes_of(flights, NUM_LAPS, 8), rtol=1e-5, atol=1e-5)
 
 
 @pytest.mark.parametrize("flown_by", slow_but(["black box"], ["black box", "plants"]))
@@ -107,7 +103,8 @@ def test_command_flies_many(flown_by, checkpoint_path, tmp_path, monkeypatch, ca
     assert len(load_rollout(report["ghost"])[0]) == len(states)
     if flown_by == "plants":
         single = outcomes_of(jax.tree.map(lambda leaf: leaf[None], rollout), 3, 7)
-        assert_close(jax.tree.map(lambda leaf: leaf[:1], outcomes), single)
+        first = jax.tree.map(lambda leaf: leaf[:1], outcomes)
+        chex.assert_trees_all_close(first, single, rtol=1e-5, atol=1e-5)
         assert "in the simulator, not on a black box" in text and report["black_box"] is None
         assert report["optimal"]["model"] == "nominal" and report["success"]["low"] is None
         assert report["plants"]["success"]["of"] == 3 and len(report["plants"]["by_thirds"]) == 12
@@ -184,10 +181,8 @@ def test_command_refuses_before_it_flies(arguments, messages, bad_files, monkeyp
     monkeypatch.chdir(bad_files)
     monkeypatch.setattr(evaluate, "can_record", lambda: True)
     monkeypatch.setattr(evaluate.Report, "fly", lambda _: pytest.fail("it flew"))
-    with pytest.raises(SystemExit) as ended:
-        run("--checkpoint", "policy.safetensors", "--steps", "5", *arguments)
-    error = capsys.readouterr().err
-    assert ended.value.code == 2 and all(message in error for message in messages), error
+    error = refused(capsys, "eval", "--checkpoint", "policy.safetensors", "--steps", "5", *arguments)
+    assert all(message in error for message in messages), error
     assert not (bad_files / "rollout.npy").exists()
 
 
@@ -232,6 +227,6 @@ def test_ids_that_draw_models_fly_the_one_that_is_given(checkpoint):
     ranges, given = params.wrappers[DomainRandomization.key], env.default_params.model
     found = sample_model(jnp.uint32(5), given, ranges)
     assert type(found.effects[0]) is LinearDrag and len(found.effects) == 1
-    assert_close(found._replace(tau=np.stack(found.tau)), given, 1e-6)
+    chex.assert_trees_all_close(found._replace(tau=np.stack(found.tau)), given, rtol=1e-6, atol=1e-6)
     plain = make("FlyTrackNoisy-v0").default_params
     assert race_env.with_model_as_given(plain) is plain

@@ -7,7 +7,7 @@ on, in JAX, fly as those in plain floats.
 from dataclasses import replace
 from itertools import pairwise
 
-import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
@@ -20,13 +20,13 @@ from benchmarks.hidden.plant import Plant, Start
 from benchmarks.loop.outside import SIGNALS
 from benchmarks.loop.plants import EFFECTS, draw_plant_with_law, plant_of
 from flytrack_env import nominal_parameters
-from flytrack_env.quaternion import Quaternion, Vec3
-from flytrack_env.state import Action, Drone, pack
 from flytrack_sysid.log import FlightLog
 from tests.support.handout_plant import HandoutPlant
+from tests.support.hidden_flights import LOW_START, flown_in_floats, random_sticks, state_of
+from tests.support.simulated_flights import flown_by
 from tests.support.slow import slow_but
 
-START, LOW_START = Start((1.0, -2.0, 6.0), 0.7, 23.8, -0.2), Start((1.0, -2.0, 3.0), 0.7, 23.5, -0.3)
+START = Start((1.0, -2.0, 6.0), 0.7, 23.8, -0.2)
 LOOP_STEPS = 120
 STEP_S, STEPS = 0.01, 100
 DELAY_S, LATENCY_S, MOCAP_S = 0.0137, 0.0032, 0.0246
@@ -43,13 +43,9 @@ MOVING_EFFECTS = {
     "rotor_drag": {"h": 0.02},
     "imu_latency": {"latency_s": LATENCY_S},
 }
-COLUMNS = {"p": 3, "v": 3, "q": 4, "f": 3, "w": 3, "slope": 3}
+# A thousandth of the sensors' noise or less (slopes: of 140 rad/s^2, times an arm of 0.06 m).
+FINE_ERRORS = {"p": 1e-4, "v": 1e-4, "q": 5e-5, "f": 1e-3, "w": 1e-3, "slope": 0.1}
 MINUTE_S = 60.0
-# Effect -> what it changes of the plant: force f, rates w, battery b; effects of sensors change nothing.
-RATE_EFFECTS = [name for name in hidden.NAMES if name.startswith(("rate_", "second_", "yaw_", "motor_"))]
-SENSOR_EFFECTS = [name for name in hidden.NAMES if name.startswith(("accelerometer_", "gyro_", "imu_"))]
-PLANT_EFFECTS = dict.fromkeys(hidden.NAMES, "f") | dict.fromkeys(SENSOR_EFFECTS, "")
-PLANT_EFFECTS |= dict.fromkeys(RATE_EFFECTS, "w") | {"command_delay": "fw", "voltage_sag": "fb"}
 
 
 def base(**effects: dict[str, float]) -> hidden.Truth:
@@ -60,40 +56,25 @@ def flown(truth: hidden.Truth, kind: str = "scripted", seconds: float = MINUTE_S
     return hidden.fly(truth, kind, seconds, np.random.default_rng(seed))
 
 
-def state_of(plant: Plant) -> np.ndarray:
-    """Return the handout's vector (21,) of a plant."""
-    own = (plant.pos_w, plant.vel_w, plant.acc_w, plant.quat, plant.rates_b, plant.applied)
-    return np.concatenate([*own, [plant.battery_v]])
-
-
 def open_loop(truth: hidden.Truth, count: int = 150, start: Start = START) -> dict[str, np.ndarray]:
-    """Return channels of a plant flown by random steps of the sticks."""
-    sticks = np.random.default_rng(4).uniform(-1.0, 1.0, (16, 4)) * [0.5, 0.5, 1.0, 1.0]
-    plant, rows = Plant(truth, start, np.random.default_rng(5)), []
-    for command in np.repeat(sticks, 10, axis=0)[:count].tolist():
-        plant.step(tuple(command))
-        rows.append((state_of(plant), plant.force_b, plant.rates_b, plant.battery_v))
-    columns = [np.array(column) for column in zip(*rows, strict=True)]
-    return dict(zip("xfwb", columns, strict=True)) | {"u": np.repeat(sticks, 10, axis=0)[:count]}
+    """Return what a plant does, flown by random steps of the sticks."""
+    return flown_in_floats(truth, random_sticks(count), start)
 
 
 def test_without_effects_it_is_the_handouts_plant() -> None:
     truth = base()
     handout, found = HandoutPlant(truth.tau, truth.coeffs, truth.max_rate, truth.drain), open_loop(truth)
     state = state_of(Plant(truth, START, np.random.default_rng(0)))
-    for sticks, own in zip(found["u"], found["x"], strict=True):
+    for sticks, own in zip(random_sticks(150), found["x"], strict=True):
         state = handout(state, sticks)
         np.testing.assert_allclose(own, state, rtol=1e-12, atol=1e-12)
 
 
-@pytest.mark.parametrize("name", hidden.NAMES)
-def test_each_effect_changes_its_channels_of_the_plant(name: str) -> None:
-    values = hidden.draw_effect(name, np.random.default_rng(8), hidden.EFFECTS[name].high)
+def test_ground_effect_fades_with_the_height() -> None:
+    """Near the ground; the laws that the package has, too, are compared in tests/unit/test_effect_laws.py."""
     low = START._replace(pos_w=(0.0, 0.0, 0.3))
-    own, plain = open_loop(base(**{name: values}), 60, low), open_loop(base(), 60, low)
-    assert {key for key in "fwb" if np.abs(own[key] - plain[key]).max() > 1e-6} == set(
-        PLANT_EFFECTS.get(name, "")
-    )
+    own = open_loop(base(ground_effect={"gain": 0.5, "height_m": 0.3}), 1, low)["f"]
+    np.testing.assert_allclose(own, open_loop(base(), 1, low)["f"] * [1.0, 1.0, 1.0 + 0.5 * np.exp(-1.0)])
 
 
 def test_equations_of_the_sensors() -> None:
@@ -193,25 +174,6 @@ def test_the_accelerometer_feels_gusts() -> None:
         assert 0.04 < np.std(log["w"][:, 2]) < 0.08
 
 
-def moving(**effects: dict[str, float]) -> hidden.Truth:
-    return replace(hidden.draw_base(np.random.default_rng(3)), motion="fine", effects=effects)
-
-
-def commands() -> np.ndarray:
-    sticks = np.random.default_rng(4).uniform(-1.0, 1.0, (STEPS // 10, 4)) * [0.5, 0.5, 1.0, 1.0]
-    return np.repeat(sticks, 10, axis=0)
-
-
-def felt(own: hidden.Truth) -> dict[str, np.ndarray]:
-    """Return what the plant's sensors say at the end of each step."""
-    drone, rows = Plant(own, START, np.random.default_rng(0)), []
-    for sticks in commands().tolist():
-        drone.step(tuple(sticks))
-        rows.append(np.concatenate([*drone.tracked, *drone.felt]))
-    parts = np.split(np.array(rows), np.cumsum(list(COLUMNS.values()))[:-1], axis=1)
-    return dict(zip(COLUMNS, parts, strict=True))
-
-
 def derivative(
     own: hidden.Truth, time_s: float, x: np.ndarray, stick: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -236,13 +198,13 @@ def derivative(
 
 def integrated(own: hidden.Truth) -> dict[str, np.ndarray]:
     """Return the same from DOP853, between the instants at which a command arrives or a sensor reads."""
-    sticks, rows = commands(), np.arange(STEPS + 1) * STEP_S
+    sticks, rows = random_sticks(STEPS), np.arange(STEPS + 1) * STEP_S
     felt_s, tracked_s = rows[1:] - LATENCY_S % STEP_S, rows[1:] - MOCAP_S % STEP_S
     times = np.unique(np.round([0.0, *rows, *(rows + DELAY_S), *felt_s, *tracked_s], 9))
     times = times[times <= rows[-1] + 1e-9]
     quat = [np.cos(0.35), 0.0, 0.0, np.sin(0.35)]
     x = np.concatenate([START.pos_w, np.zeros(3), quat, np.zeros(3), [START.thrust_stick], np.zeros(6)])
-    found: dict[str, list] = {name: [] for name in COLUMNS}
+    found: dict[str, list] = {name: [] for name in FINE_ERRORS}
     for begin, end in pairwise(times):
         number = int(np.floor((0.5 * (begin + end) - DELAY_S) / STEP_S))
         acting = sticks[max(number, 0)]
@@ -262,20 +224,19 @@ def integrated(own: hidden.Truth) -> dict[str, np.ndarray]:
 
 
 def test_fine_motion_obeys_the_differential_equations(monkeypatch: pytest.MonkeyPatch) -> None:
-    own = replace(moving(**MOVING_EFFECTS), mocap_late_s=MOCAP_S)
+    own = replace(base(**MOVING_EFFECTS), motion="fine", mocap_late_s=MOCAP_S)
     exact = integrated(own)
 
     def errors() -> dict[str, float]:
-        return {name: float(np.abs(values - exact[name]).max()) for name, values in felt(own).items()}
+        seen = open_loop(own, STEPS)
+        assert np.abs(np.linalg.norm(seen["q"], axis=1) - 1.0).max() < 1e-12
+        return {name: float(np.abs(seen[name] - values).max()) for name, values in exact.items()}
 
     found = errors()
-    assert np.abs(np.linalg.norm(felt(own)["q"], axis=1) - 1.0).max() < 1e-12
-    # A thousandth of the sensors' noise or less (slopes: of 140 rad/s^2, times an arm of 0.06 m).
-    most = {"p": 1e-4, "v": 1e-4, "q": 5e-5, "f": 1e-3, "w": 1e-3, "slope": 0.1}
-    assert all(found[name] < bound for name, bound in most.items()), found
+    assert all(found[name] < bound for name, bound in FINE_ERRORS.items()), found
     monkeypatch.setattr(plant, "LONGEST_PART_S", 0.5 * plant.LONGEST_PART_S)
     halved = errors()
-    assert all(found[name] > 3.0 * halved[name] for name in COLUMNS), (found, halved)
+    assert all(found[name] > 3.0 * halved[name] for name in exact), (found, halved)
 
 
 @pytest.mark.parametrize("motion", hidden.MOTIONS)
@@ -297,33 +258,14 @@ def test_late_motion_capture_and_effects_that_begin_in_the_log(motion: str) -> N
     assert with_onset.time[np.argmax(begun)] == pytest.approx(sudden.onset_s, abs=0.02)
 
 
-def flown_in_floats(truth: hidden.Truth, commands: np.ndarray) -> np.ndarray:
-    plant, states = Plant(truth, LOW_START, np.random.default_rng(0)), []
-    for command in commands:
-        plant.step(tuple(map(float, command)))
-        states.append(state_of(plant))
-    return np.array(states)
-
-
-def flown_in_jax(truth: hidden.Truth, commands: np.ndarray) -> np.ndarray:
-    plant, zero = plant_of(truth), Vec3(0.0, 0.0, 0.0)
-    sag_v = truth.effects.get("voltage_sag", {}).get("at_full_v", 0.0) * 0.35**2
-    quat = Quaternion(np.cos(0.35), 0.0, 0.0, np.sin(0.35))
-    drone = Drone(Vec3(*LOW_START.pos_w), zero, zero, quat, zero, Action(0.0, 0.0, 0.0, -0.3), 23.5 - sag_v)
-
-    def step(state, command):
-        state = plant.step(state, Action(*command), 0.01, nominal_parameters())
-        return state, pack(plant.drone(state))
-
-    return np.asarray(jax.lax.scan(step, plant.reset(drone, nominal_parameters()), commands)[1])
-
-
 def check_flight(truth: hidden.Truth, without: hidden.Truth | None, rng: np.random.Generator) -> None:
     """Compare both flights; that without what is tested, if any, has to differ."""
     commands = np.repeat(rng.uniform(-1.0, 1.0, (LOOP_STEPS // 4, 4)), 4, axis=0).astype(np.float32)
-    expected, found = flown_in_floats(truth, commands), flown_in_jax(truth, commands)
+    expected = flown_in_floats(truth, commands)["x"]
+    start = jnp.asarray(state_of(Plant(truth, LOW_START, rng)), jnp.float32)
+    found = flown_by(plant_of(truth), nominal_parameters(), start, commands)
     np.testing.assert_allclose(found, expected, rtol=2e-4, atol=2e-4)
-    assert without is None or np.abs(expected - flown_in_floats(without, commands)).max() > 1e-3
+    assert without is None or np.abs(expected - flown_in_floats(without, commands)["x"]).max() > 1e-3
 
 
 @pytest.mark.parametrize("names", slow_but([(), EFFECTS], [(), EFFECTS, *((name,) for name in EFFECTS)]))

@@ -10,7 +10,6 @@ from baselines.purejaxrl_ppo.flights import Score, fly_many
 from baselines.purejaxrl_ppo.race_env import plant_env
 from benchmarks.champion import CHAMPION
 from benchmarks.loop.plants import draw_plant, plant_of
-from flytrack.cli import main
 from flytrack_env import blackbox, nominal_parameters
 from flytrack_loop import Gap, errors_of
 from flytrack_loop.stages import log_of_flights, measure_gap
@@ -79,17 +78,3 @@ def test_a_policy_without_laps_has_no_gap():
     crashed, flown = Score(0.0, 1.0, math.nan, math.nan), Score(1.0, 24.0, 4.0, 4.0)
     assert math.isnan(Gap(flown, crashed).lap_percent)
     assert Gap(flown, flown._replace(flying_lap_s=4.04)).lap_percent == pytest.approx(1.0)
-
-
-def test_the_command_refuses_what_it_cannot_use(tmp_path, capsys):
-    for flags, message in (
-        (["--black-box", str(tmp_path / "none.bin")], "No such file or directory"),
-        (["--black-box", str(blackbox.SHIPPED), "--total-timesteps", "10"], "total_timesteps: found 10"),
-        (["--black-box", str(blackbox.SHIPPED), "--noise", "-1"], "noise: found -1"),
-        (["--black-box", str(blackbox.SHIPPED), "--minutes", "0"], "minutes: found 0"),
-        (["--black-box", "any.bin", "--plant", "betaflight"], "--plant: found --black-box as well"),
-        (["--black-box", str(blackbox.SHIPPED), "--body", "x"], "expected with --plant betaflight only"),
-    ):
-        with pytest.raises(SystemExit, match="2"):
-            main(["loop", *flags, "--out", str(tmp_path / "out")])
-        assert message in capsys.readouterr().err

@@ -16,6 +16,7 @@ from flytrack_env import load_model, load_provenance, save_model
 from flytrack_env.dynamics import nominal_parameters
 from flytrack_sysid import collect, load_log, save_log
 from tests.support.black_boxes import AIRLESS, SHIPPED
+from tests.support.refusals import refused
 
 TAUS = (0.02, 0.05, 0.07, 0.03)
 THRUST = (-7.0, -3.0, 3.0, -1.0, 0.9, 0.9)
@@ -35,14 +36,6 @@ def folder(tmp_path_factory) -> Path:
     run("fit", out / "data.npz", "--out", out / "model.json")
     run("validate", out / "model.json", out / "data.npz", "--out", out / "report")
     return out
-
-
-def refused(capsys, *arguments: object) -> str:
-    """Run a command that must be refused and return its message."""
-    with pytest.raises(SystemExit) as stopped:
-        run(*arguments)
-    assert stopped.value.code == 2
-    return capsys.readouterr().err
 
 
 def test_artifact_of_other_parameters_is_identified_and_flies(folder):
@@ -153,15 +146,11 @@ def test_fit_and_validate_refuse(folder, capsys, tmp_path, monkeypatch, change, 
 
 
 @pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"split": {"held_out_every": "x"}}, "held_out_every: found 'x'"),
-        ({"split": {"held_out_every": 0}}, "validate it on another log"),
-    ],
+    ("every", "message"), [("x", "held_out_every: found 'x'"), (0, "validate it on another log")]
 )
-def test_validate_refuses_model_files(folder, capsys, tmp_path, change, message):
+def test_validate_refuses_model_files(folder, capsys, tmp_path, every, message):
     document = json.loads((folder / "model.json").read_text())
-    (document["provenance"] if "split" in change else document).update(change)
+    document["provenance"]["split"] = {"held_out_every": every}
     path = tmp_path / "changed.json"
     path.write_text(json.dumps(document))
     assert message in refused(capsys, "validate", path, folder / "data.npz", "--out", tmp_path / "report")

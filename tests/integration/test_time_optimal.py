@@ -14,9 +14,9 @@ from flytrack_env import available_tracks, load_track, nominal_parameters, refer
 from flytrack_env.dynamics import step
 from flytrack_env.effects import EFFECTS
 from flytrack_env.state import BATTERY, POSITION, QUATERNION, STATE_SIZE, VELOCITY
+from tests.support.slow import slow_but
 
 SHIPPED = sorted(references.FOLDER.glob("*.npz"))
-RADIUS_M = 0.15
 EXACT = 1e-6  # of the simulator in float64
 
 
@@ -56,14 +56,10 @@ def test_every_track_has_its_references() -> None:
 
 
 # A program per number of gates and model: one of them in every run.
-FAST = "flytrack_nominal"
-REPLAYED = [
-    pytest.param(path, id=path.stem, marks=[] if path.stem.startswith(FAST) else pytest.mark.slow)
-    for path in SHIPPED
-]
+FAST = [path for path in SHIPPED if path.stem.startswith("flytrack_nominal")]
 
 
-@pytest.mark.parametrize("path", REPLAYED)
+@pytest.mark.parametrize("path", slow_but(FAST, SHIPPED), ids=lambda path: path.stem)
 def test_its_commands_fly_in_the_simulator(path: Path) -> None:
     found = references.load_reference(path)
     track = load_track(found.track)

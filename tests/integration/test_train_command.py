@@ -29,15 +29,6 @@ def call(*arguments):
     return caught.value.code
 
 
-@pytest.fixture(scope="module")
-def seeds(tmp_path_factory):
-    """A folder of seed 3, complete, and of seed 4, which has not begun."""
-    out = tmp_path_factory.mktemp("seeds")
-    options = EVERY_OTHER_UPDATE._replace(evaluation_episodes=7, seeds=SEEDS)
-    make_trainer().train(out / "seed3", SEED, options)
-    return out
-
-
 def test_flags_override_the_file_and_the_file_the_defaults(tmp_path):
     path = tmp_path / "run.toml"
     path.write_text("total_timesteps = 2e7\nlearning_rate = 1e-3\nhidden_sizes = [32, 32]\n")
@@ -108,9 +99,11 @@ def test_a_checkpoint_that_cannot_be_resumed_is_named(whole, tmp_path, changes, 
 
 
 @pytest.mark.slow
-def test_a_folder_of_seeds_is_resumed_with_those_that_had_not_begun(seeds, tmp_path):
-    moved = tmp_path / "moved"
-    shutil.copytree(seeds, moved)
+def test_a_folder_of_seeds_is_resumed_with_those_that_had_not_begun(tmp_path):
+    """Of seed 3, which is complete, and of seed 4, which has not begun; in another folder by then."""
+    options, moved = EVERY_OTHER_UPDATE._replace(evaluation_episodes=7, seeds=SEEDS), tmp_path / "moved"
+    make_trainer().train(tmp_path / "here" / "seed3", SEED, options)
+    (tmp_path / "here").rename(moved)
     first, second = tasks_of("--resume", moved)
     assert (first.seed, first.start.path) == (3, moved / "seed3" / "final.safetensors")
     assert (second.seed, second.out, second.start) == (4, moved / "seed4", None)

@@ -12,10 +12,10 @@ from jax import export
 from blackbox.plant import PlantParameters
 from flytrack_env import blackbox
 from flytrack_env.state import APPLIED_ACTION, BATTERY, QUATERNION, VELOCITY
+from tests.support.handout_plant import GRAVITY
+from tests.support.pages import ROOT
 
-ROOT = Path(__file__).resolve().parents[2]
 SHIPPED = ROOT / "blackbox" / "acro_step.bin"
-GRAVITY = 9.80665
 # Put together, so that this file passes its own search for the word.
 FORBIDDEN = "_".join(("hidden", "parameters"))
 

@@ -5,6 +5,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from baselines.purejaxrl_ppo import Config
 from baselines.purejaxrl_ppo.checkpoint import describe_run, save_checkpoint
@@ -36,7 +37,12 @@ class Rails(Plant):
     """
 
     def __init__(self) -> None:
-        self.references = [shipped_reference("flytrack", kind) for kind in ("standing", "flying")]
+        standing, flying = (shipped_reference("flytrack", kind) for kind in ("standing", "flying"))
+        laps = (standing, flying, flying, flying)
+        ends_s = np.cumsum([lap.time_s for lap in laps])
+        own_s = [lap.dt_s * np.arange(len(lap.commands)) - lap.time_s for lap in laps]
+        self.time_s = np.concatenate([end + times for end, times in zip(ends_s, own_s, strict=True)])
+        self.positions = np.concatenate([lap.states[:-1, POSITION] for lap in laps])
 
     @staticmethod
     def pace(battery_v: Any) -> Any:
@@ -44,20 +50,8 @@ class Rails(Plant):
         return 1.0 + SLOWER_PER_V * (BATTERY_FULL_V - battery_v)
 
     def _at(self, drone: Drone, time_s: jax.Array) -> Drone:
-        standing, flying = self.references
         own_s = time_s / self.pace(drone.battery_v)
-        lap_s = (own_s - standing.time_s) % flying.time_s
-
-        def position(reference: Any, at_s: jax.Array) -> jax.Array:
-            """Return where the reference is, (3,): straight lines between its samples."""
-            table = jnp.asarray(reference.states[:, POSITION], jnp.float32)
-            sample = jnp.clip(at_s / reference.dt_s, 0.0, len(table) - 1.001)
-            before = sample.astype(int)
-            part = sample - before
-            return (1.0 - part) * table[before] + part * table[before + 1]
-
-        is_start = own_s < standing.time_s
-        pos_w = Vec3(*jnp.where(is_start, position(standing, own_s), position(flying, lap_s)))
+        pos_w = Vec3(*(jnp.interp(own_s, self.time_s, axis) for axis in self.positions.T))
         is_falling = (drone.battery_v < FAILS_BELOW_V) & (time_s > FAILS_AT_S)
         return drone._replace(pos_w=pos_w._replace(z=jnp.where(is_falling, -1.0, pos_w.z)))
 
@@ -75,14 +69,20 @@ class Rails(Plant):
         return state.drone
 
 
-def write_checkpoint(path: Path) -> Path:
+def write_checkpoint(
+    path: Path,
+    env_id: str = "FlyTrackRandomized-v0",
+    track: str = "flytrack",
+    hidden_sizes: tuple[int, ...] = (8,),
+) -> Path:
     """Write a policy that has learned nothing, with all that a checkpoint tells."""
-    env_id = "FlyTrackRandomized-v0"
-    env = make(env_id, model=nominal_parameters().with_effects(LinearDrag(0.3, 0.3, 0.1)))
-    config = Config(hidden_sizes=(8,))
+    env = make(env_id, track=track, model=nominal_parameters().with_effects(LinearDrag(0.3, 0.3, 0.1)))
+    config = Config(hidden_sizes=hidden_sizes)
     size = env.observation_space().shape[0]
-    params = make_network(config).init(jax.random.key(0), jnp.zeros((1, size)))
-    save_checkpoint(path, params, config, describe_run(env, env_id, "flytrack", config, seed=0))
+    params = make_network(config).init(jax.random.key(5), jnp.zeros((1, size)))
+    uneven = jax.tree.map(lambda leaf: 0.1 * jnp.cos(jnp.arange(leaf.size)).reshape(leaf.shape), params)
+    params = jax.tree.map(jnp.add, params, uneven)
+    save_checkpoint(path, params, config, describe_run(env, env_id, track, config, seed=0))
     return path
 
 

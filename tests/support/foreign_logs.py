@@ -3,6 +3,7 @@
 import json
 import struct
 import zlib
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -162,20 +163,27 @@ def usd() -> bytes:
     return usd_log({"fixedFrequency": (variables, rows), "battery": ({"pm.vbat": "H"}, slow)})
 
 
-def save_bag(path: Path) -> None:
-    """Write a small MCAP file of JSON messages that the mapping "bag" fits."""
+def save_messages(path: Path, messages: Iterable[tuple[str, int, Any]]) -> None:
+    """Write an MCAP file of JSON messages: topic, time in ns, and content."""
     from mcap.writer import Writer
 
     with path.open("wb") as file:
-        writer = Writer(file)
+        writer, topics = Writer(file), {}
         writer.start()
-        channel = writer.register_channel(
-            "/flight", "json", writer.register_schema("any", "jsonschema", b"{}")
-        )
-        for row in range(NUM_ROWS):
-            content = {"u": [0.5, -0.25, 0.1, 0.3], "w": {"x": 0.1 * row, "y": 0.0, "z": -0.1}}
-            writer.add_message(channel, row * 10**7, json.dumps(content).encode(), row * 10**7)
+        schema = writer.register_schema("any", "jsonschema", b"{}")
+        for topic, time_ns, content in messages:
+            if topic not in topics:
+                topics[topic] = writer.register_channel(topic, "json", schema)
+            data = json.dumps(content, default=np.ndarray.tolist).encode()
+            writer.add_message(topics[topic], time_ns, data, time_ns)
         writer.finish()
+
+
+def save_bag(path: Path) -> None:
+    """Write a small MCAP file that the mapping "bag" fits."""
+    rates = ({"x": 0.1 * row, "y": 0.0, "z": -0.1} for row in range(NUM_ROWS))
+    contents = ({"u": [0.5, -0.25, 0.1, 0.3], "w": rate} for rate in rates)
+    save_messages(path, (("/flight", row * 10**7, content) for row, content in enumerate(contents)))
 
 
 def ulog(tables: dict[str, tuple[list, list]] | None = None, parameters: Any = PARAMETERS) -> bytes:

@@ -4,8 +4,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from flytrack_sysid import FlightLog
-
-GRAVITY = 9.80665
+from tests.support.handout_plant import GRAVITY
 
 
 def motion(seed: int, time: np.ndarray) -> np.ndarray:

@@ -5,7 +5,8 @@ from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).parents[2]
+from tests.support.pages import ROOT
+
 VARIABLE = "FLYTRACK_SHARED_DATA"
 CRAZYFLIE, BETAFLIGHT = "crazyflie_rate_flights", "betaflight_acro_log"
 

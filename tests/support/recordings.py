@@ -24,7 +24,6 @@ class Recording:
         missing = "this rerun-sdk has no reader (rerun.chunk)"
         reader = pytest.importorskip("rerun.chunk", reason=missing).RrdReader(path)
         (entry,) = reader.recordings()
-        self.path = path
         self.app_id = entry.application_id
         self.static: dict[tuple[str, str], list] = defaultdict(list)
         self.rows: dict[tuple[str, str], list] = defaultdict(list)

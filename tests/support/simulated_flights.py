@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from flytrack_env.dynamics import ModelParameters, move, nominal_parameters, read_sensors, sensed
 from flytrack_env.effects import EFFECTS, MOST_STEPS
-from flytrack_env.plants import Simulator, SimulatorState
+from flytrack_env.plants import Plant, Simulator, SimulatorState
 from flytrack_env.state import BATTERY, QUATERNION, Action, Drone, pack, unpack, unpack_action
 
 DT, NUM_STEPS = 0.01, 200
@@ -46,6 +46,16 @@ def flown(
     padded[: len(commands)] = commands
     padded[len(commands) :] = commands[-1]
     return np.asarray(fly(drone_with() if drone is None else drone, padded, full), float)[: len(commands)]
+
+
+def flown_by(plant: Plant, model: ModelParameters, start: jax.Array, commands: jax.Array) -> jax.Array:
+    """Return a plant's packed states after each command, (num_steps, 21)."""
+
+    def one(state: Any, action: jax.Array) -> tuple[Any, jax.Array]:
+        after = plant.step(state, unpack_action(action), DT, model)
+        return after, pack(plant.drone(after))
+
+    return jax.lax.scan(one, plant.reset(unpack(start), model), commands)[1]
 
 
 def held(num_steps: int = 1, **sticks: float) -> np.ndarray:

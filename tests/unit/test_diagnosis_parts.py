@@ -6,10 +6,10 @@ from types import SimpleNamespace
 import jax
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
 from benchmarks.diagnosis import model_of
-from benchmarks.hidden import draw_base, fly, measure
 from flytrack_env.effects import CommandDelay, LinearDrag, SecondOrderRates
 from flytrack_sysid.diagnosis import DiagnosisError, diagnose, joined, vetoes
 from flytrack_sysid.diagnosis import noise as noises
@@ -26,6 +26,7 @@ from flytrack_sysid.diagnosis.vetoes import Selection
 from flytrack_sysid.parameters import THRUST_COEFFS
 from flytrack_sysid.record import make_record
 from flytrack_sysid.residuals import predict_rows
+from tests.support.hidden_flights import scripted
 
 SECONDS, DT_S = 40.0, 0.01
 RATE = 100  # rows a second
@@ -41,9 +42,7 @@ CAUSE = Cause("rate_scale", (), "rates", {}, 100.0, 30.0, 100.0, 90.0)
 @pytest.fixture(scope="module")
 def flown():
     """A hidden plant without effects, and what its sensors log."""
-    rng = np.random.default_rng(3)
-    truth = draw_base(rng)
-    return truth, measure(fly(truth, "scripted", SECONDS, rng), "sensors", rng)
+    return scripted(3, SECONDS)
 
 
 @pytest.fixture(scope="module")
@@ -69,24 +68,12 @@ def disturbed(lanes):
     rng, keep = np.random.default_rng(4), np.exp(-DT_S / TAU_S)
     count = 1 + int(lanes.row.max())
     fresh = rng.standard_normal((count, NUM_AXES))
-    acting = [fresh[0]]
-    for row in fresh[1:]:
-        acting.append(keep * acting[-1] + np.sqrt(1.0 - keep**2) * row)
-    acting = DISTURBANCE * np.array(acting)
+    acting = DISTURBANCE * lfilter([np.sqrt(1.0 - keep**2)], [1.0, -keep], fresh, axis=0)
     walk = WANDER * np.sqrt(DT_S) * rng.standard_normal((count, NUM_AXES))
     level = np.cumsum(acting * DT_S + walk, axis=0) + LEVEL * rng.standard_normal((count, NUM_AXES))
     direct = acting + DIRECT * rng.standard_normal((count, NUM_AXES))
     series = np.stack([direct, np.diff(level, axis=0, prepend=level[:1])], axis=-1)
     return series[lanes.row] * lanes.is_joined[..., None, None]
-
-
-def whitened(lanes, left, noise: noises.Noise) -> np.ndarray:
-    """Return innovations; not a number where nothing counts."""
-    with jax.enable_x64(True):
-        gains = noises.make_gains(noise, noises.step_to(lanes), lanes.is_known, lanes.counts)
-        found = np.array(noises.innovations(gains, left, lanes.counts))
-    found[~lanes.counts] = np.nan
-    return found
 
 
 def correlation(first: np.ndarray, second: np.ndarray) -> np.ndarray:
@@ -98,7 +85,10 @@ def correlation(first: np.ndarray, second: np.ndarray) -> np.ndarray:
 def test_innovations_are_white_and_of_variance_one(lanes, disturbed):
     ones = np.ones(NUM_AXES)
     noise = noises.Noise(DIRECT, LEVEL, WANDER, DISTURBANCE, TAU_S * ones, ones)  # that they were made of
-    found = whitened(lanes, disturbed, noise)
+    with jax.enable_x64(True):
+        gains = noises.make_gains(noise, noises.step_to(lanes), lanes.is_known, lanes.counts)
+        found = np.array(noises.innovations(gains, disturbed, lanes.counts))
+    found[~lanes.counts] = np.nan
     counting = lanes.counts.any(axis=(0, 1))
     assert counting.sum() == 2 * NUM_AXES - 1
     sigmas = 5.0 / np.sqrt(lanes.counts.sum(axis=(0, 1))[counting])
@@ -212,9 +202,7 @@ def test_logs_are_joined_by_what_they_all_have_with_a_warning(flown):
 @pytest.mark.slow
 def test_a_force_may_be_a_law_whose_channels_the_log_lacks():
     """Without velocity and attitude, drag of forward flight would look like a thrust that is tilted."""
-    rng = np.random.default_rng(4)
-    truth = replace(draw_base(rng), effects={"thrust_tilt": {"towards_x": 0.1, "towards_y": 0.0}})
-    log = measure(fly(truth, "scripted", 20.0, rng), "sensors", rng)
+    truth, log = scripted(4, 20.0, effects={"thrust_tilt": {"towards_x": 0.1, "towards_y": 0.0}})
     blind = diagnose(log.without("p", "v", "q"), model_of(truth))
     (cause,) = blind.causes
     assert cause.effect == "thrust_tilt" and {"linear_drag", "wind"} <= {*cause.equivalent}
@@ -223,9 +211,7 @@ def test_a_force_may_be_a_law_whose_channels_the_log_lacks():
 
 @pytest.mark.slow
 def test_a_sensor_farther_off_than_any_on_the_list_is_told_and_not_named():
-    rng = np.random.default_rng(6)
-    truth = draw_base(rng)
-    log = measure(fly(truth, "scripted", 20.0, rng), "sensors", rng)
+    truth, log = scripted(6, 20.0)
     off = log["f"] + np.array([2.5, 0.0, 0.0])
     found = diagnose(replace(log, channels={**log.channels, "f": off}), model_of(truth))
     (cause,) = found.beyond

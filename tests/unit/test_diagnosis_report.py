@@ -5,10 +5,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
 from benchmarks.diagnosis import model_of
-from benchmarks.hidden import draw_base, fly, measure
+from benchmarks.hidden import measure
 from flytrack_env.dynamics import ModelParameters
 from flytrack_env.effects import EFFECTS, AccelerometerBias, LinearDrag
 from flytrack_sysid.diagnosis import report, summary
@@ -28,6 +29,8 @@ from flytrack_sysid.diagnosis.result import (
 from flytrack_sysid.diagnosis.score_test import BASE_CAUSES
 from flytrack_sysid.diagnosis.traces import REGRESSORS, traces
 from flytrack_sysid.parameters import names_of, to_vector, with_values
+from tests.contract.test_effects import inside_ranges
+from tests.support.hidden_flights import scripted
 
 SECONDS, DT_S = 12.0, 0.01
 SETTLED = 150  # rows until a start is forgotten
@@ -37,25 +40,14 @@ DRAG = LinearDrag(0.3, 0.4, 0.1)
 @pytest.fixture(scope="module")
 def flown():
     """A hidden plant with drag, and the clean log of its flight."""
-    rng = np.random.default_rng(5)
-    truth = replace(draw_base(rng), effects={"linear_drag": DRAG._asdict()})
-    return model_of(truth), measure(fly(truth, "scripted", SECONDS, rng), "none", rng)
+    truth, log = scripted(5, SECONDS, "none", effects={"linear_drag": DRAG._asdict()})
+    return model_of(truth), log
 
 
 @pytest.fixture(scope="module")
 def measured(flown):
     """The same log as sensors would have written it."""
-    rng = np.random.default_rng(6)
-    return measure(flown[1], "sensors", rng)
-
-
-def lagged(log, tau: np.ndarray) -> np.ndarray:
-    """Return the commands of an evenly spaced log behind first-order lags, (num_rows, 4)."""
-    keep = np.exp(-DT_S / tau)
-    found = [log["u"][0]]
-    for command in log["u"][:-1]:
-        found.append(keep * found[-1] + (1.0 - keep) * command)
-    return np.array(found)
+    return measure(flown[1], "sensors", np.random.default_rng(6))
 
 
 def test_pictures_of_a_cause_that_begins_in_flight_show_the_part_in_which_it_acts(flown):
@@ -79,7 +71,8 @@ def test_residuals_are_measured_minus_modelled(flown):
         LinearDrag(0.1, 0.2, 0.0)
     )
     found = traces(log, {"right": base.with_effects(DRAG), "wrong": wrong}, like="wrong")
-    applied = lagged(log, wrong.tau)
+    columns = zip(np.exp(-DT_S / wrong.tau), log["u"].T, strict=True)
+    applied = np.stack([lfilter([0.0, 1.0 - keep], [1.0, -keep], u) for keep, u in columns], axis=1)
     quat = Rotation.from_quat(log["q"], scalar_first=True)
     airspeed_b = quat.inv().apply(log["v"])[:-1]
     stick, volt, coeffs = applied[1:, 3], log["v_bat"][:-1, 0], wrong.thrust_coeffs
@@ -109,11 +102,7 @@ def shown(model: ModelParameters, cause: str) -> ModelParameters:
         values = dict(zip(names_of(model), to_vector(model), strict=True))
         return with_values(model, {name: 1.4 * values[name] for name in BASE_CAUSES[cause]})
     effect = next(effect for effect in EFFECTS if effect.name == cause)
-    if effect.respond is not None:  # far from neutral, no loop is stable
-        return model.with_effects(effect.parameters(20.0, 20.0, 2.0, 2.0))
-    return model.with_effects(
-        effect.parameters(**{name: 0.9 * one.high for name, one in effect.ranges.items()})
-    )
+    return model.with_effects(inside_ranges(effect, 0.9))
 
 
 def test_every_cause_has_a_plot_in_which_it_shows(flown):

@@ -8,25 +8,18 @@ import numpy as np
 import pytest
 from jax.flatten_util import ravel_pytree
 
-from flytrack_env.dynamics import ModelParameters, collective_thrust, nominal_parameters, step
+from flytrack_env.dynamics import ModelParameters, collective_thrust, step
 from tests.support.handout_plant import HandoutPlant
+from tests.support.simulated_flights import NOMINAL, drone_with, fly
 
-START = np.array([0, 0, 0, 0, 0, 0, 0, 0, 0, 1, 0, 0, 0, 0, 0, 0, 0, 0, 0, -1, 24], float)
-DTS = (0.0005, 0.002, 0.01, 0.05)
-NUM_CASES = 64
-
-
-def double_parameters(**fields: Any) -> ModelParameters:
-    """Return the nominal parameters in double precision, uneven, with some fields replaced."""
-    uneven = ModelParameters(
-        tau=np.array([0.03, 0.05, 0.08, 0.02]),
-        thrust_coeffs=np.array([-9.0, -6.0, 3.1, 0.4, 0.9, 1.1]),
-        max_rate=np.array([600.0, 500.0, 130.0]),
-        m=1.2,
-        g=9.81,
-        battery_drain_v_per_min=1.3,
-    )
-    return uneven._replace(**fields)
+UNEVEN = ModelParameters(
+    tau=np.array([0.03, 0.05, 0.08, 0.02]),
+    thrust_coeffs=np.array([-9.0, -6.0, 3.1, 0.4, 0.9, 1.1]),
+    max_rate=np.array([600.0, 500.0, 130.0]),
+    m=1.2,
+    g=9.81,
+    battery_drain_v_per_min=1.3,
+)
 
 
 def random_cases(count: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
@@ -43,50 +36,31 @@ def random_cases(count: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
 step_all = jax.jit(jax.vmap(step, in_axes=(0, 0, None, None)))
 
 
-@jax.jit
-def fly(x: jax.Array, actions: jax.Array, dt: float, params: ModelParameters) -> jax.Array:
-    """Return the states after each of T held actions (T, 4)."""
-
-    def one(x: jax.Array, u: jax.Array) -> tuple[jax.Array, jax.Array]:
-        x = step(x, u, dt, params)
-        return x, x
-
-    return jax.lax.scan(one, x, actions)[1]
-
-
 def test_nominal_drone_has_no_thrust_at_minus_one_and_the_stated_maximum() -> None:
-    model = nominal_parameters()
-    weight = model.m * model.g
+    weight = NOMINAL.m * NOMINAL.g
     for volt, ratio in ((24.0, 3.5), (22.0, 3.1)):
-        assert collective_thrust(-1.0, volt, model.thrust_coeffs) == pytest.approx(0.0, abs=1e-4)
-        full = collective_thrust(1.0, volt, model.thrust_coeffs) / weight
+        assert collective_thrust(-1.0, volt, NOMINAL.thrust_coeffs) == pytest.approx(0.0, abs=1e-4)
+        full = collective_thrust(1.0, volt, NOMINAL.thrust_coeffs) / weight
         assert full == pytest.approx(ratio, abs=0.1)
-    np.testing.assert_array_equal(model.max_rate, [618.0, 618.0, 120.0])
-    assert (model.m, model.g, model.battery_drain_v_per_min) == (1.0, 9.80665, 1.0)
 
 
-@pytest.mark.parametrize("dt", DTS)
+@pytest.mark.parametrize("dt", [0.0005, 0.002, 0.01, 0.05])
 def test_agrees_with_the_handouts_equations(dt: float) -> None:
-    params = double_parameters()
-    x, u = random_cases(NUM_CASES)
-    plant = HandoutPlant(
-        params.tau,
-        params.thrust_coeffs / params.m,
-        params.max_rate,
-        params.battery_drain_v_per_min,
-        gravity=params.g,
-    )
+    x, u = random_cases(64)
+    coeffs = UNEVEN.thrust_coeffs / UNEVEN.m
+    drain = UNEVEN.battery_drain_v_per_min
+    plant = HandoutPlant(UNEVEN.tau, coeffs, UNEVEN.max_rate, drain, gravity=UNEVEN.g)
     expected = plant(x, u, dt)
     with jax.enable_x64(True):
-        np.testing.assert_allclose(step_all(x, u, dt, params), expected, rtol=1e-12, atol=1e-12)
-    single = step_all(jnp.asarray(x), jnp.asarray(u), dt, params)
+        np.testing.assert_allclose(step_all(x, u, dt, UNEVEN), expected, rtol=1e-12, atol=1e-12)
+    single = step_all(jnp.asarray(x), jnp.asarray(u), dt, UNEVEN)
     assert single.dtype == jnp.float32
     np.testing.assert_allclose(single, expected, rtol=2e-5, atol=2e-5)
 
 
 def test_quaternion_stays_unit_over_ten_thousand_random_steps() -> None:
     actions = np.random.default_rng(3).uniform(-1.0, 1.0, (10_000, 4)).astype(np.float32)
-    x = fly(START.astype(np.float32), actions, 0.01, nominal_parameters())
+    x = np.asarray(fly(drone_with(), actions, NOMINAL))
     np.testing.assert_allclose(np.linalg.norm(x[:, 9:13], axis=1), 1.0, atol=1e-6)
     assert np.isfinite(x).all()
 
@@ -94,7 +68,7 @@ def test_quaternion_stays_unit_over_ten_thousand_random_steps() -> None:
 @pytest.mark.parametrize("differentiate", [jax.jacfwd, jax.jacrev])
 def test_gradients_equal_finite_differences(differentiate: Any) -> None:
     with jax.enable_x64(True):
-        flat, unravel = ravel_pytree(double_parameters())
+        flat, unravel = ravel_pytree(UNEVEN)
 
         @jax.jit
         def packed(vector: jax.Array) -> jax.Array:
@@ -115,4 +89,4 @@ def test_gradients_equal_finite_differences(differentiate: Any) -> None:
 @pytest.mark.parametrize(("x_shape", "u_shape", "name"), [((20,), (4,), "x"), ((21,), (3,), "action")])
 def test_wrong_shapes_are_refused(x_shape: tuple[int, ...], u_shape: tuple[int, ...], name: str) -> None:
     with pytest.raises(ValueError, match=rf"^{name}: found shape .* expected"):
-        step(np.zeros(x_shape), np.zeros(u_shape), 0.01, nominal_parameters())
+        step(np.zeros(x_shape), np.zeros(u_shape), 0.01, NOMINAL)

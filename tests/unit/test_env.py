@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -14,12 +15,9 @@ from flytrack_env.model_file import ModelFileError
 from flytrack_env.observations import OBSERVATION, OBSERVATION_SIZE
 from flytrack_env.state import Action, pack
 from flytrack_env.tracks import TrackError, load_track
+from tests.contract.test_registration import CAUSES, RACE
 from tests.support.coasting import drone_at
-from tests.support.trees import assert_close, stack
-from tests.support.wrapped_flights import NUM_ENVS, arrays, fly, steps_of
-
-CAUSES = ("crash", "ground", "out_of_bounds", "missed_gate", "battery_empty")
-RACE = {"gates_passed", "laps", "lap_completed", "lap_time_s", "gate_distance_m"}
+from tests.support.wrapped_flights import ENDS, NUM_ENVS, arrays, before_ends, fly, steps_of
 
 
 @pytest.fixture(scope="module")
@@ -32,25 +30,7 @@ def flight(env):
     return fly(env, actions=actions)
 
 
-def assert_begun(done, states):
-    """Assert that ended episodes have begun again, with nothing counted yet."""
-    race = states.race
-    for leaf in (states.time, race.gates_passed, race.laps, race.lap_start_s, race.lap_time_s):
-        assert not np.asarray(leaf)[done].any()
-
-
 # --- The protocol -------------------------------------------------------------------------------
-
-
-def test_step_returns_values_of_the_stated_types(flight):
-    shape = flight.rewards.shape
-    for observation in (flight.observations, flight.info["final_observation"]):
-        assert observation.shape == (*shape, OBSERVATION_SIZE) and observation.dtype == jnp.float32
-    assert flight.rewards.dtype == jnp.float32
-    assert flight.terminated.dtype == flight.truncated.dtype == jnp.bool_
-    assert set(flight.info) == {*CAUSES, *RACE, "terminated", "truncated", "final_observation"}
-    for before, after in zip(jax.tree.leaves(flight.start), jax.tree.leaves(flight.states), strict=True):
-        assert (before.shape, before.dtype) == (after.shape[1:], after.dtype)
 
 
 def test_default_parameters_are_used_when_none_are_given(env, flight):
@@ -60,7 +40,8 @@ def test_default_parameters_are_used_when_none_are_given(env, flight):
     expected = steps_of(env)(keys, states, np.tile(action, (NUM_ENVS, 1)), arrays(env.default_params))
     with jax.disable_jit():
         found = env.step(key, jax.tree.map(lambda leaf: leaf[0], states), action)
-    assert_close(found, jax.tree.map(lambda leaf: leaf[0], expected), 1e-5)
+    expected = jax.tree.map(lambda leaf: leaf[0], expected)
+    chex.assert_trees_all_close(found, expected, rtol=1e-5, atol=1e-5)
 
 
 def test_spaces_contain_every_observation_of_flights_that_end_in_many_ways(env, params, flight):
@@ -77,6 +58,7 @@ def test_spaces_contain_every_observation_of_flights_that_end_in_many_ways(env, 
 
 def test_info_belongs_to_the_step_not_to_the_reset(env, flight):
     done, states, info = flight.ended, flight.states, flight.info
+    assert set(info) == {*CAUSES, *RACE, "terminated", "truncated", "final_observation"}
     np.testing.assert_array_equal(np.stack([info[cause] for cause in CAUSES]).any(axis=0), flight.terminated)
     np.testing.assert_array_equal(info["terminated"], flight.terminated)
     np.testing.assert_array_equal(info["truncated"], flight.truncated)
@@ -102,45 +84,16 @@ def test_parameters_can_differ_between_environments(env, params):
 
 # --- Ends of episodes ---------------------------------------------------------------------------
 
-# Position, velocity, extra fields of the drone, steps already flown, action; causes; truncated.
-IN_FRONT = (12.55, 2.0, 1.35)
-FREE, FAST = (15.0, 2.0, 1.35), (-10.0, 0.0, 0.0)
-ZERO = (0.0, 0.0, 0.0, 0.0)
-NAN = float("nan")
-ENDS = {
-    "flies on": (FREE, FAST, {}, 100, ZERO, set(), False),
-    "passes": (IN_FRONT, FAST, {}, 100, ZERO, set(), False),
-    "frame": ((12.55, 3.0, 1.35), FAST, {}, 100, ZERO, {"crash"}, False),
-    "frame above": ((12.55, 2.0, 2.4), FAST, {}, 100, ZERO, {"crash"}, False),
-    "missed": ((12.55, 4.0, 1.35), FAST, {}, 100, ZERO, {"missed_gate"}, False),
-    "ground": ((15.0, 2.0, 0.01), (0.0, 0.0, -5.0), {}, 100, ZERO, {"ground"}, False),
-    "wall +x": ((25.49, 2.0, 1.0), (5.0, 0.0, 0.0), {}, 100, ZERO, {"out_of_bounds"}, False),
-    "wall -x": ((-2.49, 9.0, 1.0), (-5.0, 0.0, 0.0), {}, 100, ZERO, {"out_of_bounds"}, False),
-    "wall +y": ((15.0, 34.99, 1.0), (0.0, 5.0, 0.0), {}, 100, ZERO, {"out_of_bounds"}, False),
-    "wall -y": ((15.0, -2.99, 1.0), (0.0, -5.0, 0.0), {}, 100, ZERO, {"out_of_bounds"}, False),
-    "ceiling": ((15.0, 2.0, 6.34), (0.0, 0.0, 5.0), {}, 100, ZERO, {"out_of_bounds"}, False),
-    "corner": ((25.49, 2.0, 0.01), (9.0, 0, -9.0), {}, 100, ZERO, {"ground", "out_of_bounds"}, False),
-    "battery": (FREE, FAST, {"battery_v": 22.0001}, 9, ZERO, {"battery_empty"}, False),
-    "low battery": (FREE, FAST, {"battery_v": 22.01}, 9, ZERO, set(), False),
-    "nan roll": (FREE, FAST, {}, 100, (NAN, 0.0, 0.0, 0.0), {"crash"}, False),
-    "nan thrust": (FREE, FAST, {}, 100, (0.0, 0.0, 0.0, NAN), {"crash"}, False),
-    "time limit": (FREE, FAST, {}, 999, ZERO, set(), True),
-    "one before": (FREE, FAST, {}, 998, ZERO, set(), False),
-    "frame at time limit": ((12.55, 3.0, 1.35), FAST, {}, 999, ZERO, {"crash"}, True),
-    "pass at time limit": (IN_FRONT, FAST, {}, 999, ZERO, set(), True),
-}
-
 
 @pytest.fixture(scope="module")
 def ends(env):
     """One step of a batch with every row of ``ENDS``, from a race that has gone on for a while."""
-    params, states = arrays(env.default_params), []
-    counted = {"gates_passed": jnp.int32(8), "laps": jnp.int32(1), "lap_start_s": jnp.float32(0.7)}
-    for position, velocity, fields, time, *_ in ENDS.values():
-        state = env.begin(drone_at(position, velocity, **fields), 0, params)
-        states.append(state._replace(race=state.race._replace(**counted), time=jnp.int32(time)))
-    actions = jnp.array([row[4] for row in ENDS.values()], jnp.float32)
-    return env.step_batch(jax.random.key(8), stack(states), actions, params)
+    params = arrays(env.default_params)
+    counted = {"gates_passed": jnp.full(len(ENDS), 8), "laps": jnp.full(len(ENDS), 1)}
+    counted["lap_start_s"] = jnp.full(len(ENDS), 0.7)
+    states, actions = before_ends(env, params, ENDS.values())
+    begun = states._replace(race=states.race._replace(**counted))
+    return env.step_batch(jax.random.key(8), begun, actions, params)
 
 
 @pytest.mark.parametrize("name", ENDS)
@@ -154,7 +107,9 @@ def test_every_end_has_its_own_cause_and_flags(name, ends):
 def test_batch_step_resets_episodes_apart(env, params, ends):
     observation, state, _, terminated, truncated, _ = ends
     done = np.asarray(terminated | truncated)
-    assert_begun(done, state)
+    race = state.race
+    for leaf in (state.time, race.gates_passed, race.laps, race.lap_start_s, race.lap_time_s):
+        assert not np.asarray(leaf)[done].any()  # begun again, with nothing counted yet
     starts = np.stack([np.asarray(leaf)[done] for leaf in env.drone(state).pos_w], -1)
     assert len(np.unique(starts, axis=0)) == done.sum()
     expected = jax.jit(jax.vmap(env.observe, in_axes=(None, 0, None, None)))(None, state, None, params)
@@ -169,7 +124,7 @@ def test_actions_beyond_the_range_are_clipped_and_integers_are_as_good(env, flig
     factors = np.resize(np.array([1.001, 7.0, 1e30, np.inf], np.float32).repeat(2), NUM_ENVS)[:, None]
     keys, params = jax.random.split(jax.random.key(11), NUM_ENVS), arrays(env.default_params)
     both = jnp.asarray(corners * factors), jnp.asarray(corners)
-    assert_close(*(steps_of(env)(keys, flight.start, actions, params) for actions in both), 0.0)
+    chex.assert_trees_all_equal(*(steps_of(env)(keys, flight.start, actions, params) for actions in both))
     assert clip_action(jnp.array([3, 0, -2, 1])) == clip_action(jnp.array([1.0, 0.0, -1.0, 1.0]))
 
 
@@ -180,7 +135,8 @@ def test_actions_of_another_shape_are_refused(shape, env, params):
         with pytest.raises(ValueError, match=r"action: found shape .*expected \(4,\)"):
             step(key, state, jnp.zeros(shape), params)
     with pytest.raises(ValueError):
-        env.step_batch(jax.random.key(0), stack([state] * 2), jnp.zeros((2, 3)), params)
+        two = jax.tree.map(lambda leaf: jnp.stack([leaf] * 2), state)
+        env.step_batch(jax.random.key(0), two, jnp.zeros((2, 3)), params)
 
 
 # --- Construction -------------------------------------------------------------------------------

@@ -7,8 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from baselines.purejaxrl_ppo import Config, export, load_checkpoint, make_network
-from baselines.purejaxrl_ppo.checkpoint import describe_run, save_checkpoint
+from baselines.purejaxrl_ppo import export, load_checkpoint
 from baselines.purejaxrl_ppo.export import policy_of
 from benchmarks.export import CompiledPolicy, states_in_box
 from flytrack.cli import main
@@ -16,6 +15,8 @@ from flytrack_env import make
 from flytrack_env.dynamics import lag
 from flytrack_env.state import Action, unpack, unpack_action
 from flytrack_env.wrappers import NoiseParams, ObservationNoise
+from tests.support.evaluated import write_checkpoint
+from tests.support.refusals import refused
 
 SEED, COUNT = 5, 200
 LARGEST, LARGEST_LAG = 1e-5, 1e-6
@@ -25,17 +26,6 @@ CASES = {
     "another track": ("FlyTrack-v0", "split_s", (6,), True),
     "noise and earlier actions": ("FlyTrackRobust-v0", "figure_eight", (8,), False),
 }
-
-
-def write_checkpoint(path, env_id, track, hidden_sizes):
-    env, config = make(env_id, track=track), Config(hidden_sizes=hidden_sizes)
-    size = env.observation_space().shape[0]
-    params = make_network(config).init(jax.random.key(SEED), jnp.zeros((1, size)))
-    params = jax.tree.map(
-        lambda leaf: leaf + 0.1 * jnp.cos(jnp.arange(leaf.size)).reshape(leaf.shape), params
-    )
-    save_checkpoint(path, params, config, describe_run(env, env_id, track, config, SEED))
-    return env, load_checkpoint(path)
 
 
 def acted(env, checkpoint):
@@ -61,8 +51,8 @@ def acted(env, checkpoint):
 @pytest.mark.parametrize("case", CASES)
 def test_exported_policies_act_as_the_python_one(case, tmp_path, capsys):
     *told, is_float64 = CASES[case]
-    env, checkpoint = write_checkpoint(tmp_path / "a.safetensors", *told)
-    states, gates, past, actions = acted(env, checkpoint)
+    checkpoint = load_checkpoint(write_checkpoint(tmp_path / "a.safetensors", *told))
+    states, gates, past, actions = acted(make(*told[:1], track=told[1]), checkpoint)
     assert np.ptp(actions, axis=0).min() > 0.01, "actions that differ"
 
     header = tmp_path / "policy.h"
@@ -88,9 +78,11 @@ def test_exported_policies_act_as_the_python_one(case, tmp_path, capsys):
 
 @pytest.mark.skipif(shutil.which("gcc") is None, reason="gcc is not installed")
 def test_a_header_counts_gates_and_lags_as_the_environment_does(tmp_path):
-    env, _ = write_checkpoint(tmp_path / "a.safetensors", "FlyTrack-v0", "split_s", (4,))
+    write_checkpoint(tmp_path / "a.safetensors", "FlyTrack-v0", "split_s", (4,))
     main(["export", str(tmp_path / "a.safetensors"), "--c", str(tmp_path / "policy.h")])
-    compiled, gates = CompiledPolicy(tmp_path / "policy.h"), env.default_params.course.gates
+    compiled = CompiledPolicy(tmp_path / "policy.h")
+    params = make("FlyTrack-v0", track="split_s").default_params
+    gates = params.course.gates
     centres, forward, up = (np.stack(axis, axis=-1) for axis in (gates.centre, gates.forward, gates.up))
     count = np.arange(len(centres))
     for ahead, aside, is_pass in ((1.0, 0.0, True), (1.0, 0.5, True), (1.0, 0.7, False), (-1.0, 0.0, False)):
@@ -99,7 +91,7 @@ def test_a_header_counts_gates_and_lags_as_the_environment_does(tmp_path):
             end[:, :3] = centres + sign * forward + aside * up
         np.testing.assert_array_equal(compiled.next_gates(*ends, count), (count + is_pass) % len(count))
     action, applied = np.array([1.0, -1.0, 0.5, 0.2]), np.array([0.0, 0.3, -0.5, 1.0])
-    wanted = lag(unpack_action(applied), Action(*action), 0.01, env.default_params.model.tau)
+    wanted = lag(unpack_action(applied), Action(*action), 0.01, params.model.tau)
     np.testing.assert_allclose(compiled.lag(action, applied), wanted, atol=LARGEST_LAG)
 
 
@@ -122,8 +114,6 @@ def test_what_cannot_be_exported_is_told(words, message, tmp_path, monkeypatch, 
     if words[-1:] == ["unknown rows"]:
         monkeypatch.setattr(export, "KINDS_OF_PAST", ("applied",))
         words = words[:-1]
-    with pytest.raises(SystemExit) as stopped:
-        main(["export", "a.safetensors", *words])
-    assert stopped.value.code == 2 and message in capsys.readouterr().err
+    assert message in refused(capsys, "export", "a.safetensors", *words)
     assert (tmp_path / "a.safetensors").read_bytes() == before
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a.safetensors", "folder"]

@@ -9,7 +9,6 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from benchmarks.diagnosis import model_of
-from benchmarks.hidden import draw_base, fly, measure
 from flytrack import identification
 from flytrack.cli import main
 from flytrack_env.dynamics import ModelParameters
@@ -18,6 +17,7 @@ from flytrack_sysid import FlightLog, save_log
 from flytrack_sysid.diagnosis import Diagnosis
 from flytrack_sysid.diagnosis.result import CONSISTENT, Unexplained
 from flytrack_sysid.flight_recording import write_flight_recording
+from tests.support.hidden_flights import scripted
 from tests.support.made_flight import TIME_S, flight
 from tests.support.recordings import Recording
 
@@ -34,9 +34,7 @@ SCALED_FORCE = 0.1  # m of an arrow for 1 m/s^2
 @pytest.fixture(scope="module")
 def flown() -> tuple[ModelParameters, FlightLog]:
     """A plant with drag, as a model without it, and the log of two flights, each with a clock from 0 on."""
-    rng = np.random.default_rng(5)
-    truth = replace(draw_base(rng), effects={"linear_drag": DRAG._asdict()})
-    log = measure(fly(truth, "scripted", SECONDS, rng), "none", rng)
+    truth, log = scripted(5, SECONDS, "none", effects={"linear_drag": DRAG._asdict()})
     segment = (np.arange(len(log)) >= SECOND).astype(int)
     return model_of(truth), replace(log, time=log.time - segment * log.time[SECOND], segment=segment)
 
@@ -55,16 +53,10 @@ def flights(flown, models) -> dict:
     return {one.name: one for one in trajectories.trajectories_of(flown[1], models)}
 
 
-@pytest.fixture(scope="module")
-def recording(flown, models, tmp_path_factory) -> Recording:
-    """The recording of both models that stay, read back."""
-    path = tmp_path_factory.mktemp("recording") / "flight.rrd"
-    assert write_flight_recording(path, flown[1], {name: models[name] for name in ("nominal", "true")}) == ""
-    return Recording(path)
-
-
-def test_arrows_are_the_force_that_the_model_lacks_along_the_world(flown, recording):
-    log = flown[1]
+def test_arrows_are_the_force_that_the_model_lacks_along_the_world(flown, models, tmp_path):
+    log, path = flown[1], tmp_path / "flight.rrd"
+    assert write_flight_recording(path, log, {name: models[name] for name in ("nominal", "true")}) == ""
+    recording = Recording(path)
     quat = Rotation.from_quat(log["q"], scalar_first=True)
     drag_w = quat.apply(-np.array(DRAG) * quat.inv().apply(log["v"]))  # of the step after a row
     half = round(0.5 * trajectories.WINDOW_S / DT_S)

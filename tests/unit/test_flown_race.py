@@ -13,7 +13,7 @@ from flytrack_env.flown_race import follow_race, why_ended
 from flytrack_env.plants import Plant
 from flytrack_env.references import ghost_rollout, shipped_references
 from flytrack_env.state import BATTERY, POSITION, QUATERNION, VELOCITY, Action, unpack
-from flytrack_env.tracks import Gate, Track
+from tests.support.coasting import track_of_row
 
 TRACK = load_track("flytrack")
 REFERENCES = shipped_references(TRACK, ("nominal",))
@@ -94,14 +94,6 @@ def test_step_after_the_last_state_is_extrapolated():
         np.testing.assert_array_equal(one, other)
 
 
-def straight(start: tuple[float, ...], velocity: tuple[float, ...]) -> np.ndarray:
-    """Return the states (T, 21) of a flight along a line, 5 s."""
-    states, _ = ghost_rollout(REFERENCES, 500)
-    states[:, VELOCITY] = velocity
-    states[:, POSITION] = start + 0.01 * np.arange(500)[:, None] * np.array(velocity)
-    return states
-
-
 ENDS = {  # the first gate, at (12.5, 2, 1.35), is flown towards -x
     "ground": ((15.0, 2.0, 1.35), (0.0, 0.0, -2.0)),
     "out of bounds": ((15.0, 2.0, 1.35), (0.0, 0.0, 20.0)),
@@ -113,7 +105,9 @@ ENDS = {  # the first gate, at (12.5, 2, 1.35), is flown towards -x
 @pytest.mark.parametrize("end", ENDS)
 def test_end_is_the_environments(end):
     """The last state before the environment ends a flight shows why."""
-    states = straight(*ENDS[end])
+    (start, velocity), (states, _) = ENDS[end], ghost_rollout(REFERENCES, 500)
+    states[:, VELOCITY] = velocity
+    states[:, POSITION] = start + 0.01 * np.arange(500)[:, None] * np.array(velocity)
     _, causes = fly_recorded(states, 0)
     last = int(np.argmax(np.any(list(causes), axis=0)))
     names = [name.replace("_", " ") for name, happened in causes._asdict().items() if happened[last]]
@@ -134,19 +128,11 @@ def test_first_gate_is_the_tracks_near_its_start_else_the_one_passed_first():
     assert found.passes == () and found.is_miss.sum() == 1 and set(found.gate) == {0}
 
 
-def two_gates(apart_m: float, shift_m: float) -> Track:
-    """Return a course of three gates flown towards +x; the second is close behind the first, and aside."""
-    places = [(2.0, 0.0, 2.0), (2.0 + apart_m, shift_m, 2.0), (20.0, 0.0, 2.0)]
-    turned = {"quaternion": (np.sqrt(0.5), 0.0, 0.0, -np.sqrt(0.5)), "direction": 1.0}
-    gates = tuple(
-        Gate(id=index, position=place, opening=1.5, frame=2.7, **turned) for index, place in enumerate(places)
-    )
-    return replace(TRACK, name="close", gates=gates, start_position=(0.0, 0.0, 2.0))
-
-
 @pytest.mark.parametrize(("shift_m", "end"), [(0.0, "all steps flown"), (1.0, "crash"), (3.0, "missed gate")])
 def test_two_gates_in_one_step_each_have_their_time_and_end(shift_m, end):
-    track = two_gates(0.1, shift_m)
+    row = track_of_row([2.0, 2.1, 20.0])  # the second gate is close behind the first, and aside
+    aside = replace(row.gates[1], position=(2.1, shift_m, 2.0))
+    track = replace(row, gates=(row.gates[0], aside, row.gates[2]))
     states = np.zeros((10, 21))
     states[:, POSITION] = np.stack([0.2 * np.arange(10), np.zeros(10), np.full(10, 2.0)], axis=1)
     states[:, POSITION] += (0.15, 0.0, 0.0)

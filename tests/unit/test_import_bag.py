@@ -1,7 +1,6 @@
 """Bags written by the libraries and read back: ROS 2 bags, MCAP files of ROS 2 messages and of JSON."""
 
 import dataclasses
-import json
 from pathlib import Path
 from typing import Any
 
@@ -10,11 +9,11 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from flytrack_sysid import LogError, import_log
+from tests.support.foreign_logs import save_messages
 from tests.support.written_logs import read_mapping
 
 pytest.importorskip("mcap", reason="mcap is not installed: pip install 'flytrack[bags]'")
 pytest.importorskip("rosbags", reason="rosbags is not installed: pip install 'flytrack[bags]'")
-from mcap.writer import Writer as McapWriter
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
@@ -74,16 +73,9 @@ def write_ros2(folder: Path, storage: str) -> Path:
 
 def write_json(folder: Path) -> Path:
     """Write an MCAP file of JSON, without stamps."""
-    with open(folder / "flight.mcap", "wb") as file:
-        writer = McapWriter(file)
-        writer.start()
-        schema = writer.register_schema("any", "jsonschema", b"{}")
-        topics = {topic: writer.register_channel(topic, "json", schema) for topic in KINDS}
-        for stamp_ns, topic, message in messages():
-            content = {name: part for name, part in dataclasses.asdict(message).items() if name != "header"}
-            data = json.dumps(content, default=np.ndarray.tolist).encode()
-            writer.add_message(topics[topic], stamp_ns, data, stamp_ns)
-        writer.finish()
+    contents = ((topic, stamp_ns, dataclasses.asdict(message)) for stamp_ns, topic, message in messages())
+    unstamped = ((topic, at, {**content, "header": None}) for topic, at, content in contents)
+    save_messages(folder / "flight.mcap", unstamped)
     return folder / "flight.mcap"
 
 

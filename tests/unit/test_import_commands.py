@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from flytrack_sysid import LogError, import_log
 from flytrack_sysid.importing import load_mapping
 from flytrack_sysid.importing.mapping import SHIPPED
-from tests.support.written_logs import read_mapping
+from tests.support.written_logs import read_mapping, write
 
 NUM_ROWS, STEP_S = 1500, 0.01
 MAPPING = read_mapping("angle_setpoints")
@@ -40,9 +40,7 @@ def flight() -> dict[str, np.ndarray]:
 
 def read(folder: Path, mapping: str, columns: dict[str, np.ndarray] | None = None):
     """Return the import of a CSV file."""
-    table = flight() if columns is None else columns
-    rows = np.column_stack(list(table.values()))
-    np.savetxt(folder / "flight.csv", rows, delimiter=",", header=",".join(table), comments="")
+    write(folder / "flight.csv", flight() if columns is None else columns)
     (folder / "map.toml").write_text(mapping)
     return import_log(folder / "flight.csv", "csv", folder / "map.toml", align=False)
 

@@ -1,8 +1,13 @@
-"""The test for effects that begin or end within a log, on made scores."""
+"""The statistics of a diagnosis on made scores: effects that begin or end within a log, and intervals."""
+
+from types import SimpleNamespace
 
 import numpy as np
+import pytest
 
+from flytrack_sysid.diagnosis.model_selection import Marginal
 from flytrack_sysid.diagnosis.onset import is_one_flight, threshold, windowed_gains
+from flytrack_sysid.diagnosis.score_test import Linearization
 from flytrack_sysid.log import FlightLog
 
 BLOCKS, TRIMMED = 60, 0.1
@@ -40,3 +45,24 @@ def test_only_logs_of_one_clock_can_show_when():
     channels = {"u": np.zeros((4, 4))}
     for time, expected in (([0.0, 1.0, 5.0, 6.0], True), ([0.0, 1.0, 0.0, 1.0], False)):
         assert is_one_flight(FlightLog(np.array(time), channels, np.array([0, 0, 1, 1]))) is expected
+
+
+FREE = ("given", "first", "second")
+
+
+def half_widths(scores: np.ndarray, information: np.ndarray) -> np.ndarray:
+    """Return half widths of intervals, of scores of seconds (BLOCKS, 3) and information along parameters."""
+    seen = object.__new__(Linearization)
+    seen.places, seen.total, seen.score_by_block = [0, 1, 2], information, scores
+    seen.problem = SimpleNamespace(names=FREE)
+    return Marginal(seen, SimpleNamespace(places=(0, 1, 2)), FREE[1:]).half_widths()
+
+
+def test_widths_cover_when_all_parameters_are_noisier_than_said():
+    rng, truth, root = np.random.default_rng(4), 0, np.random.default_rng(1).normal(size=(3, 3))
+    information = 100.0 * (root @ root.T + np.eye(3))
+    for _ in range(300):
+        scores = rng.multivariate_normal(np.zeros(3), 4.0 * information / BLOCKS, BLOCKS)
+        error = np.linalg.solve(information, scores.sum(axis=0))[1:]
+        truth += np.sum(np.abs(error) < half_widths(scores, information))
+    assert truth / 600 == pytest.approx(0.95, abs=0.03)

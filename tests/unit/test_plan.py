@@ -1,6 +1,6 @@
 """What to fly next: manoeuvres that show what a hovering log could not, once they are flown."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from functools import cache
 from typing import NamedTuple
 
@@ -22,6 +22,8 @@ from flytrack_sysid.script_file import script_of
 MODEL = nominal_parameters()
 GYRO, FORCE, ATTITUDE, VELOCITY, VOLTAGE = 0.1, 1.5, 0.009, 0.05, 0.01  # rad/s, m/s^2, rad, m/s, V
 LITTLE, SHORT_S = 0.05, 0.3  # what wanders, over the sensors' noise, and how long it lasts
+DIRECT, LEVEL = [GYRO] * 3 + [FORCE] * 3 + [1.0], [ATTITUDE] * 3 + [VELOCITY] * 3 + [VOLTAGE]
+NOISE = np.log([DIRECT, LEVEL, [LITTLE] * 7, [LITTLE] * 7, [SHORT_S] * 7, [1.0] * 7])  # as a problem has it
 WANTED = {
     "wind": ("thrust_tilt", "accelerometer_bias"),
     "thrust_tilt": ("wind",),
@@ -36,26 +38,18 @@ WANTED = {
 
 
 class Logged(NamedTuple):
-    """A log, its problem, the model that is right, and its linearization."""
+    """The problem of a log, the model that is right, and its linearization."""
 
-    log: FlightLog
     problem: Problem
     model: FittedModel
     linearization: Linearization
 
 
-def noise_of_sensors() -> np.ndarray:
-    """Return common sensors as a problem has its noise, (6, 7)."""
-    direct, level = [GYRO] * 3 + [FORCE] * 3 + [1.0], [ATTITUDE] * 3 + [VELOCITY] * 3 + [VOLTAGE]
-    rest = np.repeat(np.array([LITTLE, LITTLE, SHORT_S]), 7).reshape(3, 7)
-    return np.concatenate([np.log([direct, level]), np.log(rest), np.zeros((1, 7))])
-
-
 def logged(log: FlightLog) -> Logged:
     lanes = make_lanes(log, np.ones(len(log), bool), np.asarray(MODEL.tau, float), MODEL.g)
-    state = SearchState(Problem.of(lanes, MODEL).with_noise(noise_of_sensors()))
+    state = SearchState(Problem.of(lanes, MODEL).with_noise(NOISE))
     model = FittedModel((), state.problem.start, 0.0, tuple(state.base_places))
-    return Logged(log, state.problem, model, state.linearized(model.vector)[1])
+    return Logged(state.problem, model, state.linearized(model.vector)[1])
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -72,20 +66,6 @@ def hover() -> Logged:
     return logged(collect(Simulator(), script=script_of([first] * 8)).without("uprev"))
 
 
-@pytest.fixture(scope="module")
-def told() -> Callable[[str], np.ndarray]:
-    """What a manoeuvre tells of everything once it is collected, with other commands than foreseen."""
-    script = script_of(flights_of(MANOEUVRES, hover_action(MODEL), seed=1))
-    log = collect(Simulator(), script=script).without("uprev")
-    kinds = np.array(script.kinds)[log.segment]
-
-    @cache
-    def told_by(name: str) -> np.ndarray:
-        return logged(log.select(kinds == name)).linearization.by_block.sum(axis=0)
-
-    return told_by
-
-
 def test_a_hovering_log_cannot_tell_wind_from_tilt(hover):
     alone, beside = (
         Question(hover.linearization, hover.model, "thrust_tilt", alike).shares()[0]
@@ -95,7 +75,16 @@ def test_a_hovering_log_cannot_tell_wind_from_tilt(hover):
 
 
 @pytest.mark.slow
-def test_what_is_advised_shows_once_it_is_flown(hover, told):
+def test_what_is_advised_shows_once_it_is_flown(hover):
+    """In flights that are collected with other commands than foreseen."""
+    script = script_of(flights_of(MANOEUVRES, hover_action(MODEL), seed=1))
+    log = collect(Simulator(), script=script).without("uprev")
+    kinds = np.array(script.kinds)[log.segment]
+
+    @cache
+    def told(name: str) -> np.ndarray:
+        return logged(log.select(kinds == name)).linearization.by_block.sum(axis=0)
+
     advice = advise(hover.problem, hover.model, hover.linearization, WANTED)
     assert set(advice) == set(WANTED)
     for effect, alike in WANTED.items():

@@ -1,14 +1,11 @@
 """Refinement by prediction: what commands do not explain is told, and no horizon is predicted worse."""
 
-from dataclasses import replace
-
 import jax
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 from benchmarks.diagnosis import model_of
-from benchmarks.hidden import draw_base, fly, measure
 from flytrack_sysid.diagnosis.lanes import make_lanes
 from flytrack_sysid.diagnosis.problem import Problem
 from flytrack_sysid.diagnosis.refinement import Judge, errors_at, refine, windows_of
@@ -17,6 +14,7 @@ from flytrack_sysid.log import FlightLog
 from flytrack_sysid.parameters import base_of
 from flytrack_sysid.prediction_windows import QUANTITIES
 from flytrack_sysid.split import held_out_rows
+from tests.support.hidden_flights import scripted
 
 SECONDS = 40.0
 TRUE_DRAG = {"d_x": 0.4, "d_y": 0.4, "d_z": 0.2}
@@ -31,31 +29,19 @@ def problem_of(truth, log: FlightLog) -> Problem:
     return Problem.of(lanes, model_of(truth))
 
 
-def refined(truth, log: FlightLog, candidates, values):
-    """Return the problem of a plant and its refinement, from given values of effects."""
-    with jax.enable_x64(True):
-        problem = problem_of(truth, log)
-        vector = problem.start.copy()
-        for name, value in values.items():
-            vector[problem.names.index(name)] = value
-        places = problem.index(base_of(problem.like))
-        found = refine(problem, problem.start, vector, candidates, places, log, held_out_rows(log), False)
-    return problem, found
-
-
-def flown(**changes):
-    """Return a plant and its measured log."""
-    rng = np.random.default_rng(3)
-    truth = replace(draw_base(rng), **changes)
-    return truth, measure(fly(truth, "scripted", SECONDS, rng), "sensors", rng)
-
-
 @pytest.fixture(scope="module")
 def dragged():
     """A plant with drag, and the refinement of a model with half of it and a bias that no flight shows."""
-    truth, log = flown(effects={"linear_drag": TRUE_DRAG})
-    halved = {f"linear_drag.{name}": 0.5 * value for name, value in TRUE_DRAG.items()}
-    return truth, log, *refined(truth, log, (DRAG, BIAS), halved | {"accelerometer_bias.x": 0.3})
+    truth, log = scripted(3, SECONDS, effects={"linear_drag": TRUE_DRAG})
+    values = {f"linear_drag.{name}": 0.5 * value for name, value in TRUE_DRAG.items()}
+    with jax.enable_x64(True):
+        problem = problem_of(truth, log)
+        vector = problem.start.copy()
+        for name, value in (values | {"accelerometer_bias.x": 0.3}).items():
+            vector[problem.names.index(name)] = value
+        places = problem.index(base_of(problem.like))
+        found = refine(problem, problem.start, vector, (DRAG, BIAS), places, log, held_out_rows(log), False)
+    return truth, log, problem, found
 
 
 def test_values_are_refined_by_flights(dragged):
@@ -74,7 +60,8 @@ def test_values_are_refined_by_flights(dragged):
 @pytest.mark.parametrize("step_s", [0.01, 0.005])
 def test_a_late_gyro_starts_flights_at_the_rates_of_their_time(step_s):
     """However many steps late: a rate that is corrected by a late reading is corrected until that arrives."""
-    truth, log = flown(effects={"imu_latency": {"latency_s": 3.7 * step_s}}, step_s=step_s)
+    late = {"imu_latency": {"latency_s": 3.7 * step_s}}
+    truth, log = scripted(3, SECONDS, effects=late, step_s=step_s)
     with jax.enable_x64(True):
         problem, windows = problem_of(truth, log), windows_of(log, held_out_rows(log))
         late = problem.start.copy()

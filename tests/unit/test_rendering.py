@@ -25,14 +25,6 @@ SHAPE = (HEIGHT, WIDTH, 3)
 COURSE = build_course(load_track("flytrack"))
 
 
-def row_at(position, gate_index, velocity):
-    """Return a row of a drone that faces gate 0, level."""
-    row = np.zeros(SCENE_SIZE, np.float32)
-    row[POSITION], row[VELOCITY], row[QUATERNION] = position, velocity, (0.0, 0.0, 0.0, 1.0)
-    row[BATTERY], row[GATE_INDEX] = 23.5, gate_index
-    return row
-
-
 def distance_to(picture, colour):
     """Return how far each pixel is from a colour, largest channel."""
     return abs(picture.astype(int) - np.array(colour)).max(axis=-1)
@@ -49,7 +41,10 @@ def test_top_view_shows_trail_drone_and_the_next_gate_where_they_are():
     rows, log = [], FlightLog(0.01)  # from the start pose through gate 0, ever faster
     for share in np.linspace(0.0, 1.0, 60):
         position, velocity = (18.6 - 9.0 * share, 2.0, 0.3 + share), (-20.0 * share, 0.0, 0.0)
-        rows.append(row_at(position, int(share > 0.7), velocity))
+        rows.append(np.zeros(SCENE_SIZE, np.float32))
+        rows[-1][POSITION], rows[-1][VELOCITY] = position, velocity
+        rows[-1][QUATERNION], rows[-1][BATTERY] = (0.0, 0.0, 0.0, 1.0), 23.5
+        rows[-1][GATE_INDEX] = share > 0.7
         log.append(rows[-1])
     picture = renderer.draw(log)
     assert distance_to(picture[top_view_pixel(renderer, rows[-1][POSITION])], scene.DRONE) < 40

@@ -1,4 +1,4 @@
-"""The step is one kernel, whatever it is made of, and the same as without."""
+"""What is fused stays the same: ``compute_once``, ``one_kernel``, a batch's auto-reset, the whole step."""
 
 from functools import partial
 from typing import Any
@@ -10,11 +10,13 @@ import pytest
 
 import flytrack_env
 from flytrack_env import nominal_parameters
+from flytrack_env.auto_reset import Ended, reset_if_ended
 from flytrack_env.effects import EFFECTS
-from flytrack_env.fusion import ATTRIBUTES, SWITCH
+from flytrack_env.fusion import ATTRIBUTES, SWITCH, compute_once, one_kernel
 from flytrack_env.motion import Motion
 from flytrack_env.tracks import random_track
 from tests.contract.test_effects import inside_ranges
+from tests.support.slow import slow_but
 
 NUM_ENVS, NUM_STEPS = 40, 6
 
@@ -52,9 +54,7 @@ def flown(env: Any, is_constant: bool) -> Any:
     return jax.block_until_ready(run())
 
 
-@pytest.mark.parametrize(
-    "name", ["plain", *(pytest.param(name, marks=pytest.mark.slow) for name in [*VARIANTS][1:])]
-)
+@pytest.mark.parametrize("name", slow_but(["plain"], VARIANTS))
 def test_the_kernel_is_the_same_step(monkeypatch: pytest.MonkeyPatch, name: str) -> None:
     with_kernel = flown(VARIANTS[name](), is_constant=True)
     monkeypatch.setenv(SWITCH, "0")
@@ -74,3 +74,138 @@ def test_a_step_is_a_kernel_unless_switched_off(monkeypatch: pytest.MonkeyPatch,
         args = keys, states, jnp.zeros((NUM_ENVS, 4)), env.default_params
         text = jax.jit(jax.vmap(env.step, in_axes=(0, 0, 0, None))).lower(*args).as_text()
         assert (next(iter(ATTRIBUTES)) in text) is (switch == "1")
+
+
+LEAVES = {
+    "float": np.array([1.5, -0.0, np.inf, -np.inf, np.nan], np.float32),
+    "all nan": np.full(3, np.nan, np.float32),
+    "scalar": np.float32(2.5),
+    "half": np.array([0.5, 2.0], np.float16),
+    "int": np.array([-3, 0, 2**31 - 1, -(2**31)], np.int32),
+    "unsigned": np.array([0, 1, 2**32 - 1], np.uint32),
+    "bool": np.array([True, False]),
+    "matrix": np.arange(6, dtype=np.float32).reshape(2, 3),
+}
+TRANSFORMS = {
+    "eager": lambda f: f,
+    "jit": jax.jit,
+    "vmap": lambda f: lambda x: jax.vmap(f)(jnp.stack([x, x]))[1],
+    "jit of vmap": lambda f: lambda x: jax.jit(jax.vmap(f))(jnp.stack([x, x]))[1],
+    "vmap along the last axis": lambda f: lambda x: jax.vmap(f, -1, -1)(jnp.stack([x, x], -1))[..., 1],
+    "scan": lambda f: lambda x: jax.lax.scan(lambda c, _: (f(c), None), x, None, length=3)[0],
+    "cond": lambda f: lambda x: jax.lax.cond(jnp.asarray(True), f, lambda y: y, x),
+    "remat": jax.checkpoint,
+}
+
+
+@pytest.mark.parametrize("leaf", LEAVES)
+@pytest.mark.parametrize("transform", TRANSFORMS)
+def test_identity(leaf: str, transform: str) -> None:
+    value = jnp.asarray(LEAVES[leaf])
+    result = TRANSFORMS[transform](compute_once)(value)
+    assert (result.dtype, result.shape) == (value.dtype, value.shape)
+    np.testing.assert_array_equal(result, value)
+    if np.issubdtype(value.dtype, np.floating):
+        np.testing.assert_array_equal(np.signbit(result), np.signbit(value))
+
+
+def swung(x: jax.Array, steps: jax.Array, unread: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Return what a loop of simple operations makes of numbers; the last one is not read."""
+    return jax.lax.fori_loop(0, 3, lambda _, y: jnp.where(y > 0.3, jnp.sin(y), y * steps), x), x + 1.0
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_one_kernel_is_the_same_function_and_prunes_what_it_does_not_read(dtype: Any) -> None:
+    with jax.enable_x64(dtype is np.float64):
+        given = (np.linspace(-2.0, 2.0, 12, dtype=dtype), dtype(1.5), np.zeros(3, dtype))
+        tangents = (np.ones(12, dtype), dtype(0.5), np.ones(3, dtype))
+        for transform in (
+            lambda f: f,
+            lambda f: jax.vmap(f, in_axes=(0, None, None)),
+            lambda f: lambda *args: jax.jvp(f, args, tangents),
+            lambda f: jax.grad(lambda *args: f(*args)[0].sum(), argnums=(0, 1)),
+        ):
+            found, expected = (jax.jit(transform(f))(*given) for f in (one_kernel(swung), swung))
+            jax.tree.map(partial(np.testing.assert_allclose, rtol=1e-6), found, expected)
+            assert jax.tree.leaves(found)[0].dtype == dtype
+
+
+def test_what_is_no_simple_operation_stays_outside_of_one_kernel() -> None:
+    def product(x: jax.Array) -> jax.Array:
+        return x @ x
+
+    matrix = jnp.eye(3)
+    text = jax.jit(one_kernel(product)).lower(matrix).as_text()
+    assert "xla_cpu_small_call" not in text
+    assert "xla_cpu_small_call" in jax.jit(one_kernel(jnp.sin)).lower(matrix).as_text()
+    np.testing.assert_array_equal(jax.jit(one_kernel(product))(matrix), matrix)
+
+
+def test_what_only_xla_finds_unread_and_constants_abort_no_process() -> None:
+    def found(x: jax.Array, unread: jax.Array, *parameters: jax.Array) -> jax.Array:
+        chosen = jnp.where(jnp.zeros((), bool), unread, parameters[0])
+        return jax.lax.fori_loop(0, 3, lambda _, y: jnp.sin(y) * parameters[1] + chosen, x)
+
+    x, one, two = np.linspace(0.0, 1.0, 1000, dtype=np.float32), np.float32(1.0), np.float32(2.0)
+    for own, unread in ((x, x), (x[:3], one)):
+        expected = jax.jit(found)(own, unread, one, two, two)
+        np.testing.assert_allclose(
+            jax.jit(one_kernel(found))(own, unread, one, two, two), expected, rtol=1e-5
+        )
+        constant = jax.jit(lambda own=own, unread=unread: one_kernel(found)(own, unread, one, two, two))()
+        np.testing.assert_allclose(constant, expected, rtol=1e-5)
+
+
+def begin(seed, offset):
+    """Return rows and state of a start."""
+    value = seed.astype(jnp.float32) + offset
+    return [value, 2.0 * value], {"scalar": value, "vector": jnp.tile(value, 3)}
+
+
+def steps(size, share):
+    """Return a batch of which about so many episodes end."""
+    index = jnp.arange(size)
+    done = jax.random.uniform(jax.random.key(1), (size,)) < share
+    state = {"scalar": index * 1.0, "vector": jnp.ones((size, 3))}
+    return Ended(done, ([index * 1.0, index * 3.0], state), (7 * index).astype(jnp.uint32))
+
+
+def expected(batch, offset):
+    """Return what the reset of each environment alone is."""
+    found = []
+    for i in range(len(batch.done)):
+        step = jax.tree.map(lambda leaf, i=i: leaf[i], batch)
+        found.append(begin(step.seed, offset) if step.done else step.shown)
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *found)
+
+
+@pytest.mark.parametrize("switch", ["1", "0"])
+@pytest.mark.parametrize("size", [7, 300])
+@pytest.mark.parametrize("share", [0.0, 0.02, 0.4, 1.0])
+def test_only_ended_environments_change(monkeypatch, switch, size, share):
+    monkeypatch.setenv(SWITCH, switch)
+    batch = steps(size, share)
+    reset = partial(reset_if_ended, begin)
+    found = jax.jit(jax.vmap(one_kernel(reset), in_axes=(0, None)))(batch, 1000.0)
+    jax.tree.map(np.testing.assert_array_equal, found, expected(batch, 1000.0))
+
+
+def test_a_batch_of_batches_and_parameters_of_each():
+    batch, reset = steps(24, 0.3), partial(reset_if_ended, begin)
+    nested = jax.tree.map(lambda leaf: leaf.reshape(4, 6, *leaf.shape[1:]), batch)
+    found = jax.jit(jax.vmap(jax.vmap(reset, in_axes=(0, None)), in_axes=(0, None)))(nested, 5.0)
+    flat = jax.tree.map(lambda leaf: leaf.reshape(24, *leaf.shape[2:]), found)
+    jax.tree.map(np.testing.assert_array_equal, flat, expected(batch, 5.0))
+    found = jax.jit(jax.vmap(reset))(batch, jnp.arange(24) * 1.0)
+    fresh = np.asarray(batch.seed, np.float32) + np.arange(24)
+    np.testing.assert_array_equal(found[0][0], np.where(batch.done, fresh, np.arange(24)))
+
+
+def test_gradient_flows_through_what_did_not_end():
+    def total(rows):
+        batch = Ended(jnp.array([True, False, True]), ([rows], rows), jnp.zeros(3, jnp.uint32))
+        reset = partial(reset_if_ended, lambda seed, _: ([seed * 1.0], seed * 1.0))
+        (found,), _ = jax.vmap(one_kernel(reset), in_axes=(0, None))(batch, None)
+        return (found**2).sum()
+
+    np.testing.assert_allclose(jax.grad(total)(jnp.array([3.0, 4.0, 5.0])), [0.0, 8.0, 0.0])

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from flytrack_env.dynamics import ModelParameters, nominal_parameters
-from flytrack_env.effects import CommandDelay, LinearDrag, QuadraticDrag
+from flytrack_env.effects import CommandDelay, QuadraticDrag
 from flytrack_env.state import STATE_SIZE, unpack
 from flytrack_sysid.log import FlightLog, log_of_states
 from flytrack_sysid.prediction import columns, predict
@@ -26,7 +26,6 @@ DT = 0.01
 NUM_ROWS = 300
 HOVER = -0.25
 TRUTH = nominal_parameters()._replace(tau=np.array([0.02, 0.03, 0.06, 0.045], np.float32))
-DRAG = LinearDrag(0.3, 0.3, 0.3)
 
 
 def scripts() -> tuple[np.ndarray, np.ndarray]:

@@ -1,8 +1,8 @@
 """What each wrapper adds to a flight, and that nothing of it survives an episode."""
 
-from functools import partial
 from typing import Any
 
+import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -22,9 +22,18 @@ from flytrack_env.wrappers import (
     RandomizationParams,
 )
 from flytrack_env.wrappers.domain_randomization import sample_model
-from tests.support.coasting import drone_at
-from tests.support.trees import stack
-from tests.support.wrapped_flights import ALL, NUM_ENVS, Flight, arrays, fly, resets_of, steps_of, wrapped
+from tests.support.wrapped_flights import (
+    ALL,
+    ENDS,
+    NUM_ENVS,
+    Flight,
+    arrays,
+    before_ends,
+    fly,
+    resets_of,
+    steps_of,
+    wrapped,
+)
 
 SIZE = 29  # of FlyTrack's own observation; behind it, one applied and three commanded actions
 NO_NOISE = NoiseParams(0.0, 0.0, 0.0, 0.0)
@@ -228,65 +237,35 @@ def test_bad_arguments_are_refused() -> None:
 
 # --- Nothing survives an episode --------------------------------------------------------------------
 
-LIMIT = 50
-# One drone per kind of end that is about to meet it on the FlyTrack course, and its action.
-FULL_STICK = (0.9, -0.8, 0.7, -0.6)
-ENDS: dict[str, Any] = {
-    "ground": ({"position": (15.0, 10.0, 0.05), "velocity": (0.0, 0.0, -20.0)}, FULL_STICK),
-    "out_of_bounds": ({"position": (25.4, 10.0, 2.0), "velocity": (20.0, 0.0, 0.0)}, FULL_STICK),
-    # Gate 0 stands at x = 12.5, y = 2, and is flown towards -x.
-    "missed_gate": ({"position": (12.55, 6.0, 1.35), "velocity": (-20.0, 0.0, 0.0)}, FULL_STICK),
-    "crash": ({"position": (12.55, 3.0, 1.35), "velocity": (-20.0, 0.0, 0.0)}, FULL_STICK),
-    "battery_empty": ({"position": (15.0, 10.0, 2.0), "battery_v": 22.0}, FULL_STICK),
-    "nan": ({"position": (15.0, 10.0, 2.0)}, (np.nan, 2.0, -np.inf, 0.5)),  # at once, whatever the delay
-    "truncated": ({"position": (15.0, 10.0, 2.0), "steps": LIMIT - 1}, FULL_STICK),
-}
 
-
-@pytest.fixture(scope="module")
-def limited() -> tuple[Any, Any, Any]:
-    """The environment in every wrapper, its parameters, and a function that steps a batch."""
+def step(keys: jax.Array, states: Any, actions: Any) -> Any:
+    """Step a batch in every wrapper."""
     env = wrapped(*ALL)
-    params = arrays(env.default_params.replace(max_steps_in_episode=LIMIT))
-
-    def step(keys: jax.Array, states: Any, actions: Any) -> Any:
-        return steps_of(env)(keys, states, jnp.asarray(actions, jnp.float32), params)
-
-    return env, params, step
+    return steps_of(env)(keys, states, jnp.asarray(actions, jnp.float32), arrays(env.default_params))
 
 
-def with_time(steps: int, path: Any, leaf: jax.Array) -> jax.Array:
-    """Return a leaf, or a number of steps where it is the environment's time."""
-    return jnp.int32(steps) if getattr(path[-1], "name", "") == "time" else leaf
-
-
-def test_after_every_kind_of_end_an_episode_begins_as_if_nothing_had_been(limited: Any) -> None:
+def test_after_every_kind_of_end_an_episode_begins_as_if_nothing_had_been() -> None:
     """The state after an end is that of a reset with the same key, in every leaf of every wrapper."""
-    env, params, step = limited
-    states, actions, applied = [], [], jax.tree.map(jnp.float32, Action(0.5, -0.5, 0.4, 0.3))
-    for i in range(NUM_ENVS):
-        drone, action = list(ENDS.values())[i % len(ENDS)]
-        drone = dict(drone)
-        steps = drone.pop("steps", 0)
-        state = env.begin(drone_at(**drone, applied=applied), 0, params, jnp.uint32(i))
-        states.append(jax.tree_util.tree_map_with_path(partial(with_time, steps), state))
-        actions.append(action)
+    env = wrapped(*ALL)
+    params, applied = arrays(env.default_params), Action(0.5, -0.5, 0.4, 0.3)
+    ends = {name: end for name, end in ENDS.items() if end[-2] or end[-1]}
+    assert len(ends) == NUM_ENVS
+    states, actions = before_ends(env, params, ends.values(), applied=applied)
     keys = jax.random.split(jax.random.key(7), NUM_ENVS)
-    one = step(keys, stack(states), np.array(actions))
-    _, _, _, terminated, truncated, info = one
-    for i in range(NUM_ENVS):
-        end = list(ENDS)[i % len(ENDS)]
-        assert bool(truncated[i]) == (end == "truncated") and bool(terminated[i]) != bool(truncated[i])
-        assert end == "truncated" or bool(info["crash" if end == "nan" else end][i])
-    fresh = resets_of(env)(keys, params)
-    for found, expected in zip(jax.tree.leaves(one[:2]), jax.tree.leaves(fresh), strict=True):
-        np.testing.assert_allclose(found, expected, atol=1e-5)
-    last = np.asarray(one[5]["final_observation"])
-    assert np.isfinite(last).all() and (last != np.asarray(one[0])).any(axis=1).all()
+    observation, after, _, terminated, truncated, info = step(keys, states, actions)
+    for row, (*_, causes, is_truncated) in enumerate(ends.values()):
+        assert bool(truncated[row]) is is_truncated and bool(terminated[row]) is bool(causes)
+        assert all(bool(info[cause][row]) for cause in causes)
+    chex.assert_trees_all_close((observation, after), resets_of(env)(keys, params), atol=1e-5)
+    last = np.asarray(info["final_observation"])
+    assert np.isfinite(last).all() and (last != np.asarray(observation)).any(axis=1).all()
     # What is no number is remembered as 0, and the rest of the action clipped.
-    np.testing.assert_allclose(last[list(ENDS).index("nan"), SIZE + 4 : SIZE + 8], [0.0, 1.0, -1.0, 0.5])
-    starts = np.stack(jax.tree.leaves(env.drone(one[1]).pos_w), -1)
+    np.testing.assert_allclose(last[list(ends).index("nan roll"), SIZE + 4 : SIZE + 8], [0.0, 1.0, -1.0, 0.5])
+    starts = np.stack(jax.tree.leaves(env.drone(after).pos_w), -1)
     assert len(np.unique(starts, axis=0)) == NUM_ENVS
+
+
+LAST_STEP = wrapped().default_params.max_steps_in_episode - 1
 
 
 def poisoned(states: Any, poison: str, rng: np.random.Generator) -> Any:
@@ -294,7 +273,7 @@ def poisoned(states: Any, poison: str, rng: np.random.Generator) -> Any:
 
     def anything(path: Any, leaf: jax.Array) -> np.ndarray:
         if getattr(path[-1], "name", "") == "time":
-            return np.full(leaf.shape, LIMIT - 1, leaf.dtype)
+            return np.full(leaf.shape, LAST_STEP, leaf.dtype)
         if leaf.dtype == bool:
             return rng.random(leaf.shape) < 0.5
         if jnp.issubdtype(leaf.dtype, jnp.integer):
@@ -307,9 +286,8 @@ def poisoned(states: Any, poison: str, rng: np.random.Generator) -> Any:
 
 
 @pytest.mark.parametrize("poison", ["nan", "infinite", "huge", "random"])
-def test_what_begins_depends_on_nothing_of_what_ended(limited: Any, flight: Flight, poison: str) -> None:
+def test_what_begins_depends_on_nothing_of_what_ended(flight: Flight, poison: str) -> None:
     """Bit for bit: the same key, another past, another last action, in every wrapper at once."""
-    _, _, step = limited
     rng, states = np.random.default_rng(0), flight.start
     for seed in range(3):
         keys, found = jax.random.split(jax.random.key(seed), NUM_ENVS), []

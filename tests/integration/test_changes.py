@@ -1,15 +1,56 @@
-"""A cause that begins within a log, and one that ends: named, with the time, in a log that is explained."""
+"""What changed: between two logs, and within one, by causes that begin or end in flight."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from benchmarks.diagnosis import Trial, make_log, model_of
-from benchmarks.hidden import Truth, draw_base, fly, measure
-from flytrack_sysid import diagnose
+from benchmarks.hidden import Truth, draw_base, draw_outside, fly, measure
+from flytrack.cli import main
+from flytrack_env import save_model
+from flytrack_env.motion import Motion
+from flytrack_sysid import diagnose, diagnose_change, save_log
 from flytrack_sysid.diagnosis import text_of
 from flytrack_sysid.log import FlightLog
+
+CHANGED_S = 30.0
+DRAG = {"d_x": 0.4, "d_y": 0.4, "d_z": 0.2}
+BASE = replace(draw_base(np.random.default_rng(3)), motion="fine")
+# A force that no list has, before and after alike.
+BOTH = replace(BASE, outside=draw_outside(np.random.default_rng(4), "heading", 2.0))
+
+
+def flown(own: Truth, seconds: float, seed: int) -> FlightLog:
+    rng = np.random.default_rng(seed)
+    return measure(fly(own, "scripted", seconds, rng), "sensors", rng)
+
+
+@pytest.fixture(scope="module")
+def before():
+    return flown(BOTH, CHANGED_S, 0)
+
+
+@pytest.mark.slow
+def test_what_both_logs_lack_is_no_cause(before) -> None:
+    found = diagnose_change(flown(BOTH, CHANGED_S, 1), before, model_of(BASE), motion=Motion.CONTINUOUS)
+    assert found.verdict == "consistent" and found.causes == () and not found.unexplained.flagged
+
+
+@pytest.mark.slow
+def test_what_changed_is_named_by_the_command(before, tmp_path: Path, capsys) -> None:
+    after = flown(replace(BOTH, effects={"linear_drag": DRAG}), CHANGED_S, 2)
+    files = [tmp_path / name for name in ("after.npz", "before.npz", "model.json")]
+    save_log(files[0], after)
+    save_log(files[1], before)
+    save_model(files[2], model_of(BASE), {})
+    flags = ["--model", str(files[2]), "--before", str(files[1]), "--out", str(tmp_path / "report")]
+    main(["diagnose", str(files[0]), *flags])
+    said = capsys.readouterr().out
+    assert "verdict: causes_found\n" in said and "linear_drag: d_x" in said
+    assert (tmp_path / "report" / "extended_model.json").exists()
+
 
 ONSET_S, SECONDS = 17.3, 40.0
 ROLL, PITCH = 0.003, -0.002
@@ -19,15 +60,10 @@ def truth(**effects: dict[str, float]) -> Truth:
     return replace(draw_base(np.random.default_rng(8)), motion="fine", effects=effects)
 
 
-def flown(own: Truth, seconds: float, seed: int = 9) -> FlightLog:
-    rng = np.random.default_rng(seed)
-    return measure(fly(own, "scripted", seconds, rng), "sensors", rng)
-
-
 @pytest.mark.slow
 def test_a_cause_that_begins_in_flight_is_named_with_its_onset():
     own = replace(truth(motor_imbalance={"roll": ROLL, "pitch": PITCH}), onset_s=ONSET_S)
-    found = diagnose(flown(own, SECONDS), model_of(own))
+    found = diagnose(flown(own, SECONDS, 9), model_of(own))
     assert found.verdict == "causes_found"  # explained, from beginning to end
     (cause,) = found.causes
     assert cause.effect == "motor_imbalance" and cause.end_s is None
@@ -44,7 +80,7 @@ def test_a_cause_that_begins_in_flight_is_named_with_its_onset():
 @pytest.mark.slow
 def test_a_cause_that_ends_in_flight_is_not_in_the_extended_model():
     own = truth(motor_imbalance={"roll": ROLL, "pitch": PITCH})
-    first, second = flown(own, 0.5 * SECONDS), flown(truth(), 0.5 * SECONDS, seed=10)
+    first, second = (flown(one, 0.5 * SECONDS, seed) for one, seed in ((own, 9), (truth(), 10)))
     channels = {name: np.concatenate([first[name], second[name]]) for name in first.channels}
     time = np.append(first.time, second.time + 0.5 * SECONDS)
     segment = np.append(first.segment, second.segment + 1)

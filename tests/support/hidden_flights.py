@@ -1,0 +1,43 @@
+"""Flights of hidden plants: scripted ones as logs, and in plain floats by given commands, to compare with."""
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from benchmarks.hidden import Truth, draw_base, fly, measure
+from benchmarks.hidden.plant import Plant, Start
+from flytrack_sysid.log import FlightLog
+
+LOW_START = Start((1.0, -2.0, 3.0), 0.7, 23.5, -0.3)
+# The state as the handout has it; what is tracked and what is felt of each step.
+COLUMNS = {"x": 21, "p": 3, "v": 3, "q": 4, "f": 3, "w": 3, "slope": 3}
+
+
+def scripted(seed: int, seconds: float, noise: str = "sensors", **changes: Any) -> tuple[Truth, FlightLog]:
+    """Return a plant of a seed, with some fields replaced, and the measured log of its flight."""
+    rng = np.random.default_rng(seed)
+    truth = replace(draw_base(rng), **changes)
+    return truth, measure(fly(truth, "scripted", seconds, rng), noise, rng)
+
+
+def state_of(plant: Plant) -> np.ndarray:
+    """Return the handout's vector (21,) of a plant."""
+    own = (plant.pos_w, plant.vel_w, plant.acc_w, plant.quat, plant.rates_b, plant.applied)
+    return np.concatenate([*own, [plant.battery_v]])
+
+
+def flown_in_floats(truth: Truth, commands: Any, start: Start = LOW_START) -> dict[str, np.ndarray]:
+    """Return ``COLUMNS`` after each command, (num_steps, n)."""
+    plant, rows = Plant(truth, start, np.random.default_rng(5)), []
+    for command in np.asarray(commands, float).tolist():
+        plant.step(tuple(command))
+        rows.append(np.concatenate([state_of(plant), *plant.tracked, *plant.felt]))
+    parts = np.split(np.array(rows), np.cumsum(list(COLUMNS.values()))[:-1], axis=1)
+    return dict(zip(COLUMNS, parts, strict=True))
+
+
+def random_sticks(num_steps: int, seed: int = 4) -> np.ndarray:
+    """Return steps of the sticks at random, each held for ten steps, (num_steps, 4)."""
+    sticks = np.random.default_rng(seed).uniform(-1.0, 1.0, (-(-num_steps // 10), 4)) * [0.5, 0.5, 1.0, 1.0]
+    return np.repeat(sticks, 10, axis=0)[:num_steps]
