@@ -34,7 +34,6 @@ from flytrack_sysid.diagnosis.score_test import (
     Candidate,
     Linearization,
     candidates_for,
-    inflation_of,
     solve,
     threshold,
 )
@@ -83,12 +82,10 @@ class Estimate(NamedTuple):
     def of(cls, parts: Split) -> "Estimate":
         """Return the refitted base, with the noise that it leaves."""
         problem = parts.train
-        noise = noises.first_guess(problem.lanes, problem.residuals(problem.start[None])[0])
-        state = SearchState.start(parts.log, problem.with_noise(noise))
+        state = SearchState.start(parts.log, problem)
         base = state.fitted((), problem.start)
         state, linearization = state.linearized(base.vector)
-        left = saturated_residuals(state.problem, linearization)
-        state = state.with_noise(noises.fit_noise(problem.lanes, left))
+        state = state.with_noise(noises.fit_noise(problem.lanes, saturated_residuals(linearization)))
         base = state.fitted((), base.vector)
         state, linearization = state.linearized(base.vector)
         return cls(state, base, base, linearization)
@@ -109,17 +106,8 @@ class Estimate(NamedTuple):
 
         The covariance is as much larger than the information's inverse as seconds disagree after the step.
         """
-        line, given = self.linearization, self.linearization.columns_at(self.model.places)
-        columns = list(columns)
-        information, share = line.projected(columns, given)
-        step = solve(information, line.score[columns] - share.T @ line.score[given])
-        inner = solve(line.total[np.ix_(given, given)], line.score[given])
-        places = given + columns
-        both = np.concatenate([inner - share @ step, step])
-        blocks = line.score_by_block[:, places] - line.by_block[:, places][:, :, places] @ both
-        blocks = blocks[:, len(given) :] - blocks[:, : len(given)] @ share
-        covariance = inflation_of(information, blocks) * solve(information, np.eye(len(columns)))
-        return step, covariance
+        gain = self.linearization.freed(list(columns), self.linearization.columns_at(self.model.places))
+        return gain.step, gain.inflation * solve(gain.information, np.eye(len(columns)))
 
 
 def diagnose_change(

@@ -11,12 +11,11 @@ import numpy as np
 from flytrack_env.dynamics import ModelParameters, nominal_parameters
 from flytrack_env.motion import Motion
 from flytrack_sysid.diagnosis.beyond import with_and_without, with_learned
-from flytrack_sysid.diagnosis.lanes import Lanes, make_lanes, thinned, voltages_of
+from flytrack_sysid.diagnosis.lanes import Lanes, lanes_of, thinned, voltages_of
 from flytrack_sysid.diagnosis.late_poses import with_late_poses
 from flytrack_sysid.diagnosis.lateness import judged_as_logged, latency_of, read_poses
 from flytrack_sysid.diagnosis.learned import find_learned
 from flytrack_sysid.diagnosis.motion_choice import Moves, how_it_moves, likelier_motion
-from flytrack_sysid.diagnosis.noise import first_guess
 from flytrack_sysid.diagnosis.onset import (
     at_end,
     ended,
@@ -135,8 +134,7 @@ def diagnose(
 
 def select_model(parts: Split) -> Selection:
     """Return the model that is selected from the rows to learn from."""
-    noise = first_guess(parts.train.lanes, parts.train.residuals(parts.train.start[None])[0])
-    return select(*search(SearchState.start(parts.log, parts.train.with_noise(noise))))
+    return select(*search(SearchState.start(parts.log, parts.train)))
 
 
 def split(
@@ -175,11 +173,6 @@ def split(
         problem_of(thinned(lanes), corrected, log, model, with_motion.late_s) for lanes in (every, judged_by)
     )
     return Split(logged, with_motion, corrected, out, train, test, as_logged, tuple(warnings))
-
-
-def lanes_of(log: FlightLog, rows: np.ndarray, model: ModelParameters) -> Lanes:
-    """Return the lanes of a log of which some rows, (num_rows,) bool, count."""
-    return make_lanes(log, rows, np.asarray(model.tau, float), float(model.g))
 
 
 def problem_of(

@@ -9,10 +9,9 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from scipy import stats
 
-from flytrack_sysid.diagnosis.lanes import AXES
 from flytrack_sysid.diagnosis.noise import OUTLIER
 from flytrack_sysid.diagnosis.problem import Problem
-from flytrack_sysid.diagnosis.result import CHANNELS, Outliers
+from flytrack_sysid.diagnosis.result import PLACES, Outliers
 
 LONGEST_RUN = 3  # rows: the filter that whitens takes in part of an outlier and gives it back
 CHANCE = 1e-6  # of so many, were the noise normal
@@ -26,17 +25,13 @@ def outliers_of(problems: Sequence[Problem], vector: np.ndarray) -> dict[str, Ou
     """
     parts = [(problem.whitened_residuals(vector)[0], problem.counts) for problem in problems]
     found = {}
-    for axes, names in zip(AXES, CHANNELS, strict=True):
-        for side, name in enumerate(names):
-            if name is None:
-                continue
-            counted = [counts[:, :, axes, side].any(axis=-1) for _, counts in parts]
-            number = sum(int(each.sum()) for each in counted)
-            far = [np.abs(white[:, :, axes, side]).max(axis=-1) > OUTLIER for white, _ in parts]
-            alone = sum(_short_runs(each) for each in far)
-            by_chance = number * (axes.stop - axes.start) * 2.0 * stats.norm.sf(OUTLIER)
-            if alone > LEAST_SHARE * number and stats.poisson.sf(alone - 1, by_chance) < CHANCE:
-                found[name] = Outliers(alone, number)
+    for name, (axes, side) in PLACES.items():
+        number = sum(int(counts[:, :, axes, side].any(axis=-1).sum()) for _, counts in parts)
+        far = [np.abs(white[:, :, axes, side]).max(axis=-1) > OUTLIER for white, _ in parts]
+        alone = sum(_short_runs(each) for each in far)
+        by_chance = number * (axes.stop - axes.start) * 2.0 * stats.norm.sf(OUTLIER)
+        if alone > LEAST_SHARE * number and stats.poisson.sf(alone - 1, by_chance) < CHANCE:
+            found[name] = Outliers(alone, number)
     return found
 
 

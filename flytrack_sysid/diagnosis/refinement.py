@@ -10,6 +10,7 @@ say nothing about what answers the commands, and nothing is named from there.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -19,10 +20,10 @@ from scipy.spatial.transform import Rotation
 
 from flytrack_env.dynamics import ModelParameters
 from flytrack_env.effects import BY_NAME
-from flytrack_sysid.diagnosis.problem import RELATIVE_STEP, Problem
-from flytrack_sysid.diagnosis.score_test import AT_BOUND, BASE_CAUSES, Candidate, prior_information, solve
+from flytrack_sysid.diagnosis.problem import Problem
+from flytrack_sysid.diagnosis.score_test import BASE_CAUSES, Candidate, prior_information, solve, step_inside
 from flytrack_sysid.log import FlightLog
-from flytrack_sysid.parameters import DRAIN, from_vector
+from flytrack_sysid.parameters import DRAIN, from_vector, in_batches
 from flytrack_sysid.prediction_windows import (
     CHUNK,
     HORIZONS_S,
@@ -78,10 +79,7 @@ class Tested(NamedTuple):
         """Return mean squares over those of ``scale``, (horizons, quantities), (models, blocks, ...)."""
         number = np.maximum(self.windows.counts.sum(axis=1), 1)
         relative = self.squares / (np.square(scale) * number)[:, None]
-        _, block = np.unique(self.windows.block, return_inverse=True)
-        result = np.zeros((block.max() + 1, len(self.errors), *scale.shape))
-        np.add.at(result, block, np.moveaxis(relative, 2, 0))
-        return result.swapaxes(0, 1)
+        return self.windows.sums_by_block(np.moveaxis(relative, 2, 0)).swapaxes(0, 1)
 
 
 def sureness(differences: np.ndarray) -> np.ndarray:
@@ -99,13 +97,12 @@ def _errors(vectors: jax.Array, like: ModelParameters, windows: Windows) -> jax.
 
 def errors_at(problem: Problem, vectors: np.ndarray, windows: Windows) -> Tested:
     """Return the errors of models, (num_vectors, num_parameters), on windows; one program for all."""
-    parts = []
-    for begin in range(0, len(vectors), BATCH):
-        part = vectors[begin : begin + BATCH]
-        filled = np.concatenate([part, np.repeat(part[-1:], BATCH - len(part), axis=0)])
-        found = [np.asarray(_errors(filled, problem.like, chunk)) for chunk in chunks_of(windows)]
-        parts.append(np.concatenate(found, axis=2)[: len(part), :, : len(windows.start)])
-    errors = np.concatenate(parts)
+
+    def of_batch(part: np.ndarray) -> np.ndarray:
+        found = [np.asarray(_errors(part, problem.like, chunk)) for chunk in chunks_of(windows)]
+        return np.concatenate(found, axis=2)[:, :, : len(windows.start)]
+
+    errors = in_batches(of_batch, vectors, BATCH)
     # A model that runs away is as bad as can be, but still a number.
     errors = np.nan_to_num(np.clip(errors, -1e6, 1e6), nan=1e6)
     return Tested(errors.reshape(*errors.shape[:-1], len(QUANTITIES), 3), windows)
@@ -191,11 +188,8 @@ class Target(NamedTuple):
         problem, at = self.problem, np.array(places, int)
         vector = problem.clipped(vector)
         for number in range(rounds + 1):
-            step = RELATIVE_STEP * problem.scale[at]
-            step = np.where(vector[at] + step > problem.high[at], -step, step)
-            moved = np.repeat(vector[None], len(at) + 1, axis=0)
-            moved[np.arange(1, len(at) + 1), at] += step
-            left = self.residuals(moved)
+            moved, step = problem.nudged(vector, places)
+            left = self.residuals(np.concatenate([vector[None], moved]))
             columns = (left[1:] - left[0]) / step[:, None, None]
             root = np.sqrt(
                 np.where(np.abs(left[0]) > OUTLIER, OUTLIER / np.maximum(np.abs(left[0]), 1e-9), 1)
@@ -213,37 +207,26 @@ class Target(NamedTuple):
             if costs[best] > cost * (1.0 - LEAST_GAIN):
                 break
             vector = ways[best]
-        return Fit(vector, tuple(places), self._covariance(at, information, scores))
-
-    def _stuck(self, vector: np.ndarray, at: np.ndarray, way: np.ndarray) -> np.ndarray:
-        room = AT_BOUND * np.maximum(np.abs(vector[at]), 1.0)
-        low, high = self.problem.low[at] + room, self.problem.high[at] - room
-        return ((vector[at] <= low) & (way < 0.0)) | ((vector[at] >= high) & (way > 0.0))
+        return Fit(vector, tuple(places), self._covariance(information, scores))
 
     def _ways(
         self, vector: np.ndarray, at: np.ndarray, information: np.ndarray, gradient: np.ndarray
     ) -> np.ndarray:
         """Return the vectors that steps of all dampings lead to; parameters at a bound stay."""
+
+        def along(free: np.ndarray, damping: float) -> np.ndarray:
+            inner = information[np.ix_(free, free)]
+            return -solve(inner + damping * np.diag(np.diag(inner)), gradient[free])
+
         found = np.repeat(vector[None], len(DAMPINGS), axis=0)
         for number, damping in enumerate(DAMPINGS):
-            free, way = np.ones(len(at), bool), np.zeros(len(at))
-            while free.any():
-                inner = information[np.ix_(free, free)]
-                way[:] = 0.0
-                way[free] = -solve(inner + damping * np.diag(np.diag(inner)), gradient[free])
-                stuck = free & self._stuck(vector, at, way)
-                if not stuck.any():
-                    break
-                free &= ~stuck
-            found[number, at] += way * free
+            found[number, at] += step_inside(self.problem, vector, at, partial(along, damping=damping))
         return self.problem.clipped(found)
 
-    def _covariance(self, at: np.ndarray, information: np.ndarray, scores: np.ndarray) -> np.ndarray:
+    def _covariance(self, information: np.ndarray, scores: np.ndarray) -> np.ndarray:
         """Return that of 95 % intervals, by the scores of blocks (sandwich); Student's t."""
-        _, block = np.unique(self.windows.block, return_inverse=True)
-        by_block = np.zeros((block.max() + 1, len(at)))
-        np.add.at(by_block, block, scores)
-        inverse = solve(information, np.eye(len(at)))
+        by_block = self.windows.sums_by_block(scores)
+        inverse = solve(information, np.eye(len(information)))
         number = max(len(by_block), 2)
         covariance = inverse @ (by_block.T @ by_block * number / (number - 1)) @ inverse
         return covariance * stats.t.ppf(0.975, number - 1) ** 2
@@ -275,10 +258,8 @@ class Judge(NamedTuple):
     @property
     def is_known(self) -> np.ndarray:
         """Where held-out windows are enough to judge by, (horizons, quantities)."""
-        _, block = np.unique(self.windows.block, return_inverse=True)
         counts = self.windows.counts
-        blocks = np.zeros((block.max() + 1, *self.scale.shape))
-        np.add.at(blocks, block, counts.swapaxes(0, 1))
+        blocks = self.windows.sums_by_block(counts.swapaxes(0, 1).astype(int))
         return (counts.sum(axis=1) >= FEWEST_WINDOWS) & ((blocks > 0).sum(axis=0) >= FEWEST_BLOCKS)
 
     def seeing(self, tested: Tested) -> "Judge":
@@ -349,9 +330,7 @@ class Refined(NamedTuple):
         own = [name for name in self.problem.names if name.startswith(f"{effect}.")]  # of a sensor
         cause = "thrust_curve" if effect == "thrust_scale" else effect
         fields = BASE_CAUSES.get(cause, own)
-        vector, places = self.fit.vector.copy(), self.problem.index(fields)
-        vector[places] = self.problem.start[places]
-        return vector
+        return self.problem.at_start(self.fit.vector, fields)
 
     def flight_errors(self, vector: np.ndarray) -> dict[str, float]:
         """Return the held-out errors of free flight by seconds; empty where none was judged.
@@ -472,7 +451,7 @@ class _Refinement(NamedTuple):
         self, problem: Problem, vector: np.ndarray, candidates: Sequence[Candidate]
     ) -> tuple[str, ...]:
         """Return the effects that change how a model predicts."""
-        without = [_neutral(problem, vector, one) for one in candidates]
+        without = [problem.at_start(vector, one.fields) for one in candidates]
         found = errors_at(problem, np.stack([vector, *without]), self.learnt).errors
         changes = np.abs(found[1:] - found[0]).max(axis=(1, 2, 3, 4))
         return tuple(one.effect for one, change in zip(candidates, changes, strict=True) if change > 0.0)
@@ -529,15 +508,9 @@ class _Refinement(NamedTuple):
         return found._replace(kept=tuple(kept), fit=fit, removed=tuple(removed), without=without)
 
     def _without(self, target: Target, fit: Fit, kept: Sequence[Candidate], one: Candidate) -> Fit:
-        vector = _neutral(target.problem, fit.vector, one)
+        vector = target.problem.at_start(fit.vector, one.fields)
         rest = [other for other in kept if other is not one]
         return target.fitted(vector, self.places(target.problem, rest), REFIT_ROUNDS)
-
-
-def _neutral(problem: Problem, vector: np.ndarray, one: Candidate) -> np.ndarray:
-    places, result = problem.index(one.fields), vector.copy()
-    result[places] = problem.start[places]
-    return result
 
 
 def _is_neutral(problem: Problem, vector: np.ndarray, fields: Sequence[str]) -> bool:

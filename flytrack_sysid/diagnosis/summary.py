@@ -8,7 +8,7 @@ import numpy as np
 from flytrack_env.dynamics import ModelParameters, collective_thrust
 from flytrack_env.effects import BY_NAME, effect_of
 from flytrack_sysid.diagnosis.identifiability import advise, unit_of, unseen_effects
-from flytrack_sysid.diagnosis.lanes import AXES, voltages_of
+from flytrack_sysid.diagnosis.lanes import voltages_of
 from flytrack_sysid.diagnosis.model_selection import (
     BaseChange,
     Marginal,
@@ -22,6 +22,7 @@ from flytrack_sysid.diagnosis.result import (
     CAUSES_FOUND,
     CHANNELS,
     CONSISTENT,
+    PLACES,
     TO_LOG,
     UNEXPLAINED,
     Cause,
@@ -108,10 +109,7 @@ def half_responses_of(
     """
     problem, fit = refined.problem, refined.fit
     places = list(model.places if fit is None else fit.places)
-    step = SLOPE_STEP * problem.scale[places]
-    step = np.where(vectors["extended"][places] + step > problem.high[places], -step, step)
-    moved = np.repeat(vectors["extended"][None], len(places), axis=0)
-    moved[np.arange(len(places)), places] += step
+    moved, step = problem.nudged(vectors["extended"], places, SLOPE_STEP)
     found = half_responses(np.stack([*vectors.values(), *moved]), problem.like, SMALL_STEP)
     full = half_responses(np.stack(list(vectors.values())), problem.like, FULL_STEP)
     own = found[list(vectors).index("extended")]
@@ -136,12 +134,7 @@ def channel_of(problem: Problem, less: np.ndarray, full: np.ndarray) -> str:
     """Return the channel in which two models differ most, in multiples of the noise."""
     white = problem.whitened_residuals(less, full)
     by_axis = np.square(white[1] - white[0]).sum(axis=(0, 1))
-    power = {
-        name: float(by_axis[axes, channel].sum())
-        for axes, names in zip(AXES, CHANNELS, strict=True)
-        for channel, name in enumerate(names)
-        if name is not None
-    }
+    power = {name: float(by_axis[place].sum()) for name, place in PLACES.items()}
     return max(power, key=lambda name: power[name])
 
 
@@ -202,11 +195,8 @@ def base_causes(
     for name, change in base_changes(selection.state, linearization, model).items():
         if name in selection.stand_ins:
             continue
-        places = problem.index(change.fields)
-        less = model.vector.copy()
-        less[places] = problem.start[places]
-        channel = channel_of(problem, less, model.vector)
-        refitted = _refitted_to_first_order(problem, linearization, model, places)
+        channel = channel_of(problem, problem.at_start(model.vector, change.fields), model.vector)
+        refitted = _refitted_to_first_order(problem, linearization, model, change.fields)
         gain, expected = held_out_gain(test, refitted, model.vector)
         if is_contradicted(gain, expected, change.marginal.inflation):
             contradicted.append(name)
@@ -223,19 +213,19 @@ def vector_without(cause: Cause, selection: Selection, linearization: Linearizat
     if cause.effect in selection.ablations:
         return selection.ablations[cause.effect].without.vector
     name = "thrust_curve" if cause.effect == "thrust_scale" else cause.effect
-    places = selection.state.problem.index(BASE_CAUSES[name])
-    return _refitted_to_first_order(selection.state.problem, linearization, selection.model, places)
+    return _refitted_to_first_order(
+        selection.state.problem, linearization, selection.model, BASE_CAUSES[name]
+    )
 
 
 def _refitted_to_first_order(
-    problem: Problem, linearization: Linearization, model: FittedModel, places: Sequence[int]
+    problem: Problem, linearization: Linearization, model: FittedModel, fields: Sequence[str]
 ) -> np.ndarray:
     """Return the vector with some parameters at nominal and the rest fitted again, to first order."""
+    places, less = problem.index(fields), problem.at_start(model.vector, fields)
     others = [place for place in model.places if place not in set(places)]
     columns, own = linearization.columns_at(others), linearization.columns_at(places)
-    less = model.vector.copy()
-    less[list(places)] = problem.start[list(places)]
-    change = less[list(places)] - model.vector[list(places)]
+    change = less[places] - model.vector[places]
     score = linearization.score[columns] - linearization.total[np.ix_(columns, own)] @ change
     less[others] += solve(linearization.total[np.ix_(columns, columns)], score)
     return problem.clipped(less)
@@ -300,12 +290,7 @@ def model_of(problem: Problem, model: FittedModel) -> ModelParameters:
 
 def _by_channel(values: np.ndarray, problem: Problem) -> dict[str, np.ndarray]:
     """Return values (NUM_AXES, 2) by channel that is judged; (axes of it,) each."""
-    return {
-        name: values[axes, channel]
-        for axes, names in zip(AXES, CHANNELS, strict=True)
-        for channel, name in enumerate(names)
-        if name is not None and problem.counts[..., axes, channel].any()
-    }
+    return {name: values[place] for name, place in PLACES.items() if problem.counts[..., *place].any()}
 
 
 def sensor_noise(problem: Problem) -> dict[str, list[float]]:

@@ -23,22 +23,15 @@ from scipy.spatial.transform import Rotation
 
 from flytrack_env.dynamics import ModelParameters, lag
 from flytrack_env.state import Action
-from flytrack_sysid.diagnosis.lanes import AXES, Lanes, lead_in_of, make_lanes
+from flytrack_sysid.diagnosis.lanes import Lanes, lanes_of, lead_in_of
 from flytrack_sysid.diagnosis.lateness import latency_of, read_poses
 from flytrack_sysid.diagnosis.problem import Problem
-from flytrack_sysid.diagnosis.result import CHANNELS
+from flytrack_sysid.diagnosis.result import PLACES
 from flytrack_sysid.log import FlightLog
 from flytrack_sysid.parameters import STICKS
 from flytrack_sysid.record import Record
 
 UNITS = {"rates": "rad/s", "attitude": "rad/s", "force": "m/s²", "velocity": "m/s²", "battery": "V"}
-# Of Problem.residuals: axes, and 0 for the direct channel, 1 for the level.
-_PLACES = {
-    name: (axes, number)
-    for axes, names in zip(AXES, CHANNELS, strict=True)
-    for number, name in enumerate(names)
-    if name is not None
-}
 _PER_STEP = ("attitude", "velocity", "battery")  # changes since the row before
 _INSTEAD = {"rates": "attitude", "force": "velocity"}
 _AXES = "xyz"
@@ -155,7 +148,7 @@ def _residuals(left: np.ndarray, rows: _Rows, record: Record, before: Rotation) 
     along = rows.along(left)
     step_s = np.roll(record.step_s, 1)[:, None]
     found = {}
-    for name, (axes, number) in _PLACES.items():
+    for name, (axes, number) in PLACES.items():
         values = along[:, axes, number]
         if name == "battery":
             summed = np.cumsum(values, axis=0)
@@ -172,7 +165,7 @@ def _counts(lanes: Lanes, rows: _Rows, record: Record) -> dict[str, np.ndarray]:
     """Return where channels count; changes since a row that was lost do not."""
     along = rows.along(lanes.counts)
     after_measured = np.append(False, record.source_row[:-1] >= 0) & ~record.begins
-    found = {name: along[:, axes, number].all(axis=1) for name, (axes, number) in _PLACES.items()}
+    found = {name: along[:, axes, number].all(axis=1) for name, (axes, number) in PLACES.items()}
     return {
         name: np.logical_and(counts, after_measured | (name not in _PER_STEP))[rows.kept]
         for name, counts in found.items()
@@ -247,8 +240,7 @@ def traces(log: FlightLog, models: Mapping[str, ModelParameters], like: str) -> 
     log = in_time[latency_of(base)]
     with jax.enable_x64(True):
         by_lateness = {
-            late_s: make_lanes(one, np.ones(len(one), bool), np.asarray(base.tau, float), float(base.g))
-            for late_s, one in in_time.items()
+            late_s: lanes_of(one, np.ones(len(one), bool), base) for late_s, one in in_time.items()
         }
         left = []
         for model in models.values():
