@@ -14,7 +14,7 @@ from flytrack_env.messages import error_text
 from flytrack_env.npz_file import NpzError, load_npz
 from flytrack_sysid.csv_file import LARGEST_BYTES, open_csv, read_columns
 from flytrack_sysid.log import CHANNELS, GAP_STEPS, FlightLog, LogError, usual_step
-from flytrack_sysid.log_table import Table, check_names, log_of_table
+from flytrack_sysid.log_table import Table, check_names, columns_of, log_of_table
 
 SUFFIXES = (".npz", ".csv")
 
@@ -44,9 +44,8 @@ def save_log(path: str | Path, log: FlightLog) -> None:
     columns = {"t": np.asarray(log.time, float)}
     if len(log) and np.any(log.segment != log.segment[0]):
         columns["segment"] = log.segment
-    for name in CHANNELS:
-        if name in log:
-            columns |= dict(zip(CHANNELS[name], np.asarray(log[name], float).T, strict=True))
+    channels = {name: np.asarray(values, float) for name, values in log.channels.items()}
+    columns |= columns_of(columns["t"], channels)
     check_names(str(path), list(columns))
     log_of_table(Table(str(path), {name: values.astype(float) for name, values in columns.items()}))
     write_atomically(path, _npz_of(columns) if path.suffix.lower() == ".npz" else _csv_of(columns))

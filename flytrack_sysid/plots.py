@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from flytrack_env.pictures import drawing
 from flytrack_env.pictures.drawing import new_figure, plain
 from flytrack_env.scene import BLUE, GREEN, GREY, ORANGE
-from flytrack_sysid.forces import ThrustError
+from flytrack_sysid.prediction_errors import ThrustError
 from flytrack_sysid.steps import AXES, StepResponse
 from flytrack_sysid.validate import Validation
 

@@ -5,10 +5,17 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from flytrack_env.dynamics import ModelParameters
-from flytrack_sysid.forces import ThrustError, force_samples, thrust_error
 from flytrack_sysid.log import FlightLog
 from flytrack_sysid.prediction import Prediction, inputs_that_lack, predict
-from flytrack_sysid.prediction_errors import OneStep, Rollout, one_step_errors, rollout_errors
+from flytrack_sysid.prediction_errors import (
+    OneStep,
+    Rollout,
+    ThrustError,
+    force_samples,
+    one_step_errors,
+    rollout_errors,
+    thrust_error,
+)
 from flytrack_sysid.record import BATTERY_UNKNOWN_V, fill_gaps
 from flytrack_sysid.steps import HELD_AFTER_S, HELD_BEFORE_S, LEAST_JUMP, StepResponse, step_responses
 

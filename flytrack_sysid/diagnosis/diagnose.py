@@ -10,6 +10,7 @@ import numpy as np
 
 from flytrack_env.dynamics import ModelParameters, nominal_parameters
 from flytrack_env.motion import Motion
+from flytrack_sysid.clocks import on_one_clock, with_causal_commands
 from flytrack_sysid.diagnosis.beyond import with_and_without, with_learned
 from flytrack_sysid.diagnosis.lanes import Lanes, lanes_of, thinned, voltages_of
 from flytrack_sysid.diagnosis.late_poses import with_late_poses
@@ -30,7 +31,6 @@ from flytrack_sysid.diagnosis.reduction import reduced
 from flytrack_sysid.diagnosis.refinement import Refined, refine
 from flytrack_sysid.diagnosis.result import Cause, Diagnosis
 from flytrack_sysid.diagnosis.search import SearchState, search
-from flytrack_sysid.diagnosis.sensor_clocks import on_one_clock, with_causal_commands
 from flytrack_sysid.diagnosis.size import split_by_size
 from flytrack_sysid.diagnosis.summary import (
     base_causes,
