@@ -230,13 +230,6 @@ def error_ratios(found: Diagnosis) -> dict[str, float]:
     return {horizon: round(errors["extended"][horizon] / size, 4) for horizon, size in base.items() if size}
 
 
-def champion_line(episodes: int, seed: int) -> dict[str, Any]:
-    """Return the race of the shipped champion, which knows nothing of the firmware."""
-    with Betaflight() as plant:
-        gap = measure_gap(load_checkpoint(CHAMPION), plant, seed, episodes)
-    return {"row": "champion", "episodes": episodes, **gap.plant._asdict()}
-
-
 def tables(lines: list[dict[str, Any]]) -> str:
     """Return the results as tables in Markdown."""
     by_row = {row: [line for line in lines if line["row"] == row] for row in ROWS}
@@ -299,7 +292,10 @@ def main(
     trials += [Trial(ROWS[len(own)], "stock", "full", own, 10 + number) for number, own in enumerate(sets)]
     commit = report.commit_of_checkout()
     if champion:
-        report.append_line(lines, {"commit": commit, **champion_line(champion, seed)})
+        with Betaflight() as plant:
+            raced = measure_gap(load_checkpoint(CHAMPION), plant, seed, champion).plant
+        line = {"commit": commit, "row": "champion", "episodes": champion, **raced._asdict()}
+        report.append_line(lines, line)
     known: dict[tuple[str, str], Known] = {}
     for trial in report.progress(trials, "set-ups"):
         key = trial.setup, trial.flown

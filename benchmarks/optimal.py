@@ -318,14 +318,11 @@ class Problem:
                 between = after = self.states[:, 0]
             yield from _gate_limits(self.task, index, between[position], after[velocity])
 
-    def total_time(self) -> Any:
-        """Return the time to the last gate, s, as an expression."""
-        whole = casadi.dot(self.steps_s, casadi.DM(self.counts).T)
-        return whole - (1.0 - self.fractions[-1]) * self.steps_s[-1]
-
     def _cost(self) -> Any:
-        changes = casadi.diff(self.commands, 1, 1)
-        return self.total_time() + SMOOTHING_S * casadi.sumsqr(changes)
+        """Return the time to the last gate, s, and that of changes of the commands, as an expression."""
+        whole_s = casadi.dot(self.steps_s, casadi.DM(self.counts).T)
+        total_s = whole_s - (1.0 - self.fractions[-1]) * self.steps_s[-1]
+        return total_s + SMOOTHING_S * casadi.sumsqr(casadi.diff(self.commands, 1, 1))
 
     def _bounds(self, guess: Guess, is_on_grid: bool) -> tuple[np.ndarray, np.ndarray]:
         """Return the least and the greatest values of the variables."""

@@ -27,8 +27,7 @@ from flytrack_sysid.diagnosis.onset import (
 )
 from flytrack_sysid.diagnosis.outliers import outlier_notes, outliers_of
 from flytrack_sysid.diagnosis.problem import Problem
-from flytrack_sysid.diagnosis.reduction import reduced
-from flytrack_sysid.diagnosis.refinement import Refined, refine
+from flytrack_sysid.diagnosis.refinement import Refined, reduced, refine
 from flytrack_sysid.diagnosis.result import Cause, Diagnosis
 from flytrack_sysid.diagnosis.search import SearchState, search
 from flytrack_sysid.diagnosis.size import split_by_size
@@ -271,9 +270,7 @@ def summarize(judged: Judged, parts: Split) -> Diagnosis:
     extended = model if refined.fit is None else model._replace(vector=refined.fit.vector)
     found = with_refined_values([*effects, *in_base], refined, extended.vector)
     spans = spans_of(selection, parts.test, parts.log)
-    found = tuple(
-        replace(one, **spans[one.effect]._asdict()) if one.effect in spans else one for one in found
-    )
+    found = tuple(replace(one, **spans.get(one.effect, {})) for one in found)
 
     def without(cause: Cause) -> np.ndarray:
         if refined.fit is None:

@@ -66,12 +66,11 @@ class Visibility:
         way, shapes = _typical_candidate(effect), BY_NAME[effect].shapes
         notable = BY_NAME[effect].notable
         fields = [field for field in way.other_fields if field.split(".")[1] not in shapes]
-        self.columns = [linearization.column(field) for field in fields]
-        sizes = [notable[field.split(".")[1]] for field in fields]
         # The columns of probes come first, in shares of the way to them.
-        self.columns = [linearization.probe_column(one) for one in way.probes] + self.columns
-        sizes = [notable[one.field.split(".")[1]] / one.value for one in way.probes] + sizes
-        self.fields, self.sizes = [one.field for one in way.probes] + fields, np.array(sizes)
+        self.columns = [*map(linearization.probe_column, way.probes), *map(linearization.column, fields)]
+        self.fields = [*(one.field for one in way.probes), *fields]
+        ways = np.array([*(one.value for one in way.probes), *np.ones(len(fields))])
+        self.sizes = np.array([notable[field.split(".")[1]] for field in self.fields]) / ways
 
     def noncentralities(self, beside: Sequence[int] = ()) -> np.ndarray:
         """Return the noncentrality of each parameter, all that is free and ``beside`` projected out."""
@@ -151,13 +150,6 @@ def _flown(vector: jax.Array, like: ModelParameters, starts: jax.Array, commands
     return jax.vmap(fly)(starts, commands)
 
 
-def _until_outside(states: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return flights that stand still once they leave the envelope, and where they are within it."""
-    inside = np.logical_and.accumulate(is_inside(states, SCRIPT_HEIGHTS, ANY_VOLTAGE), axis=1)
-    last = np.maximum.accumulate(np.where(inside, np.arange(states.shape[1]), 0), axis=1)
-    return np.take_along_axis(states, last[..., None], axis=1), inside
-
-
 def _absent_channels(lanes: Lanes) -> list[str]:
     """Return the channels of states that the log of these lanes did not have."""
     record, turned, moved = lanes.record, lanes.counts[..., 0, 1].any(), lanes.counts[..., 3, 1].any()
@@ -180,7 +172,11 @@ def _seen_flights(problem: Problem, vector: np.ndarray) -> tuple[FlightLog, np.n
     flights = flights_of(MANOEUVRES, hover_action(model, voltages), voltages=voltages)
     starts = np.stack([one.start for one in flights])
     commands = np.stack([one.command for one in flights])
-    states, inside = _until_outside(np.asarray(_flown(vector, problem.like, starts, commands)))
+    states = np.asarray(_flown(vector, problem.like, starts, commands))
+    # A flight stands still once it leaves the envelope.
+    inside = np.logical_and.accumulate(is_inside(states, SCRIPT_HEIGHTS, ANY_VOLTAGE), axis=1)
+    last = np.maximum.accumulate(np.where(inside, np.arange(states.shape[1]), 0), axis=1)
+    states = np.take_along_axis(states, last[..., None], axis=1)
     log = log_of_states(zip(states, commands, strict=True), DT_S, "manoeuvres")
     return log.without(*_absent_channels(problem.lanes)), inside.reshape(-1)
 

@@ -171,9 +171,9 @@ class Separation(NamedTuple):
     beside: Mapping[str, float]
 
 
-def separation(problem: Problem, linearization: Linearization, model: FittedModel, effect: str) -> Separation:
+def separation(linearization: Linearization, model: FittedModel, effect: str) -> Separation:
     """Return how clearly a log shows an effect of a model, and tells it from others."""
-    own = model.candidate(effect)
+    problem, own = linearization.problem, model.candidate(effect)
     columns = [linearization.column(field) for field in own.fields]
     size = (model.vector - problem.start)[problem.index(own.fields)]
     given = linearization.columns_at(model.places, without=columns)

@@ -20,8 +20,11 @@ from scipy.spatial.transform import Rotation
 
 from flytrack_env.dynamics import ModelParameters
 from flytrack_env.effects import BY_NAME
+from flytrack_sysid.diagnosis.model_selection import ablate
+from flytrack_sysid.diagnosis.onset import ended
 from flytrack_sysid.diagnosis.problem import Problem
 from flytrack_sysid.diagnosis.score_test import BASE_CAUSES, Candidate, prior_information, solve, step_inside
+from flytrack_sysid.diagnosis.vetoes import Selection
 from flytrack_sysid.log import FlightLog
 from flytrack_sysid.parameters import DRAIN, from_vector, in_batches
 from flytrack_sysid.prediction_windows import (
@@ -407,10 +410,8 @@ def refine(
     as_found = as_found._replace(judge=judge)
     if not candidates or not judge.is_known.any():
         return as_found
-    found = _Refinement(judge, learnt, base, tuple(base_places), (), is_explained)
-    found = found._replace(
-        acting=found.acting_in(problem, _probed(problem, extended, candidates), candidates)
-    )
+    acting = _acting(problem, _probed(problem, extended, candidates), candidates, learnt)
+    found = _Refinement(judge, learnt, base, tuple(base_places), acting, is_explained)
     is_at_bound = bool(at_bounds(problem, extended, found.fields_of(candidates)))
     if is_explained and not is_at_bound and not judge.is_surely_worse(extended):
         return as_found
@@ -446,15 +447,6 @@ class _Refinement(NamedTuple):
         """Return the free places that act on the windows."""
         own = [place for place in self.base_places if problem.names[place] != DRAIN]
         return own + problem.index(self.fields_of(candidates))
-
-    def acting_in(
-        self, problem: Problem, vector: np.ndarray, candidates: Sequence[Candidate]
-    ) -> tuple[str, ...]:
-        """Return the effects that change how a model predicts."""
-        without = [problem.at_start(vector, one.fields) for one in candidates]
-        found = errors_at(problem, np.stack([vector, *without]), self.learnt).errors
-        changes = np.abs(found[1:] - found[0]).max(axis=(1, 2, 3, 4))
-        return tuple(one.effect for one, change in zip(candidates, changes, strict=True) if change > 0.0)
 
     def run(self, extended: np.ndarray, as_found: Refined) -> Refined:
         """Return the refined model with the effects that held-out prediction needs."""
@@ -513,6 +505,16 @@ class _Refinement(NamedTuple):
         return target.fitted(vector, self.places(target.problem, rest), REFIT_ROUNDS)
 
 
+def _acting(
+    problem: Problem, vector: np.ndarray, candidates: Sequence[Candidate], windows: Windows
+) -> tuple[str, ...]:
+    """Return the effects that change how a model predicts."""
+    without = [problem.at_start(vector, one.fields) for one in candidates]
+    found = errors_at(problem, np.stack([vector, *without]), windows).errors
+    changes = np.abs(found[1:] - found[0]).max(axis=(1, 2, 3, 4))
+    return tuple(one.effect for one, change in zip(candidates, changes, strict=True) if change > 0.0)
+
+
 def _is_neutral(problem: Problem, vector: np.ndarray, fields: Sequence[str]) -> bool:
     """Return whether parameters are as in the nominal model, those apart that only shape what others do."""
     own = [name for name in fields if name.split(".")[1] not in BY_NAME[name.split(".")[0]].shapes]
@@ -540,3 +542,45 @@ def table_of(tested: np.ndarray) -> dict[str, dict[str, float]]:
         for index, quantity in enumerate(QUANTITIES)
         if np.isfinite(tested[:, index]).any()
     }
+
+
+def reduced(selection: Selection, refined: Refined) -> Selection:
+    """Return the selection with only those effects that a refinement kept; its base alone without any.
+
+    Where none was fitted to flights, as sensors that flights do not see, single steps decide; the base alone
+    stands where it flies better.
+    """
+    model = selection.model
+    if refined.fit is not None:
+        if refined.kept == model.candidates:
+            return selection
+        return selection._replace(model=model._replace(candidates=refined.kept, places=refined.fit.places))
+    if refined.kept:
+        kept = selection if refined.kept == model.candidates else _narrowed(selection, refined.kept)
+        if not _flies_worse(kept, refined.judge):
+            return kept
+    state, base = selection.state, selection.base
+    # What an effect that is gone held at nominal is free again, as it was when the base was fitted.
+    held = tuple(one for one in state.held if state.problem.names.index(one.field) not in base.places)
+    return selection._replace(state=replace(state, held=held), model=base)
+
+
+def _narrowed(selection: Selection, kept: Sequence[Candidate]) -> Selection:
+    """Return the selection with some of its effects, fitted to single steps again."""
+    state, model = selection.state, selection.model
+    removed = [one.effect for one in model.candidates if one not in kept]
+    state = replace(state, held=tuple(one for one in state.held if one.effect not in removed))
+    model = state.fitted(kept, state.problem.without(model.vector, removed))
+    state, linearization = state.linearized(model.vector)
+    ablations = {one.effect: ablate(state, model, linearization, one.effect) for one in kept}
+    return selection._replace(state=state, model=model, ablations=ablations)
+
+
+def _flies_worse(selection: Selection, judge: Judge | None) -> bool:
+    """Return whether a model predicts held-out flights after its last change worse than its base does."""
+    if judge is None:
+        return False
+    vector = selection.state.problem.without(selection.model.vector, ended(selection))
+    if selection.unexplained.flagged:
+        return judge.worst_ratio(vector) >= 1.0
+    return judge.is_surely_worse(vector)

@@ -59,9 +59,10 @@ STILL = (*MAX_RATES, DRAIN, *THRUST_COEFFS)  # a model where these are 0 does no
 
 
 def estimates(
-    problem: Problem, linearization: Linearization, model: FittedModel, fields: Sequence[str]
+    linearization: Linearization, model: FittedModel, fields: Sequence[str]
 ) -> dict[str, Estimated]:
     """Return values and 95 % intervals of parameters that the log determines, by name without the effect."""
+    problem = linearization.problem
     halves = Marginal(linearization, model, fields).half_widths()
     result, least = {}, halves.min()  # at least one parameter of each effect is listed
     for field, half in zip(fields, halves, strict=True):
@@ -148,7 +149,7 @@ def effect_causes(selection: Selection, test: Problem, linearization: Linearizat
     for one in model.candidates:
         ablation = selection.ablations[one.effect]
         less = ablation.without.vector
-        own = separation(problem, linearization, model, one.effect)
+        own = separation(linearization, model, one.effect)
         # Refitted where that was worth it, else to first order.
         rivals = {name: min(ablation.rivals.get(name, size), size) for name, size in own.beside.items()}
         closest = min(rivals, key=lambda name: rivals[name], default="")
@@ -165,7 +166,7 @@ def effect_causes(selection: Selection, test: Problem, linearization: Linearizat
                 effect=one.effect,
                 equivalent=alike,
                 channel=channel,
-                parameters=estimates(problem, linearization, model, one.fields),
+                parameters=estimates(linearization, model, one.fields),
                 chi2_gain=ablation.gain,
                 heldout_gain=held_out_gain(test, less, model.vector)[0],
                 lambda_=own.noncentrality,
@@ -196,12 +197,12 @@ def base_causes(
         if name in selection.stand_ins:
             continue
         channel = channel_of(problem, problem.at_start(model.vector, change.fields), model.vector)
-        refitted = _refitted_to_first_order(problem, linearization, model, change.fields)
+        refitted = _refitted_to_first_order(linearization, model, change.fields)
         gain, expected = held_out_gain(test, refitted, model.vector)
         if is_contradicted(gain, expected, change.marginal.inflation):
             contradicted.append(name)
             continue
-        parameters = estimates(problem, linearization, model, change.fields)
+        parameters = estimates(linearization, model, change.fields)
         cause = Cause(name, (), channel, parameters, change.gain, gain, change.gain, change.gain)
         if not _is_remainder(cause, effects):
             causes.append(_as_thrust_scale(cause, change, problem, model))
@@ -213,15 +214,14 @@ def vector_without(cause: Cause, selection: Selection, linearization: Linearizat
     if cause.effect in selection.ablations:
         return selection.ablations[cause.effect].without.vector
     name = "thrust_curve" if cause.effect == "thrust_scale" else cause.effect
-    return _refitted_to_first_order(
-        selection.state.problem, linearization, selection.model, BASE_CAUSES[name]
-    )
+    return _refitted_to_first_order(linearization, selection.model, BASE_CAUSES[name])
 
 
 def _refitted_to_first_order(
-    problem: Problem, linearization: Linearization, model: FittedModel, fields: Sequence[str]
+    linearization: Linearization, model: FittedModel, fields: Sequence[str]
 ) -> np.ndarray:
     """Return the vector with some parameters at nominal and the rest fitted again, to first order."""
+    problem = linearization.problem
     places, less = problem.index(fields), problem.at_start(model.vector, fields)
     others = [place for place in model.places if place not in set(places)]
     columns, own = linearization.columns_at(others), linearization.columns_at(places)

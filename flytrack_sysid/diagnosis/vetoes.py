@@ -269,13 +269,9 @@ def not_seen_at_rest(selection: Selection, test: Problem) -> list[str]:
         without = without_effect(state, without, name)
     gain, expected = seen(without.vector)
     inflation = max(one.inflation for one in ablations)
-    is_unseen = expected < HELD_OUT_SHOWN * inflation and turns_unexplained(selection)
+    are_turns_unexplained = any(name.startswith("rate:") for name in selection.unexplained.shares)
+    is_unseen = expected < HELD_OUT_SHOWN * inflation and are_turns_unexplained
     return laws if is_unseen or is_contradicted(gain, expected, inflation) else []
-
-
-def turns_unexplained(selection: Selection) -> bool:
-    """Return whether a selection leaves something of the rotation unexplained."""
-    return any(name.startswith("rate:") for name in selection.unexplained.shares)
 
 
 def is_force_law(effect: str) -> bool:
