@@ -8,13 +8,14 @@ Envelope: a flight ends where the drone would become faster than 20 m/s, leave h
 """
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from flytrack_env.dynamics import nominal_parameters
+from flytrack_env.dynamics import ModelParameters, nominal_parameters
 from flytrack_env.plants import Plant
 from flytrack_env.state import ACCELERATION, STATE_SIZE, pack, unpack, unpack_action
 from flytrack_sysid import excitation
@@ -46,18 +47,20 @@ class CollectError(ValueError):
     """A plant that cannot be flown, or a request that cannot be met."""
 
 
+def states_flown(plant: Plant, model: ModelParameters, start: jax.Array, command: jax.Array) -> jax.Array:
+    """Return the states (T + 1, 21) that commands (T, 4) lead to, from a start (21,), that one included."""
+
+    def step(state: Any, action: jax.Array) -> tuple[Any, jax.Array]:
+        return plant.step(state, unpack_action(action), DT_S, model), pack(plant.drone(state))
+
+    last, states = jax.lax.scan(step, plant.reset(unpack(start), model), command)
+    return jnp.concatenate([states, pack(plant.drone(last))[None]])
+
+
 def _fly_plant(plant: Plant) -> Fly:
     """Return a function that flies a plant from all starts at once."""
-    model = nominal_parameters()  # part of the contract; a black box ignores it
-
-    def fly_one(start: jax.Array, command: jax.Array) -> jax.Array:
-        def step(state: Any, action: jax.Array) -> tuple[Any, jax.Array]:
-            return plant.step(state, unpack_action(action), DT_S, model), pack(plant.drone(state))
-
-        last, states = jax.lax.scan(step, plant.reset(unpack(start), model), command)
-        return jnp.concatenate([states, pack(plant.drone(last))[None]])
-
-    fly_all = jax.jit(jax.vmap(fly_one))
+    # The model is part of the contract; a black box ignores it.
+    fly_all = jax.jit(jax.vmap(partial(states_flown, plant, nominal_parameters())))
 
     def fly(starts: np.ndarray, commands: np.ndarray) -> np.ndarray:
         try:

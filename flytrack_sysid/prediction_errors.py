@@ -200,13 +200,6 @@ def _starts_and_ends(
     return np.concatenate(starts), np.concatenate(ends)
 
 
-def _distance(channel: str, measured: np.ndarray, flown: np.ndarray) -> np.ndarray:
-    """Return the size of the difference, unit of the quantity; (num_starts, size) -> (num_starts,)."""
-    if channel == "q":
-        return np.rad2deg(np.linalg.norm(turn_between(measured, flown), axis=1))
-    return np.linalg.norm(measured - flown, axis=1)
-
-
 def _spread(distances: np.ndarray) -> Spread:
     median, high = np.percentile(distances, [50.0, HIGH_PERCENTILE]).tolist()
     return Spread(median, float(np.sqrt(np.mean(distances**2))), high)
@@ -233,7 +226,9 @@ def rollout_errors(
             channel = QUANTITIES[name][0]
             with np.errstate(over="ignore", invalid="ignore"):  # a model may run away
                 measured, at_end = log[channel][ends[reaches, index]], flown[channel][reaches, index]
-                errors[name] = _spread(_distance(channel, measured, at_end))
+                apart = turn_between(measured, at_end) if channel == "q" else measured - at_end
+                distances = np.linalg.norm(apart, axis=1)
+                errors[name] = _spread(np.rad2deg(distances) if channel == "q" else distances)
         rollouts.append(Rollout(horizon_s, int(reaches.sum()), errors))
     return tuple(rollouts)
 

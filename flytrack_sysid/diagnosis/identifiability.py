@@ -7,6 +7,7 @@ information that each would add to the log's decides which one to advise.
 import copy
 import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -16,7 +17,7 @@ import numpy as np
 from flytrack_env.dynamics import ModelParameters
 from flytrack_env.effects import BY_NAME, MOST_STEPS
 from flytrack_env.plants import Simulator
-from flytrack_env.state import pack, unpack, unpack_action
+from flytrack_sysid.collect import states_flown
 from flytrack_sysid.diagnosis.lanes import LANE_S, Lanes, make_lanes, voltages_of
 from flytrack_sysid.diagnosis.problem import SEARCHED, Problem
 from flytrack_sysid.diagnosis.result import SCHEMA, TO_LOG
@@ -139,15 +140,8 @@ def _look_alikes(
 @jax.jit
 def _flown(vector: jax.Array, like: ModelParameters, starts: jax.Array, commands: jax.Array) -> jax.Array:
     """Return the states of flights, (flights, steps, 21), each before its command."""
-    model, simulator = from_vector(vector, like), Simulator(MOST_STEPS)
-
-    def step(state: Any, action: jax.Array) -> tuple[Any, jax.Array]:
-        return simulator.step(state, unpack_action(action), DT_S, model), pack(simulator.drone(state))
-
-    def fly(start: jax.Array, command: jax.Array) -> jax.Array:
-        return jax.lax.scan(step, simulator.reset(unpack(start), model), command)[1]
-
-    return jax.vmap(fly)(starts, commands)
+    fly = partial(states_flown, Simulator(MOST_STEPS), from_vector(vector, like))
+    return jax.vmap(fly)(starts, commands)[:, :-1]
 
 
 def _absent_channels(lanes: Lanes) -> list[str]:
