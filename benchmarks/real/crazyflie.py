@@ -28,8 +28,8 @@ from flytrack_env.motion import Motion
 from flytrack_sysid import FlightLog, import_log
 from flytrack_sysid.diagnosis import joined, refinement
 from flytrack_sysid.diagnosis.diagnose import split
-from flytrack_sysid.diagnosis.lanes import make_lanes, thinned
-from flytrack_sysid.diagnosis.noise import first_guess, fit_noise
+from flytrack_sysid.diagnosis.lanes import lanes_of, thinned
+from flytrack_sysid.diagnosis.noise import fit_noise
 from flytrack_sysid.diagnosis.problem import Problem
 from flytrack_sysid.diagnosis.score_test import CANDIDATES
 from flytrack_sysid.diagnosis.search import SearchState
@@ -94,10 +94,7 @@ class Models(NamedTuple):
 def models_of(learnt: FlightLog, nominal: ModelParameters) -> Models:
     """Return the models of flights: base and proposed effects fitted to single steps, then refined."""
     parts = split(learnt, nominal, None, Motion.CONTINUOUS)
-    problem = parts.train
-    state = SearchState.start(
-        learnt, problem.with_noise(first_guess(problem.lanes, problem.residuals(problem.start[None])[0]))
-    )
+    problem, state = parts.train, SearchState.start(learnt, parts.train)
     ways = ([one for one in CANDIDATES if one.effect == name] for name in PROPOSED)
     candidates = [found[len(found) // 2] for found in ways]  # from probes in the middle
     base = state.fitted((), problem.start)
@@ -107,16 +104,7 @@ def models_of(learnt: FlightLog, nominal: ModelParameters) -> Models:
     model = state.fitted(candidates, vector)
     state = state.with_noise(fit_noise(problem.lanes, problem.residuals(model.vector[None])[0]))
     base, model = state.fitted((), base.vector), state.fitted(candidates, model.vector)
-    refined = refinement.refine(
-        problem,
-        base.vector,
-        model.vector,
-        candidates,
-        state.base_places,
-        learnt,
-        parts.held_out,
-        is_explained=False,
-    )
+    refined = refinement.refine(state, base, model, learnt, parts.held_out, is_explained=False)
     return Models(problem, base.vector, refined)
 
 
@@ -182,8 +170,7 @@ def fits_of(folder: Path, structure: Sequence[str], start: dict[str, float]) -> 
             continue
         windows = refinement.windows_of(log, every)
         assert windows is not None
-        lanes = thinned(make_lanes(log, every, np.asarray(model.tau, float), float(model.g)))
-        problem = Problem.of(lanes, model)
+        problem = Problem.of(thinned(lanes_of(log, every, model)), model)
         vector = problem.start.copy()
         vector[problem.index(list(start))] = list(start.values())
         scale = refinement.errors_at(problem, vector[None], windows).rms()[0]

@@ -17,14 +17,7 @@ from flytrack_sysid.diagnosis.late_poses import with_late_poses
 from flytrack_sysid.diagnosis.lateness import judged_as_logged, latency_of, read_poses
 from flytrack_sysid.diagnosis.learned import find_learned
 from flytrack_sysid.diagnosis.motion_choice import Moves, how_it_moves, likelier_motion
-from flytrack_sysid.diagnosis.onset import (
-    at_end,
-    ended,
-    first_row_as_at_end,
-    notes_of,
-    spans_of,
-    with_changes,
-)
+from flytrack_sysid.diagnosis.onset import at_end, first_row_as_at_end, notes_of, spans_of, with_changes
 from flytrack_sysid.diagnosis.outliers import outlier_notes, outliers_of
 from flytrack_sysid.diagnosis.problem import Problem
 from flytrack_sysid.diagnosis.refinement import Refined, reduced, refine
@@ -240,20 +233,16 @@ def refined_by_prediction(selection: Selection, parts: Split) -> Refined:
     Flights are of the part of the log in which the effects act that do so at its end. Those that ended before
     are kept.
     """
-    state, model, gone = selection.state, selection.model, ended(selection)
+    model, last = selection.model, at_end(selection, selection.model)
     since = np.arange(len(parts.log)) >= first_row_as_at_end(selection, parts.test)
-    refined = refine(
-        state.problem,
-        selection.base.vector,
-        state.problem.without(model.vector, gone),
-        [one for one in model.candidates if one.effect not in gone],
-        state.base_places,
+    log, held_out, is_explained = (
         parts.log.select(since),
         parts.held_out[since],
         not selection.unexplained.flagged,
     )
-    kept = tuple(one for one in model.candidates if one in refined.kept or one.effect in gone)
-    return refined._replace(kept=kept)
+    refined = refine(selection.state, selection.base, last, log, held_out, is_explained)
+    kept = (one for one in model.candidates if one in refined.kept or one not in last.candidates)
+    return refined._replace(kept=tuple(kept))
 
 
 def summarize(judged: Judged, parts: Split) -> Diagnosis:

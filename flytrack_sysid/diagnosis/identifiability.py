@@ -73,6 +73,10 @@ class Visibility:
         ways = np.array([*(one.value for one in way.probes), *np.ones(len(fields))])
         self.sizes = np.array([notable[field.split(".")[1]] for field in self.fields]) / ways
 
+    def of(self, effect: str) -> "Visibility":
+        """Return the same of another effect."""
+        return Visibility(self.linearization, self.given, effect)
+
     def noncentralities(self, beside: Sequence[int] = ()) -> np.ndarray:
         """Return the noncentrality of each parameter, all that is free and ``beside`` projected out."""
         given = self.given + [column for column in beside if column not in self.given]
@@ -117,21 +121,19 @@ def unseen_effects(state: SearchState, linearization: Linearization, model: Fitt
         smallest = float("inf")
         if sizes[worst] > DETECTED * ROUNDING:
             smallest = float(BY_NAME[effect].notable[field] * np.sqrt(DETECTED / sizes[worst]))
-        alike = _look_alikes(state, linearization, given, visible) if sizes[worst] > 0.0 else ()
+        alike = _look_alikes(state, visible) if sizes[worst] > 0.0 else ()
         result[effect] = Limit(smallest, unit_of(effect, field), alike)
     return result
 
 
-def _look_alikes(
-    state: SearchState, linearization: Linearization, given: list[int], visible: Visibility
-) -> tuple[str, ...]:
+def _look_alikes(state: SearchState, visible: Visibility) -> tuple[str, ...]:
     """Return effects beside which this one hardly shows any more."""
     sizes = visible.noncentralities()
     result = []
     for other in SEARCHED:
         if other.name in (visible.effect, *BASE_ONLY, *state.unobservable):
             continue
-        beside = visible.noncentralities(Visibility(linearization, given, other.name).columns)
+        beside = visible.noncentralities(visible.of(other.name).columns)
         if np.any((beside < SEPARATE) & (beside < LOOKS_ALIKE * sizes)):
             result.append(other.name)
     return tuple(result)

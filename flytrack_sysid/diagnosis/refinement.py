@@ -24,6 +24,7 @@ from flytrack_sysid.diagnosis.model_selection import ablate
 from flytrack_sysid.diagnosis.onset import ended
 from flytrack_sysid.diagnosis.problem import Problem
 from flytrack_sysid.diagnosis.score_test import BASE_CAUSES, Candidate, prior_information, solve, step_inside
+from flytrack_sysid.diagnosis.search import FittedModel, SearchState
 from flytrack_sysid.diagnosis.vetoes import Selection
 from flytrack_sysid.log import FlightLog
 from flytrack_sysid.parameters import DRAIN, from_vector, in_batches
@@ -387,31 +388,30 @@ def widened(problem: Problem, fields: Sequence[str]) -> Problem:
 
 
 def refine(
-    problem: Problem,
-    base: np.ndarray,
-    extended: np.ndarray,
-    candidates: Sequence[Candidate],
-    base_places: Sequence[int],
+    state: SearchState,
+    base: FittedModel,
+    model: FittedModel,
     log: FlightLog,
     held_out: np.ndarray,
     is_explained: bool,
 ) -> Refined:
     """Return which effects of a model predict held-out flights better, and their values.
 
-    base, extended: the models from one-step residuals. base_places: its free base parameters. held_out:
-    (num_rows,) bool. is_explained: one-step residuals leave noise only; the model is then the most likely
-    one already, and stands as long as it predicts no horizon worse than the base.
+    base, model: those from one-step residuals. held_out: (num_rows,) bool. is_explained: one-step residuals
+    leave noise only; the model is then the most likely one already, and stands as long as it predicts no
+    horizon worse than the base.
     """
     learnt, judged = windows_of(log, ~held_out), windows_of(log, held_out)
-    as_found = Refined(tuple(candidates), None, None, (), {}, problem, None)
+    problem, candidates, extended = state.problem, model.candidates, model.vector
+    as_found = Refined(candidates, None, None, (), {}, problem, None)
     if learnt is None or judged is None:
         return as_found
-    judge = Judge.of(problem, learnt, judged, base).seeing(errors_at(problem, extended[None], judged))
+    judge = Judge.of(problem, learnt, judged, base.vector).seeing(errors_at(problem, extended[None], judged))
     as_found = as_found._replace(judge=judge)
     if not candidates or not judge.is_known.any():
         return as_found
     acting = _acting(problem, _probed(problem, extended, candidates), candidates, learnt)
-    found = _Refinement(judge, learnt, base, tuple(base_places), acting, is_explained)
+    found = _Refinement(judge, learnt, base.vector, tuple(state.base_places), acting, is_explained)
     is_at_bound = bool(at_bounds(problem, extended, found.fields_of(candidates)))
     if is_explained and not is_at_bound and not judge.is_surely_worse(extended):
         return as_found
