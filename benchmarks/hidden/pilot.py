@@ -19,7 +19,7 @@ import numpy as np
 
 from benchmarks.hidden.outside import FirstOrderNoise
 from benchmarks.hidden.truth import DT_S, STICKS, Truth
-from benchmarks.hidden.vectors import Vector, clip_length, norm, rotation, to_body, wrap_angle
+from benchmarks.hidden.vectors import Vector, add, clip_length, norm, rotation, to_body, wrap_angle
 
 Rng = np.random.Generator
 CLIMB, TURN_RATE = 5.0, math.radians(70.0)  # m/s, rad/s: what a plan asks for
@@ -143,10 +143,9 @@ class Sketch:
         vel_w, heading = smooth[:, :3], smooth[:, 3]
         pos_w = np.array(self.start_w) + np.cumsum(vel_w, axis=0) * DT_S
         acc_w = np.gradient(vel_w, DT_S, axis=0)
-        columns = (pos_w, vel_w, acc_w)
-        rows = zip(*(map(tuple, column[:count].tolist()) for column in columns), strict=True)
-        rest = zip(heading[:count].tolist(), self._sticks, strict=False)
-        return [Moment(*row, *other) for row, other in zip(rows, rest, strict=True)]
+        vectors = (map(tuple, column[:count].tolist()) for column in (pos_w, vel_w, acc_w))
+        rows = zip(*vectors, heading[:count].tolist(), self._sticks[:count], strict=True)
+        return [Moment(*row) for row in rows]
 
 
 def steps_of(seconds: float) -> int:
@@ -361,7 +360,7 @@ class Pilot:
             POSITION_PER_VELOCITY * gain * (there - here)
             for gain, there, here in zip(gains, moment.pos_w, plant.pos_w, strict=True)
         )
-        wanted = tuple(a + b for a, b in zip(clip_length(away, MOST_CORRECTION), moment.vel_w, strict=True))
+        wanted = add(clip_length(away, MOST_CORRECTION), moment.vel_w)
         error = tuple(a - b for a, b in zip(clip_length(wanted, MOST_SPEED), plant.vel_w, strict=True))
         acc = [
             a + gain * e + k for a, gain, e, k in zip(moment.acc_w, gains, error, self._learnt_w, strict=True)

@@ -13,7 +13,7 @@ import numpy as np
 
 from flytrack_env.effects import effect_of
 from flytrack_env.messages import quote_name, quote_value
-from flytrack_sysid.importing.betaflight_rates import RATES_TYPES, full_stick_rate, stick_curve
+from flytrack_sysid.importing.betaflight_settings import RATES_TYPES, full_stick_rate, stick_curve
 from flytrack_sysid.importing.decoding import decode
 from flytrack_sysid.importing.flight import ImportedFlight, not_a_quadcopter, read_log_file, saturation
 from flytrack_sysid.importing.mapping import Mapping
