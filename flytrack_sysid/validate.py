@@ -5,16 +5,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from flytrack_env.dynamics import ModelParameters
+from flytrack_sysid import prediction_errors
 from flytrack_sysid.log import FlightLog
 from flytrack_sysid.prediction import Prediction, predict
-from flytrack_sysid.prediction_errors import (
-    OneStep,
-    Rollout,
-    ThrustError,
-    one_step_errors,
-    rollout_errors,
-    thrust_error,
-)
 from flytrack_sysid.record import BATTERY_UNKNOWN_V, fill_gaps
 from flytrack_sysid.steps import HELD_AFTER_S, HELD_BEFORE_S, LEAST_JUMP, StepResponse, step_responses
 
@@ -39,9 +32,9 @@ class Validation(NamedTuple):
 
     num_rows: int
     num_judged: int
-    one_step: OneStep
-    rollouts: tuple[Rollout, ...]
-    thrust: ThrustError | None
+    one_step: prediction_errors.OneStep
+    rollouts: tuple[prediction_errors.Rollout, ...]
+    thrust: prediction_errors.ThrustError | None
     steps: tuple[StepResponse, ...]
     notes: tuple[str, ...]
 
@@ -115,14 +108,14 @@ def validate(model: ModelParameters, log: FlightLog, rows: np.ndarray | None = N
     filled = fill_gaps(log)
     prediction, rows = predict(model, filled), rows[filled.behind]
     notes = _notes_of(prediction)
-    one_step = one_step_errors(prediction, rows)
+    one_step = prediction_errors.one_step_errors(prediction, rows)
     if not one_step.num_steps:
         notes.append("one step: no judged row is followed by a judged row")
-    rollouts = rollout_errors(prediction, rows)
+    rollouts = prediction_errors.rollout_errors(prediction, rows)
     too_long = [f"{rollout.horizon_s:g} s" for rollout in rollouts if not rollout.num_starts]
     if too_long:
         notes.append(f"free flight of {', '.join(too_long)}: no judged stretch is that long")
-    thrust = thrust_error(prediction, rows)
+    thrust = prediction_errors.thrust_error(prediction, rows)
     if thrust is None:
         notes.append("thrust: no judged step has f or a to compare the model with")
     elif "v_bat" not in log:

@@ -7,6 +7,7 @@ import numpy as np
 
 from flytrack_env.dynamics import ModelParameters, collective_thrust
 from flytrack_env.effects import BY_NAME, effect_of
+from flytrack_sysid.diagnosis import vetoes
 from flytrack_sysid.diagnosis.identifiability import advise, unit_of, unseen_effects
 from flytrack_sysid.diagnosis.lanes import voltages_of
 from flytrack_sysid.diagnosis.model_selection import (
@@ -36,15 +37,6 @@ from flytrack_sysid.diagnosis.result import (
 )
 from flytrack_sysid.diagnosis.score_test import BASE_CAUSES, Linearization, solve, threshold
 from flytrack_sysid.diagnosis.search import FittedModel, SearchState
-from flytrack_sysid.diagnosis.vetoes import (
-    Selection,
-    Veto,
-    held_out_gain,
-    is_base_remainder,
-    is_contradicted,
-    is_force_law,
-    not_seen_at_rest,
-)
 from flytrack_sysid.parameters import DRAIN, MAX_RATES, STICKS, THRUST_COEFFS, as_float32, from_vector
 from flytrack_sysid.parameters import unit_of as unit_of_parameter
 from flytrack_sysid.prediction_windows import HORIZONS_S, QUANTITIES
@@ -139,7 +131,7 @@ def channel_of(problem: Problem, less: np.ndarray, full: np.ndarray) -> str:
     return max(power, key=lambda name: power[name])
 
 
-def effect_causes(selection: Selection, test: Problem, linearization: Linearization) -> list[Cause]:
+def effect_causes(selection: vetoes.Selection, test: Problem, linearization: Linearization) -> list[Cause]:
     """Return the effects of a model as causes, those that explain most first.
 
     A force may as well be one of the laws of velocity or attitude where the log lacks these.
@@ -159,7 +151,7 @@ def effect_causes(selection: Selection, test: Problem, linearization: Linearizat
             alike += tuple(
                 name
                 for name in selection.state.unobservable
-                if is_force_law(name) and not {"v", "q"}.isdisjoint(BY_NAME[name].needs)
+                if vetoes.is_force_law(name) and not {"v", "q"}.isdisjoint(BY_NAME[name].needs)
             )
         causes.append(
             Cause(
@@ -168,7 +160,7 @@ def effect_causes(selection: Selection, test: Problem, linearization: Linearizat
                 channel=channel,
                 parameters=estimates(linearization, model, one.fields),
                 chi2_gain=ablation.gain,
-                heldout_gain=held_out_gain(test, less, model.vector)[0],
+                heldout_gain=vetoes.held_out_gain(test, less, model.vector)[0],
                 lambda_=own.noncentrality,
                 lambda_sep=max(rivals.get(closest, own.noncentrality), 0.0),
                 closest=closest,
@@ -180,11 +172,13 @@ def effect_causes(selection: Selection, test: Problem, linearization: Linearizat
 
 
 def _is_remainder(cause: Cause, others: Sequence[Cause]) -> bool:
-    return is_base_remainder(cause.chi2_gain, cause.channel, [(one.channel, one.chi2_gain) for one in others])
+    return vetoes.is_base_remainder(
+        cause.chi2_gain, cause.channel, [(one.channel, one.chi2_gain) for one in others]
+    )
 
 
 def base_causes(
-    selection: Selection, test: Problem, linearization: Linearization, effects: Sequence[Cause]
+    selection: vetoes.Selection, test: Problem, linearization: Linearization, effects: Sequence[Cause]
 ) -> tuple[list[Cause], list[str]]:
     """Return base changes that the log shows, as causes, and names that held-out rows contradict.
 
@@ -198,8 +192,8 @@ def base_causes(
             continue
         channel = channel_of(problem, problem.at_start(model.vector, change.fields), model.vector)
         refitted = _refitted_to_first_order(linearization, model, change.fields)
-        gain, expected = held_out_gain(test, refitted, model.vector)
-        if is_contradicted(gain, expected, change.marginal.inflation):
+        gain, expected = vetoes.held_out_gain(test, refitted, model.vector)
+        if vetoes.is_contradicted(gain, expected, change.marginal.inflation):
             contradicted.append(name)
             continue
         parameters = estimates(linearization, model, change.fields)
@@ -209,7 +203,7 @@ def base_causes(
     return sorted(causes, key=lambda cause: -cause.chi2_gain), contradicted
 
 
-def vector_without(cause: Cause, selection: Selection, linearization: Linearization) -> np.ndarray:
+def vector_without(cause: Cause, selection: vetoes.Selection, linearization: Linearization) -> np.ndarray:
     """Return the extended model without one of its causes, the rest fitted again."""
     if cause.effect in selection.ablations:
         return selection.ablations[cause.effect].without.vector
@@ -374,7 +368,7 @@ def _is_beyond(problem: Problem, vector: np.ndarray, field: str) -> str:
     return f"{field.split('.')[-1]} at {'most' if is_low else 'least'} {size}"
 
 
-def causes_at_end(selection: Selection, refined: Refined, test: Problem) -> tuple[Cause, ...]:
+def causes_at_end(selection: vetoes.Selection, refined: Refined, test: Problem) -> tuple[Cause, ...]:
     """Return effects with a value at the end of what is searched, as causes that say which way it would go.
 
     Left out are values that the log does not determine, which end anywhere, and delays that end at how many
@@ -520,7 +514,7 @@ def warnings_of(problem: Problem, causes: Sequence[Cause], contradicted: Sequenc
     ]
 
 
-def stand_in_notes(selection: Selection, vector: np.ndarray) -> list[str]:
+def stand_in_notes(selection: vetoes.Selection, vector: np.ndarray) -> list[str]:
     """Return base changes that are not named since something unknown may be their cause.
 
     vector: of the extended model. In hover, a constant push passes for thrust.
@@ -549,9 +543,9 @@ def given_learned_notes(problem: Problem, rest: Unexplained) -> list[str]:
     ]
 
 
-def unseen_at_rest_notes(rejected: Mapping[str, Veto]) -> list[str]:
+def unseen_at_rest_notes(rejected: Mapping[str, vetoes.Veto]) -> list[str]:
     """Return laws of the sticks that were rejected for what they do while those rest."""
-    names = ", ".join(name for name, veto in rejected.items() if veto is not_seen_at_rest)
+    names = ", ".join(name for name, veto in rejected.items() if veto is vetoes.not_seen_at_rest)
     if not names:
         return []
     return [
