@@ -8,6 +8,7 @@ from matplotlib.figure import Figure
 
 from flytrack_env.dynamics import ModelParameters
 from flytrack_env.effects import ThrustScale
+from flytrack_env.pictures.drawing import new_figure, plain
 from flytrack_sysid.diagnosis.score_test import BASE_CAUSES
 from flytrack_sysid.diagnosis.traces import REGRESSORS, UNITS, Traces
 from flytrack_sysid.parameters import STICKS, names_of, to_vector, with_values
@@ -320,16 +321,13 @@ def draw_cause(cause: str, panels: Sequence[Panel], traces: Traces, without: str
     panels = list(dict.fromkeys(panel._replace(residual=traces.used(panel.residual)) for panel in panels))
     columns = min(len(panels), MOST_COLUMNS) if len(panels) % MOST_COLUMNS != 1 else min(len(panels), 2)
     rows = -(-len(panels) // columns)
-    figure = Figure(figsize=(WIDTH_IN, LEGEND_IN + ROW_IN * rows), layout="constrained")
+    figure = new_figure(WIDTH_IN, LEGEND_IN + ROW_IN * rows)
     title = words_of(cause)
     title = title[0].upper() + title[1:] + when
     figure.suptitle(title, fontsize="large", fontweight="bold", x=0.01, ha="left")
     grid = figure.subplots(rows, columns, squeeze=False)
     for axes, panel in zip(grid.flat, panels, strict=True):
-        axes.spines[["top", "right"]].set_visible(False)
-        axes.grid(color="0.92", linewidth=0.8)
-        axes.set_axisbelow(True)
-        axes.tick_params(labelsize="small")
+        plain(axes).tick_params(labelsize="small")
         label = _label(panel.residual)
         if traces.column(EXTENDED, panel.residual)[1].sum() < FEWEST_SHOWN:
             say(axes, f"{label}:\n{NO_DATA}")

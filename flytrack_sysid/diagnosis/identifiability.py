@@ -235,15 +235,15 @@ class Question:
     def __init__(
         self, linearization: Linearization, model: FittedModel, effect: str, alike: Iterable[str] = ()
     ):
-        self.linearization, self.effect = linearization, effect
-        self.given = linearization.columns_at(model.places)
-        self.alike = [Visibility(linearization, self.given, other).columns for other in alike]
+        self.effect = effect
+        self.visible = Visibility(linearization, linearization.columns_at(model.places), effect)
+        self.alike = [self.visible.of(other).columns for other in alike]
 
     @property
     def columns(self) -> list[int]:
         """The columns of the linearization that the answer depends on."""
-        own = Visibility(self.linearization, self.given, self.effect).columns
-        return [*self.given, *own, *(column for columns in self.alike for column in columns)]
+        own = self.visible
+        return [*own.given, *own.columns, *(column for columns in self.alike for column in columns)]
 
     def shares(self, information: np.ndarray | float = 0.0) -> np.ndarray:
         """Return how well the effect would show at its notable size, the worst first; from 1 on it does.
@@ -251,9 +251,9 @@ class Question:
         Noncentrality of each of its parameters over DETECTED, and beside each look-alike over SEPARATE.
         information: added to the log's.
         """
-        later = copy.copy(self.linearization)
-        later.total = self.linearization.total + information
-        visible = Visibility(later, self.given, self.effect)
+        visible = copy.copy(self.visible)
+        visible.linearization = copy.copy(visible.linearization)
+        visible.linearization.total = self.visible.linearization.total + information
         beside = [visible.noncentralities(columns) / SEPARATE for columns in self.alike]
         return np.sort(np.concatenate([visible.noncentralities() / DETECTED, *beside]))
 

@@ -7,11 +7,11 @@ from pathlib import Path
 import numpy as np
 
 from flytrack_env.messages import quote_name
-from flytrack_sysid.csv_file import open_csv, read_columns
 from flytrack_sysid.importing.commands import commands_of
 from flytrack_sysid.importing.flight import ImportedFlight
 from flytrack_sysid.importing.mapping import Channel, Mapping
 from flytrack_sysid.log import LogError
+from flytrack_sysid.log_file import open_csv, read_columns
 from flytrack_sysid.log_table import Table, columns_of, log_of_table
 from flytrack_sysid.resample import Samples, is_increasing, on_one_base, slow_channels
 
