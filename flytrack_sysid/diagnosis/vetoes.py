@@ -11,6 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from flytrack_env.effects import BY_NAME
+from flytrack_sysid.diagnosis import unexplained as unknown
 from flytrack_sysid.diagnosis.lanes import AXES
 from flytrack_sysid.diagnosis.model_selection import (
     Ablation,
@@ -23,16 +24,6 @@ from flytrack_sysid.diagnosis.problem import Problem, blocks_of
 from flytrack_sysid.diagnosis.result import CHANNELS, Unexplained
 from flytrack_sysid.diagnosis.score_test import BASE_CAUSES, threshold
 from flytrack_sysid.diagnosis.search import FittedModel, SearchState
-from flytrack_sysid.diagnosis.unexplained import (
-    SIDES,
-    Dependence,
-    SideTest,
-    constants,
-    find_unexplained,
-    flight_of,
-    linearized_residuals,
-    whitened,
-)
 from flytrack_sysid.record import Record
 
 # Held-out rows contradict a cause where it gains so many standard deviations less than it would if it were
@@ -121,7 +112,7 @@ def apply_vetoes(selection: Selection, test: Problem) -> tuple[Selection, dict[s
 def examined(selection: Selection) -> Selection:
     """Return the selection with what it leaves unexplained, and the names that stand in for that."""
     problem, model = selection.state.problem, selection.model
-    rest, dependences = find_unexplained(problem, model, selection.base.vector)
+    rest, dependences = unknown.find_unexplained(problem, model, selection.base.vector)
     selection = selection._replace(unexplained=rest, stand_ins=())
     if not rest.flagged:
         return selection
@@ -151,7 +142,7 @@ def find_stand_ins(
     model: FittedModel,
     suspects: Sequence[Suspect],
     rest: Unexplained,
-    dependences: Sequence[Dependence],
+    dependences: Sequence[unknown.Dependence],
 ) -> list[str]:
     """Return names that stand in for something that no list has.
 
@@ -159,29 +150,30 @@ def find_stand_ins(
     which a wind, say, would be), or is small where something unknown disturbs the same side; unless it
     outweighs what the dependences explain.
     """
-    left, slopes = linearized_residuals(problem, model)
-    flight = flight_of(problem, model)
+    left, slopes = unknown.linearized_residuals(problem, model)
+    flight = unknown.flight_of(problem, model)
     disturbed = {name.split(":")[0] for name in rest.shares}
 
     def noncentralities(one: Suspect, side: str) -> tuple[float, float]:
         """Return a suspect's noncentrality on a side, and what is left beside what the rest depends on."""
-        axes = SIDES[side]
+        axes = unknown.SIDES[side]
         own = [model.places.index(place) for place in problem.index(one.fields)]
         acting = slopes[own][..., axes, :]
         if not (problem.counts[..., axes, :].any() and np.abs(acting).max() > 0.0):
             return 0.0, 0.0
-        test = SideTest.of(side, left, np.delete(slopes, own, axis=0))
+        test = unknown.SideTest.of(side, left, np.delete(slopes, own, axis=0))
         columns = blocks_of(acting * test.root)
         size = (model.vector - problem.start)[problem.index(one.fields)]
         before = test.noncentrality(columns, size)
         more = [dependence.columns for dependence in dependences if dependence.side == side]
         if more:
-            more.append(blocks_of(whitened(problem, constants(flight, side), side) * test.root))
+            constants = unknown.whitened(problem, unknown.constants(flight, side), side)
+            more.append(blocks_of(constants * test.root))
         return before, test.given_also(*more).noncentrality(columns, size)
 
     result = []
     for one in suspects:
-        by_side = {side: noncentralities(one, side) for side in SIDES}
+        by_side = {side: noncentralities(one, side) for side in unknown.SIDES}
         before, after = (sum(values) for values in zip(*by_side.values(), strict=True))
         if before == 0.0:
             continue  # it acts on neither side: the battery

@@ -102,12 +102,10 @@ def read_ulog(path: Path, mapping: Mapping) -> ImportedFlight:
 
 def _airframe(parameters: dict[str, float]) -> list[str]:
     """Return a note if the log's own parameters say that the craft is no quadcopter."""
-    kind = AIRFRAMES.get(int(parameters.get("MAV_TYPE", 0)))
-    if kind:
-        return [not_a_quadcopter(f"{kind} (MAV_TYPE {parameters['MAV_TYPE']:.0f})")]
-    kind = FRAMES.get(int(parameters.get("SYS_AUTOSTART", 0)) // 1000)
-    if kind:
-        return [not_a_quadcopter(f"{kind} (SYS_AUTOSTART {parameters['SYS_AUTOSTART']:.0f})")]
+    for kinds, name, every in ((AIRFRAMES, "MAV_TYPE", 1), (FRAMES, "SYS_AUTOSTART", 1000)):
+        kind = kinds.get(int(parameters.get(name, 0)) // every)
+        if kind:
+            return [not_a_quadcopter(f"{kind} ({name} {parameters[name]:.0f})")]
     num_rotors = int(parameters.get("CA_ROTOR_COUNT", 0))
     return [not_a_quadcopter(f"{num_rotors} rotors (CA_ROTOR_COUNT)")] if num_rotors not in (0, 4) else []
 
