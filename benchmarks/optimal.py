@@ -177,13 +177,11 @@ def step_function(model: ModelParameters) -> casadi.Function:
 
 def needed_states(step: casadi.Function) -> list[int]:
     """Return the indices of the state vector on which a path depends, directly or indirectly."""
-    depends = np.array(casadi.DM(step.jac_sparsity(0, 0), 1).full(), bool)
-    needed = set(range(layout.STATE_SIZE)[layout.POSITION])
-    while True:
-        more = needed | {int(place) for row in needed for place in np.flatnonzero(depends[row])}
-        if more == needed:
-            return sorted(needed)
-        needed = more
+    depends = np.array(casadi.DM(step.jac_sparsity(0, 0), 1).full(), bool) | np.eye(
+        layout.STATE_SIZE, dtype=bool
+    )
+    reached = np.linalg.matrix_power(depends, layout.STATE_SIZE)
+    return [int(place) for place in np.flatnonzero(reached[layout.POSITION].any(axis=0))]
 
 
 class Guess(NamedTuple):
@@ -339,11 +337,8 @@ class Problem:
             steps, fractions = (SHORTEST_SHARE * guess.steps_s, LONGEST_SHARE * guess.steps_s), (1.0, 1.0)
 
         def stacked(states: np.ndarray, stick: float, step: np.ndarray, fraction: float) -> np.ndarray:
-            sticks, ends = (
-                np.full(layout.ACTION_SIZE * self.num_steps, stick),
-                np.full(len(self.counts), fraction),
-            )
-            return np.concatenate([states.ravel("F"), sticks, step, ends])
+            sticks = np.full(layout.ACTION_SIZE * self.num_steps, stick)
+            return np.concatenate([states.ravel("F"), sticks, step, np.full(len(self.counts), fraction)])
 
         return stacked(low, -1.0, steps[0], fractions[0]), stacked(high, 1.0, steps[1], fractions[1])
 

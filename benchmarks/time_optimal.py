@@ -133,12 +133,6 @@ def _environment(plant: Plant | None) -> tuple[FlyTrack, Any]:
     return env, jax.jit(fly)
 
 
-def _params(track: Track, model: ModelParameters, dt_s: float) -> EnvParams:
-    model = jax.tree.map(lambda leaf: np.asarray(leaf, np.float32), model)
-    params = FlyTrack(track=track, model=model).default_params.replace(dt=dt_s)
-    return jax.device_put(params)  # once, not in every step
-
-
 def _frames_touched(positions: np.ndarray, params: EnvParams) -> int:
     """Return the number of gates whose frames the lines between positions, (N, 3), touch."""
     lines = (
@@ -155,7 +149,9 @@ def replay(reference: Reference, track: Track, plant: Plant | None = None) -> Re
     such as a black box; the flight ends at the first cause of termination.
     """
     env, step = _environment(plant)
-    params = _params(track, reference.model, reference.dt_s)
+    model = jax.tree.map(lambda leaf: np.asarray(leaf, np.float32), reference.model)
+    params = FlyTrack(track=track, model=model).default_params.replace(dt=reference.dt_s)
+    params = jax.device_put(params)  # once, not in every step
     first = jnp.asarray(reference.states[0], jnp.float32)
     state, steps = env.begin(unpack(first), 0, params), []
     for command in np.asarray(reference.commands, np.float32):
