@@ -336,17 +336,12 @@ class Pilot:
         self._is_cut_off = has_stick and (self._is_cut_off or self._is_unsafe(plant))
         is_free = not has_stick or self._is_cut_off
         force_w = self._force(plant, moment, is_free)
-        own = tuple(
-            stick + TREMBLE * shake
-            for stick, shake in zip(
-                self._sticks(plant, force_w, moment.heading), self._tremble.step(DT_S), strict=True
-            )
+        own, shakes = self._sticks(plant, force_w, moment.heading), self._tremble.step(DT_S)
+        hands = (None,) * len(own) if is_free else moment.sticks
+        return tuple(
+            max(-1.0, min(1.0, stick + TREMBLE * shake if hand is None else hand))
+            for stick, shake, hand in zip(own, shakes, hands, strict=True)
         )
-        if not is_free:
-            own = tuple(
-                mine if given is None else given for mine, given in zip(own, moment.sticks, strict=True)
-            )
-        return tuple(max(-1.0, min(1.0, stick)) for stick in own)
 
     def _is_unsafe(self, plant) -> bool:
         falling = max(0.0, -plant.vel_w[2])

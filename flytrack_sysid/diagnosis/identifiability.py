@@ -43,9 +43,8 @@ ROUNDING = 1e-6  # of DETECTED
 BASE_ONLY = ("thrust_scale",)  # no log tells it from the free thrust curve: a cause of the base
 LANES_PER_MANOEUVRE = int(FLIGHTS_PER_MANOEUVRE * FLIGHT_STEPS * DT_S) // LANE_S
 PRIOR_SHARE = 1e-2  # of what shows an effect: less comes from the log's own prior
-NEARLY_BEST = (
-    0.8  # of the best share: a manoeuvre that comes so near is as good, and an easier one comes first
-)
+# Of the best share: a manoeuvre that comes so near is as good, and an easier one comes first.
+NEARLY_BEST = 0.8
 PLENTY = 30.0  # shares: thirty times what shows an effect
 
 

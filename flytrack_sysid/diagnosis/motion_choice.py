@@ -205,9 +205,8 @@ def how_it_moves(
     late = {one: Moves(one) for one in motions}
     if apparent is not None:
         offset_s, sigma_s = apparent
-        half_s = 0.5 * float(
-            np.median(usual_step(log))
-        )  # rates of a simulator's step are those in its middle
+        # Rates of a simulator's step are those in its middle.
+        half_s = 0.5 * float(np.median(usual_step(log)))
         is_small = max(ON_TIME_S, min(STANDARD_ERRORS * sigma_s, UNCERTAIN_S))
         for one in motions:
             late_s = offset_s if one is Motion.CONTINUOUS else offset_s + half_s

@@ -181,10 +181,8 @@ class Linearization:
         self._sum_scores()
 
     def _sum_scores(self) -> None:
-        pull = np.zeros(len(self.prior))
-        pull[: len(self.places)] = (
-            (self.prior[: len(self.places)]) * (self.vector - self.problem.start)[self.places]
-        )
+        away = (self.vector - self.problem.start)[self.places]
+        pull = self.prior * np.append(away, np.zeros(len(self.probes)))
         self.score = self.score_by_block.sum(axis=0) - pull
         self.cost = costs_of(self.problem, self.vector[None], self.white[None])[0]
 
