@@ -74,11 +74,7 @@ def _both(rng: Rng, factor: tuple[float, float], **stock: float) -> dict[str, An
 def _rates(rng: Rng, center: tuple[float, float], full: tuple[float, float]) -> dict[str, Any]:
     most = round(rng.uniform(*full))
     least = round(rng.uniform(*center) * most)
-    return {
-        f"{axis}_{name}": value
-        for axis in ("roll", "pitch")
-        for name, value in (("rc_rate", least), ("srate", most))
-    }
+    return {"roll_rc_rate": least, "roll_srate": most, "pitch_rc_rate": least, "pitch_srate": most}
 
 
 KINDS = {

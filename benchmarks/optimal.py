@@ -369,12 +369,9 @@ class Problem:
 
     def _unstack(self, values: np.ndarray) -> Guess:
         """Return the flight of the solver's variables, with the places of the state that it does not need."""
-        sizes = [
-            len(self.needed) * (self.num_steps + 1),
-            layout.ACTION_SIZE * self.num_steps,
-            len(self.counts),
-        ]
-        short, commands, steps_s, fractions = np.split(values, np.cumsum(sizes))
+        variables = (self.states, self.commands, self.steps_s)
+        ends = np.cumsum([variable.numel() for variable in variables])
+        short, commands, steps_s, fractions = np.split(values, ends)
         states = np.zeros((self.num_steps + 1, layout.STATE_SIZE))
         states[:, self.needed] = short.reshape(-1, len(self.needed))
         commands = commands.reshape(-1, layout.ACTION_SIZE)

@@ -212,12 +212,8 @@ def refined_by_prediction(selection: Selection, parts: Split) -> Refined:
     """
     model, last = selection.model, at_end(selection, selection.model)
     since = np.arange(len(parts.log)) >= first_row_as_at_end(selection, parts.test)
-    log, held_out, is_explained = (
-        parts.log.select(since),
-        parts.held_out[since],
-        not selection.unexplained.flagged,
-    )
-    refined = refine(selection.state, selection.base, last, log, held_out, is_explained)
+    log, is_explained = parts.log.select(since), not selection.unexplained.flagged
+    refined = refine(selection.state, selection.base, last, log, parts.held_out[since], is_explained)
     kept = (one for one in model.candidates if one in refined.kept or one not in last.candidates)
     return refined._replace(kept=tuple(kept))
 

@@ -230,12 +230,9 @@ def profile_of(problem: Problem, test: Problem, vector: np.ndarray, row: int) ->
 
 def log_rows(problem: Problem, test: Problem, rows: Sequence[int]) -> np.ndarray:
     """Return the rows of the log, as fractions, of rows of the record."""
-    own, source = (
-        np.concatenate([part.ravel() for part in pair])
-        for pair in zip(
-            *((one.lanes.row, one.lanes.record.source_row) for one in (problem, test)), strict=True
-        )
-    )
+    lanes = problem.lanes, test.lanes
+    own = np.concatenate([one.row.ravel() for one in lanes])
+    source = np.concatenate([one.record.source_row.ravel() for one in lanes])
     known = (own >= 0) & (source >= 0)
     order = np.argsort(own[known])
     return np.interp(rows, own[known][order], source[known][order])

@@ -131,13 +131,9 @@ def dependences(flight: Flown) -> Mapping[str, Mapping[str, np.ndarray]]:
     tilt = _rank_waves(flight.body_to_world[..., 2, 2], counted, RANK_WAVES)
     fast = _rank_waves(np.linalg.norm(flight.vel_w, axis=-1), counted, RANK_WAVES)
     place = _place_waves(flight)
+    moves = ((flight.applied, RANK_WAVES), (flight.change, CHANGE_WAVES))
     sticks = [
-        np.concatenate(
-            [
-                _rank_waves(flight.applied[..., stick], counted, RANK_WAVES),
-                _rank_waves(flight.change[..., stick], counted, CHANGE_WAVES),
-            ]
-        )
+        np.concatenate([_rank_waves(values[..., stick], counted, number) for values, number in moves])
         for stick in range(ACTION_SIZE)
     ]
     rate = {

@@ -156,11 +156,8 @@ class Fields:
         """Return a tuple of different names, or the default."""
 
         def is_valid(value: Any) -> bool:
-            return (
-                isinstance(value, list)
-                and all(map(_is_text, value))
-                and len(set(value)) == len(value) == size
-            )
+            are_texts = isinstance(value, list) and all(map(_is_text, value))
+            return are_texts and len(set(value)) == len(value) == size
 
         return tuple(self.take(field, is_valid, f"{size} different names of columns", default))
 
@@ -397,12 +394,8 @@ def _thrust_command(fields: Fields) -> Channel:
     column, low, high = fields.text("column"), fields.number("low"), fields.number("high")
     if low == high:
         raise fields.error("high", f"found {high:g}, expected another value than low")
-    return Channel(
-        fields.name,
-        "thrust_command",
-        (column,),
-        lambda table: 2 * (table.matrix([column]) - low) / (high - low) - 1,
-    )
+    convert = lambda table: 2 * (table.matrix([column]) - low) / (high - low) - 1  # noqa: E731
+    return Channel(fields.name, "thrust_command", (column,), convert)
 
 
 def _motors(fields: Fields) -> tuple[tuple[Channel, ...], CommandRules]:
