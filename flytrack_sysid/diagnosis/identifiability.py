@@ -20,7 +20,7 @@ from flytrack_env.plants import Simulator
 from flytrack_sysid.collect import states_flown
 from flytrack_sysid.diagnosis.lanes import LANE_S, Lanes, make_lanes, voltages_of
 from flytrack_sysid.diagnosis.problem import SEARCHED, Problem
-from flytrack_sysid.diagnosis.result import SCHEMA, TO_LOG
+from flytrack_sysid.diagnosis.result import SCHEMA, TO_LOG, NotIdentifiable
 from flytrack_sysid.diagnosis.score_test import Candidate, Linearization, candidates_of
 from flytrack_sysid.diagnosis.search import FittedModel, SearchState
 from flytrack_sysid.excitation import ANY_VOLTAGE, DT_S, FLIGHT_STEPS, SCRIPT_HEIGHTS, VOLTAGES, is_inside
@@ -88,28 +88,25 @@ class Visibility:
         return found
 
 
-class Limit(NamedTuple):
-    """Of the parameter that is seen worst: smallest detectable size, infinite for none; and look-alikes."""
-
-    smallest: float
-    unit: str
-    look_alikes: tuple[str, ...]
-
-
 def unit_of(effect: str, field: str | None = None) -> str:
     """Return the unit of an effect's parameter, the first notable one if None."""
     return BY_NAME[effect].ranges[field or next(iter(BY_NAME[effect].notable))].unit
 
 
-def unseen_effects(state: SearchState, linearization: Linearization, model: FittedModel) -> dict[str, Limit]:
-    """Return effects that the log could not have shown, and how large they would have to be."""
+def unseen_effects(
+    state: SearchState, linearization: Linearization, model: FittedModel
+) -> dict[str, NotIdentifiable]:
+    """Return effects that the log could not have shown, by name; what to fly is still to be said.
+
+    Sizes are infinite where no size would show.
+    """
     given = linearization.columns_at(model.places)
-    result: dict[str, Limit] = {}
+    result: dict[str, NotIdentifiable] = {}
     for effect in (one.name for one in SEARCHED):
         if effect in model.effects or effect in BASE_ONLY:
             continue
         if effect in state.unobservable:
-            result[effect] = Limit(float("inf"), unit_of(effect), ())
+            result[effect] = NotIdentifiable(effect, float("inf"), unit_of(effect), (), "")
             continue
         visible = Visibility(linearization, given, effect)
         sizes = visible.noncentralities()
@@ -121,7 +118,7 @@ def unseen_effects(state: SearchState, linearization: Linearization, model: Fitt
         if sizes[worst] > DETECTED * ROUNDING:
             smallest = float(BY_NAME[effect].notable[field] * np.sqrt(DETECTED / sizes[worst]))
         alike = _look_alikes(state, visible) if sizes[worst] > 0.0 else ()
-        result[effect] = Limit(smallest, unit_of(effect, field), alike)
+        result[effect] = NotIdentifiable(effect, smallest, unit_of(effect, field), alike, "")
     return result
 
 

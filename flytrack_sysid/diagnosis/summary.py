@@ -271,15 +271,15 @@ def not_identifiable(
         if cause.effect in BY_NAME and cause.equivalent and cause.effect != "thrust_scale":
             twins[cause.effect] = (*twins.get(cause.effect, ()), *cause.equivalent)
             twins |= {name: (*twins.get(name, ()), cause.effect) for name in cause.equivalent}
-    wanted = {name: limit.look_alikes for name, limit in limits.items()} | twins
+    wanted = {name: limit.confused_with for name, limit in limits.items()} | twins
     flights = {name: TO_LOG + " and ".join(BY_NAME[name].needs) for name in state.unobservable}
     asked = {name: alike for name, alike in wanted.items() if name not in state.unobservable}
     flights |= advise(state.problem, model, linearization, asked)
     result = []
     for name, alike in wanted.items():
         # A twin of what was found has no size of its own.
-        smallest, unit = limits[name][:2] if name in limits else (float("inf"), unit_of(name))
-        result.append(NotIdentifiable(name, smallest, unit, tuple(alike), flights[name]))
+        twin = NotIdentifiable(name, float("inf"), unit_of(name), (), "")
+        result.append(replace(limits.get(name, twin), confused_with=tuple(alike), fly=flights[name]))
     return tuple(result)
 
 
