@@ -11,15 +11,9 @@ from typing import NamedTuple
 import numpy as np
 
 from flytrack_env.effects import BY_NAME
+from flytrack_sysid.diagnosis import model_selection
 from flytrack_sysid.diagnosis import unexplained as unknown
 from flytrack_sysid.diagnosis.lanes import AXES
-from flytrack_sysid.diagnosis.model_selection import (
-    Ablation,
-    base_changes,
-    explain_base_by_effect,
-    select_effects,
-    without_effect,
-)
 from flytrack_sysid.diagnosis.problem import Problem, blocks_of
 from flytrack_sysid.diagnosis.result import CHANNELS, Unexplained
 from flytrack_sysid.diagnosis.score_test import BASE_CAUSES, threshold
@@ -61,7 +55,7 @@ class Selection(NamedTuple):
     state: SearchState
     base: FittedModel
     model: FittedModel
-    ablations: dict[str, Ablation]
+    ablations: dict[str, model_selection.Ablation]
     unexplained: Unexplained = Unexplained()
     stand_ins: tuple[str, ...] = ()
 
@@ -71,12 +65,12 @@ Veto = Callable[[Selection, Problem], list[str]]
 
 def select(state: SearchState, base: FittedModel, model: FittedModel) -> Selection:
     """Return the model with effects swapped, removed, or put in place of base changes where that helps."""
-    state, model, ablations = select_effects(state, model)
+    state, model, ablations = model_selection.select_effects(state, model)
     while True:
-        state, simpler = explain_base_by_effect(state, model)
+        state, simpler = model_selection.explain_base_by_effect(state, model)
         if simpler is None:
             return Selection(state, base, model, ablations)
-        state, model, ablations = select_effects(state, simpler)
+        state, model, ablations = model_selection.select_effects(state, simpler)
 
 
 def reject(selection: Selection, effects: Sequence[str]) -> Selection:
@@ -86,8 +80,8 @@ def reject(selection: Selection, effects: Sequence[str]) -> Selection:
     held = tuple(one for one in state.held if one.field not in freed)
     state = replace(state, refused=(*state.refused, *effects), held=held)
     for effect in effects:
-        model = without_effect(state, model, effect)
-    state, model, ablations = select_effects(state, model)
+        model = model_selection.without_effect(state, model, effect)
+    state, model, ablations = model_selection.select_effects(state, model)
     return Selection(state, selection.base, model, ablations)
 
 
@@ -121,7 +115,7 @@ def examined(selection: Selection) -> Selection:
         for one, weight in zip(model.candidates, selection.ablations.values(), strict=True)
     ]
     state, linearization = selection.state.linearized(model.vector)
-    for name, change in base_changes(state, linearization, model).items():
+    for name, change in model_selection.base_changes(state, linearization, model).items():
         robust = change.gain / change.marginal.inflation
         suspects.append(Suspect(name, tuple(change.fields), robust, len(change.fields)))
     names = find_stand_ins(problem, model, suspects, rest, dependences)
@@ -216,7 +210,7 @@ def is_contradicted(gain: float, expected: float, inflation: float) -> bool:
 def contradicted_on_held_out(selection: Selection, test: Problem) -> list[str]:
     """Reject effects of which held-out rows show too little: they were there for a time only, or never."""
 
-    def is_rejected(one: Ablation) -> bool:
+    def is_rejected(one: model_selection.Ablation) -> bool:
         gain, expected = held_out_gain(test, one.without.vector, selection.model.vector)
         return is_contradicted(gain, expected, one.inflation)
 
@@ -258,7 +252,7 @@ def not_seen_at_rest(selection: Selection, test: Problem) -> list[str]:
         return [name for name, is_false in zip(laws, alone, strict=True) if is_false]
     without = ablations[0].without
     for name in laws[1:]:  # a scale needs the saturation that undoes it, and the other way round
-        without = without_effect(state, without, name)
+        without = model_selection.without_effect(state, without, name)
     gain, expected = seen(without.vector)
     inflation = max(one.inflation for one in ablations)
     are_turns_unexplained = any(name.startswith("rate:") for name in selection.unexplained.shares)
@@ -286,7 +280,7 @@ def seen_once(selection: Selection, test: Problem) -> list[str]:
     """
     changing = {one.effect for one in selection.state.problem.windows}
 
-    def is_rejected(effect: str, one: Ablation) -> bool:
+    def is_rejected(effect: str, one: model_selection.Ablation) -> bool:
         gain, expected = held_out_gain(test, one.without.vector, selection.model.vector)
         if effect in changing:
             return gain <= 0.0
