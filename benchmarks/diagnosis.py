@@ -26,7 +26,7 @@ from benchmarks.hidden.oracle import known, removed, signal_to_noise
 from benchmarks.report import RESULTS, append_line, command, commit_of_checkout, lines_of_commit, progress
 from flytrack_env.dynamics import ModelParameters
 from flytrack_env.motion import Motion
-from flytrack_sysid.diagnosis import Diagnosis, diagnose
+from flytrack_sysid.diagnosis import diagnose
 from flytrack_sysid.log import FlightLog
 from flytrack_sysid.split import held_out_rows
 
@@ -120,7 +120,9 @@ def plant(trial: Trial) -> dict[str, Any]:
         true_model = model._replace(motion=MOTION_OF[truth.motion])
         could = known(clean, log, ~held_out_rows(log), true_model, truth.effects)
         line["known"] = {name: [float(f"{v:.4g}") for v in one[:2]] + [one[2]] for name, one in could.items()}
-        line["removed"] = _removed(truth, found, rng)
+        # Of explainable error on a new flight, and how large that is, times the noise.
+        share, size = removed(hidden.fly(truth, "scripted", SECONDS, rng), found.base, found.extended)
+        line["removed"] = [round(share, 4), round(size, 4)]
     if trial.row == "clock":
         late = [one for one in found.causes if one.effect == "mocap_latency"]
         found_s = late[0].parameters["latency_s"].value if late else 0.0
@@ -148,13 +150,6 @@ def _graded(cause: Any, truth: hidden.Truth) -> dict[str, Any]:
             if name in true
         },
     }
-
-
-def _removed(truth: hidden.Truth, found: Diagnosis, rng: Rng) -> list[float]:
-    """Return the share of explainable error that is removed on a new flight, and its size in noise."""
-    new = hidden.fly(truth, "scripted", SECONDS, rng)
-    share, size = removed(new, found.base, found.extended)
-    return [round(share, 4), round(size, 4)]
 
 
 def read_lines(commit: str | None, path: Path = LINES) -> dict[Trial, dict[str, Any]]:

@@ -74,11 +74,7 @@ def _both(rng: Rng, factor: tuple[float, float], **stock: float) -> dict[str, An
 def _rates(rng: Rng, center: tuple[float, float], full: tuple[float, float]) -> dict[str, Any]:
     most = round(rng.uniform(*full))
     least = round(rng.uniform(*center) * most)
-    return {
-        f"{axis}_{name}": value
-        for axis in ("roll", "pitch")
-        for name, value in (("rc_rate", least), ("srate", most))
-    }
+    return {"roll_rc_rate": least, "roll_srate": most, "pitch_rc_rate": least, "pitch_srate": most}
 
 
 KINDS = {
@@ -230,13 +226,6 @@ def error_ratios(found: Diagnosis) -> dict[str, float]:
     return {horizon: round(errors["extended"][horizon] / size, 4) for horizon, size in base.items() if size}
 
 
-def champion_line(episodes: int, seed: int) -> dict[str, Any]:
-    """Return the race of the shipped champion, which knows nothing of the firmware."""
-    with Betaflight() as plant:
-        gap = measure_gap(load_checkpoint(CHAMPION), plant, seed, episodes)
-    return {"row": "champion", "episodes": episodes, **gap.plant._asdict()}
-
-
 def tables(lines: list[dict[str, Any]]) -> str:
     """Return the results as tables in Markdown."""
     by_row = {row: [line for line in lines if line["row"] == row] for row in ROWS}
@@ -299,7 +288,10 @@ def main(
     trials += [Trial(ROWS[len(own)], "stock", "full", own, 10 + number) for number, own in enumerate(sets)]
     commit = report.commit_of_checkout()
     if champion:
-        report.append_line(lines, {"commit": commit, **champion_line(champion, seed)})
+        with Betaflight() as plant:
+            raced = measure_gap(load_checkpoint(CHAMPION), plant, seed, champion).plant
+        line = {"commit": commit, "row": "champion", "episodes": champion, **raced._asdict()}
+        report.append_line(lines, line)
     known: dict[tuple[str, str], Known] = {}
     for trial in report.progress(trials, "set-ups"):
         key = trial.setup, trial.flown

@@ -31,16 +31,14 @@ def rate_of(entry: Contestant) -> float:
     return statistics.median(found[entry.name])
 
 
-def decisions_per_s(env_id: str, num_envs: int) -> float:
-    """Return the rate of environment steps; each has its observation and, where it ended, its reset."""
-    return 1e6 * rate_of(jax_contestant(env_id, env_id, num_envs, LENGTH, is_batch=False))
-
-
 def environments(most: int) -> str:
-    """Return a table of rates by number of environments; simulated seconds are those of 100 Hz."""
+    """Return a table of rates by number of environments; simulated seconds are those of 100 Hz.
+
+    A step has its observation and, where it ended, its reset.
+    """
     rows = []
     for power in report.progress(range(10, most + 1), "size"):
-        rates = [decisions_per_s(env_id, 2**power) for env_id in IDS]
+        rates = [1e6 * rate_of(jax_contestant(one, one, 2**power, LENGTH, is_batch=False)) for one in IDS]
         rows.append([f"2^{power}", *(f"{rate:.3g}" for rate in rates), f"{0.01 * rates[0]:.3g}"])
     return report.table(["environments", *(f"{one}, decisions/s" for one in IDS), "simulated s/s"], rows)
 

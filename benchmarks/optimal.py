@@ -177,13 +177,11 @@ def step_function(model: ModelParameters) -> casadi.Function:
 
 def needed_states(step: casadi.Function) -> list[int]:
     """Return the indices of the state vector on which a path depends, directly or indirectly."""
-    depends = np.array(casadi.DM(step.jac_sparsity(0, 0), 1).full(), bool)
-    needed = set(range(layout.STATE_SIZE)[layout.POSITION])
-    while True:
-        more = needed | {int(place) for row in needed for place in np.flatnonzero(depends[row])}
-        if more == needed:
-            return sorted(needed)
-        needed = more
+    depends = np.array(casadi.DM(step.jac_sparsity(0, 0), 1).full(), bool) | np.eye(
+        layout.STATE_SIZE, dtype=bool
+    )
+    reached = np.linalg.matrix_power(depends, layout.STATE_SIZE)
+    return [int(place) for place in np.flatnonzero(reached[layout.POSITION].any(axis=0))]
 
 
 class Guess(NamedTuple):
@@ -318,14 +316,11 @@ class Problem:
                 between = after = self.states[:, 0]
             yield from _gate_limits(self.task, index, between[position], after[velocity])
 
-    def total_time(self) -> Any:
-        """Return the time to the last gate, s, as an expression."""
-        whole = casadi.dot(self.steps_s, casadi.DM(self.counts).T)
-        return whole - (1.0 - self.fractions[-1]) * self.steps_s[-1]
-
     def _cost(self) -> Any:
-        changes = casadi.diff(self.commands, 1, 1)
-        return self.total_time() + SMOOTHING_S * casadi.sumsqr(changes)
+        """Return the time to the last gate, s, and that of changes of the commands, as an expression."""
+        whole_s = casadi.dot(self.steps_s, casadi.DM(self.counts).T)
+        total_s = whole_s - (1.0 - self.fractions[-1]) * self.steps_s[-1]
+        return total_s + SMOOTHING_S * casadi.sumsqr(casadi.diff(self.commands, 1, 1))
 
     def _bounds(self, guess: Guess, is_on_grid: bool) -> tuple[np.ndarray, np.ndarray]:
         """Return the least and the greatest values of the variables."""
@@ -342,11 +337,8 @@ class Problem:
             steps, fractions = (SHORTEST_SHARE * guess.steps_s, LONGEST_SHARE * guess.steps_s), (1.0, 1.0)
 
         def stacked(states: np.ndarray, stick: float, step: np.ndarray, fraction: float) -> np.ndarray:
-            sticks, ends = (
-                np.full(layout.ACTION_SIZE * self.num_steps, stick),
-                np.full(len(self.counts), fraction),
-            )
-            return np.concatenate([states.ravel("F"), sticks, step, ends])
+            sticks = np.full(layout.ACTION_SIZE * self.num_steps, stick)
+            return np.concatenate([states.ravel("F"), sticks, step, np.full(len(self.counts), fraction)])
 
         return stacked(low, -1.0, steps[0], fractions[0]), stacked(high, 1.0, steps[1], fractions[1])
 
@@ -377,12 +369,9 @@ class Problem:
 
     def _unstack(self, values: np.ndarray) -> Guess:
         """Return the flight of the solver's variables, with the places of the state that it does not need."""
-        sizes = [
-            len(self.needed) * (self.num_steps + 1),
-            layout.ACTION_SIZE * self.num_steps,
-            len(self.counts),
-        ]
-        short, commands, steps_s, fractions = np.split(values, np.cumsum(sizes))
+        variables = (self.states, self.commands, self.steps_s)
+        ends = np.cumsum([variable.numel() for variable in variables])
+        short, commands, steps_s, fractions = np.split(values, ends)
         states = np.zeros((self.num_steps + 1, layout.STATE_SIZE))
         states[:, self.needed] = short.reshape(-1, len(self.needed))
         commands = commands.reshape(-1, layout.ACTION_SIZE)

@@ -7,6 +7,7 @@ needs no solver. In Python: ``flytrack_env.references.shipped_reference("flytrac
 
 import sys
 from functools import cache
+from itertools import product
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -132,12 +133,6 @@ def _environment(plant: Plant | None) -> tuple[FlyTrack, Any]:
     return env, jax.jit(fly)
 
 
-def _params(track: Track, model: ModelParameters, dt_s: float) -> EnvParams:
-    model = jax.tree.map(lambda leaf: np.asarray(leaf, np.float32), model)
-    params = FlyTrack(track=track, model=model).default_params.replace(dt=dt_s)
-    return jax.device_put(params)  # once, not in every step
-
-
 def _frames_touched(positions: np.ndarray, params: EnvParams) -> int:
     """Return the number of gates whose frames the lines between positions, (N, 3), touch."""
     lines = (
@@ -154,7 +149,9 @@ def replay(reference: Reference, track: Track, plant: Plant | None = None) -> Re
     such as a black box; the flight ends at the first cause of termination.
     """
     env, step = _environment(plant)
-    params = _params(track, reference.model, reference.dt_s)
+    model = jax.tree.map(lambda leaf: np.asarray(leaf, np.float32), reference.model)
+    params = FlyTrack(track=track, model=model).default_params.replace(dt=reference.dt_s)
+    params = jax.device_put(params)  # once, not in every step
     first = jnp.asarray(reference.states[0], jnp.float32)
     state, steps = env.begin(unpack(first), 0, params), []
     for command in np.asarray(reference.commands, np.float32):
@@ -284,16 +281,6 @@ def write_page(path: Path | None, replays: list[tuple[Reference, str, Replay]]) 
     )
 
 
-def find_all(tracks: list[Track], kinds: tuple[str, ...], model: Path | None, folder: Path) -> None:
-    """Find references and write them into a folder."""
-    parameters, name = (nominal(), NOMINAL) if model is None else (flytrack_env.load_model(model), model.stem)
-    for track in tracks:
-        for kind in kinds:
-            found = optimise(track, kind, parameters, name)
-            files.save_reference(folder / f"{track.name}_{name}_{kind}.npz", found)
-            print(f"{track.name} {kind}: {found.time_s:.4f} s, {found.found['cpu_s']} CPU s", flush=True)
-
-
 def main(
     tracks: tuple[str, ...] = tuple(flytrack_env.available_tracks()),
     kinds: tuple[Literal["flying", "standing"], ...] = ("flying", "standing"),
@@ -310,7 +297,11 @@ def main(
     try:
         known = list(map(flytrack_env.load_track, tracks))
         if not verify:
-            find_all(known, kinds, model, out)
+            named = (nominal(), NOMINAL) if model is None else (flytrack_env.load_model(model), model.stem)
+            for track, kind in product(known, kinds):
+                found = optimise(track, kind, *named)
+                files.save_reference(out / f"{track.name}_{found.model_name}_{kind}.npz", found)
+                print(f"{track.name} {kind}: {found.time_s:.4f} s, {found.found['cpu_s']} CPU s", flush=True)
         replays, is_good = verified(out, known)
         write_page(page, replays)
         if page is not None:

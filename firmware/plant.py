@@ -34,8 +34,7 @@ from flytrack_env.motion import Motion
 from flytrack_env.plants import Plant
 from flytrack_env.quaternion import Scalar
 from flytrack_env.state import STATE_SIZE, Action, Drone, pack, unpack
-from flytrack_sysid.importing.betaflight_loop import rate_loop
-from flytrack_sysid.importing.betaflight_rates import full_stick_rate, stick_curve
+from flytrack_sysid.importing.betaflight_settings import full_stick_rate, rate_loop, stick_curve
 
 DT_S = 0.01
 STEP_US = 10_000

@@ -1,8 +1,9 @@
 """Offsets between the clocks of sensors that measure the same motion.
 
 Only sensors are compared: attitude with gyroscope, velocity with accelerometer, position with velocity.
-Commands are not: how late the motion follows them is the plant's lag. A slow estimator looks like a late
-clock and is corrected as one.
+Commands are not: how late the motion follows them is the plant's lag. But a drone that turns before it is
+told to has commands from a clock that is late. A slow estimator looks like a late clock and is corrected as
+one.
 
 Of a pair, one is the integral of the other. Both are taken as changes over the same windows of 0.1 s, so
 that both are filtered alike; the offset minimises the squared difference (Gauss-Newton from the best of a
@@ -18,6 +19,7 @@ import numpy as np
 from scipy.interpolate import make_interp_spline
 from scipy.spatial.transform import Rotation
 
+from flytrack_env.dynamics import ModelParameters
 from flytrack_sysid.log import GAP_STEPS, FlightLog, usual_step
 from flytrack_sysid.plausibility import GRAVITY, LEAST_CORRELATION, summed_turns
 from flytrack_sysid.resample import interpolate, interpolate_quaternions
@@ -31,6 +33,8 @@ FEWEST_BLOCKS = 5
 SPIKE = 12.0  # times the median deviation from both neighbours: eight standard deviations
 SIGNIFICANT = 3.0  # standard errors
 CORRECTED, LEFT = "corrected", "significant, left as asked"
+# Of a clock that a diagnosis corrects: standard errors, and s.
+LATE_ERRORS, LATE_S = 5.0, 0.005
 LEAST_STEPS = 0.1  # of the log's step: smaller offsets change less than the step itself does
 
 
@@ -219,3 +223,58 @@ def align_clocks(log: FlightLog, correct: bool = True) -> tuple[FlightLog, tuple
             verdict = CORRECTED if correct else LEFT
         found.append(ClockOffset(channel, reference, offset, sigma, correlation, verdict))
     return aligned if correct else log, tuple(found)
+
+
+def on_one_clock(log: FlightLog) -> tuple[FlightLog, np.ndarray, list[str]]:
+    """Return a log, which of its rows it still has, (num_rows,) bool, and a sentence on each clock corrected.
+
+    Velocity is compared with the accelerometer as attitude is with the gyro: half a step of a simulator, and
+    a latency of both inertial sensors, are no clocks apart. Position is compared with velocity.
+    """
+    pose_s, notes, kept = 0.0, [], np.ones(len(log), bool)
+    slack_s = 0.5 * float(np.median(usual_step(log)))  # a simulator's force may be that of half a step before
+    for channel, reference, needed, sums, rates in PAIRS:
+        if any(name not in log for name in needed):
+            continue
+        seen = log if reference != "f" else read_later(log, ("q",), pose_s)[0]
+        offset_s, sigma_s, _, reason = offset_between(seen, sums(seen), rates(seen))
+        if channel == "q":
+            pose_s = 0.0 if reason else offset_s
+            continue
+        late_s = offset_s - (pose_s if reference == "f" else 0.0)
+        if reason or abs(late_s) <= max(LATE_ERRORS * sigma_s, LATE_S) + slack_s:
+            continue
+        log, is_known = read_later(log, (channel,), late_s)
+        kept &= is_known
+        other = "attitude" if reference == "f" else "velocity"
+        name = {"v": "velocity", "p": "position"}[channel]
+        notes.append(f"the clock of {name} was {1e3 * late_s:.0f} ms late against that of {other}: corrected")
+    return (log.select(kept), kept, notes) if notes else (log, kept, [])
+
+
+def with_causal_commands(log: FlightLog, model: ModelParameters) -> tuple[FlightLog, np.ndarray, list[str]]:
+    """Return a log whose commands come before the turns they cause, the rows it still has, and a sentence.
+
+    model: its mean lag of roll and pitch is what remains between commands and turns, in whole rows, where the
+    commands were late.
+    """
+    every = np.ones(len(log), bool)
+    if "w" not in log:
+        return log, every, []
+    turns = np.cumsum(log["w"] * usual_step(log)[:, None], axis=0)
+    asked = log["u"][:, :3] * np.deg2rad(np.asarray(model.max_rate))
+    lag_s, sigma_s, _, reason = offset_between(log, turns, asked)
+    step_s = float(np.median(usual_step(log)))
+    if reason or lag_s >= -(max(LATE_ERRORS * sigma_s, LATE_S) + step_s):
+        return log, every, []
+    late = round((float(np.mean(np.asarray(model.tau)[:2])) - lag_s) / step_s)
+    later, run = np.arange(len(log)) + late, np.cumsum(log.is_start())
+    source = np.minimum(later, len(log) - 1)
+    kept = (source == later) & (run[source] == run)
+    log = replace(log, channels={**log.channels, "u": log["u"][source]})
+    note = (
+        f"the clock of the commands was about {1e3 * late * step_s:.0f} ms late: the drone turned "
+        f"{-1e3 * lag_s:.0f} ms before it was told to; corrected so that the model's lag remains, which this "
+        "log cannot show"
+    )
+    return log.select(kept), kept, [note]

@@ -8,28 +8,18 @@ Envelope: a flight ends where the drone would become faster than 20 m/s, leave h
 """
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from flytrack_env.dynamics import nominal_parameters
+from flytrack_env.dynamics import ModelParameters, nominal_parameters
 from flytrack_env.plants import Plant
 from flytrack_env.state import ACCELERATION, STATE_SIZE, pack, unpack, unpack_action
 from flytrack_sysid import excitation
-from flytrack_sysid.excitation import (
-    DT_S,
-    FEWEST_STEPS,
-    FLIGHT_STEPS,
-    FLIGHTS_PER_KIND,
-    HEIGHTS,
-    KINDS,
-    MIDDLE_V,
-    SCRIPT_HEIGHTS,
-    is_inside,
-    start_state,
-)
+from flytrack_sysid.excitation import DT_S, FEWEST_STEPS, MIDDLE_V
 from flytrack_sysid.log import FlightLog, log_of_states
 from flytrack_sysid.script_file import Script, check_script, script_of
 from flytrack_sysid.sensors import LOST_ROWS, measure
@@ -38,26 +28,28 @@ StepFunction = Callable[[np.ndarray, np.ndarray], Any]
 Fly = Callable[[np.ndarray, np.ndarray], np.ndarray]
 Report = Callable[[int, int], None]
 
-SECONDS_PER_FLIGHT = FLIGHT_STEPS * DT_S
-FEWEST_MINUTES = FLIGHTS_PER_KIND * len(KINDS) * SECONDS_PER_FLIGHT / 60.0
+SECONDS_PER_FLIGHT = excitation.FLIGHT_STEPS * DT_S
+FEWEST_MINUTES = excitation.FLIGHTS_PER_KIND * len(excitation.KINDS) * SECONDS_PER_FLIGHT / 60.0
 
 
 class CollectError(ValueError):
     """A plant that cannot be flown, or a request that cannot be met."""
 
 
+def states_flown(plant: Plant, model: ModelParameters, start: jax.Array, command: jax.Array) -> jax.Array:
+    """Return the states (T + 1, 21) that commands (T, 4) lead to, from a start (21,), that one included."""
+
+    def step(state: Any, action: jax.Array) -> tuple[Any, jax.Array]:
+        return plant.step(state, unpack_action(action), DT_S, model), pack(plant.drone(state))
+
+    last, states = jax.lax.scan(step, plant.reset(unpack(start), model), command)
+    return jnp.concatenate([states, pack(plant.drone(last))[None]])
+
+
 def _fly_plant(plant: Plant) -> Fly:
     """Return a function that flies a plant from all starts at once."""
-    model = nominal_parameters()  # part of the contract; a black box ignores it
-
-    def fly_one(start: jax.Array, command: jax.Array) -> jax.Array:
-        def step(state: Any, action: jax.Array) -> tuple[Any, jax.Array]:
-            return plant.step(state, unpack_action(action), DT_S, model), pack(plant.drone(state))
-
-        last, states = jax.lax.scan(step, plant.reset(unpack(start), model), command)
-        return jnp.concatenate([states, pack(plant.drone(last))[None]])
-
-    fly_all = jax.jit(jax.vmap(fly_one))
+    # The model is part of the contract; a black box ignores it.
+    fly_all = jax.jit(jax.vmap(partial(states_flown, plant, nominal_parameters())))
 
     def fly(starts: np.ndarray, commands: np.ndarray) -> np.ndarray:
         try:
@@ -104,7 +96,7 @@ def find_hover(fly: Fly) -> float:
     """Return the thrust action that holds the weight at 23 V, level and at rest; else raise CollectError."""
     actions = np.linspace(-1.0, 1.0, 41)
     rng = np.random.default_rng(0)
-    starts = np.stack([start_state(rng, MIDDLE_V, action, 0.0, 0.0) for action in actions])
+    starts = np.stack([excitation.start_state(rng, MIDDLE_V, action, 0.0, 0.0) for action in actions])
     commands = np.zeros((len(actions), 1, 4), np.float32)
     commands[:, 0, 3] = actions
     climb = fly(starts.astype(np.float32), commands)[:, -1, ACCELERATION][:, 2]
@@ -146,10 +138,10 @@ def collect(
     if script is None:
         hover = find_hover(_fly_any(plant, lambda done, total: None))
         number = round(minutes * 60.0 / SECONDS_PER_FLIGHT)
-        flown, heights = script_of(excitation.script(number, hover, rng)), HEIGHTS
+        flown, heights = script_of(excitation.script(number, hover, rng)), excitation.HEIGHTS
     else:
         check_script(script)
-        flown, heights = script, SCRIPT_HEIGHTS
+        flown, heights = script, excitation.SCRIPT_HEIGHTS
     log = log_of_states(_cut(*_states(fly, flown), heights), DT_S, "collected")
     if noise > 0.0:
         log = measure(log, noise, float(nominal_parameters().g), rng)
@@ -174,7 +166,7 @@ def _cut(
     states: np.ndarray, commands: np.ndarray, heights: tuple[float, float]
 ) -> list[tuple[np.ndarray, np.ndarray]]:
     """Return the part of each flight before it leaves the envelope, without those of less than two rows."""
-    inside = is_inside(states, heights)
+    inside = excitation.is_inside(states, heights)
     lengths = np.where(inside.all(axis=1), states.shape[1], np.argmin(inside, axis=1))
     kept = [(x[:n], u[:n]) for x, u, n in zip(states, commands, lengths, strict=True) if n >= FEWEST_STEPS]
     if not kept:

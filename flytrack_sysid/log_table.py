@@ -1,7 +1,7 @@
 """Checks of a file's columns on their way to a flight log; every refusal names the place."""
 
 import difflib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -64,6 +64,15 @@ def check_names(source: str, names: Sequence[str]) -> None:
         for column in columns:
             if present and column not in present:
                 raise LogError(f"{source}: column {column}: missing; found only {', '.join(present)} of it")
+
+
+def columns_of(time: np.ndarray, channels: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Return the columns of time and of channels, (num_rows, n) each, in the order of ``CHANNELS``."""
+    columns = {"t": time}
+    for name, names in CHANNELS.items():
+        if name in channels:
+            columns |= dict(zip(names, channels[name].T, strict=True))
+    return columns
 
 
 def log_of_table(table: Table) -> FlightLog:

@@ -1,6 +1,6 @@
 """Names for every number in a model, for fits, for what is held fixed, and for reports."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any, NamedTuple
 
 import jax
@@ -92,6 +92,16 @@ def from_vector(vector: Any, like: ModelParameters) -> ModelParameters:
     shapes = [np.shape(leaf) for leaf in leaves]
     reshaped = [jnp.reshape(part, shape) for part, shape in zip(parts, shapes, strict=True)]
     return jax.tree.unflatten(structure, reshaped)
+
+
+def in_batches(program: Callable[[np.ndarray], Any], values: np.ndarray, size: int) -> np.ndarray:
+    """Return what a program, compiled for so many values at once, makes of all, (num_values, ...)."""
+    parts = []
+    for begin in range(0, len(values), size):
+        part = values[begin : begin + size]
+        filled = np.concatenate([part, np.repeat(part[-1:], size - len(part), axis=0)])
+        parts.append(np.asarray(program(filled))[: len(part)])
+    return np.concatenate(parts)
 
 
 def as_float32(model: ModelParameters) -> ModelParameters:

@@ -1,6 +1,7 @@
 """Figures of a validation, in the colours of ``flytrack_env.scene``."""
 
 from collections.abc import Sequence
+from functools import partial
 
 import matplotlib
 import numpy as np
@@ -10,23 +11,18 @@ from matplotlib.figure import Figure
 from flytrack_env.pictures import drawing
 from flytrack_env.pictures.drawing import new_figure, plain
 from flytrack_env.scene import BLUE, GREEN, GREY, ORANGE
-from flytrack_sysid.forces import ThrustError
+from flytrack_sysid.prediction_errors import ThrustError
 from flytrack_sysid.steps import AXES, StepResponse
 from flytrack_sysid.validate import Validation
 
-DPI = 150
+png_of = partial(drawing.png_of, dpi=150)
 WIDTH_IN, EMPTY_HEIGHT_IN = 7.0, 1.2
 
 
-def png_of(figure: Figure) -> bytes:
-    """Return a figure as a PNG file."""
-    return drawing.png_of(figure, DPI)
-
-
-def _figure(title: str, rows: int, columns: int, height_in: float) -> tuple[Figure, np.ndarray]:
+def _figure(title: str, rows: int, height_in: float) -> tuple[Figure, np.ndarray]:
     figure = new_figure(WIDTH_IN, height_in)
     figure.suptitle(title, fontsize="large", fontweight="bold")
-    axes = figure.subplots(rows, columns, squeeze=False)
+    axes = figure.subplots(rows, 1, squeeze=False)
     for panel in axes.flat:
         plain(panel)
     return figure, axes
@@ -34,7 +30,7 @@ def _figure(title: str, rows: int, columns: int, height_in: float) -> tuple[Figu
 
 def _empty(title: str, why: str) -> Figure:
     """Return a low figure that says why there is nothing to show."""
-    figure, panels = _figure(title, 1, 1, EMPTY_HEIGHT_IN)
+    figure, panels = _figure(title, 1, EMPTY_HEIGHT_IN)
     say(panels[0, 0], why)
     return figure
 
@@ -56,7 +52,7 @@ def draw_steps(steps: Sequence[StepResponse]) -> Figure:
     title = "Response to commanded steps"
     if not steps:
         return _empty(title, "no clear commanded step of roll, pitch or yaw is judged")
-    figure, panels = _figure(title, len(AXES), 1, 8.0)
+    figure, panels = _figure(title, len(AXES), 8.0)
     for panel, axis in zip(panels[:, 0], AXES, strict=True):
         own = [step for step in steps if step.axis == axis]
         if not own:
@@ -79,7 +75,7 @@ def draw_thrust(thrust: ThrustError | None) -> Figure:
     """Draw the thrust error over applied action and voltage."""
     if thrust is None:
         return _empty("Thrust", "not judged: it needs v_bat, and f, or a with q")
-    figure, panels = _figure("Thrust", 1, 1, 4.5)
+    figure, panels = _figure("Thrust", 1, 4.5)
     heat = panels[0, 0]
     limit = max(float(np.nanmax(np.abs(thrust.mean_n))), np.finfo(float).tiny)
     heat.grid(False)

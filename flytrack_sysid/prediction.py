@@ -22,14 +22,17 @@ FLOWN = ("p", "v", "q", "w")  # channels of a free flight
 
 
 class Prediction(NamedTuple):
-    """The model's step from every row of a log; leaves of the drones are (num_rows,) float64.
+    """A model's step from every row of a log; leaves of the drones are (num_rows,) float64.
 
+    log: without gaps.
     before: the measured state; zeros (upright, 23 V) where the log has no such channel.
     memories: what the model's effects remember before the step. after: the state at the next row. force_b:
     (num_rows, 3) m/s^2, specific force of the step. record: of the rows. step_s: the usual one.
     is_settled: (num_rows,) bool, applied action and memories no longer depend on how they began.
     """
 
+    model: ModelParameters
+    log: FlightLog
     before: Drone
     memories: tuple[Any, ...]
     after: Drone
@@ -42,6 +45,11 @@ class Prediction(NamedTuple):
     def is_measured(self) -> np.ndarray:
         """Which rows were logged, (num_rows,) bool; others fill a gap."""
         return self.record.source_row >= 0
+
+    @property
+    def lacking(self) -> dict[str, tuple[str, ...]]:
+        """What ``inputs_that_lack`` says of model and log."""
+        return inputs_that_lack(self.model, self.log)
 
 
 def runs_of(rows: np.ndarray, record: Record) -> list[tuple[int, int]]:
@@ -117,7 +125,7 @@ def predict(model: ModelParameters, filled: Filled) -> Prediction:
         since_start = log.time - log.time[record.begins][np.cumsum(record.begins) - 1]
         is_settled = is_settled & (since_start >= SETTLING_S)
     step_s = float(np.median(usual_step(log)))
-    return Prediction(before, memories, after, columns(force_b), record, step_s, is_settled)
+    return Prediction(model, log, before, memories, after, columns(force_b), record, step_s, is_settled)
 
 
 @jax.jit
@@ -136,9 +144,7 @@ def _fly(
     return jax.lax.scan(one, starts, (commands, durations))[1]
 
 
-def free_flights(
-    model: ModelParameters, log: FlightLog, prediction: Prediction, starts: np.ndarray, seen: np.ndarray
-) -> dict[str, np.ndarray]:
+def free_flights(prediction: Prediction, starts: np.ndarray, seen: np.ndarray) -> dict[str, np.ndarray]:
     """Return flights of the model by itself from measured rows under the logged commands: p, v, q, w.
 
     starts: (num_starts,) rows. seen: (num_starts, num_seen) later rows, at which it returns them,
@@ -149,11 +155,11 @@ def free_flights(
     found = {name: np.empty((*seen.shape, len(CHANNELS[name]))) for name in FLOWN}
     for begin in range(0, len(starts), BATCH):
         filled = np.resize(starts[begin : begin + BATCH], BATCH)
-        rows = np.minimum(filled + np.arange(num_steps)[:, None], len(log) - 1)
+        rows = np.minimum(filled + np.arange(num_steps)[:, None], len(prediction.log) - 1)
         with jax.enable_x64(True):
             first = jax.tree.map(lambda leaf: leaf[filled], (prediction.before, prediction.memories))  # noqa: B023
-            commands = Action(*(column[rows] for column in log["u"].T))
-            flown = _fly(first, commands, prediction.record.step_s[rows], in_float64(model))
+            commands = Action(*(column[rows] for column in prediction.log["u"].T))
+            flown = _fly(first, commands, prediction.record.step_s[rows], in_float64(prediction.model))
         at = after[begin : begin + BATCH]
         for name, leaves in flown.items():
             found[name][begin : begin + BATCH] = columns(leaves)[at, np.arange(len(at))[:, None]]

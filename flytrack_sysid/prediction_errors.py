@@ -1,21 +1,15 @@
-"""Errors of a model on a measured flight: of one step, channel by channel, and of free flight."""
+"""Errors of a model on a measured flight: of one step by channel, of free flight, of thrust by action."""
 
 from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
+from scipy.stats import binned_statistic_2d
 
-from flytrack_env.dynamics import ModelParameters
-from flytrack_sysid.log import CHANNELS, FlightLog
-from flytrack_sysid.prediction import (
-    LONGEST_S,
-    Prediction,
-    columns,
-    free_flights,
-    inputs_that_lack,
-    judged_steps,
-    runs_of,
-)
+from flytrack_env.state import BATTERY_EMPTY_V, BATTERY_FULL_V
+from flytrack_sysid.log import CHANNELS
+from flytrack_sysid.prediction import LONGEST_S, Prediction, columns, free_flights, judged_steps, runs_of
+from flytrack_sysid.sensors import specific_force_b
 
 UNITS = {"p": "m", "v": "m/s", "q": "1", "w": "rad/s", "a": "m/s^2", "f": "m/s^2"}
 BY_CHANGE, BY_SPREAD = "measured change in one step", "measured channel's spread"
@@ -35,6 +29,11 @@ QUANTITIES = {
     "rates": ("w", "rad/s"),
 }
 HIGH_PERCENTILE = 95.0
+# Of thrust.
+NUM_ACTION_BINS = 10
+NUM_VOLTAGE_BINS = 4
+# V; a pack that never changes its voltage still gets a bin.
+LEAST_VOLTAGE_RANGE = 0.1
 
 
 class ChannelError(NamedTuple):
@@ -122,14 +121,12 @@ def error_of(name: str, before: np.ndarray, measured: np.ndarray, predicted: np.
     )
 
 
-def one_step_errors(
-    model: ModelParameters, log: FlightLog, prediction: Prediction, rows: np.ndarray
-) -> OneStep:
+def one_step_errors(prediction: Prediction, rows: np.ndarray) -> OneStep:
     """Return the errors from each judged row to the next; rows: (num_rows,) bool, those judged.
 
     Of acceleration and specific force, the first that the log has.
     """
-    lacking = inputs_that_lack(model, log)
+    log, lacking = prediction.log, prediction.lacking
     force = next((name for name in ("a", "f") if name in log and not lacking[name]), None)
     names = [name for name in ("p", "v", "q", "w") if name in log and not lacking[name]]
     names += [force] if force else []
@@ -167,9 +164,7 @@ class Rollout(NamedTuple):
         return {"horizon_s": self.horizon_s, "starts": self.num_starts, **errors}
 
 
-def _starts_and_ends(
-    log: FlightLog, prediction: Prediction, rows: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
+def _starts_and_ends(prediction: Prediction, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the rows to start from, (num_starts,), and those at the horizons, (num_starts, num_horizons).
 
     An end is the row nearest to its horizon; -1 where the judged run ends before.
@@ -177,14 +172,14 @@ def _starts_and_ends(
     starts, ends = [], []
     half_step = 0.5 * prediction.step_s
     for first, end in runs_of(rows, prediction.record):
-        time, is_settled = log.time[first:end], prediction.is_settled[first:end]
+        time, is_settled = prediction.log.time[first:end], prediction.is_settled[first:end]
         if not is_settled.any():
             continue
         wanted = np.arange(time[np.argmax(is_settled)], time[-1], START_EVERY_S)
         begin = np.searchsorted(time, wanted - half_step)
         begin = begin[prediction.is_measured[first + begin]]
         reached = np.searchsorted(time, time[begin, None] + np.array(HORIZONS_S) - half_step)
-        last = np.minimum(first + reached, len(log) - 1)
+        last = np.minimum(first + reached, len(rows) - 1)
         starts.append(first + begin)
         ends.append(np.where((reached < len(time)) & prediction.is_measured[last], last, -1))
     if not starts:
@@ -192,31 +187,22 @@ def _starts_and_ends(
     return np.concatenate(starts), np.concatenate(ends)
 
 
-def _distance(channel: str, measured: np.ndarray, flown: np.ndarray) -> np.ndarray:
-    """Return the size of the difference, unit of the quantity; (num_starts, size) -> (num_starts,)."""
-    if channel == "q":
-        return np.rad2deg(np.linalg.norm(turn_between(measured, flown), axis=1))
-    return np.linalg.norm(measured - flown, axis=1)
-
-
 def _spread(distances: np.ndarray) -> Spread:
     median, high = np.percentile(distances, [50.0, HIGH_PERCENTILE]).tolist()
     return Spread(median, float(np.sqrt(np.mean(distances**2))), high)
 
 
-def rollout_errors(
-    model: ModelParameters, log: FlightLog, prediction: Prediction, rows: np.ndarray
-) -> tuple[Rollout, ...]:
+def rollout_errors(prediction: Prediction, rows: np.ndarray) -> tuple[Rollout, ...]:
     """Return the errors of free flights from measured states, a start every 0.25 s of judged runs.
 
     rows: (num_rows,) bool, those judged; a flight stays in them, and begins and ends where it was measured.
     """
-    lacking = inputs_that_lack(model, log)
+    log, lacking = prediction.log, prediction.lacking
     judged = [name for name, (channel, _) in QUANTITIES.items() if channel in log and not lacking[channel]]
-    starts, ends = _starts_and_ends(log, prediction, rows)
+    starts, ends = _starts_and_ends(prediction, rows)
     starts, ends = starts[(ends >= 0).any(axis=1)], ends[(ends >= 0).any(axis=1)]
     is_reached = ends >= 0
-    flown = free_flights(model, log, prediction, starts, np.where(is_reached, ends, starts[:, None] + 1))
+    flown = free_flights(prediction, starts, np.where(is_reached, ends, starts[:, None] + 1))
     rollouts = []
     for index, horizon_s in enumerate(HORIZONS_S):
         reaches = is_reached[:, index]
@@ -225,6 +211,59 @@ def rollout_errors(
             channel = QUANTITIES[name][0]
             with np.errstate(over="ignore", invalid="ignore"):  # a model may run away
                 measured, at_end = log[channel][ends[reaches, index]], flown[channel][reaches, index]
-                errors[name] = _spread(_distance(channel, measured, at_end))
+                apart = turn_between(measured, at_end) if channel == "q" else measured - at_end
+                distances = np.linalg.norm(apart, axis=1)
+                errors[name] = _spread(np.rad2deg(distances) if channel == "q" else distances)
         rollouts.append(Rollout(horizon_s, int(reaches.sum()), errors))
     return tuple(rollouts)
+
+
+class ThrustError(NamedTuple):
+    """Measured minus modelled thrust; maps are (voltage bins, action bins), NaN where nothing flew, N."""
+
+    source: str
+    action_edges: np.ndarray
+    voltage_edges: np.ndarray
+    count: np.ndarray  # type: ignore[assignment]  # hides tuple.count
+    mean_n: np.ndarray
+    rms_n: np.ndarray
+    total_mean_n: float
+    total_rms_n: float
+
+
+def _voltage_range(battery_v: np.ndarray) -> tuple[float, float]:
+    """Return the handout's range of voltage, or the log's where it exceeds that."""
+    low, high = float(battery_v.min()), float(battery_v.max())
+    if low >= BATTERY_EMPTY_V and high <= BATTERY_FULL_V:
+        return BATTERY_EMPTY_V, BATTERY_FULL_V
+    return low, max(high, low + LEAST_VOLTAGE_RANGE)
+
+
+def thrust_error(prediction: Prediction, rows: np.ndarray) -> ThrustError | None:
+    """Return the error of thrust of judged steps by applied action and voltage, by f, else a; None without.
+
+    rows: (num_rows,) bool, those judged. Samples beyond an end are in its bin.
+    """
+    log, model, here = prediction.log, prediction.model, judged_steps(rows, prediction)
+    source = next((name for name in ("f", "a") if name in log and not prediction.lacking[name]), None)
+    if source is None or not len(here):
+        return None
+    measured_b = log["f"] if source == "f" else specific_force_b(log, float(model.g))
+    error_n = float(model.m) * (measured_b[here + 1, 2] - prediction.force_b[here, 2])
+    battery_v = np.asarray(prediction.before.battery_v)[here]
+    low, high = _voltage_range(battery_v)
+    edges = np.linspace(low, high, NUM_VOLTAGE_BINS + 1), np.linspace(-1.0, 1.0, NUM_ACTION_BINS + 1)
+    action = np.asarray(prediction.after.applied.thrust)[here]
+    place = np.clip(battery_v, low, high), np.clip(action, -1.0, 1.0)
+    count = binned_statistic_2d(*place, None, "count", edges).statistic
+    mean_n, mean_square = binned_statistic_2d(*place, [error_n, error_n**2], "mean", edges).statistic
+    return ThrustError(
+        source=source,
+        action_edges=edges[1],
+        voltage_edges=edges[0],
+        count=count.astype(int),
+        mean_n=mean_n,
+        rms_n=np.sqrt(mean_square),
+        total_mean_n=float(np.mean(error_n)),
+        total_rms_n=float(np.sqrt(np.mean(error_n**2))),
+    )

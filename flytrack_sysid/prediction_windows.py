@@ -55,6 +55,13 @@ class Windows(NamedTuple):
         """The first row whose state is the model's."""
         return int(np.argmax(self.is_free))
 
+    def sums_by_block(self, values: np.ndarray) -> np.ndarray:
+        """Return sums of values, (windows, ...), over the windows of each block, (blocks, ...)."""
+        _, block = np.unique(self.block, return_inverse=True)
+        sums = np.zeros((block.max() + 1, *values.shape[1:]), values.dtype)
+        np.add.at(sums, block, values)
+        return sums
+
 
 def chunks_of(windows: Windows) -> list[Windows]:
     """Return the windows in parts of CHUNK, the last filled up with the first one."""

@@ -140,7 +140,8 @@ def record_of(filled: Filled) -> Record:
     after_gap = np.append(False, filled.source_row[:-1] < 0) & (filled.source_row >= 0)
     return Record(
         source_row=filled.source_row,
-        step_s=steps_after(log),
+        # To the next row of the flight; the usual step at its end.
+        step_s=np.where(np.append(begins[1:], True), usual_step(log), np.diff(log.time, append=log.time[-1])),
         command=log["u"],
         command_doubt=filled.command_doubt,
         begins=begins,
@@ -164,12 +165,6 @@ def make_record(log: FlightLog) -> Record:
     return _padded(record._replace(piece=cut_evenly(filled.log.time, is_first, longest_s)))
 
 
-def steps_after(log: FlightLog) -> np.ndarray:
-    """Return the time from each row to the next of its segment, (num_rows,) s; the usual one at the end."""
-    steps = np.diff(log.time, append=log.time[-1])
-    return np.where(np.append(log.is_start()[1:], True), usual_step(log), steps)
-
-
 def _padded(record: Record) -> Record:
     """Return the record with rows added that start nothing and count for nothing."""
     missing = -len(record.source_row) % PADDED_TO
@@ -184,35 +179,23 @@ def _padded(record: Record) -> Record:
     return padded._replace(source_row=source_row, begins=begins)
 
 
-def applied_doubt(
-    step_s: np.ndarray,
-    command_doubt: np.ndarray,
-    begins: np.ndarray,
-    is_applied_known: np.ndarray,
-    tau: np.ndarray,
-) -> np.ndarray:
-    """Return how far the applied action of a replay may be off, (num_rows, 4): a standard deviation.
+def is_applied_certain(record: Record, tau: np.ndarray) -> np.ndarray:
+    """Return where the applied action of a replay is known well enough to judge a model by, (num_rows, 4).
 
-    From commands that were lost and from what was applied when a flight began; both are forgotten with
-    the lags ``tau``, (4,) s. The other arguments are those of ``Record``.
+    Doubt is from commands that were lost and from what was applied when a flight began; both are forgotten
+    with the lags ``tau``, (4,) s.
     """
-    keep = np.exp(-step_s[:, None] / tau)
-    enters = (1.0 - keep) ** 2 * command_doubt**2
-    unknown = np.where(is_applied_known, 0.0, APPLIED_UNKNOWN**2)
-    variance, variances = np.full(ACTION_SIZE, unknown[0]), np.empty_like(command_doubt)
-    restarts = begins | is_applied_known
+    keep = np.exp(-record.step_s[:, None] / tau)
+    enters = (1.0 - keep) ** 2 * record.command_doubt**2
+    unknown = np.where(record.is_applied_known, 0.0, APPLIED_UNKNOWN**2)
+    variance, variances = np.full(ACTION_SIZE, unknown[0]), np.empty_like(record.command_doubt)
+    restarts = record.begins | record.is_applied_known
     for row in range(len(restarts)):
         if restarts[row]:
             variance = np.full(ACTION_SIZE, unknown[row])
         variances[row] = variance
         variance = keep[row] ** 2 * variance + enters[row]
-    return np.sqrt(variances)
-
-
-def is_applied_certain(record: Record, tau: np.ndarray) -> np.ndarray:
-    """Return where the applied action of a replay is known well enough to judge a model by, (num_rows, 4)."""
-    doubt = applied_doubt(record.step_s, record.command_doubt, record.begins, record.is_applied_known, tau)
-    return doubt < LARGEST_DOUBT
+    return np.sqrt(variances) < LARGEST_DOUBT
 
 
 def measured_channels(log: FlightLog, record: Record, gravity: float) -> dict[str, np.ndarray]:

@@ -12,7 +12,7 @@ from flytrack_env.effects.command_delay import dead_times
 from flytrack_env.motion import Motion
 from flytrack_env.quaternion import Quaternion, Vec3
 from flytrack_env.state import ACTION_SIZE, Action, Drone
-from flytrack_sysid.parameters import from_vector, to_vector
+from flytrack_sysid.parameters import from_vector, in_batches, to_vector
 from flytrack_sysid.record import BATTERY_UNKNOWN_V
 
 SMALL_STEP, FULL_STEP = 1e-3, 1.0  # of a stick, from its centre; no limit acts on the small one
@@ -40,12 +40,7 @@ def half_responses(vectors: np.ndarray, like: ModelParameters, stick_step: float
 
     vectors: (num_models, parameters), in the order of ``parameters.names_of(like)``.
     """
-    parts = []
-    for begin in range(0, len(vectors), BATCH):
-        part = vectors[begin : begin + BATCH]
-        filled = np.concatenate([part, np.repeat(part[-1:], BATCH - len(part), axis=0)])
-        parts.append(np.asarray(_half_responses(filled, like, stick_step))[: len(part)])
-    return np.concatenate(parts)
+    return in_batches(lambda part: _half_responses(part, like, stick_step), vectors, BATCH)
 
 
 @jax.jit

@@ -4,8 +4,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from flytrack_env.dynamics import ModelParameters
-from flytrack_sysid.log import FlightLog
 from flytrack_sysid.prediction import Prediction, free_flights, runs_of
 
 AXES = ("roll", "pitch", "yaw")
@@ -50,11 +48,9 @@ def _steps_in(time: np.ndarray, command: np.ndarray) -> np.ndarray:
     return changes[is_step]
 
 
-def _largest_steps(
-    log: FlightLog, prediction: Prediction, rows: np.ndarray, axis: int
-) -> list[tuple[int, int, int]]:
+def _largest_steps(prediction: Prediction, rows: np.ndarray, axis: int) -> list[tuple[int, int, int]]:
     """Return the largest steps of an axis: first row shown, row of the step, end of the rows shown."""
-    found = []
+    found, log = [], prediction.log
     command = log["u"][:, axis]
     for start, end in runs_of(rows, prediction.record):
         time = log.time[start:end]
@@ -69,22 +65,19 @@ def _largest_steps(
     return found[:MOST_PER_AXIS]
 
 
-def step_responses(
-    model: ModelParameters, log: FlightLog, prediction: Prediction, rows: np.ndarray
-) -> tuple[StepResponse, ...]:
+def step_responses(prediction: Prediction, rows: np.ndarray) -> tuple[StepResponse, ...]:
     """Return the responses to the largest commanded steps of each rate axis.
 
     rows: (num_rows,) bool, the judged ones. A step is a jump by at least 0.2 between commands that are
     constant for 0.08 s before and 0.15 s after it.
     """
+    log = prediction.log
     if "w" not in log:
         return ()
-    shown = [
-        (axis, *place) for axis in range(len(AXES)) for place in _largest_steps(log, prediction, rows, axis)
-    ]
+    shown = [(axis, *place) for axis in range(len(AXES)) for place in _largest_steps(prediction, rows, axis)]
     firsts, ends = np.array([(first, end) for _, first, _, end in shown], int).reshape(-1, 2).T
     since_first = np.arange(1, np.max(ends - firsts, initial=1))
-    flown = free_flights(model, log, prediction, firsts, firsts[:, None] + since_first)
+    flown = free_flights(prediction, firsts, firsts[:, None] + since_first)
     responses = []
     for (axis, first, step, end), rates in zip(shown, flown["w"], strict=True):
         since = slice(first + 1, end)

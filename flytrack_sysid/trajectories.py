@@ -127,9 +127,9 @@ def _measured(timed: _Timed, name: str, residuals_w: Mapping[str, np.ndarray]) -
     )
 
 
-def _starts_and_ends(filled: Filled, prediction: Prediction) -> tuple[np.ndarray, np.ndarray]:
+def _starts_and_ends(prediction: Prediction) -> tuple[np.ndarray, np.ndarray]:
     """Return the rows that free flights start from, one a second, and those where the next one takes over."""
-    log, can_start = filled.log, prediction.is_settled & prediction.is_measured
+    log, can_start = prediction.log, prediction.is_settled & prediction.is_measured
     half_step = 0.5 * prediction.step_s
     edges = np.append(np.flatnonzero(log.is_start()), len(log))
     starts, ends = [np.zeros(0, int)], [np.zeros(0, int)]
@@ -172,9 +172,9 @@ def _free_flight(timed: _Timed, name: str, model: ModelParameters) -> Trajectory
         return None
     filled = fill_gaps(timed.log)
     prediction = predict(model, filled)
-    starts, ends = _starts_and_ends(filled, prediction)
+    starts, ends = _starts_and_ends(prediction)
     since_start = np.arange(1, 1 + int(np.ceil(LONGEST_S / prediction.step_s)))
-    flown = free_flights(model, filled.log, prediction, starts, starts[:, None] + since_start)
+    flown = free_flights(prediction, starts, starts[:, None] + since_start)
     pieces = []
     for number, (start, end) in enumerate(zip(starts, ends, strict=True)):
         one = {channel: values[number] for channel, values in flown.items()}

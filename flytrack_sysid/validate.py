@@ -5,10 +5,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from flytrack_env.dynamics import ModelParameters
-from flytrack_sysid.forces import ThrustError, force_samples, thrust_error
+from flytrack_sysid import prediction_errors
 from flytrack_sysid.log import FlightLog
-from flytrack_sysid.prediction import Prediction, inputs_that_lack, predict
-from flytrack_sysid.prediction_errors import OneStep, Rollout, one_step_errors, rollout_errors
+from flytrack_sysid.prediction import Prediction, predict
 from flytrack_sysid.record import BATTERY_UNKNOWN_V, fill_gaps
 from flytrack_sysid.steps import HELD_AFTER_S, HELD_BEFORE_S, LEAST_JUMP, StepResponse, step_responses
 
@@ -33,9 +32,9 @@ class Validation(NamedTuple):
 
     num_rows: int
     num_judged: int
-    one_step: OneStep
-    rollouts: tuple[Rollout, ...]
-    thrust: ThrustError | None
+    one_step: prediction_errors.OneStep
+    rollouts: tuple[prediction_errors.Rollout, ...]
+    thrust: prediction_errors.ThrustError | None
     steps: tuple[StepResponse, ...]
     notes: tuple[str, ...]
 
@@ -68,10 +67,10 @@ def _json_of(value: Any) -> Any:
     return None if isinstance(value, float) and not np.isfinite(value) else value
 
 
-def _notes_of(model: ModelParameters, log: FlightLog, prediction: Prediction) -> list[str]:
+def _notes_of(prediction: Prediction) -> list[str]:
     """Return what the log lacks, and what is assumed instead."""
-    notes = []
-    for name, lacking in inputs_that_lack(model, log).items():
+    log, notes = prediction.log, []
+    for name, lacking in prediction.lacking.items():
         if name in log and lacking:
             verb = "is" if len(lacking) == 1 else "are"
             notes.append(f"{NAMES[name]} ({name}): not judged; {', '.join(lacking)} {verb} not in the log")
@@ -79,7 +78,7 @@ def _notes_of(model: ModelParameters, log: FlightLog, prediction: Prediction) ->
             notes.append(f"{NAMES[name]} ({name}): not in the log")
     if "a" not in log and "f" not in log:
         notes.append("acceleration (a) and specific force (f): not in the log")
-    if "v_bat" not in log and np.any(np.asarray(model.thrust_coeffs)[4:]):
+    if "v_bat" not in log and np.any(np.asarray(prediction.model.thrust_coeffs)[4:]):
         notes.append(f"battery (v_bat): not in the log; {BATTERY_UNKNOWN_V:g} V is assumed for thrust")
     if "uprev" not in log:
         notes.append(
@@ -107,24 +106,22 @@ def validate(model: ModelParameters, log: FlightLog, rows: np.ndarray | None = N
         raise ValueError(f"rows: found {rows.dtype} of shape {rows.shape}, expected bool of ({len(log)},)")
     num_rows, num_judged = len(log), int(rows.sum())
     filled = fill_gaps(log)
-    log, rows = filled.log, rows[filled.behind]
-    prediction = predict(model, filled)
-    notes = _notes_of(model, log, prediction)
-    one_step = one_step_errors(model, log, prediction, rows)
+    prediction, rows = predict(model, filled), rows[filled.behind]
+    notes = _notes_of(prediction)
+    one_step = prediction_errors.one_step_errors(prediction, rows)
     if not one_step.num_steps:
         notes.append("one step: no judged row is followed by a judged row")
-    rollouts = rollout_errors(model, log, prediction, rows)
+    rollouts = prediction_errors.rollout_errors(prediction, rows)
     too_long = [f"{rollout.horizon_s:g} s" for rollout in rollouts if not rollout.num_starts]
     if too_long:
         notes.append(f"free flight of {', '.join(too_long)}: no judged stretch is that long")
-    samples, thrust = force_samples(model, log, prediction, rows), None
-    if samples is None:
+    thrust = prediction_errors.thrust_error(prediction, rows)
+    if thrust is None:
         notes.append("thrust: no judged step has f or a to compare the model with")
     elif "v_bat" not in log:
         notes.append("thrust by voltage: v_bat is not in the log")
-    else:
-        thrust = thrust_error(model, samples)
-    steps = step_responses(model, log, prediction, rows)
+        thrust = None
+    steps = step_responses(prediction, rows)
     if not steps:
         notes.append(
             "step responses: no judged command of roll, pitch or yaw jumps by "

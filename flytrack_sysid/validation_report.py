@@ -8,11 +8,17 @@ from typing import Any
 import numpy as np
 
 from flytrack_env.files import write_atomically
-from flytrack_sysid.forces import ThrustError
 from flytrack_sysid.log import FlightLog
 from flytrack_sysid.page import Bullets, Picture, Section, Table, Text, page
 from flytrack_sysid.plots import draw_validation, png_of
-from flytrack_sysid.prediction_errors import NORMALISED_BY, NRMSE_MEANING, QUANTITIES, START_EVERY_S, UNITS
+from flytrack_sysid.prediction_errors import (
+    NORMALISED_BY,
+    NRMSE_MEANING,
+    QUANTITIES,
+    START_EVERY_S,
+    UNITS,
+    ThrustError,
+)
 from flytrack_sysid.validate import NAMES, Validation
 
 # Heading of each figure, in the order of the page, and its caption.

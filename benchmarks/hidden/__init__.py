@@ -5,9 +5,16 @@
 flies it; ``measure`` turns the clean log into what sensors would have logged.
 """
 
-from benchmarks.hidden.draws import (
+from benchmarks.hidden.flights import CrashError, fly
+from benchmarks.hidden.noise import measure
+from benchmarks.hidden.outside import draw_outside
+from benchmarks.hidden.truth import (
     EFFECTS,
+    MOTIONS,
     NAMES,
+    Gust,
+    Outside,
+    Truth,
     draw_base,
     draw_effect,
     draw_gust,
@@ -16,7 +23,3 @@ from benchmarks.hidden.draws import (
     draw_truth,
     with_effects,
 )
-from benchmarks.hidden.flights import CrashError, fly
-from benchmarks.hidden.noise import measure
-from benchmarks.hidden.outside import draw_outside
-from benchmarks.hidden.truth import MOTIONS, Gust, Outside, Truth

@@ -2,10 +2,9 @@
 
 import numpy as np
 
-from benchmarks.hidden.pilot import Moment, Pilot, plan
+from benchmarks.hidden.pilot import Pilot, plan
 from benchmarks.hidden.plant import SAME_S, Plant, Start
 from benchmarks.hidden.truth import DT_S, Truth
-from benchmarks.hidden.vectors import Vector
 from flytrack_sysid.log import FlightLog
 
 FLOOR_M, FASTEST = 0.1, 20.0  # m, m/s: the envelope of a flight
@@ -60,7 +59,10 @@ def _attempt(
     moments = plan(kind, seconds, rng, caution)
     settling = [moments[0]._replace(vel_w=(0.0, 0.0, 0.0), acc_w=(0.0, 0.0, 0.0))] * round(SETTLE_S / DT_S)
     start = Start(moments[0].pos_w, moments[0].heading, float(rng.uniform(*OPEN_V)), HOVER_STICK)
-    plant = Plant(truth, start, rng, seconds + SETTLE_S, _centre(truth, moments), SETTLE_S)
+    # An effect of position is centred on a point of the planned path.
+    share = truth.outside.shape.get("at_share", 0.0) if truth.outside is not None else 0.0
+    centre_w = moments[int(share * (len(moments) - 1))].pos_w
+    plant = Plant(truth, start, rng, seconds + SETTLE_S, centre_w, SETTLE_S)
     pilot, rows, last = Pilot(truth, rng), [], -1
     planned = [*settling, *moments]
     for number in range(round(len(planned) * DT_S / truth.step_s)):
@@ -73,12 +75,6 @@ def _attempt(
         plant.step(sticks)
     columns = np.split(np.array(rows), np.cumsum(list(CHANNELS.values()))[:-1], axis=1)
     return dict(zip(CHANNELS, columns, strict=True))
-
-
-def _centre(truth: Truth, moments: list[Moment]) -> Vector:
-    """Return where an effect of position is centred: a point of the planned path."""
-    share = truth.outside.shape.get("at_share", 0.0) if truth.outside is not None else 0.0
-    return moments[int(share * (len(moments) - 1))].pos_w
 
 
 def _vector(truth: Truth, name: str, neutral: float) -> np.ndarray:

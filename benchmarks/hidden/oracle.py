@@ -17,7 +17,7 @@ from benchmarks.hidden.noise import DIGIT, STD
 from benchmarks.hidden.plant import SECONDS_PER_MINUTE
 from benchmarks.hidden.truth import Truth
 from flytrack_env.dynamics import ModelParameters
-from flytrack_sysid.diagnosis.lanes import NUM_AXES, make_lanes
+from flytrack_sysid.diagnosis.lanes import NUM_AXES, lanes_of
 from flytrack_sysid.diagnosis.model_selection import MOST_RIVALS, ablate
 from flytrack_sysid.diagnosis.noise import fit_noise
 from flytrack_sysid.diagnosis.problem import Problem
@@ -57,9 +57,7 @@ def clean_problem(clean: FlightLog, log: FlightLog, judged: np.ndarray, model: M
     Of the voltage that is rounding, which lasts while the battery drains by a digit: it is fitted.
     """
     kept = clean.select(np.isin(np.round(clean.time, 6), np.round(log.time, 6)))
-    tau, gravity = np.asarray(model.tau, float), float(model.g)
-    problem = Problem.of(make_lanes(kept, judged, tau, gravity), model)
-    measured = Problem.of(make_lanes(log, judged, tau, gravity), model)
+    problem, measured = (Problem.of(lanes_of(one, judged, model), model) for one in (kept, log))
     errors = measured.residuals(problem.start[None])[0] - problem.residuals(problem.start[None])[0]
     noise = true_noise(float(np.median(np.diff(clean.time))))
     noise[:, -1] = fit_noise(measured.lanes, errors, noise)[:, -1]
@@ -134,7 +132,7 @@ def removed(clean: FlightLog, base: ModelParameters, extended: ModelParameters) 
     the noise.
     """
     with jax.enable_x64(True):
-        lanes = make_lanes(clean, np.ones(len(clean), bool), np.asarray(base.tau, float), float(base.g))
+        lanes = lanes_of(clean, np.ones(len(clean), bool), base)
         problem = Problem.of(lanes, extended)
         every = [Problem.of(lanes, one).start for one in (base, extended)]
         left = problem.residuals(np.stack(every))

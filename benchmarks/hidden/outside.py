@@ -81,9 +81,8 @@ def _position(shape: Any, plant: Any) -> float:
 
 def _time(shape: Any, plant: Any) -> float:
     share, middle, width = plant.time_s / plant.duration_s, shape["middle_share"], shape["width_share"]
-    return (
-        0.5 + 0.5 * math.tanh((share - middle) / width) if shape["is_step"] else _bump(share, middle, width)
-    )
+    is_step = shape["is_step"]
+    return 0.5 + 0.5 * math.tanh((share - middle) / width) if is_step else _bump(share, middle, width)
 
 
 def heading_waves(shape: Any, heading: Any) -> Any:
@@ -217,11 +216,9 @@ def _draw_heading(rng: Rng) -> ChannelAndShape:
     shape = {f"size_{order}": rng.uniform(*WAVE) for order in HEADING_ORDERS}
     shape |= {f"phase_{order}": rng.uniform(-math.pi, math.pi) for order in HEADING_ORDERS}
     shape["largest"] = float(np.abs(heading_waves(shape, CIRCLE)).max())
-    return (
-        ("force", {**shape, **_random_direction(rng, 2)})
-        if rng.random() < 0.5
-        else ("rate", {**shape, **YAW})
-    )
+    if rng.random() < 0.5:
+        return "force", {**shape, **_random_direction(rng, 2)}
+    return "rate", {**shape, **YAW}
 
 
 def _draw_airspeed(rng: Rng) -> ChannelAndShape:

@@ -19,7 +19,7 @@ import numpy as np
 
 from benchmarks.hidden.outside import FirstOrderNoise
 from benchmarks.hidden.truth import DT_S, STICKS, Truth
-from benchmarks.hidden.vectors import Vector, clip_length, norm, rotation, to_body, wrap_angle
+from benchmarks.hidden.vectors import Vector, add, clip_length, norm, rotation, to_body, wrap_angle
 
 Rng = np.random.Generator
 CLIMB, TURN_RATE = 5.0, math.radians(70.0)  # m/s, rad/s: what a plan asks for
@@ -143,10 +143,9 @@ class Sketch:
         vel_w, heading = smooth[:, :3], smooth[:, 3]
         pos_w = np.array(self.start_w) + np.cumsum(vel_w, axis=0) * DT_S
         acc_w = np.gradient(vel_w, DT_S, axis=0)
-        columns = (pos_w, vel_w, acc_w)
-        rows = zip(*(map(tuple, column[:count].tolist()) for column in columns), strict=True)
-        rest = zip(heading[:count].tolist(), self._sticks, strict=False)
-        return [Moment(*row, *other) for row, other in zip(rows, rest, strict=True)]
+        vectors = (map(tuple, column[:count].tolist()) for column in (pos_w, vel_w, acc_w))
+        rows = zip(*vectors, heading[:count].tolist(), self._sticks[:count], strict=True)
+        return [Moment(*row) for row in rows]
 
 
 def steps_of(seconds: float) -> int:
@@ -337,17 +336,12 @@ class Pilot:
         self._is_cut_off = has_stick and (self._is_cut_off or self._is_unsafe(plant))
         is_free = not has_stick or self._is_cut_off
         force_w = self._force(plant, moment, is_free)
-        own = tuple(
-            stick + TREMBLE * shake
-            for stick, shake in zip(
-                self._sticks(plant, force_w, moment.heading), self._tremble.step(DT_S), strict=True
-            )
+        own, shakes = self._sticks(plant, force_w, moment.heading), self._tremble.step(DT_S)
+        hands = (None,) * len(own) if is_free else moment.sticks
+        return tuple(
+            max(-1.0, min(1.0, stick + TREMBLE * shake if hand is None else hand))
+            for stick, shake, hand in zip(own, shakes, hands, strict=True)
         )
-        if not is_free:
-            own = tuple(
-                mine if given is None else given for mine, given in zip(own, moment.sticks, strict=True)
-            )
-        return tuple(max(-1.0, min(1.0, stick)) for stick in own)
 
     def _is_unsafe(self, plant) -> bool:
         falling = max(0.0, -plant.vel_w[2])
@@ -361,7 +355,7 @@ class Pilot:
             POSITION_PER_VELOCITY * gain * (there - here)
             for gain, there, here in zip(gains, moment.pos_w, plant.pos_w, strict=True)
         )
-        wanted = tuple(a + b for a, b in zip(clip_length(away, MOST_CORRECTION), moment.vel_w, strict=True))
+        wanted = add(clip_length(away, MOST_CORRECTION), moment.vel_w)
         error = tuple(a - b for a, b in zip(clip_length(wanted, MOST_SPEED), plant.vel_w, strict=True))
         acc = [
             a + gain * e + k for a, gain, e, k in zip(moment.acc_w, gains, error, self._learnt_w, strict=True)

@@ -214,12 +214,8 @@ def _quadratic_drag(values: Parameters) -> Hook:
 
 def _rotor_drag(values: Parameters) -> Hook:
     """f -= h T/m (v_x, v_y, 0), v the airspeed in the body."""
-
-    def act(plant: Any) -> Vector:
-        lean = -values["h"] * plant.thrust_acc
-        return (lean * plant.airspeed_b[0], lean * plant.airspeed_b[1], 0.0)
-
-    return act
+    h = values["h"]
+    return lambda plant: scale(-h * plant.thrust_acc, (*plant.airspeed_b[:2], 0.0))
 
 
 def _thrust_tilt(values: Parameters) -> Hook:
@@ -485,14 +481,10 @@ class Plant:
         return sticks
 
     def _lag(self, command: Sticks, step_s: float) -> None:
-        before, (roll, pitch, yaw, rising, falling) = self.applied, self._shares[step_s]
-        last = falling if command[3] < before[3] else rising
-        self.applied = (
-            before[0] + roll * (command[0] - before[0]),
-            before[1] + pitch * (command[1] - before[1]),
-            before[2] + yaw * (command[2] - before[2]),
-            before[3] + last * (command[3] - before[3]),
-        )
+        before, (*rates, rising, falling) = self.applied, self._shares[step_s]
+        shares = (*rates, falling if command[3] < before[3] else rising)
+        pairs = zip(before, command, shares, strict=True)
+        self.applied = tuple(stick + share * (asked - stick) for stick, asked, share in pairs)
         if self.is_fine:
             self._set_slope(command)
         else:
@@ -506,9 +498,7 @@ class Plant:
     def _see(self, quat: Quaternion) -> None:
         """Set what depends on an attitude: airspeed and thrust."""
         self.rows = rotation(quat)
-        air = self._air_w
-        vel = self.vel_w
-        self.airspeed_b = to_body(self.rows, (vel[0] - air[0], vel[1] - air[1], vel[2] - air[2]))
+        self.airspeed_b = to_body(self.rows, add(self.vel_w, scale(-1.0, self._air_w)))
         thrust = self.truth.thrust(self.applied[3], self.battery_v)
         for hook in self._thrust_hooks:
             thrust = hook(self, thrust)
@@ -536,12 +526,7 @@ class Plant:
         return force
 
     def _accelerate(self, step_s: float) -> None:
-        x, y, z = to_world(self.rows, self.force_b)
-        self.acc_w = acc = (x, y, z - self.truth.gravity)
-        (x, y, z), (vx, vy, vz), half = self.pos_w, self.vel_w, 0.5 * step_s * step_s
-        self.pos_w = (
-            x + vx * step_s + acc[0] * half,
-            y + vy * step_s + acc[1] * half,
-            z + vz * step_s + acc[2] * half,
-        )
-        self.vel_w = (vx + acc[0] * step_s, vy + acc[1] * step_s, vz + acc[2] * step_s)
+        self.acc_w = add(to_world(self.rows, self.force_b), (0.0, 0.0, -self.truth.gravity))
+        moved = add(self.pos_w, scale(step_s, self.vel_w))
+        self.pos_w = add(moved, scale(0.5 * step_s * step_s, self.acc_w))
+        self.vel_w = add(self.vel_w, scale(step_s, self.acc_w))

@@ -15,7 +15,7 @@ import time
 from collections.abc import Callable, Sequence
 from itertools import combinations
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import numpy as np
@@ -28,8 +28,8 @@ from flytrack_env.motion import Motion
 from flytrack_sysid import FlightLog, import_log
 from flytrack_sysid.diagnosis import joined, refinement
 from flytrack_sysid.diagnosis.diagnose import split
-from flytrack_sysid.diagnosis.lanes import make_lanes, thinned
-from flytrack_sysid.diagnosis.noise import first_guess, fit_noise
+from flytrack_sysid.diagnosis.lanes import lanes_of, thinned
+from flytrack_sysid.diagnosis.noise import fit_noise
 from flytrack_sysid.diagnosis.problem import Problem
 from flytrack_sysid.diagnosis.score_test import CANDIDATES
 from flytrack_sysid.diagnosis.search import SearchState
@@ -78,26 +78,10 @@ def shortened(log: FlightLog, seconds: float) -> FlightLog:
     return log.select(np.cumsum(np.diff(log.time, prepend=log.time[0]).clip(0.0, 0.1)) < seconds)
 
 
-class Models(NamedTuple):
-    """What the flights of some policies say: a problem, the refitted base, and the refined extension."""
-
-    problem: Problem
-    base: np.ndarray
-    refined: refinement.Refined
-
-    @property
-    def extended(self) -> np.ndarray:
-        """The vector of the extended model; the base's where no effect helps."""
-        return self.base if self.refined.fit is None else self.refined.fit.vector
-
-
-def models_of(learnt: FlightLog, nominal: ModelParameters) -> Models:
+def models_of(learnt: FlightLog, nominal: ModelParameters) -> tuple[np.ndarray, refinement.Refined]:
     """Return the models of flights: base and proposed effects fitted to single steps, then refined."""
     parts = split(learnt, nominal, None, Motion.CONTINUOUS)
-    problem = parts.train
-    state = SearchState.start(
-        learnt, problem.with_noise(first_guess(problem.lanes, problem.residuals(problem.start[None])[0]))
-    )
+    problem, state = parts.train, SearchState.start(learnt, parts.train)
     ways = ([one for one in CANDIDATES if one.effect == name] for name in PROPOSED)
     candidates = [found[len(found) // 2] for found in ways]  # from probes in the middle
     base = state.fitted((), problem.start)
@@ -107,17 +91,7 @@ def models_of(learnt: FlightLog, nominal: ModelParameters) -> Models:
     model = state.fitted(candidates, vector)
     state = state.with_noise(fit_noise(problem.lanes, problem.residuals(model.vector[None])[0]))
     base, model = state.fitted((), base.vector), state.fitted(candidates, model.vector)
-    refined = refinement.refine(
-        problem,
-        base.vector,
-        model.vector,
-        candidates,
-        state.base_places,
-        learnt,
-        parts.held_out,
-        is_explained=False,
-    )
-    return Models(problem, base.vector, refined)
+    return base.vector, refinement.refine(state, base, model, learnt, parts.held_out, is_explained=False)
 
 
 def fold(folder: Path, judged: str, seconds: float) -> dict[str, Any]:
@@ -126,22 +100,22 @@ def fold(folder: Path, judged: str, seconds: float) -> dict[str, Any]:
     learnt = joined([shortened(flights(folder, [one])[0], seconds) for one in others])
     own, nominal = flights(folder, [judged])
     started = time.process_time()
-    found = models_of(learnt, nominal)
+    base, refined = models_of(learnt, nominal)
     cpu_s = time.process_time() - started
-    problem, refined = found.problem, found.refined
+    problem, fit = refined.problem, refined.fit
+    extended = base if fit is None else fit.vector  # the base's where no effect helps
     windows = make_windows(own, np.ones(len(own), bool), SPACING_S, MOST)
-    vectors = {"refitted_base": found.base, "extended": found.extended}
+    vectors = {"refitted_base": base, "extended": extended}
     if refined.base is not None:
         vectors["refitted_to_flights"] = refined.base
     errors = refinement.errors_at(refined.problem, np.stack(list(vectors.values())), windows).errors
     results = {name: refinement.Tested(one[None], windows) for name, one in zip(vectors, errors, strict=True)}
-    base = from_vector(found.base, problem.like)._replace(effects=())
-    rows, steps = rows_of(learnt, base), base_steps(base, own)
+    plain = from_vector(base, problem.like)._replace(effects=())
+    rows, steps = rows_of(learnt, plain), base_steps(plain, own)
     boxes = {**linear_ones(rows), "network": network(rows)}
     results |= {name: flown(one, windows, steps) for name, one in boxes.items()}
     known = make_windows(learnt, np.ones(len(learnt), bool), SPACING_S, MOST)
     results["placebo"] = refinement.Tested(refinement.placebo_errors(known, windows), windows)
-    fit = refined.fit
     widths = {} if fit is None else dict(zip(fit.places, fit.half_widths, strict=True))
     return {
         "policy": judged,
@@ -153,8 +127,7 @@ def fold(folder: Path, judged: str, seconds: float) -> dict[str, Any]:
         "rms": {name: one.rms()[0].round(6).tolist() for name, one in results.items()},
         "by_flight": by_flight(results, own.segment[windows.start]),
         "values": {
-            problem.names[place]: [float(found.extended[place]), float(half)]
-            for place, half in widths.items()
+            problem.names[place]: [float(extended[place]), float(half)] for place, half in widths.items()
         },
     }
 
@@ -182,8 +155,7 @@ def fits_of(folder: Path, structure: Sequence[str], start: dict[str, float]) -> 
             continue
         windows = refinement.windows_of(log, every)
         assert windows is not None
-        lanes = thinned(make_lanes(log, every, np.asarray(model.tau, float), float(model.g)))
-        problem = Problem.of(lanes, model)
+        problem = Problem.of(thinned(lanes_of(log, every, model)), model)
         vector = problem.start.copy()
         vector[problem.index(list(start))] = list(start.values())
         scale = refinement.errors_at(problem, vector[None], windows).rms()[0]

@@ -18,6 +18,7 @@ from flytrack_env.dynamics import ModelParameters, nominal_parameters
 from flytrack_env.effects import BY_NAME, acts
 from flytrack_env.motion import Motion
 from flytrack_sysid.diagnosis import noise as noises
+from flytrack_sysid.diagnosis import search
 from flytrack_sysid.diagnosis.diagnose import (
     Judged,
     Split,
@@ -34,22 +35,10 @@ from flytrack_sysid.diagnosis.score_test import (
     Candidate,
     Linearization,
     candidates_for,
-    inflation_of,
     solve,
     threshold,
 )
-from flytrack_sysid.diagnosis.search import (
-    MOST_REFITTED,
-    PER_PARAMETER,
-    PROMISING,
-    FittedModel,
-    Scored,
-    SearchState,
-    add_effect,
-    saturated_residuals,
-)
-from flytrack_sysid.diagnosis.size import is_notable
-from flytrack_sysid.diagnosis.summary import effect_causes, mean_factor, mean_thrust, verdict_of
+from flytrack_sysid.diagnosis.summary import effect_causes, is_notable, mean_factor, mean_thrust, verdict_of
 from flytrack_sysid.diagnosis.unexplained import find_unexplained
 from flytrack_sysid.diagnosis.vetoes import Selection
 from flytrack_sysid.log import FlightLog
@@ -74,21 +63,19 @@ class Change(NamedTuple):
 class Estimate(NamedTuple):
     """A model fitted to one log, by likelihood; base: the same without effects."""
 
-    state: SearchState
-    base: FittedModel
-    model: FittedModel
+    state: search.SearchState
+    base: search.FittedModel
+    model: search.FittedModel
     linearization: Linearization
 
     @classmethod
     def of(cls, parts: Split) -> "Estimate":
         """Return the refitted base, with the noise that it leaves."""
         problem = parts.train
-        noise = noises.first_guess(problem.lanes, problem.residuals(problem.start[None])[0])
-        state = SearchState.start(parts.log, problem.with_noise(noise))
+        state = search.SearchState.start(parts.log, problem)
         base = state.fitted((), problem.start)
         state, linearization = state.linearized(base.vector)
-        left = saturated_residuals(state.problem, linearization)
-        state = state.with_noise(noises.fit_noise(problem.lanes, left))
+        state = state.with_noise(noises.fit_noise(problem.lanes, search.saturated_residuals(linearization)))
         base = state.fitted((), base.vector)
         state, linearization = state.linearized(base.vector)
         return cls(state, base, base, linearization)
@@ -100,7 +87,7 @@ class Estimate(NamedTuple):
         if gain is None:
             fitted = self.state.fitted(model.joined_by(candidate), model.vector)
         else:
-            fitted = add_effect(self.state, line, model, Scored(candidate, gain))
+            fitted = search.add_effect(self.state, line, model, search.Scored(candidate, gain))
         state, linearization = self.state.linearized(fitted.vector)
         return Estimate(state, self.base, fitted, linearization)
 
@@ -109,17 +96,8 @@ class Estimate(NamedTuple):
 
         The covariance is as much larger than the information's inverse as seconds disagree after the step.
         """
-        line, given = self.linearization, self.linearization.columns_at(self.model.places)
-        columns = list(columns)
-        information, share = line.projected(columns, given)
-        step = solve(information, line.score[columns] - share.T @ line.score[given])
-        inner = solve(line.total[np.ix_(given, given)], line.score[given])
-        places = given + columns
-        both = np.concatenate([inner - share @ step, step])
-        blocks = line.score_by_block[:, places] - line.by_block[:, places][:, :, places] @ both
-        blocks = blocks[:, len(given) :] - blocks[:, : len(given)] @ share
-        covariance = inflation_of(information, blocks) * solve(information, np.eye(len(columns)))
-        return step, covariance
+        gain = self.linearization.freed(list(columns), self.linearization.columns_at(self.model.places))
+        return gain.step, gain.inflation * solve(gain.information, np.eye(len(columns)))
 
 
 def diagnose_change(
@@ -216,9 +194,10 @@ def next_change(later: Estimate, earlier: Estimate) -> tuple[Refit, tuple[str, .
     ways: dict[tuple[str, ...], Candidate] = {}
     for one in sorted((one for one in promise if promise[one] > 0.0), key=lambda one: -promise[one]):
         ways.setdefault(one.fields, one)
-    refitted = [(one, later.with_effect(one)) for one in [*ways.values()][:MOST_REFITTED]]
+    refitted = [(one, later.with_effect(one)) for one in [*ways.values()][: search.MOST_REFITTED]]
     worth = {
-        one: later.model.cost - more.model.cost - PER_PARAMETER * len(one.fields) for one, more in refitted
+        one: later.model.cost - more.model.cost - search.PER_PARAMETER * len(one.fields)
+        for one, more in refitted
     }
     found: list[Refit] = []
     for one, more in sorted(refitted, key=lambda pair: -worth[pair[0]]):
@@ -253,7 +232,7 @@ def promise_of(candidate: Candidate, later: Estimate, earlier: Estimate) -> floa
     if any(probe.is_one_way and share <= 0.0 for probe, share in zip(candidate.probes, step, strict=False)):
         return 0.0
     chi2 = min(change @ solve(covariance + covariance_before, change), step @ solve(covariance, step))
-    if chi2 < PROMISING * threshold(len(change)) or not is_large(candidate, change, later):
+    if chi2 < search.PROMISING * threshold(len(change)) or not is_large(candidate, change, later):
         return 0.0
     gain = later.linearization.gain_of(candidate, later.linearization.columns_at(later.model.places))
     return gain.chi2 if gain is not None else 0.0

@@ -114,17 +114,13 @@ def may_be(term: Term) -> str:
 
 def _least(quantities: Iterable[str]) -> str:
     """Return the quantity that says most."""
-    return min(quantities, key=_says_little)
+    return min(quantities, key=lambda one: 1 + LAST.index(one) if one in LAST else 0)
 
 
 def _column(acts: str, frame: str, axis: str) -> str:
     if frame == "air":
         return "force_along"
     return f"{'rates' if acts == 'rate' else 'force'}_{'world_' if frame == 'world' else ''}{axis}"
-
-
-def _says_little(quantity: str) -> int:
-    return 1 + LAST.index(quantity) if quantity in LAST else 0
 
 
 def with_learned(model: ModelParameters, learned: Learned | None) -> ModelParameters:

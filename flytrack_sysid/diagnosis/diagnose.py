@@ -10,50 +10,18 @@ import numpy as np
 
 from flytrack_env.dynamics import ModelParameters, nominal_parameters
 from flytrack_env.motion import Motion
+from flytrack_sysid.clocks import on_one_clock, with_causal_commands
+from flytrack_sysid.diagnosis import summary
 from flytrack_sysid.diagnosis.beyond import with_and_without, with_learned
-from flytrack_sysid.diagnosis.lanes import Lanes, make_lanes, thinned, voltages_of
-from flytrack_sysid.diagnosis.late_poses import with_late_poses
+from flytrack_sysid.diagnosis.lanes import Lanes, lanes_of, thinned, voltages_of
 from flytrack_sysid.diagnosis.lateness import judged_as_logged, latency_of, read_poses
 from flytrack_sysid.diagnosis.learned import find_learned
 from flytrack_sysid.diagnosis.motion_choice import Moves, how_it_moves, likelier_motion
-from flytrack_sysid.diagnosis.noise import first_guess
-from flytrack_sysid.diagnosis.onset import (
-    at_end,
-    ended,
-    first_row_as_at_end,
-    notes_of,
-    spans_of,
-    with_changes,
-)
-from flytrack_sysid.diagnosis.outliers import outlier_notes, outliers_of
+from flytrack_sysid.diagnosis.onset import at_end, first_row_as_at_end, notes_of, spans_of, with_changes
 from flytrack_sysid.diagnosis.problem import Problem
-from flytrack_sysid.diagnosis.reduction import reduced
-from flytrack_sysid.diagnosis.refinement import Refined, refine
+from flytrack_sysid.diagnosis.refinement import Refined, reduced, refine
 from flytrack_sysid.diagnosis.result import Cause, Diagnosis
 from flytrack_sysid.diagnosis.search import SearchState, search
-from flytrack_sysid.diagnosis.sensor_clocks import on_one_clock, with_causal_commands
-from flytrack_sysid.diagnosis.size import split_by_size
-from flytrack_sysid.diagnosis.summary import (
-    base_causes,
-    causes_at_end,
-    changed_parameters,
-    effect_causes,
-    errors_of,
-    given_learned_notes,
-    half_responses_of,
-    model_of,
-    not_identifiable,
-    prediction_of,
-    refinement_notes,
-    sensor_noise,
-    stand_in_notes,
-    unseen_at_rest_notes,
-    vector_without,
-    verdict_of,
-    warnings_of,
-    with_lost_causes,
-    with_refined_values,
-)
 from flytrack_sysid.diagnosis.vetoes import (
     Selection,
     Veto,
@@ -128,15 +96,14 @@ def diagnose(
         found = replace(found, nominal=nominal)
         if parts.as_logged or latency_of(nominal):
             problems = selection.state.problem, test
-            found = with_late_poses(found, parts.moves, nominal, problems, parts.as_logged)
+            found = summary.with_late_poses(found, parts.moves, nominal, problems, parts.as_logged)
         report(4, len(STAGES))
     return found
 
 
 def select_model(parts: Split) -> Selection:
     """Return the model that is selected from the rows to learn from."""
-    noise = first_guess(parts.train.lanes, parts.train.residuals(parts.train.start[None])[0])
-    return select(*search(SearchState.start(parts.log, parts.train.with_noise(noise))))
+    return select(*search(SearchState.start(parts.log, parts.train)))
 
 
 def split(
@@ -175,11 +142,6 @@ def split(
         problem_of(thinned(lanes), corrected, log, model, with_motion.late_s) for lanes in (every, judged_by)
     )
     return Split(logged, with_motion, corrected, out, train, test, as_logged, tuple(warnings))
-
-
-def lanes_of(log: FlightLog, rows: np.ndarray, model: ModelParameters) -> Lanes:
-    """Return the lanes of a log of which some rows, (num_rows,) bool, count."""
-    return make_lanes(log, rows, np.asarray(model.tau, float), float(model.g))
 
 
 def problem_of(
@@ -235,7 +197,7 @@ def refined_within_range(judged: Judged, test: Problem, parts: Split) -> Judged:
     while True:
         selection = judged.selection
         refined = refined_by_prediction(selection, parts)
-        stuck = causes_at_end(selection, refined, test)
+        stuck = summary.causes_at_end(selection, refined, test)
         if not stuck:
             return judged._replace(refined=refined)
         selection, rejected = apply_vetoes(reject(selection, [one.effect for one in stuck]), test)
@@ -248,20 +210,12 @@ def refined_by_prediction(selection: Selection, parts: Split) -> Refined:
     Flights are of the part of the log in which the effects act that do so at its end. Those that ended before
     are kept.
     """
-    state, model, gone = selection.state, selection.model, ended(selection)
+    model, last = selection.model, at_end(selection, selection.model)
     since = np.arange(len(parts.log)) >= first_row_as_at_end(selection, parts.test)
-    refined = refine(
-        state.problem,
-        selection.base.vector,
-        state.problem.without(model.vector, gone),
-        [one for one in model.candidates if one.effect not in gone],
-        state.base_places,
-        parts.log.select(since),
-        parts.held_out[since],
-        not selection.unexplained.flagged,
-    )
-    kept = tuple(one for one in model.candidates if one in refined.kept or one.effect in gone)
-    return refined._replace(kept=kept)
+    log, is_explained = parts.log.select(since), not selection.unexplained.flagged
+    refined = refine(selection.state, selection.base, last, log, parts.held_out[since], is_explained)
+    kept = (one for one in model.candidates if one in refined.kept or one not in last.candidates)
+    return refined._replace(kept=tuple(kept))
 
 
 def summarize(judged: Judged, parts: Split) -> Diagnosis:
@@ -271,27 +225,25 @@ def summarize(judged: Judged, parts: Split) -> Diagnosis:
     selection = reduced(judged.selection, refined)
     problem, model = selection.state.problem, selection.model
     state, linearization = selection.state.linearized(model.vector)
-    effects = effect_causes(selection, test, linearization)
-    in_base, lost_in_base = base_causes(selection, test, linearization, effects)
+    effects = summary.effect_causes(selection, test, linearization)
+    in_base, lost_in_base = summary.base_causes(selection, test, linearization, effects)
     contradicted = [name for name, veto in judged.rejected.items() if veto is contradicted_on_held_out]
     lost = [*contradicted, *lost_in_base]
     extended = model if refined.fit is None else model._replace(vector=refined.fit.vector)
-    found = with_refined_values([*effects, *in_base], refined, extended.vector)
+    found = summary.with_refined_values([*effects, *in_base], refined, extended.vector)
     spans = spans_of(selection, parts.test, parts.log)
-    found = tuple(
-        replace(one, **spans[one.effect]._asdict()) if one.effect in spans else one for one in found
-    )
+    found = tuple(replace(one, **spans.get(one.effect, {})) for one in found)
 
     def without(cause: Cause) -> np.ndarray:
         if refined.fit is None:
-            return vector_without(cause, selection, linearization)
+            return summary.vector_without(cause, selection, linearization)
         return refined.vector_without(cause.effect)
 
-    found, negligible = split_by_size(found, problem, extended.vector, refined.flight_errors, without)
+    found, negligible = summary.split_by_size(found, problem, extended.vector, refined.flight_errors, without)
     causes = tuple(one for one in found if not one.beyond)
     beyond = (*judged.refused, *(one for one in found if one.beyond))
     vectors = {"nominal": problem.start, "refitted_base": selection.base.vector, "extended": extended.vector}
-    outliers = outliers_of((problem, test), extended.vector)
+    outliers = summary.outliers_of((problem, test), extended.vector)
     extended = at_end(selection, extended)
     flying = {**vectors, "extended": extended.vector}
     learned, judged_by = None, (test, refined)
@@ -306,38 +258,38 @@ def summarize(judged: Judged, parts: Split) -> Diagnosis:
         vectors, flying = (with_and_without(learned, one, change) for one in (vectors, flying))
         extended = extended._replace(vector=vector)
         judged_by = test.with_learned(learned.effects), refined.with_learned(learned.effects)
-    limits = not_identifiable(state, linearization, model, (*found, *negligible))
-    prediction = prediction_of(judged_by[1], flying)
+    limits = summary.not_identifiable(state, linearization, model, (*found, *negligible))
+    prediction = summary.prediction_of(judged_by[1], flying)
     notes = [
-        *outlier_notes(outliers),
-        *warnings_of(problem, (*causes, *beyond), lost),
-        *refinement_notes(refined, selection.model),
-        *stand_in_notes(selection, flying["extended"]),
-        *given_learned_notes(problem, selection.unexplained),
-        *unseen_at_rest_notes(judged.rejected),
+        *summary.outlier_notes(outliers),
+        *summary.warnings_of(problem, (*causes, *beyond), lost),
+        *summary.refinement_notes(refined, selection.model),
+        *summary.stand_in_notes(selection, flying["extended"]),
+        *summary.given_learned_notes(problem, selection.unexplained),
+        *summary.unseen_at_rest_notes(judged.rejected),
         *notes_of(selection, linearization, parts.log),
     ]
-    rest = with_lost_causes(selection.unexplained, lost)
+    rest = summary.with_lost_causes(selection.unexplained, lost)
     rest = replace(rest, flagged=rest.flagged or bool(beyond))
     return Diagnosis(
-        verdict=verdict_of(causes, rest),
+        verdict=summary.verdict_of(causes, rest),
         causes=causes,
         negligible=negligible,
         beyond=beyond,
         unexplained=rest,
         not_identifiable=limits,
-        error=errors_of(judged_by[0], vectors, prediction),
+        error=summary.errors_of(judged_by[0], vectors, prediction),
         nominal=problem.like,
-        base=model_of(problem, selection.base),
-        extended=with_learned(model_of(problem, extended), learned),
-        noise=sensor_noise(problem),
+        base=summary.model_of(problem, selection.base),
+        extended=with_learned(summary.model_of(problem, extended), learned),
+        noise=summary.sensor_noise(problem),
         voltages=voltages_of(problem.lanes),
         source=Path(parts.logged.source).name,
         sha256=parts.logged.sha256,
         warnings=(*parts.warnings, *notes),
         prediction=prediction,
-        changed=changed_parameters(linearization, extended, refined),
-        half_response_s=half_responses_of(linearization, model, judged_by[1], flying),
+        changed=summary.changed_parameters(linearization, extended, refined),
+        half_response_s=summary.half_responses_of(linearization, model, judged_by[1], flying),
         outliers=outliers,
         learned=learned,
     )

@@ -8,6 +8,7 @@ from matplotlib.figure import Figure
 
 from flytrack_env.dynamics import ModelParameters
 from flytrack_env.effects import ThrustScale
+from flytrack_env.pictures.drawing import new_figure, plain
 from flytrack_sysid.diagnosis.score_test import BASE_CAUSES
 from flytrack_sysid.diagnosis.traces import REGRESSORS, UNITS, Traces
 from flytrack_sysid.parameters import STICKS, names_of, to_vector, with_values
@@ -15,6 +16,7 @@ from flytrack_sysid.plots import BLUE, GREY, ORANGE, say
 
 WIDTH_IN, ROW_IN, LEGEND_IN = 8.0, 2.5, 0.9
 MOST_COLUMNS = 3
+EXTENDED = "extended"  # its name in traces
 FEWEST_SHOWN = 50  # rows
 NO_DATA = "not in the log, or too little of it"
 NUM_BINS = 15
@@ -280,9 +282,9 @@ def _label(residual: str) -> str:
     return f"force {frame}{axis}{source} ({unit})"
 
 
-def _draw_panel(axes: Any, traces: Traces, panel: Panel, without: str, full: str) -> None:
+def _draw_panel(axes: Any, traces: Traces, panel: Panel, without: str) -> None:
     channel = panel.residual.split("_")[0]
-    (left, counts), (rest, _) = (traces.column(name, panel.residual) for name in (without, full))
+    (left, counts), (rest, _) = (traces.column(name, panel.residual) for name in (without, EXTENDED))
     label, unit = REGRESSORS[panel.regressor]
     unit, factor = _in_degrees(unit)
     scale = _in_degrees(UNITS[channel])[1]
@@ -309,33 +311,28 @@ def _draw_panel(axes: Any, traces: Traces, panel: Panel, without: str, full: str
     axes.set_xlabel(label if unit == "1" else f"{label} ({unit})", fontsize="small")
 
 
-def draw_cause(
-    cause: str, panels: Sequence[Panel], traces: Traces, without: str, extended: str, when: str = ""
-) -> Figure:
+def draw_cause(cause: str, panels: Sequence[Panel], traces: Traces, without: str, when: str = "") -> Figure:
     """Draw the panels of a cause.
 
-    without, extended: of the models in ``traces``, the extended one without the cause, and with it. The curve
-    is the difference between the predictions of the two. when: for the title, when the cause acts.
+    without: of the models in ``traces``, the extended one without the cause. The curve is the difference
+    between the predictions of it and of the one with the cause. when: for the title, when the cause acts.
     """
     # Without a sensor, its panel and that of its replacement are the same.
     panels = list(dict.fromkeys(panel._replace(residual=traces.used(panel.residual)) for panel in panels))
     columns = min(len(panels), MOST_COLUMNS) if len(panels) % MOST_COLUMNS != 1 else min(len(panels), 2)
     rows = -(-len(panels) // columns)
-    figure = Figure(figsize=(WIDTH_IN, LEGEND_IN + ROW_IN * rows), layout="constrained")
+    figure = new_figure(WIDTH_IN, LEGEND_IN + ROW_IN * rows)
     title = words_of(cause)
     title = title[0].upper() + title[1:] + when
     figure.suptitle(title, fontsize="large", fontweight="bold", x=0.01, ha="left")
     grid = figure.subplots(rows, columns, squeeze=False)
     for axes, panel in zip(grid.flat, panels, strict=True):
-        axes.spines[["top", "right"]].set_visible(False)
-        axes.grid(color="0.92", linewidth=0.8)
-        axes.set_axisbelow(True)
-        axes.tick_params(labelsize="small")
+        plain(axes).tick_params(labelsize="small")
         label = _label(panel.residual)
-        if traces.column(extended, panel.residual)[1].sum() < FEWEST_SHOWN:
+        if traces.column(EXTENDED, panel.residual)[1].sum() < FEWEST_SHOWN:
             say(axes, f"{label}:\n{NO_DATA}")
             continue
-        _draw_panel(axes, traces, panel, without, extended)
+        _draw_panel(axes, traces, panel, without)
         axes.set_title(label, fontsize="small", loc="left")
     for axes in grid[:, 0]:
         axes.set_ylabel("measured minus modelled", fontsize="small")

@@ -7,6 +7,7 @@ information that each would add to the log's decides which one to advise.
 import copy
 import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -16,10 +17,10 @@ import numpy as np
 from flytrack_env.dynamics import ModelParameters
 from flytrack_env.effects import BY_NAME, MOST_STEPS
 from flytrack_env.plants import Simulator
-from flytrack_env.state import pack, unpack, unpack_action
+from flytrack_sysid.collect import states_flown
 from flytrack_sysid.diagnosis.lanes import LANE_S, Lanes, make_lanes, voltages_of
 from flytrack_sysid.diagnosis.problem import SEARCHED, Problem
-from flytrack_sysid.diagnosis.result import SCHEMA, TO_LOG
+from flytrack_sysid.diagnosis.result import SCHEMA, TO_LOG, NotIdentifiable
 from flytrack_sysid.diagnosis.score_test import Candidate, Linearization, candidates_of
 from flytrack_sysid.diagnosis.search import FittedModel, SearchState
 from flytrack_sysid.excitation import ANY_VOLTAGE, DT_S, FLIGHT_STEPS, SCRIPT_HEIGHTS, VOLTAGES, is_inside
@@ -42,9 +43,8 @@ ROUNDING = 1e-6  # of DETECTED
 BASE_ONLY = ("thrust_scale",)  # no log tells it from the free thrust curve: a cause of the base
 LANES_PER_MANOEUVRE = int(FLIGHTS_PER_MANOEUVRE * FLIGHT_STEPS * DT_S) // LANE_S
 PRIOR_SHARE = 1e-2  # of what shows an effect: less comes from the log's own prior
-NEARLY_BEST = (
-    0.8  # of the best share: a manoeuvre that comes so near is as good, and an easier one comes first
-)
+# Of the best share: a manoeuvre that comes so near is as good, and an easier one comes first.
+NEARLY_BEST = 0.8
 PLENTY = 30.0  # shares: thirty times what shows an effect
 
 
@@ -66,12 +66,15 @@ class Visibility:
         way, shapes = _typical_candidate(effect), BY_NAME[effect].shapes
         notable = BY_NAME[effect].notable
         fields = [field for field in way.other_fields if field.split(".")[1] not in shapes]
-        self.columns = [linearization.column(field) for field in fields]
-        sizes = [notable[field.split(".")[1]] for field in fields]
         # The columns of probes come first, in shares of the way to them.
-        self.columns = [linearization.probe_column(one) for one in way.probes] + self.columns
-        sizes = [notable[one.field.split(".")[1]] / one.value for one in way.probes] + sizes
-        self.fields, self.sizes = [one.field for one in way.probes] + fields, np.array(sizes)
+        self.columns = [*map(linearization.probe_column, way.probes), *map(linearization.column, fields)]
+        self.fields = [*(one.field for one in way.probes), *fields]
+        ways = np.array([*(one.value for one in way.probes), *np.ones(len(fields))])
+        self.sizes = np.array([notable[field.split(".")[1]] for field in self.fields]) / ways
+
+    def of(self, effect: str) -> "Visibility":
+        """Return the same of another effect."""
+        return Visibility(self.linearization, self.given, effect)
 
     def noncentralities(self, beside: Sequence[int] = ()) -> np.ndarray:
         """Return the noncentrality of each parameter, all that is free and ``beside`` projected out."""
@@ -85,28 +88,25 @@ class Visibility:
         return found
 
 
-class Limit(NamedTuple):
-    """Of the parameter that is seen worst: smallest detectable size, infinite for none; and look-alikes."""
-
-    smallest: float
-    unit: str
-    look_alikes: tuple[str, ...]
-
-
 def unit_of(effect: str, field: str | None = None) -> str:
     """Return the unit of an effect's parameter, the first notable one if None."""
     return BY_NAME[effect].ranges[field or next(iter(BY_NAME[effect].notable))].unit
 
 
-def unseen_effects(state: SearchState, linearization: Linearization, model: FittedModel) -> dict[str, Limit]:
-    """Return effects that the log could not have shown, and how large they would have to be."""
+def unseen_effects(
+    state: SearchState, linearization: Linearization, model: FittedModel
+) -> dict[str, NotIdentifiable]:
+    """Return effects that the log could not have shown, by name; what to fly is still to be said.
+
+    Sizes are infinite where no size would show.
+    """
     given = linearization.columns_at(model.places)
-    result: dict[str, Limit] = {}
+    result: dict[str, NotIdentifiable] = {}
     for effect in (one.name for one in SEARCHED):
         if effect in model.effects or effect in BASE_ONLY:
             continue
         if effect in state.unobservable:
-            result[effect] = Limit(float("inf"), unit_of(effect), ())
+            result[effect] = NotIdentifiable(effect, float("inf"), unit_of(effect), (), "")
             continue
         visible = Visibility(linearization, given, effect)
         sizes = visible.noncentralities()
@@ -117,21 +117,19 @@ def unseen_effects(state: SearchState, linearization: Linearization, model: Fitt
         smallest = float("inf")
         if sizes[worst] > DETECTED * ROUNDING:
             smallest = float(BY_NAME[effect].notable[field] * np.sqrt(DETECTED / sizes[worst]))
-        alike = _look_alikes(state, linearization, given, visible) if sizes[worst] > 0.0 else ()
-        result[effect] = Limit(smallest, unit_of(effect, field), alike)
+        alike = _look_alikes(state, visible) if sizes[worst] > 0.0 else ()
+        result[effect] = NotIdentifiable(effect, smallest, unit_of(effect, field), alike, "")
     return result
 
 
-def _look_alikes(
-    state: SearchState, linearization: Linearization, given: list[int], visible: Visibility
-) -> tuple[str, ...]:
+def _look_alikes(state: SearchState, visible: Visibility) -> tuple[str, ...]:
     """Return effects beside which this one hardly shows any more."""
     sizes = visible.noncentralities()
     result = []
     for other in SEARCHED:
         if other.name in (visible.effect, *BASE_ONLY, *state.unobservable):
             continue
-        beside = visible.noncentralities(Visibility(linearization, given, other.name).columns)
+        beside = visible.noncentralities(visible.of(other.name).columns)
         if np.any((beside < SEPARATE) & (beside < LOOKS_ALIKE * sizes)):
             result.append(other.name)
     return tuple(result)
@@ -140,22 +138,8 @@ def _look_alikes(
 @jax.jit
 def _flown(vector: jax.Array, like: ModelParameters, starts: jax.Array, commands: jax.Array) -> jax.Array:
     """Return the states of flights, (flights, steps, 21), each before its command."""
-    model, simulator = from_vector(vector, like), Simulator(MOST_STEPS)
-
-    def step(state: Any, action: jax.Array) -> tuple[Any, jax.Array]:
-        return simulator.step(state, unpack_action(action), DT_S, model), pack(simulator.drone(state))
-
-    def fly(start: jax.Array, command: jax.Array) -> jax.Array:
-        return jax.lax.scan(step, simulator.reset(unpack(start), model), command)[1]
-
-    return jax.vmap(fly)(starts, commands)
-
-
-def _until_outside(states: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return flights that stand still once they leave the envelope, and where they are within it."""
-    inside = np.logical_and.accumulate(is_inside(states, SCRIPT_HEIGHTS, ANY_VOLTAGE), axis=1)
-    last = np.maximum.accumulate(np.where(inside, np.arange(states.shape[1]), 0), axis=1)
-    return np.take_along_axis(states, last[..., None], axis=1), inside
+    fly = partial(states_flown, Simulator(MOST_STEPS), from_vector(vector, like))
+    return jax.vmap(fly)(starts, commands)[:, :-1]
 
 
 def _absent_channels(lanes: Lanes) -> list[str]:
@@ -180,7 +164,11 @@ def _seen_flights(problem: Problem, vector: np.ndarray) -> tuple[FlightLog, np.n
     flights = flights_of(MANOEUVRES, hover_action(model, voltages), voltages=voltages)
     starts = np.stack([one.start for one in flights])
     commands = np.stack([one.command for one in flights])
-    states, inside = _until_outside(np.asarray(_flown(vector, problem.like, starts, commands)))
+    states = np.asarray(_flown(vector, problem.like, starts, commands))
+    # A flight stands still once it leaves the envelope.
+    inside = np.logical_and.accumulate(is_inside(states, SCRIPT_HEIGHTS, ANY_VOLTAGE), axis=1)
+    last = np.maximum.accumulate(np.where(inside, np.arange(states.shape[1]), 0), axis=1)
+    states = np.take_along_axis(states, last[..., None], axis=1)
     log = log_of_states(zip(states, commands, strict=True), DT_S, "manoeuvres")
     return log.without(*_absent_channels(problem.lanes)), inside.reshape(-1)
 
@@ -243,15 +231,15 @@ class Question:
     def __init__(
         self, linearization: Linearization, model: FittedModel, effect: str, alike: Iterable[str] = ()
     ):
-        self.linearization, self.effect = linearization, effect
-        self.given = linearization.columns_at(model.places)
-        self.alike = [Visibility(linearization, self.given, other).columns for other in alike]
+        self.effect = effect
+        self.visible = Visibility(linearization, linearization.columns_at(model.places), effect)
+        self.alike = [self.visible.of(other).columns for other in alike]
 
     @property
     def columns(self) -> list[int]:
         """The columns of the linearization that the answer depends on."""
-        own = Visibility(self.linearization, self.given, self.effect).columns
-        return [*self.given, *own, *(column for columns in self.alike for column in columns)]
+        own = self.visible
+        return [*own.given, *own.columns, *(column for columns in self.alike for column in columns)]
 
     def shares(self, information: np.ndarray | float = 0.0) -> np.ndarray:
         """Return how well the effect would show at its notable size, the worst first; from 1 on it does.
@@ -259,9 +247,9 @@ class Question:
         Noncentrality of each of its parameters over DETECTED, and beside each look-alike over SEPARATE.
         information: added to the log's.
         """
-        later = copy.copy(self.linearization)
-        later.total = self.linearization.total + information
-        visible = Visibility(later, self.given, self.effect)
+        visible = copy.copy(self.visible)
+        visible.linearization = copy.copy(visible.linearization)
+        visible.linearization.total = self.visible.linearization.total + information
         beside = [visible.noncentralities(columns) / SEPARATE for columns in self.alike]
         return np.sort(np.concatenate([visible.noncentralities() / DETECTED, *beside]))
 

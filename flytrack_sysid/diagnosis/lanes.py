@@ -10,6 +10,7 @@ from typing import NamedTuple
 import jax
 import numpy as np
 
+from flytrack_env.dynamics import ModelParameters
 from flytrack_sysid.log import FlightLog
 from flytrack_sysid.record import Record, is_applied_certain, make_record, measured_channels
 
@@ -132,6 +133,11 @@ def make_lanes(log: FlightLog, judged: np.ndarray, tau: np.ndarray, gravity: flo
     known = np.repeat(certain[index], SIZES, axis=-1)
     known &= ~begins[..., None]
     return Lanes(record._replace(begins=begins), sensed, counts, ~begins, known, index, _quanta(found))
+
+
+def lanes_of(log: FlightLog, judged: np.ndarray, model: ModelParameters) -> Lanes:
+    """Return the lanes of a log of which some rows, (num_rows,) bool, count, with the lags of a model."""
+    return make_lanes(log, judged, np.asarray(model.tau, float), float(model.g))
 
 
 def voltages_of(lanes: Lanes) -> tuple[float, float] | None:

@@ -68,14 +68,8 @@ def _weights(share: np.ndarray, motion: Motion) -> np.ndarray:
         zero = np.zeros_like(share)
         return np.stack([zero, 1.0 - share, share, zero], axis=-1)
     ages = [-tap for tap in TAPS]
-    others = [[other for other in ages if other != age] for age in ages]
-    return np.stack(
-        [
-            np.prod([(share - one) / (age - one) for one in rest], axis=0)
-            for age, rest in zip(ages, others, strict=True)
-        ],
-        axis=-1,
-    )
+    shares = ([(share - one) / (age - one) for one in ages if one != age] for age in ages)
+    return np.stack([np.prod(one, axis=0) for one in shares], axis=-1)
 
 
 def _changes(record: Record) -> np.ndarray:

@@ -66,9 +66,7 @@ class Ablation(NamedTuple):
 
 def without_effect(state: SearchState, model: FittedModel, effect: str) -> FittedModel:
     """Return the model without an effect, refitted."""
-    vector = model.vector.copy()
-    places = state.problem.index(model.candidate(effect).fields)
-    vector[places] = state.problem.start[places]  # neutral, or as the given model has it
+    vector = state.problem.at_start(model.vector, model.candidate(effect).fields)
     return state.fitted([one for one in model.candidates if one.effect != effect], vector)
 
 
@@ -90,9 +88,8 @@ def ablate(state: SearchState, model: FittedModel, linearization: Linearization,
             rivals[rival] = swaps[rival].cost - model.cost
     for other in other_groups(linearization, model, effect):
         candidates = [other if one.effect == effect else one for one in model.candidates]
-        vector = model.vector.copy()
-        dropped = state.problem.index(sorted({*model.candidate(effect).fields} - {*other.fields}))
-        vector[dropped] = state.problem.start[dropped]
+        dropped = {*model.candidate(effect).fields} - {*other.fields}
+        vector = state.problem.at_start(model.vector, sorted(dropped))
         swaps[effect] = min(state.fitted(candidates, vector), swaps.get(effect, model), key=price)
     columns = [linearization.column(field) for field in model.candidate(effect).fields]
     own = linearization.gain(columns, linearization.columns_at(model.places, without=columns))
@@ -174,9 +171,9 @@ class Separation(NamedTuple):
     beside: Mapping[str, float]
 
 
-def separation(problem: Problem, linearization: Linearization, model: FittedModel, effect: str) -> Separation:
+def separation(linearization: Linearization, model: FittedModel, effect: str) -> Separation:
     """Return how clearly a log shows an effect of a model, and tells it from others."""
-    own = model.candidate(effect)
+    problem, own = linearization.problem, model.candidate(effect)
     columns = [linearization.column(field) for field in own.fields]
     size = (model.vector - problem.start)[problem.index(own.fields)]
     given = linearization.columns_at(model.places, without=columns)
@@ -305,9 +302,7 @@ def _best_instead(
     """Return the best model with at most one effect more while base parameters are held, if it is better."""
     problem, held = state.problem, state.held
     state = replace(state, held=(*held, *(Held(field, "") for field in fields)))
-    vector = model.vector.copy()
-    vector[problem.index(fields)] = problem.start[problem.index(fields)]
-    less = state.fitted(model.candidates, vector)
+    less = state.fitted(model.candidates, problem.at_start(model.vector, fields))
     state, nearby = state.linearized(less.vector)
     limit = model.cost + PER_PARAMETER * len(fields)
     best = less if less.cost < limit else None

@@ -25,7 +25,7 @@ from flytrack_env.effects import BY_NAME, Effect
 from flytrack_env.motion import Motion
 from flytrack_sysid.clocks import PAIRS, offset_between
 from flytrack_sysid.diagnosis import noise as noises
-from flytrack_sysid.diagnosis.lanes import Lanes, make_lanes
+from flytrack_sysid.diagnosis.lanes import Lanes, lanes_of
 from flytrack_sysid.diagnosis.lateness import judged_as_logged, read_poses
 from flytrack_sysid.diagnosis.problem import Problem, blocks_of, robust_weight
 from flytrack_sysid.diagnosis.score_test import Linearization, solve
@@ -99,7 +99,7 @@ class Seen(NamedTuple):
         return self._replace(part=0, num_parts=max(self._lanes(self.log).row.shape[1] // MOST_LANES, 1))
 
     def _lanes(self, log: FlightLog) -> Lanes:
-        return make_lanes(log, self.judged, np.asarray(self.model.tau, float), float(self.model.g))
+        return lanes_of(log, self.judged, self.model)
 
     def lanes(self, log: FlightLog) -> Lanes:
         """Return the lanes of this part; in ``log`` poses may be at other times."""
@@ -205,9 +205,8 @@ def how_it_moves(
     late = {one: Moves(one) for one in motions}
     if apparent is not None:
         offset_s, sigma_s = apparent
-        half_s = 0.5 * float(
-            np.median(usual_step(log))
-        )  # rates of a simulator's step are those in its middle
+        # Rates of a simulator's step are those in its middle.
+        half_s = 0.5 * float(np.median(usual_step(log)))
         is_small = max(ON_TIME_S, min(STANDARD_ERRORS * sigma_s, UNCERTAIN_S))
         for one in motions:
             late_s = offset_s if one is Motion.CONTINUOUS else offset_s + half_s

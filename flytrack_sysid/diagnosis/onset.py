@@ -13,7 +13,7 @@ looked for.
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy import optimize, special, stats
@@ -209,8 +209,9 @@ def profile_of(problem: Problem, test: Problem, vector: np.ndarray, row: int) ->
     """
     step_s = float(np.median(problem.lanes.record.step_s))
     assert problem.noise is not None
-    test = replace(test, windows=problem.windows).with_noise(problem.noise)
-    pairs = [(one, *_on_both_sides(one, vector, row)) for one in (problem, test)]
+    problems = problem, replace(test, windows=problem.windows).with_noise(problem.noise)
+    # As if what changes at the row changed after the log, and before it.
+    sides = [[moved(one, row, to).residuals(vector[None])[0] for to in (NEVER, ALWAYS)] for one in problems]
     known: dict[int, float] = {}
     for reach_s, every_s in PROFILES:
         centre = min(known, key=lambda tried: known[tried]) if known else row
@@ -218,7 +219,7 @@ def profile_of(problem: Problem, test: Problem, vector: np.ndarray, row: int) ->
         reach = max(round(reach_s / step_s), every)
         tried = [one for one in range(centre - reach, centre + reach + 1, every) if one not in known]
         costs = np.zeros(len(tried))
-        for own, before, after in pairs:
+        for own, (before, after) in zip(problems, sides, strict=True):
             is_after = own.lanes.row[..., None, None] >= np.array(tried)[:, None, None, None, None]
             white = own.whiten(np.where(is_after, after, before))
             costs += [robust_square(one) for one in white]
@@ -227,34 +228,21 @@ def profile_of(problem: Problem, test: Problem, vector: np.ndarray, row: int) ->
     return Profile(rows, np.array([known[one] for one in rows.tolist()]))
 
 
-def _on_both_sides(problem: Problem, vector: np.ndarray, row: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return residuals as if what changes at a row changed after the log, and before it."""
-    before, after = (moved(problem, row, to).residuals(vector[None])[0] for to in (NEVER, ALWAYS))
-    return before, after
-
-
-class Span(NamedTuple):
-    """When an effect acts, s of the log's clock: onset and end, with their 95 % intervals; None without."""
-
-    onset_s: Estimated | None
-    end_s: Estimated | None
-
-
 def log_rows(problem: Problem, test: Problem, rows: Sequence[int]) -> np.ndarray:
     """Return the rows of the log, as fractions, of rows of the record."""
-    own, source = (
-        np.concatenate([part.ravel() for part in pair])
-        for pair in zip(
-            *((one.lanes.row, one.lanes.record.source_row) for one in (problem, test)), strict=True
-        )
-    )
+    lanes = problem.lanes, test.lanes
+    own = np.concatenate([one.row.ravel() for one in lanes])
+    source = np.concatenate([one.record.source_row.ravel() for one in lanes])
     known = (own >= 0) & (source >= 0)
     order = np.argsort(own[known])
     return np.interp(rows, own[known][order], source[known][order])
 
 
-def spans_of(selection: Selection, test: Problem, log: FlightLog) -> dict[str, Span]:
-    """Return when effects act that do so for a part of a log only, by name."""
+def spans_of(selection: Selection, test: Problem, log: FlightLog) -> dict[str, dict[str, Any]]:
+    """Return when effects act that do so for a part of a log only, by name and as fields of a cause.
+
+    Onset and end, s of the log's clock, with their 95 % intervals; None without.
+    """
     problem, vector = selection.state.problem, selection.model.vector
 
     def time_of(effect: str, row: int) -> Estimated | None:
@@ -266,7 +254,7 @@ def spans_of(selection: Selection, test: Problem, log: FlightLog) -> dict[str, S
         return Estimated(value, (low, high), "s")
 
     return {
-        one.effect: Span(time_of(one.effect, one.start), time_of(one.effect, one.end))
+        one.effect: {"onset_s": time_of(one.effect, one.start), "end_s": time_of(one.effect, one.end)}
         for one in windows_of(selection)
     }
 

@@ -15,7 +15,7 @@ channel   residual of a row                                                     
 """
 
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -29,7 +29,7 @@ from flytrack_env.quaternion import Quaternion, Vec3
 from flytrack_sysid.diagnosis import noise as noises
 from flytrack_sysid.diagnosis.lanes import LANE_S, Lanes, lead_in_of
 from flytrack_sysid.diagnosis.lateness import Late
-from flytrack_sysid.parameters import TAUS, bounds_of, from_vector, names_of, to_vector
+from flytrack_sysid.parameters import TAUS, bounds_of, from_vector, in_batches, names_of, to_vector
 from flytrack_sysid.record import Record
 from flytrack_sysid.replay import Step, replay
 
@@ -221,7 +221,7 @@ class Problem:
         return found if self.late is None else self.late.residuals(found)
 
     def _replayed(self, vectors: np.ndarray) -> np.ndarray:
-        return _in_batches(lambda part: _residuals(part, self.like, self.lanes), vectors)
+        return in_batches(lambda part: _residuals(part, self.like, self.lanes), vectors, _size_for(vectors))
 
     def _composed(self, vectors: np.ndarray) -> np.ndarray:
         """Return residuals of models whose effects act within their windows; each row is of a replay."""
@@ -237,8 +237,11 @@ class Problem:
 
     def without(self, vectors: np.ndarray, effects: Sequence[str]) -> np.ndarray:
         """Return vectors, (..., parameters), with some effects as in the given model."""
-        places = [place for place, name in enumerate(self.names) if name.split(".")[0] in effects]
-        vectors = vectors.copy()
+        return self.at_start(vectors, [name for name in self.names if name.split(".")[0] in effects])
+
+    def at_start(self, vectors: np.ndarray, fields: Sequence[str]) -> np.ndarray:
+        """Return vectors, (..., parameters), with some parameters as in the given model."""
+        vectors, places = vectors.copy(), self.index(fields)
         vectors[..., places] = self.start[places]
         return vectors
 
@@ -246,7 +249,8 @@ class Problem:
         """Return residuals (num_models, rows, lanes, NUM_AXES, 2), or those of some axes, as innovations."""
         assert self.gains is not None, "with_noise comes first"
         gains = jax.tree.map(lambda leaf: np.asarray(leaf)[..., axes], self.gains)
-        return _in_batches(lambda part: _whitened(part, gains, self.counts[..., axes, :]), left)
+        counts = self.counts[..., axes, :]
+        return in_batches(lambda part: _whitened(part, gains, counts), left, _size_for(left))
 
     def whitened_residuals(self, *vectors: np.ndarray) -> np.ndarray:
         """Return the innovations of models, (num_models, rows, lanes, NUM_AXES, 2)."""
@@ -256,20 +260,28 @@ class Problem:
         """Return vectors within bounds."""
         return np.clip(vectors, self.low, self.high)
 
-    def slopes(self, vector: np.ndarray, places: Sequence[int], others: np.ndarray | None = None) -> Slopes:
-        """Return a model's residuals, their slopes along places, and the way to other vectors.
+    def nudged(
+        self, vector: np.ndarray, places: Sequence[int], share: float = RELATIVE_STEP
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return copies of a vector with one of some places moved each, and by how much, for slopes.
 
         One-sided differences, into the bounds: an effect may be defined on one side of neutral only.
+        share: of a parameter's scale.
         """
         places = list(places)
-        step = RELATIVE_STEP * self.scale[places]
+        step = share * self.scale[places]
         step = np.where(vector[places] + step > self.high[places], -step, step)
         moved = np.repeat(vector[None], len(places), axis=0)
         moved[np.arange(len(places)), places] += step
+        return moved, step
+
+    def slopes(self, vector: np.ndarray, places: Sequence[int], others: np.ndarray | None = None) -> Slopes:
+        """Return a model's residuals, their slopes along places, and the way to other vectors."""
+        moved, step = self.nudged(vector, places)
         others = np.zeros((0, len(vector))) if others is None else others
         found = self.residuals(np.concatenate([vector[None], moved, others]))
         away = found[1:] - found[0]
-        away[: len(places)] /= step[:, None, None, None, None]
+        away[: len(step)] /= step[:, None, None, None, None]
         return Slopes(vector, found[0], tuple(places), away)
 
     def index(self, names: Sequence[str]) -> list[int]:
@@ -277,15 +289,9 @@ class Problem:
         return [self.names.index(name) for name in names]
 
 
-def _in_batches(program: Callable[[np.ndarray], jax.Array], values: np.ndarray) -> np.ndarray:
-    """Return a program of fixed batch size applied to values, (num_values, ...)."""
-    size = SMALL_BATCH if len(values) <= SMALL_BATCH else BATCH
-    parts = []
-    for begin in range(0, len(values), size):
-        part = values[begin : begin + size]
-        filled = np.concatenate([part, np.repeat(part[-1:], size - len(part), axis=0)])
-        parts.append(np.asarray(program(filled))[: len(part)])
-    return np.concatenate(parts)
+def _size_for(values: np.ndarray) -> int:
+    """Return how many values a program takes at once."""
+    return SMALL_BATCH if len(values) <= SMALL_BATCH else BATCH
 
 
 def as_replayed(model: ModelParameters) -> ModelParameters:

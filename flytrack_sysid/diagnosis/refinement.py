@@ -10,6 +10,7 @@ say nothing about what answers the commands, and nothing is named from there.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -19,10 +20,14 @@ from scipy.spatial.transform import Rotation
 
 from flytrack_env.dynamics import ModelParameters
 from flytrack_env.effects import BY_NAME
-from flytrack_sysid.diagnosis.problem import RELATIVE_STEP, Problem
-from flytrack_sysid.diagnosis.score_test import AT_BOUND, BASE_CAUSES, Candidate, prior_information, solve
+from flytrack_sysid.diagnosis.model_selection import ablate
+from flytrack_sysid.diagnosis.onset import ended
+from flytrack_sysid.diagnosis.problem import Problem
+from flytrack_sysid.diagnosis.score_test import BASE_CAUSES, Candidate, prior_information, solve, step_inside
+from flytrack_sysid.diagnosis.search import FittedModel, SearchState
+from flytrack_sysid.diagnosis.vetoes import Selection
 from flytrack_sysid.log import FlightLog
-from flytrack_sysid.parameters import DRAIN, from_vector
+from flytrack_sysid.parameters import DRAIN, from_vector, in_batches
 from flytrack_sysid.prediction_windows import (
     CHUNK,
     HORIZONS_S,
@@ -78,10 +83,7 @@ class Tested(NamedTuple):
         """Return mean squares over those of ``scale``, (horizons, quantities), (models, blocks, ...)."""
         number = np.maximum(self.windows.counts.sum(axis=1), 1)
         relative = self.squares / (np.square(scale) * number)[:, None]
-        _, block = np.unique(self.windows.block, return_inverse=True)
-        result = np.zeros((block.max() + 1, len(self.errors), *scale.shape))
-        np.add.at(result, block, np.moveaxis(relative, 2, 0))
-        return result.swapaxes(0, 1)
+        return self.windows.sums_by_block(np.moveaxis(relative, 2, 0)).swapaxes(0, 1)
 
 
 def sureness(differences: np.ndarray) -> np.ndarray:
@@ -99,13 +101,12 @@ def _errors(vectors: jax.Array, like: ModelParameters, windows: Windows) -> jax.
 
 def errors_at(problem: Problem, vectors: np.ndarray, windows: Windows) -> Tested:
     """Return the errors of models, (num_vectors, num_parameters), on windows; one program for all."""
-    parts = []
-    for begin in range(0, len(vectors), BATCH):
-        part = vectors[begin : begin + BATCH]
-        filled = np.concatenate([part, np.repeat(part[-1:], BATCH - len(part), axis=0)])
-        found = [np.asarray(_errors(filled, problem.like, chunk)) for chunk in chunks_of(windows)]
-        parts.append(np.concatenate(found, axis=2)[: len(part), :, : len(windows.start)])
-    errors = np.concatenate(parts)
+
+    def of_batch(part: np.ndarray) -> np.ndarray:
+        found = [np.asarray(_errors(part, problem.like, chunk)) for chunk in chunks_of(windows)]
+        return np.concatenate(found, axis=2)[:, :, : len(windows.start)]
+
+    errors = in_batches(of_batch, vectors, BATCH)
     # A model that runs away is as bad as can be, but still a number.
     errors = np.nan_to_num(np.clip(errors, -1e6, 1e6), nan=1e6)
     return Tested(errors.reshape(*errors.shape[:-1], len(QUANTITIES), 3), windows)
@@ -191,11 +192,8 @@ class Target(NamedTuple):
         problem, at = self.problem, np.array(places, int)
         vector = problem.clipped(vector)
         for number in range(rounds + 1):
-            step = RELATIVE_STEP * problem.scale[at]
-            step = np.where(vector[at] + step > problem.high[at], -step, step)
-            moved = np.repeat(vector[None], len(at) + 1, axis=0)
-            moved[np.arange(1, len(at) + 1), at] += step
-            left = self.residuals(moved)
+            moved, step = problem.nudged(vector, places)
+            left = self.residuals(np.concatenate([vector[None], moved]))
             columns = (left[1:] - left[0]) / step[:, None, None]
             root = np.sqrt(
                 np.where(np.abs(left[0]) > OUTLIER, OUTLIER / np.maximum(np.abs(left[0]), 1e-9), 1)
@@ -213,37 +211,26 @@ class Target(NamedTuple):
             if costs[best] > cost * (1.0 - LEAST_GAIN):
                 break
             vector = ways[best]
-        return Fit(vector, tuple(places), self._covariance(at, information, scores))
-
-    def _stuck(self, vector: np.ndarray, at: np.ndarray, way: np.ndarray) -> np.ndarray:
-        room = AT_BOUND * np.maximum(np.abs(vector[at]), 1.0)
-        low, high = self.problem.low[at] + room, self.problem.high[at] - room
-        return ((vector[at] <= low) & (way < 0.0)) | ((vector[at] >= high) & (way > 0.0))
+        return Fit(vector, tuple(places), self._covariance(information, scores))
 
     def _ways(
         self, vector: np.ndarray, at: np.ndarray, information: np.ndarray, gradient: np.ndarray
     ) -> np.ndarray:
         """Return the vectors that steps of all dampings lead to; parameters at a bound stay."""
+
+        def along(free: np.ndarray, damping: float) -> np.ndarray:
+            inner = information[np.ix_(free, free)]
+            return -solve(inner + damping * np.diag(np.diag(inner)), gradient[free])
+
         found = np.repeat(vector[None], len(DAMPINGS), axis=0)
         for number, damping in enumerate(DAMPINGS):
-            free, way = np.ones(len(at), bool), np.zeros(len(at))
-            while free.any():
-                inner = information[np.ix_(free, free)]
-                way[:] = 0.0
-                way[free] = -solve(inner + damping * np.diag(np.diag(inner)), gradient[free])
-                stuck = free & self._stuck(vector, at, way)
-                if not stuck.any():
-                    break
-                free &= ~stuck
-            found[number, at] += way * free
+            found[number, at] += step_inside(self.problem, vector, at, partial(along, damping=damping))
         return self.problem.clipped(found)
 
-    def _covariance(self, at: np.ndarray, information: np.ndarray, scores: np.ndarray) -> np.ndarray:
+    def _covariance(self, information: np.ndarray, scores: np.ndarray) -> np.ndarray:
         """Return that of 95 % intervals, by the scores of blocks (sandwich); Student's t."""
-        _, block = np.unique(self.windows.block, return_inverse=True)
-        by_block = np.zeros((block.max() + 1, len(at)))
-        np.add.at(by_block, block, scores)
-        inverse = solve(information, np.eye(len(at)))
+        by_block = self.windows.sums_by_block(scores)
+        inverse = solve(information, np.eye(len(information)))
         number = max(len(by_block), 2)
         covariance = inverse @ (by_block.T @ by_block * number / (number - 1)) @ inverse
         return covariance * stats.t.ppf(0.975, number - 1) ** 2
@@ -275,10 +262,8 @@ class Judge(NamedTuple):
     @property
     def is_known(self) -> np.ndarray:
         """Where held-out windows are enough to judge by, (horizons, quantities)."""
-        _, block = np.unique(self.windows.block, return_inverse=True)
         counts = self.windows.counts
-        blocks = np.zeros((block.max() + 1, *self.scale.shape))
-        np.add.at(blocks, block, counts.swapaxes(0, 1))
+        blocks = self.windows.sums_by_block(counts.swapaxes(0, 1).astype(int))
         return (counts.sum(axis=1) >= FEWEST_WINDOWS) & ((blocks > 0).sum(axis=0) >= FEWEST_BLOCKS)
 
     def seeing(self, tested: Tested) -> "Judge":
@@ -349,9 +334,7 @@ class Refined(NamedTuple):
         own = [name for name in self.problem.names if name.startswith(f"{effect}.")]  # of a sensor
         cause = "thrust_curve" if effect == "thrust_scale" else effect
         fields = BASE_CAUSES.get(cause, own)
-        vector, places = self.fit.vector.copy(), self.problem.index(fields)
-        vector[places] = self.problem.start[places]
-        return vector
+        return self.problem.at_start(self.fit.vector, fields)
 
     def flight_errors(self, vector: np.ndarray) -> dict[str, float]:
         """Return the held-out errors of free flight by seconds; empty where none was judged.
@@ -405,33 +388,30 @@ def widened(problem: Problem, fields: Sequence[str]) -> Problem:
 
 
 def refine(
-    problem: Problem,
-    base: np.ndarray,
-    extended: np.ndarray,
-    candidates: Sequence[Candidate],
-    base_places: Sequence[int],
+    state: SearchState,
+    base: FittedModel,
+    model: FittedModel,
     log: FlightLog,
     held_out: np.ndarray,
     is_explained: bool,
 ) -> Refined:
     """Return which effects of a model predict held-out flights better, and their values.
 
-    base, extended: the models from one-step residuals. base_places: its free base parameters. held_out:
-    (num_rows,) bool. is_explained: one-step residuals leave noise only; the model is then the most likely
-    one already, and stands as long as it predicts no horizon worse than the base.
+    base, model: those from one-step residuals. held_out: (num_rows,) bool. is_explained: one-step residuals
+    leave noise only; the model is then the most likely one already, and stands as long as it predicts no
+    horizon worse than the base.
     """
     learnt, judged = windows_of(log, ~held_out), windows_of(log, held_out)
-    as_found = Refined(tuple(candidates), None, None, (), {}, problem, None)
+    problem, candidates, extended = state.problem, model.candidates, model.vector
+    as_found = Refined(candidates, None, None, (), {}, problem, None)
     if learnt is None or judged is None:
         return as_found
-    judge = Judge.of(problem, learnt, judged, base).seeing(errors_at(problem, extended[None], judged))
+    judge = Judge.of(problem, learnt, judged, base.vector).seeing(errors_at(problem, extended[None], judged))
     as_found = as_found._replace(judge=judge)
     if not candidates or not judge.is_known.any():
         return as_found
-    found = _Refinement(judge, learnt, base, tuple(base_places), (), is_explained)
-    found = found._replace(
-        acting=found.acting_in(problem, _probed(problem, extended, candidates), candidates)
-    )
+    acting = _acting(problem, _probed(problem, extended, candidates), candidates, learnt)
+    found = _Refinement(judge, learnt, base.vector, tuple(state.base_places), acting, is_explained)
     is_at_bound = bool(at_bounds(problem, extended, found.fields_of(candidates)))
     if is_explained and not is_at_bound and not judge.is_surely_worse(extended):
         return as_found
@@ -467,15 +447,6 @@ class _Refinement(NamedTuple):
         """Return the free places that act on the windows."""
         own = [place for place in self.base_places if problem.names[place] != DRAIN]
         return own + problem.index(self.fields_of(candidates))
-
-    def acting_in(
-        self, problem: Problem, vector: np.ndarray, candidates: Sequence[Candidate]
-    ) -> tuple[str, ...]:
-        """Return the effects that change how a model predicts."""
-        without = [_neutral(problem, vector, one) for one in candidates]
-        found = errors_at(problem, np.stack([vector, *without]), self.learnt).errors
-        changes = np.abs(found[1:] - found[0]).max(axis=(1, 2, 3, 4))
-        return tuple(one.effect for one, change in zip(candidates, changes, strict=True) if change > 0.0)
 
     def run(self, extended: np.ndarray, as_found: Refined) -> Refined:
         """Return the refined model with the effects that held-out prediction needs."""
@@ -529,15 +500,19 @@ class _Refinement(NamedTuple):
         return found._replace(kept=tuple(kept), fit=fit, removed=tuple(removed), without=without)
 
     def _without(self, target: Target, fit: Fit, kept: Sequence[Candidate], one: Candidate) -> Fit:
-        vector = _neutral(target.problem, fit.vector, one)
+        vector = target.problem.at_start(fit.vector, one.fields)
         rest = [other for other in kept if other is not one]
         return target.fitted(vector, self.places(target.problem, rest), REFIT_ROUNDS)
 
 
-def _neutral(problem: Problem, vector: np.ndarray, one: Candidate) -> np.ndarray:
-    places, result = problem.index(one.fields), vector.copy()
-    result[places] = problem.start[places]
-    return result
+def _acting(
+    problem: Problem, vector: np.ndarray, candidates: Sequence[Candidate], windows: Windows
+) -> tuple[str, ...]:
+    """Return the effects that change how a model predicts."""
+    without = [problem.at_start(vector, one.fields) for one in candidates]
+    found = errors_at(problem, np.stack([vector, *without]), windows).errors
+    changes = np.abs(found[1:] - found[0]).max(axis=(1, 2, 3, 4))
+    return tuple(one.effect for one, change in zip(candidates, changes, strict=True) if change > 0.0)
 
 
 def _is_neutral(problem: Problem, vector: np.ndarray, fields: Sequence[str]) -> bool:
@@ -567,3 +542,45 @@ def table_of(tested: np.ndarray) -> dict[str, dict[str, float]]:
         for index, quantity in enumerate(QUANTITIES)
         if np.isfinite(tested[:, index]).any()
     }
+
+
+def reduced(selection: Selection, refined: Refined) -> Selection:
+    """Return the selection with only those effects that a refinement kept; its base alone without any.
+
+    Where none was fitted to flights, as sensors that flights do not see, single steps decide; the base alone
+    stands where it flies better.
+    """
+    model = selection.model
+    if refined.fit is not None:
+        if refined.kept == model.candidates:
+            return selection
+        return selection._replace(model=model._replace(candidates=refined.kept, places=refined.fit.places))
+    if refined.kept:
+        kept = selection if refined.kept == model.candidates else _narrowed(selection, refined.kept)
+        if not _flies_worse(kept, refined.judge):
+            return kept
+    state, base = selection.state, selection.base
+    # What an effect that is gone held at nominal is free again, as it was when the base was fitted.
+    held = tuple(one for one in state.held if state.problem.names.index(one.field) not in base.places)
+    return selection._replace(state=replace(state, held=held), model=base)
+
+
+def _narrowed(selection: Selection, kept: Sequence[Candidate]) -> Selection:
+    """Return the selection with some of its effects, fitted to single steps again."""
+    state, model = selection.state, selection.model
+    removed = [one.effect for one in model.candidates if one not in kept]
+    state = replace(state, held=tuple(one for one in state.held if one.effect not in removed))
+    model = state.fitted(kept, state.problem.without(model.vector, removed))
+    state, linearization = state.linearized(model.vector)
+    ablations = {one.effect: ablate(state, model, linearization, one.effect) for one in kept}
+    return selection._replace(state=state, model=model, ablations=ablations)
+
+
+def _flies_worse(selection: Selection, judge: Judge | None) -> bool:
+    """Return whether a model predicts held-out flights after its last change worse than its base does."""
+    if judge is None:
+        return False
+    vector = selection.state.problem.without(selection.model.vector, ended(selection))
+    if selection.unexplained.flagged:
+        return judge.worst_ratio(vector) >= 1.0
+    return judge.is_surely_worse(vector)

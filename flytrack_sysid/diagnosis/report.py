@@ -320,7 +320,7 @@ def _learned_parts(diagnosis: Diagnosis, found: Traces) -> list[Part]:
     if learned is None:
         return []
     panels = [Panel(*one) for one in learned.drawn()][:MOST_PICTURED]
-    figure = draw_cause("what was learnt", panels, found, _LESS + LEARNT, "extended")
+    figure = draw_cause("what was learnt", panels, found, _LESS + LEARNT)
     return [Bullets(learned.text().splitlines()), Picture(png_of(figure), LEARNT_READING)]
 
 
@@ -358,9 +358,7 @@ def _evidence_parts(diagnosis: Diagnosis, found: Traces, start_s: float) -> list
     for cause in sorted(diagnosis.causes, key=lambda cause: -cause.chi2_gain)[:MOST_PICTURED]:
         evidence = EVIDENCE[cause.effect]
         acting = while_acting(found, cause, start_s)
-        figure = draw_cause(
-            cause.effect, evidence.panels, acting, _LESS + cause.effect, "extended", when_of(cause)
-        )
+        figure = draw_cause(cause.effect, evidence.panels, acting, _LESS + cause.effect, when_of(cause))
         parts.append(Picture(png_of(figure), f"{evidence.reading} ({cause.effect}{when_of(cause)})"))
     if parts and any(found.used(name) != name for name in ("rates_x", "force_x")):
         parts.append(Text(DIFFERENCES))

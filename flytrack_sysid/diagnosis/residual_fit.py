@@ -15,6 +15,7 @@ import numpy as np
 from flytrack_env.effects.grammar import XYZ, Factor, Term
 from flytrack_env.effects.learned_residual import Input, Network
 from flytrack_sysid.diagnosis.law_search import Side, held_out, power
+from flytrack_sysid.diagnosis.noise import step_to
 from flytrack_sysid.diagnosis.problem import blocks_of
 from flytrack_sysid.diagnosis.score_test import solve
 from flytrack_sysid.diagnosis.unexplained import SIDES, whitened
@@ -59,18 +60,13 @@ def inputs_of(side: Side, names: Sequence[str]) -> tuple[Input, ...]:
     return tuple(found)
 
 
-def _signals(side: Side, network: Network) -> np.ndarray:
-    """Return the hidden units and the constant, (units, rows, lanes)."""
-    shape = side.flight.time_s.shape
-    return np.stack([np.broadcast_to(np.asarray(one), shape) for one in network.units(side.moment)])
-
-
 def _features(side: Side, network: Network) -> np.ndarray:
     """Return what unit weights add, world frame, (3 * units, rows, lanes, 3); units of an axis in a row."""
     term = Term(side.name, network.frame, (power("time"),), (0.0,) * XYZ, (0.0,) * XYZ)
-    rotation, signals, parts = side.flight.body_to_world, _signals(side, network), []
+    rotation, shape, parts = side.flight.body_to_world, side.flight.time_s.shape, []
+    signals = np.stack([np.broadcast_to(np.asarray(one), shape) for one in network.units(side.moment)])
     for unit in term.basis(side.moment):
-        body = np.stack([np.broadcast_to(np.asarray(part), signals.shape[1:]) for part in unit], axis=-1)
+        body = np.stack([np.broadcast_to(np.asarray(part), shape) for part in unit], axis=-1)
         world = np.einsum("rlij,rlj->rli", rotation, body)
         parts.append(signals[..., None] * world[None])
     return np.concatenate(parts)
@@ -155,8 +151,10 @@ def fit_residual(side: Side, held: Side, names: Sequence[str]) -> Residual | Non
     vector = side.vector.copy()
     vector[list(side.acting)] -= given
     vector = side.problem.clipped(vector)
-    deviation = _main_spread(members[:, blocks.num_given :])
-    network = network_with(network, mean, deviation)
+    outputs, deviations = (
+        _rows(one.reshape(XYZ, HIDDEN + 1)) for one in (mean, _main_spread(members[:, blocks.num_given :]))
+    )
+    network = replace(network, outputs=outputs, deviations=deviations)
     held_white = whitened(held.problem, _features(held, network), side.name)
     gain, expected = held_out(side, held, np.tensordot(mean, held_white, axes=1), vector)
     if gain <= 0.0:
@@ -193,12 +191,6 @@ def _rows(values: np.ndarray) -> tuple[tuple[float, ...], ...]:
     return tuple(tuple(row) for row in values.tolist())
 
 
-def network_with(network: Network, mean: np.ndarray, deviation: np.ndarray) -> Network:
-    """Return a network with outputs, (3 * units,) each."""
-    shape = (XYZ, HIDDEN + 1)
-    return replace(network, outputs=_rows(mean.reshape(shape)), deviations=_rows(deviation.reshape(shape)))
-
-
 def direct_residuals(held: Side, vector: np.ndarray, network: Network) -> tuple[np.ndarray, np.ndarray]:
     """Return what a row measures beyond the model and the network's mean, body frame, and where it counts.
 
@@ -208,7 +200,7 @@ def direct_residuals(held: Side, vector: np.ndarray, network: Network) -> tuple[
     problem = held.problem
     left, counts = problem.residuals(vector[None])[0][..., axes, :], problem.counts[..., axes, :]
     has_direct = bool(counts[..., 0].any())
-    step_s = np.concatenate([problem.lanes.record.step_s[:1], problem.lanes.record.step_s[:-1]])
+    step_s = step_to(problem.lanes)
     world = left[..., 0] if has_direct else left[..., 1] / np.maximum(step_s, 1e-6)[..., None]
     body = np.einsum("rlji,rlj->rli", held.flight.body_to_world, world)
     mean = network.at(held.moment, 0.0)

@@ -8,6 +8,7 @@ import numpy as np
 
 from flytrack_env.dynamics import ModelParameters
 from flytrack_sysid.diagnosis.beyond import Learned
+from flytrack_sysid.diagnosis.lanes import AXES
 
 SCHEMA = 1
 TO_LOG = "log "  # what comes instead of a manoeuvre where a channel is missing
@@ -18,6 +19,13 @@ CHANNELS: tuple[tuple[str | None, str], ...] = (
     ("force", "velocity"),
     (None, "battery"),
 )
+# By channel, of ``Problem.residuals``: the axes, and 0 for the direct channel, 1 for the level.
+PLACES = {
+    name: (axes, number)
+    for axes, names in zip(AXES, CHANNELS, strict=True)
+    for number, name in enumerate(names)
+    if name is not None
+}
 
 
 @dataclass(frozen=True)

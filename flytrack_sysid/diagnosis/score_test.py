@@ -6,7 +6,7 @@ blocks of a second. Gains are divided by how much more the scores of blocks vary
 """
 
 import copy
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -181,10 +181,8 @@ class Linearization:
         self._sum_scores()
 
     def _sum_scores(self) -> None:
-        pull = np.zeros(len(self.prior))
-        pull[: len(self.places)] = (
-            (self.prior[: len(self.places)]) * (self.vector - self.problem.start)[self.places]
-        )
+        away = (self.vector - self.problem.start)[self.places]
+        pull = self.prior * np.append(away, np.zeros(len(self.probes)))
         self.score = self.score_by_block.sum(axis=0) - pull
         self.cost = costs_of(self.problem, self.vector[None], self.white[None])[0]
 
@@ -250,24 +248,13 @@ class Linearization:
 
     def step(self, columns: Sequence[int]) -> np.ndarray:
         """Return the step along columns that explains most, nothing else moving."""
-        columns = list(columns)
         return solve(self.total[np.ix_(columns, columns)], self.score[columns])
 
     def step_inside(self) -> np.ndarray:
         """Return the step along all places that explains most within bounds; those stuck there stay."""
-        problem, places = self.problem, np.array(self.places)
-        low, high, now = problem.low[places], problem.high[places], self.vector[places]
-        room = AT_BOUND * np.maximum(np.abs(now), 1.0)
-        free, step = np.ones(len(places), bool), np.zeros(len(places))
-        while free.any():
-            step[:] = 0.0
-            step[free] = self.step(np.flatnonzero(free).tolist())
-            stuck = free & (((now <= low + room) & (step < 0.0)) | ((now >= high - room) & (step > 0.0)))
-            if not stuck.any():
-                break
-            free &= ~stuck
-            step[stuck] = 0.0
-        return step
+        return step_inside(
+            self.problem, self.vector, self.places, lambda free: self.step(np.flatnonzero(free).tolist())
+        )
 
     def projected(self, columns: Sequence[int], given: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
         """Return information about columns with given ones projected out, and the shares of these in them."""
@@ -284,17 +271,21 @@ class Linearization:
         added = self._own(every, given)
         if not added:
             return None
-        inner = self.total[np.ix_(given, given)]
+        found = self.freed(added, given)
+        whole = np.zeros(len(every))
+        whole[[every.index(column) for column in added]] = found.step
+        return found._replace(step=whole)
+
+    def freed(self, added: list[int], given: list[int]) -> Gain:
+        """Return what freeing ``added`` columns besides ``given`` ones gains; none may replace another."""
         own, share = self.projected(added, given)
         score = self.score[added] - share.T @ self.score[given]
         step = solve(own, score)
-        both = np.concatenate([solve(inner, self.score[given]) - share @ step, step])
-        columns = given + added
+        alone = solve(self.total[np.ix_(given, given)], self.score[given])
+        both, columns = np.concatenate([alone - share @ step, step]), given + added
         blocks = self.score_by_block[:, columns] - self.by_block[:, columns][:, :, columns] @ both
         blocks = blocks[:, len(given) :] - blocks[:, : len(given)] @ share
-        whole = np.zeros(len(every))
-        whole[[every.index(column) for column in added]] = step
-        return Gain(float(score @ step), inflation_of(own, blocks), whole, both[: len(given)], own)
+        return Gain(float(score @ step), inflation_of(own, blocks), step, both[: len(given)], own)
 
     def gain_of(self, candidate: Candidate, given: Sequence[int]) -> Gain | None:
         """Return the gain of a candidate; None where others do the same, or no probe lies the right way.
@@ -326,6 +317,31 @@ class Linearization:
             if own > least:
                 kept.append(column)
         return kept
+
+
+def step_inside(
+    problem: Problem,
+    vector: np.ndarray,
+    places: Sequence[int] | np.ndarray,
+    step_along: Callable[[np.ndarray], np.ndarray],
+) -> np.ndarray:
+    """Return the step from a vector along places that stays within bounds; those stuck there do not move.
+
+    step_along: the best step along those that are free, (num_places,) bool.
+    """
+    places = np.array(places)
+    low, high, now = problem.low[places], problem.high[places], vector[places]
+    room = AT_BOUND * np.maximum(np.abs(now), 1.0)
+    free, step = np.ones(len(places), bool), np.zeros(len(places))
+    while free.any():
+        step[:] = 0.0
+        step[free] = step_along(free)
+        stuck = free & (((now <= low + room) & (step < 0.0)) | ((now >= high - room) & (step > 0.0)))
+        if not stuck.any():
+            break
+        free &= ~stuck
+        step[stuck] = 0.0
+    return step
 
 
 def inflation_of(information: np.ndarray, scores: np.ndarray) -> float:

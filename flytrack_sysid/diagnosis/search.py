@@ -89,12 +89,16 @@ class SearchState:
 
     @classmethod
     def start(cls, log: FlightLog, problem: Problem) -> "SearchState":
-        """Return the state before anything was searched for. problem: of rows of the log, with a noise."""
+        """Return the state before anything was searched for, with a first guess of the noise.
+
+        problem: of rows of the log.
+        """
+        noise = noises.first_guess(problem.lanes, problem.residuals(problem.start[None])[0])
         channels = {*log.channels, *problem.lanes.measured}
         lacking = tuple(effect.name for effect in SEARCHED if not set(effect.needs) <= channels)
         # The replay's voltage is then assumed at every row; what falls within a step would pass for thrust.
         held = () if voltages_of(problem.lanes) else (Held(DRAIN, ""),)
-        return cls(problem, unobservable=lacking, held=held)
+        return cls(problem.with_noise(noise), unobservable=lacking, held=held)
 
     @property
     def base_places(self) -> list[int]:
@@ -268,12 +272,12 @@ def add_effects(state: SearchState, model: FittedModel) -> tuple[SearchState, Fi
     return state, model
 
 
-def saturated_residuals(problem: Problem, linearization: Linearization) -> np.ndarray:
+def saturated_residuals(linearization: Linearization) -> np.ndarray:
     """Return what a model leaves with every effect at once, one step away, regularised by the prior.
 
     Noise is fitted to this, so that a missing effect is not mistaken for noise.
     """
-    places = linearization.places
+    problem, places = linearization.problem, linearization.places
     tried = np.repeat(linearization.vector[None], len(SATURATED_SHARES), axis=0)
     tried[:, places] += SATURATED_SHARES[:, None] * linearization.step(range(len(places)))
     tried = problem.clipped(tried)
@@ -289,7 +293,7 @@ def search(state: SearchState) -> tuple[SearchState, FittedModel, FittedModel]:
     lanes = state.problem.lanes
     base = state.fitted((), state.problem.start)
     state, linearization = state.linearized(base.vector)
-    state = state.with_noise(noises.fit_noise(lanes, saturated_residuals(state.problem, linearization)))
+    state = state.with_noise(noises.fit_noise(lanes, saturated_residuals(linearization)))
     state, linearization = state.linearized(base.vector)
     base = model = state.fitted((), base.vector, linearization)
     while True:
@@ -297,8 +301,8 @@ def search(state: SearchState) -> tuple[SearchState, FittedModel, FittedModel]:
         if more is model:
             return state, base, model
         state, linearization = state.linearized(more.vector)
-        left = saturated_residuals(state.problem, linearization)
-        state = state.with_noise(noises.fit_noise(lanes, left, state.problem.noise))
+        noise = noises.fit_noise(lanes, saturated_residuals(linearization), state.problem.noise)
+        state = state.with_noise(noise)
         state, linearization = state.linearized(more.vector)
         model = state.fitted(more.candidates, more.vector, linearization)
         base = state.fitted((), base.vector)

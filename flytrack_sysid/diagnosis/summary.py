@@ -1,14 +1,17 @@
 """From a selected model to a diagnosis: causes with intervals, limits, errors on held-out rows, warnings."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
+from scipy import stats
 
 from flytrack_env.dynamics import ModelParameters, collective_thrust
-from flytrack_env.effects import BY_NAME, effect_of
+from flytrack_env.effects import BY_NAME, MocapLatency, effect_of
+from flytrack_sysid.diagnosis import vetoes
 from flytrack_sysid.diagnosis.identifiability import advise, unit_of, unseen_effects
-from flytrack_sysid.diagnosis.lanes import AXES, voltages_of
+from flytrack_sysid.diagnosis.lanes import Lanes, voltages_of
+from flytrack_sysid.diagnosis.lateness import latency_of
 from flytrack_sysid.diagnosis.model_selection import (
     BaseChange,
     Marginal,
@@ -16,35 +19,31 @@ from flytrack_sysid.diagnosis.model_selection import (
     equivalents,
     separation,
 )
-from flytrack_sysid.diagnosis.problem import Problem
+from flytrack_sysid.diagnosis.motion_choice import STANDARD_ERRORS, Moves
+from flytrack_sysid.diagnosis.noise import OUTLIER
+from flytrack_sysid.diagnosis.problem import Problem, robust_square, vector_of
 from flytrack_sysid.diagnosis.refinement import Refined, at_bounds, errors_at, table_of
 from flytrack_sysid.diagnosis.result import (
     CAUSES_FOUND,
     CHANNELS,
     CONSISTENT,
+    PLACES,
     TO_LOG,
     UNEXPLAINED,
     Cause,
     Changed,
+    Diagnosis,
     Errors,
     Estimated,
     HalfResponse,
     NotIdentifiable,
+    Outliers,
     Prediction,
     Unexplained,
 )
 from flytrack_sysid.diagnosis.score_test import BASE_CAUSES, Linearization, solve, threshold
 from flytrack_sysid.diagnosis.search import FittedModel, SearchState
-from flytrack_sysid.diagnosis.vetoes import (
-    Selection,
-    Veto,
-    held_out_gain,
-    is_base_remainder,
-    is_contradicted,
-    is_force_law,
-    not_seen_at_rest,
-)
-from flytrack_sysid.parameters import DRAIN, MAX_RATES, STICKS, THRUST_COEFFS, as_float32, from_vector
+from flytrack_sysid.parameters import DRAIN, MAX_RATES, STICKS, TAUS, THRUST_COEFFS, as_float32, from_vector
 from flytrack_sysid.parameters import unit_of as unit_of_parameter
 from flytrack_sysid.prediction_windows import HORIZONS_S, QUANTITIES
 from flytrack_sysid.record import BATTERY_UNKNOWN_V
@@ -55,12 +54,24 @@ LOOSE = 0.5  # of the prior's width: a parameter that the log knows no better is
 SCALE_TWINS = ("thrust_curve",)  # mass, payload, battery and motors all scale the thrust over the mass
 SLOPE_STEP = 1e-3  # of a parameter's scale, for slopes of times to half response
 STILL = (*MAX_RATES, DRAIN, *THRUST_COEFFS)  # a model where these are 0 does not move
+# What makes a cause matter.
+LEAST_COST = 0.02  # of the error of free flight, held out
+NOTABLE_LAG_S = 0.005  # as of the effects that delay
+NOTABLE_THRUST = 0.02  # of the weight, as of a scale of thrust
+NOTABLE_DRAIN = 0.2  # V/min: a tenth of a battery in a minute
+# Of outliers.
+LONGEST_RUN = 3  # rows: the filter that whitens takes in part of an outlier and gives it back
+OUTLIERS_BY_CHANCE = 1e-6  # of so many, were the noise normal
+LEAST_OUTLIERS = 1e-3  # of rows: fewer change nothing
+LATENCY = BY_NAME["mocap_latency"]
+LATENCIES = LATENCY.ranges["latency_s"]
 
 
 def estimates(
-    problem: Problem, linearization: Linearization, model: FittedModel, fields: Sequence[str]
+    linearization: Linearization, model: FittedModel, fields: Sequence[str]
 ) -> dict[str, Estimated]:
     """Return values and 95 % intervals of parameters that the log determines, by name without the effect."""
+    problem = linearization.problem
     halves = Marginal(linearization, model, fields).half_widths()
     result, least = {}, halves.min()  # at least one parameter of each effect is listed
     for field, half in zip(fields, halves, strict=True):
@@ -108,10 +119,7 @@ def half_responses_of(
     """
     problem, fit = refined.problem, refined.fit
     places = list(model.places if fit is None else fit.places)
-    step = SLOPE_STEP * problem.scale[places]
-    step = np.where(vectors["extended"][places] + step > problem.high[places], -step, step)
-    moved = np.repeat(vectors["extended"][None], len(places), axis=0)
-    moved[np.arange(len(places)), places] += step
+    moved, step = problem.nudged(vectors["extended"], places, SLOPE_STEP)
     found = half_responses(np.stack([*vectors.values(), *moved]), problem.like, SMALL_STEP)
     full = half_responses(np.stack(list(vectors.values())), problem.like, FULL_STEP)
     own = found[list(vectors).index("extended")]
@@ -136,16 +144,11 @@ def channel_of(problem: Problem, less: np.ndarray, full: np.ndarray) -> str:
     """Return the channel in which two models differ most, in multiples of the noise."""
     white = problem.whitened_residuals(less, full)
     by_axis = np.square(white[1] - white[0]).sum(axis=(0, 1))
-    power = {
-        name: float(by_axis[axes, channel].sum())
-        for axes, names in zip(AXES, CHANNELS, strict=True)
-        for channel, name in enumerate(names)
-        if name is not None
-    }
+    power = {name: float(by_axis[place].sum()) for name, place in PLACES.items()}
     return max(power, key=lambda name: power[name])
 
 
-def effect_causes(selection: Selection, test: Problem, linearization: Linearization) -> list[Cause]:
+def effect_causes(selection: vetoes.Selection, test: Problem, linearization: Linearization) -> list[Cause]:
     """Return the effects of a model as causes, those that explain most first.
 
     A force may as well be one of the laws of velocity or attitude where the log lacks these.
@@ -155,7 +158,7 @@ def effect_causes(selection: Selection, test: Problem, linearization: Linearizat
     for one in model.candidates:
         ablation = selection.ablations[one.effect]
         less = ablation.without.vector
-        own = separation(problem, linearization, model, one.effect)
+        own = separation(linearization, model, one.effect)
         # Refitted where that was worth it, else to first order.
         rivals = {name: min(ablation.rivals.get(name, size), size) for name, size in own.beside.items()}
         closest = min(rivals, key=lambda name: rivals[name], default="")
@@ -165,16 +168,16 @@ def effect_causes(selection: Selection, test: Problem, linearization: Linearizat
             alike += tuple(
                 name
                 for name in selection.state.unobservable
-                if is_force_law(name) and not {"v", "q"}.isdisjoint(BY_NAME[name].needs)
+                if vetoes.is_force_law(name) and not {"v", "q"}.isdisjoint(BY_NAME[name].needs)
             )
         causes.append(
             Cause(
                 effect=one.effect,
                 equivalent=alike,
                 channel=channel,
-                parameters=estimates(problem, linearization, model, one.fields),
+                parameters=estimates(linearization, model, one.fields),
                 chi2_gain=ablation.gain,
-                heldout_gain=held_out_gain(test, less, model.vector)[0],
+                heldout_gain=vetoes.held_out_gain(test, less, model.vector)[0],
                 lambda_=own.noncentrality,
                 lambda_sep=max(rivals.get(closest, own.noncentrality), 0.0),
                 closest=closest,
@@ -186,11 +189,13 @@ def effect_causes(selection: Selection, test: Problem, linearization: Linearizat
 
 
 def _is_remainder(cause: Cause, others: Sequence[Cause]) -> bool:
-    return is_base_remainder(cause.chi2_gain, cause.channel, [(one.channel, one.chi2_gain) for one in others])
+    return vetoes.is_base_remainder(
+        cause.chi2_gain, cause.channel, [(one.channel, one.chi2_gain) for one in others]
+    )
 
 
 def base_causes(
-    selection: Selection, test: Problem, linearization: Linearization, effects: Sequence[Cause]
+    selection: vetoes.Selection, test: Problem, linearization: Linearization, effects: Sequence[Cause]
 ) -> tuple[list[Cause], list[str]]:
     """Return base changes that the log shows, as causes, and names that held-out rows contradict.
 
@@ -202,40 +207,36 @@ def base_causes(
     for name, change in base_changes(selection.state, linearization, model).items():
         if name in selection.stand_ins:
             continue
-        places = problem.index(change.fields)
-        less = model.vector.copy()
-        less[places] = problem.start[places]
-        channel = channel_of(problem, less, model.vector)
-        refitted = _refitted_to_first_order(problem, linearization, model, places)
-        gain, expected = held_out_gain(test, refitted, model.vector)
-        if is_contradicted(gain, expected, change.marginal.inflation):
+        channel = channel_of(problem, problem.at_start(model.vector, change.fields), model.vector)
+        refitted = _refitted_to_first_order(linearization, model, change.fields)
+        gain, expected = vetoes.held_out_gain(test, refitted, model.vector)
+        if vetoes.is_contradicted(gain, expected, change.marginal.inflation):
             contradicted.append(name)
             continue
-        parameters = estimates(problem, linearization, model, change.fields)
+        parameters = estimates(linearization, model, change.fields)
         cause = Cause(name, (), channel, parameters, change.gain, gain, change.gain, change.gain)
         if not _is_remainder(cause, effects):
             causes.append(_as_thrust_scale(cause, change, problem, model))
     return sorted(causes, key=lambda cause: -cause.chi2_gain), contradicted
 
 
-def vector_without(cause: Cause, selection: Selection, linearization: Linearization) -> np.ndarray:
+def vector_without(cause: Cause, selection: vetoes.Selection, linearization: Linearization) -> np.ndarray:
     """Return the extended model without one of its causes, the rest fitted again."""
     if cause.effect in selection.ablations:
         return selection.ablations[cause.effect].without.vector
     name = "thrust_curve" if cause.effect == "thrust_scale" else cause.effect
-    places = selection.state.problem.index(BASE_CAUSES[name])
-    return _refitted_to_first_order(selection.state.problem, linearization, selection.model, places)
+    return _refitted_to_first_order(linearization, selection.model, BASE_CAUSES[name])
 
 
 def _refitted_to_first_order(
-    problem: Problem, linearization: Linearization, model: FittedModel, places: Sequence[int]
+    linearization: Linearization, model: FittedModel, fields: Sequence[str]
 ) -> np.ndarray:
     """Return the vector with some parameters at nominal and the rest fitted again, to first order."""
+    problem = linearization.problem
+    places, less = problem.index(fields), problem.at_start(model.vector, fields)
     others = [place for place in model.places if place not in set(places)]
     columns, own = linearization.columns_at(others), linearization.columns_at(places)
-    less = model.vector.copy()
-    less[list(places)] = problem.start[list(places)]
-    change = less[list(places)] - model.vector[list(places)]
+    change = less[places] - model.vector[places]
     score = linearization.score[columns] - linearization.total[np.ix_(columns, own)] @ change
     less[others] += solve(linearization.total[np.ix_(columns, columns)], score)
     return problem.clipped(less)
@@ -270,15 +271,15 @@ def not_identifiable(
         if cause.effect in BY_NAME and cause.equivalent and cause.effect != "thrust_scale":
             twins[cause.effect] = (*twins.get(cause.effect, ()), *cause.equivalent)
             twins |= {name: (*twins.get(name, ()), cause.effect) for name in cause.equivalent}
-    wanted = {name: limit.look_alikes for name, limit in limits.items()} | twins
+    wanted = {name: limit.confused_with for name, limit in limits.items()} | twins
     flights = {name: TO_LOG + " and ".join(BY_NAME[name].needs) for name in state.unobservable}
     asked = {name: alike for name, alike in wanted.items() if name not in state.unobservable}
     flights |= advise(state.problem, model, linearization, asked)
     result = []
     for name, alike in wanted.items():
         # A twin of what was found has no size of its own.
-        smallest, unit = limits[name][:2] if name in limits else (float("inf"), unit_of(name))
-        result.append(NotIdentifiable(name, smallest, unit, tuple(alike), flights[name]))
+        twin = NotIdentifiable(name, float("inf"), unit_of(name), (), "")
+        result.append(replace(limits.get(name, twin), confused_with=tuple(alike), fly=flights[name]))
     return tuple(result)
 
 
@@ -300,12 +301,7 @@ def model_of(problem: Problem, model: FittedModel) -> ModelParameters:
 
 def _by_channel(values: np.ndarray, problem: Problem) -> dict[str, np.ndarray]:
     """Return values (NUM_AXES, 2) by channel that is judged; (axes of it,) each."""
-    return {
-        name: values[axes, channel]
-        for axes, names in zip(AXES, CHANNELS, strict=True)
-        for channel, name in enumerate(names)
-        if name is not None and problem.counts[..., axes, channel].any()
-    }
+    return {name: values[place] for name, place in PLACES.items() if problem.counts[..., *place].any()}
 
 
 def sensor_noise(problem: Problem) -> dict[str, list[float]]:
@@ -389,7 +385,7 @@ def _is_beyond(problem: Problem, vector: np.ndarray, field: str) -> str:
     return f"{field.split('.')[-1]} at {'most' if is_low else 'least'} {size}"
 
 
-def causes_at_end(selection: Selection, refined: Refined, test: Problem) -> tuple[Cause, ...]:
+def causes_at_end(selection: vetoes.Selection, refined: Refined, test: Problem) -> tuple[Cause, ...]:
     """Return effects with a value at the end of what is searched, as causes that say which way it would go.
 
     Left out are values that the log does not determine, which end anywhere, and delays that end at how many
@@ -535,7 +531,7 @@ def warnings_of(problem: Problem, causes: Sequence[Cause], contradicted: Sequenc
     ]
 
 
-def stand_in_notes(selection: Selection, vector: np.ndarray) -> list[str]:
+def stand_in_notes(selection: vetoes.Selection, vector: np.ndarray) -> list[str]:
     """Return base changes that are not named since something unknown may be their cause.
 
     vector: of the extended model. In hover, a constant push passes for thrust.
@@ -564,9 +560,9 @@ def given_learned_notes(problem: Problem, rest: Unexplained) -> list[str]:
     ]
 
 
-def unseen_at_rest_notes(rejected: Mapping[str, Veto]) -> list[str]:
+def unseen_at_rest_notes(rejected: Mapping[str, vetoes.Veto]) -> list[str]:
     """Return laws of the sticks that were rejected for what they do while those rest."""
-    names = ", ".join(name for name, veto in rejected.items() if veto is not_seen_at_rest)
+    names = ", ".join(name for name, veto in rejected.items() if veto is vetoes.not_seen_at_rest)
     if not names:
         return []
     return [
@@ -599,3 +595,155 @@ def with_lost_causes(rest: Unexplained, contradicted: Sequence[str]) -> Unexplai
     if not contradicted or "time" in rest.depends_on:
         return rest
     return replace(rest, flagged=True, depends_on=(*rest.depends_on, "time"))
+
+
+def split_by_size(
+    causes: Sequence[Cause],
+    problem: Problem,
+    vector: np.ndarray,
+    flight_error: Callable[[np.ndarray], Mapping[str, float]],
+    without: Callable[[Cause], np.ndarray],
+) -> tuple[tuple[Cause, ...], tuple[Cause, ...]]:
+    """Return the causes that matter, and those that are negligible: significant, but too small for a name.
+
+    A cause matters where a parameter departs from what the nominal model has by a notable size (an effect's
+    ``notable``; for the base, the sizes here), or where flight without it, all else refitted, ends at least
+    2 % farther off on held-out rows.
+
+    vector: the extended model. flight_error: of a vector, by horizon, on held-out rows; empty where the log
+    cannot show it. without: the vector that is refitted without a cause.
+    """
+    small = [cause for cause in causes if not is_notable(cause.effect, problem, vector)]
+    full = flight_error(vector) if small else {}
+    negligible = []
+    for cause in small:
+        less = flight_error(without(cause))
+        if all(less[horizon] < (1.0 + LEAST_COST) * full[horizon] for horizon in full):
+            negligible.append(cause)
+    return tuple(cause for cause in causes if cause not in negligible), tuple(negligible)
+
+
+def is_notable(name: str, problem: Problem, vector: np.ndarray) -> bool:
+    """Return whether a cause departs from the nominal model by a size that matters."""
+    if name == "thrust_scale" and "thrust_scale.factor" in problem.names:
+        change = _change(problem, vector, ["thrust_scale.factor"])[0]
+        if abs(change) >= BY_NAME[name].notable["factor"]:
+            return True
+        name = "thrust_curve"  # found as one factor between two curves
+    if name in BASE_CAUSES:
+        return _is_base_notable(BASE_CAUSES[name], problem, vector)
+    notable = BY_NAME[name].notable
+    changes = _change(problem, vector, [f"{name}.{field}" for field in notable])
+    return bool(np.any(np.abs(changes) >= list(notable.values())))
+
+
+def _change(problem: Problem, vector: np.ndarray, fields: Sequence[str]) -> np.ndarray:
+    places = problem.index(fields)
+    return vector[places] - problem.start[places]
+
+
+def _is_base_notable(fields: Sequence[str], problem: Problem, vector: np.ndarray) -> bool:
+    if fields == THRUST_COEFFS:
+        stick, volt = problem.lanes.record.command[..., 3], problem.lanes.record.battery_v
+        more = collective_thrust(stick, volt, _change(problem, vector, fields))
+        weight = float(problem.like.m) * float(problem.like.g)
+        return bool(np.sqrt(np.mean(np.square(more))) >= NOTABLE_THRUST * weight)
+    sizes = {**dict.fromkeys(TAUS, NOTABLE_LAG_S), DRAIN: NOTABLE_DRAIN}
+    changes = _change(problem, vector, fields)
+    return bool(np.any(np.abs(changes) >= [sizes[field] for field in fields]))
+
+
+def outliers_of(problems: Sequence[Problem], vector: np.ndarray) -> dict[str, Outliers]:
+    """Return the outliers of a model's residuals by channel, of those that have some.
+
+    Rows far beyond the noise, by themselves, and more than chance brings about. They count by their size
+    instead of its square (``problem.robust_weight``), so that a few do no harm; a reader has to know of them
+    all the same. Errors of a model last, so only runs of a few rows count.
+
+    problems: with a noise; their rows are counted together.
+    """
+    parts = [(problem.whitened_residuals(vector)[0], problem.counts) for problem in problems]
+    found = {}
+    for name, (axes, side) in PLACES.items():
+        number = sum(int(counts[:, :, axes, side].any(axis=-1).sum()) for _, counts in parts)
+        far = [np.abs(white[:, :, axes, side]).max(axis=-1) > OUTLIER for white, _ in parts]
+        alone = sum(_short_runs(each) for each in far)
+        by_chance = number * (axes.stop - axes.start) * 2.0 * stats.norm.sf(OUTLIER)
+        if alone > LEAST_OUTLIERS * number and stats.poisson.sf(alone - 1, by_chance) < OUTLIERS_BY_CHANCE:
+            found[name] = Outliers(alone, number)
+    return found
+
+
+def _short_runs(is_far: np.ndarray) -> int:
+    """Return how many rows, (rows, lanes) bool, lie in runs of at most ``LONGEST_RUN``."""
+    edges = np.diff(np.pad(is_far, ((1, 1), (0, 0))).astype(int), axis=0)
+    starts, ends = (np.argwhere(sign == edges.T)[:, 1] for sign in (1, -1))
+    lengths = ends - starts
+    return int(lengths[lengths <= LONGEST_RUN].sum())
+
+
+def outlier_notes(outliers: Mapping[str, Outliers]) -> list[str]:
+    """Return a sentence on the outliers; none where there are none."""
+    if not outliers:
+        return []
+    listed = ", ".join(f"{one.rows} of {one.of} rows of {name}" for name, one in outliers.items())
+    return [f"outliers, beyond {OUTLIER:g} times the noise, count less: {listed}"]
+
+
+def gain_in_time(problem: Problem, as_logged: Lanes, vector: np.ndarray) -> float:
+    """Return what poses in time gain over logged ones, of minus twice the log likelihood, not refitted."""
+    noise, counts = problem.noise, problem.counts & as_logged.counts
+
+    assert noise is not None, "with_noise comes first"
+
+    def cost(one: Problem) -> float:
+        judged = replace(one, lanes=one.lanes._replace(counts=counts)).with_noise(noise)
+        return robust_square(judged.whitened_residuals(vector)[0])
+
+    return cost(replace(problem, lanes=as_logged, late=None)) - cost(problem)
+
+
+def with_late_poses(
+    found: Diagnosis,
+    moves: Moves,
+    given: ModelParameters,
+    problems: Sequence[Problem],
+    logged: Sequence[Lanes],
+) -> Diagnosis:
+    """Return a diagnosis of corrected poses with how late they were, as a cause where it matters.
+
+    given: the nominal model. problems: learnt from and judged by; logged: the lanes of each as logged.
+    """
+    before_s, late_s, sigma_s = latency_of(given), min(moves.late_s, LATENCIES.high), moves.sigma_s
+    if not late_s and not before_s:
+        return found
+    base = found.base.with_effects(MocapLatency(np.float32(before_s)))
+    extended = found.extended.with_effects(MocapLatency(np.float32(late_s)))
+    found = replace(found, base=base, extended=extended)
+    name, unit = "mocap_latency.latency_s", LATENCIES.unit
+    latency = Estimated.around(late_s, TWO_SIDED_95 * sigma_s, unit, LATENCIES.low)
+    if abs(late_s - before_s) <= STANDARD_ERRORS * sigma_s:
+        return found
+    gains = [gain_in_time(*pair, vector_of(extended)) for pair in zip(problems, logged, strict=True)]
+    size = float((late_s - before_s) / max(sigma_s, 1e-6)) ** 2
+    cause = Cause(
+        effect=LATENCY.name,
+        equivalent=(),
+        channel="attitude",
+        parameters={"latency_s": latency},
+        chi2_gain=gains[0],
+        heldout_gain=gains[1],
+        lambda_=size,
+        lambda_sep=size,
+        beyond=f"latency_s at least {late_s:.3g} s" if moves.late_s > LATENCIES.high else "",
+    )
+    changed = Changed(name, before_s, late_s, latency.ci95, unit, bool(cause.beyond))
+    found = replace(found, changed=(*found.changed, changed))
+    if abs(late_s - before_s) < LATENCY.notable["latency_s"]:
+        return replace(found, negligible=(cause, *found.negligible))
+    if cause.beyond:
+        rest = replace(found.unexplained, flagged=True)
+        found = replace(found, beyond=(cause, *found.beyond), unexplained=rest)
+    else:
+        found = replace(found, causes=(cause, *found.causes))
+    return replace(found, verdict=verdict_of(found.causes, found.unexplained))

@@ -23,22 +23,15 @@ from scipy.spatial.transform import Rotation
 
 from flytrack_env.dynamics import ModelParameters, lag
 from flytrack_env.state import Action
-from flytrack_sysid.diagnosis.lanes import AXES, Lanes, lead_in_of, make_lanes
+from flytrack_sysid.diagnosis.lanes import Lanes, lanes_of, lead_in_of
 from flytrack_sysid.diagnosis.lateness import latency_of, read_poses
 from flytrack_sysid.diagnosis.problem import Problem
-from flytrack_sysid.diagnosis.result import CHANNELS
+from flytrack_sysid.diagnosis.result import PLACES
 from flytrack_sysid.log import FlightLog
 from flytrack_sysid.parameters import STICKS
 from flytrack_sysid.record import Record
 
 UNITS = {"rates": "rad/s", "attitude": "rad/s", "force": "m/s²", "velocity": "m/s²", "battery": "V"}
-# Of Problem.residuals: axes, and 0 for the direct channel, 1 for the level.
-_PLACES = {
-    name: (axes, number)
-    for axes, names in zip(AXES, CHANNELS, strict=True)
-    for number, name in enumerate(names)
-    if name is not None
-}
 _PER_STEP = ("attitude", "velocity", "battery")  # changes since the row before
 _INSTEAD = {"rates": "attitude", "force": "velocity"}
 _AXES = "xyz"
@@ -134,10 +127,16 @@ def _lagged(record: Record, tau: np.ndarray) -> Action:
 
 
 class _Rows(NamedTuple):
-    """Where the log's rows are in lanes. place: of the record's rows; kept: of these, the log's rows."""
+    """Where the log's rows are in lanes, and what was fed in there.
+
+    place: of the record's rows; kept: of these, the log's rows. record: in that order. before: attitude in
+    the row before each of the log's.
+    """
 
     place: tuple[np.ndarray, np.ndarray]
     kept: np.ndarray
+    record: Record
+    before: Rotation
 
     def along(self, values: np.ndarray) -> np.ndarray:
         """Return values (rows, lanes, ...) in the record's order, filled rows included."""
@@ -147,15 +146,19 @@ class _Rows(NamedTuple):
 def _rows_of(lanes: Lanes) -> _Rows:
     row = np.where((np.arange(len(lanes.row)) >= lead_in_of(len(lanes.row)))[:, None], lanes.row, -1)
     lane, place = np.nonzero(row.T >= 0)  # lane after lane is the record's order
-    return _Rows((place, lane), np.flatnonzero(lanes.record.source_row[place, lane] >= 0))
+    record = Record(*(leaf[place, lane] for leaf in lanes.record))
+    record = record._replace(begins=~lanes.is_joined[place, lane])
+    kept = np.flatnonzero(record.source_row >= 0)
+    before = Rotation.from_quat(np.roll(record.quat, 1, axis=0)[kept], scalar_first=True)
+    return _Rows((place, lane), kept, record, before)
 
 
-def _residuals(left: np.ndarray, rows: _Rows, record: Record, before: Rotation) -> dict[str, np.ndarray]:
+def _residuals(left: np.ndarray, rows: _Rows) -> dict[str, np.ndarray]:
     """Return the channels of one model on the log's rows; left: (rows, lanes, NUM_AXES, 2), world."""
-    along = rows.along(left)
+    along, record = rows.along(left), rows.record
     step_s = np.roll(record.step_s, 1)[:, None]
     found = {}
-    for name, (axes, number) in _PLACES.items():
+    for name, (axes, number) in PLACES.items():
         values = along[:, axes, number]
         if name == "battery":
             summed = np.cumsum(values, axis=0)
@@ -164,15 +167,15 @@ def _residuals(left: np.ndarray, rows: _Rows, record: Record, before: Rotation) 
             values = summed - summed[started]
         elif name in _PER_STEP:
             values = values / step_s
-        found[name] = values[rows.kept] if name == "battery" else before.inv().apply(values[rows.kept])
+        found[name] = values[rows.kept] if name == "battery" else rows.before.inv().apply(values[rows.kept])
     return found
 
 
-def _counts(lanes: Lanes, rows: _Rows, record: Record) -> dict[str, np.ndarray]:
+def _counts(lanes: Lanes, rows: _Rows) -> dict[str, np.ndarray]:
     """Return where channels count; changes since a row that was lost do not."""
-    along = rows.along(lanes.counts)
+    along, record = rows.along(lanes.counts), rows.record
     after_measured = np.append(False, record.source_row[:-1] >= 0) & ~record.begins
-    found = {name: along[:, axes, number].all(axis=1) for name, (axes, number) in _PLACES.items()}
+    found = {name: along[:, axes, number].all(axis=1) for name, (axes, number) in PLACES.items()}
     return {
         name: np.logical_and(counts, after_measured | (name not in _PER_STEP))[rows.kept]
         for name, counts in found.items()
@@ -206,14 +209,10 @@ def _regressors(model: ModelParameters, record: Record, applied: np.ndarray) -> 
 
 
 def _predicted(
-    residuals: dict[str, np.ndarray],
-    lanes: Lanes,
-    rows: _Rows,
-    record: Record,
-    before: Rotation,
-    gravity: float,
+    residuals: dict[str, np.ndarray], lanes: Lanes, rows: _Rows, gravity: float
 ) -> dict[str, np.ndarray]:
     """Return the rates and the true specific force that a model predicts: measured minus its residual."""
+    record, before = rows.record, rows.before
     step_s = np.roll(record.step_s, 1)[rows.kept, None]
     if "w" in lanes.measured:
         rates = rows.along(lanes.measured["w"])[rows.kept] - residuals["rates"]
@@ -247,8 +246,7 @@ def traces(log: FlightLog, models: Mapping[str, ModelParameters], like: str) -> 
     log = in_time[latency_of(base)]
     with jax.enable_x64(True):
         by_lateness = {
-            late_s: make_lanes(one, np.ones(len(one), bool), np.asarray(base.tau, float), float(base.g))
-            for late_s, one in in_time.items()
+            late_s: lanes_of(one, np.ones(len(one), bool), base) for late_s, one in in_time.items()
         }
         left = []
         for model in models.values():
@@ -258,16 +256,12 @@ def traces(log: FlightLog, models: Mapping[str, ModelParameters], like: str) -> 
         lagged = _lagged(lanes.record, np.asarray(base.tau, float))
         applied = np.stack([np.asarray(stick) for stick in lagged], axis=-1)
     rows = _rows_of(lanes)
-    record = Record(*(rows.along(leaf) for leaf in lanes.record))
-    begins = ~rows.along(lanes.is_joined)
-    record = record._replace(begins=begins)
-    before = Rotation.from_quat(np.roll(record.quat, 1, axis=0)[rows.kept], scalar_first=True)
-    residuals = {name: _residuals(one, rows, record, before) for name, one in zip(models, left, strict=True)}
-    found = _regressors(base, record, rows.along(applied))
+    residuals = {name: _residuals(one, rows) for name, one in zip(models, left, strict=True)}
+    found = _regressors(base, rows.record, rows.along(applied))
     since = log.time - log.time[log.is_start()][np.cumsum(log.is_start()) - 1]
-    step_s = float(np.median(record.step_s))
+    step_s = float(np.median(rows.record.step_s))
     regressors = {"time": since, **{name: values[rows.kept] for name, values in found.items()}}
-    regressors |= _predicted(residuals[like], lanes, rows, record, before, float(base.g))
-    slot = np.arange(len(begins)) + BETWEEN_FLIGHTS * np.cumsum(begins)
-    counts = _counts(lanes, rows, record)
-    return Traces(residuals, counts, regressors, step_s * rows.kept, slot[rows.kept], step_s, before)
+    regressors |= _predicted(residuals[like], lanes, rows, float(base.g))
+    slot = np.arange(len(rows.record.begins)) + BETWEEN_FLIGHTS * np.cumsum(rows.record.begins)
+    elapsed_s, counts = step_s * rows.kept, _counts(lanes, rows)
+    return Traces(residuals, counts, regressors, elapsed_s, slot[rows.kept], step_s, rows.before)

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from flytrack_env.state import ACTION_SIZE
 from flytrack_sysid.diagnosis import noise as noises
-from flytrack_sysid.diagnosis.lanes import AXES, Lanes, lead_in_of
+from flytrack_sysid.diagnosis.lanes import AXES, lead_in_of
 from flytrack_sysid.diagnosis.problem import Problem, blocks_of, robust_weight
 from flytrack_sysid.diagnosis.result import Unexplained
 from flytrack_sysid.diagnosis.score_test import inflation_of, solve
@@ -51,8 +51,9 @@ class Flown(NamedTuple):
     is_counted: np.ndarray
 
 
-def flown(lanes: Lanes, tau: np.ndarray) -> Flown:
-    """Return what was flown; tau: (4,) s, lags between commands and applied action."""
+def flight_of(problem: Problem, model: FittedModel) -> Flown:
+    """Return what was flown, with the lags of a model between commands and applied action."""
+    lanes, tau = problem.lanes, model.vector[problem.index(TAUS)]
 
     def before(values: np.ndarray) -> np.ndarray:  # a step begins at the row before
         return np.concatenate([values[:1], values[:-1]])
@@ -130,13 +131,9 @@ def dependences(flight: Flown) -> Mapping[str, Mapping[str, np.ndarray]]:
     tilt = _rank_waves(flight.body_to_world[..., 2, 2], counted, RANK_WAVES)
     fast = _rank_waves(np.linalg.norm(flight.vel_w, axis=-1), counted, RANK_WAVES)
     place = _place_waves(flight)
+    moves = ((flight.applied, RANK_WAVES), (flight.change, CHANGE_WAVES))
     sticks = [
-        np.concatenate(
-            [
-                _rank_waves(flight.applied[..., stick], counted, RANK_WAVES),
-                _rank_waves(flight.change[..., stick], counted, CHANGE_WAVES),
-            ]
-        )
+        np.concatenate([_rank_waves(values[..., stick], counted, number) for values, number in moves])
         for stick in range(ACTION_SIZE)
     ]
     rate = {
@@ -272,13 +269,6 @@ class SideTest(NamedTuple):
         fit.step[is_own], fit.errors[is_own] = step, np.sqrt(np.diag(np.linalg.pinv(own)) * inflation)
         return fit
 
-    def best_group(self, columns: np.ndarray, size: int) -> int:
-        """Return which group of so many consecutive features explains most by itself."""
-        _, own, score, _ = self.projected(columns)
-        inner = [slice(start, start + size) for start in range(0, len(score) - size + 1, size)]
-        chi2 = [score[part] @ solve(own[part, part] + np.eye(size), score[part]) for part in inner]
-        return int(np.argmax(chi2))
-
     def noncentrality(self, columns: np.ndarray, size: np.ndarray) -> float:
         """Return the squared signature of slopes at a size, fitted again beside what is given."""
         _, own, score, _ = self.projected(columns)
@@ -291,11 +281,6 @@ def whitened(problem: Problem, features_w: np.ndarray, side: str) -> np.ndarray:
     step_s = noises.step_to(problem.lanes)[..., None]
     joined = features_w * problem.lanes.is_joined[..., None]
     return problem.whiten(np.stack([joined, joined * step_s], axis=-1), SIDES[side])
-
-
-def flight_of(problem: Problem, model: FittedModel) -> Flown:
-    """Return what was flown, with the lags of a model."""
-    return flown(problem.lanes, model.vector[problem.index(TAUS)])
 
 
 def linearized_residuals(problem: Problem, model: FittedModel) -> tuple[np.ndarray, np.ndarray]:
@@ -396,11 +381,12 @@ def _greedy(
 
 
 def _best_bump(test: SideTest, places: Feature) -> Feature:
-    """Return the bump about a place that explains most."""
-    group = test.best_group(places.columns, BUMP_SIZE)
-    part = slice(group * BUMP_SIZE, (group + 1) * BUMP_SIZE)
-    tries = places.columns.shape[1] // BUMP_SIZE
-    return Feature(places.name, places.features_w[part], places.columns[:, part], tries)
+    """Return the bump about a place that explains most by itself."""
+    _, own, score, _ = test.projected(places.columns)
+    parts = [slice(start, start + BUMP_SIZE) for start in range(0, len(score), BUMP_SIZE)]
+    chi2 = [score[part] @ solve(own[part, part] + np.eye(BUMP_SIZE), score[part]) for part in parts]
+    part = parts[int(np.argmax(chi2))]
+    return Feature(places.name, places.features_w[part], places.columns[:, part], len(parts))
 
 
 class Line(NamedTuple):

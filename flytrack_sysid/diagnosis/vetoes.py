@@ -11,28 +11,13 @@ from typing import NamedTuple
 import numpy as np
 
 from flytrack_env.effects import BY_NAME
+from flytrack_sysid.diagnosis import model_selection
+from flytrack_sysid.diagnosis import unexplained as unknown
 from flytrack_sysid.diagnosis.lanes import AXES
-from flytrack_sysid.diagnosis.model_selection import (
-    Ablation,
-    base_changes,
-    explain_base_by_effect,
-    select_effects,
-    without_effect,
-)
 from flytrack_sysid.diagnosis.problem import Problem, blocks_of
 from flytrack_sysid.diagnosis.result import CHANNELS, Unexplained
 from flytrack_sysid.diagnosis.score_test import BASE_CAUSES, threshold
 from flytrack_sysid.diagnosis.search import FittedModel, SearchState
-from flytrack_sysid.diagnosis.unexplained import (
-    SIDES,
-    Dependence,
-    SideTest,
-    constants,
-    find_unexplained,
-    flight_of,
-    linearized_residuals,
-    whitened,
-)
 from flytrack_sysid.record import Record
 
 # Held-out rows contradict a cause where it gains so many standard deviations less than it would if it were
@@ -70,7 +55,7 @@ class Selection(NamedTuple):
     state: SearchState
     base: FittedModel
     model: FittedModel
-    ablations: dict[str, Ablation]
+    ablations: dict[str, model_selection.Ablation]
     unexplained: Unexplained = Unexplained()
     stand_ins: tuple[str, ...] = ()
 
@@ -80,12 +65,12 @@ Veto = Callable[[Selection, Problem], list[str]]
 
 def select(state: SearchState, base: FittedModel, model: FittedModel) -> Selection:
     """Return the model with effects swapped, removed, or put in place of base changes where that helps."""
-    state, model, ablations = select_effects(state, model)
+    state, model, ablations = model_selection.select_effects(state, model)
     while True:
-        state, simpler = explain_base_by_effect(state, model)
+        state, simpler = model_selection.explain_base_by_effect(state, model)
         if simpler is None:
             return Selection(state, base, model, ablations)
-        state, model, ablations = select_effects(state, simpler)
+        state, model, ablations = model_selection.select_effects(state, simpler)
 
 
 def reject(selection: Selection, effects: Sequence[str]) -> Selection:
@@ -95,8 +80,8 @@ def reject(selection: Selection, effects: Sequence[str]) -> Selection:
     held = tuple(one for one in state.held if one.field not in freed)
     state = replace(state, refused=(*state.refused, *effects), held=held)
     for effect in effects:
-        model = without_effect(state, model, effect)
-    state, model, ablations = select_effects(state, model)
+        model = model_selection.without_effect(state, model, effect)
+    state, model, ablations = model_selection.select_effects(state, model)
     return Selection(state, selection.base, model, ablations)
 
 
@@ -121,7 +106,7 @@ def apply_vetoes(selection: Selection, test: Problem) -> tuple[Selection, dict[s
 def examined(selection: Selection) -> Selection:
     """Return the selection with what it leaves unexplained, and the names that stand in for that."""
     problem, model = selection.state.problem, selection.model
-    rest, dependences = find_unexplained(problem, model, selection.base.vector)
+    rest, dependences = unknown.find_unexplained(problem, model, selection.base.vector)
     selection = selection._replace(unexplained=rest, stand_ins=())
     if not rest.flagged:
         return selection
@@ -130,7 +115,7 @@ def examined(selection: Selection) -> Selection:
         for one, weight in zip(model.candidates, selection.ablations.values(), strict=True)
     ]
     state, linearization = selection.state.linearized(model.vector)
-    for name, change in base_changes(state, linearization, model).items():
+    for name, change in model_selection.base_changes(state, linearization, model).items():
         robust = change.gain / change.marginal.inflation
         suspects.append(Suspect(name, tuple(change.fields), robust, len(change.fields)))
     names = find_stand_ins(problem, model, suspects, rest, dependences)
@@ -151,7 +136,7 @@ def find_stand_ins(
     model: FittedModel,
     suspects: Sequence[Suspect],
     rest: Unexplained,
-    dependences: Sequence[Dependence],
+    dependences: Sequence[unknown.Dependence],
 ) -> list[str]:
     """Return names that stand in for something that no list has.
 
@@ -159,29 +144,30 @@ def find_stand_ins(
     which a wind, say, would be), or is small where something unknown disturbs the same side; unless it
     outweighs what the dependences explain.
     """
-    left, slopes = linearized_residuals(problem, model)
-    flight = flight_of(problem, model)
+    left, slopes = unknown.linearized_residuals(problem, model)
+    flight = unknown.flight_of(problem, model)
     disturbed = {name.split(":")[0] for name in rest.shares}
 
     def noncentralities(one: Suspect, side: str) -> tuple[float, float]:
         """Return a suspect's noncentrality on a side, and what is left beside what the rest depends on."""
-        axes = SIDES[side]
+        axes = unknown.SIDES[side]
         own = [model.places.index(place) for place in problem.index(one.fields)]
         acting = slopes[own][..., axes, :]
         if not (problem.counts[..., axes, :].any() and np.abs(acting).max() > 0.0):
             return 0.0, 0.0
-        test = SideTest.of(side, left, np.delete(slopes, own, axis=0))
+        test = unknown.SideTest.of(side, left, np.delete(slopes, own, axis=0))
         columns = blocks_of(acting * test.root)
         size = (model.vector - problem.start)[problem.index(one.fields)]
         before = test.noncentrality(columns, size)
         more = [dependence.columns for dependence in dependences if dependence.side == side]
         if more:
-            more.append(blocks_of(whitened(problem, constants(flight, side), side) * test.root))
+            constants = unknown.whitened(problem, unknown.constants(flight, side), side)
+            more.append(blocks_of(constants * test.root))
         return before, test.given_also(*more).noncentrality(columns, size)
 
     result = []
     for one in suspects:
-        by_side = {side: noncentralities(one, side) for side in SIDES}
+        by_side = {side: noncentralities(one, side) for side in unknown.SIDES}
         before, after = (sum(values) for values in zip(*by_side.values(), strict=True))
         if before == 0.0:
             continue  # it acts on neither side: the battery
@@ -224,7 +210,7 @@ def is_contradicted(gain: float, expected: float, inflation: float) -> bool:
 def contradicted_on_held_out(selection: Selection, test: Problem) -> list[str]:
     """Reject effects of which held-out rows show too little: they were there for a time only, or never."""
 
-    def is_rejected(one: Ablation) -> bool:
+    def is_rejected(one: model_selection.Ablation) -> bool:
         gain, expected = held_out_gain(test, one.without.vector, selection.model.vector)
         return is_contradicted(gain, expected, one.inflation)
 
@@ -266,16 +252,12 @@ def not_seen_at_rest(selection: Selection, test: Problem) -> list[str]:
         return [name for name, is_false in zip(laws, alone, strict=True) if is_false]
     without = ablations[0].without
     for name in laws[1:]:  # a scale needs the saturation that undoes it, and the other way round
-        without = without_effect(state, without, name)
+        without = model_selection.without_effect(state, without, name)
     gain, expected = seen(without.vector)
     inflation = max(one.inflation for one in ablations)
-    is_unseen = expected < HELD_OUT_SHOWN * inflation and turns_unexplained(selection)
+    are_turns_unexplained = any(name.startswith("rate:") for name in selection.unexplained.shares)
+    is_unseen = expected < HELD_OUT_SHOWN * inflation and are_turns_unexplained
     return laws if is_unseen or is_contradicted(gain, expected, inflation) else []
-
-
-def turns_unexplained(selection: Selection) -> bool:
-    """Return whether a selection leaves something of the rotation unexplained."""
-    return any(name.startswith("rate:") for name in selection.unexplained.shares)
 
 
 def is_force_law(effect: str) -> bool:
@@ -298,7 +280,7 @@ def seen_once(selection: Selection, test: Problem) -> list[str]:
     """
     changing = {one.effect for one in selection.state.problem.windows}
 
-    def is_rejected(effect: str, one: Ablation) -> bool:
+    def is_rejected(effect: str, one: model_selection.Ablation) -> bool:
         gain, expected = held_out_gain(test, one.without.vector, selection.model.vector)
         if effect in changing:
             return gain <= 0.0

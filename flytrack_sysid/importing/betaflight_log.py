@@ -12,15 +12,14 @@ from typing import Any
 import numpy as np
 
 from flytrack_env.effects import effect_of
-from flytrack_env.files import read_at_most
-from flytrack_env.messages import error_text, quote_name, quote_value
-from flytrack_sysid.importing.betaflight_rates import RATES_TYPES, full_stick_rate, stick_curve
+from flytrack_env.messages import quote_name, quote_value
+from flytrack_sysid.importing.betaflight_settings import RATES_TYPES, full_stick_rate, stick_curve
 from flytrack_sysid.importing.decoding import decode
-from flytrack_sysid.importing.flight import ImportedFlight, not_a_quadcopter, saturation
+from flytrack_sysid.importing.flight import ImportedFlight, not_a_quadcopter, read_log_file, saturation
 from flytrack_sysid.importing.mapping import Mapping
 from flytrack_sysid.importing.units import GRAVITY, PER_DEGREE, UNITS
-from flytrack_sysid.log import CHANNELS, LogError
-from flytrack_sysid.log_table import Table, log_of_table
+from flytrack_sysid.log import LogError
+from flytrack_sysid.log_table import Table, columns_of, log_of_table
 from flytrack_sysid.resample import is_increasing
 
 FIRMWARE = "Betaflight"
@@ -92,14 +91,12 @@ def _read_log(source: str, notes: dict[str, Any], frames: np.ndarray, mapping: M
     if mapping.rules.motors_as_thrust:
         channels["u"][:, 3] = _thrust_of_motors(table, headers)
         clipped.append("thrust command: the mean of the motors")
-    found = {"t": (table.columns["time"] - table.columns["time"][0]) * MICROSECOND}
-    for name, values in channels.items():
-        found |= dict(zip(CHANNELS[name], values.T, strict=True))
+    columns = columns_of((table.columns["time"] - table.columns["time"][0]) * MICROSECOND, channels)
     said += [*clipped, *_motors(table, headers)]
     if "f" not in channels:
         said.append("no accelerometer in the log: nothing is asked of the specific force")
     said += headers.stick_curve()
-    log = log_of_table(table._replace(columns=found))
+    log = log_of_table(table._replace(columns=columns))
     return ImportedFlight(log, craft, tuple(f"{source}: {text}" for text in said))
 
 
@@ -217,12 +214,7 @@ def _thrust_of_motors(table: Table, headers: _Headers) -> np.ndarray:
 
 def _complete_logs(path: Path) -> tuple[list[int], list[LogError]]:
     """Return the numbers of the complete logs in a blackbox file, from 1, and what others lack."""
-    try:
-        content = read_at_most(path, LARGEST_BYTES)
-    except OSError as error:
-        raise LogError(f"{path}: cannot be read: {error_text(error)}") from error
-    if not content.startswith(FIRST_BYTES):
-        raise LogError(f"{path}: found {content[: len(FIRST_BYTES)]!r} first, expected {FIRST_BYTES!r}")
+    content = read_log_file(path, LARGEST_BYTES, FIRST_BYTES)
     logs = content.split(FIRST_BYTES)[1:]
     is_complete = {number: END_OF_LOG in log for number, log in enumerate(logs, start=1)}
     cut_off = [

@@ -13,6 +13,7 @@ import numpy as np
 from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
+from flytrack_sysid.importing.flight import saturation
 from flytrack_sysid.importing.units import PER_DEGREE
 from flytrack_sysid.log import LogError
 from flytrack_sysid.log_table import COMMAND_MARGIN
@@ -56,8 +57,7 @@ def commands_of(
     """
     notes: tuple[str, ...] = ()
     if "motors" in channels:
-        share = np.mean(channels["motors"].max(axis=1) >= 1.0)
-        notes += (f"{source}: a motor at its upper end in {share:.2%} of the rows",)
+        notes += (f"{source}: {saturation(channels['motors'].max(axis=1) >= 1.0)}",)
     thrust, said = _thrust(source, channels, rules)
     notes += said
     if "u" in channels:

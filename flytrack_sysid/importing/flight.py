@@ -1,10 +1,13 @@
 """One imported flight, and the craft that it is of."""
 
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from flytrack_env.dynamics import ModelParameters, nominal_parameters
+from flytrack_env.files import read_at_most
+from flytrack_env.messages import error_text
 from flytrack_sysid.log import FlightLog, LogError
 
 NOMINAL_FULL_V = 24.0  # the voltage that the nominal thrust map is stated at (``nominal_parameters``)
@@ -64,6 +67,17 @@ class ImportedFlight(NamedTuple):
     log: FlightLog
     craft: Craft = Craft()
     notes: tuple[str, ...] = ()
+
+
+def read_log_file(path: Path, most_bytes: int, first: bytes) -> bytes:
+    """Return the content of a log file; raises LogError for one that does not begin as its format does."""
+    try:
+        content = read_at_most(path, most_bytes)
+    except OSError as error:
+        raise LogError(f"{path}: cannot be read: {error_text(error)}") from error
+    if not content.startswith(first):
+        raise LogError(f"{path}: found {content[: len(first)]!r} first, expected {first!r}")
+    return content
 
 
 def not_a_quadcopter(found: str) -> str:

@@ -15,9 +15,9 @@ from flytrack_env.messages import error_text, quote_name, quote_value
 from flytrack_sysid.clocks import ClockOffset, align_clocks
 from flytrack_sysid.importing.bag_log import read_bag
 from flytrack_sysid.importing.betaflight_log import read_betaflight
-from flytrack_sysid.importing.csv_log import read_csv
 from flytrack_sysid.importing.flight import Craft, ImportedFlight
 from flytrack_sysid.importing.mapping import Manifest, Mapping, load_mapping
+from flytrack_sysid.importing.table_flight import read_csv
 from flytrack_sysid.importing.ulog_log import read_ulog
 from flytrack_sysid.importing.usd_log import read_usd
 from flytrack_sysid.log import FlightLog, LogError, usual_step

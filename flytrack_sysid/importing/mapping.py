@@ -148,10 +148,7 @@ class Fields:
 
     def numbers(self, field: str, size: int, default: Any = REQUIRED, above: float = -LARGEST_NUMBER) -> Any:
         """Return a tuple of finite numbers above a bound, or the default."""
-
-        def is_valid(value: Any) -> bool:
-            return isinstance(value, list) and len(value) == size and all(_is_number(n, above) for n in value)
-
+        is_valid = partial(_are_numbers, size=size, above=above)
         value = self.take(field, is_valid, f"{size} numbers{_bound(above)}", default)
         return value if value is default else tuple(map(float, value))
 
@@ -159,11 +156,8 @@ class Fields:
         """Return a tuple of different names, or the default."""
 
         def is_valid(value: Any) -> bool:
-            return (
-                isinstance(value, list)
-                and all(map(_is_text, value))
-                and len(set(value)) == len(value) == size
-            )
+            are_texts = isinstance(value, list) and all(map(_is_text, value))
+            return are_texts and len(set(value)) == len(value) == size
 
         return tuple(self.take(field, is_valid, f"{size} different names of columns", default))
 
@@ -179,6 +173,10 @@ def _is_text(value: Any) -> bool:
 def _is_number(value: Any, above: float) -> bool:
     is_number = isinstance(value, (int, float)) and not isinstance(value, bool)
     return is_number and above < value <= LARGEST_NUMBER  # false for NaN too
+
+
+def _are_numbers(value: Any, size: int, above: float = -LARGEST_NUMBER) -> bool:
+    return isinstance(value, list) and len(value) == size and all(_is_number(one, above) for one in value)
 
 
 def _bound(above: float) -> str:
@@ -396,12 +394,8 @@ def _thrust_command(fields: Fields) -> Channel:
     column, low, high = fields.text("column"), fields.number("low"), fields.number("high")
     if low == high:
         raise fields.error("high", f"found {high:g}, expected another value than low")
-    return Channel(
-        fields.name,
-        "thrust_command",
-        (column,),
-        lambda table: 2 * (table.matrix([column]) - low) / (high - low) - 1,
-    )
+    convert = lambda table: 2 * (table.matrix([column]) - low) / (high - low) - 1  # noqa: E731
+    return Channel(fields.name, "thrust_command", (column,), convert)
 
 
 def _motors(fields: Fields) -> tuple[tuple[Channel, ...], CommandRules]:
@@ -409,9 +403,12 @@ def _motors(fields: Fields) -> tuple[tuple[Channel, ...], CommandRules]:
     listed = fields.left.get("columns")
     num_motors = len(listed) if isinstance(listed, list) else 0
     columns = fields.names("columns", num_motors, ())
-    rows = fields.take(
-        "torque_n_m", lambda value: _is_matrix(value, NUM_AXES, num_motors), "a row an axis", None
-    )
+
+    def is_matrix(value: Any) -> bool:
+        rows = value if isinstance(value, list) else []
+        return len(rows) == NUM_AXES and all(_are_numbers(row, num_motors) for row in rows)
+
+    rows = fields.take("torque_n_m", is_matrix, "a row an axis", None)
     rules = CommandRules(
         motors_as_thrust=fields.flag("as_thrust"),
         motor_torque=None if rows is None else tuple(tuple(map(float, row)) for row in rows),
@@ -424,17 +421,6 @@ def _motors(fields: Fields) -> tuple[tuple[Channel, ...], CommandRules]:
         raise fields.error("high", f"found {high:g}, expected more than low")
     convert = lambda table: np.clip((table.matrix(columns) - low) / (high - low), 0.0, 1.0)  # noqa: E731
     return (Channel(fields.name, "motors", columns, convert),), rules
-
-
-def _is_matrix(value: Any, num_rows: int, num_columns: int) -> bool:
-    is_number = partial(_is_number, above=-LARGEST_NUMBER)
-    return (
-        isinstance(value, list)
-        and len(value) == num_rows
-        and all(
-            isinstance(row, list) and len(row) == num_columns and all(map(is_number, row)) for row in value
-        )
-    )
 
 
 def _attitude(fields: Fields) -> Channel:

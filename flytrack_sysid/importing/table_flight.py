@@ -2,6 +2,7 @@
 
 import itertools
 from collections.abc import Iterable, Sequence
+from pathlib import Path
 
 import numpy as np
 
@@ -9,8 +10,9 @@ from flytrack_env.messages import quote_name
 from flytrack_sysid.importing.commands import commands_of
 from flytrack_sysid.importing.flight import ImportedFlight
 from flytrack_sysid.importing.mapping import Channel, Mapping
-from flytrack_sysid.log import CHANNELS, LogError
-from flytrack_sysid.log_table import Table, log_of_table
+from flytrack_sysid.log import LogError
+from flytrack_sysid.log_file import open_csv, read_columns
+from flytrack_sysid.log_table import Table, columns_of, log_of_table
 from flytrack_sysid.resample import Samples, is_increasing, on_one_base, slow_channels
 
 LONGEST_LIST = 1000  # characters of a header in a message
@@ -40,6 +42,21 @@ def channels_in(source: str, headers: Sequence[Iterable[str]], mapping: Mapping)
             where = f"{source}: column {quote_name(column)}: found {times} times among {listed}"
             raise LogError(f"{where}; expected once by {mapping.source}: {channel.table}")
     return found
+
+
+def read_csv(path: Path, mapping: Mapping) -> ImportedFlight:
+    """Return the flight in a CSV file with a header, by a mapping; SI units and our frames.
+
+    Raises LogError, whose message names file, row, line and column.
+    """
+    with open_csv(path, mapping.delimiter) as rows:
+        header = [name.strip() for name in next(rows, [])]
+        channels = channels_in(str(path), [header], mapping)
+        wanted = dict.fromkeys(column for channel, _ in channels for column in channel.columns)
+        table = read_columns(path, rows, header, wanted)
+    if table.lines is None or not len(table.lines):
+        raise LogError(f"{path}: found no rows, expected at least one")
+    return flight_of_table(table, mapping)
 
 
 def flight_of_table(table: Table, mapping: Mapping) -> ImportedFlight:
@@ -93,8 +110,5 @@ def _flight(
 ) -> ImportedFlight:
     """Return the flight of converted channels."""
     commands, notes = commands_of(table.source, time, values, mapping.rules, mapping.craft.max_rate_deg_s)
-    found = {"t": time, **dict(zip(CHANNELS["u"], commands.T, strict=True))}
-    for name, columns in CHANNELS.items():
-        if name in values and name != "u":
-            found |= dict(zip(columns, values[name].T, strict=True))
-    return ImportedFlight(log_of_table(table._replace(columns=found)), mapping.craft, notes)
+    columns = columns_of(time, {**values, "u": commands})
+    return ImportedFlight(log_of_table(table._replace(columns=columns)), mapping.craft, notes)

@@ -15,8 +15,8 @@ from flytrack_sysid.importing.decoding import decode
 from flytrack_sysid.importing.flight import ImportedFlight, not_a_quadcopter
 from flytrack_sysid.importing.mapping import Mapping
 from flytrack_sysid.importing.units import PER_DEGREE, UNITS, quaternion_from, vector_from
-from flytrack_sysid.log import CHANNELS, LogError
-from flytrack_sysid.log_table import LARGEST_NORM_ERROR, Table, log_of_table
+from flytrack_sysid.log import LogError
+from flytrack_sysid.log_table import LARGEST_NORM_ERROR, Table, columns_of, log_of_table
 from flytrack_sysid.resample import Samples, is_increasing, on_one_base, slow_channels
 
 LARGEST_BYTES = 2**29  # the decoder may take time and memory in proportion
@@ -92,9 +92,8 @@ def read_ulog(path: Path, mapping: Mapping) -> ImportedFlight:
     if not is_used.any():
         found = f"{is_known.sum()} of {len(base)} samples of the rates with all other topics around them"
         raise LogError(f"{path}: found {found}, {is_flying.sum()} in flight, expected some that are both")
-    columns = {"t": base[is_used] - base[is_used][0]}
-    for name, values in channels.items():
-        columns |= dict(zip(CHANNELS[name], values[is_used].T, strict=True))
+    used_channels = {name: values[is_used] for name, values in channels.items()}
+    columns = columns_of(base[is_used] - base[is_used][0], used_channels)
     used = f"{is_used.sum()} of {len(base)} samples of the rates used, {is_flying.sum()} in flight"
     said = [used, *["damaged in places; what could be read is used"] * is_damaged, *_airframe(parameters)]
     notes = tuple(f"{path}: {text}" for text in [*said, *slow_channels(ours)])
@@ -103,12 +102,10 @@ def read_ulog(path: Path, mapping: Mapping) -> ImportedFlight:
 
 def _airframe(parameters: dict[str, float]) -> list[str]:
     """Return a note if the log's own parameters say that the craft is no quadcopter."""
-    kind = AIRFRAMES.get(int(parameters.get("MAV_TYPE", 0)))
-    if kind:
-        return [not_a_quadcopter(f"{kind} (MAV_TYPE {parameters['MAV_TYPE']:.0f})")]
-    kind = FRAMES.get(int(parameters.get("SYS_AUTOSTART", 0)) // 1000)
-    if kind:
-        return [not_a_quadcopter(f"{kind} (SYS_AUTOSTART {parameters['SYS_AUTOSTART']:.0f})")]
+    for kinds, name, every in ((AIRFRAMES, "MAV_TYPE", 1), (FRAMES, "SYS_AUTOSTART", 1000)):
+        kind = kinds.get(int(parameters.get(name, 0)) // every)
+        if kind:
+            return [not_a_quadcopter(f"{kind} ({name} {parameters[name]:.0f})")]
     num_rotors = int(parameters.get("CA_ROTOR_COUNT", 0))
     return [not_a_quadcopter(f"{num_rotors} rotors (CA_ROTOR_COUNT)")] if num_rotors not in (0, 4) else []
 

@@ -40,11 +40,8 @@ def quaternion_from(attitude: Rotation, is_body_turned: bool, is_world_turned: b
         attitude = HALF_TURN * attitude
     if is_body_turned:
         attitude = attitude * HALF_TURN
-    return _continuous(attitude.as_quat(scalar_first=True))
-
-
-def _continuous(quat: np.ndarray) -> np.ndarray:
-    """Return quaternions (num_rows, 4) with signs so that neighbours are close, the first with w >= 0."""
+    quat = attitude.as_quat(scalar_first=True)
+    # Signs so that neighbours are close, the first with w >= 0.
     flips = np.sum(quat[1:] * quat[:-1], axis=1) < 0.0
     first = quat[:1, 0] < 0.0
     signs = np.where(np.cumsum(np.concatenate([first, flips])) % 2 == 1, -1.0, 1.0)

@@ -14,16 +14,15 @@ from typing import NamedTuple
 
 import numpy as np
 
-from flytrack_env.files import read_at_most
 from flytrack_env.messages import error_text, quote_name
-from flytrack_sysid.importing.flight import ImportedFlight
+from flytrack_sysid.importing.flight import ImportedFlight, read_log_file
 from flytrack_sysid.importing.mapping import Mapping
 from flytrack_sysid.importing.table_flight import TIMESTAMP, flight_of_topics
 from flytrack_sysid.log import LogError
 from flytrack_sysid.log_table import Table
 
 LARGEST_BYTES = 2**27  # 40 min at 1 kHz with 50 bytes a record
-FIRST_BYTE = 0xBC
+FIRST_BYTE = b"\xbc"
 NUM_HEADER_BYTES, NUM_CRC_BYTES = 5, 4
 STAMPS = {1: ("<u4", 1e-3), 2: ("<u8", 1e-6)}  # of a version: type, s
 FORMATS = "bBhHiIqQefd"  # of ``struct``, one value each
@@ -41,12 +40,7 @@ def read_usd(path: Path, mapping: Mapping) -> ImportedFlight:
 
     Raises LogError for what is no such log, or lacks a variable that the mapping names.
     """
-    try:
-        content = read_at_most(path, LARGEST_BYTES)
-    except OSError as error:
-        raise LogError(f"{path}: cannot be read: {error_text(error)}") from error
-    if content[:1] != bytes([FIRST_BYTE]):
-        raise LogError(f"{path}: found {content[:1]!r} first, expected {bytes([FIRST_BYTE])!r}")
+    content = read_log_file(path, LARGEST_BYTES, FIRST_BYTE)
     try:
         stamp_s, events, end = _header(content)
     except (struct.error, ValueError) as error:

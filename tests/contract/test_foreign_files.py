@@ -28,7 +28,7 @@ from flytrack_env.model_file import save_model
 from flytrack_env.references import ReferenceFileError, load_reference, shipped_path
 from flytrack_env.rollout import RolloutError, load_rollout, save_rollout
 from flytrack_env.tracks.track import TRACK_FOLDER
-from flytrack_sysid import LogError, csv_file, import_log
+from flytrack_sysid import LogError, import_log, log_file
 from flytrack_sysid.importing import load_mapping
 from flytrack_sysid.log import log_of_states
 from flytrack_sysid.manoeuvres import MANOEUVRES
@@ -253,7 +253,7 @@ def test_what_is_no_such_file_is_refused(kind: str, tmp_path: Path, monkeypatch:
 
 
 def test_compressed_logs_are_read_and_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(csv_file, "PACKED_BYTES", 50_000)
+    monkeypatch.setattr(log_file, "PACKED_BYTES", 50_000)
     text, mapping = CSV, tmp_path / "map.toml"
     mapping.write_text(read_mapping("csv"))
     (tmp_path / "a.csv").write_bytes(text)

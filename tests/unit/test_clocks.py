@@ -9,8 +9,8 @@ import pytest
 from benchmarks.diagnosis import model_of
 from flytrack_env.motion import Motion
 from flytrack_sysid import clocks, sensors
+from flytrack_sysid.clocks import on_one_clock, with_causal_commands
 from flytrack_sysid.diagnosis.motion_choice import Moves, how_it_moves
-from flytrack_sysid.diagnosis.sensor_clocks import on_one_clock, with_causal_commands
 from flytrack_sysid.log import FlightLog
 from tests.support.handout_plant import GRAVITY, HandoutPlant, excited
 from tests.support.hidden_flights import scripted

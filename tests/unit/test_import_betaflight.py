@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from flytrack_env.effects import effect_of
 from flytrack_env.state import Action
 from flytrack_sysid import LogError, import_log
-from flytrack_sysid.importing.betaflight_rates import full_stick_rate, stick_curve
+from flytrack_sysid.importing.betaflight_settings import full_stick_rate, stick_curve
 from tests.support.foreign_logs import BLACKBOX_HEADERS, blackbox
 from tests.support.foreign_logs import BLACKBOX_NAMES as NAMES
 from tests.support.foreign_logs import blackbox_frames as frames

@@ -10,8 +10,8 @@ from flytrack_sysid.diagnosis.lanes import make_lanes
 from flytrack_sysid.diagnosis.problem import Problem
 from flytrack_sysid.diagnosis.refinement import Judge, errors_at, refine, windows_of
 from flytrack_sysid.diagnosis.score_test import CANDIDATES
+from flytrack_sysid.diagnosis.search import FittedModel, SearchState
 from flytrack_sysid.log import FlightLog
-from flytrack_sysid.parameters import base_of
 from flytrack_sysid.prediction_windows import QUANTITIES
 from flytrack_sysid.split import held_out_rows
 from tests.support.hidden_flights import scripted
@@ -39,8 +39,9 @@ def dragged():
         vector = problem.start.copy()
         for name, value in (values | {"accelerometer_bias.x": 0.3}).items():
             vector[problem.names.index(name)] = value
-        places = problem.index(base_of(problem.like))
-        found = refine(problem, problem.start, vector, (DRAG, BIAS), places, log, held_out_rows(log), False)
+        base = FittedModel((), problem.start, 0.0, ())
+        model = base._replace(candidates=(DRAG, BIAS), vector=vector)
+        found = refine(SearchState(problem), base, model, log, held_out_rows(log), False)
     return truth, log, problem, found
 
 
