@@ -168,6 +168,7 @@ class FlyTrack(EpisodicEnvironment):
 
     def begin(self, drone: Drone, gate_index: Any, params: EnvParams, seed: Any = 0) -> EnvState:
         """Return the state of an episode that begins; the seed is unused, nothing else is drawn."""
+        del seed
         race = start_race(jnp.asarray(gate_index, jnp.int32), params.course)
         return EnvState(plant=self.plant.reset(drone, params.model), race=race, time=jnp.int32(0))
 

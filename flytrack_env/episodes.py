@@ -44,14 +44,11 @@ def without_nan(command: Action) -> Action:
 class EpisodicEnvironment(environment.Environment[Any, EnvParams]):  # type: ignore[type-var]
     """An environment for gymnax, made of hooks for one drone; a state is any pytree.
 
-    A hook that a class does not override is that of the environment inside, whose state is ``state.inner``.
-
-    env: the environment inside a wrapper. track: the course. plant: what moves the drone. missed_gate:
-    "terminate" or "fly_on". env_id: as registered.
+    track: the course. plant: what moves the drone. missed_gate: "terminate" or "fly_on". env_id: as
+    registered.
     """
 
     _supports_transition_gradients = True
-    env: "EpisodicEnvironment"
     track: Track
     plant: Plant
     missed_gate: str
@@ -62,28 +59,28 @@ class EpisodicEnvironment(environment.Environment[Any, EnvParams]):  # type: ign
     @property
     def default_params(self) -> EnvParams:  # type: ignore[override]
         """Parameters that the environment was made with."""
-        return self.env.default_params
+        raise NotImplementedError
 
     @property
     def observation_table(self) -> tuple[Entry, ...]:
         """What an observation holds, row by row."""
-        return self.env.observation_table
+        raise NotImplementedError
 
     def drone(self, state: Any) -> Drone:
         """Return the drone of a state, as it is."""
-        return self.env.drone(state.inner)
+        raise NotImplementedError
 
     def race(self, state: Any) -> Race:
         """Return where the drone stands in the race."""
-        return self.env.race(state.inner)
+        raise NotImplementedError
 
     def model(self, state: Any, params: EnvParams) -> ModelParameters:
         """Return the model that a state's episode is flown with."""
-        return self.env.model(state.inner, params)
+        raise NotImplementedError
 
     def sample_start(self, seed: jax.Array, params: EnvParams) -> tuple[Drone, jax.Array]:
         """Return a drone that begins an episode, and the gate to fly first (an index), of a uint32 scalar."""
-        return self.env.sample_start(seed, params)
+        raise NotImplementedError
 
     def begin(self, drone: Drone, gate_index: Any, params: EnvParams, seed: Any = 0) -> Any:
         """Return the state of an episode that begins with a given drone and gate to fly first.
@@ -104,15 +101,15 @@ class EpisodicEnvironment(environment.Environment[Any, EnvParams]):  # type: ign
 
     def observe_drone(self, drone: Drone, state: Any, params: EnvParams) -> list[jax.Array]:
         """Return the observation of a state whose sensors report ``drone``: a float32 scalar per row."""
-        return self.env.observe_drone(drone, state.inner, params)
+        raise NotImplementedError
 
     def is_truncated(self, state: Any, params: EnvParams) -> jax.Array:
         """Return whether the episode is cut off, by the time limit, a bool scalar."""
-        return self.env.is_truncated(state.inner, params)
+        raise NotImplementedError
 
     def check_params(self, params: EnvParams) -> None:
         """Raise ValueError, naming the field, for concrete values that cannot be flown."""
-        self.env.check_params(params)
+        raise NotImplementedError
 
     # What follows from them.
 
@@ -143,6 +140,7 @@ class EpisodicEnvironment(environment.Environment[Any, EnvParams]):  # type: ign
 
     def observe(self, key: jax.Array | None, state: Any, action: Any, params: EnvParams) -> jax.Array:
         """Return the observation of a state, (size,) float32; key and action are unused."""
+        del key, action
         return jnp.stack(self.observe_drone(self.drone(state), state, params))
 
     def step_env(  # type: ignore[override]  # actions are arrays here
@@ -152,6 +150,7 @@ class EpisodicEnvironment(environment.Environment[Any, EnvParams]):  # type: ign
 
         action: (4,). The observation is (size,) float32; reward and terminated are scalars. key is unused.
         """
+        del key
         rows, next_state, reward, flags, info = one_kernel(self._step_env)(state, clip_action(action), params)
         return jnp.stack(rows), next_state, reward, flags["terminated"], info
 

@@ -1,7 +1,7 @@
 """The table of environment ids, and their registration with gymnax."""
 
 import inspect
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -15,9 +15,10 @@ from flytrack_env.wrappers import ActionHistory, DomainRandomization, Observatio
 
 
 class Variant(NamedTuple):
-    """One id: what it is, and the wrappers around ``FlyTrack``, innermost first."""
+    """One id: what it is, the base arguments of ``FlyTrack``, and the wrappers, innermost first."""
 
     summary: str
+    arguments: Mapping[str, Any] = {}
     wrappers: tuple[Callable[[EpisodicEnvironment], EpisodicEnvironment], ...] = ()
 
 
@@ -53,8 +54,9 @@ def make(env_id: str, **overrides: Any) -> EpisodicEnvironment:
     if env_id not in ENVIRONMENTS:
         raise ValueError(f"env_id: found {env_id!r}, expected one of {', '.join(ENVIRONMENTS)}")
     check_keywords(overrides, ARGUMENTS)
-    env: EpisodicEnvironment = FlyTrack(**overrides)
-    for wrapper in ENVIRONMENTS[env_id].wrappers:
+    variant = ENVIRONMENTS[env_id]
+    env: EpisodicEnvironment = FlyTrack(**{**variant.arguments, **overrides})
+    for wrapper in variant.wrappers:
         if wrapper is DomainRandomization and env.plant.dt is not None:
             continue
         env = wrapper(env)

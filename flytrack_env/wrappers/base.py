@@ -6,29 +6,26 @@ each has one state of its own around the inner state, created when an episode be
 order that makes sense; any other is refused.
 """
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 
+from flytrack_env.dynamics import ModelParameters
 from flytrack_env.episodes import EpisodicEnvironment
+from flytrack_env.observations import Entry
 from flytrack_env.params import EnvParams
+from flytrack_env.race import Race
+from flytrack_env.state import Drone
 
 
 class WrapperError(ValueError):
     """An order of wrappers that makes no sense; the message says why."""
 
 
-class Wrapped(NamedTuple):
-    """The state of a wrapper: that of the environment inside, and what the wrapper itself remembers."""
-
-    inner: Any
-    own: Any
-
-
 class Wrapper(EpisodicEnvironment):
-    """Has the hooks of the environment inside; a wrapper overrides those that it changes.
+    """Delegates every hook; a wrapper overrides those that it changes.
 
-    Its state has a field ``inner`` for that of the wrapped environment, as ``Wrapped`` has. key: its name,
+    Its state is a NamedTuple whose field ``inner`` holds the wrapped environment's state. key: its name,
     and that of its parameters in ``EnvParams.wrappers``; no two wrappers of an environment share one.
 
     Raises:
@@ -83,9 +80,38 @@ class Wrapper(EpisodicEnvironment):
         own = self.own_defaults()
         return params if own is None else params.replace(wrappers={**params.wrappers, self.key: own})
 
+    @property
+    def observation_table(self) -> tuple[Entry, ...]:
+        """The inner environment's."""
+        return self.env.observation_table
+
+    def drone(self, state: Any) -> Drone:
+        """Return the drone of a state, as it is."""
+        return self.env.drone(state.inner)
+
+    def race(self, state: Any) -> Race:
+        """Return where the drone stands in the race."""
+        return self.env.race(state.inner)
+
+    def model(self, state: Any, params: EnvParams) -> ModelParameters:
+        """Return the model that a state's episode is flown with."""
+        return self.env.model(state.inner, params)
+
+    def sample_start(self, seed: jax.Array, params: EnvParams) -> tuple[Drone, jax.Array]:
+        """Return a drone that begins an episode, and the gate to fly first."""
+        return self.env.sample_start(seed, params)
+
+    def observe_drone(self, drone: Drone, state: Any, params: EnvParams) -> list[jax.Array]:
+        """Return the inner environment's observation."""
+        return self.env.observe_drone(drone, state.inner, params)
+
+    def is_truncated(self, state: Any, params: EnvParams) -> jax.Array:
+        """Return whether the time limit is reached."""
+        return self.env.is_truncated(state.inner, params)
+
     def check_params(self, params: EnvParams) -> None:
         """Raise ValueError for parameters that cannot be flown, or that lack this wrapper's own."""
-        super().check_params(params)
+        self.env.check_params(params)
         own = self.own_defaults()
         if own is None:
             return

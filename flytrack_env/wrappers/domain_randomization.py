@@ -22,7 +22,7 @@ from flytrack_env.params import RANGES, EnvParams
 from flytrack_env.quaternion import Scalar
 from flytrack_env.randomness import Draws
 from flytrack_env.state import Action, Drone
-from flytrack_env.wrappers.base import Wrapped, Wrapper, WrapperError
+from flytrack_env.wrappers.base import Wrapper, WrapperError
 
 EFFECT_FACTORS = (1e-6, 1e6)
 LEFT_ALONE: Any = None  # in the place of a parameter's bound: not drawn
@@ -57,6 +57,13 @@ class RandomizationParams(NamedTuple):
         Wind(3.0, 3.0, LEFT_ALONE, a_x=LEFT_ALONE, a_y=LEFT_ALONE, a_z=LEFT_ALONE),
         LinearDrag(0.5, 0.5, 0.3),
     )
+
+
+class RandomizedState(NamedTuple):
+    """The inner state, and the word that this episode's model is drawn from."""
+
+    inner: Any
+    word: jax.Array
 
 
 def sample_model(word: jax.Array, model: ModelParameters, ranges: RandomizationParams) -> ModelParameters:
@@ -101,9 +108,8 @@ def _draw(draws: Draws, model: ModelParameters, low: Any, high: Any, factors: tu
 class DomainRandomization(Wrapper):
     """Fly every episode with a model drawn around the given one.
 
-    It remembers the random word that the model is drawn from. The ranges are
-    ``params.wrappers["domain_randomization"]``, a ``RandomizationParams``. The policy does not see the draw;
-    ``env.model(state, params)`` returns it.
+    The ranges are ``params.wrappers["domain_randomization"]``, a ``RandomizationParams``. The policy does
+    not see the draw; ``env.model(state, params)`` returns it.
 
     Raises:
         WrapperError: as ``Wrapper``, or a plant that has its parameters baked in.
@@ -134,9 +140,9 @@ class DomainRandomization(Wrapper):
             raise ValueError(f"params.wrappers[{self.key!r}]: found {ranges!r}, expected {expected}")
         _check_ranges(ranges, params, self.env.plant.delay_steps)
 
-    def model(self, state: Wrapped, params: EnvParams) -> ModelParameters:
+    def model(self, state: RandomizedState, params: EnvParams) -> ModelParameters:
         """Return the model that a state's episode is flown with."""
-        model = self.env.model(state.inner, self._drawn(state.own, params))
+        model = self.env.model(state.inner, self._drawn(state.word, params))
         return model._replace(tau=jnp.stack(list(model.tau)))
 
     def _drawn(self, word: jax.Array, params: EnvParams) -> EnvParams:
@@ -150,23 +156,23 @@ class DomainRandomization(Wrapper):
     def _word(self, seed: Any) -> jax.Array:
         return Draws(seed).word(self.key)
 
-    def begin(self, drone: Drone, gate_index: Any, params: EnvParams, seed: Any = 0) -> Wrapped:
+    def begin(self, drone: Drone, gate_index: Any, params: EnvParams, seed: Any = 0) -> RandomizedState:
         """Return the state of an episode that begins, its model decided by the seed."""
         word = self._word(seed)
-        return Wrapped(self.env.begin(drone, gate_index, self._drawn(word, params), seed), word)
+        return RandomizedState(self.env.begin(drone, gate_index, self._drawn(word, params), seed), word)
 
-    def observe_drone(self, drone: Drone, state: Wrapped, params: EnvParams) -> list[jax.Array]:
+    def observe_drone(self, drone: Drone, state: RandomizedState, params: EnvParams) -> list[jax.Array]:
         """Return the inner environment's observation, with this episode's model."""
-        return self.env.observe_drone(drone, state.inner, self._drawn(state.own, params))
+        return self.env.observe_drone(drone, state.inner, self._drawn(state.word, params))
 
     def advance(
-        self, state: Wrapped, command: Action, params: EnvParams
-    ) -> tuple[Wrapped, jax.Array, jax.Array, dict[str, Any]]:
+        self, state: RandomizedState, command: Action, params: EnvParams
+    ) -> tuple[RandomizedState, jax.Array, jax.Array, dict[str, Any]]:
         """Return the outcome of the inner environment with this episode's model."""
         inner, reward, terminated, info = self.env.advance(
-            state.inner, command, self._drawn(state.own, params)
+            state.inner, command, self._drawn(state.word, params)
         )
-        return Wrapped(inner, state.own), reward, terminated, info
+        return RandomizedState(inner, state.word), reward, terminated, info
 
 
 def _check_ranges(ranges: RandomizationParams, params: EnvParams, delay_steps: int) -> None:

@@ -13,7 +13,7 @@ from flytrack_env.params import EnvParams
 from flytrack_env.quaternion import Quaternion, Scalar, Vec3
 from flytrack_env.randomness import Draws, next_word
 from flytrack_env.state import Action, Drone
-from flytrack_env.wrappers.base import Wrapped, Wrapper
+from flytrack_env.wrappers.base import Wrapper
 
 
 class NoiseParams(NamedTuple):
@@ -37,13 +37,19 @@ RANGES: Mapping[str, Range] = {
 }
 
 
+class NoisyState(NamedTuple):
+    """The inner state, and the word that this step's noise is drawn from."""
+
+    inner: Any
+    word: jax.Array
+
+
 class ObservationNoise(Wrapper):
     """Add white noise to what the sensors report of position, velocity, attitude and body rates.
 
-    It remembers the random word of this step. The standard deviations are
-    ``params.wrappers["observation_noise"]``, a ``NoiseParams``. Independent in every step and episode; the
-    observation of a state is always the same, so that ``final_observation`` is what the policy would have
-    seen.
+    The standard deviations are ``params.wrappers["observation_noise"]``, a ``NoiseParams``. Independent in
+    every step and episode; the observation of a state is always the same, so that ``final_observation`` is
+    what the policy would have seen.
     """
 
     key = "observation_noise"
@@ -61,25 +67,25 @@ class ObservationNoise(Wrapper):
                 expected = f"finite and >= 0, at most {bounds.high:g} {bounds.unit}"
                 raise ValueError(f"params.wrappers[{self.key!r}].{name}: found {value}, expected {expected}")
 
-    def begin(self, drone: Drone, gate_index: Any, params: EnvParams, seed: Any = 0) -> Wrapped:
+    def begin(self, drone: Drone, gate_index: Any, params: EnvParams, seed: Any = 0) -> NoisyState:
         """Return the state of an episode that begins, with noise of its own."""
         inner = self.env.begin(drone, gate_index, params, seed)
-        return Wrapped(inner, Draws(seed).word("observation_noise"))
+        return NoisyState(inner, Draws(seed).word("observation_noise"))
 
     def advance(
-        self, state: Wrapped, command: Action, params: EnvParams
-    ) -> tuple[Wrapped, jax.Array, jax.Array, dict[str, Any]]:
+        self, state: NoisyState, command: Action, params: EnvParams
+    ) -> tuple[NoisyState, jax.Array, jax.Array, dict[str, Any]]:
         """Return the outcome of the inner environment, with another draw of noise to come."""
         inner, reward, terminated, info = self.env.advance(state.inner, command, params)
-        return Wrapped(inner, next_word(state.own)), reward, terminated, info
+        return NoisyState(inner, next_word(state.word)), reward, terminated, info
 
-    def observe_drone(self, drone: Drone, state: Wrapped, params: EnvParams) -> list[jax.Array]:
+    def observe_drone(self, drone: Drone, state: NoisyState, params: EnvParams) -> list[jax.Array]:
         """Return the inner observation of a drone as noisy sensors report it.
 
         Attitude is disturbed before the observation is made of it. What is a vector is disturbed after:
         white noise of equal deviation along all axes is the same in every frame, and this is cheaper.
         """
-        noise, draws = self.own_params(params), Draws(state.own)
+        noise, draws = self.own_params(params), Draws(state.word)
         turned = compute_once(_turn(drone.quat, draws, noise.attitude_deg))
         values = self.env.observe_drone(drone._replace(quat=turned), state.inner, params)
         deviations = {

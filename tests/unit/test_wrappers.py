@@ -123,7 +123,7 @@ def test_a_model_and_the_noise_hold_for_their_episode_and_their_step(flight: Fli
     env, is_end = wrapped(*ALL), flight.ended
     noise = env.env.env  # inside the statistics and the history of commands
     assert isinstance(noise, ObservationNoise)
-    words = {"noise": states.inner.inner.own, "model": states.inner.inner.inner.inner.inner.own}
+    words = {"noise": states.inner.inner.word, "model": states.inner.inner.inner.inner.inner.word}
     assert (words["noise"][1:] != words["noise"][:-1]).all()
     np.testing.assert_array_equal(words["model"][1:][~is_end], words["model"][:-1][~is_end])
     assert (words["model"][1:][is_end] != words["model"][:-1][is_end]).all()
@@ -140,7 +140,7 @@ def test_noise_has_the_stated_deviations_and_is_white() -> None:
 
     def observations(seed: jax.Array) -> jax.Array:
         state = env.begin(drone, 0, params, seed)
-        later = state._replace(own=next_word(state.own))
+        later = state._replace(word=next_word(state.word))
         return jnp.stack([env.observe(None, each, None, params) for each in (state, later)])
 
     both = np.asarray(jax.jit(jax.vmap(observations))(jnp.arange(4000, dtype=jnp.uint32)), float)
