@@ -1,7 +1,7 @@
 """Least squares over all channels of a log, each weighted by the noise that it turns out to have.
 
-A fit replays a log and searches as the diagnosis does. Other than there, what a log measured is weighted by
-one noise per component, and levels, which a row's residuals are summed up to, are followed in short windows.
+A fit replays a log and searches as the diagnosis does, but weights each component by one noise, and sums steps
+up in short windows: so positions count without velocities, and what a model lacks has no part in the weights.
 
 ========  ==============================================================================  =======
 channel   residual                                                                        unit
@@ -38,8 +38,8 @@ TURNS, FORCES, BATTERY = AXES
 # Noise that the first round assumes, (NUM_AXES, 2), in the channels' units: that of common sensors.
 FIRST_NOISE = np.array([[0.1, 0.01]] * 3 + [[1.5, 0.05]] * 3 + [[1.0, 0.02]])
 LEAST_NOISE = 1e-12
-ROUNDS = 3
-LAST_STEPS, LAST_RISE = 3, 1e-10  # full Gauss-Newton steps at the end; of the cost, which rounding may add
+LAST_STEPS = (0, 0, 3)  # full Gauss-Newton steps at the end of each round: only the last is to be exact
+LAST_RISE = 1e-10  # of the cost, which rounding may add to such a step
 
 
 class FitError(ValueError):
@@ -231,14 +231,14 @@ def _acting(found: Linearization, free: tuple[str, ...], may_be_idle: bool) -> l
     return found.problem.index(names)
 
 
-def _polished(problem: Problem, vector: np.ndarray, places: list[int]) -> Linearization:
-    """Return where the slope of the cost, and not only its change, is rounding: full Gauss-Newton steps.
+def _polished(problem: Problem, vector: np.ndarray, places: list[int], steps: int) -> Linearization:
+    """Return where the slope of the cost, and not only its change, is rounding: so many full steps on.
 
     The cost is flat at its least, so that a search which compares costs ends where the order of summation
     decides: another number of threads, another model.
     """
     found = Linearization(problem, problem.slopes(vector, places))
-    for _ in range(LAST_STEPS):
+    for _ in range(steps):
         moved = found.vector.copy()
         moved[places] += found.step_inside()
         moved = problem.clipped(moved)
@@ -266,17 +266,17 @@ def estimate(
     with jax.enable_x64(True):
         model: Any = jax.tree.map(lambda leaf: np.asarray(leaf, float), start)
         noise = FIRST_NOISE
-        for number in range(ROUNDS):
+        for number, steps in enumerate(LAST_STEPS):
             problem = replace(Channels.of_log(log, judged, model), noise=noise)
             vector = problem.clipped(problem.start)
             seen = problem.index([name for name in free if name in problem.names])
             near = Linearization(problem, problem.slopes(vector, seen))
             places = _acting(near, free, may_be_idle=number == 0)
             vector, _ = refine(problem, vector, places, near)
-            found = _polished(problem, vector, places)
+            found = _polished(problem, vector, places, steps)
             noise = problem.spread(found.vector)
             names = tuple(problem.names[place] for place in places)
             model = parameters.with_values(model, dict(zip(names, found.vector[places], strict=True)))
-            report(number + 1, ROUNDS)
+            report(number + 1, len(LAST_STEPS))
     count = int(problem.counts.sum())
     return Estimate(model, names, _covariance(found), problem.by_channel(noise), count)
