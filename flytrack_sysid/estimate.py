@@ -1,34 +1,45 @@
-"""Least squares over all channels of a log, each weighted by the noise that it turns out to have."""
+"""Least squares over all channels of a log, each weighted by the noise that it turns out to have.
+
+A fit replays a log and searches as the diagnosis does, but weights each component by one noise, and sums steps
+up in short windows: so positions count without velocities, and what a model lacks has no part in the weights.
+
+========  ==============================================================================  =======
+channel   residual                                                                        unit
+========  ==============================================================================  =======
+``w``     body rates, against the lag driven by the commands                              rad/s
+``f``     specific force, body (from ``a`` where the log has no accelerometer)            m/s^2
+``v``     velocity, against the integrated acceleration, centred in windows               m/s
+``p``     position, likewise without offset and slope; only where the log lacks ``v``     m
+``q``     attitude, against the integrated rates, as a world-frame rotation, centred      rad
+``v_bat`` battery voltage, against its drain, centred                                     V
+========  ==============================================================================  =======
+
+Centring takes out what a window began with, which is measured with noise like the rest.
+"""
 
 from collections.abc import Callable
-from typing import NamedTuple
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
-from scipy import optimize
+from scipy.spatial.transform import Rotation
 
 from flytrack_env.dynamics import ModelParameters
 from flytrack_sysid import parameters
+from flytrack_sysid.diagnosis.lanes import AXES, DIRECT, Lanes, lead_in_of, make_lanes
+from flytrack_sysid.diagnosis.problem import Problem, robust_weight
+from flytrack_sysid.diagnosis.score_test import Linearization, solve
+from flytrack_sysid.diagnosis.search import refine
 from flytrack_sysid.log import FlightLog
-from flytrack_sysid.record import make_record
-from flytrack_sysid.residuals import CENTRED, Problem, make_problem, residuals
+from flytrack_sysid.record import is_applied_certain, make_record
 
-# Noise that the first round assumes, in the channels' units: that of common sensors.
-FIRST_NOISE = {"w": 0.1, "f": 1.5, "v": 0.05, "p": 0.01, "q": 0.01, "v_bat": 0.02}
+TURNS, FORCES, BATTERY = AXES
+# Noise that the first round assumes, (NUM_AXES, 2), in the channels' units: that of common sensors.
+FIRST_NOISE = np.array([[0.1, 0.01]] * 3 + [[1.5, 0.05]] * 3 + [[1.0, 0.02]])
 LEAST_NOISE = 1e-12
-LEAST_INFORMATION = 1e-13  # about a direction, against what is known best: rounding hides less
-# Relative to cost and step, of each round: only the last is to be exact.
-TOLERANCES = (1e-4, 1e-4, 1e-14)
-MOST_EVALUATIONS = 200  # about ten times what a search takes that ends
+LAST_STEPS = (0, 0, 3)  # full Gauss-Newton steps at the end of each round: only the last is to be exact
 LAST_RISE = 1e-10  # of the cost, which rounding may add to such a step
-LAST_STEPS = 3  # from an error of 1e-8, where the cost is flat to rounding, to that of the slopes
-# How far thrust coefficients may lie from where the search starts, in weights of the drone (per volt for
-# the last two): weak enough to move nothing that the data determine, and it keeps the rest finite.
-PRIOR_WEIGHTS = {
-    **dict.fromkeys(parameters.THRUST_COEFFS[:4], 10.0),
-    **dict.fromkeys(parameters.THRUST_COEFFS[4:], 1.0),
-}
 
 
 class FitError(ValueError):
@@ -39,176 +50,203 @@ class Estimate(NamedTuple):
     """What a fit found, in float64.
 
     model: with the estimate in it. free: names of what was estimated. covariance: of the free
-    parameters. noise: rms left of each channel, per component. measured: rms of what each channel
-    measured, likewise. count: numbers that were explained.
+    parameters. noise: rms left of each channel, per component. count: numbers that were explained.
     """
 
     model: ModelParameters
     free: tuple[str, ...]
     covariance: np.ndarray
     noise: dict[str, np.ndarray]
-    measured: dict[str, np.ndarray]
     count: int  # type: ignore[assignment]  # hides tuple.count
 
 
-@jax.jit
-def _weighted(
-    values: jax.Array,
-    where: jax.Array,
-    vector: jax.Array,
-    like: ModelParameters,
-    problem: Problem,
-    weights: dict[str, jax.Array],
-) -> jax.Array:
-    """Return all residuals times their weights, flat, with ``values`` in these places of the vector."""
-    found = residuals(parameters.from_vector(vector.at[where].set(values), like), problem)
-    return jnp.concatenate([(found[name] * weights[name]).ravel() for name in sorted(found)])
+def _in_line(values: np.ndarray) -> np.ndarray:
+    """Return (rows, lanes, ...) without lead-ins as (all rows, ...), in the order of time."""
+    own = np.swapaxes(values[lead_in_of(len(values)) :], 0, 1)
+    return own.reshape(-1, *own.shape[2:])
 
 
-_slopes = jax.jit(jax.jacfwd(_weighted))
+class Windows(NamedTuple):
+    """The windows of a level: the rows in line where they begin, and what counts, (all rows, axes)."""
+
+    starts: np.ndarray
+    counts: np.ndarray
+
+    def sums(self, values: np.ndarray) -> np.ndarray:
+        """Return, at every row, the sum of (all rows, axes) over its window."""
+        lengths = np.diff(np.append(self.starts, len(values)))
+        return np.repeat(np.add.reduceat(values, self.starts, axis=0), lengths, axis=0)
+
+    def centred(self, values: np.ndarray) -> np.ndarray:
+        """Return values less their mean over the rows of the window that count."""
+        return values - self.sums(values * self.counts) / np.maximum(self.sums(self.counts), 1.0)
+
+    def without_slope(self, values: np.ndarray, time: np.ndarray) -> np.ndarray:
+        """Return values less their regression on time, (all rows, 1), over the rows that count."""
+        values, time = self.centred(values), self.centred(time)
+        spread = self.sums(time * time * self.counts)
+        return values - self.sums(time * values * self.counts) / np.where(spread > 0.0, spread, 1.0) * time
+
+    def num_used(self) -> int:
+        """Return the number of windows in which anything counts."""
+        return int(np.add.reduceat(self.counts, self.starts).any(axis=1).sum())
 
 
-class _Search:
-    """One round: the least squares problem with given weights, in the free parameters' own scale.
+@dataclass(frozen=True, eq=False)
+class Channels(Problem):
+    """A log and the residuals of its channels, in the axes and windows that the table of this module says.
 
-    Time constants are searched for by their logarithm, so that none becomes negative.
+    noise: (NUM_AXES, 2), a standard deviation each. levels: the windows of turns, forces and battery.
+    has_position: of forces, the level is position and not velocity.
     """
 
-    def __init__(
-        self, start: ModelParameters, free: tuple[str, ...], problem: Problem, noise: dict[str, np.ndarray]
-    ):
-        self.free, self.problem = free, problem
-        names = parameters.names_of(start)
-        where = np.array([names.index(name) for name in free])
-        vector = parameters.to_vector(start)
-        self.given = where, vector, start, problem, {name: 1.0 / sigma for name, sigma in noise.items()}
-        self.centre = vector[where]
-        self.is_log = np.array([name in parameters.TAUS for name in free])
-        channels = [problem.channels[name] for name in sorted(problem.channels)]
-        self.counting = np.concatenate([channel.counts.ravel() > 0 for channel in channels])
-        scale = [PRIOR_WEIGHTS.get(name, np.inf) for name in free]
-        self.prior_weight = 1.0 / (np.array(scale) * float(start.m) * float(start.g))
+    levels: tuple[Windows, ...] = ()
+    has_position: bool = False
 
-    def values(self, params: np.ndarray) -> np.ndarray:
-        """Return the free parameters in their own units."""
-        return np.where(self.is_log, np.exp(np.where(self.is_log, params, 0.0)), params)
+    @classmethod
+    def of_log(cls, log: FlightLog, judged: np.ndarray, model: ModelParameters) -> "Channels":
+        """Return the judged rows of a log, (num_rows,) bool, for a model and the effects that it has."""
+        tau, has_position = np.asarray(model.tau, float), "p" in log and "q" in log and "v" not in log
+        lanes = make_lanes(log, np.ones(len(log), bool), tau, float(model.g))
+        certain = is_applied_certain(make_record(log), tau)[lanes.row]
+        lanes = lanes._replace(counts=_counts(lanes, judged, certain, has_position))
+        return replace(cls.of(lanes, model, ()), levels=_levels(lanes), has_position=has_position)
 
-    def residual(self, params: np.ndarray) -> np.ndarray:
-        """Return the weighted residuals of rows that count, and the pull of the prior."""
-        values = self.values(params)
-        weighted = np.asarray(_weighted(values, *self.given))[self.counting]
-        return np.concatenate([weighted, self.prior_weight * (values - self.centre)])
+    def residuals(self, vectors: np.ndarray) -> np.ndarray:
+        """Return residuals of models, (num_models, rows, lanes, NUM_AXES, 2); 0 where nothing counts."""
+        found = super().residuals(vectors)
+        for left in found:
+            in_line = self._of_channels(_in_line(left))
+            left[lead_in_of(len(left)) :] = in_line.reshape(left.shape[1], -1, *left.shape[2:]).swapaxes(0, 1)
+        return found * self.counts
 
-    def slopes(self, params: np.ndarray) -> np.ndarray:
-        """Return the derivative of ``residual``."""
-        values = self.values(params)
-        slopes = np.asarray(_slopes(values, *self.given))[self.counting]
-        chain = np.where(self.is_log, values, 1.0)
-        return np.concatenate([slopes, np.diag(self.prior_weight)]) * chain
+    def _of_channels(self, left: np.ndarray) -> np.ndarray:
+        """Return the channels' residuals from those of single steps, (all rows, NUM_AXES, 2)."""
+        before = Rotation.from_quat(_in_line(np.roll(self.lanes.record.quat, 1, axis=0)), scalar_first=True)
+        found, turn = left.copy(), left[:, TURNS, 1]
+        for axes in (TURNS, FORCES):
+            found[:, axes, 0] = before.apply(left[:, axes, 0], inverse=True)
+        # One turn after the other, to second order: to first, attitude noise would not cancel.
+        turned = self.levels[0].centred(np.cumsum(turn, axis=0)) - turn
+        found[:, TURNS, 1] += 0.5 * np.cross(turn, turned)
+        level = np.cumsum(found[..., 1], axis=0)
+        for axes, windows in zip(AXES, self.levels, strict=True):
+            found[:, axes, 1] = windows.centred(level[:, axes])
+        if self.has_position:
+            found[:, FORCES, 1] = self._of_positions(left[:, FORCES, 1])
+        return found
 
-    def acting(self) -> tuple[str, ...]:
-        """Return the free parameters on which anything that counts depends, at the start."""
-        slopes = np.asarray(_slopes(self.centre, *self.given))[self.counting]
-        return tuple(name for name, acts in zip(self.free, slopes.any(axis=0), strict=True) if acts)
+    def _of_positions(self, left: np.ndarray) -> np.ndarray:
+        """Return residuals of positions from those of changes of velocity, (all rows, 3) m/s."""
+        record = self.lanes.record
+        step_s = _in_line(np.roll(record.step_s, 1, axis=0))[:, None]  # of the step to the row
+        change = _in_line(np.diff(record.vel_w, axis=0, prepend=record.vel_w[:1])) - left
+        moved = (np.cumsum(change, axis=0) - 0.5 * change) * step_s
+        off = _in_line(record.pos_w) - np.cumsum(moved, axis=0)
+        return self.levels[1].without_slope(off, np.cumsum(step_s, axis=0))
 
-    def run(self, tolerance: float) -> tuple[np.ndarray, np.ndarray]:
-        """Return the numbers found, and their covariance in the scale of the search."""
-        bounds = np.array([parameters.bounds_of(name) for name in self.free])
-        bounds[self.is_log] = np.log(bounds[self.is_log])
-        start = np.where(self.is_log, np.log(np.abs(self.centre) + LEAST_NOISE), self.centre)
-        try:
-            result = optimize.least_squares(
-                self.residual,
-                np.clip(start, bounds[:, 0], bounds[:, 1]),
-                self.slopes,
-                bounds=bounds.T,
-                x_scale="jac",
-                xtol=tolerance,
-                ftol=tolerance,
-                gtol=None,
-                max_nfev=MOST_EVALUATIONS,
-            )
-        except ValueError as error:  # scipy's word for residuals that are not finite
-            raise FitError(f"the fit diverged: {error}") from error
-        if not result.success or not np.isfinite(result.cost):
-            raise FitError(f"the fit did not converge: {result.message}")
-        if tolerance == TOLERANCES[-1]:
-            result.x = self.polished(result.x, bounds.T)
-        return result.x, self.covariance(result.jac, result.fun)
+    def whiten(self, left: np.ndarray, axes: slice = slice(None)) -> np.ndarray:
+        """Return residuals over their noise."""
+        assert self.noise is not None, "a noise comes first"
+        return left / self.noise[axes]
 
-    def polished(self, params: np.ndarray, bounds: np.ndarray) -> np.ndarray:
-        """Return where the slope of the cost, and not only its change, is rounding: full Gauss-Newton steps.
+    def spread(self, vector: np.ndarray) -> np.ndarray:
+        """Return the rms that a model leaves, (NUM_AXES, 2), with what was taken out counted as fitted."""
+        number = self.counts.sum(axis=(0, 1))
+        for axes, windows in zip(AXES, self.levels, strict=True):
+            number[axes, 1] -= windows.num_used() * (2 if self.has_position and axes is FORCES else 1)
+        squares = np.square(self.residuals(vector[None])[0]).sum(axis=(0, 1))
+        return np.maximum(np.sqrt(squares / np.maximum(number, 1)), LEAST_NOISE)
 
-        The cost is flat at its least, so that a search which compares costs ends a 1e-8 away from it,
-        in a direction that the order of summation decides: another number of threads, another model.
-        """
-        left = self.residual(params)
-        for _ in range(LAST_STEPS):
-            slopes = self.slopes(params)
-            size = np.linalg.norm(slopes, axis=0)
-            size = np.where(size > 0.0, size, 1.0)
-            step = np.linalg.lstsq(slopes / size, -left, rcond=LEAST_INFORMATION)[0] / size
-            moved = np.clip(params + step, *bounds)
-            then = self.residual(moved)
-            if not then @ then <= (left @ left) * (1.0 + LAST_RISE):
-                break
-            params, left = moved, then
-        return params
-
-    def covariance(self, slopes: np.ndarray, left: np.ndarray) -> np.ndarray:
-        """Return the covariance of the parameters, widened where residuals within a flight are correlated.
-
-        That of independent residuals of the noise assumed, in which each standard deviation is raised to
-        that of the cluster-robust (sandwich) estimate over pieces of a flight, if that is larger: what
-        the model lacks shows as residuals that agree within a piece.
-        """
-        size = np.sqrt(np.sum(slopes**2, axis=0))
-        scale = np.where(size > 0.0, size, 1.0)
-        scaled = slopes / scale
-        information, directions = np.linalg.eigh(scaled.T @ scaled)
-        # A floor and no pseudo-inverse, so that what the data say nothing of is very uncertain.
-        information = np.maximum(information, LEAST_INFORMATION * information[-1])
-        bread = directions / information @ directions.T
-        widths = [self.problem.channels[name].counts.shape[1] for name in sorted(self.problem.channels)]
-        pieces = np.concatenate([np.repeat(self.problem.record.piece, width) for width in widths])
-        pieces = pieces[self.counting]
-        pulls = np.zeros((pieces.max() + 1, len(scale)))
-        np.add.at(pulls, pieces, scaled[: len(pieces)] * left[: len(pieces), None])
-        count = len(np.unique(pieces))
-        robust = bread @ (pulls.T @ pulls) @ bread * (count / max(count - 1, 1))
-        widen = np.sqrt(np.maximum(np.diag(robust) / np.maximum(np.diag(bread), LEAST_NOISE), 1.0))
-        wide = bread * np.outer(widen, widen)
-        return wide / np.outer(scale, scale)
+    def by_channel(self, values: np.ndarray) -> dict[str, np.ndarray]:
+        """Return (NUM_AXES, 2) by the names of the channels that count."""
+        level = ("q", "p" if self.has_position else "v", "v_bat")
+        sides = (
+            (name, values[axes], self.counts[..., axes, :], side)
+            for side, names in enumerate((DIRECT, level))
+            for name, axes in zip(names, AXES, strict=True)
+        )
+        return {name: own[:, side] for name, own, counts, side in sides if name and counts[..., side].any()}
 
 
-def _acting_search(
-    model: ModelParameters,
-    free: tuple[str, ...],
-    problem: Problem,
-    noise: dict[str, np.ndarray],
-    may_be_idle: bool,
-) -> _Search:
-    """Return a search without parameters that nothing depends on, which would lead it astray.
+def _counts(lanes: Lanes, judged: np.ndarray, certain: np.ndarray, has_position: bool) -> np.ndarray:
+    """Return what counts of judged rows; certain: where applied actions are known, (rows, lanes, 4)."""
+    source = lanes.record.source_row
+    is_judged = judged[source] & (source >= 0) & (lanes.row >= 0)
+    is_judged[: lead_in_of(len(is_judged))] = False
+    behind = judged[np.maximum.accumulate(source, axis=0)]  # of a filled row, the one before the gap
+    counts = lanes.counts & is_judged[..., None, None]
+    counts[1:, :, FORCES, 0] &= behind[:-1, :, None]  # a force is that of a step from measured values
+    if "w" in lanes.measured:
+        counts[..., TURNS, 0] = certain[..., :3] & (is_judged & lanes.is_joined)[..., None]
+    if has_position:
+        counts[..., FORCES, 1] = certain[..., 3:] & is_judged[..., None]
+    return counts
+
+
+def _levels(lanes: Lanes) -> tuple[Windows, ...]:
+    """Return the windows of levels: pieces, cut where doubt of commands ends; flights, of the voltage."""
+    joined, counts = _in_line(lanes.is_joined), _in_line(lanes.counts[..., 1]).astype(float)
+    is_cut = np.diff(_in_line(lanes.record.piece), prepend=-1) != 0
+    found = []
+    for axes in AXES:
+        known = _in_line(lanes.is_known[..., axes.start]) | ~joined
+        is_back = known & ~np.append(True, known[:-1])
+        is_new = ~joined if axes is BATTERY else ~joined | is_cut | is_back
+        found.append(Windows(np.flatnonzero(is_new), counts[:, axes]))
+    return tuple(found)
+
+
+def _covariance(found: Linearization) -> np.ndarray:
+    """Return the covariance of the parameters, widened where residuals within a flight are correlated.
+
+    That of independent residuals of the noise assumed, in which each standard deviation is raised to
+    that of the cluster-robust (sandwich) estimate over pieces of a flight, if that is larger: what
+    the model lacks shows as residuals that agree within a piece.
+    """
+    problem, white = found.problem, found.white * robust_weight(found.white)
+    bread = solve(found.total, np.eye(len(found.total)))
+    used = problem.counts.any(axis=(2, 3))
+    pulls = np.einsum("prlak,rlak->rlp", found.columns, white, optimize=True)[used]
+    pieces, piece = np.unique(problem.lanes.record.piece[used], return_inverse=True)
+    by_piece = np.zeros((len(pieces), len(bread)))
+    np.add.at(by_piece, piece, pulls)
+    robust = bread @ (by_piece.T @ by_piece) @ bread * (len(pieces) / max(len(pieces) - 1, 1))
+    widen = np.sqrt(np.maximum(np.diag(robust) / np.diag(bread), 1.0))
+    return bread * np.outer(widen, widen)
+
+
+def _acting(found: Linearization, free: tuple[str, ...], may_be_idle: bool) -> list[int]:
+    """Return the places of parameters on which something depends; others would lead a search astray.
 
     Wind, say, acts only once there is some drag; what is idle after the first round too is refused.
     """
-    search = _Search(model, free, problem, noise)
-    acting = search.acting()
-    idle = [name for name in free if name not in acting]
+    if not np.isfinite(found.columns).all() or not np.isfinite(found.cost):
+        raise FitError("the fit diverged: residuals are not finite")
+    acts = np.flatnonzero(np.abs(found.columns).max(axis=(1, 2, 3, 4), initial=0.0))
+    names = [found.problem.names[found.places[column]] for column in acts]
+    idle = [name for name in free if name not in names]
     if idle and not may_be_idle:
         raise FitError(f"{', '.join(idle)}: nothing that the log measured depends on it; expected it fixed")
-    return _Search(model, acting, problem, noise) if idle else search
+    return found.problem.index(names)
 
 
-def _spread(values: np.ndarray, channel_name: str, problem: Problem) -> np.ndarray:
-    """Return the rms of residuals per component, with the means that were taken out counted as fitted."""
-    channel = problem.channels[channel_name]
-    count = channel.counts.sum(axis=0)
-    if channel_name in CENTRED:
-        used = channel.counts.any(axis=1)
-        sizes = np.unique(channel.window[used], return_counts=True)[1]
-        count = count - np.minimum(sizes, 2 if channel_name == "p" else 1).sum()
-    return np.sqrt(np.sum(values**2, axis=0) / np.maximum(count, 1.0))
+def _polished(problem: Problem, vector: np.ndarray, places: list[int], steps: int) -> Linearization:
+    """Return where the slope of the cost, and not only its change, is rounding: so many full steps on.
+
+    The cost is flat at its least, so that a search which compares costs ends where the order of summation
+    decides: another number of threads, another model.
+    """
+    found = Linearization(problem, problem.slopes(vector, places))
+    for _ in range(steps):
+        moved = found.vector.copy()
+        moved[places] += found.step_inside()
+        moved = problem.clipped(moved)
+        later = Linearization(problem, problem.slopes(moved, places))
+        if not later.cost <= found.cost * (1.0 + LAST_RISE):
+            break
+        found = later
+    return found
 
 
 def estimate(
@@ -223,32 +261,22 @@ def estimate(
     Weights and the rows that lost commands spoil follow from the estimate of the round before.
 
     Raises:
-        FitError: a search that diverged or ended at a bound.
+        FitError: a search that diverged, or a parameter on which nothing depends.
     """
     with jax.enable_x64(True):
-        record = make_record(log)
-        model = jax.tree.map(lambda leaf: np.asarray(leaf, float), start)
-        noise: dict[str, np.ndarray] = {}
-        for number, tolerance in enumerate(TOLERANCES):
-            problem = make_problem(log, record, judged, model)
-            widths = {name: channel.counts.shape[1] for name, channel in problem.channels.items()}
-            noise = noise or {name: np.full(width, FIRST_NOISE[name]) for name, width in widths.items()}
-            search = _acting_search(model, free, problem, noise, may_be_idle=number == 0)
-            params, covariance = search.run(tolerance)
-            model = parameters.with_values(model, dict(zip(search.free, search.values(params), strict=True)))
-            noise = {  # the rms of what the model leaves
-                name: np.maximum(_spread(np.asarray(left), name, problem), LEAST_NOISE)
-                for name, left in jax.jit(residuals)(model, problem).items()
-            }
-            report(number + 1, len(TOLERANCES))
-    chain = np.where(search.is_log, np.exp(np.where(search.is_log, params, 0.0)), 1.0)
-    still = {
-        name: np.sqrt(
-            np.sum(channel.measured[:, : channel.counts.shape[1]] ** 2 * channel.counts, axis=0)
-            / np.maximum(channel.counts.sum(axis=0), 1.0)
-        )
-        for name, channel in problem.channels.items()
-    }
-    return Estimate(
-        model, free, covariance * np.outer(chain, chain), noise, still, int(search.counting.sum())
-    )
+        model: Any = jax.tree.map(lambda leaf: np.asarray(leaf, float), start)
+        noise = FIRST_NOISE
+        for number, steps in enumerate(LAST_STEPS):
+            problem = replace(Channels.of_log(log, judged, model), noise=noise)
+            vector = problem.clipped(problem.start)
+            seen = problem.index([name for name in free if name in problem.names])
+            near = Linearization(problem, problem.slopes(vector, seen))
+            places = _acting(near, free, may_be_idle=number == 0)
+            vector, _ = refine(problem, vector, places, near)
+            found = _polished(problem, vector, places, steps)
+            noise = problem.spread(found.vector)
+            names = tuple(problem.names[place] for place in places)
+            model = parameters.with_values(model, dict(zip(names, found.vector[places], strict=True)))
+            report(number + 1, len(LAST_STEPS))
+    count = int(problem.counts.sum())
+    return Estimate(model, names, _covariance(found), problem.by_channel(noise), count)

@@ -248,7 +248,7 @@ def fit(
         result = estimate(log, judged, model, free, report)
     except FitError as error:
         raise FitError(f"{log.source}: {error}") from error
-    _check_result(result, log)
+    _check_result(result, log, judged)
     intervals = _intervals(result)
     uncertainty = _map_uncertainty(result, log)
     return Fit(
@@ -300,7 +300,7 @@ def _check_response(log: FlightLog, start: ModelParameters) -> None:
         )
 
 
-def _check_result(result: Estimate, log: FlightLog) -> None:
+def _check_result(result: Estimate, log: FlightLog, judged: np.ndarray) -> None:
     """Raise FitError where the best model is no model of a drone."""
     values = dict(zip(names_of(result.model), to_vector(result.model), strict=True))
     for name in TAUS:
@@ -319,7 +319,7 @@ def _check_result(result: Estimate, log: FlightLog) -> None:
             )
     if "w" in result.noise:
         for axis, column in enumerate(CHANNELS["w"]):
-            left, measured = result.noise["w"][axis], result.measured["w"][axis]
+            left, measured = result.noise["w"][axis], np.sqrt(np.mean(np.square(log["w"][judged, axis])))
             if TAUS[axis] in result.free and left > AT_BOUND * measured:
                 raise FitError(
                     f"{log.source}: {column}: the model leaves more ({left:.3g} rad/s rms) than was measured "

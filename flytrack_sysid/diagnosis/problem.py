@@ -17,7 +17,7 @@ channel   residual of a row                                                     
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self
 
 import jax
 import jax.numpy as jnp
@@ -151,7 +151,7 @@ class Problem:
         model: ModelParameters,
         effects: Sequence[Effect] = SEARCHED,
         late: Late | None = None,
-    ) -> "Problem":
+    ) -> Self:
         """Return the problem of lanes and a nominal model that may have some effects, without a noise."""
         model = as_replayed(model)
         every = model.with_effects(*(model.effect(effect.name) for effect in effects))

@@ -4,6 +4,7 @@ from dataclasses import replace
 from types import SimpleNamespace
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.signal import lfilter
@@ -25,7 +26,7 @@ from flytrack_sysid.diagnosis.summary import stand_in_notes, warnings_of, with_r
 from flytrack_sysid.diagnosis.vetoes import Selection
 from flytrack_sysid.parameters import THRUST_COEFFS
 from flytrack_sysid.record import make_record
-from flytrack_sysid.residuals import predict_rows
+from flytrack_sysid.replay import Step, replay
 from tests.support.hidden_flights import scripted
 
 SECONDS, DT_S = 40.0, 0.01
@@ -126,6 +127,11 @@ def test_lanes_are_only_where_something_is_judged(flown):
     assert (np.diff(lead_in[:, :5], axis=0) == 1).all()  # flown for real, also where it is not judged
 
 
+def predictions(step: Step, _: None) -> tuple[jax.Array, ...]:
+    """Return the body rates, specific force and acceleration after a step."""
+    return tuple(map(jnp.stack, (step.after.rates_b, step.moved.context.force_b, step.after.acc_w)))
+
+
 def test_lanes_agree_with_one_long_replay(flown, lanes):
     truth, log = flown
     model = model_of(truth).with_effects(
@@ -136,14 +142,15 @@ def test_lanes_agree_with_one_long_replay(flown, lanes):
         left = problem.residuals(problem.start[None])[0]
         like = jax.tree.map(lambda leaf: np.asarray(leaf, float), model)
         record = make_record(log)
-        predicted = jax.tree.map(np.asarray, jax.jit(predict_rows)(like, record, record.begins))
+        later = jax.jit(lambda: replay(like, record, "commanded", None, predictions))()
+        rates_b, force_b, acc_w = (np.roll(np.asarray(one), 1, axis=0) for one in later)
     before = Rotation.from_quat(np.roll(record.quat, 1, axis=0), scalar_first=True)
     source = record.source_row
     expected = {
-        (0, 0): before.apply(log["w"][source] - predicted.rates_b),
-        (3, 0): before.apply(log["f"][source] - predicted.force_b),
+        (0, 0): before.apply(log["w"][source] - rates_b),
+        (3, 0): before.apply(log["f"][source] - force_b),
         (3, 1): np.diff(record.vel_w, axis=0, prepend=record.vel_w[:1])
-        - predicted.acc_w * np.roll(record.step_s, 1)[:, None],
+        - acc_w * np.roll(record.step_s, 1)[:, None],
     }
     for (axis, channel), one in expected.items():
         axes = slice(axis, axis + 3)

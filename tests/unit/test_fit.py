@@ -4,13 +4,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from flytrack_env.dynamics import collective_thrust
 from flytrack_sysid import FitError, fit
+from flytrack_sysid.estimate import estimate
 from flytrack_sysid.fit import Fit
 from flytrack_sysid.log import FlightLog
 from flytrack_sysid.parameters import BASE, DRAIN, TAUS, THRUST_COEFFS, to_vector
 from flytrack_sysid.sensors import measure
+from flytrack_sysid.split import held_out_rows
 from tests.support.handout_plant import GRAVITY, HandoutPlant, excited
 
 PLANT = HandoutPlant()
@@ -59,6 +62,34 @@ def test_truth_is_found_from_fewer_channels(exact, absent, tolerance):
     """Without the applied action each flight begins with a guess that fades."""
     found = fit(exact.without(*absent))
     assert tau_error(found) < tolerance and map_error(found) < tolerance
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "shape", [{"skip": 2}, {"repeat": 5}, {"jitter": 0.4}], ids=["50 Hz", "500 Hz", "uneven"]
+)
+def test_truth_is_found_at_other_steps(shape):
+    found = fit(excited(PLANT, **shape))
+    assert tau_error(found) < 1e-6 and map_error(found) < 1e-6
+
+
+@pytest.mark.parametrize("is_one_flight", [False, True])
+def test_held_out_measurements_do_not_enter(noisy, is_one_flight):
+    """Nor do they where blocks are cut from one flight: no step is judged that began in a held-out row."""
+    log = noisy
+    if is_one_flight:
+        log = replace(log, time=np.arange(len(log)) * 0.01, segment=np.zeros(len(log), int))
+    judged = ~held_out_rows(log)
+    rng = np.random.default_rng(0)
+    spoilt = {name: values.copy() for name, values in log.channels.items()}
+    for name in ("p", "v", "f", "w", "v_bat"):
+        spoilt[name][~judged] += rng.normal(size=spoilt[name][~judged].shape)
+    spoilt["q"][~judged] = Rotation.random(int((~judged).sum()), rng).as_quat(scalar_first=True)
+    logs = (log, replace(log, channels=spoilt))
+    before, after = (estimate(one, judged, PLANT.model(), (*TAUS[2:], "c0")) for one in logs)
+    np.testing.assert_allclose(to_vector(after.model), to_vector(before.model), rtol=1e-7)
+    for name, left in before.noise.items():
+        np.testing.assert_allclose(after.noise[name], left, rtol=1e-6, err_msg=name)
 
 
 def test_intervals_hold_the_truth(fitted):
