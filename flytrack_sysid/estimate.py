@@ -1,7 +1,8 @@
 """Least squares over all channels of a log, each weighted by the noise that it turns out to have.
 
-A fit replays a log and searches as the diagnosis does, but weights each component by one noise, and sums steps
-up in short windows: so positions count without velocities, and what a model lacks has no part in the weights.
+A fit replays a log and searches as the diagnosis does, but weights each component by one noise, and sums
+steps up in short windows: so positions count without velocities, and what a model lacks has no part in the
+weights.
 
 ========  ==============================================================================  =======
 channel   residual                                                                        unit
