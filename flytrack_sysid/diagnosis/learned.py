@@ -15,7 +15,14 @@ from flytrack_env.effects.learned_residual import Network, Networks
 from flytrack_sysid.diagnosis.beyond import Learned
 from flytrack_sysid.diagnosis.law_search import LEAST_EXPECTED, Found, Side, find_law, uses_time
 from flytrack_sysid.diagnosis.problem import Problem
-from flytrack_sysid.diagnosis.refinement import LIKELY_WORSE, WORSE_ANYWHERE, Judge, errors_at, sureness
+from flytrack_sysid.diagnosis.refinement import (
+    LIKELY,
+    LIKELY_WORSE,
+    WORSE_ANYWHERE,
+    Judge,
+    errors_at,
+    sureness,
+)
 from flytrack_sysid.diagnosis.residual_fit import Residual, fit_residual
 from flytrack_sysid.diagnosis.search import FittedModel
 from flytrack_sysid.diagnosis.unexplained import (
@@ -124,6 +131,8 @@ def _predicts(
     scale = np.maximum(np.nan_to_num(tested[0].rms()[0], nan=1.0), 1e-9)
     ratio = tested[1].rms()[0] / scale
     lost = sureness(tested[1].by_block(scale)[0] - tested[0].by_block(scale)[0])
-    is_worse = judge.is_known & (ratio > LIKELY_WORSE) & (lost > WORSE_ANYWHERE)
     is_better = float(np.mean(ratio[judge.is_known] ** 2)) < 1.0
+    # What makes flights in all no better has to be as good at every horizon.
+    worst = WORSE_ANYWHERE if is_better else LIKELY
+    is_worse = judge.is_known & (ratio > LIKELY_WORSE) & (lost > worst)
     return not is_worse.any() and (is_better or not acts_there)
