@@ -5,7 +5,8 @@ from flytrack_env.extras import check_installed
 check_installed("bench", "benchmarks", "safetensors", "optax", "distrax", "scipy", "matplotlib", "tqdm")
 
 from flytrack_bench.policies import Policy, PolicyError, load_policy
-from flytrack_bench.results import Data, DataError, diagnose_and_retrain, differences, run
+from flytrack_bench.results import Data, DataError, differences, run
+from flytrack_bench.retrain import diagnose_and_retrain
 from flytrack_bench.suite import Suite, SuiteError, Task, load_suite
 
 __all__ = [

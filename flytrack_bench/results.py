@@ -1,24 +1,20 @@
 """Running a suite: every task flown, with data to adapt to it if asked, and what a result file says of it."""
 
-import tempfile
 import time
 from collections.abc import Callable, Sequence
 from importlib.metadata import version
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from scipy import stats
 
-from baselines.purejaxrl_ppo import Config
 from baselines.purejaxrl_ppo.flights import fly_many, race_many, score, start_keys
 from baselines.purejaxrl_ppo.networks import Policy as NetworkPolicy
 from baselines.purejaxrl_ppo.race_env import with_model_as_given
-from baselines.purejaxrl_ppo.training import train_policy
-from flytrack_bench.policies import Policy, policy_of
+from flytrack_bench.policies import Policy
 from flytrack_bench.suite import Suite, Task
 from flytrack_loop.stages import BATCH, log_of_flights, rounded
-from flytrack_sysid import FlightLog, diagnose
+from flytrack_sysid import FlightLog
 
 SCHEMA = 1
 DRAWS, COVERED = 2000, 0.95  # of the bootstrap
@@ -63,18 +59,6 @@ class Data:
 
 
 Adapt = Callable[[Data, Policy], Policy]
-
-
-def diagnose_and_retrain(data: Data, policy: Policy) -> Policy:
-    """Return a policy trained from scratch, by the default recipe, on the extended model of a plant.
-
-    The data of the plant are diagnosed to extend the model. policy: flies all the data
-    that are left. Flights are of its own seed, that of the training is 0.
-    """
-    found = diagnose(data.fly(policy, data.seconds_left))
-    with tempfile.TemporaryDirectory() as folder:
-        checkpoint, _ = train_policy(Path(folder) / "retrained", Config(), seed=0, model=found.extended)
-    return policy_of(checkpoint, f"{policy.name}, retrained")
 
 
 def fly_task(task: Task, suite: Suite, policy: Policy) -> dict[str, float | None]:
