@@ -38,7 +38,8 @@ from flytrack_sysid.diagnosis.score_test import (
     solve,
     threshold,
 )
-from flytrack_sysid.diagnosis.summary import effect_causes, is_notable, mean_factor, mean_thrust, verdict_of
+from flytrack_sysid.diagnosis.size import is_notable
+from flytrack_sysid.diagnosis.summary import effect_causes, mean_factor, mean_thrust, verdict_of
 from flytrack_sysid.diagnosis.unexplained import find_unexplained
 from flytrack_sysid.diagnosis.vetoes import Selection
 from flytrack_sysid.log import FlightLog

@@ -14,14 +14,17 @@ from flytrack_sysid.clocks import on_one_clock, with_causal_commands
 from flytrack_sysid.diagnosis import summary
 from flytrack_sysid.diagnosis.beyond import with_and_without, with_learned
 from flytrack_sysid.diagnosis.lanes import Lanes, lanes_of, thinned, voltages_of
+from flytrack_sysid.diagnosis.late_poses import with_late_poses
 from flytrack_sysid.diagnosis.lateness import judged_as_logged, latency_of, read_poses
 from flytrack_sysid.diagnosis.learned import find_learned
 from flytrack_sysid.diagnosis.motion_choice import Moves, how_it_moves, likelier_motion
 from flytrack_sysid.diagnosis.onset import at_end, first_row_as_at_end, notes_of, spans_of, with_changes
+from flytrack_sysid.diagnosis.outliers import outlier_notes, outliers_of
 from flytrack_sysid.diagnosis.problem import Problem
 from flytrack_sysid.diagnosis.refinement import Refined, reduced, refine
 from flytrack_sysid.diagnosis.result import Cause, Diagnosis
 from flytrack_sysid.diagnosis.search import SearchState, search
+from flytrack_sysid.diagnosis.size import split_by_size
 from flytrack_sysid.diagnosis.vetoes import (
     Selection,
     Veto,
@@ -96,7 +99,7 @@ def diagnose(
         found = replace(found, nominal=nominal)
         if parts.as_logged or latency_of(nominal):
             problems = selection.state.problem, test
-            found = summary.with_late_poses(found, parts.moves, nominal, problems, parts.as_logged)
+            found = with_late_poses(found, parts.moves, nominal, problems, parts.as_logged)
         report(4, len(STAGES))
     return found
 
@@ -239,11 +242,11 @@ def summarize(judged: Judged, parts: Split) -> Diagnosis:
             return summary.vector_without(cause, selection, linearization)
         return refined.vector_without(cause.effect)
 
-    found, negligible = summary.split_by_size(found, problem, extended.vector, refined.flight_errors, without)
+    found, negligible = split_by_size(found, problem, extended.vector, refined.flight_errors, without)
     causes = tuple(one for one in found if not one.beyond)
     beyond = (*judged.refused, *(one for one in found if one.beyond))
     vectors = {"nominal": problem.start, "refitted_base": selection.base.vector, "extended": extended.vector}
-    outliers = summary.outliers_of((problem, test), extended.vector)
+    outliers = outliers_of((problem, test), extended.vector)
     extended = at_end(selection, extended)
     flying = {**vectors, "extended": extended.vector}
     learned, judged_by = None, (test, refined)
@@ -261,7 +264,7 @@ def summarize(judged: Judged, parts: Split) -> Diagnosis:
     limits = summary.not_identifiable(state, linearization, model, (*found, *negligible))
     prediction = summary.prediction_of(judged_by[1], flying)
     notes = [
-        *summary.outlier_notes(outliers),
+        *outlier_notes(outliers),
         *summary.warnings_of(problem, (*causes, *beyond), lost),
         *summary.refinement_notes(refined, selection.model),
         *summary.stand_in_notes(selection, flying["extended"]),

@@ -1,17 +1,15 @@
 """From a selected model to a diagnosis: causes with intervals, limits, errors on held-out rows, warnings."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
-from scipy import stats
 
 from flytrack_env.dynamics import ModelParameters, collective_thrust
-from flytrack_env.effects import BY_NAME, MocapLatency, effect_of
+from flytrack_env.effects import BY_NAME, effect_of
 from flytrack_sysid.diagnosis import vetoes
 from flytrack_sysid.diagnosis.identifiability import advise, unit_of, unseen_effects
-from flytrack_sysid.diagnosis.lanes import Lanes, voltages_of
-from flytrack_sysid.diagnosis.lateness import latency_of
+from flytrack_sysid.diagnosis.lanes import voltages_of
 from flytrack_sysid.diagnosis.model_selection import (
     BaseChange,
     Marginal,
@@ -19,9 +17,7 @@ from flytrack_sysid.diagnosis.model_selection import (
     equivalents,
     separation,
 )
-from flytrack_sysid.diagnosis.motion_choice import STANDARD_ERRORS, Moves
-from flytrack_sysid.diagnosis.noise import OUTLIER
-from flytrack_sysid.diagnosis.problem import Problem, robust_square, vector_of
+from flytrack_sysid.diagnosis.problem import Problem
 from flytrack_sysid.diagnosis.refinement import Refined, at_bounds, errors_at, table_of
 from flytrack_sysid.diagnosis.result import (
     CAUSES_FOUND,
@@ -32,18 +28,16 @@ from flytrack_sysid.diagnosis.result import (
     UNEXPLAINED,
     Cause,
     Changed,
-    Diagnosis,
     Errors,
     Estimated,
     HalfResponse,
     NotIdentifiable,
-    Outliers,
     Prediction,
     Unexplained,
 )
 from flytrack_sysid.diagnosis.score_test import BASE_CAUSES, Linearization, solve, threshold
 from flytrack_sysid.diagnosis.search import FittedModel, SearchState
-from flytrack_sysid.parameters import DRAIN, MAX_RATES, STICKS, TAUS, THRUST_COEFFS, as_float32, from_vector
+from flytrack_sysid.parameters import DRAIN, MAX_RATES, STICKS, THRUST_COEFFS, as_float32, from_vector
 from flytrack_sysid.parameters import unit_of as unit_of_parameter
 from flytrack_sysid.prediction_windows import HORIZONS_S, QUANTITIES
 from flytrack_sysid.record import BATTERY_UNKNOWN_V
@@ -54,17 +48,6 @@ LOOSE = 0.5  # of the prior's width: a parameter that the log knows no better is
 SCALE_TWINS = ("thrust_curve",)  # mass, payload, battery and motors all scale the thrust over the mass
 SLOPE_STEP = 1e-3  # of a parameter's scale, for slopes of times to half response
 STILL = (*MAX_RATES, DRAIN, *THRUST_COEFFS)  # a model where these are 0 does not move
-# What makes a cause matter.
-LEAST_COST = 0.02  # of the error of free flight, held out
-NOTABLE_LAG_S = 0.005  # as of the effects that delay
-NOTABLE_THRUST = 0.02  # of the weight, as of a scale of thrust
-NOTABLE_DRAIN = 0.2  # V/min: a tenth of a battery in a minute
-# Of outliers.
-LONGEST_RUN = 3  # rows: the filter that whitens takes in part of an outlier and gives it back
-OUTLIERS_BY_CHANCE = 1e-6  # of so many, were the noise normal
-LEAST_OUTLIERS = 1e-3  # of rows: fewer change nothing
-LATENCY = BY_NAME["mocap_latency"]
-LATENCIES = LATENCY.ranges["latency_s"]
 
 
 def estimates(
@@ -595,155 +578,3 @@ def with_lost_causes(rest: Unexplained, contradicted: Sequence[str]) -> Unexplai
     if not contradicted or "time" in rest.depends_on:
         return rest
     return replace(rest, flagged=True, depends_on=(*rest.depends_on, "time"))
-
-
-def split_by_size(
-    causes: Sequence[Cause],
-    problem: Problem,
-    vector: np.ndarray,
-    flight_error: Callable[[np.ndarray], Mapping[str, float]],
-    without: Callable[[Cause], np.ndarray],
-) -> tuple[tuple[Cause, ...], tuple[Cause, ...]]:
-    """Return the causes that matter, and those that are negligible: significant, but too small for a name.
-
-    A cause matters where a parameter departs from what the nominal model has by a notable size (an effect's
-    ``notable``; for the base, the sizes here), or where flight without it, all else refitted, ends at least
-    2 % farther off on held-out rows.
-
-    vector: the extended model. flight_error: of a vector, by horizon, on held-out rows; empty where the log
-    cannot show it. without: the vector that is refitted without a cause.
-    """
-    small = [cause for cause in causes if not is_notable(cause.effect, problem, vector)]
-    full = flight_error(vector) if small else {}
-    negligible = []
-    for cause in small:
-        less = flight_error(without(cause))
-        if all(less[horizon] < (1.0 + LEAST_COST) * full[horizon] for horizon in full):
-            negligible.append(cause)
-    return tuple(cause for cause in causes if cause not in negligible), tuple(negligible)
-
-
-def is_notable(name: str, problem: Problem, vector: np.ndarray) -> bool:
-    """Return whether a cause departs from the nominal model by a size that matters."""
-    if name == "thrust_scale" and "thrust_scale.factor" in problem.names:
-        change = _change(problem, vector, ["thrust_scale.factor"])[0]
-        if abs(change) >= BY_NAME[name].notable["factor"]:
-            return True
-        name = "thrust_curve"  # found as one factor between two curves
-    if name in BASE_CAUSES:
-        return _is_base_notable(BASE_CAUSES[name], problem, vector)
-    notable = BY_NAME[name].notable
-    changes = _change(problem, vector, [f"{name}.{field}" for field in notable])
-    return bool(np.any(np.abs(changes) >= list(notable.values())))
-
-
-def _change(problem: Problem, vector: np.ndarray, fields: Sequence[str]) -> np.ndarray:
-    places = problem.index(fields)
-    return vector[places] - problem.start[places]
-
-
-def _is_base_notable(fields: Sequence[str], problem: Problem, vector: np.ndarray) -> bool:
-    if fields == THRUST_COEFFS:
-        stick, volt = problem.lanes.record.command[..., 3], problem.lanes.record.battery_v
-        more = collective_thrust(stick, volt, _change(problem, vector, fields))
-        weight = float(problem.like.m) * float(problem.like.g)
-        return bool(np.sqrt(np.mean(np.square(more))) >= NOTABLE_THRUST * weight)
-    sizes = {**dict.fromkeys(TAUS, NOTABLE_LAG_S), DRAIN: NOTABLE_DRAIN}
-    changes = _change(problem, vector, fields)
-    return bool(np.any(np.abs(changes) >= [sizes[field] for field in fields]))
-
-
-def outliers_of(problems: Sequence[Problem], vector: np.ndarray) -> dict[str, Outliers]:
-    """Return the outliers of a model's residuals by channel, of those that have some.
-
-    Rows far beyond the noise, by themselves, and more than chance brings about. They count by their size
-    instead of its square (``problem.robust_weight``), so that a few do no harm; a reader has to know of them
-    all the same. Errors of a model last, so only runs of a few rows count.
-
-    problems: with a noise; their rows are counted together.
-    """
-    parts = [(problem.whitened_residuals(vector)[0], problem.counts) for problem in problems]
-    found = {}
-    for name, (axes, side) in PLACES.items():
-        number = sum(int(counts[:, :, axes, side].any(axis=-1).sum()) for _, counts in parts)
-        far = [np.abs(white[:, :, axes, side]).max(axis=-1) > OUTLIER for white, _ in parts]
-        alone = sum(_short_runs(each) for each in far)
-        by_chance = number * (axes.stop - axes.start) * 2.0 * stats.norm.sf(OUTLIER)
-        if alone > LEAST_OUTLIERS * number and stats.poisson.sf(alone - 1, by_chance) < OUTLIERS_BY_CHANCE:
-            found[name] = Outliers(alone, number)
-    return found
-
-
-def _short_runs(is_far: np.ndarray) -> int:
-    """Return how many rows, (rows, lanes) bool, lie in runs of at most ``LONGEST_RUN``."""
-    edges = np.diff(np.pad(is_far, ((1, 1), (0, 0))).astype(int), axis=0)
-    starts, ends = (np.argwhere(sign == edges.T)[:, 1] for sign in (1, -1))
-    lengths = ends - starts
-    return int(lengths[lengths <= LONGEST_RUN].sum())
-
-
-def outlier_notes(outliers: Mapping[str, Outliers]) -> list[str]:
-    """Return a sentence on the outliers; none where there are none."""
-    if not outliers:
-        return []
-    listed = ", ".join(f"{one.rows} of {one.of} rows of {name}" for name, one in outliers.items())
-    return [f"outliers, beyond {OUTLIER:g} times the noise, count less: {listed}"]
-
-
-def gain_in_time(problem: Problem, as_logged: Lanes, vector: np.ndarray) -> float:
-    """Return what poses in time gain over logged ones, of minus twice the log likelihood, not refitted."""
-    noise, counts = problem.noise, problem.counts & as_logged.counts
-
-    assert noise is not None, "with_noise comes first"
-
-    def cost(one: Problem) -> float:
-        judged = replace(one, lanes=one.lanes._replace(counts=counts)).with_noise(noise)
-        return robust_square(judged.whitened_residuals(vector)[0])
-
-    return cost(replace(problem, lanes=as_logged, late=None)) - cost(problem)
-
-
-def with_late_poses(
-    found: Diagnosis,
-    moves: Moves,
-    given: ModelParameters,
-    problems: Sequence[Problem],
-    logged: Sequence[Lanes],
-) -> Diagnosis:
-    """Return a diagnosis of corrected poses with how late they were, as a cause where it matters.
-
-    given: the nominal model. problems: learnt from and judged by; logged: the lanes of each as logged.
-    """
-    before_s, late_s, sigma_s = latency_of(given), min(moves.late_s, LATENCIES.high), moves.sigma_s
-    if not late_s and not before_s:
-        return found
-    base = found.base.with_effects(MocapLatency(np.float32(before_s)))
-    extended = found.extended.with_effects(MocapLatency(np.float32(late_s)))
-    found = replace(found, base=base, extended=extended)
-    name, unit = "mocap_latency.latency_s", LATENCIES.unit
-    latency = Estimated.around(late_s, TWO_SIDED_95 * sigma_s, unit, LATENCIES.low)
-    if abs(late_s - before_s) <= STANDARD_ERRORS * sigma_s:
-        return found
-    gains = [gain_in_time(*pair, vector_of(extended)) for pair in zip(problems, logged, strict=True)]
-    size = float((late_s - before_s) / max(sigma_s, 1e-6)) ** 2
-    cause = Cause(
-        effect=LATENCY.name,
-        equivalent=(),
-        channel="attitude",
-        parameters={"latency_s": latency},
-        chi2_gain=gains[0],
-        heldout_gain=gains[1],
-        lambda_=size,
-        lambda_sep=size,
-        beyond=f"latency_s at least {late_s:.3g} s" if moves.late_s > LATENCIES.high else "",
-    )
-    changed = Changed(name, before_s, late_s, latency.ci95, unit, bool(cause.beyond))
-    found = replace(found, changed=(*found.changed, changed))
-    if abs(late_s - before_s) < LATENCY.notable["latency_s"]:
-        return replace(found, negligible=(cause, *found.negligible))
-    if cause.beyond:
-        rest = replace(found.unexplained, flagged=True)
-        found = replace(found, beyond=(cause, *found.beyond), unexplained=rest)
-    else:
-        found = replace(found, causes=(cause, *found.causes))
-    return replace(found, verdict=verdict_of(found.causes, found.unexplained))

@@ -1,0 +1,77 @@
+"""Late poses as a cause: what the correction of the log was, with its interval and what it gains."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from flytrack_env.dynamics import ModelParameters
+from flytrack_env.effects import BY_NAME, MocapLatency
+from flytrack_sysid.diagnosis.lanes import Lanes
+from flytrack_sysid.diagnosis.lateness import latency_of
+from flytrack_sysid.diagnosis.motion_choice import STANDARD_ERRORS, Moves
+from flytrack_sysid.diagnosis.problem import Problem, robust_square, vector_of
+from flytrack_sysid.diagnosis.result import Cause, Changed, Diagnosis, Estimated
+from flytrack_sysid.diagnosis.summary import TWO_SIDED_95, verdict_of
+
+EFFECT = BY_NAME["mocap_latency"]
+BOUNDS = EFFECT.ranges["latency_s"]
+
+
+def gain_of(problem: Problem, as_logged: Lanes, vector: np.ndarray) -> float:
+    """Return what poses in time gain over logged ones, of minus twice the log likelihood, not refitted."""
+    noise, counts = problem.noise, problem.counts & as_logged.counts
+
+    assert noise is not None, "with_noise comes first"
+
+    def cost(one: Problem) -> float:
+        judged = replace(one, lanes=one.lanes._replace(counts=counts)).with_noise(noise)
+        return robust_square(judged.whitened_residuals(vector)[0])
+
+    return cost(replace(problem, lanes=as_logged, late=None)) - cost(problem)
+
+
+def with_late_poses(
+    found: Diagnosis,
+    moves: Moves,
+    given: ModelParameters,
+    problems: Sequence[Problem],
+    logged: Sequence[Lanes],
+) -> Diagnosis:
+    """Return a diagnosis of corrected poses with how late they were, as a cause where it matters.
+
+    given: the nominal model. problems: learnt from and judged by; logged: the lanes of each as logged.
+    """
+    before_s, late_s, sigma_s = latency_of(given), min(moves.late_s, BOUNDS.high), moves.sigma_s
+    if not late_s and not before_s:
+        return found
+    base = found.base.with_effects(MocapLatency(np.float32(before_s)))
+    extended = found.extended.with_effects(MocapLatency(np.float32(late_s)))
+    found = replace(found, base=base, extended=extended)
+    name, unit = "mocap_latency.latency_s", BOUNDS.unit
+    latency = Estimated.around(late_s, TWO_SIDED_95 * sigma_s, unit, BOUNDS.low)
+    if abs(late_s - before_s) <= STANDARD_ERRORS * sigma_s:
+        return found
+    gains = [gain_of(*pair, vector_of(extended)) for pair in zip(problems, logged, strict=True)]
+    size = float((late_s - before_s) / max(sigma_s, 1e-6)) ** 2
+    cause = Cause(
+        effect=EFFECT.name,
+        equivalent=(),
+        channel="attitude",
+        parameters={"latency_s": latency},
+        chi2_gain=gains[0],
+        heldout_gain=gains[1],
+        lambda_=size,
+        lambda_sep=size,
+        beyond=f"latency_s at least {late_s:.3g} s" if moves.late_s > BOUNDS.high else "",
+    )
+    changed = Changed(name, before_s, late_s, latency.ci95, unit, bool(cause.beyond))
+    found = replace(found, changed=(*found.changed, changed))
+    if abs(late_s - before_s) < EFFECT.notable["latency_s"]:
+        return replace(found, negligible=(cause, *found.negligible))
+    if cause.beyond:
+        rest = replace(found.unexplained, flagged=True)
+        found = replace(found, beyond=(cause, *found.beyond), unexplained=rest)
+    else:
+        found = replace(found, causes=(cause, *found.causes))
+    return replace(found, verdict=verdict_of(found.causes, found.unexplained))

@@ -1,0 +1,74 @@
+"""Whether a cause matters: what is significant may still be too small to be worth a name.
+
+A cause matters where a parameter departs from what the nominal model has by a notable size (an effect's
+``notable``; for the base, the sizes here), or where flight without it, all else refitted, ends at least 2 %
+farther off on held-out rows.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+
+import numpy as np
+
+from flytrack_env.dynamics import collective_thrust
+from flytrack_env.effects import BY_NAME
+from flytrack_sysid.diagnosis.problem import Problem
+from flytrack_sysid.diagnosis.result import Cause
+from flytrack_sysid.diagnosis.score_test import BASE_CAUSES
+from flytrack_sysid.parameters import DRAIN, TAUS, THRUST_COEFFS
+
+LEAST_COST = 0.02  # of the error of free flight, held out
+NOTABLE_LAG_S = 0.005  # as of the effects that delay
+NOTABLE_THRUST = 0.02  # of the weight, as of a scale of thrust
+NOTABLE_DRAIN = 0.2  # V/min: a tenth of a battery in a minute
+
+
+def split_by_size(
+    causes: Sequence[Cause],
+    problem: Problem,
+    vector: np.ndarray,
+    flight_error: Callable[[np.ndarray], Mapping[str, float]],
+    without: Callable[[Cause], np.ndarray],
+) -> tuple[tuple[Cause, ...], tuple[Cause, ...]]:
+    """Return the causes that matter, and those that are negligible.
+
+    vector: the extended model. flight_error: of a vector, by horizon, on held-out rows; empty where the log
+    cannot show it. without: the vector that is refitted without a cause.
+    """
+    small = [cause for cause in causes if not is_notable(cause.effect, problem, vector)]
+    full = flight_error(vector) if small else {}
+    negligible = []
+    for cause in small:
+        less = flight_error(without(cause))
+        if all(less[horizon] < (1.0 + LEAST_COST) * full[horizon] for horizon in full):
+            negligible.append(cause)
+    return tuple(cause for cause in causes if cause not in negligible), tuple(negligible)
+
+
+def is_notable(name: str, problem: Problem, vector: np.ndarray) -> bool:
+    """Return whether a cause departs from the nominal model by a size that matters."""
+    if name == "thrust_scale" and "thrust_scale.factor" in problem.names:
+        change = _change(problem, vector, ["thrust_scale.factor"])[0]
+        if abs(change) >= BY_NAME[name].notable["factor"]:
+            return True
+        name = "thrust_curve"  # found as one factor between two curves
+    if name in BASE_CAUSES:
+        return _is_base_notable(BASE_CAUSES[name], problem, vector)
+    notable = BY_NAME[name].notable
+    changes = _change(problem, vector, [f"{name}.{field}" for field in notable])
+    return bool(np.any(np.abs(changes) >= list(notable.values())))
+
+
+def _change(problem: Problem, vector: np.ndarray, fields: Sequence[str]) -> np.ndarray:
+    places = problem.index(fields)
+    return vector[places] - problem.start[places]
+
+
+def _is_base_notable(fields: Sequence[str], problem: Problem, vector: np.ndarray) -> bool:
+    if fields == THRUST_COEFFS:
+        stick, volt = problem.lanes.record.command[..., 3], problem.lanes.record.battery_v
+        more = collective_thrust(stick, volt, _change(problem, vector, fields))
+        weight = float(problem.like.m) * float(problem.like.g)
+        return bool(np.sqrt(np.mean(np.square(more))) >= NOTABLE_THRUST * weight)
+    sizes = {**dict.fromkeys(TAUS, NOTABLE_LAG_S), DRAIN: NOTABLE_DRAIN}
+    changes = _change(problem, vector, fields)
+    return bool(np.any(np.abs(changes) >= [sizes[field] for field in fields]))
