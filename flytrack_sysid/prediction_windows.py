@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from flytrack_env.dynamics import ModelParameters, advance, body_rates, observe_rates, read_gyro
-from flytrack_env.effects import MOST_STEPS, ImuLatency, at_time, start_memories
+from flytrack_env.effects import MOST_STEPS, ImuLatency, at_row, start_memories
 from flytrack_env.quaternion import Quaternion, Vec3
 from flytrack_env.state import Action, Drone
 from flytrack_sysid.log import FlightLog, usual_step
@@ -155,7 +155,7 @@ def _fly(model: ModelParameters, record: Record, gyro_b: jax.Array, windows: Win
     def one(carry: tuple[Drone, Any], inputs: tuple[Record, Any, Any]) -> tuple[Any, Any]:
         (flown, memories), (row, is_free, gyro) = carry, inputs
         applied = where_true(row.is_applied_known, Action(*row.applied), flown.applied)
-        memories = at_time(memories, row.time_s)
+        memories = at_row(memories, row.time_s, row.load)
         drone = where_true(is_free, flown, measured_drone(row, applied, flown.rates_b))
         beside = Vec3(*gyro) - read_gyro(drone, memories, row.step_s, in_time)
         seen = observe_rates(drone, memories, drone.rates_b + beside, row.step_s, model)

@@ -38,7 +38,8 @@ class Record(NamedTuple):
     pos_w, vel_w: (num_rows, 3). quat: (num_rows, 4). battery_v: (num_rows,). Where a channel is absent:
     0, upright, 23 V.
     piece: (num_rows,) int, numbers of stretches of at most 2.5 s, none across blocks. time_s: (num_rows,) s,
-    since the log began, of several each.
+    since the log began, of several each. load: (num_rows, 4), as in ``pendulum.Pendulum``, of a load on a
+    string; not a number where it is not known.
     """
 
     source_row: np.ndarray
@@ -54,6 +55,7 @@ class Record(NamedTuple):
     battery_v: np.ndarray
     piece: np.ndarray
     time_s: np.ndarray
+    load: np.ndarray
 
 
 def _new_times(log: FlightLog, usual: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -153,6 +155,7 @@ def record_of(filled: Filled) -> Record:
         battery_v=log["v_bat"][:, 0] if "v_bat" in log else zeros[:, 0] + BATTERY_UNKNOWN_V,
         piece=np.zeros(len(log), int),
         time_s=log.time - log.time[np.flatnonzero(is_first_row)][np.cumsum(is_first_row) - 1],
+        load=np.full((len(log), 4), np.nan),
     )
 
 

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from flytrack_env.dynamics import ModelParameters, Moved, body_rates, move, start_rates
-from flytrack_env.effects import MOST_STEPS, at_time, start_memories
+from flytrack_env.effects import MOST_STEPS, at_row, start_memories
 from flytrack_env.quaternion import Quaternion, Vec3
 from flytrack_env.state import Action, Drone
 from flytrack_sysid.record import Record
@@ -90,7 +90,7 @@ def replay(
         # As logged, which it is where a flight begins: past commands then depend on no model of a batch.
         begun = before._replace(applied=Action(*row.applied))
         memories = where_true(row.begins, start_memories(model.effects, begun, MOST_STEPS), memories)
-        memories = at_time(memories, row.time_s)
+        memories = at_row(memories, row.time_s, row.load)
         moved = move(before, memories, Action(*row.command), row.step_s, model)
         later = moved.after.applied, moved.after.rates_b, moved.memories
         return later, observe(Step(row, before, memories, moved), extra)

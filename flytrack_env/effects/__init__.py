@@ -4,17 +4,21 @@ The simulator folds them, the fit and the diagnosis free their parameters, domai
 them, the documentation lists them. A new effect is a file here and a line in ``EFFECTS``.
 """
 
+from functools import partial
 from typing import Any
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 
 from flytrack_env.effects.accelerometer_bias import ACCELEROMETER_BIAS, AccelerometerBias
 from flytrack_env.effects.accelerometer_scale import ACCELEROMETER_SCALE, AccelerometerScale
 from flytrack_env.effects.actual_rates import ACTUAL_RATES, ActualRates
-from flytrack_env.effects.base import STAGES, Effect, FlightTime, Pose, Range, StepContext
+from flytrack_env.effects.base import STAGES, Effect, Pose, Range, StepContext
 from flytrack_env.effects.betaflight_loop import BETAFLIGHT_LOOP, BetaflightLoop
 from flytrack_env.effects.betaflight_rates import BETAFLIGHT_RATES, BetaflightRates
 from flytrack_env.effects.command_delay import COMMAND_DELAY, MOST_STEPS, USUAL_STEPS, CommandDelay
+from flytrack_env.effects.grammar import Flight
 from flytrack_env.effects.ground_effect import GROUND_EFFECT, GroundEffect
 from flytrack_env.effects.gyro_bias import GYRO_BIAS, GyroBias
 from flytrack_env.effects.gyro_scale import GYRO_SCALE, GyroScale
@@ -25,6 +29,7 @@ from flytrack_env.effects.learned_residual import LEARNED_RESIDUAL, LearnedResid
 from flytrack_env.effects.linear_drag import LINEAR_DRAG, LinearDrag
 from flytrack_env.effects.mocap_latency import MOCAP_LATENCY, MocapLatency
 from flytrack_env.effects.motor_imbalance import MOTOR_IMBALANCE, MotorImbalance
+from flytrack_env.effects.pendulum import Pendulum
 from flytrack_env.effects.quadratic_drag import QUADRATIC_DRAG, QuadraticDrag
 from flytrack_env.effects.quick_rates import QUICK_RATES, QuickRates
 from flytrack_env.effects.rate_cross_coupling import RATE_CROSS_COUPLING, RateCrossCoupling
@@ -155,9 +160,20 @@ def start_memories(effects: tuple[Any, ...], drone: Drone, delay_steps: int = US
     return tuple(start(parameters) for parameters in effects)
 
 
-def at_time(memories: tuple[Any, ...], time_s: Scalar) -> tuple[Any, ...]:
-    """Return memories of effects at a time since the flight began, s."""
-    return tuple(FlightTime(time_s) if isinstance(one, FlightTime) else one for one in memories)
+def at_row(memories: tuple[Any, ...], time_s: Scalar, load: jax.Array | np.ndarray) -> tuple[Any, ...]:
+    """Return memories of effects at a row of a log: since the flight began, s, and a load on a string.
+
+    load: (4,), as in ``pendulum.Pendulum``; as remembered where the row says nothing of it (not a number).
+    """
+
+    def at(memory: Any) -> Any:
+        if not isinstance(memory, Flight):
+            return memory
+        told = None if memory.load is None else Pendulum(*load)
+        is_told = ~jnp.isnan(load[0])
+        return Flight(time_s, jax.tree.map(partial(jnp.where, is_told), told, memory.load))
+
+    return tuple(at(one) for one in memories)
 
 
 def acts(effects: tuple[Any, ...], stage: str) -> bool:
@@ -285,7 +301,7 @@ __all__ = [
     "Wind",
     "YawReaction",
     "acts",
-    "at_time",
+    "at_row",
     "check_parameters",
     "delay_steps_of",
     "effect_of",

@@ -32,8 +32,6 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
-import jax.numpy as jnp
-
 from flytrack_env.motion import Motion
 from flytrack_env.quaternion import Quaternion, Scalar, Vec3
 from flytrack_env.state import Action, Drone
@@ -62,17 +60,6 @@ class Pose(NamedTuple):
     pos_w: Vec3
     vel_w: Vec3
     quat: Quaternion
-
-
-class FlightTime(NamedTuple):
-    """The memory of an effect that needs the time since the flight began, s; a replay of a log sets it."""
-
-    time_s: Scalar
-
-
-def start_of_flight(drone: Drone) -> FlightTime:
-    """Return the time at which a flight begins."""
-    return FlightTime(jnp.zeros_like(jnp.asarray(drone.battery_v)))
 
 
 class StepContext(NamedTuple):

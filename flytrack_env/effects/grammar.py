@@ -14,14 +14,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from flytrack_env.effects.base import Effect, FlightTime, Range, StepContext, start_of_flight
+from flytrack_env.effects.base import Effect, Range, StepContext
+from flytrack_env.effects.pendulum import SHORTEST_M, Pendulum, hanging, swung
 from flytrack_env.messages import quote_value
 from flytrack_env.quaternion import Scalar, Vec3
-from flytrack_env.state import Action
+from flytrack_env.state import Action, Drone
 
-TINY_SPEED = 0.3  # m/s: slower flight has no direction
+TINY_SPEED, TINY_OFF_M = 0.3, 1e-4  # m/s: slower flight has no direction, nor a load so nearly below
 MOST_TERMS, MOST_FACTORS = 6, 2
-ACTS, FRAMES = ("force", "rate"), ("body", "world", "air")
+ACTS, FRAMES = ("force", "rate"), ("body", "world", "air", "load")
+ALONG = ("air", "load")  # frames of which the first component alone is given
 LARGEST = 1e6  # of any number in a law
 XYZ = 3
 
@@ -29,7 +31,7 @@ XYZ = 3
 class Moment(NamedTuple):
     """What a law may look at, scalars or arrays of one shape; units and frames as in ``StepContext``.
 
-    time_s: since the start of the flight.
+    time_s: since the start of the flight. load: of the law's pendulum; None without one.
     """
 
     pos_w: Vec3
@@ -40,9 +42,17 @@ class Moment(NamedTuple):
     thrust_acc: Scalar
     battery_v: Scalar
     time_s: Scalar
+    load: Pendulum | None = None
 
 
-def moment_of(context: StepContext, time_s: Scalar) -> Moment:
+class Flight(NamedTuple):
+    """The memory of a law: the time since the flight began, s, and the load on its string, if it has one."""
+
+    time_s: Scalar
+    load: Pendulum | None = None
+
+
+def moment_of(context: StepContext, flight: Flight | None) -> Moment:
     """Return what a law may look at, of the context of the stages rates and force."""
     drone = context.drone
     return Moment(
@@ -53,7 +63,7 @@ def moment_of(context: StepContext, time_s: Scalar) -> Moment:
         context.applied,
         context.thrust_acc,
         drone.battery_v,
-        time_s,
+        *(flight or Flight(0.0)),
     )
 
 
@@ -139,6 +149,17 @@ def _place(moment: Moment, x: float, y: float, z: float, radius: float) -> Scala
     return jnp.exp(off.dot(off) * (-0.5 / radius**2))
 
 
+def _off(moment: Moment) -> Vec3:
+    """Return how far the load is off, world, m."""
+    assert moment.load is not None, "a law with a pendulum remembers it"
+    return Vec3(moment.load.off_x, moment.load.off_y, 0.0)
+
+
+def _swing(moment: Moment, length: float, damping: float) -> Scalar:
+    """Return the string's angle to the vertical, if small; rad."""
+    return _off(moment).norm() * (1.0 / length)
+
+
 class Shape(NamedTuple):
     """A shape: the names of its numbers, the words of its formula, the quantities that have it, and itself.
 
@@ -184,6 +205,14 @@ SHAPES: dict[str, Shape] = {
         ("radius",),
         of_moment=True,
     ),
+    "pendulum": Shape(
+        ("length", "damping"),
+        "{q} on {length} m, damped by {damping}/s",
+        ("load",),
+        _swing,
+        ("length", "damping"),
+        of_moment=True,
+    ),
 }
 
 
@@ -216,8 +245,8 @@ class Term:
     """A vector times factors.
 
     acts: "force", m/s^2 of specific force, or "rate", rad/s of body rates. frame: of the vector: body, world,
-    or air, of which the first component alone is along the direction of flight through the air. coefficients,
-    standard_errors: three each.
+    air or load, of which the first component alone is along the direction of flight through the air, or
+    towards where the load has swung. coefficients, standard_errors: three each.
     """
 
     acts: str
@@ -226,6 +255,11 @@ class Term:
     coefficients: tuple[float, ...]
     standard_errors: tuple[float, ...]
 
+    @property
+    def num_coefficients(self) -> int:
+        """How many of the coefficients are its own."""
+        return 1 if self.frame in ALONG else XYZ
+
     def basis(self, moment: Moment) -> tuple[Vec3, ...]:
         """Return the unit vectors of the coefficients, body frame."""
         unit = tuple(Vec3(*row) for row in np.eye(XYZ).tolist())
@@ -233,8 +267,18 @@ class Term:
             return unit
         if self.frame == "world":
             return tuple(Vec3(*(axis.dot(one) for axis in moment.body_axes_w)) for one in unit)
+        if self.frame == "load":
+            off_w = _off(moment)
+            way_w = off_w.scale(1.0 / jnp.maximum(off_w.norm(), TINY_OFF_M))
+            return (Vec3(*(axis.dot(way_w) for axis in moment.body_axes_w)),)
         speed = jnp.maximum(moment.airspeed_b.norm(), TINY_SPEED)
         return (moment.airspeed_b.scale(1.0 / speed),)
+
+    @property
+    def pendulum(self) -> tuple[float, float] | None:
+        """Length, m, and damping, 1/s, of the load that it looks at; None without one."""
+        numbers = (one.numbers for one in self.factors if one.shape == "pendulum")
+        return next(((length, damping) for length, damping in numbers), None)
 
     def signal(self, moment: Moment) -> Scalar:
         """Return the product of its factors."""
@@ -251,8 +295,7 @@ class Term:
 
     def text(self) -> str:
         """Return its formula, with the standard errors of its coefficients."""
-        number = 1 if self.frame == "air" else XYZ
-        values = ", ".join(f"{value:.3g}" for value in self.coefficients[:number])
+        values = ", ".join(f"{value:.3g}" for value in self.coefficients[: self.num_coefficients])
         return f"{self.acts} ({self.frame}) += ({values}) {' '.join(one.text() for one in self.factors)}"
 
 
@@ -271,6 +314,11 @@ class Law:
     def uses(self, quantity: str) -> bool:
         """Return whether any term looks at a quantity."""
         return any(one.quantity == quantity for term in self.terms for one in term.factors)
+
+    @property
+    def pendulum(self) -> tuple[float, float] | None:
+        """Length, m, and damping, 1/s, of the load that terms look at; None without one."""
+        return next((term.pendulum for term in self.terms if term.pendulum), None)
 
     def text(self) -> str:
         """Return its formula, a line a term."""
@@ -300,15 +348,30 @@ class Law:
 def learned_effect(static: str, read: Callable[[Any], Any], **declared: Any) -> Effect:
     """Return the effect of something learnt, whose parameters are ``scale``, ``spread`` and a structure.
 
-    static: name of the structure; it has ``parts``, each with ``acts`` and ``at(moment, spread)``, ``uses``
-    and ``as_json``. read: from JSON values. declared: what else there is to an effect.
+    static: name of the structure; it has ``parts``, each with ``acts`` and ``at(moment, spread)``, ``uses``,
+    ``pendulum`` and ``as_json``. read: from JSON values. declared: what else there is to an effect.
     """
 
-    def added(parameters: Any, acts: str, flight: Any, value_b: Vec3, context: StepContext) -> Vec3:
+    def start(parameters: Any, drone: Drone) -> Flight | None:
+        structure = getattr(parameters, static)
+        if not structure.pendulum and not structure.uses("time"):
+            return None
+        load = hanging(drone.vel_w) if structure.pendulum else None
+        return Flight(jnp.zeros_like(jnp.asarray(drone.battery_v)), load)
+
+    def remember(parameters: Any, flight: Flight | None, context: StepContext) -> Flight | None:
+        if flight is None:
+            return None
+        load = flight.load
+        if load is not None:
+            load = swung(load, context.drone.vel_w, context.dt, *getattr(parameters, static).pendulum)
+        return Flight(flight.time_s + context.dt, load)
+
+    def added(parameters: Any, acts: str, flight: Flight | None, value_b: Vec3, context: StepContext) -> Vec3:
         parts = [one for one in getattr(parameters, static).parts if one.acts == acts]
         if not parts:
             return value_b
-        moment = moment_of(context, 0.0 if flight is None else flight.time_s)
+        moment = moment_of(context, flight)
         for one in parts:
             value_b = value_b + one.at(moment, parameters.spread).scale(parameters.scale)
         return value_b
@@ -320,12 +383,8 @@ def learned_effect(static: str, read: Callable[[Any], Any], **declared: Any) -> 
         needs=("q",),
         force=lambda parameters, flight, value, context: added(parameters, "force", flight, value, context),
         rates=lambda parameters, flight, value, context: added(parameters, "rate", flight, value, context),
-        start=lambda parameters, drone: (
-            start_of_flight(drone) if getattr(parameters, static).uses("time") else None
-        ),
-        remember=lambda parameters, flight, context: (
-            None if flight is None else FlightTime(flight.time_s + context.dt)
-        ),
+        start=start,
+        remember=remember,
         static=static,
         written=lambda structure: structure.as_json(),
         read=read,
@@ -340,8 +399,12 @@ def law_from_json(values: Any) -> Law:
         ValueError: what is not in the grammar, numbers that are not finite, a pole within the envelope; the
             message begins with the field.
     """
-    terms = listed("terms", values, MOST_TERMS)
-    return Law(tuple(_term(f"terms[{place}]", one) for place, one in enumerate(terms)))
+    listed_terms = listed("terms", values, MOST_TERMS)
+    terms = tuple(_term(f"terms[{place}]", one) for place, one in enumerate(listed_terms))
+    loads = {one.pendulum for one in terms if one.pendulum}
+    if len(loads) > 1:
+        raise ValueError(f"terms: found loads on {len(loads)} strings (length, damping), expected one")
+    return Law(terms)
 
 
 def listed(where: str, value: Any, most: int) -> list[Any]:
@@ -386,17 +449,16 @@ def _term(where: str, value: Any) -> Term:
     if min(numbers[1]) < 0.0:
         raise ValueError(f"{where}.standard_errors: found {quote_value(numbers[1])}, expected 0 or more")
     frame = chosen(f"{where}.frame", fields["frame"], FRAMES)
-    if frame == "air" and any(numbers[0][1:]):
+    if frame in ALONG and any(numbers[0][1:]):
         raise ValueError(
-            f"{where}.coefficients: found {numbers[0]}, expected only the first in the frame air"
+            f"{where}.coefficients: found {numbers[0]}, expected only the first in the frame {frame}"
         )
-    factors = listed(f"{where}.factors", fields["factors"], MOST_FACTORS)
-    return Term(
-        chosen(f"{where}.acts", fields["acts"], ACTS),
-        frame,
-        tuple(_factor(f"{where}.factors[{place}]", one) for place, one in enumerate(factors)),
-        *numbers,
-    )
+    listed_factors = listed(f"{where}.factors", fields["factors"], MOST_FACTORS)
+    factors = tuple(_factor(f"{where}.factors[{place}]", one) for place, one in enumerate(listed_factors))
+    term = Term(chosen(f"{where}.acts", fields["acts"], ACTS), frame, factors, *numbers)
+    if (frame == "load") != (term.pendulum is not None):
+        raise ValueError(f"{where}.frame: found {frame}, expected load with a pendulum, and only then")
+    return term
 
 
 def _factor(where: str, value: Any) -> Factor:
@@ -411,6 +473,8 @@ def _factor(where: str, value: Any) -> Factor:
             raise ValueError(f"{where}.{one}: found {by_name[one]:g}, expected more than 0")
     if name == "wave" and by_name["order"] not in (1.0, 2.0, 3.0, 4.0):
         raise ValueError(f"{where}.order: found {by_name['order']:g}, expected 1, 2, 3 or 4")
+    if name == "pendulum" and by_name["length"] < SHORTEST_M:
+        raise ValueError(f"{where}.length: found {by_name['length']:g}, expected at least {SHORTEST_M:g} m")
     if name == "power":
         _check_power(where, quantity, by_name["exponent"], by_name["offset"])
     return Factor(quantity, name, numbers)

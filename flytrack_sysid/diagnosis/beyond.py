@@ -24,6 +24,7 @@ MAY_BE = {
     "thrust": "a motor or rotor law that the list does not have",
     "tilt": "air that recirculates, or a load that shifts",
     "height": "air that changes with height",
+    "load": "a load that swings on a string",
     "voltage": "a motor law that the list does not have",
     **dict.fromkeys(("rate_x", "rate_y", "rate_z"), "gyroscopic or inertial coupling"),
     **dict.fromkeys(("roll", "pitch", "yaw"), "a stick's curve that the list does not have"),
@@ -120,7 +121,8 @@ def _least(quantities: Iterable[str]) -> str:
 def _column(acts: str, frame: str, axis: str) -> str:
     if frame == "air":
         return "force_along"
-    return f"{'rates' if acts == 'rate' else 'force'}_{'world_' if frame == 'world' else ''}{axis}"
+    is_world = frame in ("world", "load")
+    return f"{'rates' if acts == 'rate' else 'force'}_{'world_' if is_world else ''}{axis}"
 
 
 def with_learned(model: ModelParameters, learned: Learned | None) -> ModelParameters:

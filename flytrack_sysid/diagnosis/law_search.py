@@ -16,10 +16,12 @@ import numpy as np
 from scipy import optimize, stats
 
 from flytrack_env.dynamics import collective_thrust
-from flytrack_env.effects.grammar import QUANTITIES, XYZ, Factor, Moment, Term
+from flytrack_env.effects.grammar import QUANTITIES, SHAPES, XYZ, Factor, Moment, Term
+from flytrack_env.effects.pendulum import SHORTEST_M, Pendulum
 from flytrack_env.quaternion import Vec3
 from flytrack_env.state import Action
 from flytrack_sysid.diagnosis.lanes import LANE_S
+from flytrack_sysid.diagnosis.loads import with_loads
 from flytrack_sysid.diagnosis.problem import Problem, blocks_of, robust_square
 from flytrack_sysid.diagnosis.search import FittedModel
 from flytrack_sysid.diagnosis.unexplained import (
@@ -41,8 +43,11 @@ MOST_TRIED_AGAIN = 100  # terms, beside the first one found
 MOST_REFINED, REFINEMENTS = 5, 60  # terms a round whose shapes are refined, and evaluations of each
 MOST_TERMS = 3  # of one side
 MOST_STARTS = 3  # first terms from which a law is searched
+# Strings that are tried, so near in frequency that one of them swings with any load; heavily damped, 1/s.
+STRINGS_M, NUM_STRINGS, USUAL_DAMPING = (0.1, 3.0), 16, 0.8
 LEAST_SHARE = 0.04  # of what the terms before gain: the least of one more
 LEAST_OWN = 0.01  # of a column's information: what is not within the reach of the model's free numbers
+TINY = 1e-3  # of numbers that are positive
 LEAST_SIGMAS = 3.0  # of a coefficient that stays
 HELD_OUT_SHARE = 0.6  # of the gain on held-out rows that a law would have there if it were right
 LEAST_EXPECTED = 10.0  # of that gain: with less, held-out rows say nothing of a law
@@ -126,8 +131,17 @@ class Side(NamedTuple):
 
     def white(self, term: Term) -> np.ndarray:
         """Return a term's unit coefficients as innovations, (coefficients, rows, lanes, 3, 2)."""
-        features = features_of(term, self.moment, self.flight.body_to_world)
+        features = features_of(term, self._moment_for(term), self.flight.body_to_world)
         return whitened(self.problem, features, self.name)
+
+    def _moment_for(self, term: Term) -> Moment:
+        """Return what a term may look at: with its own load on a string, if it has one."""
+        if term.pendulum is None:
+            return self.moment
+        lanes = self.problem.lanes
+        load = with_loads(lanes.record, lanes.towed, term.pendulum).load
+        load = np.nan_to_num(np.concatenate([load[:1], load[:-1]]))  # a step begins at the row before
+        return self.moment._replace(load=Pendulum(*np.moveaxis(load, -1, 0)))
 
     def columns(self, term: Term) -> np.ndarray:
         """Return a term's unit coefficients, weighted, by blocks of a second."""
@@ -189,6 +203,8 @@ def factors_of(side: Side) -> Iterator[tuple[str, tuple[Factor, ...]]]:
     if side.name == "force":
         for one in (power("airspeed", 2.0), power("airspeed", 3.0), *_local(side, "airspeed", ("bump",), 8)):
             yield "air", (one,)
+        for length in np.geomspace(*STRINGS_M, NUM_STRINGS):
+            yield "load", (Factor("load", "pendulum", (float(length), USUAL_DAMPING)),)
         where = side.flight.pos_w[side.flight.is_counted]
         for place in where[np.linspace(0, len(where) - 1, 2 * BUMP_PLACES + 1).astype(int)[1::2]].tolist():
             for width in BUMP_WIDTHS_M:
@@ -213,14 +229,14 @@ def num_shaped(term: Term) -> int:
     return sum(len(one.numbers) for one in term.factors if one.shape != "power")
 
 
-def num_numbers(side: Side, term: Term) -> int:
+def num_numbers(term: Term) -> int:
     """Return how many numbers a term may choose: coefficients, and those of its shapes."""
-    return len(term.basis(side.moment)) + num_shaped(term)
+    return term.num_coefficients + num_shaped(term)
 
 
-def price_of(side: Side, term: Term) -> float:
+def price_of(term: Term) -> float:
     """Return what a term has to gain to be preferred to nothing."""
-    return PER_COEFFICIENT * len(term.basis(side.moment)) + PER_NUMBER * num_shaped(term)
+    return PER_COEFFICIENT * term.num_coefficients + PER_NUMBER * num_shaped(term)
 
 
 def score_term(side: Side, test: SideTest, term: Term) -> Trial:
@@ -229,7 +245,7 @@ def score_term(side: Side, test: SideTest, term: Term) -> Trial:
     if not np.isfinite(columns).all() or not np.abs(columns).max() > 0.0:
         return Trial(term, -np.inf, 0.0)
     gain = test.fit(columns, LEAST_OWN).gain
-    return Trial(term, gain - price_of(side, term), gain)
+    return Trial(term, gain - price_of(term), gain)
 
 
 def refine_shapes(side: Side, test: SideTest, start: Trial) -> Trial:
@@ -279,13 +295,15 @@ def _fixed(term: Term) -> list[int]:
 
 
 def _with_numbers(term: Term, values: np.ndarray) -> Term | None:
-    """Return a term with other numbers; None where one would have no width."""
+    """Return a term with other numbers; None where one would have no width or length."""
     factors, place = [], 0
     for one in term.factors:
         numbers = tuple(values[place : place + len(one.numbers)].tolist())
         place += len(one.numbers)
-        widths = {"bump": 1, "step": 1, "place": 3, "saturation": 0}
-        if one.shape in widths and not numbers[widths[one.shape]] > 1e-3:
+        by_name = dict(zip(SHAPES[one.shape].numbers, numbers, strict=True))
+        if any(not by_name[name] > TINY for name in SHAPES[one.shape].positive):
+            return None
+        if one.shape == "pendulum" and by_name["length"] < SHORTEST_M:
             return None
         factors.append(replace(one, numbers=numbers))
     return replace(term, factors=tuple(factors))
@@ -375,6 +393,44 @@ def cross_validate(side: Side, terms: Sequence[Term]) -> tuple[float, float]:
     return gain, expected
 
 
+def judged_law(side: Side, held: Side, terms: tuple[Term, ...], fit: SideFit) -> Found:
+    """Return terms that were fitted as a law, with what it gains on held-out rows."""
+    vector = vector_with(side, fit)
+    gain, expected = held_out(side, held, contribution_of(held, terms), vector)
+    return Found(terms, vector, fit.chi2, gain, expected, ())
+
+
+def is_confirmed(side: Side, law: Found) -> bool:
+    """Return whether held-out rows confirm a law, or where those say nothing, halves of the others."""
+    gain, expected = law.held_out_gain, law.expected
+    if expected < LEAST_EXPECTED:
+        gain, expected = cross_validate(side, law.terms)
+    return gain >= HELD_OUT_SHARE * expected
+
+
+def pruned(side: Side, held: Side, law: Found, number: int) -> Found | None:
+    """Return a law of terms that each gain, beside all others, what one more has to; the best term first.
+
+    A term that stood for the others when it was alone is left over beside them. None where held-out rows do
+    not confirm the rest. number: of terms among which they were chosen.
+    """
+    terms = law.terms
+    while True:
+        others = [[one for one in terms if one is not term] for term in terms]
+        total = fit_terms(side, terms)[1].chi2
+        losses = [total - fit_terms(side, rest)[1].chi2 if rest else total for rest in others]
+        least = stats.chi2.isf(CHANCE_OF_MORE / number, [num_numbers(term) for term in terms])
+        weakest = int(np.argmin(losses - least))
+        if len(terms) == 1 or losses[weakest] >= least[weakest]:
+            break
+        terms = tuple(others[weakest])
+    order = np.argsort(losses)[::-1]
+    if len(terms) == len(law.terms):
+        return law._replace(terms=tuple(terms[place] for place in order))
+    found = judged_law(side, held, *fit_terms(side, [terms[place] for place in order]))
+    return found if is_confirmed(side, found) else None
+
+
 def find_law(side: Side, held: Side) -> Found | None:
     """Return the law of a side that rows learnt from and held-out rows agree on; None without one.
 
@@ -382,18 +438,17 @@ def find_law(side: Side, held: Side) -> Found | None:
     """
     pool = [bare_term(side, *one) for one in factors_of(side)]
     firsts, ranked = best_of(side, side.test, pool)
-    limit = stats.chi2.isf(CHANCE / len(pool), [num_numbers(side, one.term) for one in firsts])
+    limit = stats.chi2.isf(CHANCE / len(pool), [num_numbers(one.term) for one in firsts])
     clear = [one for one, least in zip(firsts, limit, strict=True) if one.gain >= least]
     rivals = tuple(_kind(one.term) for one in firsts[1:] if one.merit > firsts[0].merit - 10.0)
     by_quantity: dict[str, Trial] = {}
     for one in clear:
         by_quantity.setdefault(one.term.factors[-1].quantity, one)
     starts = list(by_quantity.values())[:MOST_STARTS]
-    laws = [grow_law(side, held, one, ranked, len(pool)) for one in starts]
+    grown = [grow_law(side, held, one, ranked, len(pool)) for one in starts]
+    laws = [pruned(side, held, one, len(pool)) for one in grown if one is not None]
     found = [one._replace(rivals=rivals) for one in laws if one is not None]
-    return max(
-        found, key=lambda one: one.gain - sum(price_of(side, term) for term in one.terms), default=None
-    )
+    return max(found, key=lambda one: one.gain - sum(price_of(term) for term in one.terms), default=None)
 
 
 def best_of(side: Side, test: SideTest, pool: Sequence[Term]) -> tuple[list[Trial], list[Term]]:
@@ -421,20 +476,20 @@ def grow_law(side: Side, held: Side, first: Trial, pool: Sequence[Term], number:
         now, fit = fit_terms(side, refine_jointly(side, [*terms, first.term]))
         if len(now) <= len(terms) or (best is not None and fit.chi2 < (1.0 + LEAST_SHARE) * best.gain):
             break
-        vector = vector_with(side, fit)
-        gain, expected = held_out(side, held, contribution_of(held, now), vector)
-        if best is not None and gain < best.held_out_gain:
+        one = judged_law(side, held, now, fit)
+        if best is not None and one.held_out_gain < best.held_out_gain:
             break
-        judged_by = (gain, expected) if expected >= LEAST_EXPECTED else cross_validate(side, now)
         # One wave of a sum of two may fail on held-out rows where both do not.
-        if judged_by[0] >= HELD_OUT_SHARE * judged_by[1]:
-            best = Found(now, vector, fit.chi2, gain, expected, ())
+        if is_confirmed(side, one):
+            best = one
         terms = list(now)
         if len(terms) == MOST_TERMS:
             break
         test = side.test.given_also(*(side.columns(term) for term in terms))
+        if any(one.pendulum for one in terms):  # one drone, one load
+            pool = [one for one in pool if one.pendulum is None]
         (first, *_), _ = best_of(side, test, pool)
-        if first.gain < stats.chi2.isf(CHANCE_OF_MORE / number, num_numbers(side, first.term)):
+        if first.gain < stats.chi2.isf(CHANCE_OF_MORE / number, num_numbers(first.term)):
             break
     return best
 

@@ -29,6 +29,7 @@ from flytrack_env.quaternion import Quaternion, Vec3
 from flytrack_sysid.diagnosis import noise as noises
 from flytrack_sysid.diagnosis.lanes import LANE_S, Lanes, lead_in_of
 from flytrack_sysid.diagnosis.lateness import Late
+from flytrack_sysid.diagnosis.loads import pendulum_of, with_loads
 from flytrack_sysid.parameters import TAUS, bounds_of, from_vector, in_batches, names_of, to_vector
 from flytrack_sysid.record import Record
 from flytrack_sysid.replay import Step, replay
@@ -159,7 +160,7 @@ class Problem:
         names, start = names_of(like), to_vector(like)
         low, high = np.array([bounds_of(name) for name in names]).T
         return cls(
-            lanes=lanes,
+            lanes=_with_loads(lanes, like),
             like=like,
             given_effects=tuple(effect_of(one).name for one in model.effects),
             names=names,
@@ -187,6 +188,7 @@ class Problem:
         low, high = np.array([bounds_of(name) for name in names[len(self.names) :]]).reshape(-1, 2).T
         return replace(
             self,
+            lanes=_with_loads(self.lanes, like),
             like=like,
             names=names,
             start=start,
@@ -221,7 +223,8 @@ class Problem:
         return found if self.late is None else self.late.residuals(found)
 
     def _replayed(self, vectors: np.ndarray) -> np.ndarray:
-        return in_batches(lambda part: _residuals(part, self.like, self.lanes), vectors, _size_for(vectors))
+        lanes = self.lanes._replace(towed=None)  # of any length, for which nothing is to be compiled
+        return in_batches(lambda part: _residuals(part, self.like, lanes), vectors, _size_for(vectors))
 
     def _composed(self, vectors: np.ndarray) -> np.ndarray:
         """Return residuals of models whose effects act within their windows; each row is of a replay."""
@@ -287,6 +290,14 @@ class Problem:
     def index(self, names: Sequence[str]) -> list[int]:
         """Return the places of parameters in the vector."""
         return [self.names.index(name) for name in names]
+
+
+def _with_loads(lanes: Lanes, like: ModelParameters) -> Lanes:
+    """Return lanes with the load on a string that a model's law looks at."""
+    pendulum = pendulum_of(like)
+    if pendulum is None:
+        return lanes
+    return lanes._replace(record=with_loads(lanes.record, lanes.towed, pendulum))
 
 
 def _size_for(values: np.ndarray) -> int:

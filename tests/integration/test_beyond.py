@@ -87,3 +87,19 @@ def test_a_thermal_that_held_out_rows_do_not_pass_is_found(monkeypatch: pytest.M
     line = beyond.plant("position", 0)
     assert (line["motion"], line["found_motion"]) == ("handout", "handout")
     assert line["is_form"] and len(line["law"]) == 1 and not line["causes"]
+
+
+@pytest.mark.slow
+def test_a_load_on_a_string_is_found_with_its_length(monkeypatch: pytest.MonkeyPatch) -> None:
+    rng = np.random.default_rng(73)
+    outside = hidden.Outside("payload", ("airspeed",), "force", 1.5, {"string_m": 0.6})
+    truth = replace(hidden.draw_base(rng), outside=outside, motion="fine")
+    log = hidden.measure(hidden.fly(truth, "scripted", SECONDS, rng), "sensors", rng)
+    found = diagnose(log, model_of(truth))
+    assert found.learned is not None and not found.causes
+    (term,) = found.learned.law.terms
+    assert term.pendulum == pytest.approx((0.6, 0.4), rel=0.25)
+    assert share_removed(found, hidden.fly(truth, "scripted", SECONDS, rng)) > 0.9
+    without, with_law = (found.prediction.errors[name] for name in ("without_learned", "extended"))
+    for horizon in ("0.5", "1", "2"):
+        assert with_law["velocity_m_per_s"][horizon] < 0.9 * without["velocity_m_per_s"][horizon]

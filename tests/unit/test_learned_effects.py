@@ -10,15 +10,20 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.integrate import solve_ivp
 
 from flytrack_env import make
 from flytrack_env.effects import LearnedLaw, LearnedResidual
 from flytrack_env.effects.grammar import QUANTITIES, SHAPES, Factor, Law, Term
 from flytrack_env.effects.learned_residual import Input, Network, Networks
+from flytrack_env.effects.pendulum import hanging, swung
 from flytrack_env.model_file import ModelFileError, load_model, save_model
 from flytrack_env.params import EnvParams
+from flytrack_env.quaternion import Vec3
 from flytrack_env.state import Action
 from flytrack_env.wrappers import DomainRandomization, RandomizationParams
+from flytrack_sysid.diagnosis.loads import Towed, with_loads
+from flytrack_sysid.record import Record
 from tests.support.simulated_flights import NOMINAL, drone_with, flown, held
 
 NO = (0.0, 0.0, 0.0)
@@ -70,6 +75,46 @@ def test_time_since_the_start_acts() -> None:
     flight = flown(LearnedLaw(1.0, 0.0, Law((WARM,))), held(20)) - flown((), held(20))
     expected = 3.0 * (1.0 - np.exp(-0.01 * np.arange(20) / 0.05))
     np.testing.assert_allclose(flight[:, 8], expected, atol=2e-3)
+
+
+def test_a_load_swings_as_a_pendulum_does() -> None:
+    length, damping, pull = 0.5, 0.4, 3.0
+    law = Law((Term("force", "load", (Factor("load", "pendulum", (length, damping)),), (pull, 0, 0), NO),))
+    commands = held(150, pitch=0.2, thrust=0.1)
+    flight = flown(LearnedLaw(1.0, 0.0, law), commands)
+    plain, mass = flown((), commands), NOMINAL.m
+    assert mass > 0.0 and not np.allclose(plain[:, 6], flight[:, 6], atol=0.5)
+    times = 0.01 * np.arange(1, len(flight) + 1)
+
+    def moved(time: float, state: np.ndarray) -> list[float]:
+        off, speed = state
+        acc = np.interp(time, times, flight[:, 6])
+        return [speed, -acc - 9.81 / length * off - damping * speed]
+
+    swing = solve_ivp(moved, (0.0, times[-1]), [0.0, 0.0], t_eval=times, max_step=0.005).y[0] / length
+    # Both fly the same attitude, so that what differs along x is the pull.
+    np.testing.assert_allclose(
+        flight[:, 6] - plain[:, 6], pull * swing, atol=0.03 * pull * np.abs(swing).max()
+    )
+
+
+def test_a_replay_knows_the_load_of_any_row() -> None:
+    """Through a flight that begins in the middle, and in rows that are taken out of order."""
+    rng = np.random.default_rng(0)
+    towed = Towed(
+        np.arange(300), np.full(300, 0.01), np.isin(np.arange(300), [0, 120]), rng.normal(size=(300, 3))
+    )
+    load = hanging(Vec3(*towed.vel_w[120]))
+    for row in range(120, 200):
+        load = swung(load, Vec3(*towed.vel_w[row]), 0.01, 0.7, 0.3)
+    rows = np.array([[200, 0], [120, -1]])
+    blank = Record(*(np.zeros((2, 2)) for _ in Record._fields))
+    with jax.enable_x64(True):
+        found = with_loads(blank._replace(source_row=rows), towed, (0.7, 0.3)).load
+    np.testing.assert_allclose(found[0, 0], load, rtol=1e-6)
+    np.testing.assert_allclose(found[1, 0], hanging(Vec3(*towed.vel_w[120])))
+    np.testing.assert_allclose(found[0, 1], hanging(Vec3(*towed.vel_w[0])))
+    assert np.isnan(found[1, 1]).all()
 
 
 def test_a_network_adds_its_outputs_and_nothing_outside_its_range() -> None:
@@ -145,6 +190,8 @@ def test_every_quantity_has_a_value_and_every_shape_a_formula() -> None:
         assert shape.quantities[0] in Factor(shape.quantities[0], name, numbers).text()
 
 
+LOAD = {"quantity": "load", "shape": "pendulum", "length": 0.5, "damping": 0.1}
+HUNG = {"acts": "force", "frame": "load", "coefficients": [1.0, 0.0, 0.0], "standard_errors": [0.0] * 3}
 REFUSED = [
     (("terms", 0, "acts"), "torque", r"terms\[0\]\.acts: found 'torque', expected one of force, rate"),
     (("terms", 0, "frame"), "gate", r"frame: found 'gate', expected one of body, world, air"),
@@ -159,6 +206,14 @@ REFUSED = [
     (("terms", 1, "factors", 0, "exponent"), 7.0, "exponent: found 7, expected one of -2, -1"),
     (("terms", 1, "factors", 1, "exponent"), -1.0, r"found a pole at airspeed_x = 0 m/s, expected none"),
     (("terms",), [], "terms: found .*expected a list of 1 to 6"),
+    (("terms", 0, "frame"), "load", "frame: found load, expected load with a pendulum, and only then"),
+    (("terms", 2, "factors"), [{**LOAD, "length": 0.01}], "length: found 0.01, expected at least 0.05 m"),
+    (("terms", 2, "factors"), [LOAD], "frame: found world, expected load with a pendulum"),
+    (
+        ("terms",),
+        [{**HUNG, "factors": [{**LOAD, "length": length}]} for length in (0.3, 0.5)],
+        r"terms: found loads on 2 strings \(length, damping\), expected one",
+    ),
     (("networks", 0, "hidden"), [[1.0, 2.0]], "hidden: found another shape, expected 1 rows of 3"),
     (("networks", 0, "outputs"), [[1.0] * 3] * 2, "outputs: found another shape, expected 3 rows of 3"),
     (("networks", 0, "hidden", 0, 0), math.inf, "hidden: found inf, expected a number"),
