@@ -31,8 +31,11 @@ def pin(free_cores: Any) -> None:
 def run_job(job: str, out: Path, steps: int, seed: int) -> dict[str, Any]:
     """Return a job's result, from its file if it was finished before; an unfinished job starts again.
 
-    What it prints, and the traceback of an error, go to a log in the job's folder.
+    What it prints, and the traceback of an error, go to a log in the job's folder. Programs are forgotten,
+    since a process may map only so many into its memory.
     """
+    import jax
+
     folder = out / job
     if (folder / RESULT).exists():
         return dict(json.loads((folder / RESULT).read_text()))
@@ -45,6 +48,8 @@ def run_job(job: str, out: Path, steps: int, seed: int) -> dict[str, Any]:
         except BaseException:
             traceback.print_exc()
             raise
+        finally:
+            jax.clear_caches()
     result["cpu_s"] = time.process_time() - started_s
     write_json(folder / RESULT, result)
     return result
