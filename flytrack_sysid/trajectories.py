@@ -96,8 +96,10 @@ def states_of(channels: Mapping[str, np.ndarray]) -> np.ndarray:
 def force_w(residuals: Traces, model: str, time_s: np.ndarray) -> np.ndarray:
     """Return the specific force that a model does not explain, (num_rows, 3) m/s^2, world, means over 0.1 s.
 
-    NaN where nothing is judged. time_s: (num_rows,), as of ``time_in_line``.
+    NaN where nothing is judged. time_s: (num_rows,) of the log, as of ``time_in_line``.
     """
+    force = np.full((len(time_s), 3), np.nan)
+    time_s = time_s[residuals.row]
     columns, counts = zip(*(residuals.column(model, f"force_world_{axis}") for axis in "xyz"), strict=True)
     parts = np.column_stack([*columns, np.ones(len(time_s))])
     # By duration, so that the noise of velocities cancels between the ends of a window.
@@ -108,7 +110,9 @@ def force_w(residuals: Traces, model: str, time_s: np.ndarray) -> np.ndarray:
     begin = np.searchsorted(time_s, time_s - 0.5 * WINDOW_S)
     end = np.searchsorted(time_s, time_s + 0.5 * WINDOW_S, side="right")
     total = summed[end] - summed[begin]
-    return np.divide(total[:, :3], total[:, 3:], out=np.full((len(total), 3), np.nan), where=weight > 0.0)
+    has_any = weight[:, 0] > 0.0
+    force[residuals.row[has_any]] = total[has_any, :3] / total[has_any, 3:]
+    return force
 
 
 def _measured(timed: _Timed, name: str, residuals_w: Mapping[str, np.ndarray]) -> Trajectory:

@@ -49,6 +49,7 @@ class Traces(NamedTuple):
     slot: (num_rows,) int, place of a row among evenly spaced ones; a lost row leaves its slot empty, and
     flights are far apart. step_s: between slots.
     attitude: body to world, of the row before: the frame of force and velocity.
+    row: (num_rows,) int, of the log that was given; ends of flights whose poses came late are left out.
     """
 
     residuals: Mapping[str, Mapping[str, np.ndarray]]
@@ -58,6 +59,7 @@ class Traces(NamedTuple):
     slot: np.ndarray
     step_s: float
     attitude: Rotation
+    row: np.ndarray
 
     def used(self, name: str) -> str:
         """Return the column to use for one: without a sensor, attitude for rates and velocity for force."""
@@ -264,4 +266,5 @@ def traces(log: FlightLog, models: Mapping[str, ModelParameters], like: str) -> 
     regressors |= _predicted(residuals[like], lanes, rows, float(base.g))
     slot = np.arange(len(rows.record.begins)) + BETWEEN_FLIGHTS * np.cumsum(rows.record.begins)
     elapsed_s, counts = step_s * rows.kept, _counts(lanes, rows)
-    return Traces(residuals, counts, regressors, elapsed_s, slot[rows.kept], step_s, rows.before)
+    row = np.flatnonzero(is_known)
+    return Traces(residuals, counts, regressors, elapsed_s, slot[rows.kept], step_s, rows.before, row)

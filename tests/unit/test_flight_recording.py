@@ -12,7 +12,7 @@ from benchmarks.diagnosis import model_of
 from flytrack import identification
 from flytrack.cli import main
 from flytrack_env.dynamics import ModelParameters
-from flytrack_env.effects import LinearDrag
+from flytrack_env.effects import LinearDrag, MocapLatency
 from flytrack_sysid import FlightLog, save_log
 from flytrack_sysid.diagnosis import Diagnosis
 from flytrack_sysid.diagnosis.result import CONSISTENT, Unexplained
@@ -78,6 +78,15 @@ def test_arrows_are_the_force_that_the_model_lacks_along_the_world(flown, models
     plotted = recording.series("/plots/residual/nominal", "Scalars:scalars")[rows]
     np.testing.assert_allclose(plotted, np.linalg.norm(expected, axis=1), atol=0.02)
     assert np.isnan(recording.series("/plots/residual/nominal", "Scalars:scalars")[[0, SECOND]]).all()
+
+
+def test_of_late_poses_the_ends_have_no_force(flown, models):
+    """Where the true pose of a row was never logged; all other rows keep their places."""
+    late = models["nominal"].with_effects(MocapLatency(0.03))
+    shown, *_ = trajectories.trajectories_of(flown[1], {"late": late})
+    known = np.isfinite(shown.residuals_w["late"]).all(axis=1)
+    assert len(known) == len(flown[1]) and not known[[-1, SECOND - 1]].any()
+    assert known[SETTLED : SECOND - 5].all() and known[SECOND + SETTLED : -5].all()
 
 
 def distance_m(shown, log) -> np.ndarray:
