@@ -128,10 +128,11 @@ def _events(
     events = []
     if track is not None and race is not None:
         for one in race.passes:
-            lap = f"; lap {one.lap}: {one.lap_time_s:.3f} s" if one.lap else ""
             gate = track.gates[one.gate].id
-            events.append((one.row, f"{flight.name}: passed gate {gate} at {one.time_s:.3f} s{lap}"))
-    return [*events, (len(flight.states) - 1, f"{flight.name}: ended: {ended}")]
+            events.append((one.row, f"{flight.name}: gate {gate}, {one.time_s:.3f} s"))
+            if one.lap:  # an event of its own, as the panel is narrow
+                events.append((one.row, f"{flight.name}: lap {one.lap}, {one.lap_time_s:.3f} s"))
+    return [*events, (len(flight.states) - 1, f"{flight.name}: {ended}")]
 
 
 def _describe(flights: Sequence[Trajectory], races: Sequence[FlownRace | None], ends: Sequence[str]) -> str:
@@ -189,7 +190,7 @@ def make_blueprint(
         rrb.Horizontal(
             rrb.TextDocumentView(origin="/about", name="flights"),
             rrb.TextLogView(origin="/", contents="/events/**", name="events", columns=body),
-            column_shares=[3.0, 2.0],
+            column_shares=[5.0, 4.0],
         ),
         row_shares=[4.0, 4.0, 2.0],
     )
