@@ -65,11 +65,16 @@ def truth_of(row: str, rng: np.random.Generator) -> hidden.Truth:
     return replace(truth, outside=hidden.draw_outside(rng, row, amplitude=math.exp(rng.uniform(low, high))))
 
 
-def plant(row: str, number: int) -> dict[str, Any]:
-    """Return what was learnt of one plant, graded."""
+def flown_plant(row: str, number: int) -> tuple[hidden.Truth, FlightLog, np.random.Generator]:
+    """Return one plant, a measured flight of it, and what draws more of them."""
     rng = np.random.default_rng([SEED, number, sorted([*RIGHT, "clean", "listed"]).index(row)])
     truth = replace(truth_of(row, rng), motion=hidden.MOTIONS[number % len(hidden.MOTIONS)])
-    log = hidden.measure(hidden.fly(truth, "scripted", SECONDS, rng), "sensors", rng)
+    return truth, hidden.measure(hidden.fly(truth, "scripted", SECONDS, rng), "sensors", rng), rng
+
+
+def plant(row: str, number: int) -> dict[str, Any]:
+    """Return what was learnt of one plant, graded."""
+    truth, log, rng = flown_plant(row, number)
     started_s = time.process_time()
     found = diagnose(log, model_of(truth))
     line: dict[str, Any] = {

@@ -61,10 +61,15 @@ def versions(*packages: str) -> dict[str, str]:
 
 
 def commit_of_checkout() -> str:
-    """Return the checkout's commit, with ``-dirty`` if tracked files have changed since."""
-    command = ["git", "describe", "--always", "--exclude=*", "--dirty"]
+    """Return the checkout's commit, with ``-dirty`` if tracked files but results have changed since."""
+
+    def told(*command: str) -> str:
+        run = subprocess.run(["git", *command], cwd=ROOT, check=True, capture_output=True, text=True)
+        return run.stdout.strip()
+
     try:
-        return subprocess.run(command, cwd=ROOT, check=True, capture_output=True, text=True).stdout.strip()
+        changed = told("status", "--porcelain", "--untracked-files=no", "--", ".", ":!docs/results")
+        return told("describe", "--always", "--exclude=*") + ("-dirty" if changed else "")
     except (OSError, subprocess.CalledProcessError):  # a copy without git
         return "unknown"
 

@@ -37,6 +37,7 @@ from flytrack_sysid.diagnosis.result import (
 )
 from flytrack_sysid.diagnosis.score_test import BASE_CAUSES, Linearization, solve, threshold
 from flytrack_sysid.diagnosis.search import FittedModel, SearchState
+from flytrack_sysid.diagnosis.unexplained import is_like_drift
 from flytrack_sysid.parameters import DRAIN, MAX_RATES, STICKS, THRUST_COEFFS, as_float32, from_vector
 from flytrack_sysid.parameters import unit_of as unit_of_parameter
 from flytrack_sysid.prediction_windows import HORIZONS_S, QUANTITIES
@@ -46,6 +47,13 @@ from flytrack_sysid.response import FULL_STEP, SMALL_STEP, half_responses
 TWO_SIDED_95 = 1.959964
 LOOSE = 0.5  # of the prior's width: a parameter that the log knows no better is not determined
 SCALE_TWINS = ("thrust_curve",)  # mass, payload, battery and motors all scale the thrust over the mass
+DRIFT = (
+    "thrust_drift"  # no effect: what a log of one flight cannot tell from a curve that depends on the voltage
+)
+DRIFT_NOTE = (
+    "{} could be thrust that drifts, as of motors that warm up: within a flight, the voltage falls with the "
+    "time; fly again with warm motors and a full battery"
+)
 SLOPE_STEP = 1e-3  # of a parameter's scale, for slopes of times to half response
 STILL = (*MAX_RATES, DRAIN, *THRUST_COEFFS)  # a model where these are 0 does not move
 
@@ -198,8 +206,12 @@ def base_causes(
             continue
         parameters = estimates(linearization, model, change.fields)
         cause = Cause(name, (), channel, parameters, change.gain, gain, change.gain, change.gain)
-        if not _is_remainder(cause, effects):
-            causes.append(_as_thrust_scale(cause, change, problem, model))
+        if _is_remainder(cause, effects):
+            continue
+        cause = _as_thrust_scale(cause, change, problem, model)
+        if cause.effect == "thrust_curve" and is_like_drift(problem, model, change.fields):
+            cause = replace(cause, equivalent=(DRIFT,))
+        causes.append(cause)
     return sorted(causes, key=lambda cause: -cause.chi2_gain), contradicted
 
 
@@ -511,6 +523,7 @@ def warnings_of(problem: Problem, causes: Sequence[Cause], contradicted: Sequenc
             for name in contradicted
         ),
         *(_at_bound(cause) for cause in causes if cause.beyond),
+        *(DRIFT_NOTE.format(cause.effect) for cause in causes if DRIFT in cause.equivalent),
     ]
 
 

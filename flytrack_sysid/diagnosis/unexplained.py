@@ -12,7 +12,7 @@ from flytrack_sysid.diagnosis import noise as noises
 from flytrack_sysid.diagnosis.lanes import AXES, lead_in_of
 from flytrack_sysid.diagnosis.problem import Problem, blocks_of, robust_weight
 from flytrack_sysid.diagnosis.result import Unexplained
-from flytrack_sysid.diagnosis.score_test import inflation_of, solve
+from flytrack_sysid.diagnosis.score_test import inflation_of, solve, threshold
 from flytrack_sysid.diagnosis.search import FittedModel
 from flytrack_sysid.parameters import TAUS
 
@@ -27,6 +27,7 @@ PERIODIC_HZ = (0.3, 25.0)
 LINE = 28.0  # power of a line over that of its neighbourhood: e^-28 by chance
 NEIGHBOURS = 40  # frequencies on each side
 STOCHASTIC_GAIN, STOCHASTIC_SHARE = 50.0, 0.15  # of minus twice the log likelihood; of the sensor's noise
+DRIFT_SHARE = 0.1  # of a base change beside a steady force: it keeps less beside one that drifts, too
 FELT = 0.3  # coupling from which a disturbance moves the drone and not only the sensor
 TIME_WAVES, RANK_WAVES, CHANGE_WAVES, HEADING_WAVES, PLACE_WAVES = 8, 6, 4, 4, 2
 TINY_SPEED = 0.3  # m/s: slower flight has no direction
@@ -348,6 +349,28 @@ def find_dependences(
         places = feature("position", bumps(flight)) if has_places else None
         result += _greedy(test, side, smooth, places, flight, least, noise)
     return sorted(result, key=lambda one: -one.gain)
+
+
+def is_like_drift(problem: Problem, model: FittedModel, fields: Sequence[str]) -> bool:
+    """Return whether a base change is nearly a force of the body that changes with the time alone.
+
+    Within one flight the voltage falls with the time, so that a thrust curve takes up motors that warm up.
+    """
+    axes, flight = SIDES["force"], flight_of(problem, model)
+    left, slopes = linearized_residuals(problem, model)
+    places = problem.index(fields)
+    own = [model.places.index(place) for place in places]
+    test = SideTest.of("force", left, np.delete(slopes, own, axis=0))
+    columns, size = blocks_of(slopes[own][..., axes, :] * test.root), (model.vector - problem.start)[places]
+
+    def beside(*features_w: np.ndarray) -> float:
+        given = [blocks_of(whitened(problem, one, "force") * test.root) for one in features_w]
+        return test.given_also(*given).noncentrality(columns, size)
+
+    steady = constants(flight, "force")
+    alone = beside(steady)
+    drifting = dependences(flight)["force"]["time"]
+    return alone >= threshold(len(fields)) and beside(steady, drifting) < DRIFT_SHARE * alone
 
 
 def _greedy(

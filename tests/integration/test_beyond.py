@@ -103,3 +103,19 @@ def test_a_load_on_a_string_is_found_with_its_length(monkeypatch: pytest.MonkeyP
     without, with_law = (found.prediction.errors[name] for name in ("without_learned", "extended"))
     for horizon in ("0.5", "1", "2"):
         assert with_law["velocity_m_per_s"][horizon] < 0.9 * without["velocity_m_per_s"][horizon]
+
+
+@pytest.mark.slow
+def test_a_thrust_curve_says_where_it_could_be_motors_that_warm_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(beyond, "SEED", 59)
+    truth, log, _ = beyond.flown_plant("heating", 1)
+    warm = diagnose(log, model_of(truth))
+    rng = np.random.default_rng(74)
+    truth = replace(hidden.draw_base(rng), motion="handout")
+    nominal = model_of(truth)
+    log = hidden.measure(hidden.fly(truth, "scripted", SECONDS, rng), "sensors", rng)
+    of_stick = np.array([1.0, 1.0, 1.5, 1.0, 1.0, 1.0])
+    curved = diagnose(log, nominal._replace(thrust_coeffs=nominal.thrust_coeffs * of_stick))
+    for found, alike in ((warm, ("thrust_drift",)), (curved, ())):
+        assert [one.equivalent for one in found.causes if one.effect == "thrust_curve"] == [alike]
+        assert ("warm motors" in text_of(found)) == bool(alike)
