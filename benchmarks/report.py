@@ -63,13 +63,13 @@ def versions(*packages: str) -> dict[str, str]:
 def commit_of_checkout() -> str:
     """Return the checkout's commit, with ``-dirty`` if tracked files but results have changed since."""
 
-    def told(*command: str) -> str:
+    def git(*command: str) -> str:
         run = subprocess.run(["git", *command], cwd=ROOT, check=True, capture_output=True, text=True)
         return run.stdout.strip()
 
     try:
-        changed = told("status", "--porcelain", "--untracked-files=no", "--", ".", ":!docs/results")
-        return told("describe", "--always", "--exclude=*") + ("-dirty" if changed else "")
+        changed = git("status", "--porcelain", "--untracked-files=no", "--", ".", ":!docs/results")
+        return git("describe", "--always", "--exclude=*") + ("-dirty" if changed else "")
     except (OSError, subprocess.CalledProcessError):  # a copy without git
         return "unknown"
 

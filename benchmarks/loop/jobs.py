@@ -34,13 +34,13 @@ def run_job(job: str, out: Path, steps: int, seed: int) -> dict[str, Any]:
     What it prints, and the traceback of an error, go to a log in the job's folder. Programs are forgotten,
     since a process may map only so many into its memory.
     """
-    import jax
-
     folder = out / job
     if (folder / RESULT).exists():
         return dict(json.loads((folder / RESULT).read_text()))
     shutil.rmtree(folder, ignore_errors=True)  # else its trainings would be refused as another run's
     folder.mkdir(parents=True)
+    import jax
+
     started_s = time.process_time()
     with (folder / LOG).open("w") as log, redirect_stdout(log), redirect_stderr(log):
         try:

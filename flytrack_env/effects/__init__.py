@@ -161,17 +161,17 @@ def start_memories(effects: tuple[Any, ...], drone: Drone, delay_steps: int = US
 
 
 def at_row(memories: tuple[Any, ...], time_s: Scalar, load: jax.Array | np.ndarray) -> tuple[Any, ...]:
-    """Return memories of effects at a row of a log: since the flight began, s, and a load on a string.
+    """Return memories of effects with the time and the load of a row of a log.
 
-    load: (4,), as in ``pendulum.Pendulum``; as remembered where the row says nothing of it (not a number).
+    time_s: since the flight began. load: (4,), as in ``pendulum.Pendulum``; NaN keeps the remembered one.
     """
 
     def at(memory: Any) -> Any:
         if not isinstance(memory, Flight):
             return memory
-        told = None if memory.load is None else Pendulum(*load)
-        is_told = ~jnp.isnan(load[0])
-        return Flight(time_s, jax.tree.map(partial(jnp.where, is_told), told, memory.load))
+        logged = None if memory.load is None else Pendulum(*load)
+        is_logged = ~jnp.isnan(load[0])
+        return Flight(time_s, jax.tree.map(partial(jnp.where, is_logged), logged, memory.load))
 
     return tuple(at(one) for one in memories)
 

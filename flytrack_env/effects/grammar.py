@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from flytrack_env.effects.base import Effect, Range, StepContext
-from flytrack_env.effects.pendulum import SHORTEST_M, Pendulum, hanging, swung
+from flytrack_env.effects.pendulum import Pendulum, advance_load, is_swinging, start_load
 from flytrack_env.messages import quote_value
 from flytrack_env.quaternion import Scalar, Vec3
 from flytrack_env.state import Action, Drone
@@ -63,7 +63,8 @@ def moment_of(context: StepContext, flight: Flight | None) -> Moment:
         context.applied,
         context.thrust_acc,
         drone.battery_v,
-        *(flight or Flight(0.0)),
+        time_s=0.0 if flight is None else flight.time_s,
+        load=None if flight is None else flight.load,
     )
 
 
@@ -207,7 +208,7 @@ SHAPES: dict[str, Shape] = {
     ),
     "pendulum": Shape(
         ("length", "damping"),
-        "{q} on {length} m, damped by {damping}/s",
+        "swing({q}; {length} m, {damping}/s)",
         ("load",),
         _swing,
         ("length", "damping"),
@@ -277,8 +278,8 @@ class Term:
     @property
     def pendulum(self) -> tuple[float, float] | None:
         """Length, m, and damping, 1/s, of the load that it looks at; None without one."""
-        numbers = (one.numbers for one in self.factors if one.shape == "pendulum")
-        return next(((length, damping) for length, damping in numbers), None)
+        loads = ((one.numbers[0], one.numbers[1]) for one in self.factors if one.shape == "pendulum")
+        return next(loads, None)
 
     def signal(self, moment: Moment) -> Scalar:
         """Return the product of its factors."""
@@ -348,15 +349,15 @@ class Law:
 def learned_effect(static: str, read: Callable[[Any], Any], **declared: Any) -> Effect:
     """Return the effect of something learnt, whose parameters are ``scale``, ``spread`` and a structure.
 
-    static: name of the structure; it has ``parts``, each with ``acts`` and ``at(moment, spread)``, ``uses``,
-    ``pendulum`` and ``as_json``. read: from JSON values. declared: what else there is to an effect.
+    static: name of the structure; it has ``parts``, each with ``acts`` and ``at(moment, spread)``, ``uses``
+    and ``as_json``. read: from JSON values. declared: what else there is to an effect.
     """
 
     def start(parameters: Any, drone: Drone) -> Flight | None:
         structure = getattr(parameters, static)
-        if not structure.pendulum and not structure.uses("time"):
+        if not structure.uses("load") and not structure.uses("time"):
             return None
-        load = hanging(drone.vel_w) if structure.pendulum else None
+        load = start_load(drone.vel_w) if structure.uses("load") else None
         return Flight(jnp.zeros_like(jnp.asarray(drone.battery_v)), load)
 
     def remember(parameters: Any, flight: Flight | None, context: StepContext) -> Flight | None:
@@ -364,7 +365,11 @@ def learned_effect(static: str, read: Callable[[Any], Any], **declared: Any) -> 
             return None
         load = flight.load
         if load is not None:
-            load = swung(load, context.drone.vel_w, context.dt, *getattr(parameters, static).pendulum)
+            axes = zip(context.body_axes_w, context.force_b, strict=True)
+            x_w, y_w, z_w = (axis.scale(part) for axis, part in axes)
+            push_w = x_w + y_w + z_w  # gravity changes no horizontal velocity
+            mean_w = context.drone.vel_w + push_w.scale(0.5 * context.dt)
+            load = advance_load(load, mean_w, context.dt, *getattr(parameters, static).pendulum)
         return Flight(flight.time_s + context.dt, load)
 
     def added(parameters: Any, acts: str, flight: Flight | None, value_b: Vec3, context: StepContext) -> Vec3:
@@ -401,7 +406,7 @@ def law_from_json(values: Any) -> Law:
     """
     listed_terms = listed("terms", values, MOST_TERMS)
     terms = tuple(_term(f"terms[{place}]", one) for place, one in enumerate(listed_terms))
-    loads = {one.pendulum for one in terms if one.pendulum}
+    loads = {one.numbers for term in terms for one in term.factors if one.shape == "pendulum"}
     if len(loads) > 1:
         raise ValueError(f"terms: found loads on {len(loads)} strings (length, damping), expected one")
     return Law(terms)
@@ -473,8 +478,8 @@ def _factor(where: str, value: Any) -> Factor:
             raise ValueError(f"{where}.{one}: found {by_name[one]:g}, expected more than 0")
     if name == "wave" and by_name["order"] not in (1.0, 2.0, 3.0, 4.0):
         raise ValueError(f"{where}.order: found {by_name['order']:g}, expected 1, 2, 3 or 4")
-    if name == "pendulum" and by_name["length"] < SHORTEST_M:
-        raise ValueError(f"{where}.length: found {by_name['length']:g}, expected at least {SHORTEST_M:g} m")
+    if name == "pendulum" and not is_swinging(*numbers):
+        raise ValueError(f"{where}.damping: found {numbers[1]:g}, expected less, so that the load swings")
     if name == "power":
         _check_power(where, quantity, by_name["exponent"], by_name["offset"])
     return Factor(quantity, name, numbers)

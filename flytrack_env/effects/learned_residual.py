@@ -89,8 +89,6 @@ class Networks:
         """Return whether any network looks at a quantity."""
         return any(one.quantity == quantity for network in self.networks for one in network.inputs)
 
-    pendulum = None  # nothing is learnt of a load but laws
-
     def text(self) -> str:
         """Return what depends on what, a line a network."""
         lines = []

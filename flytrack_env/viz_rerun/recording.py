@@ -132,7 +132,7 @@ def _events(
             events.append((one.row, f"{flight.name}: gate {gate}, {one.time_s:.3f} s"))
             if one.lap:  # an event of its own, as the panel is narrow
                 events.append((one.row, f"{flight.name}: lap {one.lap}, {one.lap_time_s:.3f} s"))
-    return [*events, (len(flight.states) - 1, f"{flight.name}: {ended}")]
+    return [*events, (len(flight.states) - 1, f"{flight.name}: ended, {ended}")]
 
 
 def _describe(flights: Sequence[Trajectory], races: Sequence[FlownRace | None], ends: Sequence[str]) -> str:

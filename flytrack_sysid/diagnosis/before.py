@@ -29,7 +29,7 @@ from flytrack_sysid.diagnosis.diagnose import (
 )
 from flytrack_sysid.diagnosis.model_selection import EQUIVALENT, Marginal, ablate
 from flytrack_sysid.diagnosis.problem import Problem
-from flytrack_sysid.diagnosis.result import Cause, Diagnosis, Estimated, Unexplained
+from flytrack_sysid.diagnosis.result import DRIFT, Cause, Diagnosis, Estimated, Unexplained
 from flytrack_sysid.diagnosis.score_test import (
     BASE_CAUSES,
     Candidate,
@@ -142,7 +142,8 @@ def diagnose_change(
         named = [*effects, *base]
         causes = tuple(one for cause in named for one in changed_cause(cause, later, earlier))
         report(3, 3)
-    causes = tuple(replace(one, equivalent=alike.get(one.effect, ())) for one in causes)
+    drifts = {one.effect: one.equivalent for one in base if DRIFT in one.equivalent}
+    causes = tuple(replace(one, equivalent=(drifts | alike).get(one.effect, ())) for one in causes)
     same = {one.effect for one in named} - {one.effect for one in causes}
     return replace(
         found,

@@ -9,6 +9,7 @@ from matplotlib.figure import Figure
 from flytrack_env.dynamics import ModelParameters
 from flytrack_env.effects import ThrustScale
 from flytrack_env.pictures.drawing import new_figure, plain
+from flytrack_sysid.diagnosis.result import DRIFT
 from flytrack_sysid.diagnosis.score_test import BASE_CAUSES
 from flytrack_sysid.diagnosis.traces import REGRESSORS, UNITS, Traces
 from flytrack_sysid.parameters import STICKS, names_of, to_vector, with_values
@@ -196,6 +197,8 @@ def without(extended: ModelParameters, nominal: ModelParameters, cause: str) -> 
 
 def words_of(cause: str) -> str:
     """Return a cause in plain words; its own name where there are none."""
+    if cause == DRIFT:
+        return "a drift of the thrust, as while motors warm up; fly again with warm motors and a full battery"
     return EVIDENCE[cause].words if cause in EVIDENCE else cause.replace("_", " ")
 
 

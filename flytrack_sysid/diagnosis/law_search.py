@@ -7,21 +7,21 @@ per number is added, up to three. A term has to gain on held-out rows, too.
 """
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from scipy import optimize, stats
 
 from flytrack_env.dynamics import collective_thrust
 from flytrack_env.effects.grammar import QUANTITIES, SHAPES, XYZ, Factor, Moment, Term
-from flytrack_env.effects.pendulum import SHORTEST_M, Pendulum
+from flytrack_env.effects.pendulum import Pendulum, is_swinging
 from flytrack_env.quaternion import Vec3
 from flytrack_env.state import Action
 from flytrack_sysid.diagnosis.lanes import LANE_S
-from flytrack_sysid.diagnosis.loads import with_loads
 from flytrack_sysid.diagnosis.problem import Problem, blocks_of, robust_square
 from flytrack_sysid.diagnosis.search import FittedModel
 from flytrack_sysid.diagnosis.unexplained import (
@@ -35,6 +35,7 @@ from flytrack_sysid.diagnosis.unexplained import (
     linearized_residuals,
     whitened,
 )
+from flytrack_sysid.loads import load_at
 from flytrack_sysid.parameters import MAX_RATES, from_vector
 
 CHANCE, CHANCE_OF_MORE = 1e-7, 1e-4  # of a term where nothing is left; of a second and third one
@@ -51,6 +52,9 @@ TINY = 1e-3  # of numbers that are positive
 LEAST_SIGMAS = 3.0  # of a coefficient that stays
 HELD_OUT_SHARE = 0.6  # of the gain on held-out rows that a law would have there if it were right
 LEAST_EXPECTED = 10.0  # of that gain: with less, held-out rows say nothing of a law
+
+
+_load_at = jax.jit(load_at)
 
 
 def moment_of_flight(problem: Problem, vector: np.ndarray, flight: Flown) -> Moment:
@@ -139,8 +143,9 @@ class Side(NamedTuple):
         if term.pendulum is None:
             return self.moment
         lanes = self.problem.lanes
-        load = with_loads(lanes.record, lanes.towed, term.pendulum).load
-        load = np.nan_to_num(np.concatenate([load[:1], load[:-1]]))  # a step begins at the row before
+        assert lanes.load_input is not None, "lanes of a log have it"
+        load = np.asarray(_load_at(lanes.load_input, lanes.row, term.pendulum))
+        load = np.concatenate([load[:1], load[:-1]])  # a step begins at the row before
         return self.moment._replace(load=Pendulum(*np.moveaxis(load, -1, 0)))
 
     def columns(self, term: Term) -> np.ndarray:
@@ -275,10 +280,11 @@ def refine_shapes(side: Side, test: SideTest, start: Trial) -> Trial:
     return best
 
 
-def refine_jointly(side: Side, terms: Sequence[Term]) -> list[Term]:
-    """Return terms with the numbers of each one's shapes where it gains most beside the others."""
+def refine_jointly(side: Side, terms: Sequence[Term], places: Iterable[int]) -> list[Term]:
+    """Return terms with the numbers of some of their shapes where each gains most beside the others."""
     result = list(terms)
-    for place, term in enumerate(terms[:-1]):
+    for place in places:
+        term = terms[place]
         others = [side.columns(one) for one in (*result[:place], *result[place + 1 :])]
         test = side.test.given_also(*others)
         result[place] = refine_shapes(side, test, score_term(side, test, term)).term
@@ -295,7 +301,7 @@ def _fixed(term: Term) -> list[int]:
 
 
 def _with_numbers(term: Term, values: np.ndarray) -> Term | None:
-    """Return a term with other numbers; None where one would have no width or length."""
+    """Return a term with other numbers; None where one would have no width, or not swing."""
     factors, place = [], 0
     for one in term.factors:
         numbers = tuple(values[place : place + len(one.numbers)].tolist())
@@ -303,7 +309,7 @@ def _with_numbers(term: Term, values: np.ndarray) -> Term | None:
         by_name = dict(zip(SHAPES[one.shape].numbers, numbers, strict=True))
         if any(not by_name[name] > TINY for name in SHAPES[one.shape].positive):
             return None
-        if one.shape == "pendulum" and by_name["length"] < SHORTEST_M:
+        if one.shape == "pendulum" and not is_swinging(*numbers):
             return None
         factors.append(replace(one, numbers=numbers))
     return replace(term, factors=tuple(factors))
@@ -314,7 +320,7 @@ class Found(NamedTuple):
 
     vector: of the model with what the law changes in its free numbers. gain: on rows that were learnt from,
     held_out_gain on others, of minus twice the log likelihood; expected: there, if it were right. rivals:
-    other terms in place of the first that gain within 10 of it, as formulas.
+    other terms that alone gain within 10 of the best one, as formulas.
     """
 
     terms: tuple[Term, ...]
@@ -393,7 +399,7 @@ def cross_validate(side: Side, terms: Sequence[Term]) -> tuple[float, float]:
     return gain, expected
 
 
-def judged_law(side: Side, held: Side, terms: tuple[Term, ...], fit: SideFit) -> Found:
+def judge_law(side: Side, held: Side, terms: tuple[Term, ...], fit: SideFit) -> Found:
     """Return terms that were fitted as a law, with what it gains on held-out rows."""
     vector = vector_with(side, fit)
     gain, expected = held_out(side, held, contribution_of(held, terms), vector)
@@ -408,11 +414,11 @@ def is_confirmed(side: Side, law: Found) -> bool:
     return gain >= HELD_OUT_SHARE * expected
 
 
-def pruned(side: Side, held: Side, law: Found, number: int) -> Found | None:
+def drop_weak_terms(side: Side, held: Side, law: Found, number: int) -> Found | None:
     """Return a law of terms that each gain, beside all others, what one more has to; the best term first.
 
-    A term that stood for the others when it was alone is left over beside them. None where held-out rows do
-    not confirm the rest. number: of terms among which they were chosen.
+    A first term may only have stood in for later ones. None where held-out rows do not confirm the rest.
+    number: of terms among which they were chosen.
     """
     terms = law.terms
     while True:
@@ -423,11 +429,11 @@ def pruned(side: Side, held: Side, law: Found, number: int) -> Found | None:
         weakest = int(np.argmin(losses - least))
         if len(terms) == 1 or losses[weakest] >= least[weakest]:
             break
-        terms = tuple(others[weakest])
+        terms = tuple(refine_jointly(side, others[weakest], range(len(others[weakest]))))
     order = np.argsort(losses)[::-1]
     if len(terms) == len(law.terms):
         return law._replace(terms=tuple(terms[place] for place in order))
-    found = judged_law(side, held, *fit_terms(side, [terms[place] for place in order]))
+    found = judge_law(side, held, *fit_terms(side, [terms[place] for place in order]))
     return found if is_confirmed(side, found) else None
 
 
@@ -446,7 +452,7 @@ def find_law(side: Side, held: Side) -> Found | None:
         by_quantity.setdefault(one.term.factors[-1].quantity, one)
     starts = list(by_quantity.values())[:MOST_STARTS]
     grown = [grow_law(side, held, one, ranked, len(pool)) for one in starts]
-    laws = [pruned(side, held, one, len(pool)) for one in grown if one is not None]
+    laws = [drop_weak_terms(side, held, one, len(pool)) for one in grown if one is not None]
     found = [one._replace(rivals=rivals) for one in laws if one is not None]
     return max(found, key=lambda one: one.gain - sum(price_of(term) for term in one.terms), default=None)
 
@@ -473,10 +479,10 @@ def grow_law(side: Side, held: Side, first: Trial, pool: Sequence[Term], number:
     # Free flight on held-out rows cannot judge what looks at the time: a law does in all terms or in none.
     pool = [term for term in pool if uses_time(term) == uses_time(first.term)][:MOST_TRIED_AGAIN]
     while True:
-        now, fit = fit_terms(side, refine_jointly(side, [*terms, first.term]))
+        now, fit = fit_terms(side, refine_jointly(side, [*terms, first.term], range(len(terms))))
         if len(now) <= len(terms) or (best is not None and fit.chi2 < (1.0 + LEAST_SHARE) * best.gain):
             break
-        one = judged_law(side, held, now, fit)
+        one = judge_law(side, held, now, fit)
         if best is not None and one.held_out_gain < best.held_out_gain:
             break
         # One wave of a sum of two may fail on held-out rows where both do not.

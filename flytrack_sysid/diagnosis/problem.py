@@ -29,7 +29,7 @@ from flytrack_env.quaternion import Quaternion, Vec3
 from flytrack_sysid.diagnosis import noise as noises
 from flytrack_sysid.diagnosis.lanes import LANE_S, Lanes, lead_in_of
 from flytrack_sysid.diagnosis.lateness import Late
-from flytrack_sysid.diagnosis.loads import pendulum_of, with_loads
+from flytrack_sysid.loads import load_at, pendulum_of
 from flytrack_sysid.parameters import TAUS, bounds_of, from_vector, in_batches, names_of, to_vector
 from flytrack_sysid.record import Record
 from flytrack_sysid.replay import Step, replay
@@ -83,7 +83,10 @@ def residuals(vector: jax.Array, like: ModelParameters, lanes: Lanes) -> jax.Arr
 
     vector: the model's numbers, in the order of ``parameters.names_of(like)``.
     """
-    model = from_vector(vector, like)
+    model, pendulum = from_vector(vector, like), pendulum_of(like)
+    if pendulum is not None and lanes.load_input is not None:
+        load = load_at(lanes.load_input, lanes.row, pendulum)
+        lanes = lanes._replace(record=lanes.record._replace(load=load))
     of_lane = jax.vmap(lambda lane, sensed: _of_lane(model, lane, sensed), in_axes=1, out_axes=1)
     return jnp.where(lanes.is_joined[..., None, None], of_lane(lanes.record, lanes.measured), 0.0)
 
@@ -160,7 +163,7 @@ class Problem:
         names, start = names_of(like), to_vector(like)
         low, high = np.array([bounds_of(name) for name in names]).T
         return cls(
-            lanes=_with_loads(lanes, like),
+            lanes=lanes,
             like=like,
             given_effects=tuple(effect_of(one).name for one in model.effects),
             names=names,
@@ -188,7 +191,6 @@ class Problem:
         low, high = np.array([bounds_of(name) for name in names[len(self.names) :]]).reshape(-1, 2).T
         return replace(
             self,
-            lanes=_with_loads(self.lanes, like),
             like=like,
             names=names,
             start=start,
@@ -223,7 +225,9 @@ class Problem:
         return found if self.late is None else self.late.residuals(found)
 
     def _replayed(self, vectors: np.ndarray) -> np.ndarray:
-        lanes = self.lanes._replace(towed=None)  # of any length, for which nothing is to be compiled
+        lanes = self.lanes
+        if pendulum_of(self.like) is None:
+            lanes = lanes._replace(load_input=None)  # of any length, for which nothing is to be compiled
         return in_batches(lambda part: _residuals(part, self.like, lanes), vectors, _size_for(vectors))
 
     def _composed(self, vectors: np.ndarray) -> np.ndarray:
@@ -290,14 +294,6 @@ class Problem:
     def index(self, names: Sequence[str]) -> list[int]:
         """Return the places of parameters in the vector."""
         return [self.names.index(name) for name in names]
-
-
-def _with_loads(lanes: Lanes, like: ModelParameters) -> Lanes:
-    """Return lanes with the load on a string that a model's law looks at."""
-    pendulum = pendulum_of(like)
-    if pendulum is None:
-        return lanes
-    return lanes._replace(record=with_loads(lanes.record, lanes.towed, pendulum))
 
 
 def _size_for(values: np.ndarray) -> int:

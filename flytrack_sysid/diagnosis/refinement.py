@@ -20,13 +20,13 @@ from scipy.spatial.transform import Rotation
 
 from flytrack_env.dynamics import ModelParameters
 from flytrack_env.effects import BY_NAME
-from flytrack_sysid.diagnosis.loads import pendulum_of, with_loads
 from flytrack_sysid.diagnosis.model_selection import ablate
 from flytrack_sysid.diagnosis.onset import ended
 from flytrack_sysid.diagnosis.problem import Problem
 from flytrack_sysid.diagnosis.score_test import BASE_CAUSES, Candidate, prior_information, solve, step_inside
 from flytrack_sysid.diagnosis.search import FittedModel, SearchState
 from flytrack_sysid.diagnosis.vetoes import Selection
+from flytrack_sysid.loads import pendulum_of
 from flytrack_sysid.log import FlightLog
 from flytrack_sysid.parameters import DRAIN, from_vector, in_batches
 from flytrack_sysid.prediction_windows import (
@@ -102,12 +102,8 @@ def _errors(vectors: jax.Array, like: ModelParameters, windows: Windows) -> jax.
 
 def errors_at(problem: Problem, vectors: np.ndarray, windows: Windows) -> Tested:
     """Return the errors of models, (num_vectors, num_parameters), on windows; one program for all."""
-    pendulum = pendulum_of(problem.like)
-    if pendulum is not None:
-        # Where the drone flies by itself, so does its load.
-        record = with_loads(windows.record, problem.lanes.towed, pendulum)
-        load = np.where(windows.is_free[:, None, None], np.nan, record.load)
-        windows = windows._replace(record=record._replace(load=load))
+    if pendulum_of(problem.like) is None:
+        windows = windows._replace(load_input=None)  # of any length, for which nothing is to be compiled
 
     def of_batch(part: np.ndarray) -> np.ndarray:
         found = [np.asarray(_errors(part, problem.like, chunk)) for chunk in chunks_of(windows)]

@@ -16,6 +16,7 @@ from flytrack_sysid.diagnosis.evidence import EVIDENCE, Panel, draw_cause, list_
 from flytrack_sysid.diagnosis.result import (
     CAUSES_FOUND,
     CONSISTENT,
+    DRIFT,
     TO_LOG,
     Cause,
     Diagnosis,
@@ -422,7 +423,8 @@ def text_of(diagnosis: Diagnosis) -> str:
             f"{name} {one.value:.4g} ({one.ci95[0]:.4g} to {one.ci95[1]:.4g}) {one.unit}"
             for name, one in cause.parameters.items()
         )
-        twins = f"; not told apart from {', '.join(cause.equivalent)}" if cause.equivalent else ""
+        names = [words_of(one) if one == DRIFT else one for one in cause.equivalent]
+        twins = f"; not told apart from {', '.join(names)}" if names else ""
         lines.append(
             f"  {cause.effect}{when_of(cause)}: {values}; held-out gain {cause.heldout_gain:.4g}{twins}"
         )

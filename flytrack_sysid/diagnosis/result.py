@@ -13,6 +13,9 @@ from flytrack_sysid.diagnosis.lanes import AXES
 SCHEMA = 1
 TO_LOG = "log "  # what comes instead of a manoeuvre where a channel is missing
 CONSISTENT, CAUSES_FOUND, UNEXPLAINED = "consistent", "causes_found", "unexplained"
+DRIFT = (
+    "thrust_drift"  # no effect: what a curve that depends on the voltage may be, which falls with the time
+)
 # Direct and level channel of each side: rotation, force, battery.
 CHANNELS: tuple[tuple[str | None, str], ...] = (
     ("rates", "attitude"),
@@ -54,9 +57,9 @@ class Cause:
     """Something that the model has wrong, by name.
 
     effect: of ``flytrack_env.effects``, or a base parameter (tau_roll ... tau_thrust, thrust_curve,
-    thrust_scale, battery_drain). equivalent: names that this log cannot tell from it. channel: rates,
-    attitude, force, velocity or battery: where it shows most. parameters: by name. chi2_gain: what it gains
-    on the part that was fitted, heldout_gain: on the part held out, of minus twice the log likelihood.
+    thrust_scale, battery_drain). equivalent: names that this log cannot tell from it, or DRIFT. channel:
+    rates, attitude, force, velocity or battery: where it shows most. parameters: by name. chi2_gain: what it
+    gains on the part that was fitted, heldout_gain: on the part held out, of minus twice the log likelihood.
     lambda_: squared size of its signature over the noise, all else that is free taken out. lambda_sep: the
     same with the closest rival taken out too, and closest which that is; base parameters have none.
     beyond: where a value lies at the end of what is searched, "delay_s at least 0.04 s": the true cause may

@@ -23,6 +23,7 @@ from flytrack_sysid.diagnosis.result import (
     CAUSES_FOUND,
     CHANNELS,
     CONSISTENT,
+    DRIFT,
     PLACES,
     TO_LOG,
     UNEXPLAINED,
@@ -47,13 +48,6 @@ from flytrack_sysid.response import FULL_STEP, SMALL_STEP, half_responses
 TWO_SIDED_95 = 1.959964
 LOOSE = 0.5  # of the prior's width: a parameter that the log knows no better is not determined
 SCALE_TWINS = ("thrust_curve",)  # mass, payload, battery and motors all scale the thrust over the mass
-DRIFT = (
-    "thrust_drift"  # no effect: what a log of one flight cannot tell from a curve that depends on the voltage
-)
-DRIFT_NOTE = (
-    "{} could be thrust that drifts, as of motors that warm up: within a flight, the voltage falls with the "
-    "time; fly again with warm motors and a full battery"
-)
 SLOPE_STEP = 1e-3  # of a parameter's scale, for slopes of times to half response
 STILL = (*MAX_RATES, DRAIN, *THRUST_COEFFS)  # a model where these are 0 does not move
 
@@ -523,7 +517,6 @@ def warnings_of(problem: Problem, causes: Sequence[Cause], contradicted: Sequenc
             for name in contradicted
         ),
         *(_at_bound(cause) for cause in causes if cause.beyond),
-        *(DRIFT_NOTE.format(cause.effect) for cause in causes if DRIFT in cause.equivalent),
     ]
 
 

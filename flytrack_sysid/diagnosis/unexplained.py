@@ -116,6 +116,13 @@ def _along(waves: np.ndarray, vectors_w: np.ndarray) -> np.ndarray:
     return product.reshape(-1, *product.shape[2:])
 
 
+def time_features(flight: Flown) -> np.ndarray:
+    """Return smooth functions of the time along the body's axes, (features, rows, lanes, 3), world frame."""
+    span = max(float(flight.time_s[flight.is_counted].max(initial=0.0)), 1e-9)
+    times = np.stack([np.cos(np.pi * n * flight.time_s / span) for n in range(1, TIME_WAVES + 1)])
+    return _along(times, np.moveaxis(flight.body_to_world, -1, 0))
+
+
 def dependences(flight: Flown) -> Mapping[str, Mapping[str, np.ndarray]]:
     """Return by side (rate, force) and dependence what an unknown effect might add, of unit size.
 
@@ -127,8 +134,6 @@ def dependences(flight: Flown) -> Mapping[str, Mapping[str, np.ndarray]]:
     heading = np.arctan2(flight.body_to_world[..., 1, 0], flight.body_to_world[..., 0, 0])
     orders = range(1, HEADING_WAVES + 1)
     turns = np.stack([wave(n * heading) for n in orders for wave in (np.sin, np.cos)])
-    span = max(float(flight.time_s[counted].max(initial=0.0)), 1e-9)
-    times = np.stack([np.cos(np.pi * n * flight.time_s / span) for n in range(1, TIME_WAVES + 1)])
     tilt = _rank_waves(flight.body_to_world[..., 2, 2], counted, RANK_WAVES)
     fast = _rank_waves(np.linalg.norm(flight.vel_w, axis=-1), counted, RANK_WAVES)
     place = _place_waves(flight)
@@ -139,7 +144,7 @@ def dependences(flight: Flown) -> Mapping[str, Mapping[str, np.ndarray]]:
     ]
     rate = {
         "position": _along(place, body),
-        "time": _along(times, body),
+        "time": time_features(flight),
         "heading": _along(turns, body),
         "airspeed": _along(fast, body),
         "attitude": _along(tilt, body),
@@ -352,7 +357,7 @@ def find_dependences(
 
 
 def is_like_drift(problem: Problem, model: FittedModel, fields: Sequence[str]) -> bool:
-    """Return whether a base change is nearly a force of the body that changes with the time alone.
+    """Return whether a drift of the force would take up 90 % of a base change that no steady force does.
 
     Within one flight the voltage falls with the time, so that a thrust curve takes up motors that warm up.
     """
@@ -369,8 +374,7 @@ def is_like_drift(problem: Problem, model: FittedModel, fields: Sequence[str]) -
 
     steady = constants(flight, "force")
     alone = beside(steady)
-    drifting = dependences(flight)["force"]["time"]
-    return alone >= threshold(len(fields)) and beside(steady, drifting) < DRIFT_SHARE * alone
+    return alone >= threshold(len(fields)) and beside(steady, time_features(flight)) < DRIFT_SHARE * alone
 
 
 def _greedy(

@@ -118,4 +118,4 @@ def test_a_thrust_curve_says_where_it_could_be_motors_that_warm_up(monkeypatch: 
     curved = diagnose(log, nominal._replace(thrust_coeffs=nominal.thrust_coeffs * of_stick))
     for found, alike in ((warm, ("thrust_drift",)), (curved, ())):
         assert [one.equivalent for one in found.causes if one.effect == "thrust_curve"] == [alike]
-        assert ("warm motors" in text_of(found)) == bool(alike)
+        assert ("fly again with warm motors" in text_of(found)) == bool(alike)

@@ -80,7 +80,7 @@ def test_arrows_are_the_force_that_the_model_lacks_along_the_world(flown, models
     assert np.isnan(recording.series("/plots/residual/nominal", "Scalars:scalars")[[0, SECOND]]).all()
 
 
-def test_of_late_poses_the_ends_have_no_force(flown, models):
+def test_ends_of_late_poses_have_no_force(flown, models):
     """Where the true pose of a row was never logged; all other rows keep their places."""
     late = models["nominal"].with_effects(MocapLatency(0.03))
     shown, *_ = trajectories.trajectories_of(flown[1], {"late": late})

@@ -149,8 +149,8 @@ def test_passes_laps_events_and_table_are_the_races(tmp_path):
     assert texts[0] == f"policy: gate 0, {first.time_s:.3f} s"
     assert texts[7] == f"policy: gate 10, {lap.time_s:.3f} s"
     assert texts[8] == f"policy: lap 1, {lap.lap_time_s:.3f} s"
-    assert texts[-1] == "policy: all steps flown"
-    assert recording.rows[f"/events/{SECOND}", "TextLog:text"][-1] == ["plant / 2: battery"]
+    assert texts[-1] == "policy: ended, all steps flown"
+    assert recording.rows[f"/events/{SECOND}", "TextLog:text"][-1] == ["plant / 2: ended, battery"]
     (table,) = recording.once("/about", "TextDocument:text")
     assert f"| policy | {lap.lap_time_s:.3f} | 4.49 | {len(RACE.passes)} | all steps flown |" in table
 
