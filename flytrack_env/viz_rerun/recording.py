@@ -190,7 +190,7 @@ def make_blueprint(
         rrb.Horizontal(
             rrb.TextDocumentView(origin="/about", name="flights"),
             rrb.TextLogView(origin="/", contents="/events/**", name="events", columns=body),
-            column_shares=[5.0, 4.0],
+            column_shares=[4.0, 3.0],
         ),
         row_shares=[4.0, 4.0, 2.0],
     )
