@@ -476,7 +476,7 @@ def grow_law(side: Side, held: Side, first: Trial, pool: Sequence[Term], number:
     """
     terms: list[Term] = []
     best: Found | None = None
-    # Free flight on held-out rows cannot judge what looks at the time: a law does in all terms or in none.
+    # What happens once would pass for the remainder of another law: all terms look at the time, or none.
     pool = [term for term in pool if uses_time(term) == uses_time(first.term)][:MOST_TRIED_AGAIN]
     while True:
         now, fit = fit_terms(side, refine_jointly(side, [*terms, first.term], range(len(terms))))

@@ -13,7 +13,7 @@ import numpy as np
 from flytrack_env.effects.grammar import Law, Term
 from flytrack_env.effects.learned_residual import Network, Networks
 from flytrack_sysid.diagnosis.beyond import Learned
-from flytrack_sysid.diagnosis.law_search import LEAST_EXPECTED, Found, Side, find_law, uses_time
+from flytrack_sysid.diagnosis.law_search import LEAST_EXPECTED, Found, Side, find_law
 from flytrack_sysid.diagnosis.problem import Problem
 from flytrack_sysid.diagnosis.refinement import (
     LIKELY,
@@ -115,15 +115,11 @@ def _predicts(
 ) -> bool:
     """Return whether held-out flights are predicted no worse with what was learnt, and better in all.
 
-    acts_there: whether it acts in them enough to be judged. What looks at the time is left out: free flight
-    begins at any time.
+    acts_there: whether it acts in them enough to be judged.
     """
-    new = _of_parts(*added)
-    if judge is None or new.law.uses("time") or new.networks.uses("time"):
+    if judge is None:
         return True
-    terms = [one for one in had[0] if not uses_time(one)]
-    networks = [one for one in had[1] if not Networks((one,)).uses("time")]
-    old, both = _of_parts(terms, networks), _of_parts([*terms, *added[0]], [*networks, *added[1]])
+    old, both = _of_parts(*had), _of_parts([*had[0], *added[0]], [*had[1], *added[1]])
     tested = [
         errors_at(problem.with_learned(one.effects), one.beside(vector)[None], judge.windows)
         for vector, one in ((before, old), (after, both))
