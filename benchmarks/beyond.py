@@ -33,9 +33,9 @@ from flytrack_sysid.log import FlightLog
 
 LINES = report.RESULTS / "beyond.jsonl"
 REAL = report.ROOT / "benchmarks" / "data" / "real"  # `python -m benchmarks.real_logs --diagnose`
-SEED, SECONDS = 61, 60.0  # rules were looked at on seeds 7, 41, 43, 47, 53 and 59
+SEED, SECONDS = 67, 60.0  # rules were looked at on seeds 7, 41, 43, 47, 53, 59 and 61
 # Of plants without a law also those of older seeds: rules were looked at on their laws.
-SEEDS_OF_CONTROLS = (53, 59, SEED)
+SEEDS_OF_CONTROLS = (53, 59, 61, SEED)
 PLANTS_A_CACHE = 15  # a process may map only so many compiled programs into its memory
 AMPLITUDES = (1.0, 3.0)  # times the noise of the sensor in the law's channel
 # Kind of law -> quantities, and shapes, that are right.
