@@ -7,7 +7,6 @@ the intervals of a residual hold. It appends a line a plant to docs/results/beyo
 have a line of the same commit; --page writes docs/results/beyond.md, of the last lines of each sort.
 """
 
-import argparse
 import json
 import math
 import time
@@ -17,14 +16,13 @@ from typing import Any
 
 import jax
 import numpy as np
-from tqdm import tqdm
 
 from benchmarks import hidden, report
 from benchmarks.diagnosis import model_of
 from benchmarks.hidden.oracle import removed
 from benchmarks.real.section import formulas_of
 from flytrack_sysid.diagnosis import Diagnosis, diagnose
-from flytrack_sysid.diagnosis.lanes import make_lanes
+from flytrack_sysid.diagnosis.lanes import lanes_of
 from flytrack_sysid.diagnosis.law_search import Side
 from flytrack_sysid.diagnosis.problem import Problem
 from flytrack_sysid.diagnosis.residual_fit import direct_residuals, is_within_range
@@ -114,8 +112,7 @@ def covered(found: Diagnosis, log: FlightLog) -> dict[str, list[int]]:
         model = model._replace(
             effects=tuple(one for one in model.effects if one not in found.learned.effects)
         )
-        judged = np.ones(len(log), bool)
-        problem = Problem.of(make_lanes(log, judged, np.asarray(model.tau, float), float(model.g)), model)
+        problem = Problem.of(lanes_of(log, np.ones(len(log), bool), model), model)
         for network in found.learned.networks.networks:
             side = Side.unfitted(network.acts, problem, FittedModel((), problem.start, 0.0, ()))
             left, is_judged = direct_residuals(side, problem.start, network)
@@ -128,9 +125,9 @@ def covered(found: Diagnosis, log: FlightLog) -> dict[str, list[int]]:
 def run(trials: Sequence[Trial]) -> None:
     """Diagnose what has no line of this commit yet, and append the lines."""
     commit = report.commit_of_checkout()
-    done = {(line["row"], line["number"]) for line in read() if line["commit"] == commit}
+    done = {(line["row"], line["number"]) for line in report.lines_of_commit(LINES, commit)}
     left = [one for one in trials if one not in done]
-    for place, (row, number) in enumerate(tqdm(left, unit=" plants", disable=None)):
+    for place, (row, number) in enumerate(report.progress(left, "plants")):
         if place % PLANTS_A_CACHE == 0:
             jax.clear_caches()
         line = {"row": row, "number": number, "seed": SEED, "commit": commit}
@@ -138,13 +135,7 @@ def run(trials: Sequence[Trial]) -> None:
             line |= plant(row, number)
         except Exception as error:  # a crash is a result too, and the others go on
             line["error"] = f"{type(error).__name__}: {error}"
-        with LINES.open("a") as file:
-            file.write(json.dumps(line) + "\n")
-
-
-def read() -> list[dict[str, Any]]:
-    """Return all lines."""
-    return [json.loads(text) for text in LINES.read_text().splitlines()] if LINES.exists() else []
+        report.append_line(LINES, line)
 
 
 def figures(lines: Sequence[dict[str, Any]]) -> list[tuple[str, str, str]]:
@@ -185,18 +176,14 @@ def figures(lines: Sequence[dict[str, Any]]) -> list[tuple[str, str, str]]:
     ]
 
 
-def kind_rows(lines: Sequence[dict[str, Any]]) -> list[tuple[str, str, str, str]]:
+def kind_rows(lines: Sequence[dict[str, Any]]) -> list[tuple[str, int, int, int]]:
     """Return, by kind of law, how many plants there are, of how many the form is right, any law learnt."""
-    kinds = {kind: [line for line in lines if line["row"] == kind] for kind in RIGHT}
-    return [
-        (
-            kind,
-            str(len(own)),
-            str(sum(one.get("is_form", False) for one in own)),
-            str(sum(bool(one["law"]) for one in own)),
-        )
-        for kind, own in kinds.items()
-    ]
+    rows = []
+    for kind in RIGHT:
+        own = [line for line in lines if line["row"] == kind]
+        right = sum(one.get("is_form", False) for one in own)
+        rows.append((kind, len(own), right, sum(bool(one["law"]) for one in own)))
+    return rows
 
 
 def diagnoses_of(record: Any) -> list[dict[str, Any]]:
@@ -219,27 +206,25 @@ def real_rows() -> list[tuple[str, str, str, str]]:
     for path in sorted(REAL.glob("*_diagnosis.json")):
         for number, found in enumerate(diagnoses_of(json.loads(path.read_text()))):
             name = f"{path.stem.removesuffix('_diagnosis')} {number + 1}"
-            if "learned" not in found:
-                rows.append((name, "not diagnosed since laws are learnt", "-", "-"))
-                continue
             learned, errors = found["learned"], found["prediction"]["errors"]
             if learned is None:
                 rows.append((name, "nothing", "-", "-"))
                 continue
-            formulas = formulas_of(learned)
             ratios = [
                 errors["extended"][quantity][horizon] / before
                 for quantity, by_horizon in errors["without_learned"].items()
                 if quantity.split("_")[0] in ("velocity", "position")
                 for horizon, before in by_horizon.items()
             ]
-            rows.append((name, "; ".join(formulas), f"{np.median(ratios):.2f}", f"{max(ratios):.2f}"))
+            rows.append(
+                (name, "; ".join(formulas_of(learned)), f"{np.median(ratios):.2f}", f"{max(ratios):.2f}")
+            )
     return rows
 
 
 def write_page() -> None:
     """Write the page of the last commit's plants with and without a law, and of measured flights."""
-    every = read()
+    every = report.lines_in(LINES)
     last = {(line["row"] in RIGHT, line["seed"]): line["commit"] for line in every}
     used = {(True, SEED), *((False, seed) for seed in SEEDS_OF_CONTROLS)} & set(last)
     lines = [
@@ -275,24 +260,19 @@ def write_page() -> None:
     )
 
 
-def main() -> None:
-    """Diagnose the plants, or write the page."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument(
-        "--laws", type=int, default=4, help="plants of each kind of law; default: %(default)s"
-    )
-    parser.add_argument("--clean", type=int, default=20, help="plants without anything")
-    parser.add_argument("--listed", type=int, default=10, help="plants with listed effects only")
-    parser.add_argument("--kinds", nargs="+", choices=RIGHT, default=list(RIGHT), help="of laws")
-    parser.add_argument("--page", action="store_true", help="write the page of what was measured")
-    asked = parser.parse_args()
-    if asked.page:
+def main(laws: int = 4, clean: int = 20, listed: int = 10, page: bool = False) -> None:
+    """Diagnose the plants, or write the page.
+
+    laws: plants of each kind of law. clean: without anything. listed: with listed effects only. page: write
+    the page of what was measured.
+    """
+    if page:
         write_page()
         return
-    laws = [(kind, number) for number in range(asked.laws) for kind in asked.kinds]
-    controls = {"clean": asked.clean, "listed": asked.listed}
-    run([*laws, *((row, number) for row, count in controls.items() for number in range(count))])
+    counts = dict.fromkeys(RIGHT, laws) | {"clean": clean, "listed": listed}
+    most = max(counts.values())
+    run([(row, number) for number in range(most) for row, count in counts.items() if number < count])
 
 
 if __name__ == "__main__":
-    main()
+    report.command(main)
