@@ -57,45 +57,25 @@ class UnsupportedModelError(ValueError):
     """A model that CasADi cannot express; the message names the effect or the operation."""
 
 
-def _identity(value: Any) -> Any:
-    return value
-
-
+# Those that operator and CasADi call the same, and those that do nothing to scalars.
+OWN_NAMES = {
+    operator: ("add", "sub", "mul", "neg", "pow", "lt", "le", "gt", "ge", "eq"),
+    casadi: ("exp", "log", "sqrt", "sin", "cos", "tanh", "sign", "floor"),
+}
+NEUTRAL = ("convert_element_type", "broadcast_in_dim", "reshape", "squeeze", "copy", "stop_gradient")
 OPERATIONS: dict[str, Callable[..., Any]] = {
-    "add": operator.add,
+    **{name: getattr(module, name) for module, names in OWN_NAMES.items() for name in names},
+    **dict.fromkeys(NEUTRAL, lambda value: value),
     "add_any": operator.add,
-    "sub": operator.sub,
-    "mul": operator.mul,
     "div": operator.truediv,
-    "neg": operator.neg,
-    "pow": operator.pow,
     "square": lambda value: value * value,
-    "exp": casadi.exp,
-    "log": casadi.log,
-    "sqrt": casadi.sqrt,
-    "sin": casadi.sin,
-    "cos": casadi.cos,
-    "tanh": casadi.tanh,
     "abs": casadi.fabs,
-    "sign": casadi.sign,
-    "floor": casadi.floor,
     "max": casadi.fmax,
     "min": casadi.fmin,
-    "lt": operator.lt,
-    "le": operator.le,
-    "gt": operator.gt,
-    "ge": operator.ge,
-    "eq": operator.eq,
     "and": casadi.logic_and,
     "or": casadi.logic_or,
     "not": casadi.logic_not,
     "select_n": lambda which, off, on: casadi.if_else(which, on, off),
-    "convert_element_type": _identity,
-    "broadcast_in_dim": _identity,
-    "reshape": _identity,
-    "squeeze": _identity,
-    "copy": _identity,
-    "stop_gradient": _identity,
 }
 
 
@@ -241,11 +221,9 @@ Limit = tuple[Any, float, float]  # an expression and its bounds, elementwise
 def _gate_limits(task: Task, index: int, point: Any, velocity: Any) -> list[Limit]:
     """Return that a point is on a gate's plane, within its opening less the drone, flown in its direction."""
     gates = task.course.gates
-    forward, left, up = (
-        np.array([np.float64(axis[index]) for axis in axes])
-        for axes in (gates.forward, gates.left(), gates.up)
-    )
-    offset = point - np.array([np.float64(axis[index]) for axis in gates.centre])
+    vectors = (gates.centre, gates.forward, gates.left(), gates.up)
+    centre, forward, left, up = (np.array(axes, float)[:, index] for axes in vectors)
+    offset = point - centre
     free = float(gates.half_opening[index]) - task.radius_m - CLEARANCE_M
     return [
         (casadi.dot(forward, offset), 0.0, 0.0),
@@ -405,8 +383,7 @@ def _paths(task: Task) -> np.ndarray:
     ways = np.roll(sample_way(task.course, PATH_POINTS), 1, axis=0)
     if not task.is_lap:
         gates, position = task.course.gates, task.start[layout.POSITION]
-        centre = np.array([np.float64(axis[0]) for axis in gates.centre])
-        forward = np.array([np.float64(axis[0]) for axis in gates.forward])
+        centre, forward = (np.array(axes, float)[:, 0] for axes in (gates.centre, gates.forward))
         chord = centre - position
         length = np.linalg.norm(chord)
         s = np.linspace(0.0, 1.0, PATH_POINTS)
@@ -555,9 +532,8 @@ def _shifts(fractions: np.ndarray) -> np.ndarray:
 
 def _lengthened(flight: Guess, num_steps: int, shifts: np.ndarray) -> Guess:
     """Return a flight with its last step repeated or dropped, and moved gates at the other end of a step."""
-    fractions = np.where(
-        shifts > 0, FRACTION_EDGE, np.where(shifts < 0, 1.0 - FRACTION_EDGE, flight.fractions)
-    )
+    ends = [FRACTION_EDGE, 1.0 - FRACTION_EDGE]
+    fractions = np.select([shifts > 0, shifts < 0], ends, flight.fractions)
     rows = np.minimum(np.arange(num_steps + 1), len(flight.states) - 1)
     commands = flight.commands[np.minimum(rows[:-1], len(flight.commands) - 1)]
     return Guess(flight.states[rows], commands, flight.steps_s, fractions)
