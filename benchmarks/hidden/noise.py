@@ -26,18 +26,10 @@ DIGIT = {
 }
 LOST_ROWS = 0.02  # share
 DEGREES_OF_FREEDOM = 3  # the fewest whole ones with a finite standard deviation
+SPREAD = np.sqrt(DEGREES_OF_FREEDOM / (DEGREES_OF_FREEDOM - 2))  # that deviation
 COLOURS = (0.5, 0.95)  # coefficients of AR(1) that are drawn, per column
 
 Draw = Callable[[tuple[int, int], np.random.Generator], np.ndarray]
-
-
-def _white(shape: tuple[int, int], rng: np.random.Generator) -> np.ndarray:
-    return rng.standard_normal(shape)
-
-
-def _heavy(shape: tuple[int, int], rng: np.random.Generator) -> np.ndarray:
-    spread = np.sqrt(DEGREES_OF_FREEDOM / (DEGREES_OF_FREEDOM - 2))
-    return rng.standard_t(DEGREES_OF_FREEDOM, shape) / spread
 
 
 def _coloured(shape: tuple[int, int], rng: np.random.Generator) -> np.ndarray:
@@ -52,7 +44,11 @@ def _coloured(shape: tuple[int, int], rng: np.random.Generator) -> np.ndarray:
     return np.stack(columns, axis=1)
 
 
-NOISES: dict[str, Draw] = {"sensors": _white, "heavy": _heavy, "coloured": _coloured}
+NOISES: dict[str, Draw] = {
+    "sensors": lambda shape, rng: rng.standard_normal(shape),
+    "heavy": lambda shape, rng: rng.standard_t(DEGREES_OF_FREEDOM, shape) / SPREAD,
+    "coloured": _coloured,
+}
 NOISE_KINDS = (*NOISES, "none")
 
 

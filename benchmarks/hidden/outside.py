@@ -96,10 +96,6 @@ def _heading(shape: Any, plant: Any) -> float:
     return heading_waves(shape, math.atan2(plant.rows[1][0], plant.rows[0][0])) / shape["largest"]
 
 
-def _airspeed(shape: Any, plant: Any) -> float:
-    return _bump(norm(plant.airspeed_b), shape["speed_ms"], shape["width_ms"])
-
-
 def _attitude(shape: Any, plant: Any) -> float:
     tilt_deg = math.degrees(math.acos(max(-1.0, min(1.0, plant.rows[2][2]))))
     return _bump(tilt_deg, shape["tilt_deg"], shape["width_deg"])
@@ -107,14 +103,6 @@ def _attitude(shape: Any, plant: Any) -> float:
 
 def _periodic(shape: Any, plant: Any) -> float:
     return math.sin(2.0 * math.pi * shape["frequency_hz"] * plant.time_s + shape["phase"])
-
-
-def _flapping(shape: Any, plant: Any) -> float:
-    return plant.airspeed_b[0] / USUAL_SPEED_MS
-
-
-def _cable(shape: Any, plant: Any) -> float:
-    return math.cos(math.atan2(plant.rows[1][0], plant.rows[0][0]) + shape["phase"])
 
 
 def _heating(shape: Any, plant: Any) -> float:
@@ -221,10 +209,6 @@ def _draw_heading(rng: Rng) -> ChannelAndShape:
     return "rate", {**shape, **YAW}
 
 
-def _draw_airspeed(rng: Rng) -> ChannelAndShape:
-    return "force", {"speed_ms": rng.uniform(*SPEED_MS), "width_ms": rng.uniform(*SPEED_WIDTH_MS)}
-
-
 def _draw_attitude(rng: Rng) -> ChannelAndShape:
     shape = {"tilt_deg": rng.uniform(*TILT_DEG), "width_deg": rng.uniform(*TILT_WIDTH_DEG)}
     return "thrust", {**shape, **DOWN}
@@ -246,16 +230,16 @@ def _draw_stochastic(rng: Rng) -> ChannelAndShape:
     return ("force" if rng.random() < 0.5 else "rate"), {"time_constant_s": rng.uniform(*GUST_S)}
 
 
-def _draw_cable(rng: Rng) -> ChannelAndShape:
-    return "force", {"phase": rng.uniform(-math.pi, math.pi), **_random_direction(rng)}
-
-
 # Kind -> what it is a function of, its draw, and its signal where it has one.
 TABLE: dict[str, tuple[str, Callable[[Rng], ChannelAndShape], Callable[[Any, Any], float] | None]] = {
     "position": ("position", _draw_position, _position),
     "time": ("time", _draw_time, _time),
     "heading": ("heading", _draw_heading, _heading),
-    "airspeed": ("airspeed", _draw_airspeed, _airspeed),
+    "airspeed": (
+        "airspeed",
+        lambda rng: ("force", {"speed_ms": rng.uniform(*SPEED_MS), "width_ms": rng.uniform(*SPEED_WIDTH_MS)}),
+        lambda shape, plant: _bump(norm(plant.airspeed_b), shape["speed_ms"], shape["width_ms"]),
+    ),
     "attitude": ("tilt", _draw_attitude, _attitude),
     "command": ("command", _draw_command, None),
     "periodic": ("frequency", _draw_periodic, _periodic),
@@ -267,9 +251,13 @@ TABLE |= {
     "flapping": (
         "airspeed",
         lambda rng: ("rate", {"x": 0.0, "y": float(rng.choice([-1.0, 1.0])), "z": 0.0}),
-        _flapping,
+        lambda shape, plant: plant.airspeed_b[0] / USUAL_SPEED_MS,
     ),
-    "cable": ("heading", _draw_cable, _cable),
+    "cable": (
+        "heading",
+        lambda rng: ("force", {"phase": rng.uniform(-math.pi, math.pi), **_random_direction(rng)}),
+        lambda shape, plant: math.cos(math.atan2(plant.rows[1][0], plant.rows[0][0]) + shape["phase"]),
+    ),
     "heating": ("time", lambda rng: ("thrust", DOWN | {"warming_s": rng.uniform(*WARMING_S)}), _heating),
     "payload": ("airspeed", lambda rng: ("force", {"string_m": rng.uniform(*STRING_M)}), None),
 }
