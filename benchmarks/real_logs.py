@@ -14,7 +14,7 @@ from pathlib import Path
 from benchmarks.real.crafts import CRAFTS
 from benchmarks.real.crazyflie import DATA, LINES, VARIABLE, crazyflie_part
 from benchmarks.real.section import draw, section
-from benchmarks.report import RESULTS, ROOT, command, write_json
+from benchmarks.report import RESULTS, command, filled, write_json
 from flytrack_env.files import write_atomically
 from flytrack_env.pictures.drawing import png_of
 from flytrack_sysid import LogError
@@ -30,8 +30,7 @@ def kept(craft: str) -> Path:
 
 def page() -> tuple[str, dict[str, bytes]]:
     """Return the page on what is on record, and its pictures by file."""
-    head = (ROOT / "benchmarks" / "pages" / "real_logs.md").read_text(encoding="utf-8").strip()
-    parts, pictures = [head, "## Crazyflie 2.1, flown by learned policies", crazyflie_part()], {}
+    parts, pictures = [filled("real_logs"), crazyflie_part()], {}
     for name, craft in CRAFTS.items():
         parts.append(f"## {craft.title}")
         if not kept(name).exists():
@@ -44,7 +43,7 @@ def page() -> tuple[str, dict[str, bytes]]:
             parts += [f"### {title}" if title else "", section(one, file)]
             if figure is not None:
                 pictures[file] = png_of(figure)
-    return "\n\n".join(part for part in parts if part) + "\n", pictures
+    return "\n\n".join(part.strip("\n") for part in parts if part) + "\n", pictures
 
 
 def main(data: Path = DATA, diagnose: str = "") -> None:

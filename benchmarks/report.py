@@ -127,14 +127,18 @@ def page(title: str, *parts: str) -> str:
     return "\n\n".join([f"# {title}", *(part.strip("\n") for part in parts)]) + "\n"
 
 
+def filled(name: str, /, **values: Any) -> str:
+    """Return a template of ``benchmarks/pages`` with values filled in."""
+    return (ROOT / "benchmarks" / "pages" / f"{name}.md").read_text(encoding="utf-8").format(**values)
+
+
 def fill_page(path: Path | None, name: str, /, packages: Sequence[str] = (), **values: Any) -> None:
-    """Print a page and write it atomically: a template of ``benchmarks/pages`` with values filled in.
+    """Print a page and write it atomically, as of ``filled``.
 
     ``{command}`` and ``{provenance}`` need not be given. packages: as for ``provenance``.
     """
-    template = (ROOT / "benchmarks" / "pages" / f"{name}.md").read_text(encoding="utf-8")
     values = {"command": command_line(), "provenance": provenance_line(provenance(*packages)), **values}
-    write_page(path, template.format(**values))
+    write_page(path, filled(name, **values))
 
 
 def write_page(path: Path | None, text: str) -> None:

@@ -7,6 +7,7 @@ from typing import NamedTuple
 import jax
 import numpy as np
 
+from benchmarks import report
 from benchmarks.real.black_boxes import base_steps, flown, linear_ones, posed, rows_of
 from benchmarks.real.crazyflie import AS_GOOD, FOLDER, MOST, SPACING_S, by_flight, flights
 from benchmarks.real.section import Record, diagnosed, imported, tested
@@ -96,17 +97,16 @@ def gecko_part(record: Record) -> str:
         for name, one in errors.items()
     ]
     own = errors["extended"][HORIZON]
-    ratios = {other: own / errors[other][HORIZON] for other in ("refitted_base", "arx")}
-    return "\n\n".join(
-        [
-            f"Gyro simulated from setpoints for {HORIZON} s on the second half, which was held out: extended "
-            f"over refitted {ratios['refitted_base']:.2f} (asked: <= {ASKED_OVER_BASE}), over ARX "
-            f"{ratios['arx']:.2f} (asked: <= {ASKED_OVER_ARX}).",
-            "A linear law that knows the setpoints from 0.3 s before to 0.1 s after, fitted to the first, "
-            f"is off by {np.rad2deg(record['best_linear_rad_per_s']):.3g} deg/s on the second: what is left "
-            "beyond that does not come from the sticks, in a linear way at least.",
-            table(["body rates, rms, deg/s, after", *(f"{one:g} s" for one in HORIZONS_S)], rows),
-        ]
+    return report.filled(
+        "real_gecko",
+        horizon=HORIZON,
+        over_base=own / errors["refitted_base"][HORIZON],
+        asked_base=ASKED_OVER_BASE,
+        over_arx=own / errors["arx"][HORIZON],
+        asked_arx=ASKED_OVER_ARX,
+        best_linear=np.rad2deg(record["best_linear_rad_per_s"]),
+        errors=table(["body rates, rms, deg/s, after", *(f"{one:g} s" for one in HORIZONS_S)], rows),
+        mapping=GECKO_MAPPING,
     )
 
 
@@ -147,16 +147,14 @@ def nanobench_part(record: Record) -> str:
         rows.append([name, *(f"{one:.2f}" for one in (*half_s, known.max())), worse])
     cells = np.concatenate(every)
     heads = [f"{quantity} after 0.5 s" for quantity in QUANTITIES]
-    return "\n\n".join(
-        [
-            f"The first {SECONDS:g} s of each flight. Extended over refitted, on flights that neither was "
-            "learnt from; asked: <= 1.00 everywhere. "
-            f"{np.mean(cells <= AS_GOOD):.0%} of {len(cells)} cells are; the median is "
-            f"{np.median(cells):.2f}, the largest {cells.max():.2f}.",
-            table(["held-out flight", *heads, "largest of all horizons", "cells above 1.00"], rows),
-            "The source's own baselines were not rerun: the folder holds flights and columns, and neither "
-            "the models that its paper compares, nor how its Task 1 splits and scores them.",
-        ]
+    return report.filled(
+        "real_nanobench",
+        seconds=SECONDS,
+        good=np.mean(cells <= AS_GOOD),
+        cells=len(cells),
+        median=np.median(cells),
+        largest=cells.max(),
+        flights=table(["held-out flight", *heads, "largest of all horizons", "cells above 1.00"], rows),
     )
 
 
@@ -263,14 +261,6 @@ def betaflight(data: Path) -> Record:
     return diagnosed(found.log, found.nominal_model())[1]
 
 
-DIAGNOSED_HEAD = """Learnt from are the flights of policies {learnt}; held out are those of policies {judged},
-which command differently."""
-MAPPED = """With this mapping:
-
-```toml
-{mapping}```"""
-
-
 class Craft(NamedTuple):
     """A drone: its title, the folder of its flights, how it is measured, and its part of the page.
 
@@ -290,7 +280,7 @@ CRAFTS = {
         "Crazyflie 2.1, flown by learned policies: one diagnosis",
         FOLDER,
         crazyflie,
-        lambda record: DIAGNOSED_HEAD.format(learnt=", ".join(LEARNT), judged=", ".join(JUDGED)),
+        lambda record: report.filled("real_learnt", learnt=", ".join(LEARNT), judged=", ".join(JUDGED)),
     ),
     "payload": Craft(
         "Crazyflie 2.1 with a payload on a cable",
@@ -309,16 +299,11 @@ CRAFTS = {
             for one in record["folds"]
         },
     ),
-    "gecko": Craft(
-        "Betaflight quadcopter with 4S (Gecko), one acro flight",
-        GECKO,
-        gecko,
-        lambda record: gecko_part(record) + "\n\n" + MAPPED.format(mapping=GECKO_MAPPING),
-    ),
+    "gecko": Craft("Betaflight quadcopter with 4S (Gecko), one acro flight", GECKO, gecko, gecko_part),
     "betaflight": Craft(
         "Betaflight quadcopter with 6S, one acro flight",
         BETAFLIGHT,
         betaflight,
-        lambda record: MAPPED.format(mapping=QUAD),
+        lambda record: f"With this mapping:\n\n```toml\n{QUAD}```",
     ),
 }

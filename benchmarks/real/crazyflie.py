@@ -173,12 +173,6 @@ def fits_of(folder: Path, structure: Sequence[str], start: dict[str, float]) -> 
 # Its part of the page
 
 
-def lines_of() -> list[Line]:
-    """Return the last line of each policy, by policy; none where nothing was measured."""
-    last = {line["policy"]: line for line in report.lines_in(LINES)}
-    return [last[policy] for policy in sorted(last)]
-
-
 def ratios(line: Line, model: str) -> np.ndarray:
     """Return a model's rms errors over the refitted base's, (horizons, quantities)."""
     return np.array(line["rms"][model]) / np.array(line["rms"]["refitted_base"])
@@ -234,10 +228,8 @@ def policies_table(lines: list[Line]) -> str:
     return table([*header, "cells worse, by flight", "CPU s"], rows)
 
 
-def fits_part() -> str:
+def fits_table() -> str:
     """Return the values of one structure fitted to the flights of each policy, and whether they agree."""
-    if not FITS.exists():
-        return ""
     fits = json.loads(FITS.read_text(encoding="utf-8"))
     rows = []
     for name in fits[0]["values"]:
@@ -257,28 +249,18 @@ def fits_part() -> str:
 
 
 def crazyflie_part() -> str:
-    """Return the part of the page; nothing where nothing was measured."""
-    lines = lines_of()
-    if not lines:
-        return ""
-    num_flights = sum(len(line["by_flight"]) for line in lines)
-    parts = [
-        "### Policies left out",
-        f"{len(lines)} policies, {num_flights} flights; each is judged by models that were learnt from the "
-        "others (`python -m benchmarks.real.crazyflie`). Free flights start from measured states every "
-        "0.25 s. Numbers are errors over those of the refitted base, the model that a user gets without any "
-        "effect: below 1 is better.",
-        figures_table(lines),
-        horizons_table(lines),
-        policies_table(lines),
-    ]
-    fitted = fits_part()
-    if fitted:
-        parts += [
-            "One structure fitted to the flights of each policy alone (`--fits`), 95 % intervals:",
-            fitted,
-        ]
-    return "\n\n".join(parts)
+    """Return the part of the page, of the last line of each policy."""
+    last = {line["policy"]: line for line in report.lines_in(LINES)}
+    lines = [last[policy] for policy in sorted(last)]
+    return report.filled(
+        "real_policies",
+        policies=len(lines),
+        flights=sum(len(line["by_flight"]) for line in lines),
+        figures=figures_table(lines),
+        horizons=horizons_table(lines),
+        judged=policies_table(lines),
+        fits=fits_table(),
+    )
 
 
 def main(data: Path = DATA, policies: str = "", seconds: float = SECONDS, fits: bool = False) -> None:
