@@ -85,11 +85,9 @@ def _time(shape: Any, plant: Any) -> float:
     return 0.5 + 0.5 * math.tanh((share - middle) / width) if is_step else _bump(share, middle, width)
 
 
-def heading_waves(shape: Any, heading: Any) -> Any:
-    """Return the sum of waves of orders 2 and 3 in the heading, rad; a float or an array."""
-    cosine = math.cos if isinstance(heading, float) else np.cos
-    orders = HEADING_ORDERS
-    return sum(shape[f"size_{n}"] * cosine(n * heading + shape[f"phase_{n}"]) for n in orders)
+def heading_waves(shape: Any, heading: Any, cosine: Callable[[Any], Any] = math.cos) -> Any:
+    """Return the sum of waves of orders 2 and 3 in the heading, rad; cosine: of a float or of arrays."""
+    return sum(shape[f"size_{n}"] * cosine(n * heading + shape[f"phase_{n}"]) for n in HEADING_ORDERS)
 
 
 def _heading(shape: Any, plant: Any) -> float:
@@ -203,7 +201,7 @@ def _draw_time(rng: Rng) -> ChannelAndShape:
 def _draw_heading(rng: Rng) -> ChannelAndShape:
     shape = {f"size_{order}": rng.uniform(*WAVE) for order in HEADING_ORDERS}
     shape |= {f"phase_{order}": rng.uniform(-math.pi, math.pi) for order in HEADING_ORDERS}
-    shape["largest"] = float(np.abs(heading_waves(shape, CIRCLE)).max())
+    shape["largest"] = float(np.abs(heading_waves(shape, CIRCLE, np.cos)).max())
     if rng.random() < 0.5:
         return "force", {**shape, **_random_direction(rng, 2)}
     return "rate", {**shape, **YAW}

@@ -1,17 +1,21 @@
 """Hidden plants that an environment can fly, drawn from a seed; some have a law outside the package's list.
 
-A test compares each step with the plain floats of ``benchmarks.hidden.plant``.
+Such laws are those of ``benchmarks.hidden.outside``, for JAX; a thermal is about the world's origin. A test
+compares each step with the plain floats of ``benchmarks.hidden.plant``.
 """
 
 import math
+from collections.abc import Callable
 from dataclasses import fields, replace
+from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from benchmarks.hidden import EFFECTS as EFFECT_RANGES
 from benchmarks.hidden import Truth, draw_effect, draw_outside
-from benchmarks.loop.outside import SIGNALS, push_of
+from benchmarks.hidden.outside import SCALES, TINY_SPEED, USUAL_SPEED_MS, heading_waves
 from flytrack_bench.plants import Craft, HiddenPlant
 from flytrack_env import nominal_parameters
 
@@ -35,8 +39,35 @@ LAW_AMPLITUDES = (1.0, 3.0)  # times the sensor's noise, as in benchmarks.beyond
 LATER = 5  # random effects of all later plants
 
 
+def _bump(value: jax.Array, middle: float, width: float) -> jax.Array:
+    return jnp.exp(-0.5 * ((value - middle) / width) ** 2)
+
+
+def _heading(to_world: jax.Array) -> jax.Array:
+    return jnp.arctan2(to_world[1, 0], to_world[0, 0])
+
+
+# Kind -> its signal, of shape, position, attitude and airspeed.
+SIGNALS: dict[str, Callable[[Any, jax.Array, jax.Array, jax.Array], jax.Array]] = {
+    "airspeed": lambda shape, pos_w, to_world, airspeed_b: _bump(
+        jnp.linalg.norm(airspeed_b), shape["speed_ms"], shape["width_ms"]
+    ),
+    "attitude": lambda shape, pos_w, to_world, airspeed_b: _bump(
+        jnp.rad2deg(jnp.arccos(jnp.clip(to_world[2, 2], -1.0, 1.0))), shape["tilt_deg"], shape["width_deg"]
+    ),
+    "heading": lambda shape, pos_w, to_world, airspeed_b: (
+        heading_waves(shape, _heading(to_world), jnp.cos) / shape["largest"]
+    ),
+    "flapping": lambda shape, pos_w, to_world, airspeed_b: airspeed_b[0] / USUAL_SPEED_MS,
+    "cable": lambda shape, pos_w, to_world, airspeed_b: jnp.cos(_heading(to_world) + shape["phase"]),
+    "position": lambda shape, pos_w, to_world, airspeed_b: _bump(
+        jnp.linalg.norm(pos_w), 0.0, shape["radius_m"]
+    ),
+}
+
+
 class PlantWithLaw(HiddenPlant):
-    """A hidden plant with a law of ``outside.SIGNALS``."""
+    """A hidden plant with a law of ``SIGNALS``."""
 
     def __init__(self, truth: Truth):
         super().__init__(craft_of(truth))
@@ -45,9 +76,18 @@ class PlantWithLaw(HiddenPlant):
     def push(
         self, pos_w: jax.Array, to_world: jax.Array, airspeed_b: jax.Array
     ) -> tuple[jax.Array, jax.Array]:
-        """Return what the law adds."""
-        assert self.outside is not None
-        return push_of(self.outside, pos_w, to_world, airspeed_b)
+        """Return what the law adds; to_world: the rotation matrix of the attitude, (3, 3)."""
+        outside = self.outside
+        assert outside is not None
+        size = outside.amplitude * SCALES[outside.channel]
+        size = size * SIGNALS[outside.kind](outside.shape, pos_w, to_world, airspeed_b)
+        still = jnp.zeros(3, jnp.float32)
+        if outside.kind == "airspeed":
+            return -size * airspeed_b / jnp.maximum(jnp.linalg.norm(airspeed_b), TINY_SPEED), still
+        way = jnp.array([outside.shape[axis] for axis in "xyz"], jnp.float32)
+        if outside.kind in ("position", "cable"):
+            return size * (way @ to_world), still
+        return (still, size * way) if outside.channel == "rate" else (size * way, still)
 
 
 def plant_of(truth: Truth) -> HiddenPlant:

@@ -17,8 +17,7 @@ from benchmarks import hidden
 from benchmarks.hidden import plant
 from benchmarks.hidden.noise import COLOURS, LOST_ROWS, STD
 from benchmarks.hidden.plant import Plant, Start
-from benchmarks.loop.outside import SIGNALS
-from benchmarks.loop.plants import EFFECTS, draw_plant_with_law, plant_of
+from benchmarks.loop.plants import EFFECTS, SIGNALS, draw_plant_with_law, plant_of
 from flytrack_env import nominal_parameters
 from flytrack_sysid.log import FlightLog
 from tests.support.handout_plant import HandoutPlant
