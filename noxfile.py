@@ -1,7 +1,7 @@
-"""Checks of the repository and of its releases: ``make lint docs check-wheel check-versions``.
+"""Checks of releases: ``make check-wheel check-versions``.
 
-``nox --list`` names the sessions. Those of a release install into fresh environments, made by uv, and run in
-empty folders, so that nothing of the checkout can be imported by accident.
+``nox --list`` names the sessions. They install into fresh environments, made by uv, and run in empty folders, so
+that nothing of the checkout can be imported by accident.
 """
 
 import shlex
@@ -16,7 +16,6 @@ from pathlib import Path
 import nox
 
 nox.options.default_venv_backend = "uv"
-nox.options.sessions = ["lint", "docs"]
 nox.options.error_on_missing_interpreters = False
 
 ROOT = Path(__file__).parent
@@ -160,16 +159,3 @@ def versions(session: nox.Session, resolution: str) -> None:
     session.install(".[train,sysid,viz]", *TEST_TOOLS, "--resolution", resolution)
     lenient = ("-W", "default::DeprecationWarning") if resolution == "lowest-direct" else ()
     session.run("python", "-m", "pytest", "-q", "-m", "not slow", *lenient, "tests/unit", env=HEADLESS)
-
-
-@nox.session(venv_backend="none")
-def lint(session: nox.Session) -> None:
-    """Run ruff and mypy in the current environment."""
-    for command in ("ruff check .", "ruff format --check .", "mypy"):
-        session.run(sys.executable, "-m", *command.split())
-
-
-@nox.session(venv_backend="none")
-def docs(session: nox.Session) -> None:
-    """Build the documentation into site/; broken links and pages outside of the navigation are errors."""
-    session.run(sys.executable, "-m", "mkdocs", "build", "--strict", env={"NO_MKDOCS_2_WARNING": "1"})
