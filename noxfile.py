@@ -1,7 +1,7 @@
 """Checks of releases: ``make check-wheel check-versions``.
 
-``nox --list`` names the sessions. They install into fresh environments, made by uv, and run in empty folders, so
-that nothing of the checkout can be imported by accident.
+``nox --list`` names the sessions. They install into fresh environments, made by uv, and run in empty folders,
+so that nothing of the checkout can be imported by accident.
 """
 
 import shlex
