@@ -16,17 +16,20 @@ from flytrack_env.model_file import load_model
 from flytrack_sysid.diagnosis import Diagnosis, diagnose, learned, text_of, write_diagnosis
 from flytrack_sysid.log import FlightLog
 
+pytestmark = pytest.mark.slow
+
 SECONDS = 60.0
 BUMP_MS, WIDTH_MS = 6.0, 1.0
 
 
-def flights(seed: int) -> tuple[hidden.Truth, FlightLog, FlightLog]:
-    """Return a plant whose drag peaks at one airspeed, a measured flight of it and a clean one."""
+PEAK = hidden.Outside("airspeed", ("airspeed",), "force", 2.0, {"speed_ms": BUMP_MS, "width_ms": WIDTH_MS})
+LOAD = hidden.Outside("payload", ("airspeed",), "force", 1.5, {"string_m": 0.6})
+
+
+def flights(seed: int, law: hidden.Outside = PEAK) -> tuple[hidden.Truth, FlightLog, FlightLog]:
+    """Return a plant with a law, by default drag that peaks at an airspeed; a measured and a clean flight."""
     rng = np.random.default_rng(seed)
-    outside = hidden.Outside(
-        "airspeed", ("airspeed",), "force", 2.0, {"speed_ms": BUMP_MS, "width_ms": WIDTH_MS}
-    )
-    truth = replace(hidden.draw_base(rng), outside=outside, motion="fine")
+    truth = replace(hidden.draw_base(rng), outside=law, motion="fine")
     log = hidden.measure(hidden.fly(truth, "scripted", SECONDS, rng), "sensors", rng)
     return truth, log, hidden.fly(truth, "scripted", SECONDS, rng)
 
@@ -38,7 +41,13 @@ def share_removed(found: Diagnosis, clean: FlightLog) -> float:
     return removed(clean, found.base.with_effects(*neutral), found.extended)[0]
 
 
-@pytest.mark.slow
+def check_flights(found: Diagnosis) -> None:
+    """Check that free flights are predicted better with what was learnt."""
+    without, with_law = (found.prediction.errors[name] for name in ("without_learned", "extended"))
+    for horizon in ("0.5", "1", "2"):
+        assert with_law["velocity_m_per_s"][horizon] < 0.9 * without["velocity_m_per_s"][horizon]
+
+
 def test_a_law_is_found_with_its_numbers(tmp_path: Path) -> None:
     truth, log, clean = flights(71)
     found = diagnose(log, model_of(truth))
@@ -49,16 +58,13 @@ def test_a_law_is_found_with_its_numbers(tmp_path: Path) -> None:
     assert (factor.quantity, factor.shape) == ("airspeed", "bump")
     np.testing.assert_allclose(factor.numbers, [BUMP_MS, WIDTH_MS], rtol=0.1)
     assert share_removed(found, clean) > 0.9
-    without, with_law = (found.prediction.errors[name] for name in ("without_learned", "extended"))
-    for horizon in ("0.5", "1", "2"):
-        assert with_law["velocity_m_per_s"][horizon] < 0.9 * without["velocity_m_per_s"][horizon]
+    check_flights(found)
     assert "learnt: force (air) += (" in text_of(found)
     _, model, report = write_diagnosis(tmp_path, found, log)
     assert load_model(model).effects == found.extended.effects
     assert "What was learnt" in report.read_text() or "bump(airspeed" in report.read_text()
 
 
-@pytest.mark.slow
 def test_nothing_is_learnt_beside_a_law_of_another_log() -> None:
     truth, log, _ = flights(71)
     too_small = Term("force", "air", (Factor("airspeed", "bump", (BUMP_MS, WIDTH_MS)),), (-0.1,), (0.0,))
@@ -67,7 +73,6 @@ def test_nothing_is_learnt_beside_a_law_of_another_log() -> None:
     assert any("learned_law from another log" in warning for warning in found.warnings)
 
 
-@pytest.mark.slow
 def test_a_residual_takes_the_place_of_a_law(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(learned, "find_law", lambda side, held: None)
     truth, log, clean = flights(72)
@@ -80,7 +85,6 @@ def test_a_residual_takes_the_place_of_a_law(monkeypatch: pytest.MonkeyPatch) ->
     assert of > 10_000 and 0.86 < inside / of < 0.94
 
 
-@pytest.mark.slow
 def test_a_thermal_that_held_out_rows_do_not_pass_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
     """On this plant, another motion seemed likelier before the search."""
     monkeypatch.setattr(beyond, "SEED", 43)
@@ -89,23 +93,16 @@ def test_a_thermal_that_held_out_rows_do_not_pass_is_found(monkeypatch: pytest.M
     assert line["is_form"] and len(line["law"]) == 1 and not line["causes"]
 
 
-@pytest.mark.slow
-def test_a_load_on_a_string_is_found_with_its_length(monkeypatch: pytest.MonkeyPatch) -> None:
-    rng = np.random.default_rng(73)
-    outside = hidden.Outside("payload", ("airspeed",), "force", 1.5, {"string_m": 0.6})
-    truth = replace(hidden.draw_base(rng), outside=outside, motion="fine")
-    log = hidden.measure(hidden.fly(truth, "scripted", SECONDS, rng), "sensors", rng)
+def test_a_load_on_a_string_is_found_with_its_length() -> None:
+    truth, log, clean = flights(73, LOAD)
     found = diagnose(log, model_of(truth))
     assert found.learned is not None and not found.causes
     (term,) = found.learned.law.terms
     assert term.pendulum == pytest.approx((0.6, 0.4), rel=0.25)
-    assert share_removed(found, hidden.fly(truth, "scripted", SECONDS, rng)) > 0.9
-    without, with_law = (found.prediction.errors[name] for name in ("without_learned", "extended"))
-    for horizon in ("0.5", "1", "2"):
-        assert with_law["velocity_m_per_s"][horizon] < 0.9 * without["velocity_m_per_s"][horizon]
+    assert share_removed(found, clean) > 0.9
+    check_flights(found)
 
 
-@pytest.mark.slow
 def test_a_thrust_curve_says_where_it_could_be_motors_that_warm_up(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(beyond, "SEED", 59)
     truth, log, _ = beyond.flown_plant("heating", 1)

@@ -10,7 +10,7 @@ from baselines.purejaxrl_ppo.flights import Score, fly_many
 from baselines.purejaxrl_ppo.race_env import plant_env
 from benchmarks.champion import CHAMPION
 from benchmarks.loop.plants import draw_plant, plant_of
-from flytrack_env import blackbox, nominal_parameters
+from flytrack_env import nominal_parameters
 from flytrack_loop import Gap, errors_of
 from flytrack_loop.stages import log_of_flights, measure_gap
 
@@ -21,14 +21,8 @@ def champion():
 
 
 @pytest.fixture(scope="module")
-def shipped():
-    return blackbox.load(blackbox.SHIPPED)
-
-
-@pytest.fixture(scope="module")
-def flights(champion, shipped):
-    env = plant_env(champion, shipped)
-    return fly_many(env, champion.policy, 3, 4, 450, 1)
+def flights(champion, black_box):
+    return fly_many(plant_env(champion, black_box), champion.policy, 3, 4, 450, 1)
 
 
 @pytest.fixture(scope="module")
@@ -36,12 +30,11 @@ def log(flights):
     return log_of_flights(flights, 0.01, 3, 11.0, 0.0)
 
 
-def test_the_log_is_what_the_plant_did(log, shipped):
+def test_the_log_is_what_the_plant_did(log, fly_black_box):
     assert 11.0 <= len(log) * 0.01 < 11.0 + 4.5
     row = 200
-    state = np.concatenate([log[name][row] for name in ("p", "v", "a", "q", "w")])
-    state = np.concatenate([state, log["uprev"][row], log["v_bat"][row]]).astype(np.float32)
-    after = np.asarray(shipped.step_vector(state, log["u"][row].astype(np.float32)))
+    state = np.concatenate([log[name][row] for name in ("p", "v", "a", "q", "w", "uprev", "v_bat")])
+    after = fly_black_box(state.astype(np.float32), log["u"][row].astype(np.float32))
     np.testing.assert_allclose(log["p"][row + 1], after[:3], atol=1e-5)
     np.testing.assert_allclose(log["w"][row + 1], after[13:16], atol=1e-4)
 

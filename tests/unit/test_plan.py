@@ -12,7 +12,7 @@ from flytrack_env.dynamics import nominal_parameters
 from flytrack_env.plants import Simulator
 from flytrack_sysid import FlightLog, collect
 from flytrack_sysid.diagnosis.identifiability import Question, advise
-from flytrack_sysid.diagnosis.lanes import make_lanes
+from flytrack_sysid.diagnosis.lanes import lanes_of
 from flytrack_sysid.diagnosis.problem import Problem
 from flytrack_sysid.diagnosis.score_test import Linearization
 from flytrack_sysid.diagnosis.search import FittedModel, SearchState
@@ -46,7 +46,7 @@ class Logged(NamedTuple):
 
 
 def logged(log: FlightLog) -> Logged:
-    lanes = make_lanes(log, np.ones(len(log), bool), np.asarray(MODEL.tau, float), MODEL.g)
+    lanes = lanes_of(log, np.ones(len(log), bool), MODEL)
     state = SearchState(Problem.of(lanes, MODEL).with_noise(NOISE))
     model = FittedModel((), state.problem.start, 0.0, tuple(state.base_places))
     return Logged(state.problem, model, state.linearized(model.vector)[1])

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from flytrack_sysid.diagnosis import joined
 from flytrack_sysid.log import FlightLog
 from flytrack_sysid.record import fill_gaps
 
@@ -19,21 +20,14 @@ def ramp(*lost: int, rows: int = 12, slope: float = 0.02) -> FlightLog:
     return log.select(~np.isin(np.arange(rows), lost))
 
 
-def joined(*logs: FlightLog) -> FlightLog:
-    channels = {name: np.concatenate([log[name] for log in logs]) for name in logs[0].channels}
-    lengths = [len(log) for log in logs]
-    time = np.concatenate([log.time for log in logs])
-    return FlightLog(time, channels, np.repeat(np.arange(len(logs)), lengths))
-
-
 # What is lost: in the middle, two in a row, two gaps side by side, next to both ends of the flight.
 LOST = [(5,), (5, 6), (4, 6), (1,), (10,), (1, 10), (2, 5, 8)]
 
 
 @pytest.mark.parametrize("lost", LOST)
 def test_lost_rows_come_back_in_between(lost):
-    whole = joined(ramp(), ramp(slope=-0.03))
-    filled = fill_gaps(joined(ramp(*lost), ramp(slope=-0.03)))
+    whole = joined([ramp(), ramp(slope=-0.03)])
+    filled = fill_gaps(joined([ramp(*lost), ramp(slope=-0.03)]))
     np.testing.assert_allclose(filled.log.time, whole.time, atol=1e-12)
     np.testing.assert_array_equal(filled.log.segment, whole.segment)
     np.testing.assert_array_equal(np.flatnonzero(filled.source_row < 0), lost)

@@ -6,7 +6,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from benchmarks.diagnosis import model_of
-from flytrack_sysid.diagnosis.lanes import make_lanes
+from flytrack_sysid.diagnosis.lanes import lanes_of
 from flytrack_sysid.diagnosis.problem import Problem
 from flytrack_sysid.diagnosis.refinement import Judge, errors_at, refine, windows_of
 from flytrack_sysid.diagnosis.score_test import CANDIDATES
@@ -25,8 +25,8 @@ CIRCLE_S, RADIUS_M = 4.0, 1.0
 
 def problem_of(truth, log: FlightLog) -> Problem:
     """Return the problem of a plant's log and its team's model."""
-    lanes = make_lanes(log, ~held_out_rows(log), np.array(truth.tau), truth.gravity)
-    return Problem.of(lanes, model_of(truth))
+    model = model_of(truth)
+    return Problem.of(lanes_of(log, ~held_out_rows(log), model), model)
 
 
 @pytest.fixture(scope="module")
