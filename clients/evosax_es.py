@@ -17,8 +17,7 @@ RETURN_MARGIN, GATE_MARGIN = 0.8, 0.3
 def make_problem(env_id: str = "FlyTrack-v0") -> GymnaxProblem:
     """Return evosax's problem: the return of a small network's first 2 s, mean over some starts."""
     policy = MLP((16, 4), output_fn=tanh_output_fn)
-    problem = GymnaxProblem(env_id, policy, episode_length=200, num_rollouts=8)
-    return problem
+    return GymnaxProblem(env_id, policy, episode_length=200, num_rollouts=8)
 
 
 def evaluate(problem: GymnaxProblem, network: Any, problem_state: Any) -> tuple[float, float]:

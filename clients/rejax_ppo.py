@@ -13,7 +13,7 @@ RETURN_MARGIN, GATE_MARGIN = 8.0, 4.0
 def make_ppo(env_id: str = "FlyTrack-v0") -> rejax.PPO:
     """Return rejax's PPO for an environment, not trained yet."""
     env, params = gymnax.make(env_id)
-    ppo = rejax.PPO.create(
+    return rejax.PPO.create(
         env=LegacyStep(env),
         env_params=params,
         agent_kwargs={"activation": "tanh"},
@@ -26,7 +26,6 @@ def make_ppo(env_id: str = "FlyTrack-v0") -> rejax.PPO:
         total_timesteps=2_000_000,
         eval_freq=500_000,
     )
-    return ppo
 
 
 def measure(seed: int) -> Outcome:

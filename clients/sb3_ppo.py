@@ -24,7 +24,7 @@ def make_envs(num_envs: int) -> VecMonitor:
 def make_ppo(seed: int, algorithm: type = PPO) -> Any:
     """Return Stable-Baselines3's PPO, or sbx's, for FlyTrack-v0, not trained yet."""
     torch.set_num_threads(1)  # more threads compete with those of JAX
-    model = algorithm(
+    return algorithm(
         "MlpPolicy",
         make_envs(256),
         n_steps=64,
@@ -34,7 +34,6 @@ def make_ppo(seed: int, algorithm: type = PPO) -> Any:
         device="cpu",
         seed=seed,
     )
-    return model
 
 
 def evaluate(model: Any) -> tuple[float, float]:

@@ -32,26 +32,11 @@ PAGES_OF_SOURCES = {
 }
 
 
-def generated_pages() -> dict[str, str]:
-    """Return the pages that the code determines, by their path on the site."""
-    return {
-        **{f"envs/{env_id}.md": env_page(env_id) for env_id in ENVIRONMENTS},
-        **{f"effects/{effect.name}.md": effect_page(effect) for effect in EFFECTS},
-        **{f"tracks/{name}.md": track_page(name) for name in available_tracks()},
-    }
-
-
 def pictures() -> dict[str, bytes]:
-    """Return the PNGs of those pages, by their path on the site."""
+    """Return the PNGs of the pages that the code determines, by their path on the site."""
     figures = {f"envs/{env_id}.png": draw_env(env_id) for env_id in ENVIRONMENTS}
     figures |= {f"effects/{effect.name}.png": draw_effect(effect) for effect in EFFECTS}
     return {path: drawing.png_of(figure) for path, figure in figures.items()}
-
-
-def appendices() -> dict[str, str]:
-    """Return what the site appends to hand-written pages: lists of generated pages."""
-    ids = "".join(f"- [{env_id}](envs/{env_id}.md)\n" for env_id in ENVIRONMENTS)
-    return {"effects.md": effects_table(), "environment.md": f"\n## Every id in detail\n\n{ids}"}
 
 
 def notebook_page(name: str) -> str:
@@ -86,8 +71,11 @@ def site_pages() -> dict[str, str]:
     """Return all pages that the site adds or changes, by their path on it."""
     sources = {str(path.relative_to(ROOT)): path for path in sorted((ROOT / "docs").rglob("*.md"))}
     sources |= {path: ROOT / path for path in COPIED}
-    appended = appendices()
-    pages = generated_pages()
+    ids = "".join(f"- [{env_id}](envs/{env_id}.md)\n" for env_id in ENVIRONMENTS)
+    appended = {"effects.md": effects_table(), "environment.md": f"\n## Every id in detail\n\n{ids}"}
+    pages = {f"envs/{env_id}.md": env_page(env_id) for env_id in ENVIRONMENTS}
+    pages |= {f"effects/{effect.name}.md": effect_page(effect) for effect in EFFECTS}
+    pages |= {f"tracks/{name}.md": track_page(name) for name in available_tracks()}
     for notebook in (ROOT / "docs" / "notebooks").glob("*.ipynb"):
         pages[f"notebooks/{notebook.stem}.md"] = notebook_page(notebook.stem)
     for path, file in sources.items():
