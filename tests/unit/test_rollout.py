@@ -7,13 +7,12 @@ import numpy as np
 import pytest
 
 from flytrack_env.rollout import RolloutError, load_rollout, save_rollout
+from tests.support.recordings import make_sequence
 
 
 def make_flight(steps: int) -> tuple[np.ndarray, np.ndarray]:
     """Return random states (T, 21) and actions (T, 4), float32."""
-    rng = np.random.default_rng(steps)
-    states = rng.normal(size=(steps, 21)).astype(np.float32)
-    return states, rng.uniform(-1, 1, (steps, 4)).astype(np.float32)
+    return tuple(map(np.stack, zip(*make_sequence(steps), strict=True)))
 
 
 def without_rate_actions(states: np.ndarray) -> np.ndarray:
