@@ -76,36 +76,23 @@ def imports_of(path: Path) -> list[tuple[str, int]]:
     return found
 
 
-def module_of(path: Path) -> str:
-    """Return the name of the layer's module that a file of the package belongs to."""
-    return path.relative_to(ROOT / PACKAGE).with_suffix("").parts[0]
-
-
 MODULES = files_of(PACKAGE)
 
 
 @pytest.mark.parametrize("path", MODULES, ids=lambda path: str(path.relative_to(ROOT)))
-def test_no_arrow_points_up(path: Path) -> None:
-    module = module_of(path)
+def test_no_arrow_points_up_or_to_a_consumer_or_a_foreign_viewer(path: Path) -> None:
+    module = path.relative_to(ROOT / PACKAGE).with_suffix("").parts[0]
     assert module in RANKS, f"{module}: not in LAYERS of this test; give it a row"
     for name, line in imports_of(path):
         parts = name.split(".")
+        where = f"{path.relative_to(ROOT)}, line {line}: {module} imports {name}"
+        assert parts[0] not in CONSUMERS and parts[0] != "tests", where
+        assert ONLY_IN.get(parts[0], module) == module, where
         if parts[0] != PACKAGE:
             continue
         target = parts[1] if len(parts) > 1 and parts[1] in RANKS else "__init__"
         is_within = target == module and path.parent != ROOT / PACKAGE
-        assert is_within or RANKS[target] < RANKS[module], (
-            f"{path.relative_to(ROOT)}, line {line}: {module} imports {name}"
-        )
-
-
-@pytest.mark.parametrize("path", MODULES, ids=lambda path: str(path.relative_to(ROOT)))
-def test_package_imports_no_consumer_and_no_foreign_viewer(path: Path) -> None:
-    for name, line in imports_of(path):
-        top = name.split(".")[0]
-        where = f"{path.relative_to(ROOT)}, line {line}: imports {name}"
-        assert top not in CONSUMERS and top != "tests", where
-        assert ONLY_IN.get(top, module_of(path)) == module_of(path), where
+        assert is_within or RANKS[target] < RANKS[module], where
 
 
 CONSUMER_FILES = [path for name in CONSUMERS for path in files_of(name)]

@@ -15,6 +15,7 @@ from flytrack_sysid.parameters import BASE, DRAIN, TAUS, THRUST_COEFFS, to_vecto
 from flytrack_sysid.sensors import measure
 from flytrack_sysid.split import held_out_rows
 from tests.support.handout_plant import GRAVITY, HandoutPlant, excited
+from tests.support.slow import slow_but
 
 PLANT = HandoutPlant()
 DRAG = (0.3, 0.5, 0.2)
@@ -52,25 +53,21 @@ def half_widths(found: Fit) -> dict[str, float]:
     return {name: 0.5 * (high - low) for name, (_, low, high) in found.intervals.items()}
 
 
+ABLE = {
+    "p for v": (lambda exact: exact.without("a", "v"), 1e-6),
+    # Without the applied action each flight begins with a guess that fades.
+    "q for w": (lambda exact: exact.without("w", "uprev", "a", "p"), 1e-3),
+    "50 Hz": (lambda _: excited(PLANT, skip=2), 1e-6),
+    "500 Hz": (lambda _: excited(PLANT, repeat=5), 1e-6),
+    "uneven": (lambda _: excited(PLANT, jitter=0.4), 1e-6),
+}
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("absent", "tolerance"),
-    [(("a", "v"), 1e-6), (("w", "uprev", "a", "p"), 1e-3)],
-    ids=["p for v", "q for w"],
-)
-def test_truth_is_found_from_fewer_channels(exact, absent, tolerance):
-    """Without the applied action each flight begins with a guess that fades."""
-    found = fit(exact.without(*absent))
+@pytest.mark.parametrize(("log_of", "tolerance"), ABLE.values(), ids=ABLE)
+def test_truth_is_found_from_fewer_channels_and_at_other_steps(exact, log_of, tolerance):
+    found = fit(log_of(exact))
     assert tau_error(found) < tolerance and map_error(found) < tolerance
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    "shape", [{"skip": 2}, {"repeat": 5}, {"jitter": 0.4}], ids=["50 Hz", "500 Hz", "uneven"]
-)
-def test_truth_is_found_at_other_steps(shape):
-    found = fit(excited(PLANT, **shape))
-    assert tau_error(found) < 1e-6 and map_error(found) < 1e-6
 
 
 @pytest.mark.parametrize("is_one_flight", [False, True])
@@ -142,20 +139,20 @@ REFUSED = {
     "a setting": (lambda log: log, {"effects": ("quick_rates",)}, "quick_rates: known from settings and not"),
     "unknown effect": (lambda log: log, {"effects": ("rag",)}, "effects: rag: no effect of that name"),
     "nothing left": (lambda log: log, {"fixed": EVERYTHING}, "fixed: found every parameter"),
+    "wrong sign": (
+        lambda log: scaled(log, "w", (-1, 1, 1)),
+        {},
+        "w_x: .* sign and order of u_roll and w_x agree",
+    ),
     "no time constant": (lambda log: log, {"fixed": {"tau_yaw": 0.0}}, "tau_yaw: found 0.0, expected 0.001"),
 }
 
 
-@pytest.mark.parametrize(("change", "arguments", "message"), REFUSED.values(), ids=REFUSED)
-def test_what_cannot_be_identified_is_refused(noisy, change, arguments, message):
+@pytest.mark.parametrize("case", slow_but(REFUSED.keys() - {"wrong sign"}, REFUSED))
+def test_what_cannot_be_identified_is_refused(noisy, case):
+    change, arguments, message = REFUSED[case]
     with pytest.raises(FitError, match=message):
         fit(change(noisy), **arguments)
-
-
-@pytest.mark.slow
-def test_a_wrong_sign_is_named(noisy):
-    with pytest.raises(FitError, match=r"w_x: .* do sign and order of u_roll and w_x agree"):
-        fit(scaled(noisy, "w", (-1, 1, 1)))
 
 
 def test_result_as_text_and_json(fitted):

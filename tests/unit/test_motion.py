@@ -8,16 +8,8 @@ import numpy as np
 import pytest
 
 from benchmarks.hidden import Truth, plant
+from flytrack_env import effects
 from flytrack_env.dynamics import ModelParameters, move
-from flytrack_env.effects import (
-    CommandDelay,
-    ImuLatency,
-    ImuOffset,
-    LinearDrag,
-    SecondOrderRates,
-    YawReaction,
-    effect_of,
-)
 from flytrack_env.motion import Motion
 from flytrack_env.state import Action, unpack
 from tests.support.handout_plant import rotation
@@ -28,14 +20,14 @@ MASS, GRAVITY, DRAIN = 1.2, 9.81, 1.3
 TAU = np.array([0.03, 0.05, 0.08, 0.04])
 COEFFS = np.array([-9.0, -6.0, 3.1, 0.4, 0.9, 1.1])
 FULL_RATES = np.array([600.0, 500.0, 130.0])
-DRAG = LinearDrag(0.3, 0.2, 0.1)
+DRAG = effects.LinearDrag(0.3, 0.2, 0.1)
 ARM_B = np.array([0.02, -0.01, 0.03])
 SECONDS = 0.6
 COMMAND_S = 0.02  # how long the pilot holds a command
 PLAIN = ModelParameters(TAU, COEFFS, FULL_RATES, MASS, GRAVITY, DRAIN, motion=Motion.CONTINUOUS)
-DRAGGED = PLAIN.with_effects(DRAG, YawReaction(0.05))
-LOOP = DRAGGED.with_effects(SecondOrderRates(*[0.02] * 3, *[0.6] * 3))
-FULL = LOOP.with_effects(CommandDelay(0.013))
+DRAGGED = PLAIN.with_effects(DRAG, effects.YawReaction(0.05))
+LOOP = DRAGGED.with_effects(effects.SecondOrderRates(*[0.02] * 3, *[0.6] * 3))
+FULL = LOOP.with_effects(effects.CommandDelay(0.013))
 START = np.array([0, 0, 5, 3, -2, 1, 0, 0, 0, 0.9, 0.1, -0.3, 0.3, 0, 0, 0, 0.1, -0.2, 0.3, 0.2, 23.5])
 START[9:13] /= np.linalg.norm(START[9:13])
 START[13:16] = np.radians(FULL_RATES) * START[16:19]
@@ -62,9 +54,9 @@ def reference(model: ModelParameters) -> tuple[np.ndarray, ...]:
 
     Those of a hidden plant in parts of 0.05 ms; its motion is that of SciPy's integrator.
     """
-    effects = {effect_of(one).name: one._asdict() for one in model.effects}
+    own_effects = {effects.effect_of(one).name: one._asdict() for one in model.effects}
     own = (tuple(map(float, one)) for one in (TAU, COEFFS, FULL_RATES))
-    truth = Truth(*own, DRAIN, MASS, GRAVITY, effects, motion="fine", step_s=COMMAND_S)
+    truth = Truth(*own, DRAIN, MASS, GRAVITY, own_effects, motion="fine", step_s=COMMAND_S)
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr(plant, "LONGEST_PART_S", 5e-5)
         found = flown_in_floats(truth, held_commands(), LOW_START)
@@ -125,7 +117,7 @@ def test_free_fall_is_exact_and_attitudes_keep_their_norm():
 
 def test_an_accelerometer_off_the_centre_feels_the_turn_of_the_moment():
     """The reading against finite differences of the gyro at steps of 1 ms."""
-    offset = PLAIN.with_effects(ImuOffset(*ARM_B))
+    offset = PLAIN.with_effects(effects.ImuOffset(*ARM_B))
     _, gyro, felt = flown(offset, 1e-3)
     plain = flown(PLAIN, 1e-3)[2]
     inside = np.arange(len(gyro))[5:15]  # within the first command
@@ -138,7 +130,7 @@ def test_an_accelerometer_off_the_centre_feels_the_turn_of_the_moment():
 def test_late_readings_are_those_of_a_moment_within_a_step(late_ms):
     """Readings at 100 Hz against those at 1 kHz, of which each is at its moment."""
     smooth = PLAIN.with_effects(DRAG)  # nothing jumps where a command does
-    _, gyro, felt = flown(smooth.with_effects(ImuLatency(1e-3 * late_ms)), 1e-2)
+    _, gyro, felt = flown(smooth.with_effects(effects.ImuLatency(1e-3 * late_ms)), 1e-2)
     _, true_gyro, true_felt = flown(smooth, 1e-3)
     then = np.arange(3, len(gyro)) * 10 + 9 - late_ms
     for found, true in ((gyro[3:], true_gyro[then]), (felt[3:], true_felt[then])):

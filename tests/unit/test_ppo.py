@@ -75,24 +75,19 @@ def train(env, params=None, **changes):
     return ppo.make_network_for(env, params, config), runner.train_state.params
 
 
-def train_value(**changes) -> float:
-    network, params = train(Probe(terminates=False), **changes)
-    return float(network.apply(params, jnp.zeros(2), method="value"))
-
-
 # Mean over the 8 steps of the discounted sum of what is left of a reward of 1 each.
 VALUE_OF_EIGHT = np.mean([(1 - 0.9**left) / (1 - 0.9) for left in range(1, 9)])
+SWITCHES = ("bootstrap_at_truncation", "batched_step", "affine_shuffle", "anneal_every_gradient")
+ALL_OFF = {"min_std": 0.0, **dict.fromkeys(SWITCHES, False)}
 
 
-def test_value_bootstraps_through_truncation():
-    # The clock is hidden, so a constant reward of 1 has one value: 1 / (1 - gamma) if it never ends.
-    assert train_value() == pytest.approx(10.0, rel=0.05)
-
-
-def test_with_all_differences_off_truncation_is_termination():
-    switches = ("bootstrap_at_truncation", "batched_step", "affine_shuffle", "anneal_every_gradient")
-    found = train_value(min_std=0.0, **dict.fromkeys(switches, False))
-    assert found == pytest.approx(VALUE_OF_EIGHT, rel=0.1)
+# The clock is hidden, so a constant reward of 1 has one value: 1 / (1 - gamma) if it never ends.
+@pytest.mark.parametrize(
+    ("changes", "expected", "near"), [({}, 10.0, 0.05), (ALL_OFF, VALUE_OF_EIGHT, 0.1)], ids=["on", "all off"]
+)
+def test_value_bootstraps_through_truncation_unless_switched_off(changes, expected, near):
+    network, params = train(Probe(terminates=False), **changes)
+    assert float(network.apply(params, jnp.zeros(2), method="value")) == pytest.approx(expected, rel=near)
 
 
 def test_memory_tells_what_no_observation_shows():

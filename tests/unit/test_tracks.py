@@ -93,10 +93,6 @@ ALIKE = {"quaternion": RING.gates[0].quaternion}  # flown the same way as gate 1
 ON_WAY = tuple(tracks.sample_way(tracks.build_course(RING), 1001)[0][505].tolist())  # from gate 10 to 11
 
 
-def test_unbroken_ring_is_feasible() -> None:
-    assert tracks.find_problems(RING) == ()
-
-
 # What the message says of a break of the ring, the course, and the demand that it breaks.
 BREAKS = {
     "gate 12: opening of 0.5 m, expected at least 0.6 m": (changed(2, opening=0.5), "opening"),
@@ -151,7 +147,8 @@ def test_every_demand_has_a_break() -> None:
     assert {demand for _, demand in BREAKS.values()} == set(tracks.DEMANDS)
 
 
-def test_limits_of_ones_own_replace_the_defaults() -> None:
+def test_the_unbroken_ring_is_feasible_but_by_limits_of_ones_own() -> None:
+    assert tracks.find_problems(RING) == ()
     found = tracks.find_problems(RING, tracks.Limits(min_opening=1.51))
     assert len(found) == NUM_GATES and {problem.demand for problem in found} == {"opening"}
 
