@@ -211,15 +211,14 @@ def write_pictures(page: Path, references: list[Reference], tracks: list[Track])
     from flytrack_env.pictures import draw_flight, make_flight
     from flytrack_env.pictures.drawing import png_of  # matplotlib, needed only here
 
-    for track in tracks:
-        for found in references:
-            if (found.track, found.kind) == (track.name, "flying"):
-                name = f"{found.model_name} model, {TITLES[found.kind]}"
-                commands = np.concatenate([found.commands, found.commands[-1:]])  # one per state
-                flight = make_flight(name, found.states.astype(np.float32), commands, track)
-                picture = png_of(draw_flight(flight)["top"])
-                write_atomically(page.with_name(f"{page.stem}_{track.name}.png"), picture)
-                break
+    first = {found.track: found for found in reversed(references) if found.kind == "flying"}
+    for track in (one for one in tracks if one.name in first):
+        found = first[track.name]
+        name = f"{found.model_name} model, {TITLES[found.kind]}"
+        commands = np.concatenate([found.commands, found.commands[-1:]])  # one per state
+        flight = make_flight(name, found.states.astype(np.float32), commands, track)
+        picture = png_of(draw_flight(flight)["top"])
+        write_atomically(page.with_name(f"{page.stem}_{track.name}.png"), picture)
 
 
 def _optimum_row(reference: Reference) -> tuple[Any, ...]:

@@ -21,10 +21,10 @@ from flytrack_env.state import BATTERY, POSITION
 from flytrack_env.tracks import random_track
 from flytrack_env.wrappers import DomainRandomization
 from flytrack_env.wrappers.domain_randomization import sample_model
-from tests.support.evaluated import FAILS_BELOW_V, Rails, run, write_checkpoint
+from tests.support.evaluated import FAILS_BELOW_V, Rails, write_checkpoint
 from tests.support.pages import ROOT
 from tests.support.recordings import Recording
-from tests.support.refusals import refused
+from tests.support.refusals import refused, run
 from tests.support.slow import slow_but
 
 NUM_LAPS, NUM_STEPS, NUM_FLIGHTS = 3, 1400, 10
@@ -92,7 +92,7 @@ def test_command_flies_many(flown_by, checkpoint_path, tmp_path, monkeypatch, ca
     out, file = tmp_path / "flight.npy", tmp_path / "new" / "report.json"
     more = ["--episodes", 2, "--plants", 3] if flown_by == "plants" else ["--episodes", 6, "--laps", 1]
     where = ["--checkpoint", checkpoint_path, "--out", out, "--json", file]
-    run(*where, "--steps", 120, "--track", "split_s", "--ghost", *more)
+    run("eval", *where, "--steps", 120, "--track", "split_s", "--ghost", *more)
     outcomes, rollout = flown[0], flown[1].rollout
     report, text = json.loads(file.read_text()), capsys.readouterr().out
     assert report["schema"] == 1 and report["flights"] == 6 and report["track"] == "split_s"
@@ -133,7 +133,7 @@ def test_a_single_flight_as_json_and_docs_name_every_key(
     recording = tmp_path / "flight.rrd"
     if importlib.util.find_spec("rerun") is not None:
         where += ["--rrd", recording]
-    run(*where)
+    run("eval", *where)
     text, report = capsys.readouterr().out, json.loads(file.read_text())
     if report["recording"] is not None:
         assert report["recording"] == str(recording)

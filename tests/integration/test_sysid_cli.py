@@ -10,21 +10,16 @@ import pytest
 
 from blackbox.build import build
 from flytrack import identification
-from flytrack.cli import main
 from flytrack.identification import load_plant
 from flytrack_env import load_model, load_provenance, save_model
 from flytrack_env.dynamics import nominal_parameters
 from flytrack_sysid import collect, load_log, save_log
 from tests.support.black_boxes import AIRLESS, SHIPPED
-from tests.support.refusals import refused
+from tests.support.refusals import refused, run
 
 TAUS = (0.02, 0.05, 0.07, 0.03)
 THRUST = (-7.0, -3.0, 3.0, -1.0, 0.9, 0.9)
 OTHER = AIRLESS._replace(mass=1.0, lag=TAUS, max_rate=(618.0, 618.0, 120.0), thrust=THRUST)
-
-
-def run(*arguments: object) -> None:
-    main([*map(str, arguments)])
 
 
 @pytest.fixture(scope="module")

@@ -1,4 +1,4 @@
-"""What evaluations are tested with: a plant on rails, a policy that has learned nothing, the command."""
+"""What evaluations are tested with: a plant on rails, a policy that has learned nothing."""
 
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -10,7 +10,6 @@ import numpy as np
 from baselines.purejaxrl_ppo import Config
 from baselines.purejaxrl_ppo.checkpoint import describe_run, save_checkpoint
 from baselines.purejaxrl_ppo.networks import make_network
-from flytrack.cli import main
 from flytrack_env import make, nominal_parameters
 from flytrack_env.dynamics import ModelParameters
 from flytrack_env.effects import LinearDrag
@@ -84,7 +83,3 @@ def write_checkpoint(
     params = jax.tree.map(jnp.add, params, uneven)
     save_checkpoint(path, params, config, describe_run(env, env_id, track, config, seed=0))
     return path
-
-
-def run(*arguments: Any) -> None:
-    main(["eval", *map(str, arguments)])
