@@ -79,21 +79,6 @@ OPERATIONS: dict[str, Callable[..., Any]] = {
 }
 
 
-def flown_effects(model: ModelParameters) -> tuple[Any, ...]:
-    """Return a model's effects without those of sensors, which do not change the flight.
-
-    Raises:
-        UnsupportedModelError: an effect with a memory, which has no place in the state vector.
-    """
-    flown = tuple(effect for effect in model.effects if effect_of(effect).acts_on != SENSOR)
-    for effect in map(effect_of, flown):
-        if effect.start is not None:
-            raise UnsupportedModelError(
-                f"model: effect {effect.name}: found one with a memory, expected effects without"
-            )
-    return flown
-
-
 def _apply(equation: Any, values: list[Any]) -> list[Any]:
     """Return the outputs of one operation of a trace; numbers stay numbers."""
     inner = equation.params.get("jaxpr", equation.params.get("call_jaxpr"))
@@ -135,7 +120,12 @@ def step_function(model: ModelParameters) -> casadi.Function:
     Raises:
         UnsupportedModelError: an effect with a memory, or an operation that has no counterpart in CasADi.
     """
-    effects = flown_effects(model)
+    effects = tuple(effect for effect in model.effects if effect_of(effect).acts_on != SENSOR)
+    for effect in map(effect_of, effects):
+        if effect.start is not None:  # it has no place in the state vector
+            raise UnsupportedModelError(
+                f"model: effect {effect.name}: found one with a memory, expected effects without"
+            )
     with jax.enable_x64(True):
         model = jax.tree.map(lambda leaf: np.asarray(leaf, float), model._replace(effects=effects))
         structure = jax.tree.structure(layout.unpack(np.zeros(layout.STATE_SIZE)))
@@ -514,20 +504,15 @@ class _Search:
             if not found.is_solved:
                 break
             seen[tuple(nodes)] = (float(found.flight.times(steps)[-1]), found, steps)
-            shifts = _shifts(found.flight.fractions)
+            early = found.flight.fractions < FRACTION_EDGE + NEAR_EDGE
+            late = found.flight.fractions > 1.0 - FRACTION_EDGE - NEAR_EDGE
+            shifts = late.astype(int) - early.astype(int)
             nodes = nodes + shifts
             guess = _lengthened(found.flight, nodes[-1], shifts)
         if not seen:
             raise UnsolvedError(f"{self.task.kind}: steps of {self.dt_s} s: {found.status}")
         _, best, steps = min(seen.values(), key=lambda entry: entry[0])
         return best, steps
-
-
-def _shifts(fractions: np.ndarray) -> np.ndarray:
-    """Return by how many steps each gate should move: -1, 0 or 1."""
-    early = fractions < FRACTION_EDGE + NEAR_EDGE
-    late = fractions > 1.0 - FRACTION_EDGE - NEAR_EDGE
-    return late.astype(int) - early.astype(int)
 
 
 def _lengthened(flight: Guess, num_steps: int, shifts: np.ndarray) -> Guess:

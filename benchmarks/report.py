@@ -49,17 +49,6 @@ def cpu_name() -> str:
     return names[0] if names else platform.processor() or platform.machine()
 
 
-def versions(*packages: str) -> dict[str, str]:
-    """Return the versions of Python, of ``PACKAGES`` and of further ones; "not installed" if missing."""
-    found = {"python": platform.python_version()}
-    for package in (*PACKAGES, *packages):
-        try:
-            found[package] = version(package)
-        except PackageNotFoundError:
-            found[package] = "not installed"
-    return found
-
-
 def commit_of_checkout() -> str:
     """Return the checkout's commit, with ``-dirty`` if tracked files but results have changed since."""
 
@@ -84,13 +73,19 @@ def command_line() -> str:
 def provenance(*packages: str) -> dict[str, Any]:
     """Return what every record names: commit, date, machine and versions, as JSON values.
 
-    packages: whose versions matter besides those of ``PACKAGES``.
+    packages: whose versions matter besides those of ``PACKAGES``; "not installed" if missing.
     """
+    versions = {"python": platform.python_version()}
+    for package in (*PACKAGES, *packages):
+        try:
+            versions[package] = version(package)
+        except PackageNotFoundError:
+            versions[package] = "not installed"
     return {
         "commit": commit_of_checkout(),
         "date": str(date.today()),
         "machine": f"{cpu_name()}, {os.cpu_count()} cores",
-        "versions": versions(*packages),
+        "versions": versions,
     }
 
 

@@ -133,15 +133,6 @@ def _environment(plant: Plant | None) -> tuple[FlyTrack, Any]:
     return env, jax.jit(fly)
 
 
-def _frames_touched(positions: np.ndarray, params: EnvParams) -> int:
-    """Return the number of gates whose frames the lines between positions, (N, 3), touch."""
-    lines = (
-        Vec3(*(jnp.asarray(axis)[:, None] for axis in ends.T)) for ends in (positions[:-1], positions[1:])
-    )
-    crossing = cross_gate(params.course.gates, *lines, params.drone_radius)
-    return int(np.asarray(crossing.is_frame).any(axis=0).sum())
-
-
 def replay(reference: Reference, track: Track, plant: Plant | None = None) -> Replay:
     """Return how a reference's commands fly, open loop, as judged by the environment.
 
@@ -163,13 +154,16 @@ def replay(reference: Reference, track: Track, plant: Plant | None = None) -> Re
     states = np.concatenate([np.asarray(first)[None], packed[: last + 1]])
     drift = np.linalg.norm(states[:, layout.POSITION] - reference.states[: last + 2, layout.POSITION], axis=1)
     race = jax.tree.map(lambda leaf: leaf[last], races)
+    ends = (states[:-1, layout.POSITION], states[1:, layout.POSITION])
+    lines = (Vec3(*(jnp.asarray(axis)[:, None] for axis in one.T)) for one in ends)
+    crossing = cross_gate(params.course.gates, *lines, params.drone_radius)
     return Replay(
         states=states,
         gates_passed=int(race.gates_passed),
         time_s=float(race.lap_time_s) if int(race.laps) else float("nan"),
         ended_by=tuple(name for name, cause in causes._asdict().items() if cause[last]),
         drift_m=float(drift.max()),
-        frames_touched=_frames_touched(states[:, layout.POSITION], params),
+        frames_touched=int(np.asarray(crossing.is_frame).any(axis=0).sum()),
     )
 
 

@@ -32,12 +32,6 @@ def needs_of(effect: Effect) -> str:
     return " ".join(parts)
 
 
-def varied_by(effect: Effect) -> list[str]:
-    """Return what a flight has to vary to show the effect."""
-    varied = [REGRESSORS[panel.regressor] for panel in EVIDENCE[effect.name].panels]
-    return list(dict.fromkeys(label if unit == "1" else f"{label} ({unit})" for label, unit in varied))
-
-
 def arguments(values: Mapping[str, float]) -> str:
     """Return values as keyword arguments."""
     return ", ".join(f"{name}={value:g}" for name, value in values.items())
@@ -49,6 +43,7 @@ def effect_page(effect: Effect) -> str:
     shown = effect.fitted or (effect.groups[-1] if effect.groups else effect.notable)
     names = [name for name in shown if name in effect.notable]
     high = {name: neutral[name] + effect.notable[name] for name in names}
+    varied = [REGRESSORS[panel.regressor] for panel in EVIDENCE[effect.name].panels]
     return render(
         "effect",
         picture_size=f"{NUM_NOTABLE:g}",
@@ -61,7 +56,7 @@ def effect_page(effect: Effect) -> str:
         low=arguments({name: neutral[name] for name in high}),
         in_file="{" + ", ".join(f'"{name}": {value:g}' for name, value in high.items()) + "}",
         needs=needs_of(effect),
-        varied=varied_by(effect),
+        varied=dict.fromkeys(label if unit == "1" else f"{label} ({unit})" for label, unit in varied),
         reading=EVIDENCE[effect.name].reading,
         **{"class": effect.parameters.__name__},
     )
