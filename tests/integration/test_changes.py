@@ -15,6 +15,8 @@ from flytrack_sysid import diagnose, diagnose_change, save_log
 from flytrack_sysid.diagnosis import text_of
 from flytrack_sysid.log import FlightLog
 
+pytestmark = pytest.mark.slow
+
 CHANGED_S = 30.0
 DRAG = {"d_x": 0.4, "d_y": 0.4, "d_z": 0.2}
 BASE = replace(draw_base(np.random.default_rng(3)), motion="fine")
@@ -32,13 +34,11 @@ def before():
     return flown(BOTH, CHANGED_S, 0)
 
 
-@pytest.mark.slow
 def test_what_both_logs_lack_is_no_cause(before) -> None:
     found = diagnose_change(flown(BOTH, CHANGED_S, 1), before, model_of(BASE), motion=Motion.CONTINUOUS)
     assert found.verdict == "consistent" and found.causes == () and not found.unexplained.flagged
 
 
-@pytest.mark.slow
 def test_what_changed_is_named_by_the_command(before, tmp_path: Path, capsys) -> None:
     after = flown(replace(BOTH, effects={"linear_drag": DRAG}), CHANGED_S, 2)
     files = [tmp_path / name for name in ("after.npz", "before.npz", "model.json")]
@@ -60,7 +60,6 @@ def truth(**effects: dict[str, float]) -> Truth:
     return replace(draw_base(np.random.default_rng(8)), motion="fine", effects=effects)
 
 
-@pytest.mark.slow
 def test_a_cause_that_begins_in_flight_is_named_with_its_onset():
     own = replace(truth(motor_imbalance={"roll": ROLL, "pitch": PITCH}), onset_s=ONSET_S)
     found = diagnose(flown(own, SECONDS, 9), model_of(own))
@@ -77,7 +76,6 @@ def test_a_cause_that_begins_in_flight_is_named_with_its_onset():
     assert found.extended.effect("motor_imbalance").roll == pytest.approx(ROLL, rel=0.3)
 
 
-@pytest.mark.slow
 def test_a_cause_that_ends_in_flight_is_not_in_the_extended_model():
     own = truth(motor_imbalance={"roll": ROLL, "pitch": PITCH})
     first, second = (flown(one, 0.5 * SECONDS, seed) for one, seed in ((own, 9), (truth(), 10)))
@@ -93,7 +91,6 @@ def test_a_cause_that_ends_in_flight_is_not_in_the_extended_model():
     assert any("ended within the log" in warning for warning in found.warnings)
 
 
-@pytest.mark.slow
 def test_a_loss_of_thrust_is_told_from_a_thrust_curve_that_depends_on_voltage():
     """The battery drains all the while, and a wandering disturbance takes what a curve leaves of the step."""
     truth, _, log, model, _ = make_log(Trial("onset", 0, 28, "fine", 100))
