@@ -260,16 +260,22 @@ def write_page() -> None:
     )
 
 
-def main(laws: int = 4, clean: int = 20, listed: int = 10, page: bool = False) -> None:
+def main(
+    laws: int = 4,
+    clean: int = 20,
+    listed: int = 10,
+    kinds: tuple[str, ...] = tuple(RIGHT),
+    page: bool = False,
+) -> None:
     """Diagnose the plants, or write the page.
 
-    laws: plants of each kind of law. clean: without anything. listed: with listed effects only. page: write
-    the page of what was measured.
+    laws: plants of each kind of law. clean: without anything. listed: with listed effects only. kinds: of
+    laws, so that two processes can share them. page: write the page of what was measured.
     """
     if page:
         write_page()
         return
-    counts = dict.fromkeys(RIGHT, laws) | {"clean": clean, "listed": listed}
+    counts = dict.fromkeys(kinds, laws) | {"clean": clean, "listed": listed}
     most = max(counts.values())
     run([(row, number) for number in range(most) for row, count in counts.items() if number < count])
 

@@ -1,7 +1,6 @@
 """Where episodes start: facts about the distribution, and the randomness behind it."""
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy import stats
@@ -10,7 +9,6 @@ from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
 from flytrack_env.env import EnvParams, FlyTrack
-from flytrack_env.randomness import Draws, next_word, seed_of, seeds_of
 from flytrack_env.resets import LAST_SEGMENT_FRACTION, SIDEWAYS_FRACTION, ResetParams
 from flytrack_env.state import pack
 from flytrack_env.tracks import Track, load_track
@@ -103,72 +101,3 @@ def test_share_of_course_starts(sample) -> None:
     x, _ = sample(course_fraction=share)
     is_on_course = np.linalg.norm(x[:, 3:6], axis=1) > 0.0
     assert is_on_course.mean() == pytest.approx(share, abs=5 * np.sqrt(0.25 / NUM_STARTS))
-
-
-# --- Named draws: uniform or normal, and independent of each other ---------------------------------
-
-NUM_DRAWS = 1_000_000
-
-
-@pytest.fixture(scope="module")
-def normals() -> dict[str, np.ndarray]:
-    """Draws under two names from a million words."""
-    words = jax.random.bits(jax.random.key(0), (NUM_DRAWS,))
-    draw = jax.jit(jax.vmap(lambda word, name: Draws(word).normal(name), in_axes=(0, None)), static_argnums=1)
-    return {name: np.asarray(draw(words, name), float) for name in ("position_0", "rates_2")}
-
-
-@pytest.mark.parametrize("name", ["position_0", "rates_2"])
-def test_draws_are_standard_normal(normals: dict[str, np.ndarray], name: str) -> None:
-    found = normals[name]
-    assert abs(found.mean()) < 5e-3 and found.std() == pytest.approx(1.0, abs=5e-3)
-    assert abs(stats.skew(found)) < 0.02 and abs(stats.kurtosis(found)) < 0.03
-    # The steps of the byte sums, 0.007 wide, are in the distance.
-    assert stats.kstest(found, "norm").statistic < 4e-3
-
-
-def test_names_and_steps_are_independent(normals: dict[str, np.ndarray]) -> None:
-    first, second = normals.values()
-    assert abs(np.corrcoef(first, second)[0, 1]) < 5e-3
-    assert abs(np.corrcoef(first**2, second**2)[0, 1]) < 5e-3
-    word = jnp.uint32(1)
-    chain = []
-    for _ in range(2000):
-        chain.append(int(word))
-        word = next_word(word)
-    assert len(set(chain)) == 2000
-    series = np.asarray(jax.vmap(lambda word: Draws(word).normal("a"))(jnp.array(chain, jnp.uint32)))
-    for lag in (1, 2, 3):
-        assert abs(np.corrcoef(series[lag:], series[:-lag])[0, 1]) < 0.08
-
-
-# --- Uniform draws and words ------------------------------------------------------------------------
-
-NAMES = ("kind", "gate", "roll", "pitch", "along", "offset_x", "offset_y", "speed", "yaw", "battery")
-NUM_WORDS = 20_000
-WORDS = {
-    "of keys": lambda: jax.vmap(seed_of)(jax.random.split(jax.random.key(0), NUM_WORDS)),
-    "of counted keys": lambda: jax.vmap(lambda i: seed_of(jax.random.key(i)))(jnp.arange(NUM_WORDS)),
-    "of one key": lambda: seeds_of(seed_of(jax.random.key(0)), jnp.arange(NUM_WORDS)),
-    "of a counter": lambda: jnp.arange(NUM_WORDS, dtype=jnp.uint32),
-}
-
-
-@pytest.mark.parametrize("source", WORDS)
-def test_draws_are_uniform_and_uncorrelated(source: str) -> None:
-    words = WORDS[source]()
-    assert words.dtype == jnp.uint32
-    draw_all = jax.vmap(lambda word: jnp.stack([Draws(word).uniform(name, 0.0, 1.0) for name in NAMES]))
-    values = np.asarray(jax.jit(draw_all)(words), float)
-    assert values.min() >= 0.0 and values.max() < 1.0
-    for column in values.T:
-        assert stats.kstest(column, "uniform").pvalue > 1e-3
-    correlation = np.corrcoef(values.T) - np.eye(len(NAMES))
-    assert np.abs(correlation).max() < 4.5 / np.sqrt(NUM_WORDS)
-    lagged = [np.corrcoef(column[:-1], column[1:])[0, 1] for column in values.T]
-    assert np.abs(lagged).max() < 4.5 / np.sqrt(NUM_WORDS)
-
-
-def test_legacy_keys_are_as_good_as_typed_ones() -> None:
-    for seed in range(16):
-        assert int(seed_of(jax.random.key(seed))) == int(seed_of(jax.random.PRNGKey(seed)))
