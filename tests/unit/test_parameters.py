@@ -7,11 +7,10 @@ from flytrack_env.dynamics import nominal_parameters
 from flytrack_env.effects import EFFECTS
 from flytrack_sysid.parameters import (
     BASE,
-    bounds_of,
     names_of,
     neutral_value,
+    range_of,
     to_vector,
-    unit_of,
     with_neutral_effects,
     with_values,
 )
@@ -23,12 +22,12 @@ def test_every_name_has_unit_bounds_and_neutral_value_within():
     model = with_neutral_effects(nominal_parameters(), ALL)
     vector = to_vector(model)
     for name, value in zip(names_of(model), vector, strict=True):
-        low, high = bounds_of(name)
-        assert unit_of(name) and low < high and low <= value <= high, name
+        low, high, unit = range_of(name)
+        assert unit and low < high and low <= value <= high, name
         if "." in name:
             assert neutral_value(name) == value
     assert neutral_value("linear_drag.d_x") == 0.0 and neutral_value("thrust_scale.factor") == 1.0
-    assert bounds_of("tau_yaw").low > 0.0 and bounds_of("c3") == (-np.inf, np.inf)
+    assert range_of("tau_yaw").low > 0.0 and range_of("c3") == (-np.inf, np.inf, "N")
 
 
 def test_replacing_changes_those_alone_and_refuses_unknown_names():
