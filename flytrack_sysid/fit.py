@@ -16,17 +16,16 @@ from flytrack_sysid.estimate import Estimate, FitError, estimate
 from flytrack_sysid.log import CHANNELS, FlightLog, usual_step
 from flytrack_sysid.parameters import (
     DRAIN,
-    TAU_BOUNDS,
+    TAU_RANGE,
     TAUS,
     THRUST_COEFFS,
     as_float32,
     base_of,
-    bounds_of,
     from_vector,
     names_of,
     neutral_value,
+    range_of,
     to_vector,
-    unit_of,
     with_neutral_effects,
     with_values,
 )
@@ -93,7 +92,7 @@ class Fit:
                 "rule": "the last of every so many blocks of at most 5 s",
             },
             "intervals_95": {
-                name: {**interval._asdict(), "unit": unit_of(name)}
+                name: {**interval._asdict(), "unit": range_of(name).unit}
                 for name, interval in self.intervals.items()
             },
             "correlation": {
@@ -109,7 +108,7 @@ class Fit:
         """Return the result as a table in text."""
         lines = [f"{'parameter':28} {'estimate':>12} {'95 % interval':>27}  unit"]
         for name, (value, low, high) in self.intervals.items():
-            lines.append(f"{name:28} {value:12.6g} {low:12.6g} to {high:11.6g}  {unit_of(name)}")
+            lines.append(f"{name:28} {value:12.6g} {low:12.6g} to {high:11.6g}  {range_of(name).unit}")
         if self.map_uncertainty is not None:
             worst = self.map_uncertainty
             lines.append(
@@ -127,9 +126,9 @@ def _free_names(model: ModelParameters, log: FlightLog, fixed: Mapping[str, floa
     if unknown:
         raise FitError(f"fixed: {unknown[0]}: unknown; expected of {', '.join(names)}")
     for name, value in fixed.items():
-        low, high = bounds_of(name)
+        low, high, unit = range_of(name)
         if not (np.isfinite(value) and low <= value <= high):
-            raise FitError(f"fixed: {name}: found {value}, expected {low:g} to {high:g} {unit_of(name)}")
+            raise FitError(f"fixed: {name}: found {value}, expected {low:g} to {high:g} {unit}")
     of_effects = [name for name in names if "." in name and not BY_NAME[name.split(".")[0]].is_setting]
     wanted = [*base_of(model), *of_effects]
     if "v_bat" not in log:
@@ -143,7 +142,7 @@ def _intervals(result: Estimate) -> dict[str, Interval]:
     for name, deviation in zip(result.free, np.sqrt(np.diag(result.covariance)), strict=True):
         value, half = float(values[name]), float(TWO_SIDED_95 * deviation)
         if name in TAUS:  # even in the logarithm, so that no time is negative
-            factor = np.exp(min(half / value, np.log(TAU_BOUNDS.high / TAU_BOUNDS.low)))
+            factor = np.exp(min(half / value, np.log(TAU_RANGE.high / TAU_RANGE.low)))
             found[name] = Interval(value, float(value / factor), float(value * factor))
         else:
             found[name] = Interval(value, value - half, value + half)
@@ -180,7 +179,9 @@ def _warnings(
         if name in TAUS and 0.5 * (high - low) > UNCERTAIN_TAU * value:
             found.append(f"{name} is not determined by the data: {low:.3g} to {high:.3g} s")
         elif "." in name and low <= (neutral := neutral_value(name)) <= high:
-            found.append(f"{name} cannot be told from {neutral:g}: {low:.3g} to {high:.3g} {unit_of(name)}")
+            found.append(
+                f"{name} cannot be told from {neutral:g}: {low:.3g} to {high:.3g} {range_of(name).unit}"
+            )
     if uncertainty is not None and uncertainty.share > UNCERTAIN_THRUST:
         half_width_n, share, action, battery_v = uncertainty
         thrust = log["u"][:, 3]
@@ -304,17 +305,17 @@ def _check_result(result: Estimate, log: FlightLog, judged: np.ndarray) -> None:
     """Raise FitError where the best model is no model of a drone."""
     values = dict(zip(names_of(result.model), to_vector(result.model), strict=True))
     for name in TAUS:
-        if name in result.free and not TAU_BOUNDS.low * AT_BOUND < values[name] < TAU_BOUNDS.high / AT_BOUND:
+        if name in result.free and not TAU_RANGE.low * AT_BOUND < values[name] < TAU_RANGE.high / AT_BOUND:
             raise FitError(
-                f"{log.source}: {name}: the fit ended at {values[name]:.3g} s, expected {TAU_BOUNDS.low} to "
-                f"{TAU_BOUNDS.high} s; does {CHANNELS['u'][TAUS.index(name)]} drive this drone?"
+                f"{log.source}: {name}: the fit ended at {values[name]:.3g} s, expected {TAU_RANGE.low} to "
+                f"{TAU_RANGE.high} s; does {CHANNELS['u'][TAUS.index(name)]} drive this drone?"
             )
     for name in (name for name in result.free if "." in name):
-        low, high = bounds_of(name)
+        low, high, unit = range_of(name)
         ends = [end for end in (low, high) if end != neutral_value(name)]
         if np.isclose(values[name], ends, rtol=0.0, atol=AT_END * (high - low)).any():
             raise FitError(
-                f"{log.source}: {name}: the fit ended at {values[name]:.3g} {unit_of(name)}, expected it "
+                f"{log.source}: {name}: the fit ended at {values[name]:.3g} {unit}, expected it "
                 f"within {low:g} to {high:g}"
             )
     if "w" in result.noise:

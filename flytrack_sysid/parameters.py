@@ -1,14 +1,14 @@
 """Names for every number in a model, for fits, for what is held fixed, and for reports."""
 
 from collections.abc import Callable, Iterable, Mapping
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from flytrack_env.dynamics import ModelParameters
-from flytrack_env.effects import BY_NAME, effect_of
+from flytrack_env.effects import BY_NAME, Range, effect_of
 
 STICKS = ("roll", "pitch", "yaw", "thrust")
 TAUS = tuple(f"tau_{stick}" for stick in STICKS)
@@ -16,27 +16,18 @@ THRUST_COEFFS = tuple(f"c{power}" for power in range(6))
 MAX_RATES = tuple(f"max_rate_{stick}" for stick in STICKS[:3])
 DRAIN = "battery_drain_v_per_min"
 BASE = (*TAUS, *THRUST_COEFFS, *MAX_RATES, "m", "g", DRAIN)
-UNITS = {
-    **dict.fromkeys(TAUS, "s"),
-    **dict.fromkeys(THRUST_COEFFS[:4], "N"),
-    **dict.fromkeys(THRUST_COEFFS[4:], "N/V"),
-    **dict.fromkeys(MAX_RATES, "deg/s"),
-    **{"m": "kg", "g": "m/s^2", DRAIN: "V/min"},
+# Where a fit looks for each, and its unit: wide enough for anything that flies at 100 Hz; an answer at an end
+# is refused.
+TAU_RANGE = Range(1e-3, 0.5, "s")
+RANGES = {
+    **dict.fromkeys(TAUS, TAU_RANGE),
+    **dict.fromkeys(THRUST_COEFFS[:4], Range(-np.inf, np.inf, "N")),
+    **dict.fromkeys(THRUST_COEFFS[4:], Range(-np.inf, np.inf, "N/V")),
+    **dict.fromkeys(MAX_RATES, Range(1.0, 5000.0, "deg/s")),
+    "m": Range(1e-3, 1e3, "kg"),
+    "g": Range(-np.inf, np.inf, "m/s^2"),
+    DRAIN: Range(-np.inf, np.inf, "V/min"),
 }
-
-
-class Bounds(NamedTuple):
-    """Where a fit looks for a parameter."""
-
-    low: float
-    high: float
-
-
-# Wide enough for anything that flies at 100 Hz; an answer at a bound is refused.
-TAU_BOUNDS = Bounds(1e-3, 0.5)
-MAX_RATE_BOUNDS = Bounds(1.0, 5000.0)
-MASS_BOUNDS = Bounds(1e-3, 1e3)
-UNBOUNDED = Bounds(-np.inf, np.inf)
 
 
 def names_of(model: ModelParameters) -> tuple[str, ...]:
@@ -53,23 +44,10 @@ def base_of(model: ModelParameters) -> tuple[str, ...]:
     return (*taus, *THRUST_COEFFS, DRAIN, *craft)
 
 
-def unit_of(name: str) -> str:
-    """Return the unit of a parameter."""
+def range_of(name: str) -> Range:
+    """Return where a fit looks for a parameter, and its unit."""
     effect, _, field = name.partition(".")
-    return BY_NAME[effect].ranges[field].unit if field else UNITS[name]
-
-
-def bounds_of(name: str) -> Bounds:
-    """Return where a fit looks for a parameter."""
-    effect, _, field = name.partition(".")
-    if field:
-        bounds = BY_NAME[effect].ranges[field]
-        return Bounds(bounds.low, bounds.high)
-    if name in TAUS:
-        return TAU_BOUNDS
-    if name in MAX_RATES:
-        return MAX_RATE_BOUNDS
-    return MASS_BOUNDS if name == "m" else UNBOUNDED
+    return BY_NAME[effect].ranges[field] if field else RANGES[name]
 
 
 def neutral_value(name: str) -> float:

@@ -74,7 +74,7 @@ def replay(
     part of ``extras``, a tree of leaves (num_rows, ...). In float64 inside ``jax.enable_x64(True)``.
     """
 
-    def initial_rates(row: Record, gyro: Any, drone: Drone) -> Vec3:
+    def initial_rates(gyro: Any, drone: Drone) -> Vec3:
         if rate_source == "commanded":
             return start_rates(drone, model)
         return body_rates(drone.applied, model.max_rate) if gyro is None else Vec3(*gyro)
@@ -84,7 +84,7 @@ def replay(
         applied, rates_b, memories = carry
         applied = where_true(row.begins | row.is_applied_known, Action(*row.applied), applied)
         before = measured_drone(row, applied, rates_b)
-        initial = initial_rates(row, gyro, before)
+        initial = initial_rates(gyro, before)
         rates_b = initial if rate_source == "measured" else where_true(row.begins, initial, rates_b)
         before = before._replace(rates_b=rates_b)
         # As logged, which it is where a flight begins: past commands then depend on no model of a batch.

@@ -114,33 +114,6 @@ class Score(NamedTuple):
     flying_lap_s: float
 
 
-def outcomes_of(flights: Rollout, num_laps: int, num_gates: int) -> Outcomes:
-    """Return the outcomes of rollouts, leaves (num_flights, num_steps, ...).
-
-    num_gates: of a lap.
-    """
-    flights = jax.tree.map(np.asarray, flights)
-    before = np.pad(flights.gates_passed[:, :-1], ((0, 0), (1, 0)))
-    lap_times_s = np.full((len(before), num_laps), np.nan, np.float32)
-    gate_times_s = np.full((len(before), num_laps * num_gates), np.nan, np.float32)
-
-    def put(times_s: np.ndarray, is_event: Any, places: Any, values: Any) -> None:
-        where = is_event & (places < times_s.shape[1])
-        times_s[np.nonzero(where)[0], places[where]] = values[where]
-
-    put(lap_times_s, flights.lap_completed, flights.laps - 1, flights.lap_time_s)
-    for place in (before, before + 1):  # two gates can be passed in one step
-        put(gate_times_s, place < flights.gates_passed, place, flights.gate_time_s)
-    return Outcomes(
-        steps=flights.is_flying.sum(axis=1),
-        gates_passed=flights.gates_passed.max(axis=1),
-        laps=flights.laps.max(axis=1),
-        lap_times_s=lap_times_s,
-        gate_times_s=gate_times_s,
-        causes=Causes(*(cause.any(axis=1) for cause in flights.causes)),
-    )
-
-
 def save_flight(path: Path, rollout: Rollout) -> None:
     """Write the steps of one rollout that were flown as a rollout file."""
     is_flying = np.asarray(rollout.is_flying)
@@ -281,10 +254,23 @@ def start_keys(seed: int, num_episodes: int) -> jax.Array:
     return jax.random.split(jax.random.key(seed), num_episodes)
 
 
+def _no_outcome(num_laps: int, num_gates: int) -> Outcomes:
+    """Return the outcome of a flight before its first step."""
+    return Outcomes(
+        steps=jnp.int32(0),
+        gates_passed=jnp.int32(0),
+        laps=jnp.int32(0),
+        lap_times_s=jnp.full(num_laps, jnp.nan),
+        gate_times_s=jnp.full(num_laps * num_gates, jnp.nan),
+        causes=Causes(*(jnp.asarray(False) for _ in Causes._fields)),
+    )
+
+
 def _update_outcome(outcome: Outcomes, flown: Rollout) -> Outcomes:
     """Return the outcome of one flight after another step."""
     lap, gate = jnp.arange(outcome.lap_times_s.size), jnp.arange(outcome.gate_times_s.size)
     is_lap = flown.lap_completed & (lap == flown.laps - 1)
+    # Two gates can be passed in one step.
     is_pass = (gate >= outcome.gates_passed) & (gate < flown.gates_passed)
     return Outcomes(
         steps=outcome.steps + 1,
@@ -294,6 +280,24 @@ def _update_outcome(outcome: Outcomes, flown: Rollout) -> Outcomes:
         gate_times_s=jnp.where(is_pass, flown.gate_time_s, outcome.gate_times_s),
         causes=flown.causes,
     )
+
+
+@partial(jax.jit, static_argnames=("num_laps", "num_gates"))
+def _outcomes(flights: Rollout, num_laps: int, num_gates: int) -> Outcomes:
+    def step(outcome: Outcomes, flown: Rollout) -> tuple[Outcomes, None]:
+        later = _update_outcome(outcome, flown)
+        return jax.tree.map(partial(jnp.where, flown.is_flying), later, outcome), None
+
+    start = _no_outcome(num_laps, num_gates)
+    return jax.vmap(lambda flight: jax.lax.scan(step, start, flight)[0])(flights)
+
+
+def outcomes_of(flights: Rollout, num_laps: int, num_gates: int) -> Outcomes:
+    """Return the outcomes of rollouts, leaves (num_flights, num_steps, ...), as NumPy arrays.
+
+    num_gates: of a lap.
+    """
+    return jax.tree.map(np.asarray, _outcomes(flights, num_laps, num_gates))
 
 
 @partial(jax.jit, static_argnames=("env", "num_laps"))
@@ -307,7 +311,6 @@ def _race_batch(
     num_laps: int,
 ) -> Outcomes:
     """Return the outcomes of one batch; models: one for each key, or None for that of ``params``."""
-    zero, never = jnp.int32(0), jnp.asarray(False)
 
     def race(key: jax.Array, model: ModelParameters | None) -> Outcomes:
         own = params if model is None else params.replace(model=model)
@@ -322,16 +325,9 @@ def _race_batch(
             *after, is_over, flown = step(*now, outcome.steps)
             return *after, is_over, _update_outcome(outcome, flown)
 
-        nothing = Outcomes(
-            steps=zero,
-            gates_passed=zero,
-            laps=zero,
-            lap_times_s=jnp.full(num_laps, jnp.nan),
-            gate_times_s=jnp.full(num_laps * params.course.num_gates, jnp.nan),
-            causes=Causes(*(never for _ in Causes._fields)),
-        )
+        nothing = _no_outcome(num_laps, params.course.num_gates)
         # Under vmap the loop runs until no flight is left, and flights that are over stay as they are.
-        start = (policy.network.first_memory(), *env.reset(key, own), never, nothing)
+        start = (policy.network.first_memory(), *env.reset(key, own), jnp.asarray(False), nothing)
         return jax.lax.while_loop(is_flying, advance, start)[-1]
 
     return jax.vmap(race)(keys, models)

@@ -30,7 +30,7 @@ from flytrack_sysid.diagnosis import noise as noises
 from flytrack_sysid.diagnosis.lanes import LANE_S, Lanes, lead_in_of
 from flytrack_sysid.diagnosis.lateness import Late
 from flytrack_sysid.loads import load_at, pendulum_of
-from flytrack_sysid.parameters import TAUS, bounds_of, from_vector, in_batches, names_of, to_vector
+from flytrack_sysid.parameters import TAUS, from_vector, in_batches, names_of, range_of, to_vector
 from flytrack_sysid.record import Record
 from flytrack_sysid.replay import Step, replay
 
@@ -161,7 +161,7 @@ class Problem:
         every = model.with_effects(*(model.effect(effect.name) for effect in effects))
         like = jax.tree.map(lambda leaf: np.asarray(leaf, float), every)
         names, start = names_of(like), to_vector(like)
-        low, high = np.array([bounds_of(name) for name in names]).T
+        low, high = np.array([range_of(name)[:2] for name in names]).T
         return cls(
             lanes=lanes,
             like=like,
@@ -188,7 +188,7 @@ class Problem:
         still = (one._replace(scale=0.0) for one in learned)
         like = jax.tree.map(lambda leaf: np.asarray(leaf, float), self.like.with_effects(*still))
         names, start = names_of(like), to_vector(like)
-        low, high = np.array([bounds_of(name) for name in names[len(self.names) :]]).reshape(-1, 2).T
+        low, high = np.array([range_of(name)[:2] for name in names[len(self.names) :]]).reshape(-1, 2).T
         return replace(
             self,
             like=like,
@@ -324,7 +324,7 @@ def _longest(names: Sequence[str], lanes: Lanes) -> np.ndarray:
 def _scale(name: str, value: float) -> float:
     """Return the size of a parameter that steps are measured by."""
     if "." in name:
-        bounds = bounds_of(name)
+        bounds = range_of(name)
         return 0.1 * (bounds.high - bounds.low)
     return abs(value) if name in TAUS else max(abs(value), 1.0)
 

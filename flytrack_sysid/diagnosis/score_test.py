@@ -21,7 +21,7 @@ from flytrack_sysid.diagnosis.problem import (
     robust_square,
     robust_weight,
 )
-from flytrack_sysid.parameters import DRAIN, TAUS, THRUST_COEFFS, bounds_of, neutral_value
+from flytrack_sysid.parameters import DRAIN, TAUS, THRUST_COEFFS, neutral_value, range_of
 
 CHANCE = 1e-4  # of a name where there is nothing, for each effect
 # A direction of which the others leave less than this share cannot be told apart from them.
@@ -42,7 +42,7 @@ class Probe(NamedTuple):
     @property
     def is_one_way(self) -> bool:
         """Whether the parameter's range begins at its neutral value."""
-        return bounds_of(self.field).low == neutral_value(self.field)
+        return range_of(self.field).low == neutral_value(self.field)
 
     def placed_in(self, problem: Problem, vector: np.ndarray) -> np.ndarray:
         """Return the vector with the probe in place."""

@@ -39,8 +39,15 @@ from flytrack_sysid.diagnosis.result import (
 from flytrack_sysid.diagnosis.score_test import BASE_CAUSES, Linearization, solve, threshold
 from flytrack_sysid.diagnosis.search import FittedModel, SearchState
 from flytrack_sysid.diagnosis.unexplained import is_like_drift
-from flytrack_sysid.parameters import DRAIN, MAX_RATES, STICKS, THRUST_COEFFS, as_float32, from_vector
-from flytrack_sysid.parameters import unit_of as unit_of_parameter
+from flytrack_sysid.parameters import (
+    DRAIN,
+    MAX_RATES,
+    STICKS,
+    THRUST_COEFFS,
+    as_float32,
+    from_vector,
+    range_of,
+)
 from flytrack_sysid.prediction_windows import HORIZONS_S, QUANTITIES
 from flytrack_sysid.record import BATTERY_UNKNOWN_V
 from flytrack_sysid.response import FULL_STEP, SMALL_STEP, half_responses
@@ -64,7 +71,7 @@ def estimates(
         value, low, high = (float(one[place]) for one in (model.vector, problem.low, problem.high))
         if "." in field and half > LOOSE * (high - low) and half > least:
             continue
-        name, unit = field.split(".")[-1], unit_of_parameter(field)
+        name, unit = field.split(".")[-1], range_of(field).unit
         result[name] = Estimated.around(value, float(half), unit, low, high)
     if tuple(fields) == THRUST_COEFFS:
         half = Marginal(linearization, model, fields).half_widths(mean_thrust(problem)[None])
@@ -369,7 +376,7 @@ def _is_beyond(problem: Problem, vector: np.ndarray, field: str) -> str:
         return ""
     place = problem.names.index(field)
     is_low = vector[place] - problem.low[place] < problem.high[place] - vector[place]
-    unit = unit_of_parameter(field)
+    unit = range_of(field).unit
     size = f"{vector[place]:.3g}" + ("" if unit == "1" else f" {unit}")
     return f"{field.split('.')[-1]} at {'most' if is_low else 'least'} {size}"
 
@@ -421,7 +428,7 @@ def with_refined_values(causes: Sequence[Cause], refined: Refined, vector: np.nd
                 del values[name]  # no flight depends on it
             elif place in half:
                 value, low, high = (float(one[place]) for one in (vector, problem.low, problem.high))
-                values[name] = Estimated.around(value, half[place], unit_of_parameter(field), low, high)
+                values[name] = Estimated.around(value, half[place], range_of(field).unit, low, high)
         fields = [field for field in fields if field.split(".")[-1] in values]
         if "mean_factor" in values and fit is not None:
             own = [fit.places.index(place) for place in problem.index(THRUST_COEFFS)]
@@ -472,7 +479,7 @@ def changed_parameters(
     for place in places:
         name, value, half = problem.names[place], float(vector[place]), float(widths.get(place, np.inf))
         bound = bool(at_bounds(problem, vector, [name]))
-        ends, unit = (value - half, value + half), unit_of_parameter(name)
+        ends, unit = (value - half, value + half), range_of(name).unit
         result.append(Changed(name, float(problem.start[place]), value, ends, unit, bound))
     return tuple(result)
 
