@@ -50,6 +50,8 @@ HALVES = (
 SECONDS = 17.0  # of each flight: the shortest lasts 18 s
 STANDARD, UPGRADED = "cf_lee_standard", "cf_lee_upgraded"
 PAYLOAD_MAPPING = 'extends = "crazyflie_lee"\n\n[rows]\nevery = 2\n\n[craft]\nmass_kg = {mass_kg}\n'
+# Whose logs are also diagnosed by the model that is imported with them; and what that is called.
+OWN_MODEL, OWN_MODEL_RECORD = "asked", "logs 202 and 203, by the imported model"
 WITHIN = 0.05
 UNWANTED = ("linear_drag", "quadratic_drag", "rotor_drag", "wind")
 
@@ -210,7 +212,8 @@ def payload(data: Path) -> Record:
 
     As asked: the model of logs 182 and 183, on logs 202 and 203, which carry 5 g on a cable. Thrust commands
     of the two series do not compare (docs/real_logs.md), so there is a second pair within one series: the
-    model of log 182, which carries a payload, on log 183, which does not.
+    model of log 182, which carries a payload, on log 183, which does not. And logs 202 and 203 by the model
+    that was imported with them, whose mass is right: what a load does beside its weight.
     """
     records = {}
     for name, pair in PAIRS.items():
@@ -225,7 +228,8 @@ def payload(data: Path) -> Record:
             "ratio": thrust_of(found.extended, judged) / thrust_of(reference, judged),
             "force_per_command_ratio": float(per_command[1] / per_command[0]),
         }
-    return records
+    logs = payload_flights(data, PAIRS[OWN_MODEL].judged, PAIRS[OWN_MODEL].judged_kg)
+    return records | {OWN_MODEL_RECORD: diagnosed(*logs)[1]}
 
 
 def payload_part(record: Record) -> str:
@@ -287,7 +291,7 @@ CRAFTS = {
         STANDARD,
         payload,
         payload_part,
-        lambda record: {f"Pair: {name}": one for name, one in record.items()},
+        lambda record: {f"Pair: {name}" if name in PAIRS else name: one for name, one in record.items()},
     ),
     "nanobench": Craft(
         "Crazyflie 2.1 in angle mode (NanoBench)",
