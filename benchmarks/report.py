@@ -57,7 +57,8 @@ def commit_of_checkout() -> str:
         return run.stdout.strip()
 
     try:
-        changed = git("status", "--porcelain", "--untracked-files=no", "--", ".", ":!docs/results")
+        measured = (":!docs/results", ":!benchmarks/data")
+        changed = git("status", "--porcelain", "--untracked-files=no", "--", ".", *measured)
         return git("describe", "--always", "--exclude=*") + ("-dirty" if changed else "")
     except (OSError, subprocess.CalledProcessError):  # a copy without git
         return "unknown"
