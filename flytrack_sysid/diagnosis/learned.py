@@ -36,7 +36,7 @@ from flytrack_sysid.diagnosis.unexplained import (
 
 MOST_ROWS = 12_000  # with their lead-ins: two minutes at 100 Hz
 LEAST_SHARE, LEAST_RESIDUAL_SHARE = 0.08, 0.15  # of the sensor's noise, rms: less is not learnt
-LEAST_OFF = 0.02  # of squared errors of held-out flights, mean of all horizons: what takes less off is nothing
+LEAST_OFF = 0.02  # of squared errors of held-out flights, over all horizons: what takes less off is nothing
 LAW_SHARE = 0.75  # of what smooth functions of everything explain: the least that a law explains
 
 
