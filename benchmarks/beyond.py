@@ -209,7 +209,8 @@ def real_rows() -> list[tuple[str, str, str, str]]:
             name = f"{path.stem.removesuffix('_diagnosis')} {number + 1}"
             learned, errors = found["learned"], found["prediction"]["errors"]
             if learned is None:
-                rows.append((name, "nothing", "-", "-"))
+                has_law = any("from another log" in warning for warning in found["warnings"])
+                rows.append((name, "not looked for: the model has a law" if has_law else "nothing", "-", "-"))
                 continue
             ratios = [
                 errors["extended"][quantity][horizon] / before
