@@ -129,8 +129,17 @@ def _predicts(
     scale = np.maximum(np.nan_to_num(tested[0].rms()[0], nan=1.0), 1e-9)
     ratio = tested[1].rms()[0] / scale
     lost = sureness(tested[1].by_block(scale)[0] - tested[0].by_block(scale)[0])
-    is_better = float(np.mean(ratio[judge.is_known] ** 2)) < 1.0 - LEAST_OFF
+    return improves_flights(ratio[judge.is_known], lost[judge.is_known], acts_there)
+
+
+def improves_flights(ratio: np.ndarray, lost: np.ndarray, acts_there: bool) -> bool:
+    """Return whether flights are predicted no worse anywhere and, if it acts in them, better in all.
+
+    ratio: of errors with what was learnt over those without, by horizon and quantity. lost: by how many
+    standard errors each is larger.
+    """
+    is_better = float(np.mean(ratio**2)) < 1.0 - LEAST_OFF
     # What makes flights in all no better has to be as good at every horizon.
     worst = WORSE_ANYWHERE if is_better else LIKELY
-    is_worse = judge.is_known & (ratio > LIKELY_WORSE) & (lost > worst)
+    is_worse = (ratio > LIKELY_WORSE) & (lost > worst)
     return not is_worse.any() and (is_better or not acts_there)

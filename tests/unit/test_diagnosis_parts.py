@@ -16,6 +16,7 @@ from flytrack_sysid.diagnosis import DiagnosisError, diagnose, joined, vetoes
 from flytrack_sysid.diagnosis import noise as noises
 from flytrack_sysid.diagnosis.diagnose import thinning_warning, unused_channels
 from flytrack_sysid.diagnosis.lanes import LANE_S, LEAD_IN_S, NUM_AXES, make_lanes, thinned
+from flytrack_sysid.diagnosis.learned import improves_flights
 from flytrack_sysid.diagnosis.model_selection import Ablation
 from flytrack_sysid.diagnosis.problem import Problem
 from flytrack_sysid.diagnosis.refinement import Fit, Refined
@@ -298,3 +299,18 @@ def test_a_long_log_is_thinned_with_a_warning_that_counts_judged_rows(state, mon
     assert kept < 0.8 * number and warning.startswith(f"only {kept} of {number} rows were learnt from")
     in_lanes = int((thinned(every).row[100:] >= 0).sum())
     assert in_lanes >= number  # as many rows as are judged: counting those would have hidden the loss
+
+
+@pytest.mark.parametrize(
+    ("ratio", "lost", "acts_there", "expected"),
+    [
+        ((0.7, 0.9), (-5.0, -5.0), True, True),
+        ((0.994, 1.003), (-5.0, 1.0), True, False),  # takes too little off
+        ((0.994, 1.003), (-5.0, 1.0), False, True),  # cannot show there
+        ((0.7, 1.1), (-5.0, 3.0), True, False),  # worse at one horizon
+        ((0.7, 1.1), (-5.0, 1.5), True, True),  # which may be chance
+        ((1.0, 1.1), (0.0, 1.5), False, False),  # and is less likely where nothing gets better
+    ],
+)
+def test_what_is_learnt_has_to_improve_held_out_flights(ratio, lost, acts_there, expected):
+    assert improves_flights(np.array(ratio), np.array(lost), acts_there) is expected
