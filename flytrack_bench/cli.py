@@ -50,7 +50,7 @@ def run_bench(flags: Flags) -> int:
 def fly(flags: Flags, suite: Suite, ids: tuple[str, ...]) -> dict[str, Any]:
     """Return the result of the policies on some tasks."""
     policies = [load_policy(one) for one in flags.policy]
-    tasks, adapt = suite.chosen(ids), None if flags.adapt is None else find_object(flags.adapt)
+    tasks, adapt = suite.chosen(ids), None if flags.adapt is None else find_object(flags.adapt, "--adapt")
     if adapt is not None and not ids:
         tasks = tuple(task for task in tasks if task.craft is not None)
     return run(suite, policies, tasks, flags.data_seconds, adapt, ProgressBar("flights"))

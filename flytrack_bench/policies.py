@@ -83,7 +83,7 @@ def load_policy(where: str) -> Policy:
     if ":" not in where or Path(where).exists():
         checkpoint, content = load_checkpoint(Path(where)), Path(where).read_bytes()
         return policy_of(checkpoint, Path(where).name, hashlib.sha256(content).hexdigest())
-    found = find_object(where)
+    found = find_object(where, "policy")
     network = found if hasattr(found, "act") else Function(found)
     space = flytrack_env.FlyTrack().observation_space(flytrack_env.FlyTrack().default_params)
     try:
@@ -98,8 +98,10 @@ def load_policy(where: str) -> Policy:
     return Policy(where, network, None, None, "")
 
 
-def find_object(where: str) -> Any:
+def find_object(where: str, argument: str) -> Any:
     """Return the object that ``module:name`` names; the working directory is searched first.
+
+    argument: whose value this is, for the error.
 
     Raises:
         PolicyError: it cannot be imported.
@@ -109,4 +111,4 @@ def find_object(where: str) -> Any:
     try:
         return attrgetter(name)(importlib.import_module(module))
     except Exception as error:  # whatever a user's module raises
-        raise PolicyError(f"policy: {where}: {type(error).__name__}: {error}") from error
+        raise PolicyError(f"{argument}: {where}: {type(error).__name__}: {error}") from error

@@ -72,6 +72,7 @@ def test_a_result_repeats_and_is_verified_and_a_forged_one_is_not(small, tmp_pat
         (["--policy", CENTRED, "--tasks", "plant_9"], "expected some of flytrack, random_1"),
         (["--policy", "tests.integration.test_bench:three"], "shape (3,), expected (4,)"),
         (["--policy", "tests.integration.test_bench:absent"], "AttributeError"),
+        (["--policy", CENTRED, "--adapt", "flytrack_bench:absent"], "--adapt: flytrack_bench:absent: Attr"),
         (["--policy", "nothing.safetensors"], "nothing.safetensors: cannot be read"),
         (["--policy", CENTRED, "--verify", str(FOLDER / "v1.json")], "not a result"),
     ],
