@@ -26,6 +26,7 @@ LAYERS = (
     {"env"},
     {"references", "scene"},
     {"wrappers", "blackbox", "rollout", "rendering", "flown_race"},
+    {"multi_drone"},
     {"registration", "viz_rerun", "pictures"},
     {"gymnasium_adapter"},
     {"__init__"},

@@ -1,0 +1,106 @@
+"""What a drone sees of its opponents, and where they stand in the race."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from flytrack_env.fusion import compute_once
+from flytrack_env.observations import Entry
+from flytrack_env.quaternion import Scalar, Vec3
+from flytrack_env.tracks import GateFrame
+
+MOST_SEEN = 3
+OPPONENT = (
+    Entry(
+        "opponent_position", "position of a nearest opponent relative to the drone", 3, "gate", "m", 3.0, 10.0
+    ),
+    Entry("opponent_velocity", "its velocity relative to the drone's", 3, "gate", "m/s", 5.0, 12.0),
+    Entry("opponent_lead", "how many gates it is ahead", 1, "-", "gates", 1.0, 10.0),
+)
+
+
+class Standing(NamedTuple):
+    """What others see of a drone, scalars.
+
+    pos_w, vel_w: world, m, m/s. progress: gates passed, and the share of the way to the next one.
+    is_out: whether it is out of the race.
+    """
+
+    pos_w: Vec3
+    vel_w: Vec3
+    progress: jax.Array
+    is_out: jax.Array
+
+
+def opponent_table(num_drones: int) -> tuple[Entry, ...]:
+    """Return the observation's rows on opponents: of the three nearest, or of all where there are fewer."""
+    return OPPONENT * min(num_drones - 1, MOST_SEEN)
+
+
+def observe_opponents(own: Standing, others: Sequence[Standing], gate: GateFrame) -> list[jax.Array]:
+    """Return the rows of ``opponent_table``, nearest first, in the flight frame of a drone's own gate.
+
+    An opponent that is out of the race looks like one as far behind as an observation goes.
+    """
+    frame = (gate.forward, compute_once(gate.left()), gate.up)
+    rows = [_rows(own, other, frame) for other in _nearest(own, others)]
+    return [row for group in rows for row in group]
+
+
+def _rows(own: Standing, other: Standing, frame: tuple[Vec3, ...]) -> list[jax.Array]:
+    """Return one opponent's rows."""
+    position, velocity, lead = OPPONENT
+    quantities: list[tuple[Entry, Scalar, float]] = [
+        *((position, axis.dot(other.pos_w - own.pos_w), 0.0) for axis in frame),
+        *((velocity, axis.dot(other.vel_w - own.vel_w), 0.0) for axis in frame),
+        (lead, other.progress - own.progress, -lead.limit),
+    ]
+    quantities[0] = (*quantities[0][:2], -position.limit)
+    return [
+        jnp.where(other.is_out, absent, jnp.clip(value * (1.0 / entry.scale), -entry.limit, entry.limit))
+        for entry, value, absent in quantities
+    ]
+
+
+def _nearest(own: Standing, others: Sequence[Standing]) -> list[Standing]:
+    """Return the three nearest opponents, nearest first, those still in the race before the others.
+
+    By exchanging neighbours: a handful of selects, where a sort could not be part of the step's kernel.
+    """
+    if len(others) < 2:
+        return list(others)
+
+    def distance(other: Standing) -> jax.Array:
+        apart = other.pos_w - own.pos_w
+        return jnp.where(other.is_out, jnp.inf, apart.dot(apart))
+
+    row = compute_once([(distance(other), other) for other in others])
+    for place in range(min(len(row) - 1, MOST_SEEN)):
+        for i in reversed(range(place, len(row) - 1)):
+            is_wrong = row[i + 1][0] < row[i][0]
+            pair = row[i], row[i + 1]
+            row[i] = jax.tree.map(lambda a, b, swap=is_wrong: jnp.where(swap, b, a), *pair)
+            row[i + 1] = jax.tree.map(lambda a, b, swap=is_wrong: jnp.where(swap, a, b), *pair)
+        row = compute_once(row)
+    return [other for _, other in row[:MOST_SEEN]]
+
+
+def rank_of(own: Standing, others: Sequence[Standing]) -> jax.Array:
+    """Return the place in the race, int32, 1 for the first: by progress, drones that are out come last."""
+    rank = jnp.int32(1)
+    for other in others:
+        is_ahead = (other.progress > own.progress) & (other.is_out == own.is_out)
+        rank = rank + (is_ahead | (own.is_out & ~other.is_out)).astype(jnp.int32)
+    return rank
+
+
+def gap_of(own: Standing, others: Sequence[Standing]) -> jax.Array:
+    """Return how many gates the best opponent is behind, float32: below 0 where it is ahead."""
+    if not others:
+        return jnp.float32(0.0)
+    best = others[0].progress
+    for other in others[1:]:
+        best = jnp.maximum(best, other.progress)
+    return own.progress - best

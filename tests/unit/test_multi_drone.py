@@ -1,0 +1,217 @@
+"""Races of several drones: one is the single environment, drones do not depend on their order, and meet."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import flytrack_env
+from flytrack_env.multi_drone import MultiDroneRace, RaceRules
+from flytrack_env.multi_drone.collisions import Path, is_put_out
+from flytrack_env.multi_drone.opponents import Standing, observe_opponents, rank_of
+from flytrack_env.multi_drone.rules import BOTH_OUT, check_rules
+from flytrack_env.quaternion import Vec3
+from flytrack_env.tracks import GateFrame
+
+BOTH = RaceRules(blame=BOTH_OUT)
+coordinate = st.floats(-1.0, 1.0, width=32)
+vector = st.tuples(coordinate, coordinate, coordinate)
+
+
+RACES, DRONES = 8, 3
+RACE = MultiDroneRace(flytrack_env.make("FlyTrack-v0"), DRONES)
+PARAMS = RACE.default_params
+step_all = jax.jit(jax.vmap(RACE.step_env, (0, 0, None)))
+reset_all = jax.jit(jax.vmap(RACE.reset, (0, None)))
+
+
+def sticks(seed, *shape):
+    return 0.3 * jax.random.uniform(jax.random.key(seed), (*shape, 4), minval=-1.0, maxval=1.0)
+
+
+def starts(seed, params=PARAMS):
+    return reset_all(jax.random.split(jax.random.key(seed), RACES), params)
+
+
+def with_drones(states, drones):
+    return states._replace(inner=states.inner._replace(plant=states.inner.plant._replace(drone=drones)))
+
+
+def places_moved(tree, order):
+    return jax.tree.map(lambda leaf: leaf[:, order], tree)
+
+
+def test_one_drone_flies_bit_for_bit_as_in_the_single_environment():
+    race = MultiDroneRace(flytrack_env.make("FlyTrackRobust-v0"), 1)
+    env, params = race.env, race.env.default_params
+    keys = jax.random.split(jax.random.key(0), 32)
+    alone, alone_states = jax.vmap(env.reset, (0, None))(keys, params)
+    found, states = jax.vmap(race.reset, (0, None))(keys, race.default_params)
+    np.testing.assert_array_equal(found[:, 0], alone)
+    num_ended = 0
+    for step in range(80):
+        actions, key = sticks(step, 32), jax.random.key(step)
+        expected = env.step_batch(key, alone_states, actions, params)
+        flown = race.step_batch(key, states, actions[:, None], race.default_params)
+        alone_states, states = expected[1], flown[1]
+        for one, other in zip((flown[0], *flown[2:5]), (expected[0], *expected[2:5]), strict=True):
+            np.testing.assert_array_equal(one[:, 0], other)
+        np.testing.assert_array_equal(flown[5]["final_observation"][:, 0], expected[5]["final_observation"])
+        num_ended += int(flown[5]["race_over"].sum())
+    assert num_ended > 5
+
+
+@settings(max_examples=10, deadline=None)
+@given(st.permutations(range(DRONES)), st.integers(0, 2**31))
+def test_the_order_of_drones_does_not_matter(order, seed):
+    order = np.array(order)
+    _, states = starts(seed)
+    moved = places_moved(states, order)
+    for step in range(5):
+        actions = sticks(seed + step, RACES, DRONES)
+        flown = step_all(states, actions, PARAMS)
+        found = step_all(moved, actions[:, order], PARAMS)
+        states, moved = flown[1], found[1]
+        jax.tree.map(np.testing.assert_array_equal, places_moved(flown, order), found)
+
+
+def test_drones_far_apart_fly_as_alone():
+    size = RACE.env.observation_space().shape[0]
+    _, states = starts(5)
+    drone = states.inner.plant.drone
+    far = drone.pos_w._replace(y=drone.pos_w.y + jnp.array([0.0, 4.0, -4.0]))
+    states = with_drones(states, drone._replace(pos_w=far))
+    alone = states._replace(is_out=jnp.zeros((RACES, DRONES), bool).at[:, 1:].set(True))
+    for n in range(40):
+        actions = sticks(n, RACES, DRONES)
+        together, apart = step_all(states, actions, PARAMS), step_all(alone, actions, PARAMS)
+        states, alone = together[1], apart[1]
+        np.testing.assert_array_equal(together[0][:, 0, :size], apart[0][:, 0, :size])
+        np.testing.assert_array_equal(together[2][:, 0], apart[2][:, 0])
+
+
+@settings(max_examples=200, deadline=None)
+@given(vector, vector, vector, st.floats(0.0, 1.0))
+def test_no_collision_passes_between_two_steps(direction, other_direction, offset, moment):
+    """Two drones at 30 m/s that touch at some moment of the step do not get past each other."""
+    fast = 30.0 * 0.01
+    moves = [fast * np.array(one) / max(np.linalg.norm(one), 1e-3) for one in (direction, other_direction)]
+    apart = 0.29 * np.array(offset) / max(np.linalg.norm(offset), 1.0)  # at that moment, within a diameter
+    paths = [
+        Path(Vec3(*(at - moment * move)), Vec3(*(at + (1.0 - moment) * move)))
+        for at, move in zip((np.zeros(3), apart), moves, strict=True)
+    ]
+    assert bool(is_put_out(*paths, BOTH)) and bool(is_put_out(*reversed(paths), BOTH))
+    one_out = [bool(is_put_out(*pair, RaceRules())) for pair in (paths, reversed(paths))]
+    assert any(one_out)
+
+
+def test_who_runs_into_the_other_is_out():
+    still, fast = Path(Vec3(0.4, 0, 0), Vec3(0.4, 0, 0)), Path(Vec3(0, 0, 0), Vec3(0.3, 0, 0))
+    assert is_put_out(fast, still, RaceRules()) and not is_put_out(still, fast, RaceRules())
+    assert is_put_out(still, fast, BOTH)
+    ahead = Path(Vec3(0.5, 0, 0), Vec3(0.81, 0, 0))
+    assert not is_put_out(fast, ahead, BOTH)
+
+
+def test_a_collision_puts_out_and_costs_what_a_crash_costs():
+    params = PARAMS._replace(rules=PARAMS.rules._replace(blame=BOTH_OUT))
+    _, states = starts(0, params)
+    # Two drones fly at each other, the third is where it was.
+    drone = jax.tree.map(lambda leaf: leaf.at[:, 1].set(leaf[:, 0]), states.inner.plant.drone)
+    y = drone.pos_w.y.at[:, 1].add(0.31)
+    vel_w = Vec3(0 * y, jnp.broadcast_to(jnp.array([5.0, -5.0, 0.0]), y.shape), 0 * y)
+    states = with_drones(states, drone._replace(pos_w=drone.pos_w._replace(y=y), vel_w=vel_w))
+    idle = jnp.zeros((RACES, DRONES, 4))
+    missed = step_all(states, idle, params._replace(rules=params.rules._replace(collision_radius=0.01)))
+    flown = step_all(states, idle, params)
+    hit = np.array([True, True, False])
+    np.testing.assert_array_equal(flown[5]["collision"], np.tile(hit, (RACES, 1)))
+    assert not missed[3][:, :2].any() and flown[3][:, :2].all()
+    cost = np.where(hit, params.flight.reward.termination, 0.0)
+    np.testing.assert_allclose(flown[2] - missed[2], np.tile(cost, (RACES, 1)), atol=1e-5)
+    after = step_all(flown[1], jnp.ones((RACES, DRONES, 4)), params)
+    assert (after[2][:, :2] == 0.0).all() and after[3][:, :2].all() and not after[5]["collision"].any()
+    x, x_after = (one[1].inner.plant.drone.pos_w.x for one in (flown, after))
+    np.testing.assert_array_equal(x[:, :2], x_after[:, :2])
+
+
+def standing(x, progress=0.0, is_out=False):
+    return Standing(
+        Vec3(*map(jnp.float32, (x, 0, 0))),
+        Vec3(*map(jnp.float32, (1, 0, 0))),
+        jnp.float32(progress),
+        jnp.asarray(is_out),
+    )
+
+
+def test_opponents_are_seen_nearest_first_in_the_gate_frame():
+    to_left = GateFrame(Vec3(0, 5, 0), Vec3(0.0, 1.0, 0.0), Vec3(0.0, 0.0, 1.0), 0.5, 0.8)
+    others = [standing(9.0), standing(-3.0, 2.0), standing(0.5, is_out=True), standing(6.0)]
+    rows = np.array(observe_opponents(standing(0.0, 1.0), others, to_left)).reshape(3, 7)
+    # World x is to the right of a gate that is flown through along y.
+    np.testing.assert_allclose(rows[:, 1] * 3.0, [3.0, -6.0, -9.0], atol=1e-6)
+    np.testing.assert_allclose(rows[:, 6], [1.0, -1.0, -1.0])
+    (out,) = np.array(observe_opponents(standing(0.0), others[2:3], to_left)).reshape(1, 7)
+    np.testing.assert_allclose(out, [-10.0, 0, 0, 0, 0, 0, -10.0])
+
+
+def test_ranks_are_by_progress_and_those_that_are_out_come_last():
+    field = [standing(0, 2.5), standing(0, 4.0, is_out=True), standing(0, 3.0), standing(0, 1.0, is_out=True)]
+    ranks = [int(rank_of(one, [other for other in field if other is not one])) for one in field]
+    assert ranks == [2, 3, 1, 4]
+
+
+def test_a_race_begins_on_the_grid_and_is_over_for_all_at_once():
+    params = PARAMS._replace(rules=PARAMS.rules._replace(first_slot=0))
+    _, states = starts(3, params)
+    x, y, _ = (np.asarray(one) for one in states.inner.plant.drone.pos_w)
+    second, third = (np.hypot(x[:, n] - x[:, 0], y[:, n] - y[:, 0]) for n in (1, 2))
+    np.testing.assert_allclose(second, np.hypot(1.0, 0.5), atol=1e-4)
+    np.testing.assert_allclose(third, 1.0, atol=1e-4)
+    num_over = 0
+    for step in range(150):  # without thrust none stays in the air for longer
+        thrust = jnp.full((RACES, DRONES, 4), -1.0)
+        flown = RACE.step_batch(jax.random.key(step), states, thrust, params)
+        over = np.asarray(flown[5]["race_over"])
+        np.testing.assert_array_equal(over.all(axis=1), over.any(axis=1))
+        assert flown[3][over].all() and not flown[1].is_out[over].any()
+        states = flown[1]
+        num_over += over[:, 0].sum()
+    assert num_over >= RACES
+
+
+def test_observations_at_the_start_are_those_of_the_drones_that_begin():
+    observations, states = RACE.reset(jax.random.key(8))
+    drones, gates = states.inner.plant.drone, states.inner.race.gate_index
+    np.testing.assert_allclose(observations, RACE.begin(drones, gates, PARAMS)[0], atol=2e-5)
+    assert observations.shape == (DRONES, *RACE.observation_space().shape)
+
+
+@pytest.mark.parametrize(
+    ("rules", "message"),
+    [
+        ({"column_spacing": 0.3}, "start inside each other"),
+        ({"blame": 2}, "blame"),
+        ({"first_slot": 2}, "slot of 0 to 1"),
+        ({"collision_radius": 0.0}, "more than 0 m"),
+    ],
+)
+def test_rules_that_no_race_can_be_flown_by_are_refused(rules, message):
+    with pytest.raises(ValueError, match=message):
+        check_rules(RaceRules(**rules), 2)
+
+
+@pytest.mark.parametrize("num_drones", [0, 9, 2.0])
+def test_another_number_of_drones_is_refused(num_drones):
+    with pytest.raises(ValueError, match="expected 1 to 8"):
+        MultiDroneRace(flytrack_env.make("FlyTrack-v0"), num_drones)
+
+
+def test_drones_that_start_inside_each_other_are_refused():
+    _, states = RACE.reset(jax.random.key(0))
+    drones = jax.tree.map(lambda leaf: leaf.at[1].set(leaf[0]), states.inner.plant.drone)
+    with pytest.raises(ValueError, match="drones 0 and 1: found starts 0 m apart"):
+        RACE.begin(drones, jnp.zeros(DRONES, jnp.int32), PARAMS)
