@@ -12,7 +12,7 @@ from flytrack_env.env import EnvParams, EnvState, FlyTrack
 from flytrack_env.gymnasium_adapter import register_with_gymnasium
 from flytrack_env.model_file import ModelFileError, load_model, load_provenance, save_model
 from flytrack_env.motion import Motion
-from flytrack_env.registration import make, register_all
+from flytrack_env.registration import make, make_race, make_versus, register_all
 from flytrack_env.tracks import (
     Track,
     TrackError,
@@ -44,6 +44,8 @@ __all__ = [
     "load_provenance",
     "load_track",
     "make",
+    "make_race",
+    "make_versus",
     "nominal_parameters",
     "random_track",
     "register_all",

@@ -1,9 +1,9 @@
-"""The table of environment ids, and their registration with gymnax."""
+"""The tables of environments and races by id, and their registration with gymnax."""
 
 import inspect
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import gymnax
 from gymnax.registration import registered_envs
@@ -11,6 +11,9 @@ from gymnax.registration import registered_envs
 from flytrack_env.env import FlyTrack
 from flytrack_env.episodes import EpisodicEnvironment
 from flytrack_env.messages import check_keywords
+from flytrack_env.multi_drone import MultiDroneRace, Opponent, Versus, idle
+from flytrack_env.multi_drone.ghosts import Ghost, time_optimal_ghost
+from flytrack_env.multi_drone.rules import MOST_DRONES
 from flytrack_env.wrappers import ActionHistory, DomainRandomization, ObservationNoise
 
 
@@ -23,6 +26,7 @@ class Variant(NamedTuple):
 
 
 ARGUMENTS = tuple(inspect.signature(FlyTrack).parameters)  # of make, by name
+GHOST_DELAY_S = 0.3
 HISTORY = partial(ActionHistory, length=3)
 
 ENVIRONMENTS: dict[str, Variant] = {
@@ -64,8 +68,57 @@ def make(env_id: str, **overrides: Any) -> EpisodicEnvironment:
     return env
 
 
+RACES = {"FlyTrackDuel-v0": range(2, 3), "FlyTrackRace-v0": range(2, MOST_DRONES + 1)}  # numbers of drones
+
+
+def make_race(
+    race_id: str,
+    num_drones: int = 2,
+    over: Literal["all", "first"] = "all",
+    env_id: str = "FlyTrack-v0",
+    ghosts: Mapping[int, Ghost] | None = None,
+    **overrides: Any,
+) -> MultiDroneRace:
+    """Return the race of an id: ``FlyTrackDuel-v0``, or ``FlyTrackRace-v0`` of 2 to 8 drones.
+
+    over, ghosts: as in ``flytrack_env.multi_drone.MultiDroneRace``. env_id, overrides: as in ``make``, for
+    the environment that each drone flies.
+
+    Raises:
+        ValueError: unknown id, or a number of drones that it does not have. TypeError: unknown argument.
+    """
+    if race_id not in RACES:
+        raise ValueError(f"race_id: found {race_id!r}, expected one of {', '.join(RACES)}")
+    numbers = RACES[race_id]
+    if num_drones not in numbers:
+        raise ValueError(f"num_drones: found {num_drones!r}, expected {numbers[0]} to {numbers[-1]}")
+    return MultiDroneRace(make(env_id, **overrides), num_drones, over, ghosts)
+
+
+def make_versus(
+    race_id: str, opponents: Sequence[Opponent] | None = None, num_drones: int = 2, **arguments: Any
+) -> Versus:
+    """Return gymnax's view of a race for one learner, drone 0.
+
+    opponents: of the others; by default time-optimal ghosts, each ``GHOST_DELAY_S`` after the one before.
+    arguments: of ``make_race``.
+
+    Raises:
+        ValueError: as ``make_race`` and ``Versus``, and without opponents on a track without a time-optimal
+            lap.
+    """
+    race = make_race(race_id, num_drones, "first", **arguments)
+    if opponents is None:
+        delays_s = {place: GHOST_DELAY_S * (place - 1) for place in range(1, num_drones)}
+        ghosts = {place: time_optimal_ghost(race.env.track, delay_s) for place, delay_s in delays_s.items()}
+        race = MultiDroneRace(race.env, num_drones, "first", ghosts)
+        opponents = [idle(race)] * len(ghosts)
+    return Versus(race, opponents)
+
+
 def register_all() -> None:
     """Register every id with gymnax; ids that are registered already are left alone."""
-    for env_id in ENVIRONMENTS:
-        if env_id not in registered_envs:
-            gymnax.register(env_id, partial(make, env_id))
+    for table, maker in ((ENVIRONMENTS, make), (RACES, make_versus)):
+        for env_id in table:
+            if env_id not in registered_envs:
+                gymnax.register(env_id, partial(maker, env_id))

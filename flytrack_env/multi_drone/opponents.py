@@ -67,7 +67,8 @@ def _rows(own: Standing, other: Standing, frame: tuple[Vec3, ...]) -> list[jax.A
 def _nearest(own: Standing, others: Sequence[Standing]) -> list[Standing]:
     """Return the three nearest opponents, nearest first, those still in the race before the others.
 
-    By exchanging neighbours: a handful of selects, where a sort could not be part of the step's kernel.
+    Of two that are equally near, as on a start grid, the one ahead comes first. By exchanging neighbours: a
+    handful of selects, where a sort could not be part of the step's kernel.
     """
     if len(others) < 2:
         return list(others)
@@ -79,8 +80,8 @@ def _nearest(own: Standing, others: Sequence[Standing]) -> list[Standing]:
     row = compute_once([(distance(other), other) for other in others])
     for place in range(min(len(row) - 1, MOST_SEEN)):
         for i in reversed(range(place, len(row) - 1)):
-            is_wrong = row[i + 1][0] < row[i][0]
-            pair = row[i], row[i + 1]
+            pair = (first, one), (second, other) = row[i], row[i + 1]
+            is_wrong = (second < first) | ((second == first) & (other.progress > one.progress))
             row[i] = jax.tree.map(lambda a, b, swap=is_wrong: jnp.where(swap, b, a), *pair)
             row[i + 1] = jax.tree.map(lambda a, b, swap=is_wrong: jnp.where(swap, a, b), *pair)
         row = compute_once(row)
@@ -104,3 +105,11 @@ def gap_of(own: Standing, others: Sequence[Standing]) -> jax.Array:
     for other in others[1:]:
         best = jnp.maximum(best, other.progress)
     return own.progress - best
+
+
+def progress_of(gates_passed: Scalar, pos_w: Vec3, centre_w: Vec3, leg_m: Scalar) -> jax.Array:
+    """Return the gates passed and the share of the way to the next gate, whose centre is given, float32.
+
+    leg_m: distance of that gate from the one before.
+    """
+    return gates_passed + 1.0 - compute_once((centre_w - pos_w).norm()) / leg_m

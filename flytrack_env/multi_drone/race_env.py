@@ -5,6 +5,7 @@ a drone needs of its opponents comes from shifts of the whole vector. Unrolled, 
 one by one, and stacked, they would have to be transposed in every step.
 """
 
+from collections.abc import Mapping
 from functools import partial
 from typing import Any, Literal, NamedTuple
 
@@ -17,7 +18,15 @@ from flytrack_env.auto_reset import Ended, reset_if_ended
 from flytrack_env.episodes import EpisodicEnvironment, Step, clip_action
 from flytrack_env.fusion import compute_once, one_kernel
 from flytrack_env.multi_drone.collisions import Path, is_put_out
-from flytrack_env.multi_drone.opponents import Standing, gap_of, observe_opponents, opponent_table, rank_of
+from flytrack_env.multi_drone.ghosts import Ghost
+from flytrack_env.multi_drone.opponents import (
+    Standing,
+    gap_of,
+    observe_opponents,
+    opponent_table,
+    progress_of,
+    rank_of,
+)
 from flytrack_env.multi_drone.rules import (
     MOST_DRONES,
     RaceParams,
@@ -28,11 +37,11 @@ from flytrack_env.multi_drone.rules import (
 )
 from flytrack_env.multi_drone.start_grid import place_on_grid
 from flytrack_env.observations import Entry
-from flytrack_env.quaternion import Vec3
 from flytrack_env.race import Race
 from flytrack_env.randomness import Draws, check_key, seed_of, seeds_of
 from flytrack_env.state import Action, Drone
 
+CLEAR_OF_GHOSTS_M = 2.0
 PLACE_BITS = MOST_DRONES - 1  # of a random word: which drone of the race it is
 
 
@@ -40,7 +49,7 @@ class EntrantState(NamedTuple):
     """One drone of a race.
 
     inner: the state of its environment. leg_m: distance of its gate from the gate before. progress, is_out:
-    as in ``Standing``. gap: as ``gap_of``.
+    as in ``Standing``. gap: as ``gap_of``. step: since the race began.
     """
 
     inner: Any
@@ -48,6 +57,7 @@ class EntrantState(NamedTuple):
     progress: jax.Array
     is_out: jax.Array
     gap: jax.Array
+    step: jax.Array
 
 
 class Flown(NamedTuple):
@@ -74,21 +84,31 @@ class MultiDroneRace:
         num_drones: 1 to 8. One drone flies exactly as in ``env``.
         over: when the race is over, and reset, before the time limit: once "all" drones are out, or "first",
             once drone 0 is.
+        ghosts: by their place, from 1, drones that fly a given line (``flytrack_env.multi_drone.ghosts``).
+            With any, races begin at the start pose, and the others on a grid that leaves the line free.
 
     Raises:
-        ValueError: another number of drones, or value of ``over``.
+        ValueError: another number of drones, value of ``over`` or place of a ghost.
         TypeError: an environment that is none of FlyTrack's.
     """
 
     def __init__(
-        self, env: EpisodicEnvironment, num_drones: int = 2, over: Literal["all", "first"] = "all"
+        self,
+        env: EpisodicEnvironment,
+        num_drones: int = 2,
+        over: Literal["all", "first"] = "all",
+        ghosts: Mapping[int, Ghost] | None = None,
     ) -> None:
         if not isinstance(env, EpisodicEnvironment):
             raise TypeError(f"env: found {type(env).__name__}, expected FlyTrack or a wrapper around it")
         check_num_drones(num_drones)
         if over not in ("all", "first"):
             raise ValueError(f"over: found {over!r}, expected 'all' or 'first'")
-        self.env, self.num_drones, self.over = env, num_drones, over
+        self.env, self.num_drones, self.over, self.ghosts = env, num_drones, over, dict(ghosts or {})
+        if not set(self.ghosts) <= set(range(1, num_drones)):
+            raise ValueError(
+                f"ghosts: found places {sorted(self.ghosts)}, expected some of 1 to {num_drones - 1}"
+            )
 
     def __repr__(self) -> str:
         return f"<MultiDroneRace of {self.num_drones}: {self.env!r}>"
@@ -96,7 +116,11 @@ class MultiDroneRace:
     @property
     def default_params(self) -> RaceParams:
         """The environment's parameters, and the default rules."""
-        return RaceParams(self.env.default_params, RaceRules())
+        params = RaceParams(self.env.default_params, RaceRules())
+        if not self.ghosts:
+            return params
+        flight = params.flight.replace(reset=params.flight.reset._replace(course_fraction=0.0))
+        return RaceParams(flight, params.rules._replace(column_spacing=CLEAR_OF_GHOSTS_M))
 
     @property
     def observation_table(self) -> tuple[Entry, ...]:
@@ -160,9 +184,15 @@ class MultiDroneRace:
         words = self._words(jnp.asarray(seed, jnp.uint32)[None])
         states = jax.vmap(self._enter, (0, 0, None, 0))(drones, gate_indices, params, words)
         standings = jax.vmap(self._standing)(states)
-        others = [self._shift(standings, k) for k in range(1, self.num_drones)]
+        others = [self._shift(standings, k) for k in self._distances]
         states = states._replace(gap=jax.vmap(gap_of)(standings, others))
-        return jnp.stack(jax.vmap(self._observe, (0, 0, None))(states, others, params), axis=-1), states
+        return self.observe(states, params), states
+
+    def observe(self, states: EntrantState, params: RaceParams) -> jax.Array:
+        """Return the observations of a race's state, (num_drones, size) float32."""
+        standings = jax.vmap(self._standing)(states)
+        others = [self._shift(standings, k) for k in self._distances]
+        return jnp.stack(jax.vmap(self._observe, (0, 0, None))(states, others, params), axis=-1)
 
     @partial(jax.jit, static_argnames=("self",))
     def step(
@@ -209,16 +239,24 @@ class MultiDroneRace:
         commands = jax.vmap(clip_action)(actions)
         step = one_kernel(partial(self._step, resets))
         rows, final_rows, states, reward, terminated, truncated, info = step(
-            self._words(seeds), states, commands, params
+            self._words(seeds), states, commands, params, self._ghosts_at(states.step)
         )
         info = {**info, "final_observation": jnp.stack(final_rows, axis=-1)}
         return jnp.stack(rows, axis=-1), states, reward, terminated, truncated, info
 
     def _step(
-        self, resets: bool, words: jax.Array, states: EntrantState, commands: Action, params: RaceParams
+        self,
+        resets: bool,
+        words: jax.Array,
+        states: EntrantState,
+        commands: Action,
+        params: RaceParams,
+        ghosts: tuple[jax.Array, Path, Standing] | None,
     ) -> tuple[Any, ...]:
         """Return observations and those before the reset, row by row, states, rewards, flags and info."""
         flown = jax.vmap(self._fly, (0, 0, None))(states, commands, params.flight)
+        if ghosts is not None:
+            flown = jax.vmap(_with_ghost)(flown, *ghosts)
         states, reward, info = flown.state, flown.reward, flown.info
         others: list[Standing] = []
         if self.num_drones > 1:
@@ -264,9 +302,14 @@ class MultiDroneRace:
         gate = self.env.race(state.inner).gate
         own = self._standing(state)
         others = [
-            own._replace(pos_w=one.pos_w, progress=_progress(0, one.pos_w, gate.centre, state.leg_m))
+            own._replace(pos_w=one.pos_w, progress=progress_of(0, one.pos_w, gate.centre, state.leg_m))
             for one in opponents
         ]
+        for ghost_place, ghost in self.ghosts.items():
+            standing = jax.tree.map(lambda leaf: leaf[0], ghost.standing(jnp.zeros(1, jnp.int32)))
+            for k, other in enumerate(others, start=1):
+                is_ghost = (place + k) % self.num_drones == ghost_place
+                others[k - 1] = jax.tree.map(partial(jnp.where, is_ghost), standing, other)
         state = state._replace(gap=gap_of(own, others))
         return self._observe(state, others, params), state
 
@@ -277,8 +320,8 @@ class MultiDroneRace:
         index = jnp.asarray(gate_index)
         before = course.gate(jnp.where(index == 0, course.num_gates - 1, index - 1))
         leg_m = compute_once((gate.centre - before.centre).norm())
-        progress = _progress(0, drone.pos_w, gate.centre, leg_m)
-        return EntrantState(inner, leg_m, progress, jnp.asarray(False), jnp.float32(0.0))
+        progress = progress_of(0, drone.pos_w, gate.centre, leg_m)
+        return EntrantState(inner, leg_m, progress, jnp.asarray(False), jnp.float32(0.0), jnp.int32(0))
 
     def _standing(self, state: EntrantState) -> Standing:
         drone = self.env.drone(state.inner)
@@ -306,8 +349,8 @@ class MultiDroneRace:
         has_passed = race.gate_index != env.race(state.inner).gate_index
         leg_m = jnp.where(has_passed, (race.gate.centre - old_gate.centre).norm(), state.leg_m)
         leg_m = compute_once(leg_m)
-        progress = _progress(race.gates_passed, drone.pos_w, race.gate.centre, leg_m)
-        state = EntrantState(inner, leg_m, progress, was_out | terminated, state.gap)
+        progress = progress_of(race.gates_passed, drone.pos_w, race.gate.centre, leg_m)
+        state = EntrantState(inner, leg_m, progress, was_out | terminated, state.gap, state.step + 1)
         return Flown(
             state=state,
             standing=Standing(drone.pos_w, drone.vel_w, progress, was_out),
@@ -321,7 +364,10 @@ class MultiDroneRace:
     def _meet(
         self, flown: Flown, opponents: list[tuple[jax.Array, Path]], params: RaceParams
     ) -> tuple[EntrantState, jax.Array, jax.Array]:
-        """Return a drone's state after a step, whether a collision put it out, and its reward."""
+        """Return a drone's state after a step, whether a collision put it out, and its reward.
+
+        A ghost is put out for that step only: ``_with_ghost`` lets it fly on.
+        """
         hit = jnp.asarray(False)
         for is_out, path in opponents:
             hit = hit | (is_put_out(flown.path, path, params.rules) & ~is_out)
@@ -340,6 +386,17 @@ class MultiDroneRace:
         return state._replace(gap=gap), reward + rules.lead * gain, told
 
     # Of the flat vector.
+
+    def _ghosts_at(self, steps: jax.Array) -> tuple[jax.Array, Path, Standing] | None:
+        """Return which drones are ghosts, their paths in the next step, standings after it; None without."""
+        found: Any = None
+        place = jnp.arange(len(steps)) % self.num_drones
+        for ghost_place, ghost in self.ghosts.items():
+            before, after = ghost.standing(steps), ghost.standing(steps + 1)
+            is_ghost = place == ghost_place
+            own = (is_ghost, Path(before.pos_w, after.pos_w), after)
+            found = own if found is None else jax.tree.map(partial(jnp.where, is_ghost), own, found)
+        return found
 
     def _words(self, seeds: jax.Array) -> jax.Array:
         """Return a random word for each drone of each race, from one for each race."""
@@ -375,11 +432,23 @@ class MultiDroneRace:
         return over
 
 
+def _with_ghost(flown: Flown, is_ghost: jax.Array, path: Path, standing: Standing) -> Flown:
+    """Return a drone's step as it is, or as that of a ghost, which is never out."""
+
+    def choose(ghost: Any, own: Any) -> Any:
+        return jax.tree.map(partial(jnp.where, is_ghost), ghost, own)
+
+    state = flown.state
+    return flown._replace(
+        state=state._replace(
+            progress=choose(standing.progress, state.progress), is_out=state.is_out & ~is_ghost
+        ),
+        standing=choose(standing, flown.standing),
+        path=choose(path, flown.path),
+        terminated=flown.terminated & ~is_ghost,
+    )
+
+
 def _where_flying(was_out: jax.Array, value: jax.Array) -> jax.Array:
     """Return a value of info, 0 or False for a drone that is out."""
     return jnp.where(was_out, jnp.zeros_like(value), value)
-
-
-def _progress(gates_passed: Any, pos_w: Vec3, centre_w: Vec3, leg_m: jax.Array) -> jax.Array:
-    """Return the gates passed and the share of the way to the next gate, float32."""
-    return gates_passed + 1.0 - compute_once((centre_w - pos_w).norm()) / leg_m

@@ -25,6 +25,12 @@ class Opponent(NamedTuple):
     params: Any = ()
 
 
+def idle(race: MultiDroneRace) -> Opponent:
+    """Return an opponent that leaves its sticks alone; a ghost has one."""
+    size = race.env.observation_space().shape[0]
+    return Opponent(lambda params, seen: jnp.zeros((*seen.shape[:-1], race.env.num_actions)), size)
+
+
 class VersusParams(NamedTuple):
     """The race's parameters, and those of each opponent's policy."""
 

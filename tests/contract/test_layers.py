@@ -54,6 +54,8 @@ ONLY_IN = {
     "rerun": "viz_rerun",
     "matplotlib": "pictures",
     "moviepy": "pictures",
+    "pettingzoo": "multi_drone",
+    "jaxmarl": "multi_drone",
 }
 
 

@@ -1,5 +1,6 @@
 """Races of several drones: one is the single environment, drones do not depend on their order, and meet."""
 
+import gymnax
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -8,11 +9,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import flytrack_env
-from flytrack_env.multi_drone import MultiDroneRace, RaceRules
+from flytrack_env.multi_drone import MultiDroneRace, Opponent, RaceRules, Versus, idle
 from flytrack_env.multi_drone.collisions import Path, is_put_out
 from flytrack_env.multi_drone.opponents import Standing, observe_opponents, rank_of
+from flytrack_env.multi_drone.pettingzoo_api import ParallelRace
 from flytrack_env.multi_drone.rules import BOTH_OUT, check_rules
 from flytrack_env.quaternion import Vec3
+from flytrack_env.references import shipped_reference
 from flytrack_env.tracks import GateFrame
 
 BOTH = RaceRules(blame=BOTH_OUT)
@@ -162,6 +165,81 @@ def test_ranks_are_by_progress_and_those_that_are_out_come_last():
     field = [standing(0, 2.5), standing(0, 4.0, is_out=True), standing(0, 3.0), standing(0, 1.0, is_out=True)]
     ranks = [int(rank_of(one, [other for other in field if other is not one])) for one in field]
     assert ranks == [2, 3, 1, 4]
+
+
+def test_a_ghost_flies_its_line_and_stops_for_nobody():
+    env = gymnax.make("FlyTrackDuel-v0")[0]
+    ghost = env.game.ghosts[1]
+    states = np.stack([np.asarray(leaf) for leaf in (*ghost.pos_w, ghost.progress)], axis=-1)
+    length_m = np.linalg.norm(np.diff(states[:380, :3], axis=0), axis=1).sum()
+    assert 40.0 < length_m < 120.0 and (np.diff(states[:, 3]) > -0.5).all()
+    lap = shipped_reference("flytrack", "standing").time_s
+    assert abs(0.01 * np.argmax(states[:, 3] >= env.game.env.default_params.course.num_gates) - lap) < 0.03
+    observation, state = env.reset(jax.random.key(0))
+    behind = []
+    for step in range(60):
+        observation, state, *_, info = env.step(jax.random.key(step), state, jnp.array([0.0, 0.0, 0.0, -0.2]))
+        behind.append(-float(info["gap_gates"]))
+        assert not info["race_over"]
+    assert behind[-1] > 0.5 and info["rank"] == 2
+    drone = state.entrants.inner.plant.drone
+    frame = state.entrants.inner.race.gate
+    gate = jax.tree.map(lambda leaf: leaf[0], frame)
+    apart = Vec3(*(states[60, axis] - drone.pos_w[axis][0] for axis in range(3)))
+    np.testing.assert_allclose(observation[29:32] * 3.0, np.array(gate.to_frame(apart)), atol=1e-3)
+
+
+def test_a_view_refuses_what_does_not_fit():
+    def make_view(count, size, over="first"):
+        return Versus(MultiDroneRace(RACE.env, 2, over), [idle(RACE)._replace(observation_size=size)] * count)
+
+    for arguments, message in (
+        ((2, 29), "opponents: found 2, expected 1"),
+        ((1, 30), "found 30, expected 29 or 36"),
+        ((1, 29, "all"), "expected 'first'"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            make_view(*arguments)
+    for arguments, message in (
+        (("FlyTrackDuel-v0", 3), "expected 2 to 2"),
+        (("FlyTrackRace-v0", 9), "expected 2 to 8"),
+        (("FlyTrackRelay-v0",), "race_id"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            flytrack_env.make_race(*arguments)
+    with pytest.raises(ValueError, match="ghosts"):
+        MultiDroneRace(RACE.env, 2, ghosts={2: None})
+
+
+def test_a_learner_meets_its_opponents_alone_and_in_a_batch():
+    def act(gain, seen):
+        return jnp.tanh(gain * seen[..., :4])
+
+    race = MultiDroneRace(RACE.env, 2, "first")
+    env = Versus(race, [Opponent(act, race.observation_space().shape[0], jnp.float32(0.1))])
+    _, states = jax.vmap(env.reset, (0, None))(jax.random.split(jax.random.key(0), 4), None)
+    actions = sticks(3, 4)
+    batch = env.step_batch(jax.random.key(1), states, actions, env.default_params)
+    single = jax.vmap(env.step, (None, 0, 0, None))(jax.random.key(1), states, actions, None)
+    is_going = ~np.asarray(batch[5]["race_over"])
+    for one, other in zip((batch[0], *batch[2:5]), (single[0], *single[2:5]), strict=True):
+        np.testing.assert_allclose(one[is_going], other[is_going], atol=2e-5)
+    both = jnp.stack([actions, act(0.1, states.observations[:, 0])], axis=1)
+    by_hand = race.step_batch(jax.random.key(1), states.entrants, both, race.default_params)
+    np.testing.assert_allclose(batch[0], by_hand[0][:, 0], atol=2e-5)
+
+
+@pytest.mark.filterwarnings("ignore:The old environment creation API")  # PettingZoo's own, in its tests
+def test_pettingzoo_accepts_the_race():
+    from pettingzoo.test import parallel_api_test
+
+    race = ParallelRace(flytrack_env.make_race("FlyTrackRace-v0", DRONES))
+    parallel_api_test(race, num_cycles=150)
+    race.reset(seed=1)
+    with pytest.raises(ValueError, match=r"found \['drone_0'\], expected"):
+        race.step({"drone_0": np.zeros(4)})
+    with pytest.raises(ValueError, match=r"actions\['drone_0'\]: found shape \(3,\)"):
+        race.step({agent: np.zeros(3) for agent in race.agents})
 
 
 def test_a_race_begins_on_the_grid_and_is_over_for_all_at_once():

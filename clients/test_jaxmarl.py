@@ -1,0 +1,51 @@
+"""JaxMARL races our drones: what its own tests ask of an environment, and its wrapper."""
+
+import jax
+import jax.numpy as jnp
+from jaxmarl.environments import MultiAgentEnv
+from jaxmarl.environments.spaces import Space
+from jaxmarl.wrappers.baselines import LogWrapper
+
+import flytrack_env
+from flytrack_env.multi_drone.jaxmarl_api import JaxMarlRace
+
+ENV = JaxMarlRace(flytrack_env.make_race("FlyTrackRace-v0", 3))
+
+
+def test_it_is_an_environment_of_jaxmarl():
+    assert isinstance(ENV, MultiAgentEnv) and len(ENV.agents) == ENV.num_agents == 3
+    for agent in ENV.agents:
+        for space in (ENV.observation_space(agent), ENV.action_space(agent)):
+            assert isinstance(space, Space)
+    observations, state = ENV.reset(jax.random.key(0))
+    assert all(ENV.observation_space(agent).contains(observations[agent]) for agent in ENV.agents)
+    again = ENV.get_obs(state)
+    assert all(jnp.allclose(again[agent], observations[agent], atol=2e-5) for agent in ENV.agents)
+    actions = {agent: ENV.action_space(agent).sample(jax.random.key(1)) for agent in ENV.agents}
+    observations, _, rewards, dones, infos = ENV.step(jax.random.key(2), state, actions)
+    assert all(ENV.observation_space(agent).contains(observations[agent]) for agent in ENV.agents)
+    assert set(rewards) == set(ENV.agents) and set(dones) == {*ENV.agents, "__all__"}
+    assert infos["rank"].shape == (3,) and ENV.get_avail_actions(state)["drone_0"].all()
+
+
+def test_a_race_that_is_over_is_reset_to_the_state_that_is_given():
+    params = ENV.params._replace(flight=ENV.params.flight.replace(max_steps_in_episode=1))
+    env = JaxMarlRace(ENV.race, params)
+    (_, first), (_, given) = (env.reset(jax.random.key(seed)) for seed in (0, 1))
+    actions = {agent: jnp.zeros(4) for agent in env.agents}
+    _, state, _, dones, _ = env.step(jax.random.key(2), first, actions, given)
+    assert dones["__all__"]
+    assert all(jax.tree.leaves(jax.tree.map(jnp.array_equal, state, given)))
+
+
+def test_jaxmarls_wrapper_logs_returns_of_episodes():
+    env = LogWrapper(ENV)
+    _, state = env.reset(jax.random.key(0))
+
+    def step(state, key):
+        actions = {agent: jnp.array([0.0, 0.0, 0.0, -1.0]) for agent in ENV.agents}
+        _, state, _, dones, info = env.step(key, state, actions)
+        return state, (dones["__all__"], info["returned_episode_lengths"])
+
+    over, lengths = jax.lax.scan(step, state, jax.random.split(jax.random.key(1), 300))[1]
+    assert over.any() and (lengths[over] > 0).all()
