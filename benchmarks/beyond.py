@@ -8,7 +8,6 @@ have a line of the same commit; --page writes docs/results/beyond.md, of the las
 """
 
 import json
-import math
 import time
 from collections.abc import Sequence
 from dataclasses import replace
@@ -60,15 +59,14 @@ def truth_of(row: str, rng: np.random.Generator) -> hidden.Truth:
     truth = hidden.draw_base(rng)
     if row == "clean":
         return truth
-    low, high = np.log(AMPLITUDES)
-    return replace(truth, outside=hidden.draw_outside(rng, row, amplitude=math.exp(rng.uniform(low, high))))
+    return replace(truth, outside=hidden.draw_outside(rng, row, hidden.log_uniform(*AMPLITUDES, rng)))
 
 
 def flown_plant(row: str, number: int) -> tuple[hidden.Truth, FlightLog, np.random.Generator]:
     """Return one plant, a measured flight of it, and what draws more of them."""
     rng = np.random.default_rng([SEED, number, sorted([*RIGHT, "clean", "listed"]).index(row)])
     truth = replace(truth_of(row, rng), motion=hidden.MOTIONS[number % len(hidden.MOTIONS)])
-    return truth, hidden.measure(hidden.fly(truth, "scripted", SECONDS, rng), "sensors", rng), rng
+    return truth, hidden.measure(hidden.fly(truth, SECONDS, rng), "sensors", rng), rng
 
 
 def plant(row: str, number: int) -> dict[str, Any]:
@@ -96,7 +94,7 @@ def plant(row: str, number: int) -> dict[str, Any]:
         if row in RIGHT and learned.law.terms:
             line["is_variable"] = bool(quantities & RIGHT[row][0])
             line["is_form"] = line["is_variable"] and bool(shapes & RIGHT[row][1])
-        clean = hidden.fly(truth, "scripted", SECONDS, rng)
+        clean = hidden.fly(truth, SECONDS, rng)
         neutral = (one._replace(scale=0.0) for one in learned.effects)
         share, size = removed(clean, found.base.with_effects(*neutral), found.extended)
         line["removed"] = [round(share, 4), round(size, 4)]

@@ -50,11 +50,8 @@ class Trial(NamedTuple):
 
 
 def _outside(rng: Rng) -> hidden.Truth:
-    low, high = np.log(AMPLITUDES)
-    return replace(
-        hidden.draw_base(rng),
-        outside=hidden.draw_outside(rng, amplitude=float(np.exp(rng.uniform(low, high)))),
-    )
+    truth, amplitude = hidden.draw_base(rng), hidden.log_uniform(*AMPLITUDES, rng)
+    return replace(truth, outside=hidden.draw_outside(rng, amplitude=amplitude))
 
 
 # Row -> how a truth is drawn, and the sensors' noise.
@@ -92,7 +89,7 @@ def make_log(trial: Trial) -> tuple[hidden.Truth, FlightLog, FlightLog, ModelPar
     draw, noise = ROWS[trial.row]
     rng = np.random.default_rng([trial.seed, trial.number, list(ROWS).index(trial.row)])
     truth = replace(draw(rng), motion=trial.motion, step_s=1.0 / trial.rate)
-    clean = hidden.fly(truth, "scripted", SECONDS, rng)
+    clean = hidden.fly(truth, SECONDS, rng)
     return truth, clean, hidden.measure(clean, noise, rng), model_of(truth), rng
 
 
@@ -121,7 +118,7 @@ def plant(trial: Trial) -> dict[str, Any]:
         could = known(clean, log, ~held_out_rows(log), true_model, truth.effects)
         line["known"] = {name: [float(f"{v:.4g}") for v in one[:2]] + [one[2]] for name, one in could.items()}
         # Of explainable error on a new flight, and how large that is, times the noise.
-        share, size = removed(hidden.fly(truth, "scripted", SECONDS, rng), found.base, found.extended)
+        share, size = removed(hidden.fly(truth, SECONDS, rng), found.base, found.extended)
         line["removed"] = [round(share, 4), round(size, 4)]
     if trial.row == "clock":
         late = [one for one in found.causes if one.effect == "mocap_latency"]

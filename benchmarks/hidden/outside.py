@@ -27,7 +27,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.hidden.noise import STD
-from benchmarks.hidden.truth import GRAVITY, Outside, Truth
+from benchmarks.hidden.truth import GRAVITY, Outside, Truth, log_uniform
 from benchmarks.hidden.vectors import Vector, norm, scale, to_body
 
 # An amplitude of 1: m/s^2 of forces and of thrust over mass, rad/s of rates.
@@ -219,8 +219,7 @@ def _draw_command(rng: Rng) -> ChannelAndShape:
 
 
 def _draw_periodic(rng: Rng) -> ChannelAndShape:
-    low, high = (math.log(value) for value in FREQUENCY_HZ)
-    shape = {"frequency_hz": math.exp(rng.uniform(low, high)), "phase": rng.uniform(-math.pi, math.pi)}
+    shape = {"frequency_hz": log_uniform(*FREQUENCY_HZ, rng), "phase": rng.uniform(-math.pi, math.pi)}
     return ("force" if rng.random() < 0.5 else "rate"), {**shape, **_random_direction(rng)}
 
 
@@ -270,8 +269,7 @@ def draw_outside(rng: Rng, kind: str | None = None, amplitude: float | None = No
         KeyError: if there is no such kind.
     """
     kind = str(rng.choice(KINDS)) if kind is None else kind
-    if amplitude is None:
-        amplitude = math.exp(rng.uniform(math.log(SMALLEST), math.log(LARGEST)))
+    amplitude = log_uniform(SMALLEST, LARGEST, rng) if amplitude is None else amplitude
     depends_on, draw, _ = TABLE[kind]
     channel, shape = draw(rng)
     return Outside(kind, (depends_on,), channel, float(amplitude), shape)

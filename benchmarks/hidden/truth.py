@@ -223,13 +223,14 @@ GUST_STD, GUST_S = (0.3, 1.5), (0.3, 3.0)  # m/s^2, s
 GUST_RATE_STD = (0.02, 0.1)  # rad/s
 
 
-def _log_uniform(low: float, high: float, rng: Rng) -> float:
+def log_uniform(low: float, high: float, rng: Rng) -> float:
+    """Return a number whose logarithm is uniform."""
     return float(math.exp(rng.uniform(math.log(low), math.log(high))))
 
 
 def draw_base(rng: Rng) -> Truth:
     """Return a plant without effects: lags of 15 to 70 ms, a drawn thrust curve, else the handout."""
-    tau = tuple(_log_uniform(*TAU_S, rng) for _ in range(4))
+    tau = tuple(log_uniform(*TAU_S, rng) for _ in range(4))
     full, idle = rng.uniform(*FULL_THRUST_N), rng.uniform(*IDLE_THRUST_N)
     curved, cubic = rng.uniform(*CURVED), rng.uniform(*CUBIC)
     volt, both = rng.uniform(*PER_VOLT), rng.uniform(*PER_VOLT_STICK)
@@ -257,7 +258,7 @@ def draw_effect(name: str, rng: Rng, size: float | None = None, has_drag: bool =
         KeyError: if there is no such effect.
     """
     drawn = EFFECTS[name]
-    size = _log_uniform(drawn.low, drawn.high, rng) if size is None else size
+    size = log_uniform(drawn.low, drawn.high, rng) if size is None else size
     values = drawn.make(size, rng)
     if name == "wind" and has_drag:
         return {key.replace("a_", "v_"): AIR_PER_PUSH * value for key, value in values.items()}
@@ -279,15 +280,15 @@ def draw_truth(rng: Rng, num_effects: int) -> Truth:
 
 def draw_gust(rng: Rng) -> Gust:
     """Return gusts of 0.3 to 1.5 m/s^2 that last for 0.3 to 3 s; half of them turn the drone as well."""
-    rate_std = _log_uniform(*GUST_RATE_STD, rng) if rng.random() < 0.5 else 0.0
-    return Gust(_log_uniform(*GUST_STD, rng), _log_uniform(*GUST_S, rng), rate_std)
+    rate_std = log_uniform(*GUST_RATE_STD, rng) if rng.random() < 0.5 else 0.0
+    return Gust(log_uniform(*GUST_STD, rng), log_uniform(*GUST_S, rng), rate_std)
 
 
 def draw_onset(rng: Rng, seconds: float) -> Truth:
     """Return a plant with one effect, of the larger half of sizes, that begins within a log."""
     truth, name = draw_base(rng), str(rng.choice(SUDDEN))
     drawn = EFFECTS[name]
-    size = _log_uniform(math.sqrt(drawn.low * drawn.high), drawn.high, rng)
+    size = log_uniform(math.sqrt(drawn.low * drawn.high), drawn.high, rng)
     onset_s = seconds * float(rng.uniform(*ONSET_SHARE))
     return replace(truth, effects={name: draw_effect(name, rng, size)}, onset_s=onset_s)
 

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 from benchmarks.diagnosis import Trial, model_of, plant
-from benchmarks.hidden import Truth, draw_base, draw_effect, draw_outside, fly, measure
+from benchmarks.hidden import Truth, draw_base, draw_effect, draw_outside, fly, measure, pilot
 from flytrack_env import load_model
 from flytrack_env.dynamics import ModelParameters, nominal_parameters
 from flytrack_env.effects import BY_NAME, LinearDrag
@@ -55,20 +55,20 @@ def _short(number: int, spikes: int = 0, **fields: Any) -> Case:
     """Return a short flight of a plant in fine steps, with some outliers of the velocity."""
     rng, base = np.random.default_rng([3, number]), draw_base(np.random.default_rng(3))
     truth = replace(base, motion="fine", **fields)
-    log = measure(fly(truth, "scripted", SHORT_S, rng), "sensors", rng)
+    log = measure(fly(truth, SHORT_S, rng), "sensors", rng)
     log["v"][rng.choice(len(log), spikes, replace=False)] += rng.normal(0.0, 2.0, (spikes, 3))
     return Case(truth, model_of(truth), log, np.floor(log.time / BLOCK_S).astype(int) % 2 == 1)
 
 
-def _flown(truth: Truth, rng: Rng, kind: str = "scripted") -> Case:
-    return Case(truth, model_of(truth), measure(fly(truth, kind, SECONDS, rng), "sensors", rng))
+def _flown(truth: Truth, rng: Rng) -> Case:
+    return Case(truth, model_of(truth), measure(fly(truth, SECONDS, rng), "sensors", rng))
 
 
 def _in_training_only(rng: Rng) -> Case:
     """Return a plant with drag that is absent from the last of every four segments."""
     still = draw_base(rng)
     dragged = replace(still, effects={"linear_drag": draw_effect("linear_drag", rng, 0.4)})
-    parts = [fly(truth, "scripted", SECONDS, rng) for truth in (dragged, still)]
+    parts = [fly(truth, SECONDS, rng) for truth in (dragged, still)]
     rows = np.arange(len(parts[0]))
     segment = rows // SEGMENT_ROWS
     is_still = segment % HELD_OUT_EVERY == HELD_OUT_EVERY - 1
@@ -81,10 +81,20 @@ def _in_training_only(rng: Rng) -> Case:
 
 
 def _wind_in_hover(rng: Rng) -> Case:
-    truth = draw_base(rng)
-    way = rng.uniform(-np.pi, np.pi)
+    """Return a flight that only hovers, with small corrections and one heading, in wind."""
+
+    def hover(sketch: pilot.Sketch) -> None:
+        sketch.wait(sketch.rng.uniform(2.0, 4.5))
+        there = np.array(sketch.start_w) + 0.25 * sketch.rng.uniform(-1.0, 1.0, 3)
+        speed = tuple(((there - sketch.pos_w) / 0.8).tolist())
+        for _ in range(80):
+            sketch.add(speed)
+
+    truth, way = draw_base(rng), rng.uniform(-np.pi, np.pi)
     wind = {"a_x": HOVER_WIND * float(np.cos(way)), "a_y": HOVER_WIND * float(np.sin(way)), "a_z": 0.0}
-    return _flown(replace(truth, effects={"wind": wind}), rng, kind="hover")
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(pilot, "cycle", hover)
+        return _flown(replace(truth, effects={"wind": wind}), rng)
 
 
 def _changed(field: str, size: float, rng: Rng) -> Case:
