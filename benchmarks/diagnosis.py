@@ -15,7 +15,6 @@ from collections.abc import Callable
 from dataclasses import replace
 from datetime import date
 from itertools import product
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
@@ -149,15 +148,15 @@ def _graded(cause: Any, truth: hidden.Truth) -> dict[str, Any]:
     }
 
 
-def read_lines(commit: str | None, path: Path = LINES) -> dict[Trial, dict[str, Any]]:
+def read_lines(commit: str | None) -> dict[Trial, dict[str, Any]]:
     """Return the lines of a commit by plant; of the last line's if None."""
-    return {Trial(*(line[name] for name in Trial._fields)): line for line in lines_of_commit(path, commit)}
+    return {Trial(*(line[name] for name in Trial._fields)): line for line in lines_of_commit(LINES, commit)}
 
 
-def run(trials: list[Trial], path: Path) -> None:
+def run(trials: list[Trial]) -> None:
     """Diagnose what is not done yet and append the lines."""
     commit = commit_of_checkout()
-    done = read_lines(commit, path)
+    done = read_lines(commit)
     machine = f"{platform.machine()}, {os.cpu_count()} cores, jax {jax.__version__}"
     for trial in progress([one for one in trials if one not in done], "plants"):
         line = {**trial._asdict(), "commit": commit, "date": str(date.today()), "machine": machine}
@@ -165,7 +164,7 @@ def run(trials: list[Trial], path: Path) -> None:
             line |= plant(trial)
         except Exception as error:  # a crash is a result too, and the others go on
             line["error"] = f"{type(error).__name__}: {error}"
-        append_line(path, line)
+        append_line(LINES, line)
 
 
 def main(
@@ -175,15 +174,13 @@ def main(
     motion: str = ",".join(hidden.MOTIONS),
     rate: str = "100",
     seed: int = SEED,
-    lines: Path = LINES,
 ) -> None:
     """Diagnose plants.
 
-    plants: of each row, up to this number; first: from this one on. rate: rows per second of the log. lines:
-    file to append to.
+    plants: of each row, up to this number; first: from this one on. rate: rows per second of the log.
     """
     every = product(range(first, plants), rows.split(","), motion.split(","), map(int, rate.split(",")))
-    run([Trial(row, number, seed, moved, one_rate) for number, row, moved, one_rate in every], lines)
+    run([Trial(row, number, seed, moved, one_rate) for number, row, moved, one_rate in every])
 
 
 if __name__ == "__main__":
