@@ -273,9 +273,7 @@ def test_wrong_use_is_refused() -> None:
             type(each)(BASE, render_mode="ansi")
     with pytest.raises(ValueError, match="num_envs: found 0"):
         make_vector(num_envs=0)
-    with pytest.raises(
-        ValueError, match="autoreset_mode: found 'Disabled', expected 'NextStep' or 'SameStep'"
-    ):
+    with pytest.raises(ValueError, match="autoreset_mode: found 'Disabled', expected 'NextStep' or"):
         make_vector(autoreset_mode=AutoresetMode.DISABLED)
     with pytest.raises(RuntimeError, match=r"found 'async', .*; use 'vector_entry_point'.* or pass .*spawn"):
         gymnasium.make_vec(BASE, 2, vectorization_mode="async", vector_kwargs={"context": "fork"})
