@@ -105,17 +105,6 @@ def test_a_semi_implicit_force_has_the_attitude_after_the_step():
     assert np.abs(np.array(semi.acc_w) - np.array(at_once.acc_w)).max() > 0.1
 
 
-def test_free_fall_is_exact_and_attitudes_keep_their_norm():
-    without_thrust = PLAIN._replace(thrust_coeffs=np.zeros(6))
-    states = flown(without_thrust, COMMAND_S)[0]
-    time = COMMAND_S * np.arange(1, len(states) + 1)[:, None]
-    fall = np.array([0.0, 0.0, -GRAVITY])
-    np.testing.assert_allclose(
-        states[:, :3], START[:3] + START[3:6] * time + 0.5 * fall * time**2, atol=1e-12
-    )
-    np.testing.assert_allclose(np.linalg.norm(states[:, 9:13], axis=1), 1.0, atol=1e-12)
-
-
 def test_an_accelerometer_off_the_centre_feels_the_turn_of_the_moment():
     """The reading against finite differences of the gyro at steps of 1 ms."""
     offset = PLAIN.with_effects(effects.ImuOffset(*ARM_B))
