@@ -11,7 +11,15 @@ from flytrack_sysid import FitError, fit
 from flytrack_sysid.estimate import estimate
 from flytrack_sysid.fit import Fit
 from flytrack_sysid.log import FlightLog
-from flytrack_sysid.parameters import BASE, DRAIN, TAUS, THRUST_COEFFS, to_vector
+from flytrack_sysid.parameters import (
+    BASE,
+    DRAIN,
+    TAUS,
+    THRUST_COEFFS,
+    to_vector,
+    with_neutral_effects,
+    with_values,
+)
 from flytrack_sysid.sensors import measure
 from flytrack_sysid.split import held_out_rows
 from tests.support.handout_plant import GRAVITY, HandoutPlant, excited
@@ -179,3 +187,16 @@ def test_a_log_that_measured_nothing_is_refused_by_its_name(exact):
 @pytest.mark.slow
 def test_missing_voltage_is_said_with_what_is_taken_instead(exact):
     assert "the log as flown at 23 V" in "\n".join(fit(exact.without("v_bat")).warnings)
+
+
+def test_replacing_values_changes_those_alone_and_refuses_unknown_names():
+    model = PLANT.model()
+    changed = to_vector(with_values(model, {"tau_yaw": 0.07, "c4": 0.5}))
+    at = [BASE.index("tau_yaw"), BASE.index("c4")]
+    np.testing.assert_array_equal(changed[at], [0.07, 0.5])
+    np.testing.assert_array_equal(np.delete(changed, at), np.delete(to_vector(model), at))
+    for name in ("tau_jaw", "linear_drag.d_x", ""):
+        with pytest.raises(KeyError, match=f"{name}: unknown; expected of tau_roll"):
+            with_values(model, {name: 1.0})
+    with pytest.raises(KeyError, match="rag"):
+        with_neutral_effects(model, ["rag"])
