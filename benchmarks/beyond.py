@@ -142,7 +142,11 @@ def figures(lines: Sequence[dict[str, Any]]) -> list[tuple[str, str, str]]:
     laws = [line for line in lines if line["row"] in RIGHT]
     seen = [line for line in laws if line["unexplained"]]
     found = [line for line in laws if line["law"]]
-    controls = {row: [line for line in lines if line["row"] == row] for row in ("clean", "listed")}
+    controls = {
+        row: [bool(line["law"] or line["residual"]) for line in lines if line["row"] == row]
+        for row in ("clean", "listed")
+    }
+    is_right = [[line.get("is_form", False) for line in some] for some in (laws, seen)]
     # A thermal is elsewhere on every flight, so that a new one says nothing of it.
     removed_shares = [
         100.0 * one["removed"][0] for one in laws if "removed" in one and one["row"] != "position"
@@ -153,22 +157,11 @@ def figures(lines: Sequence[dict[str, Any]]) -> list[tuple[str, str, str]]:
     gone = f"{np.median(removed_shares):.0f} % of {len(removed_shares)}" if removed_shares else "none"
     return [
         ("variable right", "70 %", report.percent([line.get("is_variable", False) for line in laws])),
-        ("variable and form right", "70 %", report.percent([line.get("is_form", False) for line in laws])),
-        (
-            "the same, of those left unexplained",
-            "",
-            report.percent([line.get("is_form", False) for line in seen]),
-        ),
+        ("variable and form right", "70 %", report.percent(is_right[0])),
+        ("the same, of those left unexplained", "", report.percent(is_right[1])),
         ("law of another variable", "2 %", report.percent([not line["is_variable"] for line in found])),
         ("a residual in place of a law", "", report.percent([bool(line["residual"]) for line in laws])),
-        *(
-            (
-                f"law or residual, {row}",
-                "1 %",
-                report.percent([bool(one["law"] or one["residual"]) for one in own]),
-            )
-            for row, own in controls.items()
-        ),
+        *((f"law or residual, {row}", "1 %", report.percent(flags)) for row, flags in controls.items()),
         ("explainable error removed on a new flight, median of those learnt", "90 %", gone),
         ("rows of a new flight in a residual's 90 % interval", "88 to 92 %", share),
         ("CPU seconds a log, median", "", f"{np.median([line['cpu_s'] for line in lines]):.0f}"),

@@ -68,7 +68,7 @@ def optimise(track: Track, kind: str, model: ModelParameters, model_name: str) -
     """Return the time-optimal flight of a track and a model, with a full battery; needs CasADi.
 
     Raises:
-        UnsupportedModelError: an effect that cannot be expressed. UnsolvedError: no optimum was found.
+        ValueError: an effect that cannot be expressed. RuntimeError: no optimum was found.
     """
     import casadi  # an extra, needed only here
 

@@ -16,10 +16,6 @@ XYZ = ("x", "y", "z")
 CHANNELS = {"u": 4, "p": 3, "v": 3, "q": 4, "a": 3, "f": 3, "w": 3, "slope": 3, "v_bat": 1}
 
 
-class CrashError(RuntimeError):
-    """No attempt at a flight stayed within the envelope."""
-
-
 def fly(truth: Truth, seconds: float, rng: np.random.Generator) -> FlightLog:
     """Return the clean log of a flight, float64, one segment, a row per step of the truth.
 
@@ -27,7 +23,7 @@ def fly(truth: Truth, seconds: float, rng: np.random.Generator) -> FlightLog:
     sensors and without noise. A flight below 0.1 m or beyond 20 m/s is flown again, higher and slower.
 
     Raises:
-        CrashError: eight attempts left the envelope.
+        RuntimeError: eight attempts left the envelope.
     """
     seed = rng.integers(2**63)
     for caution in range(TRIES):
@@ -36,7 +32,7 @@ def fly(truth: Truth, seconds: float, rng: np.random.Generator) -> FlightLog:
         if height >= FLOOR_M and speed <= FASTEST:
             break
     else:
-        raise CrashError(
+        raise RuntimeError(
             f"flight of {truth.text()}: found {height:.2f} m and {speed:.1f} m/s after {TRIES} tries, "
             f"expected {FLOOR_M} m or more and {FASTEST} m/s or less"
         )
