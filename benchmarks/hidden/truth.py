@@ -120,7 +120,7 @@ def _positive(name: str) -> Callable[[float, Rng], Values]:
     return lambda size, rng: {name: size}
 
 
-def _direction(*names: str) -> Callable[[float, Rng], Values]:
+def direction(*names: str) -> Callable[[float, Rng], Values]:
     """Return a maker of vectors in a random direction, of the size's length."""
 
     def make(size: float, rng: Rng) -> Values:
@@ -186,25 +186,25 @@ EFFECTS: dict[str, EffectRange] = {
     "rate_expo": EffectRange(0.006, 0.15, "1", _per_axis(signs=(-1.0, 1.0))),
     "rate_scale": EffectRange(0.005, 0.1, "|ln factor|", _factors(*STICKS)),
     "rate_saturation": EffectRange(0.008, 0.2, "share lost at full stick", _per_axis()),
-    "rate_cross_coupling": EffectRange(0.005, 0.08, "1", _direction("from_roll", "from_pitch")),
-    "motor_imbalance": EffectRange(0.0006, 0.01, "rad/s per m/s^2", _direction("roll", "pitch")),
+    "rate_cross_coupling": EffectRange(0.005, 0.08, "1", direction("from_roll", "from_pitch")),
+    "motor_imbalance": EffectRange(0.0006, 0.01, "rad/s per m/s^2", direction("roll", "pitch")),
     "yaw_reaction": EffectRange(0.003, 0.05, "rad", _signed("angle")),
     "second_order_rates": EffectRange(0.002, 0.025, "s, 1 / wn", _oscillator),
     "rate_slew_limit": EffectRange(0.02, 0.25, "s, centre to full stick", _per_axis("_s")),
-    "wind": EffectRange(0.12, 1.5, "m/s^2; with drag 6 times that in m/s", _direction("a_x", "a_y", "a_z")),
+    "wind": EffectRange(0.12, 1.5, "m/s^2; with drag 6 times that in m/s", direction("a_x", "a_y", "a_z")),
     "thrust_scale": EffectRange(0.01, 0.2, "|ln factor|", _log_factor("factor")),
     "translational_lift": EffectRange(0.03, 0.4, "share of thrust", _positive("gain")),
     "ground_effect": EffectRange(0.06, 0.5, "share of thrust", _ground),
     "linear_drag": EffectRange(0.03, 0.6, "1/s", _drag("d", (0.2, 1.0))),
     "quadratic_drag": EffectRange(0.003, 0.05, "1/m", _drag("k", (0.5, 2.0))),
     "rotor_drag": EffectRange(0.003, 0.05, "s/m", _positive("h")),
-    "thrust_tilt": EffectRange(0.008, 0.12, "rad", _direction("towards_x", "towards_y")),
+    "thrust_tilt": EffectRange(0.008, 0.12, "rad", direction("towards_x", "towards_y")),
     "voltage_sag": EffectRange(0.01, 1.0, "V at full thrust", _positive("at_full_v")),
-    "accelerometer_bias": EffectRange(0.12, 1.5, "m/s^2", _direction("x", "y", "z")),
+    "accelerometer_bias": EffectRange(0.12, 1.5, "m/s^2", direction("x", "y", "z")),
     "accelerometer_scale": EffectRange(0.008, 0.12, "|ln factor|", _factors("x", "y", "z")),
-    "gyro_bias": EffectRange(0.006, 0.1, "rad/s", _direction("x", "y", "z")),
+    "gyro_bias": EffectRange(0.006, 0.1, "rad/s", direction("x", "y", "z")),
     "gyro_scale": EffectRange(0.005, 0.1, "|ln factor|", _factors("x", "y", "z")),
-    "imu_offset": EffectRange(0.005, 0.06, "m", _direction("x", "y", "z")),
+    "imu_offset": EffectRange(0.005, 0.06, "m", direction("x", "y", "z")),
     "imu_latency": EffectRange(0.0006, 0.015, "s", _positive("latency_s")),
 }
 NAMES = tuple(EFFECTS)
