@@ -8,7 +8,6 @@ have a line of the same commit; --page writes docs/results/beyond.md, of the las
 """
 
 import json
-import math
 import time
 from collections.abc import Sequence
 from dataclasses import replace
@@ -60,15 +59,14 @@ def truth_of(row: str, rng: np.random.Generator) -> hidden.Truth:
     truth = hidden.draw_base(rng)
     if row == "clean":
         return truth
-    low, high = np.log(AMPLITUDES)
-    return replace(truth, outside=hidden.draw_outside(rng, row, amplitude=math.exp(rng.uniform(low, high))))
+    return replace(truth, outside=hidden.draw_outside(rng, row, hidden.log_uniform(*AMPLITUDES, rng)))
 
 
 def flown_plant(row: str, number: int) -> tuple[hidden.Truth, FlightLog, np.random.Generator]:
     """Return one plant, a measured flight of it, and what draws more of them."""
     rng = np.random.default_rng([SEED, number, sorted([*RIGHT, "clean", "listed"]).index(row)])
     truth = replace(truth_of(row, rng), motion=hidden.MOTIONS[number % len(hidden.MOTIONS)])
-    return truth, hidden.measure(hidden.fly(truth, "scripted", SECONDS, rng), "sensors", rng), rng
+    return truth, hidden.measure(hidden.fly(truth, SECONDS, rng), "sensors", rng), rng
 
 
 def plant(row: str, number: int) -> dict[str, Any]:
@@ -96,7 +94,7 @@ def plant(row: str, number: int) -> dict[str, Any]:
         if row in RIGHT and learned.law.terms:
             line["is_variable"] = bool(quantities & RIGHT[row][0])
             line["is_form"] = line["is_variable"] and bool(shapes & RIGHT[row][1])
-        clean = hidden.fly(truth, "scripted", SECONDS, rng)
+        clean = hidden.fly(truth, SECONDS, rng)
         neutral = (one._replace(scale=0.0) for one in learned.effects)
         share, size = removed(clean, found.base.with_effects(*neutral), found.extended)
         line["removed"] = [round(share, 4), round(size, 4)]
@@ -144,7 +142,11 @@ def figures(lines: Sequence[dict[str, Any]]) -> list[tuple[str, str, str]]:
     laws = [line for line in lines if line["row"] in RIGHT]
     seen = [line for line in laws if line["unexplained"]]
     found = [line for line in laws if line["law"]]
-    controls = {row: [line for line in lines if line["row"] == row] for row in ("clean", "listed")}
+    controls = {
+        row: [bool(line["law"] or line["residual"]) for line in lines if line["row"] == row]
+        for row in ("clean", "listed")
+    }
+    is_right = [[line.get("is_form", False) for line in some] for some in (laws, seen)]
     # A thermal is elsewhere on every flight, so that a new one says nothing of it.
     removed_shares = [
         100.0 * one["removed"][0] for one in laws if "removed" in one and one["row"] != "position"
@@ -155,22 +157,11 @@ def figures(lines: Sequence[dict[str, Any]]) -> list[tuple[str, str, str]]:
     gone = f"{np.median(removed_shares):.0f} % of {len(removed_shares)}" if removed_shares else "none"
     return [
         ("variable right", "70 %", report.percent([line.get("is_variable", False) for line in laws])),
-        ("variable and form right", "70 %", report.percent([line.get("is_form", False) for line in laws])),
-        (
-            "the same, of those left unexplained",
-            "",
-            report.percent([line.get("is_form", False) for line in seen]),
-        ),
+        ("variable and form right", "70 %", report.percent(is_right[0])),
+        ("the same, of those left unexplained", "", report.percent(is_right[1])),
         ("law of another variable", "2 %", report.percent([not line["is_variable"] for line in found])),
         ("a residual in place of a law", "", report.percent([bool(line["residual"]) for line in laws])),
-        *(
-            (
-                f"law or residual, {row}",
-                "1 %",
-                report.percent([bool(one["law"] or one["residual"]) for one in own]),
-            )
-            for row, own in controls.items()
-        ),
+        *((f"law or residual, {row}", "1 %", report.percent(flags)) for row, flags in controls.items()),
         ("explainable error removed on a new flight, median of those learnt", "90 %", gone),
         ("rows of a new flight in a residual's 90 % interval", "88 to 92 %", share),
         ("CPU seconds a log, median", "", f"{np.median([line['cpu_s'] for line in lines]):.0f}"),

@@ -15,7 +15,6 @@ from collections.abc import Callable
 from dataclasses import replace
 from datetime import date
 from itertools import product
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
@@ -50,11 +49,8 @@ class Trial(NamedTuple):
 
 
 def _outside(rng: Rng) -> hidden.Truth:
-    low, high = np.log(AMPLITUDES)
-    return replace(
-        hidden.draw_base(rng),
-        outside=hidden.draw_outside(rng, amplitude=float(np.exp(rng.uniform(low, high)))),
-    )
+    truth, amplitude = hidden.draw_base(rng), hidden.log_uniform(*AMPLITUDES, rng)
+    return replace(truth, outside=hidden.draw_outside(rng, amplitude=amplitude))
 
 
 # Row -> how a truth is drawn, and the sensors' noise.
@@ -92,7 +88,7 @@ def make_log(trial: Trial) -> tuple[hidden.Truth, FlightLog, FlightLog, ModelPar
     draw, noise = ROWS[trial.row]
     rng = np.random.default_rng([trial.seed, trial.number, list(ROWS).index(trial.row)])
     truth = replace(draw(rng), motion=trial.motion, step_s=1.0 / trial.rate)
-    clean = hidden.fly(truth, "scripted", SECONDS, rng)
+    clean = hidden.fly(truth, SECONDS, rng)
     return truth, clean, hidden.measure(clean, noise, rng), model_of(truth), rng
 
 
@@ -121,7 +117,7 @@ def plant(trial: Trial) -> dict[str, Any]:
         could = known(clean, log, ~held_out_rows(log), true_model, truth.effects)
         line["known"] = {name: [float(f"{v:.4g}") for v in one[:2]] + [one[2]] for name, one in could.items()}
         # Of explainable error on a new flight, and how large that is, times the noise.
-        share, size = removed(hidden.fly(truth, "scripted", SECONDS, rng), found.base, found.extended)
+        share, size = removed(hidden.fly(truth, SECONDS, rng), found.base, found.extended)
         line["removed"] = [round(share, 4), round(size, 4)]
     if trial.row == "clock":
         late = [one for one in found.causes if one.effect == "mocap_latency"]
@@ -152,15 +148,15 @@ def _graded(cause: Any, truth: hidden.Truth) -> dict[str, Any]:
     }
 
 
-def read_lines(commit: str | None, path: Path = LINES) -> dict[Trial, dict[str, Any]]:
+def read_lines(commit: str | None) -> dict[Trial, dict[str, Any]]:
     """Return the lines of a commit by plant; of the last line's if None."""
-    return {Trial(*(line[name] for name in Trial._fields)): line for line in lines_of_commit(path, commit)}
+    return {Trial(*(line[name] for name in Trial._fields)): line for line in lines_of_commit(LINES, commit)}
 
 
-def run(trials: list[Trial], path: Path) -> None:
+def run(trials: list[Trial]) -> None:
     """Diagnose what is not done yet and append the lines."""
     commit = commit_of_checkout()
-    done = read_lines(commit, path)
+    done = read_lines(commit)
     machine = f"{platform.machine()}, {os.cpu_count()} cores, jax {jax.__version__}"
     for trial in progress([one for one in trials if one not in done], "plants"):
         line = {**trial._asdict(), "commit": commit, "date": str(date.today()), "machine": machine}
@@ -168,7 +164,7 @@ def run(trials: list[Trial], path: Path) -> None:
             line |= plant(trial)
         except Exception as error:  # a crash is a result too, and the others go on
             line["error"] = f"{type(error).__name__}: {error}"
-        append_line(path, line)
+        append_line(LINES, line)
 
 
 def main(
@@ -178,15 +174,13 @@ def main(
     motion: str = ",".join(hidden.MOTIONS),
     rate: str = "100",
     seed: int = SEED,
-    lines: Path = LINES,
 ) -> None:
     """Diagnose plants.
 
-    plants: of each row, up to this number; first: from this one on. rate: rows per second of the log. lines:
-    file to append to.
+    plants: of each row, up to this number; first: from this one on. rate: rows per second of the log.
     """
     every = product(range(first, plants), rows.split(","), motion.split(","), map(int, rate.split(",")))
-    run([Trial(row, number, seed, moved, one_rate) for number, row, moved, one_rate in every], lines)
+    run([Trial(row, number, seed, moved, one_rate) for number, row, moved, one_rate in every])
 
 
 if __name__ == "__main__":

@@ -10,7 +10,6 @@ docs/results/firmware.md.
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -262,18 +261,11 @@ def tables(lines: list[dict[str, Any]]) -> str:
     return "\n\n".join(parts)
 
 
-def main(
-    matched: int = 2,
-    single: int = 4,
-    pairs: int = 8,
-    champion: int = 256,
-    seed: int = SEED,
-    lines: Path = LINES,
-) -> None:
+def main(matched: int = 2, single: int = 4, pairs: int = 8, champion: int = 256, seed: int = SEED) -> None:
     """Fly, diagnose, and write the lines and the tables.
 
     matched: flights of each set-up and excitation. single: draws of each kind of change. pairs: set-ups with
-    two changes. champion: starts of it, 0 for none. lines: file to append to.
+    two changes. champion: starts of it, 0 for none.
     """
     rng = np.random.default_rng([seed, 7])
     trials = [
@@ -291,13 +283,13 @@ def main(
         with Betaflight() as plant:
             raced = measure_gap(load_checkpoint(CHAMPION), plant, seed, champion).plant
         line = {"commit": commit, "row": "champion", "episodes": champion, **raced._asdict()}
-        report.append_line(lines, line)
+        report.append_line(LINES, line)
     known: dict[tuple[str, str], Known] = {}
     for trial in report.progress(trials, "set-ups"):
         key = trial.setup, trial.flown
         known[key] = known.get(key) or know(*key, seed)
-        report.append_line(lines, {"commit": commit, **trial._asdict(), **graded(trial, known[key], seed)})
-    found = report.lines_of_commit(lines)
+        report.append_line(LINES, {"commit": commit, **trial._asdict(), **graded(trial, known[key], seed)})
+    found = report.lines_of_commit(LINES)
     text = PAGE.read_text(encoding="utf-8")
     before, after = text.split(MARKS[0])[0], text.split(MARKS[1])[1]
     record = report.provenance("scipy") | {"commit": found[-1]["commit"]}

@@ -1,9 +1,9 @@
 """How fast racing is learnt from scratch: ``python -m benchmarks.learning_curve [--seeds 5]``.
 
-Trains a short recipe, or that of --config, on FlyTrack-v0, one seed after the other, and every quarter of a
-million environment steps flies 256 noisy starts over 3 laps in the simulator. What counts is from when on
-95 % of them finish and do so at every later evaluation. CPU seconds are those of training
-alone, without compilation and evaluations. Writes a page and a chart.
+Trains a short recipe on FlyTrack-v0, one seed after the other, and every quarter of a million environment
+steps flies 256 noisy starts over 3 laps in the simulator. What counts is from when on 95 % of them finish and
+do so at every later evaluation. CPU seconds are those of training alone, without compilation and evaluations.
+Writes a page and a chart.
 """
 
 import time
@@ -15,7 +15,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from baselines.purejaxrl_ppo import Config
-from baselines.purejaxrl_ppo.config import settings_in_file
 from baselines.purejaxrl_ppo.flights import race_many, score, start_keys
 from baselines.purejaxrl_ppo.networks import Policy
 from baselines.purejaxrl_ppo.training import Trainer, is_due
@@ -99,16 +98,13 @@ def draw(path: Path, curves: dict[int, list[Point]]) -> None:
     write_atomically(path, png_of(figure))
 
 
-def main(
-    seeds: int = 5, config: Path | None = None, out: Path = report.RESULTS / "learning_curve.md"
-) -> None:
+def main(seeds: int = 5, out: Path = report.RESULTS / "learning_curve.md") -> None:
     """Measure every seed, print and write page and chart; exit 1 if a seed misses the aim.
 
-    seeds: how many. config: TOML file of settings, in place of the short recipe. out: page to write.
+    seeds: how many. out: page to write.
     """
     pinned = report.pin_to_one_core()
-    settings = SHORT if config is None else settings_in_file(config)
-    trainer = Trainer(Config(**settings))
+    trainer = Trainer(Config(**SHORT))
     evaluate(trainer, trainer.start(jax.random.key(0)).train_state.params, 0, 0.0)  # compiles
     curves = {seed: train(trainer, seed) for seed in range(seeds)}
     chart = out.with_suffix(".png")
@@ -118,7 +114,7 @@ def main(
     report.fill_page(
         out,
         "learning_curve",
-        settings=", ".join(f"{name} {value:g}" for name, value in settings.items()),
+        settings=", ".join(f"{name} {value:g}" for name, value in SHORT.items()),
         every=EVERY / 1e6,
         episodes=NUM_EPISODES,
         laps=NUM_LAPS,

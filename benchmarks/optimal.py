@@ -53,10 +53,6 @@ WARM = {"ipopt.mu_init": 1e-3}  # for a guess that is a solution on another grid
 QUIET = {"ipopt.print_level": 0, "ipopt.sb": "yes", "print_time": False}
 
 
-class UnsupportedModelError(ValueError):
-    """A model that CasADi cannot express; the message names the effect or the operation."""
-
-
 # Those that operator and CasADi call the same, and those that do nothing to scalars.
 OWN_NAMES = {
     operator: ("add", "sub", "mul", "neg", "pow", "lt", "le", "gt", "ge", "eq"),
@@ -91,12 +87,12 @@ def _apply(equation: Any, values: list[Any]) -> list[Any]:
         found = equation.primitive.bind(*values, **equation.params)
         return list(found) if equation.primitive.multiple_results else [found]
     if any(not isinstance(value, casadi.SX) and np.size(value) != 1 for value in values):
-        raise UnsupportedModelError(f"model: operation {name} on an array, expected scalars")
+        raise ValueError(f"model: operation {name} on an array, expected scalars")
     values = [value if isinstance(value, casadi.SX) else float(value) for value in values]
     if name == "integer_pow":
         return [values[0] ** equation.params["y"]]
     if name not in OPERATIONS:
-        raise UnsupportedModelError(f"model: operation {name}: expected one of {', '.join(OPERATIONS)}")
+        raise ValueError(f"model: operation {name}: expected one of {', '.join(OPERATIONS)}")
     return [OPERATIONS[name](*values)]
 
 
@@ -118,14 +114,12 @@ def step_function(model: ModelParameters) -> casadi.Function:
     """Return the model's step, (21,), (4,), s -> (21,), packed as ``flytrack_env.state`` says, float64.
 
     Raises:
-        UnsupportedModelError: an effect with a memory, or an operation that has no counterpart in CasADi.
+        ValueError: an effect with a memory, or an operation that has no counterpart in CasADi.
     """
     effects = tuple(effect for effect in model.effects if effect_of(effect).acts_on != SENSOR)
     for effect in map(effect_of, effects):
         if effect.start is not None:  # it has no place in the state vector
-            raise UnsupportedModelError(
-                f"model: effect {effect.name}: found one with a memory, expected effects without"
-            )
+            raise ValueError(f"model: effect {effect.name}: found one with a memory, expected none")
     with jax.enable_x64(True):
         model = jax.tree.map(lambda leaf: np.asarray(leaf, float), model._replace(effects=effects))
         structure = jax.tree.structure(layout.unpack(np.zeros(layout.STATE_SIZE)))
@@ -356,10 +350,6 @@ class Problem:
         return Guess(states, commands, steps_s, fractions)
 
 
-class UnsolvedError(RuntimeError):
-    """No start led to an optimum; the message has the solver's status."""
-
-
 class Optimum(NamedTuple):
     """The optimum: flight, gate times, s, and how it was found."""
 
@@ -477,7 +467,7 @@ class _Search:
                 if found.is_solved and times[-1] <= np.nanmin(times):
                     best = found.flight
         if best is None:
-            raise UnsolvedError(f"{self.task.kind}: no start of {len(times)} converged")
+            raise RuntimeError(f"{self.task.kind}: no start of {len(times)} converged")
         return best, counts, times
 
     def fine(self, flight: Guess, counts: np.ndarray) -> tuple[Solution, np.ndarray]:
@@ -486,7 +476,7 @@ class _Search:
         guess = resample(flight, counts, new_counts, flight.steps_s * counts / new_counts)
         found = self.solve(guess, new_counts, False, FINE)
         if not found.is_solved:
-            raise UnsolvedError(f"{self.task.kind}: free segment times: {found.status}")
+            raise RuntimeError(f"{self.task.kind}: free segment times: {found.status}")
         return found, new_counts
 
     def on_grid(self, flight: Guess, counts: np.ndarray) -> tuple[Solution, np.ndarray]:
@@ -510,7 +500,7 @@ class _Search:
             nodes = nodes + shifts
             guess = _lengthened(found.flight, nodes[-1], shifts)
         if not seen:
-            raise UnsolvedError(f"{self.task.kind}: steps of {self.dt_s} s: {found.status}")
+            raise RuntimeError(f"{self.task.kind}: steps of {self.dt_s} s: {found.status}")
         _, best, steps = min(seen.values(), key=lambda entry: entry[0])
         return best, steps
 
@@ -530,7 +520,7 @@ def find_optimum(task: Task, model: ModelParameters, dt_s: float) -> Optimum:
     It is a local optimum, the best of several starts.
 
     Raises:
-        UnsupportedModelError: a model that cannot be expressed. UnsolvedError: no optimum was found.
+        ValueError: a model that cannot be expressed. RuntimeError: no optimum was found.
     """
     wall, cpu = time.perf_counter(), time.process_time()
     search = _Search(task, model, dt_s)

@@ -5,7 +5,6 @@ simulator and writes docs/results/time_optimal.md. With ``--verify`` it only rep
 needs no solver. In Python: ``flytrack_env.references.shipped_reference("flytrack", "flying").time_s``.
 """
 
-import sys
 from functools import cache
 from itertools import product
 from pathlib import Path
@@ -69,7 +68,7 @@ def optimise(track: Track, kind: str, model: ModelParameters, model_name: str) -
     """Return the time-optimal flight of a track and a model, with a full battery; needs CasADi.
 
     Raises:
-        UnsupportedModelError: an effect that cannot be expressed. UnsolvedError: no optimum was found.
+        ValueError: an effect that cannot be expressed. RuntimeError: no optimum was found.
     """
     import casadi  # an extra, needed only here
 
@@ -287,22 +286,17 @@ def main(
     tracks: names or files. model: file; by default the simulator's nominal model. verify: only replay
     existing references. out: their folder. page: to write, with pictures beside it.
     """
-    try:
-        known = list(map(flytrack_env.load_track, tracks))
-        if not verify:
-            named = (nominal(), NOMINAL) if model is None else (flytrack_env.load_model(model), model.stem)
-            for track, kind in product(known, kinds):
-                found = optimise(track, kind, *named)
-                files.save_reference(out / f"{track.name}_{found.model_name}_{kind}.npz", found)
-                print(f"{track.name} {kind}: {found.time_s:.4f} s, {found.found['cpu_s']} CPU s", flush=True)
-        replays, is_good = verified(out, known)
-        write_page(page, replays)
-        if page is not None:
-            write_pictures(page, [reference for reference, _, _ in replays], known)
-    except ImportError as error:
-        sys.exit(f"error: {error}; pip install .[optimal]")
-    except (ValueError, OSError, RuntimeError) as error:
-        sys.exit(f"error: {error}")
+    known = list(map(flytrack_env.load_track, tracks))
+    if not verify:
+        named = (nominal(), NOMINAL) if model is None else (flytrack_env.load_model(model), model.stem)
+        for track, kind in product(known, kinds):
+            found = optimise(track, kind, *named)
+            files.save_reference(out / f"{track.name}_{found.model_name}_{kind}.npz", found)
+            print(f"{track.name} {kind}: {found.time_s:.4f} s, {found.found['cpu_s']} CPU s", flush=True)
+    replays, is_good = verified(out, known)
+    write_page(page, replays)
+    if page is not None:
+        write_pictures(page, [reference for reference, _, _ in replays], known)
     raise SystemExit(0 if is_good else 1)
 
 

@@ -5,7 +5,7 @@
 flies it; ``measure`` turns the clean log into what sensors would have logged.
 """
 
-from benchmarks.hidden.flights import CrashError, fly
+from benchmarks.hidden.flights import fly
 from benchmarks.hidden.noise import measure
 from benchmarks.hidden.outside import draw_outside
 from benchmarks.hidden.truth import (
@@ -21,5 +21,6 @@ from benchmarks.hidden.truth import (
     draw_late,
     draw_onset,
     draw_truth,
+    log_uniform,
     with_effects,
 )

@@ -16,30 +16,24 @@ XYZ = ("x", "y", "z")
 CHANNELS = {"u": 4, "p": 3, "v": 3, "q": 4, "a": 3, "f": 3, "w": 3, "slope": 3, "v_bat": 1}
 
 
-class CrashError(RuntimeError):
-    """No attempt at a flight stayed within the envelope."""
-
-
-def fly(truth: Truth, kind: str, seconds: float, rng: np.random.Generator) -> FlightLog:
+def fly(truth: Truth, seconds: float, rng: np.random.Generator) -> FlightLog:
     """Return the clean log of a flight, float64, one segment, a row per step of the truth.
 
     Channels u, p, v, a, f, q, w and v_bat; f and w are accelerometer and gyro, with the hidden effects of the
     sensors and without noise. A flight below 0.1 m or beyond 20 m/s is flown again, higher and slower.
-    kind: of ``FLIGHT_KINDS``.
 
     Raises:
-        ValueError: an unknown kind.
-        CrashError: eight attempts left the envelope.
+        RuntimeError: eight attempts left the envelope.
     """
     seed = rng.integers(2**63)
     for caution in range(TRIES):
-        rows = _attempt(truth, kind, seconds, np.random.default_rng(seed), caution)
+        rows = _attempt(truth, seconds, np.random.default_rng(seed), caution)
         height, speed = rows["p"][:, 2].min(), np.linalg.norm(rows["v"], axis=1).max()
         if height >= FLOOR_M and speed <= FASTEST:
             break
     else:
-        raise CrashError(
-            f"{kind} flight of {truth.text()}: found {height:.2f} m and {speed:.1f} m/s after {TRIES} tries, "
+        raise RuntimeError(
+            f"flight of {truth.text()}: found {height:.2f} m and {speed:.1f} m/s after {TRIES} tries, "
             f"expected {FLOOR_M} m or more and {FASTEST} m/s or less"
         )
     rows["f"], rows["w"] = imu_readings(truth, rows["f"], rows["w"], rows.pop("slope"))
@@ -49,14 +43,12 @@ def fly(truth: Truth, kind: str, seconds: float, rng: np.random.Generator) -> Fl
     settled = round(SETTLE_S / truth.step_s)
     rows = {name: values[settled:] for name, values in rows.items()}
     count = len(rows["p"])
-    return FlightLog(np.arange(count) * truth.step_s, rows, np.zeros(count, int), f"{kind} flight")
+    return FlightLog(np.arange(count) * truth.step_s, rows, np.zeros(count, int), "scripted flight")
 
 
-def _attempt(
-    truth: Truth, kind: str, seconds: float, rng: np.random.Generator, caution: int
-) -> dict[str, np.ndarray]:
+def _attempt(truth: Truth, seconds: float, rng: np.random.Generator, caution: int) -> dict[str, np.ndarray]:
     """Return the channels of one attempt, including the time to settle."""
-    moments = plan(kind, seconds, rng, caution)
+    moments = plan(seconds, rng, caution)
     settling = [moments[0]._replace(vel_w=(0.0, 0.0, 0.0), acc_w=(0.0, 0.0, 0.0))] * round(SETTLE_S / DT_S)
     start = Start(moments[0].pos_w, moments[0].heading, float(rng.uniform(*OPEN_V)), HOVER_STICK)
     # An effect of position is centred on a point of the planned path.

@@ -27,7 +27,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.hidden.noise import STD
-from benchmarks.hidden.truth import GRAVITY, Outside, Truth
+from benchmarks.hidden.truth import GRAVITY, Outside, Truth, direction, log_uniform
 from benchmarks.hidden.vectors import Vector, norm, scale, to_body
 
 # An amplitude of 1: m/s^2 of forces and of thrust over mass, rad/s of rates.
@@ -144,10 +144,10 @@ def vector_hook(outside: Outside) -> Callable[[Any], Vector]:
         return against
     if outside.kind == "payload":
         return lambda plant: to_body(plant.rows, scale(size, _payload(plant, shape)))
-    direction = (shape["x"], shape["y"], shape["z"])
+    way = (shape["x"], shape["y"], shape["z"])
     if outside.kind in ("position", "cable"):
-        return lambda plant: to_body(plant.rows, scale(size * signal(shape, plant), direction))
-    return lambda plant: scale(size * signal(shape, plant), direction)
+        return lambda plant: to_body(plant.rows, scale(size * signal(shape, plant), way))
+    return lambda plant: scale(size * signal(shape, plant), way)
 
 
 def command_hook(outside: Outside, truth: Truth) -> Callable[[Any, tuple], tuple]:
@@ -172,13 +172,6 @@ def command_hook(outside: Outside, truth: Truth) -> Callable[[Any, tuple], tuple
     return act
 
 
-def _random_direction(rng: Rng, size: int = 3) -> Shape:
-    """Return a random direction, in x and y only if size is 2."""
-    way = np.zeros(3)
-    way[:size] = rng.standard_normal(size)
-    return dict(zip(AXES, (way / np.linalg.norm(way)).tolist(), strict=True))
-
-
 def _draw_position(rng: Rng) -> ChannelAndShape:
     # Mostly up or down, as thermals go.
     up = float(rng.choice([-1.0, 1.0]))
@@ -195,7 +188,7 @@ def _draw_time(rng: Rng) -> ChannelAndShape:
     sign = float(rng.choice([-1.0, 1.0]))
     if is_thrust:
         return "thrust", {**shape, "x": 0.0, "y": 0.0, "z": sign}
-    return "rate", {**shape, **_random_direction(rng)}
+    return "rate", {**shape, **direction(*AXES)(1.0, rng)}
 
 
 def _draw_heading(rng: Rng) -> ChannelAndShape:
@@ -203,7 +196,7 @@ def _draw_heading(rng: Rng) -> ChannelAndShape:
     shape |= {f"phase_{order}": rng.uniform(-math.pi, math.pi) for order in HEADING_ORDERS}
     shape["largest"] = float(np.abs(heading_waves(shape, CIRCLE, np.cos)).max())
     if rng.random() < 0.5:
-        return "force", {**shape, **_random_direction(rng, 2)}
+        return "force", {**shape, **direction("x", "y")(1.0, rng), "z": 0.0}
     return "rate", {**shape, **YAW}
 
 
@@ -219,9 +212,8 @@ def _draw_command(rng: Rng) -> ChannelAndShape:
 
 
 def _draw_periodic(rng: Rng) -> ChannelAndShape:
-    low, high = (math.log(value) for value in FREQUENCY_HZ)
-    shape = {"frequency_hz": math.exp(rng.uniform(low, high)), "phase": rng.uniform(-math.pi, math.pi)}
-    return ("force" if rng.random() < 0.5 else "rate"), {**shape, **_random_direction(rng)}
+    shape = {"frequency_hz": log_uniform(*FREQUENCY_HZ, rng), "phase": rng.uniform(-math.pi, math.pi)}
+    return ("force" if rng.random() < 0.5 else "rate"), {**shape, **direction(*AXES)(1.0, rng)}
 
 
 def _draw_stochastic(rng: Rng) -> ChannelAndShape:
@@ -253,7 +245,7 @@ TABLE |= {
     ),
     "cable": (
         "heading",
-        lambda rng: ("force", {"phase": rng.uniform(-math.pi, math.pi), **_random_direction(rng)}),
+        lambda rng: ("force", {"phase": rng.uniform(-math.pi, math.pi), **direction(*AXES)(1.0, rng)}),
         lambda shape, plant: math.cos(math.atan2(plant.rows[1][0], plant.rows[0][0]) + shape["phase"]),
     ),
     "heating": ("time", lambda rng: ("thrust", DOWN | {"warming_s": rng.uniform(*WARMING_S)}), _heating),
@@ -270,8 +262,7 @@ def draw_outside(rng: Rng, kind: str | None = None, amplitude: float | None = No
         KeyError: if there is no such kind.
     """
     kind = str(rng.choice(KINDS)) if kind is None else kind
-    if amplitude is None:
-        amplitude = math.exp(rng.uniform(math.log(SMALLEST), math.log(LARGEST)))
+    amplitude = log_uniform(SMALLEST, LARGEST, rng) if amplitude is None else amplitude
     depends_on, draw, _ = TABLE[kind]
     channel, shape = draw(rng)
     return Outside(kind, (depends_on,), channel, float(amplitude), shape)

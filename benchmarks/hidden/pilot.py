@@ -4,10 +4,8 @@ The pilot is cascaded control from position to sticks, on the true state. The ga
 lags, so that slow drones are flown gently and no hidden effect makes the loop oscillate. The pilot knows the
 thrust curve without effects and integrates steady force errors in flight.
 
-A plan does not depend on the plant, so where it leads is known before the flight. Its kinds:
-
-- scripted: everything: legs of 0 to 18 m/s, low passes, waves on one stick, flips, thrust steps;
-- hover: one place, one heading, small corrections.
+A plan does not depend on the plant, so where it leads is known before the flight. It has everything: legs of
+0 to 18 m/s, low passes, waves on one stick, flips, thrust steps.
 """
 
 import math
@@ -18,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 
 from benchmarks.hidden.outside import FirstOrderNoise
-from benchmarks.hidden.truth import DT_S, STICKS, Truth
+from benchmarks.hidden.truth import DT_S, STICKS, Truth, log_uniform
 from benchmarks.hidden.vectors import Vector, add, clip_length, norm, rotation, to_body, wrap_angle
 
 Rng = np.random.Generator
@@ -42,12 +40,9 @@ LOW_SPEEDS, LOW_HOLD_S, LOW_TURNING = (0.5, 12.0), (0.5, 1.2), 0.3
 LOW_M, SINK_M, SINK_S, SETTLE_S = (0.15, 1.0), 0.7, 0.8, 0.7  # the last metre is sunk slowly
 LOWER_M, SLOWER = 0.2, 0.9  # changes of low heights and of speeds per repeated attempt
 YAW_TURN = (1.2, math.pi)  # rad
-# Kinds of flights.
-HOVER_M = (1.5, 8.0)  # heights
-CORRECTION_M, CORRECTION_S = 0.25, 0.8  # of small moves in a hover
-BEGIN_S, STILL_S = 0.5, (2.0, 4.5)  # of hover before something begins, and between moves
+BEGIN_S = 0.5  # of hover before something begins
 START_SPREAD_M = 5.0
-HIGHER_M = 1.5  # per repeated attempt, for kinds that are flown low throughout
+HIGHER_M = 1.5  # of the start, per repeated attempt
 # Each gain is a share of the inner loop's, so that no loop is faster than the one inside it.
 ATTITUDE_PER_LAG, VELOCITY_PER_ATTITUDE, POSITION_PER_VELOCITY, LEARN_PER_VELOCITY = 0.4, 0.3, 0.35, 0.3
 QUICKEST_ATTITUDE, QUICKEST_HEIGHT = 12.0, 5.0  # 1/s
@@ -220,7 +215,7 @@ def low_pass(sketch: Sketch) -> None:
     """Append a descent, a leg near the ground, and a climb half way."""
     rng = sketch.rng
     raised = LOWER_M * sketch.caution
-    height = math.exp(rng.uniform(*np.log(LOW_M))) + raised
+    height = log_uniform(*LOW_M, rng) + raised
     sketch.climb_to(height + SINK_M)
     for _ in range(steps_of(SINK_S)):
         sketch.add((0.0, 0.0, -SINK_M / SINK_S))
@@ -266,47 +261,19 @@ def cycle(sketch: Sketch) -> None:
         block(sketch)
 
 
-def _scripted(sketch: Sketch, seconds: float) -> None:
-    sketch.wait(BEGIN_S)
-    while len(sketch) * DT_S < seconds:
-        cycle(sketch)
-
-
-def _hover(sketch: Sketch, seconds: float) -> None:
-    rng = sketch.rng
-    while len(sketch) * DT_S < seconds:
-        sketch.wait(rng.uniform(*STILL_S))
-        move = rng.uniform(-1.0, 1.0, 3) * CORRECTION_M
-        # Back towards where the hover began, so that corrections do not wander off.
-        there = np.array(sketch.start_w) + move
-        speed = tuple(((there - sketch.pos_w) / CORRECTION_S).tolist())
-        for _ in range(steps_of(CORRECTION_S)):
-            sketch.add(speed)
-
-
-FLIGHT_KINDS: dict[str, tuple[tuple[float, float], Callable[[Sketch, float], None]]] = {
-    "scripted": (HIGH_M, _scripted),
-    "hover": (HOVER_M, _hover),
-}
-
-
-def plan(kind: str, seconds: float, rng: Rng, caution: int = 0) -> list[Moment]:
+def plan(seconds: float, rng: Rng, caution: int = 0) -> list[Moment]:
     """Return the plan of a flight, a moment per 10 ms.
 
     caution: number of earlier attempts that were too low or too fast.
-
-    Raises:
-        ValueError: if there is no such kind.
     """
-    if kind not in FLIGHT_KINDS:
-        raise ValueError(f"kind: found {kind!r}, expected one of {', '.join(FLIGHT_KINDS)}")
-    heights, draw = FLIGHT_KINDS[kind]
     start_w = (
         *rng.uniform(-START_SPREAD_M, START_SPREAD_M, 2).tolist(),
-        HIGHER_M * caution + float(rng.uniform(*heights)),
+        HIGHER_M * caution + float(rng.uniform(*HIGH_M)),
     )
     sketch = Sketch(rng, start_w, float(rng.uniform(-math.pi, math.pi)), caution)
-    draw(sketch, seconds)
+    sketch.wait(BEGIN_S)
+    while len(sketch) * DT_S < seconds:
+        cycle(sketch)
     return sketch.moments(seconds)
 
 

@@ -120,7 +120,7 @@ def _positive(name: str) -> Callable[[float, Rng], Values]:
     return lambda size, rng: {name: size}
 
 
-def _direction(*names: str) -> Callable[[float, Rng], Values]:
+def direction(*names: str) -> Callable[[float, Rng], Values]:
     """Return a maker of vectors in a random direction, of the size's length."""
 
     def make(size: float, rng: Rng) -> Values:
@@ -186,25 +186,25 @@ EFFECTS: dict[str, EffectRange] = {
     "rate_expo": EffectRange(0.006, 0.15, "1", _per_axis(signs=(-1.0, 1.0))),
     "rate_scale": EffectRange(0.005, 0.1, "|ln factor|", _factors(*STICKS)),
     "rate_saturation": EffectRange(0.008, 0.2, "share lost at full stick", _per_axis()),
-    "rate_cross_coupling": EffectRange(0.005, 0.08, "1", _direction("from_roll", "from_pitch")),
-    "motor_imbalance": EffectRange(0.0006, 0.01, "rad/s per m/s^2", _direction("roll", "pitch")),
+    "rate_cross_coupling": EffectRange(0.005, 0.08, "1", direction("from_roll", "from_pitch")),
+    "motor_imbalance": EffectRange(0.0006, 0.01, "rad/s per m/s^2", direction("roll", "pitch")),
     "yaw_reaction": EffectRange(0.003, 0.05, "rad", _signed("angle")),
     "second_order_rates": EffectRange(0.002, 0.025, "s, 1 / wn", _oscillator),
     "rate_slew_limit": EffectRange(0.02, 0.25, "s, centre to full stick", _per_axis("_s")),
-    "wind": EffectRange(0.12, 1.5, "m/s^2; with drag 6 times that in m/s", _direction("a_x", "a_y", "a_z")),
+    "wind": EffectRange(0.12, 1.5, "m/s^2; with drag 6 times that in m/s", direction("a_x", "a_y", "a_z")),
     "thrust_scale": EffectRange(0.01, 0.2, "|ln factor|", _log_factor("factor")),
     "translational_lift": EffectRange(0.03, 0.4, "share of thrust", _positive("gain")),
     "ground_effect": EffectRange(0.06, 0.5, "share of thrust", _ground),
     "linear_drag": EffectRange(0.03, 0.6, "1/s", _drag("d", (0.2, 1.0))),
     "quadratic_drag": EffectRange(0.003, 0.05, "1/m", _drag("k", (0.5, 2.0))),
     "rotor_drag": EffectRange(0.003, 0.05, "s/m", _positive("h")),
-    "thrust_tilt": EffectRange(0.008, 0.12, "rad", _direction("towards_x", "towards_y")),
+    "thrust_tilt": EffectRange(0.008, 0.12, "rad", direction("towards_x", "towards_y")),
     "voltage_sag": EffectRange(0.01, 1.0, "V at full thrust", _positive("at_full_v")),
-    "accelerometer_bias": EffectRange(0.12, 1.5, "m/s^2", _direction("x", "y", "z")),
+    "accelerometer_bias": EffectRange(0.12, 1.5, "m/s^2", direction("x", "y", "z")),
     "accelerometer_scale": EffectRange(0.008, 0.12, "|ln factor|", _factors("x", "y", "z")),
-    "gyro_bias": EffectRange(0.006, 0.1, "rad/s", _direction("x", "y", "z")),
+    "gyro_bias": EffectRange(0.006, 0.1, "rad/s", direction("x", "y", "z")),
     "gyro_scale": EffectRange(0.005, 0.1, "|ln factor|", _factors("x", "y", "z")),
-    "imu_offset": EffectRange(0.005, 0.06, "m", _direction("x", "y", "z")),
+    "imu_offset": EffectRange(0.005, 0.06, "m", direction("x", "y", "z")),
     "imu_latency": EffectRange(0.0006, 0.015, "s", _positive("latency_s")),
 }
 NAMES = tuple(EFFECTS)
@@ -223,13 +223,14 @@ GUST_STD, GUST_S = (0.3, 1.5), (0.3, 3.0)  # m/s^2, s
 GUST_RATE_STD = (0.02, 0.1)  # rad/s
 
 
-def _log_uniform(low: float, high: float, rng: Rng) -> float:
+def log_uniform(low: float, high: float, rng: Rng) -> float:
+    """Return a number whose logarithm is uniform."""
     return float(math.exp(rng.uniform(math.log(low), math.log(high))))
 
 
 def draw_base(rng: Rng) -> Truth:
     """Return a plant without effects: lags of 15 to 70 ms, a drawn thrust curve, else the handout."""
-    tau = tuple(_log_uniform(*TAU_S, rng) for _ in range(4))
+    tau = tuple(log_uniform(*TAU_S, rng) for _ in range(4))
     full, idle = rng.uniform(*FULL_THRUST_N), rng.uniform(*IDLE_THRUST_N)
     curved, cubic = rng.uniform(*CURVED), rng.uniform(*CUBIC)
     volt, both = rng.uniform(*PER_VOLT), rng.uniform(*PER_VOLT_STICK)
@@ -257,7 +258,7 @@ def draw_effect(name: str, rng: Rng, size: float | None = None, has_drag: bool =
         KeyError: if there is no such effect.
     """
     drawn = EFFECTS[name]
-    size = _log_uniform(drawn.low, drawn.high, rng) if size is None else size
+    size = log_uniform(drawn.low, drawn.high, rng) if size is None else size
     values = drawn.make(size, rng)
     if name == "wind" and has_drag:
         return {key.replace("a_", "v_"): AIR_PER_PUSH * value for key, value in values.items()}
@@ -279,15 +280,15 @@ def draw_truth(rng: Rng, num_effects: int) -> Truth:
 
 def draw_gust(rng: Rng) -> Gust:
     """Return gusts of 0.3 to 1.5 m/s^2 that last for 0.3 to 3 s; half of them turn the drone as well."""
-    rate_std = _log_uniform(*GUST_RATE_STD, rng) if rng.random() < 0.5 else 0.0
-    return Gust(_log_uniform(*GUST_STD, rng), _log_uniform(*GUST_S, rng), rate_std)
+    rate_std = log_uniform(*GUST_RATE_STD, rng) if rng.random() < 0.5 else 0.0
+    return Gust(log_uniform(*GUST_STD, rng), log_uniform(*GUST_S, rng), rate_std)
 
 
 def draw_onset(rng: Rng, seconds: float) -> Truth:
     """Return a plant with one effect, of the larger half of sizes, that begins within a log."""
     truth, name = draw_base(rng), str(rng.choice(SUDDEN))
     drawn = EFFECTS[name]
-    size = _log_uniform(math.sqrt(drawn.low * drawn.high), drawn.high, rng)
+    size = log_uniform(math.sqrt(drawn.low * drawn.high), drawn.high, rng)
     onset_s = seconds * float(rng.uniform(*ONSET_SHARE))
     return replace(truth, effects={name: draw_effect(name, rng, size)}, onset_s=onset_s)
 

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from benchmarks.hidden import EFFECTS as EFFECT_RANGES
-from benchmarks.hidden import Truth, draw_effect, draw_outside
+from benchmarks.hidden import Truth, draw_effect, draw_outside, log_uniform
 from benchmarks.hidden.outside import SCALES, TINY_SPEED, USUAL_SPEED_MS, heading_waves
 from flytrack_bench.plants import Craft, HiddenPlant
 from flytrack_env import nominal_parameters
@@ -140,6 +140,6 @@ def draw_plant(number: int, seed: int) -> Truth:
 def draw_plant_with_law(number: int, seed: int) -> Truth:
     """Return a plant by its number, from 0, with a law outside the package's list; kinds take turns."""
     rng = np.random.default_rng([seed, number, len(SIGNALS)])
-    kind, (low, high) = tuple(SIGNALS)[number % len(SIGNALS)], np.log(LAW_AMPLITUDES)
-    outside = draw_outside(rng, kind, math.exp(rng.uniform(low, high)))
+    kind = tuple(SIGNALS)[number % len(SIGNALS)]
+    outside = draw_outside(rng, kind, log_uniform(*LAW_AMPLITUDES, rng))
     return replace(draw_base(rng), outside=outside)

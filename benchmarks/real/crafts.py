@@ -91,13 +91,10 @@ def best_linear(log: FlightLog, held_out: np.ndarray) -> float:
 
 def gecko_part(record: Record) -> str:
     """Return the asked figures, and the errors of all models."""
-    errors = {
-        name: one["rates_rad_per_s"] for name, one in record["diagnosis"]["prediction"]["errors"].items()
-    }
-    rows = [
-        [name.replace("_", " "), *(f"{np.rad2deg(v):.3g}" for v in one.values())]
-        for name, one in errors.items()
-    ]
+    found = record["diagnosis"]["prediction"]["errors"]
+    errors = {name: one["rates_rad_per_s"] for name, one in found.items()}
+    degrees = {name: [f"{np.rad2deg(value):.3g}" for value in one.values()] for name, one in errors.items()}
+    rows = [[name.replace("_", " "), *cells] for name, cells in degrees.items()]
     own = errors["extended"][HORIZON]
     return report.filled(
         "real_gecko",
@@ -168,11 +165,6 @@ class Pair(NamedTuple):
     judged: tuple[str, ...]
     judged_kg: float
 
-    @property
-    def true_ratio(self) -> float:
-        """Thrust over mass on the logs that are judged, over that of the model."""
-        return self.known_kg / self.judged_kg
-
 
 PAIRS = {
     "asked": Pair(
@@ -237,12 +229,12 @@ def payload_part(record: Record) -> str:
     rows = []
     for name, pair in PAIRS.items():
         one, names = record[name], [cause["effect"] for cause in record[name]["diagnosis"]["causes"]]
-        ratio, off = one["ratio"], one["ratio"] / pair.true_ratio - 1.0
+        ratio, true_ratio = one["ratio"], pair.known_kg / pair.judged_kg  # of thrust over mass
         false = ", ".join(f"`{effect}`" for effect in names if effect in UNWANTED) or "none"
         logs = [
             " and ".join(path.rpartition("log")[2] for path in paths) for paths in (pair.known, pair.judged)
         ]
-        found = [f"{ratio:.3f}", f"{pair.true_ratio:.3f}", f"{off:+.1%}"]
+        found = [f"{ratio:.3f}", f"{true_ratio:.3f}", f"{ratio / true_ratio - 1.0:+.1%}"]
         is_named = "yes" if "thrust_scale" in names else "no"
         rows.append([name, *logs, *found, f"{one['force_per_command_ratio']:.3f}", is_named, false])
     header = (

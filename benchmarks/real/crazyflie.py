@@ -12,7 +12,7 @@ instead, to crazyflie_fits.json beside it. ``python -m benchmarks.real_logs`` wr
 import json
 import os
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from itertools import combinations
 from pathlib import Path
 from typing import Any
@@ -182,8 +182,8 @@ def _cell(quantity: str, horizon_s: float) -> tuple[int, int]:
     return HORIZONS_S.index(horizon_s), QUANTITIES.index(quantity)
 
 
-def _median(lines: list[Line], value: Callable[[Line], np.ndarray]) -> np.ndarray:
-    return np.median(np.stack([value(line) for line in lines]), axis=0)
+def _median(lines: list[Line], model: str) -> np.ndarray:
+    return np.median(np.stack([ratios(line, model) for line in lines]), axis=0)
 
 
 def figures_table(lines: list[Line]) -> str:
@@ -191,8 +191,7 @@ def figures_table(lines: list[Line]) -> str:
     rows = []
     for quantity, horizon, asked in FIGURES:
         cell = _cell(quantity, horizon)
-        own = _median(lines, lambda line: ratios(line, "extended"))[cell]
-        boxes = [_median(lines, lambda line: ratios(line, name))[cell] for name in BLACK_BOXES]  # noqa: B023
+        own, *boxes = (_median(lines, name)[cell] for name in ("extended", *BLACK_BOXES))
         cells = [f"{value:.2f}" for value in (*boxes, own / min(boxes))]
         rows.append([f"{quantity} after {horizon:g} s", f"{own:.2f}", f"<= {asked:.2f}", *cells])
     header = ["rms error over the refitted base's, median", "extended", "asked", *BLACK_BOXES]
@@ -207,7 +206,7 @@ def horizons_table(lines: list[Line]) -> str:
         for name, words in names.items():
             found = [line for line in lines if name in line["rms"]]
             if found:
-                middle = _median(found, lambda line: ratios(line, name))[:, QUANTITIES.index(quantity)]  # noqa: B023
+                middle = _median(found, name)[:, QUANTITIES.index(quantity)]
                 rows.append([quantity, words, *(f"{value:.2f}" for value in middle)])
     return table(["error of", "model", *(f"{horizon:g} s" for horizon in HORIZONS_S)], rows)
 

@@ -107,9 +107,7 @@ def test_consumers_use_public_names_of_the_package(path: Path) -> None:
         parts = name.split(".")
         assert parts[0] != WINDOWS[0] or path.parts[len(ROOT.parts)] == WINDOWS[1], (path, line)
         is_private = any(part.startswith("_") and not part.endswith("__") for part in parts)
-        assert not (parts[0] == PACKAGE and is_private), (
-            f"{path.relative_to(ROOT)}, line {line}: imports {name}"
-        )
+        assert not (parts[0] == PACKAGE and is_private), (path, line, name)
 
 
 REPOSITORY = (PACKAGE, *CONSUMERS)

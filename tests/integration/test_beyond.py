@@ -30,8 +30,8 @@ def flights(seed: int, law: hidden.Outside = PEAK) -> tuple[hidden.Truth, Flight
     """Return a plant with a law, by default drag that peaks at an airspeed; a measured and a clean flight."""
     rng = np.random.default_rng(seed)
     truth = replace(hidden.draw_base(rng), outside=law, motion="fine")
-    log = hidden.measure(hidden.fly(truth, "scripted", SECONDS, rng), "sensors", rng)
-    return truth, log, hidden.fly(truth, "scripted", SECONDS, rng)
+    log = hidden.measure(hidden.fly(truth, SECONDS, rng), "sensors", rng)
+    return truth, log, hidden.fly(truth, SECONDS, rng)
 
 
 def share_removed(found: Diagnosis, clean: FlightLog) -> float:
@@ -110,7 +110,7 @@ def test_a_thrust_curve_says_where_it_could_be_motors_that_warm_up(monkeypatch: 
     rng = np.random.default_rng(74)
     truth = replace(hidden.draw_base(rng), motion="handout")
     nominal = model_of(truth)
-    log = hidden.measure(hidden.fly(truth, "scripted", SECONDS, rng), "sensors", rng)
+    log = hidden.measure(hidden.fly(truth, SECONDS, rng), "sensors", rng)
     of_stick = np.array([1.0, 1.0, 1.5, 1.0, 1.0, 1.0])
     curved = diagnose(log, nominal._replace(thrust_coeffs=nominal.thrust_coeffs * of_stick))
     for found, alike in ((warm, ("thrust_drift",)), (curved, ())):

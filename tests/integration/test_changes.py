@@ -26,7 +26,7 @@ BOTH = replace(BASE, outside=draw_outside(np.random.default_rng(4), "heading", 2
 
 def flown(own: Truth, seconds: float, seed: int) -> FlightLog:
     rng = np.random.default_rng(seed)
-    return measure(fly(own, "scripted", seconds, rng), "sensors", rng)
+    return measure(fly(own, seconds, rng), "sensors", rng)
 
 
 @pytest.fixture(scope="module")

@@ -20,7 +20,6 @@ class Coasting(Plant):
     """A plant that flies straight on at constant velocity, whatever the command."""
 
     def reset(self, drone: Drone, model: ModelParameters) -> Drone:
-        """Return the drone."""
         return drone
 
     def step(self, state: Drone, command: Action, dt: Scalar, model: ModelParameters) -> Drone:
@@ -28,7 +27,6 @@ class Coasting(Plant):
         return state._replace(pos_w=state.pos_w + state.vel_w.scale(dt))
 
     def drone(self, state: Drone) -> Drone:
-        """Return the drone."""
         return state
 
 

@@ -1,7 +1,7 @@
 """What evaluations are tested with: a plant on rails, a policy that has learned nothing."""
 
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -20,13 +20,6 @@ from flytrack_env.state import BATTERY_FULL_V, POSITION, Action, Drone
 
 SLOWER_PER_V = 0.1
 FAILS_BELOW_V, FAILS_AT_S = 23.6, 2.0
-
-
-class OnReference(NamedTuple):
-    """State of ``Rails``: the drone and the time since the reset, s."""
-
-    drone: Drone
-    time_s: jax.Array
 
 
 class Rails(Plant):
@@ -48,24 +41,21 @@ class Rails(Plant):
         """Return how many times longer than the optimum it takes."""
         return 1.0 + SLOWER_PER_V * (BATTERY_FULL_V - battery_v)
 
-    def _at(self, drone: Drone, time_s: jax.Array) -> Drone:
+    def _at(self, drone: Drone, time_s: jax.Array) -> tuple[Drone, jax.Array]:
         own_s = time_s / self.pace(drone.battery_v)
         pos_w = Vec3(*(jnp.interp(own_s, self.time_s, axis) for axis in self.positions.T))
         is_falling = (drone.battery_v < FAILS_BELOW_V) & (time_s > FAILS_AT_S)
-        return drone._replace(pos_w=pos_w._replace(z=jnp.where(is_falling, -1.0, pos_w.z)))
+        return drone._replace(pos_w=pos_w._replace(z=jnp.where(is_falling, -1.0, pos_w.z))), time_s
 
-    def reset(self, drone: Drone, model: ModelParameters) -> OnReference:
-        """Return the drone at the start of the rails."""
-        return OnReference(self._at(drone, jnp.float32(0.0)), jnp.float32(0.0))
+    def reset(self, drone: Drone, model: ModelParameters) -> tuple[Drone, jax.Array]:
+        """Return the drone at the start of the rails, and the time since then, s."""
+        return self._at(drone, jnp.float32(0.0))
 
-    def step(self, state: OnReference, command: Action, dt: Scalar, model: ModelParameters) -> OnReference:
-        """Return the drone a step further."""
-        time_s = state.time_s + dt
-        return OnReference(self._at(state.drone, time_s), time_s)
+    def step(self, state: Any, command: Action, dt: Scalar, model: ModelParameters) -> Any:
+        return self._at(state[0], state[1] + dt)
 
-    def drone(self, state: OnReference) -> Drone:
-        """Return the drone."""
-        return state.drone
+    def drone(self, state: Any) -> Drone:
+        return state[0]
 
 
 def write_checkpoint(

@@ -29,12 +29,10 @@ class HandoutPlant:
     dt: float = 0.01
     gravity: float = GRAVITY
 
-    def model(self, **changes: object) -> ModelParameters:
-        """Return what a fit without effects should find, with some fields replaced."""
-        found = ModelParameters(
-            np.array(self.tau), np.array(self.coeffs), np.array(self.max_rate), 1.0, self.gravity, self.drain
-        )
-        return found._replace(**changes)
+    def model(self) -> ModelParameters:
+        """Return what a fit without effects should find."""
+        arrays = map(np.array, (self.tau, self.coeffs, self.max_rate))
+        return ModelParameters(*arrays, 1.0, self.gravity, self.drain)
 
     def __call__(self, x: np.ndarray, u: np.ndarray, dt: float | None = None) -> np.ndarray:
         """Return the state ``dt`` later, (..., 21)."""
@@ -75,27 +73,18 @@ def rotation(quat: np.ndarray) -> np.ndarray:
     return matrices.reshape(*quat.shape[:-1], 3, 3)
 
 
-def fly(plant: HandoutPlant, starts: np.ndarray, commands: np.ndarray, steps_s: np.ndarray) -> FlightLog:
-    """Return the float64 log of flights from starts (N, 21) under commands (N, T, 4), held for steps (T,)."""
-    states = [np.asarray(starts, float)]
-    for number, step_s in enumerate(steps_s[:-1]):
-        states.append(plant(states[-1], commands[:, number], step_s))
-    flights = np.stack(states, axis=1)
-    log = log_of_states(zip(flights, commands, strict=True), plant.dt, "handout.npz")
-    return replace(log, time=np.tile(np.cumsum(steps_s) - steps_s, len(starts)))
-
-
-def excited(
-    plant: HandoutPlant, flights: int = 24, skip: int = 1, repeat: int = 1, jitter: float = 0.0
-) -> FlightLog:
+def excited(plant: HandoutPlant, skip: int = 1, repeat: int = 1, jitter: float = 0.0) -> FlightLog:
     """Return the log of the excitation on a plant, float64, without noise.
 
     skip, repeat: of commands, for steps of 0.01 s times skip over repeat. jitter: of steps, relative.
     """
     rng = np.random.default_rng(5)
-    planned = script(flights, HOVER, rng)
-    starts = np.stack([flight.start for flight in planned])
+    planned = script(24, HOVER, rng)
     commands = np.stack([flight.command for flight in planned])[:, ::skip].repeat(repeat, axis=1)
     step_s = 0.01 * skip / repeat
     steps_s = step_s * (1.0 + rng.uniform(-jitter, jitter, commands.shape[1]))
-    return fly(replace(plant, dt=step_s), starts, commands, steps_s)
+    states = [np.stack([flight.start for flight in planned]).astype(float)]
+    for number, held_s in enumerate(steps_s[:-1]):
+        states.append(plant(states[-1], commands[:, number], held_s))
+    log = log_of_states(zip(np.stack(states, axis=1), commands, strict=True), step_s, "handout.npz")
+    return replace(log, time=np.tile(np.cumsum(steps_s) - steps_s, len(planned)))

@@ -18,7 +18,7 @@ def scripted(seed: int, seconds: float, noise: str = "sensors", **changes: Any) 
     """Return a plant of a seed, with some fields replaced, and the measured log of its flight."""
     rng = np.random.default_rng(seed)
     truth = replace(draw_base(rng), **changes)
-    return truth, measure(fly(truth, "scripted", seconds, rng), noise, rng)
+    return truth, measure(fly(truth, seconds, rng), noise, rng)
 
 
 def state_of(plant: Plant) -> np.ndarray:

@@ -16,17 +16,8 @@ from blackbox.build import build, main
 from flytrack_env.blackbox import BlackBoxError, load
 from flytrack_env.dynamics import ModelParameters
 from flytrack_env.dynamics import step as model_step
-from flytrack_env.state import ACCELERATION, APPLIED_ACTION, BATTERY, QUATERNION, RATES, VELOCITY
-from tests.support.black_boxes import (
-    AIRLESS,
-    FORBIDDEN,
-    GRAVITY,
-    ROOT,
-    SHIPPED,
-    random_inputs,
-    start,
-    write_artifact,
-)
+from flytrack_env.state import APPLIED_ACTION, BATTERY, RATES
+from tests.support.black_boxes import AIRLESS, FORBIDDEN, ROOT, SHIPPED, random_inputs, start, write_artifact
 
 REFUSALS = [
     (r"signature: found .*float32\[20\], float32\[4\].*expected", lambda x, u: x, {"shapes": ((20,), (4,))}),
@@ -122,44 +113,7 @@ def test_environment_flies_the_black_box(black_box, fly_black_box):
         black_box.step(None, None, 0.02, None)
 
 
-# --- The shipped plant's physics, and that the artifact keeps it to itself --------------------------
-
-
-def test_free_fall_without_thrust(fly_black_box):
-    after = fly_black_box(start(), [0.0, 0.0, 0.0, -1.0])
-    np.testing.assert_allclose(after[ACCELERATION], [0.0, 0.0, -GRAVITY], atol=0.1)
-    np.testing.assert_allclose(after[VELOCITY], after[ACCELERATION] * 0.01, rtol=1e-5)
-
-
-@pytest.mark.parametrize(("volt", "ratio"), [(24.0, 3.5), (22.0, 3.1)])
-def test_thrust_to_weight(fly_black_box, volt, ratio):
-    x = start(applied=[0.0, 0.0, 0.0, 1.0], volt=volt)
-    acceleration = fly_black_box(x, [0.0, 0.0, 0.0, 1.0])[ACCELERATION]
-    assert acceleration[2] / GRAVITY + 1.0 == pytest.approx(ratio, abs=0.08)
-
-
-@pytest.mark.parametrize("axis", [0, 1, 2])
-@pytest.mark.parametrize("sign", [1.0, -1.0])
-def test_drag_takes_energy(fly_black_box, axis, sign):
-    x = start(vel=sign * 15.0 * np.eye(3)[axis])
-
-    def energy(state: np.ndarray) -> float:
-        state = state.astype(np.float64)
-        return float(0.5 * state[VELOCITY] @ state[VELOCITY] + GRAVITY * state[2])
-
-    after = fly_black_box(x, [0.0, 0.0, 0.0, -1.0])
-    airless = np.asarray(plant.step(x, jnp.array([0.0, 0.0, 0.0, -1.0]), AIRLESS))
-    assert abs((energy(x) - energy(airless)) / 0.01) < 5.0
-    assert 8.0 < (energy(x) - energy(after)) / 0.01 < 60.0  # W/kg
-
-
-def test_ground_and_airspeed_add_some_thrust(fly_black_box):
-    u, still = np.zeros(4), start(applied=np.zeros(4))
-    low, fast = still.copy(), still.copy()
-    low[2], fast[3] = 0.1, 10.0
-    thrust = fly_black_box(still, u)[8] + GRAVITY
-    assert 1.01 < (fly_black_box(low, u)[8] + GRAVITY) / thrust < 1.1
-    assert 1.01 < (fly_black_box(fast, u)[8] + GRAVITY) / thrust < 1.1
+# --- The shipped plant's physics, which the artifact's digest keeps as it is ---------------------------
 
 
 def test_airless_plant_is_the_minimal_model():
@@ -169,18 +123,6 @@ def test_airless_plant_is_the_minimal_model():
     found = jax.vmap(lambda x, u: plant.step(x, u, AIRLESS))(states, actions)
     expected = jax.vmap(lambda x, u: model_step(x, u, 0.01, model))(states, actions)
     np.testing.assert_allclose(found, expected, rtol=1e-5, atol=2e-5)
-
-
-def test_attitude_battery_and_clipping(fly_black_box):
-    states, actions = random_inputs(32, seed=1)
-    for x, u in zip(states, actions, strict=True):
-        after = fly_black_box(x, u)
-        assert np.linalg.norm(after[QUATERNION]) == pytest.approx(1.0, abs=1e-6)
-        # 60 s * 100 Hz steps per volt, within float32 near 24 V.
-        assert (x[BATTERY] - after[BATTERY]) * 6000.0 == pytest.approx(1.0, rel=0.02)
-        np.testing.assert_array_equal(after, fly_black_box(x, np.clip(u, -1.0, 1.0)))
-    beyond, full = (fly_black_box(states[0], size * np.array([1.0, -1.0, 1.0, -1.0])) for size in (9.0, 1.0))
-    np.testing.assert_array_equal(beyond, full)
 
 
 def test_lags_and_full_stick_rates(fly_black_box):

@@ -8,9 +8,9 @@ import pytest
 from flytrack_env.dynamics import nominal_parameters
 from flytrack_env.plants import Simulator
 from flytrack_sysid import CollectError, collect
-from flytrack_sysid.excitation import AMPLITUDES, HEIGHTS, KINDS, LARGEST_SPEED, LEG_SPEEDS, script
+from flytrack_sysid.excitation import HEIGHTS, KINDS, LARGEST_SPEED
 from flytrack_sysid.split import blocks_of, held_out_rows
-from tests.support.handout_plant import GRAVITY, HOVER, HandoutPlant
+from tests.support.handout_plant import GRAVITY, HandoutPlant
 
 
 def test_plant_and_function_of_the_same_equations_give_the_same_log():
@@ -85,24 +85,6 @@ def test_plants_that_do_not_fly_are_refused(step, arguments, message):
 
 
 STICKS = ("roll", "pitch", "yaw", "thrust")
-
-
-def test_every_kind_comes_in_fours_with_all_amplitudes_and_voltages():
-    flights = script(48, HOVER, np.random.default_rng(0))
-    assert [flight.kind for flight in flights] == [kind for kind in KINDS for _ in range(4)] * 2
-    for kind in KINDS:
-        own = [flight for flight in flights if flight.kind == kind]
-        volts = np.sort([flight.start[20] for flight in own])
-        assert volts[0] < 22.2 and volts[-1] == 24.0 and np.diff(volts).max() < 0.45
-    for axis, kind in enumerate(KINDS[:3]):
-        own = [flight.command for flight in flights if flight.kind == kind]
-        assert all(np.ptp(np.delete(command, axis, axis=1), axis=0).max() == 0.0 for command in own)
-        for half in np.split(np.stack(own), 2, axis=1):
-            for turn in np.split(np.abs(half[..., axis]).max(axis=1), 2):
-                np.testing.assert_allclose(np.sort(turn), AMPLITUDES, rtol=0.02)
-    assert np.abs([flight.command for flight in flights]).max() <= 1.0
-    speeds = [np.linalg.norm(flight.start[3:6]) for flight in flights if flight.kind == "leg"]
-    np.testing.assert_allclose(speeds, LEG_SPEEDS * 2)
 
 
 def test_held_out_part_has_every_kind_a_clear_step_of_each_axis_and_all_voltages():

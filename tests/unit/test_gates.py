@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from flytrack_env.quaternion import Vec3
-from flytrack_env.race import Race, RaceEvents, advance_race, start_race
+from flytrack_env.race import advance_race, start_race
 from flytrack_env.tracks import Course, Crossing, Gate, GateFrame, Track, build_course, cross_gate
 from tests.support.coasting import coasting_env, drone_at
 
@@ -61,7 +61,7 @@ def test_a_point_on_the_plane_is_counted_once(y: float, event: str, sign: float)
 
 
 NUM = 8  # segments at once: one shape, compiled once
-CLOSE_M = 2e-3  # to an edge or the plane, where float32 and float64 may differ
+CLOSE_M, USUAL_M = 2e-3, 100.0  # so near an edge, float32 and float64 may differ, of segments of a usual size
 FARTHEST_M = 2.0**40  # that what moves a thousand km out of bounds in a step may reach
 
 unit_turns = st.integers(0, 2**32 - 1).map(lambda seed: Rotation.random(rng=np.random.default_rng(seed)))
@@ -115,43 +115,23 @@ def events_in_float64(gate: Gate, start: np.ndarray, end: np.ndarray, radius: fl
 def test_any_segment_meets_any_gate_as_in_the_gates_own_frame(
     turn: Rotation, centre: Any, direction: float, opening: float, thickness: float, radius: float, seed: int
 ) -> None:
+    """However long, short, far away or degenerate: never two events, and a fraction in the unit interval."""
     gate = gate_of(turn, centre, direction, opening, thickness)
     rng = np.random.default_rng(seed)
-    spread = rng.choice([0.3, 1.0, 4.0], (2, NUM, 1)) * opening
+    spread = rng.choice([0.0, 1e-40, 0.3, 0.3, 1.0, 1.0, 4.0, 4.0, FARTHEST_M], (2, NUM, 1)) * opening
     start, end = np.asarray(centre) + spread * rng.uniform(-1.0, 1.0, (2, NUM, 3))
-    frame = frame_of(gate)
-    crossing = cross(frame, vectors(start), vectors(end), np.float32(radius))
+    end[0] = start[0]
+    crossing = cross(frame_of(gate), vectors(start), vectors(end), np.float32(radius))
+    found, size_m = names(crossing), np.abs([start, end]).max(axis=(0, 2))
+    assert found[0] == "none"
     for index in range(NUM):
         expected, doubt = events_in_float64(gate, start[index], end[index], radius)
-        if doubt > CLOSE_M:
-            assert names(crossing)[index] == expected
-    assert ((np.asarray(crossing.fraction) >= 0.0) & (np.asarray(crossing.fraction) <= 1.0)).all()
-    is_pass = np.asarray(crossing.is_pass)
-    assert (np.asarray(crossing.offset)[is_pass] <= 1.0).all()
-
-
-@settings(max_examples=60, deadline=None)
-@given(
-    turn=unit_turns,
-    opening=openings,
-    numbers=st.lists(
-        st.floats(-FARTHEST_M, FARTHEST_M, width=32) | st.sampled_from([0.0, -0.0, 1e-40, -1e-40, 1e6, -1e6]),
-        min_size=6 * NUM,
-        max_size=6 * NUM,
-    ),
-)
-def test_no_segment_is_two_events_or_leaves_the_unit_interval(
-    turn: Rotation, opening: float, numbers: list[float]
-) -> None:
-    """However long, short, far away or degenerate."""
-    frame = frame_of(gate_of(turn, (1.0, 2.0, 3.0), 1.0, opening, 0.5))
-    start, end = np.array(numbers).reshape(2, NUM, 3)
-    end[0] = start[0]
-    crossing = cross(frame, vectors(start), vectors(end), np.float32(0.1))
-    assert names(crossing)[0] == "none"
-    for values in (crossing.fraction, crossing.offset):
-        assert np.isfinite(values).all() and (np.asarray(values) >= 0.0).all()
-    assert (np.asarray(crossing.fraction) <= 1.0).all()
+        if doubt > CLOSE_M * max(1.0, size_m[index] / USUAL_M):
+            assert found[index] == expected
+    fraction, offset = np.asarray(crossing.fraction), np.asarray(crossing.offset)
+    assert ((fraction >= 0.0) & (fraction <= 1.0)).all()
+    assert (np.isfinite(offset) & (offset >= 0.0)).all()
+    assert (offset[np.asarray(crossing.is_pass)] <= 1.0).all()
 
 
 # --- Races: coasting flights along a row of gates -----------------------------------------------
@@ -194,7 +174,7 @@ fly_race = jax.jit(
 @settings(max_examples=30, deadline=None)
 @given(seed=st.integers(0, 2**32 - 1), num_gates=st.sampled_from([2, 3, 8]))
 def test_a_race_counts_what_its_gates_see_one_after_the_other(seed: int, num_gates: int) -> None:
-    """Passes, laps and the gate to fly next along a path at random, against a reading gate by gate."""
+    """Passes, laps and the gate to fly next along a path at random, against a reading in float64."""
     rng = np.random.default_rng(seed)
     gates = [
         gate_of(Rotation.random(rng=rng), rng.uniform(-3.0, 3.0, 3), rng.choice([-1.0, 1.0]), 4.0, 0.5)
@@ -206,11 +186,6 @@ def test_a_race_counts_what_its_gates_see_one_after_the_other(seed: int, num_gat
     times = np.arange(LENGTH, dtype=np.float32) * 0.01
     arguments = (vectors(points[:-1]), vectors(points[1:]), times, np.full(LENGTH, np.float32(0.01)))
     last, events = fly_race(start_race(jnp.int32(first), course), *arguments, course, np.float32(0.1))
-    check_race(last, events, gates, points, first)
-
-
-def check_race(last: Race, events: RaceEvents, gates: list[Gate], points: np.ndarray, first: int) -> None:
-    """Compare a race with its gates read one after the other, in float64; give up where they are close."""
     index, passed = first, 0
     for leg, (start, end) in enumerate(pairwise(points)):
         event, doubt = events_in_float64(gates[index], start, end, 0.1)

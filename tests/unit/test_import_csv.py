@@ -1,6 +1,5 @@
-"""CSV logs by a mapping: units, frames, rows, errors; and the flights of a Crazyflie."""
+"""CSV logs by a mapping: units, frames, rows, errors."""
 
-import csv
 import json
 from pathlib import Path
 
@@ -13,7 +12,6 @@ from flytrack_env import load_model, nominal_parameters
 from flytrack_sysid import FlightLog, LogError, import_log, load_log
 from flytrack_sysid.importing.flight import Craft
 from tests.support.made_flight import GRAVITY, TIME_S, flight
-from tests.support.real_logs import CRAZYFLIE, shared
 from tests.support.written_logs import read_mapping
 
 FLIP = np.array([1.0, -1.0, -1.0])
@@ -170,21 +168,3 @@ def test_command_keeps_clocks_if_asked(folder, tmp_path, capsys):
         (line,) = (line for line in capsys.readouterr().out.splitlines() if line.startswith("clock of q"))
         assert "+20." in line and verdict in line
         assert abs(len(load_log(tmp_path / "a.npz")) - num_rows) <= 1
-
-
-def test_crazyflie_frames_are_ours():
-    """It accelerates in the direction of its tilt, and turns as commanded."""
-    files = sorted(shared(CRAZYFLIE).glob("seed*.csv.gz"))
-    found = import_log(files, "csv", "crazyflie_phoenix", align=False)
-    with (files[0].parent / "MANIFEST.csv").open() as file:
-        usable = {row["file"]: int(row["usable_rows"]) for row in csv.DictReader(file)}
-    assert np.bincount(found.log.segment).tolist() == [usable[path.name] for path in files]
-    assert found.problems == () and found.craft.mass_kg == 0.03
-    log = found.log
-    up_w = Rotation.from_quat(log["q"], scalar_first=True).apply([0.0, 0.0, 1.0])[5:-5]
-    acc_w = (log["v"][10:] - log["v"][:-10]) / 0.1
-    inside = log.segment[10:] == log.segment[:-10]
-    for axis in (0, 1):
-        assert np.corrcoef(acc_w[inside, axis], up_w[inside, axis])[0, 1] > 0.85
-    for axis in range(3):
-        assert np.corrcoef(log["u"][inside.nonzero()[0], axis], log["w"][5:-5][inside, axis])[0, 1] > 0.35

@@ -99,11 +99,9 @@ def test_torques_become_the_rates_that_the_controller_tracks(tmp_path):
     found = read(tmp_path, content, f"{LEE}[craft]\nmass_kg = 0.032\n")
     commanded = found.log["u"][:, :3] * np.deg2rad([800.0, 800.0, 400.0])
     np.testing.assert_allclose(commanded, asked, atol=0.001 * np.abs(asked).max())
-    assert "identified with Kw 0.00125, 0.001, 0.0025 N m s/rad; the law explains 100.0%" in " ".join(
-        found.notes
-    )
-    assert (
-        found.log["u"][:, 3] == pytest.approx(0.0) and found.craft.mass_kg == 0.032 and "f" not in found.log
-    )
+    said = " ".join(found.notes)
+    assert "identified with Kw 0.00125, 0.001, 0.0025 N m s/rad; the law explains 100.0%" in said
+    assert found.log["u"][:, 3] == pytest.approx(0.0)
+    assert found.craft.mass_kg == 0.032 and "f" not in found.log
     stated = "[torque_command]\ninertia_kg_m2 = [1e-5, 1e-5, 2e-5]\nlag_s = [0.01, 0.01, 0.01]\n"
     assert "0.001, 0.001, 0.002 N m s/rad (given)" in " ".join(read(tmp_path, content, LEE + stated).notes)

@@ -75,6 +75,16 @@ def test_time_since_the_start_acts() -> None:
     np.testing.assert_allclose(flight[:, 8], expected, atol=2e-3)
 
 
+def swung(times: np.ndarray, acceleration: Any, length_m: float, damping: float) -> np.ndarray:
+    """Return how far a load is off below what accelerates so, by SciPy."""
+
+    def moved(time: float, state: np.ndarray) -> list[float]:
+        off, speed = state
+        return [speed, -acceleration(time) - 9.81 / length_m * off - damping * speed]
+
+    return solve_ivp(moved, (0.0, times[-1]), [0.0, 0.0], t_eval=times, max_step=0.005).y[0]
+
+
 HANGING = Term("force", "load", (Factor("load", "pendulum", (0.5, 0.4)),), (3.0, 0.0, 0.0), NO)
 
 
@@ -83,12 +93,7 @@ def test_a_load_swings_as_a_pendulum_does() -> None:
     flight, plain = flown(law, commands), flown((), commands)
     assert not np.allclose(plain[:, 6], flight[:, 6], atol=0.5)
     times = 0.01 * np.arange(1, len(flight) + 1)
-
-    def moved(time: float, state: np.ndarray) -> list[float]:
-        off, speed = state
-        return [speed, -np.interp(time, times, flight[:, 6]) - 9.81 / 0.5 * off - 0.4 * speed]
-
-    swing = solve_ivp(moved, (0.0, times[-1]), [0.0, 0.0], t_eval=times, max_step=0.005).y[0] / 0.5
+    swing = swung(times, lambda time: np.interp(time, times, flight[:, 6]), 0.5, 0.4) / 0.5
     # Both fly the same attitude, so that what differs along x is the pull.
     near = 0.02 * 3.0 * np.abs(swing).max()
     np.testing.assert_allclose(flight[:, 6] - plain[:, 6], 3.0 * swing, atol=near)
@@ -105,12 +110,7 @@ def test_a_load_swings_alike_at_any_step(rate: int) -> None:
     record = record._replace(step_s=np.full(len(times), 1.0 / rate), begins=begins, vel_w=vel_w)
     with jax.enable_x64(True):
         load = np.asarray(load_at(LoadInput.of(record), np.arange(len(times)), (0.3, 0.5)))
-
-    def moved(time: float, state: np.ndarray) -> list[float]:
-        off, speed = state
-        return [speed, -9.0 * np.cos(9.0 * time) - 9.81 / 0.3 * off - 0.5 * speed]
-
-    off = solve_ivp(moved, (0.0, times[-1]), [0.0, 0.0], t_eval=times, rtol=1e-8, atol=1e-8).y[0]
+    off = swung(times, lambda time: 9.0 * np.cos(9.0 * time), 0.3, 0.5)
     near = max(2.0 * (9.0 / rate) ** 2, 1e-3) * np.abs(off).max()
     np.testing.assert_allclose(load[:, 0], off, atol=near)
     np.testing.assert_allclose(load[:, 1], 0.5 * load[:, 0], atol=1e-9)

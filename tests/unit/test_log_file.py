@@ -129,9 +129,7 @@ BAD_COLUMNS = {
     r"{row 0}, column q_w, q_x, q_y, q_z: found 1\.0.*, expected a quaternion of norm 1 within 0\.01": (
         lambda columns: columns.update({f"q_{axis}": columns[f"q_{axis}"] * 1.02 for axis in "wxyz"})
     ),
-    r"{row 1}, column u_yaw: found -1\.00001, expected a command in \[-1, 1\]$": set_cell(
-        "u_yaw", 1, -1.00001
-    ),
+    r"{row 1}, column u_yaw: found -1\.00001, expected a command": set_cell("u_yaw", 1, -1.00001),
 }
 
 

@@ -90,10 +90,7 @@ BAD_FILES = [
     ({"version": 2, "parameters": FIELDS}, "version: found 2, expected 1"),
     (FIELDS | {"mass": 1}, "mass: unknown; expected one of tau, "),
     (FIELDS | {"effects": {"drag": {}}}, "effects: drag: unknown; expected one of comm"),
-    (
-        FIELDS | {"effects": {"command_delay": {"delay_s": 0.07}}},
-        "effects: command_delay: delay_s: found 0.07, expected 0 to 0.06 s",
-    ),
+    (FIELDS | {"effects": {"command_delay": {"delay_s": 0.07}}}, "effects: command_delay: delay_s: found"),
 ]
 
 

@@ -93,46 +93,27 @@ ALIKE = {"quaternion": RING.gates[0].quaternion}  # flown the same way as gate 1
 ON_WAY = tuple(tracks.sample_way(tracks.build_course(RING), 1001)[0][505].tolist())  # from gate 10 to 11
 
 
-# What the message says of a break of the ring, the course, and the demand that it breaks.
+# How the message about a break of the ring begins, the course, and the demand that it breaks.
 BREAKS = {
     "gate 12: opening of 0.5 m, expected at least 0.6 m": (changed(2, opening=0.5), "opening"),
-    "gates 10 and 11: 3.00 m apart, expected 5 to 40 m": (
-        changed(1, position=(RADIUS, 3, HEIGHT)),
-        "spacing",
-    ),
+    "gates 10 and 11: 3.00 m apart": (changed(1, position=(RADIUS, 3, HEIGHT)), "spacing"),
     "gates 15 and 10: 41.00 m apart, expected 5 to 40 m": (ring(41.0), "spacing"),
-    "gate 12: 150 deg between its direction of flight and the straight way to gate 13, expected at most 100 "
-    "deg": (changed(2, direction=-1.0), "turn"),
+    "gate 12: 150 deg between its direction of flight and": (changed(2, direction=-1.0), "turn"),
     "gate 12: the way from gate 11 to 12 ": (changed(2, direction=-1.0), "own gate"),  # from behind
     # 8 m beside gate 10, 0.3 m ahead, and flown the same way: its plane is crossed at once, far to the side.
     "gate 11: the way from gate 10 to 11 misses it": (
         changed(1, position=(RADIUS - 8.0, 0.3, HEIGHT), **ALIKE),
         "own gate",
     ),
-    "gate 13: 0.00 m from the way from gate 10 to 11, expected at least 0.65 m": (
+    "gate 13: 0.00 m from the way from gate 10 to 11": (
         changed(3, position=ON_WAY, quaternion=yaw_of(120.0)),  # across it
         "path",
     ),
-    "gates 10 and 13: frames 0.20 m apart, expected at least 0.65 m": (
-        changed(3, position=(RADIUS + 2.9, 0.0, HEIGHT), **ALIKE),
-        "frames",
-    ),
-    "gate 10: frame 0.85 m out of bounds (high x), expected inside": (
-        replace(RING, bounds_high=(10.5, 15.0, 7.0)),
-        "bounds",
-    ),
-    "start: 180 deg off the direction of flight of gate 10, expected in front of it, at most 60 deg": (
-        replace(RING, start_position=(RADIUS, 5.0, HEIGHT)),
-        "start",
-    ),
-    "start: gate 13 is 0.00 m from the straight way to gate 10, expected at least 0.65 m": (
-        changed(3, position=(RADIUS + 1.0, -2.5, HEIGHT), **ALIKE),
-        "start",
-    ),
-    "start: 0.25 m too near the bounds or beyond them (low y)": (
-        replace(RING, bounds_low=(-15.0, -5.2, 0.0)),
-        "start",
-    ),
+    "gates 10 and 13: frames 0.20 m apart": (changed(3, position=(12.9, 0.0, HEIGHT), **ALIKE), "frames"),
+    "gate 10: frame 0.85 m out of bounds (high x)": (replace(RING, bounds_high=(10.5, 15, 7)), "bounds"),
+    "start: 180 deg off the direction of": (replace(RING, start_position=(RADIUS, 5.0, HEIGHT)), "start"),
+    "start: gate 13 is 0.00 m from": (changed(3, position=(11.0, -2.5, HEIGHT), **ALIKE), "start"),
+    "start: 0.25 m too near the bounds or beyond": (replace(RING, bounds_low=(-15, -5.2, 0)), "start"),
 }
 
 
@@ -207,12 +188,8 @@ def test_only_such_courses_are_drawn_and_all_differ(drawn: list[tracks.Track]) -
 
 def test_course_is_a_function_of_the_key(drawn: list[tracks.Track]) -> None:
     for seed in range(10):
-        same = (
-            tracks.random_track(seed),
-            tracks.random_track(jax.random.key(seed)),
-            tracks.random_track(jax.random.PRNGKey(seed)),
-        )
-        assert all(track == drawn[seed] for track in same)
+        for key in (seed, jax.random.key(seed), jax.random.PRNGKey(seed)):
+            assert tracks.random_track(key) == drawn[seed]
     keys = jax.random.split(jax.random.key(0), 3)
     assert len({tracks.random_track(key).gates for key in keys}) == 3
     assert tracks.random_track(np.int64(4)) == drawn[4]
