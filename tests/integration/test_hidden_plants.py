@@ -1,14 +1,17 @@
 """Plants with hidden effects: equations, motion, flights and logs. A diagnosis is graded on them.
 
-Laws that the package has, too, are compared with its own in tests/unit/test_effect_laws.py, and fine motion
-in tests/unit/test_motion.py; the plants that a policy races on, in JAX, fly as those in plain floats.
+Fine motion is that of SciPy's integrator on the same differential equations; the plants that a policy races
+on, in JAX, fly as those in plain floats.
 """
 
 from dataclasses import replace
+from itertools import pairwise
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.integrate import solve_ivp
+from scipy.spatial.transform import Rotation
 
 from benchmarks import hidden
 from benchmarks.hidden import plant
@@ -23,10 +26,10 @@ from tests.support.slow import slow_but
 
 START = Start((1.0, -2.0, 6.0), 0.7, 23.8, -0.2)
 LOOP_STEPS = 120
-STEPS = 100
-LATE_MS, MOCAP_LATE_MS = 3, 24
+STEP_S, STEPS = 0.01, 100
+DELAY_S, LATENCY_S, MOCAP_S = 0.0137, 0.0032, 0.0246
 MOVING_EFFECTS = {
-    "command_delay": {"delay_s": 0.0137},
+    "command_delay": {"delay_s": DELAY_S},
     "second_order_rates": {
         **{"roll_s": 0.02, "pitch_s": 0.025, "yaw_s": 0.015},
         **{"roll_damping": 0.6, "pitch_damping": 0.8, "yaw_damping": 0.5},
@@ -36,6 +39,7 @@ MOVING_EFFECTS = {
     "voltage_sag": {"at_full_v": 0.8},
     "linear_drag": {"d_x": 0.3, "d_y": 0.2, "d_z": 0.1},
     "rotor_drag": {"h": 0.02},
+    "imu_latency": {"latency_s": LATENCY_S},
 }
 # A thousandth of the sensors' noise or less (slopes: of 140 rad/s^2, times an arm of 0.06 m).
 FINE_ERRORS = {"p": 1e-4, "v": 1e-4, "q": 5e-5, "f": 1e-3, "w": 1e-3, "slope": 0.1}
@@ -61,13 +65,35 @@ def test_ground_effect_fades_with_the_height() -> None:
     np.testing.assert_allclose(own, open_loop(base(), 1, low)["f"] * [1.0, 1.0, 1.0 + 0.5 * np.exp(-1.0)])
 
 
-def test_an_accelerometer_off_the_centre_feels_the_turn() -> None:
+def test_equations_of_the_sensors() -> None:
     clean = flown(base(), seconds=4.0)
+
+    def seen(name: str, **values: float) -> FlightLog:
+        return flown(base(**{name: values}), seconds=4.0)
+
+    np.testing.assert_allclose(seen("gyro_bias", x=0.1, y=0.0, z=-0.2)["w"], clean["w"] + [0.1, 0.0, -0.2])
+    np.testing.assert_allclose(seen("gyro_scale", x=1.1, y=1.0, z=0.9)["w"], clean["w"] * [1.1, 1.0, 0.9])
+    late = seen("imu_latency", latency_s=0.015)
+    np.testing.assert_allclose(late["f"][5:], 0.5 * (clean["f"][3:-2] + clean["f"][4:-1]))
     arm, rates = np.array([0.03, -0.02, 0.01]), clean["w"][1:]
     expected = np.cross(rates, np.cross(rates, arm)) + np.cross(np.diff(clean["w"], axis=0) / 0.01, arm)
-    moved = flown(base(imu_offset=dict(zip("xyz", arm, strict=True))), seconds=4.0)["f"][1:] - clean["f"][1:]
+    moved = seen("imu_offset", x=0.03, y=-0.02, z=0.01)["f"][1:] - clean["f"][1:]
     np.testing.assert_allclose(moved, expected, atol=1e-9)
     assert np.abs(expected).max() > 0.1
+
+
+def test_equations_of_the_rate_loop() -> None:
+    plain = open_loop(base())["w"]
+    scaled = open_loop(base(rate_scale={"roll": 1.1, "pitch": 0.9, "yaw": 1.0}))["w"]
+    np.testing.assert_allclose(scaled, plain * [1.1, 0.9, 1.0])
+    coupled = open_loop(base(rate_cross_coupling={"from_roll": 0.1, "from_pitch": -0.2}))["w"]
+    np.testing.assert_allclose(coupled[:, 2], plain @ [0.1, -0.2, 1.0])
+    pushed = open_loop(base(motor_imbalance={"roll": 0.01, "pitch": -0.02}))
+    expected = np.outer(pushed["f"][:, 2], [0.01, -0.02, 0.0])
+    np.testing.assert_allclose(pushed["w"] - plain, expected, atol=1e-12)
+    # Delayed by two and a half steps, once the lags have settled.
+    late = open_loop(base(command_delay={"delay_s": 0.025}))["w"]
+    np.testing.assert_allclose(late[120:], 0.5 * (plain[:-3] + plain[1:-2])[117:], atol=1e-5)
 
 
 @pytest.mark.parametrize("motion", hidden.MOTIONS)
@@ -136,19 +162,69 @@ def test_the_accelerometer_feels_gusts() -> None:
         assert 0.04 < np.std(seen["w"] - open_loop(base(), 6000)["w"]) < 0.06
 
 
-def test_fine_motion_and_late_sensors_depend_on_no_step(monkeypatch: pytest.MonkeyPatch) -> None:
-    """What is read late at 100 Hz is what was there at that moment, at 1 kHz and in finer parts."""
-    own = replace(base(**MOVING_EFFECTS), motion="fine")
-    late = {**MOVING_EFFECTS, "imu_latency": {"latency_s": 1e-3 * LATE_MS}}
-    seen = open_loop(replace(own, effects=late, mocap_late_s=1e-3 * MOCAP_LATE_MS), STEPS)
-    assert np.abs(np.linalg.norm(seen["q"], axis=1) - 1.0).max() < 1e-12
-    monkeypatch.setattr(plant, "LONGEST_PART_S", 2e-4)
-    sticks = np.repeat(random_sticks(STEPS), 10, axis=0)
-    exact = flown_in_floats(replace(own, step_s=1e-3), sticks, START)
-    ends = 10 * np.arange(1, STEPS + 1) - 1
-    for name, bound in FINE_ERRORS.items():
-        then = ends - (MOCAP_LATE_MS % 10 if name in "pvq" else LATE_MS)  # the log shifts by whole steps
-        np.testing.assert_allclose(seen[name], exact[name][then], rtol=0.0, atol=bound, err_msg=name)
+def derivative(
+    own: hidden.Truth, time_s: float, x: np.ndarray, stick: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return dx/dt of position, velocity, attitude, lagged sticks, rates and their slopes; and the force."""
+    _, vel_w, quat, applied, rates, slopes = np.split(x, [3, 6, 10, 14, 17])
+    change = (stick - applied) / np.array(own.tau)
+    volt = START.open_v - own.drain * time_s / 60.0 - 0.8 * (0.5 + 0.5 * applied[3]) ** 2
+    u = applied[3]
+    thrust = np.dot(own.coeffs, [1.0, u, u * u, u**3, volt, u * volt]) / own.mass
+    asked = np.radians(own.max_rate) * applied[:3]
+    asked += np.array([0.01 * thrust, -0.005 * thrust, 0.05 * change[3]])
+    attitude = Rotation.from_quat(quat, scalar_first=True)
+    air_b = attitude.inv().apply(vel_w)
+    force_b = [0.0, 0.0, thrust] - np.array([0.3, 0.2, 0.1]) * air_b - 0.02 * thrust * air_b * [1.0, 1.0, 0.0]
+    w, axis = quat[0], quat[1:]
+    spin = 0.5 * np.concatenate([[-axis @ rates], w * rates + np.cross(axis, rates)])
+    damping, lag_s = np.array([0.6, 0.8, 0.5]), np.array([0.02, 0.025, 0.015])
+    bend = (2.0 * damping / lag_s) ** 2 * (asked - rates - lag_s * slopes)
+    acc_w = attitude.apply(force_b) - [0.0, 0.0, own.gravity]
+    return np.concatenate([vel_w, acc_w, spin, change, slopes, bend]), force_b
+
+
+def integrated(own: hidden.Truth) -> dict[str, np.ndarray]:
+    """Return the same from DOP853, between the instants at which a command arrives or a sensor reads."""
+    sticks, rows = random_sticks(STEPS), np.arange(STEPS + 1) * STEP_S
+    felt_s, tracked_s = rows[1:] - LATENCY_S % STEP_S, rows[1:] - MOCAP_S % STEP_S
+    times = np.unique(np.round([0.0, *rows, *(rows + DELAY_S), *felt_s, *tracked_s], 9))
+    times = times[times <= rows[-1] + 1e-9]
+    quat = [np.cos(0.35), 0.0, 0.0, np.sin(0.35)]
+    x = np.concatenate([START.pos_w, np.zeros(3), quat, np.zeros(3), [START.thrust_stick], np.zeros(6)])
+    found: dict[str, list] = {name: [] for name in FINE_ERRORS}
+    for begin, end in pairwise(times):
+        number = int(np.floor((0.5 * (begin + end) - DELAY_S) / STEP_S))
+        acting = sticks[max(number, 0)]
+
+        def slope(time_s: float, x: np.ndarray, acting: np.ndarray = acting) -> np.ndarray:
+            return derivative(own, time_s, x, acting)[0]
+
+        x = solve_ivp(slope, (begin, end), x, "DOP853", rtol=1e-10, atol=1e-12).y[:, -1]
+        if np.abs(felt_s - end).min() < 1e-8:
+            for name, value in zip("fw", (derivative(own, end, x, acting)[1], x[14:17]), strict=True):
+                found[name].append(value)
+            found["slope"].append(x[17:])
+        if np.abs(tracked_s - end).min() < 1e-8:
+            for name, value in zip("pvq", np.split(x[:10], [3, 6]), strict=True):
+                found[name].append(value)
+    return {name: np.array(values) for name, values in found.items()}
+
+
+def test_fine_motion_obeys_the_differential_equations(monkeypatch: pytest.MonkeyPatch) -> None:
+    own = replace(base(**MOVING_EFFECTS), motion="fine", mocap_late_s=MOCAP_S)
+    exact = integrated(own)
+
+    def errors() -> dict[str, float]:
+        seen = open_loop(own, STEPS)
+        assert np.abs(np.linalg.norm(seen["q"], axis=1) - 1.0).max() < 1e-12
+        return {name: float(np.abs(seen[name] - values).max()) for name, values in exact.items()}
+
+    found = errors()
+    assert all(found[name] < bound for name, bound in FINE_ERRORS.items()), found
+    monkeypatch.setattr(plant, "LONGEST_PART_S", 0.5 * plant.LONGEST_PART_S)
+    halved = errors()
+    assert all(found[name] > 3.0 * halved[name] for name in exact), (found, halved)
 
 
 @pytest.mark.parametrize("motion", hidden.MOTIONS)

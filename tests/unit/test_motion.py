@@ -25,8 +25,7 @@ ARM_B = np.array([0.02, -0.01, 0.03])
 SECONDS = 0.6
 COMMAND_S = 0.02  # how long the pilot holds a command
 PLAIN = ModelParameters(TAU, COEFFS, FULL_RATES, MASS, GRAVITY, DRAIN, motion=Motion.CONTINUOUS)
-TURNED = effects.YawReaction(0.05), effects.MotorImbalance(0.01, -0.005)
-DRAGGED = PLAIN.with_effects(DRAG, effects.RotorDrag(0.02), *TURNED)
+DRAGGED = PLAIN.with_effects(DRAG, effects.YawReaction(0.05))
 LOOP = DRAGGED.with_effects(effects.SecondOrderRates(*[0.02] * 3, *[0.6] * 3))
 FULL = LOOP.with_effects(effects.CommandDelay(0.013))
 START = np.array([0, 0, 5, 3, -2, 1, 0, 0, 0, 0.9, 0.1, -0.3, 0.3, 0, 0, 0, 0.1, -0.2, 0.3, 0.2, 23.5])
@@ -53,7 +52,7 @@ def flown(model: ModelParameters, dt: float, start: Any = START) -> tuple[np.nda
 def reference(model: ModelParameters) -> tuple[np.ndarray, ...]:
     """Return position, velocity, attitude and specific force, body, at every 20 ms.
 
-    Those of a hidden plant in parts of 0.05 ms, whose equations are written anew.
+    Those of a hidden plant in parts of 0.05 ms; its motion is that of SciPy's integrator.
     """
     own_effects = {effects.effect_of(one).name: one._asdict() for one in model.effects}
     own = (tuple(map(float, one)) for one in (TAU, COEFFS, FULL_RATES))
