@@ -1,4 +1,4 @@
-"""Environment steps per second of process CPU time on one core, beside Pendulum and l2f; also by Gymnasium.
+"""Environment steps per second of process CPU time on one core, beside Pendulum and l2f; races, Gymnasium.
 
 ``python -m benchmarks.env_speed [--repeats 7] [--out PAGE]`` prints a table and writes it; with ``--effects``
 that of the step's cost with each effect, and with each motion. Keys and actions
@@ -21,13 +21,14 @@ L2F_TIME_LIMIT = 500  # steps
 PENDULUM = "gymnax Pendulum-v1, vmap, 1,024"
 L2F_SMALL, L2F_LARGE = "l2f full step, 1,024", "l2f full step, 4,096"
 PLAIN, BATCH = "FlyTrack vmap(step), 1,024", "FlyTrack step_batch, 4,096"
+SMALL_BATCH, DUEL = "FlyTrack step_batch, 1,024", "FlyTrackDuel-v0 step_batch, 1,024 races"
 VARIANTS = {
     f"FlyTrack{name}-v0 vmap(step), 1,024": f"FlyTrack{name}-v0"
     for name in ("Noisy", "ActionHistory", "Randomized", "Robust")
 }
 MOST_COSTLY = 1.5  # a variant's step over the plain one's
 # Our rate, the peer's, the ratio to reach.
-TARGETS = ((PLAIN, L2F_SMALL, 6.0), (BATCH, L2F_LARGE, 10.0))
+TARGETS = ((PLAIN, L2F_SMALL, 6.0), (BATCH, L2F_LARGE, 10.0), (DUEL, SMALL_BATCH, 0.4))
 
 
 class Contestant(NamedTuple):
@@ -42,16 +43,24 @@ class Contestant(NamedTuple):
 def jax_contestant(
     name: str, env_id: str, num_envs: int, length: int, is_batch: bool, model: Any = None
 ) -> Contestant:
-    """Return a scan of ``length`` steps of a gymnax environment, all outputs in the carry; with a model."""
+    """Return a scan of ``length`` steps of a gymnax environment, all outputs in the carry; with a model.
+
+    Of a race of two, all drones' actions are given.
+    """
     import gymnax
     import jax
 
-    import_module("flytrack_env")  # registers the id
-    env, params = gymnax.make(env_id, **({} if model is None else {"model": model}))
+    flytrack_env = import_module("flytrack_env")  # registers the id
+    drones: tuple[int, ...] = ()
+    if env_id == "FlyTrackDuel-v0":
+        env, drones = flytrack_env.make_race(env_id), (2,)
+        params = env.default_params
+    else:
+        env, params = gymnax.make(env_id, **({} if model is None else {"model": model}))
     step = env.step_batch if is_batch else jax.vmap(env.step, in_axes=(0, 0, 0, None))
     reset = jax.jit(jax.vmap(env.reset, in_axes=(0, None)))
     keys = jax.random.split(jax.random.key(0), (length,) if is_batch else (length, num_envs))
-    shape = (length, num_envs, *env.action_space(params).shape)
+    shape = (length, num_envs, *drones, *env.action_space(params).shape)
     actions = jax.random.uniform(jax.random.key(1), shape, minval=-1.0)
     _, state = reset(jax.random.split(jax.random.key(2), num_envs), params)
 
@@ -139,6 +148,8 @@ def contestants() -> list[Contestant]:
         jax_contestant(PENDULUM, "Pendulum-v1", 1024, 200, is_batch=False),
         jax_contestant(PLAIN, "FlyTrack-v0", 1024, 200, is_batch=False),
         jax_contestant(BATCH, "FlyTrack-v0", 4096, 200, is_batch=True),
+        jax_contestant(SMALL_BATCH, "FlyTrack-v0", 1024, 200, is_batch=True),
+        jax_contestant(DUEL, "FlyTrackDuel-v0", 1024, 200, is_batch=True),
         *(jax_contestant(name, env_id, 1024, 200, is_batch=False) for name, env_id in VARIANTS.items()),
         gymnasium_contestant(1024, 200),
         gymnasium_contestant(1024, 200, "NextStep"),
@@ -217,7 +228,7 @@ def main(repeats: int = 7, out: Path | None = None, effects: bool = False) -> No
         for name, found in rates.items()
     )
     targets = (
-        (f"{name} to {peer}", f"{median_ratio(rates, name, peer):.1f}", f"{goal:g}")
+        (f"{name} to {peer}", f"{median_ratio(rates, name, peer):.2g}", f"{goal:g}")
         for name, peer, goal in TARGETS
         if peer in rates
     )

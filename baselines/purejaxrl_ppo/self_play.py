@@ -1,4 +1,4 @@
-"""PPO by self-play, for duels: against a pool of its own past policies and the one that it began with.
+"""PPO by self-play, for duels: against a pool of its own past policies and of some that stay.
 
 The learner and its opponents are one network. Training is that of ``ppo.py``, loss and all, on a race in
 which every opponent is frozen (``flytrack_env.multi_drone.Versus``): the pool is a part of the environment's
@@ -6,7 +6,7 @@ parameters, and between some updates the learner replaces one of its members. Ev
 share of the environments.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -24,16 +24,17 @@ FIRST_LAYER = "layers_0"
 class Settings(NamedTuple):
     """What self-play adds to PPO.
 
-    pool: policies in the pool, the first of them that which training began with; num_envs is a multiple of
-    it. every: updates after which the learner replaces a member, the oldest first. lead: reward for each gate
-    gained on the opponent. std: standard deviation of the actions at the start, small, so that what the
-    first policy can already is not lost in noise.
+    past: how many of its past policies are in the pool, beside those that stay. every: updates after which
+    the learner replaces one, the oldest first. lead: reward for each gate gained on the opponent. std:
+    standard deviation of the actions at the start, small, so that what the first policy can already is not
+    lost in noise. course_fraction: share of the races that begin somewhere on the course.
     """
 
-    pool: int = 4
-    every: int = 50
+    past: int = 2
+    every: int = 75
     lead: float = 1.0
-    std: float = 0.1
+    std: float = 0.03
+    course_fraction: float = 0.3
 
 
 def widened(params: Any, size: int) -> Any:
@@ -74,64 +75,51 @@ def pool_opponent(config: Config, size: int, pool: Any) -> Opponent:
     return Opponent(act, size, pool)
 
 
-def make_duel(race: MultiDroneRace, config: Config, settings: Settings, start: Any) -> Versus:
-    """Return the environment of the learner against a pool of which all members are the start.
-
-    Raises:
-        ValueError: a number of environments that the pool does not divide, or settings out of range.
-    """
-    if settings.pool < 1 or config.num_envs % settings.pool:
-        expected = f"a divisor of num_envs, {config.num_envs}"
-        raise ValueError(f"pool: found {settings.pool}, expected {expected}")
-    if settings.every < 1:
-        raise ValueError(f"every: found {settings.every}, expected at least 1")
-    pool = jax.tree.map(lambda leaf: jnp.repeat(leaf[None], settings.pool, axis=0), start)
-    return Versus(race, [pool_opponent(config, race.observation_space().shape[0], pool)])
-
-
 def training_params(duel: Versus, config: Config, settings: Settings) -> VersusParams:
     """Return the parameters to train with: short episodes, thicker drones, and a reward for the lead."""
     params = duel.default_params
     flight = params.race.flight
     flight = flight.replace(
-        max_steps_in_episode=config.episode_steps, drone_radius=flight.drone_radius + config.gate_margin
+        max_steps_in_episode=config.episode_steps,
+        drone_radius=flight.drone_radius + config.gate_margin,
+        reset=flight.reset._replace(course_fraction=settings.course_fraction),
     )
     rules = params.race.rules._replace(lead=settings.lead)
     return params._replace(race=params.race._replace(flight=flight, rules=rules))
 
 
 def train(
-    start: Checkpoint, race: MultiDroneRace, config: Config, settings: Settings, seed: int
+    starts: Sequence[Checkpoint], race: MultiDroneRace, config: Config, settings: Settings, seed: int
 ) -> Iterator[tuple[int, Any, Metrics]]:
     """Yield (updates, parameters of the network, metrics) each time when the learner enters the pool.
 
-    start: the policy that training begins with, of an environment for one drone. race: of two drones, over
-    with the first.
+    starts: policies of an environment for one drone that stay in the pool; training begins with the first.
+    race: of two drones, over with the first.
 
     Raises:
-        ValueError: settings that cannot be trained with.
+        ValueError: settings that cannot be trained with, or a number of environments that the pool does not
+            divide.
     """
-    first = with_std(widened(start.params, race.observation_space().shape[0]), settings.std)
-    duel = make_duel(race, config, settings, first)
+    size, num_members = race.observation_space().shape[0], len(starts) + settings.past
+    if settings.past < 1 or settings.every < 1 or config.num_envs % num_members:
+        expected = f"at least 1 each, and a pool of {num_members} that divides num_envs, {config.num_envs}"
+        raise ValueError(f"past, every: found {settings.past}, {settings.every}, expected {expected}")
+    members = [widened(start.params, size) for start in starts]
+    pool = jax.tree.map(lambda *leaves: jnp.stack(leaves), *members, *members[:1] * settings.past)
+    duel = Versus(race, [pool_opponent(config, size, pool)])
     params = training_params(duel, config, settings)
-
-    def update(carry: tuple[Runner, VersusParams], _: None) -> tuple[tuple[Runner, VersusParams], Metrics]:
-        runner, params = carry
-        runner, metrics = make_ppo(duel, params, config).update(runner)
-        return (runner, params), metrics
 
     @jax.jit
     def phase(runner: Runner, params: VersusParams) -> tuple[Runner, Metrics]:
-        (runner, _), metrics = jax.lax.scan(update, (runner, params), None, settings.every)
-        return runner, metrics
+        ppo = make_ppo(duel, params, config)
+        return jax.lax.scan(lambda runner, _: ppo.update(runner), runner, None, settings.every)
 
     runner = jax.jit(make_ppo(duel, params, config).start)(jax.random.key(seed))
+    first = with_std(members[0], settings.std)
     runner = runner._replace(train_state=runner.train_state.replace(params=first))
     for number in range(config.num_updates // settings.every):
         runner, metrics = phase(runner, params)
-        member = 1 + number % max(settings.pool - 1, 1)
-        if settings.pool > 1:
-            params = params._replace(
-                opponents=(replaced(params.opponents[0], member, runner.train_state.params),)
-            )
-        yield (number + 1) * settings.every, runner.train_state.params, metrics
+        learnt = runner.train_state.params
+        oldest = len(starts) + number % settings.past
+        params = params._replace(opponents=(replaced(params.opponents[0], oldest, learnt),))
+        yield (number + 1) * settings.every, learnt, metrics

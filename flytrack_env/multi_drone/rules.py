@@ -22,7 +22,7 @@ class RaceRules(NamedTuple):
     """
 
     collision_radius: Scalar = 0.15
-    blame: Scalar = RAMMER_OUT
+    blame: Scalar = BOTH_OUT
     column_spacing: Scalar = 1.0
     row_spacing: Scalar = 0.5
     first_slot: Scalar = DRAWN_SLOT

@@ -13,12 +13,12 @@ from flytrack_env.multi_drone import MultiDroneRace, Opponent, RaceRules, Versus
 from flytrack_env.multi_drone.collisions import Path, is_put_out
 from flytrack_env.multi_drone.opponents import Standing, observe_opponents, rank_of
 from flytrack_env.multi_drone.pettingzoo_api import ParallelRace
-from flytrack_env.multi_drone.rules import BOTH_OUT, check_rules
+from flytrack_env.multi_drone.rules import BOTH_OUT, RAMMER_OUT, check_rules
 from flytrack_env.quaternion import Vec3
 from flytrack_env.references import shipped_reference
 from flytrack_env.tracks import GateFrame
 
-BOTH = RaceRules(blame=BOTH_OUT)
+BOTH, RAMMER = RaceRules(blame=BOTH_OUT), RaceRules(blame=RAMMER_OUT)
 coordinate = st.floats(-1.0, 1.0, width=32)
 vector = st.tuples(coordinate, coordinate, coordinate)
 
@@ -107,13 +107,13 @@ def test_no_collision_passes_between_two_steps(direction, other_direction, offse
         for at, move in zip((np.zeros(3), apart), moves, strict=True)
     ]
     assert bool(is_put_out(*paths, BOTH)) and bool(is_put_out(*reversed(paths), BOTH))
-    one_out = [bool(is_put_out(*pair, RaceRules())) for pair in (paths, reversed(paths))]
+    one_out = [bool(is_put_out(*pair, RAMMER)) for pair in (paths, reversed(paths))]
     assert any(one_out)
 
 
 def test_who_runs_into_the_other_is_out():
     still, fast = Path(Vec3(0.4, 0, 0), Vec3(0.4, 0, 0)), Path(Vec3(0, 0, 0), Vec3(0.3, 0, 0))
-    assert is_put_out(fast, still, RaceRules()) and not is_put_out(still, fast, RaceRules())
+    assert is_put_out(fast, still, RAMMER) and not is_put_out(still, fast, RAMMER)
     assert is_put_out(still, fast, BOTH)
     ahead = Path(Vec3(0.5, 0, 0), Vec3(0.81, 0, 0))
     assert not is_put_out(fast, ahead, BOTH)
