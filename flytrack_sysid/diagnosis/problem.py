@@ -72,9 +72,7 @@ def _of_lane(model: ModelParameters, lane: Record, sensed: dict[str, Any]) -> ja
     """Return the residuals of a lane's rows; of its first row nothing is predicted."""
     rows, gyro_b = jax.tree.map(lambda leaf: leaf[:-1], (lane, sensed.get("w")))
     later = jax.tree.map(lambda leaf: leaf[1:], (lane, sensed))
-    found = replay(
-        model, rows, "gyro", gyro_b, lambda step, extra: _of_step(step, extra[0], extra[1], model), later
-    )
+    found = replay(model, rows, gyro_b, lambda step, extra: _of_step(step, extra[0], extra[1], model), later)
     return jnp.concatenate([jnp.zeros_like(found[:1]), found])
 
 
@@ -174,8 +172,9 @@ class Problem:
             late=late,
         )
 
-    def with_noise(self, noise: np.ndarray) -> "Problem":
-        """Return the same problem, weighted by this noise, (6, NUM_AXES)."""
+    def with_noise(self, noise: np.ndarray | None) -> "Problem":
+        """Return the same problem, weighted by this noise, (6, NUM_AXES), of a problem that has one."""
+        assert noise is not None, "with_noise comes first"
         lanes = self.lanes
         gains = _gains(noises.noise_of(noise), noises.step_to(lanes), lanes.is_known, lanes.counts)
         return replace(self, noise=noise, gains=gains)
