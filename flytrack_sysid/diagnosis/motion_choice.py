@@ -27,7 +27,7 @@ from flytrack_sysid.clocks import PAIRS, offset_between
 from flytrack_sysid.diagnosis import noise as noises
 from flytrack_sysid.diagnosis.lanes import Lanes, lanes_of
 from flytrack_sysid.diagnosis.lateness import judged_as_logged, read_poses
-from flytrack_sysid.diagnosis.problem import Problem, blocks_of, robust_weight
+from flytrack_sysid.diagnosis.problem import SEARCHED, Problem, blocks_of, robust_weight
 from flytrack_sysid.diagnosis.score_test import Linearization, solve
 from flytrack_sysid.diagnosis.search import refine
 from flytrack_sysid.log import FlightLog, usual_step
@@ -82,6 +82,21 @@ class Trial(NamedTuple):
     vector: np.ndarray
 
 
+def problem_of(
+    lanes: Lanes,
+    corrected: FlightLog,
+    logged: FlightLog,
+    model: ModelParameters,
+    late_s: float,
+    effects: Sequence[Effect] = SEARCHED,
+) -> Problem:
+    """Return the problem of lanes of a corrected log, whose poses were logged late."""
+    late = None
+    if late_s:
+        lanes, late = judged_as_logged(lanes, corrected, logged, late_s, model.motion)
+    return Problem.of(lanes, model, effects, late)
+
+
 class Seen(NamedTuple):
     """Rows of a log to learn from, (num_rows,) bool, a model to start from, and the part that is looked at.
 
@@ -108,12 +123,9 @@ class Seen(NamedTuple):
 
     def problem(self, moves: Moves) -> Problem:
         """Return the problem of a log that moves so."""
-        model, log, late_s = self.model._replace(motion=moves.motion), self.log, moves.late_s
-        if late_s <= 0.0:
-            return Problem.of(self.lanes(log), model, LOOK_ALIKES)
-        in_time = read_poses(log, late_s)[0]
-        lanes, late = judged_as_logged(self.lanes(in_time), in_time, log, late_s, moves.motion)
-        return Problem.of(lanes, model, LOOK_ALIKES, late)
+        model, late_s = self.model._replace(motion=moves.motion), max(moves.late_s, 0.0)
+        in_time = read_poses(self.log, late_s)[0]
+        return problem_of(self.lanes(in_time), in_time, self.log, model, late_s, LOOK_ALIKES)
 
 
 def _places(problem: Problem, moves: Moves) -> list[int]:
