@@ -151,10 +151,10 @@ def voltages_of(lanes: Lanes) -> tuple[float, float] | None:
     return (float(measured.min()), float(measured.max())) if len(measured) else None
 
 
-def thinned(lanes: Lanes) -> Lanes:
-    """Return lanes evenly spread, of MOST_ROWS at most, in place of those of a long log."""
+def thinned(lanes: Lanes, most: int | None = None) -> Lanes:
+    """Return lanes evenly spread, of MOST_ROWS or so many lanes at most, in place of those of a long log."""
     rows, number = lanes.row.shape
-    most = max(MOST_ROWS // (rows - lead_in_of(rows)) // LANES_PADDED_TO, 1) * LANES_PADDED_TO
+    most = most or max(MOST_ROWS // (rows - lead_in_of(rows)) // LANES_PADDED_TO, 1) * LANES_PADDED_TO
     if number <= most:
         return lanes
     return lanes.selected(np.linspace(0, number - 1, most).round().astype(int))
