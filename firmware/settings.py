@@ -103,10 +103,12 @@ def parse_dump(text: str) -> list[Setting]:
     return found
 
 
-def settings_of(given: str | Mapping[str, object], skip: Iterable[str] = ()) -> list[Setting]:
+def settings_of(
+    given: str | Mapping[str, object], skip: Iterable[str] = (), has_blackbox: bool = False
+) -> list[Setting]:
     """Return the settings to make: those given, above ``DEFAULTS`` (a dict) or the firmware's own (a dump).
 
-    ``REQUIRED`` ones come last. skip: patterns of names to leave out, ``osd_*`` say.
+    ``REQUIRED`` ones come last. skip: patterns of names to leave out, ``osd_*`` say. has_blackbox: it logs.
 
     Raises:
         FirmwareError: a dump that cannot be read, or a required setting that a dict would change.
@@ -125,7 +127,8 @@ def settings_of(given: str | Mapping[str, object], skip: Iterable[str] = ()) -> 
         one for one in made if one.name not in REQUIRED and not any(fnmatch(one.name, p) for p in skipped)
     ]
     last = made[-1] if made else Setting("", "", 0, 0)
-    return [*made, *(last._replace(name=name, value=value) for name, value in REQUIRED.items())]
+    required = REQUIRED | ({"blackbox_device": "VIRTUAL"} if has_blackbox else {})
+    return [*made, *(last._replace(name=name, value=value) for name, value in required.items())]
 
 
 def _name(text: str) -> str:
