@@ -205,7 +205,6 @@ def information_of_manoeuvres(
     Fisher information at the fitted model, with the noise and the channels of the problem's log;
     eight flights of 2.5 s each. 0 for other columns. Inside ``jax.enable_x64(True)``.
     """
-    assert problem.noise is not None
     columns = sorted(set(columns))
     log, counts = _seen_flights(problem, model.vector)
     lanes = make_lanes(log, counts, model.vector[problem.index(TAUS)], float(problem.like.g))

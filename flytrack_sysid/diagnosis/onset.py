@@ -208,7 +208,6 @@ def profile_of(problem: Problem, test: Problem, vector: np.ndarray, row: int) ->
     test: of rows held out, which decide as well.
     """
     step_s = float(np.median(problem.lanes.record.step_s))
-    assert problem.noise is not None
     problems = problem, replace(test, windows=problem.windows).with_noise(problem.noise)
     # As if what changes at the row changed after the log, and before it.
     sides = [[moved(one, row, to).residuals(vector[None])[0] for to in (NEVER, ALWAYS)] for one in problems]
@@ -346,13 +345,9 @@ def _with_change(selection: Selection, test: Problem) -> Selection | None:
     lost = [
         misfit(later, problem) - misfit(selection, problem) for problem in (selection.state.problem, test)
     ]
-    price = PER_PARAMETER * (_num_priced(later) - _num_priced(selection))
+    price = PER_PARAMETER * (later.model.num_priced - selection.model.num_priced)
     is_better = lost[0] + price < -threshold(first.num_parameters) and lost[1] < 0.0
     return later if is_better else None
-
-
-def _num_priced(selection: Selection) -> int:
-    return sum(one.num_priced for one in selection.model.candidates)
 
 
 def misfit(selection: Selection, problem: Problem) -> float:
