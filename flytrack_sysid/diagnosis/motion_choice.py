@@ -109,16 +109,9 @@ class Seen(NamedTuple):
     part: int = 0
     num_parts: int = 1
 
-    def in_parts(self) -> "Seen":
-        """Return the first of as many parts as there are, of ``MOST_LANES`` each."""
-        return self._replace(part=0, num_parts=max(self._lanes(self.log).row.shape[1] // MOST_LANES, 1))
-
-    def _lanes(self, log: FlightLog) -> Lanes:
-        return lanes_of(log, self.judged, self.model)
-
     def lanes(self, log: FlightLog) -> Lanes:
         """Return the lanes of this part; in ``log`` poses may be at other times."""
-        lanes = self._lanes(log)
+        lanes = lanes_of(log, self.judged, self.model)
         return lanes.selected(np.arange(self.part, lanes.row.shape[1], self.num_parts)[:MOST_LANES])
 
     def problem(self, moves: Moves) -> Problem:
@@ -229,7 +222,8 @@ def how_it_moves(
     if apparent is not None and [one for one in motions if late[one] == Moves(one)] == [Motion.CONTINUOUS]:
         return Moves(Motion.CONTINUOUS)
     seen = Seen(log, judged & _known_around(log, list(late.values())), model)
-    found = _chosen(seen.in_parts(), list(late.values()))
+    num_parts = max(lanes_of(log, seen.judged, model).row.shape[1] // MOST_LANES, 1)
+    found = _chosen(seen._replace(num_parts=num_parts), list(late.values()))
     is_late = found.late_s > max(LEAST_S, STANDARD_ERRORS * found.sigma_s)
     return found if is_late else Moves(found.motion)
 
