@@ -5,38 +5,12 @@ A setting's name is that of the command line's ``set``, or ``feature NAME`` with
 
 from collections.abc import Callable, Iterable, Mapping
 from fnmatch import fnmatch
+from pathlib import Path
 from typing import NamedTuple
 
 from firmware.body import FirmwareError
 from flytrack_env.messages import quote_name
 
-# Where a dict says nothing: full sticks of 620, 620 and 120 deg/s, close to FlyTrack's drones.
-DEFAULTS = {
-    "rates_type": "ACTUAL",
-    **{f"{axis}_rc_rate": "62" for axis in ("roll", "pitch")},
-    **{f"{axis}_srate": "62" for axis in ("roll", "pitch")},
-    "yaw_rc_rate": "12",
-    "yaw_srate": "12",
-    **{f"{axis}_expo": "0" for axis in ("roll", "pitch", "yaw")},
-    "min_check": "1000",
-    "max_check": "2000",
-}
-# What the plant itself needs: it arms in any attitude and at once, and its sensors and motors are simulated.
-REQUIRED = {
-    "small_angle": "180",
-    "runaway_takeoff_prevention": "OFF",
-    "gyro_calib_duration": "50",
-    "failsafe_delay": "200",
-    "battery_meter": "ADC",
-    "vbat_scale": "110",
-    "vbat_divider": "10",
-    "vbat_multiplier": "1",
-    "blackbox_device": "NONE",
-    "motor_pwm_protocol": "PWM",
-    "gyro_1_sensor_align": "DEFAULT",
-    **{f"gyro_1_align_{axis}": "0" for axis in ("roll", "pitch", "yaw")},
-    **{f"align_board_{axis}": "0" for axis in ("roll", "pitch", "yaw")},
-}
 ARM_SWITCH = "aux 0 0 0 1700 2100 0 0"
 CHANNEL_ORDER = "map AETR1234"
 # Lines of a dump about pins, lights, radio and switches, which a simulated board has not: left out.
@@ -101,6 +75,14 @@ def parse_dump(text: str) -> list[Setting]:
         else:
             raise FirmwareError(f"settings: found {quote_name(line)}, expected set, feature or profile lines")
     return found
+
+
+def _values_in(name: str) -> dict[str, str]:
+    """Return the settings in a file of this folder, the text of a dump, by name."""
+    return {one.name: one.value for one in parse_dump(Path(__file__).with_name(name).read_text())}
+
+
+DEFAULTS, REQUIRED = _values_in("defaults.txt"), _values_in("required.txt")
 
 
 def settings_of(
