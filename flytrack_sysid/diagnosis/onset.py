@@ -16,7 +16,7 @@ from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy import optimize, special, stats
+from scipy import optimize, stats
 
 from flytrack_sysid.diagnosis import noise as noises
 from flytrack_sysid.diagnosis.lanes import LANE_S, Lanes, lead_in_of
@@ -51,10 +51,8 @@ def threshold(num_parameters: int, trimmed: float = LEAST_SHARE, chance: float =
     span = 2.0 * np.log((1.0 - trimmed) / trimmed)
 
     def excess(size: float) -> float:
-        log_density = 0.5 * (num_parameters * np.log(0.5 * size) - size) - special.gammaln(
-            0.5 * num_parameters
-        )
-        return float(log_density + np.log((1.0 - num_parameters / size) * span + 2.0 / size) - np.log(chance))
+        crossings = (size - num_parameters) * span + 2.0
+        return float(stats.chi2.logpdf(size, num_parameters) + np.log(crossings) - np.log(chance))
 
     lowest = float(stats.chi2.isf(chance, num_parameters))
     return float(optimize.brentq(excess, lowest, 10.0 * lowest + 100.0))

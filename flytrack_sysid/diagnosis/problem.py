@@ -22,6 +22,7 @@ from typing import Any, NamedTuple, Self
 import jax
 import jax.numpy as jnp
 import numpy as np
+from scipy import special
 
 from flytrack_env.dynamics import ModelParameters, read_sensors
 from flytrack_env.effects import BY_NAME, EFFECTS, LEARNED, Effect, effect_of
@@ -330,15 +331,12 @@ def _scale(name: str, value: float) -> float:
 
 def robust_weight(white: np.ndarray) -> np.ndarray:
     """Return weights of innovations with which outliers count by their size, not its square (Huber)."""
-    size = np.abs(white)
-    return np.where(size > noises.OUTLIER, noises.OUTLIER / np.maximum(size, noises.OUTLIER), 1.0)
+    return noises.OUTLIER / np.maximum(np.abs(white), noises.OUTLIER)
 
 
 def robust_square(white: np.ndarray) -> float:
     """Return the sum of squares of innovations, outliers counted by their size."""
-    size = np.abs(white)
-    inside = np.minimum(size, noises.OUTLIER)
-    return float((inside * (2.0 * size - inside)).sum())
+    return float(2.0 * special.huber(noises.OUTLIER, white).sum())
 
 
 def blocks_of(values: np.ndarray) -> np.ndarray:

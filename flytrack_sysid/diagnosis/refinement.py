@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 
 import jax
 import numpy as np
-from scipy import stats
+from scipy import special, stats
 from scipy.spatial.transform import Rotation
 
 from flytrack_env.dynamics import ModelParameters
@@ -196,8 +196,7 @@ class Target(NamedTuple):
 
     def cost(self, left: np.ndarray, vectors: np.ndarray) -> np.ndarray:
         """Return the robust sum of squares and the weak prior of models, (num_vectors,)."""
-        size = np.abs(left)
-        robust = np.where(size < OUTLIER, size**2, OUTLIER * (2.0 * size - OUTLIER)).sum(axis=(1, 2))
+        robust = 2.0 * special.huber(OUTLIER, left).sum(axis=(1, 2))
         return robust + np.square(vectors - self.problem.start) @ prior_information(self.problem)
 
     def fitted(self, vector: np.ndarray, places: Sequence[int], rounds: int) -> Fit:
@@ -208,9 +207,7 @@ class Target(NamedTuple):
             moved, step = problem.nudged(vector, places)
             left = self.residuals(np.concatenate([vector[None], moved]))
             columns = (left[1:] - left[0]) / step[:, None, None]
-            root = np.sqrt(
-                np.where(np.abs(left[0]) > OUTLIER, OUTLIER / np.maximum(np.abs(left[0]), 1e-9), 1)
-            )
+            root = np.sqrt(OUTLIER / np.maximum(np.abs(left[0]), OUTLIER))
             prior, pull = prior_information(problem)[at], (vector - problem.start)[at]
             scores = np.einsum("pwn,wn->wp", columns, left[0] * root**2)
             flat = (columns * root).reshape(len(at), -1)
