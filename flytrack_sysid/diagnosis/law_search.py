@@ -345,15 +345,13 @@ def fit_terms(side: Side, terms: Sequence[Term]) -> tuple[tuple[Term, ...], Side
         if sigmas.min() >= LEAST_SIGMAS or kept.sum() == 1:
             break
         kept[np.flatnonzero(kept)[int(np.argmin(sigmas))]] = False
-    coefficients, errors = np.zeros(len(kept)), np.zeros(len(kept))
-    coefficients[kept], errors[kept] = fit.step, fit.errors
-    result, place = [], 0
-    for term, number in zip(terms, sizes, strict=True):
-        own = slice(place, place + number)
-        padded = [np.pad(values[own], (0, XYZ - number)).tolist() for values in (coefficients, errors)]
-        if any(padded[0]):
-            result.append(replace(term, coefficients=tuple(padded[0]), standard_errors=tuple(padded[1])))
-        place += number
+    numbers = np.zeros((2, len(kept)))
+    numbers[:, kept] = fit.step, fit.errors
+    result = []
+    for term, own in zip(terms, np.split(numbers, np.cumsum(sizes)[:-1], axis=1), strict=True):
+        coefficients, errors = np.pad(own, ((0, 0), (0, XYZ - own.shape[1]))).tolist()
+        if any(coefficients):
+            result.append(replace(term, coefficients=tuple(coefficients), standard_errors=tuple(errors)))
     return tuple(result), fit
 
 
