@@ -15,7 +15,6 @@ import weakref
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from pathlib import Path
-from types import TracebackType
 from typing import Any, NamedTuple
 
 import jax
@@ -138,9 +137,8 @@ class Betaflight(Plant):
         self.body, self.seed = body, seed
         self.box = None if blackbox is None else fresh_folder(Path(blackbox))
         at_rest = replace(body, gyro_noise=0.0, acc_noise=0.0)  # gyros are calibrated with the motors off
-        self.firmware = Firmware(
-            find_executable(), settings_of(settings, skip), at_rest, self.box is not None
-        )
+        made = settings_of(settings, skip, has_blackbox=self.box is not None)
+        self.firmware = Firmware(find_executable(), made, at_rest)
         self._flights: dict[int, _Flight] = {}  # the least recently flown first
         self._numbers, self._lock = itertools.count(1), threading.Lock()
         self._failure: FirmwareError | None = None
@@ -151,9 +149,7 @@ class Betaflight(Plant):
     def __enter__(self) -> "Betaflight":
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self.close()
 
     def close(self) -> None:

@@ -125,14 +125,10 @@ class Firmware:
     values: every setting it has, by scope, profile and name. is_reversed: ``yaw_motors_reversed``.
     """
 
-    def __init__(self, executable: Path, settings: list[Setting], body: Body, blackbox: bool = False):
+    def __init__(self, executable: Path, settings: list[Setting], body: Body):
         self.executable = executable
         self.folder = Path(tempfile.mkdtemp(prefix="flytrack_firmware_"))
         self.process: subprocess.Popen[bytes] | None = None
-        if blackbox:
-            settings = [
-                one._replace(value="VIRTUAL") if one.name == "blackbox_device" else one for one in settings
-            ]
         self.settings = settings
         try:
             self._configure(settings)

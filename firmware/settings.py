@@ -5,38 +5,12 @@ A setting's name is that of the command line's ``set``, or ``feature NAME`` with
 
 from collections.abc import Callable, Iterable, Mapping
 from fnmatch import fnmatch
+from pathlib import Path
 from typing import NamedTuple
 
 from firmware.body import FirmwareError
 from flytrack_env.messages import quote_name
 
-# Where a dict says nothing: full sticks of 620, 620 and 120 deg/s, close to FlyTrack's drones.
-DEFAULTS = {
-    "rates_type": "ACTUAL",
-    **{f"{axis}_rc_rate": "62" for axis in ("roll", "pitch")},
-    **{f"{axis}_srate": "62" for axis in ("roll", "pitch")},
-    "yaw_rc_rate": "12",
-    "yaw_srate": "12",
-    **{f"{axis}_expo": "0" for axis in ("roll", "pitch", "yaw")},
-    "min_check": "1000",
-    "max_check": "2000",
-}
-# What the plant itself needs: it arms in any attitude and at once, and its sensors and motors are simulated.
-REQUIRED = {
-    "small_angle": "180",
-    "runaway_takeoff_prevention": "OFF",
-    "gyro_calib_duration": "50",
-    "failsafe_delay": "200",
-    "battery_meter": "ADC",
-    "vbat_scale": "110",
-    "vbat_divider": "10",
-    "vbat_multiplier": "1",
-    "blackbox_device": "NONE",
-    "motor_pwm_protocol": "PWM",
-    "gyro_1_sensor_align": "DEFAULT",
-    **{f"gyro_1_align_{axis}": "0" for axis in ("roll", "pitch", "yaw")},
-    **{f"align_board_{axis}": "0" for axis in ("roll", "pitch", "yaw")},
-}
 ARM_SWITCH = "aux 0 0 0 1700 2100 0 0"
 CHANNEL_ORDER = "map AETR1234"
 # Lines of a dump about pins, lights, radio and switches, which a simulated board has not: left out.
@@ -103,10 +77,20 @@ def parse_dump(text: str) -> list[Setting]:
     return found
 
 
-def settings_of(given: str | Mapping[str, object], skip: Iterable[str] = ()) -> list[Setting]:
+def _values_in(name: str) -> dict[str, str]:
+    """Return the settings in a file of this folder, the text of a dump, by name."""
+    return {one.name: one.value for one in parse_dump(Path(__file__).with_name(name).read_text())}
+
+
+DEFAULTS, REQUIRED = _values_in("defaults.txt"), _values_in("required.txt")
+
+
+def settings_of(
+    given: str | Mapping[str, object], skip: Iterable[str] = (), has_blackbox: bool = False
+) -> list[Setting]:
     """Return the settings to make: those given, above ``DEFAULTS`` (a dict) or the firmware's own (a dump).
 
-    ``REQUIRED`` ones come last. skip: patterns of names to leave out, ``osd_*`` say.
+    ``REQUIRED`` ones come last. skip: patterns of names to leave out, ``osd_*`` say. has_blackbox: it logs.
 
     Raises:
         FirmwareError: a dump that cannot be read, or a required setting that a dict would change.
@@ -125,7 +109,8 @@ def settings_of(given: str | Mapping[str, object], skip: Iterable[str] = ()) -> 
         one for one in made if one.name not in REQUIRED and not any(fnmatch(one.name, p) for p in skipped)
     ]
     last = made[-1] if made else Setting("", "", 0, 0)
-    return [*made, *(last._replace(name=name, value=value) for name, value in REQUIRED.items())]
+    required = REQUIRED | ({"blackbox_device": "VIRTUAL"} if has_blackbox else {})
+    return [*made, *(last._replace(name=name, value=value) for name, value in required.items())]
 
 
 def _name(text: str) -> str:

@@ -74,11 +74,8 @@ def verify(flags: Flags) -> bool:
     suite, content = load_suite(flags.suite), read_at_most(flags.verify, MOST_BYTES)
     try:
         found = json.loads(content)
-        ids, digest, hashes = (
-            list(found["tasks"]),
-            found["digest"],
-            [one["sha256"] for one in found["policies"]],
-        )
+        ids, digest = list(found["tasks"]), found["digest"]
+        hashes = [one["sha256"] for one in found["policies"]]
     except (KeyError, TypeError, ValueError) as error:
         raise SuiteError(f"{flags.verify}: not a result: {error_text(error)}") from error
     if digest != suite.digest:

@@ -101,13 +101,6 @@ PAIRS = (
 )
 
 
-def _runs(log: FlightLog) -> list[slice]:
-    """Return the rows of each run without a gap within a segment."""
-    is_gap = np.diff(log.time) > GAP_STEPS * usual_step(log)[:-1]
-    edges = np.flatnonzero(np.append(is_gap | log.is_start()[1:], True)) + 1
-    return [slice(start, end) for start, end in pairwise([0, *edges])]
-
-
 def _without_spikes(values: np.ndarray) -> np.ndarray:
     """Return values (num_rows, n) with lone ones, far from what both neighbours say, put in between these."""
     between = 0.5 * (values[:-2] + values[2:])
@@ -121,9 +114,12 @@ def _without_spikes(values: np.ndarray) -> np.ndarray:
 
 
 def _stretches(log: FlightLog, sums: np.ndarray, rates: np.ndarray) -> list[_Stretch]:
+    """Return the runs without a gap, each within a segment, that are long enough."""
     stretches, num_blocks = [], 0
-    for rows in _runs(log):
-        time = log.time[rows]
+    is_gap = np.diff(log.time) > GAP_STEPS * usual_step(log)[:-1]
+    edges = np.flatnonzero(np.append(is_gap | log.is_start()[1:], True)) + 1
+    for start, end in pairwise([0, *edges]):
+        rows, time = slice(start, end), log.time[start:end]
         is_start = (time - time[0] >= LARGEST_OFFSET_S) & (time[-1] - time >= LARGEST_OFFSET_S + WINDOW_S)
         starts = time[is_start]
         if len(starts) < 2:

@@ -21,7 +21,6 @@ from flytrack_sysid.parameters import (
     THRUST_COEFFS,
     as_float32,
     base_of,
-    from_vector,
     names_of,
     neutral_value,
     range_of,
@@ -253,7 +252,7 @@ def fit(
     intervals = _intervals(result)
     uncertainty = _map_uncertainty(result, log)
     return Fit(
-        model=as_float32(from_vector(to_vector(result.model), result.model)),
+        model=as_float32(result.model),
         estimate=result,
         intervals=intervals,
         map_uncertainty=uncertainty,

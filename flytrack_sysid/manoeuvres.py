@@ -38,11 +38,27 @@ SPIN_STICKS = (
 ACTIONS = np.linspace(-1.0, 1.0, 41)  # at which a model's thrust is looked up
 
 
+Flight = Callable[[int, float, np.random.Generator], tuple[np.ndarray, np.ndarray]]
+
+
 class Manoeuvre(NamedTuple):
     """A manoeuvre: how to fly it on a real drone, and its flights by number, for a hovering thrust."""
 
     how: str
-    flight: Callable[[int, float, np.random.Generator], tuple[np.ndarray, np.ndarray]]
+    flight: Flight
+
+
+MANOEUVRES: dict[str, Manoeuvre] = {}
+
+
+def _manoeuvre(how: str) -> Callable[[Flight], Flight]:
+    """Return a decorator that adds a function to ``MANOEUVRES``, under its name."""
+
+    def add(flight: Flight) -> Flight:
+        MANOEUVRES[flight.__name__.removeprefix("_")] = Manoeuvre(how, flight)
+        return flight
+
+    return add
 
 
 def _start(
@@ -66,10 +82,12 @@ def _swing(hover: float, size: float, rng: np.random.Generator) -> np.ndarray:
     return command
 
 
+@_manoeuvre("Hover with the nose to the north, east, south and west, a few seconds each.")
 def _headings(number: int, hover: float, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     return _start(hover, yaw_deg=90.0 * number), _swing(hover, HOVER_SWING, rng)
 
 
+@_manoeuvre("Fly straight legs at 3, 7, 11 and 15 m/s, nose first and sideways, climbing and sinking.")
 def _speeds(number: int, hover: float, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     """Return a leg along x or, every other, along y of the body; climbing and sinking by pairs."""
     speed, yaw_deg = excitation.LEG_SPEEDS[number // 2], 90.0 * rng.integers(4)
@@ -79,24 +97,28 @@ def _speeds(number: int, hover: float, rng: np.random.Generator) -> tuple[np.nda
     return _start(hover, STARTS_V[number], yaw_deg, vel_w=vel_w), _swing(hover, excitation.LEG_SWING, rng)
 
 
+@_manoeuvre("Hover and pass slowly between 0.2 and 1 m above flat ground.")
 def _low_passes(number: int, hover: float, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     vel_w = (LOW_SPEED * (number % 2), 0.0, 0.0)
     return _start(hover, vel_w=vel_w, height=LOW_HEIGHTS[number // 2]), _swing(hover, HOVER_SWING, rng)
 
 
-def _thrust(number: int, hover: float, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+@_manoeuvre("Level, throw the thrust stick between both ends, in short jabs and held for half a second.")
+def _thrust_steps(number: int, hover: float, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     command = np.zeros((excitation.FLIGHT_STEPS, 4))
     command[:, 3] = excitation.switching(rng, *((0.5, excitation.SLOW_STEPS) if number % 2 else ()))
     return _start(hover, STARTS_V[number]), command
 
 
-def _tilted(number: int, hover: float, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+@_manoeuvre("Hold the drone at 20 to 80 degrees to one side and to the other, moving thrust up and down.")
+def _thrust_tilted(number: int, hover: float, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     tilt_deg = TILTS_DEG[number // 2] * (-1.0) ** number
     start = _start(hover, STARTS_V[number], 90.0 * rng.integers(4), tilt_deg)
     return start, _swing(hover, excitation.LEG_SWING, rng)
 
 
-def _amplitudes(number: int, hover: float, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+@_manoeuvre("Give roll, pitch and yaw to both sides, at a tenth, a third, two thirds and all of the stick.")
+def _stick_amplitudes(number: int, hover: float, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     """Return roll, then pitch at one amplitude, or yaw, then all axes."""
     command = _swing(hover, HOVER_SWING, rng)
     slots = slice(excitation.SLOT_STEPS), slice(excitation.SLOT_STEPS, excitation.FLIGHT_STEPS)
@@ -107,12 +129,14 @@ def _amplitudes(number: int, hover: float, rng: np.random.Generator) -> tuple[np
     return _start(hover, STARTS_V[number]), command
 
 
-def _switching(number: int, hover: float, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+@_manoeuvre("Throw all four sticks from side to side as fast as you can, small and large.")
+def _fast_switching(number: int, hover: float, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     command = [excitation.switching(rng, hold_steps=QUICK_STEPS) for _ in range(4)]
     size = excitation.FREE_AMPLITUDES[number // 2]
     return _start(hover, STARTS_V[number]), size * np.stack(command, axis=1)
 
 
+@_manoeuvre("Turn at full stick for two seconds: flips, rolls, yaw, and yaw with a roll.")
 def _spins(number: int, hover: float, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     command = _swing(hover, HOVER_SWING, rng)
     command[:, :3] = SPIN_STICKS[number]
@@ -120,36 +144,9 @@ def _spins(number: int, hover: float, rng: np.random.Generator) -> tuple[np.ndar
     return _start(hover, STARTS_V[number], vel_w=(0.0, 0.0, climb)), command
 
 
+@_manoeuvre("Move thrust up and down about hovering, from a full pack to an empty one.")
 def _voltages(number: int, hover: float, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     return _start(hover, STARTS_V[number]), _swing(hover, VOLTAGE_SWING, rng)
-
-
-MANOEUVRES = {
-    "headings": Manoeuvre(
-        "Hover with the nose to the north, east, south and west, a few seconds each.", _headings
-    ),
-    "speeds": Manoeuvre(
-        "Fly straight legs at 3, 7, 11 and 15 m/s, nose first and sideways, climbing and sinking.", _speeds
-    ),
-    "low_passes": Manoeuvre("Hover and pass slowly between 0.2 and 1 m above flat ground.", _low_passes),
-    "thrust_steps": Manoeuvre(
-        "Level, throw the thrust stick between both ends, in short jabs and held for half a second.", _thrust
-    ),
-    "thrust_tilted": Manoeuvre(
-        "Hold the drone at 20 to 80 degrees to one side and to the other, moving thrust up and down.", _tilted
-    ),
-    "stick_amplitudes": Manoeuvre(
-        "Give roll, pitch and yaw to both sides, at a tenth, a third, two thirds and all of the stick.",
-        _amplitudes,
-    ),
-    "fast_switching": Manoeuvre(
-        "Throw all four sticks from side to side as fast as you can, small and large.", _switching
-    ),
-    "spins": Manoeuvre("Turn at full stick for two seconds: flips, rolls, yaw, and yaw with a roll.", _spins),
-    "voltages": Manoeuvre(
-        "Move thrust up and down about hovering, from a full pack to an empty one.", _voltages
-    ),
-}
 
 
 def hover_action(model: ModelParameters, voltages: tuple[float, float] = excitation.VOLTAGES) -> float:

@@ -4,9 +4,11 @@ import base64
 from collections.abc import Sequence
 from html import escape
 from pathlib import Path
+from string import Template
 from typing import NamedTuple
 
 _STYLE = "\n" + Path(__file__).with_name("page.css").read_text(encoding="utf-8")
+_PAGE = Template(Path(__file__).with_suffix(".html").read_text(encoding="utf-8"))
 
 
 class Text(NamedTuple):
@@ -92,13 +94,4 @@ def page(title: str, sections: Sequence[Section], introduction: Sequence[Part] =
         parts = "\n".join(_html_of(part) for part in section.parts)
         body.append(f"<section>\n<h2>{escape(section.heading)}</h2>\n{parts}\n</section>")
     content = "\n".join(body)
-    return f"""<!doctype html>
-<html lang="en">
-<head><meta charset="utf-8">
-<meta name="viewport" content="width=device-width, initial-scale=1">
-<title>{escape(title)}</title>
-<style>{_STYLE}</style></head>
-<body>
-{content}
-</body></html>
-"""
+    return _PAGE.substitute(title=escape(title), style=_STYLE, content=content)

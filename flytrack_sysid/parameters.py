@@ -103,8 +103,7 @@ def with_values(model: ModelParameters, values: Mapping[str, float]) -> ModelPar
         if name not in names:
             raise KeyError(f"{name}: unknown; expected of {', '.join(names)}")
         vector[names.index(name)] = value
-    leaves = jax.tree.leaves(from_vector(vector, model))
-    return jax.tree.unflatten(jax.tree.structure(model), [np.asarray(leaf) for leaf in leaves])
+    return jax.tree.map(np.asarray, from_vector(vector, model))
 
 
 def with_neutral_effects(model: ModelParameters, effects: Iterable[str]) -> ModelParameters:

@@ -13,7 +13,6 @@ from flytrack_env.pictures.drawing import new_figure, plain
 from flytrack_env.scene import BLUE, GREEN, GREY, ORANGE
 from flytrack_sysid.prediction_errors import ThrustError
 from flytrack_sysid.steps import AXES, StepResponse
-from flytrack_sysid.validate import Validation
 
 png_of = partial(drawing.png_of, dpi=150)
 WIDTH_IN, EMPTY_HEIGHT_IN = 7.0, 1.2
@@ -92,8 +91,3 @@ def draw_thrust(thrust: ThrustError | None) -> Figure:
     heat.set_title("mean error; grey: not flown", fontsize="medium", loc="left")
     heat.set(xlabel="applied thrust action (stick, after the lag)", ylabel="battery (V)")
     return figure
-
-
-def draw_validation(validation: Validation) -> dict[str, Figure]:
-    """Return all figures of a validation by name."""
-    return {"steps": draw_steps(validation.steps), "thrust": draw_thrust(validation.thrust)}

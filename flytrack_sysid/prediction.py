@@ -106,7 +106,7 @@ def _step_from_every_row(
     def observe(step: Step, _: None) -> tuple[Any, ...]:
         return step.before, step.memories, step.after, step.moved.context.force_b
 
-    return replay(model, record, "measured", gyro_b, observe)
+    return replay(model, record, gyro_b, observe, is_gyro_fed=True)
 
 
 def predict(model: ModelParameters, filled: Filled) -> Prediction:

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.scipy.spatial.transform import Rotation
 
 from flytrack_env.dynamics import ModelParameters, advance, body_rates, observe_rates, read_gyro
 from flytrack_env.effects import MOST_STEPS, ImuLatency, at_row, start_memories
@@ -29,7 +30,6 @@ UNITS = {"attitude": "rad", "rates": "rad/s", "velocity": "m/s", "position": "m"
 # Windows come in multiples of so many: logs of one rate share one compiled program.
 CHUNK = 128
 BLOCK_S = 2.0
-NO_TURN = 1e-16  # rad^2
 
 
 class Windows(NamedTuple):
@@ -130,13 +130,7 @@ def _turn(measured: Quaternion, predicted: Quaternion) -> jax.Array:
     """Return the rotation vector from a predicted to a measured attitude, body frame, rad."""
     inverse = Quaternion(predicted.w, -predicted.x, -predicted.y, -predicted.z)
     turn = inverse.multiply(measured)
-    sign = jnp.where(turn.w < 0.0, -1.0, 1.0)
-    vector = sign * jnp.stack([turn.x, turn.y, turn.z])
-    square = jnp.sum(vector**2)
-    is_small = square < NO_TURN
-    sine = jnp.sqrt(jnp.where(is_small, 1.0, square))
-    angle = 2.0 * jnp.arctan2(sine, sign * turn.w)
-    return vector * jnp.where(is_small, 2.0, angle / sine)
+    return Rotation.from_quat(jnp.stack([turn.x, turn.y, turn.z, turn.w])).as_rotvec()
 
 
 def _gyro_in_time(

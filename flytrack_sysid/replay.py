@@ -7,22 +7,17 @@ commands, which are known exactly. The fit, the validation and the diagnosis all
 
 from collections.abc import Callable
 from functools import partial
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from flytrack_env.dynamics import ModelParameters, Moved, body_rates, move, start_rates
+from flytrack_env.dynamics import ModelParameters, Moved, body_rates, move
 from flytrack_env.effects import MOST_STEPS, at_row, start_memories
 from flytrack_env.quaternion import Quaternion, Vec3
 from flytrack_env.state import Action, Drone
 from flytrack_sysid.record import Record
-
-# Where body rates come from. "commanded": a flight starts with the rates that its applied action has settled
-# to. "gyro": a flight starts with the gyro's rates, or without a gyro with those of the sticks. "measured":
-# every step starts with the gyro's rates.
-RateSource = Literal["commanded", "gyro", "measured"]
 
 
 class Step(NamedTuple):
@@ -63,30 +58,25 @@ def measured_drone(row: Record, applied: Action, rates_b: Vec3) -> Drone:
 def replay(
     model: ModelParameters,
     record: Record,
-    rate_source: RateSource,
     gyro_b: jax.Array | np.ndarray | None,
     observe: Callable[[Step, Any], Any],
     extras: Any = None,
+    is_gyro_fed: bool = False,
 ) -> Any:
     """Return what ``observe`` makes of the model's step from every row; differentiable in the model.
 
-    gyro_b: (num_rows, 3) rad/s, needed by the source "measured". observe: called with a step and the row's
-    part of ``extras``, a tree of leaves (num_rows, ...). In float64 inside ``jax.enable_x64(True)``.
+    gyro_b: (num_rows, 3) rad/s, with which a flight starts, or every step if ``is_gyro_fed``; without a gyro
+    a flight starts with the rates of the sticks. observe: called with a step and the row's part of
+    ``extras``, a tree of leaves (num_rows, ...). In float64 inside ``jax.enable_x64(True)``.
     """
-
-    def initial_rates(gyro: Any, drone: Drone) -> Vec3:
-        if rate_source == "commanded":
-            return start_rates(drone, model)
-        return body_rates(drone.applied, model.max_rate) if gyro is None else Vec3(*gyro)
 
     def next_row(carry: tuple[Any, ...], inputs: tuple[Any, ...]) -> tuple[Any, Any]:
         row, gyro, extra = inputs
         applied, rates_b, memories = carry
         applied = where_true(row.begins | row.is_applied_known, Action(*row.applied), applied)
+        first_b = body_rates(applied, model.max_rate) if gyro is None else Vec3(*gyro)
+        rates_b = first_b if is_gyro_fed else where_true(row.begins, first_b, rates_b)
         before = measured_drone(row, applied, rates_b)
-        initial = initial_rates(gyro, before)
-        rates_b = initial if rate_source == "measured" else where_true(row.begins, initial, rates_b)
-        before = before._replace(rates_b=rates_b)
         # As logged, which it is where a flight begins: past commands then depend on no model of a batch.
         begun = before._replace(applied=Action(*row.applied))
         memories = where_true(row.begins, start_memories(model.effects, begun, MOST_STEPS), memories)

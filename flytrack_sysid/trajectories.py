@@ -19,7 +19,7 @@ from flytrack_sysid.diagnosis.traces import Traces, traces
 from flytrack_sysid.log import IN_STATE, FlightLog, time_in_line
 from flytrack_sysid.parameters import with_neutral_effects
 from flytrack_sysid.prediction import FLOWN, LONGEST_S, Prediction, free_flights, inputs_that_lack, predict
-from flytrack_sysid.record import Filled, fill_gaps
+from flytrack_sysid.record import fill_gaps
 
 WINDOW_S = 0.1  # of means: long enough for noise to average out, short beside a manoeuvre
 RESTART_S = 1.0  # of free flight: the horizon of the report's first sentence
@@ -84,12 +84,12 @@ def position_of(log: FlightLog) -> tuple[np.ndarray, str]:
 
 
 def states_of(channels: Mapping[str, np.ndarray]) -> np.ndarray:
-    """Return channels of a log as states with unit quaternions, (num_rows, 21); NaN where one is absent."""
-    states = np.full((len(next(iter(channels.values()))), STATE_SIZE), np.nan)
+    """Return channels, (..., size), as states with unit quaternions, (..., 21); NaN where one is absent."""
+    states = np.full((*next(iter(channels.values())).shape[:-1], STATE_SIZE), np.nan)
     for name in IN_STATE.keys() & channels.keys():
-        states[:, IN_STATE[name]] = channels[name]
+        states[..., IN_STATE[name]] = channels[name]
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):  # a model may diverge
-        states[:, QUATERNION] /= np.linalg.norm(states[:, QUATERNION], axis=1, keepdims=True)
+        states[..., QUATERNION] /= np.linalg.norm(states[..., QUATERNION], axis=-1, keepdims=True)
     return states
 
 
@@ -147,55 +147,42 @@ def _starts_and_ends(prediction: Prediction) -> tuple[np.ndarray, np.ndarray]:
     return np.concatenate(starts), np.concatenate(ends)
 
 
-def _shown_of(
-    filled: Filled, start: int, end: int, flown: Mapping[str, np.ndarray], every: int
-) -> tuple[np.ndarray, np.ndarray, bool]:
-    """Return rows of the log, (n,) int, a free flight's states there, (n, 21), and whether it diverges.
-
-    Measured rows before ``end``, until it diverges. flown: p, v, q, w at the rows after the start.
-    """
-    rows = start + np.arange(min(end - start, 1 + len(flown["p"])))
-    measured = {name: filled.log[name][start : start + 1] for name in FLOWN if name in filled.log}
-    after = {name: flown[name][: len(rows) - 1] for name in FLOWN}
-    states = np.concatenate([states_of(measured), states_of(after)])
-    with np.errstate(over="ignore", invalid="ignore"):
-        away_m = np.linalg.norm(states[:, POSITION] - filled.log["p"][rows], axis=1)
-    is_finite = np.all([np.isfinite(states[:, IN_STATE[name]]).all(axis=1) for name in FLOWN], axis=0)
-    is_near = is_finite & (away_m < AWAY_M)
-    is_near[0] = True
-    count = len(rows) if is_near.all() else int(np.argmin(is_near))
-    shown = np.flatnonzero(filled.source_row[rows[:count]] >= 0)
-    shown = shown[shown % every == 0]
-    return filled.source_row[rows[shown]], states[shown], count < len(rows)
-
-
 def _free_flight(timed: _Timed, name: str, model: ModelParameters) -> Trajectory | None:
     """Return a model's free flight, anew every second; None where the log lacks what it starts from."""
     model = with_neutral_effects(model, BY_NAME)  # so that one program flies all models
     if inputs_that_lack(model, timed.log)["p"]:
         return None
     filled = fill_gaps(timed.log)
-    prediction = predict(model, filled)
+    log, prediction = filled.log, predict(model, filled)
     starts, ends = _starts_and_ends(prediction)
-    since_start = np.arange(1, 1 + int(np.ceil(LONGEST_S / prediction.step_s)))
-    flown = free_flights(prediction, starts, starts[:, None] + since_start)
-    pieces = []
-    for number, (start, end) in enumerate(zip(starts, ends, strict=True)):
-        one = {channel: values[number] for channel, values in flown.items()}
-        pieces.append(_shown_of(filled, start, end, one, timed.every))
-    if pieces and pieces[0][0][0] > 0:  # begin with the log's first row, so that all have one clock
-        first = states_of({channel: timed.log[channel][:1] for channel in FLOWN if channel in timed.log})
-        pieces.insert(0, (np.zeros(1, int), first, False))
-    if not pieces:
+    if not len(starts):
         return None
-    rows, states, has_diverged = zip(*pieces, strict=True)
-    all_rows = np.concatenate(rows)
+    steps = np.arange(1 + int(np.ceil(LONGEST_S / prediction.step_s)))
+    rows = starts[:, None] + steps
+    flown = free_flights(prediction, starts, rows[:, 1:])
+    begun = {channel: log[channel][starts[:, None]] for channel in FLOWN if channel in log}
+    states = np.concatenate([states_of(begun), states_of(flown)], axis=1)
+    is_before, rows = rows < ends[:, None], np.minimum(rows, len(log) - 1)
+    with np.errstate(over="ignore", invalid="ignore"):
+        away_m = np.linalg.norm(states[..., POSITION] - log["p"][rows], axis=-1)
+    is_finite = np.all([np.isfinite(states[..., IN_STATE[one]]).all(axis=-1) for one in FLOWN], axis=0)
+    is_near = is_finite & (away_m < AWAY_M)
+    is_near[:, 0] = True
+    num_diverged = int((is_before & ~is_near).any(axis=1).sum())
+    # Measured rows, until the next start or until it diverges.
+    is_shown = is_before & np.logical_and.accumulate(is_near, axis=1) & (filled.source_row[rows] >= 0)
+    is_shown &= steps % timed.every == 0
+    shown, states, restarts = filled.source_row[rows[is_shown]], states[is_shown], is_shown.nonzero()[1] == 0
+    if shown[0] > 0:  # begin with the log's first row, so that all have one clock
+        first = states_of({channel: timed.log[channel][:1] for channel in FLOWN if channel in timed.log})
+        shown, restarts = np.append(0, shown), np.append(True, restarts)
+        states = np.concatenate([first, states])
     return Trajectory(
         name=name,
-        states=np.concatenate(states),
-        actions=np.full((len(all_rows), ACTION_SIZE), np.nan),  # the log's: one line would hide another
-        time_s=timed.time_s[all_rows],
+        states=states,
+        actions=np.full((len(shown), ACTION_SIZE), np.nan),  # the log's: one line would hide another
+        time_s=timed.time_s[shown],
         ended=f"the log ends; anew every {RESTART_S:g} s"
-        + (f"; diverged {sum(has_diverged)} times" if any(has_diverged) else ""),
-        restarts=np.concatenate([np.arange(len(own)) == 0 for own in rows]),
+        + (f"; diverged {num_diverged} times" if num_diverged else ""),
+        restarts=restarts,
     )

@@ -10,7 +10,7 @@ import numpy as np
 from flytrack_env.files import write_atomically
 from flytrack_sysid.log import FlightLog
 from flytrack_sysid.page import Bullets, Picture, Section, Table, Text, page
-from flytrack_sysid.plots import draw_validation, png_of
+from flytrack_sysid.plots import draw_steps, draw_thrust, png_of
 from flytrack_sysid.prediction_errors import (
     NORMALISED_BY,
     NRMSE_MEANING,
@@ -141,7 +141,8 @@ def write_validation(out: str | Path, validation: Validation, model_name: str, l
 
     Everything is computed before the first file is written.
     """
-    pictures = {name: png_of(figure) for name, figure in draw_validation(validation).items()}
+    figures = {"steps": draw_steps(validation.steps), "thrust": draw_thrust(validation.thrust)}
+    pictures = {name: png_of(figure) for name, figure in figures.items()}
     numbers = {"model": model_name, "log": log.source, "log_sha256": log.sha256, **validation.as_json()}
     document = json.dumps(numbers, indent=1, allow_nan=False) + "\n"
     files = {

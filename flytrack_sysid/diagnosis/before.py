@@ -252,14 +252,17 @@ def is_large(candidate: Candidate, change: np.ndarray, later: Estimate) -> bool:
 
 
 def selection_of(later: Estimate, earlier: Estimate) -> Selection:
-    """Return the model of the log after as selected, with what is unexplained in it alone."""
+    """Return the model of the log after as selected; unexplained: what was not, or much less, before."""
     state, model = later.state, later.model
     ablations = {name: ablate(state, model, later.linearization, name) for name in sorted(model.effects)}
     ablations = {one.effect: ablations[one.effect] for one in model.candidates}
     rest, past = (
-        find_unexplained(one.state.problem, one.model, one.base.vector)[0] for one in (later, earlier)
+        find_unexplained(one.state.problem, one.model, one.base.vector)[0].shares for one in (later, earlier)
     )
-    return Selection(state, later.base, model, ablations, newly_unexplained(rest, past))
+    most = max(past.values(), default=0.0)
+    shares = {name: size for name, size in rest.items() if size > WORSE * past.get(name, most)}
+    names = tuple(dict.fromkeys(name.split(": ", 1)[1] for name in shares))
+    return Selection(state, later.base, model, ablations, Unexplained(bool(shares), names, shares))
 
 
 def change_between(later: Estimate, earlier: Estimate, fields: Sequence[str]) -> Change:
@@ -293,7 +296,12 @@ def changed_values(
     change = change_between(later, earlier, fields)
     places, vector = problem.index(fields), problem.start.copy()
     vector[places] += change.size
-    factor = mean_thrust_change(later, earlier, vector) if tuple(fields) == THRUST_COEFFS else {}
+    factor: dict[str, Estimated] = {}  # by which the mean thrust changed
+    if tuple(fields) == THRUST_COEFFS:
+        ways = mean_thrust(problem)[None]
+        margins = [Marginal(one.linearization, one.model, fields) for one in (later, earlier)]
+        half_n = float(np.hypot(*(one.half_widths(ways)[0] for one in margins)))
+        factor = mean_factor(problem, vector, half_n)
     is_clear = np.any(np.abs(change.size) > change.half) and change.chi2 > threshold(len(fields))
     is_clear |= any(not one.ci95[0] <= 1.0 <= one.ci95[1] for one in factor.values())
     if not is_clear or not is_notable(name, problem, vector):
@@ -306,21 +314,3 @@ def changed_values(
     if factor:
         values |= {"factor": factor["mean_factor"]} if name == "thrust_scale" else factor
     return values
-
-
-def mean_thrust_change(later: Estimate, earlier: Estimate, vector: np.ndarray) -> dict[str, Estimated]:
-    """Return by which factor the mean thrust changed, with its interval; vector: a model changed so."""
-    problem = later.state.problem
-    margins = [Marginal(one.linearization, one.model, THRUST_COEFFS) for one in (later, earlier)]
-    half_n = float(np.hypot(*(one.half_widths(mean_thrust(problem)[None])[0] for one in margins)))
-    return mean_factor(problem, vector, half_n)
-
-
-def newly_unexplained(after: Unexplained, before: Unexplained) -> Unexplained:
-    """Return what is left unexplained after, and was not, or much less, before."""
-    most = max(before.shares.values(), default=0.0)
-    shares = {
-        name: size for name, size in after.shares.items() if size > WORSE * before.shares.get(name, most)
-    }
-    names = tuple(dict.fromkeys(name.split(": ", 1)[1] for name in shares))
-    return Unexplained(bool(shares), names, shares)

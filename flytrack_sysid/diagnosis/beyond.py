@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -10,39 +11,12 @@ from flytrack_env.dynamics import ModelParameters
 from flytrack_env.effects import LearnedLaw, LearnedResidual
 from flytrack_env.effects.grammar import Law, Term
 from flytrack_env.effects.learned_residual import Networks
+from flytrack_env.toml_file import parse_toml, read_text
 
-# What a law may be, by the quantity that says most.
-MAY_BE = {
-    "position": "a thermal or a draught at that place",
-    "time": "something that warms up, wears or comes loose",
-    "heading": "a cable, or a field that the sensors feel",
-    "airspeed": "drag of a body or a resonance that the list has no law for",
-    "airspeed_x": "blades that flap, or pressure off the centre of mass",
-    "airspeed_y": "blades that flap, or pressure off the centre of mass",
-    "airspeed_z": "inflow through the rotors",
-    "edgewise": "thrust that changes with the advance ratio",
-    "thrust": "a motor or rotor law that the list does not have",
-    "tilt": "air that recirculates, or a load that shifts",
-    "height": "air that changes with height",
-    "load": "a load that swings on a string",
-    "voltage": "a motor law that the list does not have",
-    **dict.fromkeys(("rate_x", "rate_y", "rate_z"), "gyroscopic or inertial coupling"),
-    **dict.fromkeys(("roll", "pitch", "yaw"), "a stick's curve that the list does not have"),
-    "throttle": "a motor or rotor law that the list does not have",
-}
+# What a law may be, and what to draw a quantity as.
+_WORDS = parse_toml(read_text(Path(__file__).with_suffix(".toml")))
+MAY_BE, DRAWN_AS = _WORDS["may_be"], _WORDS["drawn_as"]
 LAST = ("thrust", "throttle", "airspeed")  # say least of a product
-# What to draw a quantity as, by the names of ``traces.REGRESSORS``; others as time.
-DRAWN_AS = {
-    "edgewise": "airspeed_xy",
-    "thrust": "model_force_z",
-    "throttle": "applied_thrust",
-    "heading_cosine": "heading",
-    "heading_sine": "heading",
-    **{f"airspeed_{axis}": f"airspeed_{axis}" for axis in "xyz"},
-    **{f"rate_{axis}": f"model_rates_{axis}" for axis in "xyz"},
-    **{stick: f"applied_{stick}" for stick in ("roll", "pitch", "yaw")},
-    **{name: name for name in ("airspeed", "heading", "height", "tilt", "voltage")},
-}
 
 
 @dataclass(frozen=True)

@@ -15,9 +15,9 @@ from flytrack_sysid.diagnosis import summary
 from flytrack_sysid.diagnosis.beyond import with_and_without, with_learned
 from flytrack_sysid.diagnosis.lanes import Lanes, lanes_of, thinned, voltages_of
 from flytrack_sysid.diagnosis.late_poses import with_late_poses
-from flytrack_sysid.diagnosis.lateness import judged_as_logged, latency_of, read_poses
+from flytrack_sysid.diagnosis.lateness import read_poses
 from flytrack_sysid.diagnosis.learned import find_learned
-from flytrack_sysid.diagnosis.motion_choice import Moves, how_it_moves, likelier_motion
+from flytrack_sysid.diagnosis.motion_choice import Moves, how_it_moves, likelier_motion, problem_of
 from flytrack_sysid.diagnosis.onset import at_end, first_row_as_at_end, notes_of, spans_of, with_changes
 from flytrack_sysid.diagnosis.outliers import outlier_notes, outliers_of
 from flytrack_sysid.diagnosis.problem import Problem
@@ -95,11 +95,8 @@ def diagnose(
         report(3, len(STAGES))
         found = summarize(judged, parts._replace(test=test))
         nominal = nominal_parameters() if model is None else model
-        nominal = nominal._replace(motion=found.extended.motion)
-        found = replace(found, nominal=nominal)
-        if parts.as_logged or latency_of(nominal):
-            problems = selection.state.problem, test
-            found = with_late_poses(found, parts.moves, nominal, problems, parts.as_logged)
+        found = replace(found, nominal=nominal._replace(motion=found.extended.motion))
+        found = with_late_poses(found, parts.moves, (selection.state.problem, test), parts.as_logged)
         report(4, len(STAGES))
     return found
 
@@ -147,20 +144,9 @@ def split(
     return Split(logged, with_motion, corrected, out, train, test, as_logged, tuple(warnings))
 
 
-def problem_of(
-    lanes: Lanes, corrected: FlightLog, logged: FlightLog, model: ModelParameters, late_s: float
-) -> Problem:
-    """Return the problem of lanes of a corrected log, whose poses were logged late."""
-    if not late_s:
-        return Problem.of(lanes, model)
-    lanes, late = judged_as_logged(lanes, corrected, logged, late_s, model.motion)
-    return Problem.of(lanes, model, late=late)
-
-
 def held_out_under(selection: Selection, test: Problem) -> Problem:
     """Return the problem of held-out rows with a selection's noise, and its effects when they act."""
     problem = selection.state.problem
-    assert problem.noise is not None
     return replace(test.with_noise(problem.noise), windows=problem.windows)
 
 

@@ -1,6 +1,7 @@
 """What each cause is in plain words, and the plot that shows it: a residual against a regressor."""
 
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -9,10 +10,11 @@ from matplotlib.figure import Figure
 from flytrack_env.dynamics import ModelParameters
 from flytrack_env.effects import ThrustScale
 from flytrack_env.pictures.drawing import new_figure, plain
+from flytrack_env.toml_file import parse_toml, read_text
 from flytrack_sysid.diagnosis.result import DRIFT
 from flytrack_sysid.diagnosis.score_test import BASE_CAUSES
 from flytrack_sysid.diagnosis.traces import REGRESSORS, UNITS, Traces
-from flytrack_sysid.parameters import STICKS, names_of, to_vector, with_values
+from flytrack_sysid.parameters import names_of, to_vector, with_values
 from flytrack_sysid.plots import BLUE, GREY, ORANGE, say
 
 WIDTH_IN, ROW_IN, LEGEND_IN = 8.0, 2.5, 0.9
@@ -46,139 +48,19 @@ class Evidence(NamedTuple):
     reading: str
 
 
-def _by_axis(residual: str, regressor: str, axes: str = "xyz") -> tuple[Panel, ...]:
-    return tuple(Panel(f"{residual}_{axis}", f"{regressor}_{axis}") for axis in axes)
+def _read_evidence() -> dict[str, Evidence]:
+    """Return the evidence of causes by name, as ``evidence.toml`` has it."""
+    rows: dict[str, dict[str, Any]] = {}
+    found = {}
+    for name, own in parse_toml(read_text(Path(__file__).with_suffix(".toml"))).items():
+        rows[name] = row = rows.get(own.get("like", ""), {}) | own
+        plots = [plot.replace("*", axis) for plot in row["plots"] for axis in ("xyz" if "*" in plot else "x")]
+        panels = tuple(Panel(*plot.split(" over ")) for plot in plots)
+        found[name] = Evidence(row["words"], panels, row["reading"])
+    return found
 
 
-def _each(residual: str, regressor: str, axes: str = "xyz") -> tuple[Panel, ...]:
-    return tuple(Panel(f"{residual}_{axis}", regressor) for axis in axes)
-
-
-_TURNS = _by_axis("rates", "spin_up")
-_LATE = (*_TURNS[:2], Panel("force_z", "thrust_change"))
-_LATE_READING = "The error grows with how fast the demand changes: the drone answers earlier or later."
-_BY_STICK = tuple(
-    Panel(f"rates_{axis}", f"applied_{stick}") for axis, stick in zip("xyz", STICKS[:3], strict=True)
-)
-_BY_AIRSPEED = _by_axis("force", "airspeed")
-_GYRO = _by_axis("rates", "model_rates") + _by_axis("attitude", "model_rates")
-_GYRO_READING = "It shows in the gyro (above) and not in the turn of the attitude (below)."
-_ACCELEROMETER = _by_axis("force", "model_force") + _by_axis("velocity", "model_force")
-_ACCELEROMETER_READING = "It shows in the accelerometer (above) and not in the change of velocity (below)."
-
-EVIDENCE: dict[str, Evidence] = {
-    "command_delay": Evidence("delay of all commands", _LATE, _LATE_READING),
-    "thrust_lag_asymmetry": Evidence(
-        "different lags of rising and falling thrust",
-        _LATE[2:],
-        "The slope where thrust rises differs from that where it falls.",
-    ),
-    **{
-        f"{name}_rates": Evidence(f"{label} rates", _BY_STICK, "The error vanishes at centre and full stick.")
-        for name, label in (("actual", "Actual"), ("betaflight", "Betaflight's own"), ("quick", "Quick"))
-    },
-    "rate_expo": Evidence("stick expo", _BY_STICK, "The error bends back to nothing at full stick."),
-    "rate_scale": Evidence(
-        "scale of the body rates", _BY_STICK, "The error grows in proportion to the stick."
-    ),
-    "rate_saturation": Evidence(
-        "saturation of the body rates", _BY_STICK, "No error near the centre, a steep rise."
-    ),
-    "yaw_reaction": Evidence(
-        "yaw reaction to thrust changes",
-        (Panel("rates_z", "thrust_change"),),
-        "The yaw rate is off in proportion to how fast the thrust changes.",
-    ),
-    "motor_imbalance": Evidence(
-        "motor imbalance",
-        _each("rates", "model_force_z", "xy"),
-        "The error of the rate grows with thrust, whatever the sticks do.",
-    ),
-    "rate_cross_coupling": Evidence(
-        "coupling of roll and pitch into yaw",
-        (Panel("rates_z", "model_rates_x"), Panel("rates_z", "model_rates_y")),
-        "The yaw rate is off in proportion to the rates about the other axes.",
-    ),
-    "second_order_rates": Evidence("second-order lag of the rate loop", _TURNS, _LATE_READING),
-    "betaflight_loop": Evidence("gains, filters or motors of Betaflight's loop", _TURNS, _LATE_READING),
-    "rate_slew_limit": Evidence(
-        "limit on the change of body rates",
-        _by_axis("rates", "spin_up"),
-        "No error at gentle demands; beyond the limit it grows with the demand.",
-    ),
-    "wind": Evidence(
-        "steady wind",
-        _each("force_world", "heading"),
-        "The push keeps its direction in the world, whatever the heading.",
-    ),
-    "thrust_scale": Evidence(
-        "thrust or your mass",
-        (Panel("force_z", "model_force_z"),),
-        "The error grows in proportion to thrust.",
-    ),
-    "translational_lift": Evidence(
-        "translational lift",
-        (Panel("force_z", "airspeed_xy"),),
-        "The error along the thrust axis grows with airspeed in the rotor plane and levels off.",
-    ),
-    "ground_effect": Evidence(
-        "ground effect", (Panel("force_z", "height"),), "The error appears only near the ground."
-    ),
-    "linear_drag": Evidence(
-        "drag in proportion to airspeed", _BY_AIRSPEED, "A force against the motion, on a straight line."
-    ),
-    "quadratic_drag": Evidence(
-        "drag with the square of airspeed",
-        _BY_AIRSPEED,
-        "A force against the motion that bends: slow flight hides it.",
-    ),
-    "rotor_drag": Evidence(
-        "rotor drag", _by_axis("force", "airspeed", "xy"), "A force against the motion in the rotor plane."
-    ),
-    "thrust_tilt": Evidence(
-        "tilt of the thrust axis",
-        _each("force", "model_force_z", "xy"),
-        "A sideways force in proportion to thrust.",
-    ),
-    "voltage_sag": Evidence(
-        "battery sag under load",
-        (Panel("battery", "applied_thrust"),),
-        "The voltage falls with thrust and comes back.",
-    ),
-    "imu_latency": Evidence(
-        "latency of gyro and accelerometer",
-        _by_axis("rates", "spin_up", "xy") + _by_axis("attitude", "spin_up", "xy"),
-        "The gyro lags behind (above), as the accelerometer does; the attitude does not (below).",
-    ),
-    "mocap_latency": Evidence(
-        "latency of motion capture",
-        _by_axis("attitude", "spin_up", "xy") + _by_axis("rates", "spin_up", "xy"),
-        "The attitude lags behind (above), as position and velocity do; the gyro does not (below).",
-    ),
-    "imu_offset": Evidence(
-        "accelerometer away from the centre of mass",
-        _by_axis("force", "turning"),
-        "The error grows with the square of the body rates.",
-    ),
-    "accelerometer_scale": Evidence("scale of the accelerometer", _ACCELEROMETER, _ACCELEROMETER_READING),
-    "accelerometer_bias": Evidence("offset of the accelerometer", _ACCELEROMETER, _ACCELEROMETER_READING),
-    "gyro_scale": Evidence("scale of the gyro", _GYRO, _GYRO_READING),
-    "gyro_bias": Evidence("offset of the gyro", _GYRO, _GYRO_READING),
-    "tau_roll": Evidence("lag of roll", _TURNS[:1], _LATE_READING),
-    "tau_pitch": Evidence("lag of pitch", _TURNS[1:2], _LATE_READING),
-    "tau_yaw": Evidence("lag of yaw", _TURNS[2:], _LATE_READING),
-    "tau_thrust": Evidence("lag of thrust", _LATE[2:], _LATE_READING),
-    "thrust_curve": Evidence(
-        "thrust curve",
-        (Panel("force_z", "applied_thrust"),),
-        "The error along the thrust axis follows the thrust action.",
-    ),
-    "battery_drain": Evidence(
-        "battery drain",
-        (Panel("battery", "time"),),
-        "The voltage drifts away from the model's, evenly in time.",
-    ),
-}
+EVIDENCE = _read_evidence()
 
 
 def without(extended: ModelParameters, nominal: ModelParameters, cause: str) -> ModelParameters:

@@ -58,11 +58,18 @@ def _typical_candidate(effect: str) -> Candidate:
     return min(candidates_of(BY_NAME[effect]), key=distance)
 
 
-class Visibility:
-    """How well a log shows an effect: noncentrality of each of its parameters at its notable size."""
+class Question:
+    """How well a log shows an effect, also beside effects that look alike.
 
-    def __init__(self, linearization: Linearization, given: list[int], effect: str):
-        self.linearization, self.given, self.effect = linearization, given, effect
+    linearization: the log's, at the fitted model, along everything (``SearchState.linearized``). fields: the
+    effect's parameters, columns: theirs in the linearization, sizes: notable ones, in steps along these.
+    """
+
+    def __init__(
+        self, linearization: Linearization, model: FittedModel, effect: str, alike: Iterable[str] = ()
+    ):
+        self.linearization, self.effect = linearization, effect
+        self.given = linearization.columns_at(model.places)
         way, shapes = _typical_candidate(effect), BY_NAME[effect].shapes
         notable = BY_NAME[effect].notable
         fields = [field for field in way.other_fields if field.split(".")[1] not in shapes]
@@ -71,21 +78,33 @@ class Visibility:
         self.fields = [*(one.field for one in way.probes), *fields]
         ways = np.array([*(one.value for one in way.probes), *np.ones(len(fields))])
         self.sizes = np.array([notable[field.split(".")[1]] for field in self.fields]) / ways
+        self.alike = [Question(linearization, model, other).columns for other in alike]
 
-    def of(self, effect: str) -> "Visibility":
-        """Return the same of another effect."""
-        return Visibility(self.linearization, self.given, effect)
+    def noncentralities(
+        self, beside: Sequence[int] = (), information: np.ndarray | float = 0.0
+    ) -> np.ndarray:
+        """Return the noncentrality of each parameter at its notable size.
 
-    def noncentralities(self, beside: Sequence[int] = ()) -> np.ndarray:
-        """Return the noncentrality of each parameter, all that is free and ``beside`` projected out."""
+        All that is free and ``beside`` are projected out. information: added to the log's.
+        """
+        line = copy.copy(self.linearization)
+        line.total = line.total + information
         given = self.given + [column for column in beside if column not in self.given]
         found = np.zeros(len(self.columns))
         for number, column in enumerate(self.columns):
-            others = [one for one in given if one != column]
-            own = self.linearization.projected([column], others)[0][0, 0]
-            own -= self.linearization.prior[column]  # which does not come from the log
+            own = line.projected([column], [one for one in given if one != column])[0][0, 0]
+            own -= line.prior[column]  # which does not come from the log
             found[number] = max(float(own), 0.0) * self.sizes[number] ** 2
         return found
+
+    def shares(self, information: np.ndarray | float = 0.0) -> np.ndarray:
+        """Return how well the effect would show at its notable size, the worst first; from 1 on it does.
+
+        Noncentrality of each of its parameters over DETECTED, and beside each look-alike over SEPARATE.
+        information: added to the log's.
+        """
+        beside = [self.noncentralities(columns, information) / SEPARATE for columns in self.alike]
+        return np.sort(np.concatenate([self.noncentralities((), information) / DETECTED, *beside]))
 
 
 def unit_of(effect: str, field: str | None = None) -> str:
@@ -100,7 +119,6 @@ def unseen_effects(
 
     Sizes are infinite where no size would show.
     """
-    given = linearization.columns_at(model.places)
     result: dict[str, NotIdentifiable] = {}
     for effect in (one.name for one in SEARCHED):
         if effect in model.effects or effect in BASE_ONLY:
@@ -108,28 +126,28 @@ def unseen_effects(
         if effect in state.unobservable:
             result[effect] = NotIdentifiable(effect, float("inf"), unit_of(effect), (), "")
             continue
-        visible = Visibility(linearization, given, effect)
-        sizes = visible.noncentralities()
+        question = Question(linearization, model, effect)
+        sizes = question.noncentralities()
         worst = int(np.argmin(sizes))
         if sizes[worst] >= DETECTED:
             continue
-        field = visible.fields[worst].split(".")[1]
+        field = question.fields[worst].split(".")[1]
         smallest = float("inf")
         if sizes[worst] > DETECTED * ROUNDING:
             smallest = float(BY_NAME[effect].notable[field] * np.sqrt(DETECTED / sizes[worst]))
-        alike = _look_alikes(state, visible) if sizes[worst] > 0.0 else ()
+        alike = _look_alikes(state, model, question) if sizes[worst] > 0.0 else ()
         result[effect] = NotIdentifiable(effect, smallest, unit_of(effect, field), alike, "")
     return result
 
 
-def _look_alikes(state: SearchState, visible: Visibility) -> tuple[str, ...]:
+def _look_alikes(state: SearchState, model: FittedModel, question: Question) -> tuple[str, ...]:
     """Return effects beside which this one hardly shows any more."""
-    sizes = visible.noncentralities()
+    sizes = question.noncentralities()
     result = []
     for other in SEARCHED:
-        if other.name in (visible.effect, *BASE_ONLY, *state.unobservable):
+        if other.name in (question.effect, *BASE_ONLY, *state.unobservable):
             continue
-        beside = visible.noncentralities(visible.of(other.name).columns)
+        beside = question.noncentralities(Question(question.linearization, model, other.name).columns)
         if np.any((beside < SEPARATE) & (beside < LOOKS_ALIKE * sizes)):
             result.append(other.name)
     return tuple(result)
@@ -205,7 +223,6 @@ def information_of_manoeuvres(
     Fisher information at the fitted model, with the noise and the channels of the problem's log;
     eight flights of 2.5 s each. 0 for other columns. Inside ``jax.enable_x64(True)``.
     """
-    assert problem.noise is not None
     columns = sorted(set(columns))
     log, counts = _seen_flights(problem, model.vector)
     lanes = make_lanes(log, counts, model.vector[problem.index(TAUS)], float(problem.like.g))
@@ -220,38 +237,6 @@ def information_of_manoeuvres(
         result[name] = np.zeros_like(linearization.total)
         result[name][np.ix_(columns, columns)] = own.sum(axis=0)
     return result
-
-
-class Question:
-    """An effect that a log did not show, or not beside those that look alike.
-
-    linearization: the log's, at the fitted model, along everything (``SearchState.linearized``).
-    """
-
-    def __init__(
-        self, linearization: Linearization, model: FittedModel, effect: str, alike: Iterable[str] = ()
-    ):
-        self.effect = effect
-        self.visible = Visibility(linearization, linearization.columns_at(model.places), effect)
-        self.alike = [self.visible.of(other).columns for other in alike]
-
-    @property
-    def columns(self) -> list[int]:
-        """The columns of the linearization that the answer depends on."""
-        own = self.visible
-        return [*own.given, *own.columns, *(column for columns in self.alike for column in columns)]
-
-    def shares(self, information: np.ndarray | float = 0.0) -> np.ndarray:
-        """Return how well the effect would show at its notable size, the worst first; from 1 on it does.
-
-        Noncentrality of each of its parameters over DETECTED, and beside each look-alike over SEPARATE.
-        information: added to the log's.
-        """
-        visible = copy.copy(self.visible)
-        visible.linearization = copy.copy(visible.linearization)
-        visible.linearization.total = self.visible.linearization.total + information
-        beside = [visible.noncentralities(columns) / SEPARATE for columns in self.alike]
-        return np.sort(np.concatenate([visible.noncentralities() / DETECTED, *beside]))
 
 
 def _best_manoeuvre(shares: Mapping[str, np.ndarray]) -> str:
@@ -278,7 +263,8 @@ def advise(
     if not wanted:
         return {}
     questions = [Question(linearization, model, effect, alike) for effect, alike in wanted.items()]
-    columns = [column for question in questions for column in question.columns]
+    groups = [columns for one in questions for columns in (one.given, one.columns, *one.alike)]
+    columns = [column for group in groups for column in group]
     added = information_of_manoeuvres(problem, model, linearization, columns)
     return {
         question.effect: _best_manoeuvre({name: question.shares(one) for name, one in added.items()})

@@ -60,12 +60,6 @@ class Lanes(NamedTuple):
         return int(self.counts.any(axis=(2, 3)).sum())
 
 
-def rows_per_second(record: Record) -> int:
-    """Return how many rows of a record last about a second: a round number, so that programs are shared."""
-    rate = 1.0 / float(np.median(record.step_s[record.source_row >= 0]))
-    return max(FEWEST_ROWS_PER_S, int(float(f"{rate:.2g}")))
-
-
 def lead_in_of(rows: int) -> int:
     """Return how many of a lane's rows are its lead-in."""
     return rows * LEAD_IN_S // PIECES
@@ -120,7 +114,9 @@ def make_lanes(log: FlightLog, judged: np.ndarray, tau: np.ndarray, gravity: flo
         "v_bat": exists,
     }
     num_rows = 1 + int(np.flatnonzero(record.source_row >= 0)[-1])
-    index = _index(exists[:num_rows], rows_per_second(record))
+    rate = 1.0 / float(np.median(record.step_s[record.source_row >= 0]))
+    # A round number of rows a second, so that programs are shared.
+    index = _index(exists[:num_rows], max(FEWEST_ROWS_PER_S, int(float(f"{rate:.2g}"))))
     is_real = (index >= 0) & (np.arange(len(index)) >= lead_in_of(len(index)))[:, None]
     found = measured_channels(log, record, gravity)
     nowhere = np.zeros(len(exists), bool)
@@ -151,10 +147,10 @@ def voltages_of(lanes: Lanes) -> tuple[float, float] | None:
     return (float(measured.min()), float(measured.max())) if len(measured) else None
 
 
-def thinned(lanes: Lanes) -> Lanes:
-    """Return lanes evenly spread, of MOST_ROWS at most, in place of those of a long log."""
+def thinned(lanes: Lanes, most: int | None = None) -> Lanes:
+    """Return lanes evenly spread, of MOST_ROWS or so many lanes at most, in place of those of a long log."""
     rows, number = lanes.row.shape
-    most = max(MOST_ROWS // (rows - lead_in_of(rows)) // LANES_PADDED_TO, 1) * LANES_PADDED_TO
+    most = most or max(MOST_ROWS // (rows - lead_in_of(rows)) // LANES_PADDED_TO, 1) * LANES_PADDED_TO
     if number <= most:
         return lanes
     return lanes.selected(np.linspace(0, number - 1, most).round().astype(int))

@@ -5,7 +5,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from flytrack_env.dynamics import ModelParameters
 from flytrack_env.effects import BY_NAME, MocapLatency
 from flytrack_sysid.diagnosis.lanes import Lanes
 from flytrack_sysid.diagnosis.lateness import latency_of
@@ -20,29 +19,23 @@ BOUNDS = EFFECT.ranges["latency_s"]
 
 def gain_of(problem: Problem, as_logged: Lanes, vector: np.ndarray) -> float:
     """Return what poses in time gain over logged ones, of minus twice the log likelihood, not refitted."""
-    noise, counts = problem.noise, problem.counts & as_logged.counts
-
-    assert noise is not None, "with_noise comes first"
+    counts = problem.counts & as_logged.counts
 
     def cost(one: Problem) -> float:
-        judged = replace(one, lanes=one.lanes._replace(counts=counts)).with_noise(noise)
+        judged = replace(one, lanes=one.lanes._replace(counts=counts)).with_noise(problem.noise)
         return robust_square(judged.whitened_residuals(vector)[0])
 
     return cost(replace(problem, lanes=as_logged, late=None)) - cost(problem)
 
 
 def with_late_poses(
-    found: Diagnosis,
-    moves: Moves,
-    given: ModelParameters,
-    problems: Sequence[Problem],
-    logged: Sequence[Lanes],
+    found: Diagnosis, moves: Moves, problems: Sequence[Problem], logged: Sequence[Lanes]
 ) -> Diagnosis:
     """Return a diagnosis of corrected poses with how late they were, as a cause where it matters.
 
-    given: the nominal model. problems: learnt from and judged by; logged: the lanes of each as logged.
+    problems: learnt from and judged by; logged: the lanes of each as logged.
     """
-    before_s, late_s, sigma_s = latency_of(given), min(moves.late_s, BOUNDS.high), moves.sigma_s
+    before_s, late_s, sigma_s = latency_of(found.nominal), min(moves.late_s, BOUNDS.high), moves.sigma_s
     if not late_s and not before_s:
         return found
     base = found.base.with_effects(MocapLatency(np.float32(before_s)))

@@ -18,6 +18,7 @@ from scipy import optimize, stats
 
 from flytrack_env.dynamics import collective_thrust
 from flytrack_env.effects.grammar import QUANTITIES, SHAPES, XYZ, Factor, Moment, Term
+from flytrack_env.effects.learned_residual import Network
 from flytrack_env.effects.pendulum import Pendulum, is_swinging
 from flytrack_env.quaternion import Vec3
 from flytrack_env.state import Action
@@ -87,14 +88,10 @@ def moment_of_flight(problem: Problem, vector: np.ndarray, flight: Flown) -> Mom
     )
 
 
-def features_of(term: Term, moment: Moment, rotation: np.ndarray) -> np.ndarray:
-    """Return what unit coefficients of a term add, world frame, (coefficients, rows, lanes, 3)."""
-    signal = jnp.broadcast_to(term.signal(moment), np.shape(moment.time_s))
-    columns = []
-    for unit in term.basis(moment):
-        body = jnp.stack([jnp.broadcast_to(part, signal.shape) for part in unit], axis=-1)
-        columns.append(np.einsum("rlij,rlj->rli", rotation, np.asarray(body * signal[..., None])))
-    return np.stack(columns)
+def directions_of(term: Term, moment: Moment, rotation: np.ndarray) -> np.ndarray:
+    """Return where unit coefficients of a term point, world frame, (coefficients, rows, lanes, 3)."""
+    body = [np.stack(np.broadcast_arrays(*unit, moment.time_s)[:-1], axis=-1) for unit in term.basis(moment)]
+    return np.einsum("rlij,crlj->crli", rotation, np.stack(body))
 
 
 class Side(NamedTuple):
@@ -135,8 +132,10 @@ class Side(NamedTuple):
 
     def white(self, term: Term) -> np.ndarray:
         """Return a term's unit coefficients as innovations, (coefficients, rows, lanes, 3, 2)."""
-        features = features_of(term, self._moment_for(term), self.flight.body_to_world)
-        return whitened(self.problem, features, self.name)
+        moment = self._moment_for(term)
+        signal = np.broadcast_to(term.signal(moment), np.shape(moment.time_s))[..., None]
+        directions = directions_of(term, moment, self.flight.body_to_world)
+        return whitened(self.problem, directions * signal, self.name)
 
     def _moment_for(self, term: Term) -> Moment:
         """Return what a term may look at: with its own load on a string, if it has one."""
@@ -147,6 +146,12 @@ class Side(NamedTuple):
         load = np.asarray(_load_at(lanes.load_input, lanes.row, term.pendulum))
         load = np.concatenate([load[:1], load[:-1]])  # a step begins at the row before
         return self.moment._replace(load=Pendulum(*np.moveaxis(load, -1, 0)))
+
+    def vector_beside(self, given: np.ndarray) -> np.ndarray:
+        """Return the model's vector beside what was fitted; given: the step of its numbers that act."""
+        vector = self.vector.copy()
+        vector[list(self.acting)] -= given
+        return self.problem.clipped(vector)
 
     def columns(self, term: Term) -> np.ndarray:
         """Return a term's unit coefficients, weighted, by blocks of a second."""
@@ -258,8 +263,13 @@ def refine_shapes(side: Side, test: SideTest, start: Trial) -> Trial:
     if not num_shaped(start.term):
         return start
     numbers = np.concatenate([one.numbers for one in start.term.factors])
-    is_free = np.concatenate([np.full(len(one.numbers), one.shape != "power") for one in start.term.factors])
-    is_free &= ~np.isin(np.arange(len(numbers)), _fixed(start.term))
+    is_free = np.array(
+        [
+            one.shape != "power" and (one.shape, place) != ("wave", 0)  # a wave's order, which is whole
+            for one in start.term.factors
+            for place in range(len(one.numbers))
+        ]
+    )
     steps = np.maximum(0.2 * np.abs(numbers), 0.1)[is_free]
     best = start
 
@@ -291,15 +301,6 @@ def refine_jointly(side: Side, terms: Sequence[Term], places: Iterable[int]) -> 
     return result
 
 
-def _fixed(term: Term) -> list[int]:
-    """Return the places of numbers that are whole, in the order of all numbers of a term's factors."""
-    place, fixed = 0, []
-    for one in term.factors:
-        fixed += [place] if one.shape == "wave" else []
-        place += len(one.numbers)
-    return fixed
-
-
 def _with_numbers(term: Term, values: np.ndarray) -> Term | None:
     """Return a term with other numbers; None where one would have no width, or not swing."""
     factors, place = [], 0
@@ -316,7 +317,7 @@ def _with_numbers(term: Term, values: np.ndarray) -> Term | None:
 
 
 class Found(NamedTuple):
-    """A law of one side and what it is worth.
+    """A law of one side, or a network in its place, and what it is worth.
 
     vector: of the model with what the law changes in its free numbers. gain: on rows that were learnt from,
     held_out_gain on others, of minus twice the log likelihood; expected: there, if it were right. rivals:
@@ -324,18 +325,12 @@ class Found(NamedTuple):
     """
 
     terms: tuple[Term, ...]
+    networks: tuple[Network, ...]
     vector: np.ndarray
     gain: float
     held_out_gain: float
     expected: float
-    rivals: tuple[str, ...]
-
-
-def vector_with(side: Side, fit: SideFit) -> np.ndarray:
-    """Return the model's vector beside features that were fitted."""
-    vector = side.vector.copy()
-    vector[list(side.acting)] -= fit.given
-    return side.problem.clipped(vector)
+    rivals: tuple[str, ...] = ()
 
 
 def fit_terms(side: Side, terms: Sequence[Term]) -> tuple[tuple[Term, ...], SideFit]:
@@ -350,25 +345,14 @@ def fit_terms(side: Side, terms: Sequence[Term]) -> tuple[tuple[Term, ...], Side
         if sigmas.min() >= LEAST_SIGMAS or kept.sum() == 1:
             break
         kept[np.flatnonzero(kept)[int(np.argmin(sigmas))]] = False
-    coefficients, errors = np.zeros(len(kept)), np.zeros(len(kept))
-    coefficients[kept], errors[kept] = fit.step, fit.errors
-    result, place = [], 0
-    for term, number in zip(terms, sizes, strict=True):
-        own = slice(place, place + number)
-        padded = [np.pad(values[own], (0, XYZ - number)).tolist() for values in (coefficients, errors)]
-        if any(padded[0]):
-            result.append(replace(term, coefficients=tuple(padded[0]), standard_errors=tuple(padded[1])))
-        place += number
+    numbers = np.zeros((2, len(kept)))
+    numbers[:, kept] = fit.step, fit.errors
+    result = []
+    for term, own in zip(terms, np.split(numbers, np.cumsum(sizes)[:-1], axis=1), strict=True):
+        coefficients, errors = np.pad(own, ((0, 0), (0, XYZ - own.shape[1]))).tolist()
+        if any(coefficients):
+            result.append(replace(term, coefficients=tuple(coefficients), standard_errors=tuple(errors)))
     return tuple(result), fit
-
-
-def contribution_of(side: Side, terms: Sequence[Term]) -> np.ndarray:
-    """Return what terms with coefficients add, whitened, (rows, lanes, 3, 2)."""
-    total = np.zeros((*side.flight.time_s.shape, XYZ, 2))
-    for term in terms:
-        white = side.white(term)
-        total = total + np.tensordot(np.array(term.coefficients[: len(white)]), white, axes=1)
-    return total
 
 
 def held_out(side: Side, held: Side, learnt: np.ndarray, vector: np.ndarray) -> tuple[float, float]:
@@ -401,9 +385,10 @@ def cross_validate(side: Side, terms: Sequence[Term]) -> tuple[float, float]:
 
 def judge_law(side: Side, held: Side, terms: tuple[Term, ...], fit: SideFit) -> Found:
     """Return terms that were fitted as a law, with what it gains on held-out rows."""
-    vector = vector_with(side, fit)
-    gain, expected = held_out(side, held, contribution_of(held, terms), vector)
-    return Found(terms, vector, fit.chi2, gain, expected, ())
+    vector, white = side.vector_beside(fit.given), [held.white(term) for term in terms]
+    coefficients = [np.array(term.coefficients[: len(own)]) for term, own in zip(terms, white, strict=True)]
+    learnt = np.tensordot(np.concatenate(coefficients), np.concatenate(white), axes=1)
+    return Found(terms, (), vector, fit.chi2, *held_out(side, held, learnt, vector))
 
 
 def is_confirmed(side: Side, law: Found) -> bool:
@@ -464,11 +449,6 @@ def best_of(side: Side, test: SideTest, pool: Sequence[Term]) -> tuple[list[Tria
     return sorted(best, key=lambda one: -one.merit), [one.term for one in trials]
 
 
-def uses_time(term: Term) -> bool:
-    """Return whether a term looks at the time."""
-    return any(one.quantity == "time" for one in term.factors)
-
-
 def grow_law(side: Side, held: Side, first: Trial, pool: Sequence[Term], number: int) -> Found | None:
     """Return the law that begins with a term, to which others of a pool are added while they gain.
 
@@ -476,6 +456,10 @@ def grow_law(side: Side, held: Side, first: Trial, pool: Sequence[Term], number:
     """
     terms: list[Term] = []
     best: Found | None = None
+
+    def uses_time(term: Term) -> bool:
+        return any(one.quantity == "time" for one in term.factors)
+
     # What happens once would pass for the remainder of another law: all terms look at the time, or none.
     pool = [term for term in pool if uses_time(term) == uses_time(first.term)][:MOST_TRIED_AGAIN]
     while True:

@@ -11,20 +11,14 @@ from dataclasses import replace
 
 import numpy as np
 
-from flytrack_env.effects.grammar import Law, Term
-from flytrack_env.effects.learned_residual import Network, Networks
+from flytrack_env.effects.grammar import Law
+from flytrack_env.effects.learned_residual import Networks
 from flytrack_sysid.diagnosis.beyond import Learned
+from flytrack_sysid.diagnosis.lanes import thinned
 from flytrack_sysid.diagnosis.law_search import LEAST_EXPECTED, Found, Side, find_law
 from flytrack_sysid.diagnosis.problem import Problem
-from flytrack_sysid.diagnosis.refinement import (
-    LIKELY,
-    LIKELY_WORSE,
-    WORSE_ANYWHERE,
-    Judge,
-    errors_at,
-    sureness,
-)
-from flytrack_sysid.diagnosis.residual_fit import Residual, fit_residual
+from flytrack_sysid.diagnosis.refinement import LIKELY, LIKELY_WORSE, WORSE_ANYWHERE, Judge, errors_at
+from flytrack_sysid.diagnosis.residual_fit import fit_residual
 from flytrack_sysid.diagnosis.search import FittedModel
 from flytrack_sysid.diagnosis.unexplained import (
     Dependence,
@@ -51,47 +45,43 @@ def find_learned(
     problem, test = thinned_problem(problem), thinned_problem(test)
     waves = waves_of(problem, model, find_lines(problem, model))
     dependences = find_dependences(problem, model, base, waves)
-    terms: list[Term] = []
-    networks: list[Network] = []
-    found: dict[str, Found | Residual] = {}
+    learned = Learned(Law(()), Networks(()), {}, {}, {})
     # What wanders may be a law whose variable smooth functions of everything do not have.
     wandering = [] if dependences else list(stochastic_shares(problem, model))
     for name in dict.fromkeys([*(one.side for one in dependences), *wandering]):
         own = [one for one in dependences if one.side == name]
         if own and max(one.share for one in own) < LEAST_SHARE:
             continue
-        one = _learnt(Side.of(name, problem, model), Side.of(name, test, model), own)
-        if one is None:
+        found = _learnt(Side.of(name, problem, model), Side.of(name, test, model), own)
+        if found is None:
             continue
-        added = (one.terms, ()) if isinstance(one, Found) else ((), (one.network,))
-        acts_there = one.expected >= LEAST_EXPECTED
-        if not _predicts(problem, judge, model.vector, one.vector, (terms, networks), added, acts_there):
-            continue
-        terms, networks = [*terms, *added[0]], [*networks, *added[1]]
-        found[name], model = one, model._replace(vector=one.vector)
-    if not found:
-        return None, model.vector
-    learned = Learned(
-        Law(tuple(terms)),
-        Networks(tuple(networks)),
-        {name: one.gain for name, one in found.items()},
-        {name: one.held_out_gain for name, one in found.items()},
-        {name: one.rivals for name, one in found.items() if isinstance(one, Found)},
+        more = _with_side(learned, name, found)
+        acts_there = found.expected >= LEAST_EXPECTED
+        if _predicts(problem, judge, (learned, model.vector), (more, found.vector), acts_there):
+            learned, model = more, model._replace(vector=found.vector)
+    return learned if learned.gains else None, model.vector
+
+
+def _with_side(learned: Learned, name: str, found: Found) -> Learned:
+    """Return what was learnt, with what was found on one more side."""
+    return Learned(
+        Law((*learned.law.terms, *found.terms)),
+        Networks((*learned.networks.networks, *found.networks)),
+        {**learned.gains, name: found.gain},
+        {**learned.held_out_gains, name: found.held_out_gain},
+        {**learned.rivals, **({name: found.rivals} if found.terms else {})},
     )
-    return learned, model.vector
 
 
 def thinned_problem(problem: Problem) -> Problem:
     """Return a problem of fewer lanes, evenly spread, where a log is long: hundreds of terms are tried."""
-    rows, number = problem.lanes.row.shape
-    most = max(MOST_ROWS // rows, 2)
-    if number <= most or problem.late is not None or problem.noise is None:
+    lanes = thinned(problem.lanes, max(MOST_ROWS // len(problem.lanes.row), 2))
+    if lanes is problem.lanes or problem.late is not None or problem.noise is None:
         return problem
-    lanes = problem.lanes.selected(np.linspace(0, number - 1, most).round().astype(int))
     return replace(problem, lanes=lanes).with_noise(problem.noise)
 
 
-def _learnt(side: Side, held: Side, dependences: Sequence[Dependence]) -> Found | Residual | None:
+def _learnt(side: Side, held: Side, dependences: Sequence[Dependence]) -> Found | None:
     """Return a law that explains nearly all of what is left on a side, or else a residual."""
     law = find_law(side, held)
     flexible = sum(one.gain for one in dependences)
@@ -102,33 +92,25 @@ def _learnt(side: Side, held: Side, dependences: Sequence[Dependence]) -> Found 
     return fit_residual(side, held, [one.name for one in dependences])
 
 
-def _of_parts(terms: Sequence[Term], networks: Sequence[Network]) -> Learned:
-    return Learned(Law(tuple(terms)), Networks(tuple(networks)), {}, {}, {})
-
-
 def _predicts(
     problem: Problem,
     judge: Judge | None,
-    before: np.ndarray,
-    after: np.ndarray,
-    had: tuple[Sequence[Term], Sequence[Network]],
-    added: tuple[Sequence[Term], Sequence[Network]],
+    before: tuple[Learned, np.ndarray],
+    after: tuple[Learned, np.ndarray],
     acts_there: bool,
 ) -> bool:
     """Return whether held-out flights are predicted no worse with what was learnt, and better in all.
 
-    acts_there: whether it acts in them enough to be judged.
+    before, after: what was learnt, and the model's vector beside it. acts_there: whether it acts in them
+    enough to be judged.
     """
     if judge is None:
         return True
-    old, both = _of_parts(*had), _of_parts([*had[0], *added[0]], [*had[1], *added[1]])
-    tested = [
-        errors_at(problem.with_learned(one.effects), one.beside(vector)[None], judge.windows)
-        for vector, one in ((before, old), (after, both))
-    ]
-    scale = np.maximum(np.nan_to_num(tested[0].rms()[0], nan=1.0), 1e-9)
-    ratio = tested[1].rms()[0] / scale
-    lost = sureness(tested[1].by_block(scale)[0] - tested[0].by_block(scale)[0])
+    old, new = (
+        errors_at(problem.with_learned(learned.effects), learned.beside(vector)[None], judge.windows)
+        for learned, vector in (before, after)
+    )
+    ratio, lost = new.against(old)
     return improves_flights(ratio[judge.is_known], lost[judge.is_known], acts_there)
 
 

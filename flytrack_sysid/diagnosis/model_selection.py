@@ -158,7 +158,7 @@ def with_lags_anew(state: SearchState, model: FittedModel) -> list[FittedModel]:
 
 def price(model: FittedModel) -> float:
     """Return a model's cost and the price of its effects."""
-    return model.cost + PER_PARAMETER * sum(one.num_priced for one in model.candidates)
+    return model.cost + PER_PARAMETER * model.num_priced
 
 
 class Separation(NamedTuple):

@@ -27,7 +27,7 @@ from flytrack_sysid.clocks import PAIRS, offset_between
 from flytrack_sysid.diagnosis import noise as noises
 from flytrack_sysid.diagnosis.lanes import Lanes, lanes_of
 from flytrack_sysid.diagnosis.lateness import judged_as_logged, read_poses
-from flytrack_sysid.diagnosis.problem import Problem, blocks_of, robust_weight
+from flytrack_sysid.diagnosis.problem import SEARCHED, Problem, blocks_of, robust_weight
 from flytrack_sysid.diagnosis.score_test import Linearization, solve
 from flytrack_sysid.diagnosis.search import refine
 from flytrack_sysid.log import FlightLog, usual_step
@@ -82,6 +82,21 @@ class Trial(NamedTuple):
     vector: np.ndarray
 
 
+def problem_of(
+    lanes: Lanes,
+    corrected: FlightLog,
+    logged: FlightLog,
+    model: ModelParameters,
+    late_s: float,
+    effects: Sequence[Effect] = SEARCHED,
+) -> Problem:
+    """Return the problem of lanes of a corrected log, whose poses were logged late."""
+    late = None
+    if late_s:
+        lanes, late = judged_as_logged(lanes, corrected, logged, late_s, model.motion)
+    return Problem.of(lanes, model, effects, late)
+
+
 class Seen(NamedTuple):
     """Rows of a log to learn from, (num_rows,) bool, a model to start from, and the part that is looked at.
 
@@ -94,26 +109,16 @@ class Seen(NamedTuple):
     part: int = 0
     num_parts: int = 1
 
-    def in_parts(self) -> "Seen":
-        """Return the first of as many parts as there are, of ``MOST_LANES`` each."""
-        return self._replace(part=0, num_parts=max(self._lanes(self.log).row.shape[1] // MOST_LANES, 1))
-
-    def _lanes(self, log: FlightLog) -> Lanes:
-        return lanes_of(log, self.judged, self.model)
-
     def lanes(self, log: FlightLog) -> Lanes:
         """Return the lanes of this part; in ``log`` poses may be at other times."""
-        lanes = self._lanes(log)
+        lanes = lanes_of(log, self.judged, self.model)
         return lanes.selected(np.arange(self.part, lanes.row.shape[1], self.num_parts)[:MOST_LANES])
 
     def problem(self, moves: Moves) -> Problem:
         """Return the problem of a log that moves so."""
-        model, log, late_s = self.model._replace(motion=moves.motion), self.log, moves.late_s
-        if late_s <= 0.0:
-            return Problem.of(self.lanes(log), model, LOOK_ALIKES)
-        in_time = read_poses(log, late_s)[0]
-        lanes, late = judged_as_logged(self.lanes(in_time), in_time, log, late_s, moves.motion)
-        return Problem.of(lanes, model, LOOK_ALIKES, late)
+        model, late_s = self.model._replace(motion=moves.motion), max(moves.late_s, 0.0)
+        in_time = read_poses(self.log, late_s)[0]
+        return problem_of(self.lanes(in_time), in_time, self.log, model, late_s, LOOK_ALIKES)
 
 
 def _places(problem: Problem, moves: Moves) -> list[int]:
@@ -217,7 +222,8 @@ def how_it_moves(
     if apparent is not None and [one for one in motions if late[one] == Moves(one)] == [Motion.CONTINUOUS]:
         return Moves(Motion.CONTINUOUS)
     seen = Seen(log, judged & _known_around(log, list(late.values())), model)
-    found = _chosen(seen.in_parts(), list(late.values()))
+    num_parts = max(lanes_of(log, seen.judged, model).row.shape[1] // MOST_LANES, 1)
+    found = _chosen(seen._replace(num_parts=num_parts), list(late.values()))
     is_late = found.late_s > max(LEAST_S, STANDARD_ERRORS * found.sigma_s)
     return found if is_late else Moves(found.motion)
 

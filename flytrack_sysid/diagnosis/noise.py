@@ -200,16 +200,18 @@ def first_guess(lanes: Lanes, left: np.ndarray) -> np.ndarray:
 
 def disturbance_gain(lanes: Lanes, left: np.ndarray, log_noise: np.ndarray) -> np.ndarray:
     """Return by axis by how much the disturbance lowers minus twice the log likelihood of residuals."""
-    given = tuple(jnp.asarray(part) for part in (step_to(lanes), lanes.is_known, lanes.counts, left))
     still = log_noise.copy()
     still[3] = np.log(LEAST_SHARE)
-    return np.asarray(_total(still, *given)) - np.asarray(_total(log_noise, *given))
+    return np.subtract(*(_total(one, *_given(lanes, left)) for one in (still, log_noise)))
 
 
 def total_misfit(lanes: Lanes, left: np.ndarray, log_noise: np.ndarray) -> float:
     """Return minus twice the log likelihood of residuals under a noise."""
-    given = tuple(jnp.asarray(part) for part in (step_to(lanes), lanes.is_known, lanes.counts, left))
-    return float(np.sum(_total(log_noise, *given)))
+    return float(np.sum(_total(log_noise, *_given(lanes, left))))
+
+
+def _given(lanes: Lanes, left: np.ndarray) -> tuple[jax.Array, ...]:
+    return tuple(jnp.asarray(part) for part in (step_to(lanes), lanes.is_known, lanes.counts, left))
 
 
 @jax.jit
@@ -222,8 +224,7 @@ def fit_noise(lanes: Lanes, left: np.ndarray, start: np.ndarray | None = None) -
 
     Fisher scoring with Levenberg damping, every axis by itself.
     """
-    given = tuple(jnp.asarray(part) for part in (step_to(lanes), lanes.is_known, lanes.counts, left))
-    low, high = _bounds(lanes)
+    given, (low, high) = _given(lanes, left), _bounds(lanes)
     best = np.clip(first_guess(lanes, left) if start is None else start, low, high)
     misfit, slopes, curvature = (np.asarray(part) for part in _misfit_and_slopes(best, *given))
     damping = np.full(NUM_AXES, FIRST_DAMPING)
@@ -251,9 +252,8 @@ def fit_noise(lanes: Lanes, left: np.ndarray, start: np.ndarray | None = None) -
 
 
 def _bounds(lanes: Lanes) -> tuple[np.ndarray, np.ndarray]:
-    """Return the bounds of the search, (6, NUM_AXES) each, as logarithms and a logit."""
-    ones = np.ones(NUM_AXES)
+    """Return the bounds of the search, (6, NUM_AXES) and (6, 1), as logarithms and a logit."""
     low = [np.log(LEAST_SHARE), np.log(LEAST_SHARE), np.log(TAU_RANGE_S[0]), -5.0]
     high = [np.log(1e3)] * 4 + [np.log(TAU_RANGE_S[1]), 5.0]
-    lowest = np.stack([*np.log(floors_of(lanes)), *(value * ones for value in low)])
-    return lowest, np.stack([value * ones for value in high])
+    lowest = np.concatenate([np.log(floors_of(lanes)), np.repeat(low, NUM_AXES).reshape(-1, NUM_AXES)])
+    return lowest, np.array(high)[:, None]

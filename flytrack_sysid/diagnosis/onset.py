@@ -16,7 +16,7 @@ from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy import optimize, special, stats
+from scipy import optimize, stats
 
 from flytrack_sysid.diagnosis import noise as noises
 from flytrack_sysid.diagnosis.lanes import LANE_S, Lanes, lead_in_of
@@ -51,10 +51,8 @@ def threshold(num_parameters: int, trimmed: float = LEAST_SHARE, chance: float =
     span = 2.0 * np.log((1.0 - trimmed) / trimmed)
 
     def excess(size: float) -> float:
-        log_density = 0.5 * (num_parameters * np.log(0.5 * size) - size) - special.gammaln(
-            0.5 * num_parameters
-        )
-        return float(log_density + np.log((1.0 - num_parameters / size) * span + 2.0 / size) - np.log(chance))
+        crossings = (size - num_parameters) * span + 2.0
+        return float(stats.chi2.logpdf(size, num_parameters) + np.log(crossings) - np.log(chance))
 
     lowest = float(stats.chi2.isf(chance, num_parameters))
     return float(optimize.brentq(excess, lowest, 10.0 * lowest + 100.0))
@@ -208,7 +206,6 @@ def profile_of(problem: Problem, test: Problem, vector: np.ndarray, row: int) ->
     test: of rows held out, which decide as well.
     """
     step_s = float(np.median(problem.lanes.record.step_s))
-    assert problem.noise is not None
     problems = problem, replace(test, windows=problem.windows).with_noise(problem.noise)
     # As if what changes at the row changed after the log, and before it.
     sides = [[moved(one, row, to).residuals(vector[None])[0] for to in (NEVER, ALWAYS)] for one in problems]
@@ -346,13 +343,9 @@ def _with_change(selection: Selection, test: Problem) -> Selection | None:
     lost = [
         misfit(later, problem) - misfit(selection, problem) for problem in (selection.state.problem, test)
     ]
-    price = PER_PARAMETER * (_num_priced(later) - _num_priced(selection))
+    price = PER_PARAMETER * (later.model.num_priced - selection.model.num_priced)
     is_better = lost[0] + price < -threshold(first.num_parameters) and lost[1] < 0.0
     return later if is_better else None
-
-
-def _num_priced(selection: Selection) -> int:
-    return sum(one.num_priced for one in selection.model.candidates)
 
 
 def misfit(selection: Selection, problem: Problem) -> float:

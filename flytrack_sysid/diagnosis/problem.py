@@ -22,6 +22,7 @@ from typing import Any, NamedTuple, Self
 import jax
 import jax.numpy as jnp
 import numpy as np
+from scipy import special
 
 from flytrack_env.dynamics import ModelParameters, read_sensors
 from flytrack_env.effects import BY_NAME, EFFECTS, LEARNED, Effect, effect_of
@@ -72,9 +73,7 @@ def _of_lane(model: ModelParameters, lane: Record, sensed: dict[str, Any]) -> ja
     """Return the residuals of a lane's rows; of its first row nothing is predicted."""
     rows, gyro_b = jax.tree.map(lambda leaf: leaf[:-1], (lane, sensed.get("w")))
     later = jax.tree.map(lambda leaf: leaf[1:], (lane, sensed))
-    found = replay(
-        model, rows, "gyro", gyro_b, lambda step, extra: _of_step(step, extra[0], extra[1], model), later
-    )
+    found = replay(model, rows, gyro_b, lambda step, extra: _of_step(step, extra[0], extra[1], model), later)
     return jnp.concatenate([jnp.zeros_like(found[:1]), found])
 
 
@@ -174,8 +173,9 @@ class Problem:
             late=late,
         )
 
-    def with_noise(self, noise: np.ndarray) -> "Problem":
-        """Return the same problem, weighted by this noise, (6, NUM_AXES)."""
+    def with_noise(self, noise: np.ndarray | None) -> "Problem":
+        """Return the same problem, weighted by this noise, (6, NUM_AXES), of a problem that has one."""
+        assert noise is not None, "with_noise comes first"
         lanes = self.lanes
         gains = _gains(noises.noise_of(noise), noises.step_to(lanes), lanes.is_known, lanes.counts)
         return replace(self, noise=noise, gains=gains)
@@ -331,15 +331,12 @@ def _scale(name: str, value: float) -> float:
 
 def robust_weight(white: np.ndarray) -> np.ndarray:
     """Return weights of innovations with which outliers count by their size, not its square (Huber)."""
-    size = np.abs(white)
-    return np.where(size > noises.OUTLIER, noises.OUTLIER / np.maximum(size, noises.OUTLIER), 1.0)
+    return noises.OUTLIER / np.maximum(np.abs(white), noises.OUTLIER)
 
 
 def robust_square(white: np.ndarray) -> float:
     """Return the sum of squares of innovations, outliers counted by their size."""
-    size = np.abs(white)
-    inside = np.minimum(size, noises.OUTLIER)
-    return float((inside * (2.0 * size - inside)).sum())
+    return float(2.0 * special.huber(noises.OUTLIER, white).sum())
 
 
 def blocks_of(values: np.ndarray) -> np.ndarray:

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 
 import jax
 import numpy as np
-from scipy import stats
+from scipy import special, stats
 from scipy.spatial.transform import Rotation
 
 from flytrack_env.dynamics import ModelParameters
@@ -85,6 +85,16 @@ class Tested(NamedTuple):
         number = np.maximum(self.windows.counts.sum(axis=1), 1)
         relative = self.squares / (np.square(scale) * number)[:, None]
         return self.windows.sums_by_block(np.moveaxis(relative, 2, 0)).swapaxes(0, 1)
+
+    @property
+    def scale(self) -> np.ndarray:
+        """The rms errors of the first model, to divide by, (horizons, quantities); 1 where there are none."""
+        return np.maximum(np.nan_to_num(self.rms()[0], nan=1.0), 1e-9)
+
+    def against(self, base: "Tested") -> tuple[np.ndarray, np.ndarray]:
+        """Return the errors over a base's, (horizons, quantities), and by how many standard errors larger."""
+        lost = self.by_block(base.scale)[0] - base.by_block(base.scale)[0]
+        return self.rms()[0] / base.scale, sureness(lost)
 
 
 def sureness(differences: np.ndarray) -> np.ndarray:
@@ -186,8 +196,7 @@ class Target(NamedTuple):
 
     def cost(self, left: np.ndarray, vectors: np.ndarray) -> np.ndarray:
         """Return the robust sum of squares and the weak prior of models, (num_vectors,)."""
-        size = np.abs(left)
-        robust = np.where(size < OUTLIER, size**2, OUTLIER * (2.0 * size - OUTLIER)).sum(axis=(1, 2))
+        robust = 2.0 * special.huber(OUTLIER, left).sum(axis=(1, 2))
         return robust + np.square(vectors - self.problem.start) @ prior_information(self.problem)
 
     def fitted(self, vector: np.ndarray, places: Sequence[int], rounds: int) -> Fit:
@@ -198,9 +207,7 @@ class Target(NamedTuple):
             moved, step = problem.nudged(vector, places)
             left = self.residuals(np.concatenate([vector[None], moved]))
             columns = (left[1:] - left[0]) / step[:, None, None]
-            root = np.sqrt(
-                np.where(np.abs(left[0]) > OUTLIER, OUTLIER / np.maximum(np.abs(left[0]), 1e-9), 1)
-            )
+            root = np.sqrt(OUTLIER / np.maximum(np.abs(left[0]), OUTLIER))
             prior, pull = prior_information(problem)[at], (vector - problem.start)[at]
             scores = np.einsum("pwn,wn->wp", columns, left[0] * root**2)
             flat = (columns * root).reshape(len(at), -1)
@@ -256,11 +263,9 @@ class Judge(NamedTuple):
     @classmethod
     def of(cls, problem: Problem, learnt: Windows, judged: Windows, base: np.ndarray) -> "Judge":
         """Return the judge of a base model before anything is known to matter."""
-        tested = errors_at(problem, base[None], judged)
-        placebo = Tested(placebo_errors(learnt, judged), judged)
-        scale = np.maximum(np.nan_to_num(tested.rms()[0], nan=1.0), 1e-9)
-        judge = cls(problem, judged, tested, placebo, scale, np.zeros(scale.shape, bool))
-        return judge.seeing(tested)
+        tested, placebo = errors_at(problem, base[None], judged), placebo_errors(learnt, judged)
+        nothing = np.zeros(tested.scale.shape, bool)
+        return cls(problem, judged, tested, Tested(placebo, judged), tested.scale, nothing).seeing(base)
 
     @property
     def is_known(self) -> np.ndarray:
@@ -269,30 +274,30 @@ class Judge(NamedTuple):
         blocks = self.windows.sums_by_block(counts.swapaxes(0, 1).astype(int))
         return (counts.sum(axis=1) >= FEWEST_WINDOWS) & ((blocks > 0).sum(axis=0) >= FEWEST_BLOCKS)
 
-    def seeing(self, tested: Tested) -> "Judge":
+    def tested(self, *vectors: np.ndarray) -> Tested:
+        """Return the errors of models on the held-out windows."""
+        return errors_at(self.problem, np.stack(vectors), self.windows)
+
+    def seeing(self, vector: np.ndarray) -> "Judge":
         """Return the judge with those cells as evidence, too, in which a model beats the placebo."""
-        lost = self.placebo.by_block(self.scale)[0] - tested.by_block(self.scale)
-        beats = (np.stack([sureness(one) for one in lost]) > SURE_OF_COMMANDS).any(axis=0)
+        lost = self.placebo.by_block(self.scale)[0] - self.tested(vector).by_block(self.scale)[0]
+        beats = sureness(lost) > SURE_OF_COMMANDS
         return self._replace(matters=self.matters | (beats & self.is_known))
 
     def is_surely_worse(self, vector: np.ndarray) -> bool:
         """Return whether a model predicts any horizon worse than the base does, beyond chance."""
-        tested = errors_at(self.problem, vector[None], self.windows)
-        lost = sureness(tested.by_block(self.scale)[0] - self.base.by_block(self.scale)[0])
-        is_larger = tested.rms()[0] > LIKELY_WORSE * self.scale
-        return bool(np.any(self.is_known & is_larger & (lost > SURELY_WORSE)))
+        ratio, lost = self.tested(vector).against(self.base)
+        return bool(np.any(self.is_known & (ratio > LIKELY_WORSE) & (lost > SURELY_WORSE)))
 
     def worst_ratio(self, vector: np.ndarray) -> float:
         """Return the largest of a model's errors over the base's where it is worse; below 1 where none is."""
-        tested = errors_at(self.problem, vector[None], self.windows)
-        ratio = tested.rms()[0] / self.scale
-        lost = sureness(tested.by_block(self.scale)[0] - self.base.by_block(self.scale)[0])
+        ratio, lost = self.tested(vector).against(self.base)
         is_worse = (ratio > LIKELY_WORSE) & (lost > np.where(self.matters, LIKELY, WORSE_ANYWHERE))
         return float(np.max(ratio[self.is_known & is_worse], initial=0.0))
 
-    def losses(self, vectors: np.ndarray) -> np.ndarray:
+    def losses(self, *vectors: np.ndarray) -> np.ndarray:
         """Return mean squares over the base's in cells that are evidence, (models, blocks)."""
-        found = errors_at(self.problem, vectors, self.windows).by_block(self.scale)
+        found = self.tested(*vectors).by_block(self.scale)
         used = self.matters if self.matters.any() else self.is_known
         return found[..., used].mean(axis=-1)
 
@@ -325,7 +330,7 @@ class Refined(NamedTuple):
         """By which share the held-out error grows without an effect, all else refitted."""
         if self.judge is None or self.fit is None or not self.without:
             return {}
-        losses = self.judge.losses(np.stack([self.fit.vector, *self.without.values()])).sum(axis=1)
+        losses = self.judge.losses(self.fit.vector, *self.without.values()).sum(axis=1)
         costs = np.sqrt(losses[1:] / losses[0]) - 1.0
         return {name: float(cost) for name, cost in zip(self.without, costs, strict=True)}
 
@@ -346,7 +351,7 @@ class Refined(NamedTuple):
         """
         if self.judge is None:
             return {}
-        found = table_of(errors_at(self.problem, vector[None], self.judge.windows).rms()[0])
+        found = table_of(self.judge.tested(vector).rms()[0])
         keys = (f"{name}_{UNITS[name].replace('/', '_per_')}" for name in ("position", "attitude", "rates"))
         return next((found[key] for key in keys if key in found), {})
 
@@ -409,7 +414,7 @@ def refine(
     as_found = Refined(candidates, None, None, (), {}, problem, None)
     if learnt is None or judged is None:
         return as_found
-    judge = Judge.of(problem, learnt, judged, base.vector).seeing(errors_at(problem, extended[None], judged))
+    judge = Judge.of(problem, learnt, judged, base.vector).seeing(extended)
     as_found = as_found._replace(judge=judge)
     if not candidates or not judge.is_known.any():
         return as_found
@@ -441,8 +446,7 @@ class _Refinement(NamedTuple):
 
     def target(self, problem: Problem) -> Target:
         """Return what is fitted: cells that are evidence, and short horizons."""
-        tested = errors_at(problem, self.base[None], self.learnt)
-        scale = np.maximum(np.nan_to_num(tested.rms()[0], nan=1.0), 1e-9)
+        scale = errors_at(problem, self.base[None], self.learnt).scale
         is_short = (np.array(HORIZONS_S) <= ALWAYS_FITTED_S)[:, None]
         return Target(problem, self.learnt, scale, self.judge.matters | is_short)
 
@@ -467,7 +471,7 @@ class _Refinement(NamedTuple):
             problem = widened(problem, stuck)
             target = target._replace(problem=problem)
             fit = target.fitted(fit.vector, fit.places, MOST_ROUNDS)
-        judge = self.judge.seeing(errors_at(problem, fit.vector[None], self.judge.windows))
+        judge = self.judge.seeing(fit.vector)
         base = target.fitted(self.base, self.places(problem, ()), MOST_ROUNDS).vector
         found = as_found._replace(fit=fit, base=base, problem=problem, judge=judge)
         return self._eliminate(found, target)
@@ -481,7 +485,7 @@ class _Refinement(NamedTuple):
         while any(one.effect in self.acting for one in kept):
             tried = [one for one in kept if one.effect in self.acting]
             fits = [self._without(target, fit, kept, one) for one in tried]
-            losses = judge.losses(np.stack([fit.vector, *(one.vector for one in fits)]))
+            losses = judge.losses(fit.vector, *(one.vector for one in fits))
             sure = np.array([sureness(one - losses[0]) for one in losses[1:]])
             worth = np.sqrt(losses[1:].sum(axis=1) / losses[0].sum()) - 1.0
             needed = np.where((worth >= WORTHWHILE) & (sure >= LIKELY), np.maximum(sure, SURE), sure)

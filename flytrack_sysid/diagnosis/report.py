@@ -116,22 +116,17 @@ def fault_of(cause: str, diagnosis: Diagnosis) -> str:
     """Return the verb that a cause goes with: what the flight shows, against what the model had."""
     if cause not in BY_NAME or cause.endswith("_scale"):
         return WRONG
-    neutral = BY_NAME[cause].parameters()
-    had, shown = ([*map(float, model.effect(cause))] for model in (diagnosis.nominal, diagnosis.extended))
-    if had == [*map(float, neutral)]:
+    neutral, notable = BY_NAME[cause].parameters(), BY_NAME[cause].notable
+    models = [model.effect(cause) for model in (diagnosis.nominal, diagnosis.extended)]
+    if [*map(float, models[0])] == [*map(float, neutral)]:
         return "lacks"
-    notable = BY_NAME[cause].notable
-    size_had, size_shown, product = (
-        sum(
-            (one[place] - rest) * (other[place] - rest) / notable[field] ** 2
-            for place, (field, rest) in enumerate(neutral._asdict().items())
-            if field in notable
-        )
-        for one, other in ((had, had), (shown, shown), (had, shown))
+    had, shown = (
+        np.array([float(getattr(one, name) - getattr(neutral, name)) / notable[name] for name in notable])
+        for one in models
     )
-    if product < 0.0:
+    if had @ shown < 0.0:
         return WRONG  # the other sign
-    return "has too much" if size_shown < size_had else "has too little"
+    return "has too much" if shown @ shown < had @ had else "has too little"
 
 
 def _gain(diagnosis: Diagnosis) -> str:

@@ -12,9 +12,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from flytrack_env.effects.grammar import XYZ, Factor, Term
+from flytrack_env.effects.grammar import XYZ, Factor
 from flytrack_env.effects.learned_residual import Input, Network
-from flytrack_sysid.diagnosis.law_search import Side, held_out, power
+from flytrack_sysid.diagnosis.law_search import Found, Side, bare_term, directions_of, held_out, power
 from flytrack_sysid.diagnosis.noise import step_to
 from flytrack_sysid.diagnosis.problem import blocks_of
 from flytrack_sysid.diagnosis.score_test import solve
@@ -38,16 +38,6 @@ STICKS = {"rate": ("roll", "pitch", "yaw"), "force": ("throttle",)}
 IN_WORLD = ("position", "time")
 
 
-class Residual(NamedTuple):
-    """A network, the model's vector beside it, and what it gains on rows learnt from and on others."""
-
-    network: Network
-    vector: np.ndarray
-    gain: float
-    held_out_gain: float
-    expected: float
-
-
 def inputs_of(side: Side, names: Sequence[str]) -> tuple[Input, ...]:
     """Return the quantities that dependences are functions of, with the ranges that were flown."""
     quantities = [one for name in names for one in INPUTS.get(name, STICKS[side.name])]
@@ -60,16 +50,13 @@ def inputs_of(side: Side, names: Sequence[str]) -> tuple[Input, ...]:
     return tuple(found)
 
 
-def _features(side: Side, network: Network) -> np.ndarray:
-    """Return what unit weights add, world frame, (3 * units, rows, lanes, 3); units of an axis in a row."""
-    term = Term(side.name, network.frame, (power("time"),), (0.0,) * XYZ, (0.0,) * XYZ)
-    rotation, shape, parts = side.flight.body_to_world, side.flight.time_s.shape, []
-    signals = np.stack([np.broadcast_to(np.asarray(one), shape) for one in network.units(side.moment)])
-    for unit in term.basis(side.moment):
-        body = np.stack([np.broadcast_to(np.asarray(part), shape) for part in unit], axis=-1)
-        world = np.einsum("rlij,rlj->rli", rotation, body)
-        parts.append(signals[..., None] * world[None])
-    return np.concatenate(parts)
+def _white(side: Side, network: Network) -> np.ndarray:
+    """Return what unit weights add, whitened, (3 * units, rows, lanes, 3, 2); units of an axis in a row."""
+    term = bare_term(side, network.frame, (power("time"),))
+    directions = directions_of(term, side.moment, side.flight.body_to_world)
+    signals = np.stack([np.broadcast_to(one, directions.shape[1:3]) for one in network.units(side.moment)])
+    features = np.concatenate([signals[..., None] * one for one in directions])
+    return whitened(side.problem, features, side.name)
 
 
 def _random_units(rng: np.random.Generator, number: int) -> tuple[tuple[float, ...], ...]:
@@ -83,9 +70,8 @@ def _random_units(rng: np.random.Generator, number: int) -> tuple[tuple[float, .
 
 def _best_units(side: Side, network: Network) -> tuple[tuple[float, ...], ...]:
     """Return the units that explain most, one after the other, beside what the model may change."""
-    white = whitened(side.problem, _features(side, network), side.name)
     number = len(network.hidden) + 1
-    columns = blocks_of(white * side.test.root)
+    columns = blocks_of(_white(side, network) * side.test.root)
     by_axis = columns.reshape(len(columns), XYZ, number, -1)
     columns = np.moveaxis(by_axis, 2, 1).reshape(columns.shape)  # the axes of a unit in a row
     _, own, score, _ = side.test.projected(columns)
@@ -131,7 +117,7 @@ def _blocks(side: Side, columns: np.ndarray) -> _Blocks:
     return _Blocks(information, score, side.test.given.shape[1])
 
 
-def fit_residual(side: Side, held: Side, names: Sequence[str]) -> Residual | None:
+def fit_residual(side: Side, held: Side, names: Sequence[str]) -> Found | None:
     """Return the ensemble of what a side depends on; None where held-out rows do not gain from it.
 
     names: of dependences.
@@ -144,23 +130,20 @@ def fit_residual(side: Side, held: Side, names: Sequence[str]) -> Residual | Non
     none = ((0.0,) * (HIDDEN + 1),) * XYZ
     network = Network(side.name, frame, inputs, _random_units(rng, len(inputs)), none, none, (0.0,) * XYZ)
     network = replace(network, hidden=_best_units(side, network))
-    white = whitened(side.problem, _features(side, network), side.name)
-    blocks = _blocks(side, blocks_of(white * side.test.root))
+    blocks = _blocks(side, blocks_of(_white(side, network) * side.test.root))
     numbers, members = _ensemble(blocks, rng)
     given, mean = numbers[: blocks.num_given], numbers[blocks.num_given :]
-    vector = side.vector.copy()
-    vector[list(side.acting)] -= given
-    vector = side.problem.clipped(vector)
+    vector = side.vector_beside(given)
     outputs, deviations = (
         _rows(one.reshape(XYZ, HIDDEN + 1)) for one in (mean, _main_spread(members[:, blocks.num_given :]))
     )
     network = replace(network, outputs=outputs, deviations=deviations)
-    held_white = whitened(held.problem, _features(held, network), side.name)
-    gain, expected = held_out(side, held, np.tensordot(mean, held_white, axes=1), vector)
+    gain, expected = held_out(side, held, np.tensordot(mean, _white(held, network), axes=1), vector)
     if gain <= 0.0:
         return None
     network = _with_interval(held, network, vector)
-    return Residual(network, vector, -blocks.misfit(np.ones(len(blocks.score)), numbers), gain, expected)
+    learnt_gain = -blocks.misfit(np.ones(len(blocks.score)), numbers)
+    return Found((), (network,), vector, learnt_gain, gain, expected)
 
 
 def _ensemble(blocks: _Blocks, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:

@@ -123,11 +123,6 @@ def candidates_for(problem: Problem) -> list[Candidate]:
     return [*CANDIDATES, *(one for effect in given if effect.groups for one in candidates_of(effect))]
 
 
-def probes_for(problem: Problem) -> list[Probe]:
-    """Return the values at which effects are looked for."""
-    return list(dict.fromkeys(probe for one in candidates_for(problem) for probe in one.probes))
-
-
 def threshold(num_parameters: int) -> float:
     """Return the gain of chi2 from which so many parameters are named."""
     return float(stats.chi2.isf(CHANCE, num_parameters))

@@ -15,7 +15,6 @@ from flytrack_sysid.diagnosis.score_test import (
     Linearization,
     candidates_for,
     costs_of,
-    probes_for,
     threshold,
 )
 from flytrack_sysid.log import FlightLog
@@ -48,6 +47,11 @@ class FittedModel(NamedTuple):
     def effects(self) -> set[str]:
         """The names of its effects."""
         return {one.effect for one in self.candidates}
+
+    @property
+    def num_priced(self) -> int:
+        """How many parameters count against it."""
+        return sum(one.num_priced for one in self.candidates)
 
     def candidate(self, effect: str) -> Candidate:
         """Return the way in which an effect of the model was found."""
@@ -125,7 +129,7 @@ class SearchState:
                 last = Linearization(problem, last.slopes, last.probes)
             found = last.moved(vector)
         else:
-            probes = probes_for(problem)
+            probes = list(dict.fromkeys(probe for one in candidates_for(problem) for probe in one.probes))
             others = problem.clipped(np.array([probe.placed_in(problem, vector) for probe in probes]))
             found = Linearization(problem, problem.slopes(vector, self.every_place, others), probes)
         return replace(self, linearization=found), found

@@ -117,17 +117,15 @@ def half_responses_of(
     own = found[list(vectors).index("extended")]
     slopes = np.nan_to_num((found[len(vectors) :] - own) / step[:, None]).T
     if fit is None:
-        halves = Marginal(linearization, model, [problem.names[place] for place in places]).half_widths(
-            slopes
-        )
+        names = [problem.names[place] for place in places]
+        halves = Marginal(linearization, model, names).half_widths(slopes)
     else:
         halves = np.sqrt(np.diag(slopes @ fit.covariance @ slopes.T))
-    result = {}
-    for name, small_s, full_s in zip(vectors, found, full, strict=False):
-        pairs = zip(small_s.tolist(), full_s.tolist(), strict=True)
-        result[name] = dict(zip(STICKS, (HalfResponse(*pair) for pair in pairs), strict=True))
-    for stick, half in zip(STICKS, halves.tolist(), strict=True):
-        one = result["extended"][stick]
+    result = {
+        name: dict(zip(STICKS, map(HalfResponse, small_s.tolist(), full_s.tolist()), strict=True))
+        for name, small_s, full_s in zip(vectors, found, full, strict=False)
+    }
+    for (stick, one), half in zip(result["extended"].items(), halves.tolist(), strict=True):
         result["extended"][stick] = replace(one, ci95=(max(one.time - half, 0.0), one.time + half))
     return result
 

@@ -118,8 +118,7 @@ def examined(selection: Selection) -> Selection:
     for name, change in model_selection.base_changes(state, linearization, model).items():
         robust = change.gain / change.marginal.inflation
         suspects.append(Suspect(name, tuple(change.fields), robust, len(change.fields)))
-    names = find_stand_ins(problem, model, suspects, rest, dependences)
-    return selection._replace(state=state, stand_ins=tuple(names))
+    return selection._replace(state=state, stand_ins=find_stand_ins(selection, suspects, dependences))
 
 
 class Suspect(NamedTuple):
@@ -132,21 +131,18 @@ class Suspect(NamedTuple):
 
 
 def find_stand_ins(
-    problem: Problem,
-    model: FittedModel,
-    suspects: Sequence[Suspect],
-    rest: Unexplained,
-    dependences: Sequence[unknown.Dependence],
-) -> list[str]:
+    selection: Selection, suspects: Sequence[Suspect], dependences: Sequence[unknown.Dependence]
+) -> tuple[str, ...]:
     """Return names that stand in for something that no list has.
 
     Their gain is gone beside smooth functions of what the rest depends on (with the constants of those,
     which a wind, say, would be), or is small where something unknown disturbs the same side; unless it
     outweighs what the dependences explain.
     """
+    problem, model = selection.state.problem, selection.model
     left, slopes = unknown.linearized_residuals(problem, model)
     flight = unknown.flight_of(problem, model)
-    disturbed = {name.split(":")[0] for name in rest.shares}
+    disturbed = {name.split(":")[0] for name in selection.unexplained.shares}
 
     def noncentralities(one: Suspect, side: str) -> tuple[float, float]:
         """Return a suspect's noncentrality on a side, and what is left beside what the rest depends on."""
@@ -178,7 +174,7 @@ def find_stand_ins(
         needed = least * (DISTURBED_BASE if one.name in BASE_CAUSES else DISTURBED)
         if is_gone or (own_side in disturbed and one.robust < needed):
             result.append(one.name)
-    return result
+    return tuple(result)
 
 
 def stands_in_for_unknown(selection: Selection, test: Problem) -> list[str]:

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from flytrack_env.dynamics import ModelParameters, nominal_parameters
-from flytrack_env.files import read_at_most
+from flytrack_env.files import open_file
 from flytrack_env.messages import error_text
 from flytrack_sysid.log import FlightLog, LogError
 
@@ -69,10 +69,14 @@ class ImportedFlight(NamedTuple):
     notes: tuple[str, ...] = ()
 
 
-def read_log_file(path: Path, most_bytes: int, first: bytes) -> bytes:
-    """Return the content of a log file; raises LogError for one that does not begin as its format does."""
+def read_log_file(path: Path, most_bytes: int, first: bytes, part: int | None = None) -> bytes:
+    """Return the content of a log file; raises LogError for one that does not begin as its format does.
+
+    part: how many bytes of it are read; all if None.
+    """
     try:
-        content = read_at_most(path, most_bytes)
+        with open_file(path, most_bytes) as file:
+            content = file.read(part or most_bytes)
     except OSError as error:
         raise LogError(f"{path}: cannot be read: {error_text(error)}") from error
     if not content.startswith(first):

@@ -56,16 +56,7 @@ def read_csv(path: Path, mapping: Mapping) -> ImportedFlight:
         table = read_columns(path, rows, header, wanted)
     if table.lines is None or not len(table.lines):
         raise LogError(f"{path}: found no rows, expected at least one")
-    return flight_of_table(table, mapping)
-
-
-def flight_of_table(table: Table, mapping: Mapping) -> ImportedFlight:
-    """Return the flight in one table with a column of time; SI units and our frames.
-
-    Raises LogError, whose message names source, row, line and column.
-    """
-    channels = [channel for channel, _ in channels_in(table.source, [table.columns], mapping)]
-    values = {channel.name: channel.convert(table) for channel in channels}
+    values = {channel.name: channel.convert(table) for channel, _ in channels}
     if "t" not in values:
         raise LogError(f"{mapping.source}: time: missing, expected a table: every log has it")
     return _flight(table, values.pop("t")[:, 0], values, mapping)

@@ -9,10 +9,8 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from flytrack_env.files import open_file
-from flytrack_env.messages import error_text
 from flytrack_sysid.importing.decoding import decode
-from flytrack_sysid.importing.flight import ImportedFlight, not_a_quadcopter
+from flytrack_sysid.importing.flight import ImportedFlight, not_a_quadcopter, read_log_file
 from flytrack_sysid.importing.mapping import Mapping
 from flytrack_sysid.importing.units import PER_DEGREE, UNITS, quaternion_from, vector_from
 from flytrack_sysid.log import LogError
@@ -112,13 +110,7 @@ def _airframe(parameters: dict[str, float]) -> list[str]:
 
 def _decode(path: Path) -> tuple[dict[str, Samples], dict[str, float], bool]:
     """Return the samples of the log by channel, its parameters, and whether it is damaged in places."""
-    try:
-        with open_file(path, LARGEST_BYTES) as file:
-            first = file.read(len(FIRST_BYTES))
-    except OSError as error:
-        raise LogError(f"{path}: cannot be read: {error_text(error)}") from error
-    if first != FIRST_BYTES:
-        raise LogError(f"{path}: found {first!r} first, expected {FIRST_BYTES!r}, as every ULog begins")
+    read_log_file(path, LARGEST_BYTES, FIRST_BYTES, len(FIRST_BYTES))
     fields: dict[str, list[str]] = {}
     for topic, names in (source for sources in SOURCES.values() for source in sources):
         fields[topic] = [*fields.get(topic, TIMES), *names]

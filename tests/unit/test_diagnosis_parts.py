@@ -143,7 +143,7 @@ def test_lanes_agree_with_one_long_replay(flown, lanes):
         left = problem.residuals(problem.start[None])[0]
         like = jax.tree.map(lambda leaf: np.asarray(leaf, float), model)
         record = make_record(log)
-        later = jax.jit(lambda: replay(like, record, "commanded", None, predictions))()
+        later = jax.jit(lambda: replay(like, record, None, predictions))()
         rates_b, force_b, acc_w = (np.roll(np.asarray(one), 1, axis=0) for one in later)
     before = Rotation.from_quat(np.roll(record.quat, 1, axis=0), scalar_first=True)
     source = record.source_row
