@@ -1,0 +1,73 @@
+"""Self-play begins as good as its first policy, and its races are judged by who finishes first."""
+
+import dataclasses
+
+import jax
+import numpy as np
+import pytest
+
+import flytrack_env
+from baselines.purejaxrl_ppo import load_checkpoint
+from baselines.purejaxrl_ppo.duels import Races, fly_races, score, start_pose_params
+from baselines.purejaxrl_ppo.networks import Policy
+from baselines.purejaxrl_ppo.self_play import Settings, pool_opponent, train, widened
+from flytrack_env.model_file import model_from_json
+from flytrack_env.multi_drone import MultiDroneRace
+from tests.support.pages import ROOT
+
+CHAMPION = load_checkpoint(ROOT / "baselines" / "purejaxrl_ppo" / "champion" / "flytrack.safetensors")
+ENV = flytrack_env.make("FlyTrack-v0", model=model_from_json(CHAMPION.meta["model"], "model"))
+
+
+def test_a_widened_policy_takes_no_notice_of_the_new_rows():
+    wide = widened(CHAMPION.params, 36)
+    seen = np.asarray(jax.random.normal(jax.random.key(0), (5, 36)))
+    found = CHAMPION.network.act(wide, (), seen)[1]
+    np.testing.assert_allclose(found, CHAMPION.network.act(CHAMPION.params, (), seen[:, :29])[1], atol=1e-6)
+
+
+def test_each_member_of_a_pool_flies_its_share_of_the_races():
+    other = jax.tree.map(lambda leaf: 0.5 * leaf, CHAMPION.params)
+    pool = jax.tree.map(lambda *leaves: np.stack(leaves), CHAMPION.params, other)
+    seen = np.asarray(jax.random.normal(jax.random.key(0), (6, 29)))
+    found = pool_opponent(CHAMPION.config, 29, pool).act(pool, seen)
+    for share, params in ((slice(0, 3), CHAMPION.params), (slice(3, 6), other)):
+        expected = CHAMPION.network.act(params, (), seen[share])[1]
+        np.testing.assert_allclose(found[share], expected, atol=1e-6)
+
+
+def races_of(lap_steps, collisions=()):
+    """Two drones that complete laps in these steps of 10, in the middle of each."""
+    completed, times_s, hit = np.zeros((1, 10, 2), bool), np.zeros((1, 10, 2)), np.zeros((1, 10, 2), bool)
+    for drone, steps in enumerate(lap_steps):
+        for step, since in zip(steps, (-0.5, *steps), strict=False):
+            completed[0, step, drone], times_s[0, step:, drone] = True, 0.01 * (step - since)
+    for step in collisions:
+        hit[0, step] = True
+    nothing = np.zeros((1, 10, 2))
+    return Races(np.zeros((1, 10, 2, 21)), nothing.astype(bool), hit, completed, times_s, nothing)
+
+
+def test_who_flies_the_last_lap_first_wins_and_what_happens_later_does_not_count():
+    races = races_of(((3, 6), (4, 8)), collisions=[9])
+    np.testing.assert_allclose(races.finish_s(2), [[0.065, 0.085]])
+    assert score(races, 2) == (1.0, 1.0, 0.0)
+    assert score(races_of(((3, 9), (4, 8)), collisions=[5]), 2) == (1.0, 0.0, 1.0)
+    assert score(races_of(((3,), (4, 8))), 2) == (0.0, 0.0, 0.0)
+
+
+@pytest.mark.slow
+def test_self_play_keeps_what_the_champion_can_and_its_pool_moves_on():
+    race, first = MultiDroneRace(ENV, 2), MultiDroneRace(ENV, 2, "first")
+    config = dataclasses.replace(
+        CHAMPION.config, total_timesteps=8 * 64 * 64, num_envs=64, learning_rate=1e-5, num_minibatches=8
+    )
+    found = list(train([CHAMPION], first, config, Settings(past=1, every=4), seed=0))
+    assert [updates for updates, *_ in found] == [4, 8]
+    policies = Policy(CHAMPION.network, found[-1][1]), CHAMPION.policy
+    flown = fly_races(race, policies, start_pose_params(race.default_params, 0), 0, 16)
+    assert score(flown, 3).finishes > 0.8
+    again = list(train([CHAMPION], first, config, Settings(past=1, every=4), seed=0))
+    jax.tree.map(np.testing.assert_array_equal, again[-1][1], found[-1][1])
+    with pytest.raises(ValueError, match="pool of 3 that divides num_envs, 64"):
+        next(train([CHAMPION], first, config, Settings(past=2), seed=0))
