@@ -71,6 +71,14 @@ pygame.display.init()
 pygame.event.post(pygame.event.Event(pygame.QUIT))
 main(["fly"])
 """
+RACE_IN_OTHER_LIBRARIES = """
+import jax, flytrack_env
+from flytrack_env.multi_drone.jaxmarl_api import JaxMarlRace
+from flytrack_env.multi_drone.pettingzoo_api import ParallelRace
+race = flytrack_env.make_race("FlyTrackDuel-v0")
+for reset in (ParallelRace(race).reset, lambda: JaxMarlRace(race).reset(jax.random.key(0))):
+    assert set(reset()[0]) == {"drone_0", "drone_1"}
+"""
 SIZES = "--num-envs 16 --num-steps 32 --num-minibatches 4 --total-timesteps 1024 --hidden-sizes 8"
 
 # What each extra is for: commands, or code. [speed] compiles for ten minutes, in 4 GB.
@@ -98,6 +106,7 @@ USES = {
     "bags": ("python -m pytest -q -k import_bag tests/unit",),
     "viz": (SAVE_GHOST, "flytrack show flight.npy"),
     "render": (RENDER,),
+    "multi": (RACE_IN_OTHER_LIBRARIES,),
     "fly": (FLY_BY_HAND,),
     "export": (f"flytrack export {CHAMPION} --onnx policy.onnx --c policy.h",),
     "optimal": ("python -m benchmarks.time_optimal --tracks speedway --kinds flying --out made",),

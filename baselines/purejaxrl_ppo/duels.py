@@ -1,7 +1,8 @@
 """Races of several policies against each other, and who wins."""
 
 from functools import partial
-from typing import NamedTuple
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -9,6 +10,7 @@ import numpy as np
 
 from baselines.purejaxrl_ppo.networks import Policy
 from flytrack_env.multi_drone import MultiDroneRace, RaceParams
+from flytrack_env.rollout import save_rollout
 from flytrack_env.state import pack
 
 MOST_STEPS = 1500  # of a race of three laps
@@ -17,11 +19,12 @@ MOST_STEPS = 1500  # of a race of three laps
 class Races(NamedTuple):
     """Races flown to their end; leaves (num_races, num_steps, num_drones, ...).
 
-    states: packed (21,), after the step. is_out, collision, lap_completed, lap_time_s, rank: as told by the
-    race (``flytrack_env.multi_drone``).
+    states, actions: packed (21,), (4,), before the step. is_out, collision, lap_completed, lap_time_s, rank: as
+    told by the race (``flytrack_env.multi_drone``), after it.
     """
 
     states: np.ndarray
+    actions: np.ndarray
     is_out: np.ndarray
     collision: np.ndarray
     lap_completed: np.ndarray
@@ -35,6 +38,18 @@ class Races(NamedTuple):
         first = has_finished.argmax(axis=1)[:, None]
         finish_s = np.take_along_axis(lap_s.cumsum(axis=1), first, axis=1)[:, 0]
         return np.where(has_finished.any(axis=1), finish_s, np.inf)
+
+    def save(self, race: int, folder: Path) -> list[Path]:
+        """Write one race as a rollout of each drone, up to where it is out; return the files.
+
+        ``flytrack show`` draws and records them side by side.
+        """
+        paths = []
+        for place in range(self.states.shape[2]):
+            steps = slice(int((~self.is_out[race, :, place]).sum()) + 1)
+            paths.append(folder / f"drone_{place}.npy")
+            save_rollout(paths[-1], self.states[race, steps, place], self.actions[race, steps, place])
+        return paths
 
 
 class Score(NamedTuple):
@@ -52,17 +67,20 @@ class Score(NamedTuple):
 def _fly(
     race: MultiDroneRace, policies: tuple[Policy, ...], keys: jax.Array, params: RaceParams, num_steps: int
 ) -> tuple[jax.Array, ...]:
-    def step(carry: tuple[jax.Array, ...], _: None) -> tuple[tuple[jax.Array, ...], tuple[jax.Array, ...]]:
+    def step(carry: tuple[Any, Any], _: None) -> tuple[tuple[Any, Any], tuple[jax.Array, ...]]:
         observations, states = carry
-        actions = [
-            policy.network.act(policy.params, (), observations[:, place, : input_size(policy)])[1]
-            for place, policy in enumerate(policies)
-        ]
-        after = jax.vmap(race.step_env, (0, 0, None))(states, jnp.stack(actions, axis=1), params)
+        actions = jnp.stack(
+            [
+                policy.network.act(policy.params, (), observations[:, place, : input_size(policy)])[1]
+                for place, policy in enumerate(policies)
+            ],
+            axis=1,
+        )
+        packed = jax.vmap(jax.vmap(lambda state: pack(race.drone(state))))(states)
+        after = jax.vmap(race.step_env, (0, 0, None))(states, actions, params)
         observations, states, info = after[0], after[1], after[-1]
         told = (info[name] for name in ("collision", "lap_completed", "lap_time_s", "rank"))
-        packed = jax.vmap(jax.vmap(lambda state: pack(race.drone(state))))(states)
-        return (observations, states), (packed, states.is_out, *told)
+        return (observations, states), (packed, actions, states.is_out, *told)
 
     start = jax.vmap(race.reset, (0, None))(keys, params)
     return jax.lax.scan(step, start, None, num_steps)[1]

@@ -38,4 +38,4 @@ def is_put_out(own: Path, other: Path, rules: RaceRules) -> jax.Array:
     diameter = 2.0 * rules.collision_radius
     is_touching = nearest.dot(nearest) < diameter * diameter
     has_rammed = nearest.dot(own_move) >= -nearest.dot(other_move)
-    return is_touching & (has_rammed | (jnp.asarray(rules.blame) == BOTH_OUT))
+    return jnp.asarray(is_touching & (has_rammed | (jnp.asarray(rules.blame) == BOTH_OUT)))

@@ -17,7 +17,7 @@ from jaxmarl.environments import MultiAgentEnv, spaces
 Observations = dict[str, jax.Array]
 
 
-class JaxMarlRace(MultiAgentEnv):  # type: ignore[misc]  # without types of its own
+class JaxMarlRace(MultiAgentEnv):
     """A race as a ``jaxmarl.environments.MultiAgentEnv``; agents are "drone_0" and so on.
 
     Auto-reset is JaxMARL's own: once the race is over, ``dones["__all__"]``. An agent that is out stays done,

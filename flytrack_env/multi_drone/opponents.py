@@ -112,4 +112,4 @@ def progress_of(gates_passed: Scalar, pos_w: Vec3, centre_w: Vec3, leg_m: Scalar
 
     leg_m: distance of that gate from the one before.
     """
-    return gates_passed + 1.0 - compute_once((centre_w - pos_w).norm()) / leg_m
+    return jnp.asarray(gates_passed + 1.0 - compute_once((centre_w - pos_w).norm()) / leg_m)

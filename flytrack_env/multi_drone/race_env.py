@@ -222,7 +222,7 @@ class MultiDroneRace:
         shape = actions.shape[:-1]
         seeds = seeds_of(seed_of(key), jnp.arange(shape[0]))
         flat = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), (states, actions))
-        found = self._step_from(seeds, *flat, params, resets=True)
+        found = self._step_from(seeds, flat[0], flat[1], params, resets=True)
         return jax.tree.map(lambda leaf: leaf.reshape(*shape, *leaf.shape[1:]), found)
 
     # Below, drones of all races are one flat vector.
@@ -319,7 +319,7 @@ class MultiDroneRace:
         course, gate = params.flight.course, self.env.race(inner).gate
         index = jnp.asarray(gate_index)
         before = course.gate(jnp.where(index == 0, course.num_gates - 1, index - 1))
-        leg_m = compute_once((gate.centre - before.centre).norm())
+        leg_m = compute_once(jnp.asarray((gate.centre - before.centre).norm()))
         progress = progress_of(0, drone.pos_w, gate.centre, leg_m)
         return EntrantState(inner, leg_m, progress, jnp.asarray(False), jnp.float32(0.0), jnp.int32(0))
 
@@ -343,12 +343,12 @@ class MultiDroneRace:
         if self.num_drones > 1:
             keep = partial(jnp.where, was_out)
             inner = jax.tree.map(keep, state.inner, inner)
-            reward = keep(0.0, reward)
+            reward = jnp.where(was_out, 0.0, reward)
             info = {name: _where_flying(was_out, value) for name, value in info.items()}
         drone, race = env.drone(inner), env.race(inner)
         has_passed = race.gate_index != env.race(state.inner).gate_index
-        leg_m = jnp.where(has_passed, (race.gate.centre - old_gate.centre).norm(), state.leg_m)
-        leg_m = compute_once(leg_m)
+        new_leg_m = (race.gate.centre - old_gate.centre).norm()
+        leg_m: jax.Array = compute_once(jnp.where(has_passed, new_leg_m, state.leg_m))
         progress = progress_of(race.gates_passed, drone.pos_w, race.gate.centre, leg_m)
         state = EntrantState(inner, leg_m, progress, was_out | terminated, state.gap, state.step + 1)
         return Flown(

@@ -83,7 +83,7 @@ class Versus(environment.Environment[VersusState, VersusParams]):  # type: ignor
         return f"<Versus: {self.game!r}>"
 
     @property
-    def default_params(self) -> VersusParams:
+    def default_params(self) -> VersusParams:  # type: ignore[override]  # as in EpisodicEnvironment
         """The race's parameters, and the opponents' own."""
         return VersusParams(self.game.default_params, tuple(one.params for one in self.opponents))
 
@@ -100,14 +100,16 @@ class Versus(environment.Environment[VersusState, VersusParams]):  # type: ignor
         """Return the box of the learner's observation."""
         return self.game.observation_space()
 
-    def reset(self, key: jax.Array, params: VersusParams | None = None) -> tuple[jax.Array, VersusState]:
+    def reset(  # type: ignore[override]
+        self, key: jax.Array, params: VersusParams | None = None
+    ) -> tuple[jax.Array, VersusState]:
         """Return the learner's observation, (size,) float32, and the state of a race that begins."""
         params = self.default_params if params is None else params
         observations, entrants = self.game.reset(key, params.race)
         return observations[0], VersusState(entrants, observations[1:])
 
     @partial(jax.jit, static_argnames=("self",))
-    def step(  # type: ignore[override]
+    def step(
         self, key: jax.Array, state: VersusState, action: jax.Array, params: VersusParams | None = None
     ) -> Step:
         """Return the learner's observation, state, reward, flags and info of a step, with auto-reset."""
@@ -134,9 +136,8 @@ class Versus(environment.Environment[VersusState, VersusParams]):  # type: ignor
         """Return what a step of the race, leaves (..., num_drones, ...), comes to for drone 0."""
         observations, entrants, *outcomes, info = step
         axis = outcomes[0].ndim - 1
-        own, *flags = (
-            jax.lax.index_in_dim(one, 0, axis, keepdims=False) for one in (observations, *outcomes)
-        )
-        info = {name: jax.lax.index_in_dim(one, 0, axis, keepdims=False) for name, one in info.items()}
+        take = partial(jax.lax.index_in_dim, index=0, axis=axis, keepdims=False)
+        reward, terminated, truncated = map(take, outcomes)
         others = jax.lax.slice_in_dim(observations, 1, self.game.num_drones, axis=axis)
-        return own, VersusState(entrants, others), *flags, info
+        state = VersusState(entrants, others)
+        return take(observations), state, reward, terminated, truncated, jax.tree.map(take, info)

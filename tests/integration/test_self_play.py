@@ -13,6 +13,7 @@ from baselines.purejaxrl_ppo.networks import Policy
 from baselines.purejaxrl_ppo.self_play import Settings, pool_opponent, train, widened
 from flytrack_env.model_file import model_from_json
 from flytrack_env.multi_drone import MultiDroneRace
+from flytrack_env.rollout import load_named_rollouts
 from tests.support.pages import ROOT
 
 CHAMPION = load_checkpoint(ROOT / "baselines" / "purejaxrl_ppo" / "champion" / "flytrack.safetensors")
@@ -45,7 +46,15 @@ def races_of(lap_steps, collisions=()):
     for step in collisions:
         hit[0, step] = True
     nothing = np.zeros((1, 10, 2))
-    return Races(np.zeros((1, 10, 2, 21)), nothing.astype(bool), hit, completed, times_s, nothing)
+    return Races(
+        np.zeros((1, 10, 2, 21)),
+        np.zeros((1, 10, 2, 4)),
+        nothing.astype(bool),
+        hit,
+        completed,
+        times_s,
+        nothing,
+    )
 
 
 def test_who_flies_the_last_lap_first_wins_and_what_happens_later_does_not_count():
@@ -54,6 +63,13 @@ def test_who_flies_the_last_lap_first_wins_and_what_happens_later_does_not_count
     assert score(races, 2) == (1.0, 1.0, 0.0)
     assert score(races_of(((3, 9), (4, 8)), collisions=[5]), 2) == (1.0, 0.0, 1.0)
     assert score(races_of(((3,), (4, 8))), 2) == (0.0, 0.0, 0.0)
+
+
+def test_a_race_is_saved_as_rollouts_up_to_where_a_drone_is_out(tmp_path):
+    races = races_of(((3,), (4,)))
+    races.is_out[0, 6:, 1] = True
+    flights = load_named_rollouts(races.save(0, tmp_path)).values()
+    assert [len(states) for states, _ in flights] == [10, 7]
 
 
 @pytest.mark.slow

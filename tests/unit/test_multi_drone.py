@@ -12,7 +12,6 @@ import flytrack_env
 from flytrack_env.multi_drone import MultiDroneRace, Opponent, RaceRules, Versus, idle
 from flytrack_env.multi_drone.collisions import Path, is_put_out
 from flytrack_env.multi_drone.opponents import Standing, observe_opponents, rank_of
-from flytrack_env.multi_drone.pettingzoo_api import ParallelRace
 from flytrack_env.multi_drone.rules import BOTH_OUT, RAMMER_OUT, check_rules
 from flytrack_env.quaternion import Vec3
 from flytrack_env.references import shipped_reference
@@ -231,7 +230,10 @@ def test_a_learner_meets_its_opponents_alone_and_in_a_batch():
 
 @pytest.mark.filterwarnings("ignore:The old environment creation API")  # PettingZoo's own, in its tests
 def test_pettingzoo_accepts_the_race():
+    pytest.importorskip("pettingzoo")
     from pettingzoo.test import parallel_api_test
+
+    from flytrack_env.multi_drone.pettingzoo_api import ParallelRace
 
     race = ParallelRace(flytrack_env.make_race("FlyTrackRace-v0", DRONES))
     parallel_api_test(race, num_cycles=150)

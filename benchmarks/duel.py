@@ -1,0 +1,187 @@
+"""Duels of policies trained by self-play: ``python -m benchmarks.duel [--seeds 0 1 2 3 4]``.
+
+Trains each seed unless it is in runs/duel, on the model of the champion. Its races against both shipped
+champions, from the slot behind and from the one in front, ratings of the pool of the first seed, and a
+picture of an overtake go to docs/results/duel.md.
+"""
+
+import dataclasses
+import itertools
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+from scipy.optimize import minimize
+from scipy.special import log_expit
+
+import flytrack_env
+from baselines.purejaxrl_ppo import Checkpoint, load_checkpoint
+from baselines.purejaxrl_ppo.checkpoint import observation_layout, save_checkpoint
+from baselines.purejaxrl_ppo.duels import Races, fly_races, score, start_pose_params
+from baselines.purejaxrl_ppo.self_play import Settings, train
+from benchmarks import report
+from benchmarks.champion import CHAMPION, FOLDER, REWARD
+from flytrack_env.files import write_atomically
+from flytrack_env.model_file import model_from_json
+from flytrack_env.multi_drone import MultiDroneRace
+from flytrack_env.pictures import drawing
+from flytrack_env.scene import BLUE, ORANGE
+from flytrack_env.state import POSITION
+from flytrack_env.tracks import Track
+
+RUNS, PICTURE = Path("runs/duel"), report.RESULTS / "duel_overtake.png"
+OPPONENTS = {"champion": CHAMPION, "robust champion": FOLDER / "robust.safetensors"}
+CHANGES: dict[str, Any] = {
+    "total_timesteps": 24_000_000,
+    "learning_rate": 1e-4,
+    "num_minibatches": 16,
+    "episode_steps": 600,
+    "gamma": 0.998,
+    "min_std": 0.01,
+}
+SETTINGS = Settings(std=0.04, course_fraction=0.6)
+SLOTS = {"behind": 1, "in front": 0}
+NUM_RACES, NUM_RATED, LAPS, FLIGHT_SEED = 256, 64, 3, 100
+NUM_SNAPSHOTS = 4  # of the first seed, that are rated
+ELO = 400.0 / np.log(10.0)
+AROUND_STEPS = 120  # before and after an overtake, in the picture
+
+
+def races_on(champion: Checkpoint) -> tuple[MultiDroneRace, MultiDroneRace]:
+    """Return the race to be judged and the one to train in, with the champion's drone."""
+    model = model_from_json(champion.meta["model"], "champion")
+    env = flytrack_env.make("FlyTrack-v0", model=model, reward=REWARD)
+    return MultiDroneRace(env, 2), MultiDroneRace(env, 2, "first")
+
+
+def train_seed(seed: int, starts: list[Checkpoint], race: MultiDroneRace) -> list[Checkpoint]:
+    """Return snapshots of a seed's training, the last of them the result; train unless it is there."""
+    folder = RUNS / f"seed{seed}"
+    if not (folder / "final.safetensors").exists():
+        config = dataclasses.replace(starts[0].config, **CHANGES)
+        meta = {**starts[0].meta, "env_id": "FlyTrackDuel-v0", "seed": seed, "self_play": SETTINGS._asdict()}
+        meta |= {"observation_size": race.observation_space().shape[0]}
+        meta |= {"observation": observation_layout(race)}
+        begun_s, phases = time.process_time(), config.num_updates // SETTINGS.every
+        found = report.progress(train(starts, race, config, SETTINGS, seed), "phases")
+        for number, (updates, params, _) in enumerate(found, start=1):
+            meta |= {"steps": updates * config.batch_size, "seconds": time.process_time() - begun_s}
+            name = "final" if number == phases else f"phase_{number:03d}"
+            save_checkpoint(folder / f"{name}.safetensors", params, config, meta)
+    paths = sorted(folder.glob("phase_*.safetensors"))
+    return [load_checkpoint(path) for path in (*paths, folder / "final.safetensors")]
+
+
+def flown(race: MultiDroneRace, own: Checkpoint, other: Checkpoint, slot: int, count: int) -> Races:
+    """Return races of two policies from the start pose, the first of them in a slot of the grid."""
+    params = start_pose_params(race.default_params, slot)
+    return fly_races(race, (own.policy, other.policy), params, FLIGHT_SEED, count)
+
+
+def mean_s(finish_s: np.ndarray) -> str:
+    """Return the mean of the times of those that finish."""
+    times = finish_s[np.isfinite(finish_s)]
+    return f"{times.mean():.3f}" if len(times) else "-"
+
+
+def rows_of(race: MultiDroneRace, name: str, policy: Checkpoint) -> list[list[str]]:
+    """Return a policy's rows of the table: against each champion, from each slot."""
+    rows = []
+    for opponent, path in OPPONENTS.items():
+        for where, slot in SLOTS.items():
+            races = flown(race, policy, load_checkpoint(path), slot, NUM_RACES)
+            found, finish_s = score(races, LAPS), races.finish_s(LAPS)
+            shares = (f"{share:.1%}" for share in found)
+            rows.append([name, opponent, where, *shares, *map(mean_s, finish_s.T)])
+    return rows
+
+
+def ratings(race: MultiDroneRace, members: dict[str, Checkpoint]) -> list[list[str]]:
+    """Return the members' Elo ratings, best first, by the Bradley-Terry model of all their races.
+
+    A race that both finish, or neither, at the same time counts half for each. A prior of one drawn race with
+    an opponent of mean strength keeps ratings finite.
+    """
+    names = list(members)
+    wins = np.zeros((len(names), len(names)))
+    pairs = list(itertools.permutations(range(len(names)), 2))
+    for first, second in report.progress(pairs, "pairs"):
+        races = flown(race, members[names[first]], members[names[second]], 0, NUM_RATED)
+        own, other = races.finish_s(LAPS).T
+        wins[first, second] += (own < other).sum() + 0.5 * (own == other).sum()
+        wins[second, first] += (other < own).sum() + 0.5 * (own == other).sum()
+
+    def surprise(strength: np.ndarray) -> float:
+        prior = log_expit(strength) + log_expit(-strength)
+        return -float((wins * log_expit(strength[:, None] - strength[None])).sum() + 0.5 * prior.sum())
+
+    strength = minimize(surprise, np.zeros(len(names))).x
+    share = wins.sum(axis=1) / (wins + wins.T).sum(axis=1)
+    order = np.argsort(-strength)
+    return [[names[i], f"{ELO * strength[i]:+.0f}", f"{share[i]:.0%}"] for i in order]
+
+
+def draw_overtake(races: Races, track: Track) -> Figure | None:
+    """Return a picture of the first race that drone 0 wins from behind, about where it gets ahead."""
+    finish_s = races.finish_s(LAPS)
+    for states, rank in zip(races.states[finish_s[:, 0] < finish_s[:, 1]], races.rank, strict=False):
+        is_behind = np.flatnonzero(rank[: int(100 * finish_s[:, 0].min()), 0] == 2)
+        if not len(is_behind):
+            continue
+        middle = int(is_behind[-1])
+        steps = slice(max(middle - AROUND_STEPS, 0), middle + AROUND_STEPS)
+        figure = drawing.new_figure(8.0, 8.0)
+        axes = figure.add_subplot()
+        drawing.draw_gates(axes, track, [0, 1])
+        for drone, colour, name in ((1, ORANGE, "opponent"), (0, BLUE, "self-play policy, from behind")):
+            points = states[steps, drone, POSITION][:, :2]
+            axes.plot(*points.T, color=colour, label=name)
+            for number, point in enumerate(points[::20]):
+                axes.plot(*point, "o", color=colour, markersize=8)
+                axes.annotate(str(number), point, fontsize=6, color="white", ha="center", va="center")
+        seen = states[steps, :, POSITION][..., :2].reshape(-1, 2)
+        axes.set(
+            aspect="equal",
+            xlim=(seen[:, 0].min() - 1.5, seen[:, 0].max() + 1.5),
+            ylim=(seen[:, 1].min() - 1.5, seen[:, 1].max() + 1.5),
+            xlabel="x (m)",
+            ylabel="y (m)",
+            title=f"An overtake {0.01 * middle:.1f} s after the start; dots of a number are at one moment",
+        )
+        axes.legend(loc="best", frameon=False)
+        return figure
+    return None
+
+
+def main(seeds: tuple[int, ...] = (0, 1, 2, 3, 4)) -> None:
+    """Train, race, rate and write the page."""
+    starts = [load_checkpoint(path) for path in OPPONENTS.values()]
+    race, first_out = races_on(starts[0])
+    trained = {seed: train_seed(seed, starts, first_out) for seed in seeds}
+    rows = [row for seed in seeds for row in rows_of(race, f"seed {seed}", trained[seed][-1])]
+    rows += rows_of(race, "champion, untrained for duels", starts[0])
+    pool = trained[seeds[0]]
+    chosen = [pool[i] for i in np.linspace(0, len(pool) - 1, NUM_SNAPSHOTS).astype(int)]
+    members = dict(zip(OPPONENTS, starts, strict=True))
+    members |= {f"seed {seeds[0]} after {one.steps / 1e6:.1f} M steps": one for one in chosen}
+    picture = draw_overtake(flown(race, pool[-1], starts[1], SLOTS["behind"], NUM_RACES), race.env.track)
+    if picture is not None:
+        write_atomically(PICTURE, drawing.png_of(picture))
+    seconds = [snapshots[-1].meta["seconds"] for snapshots in trained.values()]
+    header = "policy | against | starts | finishes | wins | collisions | finish (s) | its opponent's (s)"
+    report.fill_page(
+        report.RESULTS / "duel.md",
+        "duel",
+        table=report.table(header, rows),
+        rated=NUM_RATED,
+        ratings=report.table("policy | Elo | races won", ratings(race, members)),
+        settings=", ".join(f"{name} {value:g}" for name, value in {**CHANGES, **SETTINGS._asdict()}.items()),
+        seconds=report.spread(seconds),
+        picture="" if picture is None else f"![An overtake from above]({PICTURE.name})",
+    )
+
+
+if __name__ == "__main__":
+    report.command(main)
