@@ -19,8 +19,8 @@ MOST_STEPS = 1500  # of a race of three laps
 class Races(NamedTuple):
     """Races flown to their end; leaves (num_races, num_steps, num_drones, ...).
 
-    states, actions: packed (21,), (4,), before the step. is_out, collision, lap_completed, lap_time_s, rank: as
-    told by the race (``flytrack_env.multi_drone``), after it.
+    states, actions: packed (21,), (4,), before the step. is_out, collision, lap_completed, lap_time_s, rank:
+    as told by the race (``flytrack_env.multi_drone``), after it.
     """
 
     states: np.ndarray
