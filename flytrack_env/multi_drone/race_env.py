@@ -183,14 +183,14 @@ class MultiDroneRace:
             check_apart(np.stack([np.asarray(one, float) for one in drones.pos_w], -1), params.rules)
         words = self._words(jnp.asarray(seed, jnp.uint32)[None])
         states = jax.vmap(self._enter, (0, 0, None, 0))(drones, gate_indices, params, words)
-        standings = jax.vmap(self._standing)(states)
+        standings = self._standings(states)
         others = [self._shift(standings, k) for k in self._distances]
         states = states._replace(gap=jax.vmap(gap_of)(standings, others))
         return self.observe(states, params), states
 
     def observe(self, states: EntrantState, params: RaceParams) -> jax.Array:
         """Return the observations of a race's state, (num_drones, size) float32."""
-        standings = jax.vmap(self._standing)(states)
+        standings = self._standings(states)
         others = [self._shift(standings, k) for k in self._distances]
         return jnp.stack(jax.vmap(self._observe, (0, 0, None))(states, others, params), axis=-1)
 
@@ -201,8 +201,8 @@ class MultiDroneRace:
         """Return observations, states, rewards, terminated, truncated and info, with auto-reset of the race.
 
         actions: (num_drones, 4). Everything returned has num_drones in front. terminated: whether a drone is
-        out. info: that of ``env`` while a drone flies, ``collision``, ``rank``, ``gap_gates``,
-        ``race_over`` and ``final_observation``.
+        out. truncated: whether the race is over for one that is not. info: that of ``env`` while a drone
+        flies, ``collision``, ``rank``, ``gap_gates``, ``race_over`` and ``final_observation``.
         """
         return self._step_from(seed_of(key)[None], states, actions, params, resets=True)
 
@@ -269,8 +269,9 @@ class MultiDroneRace:
                 states, standings, others, reward, params.rules
             )
             info = {**info, **told, "collision": collision}
-        terminated, truncated = states.is_out, flown.truncated & ~states.is_out
-        done = compute_once(self._is_over(terminated | truncated))
+        terminated = states.is_out
+        done = compute_once(self._is_over(terminated | flown.truncated))
+        truncated = done & ~terminated  # for those that would have flown on
         final_rows = jax.vmap(self._observe, (0, 0, None))(states, others, params)
         rows = final_rows
         if resets:
@@ -386,6 +387,15 @@ class MultiDroneRace:
         return state._replace(gap=gap), reward + rules.lead * gain, told
 
     # Of the flat vector.
+
+    def _standings(self, states: EntrantState) -> Standing:
+        """Return all standings, those of ghosts on their lines."""
+        standings = jax.vmap(self._standing)(states)
+        place = jnp.arange(len(states.step)) % self.num_drones
+        for ghost_place, ghost in self.ghosts.items():
+            choose = partial(jnp.where, place == ghost_place)
+            standings = jax.tree.map(choose, ghost.standing(states.step), standings)
+        return standings
 
     def _ghosts_at(self, steps: jax.Array) -> tuple[jax.Array, Path, Standing] | None:
         """Return which drones are ghosts, their paths in the next step, standings after it; None without."""

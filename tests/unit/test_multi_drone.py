@@ -186,6 +186,17 @@ def test_a_ghost_flies_its_line_and_stops_for_nobody():
     gate = jax.tree.map(lambda leaf: leaf[0], frame)
     apart = Vec3(*(states[60, axis] - drone.pos_w[axis][0] for axis in range(3)))
     np.testing.assert_allclose(observation[29:32] * 3.0, np.array(gate.to_frame(apart)), atol=1e-3)
+    seen = env.game.observe(state.entrants, env.game.default_params)[0]
+    np.testing.assert_allclose(seen, observation, atol=1e-5)
+
+
+def test_drones_that_would_have_flown_on_are_truncated_when_the_race_is_over():
+    race = MultiDroneRace(RACE.env, DRONES, "first")
+    _, states = race.reset(jax.random.key(1))
+    states = states._replace(is_out=jnp.array([True, False, True]))
+    _, _, reward, terminated, truncated, info = race.step_env(states, jnp.zeros((DRONES, 4)))
+    assert info["race_over"].all() and reward[0] == 0.0
+    assert terminated.tolist() == [True, False, True] and truncated.tolist() == [False, True, False]
 
 
 def test_a_view_refuses_what_does_not_fit():
