@@ -23,6 +23,7 @@ from baselines.purejaxrl_ppo.duels import Races, fly_races, score, start_pose_pa
 from baselines.purejaxrl_ppo.self_play import Settings, train
 from benchmarks import report
 from benchmarks.champion import CHAMPION, FOLDER, REWARD
+from benchmarks.env_speed import jax_contestant, measure, median_ratio
 from flytrack_env.files import write_atomically
 from flytrack_env.model_file import model_from_json
 from flytrack_env.multi_drone import MultiDroneRace
@@ -34,14 +35,13 @@ from flytrack_env.tracks import Track
 RUNS, PICTURE = Path("runs/duel"), report.RESULTS / "duel_overtake.png"
 OPPONENTS = {"champion": CHAMPION, "robust champion": FOLDER / "robust.safetensors"}
 CHANGES: dict[str, Any] = {
-    "total_timesteps": 24_000_000,
-    "learning_rate": 1e-4,
-    "num_minibatches": 16,
-    "episode_steps": 600,
+    "total_timesteps": 5_000_000,
+    "learning_rate": 5e-5,
+    "episode_steps": 400,
     "gamma": 0.998,
     "min_std": 0.01,
 }
-SETTINGS = Settings(std=0.04, course_fraction=0.6)
+SETTINGS = Settings(every=25, std=0.015, course_fraction=0.8)
 SLOTS = {"behind": 1, "in front": 0}
 NUM_RACES, NUM_RATED, LAPS, FLIGHT_SEED = 256, 64, 3, 100
 NUM_SNAPSHOTS = 4  # of the first seed, that are rated
@@ -123,6 +123,13 @@ def ratings(race: MultiDroneRace, members: dict[str, Checkpoint]) -> list[list[s
     return [[names[i], f"{ELO * strength[i]:+.0f}", f"{share[i]:.0%}"] for i in order]
 
 
+def duel_rates() -> str:
+    """Return how fast a batch of duels is stepped, as a share of single races stepped in turns with it."""
+    alone = jax_contestant("alone", "FlyTrack-v0", 1024, 200, is_batch=True)
+    duel = jax_contestant("duel", "FlyTrackDuel-v0", 1024, 200, is_batch=True)
+    return f"{median_ratio(measure([alone, duel], repeats=7), 'duel', 'alone'):.2f}"
+
+
 def draw_overtake(races: Races, track: Track) -> Figure | None:
     """Return a picture of the first race that drone 0 wins from behind, about where it gets ahead."""
     finish_s = races.finish_s(LAPS)
@@ -179,6 +186,7 @@ def main(seeds: tuple[int, ...] = (0, 1, 2, 3, 4)) -> None:
         ratings=report.table("policy | Elo | races won", ratings(race, members)),
         settings=", ".join(f"{name} {value:g}" for name, value in {**CHANGES, **SETTINGS._asdict()}.items()),
         seconds=report.spread(seconds),
+        rates=duel_rates(),
         picture="" if picture is None else f"![An overtake from above]({PICTURE.name})",
     )
 

@@ -21,7 +21,7 @@ def measure(seed: int) -> Outcome:
     torch.set_num_threads(1)  # more threads compete with those of JAX
     torch.manual_seed(seed)
     envs = gymnasium.make_vec("flytrack_env:FlyTrack-v0", NUM_ENVS, autoreset_mode="SameStep")
-    env = TransformedEnv(GymWrapper(envs), RewardSum())
+    env = TransformedEnv(GymWrapper(envs), RewardSum(), auto_unwrap=True)
     env.set_seed(seed)
     mean = torch.nn.Sequential(MLP(29, 8, num_cells=[64, 64]), NormalParamExtractor("biased_softplus_0.4"))
     outputs = ["loc", "scale"]
@@ -32,7 +32,8 @@ def measure(seed: int) -> Outcome:
     loss = ClipPPOLoss(actor, critic, entropy_bonus=False)
     optimizer, size = torch.optim.Adam(loss.parameters(), 1e-3), NUM_ENVS * NUM_STEPS
     results = []
-    for batch in Collector(env, actor, frames_per_batch=size, total_frames=size * NUM_UPDATES):
+    frames = {"frames_per_batch": size, "total_frames": size * NUM_UPDATES}
+    for batch in Collector(env, actor, auto_register_policy_transforms=False, **frames):
         # The infos of the step that ends an episode are in final_info: the gates are those before it.
         names = ("next", "done"), ("next", "episode_reward"), "gates_passed"
         results.append([batch[name].flatten().numpy() for name in names])
