@@ -28,10 +28,12 @@ CHAMPION = ROOT / "baselines" / "purejaxrl_ppo" / "champion" / "flytrack.safeten
 
 FLY_EVERY_ID = """
 import gymnasium, gymnax, jax, flytrack_env
-for env_id in flytrack_env.registration.ENVIRONMENTS:
+from flytrack_env.registration import ENVIRONMENTS, RACES
+for env_id in (*ENVIRONMENTS, *RACES):
     env, params = gymnax.make(env_id)
     key = jax.random.key(0)
     env.step(key, env.reset(key, params)[1], env.action_space(params).sample(key), params)
+for env_id in ENVIRONMENTS:
     envs = gymnasium.make_vec(f"flytrack_env:{env_id}", num_envs=3, vectorization_mode="vector_entry_point")
     assert envs.reset(seed=0)[0].shape == envs.step(envs.action_space.sample())[0].shape
 """
