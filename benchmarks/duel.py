@@ -133,11 +133,9 @@ def duel_rates() -> str:
 def draw_overtake(races: Races, track: Track) -> Figure | None:
     """Return a picture of the first race that drone 0 wins from behind, about where it gets ahead."""
     finish_s = races.finish_s(LAPS)
-    for states, rank in zip(races.states[finish_s[:, 0] < finish_s[:, 1]], races.rank, strict=False):
-        is_behind = np.flatnonzero(rank[: int(100 * finish_s[:, 0].min()), 0] == 2)
-        if not len(is_behind):
-            continue
-        middle = int(is_behind[-1])
+    for race in np.flatnonzero(finish_s[:, 0] < finish_s[:, 1]):
+        states, rank = races.states[race], races.rank[race]
+        middle = int(np.flatnonzero(rank[: int(100 * finish_s[race, 0]), 0] == 2)[-1])
         steps = slice(max(middle - AROUND_STEPS, 0), middle + AROUND_STEPS)
         figure = drawing.new_figure(8.0, 8.0)
         axes = figure.add_subplot()
