@@ -221,6 +221,7 @@ def test_a_view_refuses_what_does_not_fit():
         MultiDroneRace(RACE.env, 2, ghosts={2: None})
 
 
+@pytest.mark.slow  # three programs are compiled
 def test_a_learner_meets_its_opponents_alone_and_in_a_batch():
     def act(gain, seen):
         return jnp.tanh(gain * seen[..., :4])
