@@ -48,7 +48,9 @@ class JaxMarlRace(MultiAgentEnv):
         observations, states = self.race.reset(key, self.params)
         return self._by_agent(observations), states
 
-    def step_env(self, key: jax.Array, state: EntrantState, actions: dict[str, jax.Array]) -> tuple[Any, ...]:
+    def step_env(  # type: ignore[override]  # our states are not of JaxMARL's class, which no code needs
+        self, key: jax.Array, state: EntrantState, actions: dict[str, jax.Array]
+    ) -> tuple[Any, ...]:
         """Return observations, state, rewards, dones and infos; the key is unused.
 
         dones["__all__"]: the race is over. infos: leaves (num_drones,).
@@ -62,7 +64,7 @@ class JaxMarlRace(MultiAgentEnv):
         dones = {**self._by_agent(terminated | truncated), "__all__": info["race_over"][0]}
         return self._by_agent(observations), states, self._by_agent(rewards), dones, info
 
-    def get_obs(self, state: EntrantState) -> Observations:
+    def get_obs(self, state: EntrantState) -> Observations:  # type: ignore[override]
         """Return the observations of a state."""
         return self._by_agent(self.race.observe(state, self.params))
 
