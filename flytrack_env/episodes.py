@@ -28,6 +28,13 @@ from flytrack_env.tracks import Track
 Step = tuple[jax.Array, Any, jax.Array, jax.Array, jax.Array, dict[str, Any]]
 
 
+def observation_box(table: tuple[Entry, ...]) -> spaces.Box:
+    """Return an observation's table as a box."""
+    limits = [np.full(entry.size, entry.limit, np.float32) for entry in table]
+    limit = jnp.asarray(np.concatenate(limits))
+    return spaces.Box(-limit, limit, limit.shape, jnp.float32)
+
+
 def clip_action(action: jax.Array) -> Action:
     """Return the command of an action (4,), clipped to [-1, 1]; infinite values clip, NaN stays."""
     command = unpack_action(jnp.asarray(action))
@@ -134,9 +141,7 @@ class EpisodicEnvironment(environment.Environment[Any, EnvParams]):  # type: ign
 
     def observation_space(self, params: EnvParams | None = None) -> spaces.Box:
         """The observation's table as a box."""
-        limits = [np.full(entry.size, entry.limit, np.float32) for entry in self.observation_table]
-        limit = jnp.asarray(np.concatenate(limits))
-        return spaces.Box(-limit, limit, limit.shape, jnp.float32)
+        return observation_box(self.observation_table)
 
     def observe(self, key: jax.Array | None, state: Any, action: Any, params: EnvParams) -> jax.Array:
         """Return the observation of a state, (size,) float32; key and action are unused."""

@@ -15,7 +15,7 @@ import numpy as np
 from gymnax.environments import spaces
 
 from flytrack_env.auto_reset import Ended, reset_if_ended
-from flytrack_env.episodes import EpisodicEnvironment, Step, clip_action
+from flytrack_env.episodes import EpisodicEnvironment, Step, clip_action, observation_box
 from flytrack_env.fusion import compute_once, one_kernel
 from flytrack_env.multi_drone.collisions import Path, is_put_out
 from flytrack_env.multi_drone.ghosts import Ghost
@@ -129,9 +129,7 @@ class MultiDroneRace:
 
     def observation_space(self, params: RaceParams | None = None) -> spaces.Box:
         """Return the box of one drone's observation."""
-        limits = [np.full(entry.size, entry.limit, np.float32) for entry in self.observation_table]
-        limit = jnp.asarray(np.concatenate(limits))
-        return spaces.Box(-limit, limit, limit.shape, jnp.float32)
+        return observation_box(self.observation_table)
 
     def action_space(self, params: RaceParams | None = None) -> spaces.Box:
         """Return the box of one drone's action."""

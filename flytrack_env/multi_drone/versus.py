@@ -26,7 +26,7 @@ class Opponent(NamedTuple):
 
 
 def idle(race: MultiDroneRace) -> Opponent:
-    """Return an opponent that leaves its sticks alone; a ghost has one."""
+    """Return an opponent that leaves its sticks alone, for the place of a ghost."""
     size = race.env.observation_space().shape[0]
     return Opponent(lambda params, seen: jnp.zeros((*seen.shape[:-1], race.env.num_actions)), size)
 
@@ -72,7 +72,7 @@ class Versus(environment.Environment[VersusState, VersusParams]):  # type: ignor
                     f"opponents[{number}].observation_size: found {opponent.observation_size}, "
                     f"expected {expected}"
                 )
-        self.game, self.opponents = race, tuple(opponents)
+        self.race, self.opponents = race, tuple(opponents)
 
     @property
     def name(self) -> str:
@@ -80,32 +80,32 @@ class Versus(environment.Environment[VersusState, VersusParams]):  # type: ignor
         return repr(self)
 
     def __repr__(self) -> str:
-        return f"<Versus: {self.game!r}>"
+        return f"<Versus: {self.race!r}>"
 
     @property
     def default_params(self) -> VersusParams:  # type: ignore[override]  # as in EpisodicEnvironment
         """The race's parameters, and the opponents' own."""
-        return VersusParams(self.game.default_params, tuple(one.params for one in self.opponents))
+        return VersusParams(self.race.default_params, tuple(one.params for one in self.opponents))
 
     @property
     def num_actions(self) -> int:
         """Number of components of an action."""
-        return self.game.env.num_actions
+        return self.race.env.num_actions
 
     def action_space(self, params: VersusParams | None = None) -> spaces.Box:
         """Return the box of the learner's action."""
-        return self.game.action_space()
+        return self.race.action_space()
 
     def observation_space(self, params: VersusParams | None = None) -> spaces.Box:
         """Return the box of the learner's observation."""
-        return self.game.observation_space()
+        return self.race.observation_space()
 
     def reset(  # type: ignore[override]
         self, key: jax.Array, params: VersusParams | None = None
     ) -> tuple[jax.Array, VersusState]:
         """Return the learner's observation, (size,) float32, and the state of a race that begins."""
         params = self.default_params if params is None else params
-        observations, entrants = self.game.reset(key, params.race)
+        observations, entrants = self.race.reset(key, params.race)
         return observations[0], VersusState(entrants, observations[1:])
 
     @partial(jax.jit, static_argnames=("self",))
@@ -115,7 +115,7 @@ class Versus(environment.Environment[VersusState, VersusParams]):  # type: ignor
         """Return the learner's observation, state, reward, flags and info of a step, with auto-reset."""
         params = self.default_params if params is None else params
         actions = self._all_actions(state.observations, action, params)
-        return self._of_learner(self.game.step(key, state.entrants, actions, params.race))
+        return self._of_learner(self.race.step(key, state.entrants, actions, params.race))
 
     @partial(jax.jit, static_argnames=("self",))
     def step_batch(
@@ -123,7 +123,7 @@ class Versus(environment.Environment[VersusState, VersusParams]):  # type: ignor
     ) -> Step:
         """``step`` for a batch of races with one key, faster than ``vmap(step)``; actions: (num_races, 4)."""
         actions = self._all_actions(states.observations, actions, params)
-        return self._of_learner(self.game.step_batch(key, states.entrants, actions, params.race))
+        return self._of_learner(self.race.step_batch(key, states.entrants, actions, params.race))
 
     def _all_actions(self, observations: jax.Array, action: jax.Array, params: VersusParams) -> jax.Array:
         """Return the actions of all drones, (..., num_drones, 4)."""
@@ -138,6 +138,6 @@ class Versus(environment.Environment[VersusState, VersusParams]):  # type: ignor
         axis = outcomes[0].ndim - 1
         take = partial(jax.lax.index_in_dim, index=0, axis=axis, keepdims=False)
         reward, terminated, truncated = map(take, outcomes)
-        others = jax.lax.slice_in_dim(observations, 1, self.game.num_drones, axis=axis)
+        others = jax.lax.slice_in_dim(observations, 1, self.race.num_drones, axis=axis)
         state = VersusState(entrants, others)
         return take(observations), state, reward, terminated, truncated, jax.tree.map(take, info)

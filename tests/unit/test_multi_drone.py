@@ -168,12 +168,12 @@ def test_ranks_are_by_progress_and_those_that_are_out_come_last():
 
 def test_a_ghost_flies_its_line_and_stops_for_nobody():
     env = gymnax.make("FlyTrackDuel-v0")[0]
-    ghost = env.game.ghosts[1]
+    ghost = env.race.ghosts[1]
     states = np.stack([np.asarray(leaf) for leaf in (*ghost.pos_w, ghost.progress)], axis=-1)
     length_m = np.linalg.norm(np.diff(states[:380, :3], axis=0), axis=1).sum()
     assert 40.0 < length_m < 120.0 and (np.diff(states[:, 3]) > -0.5).all()
     lap = shipped_reference("flytrack", "standing").time_s
-    assert abs(0.01 * np.argmax(states[:, 3] >= env.game.env.default_params.course.num_gates) - lap) < 0.03
+    assert abs(0.01 * np.argmax(states[:, 3] >= env.race.env.default_params.course.num_gates) - lap) < 0.03
     observation, state = env.reset(jax.random.key(0))
     behind = []
     for step in range(60):
@@ -186,7 +186,7 @@ def test_a_ghost_flies_its_line_and_stops_for_nobody():
     gate = jax.tree.map(lambda leaf: leaf[0], frame)
     apart = Vec3(*(states[60, axis] - drone.pos_w[axis][0] for axis in range(3)))
     np.testing.assert_allclose(observation[29:32] * 3.0, np.array(gate.to_frame(apart)), atol=1e-3)
-    seen = env.game.observe(state.entrants, env.game.default_params)[0]
+    seen = env.race.observe(state.entrants, env.race.default_params)[0]
     np.testing.assert_allclose(seen, observation, atol=1e-5)
 
 
