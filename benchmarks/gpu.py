@@ -30,6 +30,10 @@ SEEDS = (1, 4, 16)
 NUM_FLIGHTS = 256
 REPEATS, LENGTH = 5, 64  # calls, and steps of each
 PAGE = report.RESULTS / "gpu.md"
+WHAT = (
+    "256 flights on the accelerator and on the CPU; rates with random actions, observations and resets "
+    "included, compilation excluded, wall time; training by PPO as shipped."
+)
 
 
 def rate_of(entry: Contestant) -> float:
@@ -121,7 +125,7 @@ def main(most: int = 20, steps: int = 8_000_000, cpu: bool = False) -> None:
             parts.append(part())
             print(parts[-1], end="\n\n", flush=True)
         parts.append(f"{jax.devices()[0].device_kind}. {report.provenance_line(report.provenance())}")
-    report.write_page(path, report.page("On a GPU", f"{report.command_line()}.", *parts))
+    report.write_page(path, report.page("On a GPU", f"{report.command_line()}: {WHAT}", *parts))
 
 
 if __name__ == "__main__":
