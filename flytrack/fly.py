@@ -27,6 +27,8 @@ class Fly:
     """Model file of the drone; default: the nominal drone, or the champion's own with its ghost."""
     ghost: Kind = "reference"
     """Fly against the time-optimal flight, against the shipped champion (extra train), or alone."""
+    race: bool = False
+    """Race it: it starts once, with you half a metre behind, does not wait at laps, and can be hit."""
     controls: Gamepad = field(default_factory=Gamepad)
     out: Path = Path("runs/flight.npy")
     """Rollout to write; a number is added to the name where the file exists."""
@@ -51,7 +53,7 @@ def run_fly(flags: Fly) -> None:
     controls = Controls(flags.controls)
     print("compiling ...", file=sys.stderr)
     ghost, model = make_ghost(flags.ghost, track, model)
-    session = Session(track, model, ghost)
+    session = Session(track, model, ghost, flags.race)
     try:
         with suppress(KeyboardInterrupt):  # quits, too
             play(session, controls, window.put, tick_of_clock())

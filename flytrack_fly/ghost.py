@@ -41,6 +41,10 @@ class Ghost(NamedTuple):
         """Return what it flies after so many laps."""
         return self.flying if laps else self.first
 
+    def lap_begin_s(self, laps: int) -> float:
+        """Return when it has flown so many laps, s since its start."""
+        return float(self.first.gate_times_s[-1] + (laps - 1) * self.flying.gate_times_s[-1]) if laps else 0.0
+
     def state_at(self, laps: int, time_s: float) -> np.ndarray:
         """Return the state (21,) so many s after the pilot's lap began; through with a lap, it flies on."""
         beyond_s = time_s - self.lap(laps).gate_times_s[-1]

@@ -8,10 +8,12 @@ import jax
 import numpy as np
 
 from flytrack_env import ModelParameters, Track, make
+from flytrack_env.multi_drone import Path, RaceRules, is_put_out, place_on_grid
+from flytrack_env.quaternion import Vec3
 from flytrack_env.rendering import FlightLog, scene_row
 from flytrack_env.rendering.flight_log import GATE_INDEX, LAP_START, LAP_TIME, LAPS
 from flytrack_env.rollout import MOST_STEPS
-from flytrack_env.state import BATTERY, STATE_SIZE
+from flytrack_env.state import BATTERY, POSITION, STATE_SIZE
 from flytrack_env.terminations import Causes
 from flytrack_env.tracks import cross_gate
 from flytrack_fly.ghost import Ghost, still_start
@@ -20,6 +22,7 @@ from flytrack_fly.sticks import NAMES, command_of, hover_thrust
 MOST_BEHIND_S = 0.1  # later than that, the flight is slowed down: it must not fall behind ever more
 START_HINT = "W, or throttle up: start.  H: keys"
 ROUNDING = 1e-6  # of a number of steps
+GRID = RaceRules()
 
 
 def steps_due(behind_s: float, frame_s: float, step_s: float) -> tuple[int, float]:
@@ -55,31 +58,44 @@ class Session:
     """Flights of FlyTrack-v0, each from rest at the start pose; the step is compiled at once.
 
     A flight begins when the throttle goes up from its middle or below. A gate that is missed stays the next.
+    is_race: the ghost starts once with the pilot, who has a place beside and behind it, and can be hit.
 
     Raises:
-        ValueError: a track or model that cannot be flown.
+        ValueError: a track or model that cannot be flown, or a race without a ghost.
     """
 
-    def __init__(self, track: Track, model: ModelParameters, ghost: Ghost | None):
-        self.ghost = ghost
+    def __init__(self, track: Track, model: ModelParameters, ghost: Ghost | None, is_race: bool = False):
+        if is_race and ghost is None:
+            raise ValueError("--race: found --ghost none, expected an opponent: reference or champion")
+        self.ghost, self.is_race = ghost, is_race
         self.gate_ids = [gate.id for gate in track.gates]
         self.env = make("FlyTrack-v0", track=track, model=model, missed_gate="fly_on")
         self.params = still_start(self.env.default_params, MOST_STEPS)  # the battery ends a flight
         self.step_s = float(self.params.dt)
         self._start = self.env.reset(jax.random.key(0), self.params)[1]
+        if is_race:
+            beside = place_on_grid(self.env.drone(self._start), 1, GRID)
+            self._start = self.env.begin(beside, jax.numpy.int32(0), self.params)
         self._step = jax.jit(self._advance_state)
-        jax.block_until_ready(self._step(self._start, np.zeros(len(NAMES), np.float32)))
+        nobody = np.full((2, 3), np.nan, np.float32)
+        jax.block_until_ready(self._step(self._start, np.zeros(len(NAMES), np.float32), nobody))
         self.flights: list[Flight] = []
         self.restart()
 
-    def _advance_state(self, state: Any, command: jax.Array) -> tuple[Any, ...]:
-        """Return the next state, its row, the time of crossing the next gate's plane, causes of an end."""
+    def _advance_state(self, state: Any, command: jax.Array, opponent_w: jax.Array) -> tuple[Any, ...]:
+        """Return the next state, its row, the time of crossing the next gate's plane, causes of an end.
+
+        opponent_w: where an opponent is before and after the step, (2, 3); NaN: nowhere.
+        """
         env, params = self.env, self.params
         _, after, _, _, info = env.step_env(None, state, command, params)
         ends_w, race = (env.drone(state).pos_w, env.drone(after).pos_w), env.race(state)
         fraction = cross_gate(race.gate, *ends_w, params.drone_radius).fraction
         row = scene_row(env.drone(after), env.race(after))
-        return after, row, (state.time + fraction) * params.dt, {name: info[name] for name in Causes._fields}
+        causes = {name: info[name] for name in Causes._fields}
+        opponent = Path(*(Vec3(*position_w) for position_w in opponent_w))
+        causes["collision"] = is_put_out(Path(*ends_w), opponent, GRID)
+        return after, row, (state.time + fraction) * params.dt, causes
 
     def restart(self) -> None:
         """Put the drone at the start; the flight so far is kept if it has begun."""
@@ -103,7 +119,7 @@ class Session:
     def fly(self, command: np.ndarray) -> None:
         """Fly a step with a command (4,); back to the start if it ends the flight."""
         flight, before = self.now, self.now.log.rows[-1]
-        self.state, row, gate_s, causes = self._step(self.state, command)
+        self.state, row, gate_s, causes = self._step(self.state, command, self._opponent_w())
         flight.commands.append(command)
         self._count(before, np.asarray(row), float(gate_s))
         flight.log.append(np.asarray(row))
@@ -118,16 +134,26 @@ class Session:
         flight, gate = self.now, int(before[GATE_INDEX])
         flight.num_gates += 1
         if self.ghost is not None:
-            ghost_s = self.ghost.lap(int(before[LAPS])).gate_times_s[gate]
-            flight.gap = gate, float(gate_s - before[LAP_START] - ghost_s)
+            laps = int(before[LAPS])
+            begin_s = self.ghost.lap_begin_s(laps) if self.is_race else before[LAP_START]
+            flight.gap = gate, float(gate_s - begin_s - self.ghost.lap(laps).gate_times_s[gate])
         if after[LAPS] > before[LAPS]:
             flight.lap_times_s.append(float(after[LAP_TIME]))
 
     def ghost_state(self) -> np.ndarray | None:
-        """Return the ghost's state (21,) now, if there is one; it begins every lap with the pilot."""
+        """Return the ghost's state (21,) now, if any; it begins every lap with the pilot, but in a race."""
         log = self.now.log
+        if self.ghost and self.is_race:
+            return self.ghost.state_at(0, log.time_s)
         laps, lap_start_s = int(log.rows[-1, LAPS]), float(log.rows[-1, LAP_START])
         return self.ghost and self.ghost.state_at(laps, log.time_s - lap_start_s)
+
+    def _opponent_w(self) -> np.ndarray:
+        """Return where the opponent of a race is before and after the next step, (2, 3); NaN without one."""
+        if self.ghost is None or not self.is_race:
+            return np.full((2, 3), np.nan, np.float32)
+        times_s = (self.now.log.time_s, self.now.log.time_s + self.step_s)
+        return np.stack([self.ghost.state_at(0, time_s)[POSITION] for time_s in times_s]).astype(np.float32)
 
     def notes(self) -> str:
         """Return what the picture says besides its bar: best lap, gap to the ghost, how to start."""
@@ -135,7 +161,8 @@ class Session:
         lines = [f"best {min(lap_times_s):.2f} s"] if lap_times_s else []
         if self.ghost and self.now.gap is not None:
             gate, gap_s = self.now.gap
-            lines.append(f"gate {self.gate_ids[gate]}: {gap_s:+.2f} s to the {self.ghost.name} ghost")
+            whom = f"the {self.ghost.name} {'opponent' if self.is_race else 'ghost'}"
+            lines.append(f"gate {self.gate_ids[gate]}: {gap_s:+.2f} s to {whom}")
         if not self.now.commands:
             lines += [f"ended: {self.flights[-2].ended}"] if len(self.flights) > 1 else []
             lines.append(START_HINT)

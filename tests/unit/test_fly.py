@@ -118,6 +118,26 @@ def test_a_crash_goes_back_to_the_start_where_the_throttle_must_come_down(sessio
     assert len(session.now.commands) == 1
 
 
+def test_in_a_race_the_opponent_goes_its_own_way_and_is_hit(session):
+    early = GHOST.first._replace(state_at=lambda time_s: GHOST.first.state_at(time_s + 0.5))
+    race = Session(TRACK, MODEL, GHOST._replace(first=early), is_race=True)
+    start_w = race.now.log.rows[-1, POSITION]
+    np.testing.assert_allclose(start_w, GHOST.state_at(0, 0.0)[POSITION] + (0.5, 0.5, 0.0), atol=1e-5)
+    session.restart()
+    race.state = session.state  # on the optimum itself, half a second behind the opponent
+    for command in STANDING.commands:
+        race.fly(command)
+    flight = race.now
+    assert flight.num_gates == 8 and flight.gap == (7, pytest.approx(0.0, abs=1e-3))
+    np.testing.assert_allclose(race.ghost_state(), GHOST.flying.state_at(flight.log.time_s - STANDING.time_s))
+    assert "to the time-optimal opponent" in race.notes()
+    assert GHOST.lap_begin_s(2) == STANDING.time_s + GHOST.flying.gate_times_s[-1]
+    still = GHOST.first._replace(state_at=lambda time_s: np.r_[start_w, np.zeros(18)])
+    race = Session(TRACK, MODEL, GHOST._replace(first=still), is_race=True)
+    race.fly(UP)
+    assert race.flights[0].ended == "collision"
+
+
 def test_the_picture_shows_the_ghost_and_looks_where_the_nose_points(session):
     session.restart()
     renderer, log = make_renderer(session.params.course, session.gate_ids), session.now.log
@@ -155,6 +175,7 @@ def test_sticks_steps_and_ghosts():
         ("--gamepad 0 --axes 0 1 2 6", "--axes: found .* expected 0 to 5 of Pad"),
         ("--expo 2", "--expo: found 2.0, expected 0 to 1"),
         ("--track tests/support/small_track.toml", "--ghost reference: .* --ghost none"),
+        ("--race --ghost none", "--race: found --ghost none, expected an opponent"),
         ("--out README.md/flight.npy", "--out README.md/flight.npy: found a file"),
         ("", "display: found none, expected a screen"),
     ],
