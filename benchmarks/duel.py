@@ -1,8 +1,8 @@
 """Duels of policies trained by self-play: ``python -m benchmarks.duel [--seeds 0 1 2 3 4]``.
 
-Trains each seed unless it is in runs/duel, on the model of the champion. Its races against both shipped
-champions, from the slot behind and from the one in front, ratings of the pool of the first seed, and a
-picture of an overtake go to docs/results/duel.md.
+Trains each seed by self-play, then polishes it among opponents, unless it is in runs/duel, on the model of
+the champion. Its races against both shipped champions, from the slot behind and from the one in front,
+ratings of the pool of the first seed, and a picture of an overtake go to docs/results/duel.md.
 """
 
 import dataclasses
@@ -11,6 +11,8 @@ import time
 from pathlib import Path
 from typing import Any
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 from matplotlib.figure import Figure
 from scipy.optimize import minimize
@@ -19,8 +21,12 @@ from scipy.special import log_expit
 import flytrack_env
 from baselines.purejaxrl_ppo import Checkpoint, load_checkpoint
 from baselines.purejaxrl_ppo.checkpoint import observation_layout, save_checkpoint
+from baselines.purejaxrl_ppo.duel_flight import DuelFlight
 from baselines.purejaxrl_ppo.duels import Races, fly_races, score, start_pose_params
-from baselines.purejaxrl_ppo.self_play import Settings, train
+from baselines.purejaxrl_ppo.networks import Policy
+from baselines.purejaxrl_ppo.polish import Settings as PolishSettings
+from baselines.purejaxrl_ppo.polish import polish
+from baselines.purejaxrl_ppo.self_play import Settings, train, widened
 from benchmarks import report
 from benchmarks.champion import CHAMPION, FOLDER, REWARD
 from benchmarks.env_speed import jax_contestant, measure, median_ratio
@@ -28,6 +34,7 @@ from flytrack_env.files import write_atomically
 from flytrack_env.model_file import model_from_json
 from flytrack_env.multi_drone import MultiDroneRace
 from flytrack_env.pictures import drawing
+from flytrack_env.progress import ProgressBar
 from flytrack_env.scene import BLUE, ORANGE
 from flytrack_env.state import POSITION
 from flytrack_env.tracks import Track
@@ -42,6 +49,9 @@ CHANGES: dict[str, Any] = {
     "min_std": 0.01,
 }
 SETTINGS = Settings(every=25, std=0.015, course_fraction=0.8)
+POLISH = PolishSettings(
+    updates=800, learning_rate=2e-4, flights=24, offset_limit=0.94, penalty_s=60.0, nearness_s=0.01
+)
 SLOTS = {"behind": 1, "in front": 0}
 NUM_RACES, NUM_RATED, LAPS, FLIGHT_SEED = 256, 64, 3, 100
 NUM_SNAPSHOTS = 4  # of the first seed, that are rated
@@ -57,7 +67,7 @@ def races_on(champion: Checkpoint) -> tuple[MultiDroneRace, MultiDroneRace]:
 
 
 def train_seed(seed: int, starts: list[Checkpoint], race: MultiDroneRace) -> list[Checkpoint]:
-    """Return snapshots of a seed's training, the last of them the result; train unless it is there."""
+    """Return snapshots of a seed's self-play, the last of them the result; train unless it is there."""
     folder = RUNS / f"seed{seed}"
     if not (folder / "final.safetensors").exists():
         config = dataclasses.replace(starts[0].config, **CHANGES)
@@ -72,6 +82,21 @@ def train_seed(seed: int, starts: list[Checkpoint], race: MultiDroneRace) -> lis
             save_checkpoint(folder / f"{name}.safetensors", params, config, meta)
     paths = sorted(folder.glob("phase_*.safetensors"))
     return [load_checkpoint(path) for path in (*paths, folder / "final.safetensors")]
+
+
+def polish_seed(seed: int, learnt: Checkpoint, starts: list[Checkpoint], race: MultiDroneRace) -> Checkpoint:
+    """Return what self-play has learnt, polished against the champions and itself, unless it is there."""
+    path = RUNS / f"seed{seed}" / "polished.safetensors"
+    if not path.exists():
+        size = race.observation_space().shape[0]
+        members = [*(widened(start.params, size) for start in starts), learnt.params]
+        pool = Policy(learnt.network, jax.tree.map(lambda *leaves: jnp.stack(leaves), *members))
+        flight, begun_s = DuelFlight(race, pool), time.process_time()
+        bar = ProgressBar("updates")
+        params = polish(flight, learnt.policy, seed, POLISH, report=bar, nearness=flight.nearness)
+        notes = {"seed": seed, "seconds": time.process_time() - begun_s, **POLISH._asdict()}
+        save_checkpoint(path, params, learnt.config, {**learnt.meta, "polished": notes})
+    return load_checkpoint(path)
 
 
 def flown(race: MultiDroneRace, own: Checkpoint, other: Checkpoint, slot: int, count: int) -> Races:
@@ -165,16 +190,21 @@ def main(seeds: tuple[int, ...] = (0, 1, 2, 3, 4)) -> None:
     starts = [load_checkpoint(path) for path in OPPONENTS.values()]
     race, first_out = races_on(starts[0])
     trained = {seed: train_seed(seed, starts, first_out) for seed in seeds}
-    rows = [row for seed in seeds for row in rows_of(race, f"seed {seed}", trained[seed][-1])]
+    polished = {seed: polish_seed(seed, trained[seed][-1], starts, race) for seed in seeds}
+    rows = [row for seed in seeds for row in rows_of(race, f"seed {seed}", polished[seed])]
+    rows += rows_of(race, f"seed {seeds[0]}, self-play alone", trained[seeds[0]][-1])
     rows += rows_of(race, "champion, untrained for duels", starts[0])
     pool = trained[seeds[0]]
     chosen = [pool[i] for i in np.linspace(0, len(pool) - 1, NUM_SNAPSHOTS).astype(int)]
     members = dict(zip(OPPONENTS, starts, strict=True))
     members |= {f"seed {seeds[0]} after {one.steps / 1e6:.1f} M steps": one for one in chosen}
-    picture = draw_overtake(flown(race, pool[-1], starts[1], SLOTS["behind"], NUM_RACES), race.env.track)
+    members[f"seed {seeds[0]}, polished"] = polished[seeds[0]]
+    picture = draw_overtake(
+        flown(race, polished[seeds[0]], starts[1], SLOTS["behind"], NUM_RACES), race.env.track
+    )
     if picture is not None:
         write_atomically(PICTURE, drawing.png_of(picture))
-    seconds = [snapshots[-1].meta["seconds"] for snapshots in trained.values()]
+    seconds = [one.meta["seconds"] + one.meta["polished"]["seconds"] for one in polished.values()]
     header = "policy | against | starts | finishes | wins | collisions | finish (s) | its opponent's (s)"
     report.fill_page(
         report.RESULTS / "duel.md",
@@ -183,6 +213,7 @@ def main(seeds: tuple[int, ...] = (0, 1, 2, 3, 4)) -> None:
         rated=NUM_RATED,
         ratings=report.table("policy | Elo | races won", ratings(race, members)),
         settings=", ".join(f"{name} {value:g}" for name, value in {**CHANGES, **SETTINGS._asdict()}.items()),
+        polished=", ".join(f"{name} {value:g}" for name, value in POLISH._asdict().items()),
         seconds=report.spread(seconds),
         rates=duel_rates(),
         picture="" if picture is None else f"![An overtake from above]({PICTURE.name})",

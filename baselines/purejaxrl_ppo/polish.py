@@ -32,9 +32,10 @@ class Settings(NamedTuple):
     updates: of the policy; learning_rate: of the first, falling to 0 as a cosine. flights: of one update,
     from noisy start poses, of so many laps. slowest_lap_s: mean lap time from which a flight is cut off.
     offset_limit: of a pass, over the free half opening, from which it is penalised, by penalty_s seconds
-    times the square of what is beyond. widened_m: by which half openings are widened. largest_gradient:
-    global norm at which gradients are clipped. gradient_decay: share of a state's gradient that is passed on
-    to the step before; below 1 it looks ahead for 1 / (1 - share) steps and cannot overflow.
+    times the square of what is beyond. nearness_s: what a step of nearness 1 to an opponent costs. widened_m:
+    by which half openings are widened. largest_gradient: global norm at which gradients are clipped.
+    gradient_decay: share of a state's gradient that is passed on to the step before; below 1 it looks ahead
+    for 1 / (1 - share) steps and cannot overflow.
     """
 
     updates: int = 1500
@@ -44,21 +45,36 @@ class Settings(NamedTuple):
     slowest_lap_s: float = 4.2
     offset_limit: float = 0.95
     penalty_s: float = 20.0
+    nearness_s: float = 0.01
     widened_m: float = 0.3
     largest_gradient: float = 1.0
     gradient_decay: float = 0.998
 
 
 class Flown(NamedTuple):
-    """What a flight came to: mean time of its gates, s, gates passed, the penalty."""
+    """What a flight came to: mean time of its gates, s, gates passed, the penalty, the sum of nearness."""
 
     time_s: jax.Array
     gates: jax.Array
     penalty: jax.Array
+    nearness: jax.Array
+
+
+Nearness = Callable[[Any], jax.Array]
+
+
+def alone(state: Any) -> jax.Array:
+    """Return the nearness to an opponent where there is none, 0."""
+    return jnp.float32(0.0)
 
 
 def fly(
-    env: EpisodicEnvironment, policy: Policy, key: jax.Array, params: EnvParams, settings: Settings
+    env: EpisodicEnvironment,
+    policy: Policy,
+    key: jax.Array,
+    params: EnvParams,
+    settings: Settings,
+    nearness: Nearness = alone,
 ) -> Flown:
     """Return a flight of the mean action, differentiable in the policy; it stands still once it is over."""
     gates = params.course.gates
@@ -85,6 +101,8 @@ def fly(
             gates=flown.gates + counts,
             # Linear far out: one lost flight must not outweigh all that race.
             penalty=flown.penalty + jnp.where(beyond < FAR, beyond * beyond, FAR * (2.0 * beyond - FAR)),
+            nearness=flown.nearness
+            + jnp.where(is_flying & (flown.gates < last_gate), nearness(next_state), 0.0),
         )
         # What ended would fly on to where numbers overflow, and its gradient with it.
         is_flying = is_flying & ~is_over
@@ -94,7 +112,7 @@ def fly(
         return (*kept, is_flying, flown), None
 
     zero = jnp.float32(0.0)
-    nothing = Flown(zero, jnp.int32(0), zero)
+    nothing = Flown(zero, jnp.int32(0), zero, zero)
     start = (policy.network.first_memory(), *env.reset_env(key, params), jnp.asarray(True), nothing)
     num_steps = round(settings.laps * settings.slowest_lap_s / float(env.default_params.dt))
     return jax.lax.scan(jax.checkpoint(step), start, jnp.arange(num_steps))[0][-1]
@@ -122,11 +140,13 @@ def polish(
     settings: Settings = Settings(),  # noqa: B008, a tuple of constants
     draw_model: DrawModel | None = None,
     report: Callable[[int, int], None] = lambda done, total: None,
+    nearness: Nearness = alone,
 ) -> Any:
     """Return the parameters of a policy that races faster.
 
     env: a simulator with the model that is raced on. draw_model: the model of each flight, from a key; that
-    of the environment if None. report: called with updates done and in all.
+    of the environment if None. report: called with updates done and in all. nearness: to an opponent, from a
+    state of the environment.
 
     Raises:
         ValueError: a policy of which no flight of an update passes all gates.
@@ -140,13 +160,14 @@ def polish(
         def flight(key: jax.Array) -> Flown:
             of_model, of_start = jax.random.split(key)
             own = params if draw_model is None else params.replace(model=draw_model(of_model))
-            return fly(env, Policy(policy.network, policy_params), of_start, own, settings)
+            return fly(env, Policy(policy.network, policy_params), of_start, own, settings, nearness)
 
         flown = jax.vmap(flight)(keys)
         is_complete = flown.gates >= last_gate
         times_s = jnp.where(is_complete, flown.time_s, 0.0).sum()
         number = is_complete.sum()
-        value = (times_s + settings.penalty_s * flown.penalty.sum()) / jnp.maximum(number, 1)
+        costs_s = settings.penalty_s * flown.penalty.sum() + settings.nearness_s * flown.nearness.sum()
+        value = (times_s + costs_s) / jnp.maximum(number, 1)
         return value, number
 
     @partial(jax.jit, donate_argnums=(0, 1))

@@ -1,18 +1,25 @@
 """Self-play begins as good as its first policy, and its races are judged by who finishes first."""
 
 import dataclasses
+from functools import partial
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import flytrack_env
 from baselines.purejaxrl_ppo import load_checkpoint
+from baselines.purejaxrl_ppo.duel_flight import DuelFlight, DuelState
 from baselines.purejaxrl_ppo.duels import Races, fly_races, score, start_pose_params
+from baselines.purejaxrl_ppo.flights import start_keys
 from baselines.purejaxrl_ppo.networks import Policy
+from baselines.purejaxrl_ppo.polish import Settings as PolishSettings
+from baselines.purejaxrl_ppo.polish import fly, polish
 from baselines.purejaxrl_ppo.self_play import Settings, pool_opponent, train, widened
 from flytrack_env.model_file import model_from_json
-from flytrack_env.multi_drone import MultiDroneRace
+from flytrack_env.multi_drone import EntrantState, MultiDroneRace
+from flytrack_env.quaternion import Vec3
 from flytrack_env.rollout import load_named_rollouts
 from tests.support.pages import ROOT
 
@@ -70,6 +77,49 @@ def test_a_race_is_saved_as_rollouts_up_to_where_a_drone_is_out(tmp_path):
     races.is_out[0, 6:, 1] = True
     flights = load_named_rollouts(races.save(0, tmp_path)).values()
     assert [len(states) for states, _ in flights] == [10, 7]
+
+
+def test_nearness_pushes_to_the_side_and_never_back():
+    flight = DuelFlight(MultiDroneRace(ENV, 2), CHAMPION.policy)
+    drone, nothing = ENV.sample_start(jnp.uint32(0), ENV.default_params)[0], jnp.zeros(2)
+    drones = jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), drone)
+
+    @jax.jit
+    def nearness(own_w):
+        """Of a learner at a place, (3,), whose opponent is at the origin and flies along x."""
+        pos_w = Vec3(*(jnp.stack([own, jnp.float32(0.0)]) for own in own_w))
+        moved = drones._replace(pos_w=pos_w, vel_w=Vec3(jnp.full(2, 9.0), nothing, nothing))
+        inner = jax.vmap(ENV.begin, (0, None, None))(moved, jnp.int32(0), ENV.default_params)
+        entrants = EntrantState(inner, nothing, nothing, nothing > 0.0, nothing, nothing)
+        return flight.nearness(DuelState(entrants, jnp.zeros((2, 36)), jnp.int32(0)))
+
+    behind, beside, ahead = (jnp.array([x, 0.1, 0.0]) for x in (-0.6, 0.0, 0.6))
+    assert float(nearness(ahead)) == 0.0 < float(nearness(behind)) < float(nearness(beside)) < 1.0
+    for place in (behind, beside):
+        x, y, z = jax.grad(nearness)(place)
+        assert abs(x) < 1e-3 and y < -0.5 and abs(z) < 1e-3
+    assert float(nearness(jnp.array([0.0, 0.0, 2.0]))) == 0.0
+
+
+@pytest.mark.slow
+def test_polishing_among_opponents_keeps_clear_of_them():
+    race = MultiDroneRace(ENV, 2)
+    member = widened(CHAMPION.params, 36)
+    flight = DuelFlight(race, Policy(CHAMPION.network, jax.tree.map(lambda leaf: leaf[None], member)))
+    settings = PolishSettings(
+        updates=12, learning_rate=1e-4, flights=4, laps=1, slowest_lap_s=4.6, nearness_s=0.1
+    )
+    learner = Policy(CHAMPION.network, member)
+    found = polish(flight, learner, 0, settings, nearness=flight.nearness)
+
+    def nearness(params):
+        policy = Policy(CHAMPION.network, params)
+        fly_one = partial(fly, flight, policy, params=flight.default_params, settings=settings)
+        flown = jax.jit(jax.vmap(partial(fly_one, nearness=flight.nearness)))(start_keys(1, 8))
+        assert (flown.gates == 8).all()
+        return float(flown.nearness.mean())
+
+    assert nearness(found) < 0.8 * nearness(member)
 
 
 @pytest.mark.slow
