@@ -2,8 +2,6 @@
 
 import argparse
 import dataclasses
-import os
-import tempfile
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
@@ -50,20 +48,13 @@ def serialize(parameters: PlantParameters) -> bytes:
 def build(parameters: PlantParameters, path: str | Path) -> Path:
     """Write the artifact of a plant with any parameters, and return its path.
 
-    It is written under a temporary name and renamed, so that no half-written file is left.
+    It is written under another name and renamed, so that nobody reads half of it.
     """
-    path, content = Path(path), serialize(parameters)
+    path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-    try:
-        with os.fdopen(handle, "wb") as file:
-            file.write(content)
-        os.chmod(temporary, 0o644)
-        os.replace(temporary, path)
-    except BaseException:
-        os.unlink(temporary)
-        raise
-    return path
+    unfinished = path.with_name(f".{path.name}.unfinished")
+    unfinished.write_bytes(serialize(parameters))
+    return unfinished.replace(path)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

@@ -80,13 +80,6 @@ def _read_effect(path: Path, name: str, values: Any) -> Any:
     return effect.parameters(**{field: float(value) for field, value in values.items()}, **static)
 
 
-def _read_motion(path: Path, name: Any) -> Motion:
-    values = [motion.value for motion in Motion]
-    if name not in values:
-        raise ModelFileError(f"{path}: motion: found {quote_value(name)}, expected {' or '.join(values)}")
-    return Motion(name)
-
-
 def _read_json(path: Path) -> dict[str, Any]:
     """Return the object in a JSON file."""
     try:
@@ -139,7 +132,8 @@ def model_from_json(data: dict[str, Any], path: str | Path, dtype: Any = np.floa
     for name in values:
         _known(str(path), name, (*SIZES, "effects", "motion", "version"))
     by_name = _object(f"{path}: effects", data.get("effects", values.get("effects", {})))
-    motion = _read_motion(path, data.get("motion", values.get("motion", Motion.HANDOUT.value)))
+    motion = data.get("motion", values.get("motion", Motion.HANDOUT.value))
+    motion = Motion(_known(f"{path}: motion", motion, [one.value for one in Motion]))
     read = {name: _read_field(path, name, values[name], dtype) for name in SIZES}
     base = ModelParameters(**read, motion=motion)
     return base.with_effects(*(_read_effect(path, name, by_name[name]) for name in by_name))

@@ -55,12 +55,6 @@ def start_race(gate_index: jax.Array, course: Course) -> Race:
     )
 
 
-def _with_gates(race: Race, course: Course) -> Race:
-    """Return the race with the flight frames that belong to its gate index."""
-    following = course.next_index(race.gate_index)
-    return race._replace(gate=course.gate(race.gate_index), next_gate=course.gate(following))
-
-
 def _count_pass(race: Race, is_pass: jax.Array, time_s: Scalar, course: Course) -> tuple[Race, jax.Array]:
     """Return the race after a possible pass, its gate frames not yet moved on, and whether a lap ended."""
     gates_passed = race.gates_passed + is_pass
@@ -100,4 +94,6 @@ def advance_race(
         is_miss=first.is_miss | (first.is_pass & second.is_miss),
         offset=jnp.where(is_second, jnp.maximum(first.offset, second.offset), first.offset),
     )
-    return compute_once((_with_gates(after, course), events))
+    following = course.next_index(after.gate_index)
+    after = after._replace(gate=course.gate(after.gate_index), next_gate=course.gate(following))
+    return compute_once((after, events))

@@ -22,7 +22,7 @@ import numpy as np
 
 from flytrack_env.files import open_file, write_atomically
 from flytrack_env.messages import error_text, quote_name, quote_value
-from flytrack_env.npz_file import NpzError, load_npz
+from flytrack_env.npz_file import NpzError, load_npz, npz_of
 from flytrack_sysid.log import CHANNELS, GAP_STEPS, FlightLog, LogError, usual_step
 from flytrack_sysid.log_table import Table, check_names, columns_of, log_of_table
 
@@ -62,7 +62,7 @@ def save_log(path: str | Path, log: FlightLog) -> None:
     columns |= columns_of(columns["t"], channels)
     check_names(str(path), list(columns))
     log_of_table(Table(str(path), {name: values.astype(float) for name, values in columns.items()}))
-    write_atomically(path, _npz_of(columns) if path.suffix.lower() == ".npz" else _csv_of(columns))
+    write_atomically(path, npz_of(columns) if path.suffix.lower() == ".npz" else _csv_of(columns))
 
 
 def check_name(path: str | Path) -> None:
@@ -137,13 +137,6 @@ def _read_csv(path: Path) -> Table:
         header = [name.strip() for name in next(rows, [])]
         check_names(str(path), header)
         return read_columns(path, rows, header, header)
-
-
-def _npz_of(columns: dict[str, np.ndarray]) -> bytes:
-    """Return an .npz file; numpy dates its members 1980, and stored bytes depend on no zlib."""
-    buffer = io.BytesIO()
-    np.savez(buffer, allow_pickle=False, **columns)
-    return buffer.getvalue()
 
 
 def _csv_of(columns: dict[str, np.ndarray]) -> bytes:

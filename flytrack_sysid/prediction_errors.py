@@ -37,25 +37,16 @@ LEAST_VOLTAGE_RANGE = 0.1
 
 
 class ChannelError(NamedTuple):
-    """One-step errors of a channel, measured minus modelled.
+    """One-step errors of a channel, measured minus modelled; of q with the sign nearer to the measured one.
 
-    errors: (num_steps, size), unit of the channel; of q with the sign that is nearer to the measured one.
     mse: mean over steps and components. nrmse: None where the measured channel never changes.
-    turn_deg: of q, (num_steps, 3) deg, the turn from modelled to measured attitude, body axes; else None.
+    angle_rms_deg: rms of the angle between measured and modelled attitude, deg; None but for q.
     """
 
-    errors: np.ndarray
     mse: float
     mse_by_axis: tuple[float, ...]
     nrmse: float | None
-    turn_deg: np.ndarray | None = None
-
-    @property
-    def angle_rms_deg(self) -> float | None:
-        """Rms of the angle between measured and modelled attitude, deg; None but for q."""
-        if self.turn_deg is None:
-            return None
-        return float(np.sqrt(np.mean(np.sum(self.turn_deg**2, axis=1))))
+    angle_rms_deg: float | None
 
     def as_json(self, name: str) -> dict[str, Any]:
         """Return the numbers, not the single errors, as JSON values."""
@@ -100,7 +91,7 @@ def turn_between(quats: np.ndarray, others: np.ndarray) -> np.ndarray:
 
 def error_of(name: str, before: np.ndarray, measured: np.ndarray, predicted: np.ndarray) -> ChannelError:
     """Return a channel's errors; all (num_steps, size)."""
-    turn_deg = None
+    angle_rms_deg = None
     if name == "q":
 
         def nearer(quats: np.ndarray) -> np.ndarray:
@@ -108,17 +99,13 @@ def error_of(name: str, before: np.ndarray, measured: np.ndarray, predicted: np.
 
         before, predicted = nearer(before), nearer(predicted)
         turn_deg = np.rad2deg(turn_between(predicted, measured))
-    errors = measured - predicted
+        angle_rms_deg = float(np.sqrt(np.mean(np.sum(turn_deg**2, axis=1))))
+    squares = (measured - predicted) ** 2
     by_change = NORMALISED_BY[name] == BY_CHANGE
     scale = np.mean((measured - before) ** 2) if by_change else np.mean(np.var(measured, axis=0))
-    mse = float(np.mean(errors**2))
-    return ChannelError(
-        errors=errors,
-        mse=mse,
-        mse_by_axis=tuple(np.mean(errors**2, axis=0).tolist()),
-        nrmse=float(np.sqrt(mse / scale)) if scale > 0.0 else None,
-        turn_deg=turn_deg,
-    )
+    mse = float(np.mean(squares))
+    nrmse = float(np.sqrt(mse / scale)) if scale > 0.0 else None
+    return ChannelError(mse, tuple(np.mean(squares, axis=0).tolist()), nrmse, angle_rms_deg)
 
 
 def one_step_errors(prediction: Prediction, rows: np.ndarray) -> OneStep:

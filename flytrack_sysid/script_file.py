@@ -1,6 +1,5 @@
 """Scripts: flights to be flown, and their ``.npz`` files, an array for each field of ``Script``."""
 
-import io
 from collections.abc import Iterable
 from pathlib import Path
 from typing import NamedTuple
@@ -9,7 +8,7 @@ import numpy as np
 
 from flytrack_env.files import write_atomically
 from flytrack_env.messages import error_text
-from flytrack_env.npz_file import NpzError, load_npz
+from flytrack_env.npz_file import NpzError, load_npz, npz_of
 from flytrack_env.state import ACTION_SIZE, APPLIED_ACTION, QUATERNION, STATE_SIZE
 from flytrack_sysid import excitation
 from flytrack_sysid.manoeuvres import MANOEUVRES
@@ -76,9 +75,7 @@ def save_script(path: str | Path, script: Script) -> None:
     """
     check_name(path)
     check_script(script, str(path))
-    buffer = io.BytesIO()
-    np.savez(buffer, allow_pickle=False, **{**script._asdict(), "kinds": np.array(script.kinds)})
-    write_atomically(path, buffer.getvalue())
+    write_atomically(path, npz_of({**script._asdict(), "kinds": np.array(script.kinds)}))
 
 
 def check_name(path: str | Path) -> None:

@@ -133,15 +133,14 @@ def cross_gate(gate: GateFrame, start_w: Vec3, end_w: Vec3, radius: Scalar) -> C
 def build_course(track: Track) -> Course:
     """Return a track as arrays, float32: the gates' flight frames, start pose and bounds."""
 
-    def vectors(rows: Sequence[tuple[float, ...]]) -> Vec3:
+    def vectors(rows: Sequence[tuple[Scalar, ...]]) -> Vec3:
         return Vec3(*np.array(rows, np.float32).reshape(-1, 3).T)
 
     forward, up = [], []
     for gate in track.gates:
-        w, x, y, z = gate.quaternion
-        local_y = (2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x))
-        forward.append(tuple(gate.direction * component for component in local_y))
-        up.append((2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)))
+        _, local_y, local_z = Quaternion(*gate.quaternion).axes()
+        forward.append(local_y.scale(gate.direction))
+        up.append(local_z)
     return Course(
         gates=GateFrame(
             centre=vectors([gate.position for gate in track.gates]),

@@ -53,13 +53,8 @@ def _turn(measured: Quaternion, predicted: Quaternion) -> Vec3:
 def _of_step(step: Step, next_row: Record, sensed: dict[str, Any], model: ModelParameters) -> jax.Array:
     """Return the residuals of the row after a step, (NUM_AXES, 2); 0 for absent channels."""
     row, before, after = step.row, step.before, step.after
-    axes = before.quat.axes()  # the residuals', whatever attitude the sensors' force had
-    read = read_sensors(step.moved, model)
-
-    def to_world(vector_b: Vec3) -> Vec3:
-        return axes[0].scale(vector_b.x) + axes[1].scale(vector_b.y) + axes[2].scale(vector_b.z)
-
-    zero = Vec3(0.0, 0.0, 0.0)
+    read, zero = read_sensors(step.moved, model), Vec3(0.0, 0.0, 0.0)
+    to_world = before.quat.rotate  # whatever attitude the sensors' force had
     rates = to_world(Vec3(*sensed["w"]) - read.rates_b) if "w" in sensed else zero
     turn = _turn(Quaternion(*next_row.quat), after.quat)
     force = to_world(Vec3(*sensed["f"]) - read.force_b) if "f" in sensed else zero

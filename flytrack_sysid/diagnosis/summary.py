@@ -179,9 +179,10 @@ def effect_causes(selection: vetoes.Selection, test: Problem, linearization: Lin
 
 
 def _is_remainder(cause: Cause, others: Sequence[Cause]) -> bool:
-    return vetoes.is_base_remainder(
-        cause.chi2_gain, cause.channel, [(one.channel, one.chi2_gain) for one in others]
-    )
+    """Return whether a cause gains next to nothing beside another that shows in the same channels."""
+    side = next(names for names in CHANNELS if cause.channel in names)
+    most = max((one.chi2_gain for one in others if one.channel in side), default=0.0)
+    return cause.chi2_gain < vetoes.BASE_REMAINDER * most
 
 
 def base_causes(

@@ -15,7 +15,7 @@ from flytrack_sysid.diagnosis import model_selection
 from flytrack_sysid.diagnosis import unexplained as unknown
 from flytrack_sysid.diagnosis.lanes import AXES
 from flytrack_sysid.diagnosis.problem import Problem, blocks_of
-from flytrack_sysid.diagnosis.result import CHANNELS, Unexplained
+from flytrack_sysid.diagnosis.result import Unexplained
 from flytrack_sysid.diagnosis.score_test import BASE_CAUSES, threshold
 from flytrack_sysid.diagnosis.search import FittedModel, SearchState
 from flytrack_sysid.record import Record
@@ -293,12 +293,3 @@ VETOES: tuple[tuple[Veto, ...], ...] = (
     (not_seen_at_rest,),
     (remainder_of_force_law, seen_once),
 )
-
-
-def is_base_remainder(gain: float, channel: str, others: Sequence[tuple[str, float]]) -> bool:
-    """Return whether a base change gains next to nothing beside a cause that shows in the same channels.
-
-    others: channel and gain of each.
-    """
-    side = next(names for names in CHANNELS if channel in names)
-    return gain < BASE_REMAINDER * max((size for name, size in others if name in side), default=0.0)

@@ -122,20 +122,15 @@ def import_log(
     craft = _common_craft(flights, sources)
     if craft.voltage_v is None and "v_bat" in log and log["v_bat"].min() > 0.0:
         craft = craft._replace(voltage_v=(float(log["v_bat"].min()), float(log["v_bat"].max())))
-    notes += _on_rates(log)
+    step_s = float(np.median(usual_step(log)))
+    if "w" in log and step_s > SLOW_STEP_S:
+        slow = f"body rates at {1.0 / step_s:.3g} Hz: too slow for a rate loop's lag or delay"
+        notes += (f"{log.source}: {slow}",)
     return Imported(log, tuple(sources), craft, offsets, notes, tuple(find_problems(log)))
 
 
 def _is_grounded(log: FlightLog) -> bool:
     return bool(log["u"][:, 3].max() < LEAST_THRUST)
-
-
-def _on_rates(log: FlightLog) -> tuple[str, ...]:
-    """Return a note if the gyroscope is too slow for a rate loop."""
-    step_s = float(np.median(usual_step(log)))
-    if "w" not in log or step_s <= SLOW_STEP_S:
-        return ()
-    return (f"{log.source}: body rates at {1.0 / step_s:.3g} Hz: too slow for a rate loop's lag or delay",)
 
 
 def _used_rows(path: Path, log: FlightLog, mapping: Mapping) -> FlightLog:
