@@ -15,9 +15,7 @@ import pytest
 from flytrack.cli import COMMANDS, SHELLS, main
 from flytrack.flags import Fit
 from flytrack_sysid.split import HELD_OUT_EVERY
-from tests.support.black_boxes import SHIPPED
 from tests.support.pages import ROOT, commands
-from tests.support.refusals import refused
 from tests.support.slow import slow_but
 
 PAGES = ("README.md", "docs/quick_start.md")
@@ -115,27 +113,3 @@ def test_shells_complete_commands_and_flags(shell: str, capsys) -> None:
     assert all(word in script for word in (*COMMANDS, "--noise", "total-timesteps")), script[:2000]
     (spec,) = [line for line in script.splitlines() if line.startswith("COMPLETION_SPEC = ")]
     assert "\\n" not in spec
-
-
-@pytest.mark.parametrize(
-    ("command", "message"),
-    [
-        ("eval --steps 5 --checkpoint missing", "missing"),
-        ("eval --steps 5 --checkpoint baselines/purejaxrl_ppo/champion", "found a folder.*flytrack.safe"),
-        ("demo --black-box missing.bin", "missing.bin"),
-        ("demo --total-timesteps 10", "total_timesteps"),
-        ("train --model benchmarks/data/real/gecko_diagnosis.json", r"other JSON \(.*expected a model file"),
-        ("train --model docs", "docs: cannot be read: found a folder"),
-        ("loop --black-box none.bin", "No such file or directory"),
-        (f"loop --black-box {SHIPPED} --total-timesteps 10", "total_timesteps: found 10"),
-        (f"loop --black-box {SHIPPED} --noise -1", "noise: found -1"),
-        (f"loop --black-box {SHIPPED} --minutes 0", "minutes: found 0"),
-        ("loop --black-box any.bin --plant betaflight", "--plant: found --black-box as well"),
-        (f"loop --black-box {SHIPPED} --body x", "expected with --plant betaflight only"),
-    ],
-)
-def test_a_bad_value_ends_a_command_before_any_work(command, message, tmp_path, monkeypatch, capsys) -> None:
-    monkeypatch.chdir(ROOT)
-    out = tmp_path / "out"
-    assert re.search(message, refused(capsys, *shlex.split(command), "--out", out))
-    assert not any(out.glob("*"))
