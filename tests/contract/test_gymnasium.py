@@ -23,6 +23,7 @@ from flytrack_env.env import EnvParams, FlyTrack
 from flytrack_env.registration import ENVIRONMENTS
 from tests.support.coasting import track_of_row
 from tests.support.slow import slow_but
+from tests.support.tables import table
 
 BASE = "FlyTrack-v0"
 
@@ -200,21 +201,7 @@ def test_options_set_the_start_of_one_episode(is_vector: bool) -> None:
     assert (abs(following[:, 22] + 0.5) > 1e-3).all()
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"speed": 3.0}, r"options: found 'speed', expected one of position, .*track"),
-        ([1], "options: found list, expected a dict"),
-        ({"position": (1.0, 2.0)}, r"options\['position'\]: found \(1.0, 2.0\), expected 3 finite numbers"),
-        ({"position": (100.0, 2.0, 1.0)}, "position.*expected within the bounds"),
-        ({"quaternion": (1.0, 1.0, 0.0, 0.0)}, "quaternion.*expected norm 1"),
-        ({"quaternion": (1.0, 0.0, 0.0, 0.0), "yaw_deg": 3.0}, "expected one of them"),
-        ({"velocity": (0.0, -1001.0, 0.0)}, "velocity.*expected at most 1000 m/s along every axis"),
-        ({"battery_v": 21.9}, "battery_v.*found 21.9, expected above 22 and up to 24 V"),
-        ({"gate_index": 8}, "gate_index.*found 8, expected an integer from 0 to 7"),
-        ({"track": "nowhere"}, "track: found 'nowhere', expected one of"),
-    ],
-)
+@pytest.mark.parametrize(("options", "message"), table("reset_options")["refused"])
 def test_bad_options_are_refused_and_change_nothing(options: Any, message: str) -> None:
     env, vector = gymnasium.make(BASE), make_vector()
     for each in (env, vector):

@@ -3,7 +3,6 @@
 import os
 import re
 import shlex
-import tomllib
 from dataclasses import replace
 from pathlib import Path
 
@@ -22,8 +21,9 @@ from tests.support.handout_plant import HandoutPlant, excited
 from tests.support.pages import ROOT
 from tests.support.recordings import make_sequence
 from tests.support.refusals import refused
+from tests.support.tables import table
 
-CASES = tomllib.loads(Path(__file__).with_name("refused_commands.toml").read_text(encoding="utf-8"))
+CASES = table("refused_commands")
 OWN = """
 def hover(observation):
     return 0.1 * observation[:4]
