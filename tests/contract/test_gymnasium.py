@@ -6,6 +6,7 @@ import pickle
 import sys
 import warnings
 from functools import partial
+from itertools import product
 from typing import Any
 
 import gymnasium
@@ -28,6 +29,8 @@ from tests.support.tables import table
 BASE = "FlyTrack-v0"
 
 IDS = sorted(ENVIRONMENTS)
+# The checks of every run: an id, and packages that are not installed.
+CHECKED = [*product((BASE, "FlyTrackRobust-v0"), ((), ("pygame",), ("pygame", "PIL")))]
 CRASH = np.full(4, np.nan, np.float32)  # an action that ends the episode
 
 
@@ -48,11 +51,9 @@ def still(params: EnvParams) -> EnvParams:
 # --- Registration and the protocol --------------------------------------------------------------
 
 
-@pytest.mark.parametrize("missing", [(), ("pygame",), ("pygame", "PIL")], ids=len)
-@pytest.mark.parametrize("env_id", slow_but(["FlyTrack-v0", "FlyTrackRobust-v0"], IDS))
-def test_checker_of_gymnasium_gives_no_warning(
-    env_id: str, missing: tuple[str, ...], monkeypatch: pytest.MonkeyPatch
-) -> None:
+@pytest.mark.parametrize("case", slow_but(CHECKED, sorted({*CHECKED, *((one, ()) for one in IDS)})), ids=str)
+def test_checker_of_gymnasium_gives_no_warning(case: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    env_id, missing = case
     monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
     for package in missing:
         monkeypatch.setitem(sys.modules, package, None)
