@@ -24,20 +24,11 @@ BETAFLIGHT = "betaflight_acro_log"
 # Every third policy, by its number, is for judging.
 LEARNT = ("48", "49", "52", "53", "67", "68", "70", "71")
 JUDGED = ("50", "66", "69")
-QUAD = """[rows]
-from_s = 2.0  # it stands on the ground before
-every = 4
-
-[craft]
-mass_kg = 0.7  # a guess: the log does not say
-"""
+QUAD, GECKO_MAPPING = (
+    Path(__file__).with_name("mappings").joinpath(f"{name}.toml").read_text(encoding="utf-8")
+    for name in ("betaflight", "gecko")
+)
 GECKO, GECKO_FILE = "bf_gecko", "btfl_002.bbl"
-GECKO_MAPPING = """[rows]
-every = 4
-
-[craft]
-mass_kg = 0.6  # a guess: the log does not say
-"""
 BEFORE_S, AFTER_S = 0.3, 0.1  # of the setpoints that the best linear law knows
 RIDGE = 1e-6
 HORIZON, ASKED_OVER_BASE, ASKED_OVER_ARX = "0.25", 0.8, 1.1

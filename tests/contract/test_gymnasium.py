@@ -6,6 +6,7 @@ import pickle
 import sys
 import warnings
 from functools import partial
+from itertools import product
 from typing import Any
 
 import gymnasium
@@ -23,10 +24,13 @@ from flytrack_env.env import EnvParams, FlyTrack
 from flytrack_env.registration import ENVIRONMENTS
 from tests.support.coasting import track_of_row
 from tests.support.slow import slow_but
+from tests.support.tables import table
 
 BASE = "FlyTrack-v0"
 
 IDS = sorted(ENVIRONMENTS)
+# The checks of every run: an id, and packages that are not installed.
+CHECKED = [*product((BASE, "FlyTrackRobust-v0"), ((), ("pygame",), ("pygame", "PIL")))]
 CRASH = np.full(4, np.nan, np.float32)  # an action that ends the episode
 
 
@@ -47,11 +51,9 @@ def still(params: EnvParams) -> EnvParams:
 # --- Registration and the protocol --------------------------------------------------------------
 
 
-@pytest.mark.parametrize("missing", [(), ("pygame",), ("pygame", "PIL")], ids=len)
-@pytest.mark.parametrize("env_id", slow_but(["FlyTrack-v0", "FlyTrackRobust-v0"], IDS))
-def test_checker_of_gymnasium_gives_no_warning(
-    env_id: str, missing: tuple[str, ...], monkeypatch: pytest.MonkeyPatch
-) -> None:
+@pytest.mark.parametrize("case", slow_but(CHECKED, sorted({*CHECKED, *((one, ()) for one in IDS)})), ids=str)
+def test_checker_of_gymnasium_gives_no_warning(case: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    env_id, missing = case
     monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
     for package in missing:
         monkeypatch.setitem(sys.modules, package, None)
@@ -200,21 +202,7 @@ def test_options_set_the_start_of_one_episode(is_vector: bool) -> None:
     assert (abs(following[:, 22] + 0.5) > 1e-3).all()
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"speed": 3.0}, r"options: found 'speed', expected one of position, .*track"),
-        ([1], "options: found list, expected a dict"),
-        ({"position": (1.0, 2.0)}, r"options\['position'\]: found \(1.0, 2.0\), expected 3 finite numbers"),
-        ({"position": (100.0, 2.0, 1.0)}, "position.*expected within the bounds"),
-        ({"quaternion": (1.0, 1.0, 0.0, 0.0)}, "quaternion.*expected norm 1"),
-        ({"quaternion": (1.0, 0.0, 0.0, 0.0), "yaw_deg": 3.0}, "expected one of them"),
-        ({"velocity": (0.0, -1001.0, 0.0)}, "velocity.*expected at most 1000 m/s along every axis"),
-        ({"battery_v": 21.9}, "battery_v.*found 21.9, expected above 22 and up to 24 V"),
-        ({"gate_index": 8}, "gate_index.*found 8, expected an integer from 0 to 7"),
-        ({"track": "nowhere"}, "track: found 'nowhere', expected one of"),
-    ],
-)
+@pytest.mark.parametrize(("options", "message"), table("reset_options")["refused"])
 def test_bad_options_are_refused_and_change_nothing(options: Any, message: str) -> None:
     env, vector = gymnasium.make(BASE), make_vector()
     for each in (env, vector):

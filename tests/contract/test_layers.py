@@ -7,56 +7,14 @@ from pathlib import Path
 import pytest
 
 from tests.support.pages import ROOT
+from tests.support.tables import table
 
 PACKAGE = "flytrack_env"
 
-# Low to high. A module imports only from rows above its own here; a package counts as one module.
-LAYERS = (
-    {"files", "extras", "fusion", "sandbox", "artifact", "messages", "progress"},
-    {"auto_reset", "compile_cache"},
-    {"quaternion", "motion", "toml_file", "npz_file"},
-    {"state", "thrust"},
-    {"tracks", "randomness"},
-    {"effects"},
-    {"dynamics"},
-    {"plants"},
-    {"race", "resets", "observations", "rewards", "terminations", "model_file"},
-    {"params"},
-    {"episodes"},
-    {"env"},
-    {"references", "scene"},
-    {"wrappers", "blackbox", "rollout", "rendering", "flown_race"},
-    {"multi_drone"},
-    {"registration", "viz_rerun", "pictures"},
-    {"gymnasium_adapter"},
-    {"__init__"},
-)
-RANKS = {name: rank for rank, layer in enumerate(LAYERS) for name in layer}
-CONSUMERS = (
-    "flytrack_sysid",
-    "baselines",
-    "flytrack_loop",
-    "flytrack_fly",
-    "flytrack_bench",
-    "flytrack",
-    "benchmarks",
-    "blackbox",
-    "firmware",
-    "clients",
-    "eval_agent",
-    "demo",
-)
+LAYERED = table("layers")
+RANKS = {name: rank for rank, layer in enumerate(LAYERED["layers"]) for name in layer}
+CONSUMERS, ONLY_IN = LAYERED["consumers"], LAYERED["only_in"]
 WINDOWS = ("pygame", "flytrack_fly")  # of all consumers, only that package opens windows
-ONLY_IN = {
-    "gymnasium": "gymnasium_adapter",
-    "PIL": "rendering",
-    "pygame": "rendering",
-    "rerun": "viz_rerun",
-    "matplotlib": "pictures",
-    "moviepy": "pictures",
-    "pettingzoo": "multi_drone",
-    "jaxmarl": "multi_drone",
-}
 
 
 def files_of(name: str) -> list[Path]:
@@ -85,7 +43,7 @@ MODULES = files_of(PACKAGE)
 @pytest.mark.parametrize("path", MODULES, ids=lambda path: str(path.relative_to(ROOT)))
 def test_no_arrow_points_up_or_to_a_consumer_or_a_foreign_viewer(path: Path) -> None:
     module = path.relative_to(ROOT / PACKAGE).with_suffix("").parts[0]
-    assert module in RANKS, f"{module}: not in LAYERS of this test; give it a row"
+    assert module in RANKS, f"{module}: not in tests/support/tables/layers.toml; give it a place"
     for name, line in imports_of(path):
         parts = name.split(".")
         where = f"{path.relative_to(ROOT)}, line {line}: {module} imports {name}"

@@ -25,10 +25,6 @@ def hover(observation):
     return jnp.array([0.0, 0.0, 0.0, -0.2]) + 0.0 * observation[:4]
 
 
-def three(observation):
-    return observation[:3]
-
-
 @pytest.fixture
 def small(tmp_path) -> Path:
     """The file of a suite of two tasks with two starts each."""
@@ -63,22 +59,6 @@ def test_a_result_repeats_and_is_verified_and_a_forged_one_is_not(small, tmp_pat
         main([*command, "--verify", str(out)])
     assert "flytrack, policy 0" in capsys.readouterr().out
     refused(capsys, *command, "--out", out)  # never overwritten
-
-
-@pytest.mark.parametrize(
-    ("flags", "message"),
-    [
-        (["--policy", CENTRED, "--suite", "v0"], "expected one of v1"),
-        (["--policy", CENTRED, "--tasks", "plant_9"], "expected some of flytrack, random_1"),
-        (["--policy", "tests.integration.test_bench:three"], "shape (3,), expected (4,)"),
-        (["--policy", "tests.integration.test_bench:absent"], "AttributeError"),
-        (["--policy", CENTRED, "--adapt", "flytrack_bench:absent"], "--adapt: flytrack_bench:absent: Attr"),
-        (["--policy", "nothing.safetensors"], "nothing.safetensors: cannot be read"),
-        (["--policy", CENTRED, "--verify", str(FOLDER / "v1.json")], "not a result"),
-    ],
-)
-def test_what_cannot_be_used_is_named(flags, message, capsys):
-    assert message in refused(capsys, "bench", *flags)
 
 
 def test_a_changed_suite_is_refused(small, monkeypatch):

@@ -11,20 +11,19 @@ import pytest
 
 from baselines.purejaxrl_ppo import evaluate, race_env
 from baselines.purejaxrl_ppo import flights as flights_module
-from baselines.purejaxrl_ppo.checkpoint import load_checkpoint, save_checkpoint
+from baselines.purejaxrl_ppo.checkpoint import load_checkpoint
 from baselines.purejaxrl_ppo.flights import fly_many, outcomes_of, race_many, score, start_keys
-from flytrack_env import FlyTrack, make, nominal_parameters, save_track
+from flytrack_env import FlyTrack, make, nominal_parameters
 from flytrack_env.effects import CommandDelay, LinearDrag, QuadraticDrag, ThrustScale
 from flytrack_env.references import shipped_reference
 from flytrack_env.rollout import load_rollout
 from flytrack_env.state import BATTERY, POSITION
-from flytrack_env.tracks import random_track
 from flytrack_env.wrappers import DomainRandomization
 from flytrack_env.wrappers.domain_randomization import sample_model
 from tests.support.evaluated import FAILS_BELOW_V, Rails, write_checkpoint
 from tests.support.pages import ROOT
 from tests.support.recordings import Recording
-from tests.support.refusals import refused, run
+from tests.support.refusals import run
 from tests.support.slow import slow_but
 
 NUM_LAPS, NUM_STEPS, NUM_FLIGHTS = 3, 1400, 10
@@ -148,42 +147,6 @@ def test_a_single_flight_as_json_and_docs_name_every_key(
     text = (ROOT / "docs" / "baseline.md").read_text()
     missing = {name for name in keys_of({**report, "plants": plants}) if f"`{name}`" not in text}
     assert not missing
-
-
-@pytest.fixture(scope="module")
-def bad_files(tmp_path_factory):
-    """A folder of a policy without its model, and of tracks without a reference."""
-    folder = tmp_path_factory.mktemp("bad")
-    old = load_checkpoint(write_checkpoint(folder / "policy.safetensors"))
-    meta = {name: value for name, value in old.meta.items() if name != "model"}
-    save_checkpoint(folder / "no_model.safetensors", old.params, old.config, meta)
-    save_track(folder / "random.toml", random_track(0))
-    (folder / "file").write_text("")
-    return folder
-
-
-@pytest.mark.parametrize(
-    ("arguments", "messages"),
-    [
-        (["--episodes", "2000000"], ["--episodes: found 2000000", "expected 1 to"]),
-        (["--plants", "2000", "--episodes", "1000"], ["--plants: found 2000", "expected 1 to 100"]),
-        (["--plants", "2", "--black-box", "any.bin"], ["--plants", "--black-box any.bin", "one of the two"]),
-        (["--plants", "2", "--checkpoint", "no_model.safetensors"], ["model", "found none"]),
-        (["--steps", "0"], ["--steps: found 0"]),
-        (["--black-box", "no.bin"], ["no.bin"]),
-        (["--track", "nowhere"], ["nowhere", "flytrack"]),
-        (["--track", "random.toml", "--ghost"], ["found no 'random", "expected one of", "flytrack_nominal"]),
-        (["--out", "policy.safetensors"], ["--out", "read or written twice"]),
-        (["--checkpoint", "file"], ["file", "not a checkpoint"]),
-    ],
-)
-def test_command_refuses_before_it_flies(arguments, messages, bad_files, monkeypatch, capsys):
-    monkeypatch.chdir(bad_files)
-    monkeypatch.setattr(evaluate, "can_record", lambda: True)
-    monkeypatch.setattr(evaluate.Report, "fly", lambda _: pytest.fail("it flew"))
-    error = refused(capsys, "eval", "--checkpoint", "policy.safetensors", "--steps", "5", *arguments)
-    assert all(message in error for message in messages), error
-    assert not (bad_files / "rollout.npy").exists()
 
 
 def test_plants_are_drawn_from_the_ranges_around_the_model():

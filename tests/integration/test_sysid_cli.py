@@ -1,7 +1,6 @@
-"""The commands of the identification: from a plant to a model and its report, and their refusals."""
+"""The commands of the identification: from a plant to a model and its report."""
 
 import json
-from dataclasses import replace
 from pathlib import Path
 
 import gymnax
@@ -9,13 +8,12 @@ import numpy as np
 import pytest
 
 from blackbox.build import build
-from flytrack import identification
 from flytrack.identification import load_plant
 from flytrack_env import load_model, load_provenance, save_model
 from flytrack_env.dynamics import nominal_parameters
 from flytrack_sysid import collect, load_log, save_log
-from tests.support.black_boxes import AIRLESS, SHIPPED
-from tests.support.refusals import refused, run
+from tests.support.black_boxes import AIRLESS
+from tests.support.refusals import run
 
 TAUS = (0.02, 0.05, 0.07, 0.03)
 THRUST = (-7.0, -3.0, 3.0, -1.0, 0.9, 0.9)
@@ -71,14 +69,6 @@ def test_fix_and_from(folder, tmp_path):
 
 
 MODULE = """
-import numpy as np
-
-def step(x, u):
-    return np.asarray(x)
-
-def broken(x, u):
-    raise RuntimeError("motors are off")
-
 def in_place(x, u):
     x[8] = 20.0 * u[3]
     x[5] += 0.01 * x[8]
@@ -95,57 +85,3 @@ def test_functions_of_the_working_folder_are_flown_and_may_change_their_argument
     change = np.diff(log["v"][:, 2])[inside]
     np.testing.assert_allclose(change, 0.01 * log["a"][1:, 2][inside], atol=1e-5)
     np.testing.assert_array_equal(log["uprev"][1:][inside], log["u"][:-1][inside])
-
-
-@pytest.mark.parametrize(
-    ("plant", "options", "message"),
-    [
-        ("missing.bin", [], "missing.bin"),
-        ("no_such_module:step", [], "no_such_module:step: cannot be imported"),
-        ("my_robot:land", [], "my_robot:land: cannot be imported"),
-        ("my_robot:broken", [], "RuntimeError: motors are off"),
-        (SHIPPED, ["--noise", "50"], "noise: found 50.0, expected 0 or more, below 50"),
-        (SHIPPED, ["--seed", "-1"], "seed: found -1"),
-        (SHIPPED, ["--out", "data.mat"], "data.mat"),
-    ],
-)
-def test_collect_refuses(capsys, tmp_path, monkeypatch, plant, options, message):
-    (tmp_path / "my_robot.py").write_text(MODULE)
-    monkeypatch.chdir(tmp_path)
-    out = [] if "--out" in options else ["--out", "data.npz"]
-    assert message in refused(capsys, "collect", "--black-box", plant, *out, *options)
-    assert {path.name for path in tmp_path.iterdir()} <= {"my_robot.py", "__pycache__"}
-
-
-@pytest.mark.parametrize(
-    ("change", "options", "message"),
-    [
-        (lambda log: replace(log, channels={**log.channels, "w": np.rad2deg(log["w"])}), [], "deg/s"),
-        (lambda log: log.select(slice(50)), [], "too short"),
-        (lambda log: log, ["--fix", "tau_yaw"], "NAME=VALUE"),
-        (lambda log: log, ["--effect", "magic"], "magic"),
-        (lambda log: log, ["--hold-out-every", "1"], "every: found 1"),
-        (lambda log: log, ["--from", "absent.json"], "absent.json"),
-        (lambda log: log, ["--out", "data.npz"], "data.npz: found suffix '.npz', expected .json"),
-    ],
-)
-def test_fit_and_validate_refuse(folder, capsys, tmp_path, monkeypatch, change, options, message):
-    monkeypatch.setattr(identification, "motion_of", pytest.fail)  # half a minute of work
-    save_log(tmp_path / "log.npz", change(load_log(folder / "data.npz")))
-    out = [] if "--out" in options else ["--out", tmp_path / "model.json"]
-    assert message in refused(capsys, "fit", tmp_path / "log.npz", *out, *options)
-    if not options:
-        arguments = ["validate", folder / "model.json", tmp_path / "log.npz", "--out", tmp_path / "report"]
-        assert message in refused(capsys, *arguments)
-    assert [path.name for path in tmp_path.iterdir()] == ["log.npz"]
-
-
-@pytest.mark.parametrize(
-    ("every", "message"), [("x", "held_out_every: found 'x'"), (0, "validate it on another log")]
-)
-def test_validate_refuses_model_files(folder, capsys, tmp_path, every, message):
-    document = json.loads((folder / "model.json").read_text())
-    document["provenance"]["split"] = {"held_out_every": every}
-    path = tmp_path / "changed.json"
-    path.write_text(json.dumps(document))
-    assert message in refused(capsys, "validate", path, folder / "data.npz", "--out", tmp_path / "report")

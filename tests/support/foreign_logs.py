@@ -9,6 +9,8 @@ from typing import Any
 
 import numpy as np
 
+from tests.support.tables import table
+
 ULOG_TYPES = {"uint64_t": "Q", "float": "f", "bool": "?", "uint8_t": "B"}
 NUM_ROWS = 30
 
@@ -89,19 +91,7 @@ def _variable_bytes(value: int, is_signed: bool) -> bytes:
     return bytes([*found, rest])
 
 
-BLACKBOX_HEADERS = {
-    "Firmware type": "Cleanflight",
-    "Firmware revision": "Betaflight 4.5.1 (77d01ba3b) STM32F405",
-    "looptime": "125",
-    "acc_1G": "2048",
-    "vbatref": "2485",
-    "vbatcellvoltage": "330,360,430",
-    "rc_rates": "220,100,50",
-    "rc_expo": "10,0,0",
-    "rates": "0,70,80",
-    "rate_limits": "1998,1998,1998",
-    "rates_type": "0",
-}
+BLACKBOX_HEADERS = table("blackbox_headers")
 
 
 def blackbox(rows: np.ndarray, names: list[str], headers: dict[str, str]) -> bytes:

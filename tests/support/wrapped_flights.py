@@ -17,6 +17,7 @@ from flytrack_env.wrappers import (
     ObservationNoise,
 )
 from tests.support.coasting import drone_at
+from tests.support.tables import table
 
 NUM_ENVS, NUM_STEPS = 16, 60
 COMMANDED = partial(ActionHistory, length=3)
@@ -88,34 +89,9 @@ def arrays(params: Any) -> Any:
     return jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32), params)
 
 
-# One step on the FlyTrack course: position, velocity, extra fields of the drone, steps already flown, action;
+# One step on the FlyTrack course: position, velocity, other fields of the drone, steps already flown, action;
 # causes; truncated.
-IN_FRONT = (12.55, 2.0, 1.35)
-FREE, FAST = (15.0, 2.0, 1.35), (-10.0, 0.0, 0.0)
-ZERO = (0.0, 0.0, 0.0, 0.0)
-NAN, INF = float("nan"), float("inf")
-ENDS = {
-    "flies on": (FREE, FAST, {}, 100, ZERO, set(), False),
-    "passes": (IN_FRONT, FAST, {}, 100, ZERO, set(), False),
-    "frame": ((12.55, 3.0, 1.35), FAST, {}, 100, ZERO, {"crash"}, False),
-    "frame above": ((12.55, 2.0, 2.4), FAST, {}, 100, ZERO, {"crash"}, False),
-    "missed": ((12.55, 4.0, 1.35), FAST, {}, 100, ZERO, {"missed_gate"}, False),
-    "ground": ((15.0, 2.0, 0.01), (0.0, 0.0, -5.0), {}, 100, ZERO, {"ground"}, False),
-    "wall +x": ((25.49, 2.0, 1.0), (5.0, 0.0, 0.0), {}, 100, ZERO, {"out_of_bounds"}, False),
-    "wall -x": ((-2.49, 9.0, 1.0), (-5.0, 0.0, 0.0), {}, 100, ZERO, {"out_of_bounds"}, False),
-    "wall +y": ((15.0, 34.99, 1.0), (0.0, 5.0, 0.0), {}, 100, ZERO, {"out_of_bounds"}, False),
-    "wall -y": ((15.0, -2.99, 1.0), (0.0, -5.0, 0.0), {}, 100, ZERO, {"out_of_bounds"}, False),
-    "ceiling": ((15.0, 2.0, 6.34), (0.0, 0.0, 5.0), {}, 100, ZERO, {"out_of_bounds"}, False),
-    "corner": ((25.49, 2.0, 0.01), (9.0, 0, -9.0), {}, 100, ZERO, {"ground", "out_of_bounds"}, False),
-    "battery": (FREE, FAST, {"battery_v": 22.0001}, 9, ZERO, {"battery_empty"}, False),
-    "low battery": (FREE, FAST, {"battery_v": 22.01}, 9, ZERO, set(), False),
-    "nan roll": (FREE, FAST, {}, 100, (NAN, 2.0, -INF, 0.5), {"crash"}, False),
-    "nan thrust": (FREE, FAST, {}, 100, (0.0, 0.0, 0.0, NAN), {"crash"}, False),
-    "time limit": (FREE, FAST, {}, 999, ZERO, set(), True),
-    "one before": (FREE, FAST, {}, 998, ZERO, set(), False),
-    "frame at time limit": ((12.55, 3.0, 1.35), FAST, {}, 999, ZERO, {"crash"}, True),
-    "pass at time limit": (IN_FRONT, FAST, {}, 999, ZERO, set(), True),
-}
+ENDS = {name: (*own, set(causes), is_late) for name, (*own, causes, is_late) in table("ends").items()}
 
 
 def before_ends(env: Any, params: Any, ends: Iterable[Any], **fields: Any) -> tuple[Any, jax.Array]:

@@ -1,16 +1,17 @@
-"""Collecting flies any plant alike, one thing at a time, within its envelope, or says why it does not fly."""
+"""Collecting flies any plant alike, within its envelope, or says why not; sensors add what they state."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from flytrack_env.dynamics import nominal_parameters
 from flytrack_env.plants import Simulator
-from flytrack_sysid import CollectError, collect
+from flytrack_sysid import CollectError, FlightLog, collect, sensors
 from flytrack_sysid.excitation import HEIGHTS, KINDS, LARGEST_SPEED
 from flytrack_sysid.split import blocks_of, held_out_rows
-from tests.support.handout_plant import GRAVITY, HandoutPlant
+from tests.support.handout_plant import GRAVITY, HandoutPlant, excited, rotation
 
 
 def test_plant_and_function_of_the_same_equations_give_the_same_log():
@@ -106,3 +107,45 @@ def test_held_out_part_has_every_kind_a_clear_step_of_each_axis_and_all_voltages
         jumps = np.abs(np.diff(judged["u"][:, axis]))
         alone = np.array([KINDS[number // 4 % len(KINDS)] == stick for number in judged.segment[1:]])
         assert jumps[same & alone].max() >= 0.3, stick
+
+
+# --- Sensors ------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def truth() -> FlightLog:
+    return excited(HandoutPlant())
+
+
+def test_noise_is_as_stated(truth):
+    log = sensors.measure(truth, 2.0, GRAVITY, np.random.default_rng(0))
+    keys = [np.round(one.time * 100).astype(int) + 1000 * one.segment for one in (truth, log)]
+    kept = np.isin(*keys)
+    assert "uprev" not in log and "a" not in log
+    assert len(log) == kept.sum() and 0.03 < 1.0 - kept.mean() < 0.05
+    np.testing.assert_array_equal(log["u"], truth["u"][kept])
+    force = sensors.specific_force_b(truth, GRAVITY)[kept]
+    stated = {
+        "w": (truth["w"][kept], sensors.GYRO_NOISE),
+        "f": (force, sensors.ACCELEROMETER_NOISE),
+        "v": (truth["v"][kept], sensors.VELOCITY_NOISE),
+        "p": (truth["p"][kept], sensors.POSITION_NOISE),
+    }
+    for name, (values, noise) in stated.items():
+        left = log[name] - values
+        np.testing.assert_allclose(left.std(axis=0), 2.0 * noise, rtol=0.05, err_msg=name)
+        assert np.abs(left.mean(axis=0)).max() < 0.1 * noise, name
+    turn = Rotation.from_quat(truth["q"][kept], scalar_first=True).inv() * Rotation.from_quat(
+        log["q"], scalar_first=True
+    )
+    np.testing.assert_allclose(np.rad2deg(turn.as_rotvec()).std(axis=0), 1.0, rtol=0.05)
+    np.testing.assert_allclose(np.linalg.norm(log["q"], axis=1), 1.0, rtol=1e-12)
+
+
+def test_accelerometer_measures_what_is_not_gravity_in_the_attitude_before(truth):
+    force = sensors.specific_force_b(truth, GRAVITY)
+    before = rotation(truth["q"][:-1])
+    expected = np.einsum("nji,nj->ni", before, truth["a"][1:] + np.array([0.0, 0.0, GRAVITY]))
+    inside = ~truth.is_start()[1:]
+    np.testing.assert_allclose(force[1:][inside], expected[inside], atol=1e-12)
+    np.testing.assert_allclose(force[1:][inside][:, :2], 0.0, atol=1e-9)  # without drag, thrust alone

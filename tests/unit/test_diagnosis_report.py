@@ -1,7 +1,8 @@
-"""The report of a diagnosis: its residuals are right, and each cause has its plot."""
+"""The report of a diagnosis: right residuals, a plot of each cause; pages load and execute nothing."""
 
 import re
 from dataclasses import replace
+from html import escape
 
 import numpy as np
 import pytest
@@ -28,6 +29,7 @@ from flytrack_sysid.diagnosis.result import (
 )
 from flytrack_sysid.diagnosis.score_test import BASE_CAUSES
 from flytrack_sysid.diagnosis.traces import REGRESSORS, traces
+from flytrack_sysid.page import Bullets, Picture, Section, Table, Text, Verdict, page
 from flytrack_sysid.parameters import names_of, to_vector, with_values
 from tests.contract.test_effects import inside_ranges
 from tests.support.hidden_flights import scripted
@@ -218,3 +220,32 @@ def test_what_is_beyond_the_list_is_told_and_not_named(diagnosis):
 def test_page_of_a_log_of_few_channels(diagnosis, measured):
     text = report.html_of(diagnosis, measured.without("w", "f", "v_bat"))
     assert "attitude or velocity replace them" in text and text.count("<img") == 1 + len(diagnosis.causes)
+
+
+# --- Any page -----------------------------------------------------------------------------------------
+
+PNG = b"\x89PNG\r\n\x1a\n and the rest"
+HOSTILE = '"><script>alert(1)</script><a href="https://example.org/x">'
+
+
+def full_page(words):
+    """Return a page with these words in every place that takes text."""
+    parts = [
+        Text(words),
+        Verdict(words, "good"),
+        Bullets([words]),
+        Table([words, "b"], [[words, "2"]], caption=words),
+        Table([words, "b"], [[words, "2"]], caption=words, is_text=True),
+        Picture(PNG, words),
+    ]
+    return page(words, [Section(words, parts)], introduction=[Text(words)])
+
+
+def test_hostile_text_is_only_shown_and_nothing_is_loaded_from_elsewhere():
+    hostile, plain = full_page(HOSTILE), full_page("plain")
+    assert hostile.replace(escape(HOSTILE), "plain") == plain
+    for name in set(re.findall(r"<(\w+)", plain)) - {"meta", "img"}:
+        assert len(re.findall(rf"<{name}\b", plain)) == plain.count(f"</{name}>"), name
+    (target,) = re.findall(r'(?:src|href)="([^"]*)"', plain)
+    assert target.startswith("data:image/png;base64,")
+    assert not re.search(r"https?://|url\(|@import|<link|<script", plain)

@@ -9,6 +9,7 @@ import pytest
 from jax.flatten_util import ravel_pytree
 
 from flytrack_env.dynamics import ModelParameters, collective_thrust, step
+from tests.support.black_boxes import random_inputs
 from tests.support.handout_plant import HandoutPlant
 from tests.support.simulated_flights import NOMINAL
 
@@ -20,17 +21,6 @@ UNEVEN = ModelParameters(
     g=9.81,
     battery_drain_v_per_min=1.3,
 )
-
-
-def random_cases(count: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
-    """Return random states (N, 21) with unit quaternions and actions (N, 4)."""
-    rng = np.random.default_rng(seed)
-    x = rng.normal(scale=5.0, size=(count, 21))
-    x[:, 9:13] = rng.normal(size=(count, 4))
-    x[:, 9:13] /= np.linalg.norm(x[:, 9:13], axis=1, keepdims=True)
-    x[:, 16:20] = rng.uniform(-1.0, 1.0, (count, 4))
-    x[:, 20] = rng.uniform(22.0, 24.0, count)
-    return x, rng.uniform(-1.0, 1.0, (count, 4))
 
 
 step_all = jax.jit(jax.vmap(step, in_axes=(0, 0, None, None)))
@@ -46,7 +36,8 @@ def test_nominal_drone_has_no_thrust_at_minus_one_and_the_stated_maximum() -> No
 
 @pytest.mark.parametrize("dt", [0.0005, 0.002, 0.01, 0.05])
 def test_agrees_with_the_handouts_equations(dt: float) -> None:
-    x, u = random_cases(64)
+    x, u = (rows.astype(float) for rows in random_inputs(64))
+    x[:, 9:13] /= np.linalg.norm(x[:, 9:13], axis=1, keepdims=True)
     coeffs = UNEVEN.thrust_coeffs / UNEVEN.m
     drain = UNEVEN.battery_drain_v_per_min
     plant = HandoutPlant(UNEVEN.tau, coeffs, UNEVEN.max_rate, drain, gravity=UNEVEN.g)
@@ -69,7 +60,7 @@ def test_gradients_equal_finite_differences(differentiate: Any) -> None:
             return step(x, u, rest[0], unravel(rest[1:]))
 
         jacobian = jax.jit(differentiate(packed))
-        for x, u in zip(*random_cases(3, seed=5), strict=True):
+        for x, u in zip(*random_inputs(3, seed=5), strict=True):
             vector = np.concatenate([x, u, [0.02], flat])
             shifts = 1e-6 * np.eye(vector.size)
             numeric = np.stack([(packed(vector + s) - packed(vector - s)) / 2e-6 for s in shifts], -1)

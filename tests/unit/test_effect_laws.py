@@ -59,7 +59,7 @@ CHOSEN = {
     "names", [*(pytest.param((name,), id=name) for name in SAME_LAWS), pytest.param(TOGETHER, id="together")]
 )
 def test_laws_are_those_of_hidden_plants_in_plain_floats(names: tuple[str, ...]) -> None:
-    """Alone and together; their equations are checked in tests/integration/test_hidden_plants.py."""
+    """Alone and together, by equations that were written twice."""
     rng = np.random.default_rng(8)
     drawn = {name: hidden.draw_effect(name, rng, hidden.EFFECTS[name].high) for name in names}
     values = {name: CHOSEN.get(name, own) for name, own in drawn.items()}

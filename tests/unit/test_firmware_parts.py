@@ -19,22 +19,9 @@ from firmware.settings import (
     values_of,
 )
 from tests.support.refusals import refused
+from tests.support.tables import FOLDER, table
 
-DUMP = """# version
-# Betaflight / STM32F405 4.5.1
-batch start
-board_name SOMEQUAD
-resource MOTOR 1 B06
-feature -AIRMODE
-feature RX_SERIAL
-set gyro_lpf1_static_hz = 0
-set small_angle = 25
-profile 1
-set p_roll = 60   # more than stock
-rateprofile 2
-set roll_srate = 70
-save
-"""
+DUMP = (FOLDER / "betaflight_dump.txt").read_text(encoding="utf-8")
 
 
 def test_a_dumps_lines_select_profiles_and_end_with_what_the_plant_needs():
@@ -79,27 +66,7 @@ def test_what_the_firmware_did_not_keep_is_named():
     assert value_of(values_of(dump), settings[0]) == "60"
 
 
-@pytest.mark.parametrize(
-    ("field", "value"),
-    [
-        ("mass_kg", 0.0),
-        ("mass_kg", float("nan")),
-        ("mass_kg", "1 kg"),
-        ("inertia", (0.001, 0.001, 0.01)),
-        ("inertia", (0.001, 0.001)),
-        ("arm_m", (0.1, 0.0)),
-        ("center_of_mass_m", (0.09, 0.0)),
-        ("thrust_tilt_rad", (0.0, 1.0)),
-        ("health", (1.0, 1.0, 1.0, 1.6)),
-        ("health", (1.0, -0.1, 1.0, 1.0)),
-        ("linear", 1.1),
-        ("lag_up_s", 0.0),
-        ("quadratic_drag", (0.1, -0.1, 0.0)),
-        ("resistance_ohm", -0.01),
-        ("gyro_noise", float("inf")),
-        ("max_thrust_n", 2.4),
-    ],
-)
+@pytest.mark.parametrize(("field", "value"), table("bodies")["fields"])
 def test_impossible_bodies_are_refused_by_name(field, value):
     with pytest.raises(FirmwareError, match=f"body: {field}: found"):
         replace(Body(), **{field: value})
@@ -126,16 +93,7 @@ def test_missing_tools_and_other_files_are_one_sentence(tmp_path, monkeypatch, c
     assert not [path for path in cache_folder().parent.iterdir()]
 
 
-@pytest.mark.parametrize(
-    ("content", "message"),
-    [
-        ("{", "body.json: found no JSON"),
-        ("[1]", r"body.json: found \[1\], expected an object of fields of Body"),
-        ('{"mass": 1}', "body.json: mass: unknown, expected of mass_kg, gravity"),
-        ('{"mass_kg": -1}', "body.json: body: mass_kg: found -1, expected more than 0"),
-        ('{"mass_kg": "heavy"}', "body.json: body: mass_kg: found heavy, expected a finite number"),
-    ],
-)
+@pytest.mark.parametrize(("content", "message"), table("bodies")["files"])
 def test_a_body_file_that_cannot_be_used_is_named(tmp_path, capsys, content, message):
     file = tmp_path / "body.json"
     file.write_text(content)

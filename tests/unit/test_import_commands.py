@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 from flytrack_sysid import LogError, import_log
 from flytrack_sysid.importing import load_mapping
 from flytrack_sysid.importing.mapping import SHIPPED
+from tests.support.tables import table
 from tests.support.written_logs import read_mapping, write
 
 NUM_ROWS, STEP_S = 1500, 0.01
@@ -93,20 +94,7 @@ def test_only_the_longest_stretch_in_the_air_is_used(tmp_path):
     assert len(log) == 300 and log.time[[0, -1]] == pytest.approx([3.0, 5.99])
 
 
-@pytest.mark.parametrize(
-    ("old", "new", "message"),
-    [
-        ("max_rate_deg_s = [300, 300, 300]", "", r"craft\.max_rate_deg_s: missing in the mapping"),
-        ('columns = ["sr", "sp", "sy"]', "", r"attitude_command\.columns: missing"),
-        ("signs", "gain = [1, -1, 1]\nsigns", r"attitude_command\.gain: found .*, expected 0, to identify"),
-        ("high = 65535", "high = 0", r"thrust_command\.high: found 0, expected another value than low"),
-        ("[time]", "[motors]\nas_thrust = true\n[time]", r"motors\.as_thrust: found no motor outputs"),
-        ("[time]", "[motors]\ncolumns = 5\n[time]", r"motors\.columns: found 5, expected"),
-        ("[time]", "[motors]\nlag_s = [1, 1, 1]\n[time]", r"motors: expected rate_gain, or inertia"),
-        ("[time]", '[command]\ncolumns = ["sr", "sp", "sy", "pwm"]\n[time]', "command: found together with"),
-        ("[time]", 'extends = "nothing"\n[time]', r"map\.toml: extends: found 'nothing', expected one of"),
-    ],
-)
+@pytest.mark.parametrize(("old", "new", "message"), table("command_mappings")["refused"])
 def test_what_makes_no_commands_is_refused(tmp_path, old, new, message):
     with pytest.raises(LogError, match=message):
         read(tmp_path, MAPPING.replace(old, new, 1))

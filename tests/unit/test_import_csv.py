@@ -12,6 +12,7 @@ from flytrack_env import load_model, nominal_parameters
 from flytrack_sysid import FlightLog, LogError, import_log, load_log
 from flytrack_sysid.importing.flight import Craft
 from tests.support.made_flight import GRAVITY, TIME_S, flight
+from tests.support.tables import table
 from tests.support.written_logs import read_mapping
 
 FLIP = np.array([1.0, -1.0, -1.0])
@@ -76,29 +77,7 @@ def test_rows_are_chosen_and_files_become_segments(folder, tmp_path):
         import_log([tmp_path / "one.csv", tmp_path / "two.csv"], "csv", tmp_path / "map.toml")
 
 
-def listed(name):
-    """Return the mapping's end with a list of the files' rows."""
-    return f'[rows.manifest]\nfile = "{name}"\nkey = "file"\ncount = "rows"\n[craft]'
-
-
-@pytest.mark.parametrize(
-    ("old", "new", "message"),
-    [
-        ("[craft]", listed("m.csv"), r"m\.csv: flight\.csv: rows: found '7x', expected a whole number"),
-        ("[craft]", listed("none.csv"), r"none\.csv: cannot be read as a manifest"),
-        ("[craft]", listed("../m.csv"), "expected the name of a file beside the log, not a path"),
-        ('unit = "cm"', 'unit = "ft"', r"map\.toml: position\.unit: found 'ft', expected one of m, cm, mm"),
-        ('column = "ms"', 'column = "us"', r"flight\.csv: column us: found 0 times.*map\.toml: time"),
-        ('"ax", "ay", "az"', '"ax", "ay"', r"specific_force\.columns: .*expected 3 different names"),
-        ("[battery]", "[batery]", r"map\.toml: batery: unknown; expected one of time, command"),
-        ("low = [1000", "low = [1600", r"csv: row \d+ \(line \d+\), column ail: found 1\d+.*, expected 1600"),
-        ("mass_kg = 0.5", "mass_kg = -1", r"craft\.mass_kg: found -1, expected a number above 0"),
-        ('unit = "ms"', 'unit = "ms"\nstep_s = 0.1', r"time: expected either column.* or step_s"),
-        ('"qx", "qy", "qz", "qw"', '"n", "e", "d", "qw"', r"row 0 \(line 2\), column n, e, d, qw: .*norm"),
-        ("[craft]", "[rows]\nfrom_s = 5000\n[craft]", r"map\.toml: rows: none of the 300 rows of .*csv"),
-        ("[time]", "[time", r"map\.toml: not a readable TOML file"),
-    ],
-)
+@pytest.mark.parametrize(("old", "new", "message"), table("csv_mappings")["refused"])
 def test_wrong_mappings_are_refused(folder, tmp_path, old, new, message):
     assert old in MAPPING
     (tmp_path / "map.toml").write_text(MAPPING.replace(old, new, 1))

@@ -1,6 +1,5 @@
 """What was learnt from a log as effects: their values, their files, and what is refused."""
 
-import copy
 import json
 import math
 from pathlib import Path
@@ -23,6 +22,7 @@ from flytrack_env.wrappers import DomainRandomization, RandomizationParams
 from flytrack_sysid.loads import LoadInput, load_at
 from flytrack_sysid.record import Record
 from tests.support.simulated_flights import NOMINAL, drone_with, flown, held
+from tests.support.tables import table
 
 NO = (0.0, 0.0, 0.0)
 DRAG = Term("force", "air", (Factor("airspeed", "bump", (4.0, 1.0)),), (-2.0, 0.0, 0.0), (0.1, 0.0, 0.0))
@@ -224,40 +224,7 @@ def test_every_quantity_has_a_value_and_every_shape_a_formula() -> None:
         assert shape.quantities[0] in Factor(shape.quantities[0], name, numbers).text()
 
 
-LOAD = {"quantity": "load", "shape": "pendulum", "length": 0.5, "damping": 0.1}
-HUNG = {"acts": "force", "frame": "load", "coefficients": [1.0, 0.0, 0.0], "standard_errors": [0.0] * 3}
-REFUSED = [
-    (("terms", 0, "acts"), "torque", r"terms\[0\]\.acts: found 'torque', expected one of force, rate"),
-    (("terms", 0, "frame"), "gate", r"frame: found 'gate', expected one of body, world, air"),
-    (("terms", 0, "coefficients"), [1.0, math.nan, 0.0], "coefficients: found nan, expected a number"),
-    (("terms", 0, "coefficients"), [1.0, 2.0, 0.0], "expected only the first in the frame air"),
-    (("terms", 0, "coefficients"), [1.0], "coefficients: found 1 numbers, expected 3"),
-    (("terms", 0, "standard_errors"), [-1.0, 0.0, 0.0], "standard_errors: .*expected 0 or more"),
-    (("terms", 0, "factors"), [], "factors: found .*expected a list of 1 to 2"),
-    (("terms", 0, "factors", 0, "shape"), "eval('1')", "shape: found .*expected one of power, bump"),
-    (("terms", 0, "factors", 0, "quantity"), "mood", "quantity: found 'mood', expected one of airspeed"),
-    (("terms", 0, "factors", 0, "width"), 0.0, "width: found 0, expected more than 0"),
-    (("terms", 1, "factors", 0, "exponent"), 7.0, "exponent: found 7, expected one of -2, -1"),
-    (("terms", 1, "factors", 1, "exponent"), -1.0, r"found a pole at airspeed_x = 0 m/s, expected none"),
-    (("terms",), [], "terms: found .*expected a list of 1 to 6"),
-    (("terms", 0, "frame"), "load", "frame: found load, expected load with a pendulum, and only then"),
-    (("terms", 2, "factors"), [{**LOAD, "damping": 9.0}], "damping: found 9, expected less"),
-    (("terms", 2, "factors"), [LOAD], "frame: found world, expected load with a pendulum"),
-    (
-        ("terms",),
-        [{**HUNG, "factors": [{**LOAD, "length": length} for length in (0.3, 0.5)]}],
-        r"terms: found loads on 2 strings \(length, damping\), expected one",
-    ),
-    (("networks", 0, "hidden"), [[1.0, 2.0]], "hidden: found another shape, expected 1 rows of 3"),
-    (("networks", 0, "outputs"), [[1.0] * 3] * 2, "outputs: found another shape, expected 3 rows of 3"),
-    (("networks", 0, "hidden", 0, 0), math.inf, "hidden: found inf, expected a number"),
-    (("networks", 0, "inputs", 0, "low"), 5.0, "expected one with a width"),
-    (("networks", 0, "inputs", 0, "quantity"), "mood", "quantity: found 'mood'"),
-    (("networks", 0, "activation"), "relu", "expected exactly acts, frame, inputs"),
-]
-
-
-@pytest.mark.parametrize(("where", "value", "expected"), REFUSED)
+@pytest.mark.parametrize(("where", "value", "expected"), table("learned_effects")["refused"])
 def test_what_is_not_in_the_grammar_is_refused(
     tmp_path: Path, where: tuple[Any, ...], value: Any, expected: str
 ) -> None:
@@ -269,7 +236,7 @@ def test_what_is_not_in_the_grammar_is_refused(
     keys = (static, *where[1:])
     for key in keys[:-1]:
         at = at[key]
-    at[keys[-1]] = copy.deepcopy(value)
+    at[keys[-1]] = value
     path.write_text(json.dumps(document))
     with pytest.raises(ModelFileError, match=expected) as error:
         load_model(path)

@@ -13,9 +13,9 @@ from scipy.spatial.transform import Rotation
 
 from flytrack_env.references import ReferenceFileError, shipped_reference
 from flytrack_env.tracks import Gate, Track, TrackError, load_track, save_track
+from tests.support.tables import table
 
 VALID = (Path(__file__).parents[1] / "support" / "small_track.toml").read_text(encoding="utf-8")
-SECOND_GATE = VALID[VALID.index("[[gates]]\nid = 3") :]
 
 
 def load_text(folder, text):
@@ -35,29 +35,7 @@ def test_valid_file_is_read(tmp_path):
         assert track.bounds_high == (15.0, 5.0, 5.0)
 
 
-START = VALID[VALID.index("[start]") : VALID.index("[bounds]")]
-POSITION, TURN = "[10.0, 1.0, 1.6]", "[0.0, 0.0, 0.0, 1.0]"
-# What is replaced, by what, the line and the field that the message names, and a part of its reason.
-REFUSALS = {
-    "missing name": ('name = "small"\n', "", 1, "name", "missing"),
-    "number as name": ('name = "small"', "name = 3", 1, "name", "non-empty string"),
-    "missing start": (START, "", 1, "start", "missing"),
-    "unknown gate field": ("opening = 1\n", "opening = 1\ncolour = 2\n", 25, "colour", "unknown"),
-    "string as number": (POSITION, '["a", 1.0, 1.6]', 21, "position", "expected a number"),
-    "number as list": (POSITION, "10.0", 21, "position", "expected 3 numbers"),
-    "two coordinates": (POSITION, "[10.0, 1.0]", 21, "position", "expected 3 numbers"),
-    "nan position": (POSITION, "[nan, 1.0, 1.6]", 21, "position", "finite"),
-    "long gate quaternion": (TURN, "[0.0, 0.0, 0.5, 1.0]", 22, "quaternion", "norm"),
-    "wrong direction": ('"-y"', '"y"', 23, "direction", "expected one of"),
-    "zero opening": ("opening = 1\n", "opening = 0\n", 24, "opening", "> 0"),
-    "opening equals frame": ("frame = 2\n", "frame = 1\n", 25, "frame", "more than the opening"),
-    "duplicate id": ("id = 3", "id = 7", 20, "id", "used twice"),
-    "real id": ("id = 3", "id = 3.5", 20, "id", "integer"),
-    "gate outside": (POSITION, "[16.0, 1.0, 1.6]", 21, "position", "inside the bounds"),
-    "start outside": ("[-4.0, 0.0, 1.0]", "[-4.0, 0.0, -1.0]", 4, "position", "inside the bounds"),
-    "bounds reversed": ("[15.0, 5.0, 5.0]", "[15.0, -6.0, 5.0]", 9, "high", "more than low"),
-    "one gate": (SECOND_GATE, "", 1, "gates", "at least two"),
-}
+REFUSALS = table("tracks")["refused"]
 
 
 @pytest.mark.parametrize("case", REFUSALS)

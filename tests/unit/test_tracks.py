@@ -13,20 +13,10 @@ from flytrack_env import tracks
 from flytrack_env.params import EnvParams
 from flytrack_env.quaternion import Vec3
 from flytrack_env.resets import ResetParams
+from tests.support.tables import FOLDER
 
-HANDOUT_ROWS = np.array(
-    [
-        [0, 12.5, 2.0, 1.35, -0.707107, 0, 0, 0.707107],
-        [1, 6.5, 6.0, 1.35, -0.382684, 0, 0, 0.923879],
-        [2, 5.5, 14.0, 1.35, -0.258819, 0, 0, 0.965926],
-        [3, 2.5, 24.0, 1.35, 0.000000, 0, 0, 1.000000],
-        [4, 7.5, 30.0, 1.35, -0.642788, 0, 0, 0.766044],
-        [8, 18.5, 22.0, 1.35, -0.087155, 0, 0, 0.996195],
-        [9, 20.5, 14.0, 1.35, 0.087155, 0, 0, 0.996195],
-        [10, 18.5, 6.0, 1.35, 0.382684, 0, 0, 0.923879],
-    ]
-)
-HANDOUT_YAWS_DEG = (270.0, 225.0, 210.0, 180.0, 260.0, 190.0, 170.0, 135.0)
+HANDOUT = np.genfromtxt(FOLDER / "handout_gates.csv", delimiter=",", skip_header=1)
+HANDOUT_ROWS, HANDOUT_YAWS_DEG = HANDOUT[:, :8], HANDOUT[:, 8]
 
 
 def test_shipped_course_is_the_handouts_table_with_its_flight_frames() -> None:
