@@ -11,7 +11,7 @@ from flytrack_env.params import EnvParams
 from flytrack_env.race import Race
 from flytrack_env.state import Action, Drone
 
-NEAR_M = 0.42  # spheres touch at 0.3
+NEAR_M = 0.5  # spheres touch at 0.3
 ALONG = 0.4  # behind, a metre along the opponent's velocity counts as so many across
 UNTOUCHED_M = 1e-3  # collision radius: whoever is hit flies on, and the gradient with it
 SMALL = 0.01  # m, m/s: where a norm has no gradient
@@ -100,4 +100,4 @@ class DuelFlight:
         across_w = apart_w - along * ahead_w
         along = jax.lax.stop_gradient(along) * jnp.where(along < 0.0, ALONG, 1.0)
         distance = jnp.sqrt(across_w @ across_w + along * along + SMALL * SMALL)
-        return jnp.where(state.entrants.is_out[1], 0.0, jnp.maximum(0.0, 1.0 - distance / NEAR_M))
+        return jnp.where(state.entrants.is_out[1], 0.0, jnp.maximum(0.0, 1.0 - distance / NEAR_M) ** 2)

@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import optax
+from optax.projections import projection_l2_ball
 
 from baselines.purejaxrl_ppo.flights import start_pose_params
 from baselines.purejaxrl_ppo.networks import Policy
@@ -29,26 +30,31 @@ FAR = 0.1  # of an offset beyond the limit
 class Settings(NamedTuple):
     """How a policy is polished.
 
-    updates: of the policy; learning_rate: of the first, falling to 0 as a cosine. flights: of one update,
+    updates: of the policy; learning_rate: the highest, reached after so many updates of warm-up and falling
+    to 0 as a cosine. flights: of one update,
     from noisy start poses, of so many laps. slowest_lap_s: mean lap time from which a flight is cut off.
     offset_limit: of a pass, over the free half opening, from which it is penalised, by penalty_s seconds
-    times the square of what is beyond. nearness_s: what a step of nearness 1 to an opponent costs. widened_m:
-    by which half openings are widened. largest_gradient: global norm at which gradients are clipped.
-    gradient_decay: share of a state's gradient that is passed on to the step before; below 1 it looks ahead
-    for 1 / (1 - share) steps and cannot overflow.
+    times the square of what is beyond. widened_m: by which half openings are widened. largest_gradient:
+    global norm at which gradients are clipped. gradient_decay: share of a state's gradient that is passed on
+    to the step before; below 1 it looks ahead for 1 / (1 - share) steps and cannot overflow. nearness_s: what
+    a step of nearness 1 to an opponent costs, with a gradient of its own that decays and is clipped
+    by largest_nearness_gradient: to keep clear takes no foresight of seconds, and must not outweigh racing.
     """
 
     updates: int = 1500
     learning_rate: float = 1e-3
+    warm_up: int = 0
     flights: int = 32
     laps: int = 3
     slowest_lap_s: float = 4.2
     offset_limit: float = 0.95
     penalty_s: float = 20.0
-    nearness_s: float = 0.01
     widened_m: float = 0.3
     largest_gradient: float = 1.0
     gradient_decay: float = 0.998
+    nearness_s: float = 0.02
+    nearness_decay: float = 0.98
+    largest_nearness_gradient: float = 0.5
 
 
 class Flown(NamedTuple):
@@ -153,27 +159,44 @@ def polish(
     """
     params = start_pose_params(env.default_params, 10**6)
     last_gate = settings.laps * params.course.num_gates
-    schedule = optax.cosine_decay_schedule(settings.learning_rate, settings.updates)
-    optimiser = optax.chain(optax.clip_by_global_norm(settings.largest_gradient), optax.adam(schedule))
+    optimiser = optax.adam(
+        optax.warmup_cosine_decay_schedule(
+            settings.learning_rate if settings.warm_up == 0 else 0.0,
+            settings.learning_rate,
+            settings.warm_up,
+            settings.updates,
+        )
+    )
+    foresight = settings._replace(gradient_decay=settings.nearness_decay)
 
-    def loss(policy_params: Any, keys: jax.Array) -> tuple[jax.Array, jax.Array]:
+    def fly_all(policy_params: Any, keys: jax.Array, settings: Settings) -> Flown:
         def flight(key: jax.Array) -> Flown:
             of_model, of_start = jax.random.split(key)
             own = params if draw_model is None else params.replace(model=draw_model(of_model))
             return fly(env, Policy(policy.network, policy_params), of_start, own, settings, nearness)
 
-        flown = jax.vmap(flight)(keys)
+        return jax.vmap(flight)(keys)
+
+    def racing(policy_params: Any, keys: jax.Array) -> tuple[jax.Array, jax.Array]:
+        flown = fly_all(policy_params, keys, settings)
         is_complete = flown.gates >= last_gate
         times_s = jnp.where(is_complete, flown.time_s, 0.0).sum()
         number = is_complete.sum()
-        costs_s = settings.penalty_s * flown.penalty.sum() + settings.nearness_s * flown.nearness.sum()
-        value = (times_s + costs_s) / jnp.maximum(number, 1)
+        value = (times_s + settings.penalty_s * flown.penalty.sum()) / jnp.maximum(number, 1)
         return value, number
+
+    def crowding(policy_params: Any, keys: jax.Array) -> jax.Array:
+        return settings.nearness_s * fly_all(policy_params, keys, foresight).nearness.mean()
 
     @partial(jax.jit, donate_argnums=(0, 1))
     def update(policy_params: Any, optimiser_state: Any, key: jax.Array) -> tuple[Any, Any, jax.Array]:
         keys = jax.random.split(key, settings.flights)
-        gradient, number = jax.grad(loss, has_aux=True)(policy_params, keys)
+        gradient, number = jax.grad(racing, has_aux=True)(policy_params, keys)
+        gradient = projection_l2_ball(gradient, settings.largest_gradient)
+        if nearness is not alone:
+            away = jax.grad(crowding)(policy_params, keys)
+            away = projection_l2_ball(away, settings.largest_nearness_gradient)
+            gradient = jax.tree.map(jnp.add, gradient, away)
         change, optimiser_state = optimiser.update(gradient, optimiser_state)
         return optax.apply_updates(policy_params, change), optimiser_state, number
 
