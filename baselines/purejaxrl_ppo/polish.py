@@ -25,6 +25,7 @@ from flytrack_env.state import Action
 from flytrack_env.tracks import cross_gate
 
 FAR = 0.1  # of an offset beyond the limit
+MOST_LOST = 20  # updates in a row
 
 
 class Settings(NamedTuple):
@@ -159,14 +160,14 @@ def polish(
     """
     params = start_pose_params(env.default_params, 10**6)
     last_gate = settings.laps * params.course.num_gates
-    optimiser = optax.adam(
-        optax.warmup_cosine_decay_schedule(
-            settings.learning_rate if settings.warm_up == 0 else 0.0,
-            settings.learning_rate,
-            settings.warm_up,
-            settings.updates,
-        )
+    schedule = optax.warmup_cosine_decay_schedule(
+        settings.learning_rate if settings.warm_up == 0 else 0.0,
+        settings.learning_rate,
+        settings.warm_up,
+        settings.updates,
     )
+    # A flight that nearly loses control can have a gradient that overflows: such an update is left out.
+    optimiser = optax.apply_if_finite(optax.adam(schedule), MOST_LOST)
     foresight = settings._replace(gradient_decay=settings.nearness_decay)
 
     def fly_all(policy_params: Any, keys: jax.Array, settings: Settings) -> Flown:

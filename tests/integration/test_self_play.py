@@ -107,7 +107,7 @@ def test_polishing_among_opponents_keeps_clear_of_them():
     member = widened(CHAMPION.params, 36)
     flight = DuelFlight(race, Policy(CHAMPION.network, jax.tree.map(lambda leaf: leaf[None], member)))
     settings = PolishSettings(
-        updates=12, learning_rate=1e-4, flights=4, laps=1, slowest_lap_s=4.6, nearness_s=0.1
+        updates=40, learning_rate=3e-4, flights=4, laps=1, slowest_lap_s=4.6, largest_nearness_gradient=2.0
     )
     learner = Policy(CHAMPION.network, member)
     found = polish(flight, learner, 0, settings, nearness=flight.nearness)
