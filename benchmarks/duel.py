@@ -167,21 +167,27 @@ def duel_rates() -> str:
 
 
 def draw_overtake(races: Races, track: Track) -> Figure | None:
-    """Return a picture of the first race that drone 0 wins from behind, about where it gets ahead."""
+    """Return a picture of the first race that drone 0 wins from behind, about where it gets ahead.
+
+    From above, and heights over time: who passes above or below another does so on the same line.
+    """
     finish_s = races.finish_s(LAPS)
     for race in np.flatnonzero(finish_s[:, 0] < finish_s[:, 1]):
         states, rank = races.states[race], races.rank[race]
         middle = int(np.flatnonzero(rank[: int(100 * finish_s[race, 0]), 0] == 2)[-1])
         steps = slice(max(middle - AROUND_STEPS, 0), middle + AROUND_STEPS)
-        figure = drawing.new_figure(8.0, 8.0)
-        axes = figure.add_subplot()
+        figure = drawing.new_figure(8.0, 10.0)
+        axes, heights = figure.subplots(2, height_ratios=(4, 1))
+        times_s = 0.01 * np.arange(len(states))[steps]
         drawing.draw_gates(axes, track, [0, 1])
         for drone, colour, name in ((1, ORANGE, "opponent"), (0, BLUE, "self-play policy, from behind")):
-            points = states[steps, drone, POSITION][:, :2]
-            axes.plot(*points.T, color=colour, label=name)
-            for number, point in enumerate(points[::20]):
-                axes.plot(*point, "o", color=colour, markersize=8)
-                axes.annotate(str(number), point, fontsize=6, color="white", ha="center", va="center")
+            points = states[steps, drone, POSITION]
+            rows = ((axes, points[:, :2]), (heights, np.column_stack([times_s, points[:, 2]])))
+            for plot, line in rows:
+                plot.plot(*line.T, color=colour, label=name)
+                for number, point in enumerate(line[::20]):
+                    plot.plot(*point, "o", color=colour, markersize=8)
+                    plot.annotate(str(number), point, fontsize=6, color="white", ha="center", va="center")
         seen = states[steps, :, POSITION][..., :2].reshape(-1, 2)
         axes.set(
             aspect="equal",
@@ -192,6 +198,7 @@ def draw_overtake(races: Races, track: Track) -> Figure | None:
             title=f"An overtake {0.01 * middle:.1f} s after the start; dots of a number are at one moment",
         )
         axes.legend(loc="best", frameon=False)
+        heights.set(xlabel="time (s)", ylabel="z (m)")
         return figure
     return None
 
