@@ -179,7 +179,16 @@ class Interrupter:
         signal.raise_signal(signal.SIGINT)
 
 
+@pytest.fixture
+def interruptible():
+    """Let SIGINT raise, which whoever is started in the background by a shell ignores."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+@pytest.mark.usefixtures("interruptible")
 def test_an_interrupt_that_python_drops_ends_the_run_all_the_same(trainer, tmp_path, monkeypatch):
     advance = Run.advance
 
