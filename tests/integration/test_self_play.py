@@ -107,7 +107,7 @@ def test_polishing_among_opponents_keeps_clear_of_them():
     member = widened(CHAMPION.params, 36)
     flight = DuelFlight(race, Policy(CHAMPION.network, jax.tree.map(lambda leaf: leaf[None], member)))
     settings = PolishSettings(
-        updates=40, learning_rate=3e-4, flights=4, laps=1, slowest_lap_s=4.6, largest_nearness_gradient=2.0
+        updates=60, learning_rate=2e-4, warm_up=10, flights=8, laps=1, slowest_lap_s=4.6
     )
     learner = Policy(CHAMPION.network, member)
     found = polish(flight, learner, 0, settings, nearness=flight.nearness)
@@ -115,11 +115,12 @@ def test_polishing_among_opponents_keeps_clear_of_them():
     def nearness(params):
         policy = Policy(CHAMPION.network, params)
         fly_one = partial(fly, flight, policy, params=flight.default_params, settings=settings)
-        flown = jax.jit(jax.vmap(partial(fly_one, nearness=flight.nearness)))(start_keys(1, 8))
-        assert (flown.gates == 8).all()
-        return float(flown.nearness.mean())
+        flown = jax.jit(jax.vmap(partial(fly_one, nearness=flight.nearness)))(start_keys(1, 32))
+        has_finished = np.asarray(flown.gates == 8)
+        assert has_finished.mean() > 0.9
+        return float(np.asarray(flown.nearness)[has_finished].mean())
 
-    assert nearness(found) < 0.8 * nearness(member)
+    assert nearness(found) < 0.6 * nearness(member)
 
 
 @pytest.mark.slow
