@@ -2,18 +2,15 @@
 
 import inspect
 from collections.abc import Mapping
-from pathlib import Path
 
 from latex2mathml.converter import convert
 
 from docs.markdown import one_line, render
 from docs.page_pictures import NUM_NOTABLE
 from flytrack_env.effects import EFFECTS, Effect
-from flytrack_env.toml_file import parse_toml, read_text
 from flytrack_sysid.diagnosis.evidence import EVIDENCE
 from flytrack_sysid.diagnosis.traces import REGRESSORS
 
-LAWS = parse_toml(read_text(Path(__file__).with_name("laws.toml")))
 CHANNELS = {
     "p": "position",
     "v": "velocity",
@@ -52,7 +49,7 @@ def effect_page(effect: Effect) -> str:
         picture_size=f"{NUM_NOTABLE:g}",
         effect=effect,
         about=one_line(inspect.getdoc(inspect.getmodule(effect.parameters))),
-        law=convert(LAWS[effect.name], display="block"),
+        law=convert(effect.equation, display="block"),
         parameters_about=one_line(effect.parameters.__doc__),
         neutral=neutral,
         high=arguments(high),

@@ -20,6 +20,7 @@ ACCELEROMETER_BIAS = Effect(
     ranges={axis: Range(-2.0, 2.0, "m/s^2") for axis in AccelerometerBias._fields},
     notable={"x": 0.3, "y": 0.3, "z": 0.3},
     needs=("f",),
+    equation=r"\mathbf{f}_\text{measured} = \mathbf{f} + (x, y, z)^\top",
     source="assumption: constant within a flight",
     accelerometer=shifted,
 )

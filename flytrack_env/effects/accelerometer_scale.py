@@ -20,6 +20,7 @@ ACCELEROMETER_SCALE = Effect(
     ranges={axis: Range(0.8, 1.2, "1") for axis in AccelerometerScale._fields},
     notable={"x": 0.05, "y": 0.05, "z": 0.05},
     needs=("f",),
+    equation=r"\mathbf{f}_\text{measured} = \operatorname{diag}(x, y, z)\, \mathbf{f}",
     source="assumption: linear up to the largest force, no leak between the axes",
     accelerometer=scaled,
 )

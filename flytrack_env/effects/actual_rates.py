@@ -33,6 +33,7 @@ ACTUAL_RATES = Effect(
     shapes=ActualRates._fields[3:],
     follows_sticks=True,
     is_setting=True,
+    equation=r"u_i \leftarrow u_i \left( 1 - b_i + b_i |u_i| \left( e_i u_i^4 + 1 - e_i \right) \right)",
     source="applyActualRates in Betaflight 4.6, src/main/fc/rc.c, over the rate at full stick",
     command=on_rate_sticks(_curve),
 )

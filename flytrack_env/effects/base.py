@@ -151,8 +151,8 @@ class Effect:
 
     name: as in model files. parameters: the NamedTuple class; its defaults are neutral. ranges: of each
     parameter. notable: the smallest departure from neutral that matters, a judgement: less hardly
-    shows in a lap or a reading. source: a publication, or the assumption. command, lag, air, thrust,
-    rates, force, battery, gyro, accelerometer, pose: hooks at these stages.
+    shows in a lap or a reading. equation: LaTeX. source: a publication, or the assumption. command,
+    lag, air, thrust, rates, force, battery, gyro, accelerometer, pose: hooks at these stages.
     most_steps: of parameters that are delays, how many steps of time each may last.
     needs: channels that a log has to have to be asked about it: p position, v velocity, q attitude, w gyro,
     f accelerometer, v_bat voltage.
@@ -176,6 +176,7 @@ class Effect:
     parameters: Any
     ranges: Mapping[str, Range]
     notable: Mapping[str, float]
+    equation: str
     source: str
     most_steps: Mapping[str, int] = field(default_factory=dict)
     needs: tuple[str, ...] = ()

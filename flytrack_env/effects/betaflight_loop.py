@@ -473,6 +473,9 @@ BETAFLIGHT_LOOP = Effect(
     groups=(GAINS, (LATE,), CENTER, *((motor,) for motor in MOTORS), MOTORS[:2], MOTORS[::2], MOTORS[::3]),
     is_setting=True,
     fitted=CRAFT,
+    equation=r"c = \text{mix}\left(u_t, P e + I \int e\, dt - D \dot{\omega} + F \dot{u}\right), \quad "
+    r"\text{motor}\, \dot{s}_k + s_k = c_k, \quad "
+    r"\dot{\omega}_i = \text{arm}_i \sum_k \pm \tfrac{1}{4} T(s_k, V)",
     source="pidController and mixTable of Betaflight 4.6 with legacy mixer, airmode and PT1 filters "
     "(src/main/flight/pid.c, mixer.c, src/main/fc/rc.c), a frame of the receiver at each step, and motors "
     "that each give a quarter of the thrust curve",

@@ -32,6 +32,7 @@ BETAFLIGHT_RATES = Effect(
     notable=dict.fromkeys(BetaflightRates._fields, 0.05),
     follows_sticks=True,
     is_setting=True,
+    equation=r"u_i \leftarrow u_i \left( 1 - e_i + e_i |u_i|^3 \right) \frac{1 - s_i}{1 - s_i |u_i|}",
     source="applyBetaflightRates in Betaflight 4.6, src/main/fc/rc.c, over the rate at full stick",
     command=on_rate_sticks(_curve),
 )

@@ -87,6 +87,8 @@ COMMAND_DELAY = Effect(
         "thrust_extra_s": Range(-LONGEST_S, LONGEST_S, "s"),
     },
     notable=dict.fromkeys(CommandDelay._fields, 0.005),
+    equation=r"u_i(t) \leftarrow \frac{1}{\Delta t} \int_t^{t + \Delta t} u_i(s - \text{delay}_i)\, ds, "
+    r"\quad \text{delay}_i = \max(0, \text{delay} + \text{extra}_i)",
     source="assumption: constant within a flight; the link comes first, then what the flight controller "
     "makes of the sticks",
     most_steps=dict.fromkeys(CommandDelay._fields, LONGEST_STEPS),

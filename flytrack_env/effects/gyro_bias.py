@@ -20,6 +20,7 @@ GYRO_BIAS = Effect(
     ranges={axis: Range(-0.5, 0.5, "rad/s") for axis in GyroBias._fields},
     notable={"x": 0.02, "y": 0.02, "z": 0.02},
     needs=("w",),
+    equation=r"\boldsymbol{\omega}_\text{measured} = \boldsymbol{\omega} + (x, y, z)^\top",
     source="assumption: constant within a flight; the rate loop flies by the true rates",
     gyro=shifted,
 )

@@ -21,6 +21,7 @@ GYRO_SCALE = Effect(
     notable={"x": 0.02, "y": 0.02, "z": 0.02},
     follows_sticks=True,
     needs=("w",),
+    equation=r"\boldsymbol{\omega}_\text{measured} = \operatorname{diag}(x, y, z)\, \boldsymbol{\omega}",
     source="assumption: linear up to the fastest turn, no leak between the axes",
     gyro=scaled,
 )

@@ -93,6 +93,8 @@ IMU_LATENCY = Effect(
     parameters=ImuLatency,
     ranges={"latency_s": Range(0.0, 0.04, "s")},
     notable={"latency_s": 0.003},
+    equation=r"\boldsymbol{\omega}_\text{measured}(t) = \boldsymbol{\omega}(t - \text{latency}), \quad "
+    r"\mathbf{f}_\text{measured}(t) = \mathbf{f}(t - \text{latency})",
     source="assumption: the same for both sensors; what imu_offset adds is not late",
     most_steps={"latency_s": USUAL_STEPS},
     probes={"latency_s": (0.005, 0.01, 0.02, 0.03)},

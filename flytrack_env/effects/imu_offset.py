@@ -35,6 +35,8 @@ IMU_OFFSET = Effect(
     ranges={axis: Range(-0.2, 0.2, "m") for axis in ImuOffset._fields},
     notable={"x": 0.02, "y": 0.02, "z": 0.02},
     needs=("f",),
+    equation=r"\mathbf{f}_\text{measured} = \mathbf{f} + \boldsymbol{\omega} \times (\boldsymbol{\omega} "
+    r"\times \mathbf{r}) + \dot{\boldsymbol{\omega}} \times \mathbf{r}",
     source="acceleration of a point of a rigid body; assumption: rates change evenly within the step",
     accelerometer=_accelerometer,
 )

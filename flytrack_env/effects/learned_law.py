@@ -22,6 +22,7 @@ LEARNED_LAW = learned_effect(
     law_from_json,
     name="learned_law",
     parameters=LearnedLaw,
+    equation=r"\mathbf{f}_b \leftarrow \mathbf{f}_b + s \sum_k \mathbf{c}_k\, g_k h_k",
     source="the log that it was learnt from; sums of products of given functions: S. Brunton et al., "
     '"Discovering governing equations from data by sparse identification", 2016',
 )

@@ -179,6 +179,8 @@ LEARNED_RESIDUAL = learned_effect(
     networks_from_json,
     name="learned_residual",
     parameters=LearnedResidual,
+    equation=r"\mathbf{f}_b \leftarrow \mathbf{f}_b + s\, (W_2 \tanh(W_1 \mathbf{z} + \mathbf{b}_1) "
+    r"+ \mathbf{b}_2)",
     source="the log that it was learnt from; a random hidden layer and linear outputs: G.-B. Huang et al., "
     '"Extreme learning machine", 2006',
 )

@@ -25,6 +25,8 @@ LINEAR_DRAG = Effect(
     ranges={axis: Range(-3.0, 3.0, "1/s") for axis in LinearDrag._fields},
     notable={"d_x": 0.05, "d_y": 0.05, "d_z": 0.05},
     needs=("v", "q"),
+    equation=r"\mathbf{f}_b \leftarrow \mathbf{f}_b - \operatorname{diag}(d_x, d_y, d_z)\, R^\top "
+    r"(\mathbf{v} - \mathbf{v}_\text{air})",
     source='M. Faessler et al., "Differential flatness of quadrotor dynamics subject to rotor drag", eq. 2',
     force=_force,
 )

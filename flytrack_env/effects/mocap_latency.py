@@ -59,6 +59,8 @@ MOCAP_LATENCY = Effect(
     parameters=MocapLatency,
     ranges={"latency_s": Range(0.0, LONGEST_S, "s")},
     notable={"latency_s": 0.002},
+    equation=r"(\mathbf{p}, \mathbf{v}, \mathbf{q})_\text{measured}(t) = "
+    r"(\mathbf{p}, \mathbf{v}, \mathbf{q})(t - \text{latency})",
     source="assumption: the same for all three, linear between steps",
     most_steps={"latency_s": MOST_STEPS},
     needs=("q", "w"),

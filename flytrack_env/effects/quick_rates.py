@@ -33,6 +33,7 @@ QUICK_RATES = Effect(
     shapes=QuickRates._fields[3:],
     follows_sticks=True,
     is_setting=True,
+    equation=r"u_i \leftarrow u_i \frac{1 - b_i}{1 - b_i \left( e_i |u_i|^3 + (1 - e_i) |u_i| \right)}",
     source="applyQuickRates in Betaflight 4.6, src/main/fc/rc.c, over the rate at full stick",
     command=on_rate_sticks(_curve),
 )

@@ -24,6 +24,8 @@ RATE_CROSS_COUPLING = Effect(
     ranges={axis: Range(-0.3, 0.3, "1") for axis in RateCrossCoupling._fields},
     notable={"from_roll": 0.03, "from_pitch": 0.03},
     follows_sticks=True,
+    equation=r"\omega_z \leftarrow \omega_z + \text{from roll} \cdot \omega_x + \text{from pitch} \cdot "
+    r"\omega_y",
     source="assumption: in proportion, and into yaw only, the axis with the least authority",
     rates=_rates,
 )

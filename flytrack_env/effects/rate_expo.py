@@ -24,6 +24,7 @@ RATE_EXPO = Effect(
     ranges={axis: Range(-0.9, 0.9, "1") for axis in RateExpo._fields},
     notable={axis: 0.05 for axis in RateExpo._fields},
     follows_sticks=True,
+    equation=r"u_i \leftarrow (1 - \text{expo}_i)\, u_i + \text{expo}_i\, u_i^3",
     source='the "expo" of radio transmitters, and of KISS and RaceFlight rates in Betaflight '
     "(src/main/fc/rc.c): the curve makes the setpoint of the rate loop, before any lag",
     command=on_rate_sticks(_curve),

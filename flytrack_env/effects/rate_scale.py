@@ -20,6 +20,8 @@ RATE_SCALE = Effect(
     ranges={axis: Range(0.5, 1.5, "1") for axis in RateScale._fields},
     notable={"roll": 0.03, "pitch": 0.03, "yaw": 0.03},
     follows_sticks=True,
+    equation=r"\boldsymbol{\omega} \leftarrow \operatorname{diag}(\text{roll}, \text{pitch}, \text{yaw})\, "
+    r"\boldsymbol{\omega}",
     source="assumption: the stick's curve stays linear",
     rates=scaled,
 )

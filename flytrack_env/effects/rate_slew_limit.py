@@ -81,6 +81,7 @@ RATE_SLEW_LIMIT = Effect(
     parameters=RateSlewLimit,
     ranges={axis: Range(0.0, 1.0, "s") for axis in RateSlewLimit._fields},
     notable={axis: 0.05 for axis in RateSlewLimit._fields},
+    equation=r"|u_i(t + \Delta t) - u_i(t)| \le \frac{\Delta t}{T_i}",
     source="the acceleration limit of Betaflight (src/main/flight/pid.c), which the setpoint passes between "
     "the stick's curve and the controller",
     # A limit on the acceleration of all axes is a shorter time on the axis with the lower rates.

@@ -130,6 +130,8 @@ SECOND_ORDER_RATES = Effect(
         **{f"{axis}_damping": Range(0.1, 3.0, "1") for axis in AXES},
     },
     notable={f"{axis}_s": 0.005 for axis in AXES},
+    equation=r"\frac{\ddot{\omega}_i}{\omega_{n,i}^2} + \text{lag}_i\, \dot{\omega}_i + \omega_i = "
+    r"\omega_{i,\text{lagged stick}}, \quad \omega_{n,i} = \frac{2\, \text{damping}_i}{\text{lag}_i}",
     source="a second-order servo, as a rate loop with a PID controller is near its bandwidth; exact for an "
     "input that is held over the step or changes evenly in it",
     probes={f"{axis}_s": (0.003, 0.01, 0.03) for axis in AXES},

@@ -21,6 +21,7 @@ THRUST_SCALE = Effect(
     parameters=ThrustScale,
     ranges={"factor": Range(0.5, 1.5, "1")},
     notable={"factor": 0.02},
+    equation=r"T \leftarrow \text{factor} \cdot T",
     source="assumption: the shape of the thrust curve stays",
     thrust=_thrust,
 )

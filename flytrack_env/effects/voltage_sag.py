@@ -33,6 +33,7 @@ VOLTAGE_SAG = Effect(
     ranges={"at_full_v": Range(-3.0, 6.0, "V")},
     notable={"at_full_v": 0.3},
     needs=("v_bat",),
+    equation=r"V = V_\text{open} - \text{at full} \cdot \left( \frac{1 + u}{2} \right)^2",
     source="assumption: a resistance without dynamics, current with the square of the stick",
     battery=_battery,
 )

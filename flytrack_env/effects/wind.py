@@ -39,6 +39,8 @@ WIND = Effect(
     },
     notable={"a_x": 0.2, "a_y": 0.2, "a_z": 0.2, "v_x": 1.0, "v_y": 1.0, "v_z": 1.0},
     needs=("q",),
+    equation=r"\mathbf{v}_\text{air} \leftarrow \mathbf{v}_\text{air} + \mathbf{v}, \quad \mathbf{f}_b "
+    r"\leftarrow \mathbf{f}_b + R^\top \mathbf{a}",
     source="assumption: uniform and steady within a flight",
     groups=(("a_x", "a_y", "a_z"), ("v_x", "v_y", "v_z")),
     air=_air,

@@ -26,6 +26,7 @@ YAW_REACTION = Effect(
     parameters=YawReaction,
     ranges={"angle": Range(-0.2, 0.2, "rad")},
     notable={"angle": 0.02},
+    equation=r"\omega_z \leftarrow \omega_z + \text{angle}\, \frac{du}{dt}",
     source="assumption: unequal spin-up of the two directions of rotation, in proportion to its speed",
     rates=_rates,
 )

@@ -74,7 +74,7 @@ def test_neutral_equals_absent_bit_for_bit(group: str) -> None:
 def test_declaration_is_consistent(effect: Effect) -> None:
     neutral = effect.parameters()
     assert tuple(effect.ranges) == neutral._fields
-    assert effect.stages and effect.source
+    assert effect.stages and effect.equation and effect.source
     assert (effect.start is None) == (effect.remember is None and effect.respond is None)
     assert set(effect.notable) == set(effect.ranges) - set(effect.shapes)
     for name, bounds in effect.ranges.items():
