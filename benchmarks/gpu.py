@@ -32,7 +32,8 @@ REPEATS, LENGTH = 5, 64  # calls, and steps of each
 PAGE = report.RESULTS / "gpu.md"
 WHAT = (
     "256 flights on the accelerator and on the CPU; rates with random actions, observations and resets "
-    "included, compilation excluded, wall time; training by PPO as shipped."
+    "included, compilation excluded, wall time; training by PPO as shipped. Both devices run the same "
+    "equations: their agreement says something of rounding, not of physics."
 )
 
 

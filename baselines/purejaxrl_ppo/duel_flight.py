@@ -35,9 +35,14 @@ class DuelFlight:
     Args:
         race: of two drones.
         pool: policies of one network, parameters with the members as first axis of each leaf.
+
+    Raises:
+        ValueError: a race of another number of drones.
     """
 
     def __init__(self, race: MultiDroneRace, pool: Policy) -> None:
+        if race.num_drones != 2:
+            raise ValueError(f"race: found {race.num_drones} drones, expected 2")
         self._race, self._pool = race, pool
         self._num_members = len(jax.tree.leaves(pool.params)[0])
 

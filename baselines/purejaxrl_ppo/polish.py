@@ -25,21 +25,19 @@ from flytrack_env.state import Action
 from flytrack_env.tracks import cross_gate
 
 FAR = 0.1  # of an offset beyond the limit
-MOST_LOST = 20  # updates in a row
 
 
 class Settings(NamedTuple):
     """How a policy is polished.
 
-    updates: of the policy; learning_rate: the highest, reached after so many updates of warm-up and falling
-    to 0 as a cosine. flights: of one update,
-    from noisy start poses, of so many laps. slowest_lap_s: mean lap time from which a flight is cut off.
-    offset_limit: of a pass, over the free half opening, from which it is penalised, by penalty_s seconds
-    times the square of what is beyond. widened_m: by which half openings are widened. largest_gradient:
-    global norm at which gradients are clipped. gradient_decay: share of a state's gradient that is passed on
-    to the step before; below 1 it looks ahead for 1 / (1 - share) steps and cannot overflow. nearness_s: what
-    a step of nearness 1 to an opponent costs, with a gradient of its own that decays and is clipped
-    by largest_nearness_gradient: to keep clear takes no foresight of seconds, and must not outweigh racing.
+    updates: of the policy. learning_rate: the highest, reached after warm_up updates and falling to 0 as a
+    cosine. flights: of one update, from noisy start poses, of so many laps. slowest_lap_s: mean lap time from
+    which a flight is cut off. offset_limit: of a pass, over the free half opening, from which it is
+    penalised, by penalty_s seconds times the square of what is beyond. widened_m: by which half openings are
+    widened. largest_gradient: global norm at which gradients are clipped. gradient_decay: share of a state's
+    gradient that is passed on to the step before; below 1 it looks ahead for 1 / (1 - share) steps and cannot
+    overflow. nearness_s: cost of a step of nearness 1 to an opponent. Its gradient has a decay and a largest
+    norm of its own, since keeping clear takes no foresight of seconds and must not outweigh racing.
     """
 
     updates: int = 1500
@@ -166,8 +164,7 @@ def polish(
         settings.warm_up,
         settings.updates,
     )
-    # A flight that nearly loses control can have a gradient that overflows: such an update is left out.
-    optimiser = optax.apply_if_finite(optax.adam(schedule), MOST_LOST)
+    optimiser = optax.adam(schedule)
     foresight = settings._replace(gradient_decay=settings.nearness_decay)
 
     def fly_all(policy_params: Any, keys: jax.Array, settings: Settings) -> Flown:

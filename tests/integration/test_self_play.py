@@ -99,6 +99,8 @@ def test_nearness_pushes_to_the_side_and_never_back():
         x, y, z = jax.grad(nearness)(place)
         assert abs(x) < 1e-3 and y < -0.5 and abs(z) < 1e-3
     assert float(nearness(jnp.array([0.0, 0.0, 2.0]))) == 0.0
+    with pytest.raises(ValueError, match="race: found 3 drones, expected 2"):
+        DuelFlight(MultiDroneRace(ENV, 3), CHAMPION.policy)
 
 
 @pytest.mark.slow
