@@ -98,8 +98,11 @@ def fly(
         next_state, _, is_over, _ = env.advance(state, Action(*action), params)
         after = env.drone(next_state)
         crossing = cross_gate(race.gate, before.pos_w, after.pos_w, params.drone_radius)
-        counts = crossing.is_pass & is_flying & (flown.gates < last_gate)
-        offset = jnp.where(counts, crossing.offset * relative, 0.0)
+        is_racing = is_flying & (flown.gates < last_gate)
+        counts = crossing.is_pass & is_racing
+        # Whoever hits a frame or misses a gate is out, and was too far from its centre.
+        is_met = is_racing & (crossing.is_pass | crossing.is_frame | crossing.is_miss)
+        offset = jnp.where(is_met, crossing.offset * relative, 0.0)
         beyond = jnp.maximum(offset - settings.offset_limit, 0.0)
         flown = Flown(
             time_s=flown.time_s + jnp.where(counts, (index + crossing.fraction) * params.dt, 0.0) / last_gate,
@@ -107,7 +110,7 @@ def fly(
             # Linear far out: one lost flight must not outweigh all that race.
             penalty=flown.penalty + jnp.where(beyond < FAR, beyond * beyond, FAR * (2.0 * beyond - FAR)),
             nearness=flown.nearness
-            + jnp.where(is_flying & (flown.gates < last_gate), nearness(next_state), 0.0),
+            + jnp.where(is_racing, nearness(next_state), 0.0),
         )
         # What ended would fly on to where numbers overflow, and its gradient with it.
         is_flying = is_flying & ~is_over

@@ -18,7 +18,9 @@ class RaceRules(NamedTuple):
     collision_radius: of the sphere around each drone, m. blame: 0, both drones of a collision are out; 1, the
     one that ran into the other is (``flytrack_env.multi_drone.collisions``). column_spacing, row_spacing: of
     the start grid, m. first_slot: slot on the grid of drone 0, the others following; -1: drawn.
-    lead: reward for each gate gained on the best opponent.
+    lead: reward for each gate gained on the best opponent. downwash: share of a wake's momentum that pushes
+    whoever flies into it (``flytrack_env.multi_drone.downwash``), 1 for all that meets the drone; None, which
+    is a program of its own: wakes are not computed.
     """
 
     collision_radius: Scalar = 0.15
@@ -27,6 +29,7 @@ class RaceRules(NamedTuple):
     row_spacing: Scalar = 0.5
     first_slot: Scalar = DRAWN_SLOT
     lead: Scalar = 0.0
+    downwash: Scalar | None = None
 
 
 class RaceParams(NamedTuple):
@@ -54,6 +57,10 @@ def check_rules(rules: RaceRules, num_drones: int) -> None:
         "row_spacing": (2.0 * np.asarray(rules.row_spacing) > diameter, apart.replace("twice ", "")),
         "first_slot": (np.isin(rules.first_slot, range(DRAWN_SLOT, num_drones)), slots),
         "lead": (np.isfinite(rules.lead), "a finite number"),
+        "downwash": (
+            rules.downwash is None or (np.asarray(rules.downwash) >= 0.0) & np.isfinite(rules.downwash),
+            "a share from 0 on, or None",
+        ),
     }
     for name, (holds, expected) in requirements.items():
         if not np.all(holds):
