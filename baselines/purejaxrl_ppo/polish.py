@@ -109,8 +109,7 @@ def fly(
             gates=flown.gates + counts,
             # Linear far out: one lost flight must not outweigh all that race.
             penalty=flown.penalty + jnp.where(beyond < FAR, beyond * beyond, FAR * (2.0 * beyond - FAR)),
-            nearness=flown.nearness
-            + jnp.where(is_racing, nearness(next_state), 0.0),
+            nearness=flown.nearness + jnp.where(is_racing, nearness(next_state), 0.0),
         )
         # What ended would fly on to where numbers overflow, and its gradient with it.
         is_flying = is_flying & ~is_over

@@ -45,11 +45,8 @@ def wake_of(drone: Drone, gravity: Scalar, is_flying: Scalar) -> Wake:
     return Wake(drone.pos_w, up.scale(-thrust), up.scale(-speed) - drone.vel_w)
 
 
-def downwash_acc_w(pos_w: Vec3, wake: Wake, share: Scalar) -> Vec3:
-    """Return how the wake of another drone accelerates one at a position, world, m/s^2.
-
-    share: of the momentum that meets it. Both drones have the same mass and disc.
-    """
+def downwash_acc_w(pos_w: Vec3, wake: Wake) -> Vec3:
+    """Return how the wake of another drone of the same mass and disc accelerates one, world, m/s^2."""
     axis = compute_once(wake.air_w.scale(1.0 / (wake.air_w.norm() + SMALL)))
     apart = pos_w - wake.pos_w
     along = compute_once(apart.dot(axis))
@@ -57,7 +54,7 @@ def downwash_acc_w(pos_w: Vec3, wake: Wake, share: Scalar) -> Vec3:
     radius = DISC_RADIUS_M + SPREAD * jnp.maximum(along, 0.0)
     met = 1.0 - jnp.exp(-((DISC_RADIUS_M / radius) ** 2))
     within = jnp.exp(-across.dot(across) / (radius * radius))
-    strength = jnp.where(along > 0.0, share * met * within, 0.0)
+    strength = jnp.where(along > 0.0, met * within, 0.0)
     return wake.push_w.scale(compute_once(strength))
 
 
@@ -67,4 +64,3 @@ def pushed(drone: Drone, acc_w: Vec3, dt: Scalar) -> Drone:
     Its position follows in the next step.
     """
     return drone._replace(vel_w=drone.vel_w + acc_w.scale(dt), acc_w=drone.acc_w + acc_w)
-

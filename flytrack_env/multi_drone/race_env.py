@@ -375,10 +375,11 @@ class MultiDroneRace:
     def _push(self, flown: Flown, wakes: list[Wake], params: RaceParams) -> Flown:
         """Return a drone's step with the push of the others' wakes, unless it is out."""
         drone = self.env.drone(flown.state.inner)
-        acc_w = downwash_acc_w(drone.pos_w, wakes[0], params.rules.downwash)
+        acc_w = downwash_acc_w(drone.pos_w, wakes[0])
         for wake in wakes[1:]:
-            acc_w = acc_w + downwash_acc_w(drone.pos_w, wake, params.rules.downwash)
-        acc_w = acc_w.scale(compute_once(jnp.where(flown.state.is_out, 0.0, 1.0)))
+            acc_w = acc_w + downwash_acc_w(drone.pos_w, wake)
+        share = jnp.where(flown.state.is_out, 0.0, jnp.asarray(params.rules.downwash))
+        acc_w = acc_w.scale(compute_once(share))
         after = pushed(drone, acc_w, params.flight.dt)
         inner = self.env.with_drone(flown.state.inner, after)
         return flown._replace(

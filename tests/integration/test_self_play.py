@@ -2,6 +2,7 @@
 
 import dataclasses
 from functools import partial
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -16,6 +17,7 @@ from baselines.purejaxrl_ppo.flights import start_keys
 from baselines.purejaxrl_ppo.networks import Policy
 from baselines.purejaxrl_ppo.polish import Settings as PolishSettings
 from baselines.purejaxrl_ppo.polish import fly, polish
+from baselines.purejaxrl_ppo.race_command import RaceSettings, describe, run_race
 from baselines.purejaxrl_ppo.self_play import Settings, pool_opponent, train, widened
 from flytrack_env.model_file import model_from_json
 from flytrack_env.multi_drone import EntrantState, MultiDroneRace
@@ -23,7 +25,8 @@ from flytrack_env.quaternion import Vec3
 from flytrack_env.rollout import load_named_rollouts
 from tests.support.pages import ROOT
 
-CHAMPION = load_checkpoint(ROOT / "baselines" / "purejaxrl_ppo" / "champion" / "flytrack.safetensors")
+CHAMPION_FILE = ROOT / "baselines" / "purejaxrl_ppo" / "champion" / "flytrack.safetensors"
+CHAMPION = load_checkpoint(CHAMPION_FILE)
 ENV = flytrack_env.make("FlyTrack-v0", model=model_from_json(CHAMPION.meta["model"], "model"))
 
 
@@ -77,6 +80,26 @@ def test_a_race_is_saved_as_rollouts_up_to_where_a_drone_is_out(tmp_path):
     races.is_out[0, 6:, 1] = True
     flights = load_named_rollouts(races.save(0, tmp_path)).values()
     assert [len(states) for states, _ in flights] == [10, 7]
+
+
+def test_a_race_is_described_by_slot():
+    settings = RaceSettings((Path("quick.safetensors"), Path("slow.safetensors")), races=1, laps=2)
+    found = describe(races_of(((3, 6), (4,)), collisions=[9]), settings, slot=1)
+    assert found.splitlines() == [
+        "1 races, collisions in 0.0%:",
+        "  slot 1  quick: finishes 100.0%, on average after 0.065 s, wins 100.0%",
+        "  slot 0  slow: finishes 0.0%, wins 0.0%",
+    ]
+
+
+@pytest.mark.slow
+def test_checkpoints_race_on_the_black_box(tmp_path, capsys):
+    run_race(RaceSettings((CHAMPION_FILE, CHAMPION_FILE), races=4, laps=1, out=tmp_path / "race"))
+    printed = capsys.readouterr().out
+    assert printed.count("4 races, collisions in 0.0%") == 2
+    assert "slot 0  flytrack: finishes 100.0%" in printed and "wins 100.0%" in printed
+    names = sorted(path.name for path in (tmp_path / "race").iterdir())
+    assert names[:2] == ["drone_0.npy", "drone_1.npy"] and all(name in printed for name in names)
 
 
 def test_nearness_pushes_to_the_side_and_never_back():

@@ -63,10 +63,11 @@ def write_checkpoint(
     env_id: str = "FlyTrackRandomized-v0",
     track: str = "flytrack",
     hidden_sizes: tuple[int, ...] = (8,),
+    memory_size: int = 0,
 ) -> Path:
     """Write a policy that has learned nothing, with all that a checkpoint tells."""
     env = make(env_id, track=track, model=nominal_parameters().with_effects(LinearDrag(0.3, 0.3, 0.1)))
-    config = Config(hidden_sizes=hidden_sizes)
+    config = Config(hidden_sizes=hidden_sizes, memory_size=memory_size)
     size = env.observation_space().shape[0]
     params = make_network(config).init(jax.random.key(5), jnp.zeros((1, size)))
     uneven = jax.tree.map(lambda leaf: 0.1 * jnp.cos(jnp.arange(leaf.size)).reshape(leaf.shape), params)
