@@ -25,7 +25,7 @@ from baselines.purejaxrl_ppo.duel_flight import DuelFlight
 from baselines.purejaxrl_ppo.duels import Races, fly_races, score, start_pose_params
 from baselines.purejaxrl_ppo.networks import Policy
 from baselines.purejaxrl_ppo.polish import Settings as PolishSettings
-from baselines.purejaxrl_ppo.polish import polish
+from baselines.purejaxrl_ppo.polish import alone, polish
 from baselines.purejaxrl_ppo.self_play import Settings, train, widened
 from benchmarks import report
 from benchmarks.champion import CHAMPION, FOLDER, REWARD
@@ -49,11 +49,14 @@ CHANGES: dict[str, Any] = {
     "min_std": 0.01,
 }
 SETTINGS = Settings(every=25, std=0.015, course_fraction=0.8)
-# First to keep clear at any price, then to get back the speed that it cost.
+# To be fast whoever else is there; or first to keep clear at any price, then to get back what speed it cost.
+RACE = PolishSettings(updates=100, learning_rate=1e-4, warm_up=20, flights=24, penalty_s=40.0, clips="flight")
 CLEAR = PolishSettings(
-    updates=300, learning_rate=2e-4, warm_up=50, flights=24, penalty_s=40.0, largest_nearness_gradient=1.0
+    updates=300, learning_rate=2e-4, warm_up=50, flights=24, penalty_s=40.0, nearness_weight=1.0
 )
-FAST = CLEAR._replace(penalty_s=20.0, largest_nearness_gradient=0.6)
+FAST = CLEAR._replace(penalty_s=20.0, nearness_weight=0.6)
+TO_RACE, TO_OVERTAKE = "polished to race", "polished to overtake"
+POLISHING = {TO_RACE: (RACE,), TO_OVERTAKE: (CLEAR, FAST)}
 SLOTS = {"behind": 1, "in front": 0}
 NUM_RACES, NUM_RATED, LAPS, FLIGHT_SEED = 256, 64, 3, 100
 NUM_SNAPSHOTS = 4  # of the first seed, that are rated
@@ -86,21 +89,31 @@ def train_seed(seed: int, starts: list[Checkpoint], race: MultiDroneRace) -> lis
     return [load_checkpoint(path) for path in (*paths, folder / "final.safetensors")]
 
 
-def polish_seed(seed: int, learnt: Checkpoint, starts: list[Checkpoint], race: MultiDroneRace) -> Checkpoint:
-    """Return what self-play has learnt, polished against the champions and itself, unless it is there."""
-    path = RUNS / f"seed{seed}" / "polished.safetensors"
+def polish_seed(
+    seed: int, learnt: Checkpoint, starts: list[Checkpoint], race: MultiDroneRace, name: str
+) -> Checkpoint | None:
+    """Return what self-play has learnt, polished against the champions and itself, unless it is there.
+
+    None: no flight finished any more.
+    name: of ``POLISHING``; to race, without a look at the opponents' nearness.
+    """
+    path = RUNS / f"seed{seed}" / f"{name.replace(' ', '_')}.safetensors"
     if not path.exists():
         size = race.observation_space().shape[0]
         members = [*(widened(start.params, size) for start in starts), learnt.params]
         pool = Policy(learnt.network, jax.tree.map(lambda *leaves: jnp.stack(leaves), *members))
-        flight, begun_s = DuelFlight(race, pool), time.process_time()
-        policy = learnt.policy
-        for settings in (CLEAR, FAST):
+        flight, policy, begun_s = DuelFlight(race, pool), learnt.policy, time.process_time()
+        nearness = alone if name == TO_RACE else flight.nearness
+        for settings in POLISHING[name]:
             bar = ProgressBar("updates")
-            params = polish(flight, policy, seed, settings, report=bar, nearness=flight.nearness)
+            try:
+                params = polish(flight, policy, seed, settings, report=bar, nearness=nearness)
+            except ValueError as error:
+                print(f"seed {seed}, {name}: {error}")
+                return None
             policy = Policy(learnt.network, params)
         notes = {"seed": seed, "seconds": time.process_time() - begun_s}
-        notes |= {"clear": CLEAR._asdict(), "fast": FAST._asdict()}
+        notes |= {"stages": [settings._asdict() for settings in POLISHING[name]]}
         save_checkpoint(path, policy.params, learnt.config, {**learnt.meta, "polished": notes})
     return load_checkpoint(path)
 
@@ -113,7 +126,9 @@ def flown(race: MultiDroneRace, own: Checkpoint, other: Checkpoint, slot: int, c
 
 def listed(settings: dict[str, Any]) -> str:
     """Return settings as text."""
-    return ", ".join(f"{name} {value:g}" for name, value in settings.items())
+    return ", ".join(
+        f"{name} {value if isinstance(value, str) else f'{value:g}'}" for name, value in settings.items()
+    )
 
 
 def mean_s(finish_s: np.ndarray) -> str:
@@ -122,8 +137,10 @@ def mean_s(finish_s: np.ndarray) -> str:
     return f"{times.mean():.3f}" if len(times) else "-"
 
 
-def rows_of(race: MultiDroneRace, name: str, policy: Checkpoint) -> list[list[str]]:
-    """Return a policy's rows of the table: against each champion, from each slot."""
+def rows_of(race: MultiDroneRace, name: str, policy: Checkpoint | None) -> list[list[str]]:
+    """Return a policy's rows of the table: against each champion, from each slot; None: it is lost."""
+    if policy is None:
+        return [[name, *["lost the course"] * 2, *["-"] * 5]]
     rows = []
     for opponent, path in OPPONENTS.items():
         for where, slot in SLOTS.items():
@@ -203,26 +220,55 @@ def draw_overtake(races: Races, track: Track) -> Figure | None:
     return None
 
 
+Kinds = dict[str, dict[int, Checkpoint | None]]
+
+
+def times_of(kinds: Kinds) -> str:
+    """Return how long polishing took, for each way to polish, as text."""
+    found = []
+    for name in POLISHING:
+        seconds = [one.meta["polished"]["seconds"] for one in kinds[name].values() if one is not None]
+        found.append(f"{report.spread(seconds)} {name}")
+    return ", ".join(found)
+
+
+def rated_members(pool: list[Checkpoint], starts: list[Checkpoint], kinds: Kinds) -> dict[str, Checkpoint]:
+    """Return the champions, snapshots of the first seed's self-play, and what it was polished to."""
+    seed = next(iter(kinds["self-play"]))
+    chosen = [pool[i] for i in np.linspace(0, len(pool) - 1, NUM_SNAPSHOTS).astype(int)]
+    polished = {f"seed {seed}, {name}": kinds[name][seed] for name in POLISHING}
+    return {
+        **dict(zip(OPPONENTS, starts, strict=True)),
+        **{f"seed {seed} after {one.steps / 1e6:.1f} M steps": one for one in chosen},
+        **{name: one for name, one in polished.items() if one is not None},
+    }
+
+
+def write_overtake(race: MultiDroneRace, own: Checkpoint | None, other: Checkpoint) -> str:
+    """Write the picture of a race that a policy wins from behind; return the line that shows it, or none."""
+    if own is None:
+        return ""
+    picture = draw_overtake(flown(race, own, other, SLOTS["behind"], NUM_RACES), race.env.track)
+    if picture is None:
+        return ""
+    write_atomically(PICTURE, drawing.png_of(picture))
+    return f"![An overtake from above]({PICTURE.name})"
+
+
 def main(seeds: tuple[int, ...] = (0, 1, 2, 3, 4)) -> None:
     """Train, race, rate and write the page."""
     starts = [load_checkpoint(path) for path in OPPONENTS.values()]
     race, first_out = races_on(starts[0])
     trained = {seed: train_seed(seed, starts, first_out) for seed in seeds}
-    polished = {seed: polish_seed(seed, trained[seed][-1], starts, race) for seed in seeds}
-    rows = [row for seed in seeds for row in rows_of(race, f"seed {seed}", polished[seed])]
-    rows += rows_of(race, f"seed {seeds[0]}, self-play alone", trained[seeds[0]][-1])
+    kinds: Kinds = {"self-play": {seed: found[-1] for seed, found in trained.items()}}
+    for name in POLISHING:
+        kinds[name] = {seed: polish_seed(seed, trained[seed][-1], starts, race, name) for seed in seeds}
+    rows = []
+    for kind, found in kinds.items():
+        for seed, policy in report.progress(found.items(), "seeds"):
+            rows += rows_of(race, f"{kind}, seed {seed}", policy)
     rows += rows_of(race, "champion, untrained for duels", starts[0])
-    pool = trained[seeds[0]]
-    chosen = [pool[i] for i in np.linspace(0, len(pool) - 1, NUM_SNAPSHOTS).astype(int)]
-    members = dict(zip(OPPONENTS, starts, strict=True))
-    members |= {f"seed {seeds[0]} after {one.steps / 1e6:.1f} M steps": one for one in chosen}
-    members[f"seed {seeds[0]}, polished"] = polished[seeds[0]]
-    picture = draw_overtake(
-        flown(race, polished[seeds[0]], starts[1], SLOTS["behind"], NUM_RACES), race.env.track
-    )
-    if picture is not None:
-        write_atomically(PICTURE, drawing.png_of(picture))
-    seconds = [one.meta["seconds"] + one.meta["polished"]["seconds"] for one in polished.values()]
+    members = rated_members(trained[seeds[0]], starts, kinds)
     header = "policy | against | starts | finishes | wins | collisions | finish (s) | its opponent's (s)"
     report.fill_page(
         report.RESULTS / "duel.md",
@@ -231,11 +277,13 @@ def main(seeds: tuple[int, ...] = (0, 1, 2, 3, 4)) -> None:
         rated=NUM_RATED,
         ratings=report.table("policy | Elo | races won", ratings(race, members)),
         settings=listed({**CHANGES, **SETTINGS._asdict()}),
+        race=listed(RACE._asdict()),
         clear=listed(CLEAR._asdict()),
         fast=listed(FAST._asdict()),
-        seconds=report.spread(seconds),
+        seconds=report.spread([found[-1].meta["seconds"] for found in trained.values()]),
+        polishing_s=times_of(kinds),
         rates=duel_rates(),
-        picture="" if picture is None else f"![An overtake from above]({PICTURE.name})",
+        picture=write_overtake(race, kinds[TO_OVERTAKE][seeds[0]], starts[1]),
     )
 
 

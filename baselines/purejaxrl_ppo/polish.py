@@ -9,7 +9,7 @@ actor changes. The policy is that of the mean action.
 
 from collections.abc import Callable
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -34,10 +34,12 @@ class Settings(NamedTuple):
     cosine. flights: of one update, from noisy start poses, of so many laps. slowest_lap_s: mean lap time from
     which a flight is cut off. offset_limit: of a pass, over the free half opening, from which it is
     penalised, by penalty_s seconds times the square of what is beyond. widened_m: by which half openings are
-    widened. largest_gradient: global norm at which gradients are clipped. gradient_decay: share of a state's
-    gradient that is passed on to the step before; below 1 it looks ahead for 1 / (1 - share) steps and cannot
-    overflow. nearness_s: cost of a step of nearness 1 to an opponent. Its gradient has a decay and a largest
-    norm of its own, since keeping clear takes no foresight of seconds and must not outweigh racing.
+    widened. largest_gradient: norm at which gradients are clipped. clips: the gradient of an "update", or
+    that of each "flight" before they are averaged, so that one that is nearly lost does not outweigh the
+    others. gradient_decay: share of a state's gradient that is passed on to the step before; below 1 it looks
+    ahead for 1 / (1 - share) steps and cannot overflow. nearness_s: cost of a step of nearness 1 to an
+    opponent. Its gradient has a decay of its own, since keeping clear takes no foresight of seconds, and is
+    clipped apart from the other, then multiplied by nearness_weight.
     """
 
     updates: int = 1500
@@ -50,10 +52,11 @@ class Settings(NamedTuple):
     penalty_s: float = 20.0
     widened_m: float = 0.3
     largest_gradient: float = 1.0
+    clips: Literal["update", "flight"] = "update"
     gradient_decay: float = 0.998
     nearness_s: float = 0.02
     nearness_decay: float = 0.98
-    largest_nearness_gradient: float = 0.5
+    nearness_weight: float = 0.5
 
 
 class Flown(NamedTuple):
@@ -100,9 +103,7 @@ def fly(
         crossing = cross_gate(race.gate, before.pos_w, after.pos_w, params.drone_radius)
         is_racing = is_flying & (flown.gates < last_gate)
         counts = crossing.is_pass & is_racing
-        # Whoever hits a frame or misses a gate is out, and was too far from its centre.
-        is_met = is_racing & (crossing.is_pass | crossing.is_frame | crossing.is_miss)
-        offset = jnp.where(is_met, crossing.offset * relative, 0.0)
+        offset = jnp.where(counts, crossing.offset * relative, 0.0)
         beyond = jnp.maximum(offset - settings.offset_limit, 0.0)
         flown = Flown(
             time_s=flown.time_s + jnp.where(counts, (index + crossing.fraction) * params.dt, 0.0) / last_gate,
@@ -169,34 +170,40 @@ def polish(
     optimiser = optax.adam(schedule)
     foresight = settings._replace(gradient_decay=settings.nearness_decay)
 
-    def fly_all(policy_params: Any, keys: jax.Array, settings: Settings) -> Flown:
-        def flight(key: jax.Array) -> Flown:
-            of_model, of_start = jax.random.split(key)
-            own = params if draw_model is None else params.replace(model=draw_model(of_model))
-            return fly(env, Policy(policy.network, policy_params), of_start, own, settings, nearness)
+    def flown(policy_params: Any, key: jax.Array, settings: Settings) -> Flown:
+        of_model, of_start = jax.random.split(key)
+        own = params if draw_model is None else params.replace(model=draw_model(of_model))
+        return fly(env, Policy(policy.network, policy_params), of_start, own, settings, nearness)
 
-        return jax.vmap(flight)(keys)
+    def race_time(policy_params: Any, key: jax.Array) -> tuple[jax.Array, jax.Array]:
+        flight = flown(policy_params, key, settings)
+        is_complete = flight.gates >= last_gate
+        return jnp.where(is_complete, flight.time_s, 0.0) + settings.penalty_s * flight.penalty, is_complete
 
-    def racing(policy_params: Any, keys: jax.Array) -> tuple[jax.Array, jax.Array]:
-        flown = fly_all(policy_params, keys, settings)
-        is_complete = flown.gates >= last_gate
-        times_s = jnp.where(is_complete, flown.time_s, 0.0).sum()
-        number = is_complete.sum()
-        value = (times_s + settings.penalty_s * flown.penalty.sum()) / jnp.maximum(number, 1)
-        return value, number
+    def crowding(policy_params: Any, key: jax.Array) -> tuple[jax.Array, jax.Array]:
+        return settings.nearness_s * flown(policy_params, key, foresight).nearness, jnp.asarray(True)
 
-    def crowding(policy_params: Any, keys: jax.Array) -> jax.Array:
-        return settings.nearness_s * fly_all(policy_params, keys, foresight).nearness.mean()
+    clip = partial(projection_l2_ball, scale=settings.largest_gradient)
+
+    def gradient_of(cost: Callable[..., Any], policy_params: Any, keys: jax.Array) -> tuple[Any, jax.Array]:
+        """Return the clipped gradient of a flight's mean cost, and the number of flights that count."""
+
+        def of_flight(key: jax.Array) -> tuple[Any, jax.Array]:
+            gradient, counts = jax.grad(cost, has_aux=True)(policy_params, key)
+            return clip(gradient) if settings.clips == "flight" else gradient, counts
+
+        gradients, counts = jax.vmap(of_flight)(keys)
+        number = counts.sum()
+        gradient = jax.tree.map(lambda leaf: leaf.sum(axis=0) / jnp.maximum(number, 1), gradients)
+        return gradient if settings.clips == "flight" else clip(gradient), number
 
     @partial(jax.jit, donate_argnums=(0, 1))
     def update(policy_params: Any, optimiser_state: Any, key: jax.Array) -> tuple[Any, Any, jax.Array]:
         keys = jax.random.split(key, settings.flights)
-        gradient, number = jax.grad(racing, has_aux=True)(policy_params, keys)
-        gradient = projection_l2_ball(gradient, settings.largest_gradient)
+        gradient, number = gradient_of(race_time, policy_params, keys)
         if nearness is not alone:
-            away = jax.grad(crowding)(policy_params, keys)
-            away = projection_l2_ball(away, settings.largest_nearness_gradient)
-            gradient = jax.tree.map(jnp.add, gradient, away)
+            away, _ = gradient_of(crowding, policy_params, keys)
+            gradient = jax.tree.map(lambda own, other: own + settings.nearness_weight * other, gradient, away)
         change, optimiser_state = optimiser.update(gradient, optimiser_state)
         return optax.apply_updates(policy_params, change), optimiser_state, number
 

@@ -18,7 +18,7 @@ from flytrack_env.auto_reset import Ended, reset_if_ended
 from flytrack_env.episodes import EpisodicEnvironment, Step, clip_action, observation_box
 from flytrack_env.fusion import compute_once, one_kernel
 from flytrack_env.multi_drone.collisions import Path, is_put_out
-from flytrack_env.multi_drone.downwash import Wake, downwash_acc_w, pushed, wake_of
+from flytrack_env.multi_drone.downwash import Wake, downwash_acc_w, push, wake_of
 from flytrack_env.multi_drone.ghosts import Ghost
 from flytrack_env.multi_drone.opponents import (
     Standing,
@@ -367,7 +367,7 @@ class MultiDroneRace:
         )
 
     def _wake(self, flown: Flown, is_ghost: jax.Array, params: RaceParams) -> Wake:
-        """Return a drone's wake; what is out, or a ghost, has none."""
+        """Return a drone's wake; a drone that is out, or a ghost, has none."""
         inner = flown.state.inner
         gravity = self.env.model(inner, params.flight).g
         return wake_of(self.env.drone(inner), gravity, ~(flown.state.is_out | is_ghost))
@@ -380,7 +380,7 @@ class MultiDroneRace:
             acc_w = acc_w + downwash_acc_w(drone.pos_w, wake)
         share = jnp.where(flown.state.is_out, 0.0, jnp.asarray(params.rules.downwash))
         acc_w = acc_w.scale(compute_once(share))
-        after = pushed(drone, acc_w, params.flight.dt)
+        after = push(drone, acc_w, params.flight.dt)
         inner = self.env.with_drone(flown.state.inner, after)
         return flown._replace(
             state=flown.state._replace(inner=inner), standing=flown.standing._replace(vel_w=after.vel_w)

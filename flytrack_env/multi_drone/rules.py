@@ -18,9 +18,9 @@ class RaceRules(NamedTuple):
     collision_radius: of the sphere around each drone, m. blame: 0, both drones of a collision are out; 1, the
     one that ran into the other is (``flytrack_env.multi_drone.collisions``). column_spacing, row_spacing: of
     the start grid, m. first_slot: slot on the grid of drone 0, the others following; -1: drawn.
-    lead: reward for each gate gained on the best opponent. downwash: share of a wake's momentum that pushes
-    whoever flies into it (``flytrack_env.multi_drone.downwash``), 1 for all that meets the drone; None, which
-    is a program of its own: wakes are not computed.
+    lead: reward for each gate gained on the best opponent. downwash: how much of the push of a wake
+    whoever flies into it feels (``flytrack_env.multi_drone.downwash``), 1 for all of it; None: wakes are not
+    computed, in a compiled program of its own.
     """
 
     collision_radius: Scalar = 0.15
@@ -59,7 +59,7 @@ def check_rules(rules: RaceRules, num_drones: int) -> None:
         "lead": (np.isfinite(rules.lead), "a finite number"),
         "downwash": (
             rules.downwash is None or (np.asarray(rules.downwash) >= 0.0) & np.isfinite(rules.downwash),
-            "a share from 0 on, or None",
+            "a number of at least 0, or None",
         ),
     }
     for name, (holds, expected) in requirements.items():

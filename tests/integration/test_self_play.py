@@ -1,6 +1,8 @@
 """Self-play begins as good as its first policy, and its races are judged by who finishes first."""
 
 import dataclasses
+import re
+import shutil
 from functools import partial
 from pathlib import Path
 
@@ -22,7 +24,7 @@ from baselines.purejaxrl_ppo.self_play import Settings, pool_opponent, train, wi
 from flytrack_env.model_file import model_from_json
 from flytrack_env.multi_drone import EntrantState, MultiDroneRace
 from flytrack_env.quaternion import Vec3
-from flytrack_env.rollout import load_named_rollouts
+from flytrack_env.rollout import load_named_rollouts, load_rollout
 from tests.support.pages import ROOT
 
 CHAMPION_FILE = ROOT / "baselines" / "purejaxrl_ppo" / "champion" / "flytrack.safetensors"
@@ -83,23 +85,29 @@ def test_a_race_is_saved_as_rollouts_up_to_where_a_drone_is_out(tmp_path):
 
 
 def test_a_race_is_described_by_slot():
-    settings = RaceSettings((Path("quick.safetensors"), Path("slow.safetensors")), races=1, laps=2)
+    settings = RaceSettings((Path("a/final.safetensors"), Path("b/final.safetensors")), races=1, laps=2)
     found = describe(races_of(((3, 6), (4,)), collisions=[9]), settings, slot=1)
     assert found.splitlines() == [
         "1 races, collisions in 0.0%:",
-        "  slot 1  quick: finishes 100.0%, on average after 0.065 s, wins 100.0%",
-        "  slot 0  slow: finishes 0.0%, wins 0.0%",
+        "  slot 1  a_final: finishes 100.0% after 0.065 s on average, wins 100.0%, out of time 0.0%",
+        "  slot 0  b_final: finishes 0.0%, wins 0.0%, out of time 100.0%",
     ]
 
 
 @pytest.mark.slow
 def test_checkpoints_race_on_the_black_box(tmp_path, capsys):
-    run_race(RaceSettings((CHAMPION_FILE, CHAMPION_FILE), races=4, laps=1, out=tmp_path / "race"))
+    other = tmp_path / "other.safetensors"
+    shutil.copy(CHAMPION_FILE.with_name("robust.safetensors"), other)
+    folder = tmp_path / "race"
+    run_race(RaceSettings((other, CHAMPION_FILE, CHAMPION_FILE), races=4, laps=1, out=folder))
     printed = capsys.readouterr().out
-    assert printed.count("4 races, collisions in 0.0%") == 2
-    assert "slot 0  flytrack: finishes 100.0%" in printed and "wins 100.0%" in printed
-    names = sorted(path.name for path in (tmp_path / "race").iterdir())
-    assert names[:2] == ["drone_0.npy", "drone_1.npy"] and all(name in printed for name in names)
+    assert printed.startswith("1 laps of flytrack, at most ") and printed.count("4 races, collisions in") == 3
+    assert len(re.findall(r"slot 0  \w+: finishes 100.0%", printed)) == 3  # nobody is before it
+    for place in range(3):
+        states, actions = load_rollout(folder / f"drone_{place}.npy")
+        assert len(states) == len(actions) > 10
+    with pytest.raises(FileExistsError):
+        run_race(RaceSettings((other, CHAMPION_FILE), out=folder))
 
 
 def test_nearness_pushes_to_the_side_and_never_back():
@@ -132,7 +140,7 @@ def test_polishing_among_opponents_keeps_clear_of_them():
     member = widened(CHAMPION.params, 36)
     flight = DuelFlight(race, Policy(CHAMPION.network, jax.tree.map(lambda leaf: leaf[None], member)))
     settings = PolishSettings(
-        updates=60, learning_rate=2e-4, warm_up=10, flights=8, laps=1, slowest_lap_s=4.6
+        updates=60, learning_rate=2e-4, warm_up=10, flights=8, laps=1, slowest_lap_s=4.6, clips="flight"
     )
     learner = Policy(CHAMPION.network, member)
     found = polish(flight, learner, 0, settings, nearness=flight.nearness)
