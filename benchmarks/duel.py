@@ -9,7 +9,7 @@ import dataclasses
 import itertools
 import time
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -30,6 +30,7 @@ from baselines.purejaxrl_ppo.self_play import Settings, train, widened
 from benchmarks import report
 from benchmarks.champion import CHAMPION, FOLDER, REWARD
 from benchmarks.env_speed import jax_contestant, measure, median_ratio
+from flytrack_env import blackbox
 from flytrack_env.files import write_atomically
 from flytrack_env.model_file import model_from_json
 from flytrack_env.multi_drone import MultiDroneRace
@@ -131,24 +132,57 @@ def listed(settings: dict[str, Any]) -> str:
     )
 
 
-def mean_s(finish_s: np.ndarray) -> str:
-    """Return the mean of the times of those that finish."""
-    times = finish_s[np.isfinite(finish_s)]
-    return f"{times.mean():.3f}" if len(times) else "-"
+class Result(NamedTuple):
+    """Races against one opponent from one slot: shares, and mean times of those that finish, s."""
+
+    finishes: float
+    wins: float
+    collisions: float
+    own_s: float
+    other_s: float
 
 
-def rows_of(race: MultiDroneRace, name: str, policy: Checkpoint | None) -> list[list[str]]:
-    """Return a policy's rows of the table: against each champion, from each slot; None: it is lost."""
-    if policy is None:
-        return [[name, *["lost the course"] * 2, *["-"] * 5]]
-    rows = []
+Results = dict[tuple[str, str], Result]  # by opponent and slot
+
+
+def results_of(race: MultiDroneRace, policy: Checkpoint) -> Results:
+    """Return a policy's results against each champion, from each slot."""
+    results = {}
     for opponent, path in OPPONENTS.items():
         for where, slot in SLOTS.items():
             races = flown(race, policy, load_checkpoint(path), slot, NUM_RACES)
-            found, finish_s = score(races, LAPS), races.finish_s(LAPS)
-            shares = (f"{share:.1%}" for share in found)
-            rows.append([name, opponent, where, *shares, *map(mean_s, finish_s.T)])
-    return rows
+            finish_s = np.where(np.isfinite(races.finish_s(LAPS)), races.finish_s(LAPS), np.nan)
+            means_s = (float(np.nanmean(one)) if np.isfinite(one).any() else np.nan for one in finish_s.T)
+            results[opponent, where] = Result(*score(races, LAPS), *means_s)
+    return results
+
+
+def table_of(found: dict[str, dict[int, Results | None]], is_whole: bool) -> str:
+    """Return results as a table: of every seed, or the lowest and the highest of all seeds of a kind."""
+    header = "policy | against | starts | finishes | wins | collisions | finish (s) | its opponent's (s)"
+    rows = []
+    for kind, seeds in found.items():
+        left = {seed: results for seed, results in seeds.items() if results is not None}
+        groups = {f"{kind}, seed {seed}": [one] for seed, one in left.items()}
+        if not is_whole:
+            lost = f", {len(left)} of {len(seeds)} seeds" if len(left) < len(seeds) else ""
+            groups = {f"{kind}{lost}": list(left.values())}
+        for name, group in groups.items():
+            for case in group[0]:
+                columns = zip(*(results[case] for results in group), strict=True)
+                cells = [as_text(column, place) for place, column in enumerate(columns)]
+                rows.append([name, *case, *cells])
+    return report.table(header, rows)
+
+
+def as_text(values: tuple[float, ...], place: int) -> str:
+    """Return one value, or the lowest and the highest of several; the first three columns are shares."""
+    known = [value for value in values if np.isfinite(value)]
+    if not known:
+        return "-"
+    show = "{:.1%}" if place < 3 else "{:.3f}"
+    low, high = show.format(min(known)), show.format(max(known))
+    return low if low == high else f"{low} to {high}"
 
 
 def ratings(race: MultiDroneRace, members: dict[str, Checkpoint]) -> list[list[str]]:
@@ -255,6 +289,14 @@ def write_overtake(race: MultiDroneRace, own: Checkpoint | None, other: Checkpoi
     return f"![An overtake from above]({PICTURE.name})"
 
 
+def all_results(race: MultiDroneRace, kinds: Kinds, where: str) -> dict[str, dict[int, Results | None]]:
+    """Return the results of all policies; None for those that are lost."""
+    return {
+        kind: {seed: None if one is None else results_of(race, one) for seed, one in policies.items()}
+        for kind, policies in report.progress(kinds.items(), f"kinds of policies, {where}")
+    }
+
+
 def main(seeds: tuple[int, ...] = (0, 1, 2, 3, 4)) -> None:
     """Train, race, rate and write the page."""
     starts = [load_checkpoint(path) for path in OPPONENTS.values()]
@@ -263,17 +305,17 @@ def main(seeds: tuple[int, ...] = (0, 1, 2, 3, 4)) -> None:
     kinds: Kinds = {"self-play": {seed: found[-1] for seed, found in trained.items()}}
     for name in POLISHING:
         kinds[name] = {seed: polish_seed(seed, trained[seed][-1], starts, race, name) for seed in seeds}
-    rows = []
-    for kind, found in kinds.items():
-        for seed, policy in report.progress(found.items(), "seeds"):
-            rows += rows_of(race, f"{kind}, seed {seed}", policy)
-    rows += rows_of(race, "champion, untrained for duels", starts[0])
+    kinds["champion, untrained for duels"] = {0: starts[0]}
+    simulated = all_results(race, kinds, "simulator")
+    env = flytrack_env.make("FlyTrack-v0", plant=blackbox.load(blackbox.SHIPPED), reward=REWARD)
+    on_black_box = all_results(MultiDroneRace(env, 2), kinds, "black box")
     members = rated_members(trained[seeds[0]], starts, kinds)
-    header = "policy | against | starts | finishes | wins | collisions | finish (s) | its opponent's (s)"
     report.fill_page(
         report.RESULTS / "duel.md",
         "duel",
-        table=report.table(header, rows),
+        summary=table_of(simulated, is_whole=False),
+        black_box=table_of(on_black_box, is_whole=False),
+        every=table_of(simulated, is_whole=True),
         rated=NUM_RATED,
         ratings=report.table("policy | Elo | races won", ratings(race, members)),
         settings=listed({**CHANGES, **SETTINGS._asdict()}),
