@@ -1,5 +1,6 @@
 """Races of several policies against each other, and who wins."""
 
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -39,15 +40,16 @@ class Races(NamedTuple):
         finish_s = np.take_along_axis(lap_s.cumsum(axis=1), first, axis=1)[:, 0]
         return np.where(has_finished.any(axis=1), finish_s, np.inf)
 
-    def save(self, race: int, folder: Path) -> list[Path]:
+    def save(self, race: int, folder: Path, names: Sequence[str] = ()) -> list[Path]:
         """Write one race as a rollout of each drone, up to where it is out; return the files.
 
-        ``flytrack show`` draws and records them side by side.
+        names: of the files, by default drone_0 and so on. ``flytrack show`` draws and records them side by
+        side.
         """
         paths = []
         for place in range(self.states.shape[2]):
             steps = slice(int((~self.is_out[race, :, place]).sum()) + 1)
-            paths.append(folder / f"drone_{place}.npy")
+            paths.append(folder / f"{names[place] if names else f'drone_{place}'}.npy")
             save_rollout(paths[-1], self.states[race, steps, place], self.actions[race, steps, place])
         return paths
 

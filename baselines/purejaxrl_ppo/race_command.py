@@ -133,8 +133,8 @@ def write_race(races: Races, settings: RaceSettings, race: MultiDroneRace, folde
     """
     finish_s = races.finish_s(settings.laps)
     chosen = int(np.argmax(finish_s[:, 0] < finish_s[:, 1:].min(axis=1)))
-    paths = races.save(chosen, folder)
-    lines = [f"{name}: {path}" for name, path in zip(settings.names, paths, strict=True)]
+    paths = races.save(chosen, folder, settings.names)
+    lines = [f"rollout: {path}" for path in paths]
     if not can_record():
         return [*lines, f"no recording: {CANNOT_RECORD}"]
     from flytrack_env.viz_rerun import Trajectory, write_recording

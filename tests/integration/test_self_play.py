@@ -103,8 +103,12 @@ def test_checkpoints_race_on_the_black_box(tmp_path, capsys):
     printed = capsys.readouterr().out
     assert printed.startswith("1 laps of flytrack, at most ") and printed.count("4 races, collisions in") == 3
     assert len(re.findall(r"slot 0  \w+: finishes 100.0%", printed)) == 3  # nobody is before it
-    for place in range(3):
-        states, actions = load_rollout(folder / f"drone_{place}.npy")
+    assert {path.suffix for path in folder.iterdir()} <= {".npy", ".rrd"}
+    paths = list(folder.glob("*.npy"))
+    assert len(paths) == 3
+    for path in paths:
+        assert path.stem in printed
+        states, actions = load_rollout(path)
         assert len(states) == len(actions) > 10
     with pytest.raises(FileExistsError):
         run_race(RaceSettings((other, CHAMPION_FILE), out=folder))
