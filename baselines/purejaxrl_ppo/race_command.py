@@ -37,7 +37,7 @@ class RaceSettings:
     black_box: OptionalPath = None
     """File of the black box that all fly; by default the shipped one."""
     downwash: OptionalFloat = None
-    """Let wakes push whoever flies into them, by this share of their momentum; by default there are none."""
+    """Scale of the push of wakes on whoever flies into them, 1 for all of it; by default there are none."""
     seed: int = 0
     """Seed of the noisy start poses."""
     out: OptionalPath = None
@@ -111,7 +111,7 @@ def describe(races: Races, settings: RaceSettings, slot: int) -> str:
     """Return the results of the races from one slot, a line for each drone."""
     finish_s = races.finish_s(settings.laps)
     collisions = score(races, settings.laps).collisions
-    lines = [f"{settings.races} races, collisions in {collisions:.1%}:"]
+    lines = [f"races: {settings.races}, with collisions: {collisions:.1%}"]
     for place, name in enumerate(settings.names):
         own_s = finish_s[:, place]
         others_s = np.delete(finish_s, place, axis=1).min(axis=1)
@@ -162,7 +162,7 @@ def run_race(settings: RaceSettings) -> None:
     num_steps, policies = steps_of(flight, settings), tuple(one.policy for one in checkpoints)
     folder = fresh_folder(DEFAULT_OUT) if settings.out is None else settings.out
     folder.mkdir(parents=True, exist_ok=settings.out is None)
-    print(f"{settings.laps} laps of {race.env.track.name}, at most {num_steps * DT_S:g} s")
+    print(f"track: {race.env.track.name}, laps: {settings.laps}, at most {num_steps * DT_S:g} s")
     bar = ProgressBar("slots")
     for slot in range(len(checkpoints)):
         first = start_pose_params(params, slot, num_steps)

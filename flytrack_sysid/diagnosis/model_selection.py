@@ -86,22 +86,22 @@ def ablate(state: SearchState, model: FittedModel, linearization: Linearization,
         if number < MOST_RIVALS and rivals[rival] < max(NEARLY, share * gain):
             swaps[rival] = add_effect(state, nearby, less, one)
             rivals[rival] = swaps[rival].cost - model.cost
-    # Without the effect the rest may have moved so far that slopes tell nothing of a rival like it.
+    # Without the effect the rest may have moved so far that slopes say nothing of a rival like it.
     beside = separation(linearization, model, effect).beside
     for one in ranked:
         rival = one.candidate.effect
         if rival not in swaps and beside.get(rival, np.inf) < EQUIVALENT:
-            swaps[rival] = swapped(state, model, effect, one.candidate)
+            swaps[rival] = with_candidate(state, model, effect, one.candidate)
             rivals[rival] = swaps[rival].cost - model.cost
     for other in other_groups(linearization, model, effect):
-        swaps[effect] = min(swapped(state, model, effect, other), swaps.get(effect, model), key=price)
+        swaps[effect] = min(with_candidate(state, model, effect, other), swaps.get(effect, model), key=price)
     columns = [linearization.column(field) for field in model.candidate(effect).fields]
     own = linearization.gain(columns, linearization.columns_at(model.places, without=columns))
     inflation, determined = (1.0, 1) if own is None else (own.inflation, own.num_parameters)
     return Ablation(gain, inflation, determined, rivals, swaps, less)
 
 
-def swapped(state: SearchState, model: FittedModel, effect: str, other: Candidate) -> FittedModel:
+def with_candidate(state: SearchState, model: FittedModel, effect: str, other: Candidate) -> FittedModel:
     """Return the model with a candidate in an effect's place, refitted from where it is."""
     candidates = [other if one.effect == effect else one for one in model.candidates]
     dropped = {*model.candidate(effect).fields} - {*other.fields}

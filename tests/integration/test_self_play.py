@@ -88,7 +88,7 @@ def test_a_race_is_described_by_slot():
     settings = RaceSettings((Path("a/final.safetensors"), Path("b/final.safetensors")), races=1, laps=2)
     found = describe(races_of(((3, 6), (4,)), collisions=[9]), settings, slot=1)
     assert found.splitlines() == [
-        "1 races, collisions in 0.0%:",
+        "races: 1, with collisions: 0.0%",
         "  slot 1  a_final: finishes 100.0% after 0.065 s on average, wins 100.0%, out of time 0.0%",
         "  slot 0  b_final: finishes 0.0%, wins 0.0%, out of time 100.0%",
     ]
@@ -101,7 +101,8 @@ def test_checkpoints_race_on_the_black_box(tmp_path, capsys):
     folder = tmp_path / "race"
     run_race(RaceSettings((other, CHAMPION_FILE, CHAMPION_FILE), races=4, laps=1, out=folder))
     printed = capsys.readouterr().out
-    assert printed.startswith("1 laps of flytrack, at most ") and printed.count("4 races, collisions in") == 3
+    assert printed.startswith("track: flytrack, laps: 1, at most ")
+    assert printed.count("races: 4, with collisions: ") == 3
     assert len(re.findall(r"slot 0  \w+: finishes 100.0%", printed)) == 3  # nobody is before it
     assert {path.suffix for path in folder.iterdir()} <= {".npy", ".rrd"}
     paths = list(folder.glob("*.npy"))
