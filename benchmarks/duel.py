@@ -50,16 +50,33 @@ CHANGES: dict[str, Any] = {
     "min_std": 0.01,
 }
 SETTINGS = Settings(every=25, std=0.015, course_fraction=0.8)
-# To be fast whoever else is there; or first to keep clear at any price, then to get back what speed it cost.
+SELF = "itself"
+
+
+class Polishing(NamedTuple):
+    """How a policy is polished: among which opponents, behind them in which share of flights.
+
+    keeps_clear: their nearness costs something.
+    """
+
+    settings: PolishSettings
+    opponents: tuple[str, ...]
+    behind: float
+    keeps_clear: bool
+
+
 RACE = PolishSettings(updates=100, learning_rate=1e-4, warm_up=20, flights=24, penalty_s=40.0, clips="flight")
-CLEAR = PolishSettings(
-    updates=300, learning_rate=2e-4, warm_up=50, flights=24, penalty_s=40.0, nearness_weight=1.0
-)
-FAST = CLEAR._replace(penalty_s=20.0, nearness_weight=0.6)
+OVERTAKE = RACE._replace(learning_rate=2e-4, flights=48, nearness_weight=0.65)
 TO_RACE, TO_OVERTAKE = "polished to race", "polished to overtake"
-POLISHING = {TO_RACE: (RACE,), TO_OVERTAKE: (CLEAR, FAST)}
+POLISHING = {
+    TO_RACE: Polishing(RACE, ("champion", "robust champion", SELF), behind=0.5, keeps_clear=False),
+    # Twice the one that can be overtaken.
+    TO_OVERTAKE: Polishing(
+        OVERTAKE, ("champion", "robust champion", "robust champion", SELF), behind=0.7, keeps_clear=True
+    ),
+}
 SLOTS = {"behind": 1, "in front": 0}
-NUM_RACES, NUM_RATED, LAPS, FLIGHT_SEED = 256, 64, 3, 100
+NUM_RACES, NUM_RATED, LAPS, FLIGHT_SEED = 256, 64, 3, 1000
 NUM_SNAPSHOTS = 4  # of the first seed, that are rated
 ELO = 400.0 / np.log(10.0)
 AROUND_STEPS = 120  # before and after an overtake, in the picture
@@ -90,32 +107,21 @@ def train_seed(seed: int, starts: list[Checkpoint], race: MultiDroneRace) -> lis
     return [load_checkpoint(path) for path in (*paths, folder / "final.safetensors")]
 
 
-def polish_seed(
-    seed: int, learnt: Checkpoint, starts: list[Checkpoint], race: MultiDroneRace, name: str
-) -> Checkpoint | None:
-    """Return what self-play has learnt, polished against the champions and itself, unless it is there.
-
-    None: no flight finished any more.
-    name: of ``POLISHING``; to race, without a look at the opponents' nearness.
-    """
+def polish_seed(seed: int, learnt: Checkpoint, race: MultiDroneRace, name: str) -> Checkpoint:
+    """Return what self-play has learnt, polished in a way of ``POLISHING``, unless it is there."""
     path = RUNS / f"seed{seed}" / f"{name.replace(' ', '_')}.safetensors"
     if not path.exists():
-        size = race.observation_space().shape[0]
-        members = [*(widened(start.params, size) for start in starts), learnt.params]
-        pool = Policy(learnt.network, jax.tree.map(lambda *leaves: jnp.stack(leaves), *members))
-        flight, policy, begun_s = DuelFlight(race, pool), learnt.policy, time.process_time()
-        nearness = alone if name == TO_RACE else flight.nearness
-        for settings in POLISHING[name]:
-            bar = ProgressBar("updates")
-            try:
-                params = polish(flight, policy, seed, settings, report=bar, nearness=nearness)
-            except ValueError as error:
-                print(f"seed {seed}, {name}: {error}")
-                return None
-            policy = Policy(learnt.network, params)
-        notes = {"seed": seed, "seconds": time.process_time() - begun_s}
-        notes |= {"stages": [settings._asdict() for settings in POLISHING[name]]}
-        save_checkpoint(path, policy.params, learnt.config, {**learnt.meta, "polished": notes})
+        how, size = POLISHING[name], race.observation_space().shape[0]
+        champions = {who: load_checkpoint(file).params for who, file in OPPONENTS.items()}
+        known = {SELF: learnt.params, **{who: widened(params, size) for who, params in champions.items()}}
+        members = jax.tree.map(lambda *leaves: jnp.stack(leaves), *(known[who] for who in how.opponents))
+        flight, begun_s = DuelFlight(race, Policy(learnt.network, members), how.behind), time.process_time()
+        nearness = flight.nearness if how.keeps_clear else alone
+        bar = ProgressBar("updates")
+        params = polish(flight, learnt.policy, seed, how.settings, report=bar, nearness=nearness)
+        polished = {"seed": seed, "seconds": time.process_time() - begun_s, **how._asdict()}
+        polished["settings"] = how.settings._asdict()
+        save_checkpoint(path, params, learnt.config, {**learnt.meta, "polished": polished})
     return load_checkpoint(path)
 
 
@@ -130,6 +136,12 @@ def listed(settings: dict[str, Any]) -> str:
     return ", ".join(
         f"{name} {value if isinstance(value, str) else f'{value:g}'}" for name, value in settings.items()
     )
+
+
+def described(how: Polishing) -> str:
+    """Return how policies are polished as text."""
+    opponents = ", ".join(how.opponents)
+    return f"among {opponents}; {how.behind:.0%} of flights from behind; {listed(how.settings._asdict())}"
 
 
 class Result(NamedTuple):
@@ -157,16 +169,14 @@ def results_of(race: MultiDroneRace, policy: Checkpoint) -> Results:
     return results
 
 
-def table_of(found: dict[str, dict[int, Results | None]], is_whole: bool) -> str:
+def table_of(found: dict[str, dict[int, Results]], is_whole: bool) -> str:
     """Return results as a table: of every seed, or the lowest and the highest of all seeds of a kind."""
     header = "policy | against | starts | finishes | wins | collisions | finish (s) | its opponent's (s)"
     rows = []
     for kind, seeds in found.items():
-        left = {seed: results for seed, results in seeds.items() if results is not None}
-        groups = {f"{kind}, seed {seed}": [one] for seed, one in left.items()}
-        if not is_whole:
-            lost = f", {len(left)} of {len(seeds)} seeds" if len(left) < len(seeds) else ""
-            groups = {f"{kind}{lost}": list(left.values())}
+        groups = {kind: list(seeds.values())}
+        if is_whole:
+            groups = {f"{kind}, seed {seed}": [results] for seed, results in seeds.items()}
         for name, group in groups.items():
             for case in group[0]:
                 columns = zip(*(results[case] for results in group), strict=True)
@@ -254,14 +264,14 @@ def draw_overtake(races: Races, track: Track) -> Figure | None:
     return None
 
 
-Kinds = dict[str, dict[int, Checkpoint | None]]
+Kinds = dict[str, dict[int, Checkpoint]]
 
 
 def times_of(kinds: Kinds) -> str:
     """Return how long polishing took, for each way to polish, as text."""
     found = []
     for name in POLISHING:
-        seconds = [one.meta["polished"]["seconds"] for one in kinds[name].values() if one is not None]
+        seconds = [one.meta["polished"]["seconds"] for one in kinds[name].values()]
         found.append(f"{report.spread(seconds)} {name}")
     return ", ".join(found)
 
@@ -270,18 +280,15 @@ def rated_members(pool: list[Checkpoint], starts: list[Checkpoint], kinds: Kinds
     """Return the champions, snapshots of the first seed's self-play, and what it was polished to."""
     seed = next(iter(kinds["self-play"]))
     chosen = [pool[i] for i in np.linspace(0, len(pool) - 1, NUM_SNAPSHOTS).astype(int)]
-    polished = {f"seed {seed}, {name}": kinds[name][seed] for name in POLISHING}
     return {
         **dict(zip(OPPONENTS, starts, strict=True)),
         **{f"seed {seed} after {one.steps / 1e6:.1f} M steps": one for one in chosen},
-        **{name: one for name, one in polished.items() if one is not None},
+        **{f"seed {seed}, {name}": kinds[name][seed] for name in POLISHING},
     }
 
 
-def write_overtake(race: MultiDroneRace, own: Checkpoint | None, other: Checkpoint) -> str:
+def write_overtake(race: MultiDroneRace, own: Checkpoint, other: Checkpoint) -> str:
     """Write the picture of a race that a policy wins from behind; return the line that shows it, or none."""
-    if own is None:
-        return ""
     picture = draw_overtake(flown(race, own, other, SLOTS["behind"], NUM_RACES), race.env.track)
     if picture is None:
         return ""
@@ -289,10 +296,10 @@ def write_overtake(race: MultiDroneRace, own: Checkpoint | None, other: Checkpoi
     return f"![An overtake from above]({PICTURE.name})"
 
 
-def all_results(race: MultiDroneRace, kinds: Kinds, where: str) -> dict[str, dict[int, Results | None]]:
-    """Return the results of all policies; None for those that are lost."""
+def all_results(race: MultiDroneRace, kinds: Kinds, where: str) -> dict[str, dict[int, Results]]:
+    """Return the results of all policies."""
     return {
-        kind: {seed: None if one is None else results_of(race, one) for seed, one in policies.items()}
+        kind: {seed: results_of(race, one) for seed, one in policies.items()}
         for kind, policies in report.progress(kinds.items(), f"kinds of policies, {where}")
     }
 
@@ -304,7 +311,7 @@ def main(seeds: tuple[int, ...] = (0, 1, 2, 3, 4)) -> None:
     trained = {seed: train_seed(seed, starts, first_out) for seed in seeds}
     kinds: Kinds = {"self-play": {seed: found[-1] for seed, found in trained.items()}}
     for name in POLISHING:
-        kinds[name] = {seed: polish_seed(seed, trained[seed][-1], starts, race, name) for seed in seeds}
+        kinds[name] = {seed: polish_seed(seed, trained[seed][-1], race, name) for seed in seeds}
     kinds["champion, untrained for duels"] = {0: starts[0]}
     simulated = all_results(race, kinds, "simulator")
     env = flytrack_env.make("FlyTrack-v0", plant=blackbox.load(blackbox.SHIPPED), reward=REWARD)
@@ -319,9 +326,8 @@ def main(seeds: tuple[int, ...] = (0, 1, 2, 3, 4)) -> None:
         rated=NUM_RATED,
         ratings=report.table("policy | Elo | races won", ratings(race, members)),
         settings=listed({**CHANGES, **SETTINGS._asdict()}),
-        race=listed(RACE._asdict()),
-        clear=listed(CLEAR._asdict()),
-        fast=listed(FAST._asdict()),
+        race=described(POLISHING[TO_RACE]),
+        overtake=described(POLISHING[TO_OVERTAKE]),
         seconds=report.spread([found[-1].meta["seconds"] for found in trained.values()]),
         polishing_s=times_of(kinds),
         rates=duel_rates(),

@@ -11,10 +11,8 @@ from flytrack_env.params import EnvParams
 from flytrack_env.race import Race
 from flytrack_env.state import Action, Drone
 
-NEAR_M = 0.5  # spheres touch at 0.3
-ALONG = 0.4  # behind, a metre along the opponent's velocity counts as so many across
+BESIDE_M, ABOVE_M = 2.0, 0.5  # from where on an opponent is not in the way; spheres touch at 0.3
 UNTOUCHED_M = 1e-3  # collision radius: whoever is hit flies on, and the gradient with it
-SMALL = 0.01  # m, m/s: where a norm has no gradient
 
 
 class DuelState(NamedTuple):
@@ -35,15 +33,16 @@ class DuelFlight:
     Args:
         race: of two drones.
         pool: policies of one network, parameters with the members as first axis of each leaf.
+        behind: share of flights that start behind the opponent.
 
     Raises:
         ValueError: a race of another number of drones.
     """
 
-    def __init__(self, race: MultiDroneRace, pool: Policy) -> None:
+    def __init__(self, race: MultiDroneRace, pool: Policy, behind: float = 0.5) -> None:
         if race.num_drones != 2:
             raise ValueError(f"race: found {race.num_drones} drones, expected 2")
-        self._race, self._pool = race, pool
+        self._race, self._pool, self._behind = race, pool, behind
         self._num_members = len(jax.tree.leaves(pool.params)[0])
 
     @property
@@ -59,7 +58,8 @@ class DuelFlight:
         """Return the learner's observation and the state of a race that begins."""
         of_start, of_slot, of_opponent = jax.random.split(key, 3)
         race = self._race_params(params)
-        rules = race.rules._replace(first_slot=jax.random.randint(of_slot, (), 0, 2))
+        slot = jax.random.bernoulli(of_slot, self._behind).astype(jnp.int32)
+        rules = race.rules._replace(first_slot=slot)
         observations, entrants = self._race.reset(of_start, race._replace(rules=rules))
         opponent = jax.random.randint(of_opponent, (), 0, self._num_members)
         return observations[0], DuelState(entrants, observations, opponent)
@@ -91,18 +91,15 @@ class DuelFlight:
         return list(state.observations[0])
 
     def nearness(self, state: DuelState) -> jax.Array:
-        """Return how near the learner is to its opponent: 0 from ``NEAR_M`` on, and 1 inside it.
+        """Return how much the opponent is in the way: 0 far beside or above it, 1 where it is, more below.
 
-        Behind it, who has to look out, distance along the opponent's velocity counts less. That has no
-        gradient: the way out is to the side, and straight back would only slow the learner down.
+        It falls with horizontal distance too, but only height has a gradient, so that the way past is always
+        above. A gradient to the side changes its sign with the side that the learner happens to be on and
+        averages to nothing over flights, and one that points back only slows it down.
         """
         drones = self._race.drone(state.entrants)
         own_w, other_w = jnp.stack(drones.pos_w, axis=-1)
-        apart_w = own_w - jax.lax.stop_gradient(other_w)
-        velocity_w = jax.lax.stop_gradient(jnp.stack(drones.vel_w, axis=-1)[1])
-        ahead_w = velocity_w / (jnp.linalg.norm(velocity_w) + SMALL)
-        along = apart_w @ ahead_w
-        across_w = apart_w - along * ahead_w
-        along = jax.lax.stop_gradient(along) * jnp.where(along < 0.0, ALONG, 1.0)
-        distance = jnp.sqrt(across_w @ across_w + along * along + SMALL * SMALL)
-        return jnp.where(state.entrants.is_out[1], 0.0, jnp.maximum(0.0, 1.0 - distance / NEAR_M) ** 2)
+        *flat, above = own_w - jax.lax.stop_gradient(other_w)
+        beside = jax.lax.stop_gradient(jnp.hypot(*flat))
+        nearness = jnp.maximum(0.0, 1.0 - beside / BESIDE_M) ** 2 * jnp.maximum(0.0, 1.0 - above / ABOVE_M)
+        return jnp.where(state.entrants.is_out[1], 0.0, nearness)

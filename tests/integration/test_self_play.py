@@ -115,7 +115,7 @@ def test_checkpoints_race_on_the_black_box(tmp_path, capsys):
         run_race(RaceSettings((other, CHAMPION_FILE), out=folder))
 
 
-def test_nearness_pushes_to_the_side_and_never_back():
+def test_nearness_pushes_up_and_neither_to_the_side_nor_back():
     flight = DuelFlight(MultiDroneRace(ENV, 2), CHAMPION.policy)
     drone, nothing = ENV.sample_start(jnp.uint32(0), ENV.default_params)[0], jnp.zeros(2)
     drones = jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), drone)
@@ -129,12 +129,13 @@ def test_nearness_pushes_to_the_side_and_never_back():
         entrants = EntrantState(inner, nothing, nothing, nothing > 0.0, nothing, nothing)
         return flight.nearness(DuelState(entrants, jnp.zeros((2, 36)), jnp.int32(0)))
 
-    behind, beside, ahead = (jnp.array([x, 0.1, 0.0]) for x in (-0.6, 0.0, 0.6))
-    assert float(nearness(ahead)) == 0.0 < float(nearness(behind)) < float(nearness(beside)) < 1.0
-    for place in (behind, beside):
-        x, y, z = jax.grad(nearness)(place)
-        assert abs(x) < 1e-3 and y < -0.5 and abs(z) < 1e-3
-    assert float(nearness(jnp.array([0.0, 0.0, 2.0]))) == 0.0
+    hit = float(nearness(jnp.zeros(3)))
+    assert hit == pytest.approx(1.0) and float(nearness(jnp.array([0.0, 0.0, -0.3]))) > hit
+    for place in ((-0.6, 0.1, 0.1), (0.6, 0.0, 0.1), (0.0, -1.0, -0.1)):
+        x, y, z = jax.grad(nearness)(jnp.array(place))
+        assert 0.0 < float(nearness(jnp.array(place))) < hit and x == 0.0 == y and z < -0.5
+    for clear in ((2.1, 0.0, 0.0), (0.0, 0.0, 0.7)):
+        assert float(nearness(jnp.array(clear))) == 0.0
     with pytest.raises(ValueError, match="race: found 3 drones, expected 2"):
         DuelFlight(MultiDroneRace(ENV, 3), CHAMPION.policy)
 
