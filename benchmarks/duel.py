@@ -138,7 +138,7 @@ def listed(settings: dict[str, Any]) -> str:
     )
 
 
-def described(how: Polishing) -> str:
+def polishing_text(how: Polishing) -> str:
     """Return how policies are polished as text."""
     opponents = ", ".join(how.opponents)
     return f"among {opponents}; {how.behind:.0%} of flights from behind; {listed(how.settings._asdict())}"
@@ -326,8 +326,8 @@ def main(seeds: tuple[int, ...] = (0, 1, 2, 3, 4)) -> None:
         rated=NUM_RATED,
         ratings=report.table("policy | Elo | races won", ratings(race, members)),
         settings=listed({**CHANGES, **SETTINGS._asdict()}),
-        race=described(POLISHING[TO_RACE]),
-        overtake=described(POLISHING[TO_OVERTAKE]),
+        race=polishing_text(POLISHING[TO_RACE]),
+        overtake=polishing_text(POLISHING[TO_OVERTAKE]),
         seconds=report.spread([found[-1].meta["seconds"] for found in trained.values()]),
         polishing_s=times_of(kinds),
         rates=duel_rates(),
