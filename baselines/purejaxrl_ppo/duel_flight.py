@@ -94,8 +94,8 @@ class DuelFlight:
         """Return how much the opponent is in the way: 0 far beside or above it, 1 where it is, more below.
 
         It falls with horizontal distance too, but only height has a gradient, so that the way past is always
-        above. A gradient to the side changes its sign with the side that the learner happens to be on and
-        averages to nothing over flights, and one that points back only slows it down.
+        above. A gradient to the side would change its sign with the side that the learner happens to be on
+        and average out over flights, and one that points back would only slow it down.
         """
         drones = self._race.drone(state.entrants)
         own_w, other_w = jnp.stack(drones.pos_w, axis=-1)

@@ -13,7 +13,7 @@ import pytest
 
 import flytrack_env
 from baselines.purejaxrl_ppo import load_checkpoint
-from baselines.purejaxrl_ppo.duel_flight import DuelFlight, DuelState
+from baselines.purejaxrl_ppo.duel_flight import ABOVE_M, BESIDE_M, DuelFlight, DuelState
 from baselines.purejaxrl_ppo.duels import Races, fly_races, score, start_pose_params
 from baselines.purejaxrl_ppo.flights import start_keys
 from baselines.purejaxrl_ppo.networks import Policy
@@ -131,9 +131,11 @@ def test_nearness_pushes_up_and_neither_to_the_side_nor_back():
 
     hit = float(nearness(jnp.zeros(3)))
     assert hit == pytest.approx(1.0) and float(nearness(jnp.array([0.0, 0.0, -0.3]))) > hit
-    for place in ((-0.6, 0.1, 0.1), (0.6, 0.0, 0.1), (0.0, -1.0, -0.1)):
+    for place in ((-0.6, 0.1, 0.1), (0.6, 0.0, 0.1), (0.0, -1.0, -0.1), (0.0, 0.0, 0.0)):
         x, y, z = jax.grad(nearness)(jnp.array(place))
-        assert 0.0 < float(nearness(jnp.array(place))) < hit and x == 0.0 == y and z < -0.1
+        share = (1.0 - np.hypot(*place[:2]) / BESIDE_M) ** 2
+        assert float(nearness(jnp.array(place))) == pytest.approx(share * (1.0 - place[2] / ABOVE_M))
+        assert x == 0.0 == y and float(z) == pytest.approx(-share / ABOVE_M)
     for clear in ((2.1, 0.0, 0.0), (0.0, 0.0, 0.7)):
         assert float(nearness(jnp.array(clear))) == 0.0
     with pytest.raises(ValueError, match="race: found 3 drones, expected 2"):
