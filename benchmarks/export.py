@@ -124,10 +124,11 @@ def evaluator(checkpoint: Checkpoint, env: Any, is_float64: bool = False, batch:
             real = jnp.float64 if is_float64 else jnp.float32
             arrays = checkpoint.params, env.default_params.course
             params, course = jax.tree.map(lambda leaf: jnp.asarray(leaf, real), arrays)
+            battery = env.default_params.model.battery
 
             def one(state: jax.Array, gate: jax.Array) -> jax.Array:
                 pair = course.gate(gate), course.gate(course.next_index(gate))
-                observation = jnp.stack(observe_race(unpack(state.astype(real)), *pair))
+                observation = jnp.stack(observe_race(unpack(state.astype(real)), *pair, battery))
                 mean: Any = checkpoint.network.apply(params, observation, method="policy")
                 return jnp.clip(mean.mode(), -1.0, 1.0)
 

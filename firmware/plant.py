@@ -26,13 +26,14 @@ from firmware.building import find_executable
 from firmware.process import AT_REST, BODY, FLY, START, START_STATE, Firmware, Reply
 from firmware.settings import settings_of
 from flytrack_env import state as layout
+from flytrack_env.battery import Battery
 from flytrack_env.dynamics import ModelParameters, nominal_parameters
 from flytrack_env.files import fresh_folder
 from flytrack_env.messages import error_text
 from flytrack_env.motion import Motion
 from flytrack_env.plants import Plant
 from flytrack_env.quaternion import Scalar
-from flytrack_env.state import STATE_SIZE, Action, Drone, pack, unpack
+from flytrack_env.state import BATTERY_EMPTY_V, BATTERY_FULL_V, STATE_SIZE, Action, Drone, pack, unpack
 from flytrack_sysid.importing.betaflight_settings import full_stick_rate, rate_loop, stick_curve
 
 DT_S = 0.01
@@ -135,6 +136,8 @@ class Betaflight(Plant):
             FirmwareError: not built, settings that are refused or not kept, or it does not start.
         """
         self.body, self.seed = body, seed
+        empty_v = body.full_v * BATTERY_EMPTY_V / BATTERY_FULL_V
+        self.battery = Battery(body.full_v, empty_v, empty_v, body.full_v)
         self.box = None if blackbox is None else fresh_folder(Path(blackbox))
         at_rest = replace(body, gyro_noise=0.0, acc_noise=0.0)  # gyros are calibrated with the motors off
         made = settings_of(settings, skip, has_blackbox=self.box is not None)

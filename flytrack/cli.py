@@ -10,6 +10,7 @@ import dataclasses
 import importlib
 import io
 import sys
+import warnings
 from collections.abc import Callable, Sequence
 from importlib.metadata import version
 from importlib.util import find_spec
@@ -142,6 +143,9 @@ def call(name: str, words: Sequence[str]) -> None:
             leave(name, REFUSED, f"error: {error}")
         print(f"usage: {PROG} {name} [OPTIONS]\n\n{describe(command)}\n\nIts flags cannot be shown: {error}")
         return
+    warnings.showwarning = lambda message, *_, **__: print(
+        f"{PROG} {name}: warning: {message}", file=sys.stderr
+    )
     try:
         status = run(asked)
     except (ImportError, ValueError, OverflowError, OSError) as error:

@@ -2,6 +2,7 @@
 
 from importlib.metadata import version
 
+from flytrack_env.battery import Battery, BatteryWarning
 from flytrack_env.compile_cache import keep_compiled_programs
 from flytrack_env.dynamics import ModelParameters, nominal_parameters
 from flytrack_env.extras import check_gymnax
@@ -30,6 +31,8 @@ register_with_gymnasium()
 __version__ = "0.1.0"
 
 __all__ = [
+    "Battery",
+    "BatteryWarning",
     "EnvParams",
     "EnvState",
     "FlyTrack",

@@ -30,6 +30,7 @@ from jax import export
 from jax.custom_batching import custom_vmap
 
 from flytrack_env import artifact, sandbox
+from flytrack_env.battery import Battery
 from flytrack_env.dynamics import ModelParameters
 from flytrack_env.files import read_at_most
 from flytrack_env.plants import Plant
@@ -112,9 +113,11 @@ class BlackBox(Plant):
     JAX raises a ValueError otherwise.
 
     path: the artifact's file. state_size: components of the artifact's own state, 21 or 18. dt: s, baked in.
+    battery: the handout's, which is part of the contract of these files.
     """
 
     dt = DT
+    battery = Battery()
 
     def __init__(self, path: Path, exported: export.Exported, max_rate: tuple[float, ...]):
         self.path = path

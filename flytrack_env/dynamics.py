@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from flytrack_env import effects
+from flytrack_env.battery import Battery
 from flytrack_env.effects import StepContext
 from flytrack_env.fusion import compute_once
 from flytrack_env.motion import Motion
@@ -31,7 +32,8 @@ class ModelParameters(NamedTuple):
     max_rate: (3,) deg/s, body rate at full stick.
     m: kg. g: m/s^2. battery_drain_v_per_min: V/min. effects: parameters of the effects that the model
     has, in the order of ``flytrack_env.effects.EFFECTS``. motion: how it moves within a step, static.
-    Without effects and with the default motion, the model is the handout's.
+    battery: between which voltages it is flown.
+    Without effects, with the default motion and battery, the model is the handout's.
     """
 
     tau: jax.Array | np.ndarray
@@ -42,6 +44,7 @@ class ModelParameters(NamedTuple):
     battery_drain_v_per_min: Scalar = 1.0
     effects: tuple[Any, ...] = ()
     motion: Motion = Motion.HANDOUT
+    battery: Battery = Battery()
 
     def with_effects(self, *parameters: Any) -> "ModelParameters":
         """Return the model with effects added, or replaced where it has them.

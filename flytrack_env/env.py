@@ -47,7 +47,8 @@ class FlyTrack(EpisodicEnvironment):
 
     Raises:
         TrackError, ModelFileError: a track or model that cannot be read.
-        ValueError: another value of ``missed_gate``; an unknown reward term, or a weight that is no number.
+        ValueError: another value of ``missed_gate``; an unknown reward term, or a weight that is no number; a
+            battery beyond all voltages that the model was fitted at.
         TypeError: a plant that is not a ``flytrack_env.plants.Plant``.
     """
 
@@ -71,6 +72,10 @@ class FlyTrack(EpisodicEnvironment):
         self.plant: Plant = Simulator(delay_steps_of(model.effects, DT_S)) if plant is None else plant
         if not isinstance(self.plant, Plant):
             raise TypeError(f"plant: found {type(plant).__name__}, expected a subclass of plants.Plant")
+        if self.plant.battery is not None:
+            model = model._replace(battery=self.plant.battery)
+        model.battery.check()
+        model.battery.warn_of_extrapolation()
         self._default_params = EnvParams(
             model=model,
             course=build_course(self.track),
@@ -111,7 +116,7 @@ class FlyTrack(EpisodicEnvironment):
         """
         if acts(params.model.effects, "gyro") or acts(params.model.effects, "pose"):
             drone = self.plant.sensed(state.plant, drone, params.dt, params.model)
-        return observe_race(drone, state.race.gate, state.race.next_gate)
+        return observe_race(drone, state.race.gate, state.race.next_gate, params.model.battery)
 
     def is_truncated(self, state: EnvState, params: EnvParams) -> jax.Array:
         """Return whether the time limit is reached."""
@@ -131,7 +136,8 @@ class FlyTrack(EpisodicEnvironment):
             state.race, before.pos_w, after.pos_w, start_time_s, params.dt, params.course, params.drone_radius
         )
         is_missed = events.is_miss & (self.missed_gate == "terminate")
-        causes = compute_once(find_causes(after, params.course, events.is_frame | is_nan, is_missed))
+        causes = find_causes(after, params.course, params.model.battery, events.is_frame | is_nan, is_missed)
+        causes = compute_once(causes)
         is_terminated = compute_once(causes.any())
         reward = total_reward(
             Transition(

@@ -11,10 +11,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from flytrack_env.battery import Battery
+from flytrack_env.effects import ROUNDING
 from flytrack_env.params import EnvParams
 from flytrack_env.quaternion import Vec3
 from flytrack_env.race import Race, RaceEvents, advance_race, start_race
-from flytrack_env.state import POSITION, VELOCITY, unpack
+from flytrack_env.state import BATTERY, POSITION, VELOCITY, unpack
 from flytrack_env.terminations import Causes, find_causes
 from flytrack_env.tracks import Course, Track, build_course, cross_gate
 
@@ -125,22 +127,29 @@ def _padded(positions: np.ndarray) -> np.ndarray:
 def why_ended(states: np.ndarray, track: Track, race: FlownRace) -> str:
     """Return why the flight ended, as far as its last state tells.
 
-    A rollout's last row is the state before its last step, which is extrapolated at the last velocity.
+    A rollout's last row is the state before its last step, which is extrapolated at the last velocity. A
+    rollout does not state its battery: one that begins within the handout's voltages is taken to have the
+    handout's, and when any other is empty is not known.
     states: (T, 21). race: as ``follow_race`` returns it for them with ``last_vel_w``.
     """
+    start_v, handout = float(states[0, BATTERY]), Battery()
+    is_handout = handout.empty_v <= start_v <= handout.full_v * (1.0 + ROUNDING)
+    battery = handout if is_handout else handout._replace(empty_v=-np.inf)
     causes = _causes(
-        np.asarray(states[-1], np.float32), build_course(track), race.is_frame[-1], race.is_miss[-1]
+        np.asarray(states[-1], np.float32), build_course(track), battery, race.is_frame[-1], race.is_miss[-1]
     )
     names = [name.replace("_", " ") for name, happened in causes._asdict().items() if happened]
     return ", ".join(names) or "all steps flown"
 
 
 @jax.jit
-def _causes(last: jax.Array, course: Course, is_frame: jax.Array, is_miss: jax.Array) -> Causes:
+def _causes(
+    last: jax.Array, course: Course, battery: Battery, is_frame: jax.Array, is_miss: jax.Array
+) -> Causes:
     """Return what would end the flight in the step after a state (21,)."""
     ahead_w = last[POSITION] + STEP_S * last[VELOCITY]
     ahead_w = jnp.where(jnp.isfinite(ahead_w).all(), ahead_w, last[POSITION])
-    return find_causes(unpack(last.at[POSITION].set(ahead_w)), course, is_frame, is_miss)
+    return find_causes(unpack(last.at[POSITION].set(ahead_w)), course, battery, is_frame, is_miss)
 
 
 @jax.jit

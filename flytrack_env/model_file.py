@@ -1,6 +1,7 @@
 """Model files: the parameters of a drone as JSON, by hand or from an identification."""
 
 import json
+import warnings
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -8,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from flytrack_env import effects
+from flytrack_env.battery import Battery, BatteryWarning
 from flytrack_env.dynamics import ModelParameters
 from flytrack_env.files import read_at_most, write_atomically
 from flytrack_env.messages import error_text, quote_name, quote_value
@@ -25,6 +27,7 @@ UNITS = {
 }
 LARGEST_BYTES = 4 * 2**20
 LARGEST = float(np.finfo(np.float32).max)
+BATTERY = "battery"
 MUST_BE_POSITIVE = ("tau", "max_rate", "m")
 
 
@@ -80,6 +83,26 @@ def _read_effect(path: Path, name: str, values: Any) -> Any:
     return effect.parameters(**{field: float(value) for field, value in values.items()}, **static)
 
 
+def _read_battery(path: Path, value: Any) -> Battery:
+    """Return a battery; voltages that are not in the file are the handout's, or those of the battery."""
+    where = f"{path}: {BATTERY}"
+    values = _object(where, value)
+    for name, volts in values.items():
+        _known(where, name, Battery._fields)
+        if not _is_number(volts):
+            raise ModelFileError(f"{where}: {name}: found {quote_value(volts)}, expected a voltage")
+    battery = Battery(**{name: float(volts) for name, volts in values.items()})
+    battery = battery._replace(
+        fitted_low_v=values.get("fitted_low_v", battery.empty_v),
+        fitted_high_v=values.get("fitted_high_v", battery.full_v),
+    )
+    try:
+        battery.check()
+    except ValueError as error:
+        raise ModelFileError(f"{path}: {error}") from error
+    return battery
+
+
 def _read_json(path: Path) -> dict[str, Any]:
     """Return the object in a JSON file."""
     try:
@@ -96,13 +119,22 @@ def load_model(path: str | Path) -> ModelParameters:
 
     The file is a JSON object with ``tau``, ``thrust_coeffs``, ``max_rate``, ``m``, ``g`` and
     ``battery_drain_v_per_min`` at the top or under ``parameters``, units as in ``ModelParameters``; and
-    optionally ``effects``, an object of effects' names (``flytrack_env.effects``) with their parameters, and
-    ``motion``, a value of ``Motion``; without it the model moves as the handout's.
+    optionally ``effects``, an object of effects' names (``flytrack_env.effects``) with their parameters,
+    ``motion``, a value of ``Motion``, without which the model moves as the handout's, and ``battery``, an
+    object with the fields of ``Battery``, without which the handout's is assumed and a warning given.
 
     Raises:
         ModelFileError: missing file, not JSON, a newer version, a field missing, unknown or out of range.
     """
-    return model_from_json(_read_json(Path(path)), path)
+    data = _read_json(Path(path))
+    model = model_from_json(data, path)
+    if BATTERY not in data and BATTERY not in data.get("parameters", {}):
+        text = (
+            f"{path}: battery: missing, as in files of older versions; flown at the handout's "
+            f"{model.battery.describe()}"
+        )
+        warnings.warn(BatteryWarning(text), stacklevel=2)
+    return model
 
 
 def model_from_json(data: dict[str, Any], path: str | Path, dtype: Any = np.float32) -> ModelParameters:
@@ -130,12 +162,13 @@ def model_from_json(data: dict[str, Any], path: str | Path, dtype: Any = np.floa
         if name not in values:
             raise ModelFileError(f"{path}: {name}: missing")
     for name in values:
-        _known(str(path), name, (*SIZES, "effects", "motion", "version"))
+        _known(str(path), name, (*SIZES, "effects", "motion", BATTERY, "version"))
     by_name = _object(f"{path}: effects", data.get("effects", values.get("effects", {})))
     motion = data.get("motion", values.get("motion", Motion.HANDOUT.value))
     motion = Motion(_known(f"{path}: motion", motion, [one.value for one in Motion]))
     read = {name: _read_field(path, name, values[name], dtype) for name in SIZES}
-    base = ModelParameters(**read, motion=motion)
+    battery = _read_battery(path, data.get(BATTERY, values.get(BATTERY, {})))
+    base = ModelParameters(**read, motion=motion, battery=battery)
     return base.with_effects(*(_read_effect(path, name, by_name[name]) for name in by_name))
 
 
@@ -149,7 +182,7 @@ def load_provenance(path: str | Path) -> dict[str, Any]:
 
 
 def model_as_json(model: ModelParameters) -> dict[str, Any]:
-    """Return a model as JSON values: ``parameters``, ``effects``, the ``units`` of both, and ``motion``."""
+    """Return a model as JSON values: parameters, effects, units, motion and battery."""
     by_name = {effects.effect_of(parameters).name: parameters for parameters in model.effects}
     effect_units = {
         name: {field: bounds.unit for field, bounds in effects.BY_NAME[name].ranges.items()}
@@ -160,6 +193,7 @@ def model_as_json(model: ModelParameters) -> dict[str, Any]:
         "effects": {name: _effect_as_json(name, parameters) for name, parameters in by_name.items()},
         "units": {**UNITS, **effect_units},
         "motion": model.motion.value,
+        BATTERY: {name: float(volts) for name, volts in model.battery._asdict().items()},
     }
 
 

@@ -10,9 +10,10 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
+from flytrack_env.battery import Battery
 from flytrack_env.fusion import compute_once
 from flytrack_env.quaternion import Scalar
-from flytrack_env.state import BATTERY_EMPTY_V, BATTERY_FULL_V, Drone
+from flytrack_env.state import Drone
 from flytrack_env.tracks import GateFrame
 
 
@@ -31,22 +32,20 @@ class Entry(NamedTuple):
     limit: float
 
 
-BATTERY_MIDDLE_V = 0.5 * (BATTERY_FULL_V + BATTERY_EMPTY_V)
-
 OBSERVATION = (
     Entry("position", "position relative to the gate's centre", 3, "gate", "m", 3.0, 30.0),
     Entry("velocity", "velocity", 3, "gate", "m/s", 5.0, 12.0),
     Entry("attitude", "rotation matrix body to gate, row by row", 9, "gate", "1", 1.0, 1.0),
     Entry("rates", "angular velocity", 3, "body", "rad/s", 5.0, 3.0),
     Entry("applied", "previous applied action: roll, pitch, yaw, thrust", 4, "body", "1", 1.0, 1.0),
-    Entry("battery", "battery voltage above 23 V", 1, "-", "V", 1.0, 1.0),
+    Entry("battery", "battery voltage, from -1 at empty to 1 at full", 1, "-", "1", 1.0, 1.0),
     Entry("next_gate", "next gate's centre relative to the gate's centre", 3, "gate", "m", 5.0, 20.0),
     Entry("next_direction", "next gate's direction of flight", 3, "gate", "1", 1.0, 1.0),
 )
 OBSERVATION_SIZE = sum(entry.size for entry in OBSERVATION)
 
 
-def observe_race(drone: Drone, gate: GateFrame, next_gate: GateFrame) -> list[jax.Array]:
+def observe_race(drone: Drone, gate: GateFrame, next_gate: GateFrame, battery: Battery) -> list[jax.Array]:
     """Return the observation of a drone before ``gate``: OBSERVATION_SIZE scalars, float32.
 
     ``drone`` is as the sensors report it. Scalars, so that wrappers can add to them and they are stacked
@@ -61,7 +60,7 @@ def observe_race(drone: Drone, gate: GateFrame, next_gate: GateFrame) -> list[ja
         tuple(axis.dot(body_axis) for axis in frame for body_axis in body_axes),
         drone.rates_b,
         drone.applied,
-        (drone.battery_v - BATTERY_MIDDLE_V,),
+        (battery.scaled(drone.battery_v),),
         tuple(axis.dot(next_gate.centre - gate.centre) for axis in frame),
         tuple(axis.dot(next_gate.forward) for axis in frame),
     ]

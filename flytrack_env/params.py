@@ -14,7 +14,6 @@ from flytrack_env.effects import ROUNDING, USUAL_STEPS, Range, check_parameters
 from flytrack_env.quaternion import Scalar
 from flytrack_env.resets import ResetParams
 from flytrack_env.rewards import RewardWeights
-from flytrack_env.state import BATTERY_EMPTY_V, BATTERY_FULL_V
 from flytrack_env.tracks import Course
 from flytrack_env.tracks.track import LARGEST
 
@@ -35,7 +34,7 @@ RANGES: Mapping[str, Range] = {
     "reset.start_height_noise": Range(0.0, LARGEST, "m"),
     "reset.start_yaw_noise_deg": Range(0.0, 180.0, "deg"),
     "reset.start_tilt_noise_deg": Range(0.0, 180.0, "deg"),
-    "reset.start_battery_low_v": Range(BATTERY_EMPTY_V, BATTERY_FULL_V, "V"),
+    "reset.start_charge_low": Range(0.0, 1.0, "1"),
     "reset.course_offset": Range(0.0, LARGEST, "m"),
     "reset.course_speed": Range(0.0, 1e3, "m/s"),
     "reset.course_yaw_deg": Range(0.0, 180.0, "deg"),
@@ -43,7 +42,7 @@ RANGES: Mapping[str, Range] = {
     "reset.course_stick": Range(0.0, 1.0, "1"),
     "reset.course_thrust_low": Range(-1.0, 1.0, "1"),
     "reset.course_thrust_high": Range(-1.0, 1.0, "1"),
-    "reset.course_battery_low_v": Range(BATTERY_EMPTY_V, BATTERY_FULL_V, "V"),
+    "reset.course_charge_low": Range(0.0, 1.0, "1"),
     **{f"reward.{name}": Range(-1e6, 1e6, "1") for name in RewardWeights._fields},
 }
 LEAST_GATES = 2
@@ -88,6 +87,7 @@ class EnvParams:
             if not np.all((np.asarray(value) >= low) & (np.asarray(value) <= high)):
                 expected = f"{bounds.low:g} to {bounds.high:g} {bounds.unit}"
                 raise ValueError(f"{name}: found {value}, expected {expected}")
+        self.model.battery.check()
         for parameters in self.model.effects:
             check_parameters(parameters, self.dt, delay_steps)
         _check_course(self.course)

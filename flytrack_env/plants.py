@@ -8,6 +8,7 @@ state is a pytree of its own, because it may hold more than the drone (a delay b
 from abc import ABC, abstractmethod
 from typing import Any, NamedTuple
 
+from flytrack_env.battery import Battery
 from flytrack_env.dynamics import ModelParameters, advance, sensed
 from flytrack_env.effects import USUAL_STEPS, start_memories
 from flytrack_env.quaternion import Scalar
@@ -19,10 +20,11 @@ class Plant(ABC):
 
     dt: the only time step that the plant can take, s; None if it takes any. A plant with a ``dt`` has its
     parameters baked in and ignores ``model`` as well. delay_steps: how many commands delays of the model's
-    effects remember.
+    effects remember. battery: of a plant that has its own; None if it is the model's.
     """
 
     dt: float | None = None
+    battery: Battery | None = None
     delay_steps: int = USUAL_STEPS
 
     @abstractmethod

@@ -10,7 +10,7 @@ from flytrack_env.dynamics import ModelParameters, start_rates
 from flytrack_env.fusion import compute_once
 from flytrack_env.quaternion import Quaternion, Scalar, Vec3
 from flytrack_env.randomness import Draws
-from flytrack_env.state import BATTERY_FULL_V, Action, Drone
+from flytrack_env.state import Action, Drone
 from flytrack_env.tracks import Course, hermite_curve
 
 # The last part of the way is left out: from there the gate could not be reached any more.
@@ -28,7 +28,7 @@ class ResetParams(NamedTuple):
     course_yaw_deg: half range of the yaw about the direction of that curve.
     course_tilt_deg: tilt from 0 to this towards any side.
     course_stick: half range of the applied rate actions; applied thrust from course_thrust_low to
-    course_thrust_high. *_battery_low_v: battery from this to full, V.
+    course_thrust_high. *_charge_low: battery from this to full, from 0 (empty) to 1 (full) in voltage.
     """
 
     course_fraction: Scalar = 0.8
@@ -36,7 +36,7 @@ class ResetParams(NamedTuple):
     start_height_noise: Scalar = 0.3
     start_yaw_noise_deg: Scalar = 15.0
     start_tilt_noise_deg: Scalar = 5.0
-    start_battery_low_v: Scalar = 23.5
+    start_charge_low: Scalar = 0.75
     course_offset: Scalar = 0.5
     course_speed: Scalar = 16.0
     course_yaw_deg: Scalar = 90.0
@@ -44,7 +44,7 @@ class ResetParams(NamedTuple):
     course_stick: Scalar = 0.3
     course_thrust_low: Scalar = -1.0
     course_thrust_high: Scalar = 0.8
-    course_battery_low_v: Scalar = 22.2
+    course_charge_low: Scalar = 0.1
 
 
 SIDEWAYS_FRACTION = 0.2
@@ -79,7 +79,7 @@ def sample_start(
             choose(params.course_thrust_high, STILL_THRUST),
         ),
     )
-    battery_low_v = choose(params.course_battery_low_v, params.start_battery_low_v)
+    lowest_v = model.battery.voltage(choose(params.course_charge_low, params.start_charge_low))
     on_curve, along = _point_on_course(draws, gate_index, course)
     anchor = Vec3(*map(choose, on_curve, course.start_pos_w))
     heading = Quaternion(*map(choose, _facing(along), course.start_quat))
@@ -90,7 +90,7 @@ def sample_start(
         quat=heading.multiply(_turn(draws, choose, params)),
         rates_b=Vec3(0.0, 0.0, 0.0),
         applied=applied,
-        battery_v=draws.uniform("battery", battery_low_v, BATTERY_FULL_V),
+        battery_v=draws.uniform("battery", lowest_v, model.battery.full_v),
     )
     drone = drone._replace(rates_b=start_rates(drone, model))
     return jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32), drone), gate_index

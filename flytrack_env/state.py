@@ -31,7 +31,7 @@ RATES = slice(13, 16)
 APPLIED_ACTION = slice(16, 20)
 BATTERY = 20
 
-BATTERY_FULL_V = 24.0
+BATTERY_FULL_V = 24.0  # of the handout; a model's own: ``battery.Battery``
 BATTERY_EMPTY_V = 22.0
 
 

@@ -5,7 +5,8 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from flytrack_env.state import BATTERY_EMPTY_V, Drone
+from flytrack_env.battery import Battery
+from flytrack_env.state import Drone
 from flytrack_env.tracks import Course
 
 
@@ -14,7 +15,7 @@ class Causes(NamedTuple):
 
     crash: the drone touched a gate's frame, or was given an action that is not a number.
     ground: below the floor of the bounds. out_of_bounds: beyond any other side.
-    missed_gate: crossed the gate's plane outside its frame. battery_empty: below 22 V.
+    missed_gate: crossed the gate's plane outside its frame. battery_empty: below the battery's empty voltage.
     """
 
     crash: jax.Array
@@ -28,7 +29,9 @@ class Causes(NamedTuple):
         return self.crash | self.ground | self.out_of_bounds | self.missed_gate | self.battery_empty
 
 
-def find_causes(drone: Drone, course: Course, is_crash: jax.Array, is_missed: jax.Array) -> Causes:
+def find_causes(
+    drone: Drone, course: Course, battery: Battery, is_crash: jax.Array, is_missed: jax.Array
+) -> Causes:
     """Return the causes of termination after a step.
 
     is_crash, is_missed: from the gate's crossing, bool scalars.
@@ -47,5 +50,5 @@ def find_causes(drone: Drone, course: Course, is_crash: jax.Array, is_missed: ja
         ground=is_below,
         out_of_bounds=~jnp.asarray(is_inside),
         missed_gate=jnp.asarray(is_missed),
-        battery_empty=jnp.asarray(drone.battery_v < BATTERY_EMPTY_V),
+        battery_empty=jnp.asarray(drone.battery_v < battery.empty_v),
     )

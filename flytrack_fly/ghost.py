@@ -14,13 +14,13 @@ from flytrack_env.model_file import model_from_json
 from flytrack_env.params import EnvParams
 from flytrack_env.references import KINDS, ReferenceFileError, is_model_of, shipped_references
 from flytrack_env.resets import ResetParams
-from flytrack_env.state import BATTERY_FULL_V, POSITION, VELOCITY
+from flytrack_env.state import POSITION, VELOCITY
 
 Kind = Literal["reference", "champion", "none"]
 CHAMPION = "champion/flytrack.safetensors"  # in baselines.purejaxrl_ppo
 CHAMPION_NEEDS = "expected 2 or more: fly on its own track, flytrack, without --model"
 MOST_STEPS, NUM_LAPS = 6000, 3  # of the champion's flight
-STILL_START = ResetParams(0.0, 0.0, 0.0, 0.0, 0.0, BATTERY_FULL_V)  # no noise, and never on the course
+STILL_START = ResetParams(0.0, 0.0, 0.0, 0.0, 0.0, 1.0)  # no noise, full, never on the course
 
 
 class GhostLap(NamedTuple):

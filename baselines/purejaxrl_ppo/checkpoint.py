@@ -45,6 +45,8 @@ STEP_FILE = re.compile(rf"step_(\d+)\{SUFFIX}")
 REWARD = "reward."  # prefix of the reward's weights among the environment's parameters
 MUST_FIT = ("env_id", "seed", "missed_gate", "config", "observation", "track_data", "model", "environment")
 
+WORDING = ("name", "unit")  # of a row of an observation
+
 # What is used before a checkpoint is compared with the run.
 FIELDS: dict[str, Any] = {
     **dict.fromkeys(("steps", "seed"), int),
@@ -102,13 +104,27 @@ class Checkpoint(NamedTuple):
                 f"({self.env_id}), but the environment's have shape {found}"
             )
         if "observation" in self.meta:
-            lines = find_differences(self.meta["observation"], observation_layout(env))
+            lines = find_differences(
+                *map(_without_wording, (self.meta["observation"], observation_layout(env)))
+            )
             check_no_differences("checkpoint: observation", lines)
 
 
 def observation_layout(env: Any) -> dict[str, Any]:
     """Return an environment's observation as JSON values: each row's meaning, frame, unit, scale, limit."""
     return as_json({f"row {i} ({e.key})": e._asdict() for i, e in enumerate(env.observation_table)})
+
+
+def _without_wording(layout: Any) -> Any:
+    """Return an observation's layout without names and units, which are for people and may be reworded."""
+    if not isinstance(layout, dict):
+        return layout
+    return {
+        row: {name: value for name, value in entry.items() if name not in WORDING}
+        if isinstance(entry, dict)
+        else entry
+        for row, entry in layout.items()
+    }
 
 
 def as_json(value: Any) -> Any:

@@ -24,7 +24,7 @@ from baselines.purejaxrl_ppo.config import OptionalName, OptionalPath
 from baselines.purejaxrl_ppo.race_env import simulated_env
 from flytrack_env.extras import check_installed
 from flytrack_env.files import write_atomically
-from flytrack_env.observations import BATTERY_MIDDLE_V, OBSERVATION, Entry, observe_race
+from flytrack_env.observations import OBSERVATION, Entry, observe_race
 from flytrack_env.params import EnvParams
 from flytrack_env.quaternion import Quaternion
 from flytrack_env.state import ACTION_SIZE, STATE_SIZE, unpack
@@ -49,7 +49,8 @@ SENTENCES = {
     "state": (
         "0:3 position, world, m; 3:6 velocity, world, m/s; 6:9 acceleration, not read; 9:13 attitude, "
         "quaternion w, x, y, z of norm 1, body to world; 13:16 angular velocity, body, rad/s; 16:20 applied "
-        "action, that is the command after the drone's lag: roll, pitch, yaw, thrust; 20 battery, V. World: "
+        "action, that is the command after the drone's lag: roll, pitch, yaw, thrust; 20 battery, V, "
+        "from {empty_v} (empty) to {full_v} (full), as the policy was trained. World: "
         "the track's, z up. Body: x forward, y left, z up."
     ),
     "gate": "index of the gate to fly, 0 to {last_gate}, in the order of the track {track}.",
@@ -115,6 +116,7 @@ def policy_of(checkpoint: Checkpoint, name: str, track: str | None = None) -> Ex
             "actions after those of FlyTrack-v0"
         )
     params = env.default_params
+    battery = params.model.battery
     sizes = [entry.size for entry in OF_DRONE]
     rate = f"{1.0 / params.dt:g} commands a second"
     words = {
@@ -123,11 +125,16 @@ def policy_of(checkpoint: Checkpoint, name: str, track: str | None = None) -> Ex
         "num_actions": len(past),
         "kind": past[0].key.rpartition("_")[0] if past else "",
         "full_stick": ", ".join(f"{value:.0f}" for value in params.model.max_rate),
+        "empty_v": f"{battery.empty_v:.4g}",
+        "full_v": f"{battery.full_v:.4g}",
     }
+    middle_v, half_v = battery.voltage(0.5), 0.5 * (battery.full_v - battery.empty_v)
     return ExportedPolicy(
         **_gates(params),
-        offsets=np.repeat([BATTERY_MIDDLE_V if entry.key == "battery" else 0.0 for entry in OF_DRONE], sizes),
-        factors=np.repeat([1.0 / entry.scale for entry in OF_DRONE], sizes),
+        offsets=np.repeat([middle_v if entry.key == "battery" else 0.0 for entry in OF_DRONE], sizes),
+        factors=np.repeat(
+            [1.0 / (half_v if entry.key == "battery" else entry.scale) for entry in OF_DRONE], sizes
+        ),
         limits=np.repeat([entry.limit for entry in OF_DRONE], sizes),
         past=past,
         layers=_layers(checkpoint),
@@ -141,9 +148,10 @@ def _gates(params: EnvParams) -> dict[str, np.ndarray]:
     """Return the fields that depend on the gates."""
     gates = jax.tree.map(lambda leaf: np.asarray(leaf, float), params.course.gates)
     following = jax.tree.map(lambda leaf: np.roll(leaf, -1, axis=0), gates)
+    battery = params.model.battery
     with jax.enable_x64(True):
         anywhere = unpack(jnp.zeros(STATE_SIZE))
-        rows = jax.vmap(lambda *pair: jnp.stack(observe_race(anywhere, *pair)))(gates, following)
+        rows = jax.vmap(lambda *pair: jnp.stack(observe_race(anywhere, *pair, battery)))(gates, following)
     axes = [np.stack(axis, axis=-1) for axis in (gates.forward, gates.left(), gates.up)]
     return {
         "centres": np.stack(gates.centre, axis=-1),

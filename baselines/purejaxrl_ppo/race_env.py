@@ -3,6 +3,7 @@
 Plants are drawn around that model, to find which deviations a policy tolerates.
 """
 
+import warnings
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -14,6 +15,7 @@ import numpy as np
 import flytrack_env
 from baselines.purejaxrl_ppo.checkpoint import Checkpoint, CheckpointError
 from baselines.purejaxrl_ppo.report import share
+from flytrack_env.battery import BatteryWarning
 from flytrack_env.dynamics import ModelParameters
 from flytrack_env.effects import effect_of
 from flytrack_env.episodes import EpisodicEnvironment
@@ -45,7 +47,17 @@ def plant_env(
     Raises:
         CheckpointError, TrackError: a checkpoint that does not fit, a track that cannot be used.
     """
-    return _checked_env(checkpoint, track, plant=plant)
+    env = _checked_env(checkpoint, track, plant=plant)
+    if "model" in checkpoint.meta:
+        trained = model_from_json(checkpoint.meta["model"], "checkpoint: model").battery
+        flown = env.default_params.model.battery
+        if not np.allclose([trained.full_v, trained.empty_v], [flown.full_v, flown.empty_v]):
+            text = (
+                f"checkpoint: trained with a battery of {trained.describe()}, and the plant's has "
+                f"{flown.describe()}: the policy meets another thrust"
+            )
+            warnings.warn(BatteryWarning(text), stacklevel=2)
+    return env
 
 
 def simulated_env(checkpoint: Checkpoint, track: str | Path | Track | None = None) -> EpisodicEnvironment:

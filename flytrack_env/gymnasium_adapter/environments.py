@@ -61,7 +61,7 @@ class _Adapter:
         simulation = self._simulation
         if TRACK in options:
             simulation = simulation.with_track(options[TRACK])
-        start = read_start(options, simulation.params.course)
+        start = read_start(options, simulation.params.course, simulation.params.model.battery)
         words = draw_words()
         if simulation is not self._simulation:
             self._simulation = simulation

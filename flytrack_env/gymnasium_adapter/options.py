@@ -8,6 +8,8 @@ from typing import Any
 import numpy as np
 
 from flytrack_env import state as layout
+from flytrack_env.battery import Battery
+from flytrack_env.effects import ROUNDING
 from flytrack_env.params import RANGES
 from flytrack_env.tracks import Course, Track
 
@@ -41,7 +43,9 @@ def check_names(options: Mapping[str, Any] | None) -> dict[str, Any]:
     return dict(options)
 
 
-def read_start(options: Mapping[str, Any], course: Course) -> tuple[np.ndarray | None, int, float | None]:
+def read_start(
+    options: Mapping[str, Any], course: Course, battery: Battery
+) -> tuple[np.ndarray | None, int, float | None]:
     """Return the start that checked options ask for on a course: drone, gate to fly first, battery, V.
 
     The drone is (21,), laid out as in ``flytrack_env.state``, and with the gate's index instead of a drawn
@@ -53,15 +57,15 @@ def read_start(options: Mapping[str, Any], course: Course) -> tuple[np.ndarray |
     battery_v = None
     if BATTERY_V in options:
         battery_v = float(_numbers(options, BATTERY_V, 0))
-        if not layout.BATTERY_EMPTY_V < battery_v <= layout.BATTERY_FULL_V:
-            expected = f"above {layout.BATTERY_EMPTY_V:g} and up to {layout.BATTERY_FULL_V:g} V"
+        if not battery.empty_v < battery_v <= battery.full_v * (1.0 + ROUNDING):
+            expected = f"above {battery.empty_v:g} and up to {battery.full_v:g} V"
             raise _error(BATTERY_V, options, expected)
     if not any(name in options for name in POSE_NAMES):
         return None, 0, battery_v
     drone = np.zeros(layout.STATE_SIZE, np.float32)
     drone[layout.POSITION], drone[layout.QUATERNION], drone[layout.VELOCITY] = _pose(options, course)
     drone[layout.APPLIED_ACTION] = STILL_ROTORS
-    drone[layout.BATTERY] = layout.BATTERY_FULL_V
+    drone[layout.BATTERY] = battery.full_v
     return drone, _gate_index(options, course.num_gates), battery_v
 
 

@@ -5,12 +5,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from flytrack_env.battery import Battery
 from flytrack_env.dynamics import ModelParameters, nominal_parameters
 from flytrack_env.files import open_file
 from flytrack_env.messages import error_text
 from flytrack_sysid.log import FlightLog, LogError
 
-NOMINAL_FULL_V = 24.0  # the voltage that the nominal thrust map is stated at (``nominal_parameters``)
 VOLTAGE_TERMS = 4  # of the thrust map: from this coefficient on they multiply the voltage
 
 
@@ -47,7 +47,8 @@ class Craft(NamedTuple):
             name = next(name for name, value in self._asdict().items() if value is None)
             raise LogError(f"{source}: craft.{name}: missing in log and mapping; a model needs it")
         nominal = nominal_parameters()
-        per_volt = NOMINAL_FULL_V / self.voltage_v[1]
+        empty_v, full_v = self.voltage_v
+        per_volt = float(nominal.battery.full_v) / full_v
         coeffs = np.asarray(nominal.thrust_coeffs, float) * self.mass_kg / float(nominal.m)
         coeffs[VOLTAGE_TERMS:] *= per_volt
         leaves: dict[str, Any] = {  # of NumPy
@@ -58,6 +59,7 @@ class Craft(NamedTuple):
             **leaves,
             m=self.mass_kg,
             battery_drain_v_per_min=float(nominal.battery_drain_v_per_min) / per_volt,
+            battery=Battery(full_v, empty_v, fitted_low_v=empty_v, fitted_high_v=full_v),
         )
 
 

@@ -43,7 +43,7 @@ def make_vector(env_id: str = BASE, num_envs: int = 3, **arguments: Any) -> Any:
 def still(params: EnvParams) -> EnvParams:
     """Parameters of which every episode begins in the same way, and lasts 12 steps at most."""
     names = ("position_noise", "height_noise", "yaw_noise_deg", "tilt_noise_deg")
-    reset = params.reset._replace(course_fraction=0.0, start_battery_low_v=24.0)
+    reset = params.reset._replace(course_fraction=0.0, start_charge_low=1.0)
     reset = reset._replace(**{f"start_{name}": 0.0 for name in names})
     return params.replace(reset=reset, max_steps_in_episode=12)
 

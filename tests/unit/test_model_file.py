@@ -9,10 +9,11 @@ import jax
 import numpy as np
 import pytest
 
+from flytrack_env.battery import Battery
 from flytrack_env.dynamics import ModelParameters, nominal_parameters
 from flytrack_env.effects import CommandDelay, LinearDrag, QuadraticDrag
 from flytrack_env.env import FlyTrack
-from flytrack_env.model_file import ModelFileError, load_model, save_model
+from flytrack_env.model_file import SIZES, ModelFileError, load_model, save_model
 from flytrack_env.motion import Motion
 
 FIELDS = {
@@ -20,7 +21,7 @@ FIELDS = {
     "thrust_coeffs": [1, 2, 3, 4, 5, 6],
     "max_rate": [618.0, 618.0, 120.0],
 }
-FIELDS |= {"m": 1, "g": 9.80665, "battery_drain_v_per_min": 1.0}
+FIELDS |= {"m": 1, "g": 9.80665, "battery_drain_v_per_min": 1.0, "battery": {}}
 MINIMAL = json.dumps(FIELDS)
 
 
@@ -34,7 +35,7 @@ def assert_same_model(a: ModelParameters, b: ModelParameters) -> None:
         nominal_parameters(),
         nominal_parameters()._replace(m=0.1, g=1.62, battery_drain_v_per_min=0.0),
         nominal_parameters().with_effects(CommandDelay(0.013), LinearDrag(0.1, 0.2, -0.05)),
-        nominal_parameters()._replace(motion=Motion.CONTINUOUS),
+        nominal_parameters()._replace(motion=Motion.CONTINUOUS, battery=Battery(4.2, 3.4, 3.5, 4.1)),
         nominal_parameters()._replace(thrust_coeffs=np.float32([0.1, -0.2, 1 / 3, 1e-7, 1e5, 0])),
     ],
 )
@@ -46,7 +47,7 @@ def test_round_trip(model: ModelParameters, tmp_path: Path) -> None:
     assert_same_model(load_model(str(path)), model)
     document = json.loads(path.read_text(encoding="utf-8"))
     assert document["provenance"] == provenance
-    assert set(document["parameters"]) | {"effects", "motion"} == set(ModelParameters._fields)
+    assert set(document["parameters"]) | {"effects", "motion", "battery"} == set(ModelParameters._fields)
     assert set(document["units"]) == set(document["parameters"]) | set(document["effects"])
 
 
@@ -54,7 +55,7 @@ def test_minimal_file_by_hand(tmp_path: Path) -> None:
     path = tmp_path / "model.json"
     path.write_text(MINIMAL, encoding="utf-8")
     model = load_model(path)
-    expected = {name: np.float32(value) for name, value in FIELDS.items()}
+    expected = {name: np.float32(FIELDS[name]) for name in SIZES}
     for name, value in expected.items():
         np.testing.assert_allclose(getattr(model, name), value)
     assert_same_model(FlyTrack(model=path).default_params.model, model)

@@ -54,7 +54,7 @@ def test_every_number_of_the_parameters_has_a_range() -> None:
     parts = ("model", "reset", "reward")
     fields = {f"{part}.{name}" for part in parts for name in getattr(PARAMS, part)._fields}
     own = {field.name for field in dataclasses.fields(EnvParams)} - {*parts, "course", "wrappers"}
-    assert set(RANGES) == (fields | own) - {"model.effects", "model.motion"}
+    assert set(RANGES) == (fields | own) - {"model.battery", "model.effects", "model.motion"}
 
 
 def test_courses_that_cannot_be_flown() -> None:

@@ -47,7 +47,7 @@ def test_start_pose_is_at_rest_before_gate_zero(sample) -> None:
     assert_uniform(offset[:, 2], 0.0, noise.start_height_noise)
     assert not x[:, 3:9].any() and not x[:, 13:16].any()
     np.testing.assert_array_equal(x[:, 16:20], np.tile([0.0, 0.0, 0.0, -1.0], (NUM_STARTS, 1)))
-    assert_uniform(x[:, 20], noise.start_battery_low_v, 24.0)
+    assert_uniform(x[:, 20], 23.5, 24.0)
 
 
 def course_curves(track: Track) -> list[CubicHermiteSpline]:
