@@ -2,7 +2,11 @@
 
 from typing import Any
 
+import numpy as np
+
 from flytrack_env.quaternion import Scalar
+
+THRUST_ACTIONS = np.linspace(-1.0, 1.0, 201)
 
 
 def collective_thrust(thrust_action: Scalar, battery_v: Scalar, coeffs: Any) -> Scalar:
@@ -13,3 +17,16 @@ def collective_thrust(thrust_action: Scalar, battery_v: Scalar, coeffs: Any) -> 
     u, volt = thrust_action, battery_v
     polynomial = coeffs[0] + u * (coeffs[1] + u * (coeffs[2] + u * coeffs[3]))
     return polynomial + volt * (coeffs[4] + u * coeffs[5])
+
+
+def hover_action(coeffs: Any, weight_n: float, battery_v: float) -> float:
+    """Return the thrust action that carries a weight, by the thrust map alone; 1 if none does.
+
+    Args:
+        coeffs: of the thrust map, (6,).
+        weight_n: mass times gravity, N.
+        battery_v: voltage under load, V.
+    """
+    thrusts_n = collective_thrust(THRUST_ACTIONS, battery_v, np.asarray(coeffs, float))
+    rising_n = np.maximum.accumulate(np.asarray(thrusts_n))  # a fitted curve may dip at its lower end
+    return float(np.interp(weight_n, rising_n, THRUST_ACTIONS))

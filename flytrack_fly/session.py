@@ -15,9 +15,10 @@ from flytrack_env.rendering.flight_log import GATE_INDEX, LAP_START, LAP_TIME, L
 from flytrack_env.rollout import MOST_STEPS
 from flytrack_env.state import BATTERY, POSITION, STATE_SIZE
 from flytrack_env.terminations import Causes
+from flytrack_env.thrust import hover_action
 from flytrack_env.tracks import cross_gate
 from flytrack_fly.ghost import Ghost, still_start
-from flytrack_fly.sticks import NAMES, command_of, hover_thrust
+from flytrack_fly.sticks import NAMES, command_of
 
 MOST_BEHIND_S = 0.1  # later than that, the flight is slowed down: it must not fall behind ever more
 START_HINT = "W, or throttle up: start.  H: keys"
@@ -113,7 +114,8 @@ class Session:
         """Fly a step with sticks (4,), once the throttle has gone up."""
         self._is_armed |= bool(sticks[3] <= 0.0)
         if self.now.commands or (self._is_armed and sticks[3] > 0.0):
-            hover = hover_thrust(self.params.model, float(self.now.log.rows[-1, BATTERY]))
+            model, battery_v = self.params.model, float(self.now.log.rows[-1, BATTERY])
+            hover = hover_action(model.thrust_coeffs, float(model.m) * float(model.g), battery_v)
             self.fly(command_of(sticks, hover))
 
     def fly(self, command: np.ndarray) -> None:

@@ -10,13 +10,9 @@ from typing import Annotated, Literal
 import numpy as np
 import tyro
 
-from flytrack_env import ModelParameters
-from flytrack_env.thrust import collective_thrust
-
 NAMES = ("roll", "pitch", "yaw", "throttle")
 KEY_REACH = np.array([0.4, 0.4, 1.0, 0.25])  # where a held key takes a stick; Shift takes it all the way
 OUT_PER_S, BACK_PER_S = 3.0, 6.0  # speeds of a stick that keys move, outwards and to the middle
-THRUST_ACTIONS = np.linspace(-1.0, 1.0, 201)
 
 
 @dataclass(frozen=True)
@@ -59,13 +55,6 @@ def move_by_keys(sticks: np.ndarray, pulls: np.ndarray, is_full: bool, dt_s: flo
     is_outwards = (pulls != 0.0) & ((targets - sticks) * pulls > 0.0)
     most = dt_s * np.where(is_outwards, OUT_PER_S, BACK_PER_S)
     return sticks + np.clip(targets - sticks, -most, most)
-
-
-def hover_thrust(model: ModelParameters, battery_v: float) -> float:
-    """Return the thrust command that carries the model's weight, by its thrust curve; 1 if none does."""
-    thrusts_n = collective_thrust(THRUST_ACTIONS, battery_v, np.asarray(model.thrust_coeffs, float))
-    rising_n = np.maximum.accumulate(np.asarray(thrusts_n))  # a fitted curve may dip at its lower end
-    return float(np.interp(float(model.m) * float(model.g), rising_n, THRUST_ACTIONS))
 
 
 def command_of(sticks: np.ndarray, hover: float) -> np.ndarray:

@@ -28,6 +28,7 @@ from flytrack_env.observations import OBSERVATION, Entry, observe_race
 from flytrack_env.params import EnvParams
 from flytrack_env.quaternion import Quaternion
 from flytrack_env.state import ACTION_SIZE, STATE_SIZE, unpack
+from flytrack_env.thrust import collective_thrust, hover_action
 
 FOLDER = Path(__file__).parent  # of the templates
 FLOAT32, FLOAT64 = 1, 11  # ONNX's numbers of types
@@ -60,7 +61,9 @@ SENTENCES = {
     ),
     "action": (
         "roll, pitch, yaw, thrust in [-1, 1]. Full stick asks for {full_stick} deg/s about body x, y, z; "
-        "thrust is -1 for none and 1 for full."
+        "thrust is -1 for none and 1 for full. With a full battery of {full_v} V the thrust map that the "
+        "policy was trained with gives {full_weights} times the weight at full thrust, and {hover} hovers: "
+        "compare both with the craft."
     ),
 }
 
@@ -116,7 +119,8 @@ def policy_of(checkpoint: Checkpoint, name: str, track: str | None = None) -> Ex
             "actions after those of FlyTrack-v0"
         )
     params = env.default_params
-    battery = params.model.battery
+    model, battery = params.model, params.model.battery
+    coeffs, weight_n = np.asarray(model.thrust_coeffs, float), float(model.m) * float(model.g)
     sizes = [entry.size for entry in OF_DRONE]
     rate = f"{1.0 / params.dt:g} commands a second"
     words = {
@@ -127,6 +131,8 @@ def policy_of(checkpoint: Checkpoint, name: str, track: str | None = None) -> Ex
         "full_stick": ", ".join(f"{value:.0f}" for value in params.model.max_rate),
         "empty_v": f"{battery.empty_v:.4g}",
         "full_v": f"{battery.full_v:.4g}",
+        "full_weights": f"{collective_thrust(1.0, battery.full_v, coeffs) / weight_n:.3f}",
+        "hover": f"{hover_action(coeffs, weight_n, battery.full_v):.3f}",
     }
     middle_v, half_v = battery.voltage(0.5), 0.5 * (battery.full_v - battery.empty_v)
     return ExportedPolicy(

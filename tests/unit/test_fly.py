@@ -18,10 +18,11 @@ from flytrack_env.rendering import make_renderer
 from flytrack_env.rendering.views import TOP_VIEW_WIDTH
 from flytrack_env.rollout import load_rollout
 from flytrack_env.state import BATTERY, POSITION, QUATERNION, RATES
+from flytrack_env.thrust import hover_action
 from flytrack_fly import play
 from flytrack_fly.ghost import cut_laps, make_ghost
 from flytrack_fly.session import Session, steps_due
-from flytrack_fly.sticks import Gamepad, hover_thrust, move_by_keys
+from flytrack_fly.sticks import Gamepad, move_by_keys
 
 TRACK = load_track("flytrack")
 STANDING = shipped_references(TRACK, ("nominal",))["standing"]
@@ -89,7 +90,8 @@ def test_a_gamepad_that_replays_the_optimum_times_its_lap(session, display, pad,
         if isinstance(command, str):
             post(pygame.QUIT)
         elif command is not None:  # the throttle has to be down at first
-            hover = hover_thrust(MODEL, float(session.now.log.rows[-1, BATTERY]))
+            battery_v = float(session.now.log.rows[-1, BATTERY])
+            hover = hover_action(MODEL.thrust_coeffs, MODEL.m * MODEL.g, battery_v)
             throttle = (command[3] - hover) / (1.0 - hover if command[3] > hover else 1.0 + hover)
             for axis, value in zip((3, 4, 0, 1), (command[0], *-command[1:3], -throttle), strict=True):
                 post(pygame.JOYAXISMOTION, instance_id=7, axis=axis, value=value)
