@@ -14,6 +14,7 @@ STICKS = ("roll", "pitch", "yaw", "thrust")
 TAUS = tuple(f"tau_{stick}" for stick in STICKS)
 THRUST_COEFFS = tuple(f"c{power}" for power in range(6))
 MAX_RATES = tuple(f"max_rate_{stick}" for stick in STICKS[:3])
+NO_BATTERY: Any = ()  # in the place of a battery: no number of it is fitted
 DRAIN = "battery_drain_v_per_min"
 BASE = (*TAUS, *THRUST_COEFFS, *MAX_RATES, "m", "g", DRAIN)
 # Where a fit looks for each, and its unit: wide enough for anything that flies at 100 Hz; an answer at an end
@@ -57,19 +58,20 @@ def neutral_value(name: str) -> float:
 
 
 def to_vector(model: ModelParameters) -> np.ndarray:
-    """Return all numbers of a model, in the order of ``names_of``, float64."""
-    return np.concatenate([np.ravel(np.asarray(leaf, float)) for leaf in jax.tree.leaves(model)])
+    """Return the numbers of a model's motion, all but its battery's, in the order of ``names_of``, float64."""
+    leaves = jax.tree.leaves(model._replace(battery=NO_BATTERY))
+    return np.concatenate([np.ravel(np.asarray(leaf, float)) for leaf in leaves])
 
 
 def from_vector(vector: Any, like: ModelParameters) -> ModelParameters:
-    """Return the model of the same structure with these numbers; differentiable."""
-    leaves, structure = jax.tree.flatten(like)
+    """Return the model of the same structure and battery with these numbers; differentiable."""
+    leaves, structure = jax.tree.flatten(like._replace(battery=NO_BATTERY))
     sizes = [np.size(leaf) for leaf in leaves]
     ends = np.cumsum(sizes)
     parts = [vector[end - size : end] for size, end in zip(sizes, ends, strict=True)]
     shapes = [np.shape(leaf) for leaf in leaves]
     reshaped = [jnp.reshape(part, shape) for part, shape in zip(parts, shapes, strict=True)]
-    return jax.tree.unflatten(structure, reshaped)
+    return jax.tree.unflatten(structure, reshaped)._replace(battery=like.battery)
 
 
 def in_batches(program: Callable[[np.ndarray], Any], values: np.ndarray, size: int) -> np.ndarray:
@@ -88,7 +90,7 @@ def as_float32(model: ModelParameters) -> ModelParameters:
     def leaf(value: Any) -> Any:
         return np.asarray(value, np.float32) if np.ndim(value) else float(np.float32(value))
 
-    return jax.tree.map(leaf, model)
+    return jax.tree.map(leaf, model)._replace(battery=model.battery)
 
 
 def with_values(model: ModelParameters, values: Mapping[str, float]) -> ModelParameters:
