@@ -58,7 +58,7 @@ def neutral_value(name: str) -> float:
 
 
 def to_vector(model: ModelParameters) -> np.ndarray:
-    """Return the numbers of a model's motion, all but its battery's, in the order of ``names_of``, float64."""
+    """Return a model's numbers but its battery's, in the order of ``names_of``, float64."""
     leaves = jax.tree.leaves(model._replace(battery=NO_BATTERY))
     return np.concatenate([np.ravel(np.asarray(leaf, float)) for leaf in leaves])
 
