@@ -10,7 +10,7 @@ from flytrack_env.messages import quote_name
 from flytrack_sysid.importing.decoding import decode
 from flytrack_sysid.importing.flight import ImportedFlight
 from flytrack_sysid.importing.mapping import Mapping
-from flytrack_sysid.importing.table_flight import LONGEST_LIST, TIMESTAMP, flight_of_topics
+from flytrack_sysid.importing.table_flight import LONGEST_LIST, RECORDED, TIMESTAMP, flight_of_topics
 from flytrack_sysid.log import LogError
 from flytrack_sysid.log_table import Table
 
@@ -48,7 +48,7 @@ def read_bag(path: Path, mapping: Mapping) -> ImportedFlight:
             raise LogError(f"{path}: topic {quote_name(topic)}: no messages; found {listed}")
     topics, said = [], []
     for found, rows in zip(notes["found"], arrays, strict=True):
-        columns = [TIMESTAMP, *(f"{found['topic']}:{field}" for field in found["fields"])]
+        columns = [TIMESTAMP, RECORDED, *(f"{found['topic']}:{field}" for field in found["fields"])]
         topics.append(Table(str(path), dict(zip(columns, rows.T, strict=True))))
         if not found["is_stamped"]:
             name = quote_name(found["topic"])

@@ -84,10 +84,10 @@ def decode_bag(arguments: Any, _: bytes) -> bytes:
     """Return fields of a bag's topics: a folder of ROS 2, a ``.bag`` of ROS 1, an ``.mcap`` file.
 
     arguments: path, and the wanted fields by topic, as in ``pose.position.x`` or ``axes[0]``. The arrays are
-    those of each topic found, (num_messages, 1 + num_fields) float64: time, s from the first message, and the
-    fields. The notes have all ``topics`` of the bag; of those ``found`` their name, their ``fields``, and
-    whether they are ``stamped`` by the sender; and the fields that are ``missing``, as [topic, field, type
-    of the messages].
+    those of each topic found, (num_messages, 2 + num_fields) float64: time and time of recording, s from 1 s
+    before the first recording, and the fields; the time is NaN where a sender that stamps others did not. The notes have
+    all ``topics`` of the bag; of those ``found`` their name, their ``fields``, and whether they are
+    ``stamped`` by the sender; and the fields that are ``missing``, as [topic, field, type of the messages].
     """
     path, wanted = arguments
     messages = _mcap_messages if Path(path).suffix == ".mcap" else _bag_messages
@@ -102,15 +102,20 @@ def decode_bag(arguments: Any, _: bytes) -> bytes:
         if message is None:
             continue
         if topic not in fields:
-            values[topic], is_stamped[topic] = array("d"), _stamp_ns(message) > 0
+            values[topic], is_stamped[topic] = array("d"), False
             fields[topic] = [field for field in wanted[topic] if _is_number(message, field)]
             missing += [[topic, field, kind] for field in wanted[topic] if field not in fields[topic]]
-        time_ns = _stamp_ns(message) if is_stamped[topic] else time_ns
-        first_ns = time_ns if first_ns is None else first_ns
-        values[topic].append((time_ns - first_ns) * 1e-9)
+        stamp_ns = _stamp_ns(message)
+        is_stamped[topic] |= stamp_ns > 0
+        first_ns = time_ns - 10**9 if first_ns is None else first_ns  # a time of 0 means "not set"
+        stamp_s = (stamp_ns - first_ns) * 1e-9 if stamp_ns > 0 else math.nan
+        values[topic].extend((stamp_s, (time_ns - first_ns) * 1e-9))
         values[topic].extend(float(_part(message, field)) for field in fields[topic])
     found = [{"topic": name, "fields": fields[name], "is_stamped": is_stamped[name]} for name in fields]
-    arrays = [np.array(values[name], float).reshape(-1, 1 + len(fields[name])) for name in fields]
+    arrays = [np.array(values[name], float).reshape(-1, 2 + len(fields[name])) for name in fields]
+    for name, rows in zip(fields, arrays, strict=True):
+        if not is_stamped[name]:
+            rows[:, 0] = rows[:, 1]
     return _pack({"topics": sorted(topics), "found": found, "missing": missing}, arrays)
 
 

@@ -105,9 +105,10 @@ def import_log(
         raise LogError("found no files to import, expected at least one")
     loaded = Mapping() if mapping is None else load_mapping(mapping)
     read = [
-        flight._replace(log=_used_rows(path, flight.log, loaded))
+        part
         for path in files
         for flight in READERS[format](path, loaded)
+        for part in _parts(flight._replace(log=_used_rows(path, flight.log, loaded)))
     ]
     notes = tuple(note for flight in read for note in flight.notes)
     grounded = [flight for flight in read if _is_grounded(flight.log)]
@@ -127,6 +128,21 @@ def import_log(
         slow = f"body rates at {1.0 / step_s:.3g} Hz: too slow for a rate loop's lag or delay"
         notes += (f"{log.source}: {slow}",)
     return Imported(log, tuple(sources), craft, offsets, notes, tuple(find_problems(log)))
+
+
+def _parts(flight: ImportedFlight) -> list[ImportedFlight]:
+    """Return the segments of a flight as flights of their own; the notes are those of the first."""
+    log = flight.log
+    numbers = np.unique(log.segment)
+    if len(numbers) == 1:
+        return [flight]
+    parts = []
+    for count, number in enumerate(numbers, start=1):
+        part = replace(
+            log.select(log.segment == number), source=f"{log.source}, part {count} of {len(numbers)}"
+        )
+        parts.append(flight._replace(log=part, notes=flight.notes if count == 1 else ()))
+    return parts
 
 
 def _is_grounded(log: FlightLog) -> bool:

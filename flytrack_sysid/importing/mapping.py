@@ -294,7 +294,7 @@ def _signed_scales(fields: Fields, dimension: str) -> np.ndarray:
 
 
 def _time(fields: Fields) -> Channel:
-    """Return time from 0 on: large numbers of us would cost digits."""
+    """Return the channel of times, s, as they are stamped."""
     if ("column" in fields) == ("step_s" in fields):
         raise fields.error("", "expected either column, with its unit, or step_s, of one row")
     if "step_s" in fields:
@@ -308,8 +308,7 @@ def _time(fields: Fields) -> Channel:
     column, scale = fields.text("column"), _scale(fields, "time")
 
     def convert(table: Table) -> np.ndarray:
-        values = table.matrix([column])
-        return (values - values[0]) * scale
+        return table.matrix([column]) * scale
 
     return Channel(fields.name, "t", (column,), convert)
 

@@ -3,13 +3,14 @@
 import json
 import struct
 import zlib
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from tests.support.tables import table
+from tests.support.written_logs import read_mapping
 
 ULOG_TYPES = {"uint64_t": "Q", "float": "f", "bool": "?", "uint8_t": "B"}
 NUM_ROWS = 30
@@ -127,7 +128,9 @@ def blackbox_frames(num_rows: int = 200) -> np.ndarray:
     return found
 
 
-def usd_log(events: dict[str, tuple[dict[str, str], np.ndarray]], version: int = 2) -> bytes:
+def usd_log(
+    events: dict[str, tuple[dict[str, str], np.ndarray]], version: int = 2, in_order: bool = True
+) -> bytes:
     """Return a Crazyflie's uSD log: of each event its variables, and rows with the time in s first."""
     stamp, per_s = {1: ("I", 1e3), 2: ("Q", 1e6)}[version]
     header, records = struct.pack("<BHH", 0xBC, version, len(events)), []
@@ -140,7 +143,8 @@ def usd_log(events: dict[str, tuple[dict[str, str], np.ndarray]], version: int =
                 f"<H{stamp}{''.join(variables.values())}", number, round(time * per_s), *values
             )
             records.append((time, content))
-    content = header + b"".join(content for _, content in sorted(records, key=lambda record: record[0]))
+    records = sorted(records, key=lambda record: record[0]) if in_order else records
+    content = header + b"".join(content for _, content in records)
     return content + struct.pack("<I", zlib.crc32(content))
 
 
@@ -196,3 +200,83 @@ def foreign_csv() -> bytes:
     rows[:, 0], rows[:, 1:5], rows[:, -1] = 10.0 * np.arange(NUM_ROWS), 1500.0, 16_000.0
     lines = [",".join(names), *(",".join(f"{value:.6g}" for value in row) for row in rows)]
     return ("\n".join(lines) + "\n").encode()
+
+
+# Logs of a drone that turns about z at as many deg/s as rows are before, so that rows can be told apart.
+CLOCK_STICKS = (0.5, -0.25, 0.1, 0.3)
+
+
+def ulog_with_clock(folder: Path, stamps_s: np.ndarray) -> tuple[Path, None]:
+    """Write a PX4 log whose topics all have these stamps."""
+    stamps_us = np.round(1e6 * stamps_s).astype(int)
+    turn = [(int(time), 0.0, 0.0, np.deg2rad(row)) for row, time in enumerate(stamps_us)]
+    setpoints = constant((*np.deg2rad([360.0, 90.0, -45.0]), 0.0, 0.0, -0.75), stamps_us)
+    tables = {
+        "vehicle_angular_velocity": ([("float", "xyz", 3)], turn),
+        "vehicle_attitude": ([("float", "q", 4)], constant(EAST, stamps_us)),
+        "vehicle_rates_setpoint": ([*SETPOINT, ("float", "thrust_body", 3)], setpoints),
+    }
+    (folder / "a.ulg").write_bytes(ulog(tables))
+    return folder / "a.ulg", None
+
+
+def betaflight_with_clock(folder: Path, stamps_s: np.ndarray) -> tuple[Path, None]:
+    """Write a blackbox log with these stamps."""
+    rows = blackbox_frames(len(stamps_s))
+    rows[:, 1], rows[:, 9] = np.round(1e6 * stamps_s), np.arange(len(stamps_s))
+    rows[:, 5] = 500
+    (folder / "a.bbl").write_bytes(blackbox(rows, BLACKBOX_NAMES, BLACKBOX_HEADERS))
+    return folder / "a.bbl", None
+
+
+def _sticks_and_turn(stamps_s: np.ndarray) -> np.ndarray:
+    """Return rows of stamps, sticks and rates in deg/s, (num_rows, 8)."""
+    num_rows = len(stamps_s)
+    still, count = np.zeros(num_rows), np.arange(num_rows)
+    return np.column_stack([stamps_s, np.tile(CLOCK_STICKS, (num_rows, 1)), still, still, count])
+
+
+USD_NAMES = ("roll", "pitch", "yaw", "thrust", "gyro.x", "gyro.y", "gyro.z", "pm.vbat")
+
+
+def usd_with_clock(folder: Path, stamps_s: np.ndarray) -> tuple[Path, Path]:
+    """Write a uSD log with these stamps."""
+    rows = np.column_stack([_sticks_and_turn(stamps_s), np.full(len(stamps_s), 3900.0)])
+    events = {"fixedFrequency": (dict.fromkeys(USD_NAMES, "f"), rows)}
+    (folder / "log00").write_bytes(usd_log(events, in_order=False))
+    return folder / "log00", _with_mapping(folder, "usd")
+
+
+def bag_with_clock(folder: Path, stamps_s: np.ndarray) -> tuple[Path, Path]:
+    """Write an MCAP file of messages with these stamps, recorded at a steady rate."""
+    messages = []
+    for row, stamp_s in enumerate(stamps_s):
+        sec, nanosec = divmod(round(1e9 * stamp_s), 10**9)
+        header = {"stamp": {"sec": sec, "nanosec": nanosec}}
+        rates = {"x": 0.0, "y": 0.0, "z": np.deg2rad(row)}
+        messages.append(("/flight", row * 4_000_000, {"header": header, "u": CLOCK_STICKS, "w": rates}))
+    save_messages(folder / "a.mcap", messages)
+    return folder / "a.mcap", _with_mapping(folder, "bag")
+
+
+def csv_with_clock(folder: Path, stamps_s: np.ndarray) -> tuple[Path, Path]:
+    """Write a CSV file with these stamps."""
+    rows = _sticks_and_turn(stamps_s)
+    np.savetxt(folder / "a.csv", rows, "%.9f", ",", header="t,roll,pitch,yaw,thrust,p,q,r", comments="")
+    return folder / "a.csv", _with_mapping(folder, "clock")
+
+
+def _with_mapping(folder: Path, name: str) -> Path:
+    """Copy a mapping of the tests into a folder."""
+    (folder / "map.toml").write_text(read_mapping(name))
+    return folder / "map.toml"
+
+
+# Of each kind of log: its format, and what writes it with given stamps.
+CLOCK_WRITERS: dict[str, tuple[str, Callable[[Path, np.ndarray], tuple[Path, Path | None]]]] = {
+    "ULog": ("ulog", ulog_with_clock),
+    "blackbox": ("betaflight", betaflight_with_clock),
+    "uSD": ("usd", usd_with_clock),
+    "bag": ("bag", bag_with_clock),
+    "CSV": ("csv", csv_with_clock),
+}

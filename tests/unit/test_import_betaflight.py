@@ -70,7 +70,9 @@ def test_logs_of_one_file_become_segments_and_lost_frames_no_rows(tmp_path):
     found = import_log(write(tmp_path / "a.bbl", log_with(), log_with(rows)), "betaflight")
     assert np.bincount(found.log.segment).tolist() == [200, 189]
     assert [source.rpartition("a.bbl")[2] for source in found.sources] == [", log 1", ", log 2"]
-    assert any("log 2: 1 frames left out" in note for note in found.notes)
+    assert any(
+        "log 2: 1 of 190 rows of the frames left out: 1 with a repeated" in note for note in found.notes
+    )
     assert np.diff(found.log.time[200:]).max() == pytest.approx(11 * 500e-6)
 
 
