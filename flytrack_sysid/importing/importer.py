@@ -15,6 +15,7 @@ from flytrack_env.messages import error_text, quote_name, quote_value
 from flytrack_sysid.clocks import ClockOffset, align_clocks
 from flytrack_sysid.importing.bag_log import read_bag
 from flytrack_sysid.importing.betaflight_log import read_betaflight
+from flytrack_sysid.importing.dataflash_log import read_dataflash
 from flytrack_sysid.importing.flight import Craft, ImportedFlight
 from flytrack_sysid.importing.mapping import Manifest, Mapping, load_mapping
 from flytrack_sysid.importing.table_flight import read_csv
@@ -29,6 +30,7 @@ READERS = {
     "csv": lambda path, mapping: [read_csv(path, mapping)],
     "ulog": lambda path, mapping: [read_ulog(path, mapping)],
     "betaflight": read_betaflight,
+    "dataflash": lambda path, mapping: [read_dataflash(path, mapping)],
     "usd": lambda path, mapping: [read_usd(path, mapping)],
     "bag": lambda path, mapping: [read_bag(path, mapping)],
 }

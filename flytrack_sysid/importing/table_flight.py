@@ -9,7 +9,7 @@ import numpy as np
 from flytrack_env.messages import quote_name
 from flytrack_sysid.importing.commands import commands_of
 from flytrack_sysid.importing.flight import ImportedFlight
-from flytrack_sysid.importing.mapping import Channel, Mapping
+from flytrack_sysid.importing.mapping import Channel, CsvFile, Mapping
 from flytrack_sysid.log import LogError
 from flytrack_sysid.log_file import open_csv, read_columns
 from flytrack_sysid.log_table import Table, columns_of, log_of_table
@@ -49,8 +49,13 @@ def channels_in(source: str, headers: Sequence[Iterable[str]], mapping: Mapping)
 def read_csv(path: Path, mapping: Mapping) -> ImportedFlight:
     """Return the flight in a CSV file with a header, by a mapping; SI units and our frames.
 
-    Raises LogError, whose message names file, row, line and column.
+    path: of a folder, if the mapping has several files. Raises LogError, whose message names file, row, line
+    and column.
     """
+    if mapping.files:
+        return _read_files(path, mapping)
+    if path.is_dir():
+        raise LogError(f"{path}: found a folder, expected a file, or files.NAME in {mapping.source}")
     with open_csv(path, mapping.delimiter) as rows:
         header = [name.strip() for name in next(rows, [])]
         channels = channels_in(str(path), [header], mapping)
@@ -68,6 +73,48 @@ def read_csv(path: Path, mapping: Mapping) -> ImportedFlight:
     values = {name: channel.convert(table) for name, channel in by_name.items()}
     flight = _flight(table, times - times[0], clock.max_gap_s, values, mapping)
     return flight._replace(notes=notes + flight.notes)
+
+
+def _read_files(folder: Path, mapping: Mapping) -> ImportedFlight:
+    """Return the flight in several CSV files of a folder, by a mapping whose columns are ``file:column``."""
+    if not folder.is_dir():
+        raise LogError(f"{folder}: found no folder, expected one with the files of {mapping.source}: files")
+    wanted: dict[str, dict[str, None]] = {}
+    for channel in mapping.channels:
+        for column in channel.columns:
+            name, colon, field = column.partition(":")
+            if name not in mapping.files or not colon:
+                expected = f"expected file:column, where file is one of {', '.join(mapping.files)}"
+                found = f"{mapping.source}: {channel.table}: found {quote_name(column)}"
+                raise LogError(f"{found}, {expected}")
+            wanted.setdefault(name, {})[field] = None
+    tables = []
+    for name, fields in wanted.items():
+        file = mapping.files[name]
+        paths = sorted(folder.glob(file.pattern))
+        if len(paths) != 1:
+            listed = ", ".join(quote_name(path.name) for path in sorted(folder.iterdir()))[:LONGEST_LIST]
+            found = f"found {len(paths)} files of the name {quote_name(file.pattern)} among {listed}"
+            raise LogError(f"{folder}: {found}; expected one by {mapping.source}: files.{name}")
+        tables.append(_read_file(paths[0], name, file, list(fields), mapping))
+    return flight_of_topics(str(folder), tables, mapping)
+
+
+def _read_file(path: Path, name: str, file: CsvFile, fields: list[str], mapping: Mapping) -> Table:
+    """Return the wanted columns of one of several files, named ``file:column``, and its times, s."""
+    with open_csv(path, mapping.delimiter) as rows:
+        header = [column.strip() for column in next(rows, [])]
+        for column in (file.time, *fields):
+            if header.count(column) != 1:
+                listed = ", ".join(map(quote_name, header))[:LONGEST_LIST]
+                found = (
+                    f"{path}: column {quote_name(column)}: found {header.count(column)} times among {listed}"
+                )
+                raise LogError(f"{found}; expected once by {mapping.source}: files.{name}")
+        table = read_columns(path, rows, header, dict.fromkeys((file.time, *fields)))
+    columns = {f"{name}:{field}": table.columns[field] for field in fields}
+    times = table.columns[file.time] * file.scale + file.offset_s
+    return Table(str(path), {TIMESTAMP: times, **columns}, table.lines)
 
 
 def flight_of_topics(source: str, topics: Sequence[Table], mapping: Mapping) -> ImportedFlight:

@@ -202,6 +202,76 @@ def foreign_csv() -> bytes:
     return ("\n".join(lines) + "\n").encode()
 
 
+DATAFLASH_HEAD, DATAFLASH_FORMAT = b"\xa3\x95", 128
+# Of a type of value by its letter: that of ``struct``, and the factor of what is written.
+DATAFLASH_TYPES = {
+    "Q": ("Q", 1),
+    "f": ("f", 1),
+    "B": ("B", 1),
+    "H": ("H", 1),
+    "c": ("h", 100),
+    "N": ("16s", 1),
+}
+DATAFLASH_TYPES |= {"Z": ("64s", 1), "n": ("4s", 1), "b": ("b", 1)}
+COPTER_PARAMETERS = {"ACRO_RP_RATE": 360.0, "ACRO_Y_RATE": 180.0, "ATC_RATE_R_MAX": 500.0, "FRAME_CLASS": 1.0}
+
+
+def dataflash(
+    messages: dict[str, tuple[str, str, list[tuple[Any, ...]]]],
+    parameters: dict[str, float] = COPTER_PARAMETERS,
+    text: str = "ArduCopter V4.5.1 (d4a1b2c3)",
+) -> bytes:
+    """Return an ArduPilot log by its specification: each message with types, names of fields, and rows.
+
+    The first value of a row is the time, us; messages are written one kind after the other.
+    """
+    known = {
+        "FMT": ("BBnNZ", "Type,Length,Name,Format,Columns", []),
+        "PARM": ("QNf", "TimeUS,Name,Value", [(0, name, value) for name, value in parameters.items()]),
+        "MSG": ("QZ", "TimeUS,Message", [(0, text)]),
+        **messages,
+    }
+
+    def packed(number: int, types: str, row: tuple[Any, ...]) -> bytes:
+        pattern = "<" + "".join(DATAFLASH_TYPES[kind][0] for kind in types)
+        values = [
+            value.encode()
+            if isinstance(value, str)
+            else value * factor
+            if kind == "f"
+            else round(value * factor)
+            for kind, value, factor in zip(
+                types, row, (DATAFLASH_TYPES[kind][1] for kind in types), strict=True
+            )
+        ]
+        return DATAFLASH_HEAD + bytes([number]) + struct.pack(pattern, *values)
+
+    content, rows = b"", list[bytes]()
+    for number, (name, (types, columns, values)) in enumerate(known.items(), start=DATAFLASH_FORMAT):
+        size = 3 + struct.calcsize("<" + "".join(DATAFLASH_TYPES[kind][0] for kind in types))
+        content += packed(DATAFLASH_FORMAT, "BBnNZ", (number, size, name, types, columns))
+        rows += [packed(number, types, row) for row in values]
+    return content + b"".join(rows)
+
+
+RATE_COLUMNS = "TimeUS,RDes,R,ROut,PDes,P,POut,YDes,Y,YOut,ADes,A,AOut"
+
+
+def small_dataflash(stamps_s: np.ndarray) -> bytes:
+    """Return an ArduPilot log of rates alone, with these stamps."""
+    rows = [
+        (round(1e6 * stamp_s), 180.0, 0.0, 0, 90.0, 0.0, 0, -45.0, float(row), 0, 0, 0, 0.6)
+        for row, stamp_s in enumerate(stamps_s)
+    ]
+    return dataflash({"RATE": ("Qffffffffffff", RATE_COLUMNS, rows)})
+
+
+def dataflash_with_clock(folder: Path, stamps_s: np.ndarray) -> tuple[Path, None]:
+    """Write an ArduPilot log whose messages have these stamps."""
+    (folder / "a.bin").write_bytes(small_dataflash(stamps_s))
+    return folder / "a.bin", None
+
+
 # Logs of a drone that turns about z at as many deg/s as rows are before, so that rows can be told apart.
 CLOCK_STICKS = (0.5, -0.25, 0.1, 0.3)
 
@@ -266,6 +336,16 @@ def csv_with_clock(folder: Path, stamps_s: np.ndarray) -> tuple[Path, Path]:
     return folder / "a.csv", _with_mapping(folder, "clock")
 
 
+def csv_files_with_clock(folder: Path, stamps_s: np.ndarray) -> tuple[Path, Path]:
+    """Write two CSV files with these stamps, the second 0.5 ms earlier, in ms from 50 s on."""
+    rows, flight = _sticks_and_turn(stamps_s), folder / "flight"
+    flight.mkdir()
+    sticks = np.column_stack([1e3 * (rows[:, 0] - 50.0005), rows[:, 1:5]])
+    np.savetxt(flight / "x_gyro_0.csv", rows[:, [0, 5, 6, 7]], "%.9f", ",", header="t,p,q,r", comments="")
+    np.savetxt(flight / "x_rc_0.csv", sticks, "%.9f", ",", header="ms,roll,pitch,yaw,thrust", comments="")
+    return flight, _with_mapping(folder, "files")
+
+
 def _with_mapping(folder: Path, name: str) -> Path:
     """Copy a mapping of the tests into a folder."""
     (folder / "map.toml").write_text(read_mapping(name))
@@ -276,7 +356,9 @@ def _with_mapping(folder: Path, name: str) -> Path:
 CLOCK_WRITERS: dict[str, tuple[str, Callable[[Path, np.ndarray], tuple[Path, Path | None]]]] = {
     "ULog": ("ulog", ulog_with_clock),
     "blackbox": ("betaflight", betaflight_with_clock),
+    "DataFlash": ("dataflash", dataflash_with_clock),
     "uSD": ("usd", usd_with_clock),
     "bag": ("bag", bag_with_clock),
     "CSV": ("csv", csv_with_clock),
+    "CSV files": ("csv", csv_files_with_clock),
 }
