@@ -215,7 +215,7 @@ def _thrust_of_motors(table: Table, headers: _Headers) -> np.ndarray:
 
 def _complete_logs(path: Path) -> tuple[list[int], list[LogError]]:
     """Return the numbers of the complete logs in a blackbox file, from 1, and what others lack."""
-    content = read_log_file(path, LARGEST_BYTES, FIRST_BYTES)
+    content = read_log_file(path, LARGEST_BYTES, FIRST_BYTES, "a Betaflight blackbox log")
     logs = content.split(FIRST_BYTES)[1:]
     is_complete = {number: END_OF_LOG in log for number, log in enumerate(logs, start=1)}
     cut_off = [

@@ -73,7 +73,7 @@ def read_dataflash(path: Path, mapping: Mapping) -> ImportedFlight:
     docs/real_logs.md says which messages the channels are of. Raises LogError for what is no such log, is not
     of a copter, or lacks rates and their setpoints.
     """
-    read_log_file(path, LARGEST_BYTES, FIRST_BYTES, len(FIRST_BYTES))
+    read_log_file(path, LARGEST_BYTES, FIRST_BYTES, "an ArduPilot log (DataFlash)", len(FIRST_BYTES))
     notes, arrays = decode(
         str(path), "dataflash", path, {name: [TIME, *names] for name, names in FIELDS.items()}
     )

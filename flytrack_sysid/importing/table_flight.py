@@ -8,6 +8,7 @@ import numpy as np
 
 from flytrack_env.messages import quote_name
 from flytrack_sysid.importing.commands import commands_of
+from flytrack_sysid.importing.file_kinds import EMPTY, GZIP, UNKNOWN, check_kind
 from flytrack_sysid.importing.flight import ImportedFlight
 from flytrack_sysid.importing.mapping import Channel, CsvFile, Mapping
 from flytrack_sysid.log import LogError
@@ -56,6 +57,7 @@ def read_csv(path: Path, mapping: Mapping) -> ImportedFlight:
         return _read_files(path, mapping)
     if path.is_dir():
         raise LogError(f"{path}: found a folder, expected a file, or files.NAME in {mapping.source}")
+    check_kind(path, "csv", "text with commas, or such compressed by gzip", (EMPTY, GZIP, UNKNOWN))
     with open_csv(path, mapping.delimiter) as rows:
         header = [name.strip() for name in next(rows, [])]
         channels = channels_in(str(path), [header], mapping)

@@ -31,7 +31,15 @@ RATE_PARAMETERS = (
 
 # Of MAVLink's MAV_TYPE, and of PX4's airframes by thousands of SYS_AUTOSTART.
 VTOL, HEXACOPTER, OCTOCOPTER = "a VTOL", "a hexacopter", "an octocopter"
-AIRFRAMES = {1: "a plane", 4: "a helicopter", 13: HEXACOPTER, 14: OCTOCOPTER, 15: "a tricopter"}
+OTHER_VEHICLES = {
+    1: "a plane",
+    7: "an airship",
+    8: "a balloon",
+    10: "a rover",
+    11: "a boat",
+    12: "a submarine",
+}
+AIRFRAMES = {4: "a helicopter", 13: HEXACOPTER, 14: OCTOCOPTER, 15: "a tricopter"}
 AIRFRAMES |= dict.fromkeys(range(19, 26), VTOL)
 FRAMES = {**dict.fromkeys((6, 7, 11), HEXACOPTER), **dict.fromkeys((8, 9, 12), OCTOCOPTER), 13: VTOL}
 
@@ -118,11 +126,14 @@ def _decode(path: Path) -> tuple[dict[str, Samples], dict[str, Clock], dict[str,
         The samples by channel, on one time line; the clocks by channel; the log's parameters; and what was
         found wrong.
     """
-    read_log_file(path, LARGEST_BYTES, FIRST_BYTES, len(FIRST_BYTES))
+    read_log_file(path, LARGEST_BYTES, FIRST_BYTES, "a PX4 log (ULog)", len(FIRST_BYTES))
     fields: dict[str, list[str]] = {}
     for topic, names in (source for sources in SOURCES.values() for source in sources):
         fields[topic] = [*fields.get(topic, TIMES), *names]
     notes, arrays = decode(str(path), "ulog", path, fields)
+    vehicle = OTHER_VEHICLES.get(int(notes["parameters"].get("MAV_TYPE", 0)))
+    if vehicle:
+        raise LogError(f"{path}: found a log of {vehicle} (MAV_TYPE), expected one of a multicopter")
     topics: dict[str, dict[str, np.ndarray]] = {}
     for (topic, field), values in zip(notes["fields"], arrays, strict=True):
         topics.setdefault(topic, {})[field] = values
@@ -194,6 +205,7 @@ def _full_stick_deg_s(path: Path, parameters: dict[str, float]) -> tuple[float, 
         known = [parameters[name] for name in names if name in parameters]
         if not known or max(known) <= 0.0:
             missing = f"{path}: parameter {' or '.join(names)}: missing, so full stick is unknown"
+            missing = "; ".join([missing, *_airframe(parameters)])
             raise LogError(f"{missing}; a mapping can state craft.max_rate_deg_s")
         rates.append(float(max(known)))
     roll, pitch, yaw = rates

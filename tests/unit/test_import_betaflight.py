@@ -120,7 +120,7 @@ def test_stick_curves_are_the_firmwares(rates_type):
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        (b"", r"a\.bbl: found b'' first, expected b'H Product:Blackbox'"),
+        (b"", r"a\.bbl: found an empty file, expected a Betaflight blackbox log"),
         (log_with()[:-200], r"a\.bbl: log 1 of 1: cut off: found no end-of-log event in \d+ b"),
         (log_with(rows=still()), r"a\.bbl: nothing flies: the thrust command never exceeds 5 %"),
         (log_with().replace(b"encoding:1", b"encoding:77"), r"a\.bbl: damaged, cannot be decoded"),
