@@ -78,7 +78,7 @@ class Import:
 
     files: Annotated[Paths, arg(metavar="FILE [FILE ...]", help_behavior_hint="(at least one)")]
     """Logs of one craft."""
-    format: Literal["csv", "ulog", "betaflight", "usd", "bag"]
+    format: Literal["csv", "ulog", "betaflight", "dataflash", "usd", "bag"]
     """Their format."""
     out: Path
     """The log, .npz or .csv."""

@@ -40,6 +40,11 @@ class Table(NamedTuple):
             found = self.columns[column] if values is None else values
             raise self.error(row, column, f"found {float(found[row])}, expected {expected}")
 
+    def select(self, rows: np.ndarray) -> "Table":
+        """Return some of the rows, by mask."""
+        lines = None if self.lines is None else self.lines[rows]
+        return Table(self.source, {name: values[rows] for name, values in self.columns.items()}, lines)
+
     def matrix(self, columns: Sequence[str]) -> np.ndarray:
         """Return some of the columns side by side, (num_rows, len(columns))."""
         return np.stack([self.columns[column] for column in columns], axis=1)

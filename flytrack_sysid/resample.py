@@ -19,12 +19,6 @@ class Samples(NamedTuple):
     values: np.ndarray
 
 
-def is_increasing(times: np.ndarray) -> np.ndarray:
-    """Return which of the times (num_rows,) are later than all before; loggers repeat and reorder."""
-    latest = np.maximum.accumulate(times)
-    return np.concatenate([[True], times[1:] > latest[:-1]])[: len(times)]
-
-
 def _brackets(times: np.ndarray, at: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the rows before and after each of the times ``at``, and whether both are near, (num_at,) each.
 

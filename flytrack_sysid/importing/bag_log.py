@@ -8,9 +8,10 @@ from pathlib import Path
 
 from flytrack_env.messages import quote_name
 from flytrack_sysid.importing.decoding import decode
+from flytrack_sysid.importing.file_kinds import UNKNOWN, ZSTD, check_kind
 from flytrack_sysid.importing.flight import ImportedFlight
 from flytrack_sysid.importing.mapping import Mapping
-from flytrack_sysid.importing.table_flight import LONGEST_LIST, TIMESTAMP, flight_of_topics
+from flytrack_sysid.importing.table_flight import LONGEST_LIST, RECORDED, TIMESTAMP, flight_of_topics
 from flytrack_sysid.log import LogError
 from flytrack_sysid.log_table import Table
 
@@ -37,6 +38,8 @@ def read_bag(path: Path, mapping: Mapping) -> ImportedFlight:
         raise LogError(
             f"{path}: cannot be read: expected a folder, or a file of at most {LARGEST_BYTES} bytes"
         )
+    if path.is_file():
+        check_kind(path, "bag", "an MCAP file, a ROS 1 bag or the folder of a ROS 2 bag", (UNKNOWN, ZSTD))
     notes, arrays = decode(str(path), "bag", path, wanted)
     for topic, field, kind in notes["missing"]:
         where = f"{path}: topic {quote_name(topic)}: field {quote_name(field)}"
@@ -48,7 +51,7 @@ def read_bag(path: Path, mapping: Mapping) -> ImportedFlight:
             raise LogError(f"{path}: topic {quote_name(topic)}: no messages; found {listed}")
     topics, said = [], []
     for found, rows in zip(notes["found"], arrays, strict=True):
-        columns = [TIMESTAMP, *(f"{found['topic']}:{field}" for field in found["fields"])]
+        columns = [TIMESTAMP, RECORDED, *(f"{found['topic']}:{field}" for field in found["fields"])]
         topics.append(Table(str(path), dict(zip(columns, rows.T, strict=True))))
         if not found["is_stamped"]:
             name = quote_name(found["topic"])

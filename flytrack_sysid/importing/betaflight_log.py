@@ -20,7 +20,7 @@ from flytrack_sysid.importing.mapping import Mapping
 from flytrack_sysid.importing.units import GRAVITY, PER_DEGREE, UNITS
 from flytrack_sysid.log import LogError
 from flytrack_sysid.log_table import Table, columns_of, log_of_table
-from flytrack_sysid.resample import is_increasing
+from flytrack_sysid.timestamps import number_segments, put_on_one_line, read_clock
 
 FIRMWARE = "Betaflight"
 LARGEST_BYTES = 2**29  # of a flash chip
@@ -78,10 +78,10 @@ def _read_log(source: str, notes: dict[str, Any], frames: np.ndarray, mapping: M
     if notes["num_undecoded"]:
         said.append(f"{notes['num_undecoded']} frames before the first full one left out")
     columns = dict(zip(names, frames.T, strict=True))
-    is_used = is_increasing(columns["time"])
-    if not is_used.all():
-        said.append(f"{np.count_nonzero(~is_used)} frames left out: not later than those before")
-    table = Table(source, {name: values[is_used] for name, values in columns.items()})
+    clock = read_clock(source, "the frames", columns["time"] * MICROSECOND)
+    said += clock.describe("the frames")
+    times = put_on_one_line(source, {"frames": clock}, "frames")["frames"]
+    table = Table(source, columns).select(clock.is_used)
     craft = mapping.craft
     if craft.max_rate_deg_s is None:
         craft = craft._replace(max_rate_deg_s=headers.full_stick_deg_s())
@@ -91,7 +91,8 @@ def _read_log(source: str, notes: dict[str, Any], frames: np.ndarray, mapping: M
     if mapping.rules.motors_as_thrust:
         channels["u"][:, 3] = _thrust_of_motors(table, headers)
         clipped.append("thrust command: the mean of the motors")
-    columns = columns_of((table.columns["time"] - table.columns["time"][0]) * MICROSECOND, channels)
+    columns = columns_of(times - times[0], channels)
+    columns["segment"] = number_segments(times, clock.max_gap_s)
     said += [*clipped, *_motors(table, headers)]
     if "f" not in channels:
         said.append("no accelerometer in the log: nothing is asked of the specific force")
@@ -214,7 +215,7 @@ def _thrust_of_motors(table: Table, headers: _Headers) -> np.ndarray:
 
 def _complete_logs(path: Path) -> tuple[list[int], list[LogError]]:
     """Return the numbers of the complete logs in a blackbox file, from 1, and what others lack."""
-    content = read_log_file(path, LARGEST_BYTES, FIRST_BYTES)
+    content = read_log_file(path, LARGEST_BYTES, FIRST_BYTES, "a Betaflight blackbox log")
     logs = content.split(FIRST_BYTES)[1:]
     is_complete = {number: END_OF_LOG in log for number, log in enumerate(logs, start=1)}
     cut_off = [

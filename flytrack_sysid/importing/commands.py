@@ -18,6 +18,7 @@ from flytrack_sysid.importing.units import PER_DEGREE
 from flytrack_sysid.log import LogError
 from flytrack_sysid.log_table import COMMAND_MARGIN
 from flytrack_sysid.plausibility import FEWEST_ROWS
+from flytrack_sysid.timestamps import MAX_GAP_S
 
 AXES = ("roll", "pitch", "yaw")
 FLYING_THRUST = -0.9  # command: with less, it may stand on the ground, where rates do not follow
@@ -195,7 +196,8 @@ def _rates_of_the_law(
         where = f"{source}: torque_command.rate_gain: missing"
         raise LogError(f"{where}; only with setpoints of attitude it can be identified")
     errors = _rotation_errors(source, channels)
-    steps = np.diff(time)[:, None] * 0.5 * (errors[1:] + errors[:-1])
+    steps_s = np.where(np.diff(time) > MAX_GAP_S, 0.0, np.diff(time))  # nothing is known of pauses
+    steps = steps_s[:, None] * 0.5 * (errors[1:] + errors[:-1])
     integrals = np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
     reference = channels.get("reference_rates", np.zeros_like(errors))
     rates = channels["w"] - reference

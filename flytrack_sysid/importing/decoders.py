@@ -1,4 +1,4 @@
-"""Decoders of other programs' logs: pyulog, orangebox, mcap and rosbags, run by ``flytrack_env.sandbox``.
+"""Decoders of other programs' logs: pyulog, orangebox, pymavlink, mcap, rosbags, run by a sandbox.
 
 A small file can make some of them run forever or exhaust the memory (an interval of 0; arrays of arrays).
 This file is imported alone there, so it imports nothing of this package. A decoder takes its arguments, the
@@ -16,6 +16,8 @@ from typing import Any
 
 import numpy as np
 
+INSTANCES = ("I", "C", "Instance", "Inst")  # of ArduPilot: fields that number sensors, estimators, batteries
+MAX_TEXTS = 1000  # messages of text, whose first ones name the firmware
 MAIN_FRAME = "I"  # of Betaflight: the frame type whose fields the others repeat
 
 
@@ -80,14 +82,50 @@ def decode_betaflight(arguments: Any, _: bytes) -> bytes:
     return _pack(notes, arrays)
 
 
+def decode_dataflash(arguments: Any, _: bytes) -> bytes:
+    """Return fields of the messages of an ArduPilot log.
+
+    arguments: path, and the wanted fields by message. The arrays are those of each instance of each message
+    found, (num_messages, num_fields) float64. The notes have of those ``found`` the ``name`` of the message,
+    its ``instance`` (0 without one) and its ``fields``; ``parameters``, as they are at first; and ``texts``.
+    """
+    from pymavlink.DFReader import DFReader_binary
+
+    path, wanted = arguments
+    reader = DFReader_binary(path)
+    parameters: dict[str, float] = {}
+    texts: list[str] = []
+    fields: dict[str, list[str]] = {}
+    values: dict[tuple[str, int], array[float]] = {}
+    while (message := reader.recv_match(type=[*wanted, "PARM", "MSG"])) is not None:
+        name = message.get_type()
+        if name == "PARM" and math.isfinite(message.Value):
+            parameters.setdefault(message.Name, float(message.Value))
+        elif name == "MSG" and len(texts) < MAX_TEXTS:
+            texts.append(message.Message)
+        if name not in wanted:
+            continue
+        columns = message.get_fieldnames()
+        if name not in fields:
+            fields[name] = [field for field in wanted[name] if field in columns]
+        instance = next((int(getattr(message, field)) for field in INSTANCES if field in columns), 0)
+        values.setdefault((name, instance), array("d")).extend(
+            float(getattr(message, field)) for field in fields[name]
+        )
+    found = [{"name": name, "instance": instance, "fields": fields[name]} for name, instance in values]
+    arrays = [np.array(rows, float).reshape(-1, len(fields[name])) for (name, _), rows in values.items()]
+    return _pack({"found": found, "parameters": parameters, "texts": texts}, arrays)
+
+
 def decode_bag(arguments: Any, _: bytes) -> bytes:
     """Return fields of a bag's topics: a folder of ROS 2, a ``.bag`` of ROS 1, an ``.mcap`` file.
 
     arguments: path, and the wanted fields by topic, as in ``pose.position.x`` or ``axes[0]``. The arrays are
-    those of each topic found, (num_messages, 1 + num_fields) float64: time, s from the first message, and the
-    fields. The notes have all ``topics`` of the bag; of those ``found`` their name, their ``fields``, and
-    whether they are ``stamped`` by the sender; and the fields that are ``missing``, as [topic, field, type
-    of the messages].
+    those of each topic found, (num_messages, 2 + num_fields) float64: time and time of recording, s from 1 s
+    before the first recording, and the fields; the time is NaN where a sender that stamps others did not. The
+    notes have all ``topics`` of the bag; of those ``found`` their name, their ``fields``, and whether they
+    are ``stamped`` by the sender; and the fields that are ``missing``, as [topic, field, type of the
+    messages].
     """
     path, wanted = arguments
     messages = _mcap_messages if Path(path).suffix == ".mcap" else _bag_messages
@@ -102,15 +140,20 @@ def decode_bag(arguments: Any, _: bytes) -> bytes:
         if message is None:
             continue
         if topic not in fields:
-            values[topic], is_stamped[topic] = array("d"), _stamp_ns(message) > 0
+            values[topic], is_stamped[topic] = array("d"), False
             fields[topic] = [field for field in wanted[topic] if _is_number(message, field)]
             missing += [[topic, field, kind] for field in wanted[topic] if field not in fields[topic]]
-        time_ns = _stamp_ns(message) if is_stamped[topic] else time_ns
-        first_ns = time_ns if first_ns is None else first_ns
-        values[topic].append((time_ns - first_ns) * 1e-9)
+        stamp_ns = _stamp_ns(message)
+        is_stamped[topic] |= stamp_ns > 0
+        first_ns = time_ns - 10**9 if first_ns is None else first_ns  # a time of 0 means "not set"
+        stamp_s = (stamp_ns - first_ns) * 1e-9 if stamp_ns > 0 else math.nan
+        values[topic].extend((stamp_s, (time_ns - first_ns) * 1e-9))
         values[topic].extend(float(_part(message, field)) for field in fields[topic])
     found = [{"topic": name, "fields": fields[name], "is_stamped": is_stamped[name]} for name in fields]
-    arrays = [np.array(values[name], float).reshape(-1, 1 + len(fields[name])) for name in fields]
+    arrays = [np.array(values[name], float).reshape(-1, 2 + len(fields[name])) for name in fields]
+    for name, rows in zip(fields, arrays, strict=True):
+        if not is_stamped[name]:
+            rows[:, 0] = rows[:, 1]
     return _pack({"topics": sorted(topics), "found": found, "missing": missing}, arrays)
 
 

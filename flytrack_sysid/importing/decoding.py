@@ -1,4 +1,4 @@
-"""Decoding logs with pyulog, orangebox, mcap and rosbags, in a process with limits on time and memory."""
+"""Decoding logs with packages of others, in a process with limits on time and memory."""
 
 import io
 import json
@@ -18,6 +18,7 @@ DECODERS = Path(__file__).with_name("decoders.py")
 PACKAGES = {
     "ulog": ("logs", "ulog logs", "pyulog"),
     "betaflight": ("logs", "betaflight logs", "orangebox"),
+    "dataflash": ("logs", "dataflash logs", "pymavlink"),
     "bag": ("bags", "bags", "mcap", "rosbags"),
 }
 # For every MiB of the file, beyond the usual limits: the slowest decode about 1 MiB per second.

@@ -9,6 +9,7 @@ from flytrack_env.battery import Battery
 from flytrack_env.dynamics import ModelParameters, nominal_parameters
 from flytrack_env.files import open_file
 from flytrack_env.messages import error_text
+from flytrack_sysid.importing.file_kinds import NUM_BYTES, identify
 from flytrack_sysid.log import FlightLog, LogError
 
 VOLTAGE_TERMS = 4  # of the thrust map: from this coefficient on they multiply the voltage
@@ -71,18 +72,26 @@ class ImportedFlight(NamedTuple):
     notes: tuple[str, ...] = ()
 
 
-def read_log_file(path: Path, most_bytes: int, first: bytes, part: int | None = None) -> bytes:
-    """Return the content of a log file; raises LogError for one that does not begin as its format does.
+def read_log_file(path: Path, most_bytes: int, first: bytes, expected: str, part: int | None = None) -> bytes:
+    """Return the content of a log file.
 
-    part: how many bytes of it are read; all if None.
+    Args:
+        path: of the file.
+        most_bytes: that it may have.
+        first: the bytes that it begins with.
+        expected: the kind of file in words.
+        part: how many bytes of it are needed; all if None.
+
+    Raises:
+        LogError: it cannot be read, or is of another kind, which the message names.
     """
     try:
         with open_file(path, most_bytes) as file:
-            content = file.read(part or most_bytes)
+            content = file.read(max(part, NUM_BYTES) if part else most_bytes)
     except OSError as error:
         raise LogError(f"{path}: cannot be read: {error_text(error)}") from error
     if not content.startswith(first):
-        raise LogError(f"{path}: found {content[: len(first)]!r} first, expected {first!r}")
+        raise LogError(f"{path}: found {identify(content[:NUM_BYTES])}, expected {expected}")
     return content
 
 

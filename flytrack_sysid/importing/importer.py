@@ -15,6 +15,7 @@ from flytrack_env.messages import error_text, quote_name, quote_value
 from flytrack_sysid.clocks import ClockOffset, align_clocks
 from flytrack_sysid.importing.bag_log import read_bag
 from flytrack_sysid.importing.betaflight_log import read_betaflight
+from flytrack_sysid.importing.dataflash_log import read_dataflash
 from flytrack_sysid.importing.flight import Craft, ImportedFlight
 from flytrack_sysid.importing.mapping import Manifest, Mapping, load_mapping
 from flytrack_sysid.importing.table_flight import read_csv
@@ -29,6 +30,7 @@ READERS = {
     "csv": lambda path, mapping: [read_csv(path, mapping)],
     "ulog": lambda path, mapping: [read_ulog(path, mapping)],
     "betaflight": read_betaflight,
+    "dataflash": lambda path, mapping: [read_dataflash(path, mapping)],
     "usd": lambda path, mapping: [read_usd(path, mapping)],
     "bag": lambda path, mapping: [read_bag(path, mapping)],
 }
@@ -105,9 +107,10 @@ def import_log(
         raise LogError("found no files to import, expected at least one")
     loaded = Mapping() if mapping is None else load_mapping(mapping)
     read = [
-        flight._replace(log=_used_rows(path, flight.log, loaded))
+        part
         for path in files
         for flight in READERS[format](path, loaded)
+        for part in _parts(flight._replace(log=_used_rows(path, flight.log, loaded)))
     ]
     notes = tuple(note for flight in read for note in flight.notes)
     grounded = [flight for flight in read if _is_grounded(flight.log)]
@@ -127,6 +130,21 @@ def import_log(
         slow = f"body rates at {1.0 / step_s:.3g} Hz: too slow for a rate loop's lag or delay"
         notes += (f"{log.source}: {slow}",)
     return Imported(log, tuple(sources), craft, offsets, notes, tuple(find_problems(log)))
+
+
+def _parts(flight: ImportedFlight) -> list[ImportedFlight]:
+    """Return the segments of a flight as flights of their own; the notes are those of the first."""
+    log = flight.log
+    numbers = np.unique(log.segment)
+    if len(numbers) == 1:
+        return [flight]
+    parts = []
+    for count, number in enumerate(numbers, start=1):
+        part = replace(
+            log.select(log.segment == number), source=f"{log.source}, part {count} of {len(numbers)}"
+        )
+        parts.append(flight._replace(log=part, notes=flight.notes if count == 1 else ()))
+    return parts
 
 
 def _is_grounded(log: FlightLog) -> bool:

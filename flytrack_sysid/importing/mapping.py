@@ -75,8 +75,24 @@ class UsedRows(NamedTuple):
     manifest: Manifest | None = None
 
 
+class CsvFile(NamedTuple):
+    """One of several CSV files of a log, with a clock of its own.
+
+    pattern: of its name, in the folder of the log. time: the column of its times, which begin at ``offset_s``
+    of the log's clock; scale: s per unit of it.
+    """
+
+    pattern: str
+    time: str
+    scale: float
+    offset_s: float = 0.0
+
+
 class Mapping(NamedTuple):
-    """A mapping file: ``channels`` are of its tables of columns; none if it has none."""
+    """A mapping file: ``channels`` are of its tables of columns; none if it has none.
+
+    files: of a log of several CSV files, by the names that columns begin with.
+    """
 
     source: str = "no mapping"
     rows: UsedRows = UsedRows()
@@ -84,6 +100,7 @@ class Mapping(NamedTuple):
     channels: tuple[Channel, ...] = ()
     rules: CommandRules = CommandRules()
     delimiter: str = ","
+    files: dict[str, CsvFile] = {}  # noqa: RUF012, not written to
 
 
 class Fields:
@@ -209,6 +226,7 @@ def load_mapping(where: str | Path) -> Mapping:
         craft=top.table("craft", _craft) or Craft(),
         channels=channels,
         rules=rules,
+        files=top.table("files", _files) or {},
         delimiter=top.take(
             "delimiter", lambda value: _is_text(value) and len(value) == 1, "one character", ","
         ),
@@ -249,6 +267,25 @@ def _channels(top: Fields) -> tuple[tuple[Channel, ...], CommandRules]:
         raise top.error("command", "found together with setpoints of attitude or torque, expected one kind")
     rules = rules._replace(attitude_gain=gain, rate_gain=rate_gain or rules.rate_gain)
     return (*present, *attitudes, *torques, *motors), rules
+
+
+def _files(fields: Fields) -> dict[str, CsvFile]:
+    """Return the files of a log of several, by name."""
+    files = {}
+    for name in list(fields.left):
+        found = fields.table(name, _file)
+        assert found is not None
+        files[name] = found
+    return files
+
+
+def _file(fields: Fields) -> CsvFile:
+    def is_pattern(value: Any) -> bool:
+        return _is_text(value) and Path(value).name == value
+
+    pattern = fields.take("file", is_pattern, "the name of a file in the log's folder, * for any text")
+    scale = _scale(fields, "time")
+    return CsvFile(str(pattern), fields.text("time"), scale, fields.number("offset_s", 0.0))
 
 
 def _rows(fields: Fields) -> UsedRows:
@@ -294,7 +331,7 @@ def _signed_scales(fields: Fields, dimension: str) -> np.ndarray:
 
 
 def _time(fields: Fields) -> Channel:
-    """Return time from 0 on: large numbers of us would cost digits."""
+    """Return the channel of times, s, as they are stamped."""
     if ("column" in fields) == ("step_s" in fields):
         raise fields.error("", "expected either column, with its unit, or step_s, of one row")
     if "step_s" in fields:
@@ -308,8 +345,7 @@ def _time(fields: Fields) -> Channel:
     column, scale = fields.text("column"), _scale(fields, "time")
 
     def convert(table: Table) -> np.ndarray:
-        values = table.matrix([column])
-        return (values - values[0]) * scale
+        return table.matrix([column]) * scale
 
     return Channel(fields.name, "t", (column,), convert)
 

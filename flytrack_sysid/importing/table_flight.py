@@ -8,15 +8,18 @@ import numpy as np
 
 from flytrack_env.messages import quote_name
 from flytrack_sysid.importing.commands import commands_of
+from flytrack_sysid.importing.file_kinds import EMPTY, GZIP, UNKNOWN, check_kind
 from flytrack_sysid.importing.flight import ImportedFlight
-from flytrack_sysid.importing.mapping import Channel, Mapping
+from flytrack_sysid.importing.mapping import Channel, CsvFile, Mapping
 from flytrack_sysid.log import LogError
 from flytrack_sysid.log_file import open_csv, read_columns
 from flytrack_sysid.log_table import Table, columns_of, log_of_table
-from flytrack_sysid.resample import Samples, is_increasing, on_one_base, slow_channels
+from flytrack_sysid.resample import Samples, on_one_base, slow_channels
+from flytrack_sysid.timestamps import MAX_LATENCY_S, number_segments, put_on_one_line, read_clock
 
 LONGEST_LIST = 1000  # characters of a header in a message
 TIMESTAMP = "timestamp"  # column of a table's own times, s
+RECORDED = "recorded"  # column of the times of recording, s, by one clock for all tables
 BASES = ("w", "q", "p")  # the rows are those of the first that is there
 
 
@@ -47,8 +50,14 @@ def channels_in(source: str, headers: Sequence[Iterable[str]], mapping: Mapping)
 def read_csv(path: Path, mapping: Mapping) -> ImportedFlight:
     """Return the flight in a CSV file with a header, by a mapping; SI units and our frames.
 
-    Raises LogError, whose message names file, row, line and column.
+    path: of a folder, if the mapping has several files. Raises LogError, whose message names file, row, line
+    and column.
     """
+    if mapping.files:
+        return _read_files(path, mapping)
+    if path.is_dir():
+        raise LogError(f"{path}: found a folder, expected a file, or files.NAME in {mapping.source}")
+    check_kind(path, "csv", "text with commas, or such compressed by gzip", (EMPTY, GZIP, UNKNOWN))
     with open_csv(path, mapping.delimiter) as rows:
         header = [name.strip() for name in next(rows, [])]
         channels = channels_in(str(path), [header], mapping)
@@ -56,10 +65,58 @@ def read_csv(path: Path, mapping: Mapping) -> ImportedFlight:
         table = read_columns(path, rows, header, wanted)
     if table.lines is None or not len(table.lines):
         raise LogError(f"{path}: found no rows, expected at least one")
-    values = {channel.name: channel.convert(table) for channel, _ in channels}
-    if "t" not in values:
+    by_name = {channel.name: channel for channel, _ in channels}
+    if "t" not in by_name:
         raise LogError(f"{mapping.source}: time: missing, expected a table: every log has it")
-    return _flight(table, values.pop("t")[:, 0], values, mapping)
+    clock = read_clock(str(path), "the rows", by_name.pop("t").convert(table)[:, 0])
+    notes = tuple(f"{path}: {text}" for text in clock.describe("the rows"))
+    times = put_on_one_line(str(path), {"rows": clock}, "rows")["rows"]
+    table = table.select(clock.is_used)
+    values = {name: channel.convert(table) for name, channel in by_name.items()}
+    flight = _flight(table, times - times[0], clock.max_gap_s, values, mapping)
+    return flight._replace(notes=notes + flight.notes)
+
+
+def _read_files(folder: Path, mapping: Mapping) -> ImportedFlight:
+    """Return the flight in several CSV files of a folder, by a mapping whose columns are ``file:column``."""
+    if not folder.is_dir():
+        raise LogError(f"{folder}: found no folder, expected one with the files of {mapping.source}: files")
+    wanted: dict[str, dict[str, None]] = {}
+    for channel in mapping.channels:
+        for column in channel.columns:
+            name, colon, field = column.partition(":")
+            if name not in mapping.files or not colon:
+                expected = f"expected file:column, where file is one of {', '.join(mapping.files)}"
+                found = f"{mapping.source}: {channel.table}: found {quote_name(column)}"
+                raise LogError(f"{found}, {expected}")
+            wanted.setdefault(name, {})[field] = None
+    tables = []
+    for name, fields in wanted.items():
+        file = mapping.files[name]
+        paths = sorted(folder.glob(file.pattern))
+        if len(paths) != 1:
+            listed = ", ".join(quote_name(path.name) for path in sorted(folder.iterdir()))[:LONGEST_LIST]
+            found = f"found {len(paths)} files of the name {quote_name(file.pattern)} among {listed}"
+            raise LogError(f"{folder}: {found}; expected one by {mapping.source}: files.{name}")
+        tables.append(_read_file(paths[0], name, file, list(fields), mapping))
+    return flight_of_topics(str(folder), tables, mapping)
+
+
+def _read_file(path: Path, name: str, file: CsvFile, fields: list[str], mapping: Mapping) -> Table:
+    """Return the wanted columns of one of several files, named ``file:column``, and its times, s."""
+    with open_csv(path, mapping.delimiter) as rows:
+        header = [column.strip() for column in next(rows, [])]
+        for column in (file.time, *fields):
+            if header.count(column) != 1:
+                listed = ", ".join(map(quote_name, header))[:LONGEST_LIST]
+                found = (
+                    f"{path}: column {quote_name(column)}: found {header.count(column)} times among {listed}"
+                )
+                raise LogError(f"{found}; expected once by {mapping.source}: files.{name}")
+        table = read_columns(path, rows, header, dict.fromkeys((file.time, *fields)))
+    columns = {f"{name}:{field}": table.columns[field] for field in fields}
+    times = table.columns[file.time] * file.scale + file.offset_s
+    return Table(str(path), {TIMESTAMP: times, **columns}, table.lines)
 
 
 def flight_of_topics(source: str, topics: Sequence[Table], mapping: Mapping) -> ImportedFlight:
@@ -69,37 +126,50 @@ def flight_of_topics(source: str, topics: Sequence[Table], mapping: Mapping) -> 
     interpolated, commands held. There are no rows where a channel has a gap of more than three of its usual
     steps.
     """
-    samples, said = {}, list[str]()
+    samples, clocks, latencies_s, said = {}, {}, {}, list[str]()
     for channel, number in channels_in(source, [topic.columns for topic in topics], mapping):
         topic = topics[number]
         if channel.name == "t":
             raise LogError(f"{mapping.source}: time: found a table, expected none: the log has its own times")
-        is_finite = np.isfinite(topic.matrix([TIMESTAMP, *channel.columns])).all(axis=1)
+        is_finite = np.isfinite(topic.matrix(channel.columns)).all(axis=1)
         if not is_finite.any():
             raise LogError(f"{source}: {channel.table}: found no row of finite numbers, expected some")
-        if not is_finite.all():
-            said.append(f"{np.sum(~is_finite)} rows of {channel.table} left out: not finite numbers")
-        kept = topic._replace(columns={name: values[is_finite] for name, values in topic.columns.items()})
-        is_used = is_increasing(kept.columns[TIMESTAMP])
-        samples[channel.name] = Samples(kept.columns[TIMESTAMP][is_used], channel.convert(kept)[is_used])
-    base = next((samples[name].times for name in BASES if name in samples), None)
-    if base is None:
+        clock = read_clock(source, channel.table, np.where(is_finite, topic.columns[TIMESTAMP], np.nan))
+        said += [text for text in clock.describe(channel.table) if text not in said]
+        kept = topic.select(clock.is_used)
+        clocks[channel.name], samples[channel.name] = clock, Samples(clock.times, channel.convert(kept))
+        if RECORDED in topic.columns:
+            latencies_s[channel.name] = float(np.median(kept.columns[RECORDED] - clock.times))
+    base_name = next((name for name in BASES if name in samples), None)
+    if base_name is None:
         raise LogError(f"{source}: {mapping.source}: rates: missing; attitude or position may replace them")
+    for name, latency_s in latencies_s.items():
+        early_s = latency_s - latencies_s.get(base_name, latency_s)
+        if abs(early_s) > MAX_LATENCY_S:
+            clocks[name] = clocks[name]._replace(times=clocks[name].times + early_s)
+            found = f"stamps of {name} are {early_s:+.6g} s before those of {base_name}, by their recording"
+            said.append(f"{found}: moved by this, so that {name} is as late as recorded")
+    times = put_on_one_line(source, clocks, base_name)
+    samples = {name: Samples(times[name], values) for name, (_, values) in samples.items()}
+    base = times[base_name]
     values, is_known = on_one_base(samples, base)
     if not is_known.any():
         raise LogError(f"{source}: found no time at which all channels are known, expected some")
     values = {name: rows[is_known] for name, rows in values.items()}
-    flight = _flight(Table(source, {}), base[is_known] - base[is_known][0], values, mapping)
+    since_start = base[is_known] - base[is_known][0]
+    flight = _flight(Table(source, {}), since_start, clocks[base_name].max_gap_s, values, mapping)
     said += slow_channels(samples)
     if not is_known.all():
-        said.append(f"{np.sum(~is_known)} of {len(base)} rows left out: not all channels are known there")
+        count = f"{np.sum(~is_known)} of {len(clocks[base_name].is_used)} rows"
+        said.append(f"{count} left out: not all channels are known there")
     return flight._replace(notes=(*(f"{source}: {text}" for text in said), *flight.notes))
 
 
 def _flight(
-    table: Table, time: np.ndarray, values: dict[str, np.ndarray], mapping: Mapping
+    table: Table, time: np.ndarray, max_gap_s: float, values: dict[str, np.ndarray], mapping: Mapping
 ) -> ImportedFlight:
-    """Return the flight of converted channels."""
+    """Return the flight of converted channels; longer steps than the gap begin a new segment."""
     commands, notes = commands_of(table.source, time, values, mapping.rules, mapping.craft.max_rate_deg_s)
     columns = columns_of(time, {**values, "u": commands})
+    columns["segment"] = number_segments(time, max_gap_s)
     return ImportedFlight(log_of_table(table._replace(columns=columns)), mapping.craft, notes)

@@ -15,7 +15,8 @@ from flytrack_sysid.importing.mapping import Mapping
 from flytrack_sysid.importing.units import PER_DEGREE, UNITS, quaternion_from, vector_from
 from flytrack_sysid.log import LogError
 from flytrack_sysid.log_table import LARGEST_NORM_ERROR, Table, columns_of, log_of_table
-from flytrack_sysid.resample import Samples, is_increasing, on_one_base, slow_channels
+from flytrack_sysid.resample import Samples, on_one_base, slow_channels
+from flytrack_sysid.timestamps import MAX_LATENCY_S, Clock, number_segments, put_on_one_line, read_clock
 
 LARGEST_BYTES = 2**29  # the decoder may take time and memory in proportion
 FIRST_BYTES = b"ULog\x01\x12\x35"
@@ -30,7 +31,15 @@ RATE_PARAMETERS = (
 
 # Of MAVLink's MAV_TYPE, and of PX4's airframes by thousands of SYS_AUTOSTART.
 VTOL, HEXACOPTER, OCTOCOPTER = "a VTOL", "a hexacopter", "an octocopter"
-AIRFRAMES = {1: "a plane", 4: "a helicopter", 13: HEXACOPTER, 14: OCTOCOPTER, 15: "a tricopter"}
+OTHER_VEHICLES = {
+    1: "a plane",
+    7: "an airship",
+    8: "a balloon",
+    10: "a rover",
+    11: "a boat",
+    12: "a submarine",
+}
+AIRFRAMES = {4: "a helicopter", 13: HEXACOPTER, 14: OCTOCOPTER, 15: "a tricopter"}
 AIRFRAMES |= dict.fromkeys(range(19, 26), VTOL)
 FRAMES = {**dict.fromkeys((6, 7, 11), HEXACOPTER), **dict.fromkeys((8, 9, 12), OCTOCOPTER), 13: VTOL}
 
@@ -57,6 +66,7 @@ SOURCES: dict[str, tuple[Source, ...]] = {
 }
 REQUIRED = ("w", "u", "q")
 TIMES = ("timestamp", "timestamp_sample")
+EVENTS = ("vehicle_land_detected",)  # topics that are published when something changes
 
 
 def read_ulog(path: Path, mapping: Mapping) -> ImportedFlight:
@@ -69,7 +79,7 @@ def read_ulog(path: Path, mapping: Mapping) -> ImportedFlight:
         raise LogError(
             f"{mapping.source}: motors.as_thrust: not read of PX4 logs: actuator outputs are too slow"
         )
-    samples, parameters, is_damaged = _decode(path)
+    samples, clocks, parameters, said = _decode(path)
     craft = mapping.craft
     if craft.max_rate_deg_s is None:
         craft = craft._replace(max_rate_deg_s=_full_stick_deg_s(path, parameters))
@@ -92,9 +102,10 @@ def read_ulog(path: Path, mapping: Mapping) -> ImportedFlight:
         raise LogError(f"{path}: found {found}, {is_flying.sum()} in flight, expected some that are both")
     used_channels = {name: values[is_used] for name, values in channels.items()}
     columns = columns_of(base[is_used] - base[is_used][0], used_channels)
-    used = f"{is_used.sum()} of {len(base)} samples of the rates used, {is_flying.sum()} in flight"
-    said = [used, *["damaged in places; what could be read is used"] * is_damaged, *_airframe(parameters)]
-    notes = tuple(f"{path}: {text}" for text in [*said, *slow_channels(ours)])
+    columns["segment"] = number_segments(base[is_used], clocks["w"].max_gap_s)
+    num_rows = len(clocks["w"].is_used)
+    used = f"{is_used.sum()} of {num_rows} samples of the rates used, {is_flying.sum()} in flight"
+    notes = tuple(f"{path}: {text}" for text in [used, *said, *_airframe(parameters), *slow_channels(ours)])
     return ImportedFlight(log_of_table(Table(str(path), columns)), craft, notes)
 
 
@@ -108,42 +119,67 @@ def _airframe(parameters: dict[str, float]) -> list[str]:
     return [not_a_quadcopter(f"{num_rotors} rotors (CA_ROTOR_COUNT)")] if num_rotors not in (0, 4) else []
 
 
-def _decode(path: Path) -> tuple[dict[str, Samples], dict[str, float], bool]:
-    """Return the samples of the log by channel, its parameters, and whether it is damaged in places."""
-    read_log_file(path, LARGEST_BYTES, FIRST_BYTES, len(FIRST_BYTES))
+def _decode(path: Path) -> tuple[dict[str, Samples], dict[str, Clock], dict[str, float], list[str]]:
+    """Read the topics of a log.
+
+    Returns:
+        The samples by channel, on one time line; the clocks by channel; the log's parameters; and what was
+        found wrong.
+    """
+    read_log_file(path, LARGEST_BYTES, FIRST_BYTES, "a PX4 log (ULog)", len(FIRST_BYTES))
     fields: dict[str, list[str]] = {}
     for topic, names in (source for sources in SOURCES.values() for source in sources):
         fields[topic] = [*fields.get(topic, TIMES), *names]
     notes, arrays = decode(str(path), "ulog", path, fields)
+    vehicle = OTHER_VEHICLES.get(int(notes["parameters"].get("MAV_TYPE", 0)))
+    if vehicle:
+        raise LogError(f"{path}: found a log of {vehicle} (MAV_TYPE), expected one of a multicopter")
     topics: dict[str, dict[str, np.ndarray]] = {}
     for (topic, field), values in zip(notes["fields"], arrays, strict=True):
         topics.setdefault(topic, {})[field] = values
-    samples = {}
+    samples, clocks = {}, {}
+    said = ["damaged in places; what could be read is used"] if notes["is_damaged"] else []
     for channel, sources in SOURCES.items():
-        found = next(
-            filter(None, (_samples_of(topics.get(topic, {}), names) for topic, names in sources)), None
-        )
-        if found is not None:
-            samples[channel] = found
-        elif channel in REQUIRED:
+        for topic, names in sources:
+            found = _samples_of(path, topic, topics.get(topic, {}), names)
+            if found is not None:
+                samples[channel], clocks[channel], faults = found
+                said += [text for text in faults if text not in said]  # channels share topics
+                break
+        if channel not in samples and channel in REQUIRED:
             wanted = " or ".join(f"{topic} ({', '.join(names)})" for topic, names in sources)
             there = ", ".join(sorted(topics)) or "none of the topics that are read"
             raise LogError(f"{path}: topic {wanted}: missing or empty; found {there}")
-    return samples, notes["parameters"], notes["is_damaged"]
+    times = put_on_one_line(str(path), clocks, "w")
+    samples = {channel: Samples(times[channel], values) for channel, (_, values) in samples.items()}
+    return samples, clocks, notes["parameters"], said
 
 
-def _samples_of(topic: dict[str, np.ndarray], fields: tuple[str, ...]) -> Samples | None:
-    """Return the finite samples of some fields, None if there are none."""
+def _samples_of(
+    path: Path, name: str, topic: dict[str, np.ndarray], fields: tuple[str, ...]
+) -> tuple[Samples, Clock, list[str]] | None:
+    """Return the samples of some fields of a topic, their clock, and what was found wrong; None without any.
+
+    Times are those at which a sensor was read, if the topic has them, else those of publishing.
+    """
     if any(field not in topic for field in ("timestamp", *fields)):
         return None
-    # The time a sensor was read, where the topic has it; else when it was published.
-    times = topic.get("timestamp_sample", topic["timestamp"])
-    times = times if np.all(times > 0) else topic["timestamp"]
     values = np.stack([topic[field] for field in fields], axis=1)
     is_finite = np.isfinite(values).all(axis=1)
-    times, values = times[is_finite] * MICROSECOND, values[is_finite]
-    is_used = is_increasing(times)
-    return Samples(times[is_used], values[is_used]) if is_used.any() else None
+    if not is_finite.any():
+        return None
+    times, faults = topic["timestamp"] * MICROSECOND, list[str]()
+    if "timestamp_sample" in topic:
+        sampled = topic["timestamp_sample"] * MICROSECOND
+        latency_s = float(np.median(times - sampled))
+        if np.median(sampled) > 0.0 and abs(latency_s) <= MAX_LATENCY_S:
+            times = sampled
+        elif np.any(sampled > 0.0):
+            found = f"timestamp_sample of {name} is {latency_s:.6g} s before timestamp"
+            faults.append(f"{found}, more than {MAX_LATENCY_S:g} s: its rows are at timestamp")
+    clock = read_clock(str(path), name, np.where(is_finite, times, np.nan), name in EVENTS)
+    faults += clock.describe(name)
+    return Samples(clock.times, values[clock.is_used]), clock, faults
 
 
 def _attitude(path: Path, samples: Samples) -> Samples:
@@ -169,6 +205,7 @@ def _full_stick_deg_s(path: Path, parameters: dict[str, float]) -> tuple[float, 
         known = [parameters[name] for name in names if name in parameters]
         if not known or max(known) <= 0.0:
             missing = f"{path}: parameter {' or '.join(names)}: missing, so full stick is unknown"
+            missing = "; ".join([missing, *_airframe(parameters)])
             raise LogError(f"{missing}; a mapping can state craft.max_rate_deg_s")
         rates.append(float(max(known)))
     roll, pitch, yaw = rates

@@ -40,7 +40,7 @@ def read_usd(path: Path, mapping: Mapping) -> ImportedFlight:
 
     Raises LogError for what is no such log, or lacks a variable that the mapping names.
     """
-    content = read_log_file(path, LARGEST_BYTES, FIRST_BYTE)
+    content = read_log_file(path, LARGEST_BYTES, FIRST_BYTE, "a Crazyflie uSD log")
     try:
         stamp_s, events, end = _header(content)
     except (struct.error, ValueError) as error:

@@ -123,7 +123,9 @@ CSV = foreign_logs.foreign_csv()
 DRAGGED = nominal_parameters().with_effects(QuadraticDrag(0.1, 0.1, 0.2))
 save_drag = partial(save_model, model=DRAGGED, provenance={})
 load_csv, load_usd, load_bag = (partial(import_mapped, form=form) for form in ("csv", "usd", "bag"))
-load_ulog, load_blackbox = (partial(import_log, format=form) for form in ("ulog", "betaflight"))
+load_ulog, load_blackbox, load_dataflash = (
+    partial(import_log, format=form) for form in ("ulog", "betaflight", "dataflash")
+)
 KINDS = {
     "track": Kind(".toml", TRACK, load_track, TrackError, hostile_texts),
     "model": Kind(".json", save_drag, load_model, ModelFileError, hostile_texts),
@@ -139,6 +141,13 @@ KINDS = {
     "imported CSV, gzip": Kind(".csv.gz", gzip.compress(CSV, mtime=0), load_csv, LogError, hostile_gzips),
     "imported PX4 log": Kind(".ulg", foreign_logs.ulog(), load_ulog, LogError, is_slow=True),
     "imported Betaflight log": Kind(".bbl", foreign_logs.betaflight(), load_blackbox, LogError, is_slow=True),
+    "imported ArduPilot log": Kind(
+        ".bin",
+        foreign_logs.small_dataflash(1.0 + 0.01 * np.arange(30)),
+        load_dataflash,
+        LogError,
+        is_slow=True,
+    ),
     "imported uSD log": Kind("", foreign_logs.usd(), load_usd, LogError),
     "imported bag": Kind(".mcap", foreign_logs.save_bag, load_bag, LogError, is_slow=True),
     "training settings": Kind(".toml", SETTINGS, settings_in_file, ConfigError, hostile_texts),

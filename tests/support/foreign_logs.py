@@ -3,13 +3,14 @@
 import json
 import struct
 import zlib
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from tests.support.tables import table
+from tests.support.written_logs import read_mapping
 
 ULOG_TYPES = {"uint64_t": "Q", "float": "f", "bool": "?", "uint8_t": "B"}
 NUM_ROWS = 30
@@ -127,7 +128,9 @@ def blackbox_frames(num_rows: int = 200) -> np.ndarray:
     return found
 
 
-def usd_log(events: dict[str, tuple[dict[str, str], np.ndarray]], version: int = 2) -> bytes:
+def usd_log(
+    events: dict[str, tuple[dict[str, str], np.ndarray]], version: int = 2, in_order: bool = True
+) -> bytes:
     """Return a Crazyflie's uSD log: of each event its variables, and rows with the time in s first."""
     stamp, per_s = {1: ("I", 1e3), 2: ("Q", 1e6)}[version]
     header, records = struct.pack("<BHH", 0xBC, version, len(events)), []
@@ -140,7 +143,8 @@ def usd_log(events: dict[str, tuple[dict[str, str], np.ndarray]], version: int =
                 f"<H{stamp}{''.join(variables.values())}", number, round(time * per_s), *values
             )
             records.append((time, content))
-    content = header + b"".join(content for _, content in sorted(records, key=lambda record: record[0]))
+    records = sorted(records, key=lambda record: record[0]) if in_order else records
+    content = header + b"".join(content for _, content in records)
     return content + struct.pack("<I", zlib.crc32(content))
 
 
@@ -196,3 +200,165 @@ def foreign_csv() -> bytes:
     rows[:, 0], rows[:, 1:5], rows[:, -1] = 10.0 * np.arange(NUM_ROWS), 1500.0, 16_000.0
     lines = [",".join(names), *(",".join(f"{value:.6g}" for value in row) for row in rows)]
     return ("\n".join(lines) + "\n").encode()
+
+
+DATAFLASH_HEAD, DATAFLASH_FORMAT = b"\xa3\x95", 128
+# Of a type of value by its letter: that of ``struct``, and the factor of what is written.
+DATAFLASH_TYPES = {
+    "Q": ("Q", 1),
+    "f": ("f", 1),
+    "B": ("B", 1),
+    "H": ("H", 1),
+    "c": ("h", 100),
+    "N": ("16s", 1),
+}
+DATAFLASH_TYPES |= {"Z": ("64s", 1), "n": ("4s", 1), "b": ("b", 1)}
+COPTER_PARAMETERS = {"ACRO_RP_RATE": 360.0, "ACRO_Y_RATE": 180.0, "ATC_RATE_R_MAX": 500.0, "FRAME_CLASS": 1.0}
+
+
+def dataflash(
+    messages: dict[str, tuple[str, str, list[tuple[Any, ...]]]],
+    parameters: dict[str, float] = COPTER_PARAMETERS,
+    text: str = "ArduCopter V4.5.1 (d4a1b2c3)",
+) -> bytes:
+    """Return an ArduPilot log by its specification: each message with types, names of fields, and rows.
+
+    The first value of a row is the time, us; messages are written one kind after the other.
+    """
+    known = {
+        "FMT": ("BBnNZ", "Type,Length,Name,Format,Columns", []),
+        "PARM": ("QNf", "TimeUS,Name,Value", [(0, name, value) for name, value in parameters.items()]),
+        "MSG": ("QZ", "TimeUS,Message", [(0, text)]),
+        **messages,
+    }
+
+    def packed(number: int, types: str, row: tuple[Any, ...]) -> bytes:
+        pattern = "<" + "".join(DATAFLASH_TYPES[kind][0] for kind in types)
+        values = [
+            value.encode()
+            if isinstance(value, str)
+            else value * factor
+            if kind == "f"
+            else round(value * factor)
+            for kind, value, factor in zip(
+                types, row, (DATAFLASH_TYPES[kind][1] for kind in types), strict=True
+            )
+        ]
+        return DATAFLASH_HEAD + bytes([number]) + struct.pack(pattern, *values)
+
+    content, rows = b"", list[bytes]()
+    for number, (name, (types, columns, values)) in enumerate(known.items(), start=DATAFLASH_FORMAT):
+        size = 3 + struct.calcsize("<" + "".join(DATAFLASH_TYPES[kind][0] for kind in types))
+        content += packed(DATAFLASH_FORMAT, "BBnNZ", (number, size, name, types, columns))
+        rows += [packed(number, types, row) for row in values]
+    return content + b"".join(rows)
+
+
+RATE_COLUMNS = "TimeUS,RDes,R,ROut,PDes,P,POut,YDes,Y,YOut,ADes,A,AOut"
+
+
+def small_dataflash(stamps_s: np.ndarray) -> bytes:
+    """Return an ArduPilot log of rates alone, with these stamps."""
+    rows = [
+        (round(1e6 * stamp_s), 180.0, 0.0, 0, 90.0, 0.0, 0, -45.0, float(row), 0, 0, 0, 0.6)
+        for row, stamp_s in enumerate(stamps_s)
+    ]
+    return dataflash({"RATE": ("Qffffffffffff", RATE_COLUMNS, rows)})
+
+
+def dataflash_with_clock(folder: Path, stamps_s: np.ndarray) -> tuple[Path, None]:
+    """Write an ArduPilot log whose messages have these stamps."""
+    (folder / "a.bin").write_bytes(small_dataflash(stamps_s))
+    return folder / "a.bin", None
+
+
+# Logs of a drone that turns about z at as many deg/s as rows are before, so that rows can be told apart.
+CLOCK_STICKS = (0.5, -0.25, 0.1, 0.3)
+
+
+def ulog_with_clock(folder: Path, stamps_s: np.ndarray) -> tuple[Path, None]:
+    """Write a PX4 log whose topics all have these stamps."""
+    stamps_us = np.round(1e6 * stamps_s).astype(int)
+    turn = [(int(time), 0.0, 0.0, np.deg2rad(row)) for row, time in enumerate(stamps_us)]
+    setpoints = constant((*np.deg2rad([360.0, 90.0, -45.0]), 0.0, 0.0, -0.75), stamps_us)
+    tables = {
+        "vehicle_angular_velocity": ([("float", "xyz", 3)], turn),
+        "vehicle_attitude": ([("float", "q", 4)], constant(EAST, stamps_us)),
+        "vehicle_rates_setpoint": ([*SETPOINT, ("float", "thrust_body", 3)], setpoints),
+    }
+    (folder / "a.ulg").write_bytes(ulog(tables))
+    return folder / "a.ulg", None
+
+
+def betaflight_with_clock(folder: Path, stamps_s: np.ndarray) -> tuple[Path, None]:
+    """Write a blackbox log with these stamps."""
+    rows = blackbox_frames(len(stamps_s))
+    rows[:, 1], rows[:, 9] = np.round(1e6 * stamps_s), np.arange(len(stamps_s))
+    rows[:, 5] = 500
+    (folder / "a.bbl").write_bytes(blackbox(rows, BLACKBOX_NAMES, BLACKBOX_HEADERS))
+    return folder / "a.bbl", None
+
+
+def _sticks_and_turn(stamps_s: np.ndarray) -> np.ndarray:
+    """Return rows of stamps, sticks and rates in deg/s, (num_rows, 8)."""
+    num_rows = len(stamps_s)
+    still, count = np.zeros(num_rows), np.arange(num_rows)
+    return np.column_stack([stamps_s, np.tile(CLOCK_STICKS, (num_rows, 1)), still, still, count])
+
+
+USD_NAMES = ("roll", "pitch", "yaw", "thrust", "gyro.x", "gyro.y", "gyro.z", "pm.vbat")
+
+
+def usd_with_clock(folder: Path, stamps_s: np.ndarray) -> tuple[Path, Path]:
+    """Write a uSD log with these stamps."""
+    rows = np.column_stack([_sticks_and_turn(stamps_s), np.full(len(stamps_s), 3900.0)])
+    events = {"fixedFrequency": (dict.fromkeys(USD_NAMES, "f"), rows)}
+    (folder / "log00").write_bytes(usd_log(events, in_order=False))
+    return folder / "log00", _with_mapping(folder, "usd")
+
+
+def bag_with_clock(folder: Path, stamps_s: np.ndarray) -> tuple[Path, Path]:
+    """Write an MCAP file of messages with these stamps, recorded at a steady rate."""
+    messages = []
+    for row, stamp_s in enumerate(stamps_s):
+        sec, nanosec = divmod(round(1e9 * stamp_s), 10**9)
+        header = {"stamp": {"sec": sec, "nanosec": nanosec}}
+        rates = {"x": 0.0, "y": 0.0, "z": np.deg2rad(row)}
+        messages.append(("/flight", row * 4_000_000, {"header": header, "u": CLOCK_STICKS, "w": rates}))
+    save_messages(folder / "a.mcap", messages)
+    return folder / "a.mcap", _with_mapping(folder, "bag")
+
+
+def csv_with_clock(folder: Path, stamps_s: np.ndarray) -> tuple[Path, Path]:
+    """Write a CSV file with these stamps."""
+    rows = _sticks_and_turn(stamps_s)
+    np.savetxt(folder / "a.csv", rows, "%.9f", ",", header="t,roll,pitch,yaw,thrust,p,q,r", comments="")
+    return folder / "a.csv", _with_mapping(folder, "clock")
+
+
+def csv_files_with_clock(folder: Path, stamps_s: np.ndarray) -> tuple[Path, Path]:
+    """Write two CSV files with these stamps, the second 0.5 ms earlier, in ms from 50 s on."""
+    rows, flight = _sticks_and_turn(stamps_s), folder / "flight"
+    flight.mkdir()
+    sticks = np.column_stack([1e3 * (rows[:, 0] - 50.0005), rows[:, 1:5]])
+    np.savetxt(flight / "x_gyro_0.csv", rows[:, [0, 5, 6, 7]], "%.9f", ",", header="t,p,q,r", comments="")
+    np.savetxt(flight / "x_rc_0.csv", sticks, "%.9f", ",", header="ms,roll,pitch,yaw,thrust", comments="")
+    return flight, _with_mapping(folder, "files")
+
+
+def _with_mapping(folder: Path, name: str) -> Path:
+    """Copy a mapping of the tests into a folder."""
+    (folder / "map.toml").write_text(read_mapping(name))
+    return folder / "map.toml"
+
+
+# Of each kind of log: its format, and what writes it with given stamps.
+CLOCK_WRITERS: dict[str, tuple[str, Callable[[Path, np.ndarray], tuple[Path, Path | None]]]] = {
+    "ULog": ("ulog", ulog_with_clock),
+    "blackbox": ("betaflight", betaflight_with_clock),
+    "DataFlash": ("dataflash", dataflash_with_clock),
+    "uSD": ("usd", usd_with_clock),
+    "bag": ("bag", bag_with_clock),
+    "CSV": ("csv", csv_with_clock),
+    "CSV files": ("csv", csv_files_with_clock),
+}

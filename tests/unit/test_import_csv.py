@@ -11,6 +11,7 @@ from flytrack.cli import main
 from flytrack_env import load_model, nominal_parameters
 from flytrack_sysid import FlightLog, LogError, import_log, load_log
 from flytrack_sysid.importing.flight import Craft
+from tests.support.foreign_logs import csv_files_with_clock
 from tests.support.made_flight import GRAVITY, TIME_S, flight
 from tests.support.tables import table
 from tests.support.written_logs import read_mapping
@@ -89,7 +90,6 @@ def test_wrong_mappings_are_refused(folder, tmp_path, old, new, message):
     ("row", "change", "message"),
     [
         (4, lambda cells: [*cells[:3], "", *cells[4:]], r"row 3 \(line 5\), column d: found an empty cell"),
-        (4, lambda cells: ["0", *cells[1:]], r"row 3 \(line 5\), column t: found -5\.0.*later time"),
         (0, lambda cells: ["ms", *cells[:-1]], r"column n: found .*|column ms: found 2 times"),
     ],
 )
@@ -110,6 +110,63 @@ def test_missing_and_unmapped_files_are_refused(folder, tmp_path):
     ):
         with pytest.raises(LogError, match=message):
             import_log(path, format_name, mapping)
+
+
+FILES = read_mapping("files")
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        (
+            '"*_rc_0.csv"',
+            '"*_rc_1.csv"',
+            r"flight: found 0 files of the name \*_rc_1\.csv among x_gyro_0\.csv, x_rc_0",
+        ),
+        ('"*_rc_0.csv"', '"*.csv"', r"flight: found 2 files .*expected one by .*map\.toml: files\.rc"),
+        (
+            '"*_rc_0.csv"',
+            '"../*.csv"',
+            r"files\.rc\.file: found '\.\./\*\.csv', expected the name of a file in",
+        ),
+        (
+            '"gyro:p"',
+            '"p"',
+            r"map\.toml: rates: found p, expected file:column, where file is one of gyro, rc",
+        ),
+        (
+            '"gyro:p"',
+            '"gyro:x"',
+            r"x_gyro_0\.csv: column x: found 0 times among t, p, q, r; expected once by",
+        ),
+        ('time = "ms"', 'time = "us"', r"x_rc_0\.csv: column us: found 0 times among ms, roll"),
+        (
+            "offset_s = 50.0",
+            "",
+            r"clock of u: found 49\.9995\d* to .*, that of w 100\.0+ to .*expected times in common",
+        ),
+    ],
+)
+def test_wrong_mappings_of_several_files_are_refused(tmp_path, old, new, message):
+    path, mapping = csv_files_with_clock(tmp_path, 100.0 + 0.01 * np.arange(200))
+    mapping.write_text(FILES.replace(old, new, 1))
+    with pytest.raises(LogError, match=message):
+        import_log(path, "csv", mapping)
+
+
+def test_several_files_keep_their_own_clocks(tmp_path):
+    path, mapping = csv_files_with_clock(tmp_path, 100.0 + 0.01 * np.arange(200))
+    late = np.loadtxt(path / "x_rc_0.csv", delimiter=",", skiprows=1)[::2]
+    late[:, 1] = np.linspace(-1.0, 1.0, len(late))
+    np.savetxt(path / "x_rc_0.csv", late, "%.9f", ",", header="ms,roll,pitch,yaw,thrust", comments="")
+    log = import_log(path, "csv", mapping).log
+    np.testing.assert_allclose(log["u"][:, 0], np.repeat(late[:, 1], 2)[: len(log)], atol=1e-8)  # held
+    for folder, message in ((path / "x_rc_0.csv", "found no folder"), (tmp_path / "no", "found no folder")):
+        with pytest.raises(LogError, match=message):
+            import_log(folder, "csv", mapping)
+    with pytest.raises(LogError, match=r"flight: found a folder, expected a file, or files\.NAME in"):
+        (tmp_path / "one.toml").write_text(read_mapping("clock"))
+        import_log(path, "csv", tmp_path / "one.toml")
 
 
 def test_nominal_model_hovers_where_the_nominal_craft_does():

@@ -113,7 +113,9 @@ def test_samples_from_before_the_estimator_runs_are_left_out(tmp_path):
 def test_other_files_and_a_missing_package_are_named(tmp_path, monkeypatch):
     path = write(tmp_path / "a.ulg", topics())
     (tmp_path / "b.ulg").write_bytes(b"time,x\n0,1\n")
-    with pytest.raises(LogError, match=r"b\.ulg: found b'time,x.*expected b'ULog"):
+    with pytest.raises(
+        LogError, match=r"b\.ulg: found text \(--format csv reads it\), expected a PX4 log \(ULog\)"
+    ):
         import_log(tmp_path / "b.ulg", "ulog")
     monkeypatch.setitem(sys.modules, "pyulog", None)
     with pytest.raises(LogError, match=r"a\.ulg: ulog logs need pyulog.*flytrack\[logs\]"):
@@ -158,3 +160,36 @@ def test_a_real_hexacopter_is_told():
     found = import_log(shared("px4_h520") / "3DRFlight_1.ulg", "ulog")
     said = " ".join(found.notes)
     assert "found a hexacopter (MAV_TYPE 13), not a quadcopter" in said and "u at 31.2 Hz, held" in said
+
+
+@pytest.mark.parametrize(("mav_type", "vehicle"), [(1, "a plane"), (10, "a rover")])
+def test_other_vehicles_are_refused_for_what_they_are(tmp_path, mav_type, vehicle):
+    """Not for the rate parameters or topics of a multicopter, which they lack."""
+    path = write(tmp_path / "a.ulg", {}, {"MAV_TYPE": float(mav_type)})
+    with pytest.raises(
+        LogError, match=rf"a\.ulg: found a log of {vehicle} \(MAV_TYPE\), expected one of a multi"
+    ):
+        import_log(path, "ulog")
+
+
+def test_a_helicopter_without_rate_parameters_is_told_as_one(tmp_path):
+    path = write(tmp_path / "a.ulg", topics(), {"MAV_TYPE": 4.0})
+    with pytest.raises(
+        LogError, match=r"full stick is unknown; found a helicopter \(MAV_TYPE 4\), not a quad"
+    ):
+        import_log(path, "ulog")
+
+
+@pytest.mark.parametrize("microseconds", [7_200_000_000, 2**32])
+def test_stamps_of_samples_from_another_clock_give_way_to_those_of_publishing(tmp_path, microseconds):
+    tables = topics()
+    for name, (fields, rows) in tables.items():
+        sampled = [(row[0], row[0] - (microseconds if "velocity" in name else 500), *row[1:]) for row in rows]
+        later = [
+            (stamp + 2 * microseconds, sample + 2 * microseconds, *rest) for stamp, sample, *rest in sampled
+        ]
+        tables[name] = ([("uint64_t", "timestamp_sample", 0), *fields], later)
+    found = import_log(write(tmp_path / "a.ulg", tables), "ulog")
+    assert len(found.log) == 195  # the last attitude was sampled 0.5 ms before its row
+    expected = f"timestamp_sample of vehicle_angular_velocity is {microseconds * 1e-6:.6g} s before timestamp"
+    assert any(expected in note for note in found.notes)

@@ -1,0 +1,251 @@
+"""ArduPilot's DataFlash logs (``.bin``), decoded by pymavlink: NED and FRD converted to our frames.
+
+Source of messages, fields and units: ardupilot.org/copter/docs/logmessages.html. A message that comes from
+several sensors has an instance.
+"""
+
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from flytrack_env.messages import quote_name
+from flytrack_sysid.importing.decoding import decode
+from flytrack_sysid.importing.flight import ImportedFlight, not_a_quadcopter, read_log_file
+from flytrack_sysid.importing.mapping import Channel, Mapping
+from flytrack_sysid.importing.table_flight import TIMESTAMP, flight_of_topics
+from flytrack_sysid.importing.units import PER_DEGREE, UNITS, quaternion_from, vector_from
+from flytrack_sysid.log import LogError
+from flytrack_sysid.log_table import Table
+
+LARGEST_BYTES = 2**29  # the decoder may take time and memory in proportion
+FIRST_BYTES = b"\xa3\x95"
+VEHICLE = "ArduCopter"
+OTHER_VEHICLES = ("ArduPlane", "ArduRover", "ArduSub", "AntennaTracker", "Blimp", "Rover")
+TIME = "TimeUS"
+GYROSCOPE, ACCELEROMETER = ("GyrX", "GyrY", "GyrZ"), ("AccX", "AccY", "AccZ")
+RATES, SETPOINTS, THROTTLE = ("R", "P", "Y"), ("RDes", "PDes", "YDes"), "AOut"
+QUATERNION, EULER_DEG = ("Q1", "Q2", "Q3", "Q4"), ("Roll", "Pitch", "Yaw")
+VELOCITY, POSITION = ("VN", "VE", "VD"), ("PN", "PE", "PD")
+HEALTH = ("GH", "AH")  # 1: gyroscope and accelerometer of this instance are healthy
+NUM_OUTPUTS = 14  # C1 to C14 of RCOU
+FIELDS: dict[str, tuple[str, ...]] = {
+    "RATE": (*RATES, *SETPOINTS, THROTTLE),
+    "IMU": (*GYROSCOPE, *ACCELEROMETER, *HEALTH),
+    "XKQ": QUATERNION,
+    "ATT": EULER_DEG,
+    "XKF1": (*VELOCITY, *POSITION),
+    "BAT": ("Volt",),
+    "RCOU": tuple(f"C{number}" for number in range(1, NUM_OUTPUTS + 1)),
+}
+# Full stick of roll, pitch, yaw, deg/s: the rate of acro mode (before 4.1: a gain, with the degrees of the
+# firmware's full stick), and the limit of other modes, 0 for none. The larger one counts.
+ACRO_RATES = (("ACRO_RP_RATE", "ACRO_RP_P"), ("ACRO_RP_RATE", "ACRO_RP_P"), ("ACRO_Y_RATE", "ACRO_YAW_P"))
+RATE_LIMITS = ("ATC_RATE_R_MAX", "ATC_RATE_P_MAX", "ATC_RATE_Y_MAX")
+FULL_STICK_DEG = 45.0
+# FRAME_CLASS of what is no quadcopter, and SERVOn_FUNCTION of the motors 1 to 8, and 9 to 12.
+FRAMES = {
+    2: "a hexacopter",
+    3: "an octocopter",
+    4: "an octaquad",
+    5: "a Y6",
+    6: "a helicopter",
+    7: "a tricopter",
+}
+MOTOR_FUNCTIONS = (*range(33, 41), *range(82, 86))
+NUM_MOTORS = 4
+# MOT_PWM_MIN, MOT_PWM_MAX, us, and MOT_SPIN_MIN, MOT_SPIN_MAX, between them, as the firmware comes.
+MOTOR_DEFAULTS = {"MOT_PWM_MIN": 1000.0, "MOT_PWM_MAX": 2000.0, "MOT_SPIN_MIN": 0.15, "MOT_SPIN_MAX": 0.95}
+MIN_HEALTHY_FRACTION = 0.5  # of the rows of an instance say so: the sensor of most of the flight
+
+
+class _Message(NamedTuple):
+    """The rows of one instance of a message: its fields by name, (num_rows,) each."""
+
+    instance: int
+    fields: dict[str, np.ndarray]
+
+
+def read_dataflash(path: Path, mapping: Mapping) -> ImportedFlight:
+    """Return the flight in a DataFlash log: commands, rates, attitude, and what else it has.
+
+    docs/real_logs.md says which messages the channels are of. Raises LogError for what is no such log, is not
+    of a copter, or lacks rates and their setpoints.
+    """
+    read_log_file(path, LARGEST_BYTES, FIRST_BYTES, "an ArduPilot log (DataFlash)", len(FIRST_BYTES))
+    notes, arrays = decode(
+        str(path), "dataflash", path, {name: [TIME, *names] for name, names in FIELDS.items()}
+    )
+    _check_vehicle(path, notes["texts"], notes["parameters"])
+    messages: dict[str, list[_Message]] = {}
+    for found, rows in zip(notes["found"], arrays, strict=True):
+        message = _Message(found["instance"], dict(zip(found["fields"], rows.T, strict=True)))
+        messages.setdefault(found["name"], []).append(message)
+    parameters: dict[str, float] = notes["parameters"]
+    said = _airframe(parameters)
+    chosen = {name: _choose(name, instances, said) for name, instances in messages.items()}
+    for name in ("RATE",):
+        if name not in chosen or any(field not in chosen[name] for field in (TIME, *FIELDS[name])):
+            listed = ", ".join(map(quote_name, sorted(chosen))) or "none of the messages that are read"
+            raise LogError(
+                f"{path}: message {name}: missing or without {', '.join(FIELDS[name])}; found {listed}"
+            )
+    craft = mapping.craft
+    if craft.max_rate_deg_s is None:
+        craft = craft._replace(max_rate_deg_s=_full_stick_deg_s(path, parameters, chosen["RATE"], said))
+    channels = _channels(chosen, parameters, np.array(craft.max_rate_deg_s), said)
+    topics = [
+        Table(str(path), {TIMESTAMP: fields[TIME] * UNITS["time"]["us"], **_named(name, fields)})
+        for name, fields in chosen.items()
+        if TIME in fields
+    ]
+    flight = flight_of_topics(str(path), topics, mapping._replace(channels=tuple(channels), craft=craft))
+    return flight._replace(notes=(*(f"{path}: {text}" for text in said), *flight.notes))
+
+
+def _named(message: str, fields: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    return {f"{message}.{field}": values for field, values in fields.items()}
+
+
+def _check_vehicle(path: Path, texts: list[str], parameters: dict[str, float]) -> None:
+    """Raise LogError for the log of another vehicle, as its messages of text name the firmware."""
+    for text in texts:
+        for vehicle in OTHER_VEHICLES:
+            if text.startswith(vehicle):
+                raise LogError(f"{path}: found a log of {quote_name(text)}, expected one of {VEHICLE}")
+    if parameters.get("Q_ENABLE", 0.0) > 0.0:
+        raise LogError(f"{path}: found a log of a quadplane (Q_ENABLE), expected one of {VEHICLE}")
+
+
+def _airframe(parameters: dict[str, float]) -> list[str]:
+    """Return a note if the log's own parameters say that the craft is no quadcopter."""
+    frame = FRAMES.get(int(parameters.get("FRAME_CLASS", 0)))
+    num_motors = sum(_function(parameters, number) in MOTOR_FUNCTIONS for number in range(1, NUM_OUTPUTS + 1))
+    if frame:
+        return [not_a_quadcopter(f"{frame} (FRAME_CLASS {parameters['FRAME_CLASS']:.0f})")]
+    return [not_a_quadcopter(f"{num_motors} motors")] if num_motors not in (0, NUM_MOTORS) else []
+
+
+def _function(parameters: dict[str, float], output: int) -> int:
+    """Return what an output drives, 0 if nothing."""
+    return int(parameters.get(f"SERVO{output}_FUNCTION", 0))
+
+
+def _choose(name: str, instances: list[_Message], said: list[str]) -> dict[str, np.ndarray]:
+    """Return the fields of the first instance of a message that measured something, and note the others."""
+    instances = sorted(instances, key=lambda message: message.instance)
+    if name == "BAT":
+        instances = [_without_zeros(message, said) for message in instances]
+    is_good = [_is_healthy(name, message.fields) for message in instances]
+    best = instances[is_good.index(True) if any(is_good) else 0]
+    if len(instances) > 1:
+        others = [
+            f"{message.instance}{'' if good else ' (not healthy)'}"
+            for message, good in zip(instances, is_good, strict=True)
+            if message is not best
+        ]
+        said.append(f"instance {best.instance} of {name} is used, not {', '.join(others)}")
+    if not any(is_good):
+        said.append(f"no instance of {name} says that it is healthy")
+    return best.fields
+
+
+def _without_zeros(message: _Message, said: list[str]) -> _Message:
+    """Return a battery's rows with NaN for voltages of 0 or less: no voltage was measured there."""
+    volts = message.fields.get("Volt", np.zeros(0))
+    is_measured = volts > 0.0
+    if not is_measured.all():
+        count = f"{np.sum(~is_measured)} of {len(volts)} voltages of battery {message.instance}"
+        said.append(f"{count} are not above 0: not measured")
+    return message._replace(fields={**message.fields, "Volt": np.where(is_measured, volts, np.nan)})
+
+
+def _is_healthy(name: str, fields: dict[str, np.ndarray]) -> bool:
+    if name == "BAT":
+        return bool(np.any(np.isfinite(fields["Volt"])))
+    return all(np.mean(fields[health]) > MIN_HEALTHY_FRACTION for health in HEALTH if health in fields)
+
+
+def _full_stick_deg_s(
+    path: Path, parameters: dict[str, float], rate: dict[str, np.ndarray], said: list[str]
+) -> tuple[float, float, float]:
+    """Return the rates of roll, pitch and yaw at a command of 1, deg/s, no less than any setpoint."""
+    full_stick = []
+    for (acro, gain), limit, setpoint in zip(ACRO_RATES, RATE_LIMITS, SETPOINTS, strict=True):
+        stated = parameters.get(acro, FULL_STICK_DEG * parameters.get(gain, 0.0))
+        known = max(stated, parameters.get(limit, 0.0))
+        if known <= 0.0:
+            missing = f"{path}: parameters {acro}, {gain} and {limit}: missing, so full stick is unknown"
+            raise LogError(f"{missing}; a mapping can state craft.max_rate_deg_s")
+        largest = float(np.max(np.abs(rate[setpoint]), initial=0.0, where=np.isfinite(rate[setpoint])))
+        if largest > known:
+            said.append(f"{setpoint} reaches {largest:.4g} deg/s: full stick is that, not {known:.4g} deg/s")
+        full_stick.append(max(known, largest))
+    roll, pitch, yaw = full_stick
+    return roll, pitch, yaw
+
+
+def _channels(
+    messages: dict[str, dict[str, np.ndarray]],
+    parameters: dict[str, float],
+    full_deg_s: np.ndarray,
+    said: list[str],
+) -> list[Channel]:
+    """Return the channels of the messages that a log has."""
+
+    def columns_of(message: str, fields: tuple[str, ...]) -> tuple[str, ...]:
+        """Return the columns of a message; none if the log lacks one of them."""
+        there = messages.get(message, {})
+        return tuple(f"{message}.{field}" for field in fields) if {TIME, *fields} <= there.keys() else ()
+
+    def vector(name: str, message: str, fields: tuple[str, ...], scale: float = 1.0) -> list[Channel]:
+        columns = columns_of(message, fields)
+        convert = lambda table: vector_from(table.matrix(columns) * scale, True)  # noqa: E731
+        return [Channel(message, name, columns, convert)] if columns else []
+
+    def commands(table: Table) -> np.ndarray:
+        rates = vector_from(table.matrix(columns_of("RATE", SETPOINTS)), True) / full_deg_s
+        return np.column_stack([rates, 2.0 * table.matrix(columns_of("RATE", (THROTTLE,))) - 1.0])
+
+    gyroscope = vector("w", "IMU", GYROSCOPE)
+    is_fast = len(messages["RATE"][TIME]) >= len(messages.get("IMU", {}).get(TIME, ()))
+    rates = vector("w", "RATE", RATES, PER_DEGREE) if is_fast or not gyroscope else gyroscope
+    said.append(f"rates of {rates[0].table}, which has more samples than other messages with rates")
+    found = [Channel("RATE", "u", columns_of("RATE", (*SETPOINTS, THROTTLE)), commands), *rates]
+    found += vector("f", "IMU", ACCELEROMETER)
+    found += vector("v", "XKF1", VELOCITY) + vector("p", "XKF1", POSITION)
+    found += _attitude(columns_of("XKQ", QUATERNION), columns_of("ATT", EULER_DEG))
+    volts = columns_of("BAT", ("Volt",))
+    if volts and np.any(np.isfinite(messages["BAT"]["Volt"])):
+        found.append(Channel("BAT", "v_bat", volts, lambda table: table.matrix(volts)))
+    outputs = [
+        number for number in range(1, NUM_OUTPUTS + 1) if _function(parameters, number) in MOTOR_FUNCTIONS
+    ]
+    motors = columns_of("RCOU", tuple(f"C{number}" for number in outputs or range(1, NUM_MOTORS + 1)))
+    return [*found, *_motors(motors, parameters)]
+
+
+def _attitude(quaternion: tuple[str, ...], euler: tuple[str, ...]) -> list[Channel]:
+    """Return the attitude: the quaternion of the estimator, else Euler angles, deg."""
+
+    def convert(table: Table) -> np.ndarray:
+        if quaternion:
+            attitude = Rotation.from_quat(table.matrix(quaternion), scalar_first=True)
+        else:
+            attitude = Rotation.from_euler("ZYX", table.matrix(euler)[:, ::-1], degrees=True)
+        return quaternion_from(attitude, is_body_turned=True, is_world_turned=True)
+
+    columns = quaternion or euler
+    return [Channel("XKQ" if quaternion else "ATT", "q", columns, convert)] if columns else []
+
+
+def _motors(columns: tuple[str, ...], parameters: dict[str, float]) -> list[Channel]:
+    """Return the motors' outputs, 0 to 1 between the ends that the firmware uses in flight."""
+    known: dict[str, Any] = {name: parameters.get(name) or usual for name, usual in MOTOR_DEFAULTS.items()}
+    low_us, high_us = known["MOT_PWM_MIN"], known["MOT_PWM_MAX"]
+    low, high = (low_us + known[name] * (high_us - low_us) for name in ("MOT_SPIN_MIN", "MOT_SPIN_MAX"))
+    if not columns or high <= low:
+        return []
+    convert = lambda table: np.clip((table.matrix(columns) - low) / (high - low), 0.0, 1.0)  # noqa: E731
+    return [Channel("RCOU", "motors", columns, convert)]
