@@ -107,8 +107,8 @@ class Fit:
     hold_out_every: int = 4
     """Hold out the last of every so many blocks; 0: none."""
     motion: MotionName = "auto"
-    """How the craft moves within a step: as drones do (continuous), or by a simulator's step; auto: what the
-    log shows."""
+    """How the craft moves within a step: as drones do (continuous), or by a simulator's step; auto: as drones
+    do if the log is measured, else what the log shows."""
 
 
 @dataclass(frozen=True)
@@ -138,8 +138,8 @@ class Diagnose:
     before: SomeLogs = ()
     """Logs of the craft as the model knows it: causes are then only what has changed since."""
     motion: MotionName = "auto"
-    """How the craft moves within a step: as drones do (continuous), or by a simulator's step; auto: what the
-    logs show."""
+    """How the craft moves within a step: as drones do (continuous), or by a simulator's step; auto: as drones
+    do if the logs are measured, else what the logs show."""
 
 
 @dataclass(frozen=True)

@@ -25,6 +25,7 @@ from flytrack_sysid.flight_recording import write_flight_recording
 from flytrack_sysid.importing import import_log
 from flytrack_sysid.log import FlightLog
 from flytrack_sysid.log_file import check_name, describe, load_log, save_log
+from flytrack_sysid.log_motion import required_motion
 from flytrack_sysid.plausibility import check_plausible
 from flytrack_sysid.script_file import check_name as check_script_name
 from flytrack_sysid.script_file import load_script, save_script
@@ -93,13 +94,17 @@ def run_fit(flags: Fit) -> None:
     start = nominal_parameters() if flags.start is None else load_model(flags.start)
     log = load_log(flags.log)
     what_is_fitted(log, start, fixed, flags.effect, flags.hold_out_every)  # refuses before the work
-    start = start._replace(motion=motion_of(log, start) if flags.motion == "auto" else Motion(flags.motion))
-    found = fit(log, start, fixed, flags.effect, flags.hold_out_every, ProgressBar("rounds"))
+    requested = None if flags.motion == "auto" else Motion(flags.motion)
+    told = start.motion
+    if required_motion(log, requested) is None:
+        start = start._replace(motion=motion_of(log, start))
+    found = fit(log, start, fixed, flags.effect, flags.hold_out_every, ProgressBar("rounds"), requested)
     provenance = found.provenance()
     provenance["started_from"] = "nominal parameters" if flags.start is None else Path(flags.start).name
     provenance["fixed"] = fixed
     save_model(flags.out, found.model, provenance)
-    print(f"motion: {start.motion.value}")
+    is_other = flags.start is not None and start.motion is not told
+    print(f"motion: {found.model.motion.value}" + f", by likelihood; --from says {told.value}" * is_other)
     print(found.describe())
     print_written([flags.out])
 

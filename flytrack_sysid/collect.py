@@ -4,7 +4,7 @@ A plant is a ``flytrack_env.plants.Plant`` or a function ``step(x, u)`` of the h
 outputs are used.
 
 Envelope: a flight ends where the drone would become faster than 20 m/s, leave heights between 10 and
-110 m, or leave 22 to 24 V. A script may go down to 0.1 m.
+110 m, or leave the plant's battery, 22 to 24 V if it does not say. A script may go down to 0.1 m.
 """
 
 from collections.abc import Callable
@@ -19,7 +19,7 @@ from flytrack_env.dynamics import ModelParameters, nominal_parameters
 from flytrack_env.plants import Plant
 from flytrack_env.state import ACCELERATION, STATE_SIZE, pack, unpack, unpack_action
 from flytrack_sysid import excitation
-from flytrack_sysid.excitation import DT_S, FEWEST_STEPS, MIDDLE_V
+from flytrack_sysid.excitation import DT_S, FEWEST_STEPS, MIDDLE_V, VOLTAGES
 from flytrack_sysid.log import FlightLog, log_of_states
 from flytrack_sysid.script_file import Script, check_script, script_of
 from flytrack_sysid.sensors import LOST_ROWS, measure
@@ -92,18 +92,18 @@ def _fly_any(plant: Plant | StepFunction, report: Report) -> Fly:
     return _fly_plant(plant) if isinstance(plant, Plant) else _fly_function(plant, report)
 
 
-def find_hover(fly: Fly) -> float:
-    """Return the thrust action that holds the weight at 23 V, level and at rest; else raise CollectError."""
+def find_hover(fly: Fly, middle_v: float = MIDDLE_V) -> float:
+    """Return the thrust action that holds the weight, level at rest at a voltage; else raise CollectError."""
     actions = np.linspace(-1.0, 1.0, 41)
     rng = np.random.default_rng(0)
-    starts = np.stack([excitation.start_state(rng, MIDDLE_V, action, 0.0, 0.0) for action in actions])
+    starts = np.stack([excitation.start_state(rng, middle_v, action, 0.0, 0.0) for action in actions])
     commands = np.zeros((len(actions), 1, 4), np.float32)
     commands[:, 0, 3] = actions
     climb = fly(starts.astype(np.float32), commands)[:, -1, ACCELERATION][:, 2]
     if not (climb[0] < 0.0 < climb[-1]):
         found = f"{climb[0]:.3g} and {climb[-1]:.3g} m/s^2"
         raise CollectError(
-            f"plant: found vertical accelerations of {found} at thrust -1 and 1, level at {MIDDLE_V:g} V; "
+            f"plant: found vertical accelerations of {found} at thrust -1 and 1, level at {middle_v:g} V; "
             "expected it to sink and to climb"
         )
     above = int(np.argmax(climb > 0.0))
@@ -135,14 +135,16 @@ def collect(
         raise CollectError(f"seed: found {seed}, expected 0 or more")
     rng = np.random.default_rng(seed)
     fly = _fly_any(plant, report)
+    battery = plant.battery if isinstance(plant, Plant) else None
+    voltages = VOLTAGES if battery is None else (float(battery.empty_v), float(battery.full_v))
     if script is None:
-        hover = find_hover(_fly_any(plant, lambda done, total: None))
+        hover = find_hover(_fly_any(plant, lambda done, total: None), 0.5 * sum(voltages))
         number = round(minutes * 60.0 / SECONDS_PER_FLIGHT)
-        flown, heights = script_of(excitation.script(number, hover, rng)), excitation.HEIGHTS
+        flown, heights = script_of(excitation.script(number, hover, rng, voltages)), excitation.HEIGHTS
     else:
         check_script(script)
         flown, heights = script, excitation.SCRIPT_HEIGHTS
-    log = log_of_states(_cut(*_states(fly, flown), heights), DT_S, "collected")
+    log = log_of_states(_cut(*_states(fly, flown), heights, voltages), DT_S, "collected")
     if noise > 0.0:
         log = measure(log, noise, float(nominal_parameters().g), rng)
     return log
@@ -163,10 +165,10 @@ def _states(fly: Fly, flown: Script) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _cut(
-    states: np.ndarray, commands: np.ndarray, heights: tuple[float, float]
+    states: np.ndarray, commands: np.ndarray, heights: tuple[float, float], voltages: tuple[float, float]
 ) -> list[tuple[np.ndarray, np.ndarray]]:
     """Return the part of each flight before it leaves the envelope, without those of less than two rows."""
-    inside = excitation.is_inside(states, heights)
+    inside = excitation.is_inside(states, heights, voltages)
     lengths = np.where(inside.all(axis=1), states.shape[1], np.argmin(inside, axis=1))
     kept = [(x[:n], u[:n]) for x, u, n in zip(states, commands, lengths, strict=True) if n >= FEWEST_STEPS]
     if not kept:

@@ -143,25 +143,34 @@ def _flight(
     )
 
 
-def _voltages(kind: str, turns: int, rng: np.random.Generator) -> np.ndarray:
+def _voltages(kind: str, turns: int, rng: np.random.Generator, voltages: tuple[float, float]) -> np.ndarray:
     """Return the voltages of a kind's flights, (turns, 4), between nearly empty and full.
 
     Denser towards both ends, which are the most informative on how thrust depends on the voltage. In random
     order, except for the last of every four, which may be held out: these are spread over the range by turn
     and kind.
     """
-    lowest, count = layout.BATTERY_EMPTY_V + RESERVE_V, turns * FLIGHTS_PER_KIND
+    lowest, count = voltages[0] + RESERVE_V, turns * FLIGHTS_PER_KIND
     share = 0.5 - 0.5 * np.cos(np.pi * np.arange(count) / (count - 1))
-    levels = lowest + share * (layout.BATTERY_FULL_V - lowest)
+    levels = lowest + share * (voltages[1] - lowest)
     last = np.arange(turns) * FLIGHTS_PER_KIND + KINDS.index(kind) % FLIGHTS_PER_KIND
     others = rng.permutation(np.delete(levels, last)).reshape(turns, FLIGHTS_PER_KIND - 1)
     return np.column_stack([others, rng.permutation(levels[last])])
 
 
-def script(num_flights: int, hover: float, rng: np.random.Generator) -> list[ScriptedFlight]:
-    """Return the flights of an excitation; ``hover`` is the thrust action that holds the weight."""
+def script(
+    num_flights: int, hover: float, rng: np.random.Generator, battery: tuple[float, float] = VOLTAGES
+) -> list[ScriptedFlight]:
+    """Return the flights of an excitation.
+
+    Args:
+        num_flights: how many.
+        hover: the thrust action that holds the weight.
+        rng: of waves, directions and the order of voltages.
+        battery: voltages of an empty and a full one, V.
+    """
     turns = -(-num_flights // (FLIGHTS_PER_KIND * len(KINDS)))
-    voltages = {kind: _voltages(kind, turns, rng) for kind in KINDS}
+    voltages = {kind: _voltages(kind, turns, rng, battery) for kind in KINDS}
     flights = [
         _flight(kind, turn, number, voltages[kind][turn, number], hover, rng)
         for turn in range(turns)

@@ -11,9 +11,11 @@ from scipy import signal
 from flytrack_env import __version__
 from flytrack_env.dynamics import ModelParameters, collective_thrust, nominal_parameters
 from flytrack_env.effects import BY_NAME
-from flytrack_env.state import BATTERY_EMPTY_V, BATTERY_FULL_V
+from flytrack_env.motion import Motion
 from flytrack_sysid.estimate import Estimate, FitError, estimate
 from flytrack_sysid.log import CHANNELS, FlightLog, usual_step
+from flytrack_sysid.log_motion import motion_notes, required_motion
+from flytrack_sysid.log_voltage import fitted_battery, flown_voltages, is_within, voltage_notes, with_voltage
 from flytrack_sysid.parameters import (
     DRAIN,
     TAU_RANGE,
@@ -29,7 +31,6 @@ from flytrack_sysid.parameters import (
     with_values,
 )
 from flytrack_sysid.plausibility import check_plausible
-from flytrack_sysid.record import BATTERY_UNKNOWN_V
 from flytrack_sysid.split import HELD_OUT_EVERY, held_out_rows
 
 TWO_SIDED_95 = 1.959964  # standard deviations of a normal distribution
@@ -149,13 +150,13 @@ def _intervals(result: Estimate) -> dict[str, Interval]:
 
 
 def _map_uncertainty(result: Estimate, log: FlightLog) -> MapUncertainty | None:
-    """Return the largest uncertainty over all actions and 22 to 24 V, or the log's own voltages."""
+    """Return the largest uncertainty over all actions and the battery's voltages, or the log's if others."""
     where = [index for index, name in enumerate(result.free) if name in THRUST_COEFFS]
     if not where:
         return None
-    volts = log["v_bat"] if "v_bat" in log else np.array([BATTERY_EMPTY_V, BATTERY_FULL_V])
-    is_usual = volts.min() >= BATTERY_EMPTY_V - 1.0 and volts.max() <= BATTERY_FULL_V + 1.0
-    low, high = (BATTERY_EMPTY_V, BATTERY_FULL_V) if is_usual else (volts.min(), volts.max())
+    low, high = flown_voltages(log)
+    if is_within((low, high), result.model.battery):
+        low, high = float(result.model.battery.empty_v), float(result.model.battery.full_v)
     action, battery_v = np.meshgrid(np.linspace(-1, 1, BOX_ACTIONS), np.linspace(low, high, BOX_VOLTAGES))
     units: Any = np.eye(len(THRUST_COEFFS))
     coeffs: Any = np.asarray(result.model.thrust_coeffs)
@@ -192,8 +193,7 @@ def _warnings(
         )
     if "v_bat" not in log:
         found.append(
-            "v_bat is absent: how thrust depends on the voltage, and the drain, are taken as they were, and "
-            f"the log as flown at {BATTERY_UNKNOWN_V:g} V"
+            "v_bat is absent: how thrust depends on the voltage, and the drain, are taken as they were"
         )
     return found
 
@@ -204,6 +204,7 @@ def what_is_fitted(
     fixed: Mapping[str, float] | None = None,
     effects: Iterable[str] = (),
     every: int = HELD_OUT_EVERY,
+    motion: Motion | None = None,
 ) -> tuple[ModelParameters, tuple[str, ...], np.ndarray]:
     """Return the model that a fit starts from, the names of what it estimates and the rows that it sees.
 
@@ -219,6 +220,7 @@ def what_is_fitted(
         raise FitError(f"effects: {name}: known from settings and not fitted; start from a model that has it")
     free = _free_names(model, log, fixed)
     model = with_values(model, fixed)
+    model = model._replace(motion=required_motion(log, motion) or model.motion)
     judged = ~held_out_rows(log, every)
     _check_data(log, judged, free)
     _check_response(log, model)
@@ -232,18 +234,24 @@ def fit(
     effects: Iterable[str] = (),
     every: int = HELD_OUT_EVERY,
     report: Callable[[int, int], None] = lambda done, rounds: None,
+    motion: Motion | None = None,
 ) -> Fit:
     """Identify lags, thrust map and battery drain from a log; mass, gravity and full-stick rates are given.
 
     start: initial values, also of what is not estimated; nominal if None. fixed: values of parameters that
     are not estimated, by name (``tau_yaw``, ``c4``, ``linear_drag.d_x``, ...). effects: names of effects
     whose parameters are estimated too. every: which rows are held out (``flytrack_sysid.split``), 0 for none.
-    report: called with the rounds done and in all.
+    report: called with the rounds done and in all. motion: how the log moves within a step; if None,
+    continuously where the log is measured, else as ``start`` does.
 
     Raises:
         LogError, FitError: an implausible log; missing channels or motion, or a fit that diverged.
     """
-    model, free, judged = what_is_fitted(log, start, fixed, effects, every)
+    model, free, judged = what_is_fitted(log, start, fixed, effects, every, motion)
+    notes = motion_notes(log, start, motion, f"replayed as {model.motion.value}")
+    given = model.battery
+    notes += voltage_notes(log, given)
+    log = with_voltage(log, model)
     try:
         result = estimate(log, judged, model, free, report)
     except FitError as error:
@@ -251,12 +259,17 @@ def fit(
     _check_result(result, log, judged)
     intervals = _intervals(result)
     uncertainty = _map_uncertainty(result, log)
+    battery = given
+    if any(name in THRUST_COEFFS for name in free):
+        battery = fitted_battery(log, given)
+    if (battery.empty_v, battery.full_v) != (given.empty_v, given.full_v):
+        notes.append(f"the model's battery is that of the log: {battery.describe()}")
     return Fit(
-        model=as_float32(result.model),
+        model=as_float32(result.model)._replace(battery=battery),
         estimate=result,
         intervals=intervals,
         map_uncertainty=uncertainty,
-        warnings=tuple(_warnings(intervals, uncertainty, log)),
+        warnings=(*notes, *_warnings(intervals, uncertainty, log)),
         every=every,
         source=log.source,
         sha256=log.sha256,

@@ -7,12 +7,16 @@ to world; command ``u`` and applied action ``uprev`` in [-1, 1]; battery ``v_bat
 Row k holds what was measured at t_k and the command held from t_k to t_k+1. As in the handout's state,
 ``a`` and ``f`` of row k are those of the step that led to t_k, with the attitude before it. ``t`` and the
 commands are always there; other channels may be absent (never zero instead), but only whole ones.
+
+Columns of ``STATED`` hold the same number in every row: ``measured``, 1 where a real drone flew and 0 where a
+simulator did; ``v_bat_low`` and ``v_bat_high``, V, the range that is stated for a pack that was not logged.
 """
 
 import hashlib
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Literal
 
 import numpy as np
 
@@ -28,7 +32,12 @@ CHANNELS: dict[str, tuple[str, ...]] = {
     "v_bat": ("v_bat",),
 }
 REQUIRED = ("t", *CHANNELS["u"])
-COLUMNS = ("t", "segment", *(column for columns in CHANNELS.values() for column in columns))
+MEASURED, STATED_VOLTAGES = "measured", ("v_bat_low", "v_bat_high")
+STATED = (MEASURED, *STATED_VOLTAGES)
+COLUMNS = ("t", "segment", *(column for columns in CHANNELS.values() for column in columns), *STATED)
+# What flew a log, and what its files say of it in the column ``measured``.
+Origin = Literal["measured", "simulated"]
+ORIGINS: dict[float, Origin] = {1.0: "measured", 0.0: "simulated"}
 GAP_STEPS = 1.5  # of the usual step: what lasts longer lacks a sample; loggers jitter by less
 NOMINAL_STEP_S = 0.01  # of a log without two rows
 BETWEEN_S = 1.0  # from the end of a segment to the start of the next, put on one time line
@@ -53,13 +62,16 @@ class FlightLog:
 
     time: (num_rows,) s. channels: of ``CHANNELS``, name -> (num_rows, number of its columns) float64;
     "u" is always there. segment: (num_rows,) int, equal numbers side by side. source: where it is from,
-    for messages.
+    for messages. origin: whether a real drone flew or a simulator; None if nobody says. stated_voltage_v:
+    lowest and highest voltage of the pack in flight, V, where they are stated but ``v_bat`` was not logged.
     """
 
     time: np.ndarray
     channels: Mapping[str, np.ndarray]
     segment: np.ndarray
     source: str = "flight log"
+    origin: Origin | None = None
+    stated_voltage_v: tuple[float, float] | None = None
 
     def __len__(self) -> int:
         return len(self.time)
@@ -72,7 +84,7 @@ class FlightLog:
 
     @cached_property
     def sha256(self) -> str:
-        """The hash of what the log holds: the same in memory and in any file of it."""
+        """The hash of the rows: the same in memory and in any file, and whatever is stated of them."""
         digest = hashlib.sha256()
         segment = np.cumsum(self.is_start())
         for name, values in (("t", self.time), ("segment", segment), *sorted(self.channels.items())):
@@ -119,7 +131,7 @@ def time_in_line(log: FlightLog, between_s: np.ndarray | float = BETWEEN_S) -> n
 def log_of_states(
     flights: Iterable[tuple[np.ndarray, np.ndarray]], dt: float, source: str = "flight log"
 ) -> FlightLog:
-    """Return the log of flights of the handout's states (T, 21) and actions (T, 4), a segment each.
+    """Return the log of a simulator's flights: states (T, 21) and actions (T, 4), a segment each.
 
     The first acceleration of a flight is that of the step before it. dt: s.
     """
@@ -131,4 +143,5 @@ def log_of_states(
         channels={"u": np.concatenate([actions for _, actions in flights]), **channels},
         segment=np.repeat(np.arange(len(flights)), [len(states) for states, _ in flights]),
         source=source,
+        origin="simulated",
     )

@@ -24,7 +24,7 @@ from flytrack_env.files import open_file, write_atomically
 from flytrack_env.messages import error_text, quote_name, quote_value
 from flytrack_env.npz_file import NpzError, load_npz, npz_of
 from flytrack_sysid.log import CHANNELS, GAP_STEPS, FlightLog, LogError, usual_step
-from flytrack_sysid.log_table import Table, check_names, columns_of, log_of_table
+from flytrack_sysid.log_table import Table, check_names, columns_of, log_of_table, stated_columns
 
 SUFFIXES = (".npz", ".csv")
 LARGEST_BYTES = 512 * 2**20
@@ -59,7 +59,7 @@ def save_log(path: str | Path, log: FlightLog) -> None:
     if len(log) and np.any(log.segment != log.segment[0]):
         columns["segment"] = log.segment
     channels = {name: np.asarray(values, float) for name, values in log.channels.items()}
-    columns |= columns_of(columns["t"], channels)
+    columns |= columns_of(columns["t"], channels) | stated_columns(log)
     check_names(str(path), list(columns))
     log_of_table(Table(str(path), {name: values.astype(float) for name, values in columns.items()}))
     write_atomically(path, npz_of(columns) if path.suffix.lower() == ".npz" else _csv_of(columns))
@@ -81,12 +81,13 @@ def gaps_of(log: FlightLog) -> np.ndarray:
 
 
 def describe(log: FlightLog) -> str:
-    """Return a few lines on a log: where from, how long, how often, what was measured, what is missing."""
+    """Return a few lines on a log: who flew it, how long, how often, what was measured, what is missing."""
     inside = ~log.is_start()[1:]
     steps = np.diff(log.time)
     absent = [name for name in CHANNELS if name not in log]
     lines = [
         f"{log.source}: {len(log)} rows, {log.is_start().sum()} segments, {steps[inside].sum():.2f} s",
+        f"origin: {log.origin or 'not marked'}",
         f"channels: {', '.join(log.channels)}; absent: {', '.join(absent) or 'none'}",
     ]
     if inside.any():

@@ -7,7 +7,18 @@ from typing import NamedTuple
 import numpy as np
 
 from flytrack_env.messages import quote_value
-from flytrack_sysid.log import CHANNELS, COLUMNS, REQUIRED, FlightLog, LogError
+from flytrack_sysid.log import (
+    CHANNELS,
+    COLUMNS,
+    MEASURED,
+    ORIGINS,
+    REQUIRED,
+    STATED,
+    STATED_VOLTAGES,
+    FlightLog,
+    LogError,
+    Origin,
+)
 
 LARGEST_NORM_ERROR = 1e-2  # of quaternions: estimators drift a little; more is no unit quaternion
 SMALLEST_NORM_ERROR = 1e-12  # below it a norm is 1 up to rounding, and the values stay as they are
@@ -64,7 +75,7 @@ def check_names(source: str, names: Sequence[str]) -> None:
     for name in REQUIRED:
         if name not in names:
             raise LogError(f"{source}: column {name}: missing; found {', '.join(names) or 'no column'}")
-    for columns in CHANNELS.values():
+    for columns in (*CHANNELS.values(), STATED_VOLTAGES):
         present = [column for column in columns if column in names]
         for column in columns:
             if present and column not in present:
@@ -78,6 +89,14 @@ def columns_of(time: np.ndarray, channels: Mapping[str, np.ndarray]) -> dict[str
         if name in channels:
             columns |= dict(zip(names, channels[name].T, strict=True))
     return columns
+
+
+def stated_columns(log: FlightLog) -> dict[str, np.ndarray]:
+    """Return the columns of what is stated of a log, the same number in every row."""
+    stated = dict(zip(STATED_VOLTAGES, log.stated_voltage_v or (), strict=False))
+    if log.origin is not None:
+        stated[MEASURED] = next(number for number, origin in ORIGINS.items() if origin == log.origin)
+    return {name: np.full(len(log), stated[name]) for name in STATED if name in stated}
 
 
 def log_of_table(table: Table) -> FlightLog:
@@ -103,6 +122,7 @@ def log_of_table(table: Table) -> FlightLog:
     for column in CHANNELS["u"]:
         is_command = np.abs(table.columns[column]) <= 1.0 + COMMAND_MARGIN
         table.check(is_command, column, "a command in [-1, 1]")
+    origin, stated_voltage_v = _origin(table), _stated_voltages(table)
     channels = {}
     for name, columns in CHANNELS.items():
         if columns[0] in table.columns:
@@ -115,7 +135,35 @@ def log_of_table(table: Table) -> FlightLog:
         expected = f"a quaternion of norm 1 within {LARGEST_NORM_ERROR:g}"
         table.check(error <= LARGEST_NORM_ERROR, ", ".join(CHANNELS["q"]), expected, norm)
         channels["q"] *= np.where(error > SMALLEST_NORM_ERROR, 1.0 / norm, 1.0)[:, None]
-    return FlightLog(table.columns["t"], channels, segment, table.source)
+    return FlightLog(table.columns["t"], channels, segment, table.source, origin, stated_voltage_v)
+
+
+def _stated(table: Table, name: str) -> float | None:
+    """Return the number that a column of ``STATED`` holds in every row; None where it is absent."""
+    values = table.columns.pop(name, None)
+    if values is None:
+        return None
+    table.check(values == values[0], name, f"{values[0]:g} as in row 0: all rows are of one craft", values)
+    return float(values[0])
+
+
+def _origin(table: Table) -> Origin | None:
+    """Return what flew, by the column ``measured``."""
+    value = _stated(table, MEASURED)
+    if value is not None and value not in ORIGINS:
+        raise table.error(0, MEASURED, f"found {value}, expected 1 (a real drone) or 0 (a simulator)")
+    return None if value is None else ORIGINS[value]
+
+
+def _stated_voltages(table: Table) -> tuple[float, float] | None:
+    """Return the lowest and the highest voltage that are stated for the pack."""
+    low, high = (_stated(table, name) for name in STATED_VOLTAGES)
+    if low is None or high is None:  # both, by ``check_names``
+        return None
+    if not 0.0 < low < high:
+        found = f"found {low:g} to {high:g} V, expected a lowest voltage above 0 and a highest above that"
+        raise table.error(0, ", ".join(STATED_VOLTAGES), found)
+    return low, high
 
 
 def _segments(table: Table) -> np.ndarray:

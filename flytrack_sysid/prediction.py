@@ -10,6 +10,7 @@ from flytrack_env.effects import acts
 from flytrack_env.quaternion import Vec3
 from flytrack_env.state import Action, Drone
 from flytrack_sysid.log import CHANNELS, FlightLog, usual_step
+from flytrack_sysid.log_voltage import with_voltage
 from flytrack_sysid.record import Filled, Record, is_applied_certain, record_of
 from flytrack_sysid.replay import Step, replay
 
@@ -25,7 +26,7 @@ class Prediction(NamedTuple):
     """A model's step from every row of a log; leaves of the drones are (num_rows,) float64.
 
     log: without gaps.
-    before: the measured state; zeros (upright, 23 V) where the log has no such channel.
+    before: the measured state; zeros (upright, ``assumed_voltage``) where the log has no such channel.
     memories: what the model's effects remember before the step. after: the state at the next row. force_b:
     (num_rows, 3) m/s^2, specific force of the step. record: of the rows. step_s: the usual one.
     is_settled: (num_rows,) bool, applied action and memories no longer depend on how they began.
@@ -114,6 +115,7 @@ def predict(model: ModelParameters, filled: Filled) -> Prediction:
 
     The applied action is the log's; without it, it follows the commands from the segment's start on.
     """
+    filled = filled._replace(log=with_voltage(filled.log, model))
     log = filled.log
     record = record_of(filled)._replace(is_applied_known=np.full(len(log), "uprev" in log))
     gyro_b = log["w"] if "w" in log else np.zeros((len(log), 3))

@@ -6,7 +6,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 from scipy.stats import binned_statistic_2d
 
-from flytrack_env.state import BATTERY_EMPTY_V, BATTERY_FULL_V
+from flytrack_env.battery import Battery
 from flytrack_sysid.log import CHANNELS
 from flytrack_sysid.prediction import LONGEST_S, Prediction, columns, free_flights, judged_steps, runs_of
 from flytrack_sysid.sensors import specific_force_b
@@ -218,11 +218,12 @@ class ThrustError(NamedTuple):
     total_rms_n: float
 
 
-def _voltage_range(battery_v: np.ndarray) -> tuple[float, float]:
-    """Return the handout's range of voltage, or the log's where it exceeds that."""
+def _voltage_range(battery_v: np.ndarray, battery: Battery) -> tuple[float, float]:
+    """Return the battery's range of voltage, or the log's where it exceeds that."""
     low, high = float(battery_v.min()), float(battery_v.max())
-    if low >= BATTERY_EMPTY_V and high <= BATTERY_FULL_V:
-        return BATTERY_EMPTY_V, BATTERY_FULL_V
+    empty_v, full_v = float(battery.empty_v), float(battery.full_v)
+    if low >= empty_v and high <= full_v:
+        return empty_v, full_v
     return low, max(high, low + LEAST_VOLTAGE_RANGE)
 
 
@@ -238,7 +239,7 @@ def thrust_error(prediction: Prediction, rows: np.ndarray) -> ThrustError | None
     measured_b = log["f"] if source == "f" else specific_force_b(log, float(model.g))
     error_n = float(model.m) * (measured_b[here + 1, 2] - prediction.force_b[here, 2])
     battery_v = np.asarray(prediction.before.battery_v)[here]
-    low, high = _voltage_range(battery_v)
+    low, high = _voltage_range(battery_v, model.battery)
     edges = np.linspace(low, high, NUM_VOLTAGE_BINS + 1), np.linspace(-1.0, 1.0, NUM_ACTION_BINS + 1)
     action = np.asarray(prediction.after.applied.thrust)[here]
     place = np.clip(battery_v, low, high), np.clip(action, -1.0, 1.0)

@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from flytrack_env.state import ACTION_SIZE
 from flytrack_sysid.log import GAP_STEPS, FlightLog, time_in_line, usual_step
+from flytrack_sysid.log_voltage import assumed_voltage
 from flytrack_sysid.resample import interpolate, interpolate_quaternions
 from flytrack_sysid.split import blocks_of, cut_evenly
 
@@ -21,7 +22,6 @@ LONGEST_FILLED_S = 0.1  # after a longer gap a new flight begins
 WINDOW_WITHOUT_VOLTAGE_S = 1.25
 WINDOW_S = 2.5  # over which increments of velocity and attitude are followed
 PADDED_TO = 1024  # rows: logs of about the same length share one compiled program
-BATTERY_UNKNOWN_V = 23.0
 UPRIGHT = (1.0, 0.0, 0.0, 0.0)
 # An applied action known worse than this counts for nothing: half a gyro's noise at full stick.
 LARGEST_DOUBT = 0.005
@@ -36,7 +36,7 @@ class Record(NamedTuple):
     may be (standard deviation). begins: (num_rows,) bool, a flight starts here.
     is_applied_known: (num_rows,) bool, ``applied`` was measured here. applied: (num_rows, 4).
     pos_w, vel_w: (num_rows, 3). quat: (num_rows, 4). battery_v: (num_rows,). Where a channel is absent:
-    0, upright, 23 V.
+    0, upright, ``assumed_voltage``.
     piece: (num_rows,) int, numbers of stretches of at most 2.5 s, none across blocks. time_s: (num_rows,) s,
     since the log began, of several each. load: (num_rows, 4), as in ``pendulum.Pendulum``, of a load on a
     string; not a number where it is not known.
@@ -152,7 +152,7 @@ def record_of(filled: Filled) -> Record:
         pos_w=log.channels.get("p", zeros),
         vel_w=_velocity(log),
         quat=log["q"] if "q" in log else np.tile(UPRIGHT, (len(log), 1)),
-        battery_v=log["v_bat"][:, 0] if "v_bat" in log else zeros[:, 0] + BATTERY_UNKNOWN_V,
+        battery_v=log["v_bat"][:, 0] if "v_bat" in log else zeros[:, 0] + assumed_voltage(log),
         piece=np.zeros(len(log), int),
         time_s=log.time - log.time[np.flatnonzero(is_first_row)][np.cumsum(is_first_row) - 1],
         load=np.full((len(log), 4), np.nan),

@@ -13,7 +13,6 @@ from flytrack_env.motion import Motion
 from flytrack_env.quaternion import Quaternion, Vec3
 from flytrack_env.state import ACTION_SIZE, Action, Drone
 from flytrack_sysid.parameters import from_vector, in_batches, to_vector
-from flytrack_sysid.record import BATTERY_UNKNOWN_V
 
 SMALL_STEP, FULL_STEP = 1e-3, 1.0  # of a stick, from its centre; no limit acts on the small one
 STEP_S, WATCHED_S = 1e-3, 1.5
@@ -91,7 +90,7 @@ def _standing(model: ModelParameters) -> Drone:
         quat=Quaternion(zero + 1.0, zero, zero, zero),
         rates_b=still,
         applied=Action(*jnp.zeros(ACTION_SIZE)),
-        battery_v=zero + BATTERY_UNKNOWN_V,
+        battery_v=zero + model.battery.voltage(0.5),
     )
     return drone._replace(rates_b=start_rates(drone, model))
 

@@ -7,8 +7,10 @@ import numpy as np
 from flytrack_env.dynamics import ModelParameters
 from flytrack_sysid import prediction_errors
 from flytrack_sysid.log import FlightLog
+from flytrack_sysid.log_motion import motion_notes, required_motion
+from flytrack_sysid.log_voltage import voltage_notes
 from flytrack_sysid.prediction import Prediction, predict
-from flytrack_sysid.record import BATTERY_UNKNOWN_V, fill_gaps
+from flytrack_sysid.record import fill_gaps
 from flytrack_sysid.steps import HELD_AFTER_S, HELD_BEFORE_S, LEAST_JUMP, StepResponse, step_responses
 
 NAMES = {
@@ -78,8 +80,6 @@ def _notes_of(prediction: Prediction) -> list[str]:
             notes.append(f"{NAMES[name]} ({name}): not in the log")
     if "a" not in log and "f" not in log:
         notes.append("acceleration (a) and specific force (f): not in the log")
-    if "v_bat" not in log and np.any(np.asarray(prediction.model.thrust_coeffs)[4:]):
-        notes.append(f"battery (v_bat): not in the log; {BATTERY_UNKNOWN_V:g} V is assumed for thrust")
     if "uprev" not in log:
         notes.append(
             "applied action (uprev): not in the log; computed from the commands by the model's own lags, as "
@@ -98,16 +98,19 @@ def validate(model: ModelParameters, log: FlightLog, rows: np.ndarray | None = N
     """Return the errors of a model on a log, from the measured states under the logged commands.
 
     rows: (num_rows,) bool, the judged ones (``split.held_out_rows``); all if None. Other rows are used only
-    for the applied action and the memories of effects.
-
+    for the applied action and the memories of effects. A measured log is replayed continuously, whatever the
+    model says, and a note says so.
     """
     rows = np.ones(len(log), bool) if rows is None else np.asarray(rows)
     if rows.shape != (len(log),) or rows.dtype != bool:
         raise ValueError(f"rows: found {rows.dtype} of shape {rows.shape}, expected bool of ({len(log)},)")
     num_rows, num_judged = len(log), int(rows.sum())
+    contradictions = motion_notes(log, model, None, f"replayed as the model says ({model.motion.value})")
+    model = model._replace(motion=required_motion(log) or model.motion)
+    contradictions += voltage_notes(log, model.battery)
     filled = fill_gaps(log)
     prediction, rows = predict(model, filled), rows[filled.behind]
-    notes = _notes_of(prediction)
+    notes = [*contradictions, *_notes_of(prediction)]
     one_step = prediction_errors.one_step_errors(prediction, rows)
     if not one_step.num_steps:
         notes.append("one step: no judged row is followed by a judged row")

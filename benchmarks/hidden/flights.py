@@ -43,7 +43,9 @@ def fly(truth: Truth, seconds: float, rng: np.random.Generator) -> FlightLog:
     settled = round(SETTLE_S / truth.step_s)
     rows = {name: values[settled:] for name, values in rows.items()}
     count = len(rows["p"])
-    return FlightLog(np.arange(count) * truth.step_s, rows, np.zeros(count, int), "scripted flight")
+    return FlightLog(
+        np.arange(count) * truth.step_s, rows, np.zeros(count, int), "scripted flight", "simulated"
+    )
 
 
 def _attempt(truth: Truth, seconds: float, rng: np.random.Generator, caution: int) -> dict[str, np.ndarray]:

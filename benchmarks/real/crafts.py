@@ -18,7 +18,6 @@ from flytrack_sysid.diagnosis import joined
 from flytrack_sysid.diagnosis.refinement import windows_of
 from flytrack_sysid.log import usual_step
 from flytrack_sysid.prediction_windows import HORIZONS_S, QUANTITIES, make_windows
-from flytrack_sysid.record import BATTERY_UNKNOWN_V
 
 BETAFLIGHT = "betaflight_acro_log"
 # Every third policy, by its number, is for judging.
@@ -186,7 +185,7 @@ def in_proportion(model: ModelParameters, per_command: float) -> ModelParameters
 def thrust_of(model: ModelParameters, log: FlightLog) -> float:
     """Return the mean thrust over the mass that a model gives to a log's commands, m/s^2."""
     stick = log["u"][:, 3]
-    thrust = collective_thrust(stick, BATTERY_UNKNOWN_V, np.asarray(model.thrust_coeffs, float))
+    thrust = collective_thrust(stick, model.battery.voltage(0.5), np.asarray(model.thrust_coeffs, float))
     return float(np.mean(thrust) * float(model.effect("thrust_scale").factor) / float(model.m))
 
 

@@ -24,7 +24,6 @@ from benchmarks import report
 from benchmarks.real.black_boxes import base_steps, flown, linear_ones, network, rows_of
 from benchmarks.report import ROOT, table
 from flytrack_env.dynamics import ModelParameters
-from flytrack_env.motion import Motion
 from flytrack_sysid import FlightLog, import_log
 from flytrack_sysid.diagnosis import joined, refinement
 from flytrack_sysid.diagnosis.diagnose import split
@@ -67,10 +66,10 @@ def policies_in(folder: Path) -> list[str]:
 
 
 def flights(folder: Path, policies: Sequence[str]) -> tuple[FlightLog, ModelParameters]:
-    """Return the flights of policies, and the nominal model, moving as drones do."""
+    """Return the flights of policies, and the nominal model."""
     files = [file for one in policies for file in sorted(folder.glob(f"seed000{one}_*.csv.gz"))]
     found = import_log(files, "csv", MAPPING)
-    return found.log, found.nominal_model()._replace(motion=Motion.CONTINUOUS)
+    return found.log, found.nominal_model()
 
 
 def shortened(log: FlightLog, seconds: float) -> FlightLog:
@@ -80,7 +79,7 @@ def shortened(log: FlightLog, seconds: float) -> FlightLog:
 
 def models_of(learnt: FlightLog, nominal: ModelParameters) -> tuple[np.ndarray, refinement.Refined]:
     """Return the models of flights: base and proposed effects fitted to single steps, then refined."""
-    parts = split(learnt, nominal, None, Motion.CONTINUOUS)
+    parts = split(learnt, nominal, None, None)
     problem, state = parts.train, SearchState.start(learnt, parts.train)
     ways = ([one for one in CANDIDATES if one.effect == name] for name in PROPOSED)
     candidates = [found[len(found) // 2] for found in ways]  # from probes in the middle

@@ -13,7 +13,6 @@ from matplotlib.ticker import LogLocator
 
 from benchmarks.report import commit_of_checkout, table
 from flytrack_env.dynamics import ModelParameters
-from flytrack_env.motion import Motion
 from flytrack_env.pictures.drawing import new_figure, plain
 from flytrack_env.scene import BLUE, GREEN, GREY, ORANGE
 from flytrack_sysid import FlightLog, Imported, diagnose, import_log
@@ -43,7 +42,7 @@ def diagnosed(
 ) -> tuple[Diagnosis, Record]:
     """Return a log's diagnosis, and a record of it: JSON values, number of rows, CPU time."""
     started = time.process_time()
-    found = diagnose(log, model, held_out, motion=Motion.CONTINUOUS)
+    found = diagnose(log, model, held_out)
     return found, {
         "num_rows": len(log),
         "cpu_s": time.process_time() - started,

@@ -43,6 +43,7 @@ from flytrack_sysid.diagnosis.summary import effect_causes, mean_factor, mean_th
 from flytrack_sysid.diagnosis.unexplained import find_unexplained
 from flytrack_sysid.diagnosis.vetoes import Selection
 from flytrack_sysid.log import FlightLog
+from flytrack_sysid.log_motion import check_same_origin
 from flytrack_sysid.parameters import THRUST_COEFFS
 
 MOST_EFFECTS = 4
@@ -51,6 +52,10 @@ MOST_EFFECTS = 4
 JUMP, JUMP_S, AFTERMATH_S = 0.5, 0.05, 0.2
 WORSE = 1.5  # times what was left unexplained before: so much more is new
 Logs = FlightLog | Sequence[FlightLog]
+
+
+def _logs(logs: Logs) -> Sequence[FlightLog]:
+    return [logs] if isinstance(logs, FlightLog) else logs
 
 
 class Change(NamedTuple):
@@ -117,10 +122,12 @@ def diagnose_change(
 
     Raises:
         DiagnosisError: as ``diagnose``, of either log.
+        LogError: measured logs beside others.
     """
-    model = nominal_parameters() if model is None else model
+    check_same_origin(*_logs(after), *_logs(before))
     with jax.enable_x64(True):
         parts = calm(split(after, model, held_out, motion))
+        model = nominal_parameters() if model is None else model
         later = Estimate.of(parts)
         earlier = Estimate.of(calm(split(before, model, None, parts.moves.motion)))
         alike: dict[str, tuple[str, ...]] = {}

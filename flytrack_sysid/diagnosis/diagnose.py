@@ -33,7 +33,9 @@ from flytrack_sysid.diagnosis.vetoes import (
     reject,
     select,
 )
-from flytrack_sysid.log import FlightLog
+from flytrack_sysid.log import STATED_VOLTAGES, FlightLog, LogError
+from flytrack_sysid.log_motion import check_same_origin, motion_notes, required_motion
+from flytrack_sysid.log_voltage import battery_of_craft, voltage_notes, with_voltage
 from flytrack_sysid.split import HELD_OUT_EVERY, held_out_rows
 
 STAGES = ("search", "vetoes", "refinement", "summary")
@@ -73,7 +75,7 @@ def diagnose(
     log: one or several, taken together. model: the simulator's nominal one if None; causes are differences
     from it. held_out: (num_rows,) bool, rows to judge by and not to learn from; the last of every four blocks
     of at most 5 s if None. report: called with stages done and to do. motion: how the log moves within a
-    step, whatever the model says; by likelihood if None. Of a real drone it is continuous.
+    step, whatever the model says; if None, continuously where the log is measured, else by likelihood.
 
     Raises:
         DiagnosisError: a log with neither gyro nor attitude; ``held_out`` of another shape.
@@ -82,6 +84,7 @@ def diagnose(
         parts = split(log, model, held_out, motion)
         selection = select_model(parts)
         # Drones, and who is late, are told by their clocks; two simulator's steps only by what they leave.
+        # A measured log is continuous, and never gets here.
         if motion is None and not parts.moves.late_s and parts.moves.motion is not Motion.CONTINUOUS:
             likelier = likelier_motion(selection.state.problem, selection.model.vector)
             if likelier is not parts.moves.motion:
@@ -127,7 +130,12 @@ def split(
         )
     logged, (log, is_kept, notes) = log, on_one_clock(log)
     warnings, out = [*warnings, *notes], out[is_kept]
+    warnings += motion_notes(log, model, motion, "chosen by likelihood")
+    motion = required_motion(log, motion)
     model = nominal_parameters() if model is None else model
+    warnings += voltage_notes(log, model.battery)
+    log = with_voltage(log, model)
+    model = model._replace(battery=battery_of_craft(log, model.battery))
     log, is_kept, notes = with_causal_commands(log, model)
     warnings, out = [*warnings, *notes], out[is_kept]
     with_motion = how_it_moves(log, model, ~out, motion)
@@ -300,11 +308,19 @@ def joined(logs: Sequence[FlightLog]) -> FlightLog:
 
     Raises:
         DiagnosisError: no log.
+        LogError: measured logs beside others, or packs of different stated voltages.
     """
     if not logs:
         raise DiagnosisError("logs: found none, expected at least one")
     if len(logs) == 1:
         return logs[0]
+    check_same_origin(*logs)
+    voltages = [one.stated_voltage_v for one in logs]
+    if len(set(voltages)) > 1:
+        shown = ", ".join(f"{Path(one.source).name}: {one.stated_voltage_v}" for one in logs)
+        raise LogError(
+            f"{', '.join(STATED_VOLTAGES)}: found {shown}; expected logs of one pack in one command"
+        )
     names = set.intersection(*(set(log.channels) for log in logs))
     first = np.cumsum([0, *(len(np.unique(log.segment)) for log in logs)])
     segments = [np.cumsum(log.is_start()) - 1 + start for log, start in zip(logs, first, strict=False)]
@@ -314,6 +330,8 @@ def joined(logs: Sequence[FlightLog]) -> FlightLog:
         channels=channels,
         segment=np.concatenate(segments),
         source=" + ".join(Path(log.source).name for log in logs),
+        origin=logs[0].origin,
+        stated_voltage_v=logs[0].stated_voltage_v,
     )
 
 

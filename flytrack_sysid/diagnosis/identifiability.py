@@ -23,7 +23,7 @@ from flytrack_sysid.diagnosis.problem import SEARCHED, Problem
 from flytrack_sysid.diagnosis.result import SCHEMA, TO_LOG, NotIdentifiable
 from flytrack_sysid.diagnosis.score_test import Candidate, Linearization, candidates_of
 from flytrack_sysid.diagnosis.search import FittedModel, SearchState
-from flytrack_sysid.excitation import ANY_VOLTAGE, DT_S, FLIGHT_STEPS, SCRIPT_HEIGHTS, VOLTAGES, is_inside
+from flytrack_sysid.excitation import ANY_VOLTAGE, DT_S, FLIGHT_STEPS, SCRIPT_HEIGHTS, is_inside
 from flytrack_sysid.log import FlightLog, log_of_states
 from flytrack_sysid.manoeuvres import (
     FLIGHTS_PER_MANOEUVRE,
@@ -33,7 +33,7 @@ from flytrack_sysid.manoeuvres import (
     hover_action,
 )
 from flytrack_sysid.parameters import TAUS, THRUST_COEFFS, from_vector
-from flytrack_sysid.record import BATTERY_UNKNOWN_V, UPRIGHT
+from flytrack_sysid.record import UPRIGHT
 from flytrack_sysid.script_file import Script, ScriptError, script_of
 
 DETECTED = 30.0  # noncentrality from which a log shows an effect nearly always
@@ -169,7 +169,7 @@ def _absent_channels(lanes: Lanes) -> list[str]:
         "q": bool(turned or np.any(record.quat != UPRIGHT)),
         "v": bool(moved),
         "p": bool(record.pos_w.any()),
-        "v_bat": bool(np.any(record.battery_v != BATTERY_UNKNOWN_V)),
+        "v_bat": voltages_of(lanes) is not None,
         "uprev": bool(record.is_applied_known.any()),
     }
     return [name for name, is_present in present.items() if not is_present]
@@ -178,7 +178,7 @@ def _absent_channels(lanes: Lanes) -> list[str]:
 def _seen_flights(problem: Problem, vector: np.ndarray) -> tuple[FlightLog, np.ndarray]:
     """Return all manoeuvres flown by a model, seen by the sensors of a problem's log, and rows that count."""
     model = problem.like._replace(thrust_coeffs=vector[problem.index(THRUST_COEFFS)])
-    voltages = voltages_of(problem.lanes) or VOLTAGES
+    voltages = voltages_of(problem.lanes) or _battery_range(problem.like)
     flights = flights_of(MANOEUVRES, hover_action(model, voltages), voltages=voltages)
     starts = np.stack([one.start for one in flights])
     commands = np.stack([one.command for one in flights])
@@ -308,12 +308,16 @@ def _reasons(path: Path, content: Any) -> dict[str, tuple[str, ...]]:
     return {name: tuple(effects) for name, effects in wanted.items() if effects}
 
 
-def _voltages(path: Path, content: dict[str, Any]) -> tuple[float, float]:
-    """Return the voltages that a diagnosis has seen; those of the handout's drone where it saw none."""
+def _battery_range(model: ModelParameters) -> tuple[float, float]:
+    return float(model.battery.empty_v), float(model.battery.full_v)
+
+
+def _voltages(path: Path, content: dict[str, Any], model: ModelParameters) -> tuple[float, float]:
+    """Return the voltages that a diagnosis has seen; those of the model's battery where it saw none."""
     data = content.get("data")
     found = data.get("voltages") if isinstance(data, dict) else None
     if found is None:
-        return VOLTAGES
+        return _battery_range(model)
     numbers = found if isinstance(found, list) and all(isinstance(one, int | float) for one in found) else []
     if len(numbers) != 2 or not 0.0 < numbers[0] <= numbers[1] < np.inf:
         raise ScriptError(f"{path}: data: voltages: found {found!r}, expected the lowest and the highest, V")
@@ -334,6 +338,6 @@ def next_flight(path: str | Path, model: ModelParameters, seed: int = 0) -> Next
     reasons = _reasons(path, content)
     if not reasons:
         raise ScriptError(f"{path}: not_identifiable: found nothing that another flight would settle")
-    voltages = _voltages(path, content)
+    voltages = _voltages(path, content, model)
     hover = hover_action(model, voltages)
     return NextFlight(script_of(flights_of(reasons, hover, seed, voltages)), reasons)

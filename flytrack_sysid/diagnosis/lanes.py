@@ -13,6 +13,7 @@ import numpy as np
 from flytrack_env.dynamics import ModelParameters
 from flytrack_sysid.loads import LoadInput
 from flytrack_sysid.log import FlightLog
+from flytrack_sysid.log_voltage import with_voltage
 from flytrack_sysid.record import Record, is_applied_certain, make_record, measured_channels
 
 LEAD_IN_S, LANE_S = 1, 5
@@ -138,7 +139,7 @@ def make_lanes(log: FlightLog, judged: np.ndarray, tau: np.ndarray, gravity: flo
 
 def lanes_of(log: FlightLog, judged: np.ndarray, model: ModelParameters) -> Lanes:
     """Return the lanes of a log of which some rows, (num_rows,) bool, count, with the lags of a model."""
-    return make_lanes(log, judged, np.asarray(model.tau, float), float(model.g))
+    return make_lanes(with_voltage(log, model), judged, np.asarray(model.tau, float), float(model.g))
 
 
 def voltages_of(lanes: Lanes) -> tuple[float, float] | None:

@@ -31,6 +31,7 @@ from flytrack_sysid.diagnosis.problem import SEARCHED, Problem, blocks_of, robus
 from flytrack_sysid.diagnosis.score_test import Linearization, solve
 from flytrack_sysid.diagnosis.search import refine
 from flytrack_sysid.log import FlightLog, usual_step
+from flytrack_sysid.log_motion import required_motion
 from flytrack_sysid.parameters import base_of
 
 CLEAR = 10.0  # of minus twice the log likelihood, by which a simulator's step has to win
@@ -289,10 +290,12 @@ def likelier_motion(problem: Problem, vector: np.ndarray) -> Motion:
 
 
 def motion_of(log: FlightLog, model: ModelParameters) -> Motion:
-    """Return the motion under which a log is likeliest. model: where the search starts.
+    """Return continuous for a measured log, else the likeliest motion. model: where the search starts.
 
     Without gyro and attitude a log shows no turns, and the model's own motion is returned.
     """
+    if (required := required_motion(log)) is not None:
+        return required
     if "w" not in log and "q" not in log:
         return model.motion
     with jax.enable_x64(True):

@@ -11,6 +11,7 @@ import numpy as np
 
 from flytrack_env.dynamics import collective_thrust
 from flytrack_env.effects import BY_NAME
+from flytrack_env.state import BATTERY_FULL_V
 from flytrack_sysid.diagnosis.problem import Problem
 from flytrack_sysid.diagnosis.result import Cause
 from flytrack_sysid.diagnosis.score_test import BASE_CAUSES
@@ -19,7 +20,7 @@ from flytrack_sysid.parameters import DRAIN, TAUS, THRUST_COEFFS
 LEAST_COST = 0.02  # of the error of free flight, held out
 NOTABLE_LAG_S = 0.005  # as of the effects that delay
 NOTABLE_THRUST = 0.02  # of the weight, as of a scale of thrust
-NOTABLE_DRAIN = 0.2  # V/min: a tenth of a battery in a minute
+NOTABLE_DRAIN_PER_MIN = 0.1  # of the battery, from full to empty: 0.2 V/min of the handout's
 
 
 def split_by_size(
@@ -53,9 +54,15 @@ def is_notable(name: str, problem: Problem, vector: np.ndarray) -> bool:
         name = "thrust_curve"  # found as one factor between two curves
     if name in BASE_CAUSES:
         return _is_base_notable(BASE_CAUSES[name], problem, vector)
-    notable = BY_NAME[name].notable
-    changes = _change(problem, vector, [f"{name}.{field}" for field in notable])
-    return bool(np.any(np.abs(changes) >= list(notable.values())))
+    effect = BY_NAME[name]
+    # Volts of the handout's battery: as large a share of a smaller pack matters as much.
+    volt = float(problem.like.battery.full_v) / BATTERY_FULL_V
+    sizes = {
+        field: size * (volt if effect.ranges[field].unit == "V" else 1.0)
+        for field, size in effect.notable.items()
+    }
+    changes = _change(problem, vector, [f"{name}.{field}" for field in sizes])
+    return bool(np.any(np.abs(changes) >= list(sizes.values())))
 
 
 def _change(problem: Problem, vector: np.ndarray, fields: Sequence[str]) -> np.ndarray:
@@ -69,6 +76,8 @@ def _is_base_notable(fields: Sequence[str], problem: Problem, vector: np.ndarray
         more = collective_thrust(stick, volt, _change(problem, vector, fields))
         weight = float(problem.like.m) * float(problem.like.g)
         return bool(np.sqrt(np.mean(np.square(more))) >= NOTABLE_THRUST * weight)
-    sizes = {**dict.fromkeys(TAUS, NOTABLE_LAG_S), DRAIN: NOTABLE_DRAIN}
+    battery = problem.like.battery
+    notable_drain = NOTABLE_DRAIN_PER_MIN * float(battery.full_v - battery.empty_v)
+    sizes = {**dict.fromkeys(TAUS, NOTABLE_LAG_S), DRAIN: notable_drain}
     changes = _change(problem, vector, fields)
     return bool(np.any(np.abs(changes) >= [sizes[field] for field in fields]))

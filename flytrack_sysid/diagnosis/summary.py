@@ -49,7 +49,6 @@ from flytrack_sysid.parameters import (
     range_of,
 )
 from flytrack_sysid.prediction_windows import HORIZONS_S, QUANTITIES
-from flytrack_sysid.record import BATTERY_UNKNOWN_V
 from flytrack_sysid.response import FULL_STEP, SMALL_STEP, half_responses
 
 TWO_SIDED_95 = 1.959964
@@ -581,7 +580,7 @@ def _voltage_unknown(problem: Problem, causes: Sequence[Cause]) -> list[str]:
     thrust = [cause.effect for cause in causes if cause.effect in ("thrust_curve", "thrust_scale")]
     if not thrust or voltages_of(problem.lanes) is not None:
         return []
-    assumed = f"no voltage was logged and {BATTERY_UNKNOWN_V:g} V were assumed"
+    assumed = f"no voltage was logged and {problem.lanes.record.battery_v.flat[0]:.4g} V were assumed"
     return [f"{assumed}: {thrust[0]} may only be the error of that"]
 
 

@@ -9,6 +9,7 @@ from flytrack_env.battery import Battery
 from flytrack_env.dynamics import ModelParameters, nominal_parameters
 from flytrack_env.files import open_file
 from flytrack_env.messages import error_text
+from flytrack_env.motion import Motion
 from flytrack_sysid.importing.file_kinds import NUM_BYTES, identify
 from flytrack_sysid.log import FlightLog, LogError
 
@@ -59,6 +60,7 @@ class Craft(NamedTuple):
         return nominal._replace(
             **leaves,
             m=self.mass_kg,
+            motion=Motion.CONTINUOUS,  # as drones move
             battery_drain_v_per_min=float(nominal.battery_drain_v_per_min) / per_volt,
             battery=Battery(full_v, empty_v, fitted_low_v=empty_v, fitted_high_v=full_v),
         )

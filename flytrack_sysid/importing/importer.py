@@ -123,6 +123,7 @@ def import_log(
     log = _concatenate([flight.log for flight in flights], sources)
     log, offsets = align_clocks(log, align)
     craft = _common_craft(flights, sources)
+    log = replace(log, origin="measured", stated_voltage_v=None if "v_bat" in log else craft.voltage_v)
     if craft.voltage_v is None and "v_bat" in log and log["v_bat"].min() > 0.0:
         craft = craft._replace(voltage_v=(float(log["v_bat"].min()), float(log["v_bat"].max())))
     step_s = float(np.median(usual_step(log)))

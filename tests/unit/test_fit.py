@@ -186,7 +186,7 @@ def test_a_log_that_measured_nothing_is_refused_by_its_name(exact):
 
 @pytest.mark.slow
 def test_missing_voltage_is_said_with_what_is_taken_instead(exact):
-    assert "the log as flown at 23 V" in "\n".join(fit(exact.without("v_bat")).warnings)
+    assert "taken as flown at 23 V" in "\n".join(fit(exact.without("v_bat")).warnings)
 
 
 def test_replacing_values_changes_those_alone_and_refuses_unknown_names():

@@ -1,0 +1,59 @@
+"""How a log is replayed within a step, by what flew it: a measured log continuously.
+
+The likelihoods of the two discrete integrators and of continuous motion differ by less than what a model
+that lacks something leaves, so on measured logs they choose a simulator's step (docs/diagnosis.md). Drones
+move continuously, so only logs that are not measured leave anything to choose.
+"""
+
+from flytrack_env.dynamics import ModelParameters
+from flytrack_env.motion import Motion
+from flytrack_sysid.log import MEASURED, FlightLog, LogError
+
+HOW_TO_MARK = f"a column {MEASURED!r} says it: 1 for a real drone, 0 for a simulator"
+
+
+def required_motion(log: FlightLog, requested: Motion | None = None) -> Motion | None:
+    """Return the motion to replay a log with: the requested one, else continuous if measured, else None."""
+    if requested is not None:
+        return requested
+    return Motion.CONTINUOUS if log.origin == "measured" else None
+
+
+def motion_notes(
+    log: FlightLog, model: ModelParameters | None, requested: Motion | None, otherwise: str
+) -> list[str]:
+    """Return where log, model and request contradict each other on the motion, a sentence each.
+
+    Args:
+        log: what is replayed.
+        model: the model as it was given; None if none was.
+        requested: the motion that was asked for; None if none was.
+        otherwise: how the motion of a log that is not measured comes about, for the note on one that is not
+            marked.
+    """
+    required, notes = required_motion(log, requested), []
+    if log.origin == "measured" and required is not Motion.CONTINUOUS:
+        notes.append(
+            f"motion: {required.value} was requested, but {log.source} is measured: drones move continuously"
+        )
+    if model is not None and required is not None and model.motion is not required:
+        why = "as requested" if requested is not None else f"since {log.source} is measured"
+        notes.append(f"motion: replayed as {required.value}, {why}; the model says {model.motion.value}")
+    if log.origin is None and requested is None:
+        notes.append(
+            f"motion: {otherwise}, since {log.source} does not say whether a drone or a simulator flew; "
+            f"{HOW_TO_MARK}; measured logs are replayed as continuous"
+        )
+    return notes
+
+
+def check_same_origin(*logs: FlightLog) -> None:
+    """Raise LogError for logs of which some are measured and others are not, or are not marked."""
+    for log in logs[1:]:
+        if log.origin != logs[0].origin:
+            found = f"{log.source} is {_shown(log)} and {logs[0].source} is {_shown(logs[0])}"
+            raise LogError(f"{found}; expected logs of one origin in one command; {HOW_TO_MARK}")
+
+
+def _shown(log: FlightLog) -> str:
+    return log.origin or "not marked"

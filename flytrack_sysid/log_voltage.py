@@ -1,0 +1,95 @@
+"""At which voltages a log was flown, and what that says of a model's battery.
+
+Where ``v_bat`` was not logged, thrust is that of the middle of the pack's stated range, else of the model's
+battery.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+
+from flytrack_env.battery import MAX_EXTRAPOLATION, Battery
+from flytrack_env.dynamics import ModelParameters
+from flytrack_sysid.log import FlightLog
+
+# Percentiles of a logged voltage, so that a lone wrong sample is no range: a pack that falls evenly from 16.7
+# to 14.4 V keeps all but 12 mV at each end.
+LOWEST_PERCENTILE, HIGHEST_PERCENTILE = 0.5, 99.5
+DECIMALS = 3  # of a battery's voltages, V: sensors have two
+
+
+def with_voltage(log: FlightLog, model: ModelParameters) -> FlightLog:
+    """Return a log that has a voltage: where neither logged nor stated, that of the model's battery."""
+    if "v_bat" in log or log.stated_voltage_v is not None:
+        return log
+    return replace(log, stated_voltage_v=(float(model.battery.empty_v), float(model.battery.full_v)))
+
+
+def assumed_voltage(log: FlightLog) -> float:
+    """Return the voltage of a log without ``v_bat``, V: the middle of what is stated, or the handout's."""
+    battery = Battery()
+    return 0.5 * sum(log.stated_voltage_v or (battery.empty_v, battery.full_v))
+
+
+def flown_voltages(log: FlightLog) -> tuple[float, float]:
+    """Return the lowest and the highest voltage that a log was flown at, logged or stated, V."""
+    if "v_bat" not in log:
+        return log.stated_voltage_v or (assumed_voltage(log), assumed_voltage(log))
+    low, high = np.percentile(log["v_bat"], [LOWEST_PERCENTILE, HIGHEST_PERCENTILE]).round(DECIMALS)
+    return float(low), float(high)
+
+
+def is_within(voltages: tuple[float, float], battery: Battery) -> bool:
+    """Return whether voltages are a battery's, but for what a thrust map may be extrapolated by."""
+    margin = MAX_EXTRAPOLATION * float(battery.full_v)
+    return voltages[0] >= float(battery.empty_v) - margin and voltages[1] <= float(battery.full_v) + margin
+
+
+def battery_of_craft(log: FlightLog, battery: Battery) -> Battery:
+    """Return the battery of the craft that flew a log: the model's, unless the log was flown at others.
+
+    Then it goes from the highest voltage of the log down to the lowest, or, of a log that hardly drains it,
+    by as large a share as the model's battery does.
+    """
+    low, high = flown_voltages(log)
+    if is_within((low, high), battery):
+        return battery
+    empty_v = min(low, round(high * float(battery.empty_v) / float(battery.full_v), DECIMALS))
+    return battery._replace(full_v=high, empty_v=empty_v, fitted_low_v=low, fitted_high_v=high)
+
+
+def fitted_battery(log: FlightLog, battery: Battery) -> Battery:
+    """Return the battery of the craft that flew a log, with a thrust map that was fitted to the log."""
+    low, high = flown_voltages(log) if "v_bat" in log else (assumed_voltage(log),) * 2
+    return battery_of_craft(log, battery)._replace(fitted_low_v=low, fitted_high_v=high)
+
+
+def voltage_notes(log: FlightLog, battery: Battery) -> list[str]:
+    """Return which voltage is assumed where none was logged, and where a log is not of a model's battery.
+
+    Args:
+        log: as it was given, without a voltage that the model lent it.
+        battery: the model's, as it was given.
+    """
+    notes = []
+    if "v_bat" not in log:
+        lender = (
+            "the model's battery" if log.stated_voltage_v is None else "the voltages stated for the craft"
+        )
+        low, high = log.stated_voltage_v or (float(battery.empty_v), float(battery.full_v))
+        notes.append(
+            f"v_bat is absent: {log.source} is taken as flown at {0.5 * (low + high):.4g} V, the middle of "
+            f"{lender} ({low:.4g} to {high:.4g} V)"
+        )
+        if log.stated_voltage_v is None:
+            return notes
+    low, high = flown_voltages(log)
+    if not is_within((low, high), battery):
+        overlap = (
+            "exceeds" if low <= float(battery.full_v) and high >= float(battery.empty_v) else "is outside"
+        )
+        notes.append(
+            f"voltage: {log.source} was flown at {low:.4g} to {high:.4g} V, which {overlap} the model's "
+            f"battery, {battery.describe()} (thrust map of {battery.describe_fitted()}); is it of this craft?"
+        )
+    return notes
