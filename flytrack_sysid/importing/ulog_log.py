@@ -1,7 +1,7 @@
 """PX4 logs (``.ulg``), read by pyulog: NED and FRD converted to our frames, topics put on one time base.
 
 Rows are the samples of the body rates; other sensors are interpolated between their own samples, setpoints
-are held. There are no rows where a topic has a gap of more than three of its usual steps, or on the ground.
+are held. There are no rows where a topic has a gap of more than three of its usual steps.
 """
 
 from pathlib import Path
@@ -82,20 +82,19 @@ def read_ulog(path: Path, mapping: Mapping) -> ImportedFlight:
     if "v_bat" in samples:
         ours["v_bat"] = samples["v_bat"]
     channels, is_known = on_one_base(ours, base)
-    is_flying = np.ones(len(base), bool)
+    if not is_known.any():
+        raise LogError(f"{path}: found no time at which all of {', '.join(ours)} are known, expected some")
+    is_landed = None
     if "landed" in samples:
         times, landed = samples["landed"]
-        is_flying = landed[np.maximum(np.searchsorted(times, base, side="right") - 1, 0), 0] == 0.0
-    is_used = is_known & is_flying
-    if not is_used.any():
-        found = f"{is_known.sum()} of {len(base)} samples of the rates with all other topics around them"
-        raise LogError(f"{path}: found {found}, {is_flying.sum()} in flight, expected some that are both")
-    used_channels = {name: values[is_used] for name, values in channels.items()}
-    columns = columns_of(base[is_used] - base[is_used][0], used_channels)
-    used = f"{is_used.sum()} of {len(base)} samples of the rates used, {is_flying.sum()} in flight"
+        last = np.maximum(np.searchsorted(times, base[is_known], side="right") - 1, 0)
+        is_landed = landed[last, 0] != 0.0
+    used_channels = {name: values[is_known] for name, values in channels.items()}
+    columns = columns_of(base[is_known] - base[is_known][0], used_channels)
+    used = f"{is_known.sum()} of {len(base)} samples of the rates have all other topics around them"
     said = [used, *["damaged in places; what could be read is used"] * is_damaged, *_airframe(parameters)]
     notes = tuple(f"{path}: {text}" for text in [*said, *slow_channels(ours)])
-    return ImportedFlight(log_of_table(Table(str(path), columns)), craft, notes)
+    return ImportedFlight(log_of_table(Table(str(path), columns)), craft, notes, is_landed)
 
 
 def _airframe(parameters: dict[str, float]) -> list[str]:
