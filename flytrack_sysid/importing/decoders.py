@@ -28,10 +28,10 @@ def _pack(notes: Any, arrays: list[np.ndarray]) -> bytes:
 
 
 def decode_ulog(arguments: Any, _: bytes) -> bytes:
-    """Return fields of the first instances of a PX4 log's topics.
+    """Return fields of a PX4 log's topics, of all their instances.
 
     arguments: path, and the wanted fields by topic. The arrays are float64, (num_rows,). The notes have their
-    topics and fields (``fields``), ``parameters`` (finite numbers) and ``is_damaged``.
+    topics, instances and fields (``fields``), ``parameters`` (finite numbers) and ``is_damaged``.
     """
     import pyulog
 
@@ -39,9 +39,8 @@ def decode_ulog(arguments: Any, _: bytes) -> bytes:
     with open(path, "rb") as file:
         ulog = pyulog.ULog(file, list(wanted))
     found = {
-        (data.name, field): data.data[field].astype(float)
-        for data in ulog.data_list
-        if data.multi_id == 0
+        (data.name, int(data.multi_id), field): data.data[field].astype(float)
+        for data in sorted(ulog.data_list, key=lambda data: data.multi_id)
         for field in wanted.get(data.name, ())
         if field in data.data
     }

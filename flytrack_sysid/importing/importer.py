@@ -150,10 +150,26 @@ def _flights_in_the_air(
             kept = is_used & ~is_ground
             if num_ground:
                 notes.append(f"{source}: {num_ground} of {num_used} rows left out: on the ground")
-        in_the_air.append(flight._replace(log=log.select(kept), is_landed=None))
+        log, said = _with_measured_voltage(log.select(kept))
+        notes += said
+        in_the_air.append(flight._replace(log=log, is_landed=None))
     if not in_the_air:
         raise LogError(f'{left_out[0]}; rows.on_ground = "keep" in a mapping uses them')
     return in_the_air, (*notes, *(f"left out: {reason}" for reason in left_out))
+
+
+def _with_measured_voltage(log: FlightLog) -> tuple[FlightLog, list[str]]:
+    """Return the log without voltages of 0, which nobody measured, and a note if there are some."""
+    if "v_bat" not in log or log["v_bat"].min() > 0.0:
+        return log, []
+    is_measured = log["v_bat"][:, 0] > 0.0
+    found = f"{log.source}: v_bat: not above 0 V in {np.sum(~is_measured)} of {len(log)} rows"
+    if not is_measured.any():
+        return log.without("v_bat"), [f"{found}: left out"]
+    row = np.arange(len(log))
+    volts = np.interp(row, row[is_measured], log["v_bat"][is_measured, 0])
+    channels = {**log.channels, "v_bat": volts[:, None]}
+    return replace(log, channels=channels), [f"{found}: interpolated between the others"]
 
 
 def _is_selected(path: Path, log: FlightLog, mapping: Mapping) -> np.ndarray:

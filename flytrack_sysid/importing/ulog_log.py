@@ -14,7 +14,7 @@ from flytrack_sysid.importing.flight import ImportedFlight, not_a_quadcopter, re
 from flytrack_sysid.importing.mapping import Mapping
 from flytrack_sysid.importing.units import PER_DEGREE, UNITS, quaternion_from, vector_from
 from flytrack_sysid.log import LogError
-from flytrack_sysid.log_table import LARGEST_NORM_ERROR, Table, columns_of, log_of_table
+from flytrack_sysid.log_table import COMMAND_MARGIN, LARGEST_NORM_ERROR, Table, columns_of, log_of_table
 from flytrack_sysid.resample import Samples, is_increasing, on_one_base, slow_channels
 
 LARGEST_BYTES = 2**29  # the decoder may take time and memory in proportion
@@ -41,6 +41,7 @@ def _indexed(topic: str, field: str, size: int) -> Source:
     return topic, tuple(f"{field}[{axis}]" for axis in range(size))
 
 
+BATTERY_FIELDS = ("voltage_v",)
 # The first one in the log is used; later ones are of older firmware.
 SOURCES: dict[str, tuple[Source, ...]] = {
     "w": (_indexed("vehicle_angular_velocity", "xyz", 3), _indexed("sensor_combined", "gyro_rad", 3)),
@@ -52,7 +53,7 @@ SOURCES: dict[str, tuple[Source, ...]] = {
         ("vehicle_rates_setpoint", ("roll", "pitch", "yaw", "thrust_body[2]")),
         ("vehicle_rates_setpoint", ("roll", "pitch", "yaw", "thrust")),
     ),
-    "v_bat": (("battery_status", ("voltage_v",)),),
+    "v_bat": (("battery_status", BATTERY_FIELDS),),
     "landed": (("vehicle_land_detected", ("landed",)),),
 }
 REQUIRED = ("w", "u", "q")
@@ -75,6 +76,7 @@ def read_ulog(path: Path, mapping: Mapping) -> ImportedFlight:
         craft = craft._replace(max_rate_deg_s=_full_stick_deg_s(path, parameters))
     base = samples["w"].times
     commands = _commands(samples["u"].values, np.array(craft.max_rate_deg_s) * PER_DEGREE)
+    _check_full_stick(path, commands, craft.max_rate_deg_s)
     ours = {"u": Samples(samples["u"].times, commands), "q": _attitude(path, samples["q"])}
     for name in ("w", "f", "p", "v"):
         if name in samples:
@@ -114,13 +116,13 @@ def _decode(path: Path) -> tuple[dict[str, Samples], dict[str, float], bool]:
     for topic, names in (source for sources in SOURCES.values() for source in sources):
         fields[topic] = [*fields.get(topic, TIMES), *names]
     notes, arrays = decode(str(path), "ulog", path, fields)
-    topics: dict[str, dict[str, np.ndarray]] = {}
-    for (topic, field), values in zip(notes["fields"], arrays, strict=True):
-        topics.setdefault(topic, {})[field] = values
+    topics: dict[str, dict[int, dict[str, np.ndarray]]] = {}
+    for (topic, instance, field), values in zip(notes["fields"], arrays, strict=True):
+        topics.setdefault(topic, {}).setdefault(instance, {})[field] = values
     samples = {}
     for channel, sources in SOURCES.items():
         found = next(
-            filter(None, (_samples_of(topics.get(topic, {}), names) for topic, names in sources)), None
+            filter(None, (_best_instance(topics.get(topic, {}), names) for topic, names in sources)), None
         )
         if found is not None:
             samples[channel] = found
@@ -129,6 +131,12 @@ def _decode(path: Path) -> tuple[dict[str, Samples], dict[str, float], bool]:
             there = ", ".join(sorted(topics)) or "none of the topics that are read"
             raise LogError(f"{path}: topic {wanted}: missing or empty; found {there}")
     return samples, notes["parameters"], notes["is_damaged"]
+
+
+def _best_instance(instances: dict[int, dict[str, np.ndarray]], fields: tuple[str, ...]) -> Samples | None:
+    """Return the samples of the instance of a topic that has most valid ones; of equal ones the first."""
+    samples = [_samples_of(topic, fields) for topic in instances.values()]
+    return max((one for one in samples if one is not None), key=lambda one: len(one.times), default=None)
 
 
 def _samples_of(topic: dict[str, np.ndarray], fields: tuple[str, ...]) -> Samples | None:
@@ -140,6 +148,8 @@ def _samples_of(topic: dict[str, np.ndarray], fields: tuple[str, ...]) -> Sample
     times = times if np.all(times > 0) else topic["timestamp"]
     values = np.stack([topic[field] for field in fields], axis=1)
     is_finite = np.isfinite(values).all(axis=1)
+    if fields == BATTERY_FIELDS:
+        is_finite &= values[:, 0] > 0.0  # PX4 reports 0 V of a battery that it does not measure
     times, values = times[is_finite] * MICROSECOND, values[is_finite]
     is_used = is_increasing(times)
     return Samples(times[is_used], values[is_used]) if is_used.any() else None
@@ -159,6 +169,19 @@ def _commands(setpoints: np.ndarray, full_stick: np.ndarray) -> np.ndarray:
     """Return commands (num_rows, 4) of setpoints: rates in FRD, rad/s; thrust, 0 to 1, either sign."""
     rates = vector_from(setpoints[:, :3], True) / full_stick
     return np.column_stack([rates, 2.0 * np.abs(setpoints[:, 3]) - 1.0])
+
+
+def _check_full_stick(path: Path, commands: np.ndarray, full_stick: tuple[float, ...]) -> None:
+    """Raise LogError for setpoints past full stick; the message says how to raise it."""
+    largest = np.abs(commands[:, :3]).max(axis=0)
+    if largest.max() > 1.0 + COMMAND_MARGIN:
+        asked = ", ".join(f"{value:.4g}" for value in largest * full_stick)
+        known = ", ".join(f"{value:.4g}" for value in full_stick)
+        needed = ", ".join(f"{value:.0f}" for value in np.ceil(np.maximum(largest, 1.0) * full_stick))
+        found = f"roll, pitch, yaw: found setpoints of up to {asked} deg/s"
+        expected = f"expected at most full stick, {known} deg/s"
+        advice = f"in a mapping, craft.max_rate_deg_s = [{needed}] raises it"
+        raise LogError(f"{path}: topic vehicle_rates_setpoint: {found}, {expected}; {advice}")
 
 
 def _full_stick_deg_s(path: Path, parameters: dict[str, float]) -> tuple[float, float, float]:

@@ -91,8 +91,9 @@ WRITERS = {
 
 def test_a_bag_compressed_as_a_whole_is_told_and_the_command_named_makes_it_one_that_is_read(tmp_path):
     storage = StoragePlugin.SQLITE3
-    with Writer(tmp_path / "bag", version=9, storage_plugin=storage) as writer:
-        writer.set_compression(CompressionMode.FILE, CompressionFormat.ZSTD)
+    unopened = Writer(tmp_path / "bag", version=9, storage_plugin=storage)
+    unopened.set_compression(CompressionMode.FILE, CompressionFormat.ZSTD)
+    with unopened as writer:
         topics = {
             topic: writer.add_connection(topic, kind, typestore=TYPES) for topic, (kind, _) in KINDS.items()
         }

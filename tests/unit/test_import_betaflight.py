@@ -182,6 +182,17 @@ def test_a_log_cut_off_is_used_up_to_its_last_whole_frame(tmp_path, num_missing)
         assert f"cut off: found no end-of-log event; {num_rows} whole frames used" in found.notes[1]
 
 
+def test_a_voltage_of_0_was_not_measured(tmp_path):
+    rows = frames()
+    rows[50:60, 6] = 0
+    found = import_log(write(tmp_path / "a.bbl", log_with(rows)), "betaflight")
+    assert found.log["v_bat"][:, 0] == pytest.approx(24.1)
+    assert "v_bat: not above 0 V in 10 of 200 rows: interpolated" in found.notes[-1]
+    rows[:, 6] = 0
+    found = import_log(write(tmp_path / "a.bbl", log_with(rows)), "betaflight")
+    assert "v_bat" not in found.log and "in 200 of 200 rows: left out" in found.notes[-1]
+
+
 ATTITUDE = [f"imuQuaternion[{axis}]" for axis in range(3)]
 
 

@@ -1,5 +1,6 @@
 """PX4 logs: what a file written by the format's specification holds, in our units and frames."""
 
+import re
 import sys
 from pathlib import Path
 from typing import Any
@@ -91,8 +92,29 @@ def test_unknown_full_stick_is_refused_unless_the_mapping_states_it(tmp_path, pi
     commands = import_log(path, "ulog", mapping).log["u"]
     np.testing.assert_allclose(commands[0], [0.5, -0.5, 0.5, 0.5], atol=1e-6)
     mapping.write_text("[craft]\nmax_rate_deg_s = [90, 90, 90]\n")
-    with pytest.raises(LogError, match=r"column u_roll: found 4\.0\d*, expected a command in \[-1, 1\]"):
+    text = r"up to 360, 90, 45 deg/s, .*, 90, 90, 90 deg/s; in a mapping, craft\.max_rate_deg_s = \["
+    with pytest.raises(LogError, match=text) as error:
         import_log(path, "ulog", mapping)
+    advice = re.search(r"max_rate_deg_s = \[.*?\]", str(error.value)).group()
+    mapping.write_text(f"[craft]\n{advice}\n")  # what the message says to write is read
+    assert import_log(path, "ulog", mapping).log["u"][0, 0] == pytest.approx(1.0, abs=0.005)
+
+
+@pytest.mark.parametrize(("first_v", "second_v"), [(16.25, 15.0), (0.0, 15.0), (np.nan, 15.0), (0.0, 0.0)])
+def test_the_battery_that_is_measured_is_used(tmp_path, first_v, second_v):
+    tables = topics()
+    fields, rows = tables["battery_status"]
+    writer = UlogWriter(PARAMETERS)
+    for name, (names, values) in tables.items():
+        if name != "battery_status":
+            writer.add(name, names, values)
+    for instance, volts in enumerate((first_v, second_v)):
+        writer.add("battery_status", fields, [(row[0], volts) for row in rows], instance)
+    (tmp_path / "a.ulg").write_bytes(writer.content())
+    log = import_log(tmp_path / "a.ulg", "ulog").log
+    expected = next((volts for volts in (first_v, second_v) if volts > 0.0), None)
+    assert ("v_bat" in log) == (expected is not None)
+    assert expected is None or log["v_bat"][:, 0] == pytest.approx(expected)
 
 
 def test_samples_from_before_the_estimator_runs_are_left_out(tmp_path):
