@@ -293,7 +293,7 @@ def _check_data(log: FlightLog, judged: np.ndarray, free: tuple[str, ...]) -> No
         if tau in free and np.ptp(stick) < NEVER_MOVED:
             raise FitError(
                 f"{log.source}: {column}: stuck at {stick[0]:.4g}; {tau} cannot be identified: move "
-                f"it, or fix {tau}"
+                f"it, or fix {tau} (--fix {tau}=VALUE)"
             )
 
 
@@ -313,6 +313,16 @@ def _check_response(log: FlightLog, start: ModelParameters) -> None:
         )
 
 
+def _likely_cause(log: FlightLog, tau: str) -> str:
+    """Return what may let the fit of a lag end at an end of its range."""
+    column = CHANNELS["u"][TAUS.index(tau)]
+    if tau != TAUS[3]:
+        return f"do sign and order of {column} and of the rates agree, and is full stick right?"
+    frames = "f" if "f" in log else "attitude or velocity"
+    ground = "is it on the ground in a part of the log"
+    return f"{ground}, is {frames} in another frame, or does {column} not drive it?"
+
+
 def _check_result(result: Estimate, log: FlightLog, judged: np.ndarray) -> None:
     """Raise FitError where the best model is no model of a drone."""
     values = dict(zip(names_of(result.model), to_vector(result.model), strict=True))
@@ -320,7 +330,7 @@ def _check_result(result: Estimate, log: FlightLog, judged: np.ndarray) -> None:
         if name in result.free and not TAU_RANGE.low * AT_BOUND < values[name] < TAU_RANGE.high / AT_BOUND:
             raise FitError(
                 f"{log.source}: {name}: the fit ended at {values[name]:.3g} s, expected {TAU_RANGE.low} to "
-                f"{TAU_RANGE.high} s; does {CHANNELS['u'][TAUS.index(name)]} drive this drone?"
+                f"{TAU_RANGE.high} s; {_likely_cause(log, name)}; --fix {name}=VALUE holds it"
             )
     for name in (name for name in result.free if "." in name):
         low, high, unit = range_of(name)

@@ -17,6 +17,9 @@ from flytrack_sysid.log import CHANNELS, FlightLog, LogError
 WINDOWS_S = (0.1, 0.3, 1.0)  # long against the noise of a sample; short ones for fast manoeuvres
 FEWEST_WINDOWS = 10
 LEAST_CORRELATION = 0.9  # with less in common, the slope may be that of noise
+# Channels of one motion correlate by more unless they contradict each other; and then they must correlate by
+# LEAST_CORRELATION if read otherwise. Right logs: 0.97 or more where they move, anything where they do not.
+CONTRADICTION = 0.5
 STILL = 1e-6  # in any unit: what changes by less does not change
 GRAVITY = float(nominal_parameters().g)  # m/s^2
 TOLERANCE = 0.15  # of a known wrong factor: scale errors of sensors stay well below it
@@ -75,13 +78,20 @@ def windows_of(log: FlightLog, length_s: float) -> Windows:
     return Windows(starts[keep], ends[keep], durations[keep])
 
 
-def slope_of(log: FlightLog, change: np.ndarray, rate: np.ndarray) -> float:
-    """Return the factor from the change of one quantity to the integral of its rate, nan if none is clear.
+def agreement(log: FlightLog, change: np.ndarray, rate: np.ndarray) -> tuple[float, float]:
+    """Return how well the change of one quantity, and the integral of its rate, agree.
 
-    change, rate: (num_rows, 3). The ratio of their sizes over windows of that length at which they move
-    most alike: noise in either biases it little where they are highly correlated.
+    Args:
+        log: where the rows are.
+        change: a quantity, (num_rows, 3).
+        rate: what should be its derivative, (num_rows, 3).
+
+    Returns:
+        Their correlation over windows of that length at which they move most alike, nan where they move too
+        little, and the size of the integral over that of the change: noise in either biases it little where
+        they are highly correlated.
     """
-    best, slope = LEAST_CORRELATION, np.nan
+    best, slope = np.nan, np.nan
     for length_s in WINDOWS_S:
         windows = windows_of(log, length_s)
         if len(windows.starts) < FEWEST_WINDOWS:
@@ -92,9 +102,15 @@ def slope_of(log: FlightLog, change: np.ndarray, rate: np.ndarray) -> float:
         if min(size_grown, size_summed) < STILL:
             continue
         correlation = np.sum(grown * summed) / (size_grown * size_summed)
-        if correlation >= best:
-            best, slope = correlation, float(size_summed / size_grown)
-    return slope
+        if not correlation < best:  # the first is better than nan
+            best, slope = float(correlation), float(size_summed / size_grown)
+    return best, slope
+
+
+def slope_of(log: FlightLog, change: np.ndarray, rate: np.ndarray) -> float:
+    """Return the factor from the change of one quantity to the integral of its rate, nan if none is clear."""
+    correlation, slope = agreement(log, change, rate)
+    return slope if correlation >= LEAST_CORRELATION else np.nan
 
 
 def _is_about(value: float, factor: float) -> bool:
@@ -146,23 +162,115 @@ def summed_turns(attitude: Rotation) -> np.ndarray:
 
 
 def _attitude(log: FlightLog) -> Iterator[str]:
-    """Compare the attitude with the rates: does it move with them, and in the right direction?"""
+    """Tell an attitude that is stuck while the rates turn."""
     if "q" not in log or "w" not in log:
         return
     windows = windows_of(log, WINDOWS_S[-1])
     turn = np.linalg.norm(windows.mean_of(log, log["w"]), axis=1) * windows.durations
-    if np.ptp(log["q"], axis=0).max() <= STILL:
-        if len(turn) and turn.max() > LEAST_TURN:
-            found = (
-                f"found the same in every row while {_columns('w')} turn by {turn.max():.2g} rad in a second"
-            )
-            yield f"{_columns('q')}: {found}: the attitude looks stuck"
+    if np.ptp(log["q"], axis=0).max() <= STILL and len(turn) and turn.max() > LEAST_TURN:
+        found = f"found the same in every row while {_columns('w')} turn by {turn.max():.2g} rad in a second"
+        yield f"{_columns('q')}: {found}: the attitude looks stuck"
+
+
+def _pairs(log: FlightLog) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    """Return what measures one motion twice: the channels, and of each pair a change and its rate."""
+    pairs = {}
+    if "q" in log:
+        attitude = Rotation.from_quat(log["q"], scalar_first=True)
+        if "w" in log:
+            pairs["q and w"] = summed_turns(attitude), log["w"]
+        if "f" in log and "v" in log:
+            pairs["v and f by q"] = log["v"], attitude.apply(log["f"]) - np.array([0.0, 0.0, GRAVITY])
+    if "p" in log and "v" in log:
+        pairs["p and v"] = log["p"], log["v"]
+    return pairs
+
+
+def _changed(channel: str, change: Callable[[np.ndarray], np.ndarray]) -> Callable[[FlightLog], FlightLog]:
+    return lambda log: replace(log, channels={**log.channels, channel: change(log[channel])})
+
+
+def _as_quaternions(change: Callable[[Rotation], Rotation]) -> Callable[[np.ndarray], np.ndarray]:
+    return lambda quat: change(Rotation.from_quat(quat, scalar_first=True)).as_quat(scalar_first=True)
+
+
+HALF_TURN = Rotation.from_rotvec([np.pi, 0.0, 0.0])  # about x: between FLU and FRD, z up and NED
+TURN_SIGNS = np.array([1.0, -1.0, -1.0])
+# One mistake each in what a mapping says: the channel, what it looks like, and how to read it right. An order
+# is mistaken before the frames are converted, which may have turned both body and world.
+CONVENTIONS: tuple[tuple[str, str, Callable[[FlightLog], FlightLog]], ...] = (
+    (
+        "q",
+        "is inverted: this looks like world to body, not body to world",
+        _changed("q", _as_quaternions(Rotation.inv)),
+    ),
+    *(
+        (
+            "q",
+            f"is read as {order}: this looks like the other order of the quaternion",
+            _changed("q", lambda quat, signs=signs, step=step: np.roll(quat * signs, step, axis=1) * signs),
+        )
+        for order, step in (("xyzw", 1), ("wxyz", -1))
+        for signs in (np.ones(4), np.array([1.0, 1.0, -1.0, -1.0]))
+    ),
+    (
+        "q",
+        "has its body axes turned: this looks like the other of flu and frd",
+        _changed("q", _as_quaternions(lambda attitude: attitude * HALF_TURN)),
+    ),
+    (
+        "q",
+        "has its world turned: this looks like the other of z_up and ned",
+        _changed("q", _as_quaternions(lambda attitude: HALF_TURN * attitude)),
+    ),
+    (
+        "q",
+        "has body axes and world turned: this looks like the other of flu and frd, and of z_up and ned",
+        _changed("q", _as_quaternions(lambda attitude: HALF_TURN * attitude * HALF_TURN)),
+    ),
+    *(
+        (
+            channel,
+            f"has y and z turned: this looks like the other of {frames}",
+            _changed(channel, TURN_SIGNS.__mul__),
+        )
+        for channel, frames in (
+            ("w", "flu and frd"),
+            ("f", "flu and frd"),
+            ("v", "z_up and ned"),
+            ("p", "z_up and ned"),
+        )
+    ),
+)
+
+
+def _conventions(log: FlightLog) -> Iterator[str]:
+    """Compare what measures one motion twice, and tell how to read it so that all of it agrees."""
+    if not _pairs(log) or ("f" in log and any(_force_sign(log))):
         return
-    attitude = Rotation.from_quat(log["q"], scalar_first=True)
-    slopes = [slope_of(log, summed_turns(one), log["w"]) for one in (attitude, attitude.inv())]
-    if np.isnan(slopes[0]) and _is_about(slopes[1], 1.0):
-        found = f"found turns that agree with {_columns('w')} only if it is inverted"
-        yield f"{_columns('q')}: {found}: this looks like world to body, not body to world"
+    before = {name: agreement(log, *pair)[0] for name, pair in _pairs(log).items()}
+    if not any(correlation < CONTRADICTION for correlation in before.values()):
+        return
+    resolved: dict[str, list[str]] = {}
+    for channel, text, read_right in CONVENTIONS:
+        if channel not in log:
+            continue
+        after = {name: agreement(log, *pair)[0] for name, pair in _pairs(read_right(log)).items()}
+        cured = [name for name in before if before[name] < CONTRADICTION and after[name] >= LEAST_CORRELATION]
+        is_harmed = any(
+            after[name] < min(before[name], LEAST_CORRELATION) for name in before if name not in cured
+        )
+        if cured and not is_harmed:
+            resolved.setdefault(", ".join(cured), []).append(f"{channel} {text}")
+    # Those that resolve most explain the log best.
+    most = max((len(names.split(", ")) for names in resolved), default=0)
+    for names, readings in resolved.items():
+        if len(names.split(", ")) == most:
+            channel = readings[0].partition(" ")[0]
+            shown = ", ".join(f"{name} correlate by {before[name]:.2f}" for name in names.split(", "))
+            agree = "; or if ".join(dict.fromkeys(readings))
+            yield f"{_columns(channel)}: found motion that contradicts itself ({shown}); it agrees if {agree}"
+            return
 
 
 def _rates(log: FlightLog) -> Iterator[str]:
@@ -242,7 +350,7 @@ def _battery(log: FlightLog) -> Iterator[str]:
 
 
 CHECKS: tuple[Callable[[FlightLog], Iterator[str]], ...]
-CHECKS = (_length, _commands, _motion, _attitude, _rates, _acceleration, _force, _battery)
+CHECKS = (_length, _commands, _motion, _attitude, _conventions, _rates, _acceleration, _force, _battery)
 
 
 def find_problems(log: FlightLog) -> list[str]:

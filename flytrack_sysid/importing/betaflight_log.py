@@ -1,8 +1,8 @@
 """Betaflight blackbox logs (``.bbl``, ``.bfl``), decoded by orangebox.
 
 Betaflight's body frame is ours: x forward, y left, z up; so is its accelerometer's sign (+1 g at rest), and
-positive yaw is to the left. docs/real_logs.md says how that was checked on a real log. There is no
-attitude or velocity in these logs.
+positive yaw is to the left. docs/real_logs.md says how that was checked on a real log. Attitude is
+there since Betaflight 2025.12; there is no velocity.
 """
 
 import json
@@ -25,10 +25,12 @@ from flytrack_sysid.timestamps import number_segments, put_on_one_line, read_clo
 FIRMWARE = "Betaflight"
 LARGEST_BYTES = 2**29  # of a flash chip
 FIRST_BYTES = b"H Product:Blackbox"
-END_OF_LOG = b"E\xffEnd of log"  # the event that a logger writes last
+END_OF_LOG = b"E\xffEnd of log\0"  # the event that a logger writes last
 STICKS = tuple(f"setpoint[{axis}]" for axis in range(4))
 GYRO = tuple(f"gyroADC[{axis}]" for axis in range(3))
 ACCELEROMETER = tuple(f"accSmooth[{axis}]" for axis in range(3))
+ATTITUDE = tuple(f"imuQuaternion[{axis}]" for axis in range(3))
+UNIT_QUATERNION = 32767.0  # of x, y, z of a quaternion whose w is at least 0 (Betaflight's blackbox.c)
 BATTERY = "vbatLatest"
 FULL_THROTTLE = 1000.0  # setpoint[3] at full throttle; 0 at none
 FINE = 10.0  # units in one deg/s where blackbox_high_resolution is set
@@ -38,6 +40,12 @@ LONGEST_LIST = 1000  # characters of names of fields in a message
 PERCENT = 100.0
 LARGEST_OVERSHOOT = 0.05  # past full stick: smoothing by a Butterworth filter overshoots a step by 4.3 %
 NUM_MOTORS = 4
+# Settings that stand between throttle, voltage and thrust: name, what is neutral, what the setting does.
+THRUST_SETTINGS = (
+    ("vbat_sag_compensation", (0,), "motors get more at a low voltage"),
+    ("thrust_linear", (0,), "motors get less at low throttle"),
+    ("motor_output_limit", (0, 100), "motors get that percentage of full output at most"),
+)
 
 
 def read_betaflight(path: Path, mapping: Mapping) -> list[ImportedFlight]:
@@ -46,12 +54,14 @@ def read_betaflight(path: Path, mapping: Mapping) -> list[ImportedFlight]:
     docs/real_logs.md says what the channels are. A log that cannot be used is left out, and a note says why.
     Raises LogError for what is no blackbox file of Betaflight 4, or has no log that can be used.
     """
-    complete, left_out = _complete_logs(path)
-    num_logs = len(complete) + len(left_out)
-    decoded, frames = decode(str(path), "betaflight", path, complete)
-    flights = []
-    for number, found, rows in zip(complete, decoded, frames, strict=True):
-        source = str(path) if num_logs == 1 else f"{path}, log {number}"
+    content = read_log_file(path, LARGEST_BYTES, FIRST_BYTES, "a Betaflight blackbox log")
+    is_cut_off = [END_OF_LOG not in log for log in content.split(FIRST_BYTES)[1:]]
+    numbers = _chosen_logs(path, len(is_cut_off), mapping)
+    cut_off = [number for number in numbers if is_cut_off[number - 1]]
+    decoded, frames = decode(str(path), "betaflight", path, numbers, cut_off)
+    flights, left_out = [], list[LogError]()
+    for number, found, rows in zip(numbers, decoded, frames, strict=True):
+        source = str(path) if len(is_cut_off) == 1 else f"{path}, log {number}"
         try:
             flights.append(_read_log(source, found, rows, mapping))
         except LogError as error:
@@ -65,8 +75,10 @@ def read_betaflight(path: Path, mapping: Mapping) -> list[ImportedFlight]:
 def _read_log(source: str, notes: dict[str, Any], frames: np.ndarray, mapping: Mapping) -> ImportedFlight:
     """Return the flight in one log; notes: ``headers`` and the ``names`` of the frames' fields."""
     headers, names = _Headers(source, notes["headers"]), notes["names"]
+    cut_off = "cut off: found no end-of-log event"
     if not len(frames):
-        raise LogError(f"{source}: found no frames, expected at least one")
+        why = f"{cut_off}, and no whole frame" if notes["num_bytes_left"] else "found no frames"
+        raise LogError(f"{source}: {why}, expected at least one")
     revision = str(headers.values.get("Firmware revision", "none"))
     if not revision.startswith(FIRMWARE):
         raise headers.error("Firmware revision", f"found {quote_value(revision)}, expected {FIRMWARE} 4")
@@ -75,6 +87,9 @@ def _read_log(source: str, notes: dict[str, Any], frames: np.ndarray, mapping: M
             listed = ", ".join(map(quote_name, names))[:LONGEST_LIST]
             raise LogError(f"{source}: field {name}: missing; found {listed}")
     said = [f"{quote_name(revision)}, {len(frames)} frames"]
+    if notes["num_bytes_left"]:
+        left = f"the last {notes['num_bytes_left']} bytes"
+        said.append(f"{cut_off}; {len(frames)} whole frames used, {left} are none")
     if notes["num_undecoded"]:
         said.append(f"{notes['num_undecoded']} frames before the first full one left out")
     columns = dict(zip(names, frames.T, strict=True))
@@ -86,7 +101,8 @@ def _read_log(source: str, notes: dict[str, Any], frames: np.ndarray, mapping: M
     if craft.max_rate_deg_s is None:
         craft = craft._replace(max_rate_deg_s=headers.full_stick_deg_s())
     full = np.array([*(craft.max_rate_deg_s or ()), FULL_THROTTLE])
-    channels = _channels(table, headers)
+    channels, about_attitude = _channels(table, headers)
+    said += about_attitude
     channels["u"], clipped = _commands(table, headers, full)
     if mapping.rules.motors_as_thrust:
         channels["u"][:, 3] = _thrust_of_motors(table, headers)
@@ -96,7 +112,7 @@ def _read_log(source: str, notes: dict[str, Any], frames: np.ndarray, mapping: M
     said += [*clipped, *_motors(table, headers)]
     if "f" not in channels:
         said.append("no accelerometer in the log: nothing is asked of the specific force")
-    said += headers.stick_curve()
+    said += [*headers.stick_curve(), *headers.thrust_settings()]
     log = log_of_table(table._replace(columns=columns))
     return ImportedFlight(log, craft, tuple(f"{source}: {text}" for text in said))
 
@@ -155,6 +171,22 @@ class _Headers:
         name = effect_of(curve).name
         return [f"commands are setpoints; for a pilot's sticks a model needs the effect {name}: {numbers}"]
 
+    def thrust_settings(self) -> list[str]:
+        """Return notes on settings that change which thrust a throttle means."""
+        found = []
+        for name, neutral, effect in THRUST_SETTINGS:
+            value = self.numbers(name, 1, [0.0])[0]
+            if value not in neutral:
+                found.append(f"{name} {value:g}: {effect}; the thrust curve has it in it")
+        kind, percent = (
+            self.numbers(f"throttle_limit_{part}", 1, [default])[0]
+            for part, default in (("type", 0.0), ("percent", PERCENT))
+        )
+        if kind and percent != PERCENT:
+            how = {1.0: "scaled to", 2.0: "clipped at"}.get(kind, "limited to")
+            found.append(f"throttle_limit: the throttle is {how} {percent:g} %, and a command of 1 is more")
+        return found
+
 
 def _commands(table: Table, headers: _Headers, full: np.ndarray) -> tuple[np.ndarray, list[str]]:
     """Return commands (num_rows, 4) and a note if some are clipped; full: the setpoints at full stick, (4,).
@@ -177,8 +209,8 @@ def _commands(table: Table, headers: _Headers, full: np.ndarray) -> tuple[np.nda
     return clipped, [f"{num_past} rows clipped to full stick: smoothed setpoints overshoot, {most}"]
 
 
-def _channels(table: Table, headers: _Headers) -> dict[str, np.ndarray]:
-    """Return the sensors' channels of the log."""
+def _channels(table: Table, headers: _Headers) -> tuple[dict[str, np.ndarray], list[str]]:
+    """Return the sensors' channels of the log, and notes."""
     found = {"w": table.matrix(GYRO) * headers.rate_unit_deg_s() * PER_DEGREE}
     if all(name in table.columns and np.any(table.columns[name]) for name in ACCELEROMETER):
         g_unit = headers.numbers("acc_1G", 1)[0]
@@ -187,7 +219,12 @@ def _channels(table: Table, headers: _Headers) -> dict[str, np.ndarray]:
         found["f"] = table.matrix(ACCELEROMETER) * GRAVITY / g_unit
     if BATTERY in table.columns:
         found["v_bat"] = table.matrix([BATTERY]) * UNITS["voltage"]["cV"]
-    return found
+    vector = table.matrix(ATTITUDE) / UNIT_QUATERNION if table.columns.keys() >= set(ATTITUDE) else None
+    if vector is None or not np.any(vector):
+        return found, []
+    size = np.linalg.norm(vector, axis=1, keepdims=True)
+    found["q"] = np.column_stack([np.sqrt(np.maximum(1.0 - size**2, 0.0)), vector / np.maximum(size, 1.0)])
+    return found, []
 
 
 def _motors(table: Table, headers: _Headers) -> list[str]:
@@ -213,18 +250,10 @@ def _thrust_of_motors(table: Table, headers: _Headers) -> np.ndarray:
     return np.clip(2.0 * (table.matrix(names).mean(axis=1) - low) / (high - low) - 1.0, -1.0, 1.0)
 
 
-def _complete_logs(path: Path) -> tuple[list[int], list[LogError]]:
-    """Return the numbers of the complete logs in a blackbox file, from 1, and what others lack."""
-    content = read_log_file(path, LARGEST_BYTES, FIRST_BYTES, "a Betaflight blackbox log")
-    logs = content.split(FIRST_BYTES)[1:]
-    is_complete = {number: END_OF_LOG in log for number, log in enumerate(logs, start=1)}
-    cut_off = [
-        LogError(
-            f"{path}: log {number} of {len(logs)}: cut off: found no end-of-log event in {len(log)} bytes"
-        )
-        for number, log in enumerate(logs, start=1)
-        if not is_complete[number]
-    ]
-    if len(cut_off) == len(logs):
-        raise cut_off[0]
-    return [number for number in is_complete if is_complete[number]], cut_off
+def _chosen_logs(path: Path, num_logs: int, mapping: Mapping) -> list[int]:
+    """Return the numbers of a file's logs that the mapping selects, from 1."""
+    numbers = list(mapping.rows.logs) or list(range(1, num_logs + 1))
+    for number in numbers:
+        if number > num_logs:
+            raise LogError(f"{mapping.source}: rows.logs: found {number}, expected 1 to {num_logs} of {path}")
+    return sorted(numbers)

@@ -9,6 +9,7 @@ import io
 import json
 import logging
 import math
+import re
 from array import array
 from collections.abc import Iterator
 from pathlib import Path
@@ -18,6 +19,7 @@ import numpy as np
 
 INSTANCES = ("I", "C", "Instance", "Inst")  # of ArduPilot: fields that number sensors, estimators, batteries
 MAX_TEXTS = 1000  # messages of text, whose first ones name the firmware
+WHOLE_FILE_COMPRESSION = re.compile(r"^\s*compression_mode:\s*[\"']?FILE\b", re.IGNORECASE | re.MULTILINE)
 MAIN_FRAME = "I"  # of Betaflight: the frame type whose fields the others repeat
 
 
@@ -28,10 +30,10 @@ def _pack(notes: Any, arrays: list[np.ndarray]) -> bytes:
 
 
 def decode_ulog(arguments: Any, _: bytes) -> bytes:
-    """Return fields of the first instances of a PX4 log's topics.
+    """Return fields of a PX4 log's topics, of all their instances.
 
     arguments: path, and the wanted fields by topic. The arrays are float64, (num_rows,). The notes have their
-    topics and fields (``fields``), ``parameters`` (finite numbers) and ``is_damaged``.
+    topics, instances and fields (``fields``), ``parameters`` (finite numbers) and ``is_damaged``.
     """
     import pyulog
 
@@ -39,9 +41,8 @@ def decode_ulog(arguments: Any, _: bytes) -> bytes:
     with open(path, "rb") as file:
         ulog = pyulog.ULog(file, list(wanted))
     found = {
-        (data.name, field): data.data[field].astype(float)
-        for data in ulog.data_list
-        if data.multi_id == 0
+        (data.name, int(data.multi_id), field): data.data[field].astype(float)
+        for data in sorted(ulog.data_list, key=lambda data: data.multi_id)
         for field in wanted.get(data.name, ())
         if field in data.data
     }
@@ -57,27 +58,32 @@ def decode_ulog(arguments: Any, _: bytes) -> bytes:
 def decode_betaflight(arguments: Any, _: bytes) -> bytes:
     """Return the main frames of a blackbox file's logs, (num_frames, num_fields) float64 each.
 
-    arguments: path, numbers of the logs, from 1. The notes have each log's ``headers``, the fields'
-    ``names`` and ``num_undecoded``: frames before the first full one, changes from a frame that was lost.
+    arguments: path, numbers of the logs, from 1, and which of them are cut off: these end where no
+    whole frame can be decoded. The notes have each log's ``headers``, the fields' ``names``,
+    ``num_undecoded``: frames before the first full one, changes from a frame that was lost, and
+    ``num_bytes_left``: what follows the last whole frame of a log that is cut off.
     """
     import orangebox
 
-    path, numbers = arguments
+    path, numbers, cut_off = arguments
     logging.getLogger("orangebox").setLevel(logging.CRITICAL)  # it warns of events that it does not know
     notes, arrays = [], []
     for number in numbers:
         parser = orangebox.Parser.load(path, number)
         main = next(fields for kind, fields in parser.reader.field_defs.items() if kind.value == MAIN_FRAME)
         names = [str(field.name) for field in main]
-        values, num_undecoded = array("d"), 0
-        for frame in parser.frames():
+        values, num_undecoded, end = array("d"), 0, 0
+        for frame in _whole_frames(parser, number in cut_off):
+            end = parser.reader.tell() if cut_off else 0
             if not values and frame.type.value != MAIN_FRAME:
                 num_undecoded += 1
                 continue
             if len(frame.data) < len(names):
                 raise ValueError(f"found a frame of {len(frame.data)} fields, expected {len(names)}")
             values.extend(frame.data[: len(names)])
-        notes.append({"headers": parser.headers, "names": names, "num_undecoded": num_undecoded})
+        num_left = parser.reader.tell() - end if number in cut_off else 0
+        counts = {"num_undecoded": num_undecoded, "num_bytes_left": num_left}
+        notes.append({"headers": parser.headers, "names": names, **counts})
         arrays.append(np.array(values, float).reshape(-1, len(names)))
     return _pack(notes, arrays)
 
@@ -115,6 +121,15 @@ def decode_dataflash(arguments: Any, _: bytes) -> bytes:
     found = [{"name": name, "instance": instance, "fields": fields[name]} for name, instance in values]
     arrays = [np.array(rows, float).reshape(-1, len(fields[name])) for (name, _), rows in values.items()]
     return _pack({"found": found, "parameters": parameters, "texts": texts}, arrays)
+
+
+def _whole_frames(parser: Any, is_cut_off: bool) -> Iterator[Any]:
+    """Yield the frames of a blackbox log; of one that is cut off, only the whole ones."""
+    try:
+        yield from parser.frames()
+    except (TypeError, IndexError, ValueError, OverflowError):  # raised at the end of the bytes
+        if not is_cut_off:
+            raise
 
 
 def decode_bag(arguments: Any, _: bytes) -> bytes:
@@ -157,11 +172,19 @@ def decode_bag(arguments: Any, _: bytes) -> bytes:
     return _pack({"topics": sorted(topics), "found": found, "missing": missing}, arrays)
 
 
+class UnsupportedError(Exception):
+    """A whole file of a kind that is not read; the message says what helps."""
+
+
 def _bag_messages(path: str, wanted: list[str]) -> Iterator[tuple[str, str, int, Any]]:
     """Yield topic, type, time of recording, ns, and content of messages; None for unwanted topics."""
     from rosbags.highlevel import AnyReader
     from rosbags.typesys import Stores, get_typestore
 
+    metadata = Path(path) / "metadata.yaml"
+    if metadata.is_file() and WHOLE_FILE_COMPRESSION.search(metadata.read_text(errors="replace")):
+        convert = f"rosbags-convert --src {path} --dst {path}_plain"
+        raise UnsupportedError(f"compressed as a whole, which is not read; first: {convert}")
     with AnyReader([Path(path)], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
         yield from ((topic, "", 0, None) for topic in reader.topics)
         connections = [connection for connection in reader.connections if connection.topic in wanted]

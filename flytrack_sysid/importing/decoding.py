@@ -21,8 +21,11 @@ PACKAGES = {
     "dataflash": ("logs", "dataflash logs", "pymavlink"),
     "bag": ("bags", "bags", "mcap", "rosbags"),
 }
-# For every MiB of the file, beyond the usual limits: the slowest decode about 1 MiB per second.
-CPU_S_PER_MIB, BYTES_PER_BYTE = 4, 32
+# Kinds of errors that say nothing of the file: its decoder cannot, or its process may not.
+NO_DAMAGE = ("UnsupportedError", "FileNotFoundError", "PermissionError", "OSError")
+# For every MiB of the file, beyond the usual limits. Orangebox, the slowest decoder, takes 3 s of processor
+# time for one on a free machine, 5 s on a busy one.
+CPU_S_PER_MIB, BYTES_PER_BYTE = 15, 32
 
 
 def limits_of(num_bytes: int) -> sandbox.ResourceLimits:
@@ -50,5 +53,8 @@ def decode(source: str, format_name: str, path: Path, *rest: Any) -> tuple[Any, 
         notes, *arrays = load_npz(io.BytesIO(packed), limits.memory_bytes).values()
         return json.loads(notes.tobytes()), arrays
     except (OSError, sandbox.SandboxError, NpzError) as error:
-        kind = f"{error.kind}: " if isinstance(error, sandbox.SandboxError) and error.kind else ""
-        raise LogError(f"{source}: damaged, cannot be decoded: {kind}{error_text(error)}") from error
+        kind = error.kind if isinstance(error, sandbox.SandboxError) else ""
+        damaged = "damaged, " if kind and kind not in NO_DAMAGE else ""
+        named = f"{kind}: " if kind and kind != NO_DAMAGE[0] else ""
+        text = "" if kind == NO_DAMAGE[0] else f"{damaged}cannot be decoded: {named}"
+        raise LogError(f"{source}: {text}{error_text(error)}") from error

@@ -67,11 +67,16 @@ class Craft(NamedTuple):
 
 
 class ImportedFlight(NamedTuple):
-    """A flight as a reader returns it: its log, the craft by file and mapping, and notes for the user."""
+    """A flight as a reader returns it: its log, the craft by file and mapping, and notes for the user.
+
+    is_landed: rows at which the autopilot itself says that it is on the ground, (num_rows,) bool; None if it
+    says nothing.
+    """
 
     log: FlightLog
     craft: Craft = Craft()
     notes: tuple[str, ...] = ()
+    is_landed: np.ndarray | None = None
 
 
 def read_log_file(path: Path, most_bytes: int, first: bytes, expected: str, part: int | None = None) -> bytes:

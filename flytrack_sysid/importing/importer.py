@@ -17,6 +17,7 @@ from flytrack_sysid.importing.bag_log import read_bag
 from flytrack_sysid.importing.betaflight_log import read_betaflight
 from flytrack_sysid.importing.dataflash_log import read_dataflash
 from flytrack_sysid.importing.flight import Craft, ImportedFlight
+from flytrack_sysid.importing.ground import find_ground
 from flytrack_sysid.importing.mapping import Manifest, Mapping, load_mapping
 from flytrack_sysid.importing.table_flight import read_csv
 from flytrack_sysid.importing.ulog_log import read_ulog
@@ -35,9 +36,9 @@ READERS = {
     "bag": lambda path, mapping: [read_bag(path, mapping)],
 }
 FORMATS = tuple(READERS)
+FORMATS_OF_SEVERAL_LOGS = ("betaflight",)
 LARGEST_MANIFEST_BYTES = 2**24
 LEAST_THRUST = -0.9  # command: what flies uses more than a twentieth of its thrust at some time
-NOTHING_FLIES = "nothing flies: the thrust command never exceeds 5 % of its range"
 
 
 class Imported(NamedTuple):
@@ -106,19 +107,12 @@ def import_log(
     if not files:
         raise LogError("found no files to import, expected at least one")
     loaded = Mapping() if mapping is None else load_mapping(mapping)
-    read = [
-        part
-        for path in files
-        for flight in READERS[format](path, loaded)
-        for part in _parts(flight._replace(log=_used_rows(path, flight.log, loaded)))
-    ]
-    notes = tuple(note for flight in read for note in flight.notes)
-    grounded = [flight for flight in read if _is_grounded(flight.log)]
-    flights = [flight for flight in read if not _is_grounded(flight.log)]
-    reasons = [f"{flight.log.source}: {NOTHING_FLIES}" for flight in grounded]
-    if not flights:
-        raise LogError(reasons[0])
-    notes += tuple(f"left out: {reason}" for reason in reasons)
+    if loaded.rows.logs and format not in FORMATS_OF_SEVERAL_LOGS:
+        raise LogError(f"{loaded.source}: rows.logs: a file of format {format} holds one log")
+    read = [(path, flight) for path in files for flight in READERS[format](path, loaded)]
+    notes = tuple(note for _, flight in read for note in flight.notes)
+    flights, said = _flights_in_the_air(read, loaded)
+    notes += said
     sources = [flight.log.source for flight in flights]
     log = _concatenate([flight.log for flight in flights], sources)
     log, offsets = align_clocks(log, align)
@@ -148,17 +142,65 @@ def _parts(flight: ImportedFlight) -> list[ImportedFlight]:
     return parts
 
 
-def _is_grounded(log: FlightLog) -> bool:
-    return bool(log["u"][:, 3].max() < LEAST_THRUST)
+def _flights_in_the_air(
+    read: list[tuple[Path, ImportedFlight]], mapping: Mapping
+) -> tuple[list[ImportedFlight], tuple[str, ...]]:
+    """Return the flights without what the mapping does not select, and without rows on the ground, and notes.
+
+    Raises LogError if nothing flies in any of them.
+    """
+    in_the_air, left_out, notes = list[ImportedFlight](), list[str](), list[str]()
+    for (path, flight), is_ground in zip(read, find_ground([flight.log for _, flight in read]), strict=True):
+        log, source = flight.log, flight.log.source
+        is_used = _is_selected(path, log, mapping)
+        if flight.is_landed is not None:
+            is_ground = is_ground | flight.is_landed
+        num_used, num_ground = is_used.sum(), np.sum(is_used & is_ground)
+        if mapping.rows.keep_ground:
+            kept = is_used
+        elif num_ground == num_used:
+            left_out.append(f"{source}: nothing flies: on the ground in all {num_used} rows")
+            continue
+        elif log["u"][is_used, 3].max() < LEAST_THRUST:
+            left_out.append(f"{source}: nothing flies: the thrust command never exceeds 5 % of its range")
+            continue
+        else:
+            kept = is_used & ~is_ground
+            if num_ground:
+                notes.append(f"{source}: {num_ground} of {num_used} rows left out: on the ground")
+        log, said = _with_measured_voltage(log.select(kept))
+        notes += said
+        in_the_air += _parts(flight._replace(log=log, is_landed=None))
+    if not in_the_air:
+        raise LogError(f'{left_out[0]}; rows.on_ground = "keep" in a mapping uses them')
+    return in_the_air, (*notes, *(f"left out: {reason}" for reason in left_out))
 
 
-def _used_rows(path: Path, log: FlightLog, mapping: Mapping) -> FlightLog:
-    """Return the rows of a file's log that the mapping selects."""
+def _with_measured_voltage(log: FlightLog) -> tuple[FlightLog, list[str]]:
+    """Return the log without voltages of 0, which nobody measured, and a note if there are some."""
+    if "v_bat" not in log or log["v_bat"].min() > 0.0:
+        return log, []
+    is_measured = log["v_bat"][:, 0] > 0.0
+    found = f"{log.source}: v_bat: not above 0 V in {np.sum(~is_measured)} of {len(log)} rows"
+    if not is_measured.any():
+        return log.without("v_bat"), [f"{found}: left out"]
+    row = np.arange(len(log))
+    volts = np.interp(row, row[is_measured], log["v_bat"][is_measured, 0])
+    channels = {**log.channels, "v_bat": volts[:, None]}
+    return replace(log, channels=channels), [f"{found}: interpolated between the others"]
+
+
+def _is_selected(path: Path, log: FlightLog, mapping: Mapping) -> np.ndarray:
+    """Return which rows of a file's log the mapping selects, (num_rows,) bool."""
     rows = mapping.rows
     since_start = log.time - log.time[:1]
     is_used = since_start >= rows.from_s
     if rows.to_s is not None:
         is_used &= since_start <= rows.to_s
+    if rows.ranges_s:
+        is_used &= np.any(
+            [(since_start >= low) & (since_start <= high) for low, high in rows.ranges_s], axis=0
+        )
     index = np.arange(len(log))
     is_used &= index % rows.every == 0
     if rows.above_m is not None:
@@ -167,7 +209,7 @@ def _used_rows(path: Path, log: FlightLog, mapping: Mapping) -> FlightLog:
         is_used &= index < _count_of(path, rows.manifest)
     if not is_used.any():
         raise LogError(f"{mapping.source}: rows: none of the {len(log)} rows of {path} is left")
-    return log.select(is_used)
+    return is_used
 
 
 def _is_airborne(log: FlightLog, above_m: float, source: str) -> np.ndarray:

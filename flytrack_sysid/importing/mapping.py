@@ -65,7 +65,9 @@ class Manifest(NamedTuple):
 class UsedRows(NamedTuple):
     """Which rows to use: every n-th from ``from_s`` to ``to_s`` after the first; a manifest limits them.
 
-    above_m: only the longest stretch of rows that are that much higher than the first.
+    above_m: only the longest stretch of rows that are that much higher than the first. ranges_s: only what is
+    in one of these, s after the first row; all if none. logs: numbers, from 1, of the logs in a file that
+    holds several; all if none. keep_ground: rows on the ground are used, too.
     """
 
     every: int = 1
@@ -73,6 +75,9 @@ class UsedRows(NamedTuple):
     from_s: float = 0.0
     to_s: float | None = None
     manifest: Manifest | None = None
+    ranges_s: tuple[tuple[float, float], ...] = ()
+    logs: tuple[int, ...] = ()
+    keep_ground: bool = False
 
 
 class CsvFile(NamedTuple):
@@ -292,7 +297,21 @@ def _rows(fields: Fields) -> UsedRows:
     def is_step(value: Any) -> bool:
         return isinstance(value, int) and not isinstance(value, bool) and 1 <= value < LARGEST_COUNT
 
+    def is_range(value: Any) -> bool:
+        return _are_numbers(value, 2) and bool(value[0] < value[1])
+
+    def are_ranges(value: Any) -> bool:
+        return isinstance(value, list) and bool(value) and all(map(is_range, value))
+
+    def are_log_numbers(value: Any) -> bool:
+        numbers = value if isinstance(value, list) and value else [None]
+        return all(map(is_step, numbers)) and len(set(numbers)) == len(numbers)
+
+    ranges = fields.take("ranges_s", are_ranges, "a list of [from, to] in s, the lower one first", ())
     return UsedRows(
+        ranges_s=tuple((float(low), float(high)) for low, high in ranges),
+        logs=tuple(fields.take("logs", are_log_numbers, "different whole numbers of at least 1", ())),
+        keep_ground=fields.choice("on_ground", ("drop", "keep"), "drop") == "keep",
         every=fields.take("every", is_step, "a whole number of at least 1, below 2^53", 1),
         above_m=fields.number("above_m", None, above=0.0),
         from_s=fields.number("from_s", 0.0),

@@ -1,7 +1,7 @@
 """PX4 logs (``.ulg``), read by pyulog: NED and FRD converted to our frames, topics put on one time base.
 
 Rows are the samples of the body rates; other sensors are interpolated between their own samples, setpoints
-are held. There are no rows where a topic has a gap of more than three of its usual steps, or on the ground.
+are held. There are no rows where a topic has a gap of more than three of its usual steps.
 """
 
 from pathlib import Path
@@ -14,7 +14,7 @@ from flytrack_sysid.importing.flight import ImportedFlight, not_a_quadcopter, re
 from flytrack_sysid.importing.mapping import Mapping
 from flytrack_sysid.importing.units import PER_DEGREE, UNITS, quaternion_from, vector_from
 from flytrack_sysid.log import LogError
-from flytrack_sysid.log_table import LARGEST_NORM_ERROR, Table, columns_of, log_of_table
+from flytrack_sysid.log_table import COMMAND_MARGIN, LARGEST_NORM_ERROR, Table, columns_of, log_of_table
 from flytrack_sysid.resample import Samples, on_one_base, slow_channels
 from flytrack_sysid.timestamps import MAX_LATENCY_S, Clock, number_segments, put_on_one_line, read_clock
 
@@ -50,6 +50,7 @@ def _indexed(topic: str, field: str, size: int) -> Source:
     return topic, tuple(f"{field}[{axis}]" for axis in range(size))
 
 
+BATTERY_FIELDS = ("voltage_v",)
 # The first one in the log is used; later ones are of older firmware.
 SOURCES: dict[str, tuple[Source, ...]] = {
     "w": (_indexed("vehicle_angular_velocity", "xyz", 3), _indexed("sensor_combined", "gyro_rad", 3)),
@@ -61,7 +62,7 @@ SOURCES: dict[str, tuple[Source, ...]] = {
         ("vehicle_rates_setpoint", ("roll", "pitch", "yaw", "thrust_body[2]")),
         ("vehicle_rates_setpoint", ("roll", "pitch", "yaw", "thrust")),
     ),
-    "v_bat": (("battery_status", ("voltage_v",)),),
+    "v_bat": (("battery_status", BATTERY_FIELDS),),
     "landed": (("vehicle_land_detected", ("landed",)),),
 }
 REQUIRED = ("w", "u", "q")
@@ -85,6 +86,7 @@ def read_ulog(path: Path, mapping: Mapping) -> ImportedFlight:
         craft = craft._replace(max_rate_deg_s=_full_stick_deg_s(path, parameters))
     base = samples["w"].times
     commands = _commands(samples["u"].values, np.array(craft.max_rate_deg_s) * PER_DEGREE)
+    _check_full_stick(path, commands, craft.max_rate_deg_s)
     ours = {"u": Samples(samples["u"].times, commands), "q": _attitude(path, samples["q"])}
     for name in ("w", "f", "p", "v"):
         if name in samples:
@@ -92,21 +94,20 @@ def read_ulog(path: Path, mapping: Mapping) -> ImportedFlight:
     if "v_bat" in samples:
         ours["v_bat"] = samples["v_bat"]
     channels, is_known = on_one_base(ours, base)
-    is_flying = np.ones(len(base), bool)
+    if not is_known.any():
+        raise LogError(f"{path}: found no time at which all of {', '.join(ours)} are known, expected some")
+    is_landed = None
     if "landed" in samples:
         times, landed = samples["landed"]
-        is_flying = landed[np.maximum(np.searchsorted(times, base, side="right") - 1, 0), 0] == 0.0
-    is_used = is_known & is_flying
-    if not is_used.any():
-        found = f"{is_known.sum()} of {len(base)} samples of the rates with all other topics around them"
-        raise LogError(f"{path}: found {found}, {is_flying.sum()} in flight, expected some that are both")
-    used_channels = {name: values[is_used] for name, values in channels.items()}
-    columns = columns_of(base[is_used] - base[is_used][0], used_channels)
-    columns["segment"] = number_segments(base[is_used], clocks["w"].max_gap_s)
+        last = np.maximum(np.searchsorted(times, base[is_known], side="right") - 1, 0)
+        is_landed = landed[last, 0] != 0.0
+    used_channels = {name: values[is_known] for name, values in channels.items()}
+    columns = columns_of(base[is_known] - base[is_known][0], used_channels)
+    columns["segment"] = number_segments(base[is_known], clocks["w"].max_gap_s)
     num_rows = len(clocks["w"].is_used)
-    used = f"{is_used.sum()} of {num_rows} samples of the rates used, {is_flying.sum()} in flight"
+    used = f"{is_known.sum()} of {num_rows} samples of the rates have all other topics around them"
     notes = tuple(f"{path}: {text}" for text in [used, *said, *_airframe(parameters), *slow_channels(ours)])
-    return ImportedFlight(log_of_table(Table(str(path), columns)), craft, notes)
+    return ImportedFlight(log_of_table(Table(str(path), columns)), craft, notes, is_landed)
 
 
 def _airframe(parameters: dict[str, float]) -> list[str]:
@@ -134,14 +135,14 @@ def _decode(path: Path) -> tuple[dict[str, Samples], dict[str, Clock], dict[str,
     vehicle = OTHER_VEHICLES.get(int(notes["parameters"].get("MAV_TYPE", 0)))
     if vehicle:
         raise LogError(f"{path}: found a log of {vehicle} (MAV_TYPE), expected one of a multicopter")
-    topics: dict[str, dict[str, np.ndarray]] = {}
-    for (topic, field), values in zip(notes["fields"], arrays, strict=True):
-        topics.setdefault(topic, {})[field] = values
+    topics: dict[str, dict[int, dict[str, np.ndarray]]] = {}
+    for (topic, instance, field), values in zip(notes["fields"], arrays, strict=True):
+        topics.setdefault(topic, {}).setdefault(instance, {})[field] = values
     samples, clocks = {}, {}
     said = ["damaged in places; what could be read is used"] if notes["is_damaged"] else []
     for channel, sources in SOURCES.items():
         for topic, names in sources:
-            found = _samples_of(path, topic, topics.get(topic, {}), names)
+            found = _best_instance(path, topic, topics.get(topic, {}), names)
             if found is not None:
                 samples[channel], clocks[channel], faults = found
                 said += [text for text in faults if text not in said]  # channels share topics
@@ -155,6 +156,14 @@ def _decode(path: Path) -> tuple[dict[str, Samples], dict[str, Clock], dict[str,
     return samples, clocks, notes["parameters"], said
 
 
+def _best_instance(
+    path: Path, name: str, instances: dict[int, dict[str, np.ndarray]], fields: tuple[str, ...]
+) -> tuple[Samples, Clock, list[str]] | None:
+    """Return ``_samples_of`` the instance of a topic that has most valid ones; of equal ones the first."""
+    found = [_samples_of(path, name, topic, fields) for topic in instances.values()]
+    return max((one for one in found if one is not None), key=lambda one: len(one[0].times), default=None)
+
+
 def _samples_of(
     path: Path, name: str, topic: dict[str, np.ndarray], fields: tuple[str, ...]
 ) -> tuple[Samples, Clock, list[str]] | None:
@@ -165,6 +174,9 @@ def _samples_of(
     if any(field not in topic for field in ("timestamp", *fields)):
         return None
     values = np.stack([topic[field] for field in fields], axis=1)
+    if fields == BATTERY_FIELDS:  # PX4 reports 0 V of a battery that it does not measure
+        topic = {field: column[values[:, 0] > 0.0] for field, column in topic.items()}
+        values = values[values[:, 0] > 0.0]
     is_finite = np.isfinite(values).all(axis=1)
     if not is_finite.any():
         return None
@@ -196,6 +208,19 @@ def _commands(setpoints: np.ndarray, full_stick: np.ndarray) -> np.ndarray:
     """Return commands (num_rows, 4) of setpoints: rates in FRD, rad/s; thrust, 0 to 1, either sign."""
     rates = vector_from(setpoints[:, :3], True) / full_stick
     return np.column_stack([rates, 2.0 * np.abs(setpoints[:, 3]) - 1.0])
+
+
+def _check_full_stick(path: Path, commands: np.ndarray, full_stick: tuple[float, ...]) -> None:
+    """Raise LogError for setpoints past full stick; the message says how to raise it."""
+    largest = np.abs(commands[:, :3]).max(axis=0)
+    if largest.max() > 1.0 + COMMAND_MARGIN:
+        asked = ", ".join(f"{value:.4g}" for value in largest * full_stick)
+        known = ", ".join(f"{value:.4g}" for value in full_stick)
+        needed = ", ".join(f"{value:.0f}" for value in np.ceil(np.maximum(largest, 1.0) * full_stick))
+        found = f"roll, pitch, yaw: found setpoints of up to {asked} deg/s"
+        expected = f"expected at most full stick, {known} deg/s"
+        advice = f"in a mapping, craft.max_rate_deg_s = [{needed}] raises it"
+        raise LogError(f"{path}: topic vehicle_rates_setpoint: {found}, {expected}; {advice}")
 
 
 def _full_stick_deg_s(path: Path, parameters: dict[str, float]) -> tuple[float, float, float]:

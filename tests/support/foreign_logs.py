@@ -35,13 +35,16 @@ class UlogWriter:
     def key(text: str) -> bytes:
         return struct.pack("<B", len(text)) + text.encode()
 
-    def add(self, name: str, fields: list[tuple[str, str, int]], rows: list[tuple[Any, ...]]) -> None:
+    def add(
+        self, name: str, fields: list[tuple[str, str, int]], rows: list[tuple[Any, ...]], instance: int = 0
+    ) -> None:
         """Add a topic: fields are (type, name, array size or 0), rows flat with the time in us first."""
         fields = [("uint64_t", "timestamp", 0), *fields]
         text = "".join(f"{kind}{f'[{size}]' if size else ''} {field};" for kind, field, size in fields)
-        self.definitions += self.message("F", f"{name}:{text}".encode())
+        if not instance:
+            self.definitions += self.message("F", f"{name}:{text}".encode())
         pattern = "<" + "".join(ULOG_TYPES[kind] * max(size, 1) for kind, _, size in fields)
-        self.data += self.message("A", struct.pack("<BH", 0, self.num_topics) + name.encode())
+        self.data += self.message("A", struct.pack("<BH", instance, self.num_topics) + name.encode())
         for row in rows:
             content = struct.pack("<H", self.num_topics) + struct.pack(pattern, *row)
             self.data += self.message("D", content)

@@ -1,6 +1,8 @@
 """Bags written by the libraries and read back: ROS 2 bags, MCAP files of ROS 2 messages and of JSON."""
 
 import dataclasses
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +16,7 @@ from tests.support.written_logs import read_mapping
 
 pytest.importorskip("mcap", reason="mcap is not installed: pip install 'flytrack[bags]'")
 pytest.importorskip("rosbags", reason="rosbags is not installed: pip install 'flytrack[bags]'")
-from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
 MAPPING = read_mapping("ros_topics")
@@ -85,6 +87,28 @@ WRITERS = {
     "MCAP of ROS 2": lambda folder: next(write_ros2(folder, "MCAP").glob("*.mcap")),
     "MCAP of JSON": write_json,
 }
+
+
+def test_a_bag_compressed_as_a_whole_is_told_and_the_command_named_makes_it_one_that_is_read(tmp_path):
+    storage = StoragePlugin.SQLITE3
+    unopened = Writer(tmp_path / "bag", version=9, storage_plugin=storage)
+    unopened.set_compression(CompressionMode.FILE, CompressionFormat.ZSTD)
+    with unopened as writer:
+        topics = {
+            topic: writer.add_connection(topic, kind, typestore=TYPES) for topic, (kind, _) in KINDS.items()
+        }
+        for stamp_ns, topic, message in messages():
+            writer.write(topics[topic], stamp_ns, TYPES.serialize_cdr(message, KINDS[topic][0]))
+    (tmp_path / "map.toml").write_text(MAPPING)
+    with pytest.raises(LogError, match=r"bag: compressed as a whole, .*: rosbags-convert") as error:
+        import_log(tmp_path / "bag", "bag", tmp_path / "map.toml")
+    assert "damaged" not in str(error.value)
+    program, *arguments = str(error.value).rpartition("first: ")[2].split()
+    subprocess.run([Path(sys.executable).with_name(program), *arguments], check=True)
+    plain = import_log(tmp_path / "bag_plain", "bag", tmp_path / "map.toml").log
+    (tmp_path / "other").mkdir()
+    expected = import_log(write_ros2(tmp_path / "other", "SQLITE3"), "bag", tmp_path / "map.toml").log
+    np.testing.assert_array_equal(plain["w"], expected["w"])
 
 
 @pytest.mark.parametrize("kind", WRITERS)

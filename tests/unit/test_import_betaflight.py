@@ -5,11 +5,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from flytrack_env.effects import effect_of
 from flytrack_env.state import Action
 from flytrack_sysid import LogError, import_log
 from flytrack_sysid.importing.betaflight_settings import full_stick_rate, stick_curve
+from flytrack_sysid.plausibility import summed_turns
 from tests.support.foreign_logs import BLACKBOX_HEADERS, blackbox
 from tests.support.foreign_logs import BLACKBOX_NAMES as NAMES
 from tests.support.foreign_logs import blackbox_frames as frames
@@ -121,7 +123,10 @@ def test_stick_curves_are_the_firmwares(rates_type):
     ("content", "message"),
     [
         (b"", r"a\.bbl: found an empty file, expected a Betaflight blackbox log"),
-        (log_with()[:-200], r"a\.bbl: log 1 of 1: cut off: found no end-of-log event in \d+ b"),
+        (
+            log_with()[: log_with().index(b"\nI\x00") + 9],
+            r"a\.bbl: cut off: found no end-of-log event, and no",
+        ),
         (log_with(rows=still()), r"a\.bbl: nothing flies: the thrust command never exceeds 5 %"),
         (log_with().replace(b"encoding:1", b"encoding:77"), r"a\.bbl: damaged, cannot be decoded"),
         (log_with(rows=frames(0)), r"a\.bbl: (found no frames|damaged)"),
@@ -158,10 +163,72 @@ def test_one_bad_log_of_many_is_left_out_with_its_reason(tmp_path):
     cut_off, rearmed = log_with()[:-200], log_with(rc_rates=None)
     path = write(tmp_path / "a.bbl", log_with(rows=still()), cut_off, log_with(), rearmed)
     found = import_log(path, "betaflight")
-    assert found.sources == (f"{path}, log 3",) and len(found.log) == 200
+    assert found.sources == (f"{path}, log 2", f"{path}, log 3")
+    assert 180 < np.sum(found.log.segment == 0) < 200 and np.sum(found.log.segment == 1) == 200
     left_out = [note for note in found.notes if note.startswith("left out: ")]
-    assert [note.partition("log ")[2][:1] for note in left_out] == ["2", "4", "1"]
-    assert "cut off" in left_out[0] and "rc_rates: missing" in left_out[1] and "nothing" in left_out[2]
+    assert [note.partition("log ")[2][:1] for note in left_out] == ["4", "1"]
+    assert "rc_rates: missing" in left_out[0] and "nothing flies" in left_out[1]
+
+
+@pytest.mark.parametrize("num_missing", [1, 13, 14, 15, 16, 200])
+def test_a_log_cut_off_is_used_up_to_its_last_whole_frame(tmp_path, num_missing):
+    whole = import_log(write(tmp_path / "a.bbl", log_with()), "betaflight").log
+    found = import_log(write(tmp_path / "b.bbl", log_with()[:-num_missing]), "betaflight")
+    num_rows = len(found.log)
+    for name in whole.channels:
+        np.testing.assert_array_equal(found.log[name], whole[name][:num_rows])
+    end, size = len(b"E\xffEnd of log\x00"), len(log_with()) - len(log_with(frames()[:-1]))
+    num_expected = 200 - max(0, num_missing - end + size - 1) // size - (num_missing >= end)
+    assert num_rows in (num_expected, num_expected + 1)
+    if num_missing > 1:
+        assert f"cut off: found no end-of-log event; {num_rows} whole frames used" in found.notes[1]
+
+
+def test_a_voltage_of_0_was_not_measured(tmp_path):
+    rows = frames()
+    rows[50:60, 6] = 0
+    found = import_log(write(tmp_path / "a.bbl", log_with(rows)), "betaflight")
+    assert found.log["v_bat"][:, 0] == pytest.approx(24.1)
+    assert "v_bat: not above 0 V in 10 of 200 rows: interpolated" in found.notes[-1]
+    rows[:, 6] = 0
+    found = import_log(write(tmp_path / "a.bbl", log_with(rows)), "betaflight")
+    assert "v_bat" not in found.log and "in 200 of 200 rows: left out" in found.notes[-1]
+
+
+ATTITUDE = [f"imuQuaternion[{axis}]" for axis in range(3)]
+
+
+def test_logged_attitude_is_read(tmp_path):
+    rows, time = frames(3000), 0.004 * np.arange(3000)
+    truth = Rotation.from_euler("xyz", np.column_stack([0.3 * np.sin(time), 0.2 * np.cos(time), 0.1 * time]))
+    quat = truth.as_quat(canonical=True)
+    turns = np.gradient(summed_turns(truth), time, axis=0)
+    rows[:, 1], rows[:, 7:10] = 1e6 * time, np.round(np.rad2deg(turns))
+    names = [*NAMES, *ATTITUDE]
+    content = log_with(np.column_stack([rows, np.round(32767 * quat[:, :3])]), names)
+    found = import_log(write(tmp_path / "a.bbl", content), "betaflight", align=False)
+    read = Rotation.from_quat(found.log["q"], scalar_first=True)
+    assert np.max((read.inv() * truth).magnitude()) < 1e-3
+    assert not any("q_w" in problem for problem in found.problems)
+    empty = log_with(np.column_stack([rows, np.zeros((3000, 3))]), names)
+    assert "q" not in import_log(write(tmp_path / "b.bbl", empty), "betaflight").log
+
+
+@pytest.mark.parametrize(
+    ("headers", "note"),
+    [
+        ({"vbat_sag_compensation": "75"}, "vbat_sag_compensation 75: motors get more at a low voltage"),
+        ({"thrust_linear": "20"}, "thrust_linear 20: motors get less"),
+        ({"motor_output_limit": "80"}, "motor_output_limit 80: motors get that percentage"),
+        ({"throttle_limit_type": "1", "throttle_limit_percent": "60"}, "the throttle is scaled to 60 %"),
+        ({"throttle_limit_type": "2", "throttle_limit_percent": "60"}, "the throttle is clipped at 60 %"),
+        ({"throttle_limit_type": "0", "throttle_limit_percent": "60", "motor_output_limit": "100"}, None),
+    ],
+)
+def test_settings_that_change_the_thrust_curve_are_told(tmp_path, headers, note):
+    said = import_log(write(tmp_path / "a.bbl", log_with(**headers)), "betaflight").notes
+    told = [text for text in said if "limit" in text or "sag" in text or "linear" in text]
+    assert len(told) == (note is not None) and (note is None or note in told[0])
 
 
 def test_motors_are_counted_and_their_saturation_told(tmp_path):
@@ -186,12 +253,13 @@ def test_logs_of_different_craft_or_channels_make_no_log(tmp_path):
         import_log([first, second], "betaflight")
 
 
-def test_real_log_holds_what_another_decoder_found():
+def test_real_log_holds_what_another_decoder_found(tmp_path):
     """Which has every second frame, in raw units."""
     folder = shared(BETAFLIGHT)
     with gzip.open(folder / "shortLog_decoded_1kHz.csv.gz", "rt") as file:
         decoded = np.genfromtxt(file, delimiter=",", names=True, deletechars="")
-    found = import_log(folder / "shortLog.BFL", "betaflight")
+    (tmp_path / "map.toml").write_text('[rows]\non_ground = "keep"\n')
+    found = import_log(folder / "shortLog.BFL", "betaflight", tmp_path / "map.toml")
     log = found.log
     assert found.problems == ()
     every = log.select(slice(0, None, 2))
@@ -213,7 +281,7 @@ def test_gecko_flies_without_a_mapping():
     """Its first 14 frames are changes of a frame that the decoder lost; smoothing overshoots full stick."""
     found = import_log(shared("bf_gecko") / "btfl_002.bbl", "betaflight")
     log = found.log
-    assert len(log) == 66624 and np.diff(log.time).max() < 0.005 and log["v_bat"].min() > 13.0
+    assert len(log) == 66000 and np.diff(log.time).max() < 0.005 and log["v_bat"].min() > 13.0
     assert found.craft.max_rate_deg_s == pytest.approx((700.0, 700.0, 700.0)) and not found.problems
     said = " ".join(found.notes)
     assert "14 frames before the first full one" in said and "9 rows clipped to full stick" in said

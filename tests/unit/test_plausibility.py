@@ -5,11 +5,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from flytrack_sysid.log import CHANNELS, FlightLog, LogError
 from flytrack_sysid.plausibility import FEWEST_ROWS, GRAVITY, check_plausible, find_problems
 from flytrack_sysid.sensors import measure, specific_force_b
 from tests.support.handout_plant import HandoutPlant, excited
+from tests.support.made_flight import noisy
 
 UPWARDS = np.array([0.0, 0.0, GRAVITY])
 Change = Callable[[FlightLog], FlightLog]
@@ -71,6 +73,68 @@ def test_wrong_log_is_named_and_only_that(logs, name, wrong):
     assert problem.startswith(f"flight.csv: {where}: found ")
     with pytest.raises(LogError, match=text):
         check_plausible(log)
+
+
+FRD = Rotation.from_rotvec([np.pi, 0.0, 0.0])
+
+
+def turned(channel: str, change: Callable[[Rotation], Rotation]) -> Change:
+    """Return a change of an attitude."""
+
+    def apply(log: FlightLog) -> FlightLog:
+        quat = change(Rotation.from_quat(log[channel], scalar_first=True)).as_quat(scalar_first=True)
+        return replace(log, channels={**log.channels, channel: quat})
+
+    return apply
+
+
+def in_order(step: int) -> Change:
+    """Return a change of the order of a quaternion's numbers."""
+    return lambda log: replace(log, channels={**log.channels, "q": np.roll(log["q"], step, axis=1)})
+
+
+# One wrong word in a mapping -> the channel that is named, and how it agrees.
+MISREAD = {
+    "wxyz read as xyzw": (in_order(1), "q", "if q is read as wxyz"),
+    "xyzw read as wxyz": (in_order(-1), "q", "if q is read as xyzw"),
+    "q inverted": (turned("q", Rotation.inv), "q", "if q is inverted"),
+    "q in frd": (turned("q", lambda one: one * FRD), "q", "if q has its body axes turned"),
+    "q in ned": (turned("q", lambda one: FRD * one), "q", "if q has its world turned"),
+    "q in frd and ned": (
+        turned("q", lambda one: FRD * one * FRD),
+        "q",
+        "if q has body axes and world turned",
+    ),
+    "w in frd": (scaled("w", [1.0, -1.0, -1.0]), "w", "if w has y and z turned"),
+    "v in ned": (scaled("v", [1.0, -1.0, -1.0]), "v", "if v has y and z turned"),
+    "p in ned": (scaled("p", [1.0, -1.0, -1.0]), "p", "if p has y and z turned"),
+}
+
+
+@pytest.mark.parametrize("noise", [False, True])
+@pytest.mark.parametrize("name", MISREAD)
+def test_channels_that_contradict_each_other_are_read_right(name, noise, truth):
+    change, channel, text = MISREAD[name]
+    right = noisy(truth, 3) if noise else truth
+    log = replace(right, channels={**right.channels, "u": np.clip(right["u"], -1.0, 1.0)})
+    assert find_problems(log) == []
+    (problem,) = find_problems(change(log))
+    assert f": {columns(channel)}: found motion that contradicts itself" in problem and text in problem
+    with pytest.raises(LogError, match="contradicts itself"):
+        check_plausible(change(log))
+
+
+def test_right_logs_of_any_noise_contradict_nothing(truth):
+    """210 logs of 10 s: 7 parts of a flight with 30 noises each, of 0.1 to 10 times the usual."""
+    rng, num_wrong = np.random.default_rng(5), 0
+    for seed in range(210):
+        start = 150 * (seed % 7)
+        log, factor = truth.select(slice(start, start + 1000)), 10.0 ** rng.uniform(-1.0, 1.0)
+        shaken = noisy(log, seed)
+        channels = {name: log[name] + factor * (shaken[name] - log[name]) for name in log.channels}
+        channels["q"] /= np.linalg.norm(channels["q"], axis=1, keepdims=True)
+        num_wrong += any("contradict" in one for one in find_problems(replace(log, channels=channels)))
+    assert num_wrong == 0
 
 
 def test_all_problems_are_listed(logs):
