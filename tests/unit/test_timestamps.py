@@ -149,7 +149,7 @@ def test_the_case_of_one_stray_stamp() -> None:
     found = import_log(folder / "stray.ulg", "ulog", align=False)
     assert 2985 <= len(found.log) <= 2999 and found.log.time[-1] == pytest.approx(11.97, abs=0.02)
     assert any("1 of 3000 rows of vehicle_angular_velocity left out" in note for note in found.notes)
-    assert "of 3000 samples of the rates used" in found.notes[0]
+    assert "of 3000 samples of the rates have all other topics" in found.notes[0]
 
 
 def test_what_is_no_clock_is_refused() -> None:
