@@ -84,8 +84,8 @@ def fresh_folder(path: Path) -> Path:
 def locked_folder(folder: Path) -> Iterator[None]:
     """Hold a folder for one process, so that no two write into it at once.
 
-    An advisory lock of the operating system on a file beside the folder, which ends with the process. Where there is none (Windows, some
-    network file systems), a warning says so.
+    An advisory lock of the operating system on a file beside the folder, which ends with the process. Where
+    there is none (Windows, some network file systems), a warning says so.
 
     Raises:
         OSError: another process holds the folder; it names the folder, the process and its command.
