@@ -147,13 +147,24 @@ def call(name: str, words: Sequence[str]) -> None:
         f"{PROG} {name}: warning: {message}", file=sys.stderr
     )
     try:
-        status = run(asked)
+        with held_output(asked):
+            status = run(asked)
     except (ImportError, ValueError, OverflowError, OSError) as error:
         leave(name, REFUSED, f"error: {error}")
     except KeyboardInterrupt:
         leave(name, STOPPED, "stopped")
     if status:
         raise SystemExit(status)
+
+
+def held_output(asked: Any) -> contextlib.AbstractContextManager[None]:
+    """Return what holds the output folder of a command's flags; nothing for one that writes files alone."""
+    out = getattr(asked, "out", None)
+    if not isinstance(out, Path) or out.suffix:
+        return contextlib.nullcontext()
+    from flytrack_env.files import locked_folder
+
+    return locked_folder(out)
 
 
 def read_flags(name: str, words: Sequence[str]) -> Any:

@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 from jax.custom_batching import custom_vmap
 
-from flytrack_env.fusion import compute_once, has_kernels, is_in_kernel, one_kernel
+from flytrack_env.fusion import compute_once, has_kernels, is_in_kernel, one_kernel, vary_like
 
 Shown = tuple[list[jax.Array], Any]  # observation, row by row, and state
 Begin = Callable[[jax.Array, Any], Shown]
@@ -80,7 +80,13 @@ def _reset_all(begin: Begin, steps: Ended, params: Any) -> Shown:
     def choose(old: jax.Array, start: jax.Array) -> jax.Array:
         return jnp.where(steps.done.reshape(-1, *[1] * (old.ndim - 1)), start, old)
 
-    return jax.tree.map(choose, steps.shown, jax.vmap(begin, in_axes=(0, None))(steps.seed, params))
+    return jax.tree.map(choose, steps.shown, _starts(begin, steps.seed, params, steps.shown))
+
+
+def _starts(begin: Begin, seeds: jax.Array, params: Any, shown: Shown) -> Shown:
+    """Return a start for each seed, in the types of what is shown."""
+    starts = jax.vmap(begin, in_axes=(0, None))(seeds, params)
+    return jax.tree.map(lambda start, old: start.astype(old.dtype), starts, shown)
 
 
 def _reset_in_rounds(begin: Begin, steps: Ended, params: Any) -> Shown:
@@ -95,13 +101,13 @@ def _reset_in_rounds(begin: Begin, steps: Ended, params: Any) -> Shown:
 
     def reset_some(carry: Any) -> Any:
         places, pending, shown = carry
-        starts = jax.vmap(begin, in_axes=(0, None))(take(steps.seed, places), params)
+        starts = _starts(begin, take(steps.seed, places), params, shown)
         news = compute_once((jnp.zeros(count, bool), starts))
         pending, shown = put((pending, shown), news, places)
         return find(pending), pending, shown
 
     # A conditional would copy every leaf in each of its branches, which cost more than the reset.
-    start = find(steps.done), steps.done, steps.shown
+    start = vary_like((find(steps.done), steps.done, steps.shown), steps)
     return jax.lax.while_loop(lambda carry: carry[0][0] < num_envs, reset_some, start)[2]
 
 
@@ -136,7 +142,7 @@ def _scan(ended: jax.Array, count: int) -> jax.Array:
         place = jnp.where(is_one, index * WORD + bit, size)
         places = jax.lax.dynamic_update_index_in_dim(places, place, found, 0)
         word = jnp.where(is_one, word ^ lowest, _at(words, jnp.minimum(index + 1, last)))
-        return jnp.where(is_one, index, index + 1), word, found + is_one, places
+        return jnp.where(is_one, index, index + 1), word, found + is_one.astype(jnp.int32), places
 
     start = (jnp.int32(0), words[0], jnp.int32(0), jnp.full(count, size, jnp.int32))
     return jax.lax.while_loop(lambda carry: (carry[0] <= last) & (carry[2] < count), next_bit, start)[3]

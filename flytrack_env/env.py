@@ -131,7 +131,7 @@ class FlyTrack(EpisodicEnvironment):
         before = self.drone(state)
         plant_state = self.plant.step(state.plant, command, params.dt, params.model)
         after = self.plant.drone(plant_state)
-        start_time_s = state.time * params.dt
+        start_time_s = state.time.astype(state.race.lap_start_s.dtype) * params.dt
         race, events = advance_race(
             state.race, before.pos_w, after.pos_w, start_time_s, params.dt, params.course, params.drone_radius
         )

@@ -16,7 +16,7 @@ from gymnax.environments import environment, spaces
 from flytrack_env.auto_reset import Ended, reset_if_ended
 from flytrack_env.dynamics import ModelParameters
 from flytrack_env.effects import effect_of
-from flytrack_env.fusion import compute_once, one_kernel
+from flytrack_env.fusion import compute_once, one_kernel, vary_like
 from flytrack_env.observations import Entry
 from flytrack_env.params import EnvParams
 from flytrack_env.plants import Plant
@@ -35,9 +35,12 @@ def observation_box(table: tuple[Entry, ...]) -> spaces.Box:
     return spaces.Box(-limit, limit, limit.shape, jnp.float32)
 
 
-def clip_action(action: jax.Array) -> Action:
-    """Return the command of an action (4,), clipped to [-1, 1]; infinite values clip, NaN stays."""
-    command = unpack_action(jnp.asarray(action))
+def clip_action(action: jax.Array, dtype: Any = None) -> Action:
+    """Return the command of an action (4,), clipped to [-1, 1]; infinite values clip, NaN stays.
+
+    dtype: of the command; the action's own if None.
+    """
+    command = unpack_action(jnp.asarray(action, dtype))
     # The fence: a batch of actions is strided, and what reads strided memory is not vectorised.
     return compute_once(Action(*(jnp.clip(value, -1.0, 1.0) for value in command)))
 
@@ -45,6 +48,11 @@ def clip_action(action: jax.Array) -> Action:
 def without_nan(command: Action) -> Action:
     """Return the command with NaN replaced by 0, so that it cannot poison a state."""
     return Action(*(jnp.where(jnp.isnan(value), 0.0, value) for value in command))
+
+
+def _keep_types(changed: Any, state: Any) -> Any:
+    """Return a changed state with the types of the state before, whatever parameters were computed with."""
+    return jax.tree.map(lambda leaf, old: jnp.asarray(leaf, jnp.result_type(old)), changed, state)
 
 
 # Our EnvParams are not of gymnax's class, which its annotations ask for and its code does not.
@@ -150,17 +158,20 @@ class EpisodicEnvironment(environment.Environment[Any, EnvParams]):  # type: ign
     def observe(self, key: jax.Array | None, state: Any, action: Any, params: EnvParams) -> jax.Array:
         """Return the observation of a state, (size,) float32; key and action are unused."""
         del key, action
-        return jnp.stack(self.observe_drone(self.drone(state), state, params))
+        return jnp.stack(self._rows(state, params))
 
     def step_env(  # type: ignore[override]  # actions are arrays here
         self, key: jax.Array | None, state: Any, action: jax.Array, params: EnvParams
     ) -> tuple[jax.Array, Any, jax.Array, jax.Array, dict[str, Any]]:
         """Return observation, state, reward, terminated and info of one step, without auto-reset.
 
-        action: (4,). The observation is (size,) float32; reward and terminated are scalars. key is unused.
+        action: (4,). The observation is (size,), of the type of the state, as the reward is; reward and
+        terminated are scalars. key is unused.
         """
         del key
-        rows, next_state, reward, flags, info = one_kernel(self._step_env)(state, clip_action(action), params)
+        rows, next_state, reward, flags, info = one_kernel(self._step_env)(
+            state, clip_action(action, self._dtype(state)), params
+        )
         return jnp.stack(rows), next_state, reward, flags["terminated"], info
 
     def reset(  # type: ignore[override]  # gymnax's is compiled; this one checks, then calls it
@@ -187,20 +198,30 @@ class EpisodicEnvironment(environment.Environment[Any, EnvParams]):  # type: ign
 
     def reset_env(self, key: jax.Array, params: EnvParams) -> tuple[jax.Array, Any]:
         """Return observation, (size,) float32, and state of an episode that begins; nothing is checked."""
-        rows, state = self._begin_from(seed_of(key), params)
+        rows, state = vary_like(self._begin_from(seed_of(key), params), (key, params))
         return jnp.stack(rows), state
 
     def _begin_from(self, seed: jax.Array, params: EnvParams) -> tuple[list[jax.Array], Any]:
         """Return observation, row by row, and state of an episode that begins, from one random word."""
         state = self.begin(*self.sample_start(seed, params), params, seed)
-        return self.observe_drone(self.drone(state), state, params), state
+        return self._rows(state, params), state
+
+    def _dtype(self, state: Any) -> Any:
+        """Return the floating-point type of a state, which its observation and reward have, too."""
+        return jnp.result_type(self.drone(state).pos_w.x)
+
+    def _rows(self, state: Any, params: EnvParams) -> list[jax.Array]:
+        """Return the observation of a state, row by row."""
+        dtype = self._dtype(state)
+        return [jnp.asarray(row, dtype) for row in self.observe_drone(self.drone(state), state, params)]
 
     @partial(jax.jit, static_argnames=("self",))
     def step(self, key: jax.Array, state: Any, action: jax.Array, params: EnvParams | None = None) -> Step:
         """Return observation, state, reward, terminated, truncated and info, with auto-reset.
 
         gymnax's protocol, except that the whole key serves the reset: what a step draws, it draws from
-        the word that the episode began with.
+        the word that the episode began with. The types are those of the state, float32 from a reset: the
+        action is cast to them.
         """
         if params is None:
             params = self.default_params
@@ -209,7 +230,8 @@ class EpisodicEnvironment(environment.Environment[Any, EnvParams]):  # type: ign
     def _step_env(self, state: Any, command: Action, params: EnvParams) -> tuple[Any, ...]:
         """Return observation, row by row, state, reward, flags and info of a step without auto-reset."""
         next_state, reward, terminated, info = self.advance(state, command, params)
-        rows = self.observe_drone(self.drone(next_state), next_state, params)
+        next_state, reward = _keep_types(next_state, state), jnp.asarray(reward, self._dtype(state))
+        rows = self._rows(next_state, params)
         rows, next_state = self._apply_transition_gradient_policy(rows, next_state)
         flags = {"terminated": terminated, "truncated": self.is_truncated(next_state, params)}
         return rows, next_state, reward, flags, info
@@ -252,7 +274,9 @@ class EpisodicEnvironment(environment.Environment[Any, EnvParams]):  # type: ign
     def _step_from(
         self, seed: jax.Array, state: Any, action: jax.Array, params: EnvParams, has_ended: Any = None
     ) -> Step:
-        found = one_kernel(self._step)(seed, state, clip_action(action), params, has_ended)
+        found = one_kernel(self._step)(
+            seed, state, clip_action(action, self._dtype(state)), params, has_ended
+        )
         rows, final_rows, state, reward, flags, info = found
         info = {**info, **flags, "final_observation": jnp.stack(final_rows)}
         return jnp.stack(rows), state, reward, flags["terminated"], flags["truncated"], info

@@ -1,9 +1,13 @@
 """Reading files of bounded size, and writing them atomically: a reader sees the old file or the new one."""
 
+import contextlib
 import itertools
 import os
 import secrets
 import stat
+import sys
+import warnings
+from collections.abc import Iterator
 from pathlib import Path
 from typing import BinaryIO
 
@@ -74,3 +78,46 @@ def fresh_folder(path: Path) -> Path:
         except FileExistsError:
             continue
     raise AssertionError("there is always another number")
+
+
+@contextlib.contextmanager
+def locked_folder(folder: Path) -> Iterator[None]:
+    """Hold a folder for one process, so that no two write into it at once.
+
+    An advisory lock of the operating system on a file beside the folder, which ends with the process. Where
+    there is none (Windows, some network file systems), a warning says so.
+
+    Raises:
+        OSError: another process holds the folder; it names the folder, the process and its command.
+    """
+    folder = Path(os.path.realpath(folder))
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    path = folder.with_name(f".{folder.name}.lock")
+    try:
+        import fcntl
+    except ImportError:
+        warnings.warn(f"{folder}: not locked, as this system has no flock", stacklevel=3)
+        yield
+        return
+    with contextlib.ExitStack() as stack:
+        while True:
+            file = stack.enter_context(path.open("a+"))
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                file.seek(0)
+                holder = file.read().strip() or "another process"
+                raise OSError(f"{folder}: found in use by {holder}, expected a folder of its own") from None
+            except OSError as error:
+                warnings.warn(f"{folder}: not locked, as its file system refuses: {error}", stacklevel=3)
+                yield
+                return
+            if path.exists() and os.path.samestat(os.fstat(file.fileno()), path.stat()):
+                break  # else it was removed by the process that held it before
+        file.truncate(0)
+        file.write(f"process {os.getpid()}: {' '.join(sys.argv)}")
+        file.flush()
+        try:
+            yield
+        finally:
+            path.unlink(missing_ok=True)

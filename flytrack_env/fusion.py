@@ -7,17 +7,19 @@ removed before fusion and does not help. A conditional does: what goes into it i
 """
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextvars import ContextVar
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
 from jax import core
 from jax.dtypes import float0
+from jax.experimental.custom_partitioning import ArrayMapping, SdyShardingRule, custom_partitioning_p
 from jax.extend.core import ClosedJaxpr, Primitive, jaxpr_as_fun
 from jax.interpreters import ad, batching, mlir
 from jax.interpreters.partial_eval import dce_jaxpr, dce_rules
+from jax.sharding import NamedSharding, PartitionSpec
 from jaxlib.mlir import ir
 
 Tree = TypeVar("Tree")
@@ -47,6 +49,20 @@ def _is_number(leaf: jax.Array) -> bool:
     return not jnp.issubdtype(leaf.dtype, jax.dtypes.extended)
 
 
+def vary_like(tree: Tree, source: Any) -> Tree:
+    """Return a tree whose leaves vary, within ``shard_map``, over all the axes that those of another do.
+
+    The same numbers: what begins as a constant and is then carried by a loop needs the type of its end.
+    """
+    axes = frozenset().union(*(jax.typeof(leaf).mat.varying for leaf in jax.tree.leaves(source)))
+
+    def vary(leaf: Any) -> Any:
+        missing = tuple(sorted(axes - jax.typeof(leaf).mat.varying))
+        return jax.lax.pcast(leaf, missing, to="varying") if missing else leaf
+
+    return jax.tree.map(vary, tree)
+
+
 def _fence(*leaves: jax.Array) -> tuple[jax.Array, ...]:
     def is_impossible(x: tuple[jax.Array, ...]) -> jax.Array:
         probe = x[0].ravel()[0].astype(jnp.float32)
@@ -56,6 +72,29 @@ def _fence(*leaves: jax.Array) -> tuple[jax.Array, ...]:
         return tuple(jnp.logical_not(leaf) if leaf.dtype == bool else -leaf for leaf in x)
 
     return jax.lax.while_loop(is_impossible, change, leaves)
+
+
+def _lower_fence(ctx, *leaves):  # type: ignore[no-untyped-def]
+    if _is_partitioned(ctx):  # the probe of a loop that never runs would be sent between the devices
+        return list(leaves)
+    return _lower(_fence, ctx, *leaves)
+
+
+def _lower(function: Callable[..., Any], ctx: Any, *values: Any) -> Any:
+    """Lower a function as it is on one device: ``shard_map`` checks types that loops here do not keep."""
+    plain = [core.ShapedArray(aval.shape, aval.dtype) for aval in ctx.avals_in]
+    return mlir.lower_fun(function, multiple_results=True)(ctx.replace(avals_in=plain), *values)
+
+
+def _is_partitioned(ctx: Any) -> bool:
+    """Return whether XLA divides what is lowered now among devices.
+
+    Not in ``pmap``, nor in ``shard_map`` over all axes of its mesh, whose body is that of one device.
+    """
+    context = ctx.module_context.axis_context
+    if hasattr(context, "manual_axes"):
+        return set(context.manual_axes) != set(context.mesh.axis_names)
+    return getattr(context, "num_devices", 1) > 1
 
 
 def _batch(leaves, axes):  # type: ignore[no-untyped-def]
@@ -87,7 +126,7 @@ ad.primitive_jvps[_compute_once_p] = _jvp
 ad.primitive_transposes[_compute_once_p] = _transpose
 dce_rules[_compute_once_p] = _prune
 mlir.register_lowering(_compute_once_p, lambda ctx, *leaves: list(leaves))
-mlir.register_lowering(_compute_once_p, mlir.lower_fun(_fence, multiple_results=True), platform="cpu")
+mlir.register_lowering(_compute_once_p, _lower_fence, platform="cpu")
 
 
 _one_kernel_p = Primitive("flytrack_one_kernel")
@@ -147,30 +186,104 @@ def one_kernel(function: Callable[..., Tree]) -> Callable[..., Tree]:
         def flat(*leaves: Any) -> Any:
             return function(*jax.tree.unflatten(structure, leaves))
 
-        token = _in_kernel.set(True)
-        try:
-            closed, shapes = jax.make_jaxpr(flat, return_shape=True)(*leaves)
-        finally:
-            _in_kernel.reset(token)
-        if is_simple(closed):
-            # XLA's compiler of such a call fails on an argument that nothing reads.
-            jaxpr, is_used = dce_jaxpr(closed.jaxpr, [True] * len(closed.jaxpr.outvars))
-            used = [leaf for leaf, used in zip(leaves, is_used, strict=True) if used]
-            results = _one_kernel_p.bind(*used, jaxpr=ClosedJaxpr(jaxpr, closed.consts))
-        else:
-            results = jaxpr_as_fun(closed)(*leaves)
-        return jax.tree.unflatten(jax.tree.structure(shapes), results)
+        return _bind(flat, leaves)
 
     return wrapped
 
 
-def _batch_kernel(args, dims, *, jaxpr):  # type: ignore[no-untyped-def]
+def _bind(function: Callable[..., Tree], leaves: Sequence[Any], element: "_Element | None" = None) -> Tree:
+    """Return the results of a function of leaves, computed by a kernel if it is made of ``SIMPLE``.
+
+    element: what the function is the batch of, if it is one.
+    """
+    # As on one device: loops do not keep the types that shard_map checks.
+    avals = [jax.typeof(leaf) for leaf in leaves]
+    plain = [core.ShapedArray(aval.shape, aval.dtype, aval.weak_type) for aval in avals]
+    token = _in_kernel.set(True)
+    try:
+        closed, shapes = jax.make_jaxpr(function, return_shape=True)(*plain)
+    finally:
+        _in_kernel.reset(token)
+    if not is_simple(closed):
+        return function(*leaves)
+    # XLA's compiler of such a call fails on an argument that nothing reads.
+    jaxpr, is_used = dce_jaxpr(closed.jaxpr, [True] * len(closed.jaxpr.outvars))
+    kernel = ClosedJaxpr(jaxpr, closed.consts)
+    used = [i for i, one in enumerate(is_used) if one]
+    divided = None if element is None else _divided(kernel, used, element)
+    results = _one_kernel_p.bind(*(leaves[i] for i in used), jaxpr=kernel, divided=divided)
+    return jax.tree.unflatten(jax.tree.structure(shapes), results)
+
+
+class _Element(NamedTuple):
+    """A function of one element of a batch, and the axis of the batch in each argument, None in those of all.
+
+    In its results the batch is the last axis.
+    """
+
+    jaxpr: ClosedJaxpr
+    dims: tuple[int | None, ...]
+
+    def batch(self) -> Callable[..., Any]:
+        """Return the function of a batch."""
+        axes = [aval.ndim for aval in self.jaxpr.out_avals]
+        return jax.vmap(jaxpr_as_fun(self.jaxpr), in_axes=self.dims, out_axes=axes)
+
+
+def _divided(kernel: ClosedJaxpr, used: Sequence[int], element: _Element) -> ClosedJaxpr:
+    """Return a kernel of a batch as an operation that XLA divides among devices along the batch.
+
+    Left to itself it divides what is within the kernel, and its compiler of such a call has no collectives.
+    used: indices of the batch's arguments that the kernel has.
+    """
+    dims = [element.dims[i] for i in used]
+    own = element._replace(dims=tuple(dim if i in used else None for i, dim in enumerate(element.dims)))
+
+    def part(*leaves: jax.Array) -> Any:
+        given = dict(zip(used, leaves, strict=True))
+        avals = enumerate(own.jaxpr.in_avals)
+        return _bind(own.batch(), [given[i] if i in given else jnp.zeros(a.shape, a.dtype) for i, a in avals])
+
+    def partition(mesh: Any, arguments: Any, results: Any) -> tuple[Any, ...]:
+        shardings = [[one.sharding for one in shapes] for shapes in (results, arguments)]
+        return mesh, part, *shardings
+
+    def mapping(name: str, ndim: int, batch: int | None) -> ArrayMapping:
+        return ArrayMapping(*("batch" if axis == batch else f"{name}x{axis}" for axis in range(ndim)))
+
+    arguments = [
+        mapping(f"a{i}", aval.ndim, dim)
+        for i, (aval, dim) in enumerate(zip(kernel.in_avals, dims, strict=True))
+    ]
+    results = [mapping(f"r{i}", aval.ndim, aval.ndim - 1) for i, aval in enumerate(kernel.out_avals)]
+    whole = {axis for array in (*arguments, *results) for axis in array} - {"batch"}
+    rule = SdyShardingRule(tuple(arguments), tuple(results), need_replication_factors=tuple(sorted(whole)))
+
+    def operation(*leaves: jax.Array) -> list[jax.Array]:
+        return custom_partitioning_p.bind(
+            *leaves,
+            call=kernel,
+            partition=partition,
+            propagate_user_sharding=None,
+            infer_sharding_from_operands=None,
+            decode_shardings=True,
+            sharding_rule=rule,
+            in_tree=jax.tree.structure([0] * len(arguments)),
+            out_tree=jax.tree.structure([0] * len(results)),
+            static_args=(),
+        )
+
+    return jax.make_jaxpr(operation)(*kernel.in_avals)
+
+
+def _batch_kernel(args, axes, *, jaxpr, divided):  # type: ignore[no-untyped-def]
+    del divided  # a batch of batches is divided along the outer one
     # The batch is the last axis, so that each component of a vector is contiguous.
-    axes = [aval.ndim for aval in jaxpr.out_avals]
-    return one_kernel(jax.vmap(jaxpr_as_fun(jaxpr), in_axes=dims, out_axes=axes))(*args), axes
+    element = _Element(jaxpr, tuple(axes))
+    return _bind(element.batch(), args, element), [aval.ndim for aval in jaxpr.out_avals]
 
 
-def _jvp_kernel(primals, tangents, *, jaxpr):  # type: ignore[no-untyped-def]
+def _jvp_kernel(primals, tangents, *, jaxpr, divided):  # type: ignore[no-untyped-def]
     moves = [type(tangent) is not ad.Zero for tangent in tangents]
     directions = [tangent for tangent, does in zip(tangents, moves, strict=True) if does]
 
@@ -185,10 +298,12 @@ def _jvp_kernel(primals, tangents, *, jaxpr):  # type: ignore[no-untyped-def]
         return jax.jvp(of_moving, moving, directions)[1]
 
     # Apart, since a batch of directions has one result.
-    return _one_kernel_p.bind(*primals, jaxpr=jaxpr), derivative(list(primals), directions)
+    return _one_kernel_p.bind(*primals, jaxpr=jaxpr, divided=divided), derivative(list(primals), directions)
 
 
-def _lower_kernel(ctx, *args, jaxpr):  # type: ignore[no-untyped-def]
+def _lower_kernel(ctx, *args, jaxpr, divided):  # type: ignore[no-untyped-def]
+    if _is_partitioned(ctx):
+        return _lower(jaxpr_as_fun(divided or jaxpr), ctx, *args)
     # XLA's compiler of such a call aborts on an argument that nothing reads, and simplifies reads away that
     # JAX sees; it does on some constants, too. So one more result reads something of each argument, and what
     # is small, as parameters are, is fenced.
@@ -196,8 +311,7 @@ def _lower_kernel(ctx, *args, jaxpr):  # type: ignore[no-untyped-def]
     given = dict(enumerate(args))
     if small:
         avals = [ctx.avals_in[i] for i in small]
-        fence = mlir.lower_fun(_fence, multiple_results=True)
-        fenced = fence(ctx.replace(avals_in=avals, avals_out=avals), *(given[i] for i in small))
+        fenced = _lower(_fence, ctx.replace(avals_in=avals, avals_out=avals), *(given[i] for i in small))
         given |= dict(zip(small, fenced, strict=True))
 
     def reading(*leaves: jax.Array) -> list[jax.Array]:
@@ -205,7 +319,7 @@ def _lower_kernel(ctx, *args, jaxpr):  # type: ignore[no-untyped-def]
         return [*jaxpr_as_fun(jaxpr)(*leaves), sum(read, jnp.float32(0.0))]
 
     calling = ctx.replace(avals_out=[*ctx.avals_out, core.ShapedArray((), jnp.float32)])
-    *results, _ = mlir.lower_fun(jax.jit(reading), multiple_results=True)(calling, *given.values())
+    *results, _ = _lower(jax.jit(reading), calling, *given.values())
     call = results[0].owner
     call.attributes["mhlo.frontend_attributes"] = ir.DictAttr.get(
         {name: ir.StringAttr.get(value) for name, value in ATTRIBUTES.items()}
@@ -213,9 +327,28 @@ def _lower_kernel(ctx, *args, jaxpr):  # type: ignore[no-untyped-def]
     return results
 
 
-_inlined = mlir.lower_fun(lambda *leaves, jaxpr: jaxpr_as_fun(jaxpr)(*leaves), multiple_results=True)
-_one_kernel_p.def_impl(lambda *leaves, jaxpr: jax.jit(jaxpr_as_fun(jaxpr))(*leaves))
-_one_kernel_p.def_abstract_eval(lambda *avals, jaxpr: list(jaxpr.out_avals))
+def _infer_kernel(*avals, jaxpr, divided):  # type: ignore[no-untyped-def]
+    del divided
+    placed = [aval for aval in avals if aval.mat.varying]
+    if not placed:
+        return list(jaxpr.out_avals)
+    # Within shard_map a result varies over the axes that any argument varies over.
+    manual_axes = type(placed[0].mat)(varying=frozenset().union(*(aval.mat.varying for aval in placed)))
+    mesh = placed[0].sharding.mesh
+
+    def vary(aval: Any) -> Any:
+        sharding = NamedSharding(mesh, PartitionSpec(*[None] * aval.ndim))
+        return aval.update(sharding=sharding, manual_axis_type=manual_axes)
+
+    return [vary(aval) for aval in jaxpr.out_avals]
+
+
+def _inlined(ctx, *args, jaxpr, divided):  # type: ignore[no-untyped-def]
+    return _lower(jaxpr_as_fun(jaxpr), ctx, *args)
+
+
+_one_kernel_p.def_impl(lambda *leaves, jaxpr, divided: jax.jit(jaxpr_as_fun(jaxpr))(*leaves))
+_one_kernel_p.def_abstract_eval(_infer_kernel)
 batching.primitive_batchers[_one_kernel_p] = _batch_kernel
 ad.primitive_jvps[_one_kernel_p] = _jvp_kernel
 mlir.register_lowering(_one_kernel_p, _inlined)

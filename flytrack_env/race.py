@@ -57,12 +57,12 @@ def start_race(gate_index: jax.Array, course: Course) -> Race:
 
 def _count_pass(race: Race, is_pass: jax.Array, time_s: Scalar, course: Course) -> tuple[Race, jax.Array]:
     """Return the race after a possible pass, its gate frames not yet moved on, and whether a lap ended."""
-    gates_passed = race.gates_passed + is_pass
+    gates_passed = race.gates_passed + is_pass.astype(jnp.int32)
     is_lap = is_pass & (gates_passed == (race.laps + 1) * course.num_gates)
     counted = race._replace(
         gate_index=jnp.where(is_pass, course.next_index(race.gate_index), race.gate_index),
         gates_passed=gates_passed,
-        laps=race.laps + is_lap,
+        laps=race.laps + is_lap.astype(jnp.int32),
         lap_start_s=jnp.where(is_lap, time_s, race.lap_start_s),
         lap_time_s=jnp.where(is_lap, time_s - race.lap_start_s, race.lap_time_s),
     )
@@ -88,7 +88,7 @@ def advance_race(
     after_first, is_first_lap = _count_pass(race, first.is_pass, first_time_s, course)
     after, is_second_lap = _count_pass(after_first, is_second, second_time_s, course)
     events = RaceEvents(
-        num_passed=first.is_pass.astype(jnp.int32) + is_second,
+        num_passed=first.is_pass.astype(jnp.int32) + is_second.astype(jnp.int32),
         is_lap=is_first_lap | is_second_lap,
         is_frame=first.is_frame | (first.is_pass & second.is_frame),
         is_miss=first.is_miss | (first.is_pass & second.is_miss),

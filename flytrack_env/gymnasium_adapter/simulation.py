@@ -146,7 +146,8 @@ class Programs:
         return packed, observations, final_observations, scenes, blocks
 
 
-# By id, missed gates, plant and layout of the parameters: all that a compiled function depends on.
+# By all that a compiled function depends on: id, missed gates, plant, the delay that the simulator of a model
+# remembers, and the layout of the parameters.
 _PROGRAMS: dict[Any, Programs] = {}
 MOST_PROGRAMS = 16
 
@@ -168,7 +169,8 @@ class Simulation:
         _check_shapes(self.params, self.env.default_params)
         self.env.check_params(self.params)
         plant = overrides.get("plant")
-        key = env_id, overrides.get("missed_gate"), plant and id(plant), Layout.of(self.params)
+        layout, delay_steps = Layout.of(self.params), self.env.plant.delay_steps
+        key = env_id, self.env.missed_gate, plant and id(plant), delay_steps, layout
         if key not in _PROGRAMS:
             if len(_PROGRAMS) == MOST_PROGRAMS:
                 del _PROGRAMS[next(iter(_PROGRAMS))]

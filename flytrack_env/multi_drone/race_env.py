@@ -16,7 +16,7 @@ from gymnax.environments import spaces
 
 from flytrack_env.auto_reset import Ended, reset_if_ended
 from flytrack_env.episodes import EpisodicEnvironment, Step, clip_action, observation_box
-from flytrack_env.fusion import compute_once, one_kernel
+from flytrack_env.fusion import compute_once, one_kernel, vary_like
 from flytrack_env.multi_drone.collisions import Path, is_put_out
 from flytrack_env.multi_drone.downwash import Wake, downwash_acc_w, push, wake_of
 from flytrack_env.multi_drone.ghosts import Ghost
@@ -165,7 +165,8 @@ class MultiDroneRace:
     @partial(jax.jit, static_argnames=("self",))
     def _reset(self, key: jax.Array, params: RaceParams) -> tuple[jax.Array, EntrantState]:
         words = self._words(seed_of(key)[None])
-        rows, states = jax.vmap(self._begin_from, (0, None))(words, params)
+        begun = jax.vmap(self._begin_from, (0, None))(words, params)
+        rows, states = vary_like(begun, (key, params))
         return jnp.stack(rows, axis=-1), states
 
     def begin(
@@ -235,7 +236,8 @@ class MultiDroneRace:
         resets: bool,
     ) -> Step:
         params = self.default_params if params is None else params
-        commands = jax.vmap(clip_action)(actions)
+        dtype = jnp.result_type(self.env.drone(states.inner).pos_w.x)
+        commands = jax.vmap(partial(clip_action, dtype=dtype))(actions)
         step = one_kernel(partial(self._step, resets))
         rows, final_rows, states, reward, terminated, truncated, info = step(
             self._words(seeds), states, commands, params, self._ghosts_at(states.step)

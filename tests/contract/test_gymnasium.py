@@ -20,11 +20,14 @@ from gymnasium.wrappers import TimeLimit
 from gymnasium.wrappers import vector as wrappers
 
 import flytrack_env
+from flytrack_env.effects import CommandDelay
 from flytrack_env.env import EnvParams, FlyTrack
 from flytrack_env.registration import ENVIRONMENTS
 from tests.support.coasting import track_of_row
 from tests.support.slow import slow_but
 from tests.support.tables import table
+
+APPLIED_ROLL = 18  # row of the observation
 
 BASE = "FlyTrack-v0"
 
@@ -249,3 +252,14 @@ def test_wrong_use_is_refused() -> None:
         make_vector(autoreset_mode=AutoresetMode.DISABLED)
     with pytest.raises(RuntimeError, match=r"found 'async', .*; use 'vector_entry_point'.* or pass .*spawn"):
         gymnasium.make_vec(BASE, 2, vectorization_mode="async", vector_kwargs={"context": "fork"})
+
+
+def test_models_with_other_delays_are_flown_with_their_own() -> None:
+    steps = {}
+    for delay_s in (0.04, 0.06, 0.04):
+        model = flytrack_env.nominal_parameters().with_effects(CommandDelay(delay_s))
+        env = gymnasium.make("flytrack_env:FlyTrack-v0", model=model)
+        env.reset(seed=0, options={"gate_index": 0})  # at rest: no roll is applied
+        rolls = [env.step(np.array([1.0, 0.0, 0.0, 1.0]))[0][APPLIED_ROLL] for _ in range(10)]
+        steps[delay_s] = int(np.flatnonzero(rolls)[0])
+    assert steps == {0.04: 4, 0.06: 6}

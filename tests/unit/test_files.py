@@ -1,12 +1,14 @@
 """Files written atomically, and new folders."""
 
 import os
+import subprocess
+import sys
 from concurrent.futures import ThreadPoolExecutor
 from unittest.mock import Mock
 
 import pytest
 
-from flytrack_env.files import fresh_folder, write_atomically
+from flytrack_env.files import fresh_folder, locked_folder, write_atomically
 
 
 def test_a_failed_write_leaves_the_old_file_and_nothing_else(tmp_path, monkeypatch):
@@ -32,3 +34,31 @@ def test_no_two_callers_are_given_the_same_folder(tmp_path):
     with ThreadPoolExecutor(8) as pool:
         folders = list(pool.map(lambda _: fresh_folder(tmp_path / "demo"), range(40)))
     assert len(set(folders)) == 40 and all(folder.is_dir() for folder in folders)
+
+
+HOLD = """
+import sys, time
+from pathlib import Path
+from flytrack_env.files import locked_folder
+with locked_folder(Path(sys.argv[1])):
+    print("held", flush=True)
+    time.sleep(600)
+"""
+
+
+def test_a_folder_is_held_by_one_process_until_it_ends(tmp_path):
+    folder = tmp_path / "runs"
+    with subprocess.Popen(
+        [sys.executable, "-c", HOLD, str(folder)], stdout=subprocess.PIPE, text=True
+    ) as holder:
+        assert holder.stdout.readline() == "held\n"
+        with (
+            pytest.raises(OSError, match=f"{folder}: found in use by process {holder.pid}: -c"),
+            locked_folder(folder),
+        ):
+            pass
+        holder.kill()
+    mine = f"in use by process {os.getpid()}"
+    with locked_folder(folder), pytest.raises(OSError, match=mine), locked_folder(folder):
+        pass
+    assert os.listdir(tmp_path) == []

@@ -1,0 +1,78 @@
+"""The step in settings that our own baseline does not have: float64, strict types, NaN checks, devices."""
+
+import os
+import subprocess
+import sys
+from functools import partial
+from typing import Any
+
+import gymnax
+import jax
+import numpy as np
+import pytest
+
+from flytrack_env.registration import ENVIRONMENTS, RACES
+from tests.support.slow import slow_but
+from tests.support.stepping import WAYS, XLA_FLAGS, flight, inputs
+
+PLAIN = "FlyTrack-v0"
+ALL_IDS = (*ENVIRONMENTS, *RACES)
+OVER_IDS = pytest.mark.parametrize("env_id", ALL_IDS)
+ONE_FAST = pytest.mark.parametrize("env_id", slow_but([PLAIN], ALL_IDS))
+
+
+@OVER_IDS
+def test_with_x64_a_step_keeps_the_types_of_the_state(env_id: str) -> None:
+    env = gymnax.make(env_id)[0]
+    with jax.enable_x64(True):
+        keys, actions, params = inputs(env)
+        begun = jax.eval_shape(jax.vmap(env.reset, (0, None)), keys, params)
+        assert {leaf.dtype.itemsize for leaf in jax.tree.leaves(begun)} <= {1, 4}
+        doubles = actions.astype(float)
+        assert doubles.dtype == np.float64
+        for state_type in (np.float32, np.float64):
+            typed = jax.tree.map(partial(as_type, state_type), begun)
+            stepped = jax.eval_shape(env.step_batch, keys[0], typed[1], doubles, params)
+            assert stepped[:2] == typed and stepped[2].dtype == state_type
+        assert jax.eval_shape(flight(env), keys, doubles, params)[0] == begun
+
+
+def as_type(dtype: Any, leaf: Any) -> jax.ShapeDtypeStruct:
+    """Return the shape of a leaf, with another type if it is a float."""
+    is_float = np.issubdtype(leaf.dtype, np.floating)
+    return jax.ShapeDtypeStruct(leaf.shape, dtype if is_float else leaf.dtype)
+
+
+@ONE_FAST
+def test_with_x64_a_flight_is_the_same(env_id: str) -> None:
+    env = gymnax.make(env_id)[0]
+    keys, actions, params = inputs(env)
+    expected = jax.jit(flight(env))(keys, actions, params)
+    with jax.enable_x64(True):
+        found = jax.jit(flight(env))(keys, actions.astype(float), params)
+    for leaf, one in zip(*map(jax.tree.leaves, (found, expected)), strict=True):
+        np.testing.assert_allclose(leaf, one, rtol=1e-5, atol=1e-5)
+
+
+@OVER_IDS
+def test_with_strict_promotion_reset_and_step_compile(env_id: str) -> None:
+    env = gymnax.make(env_id)[0]
+    with jax.numpy_dtype_promotion("strict"):
+        arguments = inputs(env)
+        assert jax.jit(flight(env)).lower(*arguments).as_text()
+
+
+@ONE_FAST
+def test_a_flight_has_no_nan(env_id: str) -> None:
+    env = gymnax.make(env_id)[0]
+    with jax.debug_nans(True):
+        jax.block_until_ready(jax.jit(flight(env))(*inputs(env)))
+
+
+@pytest.mark.parametrize("env_ids", slow_but([(PLAIN,)], [(PLAIN,), tuple(set(ALL_IDS) - {PLAIN})]))
+def test_flights_on_four_devices_are_those_on_one(env_ids: tuple[str, ...]) -> None:
+    environment = {**os.environ, "XLA_FLAGS": XLA_FLAGS}
+    command = [sys.executable, "-m", "tests.support.stepping", *env_ids]
+    result = subprocess.run(command, capture_output=True, text=True, check=False, env=environment)
+    assert result.returncode == 0, result.stderr[-3000:]
+    assert result.stdout.count(f"flown in {len(WAYS)} ways") == len(env_ids)

@@ -1,0 +1,102 @@
+"""The step outside of plain ``jit``: flights divided among devices, which need a process of their own.
+
+``python -m tests.support.stepping ENV_ID ...``, with ``XLA_FLAGS``, flies each id in each way and compares.
+"""
+
+import sys
+from collections.abc import Callable
+from typing import Any
+
+import gymnax
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
+
+import flytrack_env  # noqa: F401, registers the ids
+
+NUM_DEVICES, NUM_ENVS, NUM_STEPS = 4, 8, 5
+XLA_FLAGS = f"--xla_force_host_platform_device_count={NUM_DEVICES}"  # of the environment of the process
+MAX_STEPS = 3  # of an episode, so that episodes end
+TOLERANCE = 1e-4  # rounding of a float32 step depends on how many environments are computed at once
+
+
+def short_episodes(env: Any) -> Any:
+    """Return the parameters of an environment or a race with a time limit of ``MAX_STEPS``."""
+    params = env.default_params
+    if hasattr(params, "max_steps_in_episode"):
+        return params.replace(max_steps_in_episode=MAX_STEPS)
+    flight = params.race.flight.replace(max_steps_in_episode=MAX_STEPS)
+    return params._replace(race=params.race._replace(flight=flight))
+
+
+def flight(env: Any) -> Callable[..., Any]:
+    """Return a function of keys (n,), actions (n, ...) and parameters: a reset and steps through resets."""
+
+    def fly(keys: jax.Array, actions: jax.Array, params: Any) -> Any:
+        step = jax.vmap(env.step, in_axes=(0, 0, 0, None))
+
+        def advance(begun: Any, _: Any) -> Any:
+            observation, state, reward, terminated, truncated, _ = step(keys, begun[1], actions, params)
+            return (observation, state), (reward, terminated, truncated)
+
+        begun = jax.vmap(env.reset, in_axes=(0, None))(keys, params)
+        return jax.lax.scan(advance, begun, None, length=NUM_STEPS)
+
+    return fly
+
+
+def inputs(env: Any) -> tuple[jax.Array, jax.Array, Any]:
+    """Return keys, actions and parameters for ``flight``."""
+    shape = (NUM_ENVS, *env.action_space(env.default_params).shape)
+    actions = jax.random.uniform(jax.random.key(1), shape, jnp.float32, minval=-1.0)
+    return jax.random.split(jax.random.key(0), NUM_ENVS), actions, short_episodes(env)
+
+
+def _by_named_sharding(fly: Any, keys: jax.Array, actions: jax.Array, params: Any, mesh: Mesh) -> Any:
+    placed = jax.device_put((keys, actions), NamedSharding(mesh, PartitionSpec("batch")))
+    program = jax.jit(fly).lower(*placed, params).compile()
+    text = program.as_text()
+    assert "xla_cpu_small_call" in text, "the fast path is off"
+    assert " all-gather(" not in text, "the batch is gathered"
+    found = program(*placed, params)
+    assert not found[0][0].sharding.is_fully_replicated
+    return found
+
+
+def _by_shard_map(fly: Any, keys: jax.Array, actions: jax.Array, params: Any, mesh: Mesh) -> Any:
+    batch, steps = PartitionSpec("batch"), PartitionSpec(None, "batch")
+    specs = {"in_specs": (batch, batch, PartitionSpec()), "out_specs": (batch, steps)}
+    return jax.jit(jax.shard_map(fly, mesh=mesh, **specs))(keys, actions, params)
+
+
+def _by_pmap(fly: Any, keys: jax.Array, actions: jax.Array, params: Any, mesh: Mesh) -> Any:
+    keys, actions = (leaf.reshape(NUM_DEVICES, -1, *leaf.shape[1:]) for leaf in (keys, actions))
+    begun, steps = jax.pmap(fly, in_axes=(0, 0, None))(keys, actions, params)
+    begun = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), begun)
+    return begun, jax.tree.map(lambda leaf: jnp.concatenate(list(leaf), axis=1), steps)
+
+
+WAYS = (_by_named_sharding, _by_shard_map, _by_pmap)
+
+
+def main(env_ids: list[str]) -> None:
+    """Fly each id in every way; raise AssertionError where one differs from a flight on one device."""
+    assert len(jax.devices()) == NUM_DEVICES
+    mesh = Mesh(np.array(jax.devices()), ("batch",))
+    for env_id in env_ids:
+        env = gymnax.make(env_id)[0]
+        fly = flight(env)
+        expected = jax.jit(fly)(*inputs(env))
+        for way in WAYS:
+            found = way(fly, *inputs(env), mesh)
+            paths = [jax.tree_util.keystr(path) for path, _ in jax.tree_util.tree_leaves_with_path(found)]
+            leaves = zip(paths, *map(jax.tree.leaves, (found, expected)), strict=True)
+            for path, leaf, one in leaves:
+                name, numbers = f"{env_id}{way.__name__}{path}", (np.asarray(x, float) for x in (leaf, one))
+                np.testing.assert_allclose(*numbers, rtol=TOLERANCE, atol=TOLERANCE, err_msg=name)
+        print(env_id, "flown in", len(WAYS), "ways")
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])
