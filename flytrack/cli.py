@@ -160,8 +160,7 @@ def call(name: str, words: Sequence[str]) -> None:
 def held_output(asked: Any) -> contextlib.AbstractContextManager[None]:
     """Return what holds the output folder of a command's flags; nothing for one that writes files alone."""
     out = getattr(asked, "out", None)
-    is_folder = isinstance(out, Path) and not out.suffix
-    if not is_folder:
+    if not isinstance(out, Path) or out.suffix:
         return contextlib.nullcontext()
     from flytrack_env.files import locked_folder
 
