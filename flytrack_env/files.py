@@ -11,6 +11,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import BinaryIO
 
+_held: set[Path] = set()  # lock files of this process
+
 
 def user_cache_folder() -> Path:
     """Return FlyTrack's folder for what can be made again; RuntimeError where a user has no home."""
@@ -85,7 +87,8 @@ def locked_folder(folder: Path) -> Iterator[None]:
     """Hold a folder for one process, so that no two write into it at once.
 
     An advisory lock of the operating system on a file beside the folder, which ends with the process. Where
-    there is none (Windows, some network file systems), a warning says so.
+    there is none (Windows, some network file systems), a warning says so. A process that holds the folder
+    already goes on: a command holds what its training writes into.
 
     Raises:
         OSError: another process holds the folder; it names the folder, the process and its command.
@@ -93,6 +96,9 @@ def locked_folder(folder: Path) -> Iterator[None]:
     folder = Path(os.path.realpath(folder))
     folder.parent.mkdir(parents=True, exist_ok=True)
     path = folder.with_name(f".{folder.name}.lock")
+    if path in _held:
+        yield
+        return
     try:
         import fcntl
     except ImportError:
@@ -117,7 +123,9 @@ def locked_folder(folder: Path) -> Iterator[None]:
         file.truncate(0)
         file.write(f"process {os.getpid()}: {' '.join(sys.argv)}")
         file.flush()
+        _held.add(path)
         try:
             yield
         finally:
+            _held.remove(path)
             path.unlink(missing_ok=True)

@@ -8,7 +8,7 @@ import signal
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from functools import partial
 from pathlib import Path
 from types import FrameType
@@ -29,6 +29,7 @@ from baselines.purejaxrl_ppo.networks import Policy
 from baselines.purejaxrl_ppo.ppo import Algorithm, Runner, make_network_for, make_ppo
 from baselines.purejaxrl_ppo.tracking import RUN_FILE, Tracker
 from flytrack_env.episodes import EpisodicEnvironment
+from flytrack_env.files import locked_folder
 from flytrack_env.params import EnvParams
 
 Metrics = dict[str, np.ndarray]
@@ -182,13 +183,21 @@ class Trainer:
         return runs
 
     def run(self, runs: list["Run"]) -> list[tuple[Checkpoint, Metrics]]:
-        """Train prepared runs; those that are as far as each other side by side."""
-        left = [run for run in runs if run.load()]
-        are_together = len({(run.update, run.options._replace(resume=None)) for run in left}) == 1
-        for group in [left] if are_together else [[run] for run in left]:
-            with kept_interrupts() as check_interrupt:
-                train_group(self, group, check_interrupt)
-        return [run.result() for run in runs]
+        """Train prepared runs; those that are as far as each other side by side.
+
+        Raises:
+            OSError: another process trains into the folder of one.
+        """
+        with ExitStack() as held:
+            for run in runs:
+                held.enter_context(locked_folder(run.out))
+                files.check_free(run.out, run.start)  # another may have written since it was prepared
+            left = [run for run in runs if run.load()]
+            are_together = len({(run.update, run.options._replace(resume=None)) for run in left}) == 1
+            for group in [left] if are_together else [[run] for run in left]:
+                with kept_interrupts() as check_interrupt:
+                    train_group(self, group, check_interrupt)
+            return [run.result() for run in runs]
 
 
 class Run:
