@@ -32,7 +32,7 @@ def motion_notes(
             marked.
     """
     required, notes = required_motion(log, requested), []
-    if log.origin == "measured" and required is not Motion.CONTINUOUS:
+    if log.origin == "measured" and required not in (None, Motion.CONTINUOUS):
         notes.append(
             f"motion: {required.value} was requested, but {log.source} is measured: drones move continuously"
         )

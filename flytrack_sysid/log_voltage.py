@@ -10,6 +10,7 @@ import numpy as np
 
 from flytrack_env.battery import MAX_EXTRAPOLATION, Battery
 from flytrack_env.dynamics import ModelParameters
+from flytrack_env.state import BATTERY_EMPTY_V, BATTERY_FULL_V
 from flytrack_sysid.log import FlightLog
 
 # Percentiles of a logged voltage, so that a lone wrong sample is no range: a pack that falls evenly from 16.7
@@ -27,8 +28,8 @@ def with_voltage(log: FlightLog, model: ModelParameters) -> FlightLog:
 
 def assumed_voltage(log: FlightLog) -> float:
     """Return the voltage of a log without ``v_bat``, V: the middle of what is stated, or the handout's."""
-    battery = Battery()
-    return 0.5 * sum(log.stated_voltage_v or (battery.empty_v, battery.full_v))
+    low, high = log.stated_voltage_v or (BATTERY_EMPTY_V, BATTERY_FULL_V)
+    return 0.5 * (low + high)
 
 
 def flown_voltages(log: FlightLog) -> tuple[float, float]:

@@ -6,6 +6,7 @@ out. Where the motion is too small to tell, no problem is reported.
 
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -190,6 +191,11 @@ def _changed(channel: str, change: Callable[[np.ndarray], np.ndarray]) -> Callab
     return lambda log: replace(log, channels={**log.channels, channel: change(log[channel])})
 
 
+def _rolled(quat: np.ndarray, signs: np.ndarray, step: int) -> np.ndarray:
+    """Return quaternions in another order, (num_rows, 4), with some components negated before and after."""
+    return np.roll(quat * signs, step, axis=1) * signs
+
+
 def _as_quaternions(change: Callable[[Rotation], Rotation]) -> Callable[[np.ndarray], np.ndarray]:
     return lambda quat: change(Rotation.from_quat(quat, scalar_first=True)).as_quat(scalar_first=True)
 
@@ -208,7 +214,7 @@ CONVENTIONS: tuple[tuple[str, str, Callable[[FlightLog], FlightLog]], ...] = (
         (
             "q",
             f"is read as {order}: this looks like the other order of the quaternion",
-            _changed("q", lambda quat, signs=signs, step=step: np.roll(quat * signs, step, axis=1) * signs),
+            _changed("q", partial(_rolled, signs=signs, step=step)),
         )
         for order, step in (("xyzw", 1), ("wxyz", -1))
         for signs in (np.ones(4), np.array([1.0, 1.0, -1.0, -1.0]))

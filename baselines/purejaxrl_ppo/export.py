@@ -29,6 +29,7 @@ from flytrack_env.params import EnvParams
 from flytrack_env.quaternion import Quaternion
 from flytrack_env.state import ACTION_SIZE, STATE_SIZE, unpack
 from flytrack_env.thrust import collective_thrust, hover_action
+from flytrack_env.tracks import GateFrame
 
 FOLDER = Path(__file__).parent  # of the templates
 FLOAT32, FLOAT64 = 1, 11  # ONNX's numbers of types
@@ -132,7 +133,7 @@ def policy_of(checkpoint: Checkpoint, name: str, track: str | None = None) -> Ex
         "empty_v": f"{battery.empty_v:.4g}",
         "full_v": f"{battery.full_v:.4g}",
         "full_weights": f"{collective_thrust(1.0, battery.full_v, coeffs) / weight_n:.3f}",
-        "hover": f"{hover_action(coeffs, weight_n, battery.full_v):.3f}",
+        "hover": f"{hover_action(coeffs, weight_n, float(battery.full_v)):.3f}",
     }
     middle_v, half_v = battery.voltage(0.5), 0.5 * (battery.full_v - battery.empty_v)
     return ExportedPolicy(
@@ -157,7 +158,11 @@ def _gates(params: EnvParams) -> dict[str, np.ndarray]:
     battery = params.model.battery
     with jax.enable_x64(True):
         anywhere = unpack(jnp.zeros(STATE_SIZE))
-        rows = jax.vmap(lambda *pair: jnp.stack(observe_race(anywhere, *pair, battery)))(gates, following)
+
+        def observed(gate: GateFrame, next_gate: GateFrame) -> jax.Array:
+            return jnp.stack(observe_race(anywhere, gate, next_gate, battery))
+
+        rows = jax.vmap(observed)(gates, following)
     axes = [np.stack(axis, axis=-1) for axis in (gates.forward, gates.left(), gates.up)]
     return {
         "centres": np.stack(gates.centre, axis=-1),

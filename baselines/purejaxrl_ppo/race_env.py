@@ -51,7 +51,8 @@ def plant_env(
     if "model" in checkpoint.meta:
         trained = model_from_json(checkpoint.meta["model"], "checkpoint: model").battery
         flown = env.default_params.model.battery
-        if not np.allclose([trained.full_v, trained.empty_v], [flown.full_v, flown.empty_v]):
+        ends = np.array([[float(one.empty_v), float(one.full_v)] for one in (trained, flown)])
+        if not np.allclose(ends[0], ends[1]):
             text = (
                 f"checkpoint: trained with a battery of {trained.describe()}, and the plant's has "
                 f"{flown.describe()}: the policy meets another thrust"

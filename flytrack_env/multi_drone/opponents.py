@@ -112,5 +112,5 @@ def progress_of(gates_passed: Scalar, pos_w: Vec3, centre_w: Vec3, leg_m: Scalar
 
     leg_m: distance of that gate from the one before.
     """
-    distance_m = compute_once((centre_w - pos_w).norm())
-    return jnp.asarray(jnp.asarray(gates_passed, distance_m.dtype) + 1.0 - distance_m / leg_m)
+    distance_m = jnp.asarray(compute_once((centre_w - pos_w).norm()))
+    return jnp.asarray(gates_passed, distance_m.dtype) + 1.0 - distance_m / leg_m

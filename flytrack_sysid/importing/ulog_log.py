@@ -84,9 +84,9 @@ def read_ulog(path: Path, mapping: Mapping) -> ImportedFlight:
     craft = mapping.craft
     if craft.max_rate_deg_s is None:
         craft = craft._replace(max_rate_deg_s=_full_stick_deg_s(path, parameters))
-    base = samples["w"].times
-    commands = _commands(samples["u"].values, np.array(craft.max_rate_deg_s) * PER_DEGREE)
-    _check_full_stick(path, commands, craft.max_rate_deg_s)
+    base, full_stick = samples["w"].times, np.array(craft.max_rate_deg_s)
+    commands = _commands(samples["u"].values, full_stick * PER_DEGREE)
+    _check_full_stick(path, commands, full_stick)
     ours = {"u": Samples(samples["u"].times, commands), "q": _attitude(path, samples["q"])}
     for name in ("w", "f", "p", "v"):
         if name in samples:
@@ -210,7 +210,7 @@ def _commands(setpoints: np.ndarray, full_stick: np.ndarray) -> np.ndarray:
     return np.column_stack([rates, 2.0 * np.abs(setpoints[:, 3]) - 1.0])
 
 
-def _check_full_stick(path: Path, commands: np.ndarray, full_stick: tuple[float, ...]) -> None:
+def _check_full_stick(path: Path, commands: np.ndarray, full_stick: np.ndarray) -> None:
     """Raise LogError for setpoints past full stick; the message says how to raise it."""
     largest = np.abs(commands[:, :3]).max(axis=0)
     if largest.max() > 1.0 + COMMAND_MARGIN:
