@@ -84,6 +84,8 @@ def read_dataflash(path: Path, mapping: Mapping) -> ImportedFlight:
         messages.setdefault(found["name"], []).append(message)
     parameters: dict[str, float] = notes["parameters"]
     said = _airframe(parameters)
+    if notes["is_cut_off"]:
+        said.append("cut off: used up to the last whole message")
     chosen = {name: _choose(name, instances, said) for name, instances in messages.items()}
     for name in ("RATE",):
         if name not in chosen or any(field not in chosen[name] for field in (TIME, *FIELDS[name])):

@@ -17,6 +17,8 @@ from typing import Any
 
 import numpy as np
 
+ULOG_HEADER_BYTES = 3  # before every message: its size and type
+DATAFLASH_MESSAGE = b"\xa3\x95"  # before every message
 INSTANCES = ("I", "C", "Instance", "Inst")  # of ArduPilot: fields that number sensors, estimators, batteries
 MAX_TEXTS = 1000  # messages of text, whose first ones name the firmware
 WHOLE_FILE_COMPRESSION = re.compile(r"^\s*compression_mode:\s*[\"']?FILE\b", re.IGNORECASE | re.MULTILINE)
@@ -33,13 +35,15 @@ def decode_ulog(arguments: Any, _: bytes) -> bytes:
     """Return fields of a PX4 log's topics, of all their instances.
 
     arguments: path, and the wanted fields by topic. The arrays are float64, (num_rows,). The notes have their
-    topics, instances and fields (``fields``), ``parameters`` (finite numbers) and ``is_damaged``.
+    topics, instances and fields (``fields``), ``parameters`` (finite numbers), ``is_damaged`` and
+    ``is_cut_off``.
     """
     import pyulog
 
     path, wanted = arguments
     with open(path, "rb") as file:
-        ulog = pyulog.ULog(file, list(wanted))
+        counted = _CountedReads(file)
+        ulog = pyulog.ULog(counted, list(wanted))
     found = {
         (data.name, int(data.multi_id), field): data.data[field].astype(float)
         for data in sorted(ulog.data_list, key=lambda data: data.multi_id)
@@ -51,8 +55,30 @@ def decode_ulog(arguments: Any, _: bytes) -> bytes:
         for name, value in ulog.initial_parameters.items()
         if isinstance(value, (int, float)) and math.isfinite(value)
     }
-    notes = {"fields": list(found), "parameters": parameters, "is_damaged": bool(ulog.file_corruption)}
+    notes = {
+        "fields": list(found),
+        "parameters": parameters,
+        "is_damaged": bool(ulog.file_corruption),
+        "is_cut_off": counted.is_cut_off,
+    }
     return _pack(notes, list(found.values()))
+
+
+class _CountedReads:
+    """A binary file that knows whether it ended within something that was read, as pyulog does not tell."""
+
+    def __init__(self, file: Any):
+        self.file, self.is_cut_off = file, False
+
+    def read(self, size: int) -> bytes:
+        """Return the next bytes; fewer at the end of the file."""
+        data: bytes = self.file.read(size)
+        is_header = size == ULOG_HEADER_BYTES  # a whole log ends where the next one would begin
+        self.is_cut_off |= len(data) < size and not (is_header and not data)
+        return data
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.file, name)
 
 
 def decode_betaflight(arguments: Any, _: bytes) -> bytes:
@@ -93,7 +119,8 @@ def decode_dataflash(arguments: Any, _: bytes) -> bytes:
 
     arguments: path, and the wanted fields by message. The arrays are those of each instance of each message
     found, (num_messages, num_fields) float64. The notes have of those ``found`` the ``name`` of the message,
-    its ``instance`` (0 without one) and its ``fields``; ``parameters``, as they are at first; and ``texts``.
+    its ``instance`` (0 without one) and its ``fields``; ``parameters``, as they are at first; ``texts``; and
+    ``is_cut_off``: the last message is not whole.
     """
     from pymavlink.DFReader import DFReader_binary
 
@@ -120,7 +147,14 @@ def decode_dataflash(arguments: Any, _: bytes) -> bytes:
         )
     found = [{"name": name, "instance": instance, "fields": fields[name]} for name, instance in values]
     arrays = [np.array(rows, float).reshape(-1, len(fields[name])) for (name, _), rows in values.items()]
-    return _pack({"found": found, "parameters": parameters, "texts": texts}, arrays)
+    ends = [
+        offsets[-1] + reader.formats[kind].len for kind, offsets in enumerate(reader.offsets) if len(offsets)
+    ]
+    end = max(ends, default=0)
+    # Flash memory is padded behind the last message, but not with the beginning of another.
+    is_cut_off = end > reader.data_len or reader.data_map[end : end + 2] == DATAFLASH_MESSAGE
+    notes = {"found": found, "parameters": parameters, "texts": texts, "is_cut_off": is_cut_off}
+    return _pack(notes, arrays)
 
 
 def _whole_frames(parser: Any, is_cut_off: bool) -> Iterator[Any]:

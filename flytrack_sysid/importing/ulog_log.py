@@ -140,6 +140,8 @@ def _decode(path: Path) -> tuple[dict[str, Samples], dict[str, Clock], dict[str,
         topics.setdefault(topic, {}).setdefault(instance, {})[field] = values
     samples, clocks = {}, {}
     said = ["damaged in places; what could be read is used"] if notes["is_damaged"] else []
+    if notes["is_cut_off"] and not said:  # damage, too, may end within a message
+        said.append("cut off: used up to the last whole message")
     for channel, sources in SOURCES.items():
         for topic, names in sources:
             found = _best_instance(path, topic, topics.get(topic, {}), names)
