@@ -256,8 +256,10 @@ def _divided(kernel: ClosedJaxpr, used: Sequence[int], element: _Element) -> Clo
         for i, (aval, dim) in enumerate(zip(kernel.in_avals, dims, strict=True))
     ]
     results = [mapping(f"r{i}", aval.ndim, aval.ndim - 1) for i, aval in enumerate(kernel.out_avals)]
-    whole = {axis for array in (*arguments, *results) for axis in array} - {"batch"}
-    rule = SdyShardingRule(tuple(arguments), tuple(results), need_replication_factors=tuple(sorted(whole)))
+    # In the order in which they occur, as Shardy asks.
+    axes = (axis for array in (*arguments, *results) for axis in array)
+    whole = tuple(dict.fromkeys(axis for axis in axes if axis != "batch"))
+    rule = SdyShardingRule(tuple(arguments), tuple(results), need_replication_factors=whole)
 
     def operation(*leaves: jax.Array) -> list[jax.Array]:
         return custom_partitioning_p.bind(
