@@ -91,13 +91,15 @@ def verify(flags: Flags) -> bool:
 
 def text_of(found: dict[str, Any]) -> str:
     """Return a result as a table, the means over policies, and its summary."""
-    lines = [f"{'task':12} {'success':>8} {'lap':>8} {'over optimal':>13}"]
+    lines = [f"{'task':12} {'success':>8} {'lap':>8} {'over optimal':>13} {'gates':>6}  mostly ended by"]
     for task, ones in found["tasks"].items():
         laps = [one["flying_lap_s"] for one in ones if one["flying_lap_s"] is not None]
         ratios = [one["over_optimal"] for one in ones if one["over_optimal"] is not None]
         lap = f"{np.mean(laps):.3f} s" if laps else "-"
         ratio = f"{np.mean(ratios):.3f}" if ratios else "-"
-        lines.append(f"{task:12} {np.mean([one['success'] for one in ones]):8.1%} {lap:>8} {ratio:>13}")
+        success, gates = (np.mean([one[name] for one in ones]) for name in ("success", "gates"))
+        ends = ", ".join(dict.fromkeys(cause for one in ones for cause in list(one["ended"])[:1]))
+        lines.append(f"{task:12} {success:8.1%} {lap:>8} {ratio:>13} {gates:6.1f}  {ends.replace('_', ' ')}")
     for name, one in found["summary"].items():
         interval = "" if one["ci95"] is None else " ({:.3f} to {:.3f})".format(*one["ci95"])
         lines.append(f"{name}: interquartile mean {one['interquartile_mean']:.3f}{interval}")

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from scipy import stats
 
-from baselines.purejaxrl_ppo.flights import fly_many, race_many, score, start_keys
+from baselines.purejaxrl_ppo.flights import Outcomes, fly_many, race_many, score, start_keys
 from baselines.purejaxrl_ppo.networks import Policy as NetworkPolicy
 from baselines.purejaxrl_ppo.race_env import with_model_as_given
 from flytrack_bench.policies import Policy
@@ -61,17 +61,18 @@ class Data:
 Adapt = Callable[[Data, Policy], Policy]
 
 
-def fly_task(task: Task, suite: Suite, policy: Policy) -> dict[str, float | None]:
-    """Return how a policy does on a task: success, mean lap times, s, and its score.
+def fly_task(task: Task, suite: Suite, policy: Policy) -> dict[str, Any]:
+    """Return how a policy does on a task: success, mean lap times, s, its score, and why flights ended.
 
-    The score is the share of starts that finish times the time-optimal lap over the mean flying lap.
+    The score is the share of starts that finish times the time-optimal lap over the mean flying lap. gates:
+    passed, mean. ended: share of all flights by what ended them, but for those that finished.
     """
     env = policy.env(task.plant, task.track)
     params = with_model_as_given(env.default_params)
     keys = start_keys(suite.seed, suite.starts)
-    found = score(
-        race_many(env, NetworkPolicy(policy.network, policy.params), keys, suite.steps, suite.laps, params)
-    )
+    network = NetworkPolicy(policy.network, policy.params)
+    outcomes = race_many(env, network, keys, suite.steps, suite.laps, params)
+    found = score(outcomes)
     ratio = found.flying_lap_s / task.optimal_lap_s
     return {
         "success": round(found.success, 6),
@@ -79,7 +80,17 @@ def fly_task(task: Task, suite: Suite, policy: Policy) -> dict[str, float | None
         "flying_lap_s": rounded(found.flying_lap_s),
         "over_optimal": rounded(ratio),
         "score": rounded(found.success / ratio if found.success else 0.0),
+        "gates": rounded(found.gates),
+        "ended": ends_of(outcomes),
     }
+
+
+def ends_of(outcomes: Outcomes) -> dict[str, float]:
+    """Return the share of flights that each cause ended before they finished, the largest first."""
+    causes: dict[str, Any] = dict(outcomes.causes._asdict())
+    causes["time_limit"] = ~np.any(list(causes.values()), axis=0)
+    shares = {name: float(np.mean(happened & ~outcomes.is_complete())) for name, happened in causes.items()}
+    return {name: round(share, 6) for name, share in sorted(shares.items(), key=lambda one: -one[1]) if share}
 
 
 def run(

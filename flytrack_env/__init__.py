@@ -23,6 +23,7 @@ from flytrack_env.tracks import (
     random_track,
     save_track,
 )
+from flytrack_env.wrappers import DroneRaceEnv
 
 keep_compiled_programs()
 register_all()
@@ -33,6 +34,7 @@ __version__ = "0.1.0"
 __all__ = [
     "Battery",
     "BatteryWarning",
+    "DroneRaceEnv",
     "EnvParams",
     "EnvState",
     "FlyTrack",

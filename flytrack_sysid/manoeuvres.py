@@ -5,12 +5,13 @@ eight flights of 2.5 s. ``MANOEUVRES`` says how to fly each on a real drone.
 """
 
 from collections.abc import Callable, Iterable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from flytrack_env.dynamics import ModelParameters, collective_thrust
+from flytrack_env import thrust
+from flytrack_env.dynamics import ModelParameters
 from flytrack_env.state import BATTERY, BATTERY_EMPTY_V, BATTERY_FULL_V
 from flytrack_sysid import excitation
 
@@ -35,7 +36,6 @@ SPIN_STICKS = (
     (1.0, 0.0, 1.0),
     (0.0, 1.0, -1.0),
 )
-ACTIONS = np.linspace(-1.0, 1.0, 41)  # at which a model's thrust is looked up
 
 
 Flight = Callable[[int, float, np.random.Generator], tuple[np.ndarray, np.ndarray]]
@@ -155,15 +155,8 @@ def hover_action(model: ModelParameters, voltages: tuple[float, float] = excitat
     The nearest end of the stick if none does. Effects are ignored: they matter little to where a flight
     starts.
     """
-    middle_v = 0.5 * sum(voltages)
-    coeffs: Any = np.asarray(model.thrust_coeffs, float)
-    thrust_n = np.asarray(collective_thrust(ACTIONS, middle_v, coeffs))
-    above = thrust_n > float(model.m) * float(model.g)
-    if not above.any() or above.all():
-        return float(ACTIONS[-1] if not above.any() else ACTIONS[0])
-    first = int(np.argmax(above))
-    pair = slice(max(first - 1, 0), first + 1)
-    return float(np.interp(float(model.m) * float(model.g), thrust_n[pair], ACTIONS[pair]))
+    weight_n = float(model.m) * float(model.g)
+    return thrust.hover_action(model.thrust_coeffs, weight_n, 0.5 * sum(voltages))
 
 
 def flights_of(

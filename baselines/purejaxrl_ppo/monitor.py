@@ -13,6 +13,7 @@ from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 
 from baselines.purejaxrl_ppo.flights import (
+    CANNOT_RECORD,
     Outcomes,
     can_record,
     fly_many,
@@ -89,7 +90,9 @@ def evaluate_policy(
         rollout: lambda: save_flight(rollout, first),
         chart: lambda: draw_position_density(*density),
     }
-    if is_recorded and can_record():
+    if is_recorded and not can_record():
+        logger.warning("evaluation after %d steps: no recording (.rrd): %s", steps, CANNOT_RECORD)
+    elif is_recorded:
         writers[recording] = lambda: record_flights(recording, {"policy": first}, env.track, NUM_LAPS)
     files = []
     for path, write in writers.items():

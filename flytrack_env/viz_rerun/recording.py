@@ -16,7 +16,7 @@ from flytrack_env.tracks import Track
 from flytrack_env.viz_rerun.entities import Writer, centres_of, log_course, plots_of
 from flytrack_env.viz_rerun.trajectory import Trajectory, checked, track_of_gates
 
-APP_ID = "flytrack"
+APP_ID = "flytrack_viz"
 
 # How the viewer opens.
 BEHIND_M = (-2.5, 0.0, 1.2)  # of the drone, in its level frame
@@ -41,7 +41,7 @@ PLOTS = {
 def visualize_state_action_sequence(
     sequence: Sequence[tuple[np.ndarray, np.ndarray]],
     gates: np.ndarray,
-    recording_path: str,
+    recording_path: str = "rollout.rrd",
     app_id: str = APP_ID,
 ) -> None:
     """Write a flight as a Rerun recording, on the timelines ``step`` and ``sim_time`` (100 Hz).

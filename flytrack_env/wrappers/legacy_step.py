@@ -1,10 +1,11 @@
-"""A 5-value step for clients written before gymnax 1.0 (PureJaxRL, rejax, JaxMARL's adapter)."""
+"""A 5-value step for clients written before gymnax 1.0 (PureJaxRL, rejax, the handout)."""
 
 from functools import partial
 from typing import Any
 
 import jax
 
+from flytrack_env.env import FlyTrack
 from flytrack_env.wrappers.base import WrapperError
 
 
@@ -45,3 +46,24 @@ class LegacyStep:
         """Return observation, state, reward, done and info."""
         obs, state, reward, terminated, truncated, info = self._env.step(key, state, action, params)
         return obs, state, reward, terminated | truncated, info
+
+
+class DroneRaceEnv(LegacyStep):
+    """The handout's environment, by its name: ``FlyTrack`` with a step of five values.
+
+    Args:
+        arguments: of ``FlyTrack``.
+    """
+
+    def __init__(self, **arguments: Any):
+        super().__init__(FlyTrack(**arguments))
+
+    def reset(self, rng: jax.Array, params: Any = None) -> tuple[Any, Any]:
+        """Return observation and state."""
+        return super().reset(rng, params)
+
+    def step(
+        self, rng: jax.Array, state: Any, action: Any, params: Any = None
+    ) -> tuple[Any, Any, jax.Array, jax.Array, dict[str, Any]]:
+        """Return observation, state, reward, done and info."""
+        return super().step(rng, state, action, params)

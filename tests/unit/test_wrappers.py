@@ -17,6 +17,7 @@ from flytrack_env.wrappers import (
     ActionDelay,
     ActionHistory,
     DomainRandomization,
+    DroneRaceEnv,
     NoiseParams,
     ObservationNoise,
     RandomizationParams,
@@ -299,3 +300,16 @@ def test_what_begins_depends_on_nothing_of_what_ended(flight: Flight, poison: st
         for clean, after in zip(*found, strict=True):
             np.testing.assert_array_equal(np.asarray(clean), np.asarray(after))
             assert np.isfinite(np.asarray(after)).all()
+
+
+def test_the_handouts_environment_steps_as_flytrack_does() -> None:
+    env, same = DroneRaceEnv(track="split_s"), FlyTrack(track="split_s")
+    params, rng = env.default_params, jax.random.key(3)
+    obs, state = env.reset(rng=rng, params=params)
+    expected, same_state = same.reset(rng, params)
+    np.testing.assert_array_equal(obs, expected)
+    action = jnp.array([0.1, -0.2, 0.3, 0.4])
+    obs, state, reward, done, info = env.step(rng=rng, state=state, action=action, params=params)
+    found = same.step(rng, same_state, action, params)
+    chex.assert_trees_all_equal((obs, state, reward, info), (*found[:3], found[5]))
+    assert bool(done) == bool(found[3] | found[4])
