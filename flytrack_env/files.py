@@ -91,10 +91,14 @@ def locked_folder(folder: Path) -> Iterator[None]:
     already goes on: a command holds what its training writes into.
 
     Raises:
-        OSError: another process holds the folder; it names the folder, the process and its command.
+        OSError: another process holds the folder; it names the folder, the process and its command. Or the
+            folder would lie in a file.
     """
     folder = Path(os.path.realpath(folder))
-    folder.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        folder.parent.mkdir(parents=True, exist_ok=True)
+    except (FileExistsError, NotADirectoryError) as error:
+        raise OSError(f"{folder}: found a file at {folder.parent}, expected a folder") from error
     path = folder.with_name(f".{folder.name}.lock")
     if path in _held:
         yield
