@@ -58,11 +58,12 @@ class DroneRaceEnv(LegacyStep):
     def __init__(self, **arguments: Any):
         super().__init__(FlyTrack(**arguments))
 
-    def reset(self, rng: jax.Array, params: Any = None) -> tuple[Any, Any]:
+    # The handout calls the key rng, by which it may be passed.
+    def reset(self, rng: jax.Array, params: Any = None) -> tuple[Any, Any]:  # type: ignore[override]
         """Return observation and state."""
         return super().reset(rng, params)
 
-    def step(
+    def step(  # type: ignore[override]
         self, rng: jax.Array, state: Any, action: Any, params: Any = None
     ) -> tuple[Any, Any, jax.Array, jax.Array, dict[str, Any]]:
         """Return observation, state, reward, done and info."""
