@@ -81,11 +81,11 @@ def fly_task(task: Task, suite: Suite, policy: Policy) -> dict[str, Any]:
         "over_optimal": rounded(ratio),
         "score": rounded(found.success / ratio if found.success else 0.0),
         "gates": rounded(found.gates),
-        "ended": ends_of(outcomes),
+        "ended": end_shares(outcomes),
     }
 
 
-def ends_of(outcomes: Outcomes) -> dict[str, float]:
+def end_shares(outcomes: Outcomes) -> dict[str, float]:
     """Return the share of flights that each cause ended before they finished, the largest first."""
     causes: dict[str, Any] = dict(outcomes.causes._asdict())
     causes["time_limit"] = ~np.any(list(causes.values()), axis=0)
