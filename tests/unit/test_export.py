@@ -10,17 +10,23 @@ import pytest
 
 from baselines.purejaxrl_ppo import export, load_checkpoint
 from baselines.purejaxrl_ppo.export import policy_of
-from benchmarks.export import CompiledPolicy, states_in_box
+from baselines.purejaxrl_ppo.flights import start_pose_params
+from baselines.purejaxrl_ppo.race_env import plant_env
 from flytrack.cli import main
-from flytrack_env import make
+from flytrack_env import blackbox, make
 from flytrack_env.dynamics import lag
-from flytrack_env.state import Action, unpack, unpack_action
+from flytrack_env.observations import observe_race
+from flytrack_env.state import Action, pack, unpack, unpack_action
 from flytrack_env.wrappers import NoiseParams, ObservationNoise
+from tests.support.compiled_policy import CompiledPolicy, states_in_box
 from tests.support.evaluated import write_checkpoint
+from tests.support.pages import ROOT
 from tests.support.refusals import refused
 
 SEED, COUNT = 5, 200
-LARGEST, LARGEST_LAG = 1e-5, 1e-6
+LARGEST, LARGEST_LAG, LARGEST_FLOAT64 = 1e-5, 1e-6, 1e-7
+CHAMPIONS = ROOT / "baselines" / "purejaxrl_ppo" / "champion"
+needs_gcc = pytest.mark.skipif(shutil.which("gcc") is None, reason="gcc is not installed")
 # Environment id, track, hidden layers, and whether the ONNX file is float64 inside.
 CASES = {
     "perfect sensors": ("FlyTrack-v0", "flytrack", (8, 5), False),
@@ -45,7 +51,7 @@ def acted(env, checkpoint):
         observation = env.observe(None, begun, None, params)
         return jnp.clip(checkpoint.network.apply(checkpoint.params, observation)[0].mode(), -1.0, 1.0)
 
-    states, gates = states_in_box(policy, COUNT)
+    states, gates = states_in_box(policy, COUNT, SEED)
     return states, gates, past.reshape(COUNT, -1), np.asarray(jax.jit(jax.vmap(act))(states, gates, past))
 
 
@@ -65,17 +71,68 @@ def test_exported_policies_act_as_the_python_one(case, tmp_path, capsys):
         np.testing.assert_allclose(compiled.act(states, gates, past), actions, rtol=0.0, atol=LARGEST)
         assert np.isnan(compiled.act(states * np.nan, gates, past)).all()
 
-    pytest.importorskip("onnx", reason="onnx is not installed (extra flytrack[export])")
-    onnxruntime = pytest.importorskip("onnxruntime", reason="onnxruntime is not installed (flytrack[dev])")
-    path = str(tmp_path / "policy.onnx")
-    main(["export", str(tmp_path / "a.safetensors"), "--onnx", path, *["--float64"] * is_float64])
-    session = onnxruntime.InferenceSession(path)
-    inputs = {"state": states, "gate": gates, "past": past}
-    found = session.run(None, {one.name: inputs[one.name] for one in session.get_inputs()})[0]
+    flags = ["--float64"] * is_float64
+    found = act_by_onnx(tmp_path / "a.safetensors", flags, {"state": states, "gate": gates, "past": past})
     np.testing.assert_allclose(found, actions, rtol=0.0, atol=LARGEST)
 
 
-@pytest.mark.skipif(shutil.which("gcc") is None, reason="gcc is not installed")
+def act_by_onnx(checkpoint, flags, inputs):
+    """Export a checkpoint as ONNX, and return the actions that ONNX Runtime computes."""
+    pytest.importorskip("onnx", reason="onnx is not installed (extra flytrack[export])")
+    onnxruntime = pytest.importorskip("onnxruntime", reason="onnxruntime is not installed (flytrack[dev])")
+    path = str(checkpoint.with_name("policy.onnx"))
+    main(["export", str(checkpoint), "--onnx", path, *flags])
+    session = onnxruntime.InferenceSession(path)
+    return session.run(None, {given.name: inputs[given.name] for given in session.get_inputs()})[0]
+
+
+def test_a_float64_file_acts_as_the_policy_in_float64(tmp_path):
+    path = write_checkpoint(tmp_path / "a.safetensors", "FlyTrack-v0", "flytrack", (8, 5))
+    checkpoint = load_checkpoint(path)
+    params = make("FlyTrack-v0").default_params
+    states, gates = states_in_box(policy_of(checkpoint, path.name), COUNT, SEED)
+    with jax.enable_x64(True):
+        trees = checkpoint.params, params.course
+        weights, course = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float64), trees)
+
+        @jax.jit
+        @jax.vmap
+        def act(state, gate):
+            frames = course.gate(gate), course.gate(course.next_index(gate))
+            observation = jnp.stack(observe_race(unpack(state), *frames, params.model.battery))
+            return jnp.clip(checkpoint.network.apply(weights, observation)[0].mode(), -1.0, 1.0)
+
+        actions = np.asarray(act(states.astype(np.float64), gates))
+    found = act_by_onnx(path, ["--float64"], {"state": states, "gate": gates})
+    np.testing.assert_allclose(found, actions, rtol=0.0, atol=LARGEST_FLOAT64)
+
+
+@needs_gcc
+def test_the_compiled_champion_races_on_the_black_box_and_counts_its_gates(tmp_path):
+    checkpoint, header = CHAMPIONS / "flytrack.safetensors", tmp_path / "policy.h"
+    main(["export", str(checkpoint), "--c", str(header)])
+    compiled = CompiledPolicy(header)
+    env = plant_env(load_checkpoint(checkpoint), blackbox.load(blackbox.SHIPPED))
+    params = start_pose_params(env.default_params, 1000)
+
+    @jax.jit
+    def step(state, action):
+        state, _, terminated, info = env.step_env(None, state, action, params)[1:]
+        return state, pack(env.drone(state)), env.race(state).gate_index, terminated, info["laps"]
+
+    state = env.reset(jax.random.key(SEED), params)[1]
+    drone, gate = np.asarray(pack(env.drone(state))), np.int32(0)
+    for _ in range(1000):
+        state, moved, index, terminated, laps = step(state, compiled.act([drone], [gate])[0])
+        before, drone = drone, np.asarray(moved)
+        gate = compiled.next_gates([before], [drone], [gate])[0]
+        assert gate == index and not terminated
+        if laps == 1:
+            return
+    pytest.fail("no lap in 10 s")
+
+
+@needs_gcc
 def test_a_header_counts_gates_and_lags_as_the_environment_does(tmp_path):
     write_checkpoint(tmp_path / "a.safetensors", "FlyTrack-v0", "split_s", (4,))
     main(["export", str(tmp_path / "a.safetensors"), "--c", str(tmp_path / "policy.h")])
