@@ -45,8 +45,8 @@ class Recipe(NamedTuple):
     """How a champion is made and judged.
 
     env_id: that PPO trains on; changes: of its configuration. settings: of polishing. is_robust: for drawn
-    plants, in polishing and in judging. success: share of flights that has to finish. aim: times the
-    time-optimal flying lap.
+    plants, in polishing and in judging. success: share of flights that has to finish. times_optimal: at
+    most, of the flying lap, the time-optimal one being 1.
     """
 
     env_id: str
@@ -54,7 +54,7 @@ class Recipe(NamedTuple):
     settings: Settings
     is_robust: bool
     success: float
-    aim: float
+    times_optimal: float
 
     @property
     def config(self) -> Config:
@@ -136,36 +136,50 @@ def row_of(seed: int, before: Flown, after: Flown) -> list[str]:
 
 
 def section_of(name: str, seeds: list[int]) -> tuple[str, bool]:
-    """Train, fly and ship a champion; return its part of the page and whether the aim is met."""
+    """Train, fly and ship a champion; return its part of the page and whether the targets are met."""
     recipe = RECIPES[name]
     flown = [[fly(policy, recipe) for policy in train(name, seed)] for seed in seeds]
     after = [pair[1] for pair in flown]
     best = min((one for one in after if one.success >= recipe.success), key=lambda one: one.times_optimal)
     shipped = FOLDER / best.policy.name
     write_atomically(shipped, best.policy.read_bytes())
-    asked = f"--plants {FLIGHTS} --episodes 1" if recipe.is_robust else f"--episodes {FLIGHTS}"
+    flights = f"--plants {FLIGHTS} --episodes 1" if recipe.is_robust else f"--episodes {FLIGHTS}"
     changes = ", ".join(f"{key} {value:g}" for key, value in (CHANGES | recipe.changes).items())
     polished = ", ".join(f"{key} {value:g}" for key, value in recipe.settings._asdict().items())
     path = shipped.relative_to(report.ROOT)
+    slowest, least = max(one.times_optimal for one in after), min(one.success for one in after)
+    figures = [
+        report.Figure(
+            "flying lap over the time-optimal one, largest of the seeds",
+            f"at most {recipe.times_optimal:g}",
+            f"{slowest:.3f}",
+            len(after),
+        ),
+        report.Figure(
+            "flights that finish, fewest of any seed",
+            f"at least {recipe.success:.0%}",
+            f"{least:.1%}",
+            FLIGHTS,
+        ),
+    ]
     lines = [
         f"## `{path}`",
         f"PPO on {recipe.env_id}, {recipe.config.total_timesteps / 1e6:.0f} M steps, {changes}; polishing: "
-        f"{polished}. Shipped: seed {best.found.checkpoint.meta['seed']}. Aim: at most {recipe.aim:g} times "
-        f"the time-optimal flying lap, at least {recipe.success:.0%} of {FLIGHTS} flights finish.",
+        f"{polished}. Shipped: seed {best.found.checkpoint.meta['seed']}.",
+        report.figures_table(figures),
         report.table(HEADER, [row_of(seed, *pair) for seed, pair in zip(seeds, flown, strict=True)]),
-        f"`flytrack eval --checkpoint {path} --steps {STEPS} {asked} --laps {LAPS} "
+        f"`flytrack eval --checkpoint {path} --steps {STEPS} {flights} --laps {LAPS} "
         f"--seed {FLIGHT_SEED} --ghost`:",
         "```\n" + best.found.text.replace(f"{report.ROOT}/", "") + "```",
     ]
-    is_met = all(one.success >= recipe.success and one.times_optimal <= recipe.aim for one in after)
-    return "\n\n".join(lines), is_met
+    return "\n\n".join(lines), least >= recipe.success and slowest <= recipe.times_optimal
 
 
 def main(
     names: tuple[Literal["flytrack", "robust"], ...] = ("flytrack", "robust"),
     seeds: tuple[int, ...] = (0, 1, 2, 3, 4),
 ) -> None:
-    """Train, fly, ship the fastest and write the page; exit 1 where an aim is missed."""
+    """Train, fly, ship the fastest and write the page; exit 1 where a target is missed."""
     sections = [section_of(name, list(seeds)) for name in names]
     report.fill_page(
         report.RESULTS / "champion.md",

@@ -1,6 +1,6 @@
 """docs/results/diagnosis.md, from the lines that ``benchmarks.diagnosis`` wrote.
 
-``python -m benchmarks.diagnosis_page``: the last commit's, and below the figures of earlier ones.
+``python -m benchmarks.diagnosis_page`` takes those of the last commit.
 """
 
 from collections import Counter
@@ -11,7 +11,7 @@ import numpy as np
 
 from benchmarks.diagnosis import LINES, ROWS, Trial, read_lines
 from benchmarks.hidden import MOTIONS
-from benchmarks.report import fill_page, lines_in, percent, table
+from benchmarks.report import Figure, figures_table, fill_page, share, table
 
 Line = dict[str, Any]
 Rows = dict[str, list[Line]]
@@ -89,59 +89,85 @@ def is_time_told(line: Line) -> bool:
     return any("onset_s" in cause or "end_s" in cause for cause in (*line["causes"], *line["negligible"]))
 
 
-def figures(by_row: Rows) -> list[tuple[str, str, str]]:
-    """Return the figures: what, the aim, measured."""
+def figures(by_row: Rows) -> list[Figure]:
+    """Return the figures of plants that move in one way."""
     one = [(line, *case) for line in by_row["one"] for case in line.get("known", {}).items()]
     shown = [(line, effect, size) for line, effect, size in one if size[0] > SHOWN]
     hiding = [line for row in ("one", "two", "three") for line in by_row[row]]
     other_law = [line for line in hiding if any(effect in OTHER_LAW for effect in line["effects"])]
     same_law = [line for line in hiding if line not in other_law]
     removed = [100.0 * line["removed"][0] for line in hiding if line["removed"][1] >= NOTABLE]
-    sizes = [len(one) for line in by_row["one"] for one in classes(line)]
+    sizes = [len(names) for line in by_row["one"] for names in classes(line)]
     outside = [line for line in by_row["outside"] if line["visible"] >= VISIBLE]
     every = [line for lines in by_row.values() for line in lines]
     controls = {
         row: [bool(named(line) or line.get("beyond_the_list")) for line in by_row[row]] for row in CONTROLS
     }
     any_name = [flag for flags in controls.values() for flag in flags]
-    small = [bool(line["negligible"]) for row in CONTROLS for line in by_row[row]]
-    in_class = [any(effect in names for names in classes(line)) for line, effect, _ in shown]
-    silent = [not found(line) for line, _, size in one if size[0] < HIDDEN]
-    told = [any(line["depends_on"] in name for name in line["unexplained"]) for line in outside]
-    begun = [is_time_told(line) for row in ROWS if row != "onset" for line in by_row[row]]
-    gone = f"{percentiles(removed, 50, 10, unit=' %')} of {len(removed)}"
-    cpu_s = percentiles([line["cpu_s"] for line in every], 50, 95)
-    late, sudden = map(is_clock_right, by_row["clock"]), map(is_onset_right, by_row["onset"])
+    others = [line for row in ROWS if row != "onset" for line in by_row[row]]
+    shares = [
+        ("any name on plants without an effect", "at most 1 %", any_name),
+        *((f"the same, {row}", "", flags) for row, flags in controls.items()),
+        (
+            "something negligible on them",
+            "",
+            [bool(line["negligible"]) for row in CONTROLS for line in by_row[row]],
+        ),
+        ("detected: any name, lambda > 30", "99 %", [bool(found(line)) for line, *_ in shown]),
+        ("exact name, lambda > 30 and lambda_sep > 20", "98 %", exact_sets(by_row["one"])),
+        (
+            "truth in the reported class, lambda > 30",
+            "98 %",
+            [any(effect in names for names in classes(line)) for line, effect, _ in shown],
+        ),
+        ("silent, lambda < 8", "", [not found(line) for line, _, size in one if size[0] < HIDDEN]),
+        ("exact set of 2, each separable", "95 %", exact_sets(by_row["two"])),
+        ("exact set of 3, each separable", "90 %", exact_sets(by_row["three"])),
+        ("95 % intervals cover the truth", "92 to 98 %", covered(same_law)),
+        ("the same, beside an effect of another law", "", covered(other_law)),
+        ("outside the list: flagged", "95 %", [bool(line["unexplained"]) for line in outside]),
+        (
+            "outside the list: dependence named",
+            "80 %",
+            [any(line["depends_on"] in name for name in line["unexplained"]) for line in outside],
+        ),
+        ("outside the list: false name", "at most 5 %", [bool(named(line)) for line in outside]),
+        (
+            "motion capture 0 to 40 ms late: within 2 ms, no other name",
+            "95 %",
+            [is_clock_right(line) for line in by_row["clock"]],
+        ),
+        (
+            "effect that begins in flight: exact name, onset within 1 s",
+            "90 %",
+            [is_onset_right(line) for line in by_row["onset"]],
+        ),
+        ("others: an onset or end told", "", [is_time_told(line) for line in others]),
+        ("motion recognised", "", [line["is_motion_right"] for line in every]),
+    ]
+    cpu_s = [line["cpu_s"] for line in every]
     return [
-        ("any name on plants without an effect", "at most 1 %", percent(any_name)),
-        *((f"the same, {row}", "", percent(flags)) for row, flags in controls.items()),
-        ("something negligible on them", "", percent(small)),
-        ("detected: any name, lambda > 30", "99 %", percent([bool(found(line)) for line, *_ in shown])),
-        ("exact name, lambda > 30 and lambda_sep > 20", "98 %", percent(exact_sets(by_row["one"]))),
-        ("truth in the reported class, lambda > 30", "98 %", percent(in_class)),
-        ("mean size of a class", "at most 1.5", f"{np.mean(sizes):.2f}" if sizes else "none"),
-        ("silent, lambda < 8", "", percent(silent)),
-        ("exact set of 2, each separable", "95 %", percent(exact_sets(by_row["two"]))),
-        ("exact set of 3, each separable", "90 %", percent(exact_sets(by_row["three"]))),
-        ("explainable error removed on a new flight: median, tenth percentile", "99 %, 95 %", gone),
-        ("95 % intervals cover the truth", "92 to 98 %", percent(covered(same_law))),
-        ("the same, beside an effect of another law", "", percent(covered(other_law))),
-        ("outside the list: flagged", "95 %", percent([bool(line["unexplained"]) for line in outside])),
-        ("outside the list: dependence named", "80 %", percent(told)),
-        ("outside the list: false name", "at most 5 %", percent([bool(named(line)) for line in outside])),
-        ("motion capture 0 to 40 ms late: within 2 ms, no other name", "95 %", percent([*late])),
-        ("effect that begins in flight: exact name, onset within 1 s", "90 %", percent([*sudden])),
-        ("others: an onset or end told", "", percent(begun)),
-        ("motion recognised", "", percent([line["is_motion_right"] for line in every])),
-        ("CPU seconds a log: median, 95th percentile", "8, 15", cpu_s),
+        *(Figure(name, target, *share(flags)) for name, target, flags in shares),
+        Figure(
+            "mean size of a class", "at most 1.5", f"{np.mean(sizes):.2f}" if sizes else "none", len(sizes)
+        ),
+        Figure(
+            "explainable error removed on a new flight: median, tenth percentile",
+            "99 %, 95 %",
+            percentiles(removed, 50, 10, unit=" %"),
+            len(removed),
+        ),
+        Figure("CPU seconds a log: median, 95th percentile", "8, 15", percentiles(cpu_s, 50, 95), len(cpu_s)),
     ]
 
 
 def figures_of_motions(by_trial: dict[Trial, Line]) -> str:
-    """Return the figures of the usual rate, a column a motion."""
+    """Return the figures of the usual rate, two columns a motion."""
     columns = [figures(by_row_of(by_trial, motion, USUAL_RATE)) for motion in MOTIONS]
-    rows = [(name, aim, *(column[n][2] for column in columns)) for n, (name, aim, _) in enumerate(columns[0])]
-    return table(" | ".join(("figure", "aim", *MOTIONS)), rows)
+    rows = []
+    for figure, *others in zip(*columns, strict=True):
+        rows.append([*figure, *(cell for other in others for cell in (other.measured, other.n))])
+    return table(["figure", "target", *(head for motion in MOTIONS for head in (motion, "n"))], rows)
 
 
 def figures_of_rates(by_trial: dict[Trial, Line]) -> str:
@@ -149,10 +175,11 @@ def figures_of_rates(by_trial: dict[Trial, Line]) -> str:
     kinds = sorted({(trial.rate, trial.motion) for trial in by_trial if trial.rate != USUAL_RATE})
     rows = []
     for rate, motion in kinds:
-        own = by_row_of(by_trial, motion, rate)
-        clean = percent([bool(named(line)) for line in own["clean"]])
-        rows.append((f"{rate} Hz", motion, clean, percent(exact_sets(own["one"]))))
-    return table("rows per second | motion | any name on clean (at most 2 %) | exact single (95 %)", rows)
+        by_row, flown = by_row_of(by_trial, motion, rate), f"{rate} Hz, {motion}"
+        is_named = [bool(named(line)) for line in by_row["clean"]]
+        rows.append(Figure(f"{flown}: any name on clean plants", "at most 2 %", *share(is_named)))
+        rows.append(Figure(f"{flown}: exact single", "95 %", *share(exact_sets(by_row["one"]))))
+    return figures_table(rows)
 
 
 def by_row_of(by_trial: dict[Trial, Line], motion: str, rate: int) -> Rows:
@@ -185,25 +212,10 @@ def misses(by_trial: dict[Trial, Line]) -> str:
     return table("row | flown | truth | lambda, lambda_sep | named", rows)
 
 
-def graded(commit: str | None) -> dict[Trial, Line]:
-    """Return the lines of a commit without a crash, by plant; of the last line's if None."""
-    return {trial: line for trial, line in read_lines(commit).items() if "error" not in line}
-
-
-def earlier(last: str) -> list[str]:
-    """Return the figures of earlier commits, each with a heading, the latest first."""
-    commits = dict.fromkeys(line["commit"] for line in lines_in(LINES))
-    parts = []
-    for commit in reversed([one for one in commits if one != last]):
-        by_trial = graded(commit)
-        seeds = sorted({line["seed"] for line in by_trial.values()})
-        parts += [f"## Before, at {commit}: seeds {seeds}", figures_of_motions(by_trial)]
-    return parts
-
-
 def main() -> None:
     """Write the page."""
-    lines, by_trial = list(read_lines(None).values()), graded(None)
+    lines = list(read_lines(None).values())
+    by_trial = {trial: line for trial, line in read_lines(None).items() if "error" not in line}
     by_row = {row: [line for trial, line in by_trial.items() if trial.row == row] for row in ROWS}
     singles = [(line["effects"][0], " + ".join(sorted(named(line))) or "none") for line in by_row["one"]]
     outside = []
@@ -224,7 +236,7 @@ def main() -> None:
         rates=figures_of_rates(by_trial),
         singles=counted("truth | plants | named", singles),
         outside=counted("depends on | plants | found", outside),
-        misses="\n\n".join([misses(by_trial), *earlier(lines[-1]["commit"])]),
+        misses=misses(by_trial),
     )
 
 

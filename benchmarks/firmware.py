@@ -228,30 +228,34 @@ def error_ratios(found: Diagnosis) -> dict[str, float]:
 def tables(lines: list[dict[str, Any]]) -> str:
     """Return the results as tables in Markdown."""
     by_row = {row: [line for line in lines if line["row"] == row] for row in ROWS}
-    rows = [["matched set-up: any name", report.percent([bool(line["found"]) for line in by_row["matched"]])]]
+    is_named = [bool(line["found"]) for line in by_row["matched"]]
+    figures = [report.Figure("matched set-up: any name", "", *report.share(is_named))]
     for row in ROWS[1:]:
         some = [line for line in by_row[row] if line["apart"] >= NOTABLE]
         for figure in ("is_exact", "is_in_class", "is_false"):
-            flags = [line[figure] for line in some]
-            rows.append([f"{row} that matters: {figure[3:].replace('_', ' ')}", report.percent(flags)])
+            name = f"{row} that matters: {figure[3:].replace('_', ' ')}"
+            figures.append(report.Figure(name, "", *report.share([line[figure] for line in some])))
     named = [line["error"] for row in ROWS[1:] for line in by_row[row] if line["found"] and line["error"]]
     if named:
         worst, last = [max(one.values()) for one in named], [one["1"] for one in named if "1" in one]
-        rows.append(["extended over refitted: largest at any horizon", f"{max(worst):.3f}"])
-        rows.append(["extended over refitted after 1 s: median", f"{np.median(last):.3f}"])
+        ratio = "extended over refitted"
+        figures.append(report.Figure(f"{ratio}: largest at any horizon", "", f"{max(worst):.3f}", len(worst)))
+        figures.append(report.Figure(f"{ratio} after 1 s: median", "", f"{np.median(last):.3f}", len(last)))
     seconds = [line["cpu_s"] for some in by_row.values() for line in some]
-    rows.append(["CPU s of a diagnosis: median", f"{np.median(seconds):.0f}"])
-    parts = [report.table("figure | value", rows)]
+    figures.append(
+        report.Figure("CPU s of a diagnosis: median", "", f"{np.median(seconds):.0f}", len(seconds))
+    )
+    parts = [report.figures_table(figures)]
     cells = []
     for kind, own in KINDS.items():
         some = [line for line in by_row["single"] if line["kinds"] == [kind]]
         said = sorted({" + ".join(line["found"]) or "nothing" for line in some})
         flags = [line["is_in_class"] for line in some]
         sizes = report.spread([100.0 * line["apart"] for line in some], ".1f") if some else ""
-        cells.append(
-            [kind, sizes, ", ".join(own.names) or "that motor", report.percent(flags), "; ".join(said)]
-        )
-    parts.append(report.table("changed | flies apart, % | its names | in class | what was named", cells))
+        names = ", ".join(own.names) or "that motor"
+        cells.append([kind, sizes, names, *report.share(flags), "; ".join(said)])
+    header = "changed | flies apart, % | its names | in class | n | what was named"
+    parts.append(report.table(header, cells))
     for line in lines:
         if line["row"] == "champion":
             share = f"{line['success']:.1%} of {line['episodes']} starts finish 3 laps"

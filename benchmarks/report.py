@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterable, Sequence
 from datetime import date
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import tyro
 from tqdm import tqdm
@@ -103,9 +103,23 @@ def table(header: str | Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
     return "\n".join(f"| {' | '.join(map(str, line))} |" for line in lines)
 
 
-def percent(flags: Sequence[bool | int]) -> str:
-    """Return the share of true values with their number, as in "97.5 % of 200"; "none" of no values."""
-    return f"{100.0 * sum(flags) / len(flags):.1f} % of {len(flags)}" if len(flags) else "none"
+class Figure(NamedTuple):
+    """A figure of a page: its name, its target ("" for none), what was measured, and of how many values."""
+
+    name: str
+    target: str
+    measured: str
+    n: int | str = ""
+
+
+def figures_table(figures: Iterable[Figure]) -> str:
+    """Return figures as a table in Markdown."""
+    return table("figure | target | measured | n", figures)
+
+
+def share(flags: Sequence[bool | int]) -> tuple[str, int]:
+    """Return the share of true values as text, "none" of no values, and how many values there are."""
+    return f"{100.0 * sum(flags) / len(flags):.1f} %" if len(flags) else "none", len(flags)
 
 
 def spread(values: Sequence[float], digits: str = ",.0f") -> str:

@@ -19,8 +19,10 @@ from baselines.purejaxrl_ppo.train_ppo import DEFAULTS
 from baselines.purejaxrl_ppo.training import Options, Trainer
 from benchmarks import report
 
-AIM_STEPS_PER_S = 800_000
-AIM_COST = 0.1
+TARGET_STEPS_PER_S, TARGET_COST, LIMIT_REPEATS = 800_000, 0.1, 5
+ALL_ON = "steps per CPU second with everything on"
+COST = "cost of checkpoints, evaluations, charts and MLflow, a new store included"
+BOUND = "steps per CPU second if products of matrices, at the best rate of this core, were all there is"
 
 
 def matrix_limit(trainer: Trainer) -> float:
@@ -60,7 +62,7 @@ def measure(trainer: Trainer, options: Options, is_tracked: bool) -> float:
 
 
 def main(total_timesteps: float = Config.total_timesteps, repeats: int = 1) -> None:
-    """Measure in turns, print and write the table; exit 1 if an aim is missed."""
+    """Measure in turns, print and write the table; exit 1 if a target is missed."""
     pinned = report.pin_to_one_core()
     trainer = Trainer(Config(total_timesteps=int(total_timesteps)))
     modes = {"alone": Options(), "with everything that is on by default": DEFAULTS}
@@ -72,19 +74,23 @@ def main(total_timesteps: float = Config.total_timesteps, repeats: int = 1) -> N
             print(f"{name}: {rates[name][-1]:,.0f} steps per CPU s", flush=True)
     rows = [[name, f"{statistics.median(found):,.0f}", report.spread(found)] for name, found in rates.items()]
     alone, watched = (statistics.median(found) for found in rates.values())
+    cost = 1.0 - watched / alone
+    limit = statistics.median(matrix_limit(trainer) for _ in range(LIMIT_REPEATS))
+    figures = [
+        report.Figure(ALL_ON, f"at least {TARGET_STEPS_PER_S:,}", f"{watched:,.0f}", repeats),
+        report.Figure(COST, f"at most {TARGET_COST:.0%}", f"{cost:.1%}", repeats),
+        report.Figure(BOUND, "", f"{limit:,.0f}", LIMIT_REPEATS),
+    ]
     report.fill_page(
         report.RESULTS / "training_speed.md",
         "training_speed",
         table=report.table("training | median | lowest to highest", rows),
+        figures=report.figures_table(figures),
         steps=total_timesteps,
         repeats=repeats,
-        cost=1.0 - watched / alone,
-        aim_cost=AIM_COST,
-        aim=AIM_STEPS_PER_S,
-        limit=statistics.median(matrix_limit(trainer) for _ in range(5)),
         pinned=pinned.capitalize(),
     )
-    if watched < AIM_STEPS_PER_S or 1.0 - watched / alone > AIM_COST:
+    if watched < TARGET_STEPS_PER_S or cost > TARGET_COST:
         raise SystemExit(1)
 
 

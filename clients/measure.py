@@ -31,13 +31,22 @@ def main(seeds: int = 5) -> None:
             reached[name] += outcome.has_gained(client.RETURN_MARGIN, client.GATE_MARGIN)
             rows.append((name, seed, *(f"{value:.2f}" for value in outcome), f"{seconds:.0f}"))
             print(*rows[-1], sep=", ", flush=True)
-    margins = "\n".join(
-        f"- {name}: margins {client.RETURN_MARGIN:g} in return and {client.GATE_MARGIN:g} in gates, "
-        f"gained by **{reached[name]} of {seeds}** seeds"
+    figures = [
+        report.Figure(
+            f"{name}: seeds that gain {client.RETURN_MARGIN:g} in return and {client.GATE_MARGIN:g} in gates",
+            "100 %",
+            f"{reached[name] / seeds:.0%}",
+            seeds,
+        )
         for name, client in CLIENTS.items()
+    ]
+    report.fill_page(
+        report.RESULTS / "clients.md",
+        "clients",
+        packages=[*CLIENTS, "torch"],
+        figures=report.figures_table(figures),
+        table=report.table(HEADER, rows),
     )
-    table, packages = report.table(HEADER, rows), [*CLIENTS, "torch"]
-    report.fill_page(report.RESULTS / "clients.md", "clients", packages, margins=margins, table=table)
     if min(reached.values()) < seeds:
         raise SystemExit(1)
 

@@ -21,7 +21,7 @@ POLICIES = {
 }
 # The hidden effects matter where the minimal model's policy is worse than this.
 MATTERS_BELOW, MATTERS_ABOVE_PERCENT = 0.80, 3.0
-AIM_SUCCESS, AIM_GAP_PERCENT, AIM_SHARE = 0.95, 1.0, 0.9
+TARGET_SUCCESS, TARGET_GAP_PERCENT, TARGET_SHARE = 0.95, 1.0, 0.9
 LARGEST_GAP_PERCENT = 10.0  # larger gaps, and policies without a lap, are drawn here
 SPREAD = 0.12  # between the marks of a column
 DPI = 130
@@ -45,9 +45,9 @@ def does_matter(result: dict[str, Any]) -> bool:
 
 
 def is_reached(result: dict[str, Any]) -> bool:
-    """Return whether the extended model's policy meets the aim."""
+    """Return whether the extended model's policy races as it should."""
     after = stage(result, "after")
-    return after["plant"]["success"] >= AIM_SUCCESS and gap_percent(after) <= AIM_GAP_PERCENT
+    return after["plant"]["success"] >= TARGET_SUCCESS and gap_percent(after) <= TARGET_GAP_PERCENT
 
 
 def _number(value: float | None, form: str) -> str:
@@ -86,36 +86,27 @@ def model_table(results: list[dict[str, Any]]) -> str:
     return report.table("plant | hidden | named | log | velocity | attitude | free flight of 1 s (m)", rows)
 
 
-def verdict(results: list[dict[str, Any]]) -> tuple[str, bool]:
-    """Return the verdict as text, and whether the aim is met; without a plant that matters it is."""
+def figures(results: list[dict[str, Any]]) -> tuple[list[report.Figure], bool]:
+    """Return the figures of the extended model's policy, and whether the target is met.
+
+    Without a plant that matters it is.
+    """
     matter = [result for result in results if does_matter(result)]
-    reached = [result for result in matter if is_reached(result)]
-    lost = [result["job"] for result in matter if not is_reached(result)]
-    text = (
-        f"The hidden effects matter on {len(matter)} of {len(results)} plants: the minimal model's policy "
-        f"finishes less than {MATTERS_BELOW:.0%}, or its lap differs by more than "
-        f"{MATTERS_ABOVE_PERCENT:g} % from the simulator's. On **{len(reached)} of {len(matter)}** the "
-        f"policy of the extended model reaches at least {AIM_SUCCESS:.0%} with a lap gap of at most "
-        f"{AIM_GAP_PERCENT:g} % (aim: 9 of 10)"
-    )
-    text += f"; not on {', '.join(lost)}." if lost else "."
-    return text + (summary_of_all(results) if results else ""), len(reached) >= AIM_SHARE * len(matter)
-
-
-def summary_of_all(results: list[dict[str, Any]]) -> str:
-    """Return a sentence on all plants, whether the hidden effects matter or not."""
+    reached = [is_reached(result) for result in matter]
     pairs = [(stage(result, "before"), stage(result, "after")) for result in results]
-    lowest = min(after["plant"]["success"] for _, after in pairs)
-    widest = max(gap_percent(after) for _, after in pairs)
     laps = [tuple(one["plant"]["flying_lap_s"] for one in pair) for pair in pairs]
     shorter = [100.0 * (1.0 - after / before) for before, after in laps if before and after]
-    text = f" On all {len(results)}: at least {lowest:.1%} and a lap gap of at most {widest:.2f} %"
-    if shorter:
-        text += (
-            f"; where both fly laps, its flying lap is {median(shorter):.1f} % shorter than that of the "
-            f"minimal model's policy (median; {min(shorter):+.1f} % to {max(shorter):+.1f} %)"
-        )
-    return f"{text}."
+    lowest = min((after["plant"]["success"] for _, after in pairs), default=math.nan)
+    widest = max((gap_percent(after) for _, after in pairs), default=math.nan)
+    middle = f"{median(shorter):.1f} % ({report.spread(shorter, '+.1f')} %)" if shorter else "none"
+    goal = f"at least {TARGET_SUCCESS:.0%} finish, lap gap at most {TARGET_GAP_PERCENT:g} %"
+    found = [
+        report.Figure(f"plants that matter: {goal}", f"{TARGET_SHARE:.0%}", *report.share(reached)),
+        report.Figure("all plants: fewest that finish", "", f"{lowest:.1%}", len(results)),
+        report.Figure("all plants: largest lap gap", "", f"{widest:.2f} %", len(results)),
+        report.Figure("flying lap, shorter than the minimal model's policy's", "", middle, len(shorter)),
+    ]
+    return found, sum(reached) >= TARGET_SHARE * len(matter)
 
 
 def draw_chart(results: list[dict[str, Any]]) -> bytes:
@@ -142,15 +133,17 @@ def draw_chart(results: list[dict[str, Any]]) -> bytes:
 
 
 def write_page(path: Path, results: list[dict[str, Any]], steps: int) -> bool:
-    """Write the page and its chart; return whether the aim is met."""
-    text, is_met = verdict(results)
+    """Write the page and its chart; return whether the target is met."""
+    found, is_met = figures(results)
     chart = path.with_suffix(".png")
     write_atomically(chart, draw_chart(results))
     report.fill_page(
         path,
         "loop",
         millions=steps / 1e6,
-        verdict=text,
+        figures=report.figures_table(found),
+        below=MATTERS_BELOW,
+        above_percent=MATTERS_ABOVE_PERCENT,
         chart=chart.name,
         race=race_table(results),
         models=model_table(results),

@@ -186,15 +186,16 @@ def _median(lines: list[Line], model: str) -> np.ndarray:
 
 
 def figures_table(lines: list[Line]) -> str:
-    """Return the asked figures: medians over policies, and the same over the best black box."""
+    """Return the figures: medians over policies, and the same over the best black box."""
     rows = []
-    for quantity, horizon, asked in FIGURES:
+    for quantity, horizon, target in FIGURES:
         cell = _cell(quantity, horizon)
         own, *boxes = (_median(lines, name)[cell] for name in ("extended", *BLACK_BOXES))
         cells = [f"{value:.2f}" for value in (*boxes, own / min(boxes))]
-        rows.append([f"{quantity} after {horizon:g} s", f"{own:.2f}", f"<= {asked:.2f}", *cells])
-    header = ["rms error over the refitted base's, median", "extended", "asked", *BLACK_BOXES]
-    return table([*header, "extended over the best"], rows)
+        name = f"{quantity} after {horizon:g} s"
+        figure = report.Figure(name, f"at most {target:.2f}", f"{own:.2f}", len(lines))
+        rows.append([*figure, *cells])
+    return table(["figure", "target", "measured", "n", *BLACK_BOXES, "over the best of them"], rows)
 
 
 def horizons_table(lines: list[Line]) -> str:
