@@ -59,12 +59,6 @@ COMMANDS = {
         f"{PPO}.evaluate:run_evaluation",
         f"{PPO}.evaluate:EvaluationSettings",
     ),
-    "race": Command(
-        "Race checkpoints against each other on a black box",
-        "train",
-        f"{PPO}.race_command:run_race",
-        f"{PPO}.race_command:RaceSettings",
-    ),
     "show": _own("show", "viz", "show", "flags", "Write rollouts as a recording and pictures"),
     "fly": _own("fly", "fly", "fly", "fly", "Fly by keyboard or gamepad against a ghost"),
     "collect": _own("collect", *IDENTIFICATION, "Fly an excitation or a script on a plant"),

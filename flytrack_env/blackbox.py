@@ -160,10 +160,6 @@ class BlackBox(Plant):
         """Return the drone."""
         return state
 
-    def with_drone(self, state: Drone, drone: Drone) -> Drone:
-        """Return the other drone: the plant remembers nothing."""
-        return drone
-
 
 def _check(content: bytes, limits: ResourceLimits | None) -> None:
     """Raise ArtifactError or SandboxError unless a file's bytes are a plant."""

@@ -97,10 +97,6 @@ class FlyTrack(EpisodicEnvironment):
         """Return the drone of an environment state."""
         return self.plant.drone(state.plant)
 
-    def with_drone(self, state: EnvState, drone: Drone) -> EnvState:
-        """Return an environment state with another drone in it."""
-        return state._replace(plant=self.plant.with_drone(state.plant, drone))
-
     def race(self, state: EnvState) -> Race:
         """Return where the drone stands in the race."""
         return state.race

@@ -85,10 +85,6 @@ class EpisodicEnvironment(environment.Environment[Any, EnvParams]):  # type: ign
         """Return the drone of a state, as it is."""
         raise NotImplementedError
 
-    def with_drone(self, state: Any, drone: Drone) -> Any:
-        """Return a state with another drone in it, all else as it was."""
-        raise NotImplementedError
-
     def race(self, state: Any) -> Race:
         """Return where the drone stands in the race."""
         raise NotImplementedError

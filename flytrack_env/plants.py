@@ -39,14 +39,6 @@ class Plant(ABC):
     def drone(self, state: Any) -> Drone:
         """Return the drone of a plant's state."""
 
-    def with_drone(self, state: Any, drone: Drone) -> Any:
-        """Return a plant's state with another drone in it, all else as it was; needed for downwash only.
-
-        Raises:
-            NotImplementedError: a plant that does not say how.
-        """
-        raise NotImplementedError(f"plant: found {type(self).__name__}, expected one with with_drone")
-
     def sensed(self, state: Any, drone: Drone, dt: Scalar, model: ModelParameters) -> Drone:
         """Return a drone as gyro and motion capture report it: as it is by default."""
         return drone
@@ -84,10 +76,6 @@ class Simulator(Plant):
     def drone(self, state: SimulatorState) -> Drone:
         """Return the drone."""
         return state.drone
-
-    def with_drone(self, state: SimulatorState, drone: Drone) -> SimulatorState:
-        """Return the state with another drone."""
-        return state._replace(drone=drone)
 
     def sensed(self, state: SimulatorState, drone: Drone, dt: Scalar, model: ModelParameters) -> Drone:
         """Return a drone as gyro and motion capture report it, with the memories of the state."""

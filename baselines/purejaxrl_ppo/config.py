@@ -47,7 +47,6 @@ Count = typing.Annotated[
 # What --help shows of flags that may be left out; tyro's own would be {None}|PATH and (default: None).
 OPTIONAL = "(optional)"
 OptionalPath = typing.Annotated[Path | None, tyro.conf.arg(metavar="PATH", help_behavior_hint=OPTIONAL)]
-OptionalFloat = typing.Annotated[float | None, tyro.conf.arg(metavar="FLOAT", help_behavior_hint=OPTIONAL)]
 OptionalInt = typing.Annotated[int | None, tyro.conf.arg(metavar="INT", help_behavior_hint=OPTIONAL)]
 OptionalName = typing.Annotated[str | None, tyro.conf.arg(metavar="NAME", help_behavior_hint=OPTIONAL)]
 

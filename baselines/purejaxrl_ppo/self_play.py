@@ -1,83 +1,117 @@
-"""PPO by self-play, for duels: against a pool of its own past policies and of some that stay.
+"""PPO by self-play: ``python -m baselines.purejaxrl_ppo.self_play [--out FOLDER]``.
 
-The learner and its opponents are one network. Training is that of ``ppo.py``, loss and all, on a race in
-which every opponent is frozen (``flytrack_env.multi_drone.Versus``): the pool is a part of the environment's
-parameters, and between some updates the learner replaces one of its members. Every member races in its own
-share of the environments.
+One network learns to race a pool of opponents: a trained policy that stays, and its own past policies. The
+training is that of ``ppo.py`` on a race whose opponents are frozen (``flytrack_env.multi_drone.Versus``). The
+pool is a part of the environment's parameters. After every few updates the learner replaces the oldest of its
+past policies. At the end, the result races the policy that stayed, and its wins are printed.
 """
 
-from collections.abc import Iterator, Sequence
+import dataclasses
+import time
+from collections.abc import Iterator
+from functools import partial
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import tyro
 
-from baselines.purejaxrl_ppo.checkpoint import Checkpoint
-from baselines.purejaxrl_ppo.config import Config
-from baselines.purejaxrl_ppo.networks import make_network
+import flytrack_env
+from baselines.purejaxrl_ppo.checkpoint import (
+    Checkpoint,
+    load_checkpoint,
+    observation_layout,
+    rewards_of,
+    save_checkpoint,
+)
+from baselines.purejaxrl_ppo.config import Config, Count
+from baselines.purejaxrl_ppo.networks import ActorCritic
 from baselines.purejaxrl_ppo.ppo import Metrics, Runner, make_ppo
+from flytrack_env.model_file import model_from_json
 from flytrack_env.multi_drone import MultiDroneRace, Opponent, Versus, VersusParams
 
+CHAMPION = Path(__file__).parent / "champion" / "flytrack.safetensors"
 FIRST_LAYER = "layers_0"
+# Small steps, and nearly deterministic actions: the first policy races already, and noise would undo it.
+CONFIG_CHANGES = {"learning_rate": 5e-5, "episode_steps": 400, "gamma": 0.998, "min_std": 0.01}
+NUM_LAPS, NUM_RACE_STEPS = 3, 1500  # 15 s: the champions need 12
 
 
-class Settings(NamedTuple):
-    """What self-play adds to PPO.
+@dataclasses.dataclass(frozen=True)
+class Settings:
+    """Settings of self-play, which are the flags of the command."""
 
-    past: how many of its past policies are in the pool, beside those that stay. every: updates after which
-    the learner replaces one, the oldest first. lead: reward for each gate gained on the opponent. std:
-    standard deviation of the actions at the start, small, so that what the first policy can already is not
-    lost in noise. course_fraction: share of the races that begin somewhere on the course.
-    """
-
-    past: int = 2
-    every: int = 75
+    opponent: Path = CHAMPION
+    """Checkpoint of the policy that stays in the pool; the learner begins as a copy of it."""
+    out: Path = Path("runs/self_play")
+    """Folder of final.safetensors."""
+    total_timesteps: Count = 5_000_000
+    """Environment steps over all races."""
+    seed: int = 0
+    """Seed of the training and of the races that evaluate it."""
+    num_past: int = 3
+    """Past policies in the pool."""
+    updates_per_phase: int = 25
+    """Updates after which the learner replaces its oldest past policy."""
     lead: float = 1.0
-    std: float = 0.03
-    course_fraction: float = 0.3
+    """Reward for each gate gained on the opponent."""
+    std: float = 0.015
+    """Standard deviation of the actions at the start."""
+    course_fraction: float = 0.8
+    """Share of the races that begin somewhere on the course, not at the start."""
+    num_races: int = 256
+    """Races of the evaluation, from each slot of the start grid."""
 
 
-def widened(params: Any, size: int) -> Any:
-    """Return a network's parameters for observations of more rows, of which it takes no notice."""
+class RaceResults(NamedTuple):
+    """Shares of races in which the learner finishes, wins, and in which drones collide before a finish."""
+
+    finishes: float
+    wins: float
+    collisions: float
+
+
+def widen_params(params: Any, observation_size: int) -> Any:
+    """Return a network's parameters for longer observations, whose additional rows have no weight."""
 
     def widen(path: tuple[Any, ...], leaf: jax.Array) -> jax.Array:
         if FIRST_LAYER not in jax.tree_util.keystr(path) or leaf.ndim != 2:
             return leaf
-        return jnp.pad(leaf, ((0, size - leaf.shape[0]), (0, 0)))
+        return jnp.pad(leaf, ((0, observation_size - leaf.shape[0]), (0, 0)))
 
     return jax.tree_util.tree_map_with_path(widen, params)
 
 
-def with_std(params: Any, std: float) -> Any:
+def set_std(params: Any, std: float) -> Any:
     """Return a network's parameters with another standard deviation of the actions."""
     own = params["params"]
     return {"params": {**own, "log_std": jnp.full_like(own["log_std"], jnp.log(std))}}
 
 
-def replaced(pool: Any, member: int, params: Any) -> Any:
-    """Return a pool with other parameters in a member's place."""
-    return jax.tree.map(lambda leaf, new: leaf.at[member].set(new), pool, params)
+def make_pool_opponent(network: ActorCritic, pool: Any) -> Opponent:
+    """Return a pool of policies as one opponent.
 
+    Each member flies an equal share of a batch of races, the first member the first share.
 
-def pool_opponent(config: Config, size: int, pool: Any) -> Opponent:
-    """Return the opponent that is a pool: parameters with its members as first axis of each leaf.
-
-    The first share of a batch of observations (num_envs, size) is the first member's, and so on.
+    Args:
+        network: of all members.
+        pool: parameters, leaves (num_members, ...).
     """
-    network = make_network(config)
     num_members = len(jax.tree.leaves(pool)[0])
+    observation_size = pool["params"]["actor_tower"]["layers_0"]["kernel"].shape[1]
 
     def act(pool: Any, observations: jax.Array) -> jax.Array:
-        shares = observations.reshape(num_members, -1, size)
+        shares = observations.reshape(num_members, -1, observation_size)
         actions = jax.vmap(lambda params, share: network.act(params, (), share)[1])(pool, shares)
         return actions.reshape(*observations.shape[:-1], -1)
 
-    return Opponent(act, size, pool)
+    return Opponent(act, observation_size, pool)
 
 
-def training_params(duel: Versus, config: Config, settings: Settings) -> VersusParams:
-    """Return the parameters to train with: short episodes, thicker drones, and a reward for the lead."""
-    params = duel.default_params
+def make_training_params(env: Versus, config: Config, settings: Settings) -> VersusParams:
+    """Return parameters with short episodes, thicker drones and a reward for the lead."""
+    params = env.default_params
     flight = params.race.flight
     flight = flight.replace(
         max_steps_in_episode=config.episode_steps,
@@ -89,37 +123,150 @@ def training_params(duel: Versus, config: Config, settings: Settings) -> VersusP
 
 
 def train(
-    starts: Sequence[Checkpoint], race: MultiDroneRace, config: Config, settings: Settings, seed: int
+    start: Checkpoint, race: MultiDroneRace, config: Config, settings: Settings
 ) -> Iterator[tuple[int, Any, Metrics]]:
-    """Yield (updates, parameters of the network, metrics) each time when the learner enters the pool.
+    """Train, and yield whenever the learner enters the pool.
 
-    starts: policies of an environment for one drone that stay in the pool; training begins with the first.
-    race: of two drones, over with the first.
+    Args:
+        start: policy that stays in the pool, and that the learner begins as.
+        race: of two drones, which is over when the first one is out.
+        config: of PPO.
+        settings: of self-play.
+
+    Yields:
+        Updates so far, the learner's parameters, and the metrics of the updates since the last time.
 
     Raises:
-        ValueError: settings that cannot be trained with, or a number of environments that the pool does not
-            divide.
+        ValueError: settings that cannot be trained with.
     """
-    size, num_members = race.observation_space().shape[0], len(starts) + settings.past
-    if settings.past < 1 or settings.every < 1 or config.num_envs % num_members:
-        expected = f"at least 1 each, and a pool of {num_members} that divides num_envs, {config.num_envs}"
-        raise ValueError(f"past, every: found {settings.past}, {settings.every}, expected {expected}")
-    members = [widened(start.params, size) for start in starts]
-    pool = jax.tree.map(lambda *leaves: jnp.stack(leaves), *members, *members[:1] * settings.past)
-    duel = Versus(race, [pool_opponent(config, size, pool)])
-    params = training_params(duel, config, settings)
+    num_members = 1 + settings.num_past
+    for name in ("num_past", "updates_per_phase"):
+        if getattr(settings, name) < 1:
+            raise ValueError(f"{name}: found {getattr(settings, name)}, expected at least 1")
+    if config.num_envs % num_members:
+        raise ValueError(
+            f"num_past: found {settings.num_past}, expected a pool, of one more, that divides "
+            f"num_envs, {config.num_envs}"
+        )
+    first = widen_params(start.params, race.observation_space().shape[0])
+    pool = jax.tree.map(lambda leaf: jnp.stack([leaf] * num_members), first)
+    env = Versus(race, [make_pool_opponent(start.network, pool)])
+    params = make_training_params(env, config, settings)
 
     @jax.jit
-    def phase(runner: Runner, params: VersusParams) -> tuple[Runner, Metrics]:
-        ppo = make_ppo(duel, params, config)
-        return jax.lax.scan(lambda runner, _: ppo.update(runner), runner, None, settings.every)
+    def train_phase(runner: Runner, params: VersusParams) -> tuple[Runner, Metrics]:
+        ppo = make_ppo(env, params, config)
+        return jax.lax.scan(lambda runner, _: ppo.update(runner), runner, None, settings.updates_per_phase)
 
-    runner = jax.jit(make_ppo(duel, params, config).start)(jax.random.key(seed))
-    first = with_std(members[0], settings.std)
-    runner = runner._replace(train_state=runner.train_state.replace(params=first))
-    for number in range(config.num_updates // settings.every):
-        runner, metrics = phase(runner, params)
-        learnt = runner.train_state.params
-        oldest = len(starts) + number % settings.past
-        params = params._replace(opponents=(replaced(params.opponents[0], oldest, learnt),))
-        yield (number + 1) * settings.every, learnt, metrics
+    runner = jax.jit(make_ppo(env, params, config).start)(jax.random.key(settings.seed))
+    learner = set_std(first, settings.std)
+    runner = runner._replace(train_state=runner.train_state.replace(params=learner))
+    for phase in range(config.num_updates // settings.updates_per_phase):
+        runner, metrics = train_phase(runner, params)
+        learner = runner.train_state.params
+        oldest = 1 + phase % settings.num_past
+        pool = jax.tree.map(lambda leaf, new: leaf.at[oldest].set(new), params.opponents[0], learner)  # noqa: B023
+        params = params._replace(opponents=(pool,))
+        yield (phase + 1) * settings.updates_per_phase, learner, metrics
+
+
+@partial(jax.jit, static_argnames=("race", "network", "num_laps"))
+def fly_races(
+    race: MultiDroneRace,
+    network: ActorCritic,
+    learner: Any,
+    opponent: Any,
+    slot: int,
+    keys: jax.Array,
+    num_laps: int = NUM_LAPS,
+) -> tuple[jax.Array, jax.Array]:
+    """Race the learner against an opponent from the start grid, both with their mean actions.
+
+    Args:
+        race: of two drones.
+        network: of both.
+        learner: parameters.
+        opponent: parameters.
+        slot: of the learner on the grid, 0 in front.
+        keys: of the races, (num_races,).
+        num_laps: of a race.
+
+    Returns:
+        When each drone finishes (num_races, 2), s, infinity if never; whether drones collide before anyone
+        finishes (num_races,).
+    """
+    flight, rules = race.default_params
+    flight = flight.replace(
+        reset=flight.reset._replace(course_fraction=0.0), max_steps_in_episode=NUM_RACE_STEPS
+    )
+    params = race.default_params._replace(flight=flight, rules=rules._replace(first_slot=slot))
+
+    def act(params: Any, observations: jax.Array) -> jax.Array:
+        return network.act(params, (), observations)[1]
+
+    def step(carry: tuple[Any, ...], _: None) -> tuple[tuple[Any, ...], None]:
+        observations, states, time_s, finish_s, has_collided = carry
+        actions = jnp.stack([act(learner, observations[:, 0]), act(opponent, observations[:, 1])], axis=1)
+        step_env = jax.vmap(race.step_env, (0, 0, None))
+        observations, states, *_, info = step_env(states, actions, params)
+        is_racing = jnp.isinf(finish_s).all(axis=1)
+        has_collided = has_collided | (info["collision"].any(axis=1) & is_racing)
+        time_s = time_s + jnp.where(info["lap_completed"], info["lap_time_s"], 0.0)
+        finish_s = jnp.where(info["lap_completed"] & (info["laps"] == num_laps), time_s, finish_s)
+        return (observations, states, time_s, finish_s, has_collided), None
+
+    nobody = jnp.zeros(len(keys), bool)
+    time_s = jnp.zeros((len(keys), 2))
+    start = (*jax.vmap(race.reset, (0, None))(keys, params), time_s, time_s + jnp.inf, nobody)
+    *_, finish_s, has_collided = jax.lax.scan(step, start, None, NUM_RACE_STEPS)[0]
+    return finish_s, has_collided
+
+
+def summarize(finish_s: jax.Array, has_collided: jax.Array) -> RaceResults:
+    """Return the learner's results of races, as ``fly_races`` returns them."""
+    own_s, other_s = finish_s.T
+    return RaceResults(
+        float(jnp.isfinite(own_s).mean()), float((own_s < other_s).mean()), float(has_collided.mean())
+    )
+
+
+def main(settings: Settings) -> None:
+    """Train, write the checkpoint, and print how the result races the policy that stayed."""
+    begun_s = time.perf_counter()
+    start = load_checkpoint(settings.opponent)
+    model = model_from_json(start.meta["model"], f"{settings.opponent}: model")
+    env = flytrack_env.make(start.env_id, track=start.track, model=model, reward=rewards_of(start))
+    race = MultiDroneRace(env, 2, over="first")
+    changes: dict[str, Any] = {**CONFIG_CHANGES, "total_timesteps": settings.total_timesteps}
+    config = dataclasses.replace(start.config, **changes)
+    learner = None
+    for updates, params, metrics in train(start, race, config, settings):
+        learner = params
+        print(f"{updates * config.batch_size} steps: mean return {metrics['episode_return'][-1]:.1f}")
+    if learner is None:
+        least = settings.updates_per_phase * config.batch_size
+        raise SystemExit(f"total_timesteps: found {settings.total_timesteps}, expected at least {least}")
+    path = settings.out / "final.safetensors"
+    description = {
+        **start.meta,
+        "env_id": "FlyTrackDuel-v0",
+        "observation_size": race.observation_space().shape[0],
+        "observation": observation_layout(race),
+        "seed": settings.seed,
+        "steps": updates * config.batch_size,
+        "seconds": time.perf_counter() - begun_s,
+    }
+    save_checkpoint(path, learner, config, description)
+    print(f"checkpoint: {path}")
+    opponent = widen_params(start.params, race.observation_space().shape[0])
+    keys = jax.random.split(jax.random.key(settings.seed), settings.num_races)
+    for slot, place in enumerate(("in front of", "behind")):
+        results = summarize(*fly_races(race, start.network, learner, opponent, slot, keys))
+        print(
+            f"{settings.num_races} races from {place} {settings.opponent.stem}: "
+            f"finishes {results.finishes:.1%}, wins {results.wins:.1%}, collisions {results.collisions:.1%}"
+        )
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Settings, prog="python -m baselines.purejaxrl_ppo.self_play", description=__doc__))

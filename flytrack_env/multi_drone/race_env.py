@@ -18,7 +18,6 @@ from flytrack_env.auto_reset import Ended, reset_if_ended
 from flytrack_env.episodes import EpisodicEnvironment, Step, clip_action, observation_box
 from flytrack_env.fusion import compute_once, one_kernel, vary_like
 from flytrack_env.multi_drone.collisions import Path, is_put_out
-from flytrack_env.multi_drone.downwash import Wake, downwash_acc_w, push, wake_of
 from flytrack_env.multi_drone.ghosts import Ghost
 from flytrack_env.multi_drone.opponents import (
     Standing,
@@ -256,11 +255,6 @@ class MultiDroneRace:
     ) -> tuple[Any, ...]:
         """Return observations and those before the reset, row by row, states, rewards, flags and info."""
         flown = jax.vmap(self._fly, (0, 0, None))(states, commands, params.flight)
-        if params.rules.downwash is not None and self.num_drones > 1:
-            is_ghost = jnp.zeros_like(flown.standing.is_out) if ghosts is None else ghosts[0]
-            wakes = jax.vmap(self._wake, (0, 0, None))(flown, is_ghost, params)
-            wakes_of_others = [self._shift(wakes, k) for k in self._distances]
-            flown = jax.vmap(self._push, (0, 0, None))(flown, wakes_of_others, params)
         if ghosts is not None:
             flown = jax.vmap(_with_ghost)(flown, *ghosts)
         states, reward, info = flown.state, flown.reward, flown.info
@@ -366,26 +360,6 @@ class MultiDroneRace:
             terminated=terminated,
             truncated=env.is_truncated(inner, flight),
             info=info,
-        )
-
-    def _wake(self, flown: Flown, is_ghost: jax.Array, params: RaceParams) -> Wake:
-        """Return a drone's wake; a drone that is out, or a ghost, has none."""
-        inner = flown.state.inner
-        gravity = self.env.model(inner, params.flight).g
-        return wake_of(self.env.drone(inner), gravity, ~(flown.state.is_out | is_ghost))
-
-    def _push(self, flown: Flown, wakes: list[Wake], params: RaceParams) -> Flown:
-        """Return a drone's step with the push of the others' wakes, unless it is out."""
-        drone = self.env.drone(flown.state.inner)
-        acc_w = downwash_acc_w(drone.pos_w, wakes[0])
-        for wake in wakes[1:]:
-            acc_w = acc_w + downwash_acc_w(drone.pos_w, wake)
-        share = jnp.where(flown.state.is_out, 0.0, jnp.asarray(params.rules.downwash))
-        acc_w = acc_w.scale(compute_once(share))
-        after = push(drone, acc_w, params.flight.dt)
-        inner = self.env.with_drone(flown.state.inner, after)
-        return flown._replace(
-            state=flown.state._replace(inner=inner), standing=flown.standing._replace(vel_w=after.vel_w)
         )
 
     def _meet(

@@ -18,9 +18,7 @@ class RaceRules(NamedTuple):
     collision_radius: of the sphere around each drone, m. blame: 0, both drones of a collision are out; 1, the
     one that ran into the other is (``flytrack_env.multi_drone.collisions``). column_spacing, row_spacing: of
     the start grid, m. first_slot: slot on the grid of drone 0, the others following; -1: drawn.
-    lead: reward for each gate gained on the best opponent. downwash: how much of the push of a wake
-    whoever flies into it feels (``flytrack_env.multi_drone.downwash``), 1 for all of it; None: wakes are not
-    computed, in a compiled program of its own.
+    lead: reward for each gate gained on the best opponent.
     """
 
     collision_radius: Scalar = 0.15
@@ -29,7 +27,6 @@ class RaceRules(NamedTuple):
     row_spacing: Scalar = 0.5
     first_slot: Scalar = DRAWN_SLOT
     lead: Scalar = 0.0
-    downwash: Scalar | None = None
 
 
 class RaceParams(NamedTuple):
@@ -57,10 +54,6 @@ def check_rules(rules: RaceRules, num_drones: int) -> None:
         "row_spacing": (2.0 * np.asarray(rules.row_spacing) > diameter, apart.replace("twice ", "")),
         "first_slot": (np.isin(rules.first_slot, range(DRAWN_SLOT, num_drones)), slots),
         "lead": (np.isfinite(rules.lead), "a finite number"),
-        "downwash": (
-            rules.downwash is None or (np.asarray(rules.downwash) >= 0.0) & np.isfinite(rules.downwash),
-            "a number of at least 0, or None",
-        ),
     }
     for name, (holds, expected) in requirements.items():
         if not np.all(holds):

@@ -27,8 +27,13 @@ class Opponent(NamedTuple):
 
 def idle(race: MultiDroneRace) -> Opponent:
     """Return an opponent that leaves its sticks alone, for the place of a ghost."""
-    size = race.env.observation_space().shape[0]
-    return Opponent(lambda params, seen: jnp.zeros((*seen.shape[:-1], race.env.num_actions)), size)
+    act = partial(_leave_sticks_alone, race.env.num_actions)
+    return Opponent(act, race.env.observation_space().shape[0])
+
+
+def _leave_sticks_alone(num_actions: int, params: Any, observations: jax.Array) -> jax.Array:
+    """Return actions of zero; a function of the module, so that an environment can be pickled."""
+    return jnp.zeros((*observations.shape[:-1], num_actions))
 
 
 class VersusParams(NamedTuple):

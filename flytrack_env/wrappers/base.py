@@ -89,10 +89,6 @@ class Wrapper(EpisodicEnvironment):
         """Return the drone of a state, as it is."""
         return self.env.drone(state.inner)
 
-    def with_drone(self, state: Any, drone: Drone) -> Any:
-        """Return a state with another drone in it."""
-        return state._replace(inner=self.env.with_drone(state.inner, drone))
-
     def race(self, state: Any) -> Race:
         """Return where the drone stands in the race."""
         return self.env.race(state.inner)

@@ -45,9 +45,6 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (folder / "file").write_text("")
     (folder / "own.py").write_text(OWN)
     whole = load_checkpoint(write_checkpoint(folder / "policy.safetensors"))
-    write_checkpoint(folder / "robust.safetensors", "FlyTrackRobust-v0")
-    write_checkpoint(folder / "elsewhere.safetensors", track="split_s")
-    write_checkpoint(folder / "remembers.safetensors", memory_size=4)
     meta = {name: value for name, value in whole.meta.items() if name != "model"}
     save_checkpoint(folder / "no_model.safetensors", whole.params, whole.config, meta)
     save_track(folder / "random.toml", random_track(0))

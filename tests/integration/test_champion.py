@@ -8,7 +8,7 @@ import pytest
 from baselines.purejaxrl_ppo import load_checkpoint
 from baselines.purejaxrl_ppo.flights import race_many, score, start_keys
 from baselines.purejaxrl_ppo.networks import Policy
-from baselines.purejaxrl_ppo.polish import Settings, decayed, polish
+from baselines.purejaxrl_ppo.polish import Settings, decay_gradient, polish
 from baselines.purejaxrl_ppo.race_env import draw_plants, plant_env, simulated_env
 from benchmarks.champion import CHAMPION, FOLDER, MODEL
 from flytrack_env import blackbox, load_model, make
@@ -82,6 +82,6 @@ def test_a_policy_that_does_not_race_is_refused():
 
 def test_a_decayed_state_is_the_same_with_less_gradient():
     tree = {"value": jnp.float32(3.0), "count": jnp.int32(2)}
-    found = decayed(tree, 0.9)
+    found = decay_gradient(tree, 0.9)
     assert float(found["value"]) == 3.0 and found["count"] is tree["count"]
-    assert jax.grad(lambda x: decayed(x, 0.9) ** 2)(3.0) == pytest.approx(0.9 * 6.0)
+    assert jax.grad(lambda x: decay_gradient(x, 0.9) ** 2)(3.0) == pytest.approx(0.9 * 6.0)

@@ -1,5 +1,7 @@
 """Races of several drones: one is the single environment, drones do not depend on their order, and meet."""
 
+import pickle
+
 import gymnax
 import jax
 import jax.numpy as jnp
@@ -188,6 +190,13 @@ def test_a_ghost_flies_its_line_and_stops_for_nobody():
     np.testing.assert_allclose(observation[29:32] * 3.0, np.array(gate.to_frame(apart)), atol=1e-3)
     seen = env.race.observe(state.entrants, env.race.default_params)[0]
     np.testing.assert_allclose(seen, observation, atol=1e-5)
+
+
+def test_a_duel_can_be_pickled():
+    env = gymnax.make("FlyTrackDuel-v0")[0]
+    copy = pickle.loads(pickle.dumps(env))
+    start, observation = env.reset(jax.random.key(0)), copy.reset(jax.random.key(0))
+    jax.tree.map(np.testing.assert_array_equal, start, observation)
 
 
 def test_drones_that_would_have_flown_on_are_truncated_when_the_race_is_over():
