@@ -67,6 +67,11 @@ def _read_field(path: Path, name: str, value: Any, dtype: Any) -> Any:
 
 def _read_effect(path: Path, name: str, values: Any) -> Any:
     """Return the parameters of one effect; those that are not in the file are neutral."""
+    if name == "learned_residual":
+        raise ModelFileError(
+            f"{path}: effects: learned_residual: networks are no longer part of a model, expected other "
+            "effects only; diagnose the log again"
+        )
     effect = effects.BY_NAME[_known(f"{path}: effects", name, effects.BY_NAME)]
     where, static = f"{path}: effects: {name}", {}
     values = dict(_object(where, values))

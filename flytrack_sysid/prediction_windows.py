@@ -16,7 +16,6 @@ from flytrack_env.dynamics import ModelParameters, advance, body_rates, observe_
 from flytrack_env.effects import MOST_STEPS, ImuLatency, at_row, start_memories
 from flytrack_env.quaternion import Quaternion, Vec3
 from flytrack_env.state import Action, Drone
-from flytrack_sysid.loads import LoadInput, load_at, pendulum_of
 from flytrack_sysid.log import FlightLog, usual_step
 from flytrack_sysid.prediction import SETTLING_S
 from flytrack_sysid.record import Record, fill_gaps, record_of
@@ -39,8 +38,7 @@ class Windows(NamedTuple):
     the state of this row is the model's. ends: (horizons,) int, rows at the horizons. gyro_b: (rows,
     windows, 3) rad/s, zeros without a gyro. has_gyro: bool. counts: (horizons, windows, quantities) bool,
     what is judged. block: (windows,) int, number of the stretch of 2 s that the window starts in. start:
-    (windows,) int, row of the log. row: (rows, windows) int, and load_input: of the log without gaps; the
-    latter None where it does not matter.
+    (windows,) int, row of the log.
     """
 
     record: Record
@@ -51,8 +49,6 @@ class Windows(NamedTuple):
     counts: np.ndarray
     block: np.ndarray
     start: np.ndarray
-    row: np.ndarray
-    load_input: LoadInput | None
 
     @property
     def first_free(self) -> int:
@@ -79,7 +75,6 @@ def chunks_of(windows: Windows) -> list[Windows]:
             counts=windows.counts[:, part],
             block=windows.block[part],
             start=windows.start[part],
-            row=windows.row[:, part],
         )
         for part in index
     ]
@@ -121,8 +116,6 @@ def make_windows(log: FlightLog, judged: np.ndarray, every_s: float, most: int) 
         counts=reached[..., None] & has,
         block=run[starts] * len(rows) + ((starts - first[starts]) * step_s / BLOCK_S).astype(int),
         start=filled.behind[starts],
-        row=index,
-        load_input=LoadInput.of(record),
     )
 
 
@@ -157,7 +150,7 @@ def _fly(model: ModelParameters, record: Record, gyro_b: jax.Array, windows: Win
     def one(carry: tuple[Drone, Any], inputs: tuple[Record, Any, Any]) -> tuple[Any, Any]:
         (flown, memories), (row, is_free, gyro) = carry, inputs
         applied = where_true(row.is_applied_known, Action(*row.applied), flown.applied)
-        memories = at_row(memories, row.time_s, row.load)
+        memories = at_row(memories, row.time_s)
         drone = where_true(is_free, flown, measured_drone(row, applied, flown.rates_b))
         beside = Vec3(*gyro) - read_gyro(drone, memories, row.step_s, in_time)
         seen = observe_rates(drone, memories, drone.rates_b + beside, row.step_s, model)
@@ -187,11 +180,5 @@ def prediction_errors(model: ModelParameters, windows: Windows) -> jax.Array:
     Turn (rad, body frame), rates (rad/s), velocity (m/s) and position (m), three components each; 0 where
     nothing is judged.
     """
-    pendulum = pendulum_of(model)
-    if pendulum is not None and windows.load_input is not None:
-        load: Any = load_at(windows.load_input, windows.row, pendulum)
-        # Where the drone flies by itself, so does its load.
-        load = jnp.where(windows.is_free[:, None, None], jnp.nan, load)
-        windows = windows._replace(record=windows.record._replace(load=load))
     fly = jax.vmap(lambda record, gyro: _fly(model, record, gyro, windows), in_axes=1, out_axes=1)
     return jnp.where(jnp.repeat(windows.counts, 3, axis=-1), fly(windows.record, windows.gyro_b), 0.0)

@@ -38,8 +38,7 @@ class Record(NamedTuple):
     pos_w, vel_w: (num_rows, 3). quat: (num_rows, 4). battery_v: (num_rows,). Where a channel is absent:
     0, upright, ``assumed_voltage``.
     piece: (num_rows,) int, numbers of stretches of at most 2.5 s, none across blocks. time_s: (num_rows,) s,
-    since the log began, of several each. load: (num_rows, 4), as in ``pendulum.Pendulum``, of a load on a
-    string; not a number where it is not known.
+    since the log began, of several each.
     """
 
     source_row: np.ndarray
@@ -55,7 +54,6 @@ class Record(NamedTuple):
     battery_v: np.ndarray
     piece: np.ndarray
     time_s: np.ndarray
-    load: np.ndarray
 
 
 def _new_times(log: FlightLog, usual: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -155,7 +153,6 @@ def record_of(filled: Filled) -> Record:
         battery_v=log["v_bat"][:, 0] if "v_bat" in log else zeros[:, 0] + assumed_voltage(log),
         piece=np.zeros(len(log), int),
         time_s=log.time - log.time[np.flatnonzero(is_first_row)][np.cumsum(is_first_row) - 1],
-        load=np.full((len(log), 4), np.nan),
     )
 
 

@@ -80,7 +80,7 @@ def replay(
         # As logged, which it is where a flight begins: past commands then depend on no model of a batch.
         begun = before._replace(applied=Action(*row.applied))
         memories = where_true(row.begins, start_memories(model.effects, begun, MOST_STEPS), memories)
-        memories = at_row(memories, row.time_s, row.load)
+        memories = at_row(memories, row.time_s)
         moved = move(before, memories, Action(*row.command), row.step_s, model)
         later = moved.after.applied, moved.after.rates_b, moved.memories
         return later, observe(Step(row, before, memories, moved), extra)

@@ -222,11 +222,8 @@ def changed_table(found: Record) -> str:
 
 
 def formulas_of(learned: Record) -> list[str]:
-    """Return what was learnt beyond the list: the formulas of laws, and what residuals act on."""
-    return [one["formula"] for one in learned["law"]] + [
-        f"residual on {one['acts']} of {', '.join(each['quantity'] for each in one['inputs'])}"
-        for one in learned["residual"]
-    ]
+    """Return the formulas of what was learnt beyond the list."""
+    return [one["formula"] for one in learned["law"]]
 
 
 def section(measured: Record, picture: str) -> str:

@@ -4,11 +4,8 @@ The simulator folds them, the fit and the diagnosis free their parameters, domai
 them, the documentation lists them. A new effect is a file here and a line in ``EFFECTS``.
 """
 
-from functools import partial
 from typing import Any
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
 from flytrack_env.effects.accelerometer_bias import ACCELEROMETER_BIAS, AccelerometerBias
@@ -25,11 +22,9 @@ from flytrack_env.effects.gyro_scale import GYRO_SCALE, GyroScale
 from flytrack_env.effects.imu_latency import IMU_LATENCY, ImuLatency
 from flytrack_env.effects.imu_offset import IMU_OFFSET, ImuOffset
 from flytrack_env.effects.learned_law import LEARNED_LAW, LearnedLaw
-from flytrack_env.effects.learned_residual import LEARNED_RESIDUAL, LearnedResidual
 from flytrack_env.effects.linear_drag import LINEAR_DRAG, LinearDrag
 from flytrack_env.effects.mocap_latency import MOCAP_LATENCY, MocapLatency
 from flytrack_env.effects.motor_imbalance import MOTOR_IMBALANCE, MotorImbalance
-from flytrack_env.effects.pendulum import Pendulum
 from flytrack_env.effects.quadratic_drag import QUADRATIC_DRAG, QuadraticDrag
 from flytrack_env.effects.quick_rates import QUICK_RATES, QuickRates
 from flytrack_env.effects.rate_cross_coupling import RATE_CROSS_COUPLING, RateCrossCoupling
@@ -84,9 +79,8 @@ EFFECTS: tuple[Effect, ...] = (
     GYRO_BIAS,
     MOCAP_LATENCY,
 )
-# Without a law of their own: what a log has shown beyond all of these.
-LEARNED: tuple[Effect, ...] = (LEARNED_LAW, LEARNED_RESIDUAL)
-ORDER = (*EFFECTS, *LEARNED)
+# Last, what a log has shown beyond all of these.
+ORDER = (*EFFECTS, LEARNED_LAW)
 ROUNDING = 1e-5  # of float32 times
 # Delays that are drawn around those of a model are longer by this factor and so many seconds, at most.
 DRAWN_LONGER, DRAWN_LATER_S = 1.25, 0.02
@@ -160,20 +154,9 @@ def start_memories(effects: tuple[Any, ...], drone: Drone, delay_steps: int = US
     return tuple(start(parameters) for parameters in effects)
 
 
-def at_row(memories: tuple[Any, ...], time_s: Scalar, load: jax.Array | np.ndarray) -> tuple[Any, ...]:
-    """Return memories of effects with the time and the load of a row of a log.
-
-    time_s: since the flight began. load: (4,), as in ``pendulum.Pendulum``; NaN keeps the remembered one.
-    """
-
-    def at(memory: Any) -> Any:
-        if not isinstance(memory, Flight):
-            return memory
-        logged = None if memory.load is None else Pendulum(*load)
-        is_logged = ~jnp.isnan(load[0])
-        return Flight(time_s, jax.tree.map(partial(jnp.where, is_logged), logged, memory.load))
-
-    return tuple(at(one) for one in memories)
+def at_row(memories: tuple[Any, ...], time_s: Scalar) -> tuple[Any, ...]:
+    """Return memories of effects at the time of a row of a log, s since the flight began."""
+    return tuple(Flight(time_s) if isinstance(memory, Flight) else memory for memory in memories)
 
 
 def acts(effects: tuple[Any, ...], stage: str) -> bool:
@@ -260,7 +243,7 @@ def observe(
 __all__ = [
     "BY_NAME",
     "EFFECTS",
-    "LEARNED",
+    "LEARNED_LAW",
     "MOST_STEPS",
     "STAGES",
     "USUAL_STEPS",
@@ -277,7 +260,6 @@ __all__ = [
     "ImuLatency",
     "ImuOffset",
     "LearnedLaw",
-    "LearnedResidual",
     "LinearDrag",
     "MocapLatency",
     "MotorImbalance",

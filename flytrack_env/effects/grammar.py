@@ -14,16 +14,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from flytrack_env.effects.base import Effect, Range, StepContext
-from flytrack_env.effects.pendulum import Pendulum, advance_load, is_swinging, start_load
+from flytrack_env.effects.base import StepContext
 from flytrack_env.messages import quote_value
 from flytrack_env.quaternion import Scalar, Vec3
-from flytrack_env.state import Action, Drone
+from flytrack_env.state import Action
 
-TINY_SPEED, TINY_OFF_M = 0.3, 1e-4  # m/s: slower flight has no direction, nor a load so nearly below
+TINY_SPEED = 0.3  # m/s: slower flight has no direction
 MOST_TERMS, MOST_FACTORS = 6, 2
-ACTS, FRAMES = ("force", "rate"), ("body", "world", "air", "load")
-ALONG = ("air", "load")  # frames of which the first component alone is given
+ACTS, FRAMES = ("force", "rate"), ("body", "world", "air")
 LARGEST = 1e6  # of any number in a law
 XYZ = 3
 
@@ -31,7 +29,7 @@ XYZ = 3
 class Moment(NamedTuple):
     """What a law may look at, scalars or arrays of one shape; units and frames as in ``StepContext``.
 
-    time_s: since the start of the flight. load: of the law's pendulum; None without one.
+    time_s: since the start of the flight.
     """
 
     pos_w: Vec3
@@ -42,14 +40,12 @@ class Moment(NamedTuple):
     thrust_acc: Scalar
     battery_v: Scalar
     time_s: Scalar
-    load: Pendulum | None = None
 
 
 class Flight(NamedTuple):
-    """The memory of a law: the time since the flight began, s, and the load on its string, if it has one."""
+    """The memory of a law: the time since the flight began, s."""
 
     time_s: Scalar
-    load: Pendulum | None = None
 
 
 def moment_of(context: StepContext, flight: Flight | None) -> Moment:
@@ -64,7 +60,6 @@ def moment_of(context: StepContext, flight: Flight | None) -> Moment:
         context.thrust_acc,
         drone.battery_v,
         time_s=0.0 if flight is None else flight.time_s,
-        load=None if flight is None else flight.load,
     )
 
 
@@ -113,12 +108,8 @@ QUANTITIES: dict[str, Quantity] = {
     "throttle": Quantity("1", -1.0, 1.0, lambda m: m.applied.thrust),
     "tilt": Quantity("rad", 0.0, 2.0, _tilt),
     "height": Quantity("m", -1000.0, 1000.0, lambda m: m.pos_w.z),
-    "x": Quantity("m", -1000.0, 1000.0, lambda m: m.pos_w.x),
-    "y": Quantity("m", -1000.0, 1000.0, lambda m: m.pos_w.y),
     "voltage": Quantity("V", 0.0, 60.0, lambda m: m.battery_v),
     "time": Quantity("s", 0.0, 3600.0, lambda m: m.time_s),
-    "heading_cosine": Quantity("1", -1.0, 1.0, lambda m: _heading(m)[0]),
-    "heading_sine": Quantity("1", -1.0, 1.0, lambda m: _heading(m)[1]),
 }
 
 
@@ -148,17 +139,6 @@ def _wave(moment: Moment, order: float, phase: float) -> Scalar:
 def _place(moment: Moment, x: float, y: float, z: float, radius: float) -> Scalar:
     off = moment.pos_w - Vec3(x, y, z)
     return jnp.exp(off.dot(off) * (-0.5 / radius**2))
-
-
-def _off(moment: Moment) -> Vec3:
-    """Return how far the load is off, world, m."""
-    assert moment.load is not None, "a law with a pendulum remembers it"
-    return Vec3(moment.load.off_x, moment.load.off_y, 0.0)
-
-
-def _swing(moment: Moment, length: float, damping: float) -> Scalar:
-    """Return the string's angle to the vertical, if small; rad."""
-    return _off(moment).norm() * (1.0 / length)
 
 
 class Shape(NamedTuple):
@@ -206,14 +186,6 @@ SHAPES: dict[str, Shape] = {
         ("radius",),
         of_moment=True,
     ),
-    "pendulum": Shape(
-        ("length", "damping"),
-        "swing({q}; {length} m, {damping}/s)",
-        ("load",),
-        _swing,
-        ("length", "damping"),
-        of_moment=True,
-    ),
 }
 
 
@@ -245,9 +217,9 @@ class Factor:
 class Term:
     """A vector times factors.
 
-    acts: "force", m/s^2 of specific force, or "rate", rad/s of body rates. frame: of the vector: body, world,
-    air or load, of which the first component alone is along the direction of flight through the air, or
-    towards where the load has swung. coefficients, standard_errors: three each.
+    acts: "force", m/s^2 of specific force, or "rate", rad/s of body rates. frame: of the vector: body, world
+    or air, of which the first component alone is given, along the direction of flight through the air.
+    coefficients, standard_errors: three each.
     """
 
     acts: str
@@ -259,7 +231,7 @@ class Term:
     @property
     def num_coefficients(self) -> int:
         """How many of the coefficients are its own."""
-        return 1 if self.frame in ALONG else XYZ
+        return 1 if self.frame == "air" else XYZ
 
     def basis(self, moment: Moment) -> tuple[Vec3, ...]:
         """Return the unit vectors of the coefficients, body frame."""
@@ -268,18 +240,8 @@ class Term:
             return unit
         if self.frame == "world":
             return tuple(Vec3(*(axis.dot(one) for axis in moment.body_axes_w)) for one in unit)
-        if self.frame == "load":
-            off_w = _off(moment)
-            way_w = off_w.scale(1.0 / jnp.maximum(off_w.norm(), TINY_OFF_M))
-            return (Vec3(*(axis.dot(way_w) for axis in moment.body_axes_w)),)
         speed = jnp.maximum(moment.airspeed_b.norm(), TINY_SPEED)
         return (moment.airspeed_b.scale(1.0 / speed),)
-
-    @property
-    def pendulum(self) -> tuple[float, float] | None:
-        """Length, m, and damping, 1/s, of the load that it looks at; None without one."""
-        loads = ((one.numbers[0], one.numbers[1]) for one in self.factors if one.shape == "pendulum")
-        return next(loads, None)
 
     def signal(self, moment: Moment) -> Scalar:
         """Return the product of its factors."""
@@ -307,19 +269,9 @@ class Law:
 
     terms: tuple[Term, ...] = ()
 
-    @property
-    def parts(self) -> tuple[Term, ...]:
-        """What acts on force or rate, each by itself."""
-        return self.terms
-
     def uses(self, quantity: str) -> bool:
         """Return whether any term looks at a quantity."""
         return any(one.quantity == quantity for term in self.terms for one in term.factors)
-
-    @property
-    def pendulum(self) -> tuple[float, float] | None:
-        """Length, m, and damping, 1/s, of the load that terms look at; None without one."""
-        return next((term.pendulum for term in self.terms if term.pendulum), None)
 
     def text(self) -> str:
         """Return its formula, a line a term."""
@@ -346,57 +298,6 @@ class Law:
         ]
 
 
-def learned_effect(static: str, read: Callable[[Any], Any], **declared: Any) -> Effect:
-    """Return the effect of something learnt, whose parameters are ``scale``, ``spread`` and a structure.
-
-    static: name of the structure; it has ``parts``, each with ``acts`` and ``at(moment, spread)``, ``uses``
-    and ``as_json``. read: from JSON values. declared: what else there is to an effect.
-    """
-
-    def start(parameters: Any, drone: Drone) -> Flight | None:
-        structure = getattr(parameters, static)
-        if not structure.uses("load") and not structure.uses("time"):
-            return None
-        load = start_load(drone.vel_w) if structure.uses("load") else None
-        return Flight(jnp.zeros_like(jnp.asarray(drone.battery_v)), load)
-
-    def remember(parameters: Any, flight: Flight | None, context: StepContext) -> Flight | None:
-        if flight is None:
-            return None
-        load = flight.load
-        if load is not None:
-            axes = zip(context.body_axes_w, context.force_b, strict=True)
-            x_w, y_w, z_w = (axis.scale(part) for axis, part in axes)
-            push_w = x_w + y_w + z_w  # gravity changes no horizontal velocity
-            mean_w = context.drone.vel_w + push_w.scale(0.5 * context.dt)
-            load = advance_load(load, mean_w, context.dt, *getattr(parameters, static).pendulum)
-        return Flight(flight.time_s + context.dt, load)
-
-    def added(parameters: Any, acts: str, flight: Flight | None, value_b: Vec3, context: StepContext) -> Vec3:
-        parts = [one for one in getattr(parameters, static).parts if one.acts == acts]
-        if not parts:
-            return value_b
-        moment = moment_of(context, flight)
-        for one in parts:
-            value_b = value_b + one.at(moment, parameters.spread).scale(parameters.scale)
-        return value_b
-
-    return Effect(
-        ranges={"scale": Range(-2.0, 2.0, "1"), "spread": Range(-3.0, 3.0, "1")},
-        notable={"scale": 0.05},
-        shapes=("spread",),
-        needs=("q",),
-        force=lambda parameters, flight, value, context: added(parameters, "force", flight, value, context),
-        rates=lambda parameters, flight, value, context: added(parameters, "rate", flight, value, context),
-        start=start,
-        remember=remember,
-        static=static,
-        written=lambda structure: structure.as_json(),
-        read=read,
-        **declared,
-    )
-
-
 def law_from_json(values: Any) -> Law:
     """Return the law in JSON values of ``Law.as_json``.
 
@@ -405,11 +306,7 @@ def law_from_json(values: Any) -> Law:
             message begins with the field.
     """
     listed_terms = listed("terms", values, MOST_TERMS)
-    terms = tuple(_term(f"terms[{place}]", one) for place, one in enumerate(listed_terms))
-    loads = {one.numbers for term in terms for one in term.factors if one.shape == "pendulum"}
-    if len(loads) > 1:
-        raise ValueError(f"terms: found loads on {len(loads)} strings (length, damping), expected one")
-    return Law(terms)
+    return Law(tuple(_term(f"terms[{place}]", one) for place, one in enumerate(listed_terms)))
 
 
 def listed(where: str, value: Any, most: int) -> list[Any]:
@@ -454,16 +351,13 @@ def _term(where: str, value: Any) -> Term:
     if min(numbers[1]) < 0.0:
         raise ValueError(f"{where}.standard_errors: found {quote_value(numbers[1])}, expected 0 or more")
     frame = chosen(f"{where}.frame", fields["frame"], FRAMES)
-    if frame in ALONG and any(numbers[0][1:]):
+    if frame == "air" and any(numbers[0][1:]):
         raise ValueError(
-            f"{where}.coefficients: found {numbers[0]}, expected only the first in the frame {frame}"
+            f"{where}.coefficients: found {numbers[0]}, expected only the first in the frame air"
         )
     listed_factors = listed(f"{where}.factors", fields["factors"], MOST_FACTORS)
     factors = tuple(_factor(f"{where}.factors[{place}]", one) for place, one in enumerate(listed_factors))
-    term = Term(chosen(f"{where}.acts", fields["acts"], ACTS), frame, factors, *numbers)
-    if (frame == "load") != (term.pendulum is not None):
-        raise ValueError(f"{where}.frame: found {frame}, expected load with a pendulum, and only then")
-    return term
+    return Term(chosen(f"{where}.acts", fields["acts"], ACTS), frame, factors, *numbers)
 
 
 def _factor(where: str, value: Any) -> Factor:
@@ -478,8 +372,6 @@ def _factor(where: str, value: Any) -> Factor:
             raise ValueError(f"{where}.{one}: found {by_name[one]:g}, expected more than 0")
     if name == "wave" and by_name["order"] not in (1.0, 2.0, 3.0, 4.0):
         raise ValueError(f"{where}.order: found {by_name['order']:g}, expected 1, 2, 3 or 4")
-    if name == "pendulum" and not is_swinging(*numbers):
-        raise ValueError(f"{where}.damping: found {numbers[1]:g}, expected less, so that the load swings")
     if name == "power":
         _check_power(where, quantity, by_name["exponent"], by_name["offset"])
     return Factor(quantity, name, numbers)

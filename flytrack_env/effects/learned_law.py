@@ -2,8 +2,12 @@
 
 from typing import NamedTuple
 
-from flytrack_env.effects.grammar import Law, law_from_json, learned_effect
-from flytrack_env.quaternion import Scalar
+import jax.numpy as jnp
+
+from flytrack_env.effects.base import Effect, Range, StepContext
+from flytrack_env.effects.grammar import Flight, Law, law_from_json, moment_of
+from flytrack_env.quaternion import Scalar, Vec3
+from flytrack_env.state import Drone
 
 
 class LearnedLaw(NamedTuple):
@@ -17,12 +21,43 @@ class LearnedLaw(NamedTuple):
     law: Law = Law()
 
 
-LEARNED_LAW = learned_effect(
-    "law",
-    law_from_json,
+def _start(parameters: LearnedLaw, drone: Drone) -> Flight | None:
+    if not parameters.law.uses("time"):
+        return None
+    return Flight(jnp.zeros_like(jnp.asarray(drone.battery_v)))
+
+
+def _remember(parameters: LearnedLaw, flight: Flight | None, context: StepContext) -> Flight | None:
+    return None if flight is None else Flight(flight.time_s + context.dt)
+
+
+def _add_terms(
+    parameters: LearnedLaw, acts: str, flight: Flight | None, value_b: Vec3, context: StepContext
+) -> Vec3:
+    terms = [term for term in parameters.law.terms if term.acts == acts]
+    if not terms:
+        return value_b
+    moment = moment_of(context, flight)
+    for term in terms:
+        value_b = value_b + term.at(moment, parameters.spread).scale(parameters.scale)
+    return value_b
+
+
+LEARNED_LAW = Effect(
     name="learned_law",
     parameters=LearnedLaw,
+    ranges={"scale": Range(-2.0, 2.0, "1"), "spread": Range(-3.0, 3.0, "1")},
+    notable={"scale": 0.05},
     equation=r"\mathbf{f}_b \leftarrow \mathbf{f}_b + s \sum_k \mathbf{c}_k\, g_k h_k",
     source="the log that it was learnt from; sums of products of given functions: S. Brunton et al., "
     '"Discovering governing equations from data by sparse identification", 2016',
+    shapes=("spread",),
+    needs=("q",),
+    force=lambda parameters, flight, value, context: _add_terms(parameters, "force", flight, value, context),
+    rates=lambda parameters, flight, value, context: _add_terms(parameters, "rate", flight, value, context),
+    start=_start,
+    remember=_remember,
+    static="law",
+    written=lambda law: law.as_json(),
+    read=law_from_json,
 )

@@ -1,4 +1,4 @@
-"""What was learnt beyond the list of effects: a law, a residual, their words and JSON."""
+"""What was learnt beyond the list of effects: a law, its words and JSON."""
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
@@ -8,9 +8,8 @@ from typing import Any
 import numpy as np
 
 from flytrack_env.dynamics import ModelParameters
-from flytrack_env.effects import LearnedLaw, LearnedResidual
+from flytrack_env.effects import LearnedLaw
 from flytrack_env.effects.grammar import Law, Term
-from flytrack_env.effects.learned_residual import Networks
 from flytrack_env.toml_file import parse_toml, read_text
 
 # What a law may be, and what to draw a quantity as.
@@ -21,28 +20,24 @@ LAST = ("thrust", "throttle", "airspeed")  # say least of a product
 
 @dataclass(frozen=True)
 class Learned:
-    """What was learnt beyond the list.
+    """A law that was learnt beyond the list.
 
-    law, networks: may be empty. gains, held_out_gains: of minus twice the log likelihood, by side. rivals: of
-    laws, by side.
+    gains, held_out_gains: of minus twice the log likelihood, by side. rivals: of the law's terms, by side.
     """
 
     law: Law
-    networks: Networks
     gains: Mapping[str, float]
     held_out_gains: Mapping[str, float]
     rivals: Mapping[str, tuple[str, ...]]
 
     @property
-    def effects(self) -> tuple[Any, ...]:
-        """The parameters of what was learnt, as effects of a model."""
-        found: list[Any] = [LearnedLaw(1.0, 0.0, self.law)] if self.law.terms else []
-        return (*found, *([LearnedResidual(1.0, 0.0, self.networks)] if self.networks.networks else []))
+    def effect(self) -> LearnedLaw:
+        """The law as an effect of a model."""
+        return LearnedLaw(1.0, 0.0, self.law)
 
     def beside(self, vector: np.ndarray, is_on: bool = True) -> np.ndarray:
-        """Return a vector of ``Problem.with_learned(self.effects)``, with what was learnt or without it."""
-        scales = [leaf for one in self.effects for leaf in (float(is_on), float(one.spread))]
-        return np.append(vector, scales)
+        """Return a vector of ``Problem.with_law(self.effect)``, with the law or without it."""
+        return np.append(vector, [float(is_on), self.effect.spread])
 
     def drawn(self) -> list[tuple[str, str]]:
         """Return which residual to draw over which regressor, names as in ``traces``."""
@@ -50,16 +45,11 @@ class Learned:
         for term in self.law.terms:
             axis = "xyz"[max(range(len(term.coefficients)), key=lambda place: abs(term.coefficients[place]))]
             found.append((_column(term.acts, term.frame, axis), _least(one.quantity for one in term.factors)))
-        for network in self.networks.networks:
-            sizes = [sum(map(abs, row)) for row in network.outputs]
-            column = _column(network.acts, network.frame, "xyz"[sizes.index(max(sizes))])
-            found += [(column, one.quantity) for one in network.inputs]
         return list(dict.fromkeys((column, DRAWN_AS.get(name, "time")) for column, name in found))
 
     def text(self) -> str:
-        """Return the formulas, and what the laws may be, a line each."""
-        lines = [f"{term.text()}: may be {may_be(term)}" for term in self.law.terms]
-        return "\n".join([*lines, *self.networks.text().splitlines()])
+        """Return the formulas of the terms, and what each may be, a line each."""
+        return "\n".join(f"{term.text()}: may be {may_be(term)}" for term in self.law.terms)
 
     def as_json(self) -> dict[str, Any]:
         """Return JSON values."""
@@ -67,14 +57,6 @@ class Learned:
             "law": [
                 {"formula": term.text(), "may_be": may_be(term), **one}
                 for term, one in zip(self.law.terms, self.law.as_json(), strict=True)
-            ],
-            "residual": [
-                {
-                    "acts": one.acts,
-                    "inputs": [each._asdict() for each in one.inputs],
-                    "half_width_90": list(one.half_width_90),
-                }
-                for one in self.networks.networks
             ],
             "chi2_gain": dict(self.gains),
             "heldout_gain": dict(self.held_out_gains),
@@ -95,19 +77,18 @@ def _least(quantities: Iterable[str]) -> str:
 def _column(acts: str, frame: str, axis: str) -> str:
     if frame == "air":
         return "force_along"
-    is_world = frame in ("world", "load")
-    return f"{'rates' if acts == 'rate' else 'force'}_{'world_' if is_world else ''}{axis}"
+    return f"{'rates' if acts == 'rate' else 'force'}_{'world_' if frame == 'world' else ''}{axis}"
 
 
 def with_learned(model: ModelParameters, learned: Learned | None) -> ModelParameters:
     """Return a model with what was learnt."""
-    return model if learned is None else model.with_effects(*learned.effects)
+    return model if learned is None else model.with_effects(learned.effect)
 
 
 def with_and_without(
     learned: Learned, vectors: Mapping[str, np.ndarray], change: np.ndarray
 ) -> dict[str, np.ndarray]:
-    """Return vectors by model of ``Problem.with_learned``, with an extended one without what was learnt.
+    """Return vectors by model of ``Problem.with_law``, with an extended one without what was learnt.
 
     change: of the extended model's other parameters, fitted beside what was learnt.
     """

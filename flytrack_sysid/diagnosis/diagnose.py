@@ -247,14 +247,14 @@ def summarize(judged: Judged, parts: Split) -> Diagnosis:
     # A law that acts for a part of the log is not looked for beside an effect that does, nor one beside
     # another that the given model has.
     others = (one.effect for one in problem.windows)
-    if selection.unexplained.shares and extended.effects.isdisjoint(others) and not problem.given_learned:
+    if selection.unexplained.shares and extended.effects.isdisjoint(others) and not problem.has_given_law:
         always, always_held = (replace(one, windows=()) for one in (problem, test))
         learned, vector = find_learned(always, always_held, extended, selection.base.vector, refined.judge)
     if learned is not None:
         change = vector - extended.vector
         vectors, flying = (with_and_without(learned, one, change) for one in (vectors, flying))
         extended = extended._replace(vector=vector)
-        judged_by = test.with_learned(learned.effects), refined.with_learned(learned.effects)
+        judged_by = test.with_law(learned.effect), refined.with_law(learned.effect)
     limits = summary.not_identifiable(state, linearization, model, (*found, *negligible))
     prediction = summary.prediction_of(judged_by[1], flying)
     notes = [
@@ -262,7 +262,7 @@ def summarize(judged: Judged, parts: Split) -> Diagnosis:
         *summary.warnings_of(problem, (*causes, *beyond), lost),
         *summary.refinement_notes(refined, selection.model),
         *summary.stand_in_notes(selection, flying["extended"]),
-        *summary.given_learned_notes(problem, selection.unexplained),
+        *summary.given_law_notes(problem, selection.unexplained),
         *summary.unseen_at_rest_notes(judged.rejected),
         *notes_of(selection, linearization, parts.log),
     ]

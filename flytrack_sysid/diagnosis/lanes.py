@@ -11,7 +11,6 @@ import jax
 import numpy as np
 
 from flytrack_env.dynamics import ModelParameters
-from flytrack_sysid.loads import LoadInput
 from flytrack_sysid.log import FlightLog
 from flytrack_sysid.log_voltage import with_voltage
 from flytrack_sysid.record import Record, is_applied_certain, make_record, measured_channels
@@ -37,7 +36,6 @@ class Lanes(NamedTuple):
     is_joined: (rows, lanes) bool, the row follows the one before it in flight. is_known: (rows, lanes,
     NUM_AXES) bool, and no lost command still acts there. row: (rows, lanes)
     int, of the record, -1 where there is none. quanta: (2, NUM_AXES), the last digit of each channel.
-    load_input: of the whole log; None where it does not matter.
     """
 
     record: Record
@@ -47,12 +45,10 @@ class Lanes(NamedTuple):
     is_known: np.ndarray
     row: np.ndarray
     quanta: np.ndarray
-    load_input: LoadInput | None
 
     def selected(self, places: np.ndarray) -> "Lanes":
         """Return some of the lanes, by their numbers."""
-        of_all = ("quanta", "load_input")
-        leaves = {name: value for name, value in self._asdict().items() if name not in of_all}
+        leaves = {name: value for name, value in self._asdict().items() if name != "quanta"}
         return self._replace(**jax.tree.map(lambda leaf: leaf[:, places], leaves))
 
     @property
@@ -128,13 +124,13 @@ def make_lanes(log: FlightLog, judged: np.ndarray, tau: np.ndarray, gravity: flo
     counts = np.repeat(np.stack([side[index] for side in sides], axis=-1), SIZES, axis=-2)
     counts &= is_real[..., None, None]
     sensed: dict[str, np.ndarray] = {name: found[name][index] for name in ("w", "f") if name in found}
-    load_input, record = LoadInput.of(record), Record(*(leaf[index] for leaf in record))
+    record = Record(*(leaf[index] for leaf in record))
     begins = record.begins | (np.arange(len(index)) == 0)[:, None] | (index < 0)
     certain = np.stack([turns, lifts, np.ones_like(turns)], axis=-1)
     known = np.repeat(certain[index], SIZES, axis=-1)
     known &= ~begins[..., None]
     record = record._replace(begins=begins)
-    return Lanes(record, sensed, counts, ~begins, known, index, _quanta(found), load_input)
+    return Lanes(record, sensed, counts, ~begins, known, index, _quanta(found))
 
 
 def lanes_of(log: FlightLog, judged: np.ndarray, model: ModelParameters) -> Lanes:

@@ -11,15 +11,12 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from scipy import optimize, stats
 
 from flytrack_env.dynamics import collective_thrust
 from flytrack_env.effects.grammar import QUANTITIES, SHAPES, XYZ, Factor, Moment, Term
-from flytrack_env.effects.learned_residual import Network
-from flytrack_env.effects.pendulum import Pendulum, is_swinging
 from flytrack_env.quaternion import Vec3
 from flytrack_env.state import Action
 from flytrack_sysid.diagnosis.lanes import LANE_S
@@ -36,7 +33,6 @@ from flytrack_sysid.diagnosis.unexplained import (
     linearized_residuals,
     whitened,
 )
-from flytrack_sysid.loads import load_at
 from flytrack_sysid.parameters import MAX_RATES, from_vector
 
 CHANCE, CHANCE_OF_MORE = 1e-7, 1e-4  # of a term where nothing is left; of a second and third one
@@ -45,17 +41,12 @@ MOST_TRIED_AGAIN = 100  # terms, beside the first one found
 MOST_REFINED, REFINEMENTS = 5, 60  # terms a round whose shapes are refined, and evaluations of each
 MOST_TERMS = 3  # of one side
 MOST_STARTS = 3  # first terms from which a law is searched
-# Strings that are tried, so near in frequency that one of them swings with any load; heavily damped, 1/s.
-STRINGS_M, NUM_STRINGS, USUAL_DAMPING = (0.1, 3.0), 16, 0.8
 LEAST_SHARE = 0.04  # of what the terms before gain: the least of one more
 LEAST_OWN = 0.01  # of a column's information: what is not within the reach of the model's free numbers
 TINY = 1e-3  # of numbers that are positive
 LEAST_SIGMAS = 3.0  # of a coefficient that stays
 HELD_OUT_SHARE = 0.6  # of the gain on held-out rows that a law would have there if it were right
 LEAST_EXPECTED = 10.0  # of that gain: with less, held-out rows say nothing of a law
-
-
-_load_at = jax.jit(load_at)
 
 
 def moment_of_flight(problem: Problem, vector: np.ndarray, flight: Flown) -> Moment:
@@ -122,30 +113,11 @@ class Side(NamedTuple):
         test = SideTest.of(name, white, slopes[is_own])
         return cls(name, problem, model.vector, moment, flight, test, acting)
 
-    @classmethod
-    def unfitted(cls, name: str, problem: Problem, model: FittedModel) -> "Side":
-        """Return a side of a problem without a noise, which can tell moments and residuals only."""
-        flight = flight_of(problem, model)
-        nothing = np.zeros((0, 0, 0))
-        moment = moment_of_flight(problem, model.vector, flight)
-        return cls(name, problem, model.vector, moment, flight, SideTest(nothing, nothing, nothing), ())
-
     def white(self, term: Term) -> np.ndarray:
         """Return a term's unit coefficients as innovations, (coefficients, rows, lanes, 3, 2)."""
-        moment = self._moment_for(term)
-        signal = np.broadcast_to(term.signal(moment), np.shape(moment.time_s))[..., None]
-        directions = directions_of(term, moment, self.flight.body_to_world)
+        signal = np.broadcast_to(term.signal(self.moment), np.shape(self.moment.time_s))[..., None]
+        directions = directions_of(term, self.moment, self.flight.body_to_world)
         return whitened(self.problem, directions * signal, self.name)
-
-    def _moment_for(self, term: Term) -> Moment:
-        """Return what a term may look at: with its own load on a string, if it has one."""
-        if term.pendulum is None:
-            return self.moment
-        lanes = self.problem.lanes
-        assert lanes.load_input is not None, "lanes of a log have it"
-        load = np.asarray(_load_at(lanes.load_input, lanes.row, term.pendulum))
-        load = np.concatenate([load[:1], load[:-1]])  # a step begins at the row before
-        return self.moment._replace(load=Pendulum(*np.moveaxis(load, -1, 0)))
 
     def vector_beside(self, given: np.ndarray) -> np.ndarray:
         """Return the model's vector beside what was fitted; given: the step of its numbers that act."""
@@ -213,8 +185,6 @@ def factors_of(side: Side) -> Iterator[tuple[str, tuple[Factor, ...]]]:
     if side.name == "force":
         for one in (power("airspeed", 2.0), power("airspeed", 3.0), *_local(side, "airspeed", ("bump",), 8)):
             yield "air", (one,)
-        for length in np.geomspace(*STRINGS_M, NUM_STRINGS):
-            yield "load", (Factor("load", "pendulum", (float(length), USUAL_DAMPING)),)
         where = side.flight.pos_w[side.flight.is_counted]
         for place in where[np.linspace(0, len(where) - 1, 2 * BUMP_PLACES + 1).astype(int)[1::2]].tolist():
             for width in BUMP_WIDTHS_M:
@@ -302,7 +272,7 @@ def refine_jointly(side: Side, terms: Sequence[Term], places: Iterable[int]) -> 
 
 
 def _with_numbers(term: Term, values: np.ndarray) -> Term | None:
-    """Return a term with other numbers; None where one would have no width, or not swing."""
+    """Return a term with other numbers; None where one would have no width."""
     factors, place = [], 0
     for one in term.factors:
         numbers = tuple(values[place : place + len(one.numbers)].tolist())
@@ -310,14 +280,12 @@ def _with_numbers(term: Term, values: np.ndarray) -> Term | None:
         by_name = dict(zip(SHAPES[one.shape].numbers, numbers, strict=True))
         if any(not by_name[name] > TINY for name in SHAPES[one.shape].positive):
             return None
-        if one.shape == "pendulum" and not is_swinging(*numbers):
-            return None
         factors.append(replace(one, numbers=numbers))
     return replace(term, factors=tuple(factors))
 
 
 class Found(NamedTuple):
-    """A law of one side, or a network in its place, and what it is worth.
+    """A law of one side, and what it is worth.
 
     vector: of the model with what the law changes in its free numbers. gain: on rows that were learnt from,
     held_out_gain on others, of minus twice the log likelihood; expected: there, if it were right. rivals:
@@ -325,7 +293,6 @@ class Found(NamedTuple):
     """
 
     terms: tuple[Term, ...]
-    networks: tuple[Network, ...]
     vector: np.ndarray
     gain: float
     held_out_gain: float
@@ -388,7 +355,7 @@ def judge_law(side: Side, held: Side, terms: tuple[Term, ...], fit: SideFit) -> 
     vector, white = side.vector_beside(fit.given), [held.white(term) for term in terms]
     coefficients = [np.array(term.coefficients[: len(own)]) for term, own in zip(terms, white, strict=True)]
     learnt = np.tensordot(np.concatenate(coefficients), np.concatenate(white), axes=1)
-    return Found(terms, (), vector, fit.chi2, *held_out(side, held, learnt, vector))
+    return Found(terms, vector, fit.chi2, *held_out(side, held, learnt, vector))
 
 
 def is_confirmed(side: Side, law: Found) -> bool:
@@ -476,8 +443,6 @@ def grow_law(side: Side, held: Side, first: Trial, pool: Sequence[Term], number:
         if len(terms) == MOST_TERMS:
             break
         test = side.test.given_also(*(side.columns(term) for term in terms))
-        if any(one.pendulum for one in terms):  # one drone, one load
-            pool = [one for one in pool if one.pendulum is None]
         (first, *_), _ = best_of(side, test, pool)
         if first.gain < stats.chi2.isf(CHANCE_OF_MORE / number, num_numbers(first.term)):
             break

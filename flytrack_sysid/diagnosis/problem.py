@@ -25,12 +25,11 @@ import numpy as np
 from scipy import special
 
 from flytrack_env.dynamics import ModelParameters, read_sensors
-from flytrack_env.effects import BY_NAME, EFFECTS, LEARNED, Effect, effect_of
+from flytrack_env.effects import BY_NAME, EFFECTS, LEARNED_LAW, Effect, LearnedLaw, effect_of
 from flytrack_env.quaternion import Quaternion, Vec3
 from flytrack_sysid.diagnosis import noise as noises
 from flytrack_sysid.diagnosis.lanes import LANE_S, Lanes, lead_in_of
 from flytrack_sysid.diagnosis.lateness import Late
-from flytrack_sysid.loads import load_at, pendulum_of
 from flytrack_sysid.parameters import TAUS, from_vector, in_batches, names_of, range_of, to_vector
 from flytrack_sysid.record import Record
 from flytrack_sysid.replay import Step, replay
@@ -77,10 +76,7 @@ def residuals(vector: jax.Array, like: ModelParameters, lanes: Lanes) -> jax.Arr
 
     vector: the model's numbers, in the order of ``parameters.names_of(like)``.
     """
-    model, pendulum = from_vector(vector, like), pendulum_of(like)
-    if pendulum is not None and lanes.load_input is not None:
-        load = load_at(lanes.load_input, lanes.row, pendulum)
-        lanes = lanes._replace(record=lanes.record._replace(load=load))
+    model = from_vector(vector, like)
     of_lane = jax.vmap(lambda lane, sensed: _of_lane(model, lane, sensed), in_axes=1, out_axes=1)
     return jnp.where(lanes.is_joined[..., None, None], of_lane(lanes.record, lanes.measured), 0.0)
 
@@ -175,13 +171,10 @@ class Problem:
         gains = _gains(noises.noise_of(noise), noises.step_to(lanes), lanes.is_known, lanes.counts)
         return replace(self, noise=noise, gains=gains)
 
-    def with_learned(self, learned: Sequence[Any]) -> "Problem":
-        """Return the problem of vectors that end with the numbers of learned effects.
-
-        learned: parameters of effects, whose scales count as 0 at the start.
-        """
-        still = (one._replace(scale=0.0) for one in learned)
-        like = jax.tree.map(lambda leaf: np.asarray(leaf, float), self.like.with_effects(*still))
+    def with_law(self, law: LearnedLaw) -> "Problem":
+        """Return the problem of vectors that end with the numbers of a law; at the start its scale is 0."""
+        like = self.like.with_effects(law._replace(scale=0.0))
+        like = jax.tree.map(lambda leaf: np.asarray(leaf, float), like)
         names, start = names_of(like), to_vector(like)
         low, high = np.array([range_of(name)[:2] for name in names[len(self.names) :]]).reshape(-1, 2).T
         return replace(
@@ -201,10 +194,9 @@ class Problem:
         return noises.noise_of(self.noise)
 
     @property
-    def given_learned(self) -> tuple[str, ...]:
-        """What was learnt beyond the list in the nominal model, from another log."""
-        learned = [effect.name for effect in LEARNED]
-        return tuple(name for name in self.given_effects if name in learned)
+    def has_given_law(self) -> bool:
+        """Whether the nominal model has a law that was learnt from another log."""
+        return LEARNED_LAW.name in self.given_effects
 
     @property
     def counts(self) -> np.ndarray:
@@ -220,10 +212,7 @@ class Problem:
         return found if self.late is None else self.late.residuals(found)
 
     def _replayed(self, vectors: np.ndarray) -> np.ndarray:
-        lanes = self.lanes
-        if pendulum_of(self.like) is None:
-            lanes = lanes._replace(load_input=None)  # of any length, for which nothing is to be compiled
-        return in_batches(lambda part: _residuals(part, self.like, lanes), vectors, _size_for(vectors))
+        return in_batches(lambda part: _residuals(part, self.like, self.lanes), vectors, _size_for(vectors))
 
     def _composed(self, vectors: np.ndarray) -> np.ndarray:
         """Return residuals of models whose effects act within their windows; each row is of a replay."""

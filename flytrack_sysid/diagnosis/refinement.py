@@ -11,7 +11,7 @@ say nothing about what answers the commands, and nothing is named from there.
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import numpy as np
@@ -19,14 +19,13 @@ from scipy import special, stats
 from scipy.spatial.transform import Rotation
 
 from flytrack_env.dynamics import ModelParameters
-from flytrack_env.effects import BY_NAME
+from flytrack_env.effects import BY_NAME, LearnedLaw
 from flytrack_sysid.diagnosis.model_selection import ablate
 from flytrack_sysid.diagnosis.onset import ended
 from flytrack_sysid.diagnosis.problem import Problem
 from flytrack_sysid.diagnosis.score_test import BASE_CAUSES, Candidate, prior_information, solve, step_inside
 from flytrack_sysid.diagnosis.search import FittedModel, SearchState
 from flytrack_sysid.diagnosis.vetoes import Selection
-from flytrack_sysid.loads import pendulum_of
 from flytrack_sysid.log import FlightLog
 from flytrack_sysid.parameters import DRAIN, from_vector, in_batches
 from flytrack_sysid.prediction_windows import (
@@ -112,8 +111,6 @@ def _errors(vectors: jax.Array, like: ModelParameters, windows: Windows) -> jax.
 
 def errors_at(problem: Problem, vectors: np.ndarray, windows: Windows) -> Tested:
     """Return the errors of models, (num_vectors, num_parameters), on windows; one program for all."""
-    if pendulum_of(problem.like) is None:
-        windows = windows._replace(load_input=None)  # of any length, for which nothing is to be compiled
 
     def of_batch(part: np.ndarray) -> np.ndarray:
         found = [np.asarray(_errors(part, problem.like, chunk)) for chunk in chunks_of(windows)]
@@ -319,9 +316,9 @@ class Refined(NamedTuple):
     problem: Problem
     judge: Judge | None
 
-    def with_learned(self, learned: Sequence[Any]) -> "Refined":
-        """Return the same of the problem with learned effects, its base without them."""
-        problem = self.problem.with_learned(learned)
+    def with_law(self, law: LearnedLaw) -> "Refined":
+        """Return the same of the problem with a law, its base without it."""
+        problem = self.problem.with_law(law)
         own = problem.start[len(self.problem.start) :]
         return self._replace(problem=problem, base=None if self.base is None else np.append(self.base, own))
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from flytrack_env import __version__, save_model
 from flytrack_env.dynamics import SECONDS_PER_MINUTE
-from flytrack_env.effects import BY_NAME
+from flytrack_env.effects import BY_NAME, LearnedLaw
 from flytrack_env.files import write_atomically
 from flytrack_env.pictures.drawing import new_figure, plain
 from flytrack_env.scene import BLUE, GREEN, GREY, ORANGE
@@ -169,11 +169,7 @@ def _learned(diagnosis: Diagnosis) -> str:
     """Return what was learnt beyond the list, as a sentence; nothing without any."""
     if diagnosis.learned is None:
         return ""
-    kinds = [
-        *(["a law"] if diagnosis.learned.law.terms else []),
-        *(["a residual"] if diagnosis.learned.networks.networks else []),
-    ]
-    return f"The extended model has {' and '.join(kinds)} for it, learnt from this log."
+    return "The extended model has a law for it, learnt from this log."
 
 
 def verdict_of(diagnosis: Diagnosis) -> Verdict:
@@ -323,7 +319,7 @@ def _learned_parts(diagnosis: Diagnosis, found: Traces) -> list[Part]:
 _LESS, LEARNT = "without ", "what was learnt"
 LEARNT_READING = (
     "Orange: what the extended model leaves without it, nothing else refitted. The line is what was learnt. "
-    "It holds in the ranges that were flown; a residual adds nothing outside them."
+    "It holds in the ranges that were flown."
 )
 
 
@@ -333,8 +329,7 @@ def traces_of(diagnosis: Diagnosis, log: FlightLog) -> Traces:
     for cause in diagnosis.causes:
         models[_LESS + cause.effect] = without(diagnosis.extended, diagnosis.nominal, cause.effect)
     if diagnosis.learned is not None:
-        gone = tuple(map(type, diagnosis.learned.effects))
-        kept = tuple(one for one in diagnosis.extended.effects if type(one) not in gone)
+        kept = tuple(one for one in diagnosis.extended.effects if not isinstance(one, LearnedLaw))
         models[_LESS + LEARNT] = diagnosis.extended._replace(effects=kept)
     return traces(log, models, like="extended")
 

@@ -185,7 +185,7 @@ class Diagnosis:
     log. noise: by channel and axis, fitted standard deviations of the sensors. voltages: the lowest and the
     highest of the battery that were learnt from, V; None where it was not measured. prediction: how far
     ahead the models predict. changed: every parameter of the extended model that is not as in the nominal
-    one. learned: a law or a residual for what is unexplained, part of the extended model. half_response_s:
+    one. learned: a law for what is unexplained, part of the extended model. half_response_s:
     by model (nominal, refitted_base, extended) and by stick. outliers: by channel, if any.
     """
 

@@ -543,14 +543,13 @@ def stand_in_notes(selection: vetoes.Selection, vector: np.ndarray) -> list[str]
     return notes
 
 
-def given_learned_notes(problem: Problem, rest: Unexplained) -> list[str]:
-    """Return that nothing is learnt beside what the nominal model has learnt from another log."""
-    if not problem.given_learned or not rest.shares:
+def given_law_notes(problem: Problem, rest: Unexplained) -> list[str]:
+    """Return that no law is looked for beside one that the nominal model has from another log."""
+    if not problem.has_given_law or not rest.shares:
         return []
-    names = ", ".join(problem.given_learned)
     return [
-        f"the model has {names} from another log: nothing is learnt beside that; diagnose the model without "
-        "it to learn from this log"
+        "the model has learned_law from another log: nothing is learnt beside that; diagnose the model "
+        "without it to learn from this log"
     ]
 
 
