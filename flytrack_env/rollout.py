@@ -8,13 +8,13 @@ arrays of (x, u) pairs such as the handout's. Nothing else is unpickled, so a fo
 import io
 from collections.abc import Sequence
 from pathlib import Path
+from typing import BinaryIO
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from flytrack_env.files import open_file, write_atomically
 from flytrack_env.messages import error_text, quote_name, quote_value
-from flytrack_env.npz_file import Header, read_header
 from flytrack_env.state import ACTION_SIZE, APPLIED_ACTION, STATE_SIZE
 
 ROW_SIZE = STATE_SIZE + ACTION_SIZE
@@ -67,10 +67,7 @@ def load_rollout(path: str | Path, allow_pickle: bool = False) -> tuple[np.ndarr
     path = Path(path)
     try:
         with open_file(path, LARGEST_BYTES) as file:
-            header = read_header(io.BytesIO(file.read(LARGEST_HEADER_BYTES)))
-            is_pickled = header.dtype.hasobject and allow_pickle
-            if not is_pickled:
-                _check_header(path, header)
+            is_pickled = _check_header(path, file, allow_pickle)
             file.seek(0)
             rows = np.load(file, allow_pickle=is_pickled)
     except RolloutError:
@@ -103,9 +100,16 @@ def load_named_rollouts(
     return {name: load_rollout(file, allow_pickle) for name, file in zip(names, files, strict=True)}
 
 
-def _check_header(path: Path, header: Header) -> None:
-    """Raise RolloutError unless a header declares a rollout; no data has been read yet."""
-    shape, dtype = header.shape, header.dtype
+def _check_header(path: Path, file: BinaryIO, allow_pickle: bool) -> bool:
+    """Return whether a file declares pickled objects; raise RolloutError unless those, or a rollout.
+
+    No data has been read yet.
+    """
+    if np.lib.format.read_magic(file) != (1, 0):  # as NumPy writes it unless a header is very long
+        raise RolloutError(f"{path}: found another version of .npy than 1.0, expected {EXPECTED}")
+    shape, _, dtype = np.lib.format.read_array_header_1_0(file)
+    if dtype.hasobject and allow_pickle:
+        return True
     if dtype.hasobject:
         raise RolloutError(
             f"{path}: found pickled objects, expected {EXPECTED}; pickles run the code they hold, "
@@ -117,6 +121,7 @@ def _check_header(path: Path, header: Header) -> None:
         raise RolloutError(f"{path}: found shape {quote_value(shape)}, expected {EXPECTED}")
     if shape[0] > MOST_STEPS:
         raise RolloutError(f"{path}: found {quote_value(shape[0])} steps, expected at most {MOST_STEPS}")
+    return False
 
 
 def _rows_of_pairs(path: Path, pairs: np.ndarray) -> np.ndarray:

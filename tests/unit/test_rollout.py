@@ -66,10 +66,9 @@ BAD_FILES = {
     r"found shape \(0, 25\), expected .*T >= 1": npy_bytes(np.zeros((0, 25))),
     "found nan at step 1, column 9, expected finite": rows_with(np.nan),
     "found inf at step 1": rows_with(1e300),  # beyond float32
-    r"found version \(9, 9\)": b"\x93NUMPY\x09\x09" + bytes(99),
+    "found another version of .npy": b"\x93NUMPY\x09\x09" + bytes(99),
     "found an array of .{1,250}, exp": npy_bytes(np.zeros(3, [("a" * 900, "<f8")])),
     "found 3000000000000 steps": ROWS.replace(b"(3, 25), }" + b" " * 12, b"(3000000000000, 25), }"),
-    "cannot be read: ValueError.*": b"\x93NUMPY\x02\x00\xff\xff\xff\x7f{'descr'" + bytes(200),  # 2 GB
     "found shapes set": np.empty((0, 2), object),
     r"found shapes {\(\(17,\), \(4,\)\)}, expected pairs": pairs_of((np.zeros(17), np.zeros(4))),
     "expected pairs of x": pairs_of(("a", "b")),
