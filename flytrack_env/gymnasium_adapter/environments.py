@@ -1,13 +1,11 @@
 """The environments behind ``gymnasium.make`` and ``gymnasium.make_vec``: one compiled step each."""
 
-import multiprocessing
-import sys
 from typing import Any
 
 import gymnasium
 import numpy as np
 from gymnasium.utils import seeding
-from gymnasium.vector import AsyncVectorEnv, AutoresetMode
+from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 from gymnax.environments.spaces import gymnax_space_to_gym_space
 
@@ -92,23 +90,6 @@ class _Adapter:
             self._window = open_window(float(params.dt))
 
 
-def _refuse_fork() -> None:
-    """Raise if an ``AsyncVectorEnv`` that is going to fork makes the environment: its workers would hang.
-
-    It makes a first environment in this process, and gives the environment no other sign of itself.
-    """
-    frame = sys._getframe()
-    while frame := frame.f_back:  # type: ignore[assignment]  # None ends the loop
-        maker = frame.f_locals.get("self")
-        if isinstance(maker, AsyncVectorEnv) and "env_fns" in frame.f_locals:
-            if (maker.context or multiprocessing.get_start_method()) == "fork":
-                raise RuntimeError(
-                    "vectorization_mode: found 'async', whose forked processes hang because JAX has threads; "
-                    "use 'vector_entry_point', which is faster, or pass vector_kwargs={'context': 'spawn'}"
-                )
-            return
-
-
 class FlyTrackEnv(_Adapter, gymnasium.Env[np.ndarray, np.ndarray]):
     """One environment of an id, stepped as one compiled function.
 
@@ -119,7 +100,6 @@ class FlyTrackEnv(_Adapter, gymnasium.Env[np.ndarray, np.ndarray]):
     Raises:
         ValueError, TypeError: what ``flytrack_env.make`` and ``check_params`` refuse, or a render mode.
         ImportError: a render mode whose package is not installed.
-        RuntimeError: made by an ``AsyncVectorEnv`` whose processes are forked.
     """
 
     metadata: dict[str, Any] = {"render_modes": list(RENDER_MODES), "render_fps": 100}  # noqa: RUF012  # as Gymnasium declares it
@@ -127,7 +107,6 @@ class FlyTrackEnv(_Adapter, gymnasium.Env[np.ndarray, np.ndarray]):
     def __init__(
         self, env_id: str, render_mode: str | None = None, params: EnvParams | None = None, **overrides: Any
     ):
-        _refuse_fork()
         check_keywords(overrides, ("render_mode", "params", *ARGUMENTS))
         self.observation_space, self.action_space = self._set_up(env_id, render_mode, params, overrides)
         self._state: Any = None

@@ -250,8 +250,6 @@ def test_wrong_use_is_refused() -> None:
         make_vector(num_envs=0)
     with pytest.raises(ValueError, match="autoreset_mode: found 'Disabled', expected 'NextStep' or"):
         make_vector(autoreset_mode=AutoresetMode.DISABLED)
-    with pytest.raises(RuntimeError, match=r"found 'async', .*; use 'vector_entry_point'.* or pass .*spawn"):
-        gymnasium.make_vec(BASE, 2, vectorization_mode="async", vector_kwargs={"context": "fork"})
 
 
 def test_models_with_other_delays_are_flown_with_their_own() -> None:
