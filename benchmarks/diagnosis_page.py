@@ -18,7 +18,7 @@ Rows = dict[str, list[Line]]
 CONTROLS = ("clean", "heavy", "coloured", "gusts")
 SHOWN, SEPARATE, HIDDEN = 30.0, 20.0, 8.0  # lambda
 NOTABLE = 0.2  # of the noise: error that a new flight shows
-# The plants have other laws for these (benchmarks/hidden), so that their parameters differ.
+# The plants have other laws for these (flytrack_bench/hidden), so that their parameters differ.
 OTHER_LAW = ("translational_lift", "rate_saturation", "ground_effect")
 USUAL_RATE, CLOCK, CLOCK_WITHIN_S = 100, "mocap_latency", 0.002
 ONSET_WITHIN_S = 1.0

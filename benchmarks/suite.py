@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks import report
-from benchmarks.loop.plants import craft_of, draw_plant
+from benchmarks.loop.plants import draw_plant
 from flytrack_bench.suite import FOLDER, craft_as_json, digest_of
 from flytrack_env import load_track, random_track, save_track
 from flytrack_env.references import shipped_reference, track_digest
@@ -34,7 +34,7 @@ def draw_suite(folder: Path) -> None:
     tasks = [_task("flytrack", "flytrack", flytrack, optimal_s, None)]
     tasks += [_task(name, file, track, OPTIMAL_S[name], None) for name, (file, track) in own.items()]
     for place, number in enumerate(PLANTS):
-        craft = craft_as_json(craft_of(draw_plant(number, SEED)))
+        craft = craft_as_json(draw_plant(number, SEED))
         tasks.append(_task(f"plant_{place + 1}", "flytrack", flytrack, optimal_s, craft))
     content: dict[str, Any] = {
         "name": "v1",

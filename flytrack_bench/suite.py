@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from flytrack_bench.plants import Craft, HiddenPlant
+from flytrack_bench.hidden import HiddenPlant, Truth
 from flytrack_env import Track, TrackError, load_track
 from flytrack_env.files import read_at_most
 from flytrack_env.messages import error_text
@@ -15,6 +15,7 @@ from flytrack_env.references import track_digest
 
 FOLDER = Path(__file__).parent / "suites"
 MOST_BYTES = 2**20
+CRAFT_FIELDS = ("tau", "coeffs", "max_rate", "drain", "mass", "gravity", "effects")
 
 
 class SuiteError(ValueError):
@@ -31,7 +32,7 @@ class Task:
 
     id: str
     track: Track
-    craft: Craft | None
+    craft: Truth | None
     optimal_lap_s: float
 
     @property
@@ -101,10 +102,10 @@ def _task(path: Path, one: dict[str, Any]) -> Task:
     numbers: Any = one["craft"]
     if numbers is not None:
         numbers = {name: tuple(v) if isinstance(v, list) else v for name, v in numbers.items()}
-    craft = None if numbers is None else Craft(**numbers)
+    craft = None if numbers is None else Truth(**numbers)
     return Task(one["id"], track, craft, float(one["optimal_lap_s"]))
 
 
-def craft_as_json(craft: Craft) -> dict[str, Any]:
-    """Return a craft as JSON values."""
-    return dict(vars(craft))
+def craft_as_json(craft: Truth) -> dict[str, Any]:
+    """Return a hidden drone as JSON values: its parameters and its effects."""
+    return {name: getattr(craft, name) for name in CRAFT_FIELDS}

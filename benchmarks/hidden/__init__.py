@@ -1,20 +1,13 @@
-"""Plants with hidden effects, for grading the diagnosis, in equations that share nothing with the package.
+"""Flights of hidden drones, for grading the diagnosis.
 
 ``draw_base``, ``draw_effect``, ``draw_truth``, ``draw_outside``, ``draw_gust``, ``draw_onset`` and
 ``draw_late`` draw a ``Truth``; its ``motion`` and ``step_s`` say how it moves and is logged; ``fly``
 flies it; ``measure`` turns the clean log into what sensors would have logged.
 """
 
-from benchmarks.hidden.flights import fly
-from benchmarks.hidden.noise import measure
-from benchmarks.hidden.outside import draw_outside
-from benchmarks.hidden.truth import (
+from benchmarks.hidden.draws import (
     EFFECTS,
-    MOTIONS,
     NAMES,
-    Gust,
-    Outside,
-    Truth,
     draw_base,
     draw_effect,
     draw_gust,
@@ -24,3 +17,7 @@ from benchmarks.hidden.truth import (
     log_uniform,
     with_effects,
 )
+from benchmarks.hidden.flights import fly
+from benchmarks.hidden.noise import measure
+from benchmarks.hidden.outside import draw_outside
+from flytrack_bench.hidden import MOTIONS, Gust, Outside, Truth

@@ -3,8 +3,8 @@
 import numpy as np
 
 from benchmarks.hidden.pilot import Pilot, plan
-from benchmarks.hidden.plant import SAME_S, Plant, Start
-from benchmarks.hidden.truth import DT_S, Truth
+from flytrack_bench.hidden import DT_S, HiddenDrone, Start, Truth
+from flytrack_bench.hidden.drone import SAME_S
 from flytrack_sysid.log import FlightLog
 
 FLOOR_M, FASTEST = 0.1, 20.0  # m, m/s: the envelope of a flight
@@ -56,17 +56,17 @@ def _attempt(truth: Truth, seconds: float, rng: np.random.Generator, caution: in
     # An effect of position is centred on a point of the planned path.
     share = truth.outside.shape.get("at_share", 0.0) if truth.outside is not None else 0.0
     centre_w = moments[int(share * (len(moments) - 1))].pos_w
-    plant = Plant(truth, start, rng, seconds + SETTLE_S, centre_w, SETTLE_S)
+    drone = HiddenDrone(truth, start, rng, seconds + SETTLE_S, centre_w, SETTLE_S)
     pilot, rows, last = Pilot(truth, rng), [], -1
     planned = [*settling, *moments]
     for number in range(round(len(planned) * DT_S / truth.step_s)):
         # The pilot sends a command every 10 ms, or with every row where these are further apart.
         now = int(number * truth.step_s / DT_S + SAME_S)
         if now != last:
-            sticks, last = pilot.command(plant, planned[now]), now
-        state = (sticks, *plant.tracked, plant.acc_w, *plant.felt, (plant.battery_v,))
+            sticks, last = pilot.command(drone, planned[now]), now
+        state = (sticks, *drone.tracked, drone.acc_w, *drone.felt, (drone.battery_v,))
         rows.append([value for vector in state for value in vector])
-        plant.step(sticks)
+        drone.step(sticks)
     columns = np.split(np.array(rows), np.cumsum(list(CHANNELS.values()))[:-1], axis=1)
     return dict(zip(CHANNELS, columns, strict=True))
 

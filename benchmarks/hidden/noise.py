@@ -11,9 +11,11 @@ import numpy as np
 from scipy import signal
 from scipy.spatial.transform import Rotation
 
+from flytrack_bench.hidden.laws import SCALES
 from flytrack_sysid.log import FlightLog
 
-STD = {"p": 0.01, "v": 0.05, "f": 1.5, "q": np.deg2rad(0.5), "w": 0.1, "v_bat": 0.0}  # SI; q: about each axis
+# SI; q: about each axis. Laws outside the list are drawn in units of the noise in their channel.
+STD = {"p": 0.01, "v": 0.05, "f": SCALES["force"], "q": np.deg2rad(0.5), "w": SCALES["rate"], "v_bat": 0.0}
 # Resolution of a logged number: m, m/s, m/s^2, 1, rad/s, V; 16 bits over 32 g and 4000 deg/s.
 BITS = 2**16
 DIGIT = {

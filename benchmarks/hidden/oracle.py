@@ -14,8 +14,8 @@ import numpy as np
 from scipy import optimize, signal
 
 from benchmarks.hidden.noise import DIGIT, STD
-from benchmarks.hidden.plant import SECONDS_PER_MINUTE
-from benchmarks.hidden.truth import Truth
+from flytrack_bench.hidden import Truth
+from flytrack_bench.hidden.drone import SECONDS_PER_MINUTE
 from flytrack_env.dynamics import ModelParameters
 from flytrack_sysid.diagnosis.lanes import NUM_AXES, lanes_of
 from flytrack_sysid.diagnosis.model_selection import MOST_RIVALS, ablate

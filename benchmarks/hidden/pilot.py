@@ -15,9 +15,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from benchmarks.hidden.outside import FirstOrderNoise
-from benchmarks.hidden.truth import DT_S, STICKS, Truth, log_uniform
-from benchmarks.hidden.vectors import Vector, add, clip_length, norm, rotation, to_body, wrap_angle
+from benchmarks.hidden.draws import log_uniform
+from flytrack_bench.hidden import DT_S, STICKS, HiddenDrone, Truth
+from flytrack_bench.hidden.drone import Sticks
+from flytrack_bench.hidden.laws import FirstOrderNoise
+from flytrack_bench.hidden.vectors import Vector, add, clip_length, norm, rotation, to_body, wrap_angle
 
 Rng = np.random.Generator
 CLIMB, TURN_RATE = 5.0, math.radians(70.0)  # m/s, rad/s: what a plan asks for
@@ -297,33 +299,33 @@ class Pilot:
         self._tremble = FirstOrderNoise(TREMBLE_S, rng, len(truth.tau))
         self._stick, self._is_cut_off = FIRST_STICK, False
 
-    def command(self, plant, moment: Moment) -> tuple[float, float, float, float]:
+    def command(self, drone: HiddenDrone, moment: Moment) -> Sticks:
         """Return sticks in [-1, 1] for the plant's state at a moment of the plan."""
         has_stick = moment.sticks is not None
-        self._is_cut_off = has_stick and (self._is_cut_off or self._is_unsafe(plant))
+        self._is_cut_off = has_stick and (self._is_cut_off or self._is_unsafe(drone))
         is_free = not has_stick or self._is_cut_off
-        force_w = self._force(plant, moment, is_free)
-        own, shakes = self._sticks(plant, force_w, moment.heading), self._tremble.step(DT_S)
+        force_w = self._force(drone, moment, is_free)
+        own, shakes = self._sticks(drone, force_w, moment.heading), self._tremble.step(DT_S)
         hands = (None,) * len(own) if is_free else moment.sticks
         return tuple(
             max(-1.0, min(1.0, stick + TREMBLE * shake if hand is None else hand))
             for stick, shake, hand in zip(own, shakes, hands, strict=True)
         )
 
-    def _is_unsafe(self, plant) -> bool:
-        falling = max(0.0, -plant.vel_w[2])
-        low = plant.pos_w[2] - falling * falling / (2.0 * BRAKING) < ROOM_M
-        return low or norm(plant.vel_w) > FASTEST
+    def _is_unsafe(self, drone: HiddenDrone) -> bool:
+        falling = max(0.0, -drone.vel_w[2])
+        low = drone.pos_w[2] - falling * falling / (2.0 * BRAKING) < ROOM_M
+        return low or norm(drone.vel_w) > FASTEST
 
-    def _force(self, plant, moment: Moment, is_free: bool) -> Vector:
+    def _force(self, drone: HiddenDrone, moment: Moment, is_free: bool) -> Vector:
         """Return the wanted specific force, world, m/s^2."""
         gains = (self._level, self._level, self._upright)
         away = tuple(
             POSITION_PER_VELOCITY * gain * (there - here)
-            for gain, there, here in zip(gains, moment.pos_w, plant.pos_w, strict=True)
+            for gain, there, here in zip(gains, moment.pos_w, drone.pos_w, strict=True)
         )
         wanted = add(clip_length(away, MOST_CORRECTION), moment.vel_w)
-        error = tuple(a - b for a, b in zip(clip_length(wanted, MOST_SPEED), plant.vel_w, strict=True))
+        error = tuple(a - b for a, b in zip(clip_length(wanted, MOST_SPEED), drone.vel_w, strict=True))
         acc = [
             a + gain * e + k for a, gain, e, k in zip(moment.acc_w, gains, error, self._learnt_w, strict=True)
         ]
@@ -333,16 +335,16 @@ class Pilot:
                 for known, gain, e in zip(self._learnt_w, gains, clip_length(error, MOST_LESSON), strict=True)
             )
             self._learnt_w = clip_length(learn, MOST_LEARNT)
-        ahead = plant.pos_w[2] + LOOK_AHEAD_S * plant.vel_w[2]
+        ahead = drone.pos_w[2] + LOOK_AHEAD_S * drone.vel_w[2]
         if ahead < FLOOR_M:
             acc[2] += FLOOR_GAIN * self._upright * (FLOOR_M - ahead)
         up = self._truth.gravity + max(-MOST_DOWN, min(MOST_UP, acc[2]))
         side = clip_length((acc[0], acc[1], 0.0), up * math.tan(MOST_TILTED))
         return (side[0], side[1], up)
 
-    def _sticks(self, plant, force_w: Vector, heading: float) -> tuple[float, float, float, float]:
+    def _sticks(self, drone: HiddenDrone, force_w: Vector, heading: float) -> Sticks:
         """Return sticks that turn the thrust towards a force, and the nose towards a heading."""
-        rows = rotation(plant.quat)
+        rows = rotation(drone.quat)
         x, y, z = to_body(rows, force_w)
         across = math.hypot(x, y)
         angle = self._attitude * math.atan2(across, z) / max(across, TINY)
@@ -352,7 +354,7 @@ class Pilot:
             yaw = max(-MOST_YAW_RATE, min(MOST_YAW_RATE, YAW_GAIN * error))
         rates = (-angle * y, angle * x, yaw)
         sticks = tuple(rate / full for rate, full in zip(rates, self._full_rates, strict=True))
-        return (*sticks, self._thrust_stick(max(z, 0.0) * self._truth.mass, plant.battery_v))
+        return (*sticks, self._thrust_stick(max(z, 0.0) * self._truth.mass, drone.battery_v))
 
     def _thrust_stick(self, thrust_n: float, battery_v: float) -> float:
         """Return the stick for a thrust by the curve without effects, by Newton's method."""

@@ -67,7 +67,8 @@ def train_shared(job: str, out: Path, steps: int, seed: int) -> dict[str, Any]:
 
 def make_plant(job: str, seed: int) -> tuple[Any, str]:
     """Return the plant of a job, and its hidden effects as text."""
-    from benchmarks.loop.plants import draw_plant, draw_plant_with_law, plant_of
+    from benchmarks.loop.plants import draw_plant, draw_plant_with_law
+    from flytrack_bench.hidden import HiddenPlant
     from flytrack_env import blackbox
 
     if job == "shipped":
@@ -76,7 +77,7 @@ def make_plant(job: str, seed: int) -> tuple[Any, str]:
         truth = draw_plant_with_law(int(job.removeprefix(LAW)), seed)
     else:
         truth = draw_plant(int(job), seed)
-    return plant_of(truth), truth.text()
+    return HiddenPlant(truth), truth.text()
 
 
 def measure_plant(job: str, out: Path, steps: int, seed: int) -> dict[str, Any]:

@@ -1,22 +1,17 @@
-"""Hidden plants that an environment can fly, drawn from a seed; some have a law outside the package's list.
+"""Hidden drones for the loop, drawn from a seed; some have a law outside the package's list.
 
-Such laws are those of ``benchmarks.hidden.outside``, for JAX; a thermal is about the world's origin. A test
-compares each step with the plain floats of ``benchmarks.hidden.plant``.
+A thermal is about the world's origin.
 """
 
 import math
-from collections.abc import Callable
-from dataclasses import fields, replace
-from typing import Any
+from dataclasses import replace
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
 from benchmarks.hidden import EFFECTS as EFFECT_RANGES
-from benchmarks.hidden import Truth, draw_effect, draw_outside, log_uniform
-from benchmarks.hidden.outside import SCALES, TINY_SPEED, USUAL_SPEED_MS, heading_waves
-from flytrack_bench.plants import Craft, HiddenPlant
+from benchmarks.hidden import draw_effect, draw_outside, log_uniform
+from flytrack_bench.hidden import Truth
+from flytrack_bench.hidden.laws import STATELESS_KINDS
 from flytrack_env import nominal_parameters
 
 EFFECTS = (
@@ -37,67 +32,6 @@ LARGE = 2.0 / 3.0  # smallest size drawn, as a share of the log range
 HIDDEN = (("command_delay",), ("quadratic_drag",), ("thrust_scale",), 2, 3)
 LAW_AMPLITUDES = (1.0, 3.0)  # times the sensor's noise, as in benchmarks.beyond
 LATER = 5  # random effects of all later plants
-
-
-def _bump(value: jax.Array, middle: float, width: float) -> jax.Array:
-    return jnp.exp(-0.5 * ((value - middle) / width) ** 2)
-
-
-def _heading(to_world: jax.Array) -> jax.Array:
-    return jnp.arctan2(to_world[1, 0], to_world[0, 0])
-
-
-# Kind -> its signal, of shape, position, attitude and airspeed.
-SIGNALS: dict[str, Callable[[Any, jax.Array, jax.Array, jax.Array], jax.Array]] = {
-    "airspeed": lambda shape, pos_w, to_world, airspeed_b: _bump(
-        jnp.linalg.norm(airspeed_b), shape["speed_ms"], shape["width_ms"]
-    ),
-    "attitude": lambda shape, pos_w, to_world, airspeed_b: _bump(
-        jnp.rad2deg(jnp.arccos(jnp.clip(to_world[2, 2], -1.0, 1.0))), shape["tilt_deg"], shape["width_deg"]
-    ),
-    "heading": lambda shape, pos_w, to_world, airspeed_b: (
-        heading_waves(shape, _heading(to_world), jnp.cos) / shape["largest"]
-    ),
-    "flapping": lambda shape, pos_w, to_world, airspeed_b: airspeed_b[0] / USUAL_SPEED_MS,
-    "cable": lambda shape, pos_w, to_world, airspeed_b: jnp.cos(_heading(to_world) + shape["phase"]),
-    "position": lambda shape, pos_w, to_world, airspeed_b: _bump(
-        jnp.linalg.norm(pos_w), 0.0, shape["radius_m"]
-    ),
-}
-
-
-class PlantWithLaw(HiddenPlant):
-    """A hidden plant with a law of ``SIGNALS``."""
-
-    def __init__(self, truth: Truth):
-        super().__init__(craft_of(truth))
-        self.outside = truth.outside
-
-    def push(
-        self, pos_w: jax.Array, to_world: jax.Array, airspeed_b: jax.Array
-    ) -> tuple[jax.Array, jax.Array]:
-        """Return what the law adds; to_world: the rotation matrix of the attitude, (3, 3)."""
-        outside = self.outside
-        assert outside is not None
-        size = outside.amplitude * SCALES[outside.channel]
-        size = size * SIGNALS[outside.kind](outside.shape, pos_w, to_world, airspeed_b)
-        still = jnp.zeros(3, jnp.float32)
-        if outside.kind == "airspeed":
-            return -size * airspeed_b / jnp.maximum(jnp.linalg.norm(airspeed_b), TINY_SPEED), still
-        way = jnp.array([outside.shape[axis] for axis in "xyz"], jnp.float32)
-        if outside.kind in ("position", "cable"):
-            return size * (way @ to_world), still
-        return (still, size * way) if outside.channel == "rate" else (size * way, still)
-
-
-def plant_of(truth: Truth) -> HiddenPlant:
-    """Return a plant that flies a truth."""
-    return HiddenPlant(craft_of(truth)) if truth.outside is None else PlantWithLaw(truth)
-
-
-def craft_of(truth: Truth) -> Craft:
-    """Return the parameters of a truth's plant."""
-    return Craft(*(getattr(truth, one.name) for one in fields(Craft)))
 
 
 def _size(name: str, rng: np.random.Generator) -> float:
@@ -139,7 +73,7 @@ def draw_plant(number: int, seed: int) -> Truth:
 
 def draw_plant_with_law(number: int, seed: int) -> Truth:
     """Return a plant by its number, from 0, with a law outside the package's list; kinds take turns."""
-    rng = np.random.default_rng([seed, number, len(SIGNALS)])
-    kind = tuple(SIGNALS)[number % len(SIGNALS)]
+    rng = np.random.default_rng([seed, number, len(STATELESS_KINDS)])
+    kind = STATELESS_KINDS[number % len(STATELESS_KINDS)]
     outside = draw_outside(rng, kind, log_uniform(*LAW_AMPLITUDES, rng))
     return replace(draw_base(rng), outside=outside)

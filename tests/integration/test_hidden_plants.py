@@ -14,10 +14,10 @@ from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
 from benchmarks import hidden
-from benchmarks.hidden import plant
 from benchmarks.hidden.noise import COLOURS, LOST_ROWS, STD
-from benchmarks.hidden.plant import Plant, Start
-from benchmarks.loop.plants import EFFECTS, SIGNALS, draw_plant_with_law, plant_of
+from benchmarks.loop.plants import EFFECTS, draw_plant_with_law
+from flytrack_bench.hidden import HiddenDrone, HiddenPlant, Start, drone
+from flytrack_bench.hidden.laws import STATELESS_KINDS
 from flytrack_env import nominal_parameters
 from flytrack_sysid.log import FlightLog
 from tests.support.hidden_flights import LOW_START, flown_in_floats, random_sticks, state_of
@@ -78,7 +78,7 @@ def test_an_accelerometer_off_the_centre_feels_the_turn() -> None:
 @pytest.mark.parametrize("motion", hidden.MOTIONS)
 def test_a_flight_controller_shapes_the_sticks_before_the_lag(motion: str) -> None:
     def settled(stick: float, **effects: dict[str, float]) -> np.ndarray:
-        plant = Plant(replace(base(**effects), motion=motion), START, np.random.default_rng(0))
+        plant = HiddenDrone(replace(base(**effects), motion=motion), START, np.random.default_rng(0))
         for _ in range(200):
             plant.step((stick, -stick, stick, -0.2))
         return plant.felt.rates_b / np.radians([618.0, -618.0, 120.0])
@@ -88,7 +88,7 @@ def test_a_flight_controller_shapes_the_sticks_before_the_lag(motion: str) -> No
     np.testing.assert_allclose(settled(0.5, rate_expo=lost), 0.5 - 0.375 * np.array([0.2, 0.1, 0.05]))
     # Of a step by the whole stick: the setpoint rises evenly, and the lag follows it tau later.
     slow = {"roll_s": 0.3, "pitch_s": 0.2, "yaw_s": 0.4}
-    plant = Plant(replace(base(rate_slew_limit=slow), motion=motion), START, np.random.default_rng(0))
+    plant = HiddenDrone(replace(base(rate_slew_limit=slow), motion=motion), START, np.random.default_rng(0))
     for _ in range(18):
         plant.step((1.0, 1.0, 1.0, -0.2))
     tau, times_s = np.array(base().tau[:3]), np.array(list(slow.values()))
@@ -201,7 +201,7 @@ def test_fine_motion_obeys_the_differential_equations(monkeypatch: pytest.Monkey
 
     found = errors()
     assert all(found[name] < bound for name, bound in FINE_ERRORS.items()), found
-    monkeypatch.setattr(plant, "LONGEST_PART_S", 0.5 * plant.LONGEST_PART_S)
+    monkeypatch.setattr(drone, "LONGEST_PART_S", 0.5 * drone.LONGEST_PART_S)
     halved = errors()
     assert all(found[name] > 3.0 * halved[name] for name in exact), (found, halved)
 
@@ -229,8 +229,8 @@ def check_flight(truth: hidden.Truth, without: hidden.Truth | None, rng: np.rand
     """Compare both flights; that without what is tested, if any, has to differ."""
     commands = np.repeat(rng.uniform(-1.0, 1.0, (LOOP_STEPS // 4, 4)), 4, axis=0).astype(np.float32)
     expected = flown_in_floats(truth, commands)["x"]
-    start = jnp.asarray(state_of(Plant(truth, LOW_START, rng)), jnp.float32)
-    found = flown_by(plant_of(truth), nominal_parameters(), start, commands)
+    start = jnp.asarray(state_of(HiddenDrone(truth, LOW_START, rng)), jnp.float32)
+    found = flown_by(HiddenPlant(truth), nominal_parameters(), start, commands)
     np.testing.assert_allclose(found, expected, rtol=2e-4, atol=2e-4)
     assert without is None or np.abs(expected - flown_in_floats(without, commands)["x"]).max() > 1e-3
 
@@ -243,7 +243,7 @@ def test_the_flight_is_that_in_plain_floats(names):
     check_flight(truth, base if names else None, rng)
 
 
-@pytest.mark.parametrize("number", range(len(SIGNALS)), ids=SIGNALS)
+@pytest.mark.parametrize("number", range(len(STATELESS_KINDS)), ids=STATELESS_KINDS)
 def test_a_law_outside_the_list_acts_as_in_plain_floats(number):
     truth = draw_plant_with_law(number, seed=1)
     check_flight(truth, replace(truth, outside=None), np.random.default_rng(number))

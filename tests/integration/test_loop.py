@@ -9,7 +9,8 @@ from baselines.purejaxrl_ppo import load_checkpoint
 from baselines.purejaxrl_ppo.flights import Score, fly_many
 from baselines.purejaxrl_ppo.race_env import plant_env
 from benchmarks.champion import CHAMPION
-from benchmarks.loop.plants import draw_plant, plant_of
+from benchmarks.loop.plants import draw_plant
+from flytrack_bench.hidden import HiddenPlant
 from flytrack_env import nominal_parameters
 from flytrack_loop import Gap, errors_of
 from flytrack_loop.stages import log_of_flights, measure_gap
@@ -63,7 +64,7 @@ def test_errors_are_those_of_the_model(log):
 def test_the_gap_is_between_the_plant_and_the_simulator_learnt_in(champion):
     lost = draw_plant(2, 0)
     assert set(lost.effects) == {"thrust_scale"} and lost.effects["thrust_scale"]["factor"] < 1.0
-    gap = measure_gap(champion, plant_of(lost), seed=1, episodes=8)
+    gap = measure_gap(champion, HiddenPlant(lost), seed=1, episodes=8)
     assert gap.simulator.success == 1.0 > gap.plant.success
 
 

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.hidden import Truth, draw_base, fly, measure
-from benchmarks.hidden.plant import Plant, Start
+from flytrack_bench.hidden import HiddenDrone, Start
 from flytrack_sysid.log import FlightLog
 
 LOW_START = Start((1.0, -2.0, 3.0), 0.7, 23.5, -0.3)
@@ -21,7 +21,7 @@ def scripted(seed: int, seconds: float, noise: str = "sensors", **changes: Any) 
     return truth, measure(fly(truth, seconds, rng), noise, rng)
 
 
-def state_of(plant: Plant) -> np.ndarray:
+def state_of(plant: HiddenDrone) -> np.ndarray:
     """Return the handout's vector (21,) of a plant."""
     own = (plant.pos_w, plant.vel_w, plant.acc_w, plant.quat, plant.rates_b, plant.applied)
     return np.concatenate([*own, [plant.battery_v]])
@@ -29,7 +29,7 @@ def state_of(plant: Plant) -> np.ndarray:
 
 def flown_in_floats(truth: Truth, commands: Any, start: Start = LOW_START) -> dict[str, np.ndarray]:
     """Return ``COLUMNS`` after each command, (num_steps, n)."""
-    plant, rows = Plant(truth, start, np.random.default_rng(5)), []
+    plant, rows = HiddenDrone(truth, start, np.random.default_rng(5)), []
     for command in np.asarray(commands, float).tolist():
         plant.step(tuple(command))
         rows.append(np.concatenate([state_of(plant), *plant.tracked, *plant.felt]))

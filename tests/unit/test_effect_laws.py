@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from benchmarks import hidden
 from benchmarks.diagnosis import model_of
 from benchmarks.hidden.flights import imu_readings
-from benchmarks.hidden.plant import Plant as HiddenPlant
+from flytrack_bench.hidden import HiddenDrone
 from flytrack_env import effects
 from flytrack_env.dynamics import nominal_parameters
 from flytrack_env.effects.command_delay import LONGEST_STEPS, USUAL_STEPS
@@ -67,7 +67,7 @@ def test_laws_are_those_of_hidden_plants_in_plain_floats(names: tuple[str, ...])
     commands = np.concatenate([held(5, thrust=LOW_START.thrust_stick), random_sticks(100)])
     expected = flown_in_floats(truth, commands)
     force_b, rates_b = imu_readings(truth, expected["f"], expected["w"], expected["slope"])
-    drone = unpack(state_of(HiddenPlant(truth, LOW_START, rng)).astype(np.float32))
+    drone = unpack(state_of(HiddenDrone(truth, LOW_START, rng)).astype(np.float32))
     if "quadratic_drag" in values:  # theirs is never shared between the axes
         values["quadratic_drag"] |= {"shared": 0.0}
     parameters = tuple(effects.BY_NAME[name].parameters(**own) for name, own in values.items())

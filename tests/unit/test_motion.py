@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from benchmarks.hidden import Truth, plant
+from flytrack_bench.hidden import HiddenDrone, Truth, drone
 from flytrack_env import effects
 from flytrack_env.dynamics import ModelParameters, move
 from flytrack_env.motion import Motion
@@ -31,7 +31,7 @@ FULL = LOOP.with_effects(effects.CommandDelay(0.013))
 START = np.array([0, 0, 5, 3, -2, 1, 0, 0, 0, 0.9, 0.1, -0.3, 0.3, 0, 0, 0, 0.1, -0.2, 0.3, 0.2, 23.5])
 START[9:13] /= np.linalg.norm(START[9:13])
 START[13:16] = np.radians(FULL_RATES) * START[16:19]
-AT_REST = state_of(plant.Plant(Truth(TAU, COEFFS), LOW_START, np.random.default_rng(0)))
+AT_REST = state_of(HiddenDrone(Truth(TAU, COEFFS), LOW_START, np.random.default_rng(0)))
 
 
 def held_commands() -> np.ndarray:
@@ -58,7 +58,7 @@ def reference(model: ModelParameters) -> tuple[np.ndarray, ...]:
     own = (tuple(map(float, one)) for one in (TAU, COEFFS, FULL_RATES))
     truth = Truth(*own, DRAIN, MASS, GRAVITY, own_effects, motion="fine", step_s=COMMAND_S)
     with pytest.MonkeyPatch.context() as patched:
-        patched.setattr(plant, "LONGEST_PART_S", 5e-5)
+        patched.setattr(drone, "LONGEST_PART_S", 5e-5)
         found = flown_in_floats(truth, held_commands(), LOW_START)
     return tuple(found[name] for name in "pvqf")
 

@@ -1,4 +1,4 @@
-"""The plant in plain floats, and the hidden effects' equations; it moves in one of three ways.
+"""A hidden drone's equations, and those of its effects; it moves in one of three ways.
 
 - handout: the handout's step. Rates after the step turn the drone, the force acts in the attitude before it.
 - semi_implicit: the same, but the force acts in the attitude after the step.
@@ -7,38 +7,43 @@
   sensor falls. What the sensors say is true at an instant, not of a step.
 
 An effect acts at a stage: commands, body rates, thrust, forces. Its function takes its parameters and returns
-a hook, a function of the plant and the value so far: sticks (roll, pitch, yaw, thrust) in [-1, 1], body rates
-in rad/s, thrust in N. Hooks of forces take the plant alone and return what they add to the specific force,
+a hook, a function of the drone and the value so far: sticks (roll, pitch, yaw, thrust) in [-1, 1], body rates
+in rad/s, thrust in N. Hooks of forces take the drone alone and return what they add to the specific force,
 body, m/s^2. Where the package has another law for an effect of the same name, the difference is intended: no
 real plant follows the package's laws.
 """
 
 import cmath
 import math
-from collections import deque
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.optimize import brentq
 
-from benchmarks.hidden.outside import SCALES, FirstOrderNoise, command_hook, noise_hook, vector_hook
-from benchmarks.hidden.truth import STICKS, Truth
-from benchmarks.hidden.vectors import (
+from flytrack_bench.hidden.laws import SCALES, FirstOrderNoise, command_hook, noise_hook, vector_hook
+from flytrack_bench.hidden.truth import STICKS, Truth
+from flytrack_bench.hidden.vectors import (
+    Number,
     Quaternion,
     Vector,
     add,
+    exp,
+    expm1,
     integrate_attitude,
+    maximum,
     rotation,
     scale,
+    tanh,
     to_body,
     to_world,
     turn,
+    where,
 )
 
 Parameters = Mapping[str, float]
-Sticks = tuple[float, float, float, float]
-Hook = Callable[[Any, Any], Any]
+Sticks = tuple[Number, ...]  # roll, pitch, yaw, thrust
+Hook = Callable[..., Any]
 SECONDS_PER_MINUTE = 60.0
 TINY, LARGE = 1e-3, 1e3  # between which the bend of a saturation is searched
 LIFT_SPEED = 8.0  # m/s, airspeed at which translational lift has 1 - 1/e of its gain
@@ -47,31 +52,10 @@ LONGEST_PART_S = 0.001
 SAME_S = 1e-9  # instants nearer than this are one
 
 
-class Delay:
-    """Commands that are held for a step each, and act ``delay_s`` later."""
-
-    def __init__(self, delay_s: float, step_s: float):
-        whole, self.share = divmod(delay_s / step_s, 1.0)
-        self._past: deque[Sticks] = deque(maxlen=int(whole) + 2)
-
-    def arriving(self, sticks: Sticks) -> tuple[Sticks, Sticks]:
-        """Return what acts in the first ``share`` of the step in which sticks are sent, and in the rest."""
-        past = self._past
-        past.appendleft(sticks)
-        late = past.maxlen - 2
-        return past[min(late + 1, len(past) - 1)], past[min(late, len(past) - 1)]
-
-    def mean(self, sticks: Sticks) -> Sticks:
-        """Return the mean of what acts in the step."""
-        older, newer = self.arriving(sticks)
-        part = self.share
-        return tuple((1.0 - part) * new + part * old for new, old in zip(newer, older, strict=True))
-
-
 def _rate_expo(values: Parameters) -> Hook:
     """u *= (1 - expo) + expo u^2, u a rate stick; each axis has its own."""
     expos = tuple(values[axis] for axis in STICKS)
-    return lambda plant, sticks: (
+    return lambda drone, sticks: (
         *(u * (1.0 - expo * (1.0 - u * u)) for u, expo in zip(sticks, expos, strict=False)),
         sticks[3],
     )
@@ -80,7 +64,7 @@ def _rate_expo(values: Parameters) -> Hook:
 def _rate_scale(values: Parameters) -> Hook:
     """omega *= (roll, pitch, yaw)."""
     roll, pitch, yaw = values["roll"], values["pitch"], values["yaw"]
-    return lambda plant, rates: (roll * rates[0], pitch * rates[1], yaw * rates[2])
+    return lambda drone, rates: (roll * rates[0], pitch * rates[1], yaw * rates[2])
 
 
 def _rate_saturation(values: Parameters) -> Hook:
@@ -91,8 +75,8 @@ def _rate_saturation(values: Parameters) -> Hook:
     # At a bend x, tanh(x) / x is what is left.
     left = (1.0 - values[axis] for axis in STICKS)
     bends = [brentq(lambda x, share: math.tanh(x) - share * x, TINY, LARGE, share) for share in left]
-    return lambda plant, sticks: (
-        *(math.tanh(bend * u) / bend for u, bend in zip(sticks, bends, strict=False)),
+    return lambda drone, sticks: (
+        *(tanh(bend * u) / bend for u, bend in zip(sticks, bends, strict=False)),
         sticks[3],
     )
 
@@ -100,19 +84,19 @@ def _rate_saturation(values: Parameters) -> Hook:
 def _rate_cross_coupling(values: Parameters) -> Hook:
     """omega_z += from_roll omega_x + from_pitch omega_y."""
     from_roll, from_pitch = values["from_roll"], values["from_pitch"]
-    return lambda plant, rates: (*rates[:2], rates[2] + from_roll * rates[0] + from_pitch * rates[1])
+    return lambda drone, rates: (*rates[:2], rates[2] + from_roll * rates[0] + from_pitch * rates[1])
 
 
 def _motor_imbalance(values: Parameters) -> Hook:
     """omega_x += roll T/m, omega_y += pitch T/m; rad/s per m/s^2."""
     gains = (values["roll"], values["pitch"], 0.0)
-    return lambda plant, rates: tuple(w + k * plant.thrust_acc for w, k in zip(rates, gains, strict=True))
+    return lambda drone, rates: tuple(w + k * drone.thrust_acc for w, k in zip(rates, gains, strict=True))
 
 
 def _yaw_reaction(values: Parameters) -> Hook:
     """omega_z += angle du/dt, u the lagged thrust stick; rad."""
     angle = values["angle"]
-    return lambda plant, rates: (*rates[:2], rates[2] + angle * plant.thrust_stick_slope)
+    return lambda drone, rates: (*rates[:2], rates[2] + angle * drone.thrust_stick_slope)
 
 
 class RateLoop:
@@ -156,13 +140,13 @@ def _rate_slew_limit(values: Parameters) -> Hook:
     """A rate stick takes a least time from centre to full, s; each axis has its own."""
     before, times_s = [0.0, 0.0, 0.0], tuple(values[f"{axis}_s"] for axis in STICKS)
 
-    def act(plant: Any, sticks: Sticks) -> Sticks:
+    def act(drone: Any, sticks: Sticks) -> Sticks:
         meant = []
         for axis, full_s in enumerate(times_s):
-            most = plant.part_s / full_s
+            most = drone.part_s / full_s
             change = max(-most, min(most, sticks[axis] - before[axis]))
             # Where time is continuous, what is asked for on the way; a step asks for its end.
-            meant.append(before[axis] + (0.5 * change if plant.is_fine else change))
+            meant.append(before[axis] + (0.5 * change if drone.is_fine else change))
             before[axis] += change
         return (*meant, sticks[3])
 
@@ -171,7 +155,7 @@ def _rate_slew_limit(values: Parameters) -> Hook:
 
 def _thrust_scale(values: Parameters) -> Hook:
     """T *= factor."""
-    return lambda plant, thrust: values["factor"] * thrust
+    return lambda drone, thrust: values["factor"] * thrust
 
 
 def _translational_lift(values: Parameters) -> Hook:
@@ -181,9 +165,9 @@ def _translational_lift(values: Parameters) -> Hook:
     """
     gain = values["gain"]
 
-    def act(plant: Any, thrust: float) -> float:
-        x, y, _ = plant.airspeed_b
-        return thrust * (1.0 - gain * math.expm1(-(x * x + y * y) / LIFT_SPEED**2))
+    def act(drone: Any, thrust: Number) -> Number:
+        x, y, _ = drone.airspeed_b
+        return thrust * (1.0 - gain * expm1(-(x * x + y * y) / LIFT_SPEED**2))
 
     return act
 
@@ -194,13 +178,13 @@ def _ground_effect(values: Parameters) -> Hook:
     Not the package's law, which falls off with 1 / z^2.
     """
     gain, height = values["gain"], values["height_m"]
-    return lambda plant, thrust: thrust * (1.0 + gain * math.exp(-max(plant.pos_w[2], 0.0) / height))
+    return lambda drone, thrust: thrust * (1.0 + gain * exp(-maximum(drone.pos_w[2], 0.0) / height))
 
 
 def _linear_drag(values: Parameters) -> Hook:
     """f -= (d_x v_x, d_y v_y, d_z v_z), v the airspeed in the body."""
     drag = (values["d_x"], values["d_y"], values["d_z"])
-    return lambda plant: tuple(-d * v for d, v in zip(drag, plant.airspeed_b, strict=True))
+    return lambda drone: tuple(-d * v for d, v in zip(drag, drone.airspeed_b, strict=True))
 
 
 def _quadratic_drag(values: Parameters) -> Hook:
@@ -209,25 +193,25 @@ def _quadratic_drag(values: Parameters) -> Hook:
     The package's law with ``shared`` at 0; by default it multiplies each axis by the whole speed.
     """
     drag = (values["k_x"], values["k_y"], values["k_z"])
-    return lambda plant: tuple(-k * abs(v) * v for k, v in zip(drag, plant.airspeed_b, strict=True))
+    return lambda drone: tuple(-k * abs(v) * v for k, v in zip(drag, drone.airspeed_b, strict=True))
 
 
 def _rotor_drag(values: Parameters) -> Hook:
     """f -= h T/m (v_x, v_y, 0), v the airspeed in the body."""
     h = values["h"]
-    return lambda plant: scale(-h * plant.thrust_acc, (*plant.airspeed_b[:2], 0.0))
+    return lambda drone: scale(-h * drone.thrust_acc, (*drone.airspeed_b[:2], 0.0))
 
 
 def _thrust_tilt(values: Parameters) -> Hook:
     """f += T/m (towards_x, towards_y, 0); rad."""
     x, y = values["towards_x"], values["towards_y"]
-    return lambda plant: (x * plant.thrust_acc, y * plant.thrust_acc, 0.0)
+    return lambda drone: (x * drone.thrust_acc, y * drone.thrust_acc, 0.0)
 
 
 def _wind(values: Parameters) -> Hook:
-    """f += R^T a; the air's velocity is part of ``plant.airspeed_b`` already."""
+    """f += R^T a; the air's velocity is part of ``drone.airspeed_b`` already."""
     push_w = tuple(values.get(name, 0.0) for name in ("a_x", "a_y", "a_z"))
-    return lambda plant: to_body(plant.rows, push_w)
+    return lambda drone: to_body(drone.rows, push_w)
 
 
 # In the order in which they act: first what a flight controller makes of the sticks, then the frame.
@@ -290,12 +274,13 @@ class Part(NamedTuple):
     is_tracked: bool
 
 
-class Plant:
+class HiddenDrone:
     """A drone in flight; attributes are its state, updated by ``step``.
 
     pos_w, vel_w, acc_w: m, m/s, m/s^2. quat: body to world; rows: of the matrix in which the force acted.
     rates_b: rad/s. force_b: specific force, m/s^2. applied: lagged sticks; thrust_stick_slope: of the last of
-    them, 1/s. battery_v: V, under load. thrust_acc: thrust over mass, m/s^2. airspeed_b: m/s. time_s: s.
+    them, 1/s. battery_v, open_v: V, under load and without. thrust_acc: thrust over mass, m/s^2. airspeed_b:
+    m/s. time_s: s. past: commands that a delay remembers, the latest first, once has_flown.
     felt, tracked: what the sensors report of this step; in fine motion, at a late sensor's instant in it.
     """
 
@@ -320,9 +305,9 @@ class Plant:
         self.full_rates = tuple(math.radians(rate) for rate in truth.max_rate)
         self.is_fine, self.part_s = truth.motion == "fine", truth.step_s
         self._sag_v = truth.effects.get("voltage_sag", {}).get("at_full_v", 0.0)
-        self._open_v, self.time_s = start.open_v, 0.0
+        self.open_v, self.time_s = start.open_v, 0.0
         self._onset_s = -math.inf if truth.onset_s is None else truth.onset_s + settle_s
-        self.battery_v = self._loaded_v()
+        self.battery_v = self.loaded_v()
         self._air_w = tuple(truth.effects.get("wind", {}).get(name, 0.0) for name in AIR_VELOCITY)
         self._turning_b: Vector = (0.0, 0.0, 0.0)
         self.felt = Felt(self.force_b, self.rates_b, self.rates_b)
@@ -338,13 +323,17 @@ class Plant:
         """Collect the hooks of each stage, in the order of its table."""
         effects, outside, gust = self.truth.effects, self.truth.outside, self.truth.gust
 
-        def made(makers: dict) -> list:
+        def made(makers: Mapping[str, Callable[[Parameters], Hook]]) -> list[Hook]:
             return [self._from_onset(make(effects[name])) for name, make in makers.items() if name in effects]
 
         self._command_hooks, self._rate_hooks = made(COMMAND_EFFECTS), made(RATE_EFFECTS)
         self._thrust_hooks, self._force_hooks = made(THRUST_EFFECTS), made(FORCE_EFFECTS)
-        self._turn_hooks, self._noises = [], []
-        self._delay = Delay(effects.get("command_delay", {}).get("delay_s", 0.0), self.truth.step_s)
+        self._turn_hooks: list[Hook] = []
+        self._noises: list[FirstOrderNoise] = []
+        delay_s = effects.get("command_delay", {}).get("delay_s", 0.0)
+        whole, self._late_share = divmod(delay_s / self.truth.step_s, 1.0)
+        self.past: tuple[Sticks, ...] = ((0.0, 0.0, 0.0, 0.0),) * (int(whole) + 2)
+        self.has_flown: Any = False
         loop = effects.get("second_order_rates")
         self._loop = RateLoop(loop) if loop else None
         if outside is not None and outside.kind == "command":
@@ -365,14 +354,14 @@ class Plant:
             self._noises.insert(0 if is_rate else len(self._noises), process)
             (self._turn_hooks if is_rate else self._force_hooks).append(noise_hook(process, size, channel))
 
-    def _from_onset(self, hook):
+    def _from_onset(self, hook: Hook) -> Hook:
         """Return a hook that acts from the onset on."""
         if self.truth.onset_s is None:
             return hook
 
-        def act(plant, *value):
-            if plant.time_s >= self._onset_s:
-                return hook(plant, *value)
+        def act(drone: Any, *value: Any) -> Any:
+            if drone.time_s >= self._onset_s:
+                return hook(drone, *value)
             return value[0] if value else (0.0, 0.0, 0.0)
 
         return act
@@ -380,7 +369,7 @@ class Plant:
     def _planned_parts(self) -> list[Part]:
         """Return the parts of a step of fine motion."""
         step_s, effects = self.truth.step_s, self.truth.effects
-        arrives_s = self._delay.share * step_s
+        arrives_s = self._late_share * step_s
         felt_s = step_s - effects.get("imu_latency", {}).get("latency_s", 0.0) % step_s
         tracked_s = step_s - self.truth.mocap_late_s % step_s
         parts, begin = [], 0.0
@@ -394,8 +383,9 @@ class Plant:
             begin = end
         return parts
 
-    def _loaded_v(self) -> float:
-        return self._open_v - self._sag_v * (0.5 + 0.5 * self.applied[3]) ** 2
+    def loaded_v(self) -> Number:
+        """Return the battery's voltage under the load of the applied thrust stick."""
+        return self.open_v - self._sag_v * (0.5 + 0.5 * self.applied[3]) ** 2
 
     def step(self, sticks: Sticks) -> None:
         """Fly from one row of the log to the next under a command in [-1, 1]."""
@@ -404,7 +394,10 @@ class Plant:
             return
         step_s = self.truth.step_s
         self._pass_noise(step_s)
-        self._lag(self._shaped(self._delay.mean(sticks)), step_s)
+        older, newer = self._arriving(sticks)
+        part = self._late_share
+        mean = tuple((1.0 - part) * new + part * old for new, old in zip(newer, older, strict=True))
+        self._lag(self._shaped(mean), step_s)
         before = self.quat
         asked = self._asked(before)
         if self._loop is not None:
@@ -420,7 +413,7 @@ class Plant:
         self.tracked = Tracked(self.pos_w, self.vel_w, self.quat)
 
     def _step_finely(self, sticks: Sticks) -> None:
-        older, newer = self._delay.arriving(sticks)
+        older, newer = self._arriving(sticks)
         for part_s, is_new, is_felt, is_tracked in self._parts:
             acting = newer if is_new else older
             begin = self._rates_now(acting) if is_felt else None
@@ -429,6 +422,18 @@ class Plant:
                 self._feel(begin, middle, self._rates_now(acting), part_s)
             if is_tracked:
                 self.tracked = Tracked(self.pos_w, self.vel_w, self.quat)
+
+    def _arriving(self, sticks: Sticks) -> tuple[Sticks, Sticks]:
+        """Return what acts in the first ``_late_share`` of a step in which sticks are sent, and in the rest.
+
+        Before the first command that one acts.
+        """
+        self.past = tuple(
+            tuple(where(self.has_flown, old, new) for old, new in zip(command, sticks, strict=True))
+            for command in (sticks, *self.past[:-1])
+        )
+        self.has_flown = True
+        return self.past[-1], self.past[-2]
 
     def _feel(self, begin: Vector, middle: Vector, end: Vector, part_s: float) -> None:
         """Set what an inertial sensor feels now, at the end of a part with these body rates."""
@@ -471,8 +476,8 @@ class Plant:
             process.step(step_s)
 
     def _pass_time(self, step_s: float) -> None:
-        self._open_v -= self.truth.drain / SECONDS_PER_MINUTE * step_s
-        self.battery_v = self._loaded_v()
+        self.open_v -= self.truth.drain / SECONDS_PER_MINUTE * step_s
+        self.battery_v = self.loaded_v()
         self.time_s += step_s
 
     def _shaped(self, sticks: Sticks) -> Sticks:
@@ -482,7 +487,7 @@ class Plant:
 
     def _lag(self, command: Sticks, step_s: float) -> None:
         before, (*rates, rising, falling) = self.applied, self._shares[step_s]
-        shares = (*rates, falling if command[3] < before[3] else rising)
+        shares = (*rates, where(command[3] < before[3], falling, rising))
         pairs = zip(before, command, shares, strict=True)
         self.applied = tuple(stick + share * (asked - stick) for stick, asked, share in pairs)
         if self.is_fine:

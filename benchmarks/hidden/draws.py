@@ -1,97 +1,17 @@
-"""Plants with hidden effects: their parameters, the list of effects, and how plants are drawn.
+"""How plants with hidden effects are drawn.
 
 Each effect is drawn by its **size**, log-uniform between what a flight of a minute barely shows under the
 noise of ``benchmarks.hidden.noise`` and what cannot be missed. ``EFFECTS`` gives the unit of each size.
 """
 
 import math
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 
-GRAVITY = 9.80665  # m/s^2
-DT_S = 0.01  # of a plan's moments, and between commands
-STICKS = ("roll", "pitch", "yaw")  # those of body rates
-MOTIONS = ("handout", "semi_implicit", "fine")
-
-
-@dataclass(frozen=True)
-class Outside:
-    """An effect outside the package's list.
-
-    kind: of ``benchmarks.hidden.outside.KINDS``. depends_on: tags of what it is a function of. channel: what
-    it changes, of ``outside.SCALES``. amplitude: its largest size over the noise of
-    ``benchmarks.hidden.noise`` in that channel. shape: parameters of the kind.
-    """
-
-    kind: str
-    depends_on: tuple[str, ...]
-    channel: str
-    amplitude: float
-    shape: Mapping[str, float]
-
-
-@dataclass(frozen=True)
-class Gust:
-    """Gusts as a first-order random process per world axis, felt by the accelerometer.
-
-    std: m/s^2, specific force. time_constant: s. rate_std: rad/s, the same of body rates; 0 for none.
-    """
-
-    std: float
-    time_constant: float
-    rate_std: float = 0.0
-
-
-@dataclass(frozen=True)
-class Truth:
-    """A plant; the handout's if it has no effects.
-
-    tau: s. coeffs: N, of 1, u, u^2, u^3, V, u V. max_rate: deg/s. drain: V/min. mass: kg. gravity: m/s^2.
-    effects: name -> parameter -> value, units as in ``EFFECTS``. onset_s: time in the log at
-    which all effects begin; None: before it. motion: of ``MOTIONS``, see ``benchmarks.hidden.plant``. step_s:
-    between rows of the log. mocap_late_s: by which position, velocity and attitude are logged late.
-    """
-
-    tau: tuple[float, float, float, float]
-    coeffs: tuple[float, float, float, float, float, float]
-    max_rate: tuple[float, float, float] = (618.0, 618.0, 120.0)
-    drain: float = 1.0
-    mass: float = 1.0
-    gravity: float = GRAVITY
-    effects: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
-    outside: Outside | None = None
-    gust: Gust | None = None
-    onset_s: float | None = None
-    motion: str = "handout"
-    step_s: float = DT_S
-    mocap_late_s: float = 0.0
-
-    def thrust(self, stick: float, battery_v: float) -> float:
-        """Return thrust without effects, N, of an applied thrust stick at a voltage."""
-        one, linear, square, cube, volt, both = self.coeffs
-        return one + stick * (linear + stick * (square + stick * cube)) + battery_v * (volt + stick * both)
-
-    def text(self) -> str:
-        """Return the hidden effects in one line."""
-        parts = [f"{name}({_values(values)})" for name, values in self.effects.items()]
-        if self.outside is not None:
-            out = self.outside
-            tags = ", ".join(out.depends_on)
-            parts.append(f"outside {out.kind}[{tags}] on {out.channel} x{out.amplitude:.3g}")
-        if self.gust is not None:
-            parts.append(f"gust({self.gust.std:.3g} m/s^2, {self.gust.time_constant:.3g} s)")
-        if self.mocap_late_s:
-            parts.append(f"motion capture {1e3 * self.mocap_late_s:.3g} ms late")
-        when = "" if self.onset_s is None else f" from {self.onset_s:.1f} s on"
-        return (" + ".join(parts) or "no effects") + when
-
-
-def _values(values: Mapping[str, float]) -> str:
-    return ", ".join(f"{name} {value:.3g}" for name, value in values.items())
-
+from flytrack_bench.hidden import GRAVITY, STICKS, Gust, Truth
 
 Values = dict[str, float]
 Rng = np.random.Generator

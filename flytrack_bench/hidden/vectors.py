@@ -1,12 +1,45 @@
-"""Vectors and quaternions as tuples of floats, which is much faster than arrays for three numbers."""
+"""Numbers, vectors and quaternions of hidden drones: tuples of Python floats, or of JAX scalars.
+
+Equations are written once for both: in floats, where a pilot closes the loop, which is much faster than with
+arrays of three numbers; and traced, where JAX flies many drones at once.
+"""
 
 import math
+from collections.abc import Callable
+from typing import Any
 
-Vector = tuple[float, float, float]
-Quaternion = tuple[float, float, float, float]
+import jax.numpy as jnp
+import numpy as np
+
+Number = Any  # a Python float or a JAX scalar
+Vector = tuple[Number, ...]  # x, y, z
+Quaternion = tuple[Number, ...]  # w, x, y, z
 
 
-def rotation(quat: Quaternion) -> tuple[Vector, Vector, Vector]:
+def _either(plain: Callable[..., float], traced: Callable[..., Any]) -> Callable[..., Any]:
+    """Return a function of Python floats or, if the first is none, of JAX scalars."""
+    return lambda *values: (plain if isinstance(values[0], float) else traced)(*values)
+
+
+exp = _either(math.exp, jnp.exp)
+expm1 = _either(math.expm1, jnp.expm1)
+tanh = _either(math.tanh, jnp.tanh)
+sqrt = _either(math.sqrt, jnp.sqrt)
+cos = _either(math.cos, jnp.cos)
+acos = _either(math.acos, jnp.arccos)
+atan2 = _either(math.atan2, jnp.arctan2)
+maximum = _either(max, jnp.maximum)
+minimum = _either(min, jnp.minimum)
+
+
+def where(condition: Any, first: Number, second: Number) -> Number:
+    """Return the first number where the condition holds, else the second."""
+    if isinstance(condition, (bool, np.bool_)):
+        return first if condition else second
+    return jnp.where(condition, first, second)
+
+
+def rotation(quat: Quaternion) -> tuple[Vector, ...]:
     """Return the rows of the rotation matrix, body to world; quat: w, x, y, z of norm 1."""
     w, x, y, z = quat
     return (
@@ -16,13 +49,13 @@ def rotation(quat: Quaternion) -> tuple[Vector, Vector, Vector]:
     )
 
 
-def to_world(rows: tuple[Vector, Vector, Vector], vector_b: Vector) -> Vector:
+def to_world(rows: tuple[Vector, ...], vector_b: Vector) -> Vector:
     """Return a body vector in the world frame."""
     x, y, z = vector_b
     return tuple(row[0] * x + row[1] * y + row[2] * z for row in rows)
 
 
-def to_body(rows: tuple[Vector, Vector, Vector], vector_w: Vector) -> Vector:
+def to_body(rows: tuple[Vector, ...], vector_w: Vector) -> Vector:
     """Return a world vector in the body frame."""
     first, second, third = rows
     x, y, z = vector_w
@@ -44,7 +77,7 @@ def integrate_attitude(quat: Quaternion, rates_b: Vector, step_s: float) -> Quat
         y + w * pitch - x * yaw + z * roll,
         z + w * yaw + x * pitch - y * roll,
     )
-    norm = math.sqrt(new[0] * new[0] + new[1] * new[1] + new[2] * new[2] + new[3] * new[3])
+    norm = sqrt(new[0] * new[0] + new[1] * new[1] + new[2] * new[2] + new[3] * new[3])
     return (new[0] / norm, new[1] / norm, new[2] / norm, new[3] / norm)
 
 
@@ -69,14 +102,14 @@ def add(first: Vector, second: Vector) -> Vector:
     return (first[0] + second[0], first[1] + second[1], first[2] + second[2])
 
 
-def scale(factor: float, vector: Vector) -> Vector:
+def scale(factor: Number, vector: Vector) -> Vector:
     """Return a vector times a number."""
     return (factor * vector[0], factor * vector[1], factor * vector[2])
 
 
-def norm(vector: Vector) -> float:
+def norm(vector: Vector) -> Number:
     """Return the length of a vector."""
-    return math.sqrt(vector[0] * vector[0] + vector[1] * vector[1] + vector[2] * vector[2])
+    return sqrt(vector[0] * vector[0] + vector[1] * vector[1] + vector[2] * vector[2])
 
 
 def clip_length(vector: Vector, most: float) -> Vector:
