@@ -157,7 +157,7 @@ def in_environment(path: Path) -> Thrust:
             return state, env.drone(state).acc_w
 
         _, acc_w = jax.lax.scan(step, env.begin(drone, gate, params), None, SETTLED_STEPS)
-        return acc_w.z[-1] + params.model.g
+        return jnp.asarray(acc_w.z)[-1] + params.model.g
 
     weights = np.asarray(settled_force(jnp.asarray(STICKS, jnp.float32))) / float(params.model.g)
     hover = float(np.interp(1.0, np.maximum.accumulate(weights), STICKS))

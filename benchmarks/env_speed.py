@@ -127,7 +127,7 @@ def gymnasium_contestant(num_envs: int, length: int, autoreset_mode: str = "Same
     id_, shape = "flytrack_env:FlyTrack-v0", (NUM_ACTIONS, num_envs, 4)
     actions = np.random.default_rng(0).uniform(-1.0, 1.0, shape).astype(np.float32)
     if num_envs > 1:
-        env = gymnasium.make_vec(id_, num_envs=num_envs, autoreset_mode=autoreset_mode)
+        env: Any = gymnasium.make_vec(id_, num_envs=num_envs, autoreset_mode=autoreset_mode)
     else:
         env, actions = gymnasium.make(id_), actions[:, 0]
     env.reset(seed=0)

@@ -9,6 +9,7 @@ page.
 
 import statistics
 import time
+from collections.abc import Callable
 from functools import partial
 from typing import Any
 
@@ -89,6 +90,11 @@ def environments(most: int) -> str:
     return report.table(["environments", *(f"{one}, decisions/s" for one in IDS), "simulated s/s"], rows)
 
 
+def run_and_wait(run: Callable[[], Any]) -> None:
+    """Call a function and wait for what it returns."""
+    jax.block_until_ready(run())
+
+
 def trainings(config: Config) -> str:
     """Return a table of training steps a second by number of seeds side by side."""
     trainer, rows = Trainer(config), []
@@ -96,7 +102,7 @@ def trainings(config: Config) -> str:
         runners = [trainer.start(jax.random.key(seed)) for seed in range(number)]
         together = jax.tree.map(lambda *leaves: jnp.stack(leaves), *runners)
         update = partial(trainer.chunk_of_many, together, jnp.int32(1))
-        entry = Contestant("", number * config.batch_size, lambda run=update: jax.block_until_ready(run()))
+        entry = Contestant("", number * config.batch_size, partial(run_and_wait, update))
         rows.append([number, f"{rate_of(entry):.3g}"])
     return report.table("seeds side by side | training steps/s, all together", rows)
 

@@ -8,7 +8,7 @@ Writes a page and a chart.
 
 import time
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -24,7 +24,7 @@ from flytrack_env.pictures.drawing import new_figure, png_of
 
 TARGET_SUCCESS, TARGET_STEPS = 0.95, 3_000_000
 # Half as many steps per update as by default: it learns to finish sooner, and to be fast later.
-SHORT = {"total_timesteps": 4_000_000, "num_steps": 32, "num_minibatches": 32}
+SHORT: dict[str, Any] = {"total_timesteps": 4_000_000, "num_steps": 32, "num_minibatches": 32}
 EVERY = 250_000  # environment steps
 NUM_EPISODES, NUM_LAPS, NUM_STEPS = 256, 3, 2500
 EVALUATION_SEED = 30_000

@@ -21,6 +21,7 @@ from typing import Any, NamedTuple
 
 import casadi
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from flytrack_env import state as layout
@@ -122,7 +123,7 @@ def step_function(model: ModelParameters) -> casadi.Function:
             raise ValueError(f"model: effect {effect.name}: found one with a memory, expected none")
     with jax.enable_x64(True):
         model = jax.tree.map(lambda leaf: np.asarray(leaf, float), model._replace(effects=effects))
-        structure = jax.tree.structure(layout.unpack(np.zeros(layout.STATE_SIZE)))
+        structure = jax.tree.structure(layout.unpack(jnp.zeros(layout.STATE_SIZE)))
 
         def leaves_after(*leaves: Any) -> list[Any]:
             drone: layout.Drone = jax.tree.unflatten(structure, leaves[: layout.STATE_SIZE])
@@ -208,7 +209,7 @@ def _gate_limits(task: Task, index: int, point: Any, velocity: Any) -> list[Limi
     vectors = (gates.centre, gates.forward, gates.left(), gates.up)
     centre, forward, left, up = (np.array(axes, float)[:, index] for axes in vectors)
     offset = point - centre
-    free = float(gates.half_opening[index]) - task.radius_m - CLEARANCE_M
+    free = float(np.asarray(gates.half_opening)[index]) - task.radius_m - CLEARANCE_M
     return [
         (casadi.dot(forward, offset), 0.0, 0.0),
         (casadi.dot(left, offset), -free, free),

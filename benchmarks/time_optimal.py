@@ -154,8 +154,8 @@ def replay(reference: Reference, track: Track, plant: Plant | None = None) -> Re
     drift = np.linalg.norm(states[:, layout.POSITION] - reference.states[: last + 2, layout.POSITION], axis=1)
     race = jax.tree.map(lambda leaf: leaf[last], races)
     ends = (states[:-1, layout.POSITION], states[1:, layout.POSITION])
-    lines = (Vec3(*(jnp.asarray(axis)[:, None] for axis in one.T)) for one in ends)
-    crossing = cross_gate(params.course.gates, *lines, params.drone_radius)
+    begin, end = (Vec3(*(jnp.asarray(axis)[:, None] for axis in points.T)) for points in ends)
+    crossing = cross_gate(params.course.gates, begin, end, params.drone_radius)
     return Replay(
         states=states,
         gates_passed=int(race.gates_passed),

@@ -1,5 +1,7 @@
 """A loop in the style of CleanRL on FlyTrack-v0, with Gymnasium's own vector wrappers."""
 
+from typing import Any
+
 import gymnasium
 import jax
 import numpy as np
@@ -13,7 +15,7 @@ RETURN_MARGIN, GATE_MARGIN = 2.5, 1.0
 
 def measure(seed: int) -> Outcome:
     """Train and return the results of the episodes at the beginning and at the end of the training."""
-    envs = RecordEpisodeStatistics(gymnasium.make_vec("flytrack_env:FlyTrack-v0", NUM_ENVS))
+    envs: Any = RecordEpisodeStatistics(gymnasium.make_vec("flytrack_env:FlyTrack-v0", NUM_ENVS))
     envs = NormalizeReward(NormalizeObservation(envs))
     observations, _ = envs.reset(seed=seed)
     key, nothing = jax.random.key(seed), np.zeros(NUM_ENVS)

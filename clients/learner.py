@@ -56,7 +56,7 @@ def learn(training: Any, key: jax.Array, last: Any, steps: Any) -> Any:
     flown = values[:-1], values[1:], rewards, done
     advantages = jax.lax.scan(back, jnp.zeros(NUM_ENVS), flown, reverse=True)[1]
     scaled = (advantages - advantages.mean()) / advantages.std()
-    batch = observations, actions, counts, means[:-1], scaled, advantages + values[:-1]
+    batch: Any = observations, actions, counts, means[:-1], scaled, advantages + values[:-1]
     batch = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), batch)
 
     def loss(variables: Any, places: jax.Array) -> jax.Array:

@@ -1,6 +1,5 @@
 """A Gymnasium vector environment as a vector environment of Stable-Baselines3."""
 
-from collections.abc import Sequence
 from typing import Any
 
 import gymnasium
@@ -17,7 +16,7 @@ class SameStepVecEnv(VecEnv):
     Raises ValueError for an environment that does not reset in the same step.
     """
 
-    def __init__(self, env: gymnasium.vector.VectorEnv):
+    def __init__(self, env: gymnasium.vector.VectorEnv[Any, Any, Any]):
         mode = env.metadata.get("autoreset_mode")
         if mode is not AutoresetMode.SAME_STEP:
             raise ValueError(f"env: found autoreset_mode {mode}, expected {AutoresetMode.SAME_STEP}")
@@ -28,7 +27,7 @@ class SameStepVecEnv(VecEnv):
     def reset(self) -> np.ndarray:
         """Return the first observations of new episodes, with the seeds and options set before."""
         # Stable-Baselines3 has a None per environment where Gymnasium has a single None.
-        seeds = None if None in self._seeds else list(self._seeds)
+        seeds: Any = None if None in self._seeds else list(self._seeds)
         if any(options != self._options[0] for options in self._options):
             raise ValueError(f"options: found {self._options}, expected the same for every environment")
         observations, _ = self.env.reset(seed=seeds, options=self._options[0] or None)
@@ -45,7 +44,7 @@ class SameStepVecEnv(VecEnv):
         observations, rewards, terminated, truncated, infos = self.env.step(self._actions)
         done = terminated | truncated
         infos_of_envs: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
-        for index in np.flatnonzero(done):
+        for index in np.flatnonzero(done).tolist():
             infos_of_envs[index] = {
                 **info_of(infos["final_info"], index),
                 "terminal_observation": infos["final_obs"][index],
@@ -57,7 +56,7 @@ class SameStepVecEnv(VecEnv):
         """Close the environment."""
         self.env.close()
 
-    def get_images(self) -> Sequence[np.ndarray]:
+    def get_images(self) -> Any:
         """Return a picture per environment."""
         return self.env.render()
 

@@ -55,7 +55,7 @@ def test_the_log_is_that_of_the_episodes_flown(env_id: str) -> None:
 @every_id
 def test_gymnax_to_gym_wrapper_flies_what_the_environment_flies(env_id: str) -> None:
     env, params = gymnax.make(env_id)
-    wrapped = GymnaxToGymWrapper(env, params, seed=0)
+    wrapped: Any = GymnaxToGymWrapper(env, params, seed=0)
     observation, _ = wrapped.reset(seed=5)
     key, reset_key = jax.random.split(jax.random.key(5))
     expected, state = env.reset(reset_key, params)

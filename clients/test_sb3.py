@@ -1,7 +1,10 @@
 """Stable-Baselines3: its checker, single environments, and the adapter for vector environments."""
 
+from typing import Any
+
 import gymnasium
 import gymnax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from stable_baselines3 import PPO
@@ -36,7 +39,8 @@ def test_ppo_learns_from_a_single_environment() -> None:
 def test_the_adapter_passes_on_the_ends_of_episodes() -> None:
     envs, plain = make_vec(), make_vec().env
     envs.seed(3)
-    np.testing.assert_array_equal(envs.reset(), plain.reset(seed=list(range(3, 3 + NUM_ENVS)))[0])
+    seeds: Any = list(range(3, 3 + NUM_ENVS))
+    np.testing.assert_array_equal(envs.reset(), plain.reset(seed=seeds)[0])
     ended = []
     for actions in np.random.default_rng(0).uniform(-1, 1, (150, NUM_ENVS, 4)).astype(np.float32):
         observations, rewards, done, infos = envs.step(actions)
@@ -83,4 +87,6 @@ def test_the_entry_of_the_benchmark_flies_what_was_trained() -> None:
     model = sb3_ppo.make_ppo(seed=1)
     observations = np.random.default_rng(0).normal(size=(16, 29)).astype(np.float32)
     expected, _ = model.predict(observations, deterministic=True)
-    np.testing.assert_allclose(np.clip(entries.act_of(model)(observations), -1, 1), expected, atol=1e-6)
+    np.testing.assert_allclose(
+        np.clip(entries.act_of(model)(jnp.asarray(observations)), -1, 1), expected, atol=1e-6
+    )

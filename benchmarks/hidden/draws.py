@@ -92,7 +92,7 @@ def _per_axis(suffix: str = "", signs: tuple[float, ...] = (1.0,)) -> Callable[[
 
 
 def _oscillator(size: float, rng: Rng) -> Values:
-    values = {}
+    values: Values = {}
     for name, own in _per_axis()(size, rng).items():
         damping = float(rng.uniform(*ZETA))
         values |= {f"{name}_s": 2.0 * damping * own, f"{name}_damping": damping}

@@ -97,7 +97,7 @@ def _scale_known(state: SearchState, model: FittedModel) -> Known:
     others = [one for one in score_candidates(state, nearby, less) if one.candidate.effect != "thrust_scale"]
     for one in others[:MOST_RIVALS]:
         rivals[one.candidate.effect] = add_effect(state, nearby, less, one).cost
-    rival = min(rivals, key=rivals.get, default="")
+    rival = min(rivals, key=rivals.__getitem__, default="")
     gain = less.cost - model.cost
     return Known(gain, max(min(rivals.get(rival, less.cost) - model.cost, gain), 0.0), rival)
 
@@ -117,8 +117,9 @@ def known(
         result = {}
         for one in found.candidates:
             ablation = ablate(state, found, linearization, one.effect)
-            rival = min(ablation.rivals, key=ablation.rivals.get, default="")
-            beside = min(ablation.rivals.get(rival, ablation.gain), ablation.gain)
+            rivals = ablation.rivals
+            rival = min(rivals, key=rivals.__getitem__, default="")
+            beside = min(rivals.get(rival, ablation.gain), ablation.gain)
             result[one.effect] = Known(ablation.gain, max(beside, 0.0), rival)
         if "thrust_scale" in effects:
             result["thrust_scale"] = _scale_known(state, found)

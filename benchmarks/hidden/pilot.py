@@ -91,7 +91,9 @@ class Sketch:
     def __len__(self) -> int:
         return len(self._velocities)
 
-    def add(self, vel_w: Vector, heading: float | None = None, sticks: tuple | None = None) -> None:
+    def add(
+        self, vel_w: Vector, heading: float | None = None, sticks: tuple[float | None, ...] | None = None
+    ) -> None:
         """Append a moment; the heading is kept if not given."""
         self.heading = self.heading if heading is None else heading
         self._velocities.append(vel_w)
@@ -141,8 +143,8 @@ class Sketch:
         pos_w = np.array(self.start_w) + np.cumsum(vel_w, axis=0) * DT_S
         acc_w = np.gradient(vel_w, DT_S, axis=0)
         vectors = (map(tuple, column[:count].tolist()) for column in (pos_w, vel_w, acc_w))
-        rows = zip(*vectors, heading[:count].tolist(), self._sticks[:count], strict=True)
-        return [Moment(*row) for row in rows]
+        columns = (*vectors, heading[:count].tolist(), self._sticks[:count])
+        return [Moment(*row) for row in zip(*columns, strict=True)]
 
 
 def steps_of(seconds: float) -> int:
@@ -306,7 +308,7 @@ class Pilot:
         is_free = not has_stick or self._is_cut_off
         force_w = self._force(drone, moment, is_free)
         own, shakes = self._sticks(drone, force_w, moment.heading), self._tremble.step(DT_S)
-        hands = (None,) * len(own) if is_free else moment.sticks
+        hands = moment.sticks if moment.sticks is not None and not is_free else (None,) * len(own)
         return tuple(
             max(-1.0, min(1.0, stick + TREMBLE * shake if hand is None else hand))
             for stick, shake, hand in zip(own, shakes, hands, strict=True)

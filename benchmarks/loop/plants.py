@@ -29,7 +29,7 @@ EFFECTS = (
 LAG_SPREAD, THRUST_SPREAD = 0.2, 0.05  # |ln factor| of the lags, and of the thrust map, at most
 LARGE = 2.0 / 3.0  # smallest size drawn, as a share of the log range
 # Hidden effects of the first plants: named, or a number of random ones.
-HIDDEN = (("command_delay",), ("quadratic_drag",), ("thrust_scale",), 2, 3)
+HIDDEN: tuple[tuple[str, ...] | int, ...] = (("command_delay",), ("quadratic_drag",), ("thrust_scale",), 2, 3)
 LAW_AMPLITUDES = (1.0, 3.0)  # times the sensor's noise, as in benchmarks.beyond
 LATER = 5  # random effects of all later plants
 
@@ -64,11 +64,11 @@ def draw_base(rng: np.random.Generator) -> Truth:
 def draw_plant(number: int, seed: int) -> Truth:
     """Return a plant by its number, from 0: its effects follow ``HIDDEN``, their sizes the seed."""
     rng = np.random.default_rng([seed, number])
-    hidden = HIDDEN[number] if number < len(HIDDEN) else LATER
-    if isinstance(hidden, int):
-        hidden = tuple(str(name) for name in rng.choice(EFFECTS, size=hidden, replace=False))
+    names: tuple[str, ...] | int = HIDDEN[number] if number < len(HIDDEN) else LATER
+    if isinstance(names, int):
+        names = tuple(rng.choice(EFFECTS, size=names, replace=False).tolist())
     base = draw_base(rng)
-    return replace(base, effects={name: _draw_values(name, rng) for name in hidden})
+    return replace(base, effects={name: _draw_values(name, rng) for name in names})
 
 
 def draw_plant_with_law(number: int, seed: int) -> Truth:

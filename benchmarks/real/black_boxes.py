@@ -14,7 +14,7 @@ name        what it is
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import flax.linen as nn
 import jax
@@ -150,11 +150,11 @@ def network(rows: Rows) -> Answer:
     weights = module.init(jax.random.key(0), known[:1])
 
     @jax.jit
-    def loss(weights: dict, inputs: jax.Array, wanted: jax.Array) -> jax.Array:
+    def loss(weights: Any, inputs: jax.Array, wanted: jax.Array) -> jax.Array:
         return jnp.mean(optax.huber_loss(module.apply(weights, inputs), wanted))
 
     @jax.jit
-    def update(weights: dict, memory: tuple, inputs: jax.Array, wanted: jax.Array) -> tuple:
+    def update(weights: Any, memory: Any, inputs: jax.Array, wanted: jax.Array) -> tuple[Any, Any]:
         change, memory = chain.update(jax.grad(loss)(weights, inputs, wanted), memory)
         return optax.apply_updates(weights, change), memory
 

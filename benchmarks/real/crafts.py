@@ -141,7 +141,7 @@ def nanobench_part(record: Record) -> str:
         seconds=SECONDS,
         figures=report.figures_table(
             [
-                report.Figure("cells of at most 1.00", "100 %", *report.share(cells <= AS_GOOD)),
+                report.Figure("cells of at most 1.00", "100 %", *report.share((cells <= AS_GOOD).tolist())),
                 report.Figure("median", "at most 1.00", f"{np.median(cells):.2f}", len(cells)),
                 report.Figure("largest", "at most 1.00", f"{cells.max():.2f}", len(cells)),
             ]

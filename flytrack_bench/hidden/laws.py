@@ -79,7 +79,8 @@ def _attitude(shape: Any, drone: Any) -> Number:
 
 def _heating(shape: Any, drone: Any) -> float:
     """Return half of a temperature that follows the square of the thrust; it is kept in the drone."""
-    now, last, warmth = drone.time_s, *getattr(drone, "heat", (drone.time_s, 0.0))
+    now = drone.time_s
+    last, warmth = getattr(drone, "heat", (now, 0.0))
     warmth += -math.expm1(-(now - last) / shape["warming_s"]) * ((drone.thrust_acc / GRAVITY) ** 2 - warmth)
     drone.heat = now, warmth
     return 0.5 * warmth
@@ -87,7 +88,8 @@ def _heating(shape: Any, drone: Any) -> float:
 
 def _payload(shape: Any, drone: Any) -> Vector:
     """Return how far a pendulum with the drone's acceleration is off, world, over its usual swing."""
-    now, last, off, speed = drone.time_s, *getattr(drone, "swing", (drone.time_s, (0.0,) * 3, (0.0,) * 3))
+    now = drone.time_s
+    last, off, speed = getattr(drone, "swing", (now, (0.0,) * 3, (0.0,) * 3))
     step_s, stiffness = now - last, GRAVITY / shape["string_m"]
     pull = tuple(
         -acc - stiffness * x - DAMPING * v for acc, x, v in zip(drone.acc_w, off, speed, strict=True)
