@@ -46,7 +46,8 @@ def learn(training: Any, key: jax.Array, last: Any, steps: Any) -> Any:
     """
     observations, actions, rewards, done, counts = steps
     everything = jnp.concatenate([observations, last[None]])
-    means, values = Network().apply(training[0], everything)
+    outputs: Any = Network().apply(training[0], everything)
+    means, values = outputs
 
     def back(advantage: jax.Array, step: Any) -> Any:
         value, next_value, reward, done = step

@@ -65,6 +65,9 @@ BRAKING, ROOM_M, FASTEST = 5.0, 4.0, 15.0  # m/s^2, m, m/s
 LOOK_AHEAD_S, FLOOR_M, FLOOR_GAIN = 0.25, 0.14, 12.0
 
 
+Hands = tuple[float | None, ...]  # sticks moved by hand, None where the pilot flies
+
+
 class Moment(NamedTuple):
     """The target at one time: m, m/s, m/s^2, rad, world; sticks moved by hand, None where the pilot flies."""
 
@@ -72,7 +75,7 @@ class Moment(NamedTuple):
     vel_w: Vector
     acc_w: Vector
     heading: float
-    sticks: tuple[float | None, ...] | None
+    sticks: Hands | None
 
 
 class Sketch:
@@ -86,14 +89,12 @@ class Sketch:
         self.start_w, self.pos_w, self.heading = start_w, start_w, heading
         self._velocities: list[Vector] = []
         self._headings: list[float] = []
-        self._sticks: list[tuple[float | None, ...] | None] = []
+        self._sticks: list[Hands | None] = []
 
     def __len__(self) -> int:
         return len(self._velocities)
 
-    def add(
-        self, vel_w: Vector, heading: float | None = None, sticks: tuple[float | None, ...] | None = None
-    ) -> None:
+    def add(self, vel_w: Vector, heading: float | None = None, sticks: Hands | None = None) -> None:
         """Append a moment; the heading is kept if not given."""
         self.heading = self.heading if heading is None else heading
         self._velocities.append(vel_w)
