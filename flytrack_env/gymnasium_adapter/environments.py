@@ -212,9 +212,9 @@ class FlyTrackVectorEnv(_Adapter, gymnasium.vector.VectorEnv[np.ndarray, np.ndar
         if mode not in AUTORESET_MODES:
             expected = " or ".join(map(repr, AUTORESET_MODES))
             raise ValueError(f"autoreset_mode: found {mode!r}, expected {expected}")
-        if not isinstance(num_envs, int) or num_envs < 1:
+        if not isinstance(num_envs, (int, np.integer)) or num_envs < 1:
             raise ValueError(f"num_envs: found {num_envs!r}, expected an integer of at least 1")
-        self.num_envs = num_envs
+        self.num_envs = num_envs = int(num_envs)
         self.single_observation_space, self.single_action_space = self._set_up(
             env_id, render_mode, params, overrides
         )

@@ -1,5 +1,6 @@
 """Files written atomically, and new folders."""
 
+import errno
 import os
 import subprocess
 import sys
@@ -21,6 +22,16 @@ def test_a_failed_write_leaves_the_old_file_and_nothing_else(tmp_path, monkeypat
     (tmp_path / "link").symlink_to(path)
     write_atomically(tmp_path / "link", b"after")
     assert path.read_bytes() == b"after" and (tmp_path / "link").is_symlink()
+
+
+def test_a_full_disk_names_the_file(tmp_path, monkeypatch):
+    def fail(descriptor):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", fail)
+    with pytest.raises(OSError, match=r"No space left on device: '.*a\.txt'") as caught:
+        write_atomically(tmp_path / "a.txt", b"content")
+    assert caught.value.errno == errno.ENOSPC and not list(tmp_path.iterdir())
 
 
 def test_fresh_folders_are_new(tmp_path):
