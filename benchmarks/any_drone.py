@@ -20,7 +20,7 @@ from scipy.signal import lfilter
 
 import flytrack_env
 from baselines.purejaxrl_ppo import Checkpoint, flights, load_checkpoint
-from baselines.purejaxrl_ppo.race_env import simulated_env
+from baselines.purejaxrl_ppo.checkpoint_env import simulated_env
 from benchmarks import report
 from benchmarks.log_faults import fault_table
 from flytrack_env import ModelParameters

@@ -18,9 +18,9 @@ import jax.numpy as jnp
 import flytrack_env
 from baselines.purejaxrl_ppo import Config, load_checkpoint
 from baselines.purejaxrl_ppo.checkpoint import save_checkpoint
+from baselines.purejaxrl_ppo.checkpoint_env import draw_model
 from baselines.purejaxrl_ppo.evaluate import EvaluationSettings, Report, evaluate
 from baselines.purejaxrl_ppo.polish import Settings, polish
-from baselines.purejaxrl_ppo.race_env import draw_model
 from baselines.purejaxrl_ppo.training import train_policy
 from benchmarks import report
 from flytrack_env import blackbox

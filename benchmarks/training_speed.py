@@ -12,11 +12,11 @@ from pathlib import Path
 
 import jax
 import jax.numpy as jnp
+from msgspec.structs import replace
 
 from baselines.purejaxrl_ppo import Config
 from baselines.purejaxrl_ppo.tracking import local_uri
-from baselines.purejaxrl_ppo.train_ppo import DEFAULTS
-from baselines.purejaxrl_ppo.training import Options, Trainer
+from baselines.purejaxrl_ppo.training import DEFAULT_OPTIONS, Options, Trainer
 from benchmarks import report
 
 TARGET_STEPS_PER_S, TARGET_COST, LIMIT_REPEATS = 800_000, 0.1, 5
@@ -57,7 +57,7 @@ def measure(trainer: Trainer, options: Options, is_tracked: bool) -> float:
         out = Path(folder)
         uri = local_uri(out) if is_tracked else ""
         started_s = time.process_time()
-        checkpoint, _ = trainer.train(out, 0, options._replace(tracking_uri=uri))
+        checkpoint, _ = trainer.train(out, 0, replace(options, tracking_uri=uri))
         return checkpoint.meta["steps"] / (time.process_time() - started_s)
 
 
@@ -65,12 +65,12 @@ def main(total_timesteps: float = Config.total_timesteps, repeats: int = 1) -> N
     """Measure in turns, print and write the table; exit 1 if a target is missed."""
     pinned = report.pin_to_one_core()
     trainer = Trainer(Config(total_timesteps=int(total_timesteps)))
-    modes = {"alone": Options(), "with everything that is on by default": DEFAULTS}
+    modes = {"alone": Options(), "with everything that is on by default": DEFAULT_OPTIONS}
     rates: dict[str, list[float]] = {name: [] for name in modes}
-    measure(trainer, DEFAULTS, is_tracked=True)  # compiles and imports all that is used
+    measure(trainer, DEFAULT_OPTIONS, is_tracked=True)  # compiles and imports all that is used
     for _ in range(repeats):
         for name, options in modes.items():
-            rates[name].append(measure(trainer, options, is_tracked=options is DEFAULTS))
+            rates[name].append(measure(trainer, options, is_tracked=options is DEFAULT_OPTIONS))
             print(f"{name}: {rates[name][-1]:,.0f} steps per CPU s", flush=True)
     rows = [[name, f"{statistics.median(found):,.0f}", report.spread(found)] for name, found in rates.items()]
     alone, watched = (statistics.median(found) for found in rates.values())

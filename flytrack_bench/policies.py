@@ -13,7 +13,7 @@ import jax.numpy as jnp
 
 import flytrack_env
 from baselines.purejaxrl_ppo import Checkpoint, load_checkpoint
-from baselines.purejaxrl_ppo.race_env import plant_env
+from baselines.purejaxrl_ppo.checkpoint_env import plant_env
 from flytrack_env.episodes import EpisodicEnvironment
 from flytrack_env.plants import Plant
 from flytrack_env.state import ACTION_SIZE

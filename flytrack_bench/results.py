@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 from scipy import stats
 
+from baselines.purejaxrl_ppo.checkpoint_env import with_model_as_given
 from baselines.purejaxrl_ppo.flights import Outcomes, fly_many, race_many, score, start_keys
 from baselines.purejaxrl_ppo.networks import Policy as NetworkPolicy
-from baselines.purejaxrl_ppo.race_env import with_model_as_given
 from flytrack_bench.policies import Policy
 from flytrack_bench.suite import Suite, Task
 from flytrack_loop.stages import BATCH, log_of_flights, rounded

@@ -5,6 +5,7 @@ from pathlib import Path
 import jax
 import numpy as np
 
+from baselines.purejaxrl_ppo.checkpoint_env import plant_env, simulated_env, with_model_as_given
 from baselines.purejaxrl_ppo.flights import (
     Rollout,
     can_record,
@@ -13,7 +14,6 @@ from baselines.purejaxrl_ppo.flights import (
     save_flight,
     start_pose_params,
 )
-from baselines.purejaxrl_ppo.race_env import plant_env, simulated_env, with_model_as_given
 from flytrack_env import load_track
 from flytrack_env.episodes import EpisodicEnvironment
 from flytrack_env.pictures import read_flights, write_pictures

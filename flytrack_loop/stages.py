@@ -6,8 +6,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from baselines.purejaxrl_ppo import Checkpoint, Config
+from baselines.purejaxrl_ppo.checkpoint_env import plant_env, simulated_env, with_model_as_given
 from baselines.purejaxrl_ppo.flights import Rollout, Score, fly_many, race_many, score, start_keys
-from baselines.purejaxrl_ppo.race_env import plant_env, simulated_env, with_model_as_given
 from baselines.purejaxrl_ppo.training import train_policy
 from flytrack_env import nominal_parameters
 from flytrack_env.dynamics import ModelParameters

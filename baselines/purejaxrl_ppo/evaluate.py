@@ -12,15 +12,15 @@ import flytrack_env
 from baselines.purejaxrl_ppo import flights as flying
 from baselines.purejaxrl_ppo import report as words
 from baselines.purejaxrl_ppo.checkpoint import load_checkpoint
-from baselines.purejaxrl_ppo.config import OptionalInt, OptionalName, OptionalPath
-from baselines.purejaxrl_ppo.flights import CANNOT_RECORD, Outcomes, Rollout, can_record, record_flights
-from baselines.purejaxrl_ppo.race_env import (
+from baselines.purejaxrl_ppo.checkpoint_env import (
     Plants,
     draw_plants,
     plant_env,
     simulated_env,
     with_model_as_given,
 )
+from baselines.purejaxrl_ppo.config import OptionalInt, OptionalName, OptionalPath
+from baselines.purejaxrl_ppo.flights import CANNOT_RECORD, Outcomes, Rollout, can_record, record_flights
 from flytrack_env import EnvParams, blackbox
 from flytrack_env.episodes import EpisodicEnvironment
 from flytrack_env.files import fresh_folder, write_atomically

@@ -20,8 +20,8 @@ import tyro
 
 import flytrack_env
 from baselines.purejaxrl_ppo.checkpoint import Checkpoint, CheckpointError, load_checkpoint
+from baselines.purejaxrl_ppo.checkpoint_env import simulated_env
 from baselines.purejaxrl_ppo.config import OptionalName, OptionalPath
-from baselines.purejaxrl_ppo.race_env import simulated_env
 from flytrack_env.extras import check_installed
 from flytrack_env.files import write_atomically
 from flytrack_env.observations import OBSERVATION, Entry, observe_race

@@ -9,7 +9,7 @@ EPISODE_COUNT, LAP_COUNT = "episodes_ended", "laps_completed"
 NOT_PER_EPISODE = ("done", "last_return", "lap_time_s")  # a lap time is zero at the end of most episodes
 
 
-def summarise_episodes(log: dict[str, jax.Array]) -> dict[str, jax.Array]:
+def summarize_episodes(log: dict[str, jax.Array]) -> dict[str, jax.Array]:
     """Return how many episodes ended in an update, and means over them, 0 if none did.
 
     ``log`` holds (num_steps, num_envs) arrays: done, episode_return and the environment's info.
@@ -24,7 +24,7 @@ def summarise_episodes(log: dict[str, jax.Array]) -> dict[str, jax.Array]:
     return summary
 
 
-def summarise_race(log: dict[str, jax.Array]) -> dict[str, jax.Array]:
+def summarize_race(log: dict[str, jax.Array]) -> dict[str, jax.Array]:
     """Return laps and mean gate distance of an update; nothing for an environment without a race.
 
     laps_completed: their number. lap_time_s: mean, 0 without a lap. gate_distance_m: mean over all steps.
@@ -40,7 +40,7 @@ def summarise_race(log: dict[str, jax.Array]) -> dict[str, jax.Array]:
     }
 
 
-def summarise_updates(metrics: dict[str, np.ndarray]) -> dict[str, float]:
+def summarize_updates(metrics: dict[str, np.ndarray]) -> dict[str, float]:
     """Return one value per metric, each (num_updates,), over several updates.
 
     Means over nothing are left out. Means per episode are weighted by episodes, lap

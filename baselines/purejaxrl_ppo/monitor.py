@@ -1,8 +1,6 @@
-"""Flights of a policy while it trains: their files, where they spend their time, and the progress line."""
+"""Flights of a policy while it trains: their metrics, their files, and where they spend their time."""
 
 import logging
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -24,8 +22,8 @@ from baselines.purejaxrl_ppo.flights import (
 )
 from baselines.purejaxrl_ppo.networks import Policy
 from flytrack_env.files import write_atomically
+from flytrack_env.messages import error_text
 from flytrack_env.pictures.drawing import draw_gates, label_from_above, png_of
-from flytrack_env.progress import progress_bar
 from flytrack_env.tracks import Track
 
 NUM_LAPS = 3
@@ -41,11 +39,7 @@ logger = logging.getLogger(__name__)
 
 
 def evaluation_metrics(outcomes: Outcomes) -> dict[str, float]:
-    """Return the metrics of evaluation flights; times are left out where there are none.
-
-    success: share that completed the laps. flying_lap_s: mean; best_lap_s: shortest flying lap. ended_*:
-    share that each cause ended; ended_time_limit: share still in the air with laps to go.
-    """
+    """Return the metrics of evaluation flights (docs/baseline.md), without times where there are none."""
     values = {
         **score(outcomes)._asdict(),
         "laps": outcomes.laps.mean(),
@@ -56,49 +50,45 @@ def evaluation_metrics(outcomes: Outcomes) -> dict[str, float]:
     return {f"evaluation_{name}": float(value) for name, value in values.items() if np.isfinite(value)}
 
 
-@contextmanager
-def attempt(what: str, steps: int) -> Iterator[None]:
-    """Turn an error into a warning: a failed evaluation must not end the training."""
-    try:
-        yield
-    except Exception as error:  # whatever libraries that draw and record raise
-        text = (str(error).splitlines() or [""])[0]
-        message = "evaluation after %d steps: %s failed: %s: %s; training goes on"
-        logger.warning(message, steps, what, type(error).__name__, text)
-
-
 def evaluate_policy(
-    env: Any, policy: Policy, num_episodes: int, out: Path, steps: int, is_recorded: bool = False
+    env: Any, policy: Policy, num_episodes: int, folder: Path, steps: int, is_recorded: bool = False
 ) -> tuple[dict[str, float], list[Path]]:
-    """Fly noisy starts; write the first flight and the position density of all; return metrics and files.
+    """Fly noisy starts; write the first flight and the position density of all.
 
-    out: folder of the run. steps: environment steps of training so far, part of the files' names.
-    is_recorded: also write the first flight as a Rerun recording, if Rerun is installed. What fails is a
-    warning; the rest is returned.
+    What fails is a warning, and the rest is returned: an evaluation must not end the training.
+
+    Args:
+        env: that the policy flies in.
+        policy: whose mean action flies.
+        num_episodes: number of flights.
+        folder: of the files.
+        steps: environment steps of training so far, part of the files' names.
+        is_recorded: also write the first flight as a Rerun recording, if Rerun is installed.
+
+    Returns:
+        Metrics by name, and the files.
     """
     metrics: dict[str, float] = {}
-    with attempt("flying", steps):
+    files: list[Path] = []
+    rollout, chart = folder / f"rollout_{steps}.npy", folder / f"position_density_{steps}.png"
+    try:
         flights = fly_many(env, policy, EVALUATION_SEED, num_episodes, NUM_STEPS, NUM_LAPS)
         metrics = evaluation_metrics(outcomes_of(flights, NUM_LAPS, len(env.track.gates)))
-    if not metrics:
-        return {}, []
-    folder = out / "evaluation"
-    rollout, chart = folder / f"rollout_{steps}.npy", folder / f"position_density_{steps}.png"
-    first, recording = jax.tree.map(lambda leaf: leaf[0], flights), rollout.with_suffix(".rrd")
-    density = (chart, flights.positions(), env.track, num_episodes, f"{steps:,} training steps")
-    writers: dict[Path, Callable[[], None]] = {
-        rollout: lambda: save_flight(rollout, first),
-        chart: lambda: draw_position_density(*density),
-    }
-    if is_recorded and not can_record():
-        logger.warning("evaluation after %d steps: no recording (.rrd): %s", steps, CANNOT_RECORD)
-    elif is_recorded:
-        writers[recording] = lambda: record_flights(recording, {"policy": first}, env.track, NUM_LAPS)
-    files = []
-    for path, write in writers.items():
-        with attempt(f"writing {path.name}", steps):
-            write()
-            files.append(path)
+        first = jax.tree.map(lambda leaf: leaf[0], flights)
+        save_flight(rollout, first)
+        files.append(rollout)
+        label = f"{steps:,} training steps"
+        draw_position_density(chart, flights.positions(), env.track, num_episodes, label)
+        files.append(chart)
+        if is_recorded and can_record():
+            recording = rollout.with_suffix(".rrd")
+            record_flights(recording, {"policy": first}, env.track, NUM_LAPS)
+            files.append(recording)
+        elif is_recorded:
+            logger.warning("evaluation after %d steps: no recording (.rrd): %s", steps, CANNOT_RECORD)
+    except Exception as error:  # whatever libraries that draw and record raise
+        message = "evaluation after %d steps failed: %s: %s; training goes on"
+        logger.warning(message, steps, type(error).__name__, error_text(error))
     return metrics, files
 
 
@@ -144,27 +134,3 @@ def draw_position_density(
     axes.set(xlabel="x (m)", ylabel="y (m)", aspect="equal")
     axes.set_title("Position density: " + ", ".join(filter(None, parts)))
     write_atomically(path, png_of(figure, dpi=100))
-
-
-class ProgressLine:
-    """One line: steps, rate, time left, mean return of the last episodes, success, best lap so far."""
-
-    def __init__(self, total: int, done: int):
-        self._bar = progress_bar("steps", total=total, initial=done, unit_scale=True, desc="compile")
-
-    def begin(self) -> None:
-        """Start the clock, now that everything is compiled."""
-        self._bar.set_description("train")
-        self._bar.unpause()
-
-    def update(self, steps: int, last_return: float, success: float | None, best_lap_s: float | None) -> None:
-        """Move on to a number of environment steps and show how the policy does."""
-        success_text = "-" if success is None else f"{success:.0%}"
-        best_lap = "-" if best_lap_s is None else f"{best_lap_s:.2f} s"
-        text = f"return {last_return:.1f}, success {success_text}, best lap {best_lap}"
-        self._bar.set_postfix_str(text, refresh=False)
-        self._bar.update(steps - self._bar.n)
-
-    def close(self) -> None:
-        """Leave the line as it is."""
-        self._bar.close()

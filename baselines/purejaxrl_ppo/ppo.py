@@ -30,7 +30,7 @@ from flax.training.train_state import TrainState
 from gymnax.environments import spaces
 
 from baselines.purejaxrl_ppo.config import Config
-from baselines.purejaxrl_ppo.metrics import summarise_episodes, summarise_race
+from baselines.purejaxrl_ppo.metrics import summarize_episodes, summarize_race
 from baselines.purejaxrl_ppo.networks import ActorCritic, Memory, make_network
 
 Metrics = dict[str, jax.Array]
@@ -280,8 +280,8 @@ def make_ppo(env: Any, env_params: Any, config: Config) -> Algorithm:
             jnp.stack(epoch_keys),
         )
         metrics = {
-            **summarise_episodes(log),
-            **summarise_race(log),
+            **summarize_episodes(log),
+            **summarize_race(log),
             **jax.tree.map(jnp.mean, parts),
             "last_return": log["last_return"].mean(),
             "explained_variance": 1.0 - jnp.var(target - batch.value) / jnp.var(target),

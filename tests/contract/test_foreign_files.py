@@ -19,7 +19,7 @@ from hypothesis import strategies as st
 
 import flytrack_sysid as sysid
 from baselines.purejaxrl_ppo import CheckpointError, load_checkpoint
-from baselines.purejaxrl_ppo.config import ConfigError, settings_in_file
+from baselines.purejaxrl_ppo.config import ConfigError, read_config_file
 from benchmarks.champion import CHAMPION
 from flytrack_env import ModelFileError, TrackError, blackbox, load_model, load_track
 from flytrack_env.dynamics import nominal_parameters
@@ -150,7 +150,7 @@ KINDS = {
     ),
     "imported uSD log": Kind("", foreign_logs.usd(), load_usd, LogError),
     "imported bag": Kind(".mcap", foreign_logs.save_bag, load_bag, LogError, is_slow=True),
-    "training settings": Kind(".toml", SETTINGS, settings_in_file, ConfigError, hostile_texts),
+    "training settings": Kind(".toml", SETTINGS, read_config_file, ConfigError, hostile_texts),
     "checkpoint": Kind(CHAMPION.suffix, CHAMPION.read_bytes(), load_checkpoint, CheckpointError),
     "black box": Kind(
         ".bin", black_boxes.SHIPPED.read_bytes(), blackbox.load, blackbox.BlackBoxError, is_slow=True

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from baselines.purejaxrl_ppo import load_checkpoint
+from baselines.purejaxrl_ppo.checkpoint_env import draw_plants, plant_env, simulated_env
 from baselines.purejaxrl_ppo.flights import race_many, score, start_keys
 from baselines.purejaxrl_ppo.networks import Policy
 from baselines.purejaxrl_ppo.polish import Settings, decay_gradient, polish
-from baselines.purejaxrl_ppo.race_env import draw_plants, plant_env, simulated_env
 from benchmarks.champion import CHAMPION, FOLDER, MODEL
 from flytrack_env import blackbox, load_model, make
 from flytrack_env.model_file import model_from_json

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from baselines.purejaxrl_ppo import evaluate, race_env
+from baselines.purejaxrl_ppo import checkpoint_env, evaluate
 from baselines.purejaxrl_ppo import flights as flights_module
 from baselines.purejaxrl_ppo.checkpoint import load_checkpoint
 from baselines.purejaxrl_ppo.flights import fly_many, outcomes_of, race_many, score, start_keys
@@ -143,7 +143,7 @@ def test_a_single_flight_as_json_and_docs_name_every_key(
     assert "interval" not in text and report["success"] is None and report["ghost"] is None
     np.testing.assert_allclose(report["first_flight"]["lap_times_s"], raced.lap_times_s[index], atol=1e-5)
     assert [line.split(":")[0] for line in text.splitlines()][:4] == ["flown", "gates", "lap times", "ended"]
-    plants = race_env.draw_plants(0, 3, nominal_parameters()).summarise(np.ones((3, 1), bool))
+    plants = checkpoint_env.draw_plants(0, 3, nominal_parameters()).summarise(np.ones((3, 1), bool))
     text = (ROOT / "docs" / "baseline.md").read_text()
     missing = {name for name in keys_of({**report, "plants": plants}) if f"`{name}`" not in text}
     assert not missing
@@ -152,8 +152,8 @@ def test_a_single_flight_as_json_and_docs_name_every_key(
 def test_plants_are_drawn_from_the_ranges_around_the_model():
     known = (LinearDrag(0.4, 0.4, 0.2), CommandDelay(0.03), ThrustScale(0.9), QuadraticDrag(0.01, shared=0.0))
     model = nominal_parameters().with_effects(*known)
-    plants = race_env.draw_plants(3, 200, model)
-    for name, bounds in race_env.RANGES.items():
+    plants = checkpoint_env.draw_plants(3, 200, model)
+    for name, bounds in checkpoint_env.RANGES.items():
         drawn = plants.drawn[name]
         assert bounds[0] <= drawn.min() and drawn.max() <= bounds[1] and np.ptp(drawn) > 0.5 * np.ptp(bounds)
     found = plants.models
@@ -166,30 +166,32 @@ def test_plants_are_drawn_from_the_ranges_around_the_model():
     assert quadratic.k_x.min() >= 0.01 and (quadratic.shared == 0.0).all()
     np.testing.assert_allclose(np.hypot(wind.v_x, wind.v_y), plants.drawn["wind_m_s"], atol=1e-6)
     assert (wind.v_x < 0).any() and (wind.v_y < 0).any() and not np.any(wind.v_z)
-    fewer = race_env.draw_plants(3, 5, model)
+    fewer = checkpoint_env.draw_plants(3, 5, model)
     np.testing.assert_array_equal(fewer.models.effect("wind").v_x, wind.v_x[:5])
-    assert not np.array_equal(race_env.draw_plants(4, 5, model).drawn["wind_m_s"], fewer.drawn["wind_m_s"])
+    assert not np.array_equal(
+        checkpoint_env.draw_plants(4, 5, model).drawn["wind_m_s"], fewer.drawn["wind_m_s"]
+    )
 
 
 def test_what_breaks_the_policy_shows_in_its_thirds():
-    drawn = race_env.draw_plants(0, 90, nominal_parameters()).drawn
+    drawn = checkpoint_env.draw_plants(0, 90, nominal_parameters()).drawn
     is_good = drawn["command_delay_s"] < np.quantile(drawn["command_delay_s"], 2.0 / 3.0)
-    rows = race_env.by_thirds(drawn, np.stack([is_good, np.ones(90, bool)], axis=1))
+    rows = checkpoint_env.by_thirds(drawn, np.stack([is_good, np.ones(90, bool)], axis=1))
     shares = {name: [r["plants"]["share"] for r in rows if r["quantity"] == name] for name in drawn}
     assert shares["command_delay_s"] == [1.0, 1.0, 0.0]
     assert all(min(shares[name]) > 0.3 for name in set(drawn) - {"command_delay_s"})
     assert {row["flights_share"] for row in rows if row["quantity"] == "command_delay_s"} == {1.0, 0.5}
-    assert len(race_env.by_thirds(drawn, np.ones((90, 1), bool))) == 12
-    assert len(race_env.by_thirds({"wind_m_s": np.ones(1)}, np.ones((1, 1), bool))) == 1
+    assert len(checkpoint_env.by_thirds(drawn, np.ones((90, 1), bool))) == 12
+    assert len(checkpoint_env.by_thirds({"wind_m_s": np.ones(1)}, np.ones((1, 1), bool))) == 1
 
 
 def test_ids_that_draw_models_fly_the_one_that_is_given(checkpoint):
-    env = race_env.simulated_env(checkpoint)
-    params = race_env.with_model_as_given(env.default_params)
+    env = checkpoint_env.simulated_env(checkpoint)
+    params = checkpoint_env.with_model_as_given(env.default_params)
     env.check_params(params)
     ranges, given = params.wrappers[DomainRandomization.key], env.default_params.model
     found = sample_model(jnp.uint32(5), given, ranges)
     assert type(found.effects[0]) is LinearDrag and len(found.effects) == 1
     chex.assert_trees_all_close(found._replace(tau=np.stack(found.tau)), given, rtol=1e-6, atol=1e-6)
     plain = make("FlyTrackNoisy-v0").default_params
-    assert race_env.with_model_as_given(plain) is plain
+    assert checkpoint_env.with_model_as_given(plain) is plain

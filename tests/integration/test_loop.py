@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from baselines.purejaxrl_ppo import load_checkpoint
+from baselines.purejaxrl_ppo.checkpoint_env import plant_env
 from baselines.purejaxrl_ppo.flights import Score, fly_many
-from baselines.purejaxrl_ppo.race_env import plant_env
 from benchmarks.champion import CHAMPION
 from benchmarks.loop.plants import draw_plant
 from flytrack_bench.hidden import HiddenPlant

@@ -3,9 +3,10 @@
 import pytest
 
 from baselines.purejaxrl_ppo import load_checkpoint, monitor, tracking
+from baselines.purejaxrl_ppo.training import Options
 from flytrack_env.rollout import load_rollout
 from tests.support.pages import ROOT
-from tests.support.ppo_runs import BATCH, DEAD_URI, EVERY_OTHER_UPDATE, SEED, assert_same_end
+from tests.support.ppo_runs import BATCH, DEAD_URI, SEED, assert_same_end
 
 METRICS = {"race/episode_return", "ppo/policy_loss", "ppo/explained_variance", "race/episode_gates_passed"}
 METRICS |= {"race/episode_crash", "race/evaluation_success", "race/evaluation_ended_time_limit"}
@@ -34,15 +35,14 @@ def reports_of(caplog):
 def test_everything_is_recorded_once_though_the_run_was_cut_off(trainer, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(monitor, "NUM_STEPS", 20)
     uri = tracking.local_uri(tmp_path)
-    options = EVERY_OTHER_UPDATE._replace(evaluate_every=4 * BATCH, evaluation_episodes=2, tracking_uri=uri)
+    options = Options(2 * BATCH, evaluate_every=4 * BATCH, evaluation_episodes=2, tracking_uri="local")
     trainer.train(tmp_path, SEED, options)
     client, run = only_run(uri)
     page = f"http://127.0.0.1:5000/#/experiments/{run.info.experiment_id}/runs/{run.info.run_id}"
-    assert capsys.readouterr().out.count(f"MLflow: {page} after `mlflow ui") == 2  # at the start and the end
+    assert capsys.readouterr().out.count(f"MLflow: {page} after `mlflow ui") == 1
     description = load_checkpoint(tmp_path / "final.safetensors").meta
-    for part in ("config", "environment", "model"):
-        for name, text in tracking.flatten({part: description[part]}):
-            assert run.data.params[name] == text
+    parts = {part: description[part] for part in ("config", "environment", "model")}
+    assert tracking.describe_params(parts).items() <= run.data.params.items()
     assert run.data.params["seed"] == str(SEED) and run.data.params["env_id"] == "FlyTrackRobust-v0"
     page = (ROOT / "docs" / "baseline.md").read_text(encoding="utf-8")
     assert set(run.data.metrics) >= METRICS
@@ -59,14 +59,14 @@ def test_everything_is_recorded_once_though_the_run_was_cut_off(trainer, tmp_pat
     # Killed after the checkpoint at 4; and the folder was moved.
     for name in ("final.safetensors", f"step_{6 * BATCH}.safetensors"):
         (tmp_path / name).unlink()
-    trainer.train(tmp_path, SEED, options._replace(resume=tmp_path))
+    trainer.train(tmp_path, SEED, options, tmp_path)
     client, run = only_run(uri)
     assert run.info.status == "FINISHED" and history(client, run, "ppo/policy_loss") == before
 
 
 @pytest.mark.slow
 def test_a_server_that_is_down_does_not_end_the_training(trainer, whole, tmp_path, caplog):
-    trainer.train(tmp_path, SEED, EVERY_OTHER_UPDATE._replace(tracking_uri=DEAD_URI))
+    trainer.train(tmp_path, SEED, Options(2 * BATCH, tracking_uri=DEAD_URI))
     assert_same_end(tmp_path / "final.safetensors", whole[0] / "final.safetensors")
     reports = reports_of(caplog)
     assert len(reports) == 2 and DEAD_URI in reports[0] and "training goes on" in reports[0]
@@ -75,18 +75,17 @@ def test_a_server_that_is_down_does_not_end_the_training(trainer, whole, tmp_pat
 
 def test_a_server_that_comes_back_gets_what_it_missed(tmp_path, monkeypatch, caplog):
     monkeypatch.setattr(tracking, "RETRY_EVERY_S", 0.0)
-    uri = tracking.local_uri(tmp_path)
-    tracker = tracking.Tracker(tmp_path, uri, "name", {"seed": 3})
-    connect = tracker._connect
+    connect = tracking.Tracker._connect
 
-    def fail():
+    def fail(self):
         raise ConnectionError("gone")
 
-    tracker._connect = fail
-    tracker.begin()
+    monkeypatch.setattr(tracking.Tracker, "_connect", fail)
+    uri = tracking.local_uri(tmp_path)
+    tracker = tracking.Tracker(tmp_path, uri, "name", {"seed": 3})
     for step in (1, 2):
-        tracker.metrics(step, {"learning_rate": 0.5 * step})
-    tracker._connect = connect
+        tracker.record(step, {"learning_rate": 0.5 * step}, [])
+    monkeypatch.setattr(tracking.Tracker, "_connect", connect)
     tracker.end("FINISHED")
     client, run = only_run(uri)
     assert history(client, run, tracking.EVERY_STEP) == [(1, 0.5), (2, 1.0)]

@@ -1,6 +1,8 @@
-"""Training runs: cut off and resumed, damaged, diverged, watched, side by side; the bits stay the same."""
+"""Training runs: cut off and resumed, extended, damaged, diverged, watched; the bits stay the same."""
 
+import dataclasses
 import logging
+import os
 import random
 import shutil
 import signal
@@ -14,20 +16,11 @@ import numpy as np
 import pytest
 
 from baselines.purejaxrl_ppo import CheckpointError, load_checkpoint, monitor
-from baselines.purejaxrl_ppo.checkpoint import (
-    at_common_step,
-    checkpoints_in,
-    newest_intact,
-    save_checkpoint,
-    warn_of_other_machine,
-)
-from baselines.purejaxrl_ppo.training import DivergedError, Options, Run, Task
+from baselines.purejaxrl_ppo.checkpoint import check_same_run, checkpoints_in, newest_intact, save_checkpoint
+from baselines.purejaxrl_ppo.training import DivergedError, Options, Run, Stopped, Trainer
 from tests.support.pages import ROOT
-from tests.support.ppo_runs import BATCH, EVERY_OTHER_UPDATE, SEED, assert_same_end
+from tests.support.ppo_runs import BATCH, CONFIG, EVERY_OTHER_UPDATE, SEED, assert_same_end
 from tests.support.slow import slow_but
-
-SEEDS = (SEED, SEED + 1, SEED + 2)
-EVALUATED = EVERY_OTHER_UPDATE._replace(evaluate_every=2 * BATCH, evaluation_episodes=2)
 
 
 def step_path(folder, updates):
@@ -44,8 +37,7 @@ def test_checkpoints_are_written_at_the_steps_asked_for(whole):
 
 @pytest.mark.parametrize("updates", slow_but([2], [0, 2, 6]))
 def test_a_resumed_run_ends_bit_for_bit(trainer, whole, tmp_path, updates):
-    options = EVERY_OTHER_UPDATE._replace(resume=step_path(whole[0], updates))
-    _, metrics = trainer.train(tmp_path, SEED, options)
+    _, metrics = trainer.train(tmp_path, SEED, EVERY_OTHER_UPDATE, step_path(whole[0], updates))
     assert_same_end(tmp_path / "final.safetensors", whole[0] / "final.safetensors")
     for name, values in metrics.items():
         np.testing.assert_array_equal(values, whole[1][name][updates:], err_msg=name)
@@ -55,11 +47,11 @@ def test_a_complete_run_is_left_alone_and_no_run_is_overwritten(trainer, whole, 
     shutil.copytree(whole[0], tmp_path / "run")
     final = tmp_path / "run" / "final.safetensors"
     written = final.stat().st_mtime_ns
-    assert trainer.train(final.parent, SEED, Options(resume=final.parent))[1] == {}
+    assert trainer.train(final.parent, SEED, resume=final.parent)[1] == {}
     assert final.stat().st_mtime_ns == written
     for resume in (None, whole[0]):
         with pytest.raises(ValueError, match=r"run holds the checkpoints of a run.*--resume .*run"):
-            trainer.train(final.parent, SEED, Options(resume=resume))
+            trainer.train(final.parent, SEED, resume=resume)
 
 
 def test_the_newest_intact_checkpoint_is_taken(trainer, whole, tmp_path, caplog):
@@ -70,7 +62,7 @@ def test_the_newest_intact_checkpoint_is_taken(trainer, whole, tmp_path, caplog)
     content[len(content) // 2] ^= 1
     newest.write_bytes(content)
     with caplog.at_level(logging.WARNING):
-        trainer.train(tmp_path / "resumed", SEED, Options(resume=cut_off))
+        trainer.train(tmp_path / "resumed", SEED, resume=cut_off)
     reports = [record.getMessage() for record in caplog.records]
     assert len(reports) == 2 and "final.safetensors" in reports[0] and newest.name in reports[1]
     assert all("damaged" in report and "the checkpoint before it is used" in report for report in reports)
@@ -91,12 +83,29 @@ def test_folders_without_an_intact_checkpoint_are_refused(whole, tmp_path):
 
 def test_another_machine_or_software_is_a_warning(whole, caplog):
     checkpoint = newest_intact(whole[0])
-    warn_of_other_machine(checkpoint, checkpoint.meta)
+    check_same_run(checkpoint, checkpoint.meta)
     assert caplog.text == ""
     other = {"software": {"jax": "0.1.0"}, "machine": {"threads": 1000}}
-    warn_of_other_machine(checkpoint._replace(meta=checkpoint.meta | other), checkpoint.meta)
+    check_same_run(checkpoint._replace(meta=checkpoint.meta | other), checkpoint.meta)
     for message in ("software.jax: found '0.1.0'", "machine.threads: found 1000", "perhaps not bit for bit"):
         assert message in caplog.text
+
+
+def test_a_complete_run_is_extended(whole, tmp_path, capsys):
+    """The first 7 updates are those of the shorter run; a cut in what follows changes no bit."""
+    longer = Trainer(dataclasses.replace(CONFIG, total_timesteps=10 * BATCH), "FlyTrackRobust-v0")
+    for name in ("one", "two"):
+        shutil.copytree(whole[0], tmp_path / name)
+    final, metrics = longer.train(tmp_path / "one", SEED, EVERY_OTHER_UPDATE, tmp_path / "one")
+    assert final.steps == 10 * BATCH and len(metrics["learning_rate"]) == 3
+    assert "learning rate: 6e-05 up to step 2688, 0.000942 from there" in capsys.readouterr().out
+    shutil.copy(whole[0] / "final.safetensors", step_path(tmp_path / "two", 7))
+    shutil.copy(step_path(tmp_path / "one", 8), step_path(tmp_path / "two", 8))
+    (tmp_path / "two" / "final.safetensors").unlink()
+    longer.train(tmp_path / "two", SEED, EVERY_OTHER_UPDATE, tmp_path / "two")
+    assert_same_end(tmp_path / "two" / "final.safetensors", final.path)
+    with pytest.raises(CheckpointError, match=f"steps: found {10 * BATCH}, expected at most {7 * BATCH}"):
+        Trainer(CONFIG, "FlyTrackRobust-v0").train(tmp_path / "one", SEED, resume=tmp_path / "one")
 
 
 def poison(trainer, monkeypatch, from_update):
@@ -134,95 +143,38 @@ def test_an_evaluation_that_fails_does_not_end_the_training(trainer, tmp_path, m
     monkeypatch.setattr(monitor, broken, fail)
     trainer.train(tmp_path, SEED, Options(evaluate_every=100 * BATCH, evaluation_episodes=2))
     assert (tmp_path / "final.safetensors").exists()
-    assert f"after {7 * BATCH} steps" in caplog.text and "out of paint; training goes on" in caplog.text
-
-
-def test_the_best_lap_survives_a_resume(trainer, tmp_path, monkeypatch):
-    steps_evaluated = []
-
-    def evaluate_policy(env, policy, num_episodes, out, steps, is_recorded=False):
-        steps_evaluated.append(steps // BATCH)
-        return {"evaluation_success": 1.0, "evaluation_best_lap_s": 8.0 + steps / BATCH}, []
-
-    monkeypatch.setattr("baselines.purejaxrl_ppo.training.evaluate_policy", evaluate_policy)
-    trainer.train(tmp_path, SEED, EVALUATED)
-    for path in (tmp_path / "final.safetensors", step_path(tmp_path, 6)):
-        path.unlink()
-    steps_evaluated[:] = []
-    final, _ = trainer.train(tmp_path, SEED, EVALUATED._replace(resume=tmp_path))
-    assert steps_evaluated == [6, 7] and final.meta["best_lap_s"] == 10.0
-
-
-def asked_for(root, options=EVERY_OTHER_UPDATE):
-    return [Task(root / f"seed{seed}", seed, options) for seed in SEEDS]
-
-
-@pytest.fixture(scope="module")
-def together(trainer, tmp_path_factory):
-    root = tmp_path_factory.mktemp("together")
-    return root, trainer.run(trainer.prepare(asked_for(root)))
-
-
-def test_a_seed_learns_what_it_learns_alone(trainer, together):
-    # Sums are taken in another order, and learning amplifies the difference: the first update only.
-    for seed, (checkpoint, metrics) in zip(SEEDS, together[1], strict=True):
-        assert checkpoint.meta["seed"] == seed
-        alone = trainer.chunk(trainer.start(jax.random.key(seed)), jnp.int32(1))[1]
-        for name, values in metrics.items():
-            np.testing.assert_allclose(values[0], alone[name][0], rtol=2e-3, atol=2e-5, err_msg=name)
-
-
-class Interrupter:
-    """Ctrl-C in a destructor, where Python drops the exception."""
-
-    def __del__(self):
-        signal.raise_signal(signal.SIGINT)
+    assert (
+        f"after {7 * BATCH} steps" in caplog.text and "out of paint and more; training goes on" in caplog.text
+    )
 
 
 @pytest.fixture
-def interruptible():
+def stoppable():
     """Let SIGINT raise, which whoever is started in the background by a shell ignores."""
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     yield
     signal.signal(signal.SIGINT, before)
 
 
-@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
-@pytest.mark.usefixtures("interruptible")
-def test_an_interrupt_that_python_drops_ends_the_run_all_the_same(trainer, tmp_path, monkeypatch):
-    advance = Run.advance
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.usefixtures("stoppable")
+def test_a_signal_ends_the_run_with_a_checkpoint(trainer, whole, tmp_path, monkeypatch, number):
+    advance = Run._advance
 
-    def interrupted(self, *result):
-        advance(self, *result)
-        Interrupter()
+    def stop_after(self):
+        advance(self)
+        os.kill(os.getpid(), number)
 
-    monkeypatch.setattr(Run, "advance", interrupted)
-    with pytest.raises(KeyboardInterrupt):
-        trainer.train(tmp_path, SEED, EVERY_OTHER_UPDATE)
-    assert newest_intact(tmp_path).path == step_path(tmp_path, 2)
+    with monkeypatch.context() as patch, pytest.raises(Stopped) as caught:
+        patch.setattr(Run, "_advance", stop_after)
+        trainer.train(tmp_path, SEED, Options(checkpoint_every=3 * BATCH))
+    expected = f"stopped by {number.name} at {3 * BATCH} steps; continue with --resume {tmp_path}"
+    assert str(caught.value) == expected and caught.value.signal_number == number
+    assert newest_intact(tmp_path).path == step_path(tmp_path, 3)
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
-
-
-@pytest.mark.slow
-def test_seeds_killed_between_their_checkpoints_end_bit_for_bit(trainer, together, tmp_path, monkeypatch):
-    write = Run._checkpoint
-
-    def die(self, name):
-        if self.update == 4 and self.seed == SEEDS[1]:
-            raise KeyboardInterrupt
-        write(self, name)
-
-    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
-        patch.setattr(Run, "_checkpoint", die)
-        trainer.run(trainer.prepare(asked_for(tmp_path)))
-    starts = [newest_intact(folder) for folder, *_ in asked_for(tmp_path)]
-    assert [start.steps // BATCH for start in starts] == [4, 2, 2]
-    starts = at_common_step(starts)
-    assert [start.steps // BATCH for start in starts] == [2, 2, 2]
-    asked = [task._replace(start=start) for task, start in zip(asked_for(tmp_path), starts, strict=True)]
-    trainer.run(trainer.prepare(asked))
-    for folder, *_ in asked:
-        assert_same_end(folder / "final.safetensors", together[0] / folder.name / "final.safetensors")
+    assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
+    trainer.train(tmp_path, SEED, resume=tmp_path)
+    assert_same_end(tmp_path / "final.safetensors", whole[0] / "final.safetensors")
 
 
 def start(out, *flags):
@@ -236,11 +188,12 @@ def test_a_run_killed_at_any_moment_ends_in_the_same_bits(tmp_path, monkeypatch)
     monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", str(tmp_path / "compiled"))
     flags = (
         "--env-id FlyTrackRobust-v0 --num-envs 16 --num-steps 24 --num-minibatches 4 --hidden-sizes 8 "
-        f"--evaluate-every 0 --total-timesteps {1500 * BATCH} --checkpoint-every {20 * BATCH} --seed {SEED}"
+        f"--total-timesteps {1500 * BATCH} --seed {SEED}"
     ).split()
+    intervals = f"--evaluate-every 0 --checkpoint-every {20 * BATCH}".split()
     rng, whole, out = random.Random(0), tmp_path / "whole", tmp_path / "killed"
-    assert start(whole, *flags).wait() == 0
-    process = start(out, *flags)
+    assert start(whole, *flags, *intervals).wait() == 0
+    process = start(out, *flags, *intervals)
     for _ in range(3):
         known = set(checkpoints_in(out))
         while process.poll() is None and set(checkpoints_in(out)) == known:
@@ -250,6 +203,6 @@ def test_a_run_killed_at_any_moment_ends_in_the_same_bits(tmp_path, monkeypatch)
         assert process.wait() == -signal.SIGKILL
         for path in known.union(checkpoints_in(out)):
             load_checkpoint(path)
-        process = start(out, "--resume", str(out))
+        process = start(out, "--resume", str(out), *intervals)
     assert process.wait() == 0
     assert_same_end(out / "final.safetensors", whole / "final.safetensors")

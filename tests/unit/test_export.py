@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from baselines.purejaxrl_ppo import export, load_checkpoint
+from baselines.purejaxrl_ppo.checkpoint_env import plant_env
 from baselines.purejaxrl_ppo.export import policy_of
 from baselines.purejaxrl_ppo.flights import start_pose_params
-from baselines.purejaxrl_ppo.race_env import plant_env
 from flytrack.cli import main
 from flytrack_env import blackbox, make
 from flytrack_env.dynamics import lag

@@ -8,7 +8,7 @@ from flax import struct
 from gymnax.environments import environment, spaces
 
 from baselines.purejaxrl_ppo import Config, make_train, ppo
-from baselines.purejaxrl_ppo.metrics import summarise_episodes
+from baselines.purejaxrl_ppo.metrics import summarize_episodes
 
 
 @struct.dataclass
@@ -157,7 +157,7 @@ def test_episodes_are_averaged_over_those_that_ended():
         "episode_return": jnp.array([[1.0, 50.0], [60.0, 3.0]]),
         "laps": jnp.array([[2, 9], [9, 4]]),
     }
-    summary = summarise_episodes(log)
+    summary = summarize_episodes(log)
     assert summary["episode_return"] == 2.0
     assert summary["episode_laps"] == 3.0
     assert summary["episodes_ended"] == 2

@@ -3,20 +3,23 @@
 import dataclasses
 import json
 
+import numpy as np
 import pytest
 
 from baselines.purejaxrl_ppo import Config
-from baselines.purejaxrl_ppo.config import ConfigError, read_settings, settings_in_file
+from baselines.purejaxrl_ppo.config import ConfigError, read_config, read_config_file
 from baselines.purejaxrl_ppo.training import training_params
 from flytrack_env import make
 from tests.support.tables import table
 
 
 def changed(value):
-    """Return a value of the same type that is not the default."""
+    """Return a value of the same type that is valid and not the default."""
     if isinstance(value, tuple):
         return (*(2 * one for one in value), type(value[0])(3))
-    return not value if isinstance(value, bool) else value + type(value)(1)
+    if isinstance(value, float):
+        return value / 2 if value else 0.5
+    return not value if isinstance(value, bool) else value + 1
 
 
 OTHER = {field.name: changed(field.default) for field in dataclasses.fields(Config)}
@@ -25,9 +28,11 @@ OTHER = {field.name: changed(field.default) for field in dataclasses.fields(Conf
 def test_every_field_comes_back_from_toml_and_json(tmp_path):
     path = tmp_path / "run.toml"
     path.write_text("".join(f"{name} = {json.dumps(value)}\n" for name, value in OTHER.items()))
-    assert Config(**settings_in_file(path)) == Config(**OTHER)
-    values = json.loads(json.dumps(dataclasses.asdict(Config(**OTHER))))
-    assert Config(**read_settings("config", values)) == Config(**OTHER)
+    assert read_config_file(path) == Config(**OTHER)
+    assert read_config("config", json.loads(json.dumps(Config(**OTHER).as_json()))) == Config(**OTHER)
+    path.write_text("seed = 1")
+    with pytest.raises(ConfigError, match=r"run\.toml: seed: unknown; expected one of total_timesteps, "):
+        read_config_file(path)
 
 
 @pytest.mark.parametrize(("content", "message"), table("settings")["refused"])
@@ -35,7 +40,29 @@ def test_settings_that_cannot_be_trained_with_are_refused(tmp_path, content, mes
     path = tmp_path / "run.toml"
     path.write_text(content)
     with pytest.raises(ConfigError, match=message):
-        Config(**settings_in_file(path)).check()
+        read_config_file(path).check()
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"hidden_sizes": (8,) * 5000}, r"hidden_sizes: found \(8, .*, expected array of length <= 16"),
+        ({"hidden_sizes": (2**40,)}, r"hidden_sizes\[0\]: found 1099511627776, expected int <= 65536"),
+        ({"memory_size": 2**40}, "memory_size: found 1099511627776, expected int <= 65536"),
+        ({"num_envs": object()}, "num_envs: found '<object.*, expected int"),
+    ],
+)
+def test_settings_beyond_any_network_are_refused(changes, message):
+    with pytest.raises(ConfigError, match=message):
+        Config(**changes).check()
+
+
+def test_numbers_of_numpy_are_numbers():
+    config = Config(
+        num_envs=np.int64(512), learning_rate=np.float32(0.5), hidden_sizes=np.array([8, 8])
+    ).check()
+    assert config == Config(num_envs=512, learning_rate=0.5, hidden_sizes=(8, 8))
+    assert type(config.num_envs) is int and json.dumps(config.as_json())
 
 
 def test_a_drone_is_thicker_in_training_and_not_in_the_race():
