@@ -131,7 +131,8 @@ class Tracker:
         self._status, self._retry_s = status, 0.0
         self.flush()
         if self._pending:
-            logger.warning("tracking: %s: %d steps were not recorded", self._uri, len(self._pending))
+            num_steps = sum(bool(record.values) for record in self._pending)
+            logger.warning("tracking: %s: %d steps were not recorded", self._uri, num_steps)
 
     def _connect(self) -> None:
         for name, value in SETTINGS.items():
