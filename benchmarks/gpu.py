@@ -101,7 +101,7 @@ def trainings(config: Config) -> str:
     for number in SEEDS:
         runners = [trainer.start(jax.random.key(seed)) for seed in range(number)]
         together = jax.tree.map(lambda *leaves: jnp.stack(leaves), *runners)
-        update = partial(jax.jit(jax.vmap(trainer.chunk, (0, None))), together, jnp.int32(1))
+        update = partial(jax.jit(jax.vmap(trainer.update)), together)
         entry = Contestant("", number * config.batch_size, partial(run_and_wait, update))
         rows.append([number, f"{rate_of(entry):.3g}"])
     return report.table("seeds side by side | training steps/s, all together", rows)

@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from baselines.purejaxrl_ppo import Config
@@ -56,13 +55,13 @@ def train(trainer: Trainer, seed: int) -> list[Point]:
     """Train one seed; return its evaluations."""
     config = trainer.config
     runner = trainer.start(jax.random.key(seed))
-    trainer.chunk(runner, jnp.int32(0))  # compiles
+    jax.block_until_ready(trainer.update(runner))  # compiles
     points, cpu_s = [], 0.0
     for update in report.progress(range(1, config.num_updates + 1), "update"):
         started_s = time.process_time()
-        runner, _ = jax.block_until_ready(trainer.chunk(runner, jnp.int32(1)))
+        runner, _ = jax.block_until_ready(trainer.update(runner))
         cpu_s += time.process_time() - started_s
-        if is_due(update, EVERY, config.batch_size) or update == config.num_updates:
+        if is_due(update * config.batch_size, EVERY, config.batch_size) or update == config.num_updates:
             points.append(evaluate(trainer, runner.train_state.params, update * config.batch_size, cpu_s))
     return points
 

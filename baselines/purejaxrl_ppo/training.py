@@ -1,13 +1,13 @@
 """Trainings: begun or resumed, checked before anything is written, evaluated, recorded and stored.
 
-Updates run in chunks. Neither their length nor where a run was cut off and resumed changes a bit of the
-result: the compiled program is one update in a loop whose length is an argument.
+The compiled program is one update, so that neither what is done between updates nor where a run was cut off
+and resumed changes a bit of the result.
 """
 
 import signal
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
@@ -26,7 +26,7 @@ from baselines.purejaxrl_ppo.config import Config, Count, PositiveInt
 from baselines.purejaxrl_ppo.metrics import summarize_updates
 from baselines.purejaxrl_ppo.monitor import evaluate_policy
 from baselines.purejaxrl_ppo.networks import Policy
-from baselines.purejaxrl_ppo.ppo import Algorithm, Runner, make_network_for, make_ppo, make_schedule
+from baselines.purejaxrl_ppo.ppo import make_network_for, make_ppo, make_schedule
 from baselines.purejaxrl_ppo.tracking import LOCAL, RUN_FILE, Tracker
 from flytrack_env.episodes import EpisodicEnvironment
 from flytrack_env.files import locked_folder
@@ -35,7 +35,7 @@ from flytrack_env.progress import progress_bar
 from flytrack_env.validation import convert
 
 Metrics = dict[str, np.ndarray]
-CHUNK_STEPS = 131_072  # environment steps without a return to Python: a fraction of a second
+RECORD_EVERY = 131_072  # environment steps: metrics are recorded a few times a second
 MAY_BE_UNDEFINED = "explained_variance"  # where all returns are the same there is no variance to explain
 MAX_NAMES = 4  # in the message on numbers that are not finite: where one is not, most soon are not
 
@@ -72,36 +72,14 @@ class Options(msgspec.Struct, frozen=True):
 DEFAULT_OPTIONS = Options(checkpoint_every=1_000_000, evaluate_every=4_000_000, tracking_uri=LOCAL)
 
 
-def next_due(update: int, every: int, batch_size: int) -> float:
-    """Return the first update, after one, that reaches another multiple of ``every`` environment steps."""
-    if not every:
-        return float("inf")
-    reached = update * batch_size // every
-    return -(-(reached + 1) * every // batch_size)
+def is_due(steps: int, every: int, batch_size: int) -> bool:
+    """Return whether the update that ends at ``steps`` reaches another multiple of ``every`` steps."""
+    return every > 0 and steps // every > (steps - batch_size) // every
 
 
-def is_due(update: int, every: int, batch_size: int) -> bool:
-    """Return whether an update reaches another multiple of ``every`` environment steps."""
-    return next_due(update - 1, every, batch_size) == update
-
-
-def make_chunk(ppo: Algorithm, max_updates: int) -> Callable[[Runner, jax.Array], tuple[Runner, Any]]:
-    """Return ``chunk(runner, count) -> (runner, metrics)``: ``count`` updates, at most ``max_updates``.
-
-    metrics: leaves (max_updates,), of which the first ``count`` are filled.
-    """
-
-    def chunk(runner: Runner, count: jax.Array) -> tuple[Runner, Any]:
-        def update(index: jax.Array, carry: tuple[Runner, Any]) -> tuple[Runner, Any]:
-            runner, rows = carry
-            runner, metrics = ppo.update(runner)
-            return runner, jax.tree.map(lambda row, value: row.at[index].set(value), rows, metrics)
-
-        forms = jax.eval_shape(ppo.update, runner)[1]
-        rows = jax.tree.map(lambda form: jnp.zeros((max_updates,), form.dtype), forms)
-        return jax.lax.fori_loop(0, count, update, (runner, rows))
-
-    return jax.jit(chunk)
+def stack(rows: list[Metrics]) -> Metrics:
+    """Return the metrics of several updates, (num_updates,) each."""
+    return {name: np.stack([row[name] for row in rows]) for name in rows[0]} if rows else {}
 
 
 def training_params(env: EpisodicEnvironment, config: Config) -> EnvParams:
@@ -130,7 +108,7 @@ def track_reference(track: str | Path) -> str:
 
 @contextmanager
 def collect_signals() -> Iterator[list[int]]:
-    """Collect SIGINT and SIGTERM in a list, so that a training can end between two chunks.
+    """Collect SIGINT and SIGTERM in a list, so that a training can end between two updates.
 
     The second signal raises KeyboardInterrupt at once. Nothing is collected in another thread than the main
     one, where signals cannot be handled, nor of a signal that the caller handles or ignores.
@@ -171,7 +149,7 @@ class Trainer:
 
     Attributes:
         start: key -> runner.
-        chunk: (runner, count) -> (runner, metrics) (``make_chunk``).
+        update: runner -> (runner, metrics).
 
     Raises:
         ValueError: settings, id, track or model that cannot be used.
@@ -185,11 +163,10 @@ class Trainer:
         params = training_params(self.env, self.config)
         ppo = make_ppo(self.env, params, self.config)
         self.network = make_network_for(self.env, params, self.config)
-        self.max_updates = max(1, CHUNK_STEPS // self.config.batch_size)
         # Weak types become strong ones, as they come from a file: one program for both.
         strong = partial(jax.tree.map, lambda leaf: jnp.asarray(leaf).astype(jnp.asarray(leaf).dtype))
         self.start = jax.jit(lambda key: strong(ppo.start(key)))
-        self.chunk = make_chunk(ppo, self.max_updates)
+        self.update = jax.jit(ppo.update)
 
     def train(
         self,
@@ -269,7 +246,7 @@ class Run:
         self.update = 0  # number of updates so far
         self.begun_s = time.perf_counter()
         self.last_stored: Path | None = None
-        self.history: list[Metrics] = []  # of the chunks
+        self.history: list[Metrics] = []  # of the updates
         self.evaluation: dict[str, float] = {}  # metrics of the last one
         key = jax.random.key(description["seed"])
         if start is None:
@@ -305,7 +282,7 @@ class Run:
         try:
             if self.options.checkpoint_every and self.update == 0:
                 self._store(files.step_file(0))
-            self.trainer.chunk(self.runner, jnp.int32(0))
+            jax.block_until_ready(self.trainer.update(self.runner))  # compiles
             bar.set_description("train")
             bar.unpause()
             while self.update < config.num_updates and not signals:
@@ -322,34 +299,36 @@ class Run:
             name = signal.Signals(signals[0]).name
             text = "the run is complete" if is_complete else f"continue with --resume {self.out}"
             raise Stopped(f"stopped by {name} at {self.steps} steps; {text}", signals[0])
-        metrics = jax.tree.map(lambda *parts: np.concatenate(parts), *self.history) if self.history else {}
-        return files.load_checkpoint(self.out / files.FINAL), metrics
+        return files.load_checkpoint(self.out / files.FINAL), stack(self.history)
 
     def _advance(self) -> None:
-        """Train a chunk, then evaluate, record and store what is due after it.
+        """Train until something is due, then evaluate, record and store, in this order.
 
-        The checkpoint is last: a run that is killed before it repeats the chunk, and loses no evaluation.
+        A run that is killed before it stores repeats the updates, and loses no evaluation.
         """
-        config, options, first = self.config, self.options, self.steps
-        every = (options.checkpoint_every, options.evaluate_every)
-        due = min(next_due(self.update, steps, config.batch_size) for steps in every)
-        count = int(min(due, self.update + self.trainer.max_updates, config.num_updates)) - self.update
-        started_s = time.perf_counter()
-        chunk = self.trainer.chunk(self.runner, jnp.int32(count))
-        self.runner, rows = jax.block_until_ready(chunk)
-        elapsed_s = time.perf_counter() - started_s
-        self.update += count
-        is_last = self.update == config.num_updates
-        # Copies: views would keep JAX's arrays of every chunk to the end.
-        metrics = {name: np.asarray(row)[:count].copy() for name, row in rows.items()}
-        self.history.append(metrics)
-        values = {**summarize_updates(metrics), "steps_per_second": count * config.batch_size / elapsed_s}
-        written: list[Path] = []
-        not_finite = find_not_finite(metrics, self.runner.train_state.params)
-        if not not_finite and options.evaluate_every and (is_last or self._is_due(options.evaluate_every)):
-            policy = Policy(self.trainer.network, self.runner.train_state.params)
-            arguments = (options.evaluation_episodes, self.out / "evaluation", self.steps, is_last)
-            self.evaluation, written = evaluate_policy(self.trainer.env, policy, *arguments)
+        config, options, started_s = self.config, self.options, time.perf_counter()
+        first, num_before = self.steps, len(self.history)
+        is_recorded = is_last = False
+        while not (is_recorded or is_last):
+            self.runner, metrics = self.trainer.update(self.runner)
+            self.history.append(jax.device_get(metrics))
+            self.update += 1
+            is_last = self.update == config.num_updates
+            is_stored, is_evaluated, is_recorded = (
+                is_due(self.steps, every, config.batch_size)
+                for every in (options.checkpoint_every, options.evaluate_every, RECORD_EVERY)
+            )
+            is_recorded = is_recorded or is_stored or is_evaluated
+        rate = (self.steps - first) / (time.perf_counter() - started_s)
+        rows = stack(self.history[num_before:])
+        values, written = {**summarize_updates(rows), "steps_per_second": rate}, list[Path]()
+        params = self.runner.train_state.params
+        not_finite = find_not_finite(rows, params)
+        if options.evaluate_every and (is_evaluated or is_last) and not not_finite:
+            policy, folder = Policy(self.trainer.network, params), self.out / "evaluation"
+            self.evaluation, written = evaluate_policy(
+                self.trainer.env, policy, options.evaluation_episodes, folder, self.steps, is_last
+            )
             values |= self.evaluation
         self.tracker.record(self.steps, values, [(path, "evaluation") for path in written])
         if not_finite:
@@ -359,11 +338,8 @@ class Run:
                 f"{self.last_stored or 'none'}. Try a smaller --learning-rate (it was "
                 f"{config.learning_rate:g})"
             )
-        if not is_last and self._is_due(options.checkpoint_every):
+        if is_stored and not is_last:
             self._store(files.step_file(self.steps))
-
-    def _is_due(self, every: int) -> bool:
-        return is_due(self.update, every, self.config.batch_size)
 
     def _store(self, name: str) -> None:
         """Write a checkpoint, once all that was recorded before it is sent."""
@@ -376,7 +352,7 @@ class Run:
 
     def _format_progress(self) -> str:
         """Return the mean return of the last episodes and, of the last evaluation, success and best lap."""
-        text = f"return {self.history[-1]['last_return'][-1]:.1f}"
+        text = f"return {self.history[-1]['last_return']:.1f}"
         if "evaluation_success" in self.evaluation:
             text += f", success {self.evaluation['evaluation_success']:.0%}"
         if "evaluation_best_lap_s" in self.evaluation:

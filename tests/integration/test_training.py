@@ -110,17 +110,17 @@ def test_a_complete_run_is_extended(whole, tmp_path, capsys):
 
 def poison(trainer, monkeypatch, from_update):
     """Have training give parameters that are not finite after some updates."""
-    chunk, done = trainer.chunk, [0]
+    update, done = trainer.update, [-1]  # the first call only compiles
 
-    def poisoned(runner, count):
-        runner, rows = chunk(runner, count)
-        done[0] += int(count)
+    def poisoned(runner):
+        runner, metrics = update(runner)
+        done[0] += 1
         if done[0] <= from_update:
-            return runner, rows
+            return runner, metrics
         params = jax.tree.map(lambda leaf: leaf * jnp.nan, runner.train_state.params)
-        return runner._replace(train_state=runner.train_state.replace(params=params)), rows
+        return runner._replace(train_state=runner.train_state.replace(params=params)), metrics
 
-    monkeypatch.setattr(trainer, "chunk", poisoned)
+    monkeypatch.setattr(trainer, "update", poisoned)
 
 
 def test_a_diverged_run_ends_at_once_and_no_checkpoint_has_it(trainer, tmp_path, monkeypatch):
@@ -128,7 +128,7 @@ def test_a_diverged_run_ends_at_once_and_no_checkpoint_has_it(trainer, tmp_path,
     with pytest.raises(DivergedError) as caught:
         trainer.train(tmp_path, SEED, EVERY_OTHER_UPDATE)
     last_good = step_path(tmp_path, 2)
-    for part in (f"between steps {2 * BATCH} and {4 * BATCH}", "params", str(last_good), "--learning-rate"):
+    for part in (f"steps {2 * BATCH} and {4 * BATCH}", "not finite", str(last_good), "--learning-rate"):
         assert part in str(caught.value)
     assert newest_intact(tmp_path).path == last_good
 
