@@ -14,7 +14,6 @@ import numpy as np
 
 import flytrack_env
 from baselines.purejaxrl_ppo.checkpoint import Checkpoint, CheckpointError
-from baselines.purejaxrl_ppo.report import share
 from flytrack_env.battery import BatteryWarning
 from flytrack_env.dynamics import ModelParameters
 from flytrack_env.effects import effect_of
@@ -98,8 +97,9 @@ def with_model_as_given(params: EnvParams) -> EnvParams:
 class Plants(NamedTuple):
     """Drawn plants.
 
-    models: leaves (num_plants, ...). drawn: values by the names of ``RANGES``, (num_plants,) each; of
-    the drag, the mean of the three axes.
+    Attributes:
+        models: leaves (num_plants, ...).
+        drawn: values by the names of ``RANGES``, (num_plants,) each; of the drag, the mean of the three axes.
     """
 
     models: ModelParameters
@@ -113,91 +113,56 @@ class Plants(NamedTuple):
         """Return every model repeated, leaves (num_plants * times, ...)."""
         return jax.tree.map(lambda leaf: np.repeat(leaf, times, axis=0), self.models)
 
-    def summarise(self, is_complete: np.ndarray) -> dict[str, Any]:
-        """Return on how many plants every flight completes its laps, as JSON values.
 
-        is_complete: (num_plants, num_episodes), of flights.
-        """
-        return {
-            "success": share(np.asarray(is_complete.all(axis=1))),
-            "ranges": {name: list(bounds) for name, bounds in RANGES.items()},
-            "by_thirds": by_thirds(self.drawn, is_complete),
-        }
+def draw_plants(seed: int, num_plants: int, model: ModelParameters) -> Plants:
+    """Draw plants around a model; a smaller number returns the first of the same plants."""
+    # Row by row, so that the first plants do not depend on how many there are.
+    uniform = np.random.default_rng(seed).uniform(size=(num_plants, NUM_DRAWS))
+    return Plants(*jax.tree.map(np.asarray, jax.vmap(partial(make_plant, model))(uniform)))
 
 
-def perturb(
-    model: ModelParameters, drag_per_m: Any, thrust_scale: Any, wind_w_m_s: Any, delay_s: Any
-) -> ModelParameters:
-    """Return one plant: a model with drag, wind and delay added, and its thrust multiplied.
+def draw_model(key: jax.Array, model: ModelParameters) -> ModelParameters:
+    """Draw the model of a plant around a model, as ``draw_plants`` draws them."""
+    return make_plant(model, jax.random.uniform(key, (NUM_DRAWS,)))[0]
 
-    drag_per_m: quadratic, (3,), body axes, 1/m. wind_w_m_s: (2,), horizontal velocity of the air, world, m/s.
-    Values are clipped to the effects' ranges.
+
+def make_plant(model: ModelParameters, uniform: Any) -> tuple[ModelParameters, dict[str, jax.Array]]:
+    """Return a plant around a model: drag, wind and delay are added, and the thrust is multiplied.
+
+    Args:
+        model: that the plant is around; values are clipped to the ranges of its effects.
+        uniform: random numbers from 0 to 1, (NUM_DRAWS,).
+
+    Returns:
+        The plant's model, and its drawn values by the names of ``RANGES``.
     """
+
+    def scale(columns: Any, low: float, high: float) -> Any:
+        return low + (high - low) * uniform[columns]
+
+    drag_per_m = scale(slice(0, 3), *RANGES["quadratic_drag_per_m"])
+    thrust_scale = scale(3, *RANGES["thrust_scale"])
+    wind_m_s, heading_rad = scale(4, *RANGES["wind_m_s"]), scale(5, -np.pi, np.pi)
+    delay_s = scale(6, *RANGES["command_delay_s"])
     drag, wind = model.effect("quadratic_drag"), model.effect("wind")
     thrust, delay = model.effect("thrust_scale"), model.effect("command_delay")
-    return model.with_effects(
+    changed = model.with_effects(
         _clipped(
             drag, k_x=drag.k_x + drag_per_m[0], k_y=drag.k_y + drag_per_m[1], k_z=drag.k_z + drag_per_m[2]
         ),
-        _clipped(wind, v_x=wind.v_x + wind_w_m_s[0], v_y=wind.v_y + wind_w_m_s[1]),
+        _clipped(
+            wind,
+            v_x=wind.v_x + wind_m_s * jnp.cos(heading_rad),
+            v_y=wind.v_y + wind_m_s * jnp.sin(heading_rad),
+        ),
         _clipped(thrust, factor=thrust.factor * thrust_scale),
         _clipped(delay, delay_s=delay.delay_s + delay_s),
     )
+    return changed, dict(zip(RANGES, (drag_per_m.mean(), thrust_scale, wind_m_s, delay_s), strict=True))
 
 
 def _clipped(parameters: Any, **values: jax.Array) -> Any:
     """Return an effect's parameters with new values, clipped to its ranges."""
     ranges = effect_of(parameters).ranges
-    return parameters._replace(
-        **{name: jnp.clip(value, ranges[name].low, ranges[name].high) for name, value in values.items()}
-    )
-
-
-def draw_plants(seed: int, num_plants: int, model: ModelParameters) -> Plants:
-    """Return plants around a model (``perturb``); a smaller number returns the first of the same plants."""
-    # Row by row, so that the first plants do not depend on how many there are.
-    uniform = np.random.default_rng(seed).uniform(size=(num_plants, NUM_DRAWS))
-    models, drawn = jax.vmap(partial(plant_of, model=model))(uniform)
-    return Plants(jax.tree.map(np.asarray, models), {name: np.asarray(one) for name, one in drawn.items()})
-
-
-def draw_model(key: jax.Array, model: ModelParameters) -> ModelParameters:
-    """Return the model of a plant drawn around a model, as ``draw_plants`` draws them."""
-    return plant_of(jax.random.uniform(key, (NUM_DRAWS,)), model)[0]
-
-
-def plant_of(uniform: Any, model: ModelParameters) -> tuple[ModelParameters, dict[str, jax.Array]]:
-    """Return a plant and what of it is drawn, by the names of ``RANGES``; uniform: (NUM_DRAWS,), 0 to 1."""
-
-    def draw(columns: Any, bounds: tuple[float, float]) -> jax.Array:
-        return bounds[0] + (bounds[1] - bounds[0]) * uniform[columns]
-
-    drag, thrust = draw(slice(0, 3), RANGES["quadratic_drag_per_m"]), draw(3, RANGES["thrust_scale"])
-    wind, heading_rad = draw(4, RANGES["wind_m_s"]), draw(5, (-np.pi, np.pi))
-    delay = draw(6, RANGES["command_delay_s"])
-    wind_w = wind * jnp.stack([jnp.cos(heading_rad), jnp.sin(heading_rad)])
-    return perturb(model, drag, thrust, wind_w, delay), dict(
-        zip(RANGES, (drag.mean(), thrust, wind, delay), strict=True)
-    )
-
-
-def by_thirds(drawn: dict[str, np.ndarray], is_complete: np.ndarray) -> list[dict[str, Any]]:
-    """Return how success depends on each drawn quantity, as JSON values: a row per third of the plants.
-
-    is_complete: (num_plants, num_episodes), of flights. from, to: smallest and largest value in the third.
-    """
-    rows = []
-    for name, values in drawn.items():
-        for third, plants in enumerate(np.array_split(np.argsort(values, kind="stable"), 3)):
-            if plants.size:
-                rows.append(
-                    {
-                        "quantity": name,
-                        "third": third + 1,
-                        "from": float(values[plants].min()),
-                        "to": float(values[plants].max()),
-                        "plants": share(np.asarray(is_complete[plants].all(axis=1))),
-                        "flights_share": float(is_complete[plants].mean()),
-                    }
-                )
-    return rows
+    clipped = {name: jnp.clip(value, ranges[name].low, ranges[name].high) for name, value in values.items()}
+    return parameters._replace(**clipped)

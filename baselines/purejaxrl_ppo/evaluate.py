@@ -188,7 +188,7 @@ class Report:
             "steps_limit": settings.steps,
             "laps": settings.num_laps,
             "episodes": settings.episodes,
-            **words.summarise(outcomes, is_limited=settings.num_laps is not None),
+            **words.summarize(outcomes, is_limited=settings.num_laps is not None),
             "plants": None,
             "optimal": None,
             "time_lost_s": None,
@@ -203,12 +203,12 @@ class Report:
             is_complete = outcomes.is_complete().reshape(-1, settings.episodes)
             if settings.episodes > 1:  # flights of one plant are not independent
                 numbers["success"] |= {"low": None, "high": None}
-            numbers["plants"] = plants.summarise(is_complete)
+            numbers["plants"] = words.summarize_plants(plants.drawn, is_complete)
         if references is not None:
             numbers["optimal"] = words.compare_with_optimum(numbers, references)
             if settings.ghost:
                 gate_ids = [gate.id for gate in self.env.track.gates]
-                numbers["time_lost_s"] = words.time_lost(outcomes, references, gate_ids)
+                numbers["time_lost_s"] = words.compute_time_lost(outcomes, references, gate_ids)
         self.numbers = numbers
 
     @property

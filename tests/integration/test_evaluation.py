@@ -13,6 +13,7 @@ from baselines.purejaxrl_ppo import checkpoint_env, evaluate
 from baselines.purejaxrl_ppo import flights as flights_module
 from baselines.purejaxrl_ppo.checkpoint import load_checkpoint
 from baselines.purejaxrl_ppo.flights import fly_many, outcomes_of, race_many, score, start_keys
+from baselines.purejaxrl_ppo.report import summarize_plants
 from flytrack_env import FlyTrack, make, nominal_parameters
 from flytrack_env.effects import CommandDelay, LinearDrag, QuadraticDrag, ThrustScale
 from flytrack_env.references import shipped_reference
@@ -143,7 +144,8 @@ def test_a_single_flight_as_json_and_docs_name_every_key(
     assert "interval" not in text and report["success"] is None and report["ghost"] is None
     np.testing.assert_allclose(report["first_flight"]["lap_times_s"], raced.lap_times_s[index], atol=1e-5)
     assert [line.split(":")[0] for line in text.splitlines()][:4] == ["flown", "gates", "lap times", "ended"]
-    plants = checkpoint_env.draw_plants(0, 3, nominal_parameters()).summarise(np.ones((3, 1), bool))
+    drawn = checkpoint_env.draw_plants(0, 3, nominal_parameters()).drawn
+    plants = summarize_plants(drawn, np.ones((3, 1), bool))
     text = (ROOT / "docs" / "baseline.md").read_text()
     missing = {name for name in keys_of({**report, "plants": plants}) if f"`{name}`" not in text}
     assert not missing
@@ -176,13 +178,13 @@ def test_plants_are_drawn_from_the_ranges_around_the_model():
 def test_what_breaks_the_policy_shows_in_its_thirds():
     drawn = checkpoint_env.draw_plants(0, 90, nominal_parameters()).drawn
     is_good = drawn["command_delay_s"] < np.quantile(drawn["command_delay_s"], 2.0 / 3.0)
-    rows = checkpoint_env.by_thirds(drawn, np.stack([is_good, np.ones(90, bool)], axis=1))
+    rows = summarize_plants(drawn, np.stack([is_good, np.ones(90, bool)], axis=1))["by_thirds"]
     shares = {name: [r["plants"]["share"] for r in rows if r["quantity"] == name] for name in drawn}
     assert shares["command_delay_s"] == [1.0, 1.0, 0.0]
     assert all(min(shares[name]) > 0.3 for name in set(drawn) - {"command_delay_s"})
     assert {row["flights_share"] for row in rows if row["quantity"] == "command_delay_s"} == {1.0, 0.5}
-    assert len(checkpoint_env.by_thirds(drawn, np.ones((90, 1), bool))) == 12
-    assert len(checkpoint_env.by_thirds({"wind_m_s": np.ones(1)}, np.ones((1, 1), bool))) == 1
+    assert len(rows) == 12
+    assert len(summarize_plants({"wind_m_s": np.ones(1)}, np.ones((1, 1), bool))["by_thirds"]) == 1
 
 
 def test_ids_that_draw_models_fly_the_one_that_is_given(checkpoint):
